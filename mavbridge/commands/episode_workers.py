@@ -19,6 +19,7 @@ from multiprocessing.synchronize import Event
 from typing import Any, Generic, TypeAlias, TypeVar
 
 from mavbridge.config.workers import WorkersConfig
+from mavbridge.core.address import host_port
 from mavbridge.core.errors import MavbridgeError, PeerError, UserError
 from mavbridge.simulation.referee import EpisodeInterruptedError
 
@@ -218,10 +219,11 @@ def _require_reachable(address: str) -> None:
     """Refuse an address where nothing answers: Ray would keep trying for long."""
     if address in ("auto", "local"):
         return
-    host, _, port = address.removeprefix("ray://").rpartition(":")
     try:
-        socket.create_connection((host, int(port)), CONNECT_TIMEOUT_S).close()
-    except (OSError, OverflowError, ValueError) as error:
+        if (target := host_port(address.removeprefix("ray://"))) is None:
+            raise ValueError
+        socket.create_connection(target, CONNECT_TIMEOUT_S).close()
+    except (OSError, ValueError) as error:
         reason = error.strerror or error if isinstance(error, OSError) else "no port number"
         raise UserError(
             f"--ray {address}: nothing answers there ({reason}); name the head of a cluster as "

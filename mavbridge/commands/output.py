@@ -20,6 +20,7 @@ from rich.text import Text
 
 from mavbridge.core.extras import require_packages
 from mavbridge.core.files import require_writable
+from mavbridge.core.provenance import without_secrets
 
 PIPED_WIDTH = 120
 """Columns of the tables where there is no terminal."""
@@ -93,7 +94,7 @@ def number(value: float | None, digits: int) -> str:
 
 def print_status(line: str) -> None:
     """Print what is being done to standard error, apart from the results."""
-    Console(stderr=True).print(Text(line, style="dim"), soft_wrap=True)
+    Console(stderr=True).print(Text(without_secrets(line), style="dim"), soft_wrap=True)
 
 
 class _StatusColumn(ProgressColumn):

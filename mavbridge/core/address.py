@@ -6,11 +6,13 @@
     tcp:HOST:PORT    tcp://, tcpout://       connect
     /dev/ttyX,BAUD   serial:///dev/ttyX:BAUD serial port; 57600 baud where none is given
 
+HOST is a name, 192.168.1.9, or an IPv6 address in brackets: ``[::1]``, ``[fe80::1%eth0]``.
 Between the slashes of ``udp://`` and ``udpin://`` an empty host is this computer alone; in MAVSDK
 it is every network, which is 0.0.0.0 here.
 """
 
 import re
+import socket
 from typing import NamedTuple, TypeAlias
 
 from mavbridge.core.errors import UserError
@@ -22,10 +24,17 @@ FORMS = (
 DEFAULT_BAUD = 57600
 EVERY_INTERFACE = "0.0.0.0"  # noqa: S104 - only where the user says so
 LOOPBACK = "127.0.0.1"
+_EVERY_HOST = (EVERY_INTERFACE, "::")
+_HOST_PORT = r"(?:\[([0-9A-Fa-f:.]*:[0-9A-Fa-f:.]*(?:%[^\]\s/]+)?)\]|([^:/\s\[\]]*)):(\d{1,5})"
 _KINDS = ("udp", "udpin", "udpout", "tcp", "tcpout")
-_NETWORK = re.compile(rf"(?:({'|'.join(_KINDS)}):)?(//)?([^:/\s]*):(\d{{1,5}})/?", re.ASCII)
+_NETWORK = re.compile(rf"(?:({'|'.join(_KINDS)}):)?(//)?{_HOST_PORT}/?", re.ASCII)
+_BRACKETS = "an IPv6 address goes into brackets, as in udp:[::1]:14550; "
 _SERIAL = re.compile(r"(?:serial:(?://)?)?(/dev/[^,]+?|COM\d+)(?:,(.*)|:(\d{4,}))?")
 """A name may hold colons (/dev/serial/by-path/...): only four digits and more are a rate."""
+
+
+SocketAddress: TypeAlias = tuple[str, int, *tuple[int, ...]]
+"""Host and port as numbers, as the ``socket`` module has them: IPv6 adds flow and scope."""
 
 
 class UdpAddress(NamedTuple):
@@ -66,7 +75,7 @@ def parse_address(spec: str) -> LinkAddress:
         return serial
     found = _network(spec)
     if found is None:
-        hint = ""
+        hint = _BRACKETS if "::" in spec and "[" not in spec else ""
         if spec.startswith("tcpin:"):
             hint = "mavbridge connects, and does not listen on TCP; "
         raise UserError(f"--connect {spec!r} is not understood: {hint}use {FORMS}")
@@ -81,7 +90,46 @@ def is_reachable(spec: str) -> bool:
     address = parse_address(spec)
     if isinstance(address, SerialAddress):
         return False
-    return not (address.host.startswith("127.") or address.host == "localhost")
+    return not (address.host.startswith("127.") or address.host in ("localhost", "::1"))
+
+
+def host_port(text: str) -> tuple[str, int] | None:
+    """Read HOST:PORT, an IPv6 address in brackets; None for anything else."""
+    match = re.fullmatch(_HOST_PORT, text, re.ASCII)
+    if match is None or not 0 < (port := int(match[3])) < 65536:
+        return None
+    host: str = match[1] or match[2]
+    return (host, port) if host else None
+
+
+def spelled(host: str, port: int, *scope: int) -> str:
+    """Return HOST:PORT as ``host_port`` reads it, also of a ``SocketAddress``."""
+    zone = f"%{scope[-1]}" if scope and scope[-1] and "%" not in host else ""
+    return f"[{host}{zone}]:{port}" if ":" in host else f"{host}:{port}"
+
+
+def resolve(host: str, port: int) -> SocketAddress:
+    """Look a host up, IPv4 first where it has both; once, at the start, as a resolver may block.
+
+    Raises:
+        UserError: there is no such host, or no such network card.
+    """
+    try:
+        found = [entry[4] for entry in socket.getaddrinfo(host, port, type=socket.SOCK_DGRAM)]
+    except (OSError, UnicodeError) as error:
+        reason = error.strerror if isinstance(error, OSError) else "no such name"
+        raise UserError(f"cannot find host {host!r}: {reason}") from error
+    return socket_address(*min(found, key=len))
+
+
+def socket_address(host: str | int, port: int | bytes, *scope: int) -> SocketAddress:
+    """Return the address of which a library or a message holds these parts."""
+    return (str(host), int(port), *scope)
+
+
+def family(address: SocketAddress) -> socket.AddressFamily:
+    """Return the family of a socket for this address."""
+    return socket.AF_INET if len(address) == 2 else socket.AF_INET6
 
 
 def serial_baud(spec: str) -> int | None:
@@ -104,9 +152,9 @@ def _serial(spec: str) -> SerialAddress | None:
 def _network(spec: str) -> tuple[str, str, int] | None:
     """Kind (empty where none is given), host and port; None for anything else."""
     match = _NETWORK.fullmatch(spec)
-    if match is None or not 0 < (port := int(match[4])) < 65536:
+    if match is None or not 0 < (port := int(match[5])) < 65536:
         return None
-    kind, is_url, host = match[1] or "", match[2], match[3]
+    kind, is_url, host = match[1] or "", match[2], match[3] or match[4]
     if (is_url and not kind) or host in _KINDS:
         return None
     if not host and is_url and kind in ("udp", "udpin"):

@@ -7,6 +7,8 @@ handed to the kernel).
 from dataclasses import dataclass
 from typing import Literal, NamedTuple, TypeAlias
 
+from mavbridge.core.address import SocketAddress
+
 Output: TypeAlias = Literal["rc-override", "manual-control", "attitude", "rates", "velocity"]
 """RC_CHANNELS_OVERRIDE (ArduPilot), MANUAL_CONTROL (PX4), SET_ATTITUDE_TARGET with an attitude or
 with body rates, SET_POSITION_TARGET_LOCAL_NED with a velocity."""
@@ -264,7 +266,7 @@ class Outlet(NamedTuple):
     """Number of times that the link was opened: another number is another socket or port."""
     fd: int | None
     """None while it is closed."""
-    receiver: tuple[str, int] | None
+    receiver: SocketAddress | None
     """Address for datagrams; None on a stream."""
 
 
@@ -326,6 +328,8 @@ class LinkStats:
     """Vehicle's clock minus ours, by TIMESYNC: joins our stamps with the vehicle's log."""
     is_timesync_good: bool = False
     """Ages count from the vehicle's own stamps; False = from arrival, which hides delay."""
+    slow_clock: str | None = None
+    """How far behind real time the vehicle's clock falls; None where it does not."""
     saturated: tuple[tuple[str, float], ...] = ()
     """Share of the stick messages in which a stick of the policy meant more than the vehicle can
     do, by stick; those at 0 are left out."""

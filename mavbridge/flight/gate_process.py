@@ -8,6 +8,7 @@ import sys
 import threading
 from contextlib import suppress
 
+from mavbridge.core.address import SocketAddress
 from mavbridge.core.clock import NS_PER_MS, NS_PER_S, Clock
 from mavbridge.core.errors import ExitCode, MavbridgeError, PeerError, UserError
 from mavbridge.core.processes import child_environment
@@ -180,7 +181,7 @@ class GateProcess:
             "take the vehicle over"
         )
 
-    def _transmit(self, packet: bytes, receiver: tuple[str, int] | None) -> bool:
+    def _transmit(self, packet: bytes, receiver: SocketAddress | None) -> bool:
         """Send one packet through the gate's socket or port; never waits."""
         if self._outlet is None:
             return False

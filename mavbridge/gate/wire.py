@@ -11,6 +11,7 @@ from collections.abc import Iterable, Iterator
 from dataclasses import asdict, dataclass
 from typing import Literal, NamedTuple, TypeAlias
 
+from mavbridge.core.address import SocketAddress, socket_address
 from mavbridge.core.vehicle import (
     ACTION_CLASSES,
     Action,
@@ -93,7 +94,7 @@ class LastWords(NamedTuple):
     """That of the gate when it prepared them."""
     mode: str | None
     """The safe mode that they ask for."""
-    receiver: tuple[str, int] | None
+    receiver: SocketAddress | None
     """Address for the datagrams; None on a stream."""
     brings_file: bool
     """The open socket or port of the link comes with this message."""
@@ -328,7 +329,7 @@ def _decode_from_gate(data: bytes) -> FromGate:
         case b"W":
             phase, mode, receiver, brings_file, texts = json.loads(data[1:])
             packets = tuple((int(after_ns), bytes.fromhex(text)) for after_ns, text in texts)
-            address = None if receiver is None else (str(receiver[0]), int(receiver[1]))
+            address = None if receiver is None else socket_address(*receiver)
             return LastWords(Phase(phase), mode, address, bool(brings_file), packets)
         case b"X":
             return GateError(*json.loads(data[1:]))

@@ -88,6 +88,7 @@ class MavlinkLink:
         self._discovery = VehicleDiscovery(target_system=config.target_system)
         self._counters = LinkCounters()
         self._timesync = TimesyncFilter()
+        self._has_told_pace = False
         self._telemetry = TelemetryCollector()
         self._commands = ModeAndArm()
         self._sender = ActionSender(self._connection, self._codec, clock)
@@ -153,6 +154,8 @@ class MavlinkLink:
         if (vehicle := self._vehicle) is None:
             return "waiting for the vehicle's heartbeat"
         if (problem := vehicle.problem(now_ns)) is not None:
+            if (slow := self._timesync.slow_clock) is not None:
+                return f"{slow}; {problem}"
             hint = self._connection.hint
             return problem if hint is None else f"{problem}; {hint}"
         if self._connection.is_refused(now_ns) and not self._config.readonly:
@@ -188,6 +191,7 @@ class MavlinkLink:
                 self._telemetry.receive(body, arrived_ns, happened_ns)
             case Timesync() as reply:
                 self._timesync.receive(reply, arrived_ns)
+                self._tell_pace()
             case CommandAck() as ack:
                 is_for_us = ack.target in ((0, 0), self._codec.source)
                 if is_for_us and (refusal := self._commands.receive(ack)) is not None:
@@ -201,6 +205,12 @@ class MavlinkLink:
                 self._interrupt(changed)
         if self._forward is not None:
             self._forward(ForwardedPacket(arrived_ns, happened_ns, message.packet))
+
+    def _tell_pace(self) -> None:
+        slow = None if self._has_told_pace else self._timesync.slow_clock
+        if slow is not None:
+            self._has_told_pace = True
+            self._report(slow)
 
     def _notice_other(self, identity: VehicleIdentity, sender: Address | None, now_ns: int) -> None:
         """Another address uses the vehicle's system id: its packets are ignored while we fly."""
@@ -312,7 +322,12 @@ class MavlinkLink:
 
     def _adopt(self, identity: VehicleIdentity) -> None:
         """Start a new session: at first sight, after a reboot and after a change of address."""
-        self._vehicle = VehicleSession(identity, self._config, report=self._report)
+        self._vehicle = VehicleSession(
+            identity,
+            self._config,
+            report=self._report,
+            has_slow_clock=lambda: self._timesync.slow_pace is not None,
+        )
         if self._watches_home_height:
             self._vehicle.watch_home_height()
         self._sender.equip(self._vehicle)

@@ -13,6 +13,7 @@ from rich.text import Text
 from mavbridge.config.rates import STATUS_HZ
 from mavbridge.core.clock import NS_PER_MS, NS_PER_S
 from mavbridge.core.log import SAID, is_log_thread
+from mavbridge.core.provenance import without_secrets
 from mavbridge.core.records import Event, Tick
 from mavbridge.core.workers import HungError, Worker
 from mavbridge.observe.keyboard import ignore_job_control
@@ -153,17 +154,17 @@ class FlightScreen:
     def show_message(self, text: str) -> None:
         """Show a message with the next refresh, and log it now."""
         _said.info("%s", text)
-        self._show(Text(text), soft_wrap=True)
+        self._show(Text(without_secrets(text)), soft_wrap=True)
 
     def _show_stray(self, text: str) -> None:
         """Show a line that somebody has printed; those of the log are in it already."""
         if not is_log_thread():
             _said.info("%s", text)
-        self._show(Text(text, style="dim"), soft_wrap=True)
+        self._show(Text(without_secrets(text), style="dim"), soft_wrap=True)
 
     def show_status(self, text: str) -> None:
         """Show this as the status line from now on: the flight is over, and something goes on."""
-        self._final_status = text
+        self._final_status = without_secrets(text)
 
     def show_report(self, report: TimingReport) -> None:
         """Show the table of what was measured, and the verdicts, with the next refresh."""
@@ -201,7 +202,7 @@ class FlightScreen:
         line.append(f"  state {_age(tick.sent_ns, attitude_ns)}")
         line.append(f"  missed {self._missed_slots}")
         if tick.release_reason is not None:  # last: it may be long, and is cut first
-            line.append(f"  {tick.release_reason}", style="yellow")
+            line.append(f"  {without_secrets(tick.release_reason)}", style="yellow")
         return line
 
     def _state(self, tick: Tick) -> tuple[str, str]:

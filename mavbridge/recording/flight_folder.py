@@ -12,13 +12,14 @@ from mavbridge.recording import rows
 from mavbridge.recording.folder import TICKS, VIDEO, frames_of, video_of
 from mavbridge.recording.meta import FlightError, FlightMeta, read_meta
 from mavbridge.recording.rows import FrameRow, TickRow, read_frames, read_ticks
-from mavbridge.recording.tables import read_table
-from mavbridge.recording.video.file import count_frames, read_video
+from mavbridge.recording.tables import read_numbered, read_table
+from mavbridge.recording.video.file import read_video
+from policy.data.flight_video import with_images
 
 
 @dataclass(frozen=True, kw_only=True)
 class RecordedFlight:
-    """One flight. Row k of ``frames`` is image k, always."""
+    """One flight. Row k of ``frames`` belongs to the k-th of ``images``, always."""
 
     folder: Path
     meta: FlightMeta
@@ -28,6 +29,10 @@ class RecordedFlight:
     """The same, one row an image."""
     video: str = VIDEO
     """Name of the file of the images."""
+    numbers: tuple[int, ...] = ()
+    """Number of each row's image in the video; some are left out where files are damaged."""
+    damage: tuple[str, ...] = ()
+    """What of the flight was skipped, in sentences for the user."""
 
     def tick_rows(self) -> Iterator[TickRow]:
         """The ticks as records, with their labels where the flight is a demonstration."""
@@ -40,7 +45,7 @@ class RecordedFlight:
 
     def images(self) -> Iterator[CameraImage]:
         """The images one by one; raises VideoError if the video is damaged."""
-        return read_video(self.folder / self.video, self.frames.num_rows)
+        return read_video(self.folder / self.video, self.numbers)
 
     def rgb_images(self) -> Iterator[ImageArray]:
         """As ``images``; raises FlightError if they are depth images."""
@@ -60,18 +65,27 @@ def open_flight(folder: Path, camera: str | None = None) -> RecordedFlight:
         MavbridgeError: it is no recorded flight, or a damaged one; the message says what to do.
     """
     meta = read_meta(folder)
-    ticks = read_table(folder / TICKS, rows.TICKS, later=rows.LATER)
+    damage: list[str] = []
+    ticks = read_table(folder / TICKS, rows.TICKS, later=rows.LATER, damage=damage)
     known = ("front",) if meta.contract is None else meta.contract.cameras
     if camera is not None and camera not in known:
         raise FlightError(f"{folder} has no camera {camera}: it has {', '.join(known)}")
     other = None if camera == known[0] else camera
-    frames = _frames(folder, meta, other)
+    frames, numbers = _frames(folder, meta, other, damage)
     return RecordedFlight(
-        folder=folder, meta=meta, ticks=ticks, frames=frames, video=video_of(other)
+        folder=folder,
+        meta=meta,
+        ticks=ticks,
+        frames=frames,
+        video=video_of(other),
+        numbers=numbers,
+        damage=tuple(damage),
     )
 
 
-def _frames(folder: Path, meta: FlightMeta, camera: str | None) -> Any:
+def _frames(
+    folder: Path, meta: FlightMeta, camera: str | None, damage: list[str]
+) -> tuple[Any, tuple[int, ...]]:
     stem, video = frames_of(camera), video_of(camera)
     has_table = any((folder / stem).with_suffix(end).exists() for end in (".parquet", ".arrows"))
     has_video = (folder / video).exists()
@@ -82,12 +96,13 @@ def _frames(folder: Path, meta: FlightMeta, camera: str | None) -> Any:
                 f"{folder} lacks {missing}, though {meta.frames} frames were recorded: copy the "
                 "folder again, whole"
             )
-        return rows.FRAMES.empty_table()  # the flight ended before its first frame
-    table = read_table(folder / stem, rows.FRAMES)
-    whole = count_frames(folder / video)
-    if meta.finished and whole != table.num_rows:
-        raise FlightError(
-            f"{folder / video} holds {whole} frames, {stem}.parquet {table.num_rows} rows: one "
-            "of them was damaged or replaced later"
-        )
-    return table.slice(0, min(whole, table.num_rows))
+        return rows.FRAMES.empty_table(), ()  # the flight ended before its first frame
+    table, numbers = read_numbered(folder / stem, rows.FRAMES, damage=damage)
+    try:
+        places, more = with_images(folder / video, numbers, is_whole=meta.finished)
+    except OSError as error:
+        raise FlightError(f"{folder / video} cannot be read: {error.strerror}") from error
+    if meta.finished and len(numbers) and not len(places):
+        raise FlightError(f"{folder / video} holds none of {len(numbers)} images: copy it again")
+    damage += more
+    return table.take(places), tuple(numbers[places].tolist())

@@ -2,17 +2,19 @@
 
 from collections.abc import Collection, Iterator
 from pathlib import Path
-from typing import IO
+from typing import IO, Any
 
+import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
+from numpy.typing import NDArray
 
 from mavbridge.core.errors import MavbridgeError
+from policy.data.flight_data import DatasetError
+from policy.data.tables import read_rows
 from policy.files import library_name
 
 READ_ERRORS = (pa.ArrowException, OSError)
-MAX_ROWS = 10_000_000
-"""A day at 100 Hz, and more: a small file can claim many more rows, and fill the memory."""
 _GROUP_ROWS = 2_048
 """Rows of a Parquet row group: twenty seconds of ticks. Encoding 16,384 at once took 27 MB."""
 
@@ -61,7 +63,8 @@ def to_parquet(stream: Path, parquet: Path) -> None:
     try:
         with stream.open("rb") as file:
             schema, batches = _whole_batches(file)
-            with pq.ParquetWriter(library_name(part), schema, compression="zstd") as writer:
+            options: dict[str, Any] = {"compression": "zstd", "write_page_checksum": True}
+            with pq.ParquetWriter(library_name(part), schema, **options) as writer:
                 for table in _groups(schema, batches):
                     writer.write_table(table)
         part.replace(parquet)
@@ -85,34 +88,46 @@ def _groups(schema: pa.Schema, batches: Iterator[pa.RecordBatch]) -> Iterator[pa
         yield pa.Table.from_batches(group, schema).combine_chunks()
 
 
-def read_table(stem: Path, schema: pa.Schema, *, later: Collection[str] = ()) -> pa.Table:
+def read_table(
+    stem: Path,
+    schema: pa.Schema,
+    *,
+    later: Collection[str] = (),
+    damage: list[str] | None = None,
+) -> pa.Table:
     """The table under this stem, whichever form it has; of a cut-off stream the whole batches.
 
-    Columns named in ``later`` may be missing, since the first files lack them: they are null then.
+    What is lost is told in a sentence that is added to ``damage``. Columns named in ``later`` may
+    be missing, since the first files lack them: they are null then.
 
     Raises:
         TableError: there is none, it is damaged, or it lacks a column of ``schema``.
     """
+    return read_numbered(stem, schema, later=later, damage=damage)[0]
+
+
+def read_numbered(
+    stem: Path,
+    schema: pa.Schema,
+    *,
+    later: Collection[str] = (),
+    damage: list[str] | None = None,
+) -> tuple[pa.Table, NDArray[np.int64]]:
+    """As ``read_table``, with the numbers that the rows had before some were lost."""
     parquet, stream = stem.with_suffix(".parquet"), stem.with_suffix(".arrows")
     path = parquet if parquet.exists() else stream
     try:
-        if path is parquet:
-            rows = pq.read_metadata(library_name(parquet)).num_rows
-            if rows > MAX_ROWS:
-                raise TableError(f"{path} has {rows} rows, more rows than a flight has")
-            table = pq.read_table(library_name(parquet))
-        elif stream.stat().st_size == 0:  # killed before the first batch
-            table = schema.empty_table()
-        else:
-            with stream.open("rb") as file:
-                found, batches = _whole_batches(file)
-                table = pa.Table.from_batches(batches, found)
+        table, numbers = read_rows(stem, [] if damage is None else damage)
+    except DatasetError as error:
+        raise TableError(str(error)) from error
     except FileNotFoundError as error:
         raise TableError(
             f"{stem.parent} has neither {parquet.name} nor {stream.name}: it is no whole flight"
         ) from error
     except READ_ERRORS as error:
         raise TableError(f"{path} is damaged: {error}") from error
+    if not table.column_names:
+        table = schema.empty_table()
     for field in schema:
         if field.name in later and field.name not in table.column_names:
             table = table.append_column(field, pa.nulls(table.num_rows, field.type))
@@ -126,7 +141,7 @@ def read_table(stem: Path, schema: pa.Schema, *, later: Collection[str] = ()) ->
             f"{path} lacks the column{'s' * (len(missing) > 1)} {', '.join(missing)} "
             "of docs/formats/flight_folder.md: another program or version wrote it"
         )
-    return table
+    return table, numbers
 
 
 def _whole_batches(file: IO[bytes]) -> tuple[pa.Schema, Iterator[pa.RecordBatch]]:

@@ -27,7 +27,8 @@ def require_file(path: Path, suffixes: Sequence[str]) -> None:
     if not path.is_file():
         near = sorted(p.name for p in path.parent.glob("*") if p.suffix in suffixes)
         there = f"its folder holds {near}" if near else "its folder holds no checkpoint"
-        raise CheckpointError(f"{path}: no such file; {there}")
+        what = "not a file but a pipe or a device" if path.exists() else "no such file"
+        raise CheckpointError(f"{path}: {what}; {there}")
 
 
 def require_header(path: Path, header: dict[str, str]) -> None:

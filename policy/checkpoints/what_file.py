@@ -14,7 +14,7 @@ from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
-from policy.files import read_json, stand_in_of
+from policy.files import open_regular, read_json, stand_in_of
 
 HEAD_BYTES = 4096
 MAX_HEADER_BYTES = 100_000_000
@@ -67,7 +67,7 @@ def recognise(path: Path) -> str | None:
 
 
 def _file(path: Path) -> tuple[str, str] | None:
-    with path.open("rb") as file:
+    with open_regular(path) as file:
         head = file.read(HEAD_BYTES)
     if (found := stand_in_of(head)) is not None:
         return found
@@ -81,7 +81,7 @@ def _file(path: Path) -> tuple[str, str] | None:
     if head[8:9] == b"{":
         return _safetensors(path)
     if head.startswith(b"\x80"):
-        with path.open("rb") as file:
+        with open_regular(path) as file:
             return _pickle(path, file.read(MAX_PICKLE_BYTES))
     if path.suffix == ".onnx":
         return "an ONNX model", f"fly it with --policy onnx:{path}"
@@ -194,7 +194,7 @@ def _globals_of(content: bytes) -> tuple[list[tuple[str, str]], bool]:
 
 
 def _safetensors(path: Path) -> tuple[str, str] | None:
-    with path.open("rb") as file:
+    with open_regular(path) as file:
         (length,) = struct.unpack("<Q", file.read(8))
         text = file.read(min(length, MAX_HEADER_BYTES))
     try:

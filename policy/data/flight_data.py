@@ -86,6 +86,8 @@ class FlightData:
     decode: Callable[[], Iterator[ImageArray]]
     """Yields the images [H, W, 3] uint8 RGB in the order of ``captured_ns``; may stop early."""
     terms: ActionTerms = STICK_TERMS
+    damage: tuple[str, ...] = ()
+    """What of its files was skipped, in sentences for the user."""
 
     def __post_init__(self) -> None:
         """Refuse what would train a net on nonsense."""

@@ -9,7 +9,6 @@ from typing import Any
 import av
 import numpy as np
 import pyarrow as pa
-import pyarrow.parquet as pq
 from numpy.typing import NDArray
 
 from policy.contract import ACTION_DIM, STATE_DIM, Contract, FloatArray
@@ -21,8 +20,9 @@ from policy.data.flight_data import (
     ImageArray,
     Nanoseconds,
 )
-from policy.data.tables import file_digest, parse_state_frame, read_json, stamps, vectors
-from policy.files import library_name, why_unreadable
+from policy.data.flight_video import decode_images, video_parts, with_images
+from policy.data.tables import file_digest, parse_state_frame, read_json, read_rows, stamps, vectors
+from policy.files import why_unreadable
 from policy.stick_loop import StickLoop, rates_contract
 
 FORMAT, VERSION = "mavbridge-flight", 1
@@ -125,11 +125,21 @@ def read_flight(folder: Path) -> FlightData:
         parse_state_frame(name, contract.get("state_frame")),
         _terms(name, contract),
     )
-    ticks = _read_table(folder, "ticks", _TICK_COLUMNS)
-    frames = _read_table(folder, "frames", _FRAME_COLUMNS)
+    damage: list[str] = []
+    ticks, _ = _read_table(folder, "ticks", _TICK_COLUMNS, damage)
+    frames, numbers = _read_table(folder, "frames", _FRAME_COLUMNS, damage)
     video = folder / VIDEO
     if not video.is_file() or frames.num_rows == 0:
         raise DatasetError(f"{folder}: no frames: record the flight with its camera")
+    try:
+        places, more = with_images(
+            video, numbers, is_whole=_read_meta(folder).get("finished") is True
+        )
+    except OSError as error:
+        raise DatasetError(why_unreadable(video, error)) from error
+    if not len(places):
+        raise DatasetError(why_unreadable(video, ValueError("there is no whole image in it")))
+    frames, numbers, damage = frames.take(places), numbers[places], [*damage, *more]
     tick_ns, sent_ns = stamps(name, ticks, "woke_ns"), stamps(name, ticks, "sent_ns")
     state = vectors(name, ticks, "state", STATE_DIM)
     sent = _sent(name, ticks, terms)
@@ -163,7 +173,8 @@ def read_flight(folder: Path) -> FlightData:
         captured_ns=stamps(name, frames, "captured_ns"),
         gate=_gates(name, frames),
         fingerprint=file_digest(video),
-        decode=partial(decode_video, video),
+        decode=partial(decode_video, video, numbers),
+        damage=tuple(damage),
     )
 
 
@@ -187,36 +198,30 @@ def read_ages(folder: Path) -> Nanoseconds:
         DatasetError: not a flight, or no policy looked in it.
     """
     parse_state_frame(str(folder), _contract(folder).get("state_frame"))
-    ages = _ages(_read_table(folder, "ticks", ("woke_ns", "feature_captured_ns")))
+    ages = _ages(_read_table(folder, "ticks", ("woke_ns", "feature_captured_ns"), [])[0])
     if not (ages > 0).any():
         raise DatasetError(f"{folder}: no image had an age in it: no policy looked at its camera")
     return np.sort(ages[ages > 0])
 
 
-def decode_video(path: Path) -> Iterator[ImageArray]:
-    """Yield the frames [H, W, 3] RGB of a video, as far as it is readable.
+def decode_video(path: Path, numbers: NDArray[np.int64]) -> Iterator[ImageArray]:
+    """Yield the images of these numbers of a flight's video, [H, W, 3] RGB.
 
     Raises:
-        DatasetError: no video at all, or one of depth.
+        DatasetError: one of them cannot be decoded, or they are depth.
     """
+    count = 0
     try:
-        container = av.open(library_name(path), format="mp4")  # a playlist would name other files
-    except (av.FFmpegError, OSError) as error:
-        raise DatasetError(why_unreadable(path, error)) from error
-    with container:
-        if not container.streams.video:
-            raise DatasetError(f"{path}: there is no video in it")
-        frames = container.decode(video=0)
-        while True:
-            try:
-                frame = next(frames, None)
-            except av.FFmpegError:
-                return  # cut short by a crash: what came before it counts
-            if frame is None:
-                return
-            if frame.format.name.startswith("gray16"):
+        for image in decode_images(path, video_parts(path), numbers.tolist()):
+            if image.ndim == 2:
                 raise DatasetError(f"{path} holds depth: training and export take RGB images")
-            yield frame.to_ndarray(format="rgb24").astype(np.uint8, copy=False)
+            yield np.asarray(image, np.uint8)
+            count += 1
+    except (av.FFmpegError, OSError, ValueError) as error:
+        raise DatasetError(
+            f"{why_unreadable(path, error)}; {count} of its {len(numbers)} images came before the "
+            "damage: leave this flight out if there is no other copy"
+        ) from error
 
 
 def _read_meta(folder: Path) -> dict[str, object]:
@@ -260,33 +265,22 @@ def _terms(name: str, contract: Mapping[str, Any]) -> ActionTerms:
     return ActionTerms(action, float(hover), None if tilt is None else float(tilt))
 
 
-def _read_table(folder: Path, stem: str, columns: tuple[str, ...]) -> pa.Table:
-    parquet, stream = folder / f"{stem}.parquet", folder / f"{stem}.arrows"
+def _read_table(
+    folder: Path, stem: str, columns: tuple[str, ...], damage: list[str]
+) -> tuple[pa.Table, NDArray[np.int64]]:
     try:
-        if parquet.is_file():
-            table = pq.read_table(library_name(parquet))
-        elif stream.is_file():
-            table = _read_stream(stream)
-        else:
-            raise DatasetError(f"{folder}: neither {parquet.name} nor {stream.name} is there")
+        table, numbers = read_rows(folder / stem, damage)
+    except FileNotFoundError as error:
+        raise DatasetError(
+            f"{folder}: neither {stem}.parquet nor {stem}.arrows is there"
+        ) from error
     except (pa.ArrowException, OSError) as error:
         raise DatasetError(f"{folder}: {stem} cannot be read: {error}") from error
     if missing := [name for name in columns if name not in table.column_names]:
         raise DatasetError(f"{folder}: {stem} lacks {missing}; it has {table.column_names}")
     if table.num_rows == 0 and stem == "ticks":
         raise DatasetError(f"{folder}: no ticks: nothing was flown")
-    return table
-
-
-def _read_stream(path: Path) -> pa.Table:
-    """An Arrow stream up to its last whole batch."""
-    batches = []
-    with pa.OSFile(str(path)) as file, pa.ipc.open_stream(file) as reader:
-        while True:
-            try:
-                batches.append(reader.read_next_batch())
-            except (StopIteration, pa.ArrowInvalid, OSError):
-                return pa.Table.from_batches(batches, schema=reader.schema)
+    return table, numbers
 
 
 def _stamps_or(

@@ -6,10 +6,16 @@ from typing import Any, cast, get_args
 
 import numpy as np
 import pyarrow as pa
+import pyarrow.parquet as pq
+from numpy.typing import NDArray
 
 from policy import files
 from policy.contract import FloatArray, StateFrame
 from policy.data.flight_data import DatasetError, Nanoseconds
+from policy.files import library_name
+
+MAX_ROWS = 10_000_000
+"""A day at 100 Hz, and more: a small file can claim many more rows, and fill the memory."""
 
 
 def read_json(path: Path, kind: str) -> Any:
@@ -64,6 +70,64 @@ def vectors(name: str, table: pa.Table, column: str, width: int) -> FloatArray:
     out = np.full((table.num_rows, width), np.nan, dtype=np.float32)
     out[valid] = rows
     return out
+
+
+def read_rows(stem: Path, damage: list[str]) -> tuple[pa.Table, NDArray[np.int64]]:
+    """Read a table of a flight, finished or not; a sentence on what is lost goes to ``damage``.
+
+    Returns:
+        The rows that can be read, and their numbers; of a file that is empty, no columns.
+
+    Raises:
+        DatasetError: it has more rows than a flight.
+        OSError, pa.ArrowException: there is no such table, or nothing of it can be read.
+    """
+    parquet = stem.with_suffix(".parquet")
+    if parquet.exists():
+        return _read_groups(parquet, damage)
+    stream = stem.with_suffix(".arrows")
+    batches, end, size = [], 0, stream.stat().st_size
+    if size == 0:  # killed before the first batch
+        return pa.table({}), np.zeros(0, np.int64)
+    with stream.open("rb") as file, pa.ipc.open_stream(file) as reader:
+        try:
+            while True:
+                end = file.tell()
+                batches.append(reader.read_next_batch())
+        except StopIteration:
+            end = size
+        except (pa.ArrowException, OSError):
+            damage.append(
+                f"{stream} is damaged or cut off: its last {size - end} bytes were skipped"
+            )
+        table = pa.Table.from_batches(batches, schema=reader.schema)
+    return table, np.arange(table.num_rows)
+
+
+def _read_groups(path: Path, damage: list[str]) -> tuple[pa.Table, NDArray[np.int64]]:
+    """Read the row groups of a Parquet file that are not damaged."""
+    groups, numbers, count = [], [np.zeros(0, np.int64)], 0
+    failure: Exception | None = None
+    with pq.ParquetFile(library_name(path), page_checksum_verification=True) as file:
+        if file.metadata.num_rows > MAX_ROWS:
+            rows = file.metadata.num_rows
+            raise DatasetError(f"{path} has {rows} rows, more rows than a flight has")
+        schema = file.schema_arrow
+        for index in range(file.num_row_groups):
+            rows = file.metadata.row_group(index).num_rows
+            try:
+                groups.append(file.read_row_group(index))
+                numbers.append(np.arange(count, count + groups[-1].num_rows))
+            except (pa.ArrowException, OSError) as error:
+                failure = error
+            count += rows
+    if failure is not None:
+        if not groups:
+            raise failure
+        lost = count - sum(map(len, numbers))
+        damage.append(f"{path} is damaged: {lost} of {count} rows were skipped")
+    table = pa.concat_tables(groups) if groups else schema.empty_table()
+    return table, np.concatenate(numbers)
 
 
 def file_digest(path: Path) -> str:

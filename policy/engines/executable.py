@@ -175,8 +175,9 @@ def _try(executable: Executable) -> None:
         encoded = encode_all(executable, images)
         chunk = executable.act(encoded, state, history)
     except PolicyError as error:
+        told = str(error) if executable.name in str(error) else f"{executable.name}: {error}"
         raise PolicyError(
-            f"{error}; this was a dummy sample: image {[1, *contract.image_shape]}, state "
+            f"{told}; this was a dummy sample: image {[1, *contract.image_shape]}, state "
             f"{[1, *contract.state_shape]}, action_history [1, {contract.history_len}, "
             f"{ACTION_DIM}], as {contract.arrays} arrays"
         ) from error

@@ -34,7 +34,7 @@ from typing import Any, TypeVar, cast
 import numpy as np
 
 from policy.contract import ACTION_DIM, ACTION_NAMES, Contract
-from policy.errors import ContractError
+from policy.errors import ContractError, PolicyError
 from policy.files import read_toml
 from policy.foreign.state import DERIVED_NAMES, state_values
 
@@ -144,6 +144,11 @@ class Interface:
     def to_actions(self, actions: ArrayOrTensor) -> ArrayOrTensor:
         """The policy's actions [..., 4] -> the contract's [..., 4], arrays or tensors."""
         values: Any = actions
+        if values.shape[-1] != ACTION_DIM:
+            raise PolicyError(
+                f"its chunk is {list(values.shape)}, and its last axis must be the {ACTION_DIM} "
+                "numbers of an action"
+            )
         scale, offset = self._action_units(actions)
         return cast(ArrayOrTensor, _columns(values * scale + offset, self.action_columns))
 

@@ -137,6 +137,9 @@ class TrainingRun(ABC, Generic[M, B]):
             progress=lambda fraction: self._report_work(f"decoding, {fraction:.0%}"),
         )
         whole = [f.first_frames(n) for f, n in zip(flights, store.counts, strict=True)]
+        for flight, count in zip(flights, store.counts, strict=True):
+            if lost := len(flight.captured_ns) - count:
+                self.note(f"{flight.name}: {lost} images are missing at the end of its video")
         kept, held = hold_out(whole, self.settings.validation_fraction, self.settings.seed)
         return whole, store, kept, held
 

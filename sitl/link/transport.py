@@ -10,7 +10,8 @@ from typing import NamedTuple, TypeAlias
 from sitl import UsageError
 from sitl.clock import NS_PER_S, Clock, monotonic_from_wall_ns
 
-Address: TypeAlias = tuple[str, int]
+Address: TypeAlias = tuple[str, int, *tuple[int, ...]]
+"""Host and port as numbers, as the ``socket`` module has them: IPv6 adds flow and scope."""
 
 VEHICLE_KINDS = ("udpout", "udpin", "tcpin")  # links of a vehicle
 FOLLOWER_KINDS = ("udp", "udpin", "udpout", "tcp")  # links to another vehicle; ``udp`` is ``udpin``
@@ -37,7 +38,8 @@ class Received(NamedTuple):
 
 
 def open_transport(url: str, clock: Clock, kinds: tuple[str, ...] = VEHICLE_KINDS) -> "Transport":
-    """Open a link by its name, KIND:HOST:PORT, or KIND://HOST:PORT as MAVSDK writes it.
+    """Open a link by its name, KIND:HOST:PORT, or KIND://HOST:PORT as MAVSDK writes it; an IPv6
+    host in brackets.
 
     ``udpout`` sends there first; ``udpin`` listens and answers everybody it has heard; ``tcpin``
     serves clients, together or one after another; ``tcp`` connects whenever there is something to
@@ -50,20 +52,32 @@ def open_transport(url: str, clock: Clock, kinds: tuple[str, ...] = VEHICLE_KIND
     host, _, port_text = rest.removeprefix("//").rpartition(":")
     if kind == "udpin" and rest.startswith("//:"):
         host = "127.0.0.1"
-    if kind not in kinds or not host or not port_text.isdecimal():
+    is_bare = ":" in host and not (host.startswith("[") and host.endswith("]"))
+    if kind not in kinds or not host or is_bare or not port_text.isdecimal():
         wanted = ", ".join(f"{kind}:HOST:PORT" for kind in kinds)
         raise UsageError(f"link {url!r}: expected one of {wanted}")
     port = int(port_text)
     if not 0 < port < 65536:
         raise UsageError(f"link {url!r}: port {port} is not within 1..65535")
     try:
-        address = (socket.gethostbyname(host), port)
+        address = _resolve(host.strip("[]"), port)
         if kind.startswith("tcp"):
             return TcpLink(address, clock, listen=kind == "tcpin")
         return UdpLink(address, clock, listen=kind != "udpout")
     except OSError as error:
         reason = "already in use" if error.errno == errno.EADDRINUSE else error.strerror or error
         raise UsageError(f"link {url!r}: {reason}") from error
+
+
+def _resolve(host: str, port: int) -> Address:
+    """Look a host up, IPv4 first where it has both."""
+    found = [entry[4] for entry in socket.getaddrinfo(host, port, type=socket.SOCK_DGRAM)]
+    number, port_number, *scope = min(found, key=len)
+    return (str(number), int(port_number), *tuple(int(part) for part in scope))
+
+
+def _family(address: Address) -> socket.AddressFamily:
+    return socket.AF_INET if len(address) == 2 else socket.AF_INET6
 
 
 class UdpLink:
@@ -73,7 +87,7 @@ class UdpLink:
         self._clock = clock
         self._listen = listen
         self._peers: list[Address] = [] if listen else [address]
-        self._socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+        self._socket = socket.socket(_family(address), socket.SOCK_DGRAM)
         try:
             if listen:
                 self._socket.bind(address)
@@ -130,7 +144,7 @@ class TcpLink:
         self._clock = clock
         self._address = address
         self._connections: list[socket.socket] = []
-        self._server = socket.create_server(address) if listen else None
+        self._server = socket.create_server(address, family=_family(address)) if listen else None
         if self._server is not None:
             self._server.setblocking(False)
 
@@ -159,7 +173,7 @@ class TcpLink:
             return
         if self._server is None and not self._connections:
             try:
-                self._add(socket.create_connection(self._address, CONNECT_TIMEOUT_S))
+                self._add(socket.create_connection(self._address[:2], CONNECT_TIMEOUT_S))
             except OSError:
                 return
         for connection in tuple(self._connections):

@@ -10,24 +10,36 @@ from mavbridge.core.address import (
     SerialAddress,
     TcpAddress,
     UdpAddress,
+    host_port,
+    is_reachable,
     parse_address,
+    resolve,
     serial_baud,
+    spelled,
 )
 from mavbridge.core.errors import UserError
 
 HOSTS = st.one_of(
     st.ip_addresses(v=4).map(str), st.from_regex(r"[a-z][a-z0-9.-]{0,20}[a-z0-9]", fullmatch=True)
 ).filter(lambda host: host not in ("udp", "tcp", "udpin", "udpout", "tcpout"))
+IPV6_HOSTS = st.builds(
+    lambda number, zone: f"{number}{zone}",
+    st.ip_addresses(v=6),
+    st.sampled_from(["", "%eth0", "%2"]),
+)
 PORTS = st.integers(1, 65535)
 DEVICES = st.from_regex(
     r"/dev/[A-Za-z][A-Za-z0-9._-]{0,12}(/[A-Za-z0-9._:-]{1,12})?", fullmatch=True
 )
 
 
-@given(HOSTS, PORTS)
-def test_both_spellings_of_a_network_address_are_one(host: str, port: int) -> None:
+@given(st.one_of(HOSTS, IPV6_HOSTS), PORTS)
+def test_both_spellings_of_a_network_address_are_one(bare: str, port: int) -> None:
+    host = f"[{bare}]" if ":" in bare else bare
+    assert spelled(bare, port) == f"{host}:{port}"
+    assert host_port(f"{host}:{port}") == (bare, port)
     for kind, listens in (("udp", True), ("udpin", True), ("udpout", False)):
-        expected = UdpAddress(host, port, listens)
+        expected = UdpAddress(bare, port, listens)
         for spec in (
             f"{kind}:{host}:{port}",
             f"{kind}://{host}:{port}",
@@ -35,8 +47,8 @@ def test_both_spellings_of_a_network_address_are_one(host: str, port: int) -> No
         ):
             assert parse_address(spec) == expected
     for spec in (f"tcp:{host}:{port}", f"tcp://{host}:{port}", f"tcpout://{host}:{port}"):
-        assert parse_address(spec) == TcpAddress(host, port)
-    assert parse_address(f"{host}:{port}") == UdpAddress(host, port, True)
+        assert parse_address(spec) == TcpAddress(bare, port)
+    assert parse_address(f"{host}:{port}") == UdpAddress(bare, port, True)
 
 
 @given(DEVICES.filter(lambda name: not name.rpartition(":")[2].isdigit()), st.integers(1, 10**7))
@@ -67,6 +79,11 @@ def test_whatever_is_written_is_an_address_or_told_the_forms(text: str) -> None:
     [
         ("udp://:14540", UdpAddress("127.0.0.1", 14540, True)),
         ("udpin://:14540", UdpAddress("127.0.0.1", 14540, True)),
+        ("[::1]:14550", UdpAddress("::1", 14550, True)),
+        ("udp:[fe80::1%lo]:14550", UdpAddress("fe80::1%lo", 14550, True)),
+        ("udpin://[::]:14540", UdpAddress("::", 14540, True)),
+        ("udpout:[::ffff:10.0.0.2]:14550", UdpAddress("::ffff:10.0.0.2", 14550, False)),
+        ("tcpout://[2001:db8::1]:5760/", TcpAddress("2001:db8::1", 5760)),
         ("COM3,115200", SerialAddress("COM3", 115200)),
         ("COM3:115200", SerialAddress("COM3", 115200)),
         (
@@ -87,6 +104,11 @@ def test_special_spellings(spec: str, expected: LinkAddress) -> None:
         ("udp:14550", "not understood"),
         ("udp:host:70000", "not understood"),
         ("//host:14550", "not understood"),
+        ("udp:::1:14550", r"brackets, as in udp:\[::1\]:14550"),
+        ("tcp:2001:db8::1:5760", "brackets"),
+        ("udp:[::1]", "not understood"),
+        ("udp:[host]:14550", "not understood"),
+        ("udp:[::1:14550", "not understood"),
         ("/dev/ttyACM0,fast", "not a baud rate"),
         ("/dev/ttyACM0,0", "not a baud rate"),
         ("http://host:80", "not understood"),
@@ -95,3 +117,29 @@ def test_special_spellings(spec: str, expected: LinkAddress) -> None:
 def test_what_is_none_of_them_is_refused(spec: str, told: str) -> None:
     with pytest.raises(UserError, match=told):
         parse_address(spec)
+
+
+@pytest.mark.parametrize(
+    ("host", "address", "shown"),
+    [
+        ("127.0.0.1", ("127.0.0.1", 14550), "127.0.0.1:14550"),
+        ("::1", ("::1", 14550, 0, 0), "[::1]:14550"),
+        ("fe80::1%1", ("fe80::1", 14550, 0, 1), "[fe80::1%1]:14550"),
+    ],
+)
+def test_numbers_of_a_host(host: str, address: tuple[str, int], shown: str) -> None:
+    assert resolve(host, 14550) == address
+    assert spelled(*address) == shown
+
+
+def test_a_name_with_both_kinds_of_address_is_the_older_kind() -> None:
+    """``localhost`` stays 127.0.0.1, where simulators listen."""
+    assert resolve("localhost", 14550) == ("127.0.0.1", 14550)
+
+
+@pytest.mark.parametrize(
+    ("spec", "expected"),
+    [("udp:[::1]:14550", False), ("udp:[::]:14550", True), ("udpout:[fe80::1%lo]:14550", True)],
+)
+def test_who_else_can_send_to_it(spec: str, expected: bool) -> None:
+    assert is_reachable(spec) is expected

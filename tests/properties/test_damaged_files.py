@@ -23,9 +23,9 @@ from mavbridge.camera.shared_memory import HEADER, MAGIC, SharedMemoryCamera
 from mavbridge.commands.inspect.analysis import analyse
 from mavbridge.core.errors import MavbridgeError
 from mavbridge.recording.flight_folder import open_flight
-from mavbridge.recording.tables import MAX_ROWS
 from mavbridge.simulation.replay.recording import open_source
 from policy.checkpoints.header import read_contract
+from policy.data.tables import MAX_ROWS
 from policy.errors import PolicyError
 from policy.foreign.interface import read_interface
 from sitl.camera.shm import FramePublisher

@@ -129,7 +129,8 @@ def _time_rows(stats: LinkStats) -> Iterator[Row]:
         "go" if stats.is_timesync_good else "warn",
         ""
         if stats.is_timesync_good
-        else "the vehicle's stamps cannot be trusted: ages count from arrival, which hides delay",
+        else stats.slow_clock
+        or "the vehicle's stamps cannot be trusted: ages count from arrival, which hides delay",
     )
 
 

@@ -5,6 +5,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Literal, TypeAlias, TypedDict
 
+from mavbridge.core.provenance import without_secrets
+
 Area: TypeAlias = Literal["link", "vehicle", "parameters", "camera", "policy", "computer"]
 Verdict: TypeAlias = Literal["go", "warn", "no-go"]
 _FLAG = re.compile(r"--set [A-Z0-9_]+=-?\d+(?:\.\d+)?|--source-system \d+|ulimit -\w \w+")
@@ -21,6 +23,11 @@ class Row:
     verdict: Verdict = "go"
     advice: str = ""
     """The reason for a warning or a no-go, and what to do; empty for a go."""
+
+    def __post_init__(self) -> None:
+        """Hide the passwords of addresses, for the table and the JSON."""
+        for name in ("found", "expected", "advice"):
+            object.__setattr__(self, name, without_secrets(getattr(self, name)))
 
     @property
     def commands(self) -> tuple[str, ...]:

@@ -65,6 +65,8 @@ def export(flights: Sequence[Path], config: ExportConfig) -> int:
         episodes = []
         for flight in exemplary:
             episodes.append(read_flight(flight))
+            for text in episodes[-1].damage:
+                console.print(f"warning: {text}", soft_wrap=True)
             advance(reading)
         frames = sum(len(episode.captured_ns) for episode in episodes)
         writing = progress.add_task("writing frames", total=frames)

@@ -49,6 +49,8 @@ def imagine(config: ImagineConfig) -> int:
     )
     prepare_out(config.out)
     flight = open_flight(config.start)
+    for text in flight.damage:
+        console.print(f"warning: {text}", soft_wrap=True)
     model = load_model(config.world_model, ddim_steps=plan.ddim_steps, device=config.policy.device)
     if plan.frames > model.config.frames:
         flag = "--frames" if config.frames else "--exe-steps"

@@ -59,6 +59,8 @@ class FlightAnalysis:
     """Missed slots and late chunks, each with its cause, in the order of time."""
     moments: tuple[Moment, ...]
     """The ten worst, the worst one first."""
+    damage: tuple[str, ...]
+    """What of the recording was skipped, in sentences for the user."""
 
     @property
     def images(self) -> Images:
@@ -84,13 +86,14 @@ def analyse(folder: Path, *, gates: Path | None = None) -> FlightAnalysis:
     _require_sound(flight)
     ticks = [row.tick for row in flight.tick_rows()]
     frames = list(flight.frame_rows())
+    damage = list(flight.damage)
     series = make_series(flight, ticks)
     stick_hz = _stick_hz(ticks, flight.meta)
     delays = find_delays(
         ticks,
         stick_hz=stick_hz,
         action_hz=flight.meta.action_hz,
-        arrivals=read_arrivals(folder),
+        arrivals=read_arrivals(folder, damage),
     )
     limits = flown_limits(folder, flight.meta.contract)
     return FlightAnalysis(
@@ -99,12 +102,13 @@ def analyse(folder: Path, *, gates: Path | None = None) -> FlightAnalysis:
         stick_hz=stick_hz,
         report=_report(flight, ticks, frames, stick_hz),
         series=series,
-        cameras=tuple(_cameras(flight, frames, series.start_ns)),
-        track=read_track(flight, series, frames),
+        cameras=tuple(_cameras(flight, frames, series.start_ns, damage)),
+        track=read_track(flight, series, frames, damage),
         gates=course_gates(flight.meta.course_seed) if gates is None else read_gates(gates),
         holders=holder_spans(ticks, series.start_ns),
         delays=delays,
         moments=worst_moments(flight, ticks, frames, delays, limits),
+        damage=tuple(dict.fromkeys(damage)),
     )
 
 
@@ -185,12 +189,15 @@ def _vision(frames: Sequence[FrameRow], visual_hz: float) -> VisionReport:
     )
 
 
-def _cameras(flight: RecordedFlight, frames: Sequence[FrameRow], start_ns: int) -> Iterator[Images]:
+def _cameras(
+    flight: RecordedFlight, frames: Sequence[FrameRow], start_ns: int, damage: list[str]
+) -> Iterator[Images]:
     contract = flight.meta.contract
     names = ("front",) if contract is None else contract.cameras
     yield _images(names[0], flight, frames, start_ns)
     for name in names[1:]:
         other = open_flight(flight.folder, name)
+        damage += other.damage
         yield _images(name, other, list(other.frame_rows()), start_ns)
 
 

@@ -86,6 +86,8 @@ def _facts(flight: FlightAnalysis) -> Iterator[tuple[str, str, bool]]:
         yield "outcome", describe(meta.outcome), meta.success is False
     if not meta.finished:
         yield "recording", "cut off: shown up to its last whole batch of rows", True
+    for text in flight.damage:
+        yield "damage", text, True
     if meta.gates_passed is not None:
         yield "course", f"{meta.gates_passed} gates passed", meta.success is False
     missed = (

@@ -64,6 +64,7 @@ def to_json(analyses: Sequence[FlightAnalysis]) -> str:
     documents = [
         {
             "folder": str(flight.folder),
+            "damage": flight.damage,
             "stick_hz": flight.stick_hz,
             "report": asdict(flight.report),
             "image_latency_ms": {

@@ -32,15 +32,17 @@ def flown_limits(folder: Path, contract: Contract | None) -> FreshnessLimits | N
         return effective_freshness(contract, Limits())
 
 
-def read_arrivals(folder: Path) -> Arrivals | None:
+def read_arrivals(folder: Path, damage: list[str]) -> Arrivals | None:
     """Attitudes that reached the flight process; None where the recording has no such table.
+
+    A sentence on what is lost is added to ``damage``.
 
     Raises:
         MavbridgeError: the table is damaged.
     """
     if not _has(folder, PACKETS):
         return None
-    table = read_table(folder / PACKETS, replay_rows.PACKETS)
+    table = read_table(folder / PACKETS, replay_rows.PACKETS, damage=damage)
     columns = {name: table.column(name).to_numpy() for name in table.column_names}
     rows = np.flatnonzero(np.isin(columns["message_id"], ATTITUDES))
     if not len(rows):

@@ -41,6 +41,7 @@ def print_flight(flight: FlightAnalysis, console: Console) -> None:
     """Everything about one flight."""
     for line in _facts(flight):
         console.print(line)
+    print_damage(flight, console)
     if (table := timing_table(flight.report)) is not None:
         console.print(table)
     for line in _pilot_lines(flight) if flight.meta.source == "pilot" else verdicts(flight.report):
@@ -55,6 +56,12 @@ def print_flight(flight: FlightAnalysis, console: Console) -> None:
         console.print(Text.assemble(("causes   ", "bold"), (causes, "yellow")))
     console.print(_holders_table(flight))
     console.print(_moments_table(flight))
+
+
+def print_damage(flight: FlightAnalysis, console: Console) -> None:
+    """Say what of the recording was skipped."""
+    for text in flight.damage:
+        console.print(Text.assemble(("damage   ", "bold"), (text, "red")))
 
 
 def _facts(flight: FlightAnalysis) -> Iterator[Text]:
@@ -158,6 +165,8 @@ def print_comparison(flights: Sequence[FlightAnalysis], console: Console) -> Non
             _difference(figure, one_value, other_value),
         )
     console.print(table)
+    for flight in flights:
+        print_damage(flight, console)
 
 
 def _names(first: FlightAnalysis, second: FlightAnalysis) -> tuple[str, str]:

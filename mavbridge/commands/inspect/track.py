@@ -13,7 +13,7 @@ from mavbridge.core.course import CourseGate
 from mavbridge.core.records import Position
 from mavbridge.mavlink.codec.messages import LocalVelocity
 from mavbridge.mavlink.codec.packets import Codec
-from mavbridge.mavlink.codec.tlog import read_tlog
+from mavbridge.mavlink.codec.tlog import Skipped, read_tlog
 from mavbridge.recording.flight_folder import RecordedFlight
 from mavbridge.recording.folder import TLOG
 from mavbridge.recording.rows import FrameRow
@@ -42,8 +42,13 @@ def course_gates(seed: int | None) -> tuple[CourseGate, ...]:
     )
 
 
-def read_track(flight: RecordedFlight, series: Series, frames: Sequence[FrameRow]) -> Track | None:
-    """The simulator's truth, else the positions in the ticks, else those in the telemetry log."""
+def read_track(
+    flight: RecordedFlight, series: Series, frames: Sequence[FrameRow], damage: list[str]
+) -> Track | None:
+    """The simulator's truth, else the positions in the ticks, else those in the telemetry log.
+
+    A sentence on what of the log is lost is added to ``damage``.
+    """
     rows = [
         ((frame.captured_ns - series.start_ns) / NS_PER_S, frame.truth.position_ned_m)
         for frame in frames
@@ -58,7 +63,7 @@ def read_track(flight: RecordedFlight, series: Series, frames: Sequence[FrameRow
             position_ned_m=series.position_ned_m[known],
             source="estimator",
         )
-    rows = list(_logged_positions(flight, series.start_ns))
+    rows = list(_logged_positions(flight, series.start_ns, damage))
     return _track(rows, "estimator") if rows else None
 
 
@@ -71,7 +76,7 @@ def _track(
 
 
 def _logged_positions(
-    flight: RecordedFlight, start_ns: int
+    flight: RecordedFlight, start_ns: int, damage: list[str]
 ) -> Iterator[tuple[float, tuple[float, float, float]]]:
     """Positions in ``link.tlog``; none where there is no such file."""
     codec = Codec(source_system=0, source_component=0)
@@ -79,10 +84,12 @@ def _logged_positions(
     offset_ns = flight.meta.start_ns - unix_start_ns
     if not (flight.folder / TLOG).is_file():
         return
-    for stamp_us, packet in read_tlog(flight.folder / TLOG):
+    path, skipped = flight.folder / TLOG, Skipped()
+    for stamp_us, packet in read_tlog(path, skipped):
         for message in codec.decode_datagram(packet.data):
             body = message.body
             if isinstance(body, LocalVelocity) and body.position_ned_m is not None:
                 at_ns = stamp_us * 1000 + offset_ns
                 if at_ns >= start_ns:
                     yield (at_ns - start_ns) / NS_PER_S, body.position_ned_m
+    damage += filter(None, [skipped.describe(path)])

@@ -51,7 +51,7 @@ def replay_log(path: Path, flight: FlyConfig, config: ReplayConfig) -> int:
         policy=executable.name,
         engine=executable.engine,
         actions=actions,
-        notes=(*([replay.note] if replay.note else []), *refused),
+        notes=(*filter(None, (log.damage, video.damage, replay.note)), *refused),
     )
     return _show(result, config)
 

@@ -88,6 +88,10 @@ def replay(folder: Path, config: ReplayConfig) -> int:
         traces = gate_traces(steps)
     else:
         traces = _other_traces(flown, executable, steps, chunks)
+    if chosen == "video":
+        names = (None, *source.contract.cameras[1:])
+        damage = [text for name in names for text in open_flight(folder, name).damage]
+        source = replace(source, gaps=tuple(dict.fromkeys((*source.gaps, *damage))))
     result = ReplayResult(
         source=source,
         chosen=chosen,

@@ -23,6 +23,7 @@ class ServeConfig:
 
     def __post_init__(self) -> None:
         """Refuse what cannot be served."""
+        object.__setattr__(self, "host", self.host.removeprefix("[").removesuffix("]"))
         check_range("port", self.port, 1, 65535, "")
         if self.policy.dual_rate:
             raise UserError("each request is answered from its own image: leave out --dual-rate")

@@ -14,6 +14,7 @@ from rich.text import Text
 from mavbridge.commands.serve.answers import AnswerLoop
 from mavbridge.commands.serve.config import ServeConfig
 from mavbridge.commands.serve.server import PolicyServer
+from mavbridge.core.address import spelled
 from mavbridge.core.clock import MonotonicClock
 from mavbridge.core.workers import Worker
 from mavbridge.flight.policies import check_configured_policy, load_configured_policy
@@ -89,8 +90,7 @@ def _warnings(config: ServeConfig) -> list[str]:
 
 
 def _url(config: ServeConfig) -> str:
-    host = f"[{config.host}]" if ":" in config.host else config.host
-    return f"ws://{host}:{config.port}"
+    return f"ws://{spelled(config.host, config.port)}"
 
 
 def _image_bytes(contract: Contract) -> int:

@@ -13,6 +13,7 @@ from websockets.frames import CloseCode
 from websockets.http11 import Request, Response
 
 from mavbridge.commands.serve.answers import AnswerLoop
+from mavbridge.core.address import spelled
 from mavbridge.core.errors import UserError
 
 SPARE_BYTES = 2**20
@@ -131,4 +132,4 @@ class PolicyServer:
 
 def _name(connection: ServerConnection) -> str:
     address = connection.remote_address
-    return f"client {address[0]}:{address[1]}" if address else "a client"
+    return f"client {spelled(*address)}" if address else "a client"

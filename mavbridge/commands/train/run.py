@@ -151,4 +151,6 @@ def _read_flights(paths: Sequence[Path], settings: RunSettings) -> list[FlightDa
     if note is not None:
         Console(stderr=True, highlight=False).print(note, soft_wrap=True)
     flights = [read_flight(folder) for folder in folders]
+    for text in (text for flight in flights for text in flight.damage):
+        Console(stderr=True, highlight=False).print(f"warning: {text}", soft_wrap=True)
     return flights + [flight for path in datasets for flight in read_dataset(path, camera_key)]

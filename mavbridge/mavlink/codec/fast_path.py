@@ -68,6 +68,10 @@ _MISSING_LAYOUTS = {
 layouts as in common.xml, whose fields go by falling size on the wire."""
 MISSING_IDS = {layout.name: number for number, layout in _MISSING_LAYOUTS.items()}
 _LAYOUTS |= _MISSING_LAYOUTS
+CRC_EXTRA: dict[int, int] = {
+    number: message.crc_extra for number, message in dialect.mavlink_map.items()
+} | {number: layout.crc_extra for number, layout in _LAYOUTS.items()}
+"""Seed of each message's checksum, by the number of the message."""
 
 
 def decode_state_packet(data: bytes) -> ReceivedMessage | None:

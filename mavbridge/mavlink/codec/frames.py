@@ -1,5 +1,6 @@
 """Cuts datagrams into MAVLink packets without decoding them."""
 
+from mmap import mmap
 from typing import NamedTuple
 
 from mavbridge.mavlink.codec.messages import Endpoint
@@ -18,6 +19,17 @@ class RawPacket(NamedTuple):
     payload: bytes
     """Without the zeros that MAVLink 2 cuts off its end."""
 
+    @property
+    def sequence(self) -> int:
+        """The sender's number of the packet, 0 to 255."""
+        return self.data[2 if self.data[0] == _V1 else 4]
+
+    @property
+    def sealed(self) -> tuple[bytes, bytes]:
+        """The bytes that the checksum is about, and the checksum as it came."""
+        end = (_V1_HEADER if self.data[0] == _V1 else _V2_HEADER) + len(self.payload)
+        return self.data[1:end], self.data[end : end + _CHECKSUM]
+
 
 def split_frames(data: bytes) -> tuple[list[RawPacket], bool]:
     """The packets of a datagram, and whether bytes were left over that are none."""
@@ -32,7 +44,7 @@ def split_frames(data: bytes) -> tuple[list[RawPacket], bool]:
     return frames, False
 
 
-def frame_at(data: bytes, at: int) -> RawPacket | None:
+def frame_at(data: bytes | mmap, at: int) -> RawPacket | None:
     """The packet that begins at this place; None if there is none, or not a whole one."""
     if at >= len(data):
         return None

@@ -5,7 +5,13 @@ from typing import NamedTuple
 
 from pymavlink.dialects.v20 import ardupilotmega as dialect
 
-from mavbridge.core.address import LinkAddress, SerialAddress, TcpAddress, UdpAddress
+from mavbridge.core.address import (
+    LinkAddress,
+    SerialAddress,
+    TcpAddress,
+    UdpAddress,
+    spelled,
+)
 from mavbridge.core.clock import NS_PER_MS, NS_PER_S
 from mavbridge.core.errors import PeerError
 from mavbridge.mavlink.codec.messages import Endpoint, Heartbeat
@@ -108,7 +114,7 @@ class VehicleDiscovery:
                 "choose one with --target-system"
             )
         if len(wanted) > 1:
-            addresses = " and ".join(str(vehicle.address) for vehicle in wanted)
+            addresses = " and ".join(vehicle.place for vehicle in wanted)
             raise PeerError(
                 f"two vehicles use system id {systems[0]} (from {addresses}): give one of them "
                 "another id (MAV_SYSID, SYSID_THISMAV) or another port"
@@ -230,4 +236,4 @@ class Namesakes:
 
 def _place(address: Address | None) -> str:
     """A stream has no address."""
-    return "this connection" if address is None else f"{address[0]}:{address[1]}"
+    return "this connection" if address is None else spelled(*address)

@@ -72,5 +72,6 @@ class LinkCounters:
             ),
             vehicle_clock_offset_ns=timesync.offset_ns,
             is_timesync_good=timesync.is_good,
+            slow_clock=timesync.slow_clock,
             timesync_error_ms=None if error_ns is None else error_ns / NS_PER_MS,
         )

@@ -112,9 +112,14 @@ class StreamRequester:
     """
 
     def __init__(
-        self, wanted: tuple[StreamGroup, ...], *, report: Callable[[str], None] = lambda _: None
+        self,
+        wanted: tuple[StreamGroup, ...],
+        *,
+        report: Callable[[str], None] = lambda _: None,
+        has_slow_clock: Callable[[], bool] = lambda: False,
     ) -> None:
         self._report = report
+        self._has_slow_clock = has_slow_clock
         self._streams: list[_Stream] = []
         self._by_message: dict[str, _Stream] = {}
         self._pending: _Stream | None = None
@@ -238,7 +243,7 @@ class StreamRequester:
         return mean if is_alike and mean < _ENOUGH else None
 
     def _tell(self, share: float) -> None:
-        if self._has_told:
+        if self._has_told or self._has_slow_clock():
             return
         self._has_told = True
         wanted_hz = self._streams[0].rate_hz

@@ -25,6 +25,11 @@ _LATE_IN_A_ROW = 2
 """Requests that must have come late: one may have waited for a vehicle that was busy; but not for
 twice as long, where a link that loses most packets lets few of them through."""
 _OUTSTANDING = 16
+_PACE_NS = 4 * NS_PER_S
+"""Time over which the pace of the vehicle's clock is measured, in two halves that must agree: a
+clock that has stepped, or a simulator that stood still, is not slow."""
+SLOW_PACE = 0.9
+"""A clock slower than this, against ours, is that of a slow simulator."""
 _DRIFT_PER = 10_000
 """Clocks may drift apart by 1 in 10,000: crystals of autopilots and computers are within half."""
 _UNSTEADY_PER = 200
@@ -61,12 +66,15 @@ class TimesyncFilter:
         self._agreeing = 0
         self._sending_ns: deque[int] = deque(maxlen=_LATE_IN_A_ROW)
         self._next_ns = 0
+        self._clocks: deque[tuple[int, int]] = deque()
+        """Arrivals and the vehicle's clock of the newest answers."""
         self.round_trips = Histogram()
 
     def restart(self) -> None:
         """Forget the offset: the vehicle has rebooted, or is another one."""
         self._outstanding.clear()
         self._sending_ns.clear()
+        self._clocks.clear()
         self._best, self._agreeing = None, 0
 
     def request(self, now_ns: int) -> int | None:
@@ -86,6 +94,9 @@ class TimesyncFilter:
         if not 0 <= round_trip_ns < LONGEST_ROUND_TRIP_NS:
             return
         self.round_trips.add(round_trip_ns)
+        self._clocks.append((arrived_ns, reply.tc1))
+        while arrived_ns - self._clocks[0][0] > _PACE_NS:
+            self._clocks.popleft()
         offset_ns = reply.tc1 - (reply.ts1 + arrived_ns) // 2
         new = _Exchange(arrived_ns, offset_ns, round_trip_ns // 2)
         best = self._best or new
@@ -99,6 +110,29 @@ class TimesyncFilter:
         self._agreeing += 1
         sending_ns = reply.tc1 - best.offset_ns - reply.ts1
         self._sending_ns.append(sending_ns - self._error_ns(best, arrived_ns))
+
+    @property
+    def slow_pace(self) -> float | None:
+        """Seconds of the vehicle's clock in one of ours, below SLOW_PACE; else None."""
+        if not self._clocks or self._clocks[-1][0] - self._clocks[0][0] < _PACE_NS * 3 // 4:
+            return None
+        first, middle, last = (self._clocks[at] for at in (0, len(self._clocks) // 2, -1))
+        halves = [
+            (end[1] - begin[1]) / (end[0] - begin[0]) if end[0] > begin[0] else 1.0
+            for begin, end in ((first, middle), (middle, last))
+        ]
+        is_slow = all(0 < half < SLOW_PACE for half in halves)
+        return (last[1] - first[1]) / (last[0] - first[0]) if is_slow else None
+
+    @property
+    def slow_clock(self) -> str | None:
+        """What a slow clock means, for the user, or None."""
+        if (pace := self.slow_pace) is None:
+            return None
+        return (
+            f"the vehicle's clock runs at {pace:.2g} of real time: the simulator is slow, and not "
+            "the link; let it run at 1 (its speedup, or a faster computer)"
+        )
 
     @property
     def late_sending(self) -> str | None:

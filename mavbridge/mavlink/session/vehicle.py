@@ -64,6 +64,7 @@ class VehicleSession:
         config: LinkSettings,
         *,
         report: Callable[[str], None],
+        has_slow_clock: Callable[[], bool] = lambda: False,
     ) -> None:
         self.profile = require_profile(identity.autopilot, identity.vehicle_type)
         self.identity = identity
@@ -81,7 +82,7 @@ class VehicleSession:
         self._version_attempts = 0
         self._version_due_ns = 0
         streams = self.profile.streams(state_hz=config.state_hz, pilot_hz=config.pilot_hz)
-        self._streams = StreamRequester(streams, report=report)
+        self._streams = StreamRequester(streams, report=report, has_slow_clock=has_slow_clock)
         self._params = VehicleParams(
             self.profile, identity.source.system, config, streams=streams, report=report
         )

@@ -15,6 +15,8 @@ REOPEN_NS = NS_PER_S
 DRAIN_BUDGET_NS = 2 * NS_PER_MS
 """Longest stretch of reading: a flood must not keep the gate from its next slot. What is
 left stays with the kernel, which drops what it cannot hold."""
+_UNCHECKED = "UNKNOWN"
+"""Begin of pymavlink's names for messages that the dialect lacks."""
 REFUSED_NS = 100 * NS_PER_MS
 """Time for which every packet is refused before that counts as a problem."""
 
@@ -66,7 +68,9 @@ class Connection:
         """The vehicle's address, to which packets are sent; None until it is found."""
         self.texts: list[str] = []
         """Messages for the user, until `take_texts`."""
-        self.received_bytes = self.received_packets = 0
+        self.received_bytes = 0
+        self.received_packets = 0
+        """Those whose checksum could be tried: noise looks like packets of unknown messages."""
         self._told: list[str] = []
         self._opened = 0
         self._open(clock.now_ns())
@@ -123,7 +127,7 @@ class Connection:
                 is_stream = sender is None
                 decode = self._codec.decode if is_stream else self._codec.decode_datagram
                 for message in decode(data):
-                    self.received_packets += 1
+                    self.received_packets += not message.name.startswith(_UNCHECKED)
                     if self._log is not None:
                         self._log.put(Packet(arrived_ns, message.packet))
                     yield message, arrived_ns, sender

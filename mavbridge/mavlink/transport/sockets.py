@@ -20,15 +20,19 @@ from serial.tools import list_ports
 
 from mavbridge.core.address import (
     SerialAddress,
+    SocketAddress,
     TcpAddress,
     UdpAddress,
+    family,
     parse_address,
+    resolve,
+    spelled,
 )
 from mavbridge.core.clock import NS_PER_MS, NS_PER_S, Clock
 from mavbridge.core.errors import PeerError, UserError
 from mavbridge.mavlink.transport.holders import device_holder, udp_holder
 
-Address: TypeAlias = tuple[str, int]
+Address: TypeAlias = SocketAddress
 
 TCP_SILENCE_NS = 5 * NS_PER_S
 """Heartbeats come at 1 Hz: a connection this quiet is dead, even if the kernel has not noticed."""
@@ -138,8 +142,7 @@ class UdpTransport(_Base[socket.socket]):
 
     def open(self) -> None:
         """See `Transport`."""
-        udp = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
-        udp.setblocking(False)
+        udp = new_socket(self._address, socket.SOCK_DGRAM)
         if sys.platform == "linux":
             udp.setsockopt(socket.SOL_SOCKET, _SO_TIMESTAMPNS, 1)
         try:
@@ -147,13 +150,12 @@ class UdpTransport(_Base[socket.socket]):
                 udp.bind(self._address)
         except OSError as error:
             udp.close()
-            host, port = self._address
-            hint = "check the address"
+            place, hint = spelled(*self._address), "check the address"
             if error.errno == errno.EADDRINUSE:
-                hint = f"{udp_holder(port)}, or choose another port"
+                hint = f"{udp_holder(self._address[1])}, or choose another port"
             elif error.errno == errno.EADDRNOTAVAIL:
-                hint = f"this computer has no such address; udpout:{host}:{port} sends there"
-            raise UserError(f"cannot use udp {host}:{port}: {error.strerror}; {hint}") from error
+                hint = f"this computer has no such address; udpout:{place} sends there"
+            raise UserError(f"cannot use udp {place}: {error.strerror}; {hint}") from error
         self._handle = udp
 
     def drain(self) -> Iterator[Received]:
@@ -229,8 +231,7 @@ class TcpTransport(_StreamTransport[socket.socket]):
 
         Raises PeerError if nobody answers the first time.
         """
-        tcp = socket.socket(socket.AF_INET, socket.SOCK_STREAM)
-        tcp.setblocking(False)
+        tcp = new_socket(self._address, socket.SOCK_STREAM)
         tcp.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
         try:
             code = tcp.connect_ex(self._address)
@@ -252,16 +253,15 @@ class TcpTransport(_StreamTransport[socket.socket]):
         handle.shutdown(socket.SHUT_RDWR)
 
     def _unreachable(self, code: int) -> PeerError:
-        host, port = self._address
         if code == errno.ECONNREFUSED:
             reason = "nobody listens there: start the vehicle's end first, or check the port"
         else:
             reason = f"{os.strerror(code)}: check the address and the network"
-        return PeerError(f"cannot connect to tcp {host}:{port}: {reason}")
+        return PeerError(f"cannot connect to tcp {spelled(*self._address)}: {reason}")
 
     def _down(self, code: int | None) -> TransportDownError:
-        host, port = self._address
-        return TransportDownError(f"tcp {host}:{port}: {errno.errorcode.get(code or 0, code)}")
+        reason = errno.errorcode.get(code or 0, code)
+        return TransportDownError(f"tcp {spelled(*self._address)}: {reason}")
 
     def drain(self) -> Iterator[Received]:
         """Bytes received so far."""
@@ -430,17 +430,18 @@ def make_transport(spec: str, clock: Clock) -> Transport:
     """
     match parse_address(spec):
         case UdpAddress(host, port, listens):
-            return UdpTransport(resolved(host, port), clock, listen=listens)
+            return UdpTransport(resolve(host, port), clock, listen=listens)
         case TcpAddress(host, port):
-            return TcpTransport(resolved(host, port), clock)
+            return TcpTransport(resolve(host, port), clock)
         case SerialAddress(device, baud):
             return SerialTransport(device, baud, clock)
 
 
-def resolved(host: str, port: int) -> Address:
-    """The number of a host; looked up once, at the start, since a resolver may block."""
+def new_socket(address: Address, kind: socket.SocketKind) -> socket.socket:
+    """Make a socket that never blocks, for this address; raises UserError without IPv6."""
     try:
-        return socket.gethostbyname(host), port
-    except (OSError, UnicodeError) as error:
-        reason = error.strerror if isinstance(error, OSError) else "no such name"
-        raise UserError(f"cannot find host {host!r}: {reason}") from error
+        made = socket.socket(family(address), kind)
+    except OSError as error:
+        raise UserError(f"cannot use {spelled(*address)}: {error.strerror}") from error
+    made.setblocking(False)
+    return made

@@ -14,6 +14,7 @@ from pathlib import Path
 from typing import NamedTuple
 from urllib.parse import quote
 
+from mavbridge.core.address import host_port, spelled
 from mavbridge.core.errors import MavbridgeError, UserError
 from mavbridge.core.processes import end
 from mavbridge.observe.viewer.process import start_listening
@@ -47,14 +48,14 @@ class ServeAddress(NamedTuple):
     def data_url(self) -> str:
         """URL of the gRPC server, from this computer."""
         host = "127.0.0.1" if self.host in _ANY else self.host
-        return f"rerun+http://{_bracketed(host)}:{self.data_port}/proxy"
+        return f"rerun+http://{spelled(host, self.data_port)}/proxy"
 
     @property
     def page_url(self) -> str:
         """Address for a browser, which tells the page where the data are."""
-        host = _bracketed(socket.gethostname() if self.host in _ANY else self.host)
-        data_url = f"rerun+http://{host}:{self.data_port}/proxy"
-        return f"http://{host}:{self.port}/?url={quote(data_url, safe=':/')}"
+        host = socket.gethostname() if self.host in _ANY else self.host
+        data_url = f"rerun+http://{spelled(host, self.data_port)}/proxy"
+        return f"http://{spelled(host, self.port)}/?url={quote(data_url, safe=':/')}"
 
 
 def serve_address(text: str) -> ServeAddress:
@@ -63,14 +64,12 @@ def serve_address(text: str) -> ServeAddress:
     Raises:
         UserError: not HOST:PORT, or a port that cannot be listened on.
     """
-    host, _, port_text = text.rpartition(":")
-    host = host.strip("[]")
-    if not host or not port_text.isdecimal() or not 1 <= int(port_text) <= 65534:
+    host, first = host_port(text) or ("", 65535)
+    if first == 65535:
         raise UserError(
             f"--serve {text!r} is not understood; use HOST:PORT, such as 127.0.0.1:9090, with a "
             "port up to 65534: the next one carries the data"
         )
-    first = int(port_text)
     for port in (first, first + 1):
         try:
             found = socket.getaddrinfo(host, port, type=socket.SOCK_STREAM)[0]
@@ -81,6 +80,8 @@ def serve_address(text: str) -> ServeAddress:
                 f"--serve {text}: cannot listen on {host} port {port} ({error.strerror}); choose "
                 "another port (the page takes this one, the data the next)"
             ) from error
+    if len(found[4]) == 4 and found[4][3]:
+        raise UserError(f"--serve {text}: Rerun's server takes no link-local address; use [::]")
     return ServeAddress(str(found[4][0]), first)
 
 
@@ -96,8 +97,8 @@ class WebServer:
             "--server-memory-limit": SERVER_MEMORY,
         }
         if address.host not in LOOPBACK:  # its own page may not read the data else
-            host = "*" if address.host in _ANY else _bracketed(address.host)
-            options["--cors-allow-origin"] = f"http://{host}:{address.port}"
+            host = "*" if address.host in _ANY else address.host
+            options["--cors-allow-origin"] = f"http://{spelled(host, address.port)}"
         binary = _binary()
         flags = [word for option in options.items() for word in option]
         self._process: subprocess.Popen[bytes] = start_listening(
@@ -118,7 +119,3 @@ def _binary() -> Path:
     if spec is None or spec.origin is None:
         raise MavbridgeError("--serve needs Rerun's program, which is not installed: rerun_cli")
     return Path(spec.origin).parent / "rerun"
-
-
-def _bracketed(host: str) -> str:
-    return f"[{host}]" if ":" in host else host

@@ -2,25 +2,22 @@
 
 Depth images are kept as they are, in FFV1: 16 bits, without loss.
 
-Layout: ISO/IEC 14496-12. A moov box without samples, then a moof and an mdat box for each frame.
 The muxer holds a frame back until the next one gives its duration, so a file that was cut off
 lacks at most its last frame.
 """
 
-import mmap
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from fractions import Fraction
-from itertools import islice
 from pathlib import Path
 from typing import Any, BinaryIO
 
 import av
-import numpy as np
 from av.container import OutputContainer
 from av.error import FFmpegError
 
 from mavbridge.core.errors import MavbridgeError
 from mavbridge.core.records import CameraImage
+from policy.data.flight_video import VideoParts, decode_images, video_parts
 
 CRF = "20"
 """Constant quality; 17 to 18 is taken for visually lossless, 23 is x264's default."""
@@ -38,7 +35,6 @@ _OPTIONS: dict[str, object] = {
 _DEPTH = "gray16le"
 _FRAGMENTED = {"movflags": "frag_every_frame+empty_moov+default_base_moof"}
 WRITE_ERRORS = (OSError, FFmpegError)
-_BOX_HEADER_BYTES = 8
 _BUFFER_BYTES = 1 << 20
 """More than a fragment: it is written in one call, which a kill cannot tear."""
 
@@ -64,6 +60,7 @@ class FragmentedMp4:
         rate = Fraction(hz).limit_denominator(1000)
         if is_depth:
             stream = self._container.add_stream("ffv1", rate)
+            stream.options = {"g": "1"}  # each image by itself
         else:
             stream = self._container.add_stream("libx264", rate)
             stream.options = _OPTIONS
@@ -100,53 +97,33 @@ class FragmentedMp4:
 
 def count_frames(path: Path) -> int:
     """Whole frames of a file of ``FragmentedMp4``, however it ended; raises VideoError."""
+    return len(find_images(path).fragments)
+
+
+def find_images(path: Path) -> VideoParts:
+    """What of a file of ``FragmentedMp4`` can be decoded; raises VideoError."""
     try:
-        return len(_frame_ends(path))
+        return video_parts(path)
     except OSError as error:
         raise VideoError(f"{path} cannot be read: {error.strerror}") from error
 
 
-def _frame_ends(path: Path) -> list[int]:
-    """Offsets in the file, in bytes, at which its whole frames end."""
-    ends, at, size_bytes = [], 0, path.stat().st_size
-    with path.open("rb") as file:
-        while at + _BOX_HEADER_BYTES <= size_bytes:
-            header = file.read(_BOX_HEADER_BYTES)
-            size = int.from_bytes(header[:4], "big")
-            at += size
-            if size < _BOX_HEADER_BYTES or at > size_bytes:
-                break  # cut off; a 64-bit or open-ended box is never written here
-            if header[4:] == b"mdat":
-                ends.append(at)
-            file.seek(at)
-    return ends
+def read_video(path: Path, numbers: Sequence[int] | None = None) -> Iterator[CameraImage]:
+    """Images of a file of ``FragmentedMp4``, whole or not, as they were appended.
 
-
-def read_video(path: Path, frames: int | None = None) -> Iterator[CameraImage]:
-    """Frames of a file of ``FragmentedMp4``, whole or cut off, as they were appended.
-
-    ``frames`` is the number to read, by default all whole ones. Raises VideoError if the file
-    cannot be read, or ends before that.
+    ``numbers`` are those of the images to read, by default all that can be. Raises VideoError if
+    one of them cannot.
     """
-    wanted = count_frames(path) if frames is None else frames
-    if wanted == 0:
+    if numbers is not None and not len(numbers):
         return
+    parts = find_images(path)
+    wanted = [each.number for each in parts.fragments] if numbers is None else numbers
     seen = 0
     try:
-        # Mapped up to the last whole frame, since demuxers stumble over a torn box.
-        end = max(_frame_ends(path), default=0)
-        with (
-            path.open("rb") as file,
-            mmap.mmap(file.fileno(), end, access=mmap.ACCESS_READ) as whole,
-            av.open(whole, "r", format="mp4") as container,
-        ):
-            for frame in islice(container.decode(video=0), wanted):
-                if frame.format.name == _DEPTH:
-                    yield frame.to_ndarray().astype(np.uint16, copy=False)
-                else:
-                    yield frame.to_ndarray(format="rgb24").astype(np.uint8, copy=False)
-                seen += 1
+        for image in decode_images(path, parts, wanted):
+            yield image
+            seen += 1
     except (OSError, ValueError, FFmpegError) as error:  # ValueError: the file is empty
-        raise VideoError(f"{path} cannot be decoded after {seen} frames: {error}") from error
-    if seen < wanted:
-        raise VideoError(f"{path} ends after {seen} of {wanted} frames: it was damaged later")
+        raise VideoError(f"{path} cannot be decoded after {seen} images: {error}") from error
+    if seen < len(wanted):
+        raise VideoError(f"{path} ends after {seen} of {len(wanted)} images: it was damaged later")

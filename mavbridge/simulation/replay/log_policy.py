@@ -47,8 +47,10 @@ class LogVideo:
             UserError: it is no video that can be read.
         """
         self._path = path
+        self._path = path
         self._start_ns = START_NS + round(start_s * NS_PER_S)
-        self._frames = 0
+        self.damage: str | None = None
+        """Where the video broke off, for the user."""
         try:
             self._container = av.open(library_name(path), options={"protocol_whitelist": "file"})
             self._images = self._decode()
@@ -73,7 +75,7 @@ class LogVideo:
         self._container.close()
 
     def _decode(self) -> Iterator[Frame]:
-        """All images; a video that is damaged from some place on ends there."""
+        """All images; a video that is damaged from some place on ends there, which is noted."""
         first_s: float | None = None
         try:
             for number, image in enumerate(self._container.decode(video=0)):
@@ -84,9 +86,10 @@ class LogVideo:
                 rgb.setflags(write=False)
                 at_ns = self._start_ns + round((image.time - first_s) * NS_PER_S)
                 yield Frame(frame_id=number, captured_ns=at_ns, rgb=rgb)
-        except av.FFmpegError:
+        except av.FFmpegError as error:
             if first_s is None:
                 raise
+            self.damage = f"{why_unreadable(self._path, error)}; {number + 1} images were read"
 
 
 class LogReplay:

@@ -10,7 +10,7 @@ from mavbridge.core.clock import NS_PER_MS
 from mavbridge.core.errors import UserError
 from mavbridge.core.records import FeatureFrame, Solve, Tick
 from mavbridge.mavlink.codec.frames import RawPacket
-from mavbridge.mavlink.codec.tlog import read_tlog
+from mavbridge.mavlink.codec.tlog import Skipped, read_tlog
 from mavbridge.recording import replay_rows, rows
 from mavbridge.recording.folder import PACKETS, SOLVES, TICKS, TLOG, features_of
 from mavbridge.recording.meta import FlightMeta, read_meta
@@ -82,20 +82,22 @@ def open_source(folder: Path) -> ReplaySource:
         policy=replace(config.policy, dual_rate=meta.mode == "dual"),
         record=None,
     )
-    table = read_table(folder / TICKS, rows.TICKS, later=rows.LATER)
+    damage: list[str] = []
+    table = read_table(folder / TICKS, rows.TICKS, later=rows.LATER, damage=damage)
     ticks = list(rows.read_ticks(table, meta.contract.action))
-    solve_rows = list(read_solves(read_table(folder / SOLVES, replay_rows.SOLVES), meta.contract))
+    solved = read_table(folder / SOLVES, replay_rows.SOLVES, damage=damage)
+    solve_rows = list(read_solves(solved, meta.contract))
     if ticks and not meta.finished:  # cut off: what was sent before its last solves is not known
         solve_rows = [row for row in solve_rows if row.solve.started_ns <= ticks[-1].tick.sent_ns]
     if not ticks or not solve_rows:
         raise UserError(
             f"{folder} ended before its policy had computed anything: nothing to replay"
         )
-    stamps = list(read_packets(read_table(folder / PACKETS, replay_rows.PACKETS)))
+    stamps = list(read_packets(read_table(folder / PACKETS, replay_rows.PACKETS, damage=damage)))
     offset_ns, system = settings.wall_offset_ns, config.link.source_system
-    packets = list(
-        _received(read_tlog(folder / TLOG), stamps, offset_ns=offset_ns, own_system=system)
-    )
+    skipped = Skipped()
+    log = read_tlog(folder / TLOG, skipped)
+    packets = list(_received(log, stamps, offset_ns=offset_ns, own_system=system))
     return ReplaySource(
         folder=folder,
         meta=meta,
@@ -103,28 +105,36 @@ def open_source(folder: Path) -> ReplaySource:
         config=config,
         ticks=tuple(row.tick for row in ticks),
         solves=tuple(row.solve for row in solve_rows),
-        features=_features(folder, meta, meta.contract),
+        features=_features(folder, meta, meta.contract, damage),
         packets=tuple(packets),
         known_params=frozenset(_asked_params(folder / TLOG, system)),
-        gaps=tuple(
-            f"{count} {what} are not in the recording"
-            for what, count in (
-                ("ticks", sum(row.dropped_before for row in ticks)),
-                ("solves", sum(row.dropped_before for row in solve_rows)),
-                ("packets", len(stamps) - sum(p.happened_ns is not None for p in packets)),
-            )
-            if count
+        gaps=(
+            *damage,
+            *filter(None, [skipped.describe(folder / TLOG)]),
+            *(
+                f"{count} {what} are not in the recording"
+                for what, count in (
+                    ("ticks", sum(row.dropped_before for row in ticks)),
+                    ("solves", sum(row.dropped_before for row in solve_rows)),
+                    ("packets", len(stamps) - sum(p.happened_ns is not None for p in packets)),
+                )
+                if count
+            ),
         ),
     )
 
 
 def _features(
-    folder: Path, meta: FlightMeta, contract: Contract
+    folder: Path, meta: FlightMeta, contract: Contract, damage: list[str]
 ) -> tuple[tuple[FeatureFrame, ...], ...]:
     if meta.mode != "dual":
         return ()
     return tuple(
-        tuple(read_features(read_table(folder / features_of(name), replay_rows.FEATURES)))
+        tuple(
+            read_features(
+                read_table(folder / features_of(name), replay_rows.FEATURES, damage=damage)
+            )
+        )
         for name in (None, *contract.cameras[1:])
     )
 

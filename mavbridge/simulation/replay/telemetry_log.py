@@ -19,7 +19,7 @@ from mavbridge.mavlink.codec.messages import (
     RcChannels,
 )
 from mavbridge.mavlink.codec.packets import Codec, manual_control_sticks
-from mavbridge.mavlink.codec.tlog import read_tlog
+from mavbridge.mavlink.codec.tlog import Skipped, read_tlog
 from mavbridge.mavlink.profiles.ardupilot_params import calibration
 from mavbridge.mavlink.profiles.choice import profile_of
 from mavbridge.mavlink.profiles.profile import Profile
@@ -58,6 +58,8 @@ class TelemetryLog:
     """None: no heartbeat, or a firmware that is not known."""
     params: Mapping[str, float]
     """As far as the log holds them, which it does where the ground station has loaded them."""
+    damage: str | None
+    """What of the log was skipped, for the user."""
 
     @property
     def seconds(self) -> float:
@@ -85,7 +87,8 @@ def open_log(path: Path) -> TelemetryLog:
     params: dict[Endpoint, dict[str, float]] = {}
     first_us: int | None = None
     end_us = 0
-    for stamp_us, packet in read_tlog(path):
+    skipped = Skipped()
+    for stamp_us, packet in read_tlog(path, skipped):
         first_us = stamp_us if first_us is None else first_us
         end_us = max(end_us, stamp_us)
         attitudes[packet.source] += packet.message_id in _ATTITUDES
@@ -112,6 +115,7 @@ def open_log(path: Path) -> TelemetryLog:
         end_us=end_us,
         profile=profile_of(autopilots.get(source, -1)),
         params=params.get(source, {}),
+        damage=skipped.describe(path),
     )
 
 

@@ -41,8 +41,14 @@ def onnx_entries(files: Sequence[Path]) -> list[Entry]:
     """
     inputs, outputs = _ports(files)
     images = [port for port in inputs if len(port.shape) >= 4 and port.shape[-3] in (1, 3)]
-    states = [port for port in inputs if "state" in port.name and len(port.shape) >= 2]
     histories = [port for port in inputs if "history" in port.name and len(port.shape) >= 2]
+    given = [port.shape for port in outputs]  # an input of the shape of an output is a hidden state
+    others = [
+        port
+        for port in inputs
+        if port not in images + histories and len(port.shape) >= 2 and port.shape not in given
+    ]
+    states = [port for port in others if "state" in port.name] or others
     chunks = [port for port in outputs if port.shape[-1:] == (ACTION_DIM,) and len(port.shape) > 1]
     entries = [rate_entry(None, ""), frame_entry(None, "to answer", ""), *action_entries(None, "")]
     for name, ports, axis in (

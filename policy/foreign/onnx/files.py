@@ -16,7 +16,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from policy.errors import CheckpointError
-from policy.files import read_text, stand_in, why_unreadable
+from policy.files import last_line, read_text, stand_in, why_unreadable
 from policy.foreign.description import DESCRIPTION, Description, describe
 
 if TYPE_CHECKING:
@@ -30,6 +30,8 @@ _OFFSET, _LENGTH = (
     re.compile(rb"\x0a\x06" + key + rb"\x12[\x01-\x14](\d+)") for key in (b"offset", b"length")
 )
 """Entries of ``TensorProto.external_data`` (onnx.proto): a key and its value, both texts."""
+_GRAPH_FIELD = 7
+"""Of ONNX's ModelProto."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -97,10 +99,48 @@ def read_graph(path: Path) -> "ov.Model":
     from openvino import Core  # not needed to find the files
 
     _require_external_data(path)
+    if not _is_whole(path.read_bytes()):  # else parsers of all formats tell what they think of it
+        error = ValueError("it is something else, or breaks off")
+        raise CheckpointError(why_unreadable(path, error, "ONNX"))
     try:
         return Core().read_model(path)
     except RuntimeError as error:
-        raise CheckpointError(why_unreadable(path, error, "ONNX")) from error
+        raise CheckpointError(
+            f"{path} holds what OpenVINO cannot run ({last_line(error)}): export it with operators "
+            "of the ONNX standard alone, and without errors of onnx.checker"
+        ) from error
+
+
+def _is_whole(content: bytes) -> bool:
+    """Return whether these are fields of a protobuf message, whole, with a graph (7) among them."""
+    at, numbers = 0, set()
+    try:
+        while at < len(content):
+            key, at = _varint(content, at)
+            numbers.add(key >> 3)
+            match key & 7:
+                case 0:
+                    _, at = _varint(content, at)
+                case 2:
+                    size, at = _varint(content, at)
+                    at += size
+                case 1 | 5 as kind:
+                    at += 8 if kind == 1 else 4
+                case _:
+                    return False
+    except IndexError:
+        return False
+    return at == len(content) and _GRAPH_FIELD in numbers
+
+
+def _varint(content: bytes, at: int) -> tuple[int, int]:
+    """Read a number of protobuf; returns it, and where the next field begins."""
+    value = shift = 0
+    while True:
+        byte = content[at]
+        value, at, shift = value | (byte & 0x7F) << shift, at + 1, shift + 7
+        if not byte & 0x80:
+            return value, at
 
 
 def _require_external_data(path: Path) -> None:

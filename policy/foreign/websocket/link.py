@@ -7,6 +7,7 @@ from concurrent.futures import Future
 from contextlib import suppress
 from dataclasses import dataclass
 from typing import NamedTuple
+from urllib.parse import urlsplit
 
 from websockets.asyncio.client import ClientConnection, connect
 from websockets.exceptions import (
@@ -139,6 +140,8 @@ class ServerLink:
             # openpi's servers answer no ping while they compute; LOST_S takes its place.
             ping_interval=None,
             proxy=None,
+            # The zone of a link-local address: %eth0, or %25eth0 by the rules of URLs.
+            host=(urlsplit(self._url).hostname or "").replace("%25", "%"),
         ) as connection:
             try:
                 await self._serve_requests(connection)

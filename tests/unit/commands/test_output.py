@@ -5,7 +5,7 @@ from pathlib import Path
 import pytest
 from rich.console import Console
 
-from mavbridge.commands.output import progress_bar, require_matplotlib
+from mavbridge.commands.output import print_status, progress_bar, require_matplotlib
 from mavbridge.core.errors import UserError
 from mavbridge.core.files import require_writable
 
@@ -39,6 +39,11 @@ def test_a_figure_without_matplotlib_is_refused(monkeypatch: pytest.MonkeyPatch)
     monkeypatch.setattr(importlib.util, "find_spec", lambda _: None)
     with pytest.raises(UserError, match=r"--plot needs matplotlib: pip install"):
         require_matplotlib()
+
+
+def test_what_is_being_done_is_told_without_passwords(capsys: pytest.CaptureFixture[str]) -> None:
+    print_status("opening rtsp://me:it@host/1?token=abc")
+    assert capsys.readouterr().err == "opening rtsp://me:***@host/1?token=***\n"
 
 
 @pytest.mark.parametrize(("as_percentage", "count"), [(False, "2/8"), (True, "25%")])

@@ -15,6 +15,8 @@ import pytest
 
 from helpers.factories import make_gate_tick
 from helpers.fakes import START_NS, FakeClock
+from helpers.network import needs_ipv6
+from mavbridge.core.address import SocketAddress
 from mavbridge.core.clock import NS_PER_MS
 from mavbridge.flight import gate_process
 from mavbridge.flight.gate_process import LATEST_NS, GateDiedError, GateProcess
@@ -58,7 +60,7 @@ class Rig:
         self,
         phase: Phase = Phase.FLYING,
         fd: int | None = None,
-        receiver: tuple[str, int] | None = None,
+        receiver: SocketAddress | None = None,
         packets: tuple[tuple[int, bytes], ...] = PACKETS,
     ) -> None:
         words = LastWords(phase, "BRAKE", receiver, fd is not None, packets)
@@ -97,16 +99,17 @@ class Link:
     """The gate's open socket or port, and the vehicle's end."""
 
     fd: int
-    receiver: tuple[str, int] | None
+    receiver: SocketAddress | None
     heard: Callable[[], list[bytes]]
     close: Callable[[], None]
 
 
-def udp() -> Link:
-    ours = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
-    vehicle = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+def udp(host: str = "127.0.0.1") -> Link:
+    family = socket.AF_INET6 if ":" in host else socket.AF_INET
+    ours = socket.socket(family, socket.SOCK_DGRAM)
+    vehicle = socket.socket(family, socket.SOCK_DGRAM)
     for end in (ours, vehicle):
-        end.bind(("127.0.0.1", 0))
+        end.bind((host, 0))
         end.setblocking(False)
     port = ours.getsockname()
 
@@ -121,6 +124,10 @@ def udp() -> Link:
             received.append(data)
 
     return Link(ours.detach(), vehicle.getsockname(), heard, vehicle.close)
+
+
+def udp_over_ipv6() -> Link:
+    return udp("::1")
 
 
 def tcp() -> Link:
@@ -146,7 +153,7 @@ def serial() -> Link:
     return Link(ours, None, heard, lambda: os.close(vehicle))
 
 
-@pytest.fixture(params=[udp, tcp, serial])
+@pytest.fixture(params=[udp, pytest.param(udp_over_ipv6, marks=needs_ipv6), tcp, serial])
 def link(request: pytest.FixtureRequest) -> Iterator[Link]:
     made: Link = request.param()
     yield made

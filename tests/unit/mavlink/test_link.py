@@ -2,6 +2,7 @@
 
 from collections.abc import Iterator
 from pathlib import Path
+from random import Random
 from typing import Any
 
 import pytest
@@ -66,6 +67,7 @@ class Vehicle:
         self.answered_to: Address | None = None
         self.opened = 0
         self.boot_ns = clock.now_ns()
+        self.pace = 1.0
         self.is_alive = True
         self.results: dict[tuple[int, float | None], int] = {}
         """MAV_RESULT of commands, and of modes by their number."""
@@ -130,7 +132,7 @@ class Vehicle:
                 key = (message.command, message.param2 if message.command == 176 else None)
                 self.put(mav.command_ack_encode(message.command, self.results.get(key, 0)))
             case "TIMESYNC":
-                tc1 = self.clock.now_ns() - self.boot_ns
+                tc1 = round(self.pace * (self.clock.now_ns() - self.boot_ns))
                 self.put(mav.timesync_encode(tc1, message.ts1))
             case "MANUAL_CONTROL" if self.follows_overrides:
                 x, y, z, r = message.x, message.y, message.z, message.r
@@ -665,6 +667,16 @@ def test_200_ms_of_delay_each_way_are_200_ms_of_age(is_from_the_start: bool) -> 
     assert error_ms == pytest.approx(205 if is_from_the_start else 12, abs=7)
 
 
+def test_a_slow_clock_is_told_once_and_explains_a_heartbeat_that_is_late() -> None:
+    rig = Rig()
+    rig.vehicle.pace = 0.25
+    rig.run(10.0)
+    rig.vehicle.is_alive = False
+    snapshot = rig.run(4.0)
+    (told,) = [text for text in rig.texts if "the vehicle's clock runs at 0.25" in text]
+    assert snapshot.problem == f"{told}; the vehicle's heartbeat is lost"
+
+
 def test_what_is_forwarded_gives_the_same_readings_elsewhere() -> None:
     rig = Rig()
     rig.vehicle.delay_ns = 30 * MS
@@ -928,3 +940,17 @@ def test_acks_for_other_stations_are_ignored() -> None:
 def test_px4_with_rc_override_is_refused() -> None:
     with pytest.raises(PeerError, match="--output manual-control"):
         px4_rig(output="rc-override").run(3.0)
+
+
+def test_noise_that_looks_like_packets_of_unknown_messages_is_no_mavlink() -> None:
+    """At a wrong baud rate half of the bytes fall into them: nobody can check their sums."""
+    rig, noise = Rig(connect_timeout_s=5.0), Random(1)
+    rig.vehicle.address = None
+    for _ in range(50):
+        rig.vehicle.put_bytes(noise.randbytes(600))
+        rig.link.poll()
+        rig.link.service()
+        rig.clock.advance_ns(100 * MS)
+    rig.clock.advance_ns(1000 * MS)
+    with pytest.raises(PeerError, match="kB/s came, and no MAVLink in it"):
+        rig.link.service()

@@ -1,5 +1,7 @@
 """The parts of a session, each a state machine without I/O."""
 
+from collections.abc import Callable
+
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
@@ -148,6 +150,43 @@ def good_timesync(*, way_ns: int = NS_PER_MS) -> TimesyncFilter:
 
 def boot_us(at_ns: int) -> int:
     return (at_ns + BOOT_NS) // 1000
+
+
+def paced_timesync(pace_at: Callable[[int], float]) -> TimesyncFilter:
+    """Twelve seconds beside a clock of this pace at each moment."""
+    sync, vehicle_ns = TimesyncFilter(), 0
+    for at_ns in range(0, 12 * S, S // 5):
+        vehicle_ns += round(pace_at(at_ns) * S / 5)
+        ts1 = sync.request(at_ns)
+        assert ts1 is not None
+        sync.receive(Timesync(tc1=vehicle_ns, ts1=ts1), at_ns + 3 * NS_PER_MS)
+    return sync
+
+
+@pytest.mark.parametrize("pace", [0.1, 0.25, 0.5, 0.85])
+def test_a_slow_clock_is_known_with_its_pace(pace: float) -> None:
+    sync = paced_timesync(lambda _: pace)
+    assert sync.slow_pace == pytest.approx(pace, rel=1e-6)
+    assert f"runs at {pace:.2g} of real time" in (sync.slow_clock or "")
+    sync.restart()
+    assert sync.slow_pace is None
+
+
+@pytest.mark.parametrize(
+    "pace_at",
+    [
+        lambda _: 1.0,
+        lambda _: 0.95,
+        lambda _: 3.0,
+        lambda at_ns: 0.0 if 9 * S < at_ns < 9.8 * S else 1.0,  # it stood still
+        lambda at_ns: -6.0 if at_ns == 10 * S else 1.0,  # stepped back
+        lambda at_ns: 0.25 if at_ns > 11 * S else 1.0,  # not for long
+    ],
+)
+def test_a_clock_that_is_not_slow_all_the_time_is_not_called_slow(
+    pace_at: Callable[[int], float],
+) -> None:
+    assert paced_timesync(pace_at).slow_pace is None
 
 
 def test_things_happened_when_the_vehicle_says_once_the_offset_is_good() -> None:

@@ -280,6 +280,13 @@ def test_what_stays_away_is_told_once_and_stood_in_for_while_it_does() -> None:
     assert link.stand_ins - before <= 20 * 0.3
 
 
+def test_a_link_is_not_blamed_for_a_slow_clock() -> None:
+    link = Link(PX4.streams(state_hz=100), capacity_hz=45.0)
+    link.requester._has_slow_clock = lambda: True
+    link.run(30.0)
+    assert link.texts == []
+
+
 def test_packets_that_get_lost_are_no_reason_to_ask_for_less() -> None:
     link = Link(PX4.streams(state_hz=100), capacity_hz=10_000.0)
     link.run(30.0, loses_every=2)

@@ -1,5 +1,6 @@
 """Transports on loopback. A datagram on loopback is there when its send returns: nothing waits."""
 
+import errno
 import os
 import pty
 import select
@@ -12,6 +13,7 @@ import pytest
 import serial
 
 from helpers.fakes import FakeClock
+from helpers.network import needs_ipv6
 from mavbridge.core.clock import MonotonicClock
 from mavbridge.core.errors import PeerError, UserError
 from mavbridge.core.processes import free_port
@@ -88,6 +90,51 @@ def test_udp_listens_answers_whom_it_is_told_and_stamps_arrival() -> None:
         assert vehicle.recv(100) == b"hello"
     ours.close()
     ours.close()
+
+
+@needs_ipv6
+@pytest.mark.parametrize("host", ["[::1]", "[::]"])
+def test_udp_over_ipv6_listens_and_calls(host: str) -> None:
+    port = free_port()
+    ours = make_transport(f"udp:{host}:{port}", FakeClock())
+    vehicle = make_transport(f"udpout:[::1]:{port}", FakeClock())
+    ours.open()
+    vehicle.open()
+    assert vehicle.send(b"hello")
+    (heard,) = ours.drain()
+    assert (heard.data, heard.sender[:1]) == (b"hello", ("::1",))
+    assert ours.send(b"sticks", heard.sender)
+    (answer,) = vehicle.drain()
+    assert (answer.data, answer.sender) == (b"sticks", ("::1", port, 0, 0))
+    with pytest.raises(UserError, match=rf"cannot use udp \[::1?\]:{port}"):
+        make_transport(f"udp:{host}:{port}", FakeClock()).open()
+    ours.close()
+    vehicle.close()
+
+
+@needs_ipv6
+def test_tcp_over_ipv6() -> None:
+    with socket.create_server(("::1", 0), family=socket.AF_INET6) as server:
+        port = server.getsockname()[1]
+        ours = make_transport(f"tcp:[::1]:{port}", FakeClock())
+        ours.open()
+        vehicle, _ = server.accept()
+        with vehicle:
+            vehicle.sendall(b"hello")
+            assert [heard.data for heard in ours.drain()] == [b"hello"]
+    ours.close()
+    with pytest.raises(PeerError, match=rf"cannot connect to tcp \[::1\]:{port}: nobody listens"):
+        make_transport(f"tcp:[::1]:{port}", FakeClock()).open()
+
+
+def test_a_computer_without_ipv6_is_told(monkeypatch: pytest.MonkeyPatch) -> None:
+    def refuse(*_: object) -> socket.socket:
+        raise OSError(errno.EAFNOSUPPORT, os.strerror(errno.EAFNOSUPPORT))
+
+    transport = make_transport("udp:[::1]:14550", FakeClock())
+    monkeypatch.setattr(socket, "socket", refuse)
+    with pytest.raises(UserError, match=r"\[::1\]:14550: Address family not supported"):
+        transport.open()
 
 
 def test_a_port_in_use_is_the_users_error_and_says_whose_it_is() -> None:

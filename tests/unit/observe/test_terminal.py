@@ -226,3 +226,19 @@ def test_a_status_of_the_end_replaces_the_line() -> None:
     screen.emit(make_tick(0))
     screen.show_status("ending the flight")
     assert screen.status_line().plain == "ending the flight"
+
+
+def test_no_line_shows_the_password_of_an_address() -> None:
+    text = io.StringIO()
+    screen = make_screen(Console(file=text, width=200))
+    secret = "camera rtsp://me:it@host/1?token=abc is lost"
+    screen.emit(make_released_tick(0, secret))
+    line = screen.status_line().plain
+    screen.show_message(secret)
+    screen.show_status(secret)
+    shown = "\n".join((line, screen.status_line().plain))
+    screen.refresh()
+    shown += text.getvalue()
+    assert shown.count("rtsp://me:***@host/1?token=*** is lost") >= 4
+    assert "it@" not in shown
+    assert "abc" not in shown

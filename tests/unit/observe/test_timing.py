@@ -256,6 +256,7 @@ def test_json_has_the_keys_of_the_report_in_order() -> None:
         "saturated": {"yaw": 0.01},
         "vehicle_clock_offset_ns": None,
         "is_timesync_good": False,
+        "slow_clock": None,
         "timesync_error_ms": None,
         "messages_per_s": {"ATTITUDE_QUATERNION": 99.9, "RC_CHANNELS": 20.0},
         "lost_fraction": 0.001,

@@ -6,6 +6,7 @@ import socket
 from collections.abc import Iterator
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from helpers.golden_flights import FLIGHTS, copied
@@ -110,7 +111,7 @@ def test_a_playlist_in_place_of_a_video_is_not_followed(
     }[kind]
     (tmp_path / "camera.mp4").write_text(text)
     with pytest.raises(DatasetError, match="cannot be read"):
-        list(decode_video(tmp_path / "camera.mp4"))
+        list(decode_video(tmp_path / "camera.mp4", np.arange(3)))
 
 
 @pytest.mark.parametrize(

@@ -201,7 +201,7 @@ def _damage(name: str) -> Callable[[Path], object]:
         (_without("camera.mp4"), "lacks camera.mp4, though 10 frames were recorded"),
         (_damage("meta.json"), "is not JSON"),
         (_damage("ticks.parquet"), "ticks.parquet is damaged"),
-        (_damage("camera.mp4"), "holds 0 frames"),
+        (_damage("camera.mp4"), "holds none of 10 images"),
         (_meta(format="other"), "is not of a recorded flight"),
         (_meta(version=2), "has version 2 of the format, this build reads 1"),
         (_meta(contract={"horizon": 0}), "horizon must be an integer"),

@@ -9,6 +9,7 @@ from helpers.recordings import number_of, picture
 from mavbridge.recording.video.file import FragmentedMp4, VideoError, count_frames, read_video
 from policy.data.flight_data import DatasetError
 from policy.data.flight_folders import decode_video
+from policy.data.flight_video import video_parts
 
 
 def write(path: Path, count: int) -> FragmentedMp4:
@@ -71,17 +72,60 @@ def test_a_video_cut_off_anywhere_has_its_whole_frames(tmp_path: Path) -> None:
     assert set(counts) == {0, 1, 2, 3, 4}
 
 
+@pytest.mark.parametrize("kind", ["overwritten", "inserted", "cut out"])
+@pytest.mark.parametrize("frame", [3, 29, 40, 60])
+def test_images_behind_damage_come_back_from_the_next_key_frame_on(
+    tmp_path: Path, kind: str, frame: int
+) -> None:
+    """Key frames are 0, 30 and 60."""
+    path = tmp_path / "camera.mp4"
+    write(path, 90).close()
+    data = path.read_bytes()
+    parts = video_parts(path)
+    assert [each.number for each in parts.fragments if each.is_key] == [0, 30, 60]
+    start, end = parts.fragments[frame].start + 2, parts.fragments[frame].end
+    kept = {"overwritten": b"?" * (end - start), "inserted": b"?" * 50 + data[start:end]}
+    path.write_bytes(data[:start] + kept.get(kind, b"") + data[end:])
+
+    damaged = video_parts(path)
+
+    next_key = next(key for key in (30, 60, 90) if key > frame)
+    expected = [*range(frame), *range(next_key, 90)]
+    assert [number_of(rgb) for rgb in read_video(path)] == expected
+    assert [number_of(rgb) for rgb in read_video(path, expected[-3:])] == expected[-3:]
+    assert damaged.skipped_frames == next_key - frame - 1
+    whole = [*parts.fragments[:frame], *parts.fragments[frame + 1 :]]
+    others = len(data) - sum(each.end - each.start for each in parts.fragments)
+    spared = others + sum(each.end - each.start for each in whole)
+    assert damaged.skipped_bytes == path.stat().st_size - spared
+
+
+def test_an_image_that_is_damaged_inside_is_refused(tmp_path: Path) -> None:
+    path = tmp_path / "camera.mp4"
+    video = FragmentedMp4(path, height=96, width=128, hz=30)
+    noise = np.random.default_rng(0).integers(0, 256, (40, 96, 128, 3), dtype=np.uint8)
+    for k, image in enumerate(noise):
+        video.append(image, START_NS + k * FRAME_NS)
+    video.close()
+    data = bytearray(path.read_bytes())
+    place = video_parts(path).fragments[7]
+    data[place.end - 900 : place.end - 500] = b"\x5a" * 400
+    path.write_bytes(data)
+    with pytest.raises(VideoError, match="cannot be decoded after 7 images"):
+        list(read_video(path))
+
+
 def test_errors_say_what_is_wrong(tmp_path: Path) -> None:
     path = tmp_path / "camera.mp4"
     with pytest.raises(VideoError, match="cannot be read"):
         count_frames(path)
     path.write_bytes(b"no video")
-    with pytest.raises(VideoError, match="cannot be decoded after 0 frames"):
-        list(read_video(path, 3))
+    with pytest.raises(VideoError, match="cannot be decoded after 0 images: 3 of 3 images"):
+        list(read_video(path, range(3)))
     path.unlink()
     write(path, 3).close()
-    with pytest.raises(VideoError, match="ends after 3 of 5 frames"):
-        list(read_video(path, 5))
+    with pytest.raises(VideoError, match="2 of 5 images are missing"):
+        list(read_video(path, range(5)))
     with pytest.raises(FileExistsError):
         FragmentedMp4(path, height=48, width=64, hz=30)
 

@@ -104,3 +104,10 @@ def test_the_table_fits_its_terminal_and_ends_with_what_to_do(width: int) -> Non
     assert max(map(len, lines)) <= width
     assert "NO-GO" in lines[-2]
     assert lines[-1].endswith("--set RC_OVERRIDE_TIME=0.5")
+
+
+def test_a_row_hides_the_password_of_an_address_in_table_and_json() -> None:
+    text = "rtsp://me:it@host/1?token=abc"
+    row = Row(area="camera", name="camera", found=text, expected=text, advice=text)
+    assert "it@" not in json.dumps(as_document([row]))
+    assert row.found == "rtsp://me:***@host/1?token=***"

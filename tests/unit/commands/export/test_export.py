@@ -284,7 +284,7 @@ def _foreign(root: Path) -> None:
         (_failed, "have failed"),
         (_taken, "not empty"),
         (_left_over, "was killed"),
-        (_no_images, "not one image"),
+        (_no_images, "nothing to export"),
         (_other_clock, "of one clock"),
         (_foreign, "not a flight of mavbridge"),
     ],

@@ -1,6 +1,8 @@
 """A policy whose action is known, beside other people's recordings."""
 
 import json
+import re
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -9,6 +11,7 @@ from numpy.typing import NDArray
 from pymavlink.dialects.v20 import ardupilotmega as dialect
 
 from helpers.flight_folders import LEVEL, MS, ticks_table, write_flight, write_video
+from mavbridge.__main__ import main
 from mavbridge.commands.export.config import ExportConfig
 from mavbridge.commands.export.run import write_dataset
 from mavbridge.commands.replay.config import ReplayConfig
@@ -111,6 +114,19 @@ def test_a_log_and_a_video_give_the_policy_state_image_and_the_pilots_sticks(
     assert picture.stat().st_size > 10_000
 
 
+def test_a_damaged_log_and_a_damaged_video_are_read_and_told(tmp_path: Path, video: Path) -> None:
+    log, written = write_log(tmp_path / "flight.tlog"), tmp_path / "replay.json"
+    data = bytearray(log.read_bytes())
+    middle = len(data) // 2
+    data[middle : middle + 300] = b"?" * 300
+    log.write_bytes(data)
+
+    assert replay(log, ReplayConfig(policy=POLICY, video=video, json=written)) == 0
+
+    (note, *_) = json.loads(written.read_text())["notes"]
+    assert re.search(r"flight.tlog is damaged.*: 3\d\d bytes were skipped, with \d+ packets", note)
+
+
 def test_a_log_without_attitude_is_refused(tmp_path: Path, video: Path) -> None:
     log = write_log(tmp_path / "flight.tlog", attitude=False)
 
@@ -185,3 +201,40 @@ def test_a_dataset_that_does_not_fit_is_refused(dataset: Path) -> None:
     info.write_text(info.read_text().replace('"observation.state"', '"observation.other"'))
     with pytest.raises(MavbridgeError, match=r"no feature observation\.state"):
         replay(dataset, ReplayConfig(policy=POLICY))
+
+
+def _cut(path: Path) -> None:
+    path.write_bytes(path.read_bytes()[: path.stat().st_size // 2])
+
+
+def _point(path: Path) -> None:
+    path.write_text("version https://git-lfs.github.com/spec/v1\noid sha256:00\nsize 1\n")
+
+
+@pytest.mark.parametrize("command", ["train", "replay", "contract", "export"])
+@pytest.mark.parametrize("damage", [_cut, _point, Path.unlink], ids=["cut", "pointer", "missing"])
+@pytest.mark.parametrize("name", ["info.json", "file-000.parquet", "file-000.mp4"])
+def test_every_reader_of_a_broken_dataset_names_the_file_and_no_library_speaks(
+    dataset: Path,
+    name: str,
+    damage: Callable[[Path], None],
+    command: str,
+    capfd: pytest.CaptureFixture[str],
+) -> None:
+    path = next(found for found in sorted(dataset.rglob(name)) if "episodes" not in found.parts)
+    damage(path)
+    out = str(dataset.parent / "out.safetensors")
+    words = {
+        "train": ["--policy", "toge:small:resnet8", "--out", out, "--minutes", "0.01"],
+        "replay": ["--policy", POLICY],
+        "contract": ["--out", str(dataset.parent / "draft.toml")],
+        "export": ["--out", str(dataset.parent / "again")],
+    }[command]
+    with pytest.raises(SystemExit) as ended:
+        main([command, str(dataset), *words])
+    shown = "".join(capfd.readouterr())
+    drafts = command == "contract" and name != "info.json"  # by its meta alone
+    assert ended.value.code == (0 if drafts else 2)
+    assert "Traceback" not in shown
+    if not drafts:
+        assert str(dataset) in shown.replace("\n", "")

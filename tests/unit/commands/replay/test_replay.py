@@ -1,4 +1,5 @@
 import json
+import re
 from dataclasses import replace
 from pathlib import Path
 
@@ -161,3 +162,17 @@ def test_a_packet_that_the_log_has_lost_is_told(tmp_path: Path) -> None:
     lost = len(open_source(NUMPY).packets) - len(source.packets)
     assert lost in (0, 1)  # it may have been one of our own
     assert source.gaps == ((f"{lost} packets are not in the recording",) if lost else ())
+
+
+def test_a_damaged_log_is_told_with_what_was_skipped(tmp_path: Path) -> None:
+    folder, written = copied("numpy_px4", tmp_path), tmp_path / "replay.json"
+    log = bytearray((folder / "link.tlog").read_bytes())
+    place = len(log) // 2
+    log[place : place + 500] = b"?" * 500
+    (folder / "link.tlog").write_bytes(log)
+
+    replay(folder, ReplayConfig(source="chunks", json=written))
+
+    told = json.loads(written.read_text())["gaps"]
+    assert re.search(r"link.tlog is damaged.*: 5\d\d bytes were skipped, with \d+ packets", told[0])
+    assert re.search(r"\d+ packets are not in the recording", told[1])

@@ -2,12 +2,14 @@ import socket
 
 import pytest
 
+from helpers.network import needs_ipv6
 from mavbridge.core.errors import UserError
+from mavbridge.core.processes import free_port
 from mavbridge.observe.viewer.server import ServeAddress, serve_address
 
 
 @pytest.mark.parametrize(
-    "text", ["9090", "127.0.0.1", "127.0.0.1:", ":9090", "h:0", "h:65535", "h:x"]
+    "text", ["9090", "127.0.0.1", "127.0.0.1:", ":9090", "h:0", "h:65535", "h:x", "::1:9090"]
 )
 def test_what_is_no_address_is_refused_with_an_example(text: str) -> None:
     with pytest.raises(UserError, match=r"HOST:PORT, such as 127\.0\.0\.1:9090"):
@@ -20,6 +22,23 @@ def test_a_port_that_is_taken_is_refused(distance: int) -> None:
         taken = server.getsockname()[1]
         with pytest.raises(UserError, match=f"cannot listen on 127.0.0.1 port {taken} "):
             serve_address(f"127.0.0.1:{taken - distance}")
+
+
+@needs_ipv6
+def test_an_ipv6_address() -> None:
+    port = free_port(socket.SOCK_STREAM)
+    address = serve_address(f"[::1]:{port}")
+    assert address == ServeAddress("::1", port)
+    assert address.page_url.startswith(f"http://[::1]:{port}/?url=rerun%2Bhttp://")
+
+
+@needs_ipv6
+def test_an_address_of_one_network_card_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
+    port = free_port(socket.SOCK_STREAM)
+    link_local = ("::1", port, 0, 1)
+    monkeypatch.setattr(socket, "getaddrinfo", lambda *_, **__: [(10, 1, 6, "", link_local)])
+    with pytest.raises(UserError, match="link-local"):
+        serve_address(f"[fe80::1%eth0]:{port}")
 
 
 def test_a_host_of_somebody_else_is_refused() -> None:

@@ -27,6 +27,13 @@ PI0 = json.dumps({"type": "pi0", "input_features": {}, "output_features": {}})
 SAFETENSORS, TORCH = "model.safetensors", "model.pt"
 
 
+@pytest.mark.parametrize("name", ["weights.safetensors", "weights.pt"])
+def test_a_pipe_is_refused_and_not_waited_for(tmp_path: Path, name: str) -> None:
+    os.mkfifo(tmp_path / name)
+    with pytest.raises(CheckpointError, match="not a file but a pipe or a device"):
+        read_contract(tmp_path / name)
+
+
 class Runs:
     """Makes a folder if it is unpickled."""
 

@@ -1,16 +1,21 @@
 """Graphs of other tools: they fly as they are, or are refused in one sentence."""
 
+import os
 from collections.abc import Callable
 from pathlib import Path
+from random import Random
 
 import numpy as np
 import pytest
+import torch
+from torch import Tensor, nn
 
 pytest.importorskip("onnx", reason="the extra onnx writes the graphs")
 
-from onnx import TensorProto
+from onnx import TensorProto, helper
 
 from helpers import foreign_graphs as graphs
+from mavbridge.__main__ import main
 from policy.engines.executable import level_state
 from policy.errors import PolicyError
 from policy.foreign.drafts.onnx import onnx_entries
@@ -99,6 +104,20 @@ def pointer(path: Path) -> None:
     path.write_text("version https://git-lfs.github.com/spec/v1\noid sha256:00\nsize 208\n")
 
 
+def one_node(
+    folder: Path, kind: str, *, weight: np.ndarray | None = None, domain: str = ""
+) -> None:
+    """Write obs [1, 13] -> one node -> actions."""
+    weights = {} if weight is None else {"w": weight}
+    graphs.save_graph(
+        folder / "policy.onnx",
+        [helper.make_node(kind, ["obs", *weights], ["actions"], domain=domain)],
+        {"obs": (graphs.FLOAT, (1, 13))},
+        {"actions": (graphs.FLOAT, (1, 4 if weight is None else weight.shape[1]))},
+        weights,
+    )
+
+
 REFUSED: dict[str, tuple[Write, str]] = {
     "external data missing": (
         lambda folder: external(folder, Path.unlink),
@@ -140,7 +159,40 @@ REFUSED: dict[str, tuple[Write, str]] = {
         r"no output 'action' \(actions\)",
     ),
     "no graph": (lambda folder: (folder / "policy.onnx").write_bytes(b"\x08\x07"), r"policy\.onnx"),
+    "noise": (
+        lambda folder: (folder / "policy.onnx").write_bytes(Random(1).randbytes(500)),
+        r"policy\.onnx cannot be read as ONNX \(it is something else",
+    ),
+    "graph cut": (
+        lambda folder: [
+            graphs.actor(folder / "policy.onnx"),
+            os.truncate(folder / "policy.onnx", 150),
+        ],
+        r"policy\.onnx cannot be read as ONNX .* breaks off\).*copy it again",
+    ),
+    "operator of a vendor": (
+        lambda folder: one_node(folder, "Foo", domain="com.acme"),
+        r"policy\.onnx holds what OpenVINO cannot run \(.*com\.acme\.Foo.*ONNX standard",
+    ),
+    "shapes that do not fit": (
+        lambda folder: one_node(folder, "MatMul", weight=np.zeros((7, 4), np.float32)),
+        r"policy\.onnx holds what OpenVINO cannot run",
+    ),
+    "three actions": (
+        lambda folder: one_node(folder, "MatMul", weight=np.zeros((13, 3), np.float32)),
+        r"onnx:.*its chunk is \[1, 1, 3\], and its last axis must be the 4 numbers",
+    ),
+    "not a number": (
+        lambda folder: one_node(folder, "MatMul", weight=np.full((13, 4), np.nan, np.float32)),
+        r"onnx:.*NaN or infinity",
+    ),
 }
+COMMANDS: dict[str, Callable[[Path], list[str]]] = {
+    "flight": lambda folder: [*LINK, "--readonly", "--policy", f"onnx:{folder}"],
+    "check": lambda folder: ["check", *LINK, "--policy", f"onnx:{folder}"],
+    "contract": lambda folder: ["contract", f"{folder}/policy.onnx", "--out", f"{folder}/d.toml"],
+}
+LINK = ["--connect", "udp:127.0.0.1:17180", "--camera", "none", "--connect-timeout", "0.1"]
 
 
 @pytest.mark.parametrize("case", REFUSED)
@@ -150,6 +202,34 @@ def test_what_cannot_fly_is_refused_by_its_cause(tmp_path: Path, case: str) -> N
     write(tmp_path)
     with pytest.raises(PolicyError, match=told):
         load(f"onnx:{tmp_path}")
+
+
+@pytest.mark.parametrize("command", COMMANDS)
+@pytest.mark.parametrize("case", REFUSED)
+def test_every_reader_names_the_cause_and_no_library_speaks(
+    tmp_path: Path, case: str, command: str, capfd: pytest.CaptureFixture[str]
+) -> None:
+    write, _ = REFUSED[case]
+    graphs.write_contract(tmp_path)
+    write(tmp_path)
+    with pytest.raises(SystemExit) as ended:
+        main(COMMANDS[command](tmp_path))
+    shown = "".join(capfd.readouterr())
+    drafted = command == "contract" and (tmp_path / "d.toml").is_file()
+    assert ended.value.code == (0 if drafted else 3 if command == "check" else 2)
+    assert "Traceback" not in shown
+    assert "GraphDef" not in shown
+    if not drafted:
+        assert tmp_path.name in shown.replace("\n", "").replace(" ", "")
+
+
+def test_a_draft_has_the_state_whatever_its_input_is_called(tmp_path: Path) -> None:
+    graphs.actor(tmp_path / "policy.onnx", state="obs")
+    graphs.recurrent(tmp_path / "recurrent.onnx")
+    for name in ("policy.onnx", "recurrent.onnx"):
+        found = {(each.table, each.name): each.value for each in onnx_entries([tmp_path / name])}
+        assert found["state", "key"] == "obs"
+        assert found["state", "names"] == ["?"] * 13
 
 
 @pytest.mark.parametrize("case", [each for each in REFUSED if "external" in each])
@@ -182,3 +262,20 @@ def test_a_recurrent_torchscript_keeps_its_state_until_reset(tmp_path: Path) -> 
         throttles = [act(executable)[0] for _ in range(3)]
         assert throttles == pytest.approx([0.1, 0.2, 0.3], abs=1e-3)
         executable.reset()
+
+
+class Deep(nn.Module):
+    """Fails inside of torch."""
+
+    def forward(self, image: Tensor, state: Tensor) -> Tensor:
+        """Multiply matrices that do not fit."""
+        return torch.matmul(state, torch.zeros(7, 4))
+
+
+def test_an_error_inside_of_torchscript_is_one_sentence(tmp_path: Path) -> None:
+    graphs.write_contract(tmp_path)
+    graphs.save_script(tmp_path / "policy.pt", Deep())
+    with pytest.raises(PolicyError, match=r"policy\.pt failed on a state: .*13 and 7x4") as refusal:
+        load(f"torchscript:{tmp_path / 'policy.pt'}")
+    assert "Traceback" not in str(refusal.value)
+    assert "\n" not in str(refusal.value)

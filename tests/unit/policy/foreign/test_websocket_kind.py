@@ -13,7 +13,14 @@ from policy.loading.request import PolicyRequest
 
 
 @pytest.mark.parametrize(
-    "url", ["ws://127.0.0.1:8000", "ws://[::1]:8000", "wss://policies.example", "ws://gpu:80/path"]
+    "url",
+    [
+        "ws://127.0.0.1:8000",
+        "ws://[::1]:8000",
+        "ws://[fe80::1%lo]:8000",
+        "wss://policies.example",
+        "ws://gpu:80/path",
+    ],
 )
 def test_addresses_of_servers(url: str) -> None:
     check_server(url, None, None)
@@ -48,6 +55,11 @@ def test_a_missing_package_is_told_with_its_extra(monkeypatch: pytest.MonkeyPatc
     monkeypatch.setattr(kind, "find_spec", lambda name: None if name == "msgpack" else object())
     with pytest.raises(PolicyError, match=r"needs msgpack: pip install msgpack"):
         check_server("ws://127.0.0.1:8000", None, None)
+
+
+@pytest.mark.parametrize("host", ["::1", "[::1]", "fe80::1%eth0", "[fe80::1%eth0]", "localhost"])
+def test_an_ipv6_address_to_serve_at_may_have_brackets(host: str) -> None:
+    assert ServeConfig(host=host).host == host.strip("[]")
 
 
 @pytest.mark.parametrize(

@@ -6,6 +6,7 @@ from contextlib import closing, suppress
 import pytest
 from pymavlink.dialects.v20 import ardupilotmega as mav
 
+from helpers.network import needs_ipv6
 from mavbridge.core.processes import free_port
 from sitl import UsageError
 from sitl.clock import NS_PER_S, Clock
@@ -27,9 +28,10 @@ def drain_until(transport, count):
     return received
 
 
-def udp_client():
-    client = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
-    client.bind(("127.0.0.1", 0))
+def udp_client(host="127.0.0.1"):
+    family = socket.AF_INET6 if ":" in host else socket.AF_INET
+    client = socket.socket(family, socket.SOCK_DGRAM)
+    client.bind((host, 0))
     client.settimeout(DEADLINE_S)
     return client
 
@@ -37,9 +39,13 @@ def udp_client():
 FRAME = mav.MAVLink_timesync_message(0, 1).pack(mav.MAVLink(None))
 
 
-def test_udpout_sends_first_and_hears_the_answer():
-    with udp_client() as ground:
-        url = f"udpout:127.0.0.1:{ground.getsockname()[1]}"
+@pytest.mark.parametrize(
+    ("host", "spelling"),
+    [("127.0.0.1", "127.0.0.1"), pytest.param("::1", "[::1]", marks=needs_ipv6)],
+)
+def test_udpout_sends_first_and_hears_the_answer(host, spelling):
+    with udp_client(host) as ground:
+        url = f"udpout:{spelling}:{ground.getsockname()[1]}"
         with closing(open_transport(url, Clock())) as link:
             link.send(FRAME)
             data, address = ground.recvfrom(2048)

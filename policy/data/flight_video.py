@@ -1,0 +1,206 @@
+"""Images of a recorded flight: fragmented MP4, one fragment a frame, whole or damaged.
+
+RGB images are in H.264, depth images in FFV1.
+
+Layout: ISO/IEC 14496-12. A moov box without samples, then a moof and an mdat box for each frame.
+"""
+
+import io
+import mmap
+from collections.abc import Collection, Iterator
+from pathlib import Path
+from typing import NamedTuple
+
+import av
+import numpy as np
+from numpy.typing import NDArray
+
+from policy.contract import CameraImage
+from policy.files import library_name
+
+_BOX_HEADER_BYTES = 8
+_KINDS = (b"ftyp", b"moov", b"moof", b"mdat", b"mfra", b"free")
+_MOOF_TO_MFHD, _MOOF_TO_NUMBER = 12, 20
+"""Offsets in a moof box: of the name of its first child, and of its sequence number, from 1."""
+_SLICE, _KEY_SLICE = 1, 5
+"""NAL unit types of H.264."""
+
+
+class Fragment(NamedTuple):
+    """A moof box and its mdat box."""
+
+    number: int
+    """Of the image in the flight, from 0."""
+    start: int
+    end: int
+    is_key: bool
+
+
+class VideoParts(NamedTuple):
+    """What of a video can be decoded."""
+
+    head_bytes: int
+    fragments: tuple[Fragment, ...]
+    """Behind damage from the next key frame on."""
+    skipped_bytes: int
+    skipped_frames: int
+    is_ours: bool
+    """One image a fragment, as flights are recorded; else any MP4, read as far as it goes."""
+
+    def describe(self, path: Path) -> str | None:
+        """Return a sentence for the user; None if nothing was skipped."""
+        if not self.skipped_bytes:
+            return None
+        return (
+            f"{path} is damaged or cut off: {self.skipped_bytes} bytes and {self.skipped_frames} "
+            "whole images that need what is lost were skipped"
+        )
+
+
+def video_parts(path: Path) -> VideoParts:
+    """Find the images of a video without decoding them; raises OSError."""
+    size = path.stat().st_size
+    if not size:
+        return VideoParts(0, (), 0, 0, is_ours=True)
+    with path.open("rb") as file, mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ) as data:
+        fragments, skipped, head = [], 0, 0
+        is_intra = data.find(b"FFV1", 0, max(0, data.find(b"moof"))) >= 0  # depth images
+        at, moof, others = 0, -1, 0
+        while at < size:
+            kind, end = data[at + 4 : at + 8], at + int.from_bytes(data[at : at + 4], "big")
+            if kind not in _KINDS or not at + _BOX_HEADER_BYTES <= end <= size:
+                end, moof = _next_moof(data, at + 1), -1
+                skipped += end - at
+            elif kind == b"moof":
+                moof, head = at, head or at
+            elif kind == b"mdat":
+                is_single = moof >= 0 and _number(data, data.find(b"trun", moof, at) + 8) == 1
+                is_key: bool | None = None
+                if is_single:
+                    is_key = is_intra or _is_key(data, at + _BOX_HEADER_BYTES, end)
+                if is_key is None:
+                    others, skipped = others + (not is_single), skipped + end - max(moof, 0)
+                else:
+                    number = _number(data, moof + _MOOF_TO_NUMBER) - 1
+                    fragments.append(Fragment(number, moof, end, is_key))
+                moof = -1
+            at = end
+    kept, is_ours = list(_decodable(fragments)), others <= len(fragments)
+    return VideoParts(head, tuple(kept), skipped, len(fragments) - len(kept), is_ours)
+
+
+def _number(data: mmap.mmap, at: int) -> int:
+    return int.from_bytes(data[at : at + 4], "big")
+
+
+def with_images(
+    path: Path, numbers: NDArray[np.int64], *, is_whole: bool
+) -> tuple[NDArray[np.int64], list[str]]:
+    """Choose the rows, of these numbers, that have an image in the video.
+
+    ``is_whole``: the flight ended in order, so that each row had one. Raises OSError.
+
+    Returns:
+        The places of the rows, and sentences on what is lost.
+    """
+    parts = video_parts(path)
+    if not parts.is_ours:
+        return np.arange(len(numbers)), []
+    found = [fragment.number for fragment in parts.fragments]
+    places = np.flatnonzero(np.isin(numbers, found))
+    damage = [text] if (text := parts.describe(path)) else []
+    lost, extra = len(numbers) - len(places), len(found) - len(places)
+    if is_whole and (lost or extra):
+        damage.append(f"{path}: {lost} of its rows have no image, {extra} images have no row")
+    return places, damage
+
+
+def _next_moof(data: mmap.mmap, at: int) -> int:
+    """Return where the next moof box begins, here at the earliest, or the end of the data."""
+    at += 4  # its size comes before its name
+    while (found := data.find(b"moof", at)) >= 0:
+        start = found - 4
+        if data[start + _MOOF_TO_MFHD : start + _MOOF_TO_MFHD + 4] == b"mfhd":
+            return start
+        at = found + 1
+    return len(data)
+
+
+def _is_key(data: mmap.mmap, at: int, end: int) -> bool | None:
+    """Return whether an image depends on no other; None if it is no H.264."""
+    is_key = None
+    while at + 4 < end:
+        kind = data[at + 4] & 0x1F
+        if kind in (_SLICE, _KEY_SLICE):
+            is_key = kind == _KEY_SLICE
+        at += 4 + int.from_bytes(data[at : at + 4], "big")
+    return is_key if at == end else None
+
+
+def _decodable(fragments: list[Fragment]) -> Iterator[Fragment]:
+    """Leave out what cannot be decoded behind a gap; each image needs the one before it."""
+    expected, is_broken = 0, False
+    for fragment in fragments:
+        is_broken = not fragment.is_key and (is_broken or fragment.number != expected)
+        expected = fragment.number + 1
+        if not is_broken:
+            yield fragment
+
+
+def decode_images(path: Path, parts: VideoParts, numbers: Collection[int]) -> Iterator[CameraImage]:
+    """Yield the images of these numbers, rising, of those in ``parts``, as they were recorded.
+
+    RGB [H, W, 3] uint8, or depth [H, W] uint16.
+
+    Raises:
+        OSError, ValueError, av.FFmpegError: an image is damaged inside.
+    """
+    wanted = set(numbers)
+    if not wanted:
+        return
+    if not parts.is_ours:
+        yield from _decode_any(path)
+        return
+    if missing := wanted - {fragment.number for fragment in parts.fragments}:
+        raise ValueError(f"{len(missing)} of {len(wanted)} images are missing")
+    end = parts.fragments[-1].end
+    is_whole = parts.head_bytes + sum(e.end - e.start for e in parts.fragments) == end
+    # Mapped up to the last whole image, since demuxers stumble over a torn box.
+    with path.open("rb") as file, mmap.mmap(file.fileno(), end, access=mmap.ACCESS_READ) as data:
+        whole: mmap.mmap | io.BytesIO = data
+        if not is_whole:
+            pieces = [data[each.start : each.end] for each in parts.fragments]
+            whole = io.BytesIO(b"".join([data[: parts.head_bytes], *pieces]))
+        with av.open(whole, "r", format="mp4") as container:
+            stream = container.streams.video[0]
+            stream.codec_context.options = {"err_detect": "explode"}
+            images = zip(parts.fragments, container.decode(stream), strict=False)
+            left = len(wanted)
+            for fragment, image in images:
+                if fragment.number in wanted:
+                    yield _pixels(image)
+                    left -= 1
+                    if not left:
+                        return
+        raise ValueError(f"{left} images are missing at its end")
+
+
+def _decode_any(path: Path) -> Iterator[CameraImage]:
+    """Yield the images of a video that another program wrote, up to where it breaks off."""
+    # Read as MP4, since a playlist would name other files.
+    with av.open(library_name(path), format="mp4") as container:
+        images = container.decode(video=0)
+        while True:
+            try:
+                image = next(images, None)
+            except av.FFmpegError:
+                return
+            if image is None:
+                return
+            yield _pixels(image)
+
+
+def _pixels(image: av.VideoFrame) -> CameraImage:
+    if image.format.name.startswith("gray16"):
+        return image.to_ndarray().astype(np.uint16, copy=False)
+    return image.to_ndarray(format="rgb24").astype(np.uint8, copy=False)

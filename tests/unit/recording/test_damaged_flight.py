@@ -1,0 +1,130 @@
+"""A damaged recording is read on behind the damage, and every reader says what is lost."""
+
+import json
+import shutil
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import pyarrow.parquet as pq
+import pytest
+
+from helpers.factories import make_tick
+from helpers.recordings import make_frame, make_meta, number_of, without_writer_process
+from mavbridge.commands.inspect.config import InspectConfig
+from mavbridge.commands.inspect.run import inspect
+from mavbridge.recording.flight_folder import open_flight
+from mavbridge.recording.flight_writer import FlightWriter
+from policy.data.flight_folders import read_flight
+from policy.data.flight_video import video_parts
+
+TICKS, FRAMES = 6000, 90
+
+
+@pytest.fixture(scope="module")
+def finished(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("finished") / "flight"
+    folder.mkdir()
+    with without_writer_process():
+        writer = FlightWriter(folder, make_meta(), pressure="offline")
+        for number in range(FRAMES):
+            writer.frame(make_frame(number))
+        for number in range(TICKS):
+            writer.tick(make_tick(number))
+        writer.finish(writer.meta)
+    return folder
+
+
+@pytest.fixture
+def flight(finished: Path, tmp_path: Path) -> Iterator[Path]:
+    with without_writer_process():
+        yield Path(shutil.copytree(finished, tmp_path / "flight"))
+
+
+def spoil(path: Path, start: int, end: int) -> None:
+    data = bytearray(path.read_bytes())
+    data[start:end] = bytes(byte ^ 0x55 for byte in data[start:end])
+    path.write_bytes(data)
+
+
+def spoil_second_group(path: Path) -> int:
+    """Damage the last bytes of a column, which are values; returns the rows of the group."""
+    group = pq.read_metadata(path).row_group(1)
+    column = group.column(0)
+    start = column.dictionary_page_offset or column.data_page_offset
+    end = start + column.total_compressed_size
+    spoil(path, end - 4, end)
+    return int(group.num_rows)
+
+
+def spoil_image(folder: Path, number: int) -> None:
+    place = video_parts(folder / "camera.mp4").fragments[number]
+    spoil(folder / "camera.mp4", place.start, place.end)
+
+
+def test_a_whole_flight_has_no_damage(flight: Path) -> None:
+    assert open_flight(flight).damage == read_flight(flight).damage == ()
+
+
+def test_rows_around_damaged_ones_are_read_and_those_are_counted(flight: Path) -> None:
+    first = pq.read_metadata(flight / "ticks.parquet").row_group(0).num_rows
+    lost = spoil_second_group(flight / "ticks.parquet")
+    back = open_flight(flight)
+    indices = [row.tick.index for row in back.tick_rows()]
+    assert indices == [*range(first), *range(first + lost, TICKS)]
+    (text,) = back.damage
+    assert f"ticks.parquet is damaged: {lost} of {TICKS} rows were skipped" in text
+    learnt = read_flight(flight)
+    assert (len(learnt.tick_ns), learnt.damage) == (TICKS - lost, (text,))
+
+
+def test_rows_keep_their_images_where_the_video_is_damaged(flight: Path) -> None:
+    spoil_image(flight, 40)
+    back = open_flight(flight)
+    numbers = [*range(40), *range(60, FRAMES)]
+    assert [number_of(rgb) for rgb in back.images()] == numbers
+    assert [row.frame_id - 1 for row in back.frame_rows()] == numbers
+    assert len(back.damage) == 2
+    learnt = read_flight(flight)
+    assert [number_of(rgb) for rgb in learnt.decode()] == numbers
+    stamps = [row.captured_ns for row in back.frame_rows()]
+    assert (learnt.captured_ns.tolist(), learnt.damage) == (stamps, back.damage)
+
+
+def test_a_stream_says_how_many_bytes_follow_its_last_whole_batch(tmp_path: Path) -> None:
+    folder = tmp_path / "flight"
+    folder.mkdir()
+    with without_writer_process():
+        writer = FlightWriter(folder, make_meta(), pressure="offline")
+        for number in range(1000):
+            writer.tick(make_tick(number))
+            writer.frame(make_frame(number % 40))
+        writer.close()
+        stream = folder / "ticks.arrows"
+        stream.write_bytes(stream.read_bytes()[:-100])
+        whole = open_flight(folder)
+    assert 0 < whole.ticks.num_rows < 1000
+    (text,) = [text for text in whole.damage if "ticks.arrows" in text]
+    left = int(text.split("its last ")[1].split()[0])
+    stream.write_bytes(stream.read_bytes()[:-left])
+    with without_writer_process():
+        again = open_flight(folder)
+    assert again.ticks.num_rows == whole.ticks.num_rows
+    assert not [text for text in again.damage if "ticks.arrows" in text]
+
+
+@pytest.mark.parametrize(
+    "damage",
+    [
+        lambda folder: spoil_second_group(folder / "ticks.parquet"),
+        lambda folder: spoil_image(folder, 40),
+    ],
+)
+def test_inspect_says_so(
+    damage: Callable[[Path], object], flight: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    damage(flight)
+    written = flight.parent / "inspect.json"
+    assert inspect([flight], InspectConfig(json=written)) == 0
+    (document,) = json.loads(written.read_text())
+    assert "were skipped" in document["damage"][0]
+    assert "damage" in capsys.readouterr().out
