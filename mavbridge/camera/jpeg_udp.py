@@ -4,7 +4,6 @@ A datagram is ``HEADER`` and a part of a JPEG or PNG. Chunks may be lost, repeat
 """
 
 import logging
-import re
 import select
 import socket
 from collections import deque
@@ -16,7 +15,7 @@ from typing import NamedTuple
 from mavbridge.camera.capture import MAX_DRIVER_AGE_NS
 from mavbridge.camera.grabber import Image
 from mavbridge.camera.pipe_frames import MAX_BAD_FRAMES, MAX_JPEG_BYTES, decode_picture
-from mavbridge.core.address import LOOPBACK
+from mavbridge.core.address import LOOPBACK, host_port
 from mavbridge.core.clock import NS_PER_S, Clock
 from mavbridge.core.errors import CameraError, UserError
 
@@ -38,7 +37,6 @@ _POLL_S = 0.1
 _RECEIVE_BUFFER_BYTES = 4 << 20
 _MOST_QUEUED = 4096
 """Datagrams read behind a whole frame: a sender faster than this computer is not followed on."""
-_ADDRESS = re.compile(r"(?:\[([^\[\]\s]+)\]:|([^:\[\]\s]+):)?(\d{1,5})", re.ASCII)
 _log = logging.getLogger(__name__)
 
 
@@ -48,10 +46,10 @@ def parse_jpeg_udp(text: str) -> tuple[str, int]:
     Raises:
         UserError: it is malformed.
     """
-    match = _ADDRESS.fullmatch(text)
-    if match is None or not 0 < int(match[3]) < 65536:
+    found = host_port(text if ":" in text else f"{LOOPBACK}:{text}")
+    if found is None:
         raise UserError(f"--camera {f'jpeg-udp:{text}'!r}: use {FORM}")
-    return match[1] or match[2] or LOOPBACK, int(match[3])
+    return found
 
 
 class FrameKey(NamedTuple):
