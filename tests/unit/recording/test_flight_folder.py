@@ -18,11 +18,6 @@ from mavbridge.recording.meta import FlightError, read_meta, write_meta
 from mavbridge.recording.rows import LATER, TICKS, FrameTruth, TickLabels
 from mavbridge.recording.tlog import open_tlog_pipe
 from policy.contract import (
-    ACTION_TERMS,
-    DEPTH_TERMS,
-    FLIGHT_TERMS,
-    OBSERVATION_TERMS,
-    STALL_TERMS,
     Contract,
 )
 
@@ -231,16 +226,6 @@ def test_what_is_no_flight_says_what_is_wanted(flight: Path) -> None:
         with pytest.raises(MavbridgeError) as error:
             open_flight(path)
         assert told in str(error.value)
-
-
-def test_a_flight_whose_contract_is_of_version_1_is_read(flight: Path) -> None:
-    path = flight / "meta.json"
-    contract = json.loads(path.read_text())["contract"]
-    assert contract["version"] == 6
-    later = (*FLIGHT_TERMS, *ACTION_TERMS, *OBSERVATION_TERMS, *STALL_TERMS, *DEPTH_TERMS)
-    old = {name: value for name, value in contract.items() if name not in later}
-    _meta(contract={**old, "version": 1})(flight)
-    assert open_flight(flight).meta.contract == make_meta().contract
 
 
 def test_later_keys_in_meta_are_left_aside(flight: Path) -> None:
