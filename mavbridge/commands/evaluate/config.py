@@ -2,7 +2,7 @@
 
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Literal
 
 from cyclopts import Parameter
 
@@ -59,8 +59,6 @@ class EvaluateConfig:
     clock: ClockKind = "simulated"
     """simulated: bridge and simulator in lockstep, faster than real time, the same for the same
     seed. wall: real processes over UDP in real time, one flight at a time."""
-    realtime: Annotated[bool | None, Parameter(negative="--lockstep", show=False)] = None
-    """The old names of --clock wall and --clock simulated."""
     vision_delay: float = 0.0
     """Milliseconds added to the encoding of each image (simulated clock); an image older than
     --max-feature-age is not flown by. Here such limits may also be looser than the policy's."""
@@ -113,7 +111,7 @@ class EvaluateConfig:
     @property
     def is_wall_clock(self) -> bool:
         """Flights take real time."""
-        return self.clock == "wall" if self.realtime is None else self.realtime
+        return self.clock == "wall"
 
     @property
     def rates(self) -> Rates:

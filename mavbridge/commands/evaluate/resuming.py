@@ -25,8 +25,6 @@ def identity(config: EvaluateConfig) -> str:
     flags = replace(
         config,
         policy=replace(config.policy, checkpoint=None, contract=None),
-        clock="wall" if config.is_wall_clock else "simulated",
-        realtime=None,
         episodes=1,
         workers=WorkersConfig(),
         resume=False,

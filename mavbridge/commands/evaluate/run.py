@@ -34,9 +34,6 @@ def evaluate(config: EvaluateConfig) -> int:
     """
     require_outputs(config.json, config.plot)
     console = Console(stderr=True, emoji=False)
-    if config.realtime is not None:
-        names = ("--realtime", "wall") if config.realtime else ("--lockstep", "simulated")
-        console.print(Text("{} is now --clock {}".format(*names), style="yellow"))
     flown_by = "" if config.json is None else identity(config)
     flown = flown_before(config, flown_by) if config.resume else {}
     failure: MavbridgeError | None = None
