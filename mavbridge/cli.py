@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Annotated, Any
 
 from cyclopts import App, CycloptsError, Parameter, UnusedCliTokensError
+from cyclopts.argument import ArgumentCollection, update_argument_collection
 from cyclopts.config import Dict
 from rich.text import Text
 
@@ -319,11 +320,27 @@ def with_config(
                 f"itself: give {flag} on the command line, or --trust-config if you know the file"
             )
         cli.config = [
-            Dict(_with_home(document), use_commands_as_keys=False, source=str(config)),
+            _Settings(_with_home(document), source=str(config)),
         ]
     with run_log(log_file, verbose=verbose):
         status: int | None = cli(_with_home(list(tokens)))
     return status or 0
+
+
+class _Settings(Dict):
+    """A settings file. Its keys are flags, of which some are named as commands: record, serve."""
+
+    def __call__(self, app: App, commands: tuple[str, ...], arguments: ArgumentCollection) -> None:
+        """See ``Dict``, which leaves such keys out; tables for other commands stay left out."""
+        flags = {k: v for k, v in self.data.items() if not (isinstance(v, dict) and k in cli)}
+        update_argument_collection(
+            flags,
+            self.source,
+            arguments,
+            app.app_stack.stack[-1],
+            root_keys=(),
+            allow_unknown=self.allow_unknown,
+        )
 
 
 def _with_home(value: Any) -> Any:

@@ -51,8 +51,8 @@ def _leaves(value: Any, keys: tuple[str, ...]) -> Iterator[tuple[tuple[str, ...]
     elif isinstance(value, list):
         for each in value:
             yield from _leaves(each, keys)
-    elif isinstance(value, str):
-        yield keys, value
+    elif isinstance(value, str | int | float):
+        yield keys, str(value)
 
 
 def _foreign(key: str, value: str) -> str | None:
@@ -63,6 +63,6 @@ def _foreign(key: str, value: str) -> str | None:
         return "a program" if source.startswith("pipe:") else None
     if key in _ADDRESS_KEYS and not _LOCAL.match(value):
         return "another computer, or a port that is open to others"
-    if key in _OUTPUT_KEYS and (Path(value).is_absolute() or {"..", "~"} & {*Path(value).parts}):
+    if key in _OUTPUT_KEYS and (value.startswith(("/", "~")) or ".." in Path(value).parts):
         return "a place outside the working directory to write to"
     return None

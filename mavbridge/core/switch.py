@@ -44,7 +44,8 @@ class Switch:
         """Take a reading, or the same one again; True at the act of going high."""
         if value_us not in RADIO_US:
             return False
-        if self._newest_ns is not None and arrived_ns - self._newest_ns > GAP_NS:
+        before = self.position
+        if is_late := self._newest_ns is not None and arrived_ns - self._newest_ns > GAP_NS:
             self.forget()
         position: Position = (
             "high" if value_us > ON_US else "low" if value_us < OFF_US else "middle"
@@ -55,6 +56,8 @@ class Switch:
         held_ns = arrived_ns - self._since_ns
         if position == "low":
             self.is_off, self.is_on = True, False
+        elif position == "high" and is_late and before == "high":
+            self.is_off, self.is_on = False, True  # on a slow link; no act
         if position in self._rests:
             self._has_rested |= held_ns >= self._rest_ns
         elif position == "high" and held_ns >= DWELL_NS:

@@ -94,6 +94,10 @@ class Departure:
         """The sticks are released: from now on every mode change is somebody else's."""
         self.mode = None
 
+    def ask_at_once(self, now_ns: int) -> None:
+        """Let the next request for the mode wait for no spacing."""
+        self._request_due_ns, self._asks_until_ns = now_ns, now_ns + MODE_TIMEOUT_NS
+
     def begin(self, facts: Facts, ending: Ending) -> None:
         """Choose the safe mode for the vehicle as it is now."""
         self._began_ns = self._request_due_ns = facts.now_ns

@@ -92,8 +92,10 @@ class EngagementSettings:
 class Engagement:
     """Decides who holds the sticks; ``step`` is called at every wake of the gate."""
 
-    def __init__(self, settings: EngagementSettings) -> None:
+    def __init__(self, settings: EngagementSettings, *, chunk_period_ns: int = 0) -> None:
+        """``chunk_period_ns``: between chunks; the first one after a reset may take two."""
         self._settings = settings
+        self._first_chunk_ns = ACT_TIMEOUT_NS + 2 * chunk_period_ns
         self._departure = Departure(settings.departure)
         self._wants_arm = settings.arm
         self._own_mode: str | None = None
@@ -217,7 +219,7 @@ class Engagement:
             return "a failsafe of the vehicle is active"
         if self._switch.is_off:
             return f"the engage switch (channel {self._settings.engage_channel}) is off"
-        return facts.chunk_problem or facts.envelope_problem
+        return facts.envelope_problem
 
     def _mode_objection(self, facts: Facts) -> str | None:
         if facts.mode in self._settings.preparation.modes:
@@ -245,7 +247,7 @@ class Engagement:
             return Move()
         if not facts.armed:
             self.refusal = "not engaged: the vehicle is disarmed; arm it first, or use --arm"
-        elif (objection := self._objection(facts)) is not None:
+        elif (objection := self._objection(facts) or facts.chunk_problem) is not None:
             self.refusal = f"not engaged: {objection}"
         elif self._preparation.may_change_mode(facts):
             return self._begin_preparing(facts, ACT_TIMEOUT_NS)
@@ -266,6 +268,7 @@ class Engagement:
         self._preparation.begin(facts)
         self._prepare_timeout_ns, self._prepare_until_ns = timeout_ns, facts.now_ns + timeout_ns
         self._seen_interruption = facts.interruption
+        self.starting_ns = None
         return self._prepare(facts, None)
 
     def _prepare(self, facts: Facts, act: Act | None) -> Move:
@@ -283,7 +286,9 @@ class Engagement:
         is_late = facts.now_ns > self._prepare_until_ns
         if is_late or self._preparation.impossibility(facts) is not None:
             return self._give_up_preparing(facts)
-        preparing = self._preparation.step(facts, self._objection(facts))
+        # Once the policy is being reset, its silence is no reason to begin that anew.
+        chunk_problem = facts.chunk_problem if self.starting_ns is None else None
+        preparing = self._preparation.step(facts, self._objection(facts) or chunk_problem)
         self.reason = preparing.waits_for or "waiting for the policy's first chunk after its reset"
         if self._is_started(facts, is_ready=not preparing.waits_for):
             return self._take_off(facts)
@@ -295,14 +300,24 @@ class Engagement:
             self.starting_ns = None
         elif self.starting_ns is None:
             self.starting_ns = facts.now_ns
-        return is_ready and facts.is_policy_reset
+            until_ns = facts.now_ns + self._first_chunk_ns
+            self._prepare_until_ns = max(self._prepare_until_ns, until_ns)
+        return is_ready and facts.is_policy_reset and facts.chunk_problem is None
 
     def _give_up_preparing(self, facts: Facts) -> Move:
         """The vehicle, or an input, was not ready in time."""
-        problem = self._preparation.impossibility(facts) or (
-            f"the vehicle is not ready after {self._prepare_timeout_ns // NS_PER_S} s "
-            f"(mode {facts.mode}, armed {facts.armed}, overrides seen {facts.echo_confirmed}, "
-            f"inputs {facts.chunk_problem or 'fine'}): see its messages above"
+        unsolved = self.starting_ns is not None and (
+            "the policy has not returned a chunk that may be flown since its reset: "
+            f"{facts.chunk_problem or 'none has come'}"
+        )
+        problem = (
+            self._preparation.impossibility(facts)
+            or unsolved
+            or (
+                f"the vehicle is not ready after {self._prepare_timeout_ns // NS_PER_S} s "
+                f"(mode {facts.mode}, armed {facts.armed}, overrides seen {facts.echo_confirmed}, "
+                f"inputs {facts.chunk_problem or 'fine'}): see its messages above"
+            )
         )
         if self._prepare_timeout_ns == ACT_TIMEOUT_NS:  # the act may be repeated
             self.refusal = f"not engaged: {problem}"
@@ -365,7 +380,8 @@ class Engagement:
             return facts.overruled
         if facts.is_switched_off:
             return "the pilot's override switch is off"
-        if self._switch.is_off and self.phase is Phase.FLYING:
+        is_act = self.phase is Phase.PREPARING and self._prepare_timeout_ns == ACT_TIMEOUT_NS
+        if self._switch.is_off and (self.phase is Phase.FLYING or is_act):
             return "the pilot's engage switch is off"
         if not facts.armed and self.phase is not Phase.PREPARING:
             return "the vehicle has been disarmed"
@@ -402,7 +418,7 @@ class Engagement:
     def _give_back(self, facts: Facts, reason: str) -> Move:
         """Release in this same step, and no mode command."""
         had_sticks = self.phase is not Phase.PREPARING or self._preparation.has_sticks
-        self.phase = Phase.RELEASING
+        self.phase, self.starting_ns = Phase.RELEASING, None
         self.reason = reason
         self._released_ns = facts.now_ns
         # At least once, also where nothing seems to be held: a reboot may be but a wrong stamp.
@@ -416,7 +432,7 @@ class Engagement:
         if self.phase is Phase.FLYING and self.outcome.end is None:
             end = "fault" if ending.is_fault else ending.end
             self.outcome = self.outcome._replace(end=end)
-        self.phase = Phase.LEAVING
+        self.phase, self.starting_ns = Phase.LEAVING, None
         self.reason = ending.reason
         self._must_end = self._must_end and ending is not self._stop_reason
         self._departure.begin(facts, ending)
@@ -428,8 +444,7 @@ class Engagement:
         if self.phase is Phase.HOLDING and (act == "release" or self._must_end):
             # What held after a fault now ends as a flight without a fault does.
             return self._depart(facts, self._stop_reason or Ending(reason=OPERATOR))
-        has_link = self.phase is Phase.LEAVING or facts.link_problem is None
-        if has_link and self._unheard_ns is None:
+        if self._unheard_ns is None:
             self._heard_ns = facts.now_ns
         taken = self._takeover(facts)
         if facts.now_ns - self._heard_ns >= LOST_NS:
@@ -466,6 +481,8 @@ class Engagement:
             self.phase = Phase.ENDED
             return Move()
         objection = self._objection(facts)
+        if self.phase is Phase.FLYING or self.starting_ns is None:
+            objection = objection or facts.chunk_problem
         if objection is not None:
             self.phase, self.reason = Phase.WAITING, objection
         if self.phase is Phase.FLYING:
@@ -481,6 +498,7 @@ class Engagement:
         A copy of this machine takes the death for a fault, and hears nothing more of the vehicle.
         """
         twin = deepcopy(self, {id(self._settings): self._settings})
+        twin._departure.ask_at_once(facts.now_ns)
         if self.phase in (Phase.PREPARING, Phase.FLYING):
             twin.stop(Ending(reason="the gate has died", is_fault=True))
         # Sticks jump to neutral, unseen by us; the flight process says the words at once, or never.

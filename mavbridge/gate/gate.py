@@ -110,7 +110,7 @@ class Gate:
         """A chunk is sampled this far ahead of the send, but not beyond its end: the lag of our own
         low-pass."""
         self._envelope = Envelope(settings.envelope)
-        self._engagement = Engagement(settings.engagement)
+        self._engagement = Engagement(settings.engagement, chunk_period_ns=settings.chunk_period_ns)
         self._grid = StickGrid(settings.stick_period_ns, now_ns)
         self._stepped_ns = self._heard_ns = now_ns
         """The last step; the last one after which the gate can tell silence of the vehicle."""

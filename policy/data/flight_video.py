@@ -140,10 +140,15 @@ def _is_key(data: mmap.mmap, at: int, end: int) -> bool | None:
 def _decodable(fragments: list[Fragment]) -> Iterator[Fragment]:
     """Leave out what cannot be decoded behind a gap; each image needs the one before it."""
     expected, is_broken = 0, False
-    for fragment in fragments:
-        is_broken = not fragment.is_key and (is_broken or fragment.number != expected)
-        expected = fragment.number + 1
+    last = max((each.number for each in fragments), default=0)
+    for place, fragment in enumerate(fragments):
+        # A key image may come after lost ones; a damaged number would move all that follow.
+        later = fragments[place + 1].number if place + 1 < len(fragments) else last + 1
+        is_next = fragment.number == expected
+        is_key = fragment.is_key and (is_next or expected < fragment.number < later)
+        is_broken = not is_key and (is_broken or not is_next)
         if not is_broken:
+            expected = fragment.number + 1
             yield fragment
 
 

@@ -86,7 +86,7 @@ def read_rows(stem: Path, damage: list[str]) -> tuple[pa.Table, NDArray[np.int64
     if parquet.exists():
         return _read_groups(parquet, damage)
     stream = stem.with_suffix(".arrows")
-    batches, end, size = [], 0, stream.stat().st_size
+    batches, rows, end, size = [], 0, 0, stream.stat().st_size
     if size == 0:  # killed before the first batch
         return pa.table({}), np.zeros(0, np.int64)
     with stream.open("rb") as file, pa.ipc.open_stream(file) as reader:
@@ -94,6 +94,9 @@ def read_rows(stem: Path, damage: list[str]) -> tuple[pa.Table, NDArray[np.int64
             while True:
                 end = file.tell()
                 batches.append(reader.read_next_batch())
+                rows += batches[-1].num_rows
+                if rows > MAX_ROWS:
+                    raise DatasetError(f"{stream} has {rows} rows, more rows than a flight has")
         except StopIteration:
             end = size
         except (pa.ArrowException, OSError):

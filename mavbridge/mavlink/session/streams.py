@@ -39,6 +39,8 @@ class _Stream:
         """An optional group that the vehicle does not grant."""
         self.received: dict[str, int] = {}
         """By message: a vehicle may send a second one of the group unasked."""
+        self.has_settled = False
+        """It was granted or given up once."""
         self.newest_ns = 0
         self.stand_in_due_ns = 0
         self.is_absence_told = False
@@ -58,7 +60,7 @@ class _Stream:
         self.is_settled = self.is_given_up = False
 
     def accept(self) -> None:
-        self.is_settled, self.attempts = True, 0
+        self.is_settled, self.has_settled, self.attempts = True, True, 0
 
     def refuse(self) -> None:
         """Half the rate, then the next message: "denied" may mean too fast or unknown."""
@@ -80,7 +82,7 @@ class _Stream:
             self._give_up()
 
     def _give_up(self) -> None:
-        self.is_settled = self.is_given_up = True
+        self.is_settled = self.has_settled = self.is_given_up = True
 
     def share(self, span_s: float) -> float:
         """Part of the granted rate at which it came."""
@@ -194,7 +196,7 @@ class StreamRequester:
         """Yield requests for what stands in for streams that stay away."""
         for stream in self._streams:
             name = stream.group.stand_in
-            if name is None or not stream.is_settled or now_ns < stream.stand_in_due_ns:
+            if name is None or not stream.has_settled or now_ns < stream.stand_in_due_ns:
                 continue
             if now_ns - stream.newest_ns >= _AWAY_NS:
                 stream.stand_in_due_ns = now_ns + _STAND_IN_NS

@@ -220,10 +220,11 @@ def test_a_vehicle_that_has_vanished_is_not_held_for_ever() -> None:
     stepped.step()
     stepped.run(0.2, mode="BRAKE")
     assert stepped.phase is Phase.HOLDING
-    assert {move.hand for move in stepped.run(29, link_problem="no heartbeat")} == {Hand.NEUTRAL}
-    stepped.run(1, link_problem=None)
-    assert {move.hand for move in stepped.run(29, link_problem="no heartbeat")} == {Hand.NEUTRAL}
-    stepped.run(3)
+    for _ in range(2):
+        moves = stepped.run(29, heard_ns=stepped.facts.now_ns, mode_ns=stepped.facts.now_ns)
+        assert {move.hand for move in moves} == {Hand.NEUTRAL}
+        stepped.run(1, heard_ns=None, mode_ns=None)
+    stepped.run(33, heard_ns=stepped.facts.now_ns, mode_ns=stepped.facts.now_ns)
     assert "lost for 30 s" in stepped.reason
     assert stepped.phase is Phase.ENDED
 

@@ -213,6 +213,31 @@ def test_the_policy_gets_the_sticks_with_its_first_chunk_after_the_reset() -> No
     assert flown.chunk_serial == 6
 
 
+def test_an_act_that_was_taken_back_leaves_no_reset_for_the_next_one() -> None:
+    gate = Stepped()
+    for at_ms in (0, 10, 20):
+        gate.step(at_ms, gate.chunk(at_ms)._replace(reset_ns=0))
+    gate.step(30, gate.chunk(30)._replace(reset_ns=0), act="engage")
+    given_up = gate.step(40, gate.chunk(40)._replace(reset_ns=0), act="release")
+    assert given_up.starting_ns == 0
+    for at_ms in range(50, 2000, 10):
+        gate.step(at_ms, gate.chunk(at_ms)._replace(reset_ns=START_NS + 35 * MS))
+    asked = gate.step(2000, gate.chunk(2000)._replace(reset_ns=START_NS + 35 * MS), act="engage")
+    assert (asked.phase, asked.starting_ns) == (Phase.PREPARING, START_NS + 2000 * MS)
+
+
+def test_a_reset_that_takes_longer_than_the_grace_is_asked_for_once() -> None:
+    gate = Stepped()
+    for at_ms in (0, 10, 20):
+        gate.step(at_ms, gate.chunk(at_ms)._replace(reset_ns=0))
+    gate.step(30, gate.chunk(30)._replace(reset_ns=0), act="engage")
+    starts = {gate.step(at_ms).starting_ns for at_ms in range(40, 400, 10)}
+    assert starts == {START_NS + 30 * MS}
+    for at_ms in range(400, 600, 10):
+        output = gate.step(at_ms, gate.chunk(at_ms)._replace(reset_ns=START_NS + 35 * MS))
+    assert output.phase is Phase.FLYING
+
+
 def test_a_chunk_that_is_not_taken_is_not_news() -> None:
     gate = Stepped().engaged()
     nan = gate.chunk(33, WANTED._replace(roll=float("nan")))

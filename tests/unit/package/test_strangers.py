@@ -14,6 +14,7 @@ from mavbridge.__main__ import main
 from mavbridge.cli import cli
 from mavbridge.commands.replay.config import ReplayConfig
 from mavbridge.commands.replay.run import replay
+from mavbridge.config.flight import FlyConfig
 from mavbridge.config.trust import untrusted_settings
 from mavbridge.core.errors import UserError
 from mavbridge.recording.folder import SETTINGS
@@ -161,6 +162,8 @@ REFUSED = [
     ('report = "/etc/passwd"', "--report"),
     ('record = "../../elsewhere"', "--record"),
     ('json = "~/.profile"', "--json"),
+    ('report = "~root/x"', "--report"),
+    ("host = 0", "--host"),
     ('rerun = "/tmp/x.rrd"', "--rerun"),
 ]
 TAKEN = """
@@ -205,6 +208,22 @@ def test_a_settings_file_decides_how_to_fly(tmp_path: Path) -> None:
     assert list(untrusted_settings(read_toml(path), [])) == []
     sample = read_toml(ROOT / "examples" / "deploy" / "mavbridge.toml")
     assert list(untrusted_settings(sample, [])) == []
+
+
+def test_keys_that_are_named_as_commands_are_flags(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    flown: list[FlyConfig] = []
+    monkeypatch.setattr(cli, "config", cli.config)
+    monkeypatch.setattr("mavbridge.flight.app.fly", lambda config: flown.append(config) or 0)
+    path = tmp_path / "mavbridge.toml"
+    path.write_text(f'{TAKEN}contract = "mine.toml"\n')
+    with pytest.raises(SystemExit):
+        main(["--config", str(path)])
+    (config,) = flown
+    assert config.record == Path("flights/today")
+    assert config.serve == "127.0.0.1:9090"
+    assert config.policy.contract == Path("mine.toml")
 
 
 def test_a_settings_file_that_is_trusted_may_name_a_program(

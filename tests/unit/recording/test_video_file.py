@@ -143,4 +143,18 @@ def test_depth_comes_back_to_the_last_bit(tmp_path: Path) -> None:
     assert {each.dtype for each in back} == {np.dtype(np.uint16)}
     assert np.array_equal(back, depths)
     with pytest.raises(DatasetError, match="holds depth"):
-        next(decode_video(path))
+        next(decode_video(path, np.arange(4)))
+
+
+def test_a_damaged_number_of_an_image_moves_no_other_one(tmp_path: Path) -> None:
+    path = tmp_path / "camera.mp4"
+    write(path, 100).close()
+    whole = path.read_bytes()
+    key = video_parts(path).fragments[60]
+    assert key.is_key
+    at = key.start + 20  # the sequence number in its moof box
+    for wrong in (5, 75, 105):
+        path.write_bytes(whole[:at] + (wrong + 1).to_bytes(4, "big") + whole[at + 4 :])
+        numbers = [fragment.number for fragment in video_parts(path).fragments]
+        assert numbers == [*range(60), *range(90, 100)]
+        assert [number_of(rgb) for rgb in read_video(path)] == numbers
