@@ -81,7 +81,7 @@ def _judge_manual_control(m: Any) -> None:
 
 
 def _judge_attitude(m: Any) -> None:
-    assert 0.0 <= m.thrust <= 0.95, m
+    assert 0.0 <= m.thrust <= 1.0, m  # scaled to where a vehicle says that it hovers, up to 0.9
     w, x, y, z = m.q
     assert abs(math.hypot(w, x, y, z) - 1.0) < 1e-3, m
     assert 2 * math.asin(min(math.hypot(x, y), 1.0)) <= _MOST_LEAN_RAD, m

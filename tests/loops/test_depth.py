@@ -122,7 +122,7 @@ def test_a_policy_in_torch_gets_metres_of_all_cameras_and_times(dual_rate: bool)
     metres = np.array([[1, 2], [3, 4]], np.uint16)
     images = np.broadcast_to(1000 * metres[..., None, None], (2, 2, 40, 50)).astype(np.uint16)
     state, history = level_state(TwoRates.contract), np.zeros((1, 4, 4), np.float32)
-    chunk = executable.act(encode_all(executable, images), state, history, None)
+    chunk = executable.act(encode_all(executable, images), state, history)
     assert chunk[0, 0] == pytest.approx([1, 2, 3, 4])
 
 

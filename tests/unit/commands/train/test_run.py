@@ -104,7 +104,7 @@ def test_a_world_model_is_trained(tmp_path: Path, capsys: pytest.CaptureFixture[
             ["train", *OUT, *OLD, "--start-from", "b.safetensors", "--freeze-encoder"],
             "no such file",
         ),
-        (["train", *OUT, "--policy=world-model", "--pack"], "Unknown option"),
+        (["train", *OUT, "--policy=world-model", "--pack"], "has a command of its own"),
         (["train-world-model", *OUT], "fly longer"),
     ],
 )
