@@ -89,6 +89,8 @@ def interrupt_once(clock: Clock | None = None) -> None:
     A second KeyboardInterrupt would cut the clean-up of the first short with a traceback. The gate
     notices the end like any other death of this process.
     """
+    if signal.getsignal(signal.SIGINT) is not signal.default_int_handler:
+        return  # ignored, as shells start programs in the background
     clock = MonotonicClock() if clock is None else clock
     first_ns: int | None = None
 

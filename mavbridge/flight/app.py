@@ -161,7 +161,8 @@ def fly_executable(
         raise
     finally:
         if flight is not None:
-            flight.finish()
+            with stop_on_signals():  # the flight has its status; what is left has deadlines
+                flight.finish()
 
 
 class _Flight:

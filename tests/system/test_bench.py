@@ -38,7 +38,7 @@ def test_a_benchmark_measures_engines_flight_and_link(
     assert "scripted:hover" in captured.out
     result = json.loads((tmp_path / "out" / "bench.json").read_text())
     (flight,) = result["flights"]
-    assert (flight["asked_action_hz"], flight["solves"]) == (50.0, "single rate")
+    assert (flight["asked_action_hz"], flight["solves"]) == (50.0, "single rate, 10 steps")
     assert 0 < flight["action_hz"] < 51
     assert flight["stick_hz"] > 50
     assert flight["lateness_ms"]["p50"] > 0

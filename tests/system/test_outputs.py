@@ -13,8 +13,8 @@ pytestmark = pytest.mark.system
 
 DEATH_LIMIT_MS = 150
 """The aim on a machine of its own is 60 ms."""
-HANG_LIMIT_MS = 250
-"""The aim is 120 ms."""
+HANG_LIMIT_MS = 400
+"""The aim is 270 ms: the stall that a new contract flies through, and 20 ms."""
 MODE_LIMIT_MS = 400
 LEAST_STICK = 120
 """Of 1000: a leg of the square begins."""
