@@ -319,9 +319,7 @@ def with_config(
                 f"--config {config}: {flag} {value!r} names {what}, which a file may not do by "
                 f"itself: give {flag} on the command line, or --trust-config if you know the file"
             )
-        cli.config = [
-            _Settings(_with_home(document), source=str(config)),
-        ]
+        cli.config = [_Settings(_with_home(document), source=str(config))]
     with run_log(log_file, verbose=verbose):
         status: int | None = cli(_with_home(list(tokens)))
     return status or 0

@@ -15,7 +15,7 @@ from typing import NamedTuple
 from mavbridge.camera.capture import MAX_DRIVER_AGE_NS
 from mavbridge.camera.grabber import Image
 from mavbridge.camera.pipe_frames import MAX_BAD_FRAMES, MAX_JPEG_BYTES, decode_picture
-from mavbridge.core.address import LOOPBACK, host_port
+from mavbridge.core.address import LOOPBACK, host_port, spelled
 from mavbridge.core.clock import NS_PER_S, Clock
 from mavbridge.core.errors import CameraError, UserError
 
@@ -181,7 +181,7 @@ class JpegUdpSource:
 
     def __init__(self, host: str, port: int, *, clock: Clock) -> None:
         """Bind the port; raises CameraError if it cannot be."""
-        self._name = f"jpeg-udp:{f'[{host}]' if ':' in host else host}:{port}"
+        self._name = f"jpeg-udp:{spelled(host, port)}"
         self._clock = clock
         self._frames = FrameAssembler()
         self._stamps = SenderClock()

@@ -247,11 +247,10 @@ class Engagement:
             return Move()
         if not facts.armed:
             self.refusal = "not engaged: the vehicle is disarmed; arm it first, or use --arm"
-        elif (objection := self._objection(facts) or facts.chunk_problem) is not None:
-            self.refusal = f"not engaged: {objection}"
-        elif self._preparation.may_change_mode(facts):
-            return self._begin_preparing(facts, ACT_TIMEOUT_NS)
-        elif (objection := self._mode_objection(facts)) is not None:
+        elif (objection := self._objection(facts) or facts.chunk_problem) is not None or (
+            not self._preparation.may_change_mode(facts)
+            and (objection := self._mode_objection(facts)) is not None
+        ):
             self.refusal = f"not engaged: {objection}"
         else:
             return self._begin_preparing(facts, ACT_TIMEOUT_NS)

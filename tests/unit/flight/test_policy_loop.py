@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from helpers.factories import make_gate_tick
 from helpers.fakes import START_NS, FakeClock, ListSink
 from helpers.wire import WireEnd
 from mavbridge.core.clock import NS_PER_MS
@@ -22,7 +23,7 @@ from mavbridge.flight.state_reader import StateReader
 from mavbridge.flight.vehicle_view import VehicleView
 from mavbridge.gate.chunks import Chunk
 from mavbridge.gate.engagement import Phase
-from mavbridge.gate.wire import Absence, GateTick
+from mavbridge.gate.wire import Absence
 from policy.contract import Contract
 
 MS = NS_PER_MS
@@ -105,22 +106,8 @@ class Rig:
         return self
 
     def begin_flight(self) -> None:
-        tick = GateTick(
-            index=0,
-            due_ns=0,
-            woke_ns=0,
-            decided_ns=0,
-            sent_ns=self.clock.now_ns(),
-            missed_slots=0,
-            is_slot=True,
-            is_coasting=False,
-            chunk_serial=None,
-            trace=None,
-            sent=None,
-            phase=Phase.PREPARING,
-            reason="",
-            starting_ns=self.clock.now_ns(),
-        )
+        now_ns = self.clock.now_ns()
+        tick = make_gate_tick(now_ns, phase=Phase.PREPARING, starting_ns=now_ns)
         self.view.receive(tick)
 
 
