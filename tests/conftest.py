@@ -1,4 +1,5 @@
 import os
+import signal
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -8,6 +9,11 @@ from hypothesis import settings
 # Workers side by side have a core each: threads of torch would wait for each other, spinning.
 if "PYTEST_XDIST_WORKER" in os.environ:
     os.environ.setdefault("OMP_NUM_THREADS", "1")
+
+# A shell starts programs in the background with Ctrl-C ignored, and their children inherit that:
+# tests see what a person at a terminal would.
+if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
+    signal.signal(signal.SIGINT, signal.default_int_handler)
 
 # The first example of a property pays for imports and first kernels: no verdict on wall time.
 # The same examples in every run: none is met for the first time in CI.
