@@ -66,6 +66,8 @@ def _parser() -> argparse.ArgumentParser:
     add("--duration", type=_POSITIVE, metavar="S", help="stop after S seconds")
     end_help = "stop one second after the last gate, or at a crash"
     add("--end-with-course", action="store_true", help=end_help)
+    fly_on_help = "before the report, fly S seconds more without links, faster than real time"
+    add("--fly-on", type=_POSITIVE, default=0.0, metavar="S", help=fly_on_help)
     receiver_help = "RC receiver: throttle down, every stick centred, or none (default: mid; "
     receiver_help += "none with PX4, which looks at one only if COM_RC_IN_MODE tells it to)"
     add("--receiver", choices=("idle", "mid", "none"), help=receiver_help)
@@ -150,6 +152,7 @@ def _fly(args: argparse.Namespace) -> None:
         report=args.report,
         duration_s=args.duration,
         end_with_course=args.end_with_course,
+        fly_on_s=args.fly_on,
     )
 
 

@@ -216,6 +216,7 @@ class _StickEntry(NamedTuple):
     failsafe: bool
     lean_deg: float  # between the vehicle's axis and the vertical
     climb_mps: float
+    height_m: float
 
 
 class _StickRecord:
@@ -237,7 +238,9 @@ class _StickRecord:
         lean_deg = math.degrees(math.acos(max(-1.0, min(1.0, cos_tilt(body.ned_from_body_wxyz)))))
         climb_mps = -body.velocity_ned_mps[2]
         self._due_ns = ap.now_ns + STICK_PERIOD_NS
-        self._entries.append(_StickEntry(stamp_ns, us, *state, lean_deg, climb_mps))
+        height_m = -body.position_ned_m[2]
+        entry = _StickEntry(stamp_ns, us, *state, lean_deg, climb_mps, height_m)
+        self._entries.append(entry)
 
     def summary(self, start_ns: int) -> list[dict[str, Any]]:
         """The ``sticks`` list of the report."""
@@ -250,6 +253,7 @@ class _StickRecord:
                 "failsafe": entry.failsafe,
                 "lean_deg": round(entry.lean_deg, 2),
                 "climb_mps": round(entry.climb_mps, 3),
+                "height_m": round(entry.height_m, 3),
             }
             for entry in self._entries
         ]

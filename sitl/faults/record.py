@@ -22,6 +22,7 @@ class StickEntry(TypedDict):
     failsafe: bool
     lean_deg: float
     climb_mps: float
+    height_m: float
 
 
 class FinalState(TypedDict):
@@ -40,6 +41,7 @@ class VehicleReport(TypedDict):
     refused_messages: int
     crashed: bool
     armed_s: float
+    impact_speed_mps: float
     max_altitude_m: float
     final: FinalState
 
@@ -61,6 +63,17 @@ class Aftermath(NamedTuple):
     def flew_again(self) -> bool:
         """The policy's sticks came back."""
         return self.final_safe_ms > self.safe_ms
+
+
+class Ending(NamedTuple):
+    """What the vehicle did after the policy had lost the sticks, until a pilot took over."""
+
+    mode: str
+    """The last."""
+    lost_m: float
+    """Height, from where the policy lost the sticks to the lowest point after it."""
+    impact_mps: float
+    """Speed of the hardest touchdown of the flight; 0.0: it never touched the ground again."""
 
 
 class NoVerdictError(Exception):
@@ -102,6 +115,17 @@ def aftermath(
         mode=changed["mode"] if changed else None,
         mode_s=changed["t_s"] - fault_s if changed else None,
         most_lean_deg=max(entry["lean_deg"] for entry in entries),
+    )
+
+
+def ending(report: VehicleReport, since_s: float, until_s: float) -> Ending:
+    """Read the end of a flight between two moments on the report's clock."""
+    entries = [entry for entry in report["sticks"] if since_s <= entry["t_s"] < until_s]
+    heights_m = [entry["height_m"] for entry in entries] or [0.0]
+    return Ending(
+        mode=entries[-1]["mode"] if entries else report["final"]["mode"],
+        lost_m=heights_m[0] - min(heights_m),
+        impact_mps=report["impact_speed_mps"],
     )
 
 

@@ -44,12 +44,15 @@ class Scenario:
     """The bridge prints this."""
     modes: list[str] = field(default_factory=list)
     """Allowed first mode after the fault; empty: any, also none."""
-    receivers: list[Receiver] = field(default_factory=lambda: ["mid", "none"])
+    receivers: list[Receiver] = field(default_factory=list)
+    """Empty: mid and none, and idle where the policy loses the sticks and the bridge ends it."""
     autopilots: list[AutopilotName] = field(default_factory=lambda: ["ardupilot", "px4"])
     others_us: list[int] = field(default_factory=list)
     """Four sticks of somebody else, who may share the vehicle with the policy until the limit."""
     is_silent: bool = False
     """A takeover: no request for a mode may follow, and beyond the limit no stick of any kind."""
+    judges_end: bool = True
+    """The vehicle must hold its height or land after the end, unless it was a takeover."""
     releases: bool = True
     """The bridge can still give an ArduPilot with a receiver its sticks back."""
     transmitter: bool = False
@@ -82,11 +85,14 @@ class Scenario:
     @property
     def variants(self) -> "list[Variant]":
         """Vehicles that it is flown with; PX4 has a receiver only where one is wanted alone."""
+        receivers: list[Receiver] = self.receivers or ["mid", "none"]
+        if not self.receivers and self.outcome == "loses" and not self.is_silent:
+            receivers = ["mid", "idle", "none"]
         return [
             Variant(autopilot=autopilot, receiver=receiver)
             for autopilot in self.autopilots
-            for receiver in self.receivers
-            if autopilot == "ardupilot" or receiver == "none" or "none" not in self.receivers
+            for receiver in receivers
+            if autopilot == "ardupilot" or receiver == "none" or "none" not in receivers
         ]
 
 

@@ -3,7 +3,7 @@
 from collections.abc import Mapping, Sequence
 
 from sitl.faults.scenario import Scenario
-from sitl.faults.verdict import Verdict
+from sitl.faults.verdict import MOST_IMPACT_MPS, MOST_LOST_M, Verdict
 
 TITLES = {
     "link": "Link",
@@ -17,14 +17,18 @@ HEAD = """# Faults
 Each row is a flight in real time by real processes: gate, flight process, sockets and the bundled
 flight controller, which is judged by its own record. The policy leans, climbs and turns when the
 fault begins. "Safe" means neutral sticks, the receiver's, or out of the mode of the flight. Limits
-are in brackets: a fault that can be known only after a while has that while in its limit.
+are in brackets: a fault that can be known only after a while has that while in its limit. The
+vehicle flies on for ten seconds after the end: unless it lands, it loses {lost:.0f} m of height at
+most from where the policy lost the sticks, and it touches the ground at {impact:.0f} m/s at most.
+After a takeover this is up to the pilot, and not judged.
 `python -m sitl faults NAME` flies a row again.
 
 Written by `python -m sitl faults --out docs/faults.md` on {date}: {machine}.
 """
-COLUMNS = """| fault | vehicle | must | safe, ms | last stick, ms | then | exit |
-|---|---|---|---|---|---|---|
-"""
+COLUMNS = (
+    "| fault | vehicle | must | safe, ms | last stick, ms | then "
+    "| 10 s later | height lost, m | touchdown, m/s | exit |\n" + "|---" * 10 + "|\n"
+)
 SHOWN_STALL_MS = 10.0
 MUST = {
     "loses": "lose the sticks",
@@ -38,7 +42,8 @@ def make_page(
     verdicts: Sequence[Verdict], catalogue: Mapping[str, Scenario], *, date: str, machine: str
 ) -> str:
     """Markdown of the page."""
-    parts = [HEAD.format(date=date, machine=machine)]
+    limits = {"lost": MOST_LOST_M, "impact": MOST_IMPACT_MPS}
+    parts = [HEAD.format(date=date, machine=machine, **limits)]
     for group, title in TITLES.items():
         rows = [verdict for verdict in verdicts if catalogue[verdict.scenario].group == group]
         if rows:
@@ -56,6 +61,8 @@ def make_line(verdict: Verdict) -> str:
     if measured is not None:
         parts += [f"safe {measured.safe_ms:7.1f} ms", f"last stick {verdict.last_stick_ms:7.1f} ms"]
         parts.append(f"{measured.mode or '-'}, {measured.most_lean_deg:.0f} deg")
+    if (end := verdict.ending) is not None:
+        parts.append(f"then {end.mode}, -{end.lost_m:.1f} m, touchdown {end.impact_mps:.1f} m/s")
     parts.append(f"exit {verdict.exit}")
     if not verdict.passed and verdict.stall_ms > SHOWN_STALL_MS:
         parts.append(f"the computer stood still for {verdict.stall_ms:.0f} ms")
@@ -67,13 +74,17 @@ def make_line(verdict: Verdict) -> str:
 
 def _row(verdict: Verdict, scenario: Scenario) -> str:
     measured, last_ms = verdict.aftermath, verdict.last_stick_ms
-    safe = last = then = ""
+    safe = last = then = later = lost = impact = ""
     if measured is not None and last_ms is not None:
         safe = f"{measured.safe_ms:.0f} ({scenario.limit_ms:.0f})"
         last = f"{last_ms:.0f} ({scenario.last_stick_limit_ms:.0f})"
         then = measured.mode or "same mode"
+    if (end := verdict.ending) is not None:
+        later, lost = end.mode, f"{end.lost_m:.1f}"
+        impact = f"{end.impact_mps:.1f}" if end.impact_mps else "none"
     must = MUST[scenario.outcome]
     if not verdict.passed:
         must = f"**{must}: {'; '.join(verdict.failures)}**"
-    cells = (scenario.what, verdict.variant.text, must, safe, last, then, str(verdict.exit))
+    how = (safe, last, then, later, lost, impact)
+    cells = (scenario.what, verdict.variant.text, must, *how, str(verdict.exit))
     return "| " + " | ".join(cell.replace("|", "\\|") for cell in cells) + " |"

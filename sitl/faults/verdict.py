@@ -1,11 +1,18 @@
 """Judges a flown scenario by the vehicle's own record and by what left the bridge."""
 
+import sys
 from dataclasses import dataclass, field
 
-from sitl.faults.record import Aftermath, VehicleReport, aftermath
+from sitl.faults.record import Aftermath, Ending, VehicleReport, aftermath, ending
 from sitl.faults.scenario import Scenario, Variant
 from sitl.faults.stage.relay import Sent
 from sitl.faults.stage.stage import Stage
+
+MOST_IMPACT_MPS = 1.0
+"""Both firmwares touch down at 0.5 to 0.7 m/s (LAND_SPEED, MPC_LAND_SPEED)."""
+MOST_LOST_M = 2.0
+"""BRAKE stops within 1.8 m from 2.5 m/s of descent."""
+LANDINGS = ("LAND", "RTL", "AUTO.LAND", "AUTO.RTL")
 
 
 @dataclass(kw_only=True)
@@ -19,8 +26,13 @@ class Verdict:
     last_stick_ms: float | None = None
     """From the fault to the last steering message of the policy that left the bridge; negative:
     before it."""
+    ended_ns: int = 0
+    """When everything was told to end, CLOCK_MONOTONIC; 0: before it flew."""
+    taken_over_ns: int | None = None
+    """When a pilot ended the bridge's holding of the vehicle."""
+    ending: Ending | None = None
+    """Only of a flight whose end is the bridge's doing."""
     exit: int | None = None
-    final_mode: str = ""
     runs: int = 1
     """Flights until this one."""
     stall_ms: float = 0.0
@@ -51,7 +63,6 @@ def find_failures(
         NoVerdictError: the vehicle did not fly at the fault, or was never safe after it.
     """
     report, sent = stage.vehicle_report(), stage.relay.sent
-    verdict.final_mode = report["final"]["mode"]
     failures = [*_wrong_words(verdict, scenario), *_wrong_messages(report, sent)]
     if scenario.outcome == "refused":
         if report["armed_s"] > 0 or any(row.leans for row in sent):
@@ -72,6 +83,25 @@ def find_failures(
         has_release = variant.autopilot == "ardupilot" and variant.receiver != "none"
         if has_release and scenario.releases and any(stage.relay.overrides[-1]):
             failures.append(f"the last sticks are no release: {stage.relay.overrides[-1]}")
+    if scenario.outcome != "refused" and scenario.judges_end and not scenario.is_silent:
+        safe_ns = at_ns + round((verdict.aftermath.safe_ms if verdict.aftermath else 0.0) * 1e6)
+        since_ns = safe_ns if verdict.aftermath else verdict.ended_ns
+        until_ns = verdict.taken_over_ns or sys.maxsize
+        verdict.ending = ending(
+            report,
+            since_s=(since_ns - report["start_ns"]) / 1e9,
+            until_s=(until_ns - report["start_ns"]) / 1e9,
+        )
+        failures += _bad_end(verdict.ending)
+    return failures
+
+
+def _bad_end(end: Ending) -> list[str]:
+    failures = []
+    if end.impact_mps > MOST_IMPACT_MPS:
+        failures.append(f"it hit the ground at {end.impact_mps:.1f} m/s, in {end.mode}")
+    if end.lost_m > MOST_LOST_M and end.mode not in LANDINGS:
+        failures.append(f"it lost {end.lost_m:.1f} m of height, in {end.mode}")
     return failures
 
 
