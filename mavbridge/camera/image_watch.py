@@ -3,6 +3,7 @@
 import numpy as np
 
 from mavbridge.core.clock import NS_PER_S
+from mavbridge.core.reasons import Code, Reason, because
 from mavbridge.core.records import CameraImage
 
 TAKEOFF_NS = 2 * NS_PER_S
@@ -43,7 +44,7 @@ class ImageWatch:
         self._grounded_ns: int | None = None
         self._blank_since_ns: int | None = None
 
-    def check(self, rgb: CameraImage, captured_ns: int, *, is_airborne: bool) -> str | None:
+    def check(self, rgb: CameraImage, captured_ns: int, *, is_airborne: bool) -> Reason | None:
         """Reason not to fly by this image, or None; call it with each image, in order.
 
         ``rgb`` is kept for the next call and must not be changed.
@@ -53,7 +54,7 @@ class ImageWatch:
         frozen = self._frozen(rgb, captured_ns, is_airborne) if self._max_frozen_s > 0 else None
         return blank or frozen
 
-    def _frozen(self, rgb: CameraImage, captured_ns: int, is_airborne: bool) -> str | None:
+    def _frozen(self, rgb: CameraImage, captured_ns: int, is_airborne: bool) -> Reason | None:
         last, self._last = self._last, rgb
         if last is None or not _is_same(last, rgb):
             self._changed_ns = captured_ns
@@ -64,9 +65,9 @@ class ImageWatch:
             counted_from_ns = max(counted_from_ns, self._grounded_ns + TAKEOFF_NS)
         if captured_ns - counted_from_ns <= self._max_frozen_s * NS_PER_S:
             return None
-        return f"the image has been frozen for {(captured_ns - self._changed_ns) / NS_PER_S:.1f} s"
+        return because(Code.IMAGE_FROZEN, age_s=(captured_ns - self._changed_ns) / NS_PER_S)
 
-    def _blank(self, rgb: CameraImage, captured_ns: int) -> str | None:
+    def _blank(self, rgb: CameraImage, captured_ns: int) -> Reason | None:
         if not is_blank(rgb):
             self._blank_since_ns = None
             return None
@@ -76,7 +77,7 @@ class ImageWatch:
         if blank_s <= self._max_black_s:
             return None
         what = "without any depth" if rgb.ndim == 2 else "black or of one colour"
-        return f"the image has been {what} for {blank_s:.1f} s"
+        return because(Code.IMAGE_BLANK, what=what, age_s=blank_s)
 
 
 def _is_same(one: CameraImage, other: CameraImage) -> bool:

@@ -4,12 +4,13 @@ Stamps are nanoseconds of the injected clock, taken where the thing happened (ex
 arrival). Arrays are read-only once they are published here.
 """
 
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass, replace
 from typing import NamedTuple, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
 
+from mavbridge.core.reasons import Reason, reason_to_json
 from mavbridge.core.vehicle import Action, ActionTrace, FlightEnd, Sticks
 
 FloatArray: TypeAlias = NDArray[np.float32]
@@ -39,7 +40,7 @@ class FeatureFrame:
     ready_ns: int
     value: FloatArray
     """Dual rate: feature [1, F]. Single rate: preprocessed image [1, 3, H, W]. Read-only."""
-    fault: str | None = None
+    fault: Reason | None = None
     """Why it must not be acted on, such as a frozen image; None where nothing is wrong with it."""
 
 
@@ -89,7 +90,8 @@ class Tick:
     trace: ActionTrace | None
     sent: Action | None
     """As sent, after rounding by the message; None when released or read-only."""
-    release_reason: str | None
+    release_reason: Reason | None
+    """Why the policy does not fly; None while it does, and where the gate has not said why."""
     mode: str | None
     armed: bool
     rc_channels_us: tuple[int, ...]
@@ -123,6 +125,12 @@ class Tick:
         return "FLYING: the policy has control"
 
     @property
+    def stage(self) -> tuple[object, ...]:
+        """Equal for ticks whose ``activity`` differs by figures alone."""
+        codes = () if self.release_reason is None else self.release_reason.codes
+        return self.holder, codes, self.trace is None, self.sent is None
+
+    @property
     def holder(self) -> str:
         """WAITING for an act, PREPARING after one, NEUTRAL sticks of ours, or RELEASED.
 
@@ -138,8 +146,8 @@ class FlightOutcome:
     """How the policy flew, from its first action to its last one; None = not known."""
 
     end: FlightEnd
-    reason: str
-    """The end in words."""
+    reason: Reason | None
+    """The end, as the gate told it; None: not told."""
     flown_s: float
     height_m: float | None
     """Above the estimator's origin, at the policy's last action."""
@@ -159,6 +167,11 @@ class FlightOutcome:
     """Along the straight legs from the first gate to the last one passed; None before two."""
     crash: str | None
     """How it was seen to have hit something, in words; None: no contact was seen or told."""
+
+    def to_json(self) -> dict[str, object]:
+        """The outcome for JSON: the reason with its code, kind, figures and sentence."""
+        reason = None if self.reason is None else reason_to_json(self.reason)
+        return asdict(replace(self, reason=None)) | {"reason": reason}
 
     @property
     def success(self) -> bool | None:
@@ -186,7 +199,7 @@ class VisionTick:
     """Its place among the cameras of the contract; ``serial`` and all others are of this camera."""
     feature: FloatArray | None = None
     """What the encoder made of it, read-only: dual rate [1, F], single rate the network's image."""
-    fault: str | None = None
+    fault: Reason | None = None
     """Why it must not be acted on, such as a frozen image."""
 
 

@@ -8,6 +8,7 @@ from dataclasses import dataclass
 from typing import Literal, NamedTuple, TypeAlias
 
 from mavbridge.core.address import SocketAddress
+from mavbridge.core.reasons import Reason
 
 Output: TypeAlias = Literal["rc-override", "manual-control", "attitude", "rates", "velocity"]
 """RC_CHANNELS_OVERRIDE (ArduPilot), MANUAL_CONTROL (PX4), SET_ATTITUDE_TARGET with an attitude or
@@ -126,7 +127,7 @@ class Command:
 class Release:
     """Do not touch the sticks: they belong to the pilot. ``reason`` is shown to the user."""
 
-    reason: str
+    reason: Reason
 
 
 Decision: TypeAlias = Command | Release
@@ -235,7 +236,7 @@ class LinkSnapshot:
 
     telemetry: Telemetry
     status: VehicleStatus | None
-    problem: str | None
+    problem: Reason | None
     """Why sticks may not be sent (no heartbeat, handshake, override switch, no echo), or None."""
     is_overruled: bool = False
     """The vehicle does not act on the sticks that we send: somebody else holds them."""
@@ -249,9 +250,11 @@ class LinkSnapshot:
     """Since the release it shows our last sticks, or others that cannot be told from them."""
     are_sticks_at_rest: bool = True
     """Our last sticks have moved so little for so long that they pass for nobody's hand."""
-    interruption: str | None = None
+    interruption: Reason | None = None
     """Why every engagement so far is over, or None: the vehicle has rebooted, or now sends from
-    another address. Stays as it is once it has happened; a later one has another text."""
+    another address. Stays as it is once it has happened."""
+    interruptions: int = 0
+    """Number of interruptions so far."""
     modes: ModeRoles = ModeRoles()
     refused_mode: str | None = None
     """Mode that the vehicle has just refused to enter, or None."""

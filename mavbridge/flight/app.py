@@ -26,6 +26,7 @@ from mavbridge.core.realtime import (
     settle_process,
     settle_thread,
 )
+from mavbridge.core.reasons import Code, Reason, because
 from mavbridge.core.records import FlightOutcome
 from mavbridge.core.stopping import StopRequest, stop_on_signals
 from mavbridge.core.vehicle import FlightEnd
@@ -183,7 +184,7 @@ class _Flight:
         self._stack = stack
         self._gate = gate.process
         self._has_hung = False
-        self._ending = Ending(reason="the gate has died", is_fault=True)
+        self._ending = Ending(reason=because(Code.GATE_DIED), is_fault=True)
         """What it was asked to end for; until then only its death ends it without a summary."""
         settings = flight_settings(config, executable)
         self._hang_ns = max(
@@ -281,14 +282,14 @@ class _Flight:
         self._stack.callback(keyboard.stop, JOIN_S)
         has_keys = not self._config.link.readonly and keyboard.start()
         screen.start(hint=KEYS_HINT if has_keys else None)
-        ending = Ending(reason="the flight was ended by a signal")
+        ending = Ending(reason=because(Code.SIGNAL))
         referee = self._observers.referee
         while listener.is_alive and not stop.is_set():
             if (fault := self._fault(visions, policy)) is not None:
                 ending = Ending(reason=fault, is_fault=True)
                 break
             if referee.is_course_over(self._clock.now_ns()):
-                ending = Ending(reason="the course is done", end="course")
+                ending = Ending(reason=because(Code.COURSE_DONE), end="course")
                 break
             stop.wait(1 / STATUS_HZ)
         self._end(ending, listener, stop)
@@ -328,13 +329,13 @@ class _Flight:
             self._observers.screen.show_message(text)
         return exit_code
 
-    def _fault(self, visions: Sequence[Worker], policy: Worker) -> str | None:
+    def _fault(self, visions: Sequence[Worker], policy: Worker) -> Reason | None:
         """Why no more chunks will come, or None."""
         for vision, camera in zip(visions, self._cameras, strict=True):
             if not vision.is_alive:
-                return f"the camera{self._named(camera)} or its encoder has failed"
+                return because(Code.CAMERA_FAILED, camera=self._named(camera))
         if not policy.is_alive:
-            return "the policy has failed"
+            return because(Code.POLICY_FAILED)
         now_ns = self._clock.now_ns()
         if now_ns - self._looked_ns > STOPPED_NS:
             self._resumed_ns = now_ns
@@ -354,7 +355,7 @@ class _Flight:
             idle_ns = now_ns - max(alive_ns, self._resumed_ns)
             if idle_ns > limit_ns:
                 self._has_hung = True
-                return f"the {name} has hung for {idle_ns / NS_PER_S:.1f} s"
+                return because(Code.HANGS, name=name, idle_s=idle_ns / NS_PER_S)
         return None
 
     def _named(self, camera: str, prefix: str = "") -> str:

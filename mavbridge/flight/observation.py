@@ -8,6 +8,7 @@ from typing import NamedTuple, TypeAlias
 import numpy as np
 
 from mavbridge.core.clock import NS_PER_MS, NS_PER_S
+from mavbridge.core.reasons import Code, Reason, because
 from mavbridge.core.records import FeatureFrame, FloatArray, VehicleState
 from mavbridge.core.vehicle import Release
 from mavbridge.flight.ego_motion import EgoMotion
@@ -114,12 +115,14 @@ class ObservationSource:
         for camera, cache in enumerate(self._caches):
             feature = cache.latest()
             if feature is None:
-                return Release(f"{self._of(camera)}no image feature yet")
+                return self._missing(camera, because(Code.NO_IMAGE))
             if now_ns - feature.captured_ns > self._max_feature_age_ns:
-                limit_ms = self._max_feature_age_ns // NS_PER_MS
-                return Release(f"{self._of(camera)}the image feature is older than {limit_ms} ms")
+                age_ms = (now_ns - feature.captured_ns) / NS_PER_MS
+                limit_ms = self._max_feature_age_ns / NS_PER_MS
+                old = because(Code.TOO_OLD, quantity="image", age_ms=age_ms, limit_ms=limit_ms)
+                return self._missing(camera, old)
             if feature.fault is not None:
-                return Release(self._of(camera) + feature.fault)
+                return self._missing(camera, feature.fault)
             newest.append(feature)
         rows = [
             [
@@ -158,8 +161,11 @@ class ObservationSource:
             row = np.append(row, np.array([state.extras], np.float32), axis=1)
         return row
 
-    def _of(self, camera: int) -> str:
-        return "" if len(self._cameras) == 1 else f"camera {self._cameras[camera]}: "
+    def _missing(self, camera: int, why: Reason) -> Release:
+        """``why``, with the camera's name where there are several."""
+        is_only = len(self._cameras) == 1
+        name = self._cameras[camera]
+        return Release(why if is_only else because(Code.OF_CAMERA, camera=name, why=why))
 
 
 def observation_ages_ns(contract: Contract) -> tuple[int, ...]:

@@ -10,6 +10,7 @@ from typing import NamedTuple
 from mavbridge.core.clock import NS_PER_S
 from mavbridge.core.course import CourseGate, CourseProgress
 from mavbridge.core.errors import ExitCode
+from mavbridge.core.reasons import Reason
 from mavbridge.core.records import Event, FlightOutcome, Tick
 from mavbridge.core.stopping import StopRequest
 from mavbridge.core.vehicle import FlightEnd
@@ -45,7 +46,7 @@ class FlightReferee:
         self._flown: Tick | None = None
         """The last one in which the policy had the sticks."""
         self._has_position = self._is_flying = self._is_disarmed = False
-        self._reason = ""
+        self._reason: Reason | None = None
 
     def emit(self, event: Event) -> None:
         """Follow the ticks from the policy's first action on."""
@@ -57,7 +58,7 @@ class FlightReferee:
             self._flown = event
             self._has_position = self._has_position or event.position_ned_m is not None
         elif was_flying:
-            self._reason = event.release_reason or ""
+            self._reason = event.release_reason
         if self._began_ns:
             self._course.update(event.position_ned_m if self._is_flying else None, event.sent_ns)
             is_ours = event.phase in (Phase.FLYING.value, Phase.LEAVING.value)
@@ -141,7 +142,7 @@ def flight_verdict(
     summary: GateSummary | None,
     stop: StopRequest,
     *,
-    reason: str,
+    reason: Reason | None,
     readonly: bool,
     crash: str | None = None,
     record: Path | None = None,

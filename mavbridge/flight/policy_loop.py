@@ -6,6 +6,7 @@ from dataclasses import dataclass
 from typing import TypeAlias
 
 from mavbridge.core.clock import NS_PER_MS, NS_PER_S, Clock
+from mavbridge.core.reasons import Code, Reason, because
 from mavbridge.core.records import FloatArray, Solve, VehicleState
 from mavbridge.core.vehicle import Action, Release
 from mavbridge.flight.action_frames import ActionFrame
@@ -89,7 +90,7 @@ class PolicyLoop:
         try:
             self._run(stop)
         except BaseException:
-            self._send(Absence("the policy's loop has failed"))
+            self._send(Absence(because(Code.POLICY_FAILED)))
             raise
 
     def _run(self, stop: threading.Event) -> None:
@@ -102,7 +103,7 @@ class PolicyLoop:
             elif self._view.wait_for_attitude(newer_than_ns=self.start_ns - 1, timeout_ns=WAIT_NS):
                 self.step()
             else:
-                self._send(Absence("no attitude from the vehicle"))
+                self._send(Absence(because(Code.NO_READING, quantity="attitude")))
             self.alive_ns = self._clock.now_ns()
 
     @property
@@ -146,7 +147,7 @@ class PolicyLoop:
         frozen = self._frozen.problem(state)
         return self._observations.observe(state, now_ns) if frozen is None else Release(frozen)
 
-    def _refuse(self, reason: str) -> None:
+    def _refuse(self, reason: Reason) -> None:
         if self._due_ns is not None:
             soon_ns = self._clock.now_ns() + RETRY_NS + self._settings.period_ns // 4
             self._due_ns = min(self._due_ns, soon_ns)
@@ -158,16 +159,13 @@ class PolicyLoop:
         try:
             array = self._act(observation.encoded, observation.states, history)
         except NoChunkError as error:
-            self._refuse(str(error))
+            self._refuse(because(Code.POLICY_REFUSED, said=str(error)))
             return
         done_ns = self._clock.now_ns()
         is_chunk = array.ndim == 3 and array.shape[0] == 1 and array.shape[2] == 4
         if not is_chunk or not 0 < array.shape[1] <= MAX_HORIZON:
-            shape = list(array.shape)
-            self._refuse(
-                f"the policy returned {shape} instead of [1, horizon, 4], with at most "
-                f"{MAX_HORIZON} actions"
-            )
+            shape = str(list(array.shape))
+            self._refuse(because(Code.WRONG_SHAPE, shape=shape, most=MAX_HORIZON))
             return
         self._serial += 1
         self._view.remember(

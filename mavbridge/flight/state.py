@@ -7,6 +7,7 @@ from typing import Literal
 import numpy as np
 
 from mavbridge.core.clock import NS_PER_MS
+from mavbridge.core.reasons import Code, Reason, because
 from mavbridge.core.records import VehicleState
 from mavbridge.core.vehicle import Reading, Release, Telemetry
 
@@ -38,13 +39,13 @@ def build_state(
     attitude, rate = telemetry.ned_from_body_wxyz, telemetry.rate_body_radps
     velocity, force = telemetry.velocity_ned_mps, telemetry.specific_force_body_mps2
     if attitude is None or not attitude.is_fresh(now_ns, freshness.attitude_ns):
-        return stale(attitude, "attitude", freshness.attitude_ns)
+        return stale(attitude, "attitude", now_ns, freshness.attitude_ns)
     if rate is None or not rate.is_fresh(now_ns, freshness.attitude_ns):
-        return stale(rate, "body rates", freshness.attitude_ns)
+        return stale(rate, "body rates", now_ns, freshness.attitude_ns)
     if velocity is None or not velocity.is_fresh(now_ns, freshness.velocity_ns):
-        return stale(velocity, "velocity", freshness.velocity_ns)
+        return stale(velocity, "velocity", now_ns, freshness.velocity_ns)
     if force is None or not force.is_fresh(now_ns, freshness.velocity_ns):
-        return stale(force, "acceleration", freshness.velocity_ns)
+        return stale(force, "acceleration", now_ns, freshness.velocity_ns)
     v, q, w, a = velocity.values, attitude.values, rate.values, force.values
     if frame == "enu_flu":
         v, q, w, a = _to_enu_flu(v, q, w, a)
@@ -71,7 +72,7 @@ class FrozenStateCheck:
         self._attitude: bytes = b""
         self._changed_ns = 0
 
-    def problem(self, state: VehicleState) -> str | None:
+    def problem(self, state: VehicleState) -> Reason | None:
         """Reason not to fly by this state, or None; call it with each state, in order."""
         attitude = state.values[3:7].tobytes()
         if attitude != self._attitude:
@@ -80,19 +81,19 @@ class FrozenStateCheck:
         is_turning = bool(np.abs(state.values[7:10]).max() > LEAST_RATE_RADPS)
         if not self._max_frozen_ns or frozen_ns <= self._max_frozen_ns or not is_turning:
             return None
-        limit_ms = self._max_frozen_ns // NS_PER_MS
-        return f"the vehicle's attitude has been frozen for more than {limit_ms} ms"
+        age_ms, limit_ms = frozen_ns / NS_PER_MS, self._max_frozen_ns / NS_PER_MS
+        return because(Code.ATTITUDE_FROZEN, age_ms=age_ms, limit_ms=limit_ms)
 
 
-def stale(reading: Reading | None, what: str, limit_ns: int) -> Release:
+def stale(reading: Reading | None, quantity: str, now_ns: int, limit_ns: int) -> Release:
     """Say why a reading is none to fly by."""
     if reading is None:
-        return Release(f"no {what} from the vehicle yet")
+        return Release(because(Code.NO_READING, quantity=quantity))
     if reading.delay_ns < 0:
-        ahead_ms = -reading.delay_ns // NS_PER_MS
-        return Release(f"{what} is stamped {ahead_ms} ms ahead of the vehicle's clock")
-    # The limit, not the age: reasons are compared from tick to tick.
-    return Release(f"{what} is older than {limit_ns // NS_PER_MS} ms")
+        ahead_ms = -reading.delay_ns / NS_PER_MS
+        return Release(because(Code.READING_AHEAD, quantity=quantity, ahead_ms=ahead_ms))
+    age_ms, limit_ms = (now_ns - reading.happened_ns) / NS_PER_MS, limit_ns / NS_PER_MS
+    return Release(because(Code.TOO_OLD, quantity=quantity, age_ms=age_ms, limit_ms=limit_ms))
 
 
 _Parts = tuple[tuple[float, ...], tuple[float, ...], tuple[float, ...], tuple[float, ...]]

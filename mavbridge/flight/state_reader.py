@@ -5,6 +5,7 @@ Freshness of the extra inputs is that of the velocity: a missing or an old one i
 
 from dataclasses import replace
 
+from mavbridge.core.reasons import Code, because
 from mavbridge.core.records import VehicleState
 from mavbridge.core.vehicle import Reading, Release, Telemetry
 from mavbridge.flight.state import Freshness, build_state, stale
@@ -39,7 +40,7 @@ class StateReader:
         for extra in self._extras:
             reading = telemetry.height_above_home_m if extra == "height" else position
             if reading is None or not reading.is_fresh(now_ns, self._freshness.velocity_ns):
-                return self._missing(extra, reading)
+                return self._missing(extra, reading, now_ns)
             stamps_ns.append(reading.happened_ns)
             if extra == "goal":
                 numbers += self._to_goal(reading.values)
@@ -47,11 +48,11 @@ class StateReader:
                 numbers.append(reading.values[0] if extra == "height" else -reading.values[2])
         return replace(state, extras=tuple(numbers), extras_ns=min(stamps_ns))
 
-    def _missing(self, extra: str, reading: Reading | None) -> Release:
+    def _missing(self, extra: str, reading: Reading | None, now_ns: int) -> Release:
         what = _READINGS[extra]
         if reading is None:
-            return Release(f"no {what} from the vehicle yet, or none that it trusts")
-        return stale(reading, what, self._freshness.velocity_ns)
+            return Release(because(Code.NO_TRUSTED_READING, quantity=what))
+        return stale(reading, what, now_ns, self._freshness.velocity_ns)
 
     def _to_goal(self, position_ned_m: tuple[float, ...]) -> list[float]:
         """From the vehicle to the goal, in the world's axes of the contract."""

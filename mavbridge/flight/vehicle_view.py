@@ -9,6 +9,7 @@ from typing import NamedTuple
 
 from mavbridge.core.clock import NS_PER_S
 from mavbridge.core.ports import TickSink
+from mavbridge.core.reasons import Reason
 from mavbridge.core.records import Position, Tick, VehicleState
 from mavbridge.core.vehicle import ForwardedPacket, Telemetry
 from mavbridge.flight.history import SentHistory
@@ -89,7 +90,7 @@ class VehicleView:
         self._was_flown = False
         """The policy moved the sticks at the last tick."""
         self.phase = Phase.WAITING
-        self.reason = ""
+        self.reason: Reason | None = None
         self.starting_ns = 0
         """The policy is to be reset for a flight, as of then; 0: it is not."""
         self.flights = 0

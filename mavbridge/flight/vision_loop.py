@@ -6,6 +6,7 @@ from collections.abc import Callable
 from mavbridge.camera.image_watch import ImageWatch
 from mavbridge.core.clock import NS_PER_MS, Clock
 from mavbridge.core.ports import Camera, TickSink
+from mavbridge.core.reasons import Code, Reason, because
 from mavbridge.core.records import CameraImage, FeatureFrame, FloatArray, VisionTick
 from mavbridge.flight.feature_cache import FeatureCache
 
@@ -88,16 +89,14 @@ class VisionLoop:
         captured_ns = min(frame.captured_ns, started_ns)
         if not self._is_due(captured_ns):
             return
-        fault: str | None = None
+        fault: Reason | None = None
         if self._image_watch is not None:
             is_airborne = self._is_airborne()
             fault = self._image_watch.check(frame.rgb, captured_ns, is_airborne=is_airborne)
         ahead_ns = frame.captured_ns - started_ns
         if ahead_ns > MAX_AHEAD_NS:
-            fault = (
-                f"the camera stamps its images {ahead_ns / NS_PER_MS:.0f} ms in the future (limit "
-                f"{MAX_AHEAD_NS // NS_PER_MS} ms): have it stamp them on CLOCK_MONOTONIC"
-            )
+            ahead_ms, limit_ms = ahead_ns / NS_PER_MS, MAX_AHEAD_NS / NS_PER_MS
+            fault = because(Code.IMAGE_AHEAD, ahead_ms=ahead_ms, limit_ms=limit_ms)
         with self._encoder_lock:
             self.encoding_since_ns = self._clock.now_ns()
             value = self._encode(frame.rgb)

@@ -13,6 +13,7 @@ import traceback
 from mavbridge.core.clock import NS_PER_MS, NS_PER_S, MonotonicClock
 from mavbridge.core.errors import MavbridgeError, UserError
 from mavbridge.core.realtime import settle_gate
+from mavbridge.core.reasons import Code, because
 from mavbridge.gate.channel import SocketPort
 from mavbridge.gate.departure import Ending
 from mavbridge.gate.loop import GateLoop
@@ -94,7 +95,8 @@ def _fly(
         signing=signing,
     )
     loop = GateLoop(clock, link, port, received=received, lead_ns=LEAD_NS)
-    signal.signal(signal.SIGTERM, lambda *_: loop.stop(Ending(reason="the gate was told to end")))
+    told = Ending(reason=because(Code.TOLD_TO_END))
+    signal.signal(signal.SIGTERM, lambda *_: loop.stop(told))
     refusal = settle_gate(realtime=settings.realtime, cpu=settings.cpu)
     if refusal is not None:
         port.send(encode_from_gate(GateMessage(refusal)))

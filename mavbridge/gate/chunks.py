@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from typing import Literal, NamedTuple, TypeAlias
 
 from mavbridge.core.clock import NS_PER_MS, NS_PER_S
+from mavbridge.core.reasons import Code, Reason, because
 from mavbridge.core.vehicle import ACTION_CLASSES, Action, ActionKind
 
 LEAST_GRACE_NS = 100 * NS_PER_MS
@@ -111,31 +112,25 @@ class Lateness(NamedTuple):
     place: Place
     stall_ns: int
     """Time that was spent there."""
-    said: str = ""
-    """Why the flight process computed no chunk, in its own words."""
+    said: Reason | None = None
+    """Why the flight process computed no chunk."""
 
     @property
-    def text(self) -> str:
-        """One sentence for the user."""
-        age_ms, limit_ms, stall_ms = (
-            round(ns / NS_PER_MS) for ns in (self.age_ns, self.limit_ns, self.stall_ns)
+    def reason(self) -> Reason:
+        """The same as a reason to end a flight."""
+        code, quantity = Code.LATE, str(self.name)
+        if self.name == "horizon":
+            code, quantity = Code.PAST_HORIZON, "chunk"
+        reason = because(
+            code,
+            quantity=quantity,
+            age_ms=self.age_ns / NS_PER_MS,
+            limit_ms=self.limit_ns / NS_PER_MS,
+            place=self.place,
+            spent_ms=self.stall_ns / NS_PER_MS,
         )
-        what, limit = self.name, f"limit {limit_ms} ms"
-        if what == "horizon":
-            what, limit = "chunk", f"its horizon ends after {limit_ms} ms"
-        spent: dict[Place, str] = {
-            "computer": "the computer stood still for",
-            "gate": "the gate stood still for",
-            "flight process": "the flight process stood still, or solved, for",
-            "solve": "the solve took",
-            "link": f"the link delivered no {what} for",
-            "camera": "the camera delivered nothing for",
-        }
-        where = f": {spent[self.place]} {stall_ms} ms"
-        if self.said and self.place == "flight process":
-            where = ""  # it speaks
-        said = f"{self.said}; " if self.said else ""
-        return f"{said}{what} {age_ms} ms old ({limit}){where}"
+        said: tuple[tuple[str, Reason], ...] = () if self.said is None else (("said", self.said),)
+        return Reason(code, (*reason.data, *said))
 
 
 class ChunkBuffer:
@@ -159,9 +154,9 @@ class ChunkBuffer:
         self._period_ns = period_ns
         self.grace_ns = max(LEAST_GRACE_NS, GRACE_PERIODS * period_ns)
         self._refused_ns: deque[int] = deque(maxlen=MAX_REFUSED)
-        self._malformation: str | None = None
+        self._malformation: Reason | None = None
         """What was wrong with the last malformed chunk."""
-        self._refusal: str | None = None
+        self._refusal: Reason | None = None
         """Why the newest chunk was not taken; None if it was."""
         self._is_stale = False
         """It was refused for its age."""
@@ -202,7 +197,7 @@ class ChunkBuffer:
         staleness = self._stale(chunk, now_ns)
         is_stale = staleness is not None
         if staleness is None and now_ns > end_ns:
-            staleness = f"the chunk came after its horizon{self._horizon(chunk)} had ended"
+            staleness = because(Code.AFTER_HORIZON, **_horizon(chunk))
         if staleness is not None:
             self.explain_absence(staleness, now_ns)
             self._is_stale = is_stale
@@ -232,29 +227,24 @@ class ChunkBuffer:
             return taken_ns + chunk.step_ns + self._period_ns // 2
         return chunk.end_ns
 
-    @staticmethod
-    def _horizon(chunk: Chunk) -> str:
-        steps, each_ms = len(chunk.actions), chunk.step_ns / NS_PER_MS
-        return f" of {chunk.horizon_ns / NS_PER_MS:.3g} ms ({steps} x {each_ms:.3g} ms)"
-
-    def explain_absence(self, reason: str, now_ns: int) -> None:
+    def explain_absence(self, reason: Reason, now_ns: int) -> None:
         """Note why there is no chunk; whoever says so does not stall, and has the grace alone."""
         self._refusal, self._is_stale, self._word_ns = reason, False, now_ns
         graced_ns = max(self._grace_until_ns, now_ns - self._period_ns + self.grace_ns)
         self._until_ns = min(self._until_ns, graced_ns)
 
     @property
-    def impossibility(self) -> str | None:
+    def impossibility(self) -> Reason | None:
         """Why the policy can never fly on this computer at this rate, or None."""
         if self._is_short and (short := self._shortness()) is not None:
             return short
         if self._slow < SLOW_CHUNKS:
             return None
-        return (
-            f"the policy is too slow for this computer, or the link for the policy: the last "
-            f"{self._slow} chunks came too late, the newest {self._solve_ns // NS_PER_MS} ms after "
-            f"its attitude, which may be {self._limits.state_ns // NS_PER_MS} ms old when a stick "
-            "leaves; use a smaller policy, fewer steps or a faster computer"
+        return because(
+            Code.TOO_SLOW,
+            chunks=self._slow,
+            age_ms=self._solve_ns / NS_PER_MS,
+            limit_ms=self._limits.state_ns / NS_PER_MS,
         )
 
     def is_coasting(self, now_ns: int) -> bool:
@@ -263,7 +253,7 @@ class ChunkBuffer:
         is_overdue = now_ns - self._taken_ns > 2 * self._period_ns or now_ns > self._end_ns
         return chunk is not None and (is_overdue or self._stale(chunk, now_ns) is not None)
 
-    def problem(self, now_ns: int) -> str | None:
+    def problem(self, now_ns: int) -> Reason | None:
         """Why no flight may begin now, or None: a chunk must be fresh, by all limits."""
         chunk = self.newest
         if (flood := self._malformed_lately(now_ns)) is not None:
@@ -271,9 +261,9 @@ class ChunkBuffer:
         if (short := self._shortness()) is not None:
             return short
         if chunk is None or now_ns > self._grace_until_ns:
-            return self._refusal or "no chunk from the policy yet"
+            return self._refusal or because(Code.NO_CHUNK)
         if len(self._gaps_ns) < LEAST_GAPS:
-            return "the policy has only just begun"
+            return because(Code.JUST_BEGUN)
         bridged_ns = self._grace_until_ns - self._taken_ns
         if (gap_ns := max(self._gaps_ns)) > bridged_ns:
             advice = "it is too slow here for its rate; ask for a lower one"
@@ -281,18 +271,20 @@ class ChunkBuffer:
                 advice = (
                     "its limits and horizon let none be flown for longer; ask for a higher rate"
                 )
-            return (
-                f"the policy's chunks come up to {gap_ns // NS_PER_MS} ms apart, beyond the "
-                f"{bridged_ns // NS_PER_MS} ms that are bridged: {advice}"
+            return because(
+                Code.CHUNKS_APART,
+                gap_ms=gap_ns / NS_PER_MS,
+                bridged_ms=bridged_ns / NS_PER_MS,
+                advice=advice,
             )
         return self._stale(chunk, now_ns)
 
-    def fault(self, now_ns: int) -> str | None:
+    def fault(self, now_ns: int) -> Reason | None:
         """Why the flight must end now, or None: the grace is over, or too much was malformed."""
         if (flood := self._malformed_lately(now_ns)) is not None:
             return flood
         late = self.lateness(now_ns)
-        return None if late is None else late.text
+        return None if late is None else late.reason
 
     def is_over(self, now_ns: int) -> bool:
         """True if the grace has ended."""
@@ -310,7 +302,7 @@ class ChunkBuffer:
         """
         if not self.is_over(now_ns):
             return None
-        said = "" if self._is_stale else self._refusal or ""
+        said = None if self._is_stale else self._refusal
         silent_ns = now_ns - self._word_ns
         if self._seen is None:
             return Lateness("chunk", silent_ns, self.grace_ns, "flight process", silent_ns, said)
@@ -331,13 +323,13 @@ class ChunkBuffer:
             place, spent["computer"] = "computer", stood_ns
         return Lateness(name, now_ns - happened_ns, limit_ns, place, spent[place], said)
 
-    def _malformed_lately(self, now_ns: int) -> str | None:
+    def _malformed_lately(self, now_ns: int) -> Reason | None:
         window_ns = max(REFUSED_WINDOW_NS, REFUSED_WINDOW_PERIODS * self._period_ns)
         refused = self._refused_ns
-        if len(refused) < MAX_REFUSED or now_ns - refused[0] >= window_ns:
+        is_flood = len(refused) >= MAX_REFUSED and now_ns - refused[0] < window_ns
+        if not is_flood or self._malformation is None:
             return None
-        many = f"the policy returned {MAX_REFUSED} unusable chunks within a short time"
-        return f"{many}: {self._malformation}"
+        return because(Code.UNUSABLE_CHUNKS, chunks=MAX_REFUSED, why=self._malformation)
 
     @property
     def _is_short(self) -> bool:
@@ -345,7 +337,7 @@ class ChunkBuffer:
         chunk, least_ns = self.newest, self._period_ns * (1 - PERIOD_TOLERANCE)
         return chunk is not None and chunk.horizon_ns < least_ns
 
-    def _shortness(self) -> str | None:
+    def _shortness(self) -> Reason | None:
         """Figures of a policy whose chunks end before the next one comes, or None."""
         chunk, gaps_ns = self.newest, sorted(self._gaps_ns)
         if chunk is None or not gaps_ns:
@@ -353,11 +345,11 @@ class ChunkBuffer:
         gap_ns, covered_ns = gaps_ns[(len(gaps_ns) - 1) // 2], self._end_ns - self._taken_ns
         if gap_ns <= covered_ns and not self._is_short:
             return None
-        return (
-            f"the policy's horizon{self._horizon(chunk)} is too short for its rate: a chunk ends "
-            f"{covered_ns / NS_PER_MS:.0f} ms after it came, and chunks come "
-            f"{max(gap_ns, self._period_ns) / NS_PER_MS:.0f} ms apart; ask for a higher --rate or "
-            "--action-rate, or use a policy of a longer horizon"
+        return because(
+            Code.HORIZON_TOO_SHORT,
+            covered_ms=covered_ns / NS_PER_MS,
+            gap_ms=max(gap_ns, self._period_ns) / NS_PER_MS,
+            **_horizon(chunk),
         )
 
     def action_at(self, now_ns: int, lead_ns: int = 0) -> Action | None:
@@ -383,19 +375,26 @@ class ChunkBuffer:
         """The last moment at which a chunk keeps its limits."""
         return min(happened_ns + limit_ns for _, happened_ns, limit_ns in self._ages(chunk))
 
-    def _stale(self, chunk: Chunk, now_ns: int) -> str | None:
+    def _stale(self, chunk: Chunk, now_ns: int) -> Reason | None:
         for name, happened_ns, limit_ns in self._ages(chunk):
             if now_ns - happened_ns > limit_ns:
-                # In tens of ms: reasons are compared from step to step.
-                age_ms = (now_ns - happened_ns) // (10 * NS_PER_MS) * 10
-                return f"the {name} is {age_ms} ms old, beyond {limit_ns // NS_PER_MS} ms"
+                age_ms, limit_ms = (now_ns - happened_ns) / NS_PER_MS, limit_ns / NS_PER_MS
+                return because(Code.TOO_OLD, quantity=name, age_ms=age_ms, limit_ms=limit_ms)
         return None
 
-    def _malformed(self, chunk: Chunk) -> str | None:
+    def _malformed(self, chunk: Chunk) -> Reason | None:
         if not chunk.actions or chunk.step_ns <= 0:
-            return "the policy returned a chunk without actions"
+            return because(Code.EMPTY_CHUNK)
         if not all(type(action) is self._class for action in chunk.actions):
-            return "the policy returned actions of another kind than its contract names"
+            return because(Code.WRONG_KIND)
         if not all(math.isfinite(sum(action)) for action in chunk.actions):
-            return "the policy returned a value that is not finite"
+            return because(Code.NOT_FINITE)
         return None
+
+
+def _horizon(chunk: Chunk) -> dict[str, float]:
+    return {
+        "horizon_ms": chunk.horizon_ns / NS_PER_MS,
+        "steps": len(chunk.actions),
+        "step_ms": chunk.step_ns / NS_PER_MS,
+    }

@@ -3,6 +3,7 @@
 from dataclasses import dataclass
 
 from mavbridge.core.clock import NS_PER_MS, NS_PER_S
+from mavbridge.core.reasons import Code, Reason, because
 from mavbridge.core.vehicle import FlightEnd, OnFault
 from mavbridge.gate.facts import Facts, Hand, Move
 
@@ -41,7 +42,7 @@ MIDDLE_STICK = 0.2
 class Ending:
     """Why a flight ends by our own doing."""
 
-    reason: str
+    reason: Reason
     is_fault: bool = False
     end: FlightEnd = "signal"
     """Code of an end that is no fault."""
@@ -86,7 +87,7 @@ class Departure:
         """The receiver's sticks would hold the vehicle in the mode of the flight."""
         self.must_hold = False
         """Neutral must go on: silence is a failsafe, or the receiver would drop the vehicle."""
-        self.note: str | None = None
+        self.note: Reason | None = None
         """Why it is not released, although the flag says so; the reader resets it."""
         self.is_done = False
 
@@ -117,7 +118,7 @@ class Departure:
         elif choice in ("auto", "release"):
             instead: OnFault = "hold" if ending.is_fault else "land"
             if objection is not None and choice == "release":
-                self.note = f"{instead} instead of release in the air: {objection}"
+                self.note = because(Code.NOT_RELEASED, instead=instead, why=objection)
             choice = "release" if objection is None else instead
         # In a mode of setpoints or of the autopilot's takeoff a pilot's sticks would do nothing.
         is_deaf = facts.mode in (*facts.modes.setpoint, *facts.modes.takeoff)
@@ -161,24 +162,24 @@ class Departure:
             return is_bounded  # when neutral left is not known
         return is_bounded or (facts.are_sticks_at_rest and facts.now_ns > self._began_ns)
 
-    def _hand_objection(self, facts: Facts) -> str | None:
+    def _hand_objection(self, facts: Facts) -> Reason | None:
         """Why the pilot's sticks would not hold the vehicle in its present mode, or None."""
         if facts.has_receiver is not True:
-            return "there is no receiver"
+            return because(Code.NO_RECEIVER)
         if facts.is_landed:
             return None
         if facts.is_receiver_sick:
-            return "the receiver is lost"
+            return because(Code.RECEIVER_LOST)
         if facts.modes.is_silence_failsafe and not self._settings.is_setpoint:
-            return "the vehicle takes the end of our sticks for a failsafe"
+            return because(Code.SILENCE_IS_FAILSAFE)
         if facts.mode in facts.modes.thrust:
-            return f"in {facts.mode} the throttle is thrust"
+            return because(Code.THROTTLE_IS_THRUST, mode=facts.mode)
         if facts.pilot_sticks is None:
-            return "the receiver's throttle is not known"
+            return because(Code.THROTTLE_UNKNOWN)
         throttle = facts.pilot_sticks.throttle
         if abs(throttle) > MIDDLE_STICK:
             percent, most = 100 * throttle, 100 * MIDDLE_STICK
-            return f"the receiver's throttle rests at {percent:+.0f} % (limit {most:.0f} %)"
+            return because(Code.THROTTLE_RESTS, percent=percent, limit_percent=most)
         return None
 
     def _may_ask(self, facts: Facts, unheard_ns: int | None) -> bool:

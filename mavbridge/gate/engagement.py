@@ -10,6 +10,7 @@ from enum import Enum
 from typing import Literal, TypeAlias
 
 from mavbridge.core.clock import NS_PER_MS, NS_PER_S
+from mavbridge.core.reasons import Code, Reason, because
 from mavbridge.core.switch import Switch
 from mavbridge.core.vehicle import FlightEnd
 from mavbridge.gate.departure import STICK_REST_NS, Departure, DepartureSettings, Ending
@@ -41,7 +42,6 @@ SILENCE_NS = 250 * NS_PER_MS
 until it is told anew: its own failsafe may have acted, after 0.5 s at the earliest."""
 BACKLOG_NS = 50 * NS_PER_MS
 """After a standstill, time for what was under way to come out of pipes and sockets."""
-OPERATOR = "released by the operator"
 REST_NS = 1_800 * NS_PER_MS
 """Least rest of the engage switch, low, before going high is an act: receivers that dropped out for
 0.6 to 1.5 s, with a preset that puts the switch low, have looked like a hand."""
@@ -119,17 +119,17 @@ class Engagement:
         self._was_ready = False
         """The vehicle was armed at the last step of preparing."""
         self._switch = Switch(rest_ns=REST_NS)
-        self._seen_interruption: str | None = None
+        self._seen_interruptions = 0
         self._stop_reason: Ending | None = None
         self._must_end = False
         """The stop has not been acted upon."""
         self.phase = Phase.WAITING
-        self.reason = "not engaged"
-        """Why the policy does not fly; shown to the user."""
-        self.refusal: str | None = None
+        self.reason: Reason | None = because(Code.NOT_ENGAGED)
+        """Why the policy does not fly; None while it does."""
+        self.refusal: Reason | None = None
         """Why the last explicit act had no effect, or what the vehicle has not confirmed; the
         reader resets it."""
-        self.failure: str | None = None
+        self.failure: Reason | None = None
         """Why there was no flight: the vehicle did not take the mode or arm in time."""
         self.engaged_ns: int | None = None
         """First moment of flight."""
@@ -148,7 +148,7 @@ class Engagement:
         self._listen(facts)
         act = self._explicit_act(facts, act)
         if act == "engage" and self.phase in (Phase.LEAVING, Phase.HOLDING, Phase.RELEASING):
-            self.refusal = f"not engaged: the last flight is still ending ({self.phase.value})"
+            self.refusal = _not_engaged(because(Code.STILL_ENDING, phase=self.phase.value))
         match self.phase:
             case Phase.WAITING | Phase.RELEASED | Phase.ENDED:
                 return self._rest(facts, act)
@@ -204,36 +204,37 @@ class Engagement:
             self._switch.forget()
             is_act = False
         if was_off and not self._switch.is_off and not is_act:
-            self.refusal = (
-                f"not engaged: the engage switch (channel {channel}) did not rest low for "
-                f"{REST_NS / NS_PER_S:g} s with a receiver that works: leave it low for 2 s, then "
-                "switch it on"
-            )
+            rest_s = REST_NS / NS_PER_S
+            why = because(Code.SWITCH_NOT_RESTED, channel=channel, rest_s=rest_s)
+            self.refusal = _not_engaged(why)
         return is_act
 
-    def _objection(self, facts: Facts) -> str | None:
+    def _objection(self, facts: Facts) -> Reason | None:
         """Why the policy may not take the sticks of an armed vehicle now, or None."""
         if facts.link_problem is not None:
             return facts.link_problem
         if facts.is_failsafe:
-            return "a failsafe of the vehicle is active"
+            return because(Code.FAILSAFE, mode=facts.mode)
         if self._switch.is_off:
-            return f"the engage switch (channel {self._settings.engage_channel}) is off"
+            return self._switch_off
         return facts.envelope_problem
 
-    def _mode_objection(self, facts: Facts) -> str | None:
+    @property
+    def _switch_off(self) -> Reason:
+        return because(Code.ENGAGE_SWITCH_OFF, channel=self._settings.engage_channel or 0)
+
+    def _mode_objection(self, facts: Facts) -> Reason | None:
         if facts.mode in self._settings.preparation.modes:
             return None
         allowed = " or ".join(self._settings.preparation.modes)
-        wrong = f"the policy may not fly in {facts.mode}, only in {allowed}"
-        return f"{wrong}: change the mode, or use --mode"
+        return because(Code.WRONG_MODE, mode=facts.mode, allowed=allowed)
 
     # --- phases
 
     def _rest(self, facts: Facts, act: Act | None) -> Move:
         """The sticks are the pilot's, and nothing is sent."""
         if self._is_over(facts):
-            self.stop(Ending(reason="the flight is over"))
+            self.stop(Ending(reason=because(Code.DURATION)))
         if self._stop_reason is not None:
             self.phase = Phase.ENDED
             return Move()
@@ -246,39 +247,37 @@ class Engagement:
         if act != "engage":
             return Move()
         if not facts.armed:
-            self.refusal = "not engaged: the vehicle is disarmed; arm it first, or use --arm"
+            self.refusal = _not_engaged(because(Code.NOT_ARMED))
         elif (objection := self._objection(facts) or facts.chunk_problem) is not None or (
             not self._preparation.may_change_mode(facts)
             and (objection := self._mode_objection(facts)) is not None
         ):
-            self.refusal = f"not engaged: {objection}"
+            self.refusal = _not_engaged(objection)
         else:
             return self._begin_preparing(facts, ACT_TIMEOUT_NS)
         return Move()
 
-    def _waiting_reason(self, facts: Facts) -> str:
-        if facts.link_problem is not None:
-            return facts.link_problem
-        return facts.chunk_problem or "not engaged: press e, use the engage switch, or --arm"
+    def _waiting_reason(self, facts: Facts) -> Reason:
+        return facts.link_problem or facts.chunk_problem or because(Code.NOT_ENGAGED)
 
     def _begin_preparing(self, facts: Facts, timeout_ns: int) -> Move:
         self.phase = Phase.PREPARING
         self._own_mode = facts.mode if facts.armed else None
         self._preparation.begin(facts)
         self._prepare_timeout_ns, self._prepare_until_ns = timeout_ns, facts.now_ns + timeout_ns
-        self._seen_interruption = facts.interruption
+        self._seen_interruptions = facts.interruptions
         self.starting_ns = None
         return self._prepare(facts, None)
 
     def _prepare(self, facts: Facts, act: Act | None) -> Move:
         if self._stop_reason is not None or act == "release":
-            return self._depart(facts, self._stop_reason or Ending(reason=OPERATOR))
+            return self._depart(facts, self._stop_reason or Ending(reason=because(Code.OPERATOR)))
         is_first_mode = self._own_mode is None and self._preparation.wanted_mode(facts) is None
         if is_first_mode or self._preparation.is_own_mode(facts):
             self._own_mode = facts.mode
         taken = self._takeover(facts)
         if taken is None and self._was_ready and not facts.armed:
-            taken = "the vehicle has been disarmed"
+            taken = because(Code.DISARMED)
         if taken is not None:
             return self._yield(facts, taken)
         self._was_ready = facts.armed
@@ -288,8 +287,8 @@ class Engagement:
         # Once the policy is being reset, its silence is no reason to begin that anew.
         chunk_problem = facts.chunk_problem if self.starting_ns is None else None
         preparing = self._preparation.step(facts, self._objection(facts) or chunk_problem)
-        self.reason = preparing.waits_for or "waiting for the policy's first chunk after its reset"
-        if self._is_started(facts, is_ready=not preparing.waits_for):
+        self.reason = preparing.waits_for or because(Code.FIRST_CHUNK)
+        if self._is_started(facts, is_ready=preparing.waits_for is None):
             return self._take_off(facts)
         return preparing.move
 
@@ -305,21 +304,21 @@ class Engagement:
 
     def _give_up_preparing(self, facts: Facts) -> Move:
         """The vehicle, or an input, was not ready in time."""
-        unsolved = self.starting_ns is not None and (
-            "the policy has not returned a chunk that may be flown since its reset: "
-            f"{facts.chunk_problem or 'none has come'}"
-        )
-        problem = (
-            self._preparation.impossibility(facts)
-            or unsolved
-            or (
-                f"the vehicle is not ready after {self._prepare_timeout_ns // NS_PER_S} s "
-                f"(mode {facts.mode}, armed {facts.armed}, overrides seen {facts.echo_confirmed}, "
-                f"inputs {facts.chunk_problem or 'fine'}): see its messages above"
+        problem = self._preparation.impossibility(facts)
+        if problem is None and self.starting_ns is not None:
+            why = facts.chunk_problem or because(Code.NO_CHUNK)
+            problem = because(Code.NO_CHUNK_SINCE_RESET, why=why)
+        if problem is None:
+            problem = because(
+                Code.NOT_READY,
+                after_s=self._prepare_timeout_ns / NS_PER_S,
+                mode=facts.mode,
+                is_armed=facts.armed,
+                is_echoed=facts.echo_confirmed,
+                inputs=facts.chunk_problem or "fine",
             )
-        )
         if self._prepare_timeout_ns == ACT_TIMEOUT_NS:  # the act may be repeated
-            self.refusal = f"not engaged: {problem}"
+            self.refusal = _not_engaged(problem)
             return self._depart(facts, Ending(reason=self.refusal, is_fault=True))
         self.failure = problem
         ending = Ending(reason=problem, is_fault=True)
@@ -331,9 +330,9 @@ class Engagement:
         self.phase, self.starting_ns = Phase.FLYING, None
         flights = self.outcome.flights + 1
         self.outcome = self.outcome._replace(flights=flights, is_disarmed=False, end=None)
-        self.reason = ""
+        self.reason = None
         self._own_mode = facts.mode
-        self._seen_interruption = facts.interruption
+        self._seen_interruptions = facts.interruptions
         if self.engaged_ns is None:
             self.engaged_ns = facts.now_ns
         return Move(hand=Hand.POLICY)
@@ -346,9 +345,9 @@ class Engagement:
         if (stop := self._stop_reason) is not None:
             return self._fail(facts, stop) if stop.is_fault else self._depart(facts, stop)
         if act == "release":
-            return self._depart(facts, Ending(reason=OPERATOR, end="operator"))
+            return self._depart(facts, Ending(reason=because(Code.OPERATOR), end="operator"))
         if self._is_over(facts):
-            over = Ending(reason="the flight is over", end="duration")
+            over = Ending(reason=because(Code.DURATION), end="duration")
             self.stop(over)
             return self._depart(facts, over)
         if facts.landing is not None:
@@ -371,24 +370,24 @@ class Engagement:
             and facts.now_ns - self.engaged_ns >= duration_ns
         )
 
-    def _takeover(self, facts: Facts) -> str | None:
+    def _takeover(self, facts: Facts) -> Reason | None:
         """Why the sticks are somebody else's now, or None."""
-        if facts.interruption != self._seen_interruption:
+        if facts.interruptions != self._seen_interruptions:
             return facts.interruption
         if facts.overruled is not None:
             return facts.overruled
         if facts.is_switched_off:
-            return "the pilot's override switch is off"
+            return because(Code.OVERRIDE_SWITCH_OFF)
         is_act = self.phase is Phase.PREPARING and self._prepare_timeout_ns == ACT_TIMEOUT_NS
         if self._switch.is_off and (self.phase is Phase.FLYING or is_act):
-            return "the pilot's engage switch is off"
+            return self._switch_off
         if not facts.armed and self.phase is not Phase.PREPARING:
-            return "the vehicle has been disarmed"
+            return because(Code.DISARMED)
         if facts.is_failsafe and facts.armed:
-            return f"a failsafe of the vehicle is active (mode {facts.mode})"
+            return because(Code.FAILSAFE, mode=facts.mode)
         is_ours = facts.mode in (self._own_mode, self._departure.mode)
         if self._own_mode is not None and not is_ours and not self._departure.is_undone(facts):
-            return f"mode changed from {self._own_mode} to {facts.mode}"
+            return because(Code.MODE_CHANGED, before=self._own_mode, after=facts.mode)
         return None
 
     def _follows_us(self, facts: Facts) -> bool:
@@ -401,7 +400,7 @@ class Engagement:
             and facts.mode in facts.modes.setpoint
         )
 
-    def _yield(self, facts: Facts, reason: str) -> Move:
+    def _yield(self, facts: Facts, reason: Reason) -> Move:
         """Somebody took over: sticks are given back, and a mode that follows setpoints is left.
 
         There silence would be the policy's last lean or body rate for one to three seconds.
@@ -411,10 +410,10 @@ class Engagement:
             self.outcome = self.outcome._replace(is_disarmed=not facts.armed, end=end)
         if not self._follows_us(facts):
             return self._give_back(facts, reason)
-        self._seen_interruption = facts.interruption
+        self._seen_interruptions = facts.interruptions
         return self._depart(facts, Ending(reason=reason, is_fault=True))
 
-    def _give_back(self, facts: Facts, reason: str) -> Move:
+    def _give_back(self, facts: Facts, reason: Reason | None) -> Move:
         """Release in this same step, and no mode command."""
         had_sticks = self.phase is not Phase.PREPARING or self._preparation.has_sticks
         self.phase, self.starting_ns = Phase.RELEASING, None
@@ -442,20 +441,23 @@ class Engagement:
     def _leave(self, facts: Facts, act: Act | None) -> Move:
         if self.phase is Phase.HOLDING and (act == "release" or self._must_end):
             # What held after a fault now ends as a flight without a fault does.
-            return self._depart(facts, self._stop_reason or Ending(reason=OPERATOR))
+            return self._depart(facts, self._stop_reason or Ending(reason=because(Code.OPERATOR)))
         if self._unheard_ns is None:
             self._heard_ns = facts.now_ns
         taken = self._takeover(facts)
         if facts.now_ns - self._heard_ns >= LOST_NS:
-            taken = taken or f"the vehicle was lost for {LOST_NS // NS_PER_S} s"
+            taken = taken or because(Code.VEHICLE_LOST, after_s=LOST_NS / NS_PER_S)
         if taken is not None:
-            return self._give_back(facts, f"{self.reason}; then {taken}")
+            first = self.reason
+            both = taken if first is None else because(Code.THEN, first=first, then=taken)
+            return self._give_back(facts, both)
         if facts.mode == self._departure.mode:
             self._own_mode = facts.mode
         move = self._departure.step(facts, self._unheard_ns)
         if self._departure.is_done:
             if self.phase is Phase.LEAVING and self._departure.mode not in (None, facts.mode):
-                self.refusal = f"the vehicle has not confirmed {self._departure.mode} in time"
+                mode = self._departure.mode or ""
+                self.refusal = because(Code.MODE_NOT_CONFIRMED, mode=mode)
             if not self._departure.must_hold:
                 return self._give_back(facts, self.reason)
             self.phase = Phase.HOLDING
@@ -465,10 +467,7 @@ class Engagement:
         timeout_ns = RELEASE_TIMEOUT_NS if facts.shows_last else UNHEARD_RELEASE_TIMEOUT_NS
         if facts.is_released or facts.now_ns - self._released_ns >= timeout_ns:
             if not facts.is_released:
-                self.refusal = (
-                    "the vehicle still shows our last sticks, as it does without a receiver or "
-                    "with one that rests there: whether it took the release is not known"
-                )
+                self.refusal = because(Code.RELEASE_NOT_SEEN)
             self.phase = Phase.RELEASED
             self._departure.forget()
             return Move()
@@ -499,7 +498,7 @@ class Engagement:
         twin = deepcopy(self, {id(self._settings): self._settings})
         twin._departure.ask_at_once(facts.now_ns)
         if self.phase in (Phase.PREPARING, Phase.FLYING):
-            twin.stop(Ending(reason="the gate has died", is_fault=True))
+            twin.stop(Ending(reason=because(Code.GATE_DIED), is_fault=True))
         # Sticks jump to neutral, unseen by us; the flight process says the words at once, or never.
         facts = replace(facts, are_sticks_at_rest=False, heard_ns=None, mode_ns=None)
         rest_ns = STICK_REST_NS if facts.modes.override else 0
@@ -517,3 +516,7 @@ class Engagement:
         if twin.phase is Phase.RELEASING or must_release:
             for k in range(_RELEASES):
                 yield until_ns + k * 50 * NS_PER_MS, Move(hand=Hand.RELEASE)
+
+
+def _not_engaged(why: Reason) -> Reason:
+    return because(Code.NOT_ENGAGED_SINCE, why=why)

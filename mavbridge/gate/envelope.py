@@ -6,6 +6,7 @@ from dataclasses import dataclass, fields
 from typing import Literal, NamedTuple, TypeAlias
 
 from mavbridge.core.clock import NS_PER_MS
+from mavbridge.core.reasons import Code, Reason, because
 from mavbridge.core.rotation import tilt_rad
 from mavbridge.core.vehicle import Reading, Telemetry, VehicleStatus
 
@@ -62,14 +63,14 @@ class EnvelopeExit(NamedTuple):
 
     kind: _Kind
     """fault, or landed: the flight is over, and nothing is wrong."""
-    reason: str
+    reason: Reason
 
 
 class _Finding(NamedTuple):
     """One quantity at one tick."""
 
     name: str
-    problem: str | None
+    problem: Reason | None
     stamp_ns: int
     persist_ns: int
 
@@ -165,16 +166,18 @@ class Envelope:
             if not self._had_position or status.is_position_valid is None:
                 self._ignore("estimator", "it reports no valid position")
             lost = self._had_position and status.is_position_valid is False
-            problem = "the vehicle's estimator has lost its position" if lost else None
+            problem = because(Code.ESTIMATOR_LOST) if lost else None
             yield _Finding("estimator", problem, now_ns, FLAG_PERSIST_NS)
         if limits.battery:
-            yield _Finding("battery", status.battery_problem, now_ns, FLAG_PERSIST_NS)
+            said = status.battery_problem
+            problem = None if said is None else because(Code.BATTERY, said=said)
+            yield _Finding("battery", problem, now_ns, FLAG_PERSIST_NS)
         if limits.landing:
             if status.is_landed is None:
                 self._ignore("landing", "the vehicle does not say whether it is in the air")
             self._was_in_air |= status.armed and status.is_landed is False
             has_landed = self._was_in_air and status.armed and status.is_landed is True
-            problem = "the vehicle has landed" if has_landed else None
+            problem = because(Code.LANDED) if has_landed else None
             yield _Finding("landing", problem, now_ns, FLAG_PERSIST_NS)
 
 
@@ -182,7 +185,7 @@ def _is_limit(limit: float) -> bool:
     return 0 < limit < math.inf
 
 
-def _beyond(name: str, value: float, limit: float, unit: str) -> str | None:
+def _beyond(name: str, value: float, limit: float, unit: str) -> Reason | None:
     if value <= limit:
         return None
-    return f"{name} {value:.1f} {unit} is beyond {limit:g} {unit} (--max-{name})"
+    return because(Code.BEYOND, quantity=name, value=value, limit=limit, unit=unit)

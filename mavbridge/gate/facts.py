@@ -3,6 +3,7 @@
 from dataclasses import dataclass
 from enum import Enum
 
+from mavbridge.core.reasons import Reason
 from mavbridge.core.vehicle import ModeRoles, Sticks
 
 
@@ -27,11 +28,11 @@ class Facts:
     now_ns: int
     is_connected: bool
     """A vehicle was found, and its status is known."""
-    link_problem: str | None
+    link_problem: Reason | None
     """Why sticks may not be sent: no heartbeat, set-up not finished, a risk not accepted."""
-    interruption: str | None
+    interruption: Reason | None
     """Why every engagement so far is over: a reboot, another address; see ``LinkSnapshot``."""
-    overruled: str | None
+    overruled: Reason | None
     """Why the vehicle is thought to follow other sticks than ours, or None."""
     is_switched_off: bool
     """The pilot's override switch is low."""
@@ -52,12 +53,14 @@ class Facts:
     echo_confirmed: bool
     is_released: bool
     refused_mode: str | None
-    chunk_problem: str | None
+    chunk_problem: Reason | None
     """Why a flight may not begin now: no fresh chunk."""
-    chunk_fault: str | None
+    chunk_fault: Reason | None
     """Why a flight must end now: no chunk for longer than the grace, or a command that failed."""
-    envelope_problem: str | None
+    envelope_problem: Reason | None
     """Which limit of the flight envelope is exceeded."""
+    interruptions: int = 0
+    """Number of interruptions so far."""
     heard_ns: int | None = None
     """Arrival of the newest packet; None: now."""
     mode_ns: int | None = None
@@ -70,7 +73,7 @@ class Facts:
     """The newest chunk was solved after a reset for the flight that starts."""
     shows_last: bool = True
     """The vehicle shows the last sticks that we sent: held, or a receiver's that rests there."""
-    landing: str | None = None
+    landing: Reason | None = None
     """The vehicle has landed under the policy: a normal end."""
     command_failed: bool = False
     """The last command could not be made: the vehicle has not been sent it."""
@@ -78,7 +81,7 @@ class Facts:
     """Our last sticks pass for nobody's hand: a mode that flies by itself is not left for them."""
     stick_override_ns: int | None = None
     """When the vehicle last said that moving sticks have changed its mode."""
-    slowness: str | None = None
+    slowness: Reason | None = None
     """Why the policy can never fly: too slow, or a command that failed."""
 
 

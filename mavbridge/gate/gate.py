@@ -8,6 +8,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 
 from mavbridge.core.clock import NS_PER_MS, NS_PER_S
+from mavbridge.core.reasons import Code, Reason, because
 from mavbridge.core.vehicle import (
     Action,
     ActionMeaning,
@@ -62,11 +63,11 @@ class GateInput:
 
     link: LinkSnapshot
     chunk: Chunk | None = None
-    absence: str | None = None
+    absence: Reason | None = None
     """Why the flight process cannot compute a chunk."""
     act: Act | None = None
     stop: Ending | None = None
-    command_fault: str | None = None
+    command_fault: Reason | None = None
     """Error while the last command was made or sent."""
 
 
@@ -83,8 +84,8 @@ class GateOutput:
     chunk_serial: int | None
     is_coasting: bool
     phase: Phase
-    reason: str
-    """Why the policy does not fly; empty while it does."""
+    reason: Reason | None
+    """Why the policy does not fly; None while it does."""
     mode: str | None
     """Flight mode to request."""
     arm: bool
@@ -133,7 +134,7 @@ class Gate:
         return self._engagement.phase
 
     @property
-    def failure(self) -> str | None:
+    def failure(self) -> Reason | None:
         """Why there was no flight, or None."""
         return self._engagement.failure
 
@@ -195,7 +196,7 @@ class Gate:
             starting_ns=self._engagement.starting_ns or 0,
         )
 
-    def _silence(self, now_ns: int, stood_ns: int, attitude: Reading | None) -> str | None:
+    def _silence(self, now_ns: int, stood_ns: int, attitude: Reading | None) -> Reason | None:
         """Why the flight must end now, or None: a plan bridges a stall of ours, not a dead link."""
         if stood_ns > STOOD_STILL_NS:
             self._heard_ns = now_ns
@@ -203,9 +204,9 @@ class Gate:
         if attitude is None or now_ns - max(self._heard_ns, attitude.arrived_ns) <= limit_ns:
             return None
         age_ns = now_ns - attitude.arrived_ns
-        return Lateness("attitude", age_ns, limit_ns, "link", age_ns).text
+        return Lateness("attitude", age_ns, limit_ns, "link", age_ns).reason
 
-    def _overdue(self, now_ns: int, stood_ns: int, given: GateInput) -> str | None:
+    def _overdue(self, now_ns: int, stood_ns: int, given: GateInput) -> Reason | None:
         """Which input of the policy's flight is too late, or None."""
         if self._engagement.phase is not Phase.FLYING or not self._chunks.is_over(now_ns):
             return None
@@ -229,9 +230,9 @@ class Gate:
         middle_ns, chunk = now_ns - stood_ns // 2, given.chunk
         if late.place == "computer" and chunk is not None and chunk.computed_ns > middle_ns:
             late = late._replace(place="gate")
-        return late.text
+        return late.reason
 
-    def _facts(self, now_ns: int, given: GateInput, overdue: str | None) -> Facts:
+    def _facts(self, now_ns: int, given: GateInput, overdue: Reason | None) -> Facts:
         link, left, chunk_fault = given.link, None, given.command_fault or overdue
         status = link.status
         if chunk_fault is None and self._engagement.phase is Phase.FLYING:
@@ -245,6 +246,7 @@ class Gate:
             is_connected=status is not None,
             link_problem=link.problem,
             interruption=link.interruption,
+            interruptions=link.interruptions,
             overruled=link.problem if link.is_overruled else None,
             is_switched_off=link.is_switched_off,
             mode=status.mode if status else "unknown",
@@ -318,7 +320,7 @@ class Gate:
             case None:
                 return None, None
             case Hand.RELEASE:
-                return Release(self._engagement.reason), None
+                return Release(self._engagement.reason or because(Code.OPERATOR)), None
             case Hand.IDLE:
                 action = self._idle
             case Hand.NEUTRAL:
@@ -342,8 +344,10 @@ class Gate:
 
     def _at_rest(self, hand: Hand | None) -> Decision | None:
         """What a hand other than the policy's would send now; nothing is noted."""
-        if hand is None or hand is Hand.RELEASE:
-            return None if hand is None else Release(self._engagement.reason)
+        if hand is None:
+            return None
+        if hand is Hand.RELEASE:
+            return Release(self._engagement.reason or because(Code.OPERATOR))
         resting = {Hand.IDLE: self._idle, Hand.NEUTRAL: self._neutral}
         return Command(action=resting.get(hand) or self._level(is_thrust=True))
 
@@ -357,7 +361,7 @@ class Gate:
     def _take_messages(self) -> tuple[str, ...]:
         refusal, self._engagement.refusal = self._engagement.refusal, None
         if refusal is not None:
-            self._messages.append(refusal)
+            self._messages.append(str(refusal))
         messages, self._messages = tuple(self._messages), []
         return messages
 

@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Protocol, TypeVar
 
 from mavbridge.core.clock import NS_PER_MS, NS_PER_S, Clock
+from mavbridge.core.reasons import Code, Reason, because
 from mavbridge.core.vehicle import (
     Action,
     ActionMeaning,
@@ -141,7 +142,7 @@ class GateLoop:
         self._watches_position = False
         self._phase = Phase.WAITING
         self._stop: Ending | None = None
-        self._command_fault: str | None = None
+        self._command_fault: Reason | None = None
         """Error of the last pass while a command was made or sent."""
         self._finish_until_ns: int | None = None
         self._is_clean = False
@@ -155,7 +156,7 @@ class GateLoop:
         """The sticks are given back, and nobody wants more flights."""
 
     @property
-    def failure(self) -> str | None:
+    def failure(self) -> Reason | None:
         """Why there was no flight, or None."""
         return None if self._gate is None else self._gate.failure
 
@@ -255,9 +256,10 @@ class GateLoop:
             return send(given)
         except Exception as error:  # noqa: BLE001 - the vehicle is held: end the flight in order
             at = traceback.extract_tb(error.__traceback__)[-1]
-            self._command_fault = (
-                f"a command could not be made, a bug of mavbridge: {type(error).__name__}: {error} "
-                f"({Path(at.filename).name}:{at.lineno})"
+            self._command_fault = because(
+                Code.COMMAND_FAILED,
+                error=f"{type(error).__name__}: {error}",
+                place=f"{Path(at.filename).name}:{at.lineno}",
             )
             return None
 
@@ -307,7 +309,7 @@ class GateLoop:
     def _receive(self, snapshot: LinkSnapshot) -> GateInput:
         """Take the messages of the flight process, the newest of each kind."""
         chunk: Chunk | None = None
-        absence: str | None = None
+        absence: Reason | None = None
         act: Act | None = None
         received, self._received = [*self._received, *self._flight.receive()], []
         for data in received:
@@ -329,7 +331,7 @@ class GateLoop:
                 case _:
                     pass  # settings that count already
         if self._flight.is_closed:
-            self.stop(Ending(reason="the flight process has died", is_fault=True))
+            self.stop(Ending(reason=because(Code.FLIGHT_PROCESS_DIED), is_fault=True))
         return GateInput(
             link=snapshot,
             chunk=chunk,

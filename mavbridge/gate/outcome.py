@@ -2,6 +2,7 @@
 
 from typing import NamedTuple
 
+from mavbridge.core.reasons import Reason
 from mavbridge.core.vehicle import FlightEnd
 
 
@@ -18,5 +19,5 @@ class Outcome(NamedTuple):
     """The last one ended because the vehicle was disarmed, by itself or by somebody."""
     end: FlightEnd | None = None
     """How the last one ended; None before that."""
-    fault: str = ""
+    fault: Reason | None = None
     """The last of those faults."""

@@ -4,6 +4,7 @@ from dataclasses import dataclass
 from typing import NamedTuple
 
 from mavbridge.core.clock import NS_PER_MS, NS_PER_S
+from mavbridge.core.reasons import Code, Reason, because
 from mavbridge.gate.facts import Facts, Hand, Move
 
 REQUEST_SPACING_NS = NS_PER_S
@@ -35,8 +36,8 @@ class Preparing(NamedTuple):
     """One step of preparing."""
 
     move: Move
-    waits_for: str
-    """What is missing, in words for the user; empty: ready to fly."""
+    waits_for: Reason | None
+    """What is missing; None: ready to fly."""
 
 
 class Preparation:
@@ -94,14 +95,14 @@ class Preparation:
             wanted = known[0] if known else self._settings.modes[0]
         return None if wanted == facts.mode else wanted
 
-    def impossibility(self, facts: Facts) -> str | None:
+    def impossibility(self, facts: Facts) -> Reason | None:
         """Why waiting will not help, or None."""
         names, wanted = facts.modes.names, self.wanted_mode(facts)
         if wanted is None or not names or wanted in names:
             return facts.slowness
-        return f"this vehicle has no mode {wanted}, it has {', '.join(names)}"
+        return because(Code.NO_SUCH_MODE, mode=wanted, modes=", ".join(names))
 
-    def step(self, facts: Facts, objection: str | None) -> Preparing:
+    def step(self, facts: Facts, objection: Reason | None) -> Preparing:
         """Advance; with an ``objection`` nothing new is asked for."""
         self._watch_climb(facts)
         wanted = self.wanted_mode(facts)
@@ -109,7 +110,7 @@ class Preparation:
         self._lend_sticks(facts, wanted)
         hand = self._hand(facts, wanted)
         if facts.armed and wanted is None and climb_m is None and objection is None:
-            return Preparing(Move(hand=hand), "")
+            return Preparing(Move(hand=hand), None)
         waits_for = objection or self._waits_for(facts, wanted, climb_m)
         is_heard = facts.armed or facts.echo_confirmed
         if objection is not None or not is_heard or facts.now_ns < self._request_due_ns:
@@ -146,12 +147,14 @@ class Preparation:
             climbed_m = facts.height_m - self._ground_m
             self._is_up = climbed_m >= ARRIVED * self._settings.takeoff_m
 
-    def _waits_for(self, facts: Facts, wanted: str | None, climb_m: float | None) -> str:
+    def _waits_for(self, facts: Facts, wanted: str | None, climb_m: float | None) -> Reason:
         if self.is_taking_off and facts.height_m is None:
-            return "waiting for a position: the autopilot's own takeoff needs one"
+            return because(Code.TAKEOFF_NEEDS_POSITION)
         if climb_m is not None:
-            return f"taking off to {climb_m:g} m"
-        return f"waiting for {wanted or 'the vehicle to arm'}"
+            return because(Code.TAKING_OFF, height_m=climb_m)
+        if wanted is not None:
+            return because(Code.WAITING_FOR_MODE, mode=wanted)
+        return because(Code.WAITING_FOR_ARMING)
 
     def _hand(self, facts: Facts, wanted: str | None) -> Hand | None:
         """What to send meanwhile.

@@ -8,10 +8,11 @@ import json
 import pickle
 import struct
 from collections.abc import Iterable, Iterator
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from typing import Literal, NamedTuple, TypeAlias
 
 from mavbridge.core.address import SocketAddress, socket_address
+from mavbridge.core.reasons import Reason, reason_from_json, reason_to_json
 from mavbridge.core.vehicle import (
     ACTION_CLASSES,
     Action,
@@ -61,8 +62,8 @@ class GateTick:
     sent: Action | None
     """As sent; None when released, or when nothing was sent."""
     phase: Phase
-    reason: str
-    """Why the policy does not fly; empty while it does."""
+    reason: Reason | None
+    """Why the policy does not fly; None while it does."""
     starting_ns: int = 0
     """All has been ready since then: the policy gets the sticks with its first chunk after a reset
     from then on; 0 where it has them, or all is not ready."""
@@ -112,7 +113,7 @@ class GateError(NamedTuple):
 class Absence(NamedTuple):
     """Why the flight process cannot compute a chunk now."""
 
-    reason: str
+    reason: Reason
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -121,7 +122,7 @@ class GateSummary:
 
     autopilot: str
     link: LinkStats
-    failure: str | None
+    failure: Reason | None
     """Why there was no flight, or None."""
     outcome: Outcome
     params: dict[str, float]
@@ -154,11 +155,11 @@ def encode_to_gate(message: ToGate) -> bytes:
             kind = _class_index(message.actions[0]) if count else 0
             return _CHUNK.pack(b"C", kind, *stamps, count) + struct.pack(f"<{4 * count}d", *values)
         case Absence(reason):
-            return b"N" + reason.encode()
+            return b"N" + _encode_reason(reason)
         case GateSettings() | FlightSettings():
             return b"S" + pickle.dumps(message)
-        case Ending():
-            return b"E" + json.dumps(asdict(message)).encode()
+        case Ending(reason=reason, is_fault=is_fault, end=end):
+            return b"E" + json.dumps([is_fault, end]).encode() + b"\n" + _encode_reason(reason)
         case "engage" | "release":
             return b"A" + message.encode()
 
@@ -177,12 +178,14 @@ def _decode_to_gate(data: bytes) -> ToGate:
         case b"C":
             return _decode_chunk(data)
         case b"N":
-            return Absence(rest.decode())
+            return Absence(_decode_reason(rest))
         case b"S":
             settings: GateSettings | FlightSettings = pickle.loads(rest)  # noqa: S301 - our parent's
             return settings
         case b"E":
-            return Ending(**json.loads(rest))
+            head, _, reason = rest.partition(b"\n")
+            is_fault, end = json.loads(head)
+            return Ending(reason=_decode_reason(reason), is_fault=is_fault, end=end)
         case b"A" if rest == b"engage":
             return "engage"
         case b"A" if rest == b"release":
@@ -234,7 +237,7 @@ def encode_tick(tick: GateTick) -> bytes:
         *stages,
         *(tick.sent or _NOTHING),
     )
-    return packed + tick.reason.encode()
+    return packed if tick.reason is None else packed + _encode_reason(tick.reason)
 
 
 def _decode_tick(data: bytes) -> GateTick:
@@ -258,7 +261,7 @@ def _decode_tick(data: bytes) -> GateTick:
         trace=trace if flags & _HAS_TRACE else None,
         sent=sent if flags & _HAS_SENT else None,
         phase=_PHASES[phase],
-        reason=data[_TICK.size :].decode(),
+        reason=_decode_reason(data[_TICK.size :]) if len(data) > _TICK.size else None,
     )
 
 
@@ -300,7 +303,12 @@ def encode_from_gate(
         case GateError():
             return b"X" + json.dumps(message).encode()
         case GateSummary():
-            return b"Z" + json.dumps(asdict(message)).encode()
+            fault = message.outcome.fault
+            document = asdict(replace(message, failure=None)) | {
+                "outcome": message.outcome._replace(fault=None),
+                "reasons": [each and reason_to_json(each) for each in (message.failure, fault)],
+            }
+            return b"Z" + json.dumps(document).encode()
 
 
 def decode_from_gate(data: bytes) -> FromGate:
@@ -351,5 +359,15 @@ def _summary(document: dict[str, object]) -> GateSummary:
         saturated=saturated,
         rtt_ms=None if rtt is None else Percentiles(**rtt),
     )
-    outcome = Outcome(*document.pop("outcome"))  # type: ignore[misc]
+    failure, fault = (each and reason_from_json(each) for each in document.pop("reasons"))  # type: ignore[attr-defined]
+    outcome = Outcome(*document.pop("outcome"))._replace(fault=fault)  # type: ignore[misc]
+    document["failure"] = failure
     return GateSummary(**document, link=stats, outcome=outcome)  # type: ignore[arg-type]
+
+
+def _encode_reason(reason: Reason) -> bytes:
+    return json.dumps(reason_to_json(reason)).encode()
+
+
+def _decode_reason(data: bytes) -> Reason:
+    return reason_from_json(json.loads(data))

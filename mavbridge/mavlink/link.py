@@ -10,6 +10,7 @@ from mavbridge.core.address import parse_address
 from mavbridge.core.clock import NS_PER_MS, NS_PER_S, Clock, period_ns
 from mavbridge.core.errors import PeerError
 from mavbridge.core.histogram import Histogram
+from mavbridge.core.reasons import Code, Reason, because
 from mavbridge.core.vehicle import (
     Action,
     ActionMeaning,
@@ -97,7 +98,7 @@ class MavlinkLink:
         self._started_ns = self._heartbeat_due_ns = clock.now_ns()
         self._vehicle: VehicleSession | None = None
         self._watches_home_height = False
-        self._interruption: str | None = None
+        self._interruption: Reason | None = None
         self._interruptions = 0
         self._namesakes = Namesakes()
 
@@ -111,7 +112,7 @@ class MavlinkLink:
         """Receive everything that has arrived; never blocks. All other work is in ``service``."""
         self._receive_all()
         if self._vehicle is not None and self._vehicle.has_rebooted:
-            self._interrupt("the vehicle has rebooted: its session starts over")
+            self._interrupt(because(Code.REBOOTED))
             self._adopt(self._vehicle.identity)
         now_ns = self._clock.now_ns()
         texts = self._connection.take_texts()
@@ -123,8 +124,9 @@ class MavlinkLink:
             return LinkSnapshot(
                 telemetry=self._telemetry.snapshot(),
                 status=status,
-                problem=problem or "no policy is loaded yet",
+                problem=problem or because(Code.NO_POLICY_LOADED),
                 interruption=self._interruption,
+                interruptions=self._interruptions,
                 modes=modes,
                 refused_mode=self._commands.refused_mode,
                 texts=texts,
@@ -142,27 +144,25 @@ class MavlinkLink:
             shows_last=output.shows_last,
             are_sticks_at_rest=output.are_sticks_at_rest(vehicle),
             interruption=self._interruption,
+            interruptions=self._interruptions,
             modes=modes if output.is_sticks else replace(modes, is_silence_failsafe=False),
             refused_mode=self._commands.refused_mode,
             texts=(*texts, *output.take_notes()),
         )
 
-    def _problem(self, now_ns: int) -> str | None:
+    def _problem(self, now_ns: int) -> Reason | None:
         """Why this vehicle cannot be flown now, whatever its echo shows, or None."""
         if self._connection.is_down:
-            return "the connection to the vehicle is lost: reconnecting"
+            return because(Code.CONNECTION_LOST)
         if (vehicle := self._vehicle) is None:
-            return "waiting for the vehicle's heartbeat"
+            return because(Code.NO_HEARTBEAT)
         if (problem := vehicle.problem(now_ns)) is not None:
             if (slow := self._timesync.slow_clock) is not None:
-                return f"{slow}; {problem}"
+                return because(Code.SLOW_CLOCK, first=problem, hint=slow)
             hint = self._connection.hint
-            return problem if hint is None else f"{problem}; {hint}"
+            return problem if hint is None else because(Code.WITH_HINT, first=problem, hint=hint)
         if self._connection.is_refused(now_ns) and not self._config.readonly:
-            return (
-                f"this computer has refused every packet to the vehicle for "
-                f"{REFUSED_NS // NS_PER_MS} ms: no route, a firewall, or a full queue"
-            )
+            return because(Code.PACKETS_REFUSED, after_ms=REFUSED_NS / NS_PER_MS)
         return vehicle.output_problem(now_ns) or self._timesync.late_sending
 
     def _receive_all(self) -> None:
@@ -201,7 +201,7 @@ class MavlinkLink:
             if (output := self._sender.output) is not None:
                 output.receive(message.body, vehicle, arrived_ns)
             vehicle.receive(message, arrived_ns)
-            if (changed := vehicle.param_interruption) is not None and changed != before:
+            if (changed := vehicle.param_interruption) is not None and changed is not before:
                 self._interrupt(changed)
         if self._forward is not None:
             self._forward(ForwardedPacket(arrived_ns, happened_ns, message.packet))
@@ -216,15 +216,16 @@ class MavlinkLink:
         """Another address uses the vehicle's system id: its packets are ignored while we fly."""
         heard_ns = self._counters.heard_ns if self.is_engaged else now_ns
         text, has_replaced = self._namesakes.notice(identity, sender, now_ns, heard_ns)
-        if text is not None:
-            (self._interrupt if has_replaced else self._report)(text)
+        if text is not None and has_replaced:
+            self._interrupt(because(Code.REPLACED, said=text))
+        elif text is not None:
+            self._report(text)
 
-    def _interrupt(self, text: str) -> None:
-        """Note why every engagement so far is over; no two such texts are the same."""
+    def _interrupt(self, reason: Reason) -> None:
+        """Note why every engagement so far is over."""
         self._interruptions += 1
-        count = f" (interruption {self._interruptions})" if self._interruptions > 1 else ""
-        self._interruption = text + count
-        self._report(self._interruption)
+        self._interruption = reason
+        self._report(str(reason))
 
     def stats(self) -> LinkStats:
         """Counters for the report."""
@@ -317,7 +318,8 @@ class MavlinkLink:
     def _follow_vehicle(self, identity: VehicleIdentity, now_ns: int) -> None:
         if (moved := self._discovery.moved(identity, now_ns)) is not None:
             places = f"{moved.place} instead of {identity.place}"
-            self._interrupt(f"the vehicle now sends from {places}: its session starts over")
+            said = f"the vehicle now sends from {places}: its session starts over"
+            self._interrupt(because(Code.REPLACED, said=said))
             self._adopt(moved)
 
     def _adopt(self, identity: VehicleIdentity) -> None:

@@ -80,7 +80,8 @@ class FlightScreen:
         self._action, self._vision = RateMeter(), RateMeter()
         self._tick: Tick | None = None
         self._missed_slots = 0
-        self._activity, self._activity_ns = "", 0
+        self._activity_ns = 0
+        self._stage: tuple[object, ...] = ()
         self._messages: deque[_Message] = deque(maxlen=MAX_MESSAGES)
         self._dropped_messages = 0
         self._refreshes = 0
@@ -146,9 +147,9 @@ class FlightScreen:
         if before is not None:
             is_other = before.phase != tick.phase or before.holder != tick.holder
             is_due = tick.woke_ns - self._activity_ns >= ACTIVITY_SPACING_NS
-            if tick.activity == self._activity or not (is_other or is_due):
+            if tick.stage == self._stage or not (is_other or is_due):
                 return
-        self._activity, self._activity_ns = tick.activity, tick.woke_ns
+        self._stage, self._activity_ns = tick.stage, tick.woke_ns
         self.show_message(tick.activity)
 
     def show_message(self, text: str) -> None:
@@ -202,7 +203,7 @@ class FlightScreen:
         line.append(f"  state {_age(tick.sent_ns, attitude_ns)}")
         line.append(f"  missed {self._missed_slots}")
         if tick.release_reason is not None:  # last: it may be long, and is cut first
-            line.append(f"  {without_secrets(tick.release_reason)}", style="yellow")
+            line.append(f"  {without_secrets(str(tick.release_reason))}", style="yellow")
         return line
 
     def _state(self, tick: Tick) -> tuple[str, str]:

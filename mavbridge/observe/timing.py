@@ -6,6 +6,7 @@ from typing import Literal
 
 from mavbridge.core.clock import NS_PER_S
 from mavbridge.core.histogram import Histogram
+from mavbridge.core.reasons import Code, Reason, reason_to_json
 from mavbridge.core.records import Event, FlightOutcome, Tick
 from mavbridge.core.vehicle import LinkStats, Percentiles
 
@@ -70,7 +71,7 @@ class ReleaseEvent:
     """A release of the sticks, or a new reason for it, ``t_s`` after the first tick."""
 
     t_s: float
-    reason: str
+    reason: Reason
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -121,7 +122,7 @@ class FlightTiming:
         self._ticks, self._frames = _Span(), _Span()
         self._sticks, self._chunks = _Sticks(stick_hz), _Chunks(action_hz)
         self._last_attitude_ns: int | None = None
-        self._last_reason: str | None = None
+        self._last_codes: tuple[Code, ...] = ()
         self._releases: list[ReleaseEvent] = []
         self._release_count = 0
         self._feature_age, self._state_age = Histogram(), Histogram()
@@ -147,9 +148,10 @@ class FlightTiming:
         if tick.trace is not None:
             self._add_ages(tick)
         is_before = tick.phase in ("waiting", "preparing")
-        reason = None if is_before else tick.release_reason or None
-        if reason != self._last_reason:
-            self._last_reason = reason
+        reason = None if is_before else tick.release_reason
+        codes = () if reason is None else reason.codes
+        if codes != self._last_codes:
+            self._last_codes = codes
             if reason is None:
                 return
             self._release_count += 1
@@ -315,6 +317,12 @@ class _Span:
 def report_json(report: TimingReport) -> str:
     """The report as JSON, keys in the order of the dataclasses; null = not measured."""
     document = asdict(report)
+    document["releases"] = [
+        {"t_s": release.t_s, "reason": reason_to_json(release.reason)}
+        for release in report.releases
+    ]
+    if report.outcome is not None:
+        document["outcome"] = report.outcome.to_json()
     if report.link is not None:
         for key in ("messages_per_s", "saturated"):
             document["link"][key] = dict(document["link"][key])

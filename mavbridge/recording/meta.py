@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Any, Literal, get_args
 
 from mavbridge.core.errors import MavbridgeError
+from mavbridge.core.reasons import reason_from_json
 from mavbridge.core.records import FlightOutcome
 from mavbridge.recording.folder import META
 from policy.contract import Contract
@@ -88,6 +89,8 @@ class FlightMeta:
 def write_meta(folder: Path, meta: FlightMeta) -> None:
     """Write or replace ``meta.json``, whole or not at all; raises OSError."""
     document = {"format": FORMAT, "version": VERSION} | asdict(meta)
+    if meta.outcome is not None:
+        document["outcome"] = meta.outcome.to_json()
     text = json.dumps(document, indent=2, allow_nan=False) + "\n"
     part = folder / f"{META}.part"
     try:
@@ -142,7 +145,9 @@ def _meta(folder: Path, document: dict[str, Any]) -> FlightMeta:
         if known.get("contract") is not None:
             known["contract"] = Contract.from_json(json.dumps(known["contract"]))
         if known.get("outcome") is not None:
-            known["outcome"] = FlightOutcome(**known["outcome"])
+            reason = known["outcome"]["reason"]
+            reason = None if reason is None else reason_from_json(reason)
+            known["outcome"] = FlightOutcome(**known["outcome"] | {"reason": reason})
         known["command"] = tuple(known.get("command", ()))
         meta = FlightMeta(**known)
     except (TypeError, ContractError) as error:

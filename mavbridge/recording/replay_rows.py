@@ -1,11 +1,13 @@
 """Rows of the tables for a replay: solves of the policy, features, and stamps of packets."""
 
+import json
 from collections.abc import Iterator, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
 import pyarrow as pa
 
+from mavbridge.core.reasons import reason_from_json, reason_to_json
 from mavbridge.core.records import FeatureFrame, FloatArray, Solve, VehicleState
 from mavbridge.core.vehicle import ForwardedPacket
 from policy.contract import ACTION_DIM, STATE_DIM, Contract
@@ -101,8 +103,11 @@ def solves_batch(rows: Sequence[SolveRow]) -> pa.RecordBatch:
 def features_batch(rows: Sequence[FeatureRow]) -> pa.RecordBatch:
     """Rows of consecutive features of one camera."""
     frames = [row.frame for row in rows]
-    names = ("frame_id", "captured_ns", "ready_ns", "fault")
+    names = ("frame_id", "captured_ns", "ready_ns")
     columns: dict[str, Any] = {name: [getattr(frame, name) for frame in frames] for name in names}
+    columns["fault"] = [
+        None if frame.fault is None else json.dumps(reason_to_json(frame.fault)) for frame in frames
+    ]
     columns["value"] = _lists([frame.value for frame in frames])
     columns["dropped_before"] = [row.dropped_before for row in rows]
     return _batch(columns, FEATURES)
@@ -174,7 +179,9 @@ def read_features(table: pa.Table) -> Iterator[FeatureFrame]:
         values = _arrays(batch.column("value"))
         for value, row in zip(values, batch.drop_columns(["value"]).to_pylist(), strict=True):
             del row["dropped_before"]
-            yield FeatureFrame(value=value[None], **row)
+            fault = row.pop("fault")
+            reason = None if fault is None else reason_from_json(json.loads(fault))
+            yield FeatureFrame(value=value[None], fault=reason, **row)
 
 
 def read_packets(table: pa.Table) -> Iterator[PacketStamp]:

@@ -4,6 +4,7 @@ docs/formats/flight_folder.md is the format. A column is named as the attribute 
 a value that was not there is null.
 """
 
+import json
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, fields
 from typing import Any, NamedTuple, TypeAlias
@@ -11,6 +12,7 @@ from typing import Any, NamedTuple, TypeAlias
 import numpy as np
 import pyarrow as pa
 
+from mavbridge.core.reasons import Reason, reason_from_json, reason_to_json
 from mavbridge.core.records import Position, Tick, VehicleState
 from mavbridge.core.vehicle import ACTION_CLASSES, Action, ActionKind, ActionTrace, Sticks
 from policy.contract import ACTION_DIM, STATE_DIM
@@ -84,7 +86,7 @@ TICKS = pa.schema(
         *_fields(pa.int64(), *_STAMPS),
         *_fields(_STICKS, *_TRACE, "sent", "rc_sticks"),
         pa.field("rc_channels_us", pa.list_(pa.uint16()), nullable=False),
-        *_fields(pa.string(), "release_reason", "mode"),
+        *_fields(pa.string(), "release_reason", "release_code", "release_data", "mode"),
         pa.field("armed", pa.bool_(), nullable=False),
         pa.field("texts", pa.list_(pa.string()), nullable=False),
         pa.field("dropped_before", pa.int32(), nullable=False),
@@ -121,8 +123,12 @@ DEMONSTRATION_FRAMES = pa.schema(
 )
 """All columns of the truth are null where it was not given; its position alone never is."""
 
-_TICK = tuple(field.name for field in fields(Tick) if field.name in TICKS.names)
-"""Columns that hold an attribute of ``Tick``."""
+_TICK = tuple(
+    field.name
+    for field in fields(Tick)
+    if field.name in TICKS.names and field.name != "release_reason"
+)
+"""Columns that hold an attribute of ``Tick`` as it is."""
 _ROWS_AT_ONCE = 4096
 
 
@@ -131,6 +137,7 @@ def ticks_batch(rows: Sequence[TickRow], schema: pa.Schema) -> pa.RecordBatch:
     columns = [
         {
             **_attributes(row.tick, _TICK),
+            **_reason_columns(row.tick.release_reason),
             **_attributes(row.tick.state, _STAMPS),
             **_attributes(row.tick.trace, _TRACE),
             **_attributes(row.labels, ("expert",)),
@@ -140,6 +147,18 @@ def ticks_batch(rows: Sequence[TickRow], schema: pa.Schema) -> pa.RecordBatch:
         for row in rows
     ]
     return pa.RecordBatch.from_pylist(columns, schema=schema)
+
+
+def _reason_columns(reason: Reason | None) -> dict[str, object]:
+    """The sentence for people, the code and the figures for programs."""
+    if reason is None:
+        return {}
+    document = reason_to_json(reason)
+    return {
+        "release_reason": document["text"],
+        "release_code": document["code"],
+        "release_data": json.dumps(document["data"]),
+    }
 
 
 def frames_batch(rows: Sequence[FrameRow], schema: pa.Schema) -> pa.RecordBatch:
@@ -189,6 +208,9 @@ def _tick(row: dict[str, Any], serial: int, make: type[Action]) -> Tick:
     values = {name: row[name] for name in _TICK if name not in LATER}
     values |= {name: row[name] for name in LATER if row[name] is not None}
     values |= {name: tuple(row[name]) for name in ("rc_channels_us", "texts")}
+    code, data = row["release_code"], row["release_data"]
+    reason = code and reason_from_json({"code": code, "data": json.loads(data)})
+    values |= {"release_reason": reason}
     values |= {"sent": row["sent"] and make(*row["sent"]), "rc_sticks": _sticks(row["rc_sticks"])}
     if row["position_ned_m"] is not None:
         values["position_ned_m"] = Position(*row["position_ned_m"])

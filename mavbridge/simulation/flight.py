@@ -11,6 +11,7 @@ from mavbridge.config.rates import SIM_CAMERA_HZ, SIM_CAMERA_PX, Rates
 from mavbridge.core.clock import NS_PER_S, period_ns
 from mavbridge.core.errors import UserError
 from mavbridge.core.ports import TickSink
+from mavbridge.core.reasons import Code, because
 from mavbridge.core.records import CameraImage
 from mavbridge.flight.bridge import CameraPath, build_bridge
 from mavbridge.flight.observation import observation_ages_ns
@@ -155,7 +156,7 @@ class SimulatedFlight:
         gate = self._compose(executable, (referee, *sinks))
         while not referee.stop.is_set():
             self.clock.sleep_until_ns(self.clock.now_ns() + STEP_NS)
-        gate.stop(Ending(reason="the flight is over"))
+        gate.stop(Ending(reason=because(Code.DURATION)))
         end_ns = self.clock.now_ns() + END_NS
         while not gate.is_done and self.clock.now_ns() < end_ns:
             self.clock.sleep_until_ns(self.clock.now_ns() + STEP_NS)

@@ -9,6 +9,7 @@ from typing import Literal
 
 from mavbridge.core.clock import NS_PER_S, Clock
 from mavbridge.core.errors import MavbridgeError, PeerError
+from mavbridge.core.reasons import Reason
 from mavbridge.core.records import Event, Tick
 from mavbridge.core.vehicle import Action
 from policy.contract import ACTION_DIM
@@ -124,7 +125,7 @@ class Referee:
         self._should_stop = should_stop
         self._start_ns = clock.now_ns()
         self._meter = StickMeter()
-        self._release_reason: str | None = None
+        self._release_reason: Reason | None = None
         self._outcome: Outcome | None = None
         self._end_ns = 0
         self._distance_m = 0.0

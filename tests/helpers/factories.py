@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mavbridge.core.clock import NS_PER_MS, NS_PER_S
+from mavbridge.core.reasons import Code, Reason, because
 from mavbridge.core.records import Tick, VehicleState, VisionTick
 from mavbridge.core.vehicle import NEUTRAL, ActionTrace, Sticks
 from mavbridge.gate.engagement import Phase
@@ -71,7 +72,9 @@ def make_tick(index: int = 0, **changes: Any) -> Tick:
     return replace(tick, **changes)
 
 
-def make_released_tick(index: int = 0, reason: str = "no feature yet", **changes: Any) -> Tick:
+def make_released_tick(
+    index: int = 0, reason: Reason = because(Code.NO_IMAGE), **changes: Any
+) -> Tick:
     """Tick ``index`` of a vehicle that the pilot flies."""
     released: dict[str, Any] = {
         "predict_ns": None,
@@ -122,6 +125,6 @@ def make_gate_tick(at_ns: int, **changes: Any) -> GateTick:
         trace=None,
         sent=None,
         phase=Phase.WAITING,
-        reason="",
+        reason=None,
     )
     return replace(tick, **changes)

@@ -4,6 +4,7 @@ from dataclasses import replace
 from typing import Any
 
 from mavbridge.core.clock import NS_PER_MS
+from mavbridge.core.reasons import Code, Reason
 from mavbridge.core.vehicle import NEUTRAL, ModeRoles
 from mavbridge.gate.departure import DepartureSettings
 from mavbridge.gate.engagement import Act, Engagement, EngagementSettings, Phase
@@ -85,6 +86,11 @@ def engagement_settings(**settings: Any) -> EngagementSettings:
     )
 
 
+def codes(reason: Reason | None) -> tuple[Code, ...]:
+    """Those of a reason; none while the policy flies."""
+    return () if reason is None else reason.codes
+
+
 class Stepped:
     """An engagement, its facts, and everything that it decided."""
 
@@ -95,6 +101,8 @@ class Stepped:
 
     def step(self, act: Act | None = None, **changes: Any) -> Move:
         """One step, 10 ms after the last; changes of the facts stay."""
+        if changes.get("interruption") is not None:
+            changes.setdefault("interruptions", self.facts.interruptions + 1)
         self.facts = replace(self.facts, now_ns=self.facts.now_ns + STEP_NS, **changes)
         self.moves.append(self.engagement.step(self.facts, act))
         return self.moves[-1]
@@ -111,8 +119,8 @@ class Stepped:
         return self.engagement.phase
 
     @property
-    def reason(self) -> str:
-        return self.engagement.reason
+    def codes(self) -> tuple[Code, ...]:
+        return codes(self.engagement.reason)
 
 
 def flying(facts: Facts = AIRBORNE, **settings: Any) -> Stepped:

@@ -16,10 +16,12 @@ import numpy as np
 from pymavlink.dialects.v20 import ardupilotmega as dialect
 
 from helpers.fakes import ListSink
+from helpers.gate_facts import codes
 from helpers.gate_world import Direction, FlightPort, FreshFeatures, Network, NoCamera
 from helpers.wire import WireEnd
 from mavbridge.config.flight import FlyConfig, LinkConfig
 from mavbridge.core.clock import NS_PER_MS, NS_PER_S
+from mavbridge.core.reasons import Code, Reason, because
 from mavbridge.core.vehicle import Sticks
 from mavbridge.flight.bridge import CameraPath, build_bridge
 from mavbridge.flight.settings import flight_settings, link_settings
@@ -195,7 +197,7 @@ class GateFlight:
         """An explicit act at the terminal."""
         self.tell(act)
 
-    def stop(self, reason: str = "stopped by the user", *, is_fault: bool = False) -> None:
+    def stop(self, reason: Reason = because(Code.SIGNAL), *, is_fault: bool = False) -> None:
         """Ctrl-C, or a fault of the flight process that it could still report."""
         self.tell(Ending(reason=reason, is_fault=is_fault))
 
@@ -281,7 +283,7 @@ class GateFlight:
             )
         )
         self.ap.set_mode(mode)
-        self.until(lambda: self.reason.startswith("not engaged"), within_s=8)
+        self.until(lambda: self.codes == (Code.NOT_ENGAGED,), within_s=8)
         return self
 
     def fly(self, seconds: float = 1.5) -> "GateFlight":
@@ -326,8 +328,12 @@ class GateFlight:
         return self.last.phase if self.last else Phase.WAITING
 
     @property
-    def reason(self) -> str:
-        return self.last.reason if self.last else ""
+    def reason(self) -> Reason | None:
+        return self.last.reason if self.last else None
+
+    @property
+    def codes(self) -> tuple[Code, ...]:
+        return codes(self.reason)
 
     @property
     def messages(self) -> list[str]:

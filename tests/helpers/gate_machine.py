@@ -11,6 +11,7 @@ from helpers.gate_facts import engagement_settings
 from helpers.wire import ARDUPILOT as CALIBRATION
 from helpers.wire import WireEnd
 from mavbridge.core.clock import NS_PER_MS
+from mavbridge.core.reasons import Reason
 from mavbridge.core.vehicle import (
     NEUTRAL,
     Action,
@@ -128,8 +129,9 @@ class GateWorld:
     serial: int = 0
     act: Act | None = None
     stop: Ending | None = None
-    link_problem: str | None = None
-    interruption: str | None = None
+    link_problem: Reason | None = None
+    interruption: Reason | None = None
+    interruptions: int = 0
     refused_mode: str | None = None
     is_switched_off: bool = False
     has_chunks: bool = True
@@ -263,6 +265,7 @@ class GateWorld:
             is_released=output.is_released(vehicle, now_ns),
             shows_last=output.shows_last,
             interruption=self.interruption,
+            interruptions=self.interruptions,
             modes=roles if output.is_sticks else replace(roles, is_silence_failsafe=False),
             refused_mode=self.refused_mode,
         )

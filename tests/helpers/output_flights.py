@@ -12,6 +12,7 @@ from pymavlink.dialects.v20 import ardupilotmega as dialect
 
 from helpers.gate_flights import HEIGHT_M, GateFlight
 from mavbridge.core.clock import NS_PER_S
+from mavbridge.core.reasons import Code
 from mavbridge.gate.engagement import Phase
 from mavbridge.simulation.world import NOMINAL_VEHICLE
 from policy.contract import ActionKind, Contract, FloatArray
@@ -153,7 +154,7 @@ class OutputFlight(GateFlight):
     def launch(self, mode: Any = None) -> "OutputFlight":
         """Hover armed under the pilot, with the link ready and the policy fresh."""
         self.put_in_air()
-        self.until(lambda: self.reason.startswith("not engaged"), within_s=10)
+        self.until(lambda: self.codes == (Code.NOT_ENGAGED,), within_s=10)
         return self
 
     def put_in_air(self) -> None:

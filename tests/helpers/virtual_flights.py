@@ -10,6 +10,7 @@ from helpers.fakes import START_NS, FakeLink, ListSink
 from mavbridge.config.flight import FlyConfig, Limits, LinkConfig
 from mavbridge.config.rates import Rates
 from mavbridge.core.clock import NS_PER_MS, NS_PER_S
+from mavbridge.core.reasons import Code, Reason, because
 from mavbridge.core.records import FloatArray, Frame, ImageArray, Tick
 from mavbridge.core.vehicle import Command, Sticks
 from mavbridge.flight.bridge import CameraPath, build_bridge
@@ -184,7 +185,7 @@ class VirtualFlight:
         """Send the gate a message."""
         self._send(message)
 
-    def stop(self, reason: str = "the flight was ended by a signal") -> None:
+    def stop(self, reason: Reason = because(Code.SIGNAL)) -> None:
         self.tell(Ending(reason=reason))
 
     def fly(self, seconds: float) -> "VirtualFlight":
@@ -204,7 +205,7 @@ class VirtualFlight:
         return self.view.phase
 
     @property
-    def reason(self) -> str:
+    def reason(self) -> Reason | None:
         return self.view.reason
 
     @property

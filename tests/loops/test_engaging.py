@@ -11,6 +11,7 @@ from helpers.fakes import START_NS
 from helpers.virtual_flights import FRAME_NS, MS, STEADY, VirtualFlight, nan_chunk
 from mavbridge.config.flight import Limits
 from mavbridge.core.clock import NS_PER_S
+from mavbridge.core.reasons import Code
 from mavbridge.core.vehicle import IDLE, NEUTRAL, Command, Decision, Release, Sticks
 from mavbridge.gate.engagement import Phase
 
@@ -83,7 +84,7 @@ def test_inputs_that_never_come_never_move_a_stick() -> None:
     flight.link.lacks = "velocity_ned_mps"
     flight.fly(1.0)
     assert flight.link.decisions == []
-    assert flight.reason == "no velocity from the vehicle yet"
+    assert flight.codes == (Code.NO_READING,)
 
 
 def test_inputs_that_flicker_do_not_toss_the_sticks_to_and_fro() -> None:
@@ -104,7 +105,7 @@ def test_one_chunk_with_nan_is_not_flown_and_costs_no_stick() -> None:
 def test_a_policy_that_returns_nan_every_other_time_loses_the_sticks_once() -> None:
     flight = VirtualFlight(chunk=lambda k: nan_chunk() if k > 50 and k % 2 else STEADY).fly(3.0)
     assert flight.link.hands == [QUARTER, Command(action=NEUTRAL), Release(flight.reason)]
-    assert "unusable chunks" in flight.reason
+    assert Code.UNUSABLE_CHUNKS in flight.codes
 
 
 def test_a_policy_that_always_returns_nan_never_moves_a_stick() -> None:
@@ -203,4 +204,4 @@ def test_a_takeover_releases_in_the_same_moment_and_sends_no_mode() -> None:
     flight.link.change(mode="ALT_HOLD")
     flight.fly(2.0)
     assert len(flight.link.hands) == 2
-    assert "mode changed" in flight.reason
+    assert Code.MODE_CHANGED in flight.codes

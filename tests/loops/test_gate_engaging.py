@@ -16,6 +16,7 @@ from helpers.gate_flights import (
     leaning,
 )
 from mavbridge.core.errors import PeerError, UserError
+from mavbridge.core.reasons import Code
 from mavbridge.gate.engagement import Phase
 from sitl.ardupilot.flight_modes import Mode
 
@@ -54,7 +55,7 @@ def test_arm_arms_once_and_engages_once() -> None:
     flight.run(3)
 
     assert flight.phase is Phase.RELEASED
-    assert flight.reason == "the vehicle has been disarmed"
+    assert flight.codes == (Code.DISARMED,)
     assert not flight.commands(ARM, disarmed_ns)
 
 
@@ -85,7 +86,7 @@ def test_the_switch_engages_by_going_high_while_armed_in_an_allowed_mode() -> No
     flight.receiver(ch7=LOW)
     took_s = flight.until(lambda: flight.phase is Phase.RELEASED, within_s=0.3)
     assert took_s < 0.2
-    assert flight.reason == "the pilot's engage switch is off"
+    assert flight.codes == (Code.ENGAGE_SWITCH_OFF,)
     flight.run(2)
     flight.receiver(ch7=HIGH)
     flight.until(lambda: flight.phase is Phase.FLYING, within_s=0.3)
@@ -130,7 +131,7 @@ def test_the_keys_engage_and_release() -> None:
     flight = GateFlight().fly()
     flight.act("release")
     flight.until(lambda: flight.phase is Phase.RELEASED, within_s=1.2)
-    assert flight.reason == "released by the operator"
+    assert flight.codes == (Code.OPERATOR,)
     assert not flight.modes_asked(), "with a receiver the sticks are given back in the same mode"
 
     flight.act("engage")
@@ -186,7 +187,7 @@ def test_a_pilot_who_changes_the_mode_while_ours_is_asked_for_keeps_his() -> Non
     flight.run(3)
 
     assert flight.phase is Phase.RELEASED, flight.describe()
-    assert "mode changed from ALT_HOLD to RTL" in flight.reason
+    assert Code.MODE_CHANGED in flight.codes
     assert flight.ap.mode is Mode.RTL
     assert not flight.overrides()
 
@@ -203,7 +204,7 @@ def test_an_act_in_the_air_does_not_come_true_much_later() -> None:
     flight.run(3)
 
     assert flight.phase is Phase.RELEASED, flight.describe()
-    assert "not ready after 3 s" in flight.reason
+    assert Code.NOT_READY in flight.codes
     assert not flight.overrides()
 
 

@@ -13,6 +13,7 @@ from helpers.gate_flights import CONTRACT, HOVER, MS, NAN, GateFlight, hovering,
 from mavbridge.config.flight import EnvelopeConfig, Limits
 from mavbridge.config.rates import Rates
 from mavbridge.core.clock import NS_PER_S
+from mavbridge.core.reasons import Code
 from mavbridge.core.records import FloatArray
 from mavbridge.core.vehicle import NEUTRAL
 from mavbridge.flight.settings import TAU_S
@@ -47,7 +48,7 @@ def test_nan_every_other_time_ends_the_flight_once_and_for_all() -> None:
         *(Phase.WAITING, Phase.PREPARING, Phase.FLYING),
         *(Phase.LEAVING, Phase.RELEASING, Phase.RELEASED),
     ]
-    assert "unusable chunks" in flight.reason
+    assert Code.UNUSABLE_CHUNKS in flight.codes
     rolls = [sticks.roll for _, sticks in flight.sticks_sent()]
     assert max(rolls) < 0.31, "the smoother is not seeded again by our own echo"
 
@@ -72,7 +73,7 @@ def test_a_policy_that_returns_the_wrong_shape_is_a_fault() -> None:
     flight.run(0.5)
 
     assert flight.phase is not Phase.FLYING
-    assert "[1, 0, 4] instead of [1, horizon, 4]" in flight.reason
+    assert Code.WRONG_SHAPE in flight.codes
 
 
 @pytest.mark.parametrize(
@@ -125,7 +126,7 @@ def test_a_policy_that_is_killed_leaves_the_vehicle_neutral_within_60_ms() -> No
     safe = [e for e in flight.record(died_s) if abs(e["us"][0] - 1500) <= 2]
     assert safe[0]["t_s"] - died_s < 0.06
     assert all(abs(e["us"][0] - 1500) <= 2 for e in flight.record(safe[0]["t_s"]))
-    assert "the flight process has died" in flight.reason
+    assert Code.FLIGHT_PROCESS_DIED in flight.codes
     assert flight.ap.mode is Mode.BRAKE
     assert flight.record()[-1]["us"] == MID_RECEIVER_US[:4]
 
@@ -370,7 +371,7 @@ def test_a_landing_under_the_policy_is_a_normal_end() -> None:
     flight = GateFlight(lambda t_s: HOVER if t_s < 1.0 else (-0.8, 0.0, 0.0, 0.0)).fly()
     flight.until(lambda: flight.phase is Phase.RELEASED, within_s=15)
 
-    assert flight.reason == "the vehicle has landed"
+    assert flight.codes == (Code.LANDED,)
     assert not flight.modes_asked()
 
 

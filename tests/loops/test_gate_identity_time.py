@@ -12,6 +12,7 @@ from helpers.wire import WireEnd
 from mavbridge.config.flight import FlyConfig
 from mavbridge.core.clock import NS_PER_S
 from mavbridge.core.errors import UserError
+from mavbridge.core.reasons import Code
 from mavbridge.gate.engagement import Phase
 from sitl.ardupilot.flight_modes import Mode
 from sitl.vehicle.config import MID_RECEIVER_US
@@ -103,7 +104,7 @@ def test_200_ms_of_delay_each_way_are_noticed() -> None:
         flight.run(0.015)
 
     assert delay_ms < 115, "the contract allows 100 ms, and the grace is another 100"
-    assert "attitude is older than 100 ms" in flight.reason
+    assert Code.TOO_OLD in flight.codes
 
 
 def test_200_ms_of_delay_from_the_start_are_no_reason_to_begin() -> None:
@@ -191,7 +192,7 @@ def test_a_parameter_that_matters_and_changes_in_flight_is_latched() -> None:
     )  # ArduPilot tells every link
     flight.until(lambda: flight.phase is Phase.RELEASED, within_s=0.5)
 
-    assert "RC_OVERRIDE_TIME was changed from 3 to -1 in flight" in flight.reason
+    assert Code.PARAMETER_CHANGED in flight.codes
     assert not flight.modes_asked()
 
 

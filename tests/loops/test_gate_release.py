@@ -6,6 +6,7 @@ from typing import Any
 import pytest
 
 from helpers.gate_flights import CONTRACT, MS, GateFlight, climbing_first
+from mavbridge.core.reasons import Code
 from mavbridge.core.vehicle import NEUTRAL
 from mavbridge.gate.engagement import Phase
 from sitl.ardupilot.flight_modes import Mode
@@ -163,7 +164,7 @@ def test_a_normal_end_does_what_then_says(then: Any, mode: Mode) -> None:
     flight.until(lambda: flight.gate.is_done, within_s=6)
 
     assert flight.ap.mode is mode
-    assert flight.reason == "the flight is over"
+    assert flight.codes == (Code.DURATION,)
     assert flight.phase is Phase.ENDED
 
 
@@ -172,7 +173,7 @@ def test_the_duration_may_end_while_coasting() -> None:
     flight.is_flight_process_stopped = True
     flight.until(lambda: flight.gate.is_done, within_s=3)
 
-    assert flight.reason == "the flight is over"
+    assert flight.codes == (Code.DURATION,)
     assert flight.ap.mode is Mode.ALT_HOLD, "a normal end, with a receiver"
 
 

@@ -10,6 +10,7 @@ import pytest
 
 from helpers import release_paths as paths
 from helpers.output_flights import COMBINATIONS, Aftermath, OutputFlight
+from mavbridge.core.reasons import Code
 from mavbridge.core.vehicle import Action
 from mavbridge.gate.engagement import Phase
 from mavbridge.mavlink.codec.packets import CommandRefusedError
@@ -115,7 +116,7 @@ def test_chunks_that_are_not_numbers(autopilot: AutopilotName, kind: ActionKind)
     flight = OutputFlight(autopilot, kind)
     found = after(flight, paths.not_a_number)
     assert_safe(flight, found, mode=hold(flight), neutral_ms=GRACE_MS)
-    assert "unusable chunks" in flight.reason
+    assert Code.UNUSABLE_CHUNKS in flight.codes
 
 
 @pytest.mark.parametrize(("autopilot", "kind"), UNLIKE)
@@ -135,7 +136,7 @@ def test_a_command_that_the_codec_refuses(autopilot: AutopilotName, kind: Action
         output.encode = encode_or_refuse  # type: ignore[method-assign]
 
     found = after(flight, refuse)
-    assert "CommandRefusedError" in flight.reason
+    assert Code.COMMAND_FAILED in flight.codes
     assert_safe(flight, found, mode=hold(flight), neutral_ms=DEATH_MS)
     assert not flight.gate.is_done
 
@@ -166,7 +167,7 @@ def test_a_pilots_stick_ramp_takes_px4_out_of_offboard(kind: ActionKind) -> None
     found = after(flight, paths.stick_ramp, 2.0)
     assert found.mode == found.final_mode == "POSCTL"
     assert not found.flew_again
-    assert flight.reason == "mode changed from OFFBOARD to POSCTL"
+    assert flight.codes == (Code.MODE_CHANGED,)
     assert flight.phase is Phase.RELEASED
     assert not flight.modes_asked()[1:], "only OFFBOARD itself was asked for"
 
@@ -176,7 +177,7 @@ def test_a_disarming_in_flight(autopilot: AutopilotName, kind: ActionKind) -> No
     flight = OutputFlight(autopilot, kind)
     found = after(flight, paths.disarming, 1.0)
     assert not found.final_armed
-    assert flight.reason == "the vehicle has been disarmed"
+    assert flight.codes == (Code.DISARMED,)
     assert flight.phase in (Phase.RELEASING, Phase.RELEASED)
 
 
@@ -247,7 +248,7 @@ def test_a_failsafe_of_the_vehicle_is_left_alone(
     flight.run(2)
     found = flight.aftermath(at_s)
     assert found.final_mode == ("AUTO.RTL" if flight.is_px4 else "RTL")
-    assert "a failsafe of the vehicle is active" in flight.reason
+    assert Code.FAILSAFE in flight.codes
     assert not flight.modes_asked(at_ns)
     assert flight.phase is Phase.RELEASED
 

@@ -5,6 +5,7 @@ from pymavlink.dialects.v20 import ardupilotmega as dialect
 
 from helpers import release_paths as paths
 from helpers.output_flights import HOVERING, OutputFlight
+from mavbridge.core.reasons import Code
 from mavbridge.gate.engagement import Phase
 from policy.contract import ActionKind
 from sitl.vehicle.config import AutopilotName
@@ -56,7 +57,7 @@ def test_a_pilots_mode_during_the_takeoff_is_final(
     flight.command(dialect.MAV_CMD_DO_SET_MODE, 1, main, sub)
     flight.until(lambda: flight.phase is not Phase.PREPARING, within_s=0.1)
     flight.run(3)
-    assert "mode changed" in flight.reason, flight.reason
+    assert Code.MODE_CHANGED in flight.codes, flight.reason
     assert flight.samples[-1].mode == ("AUTO.LAND" if flight.is_px4 else "LAND")
     assert flight.phase in (Phase.RELEASED, Phase.ENDED)
     assert not flight.modes_asked(before_ns)
@@ -89,7 +90,7 @@ def test_a_policy_that_never_lifts_px4_off_is_disarmed_by_it() -> None:
     flight = OutputFlight("px4", "velocity", HOVERING, arm=True)
     flight.until(lambda: flight.phase is Phase.FLYING, within_s=15)
     flight.run(11)
-    assert flight.reason == "the vehicle has been disarmed"
+    assert flight.codes == (Code.DISARMED,)
     flight.run(3)
     assert flight.phase is Phase.RELEASED
     assert not flight.samples[-1].armed

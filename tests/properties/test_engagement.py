@@ -15,12 +15,14 @@ from hypothesis.stateful import (
 
 from helpers.gate_facts import AIRBORNE, COPTER_MODES, STEP_NS, Stepped
 from mavbridge.core.clock import NS_PER_S
+from mavbridge.core.reasons import Code, Reason, because
 from mavbridge.core.vehicle import NEUTRAL
 from mavbridge.gate.departure import MODE_TIMEOUT_NS, NEUTRAL_NS, DepartureSettings, Ending
 from mavbridge.gate.engagement import RELEASE_TIMEOUT_NS, Act, Phase
 from mavbridge.gate.facts import Hand, Move
 
 MODES = ("ALT_HOLD", "LOITER")
+JOYSTICK = because(Code.OVERRULED, quantity="sticks", cause="a joystick")
 PROBLEMS = (
     *("link_problem", "chunk_problem", "chunk_fault", "envelope_problem", "landing"),
     *("overruled", "refused_mode"),
@@ -85,7 +87,7 @@ class EngagementMachine(RuleBasedStateMachine):
             changes.get("armed") is False
             or changes.get("is_switched_off") is True
             or changes.get("overruled") is not None
-            or changes.get("interruption", facts.interruption) != facts.interruption
+            or changes.get("interruptions", facts.interruptions) != facts.interruptions
             or (own is not None and is_mode not in (own, asked))
         )
         self.last = self.vehicle.step(act, **changes)
@@ -132,7 +134,7 @@ class EngagementMachine(RuleBasedStateMachine):
     @rule(is_fault=st.booleans())
     @precondition(lambda self: len(self.vehicle.moves) > 300)
     def stop(self, is_fault: bool) -> None:
-        self.vehicle.engagement.stop(Ending(reason="stopped", is_fault=is_fault))
+        self.vehicle.engagement.stop(Ending(reason=because(Code.SIGNAL), is_fault=is_fault))
         if self.stopped_ns is None:
             self.stopped_ns = self.vehicle.facts.now_ns
         self.step()
@@ -164,7 +166,7 @@ class EngagementMachine(RuleBasedStateMachine):
     )
     def change_input(self, name: str, is_bad: bool, mode: str | None) -> None:
         """Also in the same step as a change of mode."""
-        changes: dict[str, Any] = {name: f"no {name}" if is_bad else None}
+        changes: dict[str, Any] = {name: because(Code.NO_CHUNK) if is_bad else None}
         if name == "chunk_fault":
             changes["chunk_problem"] = changes[name]
         if mode is not None:
@@ -175,14 +177,19 @@ class EngagementMachine(RuleBasedStateMachine):
     def switch_overrides(self, is_off: bool) -> None:
         self.step(is_switched_off=is_off)
 
-    @rule(overruled=st.sampled_from((None, "a joystick")))
-    def overrule(self, overruled: str | None) -> None:
+    @rule(overruled=st.sampled_from((None, JOYSTICK)))
+    def overrule(self, overruled: Reason | None) -> None:
         self.step(overruled=overruled)
 
     @rule()
     def reboot(self) -> None:
-        text = f"reboot at {self.vehicle.facts.now_ns}"
-        self.step(interruption=text, armed=False, mode="STABILIZE", link_problem="reading")
+        self.step(
+            interruption=because(Code.REBOOTED),
+            interruptions=self.vehicle.facts.interruptions + 1,
+            armed=False,
+            mode="STABILIZE",
+            link_problem=because(Code.READING_PARAMETERS),
+        )
 
     @rule(is_released=st.booleans(), echo_confirmed=st.booleans(), is_position_valid=st.booleans())
     def change_rest(self, **changes: bool) -> None:

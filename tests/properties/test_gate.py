@@ -9,6 +9,7 @@ from hypothesis import strategies as st
 from hypothesis.stateful import RuleBasedStateMachine, initialize, invariant, precondition, rule
 
 from helpers.gate_machine import FLIGHT_MODES, GRACE_NS, LIMIT_NS, MS, STEP_NS, GateWorld, Shown
+from mavbridge.core.reasons import Code, because
 from mavbridge.core.switch import DWELL_NS
 from mavbridge.core.vehicle import Sticks
 from mavbridge.gate.departure import DepartureSettings, Ending
@@ -236,13 +237,14 @@ class GateMachine(RuleBasedStateMachine):
 
     @rule()
     def reboot(self) -> None:
-        self.world.interruption = f"reboot at {self.world.now_ns}"
+        self.world.interruption = because(Code.REBOOTED)
+        self.world.interruptions += 1
         self.must_end = True
         self.step()
 
     @rule(is_lost=st.booleans())
     def lose_link(self, is_lost: bool) -> None:
-        self.world.link_problem = "the vehicle's heartbeat is lost" if is_lost else None
+        self.world.link_problem = because(Code.HEARTBEAT_LOST) if is_lost else None
         self.must_end = is_lost
         self.step()
 

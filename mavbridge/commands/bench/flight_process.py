@@ -19,6 +19,7 @@ from mavbridge.config.flight import CameraConfig, EnvelopeConfig, FlyConfig, Lin
 from mavbridge.config.policy import PolicyConfig
 from mavbridge.core.clock import NS_PER_S, Clock, MonotonicClock
 from mavbridge.core.errors import PeerError
+from mavbridge.core.reasons import Reason
 from mavbridge.core.records import Event, Tick
 from mavbridge.flight.app import fly_executable, start_gate
 from mavbridge.flight.policies import load_configured_policy
@@ -141,10 +142,10 @@ class ReleaseWatch:
     Nobody is there to engage it again.
     """
 
-    def __init__(self, end: Callable[[str], object]) -> None:
+    def __init__(self, end: Callable[[Reason], object]) -> None:
         self._end = end
         self._has_flown = False
-        self.reason: str | None = None
+        self.reason: Reason | None = None
         """Why the policy lost the sticks; None before that."""
 
     def emit(self, event: Event) -> None:

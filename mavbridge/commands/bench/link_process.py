@@ -22,6 +22,7 @@ from mavbridge.config.rates import Rates
 from mavbridge.core.clock import NS_PER_S, MonotonicClock
 from mavbridge.core.histogram import Histogram
 from mavbridge.core.realtime import settle_process, settle_thread
+from mavbridge.core.reasons import Code, because
 from mavbridge.core.records import Event, FeatureFrame, FloatArray, Frame, Tick
 from mavbridge.core.workers import Worker
 from mavbridge.flight.bridge import Bridge, CameraPath, build_bridge
@@ -103,7 +104,7 @@ def _serve(bridge: Bridge, gate: GateProcess, stop: threading.Event) -> None:
     policy.start()
     while listener.is_alive and policy.is_alive and not stop.wait(WATCH_S):
         pass
-    gate.send(Ending(reason="the measurement is over"))
+    gate.send(Ending(reason=because(Code.FINISHED, what="measurement")))
     listener.ends_within(END_S)
     for worker in (policy, listener):
         worker.join(END_S)

@@ -5,6 +5,7 @@ from collections.abc import Iterator, Mapping
 from mavbridge.commands.check.probe import ECHO_S, VehicleProbe
 from mavbridge.commands.check.rows import Row, Verdict
 from mavbridge.commands.check.terms import Terms
+from mavbridge.core.reasons import Reason
 from mavbridge.core.vehicle import LinkStats
 from mavbridge.mavlink.profiles.profile import StreamGroup
 from mavbridge.mavlink.session.vehicle import VehicleSession
@@ -26,7 +27,7 @@ _QUANTITIES = {
 
 
 def link_rows(
-    vehicle: VehicleSession, stats: LinkStats, terms: Terms, *, unfinished: str | None
+    vehicle: VehicleSession, stats: LinkStats, terms: Terms, *, unfinished: Reason | None
 ) -> Iterator[Row]:
     """All of them but the echo test."""
     yield _vehicle_row(vehicle, unfinished)
@@ -40,7 +41,7 @@ def link_rows(
     yield from _time_rows(stats)
 
 
-def _vehicle_row(vehicle: VehicleSession, unfinished: str | None) -> Row:
+def _vehicle_row(vehicle: VehicleSession, unfinished: Reason | None) -> Row:
     place = f"system {vehicle.identity.source.system} at {vehicle.identity.place}"
     return _row(
         "vehicle",
@@ -152,9 +153,10 @@ def echo_row(probe: VehicleProbe, terms: Terms) -> Row:
         f"not seen in {ECHO_S:g} s",
         expected,
         "no-go",
-        probe.echo_problem
-        or "the vehicle does not show our sticks: another station may "
-        "be overriding them, or it obeys another system id",
+        str(probe.echo_problem)
+        if probe.echo_problem is not None
+        else "the vehicle does not show our sticks: another station may be overriding them, or it "
+        "obeys another system id",
     )
 
 

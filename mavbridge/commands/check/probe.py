@@ -4,6 +4,7 @@ from collections.abc import Callable
 from typing import Literal, TypeAlias
 
 from mavbridge.core.clock import NS_PER_MS, NS_PER_S, Clock
+from mavbridge.core.reasons import Code, Reason, because
 from mavbridge.core.vehicle import NEUTRAL, Command, LinkSnapshot, LinkStats, Release
 from mavbridge.mavlink.link import MavlinkLink
 from mavbridge.mavlink.session.vehicle import VehicleSession
@@ -34,7 +35,7 @@ class VehicleProbe:
         self._snapshot: LinkSnapshot | None = None
         self.texts: list[str] = []
         """What the vehicle and the link have said."""
-        self.echo_problem: str | None = None
+        self.echo_problem: Reason | None = None
         """Why the sticks of the echo test were not taken, as the link says it."""
 
     def find(self) -> VehicleSession:
@@ -43,13 +44,13 @@ class VehicleProbe:
             self._pass()
         return vehicle
 
-    def set_up(self) -> str | None:
+    def set_up(self) -> Reason | None:
         """Read parameters and request streams; returns the step that was not finished in time."""
         self._until(SET_UP_S, lambda: self._unfinished is None)
         return self._unfinished
 
     @property
-    def _unfinished(self) -> str | None:
+    def _unfinished(self) -> Reason | None:
         return self.find().unfinished(self._clock.now_ns())
 
     def measure(self) -> LinkStats:
@@ -92,7 +93,7 @@ class VehicleProbe:
 
     def _release(self) -> bool:
         """Give the sticks back; True once the vehicle shows that it has them."""
-        self._link.send(Release("the echo test is over"))
+        self._link.send(Release(because(Code.FINISHED, what="echo test")))
         return self.snapshot().is_released and not self._link.is_release_owed
 
     def _until(self, limit_s: float, is_over: Callable[[], bool] = lambda: False) -> None:

@@ -25,7 +25,7 @@ def vehicle_rows(
     if (is_ready := vehicle.condition.is_ready_to_arm) is not None:
         yield _arming_row(is_ready=is_ready)
     if vehicle.switch_problem is not None:
-        yield _row("override switch", "off", "on", "warn", vehicle.switch_problem)
+        yield _row("override switch", "off", "on", "warn", str(vehicle.switch_problem))
     yield from _text_rows(terms, texts)
 
 

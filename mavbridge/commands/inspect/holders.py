@@ -6,6 +6,7 @@ from itertools import groupby
 from typing import Literal
 
 from mavbridge.core.clock import NS_PER_S
+from mavbridge.core.reasons import Code, Reason
 from mavbridge.core.records import Tick
 
 Holder = Literal["policy", "read-only", "idle", "neutral", "release", "pilot"]
@@ -21,8 +22,8 @@ class HolderSpan:
     """Since the first tick."""
     end_s: float
     holder: Holder
-    reason: str
-    """Why the policy did not fly, for most of the time; empty while it did."""
+    reason: Reason | None
+    """Why the policy did not fly, for most of the time; None while it did."""
 
 
 def holder_of(tick: Tick) -> Holder:
@@ -40,18 +41,21 @@ def holder_spans(ticks: Sequence[Tick], start_ns: int) -> tuple[HolderSpan, ...]
     at = 0
     for holder, group in groupby(ticks, holder_of):
         first = at
-        lasted_ns: dict[str, int] = {}
+        lasted_ns: dict[tuple[Code, ...], int] = {}
+        reasons: dict[tuple[Code, ...], Reason | None] = {}
         for tick in group:
             at += 1
             end_ns = ticks[min(at, len(ticks) - 1)].woke_ns
-            reason = "" if tick.trace is not None else tick.release_reason or ""
-            lasted_ns[reason] = lasted_ns.get(reason, 0) + end_ns - tick.woke_ns
+            reason = None if tick.trace is not None else tick.release_reason
+            codes = () if reason is None else reason.codes
+            lasted_ns[codes] = lasted_ns.get(codes, 0) + end_ns - tick.woke_ns
+            reasons[codes] = reason
         spans.append(
             HolderSpan(
                 start_s=(ticks[first].woke_ns - start_ns) / NS_PER_S,
                 end_s=(end_ns - start_ns) / NS_PER_S,
                 holder=holder,
-                reason=max(lasted_ns, key=lasted_ns.__getitem__),
+                reason=reasons[max(lasted_ns, key=lasted_ns.__getitem__)],
             )
         )
     return tuple(spans)

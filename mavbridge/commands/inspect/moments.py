@@ -6,9 +6,9 @@ from itertools import groupby, pairwise
 
 from mavbridge.commands.inspect.delays import Delay
 from mavbridge.core.clock import NS_PER_MS, NS_PER_S
+from mavbridge.core.reasons import Code, Kind
 from mavbridge.core.records import Tick
 from mavbridge.gate.chunks import FreshnessLimits
-from mavbridge.gate.engagement import OPERATOR
 from mavbridge.recording.crash import CrashWatch
 from mavbridge.recording.flight_folder import RecordedFlight
 from mavbridge.recording.rows import FrameRow
@@ -22,10 +22,6 @@ IMAGE_PERIODS = 2.0
 """A gap between two exposures beyond this many periods is worth telling."""
 LEAST_MS = 1.0
 """Coasting that ends sooner, by a chunk between two slots, is not told."""
-PLANNED_ENDS = frozenset(
-    {"the flight is over", "the flight was ended by a signal", "the vehicle has landed", OPERATOR}
-)
-"""Reasons of releases with which nothing went wrong."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -105,7 +101,8 @@ def _crash(flight: RecordedFlight, ticks: Sequence[Tick]) -> Iterator[Moment]:
 def _ends(ticks: Sequence[Tick], start_ns: int) -> Iterator[Moment]:
     for last, tick in pairwise(ticks):
         reason = tick.release_reason
-        is_planned = reason in PLANNED_ENDS or (tick.phase == "ended" and not reason)
+        is_asked = reason is not None and (reason.kind is Kind.END or reason.code is Code.OPERATOR)
+        is_planned = is_asked or (tick.phase == "ended" and reason is None)
         if last.trace is None or tick.trace is not None or is_planned:
             continue
         yield Moment(

@@ -120,7 +120,12 @@ def _holders_table(flight: FlightAnalysis) -> Table:
     shown = spans if len(spans) <= HOLDERS_SHOWN else _longest(spans)
     for span in shown:
         holder = "expert" if is_expert and span.holder == "policy" else span.holder
-        table.add_row(f"{span.start_s:.2f}", f"{span.end_s:.2f}", holder, Text(span.reason))
+        table.add_row(
+            f"{span.start_s:.2f}",
+            f"{span.end_s:.2f}",
+            holder,
+            Text(str(span.reason or "")),
+        )
     if len(shown) < len(spans):
         table.caption = f"the {len(shown)} longest of {len(spans)}"
     return table

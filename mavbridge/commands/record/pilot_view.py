@@ -5,6 +5,7 @@ from dataclasses import replace
 
 from mavbridge.core.clock import NS_PER_MS
 from mavbridge.core.ports import TickSink
+from mavbridge.core.reasons import Code, because
 from mavbridge.core.records import Event, Tick
 from mavbridge.core.vehicle import ForwardedPacket, Packet
 from mavbridge.flight.history import SentHistory
@@ -19,7 +20,7 @@ STICK_IDS = {"ardupilot": message_id("RC_CHANNELS"), "px4": message_id("MANUAL_C
 """Message that carries the pilot's sticks, by the first word of the autopilot's name."""
 STICKS_FRESH_NS = 500 * NS_PER_MS
 """Older sticks are not the pilot's any more: PX4 goes silent where its receiver does."""
-PILOTS = "the pilot flies"
+PILOTS = because(Code.PILOT_FLIES)
 
 
 class PilotView(VehicleView):

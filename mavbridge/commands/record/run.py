@@ -27,6 +27,7 @@ from mavbridge.core.errors import UserError
 from mavbridge.core.observers import FanOut, ObserverThread
 from mavbridge.core.ports import Camera, TickSink
 from mavbridge.core.provenance import command_line, git_revision, versions, without_secrets
+from mavbridge.core.reasons import Code, because
 from mavbridge.core.records import FloatArray
 from mavbridge.core.stopping import StopRequest, stop_on_signals
 from mavbridge.core.workers import Worker
@@ -258,7 +259,7 @@ class _Session:
             f"{self._episodes.finished} episodes recorded in {out}: {counts[True]} good, "
             f"{counts[False]} bad, {counts[None]} not marked"
         )
-        self._gate.send(Ending(reason="the recording is over"))
+        self._gate.send(Ending(reason=because(Code.FINISHED, what="recording")))
         listener.ends_within(GATE_END_S)
 
     def _listen(self, stop: threading.Event) -> None:
@@ -339,7 +340,7 @@ class _Session:
         """Why what is recorded now may be worth little, or None."""
         image, mode = self._images.latest(), self._view.status.mode
         if image is not None and image.fault is not None:
-            return image.fault
+            return str(image.fault)
         if self._view.status.armed and mode is not None and mode not in CONTRACT.modes:
             return f"sticks mean something else in {mode} than in {CONTRACT.modes[0]}"
         return None

@@ -5,6 +5,7 @@ from collections import Counter
 from collections.abc import Mapping
 from typing import ClassVar, NamedTuple
 
+from mavbridge.core.reasons import Code, Reason, because
 from mavbridge.core.vehicle import Action, Output, VehicleStatus
 from mavbridge.mavlink.codec.messages import Body
 from mavbridge.mavlink.codec.packets import Codec
@@ -137,20 +138,20 @@ class ActionOutput(ABC):
         """The vehicle takes what we last sent for nobody's hand."""
         return True
 
-    def overruled(self, now_ns: int) -> str | None:
+    def overruled(self, now_ns: int) -> Reason | None:
         """The likely reason why it acts on something else than what we send, or None."""
         fault = self.echo.fault(now_ns)
         if fault is None or fault == "silent" or self.echo.is_unshown(now_ns):
             return None
-        return f"the vehicle ignores our {self._noun}: {self._causes[fault]}"
+        return because(Code.OVERRULED, quantity=self._noun, cause=self._causes[fault])
 
-    def unheard(self, now_ns: int) -> str | None:
+    def unheard(self, now_ns: int) -> Reason | None:
         """The reason why our packets do not reach it, as far as can be told, or None."""
         fault = self.echo.fault(now_ns)
         if fault is not None and self.echo.is_unshown(now_ns):
-            return f"no {self._echo_message} arrive to check our {self._noun} against"
+            return because(Code.NO_ECHO, message=self._echo_message, quantity=self._noun)
         if fault == "silent":
-            return f"the vehicle does not hear our {self._noun}: {self._causes[fault]}"
+            return because(Code.UNHEARD, quantity=self._noun, cause=self._causes[fault])
         return None
 
     @property

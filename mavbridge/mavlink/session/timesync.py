@@ -5,6 +5,7 @@ from typing import NamedTuple
 
 from mavbridge.core.clock import NS_PER_MS, NS_PER_S, period_ns
 from mavbridge.core.histogram import Histogram
+from mavbridge.core.reasons import Code, Reason, because
 from mavbridge.mavlink.codec.messages import WRAP_US, Timesync
 
 TIMESYNC_HZ = 5.0
@@ -135,7 +136,7 @@ class TimesyncFilter:
         )
 
     @property
-    def late_sending(self) -> str | None:
+    def late_sending(self) -> Reason | None:
         """Why the vehicle gets our packets too late, or None.
 
         The time on the way is known less the error of the offset, so that a link that was as slow
@@ -147,7 +148,7 @@ class TimesyncFilter:
         is_late = len(self._sending_ns) == _LATE_IN_A_ROW and least_ns > LONGEST_SENDING_NS
         if not is_late and newest_ns <= 2 * LONGEST_SENDING_NS:
             return None
-        return f"our packets take {newest_ns // NS_PER_MS} ms or more to the vehicle"
+        return because(Code.LATE_SENDING, age_ms=newest_ns / NS_PER_MS)
 
     def _error_ns(self, exchange: _Exchange, now_ns: int) -> int:
         return exchange.error_ns + (now_ns - exchange.at_ns) // _DRIFT_PER

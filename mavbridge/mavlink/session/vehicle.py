@@ -10,6 +10,7 @@ from dataclasses import replace
 from pymavlink.dialects.v20 import ardupilotmega as dialect
 
 from mavbridge.core.clock import NS_PER_MS, NS_PER_S
+from mavbridge.core.reasons import Code, Reason, because
 from mavbridge.core.switch import Switch
 from mavbridge.core.vehicle import Output, VehicleStatus
 from mavbridge.mavlink.codec.calibration import RcCalibration
@@ -197,7 +198,7 @@ class VehicleSession:
         return self._params.values
 
     @property
-    def param_interruption(self) -> str | None:
+    def param_interruption(self) -> Reason | None:
         """A change of a parameter in flight that ends every engagement so far; stays once set."""
         return self._params.interruption
 
@@ -210,14 +211,14 @@ class VehicleSession:
         """Nothing is left to put back, or no more can be done about it now."""
         return self._params.is_restored
 
-    def unfinished(self, now_ns: int) -> str | None:
+    def unfinished(self, now_ns: int) -> Reason | None:
         """The step of the set-up that is not finished, or None."""
         if not self._params.is_read:
-            return "reading the vehicle's parameters"
+            return because(Code.READING_PARAMETERS)
         if not self._streams.is_settled and self._streams.renewals == 0:
-            return "requesting telemetry from the vehicle"
+            return because(Code.REQUESTING_TELEMETRY)
         if not self._is_receiver_settled(now_ns):
-            return "looking for the pilot's radio receiver"
+            return because(Code.LOOKING_FOR_RECEIVER)
         return None
 
     def _is_receiver_settled(self, now_ns: int) -> bool:
@@ -235,28 +236,28 @@ class VehicleSession:
             return replace(status, has_receiver=False)
         return status
 
-    def problem(self, now_ns: int) -> str | None:
+    def problem(self, now_ns: int) -> Reason | None:
         """The reason why it cannot be flown now, whatever the output, or None."""
         if self.condition.heartbeat is None:
-            return "waiting for the vehicle's heartbeat"
+            return because(Code.NO_HEARTBEAT)
         if now_ns - self.condition.heartbeat[0] > HEARTBEAT_TIMEOUT_NS:
-            return "the vehicle's heartbeat is lost"
+            return because(Code.HEARTBEAT_LOST)
         if (unfinished := self.unfinished(now_ns)) is not None:
             return unfinished
         return self._params.problem()
 
-    def output_problem(self, now_ns: int) -> str | None:
+    def output_problem(self, now_ns: int) -> Reason | None:
         """The reason why it cannot be flown with the output now, or None."""
         if (forbidden := self._params.output_problem(self.status(now_ns))) is not None:
             return forbidden
         return self.switch_problem
 
     @property
-    def switch_problem(self) -> str | None:
+    def switch_problem(self) -> Reason | None:
         """The override switch that keeps our sticks out, or None."""
         switch = self._params.override_switch
         if switch is not None and not self._switch.is_on:
-            return f"the override switch (RC{switch}) is off: switch it on to fly"
+            return because(Code.OVERRIDE_SWITCH_NOT_ON, channel=switch)
         return None
 
     @property

@@ -145,7 +145,7 @@ def _happened_ns(event: Observed) -> int:
 
 def _changes(before: Tick | None, now: Tick) -> Iterator[tuple[str, str, layout.Rgb]]:
     """Text, level and colour of everything in this tick that is new to the user."""
-    if before is None or before.activity != now.activity:
+    if before is None or before.stage != now.stage:
         if now.release_reason is None:
             yield now.activity, "INFO", layout.GREEN if now.trace else layout.GREY
         else:

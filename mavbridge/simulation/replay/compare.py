@@ -7,6 +7,7 @@ from typing import TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
+from mavbridge.core.reasons import Code, because
 from mavbridge.core.vehicle import Action, ActionTrace
 from mavbridge.gate.gate import GateOutput
 from mavbridge.simulation.replay.gate import GateStep, same_action
@@ -95,12 +96,15 @@ def compare_policy(pairs: Iterable[SolvePair]) -> PolicyComparison:
     """Inputs and results of all solves."""
     missing: dict[str, int] = {}
     inputs: dict[str, int] = {}
+    sentences: dict[tuple[Code, ...], str] = {}
+    """The first of each kind of reason: the others differ by their figures."""
     differences: list[Array] = []
     solves = equal = 0
     for pair in pairs:
         solves += 1
         if pair.replayed is None:
-            _count(missing, pair.refusal or "no chunk")
+            reason = pair.refusal or because(Code.NO_CHUNK)
+            _count(missing, sentences.setdefault(reason.codes, str(reason)))
             continue
         for name in _other_inputs(pair):
             _count(inputs, name)

@@ -13,6 +13,7 @@ import numpy as np
 
 from mavbridge.config.flight import FlyConfig
 from mavbridge.core.clock import NS_PER_MS
+from mavbridge.core.reasons import Code, Kind, because
 from mavbridge.core.records import Solve, Tick
 from mavbridge.core.vehicle import Action, Command, Decision, LinkSnapshot
 from mavbridge.flight.action_frames import action_frame
@@ -20,7 +21,7 @@ from mavbridge.flight.policy_loop import make_chunk
 from mavbridge.flight.settings import flight_settings, link_settings
 from mavbridge.gate.chunks import Chunk
 from mavbridge.gate.departure import Ending
-from mavbridge.gate.engagement import OPERATOR, Act, Phase
+from mavbridge.gate.engagement import Act, Phase
 from mavbridge.gate.gate import FlightSettings, Gate, GateInput, GateOutput
 from mavbridge.gate.loop import GateLoop
 from mavbridge.gate.wire import GateTick, decode_from_gate, encode_to_gate
@@ -35,9 +36,11 @@ from policy.protocol import Executable
 
 PREPARE_NS = 10 * NS_PER_MS
 """Longest time between two looks at the link, as while no policy is loaded."""
-_PLANNED = ("the flight was ended by", "the course is done")
-_OWN_ENDINGS = (*_PLANNED, "the policy has ", "the encoder ", "the camera ")
-"""How the reasons begin for which the flight process asks the gate to end."""
+_OWN_ENDINGS = (
+    *(Code.SIGNAL, Code.COURSE_DONE, Code.POLICY_FAILED, Code.CAMERA_FAILED, Code.HANGS),
+    *(Code.TOLD_TO_END, Code.FLIGHT_PROCESS_DIED),
+)
+"""Reasons for which the gate was asked to end."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -213,7 +216,7 @@ def _act(before: Tick | None, tick: Tick, *, is_called: bool) -> Act | None:
     was = None if before is None else before.phase
     if is_called and was in ("waiting", "released") and tick.phase in ("preparing", "flying"):
         return "engage"
-    if tick.phase != was and tick.release_reason == OPERATOR and was in ("preparing", "flying"):
+    if tick.phase != was and _code(tick) is Code.OPERATOR and was in ("preparing", "flying"):
         return "release"
     return None
 
@@ -221,12 +224,16 @@ def _act(before: Tick | None, tick: Tick, *, is_called: bool) -> Act | None:
 def _stop(before: Tick | None, tick: Tick) -> Ending | None:
     """What the flight process asked for at its own end."""
     was = None if before is None else before.phase
-    reason = tick.release_reason or ""
-    if tick.phase != was and reason.startswith(_OWN_ENDINGS):
-        return Ending(reason=reason, is_fault=not reason.startswith(_PLANNED))
+    reason = tick.release_reason
+    if tick.phase != was and reason is not None and reason.code in _OWN_ENDINGS:
+        return Ending(reason=reason, is_fault=reason.kind is Kind.FAULT)
     if tick.phase == Phase.ENDED.value != was:  # the second of two stops counts for nothing
-        return Ending(reason="the flight was ended by a signal")
+        return Ending(reason=because(Code.SIGNAL))
     return None
+
+
+def _code(tick: Tick) -> Code | None:
+    return None if tick.release_reason is None else tick.release_reason.code
 
 
 class _WatchedLink(MavlinkLink):

@@ -16,6 +16,7 @@ import numpy as np
 from mavbridge.config.flight import FlyConfig
 from mavbridge.core.clock import NS_PER_MS, NS_PER_S
 from mavbridge.core.errors import UserError
+from mavbridge.core.reasons import Code
 from mavbridge.core.records import Frame, Solve
 from mavbridge.core.vehicle import ForwardedPacket, Sticks
 from mavbridge.flight.bridge import CameraPath, build_bridge
@@ -117,7 +118,7 @@ class LogReplay:
         self._log, self._video = log, video
         self._clock = clock
         self._sticks = PilotSticks(log, action_meaning(contract, config.link).stick_gains)
-        self.refusals: Counter[str] = Counter()
+        self.refusals: Counter[Code] = Counter()
         """Reasons for which the policy got nothing to decide by, and how often."""
         self._solve: Solve | None = None
         self._pilot: tuple[int, Sticks] | None = None
@@ -208,12 +209,12 @@ class LogReplay:
             trace=None,
             sent=sticks,
             phase=Phase.FLYING,
-            reason="",
+            reason=None,
         )
 
     def _sent(self, message: Chunk | Absence) -> None:
         if isinstance(message, Absence):
-            self.refusals[message.reason] += 1
+            self.refusals[message.reason.code] += 1
 
     def _keep(self, solve: Solve) -> None:
         self._solve = solve

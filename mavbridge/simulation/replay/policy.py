@@ -17,6 +17,7 @@ from typing import Literal
 
 import numpy as np
 
+from mavbridge.core.reasons import Code, Reason, because
 from mavbridge.core.records import FeatureFrame, FloatArray, Frame, Solve, Tick, VehicleState
 from mavbridge.core.vehicle import ForwardedPacket, Telemetry
 from mavbridge.flight.bridge import CameraPath, build_bridge
@@ -45,7 +46,7 @@ class SolvePair:
 
     recorded: Solve
     replayed: Solve | None
-    refusal: str | None = None
+    refusal: Reason | None = None
     """Why there is none this time."""
 
 
@@ -71,7 +72,8 @@ def replay_policy(
         missing = news.bring(solve)
         loop.view.starting_ns = solve.reset_ns
         if missing is not None:
-            yield SolvePair(recorded=solve, replayed=None, refusal=missing)
+            refusal = because(Code.NOT_RECORDED, what=missing)
+            yield SolvePair(recorded=solve, replayed=None, refusal=refusal)
             continue
         yield loop.repeat(solve)
 
@@ -84,7 +86,7 @@ class _Loop:
         self._clock = clock
         self._now: Solve | None = None
         self._solve: Solve | None = None
-        self._refusal: str | None = None
+        self._refusal: Reason | None = None
         self._act = executable.act
         self._takes_recorded = executable.contract == contract
         span_ns = observation_ages_ns(contract)[0]
@@ -181,13 +183,13 @@ class _News:
         self._next_tick = 0
 
     def bring(self, solve: Solve) -> str | None:
-        """Deliver what this solve had seen; or say what the recording lacks."""
+        """Deliver what this solve had seen; returns what the recording lacks, or None."""
         self._bring_ticks(solve.started_ns)
         if not self._bring_packets(solve):
-            return "the recording lacks the packets of its state"
+            return "the packets of its state"
         for shelf, frame_id in zip(self._shelves, solve.frame_ids[-1], strict=True):
             if not shelf.bring(frame_id):
-                return f"the recording lacks the feature of frame {frame_id}"
+                return f"the feature of frame {frame_id}"
         return None
 
     def _bring_ticks(self, now_ns: int) -> None:
@@ -266,5 +268,5 @@ def _gate_tick(tick: Tick) -> GateTick:
         trace=tick.trace,
         sent=tick.sent,
         phase=Phase(tick.phase),
-        reason=tick.release_reason or "",
+        reason=tick.release_reason,
     )

@@ -6,6 +6,7 @@ from typing import Any
 import pytest
 
 from helpers.gate_facts import AIRBORNE, COPTER_MODES, PX4_MODES, flying
+from mavbridge.core.reasons import Code, because
 from mavbridge.core.vehicle import NEUTRAL, ModeRoles
 from mavbridge.gate.departure import DepartureSettings, Ending
 from mavbridge.gate.engagement import Phase
@@ -140,7 +141,7 @@ def test_no_hand_gets_the_sticks_that_would_not_hold_the_vehicle(
     stepped = flying(
         replace(AIRBORNE, pilot_sticks=sticks), departure=DepartureSettings(**settings)
     )
-    stepped.engagement.stop(Ending(reason="over", is_fault=is_fault))
+    stepped.engagement.stop(Ending(reason=because(Code.DURATION), is_fault=is_fault))
     mode = stepped.step().mode
     assert mode == ("BRAKE" if is_fault else "LAND")
     assert ("throttle" in (stepped.engagement.refusal or "")) == bool(settings)
@@ -164,7 +165,7 @@ def test_an_unconfirmed_mode_is_given_up_after_three_seconds() -> None:
     assert stepped.phase is Phase.LEAVING
     assert {move.hand for move in stepped.run(0.03)} == {Hand.NEUTRAL}
     assert stepped.phase is Phase.HOLDING
-    assert stepped.engagement.refusal == "the vehicle has not confirmed BRAKE in time"
+    assert stepped.engagement.refusal == because(Code.MODE_NOT_CONFIRMED, mode="BRAKE")
     assert sum(move.mode == "BRAKE" for move in stepped.run(5)) == 5, "asked for again"
     assert stepped.step(mode="BRAKE").hand is Hand.RELEASE
     stepped.run(1)
@@ -216,7 +217,7 @@ def test_on_the_ground_a_release_without_a_receiver_holds_neutral_in_the_same_mo
 
 def test_a_vehicle_that_has_vanished_is_not_held_for_ever() -> None:
     stepped = flying(NO_RECEIVER)
-    stepped.engagement.stop(Ending(reason="the flight process has died", is_fault=True))
+    stepped.engagement.stop(Ending(reason=because(Code.FLIGHT_PROCESS_DIED), is_fault=True))
     stepped.step()
     stepped.run(0.2, mode="BRAKE")
     assert stepped.phase is Phase.HOLDING
@@ -225,7 +226,7 @@ def test_a_vehicle_that_has_vanished_is_not_held_for_ever() -> None:
         assert {move.hand for move in moves} == {Hand.NEUTRAL}
         stepped.run(1, heard_ns=None, mode_ns=None)
     stepped.run(33, heard_ns=stepped.facts.now_ns, mode_ns=stepped.facts.now_ns)
-    assert "lost for 30 s" in stepped.reason
+    assert Code.VEHICLE_LOST in stepped.codes
     assert stepped.phase is Phase.ENDED
 
 
@@ -235,7 +236,7 @@ def test_the_pilot_wins_on_the_way_out() -> None:
     stepped.run(0.1, mode="BRAKE")
     assert stepped.phase is Phase.HOLDING
     assert stepped.step(mode="LOITER") == Move(hand=Hand.RELEASE)
-    assert "mode changed from BRAKE to LOITER" in stepped.reason
+    assert Code.MODE_CHANGED in stepped.codes
 
 
 @pytest.mark.parametrize("mode", ["STABILIZE", "ACRO"])
@@ -356,7 +357,7 @@ def test_a_vehicle_that_has_vanished_is_not_asked_for_ever() -> None:
     stepped.step(**FAULT)
     assert silence(stepped, 29)[-1].hand is Hand.NEUTRAL
     stepped.run(6)
-    assert "lost for 30 s" in stepped.reason
+    assert Code.VEHICLE_LOST in stepped.codes
 
 
 def test_a_refusal_that_comes_after_the_mode_is_there_asks_for_nothing() -> None:
@@ -383,7 +384,7 @@ def test_a_stop_while_holding_after_a_fault_lands_as_a_normal_end_does() -> None
     stepped.step(**FAULT)
     stepped.run(0.2, mode="BRAKE", chunk_fault=None)
     assert stepped.phase is Phase.HOLDING
-    stepped.engagement.stop(Ending(reason="the flight was ended by a signal"))
+    stepped.engagement.stop(Ending(reason=because(Code.SIGNAL)))
     assert stepped.step() == Move(hand=Hand.NEUTRAL, mode="LAND")
     stepped.run(0.2, mode="LAND")
     assert stepped.phase is Phase.HOLDING
@@ -422,7 +423,7 @@ def test_setpoints_end_in_a_mode_that_holds_and_then_in_silence(
     assert after[-1].hand is Hand.RELEASE
     assert stepped.phase is Phase.RELEASING
     ended = flying(facts, **rules)
-    ended.engagement.stop(Ending(reason="over"))
+    ended.engagement.stop(Ending(reason=because(Code.DURATION)))
     assert ended.step().mode == (hold if has_receiver else land)
 
 
@@ -495,7 +496,7 @@ def test_setpoints_end_at_once_where_somebody_else_chose_what_it_does(
 
 def test_sticks_leave_no_setpoint_behind_in_whichever_mode() -> None:
     stepped = flying(GUIDED, modes=("GUIDED",))
-    assert stepped.step(interruption="rebooted") == Move(hand=Hand.RELEASE)
+    assert stepped.step(interruption=because(Code.REBOOTED)) == Move(hand=Hand.RELEASE)
 
 
 @pytest.mark.parametrize(("is_landed", "hand"), [(True, Hand.IDLE), (False, Hand.NEUTRAL)])

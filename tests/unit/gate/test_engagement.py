@@ -7,6 +7,7 @@ import pytest
 
 from helpers.gate_facts import AIRBORNE, ON_GROUND, Stepped, flying
 from mavbridge.core.clock import NS_PER_S
+from mavbridge.core.reasons import Code, because
 from mavbridge.core.vehicle import NEUTRAL
 from mavbridge.gate.departure import DepartureSettings, Ending
 from mavbridge.gate.engagement import ACT_TIMEOUT_NS, PREPARE_TIMEOUT_NS, Phase
@@ -71,7 +72,7 @@ def test_a_pilot_who_never_lost_the_sticks_keeps_them(reason: str) -> None:
     stepped.step("engage")
     before = len(stepped.moves)
     if reason == "stop":
-        stepped.engagement.stop(Ending(reason="the flight process has died", is_fault=True))
+        stepped.engagement.stop(Ending(reason=because(Code.FLIGHT_PROCESS_DIED), is_fault=True))
     stepped.run(PREPARE_TIMEOUT_NS / NS_PER_S + 1 if reason == "time" else 0)
     stepped.step("release" if reason == "release" else None)
     stepped.run(0.1)
@@ -91,19 +92,25 @@ def test_a_vehicle_that_does_not_get_ready_ends_it_with_a_reason() -> None:
 
 def test_a_policy_that_is_too_slow_is_refused_before_arming() -> None:
     stepped = Stepped(ON_GROUND, arm=True)
-    stepped.run(2, echo_confirmed=True, chunk_problem="stale", slowness="5 chunks too late")
+    slow = because(Code.TOO_SLOW, chunks=5, age_ms=300.0, limit_ms=100.0)
+    stepped.run(
+        2,
+        echo_confirmed=True,
+        chunk_problem=because(Code.TOO_OLD, quantity="chunk", age_ms=300.0, limit_ms=100.0),
+        slowness=slow,
+    )
     assert stepped.phase is Phase.ENDED
-    assert stepped.engagement.failure == "5 chunks too late"
+    assert stepped.engagement.failure == slow
     assert not any(move.arm for move in stepped.moves)
 
 
 def test_one_that_is_disarmed_while_preparing_is_not_armed_again() -> None:
     stepped = Stepped(ON_GROUND, arm=True)
     stepped.run(0.5, echo_confirmed=True)
-    stepped.step(armed=True, chunk_problem="no image feature yet")
+    stepped.step(armed=True, chunk_problem=because(Code.NO_IMAGE))
     stepped.step(armed=False, chunk_problem=None, is_released=True)
     assert not any(move.arm for move in stepped.run(5))
-    assert "disarmed" in stepped.reason
+    assert Code.DISARMED in stepped.codes
 
 
 @pytest.mark.parametrize(
@@ -137,7 +144,7 @@ def test_the_switch_engages_by_going_high_while_armed_and_releases_by_going_low(
     stepped.run(2, rc_channels_us=LOW)
     assert stepped.run(0.21, rc_channels_us=HIGH)[-1] == Move(hand=Hand.POLICY)
     assert stepped.step(rc_channels_us=LOW) == Move(hand=Hand.RELEASE)
-    assert "engage switch" in stepped.reason
+    assert Code.ENGAGE_SWITCH_OFF in stepped.codes
 
 
 def test_a_switch_that_was_never_high_needs_the_debounce_alone() -> None:
@@ -323,7 +330,7 @@ def test_inputs_that_come_back_do_not_fly_again(changes: dict[str, Any]) -> None
 
 def test_the_flight_process_dies() -> None:
     stepped = flying()
-    stepped.engagement.stop(Ending(reason="the flight process has died", is_fault=True))
+    stepped.engagement.stop(Ending(reason=because(Code.FLIGHT_PROCESS_DIED), is_fault=True))
     assert stepped.step().hand is Hand.NEUTRAL
     stepped.run(0.1)
     stepped.step(is_released=True)
@@ -361,7 +368,7 @@ def test_the_operators_release_is_a_normal_end_and_the_gate_stays() -> None:
 
 def test_a_stop_before_any_flight_ends_without_a_word_to_the_vehicle() -> None:
     stepped = Stepped()
-    stepped.engagement.stop(Ending(reason="the flight is over"))
+    stepped.engagement.stop(Ending(reason=because(Code.DURATION)))
     assert stepped.step() == NOTHING
     assert stepped.phase is Phase.ENDED
 
@@ -369,7 +376,7 @@ def test_a_stop_before_any_flight_ends_without_a_word_to_the_vehicle() -> None:
 def test_readonly_flies_whenever_it_could_and_never_asks() -> None:
     stepped = Stepped(replace(AIRBORNE, armed=False, mode="RTL"), readonly=True)
     assert {move.hand for move in stepped.run(1)} == {Hand.POLICY}
-    assert stepped.step(chunk_problem="no chunk") == NOTHING
+    assert stepped.step(chunk_problem=because(Code.NO_CHUNK)) == NOTHING
     assert stepped.step(chunk_problem=None).hand is Hand.POLICY
     assert not any(move.arm or move.mode for move in stepped.moves)
 
@@ -379,7 +386,7 @@ def test_readonly_flies_whenever_it_could_and_never_asks() -> None:
 
 def test_a_takeover_releases_at_least_once_even_if_nothing_seems_to_be_held() -> None:
     stepped = flying()
-    move = stepped.step(is_released=True, interruption="the vehicle has rebooted")
+    move = stepped.step(is_released=True, interruption=because(Code.REBOOTED))
     assert move == Move(hand=Hand.RELEASE)
     assert stepped.step() == Move()
     assert stepped.phase is Phase.RELEASED
@@ -387,14 +394,14 @@ def test_a_takeover_releases_at_least_once_even_if_nothing_seems_to_be_held() ->
 
 def test_a_takeover_in_the_very_step_of_a_fault_wins() -> None:
     stepped = flying(departure=DepartureSettings(on_fault="hold"))
-    move = stepped.step(mode="RTL", chunk_fault="no chunk", envelope_problem="too high")
+    move = stepped.step(mode="RTL", chunk_fault=because(Code.NO_CHUNK), envelope_problem="too high")
     assert move == Move(hand=Hand.RELEASE)
     assert not any(move.mode for move in stepped.run(3))
 
 
 def test_the_safe_mode_of_the_last_flight_is_the_pilots_in_the_next_one() -> None:
     stepped = flying(departure=DepartureSettings(on_fault="hold"))
-    stepped.step(chunk_fault="no chunk")
+    stepped.step(chunk_fault=because(Code.NO_CHUNK))
     stepped.run(0.2, mode="BRAKE")
     stepped.run(1.5)
     stepped.step(mode="ALT_HOLD", chunk_fault=None)
@@ -436,7 +443,7 @@ def test_an_act_while_the_last_flight_ends_is_refused_aloud(phase: str) -> None:
     if phase == "releasing":
         stepped.step(mode="RTL")
     else:
-        stepped.step(chunk_fault="no chunk")
+        stepped.step(chunk_fault=because(Code.NO_CHUNK))
         stepped.run(0.2, mode="BRAKE" if phase == "holding" else "ALT_HOLD")
     assert stepped.phase.value == phase
     stepped.step("engage")
@@ -449,7 +456,7 @@ def test_an_act_while_the_last_flight_ends_is_refused_aloud(phase: str) -> None:
 def test_a_flight_in_order_is_told_so() -> None:
     stepped = flying()
     stepped.run(1, is_landed=False)
-    stepped.engagement.stop(Ending(reason="the course is done", end="course"))
+    stepped.engagement.stop(Ending(reason=because(Code.COURSE_DONE), end="course"))
     stepped.run(1)
     expected = Outcome(flights=1, has_left_ground=True, end="course")
     assert stepped.engagement.outcome == expected
@@ -483,7 +490,7 @@ def test_each_planned_end_has_its_code_until_the_next_flight() -> None:
     stepped.run(2, is_released=True)
     stepped.step("engage")
     assert stepped.engagement.outcome.end is None
-    stepped.engagement.stop(Ending(reason="the flight was ended by a signal"))
+    stepped.engagement.stop(Ending(reason=because(Code.SIGNAL)))
     stepped.step()
     assert stepped.engagement.outcome.end == "signal"
     timed = flying(duration_ns=NS_PER_S)

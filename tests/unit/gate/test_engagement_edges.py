@@ -7,6 +7,7 @@ import pytest
 
 from helpers.gate_facts import AIRBORNE, ON_GROUND, PX4_MODES, Stepped, flying
 from mavbridge.core.clock import NS_PER_S
+from mavbridge.core.reasons import Code, because
 from mavbridge.core.vehicle import NEUTRAL
 from mavbridge.gate.departure import DepartureSettings, Ending
 from mavbridge.gate.engagement import Phase
@@ -17,7 +18,7 @@ NOTHING = Move()
 LOW, HIGH = (1500,) * 7 + (1000,), (1500,) * 7 + (2000,)
 NO_RECEIVER = replace(AIRBORNE, has_receiver=False, pilot_sticks=None)
 FAULT = {"chunk_fault": "no chunk"}
-OVER = Ending(reason="the flight is over")
+OVER = Ending(reason=because(Code.DURATION))
 
 
 def holding(**settings: Any) -> Stepped:
@@ -109,29 +110,35 @@ def test_a_switch_that_goes_low_on_the_way_out_changes_nothing() -> None:
 
 
 def test_arming_waits_for_the_link() -> None:
-    stepped = Stepped(replace(ON_GROUND, link_problem="reading the calibration"), arm=True)
+    stepped = Stepped(replace(ON_GROUND, link_problem=because(Code.READING_PARAMETERS)), arm=True)
     assert set(stepped.run(1)) == {NOTHING}
-    assert (stepped.phase, stepped.reason) == (Phase.WAITING, "reading the calibration")
+    assert (stepped.phase, stepped.codes) == (Phase.WAITING, (Code.READING_PARAMETERS,))
     stepped.step(link_problem=None)
     assert stepped.phase is Phase.PREPARING
 
 
 def test_while_it_waits_it_says_what_for() -> None:
-    stepped = Stepped(replace(AIRBORNE, link_problem="no heartbeat", chunk_problem="no image"))
-    assert stepped.reason == "not engaged"
+    stepped = Stepped(
+        replace(
+            AIRBORNE,
+            link_problem=because(Code.HEARTBEAT_LOST),
+            chunk_problem=because(Code.NO_IMAGE),
+        )
+    )
+    assert stepped.codes == (Code.NOT_ENGAGED,)
     stepped.step()
-    assert stepped.reason == "no heartbeat"
+    assert stepped.codes == (Code.HEARTBEAT_LOST,)
     stepped.step(link_problem=None)
-    assert stepped.reason == "no image"
+    assert stepped.codes == (Code.NO_IMAGE,)
     stepped.step(chunk_problem=None)
-    assert stepped.reason == "not engaged: press e, use the engage switch, or --arm"
+    assert stepped.codes == (Code.NOT_ENGAGED,)
 
 
 def test_after_a_takeover_the_reason_of_it_stays() -> None:
     stepped = flying()
     stepped.step(mode="LOITER")
-    stepped.run(0.2, is_released=True, chunk_problem="no image")
-    assert stepped.reason == "mode changed from ALT_HOLD to LOITER"
+    stepped.run(0.2, is_released=True, chunk_problem=because(Code.NO_IMAGE))
+    assert stepped.codes == (Code.MODE_CHANGED,)
 
 
 def test_arm_arms_once() -> None:
@@ -140,7 +147,7 @@ def test_arm_arms_once() -> None:
     stepped.step("release")
     stepped.run(0.1, is_released=True)
     assert stepped.phase is Phase.RELEASED
-    assert stepped.reason == "released by the operator"
+    assert stepped.codes == (Code.OPERATOR,)
     assert set(stepped.run(3, echo_confirmed=True)) == {NOTHING}
 
 
@@ -154,16 +161,18 @@ def test_a_stop_keeps_a_vehicle_from_being_armed() -> None:
 def test_the_first_stop_is_the_one_that_counts() -> None:
     stepped = flying(NO_RECEIVER, departure=DepartureSettings(on_fault="rtl", then="land"))
     stepped.engagement.stop(OVER)
-    stepped.engagement.stop(Ending(reason="the flight process has died", is_fault=True))
+    stepped.engagement.stop(Ending(reason=because(Code.FLIGHT_PROCESS_DIED), is_fault=True))
     assert stepped.step().mode == "LAND"
-    assert stepped.reason == "the flight is over"
+    assert stepped.codes == (Code.DURATION,)
 
 
 @pytest.mark.parametrize(("takeoff_m", "limit_s"), [(None, 90), (100.0, 190)])
 def test_the_way_in_may_take_90_s_and_the_time_of_a_climb_at_1_mps(
     takeoff_m: float | None, limit_s: int
 ) -> None:
-    stepped = Stepped(replace(ON_GROUND, chunk_problem="no image"), arm=True, takeoff_m=takeoff_m)
+    stepped = Stepped(
+        replace(ON_GROUND, chunk_problem=because(Code.NO_IMAGE)), arm=True, takeoff_m=takeoff_m
+    )
     stepped.run(limit_s + 0.01)
     assert stepped.phase is Phase.PREPARING
     stepped.step()
@@ -177,11 +186,11 @@ def test_the_way_in_may_take_90_s_and_the_time_of_a_climb_at_1_mps(
 def test_a_vehicle_that_is_armed_and_not_ready_in_time_is_left_as_after_a_fault() -> None:
     stepped = Stepped(ON_GROUND, arm=True, departure=DepartureSettings(on_fault="rtl", then="land"))
     stepped.run(0.1, echo_confirmed=True)
-    stepped.run(89.9, armed=True, chunk_problem="no image")
+    stepped.run(89.9, armed=True, chunk_problem=because(Code.NO_IMAGE))
     assert stepped.phase is Phase.PREPARING
     moves = stepped.run(0.2)
     assert {"RTL", None} == {move.mode for move in moves}
-    assert "inputs no image" in stepped.reason
+    assert Code.NO_IMAGE in stepped.codes
     stepped.run(3, mode="RTL", is_released=True)
     assert stepped.phase is Phase.ENDED
     assert stepped.engagement.outcome == Outcome(), "the policy never flew"
@@ -206,7 +215,7 @@ def test_a_mode_that_is_changed_once_ours_is_there_is_a_takeover_although_disarm
     stepped.run(0.1)
     stepped.step(mode="LOITER")
     assert stepped.phase is Phase.RELEASING
-    assert stepped.reason == "mode changed from ALT_HOLD to LOITER"
+    assert stepped.codes == (Code.MODE_CHANGED,)
     assert stepped.engagement.outcome == Outcome(), "no flight has ended disarmed"
 
 
@@ -217,17 +226,17 @@ def test_sticks_that_idled_on_the_ground_are_released_although_none_seems_to_be_
 
 
 def test_an_interruption_before_the_act_is_forgotten_one_after_it_is_not() -> None:
-    stepped = Stepped(replace(ON_GROUND, interruption="rebooted at 1 s"), arm=True)
+    stepped = Stepped(replace(ON_GROUND, interruption=because(Code.REBOOTED)), arm=True)
     stepped.run(0.1, echo_confirmed=True)
     assert stepped.phase is Phase.PREPARING
     stepped.step(armed=True)
     assert stepped.step().hand is Hand.POLICY
-    assert stepped.step(interruption="rebooted at 9 s") == Move(hand=Hand.RELEASE)
-    assert stepped.reason == "rebooted at 9 s"
+    assert stepped.step(interruption=because(Code.REBOOTED)) == Move(hand=Hand.RELEASE)
+    assert stepped.codes == (Code.REBOOTED,)
 
 
 def test_in_the_air_too_an_interruption_before_the_act_is_forgotten() -> None:
-    stepped = flying(replace(AIRBORNE, interruption="rebooted at 1 s"))
+    stepped = flying(replace(AIRBORNE, interruption=because(Code.REBOOTED)))
     assert {move.hand for move in stepped.run(0.1)} == {Hand.POLICY}
 
 
@@ -236,7 +245,7 @@ def test_sticks_that_were_never_ours_are_not_released() -> None:
     stepped.step()
     stepped.step("engage")
     assert stepped.step("release") == NOTHING
-    assert (stepped.phase, stepped.reason) == (Phase.RELEASED, "released by the operator")
+    assert (stepped.phase, stepped.codes) == (Phase.RELEASED, (Code.OPERATOR,))
 
 
 def test_a_pilot_who_has_armed_it_and_changes_the_mode_meanwhile_keeps_it() -> None:
@@ -244,24 +253,24 @@ def test_a_pilot_who_has_armed_it_and_changes_the_mode_meanwhile_keeps_it() -> N
     stepped.step()
     stepped.step("engage")
     assert stepped.step(mode="STABILIZE") == NOTHING
-    assert stepped.reason == "mode changed from LOITER to STABILIZE"
+    assert stepped.codes == (Code.MODE_CHANGED,)
 
 
 def test_a_stop_while_preparing_is_told_and_followed_as_what_it_is() -> None:
     stepped = Stepped(ON_GROUND, arm=True, departure=DepartureSettings(on_fault="rtl", then="land"))
     stepped.run(0.1, echo_confirmed=True)
-    stepped.step(armed=True, chunk_problem="no image")
-    stepped.engagement.stop(Ending(reason="the flight process has died", is_fault=True))
+    stepped.step(armed=True, chunk_problem=because(Code.NO_IMAGE))
+    stepped.engagement.stop(Ending(reason=because(Code.FLIGHT_PROCESS_DIED), is_fault=True))
     assert stepped.step().mode == "RTL"
-    assert stepped.reason == "the flight process has died"
+    assert stepped.codes == (Code.FLIGHT_PROCESS_DIED,)
 
 
 def test_a_reboot_while_preparing_is_told_as_one_although_it_disarms() -> None:
     stepped = Stepped(ON_GROUND, arm=True)
     stepped.run(0.1, echo_confirmed=True)
-    stepped.step(armed=True, chunk_problem="no image")
-    stepped.step(armed=False, interruption="the vehicle has rebooted")
-    assert stepped.reason == "the vehicle has rebooted"
+    stepped.step(armed=True, chunk_problem=because(Code.NO_IMAGE))
+    stepped.step(armed=False, interruption=because(Code.REBOOTED))
+    assert stepped.codes == (Code.REBOOTED,)
 
 
 # --- flying
@@ -269,7 +278,7 @@ def test_a_reboot_while_preparing_is_told_as_one_although_it_disarms() -> None:
 
 def test_while_the_policy_flies_there_is_no_reason_why_not() -> None:
     stepped = flying()
-    assert stepped.reason == ""
+    assert stepped.codes == ()
 
 
 def test_a_vehicle_that_has_landed_again_has_left_the_ground() -> None:
@@ -284,9 +293,9 @@ def test_a_signal_after_the_duration_is_over_does_not_begin_the_way_out_again() 
     stepped.run(1)
     stepped.run(0.2, mode="LAND")
     assert stepped.phase is Phase.HOLDING
-    stepped.engagement.stop(Ending(reason="the flight was ended by a signal"))
+    stepped.engagement.stop(Ending(reason=because(Code.SIGNAL)))
     assert {(move.hand, move.mode) for move in stepped.run(0.2)} == {(Hand.NEUTRAL, None)}
-    assert (stepped.phase, stepped.reason) == (Phase.HOLDING, "the flight is over")
+    assert (stepped.phase, stepped.codes) == (Phase.HOLDING, (Code.DURATION,))
 
 
 def test_each_flight_and_each_fault_counts() -> None:
@@ -324,13 +333,13 @@ def test_the_duration_goes_on_through_takeovers() -> None:
     stepped.run(0.37)
     assert stepped.phase is Phase.FLYING
     assert stepped.step().hand is Hand.NEUTRAL
-    assert stepped.reason == "the flight is over"
+    assert stepped.codes == (Code.DURATION,)
 
 
 def test_a_landing_ends_it_in_order_and_the_next_act_flies_again() -> None:
     stepped = flying(departure=DepartureSettings(on_fault="rtl", then="land"))
-    assert stepped.step(landing="the vehicle has landed").mode == "LAND"
-    assert stepped.reason == "the vehicle has landed"
+    assert stepped.step(landing=because(Code.LANDED)).mode == "LAND"
+    assert stepped.codes == (Code.LANDED,)
     assert stepped.engagement.outcome.faults == 0
     stepped.run(0.2, mode="LAND", landing=None, is_released=True)
     assert stepped.phase is Phase.RELEASED
@@ -338,10 +347,10 @@ def test_a_landing_ends_it_in_order_and_the_next_act_flies_again() -> None:
 
 def test_a_stop_after_a_fault_of_another_process_counts_as_a_fault() -> None:
     stepped = flying()
-    stepped.engagement.stop(Ending(reason="the flight process has died", is_fault=True))
+    stepped.engagement.stop(Ending(reason=because(Code.FLIGHT_PROCESS_DIED), is_fault=True))
     stepped.step()
     assert stepped.engagement.outcome.faults == 1
-    assert stepped.reason == "the flight process has died"
+    assert stepped.codes == (Code.FLIGHT_PROCESS_DIED,)
 
 
 # --- leaving, holding, releasing
@@ -370,24 +379,32 @@ def test_the_operators_release_on_the_way_out_does_not_begin_it_again() -> None:
     stepped = flying(departure=DepartureSettings(on_fault="rtl", then="land"))
     stepped.step(**FAULT)
     assert stepped.step("release").mode is None
-    assert stepped.reason == "no chunk"
+    assert stepped.codes == (Code.NO_CHUNK,)
 
 
 def test_a_vehicle_is_lost_after_30_s_without_a_word_while_held() -> None:
     stepped = holding()
-    stepped.run(40, link_problem="its radio calibration was changed")
+    stepped.run(40, link_problem=because(Code.CALIBRATION_CHANGED))
     assert stepped.phase is Phase.HOLDING, "it is heard"
     stepped.run(30.2, heard_ns=stepped.facts.now_ns)
     assert stepped.phase is Phase.HOLDING
     assert stepped.run(0.1)[-1].hand is Hand.RELEASE
-    assert stepped.reason == "no chunk; then the vehicle was lost for 30 s"
+    assert stepped.codes == (
+        Code.THEN,
+        Code.NO_CHUNK,
+        Code.VEHICLE_LOST,
+    )
 
 
 def test_who_takes_a_vehicle_that_was_just_given_up_is_told() -> None:
     stepped = holding()
-    stepped.run(29.99, link_problem="no heartbeat")
+    stepped.run(29.99, link_problem=because(Code.HEARTBEAT_LOST))
     stepped.step(mode="LOITER")
-    assert stepped.reason == "no chunk; then mode changed from BRAKE to LOITER"
+    assert stepped.codes == (
+        Code.THEN,
+        Code.NO_CHUNK,
+        Code.MODE_CHANGED,
+    )
 
 
 def test_the_mode_that_was_asked_for_and_comes_late_is_no_takeover_of_the_way_out() -> None:
@@ -402,7 +419,11 @@ def test_the_mode_that_was_asked_for_and_comes_late_is_no_takeover_of_the_way_ou
 def test_why_it_was_held_and_who_took_it_are_both_told() -> None:
     stepped = holding()
     stepped.step(mode="LOITER", link_problem=None)
-    assert stepped.reason == "no chunk; then mode changed from BRAKE to LOITER"
+    assert stepped.codes == (
+        Code.THEN,
+        Code.NO_CHUNK,
+        Code.MODE_CHANGED,
+    )
 
 
 def test_a_mode_that_was_confirmed_is_not_told_to_be_unconfirmed() -> None:
@@ -420,7 +441,7 @@ def test_a_mode_that_was_not_confirmed_is_told_once() -> None:
     stepped.step(**FAULT)
     stepped.run(3.1)
     assert stepped.phase is Phase.HOLDING
-    assert stepped.engagement.refusal == "the vehicle has not confirmed BRAKE in time"
+    assert stepped.engagement.refusal == because(Code.MODE_NOT_CONFIRMED, mode="BRAKE")
     stepped.engagement.refusal = None
     stepped.run(1)
     assert stepped.engagement.refusal is None
@@ -429,7 +450,7 @@ def test_a_mode_that_was_not_confirmed_is_told_once() -> None:
 def test_going_back_from_the_safe_mode_to_the_policys_is_a_takeover() -> None:
     stepped = holding()
     assert stepped.step(mode="ALT_HOLD") == Move(hand=Hand.RELEASE)
-    assert "mode changed from BRAKE to ALT_HOLD" in stepped.reason
+    assert Code.MODE_CHANGED in stepped.codes
 
 
 @pytest.mark.parametrize(("shows_last", "limit_s"), [(True, 1), (False, 4)])
@@ -473,16 +494,18 @@ IN_OFFBOARD = replace(AIRBORNE, mode="OFFBOARD", modes=PX4_MODES)
 
 def test_a_takeover_in_a_mode_of_setpoints_is_left_as_after_a_fault_and_told_once() -> None:
     stepped = flying(IN_OFFBOARD, **OFFBOARD)
-    move = stepped.step(interruption="another address")
+    move = stepped.step(interruption=because(Code.REPLACED, said="another address"))
     assert move == Move(hand=Hand.NEUTRAL, mode="AUTO.LAND")
-    assert (stepped.phase, stepped.reason) == (Phase.LEAVING, "another address")
+    assert (stepped.phase, stepped.codes) == (Phase.LEAVING, (Code.REPLACED,))
     assert stepped.step().hand is Hand.NEUTRAL
     assert stepped.engagement.outcome.faults == 0
 
 
 def test_in_a_mode_that_follows_no_setpoints_a_takeover_is_silence() -> None:
     stepped = flying(replace(IN_OFFBOARD, mode="POSCTL"), **{**OFFBOARD, "modes": ("POSCTL",)})
-    assert stepped.step(interruption="another address") == Move(hand=Hand.RELEASE)
+    assert stepped.step(interruption=because(Code.REPLACED, said="another address")) == Move(
+        hand=Hand.RELEASE
+    )
 
 
 def test_an_act_in_a_mode_of_setpoints_that_is_late_is_left_as_after_a_fault() -> None:
@@ -490,7 +513,7 @@ def test_an_act_in_a_mode_of_setpoints_that_is_late_is_left_as_after_a_fault() -
     stepped.step()
     stepped.step("engage")
     stepped.run(0.2)
-    stepped.step(mode="OFFBOARD", chunk_problem="no image")
+    stepped.step(mode="OFFBOARD", chunk_problem=because(Code.NO_IMAGE))
     stepped.run(3)
     assert "AUTO.LAND" in {move.mode for move in stepped.moves}
     assert "AUTO.RTL" not in {move.mode for move in stepped.moves}
@@ -512,9 +535,9 @@ def test_watching_ends_as_a_flight_does(ends: str) -> None:
 
 
 def test_watching_tells_why_the_policy_could_not_fly() -> None:
-    stepped = Stepped(replace(AIRBORNE, chunk_problem="no image"), readonly=True)
+    stepped = Stepped(replace(AIRBORNE, chunk_problem=because(Code.NO_IMAGE)), readonly=True)
     stepped.step()
-    assert (stepped.phase, stepped.reason) == (Phase.WAITING, "no image")
+    assert (stepped.phase, stepped.codes) == (Phase.WAITING, (Code.NO_IMAGE,))
     stepped.run(0.1, chunk_problem=None)
-    assert (stepped.phase, stepped.reason) == (Phase.FLYING, "")
+    assert (stepped.phase, stepped.codes) == (Phase.FLYING, ())
     assert stepped.engagement.outcome.flights == 1

@@ -9,6 +9,7 @@ import pytest
 from helpers.fakes import AIRBORNE_STATUS, FOREVER_NS, START_NS
 from helpers.gate_facts import COPTER_MODES, PX4_MODES, engagement_settings, stick_smoothing
 from mavbridge.core.clock import NS_PER_MS
+from mavbridge.core.reasons import Code, because
 from mavbridge.core.vehicle import (
     IDLE,
     NEUTRAL,
@@ -247,7 +248,7 @@ def test_a_chunk_that_is_not_taken_is_not_news() -> None:
 
 def test_a_computer_that_stood_still_is_told_as_that() -> None:
     gate = Stepped().engaged()
-    assert gate.step(30 + 131).reason.endswith("the computer stood still for 131 ms")
+    assert str(gate.step(30 + 131).reason).endswith("the computer stood still for 131 ms")
 
 
 def test_slots_that_a_stall_has_missed_are_counted_and_not_made_up_for() -> None:
@@ -265,7 +266,7 @@ def test_a_gate_that_stood_still_beyond_the_grace_does_not_fly_on_with_a_fresh_c
     gate = Stepped().engaged()
     late = gate.step(30 + 2000, gate.chunk(30 + 2000))
     assert late.decision == Command(action=NEUTRAL)
-    assert late.reason.endswith("the gate stood still for 2000 ms")
+    assert str(late.reason).endswith("the gate stood still for 2000 ms")
     assert gate.step(2040, gate.chunk(2040)).decision in (Command(action=NEUTRAL), None)
 
 
@@ -285,7 +286,7 @@ def test_a_stall_of_the_flight_process_is_flown_through_and_a_silent_vehicle_is_
             if gate.gate.phase is not Phase.FLYING:
                 break
             assert output.is_coasting == (at_ms > 50)
-        assert ("delivered no attitude" in output.reason) == (heard_until_ms < 230)
+        assert ("delivered no attitude" in str(output.reason)) == (heard_until_ms < 230)
         return at_ms - 10
 
     assert flies_until_ms(1000) == 330, "300 ms after its last chunk"
@@ -345,7 +346,7 @@ def test_each_word_of_link_and_vehicle_counts(
 
 def test_a_refused_mode_is_known() -> None:
     gate = Stepped(status={"has_receiver": False}).engaged()
-    assert gate.step(31, stop=Ending(reason="dead", is_fault=True)).mode == "BRAKE"
+    assert gate.step(31, stop=Ending(reason=because(Code.GATE_DIED), is_fault=True)).mode == "BRAKE"
     gate.link = {"refused_mode": "BRAKE"}
     assert gate.step(140).mode == "LAND"
 
@@ -373,7 +374,7 @@ def test_the_envelope_ends_a_flight_as_a_fault() -> None:
     for at_ms in range(40, 740, 10):
         gate.step(at_ms, gate.chunk(at_ms), battery_problem="the battery is at 8 %")
     assert gate.gate.outcome.faults == 1
-    assert "the battery is at 8 %" in [output.reason for output in gate.outputs]
+    assert because(Code.BATTERY, said="the battery is at 8 %") in [o.reason for o in gate.outputs]
 
 
 def test_a_policy_that_is_too_slow_is_not_armed_for() -> None:
@@ -572,7 +573,7 @@ def test_a_landing_counts_from_the_beginning_of_each_flight() -> None:
     for at_ms in range(50, 800, 10):
         gate.step(at_ms, gate.chunk(at_ms), is_landed=True)
     assert gate.outputs[-1].phase is Phase.RELEASED
-    assert gate.outputs[-1].reason == "the vehicle has landed"
+    assert gate.outputs[-1].reason == because(Code.LANDED)
     gate.engaged(at_ms=830)  # still armed, on the ground
     for at_ms in range(840, 1600, 10):
         gate.step(at_ms, gate.chunk(at_ms))
@@ -600,13 +601,13 @@ def test_absence_is_the_reason_for_not_flying() -> None:
     gate = Stepped()
     link = LinkSnapshot(telemetry=Telemetry(), status=gate.status, problem=None)
     output = gate.gate.step(START_NS, GateInput(link=link, absence="no image feature yet"))
-    assert output.reason == "no image feature yet"
+    assert output.reason == because(Code.NO_IMAGE)
 
 
 def test_why_a_chunk_was_not_taken_is_told_until_the_next_one() -> None:
     gate = Stepped()
     gate.step(0, gate.chunk(0)._replace(image_ns=START_NS - 400 * MS))
-    assert gate.step(5).reason == "the image is 400 ms old, beyond 300 ms"
+    assert codes(gate.step(5).reason) == (Code.TOO_OLD,)
 
 
 def test_the_first_arming_engages_where_that_was_asked_for() -> None:
@@ -621,8 +622,8 @@ def test_without_a_vehicle_it_waits_and_can_be_ended() -> None:
     link = LinkSnapshot(telemetry=Telemetry(), status=None, problem="waiting for a heartbeat")
     waiting = gate.step(START_NS, GateInput(link=link, act="engage"))
     assert (waiting.phase, waiting.decision) == (Phase.WAITING, None)
-    assert waiting.reason == "waiting for a heartbeat"
-    ended = gate.step(START_NS + MS, GateInput(link=link, stop=Ending(reason="enough")))
+    assert waiting.reason == because(Code.NO_HEARTBEAT)
+    ended = gate.step(START_NS + MS, GateInput(link=link, stop=Ending(reason=because(Code.SIGNAL))))
     assert (ended.phase, ended.decision) == (Phase.ENDED, None)
     assert gate.failure is None
 
@@ -705,7 +706,7 @@ def test_a_chunk_of_another_kind_of_action_is_not_flown() -> None:
     for k in range(6, 12):
         gate.step(10 * k, gate.chunk(10 * k, BodyRates(0.5, 1.0, 0.0, 0.0)))
     assert gate.gate.phase is Phase.LEAVING
-    assert "unusable chunks" in gate.outputs[-1].reason
+    assert Code.UNUSABLE_CHUNKS in codes(gate.outputs[-1].reason)
 
 
 def test_neutral_velocities_on_the_way_in_are_not_those_of_an_earlier_flight() -> None:

@@ -10,6 +10,7 @@ from helpers.fakes import FOREVER_NS, START_NS, FakeClock, FakeLink
 from helpers.gate_facts import engagement_settings, stick_smoothing
 from mavbridge.core.clock import NS_PER_MS, NS_PER_S
 from mavbridge.core.errors import UserError
+from mavbridge.core.reasons import Code, because
 from mavbridge.core.vehicle import (
     IDLE,
     NEUTRAL,
@@ -214,7 +215,7 @@ def test_a_change_of_phase_is_told_even_where_nothing_is_sent() -> None:
     assert not rig.ticks[-1].is_slot
     phases = list(dict.fromkeys(tick.phase for tick in rig.ticks))
     assert phases == [Phase.WAITING, Phase.FLYING, Phase.RELEASING, Phase.RELEASED]
-    assert rig.ticks[-1].reason == "mode changed from ALT_HOLD to LOITER"
+    assert rig.ticks[-1].reason == because(Code.MODE_CHANGED, before="ALT_HOLD", after="LOITER")
 
 
 def test_packets_are_not_passed_on_before_somebody_reads_them() -> None:
@@ -235,7 +236,7 @@ def test_packets_are_not_passed_on_before_somebody_reads_them() -> None:
 
 def test_before_a_policy_is_loaded_the_link_is_served_all_the_same() -> None:
     rig = Rig()
-    rig.tell("engage", rig.chunk(), Absence("loading"))
+    rig.tell("engage", rig.chunk(), Absence(because(Code.NO_IMAGE)))
     first_ns = rig.loop.step()
     assert first_ns == START_NS + IDLE_PERIOD_NS
     rig.run(0.1)
@@ -284,19 +285,22 @@ def test_an_act_that_has_no_effect_is_answered() -> None:
 def test_why_there_is_no_chunk_is_passed_on_to_the_user() -> None:
     rig = Rig()
     rig.solves = False
-    rig.tell(FLIGHT, Absence("the image has been black for 0.6 s"))
+    rig.tell(FLIGHT, Absence(because(Code.IMAGE_BLANK, what="black", age_s=0.6)))
     rig.run(0.1)
-    assert rig.ticks[-1].reason == "the image has been black for 0.6 s"
+    assert rig.ticks[-1].reason == because(Code.IMAGE_BLANK, what="black", age_s=0.6)
 
 
 def test_a_chunk_is_the_end_of_the_reason_for_there_being_none() -> None:
     rig = Rig().flying()
     rig.solves = False
-    rig.tell(Absence("the image was black"), rig.chunk())
+    rig.tell(Absence(because(Code.IMAGE_BLANK, what="black", age_s=0.6)), rig.chunk())
     rig.run(0.2)
     assert rig.ticks[-1].phase is not Phase.FLYING
-    assert "chunk 110 ms old (limit 100 ms)" in rig.ticks[-1].reason
-    assert "black" not in rig.ticks[-1].reason
+    reason = rig.ticks[-1].reason
+    assert reason is not None
+    assert reason.codes == (Code.LATE,)
+    assert dict(reason.data)["age_ms"] == 110
+    assert dict(reason.data)["limit_ms"] == 100
 
 
 def test_a_message_that_is_none_is_an_error() -> None:
@@ -313,7 +317,7 @@ def test_sticks_leave_before_requests_and_other_work() -> None:
     rig = Rig(has_receiver=False).flying()
     services, requests = rig.link.services, []
     rig.link.on_send = lambda: requests.append((rig.link.services, list(rig.link.requests)))
-    rig.tell(Ending(reason="enough"))
+    rig.tell(Ending(reason=because(Code.SIGNAL)))
     rig.loop.step()
     assert requests == [(services, [])]
     assert rig.link.requests == ["mode LAND"]
@@ -336,7 +340,7 @@ def test_the_link_is_engaged_while_we_hold_the_sticks_or_give_them_back() -> Non
 
 def test_every_ground_station_is_told_who_holds_the_sticks() -> None:
     rig = Rig(has_receiver=False).flying()
-    rig.tell(Ending(reason="the policy has failed", is_fault=True))
+    rig.tell(Ending(reason=because(Code.POLICY_FAILED), is_fault=True))
     rig.run(0.5)
     assert rig.ticks[-1].phase is Phase.HOLDING
     assert rig.link.is_engaged
@@ -421,9 +425,9 @@ def test_a_command_that_fails_ends_the_flight_in_order_and_not_the_gate(error: E
     assert rig.link.requests == ["mode BRAKE"]
     rig.run(1.0)
     assert rig.ticks[-1].phase is Phase.RELEASED
-    assert type(error).__name__ in rig.ticks[-1].reason
+    assert type(error).__name__ in str(rig.ticks[-1].reason)
     assert rig.loop.outcome.faults == 1
-    rig.loop.stop(Ending(reason="over"))
+    rig.loop.stop(Ending(reason=because(Code.DURATION)))
     rig.run(0.1)
     assert rig.loop.is_done
     assert rig.link.restores
@@ -464,7 +468,7 @@ def test_a_mode_that_cannot_be_asked_for_does_not_end_the_gate() -> None:
         raise UserError(f"no mode {mode}")
 
     rig.link.set_mode = refuse  # type: ignore[method-assign]
-    rig.loop.stop(Ending(reason="over", is_fault=True))
+    rig.loop.stop(Ending(reason=because(Code.DURATION), is_fault=True))
     rig.run(6.0)
     assert rig.link.hands[-1] == Command(action=NEUTRAL)  # over an idle receiver
     assert rig.ticks[-1].phase is Phase.HOLDING
@@ -490,8 +494,8 @@ def test_a_chunk_that_has_come_with_the_end_of_the_channel_does_not_fly() -> Non
 
 def test_the_first_reason_to_end_is_the_one_that_counts() -> None:
     rig = Rig().flying()
-    rig.loop.stop(Ending(reason="the gate was told to end"))
-    rig.tell(Ending(reason="the policy has failed", is_fault=True))
+    rig.loop.stop(Ending(reason=because(Code.TOLD_TO_END)))
+    rig.tell(Ending(reason=because(Code.POLICY_FAILED), is_fault=True))
     rig.run(1.0)
     assert rig.link.hands[-1] == Release("the gate was told to end")
     assert rig.loop.is_done
@@ -506,7 +510,7 @@ def test_parameters_are_put_back_at_the_end_for_a_bounded_time(
     rig.link.is_restored = False
     rig.run(0.1)
     assert rig.link.restores == 0
-    rig.tell(Ending(reason="enough"))
+    rig.tell(Ending(reason=because(Code.SIGNAL)))
     stopped_ns = rig.clock.now_ns()
     services = rig.link.services
     rig.run(min(seconds, 1.0))
@@ -523,7 +527,7 @@ def test_parameters_are_put_back_at_the_end_for_a_bounded_time(
 def test_what_the_link_says_about_putting_back_is_still_passed_on() -> None:
     rig = Rig(first=[FLIGHT])
     rig.run(0.1)
-    rig.tell(Ending(reason="enough"))
+    rig.tell(Ending(reason=because(Code.SIGNAL)))
     restore = rig.link.begin_restore
 
     def begin_restore() -> None:

@@ -5,6 +5,7 @@ from dataclasses import replace
 import pytest
 
 from helpers.gate_facts import AIRBORNE, COPTER_MODES, ON_GROUND, PX4_MODES, Stepped, flying
+from mavbridge.core.reasons import Code, because
 from mavbridge.core.vehicle import OnFault
 from mavbridge.gate.departure import DepartureSettings
 from mavbridge.gate.engagement import Phase
@@ -33,7 +34,7 @@ def test_the_autopilot_takes_off_before_sticks_fly() -> None:
     assert requests(climbing) == ["climb 8"] * 2
     assert {move.hand for move in climbing} == {Hand.NEUTRAL}
     assert requests(stepped.run(2.0, is_landed=False, height_m=4.0)) == []
-    assert stepped.reason == "taking off to 8 m"
+    assert stepped.codes == (Code.TAKING_OFF,)
     assert requests(stepped.run(0.5, height_m=7.3)) == ["mode ALT_HOLD"]
     stepped.step(mode="ALT_HOLD")
     assert stepped.phase is Phase.FLYING
@@ -43,15 +44,15 @@ def test_the_height_counts_from_the_place_of_arming() -> None:
     stepped = Stepped(replace(GROUND, mode="GUIDED", height_m=-3.0), arm=True, takeoff_m=8.0)
     stepped.run(0.1)
     stepped.run(0.1, armed=True, is_landed=False, height_m=4.0)
-    assert stepped.reason == "taking off to 8 m"
+    assert stepped.codes == (Code.TAKING_OFF,)
     stepped.run(1.1, height_m=4.3)
-    assert stepped.reason == "waiting for ALT_HOLD"
+    assert stepped.codes == (Code.WAITING_FOR_MODE,)
 
 
 def test_a_takeoff_waits_for_a_position() -> None:
     stepped = Stepped(replace(GROUND, height_m=None), arm=True, takeoff_m=8.0)
     stepped.run(0.1)
-    assert "waiting for a position" in stepped.reason
+    assert Code.TAKEOFF_NEEDS_POSITION in stepped.codes
 
 
 def test_setpoints_would_end_a_takeoff_so_none_is_sent() -> None:
@@ -151,7 +152,10 @@ def entering_offboard() -> Stepped:
     stepped.step("engage")
     stepped.run(0.12)
     assert "OFFBOARD" in [move.mode for move in stepped.moves]
-    stepped.step(mode="OFFBOARD", chunk_problem="the chunk is old")
+    stepped.step(
+        mode="OFFBOARD",
+        chunk_problem=because(Code.TOO_OLD, quantity="chunk", age_ms=300.0, limit_ms=100.0),
+    )
     assert stepped.phase is Phase.PREPARING
     return stepped
 
@@ -168,7 +172,7 @@ def test_a_mode_of_setpoints_that_we_have_entered_is_left_again(is_late: bool) -
     stepped = entering_offboard()
     if is_late:
         stepped.run(3.0)
-        assert "not engaged" in stepped.reason
+        assert Code.NOT_ENGAGED_SINCE in stepped.codes
     else:
         stepped.step("release")
     assert stepped.phase is Phase.LEAVING
@@ -203,7 +207,14 @@ def test_neutral_goes_on_in_a_climb_whose_echo_is_lost() -> None:
     """Without a receiver silence would be its radio failsafe; on the ground nothing is sent."""
     stepped = Stepped(replace(GROUND, mode="GUIDED", has_receiver=False), arm=True, takeoff_m=8.0)
     stepped.run(0.1)
-    assert {move.hand for move in stepped.run(0.1, link_problem="no RC_CHANNELS arrive")} == {None}
+    assert {
+        move.hand
+        for move in stepped.run(
+            0.1, link_problem=because(Code.NO_ECHO, message="RC_CHANNELS", quantity="sticks")
+        )
+    } == {None}
     stepped.run(1.0, armed=True, is_landed=False, height_m=2.0, link_problem=None)
-    moves = stepped.run(1.0, link_problem="no RC_CHANNELS arrive")
+    moves = stepped.run(
+        1.0, link_problem=because(Code.NO_ECHO, message="RC_CHANNELS", quantity="sticks")
+    )
     assert {move.hand for move in moves} == {Hand.NEUTRAL}

@@ -5,6 +5,7 @@ from typing import Any
 
 from helpers.gate_facts import AIRBORNE, COPTER_MODES, ON_GROUND, PX4_MODES
 from mavbridge.core.clock import NS_PER_S
+from mavbridge.core.reasons import Code, because
 from mavbridge.gate.facts import Facts, Hand
 from mavbridge.gate.preparation import FLOW_NS, Preparation, PreparationSettings
 
@@ -46,7 +47,15 @@ def test_one_that_we_armed_is_idle_until_the_policy_takes_it() -> None:
     move, waits_for = preparation.step(ready, None)
     assert (move.hand, waits_for) == (Hand.IDLE, "")
     # Silence while the link has a problem: it stands on the ground.
-    assert preparation.step(replace(ready, link_problem="no RC_CHANNELS"), None).move.hand is None
+    assert (
+        preparation.step(
+            replace(
+                ready, link_problem=because(Code.NO_ECHO, message="RC_CHANNELS", quantity="sticks")
+            ),
+            None,
+        ).move.hand
+        is None
+    )
 
 
 def test_which_mode_is_wanted() -> None:
@@ -71,7 +80,12 @@ def test_the_modes_of_a_takeoff_are_our_own_only_if_we_take_off() -> None:
 def test_one_that_is_found_in_the_air_does_not_take_off() -> None:
     preparation = begun(AIRBORNE, takeoff_m=8.0)
     assert not preparation.is_taking_off
-    move = preparation.step(replace(AIRBORNE, link_problem="no RC_CHANNELS"), None).move
+    move = preparation.step(
+        replace(
+            AIRBORNE, link_problem=because(Code.NO_ECHO, message="RC_CHANNELS", quantity="sticks")
+        ),
+        None,
+    ).move
     assert (move.hand, move.takeoff_m) == (None, None)
 
 
@@ -151,5 +165,8 @@ def test_no_setpoint_flows_in_a_climb_even_where_the_mode_would_take_it() -> Non
     preparation = begun(GROUND, takeoff_m=10.0, is_setpoint=True, modes=("OFFBOARD",))
     climbing = replace(GROUND, armed=True, mode="OFFBOARD", modes=PX4_MODES)
     assert preparation.step(climbing, None).move.hand is None
-    without_link = replace(climbing, link_problem="no ATTITUDE_TARGET")
+    without_link = replace(
+        climbing,
+        link_problem=because(Code.NO_ECHO, message="ATTITUDE_TARGET", quantity="setpoints"),
+    )
     assert preparation.step(without_link, None).move.hand is None

@@ -10,6 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from helpers.gate_facts import engagement_settings, stick_smoothing
+from mavbridge.core.reasons import Code, because
 from mavbridge.core.vehicle import (
     ActionMeaning,
     ActionTrace,
@@ -78,7 +79,7 @@ TICK = GateTick(
     trace=ActionTrace(raw=STICKS, clipped=STICKS, slewed=STICKS, smoothed=STICKS),
     sent=STICKS,
     phase=Phase.FLYING,
-    reason="",
+    reason=None,
 )
 STATUS = GateStatus("ArduPilot 4.6.3", "ALT_HOLD", True, False, (1500,) * 8, STICKS, True)
 STATS = LinkStats(
@@ -102,10 +103,10 @@ SUMMARY = GateSummary(
 TO_GATE: list[ToGate] = [
     CHUNK,
     CHUNK._replace(actions=()),
-    Absence("no image feature yet: größer als 300 ms"),
+    Absence(because(Code.OF_CAMERA, camera="größer", why=because(Code.NO_IMAGE))),
     GateSettings(link=LinkSettings(connect="udp:127.0.0.1:14550"), tlog_fd=9, cpu=1),
     FLIGHT,
-    Ending(reason="the policy has hung", is_fault=True),
+    Ending(reason=because(Code.HANGS, name="policy", idle_s=2.0), is_fault=True),
     "engage",
     "release",
 ]
@@ -113,7 +114,10 @@ FROM_GATE: list[FromGate] = [
     TICK,
     replace(TICK, trace=None, sent=None, chunk_serial=None, is_slot=False, is_coasting=True),
     replace(TICK, chunk_serial=0, sent=None),
-    *(replace(TICK, phase=phase, reason=f"weil es {phase.value} heißt") for phase in Phase),
+    *(
+        replace(TICK, phase=phase, reason=because(Code.STILL_ENDING, phase=phase.value))
+        for phase in Phase
+    ),
     (),
     (ForwardedPacket(1, 2, b"\xfd" * 280), ForwardedPacket(3, 3, b""), ForwardedPacket(4, 1, b"P")),
     STATUS,
@@ -183,7 +187,7 @@ def test_any_chunk_arrives_bit_by_bit(seven: tuple[int, ...], actions: list[Stic
         | st.builds(ActionTrace, raw=sticks, clipped=sticks, slewed=sticks, smoothed=sticks),
         sent=st.none() | sticks,
         phase=st.sampled_from(Phase),
-        reason=st.text(st.characters(codec="utf-8"), max_size=50),
+        reason=st.none() | st.sampled_from(Code).map(because),
     )
 )
 def test_any_tick_arrives_bit_by_bit(tick: GateTick) -> None:

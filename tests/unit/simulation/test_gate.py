@@ -5,6 +5,7 @@ from typing import Any
 
 from helpers.fakes import START_NS
 from mavbridge.core.clock import NS_PER_MS
+from mavbridge.core.reasons import Code, because
 from mavbridge.gate.wire import Absence, GateMessage, decode_to_gate, encode_from_gate
 from mavbridge.simulation.clock import AheadClock, SteppedClock
 from mavbridge.simulation.gate import GateStepper, MemoryPort, PolicyStepper, sender
@@ -89,9 +90,9 @@ def test_a_message_leaves_when_its_maker_is_done_and_arrives_a_hop_later() -> No
     port = MemoryPort(outgoing=to_gate, incoming=DelayedChannel(world, repeat(0)))
     gate = MemoryPort(outgoing=DelayedChannel(world, repeat(0)), incoming=to_gate)
     clock.ahead_ns = 3 * MS
-    sender(world, clock, port)(Absence("no image feature yet"))
+    sender(world, clock, port)(Absence(because(Code.NO_IMAGE)))
     clock.ahead_ns = 0
     world.sleep_until_ns(START_NS + 3 * MS + MS // 10 - 1)
     assert gate.receive() == []
     world.sleep_until_ns(START_NS + 3 * MS + MS // 10)
-    assert [decode_to_gate(one) for one in gate.receive()] == [Absence("no image feature yet")]
+    assert [decode_to_gate(one) for one in gate.receive()] == [Absence(because(Code.NO_IMAGE))]

@@ -5,6 +5,7 @@ from collections.abc import Callable, Iterator, Mapping
 
 from mavbridge.core.address import serial_baud
 from mavbridge.core.clock import NS_PER_S
+from mavbridge.core.reasons import Code, Reason, because
 from mavbridge.core.vehicle import Output, VehicleStatus
 from mavbridge.mavlink.codec.calibration import RcCalibration
 from mavbridge.mavlink.codec.messages import CommandRequest, ParamRequest, ParamValue, ParamWrite
@@ -71,7 +72,7 @@ class VehicleParams:
         """Every parameter has come or was given up."""
         self.calibration: RcCalibration | None = None
         """The calibration to fly with; None before it is read, or if it cannot be used."""
-        self.interruption: str | None = None
+        self.interruption: Reason | None = None
         """A change in flight that ends every engagement so far, or None; stays once set."""
 
     @property
@@ -114,8 +115,8 @@ class VehicleParams:
         if not is_armed or old is None or before is None:
             return
         if after.endangers(before[1], accepted=self._config.accepted_risks):
-            self.interruption = (
-                f"{param.name} was changed from {old:g} to {param.value:g} in flight"
+            self.interruption = because(
+                Code.PARAMETER_CHANGED, name=param.name, before=old, after=param.value
             )
 
     def absent(self, name: str) -> None:
@@ -212,11 +213,14 @@ class VehicleParams:
             yield Danger("slow-serial", self._serial)
         yield from assessment.dangers
 
-    def problem(self) -> str | None:
+    def problem(self) -> Reason | None:
         """Why nothing may begin yet, whatever the output, or None."""
-        return self._changes.problem() if self.is_read else "reading the vehicle's parameters"
+        if not self.is_read:
+            return because(Code.READING_PARAMETERS)
+        said = self._changes.problem()
+        return None if said is None else because(Code.PARAMETERS, said=said)
 
-    def output_problem(self, status: VehicleStatus | None) -> str | None:
+    def output_problem(self, status: VehicleStatus | None) -> Reason | None:
         """Why a flight with the output may not begin or go on with these parameters, or None."""
         if not self.is_read or self._output is None:
             return None
@@ -228,14 +232,15 @@ class VehicleParams:
                 if is_sticks
                 else "not fly by our setpoints"
             )
-            return f"the vehicle would {what}: {'; '.join(assessment.obstacles)}"
+            return because(Code.OBSTACLE, what=what, causes="; ".join(assessment.obstacles))
         if assessment.unusable is not None:
-            return assessment.unusable
+            return because(Code.PARAMETERS, said=assessment.unusable)
         if self._output == "rc-override" and assessment.calibration != self.calibration:
-            return "the vehicle's radio calibration was changed in flight: disarm to take it in"
-        accepted = self._config.accepted_risks
-        dangers = self._dangers(assessment)
-        return next((d.refusal for d in dangers if d.risk not in accepted), None)
+            return because(Code.CALIBRATION_CHANGED)
+        for danger in self._dangers(assessment):
+            if danger.risk not in self._config.accepted_risks:
+                return because(Code.RISK, risk=danger.risk, said=danger.refusal)
+        return None
 
     def _current(self, status: VehicleStatus | None) -> Assessment:
         """The assessment for the present output and receiver."""

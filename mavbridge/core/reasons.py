@@ -1,0 +1,405 @@
+"""Reasons as values: why the policy does not fly, lost the sticks, or a flight ended.
+
+Code decides, records and tests by ``Reason.code``. Only people read the sentence, ``str(reason)``.
+"""
+
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from enum import Enum, StrEnum, auto
+from typing import TypeAlias
+
+Value: TypeAlias = "str | int | float | bool | Reason"
+
+
+class Kind(Enum):
+    """Whose doing it is."""
+
+    WAITING = "waiting"
+    """Nobody's: something has not come yet, or was not asked for."""
+    PILOT = "pilot"
+    """The pilot's, or an operator's: an explicit act."""
+    VEHICLE = "vehicle"
+    """The autopilot's, or its link's."""
+    FAULT = "fault"
+    """Ours: the policy, its inputs, this computer."""
+    END = "end"
+    """A planned end."""
+
+
+class Code(StrEnum):
+    """One for each reason; ``_REASONS`` has its kind and its sentence."""
+
+    # Before a flight
+    NOT_ENGAGED = auto()
+    NOT_ENGAGED_SINCE = auto()
+    STILL_ENDING = auto()
+    SWITCH_NOT_RESTED = auto()
+    NOT_ARMED = auto()
+    WRONG_MODE = auto()
+    FIRST_CHUNK = auto()
+    TAKEOFF_NEEDS_POSITION = auto()
+    TAKING_OFF = auto()
+    WAITING_FOR_MODE = auto()
+    WAITING_FOR_ARMING = auto()
+    NO_SUCH_MODE = auto()
+    NO_CHUNK_SINCE_RESET = auto()
+    NOT_READY = auto()
+    # Somebody else has the sticks
+    OPERATOR = auto()
+    ENGAGE_SWITCH_OFF = auto()
+    OVERRIDE_SWITCH_OFF = auto()
+    MODE_CHANGED = auto()
+    DISARMED = auto()
+    FAILSAFE = auto()
+    OVERRULED = auto()
+    REBOOTED = auto()
+    REPLACED = auto()
+    PARAMETER_CHANGED = auto()
+    # Planned ends
+    DURATION = auto()
+    SIGNAL = auto()
+    COURSE_DONE = auto()
+    LANDED = auto()
+    TOLD_TO_END = auto()
+    FINISHED = auto()
+    PILOT_FLIES = auto()
+    # The way out of a flight
+    THEN = auto()
+    VEHICLE_LOST = auto()
+    MODE_NOT_CONFIRMED = auto()
+    RELEASE_NOT_SEEN = auto()
+    NOT_RELEASED = auto()
+    NO_RECEIVER = auto()
+    RECEIVER_LOST = auto()
+    SILENCE_IS_FAILSAFE = auto()
+    THROTTLE_IS_THRUST = auto()
+    THROTTLE_UNKNOWN = auto()
+    THROTTLE_RESTS = auto()
+    # The link and the vehicle
+    NO_POLICY_LOADED = auto()
+    CONNECTION_LOST = auto()
+    NO_HEARTBEAT = auto()
+    HEARTBEAT_LOST = auto()
+    PACKETS_REFUSED = auto()
+    UNHEARD = auto()
+    NO_ECHO = auto()
+    LATE_SENDING = auto()
+    READING_PARAMETERS = auto()
+    REQUESTING_TELEMETRY = auto()
+    LOOKING_FOR_RECEIVER = auto()
+    PARAMETERS = auto()
+    OBSTACLE = auto()
+    CALIBRATION_CHANGED = auto()
+    RISK = auto()
+    OVERRIDE_SWITCH_NOT_ON = auto()
+    WITH_HINT = auto()
+    SLOW_CLOCK = auto()
+    # The envelope
+    BEYOND = auto()
+    ESTIMATOR_LOST = auto()
+    BATTERY = auto()
+    # The policy, its inputs and this computer
+    LATE = auto()
+    PAST_HORIZON = auto()
+    TOO_OLD = auto()
+    AFTER_HORIZON = auto()
+    HORIZON_TOO_SHORT = auto()
+    TOO_SLOW = auto()
+    CHUNKS_APART = auto()
+    NO_CHUNK = auto()
+    NOT_RECORDED = auto()
+    JUST_BEGUN = auto()
+    EMPTY_CHUNK = auto()
+    WRONG_KIND = auto()
+    NOT_FINITE = auto()
+    WRONG_SHAPE = auto()
+    UNUSABLE_CHUNKS = auto()
+    POLICY_REFUSED = auto()
+    NO_READING = auto()
+    NO_TRUSTED_READING = auto()
+    READING_AHEAD = auto()
+    ATTITUDE_FROZEN = auto()
+    NO_IMAGE = auto()
+    IMAGE_AHEAD = auto()
+    IMAGE_FROZEN = auto()
+    IMAGE_BLANK = auto()
+    OF_CAMERA = auto()
+    COMMAND_FAILED = auto()
+    CAMERA_FAILED = auto()
+    POLICY_FAILED = auto()
+    HANGS = auto()
+    GATE_DIED = auto()
+    FLIGHT_PROCESS_DIED = auto()
+
+
+_WAITING, _PILOT, _VEHICLE, _FAULT, _END = Kind
+_REASONS: dict[Code, tuple[Kind, str]] = {
+    Code.NOT_ENGAGED: (_WAITING, "not engaged: press e, use the engage switch, or --arm"),
+    Code.NOT_ENGAGED_SINCE: (_WAITING, "not engaged: {why}"),
+    Code.STILL_ENDING: (_WAITING, "the last flight is still ending ({phase})"),
+    Code.SWITCH_NOT_RESTED: (
+        _WAITING,
+        "the engage switch (channel {channel}) did not rest low for {rest_s:g} s with a receiver "
+        "that works: leave it low for 2 s, then switch it on",
+    ),
+    Code.NOT_ARMED: (_WAITING, "the vehicle is disarmed; arm it first, or use --arm"),
+    Code.WRONG_MODE: (
+        _WAITING,
+        "the policy may not fly in {mode}, only in {allowed}: change the mode, or use --mode",
+    ),
+    Code.FIRST_CHUNK: (_WAITING, "waiting for the policy's first chunk after its reset"),
+    Code.TAKEOFF_NEEDS_POSITION: (
+        _WAITING,
+        "waiting for a position: the autopilot's own takeoff needs one",
+    ),
+    Code.TAKING_OFF: (_WAITING, "taking off to {height_m:g} m"),
+    Code.WAITING_FOR_MODE: (_WAITING, "waiting for {mode}"),
+    Code.WAITING_FOR_ARMING: (_WAITING, "waiting for the vehicle to arm"),
+    Code.NO_SUCH_MODE: (_VEHICLE, "this vehicle has no mode {mode}, it has {modes}"),
+    Code.NO_CHUNK_SINCE_RESET: (
+        _FAULT,
+        "the policy has not returned a chunk that may be flown since its reset: {why}",
+    ),
+    Code.NOT_READY: (
+        _VEHICLE,
+        "the vehicle is not ready after {after_s:.0f} s (mode {mode}, armed {is_armed}, overrides "
+        "seen {is_echoed}, inputs {inputs}): see its messages above",
+    ),
+    Code.OPERATOR: (_PILOT, "released by the operator"),
+    Code.ENGAGE_SWITCH_OFF: (_PILOT, "the pilot's engage switch (channel {channel}) is off"),
+    Code.OVERRIDE_SWITCH_OFF: (_PILOT, "the pilot's override switch is off"),
+    Code.MODE_CHANGED: (_PILOT, "mode changed from {before} to {after}"),
+    Code.DISARMED: (_VEHICLE, "the vehicle has been disarmed"),
+    Code.FAILSAFE: (_VEHICLE, "a failsafe of the vehicle is active (mode {mode})"),
+    Code.OVERRULED: (_PILOT, "the vehicle ignores our {quantity}: {cause}"),
+    Code.REBOOTED: (_VEHICLE, "the vehicle has rebooted: its session starts over"),
+    Code.REPLACED: (_VEHICLE, "{said}"),
+    Code.PARAMETER_CHANGED: (
+        _PILOT,
+        "{name} was changed from {before:g} to {after:g} in flight",
+    ),
+    Code.DURATION: (_END, "the flight is over"),
+    Code.SIGNAL: (_END, "the flight was ended by a signal"),
+    Code.COURSE_DONE: (_END, "the course is done"),
+    Code.LANDED: (_END, "the vehicle has landed"),
+    Code.TOLD_TO_END: (_END, "the gate was told to end"),
+    Code.FINISHED: (_END, "the {what} is over"),
+    Code.PILOT_FLIES: (_PILOT, "the pilot flies"),
+    Code.THEN: (_FAULT, "{first}; then {then}"),
+    Code.VEHICLE_LOST: (_VEHICLE, "the vehicle was lost for {after_s:.0f} s"),
+    Code.MODE_NOT_CONFIRMED: (_VEHICLE, "the vehicle has not confirmed {mode} in time"),
+    Code.RELEASE_NOT_SEEN: (
+        _VEHICLE,
+        "the vehicle still shows our last sticks, as it does without a receiver or with one that "
+        "rests there: whether it took the release is not known",
+    ),
+    Code.NOT_RELEASED: (_VEHICLE, "{instead} instead of release in the air: {why}"),
+    Code.NO_RECEIVER: (_VEHICLE, "there is no receiver"),
+    Code.RECEIVER_LOST: (_VEHICLE, "the receiver is lost"),
+    Code.SILENCE_IS_FAILSAFE: (
+        _VEHICLE,
+        "the vehicle takes the end of our sticks for a failsafe",
+    ),
+    Code.THROTTLE_IS_THRUST: (_VEHICLE, "in {mode} the throttle is thrust"),
+    Code.THROTTLE_UNKNOWN: (_VEHICLE, "the receiver's throttle is not known"),
+    Code.THROTTLE_RESTS: (
+        _VEHICLE,
+        "the receiver's throttle rests at {percent:+.0f} % (limit {limit_percent:.0f} %)",
+    ),
+    Code.NO_POLICY_LOADED: (_WAITING, "no policy is loaded yet"),
+    Code.CONNECTION_LOST: (_VEHICLE, "the connection to the vehicle is lost: reconnecting"),
+    Code.NO_HEARTBEAT: (_WAITING, "waiting for the vehicle's heartbeat"),
+    Code.HEARTBEAT_LOST: (_VEHICLE, "the vehicle's heartbeat is lost"),
+    Code.PACKETS_REFUSED: (
+        _FAULT,
+        "this computer has refused every packet to the vehicle for {after_ms:.0f} ms: no route, a "
+        "firewall, or a full queue",
+    ),
+    Code.UNHEARD: (_VEHICLE, "the vehicle does not hear our {quantity}: {cause}"),
+    Code.NO_ECHO: (_VEHICLE, "no {message} arrive to check our {quantity} against"),
+    Code.LATE_SENDING: (_VEHICLE, "our packets take {age_ms:.0f} ms or more to the vehicle"),
+    Code.READING_PARAMETERS: (_WAITING, "reading the vehicle's parameters"),
+    Code.REQUESTING_TELEMETRY: (_WAITING, "requesting telemetry from the vehicle"),
+    Code.LOOKING_FOR_RECEIVER: (_WAITING, "looking for the pilot's radio receiver"),
+    Code.PARAMETERS: (_VEHICLE, "{said}"),
+    Code.OBSTACLE: (_VEHICLE, "the vehicle would {what}: {causes}"),
+    Code.CALIBRATION_CHANGED: (
+        _PILOT,
+        "the vehicle's radio calibration was changed in flight: disarm to take it in",
+    ),
+    Code.RISK: (_VEHICLE, "{said}"),
+    Code.OVERRIDE_SWITCH_NOT_ON: (
+        _WAITING,
+        "the override switch (RC{channel}) is off: switch it on to fly",
+    ),
+    Code.WITH_HINT: (_VEHICLE, "{first}; {hint}"),
+    Code.SLOW_CLOCK: (_VEHICLE, "{hint}; {first}"),
+    Code.BEYOND: (
+        _FAULT,
+        "{quantity} {value:.1f} {unit} is beyond {limit:g} {unit} (--max-{quantity})",
+    ),
+    Code.ESTIMATOR_LOST: (_VEHICLE, "the vehicle's estimator has lost its position"),
+    Code.BATTERY: (_VEHICLE, "{said}"),
+    Code.LATE: (_FAULT, "{quantity} {age_ms:.0f} ms old (limit {limit_ms:.0f} ms)"),
+    Code.PAST_HORIZON: (
+        _FAULT,
+        "{quantity} {age_ms:.0f} ms old (its horizon ends after {limit_ms:.0f} ms)",
+    ),
+    Code.TOO_OLD: (_FAULT, "the {quantity} is {age_ms:.0f} ms old, beyond {limit_ms:.0f} ms"),
+    Code.AFTER_HORIZON: (
+        _FAULT,
+        "the chunk came after its horizon of {horizon_ms:.3g} ms ({steps} x {step_ms:.3g} ms) had "
+        "ended",
+    ),
+    Code.HORIZON_TOO_SHORT: (
+        _FAULT,
+        "the policy's horizon of {horizon_ms:.3g} ms ({steps} x {step_ms:.3g} ms) is too short for "
+        "its rate: a chunk ends {covered_ms:.0f} ms after it came, and chunks come {gap_ms:.0f} ms "
+        "apart; ask for a higher --rate or --action-rate, or use a policy of a longer horizon",
+    ),
+    Code.TOO_SLOW: (
+        _FAULT,
+        "the policy is too slow for this computer, or the link for the policy: the last {chunks} "
+        "chunks came too late, the newest {age_ms:.0f} ms after its attitude, which may be "
+        "{limit_ms:.0f} ms old when a stick leaves; use a smaller policy, fewer steps or a faster "
+        "computer",
+    ),
+    Code.CHUNKS_APART: (
+        _FAULT,
+        "the policy's chunks come up to {gap_ms:.0f} ms apart, beyond the {bridged_ms:.0f} ms that "
+        "are bridged: {advice}",
+    ),
+    Code.NO_CHUNK: (_WAITING, "no chunk from the policy yet"),
+    Code.NOT_RECORDED: (_FAULT, "the recording lacks {what}"),
+    Code.JUST_BEGUN: (_WAITING, "the policy has only just begun"),
+    Code.EMPTY_CHUNK: (_FAULT, "the policy returned a chunk without actions"),
+    Code.WRONG_KIND: (
+        _FAULT,
+        "the policy returned actions of another kind than its contract names",
+    ),
+    Code.NOT_FINITE: (_FAULT, "the policy returned a value that is not finite"),
+    Code.WRONG_SHAPE: (
+        _FAULT,
+        "the policy returned {shape} instead of [1, horizon, 4], with at most {most} actions",
+    ),
+    Code.UNUSABLE_CHUNKS: (
+        _FAULT,
+        "the policy returned {chunks} unusable chunks within a short time: {why}",
+    ),
+    Code.POLICY_REFUSED: (_FAULT, "{said}"),
+    Code.NO_READING: (_WAITING, "no {quantity} from the vehicle yet"),
+    Code.NO_TRUSTED_READING: (
+        _WAITING,
+        "no {quantity} from the vehicle yet, or none that it trusts",
+    ),
+    Code.READING_AHEAD: (
+        _VEHICLE,
+        "{quantity} is stamped {ahead_ms:.0f} ms ahead of the vehicle's clock",
+    ),
+    Code.ATTITUDE_FROZEN: (
+        _VEHICLE,
+        "the vehicle's attitude has been frozen for {age_ms:.0f} ms (limit {limit_ms:.0f} ms)",
+    ),
+    Code.NO_IMAGE: (_WAITING, "no image feature yet"),
+    Code.IMAGE_AHEAD: (
+        _FAULT,
+        "the camera stamps its images {ahead_ms:.0f} ms in the future (limit {limit_ms:.0f} ms): "
+        "have it stamp them on CLOCK_MONOTONIC",
+    ),
+    Code.IMAGE_FROZEN: (_FAULT, "the image has been frozen for {age_s:.1f} s"),
+    Code.IMAGE_BLANK: (_FAULT, "the image has been {what} for {age_s:.1f} s"),
+    Code.OF_CAMERA: (_FAULT, "camera {camera}: {why}"),
+    Code.COMMAND_FAILED: (
+        _FAULT,
+        "a command could not be made, a bug of mavbridge: {error} ({place})",
+    ),
+    Code.CAMERA_FAILED: (_FAULT, "the camera{camera} or its encoder has failed"),
+    Code.POLICY_FAILED: (_FAULT, "the policy has failed"),
+    Code.HANGS: (_FAULT, "the {name} has hung for {idle_s:.1f} s"),
+    Code.GATE_DIED: (_FAULT, "the gate has died"),
+    Code.FLIGHT_PROCESS_DIED: (_FAULT, "the flight process has died"),
+}
+_SPENT = {
+    "computer": "the computer stood still for",
+    "gate": "the gate stood still for",
+    "flight process": "the flight process stood still, or solved, for",
+    "solve": "the solve took",
+    "link": "the link delivered no {quantity} for",
+    "camera": "the camera delivered nothing for",
+}
+"""Where the time of a late input was spent, by ``place`` of ``LATE`` and ``PAST_HORIZON``."""
+
+
+@dataclass(frozen=True, slots=True)
+class Reason:
+    """A code with its figures: names with their unit, such as ``age_ms``, and plain values."""
+
+    code: Code
+    data: tuple[tuple[str, Value], ...] = ()
+
+    @property
+    def kind(self) -> Kind:
+        """Whose doing it is; of a reason that wraps another one, the other's."""
+        inner = dict(self.data).get("first") or dict(self.data).get("why")
+        return inner.kind if isinstance(inner, Reason) else _REASONS[self.code][0]
+
+    @property
+    def codes(self) -> tuple[Code, ...]:
+        """Its own code and those inside it: equal for the same reason with other figures."""
+        return tuple(self._codes())
+
+    def _codes(self) -> Iterator[Code]:
+        yield self.code
+        for _, value in self.data:
+            if isinstance(value, Reason):
+                yield from value.codes
+
+    def __str__(self) -> str:
+        """The sentence for the user."""
+        words = dict(self.data)
+        text = _REASONS[self.code][1].format(**words)
+        if self.code not in (Code.LATE, Code.PAST_HORIZON):
+            return text
+        said, place = words.get("said"), words["place"]
+        if said is not None and place == "flight process":  # it speaks
+            return f"{said}; {text}"
+        spent = _SPENT[str(place)].format(**words)
+        text = f"{text}: {spent} {words['spent_ms']:.0f} ms"
+        return text if said is None else f"{said}; {text}"
+
+
+def because(code: Code, **data: Value) -> Reason:
+    """Make a reason."""
+    return Reason(code, tuple(data.items()))
+
+
+def reason_to_json(reason: Reason) -> dict[str, object]:
+    """Code, kind, figures and sentence, for JSON."""
+    data = {
+        name: reason_to_json(value) if isinstance(value, Reason) else value
+        for name, value in reason.data
+    }
+    return {
+        "code": reason.code.value,
+        "kind": reason.kind.value,
+        "data": data,
+        "text": str(reason),
+    }
+
+
+def reason_from_json(document: Mapping[str, object]) -> Reason:
+    """Inverse of ``reason_to_json``.
+
+    Raises:
+        KeyError, TypeError, ValueError: it is none, or of a code that this version does not know.
+    """
+    data = document["data"]
+    if not isinstance(data, dict):
+        raise TypeError(f"data is {type(data).__name__}, not an object")
+    return because(
+        Code(str(document["code"])),
+        **{
+            name: reason_from_json(value) if isinstance(value, dict) else value
+            for name, value in data.items()
+        },
+    )
