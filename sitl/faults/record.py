@@ -1,6 +1,7 @@
 """What the vehicle's report (docs/formats/flight_report.md) says of a fault at a known time."""
 
 from collections.abc import Sequence
+from itertools import takewhile
 from typing import Literal, NamedTuple, TypedDict
 
 Receiver = Literal["idle", "mid", "none"]
@@ -10,6 +11,10 @@ RECEIVER_US: dict[Receiver, Four] = {"idle": (1500, 1500, 1000, 1500), "mid": NE
 """Sticks of a receiver by its flag; ``none`` has no sticks."""
 NUDGE_US = 4
 """Steps of one channel by which the bridge finds out whether the vehicle still hears it."""
+
+
+LANDINGS = ("LAND", "RTL", "AUTO.LAND", "AUTO.RTL")
+"""Modes in which a vehicle goes down by its own will."""
 
 
 class StickEntry(TypedDict):
@@ -71,7 +76,7 @@ class Ending(NamedTuple):
     mode: str
     """The last."""
     lost_m: float
-    """Height, from where the policy lost the sticks to the lowest point after it."""
+    """Height, from where the policy lost the sticks to the lowest point before a landing."""
     impact_mps: float
     """Speed of the hardest touchdown of the flight; 0.0: it never touched the ground again."""
 
@@ -121,7 +126,8 @@ def aftermath(
 def ending(report: VehicleReport, since_s: float, until_s: float) -> Ending:
     """Read the end of a flight between two moments on the report's clock."""
     entries = [entry for entry in report["sticks"] if since_s <= entry["t_s"] < until_s]
-    heights_m = [entry["height_m"] for entry in entries] or [0.0]
+    held = list(takewhile(lambda entry: entry["mode"] not in LANDINGS, entries))
+    heights_m = [entry["height_m"] for entry in held] or [0.0]
     return Ending(
         mode=entries[-1]["mode"] if entries else report["final"]["mode"],
         lost_m=heights_m[0] - min(heights_m),

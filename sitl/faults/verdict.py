@@ -12,7 +12,6 @@ MOST_IMPACT_MPS = 1.0
 """Both firmwares touch down at 0.5 to 0.7 m/s (LAND_SPEED, MPC_LAND_SPEED)."""
 MOST_LOST_M = 2.0
 """BRAKE stops within 1.8 m from 2.5 m/s of descent."""
-LANDINGS = ("LAND", "RTL", "AUTO.LAND", "AUTO.RTL")
 
 
 @dataclass(kw_only=True)
@@ -100,7 +99,7 @@ def _bad_end(end: Ending) -> list[str]:
     failures = []
     if end.impact_mps > MOST_IMPACT_MPS:
         failures.append(f"it hit the ground at {end.impact_mps:.1f} m/s, in {end.mode}")
-    if end.lost_m > MOST_LOST_M and end.mode not in LANDINGS:
+    if end.lost_m > MOST_LOST_M:
         failures.append(f"it lost {end.lost_m:.1f} m of height, in {end.mode}")
     return failures
 

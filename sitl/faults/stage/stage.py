@@ -13,7 +13,7 @@ from contextlib import ExitStack, contextmanager, suppress
 from pathlib import Path
 from typing import Any, Literal, TypeAlias, cast
 
-from sitl.clock import Clock
+from sitl.clock import NS_PER_MS, Clock
 from sitl.faults.record import VehicleReport
 from sitl.faults.stage.camera import FrameFeed
 from sitl.faults.stage.carriers import Carrier, UdpCarrier
@@ -26,6 +26,8 @@ TIMEOUT_S = 90.0
 STARTS = 3
 LEANING = 100
 """Steering messages that lean, in a row: the policy holds its lean."""
+STICKS_OVER_NS = 200 * NS_PER_MS
+"""Time without a stick of the policy after which its flight is over."""
 STALLED = ("delivered no attitude", "stood still")
 ORDERLY = (0, 4)
 """Exit statuses of a flight that ended in order; 4: a busy machine made the gate end it before."""
@@ -250,12 +252,12 @@ class Stage:
         return processes_with(f"{MARK}={self._mark}")
 
     def last_lean_ns(self) -> int:
-        """When the policy's last stick left, once others have followed it; waits for that."""
+        """When the policy's last stick left, once none has followed it; waits for that."""
         sent = self.relay.sent
 
         def is_over() -> bool:
-            steering = [row for row in sent[-3 * LEANING :] if row.steers]
-            return bool(steering) and not any(row.leans for row in steering[-LEANING // 10 :])
+            leans = [row.at_ns for row in sent[-3 * LEANING :] if row.leans]
+            return not leans or self.clock.now_ns() - leans[-1] > STICKS_OVER_NS
 
         if not self.relay.wait_until(is_over, TIMEOUT_S):
             raise StageError(f"the policy goes on flying:\n{self._text}")
