@@ -22,6 +22,8 @@ from sitl.simulated_vehicle import SimulatedVehicle
 from sitl.vehicle.config import STEP_NS, VehicleConfig
 
 JOIN_TIMEOUT_S = 5.0
+LEAST_PRIORITY = 19
+"""Of a vehicle that flies on faster than real time: flights beside it are judged by the ms."""
 
 
 class PilotOptions(NamedTuple):
@@ -92,7 +94,9 @@ def run_vehicle(
                 rc_input=rc_input,
                 end_with_course=end_with_course,
             )
-        fly_on(vehicle, fly_on_s)
+        if fly_on_s:
+            os.nice(LEAST_PRIORITY)
+            fly_on(vehicle, fly_on_s)
         if report is not None:
             write_report(report, vehicle.log.summary(vehicle.ap, vehicle.bad_frames))
             print_status(f"report written to {report}")
@@ -134,11 +138,7 @@ def fly(
 
 
 def fly_on(vehicle: SimulatedVehicle, duration_s: float) -> None:
-    """Advance the vehicle as fast as the computer can; it receives and sends nothing.
-
-    At the lowest priority: flights beside it are judged by the millisecond.
-    """
-    os.nice(19)
+    """Advance the vehicle as fast as the computer can; it receives and sends nothing."""
     start_ns = vehicle.ap.now_ns
     for now_ns in range(start_ns, start_ns + round(duration_s * NS_PER_S), STEP_NS):
         vehicle.step(now_ns)

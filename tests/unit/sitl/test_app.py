@@ -14,15 +14,15 @@ import pytest
 from pymavlink.dialects.v20 import ardupilotmega as mav
 
 from sitl.__main__ import main
-from sitl.app import filming, fly
+from sitl.app import filming, fly, fly_on
 from sitl.ardupilot.flight_modes import Mode
 from sitl.camera.fpv import CameraOptions
 from sitl.clock import NS_PER_MS, NS_PER_S, Clock, StopRequest, stop_on_signal
-from sitl.course.layout import make_course
+from sitl.course.layout import AirborneStart, make_course
 from sitl.course.referee import Crash
 from sitl.link.transport import Received
 from sitl.simulated_vehicle import SimulatedVehicle
-from sitl.vehicle.config import STEP_NS
+from sitl.vehicle.config import STEP_NS, VehicleConfig
 
 
 class FakeClock:
@@ -152,9 +152,10 @@ def test_the_rc_input_moves_the_receiver_while_the_vehicle_flies():
     assert switched["mode"] == "RTL"
 
 
-def test_terminating_the_process_writes_the_report(tmp_path):
+@pytest.mark.parametrize(("flags", "least_s"), [([], 0.0), (["--fly-on", "20"], 20.0)])
+def test_terminating_the_process_writes_the_report(tmp_path, flags, least_s):
     path = tmp_path / "fc.json"
-    command = [sys.executable, "-m", "sitl", "--connect", "udpout:127.0.0.1:9"]
+    command = [sys.executable, "-m", "sitl", "--connect", "udpout:127.0.0.1:9", *flags]
     with subprocess.Popen(
         [*command, "--receiver", "mid", "--report", str(path)], stderr=subprocess.PIPE, text=True
     ) as process:
@@ -164,7 +165,27 @@ def test_terminating_the_process_writes_the_report(tmp_path):
 
     assert process.returncode == 0
     assert path.stat().st_size > 0
-    assert json.loads(path.read_text())["final"]["mode"] == "STABILIZE"
+    report = json.loads(path.read_text())
+    assert report["final"]["mode"] == "STABILIZE"
+    assert report["duration_s"] >= least_s - 0.01
+
+
+@pytest.mark.parametrize("autopilot", ["ardupilot", "px4"])
+def test_a_vehicle_flies_on_by_itself(autopilot):
+    vehicle = SimulatedVehicle(links=1, boot_ns=0, config=VehicleConfig(autopilot=autopilot))
+    level = (1.0, 0.0, 0.0, 0.0)
+    start = AirborneStart(
+        position_ned_m=(0.0, 0.0, -5.0),
+        velocity_ned_mps=(0.0, 0.0, 0.0),
+        ned_from_body_wxyz=level,
+        next_gate=0,
+    )
+    vehicle.launch(start)
+
+    fly_on(vehicle, 10.0)
+
+    assert vehicle.ap.now_ns == pytest.approx(10 * NS_PER_S, abs=5 * NS_PER_MS)
+    assert vehicle.take_outgoing(0) == b""
 
 
 def test_a_short_run_writes_its_report(tmp_path):

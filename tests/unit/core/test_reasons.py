@@ -1,0 +1,99 @@
+"""Each reason has a kind and a sentence, and comes through JSON as it was."""
+
+import json
+import string
+
+import pytest
+
+from mavbridge.core import reasons
+from mavbridge.core.reasons import (
+    Code,
+    Kind,
+    Reason,
+    because,
+    reason_from_json,
+    reason_to_json,
+)
+
+DISARMED = because(Code.DISARMED)
+LATE = {"quantity": "attitude", "age_ms": 104.2, "limit_ms": 100.0, "spent_ms": 131.0}
+
+
+def example(code: Code) -> Reason:
+    """A reason with every figure that its sentence names."""
+    _, text = reasons._REASONS[code]
+    data: dict[str, reasons.Value] = {}
+    for _, name, spec, _ in string.Formatter().parse(text):
+        if name is not None:
+            data[name] = 1.5 if spec else "a word"
+    if code in (Code.LATE, Code.PAST_HORIZON):
+        data |= LATE | {"place": "computer"}
+    return because(code, **data)
+
+
+@pytest.mark.parametrize("code", Code)
+def test_each_reason_can_be_said_and_comes_through_json(code: Code) -> None:
+    reason = example(code)
+    assert str(reason)
+    document = json.loads(json.dumps(reason_to_json(reason)))
+    assert reason_from_json(document) == reason
+    assert document["code"] == code.value
+    assert document["kind"] == reason.kind.value
+    assert document["text"] == str(reason)
+
+
+def test_no_two_reasons_say_the_same() -> None:
+    texts = [text for _, text in reasons._REASONS.values() if text != "{said}"]
+    assert len(texts) == len(set(texts))
+    assert set(reasons._REASONS) == set(Code)
+
+
+@pytest.mark.parametrize(
+    ("reason", "text"),
+    [
+        (
+            because(Code.MODE_CHANGED, before="ALT_HOLD", after="LOITER"),
+            "mode changed from ALT_HOLD to LOITER",
+        ),
+        (
+            because(Code.LATE, **LATE, place="computer"),
+            "attitude 104 ms old (limit 100 ms): the computer stood still for 131 ms",
+        ),
+        (
+            because(Code.LATE, **LATE, place="link"),
+            "attitude 104 ms old (limit 100 ms): the link delivered no attitude for 131 ms",
+        ),
+        (
+            because(Code.PAST_HORIZON, **LATE, place="solve"),
+            "attitude 104 ms old (its horizon ends after 100 ms): the solve took 131 ms",
+        ),
+        (
+            because(Code.LATE, **LATE, place="flight process", said=because(Code.NOT_FINITE)),
+            "the policy returned a value that is not finite; attitude 104 ms old (limit 100 ms)",
+        ),
+        (
+            because(Code.THEN, first=because(Code.DURATION), then=DISARMED),
+            "the flight is over; then the vehicle has been disarmed",
+        ),
+    ],
+)
+def test_the_sentence_has_the_figures(reason: Reason, text: str) -> None:
+    assert str(reason) == text
+
+
+def test_a_reason_inside_another_keeps_its_code_and_gives_its_kind() -> None:
+    both = because(Code.THEN, first=because(Code.DURATION), then=DISARMED)
+    assert both.codes == (Code.THEN, Code.DURATION, Code.DISARMED)
+    assert both.kind is Kind.END
+    of_camera = because(Code.OF_CAMERA, camera="front", why=because(Code.NO_IMAGE))
+    assert of_camera.kind is Kind.WAITING
+    assert reason_from_json(reason_to_json(of_camera)) == of_camera
+
+
+@pytest.mark.parametrize(
+    "document",
+    [{}, {"code": "no such"}, {"code": "no such", "data": {}}, {"code": "late", "data": 1}],
+)
+def test_what_is_no_reason_is_refused(document: dict[str, object]) -> None:
+    with pytest.raises((KeyError, TypeError, ValueError)):
+        reason_from_json(document)
