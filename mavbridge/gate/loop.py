@@ -3,6 +3,7 @@
 import traceback
 from collections.abc import Callable, Iterable, Sequence
 from contextlib import suppress
+from functools import partial
 from pathlib import Path
 from typing import Protocol, TypeVar
 
@@ -40,7 +41,6 @@ IDLE_PERIOD_NS = 10 * NS_PER_MS
 """Between two looks at the link before a policy is loaded."""
 FINISH_NS = 4 * NS_PER_S
 """Longest that putting parameters back may take, or sending a release that was held up."""
-_Given = TypeVar("_Given")
 _Sent = TypeVar("_Sent")
 WORDS_NS, THRUST_WORDS_NS = NS_PER_S, 100 * NS_PER_MS
 """Oldest last words: signatures must be no older than a minute, and what tells the safe mode may
@@ -82,8 +82,9 @@ class GateLink(Protocol):
     def watch_home_height(self) -> None:
         """Keep the height above home coming."""
 
-    def send(self, decision: Decision) -> Action | None:
-        """Send the decision; returns the action as rounded and sent, None when released."""
+    def send(self, decision: Decision, decided_ns: int) -> Action | None:
+        """Send what was decided for that moment; returns the action as rounded and sent, or None
+        when it released."""
 
     def set_mode(self, mode: str) -> None:
         """Ask for a flight mode."""
@@ -235,7 +236,7 @@ class GateLoop:
             self._clock.sleep_until_ns(at_ns)
         self._command_fault = None
         wanted = output.decision
-        sent = None if wanted is None else self._attempt(self._link.send, wanted)
+        sent = None if wanted is None else self._attempt(partial(self._link.send, wanted, at_ns))
         if isinstance(wanted, Command) and sent is None:
             self._gate.unsent()
         if output.slot is not None or output.decision is not None or output.phase != self._phase:
@@ -250,10 +251,10 @@ class GateLoop:
         # A command that failed is answered in a pass that follows at once.
         return woke_ns if self._command_fault else self._gate.next_ns - self._lead_ns
 
-    def _attempt(self, send: Callable[[_Given], _Sent], given: _Given) -> _Sent | None:
-        """Send it; an error is a fault of the flight, not the gate's end."""
+    def _attempt(self, send: Callable[[], _Sent]) -> _Sent | None:
+        """Send something; an error is a fault of the flight, not the gate's end."""
         try:
-            return send(given)
+            return send()
         except Exception as error:  # noqa: BLE001 - the vehicle is held: end the flight in order
             at = traceback.extract_tb(error.__traceback__)[-1]
             self._command_fault = because(
@@ -266,11 +267,11 @@ class GateLoop:
     def _follow(self, output: GateOutput) -> None:
         """Send the requests, and show the messages."""
         if output.mode is not None:
-            self._attempt(self._link.set_mode, output.mode)
+            self._attempt(partial(self._link.set_mode, output.mode))
         if output.arm:
             self._link.arm()
         if output.takeoff_m is not None:
-            self._attempt(self._link.takeoff, output.takeoff_m)
+            self._attempt(partial(self._link.takeoff, output.takeoff_m))
         for text in output.messages:
             self._flight.send(encode_from_gate(GateMessage(text)))
 

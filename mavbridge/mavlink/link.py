@@ -425,8 +425,10 @@ class MavlinkLink:
 
     # --- actions
 
-    def send(self, decision: Decision) -> Action | None:
+    def send(self, decision: Decision, decided_ns: int | None = None) -> Action | None:
         """Send an action or a release; returns the action as it was really sent, or None.
+
+        ``decided_ns``: the moment that the action was decided for, by which it is made; None: now.
 
         Releases leave every 50 ms for as long as they are asked for and the output has any. One
         that cannot be sent now is sent before anything else that can.
@@ -434,7 +436,7 @@ class MavlinkLink:
         Raises:
             CommandRefusedError: an action that this output must not send.
         """
-        action = None if self._config.readonly else self._sender.send(decision)
+        action = None if self._config.readonly else self._sender.send(decision, decided_ns)
         if action is not None:
             self._counters.sent += 1
         return action

@@ -51,8 +51,10 @@ class ActionSender:
         """A release could not be sent: ``try_release`` before everything else."""
         return self._release.is_owed
 
-    def send(self, decision: Decision) -> Action | None:
+    def send(self, decision: Decision, decided_ns: int | None = None) -> Action | None:
         """Send an action or a release; returns the action as it was really sent, or None.
+
+        ``decided_ns``: the moment that the action was decided for, by which it is made; None: now.
 
         Raises:
             CommandRefusedError: an action that this output must not send.
@@ -66,7 +68,8 @@ class ActionSender:
             if self._release.is_due(self._clock.now_ns()):
                 self.try_release()
             return None
-        encoded = output.encode(decision.action, vehicle, self._clock.now_ns())
+        made_ns = self._clock.now_ns() if decided_ns is None else decided_ns
+        encoded = output.encode(decision.action, vehicle, made_ns)
         if encoded is None or (self._release.is_owed and not self.try_release()):
             return None
         self._release.acted(output.releases)

@@ -15,7 +15,7 @@ from mavbridge.config.flight import FlyConfig
 from mavbridge.core.clock import NS_PER_MS
 from mavbridge.core.reasons import Code, Kind, because
 from mavbridge.core.records import Solve, Tick
-from mavbridge.core.vehicle import Action, Command, Decision, LinkSnapshot
+from mavbridge.core.vehicle import Action, LinkSnapshot
 from mavbridge.flight.action_frames import action_frame
 from mavbridge.flight.policy_loop import make_chunk
 from mavbridge.flight.settings import flight_settings, link_settings
@@ -26,7 +26,6 @@ from mavbridge.gate.gate import FlightSettings, Gate, GateInput, GateOutput
 from mavbridge.gate.loop import GateLoop
 from mavbridge.gate.wire import GateTick, decode_from_gate, encode_to_gate
 from mavbridge.mavlink.link import MavlinkLink
-from mavbridge.mavlink.outputs.echo import NUDGE_STEP_NS
 from mavbridge.mavlink.transport.sockets import Address, Received
 from mavbridge.simulation.clock import SteppedClock
 from mavbridge.simulation.network import VEHICLE
@@ -109,7 +108,6 @@ def replay_gate(source: ReplaySource) -> list[GateStep]:
     for arrivals in _arrivals(source):
         tick = arrivals.tick
         _keep_link(link, clock, transport, tick.woke_ns)
-        link.recorded = tick
         port.decided_ns, transport.sent_ns = tick.decided_ns or tick.woke_ns, tick.sent_ns
         port.inbox += [encode_to_gate(message) for message in arrivals.messages]
         loop.step()
@@ -240,28 +238,11 @@ class _WatchedLink(MavlinkLink):
     """Keeps what it told the gate last."""
 
     newest: LinkSnapshot
-    recorded: Tick
-    """That of this pass."""
 
     def poll(self) -> LinkSnapshot:
         """See ``MavlinkLink``."""
         self.newest = super().poll()
         return self.newest
-
-    def send(self, decision: Decision) -> Action | None:
-        """See ``MavlinkLink``.
-
-        The nudge of the sticks steps at fixed times. Where one lies between the decision and the
-        send, the recorded sticks tell whether it had come when the message was made.
-        """
-        made_ns, sent_ns, sent = self._clock.now_ns(), self.recorded.sent_ns, self.recorded.sent
-        output, vehicle = self._sender.output, self._vehicle
-        has_stepped = made_ns // NUDGE_STEP_NS != sent_ns // NUDGE_STEP_NS
-        if has_stepped and sent and output and vehicle and isinstance(decision, Command):
-            before = output.encode(decision.action, vehicle, made_ns)
-            if before is not None and not same_action(before.action, sent):
-                self._clock.sleep_until_ns(sent_ns)
-        return super().send(decision)
 
 
 def same_action(one: Action | None, other: Action | None) -> bool:
