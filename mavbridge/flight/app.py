@@ -38,11 +38,12 @@ from mavbridge.flight.gate_process import GateProcess
 from mavbridge.flight.observation import observation_ages_ns
 from mavbridge.flight.observers import FlightObservers
 from mavbridge.flight.outcome import flight_verdict, log_link
+from mavbridge.flight.plan import FlightPlan, plan_flight
 from mavbridge.flight.policies import (
     load_configured_policy,
     looks_at_images,
 )
-from mavbridge.flight.settings import effective_freshness, flight_settings, gate_settings
+from mavbridge.flight.settings import gate_settings
 from mavbridge.flight.speed import require_speed
 from mavbridge.gate.departure import Ending
 from mavbridge.gate.engagement import Phase
@@ -97,14 +98,17 @@ def fly(config: FlyConfig) -> int:
         )
         policy_life.enter_context(loaded)
         unsigned = signing_note(config.link)
-        notes = (*loaded.notes, *require_speed(config, loaded), *([unsigned] if unsigned else []))
+        executable = loaded.executable
+        plan = plan_flight(config, executable.contract, is_dual=executable.dual_rate)
+        speed = require_speed(plan, executable.name, loaded.times)
+        notes = (*loaded.notes, *speed, *([unsigned] if unsigned else []))
         for note in notes:
             logging.getLogger(SAID).info("%s", note)
             console.print(Text(note, style="yellow"))
         if (times := loaded.times) is not None:
             act_ms, encode_ms = times.act_s * 1e3, times.encode_s * 1e3
             _log.debug("a chunk takes %.2f ms here, an image %.2f ms", act_ms, encode_ms)
-        return fly_executable(config, loaded.executable, clock=clock, console=console, gate=gate)
+        return fly_executable(plan, executable, clock=clock, console=console, gate=gate)
 
 
 def start_gate(config: FlyConfig, clock: Clock, stack: ExitStack) -> StartedGate:
@@ -129,7 +133,7 @@ def start_gate(config: FlyConfig, clock: Clock, stack: ExitStack) -> StartedGate
 
 
 def fly_executable(
-    config: FlyConfig,
+    plan: FlightPlan,
     executable: Executable,
     *,
     clock: Clock,
@@ -144,16 +148,15 @@ def fly_executable(
     # OpenCV would print its own complaint about a camera before, and instead of, ours.
     cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_SILENT)
     cv2.setNumThreads(1)  # both loops may share two cores: no pool of threads under either
-    settings = flight_settings(config, executable)
     flight: _Flight | None = None
     try:
         with ExitStack() as stack:
-            gate = gate or start_gate(config, clock, stack)
+            gate = gate or start_gate(plan.config, clock, stack)
             prepare_to_die_first()
-            flight = _Flight(config, clock, console, executable, gate, sinks, stack)
+            flight = _Flight(plan, clock, console, executable, gate, sinks, stack)
             # Only now: until a stick can have been taken, a signal may simply end the process.
             stop = stack.enter_context(stop_on_signals())
-            gate.process.send(settings)
+            gate.process.send(plan.gate)
             flight.run(stop)
         return flight.verdict(stop)
     except MavbridgeError as error:
@@ -171,7 +174,7 @@ class _Flight:
 
     def __init__(
         self,
-        config: FlyConfig,
+        plan: FlightPlan,
         clock: Clock,
         console: Console,
         executable: Executable,
@@ -179,23 +182,22 @@ class _Flight:
         sinks: tuple[TickSink, ...],
         stack: ExitStack,
     ) -> None:
-        self._config = config
+        config = self._config = plan.config
         self._clock = clock
         self._stack = stack
         self._gate = gate.process
         self._has_hung = False
         self._ending = Ending(reason=because(Code.GATE_DIED), is_fault=True)
         """What it was asked to end for; until then only its death ends it without a summary."""
-        settings = flight_settings(config, executable)
         self._hang_ns = max(
             LEAST_HANG_NS,
-            HANG_PERIODS * settings.chunk_period_ns,
-            settings.freshness.state_ns,  # of a slow policy that plays each chunk for long
+            HANG_PERIODS * plan.gate.chunk_period_ns,
+            plan.gate.freshness.state_ns,  # of a slow policy that plays each chunk for long
         )
-        feature_ns = effective_freshness(executable.contract, config.limits).feature_ns
+        feature_ns = plan.start_limits.feature_ns
         self._encoder_hang_ns = max(LEAST_HANG_NS, HANG_PERIODS * feature_ns)
         self._looked_ns = self._resumed_ns = clock.now_ns()
-        self._observers = FlightObservers(config, executable, clock=clock, console=console)
+        self._observers = FlightObservers(plan, executable, clock=clock, console=console)
         stack.callback(self._close_recorder)  # after the gate: it records the release
         contract = executable.contract
         self._cameras = contract.cameras
@@ -213,7 +215,7 @@ class _Flight:
             gate.tlog_pipe, self._gate, lambda: self._bridge.view.status.autopilot
         )
         self._bridge: Bridge = build_bridge(
-            config,
+            plan,
             executable,
             clock=clock,
             send=self._gate.send,

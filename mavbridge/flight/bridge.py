@@ -6,9 +6,9 @@ from dataclasses import dataclass
 from itertools import chain
 
 from mavbridge.camera.image_watch import ImageWatch
-from mavbridge.config.flight import CameraConfig, FlyConfig
+from mavbridge.config.flight import CameraConfig
 from mavbridge.config.rates import LoopRates
-from mavbridge.core.clock import NS_PER_MS, NS_PER_S, Clock, period_ns
+from mavbridge.core.clock import NS_PER_MS, NS_PER_S, Clock
 from mavbridge.core.observers import FanOut
 from mavbridge.core.ports import Camera, TickSink
 from mavbridge.core.records import CameraImage, FloatArray, Solve, VehicleState
@@ -17,8 +17,8 @@ from mavbridge.flight.action_frames import action_frame
 from mavbridge.flight.feature_cache import FeatureCache
 from mavbridge.flight.history import SentHistory
 from mavbridge.flight.observation import ObservationSource, StateHistory, observation_ages_ns
+from mavbridge.flight.plan import FlightPlan
 from mavbridge.flight.policy_loop import PolicyLoop, PolicySettings
-from mavbridge.flight.settings import effective_freshness
 from mavbridge.flight.state import Freshness
 from mavbridge.flight.state_reader import StateReader
 from mavbridge.flight.vehicle_view import VehicleView
@@ -57,7 +57,7 @@ class CameraPath:
 
 
 def build_bridge(
-    config: FlyConfig,
+    plan: FlightPlan,
     executable: Executable,
     *,
     clock: Clock,
@@ -73,7 +73,7 @@ def build_bridge(
     """Join a policy, its cameras and the gate.
 
     Args:
-        config: rates and limits; its camera and address are not used.
+        plan: of the flight; its cameras and address are not used.
         executable: the policy on its engine.
         clock: time of the policy loop; in simulation its solves take simulated time.
         send: hands a chunk to the gate, or the reason why there is none.
@@ -85,22 +85,20 @@ def build_bridge(
         watch_packets: is given every packet of the vehicle that arrives; must not block.
         delay_vision: wraps the sink of each vision loop, where encoding takes simulated time.
     """
-    contract = executable.contract
-    loops = config.rates.loops(is_dual=executable.dual_rate, play_s=contract.play_s)
-    limits = effective_freshness(contract, config.limits)
+    config, contract, limits = plan.config, plan.contract, plan.start_limits
     freshness = Freshness(attitude_ns=limits.state_ns, velocity_ns=limits.velocity_ns)
     reader = StateReader(contract, freshness=freshness, goal_ned_m=config.goal_ned_m)
     settings = PolicySettings(
         action_frame=action_frame(contract),
         chunk_dt_s=contract.chunk_dt_s,
         max_frozen_ns=round(config.limits.max_frozen_state * NS_PER_S),
-        period_ns=period_ns(loops.action_hz),
+        period_ns=plan.gate.chunk_period_ns,
     )
     states = _state_history(contract, settings.period_ns, limits.feature_ns)
     history = SentHistory(
         length=contract.history_len, dt_s=contract.history_dt_s, frame=settings.action_frame
     )
-    rates = _visual_rates(contract, loops)
+    rates = _visual_rates(contract, plan.loops)
     adaptive = [[rate] if rate.is_adaptive else [] for rate in rates]
 
     def remember() -> None:

@@ -11,7 +11,6 @@ from typing import TYPE_CHECKING
 from rich.console import Console
 
 import mavbridge
-from mavbridge.config.flight import FlyConfig
 from mavbridge.core.clock import NS_PER_S, Clock, wall_offset_ns
 from mavbridge.core.course import read_gates
 from mavbridge.core.errors import UserError
@@ -29,8 +28,8 @@ from mavbridge.core.vehicle import ForwardedPacket
 from mavbridge.flight.action_frames import action_frame
 from mavbridge.flight.gate_process import GateProcess
 from mavbridge.flight.outcome import FlightReferee, describe
+from mavbridge.flight.plan import FlightPlan
 from mavbridge.flight.policies import policy_files
-from mavbridge.flight.settings import effective_freshness
 from mavbridge.gate.wire import GateSummary
 from mavbridge.observe.terminal import FlightScreen
 from mavbridge.observe.timing import FlightTiming, Mode, ObserverDrops, report_json
@@ -56,16 +55,14 @@ class FlightObservers:
     """The observers that the flags ask for. None of them can delay a loop."""
 
     def __init__(
-        self, config: FlyConfig, executable: Executable, *, clock: Clock, console: Console
+        self, plan: FlightPlan, executable: Executable, *, clock: Clock, console: Console
     ) -> None:
-        self._config = config
+        config = self._config = plan.config
+        self._plan = plan
         self._executable = executable
         self._clock = clock
-        self._loops = config.rates.loops(
-            is_dual=executable.dual_rate, play_s=executable.contract.play_s
-        )
-        self._mode: Mode = "dual" if executable.dual_rate else "single"
-        action_hz, vision_hz = self._loops.action_hz, self._loops.max_vision_hz
+        self._mode: Mode = "dual" if plan.is_dual else "single"
+        action_hz, vision_hz = plan.loops.action_hz, plan.loops.max_vision_hz
         self._timing = FlightTiming(
             stick_hz=config.rates.stick_rate, action_hz=action_hz, vision_hz=vision_hz
         )
@@ -117,13 +114,10 @@ class FlightObservers:
         """Start the viewer or its file, if one is wanted; it is closed with ``stack``."""
         if self._config.rerun == "off" and not self._config.serve:
             return
-        config, contract = self._config, self._executable.contract
-        freshness = effective_freshness(contract, config.limits).while_played(
-            round(contract.play_s * NS_PER_S)
-        )
+        config, contract, freshness = self._config, self._plan.contract, self._plan.gate.freshness
         flight = ViewedFlight(
-            vision_hz=self._loops.max_vision_hz,
-            chunk_hz=self._loops.action_hz,
+            vision_hz=self._plan.loops.max_vision_hz,
+            chunk_hz=self._plan.loops.action_hz,
             stick_hz=config.rates.stick_rate,
             contract=contract,
             max_state_age_s=freshness.state_ns / NS_PER_S,
@@ -158,10 +152,11 @@ class FlightObservers:
             policy=self._executable.name,
             engine=self._executable.engine,
             mode=self._mode,
-            action_hz=self._loops.action_hz,
-            visual_hz=self._loops.max_vision_hz,
+            action_hz=self._plan.loops.action_hz,
+            visual_hz=self._plan.loops.max_vision_hz,
             contract=self._executable.contract,
             seed=self._config.policy.seed,
+            plan=self._plan.figures(),
             command=command_line(),
             versions=versions(),
             git_revision=git_revision(),

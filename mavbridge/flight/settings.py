@@ -6,21 +6,18 @@ from dataclasses import replace
 from pathlib import Path
 
 from mavbridge.config.flight import EnvelopeConfig, FlyConfig, Limits, LinkConfig
-from mavbridge.core.clock import NS_PER_S, period_ns
+from mavbridge.core.clock import NS_PER_S
 from mavbridge.core.errors import UserError
 from mavbridge.core.vehicle import ActionMeaning, StickGains
 from mavbridge.gate.chunks import FreshnessLimits
 from mavbridge.gate.departure import DepartureSettings
 from mavbridge.gate.engagement import EngagementSettings
 from mavbridge.gate.envelope import EnvelopeLimits
-from mavbridge.gate.gate import FlightSettings
 from mavbridge.gate.limits import LimitSettings
 from mavbridge.gate.preparation import PreparationSettings
 from mavbridge.gate.settings import GateSettings
-from mavbridge.gate.smoothing import Smoothing
 from mavbridge.mavlink.settings import LinkSettings, SigningFiles
 from policy.contract import ActionKind, Contract
-from policy.protocol import Executable
 
 LEAST = 1e-9
 """A limit that widens nothing."""
@@ -50,31 +47,7 @@ def gate_settings(
     )
 
 
-def flight_settings(config: FlyConfig, executable: Executable) -> FlightSettings:
-    """Settings of a flight of this policy; raises UserError."""
-    rates, limits, contract = config.rates, config.limits, executable.contract
-    loops = rates.loops(is_dual=executable.dual_rate, play_s=contract.play_s)
-    _require_goal(config, contract)
-    return FlightSettings(
-        stick_period_ns=period_ns(rates.stick_rate),
-        chunk_period_ns=period_ns(loops.action_hz),
-        freshness=effective_freshness(contract, limits).while_played(
-            round(contract.play_s * NS_PER_S)
-        ),
-        meaning=action_meaning(contract, config.link),
-        output=None if config.link.output == "auto" else config.link.output,
-        smoothing=Smoothing(
-            limits=limit_settings(config).of(contract.action),
-            tau_s=TAU_S[contract.action] if limits.tau is None else limits.tau,
-        ),
-        envelope=envelope_limits(config.envelope, _policy_envelope(contract)),
-        engagement=engagement_settings(config, contract),
-        watches_home_height="height" in contract.state_extras,
-        watches_position=bool({"goal", "altitude"} & set(contract.state_extras)),
-    )
-
-
-def _require_goal(config: FlyConfig, contract: Contract) -> None:
+def require_goal(config: FlyConfig, contract: Contract) -> None:
     """Raise UserError unless the flight has a goal just where the policy takes one."""
     if "goal" in contract.state_extras and config.goal is None:
         raise UserError(
@@ -103,7 +76,7 @@ def limit_settings(config: FlyConfig) -> LimitSettings:
     )
 
 
-def _policy_envelope(contract: Contract) -> EnvelopeLimits:
+def policy_envelope(contract: Contract) -> EnvelopeLimits:
     """Envelope that the policy needs; nothing where its contract is silent."""
     return EnvelopeLimits(
         tilt_deg=contract.max_tilt_deg or LEAST,

@@ -3,13 +3,11 @@
 import math
 from typing import NamedTuple
 
-from mavbridge.config.flight import FlyConfig
 from mavbridge.core.clock import NS_PER_S
 from mavbridge.core.errors import PolicyError
-from mavbridge.flight.settings import effective_freshness
+from mavbridge.flight.plan import FlightPlan
 from mavbridge.gate.chunks import PERIOD_TOLERANCE, FreshnessLimits
 from policy.contract import Contract
-from policy.loading.request import LoadedPolicy
 from policy.loading.timing import SolveTimes
 
 CLEARLY = 1.5
@@ -38,16 +36,18 @@ class _Age(NamedTuple):
         return self.reached_s / self.allowed_s
 
 
-def require_speed(config: FlyConfig, loaded: LoadedPolicy) -> tuple[str, ...]:
+def require_speed(plan: FlightPlan, name: str, times: SolveTimes | None) -> tuple[str, ...]:
     """Notes about the policy's speed and rates, for the user.
+
+    Args:
+        plan: of the flight.
+        name: that of the policy.
+        times: of its parts on this computer; None: not measured.
 
     Raises:
         PolicyError: it clearly cannot keep the limits of its own contract; with the figures.
     """
-    executable, times = loaded.executable, loaded.times
-    contract, is_dual = executable.contract, executable.dual_rate
-    rates = config.rates
-    loops = rates.loops(is_dual=is_dual, play_s=contract.play_s)
+    contract, is_dual, loops, rates = plan.contract, plan.is_dual, plan.loops, plan.config.rates
     action_hz, image_hz = loops.action_hz, min((loops.max_vision_hz, *contract.camera_rates_hz))
     flag = "--action-rate" if is_dual else "--rate"
     notes = []
@@ -60,11 +60,11 @@ def require_speed(config: FlyConfig, loaded: LoadedPolicy) -> tuple[str, ...]:
             f"{action_hz:.3g} chunks a second, since this policy is meant to play each one for "
             f"{_text(contract.play_s)}; {flag} asks for another rate"
         )
-    _require_horizon(executable.name, contract, action_hz, flag)
+    _require_horizon(name, contract, action_hz, flag)
     if times is None:
         return tuple(notes)
     figures = f"a chunk takes {_text(times.act_s)} here, an image {_text(times.encode_s)}"
-    limits = effective_freshness(contract, config.limits)
+    limits = plan.start_limits
     worst = _worst(contract, limits, times, action_hz=action_hz, image_hz=image_hz)
     told = (
         f"{figures}; at {action_hz:.3g} chunks and {image_hz:.3g} images a second, {worst.what} up "
@@ -75,7 +75,7 @@ def require_speed(config: FlyConfig, loaded: LoadedPolicy) -> tuple[str, ...]:
         is_by_rate = fastest.share <= CLEARLY
         advice = f"Ask for a higher {flag} or --visual-rate" if is_by_rate else FASTER
         fault = "has too short a horizon" if worst.by == "horizon" else "is too slow"
-        raise PolicyError(f"{executable.name} {fault}: {told}. {advice}")
+        raise PolicyError(f"{name} {fault}: {told}. {advice}")
     if worst.share > 1:
         notes.append(f"warning: {told}: it will coast")
     for what, asked_hz, each_s in (

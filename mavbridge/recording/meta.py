@@ -77,6 +77,8 @@ class FlightMeta:
     """SHA-256 of the policy's files (weights, contract, code), by absolute path."""
     cameras: dict[str, str] = field(default_factory=dict)
     """Source of each camera, by its name in the contract."""
+    plan: dict[str, float] = field(default_factory=dict)
+    """Rates, periods and limits of the flight, as resolved from flags and contract."""
     parameters: dict[str, float] = field(default_factory=dict)
     """Parameters of the autopilot that matter to the flight, by name, as read from it."""
 

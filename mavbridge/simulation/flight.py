@@ -15,7 +15,8 @@ from mavbridge.core.reasons import Code, because
 from mavbridge.core.records import CameraImage
 from mavbridge.flight.bridge import CameraPath, build_bridge
 from mavbridge.flight.observation import observation_ages_ns
-from mavbridge.flight.settings import flight_settings, link_settings
+from mavbridge.flight.plan import plan_flight
+from mavbridge.flight.settings import link_settings
 from mavbridge.gate.departure import Ending
 from mavbridge.gate.loop import GateLoop
 from mavbridge.mavlink.link import MavlinkLink
@@ -172,7 +173,8 @@ class SimulatedFlight:
             goal=self._settings.goal,
             arm=True,
         )
-        loops = config.rates.loops(is_dual=executable.dual_rate, play_s=executable.contract.play_s)
+        plan = plan_flight(config, executable.contract, is_dual=executable.dual_rate)
+        loops = plan.loops
         stalled_ns = self._stalls.end_ns
         to_gate = DelayedChannel(world, hop.samples_ns(self._random(7)), stalled_ns)
         to_flight = DelayedChannel(world, hop.samples_ns(self._random(8)), stalled_ns)
@@ -195,10 +197,10 @@ class SimulatedFlight:
         vision_clocks = [AheadClock(world) for _ in contract.cameras]
         cameras = self._make_cameras(contract, camera_hz=max(loops.max_vision_hz, SIM_CAMERA_HZ))
         send = sender(world, policy_clock, flight_port)
-        send(flight_settings(config, executable))
+        send(plan.gate)
         past_ns = observation_ages_ns(contract)[0]
         bridge = build_bridge(
-            config,
+            plan,
             self._take_time(executable, vision_clocks, policy_clock),
             clock=policy_clock,
             send=send,

@@ -24,7 +24,8 @@ from mavbridge.core.clock import NS_PER_MS, NS_PER_S
 from mavbridge.core.reasons import Code, Reason, because
 from mavbridge.core.vehicle import Sticks
 from mavbridge.flight.bridge import CameraPath, build_bridge
-from mavbridge.flight.settings import flight_settings, link_settings
+from mavbridge.flight.plan import plan_flight
+from mavbridge.flight.settings import link_settings
 from mavbridge.gate.departure import Ending
 from mavbridge.gate.engagement import Act, Phase
 from mavbridge.gate.loop import GateLoop
@@ -144,8 +145,9 @@ class GateFlight:
         executable = self._executable(contract)
         self._horizon = contract.horizon
         self._policy_clock = AheadClock(self.clock)
+        plan = plan_flight(config, contract, is_dual=executable.dual_rate)
         bridge = build_bridge(
-            config,
+            plan,
             executable,
             clock=self._policy_clock,
             send=self._send,
@@ -154,7 +156,7 @@ class GateFlight:
             watches_images=False,
         )
         self.view = bridge.view
-        self.tell(flight_settings(config, executable))
+        self.tell(plan.gate)
         policy = PolicyStepper(
             self.clock, self._policy_clock, self._port, bridge.policy, bridge.view
         )

@@ -14,7 +14,7 @@ from mavbridge.core.reasons import Code, Reason, because
 from mavbridge.core.records import FloatArray, Frame, ImageArray, Tick
 from mavbridge.core.vehicle import Command, Sticks
 from mavbridge.flight.bridge import CameraPath, build_bridge
-from mavbridge.flight.settings import flight_settings
+from mavbridge.flight.plan import plan_flight
 from mavbridge.gate.departure import Ending
 from mavbridge.gate.engagement import Phase
 from mavbridge.gate.loop import GateLoop
@@ -133,9 +133,10 @@ class VirtualFlight:
         self._send = sender(world, self._policy_clock, port)
         gate = GateLoop(world, self.link, MemoryPort(outgoing=to_flight, incoming=to_gate))
         self.link.forward = gate.forward
-        self._send(flight_settings(self.config, executable))
+        plan = plan_flight(self.config, executable.contract, is_dual=executable.dual_rate)
+        self._send(plan.gate)
         bridge = build_bridge(
-            self.config,
+            plan,
             executable,
             clock=self._policy_clock,
             send=self._send,

@@ -15,7 +15,6 @@ from mavbridge.commands.replay.run import CLOCK_TOLERANCE, ENGINE_TOLERANCE
 from mavbridge.core.clock import NS_PER_S
 from mavbridge.core.records import Solve
 from mavbridge.flight.policies import load_configured_policy
-from mavbridge.flight.settings import flight_settings
 from mavbridge.simulation.clock import SteppedClock
 from mavbridge.simulation.replay.compare import (
     PolicyComparison,
@@ -25,8 +24,7 @@ from mavbridge.simulation.replay.compare import (
 )
 from mavbridge.simulation.replay.gate import (
     chunk_of,
-    recorded_executable,
-    recorded_settings,
+    recorded_plan,
     replay_other,
 )
 from mavbridge.simulation.replay.policy import replay_policy
@@ -89,7 +87,7 @@ def test_the_shipped_policy_gets_the_same_inputs_and_decides_the_same_on_any_eng
         if pair.replayed is not None
     }
     steps = through_gate("toge_ardupilot")
-    outputs = replay_other(steps, recorded_settings(source), chunks)
+    outputs = replay_other(steps, recorded_plan(source).gate, chunks)
     assert other_traces(steps, outputs).deviation.most < ENGINE_TOLERANCE
 
 
@@ -108,7 +106,7 @@ def test_other_chunks_go_the_same_way_as_the_recorded_ones(name: str) -> None:
     source, steps = golden(name), through_gate(name)
     chunks = {solve.serial: chunk_of(solve, source.contract) for solve in source.solves}
 
-    traces = other_traces(steps, replay_other(steps, recorded_settings(source), chunks))
+    traces = other_traces(steps, replay_other(steps, recorded_plan(source).gate, chunks))
 
     assert traces.deviation.most == 0
 
@@ -119,7 +117,7 @@ def test_another_low_pass_moves_the_sticks() -> None:
     config = replace(source.config, limits=limits)
     chunks = {solve.serial: chunk_of(solve, source.contract) for solve in source.solves}
 
-    settings = flight_settings(config, recorded_executable(source))
+    settings = recorded_plan(replace(source, config=config)).gate
     traces = other_traces(steps, replay_other(steps, settings, chunks))
 
     assert 0.005 < traces.deviation.most < 1

@@ -22,6 +22,7 @@ from mavbridge.core.errors import PeerError
 from mavbridge.core.reasons import Reason
 from mavbridge.core.records import Event, Tick
 from mavbridge.flight.app import fly_executable, start_gate
+from mavbridge.flight.plan import plan_flight
 from mavbridge.flight.policies import load_configured_policy
 from mavbridge.gate.departure import Ending
 from mavbridge.observe.output import flight_console
@@ -79,7 +80,8 @@ def _measure(
         probe, console = GateProbe(gate.process.pid, clock), flight_console()
         watch = ReleaseWatch(lambda reason: gate.process.send(Ending(reason=reason)))
         sinks = (meter, probe, watch)
-        fly_executable(config, climb, clock=clock, console=console, sinks=sinks, gate=gate)
+        plan = plan_flight(config, climb.contract, is_dual=climb.dual_rate)
+        fly_executable(plan, climb, clock=clock, console=console, sinks=sinks, gate=gate)
         summary = gate.process.summary
     flight = _flight(job.policy, executable.engine, meter, probe)
     if flight.duration_s < LEAST_SHARE * job.duration:

@@ -28,7 +28,8 @@ from mavbridge.core.workers import Worker
 from mavbridge.flight.bridge import Bridge, CameraPath, build_bridge
 from mavbridge.flight.feature_cache import FeatureCache
 from mavbridge.flight.gate_process import GateProcess
-from mavbridge.flight.settings import flight_settings, gate_settings
+from mavbridge.flight.plan import FlightPlan, plan_flight
+from mavbridge.flight.settings import gate_settings
 from mavbridge.gate.departure import Ending
 from policy.contract import ACTION_DIM, ACTION_NAMES, RATE, Contract
 from policy.protocol import Executable
@@ -62,15 +63,16 @@ def main(*, port: int, out: Path) -> None:
     link = replace(settings.link, state_hz=ATTITUDE_HZ)
     gate = GateProcess(replace(settings, link=link), MonotonicClock())
     try:
-        bridge = link_bridge(config, gate, meter)
-        gate.send(flight_settings(config, ROLL_RATE))
+        plan = plan_flight(config, ROLL_RATE.contract, is_dual=ROLL_RATE.dual_rate)
+        bridge = link_bridge(plan, gate, meter)
+        gate.send(plan.gate)
         _serve(bridge, gate, stop)
     finally:
         gate.close()
     out.write_text(to_json(meter.timing()))
 
 
-def link_bridge(config: FlyConfig, gate: GateProcess, meter: "ClientMeter") -> Bridge:
+def link_bridge(plan: FlightPlan, gate: GateProcess, meter: "ClientMeter") -> Bridge:
     """The policy loop and its view of the vehicle; the vision loop is built and never runs."""
     clock, cache = MonotonicClock(), FeatureCache()
     now_ns = clock.now_ns()
@@ -79,7 +81,7 @@ def link_bridge(config: FlyConfig, gate: GateProcess, meter: "ClientMeter") -> B
         FeatureFrame(frame_id=0, captured_ns=now_ns + DAY_NS, ready_ns=now_ns, value=feature)
     )
     return build_bridge(
-        config,
+        plan,
         ROLL_RATE,
         clock=clock,
         send=gate.send,

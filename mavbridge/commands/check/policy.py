@@ -8,8 +8,8 @@ from mavbridge.commands.check.rows import Row, Verdict
 from mavbridge.config.flight import FlyConfig
 from mavbridge.core.clock import Clock
 from mavbridge.core.errors import MavbridgeError
+from mavbridge.flight.plan import plan_flight
 from mavbridge.flight.policies import load_configured_policy
-from mavbridge.flight.settings import flight_settings
 from mavbridge.flight.speed import require_speed
 from policy.contract import Contract
 from policy.loading.request import LoadedPolicy
@@ -68,7 +68,9 @@ def _speed_rows(config: FlyConfig, loaded: LoadedPolicy) -> Iterator[Row]:
     yield from _slot_rows(config, loaded)
     expected = "within the ages of its contract"
     try:
-        notes = require_speed(config, loaded)
+        executable = loaded.executable
+        plan = plan_flight(config, executable.contract, is_dual=executable.dual_rate)
+        notes = require_speed(plan, executable.name, loaded.times)
     except MavbridgeError as error:
         yield _row("speed", "too slow", "no-go", str(error), expected=expected)
         return
@@ -106,10 +108,14 @@ def _contract_rows(config: FlyConfig, executable: Executable) -> list[Row]:
     takes = f"{contract.image_width}x{contract.image_height} of {', '.join(contract.cameras)}"
     found = f"{contract.action}, {contract.state_frame}, {takes}"
     try:
-        flight_settings(config, executable)
+        plan = plan_flight(config, contract, is_dual=executable.dual_rate)
     except MavbridgeError as error:
         return [_row("flags of the flight", found, "no-go", str(error))]
-    return [_row("contract", found, expected="no flag that contradicts it")]
+    figures = ", ".join(f"{name} {value:.4g}" for name, value in plan.figures().items())
+    return [
+        _row("contract", found, expected="no flag that contradicts it"),
+        _row("plan", figures),
+    ]
 
 
 def _row(

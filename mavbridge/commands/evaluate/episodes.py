@@ -25,6 +25,7 @@ from mavbridge.core.clock import NS_PER_MS, NS_PER_S, MonotonicClock
 from mavbridge.core.errors import CameraError, MavbridgeError, PeerError
 from mavbridge.core.processes import END_TIMEOUT_S, end, free_port, running, wait
 from mavbridge.flight.app import fly_executable
+from mavbridge.flight.plan import plan_flight
 from mavbridge.flight.policies import is_scripted, load_configured_policy, load_for_episodes
 from mavbridge.flight.settings import contract_with_ages
 from mavbridge.simulation.delays import Delay, Delays
@@ -221,8 +222,9 @@ def _fly_bridge(job: _BridgeJob, _: Callable[[], bool]) -> _BridgeFlight:
             duration=settings.max_time,
         )
         console = Console(file=nowhere)
+        plan = plan_flight(config, executable.contract, is_dual=executable.dual_rate)
         try:
-            fly_executable(config, executable, clock=clock, console=console, sinks=(meter,))
+            fly_executable(plan, executable, clock=clock, console=console, sinks=(meter,))
         except CameraError as error:
             return _BridgeFlight(executable.engine, meter, str(error))
     return _BridgeFlight(executable.engine, meter, "")

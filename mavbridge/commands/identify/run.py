@@ -14,6 +14,7 @@ from mavbridge.core.errors import PeerError, UserError
 from mavbridge.core.files import require_writable
 from mavbridge.flight.app import fly_executable
 from mavbridge.flight.checks import check_flight
+from mavbridge.flight.plan import plan_flight
 from mavbridge.flight.policies import configured_contract
 from mavbridge.observe.output import flight_console
 from policy.contract import Contract
@@ -39,7 +40,8 @@ def identify(config: IdentifyConfig) -> int:
     check_flight(flight, clock)
     policy, executable = doublet_policy(trained, clock, is_in_air=flight.takeoff is not None)
     recording = ResponseRecording()
-    fly_executable(flight, executable, clock=clock, console=flight_console(), sinks=(recording,))
+    plan = plan_flight(flight, executable.contract, is_dual=executable.dual_rate)
+    fly_executable(plan, executable, clock=clock, console=flight_console(), sinks=(recording,))
     if policy.program_start_s is None:
         raise PeerError("the flight ended before the doublet began: there is nothing to measure")
     found = identify_pushes(recording, contract=trained, program_start_s=policy.program_start_s)

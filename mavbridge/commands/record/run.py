@@ -28,13 +28,13 @@ from mavbridge.core.observers import FanOut, ObserverThread
 from mavbridge.core.ports import Camera, TickSink
 from mavbridge.core.provenance import command_line, git_revision, versions, without_secrets
 from mavbridge.core.reasons import Code, because
-from mavbridge.core.records import FloatArray
 from mavbridge.core.stopping import StopRequest, stop_on_signals
 from mavbridge.core.workers import Worker
 from mavbridge.flight.feature_cache import FeatureCache
 from mavbridge.flight.gate_process import GateProcess
 from mavbridge.flight.history import SentHistory
-from mavbridge.flight.settings import flight_settings, gate_settings
+from mavbridge.flight.plan import plan_flight
+from mavbridge.flight.settings import gate_settings
 from mavbridge.flight.state import Freshness
 from mavbridge.flight.vision_loop import VisionLoop
 from mavbridge.gate.departure import Ending
@@ -46,7 +46,6 @@ from mavbridge.observe.viewer.flight import RerunView
 from mavbridge.observe.viewer.layout import ViewedFlight
 from mavbridge.recording.meta import FlightMeta
 from policy.contract import Contract
-from policy.protocol import Executable
 
 STEP_S = 0.05
 MAX_KEYS = 64
@@ -110,22 +109,6 @@ def listening_gate(config: RecordConfig, clock: Clock) -> GateSettings:
     return replace(settings, link=link)
 
 
-def nobody() -> Executable:
-    """A policy that is never asked: its contract alone counts."""
-
-    def act(_f: FloatArray, _s: FloatArray, _h: FloatArray) -> FloatArray:
-        raise AssertionError("a recording has no policy loop")
-
-    return Executable(
-        contract=CONTRACT,
-        name="pilot",
-        engine="none",
-        dual_rate=True,
-        encode=lambda _image, _camera=0, /: NOTHING.copy(),
-        act=act,
-    )
-
-
 class _Session:
     """Everything that is opened goes on the exit stack at once."""
 
@@ -159,7 +142,7 @@ class _Session:
             report=self.screen.show_message,
         )
         sink = FanOut((self.screen, self._episodes, *viewer))
-        flight = flight_settings(pilot_flight(config), nobody())
+        flight = plan_flight(pilot_flight(config), CONTRACT, is_dual=True).gate
         self._view = PilotView(
             history=SentHistory(length=CONTRACT.history_len, dt_s=CONTRACT.history_dt_s),
             sink=sink,
@@ -191,7 +174,7 @@ class _Session:
         frame_ns = period_ns(self._config.film.visual_rate)
         return VisionLoop(
             camera=camera,
-            encode=nobody().encode,
+            encode=lambda _image: NOTHING.copy(),
             cache=self._images,
             sink=sink,
             clock=self._clock,

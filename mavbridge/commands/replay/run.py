@@ -16,24 +16,22 @@ from mavbridge.config.trust import foreign_policy
 from mavbridge.core.clock import NS_PER_S
 from mavbridge.core.errors import ExitCode, UserError
 from mavbridge.core.records import FeatureFrame
+from mavbridge.flight.plan import plan_flight
 from mavbridge.flight.policies import is_scripted, load_configured_policy
-from mavbridge.flight.settings import flight_settings
 from mavbridge.gate.chunks import Chunk
 from mavbridge.recording.flight_folder import open_flight
 from mavbridge.recording.folder import require_extra
 from mavbridge.simulation.clock import SteppedClock
 from mavbridge.simulation.replay.compare import (
     PolicyComparison,
-    StickTraces,
     compare_gate,
     compare_policy,
     gate_traces,
     other_traces,
 )
 from mavbridge.simulation.replay.gate import (
-    GateStep,
     chunk_of,
-    recorded_executable,
+    recorded_plan,
     replay_gate,
     replay_other,
 )
@@ -73,13 +71,15 @@ def replay(folder: Path, config: ReplayConfig) -> int:
     print_status(f"replaying {len(source.ticks)} ticks of {folder} through the gate")
     steps = replay_gate(source)
     flown = replace(source, config=other_config(source.config, config))
-    executable = recorded_executable(flown)
+    plan, engine = recorded_plan(flown), source.meta.engine or ""
     chunks = {solve.serial: chunk_of(solve, source.contract) for solve in source.solves}
     compared: PolicyComparison | None = None
     if chosen != "chunks":
         clock = SteppedClock(source.solves[0].started_ns - NS_PER_S)
         with load_configured_policy(flown.config.policy, clock) as loaded:
             executable = loaded.executable
+            engine = executable.engine
+            plan = plan_flight(flown.config, executable.contract, is_dual=executable.dual_rate)
             pairs = _replayed(flown, executable, clock, chosen)
         compared = compare_policy(pairs)
         chunks = _other_chunks(executable, pairs)
@@ -87,7 +87,7 @@ def replay(folder: Path, config: ReplayConfig) -> int:
     if is_same and not config.changes_limits:
         traces = gate_traces(steps)
     else:
-        traces = _other_traces(flown, executable, steps, chunks)
+        traces = other_traces(steps, replay_other(steps, plan.gate, chunks))
     if chosen == "video":
         names = (None, *source.contract.cameras[1:])
         damage = [text for name in names for text in open_flight(folder, name).damage]
@@ -95,7 +95,7 @@ def replay(folder: Path, config: ReplayConfig) -> int:
     result = ReplayResult(
         source=source,
         chosen=chosen,
-        engine=executable.engine if compared else None,
+        engine=engine if compared else None,
         policy=compared,
         gate=compare_gate(steps),
         sticks=traces,
@@ -103,7 +103,7 @@ def replay(folder: Path, config: ReplayConfig) -> int:
             config,
             chosen,
             recorded_engine=source.meta.engine,
-            engine=executable.engine,
+            engine=engine,
             is_scripted=is_scripted(flown.config.policy),
         ),
     )
@@ -253,16 +253,6 @@ def _other_chunks(executable: Executable, pairs: Sequence[SolvePair]) -> dict[in
         for pair in pairs
         if pair.replayed is not None
     }
-
-
-def _other_traces(
-    source: ReplaySource,
-    executable: Executable,
-    steps: Sequence[GateStep],
-    chunks: dict[int, Chunk],
-) -> StickTraces:
-    settings = flight_settings(source.config, executable)
-    return other_traces(steps, replay_other(steps, settings, chunks))
 
 
 def _write(result: ReplayResult, config: ReplayConfig) -> None:

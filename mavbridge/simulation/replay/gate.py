@@ -17,8 +17,9 @@ from mavbridge.core.reasons import Code, Kind, because
 from mavbridge.core.records import Solve, Tick
 from mavbridge.core.vehicle import Action, LinkSnapshot
 from mavbridge.flight.action_frames import action_frame
+from mavbridge.flight.plan import FlightPlan, plan_flight
 from mavbridge.flight.policy_loop import make_chunk
-from mavbridge.flight.settings import flight_settings, link_settings
+from mavbridge.flight.settings import link_settings
 from mavbridge.gate.chunks import Chunk
 from mavbridge.gate.departure import Ending
 from mavbridge.gate.engagement import Act, Phase
@@ -31,7 +32,6 @@ from mavbridge.simulation.clock import SteppedClock
 from mavbridge.simulation.network import VEHICLE
 from mavbridge.simulation.replay.recording import RecordedPacket, ReplaySource
 from policy.contract import Contract
-from policy.protocol import Executable
 
 PREPARE_NS = 10 * NS_PER_MS
 """Longest time between two looks at the link, as while no policy is loaded."""
@@ -70,25 +70,9 @@ def chunk_of(solve: Solve, contract: Contract) -> Chunk:
     )
 
 
-def recorded_settings(source: ReplaySource) -> FlightSettings:
-    """Settings that the gate had; nothing is loaded for them."""
-    return flight_settings(source.config, recorded_executable(source))
-
-
-def recorded_executable(source: ReplaySource) -> Executable:
-    """The policy of the flight without its weights: its contract and its rates."""
-
-    def refuse(*_: object) -> None:
-        raise RuntimeError("the settings of the gate need no network")
-
-    return Executable(
-        contract=source.contract,
-        name=source.meta.policy or "",
-        engine=source.meta.engine or "",
-        dual_rate=source.meta.mode == "dual",
-        encode=refuse,  # type: ignore[arg-type]
-        act=refuse,  # type: ignore[arg-type]
-    )
+def recorded_plan(source: ReplaySource) -> FlightPlan:
+    """Plan of the recorded flight."""
+    return plan_flight(source.config, source.contract, is_dual=source.meta.mode == "dual")
 
 
 def replay_gate(source: ReplaySource) -> list[GateStep]:
@@ -101,9 +85,10 @@ def replay_gate(source: ReplaySource) -> list[GateStep]:
     link = _link(source, clock, transport)
     port = _RecordedPort(clock)
     loop = GateLoop(clock, link, port)
-    port.inbox.append(encode_to_gate(recorded_settings(source)))
+    settings = recorded_plan(source).gate
+    port.inbox.append(encode_to_gate(settings))
     # The grid begins where the gate gets its settings.
-    port.begin_ns = ticks[0].due_ns - ticks[0].index * recorded_settings(source).stick_period_ns
+    port.begin_ns = ticks[0].due_ns - ticks[0].index * settings.stick_period_ns
     steps = []
     for arrivals in _arrivals(source):
         tick = arrivals.tick
@@ -256,7 +241,7 @@ def _link(
     source: ReplaySource, clock: SteppedClock, transport: "_RecordedTransport"
 ) -> _WatchedLink:
     config: FlyConfig = source.config
-    loops = config.rates.loops(is_dual=source.meta.mode == "dual")
+    loops = recorded_plan(source).loops
     settings = link_settings(
         config.link,
         state_hz=loops.state_hz,

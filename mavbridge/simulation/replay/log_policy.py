@@ -22,6 +22,7 @@ from mavbridge.core.vehicle import ForwardedPacket, Sticks
 from mavbridge.flight.bridge import CameraPath, build_bridge
 from mavbridge.flight.feature_cache import FeatureCache
 from mavbridge.flight.observation import observation_ages_ns
+from mavbridge.flight.plan import plan_flight
 from mavbridge.flight.settings import action_meaning
 from mavbridge.gate.chunks import Chunk
 from mavbridge.gate.engagement import Phase
@@ -125,7 +126,7 @@ class LogReplay:
         self._ticks = 0
         self._cache = FeatureCache(span_ns=observation_ages_ns(contract)[0])
         self._bridge = build_bridge(
-            config,
+            plan_flight(config, contract, is_dual=executable.dual_rate),
             executable,
             clock=self._clock,
             send=self._sent,

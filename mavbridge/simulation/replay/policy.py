@@ -23,7 +23,6 @@ from mavbridge.core.vehicle import ForwardedPacket, Telemetry
 from mavbridge.flight.bridge import CameraPath, build_bridge
 from mavbridge.flight.feature_cache import FeatureCache
 from mavbridge.flight.observation import observation_ages_ns
-from mavbridge.flight.settings import effective_freshness
 from mavbridge.flight.state import Freshness
 from mavbridge.flight.state_reader import StateReader
 from mavbridge.flight.vehicle_view import VehicleView
@@ -34,6 +33,7 @@ from mavbridge.mavlink.codec.messages import Measurement
 from mavbridge.mavlink.codec.packets import Codec
 from mavbridge.mavlink.session.telemetry import TelemetryCollector
 from mavbridge.simulation.clock import SteppedClock
+from mavbridge.simulation.replay.gate import recorded_plan
 from mavbridge.simulation.replay.recording import RecordedPacket, ReplaySource
 from policy.protocol import Executable
 
@@ -92,7 +92,7 @@ class _Loop:
         span_ns = observation_ages_ns(contract)[0]
         self.caches = [FeatureCache(span_ns=span_ns) for _ in contract.cameras]
         bridge = build_bridge(
-            source.config,
+            recorded_plan(source),
             replace(executable, act=self._timed_act),
             clock=clock,
             send=self._sent,
@@ -172,7 +172,7 @@ class _News:
         self._packets = [p for p in source.packets if p.happened_ns is not None]
         self._telemetry = _telemetry(self._packets)
         self._stamps = np.array([_stamps_ns(now) for now in self._telemetry]).reshape(-1, 4)
-        limits = effective_freshness(source.contract, source.config.limits)
+        limits = recorded_plan(source).start_limits
         self._reader = StateReader(
             source.contract,
             freshness=Freshness(attitude_ns=limits.state_ns, velocity_ns=limits.velocity_ns),

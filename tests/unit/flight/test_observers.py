@@ -10,6 +10,7 @@ from rich.console import Console
 from helpers.fakes import FakeClock
 from mavbridge.config.flight import FlyConfig
 from mavbridge.flight.observers import FlightObservers
+from mavbridge.flight.plan import plan_flight
 from policy.contract import Contract
 from policy.engines.executable import ExecutionSettings, make_numpy_executable
 
@@ -28,8 +29,8 @@ def observers(report: Path, said: io.StringIO) -> FlightObservers:
         Hovering(), ExecutionSettings(name="hovering", dual_rate=False)
     )
     console = Console(file=said, width=200)
-    config = FlyConfig(report=report)
-    return FlightObservers(config, executable, clock=FakeClock(), console=console)
+    plan = plan_flight(FlyConfig(report=report), executable.contract, is_dual=False)
+    return FlightObservers(plan, executable, clock=FakeClock(), console=console)
 
 
 def test_a_report_that_cannot_be_written_is_said(tmp_path: Path) -> None:

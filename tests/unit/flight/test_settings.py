@@ -9,7 +9,8 @@ from mavbridge.config.flight import EnvelopeConfig, FlyConfig, Limits, LinkConfi
 from mavbridge.config.rates import Rates
 from mavbridge.core.errors import UserError
 from mavbridge.core.vehicle import ActionMeaning, StickGains
-from mavbridge.flight.settings import action_meaning, flight_settings, gate_settings
+from mavbridge.flight.plan import plan_flight
+from mavbridge.flight.settings import action_meaning, gate_settings
 from mavbridge.gate.departure import DepartureSettings
 from mavbridge.gate.engagement import EngagementSettings
 from mavbridge.gate.gate import FlightSettings
@@ -31,7 +32,8 @@ def settings_for(
         encode=lambda rgb: rgb,
         act=lambda *inputs: inputs[0],
     )
-    return flight_settings(config or FlyConfig(link=LINK), executable)
+    contract, is_dual = executable.contract, executable.dual_rate
+    return plan_flight(config or FlyConfig(link=LINK), contract, is_dual=is_dual).gate
 
 
 def test_the_process_is_told_what_the_flags_say(

@@ -2,17 +2,15 @@
 
 from dataclasses import replace
 
-import numpy as np
 import pytest
 
 from mavbridge.config.flight import FlyConfig, LinkConfig
 from mavbridge.config.rates import Rates
 from mavbridge.core.errors import PolicyError
+from mavbridge.flight.plan import plan_flight
 from mavbridge.flight.speed import require_speed
 from policy.contract import Contract
-from policy.loading.request import LoadedPolicy
 from policy.loading.timing import SolveTimes
-from policy.protocol import Executable
 
 CONTRACT = Contract(feature_dim=1, arrays="numpy", horizon=100)
 
@@ -26,20 +24,12 @@ def notes_of(
     contract: Contract = CONTRACT,
 ) -> str:
     """What the user is told where a policy takes so long; its horizon is 5 s."""
-    executable = Executable(
-        contract=contract,
-        name="test",
-        engine="numpy",
-        dual_rate=is_dual,
-        encode=lambda rgb, camera=0: np.zeros((1, 1), np.float32),
-        act=lambda *inputs: np.zeros((1, 100, 4), np.float32),
-    )
     times = None
     if act_ms is not None:
         times = SolveTimes(encode_s=encode_ms / 1e3, act_s=act_ms / 1e3)
     config = FlyConfig(link=LinkConfig(connect="memory"), rates=Rates(rate=hz, action_rate=hz))
-    loaded = LoadedPolicy(executable=executable, notes=(), times=times)
-    return "; ".join(require_speed(config, loaded))
+    plan = plan_flight(config, contract, is_dual=is_dual)
+    return "; ".join(require_speed(plan, "test", times))
 
 
 def playing(play_s: float) -> Contract:
@@ -138,13 +128,5 @@ def test_where_nothing_could_be_measured_nothing_is_refused() -> None:
 def test_a_rate_of_the_other_mode_is_not_ignored_in_silence(
     is_dual: bool, rates: Rates, told: str | None
 ) -> None:
-    executable = Executable(
-        contract=CONTRACT,
-        name="test",
-        engine="numpy",
-        dual_rate=is_dual,
-        encode=lambda rgb, camera=0: np.zeros((1, 1), np.float32),
-        act=lambda *inputs: np.zeros((1, 100, 4), np.float32),
-    )
-    loaded = LoadedPolicy(executable=executable, notes=())
-    assert require_speed(FlyConfig(rates=rates), loaded) == (() if told is None else (told,))
+    plan = plan_flight(FlyConfig(rates=rates), CONTRACT, is_dual=is_dual)
+    assert require_speed(plan, "test", None) == (() if told is None else (told,))

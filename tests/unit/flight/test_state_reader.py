@@ -10,7 +10,7 @@ from mavbridge.core.clock import NS_PER_MS
 from mavbridge.core.errors import UserError
 from mavbridge.core.records import VehicleState
 from mavbridge.core.vehicle import Reading, Release, Telemetry
-from mavbridge.flight.settings import flight_settings
+from mavbridge.flight.plan import plan_flight
 from mavbridge.flight.state import Freshness
 from mavbridge.flight.state_reader import StateReader
 from policy.contract import Contract, StateExtra
@@ -119,7 +119,7 @@ def test_a_goal_is_given_just_where_the_policy_takes_one() -> None:
             encode=lambda rgb, camera=0: np.zeros((1, 1), np.float32),
             act=lambda e, s, h: e,
         )
-        return flight_settings(config(goal), executable)
+        return plan_flight(config(goal), executable.contract, is_dual=executable.dual_rate).gate
 
     assert config("-10.5, 2,-3").goal_ned_m == (-10.5, 2.0, -3.0)
     with pytest.raises(UserError, match="this policy flies to a goal: give --goal"):

@@ -9,9 +9,9 @@ import pytest
 from helpers.recordings import make_meta
 from mavbridge.__main__ import main
 from mavbridge.commands.record.config import ListenConfig, RecordConfig
-from mavbridge.commands.record.run import listening_gate, nobody, pilot_flight
+from mavbridge.commands.record.run import CONTRACT, listening_gate, pilot_flight
 from mavbridge.core.clock import NS_PER_S, MonotonicClock
-from mavbridge.flight.settings import flight_settings
+from mavbridge.flight.plan import plan_flight
 from mavbridge.recording.meta import write_meta
 
 CONNECT = ("--connect", "udp:127.0.0.1:14999")
@@ -22,7 +22,7 @@ def test_the_gate_only_listens_and_asks_for_the_pilots_sticks_at_the_rate(tmp_pa
     gate = listening_gate(config, MonotonicClock())
     assert gate.link.readonly
     assert (gate.link.pilot_hz, gate.link.state_hz) == (50.0, 50.0)
-    flight = flight_settings(pilot_flight(config), nobody())
+    flight = plan_flight(pilot_flight(config), CONTRACT, is_dual=True).gate
     assert flight.engagement.readonly
     assert flight.stick_period_ns == NS_PER_S // 50
     assert flight.meaning.stick_gains is not None, "the vehicle's sticks in a policy's terms"

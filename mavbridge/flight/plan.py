@@ -1,0 +1,90 @@
+"""All that follows from the flags and the contract of a flight, resolved once."""
+
+from dataclasses import dataclass
+
+from mavbridge.config.flight import FlyConfig
+from mavbridge.config.rates import LoopRates
+from mavbridge.core.clock import NS_PER_S, period_ns
+from mavbridge.flight.settings import (
+    TAU_S,
+    action_meaning,
+    effective_freshness,
+    engagement_settings,
+    envelope_limits,
+    limit_settings,
+    policy_envelope,
+    require_goal,
+)
+from mavbridge.gate.chunks import FreshnessLimits
+from mavbridge.gate.gate import FlightSettings
+from mavbridge.gate.smoothing import Smoothing
+from policy.contract import Contract
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class FlightPlan:
+    """Made by ``plan_flight`` alone, and handed down."""
+
+    config: FlyConfig
+    contract: Contract
+    is_dual: bool
+    loops: LoopRates
+    start_limits: FreshnessLimits
+    """Oldest inputs from which a chunk may be computed."""
+    gate: FlightSettings
+    """Settings of the gate; its ``freshness`` holds while a chunk is played."""
+
+    def figures(self) -> dict[str, float]:
+        """Rates, periods and limits by their names, for people and for ``meta.json``."""
+        limits, smoothing, envelope = self.gate.freshness, self.gate.smoothing, self.gate.envelope
+        return {
+            "vision_hz": self.loops.max_vision_hz,
+            "action_hz": self.loops.action_hz,
+            "stick_hz": self.config.rates.stick_rate,
+            "state_hz": self.loops.state_hz,
+            "max_attitude_age_s": limits.state_ns / NS_PER_S,
+            "max_velocity_age_s": limits.velocity_ns / NS_PER_S,
+            "max_feature_age_s": limits.feature_ns / NS_PER_S,
+            "max_chunk_age_s": limits.chunk_ns / NS_PER_S,
+            "max_stall_s": limits.stall_ns / NS_PER_S,
+            "tau_s": smoothing.tau_s,
+            "max_tilt_deg": envelope.tilt_deg,
+            "max_height_m": envelope.height_m,
+            "max_speed_mps": envelope.speed_mps,
+            "max_distance_m": envelope.distance_m,
+        }
+
+
+def plan_flight(config: FlyConfig, contract: Contract, *, is_dual: bool) -> FlightPlan:
+    """Resolve the flags of a flight of a policy with this contract.
+
+    Raises:
+        UserError: a flag contradicts the contract.
+    """
+    rates, limits = config.rates, config.limits
+    loops = rates.loops(is_dual=is_dual, play_s=contract.play_s)
+    start_limits = effective_freshness(contract, limits)
+    require_goal(config, contract)
+    gate = FlightSettings(
+        stick_period_ns=period_ns(rates.stick_rate),
+        chunk_period_ns=period_ns(loops.action_hz),
+        freshness=start_limits.while_played(round(contract.play_s * NS_PER_S)),
+        meaning=action_meaning(contract, config.link),
+        output=None if config.link.output == "auto" else config.link.output,
+        smoothing=Smoothing(
+            limits=limit_settings(config).of(contract.action),
+            tau_s=TAU_S[contract.action] if limits.tau is None else limits.tau,
+        ),
+        envelope=envelope_limits(config.envelope, policy_envelope(contract)),
+        engagement=engagement_settings(config, contract),
+        watches_home_height="height" in contract.state_extras,
+        watches_position=bool({"goal", "altitude"} & set(contract.state_extras)),
+    )
+    return FlightPlan(
+        config=config,
+        contract=contract,
+        is_dual=is_dual,
+        loops=loops,
+        start_limits=start_limits,
+        gate=gate,
+    )
