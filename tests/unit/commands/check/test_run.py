@@ -71,7 +71,7 @@ def test_a_net_without_its_camera_is_a_no_go(capsys: pytest.CaptureFixture[str])
 def test_a_policy_tells_its_engine_speed_and_contract() -> None:
     findings = check_policy(flight("scripted:square:velocity"), MonotonicClock())
     names = [row.name for row in findings.rows]
-    assert names == ["engine", "time for a chunk", "time for an image", "contract"]
+    assert names == ["engine", "time for a chunk", "time for an image", "contract", "plan"]
     assert findings.contract is not None
     assert findings.contract.action == "velocity"
 
