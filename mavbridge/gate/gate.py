@@ -320,7 +320,7 @@ class Gate:
             case None:
                 return None, None
             case Hand.RELEASE:
-                return Release(self._engagement.reason or because(Code.OPERATOR)), None
+                return Release(self._engagement.reason or because(Code.NOT_ENGAGED)), None
             case Hand.IDLE:
                 action = self._idle
             case Hand.NEUTRAL:
@@ -347,7 +347,7 @@ class Gate:
         if hand is None:
             return None
         if hand is Hand.RELEASE:
-            return Release(self._engagement.reason or because(Code.OPERATOR))
+            return Release(self._engagement.reason or because(Code.NOT_ENGAGED))
         resting = {Hand.IDLE: self._idle, Hand.NEUTRAL: self._neutral}
         return Command(action=resting.get(hand) or self._level(is_thrust=True))
 

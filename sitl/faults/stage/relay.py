@@ -113,7 +113,7 @@ class Sent(NamedTuple):
             )
         if self.name == "MANUAL_CONTROL":
             message = self.message
-            return bool(max(abs(message.x), abs(message.y), abs(message.r)) > 2 * NUDGE_US)
+            return bool(max(abs(message.x), abs(message.y), abs(message.r)) > NUDGE_US)
         return False
 
     @property

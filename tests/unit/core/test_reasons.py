@@ -1,10 +1,14 @@
 """Each reason has a kind and a sentence, and comes through JSON as it was."""
 
+import ast
 import json
 import string
+from collections.abc import Iterator
+from pathlib import Path
 
 import pytest
 
+import mavbridge
 from mavbridge.core import reasons
 from mavbridge.core.reasons import (
     Code,
@@ -15,6 +19,7 @@ from mavbridge.core.reasons import (
     reason_to_json,
 )
 
+FORMATTER = string.Formatter()
 DISARMED = because(Code.DISARMED)
 LATE = {"quantity": "attitude", "age_ms": 104.2, "limit_ms": 100.0, "spent_ms": 131.0}
 
@@ -23,7 +28,7 @@ def example(code: Code) -> Reason:
     """A reason with every figure that its sentence names."""
     _, text = reasons._REASONS[code]
     data: dict[str, reasons.Value] = {}
-    for _, name, spec, _ in string.Formatter().parse(text):
+    for _, name, spec, _ in FORMATTER.parse(text):
         if name is not None:
             data[name] = 1.5 if spec else "a word"
     if code in (Code.LATE, Code.PAST_HORIZON):
@@ -97,3 +102,33 @@ def test_a_reason_inside_another_keeps_its_code_and_gives_its_kind() -> None:
 def test_what_is_no_reason_is_refused(document: dict[str, object]) -> None:
     with pytest.raises((KeyError, TypeError, ValueError)):
         reason_from_json(document)
+
+
+def _calls() -> Iterator[tuple[str, Code, set[str]]]:
+    """Place, code and names of the figures of each ``because(Code.X, ...)`` in the source."""
+    for path in sorted(Path(mavbridge.__file__).parent.rglob("*.py")):
+        for node in ast.walk(ast.parse(path.read_text())):
+            match node:
+                case ast.Call(
+                    func=ast.Name(id="because"),
+                    args=[ast.Attribute(value=ast.Name(id="Code"), attr=name)],
+                    keywords=keywords,
+                ):
+                    figures = {each.arg for each in keywords if each.arg is not None}
+                    if len(figures) == len(keywords):  # no **figures
+                        yield f"{path.name}:{node.lineno}", Code[name], figures
+
+
+def test_each_reason_that_the_source_makes_has_the_figures_of_its_sentence() -> None:
+    calls = list(_calls())
+    assert len(calls) > 80
+    wrong = [
+        (place, code)
+        for place, code, figures in calls
+        if not figures >= {name for _, name, _, _ in FORMATTER.parse(_text(code)) if name}
+    ]
+    assert not wrong
+
+
+def _text(code: Code) -> str:
+    return reasons._REASONS[code][1]
