@@ -17,7 +17,7 @@ from mavbridge.gate.outcome import Outcome
 NOTHING = Move()
 LOW, HIGH = (1500,) * 7 + (1000,), (1500,) * 7 + (2000,)
 NO_RECEIVER = replace(AIRBORNE, has_receiver=False, pilot_sticks=None)
-FAULT = {"chunk_fault": "no chunk"}
+FAULT = {"chunk_fault": because(Code.NO_CHUNK)}
 OVER = Ending(reason=because(Code.DURATION))
 
 
@@ -177,9 +177,13 @@ def test_the_way_in_may_take_90_s_and_the_time_of_a_climb_at_1_mps(
     assert stepped.phase is Phase.PREPARING
     stepped.step()
     assert stepped.phase is Phase.RELEASING
-    assert stepped.engagement.failure == (
-        f"the vehicle is not ready after {limit_s} s (mode ALT_HOLD, armed False, "
-        "overrides seen False, inputs no image): see its messages above"
+    assert stepped.engagement.failure == because(
+        Code.NOT_READY,
+        after_s=limit_s,
+        mode="ALT_HOLD",
+        is_armed=False,
+        is_echoed=False,
+        inputs=because(Code.NO_IMAGE),
     )
 
 
@@ -462,7 +466,7 @@ def test_a_release_is_repeated_until_it_shows_or_for_so_long(
     assert {move.hand for move in stepped.run(limit_s - 0.01)} == {Hand.RELEASE}
     assert stepped.step() == NOTHING
     assert stepped.phase is Phase.RELEASED
-    assert "not known" in (stepped.engagement.refusal or "")
+    assert stepped.engagement.refusal == because(Code.RELEASE_NOT_SEEN)
 
 
 def test_a_release_that_is_confirmed_is_told_without_doubt() -> None:
@@ -517,7 +521,7 @@ def test_an_act_in_a_mode_of_setpoints_that_is_late_is_left_as_after_a_fault() -
     stepped.run(3)
     assert "AUTO.LAND" in {move.mode for move in stepped.moves}
     assert "AUTO.RTL" not in {move.mode for move in stepped.moves}
-    assert stepped.reason == stepped.engagement.refusal
+    assert stepped.engagement.reason == stepped.engagement.refusal
     assert stepped.engagement.failure is None
 
 

@@ -497,7 +497,7 @@ def test_the_first_reason_to_end_is_the_one_that_counts() -> None:
     rig.loop.stop(Ending(reason=because(Code.TOLD_TO_END)))
     rig.tell(Ending(reason=because(Code.POLICY_FAILED), is_fault=True))
     rig.run(1.0)
-    assert rig.link.hands[-1] == Release("the gate was told to end")
+    assert rig.link.hands[-1] == Release(because(Code.TOLD_TO_END))
     assert rig.loop.is_done
 
 

@@ -119,9 +119,8 @@ def test_a_policy_of_setpoints_is_not_engaged_in_a_mode_of_sticks() -> None:
     stepped = Stepped(AIRBORNE, is_setpoint=True, modes=("GUIDED",))
     stepped.step()
     stepped.step("engage")
-    refusal = stepped.engagement.refusal
-    assert refusal is not None
-    assert "only in GUIDED: change the mode, or use --mode" in refusal
+    wrong = because(Code.WRONG_MODE, mode="ALT_HOLD", allowed="GUIDED")
+    assert stepped.engagement.refusal == because(Code.NOT_ENGAGED_SINCE, why=wrong)
     assert flying().phase is Phase.FLYING
 
 

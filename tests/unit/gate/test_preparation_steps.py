@@ -29,8 +29,9 @@ def test_the_first_step_asks_at_once_and_the_second_a_second_later() -> None:
 
 
 def test_an_objection_is_what_it_waits_for_and_nothing_is_asked() -> None:
-    move, waits_for = begun(GROUND).step(GROUND, "the chunk is old")
-    assert (move.hand, move.mode, waits_for) == (Hand.IDLE, None, "the chunk is old")
+    objection = because(Code.NO_CHUNK)
+    move, waits_for = begun(GROUND).step(GROUND, objection)
+    assert (move.hand, move.mode, waits_for) == (Hand.IDLE, None, objection)
 
 
 def test_a_mode_is_asked_of_an_armed_vehicle_that_shows_no_sticks_of_ours() -> None:
@@ -45,7 +46,7 @@ def test_one_that_we_armed_is_idle_until_the_policy_takes_it() -> None:
     ready = replace(GROUND, mode="ALT_HOLD", armed=True)
     assert preparation.step(ready, None) == preparation.step(ready, None)
     move, waits_for = preparation.step(ready, None)
-    assert (move.hand, waits_for) == (Hand.IDLE, "")
+    assert (move.hand, waits_for) == (Hand.IDLE, None)
     # Silence while the link has a problem: it stands on the ground.
     assert (
         preparation.step(
@@ -122,7 +123,8 @@ def test_the_climb_is_asked_for_in_the_step_that_sees_it_armed() -> None:
     preparation = begun(replace(GROUND, mode="GUIDED"), takeoff_m=10.0)
     armed = replace(GROUND, mode="GUIDED", armed=True)
     move, waits_for = preparation.step(armed, None)
-    assert (move.hand, move.takeoff_m, waits_for) == (Hand.NEUTRAL, 10.0, "taking off to 10 m")
+    told = because(Code.TAKING_OFF, height_m=10.0)
+    assert (move.hand, move.takeoff_m, waits_for) == (Hand.NEUTRAL, 10.0, told)
 
 
 def test_a_climb_that_has_begun_is_not_asked_for_again() -> None:

@@ -94,8 +94,8 @@ STATS = LinkStats(
 SUMMARY = GateSummary(
     autopilot="PX4",
     link=STATS,
-    failure="did not arm",
-    outcome=Outcome(flights=2, has_left_ground=True, faults=1, is_disarmed=False),
+    failure=because(Code.NO_CHUNK_SINCE_RESET, why=because(Code.NO_IMAGE)),
+    outcome=Outcome(flights=2, faults=1, end="fault", fault=because(Code.IMAGE_FROZEN, age_s=0.6)),
     params={"RC_OVERRIDE_TIME": 0.5},
     dropped_messages=1,
     dropped_packets=2,
