@@ -97,8 +97,8 @@ def test_yaw_is_no_tilt() -> None:
         ),
         ({"is_position_valid": False}, because(Code.ESTIMATOR_LOST)),
         (
-            {"battery_problem": "the battery is at 8 %"},
-            because(Code.BATTERY, said="the battery is at 8 %"),
+            {"battery_problem": "8 %"},
+            because(Code.BATTERY, said="8 %"),
         ),
         ({"is_landed": True}, because(Code.LANDED)),
     ],

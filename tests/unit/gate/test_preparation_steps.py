@@ -148,13 +148,13 @@ def test_nine_tenths_of_the_height_are_enough_and_count_from_where_it_stood() ->
 def test_a_climb_whose_height_is_lost_for_a_moment_goes_on() -> None:
     preparation = begun(replace(GROUND, mode="GUIDED"), takeoff_m=10.0)
     climbing = replace(GROUND, mode="GUIDED", armed=True, height_m=None)
-    assert "waiting for a position" in preparation.step(climbing, None).waits_for
+    assert preparation.step(climbing, None).waits_for == because(Code.TAKEOFF_NEEDS_POSITION)
     assert preparation.is_taking_off
 
 
 def test_without_a_takeoff_no_height_is_needed() -> None:
     facts = replace(GROUND, mode="ALT_HOLD", height_m=None)
-    assert begun(facts).step(facts, None).waits_for == "waiting for the vehicle to arm"
+    assert begun(facts).step(facts, None).waits_for == because(Code.WAITING_FOR_ARMING)
 
 
 def test_the_mode_in_which_it_climbs_is_left_to_the_autopilot() -> None:
