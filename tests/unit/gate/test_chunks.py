@@ -262,8 +262,9 @@ def test_chunks_that_are_farther_apart_than_one_may_be_flown_begin_no_flight() -
     slow = buffer(500)
     for serial, now_ms in enumerate((1000, 1500, 2000), start=1):
         slow.offer(chunk(serial, now_ms), now_ms * MS)
+    assert codes(slow.problem(2000 * MS)) == (Code.CHUNKS_APART,)
     assert figures(slow.problem(2000 * MS), "gap_ms", "bridged_ms") == (500, 195)
-    assert "ask for a higher rate" in str(slow.problem(2000 * MS))
+    assert "ask for a higher rate" in str(slow.problem(2000 * MS)), "the user is told what to do"
 
 
 STALL = replace(LIMITS, stall_ns=300 * MS)
@@ -333,6 +334,7 @@ def test_a_policy_whose_chunks_come_as_seldom_as_a_stall_begins_no_flight() -> N
     held = buffer(10, STALL)
     for serial, now_ms in enumerate((1000, 1250, 1500), start=1):
         held.offer(chunk(serial, now_ms), now_ms * MS)
+    assert codes(held.problem(1500 * MS)) == (Code.CHUNKS_APART,)
     assert figures(held.problem(1500 * MS), "gap_ms", "bridged_ms") == (250, 100)
 
 
@@ -358,8 +360,9 @@ def test_a_flight_may_begin_after_three_chunks_in_time() -> None:
 @pytest.mark.parametrize("gaps_ms", [(101, 10), (10, 101)])
 def test_one_chunk_of_the_last_few_that_was_late_begins_no_flight(gaps_ms: tuple[int, ...]) -> None:
     held, now_ns = began(10, *gaps_ms)
+    assert codes(held.problem(now_ns)) == (Code.CHUNKS_APART,)
     assert figures(held.problem(now_ns), "gap_ms", "bridged_ms") == (101, 100)
-    assert "it is too slow here" in str(held.problem(now_ns))
+    assert "it is too slow here" in str(held.problem(now_ns)), "the user is told what to do"
     for serial in range(4, 11):  # the eighth gap after it forgets it
         now_ns += 10 * MS
         held.offer(chunk(serial, now_ns // MS), now_ns)
@@ -558,7 +561,7 @@ def test_a_link_that_delivers_nothing_is_named_although_the_flight_process_speak
     assert late is not None
     assert late[3:] == ("link", 150 * MS, none)
     assert (late.name, late.limit_ns) == (name, (100 if name == "attitude" else 250) * MS)
-    assert str(late.reason).endswith(f": the link delivered no {name} for 150 ms")
+    assert figures(late.reason, "quantity", "place", "spent_ms") == (name, "link", 150)
 
 
 def test_a_camera_that_delivers_nothing_is_named() -> None:

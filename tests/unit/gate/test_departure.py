@@ -17,6 +17,7 @@ IDLE_RECEIVER = replace(AIRBORNE, pilot_sticks=NEUTRAL._replace(throttle=-1.0))
 NO_RECEIVER = replace(AIRBORNE, has_receiver=False, pilot_sticks=None)
 PX4 = replace(NO_RECEIVER, mode="ALTCTL", modes=PX4_MODES)
 FAULT = {"chunk_fault": because(Code.NO_CHUNK)}
+LOST = because(Code.VEHICLE_LOST, after_s=30)
 OVERRULED = because(Code.OVERRULED, quantity="setpoints", cause="another station")
 
 
@@ -227,7 +228,8 @@ def test_a_vehicle_that_has_vanished_is_not_held_for_ever() -> None:
         assert {move.hand for move in moves} == {Hand.NEUTRAL}
         stepped.run(1, heard_ns=None, mode_ns=None)
     stepped.run(33, heard_ns=stepped.facts.now_ns, mode_ns=stepped.facts.now_ns)
-    assert Code.VEHICLE_LOST in stepped.codes
+    died = because(Code.FLIGHT_PROCESS_DIED)
+    assert stepped.engagement.reason == because(Code.THEN, first=died, then=LOST)
     assert stepped.phase is Phase.ENDED
 
 
@@ -237,7 +239,9 @@ def test_the_pilot_wins_on_the_way_out() -> None:
     stepped.run(0.1, mode="BRAKE")
     assert stepped.phase is Phase.HOLDING
     assert stepped.step(mode="LOITER") == Move(hand=Hand.RELEASE)
-    assert Code.MODE_CHANGED in stepped.codes
+    changed = because(Code.MODE_CHANGED, before="BRAKE", after="LOITER")
+    first = FAULT["chunk_fault"]
+    assert stepped.engagement.reason == because(Code.THEN, first=first, then=changed)
 
 
 @pytest.mark.parametrize("mode", ["STABILIZE", "ACRO"])
@@ -358,7 +362,8 @@ def test_a_vehicle_that_has_vanished_is_not_asked_for_ever() -> None:
     stepped.step(**FAULT)
     assert silence(stepped, 29)[-1].hand is Hand.NEUTRAL
     stepped.run(6)
-    assert Code.VEHICLE_LOST in stepped.codes
+    first = FAULT["chunk_fault"]
+    assert stepped.engagement.reason == because(Code.THEN, first=first, then=LOST)
 
 
 def test_a_refusal_that_comes_after_the_mode_is_there_asks_for_nothing() -> None:

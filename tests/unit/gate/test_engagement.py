@@ -103,6 +103,7 @@ def test_a_vehicle_that_does_not_get_ready_ends_it_with_a_reason() -> None:
     stepped = Stepped(ON_GROUND, arm=True)
     stepped.run(PREPARE_TIMEOUT_NS / NS_PER_S + 2)
     assert stepped.phase is Phase.ENDED
+    assert codes(stepped.engagement.failure) == (Code.NOT_READY,)
     assert after_s(stepped.engagement.failure) == 90
     assert stepped.moves[-2].hand is not Hand.IDLE
 
@@ -219,7 +220,7 @@ def test_a_receiver_that_was_lost_has_to_show_the_switch_low_again(
     well = {"is_failsafe": False, "is_receiver_sick": False, "channels_ns": None}
     stepped.run(again_s, rc_channels_us=LOW, **well)
     assert set(stepped.run(1, rc_channels_us=HIGH, **well)) == {NOTHING}
-    assert Code.SWITCH_NOT_RESTED in codes(stepped.engagement.refusal)
+    assert codes(stepped.engagement.refusal) == (Code.NOT_ENGAGED_SINCE, Code.SWITCH_NOT_RESTED)
     stepped.run(2, rc_channels_us=LOW)
     assert Move(hand=Hand.POLICY) in stepped.run(0.3, rc_channels_us=HIGH)
 

@@ -621,7 +621,8 @@ def test_absence_is_the_reason_for_not_flying() -> None:
 def test_why_a_chunk_was_not_taken_is_told_until_the_next_one() -> None:
     gate = Stepped()
     gate.step(0, gate.chunk(0)._replace(image_ns=START_NS - 400 * MS))
-    assert codes(gate.step(5).reason) == (Code.TOO_OLD,)
+    told = because(Code.TOO_OLD, quantity="image", age_ms=400, limit_ms=300)
+    assert gate.step(5).reason == told
 
 
 def test_the_first_arming_engages_where_that_was_asked_for() -> None:

@@ -427,7 +427,7 @@ def test_a_command_that_fails_ends_the_flight_in_order_and_not_the_gate(error: E
     rig.run(1.0)
     assert rig.ticks[-1].phase is Phase.RELEASED
     assert codes(rig.ticks[-1].reason) == (Code.COMMAND_FAILED,)
-    assert type(error).__name__ in str(rig.ticks[-1].reason)
+    assert type(error).__name__ in str(rig.ticks[-1].reason), "the user is told which error"
     assert rig.loop.outcome.faults == 1
     rig.loop.stop(Ending(reason=because(Code.DURATION)))
     rig.run(0.1)

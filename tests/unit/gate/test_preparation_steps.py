@@ -10,6 +10,7 @@ from mavbridge.gate.facts import Facts, Hand
 from mavbridge.gate.preparation import FLOW_NS, Preparation, PreparationSettings
 
 GROUND = replace(ON_GROUND, mode="STABILIZE", echo_confirmed=True)
+NO_ECHO = because(Code.NO_ECHO, message="RC_CHANNELS", quantity="sticks")
 
 
 def begun(
@@ -48,15 +49,7 @@ def test_one_that_we_armed_is_idle_until_the_policy_takes_it() -> None:
     move, waits_for = preparation.step(ready, None)
     assert (move.hand, waits_for) == (Hand.IDLE, None)
     # Silence while the link has a problem: it stands on the ground.
-    assert (
-        preparation.step(
-            replace(
-                ready, link_problem=because(Code.NO_ECHO, message="RC_CHANNELS", quantity="sticks")
-            ),
-            None,
-        ).move.hand
-        is None
-    )
+    assert preparation.step(replace(ready, link_problem=NO_ECHO), None).move.hand is None
 
 
 def test_which_mode_is_wanted() -> None:
@@ -81,12 +74,7 @@ def test_the_modes_of_a_takeoff_are_our_own_only_if_we_take_off() -> None:
 def test_one_that_is_found_in_the_air_does_not_take_off() -> None:
     preparation = begun(AIRBORNE, takeoff_m=8.0)
     assert not preparation.is_taking_off
-    move = preparation.step(
-        replace(
-            AIRBORNE, link_problem=because(Code.NO_ECHO, message="RC_CHANNELS", quantity="sticks")
-        ),
-        None,
-    ).move
+    move = preparation.step(replace(AIRBORNE, link_problem=NO_ECHO), None).move
     assert (move.hand, move.takeoff_m) == (None, None)
 
 
@@ -167,8 +155,5 @@ def test_no_setpoint_flows_in_a_climb_even_where_the_mode_would_take_it() -> Non
     preparation = begun(GROUND, takeoff_m=10.0, is_setpoint=True, modes=("OFFBOARD",))
     climbing = replace(GROUND, armed=True, mode="OFFBOARD", modes=PX4_MODES)
     assert preparation.step(climbing, None).move.hand is None
-    without_link = replace(
-        climbing,
-        link_problem=because(Code.NO_ECHO, message="ATTITUDE_TARGET", quantity="setpoints"),
-    )
+    without_link = replace(climbing, link_problem=NO_ECHO)
     assert preparation.step(without_link, None).move.hand is None
