@@ -18,10 +18,8 @@ NOTHING = Move()
 LOW, HIGH = (1500,) * 7 + (1000,), (1500,) * 7 + (2000,)
 NO_RECEIVER = replace(AIRBORNE, has_receiver=False, pilot_sticks=None)
 FAULT = {"chunk_fault": because(Code.NO_CHUNK)}
-OVER = Ending(reason=because(Code.DURATION))
-
-
 REBOOTED = {"interruption": because(Code.REBOOTED), "interruptions": 1}
+OVER = Ending(reason=because(Code.DURATION))
 
 
 def changed(before: str, after: str) -> Reason:
