@@ -311,7 +311,10 @@ class GateMachine(RuleBasedStateMachine):
     @precondition(lambda self: self.was_stopped_ns is None)
     @rule(how=st.sampled_from(("dies", "dies", "ends", "fails")))
     def end(self, how: str) -> None:
-        self.world.stop = Ending(reason=how, is_fault=how != "ends")
+        code = {"dies": Code.FLIGHT_PROCESS_DIED, "ends": Code.SIGNAL, "fails": Code.POLICY_FAILED}[
+            how
+        ]
+        self.world.stop = Ending(reason=because(code), is_fault=how != "ends")
         if how == "dies":
             self.world.has_chunks = False
             self.silent_ns = self.silent_ns or self.world.now_ns

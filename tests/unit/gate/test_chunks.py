@@ -4,7 +4,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from helpers.gate_facts import codes
 from mavbridge.core.clock import NS_PER_MS, NS_PER_S
+from mavbridge.core.reasons import Code, Reason, because
 from mavbridge.core.vehicle import NEUTRAL, BodyRates, Sticks
 from mavbridge.gate.chunks import (
     GRACE_PERIODS,
@@ -20,6 +22,7 @@ MS = NS_PER_MS
 LIMITS = FreshnessLimits(
     state_ns=100 * MS, velocity_ns=250 * MS, feature_ns=300 * MS, chunk_ns=300 * MS
 )
+OLD_IMAGE = because(Code.TOO_OLD, quantity="image", age_ms=301.0, limit_ms=300.0)
 NAN = Sticks(float("nan"), 0.0, 0.0, 0.0)
 
 
@@ -41,6 +44,17 @@ def chunk(serial: int, computed_ms: int, **changes: object) -> Chunk:
 
 def buffer(period_ms: int = 10, limits: FreshnessLimits = LIMITS) -> ChunkBuffer:
     return ChunkBuffer(limits, period_ns=period_ms * MS, kind="sticks")
+
+
+def figures(reason: Reason | None, *names: str) -> tuple[object, ...]:
+    """Those of a reason by their names, each to 0.01."""
+    assert reason is not None
+    data = dict(reason.data)
+    return tuple(round(each, 2) if isinstance(each := data[n], float) else each for n in names)
+
+
+def too_old(quantity: str, age_ms: float, limit_ms: float) -> Reason:
+    return because(Code.TOO_OLD, quantity=quantity, age_ms=age_ms, limit_ms=limit_ms)
 
 
 def test_actions_are_linear_between_their_times_and_held_at_the_ends() -> None:
@@ -109,8 +123,9 @@ def test_a_horizon_shorter_than_the_time_between_solves_never_flies(
     assert (held.impossibility is None) == is_possible
     assert (held.problem(now_ms * MS) is None) == is_possible
     if not is_possible:
-        assert "20 ms (1 x 20 ms)" in (held.impossibility or "")
-        assert "33 ms apart" in (held.impossibility or "")
+        assert codes(held.impossibility) == (Code.HORIZON_TOO_SHORT,)
+        told = figures(held.impossibility, "horizon_ms", "steps", "step_ms", "gap_ms")
+        assert told == (20, 1, 20, 33)
 
 
 def test_a_horizon_that_ends_before_the_next_chunk_comes_begins_no_flight() -> None:
@@ -162,13 +177,14 @@ def test_each_age_is_judged_when_the_chunk_arrives(age: str) -> None:
     assert buffer().offer(chunk(1, 2000, **{age: (2000 - limit_ms) * MS}), 2000 * MS)
     late = buffer()
     assert not late.offer(chunk(1, 2000, **{age: (2000 - limit_ms) * MS - 1}), 2000 * MS)
-    assert f"beyond {limit_ms} ms" in (late.problem(2000 * MS) or "")
+    assert codes(late.problem(2000 * MS)) == (Code.TOO_OLD,)
+    assert figures(late.problem(2000 * MS), "limit_ms") == (limit_ms,)
 
 
 def test_a_900_ms_solve_does_not_fly_the_attitude_that_it_began_with() -> None:
     slow = buffer(period_ms=1000)
     assert not slow.offer(chunk(1, 2000, attitude_ns=1098 * MS), 2000 * MS)
-    assert "the attitude is 900 ms old, beyond 100 ms" in (slow.problem(2000 * MS) or "")
+    assert slow.problem(2000 * MS) == too_old("attitude", 902, 100)
 
 
 def test_a_computer_that_is_too_slow_for_the_policy_is_told_from_one_slow_solve() -> None:
@@ -177,7 +193,8 @@ def test_a_computer_that_is_too_slow_for_the_policy_is_told_from_one_slow_solve(
         slow.offer(chunk(serial, 1000 * serial, attitude_ns=(1000 * serial - 905) * MS), 0)
     assert slow.impossibility is None
     slow.offer(chunk(9, 9000, attitude_ns=8095 * MS), 9000 * MS)
-    assert "the newest 905 ms after its attitude" in (slow.impossibility or "")
+    expected = because(Code.TOO_SLOW, chunks=5, age_ms=905, limit_ms=100)
+    assert slow.impossibility == expected
     slow.offer(chunk(10, 9100), 9100 * MS)
     assert slow.impossibility is None
     for serial in range(11, 15):  # they count anew
@@ -203,7 +220,7 @@ def test_without_a_new_chunk_it_coasts_for_the_grace_and_then_is_at_fault() -> N
     assert not held.is_coasting(1020 * MS)
     assert held.is_coasting(1021 * MS)
     assert held.fault(1100 * MS) is None
-    assert "100 ms" in (held.fault(1100 * MS + 1) or "")
+    assert figures(held.fault(1100 * MS + 1), "quantity", "limit_ms") == ("attitude", 100)
 
 
 def test_a_chunk_beyond_its_limits_coasts_although_the_next_one_is_not_due() -> None:
@@ -223,7 +240,7 @@ def test_the_grace_of_a_slow_policy_ends_with_its_limits() -> None:
     slow = buffer(500)
     slow.offer(chunk(1, 1000), 1000 * MS)  # from an attitude at 995 ms, which may be 100 ms old
     assert slow.fault(1195 * MS) is None
-    assert "195 ms" in (slow.fault(1195 * MS + 1) or "")
+    assert figures(slow.fault(1195 * MS + 1), "quantity", "spent_ms") == ("attitude", 195)
 
 
 def test_a_chunk_that_is_meant_to_be_played_for_a_second_may_be_older_by_that() -> None:
@@ -231,7 +248,7 @@ def test_a_chunk_that_is_meant_to_be_played_for_a_second_may_be_older_by_that() 
     played.offer(chunk(1, 1000, actions=(NEUTRAL,) * 40), 1000 * MS)
     assert not played.is_coasting(2000 * MS)
     assert played.fault(2195 * MS) is None
-    assert "1195 ms" in (played.fault(2195 * MS + 1) or "")
+    assert figures(played.fault(2195 * MS + 1), "quantity", "spent_ms") == ("attitude", 1195)
 
 
 def test_the_grace_of_a_slow_policy_ends_with_its_horizon() -> None:
@@ -245,8 +262,9 @@ def test_chunks_that_are_farther_apart_than_one_may_be_flown_begin_no_flight() -
     slow = buffer(500)
     for serial, now_ms in enumerate((1000, 1500, 2000), start=1):
         slow.offer(chunk(serial, now_ms), now_ms * MS)
-    assert "come up to 500 ms apart, beyond the 195 ms" in (slow.problem(2000 * MS) or "")
-    assert "ask for a higher rate" in (slow.problem(2000 * MS) or "")
+    assert codes(slow.problem(2000 * MS)) == (Code.CHUNKS_APART,)
+    assert figures(slow.problem(2000 * MS), "gap_ms", "bridged_ms") == (500, 195)
+    assert "ask for a higher rate" in str(slow.problem(2000 * MS)), "the user is told what to do"
 
 
 STALL = replace(LIMITS, stall_ns=300 * MS)
@@ -259,7 +277,7 @@ def test_a_stall_is_flown_through_along_the_chunk() -> None:
         assert held.fault(at_ms * MS) is None
         assert held.is_coasting(at_ms * MS)
     assert held.action_at(1295 * MS) == pytest.approx((0.0, 0.0, 0.0, 0.3))
-    assert "300 ms" in (held.fault(1300 * MS + 1) or "")
+    assert figures(held.fault(1300 * MS + 1), "quantity", "limit_ms") == ("chunk", 300)
 
 
 @pytest.mark.parametrize(("steps", "until_ms"), [(1, 1100), (4, 1195), (6, 1295), (16, 1300)])
@@ -289,7 +307,7 @@ def test_a_flight_process_that_has_no_chunk_to_give_is_not_stalled_and_gets_the_
     held.offer(chunk(1, 1000), 1000 * MS)
     for serial, at_ms in enumerate((heard_ms, heard_ms + 10), start=2):
         if refusal == "absence":
-            held.explain_absence("the image feature is older than 300 ms", at_ms * MS)
+            held.explain_absence(OLD_IMAGE, at_ms * MS)
         else:
             bad = {"actions": (NAN,)} if refusal == "malformed" else {"image_ns": 600 * MS}
             assert not held.offer(chunk(serial, at_ms, **bad), at_ms * MS)
@@ -316,7 +334,8 @@ def test_a_policy_whose_chunks_come_as_seldom_as_a_stall_begins_no_flight() -> N
     held = buffer(10, STALL)
     for serial, now_ms in enumerate((1000, 1250, 1500), start=1):
         held.offer(chunk(serial, now_ms), now_ms * MS)
-    assert "come up to 250 ms apart, beyond the 100 ms" in (held.problem(1500 * MS) or "")
+    assert codes(held.problem(1500 * MS)) == (Code.CHUNKS_APART,)
+    assert figures(held.problem(1500 * MS), "gap_ms", "bridged_ms") == (250, 100)
 
 
 def began(period_ms: int, *gaps_ms: int, **changes: object) -> tuple[ChunkBuffer, int]:
@@ -333,7 +352,7 @@ def began(period_ms: int, *gaps_ms: int, **changes: object) -> tuple[ChunkBuffer
 def test_a_flight_may_begin_after_three_chunks_in_time() -> None:
     for gaps_ms in ((), (10,)):
         held, now_ns = began(10, *gaps_ms)
-        assert held.problem(now_ns) == "the policy has only just begun"
+        assert held.problem(now_ns) == because(Code.JUST_BEGUN)
     held, now_ns = began(10, 100, 10)  # as far apart as is bridged
     assert held.problem(now_ns) is None
 
@@ -341,8 +360,9 @@ def test_a_flight_may_begin_after_three_chunks_in_time() -> None:
 @pytest.mark.parametrize("gaps_ms", [(101, 10), (10, 101)])
 def test_one_chunk_of_the_last_few_that_was_late_begins_no_flight(gaps_ms: tuple[int, ...]) -> None:
     held, now_ns = began(10, *gaps_ms)
-    told = "come up to 101 ms apart, beyond the 100 ms that are bridged: it is too slow here"
-    assert told in (held.problem(now_ns) or "")
+    assert codes(held.problem(now_ns)) == (Code.CHUNKS_APART,)
+    assert figures(held.problem(now_ns), "gap_ms", "bridged_ms") == (101, 100)
+    assert "it is too slow here" in str(held.problem(now_ns)), "the user is told what to do"
     for serial in range(4, 11):  # the eighth gap after it forgets it
         now_ns += 10 * MS
         held.offer(chunk(serial, now_ns // MS), now_ns)
@@ -354,7 +374,7 @@ def test_without_a_new_chunk_for_the_grace_no_flight_begins_although_its_limits_
 ):
     held, now_ns = began(10, 10, 10, attitude_ns=1020 * MS)
     assert held.problem(now_ns + 100 * MS) is None
-    assert held.problem(now_ns + 100 * MS + 1) == "no chunk from the policy yet"
+    assert held.problem(now_ns + 100 * MS + 1) == because(Code.NO_CHUNK)
 
 
 @pytest.mark.parametrize(
@@ -369,12 +389,11 @@ def test_without_a_new_chunk_for_the_grace_no_flight_begins_although_its_limits_
 def test_no_flight_begins_beyond_any_limit_of_age(age: str, name: str, limit_ms: int) -> None:
     held, now_ns = began(10, 10, 10, **{age: (1020 - limit_ms + 50) * MS})
     assert held.problem(now_ns + 50 * MS) is None
-    told = f"the {name} is {limit_ms} ms old, beyond {limit_ms} ms"
-    assert held.problem(now_ns + 50 * MS + 1) == told
+    assert held.problem(now_ns + 50 * MS + 1) == too_old(name, limit_ms + 1e-6, limit_ms)
 
 
 def test_where_there_never_was_a_chunk_there_is_a_fault_and_no_action() -> None:
-    assert buffer().lateness(0) == ("chunk", 0, 100 * MS, "flight process", 0, "")
+    assert buffer().lateness(0) == ("chunk", 0, 100 * MS, "flight process", 0, None)
     assert buffer().fault(0) is not None
     assert buffer().action_at(0) is None
 
@@ -397,7 +416,7 @@ def test_five_unusable_chunks_in_a_row_count_also_where_one_came_long_before() -
     held = buffer()
     for serial, at_ms in enumerate((1000, 9000, 9010, 9020, 9030, 9040), start=1):
         held.offer(chunk(serial, at_ms, actions=(NAN,)), at_ms * MS)
-    assert "unusable" in (held.fault(9040 * MS) or "")
+    assert codes(held.fault(9040 * MS)) == (Code.UNUSABLE_CHUNKS, Code.NOT_FINITE)
 
 
 ages = st.integers(0, 400).map(lambda ms: ms * MS)
@@ -445,7 +464,7 @@ def test_stale_chunks_that_keep_coming_do_not_prolong_the_grace() -> None:
     held.offer(chunk(1, 1000), 1000 * MS)
     for serial, now_ms in enumerate(range(1010, 1110, 10), start=2):
         assert not held.offer(chunk(serial, now_ms, image_ns=600 * MS), now_ms * MS)
-    assert held.lateness(1101 * MS) == (*("image", 501 * MS, 300 * MS, "camera", 500 * MS, ""),)
+    assert held.lateness(1101 * MS) == (*("image", 501 * MS, 300 * MS, "camera", 500 * MS, None),)
 
 
 @pytest.mark.parametrize(
@@ -479,11 +498,10 @@ def test_nan_every_other_time_ends_the_flight_although_good_ones_lie_between() -
         held.offer(chunk(serial, now_ms, **bad), now_ms * MS)
         faults.append(held.fault(now_ms * MS))
     assert faults[:-1] == [None] * (2 * MAX_REFUSED - 1)
-    assert "unusable" in (faults[-1] or "")
-    assert "not finite" in (faults[-1] or "")
+    assert codes(faults[-1]) == (Code.UNUSABLE_CHUNKS, Code.NOT_FINITE)
     assert held.problem(now_ms * MS) == faults[-1], "nor may the next flight begin at once"
     held.offer(chunk(99, now_ms + 1000), (now_ms + 1000) * MS)
-    assert "unusable" not in (held.problem((now_ms + 1000) * MS) or "")
+    assert Code.UNUSABLE_CHUNKS not in codes(held.problem((now_ms + 1000) * MS))
 
 
 def test_an_older_chunk_never_replaces_a_newer_one() -> None:
@@ -495,11 +513,11 @@ def test_an_older_chunk_never_replaces_a_newer_one() -> None:
 
 def test_the_reason_for_no_chunk_is_the_flight_processs_own() -> None:
     held = buffer()
-    held.explain_absence("no image feature yet", 0)
-    assert held.problem(0) == "no image feature yet"
+    held.explain_absence(because(Code.NO_IMAGE), 0)
+    assert held.problem(0) == because(Code.NO_IMAGE)
     held.offer(chunk(1, 1000), 1000 * MS)
-    held.explain_absence("the image has been frozen for 0.6 s", 1010 * MS)
-    assert "frozen" in (held.fault(1200 * MS) or "")
+    held.explain_absence(because(Code.IMAGE_FROZEN, age_s=0.6), 1010 * MS)
+    assert codes(held.fault(1200 * MS)) == (Code.LATE, Code.IMAGE_FROZEN)
 
 
 # --- what a fault names
@@ -510,9 +528,14 @@ def test_a_silent_flight_process_is_named_with_the_input_that_ran_out_first() ->
     held.offer(chunk(1, 1000), 1000 * MS)
     assert held.lateness(1100 * MS) is None
     late = held.lateness(1104 * MS)
-    assert late == ("attitude", 109 * MS, 100 * MS, "flight process", 104 * MS, "")
-    assert held.fault(1104 * MS) == (
-        "attitude 109 ms old (limit 100 ms): the flight process stood still, or solved, for 104 ms"
+    assert late == ("attitude", 109 * MS, 100 * MS, "flight process", 104 * MS, None)
+    assert held.fault(1104 * MS) == because(
+        Code.LATE,
+        quantity="attitude",
+        age_ms=109,
+        limit_ms=100,
+        place="flight process",
+        spent_ms=104,
     )
 
 
@@ -520,7 +543,7 @@ def test_a_gate_that_did_not_look_names_the_computer() -> None:
     held = buffer()
     held.offer(chunk(1, 1000), 1000 * MS)
     late = held.lateness(1131 * MS, stood_ns=131 * MS)
-    assert late == ("attitude", 136 * MS, 100 * MS, "computer", 131 * MS, "")
+    assert late == ("attitude", 136 * MS, 100 * MS, "computer", 131 * MS, None)
     late = held.lateness(1131 * MS, stood_ns=10 * MS)
     assert late is not None
     assert late.place == "flight process"
@@ -532,18 +555,19 @@ def test_a_link_that_delivers_nothing_is_named_although_the_flight_process_speak
 ) -> None:
     held = buffer()
     held.offer(chunk(1, 1000, velocity_ns=(995 if name == "attitude" else 760) * MS), 1000 * MS)
-    held.explain_absence(f"no {name} from the vehicle", 1090 * MS)
+    none = because(Code.NO_READING, quantity=name)
+    held.explain_absence(none, 1090 * MS)
     late = held.lateness(1110 * MS, heard_ns={"attitude": 1100 * MS, name: 960 * MS})
     assert late is not None
-    assert late[3:] == ("link", 150 * MS, f"no {name} from the vehicle")
+    assert late[3:] == ("link", 150 * MS, none)
     assert (late.name, late.limit_ns) == (name, (100 if name == "attitude" else 250) * MS)
-    assert late.text.endswith(f": the link delivered no {name} for 150 ms")
+    assert figures(late.reason, "quantity", "place", "spent_ms") == (name, "link", 150)
 
 
 def test_a_camera_that_delivers_nothing_is_named() -> None:
     held = buffer()
     held.offer(chunk(1, 1000, image_ns=710 * MS), 1000 * MS)
-    held.explain_absence("the image feature is older than 300 ms", 1100 * MS)
+    held.explain_absence(OLD_IMAGE, 1100 * MS)
     late = held.lateness(1104 * MS, stood_ns=10 * MS)
     assert late is not None
     assert late[:5] == ("image", 394 * MS, 300 * MS, "camera", 390 * MS)
@@ -553,15 +577,16 @@ def test_a_solve_that_took_too_long_is_named() -> None:
     held = buffer()
     held.offer(chunk(1, 1000), 1000 * MS)
     held.offer(chunk(2, 1090, attitude_ns=940 * MS), 1090 * MS)
-    assert held.lateness(1104 * MS) == ("attitude", 164 * MS, 100 * MS, "solve", 150 * MS, "")
+    assert held.lateness(1104 * MS) == ("attitude", 164 * MS, 100 * MS, "solve", 150 * MS, None)
 
 
 def test_what_the_flight_process_says_comes_first() -> None:
     held = buffer()
     held.offer(chunk(1, 1000), 1000 * MS)
-    held.explain_absence("the policy's server is gone", 1050 * MS)
+    held.explain_absence(because(Code.POLICY_REFUSED, said="its server is gone"), 1050 * MS)
     told = held.fault(1104 * MS)
-    assert told == "the policy's server is gone; attitude 109 ms old (limit 100 ms)"
+    assert codes(told) == (Code.LATE, Code.POLICY_REFUSED)
+    assert str(told) == "its server is gone; attitude 109 ms old (limit 100 ms)"
 
 
 def test_a_grace_that_ends_within_all_limits_names_the_chunk_or_its_horizon() -> None:

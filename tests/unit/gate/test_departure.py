@@ -5,8 +5,8 @@ from typing import Any
 
 import pytest
 
-from helpers.gate_facts import AIRBORNE, COPTER_MODES, PX4_MODES, flying
-from mavbridge.core.reasons import Code, because
+from helpers.gate_facts import AIRBORNE, COPTER_MODES, PX4_MODES, codes, flying
+from mavbridge.core.reasons import Code, Reason, because
 from mavbridge.core.vehicle import NEUTRAL, ModeRoles
 from mavbridge.gate.departure import DepartureSettings, Ending
 from mavbridge.gate.engagement import Phase
@@ -16,7 +16,9 @@ MIDDLE = replace(AIRBORNE, pilot_sticks=NEUTRAL)
 IDLE_RECEIVER = replace(AIRBORNE, pilot_sticks=NEUTRAL._replace(throttle=-1.0))
 NO_RECEIVER = replace(AIRBORNE, has_receiver=False, pilot_sticks=None)
 PX4 = replace(NO_RECEIVER, mode="ALTCTL", modes=PX4_MODES)
-FAULT = {"chunk_fault": "no chunk"}
+FAULT = {"chunk_fault": because(Code.NO_CHUNK)}
+LOST = because(Code.VEHICLE_LOST, after_s=30)
+OVERRULED = because(Code.OVERRULED, quantity="setpoints", cause="another station")
 
 
 @pytest.mark.parametrize(
@@ -80,9 +82,7 @@ def test_a_mode_that_is_left_for_a_hand_of_nobody_is_asked_for_again() -> None:
     assert {move.hand for move in moves} == {Hand.NEUTRAL}
 
 
-@pytest.mark.parametrize(
-    "changes", [{"is_told": False}, {"is_told": True, "overruled": "other sticks"}]
-)
+@pytest.mark.parametrize("changes", [{"is_told": False}, {"is_told": True, "overruled": OVERRULED}])
 def test_another_stations_mode_and_a_hand_of_the_pilots_win(changes: Any) -> None:
     moves = leave_for_a_hand(**changes)
     assert {move.mode for move in moves} == {None}
@@ -144,7 +144,9 @@ def test_no_hand_gets_the_sticks_that_would_not_hold_the_vehicle(
     stepped.engagement.stop(Ending(reason=because(Code.DURATION), is_fault=is_fault))
     mode = stepped.step().mode
     assert mode == ("BRAKE" if is_fault else "LAND")
-    assert ("throttle" in (stepped.engagement.refusal or "")) == bool(settings)
+    throttle_code = Code.THROTTLE_UNKNOWN if throttle is None else Code.THROTTLE_RESTS
+    refusal = (Code.NOT_RELEASED, throttle_code) if settings else ()
+    assert codes(stepped.engagement.refusal) == refusal
     assert {move.hand for move in stepped.run(40)} == {Hand.NEUTRAL}, "never confirmed"
     assert stepped.step(mode=mode).hand is Hand.RELEASE
 
@@ -170,7 +172,7 @@ def test_an_unconfirmed_mode_is_given_up_after_three_seconds() -> None:
     assert stepped.step(mode="BRAKE").hand is Hand.RELEASE
     stepped.run(1)
     assert stepped.phase is Phase.RELEASED
-    assert "whether it took the release is not known" in stepped.engagement.refusal
+    assert stepped.engagement.refusal == because(Code.RELEASE_NOT_SEEN)
 
 
 def test_while_not_even_our_last_sticks_have_arrived_the_release_goes_on() -> None:
@@ -226,7 +228,8 @@ def test_a_vehicle_that_has_vanished_is_not_held_for_ever() -> None:
         assert {move.hand for move in moves} == {Hand.NEUTRAL}
         stepped.run(1, heard_ns=None, mode_ns=None)
     stepped.run(33, heard_ns=stepped.facts.now_ns, mode_ns=stepped.facts.now_ns)
-    assert Code.VEHICLE_LOST in stepped.codes
+    died = because(Code.FLIGHT_PROCESS_DIED)
+    assert stepped.engagement.reason == because(Code.THEN, first=died, then=LOST)
     assert stepped.phase is Phase.ENDED
 
 
@@ -236,7 +239,9 @@ def test_the_pilot_wins_on_the_way_out() -> None:
     stepped.run(0.1, mode="BRAKE")
     assert stepped.phase is Phase.HOLDING
     assert stepped.step(mode="LOITER") == Move(hand=Hand.RELEASE)
-    assert Code.MODE_CHANGED in stepped.codes
+    changed = because(Code.MODE_CHANGED, before="BRAKE", after="LOITER")
+    first = FAULT["chunk_fault"]
+    assert stepped.engagement.reason == because(Code.THEN, first=first, then=changed)
 
 
 @pytest.mark.parametrize("mode", ["STABILIZE", "ACRO"])
@@ -357,7 +362,8 @@ def test_a_vehicle_that_has_vanished_is_not_asked_for_ever() -> None:
     stepped.step(**FAULT)
     assert silence(stepped, 29)[-1].hand is Hand.NEUTRAL
     stepped.run(6)
-    assert Code.VEHICLE_LOST in stepped.codes
+    first = FAULT["chunk_fault"]
+    assert stepped.engagement.reason == because(Code.THEN, first=first, then=LOST)
 
 
 def test_a_refusal_that_comes_after_the_mode_is_there_asks_for_nothing() -> None:
@@ -460,7 +466,11 @@ GUIDED = replace(AIRBORNE, mode="GUIDED")
 @pytest.mark.parametrize(
     "change",
     [
-        {"interruption": "GUID_OPTIONS was changed from 8 to 0 in flight"},
+        {
+            "interruption": because(
+                Code.PARAMETER_CHANGED, name="GUID_OPTIONS", before=8.0, after=0.0
+            )
+        },
         {"rc_channels_us": (1500,) * 6 + (1000,) + (1500,)},
     ],
 )
@@ -479,19 +489,21 @@ def test_a_takeover_that_leaves_the_mode_does_not_leave_the_last_setpoint(change
 @pytest.mark.parametrize(
     ("change", "reason"),
     [
-        ({"mode": "LOITER"}, "mode changed from GUIDED to LOITER"),
-        ({"mode": "GUIDED_NOGPS"}, "mode changed from GUIDED to GUIDED_NOGPS"),
-        ({"armed": False}, "the vehicle has been disarmed"),
-        ({"is_failsafe": True}, "a failsafe of the vehicle is active (mode GUIDED)"),
-        ({"overruled": "another station commands it"}, "another station commands it"),
+        ({"mode": mode}, because(Code.MODE_CHANGED, before="GUIDED", after=mode))
+        for mode in ("LOITER", "GUIDED_NOGPS")
+    ]
+    + [
+        ({"armed": False}, because(Code.DISARMED)),
+        ({"is_failsafe": True}, because(Code.FAILSAFE, mode="GUIDED")),
+        ({"overruled": OVERRULED}, OVERRULED),
     ],
 )
 def test_setpoints_end_at_once_where_somebody_else_chose_what_it_does(
-    change: Any, reason: str
+    change: Any, reason: Reason
 ) -> None:
     stepped = flying(GUIDED, is_setpoint=True, modes=("GUIDED",), departure=SETPOINTS)
     assert stepped.step(**change) == Move(hand=Hand.RELEASE)
-    assert stepped.reason == reason
+    assert stepped.engagement.reason == reason
 
 
 def test_sticks_leave_no_setpoint_behind_in_whichever_mode() -> None:

@@ -5,9 +5,9 @@ from typing import Any
 
 import pytest
 
-from helpers.gate_facts import AIRBORNE, ON_GROUND, Stepped, flying
+from helpers.gate_facts import AIRBORNE, COPTER_MODES, ON_GROUND, Stepped, codes, flying
 from mavbridge.core.clock import NS_PER_S
-from mavbridge.core.reasons import Code, because
+from mavbridge.core.reasons import Code, Reason, because
 from mavbridge.core.vehicle import NEUTRAL
 from mavbridge.gate.departure import DepartureSettings, Ending
 from mavbridge.gate.engagement import ACT_TIMEOUT_NS, PREPARE_TIMEOUT_NS, Phase
@@ -16,6 +16,22 @@ from mavbridge.gate.outcome import Outcome
 
 NOTHING = Move()
 LOW, HIGH = (1500,) * 7 + (1000,), (1500,) * 7 + (2000,)
+OLD_IMAGE = because(Code.TOO_OLD, quantity="image", age_ms=400.0, limit_ms=300.0)
+READING = because(Code.READING_PARAMETERS)
+TILT = because(Code.BEYOND, quantity="tilt", value=70.0, limit=60.0, unit="deg")
+OVERRULED = because(Code.OVERRULED, quantity="sticks", cause="a joystick")
+
+
+def wrong_mode(mode: str) -> Reason:
+    return because(Code.WRONG_MODE, mode=mode, allowed="ALT_HOLD or ALTCTL")
+
+
+def after_s(reason: Reason | None) -> Any:
+    """The time that a vehicle was given to get ready."""
+    assert reason is not None
+    inner = dict(reason.data).get("why", reason)
+    return dict(inner.data)["after_s"]
+
 
 # --- engaging
 
@@ -53,7 +69,8 @@ def test_a_mode_that_the_vehicle_lacks_is_a_failure_at_once() -> None:
     stepped = Stepped(ON_GROUND, arm=True, mode="ALTCTL")
     stepped.run(0.1, is_released=True)
     assert stepped.phase is Phase.ENDED
-    assert "has no mode ALTCTL, it has" in (stepped.engagement.failure or "")
+    modes = ", ".join(COPTER_MODES.names)
+    assert stepped.engagement.failure == because(Code.NO_SUCH_MODE, mode="ALTCTL", modes=modes)
     assert {move.mode for move in stepped.moves} == {None}
 
 
@@ -86,7 +103,8 @@ def test_a_vehicle_that_does_not_get_ready_ends_it_with_a_reason() -> None:
     stepped = Stepped(ON_GROUND, arm=True)
     stepped.run(PREPARE_TIMEOUT_NS / NS_PER_S + 2)
     assert stepped.phase is Phase.ENDED
-    assert "not ready after 90 s" in (stepped.engagement.failure or "")
+    assert codes(stepped.engagement.failure) == (Code.NOT_READY,)
+    assert after_s(stepped.engagement.failure) == 90
     assert stepped.moves[-2].hand is not Hand.IDLE
 
 
@@ -116,23 +134,21 @@ def test_one_that_is_disarmed_while_preparing_is_not_armed_again() -> None:
 @pytest.mark.parametrize(
     ("changes", "told"),
     [
-        ({"armed": False}, "disarmed"),
-        ({"mode": "STABILIZE"}, "not fly in STABILIZE, only in ALT_HOLD or ALTCTL"),
-        ({"mode": "GUIDED"}, "GUIDED"),
-        ({"mode": "RTL"}, "RTL"),
-        ({"chunk_problem": "the image is 400 ms old"}, "the image is 400 ms old"),
-        ({"link_problem": "reading the vehicle's radio calibration"}, "calibration"),
-        ({"is_failsafe": True}, "failsafe"),
-        ({"envelope_problem": "tilt 70 deg"}, "tilt"),
+        ({"armed": False}, because(Code.NOT_ARMED)),
+        *(({"mode": mode}, wrong_mode(mode)) for mode in ("STABILIZE", "GUIDED", "RTL")),
+        ({"chunk_problem": OLD_IMAGE}, OLD_IMAGE),
+        ({"link_problem": READING}, READING),
+        ({"is_failsafe": True}, because(Code.FAILSAFE, mode="ALT_HOLD")),
+        ({"envelope_problem": TILT}, TILT),
     ],
 )
 def test_an_act_that_cannot_be_followed_is_refused_and_forgotten(
-    changes: dict[str, Any], told: str
+    changes: dict[str, Any], told: Reason
 ) -> None:
     stepped = Stepped(replace(AIRBORNE, **changes))
     stepped.step()
     assert stepped.step("engage") == NOTHING
-    assert told in (stepped.engagement.refusal or "")
+    assert stepped.engagement.refusal == because(Code.NOT_ENGAGED_SINCE, why=told)
     good = {name: getattr(AIRBORNE, name) for name in changes}
     assert set(stepped.run(2, **good)) == {NOTHING}
     assert stepped.step("engage") == Move(hand=Hand.POLICY)
@@ -204,7 +220,7 @@ def test_a_receiver_that_was_lost_has_to_show_the_switch_low_again(
     well = {"is_failsafe": False, "is_receiver_sick": False, "channels_ns": None}
     stepped.run(again_s, rc_channels_us=LOW, **well)
     assert set(stepped.run(1, rc_channels_us=HIGH, **well)) == {NOTHING}
-    assert "rest low" in (stepped.engagement.refusal or "")
+    assert codes(stepped.engagement.refusal) == (Code.NOT_ENGAGED_SINCE, Code.SWITCH_NOT_RESTED)
     stepped.run(2, rc_channels_us=LOW)
     assert Move(hand=Hand.POLICY) in stepped.run(0.3, rc_channels_us=HIGH)
 
@@ -235,7 +251,8 @@ def test_the_key_does_not_overrule_a_switch_that_is_off() -> None:
     stepped = Stepped(replace(AIRBORNE, rc_channels_us=LOW), engage_channel=8)
     stepped.step()
     assert stepped.step("engage") == NOTHING
-    assert "switch" in (stepped.engagement.refusal or "")
+    off = because(Code.ENGAGE_SWITCH_OFF, channel=8)
+    assert stepped.engagement.refusal == because(Code.NOT_ENGAGED_SINCE, why=off)
 
 
 def test_engage_on_arm_counts_the_first_arming_alone() -> None:
@@ -254,24 +271,24 @@ def test_a_vehicle_that_is_armed_when_it_is_found_was_not_armed_for_us() -> None
 
 # --- losing the sticks to somebody else: release in the same step, no mode command, latched
 
-TAKEOVERS: list[tuple[dict[str, Any], str]] = [
-    ({"mode": "LOITER"}, "mode changed from ALT_HOLD to LOITER"),
-    ({"armed": False}, "disarmed"),
-    ({"is_switched_off": True}, "override switch"),
-    ({"overruled": "the vehicle ignores our sticks"}, "ignores our sticks"),
-    ({"interruption": "the vehicle has rebooted"}, "rebooted"),
-    ({"is_failsafe": True, "mode": "RTL"}, "failsafe"),
+TAKEOVERS: list[tuple[dict[str, Any], Reason]] = [
+    ({"mode": "LOITER"}, because(Code.MODE_CHANGED, before="ALT_HOLD", after="LOITER")),
+    ({"armed": False}, because(Code.DISARMED)),
+    ({"is_switched_off": True}, because(Code.OVERRIDE_SWITCH_OFF)),
+    ({"overruled": OVERRULED}, OVERRULED),
+    ({"interruption": because(Code.REBOOTED)}, because(Code.REBOOTED)),
+    ({"is_failsafe": True, "mode": "RTL"}, because(Code.FAILSAFE, mode="RTL")),
 ]
 
 
 @pytest.mark.parametrize(("changes", "told"), TAKEOVERS)
 @pytest.mark.parametrize("on_fault", ["auto", "land"])
 def test_a_takeover_releases_at_once_and_sends_no_mode(
-    changes: dict[str, Any], told: str, on_fault: Any
+    changes: dict[str, Any], told: Reason, on_fault: Any
 ) -> None:
     stepped = flying(departure=DepartureSettings(on_fault=on_fault, then=on_fault))
     assert stepped.step(**changes) == Move(hand=Hand.RELEASE)
-    assert told in stepped.reason
+    assert stepped.engagement.reason == told
     moves = stepped.run(3, is_released=False)
     assert {move.mode for move in moves} == {None}
     assert moves[-1] == NOTHING
@@ -279,7 +296,7 @@ def test_a_takeover_releases_at_once_and_sends_no_mode(
 
 
 @pytest.mark.parametrize(("changes", "told"), TAKEOVERS)
-def test_what_was_taken_comes_back_only_by_an_act(changes: dict[str, Any], told: str) -> None:
+def test_what_was_taken_comes_back_only_by_an_act(changes: dict[str, Any], told: Reason) -> None:
     stepped = flying()
     stepped.step(**changes)
     stepped.run(0.1, is_released=True)
@@ -288,7 +305,7 @@ def test_what_was_taken_comes_back_only_by_an_act(changes: dict[str, Any], told:
     assert set(stepped.run(2, **back)) == {NOTHING}
     stepped.run(1, armed=False)
     assert set(stepped.run(1, armed=True)) == {NOTHING}  # disarming resets nothing
-    assert told in stepped.reason
+    assert stepped.engagement.reason == told
     assert stepped.step("engage") == Move(hand=Hand.POLICY)
 
 
@@ -302,9 +319,9 @@ def test_a_release_that_is_confirmed_ends_at_once() -> None:
 # --- our own faults and ends
 
 FAULTS = [
-    {"chunk_fault": "no chunk of the policy that may be flown for 100 ms"},
-    {"link_problem": "the vehicle's heartbeat is lost"},
-    {"envelope_problem": "tilt 63 deg is beyond 60 deg"},
+    {"chunk_fault": because(Code.NO_CHUNK)},
+    {"link_problem": because(Code.HEARTBEAT_LOST)},
+    {"envelope_problem": TILT},
 ]
 
 
@@ -394,7 +411,7 @@ def test_a_takeover_releases_at_least_once_even_if_nothing_seems_to_be_held() ->
 
 def test_a_takeover_in_the_very_step_of_a_fault_wins() -> None:
     stepped = flying(departure=DepartureSettings(on_fault="hold"))
-    move = stepped.step(mode="RTL", chunk_fault=because(Code.NO_CHUNK), envelope_problem="too high")
+    move = stepped.step(mode="RTL", chunk_fault=because(Code.NO_CHUNK), envelope_problem=TILT)
     assert move == Move(hand=Hand.RELEASE)
     assert not any(move.mode for move in stepped.run(3))
 
@@ -422,7 +439,8 @@ def test_an_act_that_waits_for_a_mode_is_given_up_soon_and_touches_no_stick() ->
     assert {move.hand for move in moves} <= {None, Hand.RELEASE}
     assert stepped.phase is Phase.RELEASED
     assert stepped.engagement.failure is None
-    assert "not ready after 3 s" in (stepped.engagement.refusal or "")
+    assert codes(stepped.engagement.refusal) == (Code.NOT_ENGAGED_SINCE, Code.NOT_READY)
+    assert after_s(stepped.engagement.refusal) == 3
 
 
 def test_a_pilots_mode_is_not_changed_back_while_ours_is_awaited() -> None:
@@ -447,7 +465,8 @@ def test_an_act_while_the_last_flight_ends_is_refused_aloud(phase: str) -> None:
         stepped.run(0.2, mode="BRAKE" if phase == "holding" else "ALT_HOLD")
     assert stepped.phase.value == phase
     stepped.step("engage")
-    assert f"still ending ({phase})" in (stepped.engagement.refusal or "")
+    still = because(Code.STILL_ENDING, phase=phase)
+    assert stepped.engagement.refusal == because(Code.NOT_ENGAGED_SINCE, why=still)
 
 
 # --- how it went
@@ -466,13 +485,13 @@ def test_a_flight_in_order_is_told_so() -> None:
     ("changes", "ended"),
     [
         (
-            {"chunk_fault": "attitude too old"},
-            {"faults": 1, "end": "fault", "fault": "attitude too old"},
+            {"chunk_fault": OLD_IMAGE},
+            {"faults": 1, "end": "fault", "fault": OLD_IMAGE},
         ),
-        ({"link_problem": "lost"}, {"faults": 1, "end": "fault", "fault": "lost"}),
+        ({"link_problem": READING}, {"faults": 1, "end": "fault", "fault": READING}),
         ({"armed": False}, {"is_disarmed": True, "end": "disarmed"}),
         ({"mode": "LOITER"}, {"end": "takeover"}),  # the pilot has taken over, and goes on
-        ({"landing": "the vehicle has landed"}, {"end": "landed"}),
+        ({"landing": because(Code.LANDED)}, {"end": "landed"}),
     ],
 )
 def test_how_a_flight_ended_is_told(changes: dict[str, Any], ended: dict[str, Any]) -> None:

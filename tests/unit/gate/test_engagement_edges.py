@@ -7,7 +7,7 @@ import pytest
 
 from helpers.gate_facts import AIRBORNE, ON_GROUND, PX4_MODES, Stepped, flying
 from mavbridge.core.clock import NS_PER_S
-from mavbridge.core.reasons import Code, because
+from mavbridge.core.reasons import Code, Reason, because
 from mavbridge.core.vehicle import NEUTRAL
 from mavbridge.gate.departure import DepartureSettings, Ending
 from mavbridge.gate.engagement import Phase
@@ -17,8 +17,18 @@ from mavbridge.gate.outcome import Outcome
 NOTHING = Move()
 LOW, HIGH = (1500,) * 7 + (1000,), (1500,) * 7 + (2000,)
 NO_RECEIVER = replace(AIRBORNE, has_receiver=False, pilot_sticks=None)
-FAULT = {"chunk_fault": "no chunk"}
+FAULT = {"chunk_fault": because(Code.NO_CHUNK)}
+REBOOTED = {"interruption": because(Code.REBOOTED), "interruptions": 1}
 OVER = Ending(reason=because(Code.DURATION))
+
+
+def changed(before: str, after: str) -> Reason:
+    return because(Code.MODE_CHANGED, before=before, after=after)
+
+
+def held_until(taken: Reason) -> Reason:
+    """Of a vehicle that was ``holding``."""
+    return because(Code.THEN, first=FAULT["chunk_fault"], then=taken)
 
 
 def holding(**settings: Any) -> Stepped:
@@ -138,7 +148,7 @@ def test_after_a_takeover_the_reason_of_it_stays() -> None:
     stepped = flying()
     stepped.step(mode="LOITER")
     stepped.run(0.2, is_released=True, chunk_problem=because(Code.NO_IMAGE))
-    assert stepped.codes == (Code.MODE_CHANGED,)
+    assert stepped.engagement.reason == changed("ALT_HOLD", "LOITER")
 
 
 def test_arm_arms_once() -> None:
@@ -177,9 +187,13 @@ def test_the_way_in_may_take_90_s_and_the_time_of_a_climb_at_1_mps(
     assert stepped.phase is Phase.PREPARING
     stepped.step()
     assert stepped.phase is Phase.RELEASING
-    assert stepped.engagement.failure == (
-        f"the vehicle is not ready after {limit_s} s (mode ALT_HOLD, armed False, "
-        "overrides seen False, inputs no image): see its messages above"
+    assert stepped.engagement.failure == because(
+        Code.NOT_READY,
+        after_s=limit_s,
+        mode="ALT_HOLD",
+        is_armed=False,
+        is_echoed=False,
+        inputs=because(Code.NO_IMAGE),
     )
 
 
@@ -215,7 +229,7 @@ def test_a_mode_that_is_changed_once_ours_is_there_is_a_takeover_although_disarm
     stepped.run(0.1)
     stepped.step(mode="LOITER")
     assert stepped.phase is Phase.RELEASING
-    assert stepped.codes == (Code.MODE_CHANGED,)
+    assert stepped.engagement.reason == changed("ALT_HOLD", "LOITER")
     assert stepped.engagement.outcome == Outcome(), "no flight has ended disarmed"
 
 
@@ -226,7 +240,7 @@ def test_sticks_that_idled_on_the_ground_are_released_although_none_seems_to_be_
 
 
 def test_an_interruption_before_the_act_is_forgotten_one_after_it_is_not() -> None:
-    stepped = Stepped(replace(ON_GROUND, interruption=because(Code.REBOOTED)), arm=True)
+    stepped = Stepped(replace(ON_GROUND, **REBOOTED), arm=True)
     stepped.run(0.1, echo_confirmed=True)
     assert stepped.phase is Phase.PREPARING
     stepped.step(armed=True)
@@ -236,7 +250,7 @@ def test_an_interruption_before_the_act_is_forgotten_one_after_it_is_not() -> No
 
 
 def test_in_the_air_too_an_interruption_before_the_act_is_forgotten() -> None:
-    stepped = flying(replace(AIRBORNE, interruption=because(Code.REBOOTED)))
+    stepped = flying(replace(AIRBORNE, **REBOOTED))
     assert {move.hand for move in stepped.run(0.1)} == {Hand.POLICY}
 
 
@@ -253,7 +267,7 @@ def test_a_pilot_who_has_armed_it_and_changes_the_mode_meanwhile_keeps_it() -> N
     stepped.step()
     stepped.step("engage")
     assert stepped.step(mode="STABILIZE") == NOTHING
-    assert stepped.codes == (Code.MODE_CHANGED,)
+    assert stepped.engagement.reason == changed("LOITER", "STABILIZE")
 
 
 def test_a_stop_while_preparing_is_told_and_followed_as_what_it_is() -> None:
@@ -389,22 +403,14 @@ def test_a_vehicle_is_lost_after_30_s_without_a_word_while_held() -> None:
     stepped.run(30.2, heard_ns=stepped.facts.now_ns)
     assert stepped.phase is Phase.HOLDING
     assert stepped.run(0.1)[-1].hand is Hand.RELEASE
-    assert stepped.codes == (
-        Code.THEN,
-        Code.NO_CHUNK,
-        Code.VEHICLE_LOST,
-    )
+    assert stepped.engagement.reason == held_until(because(Code.VEHICLE_LOST, after_s=30))
 
 
 def test_who_takes_a_vehicle_that_was_just_given_up_is_told() -> None:
     stepped = holding()
     stepped.run(29.99, link_problem=because(Code.HEARTBEAT_LOST))
     stepped.step(mode="LOITER")
-    assert stepped.codes == (
-        Code.THEN,
-        Code.NO_CHUNK,
-        Code.MODE_CHANGED,
-    )
+    assert stepped.engagement.reason == held_until(changed("BRAKE", "LOITER"))
 
 
 def test_the_mode_that_was_asked_for_and_comes_late_is_no_takeover_of_the_way_out() -> None:
@@ -419,11 +425,7 @@ def test_the_mode_that_was_asked_for_and_comes_late_is_no_takeover_of_the_way_ou
 def test_why_it_was_held_and_who_took_it_are_both_told() -> None:
     stepped = holding()
     stepped.step(mode="LOITER", link_problem=None)
-    assert stepped.codes == (
-        Code.THEN,
-        Code.NO_CHUNK,
-        Code.MODE_CHANGED,
-    )
+    assert stepped.engagement.reason == held_until(changed("BRAKE", "LOITER"))
 
 
 def test_a_mode_that_was_confirmed_is_not_told_to_be_unconfirmed() -> None:
@@ -450,7 +452,7 @@ def test_a_mode_that_was_not_confirmed_is_told_once() -> None:
 def test_going_back_from_the_safe_mode_to_the_policys_is_a_takeover() -> None:
     stepped = holding()
     assert stepped.step(mode="ALT_HOLD") == Move(hand=Hand.RELEASE)
-    assert Code.MODE_CHANGED in stepped.codes
+    assert stepped.engagement.reason == held_until(changed("BRAKE", "ALT_HOLD"))
 
 
 @pytest.mark.parametrize(("shows_last", "limit_s"), [(True, 1), (False, 4)])
@@ -462,7 +464,7 @@ def test_a_release_is_repeated_until_it_shows_or_for_so_long(
     assert {move.hand for move in stepped.run(limit_s - 0.01)} == {Hand.RELEASE}
     assert stepped.step() == NOTHING
     assert stepped.phase is Phase.RELEASED
-    assert "not known" in (stepped.engagement.refusal or "")
+    assert stepped.engagement.refusal == because(Code.RELEASE_NOT_SEEN)
 
 
 def test_a_release_that_is_confirmed_is_told_without_doubt() -> None:
@@ -517,7 +519,7 @@ def test_an_act_in_a_mode_of_setpoints_that_is_late_is_left_as_after_a_fault() -
     stepped.run(3)
     assert "AUTO.LAND" in {move.mode for move in stepped.moves}
     assert "AUTO.RTL" not in {move.mode for move in stepped.moves}
-    assert stepped.reason == stepped.engagement.refusal
+    assert stepped.engagement.reason == stepped.engagement.refusal
     assert stepped.engagement.failure is None
 
 

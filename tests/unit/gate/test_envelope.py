@@ -9,6 +9,7 @@ import pytest
 from mavbridge.config.flight import EnvelopeConfig
 from mavbridge.core.clock import NS_PER_MS, NS_PER_S
 from mavbridge.core.errors import UserError
+from mavbridge.core.reasons import Code, Reason, because
 from mavbridge.core.vehicle import Reading, Telemetry, VehicleStatus
 from mavbridge.flight.settings import envelope_limits
 from mavbridge.gate.envelope import Envelope, EnvelopeExit, EnvelopeInput, EnvelopeLimits
@@ -29,6 +30,11 @@ def tilted(degrees: float, axis: str = "roll") -> tuple[float, float, float, flo
     return math.cos(half), x, y, 0.0
 
 
+def beyond(quantity: str, value: float, limit: float, unit: str = "m") -> Reason:
+    data = {"quantity": quantity, "value": pytest.approx(value), "limit": limit, "unit": unit}
+    return because(Code.BEYOND, **data)
+
+
 class Flight:
     """Readings at one rate, checks at another."""
 
@@ -41,7 +47,7 @@ class Flight:
         self.velocity: tuple[float, ...] | None = (3.0, 0.0, 0.0)
         self.end: EnvelopeExit | None = None
 
-    def run(self, duration_s: float, **status: Any) -> str | None:
+    def run(self, duration_s: float, **status: Any) -> Reason | None:
         """Checks at 400 Hz; returns the reason of the first end."""
         self.status = replace(self.status, **status)
         until_ns = self.now_ns + round(duration_s * S)
@@ -69,7 +75,7 @@ def test_an_ordinary_flight_stays_inside_and_is_watched_completely() -> None:
 def test_too_much_tilt_ends_the_flight(degrees: float, axis: str) -> None:
     flight = Flight()
     flight.attitude = tilted(degrees, axis)
-    reason = f"tilt {abs(degrees):.1f} deg is beyond 60 deg (--max-tilt)"
+    reason = beyond("tilt", abs(degrees), 60.0, "deg")
     assert flight.run(0.2) == reason
     assert flight.end == EnvelopeExit("fault", reason)
 
@@ -83,25 +89,28 @@ def test_yaw_is_no_tilt() -> None:
 @pytest.mark.parametrize(
     ("change", "reason"),
     [
-        ({"velocity": (12.0, 0.0, -17.0)}, "speed 20.8 m/s is beyond 20 m/s (--max-speed)"),
-        ({"position_ned_m": (0.0, 0.0, -121.0)}, "height 121.0 m is beyond 120 m (--max-height)"),
+        ({"velocity": (12.0, 0.0, -17.0)}, beyond("speed", math.hypot(12, 17), 20.0, "m/s")),
+        ({"position_ned_m": (0.0, 0.0, -121.0)}, beyond("height", 121.0, 120.0)),
         (
             {"position_ned_m": (-240.0, 200.0, -9.0)},
-            "distance 312.4 m is beyond 300 m (--max-distance)",
+            beyond("distance", math.hypot(240, 200), 300.0),
         ),
-        ({"is_position_valid": False}, "the vehicle's estimator has lost its position"),
-        ({"battery_problem": "the battery is at 8 %"}, "the battery is at 8 %"),
-        ({"is_landed": True}, "the vehicle has landed"),
+        ({"is_position_valid": False}, because(Code.ESTIMATOR_LOST)),
+        (
+            {"battery_problem": "8 %"},
+            because(Code.BATTERY, said="8 %"),
+        ),
+        ({"is_landed": True}, because(Code.LANDED)),
     ],
 )
-def test_each_quantity_ends_the_flight_by_name(change: dict[str, Any], reason: str) -> None:
+def test_each_quantity_ends_the_flight_by_name(change: dict[str, Any], reason: Reason) -> None:
     flight = Flight()
     assert flight.run(0.5) is None
     status = dict(change)  # the parameter is this test's in every run of it
     flight.velocity = status.pop("velocity", flight.velocity)
     assert flight.run(1.0, **status) == reason
     assert flight.end is not None
-    assert flight.end.kind == ("landed" if "landed" in reason else "fault")
+    assert flight.end.kind == ("landed" if reason.code is Code.LANDED else "fault")
 
 
 @pytest.mark.parametrize("state_hz", [10.0, 50.0, 100.0, 400.0])
@@ -229,12 +238,12 @@ def test_what_is_at_its_limit_is_inside_and_small_limits_count() -> None:
     limits = EnvelopeLimits(height_m=0.5)
     assert Flight(limits).run(1.0, position_ned_m=(0.0, 0.0, -0.5)) is None
     told = Flight(limits).run(1.0, position_ned_m=(0.0, 0.0, -0.6))
-    assert told == "height 0.6 m is beyond 0.5 m (--max-height)"
+    assert told == beyond("height", 0.6, 0.5)
 
 
 def test_of_two_reasons_the_first_is_told() -> None:
     told = Flight().run(1.0, position_ned_m=(400.0, 0.0, -200.0))
-    assert (told or "").startswith("height")
+    assert told == beyond("height", 200.0, 120.0)
 
 
 def test_a_new_flight_counts_anew() -> None:
@@ -242,7 +251,7 @@ def test_a_new_flight_counts_anew() -> None:
     assert flight.run(0.5, battery_problem="low") is None
     flight.envelope.reset()
     assert flight.run(0.5) is None
-    assert flight.run(0.2) == "low"
+    assert flight.run(0.2) == because(Code.BATTERY, said="low")
 
 
 def test_an_estimator_that_says_nothing_is_said_to_be_not_watched() -> None:
@@ -272,7 +281,7 @@ def test_a_vehicle_that_has_not_taken_off_has_not_landed() -> None:
     assert flight.run(5.0, is_landed=True) is None
     assert flight.run(1.0, is_landed=False) is None
     assert flight.run(1.0, is_landed=True, armed=False) is None  # disarming is told elsewhere
-    assert flight.run(1.0, armed=True) == "the vehicle has landed"
+    assert flight.run(1.0, armed=True) == because(Code.LANDED)
     flight.envelope.reset()
     assert flight.run(5.0) is None
 

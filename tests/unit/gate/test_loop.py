@@ -7,7 +7,7 @@ from typing import Any
 import pytest
 
 from helpers.fakes import FOREVER_NS, START_NS, FakeClock, FakeLink
-from helpers.gate_facts import engagement_settings, stick_smoothing
+from helpers.gate_facts import codes, engagement_settings, stick_smoothing
 from mavbridge.core.clock import NS_PER_MS, NS_PER_S
 from mavbridge.core.errors import UserError
 from mavbridge.core.reasons import Code, because
@@ -398,7 +398,8 @@ def test_the_death_of_the_flight_process_is_a_fault() -> None:
     assert rig.link.decisions[-1][1] == Command(action=NEUTRAL)
     assert rig.link.requests == ["mode BRAKE"]  # not LAND, as at a normal end
     rig.run(1.0)
-    assert rig.link.hands[-2:] == [Command(action=NEUTRAL), Release("the flight process has died")]
+    died = Release(because(Code.FLIGHT_PROCESS_DIED))
+    assert rig.link.hands[-2:] == [Command(action=NEUTRAL), died]
     assert rig.loop.is_done
 
 
@@ -425,7 +426,8 @@ def test_a_command_that_fails_ends_the_flight_in_order_and_not_the_gate(error: E
     assert rig.link.requests == ["mode BRAKE"]
     rig.run(1.0)
     assert rig.ticks[-1].phase is Phase.RELEASED
-    assert type(error).__name__ in str(rig.ticks[-1].reason)
+    assert codes(rig.ticks[-1].reason) == (Code.COMMAND_FAILED,)
+    assert type(error).__name__ in str(rig.ticks[-1].reason), "the user is told which error"
     assert rig.loop.outcome.faults == 1
     rig.loop.stop(Ending(reason=because(Code.DURATION)))
     rig.run(0.1)
@@ -458,7 +460,8 @@ def test_idle_sticks_that_cannot_be_made_end_the_way_into_a_flight() -> None:
     rig.tell(replace(FLIGHT, engagement=engagement))
     rig.run(1.5)
     assert rig.loop.is_done
-    assert "broken" in (rig.loop.failure or "")
+    assert codes(rig.loop.failure) == (Code.COMMAND_FAILED,)
+    assert "broken" in str(rig.loop.failure)
 
 
 def test_a_mode_that_cannot_be_asked_for_does_not_end_the_gate() -> None:
@@ -497,7 +500,7 @@ def test_the_first_reason_to_end_is_the_one_that_counts() -> None:
     rig.loop.stop(Ending(reason=because(Code.TOLD_TO_END)))
     rig.tell(Ending(reason=because(Code.POLICY_FAILED), is_fault=True))
     rig.run(1.0)
-    assert rig.link.hands[-1] == Release("the gate was told to end")
+    assert rig.link.hands[-1] == Release(because(Code.TOLD_TO_END))
     assert rig.loop.is_done
 
 
@@ -599,7 +602,8 @@ def test_a_takeover_leaves_only_releases_to_be_said() -> None:
     rig = Rig().flying()
     rig.link.change(mode="LOITER")
     rig.loop.step()
-    assert {text for _, text in said(rig)} <= {str(Release("mode changed from ALT_HOLD to LOITER"))}
+    taken = because(Code.MODE_CHANGED, before="ALT_HOLD", after="LOITER")
+    assert {text for _, text in said(rig)} <= {str(Release(taken))}
     assert words(rig).mode is None
 
 
@@ -705,4 +709,6 @@ def test_the_reason_for_no_flight_is_known_at_the_end() -> None:
     rig.tell(replace(FLIGHT, engagement=engagement))
     rig.run(100.0)
     assert rig.loop.is_done
-    assert "not ready after 90 s" in (rig.loop.failure or "")
+    assert codes(rig.loop.failure) == (Code.NOT_READY, Code.NO_CHUNK)
+    assert rig.loop.failure is not None
+    assert dict(rig.loop.failure.data)["after_s"] == 90

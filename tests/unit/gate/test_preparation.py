@@ -12,6 +12,7 @@ from mavbridge.gate.engagement import Phase
 from mavbridge.gate.facts import Hand, Move
 
 GROUND = replace(ON_GROUND, mode="STABILIZE", modes=COPTER_MODES, echo_confirmed=True)
+NO_ECHO = because(Code.NO_ECHO, message="RC_CHANNELS", quantity="sticks")
 PX4_GROUND = replace(GROUND, mode="AUTO.LOITER", modes=PX4_MODES)
 
 
@@ -34,7 +35,7 @@ def test_the_autopilot_takes_off_before_sticks_fly() -> None:
     assert requests(climbing) == ["climb 8"] * 2
     assert {move.hand for move in climbing} == {Hand.NEUTRAL}
     assert requests(stepped.run(2.0, is_landed=False, height_m=4.0)) == []
-    assert stepped.codes == (Code.TAKING_OFF,)
+    assert stepped.engagement.reason == because(Code.TAKING_OFF, height_m=8)
     assert requests(stepped.run(0.5, height_m=7.3)) == ["mode ALT_HOLD"]
     stepped.step(mode="ALT_HOLD")
     assert stepped.phase is Phase.FLYING
@@ -44,9 +45,9 @@ def test_the_height_counts_from_the_place_of_arming() -> None:
     stepped = Stepped(replace(GROUND, mode="GUIDED", height_m=-3.0), arm=True, takeoff_m=8.0)
     stepped.run(0.1)
     stepped.run(0.1, armed=True, is_landed=False, height_m=4.0)
-    assert stepped.codes == (Code.TAKING_OFF,)
+    assert stepped.engagement.reason == because(Code.TAKING_OFF, height_m=8)
     stepped.run(1.1, height_m=4.3)
-    assert stepped.codes == (Code.WAITING_FOR_MODE,)
+    assert stepped.engagement.reason == because(Code.WAITING_FOR_MODE, mode="ALT_HOLD")
 
 
 def test_a_takeoff_waits_for_a_position() -> None:
@@ -119,9 +120,8 @@ def test_a_policy_of_setpoints_is_not_engaged_in_a_mode_of_sticks() -> None:
     stepped = Stepped(AIRBORNE, is_setpoint=True, modes=("GUIDED",))
     stepped.step()
     stepped.step("engage")
-    refusal = stepped.engagement.refusal
-    assert refusal is not None
-    assert "only in GUIDED: change the mode, or use --mode" in refusal
+    wrong = because(Code.WRONG_MODE, mode="ALT_HOLD", allowed="GUIDED")
+    assert stepped.engagement.refusal == because(Code.NOT_ENGAGED_SINCE, why=wrong)
     assert flying().phase is Phase.FLYING
 
 
@@ -207,14 +207,7 @@ def test_neutral_goes_on_in_a_climb_whose_echo_is_lost() -> None:
     """Without a receiver silence would be its radio failsafe; on the ground nothing is sent."""
     stepped = Stepped(replace(GROUND, mode="GUIDED", has_receiver=False), arm=True, takeoff_m=8.0)
     stepped.run(0.1)
-    assert {
-        move.hand
-        for move in stepped.run(
-            0.1, link_problem=because(Code.NO_ECHO, message="RC_CHANNELS", quantity="sticks")
-        )
-    } == {None}
+    assert {move.hand for move in stepped.run(0.1, link_problem=NO_ECHO)} == {None}
     stepped.run(1.0, armed=True, is_landed=False, height_m=2.0, link_problem=None)
-    moves = stepped.run(
-        1.0, link_problem=because(Code.NO_ECHO, message="RC_CHANNELS", quantity="sticks")
-    )
+    moves = stepped.run(1.0, link_problem=NO_ECHO)
     assert {move.hand for move in moves} == {Hand.NEUTRAL}

@@ -10,6 +10,7 @@ from mavbridge.gate.facts import Facts, Hand
 from mavbridge.gate.preparation import FLOW_NS, Preparation, PreparationSettings
 
 GROUND = replace(ON_GROUND, mode="STABILIZE", echo_confirmed=True)
+NO_ECHO = because(Code.NO_ECHO, message="RC_CHANNELS", quantity="sticks")
 
 
 def begun(
@@ -29,8 +30,9 @@ def test_the_first_step_asks_at_once_and_the_second_a_second_later() -> None:
 
 
 def test_an_objection_is_what_it_waits_for_and_nothing_is_asked() -> None:
-    move, waits_for = begun(GROUND).step(GROUND, "the chunk is old")
-    assert (move.hand, move.mode, waits_for) == (Hand.IDLE, None, "the chunk is old")
+    objection = because(Code.NO_CHUNK)
+    move, waits_for = begun(GROUND).step(GROUND, objection)
+    assert (move.hand, move.mode, waits_for) == (Hand.IDLE, None, objection)
 
 
 def test_a_mode_is_asked_of_an_armed_vehicle_that_shows_no_sticks_of_ours() -> None:
@@ -45,17 +47,9 @@ def test_one_that_we_armed_is_idle_until_the_policy_takes_it() -> None:
     ready = replace(GROUND, mode="ALT_HOLD", armed=True)
     assert preparation.step(ready, None) == preparation.step(ready, None)
     move, waits_for = preparation.step(ready, None)
-    assert (move.hand, waits_for) == (Hand.IDLE, "")
+    assert (move.hand, waits_for) == (Hand.IDLE, None)
     # Silence while the link has a problem: it stands on the ground.
-    assert (
-        preparation.step(
-            replace(
-                ready, link_problem=because(Code.NO_ECHO, message="RC_CHANNELS", quantity="sticks")
-            ),
-            None,
-        ).move.hand
-        is None
-    )
+    assert preparation.step(replace(ready, link_problem=NO_ECHO), None).move.hand is None
 
 
 def test_which_mode_is_wanted() -> None:
@@ -80,12 +74,7 @@ def test_the_modes_of_a_takeoff_are_our_own_only_if_we_take_off() -> None:
 def test_one_that_is_found_in_the_air_does_not_take_off() -> None:
     preparation = begun(AIRBORNE, takeoff_m=8.0)
     assert not preparation.is_taking_off
-    move = preparation.step(
-        replace(
-            AIRBORNE, link_problem=because(Code.NO_ECHO, message="RC_CHANNELS", quantity="sticks")
-        ),
-        None,
-    ).move
+    move = preparation.step(replace(AIRBORNE, link_problem=NO_ECHO), None).move
     assert (move.hand, move.takeoff_m) == (None, None)
 
 
@@ -122,7 +111,8 @@ def test_the_climb_is_asked_for_in_the_step_that_sees_it_armed() -> None:
     preparation = begun(replace(GROUND, mode="GUIDED"), takeoff_m=10.0)
     armed = replace(GROUND, mode="GUIDED", armed=True)
     move, waits_for = preparation.step(armed, None)
-    assert (move.hand, move.takeoff_m, waits_for) == (Hand.NEUTRAL, 10.0, "taking off to 10 m")
+    told = because(Code.TAKING_OFF, height_m=10.0)
+    assert (move.hand, move.takeoff_m, waits_for) == (Hand.NEUTRAL, 10.0, told)
 
 
 def test_a_climb_that_has_begun_is_not_asked_for_again() -> None:
@@ -146,13 +136,13 @@ def test_nine_tenths_of_the_height_are_enough_and_count_from_where_it_stood() ->
 def test_a_climb_whose_height_is_lost_for_a_moment_goes_on() -> None:
     preparation = begun(replace(GROUND, mode="GUIDED"), takeoff_m=10.0)
     climbing = replace(GROUND, mode="GUIDED", armed=True, height_m=None)
-    assert "waiting for a position" in preparation.step(climbing, None).waits_for
+    assert preparation.step(climbing, None).waits_for == because(Code.TAKEOFF_NEEDS_POSITION)
     assert preparation.is_taking_off
 
 
 def test_without_a_takeoff_no_height_is_needed() -> None:
     facts = replace(GROUND, mode="ALT_HOLD", height_m=None)
-    assert begun(facts).step(facts, None).waits_for == "waiting for the vehicle to arm"
+    assert begun(facts).step(facts, None).waits_for == because(Code.WAITING_FOR_ARMING)
 
 
 def test_the_mode_in_which_it_climbs_is_left_to_the_autopilot() -> None:
@@ -165,8 +155,5 @@ def test_no_setpoint_flows_in_a_climb_even_where_the_mode_would_take_it() -> Non
     preparation = begun(GROUND, takeoff_m=10.0, is_setpoint=True, modes=("OFFBOARD",))
     climbing = replace(GROUND, armed=True, mode="OFFBOARD", modes=PX4_MODES)
     assert preparation.step(climbing, None).move.hand is None
-    without_link = replace(
-        climbing,
-        link_problem=because(Code.NO_ECHO, message="ATTITUDE_TARGET", quantity="setpoints"),
-    )
+    without_link = replace(climbing, link_problem=NO_ECHO)
     assert preparation.step(without_link, None).move.hand is None

@@ -94,8 +94,14 @@ STATS = LinkStats(
 SUMMARY = GateSummary(
     autopilot="PX4",
     link=STATS,
-    failure="did not arm",
-    outcome=Outcome(flights=2, has_left_ground=True, faults=1, is_disarmed=False),
+    failure=because(Code.NO_CHUNK_SINCE_RESET, why=because(Code.NO_IMAGE)),
+    outcome=Outcome(
+        flights=2,
+        has_left_ground=True,
+        faults=1,
+        end="fault",
+        fault=because(Code.IMAGE_FROZEN, age_s=0.6),
+    ),
     params={"RC_OVERRIDE_TIME": 0.5},
     dropped_messages=1,
     dropped_packets=2,
@@ -153,6 +159,12 @@ def test_what_the_gate_sends_arrives_as_it_was(message: FromGate) -> None:
     assert type(received) is type(message)
 
 
+plain = st.sampled_from((Code.NO_IMAGE, Code.DURATION, Code.LANDED)).map(because)
+figures = st.fixed_dictionaries({"age_s": st.floats(allow_nan=False)})
+reasons = st.recursive(
+    plain | figures.map(lambda data: because(Code.IMAGE_FROZEN, **data)),
+    lambda inner: st.builds(because, st.just(Code.OF_CAMERA), camera=st.text(), why=inner),
+)
 stamps = st.integers(-(2**63), 2**63 - 1)
 sticks = st.builds(Sticks, *[st.floats(width=64)] * 4)
 
@@ -187,7 +199,7 @@ def test_any_chunk_arrives_bit_by_bit(seven: tuple[int, ...], actions: list[Stic
         | st.builds(ActionTrace, raw=sticks, clipped=sticks, slewed=sticks, smoothed=sticks),
         sent=st.none() | sticks,
         phase=st.sampled_from(Phase),
-        reason=st.none() | st.sampled_from(Code).map(because),
+        reason=st.none() | reasons,
     )
 )
 def test_any_tick_arrives_bit_by_bit(tick: GateTick) -> None:
