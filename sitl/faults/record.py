@@ -10,7 +10,7 @@ NEUTRAL_US: Four = (1500, 1500, 1500, 1500)
 RECEIVER_US: dict[Receiver, Four] = {"idle": (1500, 1500, 1000, 1500), "mid": NEUTRAL_US}
 """Sticks of a receiver by its flag; ``none`` has no sticks."""
 NUDGE_US = 8
-"""Steps of one channel by which the bridge finds out whether the vehicle still hears it: 4, twice."""
+"""Most by which the bridge moves a channel to see whether the vehicle hears it: two steps of 4."""
 LANDINGS = ("LAND", "RTL", "AUTO.LAND", "AUTO.RTL")
 """Modes in which a vehicle goes down by its own will."""
 
