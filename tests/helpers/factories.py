@@ -20,6 +20,7 @@ from mavbridge.gate.wire import GateTick
 START_NS = 1_000 * NS_PER_S
 TICK_NS = 10 * NS_PER_MS
 FRAME_NS = NS_PER_S // 30
+_NO_IMAGE = because(Code.NO_IMAGE)
 HOVER = (0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, -9.81)
 
 
@@ -72,9 +73,7 @@ def make_tick(index: int = 0, **changes: Any) -> Tick:
     return replace(tick, **changes)
 
 
-def make_released_tick(
-    index: int = 0, reason: Reason = because(Code.NO_IMAGE), **changes: Any
-) -> Tick:
+def make_released_tick(index: int = 0, reason: Reason = _NO_IMAGE, **changes: Any) -> Tick:
     """Tick ``index`` of a vehicle that the pilot flies."""
     released: dict[str, Any] = {
         "predict_ns": None,

@@ -9,6 +9,7 @@ from typing import Any
 from helpers.gate_facts import COPTER_MODES
 from helpers.wire import WireEnd
 from mavbridge.core.clock import NS_PER_S, Clock
+from mavbridge.core.reasons import Reason
 from mavbridge.core.records import Event, Tick, VisionTick
 from mavbridge.core.vehicle import (
     NEUTRAL,
@@ -101,9 +102,9 @@ class FakeLink:
         self._telemetry = Telemetry()
         self.forward: Callable[[ForwardedPacket], None] = lambda packet: None
         self.status: VehicleStatus | None = replace(AIRBORNE_STATUS, **status)
-        self.problem: str | None = None
-        self.overruled: str | None = None
-        self.interruption: str | None = None
+        self.problem: Reason | None = None
+        self.overruled: Reason | None = None
+        self.interruption: Reason | None = None
         self.is_release_owed = False
         self.echo_confirmed = True
         self.obeys = True
@@ -177,6 +178,7 @@ class FakeLink:
             problem=self.problem or self.overruled,
             is_overruled=self.overruled is not None,
             interruption=self.interruption,
+            interruptions=int(self.interruption is not None),
             echo_confirmed=self.echo_confirmed,
             is_released=not holds,
             modes=COPTER_MODES,

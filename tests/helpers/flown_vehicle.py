@@ -4,6 +4,7 @@ from typing import cast
 
 from helpers.wire import WireEnd
 from mavbridge.core.clock import NS_PER_MS, NS_PER_S
+from mavbridge.core.reasons import Reason
 from mavbridge.core.vehicle import Action, VehicleStatus
 from mavbridge.mavlink.codec.calibration import RcCalibration
 from mavbridge.mavlink.codec.messages import Body, Endpoint
@@ -86,7 +87,7 @@ class Flight:
         return status
 
     @property
-    def problem(self) -> str | None:
+    def problem(self) -> Reason | None:
         """What the echo tells now."""
         return self.output.overruled(self.now_ns) or self.output.unheard(self.now_ns)
 

@@ -45,6 +45,7 @@ from sitl.vehicle.config import IDLE_RECEIVER_US, MID_RECEIVER_US, STEP_NS, Vehi
 
 MS = NS_PER_MS
 HEIGHT_M = 10.0
+SIGNAL = because(Code.SIGNAL)
 NAN = (math.nan,) * 4
 HOVER = (0.0, 0.0, 0.0, 0.0)
 CONTRACT = Contract(feature_dim=1, arrays="numpy")
@@ -197,7 +198,7 @@ class GateFlight:
         """An explicit act at the terminal."""
         self.tell(act)
 
-    def stop(self, reason: Reason = because(Code.SIGNAL), *, is_fault: bool = False) -> None:
+    def stop(self, reason: Reason = SIGNAL, *, is_fault: bool = False) -> None:
         """Ctrl-C, or a fault of the flight process that it could still report."""
         self.tell(Ending(reason=reason, is_fault=is_fault))
 

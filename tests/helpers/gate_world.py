@@ -7,6 +7,7 @@ from collections.abc import Iterator
 import numpy as np
 
 from mavbridge.core.clock import NS_PER_MS
+from mavbridge.core.reasons import Reason
 from mavbridge.core.records import FeatureFrame, Frame
 from mavbridge.flight.feature_cache import FeatureCache
 from mavbridge.gate.wire import FromGate, decode_from_gate
@@ -90,7 +91,7 @@ class FreshFeatures(FeatureCache):
     def __init__(self, clock: SteppedClock) -> None:
         super().__init__()
         self._clock = clock
-        self.fault: str | None = None
+        self.fault: Reason | None = None
         self.stopped_ns: int | None = None
         """When the last image was exposed; None: just now."""
 

@@ -7,6 +7,7 @@ from typing import Any
 
 from helpers.wire import CALIBRATION
 from mavbridge.core.clock import NS_PER_MS, NS_PER_S
+from mavbridge.core.reasons import Reason
 from mavbridge.core.vehicle import Output, VehicleStatus
 from mavbridge.mavlink.codec.messages import CommandRequest, ParamRequest, ParamValue, ParamWrite
 from mavbridge.mavlink.profiles.ardupilot import ARDUPILOT
@@ -97,7 +98,7 @@ class ParamVehicle:
     def writes(self) -> list[tuple[str, float]]:
         return [(r.name, r.value) for r in self.requests if isinstance(r, ParamWrite)]
 
-    def problem(self) -> str | None:
+    def problem(self) -> Reason | None:
         report = status(self.armed, self.has_receiver)
         return self.params.problem() or self.params.output_problem(report)
 

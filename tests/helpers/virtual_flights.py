@@ -28,6 +28,7 @@ from policy.protocol import Executable
 MS = NS_PER_MS
 FRAME_NS = NS_PER_S // 30
 HOP_NS = MS // 10
+SIGNAL = because(Code.SIGNAL)
 """A message between the processes."""
 STEADY = np.full((1, 16, 4), 0.25, np.float32)
 SHARP = Limits(tau=0.0, max_slew=0.0)
@@ -185,7 +186,7 @@ class VirtualFlight:
         """Send the gate a message."""
         self._send(message)
 
-    def stop(self, reason: Reason = because(Code.SIGNAL)) -> None:
+    def stop(self, reason: Reason = SIGNAL) -> None:
         self.tell(Ending(reason=reason))
 
     def fly(self, seconds: float) -> "VirtualFlight":

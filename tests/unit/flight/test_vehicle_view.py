@@ -141,13 +141,13 @@ def test_while_nobody_flies_ticks_have_the_newest_state_if_it_is_fresh(
     viewed.receive(viewed.packets(), replace(NOBODY, sent_ns=START_NS + late_ms * MS))
     (tick,) = viewed.sink.ticks
     assert (tick.state is not None) is is_fresh
-    assert tick.release_reason == "wait"
+    assert tick.release_reason == WAIT
 
 
 @pytest.mark.parametrize("phase", list(Phase))
 def test_a_reason_is_told_unless_the_policy_has_the_sticks(phase: Phase) -> None:
     (tick,) = Viewed().receive(replace(NOBODY, phase=phase)).sink.ticks
-    assert tick.release_reason == (None if phase is Phase.FLYING else "wait")
+    assert tick.release_reason == (None if phase is Phase.FLYING else WAIT)
 
 
 def test_ticks_are_numbered_without_gaps_and_take_the_words_along() -> None:

@@ -19,7 +19,7 @@ from mavbridge.commands.inspect.tables import print_comparison, print_flight
 from mavbridge.core.clock import NS_PER_MS
 from mavbridge.core.course import CourseGate
 from mavbridge.core.errors import MavbridgeError, UserError
-from mavbridge.core.reasons import Code, Kind, because
+from mavbridge.core.reasons import Code, Kind, because, reason_to_json
 from mavbridge.core.records import Position, Tick, VisionTick
 from mavbridge.mavlink.codec.packets import Codec
 from mavbridge.recording.flight_folder import open_flight
@@ -190,6 +190,10 @@ def test_the_figures_go_to_a_file(tmp_path: Path, capsys: pytest.CaptureFixture[
     (document,) = json.loads((tmp_path / "figures.json").read_text())
     assert document["report"]["sticks"]["sends"] == 89
     assert document["causes"] == {"the policy took long": 1}
+    release = {"t_s": 0.9, "reason": reason_to_json(LINK_LOST)}
+    assert document["report"]["releases"] == [release]
+    assert document["holders"][1]["reason"] is None
+    assert document["holders"][2]["reason"] == release["reason"]
     assert "The worst moments" in capsys.readouterr().out
 
 
