@@ -316,6 +316,11 @@ class _Span:
 
 def report_json(report: TimingReport) -> str:
     """The report as JSON, keys in the order of the dataclasses; null = not measured."""
+    return json.dumps(report_document(report), indent=2, allow_nan=False) + "\n"
+
+
+def report_document(report: TimingReport) -> dict[str, object]:
+    """The same for a document that holds more."""
     document = asdict(report)
     document["releases"] = [
         {"t_s": release.t_s, "reason": reason_to_json(release.reason)}
@@ -326,4 +331,4 @@ def report_json(report: TimingReport) -> str:
     if report.link is not None:
         for key in ("messages_per_s", "saturated"):
             document["link"][key] = dict(document["link"][key])
-    return json.dumps(document, indent=2, allow_nan=False) + "\n"
+    return document

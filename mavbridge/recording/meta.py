@@ -152,7 +152,7 @@ def _meta(folder: Path, document: dict[str, Any]) -> FlightMeta:
             known["outcome"] = FlightOutcome(**known["outcome"] | {"reason": reason})
         known["command"] = tuple(known.get("command", ()))
         meta = FlightMeta(**known)
-    except (TypeError, ContractError) as error:
+    except (KeyError, TypeError, ValueError, ContractError) as error:
         raise FlightError(f"{folder / META} is incomplete or damaged: {error}") from error
     if meta.source not in get_args(FlightSource) or meta.mode not in ("dual", "single"):
         raise FlightError(f"{folder / META}: source {meta.source!r}, mode {meta.mode!r}")

@@ -4,7 +4,7 @@ from dataclasses import replace
 from typing import Any
 
 from mavbridge.core.clock import NS_PER_MS
-from mavbridge.core.reasons import Code, Reason
+from mavbridge.core.reasons import Code, Reason, Value
 from mavbridge.core.vehicle import NEUTRAL, ModeRoles
 from mavbridge.gate.departure import DepartureSettings
 from mavbridge.gate.engagement import Act, Engagement, EngagementSettings, Phase
@@ -89,6 +89,16 @@ def engagement_settings(**settings: Any) -> EngagementSettings:
 def codes(reason: Reason | None) -> tuple[Code, ...]:
     """Those of a reason; none while the policy flies."""
     return () if reason is None else reason.codes
+
+
+def figures(reason: Reason | None, code: Code) -> dict[str, Value]:
+    """Those of the reason with this code, which may be inside another one; else none."""
+    if reason is None:
+        return {}
+    if reason.code is code:
+        return dict(reason.data)
+    inner = (figures(value, code) for _, value in reason.data if isinstance(value, Reason))
+    return next(filter(None, inner), {})
 
 
 class Stepped:

@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 
 from helpers.fakes import START_NS, FakeLink, ListSink
+from helpers.gate_facts import codes
 from mavbridge.config.flight import FlyConfig, Limits, LinkConfig
 from mavbridge.config.rates import Rates
 from mavbridge.core.clock import NS_PER_MS, NS_PER_S
@@ -209,6 +210,10 @@ class VirtualFlight:
     @property
     def reason(self) -> Reason | None:
         return self.view.reason
+
+    @property
+    def codes(self) -> tuple[Code, ...]:
+        return codes(self.reason)
 
     @property
     def sent(self) -> list[tuple[float, Sticks | None]]:

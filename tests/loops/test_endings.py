@@ -7,6 +7,7 @@ import pytest
 
 from helpers.gate_flights import NAN, GateFlight, climbing_first, leaning
 from helpers.output_flights import OutputFlight
+from mavbridge.core.reasons import Code, because
 from mavbridge.gate.engagement import Phase
 from sitl.vehicle.config import IDLE_RECEIVER_US
 
@@ -53,7 +54,7 @@ def hang(flight: GateFlight) -> None:
 
 
 def fault(flight: GateFlight) -> None:
-    flight.stop("the camera is gone", is_fault=True)
+    flight.stop(because(Code.CAMERA_FAILED, camera=""), is_fault=True)
 
 
 def not_a_number(flight: GateFlight) -> None:

@@ -8,10 +8,11 @@ import numpy as np
 import pytest
 
 from helpers.fakes import START_NS
+from helpers.gate_facts import figures
 from helpers.virtual_flights import FRAME_NS, MS, STEADY, VirtualFlight, nan_chunk
 from mavbridge.config.flight import Limits
 from mavbridge.core.clock import NS_PER_S
-from mavbridge.core.reasons import Code
+from mavbridge.core.reasons import Code, Reason, Value, because
 from mavbridge.core.vehicle import IDLE, NEUTRAL, Command, Decision, Release, Sticks
 from mavbridge.gate.engagement import Phase
 
@@ -23,6 +24,13 @@ def sticks_of(decisions: list[Decision]) -> list[Sticks | None]:
     return [one.action if isinstance(one, Command) else None for one in decisions]
 
 
+def given_back(flight: VirtualFlight) -> Reason:
+    """Why, as the gate and the link were told, after a way out with neutral sticks."""
+    assert flight.reason is not None
+    assert flight.link.hands == [QUARTER, Command(action=NEUTRAL), Release(flight.reason)]
+    return flight.reason
+
+
 # --- losing the inputs
 
 
@@ -30,8 +38,8 @@ def test_a_camera_that_stops_ends_the_flight_and_one_that_returns_does_not_fly_a
     times = [START_NS + k * FRAME_NS for k in range(150)]
     gap = [t for t in times if not NS_PER_S < t - START_NS < 2 * NS_PER_S]
     flight = VirtualFlight(frames_ns=gap).fly(3.0)
-    assert flight.link.hands == [QUARTER, Command(action=NEUTRAL), Release(flight.reason)]
-    assert "(limit 300 ms): the camera delivered nothing for" in flight.reason
+    found = figures(given_back(flight), Code.LATE)
+    assert (found["limit_ms"], found["place"]) == (300, "camera")
     assert flight.phase is Phase.RELEASED
     last = flight.flown[-1]
     assert last.is_coasting
@@ -60,20 +68,20 @@ def no_velocity(flight: VirtualFlight) -> None:
 
 
 @pytest.mark.parametrize(
-    ("lose", "seconds", "told"),
+    ("lose", "seconds", "code", "known"),
     [
-        (stale_attitude, 0.2, "attitude is older than 100 ms"),
-        (no_attitude, 0.1, "the link delivered no attitude for"),
-        (no_velocity, 0.35, "velocity is older than 250 ms"),
+        (stale_attitude, 0.2, Code.TOO_OLD, {"quantity": "attitude", "limit_ms": 100}),
+        (no_attitude, 0.1, Code.LATE, {"quantity": "attitude", "place": "link"}),
+        (no_velocity, 0.35, Code.TOO_OLD, {"quantity": "velocity", "limit_ms": 250}),
     ],
 )
 def test_a_state_that_is_lost_ends_the_flight_after_the_grace(
-    lose: Callable[[VirtualFlight], None], seconds: float, told: str
+    lose: Callable[[VirtualFlight], None], seconds: float, code: Code, known: dict[str, Value]
 ) -> None:
     flight = VirtualFlight()
     flight.at(1.0, lambda: lose(flight)).fly(3.0)
-    assert flight.link.hands == [QUARTER, Command(action=NEUTRAL), Release(flight.reason)]
-    assert told in flight.reason
+    found = figures(given_back(flight), code)
+    assert found | known == found
     assert flight.sent[-1][0] < 1.0 + seconds + 0.1
     flown_until_s = (flight.flown[-1].sent_ns - START_NS) / NS_PER_S
     assert flown_until_s == pytest.approx(1.0 + seconds, abs=0.02)
@@ -104,21 +112,20 @@ def test_one_chunk_with_nan_is_not_flown_and_costs_no_stick() -> None:
 
 def test_a_policy_that_returns_nan_every_other_time_loses_the_sticks_once() -> None:
     flight = VirtualFlight(chunk=lambda k: nan_chunk() if k > 50 and k % 2 else STEADY).fly(3.0)
-    assert flight.link.hands == [QUARTER, Command(action=NEUTRAL), Release(flight.reason)]
-    assert Code.UNUSABLE_CHUNKS in flight.codes
+    assert Code.UNUSABLE_CHUNKS in given_back(flight).codes
 
 
 def test_a_policy_that_always_returns_nan_never_moves_a_stick() -> None:
     flight = VirtualFlight(chunk=lambda solve: nan_chunk()).fly(0.5)
     assert flight.link.decisions == []
-    assert flight.reason.endswith("the policy returned a value that is not finite")
+    assert Code.NOT_FINITE in flight.codes
 
 
 @pytest.mark.parametrize("shape", [(16, 4), (2, 16, 4), (1, 0, 4), (1, 16, 3), (1, 1025, 4)])
 def test_a_chunk_of_another_shape_never_moves_a_stick(shape: tuple[int, ...]) -> None:
     flight = VirtualFlight(chunk=lambda solve: np.zeros(shape, np.float32)).fly(0.5)
     assert flight.link.decisions == []
-    assert flight.reason.startswith(f"the policy returned {list(shape)} instead of [1, horizon, 4]")
+    assert figures(flight.reason, Code.WRONG_SHAPE)["shape"] == str(list(shape))
 
 
 # --- how a flight begins and ends
@@ -152,7 +159,7 @@ def test_a_vehicle_that_does_not_obey_is_asked_once_a_second() -> None:
 @pytest.mark.parametrize(
     ("status", "end", "requests", "phase"),
     [
-        ({}, Release("the flight is over"), [], Phase.ENDED),
+        ({}, Release(because(Code.DURATION)), [], Phase.ENDED),
         ({"has_receiver": False}, Command(action=NEUTRAL), ["mode LAND"], Phase.HOLDING),
     ],
     ids=["receiver", "no receiver"],
@@ -198,7 +205,8 @@ def test_sticks_that_are_the_pilots_are_not_touched_on_the_way_out() -> None:
 def test_a_takeover_releases_in_the_same_moment_and_sends_no_mode() -> None:
     flight = VirtualFlight()
     flight.at(0.5005, lambda: flight.link.change(mode="LOITER")).fly(2.0)
-    assert flight.link.hands == [QUARTER, Release("mode changed from ALT_HOLD to LOITER")]
+    changed = because(Code.MODE_CHANGED, before="ALT_HOLD", after="LOITER")
+    assert flight.link.hands == [QUARTER, Release(changed)]
     assert flight.sent[-1][0] == pytest.approx(0.503, abs=0.0001)  # the vehicle's next packet
     assert flight.link.requests == []
     flight.link.change(mode="ALT_HOLD")

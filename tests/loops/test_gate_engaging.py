@@ -16,7 +16,7 @@ from helpers.gate_flights import (
     leaning,
 )
 from mavbridge.core.errors import PeerError, UserError
-from mavbridge.core.reasons import Code
+from mavbridge.core.reasons import Code, because
 from mavbridge.gate.engagement import Phase
 from sitl.ardupilot.flight_modes import Mode
 
@@ -38,7 +38,7 @@ def test_somebody_elses_arming_is_not_engaging_and_nothing_is_sent() -> None:
     flight.run(3)
 
     assert flight.phase is Phase.WAITING
-    assert flight.reason.startswith("not engaged")
+    assert flight.codes == (Code.NOT_ENGAGED,)
     assert not flight.overrides()
     assert not flight.commands(ARM)
     assert not flight.modes_asked()
@@ -276,7 +276,7 @@ def test_from_pilot_to_policy_without_a_jump_and_back_without_a_blend() -> None:
 
 def test_an_engagement_before_the_last_one_has_ended_is_refused_aloud() -> None:
     flight = GateFlight(on_fault="hold").fly()
-    flight.features.fault = "the image has been frozen"
+    flight.features.fault = because(Code.IMAGE_FROZEN, age_s=0.6)
     flight.until(lambda: flight.phase is Phase.LEAVING, within_s=0.5)
     flight.act("engage")
     flight.run(0.01)

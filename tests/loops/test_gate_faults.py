@@ -9,11 +9,12 @@ from typing import Any
 import numpy as np
 import pytest
 
+from helpers.gate_facts import figures
 from helpers.gate_flights import CONTRACT, HOVER, MS, NAN, GateFlight, hovering, leaning
 from mavbridge.config.flight import EnvelopeConfig, Limits
 from mavbridge.config.rates import Rates
 from mavbridge.core.clock import NS_PER_S
-from mavbridge.core.reasons import Code
+from mavbridge.core.reasons import Code, because
 from mavbridge.core.records import FloatArray
 from mavbridge.core.vehicle import NEUTRAL
 from mavbridge.flight.settings import TAU_S
@@ -96,8 +97,9 @@ def test_a_stall_is_bridged_by_coasting_as_long_as_the_contract_says(
     if survives:
         assert min(t.sent.roll for t in gap_ticks if t.sent) > 0.29, "along the last chunk"
     else:
-        assert "chunk 25" in flight.reason
-        assert "(limit 250 ms): the flight process stood still" in flight.reason
+        found = figures(flight.reason, Code.LATE)
+        assert (found["quantity"], found["place"]) == ("chunk", "flight process")
+        assert (found["age_ms"], found["limit_ms"]) == (pytest.approx(255, abs=5), 250)
 
 
 def test_after_a_stop_and_a_continue_nothing_stale_is_ever_sent() -> None:
@@ -137,7 +139,7 @@ def test_a_900_ms_solve_flies_no_902_ms_old_attitude() -> None:
     flight.run(3)
 
     assert flight.phase is Phase.RELEASED
-    assert "(limit 250 ms)" in flight.reason
+    assert figures(flight.reason, Code.LATE)["limit_ms"] == 250
     flown = [t for t in flight.ticks if t.trace is not None]
     solves = {tick.chunk_serial for tick in flown}
     assert all(tick.sent_ns - flown[0].sent_ns < 3 * NS_PER_S for tick in flown)
@@ -227,7 +229,8 @@ def test_a_slow_policy_that_hangs_is_flown_no_longer_than_its_chunk_may_be(
     neutral_ns = flight.clock.now_ns()
     flight.run(4)
 
-    assert "the flight process stood still" in flight.reason
+    late, ended = (figures(flight.reason, code) for code in (Code.LATE, Code.PAST_HORIZON))
+    assert (late | ended)["place"] == "flight process"
     assert oldest_s(flight) <= within_s
     assert largest(flight, neutral_ns) < 0.01
 
@@ -250,7 +253,7 @@ def camera_dies(flight: GateFlight) -> None:
 
 
 def image_freezes(flight: GateFlight) -> None:
-    flight.features.fault = "the image has been frozen for 0.6 s"
+    flight.features.fault = because(Code.IMAGE_FROZEN, age_s=0.6)
 
 
 def telemetry_ends(flight: GateFlight) -> None:
@@ -262,21 +265,27 @@ def sensors_freeze(flight: GateFlight) -> None:
 
 
 @pytest.mark.parametrize(
-    ("fail", "told", "within_s"),
+    ("fail", "code", "known", "within_s"),
     [
-        (camera_dies, "(limit 300 ms): the camera delivered nothing for", 0.45),
-        (image_freezes, "the image has been frozen for 0.6 s", 0.15),
-        (telemetry_ends, "the link delivered no attitude for 1", 0.25),
-        (sensors_freeze, "the vehicle's attitude has been frozen for more than 500 ms", 0.7),
+        (camera_dies, Code.LATE, {"limit_ms": 300, "place": "camera"}, 0.45),
+        (image_freezes, Code.IMAGE_FROZEN, {"age_s": 0.6}, 0.15),
+        (
+            telemetry_ends,
+            Code.LATE,
+            {"quantity": "attitude", "place": "link", "spent_ms": pytest.approx(150, abs=50)},
+            0.25,
+        ),
+        (sensors_freeze, Code.ATTITUDE_FROZEN, {"limit_ms": 500}, 0.7),
     ],
 )
 def test_inputs_that_fail_end_the_flight_and_do_not_begin_it_again(
-    fail: Callable[[GateFlight], None], told: str, within_s: float
+    fail: Callable[[GateFlight], None], code: Code, known: dict[str, Any], within_s: float
 ) -> None:
     flight = GateFlight(weaving, on_fault="release").fly()
     fail(flight)
     flight.until(lambda: flight.phase is Phase.LEAVING, within_s=within_s)
-    assert told in flight.reason
+    found = figures(flight.reason, code)
+    assert found | known == found
     neutral_ns = flight.clock.now_ns()
     flight.features.stopped_ns = flight.features.fault = None
     flight.down.is_silent = flight.ap.sensors_frozen = False
@@ -313,23 +322,26 @@ def by_speed(_: float) -> tuple[float, float, float, float]:
 
 
 @pytest.mark.parametrize(
-    ("policy", "envelope", "told"),
+    ("policy", "envelope", "quantity", "limit"),
     [
-        (by_speed, EnvelopeConfig(max_tilt=10), "tilt 1"),
-        (by_height, EnvelopeConfig(max_height=12), "height 12"),
-        (by_speed, EnvelopeConfig(max_speed=3), "speed 3"),
-        (by_speed, EnvelopeConfig(max_distance=5), "distance"),
+        (by_speed, EnvelopeConfig(max_tilt=10), "tilt", 10),
+        (by_height, EnvelopeConfig(max_height=12), "height", 12),
+        (by_speed, EnvelopeConfig(max_speed=3), "speed", 3),
+        (by_speed, EnvelopeConfig(max_distance=5), "distance", 5),
     ],
 )
 def test_leaving_the_envelope_ends_the_flight(
     policy: Callable[[float], tuple[float, float, float, float]],
     envelope: EnvelopeConfig,
-    told: str,
+    quantity: str,
+    limit: float,
 ) -> None:
     flight = GateFlight(policy, envelope=envelope, on_fault="hold").launch()
     flight.act("engage")
     flight.until(lambda: flight.phase is Phase.LEAVING, within_s=8)
-    assert told in flight.reason, flight.reason
+    found = figures(flight.reason, Code.BEYOND)
+    assert (found["quantity"], found["limit"]) == (quantity, limit)
+    assert limit < float(str(found["value"])) < 2 * limit
     flight.run(2)
     assert flight.ap.mode is Mode.BRAKE
 
@@ -343,14 +355,14 @@ def battery_low(flight: GateFlight) -> None:
 
 
 @pytest.mark.parametrize(
-    ("fail", "told", "mode"),
+    ("fail", "code", "mode"),
     [
-        (position_gone, "estimator has lost its position", Mode.LAND),
-        (battery_low, "the battery is at 5 %, below 10 %", Mode.BRAKE),
+        (position_gone, Code.ESTIMATOR_LOST, Mode.LAND),
+        (battery_low, Code.BATTERY, Mode.BRAKE),
     ],
 )
 def test_flags_of_the_vehicle_end_the_flight(
-    fail: Callable[[GateFlight], None], told: str, mode: Mode
+    fail: Callable[[GateFlight], None], code: Code, mode: Mode
 ) -> None:
     contract = replace(CONTRACT, max_velocity_age_s=5.0)  # it comes and goes with the position
     flight = GateFlight(contract=contract, on_fault="hold").fly()
@@ -358,7 +370,9 @@ def test_flags_of_the_vehicle_end_the_flight(
     flight.until(lambda: flight.phase is Phase.LEAVING, within_s=2)
     flight.run(2)
 
-    assert told in flight.reason
+    assert code in flight.codes
+    if code is Code.BATTERY:
+        assert "the battery is at 5 %, below 10 %" in str(flight.reason)
     assert flight.ap.mode is mode, "hold is BRAKE with a position, else LAND"
 
 

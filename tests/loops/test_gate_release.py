@@ -6,13 +6,13 @@ from typing import Any
 import pytest
 
 from helpers.gate_flights import CONTRACT, MS, GateFlight, climbing_first
-from mavbridge.core.reasons import Code
+from mavbridge.core.reasons import Code, because
 from mavbridge.core.vehicle import NEUTRAL
 from mavbridge.gate.engagement import Phase
 from sitl.ardupilot.flight_modes import Mode
 from sitl.vehicle.config import IDLE_RECEIVER_US, MID_RECEIVER_US
 
-FAULT = "the camera is gone"
+FAULT = because(Code.CAMERA_FAILED, camera="")
 
 
 def fault(flight: GateFlight) -> None:
@@ -141,13 +141,13 @@ def test_without_a_receiver_a_fault_holds_the_place_for_as_long_as_it_takes() ->
 
 def test_stopping_twice_changes_nothing() -> None:
     flight = GateFlight(climbing_first, receiver_us=None, arm=True).take_off()
-    flight.stop("first")
+    flight.stop(because(Code.COURSE_DONE))
     flight.run(0.5)
-    flight.stop("second", is_fault=True)
+    flight.stop(FAULT, is_fault=True)
     flight.run(2)
 
     assert flight.phase is Phase.HOLDING
-    assert flight.reason == "first"
+    assert flight.codes == (Code.COURSE_DONE,)
     assert flight.modes_asked()[-1] == Mode.LAND
 
 

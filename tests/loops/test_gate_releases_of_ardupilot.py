@@ -5,6 +5,7 @@ from dataclasses import replace
 import pytest
 
 from helpers.gate_flights import GateFlight, climbing_first
+from mavbridge.core.reasons import Code
 from mavbridge.gate.engagement import Phase
 from mavbridge.simulation.world import NOMINAL_VEHICLE
 from sitl.vehicle.config import ArduPilotRelease
@@ -30,4 +31,5 @@ def test_a_vehicle_of_any_release_that_listens_to_another_station_is_refused(
     flight.run(12)
 
     assert flight.phase is not Phase.FLYING
-    assert "--source-system 42" in flight.reason
+    assert Code.OBSTACLE in flight.codes
+    assert "--source-system 42" in str(flight.reason)

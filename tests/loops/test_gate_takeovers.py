@@ -6,7 +6,7 @@ import pytest
 
 from helpers.gate_flights import GateFlight, climbing_first, hovering, leaning
 from mavbridge.core.clock import NS_PER_MS, NS_PER_S
-from mavbridge.core.reasons import Code
+from mavbridge.core.reasons import Code, Reason, because
 from mavbridge.gate.engagement import Phase
 from sitl.ardupilot.flight_modes import Mode
 from sitl.vehicle.config import MID_RECEIVER_US
@@ -41,18 +41,26 @@ def by_joystick(flight: GateFlight) -> None:
 
 
 TAKEOVERS = [
-    (by_mode, "mode changed from ALT_HOLD to LOITER", 0.03),
-    (by_radio, "mode changed from ALT_HOLD to LOITER", 0.25),
-    (by_disarming, "the vehicle has been disarmed", 0.12),
-    (by_failsafe, "a failsafe of the vehicle is active", 0.12),
-    (by_switch, "the pilot's override switch is off", 0.12),
-    (by_joystick, "another station is overriding them", 0.5),
+    (by_mode, because(Code.MODE_CHANGED, before="ALT_HOLD", after="LOITER"), 0.03),
+    (by_radio, because(Code.MODE_CHANGED, before="ALT_HOLD", after="LOITER"), 0.25),
+    (by_disarming, because(Code.DISARMED), 0.12),
+    (by_failsafe, because(Code.FAILSAFE, mode="ALT_HOLD"), 0.12),
+    (by_switch, because(Code.OVERRIDE_SWITCH_OFF), 0.12),
+    (
+        by_joystick,
+        because(
+            Code.OVERRULED,
+            quantity="sticks",
+            cause="another station is overriding them (a joystick on our system id?)",
+        ),
+        0.5,
+    ),
 ]
 
 
-@pytest.mark.parametrize(("take", "told", "within_s"), TAKEOVERS)
+@pytest.mark.parametrize(("take", "reason", "within_s"), TAKEOVERS)
 def test_a_takeover_releases_and_no_mode_command_ever_leaves(
-    take: Callable[[GateFlight], None], told: str, within_s: float
+    take: Callable[[GateFlight], None], reason: Reason, within_s: float
 ) -> None:
     flight = GateFlight(receiver_us=MID, params=OVERRIDE_SWITCH).fly()
     before_ns = flight.clock.now_ns()
@@ -62,16 +70,16 @@ def test_a_takeover_releases_and_no_mode_command_ever_leaves(
     flight.run(3)
 
     assert flight.phases(before_ns - 50 * MS) == [Phase.FLYING, Phase.RELEASING, Phase.RELEASED]
-    assert told in flight.reason
+    assert flight.reason == reason
     assert not flight.modes_asked()
     releases = flight.overrides(given_ns - MS)
     assert releases
     assert {us for _, us in releases} == {(0, 0, 0, 0)}, "after the takeover nothing but releases"
 
 
-@pytest.mark.parametrize(("take", "told", "within_s"), TAKEOVERS)
+@pytest.mark.parametrize(("take", "reason", "within_s"), TAKEOVERS)
 def test_what_was_taken_does_not_come_back_by_itself(
-    take: Callable[[GateFlight], None], told: str, within_s: float
+    take: Callable[[GateFlight], None], reason: Reason, within_s: float
 ) -> None:
     flight = GateFlight(receiver_us=MID, params=OVERRIDE_SWITCH).fly()
     take(flight)
@@ -85,7 +93,7 @@ def test_what_was_taken_does_not_come_back_by_itself(
     flight.run(2)
 
     assert flight.phase is Phase.RELEASED
-    assert told in flight.reason
+    assert flight.reason == reason
     assert not flight.modes_asked()
 
 
@@ -130,7 +138,7 @@ def test_a_mode_change_whose_heartbeat_is_lost_is_seen_within_a_tenth_of_a_secon
 def test_a_takeover_on_the_way_out_ends_the_requests_for_a_mode() -> None:
     flight = GateFlight(on_fault="hold").fly()
     flight.up.is_silent = True  # the request for BRAKE gets lost
-    flight.stop("the camera is gone", is_fault=True)
+    flight.stop(because(Code.CAMERA_FAILED, camera=""), is_fault=True)
     flight.run(0.02)
     assert flight.phase is Phase.LEAVING
     flight.pilot_mode(Mode.LOITER)

@@ -13,6 +13,7 @@ import pytest
 from helpers.golden_flights import FLIGHTS, NAMES, golden, through_gate
 from mavbridge.commands.replay.run import CLOCK_TOLERANCE, ENGINE_TOLERANCE
 from mavbridge.core.clock import NS_PER_S
+from mavbridge.core.reasons import Code, because
 from mavbridge.core.records import Solve
 from mavbridge.flight.policies import load_configured_policy
 from mavbridge.simulation.clock import SteppedClock
@@ -154,6 +155,6 @@ def test_a_feature_that_was_lost_is_told_and_the_rest_repeated(
 
     compared = repeated(replace(source, features=(without,)), numpy_executable)
 
-    reason = f"the recording lacks the feature of frame {lost.frame_id}"
-    assert compared.missing[reason] > 0
+    reason = because(Code.NOT_RECORDED, what=f"the feature of frame {lost.frame_id}")
+    assert compared.missing[str(reason)] > 0
     assert compared.solves - sum(compared.missing.values()) > 100

@@ -2,9 +2,11 @@
 
 import pytest
 
+from helpers.gate_facts import figures
 from helpers.gate_flights import MS, GateFlight, leaning
 from mavbridge.config.flight import Limits
 from mavbridge.config.rates import Rates
+from mavbridge.core.reasons import Code
 from mavbridge.gate.engagement import Phase
 from policy.contract import Contract
 
@@ -53,8 +55,9 @@ def test_one_that_does_not_begins_no_flight_and_arms_nothing(
 ) -> None:
     flight = flight_of(horizon, dt_s, hz, solve_ms=solve_ms)
     flight.run(6)
-    assert "horizon" in flight.reason
-    assert f"{horizon} x {dt_s * 1e3:g} ms" in flight.reason
+    found = figures(flight.reason, Code.HORIZON_TOO_SHORT)
+    found |= figures(flight.reason, Code.AFTER_HORIZON)
+    assert (found["steps"], found["step_ms"]) == (horizon, pytest.approx(dt_s * 1e3))
     flight.act("engage")
     flight.run(1)
     assert flight.phases() == [Phase.WAITING]
@@ -64,7 +67,8 @@ def test_with_arm_it_gives_up_at_once_with_the_figures() -> None:
     contract = Contract(feature_dim=1, arrays="numpy", horizon=1, chunk_dt_s=0.02)
     flight = GateFlight(leaning, contract=contract, rates=Rates(action_rate=30.0), arm=True)
     flight.until(lambda: flight.gate.failure is not None, within_s=12)
-    assert "20 ms (1 x 20 ms)" in (flight.gate.failure or "")
+    found = figures(flight.gate.failure, Code.HORIZON_TOO_SHORT)
+    assert (found["horizon_ms"], found["steps"], found["step_ms"]) == (20, 1, 20)
     assert not flight.ap.armed
 
 

@@ -8,9 +8,11 @@ import numpy as np
 import pytest
 
 from helpers.fakes import ListSink
+from helpers.gate_facts import figures
 from mavbridge.config.rates import Rates
 from mavbridge.core.clock import NS_PER_MS, NS_PER_S, Clock
 from mavbridge.core.errors import UserError
+from mavbridge.core.reasons import Code
 from mavbridge.simulation.flight import SimulatedFlight, SimulationSettings
 from mavbridge.simulation.world import make_vehicle
 from policy.contract import Contract
@@ -122,11 +124,10 @@ def test_the_slowest_camera_decides_whether_an_image_is_too_old() -> None:
     executable = make_numpy_executable(Watchful(one.clock, contract), ExecutionSettings(name="w"))
     one.fly(executable, max_time_s=4.0, sinks=(sink,))
     reasons = {tick.release_reason for tick in sink.ticks}
-    assert any(
-        "camera down: the image feature is older than 300 ms" in (reason or "")
-        for reason in reasons
-    )
-    assert not any("camera front" in (reason or "") for reason in reasons)
+    missing = [figures(reason, Code.OF_CAMERA) for reason in reasons]
+    assert {found["camera"] for found in missing if found} == {"down"}
+    old = [figures(reason, Code.TOO_OLD) for reason in reasons]
+    assert ("image", 300) in [(found["quantity"], found["limit_ms"]) for found in old if found]
 
 
 def test_the_simulator_says_which_cameras_it_has() -> None:

@@ -95,7 +95,7 @@ def test_a_px4_without_sticks_is_lent_neutral_ones_for_a_mode_that_needs_some() 
     flight = OutputFlight("px4", "sticks", mode="ALTCTL")
     flight.put_in_air()
     flight._forget_sticks()
-    flight.until(lambda: flight.reason.startswith("not engaged"), within_s=10)
+    flight.until(lambda: flight.codes == (Code.NOT_ENGAGED,), within_s=10)
     flight.act("engage")
     flight.until(lambda: flight.phase is Phase.FLYING, within_s=2.0)
     assert flight.px4.mode_name == "ALTCTL"

@@ -65,7 +65,7 @@ def _flight(flight: FlightAnalysis) -> dict[str, Any]:
         "t": _packed(_thinned_times(series.t_s)),
         "plots": [plot for plot in _plots(flight) if plot["series"]],
         "histograms": list(_histograms(series)),
-        "holders": [asdict(span) for span in flight.holders],
+        "holders": [asdict(span) | {"reason": str(span.reason or "")} for span in flight.holders],
         "moments": [asdict(moment) for moment in flight.moments],
         "track": _track(flight),
         "gates": [gate._asdict() for gate in flight.gates],

@@ -17,8 +17,10 @@ from mavbridge.commands.output import print_status, table_console
 from mavbridge.core.clock import NS_PER_S
 from mavbridge.core.errors import UserError
 from mavbridge.core.files import require_writable
+from mavbridge.core.reasons import reason_to_json
 from mavbridge.core.records import Observed, Solve, Tick, VisionTick
 from mavbridge.flight.action_frames import action_frame
+from mavbridge.observe.timing import report_document
 from mavbridge.observe.viewer.flight import RerunView
 from mavbridge.observe.viewer.layout import ViewedFlight
 from mavbridge.observe.viewer.target import check_target
@@ -66,13 +68,16 @@ def to_json(analyses: Sequence[FlightAnalysis]) -> str:
             "folder": str(flight.folder),
             "damage": flight.damage,
             "stick_hz": flight.stick_hz,
-            "report": asdict(flight.report),
+            "report": report_document(flight.report),
             "image_latency_ms": {
                 images.camera: images.latency_ms and asdict(images.latency_ms)
                 for images in flight.cameras
             },
             "causes": dict(flight.causes),
-            "holders": [asdict(span) for span in flight.holders],
+            "holders": [
+                asdict(span) | {"reason": span.reason and reason_to_json(span.reason)}
+                for span in flight.holders
+            ],
             "moments": [asdict(moment) for moment in flight.moments],
         }
         for flight in analyses

@@ -5,6 +5,7 @@ import pytest
 
 from mavbridge.camera.image_watch import TAKEOFF_NS, ImageWatch, is_blank
 from mavbridge.core.clock import NS_PER_S
+from mavbridge.core.reasons import Code, because
 
 PERIOD_NS = NS_PER_S // 20
 RANDOM = np.random.default_rng(7)
@@ -38,7 +39,7 @@ def watch():
 
 def test_the_same_pixels_beyond_the_limit_are_frozen(watch):
     copies = [SCENE.copy() for _ in range(40)]
-    assert first_fault(watch, copies) == (11, "the image has been frozen for 0.6 s")
+    assert first_fault(watch, copies) == (11, because(Code.IMAGE_FROZEN, age_s=0.55))
 
 
 @pytest.mark.parametrize("pixel", [(0, 0), (47, 63), (20, 31), (21, 32)])
@@ -68,7 +69,7 @@ def test_take_off_has_time_to_move_the_image_and_no_more(watch):
     allowed = 99 + (TAKEOFF_NS + NS_PER_S // 2) // PERIOD_NS
     index, reason = first_fault(watch, [SCENE] * 100, start=100)
     assert index == allowed + 1
-    assert reason == f"the image has been frozen for {index * PERIOD_NS / NS_PER_S:.1f} s"
+    assert reason == because(Code.IMAGE_FROZEN, age_s=index * PERIOD_NS / NS_PER_S)
 
 
 def test_after_take_off_a_change_takes_the_allowance_away(watch):
@@ -98,7 +99,10 @@ def test_other_image_sizes_are_other_images(watch):
 def test_blank_images(watch, image):
     assert is_blank(image)
     index, reason = first_fault(watch, [image] * 40, is_airborne=False)
-    assert (index, reason) == (11, "the image has been black or of one colour for 0.6 s")
+    assert (index, reason) == (
+        11,
+        because(Code.IMAGE_BLANK, what="black or of one colour", age_s=0.55),
+    )
 
 
 def test_hot_pixels_do_not_make_a_picture():
@@ -139,8 +143,9 @@ def test_light_ends_the_black(watch):
 
 def test_a_limit_of_zero_turns_its_part_off():
     black = np.zeros_like(SCENE)
-    assert "frozen" in first_fault(ImageWatch(max_frozen_s=0.5, max_black_s=0), [black] * 40)[1]
-    assert "black" in first_fault(ImageWatch(max_frozen_s=0, max_black_s=0.5), [black] * 40)[1]
+    _, frozen = first_fault(ImageWatch(max_frozen_s=0.5, max_black_s=0), [black] * 40)
+    _, blank = first_fault(ImageWatch(max_frozen_s=0, max_black_s=0.5), [black] * 40)
+    assert (frozen.code, blank.code) == (Code.IMAGE_FROZEN, Code.IMAGE_BLANK)
     assert first_fault(ImageWatch(max_frozen_s=0, max_black_s=0.5), [SCENE] * 40) is None
     assert first_fault(ImageWatch(max_frozen_s=0, max_black_s=0), [black] * 40) is None
 
@@ -158,4 +163,4 @@ def test_depth_that_is_nowhere_known_is_a_fault_and_a_wall_is_none(depth, fault)
     assert is_blank(depth) is fault
     found = first_fault(watch, [depth.copy() for _ in range(20)])
     assert (found is not None) is fault
-    assert not fault or "without any depth" in found[1]
+    assert not fault or dict(found[1].data)["what"] == "without any depth"

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from mavbridge.core.clock import NS_PER_MS
+from mavbridge.core.reasons import Code, Reason, because
 from mavbridge.core.records import FeatureFrame, VehicleState
 from mavbridge.core.vehicle import Release
 from mavbridge.flight.feature_cache import MAX_PAST, FeatureCache
@@ -25,7 +26,14 @@ THREE_STEPS = Contract(observation_steps=3, observation_dt_s=0.1, feature_dim=1)
 TWO_CAMERAS = Contract(cameras=("front", "down"), feature_dim=1)
 
 
-def seen(ago_ms: float, fault: str | None = None) -> FeatureFrame:
+BLACK = because(Code.IMAGE_BLANK, what="black", age_s=0.6)
+
+
+def of(camera: str, why: Reason) -> Reason:
+    return because(Code.OF_CAMERA, camera=camera, why=why)
+
+
+def seen(ago_ms: float, fault: Reason | None = None) -> FeatureFrame:
     """A feature whose value is its age in ms."""
     captured_ns = NOW_NS - round(ago_ms * MS)
     value = np.full((1, 1), ago_ms, np.float32)
@@ -103,7 +111,7 @@ def test_the_oldest_is_repeated_where_there_is_no_older_one() -> None:
 
 def test_an_image_with_a_fault_is_nobodys_past() -> None:
     cache = cache_of(221, 187)
-    cache.publish(seen(120, fault="the image has been black"))
+    cache.publish(seen(120, fault=BLACK))
     cache.publish(seen(20))
     states = StateHistory(span_ns=200 * MS)
     found = observed(source(THREE_STEPS, cache, states=states).observe(felt(0), NOW_NS))
@@ -135,15 +143,19 @@ def test_one_observation_of_one_camera_passes_through_untouched() -> None:
 @pytest.mark.parametrize(
     ("front", "down", "reason"),
     [
-        (None, seen(20), "camera front: no image feature yet"),
-        (seen(20), None, "camera down: no image feature yet"),
-        (seen(20), seen(301), "camera down: the image feature is older than 300 ms"),
-        (seen(20), seen(20, "it is black"), "camera down: it is black"),
+        (None, seen(20), of("front", because(Code.NO_IMAGE))),
+        (seen(20), None, of("down", because(Code.NO_IMAGE))),
+        (
+            seen(20),
+            seen(301),
+            of("down", because(Code.TOO_OLD, quantity="image", age_ms=301.0, limit_ms=300.0)),
+        ),
+        (seen(20), seen(20, BLACK), of("down", BLACK)),
         (seen(20), seen(20), None),
     ],
 )
 def test_no_camera_may_be_missing_old_or_at_fault(
-    front: FeatureFrame | None, down: FeatureFrame | None, reason: str | None
+    front: FeatureFrame | None, down: FeatureFrame | None, reason: Reason | None
 ) -> None:
     caches = FeatureCache(), FeatureCache()
     for cache, frame in zip(caches, (front, down), strict=True):

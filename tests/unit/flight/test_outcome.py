@@ -10,6 +10,7 @@ import pytest
 from helpers.factories import make_released_tick, make_state, make_tick
 from helpers.fakes import FakeClock
 from mavbridge.core.course import CourseGate
+from mavbridge.core.reasons import Code, because
 from mavbridge.core.records import FlightOutcome, Position, Tick
 from mavbridge.core.stopping import StopRequest
 from mavbridge.core.vehicle import FlightEnd, LinkStats
@@ -18,6 +19,7 @@ from mavbridge.gate.outcome import Outcome
 from mavbridge.gate.wire import GateStatus, GateSummary
 
 FLOWN = Outcome(flights=1, has_left_ground=True)
+NO_CHUNK = because(Code.NO_CHUNK)
 STATS = LinkStats(
     messages_per_s=(),
     lost_fraction=None,
@@ -57,7 +59,7 @@ def stopped(number: int | None) -> StopRequest:
         (FLOWN._replace(is_disarmed=True), None, 3, "was disarmed"),
         (FLOWN._replace(has_left_ground=False), None, 3, "not left the ground"),
         (FLOWN._replace(has_left_ground=False), signal.SIGTERM, 143, "not left the ground"),
-        (Outcome(), None, 3, "the policy has not flown: waiting for a chunk"),
+        (Outcome(), None, 3, f"the policy has not flown: {NO_CHUNK}"),
         (Outcome(), signal.SIGINT, 130, "the policy has not flown"),
         (None, signal.SIGINT, 130, None),  # an impatient user, while the gate holds neutral
         (None, None, 3, None),
@@ -67,7 +69,7 @@ def test_the_status_says_what_a_script_needs(
     outcome: Outcome | None, number: int | None, status: int, told: str | None
 ) -> None:
     words = None if outcome is None else summary(outcome)
-    verdict = flight_verdict(words, stopped(number), reason="waiting for a chunk", readonly=False)
+    verdict = flight_verdict(words, stopped(number), reason=NO_CHUNK, readonly=False)
     assert verdict.exit_code == status
     assert (told or "") in (verdict.text or "")
     assert (told is None) == (verdict.text is None)
@@ -75,17 +77,18 @@ def test_the_status_says_what_a_script_needs(
 
 @pytest.mark.parametrize("record", [None, Path("flights/a b")])
 def test_a_fault_is_told_with_its_cause_and_the_command_that_shows_it(record: Path | None) -> None:
-    words = summary(FLOWN._replace(faults=1, fault="attitude 104 ms old (limit 100 ms)"))
-    told = flight_verdict(words, stopped(None), reason="", readonly=False, record=record).text
+    old = because(Code.TOO_OLD, quantity="attitude", age_ms=104.0, limit_ms=100.0)
+    words = summary(FLOWN._replace(faults=1, fault=old))
+    told = flight_verdict(words, stopped(None), reason=None, readonly=False, record=record).text
     end = "" if record is None else "; see it with: mavbridge inspect 'flights/a b'"
-    assert (told or "").endswith(f": attitude 104 ms old (limit 100 ms){end}")
+    assert (told or "").endswith(f": {old}{end}")
 
 
 def test_a_flight_that_sends_nothing_needs_no_air() -> None:
     watched = summary(Outcome(flights=1, has_left_ground=False))
-    assert flight_verdict(watched, stopped(None), reason="", readonly=True).exit_code == 0
+    assert flight_verdict(watched, stopped(None), reason=None, readonly=True).exit_code == 0
     unseen = summary(Outcome())
-    assert flight_verdict(unseen, stopped(None), reason="", readonly=True).exit_code == 3
+    assert flight_verdict(unseen, stopped(None), reason=None, readonly=True).exit_code == 3
 
 
 @pytest.mark.parametrize(
@@ -103,7 +106,7 @@ def test_a_flight_that_hit_something_is_never_a_success(
 ) -> None:
     words = None if outcome is None else summary(outcome)
     verdict = flight_verdict(
-        words, stopped(number), reason="", readonly=False, crash="it hit gate 7"
+        words, stopped(number), reason=None, readonly=False, crash="it hit gate 7"
     )
     assert verdict.exit_code == status
 

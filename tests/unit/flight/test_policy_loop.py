@@ -11,13 +11,14 @@ from helpers.factories import make_gate_tick
 from helpers.fakes import START_NS, FakeClock, ListSink
 from helpers.wire import WireEnd
 from mavbridge.core.clock import NS_PER_MS
+from mavbridge.core.reasons import Code, Reason, because
 from mavbridge.core.records import FeatureFrame, FloatArray
 from mavbridge.core.vehicle import ForwardedPacket, Velocity
 from mavbridge.flight.action_frames import ActionFrame, action_frame
 from mavbridge.flight.feature_cache import FeatureCache
 from mavbridge.flight.history import SentHistory
 from mavbridge.flight.observation import ObservationSource
-from mavbridge.flight.policy_loop import RETRY_NS, PolicyLoop, PolicySettings
+from mavbridge.flight.policy_loop import MAX_HORIZON, RETRY_NS, PolicyLoop, PolicySettings
 from mavbridge.flight.state import Freshness
 from mavbridge.flight.state_reader import StateReader
 from mavbridge.flight.vehicle_view import VehicleView
@@ -29,6 +30,8 @@ from policy.contract import Contract
 MS = NS_PER_MS
 STICKS_FRAME = ActionFrame()
 FRESH = Freshness(attitude_ns=100 * MS, velocity_ns=250 * MS)
+NO_ATTITUDE = because(Code.NO_READING, quantity="attitude")
+FROZEN = because(Code.IMAGE_FROZEN, age_s=0.6)
 
 
 class Rig:
@@ -95,7 +98,7 @@ class Rig:
         )
         return self
 
-    def see(self, *, age_ns: int = 30 * MS, fault: str | None = None) -> "Rig":
+    def see(self, *, age_ns: int = 30 * MS, fault: Reason | None = None) -> "Rig":
         captured_ns = self.clock.now_ns() - age_ns
         value = np.zeros((1, 8), np.float32)
         self.cache.publish(
@@ -144,22 +147,23 @@ def test_actions_reach_the_gate_in_its_own_kind_and_axes() -> None:
     assert action == Velocity(2.0, 1.0, -3.0, -0.5)
 
 
+def too_old(quantity: str, age_ms: float, limit_ms: float) -> Reason:
+    return because(Code.TOO_OLD, quantity=quantity, age_ms=age_ms, limit_ms=limit_ms)
+
+
 @pytest.mark.parametrize(
     ("prepare", "reason"),
     [
-        (lambda rig: rig.see(), "no attitude from the vehicle yet"),
-        (lambda rig: rig.measure(), "no image feature yet"),
-        (
-            lambda rig: rig.measure().see(age_ns=301 * MS),
-            "the image feature is older than 300 ms",
-        ),
-        (lambda rig: rig.measure(attitude_age_ns=101 * MS).see(), "attitude is older than 100 ms"),
-        (lambda rig: rig.measure(velocity_age_ns=251 * MS).see(), "velocity is older than 250 ms"),
-        (lambda rig: rig.measure().see(fault="the image is black"), "the image is black"),
+        (lambda rig: rig.see(), NO_ATTITUDE),
+        (lambda rig: rig.measure(), because(Code.NO_IMAGE)),
+        (lambda rig: rig.measure().see(age_ns=301 * MS), too_old("image", 301, 300)),
+        (lambda rig: rig.measure(attitude_age_ns=101 * MS).see(), too_old("attitude", 101, 100)),
+        (lambda rig: rig.measure(velocity_age_ns=251 * MS).see(), too_old("velocity", 251, 250)),
+        (lambda rig: rig.measure().see(fault=FROZEN), FROZEN),
     ],
 )
 def test_without_usable_inputs_the_policy_is_not_asked(
-    prepare: Callable[[Rig], Rig], reason: str
+    prepare: Callable[[Rig], Rig], reason: Reason
 ) -> None:
     rig = prepare(Rig())
     rig.loop.step()
@@ -175,7 +179,7 @@ def test_a_chunk_of_another_shape_is_not_passed_on(shape: tuple[int, ...]) -> No
     rig.loop.step()
     (refused,) = rig.sent
     assert isinstance(refused, Absence)
-    assert f"returned {list(shape)} instead of [1, horizon, 4]" in refused.reason
+    assert refused.reason == because(Code.WRONG_SHAPE, shape=str(list(shape)), most=MAX_HORIZON)
 
 
 def run_on(rig: Rig, milliseconds: int) -> Rig:
@@ -245,8 +249,7 @@ def test_it_solves_until_it_is_told_to_stop_and_says_when_no_attitude_comes() ->
     before_ns = rig.loop.alive_ns
     rig.loop.run(stop)
     told = [one if isinstance(one, Absence) else one.serial for one in rig.sent]
-    nothing = Absence("no attitude from the vehicle")
-    assert told == [1, nothing, 2, nothing]
+    assert told == [1, Absence(NO_ATTITUDE), 2, Absence(NO_ATTITUDE)]
     assert rig.loop.alive_ns > before_ns
 
 
@@ -260,4 +263,4 @@ def test_a_policy_that_fails_is_told_to_the_gate_at_once(failure: type[BaseExcep
     rig.loop._act = fail
     with pytest.raises(failure):
         rig.loop.run(threading.Event())
-    assert rig.sent == [Absence("the policy's loop has failed")]
+    assert rig.sent == [Absence(because(Code.POLICY_FAILED))]

@@ -8,6 +8,7 @@ import pytest
 from mavbridge.config.flight import FlyConfig, LinkConfig
 from mavbridge.core.clock import NS_PER_MS
 from mavbridge.core.errors import UserError
+from mavbridge.core.reasons import Code, because
 from mavbridge.core.records import VehicleState
 from mavbridge.core.vehicle import Reading, Release, Telemetry
 from mavbridge.flight.plan import plan_flight
@@ -74,17 +75,19 @@ def test_what_is_missing_or_old_is_a_reason_and_never_a_zero(extra: StateExtra, 
     what = "position" if field == "position_ned_m" else "height above home"
     reading = getattr(FLYING, field)
     missing = read(replace(FLYING, **{field: None}), extra)
-    assert missing == Release(f"no {what} from the vehicle yet, or none that it trusts")
+    assert missing == Release(because(Code.NO_TRUSTED_READING, quantity=what))
     just = replace(FLYING, **{field: at(250, *reading.values)})
     assert isinstance(read(just, extra), VehicleState)
     old = replace(FLYING, **{field: at(252, *reading.values)})
-    assert read(old, extra) == Release(f"{what} is older than 250 ms")
+    assert read(old, extra) == Release(
+        because(Code.TOO_OLD, quantity=what, age_ms=252.0, limit_ms=250.0)
+    )
     assert isinstance(read(old), VehicleState)  # nobody asks for it
 
 
 def test_a_state_that_is_missing_is_a_reason_also_where_extras_are_asked_for() -> None:
     refused = read(replace(FLYING, ned_from_body_wxyz=None), "height")
-    assert refused == Release("no attitude from the vehicle yet")
+    assert refused == Release(because(Code.NO_READING, quantity="attitude"))
 
 
 def test_a_contract_with_a_goal_is_not_flown_without_one() -> None:

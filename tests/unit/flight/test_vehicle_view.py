@@ -12,6 +12,7 @@ from helpers.factories import make_state, make_trace
 from helpers.fakes import START_NS, ListSink
 from helpers.wire import WireEnd
 from mavbridge.core.clock import NS_PER_MS
+from mavbridge.core.reasons import Code, because
 from mavbridge.core.vehicle import ForwardedPacket, Sticks
 from mavbridge.flight.history import SentHistory
 from mavbridge.flight.state import Freshness
@@ -36,9 +37,11 @@ TICK = GateTick(
     trace=make_trace(STICKS),
     sent=STICKS,
     phase=Phase.FLYING,
-    reason="",
+    reason=None,
 )
-NOBODY = replace(TICK, chunk_serial=None, trace=None, sent=None, phase=Phase.WAITING, reason="wait")
+WAIT = because(Code.NO_CHUNK)
+OFF = because(Code.OVERRIDE_SWITCH_OFF)
+NOBODY = replace(TICK, chunk_serial=None, trace=None, sent=None, phase=Phase.WAITING, reason=WAIT)
 LATER = replace(TICK, index=6, due_ns=START_NS + 20 * MS, sent_ns=START_NS + 21 * MS)
 SOLVE = SolveInputs(
     serial=7,
@@ -138,13 +141,13 @@ def test_while_nobody_flies_ticks_have_the_newest_state_if_it_is_fresh(
     viewed.receive(viewed.packets(), replace(NOBODY, sent_ns=START_NS + late_ms * MS))
     (tick,) = viewed.sink.ticks
     assert (tick.state is not None) is is_fresh
-    assert tick.release_reason == "wait"
+    assert tick.release_reason == WAIT
 
 
 @pytest.mark.parametrize("phase", list(Phase))
 def test_a_reason_is_told_unless_the_policy_has_the_sticks(phase: Phase) -> None:
     (tick,) = Viewed().receive(replace(NOBODY, phase=phase)).sink.ticks
-    assert tick.release_reason == (None if phase is Phase.FLYING else "wait")
+    assert tick.release_reason == (None if phase is Phase.FLYING else WAIT)
 
 
 def test_ticks_are_numbered_without_gaps_and_take_the_words_along() -> None:
@@ -167,8 +170,8 @@ def test_flights_are_counted_and_the_phase_is_that_of_the_gate() -> None:
     viewed = Viewed().receive(NOBODY, TICK, TICK, replace(NOBODY, phase=Phase.RELEASED), TICK)
     assert viewed.view.flights == 2
     assert viewed.view.phase is Phase.FLYING
-    viewed.receive(replace(NOBODY, phase=Phase.RELEASING, reason="mode changed"))
-    assert (viewed.view.phase, viewed.view.reason) == (Phase.RELEASING, "mode changed")
+    viewed.receive(replace(NOBODY, phase=Phase.RELEASING, reason=OFF))
+    assert (viewed.view.phase, viewed.view.reason) == (Phase.RELEASING, OFF)
 
 
 def test_it_is_airborne_while_the_policy_flies_and_the_vehicle_says_so() -> None:

@@ -13,6 +13,7 @@ from helpers.wire import CALIBRATION, WireEnd
 from mavbridge.core.clock import NS_PER_MS, NS_PER_S
 from mavbridge.core.errors import PeerError, UserError
 from mavbridge.core.observers import BoundedQueue
+from mavbridge.core.reasons import Code, because
 from mavbridge.core.vehicle import (
     IDLE,
     ActionMeaning,
@@ -205,12 +206,13 @@ class Rig:
 
 
 IDLE_US = [1500, 1500, 1100, 1500, 65535, 65535, 65535, 65535]
+PILOTS = Release(because(Code.PILOT_FLIES))
 RELEASE_US = [0, 0, 0, 0, 65535, 65535, 65535, 65535]
 
 
 def test_from_first_heartbeat_to_ready() -> None:
     rig = Rig()
-    assert rig.run(1.0).problem == "waiting for the vehicle's heartbeat"
+    assert rig.run(1.0).problem == because(Code.NO_HEARTBEAT)
     snapshot = rig.run(9.0)
     assert snapshot.problem is None
     assert not snapshot.echo_confirmed
@@ -239,7 +241,8 @@ def test_what_is_missing_is_said_with_why_a_vehicle_that_signs_does_not_answer(
     rig.vehicle.is_deaf = True
     problem = rig.run(12.0).problem
     assert problem is not None
-    assert ("give its key by --signing-key-file" in problem) is signs
+    assert problem.codes == ((Code.WITH_HINT,) if signs else ()) + (Code.REQUESTING_TELEMETRY,)
+    assert ("give its key by --signing-key-file" in str(problem)) is signs
 
 
 def test_the_packet_log_has_both_directions_and_only_what_left() -> None:
@@ -299,14 +302,18 @@ def test_a_vehicle_that_would_ignore_us_is_reported_before_a_stick_is_sent(
     rig.vehicle.params |= params
     problem = rig.run(8.0).problem
     assert problem is not None
-    assert "would ignore our sticks" in problem
-    assert expected in problem
+    assert problem.code is Code.OBSTACLE
+    assert "would ignore our sticks" in str(problem)
+    assert expected in str(problem)
 
 
 def test_a_radio_calibration_that_would_fail_in_flight_is_a_problem_and_not_an_error() -> None:
     rig = Rig()
     rig.vehicle.params["RC1_MAX"] = 2250.0
-    assert "--set RC1_MAX=2200" in (rig.run(8.0).problem or "")
+    problem = rig.run(8.0).problem
+    assert problem is not None
+    assert problem.code is Code.PARAMETERS
+    assert "--set RC1_MAX=2200" in str(problem)
     assert rig.link.send(Command(action=Sticks(0.0, 0.0, 0.0, 1.0))) is None
 
 
@@ -334,10 +341,11 @@ def test_a_parameter_that_matters_and_changes_in_flight_is_an_interruption() -> 
     assert rig.run(1.5, Command(action=IDLE)).interruption is None
     rig.vehicle.put(rig.vehicle.end.mav.param_value_encode(b"RC1_MAX", 1950, 9, 99, 0))
     snapshot = rig.run(0.1, Command(action=IDLE))
-    assert snapshot.interruption == "RC1_MAX was changed from 1900 to 1950 in flight"
-    assert "disarm" in (snapshot.problem or "")
+    changed = because(Code.PARAMETER_CHANGED, name="RC1_MAX", before=1900.0, after=1950.0)
+    assert snapshot.interruption == changed
+    assert snapshot.problem == because(Code.CALIBRATION_CHANGED)
     rig.vehicle.armed = False
-    assert rig.run(2.0, Release("disarmed")).problem is None
+    assert rig.run(2.0, PILOTS).problem is None
 
 
 @pytest.mark.parametrize("resting_throttle_us", [1000, 1100])
@@ -348,7 +356,9 @@ def test_a_vehicle_that_ignores_us_is_noticed(resting_throttle_us: int) -> None:
     rig.run(8.0)
     assert rig.run(0.9, Command(action=IDLE)).problem is None
     snapshot = rig.run(0.3, Command(action=IDLE))
-    assert "another station may be overriding" in (snapshot.problem or "")
+    assert snapshot.problem is not None
+    assert snapshot.problem.code is Code.OVERRULED
+    assert "another station may be overriding" in str(snapshot.problem)
     assert snapshot.is_overruled
     assert not snapshot.echo_confirmed
     assert rig.link.stats().echo_confirmed is False
@@ -359,7 +369,8 @@ def test_without_rc_channels_there_is_nothing_to_check_against() -> None:
     rig.run(8.0)
     rig.vehicle.shows_rc = False
     rig.vehicle.follows_overrides = False
-    assert "no RC_CHANNELS" in (rig.run(1.3, Command(action=IDLE)).problem or "")
+    unshown = because(Code.NO_ECHO, message="RC_CHANNELS", quantity="sticks")
+    assert rig.run(1.3, Command(action=IDLE)).problem == unshown
 
 
 def test_releases_leave_every_50_ms_while_they_are_asked_for_and_not_for_ever() -> None:
@@ -368,17 +379,17 @@ def test_releases_leave_every_50_ms_while_they_are_asked_for_and_not_for_ever() 
     for k in range(2):
         rig.run(0.2, Command(action=IDLE))
         count = len(rig.overrides())
-        rig.run(0.01, Release("pilot"))
+        rig.run(0.01, PILOTS)
         assert rig.overrides()[count:] == [RELEASE_US]  # in the same tick
-        rig.run(0.05 + 0.05 * k, Release("pilot"))
+        rig.run(0.05 + 0.05 * k, PILOTS)
         rig.run(1.0)  # nobody asks
         assert rig.overrides()[count:] == [RELEASE_US] * (2 + k)
-    rig.run(0.01, Release("pilot"))
+    rig.run(0.01, PILOTS)
     rig.run(0.01, Command(action=IDLE))
     count = len(rig.overrides())
-    rig.run(0.01, Release("pilot"))
+    rig.run(0.01, PILOTS)
     assert rig.overrides()[count:] == [RELEASE_US]  # the last one was before an override
-    rig.run(6.0, Release("pilot"))
+    rig.run(6.0, PILOTS)
     assert rig.overrides()[count:] == [RELEASE_US] * 80
     assert rig.link.stats().sent_overrides == 41
 
@@ -388,7 +399,7 @@ def test_a_release_that_could_not_be_sent_goes_before_everything_else() -> None:
     rig.run(8.0)
     rig.run(0.2, Command(action=IDLE))
     rig.vehicle.is_deaf = True
-    rig.run(1.5, Release("pilot"))
+    rig.run(1.5, PILOTS)
     assert RELEASE_US not in rig.overrides()
     rig.vehicle.is_deaf = False
     count = len(rig.vehicle.received)
@@ -404,11 +415,11 @@ def test_a_release_is_the_first_packet_after_a_reopen(still_asked: bool) -> None
     rig.run(0.2, Command(action=IDLE))
     rig.vehicle.is_down = True
     rig.run(0.02, Command(action=IDLE))  # now it is noticed
-    rig.run(0.01, Release("pilot"))
-    rig.run(2.5, Release("pilot") if still_asked else None)
+    rig.run(0.01, PILOTS)
+    rig.run(2.5, PILOTS if still_asked else None)
     count = len(rig.vehicle.received)
     rig.vehicle.is_down = False
-    rig.run(1.2, Release("pilot") if still_asked else None)
+    rig.run(1.2, PILOTS if still_asked else None)
     names = rig.vehicle.names()[count:]
     assert names[0] == "RC_CHANNELS_OVERRIDE"
     assert "HEARTBEAT" in names
@@ -424,7 +435,7 @@ def test_sticks_that_could_not_be_sent_are_not_reported_as_sent() -> None:
     rig.vehicle.is_deaf = True
     assert rig.link.send(Command(action=IDLE)) is None
     rig.vehicle.is_down = True
-    assert rig.run(0.1).problem == "the connection to the vehicle is lost: reconnecting"
+    assert rig.run(0.1).problem == because(Code.CONNECTION_LOST)
     assert rig.link.send(Command(action=IDLE)) is None
     assert rig.link.stats().sent_overrides == 20
 
@@ -432,7 +443,7 @@ def test_sticks_that_could_not_be_sent_are_not_reported_as_sent() -> None:
 def test_nothing_is_released_that_was_never_overridden() -> None:
     rig = Rig()
     rig.run(8.0)
-    rig.run(1.0, Release("disarmed"))
+    rig.run(1.0, PILOTS)
     assert rig.overrides() == []
 
 
@@ -450,7 +461,7 @@ def test_the_override_switch_decides() -> None:
     rig = Rig()
     rig.vehicle.params["RC7_OPTION"] = 46.0
     rig.vehicle.channels[6] = 1000
-    assert "override switch (RC7) is off" in (rig.run(9.0).problem or "")
+    assert rig.run(9.0).problem == because(Code.OVERRIDE_SWITCH_NOT_ON, channel=7)
     rig.vehicle.channels[6] = 2000
     assert rig.run(0.3).problem is None
 
@@ -460,7 +471,7 @@ def test_a_silent_vehicle_is_lost_after_three_beats_and_found_again() -> None:
     rig.run(8.0)
     rig.vehicle.is_alive = False
     assert rig.run(1.9).problem is None  # the last beat was a second before
-    assert rig.run(0.3).problem == "the vehicle's heartbeat is lost"
+    assert rig.run(0.3).problem == because(Code.HEARTBEAT_LOST)
     rig.vehicle.is_alive = True
     assert rig.run(1.0).problem is None
 
@@ -490,12 +501,15 @@ def test_on_the_ground_a_vehicle_that_moves_is_followed_and_said_to_have_moved()
     rig = Rig()
     assert rig.run(8.0).interruption is None
     told = []
-    for port in (2, 1):
+    for count, port in enumerate((2, 1), 1):
         rig.vehicle.address = ("127.0.0.1", port)
-        told.append(rig.run(10.0).interruption)
+        snapshot = rig.run(10.0)
+        assert snapshot.interruptions == count
+        told.append(snapshot.interruption)
         assert rig.vehicle.answered_to == ("127.0.0.1", port)
         assert rig.run(0.1).problem is None
-    assert all(text is not None and text in rig.texts for text in told)
+    assert all(why is not None and why.code is Code.REPLACED for why in told)
+    assert all(str(why) in rig.texts for why in told)
     assert "now sends from 127.0.0.1:2 instead of 127.0.0.1:1" in str(told[0])
     assert told[0] != told[1]
 
@@ -509,15 +523,16 @@ def test_in_flight_a_vehicle_that_moves_is_not_followed() -> None:
     count = len(rig.forwarded)
     snapshot = rig.run(9.0, Command(action=IDLE))
     assert snapshot.interruption is not None
+    assert snapshot.interruption.code is Code.REPLACED
     for part in ("127.0.0.1:1 is silent", "heard from 127.0.0.1:2", "engage again"):
-        assert part in snapshot.interruption
+        assert part in str(snapshot.interruption)
     assert rig.vehicle.answered_to == ("127.0.0.1", 1)
     assert len(rig.forwarded) == count
     attitude = snapshot.telemetry.ned_from_body_wxyz
     assert attitude is not None
     assert rig.clock.now_ns() - attitude.happened_ns >= 9 * NS_PER_S
     rig.link.is_engaged = False
-    rig.run(1.0, Release("moved"))
+    rig.run(1.0, PILOTS)
     assert rig.vehicle.answered_to == ("127.0.0.1", 2)
     assert rig.run(5.0).problem is None
     assert rig.overrides()[-20:] == [RELEASE_US] * 20  # by the calibration of the last override
@@ -555,19 +570,17 @@ def test_one_old_stamp_is_no_reboot_and_costs_no_release() -> None:
 def test_a_reboot_ends_the_engagement_and_still_leaves_a_release() -> None:
     rig = Rig()
     rig.run(8.0)
-    told = []
-    for _ in range(2):
+    for interruptions in (1, 2):
         rig.link.is_engaged = True
         rig.run(0.2, Command(action=IDLE))
         rig.vehicle.boot_ns = rig.clock.now_ns()
-        told.append(rig.run(0.05, Command(action=IDLE)).interruption)
+        snapshot = rig.run(0.05, Command(action=IDLE))
+        assert snapshot.interruption == because(Code.REBOOTED)
+        assert snapshot.interruptions == interruptions
         count = len(rig.overrides())
-        rig.run(0.2, Release("reboot"))
+        rig.run(0.2, PILOTS)
         assert rig.overrides()[count:] == [RELEASE_US] * 4
         assert rig.run(8.0).problem is None
-    assert "the vehicle has rebooted" in str(told[0])
-    assert "the vehicle has rebooted" in str(told[1])
-    assert told[0] != told[1]
 
 
 def test_a_reboot_starts_the_handshake_again() -> None:
@@ -674,7 +687,9 @@ def test_a_slow_clock_is_told_once_and_explains_a_heartbeat_that_is_late() -> No
     rig.vehicle.is_alive = False
     snapshot = rig.run(4.0)
     (told,) = [text for text in rig.texts if "the vehicle's clock runs at 0.25" in text]
-    assert snapshot.problem == f"{told}; the vehicle's heartbeat is lost"
+    assert snapshot.problem == because(
+        Code.SLOW_CLOCK, first=because(Code.HEARTBEAT_LOST), hint=told
+    )
 
 
 def test_what_is_forwarded_gives_the_same_readings_elsewhere() -> None:
@@ -763,8 +778,8 @@ def test_px4_is_flown_with_manual_control_and_released_by_silence() -> None:
     snapshot = rig.run(0.1, Command(action=IDLE))
     assert snapshot.echo_confirmed
     assert not snapshot.is_released
-    assert rig.run(0.5, Release("pilot")).is_released is False
-    assert rig.run(0.3, Release("pilot")).is_released
+    assert rig.run(0.5, PILOTS).is_released is False
+    assert rig.run(0.3, PILOTS).is_released
     sticks = [m for m in rig.vehicle.received if m.get_type() == "MANUAL_CONTROL"]
     assert len(sticks) == 10
     assert rig.overrides() == []
@@ -775,7 +790,7 @@ def test_where_nobody_else_has_sticks_px4_gets_neutral_ones_before_the_silence()
     rig.vehicle.channels = [0] * 8
     rig.run(8.0)
     rig.run(0.1, Command(action=IDLE))
-    rig.run(0.5, Release("pilot"))
+    rig.run(0.5, PILOTS)
     sticks = [m for m in rig.vehicle.received if m.get_type() == "MANUAL_CONTROL"]
     assert [(m.x, m.y, m.z, m.r) for m in sticks[10:]] == [(0, 0, 500, 0)]
 
@@ -787,7 +802,7 @@ def test_px4_that_does_not_hear_our_sticks_is_noticed() -> None:
     rig.vehicle.follows_overrides = False
     assert rig.run(0.4, Command(action=IDLE)).problem is None
     snapshot = rig.run(0.1, Command(action=IDLE))
-    assert snapshot.problem == "no MANUAL_CONTROL arrive to check our sticks against"
+    assert snapshot.problem == because(Code.NO_ECHO, message="MANUAL_CONTROL", quantity="sticks")
     assert not snapshot.is_overruled
 
 
@@ -798,7 +813,9 @@ def test_other_sticks_that_px4_follows_are_noticed() -> None:
     rig.vehicle.put(rig.vehicle.end.mav.manual_control_encode(1, 300, -200, 700, 0, 0))
     rig.vehicle.follows_overrides = False
     snapshot = rig.run(0.02, Command(action=IDLE))
-    assert "another station sends sticks" in (snapshot.problem or "")
+    assert snapshot.problem is not None
+    assert snapshot.problem.code is Code.OVERRULED
+    assert "another station sends sticks" in str(snapshot.problem)
     assert snapshot.is_overruled
 
 
@@ -857,7 +874,7 @@ def test_setpoints_are_sent_as_such_and_their_silence_is_no_failsafe(autopilot: 
     assert (snapshot.problem, snapshot.echo_confirmed) == (None, True)  # in a mode with sticks
     names = rig.vehicle.names()
     assert names.count("SET_ATTITUDE_TARGET") == 200
-    assert rig.run(0.5, Release("end")).is_released
+    assert rig.run(0.5, PILOTS).is_released
     assert rig.vehicle.names().count("SET_ATTITUDE_TARGET") == 200
     assert not {"MANUAL_CONTROL", "RC_CHANNELS_OVERRIDE"} & {*rig.vehicle.names()}
 
@@ -913,7 +930,7 @@ def test_an_output_that_makes_no_sense_is_refused_at_once_where_the_vehicle_is_k
 
 def test_without_a_policy_nothing_is_sent() -> None:
     rig = Rig(meaning=None)
-    assert rig.run(8.0, Command(action=IDLE)).problem == "no policy is loaded yet"
+    assert rig.run(8.0, Command(action=IDLE)).problem == because(Code.NO_POLICY_LOADED)
     assert rig.overrides() == []
     rig.link.begin_flight(ActionMeaning(), None)
     assert rig.run(0.1).problem is None

@@ -9,6 +9,7 @@ from pymavlink.dialects.v20 import ardupilotmega as dialect
 from helpers.parameters import NAMES, ParamVehicle, lossy, status
 from helpers.wire import CALIBRATION
 from mavbridge.core.clock import NS_PER_S
+from mavbridge.core.reasons import Code, because
 from mavbridge.core.vehicle import Output, Risk
 from mavbridge.mavlink.codec.messages import CommandRequest, ParamValue, ParamWrite
 from mavbridge.mavlink.profiles import ardupilot_params
@@ -141,8 +142,9 @@ def test_a_risk_is_refused_until_it_is_accepted_or_mended(
     refused.run(6.0)
     problem = refused.problem()
     assert problem is not None
-    assert cure in problem
-    assert f"--accept-risk {risk}" in problem
+    assert (problem.code, dict(problem.data)["risk"]) == (Code.RISK, risk)
+    assert cure in str(problem)
+    assert f"--accept-risk {risk}" in str(problem)
     for name in change:
         refused.set_by_pilot(name, 1.0)
     assert refused.problem() is None
@@ -156,7 +158,10 @@ def test_a_risk_is_refused_until_it_is_accepted_or_mended(
 def test_a_receiver_makes_up_for_a_disabled_throttle_failsafe() -> None:
     vehicle = ParamVehicle({"FS_THR_ENABLE": 0.0})
     vehicle.run(6.0)
-    assert "no receiver was seen" in (vehicle.problem() or "")
+    problem = vehicle.problem()
+    assert problem is not None
+    assert dict(problem.data)["risk"] == "no-throttle-failsafe"
+    assert "no receiver was seen" in str(problem)
     vehicle.has_receiver = True
     assert vehicle.problem() is None
 
@@ -214,10 +219,10 @@ def test_many_sticks_fill_a_port_that_carries_few_states() -> None:
 def test_a_slow_serial_port_is_refused_for_both_autopilots(connect: str) -> None:
     vehicle = ParamVehicle(connect=connect)
     vehicle.run(6.0)
-    assert "or --accept-risk slow-serial" in (vehicle.problem() or "")
+    assert "or --accept-risk slow-serial" in str(vehicle.problem())
     px4 = px4_vehicle(connect=connect)
     px4.run(6.0)
-    assert "or --accept-risk slow-serial" in (px4.problem() or "")
+    assert "or --accept-risk slow-serial" in str(px4.problem())
     fine = px4_vehicle(connect=connect, accepted_risks=("slow-serial",))
     fine.run(6.0)
     assert fine.problem() is None
@@ -244,7 +249,7 @@ def test_what_is_known_can_be_listed() -> None:
 def test_reading_goes_on_through_losses(seed: int) -> None:
     vehicle = ParamVehicle({"RC_OVERRIDE_TIME": -1.0}, loses=lossy(0.5, seed))
     vehicle.run(60.0)
-    assert "RC_OVERRIDE_TIME is -1" in (vehicle.problem() or "")
+    assert "RC_OVERRIDE_TIME is -1" in str(vehicle.problem())
 
 
 def test_a_vehicle_without_the_decisive_parameters_is_flown_with_a_warning() -> None:
@@ -290,7 +295,7 @@ def test_a_change_on_the_ground_is_taken_in() -> None:
     vehicle.run(6.0)
     vehicle.set_by_pilot("RC1_MAX", 1950.0)
     vehicle.set_by_pilot("RCMAP_YAW", 5.0)
-    assert "RC5_MIN" in (vehicle.problem() or "")
+    assert "RC5_MIN" in str(vehicle.problem())
     vehicle.values |= {f"RC5_{part}": 1500.0 for part in NAMES} | {
         "RC5_MIN": 1000.0,
         "RC5_MAX": 2000.0,
@@ -333,7 +338,7 @@ def test_a_change_in_flight_that_matters_interrupts_for_good(name: str, value: f
     vehicle.run(1.0)
     vehicle.set_by_pilot(name, value)
     vehicle.run(1.0)
-    told = f"{name} was changed from {old:g} to {value:g} in flight"
+    told = because(Code.PARAMETER_CHANGED, name=name, before=old, after=value)
     assert vehicle.params.interruption == told
     assert vehicle.params.calibration == before  # a release needs the channels of the override
     if name != "RC7_OPTION":  # whether that switch is on is for the session to say
@@ -371,7 +376,7 @@ def test_a_calibration_changed_in_flight_counts_from_the_next_time_on_the_ground
     vehicle.armed = True
     vehicle.set_by_pilot("RC1_MAX", 1950.0)
     vehicle.run(1.0)
-    assert "disarm to take it in" in (vehicle.problem() or "")
+    assert vehicle.problem() == because(Code.CALIBRATION_CHANGED)
     vehicle.armed = False
     vehicle.run(0.1)
     assert vehicle.problem() is None
@@ -398,9 +403,10 @@ def test_all_is_read_before_the_output_is_known_and_nothing_is_read_twice() -> N
     assert vehicle.texts == []  # nobody is advised about an output that may not be used
     count = len(vehicle.requests)
     vehicle.params.use_output("rates")
-    problem = vehicle.problem() or ""
-    assert "--set GUID_OPTIONS=8" in problem
-    assert problem.startswith("the vehicle would not fly by our setpoints")
+    problem = vehicle.problem()
+    assert problem is not None
+    assert (problem.code, dict(problem.data)["what"]) == (Code.OBSTACLE, "not fly by our setpoints")
+    assert "--set GUID_OPTIONS=8" in str(problem)
     vehicle.set_by_pilot("GUID_OPTIONS", 8.0)
     assert vehicle.problem() is None
     vehicle.run(3.0)
@@ -427,7 +433,10 @@ def test_what_only_another_output_needs_does_not_matter() -> None:
 def test_a_px4_that_does_not_listen_to_mavlinks_sticks_is_refused(mode: float) -> None:
     vehicle = px4_vehicle({"COM_RC_IN_MODE": mode})
     vehicle.run(6.0)
-    assert "--set COM_RC_IN_MODE=1" in (vehicle.problem() or "")
+    problem = vehicle.problem()
+    assert problem is not None
+    assert problem.code is Code.OBSTACLE
+    assert "--set COM_RC_IN_MODE=1" in str(problem)
     setpoints = px4_vehicle({"COM_RC_IN_MODE": mode}, output="velocity")
     setpoints.run(6.0)
     assert setpoints.problem() is None

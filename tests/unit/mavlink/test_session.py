@@ -10,6 +10,7 @@ from pymavlink.dialects.v20 import ardupilotmega as dialect
 from mavbridge.core.address import parse_address
 from mavbridge.core.clock import NS_PER_MS, NS_PER_S
 from mavbridge.core.errors import PeerError
+from mavbridge.core.reasons import Code
 from mavbridge.mavlink.codec.messages import (
     Attitude,
     Endpoint,
@@ -259,7 +260,8 @@ def test_packets_that_begin_to_come_late_are_told_after_two_of_them() -> None:
     assert sync.late_sending is None  # one may have waited
     exchange(sync, 11 * S, up_ns=180 * NS_PER_MS, down_ns=NS_PER_MS)
     assert sync.late_sending is not None
-    assert "take 178 ms or more to the vehicle" in sync.late_sending
+    assert sync.late_sending.code is Code.LATE_SENDING
+    assert dict(sync.late_sending.data)["age_ms"] == pytest.approx(178.5, abs=0.5)
     exchange(sync, 12 * S, up_ns=NS_PER_MS, down_ns=NS_PER_MS)
     assert sync.late_sending is None
     exchange(sync, 13 * S, up_ns=310 * NS_PER_MS, down_ns=NS_PER_MS)

@@ -10,6 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from helpers.parameters import ParamVehicle, lossy
+from mavbridge.core.reasons import Code, because
 
 WANTED = (("RC_OVERRIDE_TIME", 0.5),)
 SET = [("RC_OVERRIDE_TIME", 0.5)]
@@ -87,7 +88,7 @@ def test_a_value_that_the_vehicle_does_not_take_forbids_the_flight(tmp_path: Pat
     vehicle = start(tmp_path)
     vehicle.refuses.add("RC_OVERRIDE_TIME")
     vehicle.run(10.0)
-    assert "did not take --set RC_OVERRIDE_TIME=0.5: it stays at 3" in (vehicle.problem() or "")
+    assert "did not take --set RC_OVERRIDE_TIME=0.5: it stays at 3" in str(vehicle.problem())
     assert len(vehicle.writes) == 6
     assert list(tmp_path.iterdir()) == []  # nothing to put back
     vehicle.set_by_pilot("RC_OVERRIDE_TIME", 0.5)
@@ -102,14 +103,14 @@ def test_a_vehicle_that_does_not_confirm_may_have_taken_it(tmp_path: Path) -> No
         vehicle.step()
     vehicle.fall_silent()
     vehicle.run(5.0)
-    assert "it does not answer" in (vehicle.problem() or "")
+    assert "it does not answer" in str(vehicle.problem())
     assert "RC_OVERRIDE_TIME" in remembered(tmp_path)
 
 
 def test_a_parameter_that_does_not_exist_forbids_the_flight(tmp_path: Path) -> None:
     vehicle = ParamVehicle(folder=tmp_path, set_params=(("RC_OVERIDE_TIME", 0.5),))
     vehicle.run(6.0)
-    assert "no such parameter; check its name" in (vehicle.problem() or "")
+    assert "no such parameter; check its name" in str(vehicle.problem())
     assert vehicle.writes == []
 
 
@@ -117,7 +118,8 @@ def test_nothing_is_set_or_put_back_while_armed(tmp_path: Path) -> None:
     vehicle = start(tmp_path)
     vehicle.armed = True
     vehicle.run(6.0)
-    assert vehicle.problem() == "--set and --restore-params wait until the vehicle is disarmed"
+    said = "--set and --restore-params wait until the vehicle is disarmed"
+    assert vehicle.problem() == because(Code.PARAMETERS, said=said)
     assert vehicle.writes == []
     vehicle.armed = False
     vehicle.run(1.0)
@@ -154,7 +156,7 @@ def test_arming_while_something_is_set_stops_that_until_it_is_disarmed(tmp_path:
     vehicle.refuses.clear()
     vehicle.run(5.0)
     assert vehicle.writes == SET
-    assert "wait until the vehicle is disarmed" in (vehicle.problem() or "")
+    assert "wait until the vehicle is disarmed" in str(vehicle.problem())
     vehicle.armed = False
     vehicle.run(1.0)
     assert vehicle.values["RC_OVERRIDE_TIME"] == 0.5
@@ -329,7 +331,7 @@ def test_a_damaged_file_is_never_overwritten(tmp_path: Path, content: str) -> No
     file.write_text(content)
     vehicle = start(tmp_path)
     vehicle.run(6.0)
-    assert f"cannot read {file}" in (vehicle.problem() or "")
+    assert f"cannot read {file}" in str(vehicle.problem())
     end(vehicle)
     assert vehicle.writes == []
     assert file.read_text() == content
@@ -343,7 +345,7 @@ def test_nothing_is_set_that_cannot_be_remembered(tmp_path: Path) -> None:
     (tmp_path / "file").write_text("")
     vehicle = start(tmp_path / "file" / "state")
     vehicle.run(6.0)
-    problem = vehicle.problem() or ""
+    problem = str(vehicle.problem())
     assert "cannot re" in problem
     assert "vehicle-1-ab12.json" in problem
     assert vehicle.writes == []
@@ -359,5 +361,5 @@ def test_a_full_disk_forbids_the_flight(tmp_path: Path, monkeypatch: pytest.Monk
 
     monkeypatch.setattr("mavbridge.core.files.os.fsync", full)
     vehicle.run(6.0)
-    assert "No space left on device" in (vehicle.problem() or "")
+    assert "No space left on device" in str(vehicle.problem())
     assert vehicle.writes == []

@@ -10,6 +10,7 @@ from pymavlink.dialects.v20 import ardupilotmega as dialect
 from helpers.wire import ARDUPILOT, CALIBRATION
 from mavbridge.core.clock import NS_PER_MS, NS_PER_S
 from mavbridge.core.errors import PeerError
+from mavbridge.core.reasons import Code, Reason, because
 from mavbridge.core.vehicle import ActionMeaning, Sticks, VehicleStatus
 from mavbridge.mavlink.codec.messages import (
     Altitude,
@@ -113,7 +114,7 @@ class Session:
         self.put(Heartbeat(2, 3, 81 | 128 * armed, mode, state))
 
     @property
-    def problem(self) -> str | None:
+    def problem(self) -> Reason | None:
         session, now_ns = self.session, self.now_ns
         return session.problem(now_ns) or session.output_problem(now_ns)
 
@@ -400,7 +401,7 @@ def test_nothing_is_ready_before_the_receiver_was_looked_for() -> None:
         if tick % 50 == 0:
             session.put(Heartbeat(2, 3, 81, 2, 4))
         problem = session.problem
-        looked_s += 0.01 * (problem == "looking for the pilot's radio receiver")
+        looked_s += 0.01 * (problem == because(Code.LOOKING_FOR_RECEIVER))
     assert looked_s == pytest.approx(2.0, abs=0.03)
     assert session.problem is None
 
@@ -413,7 +414,7 @@ def test_a_receiver_that_shows_at_once_is_not_waited_for() -> None:
         session.answer_requests()
         session.now_ns += 20 * MS
         session.put(Heartbeat(2, 3, 81, 2, 4))
-        assert session.problem != "looking for the pilot's radio receiver"
+        assert session.problem != because(Code.LOOKING_FOR_RECEIVER)
     assert session.problem is None
 
 
@@ -518,7 +519,9 @@ def test_without_a_switch_nothing_is_switched_off() -> None:
 # --- the echo, in words
 
 
-def overruled(session: Session, shown_us: tuple[int, ...], duration_s: float = 1.2) -> str | None:
+def overruled(
+    session: Session, shown_us: tuple[int, ...], duration_s: float = 1.2
+) -> Reason | None:
     """Sticks of ours at 100 Hz; ``shown_us`` instead of them from 0.3 s on."""
     session.rc(RECEIVER)
     for tick in range(round(duration_s * 100)):
@@ -534,19 +537,26 @@ def overruled(session: Session, shown_us: tuple[int, ...], duration_s: float = 1
 
 
 @pytest.mark.parametrize(
-    ("shown_us", "expected"),
+    ("shown_us", "code", "expected"),
     [
-        ((1300, 1500, 1500, 1500, *RECEIVER[4:]), "another station is overriding them"),
-        (RECEIVER, "the sticks that it had before us"),
-        ((1700, 1500, 1500, 1500, *RECEIVER[4:]), "does not hear our sticks"),
-        ((), "no RC_CHANNELS arrive"),
+        (
+            (1300, 1500, 1500, 1500, *RECEIVER[4:]),
+            Code.OVERRULED,
+            "another station is overriding them",
+        ),
+        (RECEIVER, Code.OVERRULED, "the sticks that it had before us"),
+        ((1700, 1500, 1500, 1500, *RECEIVER[4:]), Code.UNHEARD, "our sticks"),
+        ((), Code.NO_ECHO, "no RC_CHANNELS arrive"),
     ],
 )
-def test_the_reason_names_what_was_seen(shown_us: tuple[int, ...], expected: str) -> None:
+def test_the_reason_names_what_was_seen(
+    shown_us: tuple[int, ...], code: Code, expected: str
+) -> None:
     session = Session()
     reason = overruled(session, shown_us, 1.5)
     assert reason is not None
-    assert expected in reason
+    assert reason.code is code
+    assert expected in str(reason)
     # Where our packets are lost, nobody has taken over: the way out begins with neutral sticks.
     is_lost = not shown_us or shown_us[0] == 1700
     assert (session.output.overruled(session.now_ns) is None) is is_lost

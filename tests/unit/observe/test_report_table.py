@@ -6,6 +6,7 @@ from rich.console import Console, RenderableType
 from helpers.factories import START_NS, TICK_NS, make_released_tick, make_tick
 from helpers.reports import report_of
 from mavbridge.core.clock import NS_PER_MS
+from mavbridge.core.reasons import Code, because
 from mavbridge.core.vehicle import LinkStats, Percentiles
 from mavbridge.observe.report_table import timing_table, verdicts
 from mavbridge.observe.timing import TimingReport
@@ -66,12 +67,13 @@ def test_verdicts_compare_targets_and_results() -> None:
 
 
 def test_verdicts_name_the_last_releases_and_what_observers_missed() -> None:
-    reasons = ["a", "b", "c", "d"]
+    reasons = [because(code) for code in (Code.NO_CHUNK, Code.DISARMED, Code.DURATION, Code.SIGNAL)]
     report = report_of(
         *(make_released_tick(index, reason) for index, reason in enumerate(reasons)), rerun_drops=1
     )
     assert verdict_lines(report)[-2:] == [
-        "releases released 4 times, last for: b (0.0 s); c (0.0 s); d (0.0 s)",
+        "releases released 4 times, last for: the vehicle has been disarmed (0.0 s); "
+        "the flight is over (0.0 s); the flight was ended by a signal (0.0 s)",
         "rerun    missed 1 event",
     ]
 

@@ -14,6 +14,7 @@ from helpers.factories import (
 from helpers.reports import report_of
 from mavbridge.config.rates import STATUS_HZ
 from mavbridge.core.clock import NS_PER_MS
+from mavbridge.core.reasons import Code, Reason, because
 from mavbridge.core.records import Tick
 from mavbridge.core.vehicle import NEUTRAL
 from mavbridge.observe.terminal import MAX_MESSAGES, PLAIN_PERIOD_S, FlightScreen
@@ -25,6 +26,10 @@ REFRESH_TICKS = round(100 / STATUS_HZ)
 def make_screen(console: Console | None = None, *, readonly: bool = False) -> FlightScreen:
     console = console or Console(file=io.StringIO())
     return FlightScreen(console, action_hz=100, vision_hz=30, readonly=readonly)
+
+
+def said(text: str) -> Reason:
+    return because(Code.POLICY_REFUSED, said=text)
 
 
 def fly(screen: FlightScreen, *, ticks: int, first: int = 0) -> str:
@@ -53,12 +58,15 @@ def test_before_the_first_tick_the_line_says_so() -> None:
 @pytest.mark.parametrize(
     ("tick", "expected"),
     [
-        (make_released_tick(0, "no feature yet"), "RELEASED  ALT_HOLD armed"),
+        (make_released_tick(0), "RELEASED  ALT_HOLD armed"),
         (
-            make_released_tick(0, "no receiver", sent=NEUTRAL, phase="holding"),
+            make_released_tick(0, because(Code.NO_RECEIVER), sent=NEUTRAL, phase="holding"),
             "NEUTRAL  ALT_HOLD armed",
         ),
-        (make_released_tick(0, "press e", phase="waiting"), "WAITING  ALT_HOLD armed"),
+        (
+            make_released_tick(0, because(Code.NOT_ENGAGED), phase="waiting"),
+            "WAITING  ALT_HOLD armed",
+        ),
         (make_tick(0, is_coasting=True), "COASTING  ALT_HOLD armed"),
         (make_tick(0, trace=None), "PREPARING  ALT_HOLD armed"),
         (make_tick(0, armed=False), "FLYING  ALT_HOLD disarmed"),
@@ -79,10 +87,10 @@ def test_readonly_is_not_called_flying_and_a_release_stays_a_release() -> None:
     screen = make_screen(readonly=True)
     screen.emit(make_tick(0, sent=None))
     assert screen.status_line().plain.startswith("READ-ONLY  ")
-    screen.emit(make_released_tick(1, "no feature yet"))
+    screen.emit(make_released_tick(1, because(Code.NO_IMAGE)))
     line = screen.status_line().plain
     assert line.startswith("RELEASED  ")
-    assert line.endswith("  no feature yet")  # last, since it may be long
+    assert line.endswith("  no image feature yet")  # last, since it may be long
 
 
 def test_one_refresh_is_no_rate_yet() -> None:
@@ -114,7 +122,7 @@ def test_the_line_is_cut_not_wrapped_on_a_narrow_terminal() -> None:
     console = Console(file=out, width=60, force_terminal=True, color_system=None)
     screen = make_screen(console)
     with screen.live():
-        screen.emit(make_released_tick(0, "a very long reason " * 10))
+        screen.emit(make_released_tick(0, said("a very long reason " * 10)))
         screen.refresh()
         shown = out.getvalue().split("RELEASED")[-1]
     assert shown.rstrip().endswith("\N{HORIZONTAL ELLIPSIS}")
@@ -138,11 +146,12 @@ def test_where_there_is_no_terminal_a_line_is_printed_now_and_then() -> None:
 def test_messages_are_printed_once_in_order() -> None:
     out = io.StringIO()
     screen = make_screen(Console(file=out, width=80))
-    screen.emit(make_released_tick(0, reason="no [bold] state", texts=("vehicle: Arming motors",)))
-    screen.emit(make_released_tick(1, reason="no [bold] state"))
+    no_state = said("no [bold] state")
+    screen.emit(make_released_tick(0, reason=no_state, texts=("vehicle: Arming motors",)))
+    screen.emit(make_released_tick(1, reason=no_state))
     screen.emit(make_tick(2, trace=None, phase="preparing"))
     screen.emit(make_tick(3, phase="flying"))
-    screen.emit(make_released_tick(4, reason="mode", phase="released"))
+    screen.emit(make_released_tick(4, because(Code.DISARMED), phase="released"))
     screen.emit(make_tick(5, sent=None, phase="flying"))
     for _ in range(2):
         screen.refresh()
@@ -151,7 +160,7 @@ def test_messages_are_printed_once_in_order() -> None:
         "RELEASED: no [bold] state",
         "PREPARING: not in control yet",
         "FLYING: the policy has control",
-        "RELEASED: mode",
+        "RELEASED: the vehicle has been disarmed",
         "READ-ONLY: the policy runs, nothing is sent",
     ]
 
@@ -159,11 +168,21 @@ def test_messages_are_printed_once_in_order() -> None:
 def test_a_reason_that_keeps_changing_is_shown_once_a_second() -> None:
     out = io.StringIO()
     screen = make_screen(Console(file=out, width=80))
+    reasons = [because(code) for code in (Code.NO_CHUNK, Code.NO_IMAGE, Code.NOT_ARMED)]
     for index in range(201):
-        screen.emit(make_released_tick(index, reason=f"{index} ms old", phase="waiting"))
+        screen.emit(make_released_tick(index, reasons[index % 3], phase="waiting"))
     screen.refresh()
     lines = out.getvalue().splitlines()
-    assert lines == [f"WAITING: {index} ms old" for index in (0, 100, 200)]
+    assert lines == [f"WAITING: {reasons[index % 3]}" for index in (0, 100, 200)]
+
+
+def test_a_reason_whose_figures_alone_change_is_shown_once() -> None:
+    out = io.StringIO()
+    screen = make_screen(Console(file=out, width=80))
+    for index in range(201):
+        screen.emit(make_released_tick(index, because(Code.IMAGE_FROZEN, age_s=index / 100)))
+    screen.refresh()
+    assert out.getvalue() == "RELEASED: the image has been frozen for 0.0 s\n"
 
 
 def test_on_a_terminal_the_line_is_redrawn_and_leaves_nothing_behind() -> None:
@@ -232,7 +251,7 @@ def test_no_line_shows_the_password_of_an_address() -> None:
     text = io.StringIO()
     screen = make_screen(Console(file=text, width=200))
     secret = "camera rtsp://me:it@host/1?token=abc is lost"
-    screen.emit(make_released_tick(0, secret))
+    screen.emit(make_released_tick(0, said(secret)))
     line = screen.status_line().plain
     screen.show_message(secret)
     screen.show_status(secret)

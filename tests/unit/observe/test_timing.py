@@ -11,6 +11,7 @@ from helpers.factories import (
     make_vision_tick,
 )
 from mavbridge.core.clock import NS_PER_MS
+from mavbridge.core.reasons import Code, Reason, because, reason_to_json
 from mavbridge.core.records import Tick
 from mavbridge.core.vehicle import LinkStats, Percentiles
 from mavbridge.observe.timing import (
@@ -31,6 +32,13 @@ LINK = LinkStats(
     echo_confirmed=True,
     saturated=(("yaw", 0.01),),
 )
+
+
+NO_IMAGE, OFF = because(Code.NO_IMAGE), because(Code.OVERRIDE_SWITCH_OFF)
+
+
+def frozen(age_s: float) -> Reason:
+    return because(Code.IMAGE_FROZEN, age_s=age_s)
 
 
 def report_of(timing: FlightTiming, link: LinkStats | None = None) -> TimingReport:
@@ -165,30 +173,40 @@ def test_readonly_has_ages_but_nothing_on_the_wire() -> None:
 
 def test_releases_are_transitions_since_the_first_tick() -> None:
     report = timed(
-        make_released_tick(0, "no feature yet"),
-        make_released_tick(1, "no feature yet"),
+        make_released_tick(0, NO_IMAGE),
+        make_released_tick(1, NO_IMAGE),
         make_tick(2),
-        make_released_tick(3, "feature too old"),
-        make_released_tick(4, "pilot's mode"),
+        make_released_tick(3, frozen(0.6)),
+        make_released_tick(4, OFF),
         make_tick(5),
-        make_released_tick(6, "pilot's mode"),
+        make_released_tick(6, OFF),
     )
     assert report.releases == (
-        ReleaseEvent(t_s=0.0, reason="no feature yet"),
-        ReleaseEvent(t_s=0.03, reason="feature too old"),
-        ReleaseEvent(t_s=0.04, reason="pilot's mode"),
-        ReleaseEvent(t_s=0.06, reason="pilot's mode"),
+        ReleaseEvent(t_s=0.0, reason=NO_IMAGE),
+        ReleaseEvent(t_s=0.03, reason=frozen(0.6)),
+        ReleaseEvent(t_s=0.04, reason=OFF),
+        ReleaseEvent(t_s=0.06, reason=OFF),
     )
     assert report.release_count == 4
 
 
 def test_the_release_list_is_bounded_and_the_count_is_not() -> None:
     report = timed(
-        *(make_released_tick(index, f"reason {index}") for index in range(MAX_RELEASES + 7))
+        *(
+            make_released_tick(index, frozen(index) if index % 2 else NO_IMAGE)
+            for index in range(MAX_RELEASES + 7)
+        )
     )
     assert len(report.releases) == MAX_RELEASES
-    assert report.releases[-1].reason == f"reason {MAX_RELEASES - 1}"
+    last = MAX_RELEASES - 1
+    assert report.releases[-1].reason == (frozen(last) if last % 2 else NO_IMAGE)
     assert report.release_count == MAX_RELEASES + 7
+
+
+def test_a_reason_whose_figures_alone_change_is_one_release() -> None:
+    report = timed(*(make_released_tick(index, frozen(index / 100)) for index in range(9)))
+    assert report.releases == (ReleaseEvent(t_s=0.0, reason=frozen(0.0)),)
+    assert report.release_count == 1
 
 
 def test_vision_counts_what_was_dropped_since_its_first_frame() -> None:
@@ -264,7 +282,7 @@ def test_json_has_the_keys_of_the_report_in_order() -> None:
         "sent_overrides": 6000,
         "echo_confirmed": True,
     }
-    assert document["releases"] == [{"t_s": 0.0, "reason": "no feature yet"}]
+    assert document["releases"] == [{"t_s": 0.0, "reason": reason_to_json(NO_IMAGE)}]
     assert document["observer_drops"] == {"rerun": None, "recorder": None}
 
 
@@ -276,7 +294,7 @@ def test_json_says_null_for_what_was_not_measured() -> None:
     assert document["action"]["rate_hz"] is None
 
 
-def test_an_empty_reason_is_no_release() -> None:
-    """A read-only flight has one before the policy has begun."""
-    begin = make_released_tick(0, "", phase="released")
+def test_no_reason_is_no_release() -> None:
+    """A read-only flight has none before the policy has begun."""
+    begin = make_released_tick(0, release_reason=None, phase="released")
     assert timed(begin, make_tick(1, sent=None)).release_count == 0

@@ -7,12 +7,13 @@ from pathlib import Path
 import pytest
 
 from helpers.recordings import make_meta
+from mavbridge.core.reasons import Code, because
 from mavbridge.core.records import FlightOutcome
 from mavbridge.recording.meta import FlightError, read_meta, write_meta
 
 OUTCOME = FlightOutcome(
     end="duration",
-    reason="the flight is over",
+    reason=because(Code.DURATION),
     flown_s=20.0,
     height_m=3.1,
     speed_mps=0.2,
@@ -30,7 +31,8 @@ OUTCOME = FlightOutcome(
 def test_the_outcome_is_kept_as_numbers_and_codes(tmp_path: Path) -> None:
     write_meta(tmp_path, make_meta().with_outcome(OUTCOME))
     written = json.loads((tmp_path / "meta.json").read_text())
-    assert written["outcome"] == asdict(OUTCOME)
+    reason = {"code": "duration", "kind": "end", "data": {}, "text": "the flight is over"}
+    assert written["outcome"] == asdict(OUTCOME) | {"reason": reason}
     assert written["success"] is False, "three gates are missing"
     assert read_meta(tmp_path).outcome == OUTCOME
 

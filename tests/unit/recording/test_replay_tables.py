@@ -9,6 +9,7 @@ from helpers.factories import START_NS, make_state, make_vision_tick
 from mavbridge.config.flight import CameraConfig, FlyConfig, Limits, LinkConfig
 from mavbridge.config.policy import PolicyConfig
 from mavbridge.config.rates import Rates
+from mavbridge.core.reasons import Code, because, reason_to_json
 from mavbridge.core.records import Solve
 from mavbridge.core.vehicle import ForwardedPacket
 from mavbridge.recording import replay_rows
@@ -30,6 +31,7 @@ from mavbridge.recording.tables import read_table
 from policy.contract import Contract
 
 CONTRACT = Contract()
+FROZEN = because(Code.IMAGE_FROZEN, age_s=0.6)
 HEARTBEAT = bytes.fromhex("fd09000007010100000000000000020c51040300000000")
 
 
@@ -97,7 +99,7 @@ def test_features_of_each_camera_have_a_table_of_their_own(tmp_path: Path) -> No
     value = np.array([[0.1, -1e-30, 3.0]], np.float32)
     vision = replace(make_vision_tick(3), serial=0, feature=value)
     tables.feature(vision)
-    tables.feature(replace(vision, camera=1, serial=2, fault="frozen", feature=-value))
+    tables.feature(replace(vision, camera=1, serial=2, fault=FROZEN, feature=-value))
     tables.finish()
 
     (front,) = read_features(read_table(tmp_path / "features", replay_rows.FEATURES))
@@ -106,7 +108,7 @@ def test_features_of_each_camera_have_a_table_of_their_own(tmp_path: Path) -> No
     assert front.value.tobytes() == value.tobytes()
     assert front.value.shape == (1, 3)
     assert (front.frame_id, front.captured_ns) == (vision.frame_id, vision.captured_ns)
-    assert down["fault"].to_pylist() == ["frozen"]
+    assert [json.loads(text) for text in down["fault"].to_pylist()] == [reason_to_json(FROZEN)]
     assert down["dropped_before"].to_pylist() == [2]
 
 

@@ -7,6 +7,7 @@ from hypothesis import strategies as st
 
 from helpers.factories import make_released_tick, make_state, make_tick, make_trace
 from helpers.recordings import make_row
+from mavbridge.core.reasons import Code, because
 from mavbridge.core.records import Tick, VehicleState
 from mavbridge.core.vehicle import ActionTrace, Sticks, Velocity
 from mavbridge.recording.replay_rows import FEATURES, PACKETS, SOLVES
@@ -31,6 +32,14 @@ stamps = st.integers(0, 2**62)
 vectors = st.tuples(floats, floats, floats)
 
 
+simple = st.sampled_from([because(Code.NO_CHUNK), because(Code.OVERRIDE_SWITCH_OFF)])
+reasons = (
+    simple
+    | st.builds(because, st.just(Code.RISK), risk=st.text(), said=st.text())
+    | st.builds(because, st.just(Code.NO_CHUNK_SINCE_RESET), why=simple)
+)
+
+
 @st.composite
 def ticks(draw: st.DrawFn) -> Tick:
     state = None
@@ -50,7 +59,7 @@ def ticks(draw: st.DrawFn) -> Tick:
         trace=make_trace(draw(sticks)) if draw(st.booleans()) else None,
         sent=draw(st.none() | sticks),
         rc_sticks=draw(st.none() | sticks),
-        release_reason=draw(st.none() | st.text()),
+        release_reason=draw(st.none() | reasons),
         mode=draw(st.none() | st.text()),
         armed=draw(st.booleans()),
         rc_channels_us=tuple(draw(st.lists(st.integers(0, 65535), max_size=18))),

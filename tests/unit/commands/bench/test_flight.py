@@ -9,6 +9,7 @@ from mavbridge.commands.bench.flight import FlightJob, to_flags
 from mavbridge.commands.bench.flight_process import CLIMB_STICK, ReleaseWatch, level_climb
 from mavbridge.config.policy import PolicyConfig
 from mavbridge.config.rates import Rates
+from mavbridge.core.reasons import Code, Reason, because
 from policy.contract import Contract
 from policy.protocol import Executable
 
@@ -64,11 +65,13 @@ def test_a_level_climb_does_the_work_and_returns_other_sticks() -> None:
 
 
 def test_a_flight_ends_once_the_policy_has_lost_the_sticks() -> None:
-    ended: list[str] = []
+    ended: list[Reason] = []
     watch = ReleaseWatch(ended.append)
-    for event in (make_released_tick(0, "not engaged"), make_tick(1), make_vision_tick()):
+    for event in (make_released_tick(0), make_tick(1), make_vision_tick()):
         watch.emit(event)
     assert not ended
-    for index, reason in enumerate(("no chunk", "no chunk; then disarmed")):
+    first = because(Code.NO_CHUNK)
+    both = because(Code.THEN, first=first, then=because(Code.DISARMED))
+    for index, reason in enumerate((first, both)):
         watch.emit(make_released_tick(2 + index, reason))
-    assert ended == [watch.reason] == ["no chunk"]
+    assert ended == [watch.reason] == [first]

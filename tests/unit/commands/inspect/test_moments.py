@@ -8,6 +8,7 @@ from helpers.factories import START_NS, TICK_NS, make_released_tick, make_state,
 from mavbridge.commands.inspect.delays import Arrivals, find_delays
 from mavbridge.commands.inspect.holders import holder_spans
 from mavbridge.core.clock import NS_PER_MS
+from mavbridge.core.reasons import Code, because
 from mavbridge.core.records import Tick
 from mavbridge.core.vehicle import NEUTRAL
 
@@ -103,22 +104,23 @@ def test_slots_while_the_policy_does_not_fly_are_not_missed() -> None:
 
 
 def test_who_held_the_sticks_when() -> None:
+    old = because(Code.TOO_OLD, quantity="attitude", age_ms=104.0, limit_ms=100.0)
     ticks = [
-        make_released_tick(0, "waiting for an act", phase="waiting"),
-        make_released_tick(1, "arming", phase="preparing", sent=NEUTRAL),
+        make_released_tick(0, because(Code.NOT_ENGAGED), phase="waiting"),
+        make_released_tick(1, because(Code.WAITING_FOR_ARMING), phase="preparing", sent=NEUTRAL),
         make_tick(2, phase="flying"),
         make_tick(3, phase="flying", is_coasting=True),
-        make_released_tick(4, "too old", phase="leaving", sent=NEUTRAL),
-        make_released_tick(5, "too old", phase="releasing"),
-        make_released_tick(6, "too old", phase="released"),
-        make_released_tick(7, "another reason", phase="released"),
+        make_released_tick(4, old, phase="leaving", sent=NEUTRAL),
+        make_released_tick(5, old, phase="releasing"),
+        make_released_tick(6, old, phase="released"),
+        make_released_tick(7, because(Code.DISARMED), phase="released"),
     ]
     spans = holder_spans(ticks, START_NS)
     names = ["pilot", "idle", "policy", "neutral", "release", "pilot"]
     assert [span.holder for span in spans] == names
     assert [span.start_s for span in spans] == pytest.approx([0.0, 0.01, 0.02, 0.04, 0.05, 0.06])
     assert [span.end_s for span in spans[:-1]] == [span.start_s for span in spans[1:]]
-    assert [span.reason for span in spans[2:4]] == ["", "too old"]
+    assert [span.reason for span in spans[2:4]] == [None, old]
 
 
 def test_a_policy_that_only_looks_on_holds_nothing() -> None:
@@ -127,8 +129,9 @@ def test_a_policy_that_only_looks_on_holds_nothing() -> None:
 
 
 def test_of_several_reasons_the_one_that_lasted_is_told() -> None:
-    reasons = ["no heartbeat", *["taking off"] * 5, "no chunk"]
+    rising = [because(Code.TAKING_OFF, height_m=2.0 + k) for k in range(5)]
+    reasons = [because(Code.NO_HEARTBEAT), *rising, because(Code.NO_CHUNK)]
     ticks = [make_released_tick(k, reason, phase="preparing") for k, reason in enumerate(reasons)]
     (span,) = holder_spans(ticks, START_NS)
-    assert (span.holder, span.reason) == ("pilot", "taking off")
+    assert (span.holder, span.reason) == ("pilot", rising[-1])
     assert span.end_s == pytest.approx(0.06)

@@ -16,6 +16,7 @@ from mavbridge.commands.inspect import page
 from mavbridge.commands.inspect.analysis import FlightAnalysis, analyse
 from mavbridge.commands.inspect.page import page_data, write_page
 from mavbridge.core.course import CourseGate
+from mavbridge.core.reasons import Code, because
 from mavbridge.core.records import Position
 from mavbridge.recording.flight_writer import FlightWriter
 
@@ -33,7 +34,9 @@ def flight(folder: Path, *, name: str = "scripted:hover", frames: int = 10) -> F
             writer.frame(make_frame(number))
         for index in range(40):
             writer.tick(make_tick(index, position_ned_m=Position(0.1 * index, 1.0, -2.0)))
-        writer.tick(make_released_tick(40, NASTY, phase="released"))
+        writer.tick(
+            make_released_tick(40, because(Code.POLICY_REFUSED, said=NASTY), phase="released")
+        )
         writer.finish(writer.meta)
     return replace(analyse(folder), gates=(CourseGate(Position(5, 0, -2), 0.1, 2.4),))
 
@@ -78,6 +81,7 @@ def test_no_name_or_reason_leaves_its_place(tmp_path: Path) -> None:
     (shown,) = data_of(text)
     assert shown["facts"][0][1].startswith(NASTY)
     assert shown["moments"][0]["detail"].startswith(NASTY)
+    assert [span["reason"] for span in shown["holders"]] == ["", NASTY]
 
 
 def test_a_long_flight_is_thinned_and_keeps_every_spike(

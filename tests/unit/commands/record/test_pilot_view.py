@@ -9,6 +9,7 @@ from helpers.fakes import START_NS, ListSink
 from helpers.wire import WireEnd
 from mavbridge.commands.record.pilot_view import STICKS_FRESH_NS, PilotView
 from mavbridge.core.clock import NS_PER_MS
+from mavbridge.core.reasons import Code, because
 from mavbridge.core.records import Tick
 from mavbridge.core.vehicle import ForwardedPacket, Sticks
 from mavbridge.flight.history import SentHistory
@@ -35,7 +36,7 @@ class Viewed:
         )
 
     def tick(self, at_ns: int) -> Tick:
-        self.view.receive(make_gate_tick(at_ns, reason="no image feature yet"))
+        self.view.receive(make_gate_tick(at_ns, reason=because(Code.NO_IMAGE)))
         event = self.sink.events[-1]
         assert isinstance(event, Tick)
         return event
@@ -82,7 +83,7 @@ def test_ticks_are_the_pilots_and_old_sticks_are_none(viewed: Viewed) -> None:
     viewed.view.receive(viewed.radio(START_NS))
     tick = viewed.tick(START_NS + 10 * NS_PER_MS)
     assert tick.rc_sticks == STICKS
-    assert (tick.phase, tick.release_reason) == ("released", "the pilot flies")
+    assert (tick.phase, tick.release_reason) == ("released", because(Code.PILOT_FLIES))
     assert tick.activity == "RELEASED: the pilot flies"
     assert viewed.tick(START_NS + STICKS_FRESH_NS + 1).rc_sticks is None
 

@@ -7,6 +7,7 @@ import pytest
 
 from helpers.flown_vehicle import Flight, FlownVehicle, codec
 from mavbridge.core.clock import NS_PER_MS, NS_PER_S
+from mavbridge.core.reasons import Code
 from mavbridge.core.rotation import heading_rad, quaternion_from_euler
 from mavbridge.core.vehicle import NEUTRAL, ActionMeaning, AttitudeThrust, BodyRates, Velocity
 from mavbridge.mavlink.codec.messages import (
@@ -199,7 +200,10 @@ def test_setpoints_of_another_station_are_noticed_but_not_a_change_of_mode(
     assert flight.problem is None
     flight.send(LEVEL)
     flight.receive(target(0.45))
-    assert "another station commands it" in (flight.output.overruled(flight.now_ns) or "")
+    why = flight.output.overruled(flight.now_ns)
+    assert why is not None
+    assert (why.code, dict(why.data)["quantity"]) == (Code.OVERRULED, "setpoints")
+    assert "another station commands it" in str(why)
 
 
 def test_a_vehicle_that_hears_no_setpoint_any_more_is_noticed() -> None:
@@ -212,7 +216,9 @@ def test_a_vehicle_that_hears_no_setpoint_any_more_is_noticed() -> None:
         flight.send(LEVEL)
         flight.receive(target(message.thrust))
     assert 0.35 * S < flight.now_ns - deaf_ns < 0.5 * S
-    assert "does not hear our setpoints" in (flight.output.unheard(flight.now_ns) or "")
+    why = flight.output.unheard(flight.now_ns)
+    assert why is not None
+    assert (why.code, dict(why.data)["quantity"]) == (Code.UNHEARD, "setpoints")
     assert flight.output.overruled(flight.now_ns) is None
 
 
@@ -272,7 +278,10 @@ def test_a_velocity_and_its_echo(profile: Profile) -> None:
     for _ in range(5):
         flight.send(Velocity(1.0, 0.5, -0.25, 0.2))
         flight.receive(VelocityTarget(0, 3079, (0.0, 0.0, 0.0), 0.0))
-    assert "limits or refuses them" in (flight.output.overruled(flight.now_ns) or "")
+    why = flight.output.overruled(flight.now_ns)
+    assert why is not None
+    assert why.code is Code.OVERRULED
+    assert "limits or refuses them" in str(why)
 
 
 def test_a_target_without_a_velocity_is_no_echo() -> None:

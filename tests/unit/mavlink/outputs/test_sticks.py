@@ -9,6 +9,7 @@ from helpers.flown_vehicle import Flight, FlownVehicle, codec
 from helpers.wire import ARDUPILOT as CALIBRATION
 from mavbridge.core.clock import NS_PER_MS
 from mavbridge.core.errors import PeerError
+from mavbridge.core.reasons import Code
 from mavbridge.core.vehicle import (
     IDLE,
     NEUTRAL,
@@ -154,15 +155,15 @@ def test_px4_shows_our_sticks_rounded_down() -> None:
 
 
 @pytest.mark.parametrize(
-    ("shown", "expected"),
+    ("shown", "code", "expected"),
     [
-        (ManualControl(300, 0, 700, 0), "another station sends sticks"),
-        (ManualControl(0, 0, 500, 0), "does not hear our sticks"),
-        (None, "no MANUAL_CONTROL arrive"),
+        (ManualControl(300, 0, 700, 0), Code.OVERRULED, "another station sends sticks"),
+        (ManualControl(0, 0, 500, 0), Code.UNHEARD, "our sticks"),
+        (None, Code.NO_ECHO, "no MANUAL_CONTROL arrive"),
     ],
 )
 def test_what_px4_acts_on_instead_of_our_sticks_is_told(
-    shown: ManualControl | None, expected: str
+    shown: ManualControl | None, code: Code, expected: str
 ) -> None:
     flight = px4_flight()
     for _ in range(50):
@@ -172,7 +173,9 @@ def test_what_px4_acts_on_instead_of_our_sticks_is_told(
         flight.send(NEUTRAL)
         if shown is not None:
             flight.receive(shown)
-    assert expected in (flight.problem or "")
+    assert flight.problem is not None
+    assert flight.problem.code is code
+    assert expected in str(flight.problem)
     assert flight.now_ns - since_ns < 500 * MS
 
 

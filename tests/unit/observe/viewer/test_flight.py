@@ -26,6 +26,7 @@ from helpers.factories import (
 from mavbridge.core.clock import NS_PER_MS
 from mavbridge.core.course import CourseGate
 from mavbridge.core.errors import UserError
+from mavbridge.core.reasons import Code, because
 from mavbridge.core.records import Observed, Position, Solve
 from mavbridge.core.vehicle import ActionKind, ActionTrace, Sticks
 from mavbridge.flight.action_frames import action_frame
@@ -208,17 +209,17 @@ def test_rc_echo_shows_four_channels_as_they_change(rrd: Path) -> None:
 def test_events_are_transitions_across_batches(rrd: Path) -> None:
     seen = show(
         rrd,
-        [make_released_tick(0, "no feature yet", armed=False), make_released_tick(1, armed=False)],
+        [make_released_tick(0, armed=False), make_released_tick(1, armed=False)],
         [make_tick(2), make_tick(3)],
-        [make_released_tick(4, "feature too old", mode="LAND")],
+        [make_released_tick(4, because(Code.LANDED), mode="LAND")],
     )
     assert [text.split(maxsplit=2)[2] for text in seen.events()] == [
-        "RELEASED: no feature yet",
+        "RELEASED: no image feature yet",
         "mode ALT_HOLD",
         "disarmed",
         "FLYING: the policy has control",
         "armed",
-        "RELEASED: feature too old",
+        "RELEASED: the vehicle has landed",
         "mode LAND",
     ]
     stamps_ms = [stamp_ns // NS_PER_MS for stamp_ns in seen.columns["/events"]["time"]]
