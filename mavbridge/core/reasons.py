@@ -345,8 +345,18 @@ class Reason:
 
     @property
     def codes(self) -> tuple[Code, ...]:
-        """Its own code and those inside it: equal for the same reason with other figures."""
+        """Its own code and those inside it."""
         return tuple(self._codes())
+
+    @property
+    def key(self) -> tuple[object, ...]:
+        """Equal for reasons that differ by numbers alone."""
+        words = [
+            value.key if isinstance(value, Reason) else value
+            for _, value in self.data
+            if isinstance(value, str | Reason)
+        ]
+        return self.code, *words
 
     def _codes(self) -> Iterator[Code]:
         yield self.code

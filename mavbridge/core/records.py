@@ -127,8 +127,8 @@ class Tick:
     @property
     def stage(self) -> tuple[object, ...]:
         """Equal for ticks whose ``activity`` differs by figures alone."""
-        codes = () if self.release_reason is None else self.release_reason.codes
-        return self.holder, codes, self.trace is None, self.sent is None
+        reason = None if self.release_reason is None else self.release_reason.key
+        return self.holder, reason, self.trace is None, self.sent is None
 
     @property
     def holder(self) -> str:

@@ -41,7 +41,7 @@ def build_state(
     if attitude is None or not attitude.is_fresh(now_ns, freshness.attitude_ns):
         return stale(attitude, "attitude", now_ns, freshness.attitude_ns)
     if rate is None or not rate.is_fresh(now_ns, freshness.attitude_ns):
-        return stale(rate, "body rates", now_ns, freshness.attitude_ns)
+        return stale(rate, "body rate", now_ns, freshness.attitude_ns)
     if velocity is None or not velocity.is_fresh(now_ns, freshness.velocity_ns):
         return stale(velocity, "velocity", now_ns, freshness.velocity_ns)
     if force is None or not force.is_fresh(now_ns, freshness.velocity_ns):

@@ -6,7 +6,7 @@ from typing import Literal
 
 from mavbridge.core.clock import NS_PER_S
 from mavbridge.core.histogram import Histogram
-from mavbridge.core.reasons import Code, Reason, reason_to_json
+from mavbridge.core.reasons import Reason, reason_to_json
 from mavbridge.core.records import Event, FlightOutcome, Tick
 from mavbridge.core.vehicle import LinkStats, Percentiles
 
@@ -122,7 +122,7 @@ class FlightTiming:
         self._ticks, self._frames = _Span(), _Span()
         self._sticks, self._chunks = _Sticks(stick_hz), _Chunks(action_hz)
         self._last_attitude_ns: int | None = None
-        self._last_codes: tuple[Code, ...] = ()
+        self._last_key: tuple[object, ...] | None = None
         self._releases: list[ReleaseEvent] = []
         self._release_count = 0
         self._feature_age, self._state_age = Histogram(), Histogram()
@@ -149,9 +149,9 @@ class FlightTiming:
             self._add_ages(tick)
         is_before = tick.phase in ("waiting", "preparing")
         reason = None if is_before else tick.release_reason
-        codes = () if reason is None else reason.codes
-        if codes != self._last_codes:
-            self._last_codes = codes
+        key = None if reason is None else reason.key
+        if key != self._last_key:
+            self._last_key = key
             if reason is None:
                 return
             self._release_count += 1

@@ -6,7 +6,7 @@ from itertools import groupby
 from typing import Literal
 
 from mavbridge.core.clock import NS_PER_S
-from mavbridge.core.reasons import Code, Reason
+from mavbridge.core.reasons import Reason
 from mavbridge.core.records import Tick
 
 Holder = Literal["policy", "read-only", "idle", "neutral", "release", "pilot"]
@@ -41,15 +41,15 @@ def holder_spans(ticks: Sequence[Tick], start_ns: int) -> tuple[HolderSpan, ...]
     at = 0
     for holder, group in groupby(ticks, holder_of):
         first = at
-        lasted_ns: dict[tuple[Code, ...], int] = {}
-        reasons: dict[tuple[Code, ...], Reason | None] = {}
+        lasted_ns: dict[object, int] = {}
+        reasons: dict[object, Reason | None] = {}
         for tick in group:
             at += 1
             end_ns = ticks[min(at, len(ticks) - 1)].woke_ns
             reason = None if tick.trace is not None else tick.release_reason
-            codes = () if reason is None else reason.codes
-            lasted_ns[codes] = lasted_ns.get(codes, 0) + end_ns - tick.woke_ns
-            reasons[codes] = reason
+            key = None if reason is None else reason.key
+            lasted_ns[key] = lasted_ns.get(key, 0) + end_ns - tick.woke_ns
+            reasons[key] = reason
         spans.append(
             HolderSpan(
                 start_s=(ticks[first].woke_ns - start_ns) / NS_PER_S,

@@ -132,3 +132,12 @@ def test_each_reason_that_the_source_makes_has_the_figures_of_its_sentence() -> 
 
 def _text(code: Code) -> str:
     return reasons._REASONS[code][1]
+
+
+def test_the_key_differs_by_words_and_not_by_numbers() -> None:
+    old = because(Code.TOO_OLD, quantity="image", age_ms=310.0, limit_ms=300.0)
+    older = because(Code.TOO_OLD, quantity="image", age_ms=320.0, limit_ms=300.0)
+    other = because(Code.TOO_OLD, quantity="attitude", age_ms=310.0, limit_ms=300.0)
+    assert old.key == older.key != other.key
+    nested = [because(Code.NOT_ENGAGED_SINCE, why=why).key for why in (old, older, other)]
+    assert nested[0] == nested[1] != nested[2]

@@ -101,7 +101,7 @@ def test_enu_attitude_is_the_same_rotation_between_other_axes(q: tuple[float, ..
     ("field", "what"),
     [
         ("ned_from_body_wxyz", "attitude"),
-        ("rate_body_radps", "body rates"),
+        ("rate_body_radps", "body rate"),
         ("velocity_ned_mps", "velocity"),
         ("specific_force_body_mps2", "acceleration"),
     ],
@@ -111,7 +111,7 @@ def test_a_missing_or_old_part_is_a_reason(field: str, what: str) -> None:
     missing = build_state(without(good, field), NOW_NS, frame="ned_frd", freshness=LIMITS)
     assert missing == Release(because(Code.NO_READING, quantity=what))
 
-    limit_ns = LIMITS.attitude_ns if what in ("attitude", "body rates") else LIMITS.velocity_ns
+    limit_ns = LIMITS.attitude_ns if what in ("attitude", "body rate") else LIMITS.velocity_ns
     reading = getattr(good, field)
     at_limit = replace(good, **{field: Reading(NOW_NS - limit_ns, reading.values)})
     old = replace(good, **{field: Reading(NOW_NS - limit_ns - 1, reading.values)})
