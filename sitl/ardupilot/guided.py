@@ -9,7 +9,7 @@ from enum import Enum, auto
 from typing import NamedTuple
 
 from sitl.ardupilot.control import AttitudeController, lean_for
-from sitl.ardupilot.params import Params
+from sitl.ardupilot.params import ArduPilotParams
 from sitl.clock import NS_PER_MS, NS_PER_S
 from sitl.rotation import Quat, Vec3, from_euler, integrate, to_euler
 from sitl.vehicle.control import HeightController, clamp, thrust_for
@@ -60,7 +60,7 @@ class GuidedControl:
     """Control law of both modes, on the attitude and height controllers of all modes."""
 
     def __init__(
-        self, params: Params, attitude: AttitudeController, height: HeightController
+        self, params: ArduPilotParams, attitude: AttitudeController, height: HeightController
     ) -> None:
         self._params = params
         self._attitude = attitude

@@ -11,7 +11,7 @@ from typing import TypeAlias
 from pymavlink.dialects.v20 import ardupilotmega as mav
 
 from sitl.clock import NS_PER_S
-from sitl.link.framing import Message
+from sitl.link.endpoint import Message
 from sitl.rotation import Quat, Vec3, from_euler, integrate
 
 ReportedPose: TypeAlias = tuple[Vec3, Quat]  # position_ned_m, ned_from_body_wxyz

@@ -8,7 +8,7 @@ PX4's parameters of it only scale them.
 import math
 from collections import deque
 
-from sitl.px4.params import DEFAULT_RATE_P, Params
+from sitl.px4.params import DEFAULT_RATE_P, Px4Params
 from sitl.rotation import (
     Quat,
     Vec3,
@@ -17,7 +17,7 @@ from sitl.rotation import (
     multiply,
     rotate,
     rotation_vector,
-    to_euler,
+    to_heading,
 )
 from sitl.vehicle.control import clamp
 from sitl.vehicle.dynamics import GRAVITY_MPS2, Airframe, BodyState
@@ -43,7 +43,7 @@ MAX_VELOCITY_INTEGRAL_MPS2 = 4.0
 class RateController:
     """Tracks body rates, and through them attitudes."""
 
-    def __init__(self, params: Params) -> None:
+    def __init__(self, params: Px4Params) -> None:
         self._params = params
         self._yaw_accel_radps2 = 0.0
         self._targets: deque[tuple[Quat, float]] = deque(maxlen=TARGET_DELAY_STEPS + 1)
@@ -95,7 +95,7 @@ class RateController:
 class VelocityController:
     """Tracks a horizontal velocity by leaning: proportional, integral and damping terms."""
 
-    def __init__(self, params: Params) -> None:
+    def __init__(self, params: Px4Params) -> None:
         self._params = params
         self._integral = [0.0, 0.0]
         self._last_mps: tuple[float, float] | None = None
@@ -138,12 +138,6 @@ class VelocityController:
 def attitude_for(accel_ne_mps2: tuple[float, float], yaw_rad: float) -> Quat:
     """The attitude whose thrust gives this horizontal acceleration in level flight."""
     north, east = accel_ne_mps2
-    forward = north * math.cos(yaw_rad) + east * math.sin(yaw_rad)
-    right = east * math.cos(yaw_rad) - north * math.sin(yaw_rad)
+    forward, right = to_heading(north, east, yaw_rad)
     roll = math.asin(right / math.sqrt(forward**2 + right**2 + GRAVITY_MPS2**2))
     return from_euler(roll, math.atan2(-forward, GRAVITY_MPS2), yaw_rad)
-
-
-def yaw_of(body: BodyState) -> float:
-    """Heading in radians."""
-    return to_euler(body.ned_from_body_wxyz)[2]

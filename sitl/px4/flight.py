@@ -8,18 +8,16 @@ from sitl.px4.control import (
     SIH_QUAD,
     RateController,
     attitude_for,
-    yaw_of,
 )
 from sitl.px4.horizontal import STILL, Horizontal, NorthEast
 from sitl.px4.modes import Mode
-from sitl.px4.params import Params
+from sitl.px4.params import Px4Params
 from sitl.px4.setpoints import AttitudeSetpoint, RateSetpoint, Setpoint, VelocitySetpoint
 from sitl.px4.sticks import Sticks
-from sitl.rotation import IDENTITY, Quat, Vec3, cos_tilt, from_euler
+from sitl.rotation import IDENTITY, Quat, Vec3, cos_tilt, from_euler, from_heading, yaw_of
 from sitl.vehicle.control import HeightController, mix, thrust_for
 from sitl.vehicle.dynamics import BodyState
 
-STOPPED = (0.0, 0.0, 0.0, 0.0)
 IDLE = (0.05, 0.05, 0.05, 0.05)  # armed on the ground
 STILL_YAW_RADPS = 0.01  # a slower yaw stick holds the heading
 TAKEOFF_CLIMB_MPS = 0.3  # a climb stick beyond this lifts a landed vehicle off
@@ -29,7 +27,7 @@ ARRIVED_M = 1.0
 class FlightControl:
     """Control laws of all modes, and the controllers that they share."""
 
-    def __init__(self, params: Params) -> None:
+    def __init__(self, params: Px4Params) -> None:
         self._params = params
         self._rates = RateController(params)
         self._horizontal = Horizontal(params)
@@ -122,19 +120,19 @@ class FlightControl:
                 dt_s,
             )
         yaw_rate = self._stick_yaw(sticks if mode.piloted else Sticks(), body, dt_s)
-        yaw = yaw_of(body) if self._yaw_hold_rad is None else self._yaw_hold_rad
+        yaw = yaw_of(body.ned_from_body_wxyz) if self._yaw_hold_rad is None else self._yaw_hold_rad
         if mode.manual_throttle:
             roll, pitch = curves.lean_rad(sticks, self._params)
             thrust = curves.manual_thrust(sticks, self._params, HOVER_THRUST)
             return self._lean_to(from_euler(roll, pitch, yaw), yaw_rate, thrust, body, dt_s)
         if mode is Mode.ALTCTL:
             forward, right = curves.lean_accel_mps2(sticks, self._params)
-            accel = _to_north_east(forward, right, yaw)
+            accel = from_heading(forward, right, yaw)
         elif not has_position:
             accel = STILL
         elif mode is Mode.POSCTL:
             speed = curves.speed_mps(sticks, self._params)
-            accel = self._horizontal.steer(_to_north_east(*speed, yaw), body, dt_s)
+            accel = self._horizontal.steer(from_heading(*speed, yaw), body, dt_s)
         else:
             accel = self._horizontal.fly_to(self._destination(mode, body), body, dt_s)
         self._accel_mps2 = accel
@@ -159,7 +157,7 @@ class FlightControl:
             self._yaw_hold_rad, yaw_rate = setpoint.yaw_rad, setpoint.yaw_rate_radps
         else:
             yaw_rate = self._hold_yaw(setpoint.yaw_rate_radps, body)
-        yaw = yaw_of(body) if self._yaw_hold_rad is None else self._yaw_hold_rad
+        yaw = yaw_of(body.ned_from_body_wxyz) if self._yaw_hold_rad is None else self._yaw_hold_rad
         thrust = self._climb(climb, body, dt_s)
         return self._lean_to(attitude_for(accel, yaw), yaw_rate, thrust, body, dt_s)
 
@@ -194,7 +192,7 @@ class FlightControl:
             self._yaw_hold_rad = None
             return yaw_rate_radps
         if self._yaw_hold_rad is None:
-            self._yaw_hold_rad = yaw_of(body)
+            self._yaw_hold_rad = yaw_of(body.ned_from_body_wxyz)
         return 0.0
 
     def _climb(self, climb_mps: float, body: BodyState, dt_s: float) -> float:
@@ -243,8 +241,3 @@ class FlightControl:
             is_near = math.hypot(north, east) < self._params["RTL_MIN_DIST"]
             self._returns_to_m = -down if is_near else self._params["RTL_RETURN_ALT"]
         return self._returns_to_m
-
-
-def _to_north_east(forward: float, right: float, yaw_rad: float) -> NorthEast:
-    cy, sy = math.cos(yaw_rad), math.sin(yaw_rad)
-    return forward * cy - right * sy, forward * sy + right * cy

@@ -8,7 +8,7 @@ import math
 from typing import TypeAlias
 
 from sitl.px4.control import VelocityController
-from sitl.px4.params import Params
+from sitl.px4.params import Px4Params
 from sitl.vehicle.control import clamp
 from sitl.vehicle.dynamics import BodyState
 
@@ -25,7 +25,7 @@ REACTION_S = 0.85
 class Horizontal:
     """Paths and the velocity controller behind them."""
 
-    def __init__(self, params: Params) -> None:
+    def __init__(self, params: Px4Params) -> None:
         self._params = params
         self._velocity = VelocityController(params)
         self.accel_mps2 = STILL

@@ -10,7 +10,7 @@ import math
 from typing import NamedTuple
 
 from sitl.clock import NS_PER_S
-from sitl.px4.params import Params
+from sitl.px4.params import Px4Params
 
 RC_SOURCE = -1  # the receiver; links are numbered from 0
 POLL_NS = NS_PER_S // 5
@@ -74,7 +74,7 @@ class StickSpeed:
 class StickInput:
     """The sticks that PX4 acts on; stamps are nanoseconds of one clock."""
 
-    def __init__(self, params: Params) -> None:
+    def __init__(self, params: Px4Params) -> None:
         self._params = params
         self.sticks = Sticks()
         self.valid = False

@@ -18,11 +18,11 @@ from policy.contract import ActionKind, Contract, FloatArray
 from policy.protocol import Executable
 from policy.scripted.policy import ScriptedPolicy
 from policy.scripted.programs import LEG_MPS, LEG_S, Motion, Program, Push, make_program
-from sitl.ardupilot.autopilot import Autopilot as ArduPilot
+from sitl.ardupilot.autopilot import ArduCopter
 from sitl.ardupilot.flight_modes import Mode as ArduMode
 from sitl.ardupilot.guided import Submode
 from sitl.course.layout import AirborneStart
-from sitl.px4.autopilot import Autopilot as Px4
+from sitl.px4.autopilot import Px4
 from sitl.px4.modes import Mode as Px4Mode
 from sitl.px4.setpoints import AttitudeSetpoint, VelocitySetpoint
 from sitl.rotation import Quat, cos_tilt
@@ -192,8 +192,8 @@ class OutputFlight(GateFlight):
     # --- the vehicle
 
     @property
-    def ardupilot(self) -> ArduPilot:
-        assert isinstance(self.vehicle.ap, ArduPilot)
+    def ardupilot(self) -> ArduCopter:
+        assert isinstance(self.vehicle.ap, ArduCopter)
         return self.vehicle.ap
 
     @property

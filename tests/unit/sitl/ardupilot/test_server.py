@@ -9,9 +9,9 @@ from hypothesis import strategies as st
 from pymavlink.dialects.v20 import ardupilotmega as mav
 
 from helpers.vehicle_faults import Reboot, SensorFreeze, VehicleFaults
+from sitl.ardupilot.endpoint import Streams
 from sitl.ardupilot.flight_modes import Mode
-from sitl.ardupilot.link.messages import BUILDERS
-from sitl.ardupilot.link.streams import Streams
+from sitl.ardupilot.messages import BUILDERS
 from sitl.clock import NS_PER_MS, NS_PER_S
 from sitl.faults.stage.link import FaultyLink, LinkFaults
 from sitl.simulated_vehicle import SimulatedVehicle

@@ -8,8 +8,7 @@ from pymavlink.dialects.v20 import development
 
 from sitl.clock import NS_PER_S
 from sitl.px4.events import Event
-from sitl.px4.link.messages import event_message
-from sitl.px4.link.streams import CURRENT_MODE
+from sitl.px4.messages import CURRENT_MODE, event_message
 from sitl.px4.modes import Mode
 
 MID = (0, 0, 500, 0)

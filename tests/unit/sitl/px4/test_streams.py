@@ -4,7 +4,8 @@ import pytest
 from pymavlink.dialects.v20 import ardupilotmega as mav
 
 from sitl.clock import NS_PER_MS
-from sitl.px4.link.streams import CURRENT_MODE, GCS_HZ, ONBOARD_HZ, Streams
+from sitl.px4.endpoint import GCS_HZ, ONBOARD_HZ, Streams
+from sitl.px4.messages import CURRENT_MODE
 
 ATTITUDE = mav.MAVLINK_MSG_ID_ATTITUDE
 PLENTY = 1e9
