@@ -16,8 +16,7 @@ from pymavlink.dialects.v20 import ardupilotmega as mav
 from sitl.clock import NS_PER_S
 from sitl.rotation import Quat, Vec3, yaw_of
 from sitl.vehicle.config import Battery, VehicleConfig
-from sitl.vehicle.dynamics import Airframe, BodyState, Quadrotor
-from sitl.vehicle.environment import SensorNoise, Wind
+from sitl.vehicle.dynamics import Airframe, BodyState, Quadrotor, SensorNoise, Wind
 
 STOPPED = (0.0, 0.0, 0.0, 0.0)
 LANDED_AFTER_NS = NS_PER_S
@@ -30,6 +29,14 @@ class StatusText(NamedTuple):
 
     severity: int
     text: str
+
+
+class AttitudeSetpoint(NamedTuple):
+    """A valid SET_ATTITUDE_TARGET; body axes are FRD."""
+
+    ned_from_body_wxyz: Quat | None  # None: the rates alone count
+    rate_body_radps: Vec3
+    thrust: float  # PX4: a collective, 0..1; ArduPilot: what GUID_OPTIONS says
 
 
 def float32(value: float) -> float:

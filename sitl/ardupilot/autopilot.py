@@ -9,7 +9,7 @@ from collections.abc import Sequence
 from contextlib import suppress
 
 from sitl.ardupilot.failsafe import GcsFailsafe, RadioFailsafe
-from sitl.ardupilot.flight_modes import FlightControl, Mode
+from sitl.ardupilot.flight_modes import CopterControl, Mode
 from sitl.ardupilot.guided import GuidedControl
 from sitl.ardupilot.params import ArduPilotParams
 from sitl.ardupilot.rc import ModeSwitch, RcEngine
@@ -56,7 +56,7 @@ class ArduCopter(Autopilot):
         self.rc = RcEngine(params, config.receiver_us if config.receiver else None)
         self.radio_failsafe = RadioFailsafe(params, boot_ns)
         self.gcs_failsafe = GcsFailsafe(params)
-        self.control = FlightControl(params)
+        self.control = CopterControl(params)
         """Targets and thrust, for telemetry; only this autopilot commands it."""
         self.simple = SimpleMode(params)
         self._armed = False

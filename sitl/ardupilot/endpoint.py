@@ -49,7 +49,7 @@ class _Stream:
     late_ns: int = 0  # delay of the next message after its slot
 
 
-class Streams:
+class ArduPilotStreams:
     """The message intervals of one link; stamps are the vehicle's clock, intervals whole ms.
 
     MESSAGE_INTERVAL does not report what the conditions add to them (a slow link, jitter, phases),
@@ -141,7 +141,7 @@ class ArduPilotEndpoint(Endpoint[ArduCopter]):
     def restart(self, ap: ArduCopter) -> None:
         """Begin again with a vehicle that has just booted."""
         super().restart(ap)
-        self._streams = Streams(BUILDERS, ap.now_ns, ap.config.conditions)
+        self._streams = ArduPilotStreams(BUILDERS, ap.now_ns, ap.config.conditions)
         self._timesync_due_ns = ap.now_ns + TIMESYNC_PERIOD_NS
 
     def step(self, _now_ns: int) -> None:

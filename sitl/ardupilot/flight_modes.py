@@ -79,7 +79,7 @@ class Mode(IntEnum):
         return self in (Mode.RTL, Mode.LAND)
 
 
-class FlightControl:
+class CopterControl:
     """Control laws of all modes, and the controllers that they share."""
 
     def __init__(self, params: ArduPilotParams) -> None:

@@ -11,7 +11,8 @@ from typing import NamedTuple
 from sitl.ardupilot.control import AttitudeController, lean_for
 from sitl.ardupilot.params import ArduPilotParams
 from sitl.clock import NS_PER_MS, NS_PER_S
-from sitl.rotation import Quat, Vec3, from_euler, integrate, to_euler
+from sitl.firmware import AttitudeSetpoint
+from sitl.rotation import Vec3, from_euler, integrate, to_euler
 from sitl.vehicle.control import HeightController, clamp, thrust_for
 from sitl.vehicle.dynamics import BodyState
 
@@ -31,14 +32,6 @@ POSITION_GAIN_PER_S = 1.0
 MAX_POSITION_ERROR_M = 2.0
 MAX_LEAN_ACCEL_MPS2 = 5.0
 MIN_CLIMB_ACCEL_MPS2 = 0.5
-
-
-class AttitudeSetpoint(NamedTuple):
-    """A valid SET_ATTITUDE_TARGET; body axes are FRD."""
-
-    ned_from_body_wxyz: Quat | None  # None: the rates alone count
-    rate_body_radps: Vec3
-    thrust: float  # what it means is up to GUID_OPTIONS
 
 
 class VelocitySetpoint(NamedTuple):

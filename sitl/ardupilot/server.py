@@ -14,9 +14,10 @@ from pymavlink.dialects.v20 import ardupilotmega as mav
 from sitl.ardupilot.autopilot import ArduCopter
 from sitl.ardupilot.endpoint import ArduPilotEndpoint
 from sitl.ardupilot.flight_modes import Mode
-from sitl.ardupilot.guided import AttitudeSetpoint, VelocitySetpoint
+from sitl.ardupilot.guided import VelocitySetpoint
 from sitl.ardupilot.rc import IGNORE, PRIMARY_CHANNELS, RELEASE
 from sitl.ardupilot.sticks import Axes
+from sitl.firmware import AttitudeSetpoint
 from sitl.link.endpoint import Message
 from sitl.link.server import (
     ACCEPTED,

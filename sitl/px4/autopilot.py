@@ -11,10 +11,9 @@ from sitl.clock import NS_PER_MS, NS_PER_S
 from sitl.firmware import STOPPED, Autopilot
 from sitl.px4.commander import Commander
 from sitl.px4.control import SIH_QUAD
-from sitl.px4.flight import FlightControl
+from sitl.px4.flight import Px4Control, Setpoint
 from sitl.px4.modes import Mode
 from sitl.px4.params import Px4Params
-from sitl.px4.setpoints import Setpoint
 from sitl.px4.sticks import RC_SOURCE, StickInput, Sticks
 from sitl.vehicle.config import Battery, VehicleConfig
 
@@ -45,7 +44,7 @@ class Px4(Autopilot):
         """Channels of the receiver, or of RC_CHANNELS_OVERRIDE, which counts as one."""
         self.setpoint: Setpoint | None = None
         self.setpoint_count = 0
-        self.flight = FlightControl(params)
+        self.flight = Px4Control(params)
         self._setpoint_ns = boot_ns
         self._has_transmitter = config.receiver
         self._receiver_due_ns = boot_ns

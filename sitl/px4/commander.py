@@ -9,7 +9,7 @@ from sitl.firmware import StatusText
 from sitl.px4 import events as ev
 from sitl.px4.events import Event
 from sitl.px4.failsafe import LostSticks, Phase, mode_without_stream
-from sitl.px4.modes import SPOKEN_NAMES, Mode
+from sitl.px4.modes import Mode
 from sitl.px4.params import Px4Params
 from sitl.px4.sticks import StickInput
 
@@ -123,8 +123,8 @@ class Commander:
         if self.terminated:
             return False
         if self.armed and mode is not Mode.AUTO_LAND and not self.can_fly(mode):
-            arguments = ev.pack("IB", self.mode.custom_mode, ev.NAVIGATION_MODES[mode])
-            text = f"Switching to {SPOKEN_NAMES[mode]} is currently not available"
+            arguments = ev.pack("IB", self.mode.custom_mode, mode.event_number)
+            text = f"Switching to {mode.spoken} is currently not available"
             if says_why:
                 self._deny(text, "commander_modeswitch_not_avail", arguments)
             return False

@@ -86,7 +86,7 @@ class _Stream:
     version: Hashable = None  # of the topic, when it was sent
 
 
-class Streams:
+class Px4Streams:
     """The message intervals of one link; stamps are the vehicle's clock."""
 
     def __init__(
@@ -159,7 +159,7 @@ class Px4Endpoint(Endpoint[Px4]):
         super().restart(ap)
         self.has_gcs = False
         """A ground station's heartbeat has come; without one no text is sent."""
-        self._streams = Streams(self._default_hz, ap.config.link_bytes_ps, ap.now_ns)
+        self._streams = Px4Streams(self._default_hz, ap.config.link_bytes_ps, ap.now_ns)
         self._heartbeat_due_ns = ap.now_ns
         self._looked_ns = ap.now_ns
 

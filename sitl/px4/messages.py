@@ -25,8 +25,8 @@ from sitl.link.telemetry import (
 )
 from sitl.px4.autopilot import Px4
 from sitl.px4.events import Event
+from sitl.px4.flight import PositionSetpoint
 from sitl.px4.modes import Mode
-from sitl.px4.setpoints import VelocitySetpoint
 from sitl.rotation import conjugate, rotate
 from sitl.vehicle.config import Px4Release
 
@@ -52,15 +52,6 @@ CAPABILITIES = 0xE8FF
 _SENSORS_PRESENT, _SENSORS_ENABLED, _SENSORS_HEALTHY = 0x200C02F, 0x201C02F, 0x320C83F
 _ESTIMATOR_WITHOUT_POSITION = 0xE5
 _ESTIMATOR_WITH_POSITION, _ESTIMATOR_ON_GROUND = 0x37F, 0x3FF
-_STANDARD_MODES = {
-    Mode.POSCTL: 1,
-    Mode.ALTCTL: 4,
-    Mode.AUTO_RTL: 5,
-    Mode.AUTO_MISSION: 6,
-    Mode.AUTO_LAND: 7,
-    Mode.AUTO_TAKEOFF: 8,
-}
-"""MAV_STANDARD_MODE; 0 for the others."""
 _STATE_UNINIT, _STATE_STANDBY, _STATE_ACTIVE = 0, 3, 4
 _STATE_CRITICAL, _STATE_TERMINATED = 5, 8
 _ODOMETRY_COVARIANCE = [math.nan, *[0.0] * 20]
@@ -88,16 +79,15 @@ def event_message(event: Event, sequence: int) -> Message:
 
 
 def _current_mode(ap: Px4) -> Message:
-    intended = ap.commander.intended
-    standard = _STANDARD_MODES.get(ap.mode, 0)
-    payload = _CURRENT_MODE.pack(ap.mode.custom_mode, intended.custom_mode, standard)
+    mode, intended = ap.mode, ap.commander.intended
+    payload = _CURRENT_MODE.pack(mode.custom_mode, intended.custom_mode, mode.standard)
     return HandPacked(CURRENT_MODE, "CURRENT_MODE", payload, CURRENT_MODE_CRC_EXTRA)
 
 
 def _heartbeat(ap: Px4) -> Message:
     """Once a second; what is between two of them, arming included, it never shows."""
     flags = ap.mode.base_flags
-    if ap.mode is Mode.OFFBOARD and isinstance(ap.setpoint, VelocitySetpoint):
+    if ap.mode is Mode.OFFBOARD and isinstance(ap.setpoint, PositionSetpoint):
         flags |= mav.MAV_MODE_FLAG_STABILIZE_ENABLED
     if ap.armed:
         flags |= mav.MAV_MODE_FLAG_SAFETY_ARMED
@@ -268,7 +258,7 @@ def topic_version(message_id: int, ap: Px4) -> Hashable:
     if message_id in _SLOW_TOPICS:
         return _at_rate(ap, 8)
     if message_id == mav.MAVLINK_MSG_ID_ATTITUDE_TARGET:
-        sends_attitude = ap.mode is Mode.OFFBOARD and not isinstance(ap.setpoint, VelocitySetpoint)
+        sends_attitude = ap.mode is Mode.OFFBOARD and not isinstance(ap.setpoint, PositionSetpoint)
         return ap.setpoint_count if sends_attitude else _at_rate(ap, 8)
     if message_id == mav.MAVLINK_MSG_ID_MANUAL_CONTROL:
         return ap.stick_input.count

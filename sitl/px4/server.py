@@ -8,6 +8,7 @@ import math
 
 from pymavlink.dialects.v20 import ardupilotmega as mav
 
+from sitl.firmware import AttitudeSetpoint
 from sitl.link.endpoint import Message
 from sitl.link.server import (
     ACCEPTED,
@@ -23,9 +24,9 @@ from sitl.link.server import (
 )
 from sitl.px4.autopilot import Px4
 from sitl.px4.endpoint import Px4Endpoint
+from sitl.px4.flight import PositionSetpoint, Setpoint
 from sitl.px4.messages import HOME
 from sitl.px4.modes import Mode, mode_of
-from sitl.px4.setpoints import AttitudeSetpoint, RateSetpoint, Setpoint, VelocitySetpoint
 from sitl.px4.sticks import from_manual_control
 from sitl.report import FlightLog
 from sitl.rotation import Vec3, from_heading
@@ -130,10 +131,10 @@ class Px4Server(MavlinkServer[Px4, Px4Endpoint]):
                 self._log.refused_messages += 1
                 return
             attitude = (w / length, x / length, y / length, z / length)
-            setpoint = AttitudeSetpoint(attitude, yaw_rate, _thrust(message))
+            setpoint = AttitudeSetpoint(attitude, (0.0, 0.0, yaw_rate), _thrust(message))
             self._follow(setpoint, arrived_ns)
         elif not mask & _IGNORE_RATES and all(map(math.isfinite, rates)):
-            self._follow(RateSetpoint(rates, _thrust(message)), arrived_ns)
+            self._follow(AttitudeSetpoint(None, rates, _thrust(message)), arrived_ns)
 
     def _set_position_target(self, link: Px4Endpoint, message: Message, arrived_ns: int) -> None:
         frame, mask = message.coordinate_frame, message.type_mask
@@ -158,7 +159,7 @@ class Px4Server(MavlinkServer[Px4, Px4Endpoint]):
         if not all(map(math.isfinite, numbers)):
             self._log.refused_messages += 1
             return
-        self._follow(VelocitySetpoint(position, velocity, yaw, yaw_rate), arrived_ns)
+        self._follow(PositionSetpoint(position, velocity, yaw, yaw_rate), arrived_ns)
 
     def _follow(self, setpoint: Setpoint, arrived_ns: int) -> None:
         self._ap.set_setpoint(setpoint, arrived_ns)

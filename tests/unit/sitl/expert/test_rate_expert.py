@@ -9,18 +9,17 @@ from sitl import UsageError
 from sitl.ardupilot.autopilot import ArduCopter
 from sitl.ardupilot.control import boosted
 from sitl.ardupilot.flight_modes import Mode
-from sitl.ardupilot.guided import AttitudeSetpoint
 from sitl.ardupilot.params import ArduPilotParams
 from sitl.clock import NS_PER_MS, NS_PER_S
 from sitl.course.layout import RACE_SEEDS, AirborneStart, Course, make_course
 from sitl.expert.demonstrator import RateExpert
 from sitl.expert.disturbance import RATE_STRENGTHS, Disturbance, random_start
 from sitl.expert.rate_response import HOVER_THRUST, RateCommand
+from sitl.firmware import AttitudeSetpoint
 from sitl.px4.autopilot import Px4
 from sitl.px4.control import HOVER_THRUST as PX4_HOVER_THRUST
 from sitl.px4.modes import Mode as Px4Mode
 from sitl.px4.params import Px4Params
-from sitl.px4.setpoints import RateSetpoint
 from sitl.report import FlightLog
 from sitl.rotation import cos_tilt, from_euler
 from sitl.vehicle.config import VehicleConfig
@@ -149,14 +148,14 @@ def test_it_flies_a_race_on_px4_with_its_heavy_drag() -> None:
 
     def send(flown: RateCommand) -> None:
         thrust = flown.thrust * PX4_HOVER_THRUST / HOVER_THRUST
-        ap.set_setpoint(RateSetpoint(flown[1:], min(1.0, thrust)), ap.now_ns)
+        ap.set_setpoint(AttitudeSetpoint(None, flown[1:], min(1.0, thrust)), ap.now_ns)
 
     for _ in range(50):
         ap.step()
     send(RateCommand(0.0, 0.0, 0.0, 0.0))
     ap.commander.intended = Px4Mode.OFFBOARD
     ap.step()
-    assert ap.commander.arm(), ap.commander.texts
+    assert ap.commander.arm(), ap.texts
     log = fly(course, RateExpert(course, 8.0), ap, send, Disturbance(0, strength=0.0))
     assert not log.crashed
     assert log.next_gate is None

@@ -4,7 +4,7 @@ import math
 
 import pytest
 
-from sitl.px4 import curves
+from sitl.px4 import sticks as curves
 from sitl.px4.params import Px4Params
 from sitl.px4.sticks import from_manual_control
 

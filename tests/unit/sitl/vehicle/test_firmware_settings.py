@@ -8,7 +8,7 @@ import pytest
 from pymavlink.dialects.v20 import ardupilotmega as mav
 
 from helpers.course_flights import fly_course, pwm_us
-from sitl.ardupilot.endpoint import Streams
+from sitl.ardupilot.endpoint import ArduPilotStreams
 from sitl.ardupilot.params import ArduPilotParams
 from sitl.clock import NS_PER_MS, NS_PER_S
 from sitl.course.layout import AirborneStart, make_course
@@ -175,7 +175,7 @@ def test_every_angle_gain_that_is_drawn_is_stable(gain):
 
 
 def sent_ms(seed=0, seconds=4, interval_us=10_000, **conditions):
-    streams = Streams([ATTITUDE], 0, replace(NOMINAL, seed=seed, **conditions))
+    streams = ArduPilotStreams([ATTITUDE], 0, replace(NOMINAL, seed=seed, **conditions))
     assert streams.set_interval(ATTITUDE, interval_us, loop_hz=400.0, now_ns=0) is None
     stamps = range(STEP_NS, seconds * NS_PER_S, STEP_NS)
     return [now / NS_PER_MS for now in stamps if ATTITUDE in streams.due(now, 1)]
@@ -184,7 +184,7 @@ def sent_ms(seed=0, seconds=4, interval_us=10_000, **conditions):
 def test_a_slow_link_adds_to_every_interval_and_does_not_say_so():
     sent = sent_ms(stream_slowdown_ms=15)
     assert set(np.diff(sent)) == {25.0}
-    streams = Streams([ATTITUDE], 0, replace(NOMINAL, stream_slowdown_ms=15))
+    streams = ArduPilotStreams([ATTITUDE], 0, replace(NOMINAL, stream_slowdown_ms=15))
     streams.set_interval(ATTITUDE, 10_000, loop_hz=400.0, now_ns=0)
     assert streams.interval_us(ATTITUDE) == 10_000
 
