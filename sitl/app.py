@@ -6,7 +6,7 @@ import threading
 from collections.abc import Iterator, Sequence
 from contextlib import ExitStack, closing, contextmanager, nullcontext
 from pathlib import Path
-from typing import NamedTuple
+from typing import Literal, NamedTuple
 
 from sitl import UsageError
 from sitl.camera.fpv import CameraOptions, FpvRenderer
@@ -15,15 +15,20 @@ from sitl.clock import NS_PER_S, Clock, StopRequest, stop_on_signal
 from sitl.course.layout import Course
 from sitl.link.rc_input import RcInput
 from sitl.link.transport import Transport, open_transport
-from sitl.pilot.choose import PilotName, make_pilot, prepare_vehicle
+from sitl.pilot.axes import parse_axes
+from sitl.pilot.expert import ExpertPilot
 from sitl.pilot.transmitter import Pilot
 from sitl.report import write_report
 from sitl.simulated_vehicle import SimulatedVehicle
-from sitl.vehicle.config import STEP_NS, VehicleConfig
+from sitl.vehicle.config import STEP_NS, AutopilotName, VehicleConfig
 
 JOIN_TIMEOUT_S = 5.0
 LEAST_PRIORITY = 19
 """Of a vehicle that flies on faster than real time: flights beside it are judged by the ms."""
+PilotName = Literal["gamepad", "keyboard", "expert"]
+PILOTS: tuple[PilotName, ...] = ("gamepad", "keyboard", "expert")
+_PX4_PARAMS = {"COM_RC_IN_MODE": 0.0, "COM_FLTMODE_BOOT": 1.0}
+"""Sticks from the receiver alone; the mode after boot is Altitude."""
 
 
 class PilotOptions(NamedTuple):
@@ -71,13 +76,7 @@ def run_vehicle(
         if pilot is not None:
             prepare_vehicle(vehicle, config.autopilot)
             rc_input, line = make_pilot(
-                pilot.name,
-                vehicle=vehicle,
-                autopilot=config.autopilot,
-                course=course,
-                axes=pilot.axes,
-                speed_mps=pilot.speed_mps,
-                clock=clock,
+                pilot, vehicle=vehicle, autopilot=config.autopilot, course=course, clock=clock
             )
             stack.enter_context(closing(rc_input))
             print_status(line)
@@ -100,6 +99,53 @@ def run_vehicle(
         if report is not None:
             write_report(report, vehicle.log.summary(vehicle.ap, vehicle.bad_frames))
             print_status(f"report written to {report}")
+
+
+def prepare_vehicle(vehicle: SimulatedVehicle, autopilot: AutopilotName) -> None:
+    """Have the vehicle fly by its receiver in ALT_HOLD or ALTCTL; to be called before it flies."""
+    if autopilot == "px4":
+        for name, value in _PX4_PARAMS.items():
+            vehicle.params.set(name, value)
+        vehicle.reboot()
+
+
+def make_pilot(
+    options: PilotOptions,
+    *,
+    vehicle: SimulatedVehicle,
+    autopilot: AutopilotName,
+    course: Course,
+    clock: Clock,
+) -> tuple[Pilot, str]:
+    """The pilot, and a line for the user about it.
+
+    Raises:
+        UsageError: its package, display or vehicle is missing, or its axes cannot be read.
+    """
+    name, axes, speed_mps = options
+    if name == "expert":
+        if autopilot != "ardupilot":
+            raise UsageError("--pilot expert knows the sticks of ardupilot alone")
+        expert = ExpertPilot(vehicle, course, speed_mps=speed_mps)
+        return expert, f"the expert flies at {speed_mps:g} m/s"
+    wanted = parse_axes(axes)
+    os.environ.setdefault("PYGAME_HIDE_SUPPORT_PROMPT", "1")  # a line of its own on every import
+    try:
+        import pygame
+
+        from sitl.pilot import gamepad, keyboard
+    except ModuleNotFoundError as error:
+        if error.name != "pygame":
+            raise
+        raise UsageError(f"--pilot {name} needs pygame: pip install pygame-ce") from error
+    try:
+        if name == "keyboard":
+            return keyboard.KeyboardPilot(clock), keyboard.HELP
+        pad = gamepad.PygamePad()
+    except pygame.error as error:
+        raise UsageError(f"--pilot {name} needs a display: {error}") from error
+    found = pad.description or "no gamepad yet: plug one in (until then the receiver has no signal)"
+    return gamepad.GamepadPilot(pad, wanted, clock), f"{found}; {gamepad.HELP}"
 
 
 def fly(

@@ -1,14 +1,27 @@
-"""What the rest of the simulator knows of a firmware: nothing else asks which one it is.
+"""The base of both firmwares below MAVLink: parameters, sensing, readiness, landing, launch.
 
-`sitl.ardupilot.firmware` and `sitl.px4.firmware` are the two.
+`sitl.ardupilot.autopilot` and `sitl.px4.autopilot` have what differs; nothing else asks which of
+the two a vehicle runs.
 """
 
-from collections.abc import Sequence
-from typing import NamedTuple, Protocol
+import math
+import struct
+from abc import ABC, abstractmethod
+from collections.abc import Collection, Mapping, Sequence
+from dataclasses import replace
+from typing import ClassVar, NamedTuple, Self
 
-from sitl.rotation import Quat, Vec3
-from sitl.vehicle.config import VehicleConfig
-from sitl.vehicle.dynamics import BodyState
+from pymavlink.dialects.v20 import ardupilotmega as mav
+
+from sitl.clock import NS_PER_S
+from sitl.rotation import Quat, Vec3, yaw_of
+from sitl.vehicle.config import Battery, VehicleConfig
+from sitl.vehicle.dynamics import Airframe, BodyState, Quadrotor, SensorNoise, Wind
+
+STOPPED = (0.0, 0.0, 0.0, 0.0)
+LANDED_AFTER_NS = NS_PER_S
+LANDED_SPEED_MPS = 0.3
+_INT32_LIMIT = 1 << 31
 
 
 class StatusText(NamedTuple):
@@ -18,145 +31,259 @@ class StatusText(NamedTuple):
     text: str
 
 
-class Autopilot(Protocol):
+class AttitudeSetpoint(NamedTuple):
+    """A valid SET_ATTITUDE_TARGET; body axes are FRD."""
+
+    ned_from_body_wxyz: Quat | None  # None: the rates alone count
+    rate_body_radps: Vec3
+    thrust: float  # PX4: a collective, 0..1; ArduPilot: what GUID_OPTIONS says
+
+
+def float32(value: float) -> float:
+    """Round as the wire does; raises OverflowError beyond its range."""
+    (rounded,) = struct.unpack("<f", struct.pack("<f", value))
+    return float(rounded)
+
+
+class Params:
+    """Named numbers in a fixed, sorted order, which is the index in PARAM_VALUE.
+
+    An integer travels as its four bytes in the float field of PARAM_VALUE and PARAM_SET, so a peer
+    that reads it as a number sees a denormal.
+    """
+
+    def __init__(self, values: Mapping[str, float], integers: Collection[str] = ()) -> None:
+        """``integers`` are the names of those that are stored as INT32; the others are float32."""
+        self._values = {name: float32(values[name]) for name in sorted(values)}
+        self._integers = integers
+        self.names: tuple[str, ...] = tuple(self._values)
+        """Names on the wire, in PARAM_VALUE's order."""
+        self.changes = 0
+        """Number of changed values: PX4 tells its modules, not which one."""
+
+    def __getitem__(self, name: str) -> float:
+        return self._values[name]
+
+    def __contains__(self, name: str) -> bool:
+        return name in self._values
+
+    def get(self, name: str, default: float) -> float:
+        """The value, or ``default`` where the release lacks the parameter."""
+        return self._values.get(name, default)
+
+    def integer(self, name: str) -> int:
+        """The value of an integer, an enumeration or a bit mask."""
+        return int(self._values[name])
+
+    def set(self, name: str, value: float) -> bool:
+        """Store the value; False for an unknown name or a value that its type cannot hold."""
+        if name not in self._values or not math.isfinite(value):
+            return False
+        if name in self._integers:
+            if not -_INT32_LIMIT <= value < _INT32_LIMIT:
+                return False
+            new: float = int(value)
+        else:
+            try:
+                new = float32(value)
+            except OverflowError:
+                return False
+        self.changes += new != self._values[name]
+        self._values[name] = new
+        return True
+
+    def kind(self, name: str) -> int:
+        """MAV_PARAM_TYPE of PARAM_VALUE."""
+        is_integer = name in self._integers
+        return int(mav.MAV_PARAM_TYPE_INT32 if is_integer else mav.MAV_PARAM_TYPE_REAL32)
+
+    def on_wire(self, name: str) -> float:
+        """The value as the float field of PARAM_VALUE carries it."""
+        if name not in self._integers:
+            return self._values[name]
+        (packed,) = struct.unpack("<f", struct.pack("<i", self.integer(name)))
+        return float(packed)
+
+    def set_on_wire(self, name: str, packed: float) -> bool:
+        """Store what the float field of PARAM_SET carries; False as in `set`."""
+        if name not in self._integers:
+            return self.set(name, packed)
+        (value,) = struct.unpack("<i", struct.pack("<f", packed))
+        return self.set(name, value)
+
+
+class Autopilot(ABC):
     """One boot of the flight controller without its links; stamps are the caller's clock."""
 
-    sensors_frozen: bool
-    """Fault: telemetry and control keep the last state, the physics goes on."""
+    step_ns: ClassVar[int]
+    """Control period: what `step` advances by."""
+    airframe: ClassVar[Airframe]
+    gps_period_ns: ClassVar[int]
+    gyro_noise_radps: ClassVar[float] = 0.0
+    """Noise of the body rates on each axis, on top of the conditions'."""
+    id_param: ClassVar[str]
+    """Parameter of the vehicle's system id."""
 
-    @property
-    def texts(self) -> list[StatusText]:
-        """Texts that every link is to send next."""
-        ...
-
-    @property
-    def config(self) -> VehicleConfig:
-        """What makes this vehicle differ from others."""
-        ...
-
-    @property
-    def now_ns(self) -> int:
+    def __init__(self, params: Params, config: VehicleConfig, boot_ns: int) -> None:
+        self.params = params
+        """A reboot leaves them."""
+        self.config = config
+        self.boot_ns = boot_ns
+        self.now_ns = boot_ns
         """Time of the last control step."""
-        ...
+        self.landed = True
+        self.battery = Battery()
+        """Replaced as a whole by whoever wants another one."""
+        self.sensors_frozen = False
+        """Fault: telemetry and control keep the last state, the physics goes on."""
+        self.position_lost = False
+        """Fault: the estimator has no horizontal position any more, as long as this is set."""
+        self.texts: list[StatusText] = []
+        """Status texts that every link is to send next; the reader empties the list."""
+        self.motor_commands: tuple[float, ...] = STOPPED
+        conditions = config.conditions
+        rate_noise_radps = math.hypot(conditions.rate_noise_radps, self.gyro_noise_radps)
+        self._quad = Quadrotor(conditions, self.airframe)
+        self._wind = Wind(conditions, self.step_s)
+        self._noise = SensorNoise(replace(conditions, rate_noise_radps=rate_noise_radps))
+        self._physics = self._quad.at_rest()
+        self.sensed = self._physics.body
+        self.gps = self._physics.body
+        """State at the last fix."""
+        self._gps_due_ns = boot_ns
+        self._still_since_ns: int | None = boot_ns
+
+    def rebooted(self) -> Self:
+        """The flight controller after a restart on the ground at the origin."""
+        return type(self)(self.params, self.config, self.now_ns)
 
     @property
+    @abstractmethod
     def armed(self) -> bool:
         """The motors may turn."""
-        ...
 
     @property
-    def landed(self) -> bool:
-        """The vehicle rests on the ground."""
-        ...
-
-    @property
-    def step_ns(self) -> int:
-        """Control period: what `step` advances by."""
-        ...
-
-    @property
+    @abstractmethod
     def mode_name(self) -> str:
         """The firmware's own name of the flight mode."""
-        ...
 
     @property
+    @abstractmethod
     def in_failsafe(self) -> bool:
         """The pilot's sticks are lost, and the firmware acts on it."""
-        ...
 
     @property
-    def truth(self) -> BodyState:
-        """True state of the vehicle, without sensor faults and noise."""
-        ...
-
-    @property
+    @abstractmethod
     def sticks_us(self) -> tuple[int, int, int, int]:
         """Roll, pitch, throttle and yaw that the modes use; 0: never had a value.
 
         Microseconds, 1500 centred, as ArduCopter has them: less is left, nose down and descent.
         """
-        ...
 
+    @abstractmethod
     def set_receiver(self, values_us: Sequence[int]) -> None:
-        """Move the pilot's sticks and switches, in microseconds by channel."""
-        ...
+        """Move the pilot's sticks and switches, in microseconds by channel; all zeros: off."""
+
+    @property
+    def step_s(self) -> float:
+        """Control period in seconds."""
+        return self.step_ns / NS_PER_S
+
+    @property
+    def truth(self) -> BodyState:
+        """True state of the vehicle, without sensor faults and noise."""
+        return self._physics.body
+
+    @property
+    def yaw_rad(self) -> float:
+        """Sensed heading of the nose."""
+        return yaw_of(self.sensed.ned_from_body_wxyz)
+
+    @property
+    def system_id(self) -> int:
+        """MAVLink system id of the vehicle."""
+        return self.params.integer(self.id_param)
+
+    @property
+    def uptime_ns(self) -> int:
+        """Time since boot: the clock of all telemetry."""
+        return self.now_ns - self.boot_ns
+
+    @property
+    def estimator_ready(self) -> bool:
+        """True once the attitude is aligned: arming is possible."""
+        return self.uptime_ns >= self.config.estimator_ready_s * NS_PER_S
+
+    @property
+    def position_ready(self) -> bool:
+        """True once there is a horizontal position."""
+        is_settled = self.uptime_ns >= self.config.position_ready_s * NS_PER_S
+        return is_settled and not self.position_lost
 
     def step(self) -> None:
         """Advance everything by one control period."""
-        ...
+        self.now_ns += self.step_ns
+        self._read_inputs()
+        self.motor_commands = self._motors()
+        substeps = self.step_ns // self.airframe.step_ns
+        wind_mps = self._wind.step()
+        self._physics = self._quad.step(self._physics, self.motor_commands, substeps, wind_mps)
+        if not self.sensors_frozen:
+            self.sensed = self._noise.sense(self._physics.body)
+            if self.now_ns >= self._gps_due_ns:
+                self._gps_due_ns += self.gps_period_ns
+                self.gps = self.sensed
+        self._detect_landing()
 
     def launch(
         self, position_ned_m: Vec3, velocity_ned_mps: Vec3, ned_from_body_wxyz: Quat
     ) -> None:
-        """Put the vehicle in the air in this state, armed, where the sticks lean and climb."""
-        ...
+        """Put the vehicle in the air in this state, armed, where the sticks lean and climb.
 
+        It stays in a mode that setpoints fly.
+        """
+        self._physics = self._quad.airborne(position_ned_m, velocity_ned_mps, ned_from_body_wxyz)
+        self.sensed = self.gps = self._physics.body
+        self._start_in_air()
 
-class Params(Protocol):
-    """Named numbers in a fixed order, which is the index in PARAM_VALUE."""
+    @abstractmethod
+    def _read_inputs(self) -> None:
+        """Take sticks and setpoints, and decide on mode and arming."""
 
-    @property
-    def names(self) -> tuple[str, ...]:
-        """All names, sorted."""
-        ...
+    @abstractmethod
+    def _motors(self) -> tuple[float, ...]:
+        """Motor commands of this step, each in [0, 1]."""
 
-    def __getitem__(self, name: str) -> float: ...
-
-    def set(self, name: str, value: float) -> bool:
-        """Store the value; False for an unknown name or a value that does not fit."""
-        ...
-
-
-class Endpoint(Protocol):
-    """One MAVLink link of the vehicle."""
-
-    bad_frames: int
-
-    def take_outgoing(self) -> bytes:
-        """Everything queued since the last call: whole frames, in order."""
-        ...
-
-
-class Server(Protocol):
-    """The MAVLink side of the vehicle, without I/O."""
+    @abstractmethod
+    def _start_in_air(self) -> None:
+        """Arm and fly from the state that the vehicle was just put into."""
 
     @property
-    def links(self) -> Sequence[Endpoint]:
-        """One endpoint a link."""
-        ...
+    @abstractmethod
+    def _is_pushing(self) -> bool:
+        """Thrust is above half of hovering: the vehicle is no landed one."""
 
-    @property
-    def reboot_requested(self) -> bool:
-        """A command has requested a reboot."""
-        ...
+    def _set_landed(self, *, landed: bool) -> None:
+        self.landed = landed
+        if not landed:
+            self._still_since_ns = None
 
-    def receive(self, link_id: int, data: bytes, arrived_ns: int) -> None:
-        """Act on the bytes of one datagram, or of one read of a stream."""
-        ...
+    def _detect_landing(self) -> None:
+        body = self.sensed
+        is_slow = max(abs(v) for v in body.velocity_ned_mps) < LANDED_SPEED_MPS
+        is_still = body.touching and is_slow and not (self.armed and self._is_pushing)
+        self._still_since_ns = self._since(self._still_since_ns, is_still)
+        if not self.landed and self._has_held(self._still_since_ns, LANDED_AFTER_NS):
+            self._set_landed(landed=True)
 
-    def step(self, now_ns: int) -> None:
-        """Queue what is due on every link; ``now_ns`` is at most one control step ahead."""
-        ...
+    def _since(self, since_ns: int | None, condition: bool) -> int | None:
+        """Start of the time for which the condition has held; None if it does not hold."""
+        if not condition:
+            return None
+        return self.now_ns if since_ns is None else since_ns
 
+    def _has_held(self, since_ns: int | None, duration_ns: float) -> bool:
+        return since_ns is not None and self.now_ns - since_ns >= duration_ns
 
-class Firmware(Protocol):
-    """A firmware that runs on the simulated vehicle."""
-
-    @property
-    def params(self) -> Params:
-        """Its parameters, which a reboot leaves."""
-        ...
-
-    @property
-    def ap(self) -> Autopilot:
-        """The flight controller since the last boot."""
-        ...
-
-    @property
-    def server(self) -> Server:
-        """Its links."""
-        ...
-
-    def reboot(self) -> None:
-        """Restart on the ground at the origin."""
-        ...
+    def _send_text(self, severity: int, text: str) -> None:
+        self.texts.append(StatusText(severity, text))

@@ -97,3 +97,20 @@ def cos_tilt(q: Quat) -> float:
 def wrap_pi(angle: float) -> float:
     """The angle in [-pi, pi]."""
     return math.remainder(angle, 2.0 * math.pi)
+
+
+def yaw_of(q: Quat) -> float:
+    """Heading in radians."""
+    return to_euler(q)[2]
+
+
+def from_heading(forward: float, right: float, yaw: float) -> tuple[float, float]:
+    """North and east parts of a horizontal vector in the axes of a heading."""
+    cy, sy = math.cos(yaw), math.sin(yaw)
+    return forward * cy - right * sy, forward * sy + right * cy
+
+
+def to_heading(north: float, east: float, yaw: float) -> tuple[float, float]:
+    """Forward and right parts of a horizontal vector in the axes of a heading."""
+    cy, sy = math.cos(yaw), math.sin(yaw)
+    return north * cy + east * sy, east * cy - north * sy

@@ -2,12 +2,18 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any
 
-from sitl.ardupilot.firmware import ArduCopter
+from sitl.ardupilot.autopilot import ArduCopter
+from sitl.ardupilot.params import ArduPilotParams
+from sitl.ardupilot.server import ArduPilotServer
 from sitl.clock import NS_PER_S
 from sitl.course.layout import AirborneStart, Course
-from sitl.firmware import Autopilot, Firmware, Params, Server, StatusText
-from sitl.px4.firmware import Px4
+from sitl.firmware import Autopilot, Params, StatusText
+from sitl.link.server import MavlinkServer
+from sitl.px4.autopilot import Px4
+from sitl.px4.params import Px4Params
+from sitl.px4.server import Px4Server
 from sitl.report import FlightLog
 from sitl.vehicle.config import VehicleConfig
 from sitl.vehicle.dynamics import BodyState
@@ -36,27 +42,29 @@ class SimulatedVehicle:
         config: VehicleConfig | None = None,
         course: Course | None = None,
     ) -> None:
-        self._config = config or VehicleConfig()
+        config = config or VehicleConfig()
         self.log = FlightLog(boot_ns, course)
-        make = Px4 if self._config.autopilot == "px4" else ArduCopter
-        self._firmware: Firmware = make(self._config, links, boot_ns, self.log)
+        self.ap: Autopilot
+        """The flight controller since its last boot."""
+        self.server: MavlinkServer[Any, Any]
+        """The vehicle's links."""
+        if config.autopilot == "px4":
+            px4_params = Px4Params(
+                config.conditions, receiver=config.receiver, release=config.px4_release
+            )
+            self.ap = px4 = Px4(px4_params, config, boot_ns)
+            self.server = Px4Server(px4, links, self.log)
+        else:
+            params = ArduPilotParams(config.conditions, config.ardupilot_release)
+            self.ap = copter = ArduCopter(params, config, boot_ns)
+            self.server = ArduPilotServer(copter, links, self.log)
         self._transmitter_us: Sequence[int] | None = None
         self.pose = Pose(stamp_ns=boot_ns, body=self.ap.truth)
 
     @property
-    def ap(self) -> Autopilot:
-        """The flight controller since its last boot."""
-        return self._firmware.ap
-
-    @property
     def params(self) -> Params:
-        """The firmware's parameters."""
-        return self._firmware.params
-
-    @property
-    def server(self) -> Server:
-        """The vehicle's links."""
-        return self._firmware.server
+        """The firmware's parameters, which a reboot leaves."""
+        return self.ap.params
 
     @property
     def bad_frames(self) -> int:
@@ -94,7 +102,8 @@ class SimulatedVehicle:
 
     def take_outgoing(self, link_id: int) -> bytes:
         """Bytes to send on a link: whole frames, in order."""
-        return self.server.links[link_id].take_outgoing()
+        outgoing: bytes = self.server.links[link_id].take_outgoing()
+        return outgoing
 
     def launch(self, start: AirborneStart) -> None:
         """Put the vehicle in the air in this state, armed, where the sticks lean and climb."""
@@ -104,7 +113,8 @@ class SimulatedVehicle:
 
     def reboot(self) -> None:
         """Restart on the ground at the origin: time_boot_ms is 0, parameters stay."""
-        self._firmware.reboot()
+        self.ap = self.ap.rebooted()
+        self.server.restart(self.ap)
         if self._transmitter_us is not None:
             self.ap.set_receiver(self._transmitter_us)
         self.log.on_reboot()

@@ -9,26 +9,23 @@ from collections.abc import Sequence
 from contextlib import suppress
 
 from sitl.ardupilot.failsafe import GcsFailsafe, RadioFailsafe
-from sitl.ardupilot.flight_modes import STOPPED, FlightControl, Mode
-from sitl.ardupilot.gesture import RudderGesture
+from sitl.ardupilot.flight_modes import CopterControl, Mode
 from sitl.ardupilot.guided import GuidedControl
-from sitl.ardupilot.params import Params
+from sitl.ardupilot.params import ArduPilotParams
 from sitl.ardupilot.rc import ModeSwitch, RcEngine
-from sitl.ardupilot.simple import SimpleMode
-from sitl.ardupilot.sticks import Sticks, climb_rate_mps, read_sticks
+from sitl.ardupilot.sticks import (
+    RudderGesture,
+    SimpleMode,
+    Sticks,
+    climb_rate_mps,
+    read_sticks,
+)
 from sitl.clock import NS_PER_S
-from sitl.firmware import StatusText
-from sitl.rotation import Quat, Vec3, cos_tilt, to_euler
-from sitl.vehicle.config import STEP_NS, Battery, VehicleConfig
-from sitl.vehicle.dynamics import QUAD, BodyState, Quadrotor
-from sitl.vehicle.environment import SensorNoise, Wind
+from sitl.firmware import STOPPED, Autopilot
+from sitl.rotation import cos_tilt
+from sitl.vehicle.config import STEP_NS, VehicleConfig
+from sitl.vehicle.dynamics import QUAD
 
-SUBSTEPS = STEP_NS // QUAD.step_ns
-STEP_S = STEP_NS / NS_PER_S
-GPS_PERIOD_NS = NS_PER_S // 5
-
-LANDED_AFTER_NS = NS_PER_S
-LANDED_SPEED_MPS = 0.3
 CRASH_TILT_COS = 0.7
 CRASH_AFTER_NS = NS_PER_S
 SEVERITY_CRITICAL, SEVERITY_WARNING, SEVERITY_INFO = 2, 4, 6
@@ -44,55 +41,34 @@ FS_OPTION_PILOT_CONTINUES = 16
 RC_OPTION_SKIP_NEUTRAL_CHECK = 64
 
 
-class Autopilot:
-    """One boot of the vehicle; stamps are nanoseconds of the caller's clock, from ``boot_ns``."""
+class ArduCopter(Autopilot):
+    """One boot of the vehicle; the control period is that of 400 Hz."""
 
-    def __init__(self, params: Params, config: VehicleConfig, boot_ns: int) -> None:
-        self.params = params
-        self.config = config
-        self.boot_ns = boot_ns
-        self.now_ns = boot_ns
+    step_ns = STEP_NS
+    airframe = QUAD
+    gps_period_ns = NS_PER_S // 5
+    id_param = "MAV_SYSID"
+    params: ArduPilotParams
+
+    def __init__(self, params: ArduPilotParams, config: VehicleConfig, boot_ns: int) -> None:
+        super().__init__(params, config, boot_ns)
         self.mode = Mode.STABILIZE
-        self.armed = False
-        self.landed = True
         self.rc = RcEngine(params, config.receiver_us if config.receiver else None)
-        self.battery = Battery()
-        """Replaced as a whole by whoever wants another one."""
         self.radio_failsafe = RadioFailsafe(params, boot_ns)
         self.gcs_failsafe = GcsFailsafe(params)
-        self.texts: list[StatusText] = []
-        """Status texts to send; the reader empties the list."""
-        self.motor_commands: tuple[float, ...] = STOPPED
-        self.sensors_frozen = False
-        """Fault: telemetry and control keep the last state, the physics goes on."""
-        self.position_lost = False
-        """Fault: the estimator has no position any more, as long as this is set."""
-        self.control = FlightControl(params)
+        self.control = CopterControl(params)
         """Targets and thrust, for telemetry; only this autopilot commands it."""
         self.simple = SimpleMode(params)
+        self._armed = False
         self._mode_switch = ModeSwitch()
         self._gesture = RudderGesture()
-        self._quad = Quadrotor(config.conditions)
-        self._wind = Wind(config.conditions, STEP_S)
-        self._noise = SensorNoise(config.conditions)
-        self._physics = self._quad.at_rest()
-        self.sensed = self._physics.body
-        self.gps = self._physics.body
-        """State at the last 5 Hz fix."""
-        self._gps_due_ns = boot_ns
-        self._still_since_ns: int | None = boot_ns
         self._tipped_since_ns: int | None = None
         self._idle_since_ns = self._armed_ns = boot_ns
 
     @property
-    def truth(self) -> BodyState:
-        """True state of the vehicle, without sensor faults and noise."""
-        return self._physics.body
-
-    @property
-    def step_ns(self) -> int:
-        """Control period: 400 Hz."""
-        return STEP_NS
+    def armed(self) -> bool:
+        """The motors may turn."""
+        return self._armed
 
     @property
     def mode_name(self) -> str:
@@ -112,26 +88,6 @@ class Autopilot:
     def set_receiver(self, values_us: Sequence[int]) -> None:
         """Move the pilot's sticks and switches (`RcEngine.set_receiver`)."""
         self.rc.set_receiver(values_us)
-
-    @property
-    def _yaw_rad(self) -> float:
-        return to_euler(self.sensed.ned_from_body_wxyz)[2]
-
-    @property
-    def uptime_ns(self) -> int:
-        """Time since boot: the clock of all telemetry."""
-        return self.now_ns - self.boot_ns
-
-    @property
-    def estimator_ready(self) -> bool:
-        """True once the attitude is aligned: arming is possible."""
-        return self.uptime_ns >= self.config.estimator_ready_s * NS_PER_S
-
-    @property
-    def position_ready(self) -> bool:
-        """True once there is a position: LOCAL_POSITION_NED flows, RTL is possible."""
-        is_settled = self.uptime_ns >= self.config.position_ready_s * NS_PER_S
-        return is_settled and not self.position_lost
 
     @property
     def has_gps(self) -> bool:
@@ -183,9 +139,9 @@ class Autopilot:
         if refusal is not None and not force:
             self._send_text(SEVERITY_CRITICAL, f"Arm: {refusal}")
             return False
-        self.armed = True
+        self._armed = True
         self._armed_ns = self._idle_since_ns = self.now_ns
-        self.simple.arm(self._yaw_rad)
+        self.simple.arm(self.yaw_rad)
         self.control.enter(self.mode, self.sensed)
         self._send_text(SEVERITY_INFO, "Arming motors")
         return True
@@ -195,7 +151,7 @@ class Autopilot:
         if self.armed and not (self.landed or force):
             return False
         if self.armed:
-            self.armed = False
+            self._armed = False
             self._send_text(SEVERITY_INFO, "Disarming motors")
         return True
 
@@ -233,37 +189,22 @@ class Autopilot:
 
     def step(self) -> None:
         """Advance everything by one control period."""
-        self.now_ns += STEP_NS
+        super().step()
+        self._detect_crash()
+
+    def _read_inputs(self) -> None:
         self._read_radio()
         if self.gcs_failsafe.update(self.now_ns):
             self._on_gcs_change()
-        self.motor_commands = self._motors()
-        wind_mps = self._wind.step()
-        self._physics = self._quad.step(self._physics, self.motor_commands, SUBSTEPS, wind_mps)
-        if not self.sensors_frozen:
-            self.sensed = self._noise.sense(self._physics.body)
-            if self.now_ns >= self._gps_due_ns:
-                self._gps_due_ns += GPS_PERIOD_NS
-                self.gps = self.sensed
-        self._detect_landing()
-        self._detect_crash()
 
-    def launch(
-        self, position_ned_m: Vec3, velocity_ned_mps: Vec3, ned_from_body_wxyz: Quat
-    ) -> None:
-        """Put the vehicle in the air in this state, armed; in ALT_HOLD, unless setpoints fly it.
-
-        The sticks count from the next step: an idle receiver commands a descent. Setpoints count
-        from the next one on.
-        """
-        self._physics = self._quad.airborne(position_ned_m, velocity_ned_mps, ned_from_body_wxyz)
-        self.sensed = self.gps = self._physics.body
-        self.armed = True
-        self.landed = False
+    def _start_in_air(self) -> None:
+        """Fly on in ALT_HOLD, unless setpoints fly it; an idle receiver commands a descent."""
+        self._armed = True
+        self._set_landed(landed=False)
         if not self.mode.is_guided:
             self.mode = Mode.ALT_HOLD
         self._idle_since_ns = self.now_ns
-        self._still_since_ns = self._tipped_since_ns = None
+        self._tipped_since_ns = None
         self.control.enter(self.mode, self.sensed)
 
     def _motors(self) -> tuple[float, ...]:
@@ -271,15 +212,14 @@ class Autopilot:
             self.control.reset(self.sensed)
             return STOPPED
         sticks = self.simple.turned(
-            read_sticks(self.rc, self.params), self._yaw_rad, self.sensed.position_ned_m
+            read_sticks(self.rc, self.params), self.yaw_rad, self.sensed.position_ned_m
         )
         if self.landed:
             if not self._lifts_off(sticks):
                 if self.mode.lands or self._is_idle(sticks):
                     self.disarm(force=False)
                 return self.control.idle(self.sensed)
-            self.landed = False
-            self._still_since_ns = None
+            self._set_landed(landed=False)
         self._idle_since_ns = self.now_ns
         return self.control.fly(
             self.mode,
@@ -287,7 +227,7 @@ class Autopilot:
             self.sensed,
             self.now_ns,
             has_position=self.position_ready,
-            dt_s=STEP_S,
+            dt_s=self.step_s,
         )
 
     def _lifts_off(self, sticks: Sticks) -> bool:
@@ -302,14 +242,9 @@ class Autopilot:
         delay_s = self.params["DISARM_DELAY"]
         return delay_s > 0.0 and self._has_held(self._idle_since_ns, delay_s * NS_PER_S)
 
-    def _detect_landing(self) -> None:
-        body = self.sensed
-        is_slow = max(abs(v) for v in body.velocity_ned_mps) < LANDED_SPEED_MPS
-        is_pushing = self.armed and self.control.collective > 0.5 * self.params["MOT_THST_HOVER"]
-        is_still = body.touching and is_slow and not is_pushing
-        self._still_since_ns = self._since(self._still_since_ns, is_still)
-        if self._has_held(self._still_since_ns, LANDED_AFTER_NS):
-            self.landed = True
+    @property
+    def _is_pushing(self) -> bool:
+        return self.control.collective > 0.5 * self.params["MOT_THST_HOVER"]
 
     def _detect_crash(self) -> None:
         """Stop the motors of a vehicle that lies on its side."""
@@ -319,15 +254,6 @@ class Autopilot:
         if self._has_held(self._tipped_since_ns, CRASH_AFTER_NS):
             self._send_text(SEVERITY_CRITICAL, "Crash: Disarming")
             self.disarm(force=True)
-
-    def _since(self, since_ns: int | None, condition: bool) -> int | None:
-        """Start of the time for which the condition has held; None if it does not hold."""
-        if not condition:
-            return None
-        return self.now_ns if since_ns is None else since_ns
-
-    def _has_held(self, since_ns: int | None, duration_ns: float) -> bool:
-        return since_ns is not None and self.now_ns - since_ns >= duration_ns
 
     def _read_radio(self) -> None:
         new_input = self.rc.update(self.now_ns)
@@ -396,6 +322,3 @@ class Autopilot:
             return
         mode = FAILSAFE_MODES[parameter].get(self.params.integer(parameter), Mode.RTL)
         self.set_mode(mode if self.position_ready else Mode.LAND)
-
-    def _send_text(self, severity: int, text: str) -> None:
-        self.texts.append(StatusText(severity, text))

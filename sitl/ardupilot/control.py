@@ -2,7 +2,7 @@
 
 import math
 
-from sitl.ardupilot.params import DEFAULT_RATE_P, Params
+from sitl.ardupilot.params import DEFAULT_RATE_P, ArduPilotParams
 from sitl.rotation import (
     IDENTITY,
     Quat,
@@ -14,6 +14,8 @@ from sitl.rotation import (
     multiply,
     rotation_vector,
     to_euler,
+    to_heading,
+    yaw_of,
 )
 from sitl.vehicle.control import clamp
 from sitl.vehicle.dynamics import GRAVITY_MPS2, BodyState
@@ -35,7 +37,7 @@ _ANGLE_GAINS = ("ATC_ANG_RLL_P", "ATC_ANG_PIT_P", "ATC_ANG_YAW_P")
 class AttitudeController:
     """Tracks leans, attitudes or body rates; the target lives here between steps."""
 
-    def __init__(self, params: Params) -> None:
+    def __init__(self, params: ArduPilotParams) -> None:
         self._params = params
         self._target = IDENTITY
         self._target_rate_radps: Vec3 = (0.0, 0.0, 0.0)
@@ -191,7 +193,7 @@ class _Response:
         return roll, pitch, yaw
 
 
-def boosted(thrust: float, body: BodyState, params: Params) -> float:
+def boosted(thrust: float, body: BodyState, params: ArduPilotParams) -> float:
     """Collective in [0, 1] that keeps the vertical thrust of a leaning vehicle, to 84 degrees.
 
     ATC_ANGLE_BOOST turns it off. Formula: ArduPilot's ``get_throttle_boosted``.
@@ -205,7 +207,5 @@ def boosted(thrust: float, body: BodyState, params: Params) -> float:
 def lean_for(accel_ne_mps2: tuple[float, float], body: BodyState) -> tuple[float, float]:
     """Roll and pitch (rad) at which a hovering vehicle accelerates north and east so much."""
     north, east = accel_ne_mps2
-    _, _, yaw = to_euler(body.ned_from_body_wxyz)
-    forward = north * math.cos(yaw) + east * math.sin(yaw)
-    right = east * math.cos(yaw) - north * math.sin(yaw)
+    forward, right = to_heading(north, east, yaw_of(body.ned_from_body_wxyz))
     return math.atan2(right, GRAVITY_MPS2), -math.atan2(forward, GRAVITY_MPS2)

@@ -1,6 +1,6 @@
 """Detects the loss of the pilot's sticks or of the ground station; the autopilot acts on it."""
 
-from sitl.ardupilot.params import Params
+from sitl.ardupilot.params import ArduPilotParams
 from sitl.clock import NS_PER_S
 
 LOW_READS_TO_FAIL = 3
@@ -10,7 +10,7 @@ GCS_CHECK_PERIOD_NS = NS_PER_S // 3  # ArduCopter looks at the ground station in
 class RadioFailsafe:
     """No sticks for RC_FS_TIMEOUT, or a throttle below FS_THR_VALUE."""
 
-    def __init__(self, params: Params, now_ns: int) -> None:
+    def __init__(self, params: ArduPilotParams, now_ns: int) -> None:
         self._params = params
         self._last_input_ns = now_ns
         self._low_reads = 0
@@ -41,7 +41,7 @@ class RadioFailsafe:
 class GcsFailsafe:
     """No heartbeat and no override of the ground station for FS_GCS_TIMEOUT."""
 
-    def __init__(self, params: Params) -> None:
+    def __init__(self, params: ArduPilotParams) -> None:
         self._params = params
         self._last_contact_ns: int | None = None
         self._due_ns = 0

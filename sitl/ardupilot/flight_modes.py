@@ -6,13 +6,12 @@ from enum import IntEnum
 from sitl.ardupilot import sticks as pilot
 from sitl.ardupilot.control import AttitudeController, boosted, lean_for
 from sitl.ardupilot.guided import GuidedControl
-from sitl.ardupilot.params import Params
+from sitl.ardupilot.params import ArduPilotParams
 from sitl.ardupilot.sticks import Sticks
 from sitl.rotation import Quat, Vec3, to_euler, wrap_pi
 from sitl.vehicle.control import HeightController, mix, thrust_for
 from sitl.vehicle.dynamics import BodyState
 
-STOPPED = (0.0, 0.0, 0.0, 0.0)
 IDLE = (0.03, 0.03, 0.03, 0.03)  # armed on the ground, throttle down
 
 SLOW_DESCENT_HEIGHT_M = 10.0  # LAND descends by WPNAV_SPEED_DN above it, by LAND_SPEED below
@@ -80,10 +79,10 @@ class Mode(IntEnum):
         return self in (Mode.RTL, Mode.LAND)
 
 
-class FlightControl:
+class CopterControl:
     """Control laws of all modes, and the controllers that they share."""
 
-    def __init__(self, params: Params) -> None:
+    def __init__(self, params: ArduPilotParams) -> None:
         self._params = params
         self._attitude = AttitudeController(params)
         self._height = HeightController()

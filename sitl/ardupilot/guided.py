@@ -9,9 +9,10 @@ from enum import Enum, auto
 from typing import NamedTuple
 
 from sitl.ardupilot.control import AttitudeController, lean_for
-from sitl.ardupilot.params import Params
+from sitl.ardupilot.params import ArduPilotParams
 from sitl.clock import NS_PER_MS, NS_PER_S
-from sitl.rotation import Quat, Vec3, from_euler, integrate, to_euler
+from sitl.firmware import AttitudeSetpoint
+from sitl.rotation import Vec3, from_euler, integrate, to_euler
 from sitl.vehicle.control import HeightController, clamp, thrust_for
 from sitl.vehicle.dynamics import BodyState
 
@@ -33,14 +34,6 @@ MAX_LEAN_ACCEL_MPS2 = 5.0
 MIN_CLIMB_ACCEL_MPS2 = 0.5
 
 
-class AttitudeSetpoint(NamedTuple):
-    """A valid SET_ATTITUDE_TARGET; body axes are FRD."""
-
-    ned_from_body_wxyz: Quat | None  # None: the rates alone count
-    rate_body_radps: Vec3
-    thrust: float  # what it means is up to GUID_OPTIONS
-
-
 class VelocitySetpoint(NamedTuple):
     """A valid SET_POSITION_TARGET_LOCAL_NED."""
 
@@ -60,7 +53,7 @@ class GuidedControl:
     """Control law of both modes, on the attitude and height controllers of all modes."""
 
     def __init__(
-        self, params: Params, attitude: AttitudeController, height: HeightController
+        self, params: ArduPilotParams, attitude: AttitudeController, height: HeightController
     ) -> None:
         self._params = params
         self._attitude = attitude

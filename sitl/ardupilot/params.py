@@ -8,22 +8,12 @@ to the next come from its conditions; their nominal attitude gains and rate limi
 vehicle's own tuning, not the firmware's defaults.
 """
 
-import math
-import struct
-
+from sitl.firmware import Params, float32
 from sitl.vehicle.conditions import NOMINAL, Conditions
 from sitl.vehicle.config import ArduPilotRelease
 
 RC_CHANNELS_WITH_PARAMS = 8
-
-
-def _float32(value: float) -> float:
-    """Round as the wire does; raises OverflowError beyond its range."""
-    (rounded,) = struct.unpack("<f", struct.pack("<f", value))
-    return float(rounded)
-
-
-DEFAULT_RATE_P = _float32(0.135)
+DEFAULT_RATE_P = float32(0.135)
 """Gain of the loop from body rates to torque, roll and pitch."""
 _FIXED = {
     "ACRO_BAL_PITCH": 1.0,
@@ -121,54 +111,35 @@ def _varied(conditions: Conditions) -> dict[str, float]:
     }
 
 
-class Params:
+class ArduPilotParams(Params):
     """Named numbers; `on_wire` and `set_on_wire` know them by the names of the release."""
 
     def __init__(
         self, conditions: Conditions = NOMINAL, release: ArduPilotRelease = "4.7-dev"
     ) -> None:
         values = _FIXED | _varied(conditions)
+        dead_zones_us = conditions.rc_dead_zones_us
         for index in range(RC_CHANNELS_WITH_PARAMS):
-            values |= {f"RC{index + 1}_{name}": value for name, value in _RC_CHANNEL.items()}
-            dead_zones_us = conditions.rc_dead_zones_us
-            values[f"RC{index + 1}_DZ"] = (
-                dead_zones_us[index] if index < len(dead_zones_us) else 0.0
-            )
-        self._values = {name: _float32(values[name]) for name in sorted(values)}
+            dead_zone_us = dead_zones_us[index] if index < len(dead_zones_us) else 0.0
+            channel = {**_RC_CHANNEL, "DZ": dead_zone_us}
+            values |= {f"RC{index + 1}_{name}": value for name, value in channel.items()}
+        super().__init__(values)
         renamed = {"4.6": _NAMES_4_6, "4.7-dev": {}, "4.7": _NAMES_4_7}[release]
         absent = _ABSENT_IN_4_6 if release == "4.6" else ()
         named = {renamed.get(name, name): name for name in self._values if name not in absent}
         self._by_wire_name = {name: named[name] for name in sorted(named)}
-        self.names: tuple[str, ...] = tuple(self._by_wire_name)
-        """Names on the wire, in PARAM_VALUE's order."""
-
-    def __getitem__(self, name: str) -> float:
-        return self._values[name]
+        self.names = tuple(self._by_wire_name)
 
     def on_wire(self, name: str) -> float:
         """The value in the unit that this name, one of ``names``, has on the wire."""
         value = self._values[self._by_wire_name[name]]
         return value / HUNDREDTHS if name in _SI_NAMES else value
 
-    def set_on_wire(self, name: str, value: float) -> bool:
+    def set_on_wire(self, name: str, packed: float) -> bool:
         """As `set`, by a name and in the unit of the wire."""
         scale = HUNDREDTHS if name in _SI_NAMES else 1.0
-        return name in self._by_wire_name and self.set(self._by_wire_name[name], scale * value)
-
-    def integer(self, name: str) -> int:
-        """The value of an enumeration or bit mask."""
-        return int(self._values[name])
+        return name in self._by_wire_name and self.set(self._by_wire_name[name], scale * packed)
 
     def decimal(self, name: str) -> float:
         """The value rounded to the seven digits that float32 carries: 0.15, not 0.1500000059."""
         return float(f"{self._values[name]:.7g}")
-
-    def set(self, name: str, value: float) -> bool:
-        """Store the value; False for an unknown name or a value that is not a float32 number."""
-        if name not in self._values or not math.isfinite(value):
-            return False
-        try:
-            self._values[name] = _float32(value)
-        except OverflowError:
-            return False
-        return True

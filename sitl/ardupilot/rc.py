@@ -8,7 +8,7 @@ from bisect import bisect_left
 from collections.abc import Sequence
 from itertools import zip_longest
 
-from sitl.ardupilot.params import RC_CHANNELS_WITH_PARAMS, Params
+from sitl.ardupilot.params import RC_CHANNELS_WITH_PARAMS, ArduPilotParams
 from sitl.clock import NS_PER_S
 
 CHANNELS = 16
@@ -27,7 +27,7 @@ _OPTIONS_IGNORE_OVERRIDES = 2
 class RcEngine:
     """Merges receiver and overrides, channel by channel; stamps are nanoseconds of one clock."""
 
-    def __init__(self, params: Params, receiver_us: Sequence[int] | None) -> None:
+    def __init__(self, params: ArduPilotParams, receiver_us: Sequence[int] | None) -> None:
         self._params = params
         self._receiver_us = receiver_us
         self._has_frames = receiver_us is not None

@@ -1,16 +1,27 @@
-"""Turns PWM into pilot commands: dead zones, curves and rates of ArduCopter's manual modes.
+"""Turns PWM into pilot commands: dead zones, curves and rates of ArduCopter's manual modes, Simple
+mode, and arming by the rudder.
 
 Formulas: ArduPilot ``RC_Channel`` (calibration), Copter ``get_pilot_desired_throttle`` and
 ``get_pilot_desired_climb_rate``; pinned by leans and rates measured on the firmware.
 """
 
 import math
-from typing import NamedTuple
+from collections.abc import Sequence
+from enum import IntEnum
+from typing import Literal, NamedTuple
 
-from sitl.ardupilot.params import Params
+from sitl.ardupilot.params import RC_CHANNELS_WITH_PARAMS, ArduPilotParams
 from sitl.ardupilot.rc import RcEngine
+from sitl.clock import NS_PER_S
+from sitl.rotation import Vec3, from_heading
 
 THROTTLE_FULL = 1000.0
+GESTURE_NS = 2 * NS_PER_S
+"""ArduCopter's ARM_DELAY and DISARM_DELAY of the sticks."""
+FULL_YAW = 4000 / 4500
+_OPTION_SIMPLE, _OPTION_SUPER_SIMPLE = 3, 13
+_LOW_US, _HIGH_US = 1200, 1800
+_SUPER_SIMPLE_RADIUS_M = 10.0
 
 
 class Sticks(NamedTuple):
@@ -23,7 +34,7 @@ class Sticks(NamedTuple):
     throttle_mid: float  # middle of the throttle's travel on that scale
 
 
-def read_sticks(rc: RcEngine, params: Params) -> Sticks:
+def read_sticks(rc: RcEngine, params: ArduPilotParams) -> Sticks:
     """Read the four flight sticks by RCMAP_*; a channel that never had a value is centred."""
     throttle, mid = _throttle(rc, params)
     return Sticks(
@@ -35,7 +46,7 @@ def read_sticks(rc: RcEngine, params: Params) -> Sticks:
     )
 
 
-def _centred(rc: RcEngine, params: Params, axis: str) -> float:
+def _centred(rc: RcEngine, params: ArduPilotParams, axis: str) -> float:
     index = rc.index_of(axis)
     pwm = rc.channels_us[index]
     name = f"RC{index + 1}_"
@@ -52,7 +63,7 @@ def _centred(rc: RcEngine, params: Params, axis: str) -> float:
     return -value if params[name + "REVERSED"] else value
 
 
-def _throttle(rc: RcEngine, params: Params) -> tuple[float, float]:
+def _throttle(rc: RcEngine, params: ArduPilotParams) -> tuple[float, float]:
     """Throttle and its middle, in 0..THROTTLE_FULL."""
     index = rc.index_of("THROTTLE")
     name = f"RC{index + 1}_"
@@ -70,19 +81,19 @@ def _throttle(rc: RcEngine, params: Params) -> tuple[float, float]:
     return max(0.0, (pwm - bottom) * scale), mid
 
 
-def lean_angles(sticks: Sticks, params: Params) -> tuple[float, float]:
+def lean_angles(sticks: Sticks, params: ArduPilotParams) -> tuple[float, float]:
     """Roll and pitch in radians (+ right, + nose up), their length limited to ANGLE_MAX."""
     limit = math.radians(params["ANGLE_MAX"] / 100.0)
     scale = limit / max(1.0, math.hypot(sticks.roll, sticks.pitch))
     return sticks.roll * scale, sticks.pitch * scale
 
 
-def yaw_rate_radps(sticks: Sticks, params: Params) -> float:
+def yaw_rate_radps(sticks: Sticks, params: ArduPilotParams) -> float:
     """Yaw rate of the angle modes."""
     return math.radians(params["PILOT_Y_RATE"]) * _expo(sticks.yaw, params["PILOT_Y_EXPO"])
 
 
-def acro_rates_radps(sticks: Sticks, params: Params) -> tuple[float, float, float]:
+def acro_rates_radps(sticks: Sticks, params: ArduPilotParams) -> tuple[float, float, float]:
     """Body roll, pitch and yaw rates of ACRO, before the trainer; roll and pitch share a circle."""
     length = max(1.0, math.hypot(sticks.roll, sticks.pitch))
     full = math.radians(params["ACRO_RP_RATE"])
@@ -100,7 +111,7 @@ def _expo(value: float, expo: float) -> float:
     return (1.0 - expo) * value / (1.0 - expo * abs(value))
 
 
-def climb_rate_mps(sticks: Sticks, params: Params) -> float:
+def climb_rate_mps(sticks: Sticks, params: ArduPilotParams) -> float:
     """Climb rate of ALT_HOLD, + up; 0 within THR_DZ of the middle."""
     dead_zone = max(0.0, min(400.0, params["THR_DZ"]))
     top = sticks.throttle_mid + dead_zone
@@ -113,7 +124,7 @@ def climb_rate_mps(sticks: Sticks, params: Params) -> float:
     return 0.0
 
 
-def manual_thrust(sticks: Sticks, params: Params) -> float:
+def manual_thrust(sticks: Sticks, params: ArduPilotParams) -> float:
     """Collective in [0, 1] of STABILIZE and ACRO: an expo through hover thrust at mid-stick."""
     mid = min(max(sticks.throttle_mid, 1.0), THROTTLE_FULL - 1.0)
     if sticks.throttle < mid:
@@ -122,3 +133,80 @@ def manual_thrust(sticks: Sticks, params: Params) -> float:
         position = 0.5 + 0.5 * (sticks.throttle - mid) / (THROTTLE_FULL - mid)
     expo = max(-0.5, min(1.0, (0.5 - params["MOT_THST_HOVER"]) / 0.375))
     return max(0.0, min(1.0, position * (1.0 - expo) + expo * position**3))
+
+
+class RudderGesture:
+    """Throttle at its end with full yaw: to the right arms, to the left disarms."""
+
+    def __init__(self) -> None:
+        self._side = 0
+        self._since_ns: int | None = None
+
+    def update(self, sticks: Sticks, now_ns: int) -> Literal["arm", "disarm"] | None:
+        """The gesture, once, when it has been held for long enough."""
+        side = 0
+        if sticks.throttle == 0.0 and abs(sticks.yaw) > FULL_YAW:
+            side = 1 if sticks.yaw > 0.0 else -1
+        if side != self._side:
+            self._side, self._since_ns = side, now_ns
+        if side == 0 or self._since_ns is None or now_ns - self._since_ns < GESTURE_NS:
+            return None
+        self._since_ns = None
+        return "arm" if side > 0 else "disarm"
+
+
+class Axes(IntEnum):
+    """Axes in which the sticks count."""
+
+    VEHICLE = 0
+    ARMING = 1
+    HOME = 2
+
+
+class SimpleMode:
+    """Simple and Super Simple mode: pitch and roll sticks count in other axes than the vehicle's.
+
+    As Copter up to 4.6 and from 4.8 on has them; 4.7.0 switches them and turns nothing. They stay
+    as they are until a switch or a command changes them: a parameter alone does nothing.
+    """
+
+    def __init__(self, params: ArduPilotParams) -> None:
+        self._params = params
+        self.axes = Axes.VEHICLE
+        self._arming_rad = self._home_rad = 0.0
+        self._aux: Axes | None = None
+
+    def arm(self, yaw_rad: float) -> None:
+        """Remember the heading at arming."""
+        self._arming_rad = self._home_rad = yaw_rad
+
+    def read_mode_switch(self, position: int) -> None:
+        """The mode switch has moved to this position, 1 to 6, or was read for the first time."""
+        if self._aux is None:
+            bit = 1 << (position - 1)
+            is_super = self._params.integer("SUPER_SIMPLE") & bit
+            is_simple = self._params.integer("SIMPLE") & bit
+            self.axes = Axes.HOME if is_super else Axes.ARMING if is_simple else Axes.VEHICLE
+
+    def read_aux(self, channels_us: Sequence[int]) -> None:
+        """Follow the movements of a switch with RCn_OPTION 3 or 13."""
+        before, self._aux = self._aux, None
+        for index in range(RC_CHANNELS_WITH_PARAMS):
+            option, pwm_us = self._params.integer(f"RC{index + 1}_OPTION"), channels_us[index]
+            if option in (_OPTION_SIMPLE, _OPTION_SUPER_SIMPLE) and pwm_us:
+                high = Axes.HOME if option == _OPTION_SUPER_SIMPLE else Axes.ARMING
+                is_low = pwm_us < _LOW_US
+                self._aux = Axes.VEHICLE if is_low else high if pwm_us > _HIGH_US else Axes.ARMING
+        if self._aux is not None and self._aux is not before:
+            self.axes = self._aux
+
+    def turned(self, sticks: Sticks, yaw_rad: float, position_ned_m: Vec3) -> Sticks:
+        """The same sticks in the vehicle's own axes."""
+        if self.axes is Axes.VEHICLE:
+            return sticks
+        north_m, east_m, _ = position_ned_m
+        if math.hypot(north_m, east_m) > _SUPER_SIMPLE_RADIUS_M:
+            self._home_rad = math.atan2(east_m, north_m)
+        angle_rad = self._home_rad if self.axes is Axes.HOME else self._arming_rad
+        forward, right = from_heading(-sticks.pitch, sticks.roll, angle_rad - yaw_rad)
+        return sticks._replace(pitch=-forward, roll=right)

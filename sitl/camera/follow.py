@@ -1,23 +1,155 @@
 """Films the course from any other vehicle: its reported pose in, camera frames out.
 
 The vehicle's local NED is taken for the frame of the course, so it must start at the origin,
-heading north.
+heading north. Nothing is sent that could steer the vehicle: only heartbeats and requests for
+messages.
 """
 
+import math
 import sys
-from collections.abc import Callable
+from collections import Counter
+from collections.abc import Callable, Iterator
 from contextlib import closing
+from typing import TypeAlias
+
+from pymavlink.dialects.v20 import ardupilotmega as mav
 
 from sitl.camera.fpv import CameraOptions, FpvRenderer
 from sitl.camera.shm import FramePublisher
 from sitl.clock import NS_PER_S, Clock
 from sitl.course.layout import Course
-from sitl.link.pose_listener import PoseListener
+from sitl.link.endpoint import Message
 from sitl.link.transport import FOLLOWER_KINDS, open_transport
+from sitl.rotation import Quat, Vec3, from_euler, integrate
 
+ReportedPose: TypeAlias = tuple[Vec3, Quat]  # position_ned_m, ned_from_body_wxyz
+
+SYSTEM_ID = 246
+"""Not 255: ArduPilot would count our heartbeats as its ground station's, and so not notice that
+the pilot's ground station has gone."""
+POSE_MAX_AGE_NS = NS_PER_S
+REQUEST_PERIOD_NS = NS_PER_S
+ROUNDS_BEFORE_EULER = 3
+"""Requests for the quaternion that go unanswered before Euler angles are requested as well."""
+QUATERNION = mav.MAVLINK_MSG_ID_ATTITUDE_QUATERNION
+POSITION = mav.MAVLINK_MSG_ID_LOCAL_POSITION_NED
+FRAME_STARTS = (mav.PROTOCOL_MARKER_V1, mav.PROTOCOL_MARKER_V2)
 MESSAGES_PER_FRAME = 2
 MAX_MESSAGE_HZ = 200.0  # within what ArduPilot can send at its default loop rate
 NO_POSE = "no pose from the vehicle in the last second, so no frames"
+
+
+class PoseListener:
+    """Tracks the pose of the first autopilot that is heard, without I/O: bytes in, bytes out.
+
+    Once a second it requests each message that comes at less than half of the wanted rate. A
+    reading with a value that is not finite, or a quaternion that is far from unit, is ignored.
+    """
+
+    def __init__(self, *, rate_hz: float) -> None:
+        self._mav = mav.MAVLink(
+            None, srcSystem=SYSTEM_ID, srcComponent=mav.MAV_COMP_ID_ONBOARD_COMPUTER
+        )
+        self._mav.robust_parsing = True
+        self._rate_hz = rate_hz
+        self._vehicle: int | None = None
+        self._attitude: tuple[int, Quat, Vec3] | None = None
+        self._position: tuple[int, Vec3, Vec3] | None = None
+        self._received = Counter[int]()
+        self._rounds_without_quaternion = 0
+        self._due_ns: int | None = None
+
+    def receive(self, data: bytes, arrived_ns: int) -> None:
+        """Parse received bytes; garbage and other senders are ignored."""
+        for message in self._messages(data):
+            if message.get_srcComponent() != mav.MAV_COMP_ID_AUTOPILOT1:
+                continue
+            is_heartbeat = message.get_type() == "HEARTBEAT"
+            is_autopilot = is_heartbeat and message.autopilot != mav.MAV_AUTOPILOT_INVALID
+            if self._vehicle is None and is_autopilot:
+                self._vehicle = message.get_srcSystem()
+            if message.get_srcSystem() == self._vehicle:
+                self._received[message.get_msgId()] += 1
+                self._update(message, arrived_ns)
+
+    def pose_at(self, now_ns: int) -> ReportedPose | None:
+        """The pose extrapolated to ``now_ns`` at constant velocity and body rate.
+
+        None if position or attitude is missing or older than POSE_MAX_AGE_NS.
+        """
+        if self._attitude is None or self._position is None:
+            return None
+        attitude_ns, wxyz, rate_radps = self._attitude
+        position_ns, position_m, velocity_mps = self._position
+        if now_ns - min(attitude_ns, position_ns) > POSE_MAX_AGE_NS:
+            return None
+        dt_s = (now_ns - position_ns) / NS_PER_S
+        (north, east, down), (north_mps, east_mps, down_mps) = position_m, velocity_mps
+        now_m = (north + north_mps * dt_s, east + east_mps * dt_s, down + down_mps * dt_s)
+        return now_m, integrate(wxyz, rate_radps, (now_ns - attitude_ns) / NS_PER_S)
+
+    def outgoing(self, now_ns: int) -> list[bytes]:
+        """Packets to send now: a heartbeat and requests once a second, else nothing."""
+        if self._due_ns is not None and now_ns < self._due_ns:
+            return []
+        self._due_ns = now_ns + REQUEST_PERIOD_NS
+        own_type, no_autopilot = mav.MAV_TYPE_ONBOARD_CONTROLLER, mav.MAV_AUTOPILOT_INVALID
+        messages = [
+            mav.MAVLink_heartbeat_message(own_type, no_autopilot, 0, 0, mav.MAV_STATE_ACTIVE, 3)
+        ]
+        number, interval_us = mav.MAV_CMD_SET_MESSAGE_INTERVAL, 1e6 / self._rate_hz
+        for kind in self._missing():
+            to, params = (self._vehicle, mav.MAV_COMP_ID_AUTOPILOT1), (kind, interval_us)
+            request = mav.MAVLink_command_long_message(*to, number, 0, *params, *[0.0] * 5)
+            messages.append(request)
+        self._received.clear()
+        return [message.pack(self._mav) for message in messages]
+
+    def _messages(self, data: bytes) -> Iterator[Message]:
+        """Parse; where garbage looked like a frame, the bytes that it swallowed are read again."""
+        parser = self._mav
+        message = parser.parse_char(data)
+        while message is not None:
+            if message.get_type() != "BAD_DATA":
+                yield message
+            elif message.data[0] in FRAME_STARTS:
+                parser.buf = bytearray(message.data[1:]) + parser.buf[parser.buf_index :]
+                parser.buf_index = 0
+            message = parser.parse_char(b"")
+
+    def _update(self, message: Message, arrived_ns: int) -> None:
+        match message.get_type():
+            case "ATTITUDE_QUATERNION":
+                wxyz = (message.q1, message.q2, message.q3, message.q4)
+                self._update_attitude(wxyz, message, arrived_ns)
+            case "ATTITUDE":
+                angles_rad = (message.roll, message.pitch, message.yaw)
+                if all(map(math.isfinite, angles_rad)):
+                    self._update_attitude(from_euler(*angles_rad), message, arrived_ns)
+            case "LOCAL_POSITION_NED":
+                position_m = (message.x, message.y, message.z)
+                velocity_mps = (message.vx, message.vy, message.vz)
+                if all(map(math.isfinite, position_m + velocity_mps)):
+                    self._position = (arrived_ns, position_m, velocity_mps)
+
+    def _update_attitude(self, wxyz: Quat, message: Message, arrived_ns: int) -> None:
+        rate_radps = (message.rollspeed, message.pitchspeed, message.yawspeed)
+        norm = math.hypot(*wxyz)
+        if 0.9 < norm < 1.1 and all(map(math.isfinite, rate_radps)):
+            w, x, y, z = (part / norm for part in wxyz)
+            self._attitude = (arrived_ns, (w, x, y, z), rate_radps)
+
+    def _missing(self) -> list[int]:
+        """Ids of the messages to request."""
+        if self._vehicle is None:
+            return []
+        wanted = [QUATERNION, POSITION]
+        self._rounds_without_quaternion += 1
+        if self._received[QUATERNION]:
+            self._rounds_without_quaternion = 0
+        if self._rounds_without_quaternion > ROUNDS_BEFORE_EULER:
+            wanted.append(mav.MAVLINK_MSG_ID_ATTITUDE)
+        return [kind for kind in wanted if self._received[kind] < self._rate_hz / 2]
 
 
 def film_vehicle(

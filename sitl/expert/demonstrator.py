@@ -1,6 +1,6 @@
 """Experts that fly a gate course from the true pose: by sticks in ALT_HOLD, or by body rates."""
 
-from sitl.ardupilot.params import Params
+from sitl.ardupilot.params import ArduPilotParams
 from sitl.course.layout import Course
 from sitl.expert.course_guide import Agility, CourseGuide, Predicted
 from sitl.expert.rate_response import RateCommand, rate_command
@@ -48,10 +48,15 @@ class Expert:
     """
 
     def __init__(
-        self, course: Course, speed_mps: float, *, next_gate: int = 0, params: Params | None = None
+        self,
+        course: Course,
+        speed_mps: float,
+        *,
+        next_gate: int = 0,
+        params: ArduPilotParams | None = None,
     ) -> None:
         self._guide = CourseGuide(course, STICK_AGILITY, speed_mps, next_gate)
-        params = Params() if params is None else params
+        params = ArduPilotParams() if params is None else params
         self._lag_s = STICK_LAG_S + (params.decimal("ATC_INPUT_TC") - NOMINAL.input_time_s)
         self._response = StickResponse(params)
 

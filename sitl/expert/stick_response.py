@@ -4,7 +4,7 @@ import cmath
 import math
 from typing import NamedTuple
 
-from sitl.ardupilot.params import Params
+from sitl.ardupilot.params import ArduPilotParams
 from sitl.expert.course_guide import Demand
 from sitl.vehicle.control import clamp
 from sitl.vehicle.dynamics import GRAVITY_MPS2
@@ -28,7 +28,7 @@ CENTRED = StickPositions(0.0, 0.0, 0.0, 0.0)
 class StickResponse:
     """Inverse of the vehicle's ALT_HOLD stick curves."""
 
-    def __init__(self, params: Params) -> None:
+    def __init__(self, params: ArduPilotParams) -> None:
         self._lean_rad = math.radians(params["ANGLE_MAX"] / 100.0)
         self._yaw_radps = math.radians(params["PILOT_Y_RATE"])
         self._yaw_expo = params["PILOT_Y_EXPO"]

@@ -1,38 +1,23 @@
 """Units and messages that both firmwares send alike, from the state of the vehicle."""
 
 import math
-from collections.abc import Iterable
-from typing import NamedTuple, Protocol
+from collections.abc import Callable, Iterable
+from typing import NamedTuple
 
 from pymavlink.dialects.v20 import ardupilotmega as mav
 
-from sitl.link.framing import Message
+from sitl.firmware import Autopilot
+from sitl.link.endpoint import Message
 from sitl.rotation import Vec3, conjugate, rotate, to_euler
-from sitl.vehicle.dynamics import BodyState
+from sitl.vehicle.dynamics import GRAVITY_MPS2
 
 METRES_PER_DEGREE = 111_319.5
 INT16 = 32767
-
-
-class Sensing(Protocol):
-    """The part of an autopilot that these messages tell of."""
-
-    motor_commands: tuple[float, ...]
-    sensed: BodyState
-
-    @property
-    def uptime_ns(self) -> int:
-        """Time since boot."""
-        ...
-
-    @property
-    def position_ready(self) -> bool:
-        """There is a horizontal position."""
-        ...
+_IMU_FIELDS_UPDATED = 0x1FFF
 
 
 class Home(NamedTuple):
-    """The place of the simulator's origin."""
+    """The place of the simulator's origin, and the messages that depend on it."""
 
     lat_deg: float
     lon_deg: float
@@ -40,6 +25,9 @@ class Home(NamedTuple):
     """Above mean sea level."""
     field_ned_gauss: Vec3
     """Magnetic field of the earth."""
+    pressure_hpa: float
+    """Of the air at this altitude."""
+    temperature_c: float
 
     def lat_lon_e7(self, north_m: float, east_m: float) -> tuple[int, int]:
         """Latitude and longitude in 1e-7 degrees."""
@@ -47,11 +35,11 @@ class Home(NamedTuple):
         lon = self.lon_deg + east_m / (METRES_PER_DEGREE * math.cos(math.radians(self.lat_deg)))
         return round(lat * 1e7), round(lon * 1e7)
 
-    def mag_gauss(self, ap: Sensing) -> Vec3:
+    def mag_gauss(self, ap: Autopilot) -> Vec3:
         """The field in body axes."""
         return rotate(conjugate(ap.sensed.ned_from_body_wxyz), self.field_ned_gauss)
 
-    def global_position_int(self, ap: Sensing) -> Message | None:
+    def global_position_int(self, ap: Autopilot) -> Message | None:
         """GLOBAL_POSITION_INT; None without a position."""
         if not ap.position_ready:
             return None
@@ -62,10 +50,10 @@ class Home(NamedTuple):
             round(1000.0 * (self.alt_m - down)),
             round(-1000.0 * down),
             *int16(ap.sensed.velocity_ned_mps, 100.0),
-            heading(yaw_rad(ap), 100.0),
+            heading(ap.yaw_rad, 100.0),
         )
 
-    def home_position(self, ap: Sensing) -> Message | None:
+    def home_position(self, ap: Autopilot) -> Message | None:
         """HOME_POSITION; None without a position."""
         if not ap.position_ready:
             return None
@@ -74,13 +62,71 @@ class Home(NamedTuple):
             *self.lat_lon_e7(0.0, 0.0), altitude_mm, 0.0, 0.0, 0.0, level, 0.0, 0.0, 0.0
         )
 
+    def gps_raw_int(self, ap: Autopilot, *, fix: int, eph: int, epv: int) -> Message:
+        """GPS_RAW_INT: the last fix, repeated; accuracies and satellites are constant."""
+        north, east, down = ap.gps.position_ned_m
+        vn, ve, _ = ap.gps.velocity_ned_mps
+        place = (*self.lat_lon_e7(north, east), round(1000.0 * (self.alt_m - down)))
+        motion = (round(100.0 * math.hypot(vn, ve)), heading(math.atan2(ve, vn), 100.0))
+        return mav.MAVLink_gps_raw_int_message(boot_us(ap), fix, *place, eph, epv, *motion, 10)
 
-def boot_ms(ap: Sensing) -> int:
+    def highres_imu(
+        self,
+        ap: Autopilot,
+        gyro_radps: Iterable[float],
+        field: Iterable[float],
+        *,
+        has_difference: bool,
+    ) -> Message:
+        """HIGHRES_IMU in m/s^2 and rad/s; the field in the firmware's own unit.
+
+        With ``has_difference`` its differential pressure is against that of the origin; else 0.
+        """
+        height_m = -ap.sensed.position_ned_m[2]
+        pressure = self.pressure_hpa * math.exp(-height_m / 8434.0)
+        difference = pressure - self.pressure_hpa if has_difference else 0.0
+        air = (pressure, difference, self.alt_m + height_m, self.temperature_c)
+        imu = (*ap.sensed.specific_force_body_mps2, *gyro_radps, *field)
+        return mav.MAVLink_highres_imu_message(boot_us(ap), *imu, *air, _IMU_FIELDS_UPDATED, 0)
+
+    def scaled_imu(self, ap: Autopilot, gyro_radps: Iterable[float]) -> tuple[int, ...]:
+        """Acceleration in milli-g, gyro in mrad/s, field in mGauss."""
+        accel = [1000.0 * force / GRAVITY_MPS2 for force in ap.sensed.specific_force_body_mps2]
+        field = int16(self.mag_gauss(ap), 1000.0)
+        return (*int16(accel, 1.0), *int16(gyro_radps, 1000.0), *field)
+
+    @property
+    def temperature_cdeg(self) -> int:
+        """In hundredths of a degree."""
+        return round(100.0 * self.temperature_c)
+
+    def builders(self) -> dict[int, Callable[[Autopilot], Message | None]]:
+        """The messages that are the same in both firmwares, by number."""
+        return {
+            # No date: the vehicle has no wall clock.
+            mav.MAVLINK_MSG_ID_SYSTEM_TIME: lambda ap: mav.MAVLink_system_time_message(
+                0, boot_ms(ap)
+            ),
+            mav.MAVLINK_MSG_ID_ATTITUDE: lambda ap: mav.MAVLink_attitude_message(
+                boot_ms(ap), *to_euler(ap.sensed.ned_from_body_wxyz), *ap.sensed.rate_body_radps
+            ),
+            mav.MAVLINK_MSG_ID_ATTITUDE_QUATERNION: lambda ap: (
+                mav.MAVLink_attitude_quaternion_message(
+                    boot_ms(ap), *ap.sensed.ned_from_body_wxyz, *ap.sensed.rate_body_radps
+                )
+            ),
+            mav.MAVLINK_MSG_ID_GLOBAL_POSITION_INT: self.global_position_int,
+            mav.MAVLINK_MSG_ID_HOME_POSITION: self.home_position,
+            mav.MAVLINK_MSG_ID_SERVO_OUTPUT_RAW: servo_output_raw,
+        }
+
+
+def boot_ms(ap: Autopilot) -> int:
     """Time since boot in whole milliseconds, a uint32 that wraps after 49.7 days."""
     return ap.uptime_ns // 1_000_000 % 2**32
 
 
-def boot_us(ap: Sensing) -> int:
+def boot_us(ap: Autopilot) -> int:
     """Time since boot in whole microseconds."""
     return ap.uptime_ns // 1_000
 
@@ -90,18 +136,68 @@ def int16(values: Iterable[float], scale: float) -> list[int]:
     return [max(-INT16, min(INT16, round(scale * value))) for value in values]
 
 
-def yaw_rad(ap: Sensing) -> float:
-    """Heading of the nose."""
-    return to_euler(ap.sensed.ned_from_body_wxyz)[2]
-
-
 def heading(angle_rad: float, units_per_degree: float = 1.0) -> int:
     """From 0 to below a full turn."""
     full_turn = round(360 * units_per_degree)
     return round(math.degrees(angle_rad) % 360.0 * units_per_degree) % full_turn
 
 
-def servo_output_raw(ap: Sensing) -> Message:
+def servo_output_raw(ap: Autopilot) -> Message:
     """SERVO_OUTPUT_RAW: motors at 1000..2000 us."""
     motors = (round(1000.0 + 1000.0 * m) for m in ap.motor_commands)
     return mav.MAVLink_servo_output_raw_message(boot_us(ap) & 0xFFFFFFFF, 0, *motors, 0, 0, 0, 0)
+
+
+def vfr_hud(ap: Autopilot, *, altitude_m: float, throttle: float) -> Message:
+    """VFR_HUD; the throttle is a share of full."""
+    north, east, down = ap.sensed.velocity_ned_mps
+    speed, percent = math.hypot(north, east), round(100.0 * throttle)
+    nose = heading(ap.yaw_rad)
+    return mav.MAVLink_vfr_hud_message(speed, speed, nose, percent, altitude_m, -down)
+
+
+def sys_status(ap: Autopilot, *, present: int, enabled: int, healthy: int) -> Message:
+    """SYS_STATUS with these sensors and the battery."""
+    battery = (*_battery_mv_ca(ap), ap.battery.remaining_percent)
+    return mav.MAVLink_sys_status_message(
+        present, enabled, healthy, 100, *battery, 0, 0, 0, 0, 0, 0
+    )
+
+
+def battery_status(ap: Autopilot, *, energy_hj: int) -> Message:
+    """BATTERY_STATUS: one pack, its voltage as that of a single cell; -1 hJ used: not known."""
+    charge = mav.MAV_BATTERY_CHARGE_STATE_OK
+    if ap.battery.is_low:
+        charge = mav.MAV_BATTERY_CHARGE_STATE_LOW
+    kind = (mav.MAV_BATTERY_FUNCTION_ALL, mav.MAV_BATTERY_TYPE_LIPO)
+    pack_mv, current_ca = _battery_mv_ca(ap)
+    cells_mv, used = [pack_mv] + [65535] * 9, (0, energy_hj)
+    return mav.MAVLink_battery_status_message(
+        0, *kind, INT16, cells_mv, current_ca, *used, ap.battery.remaining_percent, 0, charge
+    )
+
+
+def _battery_mv_ca(ap: Autopilot) -> tuple[int, int]:
+    return round(1000.0 * ap.battery.voltage_v), round(100.0 * ap.battery.current_a)
+
+
+def autopilot_version(ap: Autopilot, *, capabilities: int, version: int) -> Message:
+    """AUTOPILOT_VERSION; the unique number is the system id."""
+    no_hash = [0] * 8
+    return mav.MAVLink_autopilot_version_message(
+        capabilities, version, 0, 0, 0, no_hash, no_hash, no_hash, 0, 0, ap.system_id
+    )
+
+
+def extended_sys_state(
+    ap: Autopilot, vtol: int, *, is_landing: bool, is_taking_off: bool
+) -> Message:
+    """EXTENDED_SYS_STATE."""
+    state = mav.MAV_LANDED_STATE_IN_AIR
+    if ap.landed:
+        state = mav.MAV_LANDED_STATE_ON_GROUND
+    elif is_landing:
+        state = mav.MAV_LANDED_STATE_LANDING
+    elif is_taking_off:
+        state = mav.MAV_LANDED_STATE_TAKEOFF
+    return mav.MAVLink_extended_sys_state_message(vtol, state)

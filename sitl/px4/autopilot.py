@@ -6,95 +6,50 @@ sockets or the host's time.
 
 import math
 from collections.abc import Sequence
-from dataclasses import replace
-from enum import Enum
 
 from sitl.clock import NS_PER_MS, NS_PER_S
-from sitl.firmware import StatusText
+from sitl.firmware import STOPPED, Autopilot
 from sitl.px4.commander import Commander
 from sitl.px4.control import SIH_QUAD
-from sitl.px4.flight import STOPPED, FlightControl
+from sitl.px4.flight import Px4Control, Setpoint
 from sitl.px4.modes import Mode
-from sitl.px4.params import Params
-from sitl.px4.setpoints import Setpoint
+from sitl.px4.params import Px4Params
 from sitl.px4.sticks import RC_SOURCE, StickInput, Sticks
-from sitl.rotation import Quat, Vec3
-from sitl.vehicle.conditions import Conditions
 from sitl.vehicle.config import Battery, VehicleConfig
-from sitl.vehicle.dynamics import BodyState, Quadrotor
-from sitl.vehicle.environment import SensorNoise, Wind
 
-STEP_NS = 4 * NS_PER_MS
-"""SIH's: every stamp is a multiple of it."""
-STEP_S = STEP_NS / NS_PER_S
-SUBSTEPS = STEP_NS // SIH_QUAD.step_ns
-GPS_PERIOD_NS = NS_PER_S // 8
 RECEIVER_PERIOD_NS = NS_PER_S // 50
-RECEIVER_LOST_NS = NS_PER_S // 2
-LANDED_AFTER_NS = NS_PER_S
-LANDED_SPEED_MPS = 0.3
 RAMP_FROM_MPS = -2.4  # as long on the ground as measured
 TAKEOFF_MARGIN_M = 0.2  # below its height AUTO.TAKEOFF has arrived
 
 
-RATE_NOISE_RADPS = math.radians(5.0)
-"""What SIH's body rates carry, on each axis."""
+class Px4(Autopilot):
+    """One boot of the vehicle, with the control period, airframe and noise of PX4's SIH.
 
+    Every stamp is a multiple of the control period.
+    """
 
-class LandedState(Enum):
-    """MAV_LANDED_STATE of EXTENDED_SYS_STATE."""
+    step_ns = 4 * NS_PER_MS
+    airframe = SIH_QUAD
+    gps_period_ns = NS_PER_S // 8
+    gyro_noise_radps = math.radians(5.0)
+    id_param = "MAV_SYS_ID"
+    params: Px4Params
 
-    ON_GROUND = 1
-    IN_AIR = 2
-    TAKEOFF = 3
-    LANDING = 4
-
-
-def _with_gyro_noise(conditions: Conditions) -> Conditions:
-    noise = math.hypot(conditions.rate_noise_radps, RATE_NOISE_RADPS)
-    return replace(conditions, rate_noise_radps=noise)
-
-
-class Autopilot:
-    """One boot of the vehicle; stamps are nanoseconds of the caller's clock, from ``boot_ns``."""
-
-    def __init__(self, params: Params, config: VehicleConfig, boot_ns: int) -> None:
-        self.params = params
-        self.config = config
-        self.boot_ns = boot_ns
-        self.now_ns = boot_ns
-        self.landed = True
+    def __init__(self, params: Px4Params, config: VehicleConfig, boot_ns: int) -> None:
+        super().__init__(params, config, boot_ns)
         self.battery = Battery(voltage_v=16.2)
-        """Replaced as a whole by whoever wants another one."""
-        self.sensors_frozen = False
-        """Fault: telemetry and control keep the last state, the physics goes on."""
-        self.position_lost = False
-        """Fault: the estimator has no horizontal position any more, as long as this is set."""
         self.stick_input = StickInput(params)
-        self.commander = Commander(params, self.stick_input, boot_ns)
-        self.motor_commands: tuple[float, ...] = STOPPED
+        self.commander = Commander(params, self.stick_input, boot_ns, self.texts)
         self.receiver_us: tuple[int, ...] | None = config.receiver_us if config.receiver else None
         """Channels of the receiver, or of RC_CHANNELS_OVERRIDE, which counts as one."""
         self.setpoint: Setpoint | None = None
         self.setpoint_count = 0
-        self.flight = FlightControl(params)
+        self.flight = Px4Control(params)
         self._setpoint_ns = boot_ns
         self._has_transmitter = config.receiver
         self._receiver_due_ns = boot_ns
-        self._quad = Quadrotor(config.conditions, SIH_QUAD)
-        self._wind = Wind(config.conditions, STEP_S)
-        self._noise = SensorNoise(_with_gyro_noise(config.conditions))
-        self._physics = self._quad.at_rest()
-        self.sensed = self.gps = self._physics.body
-        self._gps_due_ns = boot_ns
-        self._still_since_ns: int | None = boot_ns
         self._ramp_ns: int | None = None  # since when the vehicle leaves the ground
         self._flown_mode = self.mode
-
-    @property
-    def step_ns(self) -> int:
-        """Control period: 250 Hz."""
-        return STEP_NS
 
     @property
     def mode(self) -> Mode:
@@ -103,7 +58,7 @@ class Autopilot:
 
     @property
     def mode_name(self) -> str:
-        """Its name: ALTCTL, AUTO.RTL."""
+        """Name of the flight mode: ALTCTL, AUTO.RTL."""
         return self.mode.label
 
     @property
@@ -112,19 +67,9 @@ class Autopilot:
         return self.commander.armed
 
     @property
-    def texts(self) -> list[StatusText]:
-        """Texts that every link is to send next."""
-        return self.commander.texts
-
-    @property
     def in_failsafe(self) -> bool:
         """A failsafe has changed the mode."""
         return self.commander.in_failsafe
-
-    @property
-    def truth(self) -> BodyState:
-        """True state of the vehicle, without sensor faults and noise."""
-        return self._physics.body
 
     @property
     def sticks_us(self) -> tuple[int, int, int, int]:
@@ -135,31 +80,6 @@ class Autopilot:
         axes = (sticks.right, -sticks.forward, sticks.throttle, sticks.yaw)
         roll, pitch, throttle, yaw = (1500 + round(500.0 * value) for value in axes)
         return roll, pitch, throttle, yaw
-
-    @property
-    def uptime_ns(self) -> int:
-        """Time since boot: the clock of all telemetry."""
-        return self.now_ns - self.boot_ns
-
-    @property
-    def estimator_ready(self) -> bool:
-        """True once the attitude is aligned: arming is possible."""
-        return self.uptime_ns >= self.config.estimator_ready_s * NS_PER_S
-
-    @property
-    def position_ready(self) -> bool:
-        """True once there is a horizontal position."""
-        is_settled = self.uptime_ns >= self.config.position_ready_s * NS_PER_S
-        return is_settled and not self.position_lost
-
-    @property
-    def landed_state(self) -> LandedState:
-        """What EXTENDED_SYS_STATE says."""
-        if self.landed:
-            return LandedState.ON_GROUND
-        if self.mode is Mode.AUTO_LAND:
-            return LandedState.LANDING
-        return LandedState.TAKEOFF if self.mode is Mode.AUTO_TAKEOFF else LandedState.IN_AIR
 
     def set_receiver(self, values_us: Sequence[int]) -> None:
         """Move the transmitter's sticks, in microseconds by channel; all zeros switch it off."""
@@ -178,32 +98,17 @@ class Autopilot:
         above_m = self.params["MIS_TAKEOFF_ALT"] - self.sensed.position_ned_m[2]
         self.flight.takeoff_to_m = above_m if height_m is None else height_m
 
-    def step(self) -> None:
-        """Advance everything by one control period."""
-        self.now_ns += STEP_NS
+    def _read_inputs(self) -> None:
         self._read_receiver()
         self.stick_input.update(self.now_ns)
         self._update_commander()
-        self.motor_commands = self._motors()
-        wind_mps = self._wind.step()
-        self._physics = self._quad.step(self._physics, self.motor_commands, SUBSTEPS, wind_mps)
-        if not self.sensors_frozen:
-            self.sensed = self._noise.sense(self._physics.body)
-            if self.now_ns >= self._gps_due_ns:
-                self._gps_due_ns += GPS_PERIOD_NS
-                self.gps = self.sensed
-        self._detect_landing()
 
-    def launch(
-        self, position_ned_m: Vec3, velocity_ned_mps: Vec3, ned_from_body_wxyz: Quat
-    ) -> None:
-        """Put the vehicle in the air in this state, armed; in ALTCTL, unless setpoints fly it.
+    def _start_in_air(self) -> None:
+        """Fly on in ALTCTL, unless setpoints fly it.
 
         Sticks that are valid go on, as do setpoints; else they count as valid and centred until the
         first ones come.
         """
-        self._physics = self._quad.airborne(position_ned_m, velocity_ned_mps, ned_from_body_wxyz)
-        self.sensed = self.gps = self._physics.body
         commander = self.commander
         if commander.mode is not Mode.OFFBOARD:
             if not self.stick_input.valid:
@@ -211,9 +116,8 @@ class Autopilot:
             commander.mode = commander.intended = self._flown_mode = Mode.ALTCTL
             commander.start(ignores_sticks=False)
         self._set_landed(landed=False)
-        commander.texts.clear()
+        self.texts.clear()
         commander.events.clear()
-        self._still_since_ns = None
         self.flight.reset(self.sensed)
 
     def _read_receiver(self) -> None:
@@ -255,7 +159,7 @@ class Autopilot:
             self.setpoint,
             self.sensed,
             has_position=self.position_ready,
-            dt_s=STEP_S,
+            dt_s=self.step_s,
         )
         height_m = -self.sensed.position_ned_m[2]
         if height_m >= self.flight.takeoff_to_m - TAKEOFF_MARGIN_M:
@@ -290,20 +194,12 @@ class Autopilot:
             if self.flight.most_climb_mps <= 0.0 or math.isinf(self.flight.most_climb_mps):
                 return False
         self._set_landed(landed=False)
-        self._still_since_ns = None
         return True
 
     def _set_landed(self, *, landed: bool) -> None:
-        self.landed = landed
+        super()._set_landed(landed=landed)
         self.commander.on_landed_change(landed=landed)
 
-    def _detect_landing(self) -> None:
-        body = self.sensed
-        is_slow = max(abs(v) for v in body.velocity_ned_mps) < LANDED_SPEED_MPS
-        is_pushing = self.armed and self.flight.thrust > 0.5 * self.params["MPC_THR_HOVER"]
-        if not (body.touching and is_slow and not is_pushing):
-            self._still_since_ns = None
-        elif self._still_since_ns is None:
-            self._still_since_ns = self.now_ns
-        elif not self.landed and self.now_ns - self._still_since_ns >= LANDED_AFTER_NS:
-            self._set_landed(landed=True)
+    @property
+    def _is_pushing(self) -> bool:
+        return self.flight.thrust > 0.5 * self.params["MPC_THR_HOVER"]

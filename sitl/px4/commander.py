@@ -9,8 +9,8 @@ from sitl.firmware import StatusText
 from sitl.px4 import events as ev
 from sitl.px4.events import Event
 from sitl.px4.failsafe import LostSticks, Phase, mode_without_stream
-from sitl.px4.modes import SPOKEN_NAMES, Mode
-from sitl.px4.params import Params
+from sitl.px4.modes import Mode
+from sitl.px4.params import Px4Params
 from sitl.px4.sticks import StickInput
 
 CHECK_PERIOD_NS = 20 * NS_PER_MS
@@ -24,7 +24,10 @@ _BOOT_MODES = {1: Mode.ALTCTL, 2: Mode.POSCTL}
 class Commander:
     """Decides on mode and arming of one boot; texts and events wait in lists for the links."""
 
-    def __init__(self, params: Params, sticks: StickInput, boot_ns: int) -> None:
+    def __init__(
+        self, params: Px4Params, sticks: StickInput, boot_ns: int, texts: list[StatusText]
+    ) -> None:
+        """``texts`` is the list that status texts wait in."""
         self._params = params
         self._sticks = sticks
         self._boot_ns = self.now_ns = boot_ns
@@ -37,9 +40,9 @@ class Commander:
         self.estimator_ready = self.position_ready = False
         self.setpoint_fresh = False
         self.lost_sticks = LostSticks(params)
-        self.texts: list[StatusText] = []
-        """Status texts to send; the reader empties the list, as the next."""
         self.events: list[Event] = []
+        """Events to send; the reader empties the list."""
+        self._texts = texts
         self._fallback = False
         self._sticks_missed = True  # lost, and that is known
         self._lost_ns: int | None = None
@@ -120,8 +123,8 @@ class Commander:
         if self.terminated:
             return False
         if self.armed and mode is not Mode.AUTO_LAND and not self.can_fly(mode):
-            arguments = ev.pack("IB", self.mode.custom_mode, ev.NAVIGATION_MODES[mode])
-            text = f"Switching to {SPOKEN_NAMES[mode]} is currently not available"
+            arguments = ev.pack("IB", self.mode.custom_mode, mode.event_number)
+            text = f"Switching to {mode.spoken} is currently not available"
             if says_why:
                 self._deny(text, "commander_modeswitch_not_avail", arguments)
             return False
@@ -280,7 +283,7 @@ class Commander:
 
     def _say(self, severity: int, text: str) -> None:
         # The tab marks a text that exists as an event as well; ground stations hide it.
-        self.texts.append(StatusText(severity, text + "\t"))
+        self._texts.append(StatusText(severity, text + "\t"))
 
     def _emit(self, name: str, levels: int, arguments: bytes = b"") -> None:
         uptime_ms = (self.now_ns - self._boot_ns) // NS_PER_MS

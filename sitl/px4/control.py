@@ -7,8 +7,9 @@ PX4's parameters of it only scale them.
 
 import math
 from collections import deque
+from typing import TypeAlias
 
-from sitl.px4.params import DEFAULT_RATE_P, Params
+from sitl.px4.params import DEFAULT_RATE_P, Px4Params
 from sitl.rotation import (
     Quat,
     Vec3,
@@ -17,7 +18,7 @@ from sitl.rotation import (
     multiply,
     rotate,
     rotation_vector,
-    to_euler,
+    to_heading,
 )
 from sitl.vehicle.control import clamp
 from sitl.vehicle.dynamics import GRAVITY_MPS2, Airframe, BodyState
@@ -32,18 +33,26 @@ SIH_QUAD = Airframe(
 )
 HOVER_THRUST = 0.484
 
+NorthEast: TypeAlias = tuple[float, float]
+STILL: NorthEast = (0.0, 0.0)
+
 RATE_GAIN_PER_S = 14.0  # roll and pitch, at the default MC_ROLLRATE_P and MC_PITCHRATE_P
 YAW_GAIN_PER_S = 2.6
 TARGET_DELAY_STEPS = 9
 """Control steps until an attitude that is asked for is flown: 36 ms."""
 YAW_TORQUE_LAG_S = 0.08  # MC_YAW_TQ_CUTOFF 2 Hz
 MAX_VELOCITY_INTEGRAL_MPS2 = 4.0
+HOLD_BELOW_MPS = 0.3  # braking ends at this speed, and the place of that moment is held
+BRAKING_PER_S = 1.0  # of POSCTL with centred sticks
+MOVING_MPS = 0.5
+REACTION_S = 0.85
+"""How long AUTO keeps the lean of a moving vehicle before it brakes, as measured."""
 
 
 class RateController:
     """Tracks body rates, and through them attitudes."""
 
-    def __init__(self, params: Params) -> None:
+    def __init__(self, params: Px4Params) -> None:
         self._params = params
         self._yaw_accel_radps2 = 0.0
         self._targets: deque[tuple[Quat, float]] = deque(maxlen=TARGET_DELAY_STEPS + 1)
@@ -95,13 +104,13 @@ class RateController:
 class VelocityController:
     """Tracks a horizontal velocity by leaning: proportional, integral and damping terms."""
 
-    def __init__(self, params: Params) -> None:
+    def __init__(self, params: Px4Params) -> None:
         self._params = params
         self._integral = [0.0, 0.0]
-        self._last_mps: tuple[float, float] | None = None
+        self._last_mps: NorthEast | None = None
         self._accel = [0.0, 0.0]
 
-    def reset(self, accel_ne_mps2: tuple[float, float]) -> None:
+    def reset(self, accel_ne_mps2: NorthEast) -> None:
         """Begin with this acceleration, as if it were what wind and drag need."""
         self._integral = list(accel_ne_mps2)
         self._last_mps = None
@@ -110,10 +119,10 @@ class VelocityController:
     def update(
         self,
         body: BodyState,
-        wanted_ne_mps: tuple[float, float],
+        wanted_ne_mps: NorthEast,
         dt_s: float,
-        feedforward_ne_mps2: tuple[float, float] = (0.0, 0.0),
-    ) -> tuple[float, float]:
+        feedforward_ne_mps2: NorthEast = (0.0, 0.0),
+    ) -> NorthEast:
         """Acceleration north and east in m/s^2, within MPC_TILTMAX_AIR."""
         params = self._params
         actual = body.velocity_ned_mps[:2]
@@ -135,15 +144,124 @@ class VelocityController:
         return accel[0] * scale, accel[1] * scale
 
 
-def attitude_for(accel_ne_mps2: tuple[float, float], yaw_rad: float) -> Quat:
+class Horizontal:
+    """Motion of the modes that know where they are: paths, and the velocity controller behind them.
+
+    POSCTL's sticks push a velocity that drag holds back; AUTO modes follow a path of limited jerk
+    to a place; OFFBOARD tracks the velocity that is asked for as it is.
+    """
+
+    def __init__(self, params: Px4Params) -> None:
+        self._params = params
+        self._velocity = VelocityController(params)
+        self.accel_mps2 = STILL
+        """Acceleration that was asked for last."""
+        self.speed_mps = STILL
+        """Velocity that was asked for last."""
+        self._path_accel = STILL
+        self._place_m: NorthEast | None = None  # on the path, or the place that POSCTL holds
+        self._stop_m = STILL
+        self._reaction_s = 0.0
+
+    def reset(self, body: BodyState, accel_mps2: NorthEast) -> None:
+        """Begin in the present motion, with the acceleration that was asked for until now."""
+        self._velocity.reset(accel_mps2)
+        self.accel_mps2 = accel_mps2
+        self.speed_mps = (body.velocity_ned_mps[0], body.velocity_ned_mps[1])
+        self._path_accel = STILL
+        self._place_m = None
+        self._reaction_s = REACTION_S if math.hypot(*self.speed_mps) > MOVING_MPS else 0.0
+
+    def track(self, velocity_mps: NorthEast, body: BodyState, dt_s: float) -> NorthEast:
+        """OFFBOARD: a velocity, at most MPC_XY_VEL_MAX."""
+        self.speed_mps = shorten(velocity_mps, self._params["MPC_XY_VEL_MAX"])
+        return self._follow(self.speed_mps, STILL, body, dt_s)
+
+    def steer(self, wanted_mps: NorthEast, body: BodyState, dt_s: float) -> NorthEast:
+        """POSCTL: a velocity that the sticks end up at; held in place once it has come to rest."""
+        params = self._params
+        full = 2.0 * params["MPC_ACC_HOR"]  # at full stick, before drag
+        per_s = full / params["MPC_VEL_MANUAL"]
+        if wanted_mps == STILL:
+            per_s = BRAKING_PER_S
+        gaps = [per_s * (w - v) for w, v in zip(wanted_mps, self.speed_mps, strict=True)]
+        self._approach((gaps[0], gaps[1]), full, params["MPC_JERK_MAX"], dt_s)
+        if wanted_mps != STILL:
+            self._place_m = None
+        elif self._place_m is None and math.hypot(*self.speed_mps) < HOLD_BELOW_MPS:
+            self._place_m = _place(body)
+        if self._place_m is None:
+            return self._follow(self.speed_mps, self._path_accel, body, dt_s)
+        self.speed_mps = self._path_accel = STILL
+        return self._follow(self._towards(self._place_m, body), STILL, body, dt_s)
+
+    def fly_to(self, target_m: NorthEast | None, body: BodyState, dt_s: float) -> NorthEast:
+        """AUTO: a place north and east of home; None: where braking ends."""
+        params = self._params
+        if self._reaction_s > 0.0:
+            self._reaction_s -= dt_s
+            self.speed_mps = (body.velocity_ned_mps[0], body.velocity_ned_mps[1])
+            return self.accel_mps2
+        accel, jerk = params["MPC_ACC_HOR"], params["MPC_JERK_AUTO"]
+        if self._place_m is None:
+            self._place_m = _place(body)
+            lead_s = math.hypot(*self.speed_mps) / (2.0 * accel) + accel / (2.0 * jerk)
+            pairs = zip(self._place_m, self.speed_mps, strict=True)
+            north, east = (place + lead_s * speed for place, speed in pairs)
+            self._stop_m = (north, east)
+        target = self._stop_m if target_m is None else target_m
+        gain = params["MPC_XY_TRAJ_P"]
+        offsets = [gain * (t - p) for t, p in zip(target, self._place_m, strict=True)]
+        wanted = shorten((offsets[0], offsets[1]), params["MPC_XY_CRUISE"])
+        gaps = [w - v for w, v in zip(wanted, self.speed_mps, strict=True)]
+        gap = math.hypot(*gaps)
+        scale = math.sqrt(2.0 * jerk * gap) / gap if gap > 1e-6 else 0.0
+        self._approach((scale * gaps[0], scale * gaps[1]), accel, jerk, dt_s)
+        north, east = self._place_m
+        self._place_m = (north + self.speed_mps[0] * dt_s, east + self.speed_mps[1] * dt_s)
+        correction = self._towards(self._place_m, body)
+        velocity = (self.speed_mps[0] + correction[0], self.speed_mps[1] + correction[1])
+        return self._follow(velocity, self._path_accel, body, dt_s)
+
+    def _approach(self, wanted: NorthEast, limit: float, jerk: float, dt_s: float) -> None:
+        """Turn the path's acceleration towards the wanted one, and its velocity with it."""
+        wanted = shorten(wanted, limit)
+        step = jerk * dt_s
+        now_n, now_e = self._path_accel
+        accel_n = now_n + clamp(wanted[0] - now_n, step)
+        accel_e = now_e + clamp(wanted[1] - now_e, step)
+        self._path_accel = (accel_n, accel_e)
+        self.speed_mps = (
+            self.speed_mps[0] + accel_n * dt_s,
+            self.speed_mps[1] + accel_e * dt_s,
+        )
+
+    def _towards(self, place_m: NorthEast, body: BodyState) -> NorthEast:
+        gain = self._params["MPC_XY_P"]
+        north, east = body.position_ned_m[:2]
+        offset = (gain * (place_m[0] - north), gain * (place_m[1] - east))
+        return shorten(offset, self._params["MPC_XY_CRUISE"])
+
+    def _follow(
+        self, velocity: NorthEast, feedforward: NorthEast, body: BodyState, dt_s: float
+    ) -> NorthEast:
+        self.accel_mps2 = self._velocity.update(body, velocity, dt_s, feedforward)
+        return self.accel_mps2
+
+
+def shorten(vector: NorthEast, limit: float) -> NorthEast:
+    """The vector, or one in its direction of this length where it is longer."""
+    scale = limit / max(limit, math.hypot(*vector))
+    return vector[0] * scale, vector[1] * scale
+
+
+def _place(body: BodyState) -> NorthEast:
+    return body.position_ned_m[0], body.position_ned_m[1]
+
+
+def attitude_for(accel_ne_mps2: NorthEast, yaw_rad: float) -> Quat:
     """The attitude whose thrust gives this horizontal acceleration in level flight."""
     north, east = accel_ne_mps2
-    forward = north * math.cos(yaw_rad) + east * math.sin(yaw_rad)
-    right = east * math.cos(yaw_rad) - north * math.sin(yaw_rad)
+    forward, right = to_heading(north, east, yaw_rad)
     roll = math.asin(right / math.sqrt(forward**2 + right**2 + GRAVITY_MPS2**2))
     return from_euler(roll, math.atan2(-forward, GRAVITY_MPS2), yaw_rad)
-
-
-def yaw_of(body: BodyState) -> float:
-    """Heading in radians."""
-    return to_euler(body.ned_from_body_wxyz)[2]

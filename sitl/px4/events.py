@@ -7,8 +7,6 @@ An event's id is the autopilot's component in its top byte and a hash of the eve
 import struct
 from typing import NamedTuple
 
-from sitl.px4.modes import Mode
-
 SEVERITY_CRITICAL, SEVERITY_INFO = 2, 6
 LEVELS_INFO, LEVELS_DENIED, LEVELS_FAILSAFE = 0x66, 0x62, 0x42
 """Levels for the outside and, in the upper half, for the vehicle's own log: 2 critical, 6 info."""
@@ -16,35 +14,17 @@ _AUTOPILOT_COMPONENT = 1 << 24
 _FNV1A_32_OFFSET, _FNV1A_32_PRIME = 0x811C9DC5, 0x01000193
 
 ARM_REASON_GESTURE, ARM_REASON_COMMAND, ARM_REASON_LANDING = 1, 4, 6
-ARM_REASON_INACTION, ARM_REASON_FAILSAFE = 7, 14
+ARM_REASON_INACTION = 7
 """Reasons of arming and disarming, as the events carry them."""
 REASON_NAMES = {
     ARM_REASON_GESTURE: "stick gesture",
     ARM_REASON_COMMAND: "external command",
     ARM_REASON_LANDING: "landing",
     ARM_REASON_INACTION: "auto preflight disarming",
-    ARM_REASON_FAILSAFE: "failsafe",
 }
 
-ACTION_POSCTL, ACTION_ALTCTL, ACTION_STAB = 2, 3, 4
-ACTION_HOLD, ACTION_RTL, ACTION_LAND, ACTION_DISARM, ACTION_TERMINATE = 5, 6, 7, 9, 10
+ACTION_POSCTL, ACTION_RTL, ACTION_TERMINATE = 2, 6, 10
 CAUSE_STICKS_LOST = 1
-
-NAVIGATION_MODES = {
-    Mode.MANUAL: 0,
-    Mode.ALTCTL: 1,
-    Mode.POSCTL: 2,
-    Mode.AUTO_MISSION: 3,
-    Mode.AUTO_LOITER: 4,
-    Mode.AUTO_RTL: 5,
-    Mode.ACRO: 6,
-    Mode.OFFBOARD: 7,
-    Mode.STAB: 8,
-    Mode.AUTO_TAKEOFF: 10,
-    Mode.AUTO_LAND: 11,
-    Mode.TERMINATION: 255,
-}
-"""Modes as arguments of events."""
 
 
 class Event(NamedTuple):

@@ -10,7 +10,7 @@ from enum import Enum
 
 from sitl.clock import NS_PER_S
 from sitl.px4.modes import Mode
-from sitl.px4.params import Params
+from sitl.px4.params import Px4Params
 
 REFILL = 0.25
 
@@ -37,7 +37,7 @@ class Phase(Enum):
 class LostSticks:
     """The latched failsafe of lost sticks, and its budget of delay."""
 
-    def __init__(self, params: Params) -> None:
+    def __init__(self, params: Px4Params) -> None:
         self._params = params
         self.phase = Phase.NONE
         self._spent_s = 0.0
@@ -92,7 +92,7 @@ class LostSticks:
         return _STICKS_LOST_MODES.get(self._params.integer("NAV_RCL_ACT"), Mode.AUTO_RTL)
 
 
-def mode_without_stream(params: Params, *, has_sticks: bool) -> Mode:
+def mode_without_stream(params: Px4Params, *, has_sticks: bool) -> Mode:
     """The mode that takes over from OFFBOARD without setpoints; RTL where it needs sticks."""
     mode = _STREAM_LOST_MODES.get(params.integer("COM_OBL_RC_ACT"), Mode.AUTO_RTL)
     return Mode.AUTO_RTL if mode.piloted and not has_sticks else mode

@@ -1,35 +1,49 @@
 """From mode, sticks, setpoint and state to motors: the control laws of all modes."""
 
 import math
+from typing import NamedTuple, TypeAlias
 
-from sitl.px4 import curves
+from sitl.firmware import AttitudeSetpoint
+from sitl.px4 import sticks as pilot
 from sitl.px4.control import (
     HOVER_THRUST,
     SIH_QUAD,
+    STILL,
+    Horizontal,
+    NorthEast,
     RateController,
     attitude_for,
-    yaw_of,
 )
-from sitl.px4.horizontal import STILL, Horizontal, NorthEast
 from sitl.px4.modes import Mode
-from sitl.px4.params import Params
-from sitl.px4.setpoints import AttitudeSetpoint, RateSetpoint, Setpoint, VelocitySetpoint
+from sitl.px4.params import Px4Params
 from sitl.px4.sticks import Sticks
-from sitl.rotation import IDENTITY, Quat, Vec3, cos_tilt, from_euler
+from sitl.rotation import IDENTITY, Quat, Vec3, cos_tilt, from_euler, from_heading, yaw_of
 from sitl.vehicle.control import HeightController, mix, thrust_for
 from sitl.vehicle.dynamics import BodyState
 
-STOPPED = (0.0, 0.0, 0.0, 0.0)
 IDLE = (0.05, 0.05, 0.05, 0.05)  # armed on the ground
 STILL_YAW_RADPS = 0.01  # a slower yaw stick holds the heading
 TAKEOFF_CLIMB_MPS = 0.3  # a climb stick beyond this lifts a landed vehicle off
 ARRIVED_M = 1.0
 
 
-class FlightControl:
+class PositionSetpoint(NamedTuple):
+    """SET_POSITION_TARGET_LOCAL_NED; None where the sender ignores the field."""
+
+    position_ned_m: Vec3 | None
+    velocity_ned_mps: Vec3 | None
+    yaw_rad: float | None
+    yaw_rate_radps: float
+
+
+Setpoint: TypeAlias = AttitudeSetpoint | PositionSetpoint
+"""What a companion computer asks for in OFFBOARD."""
+
+
+class Px4Control:
     """Control laws of all modes, and the controllers that they share."""
 
-    def __init__(self, params: Params) -> None:
+    def __init__(self, params: Px4Params) -> None:
         self._params = params
         self._rates = RateController(params)
         self._horizontal = Horizontal(params)
@@ -85,19 +99,19 @@ class FlightControl:
         if mode is Mode.AUTO_TAKEOFF:
             return -body.position_ned_m[2] < self.takeoff_to_m
         if mode.manual_throttle:
-            return curves.manual_thrust(sticks, self._params, HOVER_THRUST) > 0.9 * HOVER_THRUST
+            return pilot.manual_thrust(sticks, self._params, HOVER_THRUST) > 0.9 * HOVER_THRUST
         if mode.piloted:
-            return curves.climb_mps(sticks, self._params) > TAKEOFF_CLIMB_MPS
+            return pilot.climb_mps(sticks, self._params) > TAKEOFF_CLIMB_MPS
         if mode is not Mode.OFFBOARD or setpoint is None:
             return False
-        if isinstance(setpoint, VelocitySetpoint):
+        if isinstance(setpoint, PositionSetpoint):
             return self._offboard_climb_mps(setpoint, body) > TAKEOFF_CLIMB_MPS
         return setpoint.thrust > 0.9 * HOVER_THRUST
 
     @staticmethod
     def is_direct(mode: Mode, setpoint: Setpoint | None) -> bool:
         """Stick or setpoint is thrust, not a climb rate."""
-        is_velocity = isinstance(setpoint, VelocitySetpoint)
+        is_velocity = isinstance(setpoint, PositionSetpoint)
         return mode.manual_throttle or (mode is Mode.OFFBOARD and not is_velocity)
 
     def fly(
@@ -116,25 +130,25 @@ class FlightControl:
         if mode is Mode.ACRO:
             self.attitude = body.ned_from_body_wxyz
             return self._turn_at(
-                curves.acro_rates_radps(sticks, self._params),
-                curves.manual_thrust(sticks, self._params, HOVER_THRUST),
+                pilot.acro_rates_radps(sticks, self._params),
+                pilot.manual_thrust(sticks, self._params, HOVER_THRUST),
                 body,
                 dt_s,
             )
         yaw_rate = self._stick_yaw(sticks if mode.piloted else Sticks(), body, dt_s)
-        yaw = yaw_of(body) if self._yaw_hold_rad is None else self._yaw_hold_rad
+        yaw = yaw_of(body.ned_from_body_wxyz) if self._yaw_hold_rad is None else self._yaw_hold_rad
         if mode.manual_throttle:
-            roll, pitch = curves.lean_rad(sticks, self._params)
-            thrust = curves.manual_thrust(sticks, self._params, HOVER_THRUST)
+            roll, pitch = pilot.lean_rad(sticks, self._params)
+            thrust = pilot.manual_thrust(sticks, self._params, HOVER_THRUST)
             return self._lean_to(from_euler(roll, pitch, yaw), yaw_rate, thrust, body, dt_s)
         if mode is Mode.ALTCTL:
-            forward, right = curves.lean_accel_mps2(sticks, self._params)
-            accel = _to_north_east(forward, right, yaw)
+            forward, right = pilot.lean_accel_mps2(sticks, self._params)
+            accel = from_heading(forward, right, yaw)
         elif not has_position:
             accel = STILL
         elif mode is Mode.POSCTL:
-            speed = curves.speed_mps(sticks, self._params)
-            accel = self._horizontal.steer(_to_north_east(*speed, yaw), body, dt_s)
+            speed = pilot.speed_mps(sticks, self._params)
+            accel = self._horizontal.steer(from_heading(*speed, yaw), body, dt_s)
         else:
             accel = self._horizontal.fly_to(self._destination(mode, body), body, dt_s)
         self._accel_mps2 = accel
@@ -142,12 +156,12 @@ class FlightControl:
         return self._lean_to(attitude_for(accel, yaw), yaw_rate, thrust, body, dt_s)
 
     def _fly_offboard(self, setpoint: Setpoint, body: BodyState, dt_s: float) -> tuple[float, ...]:
-        if isinstance(setpoint, RateSetpoint):
-            self.attitude = body.ned_from_body_wxyz
-            return self._turn_at(setpoint.rate_body_radps, setpoint.thrust, body, dt_s)
         if isinstance(setpoint, AttitudeSetpoint):
-            target, yaw_rate = setpoint.ned_from_body_wxyz, setpoint.yaw_rate_radps
-            return self._lean_to(target, yaw_rate, setpoint.thrust, body, dt_s)
+            target, rates, thrust = setpoint
+            if target is not None:
+                return self._lean_to(target, rates[2], thrust, body, dt_s)
+            self.attitude = body.ned_from_body_wxyz
+            return self._turn_at(rates, thrust, body, dt_s)
         north, east, _ = setpoint.velocity_ned_mps or (0.0, 0.0, 0.0)
         if setpoint.position_ned_m is not None:
             gain = self._params["MPC_XY_P"]
@@ -159,11 +173,11 @@ class FlightControl:
             self._yaw_hold_rad, yaw_rate = setpoint.yaw_rad, setpoint.yaw_rate_radps
         else:
             yaw_rate = self._hold_yaw(setpoint.yaw_rate_radps, body)
-        yaw = yaw_of(body) if self._yaw_hold_rad is None else self._yaw_hold_rad
+        yaw = yaw_of(body.ned_from_body_wxyz) if self._yaw_hold_rad is None else self._yaw_hold_rad
         thrust = self._climb(climb, body, dt_s)
         return self._lean_to(attitude_for(accel, yaw), yaw_rate, thrust, body, dt_s)
 
-    def _offboard_climb_mps(self, setpoint: VelocitySetpoint, body: BodyState) -> float:
+    def _offboard_climb_mps(self, setpoint: PositionSetpoint, body: BodyState) -> float:
         climb = -setpoint.velocity_ned_mps[2] if setpoint.velocity_ned_mps else 0.0
         if setpoint.position_ned_m is not None:
             climb += self._params["MPC_Z_P"] * (body.position_ned_m[2] - setpoint.position_ned_m[2])
@@ -183,7 +197,7 @@ class FlightControl:
 
     def _stick_yaw(self, sticks: Sticks, body: BodyState, dt_s: float) -> float:
         """Yaw rate behind MPC_MAN_Y_TAU."""
-        wanted = curves.yaw_rate_radps(sticks, self._params)
+        wanted = pilot.yaw_rate_radps(sticks, self._params)
         lag_s = max(dt_s, self._params["MPC_MAN_Y_TAU"])
         self._yaw_rate_radps += (wanted - self._yaw_rate_radps) * dt_s / lag_s
         return self._hold_yaw(self._yaw_rate_radps, body)
@@ -194,7 +208,7 @@ class FlightControl:
             self._yaw_hold_rad = None
             return yaw_rate_radps
         if self._yaw_hold_rad is None:
-            self._yaw_hold_rad = yaw_of(body)
+            self._yaw_hold_rad = yaw_of(body.ned_from_body_wxyz)
         return 0.0
 
     def _climb(self, climb_mps: float, body: BodyState, dt_s: float) -> float:
@@ -216,7 +230,7 @@ class FlightControl:
             up = params["MPC_TKO_SPEED"]
             up += share * (params["MPC_Z_VEL_MAX_UP"] - up)
             down = slow + share * (params["MPC_Z_VEL_MAX_DN"] - slow)
-            return max(-down, min(up, curves.climb_mps(sticks, params)))
+            return max(-down, min(up, pilot.climb_mps(sticks, params)))
         if mode is Mode.AUTO_TAKEOFF:
             return max(0.0, min(params["MPC_TKO_SPEED"], 1.5 * (self.takeoff_to_m + 0.1 - height)))
         if mode is Mode.AUTO_RTL and not self._home_reached:
@@ -243,8 +257,3 @@ class FlightControl:
             is_near = math.hypot(north, east) < self._params["RTL_MIN_DIST"]
             self._returns_to_m = -down if is_near else self._params["RTL_RETURN_ALT"]
         return self._returns_to_m
-
-
-def _to_north_east(forward: float, right: float, yaw_rad: float) -> NorthEast:
-    cy, sy = math.cos(yaw_rad), math.sin(yaw_rad)
-    return forward * cy - right * sy, forward * sy + right * cy

@@ -9,26 +9,32 @@ _SUB_ANY = (1, 2)  # POSCTL's orbit and slow flight; both are flown as POSCTL he
 
 
 class Mode(Enum):
-    """Flight mode by its main and sub mode in HEARTBEAT.custom_mode."""
+    """Flight mode: main and sub mode of HEARTBEAT.custom_mode, its name in status texts, its number
+    as the argument of an event, and its MAV_STANDARD_MODE."""
 
-    MANUAL = (1, 0)
-    ALTCTL = (2, 0)
-    POSCTL = (3, 0)
-    AUTO_TAKEOFF = (4, 2)
-    AUTO_LOITER = (4, 3)
-    AUTO_MISSION = (4, 4)
-    AUTO_RTL = (4, 5)
-    AUTO_LAND = (4, 6)
-    ACRO = (5, 0)
-    OFFBOARD = (6, 0)
-    STAB = (7, 0)
-    TERMINATION = (10, 0)
+    MANUAL = (1, 0, "Manual", 0, 0)
+    ALTCTL = (2, 0, "Altitude", 1, 4)
+    POSCTL = (3, 0, "Position", 2, 1)
+    AUTO_TAKEOFF = (4, 2, "Takeoff", 10, 8)
+    AUTO_LOITER = (4, 3, "Hold", 4, 0)
+    AUTO_MISSION = (4, 4, "Mission", 3, 6)
+    AUTO_RTL = (4, 5, "RTL", 5, 5)
+    AUTO_LAND = (4, 6, "Land", 11, 7)
+    ACRO = (5, 0, "Acro", 6, 0)
+    OFFBOARD = (6, 0, "Offboard", 7, 0)
+    STAB = (7, 0, "Stabilized", 8, 0)
+    TERMINATION = (10, 0, "Termination", 255, 0)
+
+    def __init__(self, main: int, sub: int, spoken: str, event_number: int, standard: int) -> None:
+        self.main, self.sub = main, sub
+        self.spoken = spoken
+        self.event_number = event_number
+        self.standard = standard
 
     @property
     def custom_mode(self) -> int:
         """The number in HEARTBEAT and CURRENT_MODE."""
-        main, sub = self.value
-        return int(main) << 16 | int(sub) << 24
+        return self.main << 16 | self.sub << 24
 
     @property
     def label(self) -> str:
@@ -48,7 +54,7 @@ class Mode(Enum):
     @property
     def is_auto(self) -> bool:
         """One of the AUTO modes."""
-        return int(self.value[0]) == MAIN_AUTO
+        return self.main == MAIN_AUTO
 
     @property
     def needs_position(self) -> bool:
@@ -76,30 +82,11 @@ class Mode(Enum):
 
 _CUSTOM = int(mav.MAV_MODE_FLAG_CUSTOM_MODE_ENABLED)
 
-SPOKEN_NAMES = {
-    Mode.MANUAL: "Manual",
-    Mode.ALTCTL: "Altitude",
-    Mode.POSCTL: "Position",
-    Mode.AUTO_TAKEOFF: "Takeoff",
-    Mode.AUTO_LOITER: "Hold",
-    Mode.AUTO_MISSION: "Mission",
-    Mode.AUTO_RTL: "RTL",
-    Mode.AUTO_LAND: "Land",
-    Mode.ACRO: "Acro",
-    Mode.OFFBOARD: "Offboard",
-    Mode.STAB: "Stabilized",
-    Mode.TERMINATION: "Termination",
-}
-"""As status texts have them."""
-
 
 def mode_of(main: int, sub: int) -> Mode | None:
     """The mode of these numbers, or None; AUTO without a sub mode is a mission."""
     if (main, sub) == (MAIN_AUTO, 0):
         return Mode.AUTO_MISSION
-    if main == Mode.POSCTL.value[0] and sub in _SUB_ANY:
+    if main == Mode.POSCTL.main and sub in _SUB_ANY:
         return Mode.POSCTL
-    try:
-        return Mode((main, sub))
-    except ValueError:
-        return None
+    return next((mode for mode in Mode if (mode.main, mode.sub) == (main, sub)), None)

@@ -1,16 +1,12 @@
 """Parameters that the simulated firmware reads or a bridge asks for, with PX4's SIH defaults.
 
-PX4 stores INT32 and float. An INT32 travels as its four bytes in PARAM_VALUE's float field, so a
-peer that reads it as a number sees a denormal.
+PX4 stores INT32 and float.
 """
 
-import math
-import struct
 from collections.abc import Mapping
 from types import MappingProxyType
 
-from pymavlink.dialects.v20 import ardupilotmega as mav
-
+from sitl.firmware import Params, float32
 from sitl.vehicle.conditions import NOMINAL, Conditions
 from sitl.vehicle.config import Px4Release
 
@@ -115,15 +111,6 @@ _OLD_NAMES: Mapping[str, float] = MappingProxyType(
     {"MPC_HOLD_DZ": 0.1, "MPC_YAW_EXPO": 0.6, "MPC_Z_MAN_EXPO": 0.6}
 )
 """What releases before 1.17 have in place of DEAD_ZONE (upstream commit 2bf9fce577)."""
-_INT32_LIMIT = 1 << 31
-
-
-def _float32(value: float) -> float:
-    """Round as the wire does; raises OverflowError beyond its range."""
-    (rounded,) = struct.unpack("<f", struct.pack("<f", value))
-    return float(rounded)
-
-
 _OLD_OVERRIDE, _NEW_OVERRIDE = ("COM_RC_OVERRIDE", "COM_RC_STICK_OV"), ("MAN_OVERRIDE_SPD",)
 _ABSENT: Mapping[Px4Release, tuple[str, ...]] = MappingProxyType(
     {
@@ -134,7 +121,7 @@ _ABSENT: Mapping[Px4Release, tuple[str, ...]] = MappingProxyType(
         "1.18": _OLD_OVERRIDE,
     }
 )
-DEFAULT_RATE_P = _float32(_FLOATS["MC_ROLLRATE_P"])
+DEFAULT_RATE_P = float32(_FLOATS["MC_ROLLRATE_P"])
 
 
 def _varied(conditions: Conditions) -> dict[str, float]:
@@ -168,8 +155,8 @@ def _varied(conditions: Conditions) -> dict[str, float]:
     return {name: factor * _FLOATS[name] for name, factor in factors.items()}
 
 
-class Params:
-    """Named numbers in a fixed, sorted order (the order is PARAM_VALUE's index)."""
+class Px4Params(Params):
+    """PX4's parameters of one release."""
 
     def __init__(
         self,
@@ -186,62 +173,9 @@ class Params:
         if receiver:
             values |= {"RC_MAP_ROLL": 1, "RC_MAP_PITCH": 2, "RC_MAP_THROTTLE": 3, "RC_MAP_YAW": 4}
             values["RC_CHAN_CNT"] = 8
-        self._values = {name: _float32(values[name]) for name in sorted(values)}
-        self.names: tuple[str, ...] = tuple(self._values)
-        self.changes = 0
-        """How often a value has changed: PX4 tells its modules, not which one."""
-
-    def __getitem__(self, name: str) -> float:
-        return self._values[name]
-
-    def __contains__(self, name: str) -> bool:
-        return name in self._values
-
-    def get(self, name: str, default: float) -> float:
-        """The value, or ``default`` where the release lacks the parameter."""
-        return self._values.get(name, default)
+        super().__init__(values, _INTEGERS)
 
     @property
     def dead_zone(self) -> float:
-        """Of the stick, on each side of the middle."""
+        """Share of the stick, on each side of the middle."""
         return self._values[DEAD_ZONE if DEAD_ZONE in self._values else "MPC_HOLD_DZ"]
-
-    def integer(self, name: str) -> int:
-        """The value of an INT32."""
-        return int(self._values[name])
-
-    def set(self, name: str, value: float) -> bool:
-        """Store the value; False for an unknown name or a value that its type cannot hold."""
-        if name not in self._values or not math.isfinite(value):
-            return False
-        if name in _INTEGERS:
-            if not -_INT32_LIMIT <= value < _INT32_LIMIT:
-                return False
-            new: float = int(value)
-        else:
-            try:
-                new = _float32(value)
-            except OverflowError:
-                return False
-        self.changes += new != self._values[name]
-        self._values[name] = new
-        return True
-
-    def kind(self, name: str) -> int:
-        """MAV_PARAM_TYPE of PARAM_VALUE."""
-        is_integer = name in _INTEGERS
-        return int(mav.MAV_PARAM_TYPE_INT32 if is_integer else mav.MAV_PARAM_TYPE_REAL32)
-
-    def on_wire(self, name: str) -> float:
-        """The value as PARAM_VALUE's float field carries it."""
-        if name not in _INTEGERS:
-            return self._values[name]
-        (packed,) = struct.unpack("<f", struct.pack("<i", int(self._values[name])))
-        return float(packed)
-
-    def set_from_wire(self, name: str, packed: float) -> bool:
-        """Store what PARAM_SET's float field carries; False as in `set`."""
-        if name not in _INTEGERS:
-            return self.set(name, packed)
-        (value,) = struct.unpack("<i", struct.pack("<f", packed))
-        return self.set(name, value)

@@ -1,4 +1,5 @@
-"""Chooses between the senders of sticks, notices their loss, and reads gestures from them.
+"""Chooses between the senders of sticks, notices their loss, reads gestures from them, and turns
+them into what the modes ask for.
 
 MAVLink has no notion of an override here: each link, and the receiver, is a source, COM_RC_IN_MODE
 says which may win, and the last values of the winner hold until it is declared lost. Timers and
@@ -10,7 +11,9 @@ import math
 from typing import NamedTuple
 
 from sitl.clock import NS_PER_S
-from sitl.px4.params import Params
+from sitl.px4.params import Px4Params
+from sitl.rotation import Vec3
+from sitl.vehicle.dynamics import GRAVITY_MPS2
 
 RC_SOURCE = -1  # the receiver; links are numbered from 0
 POLL_NS = NS_PER_S // 5
@@ -32,6 +35,11 @@ _PRIORITIES = {
     8: (None, "high"),
 }
 """COM_RC_IN_MODE: whether the receiver comes first (else last), and which link wins."""
+
+
+EXPO = 0.6
+"""Of climb, yaw and POSCTL's speed: 0.4 x + 0.6 x^3 behind a dead zone, as measured. Leans have no
+dead zone; in ALTCTL they go by the tangent, in STAB by the angle."""
 
 
 class Sticks(NamedTuple):
@@ -74,7 +82,7 @@ class StickSpeed:
 class StickInput:
     """The sticks that PX4 acts on; stamps are nanoseconds of one clock."""
 
-    def __init__(self, params: Params) -> None:
+    def __init__(self, params: Px4Params) -> None:
         self._params = params
         self.sticks = Sticks()
         self.valid = False
@@ -182,3 +190,61 @@ class StickInput:
             gesture = 1 if sticks.yaw > 0.0 else -1
         if gesture != self._gesture:
             self._gesture, self._gesture_since_ns, self._gesture_done = gesture, now_ns, False
+
+
+def curve(value: float, dead_zone: float, expo: float = EXPO) -> float:
+    """A stick in [-1, 1] behind dead zone and expo."""
+    beyond = max(0.0, abs(value) - dead_zone) / (1.0 - dead_zone)
+    return math.copysign((1.0 - expo) * beyond + expo * beyond**3, value)
+
+
+def climb_mps(sticks: Sticks, params: Px4Params) -> float:
+    """Climb rate of ALTCTL and POSCTL, + up."""
+    share = curve(sticks.throttle, params.dead_zone, params.get("MPC_Z_MAN_EXPO", EXPO))
+    return share * params["MPC_Z_VEL_MAX_UP" if share > 0.0 else "MPC_Z_VEL_MAX_DN"]
+
+
+def yaw_rate_radps(sticks: Sticks, params: Px4Params) -> float:
+    """Yaw rate of every mode but ACRO."""
+    share = curve(sticks.yaw, params.dead_zone, params.get("MPC_YAW_EXPO", EXPO))
+    return math.radians(params["MPC_MAN_Y_MAX"]) * share
+
+
+def lean_accel_mps2(sticks: Sticks, params: Px4Params) -> tuple[float, float]:
+    """Forward and right acceleration of ALTCTL's lean; both sticks share MPC_MAN_TILT_MAX."""
+    scale = GRAVITY_MPS2 * math.tan(math.radians(params["MPC_MAN_TILT_MAX"]))
+    scale /= max(1.0, math.hypot(sticks.forward, sticks.right))
+    return sticks.forward * scale, sticks.right * scale
+
+
+def lean_rad(sticks: Sticks, params: Px4Params) -> tuple[float, float]:
+    """Roll and pitch (+ nose up) of STAB; both sticks share MPC_MAN_TILT_MAX."""
+    scale = math.radians(params["MPC_MAN_TILT_MAX"])
+    scale /= max(1.0, math.hypot(sticks.forward, sticks.right))
+    return sticks.right * scale, -sticks.forward * scale
+
+
+def acro_rates_radps(sticks: Sticks, params: Px4Params) -> Vec3:
+    """Body rates of ACRO, linear."""
+    return (
+        math.radians(params["MC_ACRO_R_MAX"]) * sticks.right,
+        -math.radians(params["MC_ACRO_P_MAX"]) * sticks.forward,
+        math.radians(params["MC_ACRO_Y_MAX"]) * sticks.yaw,
+    )
+
+
+def speed_mps(sticks: Sticks, params: Px4Params) -> tuple[float, float]:
+    """Forward and right speed that POSCTL ends up at; both sticks share MPC_VEL_MANUAL."""
+    length = math.hypot(sticks.forward, sticks.right)
+    if length == 0.0:
+        return 0.0, 0.0
+    speed = params["MPC_VEL_MANUAL"] * curve(min(1.0, length), params.dead_zone)
+    return speed * sticks.forward / length, speed * sticks.right / length
+
+
+def manual_thrust(sticks: Sticks, params: Px4Params, hover: float) -> float:
+    """Collective of STAB and ACRO: straight lines through hover thrust at mid-stick."""
+    if sticks.throttle < 0.0:
+        least = params["MPC_MANTHR_MIN"]
+        return least + (1.0 + sticks.throttle) * (hover - least)
+    return hover + sticks.throttle * (params["MPC_THR_MAX"] - hover)

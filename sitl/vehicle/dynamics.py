@@ -1,10 +1,12 @@
-"""A quadrotor as a MuJoCo free body: motors with lag, rotor drag, air drag, a ground to hit.
+"""A quadrotor as a MuJoCo free body: motors with lag, rotor drag, air drag, a ground to hit; the
+wind around it, and the noise of its sensors.
 
 MuJoCo works in north-west-up with a forward-left-up body; everything outside this module is NED and
 FRD. Both differ by a half turn about x, so vectors and the vector part of quaternions flip y and z:
 ``_flip`` is the only conversion.
 """
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
@@ -21,6 +23,8 @@ INERTIA_KGM2: Vec3 = (0.012, 0.012, 0.022)
 MOTOR_ARM_M = 0.12  # motors sit at (+-arm, +-arm): a 0.34 m diagonal wheelbase
 YAW_TORQUE_PER_THRUST_M = 0.016
 REST_HEIGHT_M = 0.06
+VERTICAL_GUST_SHARE = 0.5
+"""Vertical over horizontal gust strength: near the ground the air moves along it."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -188,4 +192,59 @@ class Quadrotor:
                 motors=tuple(data.act.tolist()),
                 touching=data.ncon > 0,
             ),
+        )
+
+
+class Wind:
+    """Steady wind and gusts, one value per control step.
+
+    Gusts are a first-order Gauss-Markov process per axis: the longitudinal Dryden spectrum as seen
+    by a vehicle whose passage through the turbulence takes ``gust_time_s`` (MIL-F-8785C).
+    """
+
+    def __init__(self, conditions: Conditions, step_s: float) -> None:
+        self._random = np.random.Generator(np.random.PCG64((conditions.seed, 1)))
+        self._mean = np.array(conditions.wind_ned_mps)
+        self._rms = conditions.gust_rms_mps * np.array([1.0, 1.0, VERTICAL_GUST_SHARE])
+        self._decay = math.exp(-step_s / conditions.gust_time_s)
+        self._innovation = math.sqrt(1.0 - self._decay**2)
+        self._is_calm = conditions.gust_rms_mps == 0.0 and not any(conditions.wind_ned_mps)
+        self._gust = self._rms * self._random.standard_normal(3)
+
+    def step(self) -> Vec3:
+        """Velocity of the air in NED, m/s, for the next step."""
+        if self._is_calm:
+            return (0.0, 0.0, 0.0)
+        noise = self._innovation * self._rms * self._random.standard_normal(3)
+        self._gust = self._decay * self._gust + noise
+        north, east, down = (self._mean + self._gust).tolist()
+        return (north, east, down)
+
+
+class SensorNoise:
+    """White noise on sensed velocity, rates and specific force; position and attitude are exact."""
+
+    def __init__(self, conditions: Conditions) -> None:
+        self._random = np.random.Generator(np.random.PCG64((conditions.seed, 2)))
+        self._sigma = np.repeat(
+            [
+                conditions.velocity_noise_mps,
+                conditions.rate_noise_radps,
+                conditions.specific_force_noise_mps2,
+            ],
+            3,
+        )
+        self._is_exact = not self._sigma.any()
+
+    def sense(self, truth: BodyState) -> BodyState:
+        """The state as the sensors report it."""
+        if self._is_exact:
+            return truth
+        exact = (truth.velocity_ned_mps, truth.rate_body_radps, truth.specific_force_body_mps2)
+        noise = self._sigma * self._random.standard_normal(9)
+        sensed = (np.ravel(exact) + noise).tolist()
+        return truth._replace(
+            velocity_ned_mps=tuple(sensed[0:3]),
+            rate_body_radps=tuple(sensed[3:6]),
+            specific_force_body_mps2=tuple(sensed[6:9]),
         )

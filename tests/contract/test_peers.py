@@ -16,7 +16,7 @@ from pathlib import Path
 import pytest
 
 from mavbridge.core.processes import free_port
-from sitl.ardupilot.params import Params
+from sitl.ardupilot.params import ArduPilotParams
 from sitl.clock import NS_PER_S, Clock
 
 PEERS = Path(__file__).parents[2] / ".venv-peers" / "bin"
@@ -130,7 +130,7 @@ def test_mavsdk_gets_parameters_telemetry_and_arms():
     found = json.loads(console.seen.partition("RESULT ")[2].splitlines()[0])
     assert found == {
         "param": 0.5,
-        "params": len(Params().names),
+        "params": len(ArduPilotParams().names),
         "attitude": True,
         "position": True,
         "version": 4,

@@ -38,7 +38,7 @@ from mavbridge.simulation.network import DelayedChannel
 from mavbridge.simulation.world import NOMINAL_VEHICLE
 from policy.contract import Contract, FloatArray
 from policy.protocol import Executable
-from sitl.ardupilot.autopilot import Autopilot
+from sitl.ardupilot.autopilot import ArduCopter
 from sitl.ardupilot.flight_modes import Mode
 from sitl.course.layout import AirborneStart
 from sitl.simulated_vehicle import SimulatedVehicle
@@ -309,7 +309,7 @@ class GateFlight:
     # --- what happened
 
     @property
-    def ap(self) -> Autopilot:
+    def ap(self) -> ArduCopter:
         """The vehicle's autopilot since its last boot."""
         return self.vehicle.ap
 

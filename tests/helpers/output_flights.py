@@ -19,13 +19,13 @@ from policy.contract import ActionKind, Contract, FloatArray
 from policy.protocol import Executable
 from policy.scripted.policy import ScriptedPolicy
 from policy.scripted.programs import LEG_MPS, LEG_S, Motion, Program, Push, make_program
-from sitl.ardupilot.autopilot import Autopilot as ArduPilot
+from sitl.ardupilot.autopilot import ArduCopter
 from sitl.ardupilot.flight_modes import Mode as ArduMode
 from sitl.ardupilot.guided import Submode
 from sitl.course.layout import AirborneStart
-from sitl.px4.autopilot import Autopilot as Px4
+from sitl.px4.autopilot import Px4
+from sitl.px4.flight import PositionSetpoint
 from sitl.px4.modes import Mode as Px4Mode
-from sitl.px4.setpoints import AttitudeSetpoint, VelocitySetpoint
 from sitl.rotation import Quat, cos_tilt
 from sitl.vehicle.config import MID_RECEIVER_US, AutopilotName, Px4Release
 
@@ -193,8 +193,8 @@ class OutputFlight(GateFlight):
     # --- the vehicle
 
     @property
-    def ardupilot(self) -> ArduPilot:
-        assert isinstance(self.vehicle.ap, ArduPilot)
+    def ardupilot(self) -> ArduCopter:
+        assert isinstance(self.vehicle.ap, ArduCopter)
         return self.vehicle.ap
 
     @property
@@ -274,11 +274,10 @@ class OutputFlight(GateFlight):
     def _is_setpoint_neutral(self) -> bool:
         if self.is_px4:
             setpoint: Any = self.px4.setpoint
-            if isinstance(setpoint, VelocitySetpoint):
+            if isinstance(setpoint, PositionSetpoint):
                 return math.hypot(*(setpoint.velocity_ned_mps or ())) < NEUTRAL_MPS
-            if isinstance(setpoint, AttitudeSetpoint):
-                return _tilt_rad(setpoint.ned_from_body_wxyz) < NEUTRAL_TILT_RAD
-            return False
+            attitude = setpoint.ned_from_body_wxyz if setpoint is not None else None
+            return attitude is not None and _tilt_rad(attitude) < NEUTRAL_TILT_RAD
         guided = self.ardupilot.guided
         if guided is None or guided.submode is not Submode.ATTITUDE:
             return guided is None or math.hypot(*guided.velocity[0]) < NEUTRAL_MPS

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 
 from mavbridge.core.vehicle import StickGains, Sticks
 from mavbridge.mavlink.profiles.ardupilot_params import calibration
-from sitl.ardupilot.params import Params
+from sitl.ardupilot.params import ArduPilotParams
 from sitl.ardupilot.rc import RcEngine
 from sitl.ardupilot.sticks import climb_rate_mps, lean_angles, read_sticks, yaw_rate_radps
 from sitl.vehicle.conditions import Conditions
@@ -54,13 +54,13 @@ def policy_motion(sticks: Sticks, gains: StickGains) -> Motion:
 
 def copter_values(**changed: float) -> dict[str, float]:
     """Parameters of the simulated copter."""
-    params = Params()
+    params = ArduPilotParams()
     return {name: params[name] for name in params.names} | changed
 
 
 def copter_motion(sticks: Sticks, conditions: Conditions) -> Motion:
     """What the simulated copter's own code makes of these sticks, as PWM on the wire."""
-    params = Params(conditions)
+    params = ArduPilotParams(conditions)
     channels = calibration({name: params[name] for name in params.names})
     rc = RcEngine(params, None)
     for channel, pwm_us in zip(channels.channels, channels.to_pwm_us(sticks), strict=True):

@@ -16,7 +16,7 @@ from mavbridge.simulation.clock import SteppedClock
 from mavbridge.simulation.network import DelayedChannel, MemoryTransport
 from mavbridge.simulation.world import NOMINAL_VEHICLE, VehicleStepper
 from policy.contract import Contract
-from sitl.ardupilot.autopilot import Autopilot
+from sitl.ardupilot.autopilot import ArduCopter
 from sitl.simulated_vehicle import SimulatedVehicle
 from sitl.vehicle.config import MID_RECEIVER_US, AutopilotName
 
@@ -56,7 +56,7 @@ class Bench:
 
     def arm(self) -> None:
         """Somebody arms it, whatever its own checks say."""
-        assert isinstance(self.vehicle.ap, Autopilot)
+        assert isinstance(self.vehicle.ap, ArduCopter)
         assert self.vehicle.ap.arm(force=True)
 
     def log_sent(self) -> list[tuple[int, bytes]]:

@@ -10,7 +10,7 @@ from sitl.clock import NS_PER_MS, NS_PER_S
 from sitl.faults.stage.relay import VEHICLE, Message, set_fields
 from sitl.faults.stage.stage import Stage
 from sitl.faults.stage.transmitter import Transmitter
-from sitl.px4.params import Params as Px4Params
+from sitl.px4.params import Px4Params
 
 STAMPS = {"time_boot_ms": NS_PER_S // NS_PER_MS, "time_usec": 1_000_000, "tc1": NS_PER_S}
 """Fields with the vehicle's time, and their units in a second."""

@@ -5,9 +5,9 @@ from collections.abc import Callable
 
 import pytest
 
-from sitl.ardupilot.autopilot import Autopilot
+from sitl.ardupilot.autopilot import ArduCopter
 from sitl.ardupilot.flight_modes import Mode
-from sitl.ardupilot.params import Params
+from sitl.ardupilot.params import ArduPilotParams
 from sitl.clock import NS_PER_S
 from sitl.rotation import to_euler
 from sitl.vehicle.config import STEP_NS, VehicleConfig
@@ -19,7 +19,7 @@ class Pilot:
     """Holds the sticks of one autopilot at 50 Hz."""
 
     def __init__(self, config: VehicleConfig) -> None:
-        self.ap = Autopilot(Params(), config, boot_ns=0)
+        self.ap = ArduCopter(ArduPilotParams(), config, boot_ns=0)
 
     def hold(
         self,
@@ -29,7 +29,7 @@ class Pilot:
         pitch: int = 1500,
         thr: int = 1500,
         yaw: int = 1500,
-        watch: Callable[[Autopilot], None] = lambda ap: None,
+        watch: Callable[[ArduCopter], None] = lambda ap: None,
     ) -> None:
         """Hold these sticks; ``watch`` sees every step."""
         for index in range(round(seconds * NS_PER_S / STEP_NS)):

@@ -91,6 +91,7 @@ def test_sticks_are_recorded_when_they_change_with_how_the_vehicle_moved(pilot):
         "failsafe": False,
         "lean_deg": pytest.approx(0.0, abs=0.1),
         "climb_mps": pytest.approx(0.0, abs=0.1),
+        "height_m": pytest.approx(6.5, abs=0.1),
     }
     assert (neutral["us"], neutral["mode"]) == ((1500,) * 4, "ALT_HOLD")
     assert neutral["t_s"] == pytest.approx(start_ns / NS_PER_S + 0.5, abs=0.003)

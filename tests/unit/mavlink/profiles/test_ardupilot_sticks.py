@@ -10,7 +10,7 @@ from mavbridge.mavlink.profiles.ardupilot import ARDUPILOT
 from mavbridge.mavlink.profiles.ardupilot_params import calibration
 from mavbridge.mavlink.profiles.ardupilot_sticks import ardupilot_curves
 from mavbridge.mavlink.profiles.sticks import IDENTITY
-from sitl.ardupilot.params import Params
+from sitl.ardupilot.params import ArduPilotParams
 from sitl.vehicle.conditions import Conditions
 
 GAINS = StickGains()
@@ -19,7 +19,7 @@ TWICE = Conditions(angle_max_cdeg=6000.0, pilot_yaw_rate_degps=405.0, pilot_spee
 
 
 def values_of(conditions: Conditions) -> dict[str, float]:
-    params = Params(conditions)
+    params = ArduPilotParams(conditions)
     return {name: params[name] for name in params.names}
 
 

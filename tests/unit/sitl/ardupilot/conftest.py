@@ -1,53 +1,16 @@
-"""The far ends of a simulated vehicle's links, on a clock that the test steps."""
+"""The far ends of an ArduPilot vehicle's links."""
 
 import pytest
-from pymavlink.dialects.v20 import ardupilotmega as mav
 
-from sitl.clock import NS_PER_S
-from sitl.simulated_vehicle import SimulatedVehicle
-from sitl.vehicle.config import STEP_NS
-
-
-class Station:
-    """The far ends of a vehicle's links."""
-
-    def __init__(self, links=1, config=None):
-        self.vehicle = SimulatedVehicle(links=links, boot_ns=0, config=config)
-        self.now_ns = 0
-        self._parsers = [mav.MAVLink(None) for _ in range(links)]
-        self._sender = mav.MAVLink(None, srcSystem=255, srcComponent=190)
-
-    def pack(self, message, system_id=255):
-        self._sender.srcSystem = system_id
-        return message.pack(self._sender)
-
-    def send(self, message, link=0, system_id=255):
-        self.vehicle.receive(link, self.pack(message, system_id), self.now_ns)
-
-    def run(self, seconds, link=0):
-        received = []
-        for _ in range(round(seconds * NS_PER_S / STEP_NS)):
-            self.now_ns += STEP_NS
-            self.vehicle.step(self.now_ns)
-            received += self._parsers[link].parse_buffer(self.vehicle.take_outgoing(link)) or []
-        return received
-
-    def interval(self, message_id, rate_hz, link=0):
-        self.command(mav.MAV_CMD_SET_MESSAGE_INTERVAL, message_id, 1e6 / rate_hz, link=link)
-
-    def command(self, number, *params, link=0):
-        padded = (*params, *[0.0] * (7 - len(params)))
-        self.send(mav.MAVLink_command_long_message(1, 1, number, 0, *padded), link=link)
-        acks = [m for m in self.run(0.01, link) if m.get_type() == "COMMAND_ACK"]
-        return acks[-1].result if acks else None
+from helpers.ends import Ends
 
 
 @pytest.fixture
 def station():
-    return Station()
+    return Ends()
 
 
 @pytest.fixture(scope="session")
 def station_of():
     """Makes a station: ``station_of(links=2, config=VehicleConfig(...))``."""
-    return Station
+    return Ends

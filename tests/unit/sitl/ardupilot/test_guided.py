@@ -5,8 +5,9 @@ import math
 import pytest
 
 from sitl.ardupilot.flight_modes import Mode
-from sitl.ardupilot.guided import AttitudeSetpoint, VelocitySetpoint
+from sitl.ardupilot.guided import VelocitySetpoint
 from sitl.clock import NS_PER_S
+from sitl.firmware import AttitudeSetpoint
 from sitl.rotation import from_euler, to_euler
 from sitl.vehicle.config import MID_RECEIVER_US, STEP_NS, VehicleConfig
 

@@ -7,7 +7,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from sitl.ardupilot import sticks as pilot_sticks
-from sitl.ardupilot.params import Params
+from sitl.ardupilot.params import ArduPilotParams
 from sitl.ardupilot.rc import RcEngine
 from sitl.ardupilot.sticks import Sticks, read_sticks
 from sitl.clock import NS_PER_MS, NS_PER_S
@@ -17,7 +17,7 @@ KEEP = 65535
 
 
 def engine(*, receiver=True, **params):
-    store = Params()
+    store = ArduPilotParams()
     for name, value in params.items():
         assert store.set(name, value)
     return RcEngine(store, IDLE_RECEIVER_US if receiver else None), store
@@ -233,7 +233,7 @@ def test_the_lean_never_exceeds_angle_max(roll_us, pitch_us):
 def test_acro_expo_is_odd_and_keeps_its_ends(value):
     def rate(roll):
         sticks = Sticks(roll=roll, pitch=0.0, yaw=0.0, throttle=0.0, throttle_mid=485.0)
-        return pilot_sticks.acro_rates_radps(sticks, Params())[0]
+        return pilot_sticks.acro_rates_radps(sticks, ArduPilotParams())[0]
 
     assert rate(value) == pytest.approx(-rate(-value))
     assert abs(rate(value)) <= rate(1.0) + 1e-9

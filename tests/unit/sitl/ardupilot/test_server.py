@@ -9,9 +9,9 @@ from hypothesis import strategies as st
 from pymavlink.dialects.v20 import ardupilotmega as mav
 
 from helpers.vehicle_faults import Reboot, SensorFreeze, VehicleFaults
+from sitl.ardupilot.endpoint import ArduPilotStreams
 from sitl.ardupilot.flight_modes import Mode
-from sitl.ardupilot.link.messages import BUILDERS
-from sitl.ardupilot.link.streams import Streams
+from sitl.ardupilot.messages import BUILDERS
 from sitl.clock import NS_PER_MS, NS_PER_S
 from sitl.faults.stage.link import FaultyLink, LinkFaults
 from sitl.simulated_vehicle import SimulatedVehicle
@@ -300,7 +300,7 @@ def test_a_host_stall_advances_physics_but_sends_no_burst(station):
 
 
 def test_an_eleventh_interval_joins_the_nearest_of_ten():
-    streams = Streams(range(100), 0)
+    streams = ArduPilotStreams(range(100), 0)
     for index in range(9):
         streams.set_interval(10 + index, (10 + index) * 1000, loop_hz=400.0, now_ns=0)
 
@@ -314,7 +314,7 @@ def test_an_eleventh_interval_joins_the_nearest_of_ten():
     ("loop_hz", "shortest_us"), [(400, 3000), (300, 4000), (200, 6000), (100, 12000), (50, 25000)]
 )
 def test_the_cap_follows_the_loop_rate(loop_hz, shortest_us):
-    streams = Streams([30], 0)
+    streams = ArduPilotStreams([30], 0)
 
     assert streams.set_interval(30, shortest_us, loop_hz=loop_hz, now_ns=0) is None
     assert "too fast" in streams.set_interval(30, shortest_us - 1000, loop_hz=loop_hz, now_ns=0)
@@ -322,7 +322,7 @@ def test_the_cap_follows_the_loop_rate(loop_hz, shortest_us):
 
 @given(st.lists(st.integers(1, 40), min_size=1, max_size=200), st.integers(3, 50))
 def test_streams_never_send_faster_than_asked(gaps_ms, interval_ms):
-    streams = Streams([30], 0)
+    streams = ArduPilotStreams([30], 0)
     streams.set_interval(30, interval_ms * 1000, loop_hz=400.0, now_ns=0)
     now_ms, sent = 0, 0
     for gap_ms in gaps_ms:

@@ -5,9 +5,8 @@ import math
 import pytest
 from pymavlink.dialects.v20 import ardupilotmega as mav
 
-from sitl.ardupilot.params import Params
-from sitl.ardupilot.simple import Axes, SimpleMode
-from sitl.ardupilot.sticks import Sticks
+from sitl.ardupilot.params import ArduPilotParams
+from sitl.ardupilot.sticks import Axes, SimpleMode, Sticks
 
 FORWARD = Sticks(roll=0.0, pitch=-1.0, yaw=0.0, throttle=500.0, throttle_mid=500.0)
 EAST = math.pi / 2
@@ -16,7 +15,7 @@ ALL_POSITIONS = 63.0
 
 
 def simple(**params):
-    store = Params()
+    store = ArduPilotParams()
     for name, value in params.items():
         assert store.set(name, value)
     return SimpleMode(store)

@@ -20,7 +20,7 @@ def latest(messages, name):
 def override(station, *values_us, link=0, seconds=0.02):
     padded = (*values_us, *[65535] * (8 - len(values_us)))
     station.send(mav.MAVLink_rc_channels_override_message(1, 1, *padded), link=link)
-    return station.run(seconds, link)
+    return station.run(seconds, link=link)
 
 
 def fly(station):
@@ -48,12 +48,12 @@ def test_heartbeats_come_as_often_as_asked_in_whole_milliseconds(station, asked_
 @pytest.mark.parametrize("link", [0, 1])
 def test_a_change_of_mode_sends_a_heartbeat_on_every_link_at_once(station_of, link):
     station = station_of(links=2)
-    station.run(0.5, link)
+    station.run(0.5, link=link)
     set_mode = mav.MAV_CMD_DO_SET_MODE
     command = mav.MAVLink_command_long_message(1, 1, set_mode, 0, 1, Mode.ALT_HOLD, *[0] * 5)
     station.send(command)
 
-    (heartbeat,) = [m for m in station.run(0.0025, link) if m.get_type() == "HEARTBEAT"]
+    (heartbeat,) = [m for m in station.run(0.0025, link=link) if m.get_type() == "HEARTBEAT"]
 
     assert heartbeat.custom_mode == Mode.ALT_HOLD
 

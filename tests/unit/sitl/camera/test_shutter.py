@@ -6,8 +6,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from sitl.camera.fpv import FpvRenderer, rotation_matrix
-from sitl.camera.shutter import Shutter
+from sitl.camera.fpv import FpvRenderer, Shutter, rotation_matrix
 from sitl.course.layout import make_course
 from sitl.rotation import IDENTITY, from_euler, integrate
 from sitl.vehicle.conditions import NOMINAL

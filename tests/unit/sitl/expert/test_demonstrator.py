@@ -13,9 +13,9 @@ from helpers.course_flights import fly_course
 from sitl import UsageError
 from sitl.camera.fpv import body_from_camera
 from sitl.course.layout import AirborneStart, gate_truth, make_course
+from sitl.expert.course_guide import Waypoint, least_acceleration
 from sitl.expert.demonstrator import Expert
 from sitl.expert.disturbance import Disturbance, random_start
-from sitl.expert.guidance import Waypoint, least_acceleration
 from sitl.rotation import IDENTITY, from_euler
 from sitl.vehicle.conditions import NOMINAL, random_conditions
 from sitl.vehicle.dynamics import Quadrotor

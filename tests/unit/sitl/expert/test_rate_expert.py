@@ -6,21 +6,20 @@ from collections.abc import Callable
 import pytest
 
 from sitl import UsageError
-from sitl.ardupilot.autopilot import Autopilot
+from sitl.ardupilot.autopilot import ArduCopter
 from sitl.ardupilot.control import boosted
 from sitl.ardupilot.flight_modes import Mode
-from sitl.ardupilot.guided import AttitudeSetpoint
-from sitl.ardupilot.params import Params
+from sitl.ardupilot.params import ArduPilotParams
 from sitl.clock import NS_PER_MS, NS_PER_S
 from sitl.course.layout import RACE_SEEDS, AirborneStart, Course, make_course
 from sitl.expert.demonstrator import RateExpert
 from sitl.expert.disturbance import RATE_STRENGTHS, Disturbance, random_start
 from sitl.expert.rate_response import HOVER_THRUST, RateCommand
-from sitl.px4.autopilot import Autopilot as Px4Autopilot
+from sitl.firmware import AttitudeSetpoint
+from sitl.px4.autopilot import Px4
 from sitl.px4.control import HOVER_THRUST as PX4_HOVER_THRUST
 from sitl.px4.modes import Mode as Px4Mode
-from sitl.px4.params import Params as Px4Params
-from sitl.px4.setpoints import RateSetpoint
+from sitl.px4.params import Px4Params
 from sitl.report import FlightLog
 from sitl.rotation import cos_tilt, from_euler
 from sitl.vehicle.config import VehicleConfig
@@ -84,7 +83,7 @@ def test_a_speed_that_it_cannot_fly_is_refused(speed_mps: float) -> None:
 def fly(
     course: Course,
     expert: RateExpert,
-    ap: Autopilot | Px4Autopilot,
+    ap: ArduCopter | Px4,
     send: Callable[[RateCommand], None],
     disturbance: Disturbance,
 ) -> FlightLog:
@@ -105,9 +104,9 @@ def fly(
 def fly_ardupilot(
     course: Course, speed_mps: float, *, start: AirborneStart | None = None, strength: float = 0.0
 ) -> FlightLog:
-    params = Params()
+    params = ArduPilotParams()
     params.set("GUID_OPTIONS", 8)
-    ap = Autopilot(params, READY, 0)
+    ap = ArduCopter(params, READY, 0)
     for _ in range(50):
         ap.step()
     assert ap.set_mode(Mode.GUIDED_NOGPS)
@@ -145,25 +144,25 @@ def test_it_flies_on_from_the_air_and_against_disturbances() -> None:
 
 def test_it_flies_a_race_on_px4_with_its_heavy_drag() -> None:
     course = make_course(RACE_SEEDS + 3)
-    ap = Px4Autopilot(Px4Params(), READY, 0)
+    ap = Px4(Px4Params(), READY, 0)
 
     def send(flown: RateCommand) -> None:
         thrust = flown.thrust * PX4_HOVER_THRUST / HOVER_THRUST
-        ap.set_setpoint(RateSetpoint(flown[1:], min(1.0, thrust)), ap.now_ns)
+        ap.set_setpoint(AttitudeSetpoint(None, flown[1:], min(1.0, thrust)), ap.now_ns)
 
     for _ in range(50):
         ap.step()
     send(RateCommand(0.0, 0.0, 0.0, 0.0))
     ap.commander.intended = Px4Mode.OFFBOARD
     ap.step()
-    assert ap.commander.arm(), ap.commander.texts
+    assert ap.commander.arm(), ap.texts
     log = fly(course, RateExpert(course, 8.0), ap, send, Disturbance(0, strength=0.0))
     assert not log.crashed
     assert log.next_gate is None
 
 
 def test_ardupilot_boosts_the_thrust_of_a_lean_to_84_degrees() -> None:
-    params = Params()
+    params = ArduPilotParams()
     for lean_deg, factor in ((0.0, 1.0), (60.0, 2.0), (80.0, 1 / math.cos(math.radians(80)))):
         leaning = body(ned_from_body_wxyz=from_euler(math.radians(lean_deg), 0.0, 0.0))
         assert boosted(0.1, leaning, params) == pytest.approx(0.1 * factor)

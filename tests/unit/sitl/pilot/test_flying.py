@@ -4,11 +4,11 @@ import pytest
 
 from sitl import UsageError
 from sitl.__main__ import main
+from sitl.app import PilotOptions, make_pilot, prepare_vehicle
 from sitl.clock import NS_PER_S, Clock
 from sitl.course.layout import make_course
 from sitl.expert.stick_response import CENTRED
 from sitl.pilot.axes import DEFAULT_AXES
-from sitl.pilot.choose import make_pilot, prepare_vehicle
 from sitl.pilot.transmitter import OFF_US, Hand, Transmitter
 from sitl.simulated_vehicle import SimulatedVehicle
 from sitl.vehicle.config import STEP_NS, VehicleConfig
@@ -25,12 +25,10 @@ def vehicle_of(autopilot, **changes):
 
 def pilot_of(name, vehicle, autopilot="ardupilot", axes=DEFAULT_AXES):
     pilot, _ = make_pilot(
-        name,
+        PilotOptions(name, axes, 5.0),
         vehicle=vehicle,
         autopilot=autopilot,
         course=COURSE,
-        axes=axes,
-        speed_mps=5.0,
         clock=Clock(),
     )
     return pilot

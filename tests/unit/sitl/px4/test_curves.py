@@ -4,8 +4,8 @@ import math
 
 import pytest
 
-from sitl.px4 import curves
-from sitl.px4.params import Params
+from sitl.px4 import sticks as curves
+from sitl.px4.params import Px4Params
 from sitl.px4.sticks import from_manual_control
 
 
@@ -17,38 +17,38 @@ def sticks(x=0, y=0, z=500, r=0):
     ("z", "climb_mps"), [(500, 0.0), (550, 0.0), (600, 0.15), (750, 0.7), (1000, 3.0), (0, -1.5)]
 )
 def test_climb(z, climb_mps):
-    assert curves.climb_mps(sticks(z=z), Params()) == pytest.approx(climb_mps, abs=0.02)
+    assert curves.climb_mps(sticks(z=z), Px4Params()) == pytest.approx(climb_mps, abs=0.02)
 
 
 @pytest.mark.parametrize(("r", "degps"), [(100, 0.0), (500, 34.5), (-500, -34.5), (1000, 150.0)])
 def test_yaw(r, degps):
-    rate = curves.yaw_rate_radps(sticks(r=r), Params())
+    rate = curves.yaw_rate_radps(sticks(r=r), Px4Params())
     assert math.degrees(rate) == pytest.approx(degps, abs=0.5)
 
 
 @pytest.mark.parametrize(("y", "lean_deg"), [(50, 2.0), (100, 4.0), (500, 19.3), (1000, 35.0)])
 def test_altctl_leans_by_the_tangent(y, lean_deg):
-    _, right = curves.lean_accel_mps2(sticks(y=y), Params())
+    _, right = curves.lean_accel_mps2(sticks(y=y), Px4Params())
     assert math.degrees(math.atan(right / 9.80665)) == pytest.approx(lean_deg, abs=0.1)
 
 
 def test_both_sticks_share_the_lean():
-    accel = curves.lean_accel_mps2(sticks(x=1000, y=1000), Params())
+    accel = curves.lean_accel_mps2(sticks(x=1000, y=1000), Px4Params())
     assert math.degrees(math.atan(math.hypot(*accel) / 9.80665)) == pytest.approx(35.0)
-    assert math.degrees(math.hypot(*curves.lean_rad(sticks(x=1000, y=1000), Params()))) == (
+    assert math.degrees(math.hypot(*curves.lean_rad(sticks(x=1000, y=1000), Px4Params()))) == (
         pytest.approx(35.0)
     )
 
 
 def test_stab_leans_by_the_angle_and_hovers_at_mid_stick():
-    roll, pitch = curves.lean_rad(sticks(x=500, y=500), Params())
+    roll, pitch = curves.lean_rad(sticks(x=500, y=500), Px4Params())
 
     assert math.degrees(roll) == pytest.approx(17.5)
     assert math.degrees(pitch) == pytest.approx(-17.5)
-    assert curves.manual_thrust(sticks(), Params(), 0.484) == pytest.approx(0.484)
-    assert curves.manual_thrust(sticks(z=1000), Params(), 0.484) == pytest.approx(1.0)
+    assert curves.manual_thrust(sticks(), Px4Params(), 0.484) == pytest.approx(0.484)
+    assert curves.manual_thrust(sticks(z=1000), Px4Params(), 0.484) == pytest.approx(1.0)
 
 
 def test_acro_is_linear():
-    rates = curves.acro_rates_radps(sticks(x=300, y=300, r=-300), Params())
+    rates = curves.acro_rates_radps(sticks(x=300, y=300, r=-300), Px4Params())
     assert [math.degrees(rate) for rate in rates] == pytest.approx([30.0, -30.0, -30.0])

@@ -3,7 +3,7 @@
 import pytest
 
 from sitl.clock import NS_PER_MS, NS_PER_S
-from sitl.px4.params import Params
+from sitl.px4.params import Px4Params
 from sitl.px4.sticks import RC_SOURCE, StickInput, Sticks, from_manual_control
 
 PERIOD_NS = 20 * NS_PER_MS
@@ -14,7 +14,7 @@ class Senders:
     """Sends sticks of several sources at 50 Hz; a source's throttle tells it apart."""
 
     def __init__(self, in_mode=1):
-        self.params = Params()
+        self.params = Px4Params()
         self.params.set("COM_RC_IN_MODE", in_mode)
         self.input = StickInput(self.params)
         self.now_ns = 0

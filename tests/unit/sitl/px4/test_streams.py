@@ -4,7 +4,8 @@ import pytest
 from pymavlink.dialects.v20 import ardupilotmega as mav
 
 from sitl.clock import NS_PER_MS
-from sitl.px4.link.streams import CURRENT_MODE, GCS_HZ, ONBOARD_HZ, Streams
+from sitl.px4.endpoint import GCS_HZ, ONBOARD_HZ, Px4Streams
+from sitl.px4.messages import CURRENT_MODE
 
 ATTITUDE = mav.MAVLINK_MSG_ID_ATTITUDE
 PLENTY = 1e9
@@ -26,14 +27,14 @@ def sent_ms(streams, seconds, message_id=ATTITUDE, version_of=None, begin_ms=0):
     [(10, 10), (50, 50), (100, 100), (125, 125), (150, 146), (200, 125), (250, 250), (1000, 250)],
 )
 def test_rates_come_out_as_measured(asked_hz, sent_hz):
-    streams = Streams({}, PLENTY, 0)
+    streams = Px4Streams({}, PLENTY, 0)
     streams.set_interval(ATTITUDE, int(1e6 / asked_hz), 0)
 
     assert len(sent_ms(streams, 4.0)) / 4.0 == pytest.approx(sent_hz, rel=0.03)
 
 
 def test_nothing_is_sent_while_the_topic_is_old():
-    streams = Streams({}, PLENTY, 0)
+    streams = Px4Streams({}, PLENTY, 0)
     streams.set_interval(ATTITUDE, 4000, 0)
 
     times = sent_ms(streams, 1.0, version_of=lambda ms: ms // 100)
@@ -42,7 +43,7 @@ def test_nothing_is_sent_while_the_topic_is_old():
 
 
 def test_a_stream_that_waited_starts_a_new_grid():
-    streams = Streams({}, PLENTY, 0)
+    streams = Px4Streams({}, PLENTY, 0)
     streams.set_interval(ATTITUDE, 20_000, 0)
     version = {"now": 1}
     sent_ms(streams, 0.1, version_of=lambda _: version["now"])
@@ -54,7 +55,7 @@ def test_a_stream_that_waited_starts_a_new_grid():
 
 
 def test_zero_restores_the_links_default_and_minus_one_stops():
-    streams = Streams({ATTITUDE: 50.0}, PLENTY, 0)
+    streams = Px4Streams({ATTITUDE: 50.0}, PLENTY, 0)
     streams.set_interval(ATTITUDE, -1, 0)
     assert streams.interval_us(ATTITUDE) == -1
     streams.set_interval(ATTITUDE, 0, 0)
@@ -62,7 +63,7 @@ def test_zero_restores_the_links_default_and_minus_one_stops():
 
 
 def test_a_slow_link_slows_every_stream_alike_and_nobody_is_told():
-    streams = Streams(ONBOARD_HZ, 4000.0, 0)
+    streams = Px4Streams(ONBOARD_HZ, 4000.0, 0)
 
     assert streams.scale == pytest.approx(0.118, abs=0.004)
     assert streams.interval_us(ATTITUDE) == 10_000
@@ -70,11 +71,11 @@ def test_a_slow_link_slows_every_stream_alike_and_nobody_is_told():
 
 
 def test_a_hopeless_link_keeps_a_twentieth():
-    assert Streams(ONBOARD_HZ, 10.0, 0).scale == 0.05
+    assert Px4Streams(ONBOARD_HZ, 10.0, 0).scale == 0.05
 
 
 def test_a_fast_link_is_not_scaled():
-    assert Streams(ONBOARD_HZ, 4_000_000.0, 0).scale == 1.0
+    assert Px4Streams(ONBOARD_HZ, 4_000_000.0, 0).scale == 1.0
 
 
 def test_links_differ_in_what_they_send_unasked():

@@ -7,9 +7,9 @@ import numpy as np
 import pytest
 
 from sitl import UsageError
-from sitl.ardupilot.autopilot import Autopilot
+from sitl.ardupilot.autopilot import ArduCopter
 from sitl.ardupilot.flight_modes import Mode
-from sitl.ardupilot.params import Params
+from sitl.ardupilot.params import ArduPilotParams
 from sitl.camera.fpv import FpvRenderer
 from sitl.camera.scenery import STRAY_CLEARANCE_M, course_faces
 from sitl.course.layout import make_course
@@ -41,7 +41,7 @@ NOMINAL_VIEW = [
 def fly(conditions, seconds=8.0):
     """Take off, then weave; the state at the end."""
     config = VehicleConfig(estimator_ready_s=0.0, conditions=conditions)
-    ap = Autopilot(Params(conditions), config, boot_ns=0)
+    ap = ArduCopter(ArduPilotParams(conditions), config, boot_ns=0)
     for tick in range(round(seconds * 100)):
         t_s = tick / 100
         sticks = [1500, 1500, 1000 if t_s < 0.5 else 1800 if t_s < 3.0 else 1500, 1500]

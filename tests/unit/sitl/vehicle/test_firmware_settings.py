@@ -8,8 +8,8 @@ import pytest
 from pymavlink.dialects.v20 import ardupilotmega as mav
 
 from helpers.course_flights import fly_course, pwm_us
-from sitl.ardupilot.link.streams import Streams
-from sitl.ardupilot.params import Params
+from sitl.ardupilot.endpoint import ArduPilotStreams
+from sitl.ardupilot.params import ArduPilotParams
 from sitl.clock import NS_PER_MS, NS_PER_S
 from sitl.course.layout import AirborneStart, make_course
 from sitl.expert.demonstrator import Expert
@@ -78,13 +78,13 @@ def test_the_vehicle_tells_what_its_conditions_are():
         "ATC_ACCEL_P_MAX": drawn.lean_accel_max_cdegps2,
     }
     assert {name: read_param(vehicle, name) for name in wanted} == pytest.approx(wanted, rel=1e-6)
-    nominal = Params()
+    nominal = ArduPilotParams()
     assert not [name for name, value in wanted.items() if value == nominal[name]]
 
 
 def test_what_is_drawn_is_usual():
     for seed in range(50):
-        params = Params(random_conditions(seed))
+        params = ArduPilotParams(random_conditions(seed))
         assert 3000 <= params["ANGLE_MAX"] <= 4500
         assert all(0 <= params[f"RC{n}_DZ"] <= 30 for n in (1, 2, 3, 4))
         assert 145 <= params["PILOT_Y_RATE"] <= 284
@@ -175,7 +175,7 @@ def test_every_angle_gain_that_is_drawn_is_stable(gain):
 
 
 def sent_ms(seed=0, seconds=4, interval_us=10_000, **conditions):
-    streams = Streams([ATTITUDE], 0, replace(NOMINAL, seed=seed, **conditions))
+    streams = ArduPilotStreams([ATTITUDE], 0, replace(NOMINAL, seed=seed, **conditions))
     assert streams.set_interval(ATTITUDE, interval_us, loop_hz=400.0, now_ns=0) is None
     stamps = range(STEP_NS, seconds * NS_PER_S, STEP_NS)
     return [now / NS_PER_MS for now in stamps if ATTITUDE in streams.due(now, 1)]
@@ -184,7 +184,7 @@ def sent_ms(seed=0, seconds=4, interval_us=10_000, **conditions):
 def test_a_slow_link_adds_to_every_interval_and_does_not_say_so():
     sent = sent_ms(stream_slowdown_ms=15)
     assert set(np.diff(sent)) == {25.0}
-    streams = Streams([ATTITUDE], 0, replace(NOMINAL, stream_slowdown_ms=15))
+    streams = ArduPilotStreams([ATTITUDE], 0, replace(NOMINAL, stream_slowdown_ms=15))
     streams.set_interval(ATTITUDE, 10_000, loop_hz=400.0, now_ns=0)
     assert streams.interval_us(ATTITUDE) == 10_000
 
@@ -222,7 +222,7 @@ def test_the_expert_s_sticks_mean_the_same_on_vehicles_that_are_set_up_different
         pilot_speed_down_cmps=500,
     )
     first, second = (
-        Expert(course, 5.0, next_gate=2, params=Params(conditions)).sticks(body, 0.0)
+        Expert(course, 5.0, next_gate=2, params=ArduPilotParams(conditions)).sticks(body, 0.0)
         for conditions in (nominal, other)
     )
     assert min(map(abs, first)) > 0.02

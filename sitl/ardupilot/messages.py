@@ -5,35 +5,31 @@ whose gyro keeps its bias and whose magnetometer is a million times too large, p
 withheld until the estimator has one.
 """
 
-import math
 from collections.abc import Callable
 
 from pymavlink.dialects.v20 import ardupilotmega as mav
 
-from sitl.ardupilot.autopilot import Autopilot
+from sitl.ardupilot.autopilot import ArduCopter
 from sitl.ardupilot.flight_modes import Mode
 from sitl.ardupilot.guided import Submode
-from sitl.link.framing import Message
+from sitl.link.endpoint import Message
 from sitl.link.telemetry import (
-    INT16,
     Home,
+    autopilot_version,
+    battery_status,
     boot_ms,
     boot_us,
-    heading,
-    int16,
-    servo_output_raw,
-    yaw_rad,
+    extended_sys_state,
+    sys_status,
+    vfr_hud,
 )
-from sitl.rotation import Vec3, to_euler
+from sitl.rotation import Vec3
 from sitl.vehicle.config import ArduPilotRelease
-from sitl.vehicle.dynamics import GRAVITY_MPS2
 
-HOME = Home(-35.3632621, 149.1652374, 584.0, field_ned_gauss=(0.2322, 0.0520, -0.5280))
+HOME = Home(-35.3632621, 149.1652374, 584.0, (0.2322, 0.0520, -0.5280), 945.0, 35.0)
 """ArduPilot SITL's default home."""
 GYRO_BIAS_RADPS: Vec3 = (0.003, -0.002, 0.001)
 """Subtracted by the estimator; raw IMU messages still carry it."""
-GROUND_PRESSURE_HPA = 945.0
-TEMPERATURE_CDEG = 3500
 
 _SENSORS = (
     mav.MAV_SYS_STATUS_SENSOR_3D_GYRO
@@ -70,16 +66,15 @@ _EKF_HORIZONTAL = (
 )
 _VELOCITY_ONLY = 3079  # POSITION_TARGET_LOCAL_NED.type_mask: all but velocity and acceleration
 _POSITION_ONLY = 3576  # all but the position
-_IMU_FIELDS_UPDATED = 8191
 
 
-def _raw_gyro(ap: Autopilot) -> tuple[float, ...]:
+def _raw_gyro(ap: ArduCopter) -> tuple[float, ...]:
     return tuple(
         rate + bias for rate, bias in zip(ap.sensed.rate_body_radps, GYRO_BIAS_RADPS, strict=True)
     )
 
 
-def _heartbeat(ap: Autopilot) -> Message:
+def _heartbeat(ap: ArduCopter) -> Message:
     """CRITICAL while a failsafe is active."""
     base_mode = (
         mav.MAV_MODE_FLAG_CUSTOM_MODE_ENABLED
@@ -98,41 +93,23 @@ def _heartbeat(ap: Autopilot) -> Message:
     )
 
 
-def _scaled_imu_fields(ap: Autopilot) -> tuple[int, ...]:
-    """Acceleration in milli-g, gyro in mrad/s, field in mGauss."""
-    accel = [1000.0 * force / GRAVITY_MPS2 for force in ap.sensed.specific_force_body_mps2]
-    return (*int16(accel, 1.0), *int16(_raw_gyro(ap), 1000.0), *int16(HOME.mag_gauss(ap), 1000.0))
+def _scaled_imu(ap: ArduCopter) -> tuple[int, ...]:
+    return HOME.scaled_imu(ap, _raw_gyro(ap))
 
 
-def _highres_imu(ap: Autopilot) -> Message:
-    """m/s^2, rad/s with bias; the field is in micro-gauss, as the firmware has it."""
-    height = -ap.sensed.position_ned_m[2]
-    pressure = GROUND_PRESSURE_HPA * math.exp(-height / 8434.0)
-    return mav.MAVLink_highres_imu_message(
-        boot_us(ap),
-        *ap.sensed.specific_force_body_mps2,
-        *_raw_gyro(ap),
-        *(1e6 * b for b in HOME.mag_gauss(ap)),
-        pressure,
-        pressure - GROUND_PRESSURE_HPA,
-        HOME.alt_m + height,
-        TEMPERATURE_CDEG / 100.0,
-        _IMU_FIELDS_UPDATED,
-        0,
-    )
+def _highres_imu(ap: ArduCopter) -> Message:
+    """Rates with bias; the field is in micro-gauss, as the firmware has it."""
+    field = (1e6 * b for b in HOME.mag_gauss(ap))
+    return HOME.highres_imu(ap, _raw_gyro(ap), field, has_difference=True)
 
 
-def _vfr_hud(ap: Autopilot) -> Message:
-    north, east, down = ap.sensed.velocity_ned_mps
-    speed = math.hypot(north, east)
-    throttle = round(100.0 * sum(ap.motor_commands) / len(ap.motor_commands))
-    altitude = HOME.alt_m - ap.sensed.position_ned_m[2] if ap.has_gps else 0.0
-    return mav.MAVLink_vfr_hud_message(
-        speed, speed, heading(yaw_rad(ap)), throttle, altitude, -down
-    )
+def _vfr_hud(ap: ArduCopter) -> Message:
+    throttle = sum(ap.motor_commands) / len(ap.motor_commands)
+    altitude_m = HOME.alt_m - ap.sensed.position_ned_m[2] if ap.has_gps else 0.0
+    return vfr_hud(ap, altitude_m=altitude_m, throttle=throttle)
 
 
-def _sys_status(ap: Autopilot) -> Message:
+def _sys_status(ap: ArduCopter) -> Message:
     """PREARM_CHECK is healthy when mode and sticks alone decide on arming."""
     present = _SENSORS | mav.MAV_SYS_STATUS_PREARM_CHECK
     present |= mav.MAV_SYS_STATUS_SENSOR_RC_RECEIVER if ap.rc.found else 0
@@ -143,17 +120,10 @@ def _sys_status(ap: Autopilot) -> Message:
         faults |= mav.MAV_SYS_STATUS_SENSOR_RC_RECEIVER
     if ap.battery.is_low:
         faults |= mav.MAV_SYS_STATUS_SENSOR_BATTERY
-    battery = (*_battery_mv_ca(ap), ap.battery.remaining_percent)
-    return mav.MAVLink_sys_status_message(
-        present, present, present & ~faults, 100, *battery, 0, 0, 0, 0, 0, 0
-    )
+    return sys_status(ap, present=present, enabled=present, healthy=present & ~faults)
 
 
-def _battery_mv_ca(ap: Autopilot) -> tuple[int, int]:
-    return round(1000.0 * ap.battery.voltage_v), round(100.0 * ap.battery.current_a)
-
-
-def _ekf_status_report(ap: Autopilot) -> Message:
+def _ekf_status_report(ap: ArduCopter) -> Message:
     """Attitude from the start, the rest with a position."""
     flags = mav.EKF_UNINITIALIZED
     if ap.estimator_ready:
@@ -163,65 +133,18 @@ def _ekf_status_report(ap: Autopilot) -> Message:
     return mav.MAVLink_ekf_status_report_message(flags, 0.01, 0.01, 0.01, 0.01, 0.0)
 
 
-def _gps_raw_int(ap: Autopilot) -> Message:
-    """The last 5 Hz fix, repeated; accuracies and satellites are constant."""
-    north, east, down = ap.gps.position_ned_m
-    vn, ve, _ = ap.gps.velocity_ned_mps
-    return mav.MAVLink_gps_raw_int_message(
-        boot_us(ap),
-        mav.GPS_FIX_TYPE_3D_FIX,
-        *HOME.lat_lon_e7(north, east),
-        round(1000.0 * (HOME.alt_m - down)),
-        121,
-        200,
-        round(100.0 * math.hypot(vn, ve)),
-        heading(math.atan2(ve, vn), 100.0),
-        10,
-    )
+def _extended_sys_state(ap: ArduCopter) -> Message:
+    is_taking_off = ap.guided is not None and ap.guided.is_taking_off(ap.sensed)
+    vtol, is_landing = mav.MAV_VTOL_STATE_UNDEFINED, ap.mode.lands
+    return extended_sys_state(ap, vtol, is_landing=is_landing, is_taking_off=is_taking_off)
 
 
-def _battery_status(ap: Autopilot) -> Message:
-    """One pack, its voltage as that of a single cell."""
-    function, chemistry = mav.MAV_BATTERY_FUNCTION_ALL, mav.MAV_BATTERY_TYPE_LIPO
-    pack_mv, current_ca = _battery_mv_ca(ap)
-    is_low = ap.battery.is_low
-    return mav.MAVLink_battery_status_message(
-        0,
-        function,
-        chemistry,
-        INT16,
-        [pack_mv] + [65535] * 9,
-        current_ca,
-        0,
-        0,
-        ap.battery.remaining_percent,
-        0,
-        mav.MAV_BATTERY_CHARGE_STATE_LOW if is_low else mav.MAV_BATTERY_CHARGE_STATE_OK,
-    )
-
-
-def _extended_sys_state(ap: Autopilot) -> Message:
-    if ap.landed:
-        state = mav.MAV_LANDED_STATE_ON_GROUND
-    elif ap.mode.lands:
-        state = mav.MAV_LANDED_STATE_LANDING
-    elif ap.guided is not None and ap.guided.is_taking_off(ap.sensed):
-        state = mav.MAV_LANDED_STATE_TAKEOFF
-    else:
-        state = mav.MAV_LANDED_STATE_IN_AIR
-    return mav.MAVLink_extended_sys_state_message(mav.MAV_VTOL_STATE_UNDEFINED, state)
-
-
-def _autopilot_version(ap: Autopilot) -> Message:
-    unique = ap.params.integer("MAV_SYSID")
-    no_hash = [0] * 8
+def _autopilot_version(ap: ArduCopter) -> Message:
     version = _FIRMWARE_VERSIONS[ap.config.ardupilot_release]
-    return mav.MAVLink_autopilot_version_message(
-        _CAPABILITIES, version, 0, 0, 0, no_hash, no_hash, no_hash, 0, 0, unique
-    )
+    return autopilot_version(ap, capabilities=_CAPABILITIES, version=version)
 
 
-def _attitude_target(ap: Autopilot) -> Message:
+def _attitude_target(ap: ArduCopter) -> Message:
     """The controller's shaped target, whatever was sent; thrust before the boost for a lean."""
     attitude, rate_radps = ap.control.target
     return mav.MAVLink_attitude_target_message(
@@ -229,7 +152,7 @@ def _attitude_target(ap: Autopilot) -> Message:
     )
 
 
-def _position_target(ap: Autopilot) -> Message | None:
+def _position_target(ap: ArduCopter) -> Message | None:
     """The setpoint that GUIDED follows, in NED axes; nothing in other modes or for attitudes."""
     guided = ap.guided if ap.mode is Mode.GUIDED else None
     if guided is None or guided.submode is Submode.ATTITUDE:
@@ -245,24 +168,19 @@ def _position_target(ap: Autopilot) -> Message | None:
     )
 
 
-BUILDERS: dict[int, Callable[[Autopilot], Message | None]] = {
+BUILDERS: dict[int, Callable[[ArduCopter], Message | None]] = {
+    **HOME.builders(),
     mav.MAVLINK_MSG_ID_HEARTBEAT: _heartbeat,
     mav.MAVLINK_MSG_ID_SYS_STATUS: _sys_status,
-    # No date: the vehicle has no wall clock.
-    mav.MAVLINK_MSG_ID_SYSTEM_TIME: lambda ap: mav.MAVLink_system_time_message(0, boot_ms(ap)),
-    mav.MAVLINK_MSG_ID_GPS_RAW_INT: _gps_raw_int,
+    mav.MAVLINK_MSG_ID_GPS_RAW_INT: lambda ap: HOME.gps_raw_int(
+        ap, fix=mav.GPS_FIX_TYPE_3D_FIX, eph=121, epv=200
+    ),
     mav.MAVLINK_MSG_ID_SCALED_IMU: lambda ap: mav.MAVLink_scaled_imu_message(
-        boot_ms(ap), *_scaled_imu_fields(ap), TEMPERATURE_CDEG
+        boot_ms(ap), *_scaled_imu(ap), HOME.temperature_cdeg
     ),
     # Scaled integers in spite of its name.
     mav.MAVLINK_MSG_ID_RAW_IMU: lambda ap: mav.MAVLink_raw_imu_message(
-        boot_us(ap), *_scaled_imu_fields(ap), 0, TEMPERATURE_CDEG
-    ),
-    mav.MAVLINK_MSG_ID_ATTITUDE: lambda ap: mav.MAVLink_attitude_message(
-        boot_ms(ap), *to_euler(ap.sensed.ned_from_body_wxyz), *ap.sensed.rate_body_radps
-    ),
-    mav.MAVLINK_MSG_ID_ATTITUDE_QUATERNION: lambda ap: mav.MAVLink_attitude_quaternion_message(
-        boot_ms(ap), *ap.sensed.ned_from_body_wxyz, *ap.sensed.rate_body_radps
+        boot_us(ap), *_scaled_imu(ap), 0, HOME.temperature_cdeg
     ),
     mav.MAVLINK_MSG_ID_LOCAL_POSITION_NED: lambda ap: (
         mav.MAVLink_local_position_ned_message(
@@ -271,9 +189,7 @@ BUILDERS: dict[int, Callable[[Autopilot], Message | None]] = {
         if ap.position_ready
         else None
     ),
-    mav.MAVLINK_MSG_ID_GLOBAL_POSITION_INT: HOME.global_position_int,
     mav.MAVLINK_MSG_ID_RC_CHANNELS_RAW: lambda _: None,  # accepted by the firmware, never sent
-    mav.MAVLINK_MSG_ID_SERVO_OUTPUT_RAW: servo_output_raw,
     # The values after overrides.
     mav.MAVLINK_MSG_ID_RC_CHANNELS: lambda ap: mav.MAVLink_rc_channels_message(
         boot_ms(ap), ap.rc.channel_count, *ap.rc.channels_us, 0, 0, 255
@@ -283,14 +199,13 @@ BUILDERS: dict[int, Callable[[Autopilot], Message | None]] = {
     mav.MAVLINK_MSG_ID_HIGHRES_IMU: _highres_imu,
     # The second IMU agrees with the first.
     mav.MAVLINK_MSG_ID_SCALED_IMU2: lambda ap: mav.MAVLink_scaled_imu2_message(
-        boot_ms(ap), *_scaled_imu_fields(ap), TEMPERATURE_CDEG
+        boot_ms(ap), *_scaled_imu(ap), HOME.temperature_cdeg
     ),
-    mav.MAVLINK_MSG_ID_BATTERY_STATUS: _battery_status,
+    mav.MAVLINK_MSG_ID_BATTERY_STATUS: lambda ap: battery_status(ap, energy_hj=0),
     mav.MAVLINK_MSG_ID_AUTOPILOT_VERSION: _autopilot_version,
     mav.MAVLINK_MSG_ID_EKF_STATUS_REPORT: _ekf_status_report,
     mav.MAVLINK_MSG_ID_ATTITUDE_TARGET: _attitude_target,
     mav.MAVLINK_MSG_ID_POSITION_TARGET_LOCAL_NED: _position_target,
-    mav.MAVLINK_MSG_ID_HOME_POSITION: HOME.home_position,
     mav.MAVLINK_MSG_ID_EXTENDED_SYS_STATE: _extended_sys_state,
 }
 """Every message that can be streamed or requested; None where there is nothing to report yet."""

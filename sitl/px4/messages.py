@@ -11,36 +11,34 @@ from collections.abc import Callable, Hashable
 import numpy as np
 from pymavlink.dialects.v20 import ardupilotmega as mav
 
-from sitl.link.framing import Message
+from sitl.clock import NS_PER_MS
+from sitl.link.endpoint import Message
 from sitl.link.telemetry import (
-    INT16,
     Home,
+    autopilot_version,
+    battery_status,
     boot_ms,
     boot_us,
-    heading,
-    int16,
-    servo_output_raw,
-    yaw_rad,
+    extended_sys_state,
+    sys_status,
+    vfr_hud,
 )
-from sitl.px4.autopilot import Autopilot
+from sitl.px4.autopilot import Px4
 from sitl.px4.events import Event
-from sitl.px4.link.streams import CURRENT_MODE, at_rate
+from sitl.px4.flight import PositionSetpoint
 from sitl.px4.modes import Mode
-from sitl.px4.setpoints import VelocitySetpoint
-from sitl.rotation import conjugate, rotate, to_euler
+from sitl.rotation import conjugate, rotate
 from sitl.vehicle.config import Px4Release
-from sitl.vehicle.dynamics import GRAVITY_MPS2
 
+CURRENT_MODE = 436
 EVENT = 410
 EVENT_CRC_EXTRA, CURRENT_MODE_CRC_EXTRA = 160, 193
 _EVENT = struct.Struct("<IIHBBB40s")
 _CURRENT_MODE = struct.Struct("<IIB")
 EVENT_ARGUMENT_BYTES = 40
 
-HOME = Home(47.397743, 8.545594, 489.4, field_ned_gauss=(0.215, 0.0118, 0.4307))
+HOME = Home(47.397743, 8.545594, 489.4, (0.215, 0.0118, 0.4307), 955.6, 25.0)
 """PX4 SIH's default home."""
-GROUND_PRESSURE_HPA = 955.6
-TEMPERATURE_C = 25.0
 
 _FIRMWARE_VERSIONS: dict[Px4Release, int] = {
     "1.14": 0x010E04FF,
@@ -54,18 +52,8 @@ CAPABILITIES = 0xE8FF
 _SENSORS_PRESENT, _SENSORS_ENABLED, _SENSORS_HEALTHY = 0x200C02F, 0x201C02F, 0x320C83F
 _ESTIMATOR_WITHOUT_POSITION = 0xE5
 _ESTIMATOR_WITH_POSITION, _ESTIMATOR_ON_GROUND = 0x37F, 0x3FF
-_STANDARD_MODES = {
-    Mode.POSCTL: 1,
-    Mode.ALTCTL: 4,
-    Mode.AUTO_RTL: 5,
-    Mode.AUTO_MISSION: 6,
-    Mode.AUTO_LAND: 7,
-    Mode.AUTO_TAKEOFF: 8,
-}
-"""MAV_STANDARD_MODE; 0 for the others."""
 _STATE_UNINIT, _STATE_STANDBY, _STATE_ACTIVE = 0, 3, 4
 _STATE_CRITICAL, _STATE_TERMINATED = 5, 8
-_IMU_FIELDS_UPDATED = 0x1FFF
 _ODOMETRY_COVARIANCE = [math.nan, *[0.0] * 20]
 
 
@@ -90,17 +78,16 @@ def event_message(event: Event, sequence: int) -> Message:
     return HandPacked(EVENT, "EVENT", payload, EVENT_CRC_EXTRA)
 
 
-def _current_mode(ap: Autopilot) -> Message:
-    intended = ap.commander.intended
-    standard = _STANDARD_MODES.get(ap.mode, 0)
-    payload = _CURRENT_MODE.pack(ap.mode.custom_mode, intended.custom_mode, standard)
+def _current_mode(ap: Px4) -> Message:
+    mode, intended = ap.mode, ap.commander.intended
+    payload = _CURRENT_MODE.pack(mode.custom_mode, intended.custom_mode, mode.standard)
     return HandPacked(CURRENT_MODE, "CURRENT_MODE", payload, CURRENT_MODE_CRC_EXTRA)
 
 
-def _heartbeat(ap: Autopilot) -> Message:
+def _heartbeat(ap: Px4) -> Message:
     """Once a second; what is between two of them, arming included, it never shows."""
     flags = ap.mode.base_flags
-    if ap.mode is Mode.OFFBOARD and isinstance(ap.setpoint, VelocitySetpoint):
+    if ap.mode is Mode.OFFBOARD and isinstance(ap.setpoint, PositionSetpoint):
         flags |= mav.MAV_MODE_FLAG_STABILIZE_ENABLED
     if ap.armed:
         flags |= mav.MAV_MODE_FLAG_SAFETY_ARMED
@@ -117,7 +104,7 @@ def _heartbeat(ap: Autopilot) -> Message:
     )
 
 
-def _sys_status(ap: Autopilot) -> Message:
+def _sys_status(ap: Px4) -> Message:
     """PREARM_CHECK, never present, is healthy where arming would not be refused for health."""
     sticks = mav.MAV_SYS_STATUS_SENSOR_RC_RECEIVER if ap.stick_input.valid else 0
     healthy = _SENSORS_HEALTHY | sticks
@@ -125,59 +112,21 @@ def _sys_status(ap: Autopilot) -> Message:
         healthy |= mav.MAV_SYS_STATUS_PREARM_CHECK
     if ap.battery.is_low:
         healthy &= ~mav.MAV_SYS_STATUS_SENSOR_BATTERY
-    battery = (*_battery_mv_ca(ap), ap.battery.remaining_percent)
-    return mav.MAVLink_sys_status_message(
-        _SENSORS_PRESENT | sticks, _SENSORS_ENABLED, healthy, 100, *battery, 0, 0, 0, 0, 0, 0
-    )
+    present, enabled = _SENSORS_PRESENT | sticks, _SENSORS_ENABLED
+    return sys_status(ap, present=present, enabled=enabled, healthy=healthy)
 
 
-def _battery_mv_ca(ap: Autopilot) -> tuple[int, int]:
-    return round(1000.0 * ap.battery.voltage_v), round(100.0 * ap.battery.current_a)
+def _gps_raw_int(ap: Px4) -> Message:
+    fix = mav.GPS_FIX_TYPE_NO_FIX if ap.position_lost else mav.GPS_FIX_TYPE_3D_FIX
+    return HOME.gps_raw_int(ap, fix=fix, eph=70, epv=110)
 
 
-def _gps_raw_int(ap: Autopilot) -> Message:
-    """The last 8 Hz fix."""
-    north, east, down = ap.gps.position_ned_m
-    vn, ve, _ = ap.gps.velocity_ned_mps
-    return mav.MAVLink_gps_raw_int_message(
-        boot_us(ap),
-        mav.GPS_FIX_TYPE_NO_FIX if ap.position_lost else mav.GPS_FIX_TYPE_3D_FIX,
-        *HOME.lat_lon_e7(north, east),
-        round(1000.0 * (HOME.alt_m - down)),
-        70,
-        110,
-        round(100.0 * math.hypot(vn, ve)),
-        heading(math.atan2(ve, vn), 100.0),
-        10,
-    )
+def _highres_imu(ap: Px4) -> Message:
+    gyro, field = ap.sensed.rate_body_radps, HOME.mag_gauss(ap)
+    return HOME.highres_imu(ap, gyro, field, has_difference=False)
 
 
-def _highres_imu(ap: Autopilot) -> Message:
-    height = -ap.sensed.position_ned_m[2]
-    pressure = GROUND_PRESSURE_HPA * math.exp(-height / 8434.0)
-    return mav.MAVLink_highres_imu_message(
-        boot_us(ap),
-        *ap.sensed.specific_force_body_mps2,
-        *ap.sensed.rate_body_radps,
-        *HOME.mag_gauss(ap),
-        pressure,
-        0.0,
-        HOME.alt_m + height,
-        TEMPERATURE_C,
-        _IMU_FIELDS_UPDATED,
-        0,
-    )
-
-
-def _scaled_imu(ap: Autopilot) -> Message:
-    accel = [1000.0 * force / GRAVITY_MPS2 for force in ap.sensed.specific_force_body_mps2]
-    gyro, field = int16(ap.sensed.rate_body_radps, 1000.0), int16(HOME.mag_gauss(ap), 1000.0)
-    return mav.MAVLink_scaled_imu_message(
-        boot_ms(ap), *int16(accel, 1.0), *gyro, *field, round(100.0 * TEMPERATURE_C)
-    )
-
-
-def _local_position_ned(ap: Autopilot) -> Message:
+def _local_position_ned(ap: Px4) -> Message:
     """Without a position it still comes: zeros that nothing marks as such."""
     (north, east, down), (vn, ve, vd) = ap.sensed.position_ned_m, ap.sensed.velocity_ned_mps
     if not ap.position_ready:
@@ -185,7 +134,7 @@ def _local_position_ned(ap: Autopilot) -> Message:
     return mav.MAVLink_local_position_ned_message(boot_ms(ap), north, east, down, vn, ve, vd)
 
 
-def _odometry(ap: Autopilot) -> Message:
+def _odometry(ap: Px4) -> Message:
     """Velocity in body axes."""
     body = ap.sensed
     velocity = rotate(conjugate(body.ned_from_body_wxyz), body.velocity_ned_mps)
@@ -205,7 +154,7 @@ def _odometry(ap: Autopilot) -> Message:
     )
 
 
-def _rc_channels(ap: Autopilot) -> Message | None:
+def _rc_channels(ap: Px4) -> Message | None:
     """A receiver's channels; MANUAL_CONTROL never shows here."""
     if ap.receiver_us is None:
         return None
@@ -213,7 +162,7 @@ def _rc_channels(ap: Autopilot) -> Message | None:
     return mav.MAVLink_rc_channels_message(boot_ms(ap), len(ap.receiver_us), *channels, 100)
 
 
-def _manual_control(ap: Autopilot) -> Message | None:
+def _manual_control(ap: Px4) -> Message | None:
     """The chosen sticks, as single-precision shares of full stick and cut to whole numbers."""
     if not ap.stick_input.valid:
         return None
@@ -221,20 +170,15 @@ def _manual_control(ap: Autopilot) -> Message | None:
     thousand, one, two = np.float32(1000.0), np.float32(1.0), np.float32(2.0)
     x, y, r = (int(value * thousand) for value in (forward, right, yaw))
     z = int((throttle + one) / two * thousand)
-    return mav.MAVLink_manual_control_message(ap.params.integer("MAV_SYS_ID"), x, y, z, r, 0)
+    return mav.MAVLink_manual_control_message(ap.system_id, x, y, z, r, 0)
 
 
-def _vfr_hud(ap: Autopilot) -> Message:
-    north, east, down = ap.sensed.velocity_ned_mps
-    speed = math.hypot(north, east)
-    altitude = HOME.alt_m - ap.sensed.position_ned_m[2]
-    throttle = round(100.0 * ap.flight.thrust) if ap.armed else 0
-    return mav.MAVLink_vfr_hud_message(
-        speed, speed, heading(yaw_rad(ap)), throttle, altitude, -down
-    )
+def _vfr_hud(ap: Px4) -> Message:
+    altitude_m = HOME.alt_m - ap.sensed.position_ned_m[2]
+    return vfr_hud(ap, altitude_m=altitude_m, throttle=ap.flight.thrust if ap.armed else 0.0)
 
 
-def _attitude_target(ap: Autopilot) -> Message:
+def _attitude_target(ap: Px4) -> Message:
     """What the rate and attitude loops are asked for, in any mode."""
     flight = ap.flight
     return mav.MAVLink_attitude_target_message(
@@ -242,7 +186,7 @@ def _attitude_target(ap: Autopilot) -> Message:
     )
 
 
-def _position_target(ap: Autopilot) -> Message:
+def _position_target(ap: Px4) -> Message:
     none, flight = [math.nan] * 3, ap.flight
     turn = (math.nan, flight.yaw_rate_radps)
     return mav.MAVLink_position_target_local_ned_message(
@@ -250,25 +194,7 @@ def _position_target(ap: Autopilot) -> Message:
     )
 
 
-def _battery_status(ap: Autopilot) -> Message:
-    pack_mv, current_ca = _battery_mv_ca(ap)
-    is_low = ap.battery.is_low
-    return mav.MAVLink_battery_status_message(
-        0,
-        mav.MAV_BATTERY_FUNCTION_ALL,
-        mav.MAV_BATTERY_TYPE_LIPO,
-        INT16,
-        [pack_mv] + [65535] * 9,
-        current_ca,
-        0,
-        -1,
-        ap.battery.remaining_percent,
-        0,
-        mav.MAV_BATTERY_CHARGE_STATE_LOW if is_low else mav.MAV_BATTERY_CHARGE_STATE_OK,
-    )
-
-
-def _estimator_status(ap: Autopilot) -> Message:
+def _estimator_status(ap: Px4) -> Message:
     """The one message that says whether there is a horizontal position."""
     flags = _ESTIMATOR_ON_GROUND if ap.landed else _ESTIMATOR_WITH_POSITION
     if not ap.position_ready:
@@ -280,39 +206,26 @@ def _estimator_status(ap: Autopilot) -> Message:
     )
 
 
-def _autopilot_version(ap: Autopilot) -> Message:
-    unique = ap.params.integer("MAV_SYS_ID")
-    no_hash = [0] * 8
-    return mav.MAVLink_autopilot_version_message(
-        CAPABILITIES,
-        _FIRMWARE_VERSIONS[ap.config.px4_release],
-        0,
-        0,
-        0,
-        no_hash,
-        no_hash,
-        no_hash,
-        0,
-        0,
-        unique,
-    )
+def _autopilot_version(ap: Px4) -> Message:
+    version = _FIRMWARE_VERSIONS[ap.config.px4_release]
+    return autopilot_version(ap, capabilities=CAPABILITIES, version=version)
 
 
-BUILDERS: dict[int, Callable[[Autopilot], Message | None]] = {
+def _extended_sys_state(ap: Px4) -> Message:
+    is_landing, is_taking_off = ap.mode is Mode.AUTO_LAND, ap.mode is Mode.AUTO_TAKEOFF
+    vtol = mav.MAV_VTOL_STATE_MC
+    return extended_sys_state(ap, vtol, is_landing=is_landing, is_taking_off=is_taking_off)
+
+
+BUILDERS: dict[int, Callable[[Px4], Message | None]] = {
+    **HOME.builders(),
     mav.MAVLINK_MSG_ID_HEARTBEAT: _heartbeat,
     mav.MAVLINK_MSG_ID_SYS_STATUS: _sys_status,
-    mav.MAVLINK_MSG_ID_SYSTEM_TIME: lambda ap: mav.MAVLink_system_time_message(0, boot_ms(ap)),
     mav.MAVLINK_MSG_ID_GPS_RAW_INT: _gps_raw_int,
-    mav.MAVLINK_MSG_ID_SCALED_IMU: _scaled_imu,
-    mav.MAVLINK_MSG_ID_ATTITUDE: lambda ap: mav.MAVLink_attitude_message(
-        boot_ms(ap), *to_euler(ap.sensed.ned_from_body_wxyz), *ap.sensed.rate_body_radps
-    ),
-    mav.MAVLINK_MSG_ID_ATTITUDE_QUATERNION: lambda ap: mav.MAVLink_attitude_quaternion_message(
-        boot_ms(ap), *ap.sensed.ned_from_body_wxyz, *ap.sensed.rate_body_radps
+    mav.MAVLINK_MSG_ID_SCALED_IMU: lambda ap: mav.MAVLink_scaled_imu_message(
+        boot_ms(ap), *HOME.scaled_imu(ap, ap.sensed.rate_body_radps), HOME.temperature_cdeg
     ),
     mav.MAVLINK_MSG_ID_LOCAL_POSITION_NED: _local_position_ned,
-    mav.MAVLINK_MSG_ID_GLOBAL_POSITION_INT: HOME.global_position_int,
-    mav.MAVLINK_MSG_ID_SERVO_OUTPUT_RAW: servo_output_raw,
     mav.MAVLINK_MSG_ID_RC_CHANNELS: _rc_channels,
     mav.MAVLINK_MSG_ID_MANUAL_CONTROL: _manual_control,
     mav.MAVLINK_MSG_ID_VFR_HUD: _vfr_hud,
@@ -321,13 +234,10 @@ BUILDERS: dict[int, Callable[[Autopilot], Message | None]] = {
     mav.MAVLINK_MSG_ID_HIGHRES_IMU: _highres_imu,
     # The vehicle's own request; the peer's answer needs no action.
     mav.MAVLINK_MSG_ID_TIMESYNC: lambda ap: mav.MAVLink_timesync_message(0, ap.uptime_ns),
-    mav.MAVLINK_MSG_ID_BATTERY_STATUS: _battery_status,
+    mav.MAVLINK_MSG_ID_BATTERY_STATUS: lambda ap: battery_status(ap, energy_hj=-1),
     mav.MAVLINK_MSG_ID_AUTOPILOT_VERSION: _autopilot_version,
     mav.MAVLINK_MSG_ID_ESTIMATOR_STATUS: _estimator_status,
-    mav.MAVLINK_MSG_ID_HOME_POSITION: HOME.home_position,
-    mav.MAVLINK_MSG_ID_EXTENDED_SYS_STATE: lambda ap: mav.MAVLink_extended_sys_state_message(
-        mav.MAV_VTOL_STATE_MC, ap.landed_state.value
-    ),
+    mav.MAVLINK_MSG_ID_EXTENDED_SYS_STATE: _extended_sys_state,
     mav.MAVLINK_MSG_ID_ODOMETRY: _odometry,
     CURRENT_MODE: _current_mode,
 }
@@ -343,17 +253,22 @@ _SLOW_TOPICS = (
 )
 
 
-def topic_version(message_id: int, ap: Autopilot) -> Hashable:
+def topic_version(message_id: int, ap: Px4) -> Hashable:
     """Changes whenever there is something new to send: it bounds the rate of a stream."""
     if message_id in _SLOW_TOPICS:
-        return at_rate(ap.uptime_ns, 8)
+        return _at_rate(ap, 8)
     if message_id == mav.MAVLINK_MSG_ID_ATTITUDE_TARGET:
-        sends_attitude = ap.mode is Mode.OFFBOARD and not isinstance(ap.setpoint, VelocitySetpoint)
-        return ap.setpoint_count if sends_attitude else at_rate(ap.uptime_ns, 8)
+        sends_attitude = ap.mode is Mode.OFFBOARD and not isinstance(ap.setpoint, PositionSetpoint)
+        return ap.setpoint_count if sends_attitude else _at_rate(ap, 8)
     if message_id == mav.MAVLINK_MSG_ID_MANUAL_CONTROL:
         return ap.stick_input.count
     if message_id == mav.MAVLINK_MSG_ID_GPS_RAW_INT:
-        return at_rate(ap.uptime_ns, 125)
+        return _at_rate(ap, 125)
     if message_id == CURRENT_MODE:
-        return ap.mode, ap.commander.intended, at_rate(ap.uptime_ns, 500)
+        return ap.mode, ap.commander.intended, _at_rate(ap, 500)
     return ap.uptime_ns
+
+
+def _at_rate(ap: Px4, period_ms: int) -> int:
+    """Version of a topic that is published this often."""
+    return ap.uptime_ns // (period_ms * NS_PER_MS)

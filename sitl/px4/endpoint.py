@@ -1,4 +1,4 @@
-"""Schedules the messages of one link as PX4 does: rates by topic, a bandwidth, silent scaling.
+"""One link of a PX4 vehicle: texts, events, and streams by topic in a bandwidth, scaled silently.
 
 A stream is looked at once a control step. It is sent when its interval has passed and its topic is
 new; a stream that is late by less than half an interval keeps its grid, a later one begins anew.
@@ -11,9 +11,18 @@ from types import MappingProxyType
 
 from pymavlink.dialects.v20 import ardupilotmega as mav
 
-from sitl.clock import NS_PER_MS
+from sitl.clock import NS_PER_S
+from sitl.link.endpoint import MAX_STATUSTEXT, Endpoint
+from sitl.px4.autopilot import Px4
+from sitl.px4.events import Event
+from sitl.px4.messages import (
+    BUILDERS,
+    BUILDERS_1_14,
+    CURRENT_MODE,
+    event_message,
+    topic_version,
+)
 
-CURRENT_MODE = 436  # not in pymavlink's dialect
 NS_PER_US = 1000
 LOWEST_SCALE = 0.05
 FRAME_BYTES = 12
@@ -77,7 +86,7 @@ class _Stream:
     version: Hashable = None  # of the topic, when it was sent
 
 
-class Streams:
+class Px4Streams:
     """The message intervals of one link; stamps are the vehicle's clock."""
 
     def __init__(
@@ -135,6 +144,62 @@ def payload_bytes(message_id: int) -> int:
     return int(fields.unpacker.size) + FRAME_BYTES
 
 
-def at_rate(uptime_ns: int, period_ms: int) -> int:
-    """Version of a topic that is published this often."""
-    return uptime_ns // (period_ms * NS_PER_MS)
+class Px4Endpoint(Endpoint[Px4]):
+    """A link to a ground station, or to a companion computer, which gets other streams."""
+
+    def __init__(self, ap: Px4, *, is_onboard: bool) -> None:
+        self.heard: set[tuple[int, int]] = set()
+        """Systems and components that have sent on this link."""
+        self._default_hz = ONBOARD_HZ if is_onboard else GCS_HZ
+        self._text_id = self._event_sequence = 0
+        super().__init__(ap, BUILDERS_1_14 if ap.config.px4_release == "1.14" else BUILDERS)
+
+    def restart(self, ap: Px4) -> None:
+        """Begin again with a vehicle that has just booted."""
+        super().restart(ap)
+        self.has_gcs = False
+        """A ground station's heartbeat has come; without one no text is sent."""
+        self._streams = Px4Streams(self._default_hz, ap.config.link_bytes_ps, ap.now_ns)
+        self._heartbeat_due_ns = ap.now_ns
+        self._looked_ns = ap.now_ns
+
+    def step(self, now_ns: int) -> None:
+        """Queue what is due: streams once a control step, parameters at every call."""
+        ap = self._ap
+        self._send_next_param(now_ns)
+        if ap.now_ns >= self._heartbeat_due_ns:
+            self._heartbeat_due_ns += NS_PER_S
+            self.send_now(mav.MAVLINK_MSG_ID_HEARTBEAT)
+        if ap.now_ns != self._looked_ns:
+            self._looked_ns = ap.now_ns
+            for message_id in self._streams.due(ap.now_ns, lambda key: topic_version(key, ap)):
+                self.send_now(message_id)
+
+    def set_interval(self, message_id: int, interval_us: int) -> bool:
+        """Change a stream; False for a message that cannot be streamed."""
+        if message_id not in self._builders or message_id == mav.MAVLINK_MSG_ID_HEARTBEAT:
+            return False
+        self._streams.set_interval(message_id, interval_us, self._ap.now_ns)
+        return True
+
+    def interval_us(self, message_id: int) -> int:
+        """The interval that MESSAGE_INTERVAL reports."""
+        return self._streams.interval_us(message_id)
+
+    def send_text(self, severity: int, text: str) -> None:
+        """Send STATUSTEXT once a ground station is known, a long one in numbered chunks."""
+        if not self.has_gcs:
+            return
+        data = text.encode("ascii", "replace")
+        if len(data) <= MAX_STATUSTEXT:
+            self.send(mav.MAVLink_statustext_message(severity, data))
+            return
+        self._text_id = self._text_id % 65535 + 1
+        for index, start in enumerate(range(0, len(data) + 1, MAX_STATUSTEXT)):
+            chunk = data[start : start + MAX_STATUSTEXT]
+            self.send(mav.MAVLink_statustext_message(severity, chunk, self._text_id, index))
+
+    def send_event(self, event: Event) -> None:
+        """Send EVENT, whoever listens."""
+        self._event_sequence = (self._event_sequence + 1) % 65536
+        self.send(event_message(event, self._event_sequence))

@@ -8,8 +8,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
+from sitl.camera.follow import POSE_MAX_AGE_NS, ROUNDS_BEFORE_EULER, SYSTEM_ID, PoseListener
 from sitl.clock import NS_PER_S
-from sitl.link.pose_listener import POSE_MAX_AGE_NS, ROUNDS_BEFORE_EULER, SYSTEM_ID, PoseListener
 from sitl.rotation import IDENTITY, from_euler
 
 T0_NS = 100 * NS_PER_S

@@ -1,4 +1,4 @@
-"""Schedules the messages of one link, with ArduPilot's rounding, caps and buckets."""
+"""One link of an ArduPilot vehicle: message intervals with its rounding, caps and buckets."""
 
 from collections.abc import Collection
 from dataclasses import dataclass
@@ -6,12 +6,16 @@ from dataclasses import dataclass
 import numpy as np
 from pymavlink.dialects.v20 import ardupilotmega as mav
 
-from sitl.clock import NS_PER_MS
+from sitl.ardupilot.autopilot import ArduCopter
+from sitl.ardupilot.messages import BUILDERS
+from sitl.clock import NS_PER_MS, NS_PER_S
+from sitl.link.endpoint import MAX_STATUSTEXT, Endpoint
 from sitl.vehicle.conditions import NOMINAL, Conditions
 
 HEARTBEAT_INTERVAL_MS = 1000
 MAX_INTERVAL_US = 60_000_000
 MAX_DISTINCT_INTERVALS = 10
+TIMESYNC_PERIOD_NS = 10 * NS_PER_S
 PARAM_SLOWDOWN = 4  # factor on all intervals while a parameter list is being sent
 
 STREAM_GROUPS: dict[int, tuple[int, ...]] = {
@@ -45,7 +49,7 @@ class _Stream:
     late_ns: int = 0  # delay of the next message after its slot
 
 
-class Streams:
+class ArduPilotStreams:
     """The message intervals of one link; stamps are the vehicle's clock, intervals whole ms.
 
     MESSAGE_INTERVAL does not report what the conditions add to them (a slow link, jitter, phases),
@@ -125,3 +129,50 @@ class Streams:
 def shortest_ms(loop_hz: float) -> int:
     """Shortest interval: 0.8 of the main loop's rate, in whole milliseconds; 3 ms at 400 Hz."""
     return int(1000.0 / (0.8 * max(50.0, loop_hz)))
+
+
+class ArduPilotEndpoint(Endpoint[ArduCopter]):
+    """Intervals belong to the link, not to the sender that requested them; two ground stations on
+    one link share them."""
+
+    def __init__(self, ap: ArduCopter) -> None:
+        super().__init__(ap, BUILDERS)
+
+    def restart(self, ap: ArduCopter) -> None:
+        """Begin again with a vehicle that has just booted."""
+        super().restart(ap)
+        self._streams = ArduPilotStreams(BUILDERS, ap.now_ns, ap.config.conditions)
+        self._timesync_due_ns = ap.now_ns + TIMESYNC_PERIOD_NS
+
+    def step(self, _now_ns: int) -> None:
+        """Queue what is due by the vehicle's clock."""
+        now_ns = self._ap.now_ns
+        self._send_next_param(now_ns)
+        for message_id in self._streams.due(now_ns, PARAM_SLOWDOWN if self._queued_params else 1):
+            self.send_now(message_id)
+        if now_ns >= self._timesync_due_ns:
+            self._timesync_due_ns += TIMESYNC_PERIOD_NS
+            uptime_ns = self._ap.uptime_ns
+            self.send(mav.MAVLink_timesync_message(0, uptime_ns + self._ap.system_id))
+
+    def set_interval(self, message_id: int, interval_us: int) -> str | None:
+        """Change a stream; returns the reason if refused."""
+        loop_hz = self._ap.params["SCHED_LOOP_RATE"]
+        return self._streams.set_interval(
+            message_id, interval_us, loop_hz=loop_hz, now_ns=self._ap.now_ns
+        )
+
+    def set_group(self, group: int, rate_hz: int) -> None:
+        """Change the group of streams of a REQUEST_DATA_STREAM; rate 0 stops it."""
+        loop_hz = self._ap.params["SCHED_LOOP_RATE"]
+        self._streams.set_group(group, rate_hz, loop_hz=loop_hz, now_ns=self._ap.now_ns)
+
+    def interval_us(self, message_id: int) -> int:
+        """The interval that MESSAGE_INTERVAL reports."""
+        return self._streams.interval_us(message_id)
+
+    def send_text(self, severity: int, text: str) -> None:
+        """Send STATUSTEXT, in as many messages as the text needs."""
+        for start in range(0, len(text), MAX_STATUSTEXT):
+            chunk = text[start : start + MAX_STATUSTEXT].encode("ascii", "replace")
+            self.send(mav.MAVLink_statustext_message(severity, chunk))

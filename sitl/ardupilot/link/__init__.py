@@ -1,1 +1,0 @@
-"""ArduCopter's side of MAVLink: who is obeyed, what is sent, how often."""

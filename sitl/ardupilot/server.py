@@ -1,0 +1,291 @@
+"""Receives MAVLink on all links of an ArduPilot vehicle: who is obeyed, what a message does.
+
+Filters are ArduCopter's as measured: overrides only from MAV_GCS_SYSID (or up to MAV_GCS_SYSID_HI),
+commands from anybody, everything only for target system 0 or the vehicle's own.
+
+Setpoints are never answered, and ignored outside GUIDED and GUIDED_NOGPS. An invalid one makes
+GUIDED brake and leaves GUIDED_NOGPS with its last setpoint, as measured on the firmware.
+"""
+
+import math
+
+from pymavlink.dialects.v20 import ardupilotmega as mav
+
+from sitl.ardupilot.autopilot import ArduCopter
+from sitl.ardupilot.endpoint import ArduPilotEndpoint
+from sitl.ardupilot.flight_modes import Mode
+from sitl.ardupilot.guided import VelocitySetpoint
+from sitl.ardupilot.rc import IGNORE, PRIMARY_CHANNELS, RELEASE
+from sitl.ardupilot.sticks import Axes
+from sitl.firmware import AttitudeSetpoint
+from sitl.link.endpoint import Message
+from sitl.link.server import (
+    ACCEPTED,
+    COMMAND_FIELDS,
+    DENIED,
+    FAILED,
+    FORCE,
+    MAX_RC_FIELDS,
+    UNSUPPORTED,
+    MavlinkServer,
+    Params7,
+    send_ack,
+    sender_of,
+)
+from sitl.report import FlightLog
+from sitl.rotation import from_euler, rotate
+
+FORCE_REBOOT = 20190226.0  # param 6 of PREFLIGHT_REBOOT_SHUTDOWN: also while armed (ArduPilot)
+SIMPLE_MODE, SWITCH_LOW = 3.0, 0.0  # params of DO_AUX_FUNCTION
+_OPTION_GCS_ONLY = 1
+MAX_NORM_ERROR = 1e-3  # of the squared length of a quaternion
+
+_RATES_IGNORED = (
+    mav.ATTITUDE_TARGET_TYPEMASK_BODY_ROLL_RATE_IGNORE
+    | mav.ATTITUDE_TARGET_TYPEMASK_BODY_PITCH_RATE_IGNORE
+    | mav.ATTITUDE_TARGET_TYPEMASK_BODY_YAW_RATE_IGNORE
+)
+_POSITION_IGNORED = (
+    mav.POSITION_TARGET_TYPEMASK_X_IGNORE
+    | mav.POSITION_TARGET_TYPEMASK_Y_IGNORE
+    | mav.POSITION_TARGET_TYPEMASK_Z_IGNORE
+)
+_VELOCITY_IGNORED = (
+    mav.POSITION_TARGET_TYPEMASK_VX_IGNORE
+    | mav.POSITION_TARGET_TYPEMASK_VY_IGNORE
+    | mav.POSITION_TARGET_TYPEMASK_VZ_IGNORE
+)
+_NED_AXES = (mav.MAV_FRAME_LOCAL_NED, mav.MAV_FRAME_LOCAL_OFFSET_NED)
+_BODY_AXES = (mav.MAV_FRAME_BODY_NED, mav.MAV_FRAME_BODY_OFFSET_NED)
+
+
+class ArduPilotServer(MavlinkServer[ArduCopter, ArduPilotEndpoint]):
+    """ArduPilot's messages and commands."""
+
+    bad_interval = DENIED
+
+    def __init__(self, ap: ArduCopter, link_count: int, log: FlightLog) -> None:
+        super().__init__(ap, [ArduPilotEndpoint(ap) for _ in range(link_count)], log)
+        self._mode = ap.mode
+        self._handlers |= {
+            "HEARTBEAT": self._heartbeat,
+            "RC_CHANNELS_OVERRIDE": self._override,
+            "MANUAL_CONTROL": self._manual_control,
+            "SET_MODE": self._set_mode,
+            "SET_ATTITUDE_TARGET": self._attitude_target,
+            "SET_POSITION_TARGET_LOCAL_NED": self._position_target,
+            "REQUEST_DATA_STREAM": self._data_stream,
+            "MISSION_COUNT": self._refuse_mission,
+            "MISSION_CLEAR_ALL": self._refuse_mission,
+        }
+        self._commands |= {
+            mav.MAV_CMD_NAV_RETURN_TO_LAUNCH: lambda *_: self._to_mode(Mode.RTL),
+            mav.MAV_CMD_NAV_TAKEOFF: self._take_off,
+            mav.MAV_CMD_NAV_LAND: lambda *_: self._to_mode(Mode.LAND),
+            mav.MAV_CMD_DO_SET_MODE: self._do_set_mode,
+            mav.MAV_CMD_DO_AUX_FUNCTION: self._aux_function,
+            mav.MAV_CMD_PREFLIGHT_REBOOT_SHUTDOWN: self._reboot,
+            mav.MAV_CMD_COMPONENT_ARM_DISARM: self._arm_disarm,
+            mav.MAV_CMD_GET_HOME_POSITION: self._send_home,
+            mav.MAV_CMD_SET_MESSAGE_INTERVAL: self._set_interval,
+            mav.MAV_CMD_REQUEST_MESSAGE: self._request_message,
+            mav.MAV_CMD_REQUEST_AUTOPILOT_CAPABILITIES: self._send_version,
+        }
+
+    def restart(self, ap: ArduCopter) -> None:
+        """Serve a vehicle that has just booted."""
+        super().restart(ap)
+        self._mode = ap.mode
+
+    def _pass_on(self, link: ArduPilotEndpoint, message: Message) -> None:
+        """No-op: this vehicle forwards nothing."""
+
+    def _announce(self) -> None:
+        """A change of mode sends a heartbeat at once."""
+        if self._ap.mode is not self._mode:
+            self._mode = self._ap.mode
+            for link in self.links:
+                link.send_now(mav.MAVLINK_MSG_ID_HEARTBEAT)
+
+    def _is_accepted(self, message: Message) -> bool:
+        own = self._ap.system_id
+        gcs_only = self._ap.params.integer("MAV_OPTIONS") & _OPTION_GCS_ONLY
+        if gcs_only and message.get_srcSystem() != own and not self._is_from_gcs(message):
+            return False
+        if getattr(message, "target_system", 0) not in (0, own):
+            return False
+        # Commands mark unused parameters with NaN; each checks those that it reads.
+        values = [getattr(message, name) for name in message.fieldnames]
+        numbers = [value for value in values if isinstance(value, float)]
+        if message.get_type() not in COMMAND_FIELDS and not all(map(math.isfinite, numbers)):
+            self._log.refused_messages += 1
+            return False
+        return True
+
+    def _is_from_gcs(self, message: Message) -> bool:
+        low = self._ap.params.integer("MAV_GCS_SYSID")
+        high = max(low, self._ap.params.integer("MAV_GCS_SYSID_HI"))
+        return low <= int(message.get_srcSystem()) <= high
+
+    def _heartbeat(self, _link: ArduPilotEndpoint, message: Message, arrived_ns: int) -> None:
+        if self._is_from_gcs(message):
+            self._ap.gcs_failsafe.on_contact(arrived_ns)
+
+    def _override(self, _link: ArduPilotEndpoint, message: Message, arrived_ns: int) -> None:
+        if not self._is_from_gcs(message):
+            return
+        self._ap.gcs_failsafe.on_contact(arrived_ns)
+        raw_us = [getattr(message, f"chan{n}_raw") for n in range(1, MAX_RC_FIELDS + 1)]
+        primary = set(raw_us[:PRIMARY_CHANNELS])
+        if primary - {RELEASE, IGNORE}:
+            self._log.on_override(arrived_ns)
+        elif RELEASE in primary:
+            self._log.on_release(arrived_ns)
+        self._ap.rc.override(raw_us, arrived_ns)
+
+    def _manual_control(self, _link: ArduPilotEndpoint, message: Message, arrived_ns: int) -> None:
+        is_for_us = message.target == self._ap.system_id
+        if not is_for_us or not self._is_from_gcs(message):
+            return
+        self._ap.gcs_failsafe.on_contact(arrived_ns)
+        self._log.on_manual_control(arrived_ns)
+        self._ap.rc.manual_control(
+            x=message.x, y=message.y, z=message.z, r=message.r, now_ns=arrived_ns
+        )
+
+    def _attitude_target(self, _link: ArduPilotEndpoint, message: Message, arrived_ns: int) -> None:
+        ap = self._ap
+        if ap.guided is None:
+            return
+        setpoint = _attitude_setpoint(message)
+        if setpoint is not None:
+            ap.guided.follow_attitude(setpoint, ap.sensed, arrived_ns)
+            self._log.on_setpoint(arrived_ns)
+        elif ap.mode is Mode.GUIDED:
+            ap.guided.brake(ap.sensed)
+
+    def _position_target(self, _link: ArduPilotEndpoint, message: Message, arrived_ns: int) -> None:
+        """GUIDED_NOGPS ignores it."""
+        ap = self._ap
+        if ap.guided is None or ap.mode is not Mode.GUIDED:
+            return
+        setpoint = _velocity_setpoint(message, ap.yaw_rad)
+        if setpoint is None:
+            ap.guided.brake(ap.sensed)
+        else:
+            ap.guided.follow_velocity(setpoint, ap.sensed, arrived_ns)
+            self._log.on_setpoint(arrived_ns)
+
+    def _set_mode(self, link: ArduPilotEndpoint, message: Message, _arrived_ns: int) -> None:
+        has_mode = message.base_mode & mav.MAV_MODE_FLAG_CUSTOM_MODE_ENABLED
+        result = self._to_mode(message.custom_mode) if has_mode else DENIED
+        send_ack(link, message, mav.MAVLINK_MSG_ID_SET_MODE, result)
+
+    def _data_stream(self, link: ArduPilotEndpoint, message: Message, _arrived_ns: int) -> None:
+        rate_hz = message.req_message_rate if message.start_stop else 0
+        link.set_group(message.req_stream_id, rate_hz)
+
+    def _refuse_mission(self, link: ArduPilotEndpoint, message: Message, _arrived_ns: int) -> None:
+        sender, result = sender_of(message), mav.MAV_MISSION_UNSUPPORTED
+        link.send(mav.MAVLink_mission_ack_message(*sender, result, message.mission_type))
+
+    def _to_mode(self, number: float) -> int:
+        try:
+            mode = Mode(int(number))
+        except ValueError:
+            return FAILED
+        return ACCEPTED if self._ap.set_mode(mode) else FAILED
+
+    def _do_set_mode(self, params: Params7, _link: ArduPilotEndpoint) -> int:
+        if not _are_finite(params[:2]):
+            return DENIED
+        if not int(params[0]) & mav.MAV_MODE_FLAG_CUSTOM_MODE_ENABLED:
+            return DENIED
+        return self._to_mode(params[1])
+
+    def _arm_disarm(self, params: Params7, _link: ArduPilotEndpoint) -> int:
+        if params[0] not in (0.0, 1.0):
+            return UNSUPPORTED
+        force = params[1] == FORCE
+        done = self._ap.arm(force=force) if params[0] else self._ap.disarm(force=force)
+        return ACCEPTED if done else FAILED
+
+    def _set_interval(self, params: Params7, link: ArduPilotEndpoint) -> int:
+        if not _are_finite(params[:2]) or params[2] != 0.0:
+            return DENIED
+        refusal = link.set_interval(int(params[0]), int(params[1]))
+        if refusal is None:
+            return ACCEPTED
+        link.send_text(mav.MAV_SEVERITY_INFO, refusal)
+        return DENIED
+
+    def _request_message(self, params: Params7, link: ArduPilotEndpoint) -> int:
+        if not _are_finite(params[:1]):
+            return DENIED
+        if int(params[0]) == mav.MAVLINK_MSG_ID_MESSAGE_INTERVAL:
+            return self._get_interval(params[1:], link)
+        return ACCEPTED if link.send_now(int(params[0])) else FAILED
+
+    def _send_home(self, _params: Params7, link: ArduPilotEndpoint) -> int:
+        link.send_now(mav.MAVLINK_MSG_ID_HOME_POSITION)
+        return ACCEPTED
+
+    def _send_version(self, _params: Params7, link: ArduPilotEndpoint) -> int:
+        link.send_now(mav.MAVLINK_MSG_ID_AUTOPILOT_VERSION)
+        return ACCEPTED
+
+    def _take_off(self, params: Params7, _link: ArduPilotEndpoint) -> int:
+        height_m = params[6]
+        return ACCEPTED if math.isfinite(height_m) and self._ap.take_off(height_m) else FAILED
+
+    def _aux_function(self, params: Params7, _link: ArduPilotEndpoint) -> int:
+        """Simple mode off is the one function that this vehicle takes from a command."""
+        if params[:2] != (SIMPLE_MODE, SWITCH_LOW):
+            return FAILED
+        self._ap.simple.axes = Axes.VEHICLE
+        return ACCEPTED
+
+    def _reboot(self, params: Params7, _link: ArduPilotEndpoint) -> int:
+        if self._ap.armed and params[5] != FORCE_REBOOT:
+            return FAILED
+        if params[0] not in (1.0, 3.0):
+            return UNSUPPORTED
+        self.reboot_requested = True
+        return ACCEPTED
+
+
+def _are_finite(params: Params7) -> bool:
+    return all(map(math.isfinite, params))
+
+
+def _attitude_setpoint(message: Message) -> AttitudeSetpoint | None:
+    mask = message.type_mask
+    ignored_rates = mask & _RATES_IGNORED
+    if mask & mav.ATTITUDE_TARGET_TYPEMASK_THROTTLE_IGNORE:
+        return None
+    if ignored_rates not in (0, _RATES_IGNORED):
+        return None
+    attitude = None
+    if not mask & mav.ATTITUDE_TARGET_TYPEMASK_ATTITUDE_IGNORE:
+        w, x, y, z = message.q
+        norm = w * w + x * x + y * y + z * z
+        if not abs(norm - 1.0) <= MAX_NORM_ERROR:  # also not a number
+            return None
+        length = math.sqrt(norm)
+        attitude = (w / length, x / length, y / length, z / length)
+    rate = (message.body_roll_rate, message.body_pitch_rate, message.body_yaw_rate)
+    return AttitudeSetpoint(attitude, (0.0, 0.0, 0.0) if ignored_rates else rate, message.thrust)
+
+
+def _velocity_setpoint(message: Message, heading_rad: float) -> VelocitySetpoint | None:
+    """The velocity in NED axes; accelerations and a heading in the message have no effect."""
+    mask = message.type_mask
+    if mask & _VELOCITY_IGNORED or mask & _POSITION_IGNORED != _POSITION_IGNORED:
+        return None
+    velocity_mps = (message.vx, message.vy, message.vz)
+    if message.coordinate_frame in _BODY_AXES:
+        velocity_mps = rotate(from_euler(0.0, 0.0, heading_rad), velocity_mps)
+    elif message.coordinate_frame not in _NED_AXES:
+        return None
+    has_rate = not mask & mav.POSITION_TARGET_TYPEMASK_YAW_RATE_IGNORE
+    return VelocitySetpoint(velocity_mps, message.yaw_rate if has_rate else 0.0)

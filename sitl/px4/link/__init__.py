@@ -1,1 +1,0 @@
-"""PX4's side of MAVLink: who is obeyed, what is sent, how often."""

@@ -1,0 +1,230 @@
+"""Receives MAVLink on all links of a PX4 vehicle, and forwards between them.
+
+Nobody is filtered: sticks, setpoints and commands of any system are taken if they are addressed to
+the vehicle or to everybody.
+"""
+
+import math
+
+from pymavlink.dialects.v20 import ardupilotmega as mav
+
+from sitl.firmware import AttitudeSetpoint
+from sitl.link.endpoint import Message
+from sitl.link.server import (
+    ACCEPTED,
+    DENIED,
+    FAILED,
+    FORCE,
+    MAX_RC_FIELDS,
+    REJECTED,
+    MavlinkServer,
+    Params7,
+    send_ack,
+    sender_of,
+)
+from sitl.px4.autopilot import Px4
+from sitl.px4.endpoint import Px4Endpoint
+from sitl.px4.flight import PositionSetpoint, Setpoint
+from sitl.px4.messages import HOME
+from sitl.px4.modes import Mode, mode_of
+from sitl.px4.sticks import from_manual_control
+from sitl.report import FlightLog
+from sitl.rotation import Vec3, from_heading
+
+_RC_IGNORE = 65535
+_IGNORE_ATTITUDE = mav.ATTITUDE_TARGET_TYPEMASK_ATTITUDE_IGNORE
+_IGNORE_RATES = 0b111
+_IGNORE_YAW_RATE = 0b100
+_IGNORE_POSITION, _IGNORE_VELOCITY = 0b111, 0b111 << 3
+_IGNORE_YAW, _IGNORE_YAW_SPEED = 1 << 10, 1 << 11
+
+
+class Px4Server(MavlinkServer[Px4, Px4Endpoint]):
+    """PX4's messages and commands; it denies a reboot in simulation."""
+
+    bad_interval = FAILED
+
+    def __init__(self, ap: Px4, link_count: int, log: FlightLog) -> None:
+        onboard = ap.config.onboard_links
+        links = [Px4Endpoint(ap, is_onboard=n in onboard) for n in range(link_count)]
+        super().__init__(ap, links, log)
+        self._handlers |= {
+            "HEARTBEAT": self._heartbeat,
+            "MANUAL_CONTROL": self._manual_control,
+            "RC_CHANNELS_OVERRIDE": self._override,
+            "SET_MODE": self._set_mode,
+            "SET_ATTITUDE_TARGET": self._set_attitude_target,
+            "SET_POSITION_TARGET_LOCAL_NED": self._set_position_target,
+        }
+        self._commands |= {
+            mav.MAV_CMD_NAV_RETURN_TO_LAUNCH: lambda *_: self._to_mode(Mode.AUTO_RTL),
+            mav.MAV_CMD_NAV_LAND: lambda *_: self._to_mode(Mode.AUTO_LAND),
+            mav.MAV_CMD_NAV_TAKEOFF: self._takeoff,
+            mav.MAV_CMD_DO_FLIGHTTERMINATION: self._terminate,
+            mav.MAV_CMD_PREFLIGHT_REBOOT_SHUTDOWN: self._reboot,
+            mav.MAV_CMD_COMPONENT_ARM_DISARM: self._arm_disarm,
+            mav.MAV_CMD_SET_MESSAGE_INTERVAL: self._set_interval,
+            mav.MAV_CMD_REQUEST_MESSAGE: self._request_message,
+        }
+
+    def _announce(self) -> None:
+        """Events go out before the texts."""
+        events = self._ap.commander.events
+        for event in events:
+            for link in self.links:
+                link.send_event(event)
+        events.clear()
+
+    def _is_accepted(self, message: Message) -> bool:
+        system = getattr(message, "target_system", getattr(message, "target", 0))
+        component = getattr(message, "target_component", 0)
+        is_ours = component in (0, mav.MAV_COMP_ID_AUTOPILOT1)
+        return system in (0, self._ap.system_id) and is_ours
+
+    def _pass_on(self, link: Px4Endpoint, message: Message) -> None:
+        """Forward a frame to the other links, as it is.
+
+        What is addressed to everybody goes everywhere; MANUAL_CONTROL counts as such, since its
+        target is no ordinary target field. The rest goes where its addressee was heard.
+        """
+        link.heard.add(sender_of(message))
+        system = getattr(message, "target_system", 0)
+        component = getattr(message, "target_component", 0)
+        if (system, component) == (self._ap.system_id, mav.MAV_COMP_ID_AUTOPILOT1):
+            return
+        is_heartbeat = message.get_type() == "HEARTBEAT"
+        if is_heartbeat and message.type != mav.MAV_TYPE_GCS:
+            return
+        for other in self.links:
+            if other is link:
+                continue
+            heard = any(
+                system in (0, known_system) and component in (0, known_component)
+                for known_system, known_component in other.heard
+            )
+            if system == 0 or heard:
+                other.pass_on(bytes(message.get_msgbuf()))
+
+    def _heartbeat(self, link: Px4Endpoint, message: Message, _arrived_ns: int) -> None:
+        if message.type == mav.MAV_TYPE_GCS:
+            link.has_gcs = True
+
+    def _manual_control(self, link: Px4Endpoint, message: Message, arrived_ns: int) -> None:
+        self._log.on_manual_control(arrived_ns)
+        sticks = from_manual_control(message.x, message.y, message.z, message.r)
+        self._ap.stick_input.on_sticks(self.links.index(link), sticks, arrived_ns)
+
+    def _override(self, _link: Px4Endpoint, message: Message, arrived_ns: int) -> None:
+        """No override: the values become those of a receiver."""
+        self._log.on_override(arrived_ns)
+        values = [getattr(message, f"chan{n}_raw") for n in range(1, MAX_RC_FIELDS + 1)]
+        self._ap.set_receiver([0 if value == _RC_IGNORE else value for value in values])
+
+    def _set_attitude_target(self, _link: Px4Endpoint, message: Message, arrived_ns: int) -> None:
+        mask = message.type_mask
+        rates: Vec3 = (message.body_roll_rate, message.body_pitch_rate, message.body_yaw_rate)
+        if not mask & _IGNORE_ATTITUDE:
+            yaw_rate = 0.0 if mask & _IGNORE_YAW_RATE else message.body_yaw_rate
+            w, x, y, z = message.q
+            length = math.sqrt(w * w + x * x + y * y + z * z)
+            if not (math.isfinite(length) and length > 0.5 and math.isfinite(yaw_rate)):
+                self._log.refused_messages += 1
+                return
+            attitude = (w / length, x / length, y / length, z / length)
+            setpoint = AttitudeSetpoint(attitude, (0.0, 0.0, yaw_rate), _thrust(message))
+            self._follow(setpoint, arrived_ns)
+        elif not mask & _IGNORE_RATES and all(map(math.isfinite, rates)):
+            self._follow(AttitudeSetpoint(None, rates, _thrust(message)), arrived_ns)
+
+    def _set_position_target(self, link: Px4Endpoint, message: Message, arrived_ns: int) -> None:
+        frame, mask = message.coordinate_frame, message.type_mask
+        if frame not in (mav.MAV_FRAME_LOCAL_NED, mav.MAV_FRAME_BODY_NED):
+            self._ap.commander.refuse_frame(frame)
+            return
+        velocity: Vec3 | None = (message.vx, message.vy, message.vz)
+        position: Vec3 | None = (message.x, message.y, message.z)
+        is_body = frame == mav.MAV_FRAME_BODY_NED
+        if mask & _IGNORE_VELOCITY or velocity is None:
+            velocity = None
+        elif is_body:
+            forward, right, down = velocity
+            velocity = (*from_heading(forward, right, self._ap.yaw_rad), down)
+        if mask & _IGNORE_POSITION or is_body:
+            position = None
+        if velocity is None and position is None:
+            return
+        yaw = None if mask & _IGNORE_YAW else message.yaw
+        yaw_rate = 0.0 if mask & _IGNORE_YAW_SPEED else message.yaw_rate
+        numbers = (*(velocity or ()), *(position or ()), yaw_rate, 0.0 if yaw is None else yaw)
+        if not all(map(math.isfinite, numbers)):
+            self._log.refused_messages += 1
+            return
+        self._follow(PositionSetpoint(position, velocity, yaw, yaw_rate), arrived_ns)
+
+    def _follow(self, setpoint: Setpoint, arrived_ns: int) -> None:
+        self._ap.set_setpoint(setpoint, arrived_ns)
+        if self._ap.mode_name == "OFFBOARD":
+            self._log.on_setpoint(arrived_ns)
+
+    def _set_mode(self, link: Px4Endpoint, message: Message, _arrived_ns: int) -> None:
+        """The old message: acknowledged as the command that replaced it."""
+        main, sub = message.custom_mode >> 16 & 0xFF, message.custom_mode >> 24 & 0xFF
+        result = self._change_mode(message, message.base_mode, main, sub)
+        send_ack(link, message, mav.MAV_CMD_DO_SET_MODE, result)
+
+    def _execute(self, message: Message, params: Params7, link: Px4Endpoint) -> int | None:
+        """As in the base; a change of mode depends on who asks."""
+        if message.command == mav.MAV_CMD_DO_SET_MODE:
+            return self._change_mode(message, *params[:3])
+        return super()._execute(message, params, link)
+
+    def _change_mode(self, message: Message, base_mode: float, main: float, sub: float) -> int:
+        """Change to a custom mode; a refusal becomes a text only for ground stations."""
+        if not all(map(math.isfinite, (base_mode, main, sub))):
+            return REJECTED
+        mode = mode_of(int(main), int(sub))
+        if not int(base_mode) & mav.MAV_MODE_FLAG_CUSTOM_MODE_ENABLED or mode is None:
+            return REJECTED
+        is_station = message.get_srcComponent() == mav.MAV_COMP_ID_MISSIONPLANNER
+        return self._to_mode(mode, says_why=is_station)
+
+    def _to_mode(self, mode: Mode, *, says_why: bool = True) -> int:
+        if mode is Mode.AUTO_TAKEOFF:
+            self._ap.prepare_takeoff(None)
+        return ACCEPTED if self._ap.commander.set_mode(mode, says_why=says_why) else REJECTED
+
+    def _arm_disarm(self, params: Params7, _link: Px4Endpoint) -> int | None:
+        if params[0] not in (0.0, 1.0):
+            return None
+        force, commander = params[1] == FORCE, self._ap.commander
+        done = commander.arm() if params[0] else commander.disarm(force=force)
+        return ACCEPTED if done else REJECTED
+
+    def _takeoff(self, params: Params7, _link: Px4Endpoint) -> int:
+        """Param 7 is an altitude above sea level; NaN: MIS_TAKEOFF_ALT above here."""
+        height_m = params[6] - HOME.alt_m
+        self._ap.prepare_takeoff(height_m if math.isfinite(height_m) else None)
+        return ACCEPTED if self._ap.commander.set_mode(Mode.AUTO_TAKEOFF) else REJECTED
+
+    def _set_interval(self, params: Params7, link: Px4Endpoint) -> int:
+        is_plain = params[2] == 0.0 and params[6] == 0.0
+        if not is_plain or not all(map(math.isfinite, params[:2])):
+            return FAILED
+        return ACCEPTED if link.set_interval(int(params[0]), int(params[1])) else FAILED
+
+    def _request_message(self, params: Params7, link: Px4Endpoint) -> int:
+        is_known = math.isfinite(params[0]) and link.send_now(int(params[0]))
+        return ACCEPTED if is_known else DENIED
+
+    def _terminate(self, params: Params7, _link: Px4Endpoint) -> int:
+        if params[0] > 0.5:
+            self._ap.commander.terminate()
+        return ACCEPTED
+
+    def _reboot(self, params: Params7, _link: Px4Endpoint) -> int:
+        """Zero asks for nothing; a reboot is refused while armed, and always in SITL."""
+        return ACCEPTED if math.isfinite(params[0]) and int(params[0]) == 0 else DENIED
+
+
+def _thrust(message: Message) -> float:
+    return max(0.0, min(1.0, message.thrust)) if math.isfinite(message.thrust) else 0.0

@@ -1,0 +1,113 @@
+"""Parameters of both firmwares: names, order, types, units, and refusal of bad values."""
+
+import math
+import struct
+
+import pytest
+from pymavlink.dialects.v20 import ardupilotmega as mav
+
+from sitl.ardupilot.params import ArduPilotParams
+from sitl.px4.params import Px4Params
+from sitl.vehicle.conditions import random_conditions
+
+BOTH = pytest.mark.parametrize(
+    ("make", "seconds"), [(ArduPilotParams, "RC_OVERRIDE_TIME"), (Px4Params, "COM_OF_LOSS_T")]
+)
+"""A firmware's parameters, and one of them that is a duration."""
+
+
+@BOTH
+def test_names_are_sorted_and_fit_the_wire(make, seconds):
+    names = make().names
+
+    assert list(names) == sorted(names)
+    assert all(len(name) <= 16 for name in names)
+
+
+@BOTH
+def test_values_are_float32_and_travel_as_themselves(make, seconds):
+    params = make()
+
+    assert params.kind(seconds) == mav.MAV_PARAM_TYPE_REAL32
+    assert params.set_on_wire(seconds, 0.1)
+    assert params[seconds] != 0.1
+    assert params[seconds] == params.on_wire(seconds) == pytest.approx(0.1, rel=1e-7)
+
+
+@BOTH
+@pytest.mark.parametrize("value", [math.nan, math.inf, -math.inf, 1e39])
+def test_what_is_no_float32_is_refused(make, seconds, value):
+    params = make()
+    before = params[seconds]
+
+    assert not params.set(seconds, value)
+    assert params[seconds] == before
+
+
+@BOTH
+def test_unknown_names_are_refused(make, seconds):
+    params = make()
+
+    assert not params.set("SYSID_MYGCS", 1.0)
+    assert "SYSID_MYGCS" not in params.names
+
+
+@pytest.mark.parametrize(
+    ("name", "default"),
+    [("RC_OVERRIDE_TIME", 3.0), ("RC_FS_TIMEOUT", 1.0), ("MAV_GCS_SYSID", 255.0), ("RC3_DZ", 30.0)],
+)
+def test_defaults_are_the_firmware_s(name, default):
+    assert ArduPilotParams()[name] == default
+
+
+@pytest.mark.parametrize(
+    ("release", "present", "absent"),
+    [
+        ("4.6", ("SYSID_THISMAV", "SYSID_MYGCS", "SYSID_ENFORCE", "ANGLE_MAX"), "MAV_GCS_SYSID_HI"),
+        ("4.7-dev", ("MAV_SYSID", "MAV_GCS_SYSID", "MAV_OPTIONS", "PILOT_SPEED_UP"), "WP_SPD_UP"),
+        ("4.7", ("MAV_SYSID", "ATC_ANGLE_MAX", "PILOT_SPD_UP", "RTL_ALT_M"), "ANGLE_MAX"),
+    ],
+)
+def test_a_release_answers_to_its_own_names_alone(release, present, absent):
+    names = ArduPilotParams(release=release).names
+
+    assert set(present) <= set(names)
+    assert absent not in names
+    assert len(set(names)) == len(names) == len(ArduPilotParams().names) - (release == "4.6")
+
+
+def test_release_4_7_speaks_of_metres_and_degrees():
+    params = ArduPilotParams(release="4.7")
+
+    assert params.on_wire("ATC_ANGLE_MAX") == pytest.approx(30.0)
+    assert params.on_wire("PILOT_SPD_UP") == pytest.approx(2.5)
+    assert params.set_on_wire("RTL_ALT_M", 20.0)
+    assert params["RTL_ALT"] == pytest.approx(2000.0)
+    assert not params.set_on_wire("RTL_ALT", 1500.0)
+
+
+def test_an_integer_of_px4_travels_as_its_bytes():
+    def as_float(value):
+        return struct.unpack("<f", struct.pack("<i", value))[0]
+
+    params = Px4Params()
+
+    assert params.kind("NAV_RCL_ACT") == mav.MAV_PARAM_TYPE_INT32
+    assert params.on_wire("NAV_RCL_ACT") == as_float(2)
+    assert params.set_on_wire("NAV_RCL_ACT", as_float(3))
+    assert params.integer("NAV_RCL_ACT") == 3
+    assert not params.set("NAV_RCL_ACT", 2.0**31)
+
+
+def test_a_receiver_is_mapped():
+    assert Px4Params()["RC_MAP_THROTTLE"] == 0
+    assert Px4Params(receiver=True)["RC_MAP_THROTTLE"] == 3
+
+
+def test_other_vehicles_have_other_settings():
+    nominal, drawn = Px4Params(), Px4Params(random_conditions(8))
+    varied = {name for name in nominal.names if drawn[name] != nominal[name]}
+
+    assert varied >= {"MPC_MAN_TILT_MAX", "MPC_MAN_Y_MAX", "MPC_Z_VEL_MAX_DN", "MC_ROLLRATE_P"}
+    assert 35.0 <= drawn["MPC_MAN_TILT_MAX"] <= 52.5
+    assert 1.07 <= drawn["MPC_Z_VEL_MAX_DN"] <= 2.1
