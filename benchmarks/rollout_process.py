@@ -14,7 +14,7 @@ import torch
 from cyclopts import App, Parameter
 from rich.console import Console
 
-from mavbridge.commands.bench.results import to_json
+from benchmarks.results import to_json
 from mavbridge.commands.imagine.deciders import WorldModelDecider
 from mavbridge.commands.imagine.loop import RolloutPlan
 from mavbridge.commands.imagine.output import SerialOutput

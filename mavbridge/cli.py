@@ -13,7 +13,6 @@ from cyclopts.config import Dict
 from rich.text import Text
 
 import mavbridge
-from mavbridge.commands.bench.config import BenchConfig
 from mavbridge.commands.check.config import CheckConfig
 from mavbridge.commands.contract.config import ContractConfig
 from mavbridge.commands.demonstrate.config import DemonstrateConfig
@@ -97,8 +96,8 @@ def fly(config: FlyConfig | None = None) -> int:
 
 @cli.command
 def check(config: CheckConfig | None = None) -> int:
-    """Say whether a flight could begin: give it the flags of the flight. --policy none and
-    --camera none leave those out. Exit status: 0 go, 3 no-go."""
+    """Say whether a flight could begin: give it the flags of the flight. --connect none, --policy
+    none and --camera none leave those out. Exit status: 0 go, 3 no-go."""
     if config is None or not config.flight.link.connect:
         raise UserError("name the vehicle: --connect udp:127.0.0.1:14550 (see --help)")
     require_supported_system()
@@ -157,14 +156,6 @@ def inspect(*flights: Path, config: InspectConfig | None = None) -> int:
     from mavbridge.commands.inspect.run import inspect as run_inspection
 
     return run_inspection(flights, config or InspectConfig())
-
-
-@cli.command
-def bench(config: BenchConfig | None = None) -> int:
-    """Measure this machine with one policy: engines, both loops in simulated flight, the link."""
-    from mavbridge.commands.bench.run import bench as run_bench
-
-    return run_bench(BenchConfig() if config is None else config)
 
 
 @cli.command

@@ -5,9 +5,7 @@ import pytest
 
 from helpers.bench_results import RESULT
 
-figure = pytest.importorskip(
-    "mavbridge.commands.bench.figure", reason="the figure needs the extra 'bench'"
-)
+figure = pytest.importorskip("benchmarks.figure", reason="the figure needs the extra 'bench'")
 
 
 @pytest.fixture

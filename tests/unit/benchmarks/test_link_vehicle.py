@@ -1,7 +1,7 @@
 import numpy as np
 
-from mavbridge.commands.bench.link_process import repeat_roll_rate
-from mavbridge.commands.bench.link_vehicle import (
+from benchmarks.link import repeat_roll_rate
+from benchmarks.link_vehicle import (
     CODES,
     PARAMS,
     PENDING_LIMIT,

@@ -1,26 +1,32 @@
-"""Client of the link test: gate and policy loop, with a policy that repeats the roll rate.
+"""The latency of the link: clients in turn against one vehicle that times their answers.
 
-``python -m mavbridge.commands.bench.link_process --port P --out FILE``. No torch is loaded and no
-camera runs, but every attitude goes the way of a flight's: from the socket through the gate to the
-flight process, through the policy loop, and as a chunk back to the gate.
+Our client, ``python -m benchmarks.link --port P --out FILE``, is gate and policy loop with a policy
+that repeats the roll rate. No torch is loaded and no camera runs, but every attitude goes the way
+of a flight's: from the socket through the gate to the flight process, through the policy loop, and
+as a chunk back to the gate.
 """
 
 import signal
+import sys
 import threading
 from collections.abc import Callable
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
+from tempfile import TemporaryDirectory
 
 import numpy as np
 from cyclopts import App
 
-from mavbridge.commands.bench.link_vehicle import ATTITUDE_HZ
-from mavbridge.commands.bench.results import ClientTiming, to_json
+from benchmarks.link_vehicle import ATTITUDE_HZ, CONNECT_S, Answers
+from benchmarks.results import OURS, ClientTiming, LinkLatency, from_json, to_json
+from mavbridge.commands.output import print_status
 from mavbridge.config.flight import FlyConfig, Limits, LinkConfig
 from mavbridge.config.rates import Rates
 from mavbridge.core.clock import NS_PER_S, MonotonicClock
+from mavbridge.core.errors import UserError
 from mavbridge.core.histogram import Histogram
+from mavbridge.core.processes import end, free_port, log_tail, running, wait
 from mavbridge.core.realtime import settle_process, settle_thread
 from mavbridge.core.records import Event, FeatureFrame, FloatArray, Frame, Tick
 from mavbridge.core.workers import Worker
@@ -32,6 +38,10 @@ from mavbridge.gate.departure import Ending
 from policy.contract import ACTION_DIM, ACTION_NAMES, RATE, Contract
 from policy.protocol import Executable
 
+LINK_PROCESS = "benchmarks.link"
+LINK_VEHICLE = "benchmarks.link_vehicle"
+STARTING_S = 15.0
+"""For imports, beside what the vehicle gives a client to connect."""
 ROLL = ACTION_NAMES.index("roll")
 MOST_CHUNKS_HZ = 200.0
 """Twice the vehicle's rate: an attitude that follows a late one closely is answered at once."""
@@ -40,6 +50,59 @@ WATCH_S = 0.1
 END_S = 5.0
 """For the release of a vehicle that may be gone already, and for threads to end."""
 app = App(help=__doc__)
+
+
+@dataclass(frozen=True, kw_only=True)
+class LinkClient:
+    """A program that answers each attitude with sticks."""
+
+    name: str
+    command: tuple[str, ...]
+    """``--port P`` is appended."""
+    writes_timing: bool = False
+    """Takes ``--out FILE``, too, and writes a ``ClientTiming`` there."""
+
+
+OUR_CLIENT = LinkClient(name=OURS, command=(sys.executable, "-m", LINK_PROCESS), writes_timing=True)
+
+
+def time_link(client: LinkClient, attitudes: int) -> LinkLatency:
+    """Time one client.
+
+    Raises:
+        UserError: the client or the vehicle failed; quotes the end of both logs.
+    """
+    print_status(f"link: {client.name}")
+    port = str(free_port())
+    timeout_s = STARTING_S + CONNECT_S + 1.1 * attitudes / ATTITUDE_HZ
+    with TemporaryDirectory(prefix="mavbridge-bench-") as name:
+        folder = Path(name)
+        log, vehicle_log = folder / "client.log", folder / "vehicle.log"
+        timing, answers = folder / "timing.json", folder / "answers.json"
+        own = ("--out", str(timing)) if client.writes_timing else ()
+        vehicle_command = (
+            *(sys.executable, "-m", LINK_VEHICLE, "--port", port),
+            *("--attitudes", str(attitudes), "--out", str(answers)),
+        )
+        with (
+            running(*client.command, "--port", port, *own, log=log) as process,
+            running(*vehicle_command, log=vehicle_log) as vehicle,
+        ):
+            try:
+                wait(vehicle, f"python -m {LINK_VEHICLE}", vehicle_log, timeout_s)
+            except UserError as error:
+                raise UserError(f"{client.name}: {error}\nits log: {log_tail(log)}") from error
+            end(process)
+        counted = from_json(Answers, answers.read_text())
+        if counted.round_trip_ms is None:
+            raise UserError(f"{client.name} answered no attitude; its log: {log_tail(log)}")
+        return LinkLatency(
+            client=client.name,
+            sent=counted.sent,
+            answered=counted.answered,
+            round_trip_ms=counted.round_trip_ms,
+            timing=from_json(ClientTiming, timing.read_text()) if own else ClientTiming(),
+        )
 
 
 @app.default

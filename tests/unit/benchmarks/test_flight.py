@@ -4,9 +4,8 @@ import numpy as np
 import pytest
 from cyclopts import App
 
+from benchmarks.flight import CLIMB_STICK, FlightJob, ReleaseWatch, level_climb, to_flags
 from helpers.factories import make_released_tick, make_state, make_tick, make_vision_tick
-from mavbridge.commands.bench.flight import FlightJob, to_flags
-from mavbridge.commands.bench.flight_process import CLIMB_STICK, ReleaseWatch, level_climb
 from mavbridge.config.policy import PolicyConfig
 from mavbridge.config.rates import Rates
 from policy.contract import Contract

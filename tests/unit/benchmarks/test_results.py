@@ -4,8 +4,7 @@ from io import StringIO
 import pytest
 from rich.console import Console
 
-from helpers.bench_results import RESULT, all_equal, make_flight
-from mavbridge.commands.bench.results import (
+from benchmarks.results import (
     BenchResult,
     ClientTiming,
     Flight,
@@ -15,6 +14,7 @@ from mavbridge.commands.bench.results import (
     solves_of,
     to_json,
 )
+from helpers.bench_results import RESULT, all_equal, make_flight
 from mavbridge.config.policy import PolicyConfig
 from mavbridge.core.vehicle import Percentiles
 

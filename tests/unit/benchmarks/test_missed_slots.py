@@ -2,10 +2,8 @@ from pathlib import Path
 
 import pytest
 
-from helpers.factories import make_released_tick, make_tick, make_vision_tick
-from helpers.fakes import FakeClock
-from mavbridge.commands.bench import missed_slots
-from mavbridge.commands.bench.missed_slots import (
+from benchmarks import missed_slots
+from benchmarks.missed_slots import (
     Cause,
     Counters,
     GateProbe,
@@ -14,6 +12,8 @@ from mavbridge.commands.bench.missed_slots import (
     stolen_ms_since,
     stolen_ns,
 )
+from helpers.factories import make_released_tick, make_tick, make_vision_tick
+from helpers.fakes import FakeClock
 from mavbridge.core.clock import NS_PER_MS
 from mavbridge.core.records import Tick
 

@@ -7,7 +7,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 import torch
 
-from mavbridge.commands.bench.results import EngineTiming, name_of
+from benchmarks.results import EngineTiming, name_of
 from mavbridge.commands.output import print_status
 from mavbridge.config.policy import Engine, PolicyConfig
 from mavbridge.core.clock import NS_PER_S, MonotonicClock

@@ -9,8 +9,8 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import FuncFormatter, NullFormatter
 
-from mavbridge.commands.bench.engines import EAGER
-from mavbridge.commands.bench.results import OURS, BenchResult, EngineTiming, Flight
+from benchmarks.engines import EAGER
+from benchmarks.results import OURS, BenchResult, EngineTiming, Flight
 from mavbridge.commands.output import (
     BLUE,
     FIGURE_DPI,

@@ -1,6 +1,6 @@
 import pytest
 
-from mavbridge.commands.bench.engines import BOTH, CHUNK, ENCODE, time_engines
+from benchmarks.engines import BOTH, CHUNK, ENCODE, time_engines
 from mavbridge.config.policy import PolicyConfig
 from policy.errors import PolicyError
 

@@ -1,7 +1,7 @@
 import pytest
 
+from benchmarks.flight import FlightMeter
 from helpers.factories import make_released_tick, make_tick, make_vision_tick
-from mavbridge.commands.bench.flight_process import FlightMeter
 
 
 def test_what_comes_before_the_first_action_does_not_count() -> None:

@@ -15,7 +15,7 @@ from pathlib import Path
 from cyclopts import App
 from pymavlink.dialects.v20 import ardupilotmega as mav
 
-from mavbridge.commands.bench.results import to_json
+from benchmarks.results import to_json
 from mavbridge.core.clock import NS_PER_MS, NS_PER_S, Clock, MonotonicClock
 from mavbridge.core.histogram import Histogram
 from mavbridge.core.vehicle import Percentiles

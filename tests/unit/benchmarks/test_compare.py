@@ -4,17 +4,17 @@ from pathlib import Path
 
 import pytest
 
+from benchmarks import compare
+from benchmarks.compare import BenchOutputs
+from benchmarks.results import BenchResult
 from helpers.bench_results import RESULT
-from mavbridge.commands.bench import run
-from mavbridge.commands.bench.config import BenchConfig, BenchOutputs
-from mavbridge.commands.bench.results import BenchResult
 from mavbridge.core.errors import UserError
 
 
 @pytest.fixture
 def canned(monkeypatch: pytest.MonkeyPatch) -> None:
     """A run that takes no time."""
-    monkeypatch.setattr(run, "measure", lambda *_, **__: RESULT)
+    monkeypatch.setattr(compare, "measure", lambda *_, **__: RESULT)
 
 
 @pytest.fixture
@@ -24,7 +24,7 @@ def forbidden(monkeypatch: pytest.MonkeyPatch) -> None:
     def measure(*_: object, **__: object) -> BenchResult:
         return pytest.fail("the benchmark ran before its arguments were looked at")
 
-    monkeypatch.setattr(run, "measure", measure)
+    monkeypatch.setattr(compare, "measure", measure)
 
 
 @pytest.fixture
@@ -45,7 +45,7 @@ def test_exit_status_tells_whether_the_budget_holds(
     most: float,
     status: int,
 ) -> None:
-    assert run.bench(BenchConfig(outputs=BenchOutputs(check=budget(most)))) == status
+    assert compare.main(BenchOutputs(check=budget(most))) == status
     out = capsys.readouterr().out
     assert ("over budget: toge, encode: torch / roofline f32: 3," in out) == bool(status)
 
@@ -53,7 +53,7 @@ def test_exit_status_tells_whether_the_budget_holds(
 @pytest.mark.usefixtures("canned")
 def test_writes_json_into_a_folder_that_is_made(tmp_path: Path) -> None:
     path = tmp_path / "new" / "bench.json"
-    assert run.bench(BenchConfig(outputs=BenchOutputs(json=path))) == 0
+    assert compare.main(BenchOutputs(json=path)) == 0
     assert json.loads(path.read_text())["machine"]["cpu"] == "some cpu"
 
 
@@ -61,12 +61,12 @@ def test_writes_json_into_a_folder_that_is_made(tmp_path: Path) -> None:
 @pytest.mark.parametrize("flag", ["json", "plot", "check"])
 def test_what_cannot_be_used_is_refused_before_the_run(tmp_path: Path, flag: str) -> None:
     with pytest.raises(UserError):
-        run.bench(BenchConfig(outputs=BenchOutputs(**{flag: tmp_path})))  # a folder
+        compare.main(BenchOutputs(**{flag: tmp_path}))  # a folder
 
 
 def test_ctrl_c_is_no_traceback(monkeypatch: pytest.MonkeyPatch) -> None:
     def interrupted(*_: object, **__: object) -> BenchResult:
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(run, "measure", interrupted)
-    assert run.bench(BenchConfig()) == run.INTERRUPTED
+    monkeypatch.setattr(compare, "measure", interrupted)
+    assert compare.main() == compare.INTERRUPTED

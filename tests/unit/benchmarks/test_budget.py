@@ -4,8 +4,8 @@ from pathlib import Path
 
 import pytest
 
+from benchmarks.compare import ratios, read_budget, violations
 from helpers.bench_results import RESULT, make_flight
-from mavbridge.commands.bench.run import ratios, read_budget, violations
 from mavbridge.core.errors import UserError
 
 
@@ -65,7 +65,7 @@ def test_nan_is_over_every_budget() -> None:
 
 
 def test_reads_what_the_repository_holds() -> None:
-    path = Path(__file__).parents[4] / "benchmarks" / "budget.json"
+    path = Path(__file__).parents[3] / "benchmarks" / "budget.json"
     budget = read_budget(path)
     assert budget == json.loads(path.read_text())["ratios"]
     assert all(most > 0 for most in budget.values())
