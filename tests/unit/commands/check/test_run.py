@@ -10,11 +10,10 @@ from rich.console import Console
 
 from helpers.fakes import FakeClock
 from mavbridge import cli
-from mavbridge.commands.check.config import CheckConfig
 from mavbridge.commands.check.policy import Pace, check_policy
-from mavbridge.commands.check.rows import Row, as_document, overall
+from mavbridge.commands.check.rows import Row, as_document, overall, print_check
 from mavbridge.commands.check.run import check
-from mavbridge.commands.check.table import print_check
+from mavbridge.commands.config import CheckConfig
 from mavbridge.config.flight import CameraConfig, FlyConfig, LinkConfig
 from mavbridge.config.policy import PolicyConfig
 from mavbridge.core.clock import NS_PER_MS, MonotonicClock

@@ -10,10 +10,12 @@ from rich.text import Text
 
 from mavbridge.commands.output import progress_bar
 from mavbridge.config.checks import check_range
-from mavbridge.config.courses import MAX_EPISODES
+from mavbridge.config.courses import CHECK_COURSE_SEED, MAX_EPISODES, first_seed
+from mavbridge.config.policy import PolicyConfig
 from mavbridge.core.clock import NS_PER_S, MonotonicClock
 from mavbridge.core.errors import UserError
 from mavbridge.core.stopping import INTERRUPTED, stop_on_signals
+from mavbridge.flight.policies import load_configured_policy
 from policy.contract import Contract
 from policy.data.flight_data import DatasetError, FlightData, common_frame, common_terms
 from policy.data.flight_folders import find_flights, leave_out_failed, read_flight
@@ -44,7 +46,7 @@ def run_policy_training(paths: Sequence[Path], settings: TrainSettings) -> int:
     check: Check | None = None
     if settings.check_flights:
         try:
-            from mavbridge.commands.train.check_flights import share_of_gates
+            import mavbridge.simulation.flight  # noqa: F401 - share_of_gates needs it
         except ImportError as error:
             raise UserError(
                 f"--check-flights needs the simulator ({error}): install mavbridge[sitl]"
@@ -67,6 +69,24 @@ def run_world_model_training(paths: Sequence[Path], settings: WorldModelSettings
         raise DatasetError(f"a world model learns from flights by sticks, these were by {action}")
     config = replace(config, contract=Contract(state_frame=common_frame(flights)))
     return _finish(lambda hooks: train_world_model(flights, config, settings, hooks))
+
+
+def share_of_gates(checkpoint: Path, settings: TrainSettings) -> float:
+    """Fly a checkpoint at two rates over ``check_flights`` courses; the share of gates passed.
+
+    Raises:
+        MavbridgeError, PolicyError: it cannot be flown.
+    """
+    from mavbridge.simulation.flight import SimulatedFlight
+
+    wanted = PolicyConfig(policy=settings.policy, checkpoint=checkpoint, dual_rate=True)
+    first, passed, total = first_seed(settings.check_courses) + CHECK_COURSE_SEED, 0, 0
+    with load_configured_policy(wanted, MonotonicClock()) as loaded:
+        for index in range(settings.check_flights):
+            flight = SimulatedFlight(course_seed=first + index, seed=index)
+            result = flight.fly(loaded.executable)
+            passed, total = passed + result.gates_passed, total + result.gates_total
+    return passed / total
 
 
 def fit_to_flights(

@@ -5,7 +5,7 @@ from pathlib import Path
 
 from rich.console import Console
 
-from mavbridge.commands.export_policy.config import ExportPolicyConfig
+from mavbridge.commands.config import ExportPolicyConfig
 from mavbridge.core.errors import UserError
 from mavbridge.core.extras import require_packages
 from policy.engines.choose import chunks_of_samples

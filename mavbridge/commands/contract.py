@@ -4,7 +4,7 @@ from pathlib import Path
 
 from rich.console import Console
 
-from mavbridge.commands.contract.config import ContractConfig
+from mavbridge.commands.config import ContractConfig
 from mavbridge.core.errors import UserError
 from policy.data.lerobot import is_lerobot
 from policy.foreign.drafts.entries import Entry, draft_text
