@@ -1,6 +1,7 @@
 """Rows about the link: the vehicle, the rates that come, losses, round trips and clocks."""
 
 from collections.abc import Callable, Iterator, Mapping
+from functools import partial
 from typing import Literal, TypeAlias
 
 from mavbridge.commands.check.param_rows import Terms
@@ -40,6 +41,7 @@ _QUANTITIES = {
     "HIGHRES_IMU": "acceleration",
     "RC_CHANNELS": "sticks (echo)",
 }
+_row = partial(Row, "link")
 
 
 class VehicleProbe:
@@ -255,10 +257,4 @@ def echo_row(probe: VehicleProbe, terms: Terms) -> Row:
         probe.echo_problem
         or "the vehicle does not show our sticks: another station may "
         "be overriding them, or it obeys another system id",
-    )
-
-
-def _row(name: str, found: str, expected: str, verdict: Verdict = "go", advice: str = "") -> Row:
-    return Row(
-        area="link", name=name, found=found, expected=expected, verdict=verdict, advice=advice
     )

@@ -3,6 +3,7 @@
 import re
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import NamedTuple
 
 from mavbridge.commands.check.rows import Row, Verdict
@@ -22,6 +23,7 @@ from policy.contract import Contract
 _STICK_OUTPUTS = ("rc-override", "manual-control")
 _NOT_SENT = "not sent"
 _PARAMETER = re.compile(r"\b[A-Z][A-Za-z0-9]*_\w+\b")
+_row = partial(Row, "parameters")
 
 
 class Sentence(NamedTuple):
@@ -221,15 +223,4 @@ def _thrust_rows(terms: Terms) -> Iterator[Row]:
         f"{terms.contract.hover_thrust:.2f} in training",
         "warn" if hover is None else "go",
         "" if hover is not None else "the vehicle does not tell at which thrust it hovers",
-    )
-
-
-def _row(name: str, found: str, expected: str, verdict: Verdict = "go", advice: str = "") -> Row:
-    return Row(
-        area="parameters",
-        name=name,
-        found=found,
-        expected=expected,
-        verdict=verdict,
-        advice=advice,
     )

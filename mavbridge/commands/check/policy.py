@@ -180,9 +180,12 @@ def _run_at_rates(
         workers.append(Worker(f"mavbridge-check-{pace.name}", run))
     for worker in workers:
         worker.start()
-    for worker in workers:
-        worker.ends_within(timing_s + _JOIN_S)
-        worker.join(_JOIN_S)
+    try:
+        for worker in workers:
+            worker.ends_within(timing_s + _JOIN_S)
+    finally:  # also on Ctrl-C: the policy is closed once nothing calls it
+        for worker in workers:
+            worker.join(_JOIN_S)
     return [chunks, pictures]
 
 

@@ -3,7 +3,7 @@
 import re
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Literal, TypeAlias, TypedDict
+from typing import Literal, TypeAlias
 
 from rich.console import Console
 from rich.table import Table
@@ -22,7 +22,7 @@ _FOOT = (
 )
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
+@dataclass(frozen=True, slots=True)
 class Row:
     """One thing that was looked at."""
 
@@ -45,48 +45,22 @@ class Row:
         return tuple(_FLAG.findall(self.advice))
 
 
-class RowDocument(TypedDict):
-    """One row as JSON."""
-
-    area: Area
-    name: str
-    verdict: Verdict
-    found: str
-    expected: str
-    advice: str
-    commands: list[str]
-
-
-class CheckDocument(TypedDict):
-    """The whole check as JSON."""
-
-    verdict: Verdict
-    rows: list[RowDocument]
-
-
 def overall(rows: Sequence[Row]) -> Verdict:
     """The worst verdict of all."""
     verdicts = {row.verdict for row in rows}
     return "no-go" if "no-go" in verdicts else "warn" if "warn" in verdicts else "go"
 
 
-def as_document(rows: Sequence[Row]) -> CheckDocument:
-    """All rows in the order of the table."""
-    return CheckDocument(
-        verdict=overall(rows),
-        rows=[
-            RowDocument(
-                area=row.area,
-                name=row.name,
-                verdict=row.verdict,
-                found=row.found,
-                expected=row.expected,
-                advice=row.advice,
-                commands=list(row.commands),
-            )
+def as_document(rows: Sequence[Row]) -> dict[str, object]:
+    """All rows in the order of the table, for JSON."""
+    names = ("area", "name", "verdict", "found", "expected", "advice")
+    return {
+        "verdict": overall(rows),
+        "rows": [
+            {name: getattr(row, name) for name in names} | {"commands": list(row.commands)}
             for row in rows
         ],
-    )
+    }
 
 
 def print_check(rows: Sequence[Row], console: Console) -> None:

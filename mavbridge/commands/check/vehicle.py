@@ -3,6 +3,7 @@
 from collections.abc import Iterator, Sequence
 from contextlib import ExitStack
 from dataclasses import replace
+from functools import partial
 
 from mavbridge.commands.check.link_rows import VehicleProbe, echo_row, link_rows
 from mavbridge.commands.check.param_rows import Terms, param_rows
@@ -21,6 +22,7 @@ from mavbridge.mavlink.transport.signing_files import SigningStore
 from mavbridge.mavlink.transport.sockets import Transport, make_transport
 
 _TEXTS_SHOWN = 4
+_row = partial(Row, "vehicle")
 
 
 def vehicle_rows(
@@ -137,12 +139,6 @@ def _text_rows(terms: Terms, texts: Sequence[str]) -> Iterator[Row]:
 
 def _judged(said: str, is_quiet: bool) -> tuple[Verdict, str]:
     return ("go", "") if is_quiet else ("warn", said)
-
-
-def _row(name: str, found: str, expected: str, verdict: Verdict = "go", advice: str = "") -> Row:
-    return Row(
-        area="vehicle", name=name, found=found, expected=expected, verdict=verdict, advice=advice
-    )
 
 
 def check_vehicle(
