@@ -19,11 +19,11 @@ from cyclopts import App
 from pymavlink import mavutil
 from pymavlink.dialects.v20 import ardupilotmega as mav
 
+from benchmarks.engines import EAGER
+from benchmarks.flight import FlightJob
+from benchmarks.missed_slots import stolen_ms_since, stolen_ns
+from benchmarks.results import BASELINE, Flight, solves_of, to_json
 from mavbridge.camera.open import open_camera
-from mavbridge.commands.bench.engines import EAGER
-from mavbridge.commands.bench.flight import FlightJob
-from mavbridge.commands.bench.missed_slots import stolen_ms_since, stolen_ns
-from mavbridge.commands.bench.results import BASELINE, Flight, solves_of, to_json
 from mavbridge.config.policy import PolicyConfig
 from mavbridge.core.clock import NS_PER_MS, NS_PER_S, MonotonicClock
 from mavbridge.core.histogram import Histogram

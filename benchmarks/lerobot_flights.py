@@ -17,9 +17,9 @@ from pathlib import Path
 
 import numpy as np
 
+from benchmarks.flight import fly
 from benchmarks.lerobot_policies import PEER
-from mavbridge.commands.bench.flight import fly
-from mavbridge.commands.bench.results import Flight
+from benchmarks.results import Flight
 from mavbridge.config.policy import PolicyConfig
 from mavbridge.config.rates import Rates
 from mavbridge.core.errors import UserError

@@ -1,6 +1,6 @@
 """One measured flight whose process is kept busy: ``python -m benchmarks.loaded_flight``.
 
-It takes the flags of ``mavbridge.commands.bench.flight_process`` and ``--load``:
+It takes the flags of ``benchmarks.flight`` and ``--load``:
 
     none   nothing beside the flight
     slow   every tenth solve takes 30 ms longer
@@ -15,8 +15,7 @@ from typing import Literal, TypeAlias
 import torch
 from cyclopts import App
 
-from mavbridge.commands.bench.flight import FlightJob
-from mavbridge.commands.bench.flight_process import measure_flight
+from benchmarks.flight import FlightJob, measure_flight
 from mavbridge.core.clock import NS_PER_MS, MonotonicClock
 from mavbridge.core.workers import Worker
 from policy.contract import FloatArray

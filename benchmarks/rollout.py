@@ -14,8 +14,8 @@ from typing import TYPE_CHECKING
 from cyclopts import App
 from rich.console import Console
 
+from benchmarks.results import from_json, this_machine
 from benchmarks.rollout_process import COMMAND, RolloutJob, Trial
-from mavbridge.commands.bench.results import from_json, this_machine
 from mavbridge.commands.imagine.run import load_model
 from mavbridge.commands.output import (
     BLUE,

@@ -14,9 +14,8 @@ import torch
 from cyclopts import App, Parameter
 from rich.console import Console
 
-from mavbridge.commands.bench.results import to_json
-from mavbridge.commands.imagine.deciders import WorldModelDecider
-from mavbridge.commands.imagine.loop import RolloutPlan
+from benchmarks.results import to_json
+from mavbridge.commands.imagine.loop import RolloutPlan, WorldModelDecider
 from mavbridge.commands.imagine.output import SerialOutput
 from mavbridge.commands.imagine.run import load_model, run_rollout
 from mavbridge.commands.imagine.sampling import Sampler, torch_threads

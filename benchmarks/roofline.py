@@ -13,8 +13,8 @@ from torch import nn
 from torch.utils.flop_counter import FlopCounterMode
 
 from benchmarks.baseline import eager_toge
-from mavbridge.commands.bench.engines import CHUNK, ENCODE
-from mavbridge.commands.bench.results import EngineTiming
+from benchmarks.engines import CHUNK, ENCODE
+from benchmarks.results import EngineTiming
 from mavbridge.config.policy import PolicyConfig
 from mavbridge.core.clock import NS_PER_MS, NS_PER_S, MonotonicClock
 from policy.contract import ACTION_DIM

@@ -22,9 +22,9 @@ from rich.table import Table
 from rich.text import Text
 
 from benchmarks.compare import SHIPPED
+from benchmarks.flight import fly
 from benchmarks.loaded_flight import Load
-from mavbridge.commands.bench.flight import fly
-from mavbridge.commands.bench.results import (
+from benchmarks.results import (
     Flight,
     Machine,
     causes,

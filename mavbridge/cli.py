@@ -1,8 +1,9 @@
 """The command line: every flag is a field of a config dataclass."""
 
 import difflib
+import os
 import re
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Annotated, Any
@@ -13,20 +14,20 @@ from cyclopts.config import Dict
 from rich.text import Text
 
 import mavbridge
-from mavbridge.commands.bench.config import BenchConfig
-from mavbridge.commands.check.config import CheckConfig
-from mavbridge.commands.contract.config import ContractConfig
-from mavbridge.commands.demonstrate.config import DemonstrateConfig
+from mavbridge.commands.config import (
+    CheckConfig,
+    ContractConfig,
+    DemonstrateConfig,
+    ExportConfig,
+    ExportPolicyConfig,
+    IdentifyConfig,
+    ImagineConfig,
+    InspectConfig,
+    ServeConfig,
+)
 from mavbridge.commands.evaluate.config import EvaluateConfig
-from mavbridge.commands.export.config import ExportConfig
-from mavbridge.commands.export_policy.config import ExportPolicyConfig
-from mavbridge.commands.identify.config import IdentifyConfig
-from mavbridge.commands.imagine.config import ImagineConfig
-from mavbridge.commands.inspect.config import InspectConfig
 from mavbridge.commands.record.config import RecordConfig
 from mavbridge.commands.replay.config import ReplayConfig
-from mavbridge.commands.serve.config import ServeConfig
-from mavbridge.commands.train.checks import prepare as prepare_training
 from mavbridge.config.flight import FlyConfig
 from mavbridge.config.groups import RARE
 from mavbridge.config.trust import untrusted_settings
@@ -36,7 +37,7 @@ from mavbridge.core.realtime import require_supported_system
 from mavbridge.recording.folder import require_extra
 from policy.files import read_toml, user_path
 from policy.foreign.websocket.kind import require_packages
-from policy.training.settings import TrainSettings, WorldModelSettings
+from policy.training.settings import RunSettings, TrainSettings, WorldModelSettings
 
 HELP = """Fly an ArduPilot or PX4 vehicle with a vision policy.
 
@@ -97,8 +98,8 @@ def fly(config: FlyConfig | None = None) -> int:
 
 @cli.command
 def check(config: CheckConfig | None = None) -> int:
-    """Say whether a flight could begin: give it the flags of the flight. --policy none and
-    --camera none leave those out. Exit status: 0 go, 3 no-go."""
+    """Say whether a flight could begin: give it the flags of the flight. --connect none, --policy
+    none and --camera none leave those out. Exit status: 0 go, 3 no-go."""
     if config is None or not config.flight.link.connect:
         raise UserError("name the vehicle: --connect udp:127.0.0.1:14550 (see --help)")
     require_supported_system()
@@ -160,18 +161,10 @@ def inspect(*flights: Path, config: InspectConfig | None = None) -> int:
 
 
 @cli.command
-def bench(config: BenchConfig | None = None) -> int:
-    """Measure this machine with one policy: engines, both loops in simulated flight, the link."""
-    from mavbridge.commands.bench.run import bench as run_bench
-
-    return run_bench(BenchConfig() if config is None else config)
-
-
-@cli.command
 def serve(config: ServeConfig | None = None) -> int:
     """Serve a policy for flights on other computers, which name it --policy ws://HOST:PORT."""
     require_packages("serve")
-    from mavbridge.commands.serve.run import serve as run_server
+    from mavbridge.commands.serve import serve as run_server
 
     return run_server(ServeConfig() if config is None else config)
 
@@ -211,8 +204,34 @@ def demonstrate(config: DemonstrateConfig) -> int:
     """Record flights of simulated gate courses by an expert, to learn from."""
     require_extra("demonstrate")
     with _needs_simulator("demonstrate"):
-        from mavbridge.commands.demonstrate.run import demonstrate as run_demonstrations
+        from mavbridge.commands.demonstrate import demonstrate as run_demonstrations
     return run_demonstrations(config)
+
+
+def _prepare_training(command: str, flights: Sequence[Path], settings: RunSettings) -> None:
+    """Refuse paths that could not be used, before torch and the flights are loaded.
+
+    Raises:
+        UserError: an extra, a folder or a file is missing, or --out cannot be written.
+    """
+    require_extra(command)
+    if not flights:
+        raise UserError(f"name the flights to learn from: mavbridge {command} DIR... --out FILE")
+    for path in flights:
+        if not path.is_dir():
+            raise UserError(f"{path}: no such folder")
+    folder = settings.out.parent
+    if not folder.is_dir():
+        raise UserError(f"--out {settings.out}: there is no folder {folder}")
+    if not os.access(folder, os.W_OK):
+        raise UserError(f"--out {settings.out}: {folder} cannot be written to")
+    for name in ("start_from", "backbone_weights"):
+        weights: Path | None = getattr(settings, name, None)
+        if weights is not None and not weights.is_file():
+            raise UserError(f"--{name.replace('_', '-')} {weights}: no such file")
+    # torch's threads else spin at every barrier: on a core that something else uses too, ten times
+    # the time. OpenMP reads it once, as torch is loaded.
+    os.environ.setdefault("OMP_WAIT_POLICY", "passive")
 
 
 @cli.command
@@ -223,8 +242,8 @@ def train(*flights: Path, settings: Annotated[TrainSettings, Parameter(name="*")
         flights: flight folders, folders of them, or LeRobot datasets (v3).
         settings: the settings.
     """
-    prepare_training("train", flights, settings)
-    from mavbridge.commands.train.run import run_policy_training
+    _prepare_training("train", flights, settings)
+    from mavbridge.commands.train import run_policy_training
 
     return run_policy_training(flights, settings)
 
@@ -239,8 +258,8 @@ def train_world_model(
         flights: flight folders, folders of them, or LeRobot datasets (v3).
         settings: the settings.
     """
-    prepare_training("train-world-model", flights, settings)
-    from mavbridge.commands.train.run import run_world_model_training
+    _prepare_training("train-world-model", flights, settings)
+    from mavbridge.commands.train import run_world_model_training
 
     return run_world_model_training(flights, settings)
 
@@ -269,7 +288,7 @@ def export_policy(checkpoint: Path | None = None, *, config: ExportPolicyConfig)
         checkpoint: its weights, .safetensors; left out, those that TOGE ships with.
         config: the settings.
     """
-    from mavbridge.commands.export_policy.run import export_policy as run_export
+    from mavbridge.commands.export_policy import export_policy as run_export
 
     return run_export(checkpoint, config)
 
@@ -282,7 +301,7 @@ def contract(source: Path, config: ContractConfig | None = None) -> int:
         source: folder of a LeRobot policy, of a LeRobot dataset, or of ONNX files; or one of those.
         config: the settings.
     """
-    from mavbridge.commands.contract.run import contract as run_contract
+    from mavbridge.commands.contract import contract as run_contract
 
     return run_contract(source, config or ContractConfig())
 

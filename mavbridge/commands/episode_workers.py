@@ -1,22 +1,21 @@
 """Episodes one after the other, on processes of this machine, or on a Ray cluster.
 
-The results are the same from all three: an episode depends on its job alone, and one whose worker
-was lost is flown again.
+The results are the same from all three: an episode depends on its job alone.
 """
 
-import itertools
 import logging
 import multiprocessing
 import os
 import signal
 import socket
-import traceback
-from collections import Counter
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import suppress
-from multiprocessing.connection import Connection, wait
-from multiprocessing.synchronize import Event
-from typing import Any, Generic, TypeAlias, TypeVar
+import threading
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
+from concurrent.futures.process import BrokenProcessPool
+from contextlib import ExitStack, suppress
+from functools import partial
+from multiprocessing.connection import Connection
+from typing import TypeAlias, TypeVar
 
 from mavbridge.config.workers import WorkersConfig
 from mavbridge.core.address import host_port
@@ -30,12 +29,13 @@ FlyJob: TypeAlias = Callable[[Job, ShouldStop], Result]
 """Importable in another process; raises ``EpisodeInterruptedError`` when ``ShouldStop`` says so."""
 
 MAX_RETRIES = 3
-"""Lost workers of one episode before it is held to be the cause."""
+"""Lost workers of one episode on Ray, which flies it again, before it is held to be the cause."""
 CONNECT_TIMEOUT_S = 5.0
 END_TIMEOUT_S = 10.0
-"""Limit for a process to end by itself, and then on SIGTERM, before it is killed."""
-_SPAWN = multiprocessing.get_context("spawn")
+"""Time for the flight of a worker to end in order, once it is told to stop."""
 _POLL_S = 0.1
+_stop = threading.Event()
+"""In a worker process: set when it is to end."""
 
 
 def fly_jobs(
@@ -48,7 +48,7 @@ def fly_jobs(
 
     Raises:
         UserError: Ray is missing, or its cluster cannot be reached.
-        PeerError: an episode lost one worker after the other.
+        PeerError: a worker died.
         MavbridgeError: an episode cannot be flown.
     """
     if config.ray_address is not None:
@@ -63,106 +63,67 @@ def fly_jobs(
                 yield index, fly(job, should_stop)
 
 
-def _attempt(fly: FlyJob[Job, Result], job: Job, should_stop: ShouldStop) -> Result | Exception:
-    """Fly in a worker; an unexpected error takes its traceback along."""
-    try:
-        return fly(job, should_stop)
-    except MavbridgeError as error:
-        return error
-    except Exception as error:  # noqa: BLE001 - raised again where the results are awaited
-        error.add_note(traceback.format_exc())
-        return error
-
-
-def raise_failure(outcome: Result | Exception) -> Result:
-    """Return the result, or raise what the worker's job raised."""
-    if isinstance(outcome, Exception):
-        raise outcome
-    return outcome
-
-
-class WorkerProcess(Generic[Job, Result]):
-    """A process that flies the jobs it is sent."""
-
-    def __init__(self, name: str, fly: FlyJob[Job, Result], stop: Event) -> None:
-        self.connection, theirs = _SPAWN.Pipe()
-        """Readable when an outcome has arrived, or when the process has died."""
-        self._process = _SPAWN.Process(target=_serve, args=(theirs, fly, stop), name=name)
-        self._process.start()
-        theirs.close()
-
-    def send(self, job: Job) -> None:
-        """Hand over a job."""
-        with suppress(BrokenPipeError):  # it has died, which ``receive`` reports
-            self.connection.send(job)
-
-    def receive(self) -> Result | Exception | None:
-        """Outcome of the job; None if the process has died, or hangs."""
-        with suppress(EOFError, ConnectionResetError):
-            if self.connection.poll(END_TIMEOUT_S):
-                outcome: Result | Exception = self.connection.recv()
-                return outcome
-        return None
-
-    def terminate(self) -> None:
-        """Send SIGTERM, which ends a flight in order."""
-        self._process.terminate()
-
-    def end(self) -> None:
-        """Wait for the end of the process, which follows that of its pipe; at worst kill it."""
-        self.connection.close()
-        for insist in (self._process.terminate, self._process.kill):
-            self._process.join(END_TIMEOUT_S)
-            if not self._process.is_alive():
-                return
-            insist()
-        self._process.join(END_TIMEOUT_S)
-
-
-def _serve(connection: Connection, fly: FlyJob[Job, Result], stop: Event) -> None:
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C reaches the parent, which sets the event
-    with suppress(EOFError, BrokenPipeError, ConnectionResetError):
-        while True:
-            connection.send(_attempt(fly, connection.recv(), stop.is_set))
-
-
 def _fly_on_processes(
     fly: FlyJob[Job, Result], jobs: Sequence[Job], count: int, should_stop: ShouldStop
 ) -> Iterator[tuple[int, Result]]:
-    waiting = list(reversed(range(len(jobs))))
-    losses: Counter[int] = Counter()
-    stop, names = _SPAWN.Event(), map("mavbridge-worker-{}".format, itertools.count())
-    idle: list[WorkerProcess[Job, Result]] = []
-    busy: dict[WorkerProcess[Job, Result], int] = {}
-    try:
-        while (waiting or busy) and not should_stop():
-            while waiting and len(busy) < count:
-                worker = idle.pop() if idle else WorkerProcess(next(names), fly, stop)
-                busy[worker] = index = waiting.pop()
-                worker.send(jobs[index])
-            ready = wait([worker.connection for worker in busy], _POLL_S)
-            for worker in [worker for worker in busy if worker.connection in ready]:
-                index, outcome = busy.pop(worker), worker.receive()
-                if outcome is not None:
-                    idle.append(worker)
-                    yield index, raise_failure(outcome)
-                    continue
-                worker.end()
-                waiting.append(index)
-                losses[index] += 1
-                if losses[index] > MAX_RETRIES:
-                    raise _loss(jobs[index])
-    finally:
-        stop.set()
-        for worker in (*idle, *busy):
-            worker.end()
+    context = multiprocessing.get_context("spawn")
+    with ExitStack() as stack:
+        # Ends for the workers when it is closed here, and also when this process dies.
+        theirs, ours = context.Pipe(duplex=False)
+        stack.callback(theirs.close)
+        # One worker each: a pool of many may not notice that one has died (CPython 3.11).
+        executors = [
+            stack.enter_context(ProcessPoolExecutor(1, context, _begin_worker, (theirs,)))
+            for _ in range(count)
+        ]
+        stack.callback(ours.close)
+        submit = [partial(one.submit, partial(_fly_in_worker, fly)) for one in executors]
+        yield from _collect(submit, jobs, should_stop, (BrokenProcessPool,))
 
 
-def _loss(job: object) -> PeerError:
-    return PeerError(
-        f"{job} lost {MAX_RETRIES + 1} workers one after the other (out of memory?): use fewer "
-        "--workers, or one to see the cause"
-    )
+def _begin_worker(parent: Connection) -> None:
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C reaches the parent, which closes the pipe
+
+    def end_with_parent() -> None:
+        parent.poll(None)
+        _stop.set()
+        threading.Event().wait(END_TIMEOUT_S)
+        os._exit(1)  # it hangs, or its parent is dead
+
+    threading.Thread(target=end_with_parent, name="mavbridge-worker-end", daemon=True).start()
+
+
+def _fly_in_worker(fly: FlyJob[Job, Result], job: Job) -> Result:
+    return fly(job, _stop.is_set)
+
+
+def _collect(
+    workers: Iterable[Callable[[Job], "Future[Result]"]],
+    jobs: Sequence[Job],
+    should_stop: ShouldStop,
+    lost: tuple[type[Exception], ...],
+) -> Iterator[tuple[int, Result]]:
+    """Keep one job with each worker until all are flown or ``should_stop``.
+
+    An outcome of the type ``lost`` is the death of a worker.
+    """
+    waiting, idle = list(reversed(range(len(jobs)))), list(workers)
+    busy: dict[Future[Result], tuple[int, Callable[[Job], Future[Result]]]] = {}
+    while (waiting or busy) and not should_stop():
+        while waiting and idle:
+            index, submit = waiting.pop(), idle.pop()
+            busy[submit(jobs[index])] = index, submit
+        for future in wait(busy, _POLL_S, FIRST_COMPLETED).done:
+            index, submit = busy.pop(future)
+            try:
+                result = future.result()
+            except lost as error:
+                raise PeerError(
+                    f"the worker that flew {jobs[index]} died (out of memory?): use fewer "
+                    "--workers, or one to see the cause"
+                ) from error
+            idle.append(submit)
+            yield index, result
 
 
 def _fly_on_ray(
@@ -189,23 +150,19 @@ def _fly_on_ray(
         ray.init(address=address, log_to_driver=False, logging_level=logging.ERROR)
     except (ConnectionError, RuntimeError, ValueError) as error:
         raise UserError(f"--ray {address}: {str(error).strip().splitlines()[0]}") from error
+    task = ray.remote(max_retries=MAX_RETRIES, num_cpus=1)(fly)
+    errors = ray.exceptions
+    lost = (
+        *(errors.WorkerCrashedError, errors.NodeDiedError, errors.LocalRayletDiedError),
+        *(errors.OutOfMemoryError, errors.ObjectLostError),
+    )
     try:
-        task = ray.remote(max_retries=MAX_RETRIES, num_cpus=1)(_attempt)
-        waiting = list(reversed(range(len(jobs))))
-        busy: dict[Any, int] = {}
-        while (waiting or busy) and not should_stop():
-            while waiting and len(busy) < count:
-                index = waiting.pop()
-                busy[task.remote(fly, jobs[index], _never)] = index
-            for reference in ray.wait(list(busy), num_returns=1, timeout=_POLL_S)[0]:
-                index = busy.pop(reference)
-                try:
-                    outcome: Result | Exception = ray.get(reference)
-                except ray.exceptions.RayTaskError:
-                    raise  # a bug, and not the worker's end: its traceback helps
-                except ray.exceptions.RayError as error:
-                    raise _loss(jobs[index]) from error
-                yield index, raise_failure(outcome)
+        submit = [lambda job: task.remote(job, _never).future()] * count
+        yield from _collect(submit, jobs, should_stop, lost)
+    except errors.RayTaskError as error:
+        if isinstance(error.cause, MavbridgeError):
+            raise error.cause from error
+        raise  # a bug: its traceback helps
     finally:
         ray.shutdown()
 

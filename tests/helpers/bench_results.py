@@ -1,6 +1,6 @@
 from typing import Any
 
-from mavbridge.commands.bench.results import (
+from benchmarks.results import (
     BenchResult,
     ClientTiming,
     EngineTiming,

@@ -10,8 +10,7 @@ import numpy as np
 from websockets.asyncio.server import Server, ServerConnection, serve
 from websockets.exceptions import ConnectionClosed
 
-from mavbridge.commands.serve.answers import AnswerLoop
-from mavbridge.commands.serve.server import PolicyServer
+from mavbridge.commands.serve import AnswerLoop, PolicyServer
 from mavbridge.core.clock import NS_PER_S, MonotonicClock
 from mavbridge.core.workers import Worker
 from policy.errors import PolicyError

@@ -11,8 +11,14 @@ from torch import Tensor
 
 from helpers.factories import START_NS, TICK_NS, make_state, make_tick, make_vision_tick
 from helpers.recordings import make_meta, without_writer_process
-from mavbridge.commands.imagine.deciders import Decider, PolicyDecider, WorldModelDecider
-from mavbridge.commands.imagine.loop import RolloutPlan, Segment, rollout
+from mavbridge.commands.imagine.loop import (
+    Decider,
+    PolicyDecider,
+    RolloutPlan,
+    Segment,
+    WorldModelDecider,
+    rollout,
+)
 from mavbridge.commands.imagine.output import OnFrame, SerialOutput, ignore_frame
 from mavbridge.commands.imagine.sampling import Sampler
 from mavbridge.commands.imagine.start import RolloutStart, read_start

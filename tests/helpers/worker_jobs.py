@@ -6,6 +6,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
+from mavbridge.commands import episode_workers
 from mavbridge.core.clock import NS_PER_MS, MonotonicClock
 from mavbridge.simulation.referee import EpisodeInterruptedError
 
@@ -22,6 +23,7 @@ class Job:
     waits_for_stop: bool = False
     gets_ctrl_c: bool = False
     """As every process of a terminal does."""
+    kills_parent: bool = False
 
     def __str__(self) -> str:
         return f"job {self.number}"
@@ -31,6 +33,9 @@ def run(job: Job, should_stop: Callable[[], bool]) -> int:
     if job.folder is not None and len(list(job.folder.iterdir())) < job.deaths:
         (job.folder / str(os.getpid())).touch()
         os.kill(os.getpid(), signal.SIGKILL)
+    if job.kills_parent:
+        episode_workers.END_TIMEOUT_S = 0.1
+        os.kill(os.getppid(), signal.SIGKILL)
     if job.gets_ctrl_c:
         signal.raise_signal(signal.SIGINT)
     if job.error is not None:

@@ -3,7 +3,7 @@
 import pytest
 
 from mavbridge.commands.identify.analysis import full_stick, identify_pushes
-from mavbridge.commands.identify.recording import ResponseRecording
+from mavbridge.commands.identify.fit import ResponseRecording
 from mavbridge.commands.identify.run import doublet_policy
 from mavbridge.simulation.flight import SimulatedFlight, SimulationSettings
 from mavbridge.simulation.world import make_vehicle

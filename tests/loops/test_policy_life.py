@@ -4,7 +4,7 @@ from pathlib import Path
 
 import pytest
 
-from mavbridge.commands.bench.engines import time_engines
+from benchmarks.engines import time_engines
 from mavbridge.commands.evaluate.config import EvaluateConfig
 from mavbridge.commands.evaluate.episodes import EpisodeSpec, fly_simulated
 from mavbridge.config.policy import PolicyConfig

@@ -1,60 +1,54 @@
-"""``mavbridge bench`` and its peers with their real processes."""
-
-import json
-from pathlib import Path
+"""Parts of ``make bench`` with their real processes."""
 
 import pytest
 
 from benchmarks.compare import peer_clients
-from mavbridge.__main__ import main
-from mavbridge.commands.bench import run
-from mavbridge.commands.bench.link import time_link
-from mavbridge.commands.bench.run import Effort
+from benchmarks.engines import time_engines
+from benchmarks.flight import fly
+from benchmarks.link import OUR_CLIENT, time_link
+from mavbridge.config.policy import PolicyConfig
+from mavbridge.config.rates import Rates
 
 pytestmark = pytest.mark.system
 
-TINY = Effort(engine_rounds=1, engine_block_s=0.05, flight_s=1.0, attitudes=50)
+HOVER = PolicyConfig(policy="scripted:hover", dual_rate=False)
 
 
-def test_a_benchmark_measures_engines_flight_and_link(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    monkeypatch.setattr(run, "QUICK", TINY)
-    monkeypatch.chdir(tmp_path)
-    flags = (
-        "--quick",
-        "--policy",
-        "scripted:hover",
-        "--single-rate",
-        "--rate",
-        "50",
-        "--json",
-        "out/bench.json",
-    )
-    with pytest.raises(SystemExit) as stopped:
-        main(["bench", *flags])
-    captured = capsys.readouterr()
-    assert stopped.value.code == 0, captured.err
-    assert "scripted:hover" in captured.out
-    result = json.loads((tmp_path / "out" / "bench.json").read_text())
-    (flight,) = result["flights"]
-    assert (flight["asked_action_hz"], flight["solves"]) == (50.0, "single rate, 10 steps")
-    assert 0 < flight["action_hz"] < 51
-    assert flight["stick_hz"] > 50
-    assert flight["lateness_ms"]["p50"] > 0
-    assert 0 < flight["gate_cpu_cores"] < flight["cpu_cores"]
-    assert flight["lost_reports"] == 0
-    assert flight["vision_hz"] > 0
-    assert flight["vehicle_gap_ms"]["p50"] > 0
-    assert [one["p50_ms"] > 0 for one in result["engines"]] == [True]
-    for link in result["links"]:
-        assert link["sent"] == 50
-        # An attitude may be overtaken by the next one, and a shared host may stall.
-        assert link["answered"] >= 25
-        times = link["round_trip_ms"]
-        assert 0 < times["p50"] <= times["p99"] <= times["max"]
-        assert link["timing"]["state_to_wire_ms"]["p50"] >= 0
-        assert link["timing"]["chunk_to_wire_ms"]["p50"] > 0
+def test_a_flight_is_measured() -> None:
+    flight = fly(HOVER, Rates(rate=50.0), 1.0)
+    assert (flight.asked_action_hz, flight.solves) == (50.0, "single rate, 10 steps")
+    assert flight.action_hz is not None
+    assert 0 < flight.action_hz < 51
+    assert flight.stick_hz is not None
+    assert flight.stick_hz > 50
+    assert flight.lateness_ms is not None
+    assert flight.lateness_ms.p50 > 0
+    assert flight.gate_cpu_cores is not None
+    assert 0 < flight.gate_cpu_cores < flight.cpu_cores
+    assert flight.lost_reports == 0
+    assert flight.vision_hz is not None
+    assert flight.vision_hz > 0
+    assert flight.vehicle_gap_ms is not None
+    assert flight.vehicle_gap_ms["p50"] > 0
+
+
+def test_an_engine_is_timed() -> None:
+    timings, notes = time_engines((HOVER,), rounds=1, block_s=0.05)
+    assert [one.p50_ms > 0 for one in timings] == [True]
+    assert not notes
+
+
+def test_our_client_answers_the_vehicle_of_the_link_test() -> None:
+    link = time_link(OUR_CLIENT, attitudes=50)
+    assert link.sent == 50
+    # An attitude may be overtaken by the next one, and a shared host may stall.
+    assert link.answered >= 25
+    assert 0 < link.round_trip_ms.p50 <= link.round_trip_ms.p99 <= link.round_trip_ms.max
+    timing = link.timing
+    assert timing.state_to_wire_ms is not None
+    assert timing.state_to_wire_ms.p50 >= 0
+    assert timing.chunk_to_wire_ms is not None
+    assert timing.chunk_to_wire_ms.p50 > 0
 
 
 def test_a_bare_pymavlink_loop_is_a_client_of_the_link_test() -> None:

@@ -1,6 +1,8 @@
 """Jobs in worker processes and on a local Ray cluster."""
 
 import os
+import signal
+import subprocess
 import sys
 import traceback
 from pathlib import Path
@@ -8,7 +10,7 @@ from pathlib import Path
 import pytest
 
 from helpers.worker_jobs import Job, run
-from mavbridge.commands.episode_workers import MAX_RETRIES, fly_jobs
+from mavbridge.commands.episode_workers import fly_jobs
 from mavbridge.config.workers import WorkersConfig
 from mavbridge.core.errors import PeerError
 
@@ -17,24 +19,37 @@ pytestmark = pytest.mark.system
 TWO = WorkersConfig(workers=2)
 
 
-def jobs(folder: Path, *, deaths: int) -> list[Job]:
-    return [
-        Job(number=10),
-        Job(number=20, deaths=deaths, folder=folder),
-        Job(number=30, gets_ctrl_c=True),
-    ]
+def test_workers_have_the_results_of_one_process() -> None:
+    three = [Job(number=10), Job(number=20, gets_ctrl_c=True), Job(number=30)]
+    assert sorted(fly_jobs(run, three, TWO, lambda: False)) == [(0, 10), (1, 20), (2, 30)]
 
 
-def test_a_lost_worker_costs_a_retry_and_changes_no_result(tmp_path: Path) -> None:
-    flown = list(fly_jobs(run, jobs(tmp_path, deaths=2), TWO, lambda: False))
-    assert sorted(flown) == [(0, 10), (1, 20), (2, 30)]
-    assert len(list(tmp_path.iterdir())) == 2
+def test_a_worker_that_dies_ends_the_run_and_its_job_is_named(tmp_path: Path) -> None:
+    dying = Job(number=20, deaths=1, folder=tmp_path)
+    others = [Job(number=30, waits_for_stop=True) for _ in range(2)]
+    with pytest.raises(PeerError, match="the worker that flew job 20 died"):
+        list(fly_jobs(run, [others[0], dying, others[1]], TWO, lambda: False))
 
 
-def test_a_job_that_loses_every_worker_is_named(tmp_path: Path) -> None:
-    with pytest.raises(PeerError, match=f"job 20 lost {MAX_RETRIES + 1} workers"):
-        list(fly_jobs(run, jobs(tmp_path, deaths=100), TWO, lambda: False))
-    assert len(list(tmp_path.iterdir())) == MAX_RETRIES + 1
+KILLED_PARENT = """
+from helpers.worker_jobs import Job, run
+from mavbridge.commands.episode_workers import fly_jobs
+from mavbridge.config.workers import WorkersConfig
+if __name__ == "__main__":
+    jobs = [Job(number=1, waits_for_stop=True), Job(number=2, kills_parent=True)]
+    list(fly_jobs(run, jobs, WorkersConfig(workers=2), lambda: False))
+"""
+
+
+def test_workers_end_with_a_parent_that_is_killed(tmp_path: Path) -> None:
+    program = tmp_path / "parent.py"
+    program.write_text(KILLED_PARENT)
+    environment = os.environ | {"PYTHONPATH": os.pathsep.join(sys.path)}
+    with subprocess.Popen(
+        [sys.executable, str(program)], stdout=subprocess.PIPE, env=environment
+    ) as parent:
+        parent.communicate(timeout=60)  # the end of the output, which every worker holds open
+    assert parent.returncode == -signal.SIGKILL
 
 
 @pytest.mark.parametrize("error", [PeerError("the vehicle is gone"), KeyError("a bug")])
@@ -44,7 +59,7 @@ def test_an_error_in_a_worker_is_raised_here(error: Exception) -> None:
         list(fly_jobs(run, failing, TWO, lambda: False))
     shown = "".join(traceback.format_exception(raised.value))
     assert str(error) in shown
-    assert ("worker_jobs.py" in shown) == isinstance(error, KeyError)
+    assert "worker_jobs.py" in shown
 
 
 def test_a_stop_interrupts_the_jobs_under_way() -> None:
@@ -62,5 +77,6 @@ def test_ray_has_the_same_results_though_a_worker_is_lost(
     pytest.importorskip("ray", reason="needs the extra cluster")
     monkeypatch.setenv("PYTHONPATH", os.pathsep.join(sys.path))  # its workers import the helpers
     config = WorkersConfig(workers=2, ray="local")
-    flown = list(fly_jobs(run, jobs(tmp_path, deaths=1), config, lambda: False))
+    three = [Job(number=10), Job(number=20, deaths=1, folder=tmp_path), Job(number=30)]
+    flown = list(fly_jobs(run, three, config, lambda: False))
     assert sorted(flown) == [(0, 10), (1, 20), (2, 30)]

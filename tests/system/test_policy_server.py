@@ -20,7 +20,7 @@ import websockets.sync.client
 from websockets.exceptions import ConnectionClosed, InvalidStatus
 
 from helpers.policy_servers import Gate, Reply, chunk_of, our_server, scripted_server
-from mavbridge.commands.serve import server
+from mavbridge.commands import serve as server
 from mavbridge.core.clock import NS_PER_S, MonotonicClock
 from mavbridge.core.processes import free_port
 from policy.contract import Contract, FloatArray

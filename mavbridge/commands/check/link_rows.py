@@ -1,16 +1,34 @@
 """Rows about the link: the vehicle, the rates that come, losses, round trips and clocks."""
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
+from functools import partial
+from typing import Literal, TypeAlias
 
-from mavbridge.commands.check.probe import ECHO_S, VehicleProbe
+from mavbridge.commands.check.param_rows import Terms
 from mavbridge.commands.check.rows import Row, Verdict
-from mavbridge.commands.check.terms import Terms
-from mavbridge.core.reasons import Reason
-from mavbridge.core.vehicle import LinkStats
+from mavbridge.core.clock import NS_PER_MS, NS_PER_S, Clock
+from mavbridge.core.reasons import Code, Reason, because
+from mavbridge.core.vehicle import NEUTRAL, Command, LinkSnapshot, LinkStats, Release
+from mavbridge.mavlink.link import MavlinkLink
 from mavbridge.mavlink.profiles.profile import StreamGroup
 from mavbridge.mavlink.session.vehicle import VehicleSession
 from policy.contract import Contract
 
+SET_UP_S = 15.0
+"""Longest wait for version, parameters, streams and the receiver: on a link that loses nothing it
+takes one to three seconds."""
+SETTLE_S = 1.0
+"""From the grant of the streams until their rates are counted."""
+MEASURE_S = 3.0
+ECHO_S = 3.0
+RELEASE_S = 4.0
+"""The releases of an override are spread over so much time at most."""
+_POLL_NS = NS_PER_MS
+"""Between two looks at the link; the kernel stamps what arrives meanwhile."""
+_STICK_NS = 20 * NS_PER_MS
+
+EchoResult: TypeAlias = Literal["taken", "not taken", "armed"]
+"""``armed``: the vehicle is, or was, armed, so nothing was sent, or no more."""
 _ENOUGH = 0.9
 """Share of the rate that was asked for."""
 _ECHO_HZ = 20.0
@@ -24,6 +42,90 @@ _QUANTITIES = {
     "HIGHRES_IMU": "acceleration",
     "RC_CHANNELS": "sticks (echo)",
 }
+_row = partial(Row, "link")
+
+
+class VehicleProbe:
+    """Runs a ``MavlinkLink`` that has no gate; its methods are called in their order."""
+
+    def __init__(self, link: MavlinkLink, clock: Clock) -> None:
+        self._link = link
+        self._clock = clock
+        self._snapshot: LinkSnapshot | None = None
+        self.texts: list[str] = []
+        """What the vehicle and the link have said."""
+        self.echo_problem: Reason | None = None
+        """Why the sticks of the echo test were not taken, as the link says it."""
+
+    def find(self) -> VehicleSession:
+        """Wait for the vehicle; raises PeerError as the link does if there is none in time."""
+        while (vehicle := self._link.vehicle) is None:
+            self._pass()
+        return vehicle
+
+    def set_up(self) -> Reason | None:
+        """Read parameters and request streams; returns the step that was not finished in time."""
+        self._until(SET_UP_S, lambda: self._unfinished is None)
+        return self._unfinished
+
+    @property
+    def _unfinished(self) -> Reason | None:
+        return self.find().unfinished(self._clock.now_ns())
+
+    def measure(self) -> LinkStats:
+        """Count messages, losses and round trips."""
+        self._until(SETTLE_S)
+        self._link.restart_counters()
+        self._until(MEASURE_S)
+        return self._link.stats()
+
+    def snapshot(self) -> LinkSnapshot:
+        """Everything that the link knows now."""
+        return self._snapshot or self._pass()
+
+    def echo(self) -> EchoResult:
+        """Send neutral sticks while the vehicle is disarmed, look for them, and release them."""
+        result: EchoResult = "not taken"
+        due_ns = 0
+
+        def is_over() -> bool:
+            nonlocal result, due_ns
+            snapshot = self.snapshot()
+            if snapshot.status is None or snapshot.status.armed:
+                result = "armed"
+            elif snapshot.echo_confirmed:
+                result = "taken"
+            elif (now_ns := self._clock.now_ns()) >= due_ns:
+                due_ns = now_ns + _STICK_NS
+                self.echo_problem = snapshot.problem or self.echo_problem
+                self._link.send(Command(action=NEUTRAL))
+            return result != "not taken"
+
+        self._link.is_engaged = True
+        try:
+            self._until(ECHO_S, is_over)
+        finally:
+            if result != "armed" or due_ns:
+                self._until(RELEASE_S, self._release)
+            self._link.is_engaged = False
+        return result
+
+    def _release(self) -> bool:
+        """Give the sticks back; True once the vehicle shows that it has them."""
+        self._link.send(Release(because(Code.FINISHED, what="echo test")))
+        return self.snapshot().is_released and not self._link.is_release_owed
+
+    def _until(self, limit_s: float, is_over: Callable[[], bool] = lambda: False) -> None:
+        deadline_ns = self._clock.now_ns() + round(limit_s * NS_PER_S)
+        while self._clock.now_ns() < deadline_ns and not is_over():
+            self._pass()
+
+    def _pass(self) -> LinkSnapshot:
+        self._snapshot = self._link.poll()
+        self.texts += [text for text in self._snapshot.texts if text not in self.texts]
+        self._link.service()
+        self._clock.sleep_until_ns(self._clock.now_ns() + _POLL_NS)
+        return self._snapshot
 
 
 def link_rows(
@@ -157,10 +259,4 @@ def echo_row(probe: VehicleProbe, terms: Terms) -> Row:
         if probe.echo_problem is not None
         else "the vehicle does not show our sticks: another station may be overriding them, or it "
         "obeys another system id",
-    )
-
-
-def _row(name: str, found: str, expected: str, verdict: Verdict = "go", advice: str = "") -> Row:
-    return Row(
-        area="link", name=name, found=found, expected=expected, verdict=verdict, advice=advice
     )

@@ -1,23 +1,39 @@
-"""Rows about the policy: whether it loads, its engine, its speed here, and what it expects."""
+"""Rows about the policy: whether it loads, its engine, its rates here, and what it expects."""
 
-from collections.abc import Iterator
+import threading
+from collections.abc import Callable, Iterator
 from contextlib import ExitStack
 from dataclasses import dataclass, field
+from functools import partial
+
+import numpy as np
 
 from mavbridge.commands.check.rows import Row, Verdict
 from mavbridge.config.flight import FlyConfig
-from mavbridge.core.clock import Clock
+from mavbridge.core.clock import NS_PER_S, Clock, period_ns
 from mavbridge.core.errors import MavbridgeError
+from mavbridge.core.histogram import Histogram
+from mavbridge.core.realtime import settle_thread
+from mavbridge.core.workers import Worker
 from mavbridge.flight.plan import plan_flight
 from mavbridge.flight.policies import load_configured_policy
 from mavbridge.flight.speed import require_speed
-from policy.contract import Contract
+from policy.contract import ACTION_DIM, Contract
+from policy.engines.executable import encode_all, level_state
 from policy.loading.request import LoadedPolicy
+from policy.preprocess import dummy_images
 from policy.protocol import Executable
 
 NO_POLICY = "none"
 _BUSY = 0.8
 """Share of a slot from which other work on this computer makes chunks late."""
+_HELD = 0.98
+"""Share of the asked rate from which it counts as held."""
+_LATE_PERIODS = 1.5
+"""A chunk that comes more than so many periods after the one before is late, as in the report of a
+flight."""
+_JOIN_S = 60.0
+"""Longest wait for the last call of a slow policy."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -30,8 +46,8 @@ class PolicyFindings:
     is_dual: bool = True
 
 
-def check_policy(config: FlyConfig, clock: Clock) -> PolicyFindings:
-    """Load the policy as a flight does, and close it again; a failure is a row."""
+def check_policy(config: FlyConfig, clock: Clock, *, timing_s: float) -> PolicyFindings:
+    """Load the policy as a flight does, run it for ``timing_s``; a failure is a row."""
     if config.policy.policy == NO_POLICY:
         return PolicyFindings()
     try:
@@ -40,7 +56,7 @@ def check_policy(config: FlyConfig, clock: Clock) -> PolicyFindings:
                 config.policy, clock, starts_in_air=config.takeoff is not None
             )
             stack.enter_context(loaded)
-            rows = [_engine_row(loaded), *_speed_rows(config, loaded)]
+            rows = [_engine_row(loaded), *_speed_rows(config, loaded, clock, timing_s)]
             rows += _contract_rows(config, loaded.executable)
             contract = loaded.executable.contract
             return PolicyFindings(rows=rows, contract=contract, is_dual=loaded.executable.dual_rate)
@@ -63,9 +79,15 @@ def _engine_row(loaded: LoadedPolicy) -> Row:
     )
 
 
-def _speed_rows(config: FlyConfig, loaded: LoadedPolicy) -> Iterator[Row]:
-    """The share of each slot that a chunk and an image need, and what a flight says of it."""
-    yield from _slot_rows(config, loaded)
+def _speed_rows(
+    config: FlyConfig, loaded: LoadedPolicy, clock: Clock, timing_s: float
+) -> Iterator[Row]:
+    """The rates that were held, and what a flight says of the policy's speed."""
+    if loaded.times is None:
+        yield _row("speed", "not measured: no chunk on a dummy sample")
+    else:
+        for pace in _run_at_rates(config, loaded.executable, clock, timing_s):
+            yield pace.row()
     expected = "within the ages of its contract"
     try:
         executable = loaded.executable
@@ -79,28 +101,94 @@ def _speed_rows(config: FlyConfig, loaded: LoadedPolicy) -> Iterator[Row]:
         yield _row("speed", "slower than asked", "warn", "; ".join(warnings), expected=expected)
 
 
-def _slot_rows(config: FlyConfig, loaded: LoadedPolicy) -> Iterator[Row]:
-    contract, times = loaded.executable.contract, loaded.times
-    if times is None:
-        yield _row("speed", "not measured: no chunk on a dummy sample")
-        return
-    loops = config.rates.loops(is_dual=loaded.executable.dual_rate, play_s=contract.play_s)
-    image_hz = min((loops.max_vision_hz, *contract.camera_rates_hz))
-    for name, each_s, rate_hz in (
-        ("a chunk", times.act_s, loops.action_hz),
-        ("an image", times.encode_s, image_hz),
-    ):
-        share = each_s * rate_hz
-        is_tight = share > _BUSY
-        yield _row(
-            f"time for {name}",
-            f"{each_s * 1000:.1f} ms, {share:.0%} of its slot",
-            "warn" if is_tight else "go",
-            f"{name} leaves little of its slot: other programs will make it late"
-            if is_tight
-            else "",
-            expected=f"under {_BUSY:.0%} of {1000 / rate_hz:.3g} ms ({rate_hz:.3g} Hz)",
+@dataclass(kw_only=True)
+class Pace:
+    """One half of the policy, called on a grid as the loops of a flight call it."""
+
+    name: str
+    asked_hz: float
+    took: Histogram = field(default_factory=Histogram)
+    late: int = 0
+    rate_hz: float = 0.0
+
+    def run(
+        self,
+        stop: threading.Event,
+        *,
+        call: Callable[[], object],
+        clock: Clock,
+        duration_s: float,
+        settle: Callable[[], object],
+    ) -> None:
+        """Call for ``duration_s``, and count; a call that is late moves those behind it."""
+        settle()
+        begun_ns = ended_ns = due_ns = clock.now_ns()
+        every_ns = period_ns(self.asked_hz)
+        while due_ns < begun_ns + duration_s * NS_PER_S and not stop.is_set():
+            clock.sleep_until_ns(due_ns)
+            called_ns = clock.now_ns()
+            call()
+            now_ns = clock.now_ns()
+            self.late += self.took.count > 0 and now_ns - ended_ns > _LATE_PERIODS * every_ns
+            self.took.add(now_ns - called_ns)
+            ended_ns, due_ns = now_ns, max(due_ns + every_ns, now_ns)
+        self.rate_hz = self.took.count * NS_PER_S / max(due_ns - begun_ns, 1)
+
+    def row(self) -> Row:
+        """The rate and the times; a warning if it was not held, or only just."""
+        took_ms = self.took.percentiles_ms()
+        if took_ms is None:
+            return _row(self.name, "not one in time", "warn", "far too slow for this computer")
+        share, advice = took_ms.p50 * self.asked_hz / 1000, ""
+        if self.rate_hz < _HELD * self.asked_hz:
+            advice = f"this computer makes {self.rate_hz:.1f} {self.name} a second here"
+        elif share > _BUSY:
+            advice = f"{self.name} leave little of their slots: other programs will make them late"
+        times = f"{took_ms.p50:.1f} / {took_ms.p99:.1f} / {took_ms.max:.1f} ms"
+        return _row(
+            self.name,
+            f"{self.rate_hz:.1f} Hz, {self.late} of {self.took.count} late; {times} "
+            f"(p50 / p99 / max), {share:.0%} of a slot",
+            "warn" if advice else "go",
+            advice,
+            expected=f"{self.asked_hz:.3g} Hz, under {_BUSY:.0%} of a slot",
         )
+
+
+def _run_at_rates(
+    config: FlyConfig, executable: Executable, clock: Clock, timing_s: float
+) -> list[Pace]:
+    """Chunks and images of a dummy sample, each in a thread, at the rates of the flight."""
+    contract, rates = executable.contract, config.rates
+    loops = rates.loops(is_dual=executable.dual_rate, play_s=contract.play_s)
+    images, state = dummy_images(contract), level_state(contract)
+    history = np.zeros((1, contract.history_len, ACTION_DIM), np.float32)
+    encoded = encode_all(executable, images)
+    one_of_each = images.reshape(-1, len(contract.cameras), *contract.picture_shape)[0]
+
+    def encode() -> None:
+        for camera, image in enumerate(one_of_each):
+            executable.encode(image, camera)
+
+    chunks = Pace(name="chunks", asked_hz=loops.action_hz)
+    pictures = Pace(name="images", asked_hz=min((loops.max_vision_hz, *contract.camera_rates_hz)))
+    workers = []
+    for pace, call, realtime, cpu in (
+        (chunks, lambda: executable.act(encoded, state, history), rates.realtime, rates.action_cpu),
+        (pictures, encode, False, rates.vision_cpu),
+    ):
+        settle = partial(settle_thread, realtime=realtime, cpu=cpu)
+        run = partial(pace.run, call=call, clock=clock, duration_s=timing_s, settle=settle)
+        workers.append(Worker(f"mavbridge-check-{pace.name}", run))
+    for worker in workers:
+        worker.start()
+    try:
+        for worker in workers:
+            worker.ends_within(timing_s + _JOIN_S)
+    finally:  # also on Ctrl-C: the policy is closed once nothing calls it
+        for worker in workers:
+            worker.join(_JOIN_S)
+    return [chunks, pictures]
 
 
 def _contract_rows(config: FlyConfig, executable: Executable) -> list[Row]:

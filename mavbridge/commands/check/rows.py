@@ -1,18 +1,28 @@
-"""Rows of the check, and the verdict on all of them."""
+"""Rows of the check, the verdict on all of them, their JSON and their table."""
 
 import re
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Literal, TypeAlias, TypedDict
+from typing import Literal, TypeAlias
 
+from rich.console import Console
+from rich.table import Table
+from rich.text import Text
+
+from mavbridge.commands.output import PIPED_WIDTH
 from mavbridge.core.provenance import without_secrets
 
 Area: TypeAlias = Literal["link", "vehicle", "parameters", "camera", "policy", "computer"]
 Verdict: TypeAlias = Literal["go", "warn", "no-go"]
 _FLAG = re.compile(r"--set [A-Z0-9_]+=-?\d+(?:\.\d+)?|--source-system \d+|ulimit -\w \w+")
+_STYLES: dict[Verdict, str] = {"go": "green", "warn": "yellow", "no-go": "bold red"}
+_FOOT = (
+    "Nothing was set, armed or flown. What a flight asks for was asked for as well: message "
+    "rates, which stay until the vehicle or another station changes them."
+)
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
+@dataclass(frozen=True, slots=True)
 class Row:
     """One thing that was looked at."""
 
@@ -35,45 +45,77 @@ class Row:
         return tuple(_FLAG.findall(self.advice))
 
 
-class RowDocument(TypedDict):
-    """One row as JSON."""
-
-    area: Area
-    name: str
-    verdict: Verdict
-    found: str
-    expected: str
-    advice: str
-    commands: list[str]
-
-
-class CheckDocument(TypedDict):
-    """The whole check as JSON."""
-
-    verdict: Verdict
-    rows: list[RowDocument]
-
-
 def overall(rows: Sequence[Row]) -> Verdict:
     """The worst verdict of all."""
     verdicts = {row.verdict for row in rows}
     return "no-go" if "no-go" in verdicts else "warn" if "warn" in verdicts else "go"
 
 
-def as_document(rows: Sequence[Row]) -> CheckDocument:
-    """All rows in the order of the table."""
-    return CheckDocument(
-        verdict=overall(rows),
-        rows=[
-            RowDocument(
-                area=row.area,
-                name=row.name,
-                verdict=row.verdict,
-                found=row.found,
-                expected=row.expected,
-                advice=row.advice,
-                commands=list(row.commands),
-            )
+def as_document(rows: Sequence[Row]) -> dict[str, object]:
+    """All rows in the order of the table, for JSON."""
+    names = ("area", "name", "verdict", "found", "expected", "advice")
+    return {
+        "verdict": overall(rows),
+        "rows": [
+            {name: getattr(row, name) for name in names} | {"commands": list(row.commands)}
             for row in rows
         ],
-    )
+    }
+
+
+def print_check(rows: Sequence[Row], console: Console) -> None:
+    """Print all rows, then the reasons and cures of those that are not go, then the verdict."""
+    if not console.is_terminal:
+        console.width = PIPED_WIDTH
+    console.print(_table(rows))
+    for verdict in ("no-go", "warn"):
+        _print_reasons([row for row in rows if row.verdict == verdict], console)
+    console.print()
+    console.print(Text(_FOOT, style="dim"))
+    console.print(_summary(rows))
+
+
+def _table(rows: Sequence[Row]) -> Table:
+    table = Table(pad_edge=False, box=None, padding=(0, 1), header_style="bold")
+    table.add_column("", no_wrap=True)
+    table.add_column("what", overflow="fold")
+    table.add_column("found", overflow="fold", ratio=3)
+    table.add_column("should be", overflow="fold", ratio=2, style="dim")
+    area = None
+    for row in rows:
+        if row.area != area:
+            area = row.area
+            table.add_row("", Text(area, style="bold underline"))
+        mark = Text(row.verdict, style=_STYLES[row.verdict])
+        table.add_row(mark, Text(row.name), Text(row.found), Text(row.expected))
+    return table
+
+
+def _print_reasons(rows: Sequence[Row], console: Console) -> None:
+    """Each reason once, with its rows' names, its text hanging under itself."""
+    names: dict[str, list[str]] = {}
+    for row in rows:
+        names.setdefault(row.advice, []).append(row.name)
+    if not names:
+        return
+    grid = Table.grid(padding=(0, 1))
+    grid.add_column(no_wrap=True)
+    grid.add_column(overflow="fold")
+    mark = Text(rows[0].verdict, style=_STYLES[rows[0].verdict])
+    for advice, whose in names.items():
+        names_itself = advice.startswith(tuple(whose))
+        head = "" if names_itself else f"{', '.join(whose)}: "
+        grid.add_row(mark, Text.assemble((head, "bold"), advice))
+    console.print()
+    console.print(grid)
+
+
+def _summary(rows: Sequence[Row]) -> Text:
+    verdict = overall(rows)
+    counts = {each: sum(row.verdict == each for row in rows) for each in _STYLES}
+    told = f"{counts['go']} go, {counts['warn']} to be warned of, {counts['no-go']} no-go"
+    word = "NO-GO" if verdict == "no-go" else "GO"
+    sets = dict.fromkeys(command for row in rows for command in row.commands)
+    flags = [flag for flag in sets if flag.startswith("--")]
+    cure = f"\nfor one flight, add: {' '.join(flags)}" if flags else ""
+    return Text.assemble((word, _STYLES[verdict]), f": {told}{cure}")

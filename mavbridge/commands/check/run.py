@@ -1,6 +1,9 @@
-"""``mavbridge check`` from its config to its exit status."""
+"""``mavbridge check`` from its config to its exit status, and the rows about this computer."""
 
 import json
+import os
+import platform
+import subprocess
 import sys
 from pathlib import Path
 
@@ -9,22 +12,105 @@ from rich.console import Console
 
 from mavbridge.camera.open import NO_CAMERA
 from mavbridge.commands.check.camera import CameraNeeds, camera_rows
-from mavbridge.commands.check.computer import computer_rows
-from mavbridge.commands.check.config import CheckConfig
 from mavbridge.commands.check.policy import NO_POLICY, PolicyFindings, check_policy
-from mavbridge.commands.check.rows import Row, as_document, overall
-from mavbridge.commands.check.table import print_check
+from mavbridge.commands.check.rows import Row, as_document, overall, print_check
 from mavbridge.commands.check.vehicle import check_vehicle
+from mavbridge.commands.config import CheckConfig
 from mavbridge.commands.output import print_status
 from mavbridge.config.flight import CameraConfig, FlyConfig
+from mavbridge.config.rates import Rates
 from mavbridge.core.clock import Clock, MonotonicClock
 from mavbridge.core.errors import ExitCode, MavbridgeError
 from mavbridge.core.files import require_writable
+from mavbridge.core.processes import child_environment
 from mavbridge.flight.policies import looks_at_images, require_images
 from policy.contract import Contract
 from policy.preprocess import least_source_px
 
+_CLOCK_SOURCE = Path("/sys/devices/system/clocksource/clocksource0/current_clocksource")
+_SLOW_CLOCKS = ("hpet", "acpi_pm", "jiffies", "refined-jiffies", "pit")
+"""Clock sources that are read from a device, in a microsecond or more, or only tick."""
+_CORES = 2
+"""The gate beside the policy, so that neither delays the other."""
+_RIGHTS_TIMEOUT_S = 10.0
+_TRY_RIGHTS = """
+import sys
+from mavbridge.core.realtime import settle_gate, settle_thread
+cpus = [int(word) if word else None for word in sys.argv[2:]]
+realtime = sys.argv[1] == "yes"
+refusals = [settle_gate(realtime=realtime, cpu=cpus[0])]
+refusals += [settle_thread(realtime=False, cpu=cpu) for cpu in cpus[1:]]
+print("; ".join(filter(None, refusals)))
+"""
+"""A process of its own asks as the gate does, and ends: nothing of it stays with this one."""
 STDOUT = Path("-")
+NO_VEHICLE = "none"
+
+
+def computer_rows(rates: Rates) -> list[Row]:
+    """Clock source, cores, real-time scheduling and locked memory."""
+    return [_clock_row(), _cores_row(), _rights_row(rates)]
+
+
+def _clock_row() -> Row:
+    try:
+        source = _CLOCK_SOURCE.read_text().strip()
+    except OSError:  # no such file on macOS, or in some containers
+        source = ""
+    is_slow = source in _SLOW_CLOCKS
+    return Row(
+        area="computer",
+        name="clock",
+        found=source or f"not told by {platform.system()}",
+        expected="one that the processor reads by itself, such as tsc",
+        verdict="warn" if is_slow else "go",
+        advice=f"the clock source {source} is slow to read or coarse: stamps are late by its time; "
+        "see current_clocksource in the kernel's documentation"
+        if is_slow
+        else "",
+    )
+
+
+def _cores_row() -> Row:
+    has_affinity = hasattr(os, "sched_getaffinity")
+    cores = len(os.sched_getaffinity(0)) if has_affinity else os.cpu_count() or 1
+    return Row(
+        area="computer",
+        name="cores",
+        found=str(cores),
+        expected=f"{_CORES} or more",
+        verdict="go" if cores >= _CORES else "warn",
+        advice=""
+        if cores >= _CORES
+        else "gate and policy share one core: a slow policy delays the sticks",
+    )
+
+
+def _rights_row(rates: Rates) -> Row:
+    words = ["yes" if rates.realtime else "no"]
+    cpus = (rates.gate_cpu, rates.action_cpu, rates.vision_cpu)
+    words += ["" if cpu is None else str(cpu) for cpu in cpus]
+    try:
+        tried = subprocess.run(
+            [sys.executable, "-c", _TRY_RIGHTS, *words],
+            env=child_environment(),
+            capture_output=True,
+            text=True,
+            timeout=_RIGHTS_TIMEOUT_S,
+            check=True,
+        )
+        refused = tried.stdout.strip()
+    except (OSError, subprocess.SubprocessError) as error:
+        refused = f"the rights of the gate could not be tried: {error}"
+    wanted = "SCHED_FIFO and locked memory" if rates.realtime else "locked memory"
+    return Row(
+        area="computer",
+        name="rights of the gate",
+        found="refused in part" if refused else "granted",
+        expected=wanted,
+        verdict="warn" if refused else "go",
+        advice=refused,
+    )
 
 
 def check(config: CheckConfig) -> int:
@@ -51,16 +137,21 @@ def check_all(config: CheckConfig) -> list[Row]:
     """All rows, in the order of the table."""
     flight, clock = config.flight, MonotonicClock()
     if flight.policy.policy != NO_POLICY:
-        print_status("loading the policy")
-    policy = check_policy(flight, clock)
+        print_status(f"loading the policy, then running it for {config.timing:g} s")
+    policy = check_policy(flight, clock, timing_s=config.timing)
     cameras = _check_cameras(flight, policy, clock)
-    print_status(f"listening to the vehicle on {flight.link.connect}")
-    vehicle = check_vehicle(flight, policy, clock, echo_test=config.echo_test)
+    if flight.link.connect == NO_VEHICLE:
+        vehicle = [Row(area="link", name="vehicle", found="none", expected="none for this check")]
+    else:
+        print_status(f"listening to the vehicle on {flight.link.connect}")
+        vehicle = check_vehicle(flight, policy, clock, echo_test=config.echo_test)
     return [*vehicle, *cameras, *policy.rows, *computer_rows(flight.rates)]
 
 
 def _check_cameras(config: FlyConfig, policy: PolicyFindings, clock: Clock) -> list[Row]:
     """Rows of every camera of the flight, or of the flags that do not fit the policy."""
+    if config.link.connect == NO_VEHICLE and set(config.camera.sources) == {NO_CAMERA}:
+        return []  # only this computer is checked
     try:
         require_images(config)
         needs = _camera_needs(config, policy)

@@ -5,10 +5,13 @@ In real time vehicle and bridge are processes of their own, connected over UDP.
 
 import json
 import multiprocessing
+import signal
 import sys
+import traceback
 from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import dataclass, replace
+from multiprocessing.connection import Connection
 from pathlib import Path
 from subprocess import Popen, TimeoutExpired
 from tempfile import TemporaryDirectory
@@ -16,7 +19,6 @@ from typing import NamedTuple
 
 from rich.console import Console
 
-from mavbridge.commands.episode_workers import WorkerProcess, raise_failure
 from mavbridge.commands.evaluate.config import EvaluateConfig
 from mavbridge.config.courses import HELD_OUT_COURSE_SEED, MAX_EPISODES, first_seed
 from mavbridge.config.flight import CameraConfig, FlyConfig, LinkConfig
@@ -179,11 +181,16 @@ def _run_bridge(
     """Run the bridge in a process of its own until it or the vehicle has ended."""
     clock, spec = MonotonicClock(), job.spec
     deadline_ns = clock.now_ns() + round((spec.config.max_time + STARTUP_S) * NS_PER_S)
-    never = multiprocessing.get_context("spawn").Event()
-    worker = WorkerProcess("mavbridge-evaluate-bridge", _fly_bridge, never)
-    worker.send(job)
+    context = multiprocessing.get_context("spawn")
+    outcomes, theirs = context.Pipe(duplex=False)
+    bridge = context.Process(
+        target=_send_outcome, args=(theirs, job), name="mavbridge-evaluate-bridge"
+    )
+    bridge.start()
+    theirs.close()
+    outcome: _BridgeFlight | Exception | None = None
     try:
-        while not worker.connection.poll(_POLL_S) and vehicle.poll() is None:
+        while not outcomes.poll(_POLL_S) and vehicle.poll() is None:
             if should_stop():
                 raise EpisodeInterruptedError(f"{spec}: interrupted")
             if clock.now_ns() > deadline_ns:
@@ -191,15 +198,30 @@ def _run_bridge(
         if should_stop():  # the vehicle ended by the same Ctrl-C
             raise EpisodeInterruptedError(f"{spec}: interrupted")
     finally:
-        worker.terminate()  # gives the sticks back
-        outcome = worker.receive()
-        worker.end()
+        bridge.terminate()  # gives the sticks back
+        with suppress(EOFError):
+            outcome = outcomes.recv() if outcomes.poll(END_TIMEOUT_S) else None
+        bridge.join(END_TIMEOUT_S)
+        bridge.kill()
+        bridge.join(END_TIMEOUT_S)
     if outcome is None:
         raise PeerError(f"{spec}: the bridge's process has died, or hung at its end")
-    return raise_failure(outcome)
+    if isinstance(outcome, Exception):
+        raise outcome
+    return outcome
 
 
-def _fly_bridge(job: _BridgeJob, _: Callable[[], bool]) -> _BridgeFlight:
+def _send_outcome(results: Connection, job: _BridgeJob) -> None:
+    """Fly once, in a process of its own; Ctrl-C reaches its parent, which then ends it."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    try:
+        results.send(_fly_bridge(job))
+    except Exception as error:  # noqa: BLE001 - raised again by the parent
+        error.add_note(traceback.format_exc())
+        results.send(error)
+
+
+def _fly_bridge(job: _BridgeJob) -> _BridgeFlight:
     """Fly once, as ``mavbridge fly`` does; ended by signals, like that."""
     settings, clock, meter = job.spec.config, MonotonicClock(), StickMeter()
     with (

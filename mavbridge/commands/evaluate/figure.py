@@ -4,8 +4,7 @@ from matplotlib import rc_context
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from mavbridge.commands.evaluate.results import Evaluation
-from mavbridge.commands.evaluate.statistics import rate
+from mavbridge.commands.evaluate.results import Evaluation, rate
 from mavbridge.commands.output import BLUE, FIGURE_DPI, FIGURE_STYLE, MUTED, RED
 
 

@@ -1,4 +1,4 @@
-"""Writes a LeRobot dataset of format v3.0, episode by episode."""
+"""Writes a LeRobot dataset of format v3.0, episode by episode, with its statistics."""
 
 import json
 from collections.abc import Iterable
@@ -20,7 +20,6 @@ from mavbridge.commands.export.files import (
     VideoFiles,
 )
 from mavbridge.commands.export.rows import MIN_ROWS, Stretch
-from mavbridge.commands.export.stats import ImageStats, vector_stats
 from mavbridge.core.records import ImageArray
 from mavbridge.recording.video.file import VideoError
 from policy.contract import ACTION_NAMES, STATE_NAMES
@@ -29,9 +28,69 @@ from policy.files import library_name
 from policy.foreign.state import state_values
 from policy.preprocess import resize
 
+QUANTILES = {"q01": 0.01, "q10": 0.10, "q50": 0.50, "q90": 0.90, "q99": 0.99}
+Stats: TypeAlias = dict[str, NDArray[np.float64] | NDArray[np.int64]]
+"""By name; "count" is [1] int64, the others are as wide as the feature."""
+
+_PIXEL_STEP = 2
+"""Every second pixel in each direction represents an image's colours."""
+_LEVELS = 256
 Json: TypeAlias = "str | int | float | bool | list[Json] | dict[str, Json] | None"
 
 _ROW_NUMBERS = ("frame_index", "episode_index", "index", "task_index")
+
+
+def vector_stats(values: NDArray[np.generic]) -> Stats:
+    """Statistics of each column of values [N, D] or [N], N >= 1."""
+    numbers = values.reshape(len(values), -1).astype(np.float64)
+    return {
+        "min": numbers.min(axis=0),
+        "max": numbers.max(axis=0),
+        "mean": numbers.mean(axis=0),
+        "std": numbers.std(axis=0),
+        "count": np.array([len(numbers)], np.int64),
+        **{name: np.quantile(numbers, at, axis=0) for name, at in QUANTILES.items()},
+    }
+
+
+class ImageStats:
+    """Colours of many images, counted."""
+
+    def __init__(self) -> None:
+        self._counts = np.zeros((3, _LEVELS), np.int64)
+        self._images = 0
+
+    def add(self, rgb: ImageArray) -> None:
+        """Count an image [H, W, 3] uint8."""
+        for channel in range(3):
+            sample = rgb[::_PIXEL_STEP, ::_PIXEL_STEP, channel].ravel()
+            self._counts[channel] += np.bincount(sample, minlength=_LEVELS)
+        self._images += 1
+
+    def merge(self, other: "ImageStats") -> None:
+        """Add the images that another has counted."""
+        self._counts += other._counts
+        self._images += other._images
+
+    def stats(self) -> Stats:
+        """Statistics [3, 1, 1] of colours in [0, 1]; "count" is the number of images."""
+        levels = np.arange(_LEVELS) / (_LEVELS - 1)
+        total = self._counts.sum(axis=1)
+        mean = self._counts @ levels / total
+        variance = self._counts @ levels**2 / total - mean**2
+        up_to = np.cumsum(self._counts, axis=1)
+        found: dict[str, NDArray[np.float64]] = {
+            "min": levels[(self._counts > 0).argmax(axis=1)],
+            "max": levels[_LEVELS - 1 - (self._counts[:, ::-1] > 0).argmax(axis=1)],
+            "mean": mean,
+            "std": np.sqrt(np.maximum(variance, 0.0)),
+            **{
+                name: levels[(up_to >= at * total[:, None]).argmax(axis=1)]
+                for name, at in QUANTILES.items()
+            },
+        }
+        out: Stats = {name: values.reshape(3, 1, 1) for name, values in found.items()}
+        return out | {"count": np.array([self._images], np.int64)}
 
 
 class DatasetWriter:

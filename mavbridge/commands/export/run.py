@@ -11,7 +11,7 @@ from av.error import FFmpegError
 from rich.console import Console
 from rich.progress import TaskID
 
-from mavbridge.commands.export.config import ExportConfig
+from mavbridge.commands.config import ExportConfig
 from mavbridge.commands.export.dataset import DatasetWriter, fit_size
 from mavbridge.commands.export.files import DATA_FILE_MB, MB, VIDEO_FILE_MB, DatasetSpec
 from mavbridge.commands.export.rows import Stretch, common_fps, stretches, worst_shift_ns

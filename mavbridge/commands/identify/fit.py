@@ -1,9 +1,15 @@
-"""Step response of one axis by least squares: gains to both sides, dead time, lag."""
+"""Step response of one axis by least squares, and the recording that it is fitted to."""
 
+from collections import deque
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
+
+from mavbridge.core.clock import NS_PER_S
+from mavbridge.core.records import Event, Tick, VehicleState
+from mavbridge.core.vehicle import Action
 
 Array = NDArray[np.float64]
 
@@ -18,6 +24,8 @@ OUTLIER_SIGMAS = 4.0
 SIGMA_PER_MAD = 1.4826
 """Standard deviation of a normal distribution over its median absolute deviation."""
 LEAST_SAMPLES = 20
+MAX_ROWS = 100_000
+"""Most actions, and most states: four minutes at 400 Hz. Beyond it the oldest are forgotten."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -163,3 +171,38 @@ class _Grid:
         ones = np.ones((*at.shape[:2], 1))
         columns: Array = np.concatenate([at, ones], axis=-1).transpose(1, 0, 2)
         return columns
+
+
+class ResponseRecording:
+    """A sink of ticks that keeps the policy's actions and the states that they came from.
+
+    One thread emits; the rest is for after the flight.
+    """
+
+    def __init__(self) -> None:
+        self._sent: deque[tuple[int, Action]] = deque(maxlen=MAX_ROWS)
+        self._states: deque[VehicleState] = deque(maxlen=MAX_ROWS)
+
+    def emit(self, event: Event) -> None:
+        """Keep a tick in which the policy flew; see ``mavbridge.core.ports.TickSink``."""
+        if not isinstance(event, Tick) or event.trace is None:
+            return
+        # As the policy's after its limits, before any mapping to this vehicle's own curves.
+        self._sent.append((event.sent_ns, event.trace.smoothed))
+        state = event.state
+        if state is not None and (not self._states or state is not self._states[-1]):
+            self._states.append(state)
+
+    def inputs(self, column: int) -> tuple[Array, Array]:
+        """Times in s and values of one number of the actions."""
+        times = np.array([at_ns for at_ns, _ in self._sent], np.float64) / NS_PER_S
+        return times, np.array([action[column] for _, action in self._sent], np.float64)
+
+    def outputs(
+        self, read: Callable[[VehicleState], float], measured_ns: Callable[[VehicleState], int]
+    ) -> tuple[Array, Array]:
+        """Times in s and values of something that ``read`` finds in a state; each moment once."""
+        times = np.array([measured_ns(state) for state in self._states], np.int64)
+        values = np.array([read(state) for state in self._states], np.float64)
+        _, first = np.unique(times, return_index=True)
+        return times[first].astype(np.float64) / NS_PER_S, values[first]

@@ -9,9 +9,14 @@ from rich.console import Console
 from rich.text import Text
 
 import policy
-from mavbridge.commands.imagine.config import ImagineConfig
-from mavbridge.commands.imagine.deciders import Decider, PolicyDecider, WorldModelDecider
-from mavbridge.commands.imagine.loop import RolloutPlan, rollout
+from mavbridge.commands.config import ImagineConfig
+from mavbridge.commands.imagine.loop import (
+    Decider,
+    PolicyDecider,
+    RolloutPlan,
+    WorldModelDecider,
+    rollout,
+)
 from mavbridge.commands.imagine.output import (
     OnFrame,
     RolloutError,

@@ -3,14 +3,25 @@
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
+from pathlib import Path
 from typing import Literal, NamedTuple, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
 
+from mavbridge.config.flight import Limits
 from mavbridge.core.clock import NS_PER_MS, NS_PER_S
-from mavbridge.core.records import Tick
+from mavbridge.core.errors import MavbridgeError
+from mavbridge.core.records import Solve, Tick
+from mavbridge.flight.settings import effective_freshness
+from mavbridge.gate.chunks import FreshnessLimits
 from mavbridge.observe.timing import LATE_PERIODS
+from mavbridge.recording import replay_rows
+from mavbridge.recording.folder import PACKETS, SOLVES
+from mavbridge.recording.replay_rows import read_solves
+from mavbridge.recording.settings import read_settings
+from mavbridge.recording.tables import read_table
+from policy.contract import Contract
 
 Stamps: TypeAlias = NDArray[np.int64]
 Cause = Literal[
@@ -22,6 +33,8 @@ Cause = Literal[
     "the attitude or the policy loop was late",
 ]
 """The last one where the recording lacks the arrivals, without which nobody can tell."""
+ATTITUDES = (30, 31)
+"""Message ids of ATTITUDE and ATTITUDE_QUATERNION (MAVLink, common.xml)."""
 
 
 class Arrivals(NamedTuple):
@@ -165,3 +178,47 @@ def _arrival_ns(
     if int(arrivals.happened_ns[number]) > solve.attitude_ns:
         return None  # the one that was used is not in the table: its row was lost
     return int(arrivals.arrived_ns[number])
+
+
+def flown_limits(folder: Path, contract: Contract | None) -> FreshnessLimits | None:
+    """Ages at which chunks were flown: the flags' where they are recorded, else the contract's."""
+    if contract is None:
+        return None
+    try:
+        return effective_freshness(contract, read_settings(folder).config.limits)
+    except MavbridgeError:  # no settings, or those of another version
+        return effective_freshness(contract, Limits())
+
+
+def read_arrivals(folder: Path, damage: list[str]) -> Arrivals | None:
+    """Attitudes that reached the flight process; None where the recording has no such table.
+
+    A sentence on what is lost is added to ``damage``.
+
+    Raises:
+        MavbridgeError: the table is damaged.
+    """
+    if not _has(folder, PACKETS):
+        return None
+    table = read_table(folder / PACKETS, replay_rows.PACKETS, damage=damage)
+    columns = {name: table.column(name).to_numpy() for name in table.column_names}
+    rows = np.flatnonzero(np.isin(columns["message_id"], ATTITUDES))
+    if not len(rows):
+        return None
+    rows = rows[np.argsort(columns["happened_ns"][rows], kind="stable")]
+    return Arrivals(columns["happened_ns"][rows], columns["arrived_ns"][rows])
+
+
+def recorded_solves(folder: Path, contract: Contract | None) -> Iterator[Solve]:
+    """What the policy computed, in the order of time; nothing where it was not recorded.
+
+    Raises:
+        MavbridgeError: the table is damaged.
+    """
+    if contract is not None and _has(folder, SOLVES):
+        table = read_table(folder / SOLVES, replay_rows.SOLVES)
+        yield from (row.solve for row in read_solves(table, contract))
+
+
+def _has(folder: Path, stem: str) -> bool:
+    return any((folder / stem).with_suffix(end).exists() for end in (".parquet", ".arrows"))

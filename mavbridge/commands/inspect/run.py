@@ -8,10 +8,10 @@ from dataclasses import asdict
 from itertools import islice
 from pathlib import Path
 
+from mavbridge.commands.config import InspectConfig
 from mavbridge.commands.inspect.analysis import FlightAnalysis, analyse
-from mavbridge.commands.inspect.config import InspectConfig
+from mavbridge.commands.inspect.delays import flown_limits, recorded_solves
 from mavbridge.commands.inspect.page import write_page
-from mavbridge.commands.inspect.sources import flown_limits, recorded_solves
 from mavbridge.commands.inspect.tables import print_comparison, print_flight
 from mavbridge.commands.output import print_status, table_console
 from mavbridge.core.clock import NS_PER_S

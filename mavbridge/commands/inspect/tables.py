@@ -8,8 +8,7 @@ from rich.console import Console
 from rich.table import Table
 from rich.text import Text
 
-from mavbridge.commands.inspect.analysis import FlightAnalysis
-from mavbridge.commands.inspect.holders import HolderSpan
+from mavbridge.commands.inspect.analysis import FlightAnalysis, HolderSpan
 from mavbridge.core.vehicle import Percentiles
 from mavbridge.flight.outcome import describe
 from mavbridge.observe.report_table import rate_style, shown_rate, timing_table, verdicts

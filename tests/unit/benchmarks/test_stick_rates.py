@@ -7,9 +7,9 @@ from rich.console import Console
 
 from benchmarks import stick_rates
 from benchmarks.loaded_flight import SLOW_EVERY, SLOW_NS, with_slow_solves
+from benchmarks.results import Flight
 from benchmarks.stick_rates import Case, case_table
 from helpers.bench_results import make_flight
-from mavbridge.commands.bench.results import Flight
 from mavbridge.config.policy import PolicyConfig
 from mavbridge.config.rates import Rates
 from mavbridge.core.clock import MonotonicClock

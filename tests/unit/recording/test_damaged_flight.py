@@ -10,7 +10,7 @@ import pytest
 
 from helpers.factories import make_tick
 from helpers.recordings import make_frame, make_meta, number_of, without_writer_process
-from mavbridge.commands.inspect.config import InspectConfig
+from mavbridge.commands.config import InspectConfig
 from mavbridge.commands.inspect.run import inspect
 from mavbridge.recording.flight_folder import open_flight
 from mavbridge.recording.flight_writer import FlightWriter

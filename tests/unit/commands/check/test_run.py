@@ -2,20 +2,21 @@
 
 import io
 import json
+import threading
 from pathlib import Path
 
 import pytest
 from rich.console import Console
 
+from helpers.fakes import FakeClock
 from mavbridge import cli
-from mavbridge.commands.check.config import CheckConfig
-from mavbridge.commands.check.policy import check_policy
-from mavbridge.commands.check.rows import Row, as_document, overall
+from mavbridge.commands.check.policy import Pace, check_policy
+from mavbridge.commands.check.rows import Row, as_document, overall, print_check
 from mavbridge.commands.check.run import check
-from mavbridge.commands.check.table import print_check
+from mavbridge.commands.config import CheckConfig
 from mavbridge.config.flight import CameraConfig, FlyConfig, LinkConfig
 from mavbridge.config.policy import PolicyConfig
-from mavbridge.core.clock import MonotonicClock
+from mavbridge.core.clock import NS_PER_MS, MonotonicClock
 from mavbridge.core.errors import ExitCode, UserError
 from mavbridge.core.processes import free_port
 
@@ -40,7 +41,7 @@ def test_no_vehicle_is_a_no_go_in_status_table_and_json(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     path = tmp_path / "check.json"
-    status = check(CheckConfig(flight=flight("scripted:hover"), json=path))
+    status = check(CheckConfig(timing=0.5, flight=flight("scripted:hover"), json=path))
 
     document = json.loads(path.read_text())
     assert status == ExitCode.NOT_FLOWN
@@ -50,7 +51,7 @@ def test_no_vehicle_is_a_no_go_in_status_table_and_json(
 
 
 def test_json_on_standard_output_is_nothing_but_json(capsys: pytest.CaptureFixture[str]) -> None:
-    check(CheckConfig(flight=flight("none"), json=Path("-")))
+    check(CheckConfig(timing=0.5, flight=flight("none"), json=Path("-")))
     out, err = capsys.readouterr()
     assert json.loads(out)["verdict"] == "no-go"
     assert "heard nothing" in err
@@ -62,16 +63,47 @@ def test_the_vehicle_must_be_named() -> None:
 
 
 def test_a_net_without_its_camera_is_a_no_go(capsys: pytest.CaptureFixture[str]) -> None:
-    check(CheckConfig(flight=flight("resnet-unet:nonsense"), json=Path("-")))
+    check(CheckConfig(timing=0.5, flight=flight("resnet-unet:nonsense"), json=Path("-")))
     rows = {row["name"]: row for row in json.loads(capsys.readouterr().out)["rows"]}
     assert "name its camera" in rows["cameras"]["advice"]
     assert rows["policy"]["verdict"] == "no-go", "a policy that cannot be loaded is a row"
 
 
+def test_a_policy_and_a_computer_are_checked_without_a_vehicle(
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    config = FlyConfig(
+        link=LinkConfig(connect="none"), policy=PolicyConfig(policy="scripted:hover"), camera=BLIND
+    )
+    assert check(CheckConfig(timing=0.5, flight=config, json=Path("-"))) == ExitCode.DONE
+    rows = json.loads(capsys.readouterr().out)["rows"]
+    assert {row["area"] for row in rows} == {"link", "policy", "computer"}
+
+
+@pytest.mark.parametrize(
+    ("each_ms", "rate_hz", "late", "verdict"),
+    [(4, 100.0, 0, "go"), (9, 100.0, 0, "warn"), (20, 50.0, 49, "warn")],
+)
+def test_a_pace_that_is_not_held_is_a_warning(
+    each_ms: int, rate_hz: float, late: int, verdict: str
+) -> None:
+    clock = FakeClock()
+    pace = Pace(name="chunks", asked_hz=100.0)
+    pace.run(
+        threading.Event(),
+        call=lambda: clock.advance_ns(each_ms * NS_PER_MS),
+        clock=clock,
+        duration_s=1.0,
+        settle=lambda: None,
+    )
+    assert pace.rate_hz == pytest.approx(rate_hz)
+    assert (pace.late, pace.row().verdict) == (late, verdict)
+
+
 def test_a_policy_tells_its_engine_speed_and_contract() -> None:
-    findings = check_policy(flight("scripted:square:velocity"), MonotonicClock())
+    findings = check_policy(flight("scripted:square:velocity"), MonotonicClock(), timing_s=0.5)
     names = [row.name for row in findings.rows]
-    assert names == ["engine", "time for a chunk", "time for an image", "contract", "plan"]
+    assert names == ["engine", "chunks", "images", "contract", "plan"]
     assert findings.contract is not None
     assert findings.contract.action == "velocity"
 
@@ -80,7 +112,7 @@ def test_a_flag_that_contradicts_the_policy_is_a_no_go() -> None:
     config = FlyConfig(policy=PolicyConfig(policy="scripted:hover"), mode="LOITER", camera=BLIND)
     (row,) = [
         row
-        for row in check_policy(config, MonotonicClock()).rows
+        for row in check_policy(config, MonotonicClock(), timing_s=0.5).rows
         if row.name == "flags of the flight"
     ]
     assert row.verdict == "no-go"

@@ -5,8 +5,8 @@ from pathlib import Path
 
 import pytest
 
-from mavbridge.commands.contract.config import ContractConfig
-from mavbridge.commands.contract.run import contract
+from mavbridge.commands.config import ContractConfig
+from mavbridge.commands.contract import contract
 from policy.errors import CheckpointError, ContractError
 from policy.foreign.interface import read_interface
 

@@ -8,11 +8,15 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from mavbridge.commands.demonstrate.config import DemonstrateConfig
-from mavbridge.commands.demonstrate.flight import DemonstrationSpec, fly_demonstration
-from mavbridge.commands.demonstrate.pilot import TurnSchedule, draw_variation
-from mavbridge.commands.demonstrate.run import demonstrate
-from mavbridge.commands.train.run import fit_to_flights
+from mavbridge.commands.config import DemonstrateConfig
+from mavbridge.commands.demonstrate import (
+    DemonstrationSpec,
+    TurnSchedule,
+    demonstrate,
+    draw_variation,
+    fly_demonstration,
+)
+from mavbridge.commands.train import fit_to_flights
 from mavbridge.config.courses import RACE_COURSE_SEED, AutopilotKind
 from mavbridge.config.policy import PolicyConfig
 from mavbridge.core.errors import UserError

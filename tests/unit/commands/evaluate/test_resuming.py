@@ -8,11 +8,10 @@ from typing import Any
 import pytest
 
 from helpers.evaluated_flights import finished
-from mavbridge.commands.evaluate import resuming, run
+from mavbridge.commands.evaluate import run
 from mavbridge.commands.evaluate.config import EvaluateConfig
 from mavbridge.commands.evaluate.episodes import EpisodeSpec, FlownEpisode
-from mavbridge.commands.evaluate.resuming import identity
-from mavbridge.commands.evaluate.run import evaluate
+from mavbridge.commands.evaluate.run import evaluate, identity
 from mavbridge.config.policy import PolicyConfig
 from mavbridge.config.workers import WorkersConfig
 from mavbridge.core.errors import PeerError, UserError
@@ -126,7 +125,7 @@ def test_a_contract_and_a_program_are_known_by_what_they_say(
     other.write_text("a = 2")
     assert identity(by_one) != identity(by_other)
     before = identity(config)
-    monkeypatch.setattr(resuming, "git_revision", lambda: "another")
+    monkeypatch.setattr(run, "git_revision", lambda: "another")
     assert identity(config) != before
 
 

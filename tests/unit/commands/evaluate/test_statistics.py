@@ -1,6 +1,6 @@
 import pytest
 
-from mavbridge.commands.evaluate.statistics import Estimate, mean, rate
+from mavbridge.commands.evaluate.results import Estimate, mean, rate
 
 
 @pytest.mark.parametrize(

@@ -15,7 +15,7 @@ import pytest
 from helpers.flight_folders import LEVEL, MS, spot, ticks_table, write_flight, write_meta
 from helpers.lerobot_rules import broken_rules
 from mavbridge.__main__ import main
-from mavbridge.commands.export.config import ExportConfig
+from mavbridge.commands.config import ExportConfig
 from mavbridge.commands.export.run import ExportSummary, export, write_dataset
 from mavbridge.core.errors import MavbridgeError, UserError
 from policy.data.flight_data import FlightData

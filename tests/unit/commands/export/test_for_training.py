@@ -10,7 +10,7 @@ import pytest
 
 from helpers.flight_folders import write_meta, write_spot_flight
 from helpers.lerobot_rules import broken_rules
-from mavbridge.commands.export.config import ExportConfig
+from mavbridge.commands.config import ExportConfig
 from mavbridge.commands.export.rows import stretches
 from mavbridge.commands.export.run import export
 from mavbridge.core.errors import UserError

@@ -6,9 +6,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from mavbridge.commands.export_policy import run
-from mavbridge.commands.export_policy.config import ExportFormat, ExportPolicyConfig
-from mavbridge.commands.export_policy.run import export_policy
+from mavbridge.commands import export_policy as run
+from mavbridge.commands.config import ExportFormat, ExportPolicyConfig
+from mavbridge.commands.export_policy import export_policy
 from mavbridge.core.errors import UserError
 from policy.contract import Contract, FloatArray
 from policy.errors import PolicyError

@@ -11,10 +11,15 @@ import pytest
 from rich.console import Console
 
 from helpers.factories import make_released_tick, make_state, make_tick, make_trace
-from mavbridge.commands.identify.analysis import Identification, Side, identify_pushes
-from mavbridge.commands.identify.axes import CHANNELS, trained_motion
-from mavbridge.commands.identify.recording import MAX_ROWS, ResponseRecording
-from mavbridge.commands.identify.results import print_identification, to_json, verdicts
+from mavbridge.commands.identify.analysis import (
+    CHANNELS,
+    Identification,
+    Side,
+    identify_pushes,
+    trained_motion,
+)
+from mavbridge.commands.identify.fit import MAX_ROWS, ResponseRecording
+from mavbridge.commands.identify.run import print_identification, to_json, verdicts
 from mavbridge.core.clock import NS_PER_MS, NS_PER_S
 from mavbridge.core.vehicle import ACTION_CLASSES
 from policy.contract import ActionKind, Contract

@@ -1,7 +1,7 @@
 import pytest
 
 from helpers.fakes import FakeClock
-from mavbridge.commands.identify.config import IdentifyConfig
+from mavbridge.commands.config import IdentifyConfig
 from mavbridge.commands.identify.run import doublet_flight, doublet_policy
 from mavbridge.config.flight import FlyConfig, LinkConfig
 from mavbridge.config.policy import PolicyConfig

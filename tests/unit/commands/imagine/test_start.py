@@ -16,7 +16,7 @@ from helpers.rollouts import (
     noise_executable,
     write_flight,
 )
-from mavbridge.commands.imagine.deciders import ObservationQueue, PolicyDecider
+from mavbridge.commands.imagine.loop import ObservationQueue, PolicyDecider
 from mavbridge.commands.imagine.start import RealFrames, read_start
 from mavbridge.core.clock import NS_PER_MS, NS_PER_S
 from mavbridge.core.errors import UserError

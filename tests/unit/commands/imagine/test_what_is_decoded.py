@@ -10,8 +10,7 @@ import pytest
 import torch
 
 from helpers.rollouts import TinyWorld, make_plan, make_sampler, make_start, run
-from mavbridge.commands.imagine.deciders import ObservationQueue
-from mavbridge.commands.imagine.loop import rollout
+from mavbridge.commands.imagine.loop import ObservationQueue, rollout
 from mavbridge.commands.imagine.streamed import QUEUED_SEGMENTS
 from mavbridge.core.records import FloatArray, ImageArray, RolloutFrame
 from policy.contract import Contract

@@ -11,8 +11,8 @@ from rich.console import Console
 
 from helpers.factories import make_released_tick, make_state, make_tick
 from helpers.recordings import make_frame, make_meta, without_writer_process
+from mavbridge.commands.config import InspectConfig
 from mavbridge.commands.inspect.analysis import FlightAnalysis, analyse
-from mavbridge.commands.inspect.config import InspectConfig
 from mavbridge.commands.inspect.run import _events as events_of
 from mavbridge.commands.inspect.run import inspect
 from mavbridge.commands.inspect.tables import print_comparison, print_flight

@@ -12,7 +12,7 @@ from pymavlink.dialects.v20 import ardupilotmega as dialect
 
 from helpers.flight_folders import LEVEL, MS, ticks_table, write_flight, write_video
 from mavbridge.__main__ import main
-from mavbridge.commands.export.config import ExportConfig
+from mavbridge.commands.config import ExportConfig
 from mavbridge.commands.export.run import write_dataset
 from mavbridge.commands.replay.config import ReplayConfig
 from mavbridge.commands.replay.run import replay

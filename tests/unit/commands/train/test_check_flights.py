@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 import torch
 
-from mavbridge.commands.train import check_flights as train_check
+from mavbridge.commands import train as train_check
 from mavbridge.config.courses import (
     CHECK_COURSE_SEED,
     HELD_OUT_COURSE_SEED,
@@ -69,7 +69,7 @@ def test_counts_the_gates_of_courses_that_nothing_else_flies_with_the_weights_in
         features.append(executable.encode(np.full((32, 32, 3), 128, np.uint8)))
         return result(course_seed, seed, gates=2 * seed)
 
-    monkeypatch.setattr(train_check, "SimulatedFlight", flights_by(fly))
+    monkeypatch.setattr("mavbridge.simulation.flight.SimulatedFlight", flights_by(fly))
 
     monkeypatch.setattr(train_check, "load_configured_policy", load_for_torch)  # compiles nothing
     path = tmp_path / "toge.safetensors"
@@ -95,7 +95,7 @@ def test_races_have_courses_of_their_own_to_check_by(
         flown.append(course_seed)
         return result(course_seed, seed, gates=1)
 
-    monkeypatch.setattr(train_check, "SimulatedFlight", flights_by(fly))
+    monkeypatch.setattr("mavbridge.simulation.flight.SimulatedFlight", flights_by(fly))
     monkeypatch.setattr(train_check, "load_configured_policy", load_for_torch)
     path = save(tmp_path / "toge.safetensors", 0)
     settings = TrainSettings(out=path, check_flights=2, check_courses="race")

@@ -3,7 +3,7 @@ from typing import Any
 
 import pytest
 
-from mavbridge.commands.serve.config import ServeConfig
+from mavbridge.commands.config import ServeConfig
 from mavbridge.config.policy import PolicyConfig
 from policy.errors import MavbridgeError, PolicyError
 from policy.foreign.websocket import kind

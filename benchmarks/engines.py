@@ -1,0 +1,126 @@
+"""Encoding one image and sampling one chunk on each engine, one thread, with nothing beside it."""
+
+from collections.abc import Callable, Sequence
+from contextlib import ExitStack
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+import torch
+
+from benchmarks.results import EngineTiming, name_of
+from mavbridge.commands.output import print_status
+from mavbridge.config.policy import Engine, PolicyConfig
+from mavbridge.core.clock import NS_PER_S, MonotonicClock
+from mavbridge.core.histogram import Histogram
+from mavbridge.flight.policies import load_configured_policy
+from policy.contract import ACTION_DIM
+from policy.engines.executable import encode_all, level_state
+from policy.errors import PolicyError
+from policy.preprocess import dummy_images
+from policy.protocol import Executable
+
+EAGER: Engine = "torch"
+ENCODE, CHUNK, BOTH = "encode one image", "sample one chunk", "one image to one chunk"
+
+
+@dataclass(frozen=True, kw_only=True)
+class _Case:
+    policy: str
+    work: str
+    engine: str
+    call: Callable[[], object]
+    durations: Histogram = field(default_factory=Histogram)
+
+
+def time_engines(
+    policies: Sequence[PolicyConfig], *, rounds: int, block_s: float
+) -> tuple[tuple[EngineTiming, ...], tuple[str, ...]]:
+    """Time each policy on its engine, or with ``auto`` on all of this device; notes on failures.
+
+    Each round times every case for ``block_s``: a slow minute of the host is shared by all engines.
+
+    Raises:
+        PolicyError: a policy cannot be loaded on any engine.
+    """
+    torch.set_num_threads(1)
+    cases, notes = [], []
+    with ExitStack() as lives:
+        for policy in policies:
+            found, remarks = _cases(policy, lives)
+            cases += found
+            notes += remarks
+        for number in range(rounds):
+            print_status(f"engines, round {number + 1} of {rounds}")
+            for case in cases:
+                _time(case, block_s)
+    return tuple(map(_timing, cases)), tuple(notes)
+
+
+def _cases(policy: PolicyConfig, lives: ExitStack) -> tuple[list[_Case], list[str]]:
+    devices = (policy.device, policy.vision_device or "", policy.action_device or "")
+    fast: Engine = "cuda-graph" if any(name.startswith("cuda") for name in devices) else "openvino"
+    engines: tuple[Engine, ...] = (EAGER, fast) if policy.engine == "auto" else (policy.engine,)
+    cases: list[_Case] = []
+    notes = []
+    for engine in engines:
+        try:
+            cases += _cases_on(replace(policy, engine=engine), lives)
+        except PolicyError as error:
+            notes.append(f"{name_of(policy)} on {engine}: not measured: {error}")
+    if cases:
+        return cases, notes
+    return _cases_on(
+        policy, lives
+    ), []  # a policy in numpy runs on "auto" alone; others are refused
+
+
+def _cases_on(policy: PolicyConfig, lives: ExitStack) -> list[_Case]:
+    executable = _load(policy, lives)
+    contract = executable.contract
+    images, state = dummy_images(contract), level_state(contract)
+    image = images.reshape(-1, *contract.picture_shape)[0]
+    history = np.zeros((1, contract.history_len, ACTION_DIM), np.float32)
+    feature = encode_all(executable, images)
+    engine = executable.engine if policy.engine == "auto" else policy.engine
+
+    def case(work: str, call: Callable[[], object]) -> _Case:
+        return _Case(policy=name_of(policy), work=work, engine=engine, call=call)
+
+    if not executable.dual_rate:
+        return [case(BOTH, lambda: executable.act(encode_all(executable, images), state, history))]
+    return [
+        case(ENCODE, lambda: executable.encode(image)),
+        case(CHUNK, lambda: executable.act(feature, state, history)),
+    ]
+
+
+def _load(policy: PolicyConfig, lives: ExitStack) -> Executable:
+    loaded = lives.enter_context(load_configured_policy(policy, MonotonicClock()))
+    if policy.engine != "auto" and not loaded.executable.engine.startswith(policy.engine):
+        raise PolicyError("; ".join(loaded.notes))  # says why the engine was passed over
+    return loaded.executable
+
+
+def _time(case: _Case, block_s: float) -> None:
+    clock = MonotonicClock()
+    case.call()  # warms the caches that the other cases have emptied
+    end_ns = clock.now_ns() + round(block_s * NS_PER_S)
+    while True:
+        start_ns = clock.now_ns()
+        case.call()
+        case.durations.add(clock.now_ns() - start_ns)
+        if clock.now_ns() >= end_ns:
+            return
+
+
+def _timing(case: _Case) -> EngineTiming:
+    percentiles = case.durations.percentiles_ms()
+    if percentiles is None:
+        raise ValueError(f"{case.work} was never timed")
+    return EngineTiming(
+        policy=case.policy,
+        work=case.work,
+        engine=case.engine,
+        p50_ms=percentiles.p50,
+        p99_ms=percentiles.p99,
+    )

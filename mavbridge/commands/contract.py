@@ -1,0 +1,73 @@
+"""``mavbridge contract``: what a policy's files say, and questions for what they do not say."""
+
+from pathlib import Path
+
+from rich.console import Console
+
+from mavbridge.commands.config import ContractConfig
+from mavbridge.core.errors import UserError
+from policy.data.lerobot import is_lerobot
+from policy.foreign.drafts.entries import Entry, draft_text
+from policy.foreign.drafts.lerobot import (
+    checkpoint_entries,
+    dataset_entries,
+    dataset_of,
+)
+from policy.foreign.drafts.onnx import onnx_entries, onnx_files
+from policy.foreign.interface import CONTRACT_FILE, UNANSWERED
+from policy.foreign.lerobot.config import CONFIG_FILE
+
+
+def contract(source: Path, config: ContractConfig) -> int:
+    """Write a contract file for a LeRobot policy or dataset, or for ONNX."""
+    out = config.out or (source if source.is_dir() else source.parent) / CONTRACT_FILE
+    if out.exists():
+        raise UserError(f"{out} is there already: change that, or name another file by --out")
+    text, summary = _draft(source, config.dataset)
+    try:
+        with out.open("x") as file:
+            file.write(text)
+    except OSError as error:
+        raise UserError(f"{out} cannot be written: {error.strerror}") from error
+    Console(highlight=False, emoji=False, markup=False).print(f"{out}: {summary}", soft_wrap=True)
+    return 0
+
+
+def _draft(source: Path, dataset: Path | None) -> tuple[str, str]:
+    """Its text, and what the user should know of it."""
+    if dataset is not None and not is_lerobot(dataset):
+        raise UserError(f"--dataset {dataset}: not a LeRobot dataset, it has no meta/info.json")
+    if is_lerobot(source):
+        return _described(source, dataset_entries(source))
+    if graphs := onnx_files(source):
+        return _described(source, onnx_entries(graphs))
+    if not (source / CONFIG_FILE).is_file():
+        raise UserError(
+            f"{source}: neither a LeRobot policy (a folder with {CONFIG_FILE}), nor a LeRobot "
+            "dataset (a folder with meta/info.json), nor ONNX (a file, or a folder of them)"
+        )
+    dataset = dataset or dataset_of(source)
+    if dataset is not None and (dataset / CONTRACT_FILE).is_file():
+        text = (dataset / CONTRACT_FILE).read_text()
+        return text, f"a copy of {dataset / CONTRACT_FILE}, which mavbridge export wrote"
+    text, summary = _described(source, checkpoint_entries(source, dataset))
+    if dataset is None:
+        return text, f"{summary}\nmore is known with the dataset that it was trained on: --dataset"
+    return text, f"{summary}\nits dataset is {dataset}"
+
+
+def _described(source: Path, entries: list[Entry]) -> tuple[str, str]:
+    counts = {
+        origin: [f"[{entry.table}] {entry.name}" for entry in entries if entry.origin == origin]
+        for origin in ("read", "guessed", "to answer")
+    }
+    lines = [f"{len(names)} entries {origin}" for origin, names in counts.items()]
+    summary = ", ".join(lines)
+    for origin, request in (("guessed", "check"), ("to answer", "answer")):
+        if counts[origin]:
+            summary += f"\nplease {request}: {', '.join(counts[origin])}"
+    title = (
+        f"Contract of {source}, drafted by mavbridge contract: what its own files do not say. "
+        f"Check what was guessed, and replace every {UNANSWERED!r}: it does not fly before."
+    )
+    return draft_text(title, entries), summary

@@ -1,1 +1,0 @@
-"""``mavbridge contract``: a first draft of a contract file."""

@@ -1,0 +1,413 @@
+"""``mavbridge demonstrate``: flights of simulated gate courses, flown or labelled by an expert."""
+
+from collections.abc import Callable, Sequence
+from contextlib import ExitStack
+from dataclasses import asdict, dataclass, replace
+from datetime import UTC, datetime
+from pathlib import Path
+from shutil import rmtree
+
+import numpy as np
+from rich.console import Console
+from rich.text import Text
+
+import mavbridge
+from mavbridge.commands.config import DemonstrateConfig
+from mavbridge.commands.episode_workers import fly_jobs
+from mavbridge.commands.output import progress_bar
+from mavbridge.config.rates import SIM_CAMERA_PX, Rates
+from mavbridge.core.clock import NS_PER_MS, NS_PER_S, MonotonicClock
+from mavbridge.core.errors import UserError
+from mavbridge.core.records import Event, Tick
+from mavbridge.core.stopping import INTERRUPTED, stop_on_signals
+from mavbridge.core.vehicle import Action, BodyRates, Sticks
+from mavbridge.flight.policies import load_for_episodes
+from mavbridge.recording.flight_writer import FlightWriter
+from mavbridge.recording.folder import META, prepare_folder
+from mavbridge.recording.meta import FlightError, FlightMeta, read_meta
+from mavbridge.recording.rows import FrameTruth, TickLabels
+from mavbridge.simulation.delays import Delay, Delays
+from mavbridge.simulation.flight import SimulatedFlight, SimulationSettings
+from mavbridge.simulation.world import NOMINAL_VEHICLE, Exposure
+from policy.contract import ACTION_DIM, Contract, FloatArray
+from policy.protocol import Executable
+from sitl.course.layout import gate_truth
+from sitl.expert.demonstrator import Expert, RateExpert
+from sitl.expert.disturbance import RATE_STRENGTHS, STICK_STRENGTHS, Disturbance, random_start
+from sitl.vehicle.conditions import NOMINAL, Conditions, random_conditions
+from sitl.vehicle.dynamics import BodyState
+
+SETTLE_NS = 300 * NS_PER_MS
+"""After a start in the air: until the last frame and state from the ground are gone."""
+STUDENT_TURN_S, EXPERT_TURN_S = (1.5, 6.0), (0.4, 1.6)
+"""Least and most length of a turn. Where a student flies, the expert takes over now and then: a
+student that crashes at the first gate would otherwise learn nothing about the later ones (DAgger,
+Ross et al. 2011, mixes the two at random)."""
+SOLVES_KEPT = 64
+"""Solves whose expert actions are kept until their ticks are recorded."""
+NOMINAL_SHARE = 0.25
+"""Flights without random conditions: what most users fly first."""
+AIRBORNE_SHARE = 0.35
+"""Flights that start in the air and off the course."""
+UNDISTURBED_SHARE = 0.3
+"""Flights without disturbed actions: examples of a good flight."""
+TRUTHS_KEPT = 64
+"""Exposures whose frames may still be on their way."""
+RATE_TILT_DEG = 80.0
+"""Largest tilt of a policy that learns from an expert by body rates, which leans by up to 62."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Variation:
+    """The random part of one demonstration; everything follows from ``seed``."""
+
+    seed: int
+    conditions: Conditions
+    delays: Delays
+    starts_airborne: bool
+    disturbance: float
+
+
+def draw_variation(seed: int) -> Variation:
+    """The variation of a seed."""
+    random = np.random.Generator(np.random.PCG64((seed, 4)))
+    shares = (NOMINAL_SHARE, AIRBORNE_SHARE, UNDISTURBED_SHARE)
+    is_nominal, is_airborne, is_undisturbed = random.random(3) < shares
+    return Variation(
+        seed=seed,
+        conditions=NOMINAL if is_nominal else random_conditions(seed),
+        delays=_random_delays(random),
+        starts_airborne=bool(is_airborne),
+        disturbance=0.0 if is_undisturbed else float(random.uniform(0.5, 1.0)),
+    )
+
+
+def _random_delays(random: np.random.Generator) -> Delays:
+    """Delays between those of a fast computer and a busy one, with log-uniform medians."""
+
+    def median_ns(low_ms: float, high_ms: float) -> int:
+        return round(NS_PER_MS * float(np.exp(random.uniform(np.log(low_ms), np.log(high_ms)))))
+
+    camera_ns, vision_ns = median_ns(2, 12), median_ns(6, 35)
+    action_ns, link_ns = median_ns(0.8, 6), median_ns(0.2, 3)
+    return Delays(
+        camera=Delay(p50_ns=camera_ns),
+        vision=Delay(p50_ns=vision_ns, p99_ns=2 * vision_ns),
+        action=Delay(p50_ns=action_ns, p99_ns=2 * action_ns),
+        uplink=Delay(p50_ns=link_ns),
+        downlink=Delay(p50_ns=link_ns),
+    )
+
+
+class Pilot:
+    """The expert's action at every solve, and an executable that flies."""
+
+    def __init__(
+        self,
+        flight: SimulatedFlight,
+        variation: Variation,
+        *,
+        speed_mps: float,
+        contract: Contract,
+        student: Executable | None,
+    ) -> None:
+        self._flight = flight
+        self._variation = variation
+        self._speed_mps = speed_mps
+        self._student = student
+        self._by_rates = contract.action == "rates"
+        self._disturbance = Disturbance(
+            variation.seed,
+            strength=variation.disturbance,
+            from_ground=not variation.starts_airborne,
+            strengths=RATE_STRENGTHS if self._by_rates else STICK_STRENGTHS,
+        )
+        self._turns = TurnSchedule(variation.seed)
+        self._expert: Expert | RateExpert | None = None
+        self._solves = 0
+        self._expert_actions: dict[int, Action] = {}
+        """By the serial of the chunk that was computed with them."""
+        self.begin_ns: int | None = None
+        """When the demonstration begins; None before the policy has the vehicle's sticks."""
+        expert = Executable(
+            contract=contract,
+            name=f"expert at {speed_mps:g} m/s",
+            engine="numpy",
+            dual_rate=True,
+            encode=lambda _rgb, _camera=0: np.zeros((1, 1), np.float32),
+            act=self._act,
+        )
+        self.executable = replace(student or expert, act=self._act, reset=self._start)
+
+    def expert_action(self, chunk_serial: int) -> Action | None:
+        """The expert's action at the state of a recent chunk; None before its demonstration."""
+        return self._expert_actions.get(chunk_serial)
+
+    def _start(self) -> None:
+        """The policy has the sticks now: a vehicle that is put in the air is under control."""
+        if self._student is not None:
+            self._student.reset()
+        self._expert = self._begin(self._flight.clock.now_ns())
+
+    def _act(self, encoded: FloatArray, state: FloatArray, history: FloatArray) -> FloatArray:
+        self._solves += 1
+        horizon = self.executable.contract.horizon
+        if self._expert is None:  # not engaged yet: the gate wants to see chunks first
+            return np.zeros((1, horizon, ACTION_DIM), np.float32)
+        now_s, body = self._flight.clock.now_ns() / NS_PER_S, self._flight.vehicle.ap.truth
+        self._expert_actions[self._solves], disturbed = self._demonstrate(self._expert, body, now_s)
+        self._expert_actions.pop(self._solves - SOLVES_KEPT, None)
+        chunk = np.tile(np.array(disturbed, np.float32), (1, horizon, 1))
+        if self._student is None:
+            return chunk
+        # Called at every tick, also in the expert's turns: the student may hold state of its own.
+        students = self._student.act(encoded, state, history)
+        return students if self._turns.is_students(now_s) else chunk
+
+    def _demonstrate(
+        self, expert: Expert | RateExpert, body: BodyState, now_s: float
+    ) -> tuple[Action, Sequence[float]]:
+        """The expert's action, and what is flown of it."""
+        if isinstance(expert, RateExpert):
+            command = expert.command(body, now_s)
+            return BodyRates(*command), self._disturbance.flown(command, now_s)
+        sticks = expert.sticks(body, now_s)
+        return Sticks(*sticks), self._disturbance.flown(sticks, now_s)
+
+    def _begin(self, now_ns: int) -> Expert | RateExpert:
+        """Put the vehicle where the demonstration starts, and make the expert that flies it.
+
+        The expert does not know the vehicle's parameters, which no learner could see: it flies as
+        many courses without them (37 of 40, and 37 of 40 with).
+        """
+        if not self._variation.starts_airborne:
+            self.begin_ns = now_ns
+            return self._make_expert(0)
+        seed = self._variation.seed
+        start = random_start(self._flight.course, seed, speed_mps=self._speed_mps)
+        self._flight.vehicle.launch(start)
+        self.begin_ns = now_ns + SETTLE_NS
+        return self._make_expert(start.next_gate)
+
+    def _make_expert(self, next_gate: int) -> Expert | RateExpert:
+        make = RateExpert if self._by_rates else Expert
+        return make(self._flight.course, self._speed_mps, next_gate=next_gate)
+
+
+class TurnSchedule:
+    """Student and expert fly in turns of random length, which follow from ``seed``."""
+
+    def __init__(self, seed: int) -> None:
+        self._random = np.random.Generator(np.random.PCG64((seed, 5)))
+        self._is_students = bool(self._random.random() < 0.5)
+        self._end_s: float | None = None
+
+    def is_students(self, t_s: float) -> bool:
+        """The student flies at ``t_s``; call in order of time."""
+        if self._end_s is None:
+            self._end_s = t_s + self._length_s()
+        while t_s >= self._end_s:
+            self._is_students = not self._is_students
+            self._end_s += self._length_s()
+        return self._is_students
+
+    def _length_s(self) -> float:
+        turn_s = STUDENT_TURN_S if self._is_students else EXPERT_TURN_S
+        return float(self._random.uniform(*turn_s))
+
+
+@dataclass(frozen=True, kw_only=True)
+class DemonstrationSpec:
+    """A demonstration to fly."""
+
+    folder: Path
+    """Its contents are replaced."""
+    seed: int
+    config: DemonstrateConfig
+
+    def __str__(self) -> str:
+        return f"demonstration {self.seed}"
+
+
+def fly_demonstration(spec: DemonstrationSpec, should_stop: Callable[[], bool]) -> bool:
+    """Fly and record one course; returns whether it was finished.
+
+    Raises:
+        EpisodeInterruptedError: ``should_stop`` ended it; the folder holds an unfinished flight.
+        MavbridgeError: it cannot be flown or recorded.
+    """
+    rmtree(spec.folder, ignore_errors=True)
+    prepare_folder(spec.folder)
+    with ExitStack() as stack:
+        return _fly(spec, should_stop, stack)
+
+
+def _fly(spec: DemonstrationSpec, should_stop: Callable[[], bool], stack: ExitStack) -> bool:
+    """The same, with the student's life on ``stack``."""
+    variation, wanted = draw_variation(spec.seed), spec.config.policy
+    student: Executable | None = None
+    size_px = wanted.image_size or SIM_CAMERA_PX
+    contract = Contract(
+        feature_dim=1,
+        arrays="numpy",
+        image_height=size_px,
+        image_width=size_px,
+        action=spec.config.action,
+        max_tilt_deg=RATE_TILT_DEG if spec.config.action == "rates" else None,
+    )
+    if wanted.checkpoint is not None:
+        loaded = load_for_episodes(replace(wanted, dual_rate=True), MonotonicClock())
+        student = stack.enter_context(loaded).executable
+        contract = student.contract
+        if contract.action != spec.config.action:
+            raise UserError(
+                f"{wanted.checkpoint} flies by {contract.action}: use --action {contract.action}"
+            )
+    flight = SimulatedFlight(
+        course_seed=spec.seed,
+        seed=spec.seed,
+        # The expert looks at no image: frames are drawn in the size to be recorded.
+        settings=SimulationSettings(
+            delays=variation.delays, least_camera_px=SIM_CAMERA_PX if student else 1
+        ),
+        vehicle=replace(
+            NOMINAL_VEHICLE,
+            conditions=variation.conditions,
+            autopilot=spec.config.autopilot,
+        ),
+    )
+    pilot = Pilot(
+        flight, variation, speed_mps=spec.config.speed, contract=contract, student=student
+    )
+    meta = _meta(spec, variation, pilot.executable)
+    writer = FlightWriter(spec.folder, meta, pressure="offline", with_labels=True)
+    recorder = _LabelledRecorder(flight, pilot, writer)
+    try:
+        result = flight.fly(
+            pilot.executable,
+            max_time_s=spec.config.max_time,
+            sinks=(recorder,),
+            should_stop=should_stop,
+        )
+    except BaseException:
+        writer.close()
+        raise
+    success = flight.vehicle.log.next_gate is None and not flight.vehicle.log.crashed
+    writer.finish(
+        replace(writer.meta, autopilot="sitl", success=success, gates_passed=result.gates_passed)
+    )
+    return success
+
+
+def _meta(spec: DemonstrationSpec, variation: Variation, executable: Executable) -> FlightMeta:
+    return FlightMeta(
+        started_at=datetime.now(UTC).isoformat(),
+        start_ns=0,
+        mavbridge_version=mavbridge.__version__,
+        source="dagger" if spec.config.policy.checkpoint else "demonstration",
+        policy=executable.name,
+        engine=executable.engine,
+        mode="dual",
+        action_hz=Rates().loops(is_dual=True).action_hz,
+        visual_hz=Rates().visual_limits_hz[1],
+        contract=executable.contract,
+        course_seed=spec.seed,
+        seed=spec.seed,
+        conditions=variation.conditions.numbers(),
+    )
+
+
+class _LabelledRecorder:
+    """A ``TickSink`` that records, with labels, what happens once the demonstration has begun."""
+
+    def __init__(self, flight: SimulatedFlight, pilot: Pilot, writer: FlightWriter) -> None:
+        self._flight = flight
+        self._pilot = pilot
+        self._writer = writer
+        self._truths: dict[int, FrameTruth] = {}
+        self._ticks = self._frames = 0
+        self._chunk_serial = 0
+        flight.watch_exposures(self._keep_truth)
+
+    def _keep_truth(self, exposure: Exposure) -> None:
+        body = exposure.body
+        position_ned_m, ned_from_body_wxyz = body.position_ned_m, body.ned_from_body_wxyz
+        next_gate = self._flight.vehicle.log.next_gate
+        gates = gate_truth(self._flight.course, next_gate, position_ned_m, ned_from_body_wxyz)
+        self._truths[exposure.frame_id] = FrameTruth(
+            position_ned_m=position_ned_m,
+            ned_from_body_wxyz=ned_from_body_wxyz,
+            velocity_ned_mps=body.velocity_ned_mps,
+            **asdict(gates),
+        )
+        if len(self._truths) > TRUTHS_KEPT:
+            self._truths.pop(next(iter(self._truths)))
+
+    def emit(self, event: Event) -> None:
+        """Record the event, numbered from the first that is recorded."""
+        from_ns = self._pilot.begin_ns
+        if from_ns is None:
+            return
+        if isinstance(event, Tick):
+            self._record(event, from_ns)
+        elif event.captured_ns >= from_ns:
+            truth = self._truths.get(event.frame_id)
+            self._writer.frame(replace(event, serial=self._frames), truth)
+            self._frames += 1
+
+    def _record(self, tick: Tick, from_ns: int) -> None:
+        """Record the first send of each chunk: one row for each decision of the policy."""
+        serial = tick.chunk_serial
+        if tick.woke_ns < from_ns or serial is None or serial == self._chunk_serial:
+            return
+        self._chunk_serial = serial
+        labels = TickLabels(expert=self._pilot.expert_action(serial))
+        self._writer.tick(replace(tick, serial=self._ticks), labels)
+        self._ticks += 1
+
+
+def demonstrate(config: DemonstrateConfig) -> int:
+    """Fly every episode that is not recorded yet; 130 if interrupted, to be resumed later.
+
+    Raises:
+        MavbridgeError: a flight cannot be flown or recorded.
+    """
+    console = Console(stderr=True, emoji=False)
+    specs = _missing(config)
+    done = config.episodes - len(specs)
+    if done:
+        console.print(Text(f"{done} of {config.episodes} are there already", style="dim"))
+    successes = 0
+    with stop_on_signals() as stop, progress_bar(console) as progress:
+        bar = progress.add_task("demonstrating", total=config.episodes, completed=done)
+        flown = fly_jobs(fly_demonstration, specs, config.workers, stop.is_set)
+        for count, (_, success) in enumerate(flown, start=1):
+            successes += success
+            progress.update(bar, advance=1, status=f"{successes} of {count} finished the course")
+        was_stopped = stop.is_set()
+    if was_stopped:
+        console.print(Text("interrupted: run the same command to resume", style="yellow"))
+        return INTERRUPTED
+    return 0
+
+
+def _missing(config: DemonstrateConfig) -> list[DemonstrationSpec]:
+    """The episodes without a finished recording.
+
+    Raises:
+        UserError: the folder of an episode holds something that is no flight.
+    """
+    specs = []
+    for index in range(config.episodes):
+        folder = config.out / f"{index:06d}"
+        if folder.is_dir() and any(folder.iterdir()):
+            if not (folder / META).is_file():
+                raise UserError(f"{folder} is no recorded flight: name another --out")
+            try:
+                if read_meta(folder).finished:
+                    continue
+            except FlightError:
+                pass  # cut off while it was written
+        seed = config.first_course_seed + index
+        specs.append(DemonstrationSpec(folder=folder, seed=seed, config=config))
+    return specs

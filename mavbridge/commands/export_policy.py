@@ -1,0 +1,64 @@
+"""A policy of ours in, files that other programs read out, and proof that they are the same."""
+
+from dataclasses import replace
+from pathlib import Path
+
+from rich.console import Console
+
+from mavbridge.commands.config import ExportPolicyConfig
+from mavbridge.core.errors import UserError
+from mavbridge.core.extras import require_packages
+from policy.engines.choose import chunks_of_samples
+from policy.engines.parity import make_parity_samples, parity_failure
+from policy.foreign.export import export_onnx, export_torchscript
+from policy.loading.builtin import BUILTIN_KINDS, load_builtin
+from policy.loading.load import load_policy
+from policy.loading.request import PolicyRequest
+
+
+def export_policy(checkpoint: Path | None, config: ExportPolicyConfig) -> int:
+    """Write a policy, and compare what was written with it."""
+    console = Console(stderr=True, highlight=False, emoji=False)
+    kind = config.policy.partition(":")[0]
+    if kind not in BUILTIN_KINDS:
+        raise UserError(f"--policy {config.policy}: policies of toge and resnet-unet are exported")
+    ours = PolicyRequest(spec=config.policy, checkpoint=checkpoint, engine="torch")
+    _require_room(config)
+    policy, notes = load_builtin(ours)
+    if policy.contract.action != "sticks":
+        raise UserError(
+            f"{config.policy} flies by {policy.contract.action}: policies by sticks are exported"
+        )
+    if config.format == "onnx":
+        config.out.mkdir(parents=True, exist_ok=True)
+        export_onnx(policy, config.out)
+    else:
+        export_torchscript(policy, config.out)
+    spec = f"{config.format}:{config.out}"
+    reason = _difference(ours, PolicyRequest(spec=spec))
+    if reason is not None:
+        raise UserError(f"{config.out} was written, but it is another policy: {reason}")
+    for note in notes:
+        console.print(note, soft_wrap=True)
+    flight = f"mavbridge --connect ... --policy {spec}"
+    console.print(f"wrote {config.out}; it agrees with torch. Fly it: {flight}", soft_wrap=True)
+    return 0
+
+
+def _require_room(config: ExportPolicyConfig) -> None:
+    """Refuse an output that would hurt something, or that nothing here can write."""
+    if config.format == "onnx":
+        require_packages("--format onnx", {"onnx": "onnx"})
+        if config.out.is_file() or (config.out.is_dir() and any(config.out.iterdir())):
+            raise UserError(f"--out {config.out} is taken: name a new or empty folder")
+    elif config.out.exists() or not config.out.parent.is_dir():
+        raise UserError(f"--out {config.out}: name a new file in a folder that exists")
+
+
+def _difference(ours: PolicyRequest, written: PolicyRequest) -> str | None:
+    """Why two policies are not the same from image to stick, or None."""
+    chunks = []
+    for request in (ours, written):
+        executable = load_policy(replace(request, dual_rate=False), now_s=lambda: 0.0).executable
+        chunks.append(chunks_of_samples(executable, make_parity_samples(executable.contract)))
+    return parity_failure(chunks[0], chunks[1])

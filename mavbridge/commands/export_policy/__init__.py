@@ -1,1 +1,0 @@
-"""``mavbridge export-policy``: a policy of ours as ONNX or TorchScript."""

@@ -1,0 +1,298 @@
+"""``mavbridge serve``: a policy on this computer for flights and robots elsewhere.
+
+The thread that answers, the network side (the websocket protocol of openpi), and the command.
+"""
+
+import asyncio
+import hmac
+import http
+import logging
+import math
+import os
+import queue
+import signal
+import threading
+from collections.abc import Callable
+from concurrent.futures import Future
+from contextlib import ExitStack, suppress
+from dataclasses import dataclass, replace
+from ipaddress import ip_address
+
+from rich.console import Console
+from rich.text import Text
+from websockets.asyncio.server import Server, ServerConnection
+from websockets.asyncio.server import serve as serve_websockets
+from websockets.exceptions import ConnectionClosed
+from websockets.frames import CloseCode
+from websockets.http11 import Request, Response
+
+from mavbridge.commands.config import ServeConfig
+from mavbridge.core.address import spelled
+from mavbridge.core.clock import NS_PER_MS, Clock, MonotonicClock
+from mavbridge.core.errors import UserError
+from mavbridge.core.workers import Worker
+from mavbridge.flight.policies import check_configured_policy, load_configured_policy
+from policy.contract import Contract
+from policy.errors import PolicyError
+from policy.foreign.interface import Interface
+from policy.foreign.websocket.link import API_KEY_VARIABLE
+from policy.foreign.websocket.messages import CONTRACT_KEY, pack, unpack
+from policy.foreign.websocket.observation import RESET_KEY, from_message
+from policy.foreign.websocket.remote_policy import ACTIONS_KEY
+from policy.protocol import Executable, keep_nothing
+
+MAX_CLIENTS = 4
+WAIT_S = 0.1
+"""Longest wait for a request before the stop flag is checked."""
+SPARE_BYTES = 2**20
+"""Most bytes of a request beside its images."""
+PING_S = 5.0
+"""A client that has not been heard of for two or three of these is gone, and its place is free."""
+CLOSE_S = 1.0
+UNASKED_S = 5.0
+"""After this a client that has asked for nothing gives its place to another one."""
+HEALTH_PATH = "/healthz"
+LOOK_S = 0.5
+"""Between two looks whether the policy's thread is alive."""
+JOIN_S = 2.0
+
+
+@dataclass(frozen=True, slots=True)
+class Job:
+    """A request, and where its answer goes: bytes, or the text of an error."""
+
+    request: bytes | str
+    answer: Future[bytes | str]
+
+
+class AnswerLoop:
+    """Answers one request after the other; only its own thread calls the policy."""
+
+    def __init__(self, executable: Executable, *, clock: Clock) -> None:
+        """``executable`` is single-rate."""
+        self._executable = executable
+        self._interface = Interface(contract=executable.contract)
+        self._clock = clock
+        self.max_clients = MAX_CLIENTS if executable.reset is keep_nothing else 1
+        """One alone where the policy remembers: two flights would share what it keeps."""
+        self._jobs: queue.Queue[Job] = queue.Queue(self.max_clients)
+
+    @property
+    def metadata(self) -> bytes:
+        """The first message to every client."""
+        return pack(
+            {
+                CONTRACT_KEY: self._executable.contract.to_json(),
+                "policy": self._executable.name,
+            }
+        )
+
+    def submit(self, request: bytes | str) -> Future[bytes | str]:
+        """Queue a request; raises queue.Full."""
+        job = Job(request, Future())
+        self._jobs.put_nowait(job)
+        return job.answer
+
+    def run(self, stop: threading.Event) -> None:
+        """Answer until told to stop."""
+        while not stop.is_set():
+            try:
+                job = self._jobs.get(timeout=WAIT_S)
+            except queue.Empty:
+                continue
+            if job.answer.set_running_or_notify_cancel():
+                job.answer.set_result(self.answer(job.request))
+
+    def answer(self, request: bytes | str) -> bytes | str:
+        """A chunk as msgpack, or a text that says what is wrong with the request or the policy."""
+        begun_ns = self._clock.now_ns()
+        try:
+            message = unpack(request)
+            image, state, history = from_message(self._interface, message)
+            if message.get(RESET_KEY):
+                self._executable.reset()
+            chunk = self._executable.act(image, state, history)
+        except PolicyError as error:
+            return str(error)
+        took_ms = (self._clock.now_ns() - begun_ns) / NS_PER_MS
+        return pack({ACTIONS_KEY: chunk[0], "server_timing": {"infer_ms": took_ms}})
+
+
+class PolicyServer:
+    """Greets clients, checks their key, and passes their requests to the policy's thread."""
+
+    def __init__(
+        self,
+        answers: AnswerLoop,
+        *,
+        image_bytes: int,
+        api_key: str | None,
+        report: Callable[[str], None],
+    ) -> None:
+        """Prepare; nothing listens yet.
+
+        Args:
+            answers: its thread runs while clients are served.
+            image_bytes: images of one request; larger requests are refused.
+            api_key: what clients must know; None lets in all that reach this computer.
+            report: gets a line for each client that comes or goes.
+        """
+        self._answers = answers
+        self._max_bytes = image_bytes + SPARE_BYTES
+        self._api_key = api_key
+        self._report = report
+        self._clients = 0
+        self._unasked: dict[ServerConnection, float] = {}
+        """Clients that have asked for nothing yet, with the time at which each came."""
+
+    async def listen(self, host: str, port: int) -> Server:
+        """Listen from now on.
+
+        Raises:
+            UserError: it cannot listen there.
+        """
+        # It would print a traceback for every stranger that knocks at the port.
+        logging.getLogger("websockets.server").setLevel(logging.CRITICAL)
+        try:
+            return await serve_websockets(
+                self._talk,
+                host,
+                port,
+                compression=None,
+                max_size=self._max_bytes,
+                process_request=self._admit,
+                ping_interval=PING_S,
+                ping_timeout=2 * PING_S,
+                close_timeout=CLOSE_S,
+            )
+        except (OSError, ValueError) as error:
+            reason = getattr(error, "strerror", None) or error
+            raise UserError(
+                f"--host {host} --port {port}: cannot listen there: {reason}"
+            ) from error
+
+    def _admit(self, connection: ServerConnection, request: Request) -> Response | None:
+        """Refuse pages of a browser, which alone name an origin, and clients without the key.
+
+        Whoever only asks whether a server is here gets an answer.
+        """
+        if origins := request.headers.get_all("Origin"):
+            self._report(f"{_name(connection)} was refused: a web page of {origins[0][:60]!r}")
+            return connection.respond(http.HTTPStatus.FORBIDDEN, "this serves no web pages\n")
+        if request.path == HEALTH_PATH:
+            return connection.respond(http.HTTPStatus.OK, "OK\n")
+        given = request.headers.get("Authorization", "")
+        if self._api_key is None or hmac.compare_digest(
+            given.encode(), f"Api-Key {self._api_key}".encode()
+        ):
+            return None
+        self._report(f"{_name(connection)} was refused: it has not the API key")
+        return connection.respond(http.HTTPStatus.UNAUTHORIZED, "the API key is missing or wrong\n")
+
+    async def _talk(self, connection: ServerConnection) -> None:
+        if self._clients == self._answers.max_clients:
+            await self._make_room()
+        if self._clients == self._answers.max_clients:
+            reason = f"the most are served already: {self._clients}"
+            await connection.close(CloseCode.TRY_AGAIN_LATER, reason)
+            return
+        self._clients += 1
+        self._unasked[connection] = asyncio.get_running_loop().time()
+        self._report(f"{_name(connection)} has connected")
+        try:
+            with suppress(ConnectionClosed):
+                await connection.send(self._answers.metadata)
+                async for request in connection:
+                    self._unasked.pop(connection, None)
+                    # One at a time from each client: the queue has room for all.
+                    answer = self._answers.submit(request)
+                    reply: bytes | str = await asyncio.wrap_future(answer)
+                    await connection.send(reply)
+        finally:
+            self._clients -= 1
+            self._unasked.pop(connection, None)
+            self._report(f"{_name(connection)} has gone")
+
+    async def _make_room(self) -> None:
+        """End the clients that only hold a place."""
+        latest = asyncio.get_running_loop().time() - UNASKED_S
+        idle = [each for each, came in self._unasked.items() if came < latest]
+        for each in idle:
+            await each.close(CloseCode.TRY_AGAIN_LATER, "it has asked for nothing, and others wait")
+        await asyncio.sleep(0)  # for their own tasks to leave
+
+
+def _name(connection: ServerConnection) -> str:
+    address = connection.remote_address
+    return f"client {spelled(*address)}" if address else "a client"
+
+
+def serve(config: ServeConfig) -> int:
+    """Serve a policy until a signal comes.
+
+    Raises:
+        MavbridgeError: the policy cannot be loaded, or the address cannot be listened at.
+    """
+    policy_config = replace(config.policy, dual_rate=False)
+    check_configured_policy(policy_config)
+    console, clock = Console(highlight=False), MonotonicClock()
+    with ExitStack() as stack:
+        loaded = stack.enter_context(load_configured_policy(policy_config, clock))
+        for note in loaded.notes:
+            console.print(Text(note, style="yellow"))
+        answers = AnswerLoop(loaded.executable, clock=clock)
+        server = PolicyServer(
+            answers,
+            image_bytes=_image_bytes(loaded.executable.contract),
+            api_key=os.environ.get(API_KEY_VARIABLE) or None,
+            report=lambda line: console.print(Text(line)),
+        )
+        policy = Worker("mavbridge-policy", answers.run)
+        stack.callback(policy.join, JOIN_S)
+        policy.start()
+        asyncio.run(_serve(config, server, policy, console))
+    return 0
+
+
+async def _serve(
+    config: ServeConfig, server: PolicyServer, policy: Worker, console: Console
+) -> None:
+    stop = asyncio.Event()
+    for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
+        asyncio.get_running_loop().add_signal_handler(number, stop.set)
+    listener = await server.listen(config.host, config.port)
+    console.print(Text(f"serving {config.policy.policy} at {_url(config)}; Ctrl-C ends it"))
+    for line in _warnings(config):
+        console.print(Text(line, style="yellow"))
+    while not stop.is_set() and policy.is_alive:
+        with suppress(TimeoutError):
+            await asyncio.wait_for(stop.wait(), LOOK_S)
+    listener.close()
+    with suppress(TimeoutError):  # a solve that hangs is the policy thread's to report
+        await asyncio.wait_for(listener.wait_closed(), JOIN_S)
+
+
+def _warnings(config: ServeConfig) -> list[str]:
+    """What the user should know who listens to other computers."""
+    try:
+        is_local = config.host == "localhost" or ip_address(config.host).is_loopback
+    except ValueError:
+        is_local = False
+    if is_local:
+        return []
+    has_key = bool(os.environ.get(API_KEY_VARIABLE))
+    who = (
+        "every computer that reaches it and has the API key"
+        if has_key
+        else f"every computer that reaches it: set {API_KEY_VARIABLE} on both sides to keep "
+        "strangers out"
+    )
+    return [f"warning: {config.host} is open to {who}; nothing is encrypted"]
+
+
+def _url(config: ServeConfig) -> str:
+    return f"ws://{spelled(config.host, config.port)}"
+
+
+def _image_bytes(contract: Contract) -> int:
+    return math.prod(contract.image_shape)

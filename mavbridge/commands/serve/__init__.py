@@ -1,1 +1,0 @@
-"""``mavbridge serve``: a policy on this computer for flights and robots elsewhere."""

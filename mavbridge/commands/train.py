@@ -1,0 +1,176 @@
+"""``mavbridge train`` and ``train-world-model``: flights in, a checkpoint out."""
+
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Self
+
+from rich.console import Console
+from rich.text import Text
+
+from mavbridge.commands.output import progress_bar
+from mavbridge.config.checks import check_range
+from mavbridge.config.courses import CHECK_COURSE_SEED, MAX_EPISODES, first_seed
+from mavbridge.config.policy import PolicyConfig
+from mavbridge.core.clock import NS_PER_S, MonotonicClock
+from mavbridge.core.errors import UserError
+from mavbridge.core.stopping import INTERRUPTED, stop_on_signals
+from mavbridge.flight.policies import load_configured_policy
+from policy.contract import Contract
+from policy.data.flight_data import DatasetError, FlightData, common_frame, common_terms
+from policy.data.flight_folders import find_flights, leave_out_failed, read_flight
+from policy.data.lerobot import is_lerobot, read_dataset
+from policy.engines.devices import require_devices
+from policy.loading.builtin import builtin_config
+from policy.stick_loop import rates_contract
+from policy.training.policy_run import Check, Network, train_policy
+from policy.training.report import Hooks, TrainingProgress, TrainResult
+from policy.training.run_folder import TrainingStoppedError
+from policy.training.settings import RunSettings, TrainSettings, WorldModelSettings
+from policy.training.world_model.run import train_world_model
+from policy.world_model.config import WorldModelConfig
+
+
+def run_policy_training(paths: Sequence[Path], settings: TrainSettings) -> int:
+    """Train a policy; 0 when the checkpoint is written, 130 if interrupted.
+
+    Paths are flight folders, folders of them, or LeRobot datasets.
+
+    Raises:
+        UserError: a flag that cannot be used.
+        PolicyError: flights, weights or a run that cannot be used.
+    """
+    require_devices(settings.device)
+    network = builtin_config(settings.policy, image_size=settings.image_size)
+    check_range("check-flights", settings.check_flights, 0, MAX_EPISODES, "")
+    check: Check | None = None
+    if settings.check_flights:
+        try:
+            import mavbridge.simulation.flight  # noqa: F401 - share_of_gates needs it
+        except ImportError as error:
+            raise UserError(
+                f"--check-flights needs the simulator ({error}): install mavbridge[sitl]"
+            ) from error
+
+        def check(checkpoint: Path) -> float:
+            return share_of_gates(checkpoint, settings)
+
+    flights = _read_flights(paths, settings)
+    network = fit_to_flights(network, flights, settings)
+    return _finish(lambda hooks: train_policy(flights, network, settings, hooks, check))
+
+
+def run_world_model_training(paths: Sequence[Path], settings: WorldModelSettings) -> int:
+    """Train a world model; see ``run_policy_training``."""
+    require_devices(settings.device)
+    config = WorldModelConfig(image_size=settings.image_size)
+    flights = _read_flights(paths, settings)
+    if (action := common_terms(flights).action) != "sticks":
+        raise DatasetError(f"a world model learns from flights by sticks, these were by {action}")
+    config = replace(config, contract=Contract(state_frame=common_frame(flights)))
+    return _finish(lambda hooks: train_world_model(flights, config, settings, hooks))
+
+
+def share_of_gates(checkpoint: Path, settings: TrainSettings) -> float:
+    """Fly a checkpoint at two rates over ``check_flights`` courses; the share of gates passed.
+
+    Raises:
+        MavbridgeError, PolicyError: it cannot be flown.
+    """
+    from mavbridge.simulation.flight import SimulatedFlight
+
+    wanted = PolicyConfig(policy=settings.policy, checkpoint=checkpoint, dual_rate=True)
+    first, passed, total = first_seed(settings.check_courses) + CHECK_COURSE_SEED, 0, 0
+    with load_configured_policy(wanted, MonotonicClock()) as loaded:
+        for index in range(settings.check_flights):
+            flight = SimulatedFlight(course_seed=first + index, seed=index)
+            result = flight.fly(loaded.executable)
+            passed, total = passed + result.gates_passed, total + result.gates_total
+    return passed / total
+
+
+def fit_to_flights(
+    network: Network, flights: Sequence[FlightData], settings: TrainSettings
+) -> Network:
+    """The network with state frame and actions of the flights, and the inputs of the settings."""
+    terms = common_terms(flights)
+    contract = replace(
+        network.contract,
+        state_frame=common_frame(flights),
+        since_exposure=settings.since_exposure,
+        hover_thrust=terms.hover_thrust,
+        max_tilt_deg=terms.max_tilt_deg,
+    )
+    if terms.action == "rates":
+        contract = rates_contract(contract)
+    return replace(network, contract=contract)
+
+
+class Display:
+    """A progress bar, whose last words are the losses, and lines for what the run reports."""
+
+    def __init__(self) -> None:
+        self._bar = progress_bar(Console(stderr=True, highlight=False), as_percentage=True)
+        self._task = self._bar.add_task("starting", total=1.0)
+
+    def __enter__(self) -> Self:
+        self._bar.start()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._bar.stop()
+
+    def show(self, progress: TrainingProgress) -> None:
+        """Show whatever the run reports."""
+        if progress.note is not None:
+            self._bar.print(f"note: {progress.note}")
+            return
+        self._bar.update(self._task, description=progress.stage, completed=progress.fraction)
+        if progress.losses is not None:
+            parts = (f"{name} {value:.3f}" for name, value in progress.losses.items())
+            losses = f"step {progress.step}  {'  '.join(parts).replace('_', ' ')}"
+            self._bar.update(self._task, status=losses)
+        if progress.validation is not None:
+            self._bar.print(
+                f"{progress.fraction:4.0%} {progress.stage}, step {progress.step}: "
+                f"{progress.validation.describe()}"
+            )
+
+
+def _finish(train: Callable[[Hooks], TrainResult]) -> int:
+    clock = MonotonicClock()
+    try:
+        with stop_on_signals() as stop, Display() as display:
+            result = train(
+                Hooks(
+                    now_s=lambda: clock.now_ns() / NS_PER_S,
+                    report=display.show,
+                    should_stop=stop.is_set,
+                )
+            )
+    except TrainingStoppedError as stopped:
+        Console(stderr=True, highlight=False).print(Text(str(stopped), style="yellow"))
+        return INTERRUPTED
+    console = Console(highlight=False)
+    console.print(f"{result.checkpoint}: {result.steps} steps", soft_wrap=True)
+    if result.validation is not None:
+        console.print(result.validation.describe(), soft_wrap=True)
+    if result.score is not None:
+        console.print(f"closed-loop score {result.score:.3f}")
+    return 0
+
+
+def _read_flights(paths: Sequence[Path], settings: RunSettings) -> list[FlightData]:
+    camera_key = settings.camera_key
+    datasets = [path for path in paths if is_lerobot(path)]
+    if camera_key is not None and not datasets:
+        raise UserError("--camera-key is for LeRobot datasets; flights have one camera")
+    own = [path for path in paths if path not in datasets]
+    folders = find_flights(own) if own else []
+    folders, note = leave_out_failed(folders, include_failed=settings.include_failed)
+    if note is not None:
+        Console(stderr=True, highlight=False).print(note, soft_wrap=True)
+    flights = [read_flight(folder) for folder in folders]
+    for text in (text for flight in flights for text in flight.damage):
+        Console(stderr=True, highlight=False).print(f"warning: {text}", soft_wrap=True)
+    return flights + [flight for path in datasets for flight in read_dataset(path, camera_key)]

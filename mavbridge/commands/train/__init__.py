@@ -1,1 +1,0 @@
-"""``mavbridge train``: flight folders in, a checkpoint out."""

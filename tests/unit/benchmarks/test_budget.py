@@ -1,0 +1,90 @@
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+
+from benchmarks.compare import ratios, read_budget, violations
+from helpers.bench_results import RESULT, make_flight
+from mavbridge.core.errors import UserError
+
+
+@pytest.mark.parametrize(
+    ("name", "value"),
+    [
+        ("toge, encode: torch / roofline f32", 3.0),
+        ("toge, sample: torch / roofline f32", 6.0),
+        ("toge, encode: quick / roofline f32", 0.75),
+        ("toge, encode: quick / torch", 0.25),
+        ("flight: toge:small, 1 step, torch: period / asked period", 2.0),
+        ("flight: toge:small, 1 step, torch: period / baseline", 0.5),
+        ("flight: toge:small, 1 step, torch: cpu an action / baseline", 0.5),
+        ("flight: toge:small, 1 step, torch: state to wire / baseline", 0.05),
+        ("flight: toge:small, 1 step, torch: stick lateness p99 / period", 0.05),
+        ("link: mavbridge: round trip / bare pymavlink loop", 2.0),
+    ],
+)
+def test_ratios_compare_two_figures_of_one_run(name: str, value: float) -> None:
+    assert ratios(RESULT)[name] == pytest.approx(value)
+    assert len(ratios(RESULT)) == 10
+
+
+def test_a_run_without_the_other_side_has_no_ratio_with_it() -> None:
+    alone = replace(RESULT, engines=(), flights=RESULT.flights[:1], links=RESULT.links[:1])
+    name = "flight: toge:small, 1 step, torch"
+    assert ratios(alone) == {
+        f"{name}: period / asked period": pytest.approx(2.0),
+        f"{name}: stick lateness p99 / period": pytest.approx(0.05),
+    }
+
+
+def test_a_flight_that_never_acted_has_no_ratio() -> None:
+    idle = make_flight("mavbridge", action_hz=None, cpu_cores=0.0)
+    grounded = replace(RESULT, engines=(), links=(), flights=(idle, RESULT.flights[1]))
+    assert ratios(grounded) == {}
+
+
+def test_within_the_budget_there_are_no_lines() -> None:
+    assert violations({"a": 1.0, "b": 2.0}, {"a": 1.0, "b": 2.5}) == ()
+
+
+def test_what_got_worse_is_named_with_both_figures() -> None:
+    (line,) = violations({"a": 1.5, "b": 2.0}, {"a": 1.0, "b": 2.5})
+    assert line.startswith("a: 1.5")
+    assert "1" in line.split("at most")[1]
+
+
+def test_a_ratio_that_was_not_measured_is_not_a_success() -> None:
+    (line,) = violations({"b": 2.0}, {"a": 1.0})
+    assert "a: not measured" in line
+    assert "b" in line
+
+
+def test_nan_is_over_every_budget() -> None:
+    assert violations({"a": float("nan")}, {"a": 1.0})
+
+
+def test_reads_what_the_repository_holds() -> None:
+    path = Path(__file__).parents[3] / "benchmarks" / "budget.json"
+    budget = read_budget(path)
+    assert budget == json.loads(path.read_text())["ratios"]
+    assert all(most > 0 for most in budget.values())
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        *("", "[]", "{}", '{"ratios": {}}', '{"ratios": {"a": "1"}}', '{"ratios": {"a": true}}'),
+        *('{"ratios": {"a": 0}}', '{"ratios": {"a": NaN}}', '{"ratios": [1]}'),
+    ],
+)
+def test_refuses_what_is_no_budget(tmp_path: Path, text: str) -> None:
+    path = tmp_path / "budget.json"
+    path.write_text(text)
+    with pytest.raises(UserError, match=r"budget\.json"):
+        read_budget(path)
+
+
+def test_refuses_a_budget_that_is_not_there(tmp_path: Path) -> None:
+    with pytest.raises(UserError, match="cannot read"):
+        read_budget(tmp_path / "none.json")

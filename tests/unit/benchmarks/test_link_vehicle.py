@@ -1,0 +1,84 @@
+import numpy as np
+
+from benchmarks.link import repeat_roll_rate
+from benchmarks.link_vehicle import (
+    CODES,
+    PARAMS,
+    PENDING_LIMIT,
+    RoundTrips,
+    code_of,
+    code_of_pwm,
+    stick_of,
+)
+from mavbridge.core.clock import NS_PER_MS
+from mavbridge.core.vehicle import Sticks
+from mavbridge.mavlink.outputs.echo import NUDGE_STEP_NS, EchoCheck
+from mavbridge.mavlink.outputs.override import OVERRIDE_ECHO
+from mavbridge.mavlink.profiles.ardupilot_params import calibration
+
+NUDGE_LEVELS = 3
+
+
+def test_every_code_comes_back_through_policy_calibration_and_nudge() -> None:
+    echo = EchoCheck(OVERRIDE_ECHO)
+    echo.sent((1500, 1500, 1500, 1504), 0)
+    echo.received((1500, 1500, 1500, 1504), 1, 1)
+    assert echo.confirmed
+    feature, history = np.zeros((1, 1), np.float32), np.zeros((1, 4, 4), np.float32)
+    state = np.zeros((1, 13), np.float32)
+    for code in range(CODES):
+        state[0, 7] = stick_of(code)
+        chunk = repeat_roll_rate(feature, state, history)
+        assert chunk.shape == (1, 16, 4)
+        pwm_us = calibration(PARAMS).to_pwm_us(Sticks(*chunk[0, 0].tolist()))
+        nudged_us = {
+            echo.with_nudge(pwm_us, level * NUDGE_STEP_NS)[3] for level in range(NUDGE_LEVELS)
+        }
+        assert len(nudged_us) == NUDGE_LEVELS
+        assert {*map(code_of_pwm, nudged_us)} == {code}
+
+
+def test_every_code_comes_back_through_manual_control() -> None:
+    assert [code_of(round(1000 * stick_of(code)) / 1000) for code in range(CODES)] == [
+        *range(CODES)
+    ]
+
+
+def test_an_answer_is_timed_from_its_own_attitude() -> None:
+    trips = RoundTrips()
+    trips.start()
+    trips.send(7, 1000 * NS_PER_MS)
+    trips.send(8, 1010 * NS_PER_MS)
+    trips.answer(8, 1012 * NS_PER_MS)
+    answers = trips.answers()
+    assert (answers.sent, answers.answered) == (2, 1)
+    assert answers.round_trip_ms is not None
+    assert answers.round_trip_ms.max == 2.0
+
+
+def test_only_the_first_answer_to_an_attitude_counts() -> None:
+    trips = RoundTrips()
+    trips.start()
+    trips.send(7, 0)
+    for arrived_ms in (2, 12):
+        trips.answer(7, arrived_ms * NS_PER_MS)
+    assert trips.answers().answered == 1
+
+
+def test_an_answer_to_nothing_does_not_count() -> None:
+    trips = RoundTrips()
+    trips.start()
+    trips.send(7, 0)
+    trips.answer(9, NS_PER_MS)
+    assert trips.answers().round_trip_ms is None
+
+
+def test_nothing_counts_before_the_start_and_a_lost_answer_ends_the_row() -> None:
+    trips = RoundTrips()
+    trips.send(0, 0)
+    trips.answer(0, 1)
+    assert trips.answered_in_a_row == 1
+    assert (trips.answers().sent, trips.answers().answered) == (0, 0)
+    for code in range(1, PENDING_LIMIT + 2):
+        trips.send(code, 2)
+    assert trips.answered_in_a_row == 0
