@@ -118,6 +118,8 @@ def _collect(
             try:
                 result = future.result()
             except lost as error:
+                if should_stop():  # Ctrl-C reaches a worker that has only just been started
+                    return
                 raise PeerError(
                     f"the worker that flew {jobs[index]} died (out of memory?): use fewer "
                     "--workers, or one to see the cause"

@@ -319,6 +319,7 @@ _REASONS: dict[Code, tuple[Kind, str]] = {
     Code.GATE_DIED: (_FAULT, "the gate has died"),
     Code.FLIGHT_PROCESS_DIED: (_FAULT, "the flight process has died"),
 }
+_WRAPPERS = (Code.THEN, Code.WITH_HINT, Code.SLOW_CLOCK, Code.OF_CAMERA)
 _SPENT = {
     "computer": "the computer stood still for",
     "gate": "the gate stood still for",
@@ -339,9 +340,11 @@ class Reason:
 
     @property
     def kind(self) -> Kind:
-        """Whose doing it is; of a reason that wraps another one, the other's."""
+        """Whose doing it is; of a reason that only adds words to another one, the other's."""
         inner = dict(self.data).get("first") or dict(self.data).get("why")
-        return inner.kind if isinstance(inner, Reason) else _REASONS[self.code][0]
+        if self.code in _WRAPPERS and isinstance(inner, Reason):
+            return inner.kind
+        return _REASONS[self.code][0]
 
     @property
     def codes(self) -> tuple[Code, ...]:

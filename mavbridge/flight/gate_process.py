@@ -127,7 +127,7 @@ class GateProcess:
             by = f" (signal {signal})" if signal > 0 else ""
             raise GateDiedError(f"the gate process has died{by}: {left}")
         if self.summary is not None and self.summary.failure is not None:
-            raise PeerError(self.summary.failure)
+            raise PeerError(str(self.summary.failure))
 
     def _take(self, message: FromGate, view: VehicleView) -> None:
         match message:

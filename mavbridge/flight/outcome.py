@@ -81,15 +81,20 @@ class FlightReferee:
         """The last gate was passed, and the run-out behind it is over."""
         return self._course.is_done and now_ns - self._course.passed_ns[-1] >= RUN_OUT_NS
 
-    def outcome(self, end: FlightEnd, vehicle: GateStatus) -> FlightOutcome | None:
-        """The outcome of a flight that ended so; None if the policy has not flown."""
+    def outcome(
+        self, end: FlightEnd, vehicle: GateStatus, asked: Reason | None = None
+    ) -> FlightOutcome | None:
+        """The outcome of a flight that ended so; None if the policy has not flown.
+
+        ``asked``: the reason, where the gate did not live to tell one.
+        """
         if (flown := self._flown) is None:
             return None
         position, state, passed_ns = flown.position_ned_m, flown.state, self._course.passed_ns
         knows_gates = self._gates_total is not None and self._has_position
         return FlightOutcome(
             end=end,
-            reason=self._reason,
+            reason=asked if self._reason is None else self._reason,
             flown_s=(flown.sent_ns - self._began_ns) / NS_PER_S,
             height_m=None if position is None else -position.down,
             speed_mps=None if state is None else math.hypot(*state.values[:3].tolist()),
@@ -127,7 +132,8 @@ def describe(outcome: FlightOutcome) -> str:
     state = "landed" if outcome.is_landed else "armed" if outcome.is_armed else "disarmed"
     left.append(f"now {state} in {outcome.mode}")
     text = "; ".join(", ".join(part) for part in (course, left) if part)
-    return f"{text}: {outcome.reason}" if outcome.end in _UNPLANNED else text
+    is_told = outcome.end in _UNPLANNED and outcome.reason is not None
+    return f"{text}: {outcome.reason}" if is_told else text
 
 
 class Verdict(NamedTuple):

@@ -148,7 +148,8 @@ def _meta(folder: Path, document: dict[str, Any]) -> FlightMeta:
             known["contract"] = Contract.from_json(json.dumps(known["contract"]))
         if known.get("outcome") is not None:
             reason = known["outcome"]["reason"]
-            reason = None if reason is None else reason_from_json(reason)
+            # A sentence without a code is not read back: nothing may be decided by it.
+            reason = reason_from_json(reason) if isinstance(reason, dict) else None
             known["outcome"] = FlightOutcome(**known["outcome"] | {"reason": reason})
         known["command"] = tuple(known.get("command", ()))
         meta = FlightMeta(**known)

@@ -7,9 +7,10 @@ from typing import Any, NamedTuple
 import numpy as np
 import pyarrow as pa
 
-from mavbridge.core.reasons import reason_from_json, reason_to_json
+from mavbridge.core.reasons import reason_to_json
 from mavbridge.core.records import FeatureFrame, FloatArray, Solve, VehicleState
 from mavbridge.core.vehicle import ForwardedPacket
+from mavbridge.recording.rows import read_reason
 from policy.contract import ACTION_DIM, STATE_DIM, Contract
 
 _NUMBERS = pa.list_(pa.float32())
@@ -180,7 +181,8 @@ def read_features(table: pa.Table) -> Iterator[FeatureFrame]:
         for value, row in zip(values, batch.drop_columns(["value"]).to_pylist(), strict=True):
             del row["dropped_before"]
             fault = row.pop("fault")
-            reason = None if fault is None else reason_from_json(json.loads(fault))
+            stored = {"code": None, "data": {}} if fault is None else json.loads(fault)
+            reason = read_reason(stored["code"], json.dumps(stored["data"]))
             yield FeatureFrame(value=value[None], fault=reason, **row)
 
 

@@ -15,6 +15,7 @@ import pyarrow as pa
 from mavbridge.core.reasons import Reason, reason_from_json, reason_to_json
 from mavbridge.core.records import Position, Tick, VehicleState
 from mavbridge.core.vehicle import ACTION_CLASSES, Action, ActionKind, ActionTrace, Sticks
+from mavbridge.recording.meta import FlightError
 from policy.contract import ACTION_DIM, STATE_DIM
 
 Vector: TypeAlias = tuple[float, float, float]
@@ -105,6 +106,8 @@ LATER = frozenset(
 )
 """Columns of ticks that older flights lack: in the first ones, every tick was a slot with a new
 chunk."""
+OPTIONAL = LATER | {"release_code", "release_data"}
+"""Columns that a table may lack."""
 DEMONSTRATION_TICKS = TICKS.append(pa.field("expert", _STICKS))
 
 _FRAME_STAMPS = _fields(pa.int64(), "frame_id", "captured_ns", "ready_ns", nullable=False)
@@ -208,9 +211,7 @@ def _tick(row: dict[str, Any], serial: int, make: type[Action]) -> Tick:
     values = {name: row[name] for name in _TICK if name not in LATER}
     values |= {name: row[name] for name in LATER if row[name] is not None}
     values |= {name: tuple(row[name]) for name in ("rc_channels_us", "texts")}
-    code, data = row["release_code"], row["release_data"]
-    reason = code and reason_from_json({"code": code, "data": json.loads(data)})
-    values |= {"release_reason": reason}
+    values |= {"release_reason": read_reason(row["release_code"], row["release_data"])}
     values |= {"sent": row["sent"] and make(*row["sent"]), "rc_sticks": _sticks(row["rc_sticks"])}
     if row["position_ned_m"] is not None:
         values["position_ned_m"] = Position(*row["position_ned_m"])
@@ -222,6 +223,18 @@ def _tick(row: dict[str, Any], serial: int, make: type[Action]) -> Tick:
     if row["raw"] is not None:
         trace = ActionTrace(**{name: make(*row[name]) for name in _TRACE})
     return Tick(**values | {"serial": serial, "state": state, "trace": trace})
+
+
+def read_reason(code: str | None, data: str) -> Reason | None:
+    """The reason of this code with the figures of a JSON object; raises FlightError."""
+    if code is None:
+        return None
+    try:
+        return reason_from_json({"code": code, "data": json.loads(data)})
+    except (KeyError, TypeError, ValueError) as error:
+        raise FlightError(
+            f"no reason {code!r} with {data} is known here: use the mavbridge that recorded it"
+        ) from error
 
 
 def _sticks(values: list[float] | None) -> Sticks | None:

@@ -2,7 +2,7 @@
 
 import threading
 from collections.abc import Callable, Iterator
-from contextlib import ExitStack
+from contextlib import ExitStack, suppress
 from dataclasses import dataclass, field
 from functools import partial
 
@@ -20,6 +20,7 @@ from mavbridge.flight.policies import load_configured_policy
 from mavbridge.flight.speed import require_speed
 from policy.contract import ACTION_DIM, Contract
 from policy.engines.executable import encode_all, level_state
+from policy.errors import NoChunkError
 from policy.loading.request import LoadedPolicy
 from policy.preprocess import dummy_images
 from policy.protocol import Executable
@@ -127,7 +128,8 @@ class Pace:
         while due_ns < begun_ns + duration_s * NS_PER_S and not stop.is_set():
             clock.sleep_until_ns(due_ns)
             called_ns = clock.now_ns()
-            call()
+            with suppress(NoChunkError):  # as in a flight, which goes on along the last one
+                call()
             now_ns = clock.now_ns()
             self.late += self.took.count > 0 and now_ns - ended_ns > _LATE_PERIODS * every_ns
             self.took.add(now_ns - called_ns)
@@ -182,12 +184,11 @@ def _run_at_rates(
         workers.append(Worker(f"mavbridge-check-{pace.name}", run))
     for worker in workers:
         worker.start()
-    try:
+    with ExitStack() as stack:  # also on Ctrl-C: the policy is closed once nothing calls it
+        for worker in workers:
+            stack.callback(worker.join, _JOIN_S)
         for worker in workers:
             worker.ends_within(timing_s + _JOIN_S)
-    finally:  # also on Ctrl-C: the policy is closed once nothing calls it
-        for worker in workers:
-            worker.join(_JOIN_S)
     return [chunks, pictures]
 
 

@@ -96,15 +96,15 @@ def compare_policy(pairs: Iterable[SolvePair]) -> PolicyComparison:
     """Inputs and results of all solves."""
     missing: dict[str, int] = {}
     inputs: dict[str, int] = {}
-    sentences: dict[tuple[Code, ...], str] = {}
-    """The first of each kind of reason: the others differ by their figures."""
+    sentences: dict[object, str] = {}
+    """The first of each reason: the others differ by their figures."""
     differences: list[Array] = []
     solves = equal = 0
     for pair in pairs:
         solves += 1
         if pair.replayed is None:
             reason = pair.refusal or because(Code.NO_CHUNK)
-            _count(missing, sentences.setdefault(reason.codes, str(reason)))
+            _count(missing, sentences.setdefault(reason.key, str(reason)))
             continue
         for name in _other_inputs(pair):
             _count(inputs, name)

@@ -13,7 +13,7 @@ import numpy as np
 
 from mavbridge.config.flight import FlyConfig
 from mavbridge.core.clock import NS_PER_MS
-from mavbridge.core.reasons import Code, Kind, because
+from mavbridge.core.reasons import Code, Kind, Reason, because
 from mavbridge.core.records import Solve, Tick
 from mavbridge.core.vehicle import Action, LinkSnapshot
 from mavbridge.flight.action_frames import action_frame
@@ -208,7 +208,9 @@ def _stop(before: Tick | None, tick: Tick) -> Ending | None:
     """What the flight process asked for at its own end."""
     was = None if before is None else before.phase
     reason = tick.release_reason
-    if tick.phase != was and reason is not None and reason.code in _OWN_ENDINGS:
+    if reason is not None and reason.code is Code.THEN:
+        reason = dict(reason.data)["first"]  # type: ignore[assignment]
+    if tick.phase != was and isinstance(reason, Reason) and reason.code in _OWN_ENDINGS:
         return Ending(reason=reason, is_fault=reason.kind is Kind.FAULT)
     if tick.phase == Phase.ENDED.value != was:  # the second of two stops counts for nothing
         return Ending(reason=because(Code.SIGNAL))
@@ -241,7 +243,8 @@ def _link(
     source: ReplaySource, clock: SteppedClock, transport: "_RecordedTransport"
 ) -> _WatchedLink:
     config: FlyConfig = source.config
-    loops = recorded_plan(source).loops
+    # As the gate was started, before a policy was loaded.
+    loops = config.rates.loops(is_dual=source.meta.mode == "dual")
     settings = link_settings(
         config.link,
         state_hz=loops.state_hz,

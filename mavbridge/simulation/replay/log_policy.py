@@ -16,7 +16,6 @@ import numpy as np
 from mavbridge.config.flight import FlyConfig
 from mavbridge.core.clock import NS_PER_MS, NS_PER_S
 from mavbridge.core.errors import UserError
-from mavbridge.core.reasons import Code
 from mavbridge.core.records import Frame, Solve
 from mavbridge.core.vehicle import ForwardedPacket, Sticks
 from mavbridge.flight.bridge import CameraPath, build_bridge
@@ -119,8 +118,10 @@ class LogReplay:
         self._log, self._video = log, video
         self._clock = clock
         self._sticks = PilotSticks(log, action_meaning(contract, config.link).stick_gains)
-        self.refusals: Counter[Code] = Counter()
-        """Reasons for which the policy got nothing to decide by, and how often."""
+        self.refusals: Counter[str] = Counter()
+        """Reasons for which the policy got nothing to decide by, and how often: the first sentence
+        of those that differ by their figures."""
+        self._sentences: dict[object, str] = {}
         self._solve: Solve | None = None
         self._pilot: tuple[int, Sticks] | None = None
         self._ticks = 0
@@ -215,7 +216,8 @@ class LogReplay:
 
     def _sent(self, message: Chunk | Absence) -> None:
         if isinstance(message, Absence):
-            self.refusals[message.reason.code] += 1
+            reason = message.reason
+            self.refusals[self._sentences.setdefault(reason.key, str(reason))] += 1
 
     def _keep(self, solve: Solve) -> None:
         self._solve = solve

@@ -23,6 +23,7 @@ from mavbridge.core.vehicle import ForwardedPacket, Telemetry
 from mavbridge.flight.bridge import CameraPath, build_bridge
 from mavbridge.flight.feature_cache import FeatureCache
 from mavbridge.flight.observation import observation_ages_ns
+from mavbridge.flight.plan import plan_flight
 from mavbridge.flight.state import Freshness
 from mavbridge.flight.state_reader import StateReader
 from mavbridge.flight.vehicle_view import VehicleView
@@ -91,8 +92,9 @@ class _Loop:
         self._takes_recorded = executable.contract == contract
         span_ns = observation_ages_ns(contract)[0]
         self.caches = [FeatureCache(span_ns=span_ns) for _ in contract.cameras]
+        plan = plan_flight(source.config, executable.contract, is_dual=executable.dual_rate)
         bridge = build_bridge(
-            recorded_plan(source),
+            plan,
             replace(executable, act=self._timed_act),
             clock=clock,
             send=self._sent,
