@@ -191,7 +191,7 @@ class FakeLink:
     def takeoff(self, height_m: float) -> None:
         self.requests.append(f"takeoff {height_m:g}")
 
-    def send(self, decision: Decision) -> Action | None:
+    def send(self, decision: Decision, decided_ns: int) -> Action | None:
         self.on_send()
         if not self.takes(decision):
             return None

@@ -146,7 +146,7 @@ class GateFlight:
         executable = self._executable(contract)
         self._horizon = contract.horizon
         self._policy_clock = AheadClock(self.clock)
-        plan = plan_flight(config, contract, is_dual=executable.dual_rate)
+        plan = plan_flight(config, executable.contract, is_dual=executable.dual_rate)
         bridge = build_bridge(
             plan,
             executable,

@@ -157,7 +157,7 @@ def test_a_frame_from_the_future_is_as_fresh_as_now_and_no_fresher() -> None:
 def test_history_is_what_was_sent_not_what_was_wished() -> None:
     flight = VirtualFlight()
     rounded, send = Sticks(0.2, 0.2, 0.2, 0.2), flight.link.send
-    flight.link.send = lambda one: rounded if send(one) else None  # type: ignore[method-assign]
+    flight.link.send = lambda one, at_ns: rounded if send(one, at_ns) else None  # type: ignore[method-assign]
     flight.fly(1.0)
     assert flight.histories[0] == pytest.approx(0.0)  # nothing was sent before the first action
     assert flight.histories[-1] == pytest.approx(0.2)

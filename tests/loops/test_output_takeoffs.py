@@ -83,7 +83,8 @@ def test_a_takeoff_without_a_position_is_not_begun() -> None:
     flight.run(15)
     assert not any(s.armed for s in flight.samples)
     assert flight.phase is Phase.PREPARING, flight.describe()
-    assert flight.codes == (Code.TAKEOFF_NEEDS_POSITION,), flight.reason
+    assert flight.codes == (Code.TOO_OLD,), flight.reason
+    assert dict(flight.reason.data)["quantity"] == "velocity"
 
 
 def test_a_policy_that_never_lifts_px4_off_is_disarmed_by_it() -> None:
