@@ -166,7 +166,7 @@ _REASONS: dict[Code, tuple[Kind, str]] = {
         "seen {is_echoed}, inputs {inputs}): see its messages above",
     ),
     Code.OPERATOR: (_PILOT, "released by the operator"),
-    Code.ENGAGE_SWITCH_OFF: (_PILOT, "the pilot's engage switch (channel {channel}) is off"),
+    Code.ENGAGE_SWITCH_OFF: (_PILOT, "the pilot's engage switch is off (channel {channel})"),
     Code.OVERRIDE_SWITCH_OFF: (_PILOT, "the pilot's override switch is off"),
     Code.MODE_CHANGED: (_PILOT, "mode changed from {before} to {after}"),
     Code.DISARMED: (_VEHICLE, "the vehicle has been disarmed"),
