@@ -10,11 +10,6 @@ from hypothesis import settings
 if "PYTEST_XDIST_WORKER" in os.environ:
     os.environ.setdefault("OMP_NUM_THREADS", "1")
 
-# A shell starts programs in the background with Ctrl-C ignored, and their children inherit that:
-# tests see what a person at a terminal would.
-if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
-    signal.signal(signal.SIGINT, signal.default_int_handler)
-
 # The first example of a property pays for imports and first kernels: no verdict on wall time.
 # The same examples in every run: none is met for the first time in CI.
 settings.register_profile("repeatable", deadline=None, derandomize=True)
@@ -29,3 +24,12 @@ def user_cache(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
         patch.setenv("XDG_CACHE_HOME", str(folder))
         patch.setenv("XDG_STATE_HOME", str(tmp_path_factory.mktemp("state")))
         yield folder
+
+
+@pytest.fixture(autouse=True)
+def _ctrl_c_is_heard() -> Iterator[None]:
+    """As a person at a terminal has it: shells start programs in the background without it, their
+    children inherit that, and a test may leave it so."""
+    signal.signal(signal.SIGINT, signal.default_int_handler)
+    yield
+    signal.signal(signal.SIGINT, signal.default_int_handler)

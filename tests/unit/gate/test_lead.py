@@ -62,7 +62,7 @@ class ReadyVehicle:
     def begin_flight(self, meaning: ActionMeaning, output: Output | None) -> None:
         pass
 
-    def send(self, _decision: Decision) -> Action | None:
+    def send(self, _decision: Decision, _decided_ns: int) -> Action | None:
         self.sent_ns.append(self._clock.now_ns())
         return None
 
