@@ -386,18 +386,16 @@ def because(code: Code, **data: Value) -> Reason:
     return Reason(code, tuple(data.items()))
 
 
-def reason_to_json(reason: Reason) -> dict[str, object]:
-    """Code, kind, figures and sentence, for JSON."""
+def reason_to_json(reason: Reason, *, has_words: bool = True) -> dict[str, object]:
+    """Code and figures for JSON; with ``has_words`` the kind and the sentence for readers, too."""
     data = {
-        name: reason_to_json(value) if isinstance(value, Reason) else value
+        name: reason_to_json(value, has_words=has_words) if isinstance(value, Reason) else value
         for name, value in reason.data
     }
-    return {
-        "code": reason.code.value,
-        "kind": reason.kind.value,
-        "data": data,
-        "text": str(reason),
-    }
+    document: dict[str, object] = {"code": reason.code.value, "data": data}
+    if has_words:
+        document |= {"kind": reason.kind.value, "text": str(reason)}
+    return document
 
 
 def reason_from_json(document: Mapping[str, object]) -> Reason:

@@ -366,7 +366,7 @@ def _summary(document: dict[str, object]) -> GateSummary:
 
 
 def _encode_reason(reason: Reason) -> bytes:
-    return json.dumps(reason_to_json(reason)).encode()
+    return json.dumps(reason_to_json(reason, has_words=False)).encode()
 
 
 def _decode_reason(data: bytes) -> Reason:
