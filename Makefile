@@ -22,7 +22,7 @@ PARALLEL := --numprocesses auto --maxprocesses 8 --dist loadfile
 # Flights in real time have the machine for themselves: they are judged by the millisecond.
 FLIGHTS := --numprocesses auto --maxprocesses 2 --dist worksteal
 
-# Modules whose mutants are tried, as in MODULES=mavbridge/gate/gate.py; none = all of tests/mutation.toml.
+# Modules whose mutants are tried, as in MODULES=mavbridge/guard/guard.py; none = all of tests/mutation.toml.
 MODULES ?=
 
 .PHONY: fly check test lint bench faults fuzz mutants soak clean
@@ -80,7 +80,7 @@ FUZZ_DATAGRAMS ?= 10000000
 FUZZ_SEED ?=
 fuzz: $(VENV)/installed  ## hostile datagrams on all cores: FUZZ_DATAGRAMS=N, FUZZ_SEED=N repeats a run
 	PYTHONPATH=.:tests $(BIN)/python -m fuzz --datagrams $(FUZZ_DATAGRAMS) $(if $(FUZZ_SEED),--seed $(FUZZ_SEED))
-	GATE_EXAMPLES=1000 $(BIN)/pytest -q tests/properties/test_gate.py
+	GUARD_EXAMPLES=1000 $(BIN)/pytest -q tests/properties/test_guard.py
 
 clean:  ## forget the environments and outputs
 	rm -rf $(VENV) .venv-peers out

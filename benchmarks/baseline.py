@@ -250,7 +250,7 @@ class Baseline:
             state_age_ms=None,
             state_to_wire_ms=self._state_to_wire.percentiles_ms(),
             cpu_cores=round(cpu_ns / NS_PER_S / duration_s, 3),
-            gate_cpu_cores=None,
+            guard_cpu_cores=None,
             stolen_ms=stolen_ms,
             missed_by_cause=None,
         )

@@ -17,7 +17,7 @@ from tempfile import TemporaryDirectory
 
 from cyclopts import App, Parameter
 
-from benchmarks.missed_slots import GateProbe, stolen_ms_since, stolen_ns
+from benchmarks.missed_slots import GuardProbe, stolen_ms_since, stolen_ns
 from benchmarks.results import OURS, Flight, from_json, name_of, solves_of, to_json
 from mavbridge.commands.output import print_status
 from mavbridge.config.flight import CameraConfig, EnvelopeConfig, FlyConfig, LinkConfig
@@ -28,10 +28,10 @@ from mavbridge.core.errors import PeerError, UserError
 from mavbridge.core.processes import end, free_port, running, wait
 from mavbridge.core.reasons import Reason
 from mavbridge.core.records import Event, Tick
-from mavbridge.flight.app import fly_executable, start_gate
+from mavbridge.flight.app import fly_executable, start_guard
 from mavbridge.flight.plan import plan_flight
 from mavbridge.flight.policies import load_configured_policy
-from mavbridge.gate.departure import Ending
+from mavbridge.guard.departure import Ending
 from mavbridge.observe.output import flight_console
 from mavbridge.observe.timing import FlightTiming, ObserverDrops, TimingReport
 from policy.contract import FloatArray
@@ -158,13 +158,13 @@ def _measure(
     )
     climb = level_climb(alter(executable))
     with ExitStack() as stack:
-        gate = start_gate(config, clock, stack)
-        probe, console = GateProbe(gate.process.pid, clock), flight_console()
-        watch = ReleaseWatch(lambda reason: gate.process.send(Ending(reason=reason)))
+        guard = start_guard(config, clock, stack)
+        probe, console = GuardProbe(guard.process.pid, clock), flight_console()
+        watch = ReleaseWatch(lambda reason: guard.process.send(Ending(reason=reason)))
         sinks = (meter, probe, watch)
         plan = plan_flight(config, climb.contract, is_dual=climb.dual_rate)
-        fly_executable(plan, climb, clock=clock, console=console, sinks=sinks, gate=gate)
-        summary = gate.process.summary
+        fly_executable(plan, climb, clock=clock, console=console, sinks=sinks, guard=guard)
+        summary = guard.process.summary
     flight = _flight(job.policy, executable.engine, meter, probe)
     if flight.duration_s < LEAST_SHARE * job.duration:
         lasted = f"the flight lasted {flight.duration_s:g} s instead of {job.duration:g} s"
@@ -242,7 +242,7 @@ class ReleaseWatch:
             self._end(self.reason)
 
 
-def _flight(policy: PolicyConfig, engine: str, meter: FlightMeter, probe: GateProbe) -> Flight:
+def _flight(policy: PolicyConfig, engine: str, meter: FlightMeter, probe: GuardProbe) -> Flight:
     report = meter.report()
     sticks, action, vision = report.sticks, report.action, report.vision
     elapsed_ns = report.duration_s * NS_PER_S
@@ -270,7 +270,7 @@ def _flight(policy: PolicyConfig, engine: str, meter: FlightMeter, probe: GatePr
         state_age_ms=report.state_age_ms,
         state_to_wire_ms=report.state_to_wire_ms,
         cpu_cores=round((meter.cpu_ns + probe.cpu_ns) / elapsed_ns, 3),
-        gate_cpu_cores=round(probe.cpu_ns / elapsed_ns, 3),
+        guard_cpu_cores=round(probe.cpu_ns / elapsed_ns, 3),
         stolen_ms=stolen_ms_since(meter.stolen_start_ns),
         missed_by_cause=probe.missed_by_cause,
     )

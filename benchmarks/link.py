@@ -1,9 +1,9 @@
 """The latency of the link: clients in turn against one vehicle that times their answers.
 
-Our client, ``python -m benchmarks.link --port P --out FILE``, is gate and policy loop with a policy
+Our client ``python -m benchmarks.link --port P --out FILE`` is guard and policy loop, with a policy
 that repeats the roll rate. No torch is loaded and no camera runs, but every attitude goes the way
-of a flight's: from the socket through the gate to the flight process, through the policy loop, and
-as a chunk back to the gate.
+of a flight's: from the socket through the guard to the flight process, through the policy loop, and
+as a chunk back to the guard.
 """
 
 import signal
@@ -33,10 +33,10 @@ from mavbridge.core.records import Event, FeatureFrame, FloatArray, Frame, Tick
 from mavbridge.core.workers import Worker
 from mavbridge.flight.bridge import Bridge, CameraPath, build_bridge
 from mavbridge.flight.feature_cache import FeatureCache
-from mavbridge.flight.gate_process import GateProcess
+from mavbridge.flight.guard_process import GuardProcess
 from mavbridge.flight.plan import FlightPlan, plan_flight
-from mavbridge.flight.settings import gate_settings
-from mavbridge.gate.departure import Ending
+from mavbridge.flight.settings import guard_settings
+from mavbridge.guard.departure import Ending
 from policy.contract import ACTION_DIM, ACTION_NAMES, RATE, Contract
 from policy.protocol import Executable
 
@@ -122,20 +122,20 @@ def main(*, port: int, out: Path) -> None:
         on_fault="release",
         then="release",
     )
-    settings = gate_settings(config, is_dual=True, tlog_fd=None, wall_offset_ns=0)
+    settings = guard_settings(config, is_dual=True, tlog_fd=None, wall_offset_ns=0)
     link = replace(settings.link, state_hz=ATTITUDE_HZ)
-    gate = GateProcess(replace(settings, link=link), MonotonicClock())
+    guard = GuardProcess(replace(settings, link=link), MonotonicClock())
     try:
         plan = plan_flight(config, ROLL_RATE.contract, is_dual=ROLL_RATE.dual_rate)
-        bridge = link_bridge(plan, gate, meter)
-        gate.send(plan.gate)
-        _serve(bridge, gate, stop)
+        bridge = link_bridge(plan, guard, meter)
+        guard.send(plan.guard)
+        _serve(bridge, guard, stop)
     finally:
-        gate.close()
+        guard.close()
     out.write_text(to_json(meter.timing()))
 
 
-def link_bridge(plan: FlightPlan, gate: GateProcess, meter: "ClientMeter") -> Bridge:
+def link_bridge(plan: FlightPlan, guard: GuardProcess, meter: "ClientMeter") -> Bridge:
     """The policy loop and its view of the vehicle; the vision loop is built and never runs."""
     clock, cache = MonotonicClock(), FeatureCache()
     now_ns = clock.now_ns()
@@ -147,15 +147,15 @@ def link_bridge(plan: FlightPlan, gate: GateProcess, meter: "ClientMeter") -> Br
         plan,
         ROLL_RATE,
         clock=clock,
-        send=gate.send,
+        send=guard.send,
         cameras=[CameraPath(camera=NoCamera(), cache=cache, clock=clock)],
         sinks=(meter,),
         watches_images=False,
     )
 
 
-def _serve(bridge: Bridge, gate: GateProcess, stop: threading.Event) -> None:
-    """Run until told to stop or until the gate ends, and raise what a thread has raised."""
+def _serve(bridge: Bridge, guard: GuardProcess, stop: threading.Event) -> None:
+    """Run until told to stop or until the guard ends, and raise what a thread has raised."""
 
     def run_settled(ended: threading.Event, *, run: Callable[[threading.Event], None]) -> None:
         settle_thread(realtime=True, cpu=None)  # as a flight does
@@ -163,13 +163,13 @@ def _serve(bridge: Bridge, gate: GateProcess, stop: threading.Event) -> None:
 
     settle_process()
     policy = Worker("mavbridge-policy", partial(run_settled, run=bridge.policy.run))
-    listen = partial(gate.listen, view=bridge.view)
-    listener = Worker("mavbridge-gate", partial(run_settled, run=listen))
+    listen = partial(guard.listen, view=bridge.view)
+    listener = Worker("mavbridge-guard", partial(run_settled, run=listen))
     listener.start()
     policy.start()
     while listener.is_alive and policy.is_alive and not stop.wait(WATCH_S):
         pass
-    gate.send(Ending(reason=because(Code.FINISHED, what="measurement")))
+    guard.send(Ending(reason=because(Code.FINISHED, what="measurement")))
     listener.ends_within(END_S)
     for worker in (policy, listener):
         worker.join(END_S)

@@ -1,4 +1,4 @@
-"""Why slots of the gate were missed, and its processor time: counters of the system."""
+"""Why slots of the guard were missed, and its processor time: counters of the system."""
 
 import os
 from collections import deque
@@ -8,9 +8,9 @@ from typing import Literal, NamedTuple
 from mavbridge.core.clock import NS_PER_MS, NS_PER_S, Clock
 from mavbridge.core.records import Event, Tick
 
-Cause = Literal["host", "kernel", "gate"]
-"""host: the hypervisor gave our processor to others; kernel: the gate could run and was not put on
-a processor; gate: neither, so its own work or its link took that long."""
+Cause = Literal["host", "kernel", "guard"]
+"""host: the hypervisor gave our processor to others; kernel: the guard could run and was not put on
+a processor; guard: neither, so its own work or its link took that long."""
 PROC = Path("/proc")
 MAX_READINGS = 512
 """More than a second at 400 Hz."""
@@ -19,14 +19,14 @@ STEAL_FIELD = 8
 
 
 class Counters(NamedTuple):
-    """Times of the gate and of its machine; each only ever grows, and stays 0 where unknown."""
+    """Times of the guard and of its machine; each only ever grows, and stays 0 where unknown."""
 
     host_ns: int
     """Taken by the hypervisor since boot, from all processors."""
     waited_ns: int
-    """The gate could run and was not running."""
+    """The guard could run and was not running."""
     cpu_ns: int
-    """The gate ran."""
+    """The guard ran."""
 
 
 def stolen_ns() -> int | None:
@@ -65,13 +65,13 @@ def find_cause(first: Tick, second: Tick, before: Counters, after: Counters) -> 
     gap_ns = second.sent_ns - first.sent_ns
     if 2 * (after.host_ns - before.host_ns) >= gap_ns:
         return "host"
-    return "kernel" if 2 * (after.waited_ns - before.waited_ns) >= gap_ns else "gate"
+    return "kernel" if 2 * (after.waited_ns - before.waited_ns) >= gap_ns else "guard"
 
 
-class GateProbe:
-    """A ``TickSink`` that reads the gate's counters from the policy's first action to its last.
+class GuardProbe:
+    """A ``TickSink`` that reads the guard's counters from the policy's first action to its last.
 
-    It runs in the flight process, so reading costs the gate nothing, but may come late: a gap is
+    It runs in the flight process, so reading costs the guard nothing, but may come late: a gap is
     explained by what the counters grew since they were last read before it began.
     """
 
@@ -87,7 +87,7 @@ class GateProbe:
 
     @property
     def cpu_ns(self) -> int:
-        """Processor time of the gate; 0 where the system does not tell."""
+        """Processor time of the guard; 0 where the system does not tell."""
         if self._first is None or self._newest is None:
             return 0
         return self._newest.cpu_ns - self._first.cpu_ns

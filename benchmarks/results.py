@@ -84,12 +84,12 @@ class Flight:
     """From an attitude's arrival at this computer to the send of the first sticks made from it."""
     cpu_cores: float
     """Processor time of all our processes over elapsed time."""
-    gate_cpu_cores: float | None
-    """The gate's share of it."""
+    guard_cpu_cores: float | None
+    """The guard's share of it."""
     stolen_ms: float | None
     missed_by_cause: Mapping[str, int] | None
     lost_reports: int = 0
-    """Messages of the gate that its reader was too slow for: the figures lack them."""
+    """Messages of the guard that its reader was too slow for: the figures lack them."""
     vehicle_gap_ms: Mapping[str, float] | None = None
     """p50, p99 and max between stick messages, as the vehicle saw them arrive."""
 
@@ -242,7 +242,7 @@ _FLIGHT_ROWS: tuple[tuple[str, Callable[[Flight], str]], ...] = (
     ("attitude to wire, ms", lambda f: spread(f.state_to_wire_ms)),
     ("gaps at the vehicle, ms", lambda f: _gaps(f.vehicle_gap_ms)),
     ("processor time, cores", lambda f: number(f.cpu_cores, 2)),
-    ("of it the gate", lambda f: number(f.gate_cpu_cores, 2)),
+    ("of it the guard", lambda f: number(f.guard_cpu_cores, 2)),
     ("stolen by the host, ms", lambda f: number(f.stolen_ms, 0)),
 )
 

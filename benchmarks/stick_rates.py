@@ -6,7 +6,7 @@ python -m benchmarks.stick_rates --rates 100 --loads none --realtime --starts 6
 
 The policy is the shipped one, as ``make fly`` flies it; ``benchmarks.loaded_flight`` describes the
 loads. A slot is missed when nothing was sent within one period; lateness is from a slot to its
-send; the latency from a new attitude depends on the phase between the vehicle and the gate, which
+send; the latency from a new attitude depends on the phase between the vehicle and the guard, which
 is another one at every start.
 """
 
@@ -49,7 +49,7 @@ class Case:
 
     load: Load
     realtime: bool
-    """SCHED_FIFO for gate and policy, where the system permits it."""
+    """SCHED_FIFO for guard and policy, where the system permits it."""
     flight: Flight
 
 

@@ -1,7 +1,7 @@
 #!/bin/bash
-# PID 1 of a container: starts mavbridge, passes signals on, and ends only when the gate has ended, too.
+# PID 1 of a container: starts mavbridge, passes signals on, and ends only when the guard has ended, too.
 
-# Whether a process is left whose parent is this one: the gate of a dead mavbridge becomes one.
+# Whether a process is left whose parent is this one: the guard of a dead mavbridge becomes one.
 has_children() {
   local file key value
   for file in /proc/[0-9]*/status; do
@@ -32,7 +32,7 @@ wait "$flight" 2> /dev/null
 again=$?
 ((again == 127)) || status=$again
 
-# The gate ends by itself, some only when the vehicle is disarmed; the container's stop timeout is the limit.
+# The guard ends by itself, some only when the vehicle is disarmed; the container's stop timeout is the limit.
 while has_children; do
   sleep 0.2
 done

@@ -152,7 +152,7 @@ class Pilot:
     def _act(self, encoded: FloatArray, state: FloatArray, history: FloatArray) -> FloatArray:
         self._solves += 1
         horizon = self.executable.contract.horizon
-        if self._expert is None:  # not engaged yet: the gate wants to see chunks first
+        if self._expert is None:  # not engaged yet: the guard wants to see chunks first
             return np.zeros((1, horizon, ACTION_DIM), np.float32)
         now_s, body = self._flight.clock.now_ns() / NS_PER_S, self._flight.vehicle.ap.truth
         self._expert_actions[self._solves], disturbed = self._demonstrate(self._expert, body, now_s)

@@ -60,10 +60,10 @@ class Rates:
     stick_rate: float = 100.0
     """Stick commands a second that leave for the autopilot, whatever the policy's rate."""
     realtime: Annotated[bool, Parameter(group=RARE)] = True
-    """Real-time scheduling (SCHED_FIFO) of the gate and of the policy, where the system permits
+    """Real-time scheduling (SCHED_FIFO) of the guard and of the policy, where the system permits
     it."""
-    gate_cpu: Annotated[int | None, Parameter(group=RARE)] = None
-    """Run the gate on this CPU alone."""
+    guard_cpu: Annotated[int | None, Parameter(group=RARE)] = None
+    """Run the guard on this CPU alone."""
     action_cpu: Annotated[int | None, Parameter(group=RARE)] = None
     """Run the policy on this CPU alone."""
     vision_cpu: Annotated[int | None, Parameter(group=RARE)] = None

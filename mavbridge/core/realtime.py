@@ -13,19 +13,19 @@ from mavbridge.core.errors import UserError
 SWITCH_INTERVAL_S = 0.0005
 """Longest time that another Python thread may hold the interpreter while the action loop waits.
 Python's default, 5 ms, is half a period at 100 Hz."""
-GATE_FIFO_PRIORITY = 10
+GUARD_FIFO_PRIORITY = 10
 """Above every ordinary thread, below the kernel's own."""
 ACTION_FIFO_PRIORITY = 5
-"""Below the gate: however long an inference takes, the gate sends on time."""
+"""Below the guard: however long an inference takes, the guard sends on time."""
 OOM_SCORE = 500
 """As if this process held half of the machine's memory more than it does (oom_score_adj in proc(5),
-of 1000): it is killed before the gate, whose own score stays 0."""
+of 1000): it is killed before the guard, whose own score stays 0."""
 _MCL_CURRENT, _MCL_FUTURE = 1, 2
 """From <sys/mman.h>, the same on Linux for x86 and ARM, and on macOS."""
 
 
 def require_supported_system() -> None:
-    """Raise UserError where a gate cannot outlive the flight process; call before other imports."""
+    """Raise UserError where a guard cannot outlive the flight process; call first."""
     if platform.system() not in ("Linux", "Darwin"):
         raise UserError(
             f"mavbridge does not fly from {platform.system() or 'this system'}: use Linux (with "
@@ -45,10 +45,10 @@ def settle_process() -> None:
 
 
 def prepare_to_die_first() -> None:
-    """Have the kernel kill this process before the gate, and quickly: without a core dump.
+    """Have the kernel kill this process before the guard, and quickly: without a core dump.
 
-    The gate learns of the death when the kernel closes the channel, which is after any dump.
-    Children inherit both settings, so the gate is started before. What is refused stays as it was.
+    The guard learns of the death when the kernel closes the channel, which is after any dump.
+    Children inherit both settings, so the guard is started before. What is refused stays as it was.
     """
     with suppress(OSError):  # no such file on macOS
         Path("/proc/self/oom_score_adj").write_text(str(OOM_SCORE))
@@ -58,8 +58,8 @@ def prepare_to_die_first() -> None:
         resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
 
 
-def settle_gate(*, realtime: bool, cpu: int | None) -> str | None:
-    """Prepare the gate process, which has one thread; call once it is built.
+def settle_guard(*, realtime: bool, cpu: int | None) -> str | None:
+    """Prepare the guard process, which has one thread; call once it is built.
 
     Its memory stays in RAM, and ``realtime`` puts it before all ordinary threads; what it starts
     is ordinary again. Collection stays enabled, as in ``settle_process``.
@@ -70,8 +70,8 @@ def settle_gate(*, realtime: bool, cpu: int | None) -> str | None:
     gc.collect()
     gc.freeze()
     refusals = [
-        _pin("the gate", cpu),
-        _use_fifo(GATE_FIFO_PRIORITY, "the gate", resets_on_fork=True) if realtime else None,
+        _pin("the guard", cpu),
+        _use_fifo(GUARD_FIFO_PRIORITY, "the guard", resets_on_fork=True) if realtime else None,
         _lock_memory(),
     ]
     return "; ".join(filter(None, refusals)) or None
@@ -124,7 +124,7 @@ def _lock_memory() -> str | None:
     Only where no limit holds for this process: under one, an allocation in flight could fail that
     succeeds unlocked. Without a limit of its own Linux grants it to CAP_IPC_LOCK alone (mlock(2)).
     """
-    lacking = "the gate's memory is not locked, so it may wait for the disk"
+    lacking = "the guard's memory is not locked, so it may wait for the disk"
     if platform.system() != "Linux":
         return f"{lacking}: {platform.system()} cannot lock it, use Linux"
     import resource

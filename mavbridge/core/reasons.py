@@ -128,7 +128,7 @@ class Code(StrEnum):
     CAMERA_FAILED = auto()
     POLICY_FAILED = auto()
     HANGS = auto()
-    GATE_DIED = auto()
+    GUARD_DIED = auto()
     FLIGHT_PROCESS_DIED = auto()
 
 
@@ -182,7 +182,7 @@ _REASONS: dict[Code, tuple[Kind, str]] = {
     Code.SIGNAL: (_END, "the flight was ended by a signal"),
     Code.COURSE_DONE: (_END, "the course is done"),
     Code.LANDED: (_END, "the vehicle has landed"),
-    Code.TOLD_TO_END: (_END, "the gate was told to end"),
+    Code.TOLD_TO_END: (_END, "the guard was told to end"),
     Code.FINISHED: (_END, "the {what} is over"),
     Code.PILOT_FLIES: (_PILOT, "the pilot flies"),
     Code.THEN: (_FAULT, "{first}; then {then}"),
@@ -316,13 +316,13 @@ _REASONS: dict[Code, tuple[Kind, str]] = {
     Code.CAMERA_FAILED: (_FAULT, "the camera{camera} or its encoder has failed"),
     Code.POLICY_FAILED: (_FAULT, "the policy has failed"),
     Code.HANGS: (_FAULT, "the {name} has hung for {idle_s:.1f} s"),
-    Code.GATE_DIED: (_FAULT, "the gate has died"),
+    Code.GUARD_DIED: (_FAULT, "the guard has died"),
     Code.FLIGHT_PROCESS_DIED: (_FAULT, "the flight process has died"),
 }
 _WRAPPERS = (Code.THEN, Code.WITH_HINT, Code.SLOW_CLOCK, Code.OF_CAMERA)
 _SPENT = {
     "computer": "the computer stood still for",
-    "gate": "the gate stood still for",
+    "guard": "the guard stood still for",
     "flight process": "the flight process stood still, or solved, for",
     "solve": "the solve took",
     "link": "the link delivered no {quantity} for",

@@ -91,7 +91,7 @@ class Tick:
     sent: Action | None
     """As sent, after rounding by the message; None when released or read-only."""
     release_reason: Reason | None
-    """Why the policy does not fly; None while it does, and where the gate has not said why."""
+    """Why the policy does not fly; None while it does, and where the guard has not said why."""
     mode: str | None
     armed: bool
     rc_channels_us: tuple[int, ...]
@@ -106,7 +106,7 @@ class Tick:
     is_coasting: bool = False
     """The chunk was too old to be flown as fresh, and was flown for the grace alone."""
     phase: str | None = None
-    """State of the gate's engagement: a value of ``gate.engagement.Phase``; None in old records."""
+    """State of the engagement: a value of ``guard.engagement.Phase``; None in old records."""
     position_ned_m: Position | None = None
     """From the estimator's origin; None where the vehicle tells none, or none that is fresh."""
     decided_ns: int | None = None
@@ -147,7 +147,7 @@ class FlightOutcome:
 
     end: FlightEnd
     reason: Reason | None
-    """The end, as the gate told it; None: not told."""
+    """The end, as the guard told it; None: not told."""
     flown_s: float
     height_m: float | None
     """Above the estimator's origin, at the policy's last action."""

@@ -86,7 +86,7 @@ def stop_on_signals() -> Iterator[StopRequest]:
 def interrupt_once(clock: Clock | None = None) -> None:
     """Let the first Ctrl-C raise KeyboardInterrupt, and a later one end the process at once.
 
-    A second KeyboardInterrupt would cut the clean-up of the first short with a traceback. The gate
+    A second KeyboardInterrupt would cut the clean-up of the first short with a traceback. The guard
     notices the end like any other death of this process.
     """
     if signal.getsignal(signal.SIGINT) is not signal.default_int_handler:

@@ -263,7 +263,7 @@ class LinkSnapshot:
 
 
 class Outlet(NamedTuple):
-    """Where packets to the vehicle leave, for a process that may send in place of the gate."""
+    """Where packets to the vehicle leave, for a process that may send in place of the guard."""
 
     opened: int
     """Number of times that the link was opened: another number is another socket or port."""

@@ -1,6 +1,6 @@
-"""A policy's actions, in the axes of its contract, and the same actions in the gate's.
+"""A policy's actions, in the axes of its contract, and the same actions in the guard's.
 
-The gate, the limits and MAVLink have NED world and FRD body axes. A policy with the state in
+The guard, the limits and MAVLink have NED world and FRD body axes. A policy with the state in
 ``enu_flu`` (ROS, REP 103) puts its actions out in those axes as well, and finds them so in its
 history. Both ways are the same change of axes.
 """
@@ -26,15 +26,15 @@ class ActionFrame:
     signs: tuple[float, ...] = (1.0, 1.0, 1.0, 1.0)
     """Number ``i`` in the one axes is ``signs[i]`` times number ``order[i]`` in the other."""
 
-    def to_gate(self, actions: FloatArray) -> tuple[Action, ...]:
+    def to_guard(self, actions: FloatArray) -> tuple[Action, ...]:
         """Actions [horizon, 4] of the policy -> the same in NED and FRD."""
         kind = type(self.neutral)
         return tuple(kind(*row) for row in self._other_axes(actions).tolist())
 
-    def from_gate(self, actions: Sequence[Action]) -> FloatArray:
+    def from_guard(self, actions: Sequence[Action]) -> FloatArray:
         """Actions as they were sent -> [len, 4] in the policy's axes.
 
-        An action of another kind is neutral: the gate has others while it gets the vehicle ready,
+        An action of another kind is neutral: the guard has others while it gets the vehicle ready,
         and levels it by an attitude where a policy puts out body rates.
         """
         kind = type(self.neutral)

@@ -1,4 +1,4 @@
-"""One real flight: starts the gate, opens what the flags name, stops all in reverse order."""
+"""One real flight: starts the guard, opens what the flags name, stops all in reverse order."""
 
 import logging
 import threading
@@ -34,7 +34,7 @@ from mavbridge.core.workers import HungError, Worker
 from mavbridge.flight.bridge import Bridge, CameraPath, build_bridge
 from mavbridge.flight.checks import check_flight, signing_note
 from mavbridge.flight.feature_cache import FeatureCache
-from mavbridge.flight.gate_process import GateProcess
+from mavbridge.flight.guard_process import GuardProcess
 from mavbridge.flight.observation import observation_ages_ns
 from mavbridge.flight.observers import FlightObservers
 from mavbridge.flight.outcome import flight_verdict, log_link
@@ -43,10 +43,10 @@ from mavbridge.flight.policies import (
     load_configured_policy,
     looks_at_images,
 )
-from mavbridge.flight.settings import gate_settings
+from mavbridge.flight.settings import guard_settings
 from mavbridge.flight.speed import require_speed
-from mavbridge.gate.departure import Ending
-from mavbridge.gate.engagement import Phase
+from mavbridge.guard.departure import Ending
+from mavbridge.guard.engagement import Phase
 from mavbridge.observe.keyboard import ENGAGE_KEY, KEYS_HINT, Keyboard
 from mavbridge.observe.output import flight_console
 from mavbridge.recording.tlog import TlogPipe, open_tlog_pipe
@@ -57,20 +57,20 @@ from policy.protocol import Executable
 _log = logging.getLogger(__name__)
 JOIN_S = 2.0
 LEAST_HANG_NS = NS_PER_S
-"""Silence of the policy, or of the encoder, after which the flight ends; the gate has released it
+"""Silence of the policy, or of the encoder, after which the flight ends; the guard has released it
 long before."""
 HANG_PERIODS = 5
 STOPPED_NS = LEAST_HANG_NS // 2
 """The main thread looks STATUS_HZ times a second; after a longer pause the whole process had been
 stopped, which is no hang of the policy."""
 END_S = 10.0
-"""Longest wait for a gate that neither holds sticks nor ends."""
+"""Longest wait for a guard that neither holds sticks nor ends."""
 
 
-class StartedGate(NamedTuple):
-    """A gate that looks for the vehicle already, and the pipe of its telemetry log."""
+class StartedGuard(NamedTuple):
+    """A guard that looks for the vehicle already, and the pipe of its telemetry log."""
 
-    process: GateProcess
+    process: GuardProcess
     tlog_pipe: TlogPipe | None
 
 
@@ -84,15 +84,15 @@ def fly(config: FlyConfig) -> int:
     console = flight_console()
     report_folder = config.report.parent if config.report else None
     viewer_folder = Path(config.rerun).parent if config.rerun.endswith(".rrd") else None
-    # The policy is closed last: whatever its close does, the gate has ended before.
+    # The policy is closed last: whatever its close does, the guard has ended before.
     with (
         empty_folders_removed(config.record, report_folder, viewer_folder),
         ExitStack() as policy_life,
         ExitStack() as stack,
     ):
         check_flight(config, clock)
-        gate = start_gate(config, clock, stack)  # finds the vehicle while the weights load
-        gate.process.wait_until_open()
+        guard = start_guard(config, clock, stack)  # finds the vehicle while the weights load
+        guard.process.wait_until_open()
         loaded = load_configured_policy(
             config.policy, clock, starts_in_air=config.takeoff is not None
         )
@@ -108,28 +108,28 @@ def fly(config: FlyConfig) -> int:
         if (times := loaded.times) is not None:
             act_ms, encode_ms = times.act_s * 1e3, times.encode_s * 1e3
             _log.debug("a chunk takes %.2f ms here, an image %.2f ms", act_ms, encode_ms)
-        return fly_executable(plan, executable, clock=clock, console=console, gate=gate)
+        return fly_executable(plan, executable, clock=clock, console=console, guard=guard)
 
 
-def start_gate(config: FlyConfig, clock: Clock, stack: ExitStack) -> StartedGate:
-    """Start the gate process; with ``stack`` its channel is closed, which ends it."""
+def start_guard(config: FlyConfig, clock: Clock, stack: ExitStack) -> StartedGuard:
+    """Start the guard process; with ``stack`` its channel is closed, which ends it."""
     tlog_pipe: TlogPipe | None = None
     tlog_fd: int | None = None
     if config.record is not None:
         tlog_pipe = open_tlog_pipe()
         stack.callback(tlog_pipe.close)
         tlog_fd = tlog_pipe.writer.fileno()
-    settings = gate_settings(
+    settings = guard_settings(
         config,
         is_dual=config.policy.may_be_dual,
         tlog_fd=tlog_fd,
         wall_offset_ns=wall_offset_ns(clock),
     )
-    process = GateProcess(settings, clock)
+    process = GuardProcess(settings, clock)
     stack.callback(process.close)
     if tlog_pipe is not None:
         tlog_pipe.writer.close()
-    return StartedGate(process, tlog_pipe)
+    return StartedGuard(process, tlog_pipe)
 
 
 def fly_executable(
@@ -139,7 +139,7 @@ def fly_executable(
     clock: Clock,
     console: Console,
     sinks: tuple[TickSink, ...] = (),
-    gate: StartedGate | None = None,
+    guard: StartedGuard | None = None,
 ) -> int:
     """Run one flight of a policy that is loaded already; returns the exit status.
 
@@ -151,12 +151,12 @@ def fly_executable(
     flight: _Flight | None = None
     try:
         with ExitStack() as stack:
-            gate = gate or start_gate(plan.config, clock, stack)
+            guard = guard or start_guard(plan.config, clock, stack)
             prepare_to_die_first()
-            flight = _Flight(plan, clock, console, executable, gate, sinks, stack)
+            flight = _Flight(plan, clock, console, executable, guard, sinks, stack)
             # Only now: until a stick can have been taken, a signal may simply end the process.
             stop = stack.enter_context(stop_on_signals())
-            gate.process.send(plan.gate)
+            guard.process.send(plan.guard)
             flight.run(stop)
         return flight.verdict(stop)
     except MavbridgeError as error:
@@ -178,27 +178,27 @@ class _Flight:
         clock: Clock,
         console: Console,
         executable: Executable,
-        gate: StartedGate,
+        guard: StartedGuard,
         sinks: tuple[TickSink, ...],
         stack: ExitStack,
     ) -> None:
         config = self._config = plan.config
         self._clock = clock
         self._stack = stack
-        self._gate = gate.process
+        self._guard = guard.process
         self._has_hung = False
-        self._ending = Ending(reason=because(Code.GATE_DIED), is_fault=True)
+        self._ending = Ending(reason=because(Code.GUARD_DIED), is_fault=True)
         """What it was asked to end for; until then only its death ends it without a summary."""
         self._hang_ns = max(
             LEAST_HANG_NS,
-            HANG_PERIODS * plan.gate.chunk_period_ns,
-            plan.gate.freshness.state_ns,  # of a slow policy that plays each chunk for long
+            HANG_PERIODS * plan.guard.chunk_period_ns,
+            plan.guard.freshness.state_ns,  # of a slow policy that plays each chunk for long
         )
         feature_ns = plan.start_limits.feature_ns
         self._encoder_hang_ns = max(LEAST_HANG_NS, HANG_PERIODS * feature_ns)
         self._looked_ns = self._resumed_ns = clock.now_ns()
         self._observers = FlightObservers(plan, executable, clock=clock, console=console)
-        stack.callback(self._close_recorder)  # after the gate: it records the release
+        stack.callback(self._close_recorder)  # after the guard: it records the release
         contract = executable.contract
         self._cameras = contract.cameras
         past_ns = observation_ages_ns(contract)[0]
@@ -212,13 +212,13 @@ class _Flight:
         ]
         self._observers.open_viewer(stack)
         self._observers.open_recorder(
-            gate.tlog_pipe, self._gate, lambda: self._bridge.view.status.autopilot
+            guard.tlog_pipe, self._guard, lambda: self._bridge.view.status.autopilot
         )
         self._bridge: Bridge = build_bridge(
             plan,
             executable,
             clock=clock,
-            send=self._gate.send,
+            send=self._guard.send,
             cameras=cameras,
             sinks=(*self._observers.sinks, *sinks),
             watches_images=looks_at_images(config),
@@ -235,7 +235,7 @@ class _Flight:
         """How the policy flew; None if it has not, as in a start that failed."""
         if not self._observers.referee.has_flown:
             return None
-        summary, asked = self._gate.summary, self._ending
+        summary, asked = self._guard.summary, self._ending
         end: FlightEnd = "fault" if asked.is_fault else asked.end
         if summary is not None and summary.outcome.end is not None:
             end = summary.outcome.end
@@ -257,7 +257,7 @@ class _Flight:
         return camera
 
     def run(self, stop: StopRequest) -> None:
-        """Fly until the gate ends, a loop ends, or a signal comes."""
+        """Fly until the guard ends, a loop ends, or a signal comes."""
         rates, bridge, screen = self._config.rates, self._bridge, self._observers.screen
         visions = [
             Worker(
@@ -270,13 +270,13 @@ class _Flight:
         policy = Worker("mavbridge-policy", act)
         # On the way of every attitude to the policy, so it must not wait for ordinary threads.
         listen = self._scheduled(
-            partial(self._gate.listen, view=bridge.view),
+            partial(self._guard.listen, view=bridge.view),
             realtime=rates.realtime,
             cpu=rates.action_cpu,
         )
-        listener = Worker("mavbridge-gate", listen)
+        listener = Worker("mavbridge-guard", listen)
         settle_process()
-        # Joined in reverse: the gate has ended before anything that feeds it is closed.
+        # Joined in reverse: the guard has ended before anything that feeds it is closed.
         for worker in (*visions, policy, listener):
             self._stack.callback(self._join, worker)
             worker.start()
@@ -297,7 +297,7 @@ class _Flight:
         self._end(ending, listener, stop)
 
     def _on_key(self, key: str) -> None:
-        self._gate.send("engage" if key == ENGAGE_KEY else "release")
+        self._guard.send("engage" if key == ENGAGE_KEY else "release")
 
     def _scheduled(
         self, run: Callable[[threading.Event], None], *, realtime: bool, cpu: int | None
@@ -320,7 +320,7 @@ class _Flight:
     def verdict(self, stop: StopRequest) -> int:
         """Judge the flight, which has ended; tells the user why it is no success."""
         exit_code, text = flight_verdict(
-            self._gate.summary,
+            self._guard.summary,
             stop,
             reason=self._bridge.view.reason,
             readonly=self._config.link.readonly,
@@ -365,23 +365,23 @@ class _Flight:
         return f" {prefix}{camera}" if len(self._cameras) > 1 else ""
 
     def _end(self, ending: Ending, listener: Worker, stop: StopRequest) -> None:
-        """Have the gate give the sticks back, and wait for it while it holds any."""
+        """Have the guard give the sticks back, and wait for it while it holds any."""
         self._ending = ending
-        self._gate.send(ending)
+        self._guard.send(ending)
         screen, view = self._observers.screen, self._bridge.view
         asked = stop.requests
         until_ns = self._clock.now_ns() + round(END_S * NS_PER_S)
         is_told = False
         while not listener.ends_within(1 / STATUS_HZ):
             is_holding = view.phase is Phase.HOLDING
-            if is_holding:  # the gate's release and its summary come after the landing
+            if is_holding:  # the guard's release and its summary come after the landing
                 until_ns = self._clock.now_ns() + round(END_S * NS_PER_S)
             if is_holding and not is_told:
                 is_told = True
                 screen.show_message(
                     "without a receiver silence is a failsafe, so neutral sticks go on until the "
-                    "vehicle is disarmed or its mode is changed; Ctrl-C leaves that to the gate "
-                    f"(process {self._gate.pid})"
+                    "vehicle is disarmed or its mode is changed; Ctrl-C leaves that to the guard "
+                    f"(process {self._guard.pid})"
                 )
             if stop.requests > asked or self._clock.now_ns() > until_ns:
                 break
@@ -399,7 +399,7 @@ class _Flight:
 
     def finish(self) -> None:
         """Print the report of a flight with a vehicle, and write it where --report names a file."""
-        view, screen, summary = self._bridge.view, self._observers.screen, self._gate.summary
+        view, screen, summary = self._bridge.view, self._observers.screen, self._guard.summary
         for text in view.take_texts():  # said after the last tick
             screen.show_message(text)
         if view.status.armed and not view.status.is_landed and view.flights:
@@ -407,16 +407,16 @@ class _Flight:
             left = f"still armed in {view.status.mode}{height}"
             if summary is not None:
                 screen.show_message(f"control given back, {left}")
-            elif view.phase is Phase.HOLDING and not self._gate.wait(0):
-                holder = f"the gate (process {self._gate.pid})"
+            elif view.phase is Phase.HOLDING and not self._guard.wait(0):
+                holder = f"the guard (process {self._guard.pid})"
                 screen.show_message(f"{left}: {holder} goes on sending neutral sticks")
         if summary is not None:
             log_link(summary)
         if summary is not None and summary.dropped_messages:
             screen.show_message(
-                f"{summary.dropped_messages} messages of the gate did not fit into its queue: this "
-                "process was too busy to take them"
+                f"{summary.dropped_messages} messages of the guard did not fit into its queue: "
+                "this process was too busy to take them"
             )
         is_found = view.status.mode is not None
         autopilot = view.status.autopilot if is_found else None
-        self._observers.finish(self._gate.summary, autopilot, self._outcome)
+        self._observers.finish(self._guard.summary, autopilot, self._outcome)

@@ -21,11 +21,11 @@ from mavbridge.flight.plan import FlightPlan
 from mavbridge.flight.policy_loop import PolicyLoop, PolicySettings
 from mavbridge.flight.state import Freshness
 from mavbridge.flight.state_reader import StateReader
-from mavbridge.flight.vehicle_view import VehicleView
+from mavbridge.flight.telemetry_cache import TelemetryCache
 from mavbridge.flight.vision_loop import VisionLoop
 from mavbridge.flight.vision_rate import AdaptiveRate
-from mavbridge.gate.chunks import Chunk
-from mavbridge.gate.wire import Absence
+from mavbridge.guard.chunks import Chunk
+from mavbridge.guard.wire import Absence
 from policy.contract import Contract
 from policy.protocol import Executable
 
@@ -36,12 +36,12 @@ in between as well."""
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Bridge:
-    """Camera to feature cache, state and feature to chunks, and what the gate says of both."""
+    """Camera to feature cache, state and feature to chunks, and what the guard says of both."""
 
     visions: tuple[VisionLoop, ...]
     """One for each camera of the contract, in its order."""
     policy: PolicyLoop
-    view: VehicleView
+    view: TelemetryCache
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -70,13 +70,13 @@ def build_bridge(
     watch_packets: Callable[[tuple[ForwardedPacket, ...]], object] = lambda packets: None,
     delay_vision: Callable[[TickSink], TickSink] | None = None,
 ) -> Bridge:
-    """Join a policy, its cameras and the gate.
+    """Join a policy, its cameras and the guard.
 
     Args:
         plan: of the flight; its cameras and address are not used.
         executable: the policy on its engine.
         clock: time of the policy loop; in simulation its solves take simulated time.
-        send: hands a chunk to the gate, or the reason why there is none.
+        send: hands a chunk to the guard, or the reason why there is none.
         cameras: those of the contract, in its order.
         sinks: see every tick and every encoded frame of the first camera.
         watches_images: a frozen or a black image is a fault; False where nobody looks at it.
@@ -92,7 +92,7 @@ def build_bridge(
         action_frame=action_frame(contract),
         chunk_dt_s=contract.chunk_dt_s,
         max_frozen_ns=round(config.limits.max_frozen_state * NS_PER_S),
-        period_ns=plan.gate.chunk_period_ns,
+        period_ns=plan.guard.chunk_period_ns,
     )
     states = _state_history(contract, settings.period_ns, limits.feature_ns)
     history = SentHistory(
@@ -105,7 +105,7 @@ def build_bridge(
         if states is not None:
             _push_state(states, reader, view)
 
-    view = VehicleView(
+    view = TelemetryCache(
         history=history,
         sink=FanOut([*chain(*adaptive), *sinks]),
         state_frame=contract.state_frame,
@@ -190,7 +190,7 @@ def _visual_rates(contract: Contract, loops: LoopRates) -> list[AdaptiveRate]:
     ]
 
 
-def _push_state(states: StateHistory, reader: StateReader, view: VehicleView) -> None:
+def _push_state(states: StateHistory, reader: StateReader, view: TelemetryCache) -> None:
     """Remember the state at the attitude that has just come in."""
     has_position = view.status.has_position
     state = reader.read(view.telemetry(), view.attitude_ns, has_position=has_position)

@@ -54,4 +54,4 @@ class SentHistory:
         """[1, K, 4], see ``policy.contract.history_ages_ns``."""
         with self._lock:
             rows = [self._sent[bisect_right(self._sent_ns, now_ns - age)] for age in self._ages_ns]
-        return self._frame.from_gate(rows)[None]
+        return self._frame.from_guard(rows)[None]

@@ -26,11 +26,11 @@ from mavbridge.core.provenance import (
 from mavbridge.core.records import FlightOutcome, Solve
 from mavbridge.core.vehicle import ForwardedPacket
 from mavbridge.flight.action_frames import action_frame
-from mavbridge.flight.gate_process import GateProcess
+from mavbridge.flight.guard_process import GuardProcess
 from mavbridge.flight.outcome import FlightReferee, describe
 from mavbridge.flight.plan import FlightPlan
 from mavbridge.flight.policies import policy_files
-from mavbridge.gate.wire import GateSummary
+from mavbridge.guard.wire import GuardSummary
 from mavbridge.observe.terminal import FlightScreen
 from mavbridge.observe.timing import FlightTiming, Mode, ObserverDrops, report_json
 from mavbridge.observe.viewer.flight import RerunView
@@ -70,7 +70,7 @@ class FlightObservers:
         self.referee = FlightReferee(self._gates)
         self._viewer: ObserverThread | None = None
         self._recorder: Recorder | None = None
-        self._gate: GateProcess | None = None
+        self._guard: GuardProcess | None = None
         self.screen = FlightScreen(
             console, action_hz=action_hz, vision_hz=vision_hz, readonly=config.link.readonly
         )
@@ -114,7 +114,7 @@ class FlightObservers:
         """Start the viewer or its file, if one is wanted; it is closed with ``stack``."""
         if self._config.rerun == "off" and not self._config.serve:
             return
-        config, contract, freshness = self._config, self._plan.contract, self._plan.gate.freshness
+        config, contract, freshness = self._config, self._plan.contract, self._plan.guard.freshness
         flight = ViewedFlight(
             vision_hz=self._plan.loops.max_vision_hz,
             chunk_hz=self._plan.loops.action_hz,
@@ -122,7 +122,7 @@ class FlightObservers:
             contract=contract,
             max_state_age_s=freshness.state_ns / NS_PER_S,
             max_feature_age_s=freshness.feature_ns / NS_PER_S,
-            to_ned=action_frame(contract).to_gate,
+            to_ned=action_frame(contract).to_guard,
             gates=self._gates or (),
         )
         view = RerunView(config.rerun, flight, serve=config.serve)
@@ -134,7 +134,7 @@ class FlightObservers:
         stack.callback(self._viewer.close, VIEWER_JOIN_S)
 
     def open_recorder(
-        self, tlog_pipe: TlogPipe | None, gate: GateProcess, autopilot: Callable[[], str]
+        self, tlog_pipe: TlogPipe | None, guard: GuardProcess, autopilot: Callable[[], str]
     ) -> None:
         """Start the recording, if one is wanted; raises UserError if it cannot be written."""
         if self._config.record is None or tlog_pipe is None:
@@ -163,13 +163,13 @@ class FlightObservers:
             policy_files=digests(policy_files(self._config.policy)),
             cameras=self._camera_sources(),
         )
-        self._gate = gate
+        self._guard = guard
         try:
             self._recorder = Recorder(
                 self._config.record,
                 meta,
                 tlog_pipe=tlog_pipe,
-                packets_dropped=lambda: gate.summary.dropped_packets if gate.summary else 0,
+                packets_dropped=lambda: guard.summary.dropped_packets if guard.summary else 0,
                 autopilot=autopilot,
                 report=self.screen.show_message,
                 settings=ReplaySettings(config=self._config, wall_offset_ns=offset_ns),
@@ -178,8 +178,8 @@ class FlightObservers:
             raise UserError(f"--record {self._config.record}: {error}") from error
 
     def close_recorder(self, outcome: FlightOutcome | None) -> None:
-        """Finish the recording; after the gate has ended, so that it holds the release."""
-        recorder, summary = self._recorder, self._gate.summary if self._gate else None
+        """Finish the recording; after the guard has ended, so that it holds the release."""
+        recorder, summary = self._recorder, self._guard.summary if self._guard else None
         if recorder is None or self._config.record is None:
             return
         recorder.close(RECORDER_JOIN_S)
@@ -189,7 +189,7 @@ class FlightObservers:
             self._write_end(replace(meta, parameters=params), self._config.record)
 
     def _write_end(self, meta: "FlightMeta", folder: Path) -> None:
-        """Add to the meta data what is known only when the gate has ended."""
+        """Add to the meta data what is known only when the guard has ended."""
         from mavbridge.recording.meta import write_meta
 
         try:
@@ -203,7 +203,7 @@ class FlightObservers:
         return dict(zip(names, sources, strict=True))
 
     def finish(
-        self, summary: GateSummary | None, autopilot: str | None, outcome: FlightOutcome | None
+        self, summary: GuardSummary | None, autopilot: str | None, outcome: FlightOutcome | None
     ) -> None:
         """Show the report, and write it where --report names a file, if a vehicle was found.
 
@@ -225,7 +225,7 @@ class FlightObservers:
             Path(self._config.rerun).unlink(missing_ok=True)
 
     def _report(
-        self, summary: GateSummary | None, autopilot: str, outcome: FlightOutcome | None
+        self, summary: GuardSummary | None, autopilot: str, outcome: FlightOutcome | None
     ) -> None:
         viewer, recorder = self._viewer, self._recorder
         report = self._timing.report(

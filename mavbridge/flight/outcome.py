@@ -14,13 +14,13 @@ from mavbridge.core.reasons import Reason
 from mavbridge.core.records import Event, FlightOutcome, Tick
 from mavbridge.core.stopping import StopRequest
 from mavbridge.core.vehicle import FlightEnd
-from mavbridge.gate.engagement import Phase
-from mavbridge.gate.wire import GateStatus, GateSummary
+from mavbridge.guard.engagement import Phase
+from mavbridge.guard.wire import GuardStatus, GuardSummary
 from mavbridge.recording.crash import CrashWatch
 
 _log = logging.getLogger(__name__)
 RUN_OUT_NS = NS_PER_S
-"""From the last gate to the end of the flight: a crash just behind the gate still counts."""
+"""From the last gate to the end of the flight: a crash just behind it still counts."""
 _ENDS: dict[FlightEnd, str] = {
     "course": "the end of the course",
     "duration": "--duration",
@@ -82,11 +82,11 @@ class FlightReferee:
         return self._course.is_done and now_ns - self._course.passed_ns[-1] >= RUN_OUT_NS
 
     def outcome(
-        self, end: FlightEnd, vehicle: GateStatus, asked: Reason | None = None
+        self, end: FlightEnd, vehicle: GuardStatus, asked: Reason | None = None
     ) -> FlightOutcome | None:
         """The outcome of a flight that ended so; None if the policy has not flown.
 
-        ``asked``: the reason, where the gate did not live to tell one.
+        ``asked``: the reason, where the guard did not live to tell one.
         """
         if (flown := self._flown) is None:
             return None
@@ -145,7 +145,7 @@ class Verdict(NamedTuple):
 
 
 def flight_verdict(
-    summary: GateSummary | None,
+    summary: GuardSummary | None,
     stop: StopRequest,
     *,
     reason: Reason | None,
@@ -156,7 +156,7 @@ def flight_verdict(
     """Judge a flight that ended without an exception.
 
     Args:
-        summary: the gate's last words; None where it goes on without us.
+        summary: the guard's last words; None where it goes on without us.
         stop: the signals that have come.
         reason: why the policy does not fly now, from the last tick.
         readonly: nothing was sent, so there was nothing to fly.
@@ -187,7 +187,7 @@ def flight_verdict(
     return Verdict(ExitCode.DONE)
 
 
-def log_link(summary: GateSummary) -> None:
+def log_link(summary: GuardSummary) -> None:
     """Log what came over the link, and the parameters that were read."""
     rates = (f"{name} {rate_hz:.1f}" for name, rate_hz in summary.link.messages_per_s)
     _log.debug("received, in Hz: %s", ", ".join(rates))

@@ -15,9 +15,9 @@ from mavbridge.flight.settings import (
     policy_envelope,
     require_goal,
 )
-from mavbridge.gate.chunks import FreshnessLimits
-from mavbridge.gate.gate import FlightSettings
-from mavbridge.gate.smoothing import Smoothing
+from mavbridge.guard.chunks import FreshnessLimits
+from mavbridge.guard.guard import FlightSettings
+from mavbridge.guard.smoothing import Smoothing
 from policy.contract import Contract
 
 
@@ -31,12 +31,16 @@ class FlightPlan:
     loops: LoopRates
     start_limits: FreshnessLimits
     """Oldest inputs from which a chunk may be computed."""
-    gate: FlightSettings
-    """Settings of the gate; its ``freshness`` holds while a chunk is played."""
+    guard: FlightSettings
+    """Settings of the guard; its ``freshness`` holds while a chunk is played."""
 
     def figures(self) -> dict[str, float]:
         """Rates, periods and limits by their names, for people and for ``meta.json``."""
-        limits, smoothing, envelope = self.gate.freshness, self.gate.smoothing, self.gate.envelope
+        limits, smoothing, envelope = (
+            self.guard.freshness,
+            self.guard.smoothing,
+            self.guard.envelope,
+        )
         return {
             "vision_hz": self.loops.max_vision_hz,
             "action_hz": self.loops.action_hz,
@@ -65,7 +69,7 @@ def plan_flight(config: FlyConfig, contract: Contract, *, is_dual: bool) -> Flig
     loops = rates.loops(is_dual=is_dual, play_s=contract.play_s)
     start_limits = effective_freshness(contract, limits)
     require_goal(config, contract)
-    gate = FlightSettings(
+    guard = FlightSettings(
         stick_period_ns=period_ns(rates.stick_rate),
         chunk_period_ns=period_ns(loops.action_hz),
         freshness=start_limits.while_played(round(contract.play_s * NS_PER_S)),
@@ -86,5 +90,5 @@ def plan_flight(config: FlyConfig, contract: Contract, *, is_dual: bool) -> Flig
         is_dual=is_dual,
         loops=loops,
         start_limits=start_limits,
-        gate=gate,
+        guard=guard,
     )

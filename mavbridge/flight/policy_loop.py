@@ -1,4 +1,4 @@
-"""The fast path: newest attitude + cached feature + sent actions -> chunk -> the gate."""
+"""The fast path: newest attitude + cached feature + sent actions -> chunk -> the guard."""
 
 import threading
 from collections.abc import Callable
@@ -14,23 +14,23 @@ from mavbridge.flight.history import SentHistory
 from mavbridge.flight.observation import Observation, ObservationSource
 from mavbridge.flight.state import FrozenStateCheck
 from mavbridge.flight.state_reader import StateReader
-from mavbridge.flight.vehicle_view import SolveInputs, VehicleView
-from mavbridge.gate.chunks import Chunk
-from mavbridge.gate.wire import Absence
+from mavbridge.flight.telemetry_cache import SolveInputs, TelemetryCache
+from mavbridge.guard.chunks import Chunk
+from mavbridge.guard.wire import Absence
 from policy.errors import NoChunkError
 
 Act: TypeAlias = Callable[[FloatArray, FloatArray, FloatArray], FloatArray]
 """``Executable.act``."""
 
 WAIT_NS = 100 * NS_PER_MS
-"""Longest wait for an attitude before the stop flag is checked, and the gate told why it waits."""
+"""Longest wait for an attitude before the stop flag is checked, and the guard told why it waits."""
 
 RETRY_NS = 100 * NS_PER_MS
 """After a solve that was refused the next one starts at the latest so much later, however slow the
 policy is."""
 
 MAX_HORIZON = 1024
-"""Most actions of a chunk, as in a contract: the gate has to read each one between two sticks."""
+"""Most actions of a chunk, as in a contract: the guard has to read each one between two sticks."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -48,14 +48,14 @@ class PolicySettings:
 class PolicyLoop:
     """Solves on each new attitude, at most at the policy's rate, in a thread of its own.
 
-    It computes before the flight as well: the gate engages only with a fresh chunk.
+    It computes before the flight as well: the guard engages only with a fresh chunk.
     """
 
     def __init__(
         self,
         *,
         clock: Clock,
-        view: VehicleView,
+        view: TelemetryCache,
         reader: StateReader,
         observations: ObservationSource,
         history: SentHistory,
@@ -86,7 +86,7 @@ class PolicyLoop:
         """When the last step ended; read by another thread."""
 
     def run(self, stop: threading.Event) -> None:
-        """Solve until told to stop; the gate is told of a failure, which is no stall."""
+        """Solve until told to stop; the guard is told of a failure, which is no stall."""
         try:
             self._run(stop)
         except BaseException:
@@ -115,7 +115,7 @@ class PolicyLoop:
 
     @property
     def _is_starting(self) -> bool:
-        """The gate waits for a reset, and the first chunk after it."""
+        """The guard waits for a reset, and the first chunk after it."""
         return self._view.starting_ns > self._reset_ns
 
     @property
@@ -181,7 +181,7 @@ class PolicyLoop:
         chunk = make_chunk(
             self._serial,
             state,
-            self._settings.action_frame.to_gate(array[0]),
+            self._settings.action_frame.to_guard(array[0]),
             image_ns=observation.image_ns,
             computed_ns=done_ns,
             step_ns=round(self._settings.chunk_dt_s * NS_PER_S),

@@ -1,4 +1,4 @@
-"""From the flags of a command, and the contract of a policy, to the settings of link and gate."""
+"""From the flags of a command, and the contract of a policy, to the settings of link and guard."""
 
 import math
 import os
@@ -9,13 +9,13 @@ from mavbridge.config.flight import EnvelopeConfig, FlyConfig, Limits, LinkConfi
 from mavbridge.core.clock import NS_PER_S
 from mavbridge.core.errors import UserError
 from mavbridge.core.vehicle import ActionMeaning, StickGains
-from mavbridge.gate.chunks import FreshnessLimits
-from mavbridge.gate.departure import DepartureSettings
-from mavbridge.gate.engagement import EngagementSettings
-from mavbridge.gate.envelope import EnvelopeLimits
-from mavbridge.gate.limits import LimitSettings
-from mavbridge.gate.preparation import PreparationSettings
-from mavbridge.gate.settings import GateSettings
+from mavbridge.guard.chunks import FreshnessLimits
+from mavbridge.guard.departure import DepartureSettings
+from mavbridge.guard.engagement import EngagementSettings
+from mavbridge.guard.envelope import EnvelopeLimits
+from mavbridge.guard.limits import LimitSettings
+from mavbridge.guard.preparation import PreparationSettings
+from mavbridge.guard.settings import GuardSettings
 from mavbridge.mavlink.settings import LinkSettings, SigningFiles
 from policy.contract import ActionKind, Contract
 
@@ -27,12 +27,12 @@ TAU_S: dict[ActionKind, float] = {"sticks": 0.05, "rates": 0.01, "attitude": 0.0
 room for 50 ms more."""
 
 
-def gate_settings(
+def guard_settings(
     config: FlyConfig, *, is_dual: bool, tlog_fd: int | None, wall_offset_ns: int
-) -> GateSettings:
+) -> GuardSettings:
     """Settings of the process, before a policy is loaded; chunks are sent besides the slots."""
     rates = config.rates
-    return GateSettings(
+    return GuardSettings(
         link=link_settings(
             config.link,
             state_hz=rates.loops(is_dual=is_dual).state_hz,
@@ -41,7 +41,7 @@ def gate_settings(
             folder=state_folder(),
         ),
         realtime=config.rates.realtime,
-        cpu=config.rates.gate_cpu,
+        cpu=config.rates.guard_cpu,
         tlog_fd=tlog_fd,
         wall_offset_ns=wall_offset_ns,
     )

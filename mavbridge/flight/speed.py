@@ -6,7 +6,7 @@ from typing import NamedTuple
 from mavbridge.core.clock import NS_PER_S
 from mavbridge.core.errors import PolicyError
 from mavbridge.flight.plan import FlightPlan
-from mavbridge.gate.chunks import PERIOD_TOLERANCE, FreshnessLimits
+from mavbridge.guard.chunks import PERIOD_TOLERANCE, FreshnessLimits
 from policy.contract import Contract
 from policy.loading.timing import SolveTimes
 

@@ -1,4 +1,4 @@
-"""The vehicle as the gate sees it. One thread owns socket and codec."""
+"""The vehicle as the guard sees it. One thread owns socket and codec."""
 
 from collections.abc import Callable, Iterable, Mapping
 from contextlib import suppress
@@ -38,8 +38,8 @@ from mavbridge.mavlink.codec.signing import Signing
 from mavbridge.mavlink.outputs.sender import ActionSender
 from mavbridge.mavlink.session.commands import ModeAndArm, mode_request
 from mavbridge.mavlink.session.discovery import (
+    DuplicateSystems,
     Hearing,
-    Namesakes,
     VehicleDiscovery,
     VehicleIdentity,
 )
@@ -100,7 +100,7 @@ class MavlinkLink:
         self._watches_home_height = False
         self._interruption: Reason | None = None
         self._interruptions = 0
-        self._namesakes = Namesakes()
+        self._duplicate_systems = DuplicateSystems()
 
     def fileno(self) -> int | None:
         """Descriptor for ``select`` to wake up on arrivals; None while the transport is closed."""
@@ -215,7 +215,7 @@ class MavlinkLink:
     def _notice_other(self, identity: VehicleIdentity, sender: Address | None, now_ns: int) -> None:
         """Another address uses the vehicle's system id: its packets are ignored while we fly."""
         heard_ns = self._counters.heard_ns if self.is_engaged else now_ns
-        text, has_replaced = self._namesakes.notice(identity, sender, now_ns, heard_ns)
+        text, has_replaced = self._duplicate_systems.notice(identity, sender, now_ns, heard_ns)
         if text is not None and has_replaced:
             self._interrupt(because(Code.REPLACED, said=text))
         elif text is not None:
@@ -337,7 +337,7 @@ class MavlinkLink:
         self._timesync.restart()
         self._commands = ModeAndArm()
         self._counters.new_sequence()
-        self._namesakes = Namesakes()
+        self._duplicate_systems = DuplicateSystems()
         self._connection.peer = identity.address
 
     def begin_flight(self, meaning: ActionMeaning, output: Output | None) -> None:

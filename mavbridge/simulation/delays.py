@@ -58,7 +58,7 @@ class Delays:
     action: Delay = Delay(p50_ns=3 * NS_PER_MS, p99_ns=6 * NS_PER_MS)
     """State to chunk; in single-rate mode the time for the image comes on top."""
     hop: Delay = Delay(p50_ns=NS_PER_MS // 10, p99_ns=NS_PER_MS // 2)
-    """Message between the flight process and the gate, either way."""
+    """Message between the flight process and the guard, either way."""
     uplink: Delay = Delay(p50_ns=NS_PER_MS * 3 // 10)
     downlink: Delay = Delay(p50_ns=NS_PER_MS * 3 // 10)
     stall_ns: int = 0

@@ -17,12 +17,12 @@ from mavbridge.flight.bridge import CameraPath, build_bridge
 from mavbridge.flight.observation import observation_ages_ns
 from mavbridge.flight.plan import plan_flight
 from mavbridge.flight.settings import link_settings
-from mavbridge.gate.departure import Ending
-from mavbridge.gate.loop import GateLoop
+from mavbridge.guard.departure import Ending
+from mavbridge.guard.loop import GuardLoop
 from mavbridge.mavlink.link import MavlinkLink
 from mavbridge.simulation.clock import AheadClock, SteppedClock
 from mavbridge.simulation.delays import Delays, Stalls
-from mavbridge.simulation.gate import GateStepper, MemoryPort, PolicyStepper, sender
+from mavbridge.simulation.guard import GuardStepper, MemoryPort, PolicyStepper, sender
 from mavbridge.simulation.network import DelayedChannel, MemoryTransport
 from mavbridge.simulation.referee import EpisodeResult, Referee
 from mavbridge.simulation.world import (
@@ -48,7 +48,7 @@ from sitl.vehicle.config import STEP_NS, VehicleConfig
 MAX_TIME_S = 60.0
 """Default limit: courses are some 80 m long, so a policy slower than 1.5 m/s fails."""
 END_NS = 3 * NS_PER_S
-"""Longest that the gate may take to give the sticks back."""
+"""Longest that the guard may take to give the sticks back."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -154,16 +154,16 @@ class SimulatedFlight:
         cv2.setNumThreads(1)  # the same images on any machine, and no pool to wake for them
         referee = Referee(self.clock, self.vehicle, max_time_s=max_time_s, should_stop=should_stop)
         self.watch_steps(referee.watch)
-        gate = self._compose(executable, (referee, *sinks))
+        guard = self._compose(executable, (referee, *sinks))
         while not referee.stop.is_set():
             self.clock.sleep_until_ns(self.clock.now_ns() + STEP_NS)
-        gate.stop(Ending(reason=because(Code.DURATION)))
+        guard.stop(Ending(reason=because(Code.DURATION)))
         end_ns = self.clock.now_ns() + END_NS
-        while not gate.is_done and self.clock.now_ns() < end_ns:
+        while not guard.is_done and self.clock.now_ns() < end_ns:
             self.clock.sleep_until_ns(self.clock.now_ns() + STEP_NS)
         return referee.result(course_seed=self._course_seed, seed=self._seed)
 
-    def _compose(self, executable: Executable, sinks: tuple[TickSink, ...]) -> GateLoop:
+    def _compose(self, executable: Executable, sinks: tuple[TickSink, ...]) -> GuardLoop:
         """Build the bridge on the stepped clock; its parts run as events from now on."""
         world, hop = self.clock, self._settings.delays.hop
         config = FlyConfig(
@@ -176,9 +176,9 @@ class SimulatedFlight:
         plan = plan_flight(config, executable.contract, is_dual=executable.dual_rate)
         loops = plan.loops
         stalled_ns = self._stalls.end_ns
-        to_gate = DelayedChannel(world, hop.samples_ns(self._random(7)), stalled_ns)
+        to_guard = DelayedChannel(world, hop.samples_ns(self._random(7)), stalled_ns)
         to_flight = DelayedChannel(world, hop.samples_ns(self._random(8)), stalled_ns)
-        flight_port = MemoryPort(outgoing=to_gate, incoming=to_flight)
+        flight_port = MemoryPort(outgoing=to_guard, incoming=to_flight)
         link = MavlinkLink(
             self._transport,
             world,
@@ -188,16 +188,16 @@ class SimulatedFlight:
                 stick_hz=config.rates.stick_rate,
                 min_battery_percent=0.0,
             ),
-            forward=lambda packet: gate.forward(packet),
+            forward=lambda packet: guard.forward(packet),
         )
-        gate = GateLoop(world, link, MemoryPort(outgoing=to_flight, incoming=to_gate))
+        guard = GuardLoop(world, link, MemoryPort(outgoing=to_flight, incoming=to_guard))
         contract, policy_clock = executable.contract, AheadClock(world)
         for name, value in needed_params(contract, self._vehicle_config.autopilot).items():
             self.vehicle.params.set(name, value)
         vision_clocks = [AheadClock(world) for _ in contract.cameras]
         cameras = self._make_cameras(contract, camera_hz=max(loops.max_vision_hz, SIM_CAMERA_HZ))
         send = sender(world, policy_clock, flight_port)
-        send(plan.gate)
+        send(plan.guard)
         past_ns = observation_ages_ns(contract)[0]
         bridge = build_bridge(
             plan,
@@ -217,10 +217,10 @@ class SimulatedFlight:
         for clock, camera, vision in zip(vision_clocks, cameras, bridge.visions, strict=True):
             VisionStepper(world, clock, camera, vision)
         policy = PolicyStepper(world, policy_clock, flight_port, bridge.policy, bridge.view)
-        gate_stepper = GateStepper(world, gate)
+        guard_stepper = GuardStepper(world, guard)
         to_flight.on_arrival = policy.receive
-        to_gate.on_arrival = self._downlink.on_arrival = gate_stepper.step
-        return gate
+        to_guard.on_arrival = self._downlink.on_arrival = guard_stepper.step
+        return guard
 
     def _make_cameras(self, contract: Contract, *, camera_hz: float) -> list[SimulatedCamera]:
         """The cameras of a policy; a lone one looks ahead, whatever its name.

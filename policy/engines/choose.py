@@ -1,6 +1,6 @@
 """Which engine runs a policy: the fastest that is present and computes what plain torch computes.
 
-An engine that cannot be made, or fails the parity gate, is passed over with a note of the reason.
+An engine that cannot be made, or fails the parity check, is passed over with a note of the reason.
 Torch, the reference, is last.
 """
 
@@ -61,7 +61,7 @@ def choose_executable(
 def first_that_agrees(
     policy: SingleRatePolicy, candidates: list[Candidate], settings: ExecutionSettings
 ) -> tuple[Executable, tuple[str, ...]]:
-    """The first candidate that passes the gate, or torch, with a line for each one passed over.
+    """The first candidate that passes the check, or torch, with a line for each one passed over.
 
     Raises:
         PolicyError: the policy fails on torch itself.

@@ -3,7 +3,7 @@
 The image path is converted as it is. The denoiser is written again over the same weights, as 2-D
 convolutions over a single row, which the CPU plugin runs faster than the products of matrices that
 torch prefers (bf16: by a third). What tells the steps of a solve apart are inputs, so that one
-graph, and one copy of the weights, serves every step. The parity gate compares the result with
+graph, and one copy of the weights, serves every step. The parity check compares the result with
 torch.
 """
 

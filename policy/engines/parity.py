@@ -1,4 +1,4 @@
-"""The parity gate: do two ways to compute a policy agree, from image to stick?"""
+"""The parity check: do two ways to compute a policy agree, from image to stick?"""
 
 from dataclasses import dataclass
 

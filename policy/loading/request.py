@@ -24,7 +24,7 @@ class PolicyRequest:
     allow_untrained: bool = False
     """Accept seeded random weights where there is no checkpoint."""
     engine: EngineName = "auto"
-    """Engine that runs the network; auto = the fastest that passes the parity gate."""
+    """Engine that runs the network; auto = the fastest that passes the parity check."""
     device: str = "cpu"
     """torch's name of where to run: cpu, cuda, cuda:0, mps."""
     vision_device: str | None = None

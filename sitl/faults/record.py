@@ -9,7 +9,7 @@ Four = tuple[int, int, int, int]
 NEUTRAL_US: Four = (1500, 1500, 1500, 1500)
 RECEIVER_US: dict[Receiver, Four] = {"idle": (1500, 1500, 1000, 1500), "mid": NEUTRAL_US}
 """Sticks of a receiver by its flag; ``none`` has no sticks."""
-NUDGE_US = 8
+DITHER_US = 8
 """Most by which the bridge moves a channel to see whether the vehicle hears it: two steps of 4."""
 LANDINGS = ("LAND", "RTL", "AUTO.LAND", "AUTO.RTL")
 """Modes in which a vehicle goes down by its own will."""
@@ -139,6 +139,6 @@ def is_safe(
     """Neutral sticks, the receiver's, somebody else's, out of the flight's mode, or disarmed."""
     allowed = {NEUTRAL_US, RECEIVER_US.get(receiver, NEUTRAL_US), others_us or NEUTRAL_US}
     is_stick = any(
-        all(abs(a - b) <= NUDGE_US for a, b in zip(entry["us"], us, strict=True)) for us in allowed
+        all(abs(a - b) <= DITHER_US for a, b in zip(entry["us"], us, strict=True)) for us in allowed
     )
     return is_stick or entry["mode"] != mode or not entry["armed"]

@@ -132,15 +132,15 @@ def _leans(stage: Stage) -> bool:
 
 
 def _end(scenario: Scenario, stage: Stage, verdict: Verdict) -> None:
-    """Let everything end; a gate that holds the vehicle for want of a receiver is taken over."""
-    gate = stage.gate
+    """Let everything end; a guard that holds the vehicle for want of a receiver is taken over."""
+    guard = stage.guard
     stage.kill_group(signal.SIGCONT)
     verdict.ended_ns = stage.kill_group(signal.SIGINT)
     if -signal.SIGKILL in scenario.exits:
         stage.kill(signal.SIGKILL)
-    if not gate.has_ended(FLY_ON_S):
+    if not guard.has_ended(FLY_ON_S):
         landing = "AUTO.LAND" if stage.is_px4 else "LAND"
         verdict.taken_over_ns = stage.relay.set_mode(landing)
-        if not gate.has_ended(END_S):
-            verdict.failures.append(f"the gate still runs {END_S:.0f} s after a takeover")
+        if not guard.has_ended(END_S):
+            verdict.failures.append(f"the guard still runs {END_S:.0f} s after a takeover")
     verdict.exit, verdict.output = stage.end()

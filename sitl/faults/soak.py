@@ -38,7 +38,7 @@ LEANING_ROWS = 50
 """Messages of sticks that lean, in a row: the policy has the sticks."""
 MOST_GROWTH = {
     "flight": Usage(rss_mb=40.0, descriptors=2, threads=0),
-    "gate": Usage(rss_mb=4.0, descriptors=1, threads=0),
+    "guard": Usage(rss_mb=4.0, descriptors=1, threads=0),
 }
 """Growth of a process that is no leak yet: allocators keep what they once had."""
 REPORT_EVERY = 20
@@ -87,7 +87,7 @@ class SoakResult:
     sent: int = 0
     """Overrides and releases that left the bridge."""
     growth: dict[str, Usage] = field(default_factory=dict)
-    """Growth of the flight process and of the gate, after they had settled."""
+    """Growth of the flight process and of the guard, after they had settled."""
     stalls: int = 0
     """Faults that the policy should have survived, but a busy machine took the sticks from it."""
     failures: list[str] = field(default_factory=list)
@@ -113,13 +113,13 @@ def soak(minutes: float, seed: int, folder: Path, report: Callable[[str], None])
         )  # fmt: skip
         if not stage.wait_for("not engaged: press e, use the engage switch"):
             raise StageError("the bridge is not ready to engage")
-        stage.gate.has_ended(0)  # finds it while its parent lives
+        stage.guard.has_ended(0)  # finds it while its parent lives
         _engage(stage, transmitter)
         usages = _fly(stage, transmitter, result, minutes, random.Random(seed), report)  # noqa: S311
         stage.kill_group(signal.SIGINT)
         stage.observe(SETTLE_S)
         stage.relay.disarm()
-        stage.gate.has_ended(30.0)
+        stage.guard.has_ended(30.0)
         status, output = stage.end()
         result.sent += len(stage.relay.overrides)
     if status not in ORDERLY or "Traceback" in output:
@@ -142,7 +142,7 @@ def _fly(
     report: Callable[[str], None],
 ) -> dict[str, list[Usage]]:
     """Break the flight again and again; what the two processes held after each time."""
-    pids = {"flight": stage.bridge_pid, "gate": stage.gate.pid}
+    pids = {"flight": stage.bridge_pid, "guard": stage.guard.pid}
     usages: dict[str, list[Usage]] = {name: [] for name in pids}
     end_ns = stage.clock.now_ns() + round(minutes * 60 * NS_PER_S)
     while stage.clock.now_ns() < end_ns:

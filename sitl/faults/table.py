@@ -14,7 +14,7 @@ TITLES = {
 }
 HEAD = """# Faults
 
-Each row is a flight in real time by real processes: gate, flight process, sockets and the bundled
+Each row is a flight in real time by real processes: guard, flight process, sockets and the bundled
 flight controller, which is judged by its own record. The policy leans, climbs and turns when the
 fault begins. "Safe" means neutral sticks, the receiver's, or out of the mode of the flight. Limits
 are in brackets: a fault that can be known only after a while has that while in its limit. The

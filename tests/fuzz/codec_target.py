@@ -15,7 +15,7 @@ from mavbridge.mavlink.codec.packets import Codec
 MOST_CPU_S = 5.0
 """For one datagram, to find a loop without an end. The dearest take 3 ms on an idle machine."""
 MOST_SHOWN_BYTES = 4096
-"""Of each datagram in a message: the gate reads no more of one."""
+"""Of each datagram in a message: the guard reads no more of one."""
 _SAMPLE_EVERY = 50
 """The vehicle's own packets, of which the mutations are made."""
 

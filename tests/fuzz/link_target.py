@@ -1,4 +1,4 @@
-"""Hostile datagrams against a whole flight: link, gate, policy loop and vehicle, in simulated time.
+"""Hostile datagrams against a whole flight: link, guard, policy loop, vehicle, in simulated time.
 
 The datagrams come as if from the socket, between those of a simulated vehicle that goes on being
 honest. In a row: while the vehicle is looked for, while nobody has engaged, in flight from
@@ -22,8 +22,8 @@ from helpers.wire import WireEnd
 from mavbridge.core.clock import NS_PER_MS
 from mavbridge.core.errors import PeerError
 from mavbridge.core.vehicle import ActionKind
-from mavbridge.gate.engagement import ACT_TIMEOUT_NS, Phase
-from mavbridge.gate.wire import GateMessage, GateTick
+from mavbridge.guard.engagement import ACT_TIMEOUT_NS, Phase
+from mavbridge.guard.wire import GuardMessage, GuardTick
 from mavbridge.mavlink.transport.sockets import Address, Received
 from mavbridge.simulation.network import VEHICLE
 from sitl.vehicle.config import AutopilotName
@@ -32,7 +32,7 @@ STRANGER: Address = ("stranger", 9)
 BATCH, BATCH_NS = 10, 5 * NS_PER_MS
 """2,000 datagrams a second."""
 MOST_ENTRIES = 1000
-"""In any table or queue of link and gate, whatever was received."""
+"""In any table or queue of link and guard, whatever was received."""
 MOST_BYTES = 3_000_000
 ROUNDS = 8
 """Flights with one program."""
@@ -53,7 +53,7 @@ class HostileFlight:
         self.fed = 0
         self.flights = self.reboots = self.refused_starts = 0
         self._last: list[bytes] = []
-        """The datagrams that were fed last, for a failure; so is what the gate has told."""
+        """The datagrams that were fed last, for a failure; so is what the guard has told."""
         self._told: deque[str] = deque(maxlen=12)
         self._make = lambda: OutputFlight(autopilot, kind)
         self._begin()
@@ -142,12 +142,12 @@ class HostileFlight:
 
     def _is_ready(self) -> bool:
         """An engage would be obeyed, as far as the link and the inputs are concerned."""
-        gate, link = self.flight.gate._gate, self.flight.link.poll()
-        assert gate is not None
+        guard, link = self.flight.guard._guard, self.flight.link.poll()
+        assert guard is not None
         if link.status is None or link.problem is not None:
             return False
         is_flown = link.status.armed and not link.status.is_failsafe
-        is_fresh = gate._chunks.problem(self.flight.clock.now_ns()) is None
+        is_fresh = guard._chunks.problem(self.flight.clock.now_ns()) is None
         return is_flown and is_fresh and link.status.mode == self.flight.vehicle.ap.mode_name
 
     # --- time
@@ -170,16 +170,16 @@ class HostileFlight:
         clock.sleep_until_ns(clock.now_ns() + ms * NS_PER_MS)
         self._judge.read()
         self._source.heard.extend(data for _, data in flight.down.sent[-4:])
-        for report in flight.gate_port.reports:
-            if isinstance(report, GateTick):
+        for report in flight.guard_port.reports:
+            if isinstance(report, GuardTick):
                 self._follow(report)
-            elif isinstance(report, GateMessage):
+            elif isinstance(report, GuardMessage):
                 self._told.append(report.text)
-        del flight.gate_port.reports[:-1], flight.down.sent[:], flight.up.sent[:]
+        del flight.guard_port.reports[:-1], flight.down.sent[:], flight.up.sent[:]
         flight.sink.events.clear()
         del flight.samples[:-1]
 
-    def _follow(self, tick: GateTick) -> None:
+    def _follow(self, tick: GuardTick) -> None:
         """A flight begins by an act alone, which counts once and not for long."""
         before, self._phase = self._phase, tick.phase
         if before in _AT_REST and tick.phase not in _AT_REST:
@@ -201,18 +201,18 @@ class HostileFlight:
     # --- memory
 
     def _judge_memory(self) -> None:
-        """Every table of link and gate is bounded."""
+        """Every table of link and guard is bounded."""
         flight = self.flight
         harness = (
-            *(flight.network, flight.clock, flight.gate_port, flight.vehicle, flight),
+            *(flight.network, flight.clock, flight.guard_port, flight.vehicle, flight),
             *(flight.sink, flight.sink.events),
         )
         total = 0
-        for item in _reachable([flight.link, flight.gate, flight.view], harness):
+        for item in _reachable([flight.link, flight.guard, flight.view], harness):
             total += sys.getsizeof(item)
             if isinstance(item, dict | set | deque):
                 assert len(item) <= MOST_ENTRIES, f"{len(item)} entries: {str(item)[:300]}"
-        assert total <= MOST_BYTES, f"link and gate hold {total} bytes"
+        assert total <= MOST_BYTES, f"link and guard hold {total} bytes"
 
 
 def _reachable(roots: list[object], harness: tuple[object, ...]) -> list[object]:

@@ -1,4 +1,4 @@
-"""Reads everything that leaves the gate by pymavlink alone, and judges it."""
+"""Reads everything that leaves the guard by pymavlink alone, and judges it."""
 
 import math
 from typing import Any

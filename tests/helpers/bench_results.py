@@ -41,7 +41,7 @@ def make_flight(runner: str, **changes: Any) -> Flight:
         "state_age_ms": all_equal(25.0),
         "state_to_wire_ms": all_equal(20.0),
         "cpu_cores": 1.0,
-        "gate_cpu_cores": 0.125,
+        "guard_cpu_cores": 0.125,
         "stolen_ms": None,
         "missed_by_cause": {"kernel": 9, "host": 3} if runner == "mavbridge" else None,
         "vehicle_gap_ms": {"p50": 10.0, "p99": 11.0, "max": 12.0},

@@ -14,8 +14,8 @@ from mavbridge.core.clock import NS_PER_MS, NS_PER_S
 from mavbridge.core.reasons import Code, Reason, because
 from mavbridge.core.records import Tick, VehicleState, VisionTick
 from mavbridge.core.vehicle import NEUTRAL, ActionTrace, Sticks
-from mavbridge.gate.engagement import Phase
-from mavbridge.gate.wire import GateTick
+from mavbridge.guard.engagement import Phase
+from mavbridge.guard.wire import GuardTick
 
 START_NS = 1_000 * NS_PER_S
 TICK_NS = 10 * NS_PER_MS
@@ -109,9 +109,9 @@ def about_z(angle_rad: NDArray[np.float64]) -> NDArray[np.float64]:
     return np.stack([np.cos(angle_rad / 2), zero, zero, np.sin(angle_rad / 2)], axis=-1)
 
 
-def make_gate_tick(at_ns: int, **changes: Any) -> GateTick:
-    """A slot that the gate served in time, with nothing to send."""
-    tick = GateTick(
+def make_guard_tick(at_ns: int, **changes: Any) -> GuardTick:
+    """A slot that the guard served in time, with nothing to send."""
+    tick = GuardTick(
         index=0,
         due_ns=at_ns,
         woke_ns=at_ns,

@@ -6,7 +6,7 @@ from dataclasses import replace
 from functools import partial
 from typing import Any
 
-from helpers.gate_facts import COPTER_MODES
+from helpers.guard_facts import COPTER_MODES
 from helpers.wire import WireEnd
 from mavbridge.core.clock import NS_PER_S, Clock
 from mavbridge.core.reasons import Reason
@@ -30,7 +30,7 @@ from mavbridge.core.vehicle import (
 
 START_NS = 1_000 * NS_PER_S
 FOREVER_NS = 2**62
-"""``reset_ns`` of chunks for a gate that is to engage at once."""
+"""``reset_ns`` of chunks for a guard that is to engage at once."""
 
 
 class FakeClock:
@@ -93,7 +93,7 @@ def level_telemetry(arrived_ns: int) -> Telemetry:
 
 
 class FakeLink:
-    """The gate's link to a vehicle in memory, which obeys at once; ``vehicle`` may be replaced."""
+    """The guard's link to a vehicle in memory, which obeys at once; ``vehicle`` may be replaced."""
 
     def __init__(self, clock: Clock, **status: Any) -> None:
         self._clock = clock

@@ -79,7 +79,7 @@ class Flight:
 
     @property
     def status(self) -> VehicleStatus:
-        """The vehicle's status as the gate gets it."""
+        """The vehicle's status as the guard gets it."""
         status = self.output.in_policy_terms(
             self.vehicle.status(self.now_ns), self.session, self.now_ns
         )

@@ -1,10 +1,10 @@
-"""Recorded flights whose sticks every change of the flight's and the gate's code must reproduce."""
+"""Recorded flights whose sticks every change of flight and guard must reproduce."""
 
 import shutil
 from functools import cache
 from pathlib import Path
 
-from mavbridge.simulation.replay.gate import GateStep, replay_gate
+from mavbridge.simulation.replay.guard import GuardStep, replay_guard
 from mavbridge.simulation.replay.recording import ReplaySource, open_source
 
 FLIGHTS = Path(__file__).parents[1] / "data" / "flights"
@@ -18,9 +18,9 @@ def golden(name: str) -> ReplaySource:
 
 
 @cache
-def through_gate(name: str) -> tuple[GateStep, ...]:
-    """Its recorded chunks through the gate."""
-    return tuple(replay_gate(golden(name)))
+def through_gate(name: str) -> tuple[GuardStep, ...]:
+    """Its recorded chunks through the guard."""
+    return tuple(replay_guard(golden(name)))
 
 
 def copied(name: str, folder: Path) -> Path:

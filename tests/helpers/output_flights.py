@@ -10,10 +10,10 @@ from typing import Any, NamedTuple
 import numpy as np
 from pymavlink.dialects.v20 import ardupilotmega as dialect
 
-from helpers.gate_flights import HEIGHT_M, GateFlight
+from helpers.guard_flights import HEIGHT_M, GuardFlight
 from mavbridge.core.clock import NS_PER_S
 from mavbridge.core.reasons import Code
-from mavbridge.gate.engagement import Phase
+from mavbridge.guard.engagement import Phase
 from mavbridge.simulation.world import NOMINAL_VEHICLE
 from policy.contract import ActionKind, Contract, FloatArray
 from policy.protocol import Executable
@@ -91,7 +91,7 @@ class Aftermath:
     final_armed: bool
 
 
-class OutputFlight(GateFlight):
+class OutputFlight(GuardFlight):
     """One flight of one kind of action on one firmware."""
 
     def __init__(
@@ -106,7 +106,7 @@ class OutputFlight(GateFlight):
         px4_release: Px4Release = "1.18",
         **config: Any,
     ) -> None:
-        """``config`` as in ``GateFlight``; ``receiver_us`` None is MID for ArduPilot."""
+        """``config`` as in ``GuardFlight``; ``receiver_us`` None is MID for ArduPilot."""
         self.autopilot, self.kind, self.is_px4 = autopilot, kind, autopilot == "px4"
         self.mode = FLIGHT_MODES[autopilot, kind]
         self.samples: list[Sample] = []

@@ -111,7 +111,7 @@ def chunk_of(value: float, horizon: int = 16) -> bytes:
     )
 
 
-class Gate:
+class Guard:
     """Holds the answers of a scripted server while it is shut."""
 
     def __init__(self) -> None:
@@ -120,7 +120,7 @@ class Gate:
         self.requests = 0
 
     def reply(self, _message: Message) -> bytes:
-        """The number of the request, once the gate is open."""
+        """The number of the request, once the guard is open."""
         self.requests += 1
         number = self.requests
         assert self.is_open.wait(START_S)

@@ -59,7 +59,7 @@ def disarming(flight: OutputFlight) -> None:
     flight.command(dialect.MAV_CMD_COMPONENT_ARM_DISARM, 0, FORCE)
 
 
-def deaf_gate(flight: OutputFlight) -> None:
+def deaf_guard(flight: OutputFlight) -> None:
     """For two seconds nothing of the vehicle reaches us."""
     _silence(flight, up_s=0.0, down_s=2.0)
 
@@ -121,7 +121,7 @@ PATHS: dict[str, Callable[[OutputFlight], None]] = {
     "pilot's mode": pilots_mode,
     "pilot's stick ramp": stick_ramp,
     "disarmed": disarming,
-    "vehicle not heard 2 s": deaf_gate,
+    "vehicle not heard 2 s": deaf_guard,
     "we are not heard 0.3 s": deaf_vehicle_short,
     "we are not heard 1.5 s": deaf_vehicle,
     "link cut 1.5 s": cut_link,

@@ -1,4 +1,4 @@
-"""The loops of a flight and its gate on virtual time, with a vehicle and a policy of fakes."""
+"""The loops of a flight and its guard on virtual time, with a vehicle and a policy of fakes."""
 
 from collections.abc import Callable
 from itertools import repeat
@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 
 from helpers.fakes import START_NS, FakeLink, ListSink
-from helpers.gate_facts import codes
+from helpers.guard_facts import codes
 from mavbridge.config.flight import FlyConfig, Limits, LinkConfig
 from mavbridge.config.rates import Rates
 from mavbridge.core.clock import NS_PER_MS, NS_PER_S
@@ -16,11 +16,11 @@ from mavbridge.core.records import FloatArray, Frame, ImageArray, Tick
 from mavbridge.core.vehicle import Command, Sticks
 from mavbridge.flight.bridge import CameraPath, build_bridge
 from mavbridge.flight.plan import plan_flight
-from mavbridge.gate.departure import Ending
-from mavbridge.gate.engagement import Phase
-from mavbridge.gate.loop import GateLoop
+from mavbridge.guard.departure import Ending
+from mavbridge.guard.engagement import Phase
+from mavbridge.guard.loop import GuardLoop
 from mavbridge.simulation.clock import AheadClock, SteppedClock
-from mavbridge.simulation.gate import GateStepper, MemoryPort, PolicyStepper, sender
+from mavbridge.simulation.guard import GuardStepper, MemoryPort, PolicyStepper, sender
 from mavbridge.simulation.network import DelayedChannel
 from mavbridge.simulation.world import DelayedFeatureCache, DelayedSink, VisionStepper
 from policy.contract import Contract
@@ -116,10 +116,10 @@ class VirtualFlight:
             frames_ns = [START_NS + k * FRAME_NS for k in range(400)]
         self.camera = EventCamera(self.world, frames_ns)
         self._policy_clock, self._vision_clock = AheadClock(self.world), AheadClock(self.world)
-        self.gate = self._compose(contract or Contract(feature_dim=8, arrays="numpy"))
+        self.guard = self._compose(contract or Contract(feature_dim=8, arrays="numpy"))
         self.world.schedule(START_NS + state_phase_ns, self._measure)
 
-    def _compose(self, contract: Contract) -> GateLoop:
+    def _compose(self, contract: Contract) -> GuardLoop:
         world = self.world
         executable = Executable(
             contract=contract,
@@ -130,13 +130,13 @@ class VirtualFlight:
             act=self._act,
             reset=self._reset,
         )
-        to_gate, to_flight = (DelayedChannel(world, repeat(HOP_NS)) for _ in range(2))
-        port = MemoryPort(outgoing=to_gate, incoming=to_flight)
+        to_guard, to_flight = (DelayedChannel(world, repeat(HOP_NS)) for _ in range(2))
+        port = MemoryPort(outgoing=to_guard, incoming=to_flight)
         self._send = sender(world, self._policy_clock, port)
-        gate = GateLoop(world, self.link, MemoryPort(outgoing=to_flight, incoming=to_gate))
-        self.link.forward = gate.forward
+        guard = GuardLoop(world, self.link, MemoryPort(outgoing=to_flight, incoming=to_guard))
+        self.link.forward = guard.forward
         plan = plan_flight(self.config, executable.contract, is_dual=executable.dual_rate)
-        self._send(plan.gate)
+        self._send(plan.guard)
         bridge = build_bridge(
             plan,
             executable,
@@ -154,9 +154,9 @@ class VirtualFlight:
         self.view = bridge.view
         VisionStepper(world, self._vision_clock, self.camera, bridge.visions[0])  # type: ignore[arg-type]
         policy = PolicyStepper(world, self._policy_clock, port, bridge.policy, bridge.view)
-        self._gate_stepper = GateStepper(world, gate)
-        to_flight.on_arrival, to_gate.on_arrival = policy.receive, self._gate_stepper.step
-        return gate
+        self._guard_stepper = GuardStepper(world, guard)
+        to_flight.on_arrival, to_guard.on_arrival = policy.receive, self._guard_stepper.step
+        return guard
 
     def _encode(self, rgb: ImageArray) -> FloatArray:
         self._vision_clock.ahead_ns += self._encode_ns
@@ -174,7 +174,7 @@ class VirtualFlight:
 
     def _measure(self) -> None:
         self.measure()
-        self._gate_stepper.step()
+        self._guard_stepper.step()
         self.world.schedule(self.world.now_ns() + self._state_period_ns, self._measure)
 
     # --- events
@@ -185,7 +185,7 @@ class VirtualFlight:
         return self
 
     def tell(self, message: Any) -> None:
-        """Send the gate a message."""
+        """Send the guard a message."""
         self._send(message)
 
     def stop(self, reason: Reason = SIGNAL) -> None:

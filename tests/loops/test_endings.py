@@ -5,10 +5,10 @@ from typing import Any, NamedTuple
 
 import pytest
 
-from helpers.gate_flights import NAN, GateFlight, climbing_first, leaning
+from helpers.guard_flights import NAN, GuardFlight, climbing_first, leaning
 from helpers.output_flights import OutputFlight
 from mavbridge.core.reasons import Code, because
-from mavbridge.gate.engagement import Phase
+from mavbridge.guard.engagement import Phase
 from sitl.vehicle.config import IDLE_RECEIVER_US
 
 AFTER_S = 10.0
@@ -25,14 +25,14 @@ LANDINGS = ("LAND", "RTL", "AUTO.LAND", "AUTO.RTL")
 class Ending(NamedTuple):
     """A way in which a flight ends by our own doing."""
 
-    act: Callable[[GateFlight], object]
+    act: Callable[[GuardFlight], object]
     settings: dict[str, Any] = {}  # noqa: RUF012
 
 
-def cut(seconds: float) -> Callable[[GateFlight], None]:
+def cut(seconds: float) -> Callable[[GuardFlight], None]:
     """Nothing passes either way for a while."""
 
-    def act(flight: GateFlight) -> None:
+    def act(flight: GuardFlight) -> None:
         flight.up.is_silent = flight.down.is_silent = True
         flight.run(seconds)
         flight.up.is_silent = flight.down.is_silent = False
@@ -40,24 +40,24 @@ def cut(seconds: float) -> Callable[[GateFlight], None]:
     return act
 
 
-def deaf(flight: GateFlight) -> None:
+def deaf(flight: GuardFlight) -> None:
     """Nothing of ours arrives for a while; the vehicle is heard."""
     flight.up.is_silent = True
     flight.run(4.0)
     flight.up.is_silent = False
 
 
-def hang(flight: GateFlight) -> None:
+def hang(flight: GuardFlight) -> None:
     flight.is_flight_process_stopped = True
     flight.run(0.5)
     flight.is_flight_process_stopped = False
 
 
-def fault(flight: GateFlight) -> None:
+def fault(flight: GuardFlight) -> None:
     flight.stop(because(Code.CAMERA_FAILED, camera=""), is_fault=True)
 
 
-def not_a_number(flight: GateFlight) -> None:
+def not_a_number(flight: GuardFlight) -> None:
     if isinstance(flight, OutputFlight):
         flight.return_nan()
     else:
@@ -65,11 +65,11 @@ def not_a_number(flight: GateFlight) -> None:
 
 
 ENDINGS = {
-    "death": Ending(GateFlight.die),
+    "death": Ending(GuardFlight.die),
     "hang": Ending(hang),
     "NaN": Ending(not_a_number),
-    "end": Ending(GateFlight.stop),
-    "end, release": Ending(GateFlight.stop, {"then": "release"}),
+    "end": Ending(GuardFlight.stop),
+    "end, release": Ending(GuardFlight.stop, {"then": "release"}),
     "key": Ending(lambda flight: flight.act("release")),
     "fault, release": Ending(fault, {"on_fault": "release"}),
     "cut 1.5 s": Ending(cut(1.5)),
@@ -81,12 +81,12 @@ ENDINGS = {
 OUTAGES = {name for name in ENDINGS if name.endswith(" s")}
 
 
-def in_the_air(receiver: str, settings: dict[str, Any]) -> GateFlight:
+def in_the_air(receiver: str, settings: dict[str, Any]) -> GuardFlight:
     """The policy flies ArduPilot in ALT_HOLD, over a receiver whose throttle rests so."""
     if receiver == "absent":
-        flight = GateFlight(climbing_first, receiver_us=None, arm=True, **settings)
+        flight = GuardFlight(climbing_first, receiver_us=None, arm=True, **settings)
         return flight.take_off(5.0)
-    flight = GateFlight(leaning, **settings).launch()
+    flight = GuardFlight(leaning, **settings).launch()
     if receiver == "idle":
         flight.receiver(ch3=IDLE_RECEIVER_US[2])
         flight.run(0.2)
@@ -96,7 +96,7 @@ def in_the_air(receiver: str, settings: dict[str, Any]) -> GateFlight:
     return flight
 
 
-def judge(flight: GateFlight, ending: Ending) -> list[str]:
+def judge(flight: GuardFlight, ending: Ending) -> list[str]:
     """Bring the flight to its end, and judge the ten seconds after it; returns the later modes."""
     before = len(flight.modes)
     ending.act(flight)

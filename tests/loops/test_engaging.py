@@ -8,13 +8,13 @@ import numpy as np
 import pytest
 
 from helpers.fakes import START_NS
-from helpers.gate_facts import figures
+from helpers.guard_facts import figures
 from helpers.virtual_flights import FRAME_NS, MS, STEADY, VirtualFlight, nan_chunk
 from mavbridge.config.flight import Limits
 from mavbridge.core.clock import NS_PER_S
 from mavbridge.core.reasons import Code, Reason, Value, because
 from mavbridge.core.vehicle import IDLE, NEUTRAL, Command, Decision, Release, Sticks
-from mavbridge.gate.engagement import Phase
+from mavbridge.guard.engagement import Phase
 
 PERIOD_NS = 10 * MS
 QUARTER = Command(action=Sticks(0.25, 0.25, 0.25, 0.25))
@@ -25,7 +25,7 @@ def sticks_of(decisions: list[Decision]) -> list[Sticks | None]:
 
 
 def given_back(flight: VirtualFlight) -> Reason:
-    """Why, as the gate and the link were told, after a way out with neutral sticks."""
+    """Why, as the guard and the link were told, after a way out with neutral sticks."""
     assert flight.reason is not None
     assert flight.link.hands == [QUARTER, Command(action=NEUTRAL), Release(flight.reason)]
     return flight.reason
@@ -192,13 +192,13 @@ def test_neutral_goes_on_without_a_receiver_until_the_vehicle_is_disarmed() -> N
     neutral_s = [at_s for at_s, sticks in flight.sent if sticks == NEUTRAL]
     assert max(np.diff(neutral_s)) <= 0.015
     assert neutral_s[-1] == pytest.approx(30.0, abs=0.011)
-    assert flight.gate.is_done
+    assert flight.guard.is_done
 
 
 def test_sticks_that_are_the_pilots_are_not_touched_on_the_way_out() -> None:
     flight = VirtualFlight(arm=False)
     flight.at(0.5, flight.stop).fly(1.0)
-    assert flight.gate.is_done
+    assert flight.guard.is_done
     assert flight.link.decisions == []
 
 

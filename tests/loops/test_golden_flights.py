@@ -1,6 +1,6 @@
 """Golden flights: recorded once, reproduced by every later version of the code.
 
-If one of these tests fails, the flight or the gate now does something else with the same bytes,
+If one of these tests fails, the flight or the guard now does something else with the same bytes,
 features and moments. Where that is meant, record the flight anew (tests/data/flights/README.md).
 """
 
@@ -19,11 +19,11 @@ from mavbridge.flight.policies import load_configured_policy
 from mavbridge.simulation.clock import SteppedClock
 from mavbridge.simulation.replay.compare import (
     PolicyComparison,
-    compare_gate,
+    compare_guard,
     compare_policy,
     other_traces,
 )
-from mavbridge.simulation.replay.gate import (
+from mavbridge.simulation.replay.guard import (
     chunk_of,
     recorded_plan,
     replay_other,
@@ -53,8 +53,8 @@ def repeated(source: ReplaySource, executable: Executable) -> PolicyComparison:
 
 
 @pytest.mark.parametrize("name", NAMES)
-def test_the_gate_reproduces_phases_traces_and_sent_sticks_bit_for_bit(name: str) -> None:
-    compared = compare_gate(through_gate(name))
+def test_the_guard_reproduces_phases_traces_and_sent_sticks_bit_for_bit(name: str) -> None:
+    compared = compare_guard(through_gate(name))
 
     assert compared.first is None
     assert compared.differ == {}
@@ -88,7 +88,7 @@ def test_the_shipped_policy_gets_the_same_inputs_and_decides_the_same_on_any_eng
         if pair.replayed is not None
     }
     steps = through_gate("toge_ardupilot")
-    outputs = replay_other(steps, recorded_plan(source).gate, chunks)
+    outputs = replay_other(steps, recorded_plan(source).guard, chunks)
     assert other_traces(steps, outputs).deviation.most < ENGINE_TOLERANCE
 
 
@@ -107,7 +107,7 @@ def test_other_chunks_go_the_same_way_as_the_recorded_ones(name: str) -> None:
     source, steps = golden(name), through_gate(name)
     chunks = {solve.serial: chunk_of(solve, source.contract) for solve in source.solves}
 
-    traces = other_traces(steps, replay_other(steps, recorded_plan(source).gate, chunks))
+    traces = other_traces(steps, replay_other(steps, recorded_plan(source).guard, chunks))
 
     assert traces.deviation.most == 0
 
@@ -118,7 +118,7 @@ def test_another_low_pass_moves_the_sticks() -> None:
     config = replace(source.config, limits=limits)
     chunks = {solve.serial: chunk_of(solve, source.contract) for solve in source.solves}
 
-    settings = recorded_plan(replace(source, config=config)).gate
+    settings = recorded_plan(replace(source, config=config)).guard
     traces = other_traces(steps, replay_other(steps, settings, chunks))
 
     assert 0.005 < traces.deviation.most < 1

@@ -2,20 +2,20 @@
 
 import pytest
 
-from helpers.gate_facts import figures
-from helpers.gate_flights import MS, GateFlight, leaning
+from helpers.guard_facts import figures
+from helpers.guard_flights import MS, GuardFlight, leaning
 from mavbridge.config.flight import Limits
 from mavbridge.config.rates import Rates
 from mavbridge.core.reasons import Code
-from mavbridge.gate.engagement import Phase
+from mavbridge.guard.engagement import Phase
 from policy.contract import Contract
 
 
 def flight_of(
     horizon: int, dt_s: float, hz: float, *, solve_ms: int = 3, tau: float | None = None
-) -> GateFlight:
+) -> GuardFlight:
     contract = Contract(feature_dim=1, arrays="numpy", horizon=horizon, chunk_dt_s=dt_s)
-    flight = GateFlight(
+    flight = GuardFlight(
         leaning, contract=contract, rates=Rates(action_rate=hz), limits=Limits(tau=tau)
     )
     flight.solve_ns = solve_ms * MS
@@ -65,9 +65,9 @@ def test_one_that_does_not_begins_no_flight_and_arms_nothing(
 
 def test_with_arm_it_gives_up_at_once_with_the_figures() -> None:
     contract = Contract(feature_dim=1, arrays="numpy", horizon=1, chunk_dt_s=0.02)
-    flight = GateFlight(leaning, contract=contract, rates=Rates(action_rate=30.0), arm=True)
-    flight.until(lambda: flight.gate.failure is not None, within_s=12)
-    found = figures(flight.gate.failure, Code.HORIZON_TOO_SHORT)
+    flight = GuardFlight(leaning, contract=contract, rates=Rates(action_rate=30.0), arm=True)
+    flight.until(lambda: flight.guard.failure is not None, within_s=12)
+    found = figures(flight.guard.failure, Code.HORIZON_TOO_SHORT)
     assert (found["horizon_ms"], found["steps"], found["step_ms"]) == (20, 1, 20)
     assert not flight.ap.armed
 
@@ -80,4 +80,4 @@ def test_solves_that_become_too_slow_for_the_horizon_end_the_flight_as_coasting(
     assert all(tick.is_coasting for tick in level)
     assert 0 < len(level) <= 13
     assert took_s < 1.0
-    assert flight.gate.outcome.faults == 1
+    assert flight.guard.outcome.faults == 1

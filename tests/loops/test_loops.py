@@ -1,4 +1,4 @@
-"""Camera, encoder, policy and gate together on virtual time; see helpers.virtual_flights."""
+"""Camera, encoder, policy and guard together on virtual time; see helpers.virtual_flights."""
 
 from dataclasses import replace
 
@@ -11,12 +11,12 @@ from mavbridge.config.rates import Rates
 from mavbridge.core.clock import NS_PER_S
 from mavbridge.core.records import Frame
 from mavbridge.core.vehicle import Sticks
-from mavbridge.gate.engagement import Phase
+from mavbridge.guard.engagement import Phase
 from policy.contract import Contract
 
 PERIOD_NS = 10 * MS
 GRID_NS = START_NS + HOP_NS
-"""First slot: when the gate has got its settings."""
+"""First slot: when the guard has got its settings."""
 CONTRACT = Contract(feature_dim=8, arrays="numpy")
 
 

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from helpers.fakes import ListSink
-from helpers.gate_facts import figures
+from helpers.guard_facts import figures
 from mavbridge.config.rates import Rates
 from mavbridge.core.clock import NS_PER_MS, NS_PER_S, Clock
 from mavbridge.core.errors import UserError

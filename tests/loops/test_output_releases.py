@@ -12,7 +12,7 @@ from helpers import release_paths as paths
 from helpers.output_flights import COMBINATIONS, Aftermath, OutputFlight
 from mavbridge.core.reasons import Code
 from mavbridge.core.vehicle import Action
-from mavbridge.gate.engagement import Phase
+from mavbridge.guard.engagement import Phase
 from mavbridge.mavlink.codec.packets import CommandRefusedError
 from mavbridge.mavlink.session.vehicle import VehicleSession
 from policy.contract import ActionKind
@@ -33,8 +33,8 @@ UNLIKE: tuple[tuple[AutopilotName, ActionKind], ...] = (
     ("px4", "sticks"),
     ("px4", "rates"),
 )
-"""Where the gate alone decides, these stand for the others; ArduPilot's sticks have tests of their
-own (``test_gate_faults``)."""
+"""Where the guard alone decides, these stand for the others; ArduPilot's sticks have tests of their
+own (``test_guard_faults``)."""
 
 
 def after(
@@ -138,7 +138,7 @@ def test_a_command_that_the_codec_refuses(autopilot: AutopilotName, kind: Action
     found = after(flight, refuse)
     assert Code.COMMAND_FAILED in flight.codes
     assert_safe(flight, found, mode=hold(flight), neutral_ms=DEATH_MS)
-    assert not flight.gate.is_done
+    assert not flight.guard.is_done
 
 
 @pytest.mark.parametrize(("autopilot", "kind"), COMBINATIONS)
@@ -155,7 +155,7 @@ def test_the_pilots_mode_by_a_ground_station(autopilot: AutopilotName, kind: Act
     assert found.mode_ms < 10
     assert not found.flew_again
     assert flight.phase is Phase.RELEASED
-    assert not flight.modes_asked(at_ns), "the gate never changes the pilot's mode"
+    assert not flight.modes_asked(at_ns), "the guard never changes the pilot's mode"
     if kind != "sticks":
         names = {m.get_type() for _, m in flight.left(heard_ns + 1)}
         assert not names & {"SET_ATTITUDE_TARGET", "SET_POSITION_TARGET_LOCAL_NED"}, "silence"
@@ -186,7 +186,7 @@ def test_a_vehicle_that_is_not_heard_gets_neutral_and_a_mode_all_the_same(
     autopilot: AutopilotName, kind: ActionKind
 ) -> None:
     flight = OutputFlight(autopilot, kind)
-    found = after(flight, paths.deaf_gate)
+    found = after(flight, paths.deaf_guard)
     assert_safe(flight, found, mode=hold(flight), neutral_ms=GRACE_MS)
 
 
@@ -285,9 +285,9 @@ def test_px4s_sticks_shown_again_after_a_gap_are_no_takeover(gap_s: float, is_he
 
 
 @pytest.mark.parametrize(("autopilot", "kind"), COMBINATIONS)
-def test_death_of_the_gate(autopilot: AutopilotName, kind: ActionKind) -> None:
+def test_death_of_the_guard(autopilot: AutopilotName, kind: ActionKind) -> None:
     flight = OutputFlight(autopilot, kind)
-    found = after(flight, OutputFlight.kill_gate)
+    found = after(flight, OutputFlight.kill_guard)
     assert found.neutral_ms is not None, found
     assert found.neutral_ms <= 20, found
     assert not found.flew_again, found

@@ -21,7 +21,7 @@ from mavbridge.core.records import FeatureFrame, Solve, Tick, VisionTick
 from mavbridge.core.vehicle import ForwardedPacket
 from mavbridge.flight.history import SentHistory
 from mavbridge.flight.state import Freshness
-from mavbridge.flight.vehicle_view import VehicleView
+from mavbridge.flight.telemetry_cache import TelemetryCache
 from mavbridge.simulation import flight as simulation
 from mavbridge.simulation.clock import SteppedClock
 from mavbridge.simulation.flight import SimulatedFlight, SimulationSettings
@@ -259,7 +259,7 @@ def test_the_example_on_a_server_is_repeated_bit_for_bit(
 def test_what_reaches_the_policy_in_one_batch_does_not_change_past_states() -> None:
     """Attitudes of one batch are all remembered: a replay does not know what came together."""
     pushed: list[int] = []
-    view = VehicleView(
+    view = TelemetryCache(
         history=SentHistory(length=4, dt_s=0.05),
         sink=ListSink(),
         state_frame="ned_frd",

@@ -13,13 +13,13 @@ from hypothesis.stateful import (
     rule,
 )
 
-from helpers.gate_facts import AIRBORNE, COPTER_MODES, STEP_NS, Stepped
+from helpers.guard_facts import AIRBORNE, COPTER_MODES, STEP_NS, Stepped
 from mavbridge.core.clock import NS_PER_S
 from mavbridge.core.reasons import Code, Reason, because
 from mavbridge.core.vehicle import NEUTRAL
-from mavbridge.gate.departure import MODE_TIMEOUT_NS, NEUTRAL_NS, DepartureSettings, Ending
-from mavbridge.gate.engagement import RELEASE_TIMEOUT_NS, Act, Phase
-from mavbridge.gate.facts import Hand, Move
+from mavbridge.guard.departure import MODE_TIMEOUT_NS, NEUTRAL_NS, DepartureSettings, Ending
+from mavbridge.guard.engagement import RELEASE_TIMEOUT_NS, Act, Phase
+from mavbridge.guard.facts import Hand, Move
 
 MODES = ("ALT_HOLD", "LOITER")
 JOYSTICK = because(Code.OVERRULED, quantity="sticks", cause="a joystick")

@@ -23,8 +23,8 @@ def test_a_flight_is_measured() -> None:
     assert flight.stick_hz > 50
     assert flight.lateness_ms is not None
     assert flight.lateness_ms.p50 > 0
-    assert flight.gate_cpu_cores is not None
-    assert 0 < flight.gate_cpu_cores < flight.cpu_cores
+    assert flight.guard_cpu_cores is not None
+    assert 0 < flight.guard_cpu_cores < flight.cpu_cores
     assert flight.lost_reports == 0
     assert flight.vision_hz is not None
     assert flight.vision_hz > 0

@@ -188,7 +188,7 @@ def test_a_killed_bridge_leaves_a_readable_flight(tmp_path: Path) -> None:
     logged = list(logged_overrides(folder / "link.tlog"))
     assert len(logged) > 0
     assert logged == flying.relay.overrides
-    assert logged[-1] == RELEASE  # the gate has outlived its parent
+    assert logged[-1] == RELEASE  # the guard has outlived its parent
 
 
 def test_a_killed_writer_does_not_touch_the_flight(tmp_path: Path) -> None:

@@ -37,12 +37,12 @@ def wait_for_a_leg(flying: Stage) -> None:
     """The square has begun."""
     sent = flying.relay.sent
     assert flying.relay.wait_until(lambda: bool(sent), TIMEOUT_S)
-    assert flying.gate.pid
+    assert flying.guard.pid
     assert flying.relay.wait_until(lambda: is_flown(sent[-1]), TIMEOUT_S)
 
 
 def sent_last(flying: Stage) -> Sent:
-    """The newest action that left the gate."""
+    """The newest action that left the guard."""
     names = ("MANUAL_CONTROL", "SET_POSITION_TARGET_LOCAL_NED")
     return next(sent for sent in reversed(flying.relay.sent) if sent.name in names)
 
@@ -66,10 +66,10 @@ def test_px4s_sticks_when_the_flight_process_is_killed(tmp_path: Path) -> None:
         flying.start("--dual-rate", "--arm", "--policy", "scripted:square")
         wait_for_a_leg(flying)
         at_ns = flying.kill(signal.SIGKILL)
-        assert not flying.gate.has_ended(1.5), "the end of the only sticks would be a failsafe"
+        assert not flying.guard.has_ended(1.5), "the end of the only sticks would be a failsafe"
         message = sent_last(flying).message
         flying.relay.disarm()
-        assert flying.gate.has_ended(15)
+        assert flying.guard.has_ended(15)
         flying.end()
     report = flying.vehicle_report()
     assert last_flown_ms(flying, at_ns) <= DEATH_LIMIT_MS
@@ -102,7 +102,7 @@ def test_ardupilots_guided_when_the_flight_process_is_killed(tmp_path: Path) -> 
         flying.start("--dual-rate", "--arm", *TAKEOFF)
         wait_for_a_leg(flying)
         at_ns = flying.kill(signal.SIGKILL)
-        assert flying.gate.has_ended(15)
+        assert flying.guard.has_ended(15)
         flying.end()
     report = flying.vehicle_report()
     assert last_flown_ms(flying, at_ns) <= DEATH_LIMIT_MS

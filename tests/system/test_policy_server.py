@@ -19,7 +19,7 @@ import pytest
 import websockets.sync.client
 from websockets.exceptions import ConnectionClosed, InvalidStatus
 
-from helpers.policy_servers import Gate, Reply, chunk_of, our_server, scripted_server
+from helpers.policy_servers import Guard, Reply, chunk_of, our_server, scripted_server
 from mavbridge.commands import serve as server
 from mavbridge.core.clock import NS_PER_S, MonotonicClock
 from mavbridge.core.processes import free_port
@@ -102,34 +102,34 @@ def predict_until(policy: RemotePolicy, is_good: Callable[[float | str], bool]) 
 
 
 def test_a_late_answer_is_never_flown(contract_file: Path) -> None:
-    gate = Gate()
-    with scripted_server(gate.reply) as port, loaded(port, contract_file) as policy:
-        tried = gate.requests
+    guard = Guard()
+    with scripted_server(guard.reply) as port, loaded(port, contract_file) as policy:
+        tried = guard.requests
         assert predict(policy) == tried + 1
-        gate.is_open.clear()
+        guard.is_open.clear()
         begun_ns = CLOCK.now_ns()
         with pytest.raises(NoChunkError, match="has not answered within 500 ms"):
             predict(policy)
         assert 0.4 < (CLOCK.now_ns() - begun_ns) / NS_PER_S < 5.0
-        gate.is_open.set()
+        guard.is_open.set()
         # The answer to the request before is thrown away: this is the one to the newest.
-        predict_until(policy, lambda value: value == gate.requests)
-        assert gate.requests >= tried + 3
+        predict_until(policy, lambda value: value == guard.requests)
+        assert guard.requests >= tried + 3
 
 
 def test_an_answer_that_nobody_asked_for_is_not_flown_in_place_of_the_next(
     contract_file: Path,
 ) -> None:
-    gate = Gate()
+    guard = Guard()
 
     def reply(message: Message) -> Reply:
-        answer = gate.reply(message)
-        return (answer, answer) if gate.requests == 3 else answer
+        answer = guard.reply(message)
+        return (answer, answer) if guard.requests == 3 else answer
 
     with scripted_server(reply) as port, loaded(port, contract_file) as policy:
-        assert predict(policy) == gate.requests == 3
+        assert predict(policy) == guard.requests == 3
         predict_until(policy, lambda outcome: "nobody asked for" in str(outcome))
-        predict_until(policy, lambda value: value == gate.requests)
+        predict_until(policy, lambda value: value == guard.requests)
 
 
 def test_a_flight_that_ends_takes_its_leave(contract_file: Path) -> None:
@@ -173,15 +173,15 @@ def test_a_server_that_falls_silent_is_connected_to_again(
 ) -> None:
     monkeypatch.setattr(link, "LOST_S", 0.05)
     monkeypatch.setattr(remote_policy, "MOST_WAIT_S", 0.05)
-    gate = Gate()
-    with scripted_server(gate.reply) as port:
+    guard = Guard()
+    with scripted_server(guard.reply) as port:
         policy, _ = load_server_policy(f"ws://127.0.0.1:{port}", contract_file)
         with closing(policy):
             policy.reset()
-            gate.is_open.clear()
+            guard.is_open.clear()
             predict_until(policy, lambda found: "connecting again" in str(found))
-            gate.is_open.set()
-            predict_until(policy, lambda found: found == gate.requests)
+            guard.is_open.set()
+            predict_until(policy, lambda found: found == guard.requests)
 
 
 @pytest.mark.parametrize(
@@ -242,7 +242,7 @@ def test_addresses_without_a_policy_server(
             read_policy_contract(PolicyRequest(spec=url))
 
 
-def test_the_deadline_is_what_the_gate_would_fly() -> None:
+def test_the_deadline_is_what_the_guard_would_fly() -> None:
     def contract(age_s: float, play_s: float) -> Contract:
         return Contract(
             max_state_age_s=age_s, max_velocity_age_s=1.0, max_feature_age_s=1.0, play_s=play_s

@@ -46,7 +46,7 @@ _row = partial(Row, "link")
 
 
 class VehicleProbe:
-    """Runs a ``MavlinkLink`` that has no gate; its methods are called in their order."""
+    """Runs a ``MavlinkLink`` that has no guard; its methods are called in their order."""
 
     def __init__(self, link: MavlinkLink, clock: Clock) -> None:
         self._link = link

@@ -31,18 +31,18 @@ _CLOCK_SOURCE = Path("/sys/devices/system/clocksource/clocksource0/current_clock
 _SLOW_CLOCKS = ("hpet", "acpi_pm", "jiffies", "refined-jiffies", "pit")
 """Clock sources that are read from a device, in a microsecond or more, or only tick."""
 _CORES = 2
-"""The gate beside the policy, so that neither delays the other."""
+"""The guard beside the policy, so that neither delays the other."""
 _RIGHTS_TIMEOUT_S = 10.0
 _TRY_RIGHTS = """
 import sys
-from mavbridge.core.realtime import settle_gate, settle_thread
+from mavbridge.core.realtime import settle_guard, settle_thread
 cpus = [int(word) if word else None for word in sys.argv[2:]]
 realtime = sys.argv[1] == "yes"
-refusals = [settle_gate(realtime=realtime, cpu=cpus[0])]
+refusals = [settle_guard(realtime=realtime, cpu=cpus[0])]
 refusals += [settle_thread(realtime=False, cpu=cpu) for cpu in cpus[1:]]
 print("; ".join(filter(None, refusals)))
 """
-"""A process of its own asks as the gate does, and ends: nothing of it stays with this one."""
+"""A process of its own asks as the guard does, and ends: nothing of it stays with this one."""
 STDOUT = Path("-")
 NO_VEHICLE = "none"
 
@@ -82,13 +82,13 @@ def _cores_row() -> Row:
         verdict="go" if cores >= _CORES else "warn",
         advice=""
         if cores >= _CORES
-        else "gate and policy share one core: a slow policy delays the sticks",
+        else "guard and policy share one core: a slow policy delays the sticks",
     )
 
 
 def _rights_row(rates: Rates) -> Row:
     words = ["yes" if rates.realtime else "no"]
-    cpus = (rates.gate_cpu, rates.action_cpu, rates.vision_cpu)
+    cpus = (rates.guard_cpu, rates.action_cpu, rates.vision_cpu)
     words += ["" if cpu is None else str(cpu) for cpu in cpus]
     try:
         tried = subprocess.run(
@@ -101,11 +101,11 @@ def _rights_row(rates: Rates) -> Row:
         )
         refused = tried.stdout.strip()
     except (OSError, subprocess.SubprocessError) as error:
-        refused = f"the rights of the gate could not be tried: {error}"
+        refused = f"the rights of the guard could not be tried: {error}"
     wanted = "SCHED_FIFO and locked memory" if rates.realtime else "locked memory"
     return Row(
         area="computer",
-        name="rights of the gate",
+        name="rights of the guard",
         found="refused in part" if refused else "granted",
         expected=wanted,
         verdict="warn" if refused else "go",

@@ -13,8 +13,8 @@ from mavbridge.config.flight import FlyConfig
 from mavbridge.core.clock import Clock
 from mavbridge.core.errors import MavbridgeError
 from mavbridge.core.vehicle import ActionMeaning, LinkSnapshot, VehicleStatus
-from mavbridge.flight.settings import action_meaning, gate_settings
-from mavbridge.gate.departure import MIDDLE_STICK
+from mavbridge.flight.settings import action_meaning, guard_settings
+from mavbridge.guard.departure import MIDDLE_STICK
 from mavbridge.mavlink.link import MavlinkLink
 from mavbridge.mavlink.session.vehicle import VehicleSession
 from mavbridge.mavlink.settings import LinkSettings
@@ -186,9 +186,9 @@ def check_vehicle(
 
 def checking_settings(config: FlyConfig, policy: PolicyFindings, *, sends: bool) -> LinkSettings:
     """Settings of the flight's link, which sets no parameter and, unless ``sends``, no stick."""
-    gate = gate_settings(config, is_dual=policy.is_dual, tlog_fd=None, wall_offset_ns=0)
+    guard = guard_settings(config, is_dual=policy.is_dual, tlog_fd=None, wall_offset_ns=0)
     return replace(
-        gate.link,
+        guard.link,
         readonly=not sends,
         set_params=(),
         restore_params=False,

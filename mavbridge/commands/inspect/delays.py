@@ -14,7 +14,7 @@ from mavbridge.core.clock import NS_PER_MS, NS_PER_S
 from mavbridge.core.errors import MavbridgeError
 from mavbridge.core.records import Solve, Tick
 from mavbridge.flight.settings import effective_freshness
-from mavbridge.gate.chunks import FreshnessLimits
+from mavbridge.guard.chunks import FreshnessLimits
 from mavbridge.observe.timing import LATE_PERIODS
 from mavbridge.recording import replay_rows
 from mavbridge.recording.folder import PACKETS, SOLVES
@@ -25,7 +25,7 @@ from policy.contract import Contract
 
 Stamps: TypeAlias = NDArray[np.int64]
 Cause = Literal[
-    "the gate woke late",
+    "the guard woke late",
     "sending took long",
     "the policy took long",
     "the attitude came late",
@@ -96,7 +96,7 @@ def _missed_slots(ticks: Sequence[Tick], slot_ns: float) -> Iterator[Delay]:
             what="missed slots",
             count=tick.missed_slots,
             delay_ms=max(0.0, tick.sent_ns - last.sent_ns - slot_ns) / NS_PER_MS,
-            cause="sending took long" if is_slow_send else "the gate woke late",
+            cause="sending took long" if is_slow_send else "the guard woke late",
         )
 
 

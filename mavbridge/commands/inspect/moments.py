@@ -8,7 +8,7 @@ from mavbridge.commands.inspect.delays import Delay
 from mavbridge.core.clock import NS_PER_MS, NS_PER_S
 from mavbridge.core.reasons import Code, Kind
 from mavbridge.core.records import Tick
-from mavbridge.gate.chunks import FreshnessLimits
+from mavbridge.guard.chunks import FreshnessLimits
 from mavbridge.recording.crash import CrashWatch
 from mavbridge.recording.flight_folder import RecordedFlight
 from mavbridge.recording.rows import FrameRow
@@ -159,7 +159,7 @@ def _coasting(ticks: Sequence[Tick], limits: FreshnessLimits | None) -> Iterator
 
 
 def _staleness(tick: Tick, limits: FreshnessLimits | None) -> str:
-    """Why the chunk of a tick was too old; the order is that of the gate's own check."""
+    """Why the chunk of a tick was too old; the order is that of the guard's own check."""
     state = tick.state
     if limits is not None and state is not None:
         ages = (

@@ -98,7 +98,7 @@ def show_in_viewer(flight: FlightAnalysis, target: str) -> None:
             contract=contract,
             max_state_age_s=None if limits is None else limits.state_ns / NS_PER_S,
             max_feature_age_s=None if limits is None else limits.feature_ns / NS_PER_S,
-            to_ned=action_frame(contract).to_gate,
+            to_ned=action_frame(contract).to_guard,
             gates=flight.gates,
         ),
     )

@@ -1,6 +1,6 @@
 """``mavbridge record``: flights of a human pilot, to learn from; nothing is sent but requests.
 
-gate process, read-only --ticks, packets--> PilotView --+
+guard process, read-only --ticks, packets--> PilotView --+
 camera --> vision loop, which encodes nothing ----------+--> EpisodeSink --> Recorder, one each
 keys, radio switch, arming --> EpisodeControl --begin, end, mark--> Episodes (folders, marks)
 """

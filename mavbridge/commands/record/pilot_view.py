@@ -10,8 +10,8 @@ from mavbridge.core.records import Event, Tick
 from mavbridge.core.vehicle import ForwardedPacket, Packet
 from mavbridge.flight.history import SentHistory
 from mavbridge.flight.state import Freshness, StateFrame
-from mavbridge.flight.vehicle_view import VehicleView
-from mavbridge.gate.wire import FromGate
+from mavbridge.flight.telemetry_cache import TelemetryCache
+from mavbridge.guard.wire import FromGuard
 from mavbridge.mavlink.codec.frames import split_frames
 from mavbridge.mavlink.session.streams import message_id
 from mavbridge.mavlink.transport.packet_pipe import PacketPipe
@@ -23,8 +23,8 @@ STICKS_FRESH_NS = 500 * NS_PER_MS
 PILOTS = because(Code.PILOT_FLIES)
 
 
-class PilotView(VehicleView):
-    """Adds to a ``VehicleView`` a log of the vehicle's packets, and counts those with sticks."""
+class PilotView(TelemetryCache):
+    """Adds to a ``TelemetryCache`` a log of the vehicle's packets, and counts those with sticks."""
 
     def __init__(
         self,
@@ -51,8 +51,8 @@ class PilotView(VehicleView):
         with self._log_lock:
             self._log = log
 
-    def receive(self, message: FromGate) -> None:
-        """Take one message of the gate."""
+    def receive(self, message: FromGuard) -> None:
+        """Take one message of the guard."""
         super().receive(message)
         if not isinstance(message, tuple):
             return
@@ -60,7 +60,7 @@ class PilotView(VehicleView):
         with self._log_lock:
             for packet in message:
                 if not isinstance(packet, ForwardedPacket):
-                    return  # another message of the gate that is a tuple
+                    return  # another message of the guard that is a tuple
                 if self._log is not None:
                     self._log.put(Packet(packet.arrived_ns, packet.data))
                 frames, _ = split_frames(packet.data)

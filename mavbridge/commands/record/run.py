@@ -31,14 +31,14 @@ from mavbridge.core.reasons import Code, because
 from mavbridge.core.stopping import StopRequest, stop_on_signals
 from mavbridge.core.workers import Worker
 from mavbridge.flight.feature_cache import FeatureCache
-from mavbridge.flight.gate_process import GateProcess
+from mavbridge.flight.guard_process import GuardProcess
 from mavbridge.flight.history import SentHistory
 from mavbridge.flight.plan import plan_flight
-from mavbridge.flight.settings import gate_settings
+from mavbridge.flight.settings import guard_settings
 from mavbridge.flight.state import Freshness
 from mavbridge.flight.vision_loop import VisionLoop
-from mavbridge.gate.departure import Ending
-from mavbridge.gate.settings import GateSettings
+from mavbridge.guard.departure import Ending
+from mavbridge.guard.settings import GuardSettings
 from mavbridge.mavlink.transport.sockets import make_transport
 from mavbridge.observe.keyboard import Keyboard
 from mavbridge.observe.output import flight_console
@@ -54,7 +54,7 @@ DISK_NS = NS_PER_S
 """Between two looks at the disk."""
 JOIN_S = 2.0
 RERUN_CAPACITY = 1000
-GATE_END_S = 5.0
+GUARD_END_S = 5.0
 MAX_FROZEN_S = MAX_BLACK_S = 0.5
 """Time for which an image may stand still, or be black, before it is shown as a problem."""
 NOTHING = np.zeros((1, 1), np.float32)
@@ -100,9 +100,9 @@ def pilot_flight(config: RecordConfig) -> FlyConfig:
     return FlyConfig(link=config.vehicle.link, rates=rates)
 
 
-def listening_gate(config: RecordConfig, clock: Clock) -> GateSettings:
-    """Settings of a gate that asks for the pilot's sticks at the rate of the recording."""
-    settings = gate_settings(
+def listening_guard(config: RecordConfig, clock: Clock) -> GuardSettings:
+    """Settings of a guard that asks for the pilot's sticks at the rate of the recording."""
+    settings = guard_settings(
         pilot_flight(config), is_dual=True, tlog_fd=None, wall_offset_ns=wall_offset_ns(clock)
     )
     link = replace(settings.link, pilot_hz=config.rate, stick_hz=0.0, min_battery_percent=0.0)
@@ -128,9 +128,9 @@ class _Session:
         """Why the last begin was refused."""
         self.screen = RecordScreen(console, rate_hz=config.rate, vision_hz=config.film.visual_rate)
         viewer = self._open_viewer()
-        self._gate = GateProcess(listening_gate(config, clock), clock)
-        stack.callback(self._gate.close)
-        self._gate.wait_until_open()
+        self._guard = GuardProcess(listening_guard(config, clock), clock)
+        stack.callback(self._guard.close)
+        self._guard.wait_until_open()
         camera = self._open_camera(console)
         self._episodes = Episodes(
             config.out,
@@ -142,7 +142,7 @@ class _Session:
             report=self.screen.show_message,
         )
         sink = FanOut((self.screen, self._episodes, *viewer))
-        flight = plan_flight(pilot_flight(config), CONTRACT, is_dual=True).gate
+        flight = plan_flight(pilot_flight(config), CONTRACT, is_dual=True).guard
         self._view = PilotView(
             history=SentHistory(length=CONTRACT.history_len, dt_s=CONTRACT.history_dt_s),
             sink=sink,
@@ -153,7 +153,7 @@ class _Session:
         )
         self._images = FeatureCache()
         self._vision = self._vision_loop(camera, sink)
-        self._gate.send(flight)
+        self._guard.send(flight)
 
     def _open_camera(self, console: Console) -> Camera:
         film = self._config.film
@@ -216,7 +216,7 @@ class _Session:
     def run(self, stop: StopRequest) -> None:
         """Follow orders until one of them, a signal, a worker's death or the disk ends it."""
         vision = Worker("mavbridge-vision", self._vision.run)
-        listener = Worker("mavbridge-gate", self._listen)
+        listener = Worker("mavbridge-guard", self._listen)
         for worker in (vision, listener):
             self._stack.callback(worker.join, JOIN_S)
             worker.start()
@@ -242,11 +242,11 @@ class _Session:
             f"{self._episodes.finished} episodes recorded in {out}: {counts[True]} good, "
             f"{counts[False]} bad, {counts[None]} not marked"
         )
-        self._gate.send(Ending(reason=because(Code.FINISHED, what="recording")))
-        listener.ends_within(GATE_END_S)
+        self._guard.send(Ending(reason=because(Code.FINISHED, what="recording")))
+        listener.ends_within(GUARD_END_S)
 
     def _listen(self, stop: threading.Event) -> None:
-        self._gate.listen(stop, self._view)
+        self._guard.listen(stop, self._view)
 
     def _step(self) -> bool:
         """Look at everything that decides about episodes; False: the session is over."""

@@ -26,7 +26,7 @@ class ReplayConfig:
     episode: Annotated[int, Parameter(group=POLICY)] = 0
     """Number of the episode, where a LeRobot dataset is replayed."""
     source: Annotated[ReplayFrom, Parameter(name="--from", group=POLICY)] = "auto"
-    """chunks: the gate alone, with the recorded chunks and without a policy; features: the policy
+    """chunks: the guard alone, with the recorded chunks and without a policy; features: the policy
     from the recorded features; video: the encoder as well, from the recorded video, which is lossy.
     auto: features, where there are any and the encoder is the same."""
     policy: Annotated[str | None, Parameter(group=POLICY)] = None
@@ -72,7 +72,7 @@ class ReplayConfig:
         if self.source != "auto" or self.changes_limits or self.tolerance is not None:
             raise UserError(
                 "--from, --tolerance and the limits are for flights recorded by mavbridge: another "
-                "recording has no chunks, features or gate to compute once more"
+                "recording has no chunks, features or guard to compute once more"
             )
 
     @property
@@ -93,6 +93,6 @@ class ReplayConfig:
 
     @property
     def changes_limits(self) -> bool:
-        """The gate is to do something else with the chunks."""
+        """The guard is to do something else with the chunks."""
         given = (self.tau, self.max_slew, self.max_feature_age, self.max_chunk_age)
         return any(value is not None for value in given)

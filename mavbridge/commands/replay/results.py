@@ -12,7 +12,7 @@ from mavbridge.core.vehicle import ACTION_CLASSES
 from mavbridge.simulation.replay.compare import (
     PAST_INPUTS,
     Deviation,
-    GateComparison,
+    GuardComparison,
     PolicyComparison,
     StickTraces,
 )
@@ -28,7 +28,7 @@ class ReplayResult:
     engine: str | None
     """On which the policy ran; None: it was not asked."""
     policy: PolicyComparison | None
-    gate: GateComparison
+    guard: GuardComparison
     """With the recorded chunks and settings."""
     sticks: StickTraces
     """With the new chunks and settings."""
@@ -39,8 +39,8 @@ class ReplayResult:
     def problems(self) -> tuple[str, ...]:
         """Why it is not equal, in words."""
         found = []
-        if self.gate.first is not None:
-            found.append(f"the gate came out differently, first in the {self.gate.first}")
+        if self.guard.first is not None:
+            found.append(f"the guard came out differently, first in the {self.guard.first}")
         if self.tolerance is None:
             return tuple(found)
         for name, count in self.policy.missing.items() if self.policy else ():
@@ -71,9 +71,9 @@ def print_replay(result: ReplayResult, console: Console) -> None:
     if (policy := result.policy) is not None:
         equal = f"{policy.equal_chunks} of {policy.solves} chunks"
         rows.append(_row("policy: chunks", equal, policy.deviation))
-    gate = result.gate
-    same = f"{gate.steps - max(gate.differ.values(), default=0)} of {gate.steps} ticks"
-    rows.append(_row("gate: sticks, recorded chunks", same, gate.deviation))
+    guard = result.guard
+    same = f"{guard.steps - max(guard.differ.values(), default=0)} of {guard.steps} ticks"
+    rows.append(_row("guard: sticks, recorded chunks", same, guard.deviation))
     if result.policy is not None or result.tolerance is None:
         moved = result.sticks.deviation
         rows.append(_row("sticks, these chunks and limits", "", moved))
@@ -125,7 +125,7 @@ def to_json(result: ReplayResult) -> str:
         "problems": result.problems,
         "gaps": result.source.gaps,
         "policy": None if result.policy is None else asdict(result.policy),
-        "gate": asdict(result.gate),
+        "guard": asdict(result.guard),
         "sticks": asdict(result.sticks.deviation),
     }
     return json.dumps(_finite(document), indent=2) + "\n"

@@ -18,21 +18,21 @@ from mavbridge.core.errors import ExitCode, UserError
 from mavbridge.core.records import FeatureFrame
 from mavbridge.flight.plan import plan_flight
 from mavbridge.flight.policies import is_scripted, load_configured_policy
-from mavbridge.gate.chunks import Chunk
+from mavbridge.guard.chunks import Chunk
 from mavbridge.recording.flight_folder import open_flight
 from mavbridge.recording.folder import require_extra
 from mavbridge.simulation.clock import SteppedClock
 from mavbridge.simulation.replay.compare import (
     PolicyComparison,
-    compare_gate,
+    compare_guard,
     compare_policy,
-    gate_traces,
+    guard_traces,
     other_traces,
 )
-from mavbridge.simulation.replay.gate import (
+from mavbridge.simulation.replay.guard import (
     chunk_of,
     recorded_plan,
-    replay_gate,
+    replay_guard,
     replay_other,
 )
 from mavbridge.simulation.replay.policy import SolvePair, replay_policy
@@ -68,8 +68,8 @@ def replay(folder: Path, config: ReplayConfig) -> int:
     source = open_source(folder)
     config = _trusted(source, config)
     chosen = _source_of(source, config)
-    print_status(f"replaying {len(source.ticks)} ticks of {folder} through the gate")
-    steps = replay_gate(source)
+    print_status(f"replaying {len(source.ticks)} ticks of {folder} through the guard")
+    steps = replay_guard(source)
     flown = replace(source, config=other_config(source.config, config))
     plan, engine = recorded_plan(flown), source.meta.engine or ""
     chunks = {solve.serial: chunk_of(solve, source.contract) for solve in source.solves}
@@ -85,9 +85,9 @@ def replay(folder: Path, config: ReplayConfig) -> int:
         chunks = _other_chunks(executable, pairs)
     is_same = compared is None or compared.equal_chunks == compared.solves
     if is_same and not config.changes_limits:
-        traces = gate_traces(steps)
+        traces = guard_traces(steps)
     else:
-        traces = other_traces(steps, replay_other(steps, plan.gate, chunks))
+        traces = other_traces(steps, replay_other(steps, plan.guard, chunks))
     if chosen == "video":
         names = (None, *source.contract.cameras[1:])
         damage = [text for name in names for text in open_flight(folder, name).damage]
@@ -97,7 +97,7 @@ def replay(folder: Path, config: ReplayConfig) -> int:
         chosen=chosen,
         engine=engine if compared else None,
         policy=compared,
-        gate=compare_gate(steps),
+        guard=compare_guard(steps),
         sticks=traces,
         tolerance=tolerance_of(
             config,

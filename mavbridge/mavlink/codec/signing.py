@@ -26,7 +26,7 @@ MOST_LAG_TICKS = 60 * 10**9 // TICK_NS
 _RADIO_STATUS = 109
 """Made by the telemetry radio itself, which knows no key; nothing is decided by it."""
 LINK_ID, LAST_WORDS_LINK_ID = 0, 1
-"""Of the packets that the gate sends, and of those that the flight process sends if it dies, which
+"""Of the packets that the guard sends, and of those that the flight process sends if it dies, which
 are signed before: a stream of their own, within ``MOST_LAG_TICKS`` of the other."""
 Stream: TypeAlias = tuple[int, int, int]
 """Link id, system and component: timestamps grow within each."""

@@ -17,20 +17,20 @@ from mavbridge.mavlink.session.vehicle import VehicleSession
 THRUST_UNITS = 1_000_000
 THRUST_ECHO = EchoRules(
     tolerance=1,
-    nudged=0,
-    nudge=20,
-    seek_nudge=20,
+    dithered=0,
+    dither=20,
+    seek_dither=20,
     centre=THRUST_UNITS // 2,
     foreign_samples=FOREIGN_SAMPLES,
 )
-"""Thrust in millionths; both autopilots show it as it was sent. Its nudge of two times 20 is a
+"""Thrust in millionths; both autopilots show it as it was sent. Its dither of two times 20 is a
 climb of a millimetre per second after a second."""
 RATE_UNITS = 10_000
 RATE_ECHO = EchoRules(
-    tolerance=1, nudged=2, nudge=10, seek_nudge=10, centre=0, foreign_samples=FOREIGN_SAMPLES
+    tolerance=1, dithered=2, dither=10, seek_dither=10, centre=0, foreign_samples=FOREIGN_SAMPLES
 )
 """Body rates in 1e-4 rad/s: what PX4 shows of a rate setpoint, from half a second after the last
-attitude setpoint on. The nudge is 0.06 degrees/s of yaw rate."""
+attitude setpoint on. The dither is 0.06 degrees/s of yaw rate."""
 MOST_LEAD_RAD = math.radians(45.0)
 """Largest angle between the heading that is asked for and the vehicle's own. It follows with a lag
 of 0.3 to 0.4 s, so that yaw rates up to 110 degrees/s are followed in full."""
@@ -133,7 +133,7 @@ class AttitudeOutput(SetpointOutput):
         shown: Shown = (round(min(self._scale * action.thrust, 1.0) * boost * THRUST_UNITS),)
         is_checked = shown[0] > 0  # idle motors are left idle
         if is_checked and not self._shows_rates:
-            shown = self.echo.with_nudge(shown, now_ns)
+            shown = self.echo.with_dither(shown, now_ns)
         thrust = shown[0] / THRUST_UNITS
         policy_thrust = thrust / scale
         if isinstance(action, BodyRates):
@@ -170,7 +170,7 @@ class AttitudeOutput(SetpointOutput):
         self._heading.restart()
         rates = tuple(round(rate * RATE_UNITS) for rate in action[1:])
         if self._shows_rates:
-            shown = rates = self.echo.with_nudge(rates, now_ns)
+            shown = rates = self.echo.with_dither(rates, now_ns)
         roll, pitch, yaw = (rate / RATE_UNITS for rate in rates)
         packet = self._codec.encode_rates(
             vehicle.identity.source, (roll, pitch, yaw), thrust, now_ns=now_ns

@@ -32,8 +32,8 @@ RETURNED_SAMPLES = 2
 """So many messages within this time with the values of before us: one is a stray release of
 another station; a joystick at 50 Hz has a quarter to a half of 29 RC_CHANNELS. Sticks that nobody
 but another overrider can have sent need no second one: at 10 Hz it is shown but once or twice."""
-NUDGE_STEP_NS = 25 * NS_PER_MS
-_NUDGE_LEVELS = 3
+DITHER_STEP_NS = 25 * NS_PER_MS
+_DITHER_LEVELS = 3
 """Three levels of 25 ms, by time and not by packet: no usual rate of commands or of what shows them
 hits the same level each time, and one lost packet never makes two levels look like one."""
 _PAUSE_NS = 100 * NS_PER_MS
@@ -50,14 +50,14 @@ class EchoRules:
     """Largest difference from what was sent, and movement of another source at rest."""
     release_tolerance: int = 0
     """The same where our last values are told from another source that rests beside them."""
-    nudged: int
+    dithered: int
     """Index of the number that we keep changing, so that its echo changes too."""
-    nudge: int
+    dither: int
     """Its step once the echo is confirmed."""
-    seek_nudge: int
+    seek_dither: int
     """Its step until then: more than ``tolerance``, lest a source at rest is taken for us."""
     centre: int
-    """The nudge goes towards this value, never away from it."""
+    """The dither goes towards this value, never away from it."""
     foreign_samples: int = 1
     """So many values of nobody's within half a second are a fault. More than one where the vehicle
     shows others for a moment as soon as its mode changes, which is told a little later."""
@@ -69,7 +69,7 @@ class EchoCheck:
     """Tells whether the vehicle acts on our commands, on ours alone, and on fresh ones.
 
     Confirmed when it shows values that we sent and that it did not show before. From then on each
-    message must match something that we sent recently, and must change as the nudge does.
+    message must match something that we sent recently, and must change as the dither does.
     """
 
     def __init__(self, rules: EchoRules) -> None:
@@ -115,16 +115,16 @@ class EchoCheck:
         pause_ns = self._rules.longest_pause_ns
         return self._arrived_ns is None or now_ns - self._arrived_ns > pause_ns
 
-    def with_nudge(self, wanted: Shown, now_ns: int) -> Shown:
+    def with_dither(self, wanted: Shown, now_ns: int) -> Shown:
         """The values to send: one walks by up to two steps towards its centre, never outwards.
 
         So the echo of a vehicle that takes our packets changes all the time, and differs from
         another source that rests where we do.
         """
-        rules, at = self._rules, self._rules.nudged
-        step = rules.nudge if self.confirmed else rules.seek_nudge
-        nudge = now_ns // NUDGE_STEP_NS % _NUDGE_LEVELS * step
-        value = wanted[at] + (nudge if wanted[at] <= rules.centre else -nudge)
+        rules, at = self._rules, self._rules.dithered
+        step = rules.dither if self.confirmed else rules.seek_dither
+        dither = now_ns // DITHER_STEP_NS % _DITHER_LEVELS * step
+        value = wanted[at] + (dither if wanted[at] <= rules.centre else -dither)
         return (*wanted[:at], value, *wanted[at + 1 :])
 
     def tried(self, now_ns: int) -> None:

@@ -16,16 +16,16 @@ from mavbridge.mavlink.session.vehicle import VehicleSession
 MANUAL_ECHO = EchoRules(
     tolerance=1,
     release_tolerance=1,
-    nudged=3,
-    nudge=2,
-    seek_nudge=4,
+    dithered=3,
+    dither=2,
+    seek_dither=4,
     centre=0,
     longest_pause_ns=450 * NS_PER_MS,
 )
 """x, y, z, r. PX4 shows the sticks as they came, or one less (rounded down), at the rate at which
 they came: it shows nothing when it hears nothing.
 
-The nudge is on r, whose dead zone is a tenth; outside it 4 are half a degree a second.
+The dither is on r, whose dead zone is a tenth; outside it 4 are half a degree a second.
 """
 _MODES = ("ALTCTL", "POSCTL", "MANUAL", "STABILIZED", "ACRO")
 """In all others the last sticks do nothing, but one that jumps may be taken for the pilot's hand,
@@ -109,7 +109,7 @@ class ManualControlOutput(StickOutput):
     def encode(self, action: Action, vehicle: VehicleSession, now_ns: int) -> Encoded | None:
         """The four sticks, rounded."""
         sticks, curves = self._wanted(action, vehicle, now_ns)
-        shown = self.echo.with_nudge(manual_control_of(sticks), now_ns)
+        shown = self.echo.with_dither(manual_control_of(sticks), now_ns)
         x, y, z, r = shown
         values = ManualControl(x, y, z, r)
         packet = self._codec.encode_manual_control(vehicle.identity.source.system, values)

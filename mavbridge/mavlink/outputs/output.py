@@ -75,7 +75,7 @@ class ActionOutput(ABC):
 
     @abstractmethod
     def encode_resting(self, action: Action, vehicle: VehicleSession, now_ns: int) -> bytes | None:
-        """The packet of an action at rest, for later: nothing is noted, and no nudge is in it.
+        """The packet of an action at rest, for later: nothing is noted, and no dither is in it.
 
         Raises:
             CommandRefusedError: as ``encode``.

@@ -12,10 +12,10 @@ from mavbridge.mavlink.outputs.output import Encoded
 from mavbridge.mavlink.outputs.sticks import StickOutput
 from mavbridge.mavlink.session.vehicle import VehicleSession
 
-OVERRIDE_ECHO = EchoRules(tolerance=2, nudged=3, nudge=1, seek_nudge=4, centre=1500)
+OVERRIDE_ECHO = EchoRules(tolerance=2, dithered=3, dither=1, seek_dither=4, centre=1500)
 """In us. A receiver at rest moves by 2; the vehicle itself shows overrides to the microsecond.
 
-Roll is nudged: 1500, 1501 and 1502 us were seen to move nothing, inside the dead zone of 20 us;
+Roll is dithered: 1500, 1501 and 1502 us were seen to move nothing, inside the dead zone of 20 us;
 beyond it, 2 us are 0.2 degrees of lean at the usual calibration. Two of the larger steps are well
 inside the dead zone.
 """
@@ -57,7 +57,7 @@ class OverrideOutput(StickOutput):
         calibration = vehicle.calibration
         if calibration is None:
             return None
-        shown = self.echo.with_nudge(pwm_of(sticks, calibration), now_ns)
+        shown = self.echo.with_dither(pwm_of(sticks, calibration), now_ns)
         throttle, yaw, pitch, roll = shown
         pwm_us = (throttle, yaw, pitch, roll)
         packet = self._codec.encode_override(vehicle.identity.source, pwm_us, calibration)

@@ -15,7 +15,7 @@ from mavbridge.mavlink.session.vehicle import VehicleSession
 
 MM_PER_M = 1000
 VELOCITY_ECHO = EchoRules(
-    tolerance=0, nudged=0, nudge=1, seek_nudge=1, centre=0, foreign_samples=FOREIGN_SAMPLES
+    tolerance=0, dithered=0, dither=1, seek_dither=1, centre=0, foreign_samples=FOREIGN_SAMPLES
 )
 """Velocity down, in mm/s, which both autopilots show as it was sent; the horizontal ones are turned
 into NED axes first."""
@@ -42,7 +42,7 @@ class VelocityOutput(SetpointOutput):
             raise CommandRefusedError(f"{action} is not finite")
         climb_mps, descent_mps = vehicle.profile.climb_limits(vehicle.known_params)
         down_mps = min(max(action.z_mps, -climb_mps), descent_mps)
-        shown = self.echo.with_nudge((round(down_mps * MM_PER_M),), now_ns)
+        shown = self.echo.with_dither((round(down_mps * MM_PER_M),), now_ns)
         sent = action._replace(z_mps=shown[0] / MM_PER_M)
         packet = self._codec.encode_velocity(
             vehicle.identity.source, sent, is_heading_frame=self._is_heading_frame, now_ns=now_ns

@@ -79,7 +79,7 @@ class Danger(NamedTuple):
 
 
 LONGEST_SETPOINT_S = 3.0
-"""Longest time for which a vehicle may go on with the last setpoint of a gate that has died;
+"""Longest time for which a vehicle may go on with the last setpoint of a guard that has died;
 ArduPilot's default."""
 
 

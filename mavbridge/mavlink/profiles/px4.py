@@ -59,7 +59,7 @@ _EXCEPT_HOLD, _EXCEPT_OFFBOARD = 2, 4
 """Values in COM_RCL_EXCEPT of modes in which the loss of sticks is no failsafe."""
 _LONGEST_S = 1.0
 _SHORTEST_S = 0.3
-"""A gate on a busy computer may be late by a tenth of this; a link loses a few packets in a row."""
+"""A guard on a busy computer may be late by a tenth of it; a link loses a few packets in a row."""
 _SLOWEST_HAND_PER_S = 0.05
 """Where neither parameter was read: the least that COM_RC_STICK_OV takes, 5 %."""
 

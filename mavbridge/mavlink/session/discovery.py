@@ -30,8 +30,8 @@ _NOT_VEHICLES = (
 _CAPACITY = 64
 _SILENT_NS = 500 * NS_PER_MS
 """Silence after which a vehicle that is heard elsewhere is taken to have moved there."""
-_NAMESAKES = 16
-_NAMESAKE_ADVICE = "give it another system id, or keep it off this port"
+_DUPLICATE_SYSTEMS = 16
+_DUPLICATE_SYSTEM_ADVICE = "give it another system id, or keep it off this port"
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -200,7 +200,7 @@ class Hearing(NamedTuple):
                 )
 
 
-class Namesakes:
+class DuplicateSystems:
     """Other senders that use the system id of the chosen vehicle."""
 
     def __init__(self) -> None:
@@ -223,14 +223,14 @@ class Namesakes:
             return (
                 f"the vehicle at {vehicle.place} is silent, and system {vehicle.source.system} is "
                 f"now heard from {_place(sender)}, which is not followed in flight: if it is "
-                f"another vehicle, {_NAMESAKE_ADVICE}; if this one has moved, engage again"
+                f"another vehicle, {_DUPLICATE_SYSTEM_ADVICE}; if this one has moved, engage again"
             ), True
-        if sender in self._reported or len(self._reported) >= _NAMESAKES:
+        if sender in self._reported or len(self._reported) >= _DUPLICATE_SYSTEMS:
             return None, False
         self._reported.add(sender)
         return (
             f"system {vehicle.source.system} is also heard from {_place(sender)}, which is "
-            f"ignored: the vehicle is at {vehicle.place}; {_NAMESAKE_ADVICE}"
+            f"ignored: the vehicle is at {vehicle.place}; {_DUPLICATE_SYSTEM_ADVICE}"
         ), False
 
 

@@ -13,7 +13,7 @@ from mavbridge.mavlink.transport.sockets import Address, Transport, TransportDow
 
 REOPEN_NS = NS_PER_S
 DRAIN_BUDGET_NS = 2 * NS_PER_MS
-"""Longest stretch of reading: a flood must not keep the gate from its next slot. What is
+"""Longest stretch of reading: a flood must not keep the guard from its next slot. What is
 left stays with the kernel, which drops what it cannot hold."""
 _UNCHECKED = "UNKNOWN"
 """Begin of pymavlink's names for messages that the dialect lacks."""

@@ -4,7 +4,7 @@ from collections.abc import Iterator
 from pathlib import Path
 
 _PROC = Path("/proc")
-_GATE = ("mavbridge.gate", "mavbridge/gate/")
+_GUARD = ("mavbridge.guard", "mavbridge/guard/")
 
 
 def udp_holder(port: int, proc: Path = _PROC) -> str:
@@ -40,9 +40,9 @@ def _holder(targets: set[str], proc: Path) -> str | None:
         except OSError:  # it has ended, or belongs to another user
             continue
         line = " ".join(words).strip()
-        if any(word.startswith(_GATE[0]) or _GATE[1] in word for word in words):
+        if any(word.startswith(_GUARD[0]) or _GUARD[1] in word for word in words):
             return (
-                f"the gate of another flight has it (process {process.name}: {line}) and may be "
+                f"the guard of another flight has it (process {process.name}: {line}) and may be "
                 f"giving the sticks back: wait until it has, stop it with kill {process.name}"
             )
         return f"process {process.name} ({line}) has it: stop it"

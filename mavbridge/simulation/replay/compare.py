@@ -9,8 +9,8 @@ from numpy.typing import NDArray
 
 from mavbridge.core.reasons import Code, because
 from mavbridge.core.vehicle import Action, ActionTrace
-from mavbridge.gate.gate import GateOutput
-from mavbridge.simulation.replay.gate import GateStep, same_action
+from mavbridge.guard.guard import GuardOutput
+from mavbridge.simulation.replay.guard import GuardStep, same_action
 from mavbridge.simulation.replay.policy import SolvePair
 
 Array: TypeAlias = NDArray[np.float64]
@@ -50,8 +50,8 @@ class PolicyComparison:
 
 
 @dataclass(frozen=True, kw_only=True)
-class GateComparison:
-    """Every pass of the gate once more, with the recorded chunks."""
+class GuardComparison:
+    """Every pass of the guard once more, with the recorded chunks."""
 
     steps: int
     flown: int
@@ -148,7 +148,7 @@ def _other_inputs(pair: SolvePair) -> list[str]:
     return [name for name in INPUTS if not is_same[name]]
 
 
-def compare_gate(steps: Sequence[GateStep]) -> GateComparison:
+def compare_guard(steps: Sequence[GuardStep]) -> GuardComparison:
     """Phases, chunks, the whole trace and the sent sticks of all passes.
 
     The very first pass reads the settings, and decides nothing.
@@ -159,16 +159,16 @@ def compare_gate(steps: Sequence[GateStep]) -> GateComparison:
         for name in _other_results(step):
             _count(differ, name)
             first = first or f"{name} of tick {number} ({step.recorded.phase})"
-    return GateComparison(
+    return GuardComparison(
         steps=len(steps),
         flown=sum(step.recorded.trace is not None for step in steps),
         differ=differ,
         first=first,
-        deviation=gate_traces(steps).deviation,
+        deviation=guard_traces(steps).deviation,
     )
 
 
-def _other_results(step: GateStep) -> list[str]:
+def _other_results(step: GuardStep) -> list[str]:
     one, other = step.recorded, step.replayed
     if other is None:
         is_told = one.trace is not None or one.sent is not None or one.is_slot
@@ -190,17 +190,17 @@ def _stage(trace: ActionTrace | None, stage: str) -> Action | None:
     return None if trace is None else getattr(trace, stage)
 
 
-def gate_traces(steps: Sequence[GateStep]) -> StickTraces:
-    """The recorded chunks through the gate."""
+def guard_traces(steps: Sequence[GuardStep]) -> StickTraces:
+    """The recorded chunks through the guard."""
     return _traces(steps, [step.replayed.trace if step.replayed else None for step in steps])
 
 
-def other_traces(steps: Sequence[GateStep], outputs: Iterable[GateOutput]) -> StickTraces:
-    """Other chunks, or other settings, through the gate."""
+def other_traces(steps: Sequence[GuardStep], outputs: Iterable[GuardOutput]) -> StickTraces:
+    """Other chunks, or other settings, through the guard."""
     return _traces(steps, [output.trace for output in outputs])
 
 
-def _traces(steps: Sequence[GateStep], traces: Sequence[ActionTrace | None]) -> StickTraces:
+def _traces(steps: Sequence[GuardStep], traces: Sequence[ActionTrace | None]) -> StickTraces:
     begin_ns = steps[0].recorded.sent_ns
     return StickTraces(
         times_s=np.array([(step.recorded.sent_ns - begin_ns) / 1e9 for step in steps]),

@@ -1,6 +1,6 @@
 """A policy beside a telemetry log and a video: it sees both, and somebody else has the sticks.
 
-``VisionLoop``, ``VehicleView``, ``StateReader``, ``ObservationSource``, ``SentHistory`` and
+``VisionLoop``, ``TelemetryCache``, ``StateReader``, ``ObservationSource``, ``SentHistory`` and
 ``PolicyLoop`` run as in flight, composed by ``build_bridge``, on stepped time: a packet arrives at
 its stamp in the log, which is also taken for the moment that it tells about, an image at its
 exposure, and neither encoding nor solving takes time. The pilot's sticks are the history.
@@ -23,9 +23,9 @@ from mavbridge.flight.feature_cache import FeatureCache
 from mavbridge.flight.observation import observation_ages_ns
 from mavbridge.flight.plan import plan_flight
 from mavbridge.flight.settings import action_meaning
-from mavbridge.gate.chunks import Chunk
-from mavbridge.gate.engagement import Phase
-from mavbridge.gate.wire import Absence, GateStatus, GateTick
+from mavbridge.guard.chunks import Chunk
+from mavbridge.guard.engagement import Phase
+from mavbridge.guard.wire import Absence, GuardStatus, GuardTick
 from mavbridge.simulation.clock import START_NS, SteppedClock
 from mavbridge.simulation.replay.actions import ActionPair
 from mavbridge.simulation.replay.telemetry_log import PilotSticks, TelemetryLog
@@ -137,7 +137,7 @@ class LogReplay:
             watch_solve=self._keep,
         )
         autopilot = "none" if log.profile is None else log.profile.name
-        status = GateStatus(autopilot, None, True, None, (), None, has_position=True)
+        status = GuardStatus(autopilot, None, True, None, (), None, has_position=True)
         self._bridge.view.receive(status)
 
     @property
@@ -195,10 +195,10 @@ class LogReplay:
             recorded=tuple(pilot[1]) if pilot is not None and is_held else None,
         )
 
-    def _tick(self, sticks: Sticks, now_ns: int) -> GateTick:
-        """The pilot's sticks, as the gate reports those that it has sent."""
+    def _tick(self, sticks: Sticks, now_ns: int) -> GuardTick:
+        """The pilot's sticks, as the guard reports those that it has sent."""
         self._ticks += 1
-        return GateTick(
+        return GuardTick(
             index=self._ticks,
             due_ns=now_ns,
             woke_ns=now_ns,

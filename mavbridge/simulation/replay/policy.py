@@ -1,7 +1,7 @@
 """The policy loop of a recorded flight once more: its bytes, its features, its sent sticks.
 
-``VehicleView``, ``StateReader``, ``ObservationSource``, ``SentHistory`` and ``PolicyLoop`` run as
-in the flight, composed by ``build_bridge``. Taken from the recording: when each solve began and
+``TelemetryCache``, ``StateReader``, ``ObservationSource``, ``SentHistory`` and ``PolicyLoop`` run
+as in the flight, composed by ``build_bridge``. Taken from the recording: when each solve began and
 ended; what had reached the flight process by then (the state, its stamps and the newest image tell
 it); when packets arrived and what moment they tell about; and which sticks had been sent. Solves
 that returned no chunk are not in a recording, and are not repeated.
@@ -26,15 +26,15 @@ from mavbridge.flight.observation import observation_ages_ns
 from mavbridge.flight.plan import plan_flight
 from mavbridge.flight.state import Freshness
 from mavbridge.flight.state_reader import StateReader
-from mavbridge.flight.vehicle_view import VehicleView
-from mavbridge.gate.chunks import Chunk
-from mavbridge.gate.engagement import Phase
-from mavbridge.gate.wire import Absence, GateStatus, GateTick
+from mavbridge.flight.telemetry_cache import TelemetryCache
+from mavbridge.guard.chunks import Chunk
+from mavbridge.guard.engagement import Phase
+from mavbridge.guard.wire import Absence, GuardStatus, GuardTick
 from mavbridge.mavlink.codec.messages import Measurement
 from mavbridge.mavlink.codec.packets import Codec
 from mavbridge.mavlink.session.telemetry import TelemetryCollector
 from mavbridge.simulation.clock import SteppedClock
-from mavbridge.simulation.replay.gate import recorded_plan
+from mavbridge.simulation.replay.guard import recorded_plan
 from mavbridge.simulation.replay.recording import RecordedPacket, ReplaySource
 from policy.protocol import Executable
 
@@ -106,7 +106,7 @@ class _Loop:
         self._policy = bridge.policy
         self.view = bridge.view
         autopilot = source.meta.autopilot or "none"
-        self.view.receive(GateStatus(autopilot, None, True, None, (), None, has_position=True))
+        self.view.receive(GuardStatus(autopilot, None, True, None, (), None, has_position=True))
 
     def repeat(self, recorded: Solve) -> SolvePair:
         """One step of the loop at the moment of a recorded one."""
@@ -166,9 +166,11 @@ class _Shelf:
 
 
 class _News:
-    """What reached the flight process: packets, ticks of the gate, and features."""
+    """What reached the flight process: packets, ticks of the guard, and features."""
 
-    def __init__(self, source: ReplaySource, view: VehicleView, shelves: Sequence[_Shelf]) -> None:
+    def __init__(
+        self, source: ReplaySource, view: TelemetryCache, shelves: Sequence[_Shelf]
+    ) -> None:
         self._view = view
         self._shelves = shelves
         self._packets = [p for p in source.packets if p.happened_ns is not None]
@@ -200,7 +202,7 @@ class _News:
             if tick.sent_ns > now_ns:
                 return
             self._next_tick += 1
-            self._view.receive(_gate_tick(tick))
+            self._view.receive(_guard_tick(tick))
 
     def _has_extras(self, place: int, solve: Solve) -> bool:
         """After this packet the extra inputs, which come in messages of their own, are the solve's.
@@ -255,9 +257,9 @@ def _stamps_ns(now: Telemetry) -> list[int]:
     return [0 if reading is None else reading.happened_ns for reading in readings]
 
 
-def _gate_tick(tick: Tick) -> GateTick:
-    """The gate's report that became this tick."""
-    return GateTick(
+def _guard_tick(tick: Tick) -> GuardTick:
+    """The guard's report that became this tick."""
+    return GuardTick(
         index=tick.index,
         due_ns=tick.due_ns,
         woke_ns=tick.woke_ns,

@@ -73,7 +73,7 @@ def _notes(plan: Plan, policy: LeRobotPolicy, seed: int, num_diffusion_steps: in
     if isinstance(config, ActConfig):
         if config.temporal_ensemble_coeff is not None:
             notes.append(
-                "its temporal ensembling is not computed: the gate smooths from chunk to chunk"
+                "its temporal ensembling is not computed: the guard smooths from chunk to chunk"
             )
         return notes
     notes.append(

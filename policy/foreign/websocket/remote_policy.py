@@ -28,7 +28,7 @@ MOST_WAIT_S = 1.5
 
 
 def answer_deadline_s(contract: Contract) -> float:
-    """Time after which the gate would no longer fly by the answer."""
+    """Time after which the guard would no longer fly by the answer."""
     ages_s = (contract.max_state_age_s, contract.max_velocity_age_s, contract.max_feature_age_s)
     chunk_s = contract.horizon * contract.chunk_dt_s
     return min(min(ages_s) + contract.play_s, chunk_s, MOST_WAIT_S)

@@ -16,7 +16,7 @@ class StageError(Exception):
 
 
 class Process:
-    """A process of which nobody here is the parent, such as the gate of a killed bridge."""
+    """A process of which nobody here is the parent, such as the guard of a killed bridge."""
 
     def __init__(self, pid: int, clock: Clock) -> None:
         self.pid = pid

@@ -12,7 +12,7 @@ from typing import Any, NamedTuple, TypeAlias
 from pymavlink.dialects.v20 import ardupilotmega as dialect
 
 from sitl.clock import NS_PER_S, Clock
-from sitl.faults.record import NEUTRAL_US, NUDGE_US
+from sitl.faults.record import DITHER_US, NEUTRAL_US
 from sitl.faults.stage.carriers import LOOPBACK, Carrier
 from sitl.faults.stage.link import FaultyLink, LinkFaults
 
@@ -108,12 +108,12 @@ class Sent(NamedTuple):
             turned = (sticks.roll, sticks.pitch, sticks.yaw)
             centre = (NEUTRAL_US[0], NEUTRAL_US[1], NEUTRAL_US[3])
             return any(
-                us not in (0, IGNORED_US) and abs(us - middle) > NUDGE_US
+                us not in (0, IGNORED_US) and abs(us - middle) > DITHER_US
                 for us, middle in zip(turned, centre, strict=True)
             )
         if self.name == "MANUAL_CONTROL":
             message = self.message
-            return bool(max(abs(message.x), abs(message.y), abs(message.r)) > NUDGE_US)
+            return bool(max(abs(message.x), abs(message.y), abs(message.r)) > DITHER_US)
         return False
 
     @property

@@ -30,14 +30,14 @@ STICKS_OVER_NS = 200 * NS_PER_MS
 """Time without a stick of the policy after which its flight is over."""
 STALLED = ("delivered no attitude", "stood still")
 ORDERLY = (0, 4)
-"""Exit statuses of a flight that ended in order; 4: a busy machine made the gate end it before."""
+"""Exit statuses of a flight that ended in order; 4: a busy machine made the guard end it before."""
 MARK = "SITL_FAULT_MARK"
 """Environment variable: the file into which a policy of the catalogue writes the moment, in ns of
 CLOCK_MONOTONIC, when its fault begins."""
 PIPE_BLOCK = 4096
 NEWEST_LINES = 30
 CATALOGUE = Path(__file__).parents[1] / "catalogue"
-ProcessName: TypeAlias = Literal["flight", "gate", "recorder"]
+ProcessName: TypeAlias = Literal["flight", "guard", "recorder"]
 """``recorder`` is the process that writes the video of a recording."""
 
 
@@ -65,7 +65,7 @@ class Stage:
         self._lines: list[str] = []
         self._news = threading.Condition()
         self._reader: threading.Thread | None = None
-        self._gate: Process | None = None
+        self._guard: Process | None = None
         self.camera: FrameFeed | None = None
         """The camera, where the vehicle has none of its own."""
         self.viewer: Viewer | None = None
@@ -147,9 +147,9 @@ class Stage:
             )
 
     def wait_for_lean(self) -> None:
-        """The policy holds its lean; remembers the gate, for after the death of its parent.
+        """The policy holds its lean; remembers the guard, for after the death of its parent.
 
-        Where a busy machine made the gate end the flight before, both start anew.
+        Where a busy machine made the guard end the flight before, both start anew.
         """
         sent = self.relay.sent
 
@@ -163,7 +163,7 @@ class Stage:
         for _ in range(STARTS):
             if not self.relay.wait_until(lambda: is_leaning() or is_over(), TIMEOUT_S):
                 raise StageError(f"the policy has not flown:\n{self._text}")
-            self.gate.has_ended(0)  # finds it while its parent lives
+            self.guard.has_ended(0)  # finds it while its parent lives
             if is_leaning():
                 self.memory |= mapped_memory(self.bridge_pid)
                 return
@@ -231,11 +231,11 @@ class Stage:
         return self._running().pid
 
     @property
-    def gate(self) -> Process:
-        """The gate process; the first call must come while the bridge lives."""
-        if self._gate is None:
-            self._gate = Process(child_of(self.bridge_pid, b"mavbridge.gate"), self.clock)
-        return self._gate
+    def guard(self) -> Process:
+        """The guard process; the first call must come while the bridge lives."""
+        if self._guard is None:
+            self._guard = Process(child_of(self.bridge_pid, b"mavbridge.guard"), self.clock)
+        return self._guard
 
     def recorder(self) -> Process:
         """The process that writes the video of a recording."""
@@ -245,7 +245,7 @@ class Stage:
         """Process id, while the bridge lives."""
         if name == "recorder":
             return child_of(self.bridge_pid, b"spawn_main")
-        return self.gate.pid if name == "gate" else self.bridge_pid
+        return self.guard.pid if name == "guard" else self.bridge_pid
 
     def processes(self) -> list[tuple[int, str]]:
         """Id and command of every process of the bridge that still runs."""
@@ -289,9 +289,9 @@ class Stage:
 
     def close(self) -> None:
         """Free everything, and end what a failed test has left."""
-        if self._gate is not None:
-            self._gate.close()
-            self._gate = None
+        if self._guard is not None:
+            self._guard.close()
+            self._guard = None
         if self._bridge is None:
             return
         if self._bridge.poll() is None:

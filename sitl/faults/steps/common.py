@@ -52,7 +52,7 @@ class Signal:
         number = signal.Signals[self.name]
         if self.to == "recorder":
             return stage.recorder().kill(number)
-        kill = {"flight": stage.kill, "group": stage.kill_group, "gate": stage.gate.kill}[self.to]
+        kill = {"flight": stage.kill, "group": stage.kill_group, "guard": stage.guard.kill}[self.to]
         return kill(number)
 
 

@@ -114,7 +114,7 @@ class Unread:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Namesake:
+class DuplicateSystem:
     """Another vehicle of the same system id, disarmed, sends to the bridge from its own port."""
 
     s: float
@@ -161,13 +161,13 @@ class Rates:
         return began_ns
 
 
-LinkStep: TypeAlias = Link | Silence | Broken | Unread | Namesake | Rates
+LinkStep: TypeAlias = Link | Silence | Broken | Unread | DuplicateSystem | Rates
 LINK_KINDS: dict[str, Callable[..., LinkStep]] = {
     "link": Link,
     "silence": Silence,
     "broken": Broken,
     "unread": Unread,
-    "namesake": Namesake,
+    "duplicate system": DuplicateSystem,
     "rates": Rates,
 }
 """Steps by the key ``do`` of a scenario."""

@@ -12,14 +12,14 @@ from benchmarks.link_vehicle import (
 )
 from mavbridge.core.clock import NS_PER_MS
 from mavbridge.core.vehicle import Sticks
-from mavbridge.mavlink.outputs.echo import NUDGE_STEP_NS, EchoCheck
+from mavbridge.mavlink.outputs.echo import DITHER_STEP_NS, EchoCheck
 from mavbridge.mavlink.outputs.override import OVERRIDE_ECHO
 from mavbridge.mavlink.profiles.ardupilot_params import calibration
 
-NUDGE_LEVELS = 3
+DITHER_LEVELS = 3
 
 
-def test_every_code_comes_back_through_policy_calibration_and_nudge() -> None:
+def test_every_code_comes_back_through_policy_calibration_and_dither() -> None:
     echo = EchoCheck(OVERRIDE_ECHO)
     echo.sent((1500, 1500, 1500, 1504), 0)
     echo.received((1500, 1500, 1500, 1504), 1, 1)
@@ -31,11 +31,11 @@ def test_every_code_comes_back_through_policy_calibration_and_nudge() -> None:
         chunk = repeat_roll_rate(feature, state, history)
         assert chunk.shape == (1, 16, 4)
         pwm_us = calibration(PARAMS).to_pwm_us(Sticks(*chunk[0, 0].tolist()))
-        nudged_us = {
-            echo.with_nudge(pwm_us, level * NUDGE_STEP_NS)[3] for level in range(NUDGE_LEVELS)
+        dithered_us = {
+            echo.with_dither(pwm_us, level * DITHER_STEP_NS)[3] for level in range(DITHER_LEVELS)
         }
-        assert len(nudged_us) == NUDGE_LEVELS
-        assert {*map(code_of_pwm, nudged_us)} == {code}
+        assert len(dithered_us) == DITHER_LEVELS
+        assert {*map(code_of_pwm, dithered_us)} == {code}
 
 
 def test_every_code_comes_back_through_manual_control() -> None:

@@ -6,7 +6,7 @@ from benchmarks import missed_slots
 from benchmarks.missed_slots import (
     Cause,
     Counters,
-    GateProbe,
+    GuardProbe,
     find_cause,
     read_counters,
     stolen_ms_since,
@@ -23,7 +23,7 @@ NOTHING = Counters(0, 0, 0)
 
 @pytest.mark.parametrize(
     ("host_ms", "waited_ms", "expected"),
-    [(25, 0, "host"), (24, 25, "kernel"), (50, 50, "host"), (24, 24, "gate")],
+    [(25, 0, "host"), (24, 25, "kernel"), (50, 50, "host"), (24, 24, "guard")],
 )
 def test_the_outermost_counter_that_explains_half_of_a_gap_is_the_cause(
     host_ms: int, waited_ms: int, expected: Cause
@@ -35,7 +35,7 @@ def test_the_outermost_counter_that_explains_half_of_a_gap_is_the_cause(
 
 @pytest.fixture
 def proc(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """The kernel's files: a gate that has run for 1 ms, and nothing stolen."""
+    """The kernel's files: a guard that has run for 1 ms, and nothing stolen."""
     monkeypatch.setattr(missed_slots, "PROC", tmp_path)
     monkeypatch.setattr(missed_slots.os, "sysconf", lambda _: 100)
     (tmp_path / str(PID)).mkdir()
@@ -55,7 +55,7 @@ class Reader:
 
     def __init__(self) -> None:
         self.clock = FakeClock()
-        self.probe = GateProbe(PID, self.clock)
+        self.probe = GuardProbe(PID, self.clock)
 
     def take(self, tick: Tick, *, late_ms: int = 0) -> None:
         self.clock.sleep_until_ns(tick.sent_ns + late_ms * NS_PER_MS)
@@ -72,7 +72,7 @@ def test_missed_slots_are_counted_by_cause(proc: Path) -> None:
     write(proc, stolen_ms=40, cpu_ms=5, waited_ms=30)
     reader.take(make_tick(12, missed_slots=2))
     probe = reader.probe
-    assert probe.missed_by_cause == {"host": 4, "gate": 2, "kernel": 2}
+    assert probe.missed_by_cause == {"host": 4, "guard": 2, "kernel": 2}
     assert probe.cpu_ns == 4 * NS_PER_MS
 
 
@@ -88,7 +88,7 @@ def test_ticks_that_are_read_late_are_explained_by_what_happened_since_before_th
 
 
 def test_ticks_on_time_and_frames_count_nothing(proc: Path) -> None:
-    probe = GateProbe(PID, FakeClock())
+    probe = GuardProbe(PID, FakeClock())
     for index in range(5):
         probe.emit(make_tick(index))
         probe.emit(make_vision_tick(index))
@@ -96,21 +96,21 @@ def test_ticks_on_time_and_frames_count_nothing(proc: Path) -> None:
 
 
 def test_slots_missed_around_a_release_do_not_count(proc: Path) -> None:
-    probe = GateProbe(PID, FakeClock())
+    probe = GuardProbe(PID, FakeClock())
     probe.emit(make_tick(0))
     probe.emit(make_released_tick(5, missed_slots=4))
     probe.emit(make_tick(9, missed_slots=3))
     assert probe.missed_by_cause == {}
 
 
-def test_a_system_that_tells_nothing_leaves_the_gate_as_the_cause(proc: Path) -> None:
+def test_a_system_that_tells_nothing_leaves_the_guard_as_the_cause(proc: Path) -> None:
     (proc / "stat").unlink()
     (proc / str(PID) / "schedstat").unlink()
     assert read_counters(PID) == NOTHING
-    probe = GateProbe(PID, FakeClock())
+    probe = GuardProbe(PID, FakeClock())
     probe.emit(make_tick(0))
     probe.emit(make_tick(3, missed_slots=2))
-    assert (probe.missed_by_cause, probe.cpu_ns) == ({"gate": 2}, 0)
+    assert (probe.missed_by_cause, probe.cpu_ns) == ({"guard": 2}, 0)
 
 
 def test_stolen_time_is_what_the_kernel_counts(proc: Path) -> None:

@@ -10,7 +10,7 @@ import pytest
 from mavbridge.core.errors import UserError
 from mavbridge.core.realtime import (
     ACTION_FIFO_PRIORITY,
-    GATE_FIFO_PRIORITY,
+    GUARD_FIFO_PRIORITY,
     SWITCH_INTERVAL_S,
     require_supported_system,
     settle_process,
@@ -26,11 +26,11 @@ prepare_to_die_first()
 print(open("/proc/self/oom_score_adj").read().strip(), *resource.getrlimit(resource.RLIMIT_CORE))
 """
 
-GATE = """
+GUARD = """
 import os, sys
-from mavbridge.core.realtime import settle_gate
+from mavbridge.core.realtime import settle_guard
 {before}
-print(settle_gate(realtime=True, cpu=None))
+print(settle_guard(realtime=True, cpu=None))
 policy = os.sched_getscheduler(0)
 is_fifo = policy & ~os.SCHED_RESET_ON_FORK == os.SCHED_FIFO
 print(is_fifo, bool(policy & os.SCHED_RESET_ON_FORK), os.sched_getparam(0).sched_priority)
@@ -85,20 +85,20 @@ def test_the_flight_process_is_the_first_victim_and_leaves_no_core_dump() -> Non
 
 
 @linux
-def test_the_gate_has_real_time_and_locked_memory_or_says_what_it_lacks() -> None:
+def test_the_guard_has_real_time_and_locked_memory_or_says_what_it_lacks() -> None:
     refusal, scheduling, locked_kb, is_child_ordinary, has_numpy = printed_by(
-        GATE.format(before="")
+        GUARD.format(before="")
     )
     if "real-time" not in refusal:
-        assert scheduling == f"True True {GATE_FIFO_PRIORITY}"
+        assert scheduling == f"True True {GUARD_FIFO_PRIORITY}"
     assert ("not locked" in refusal) == (locked_kb == "0")
     assert is_child_ordinary == "True"
     assert has_numpy == "False"
 
 
 @linux
-def test_a_gate_without_rights_says_how_to_allow_what_it_lacks() -> None:
-    refusal, scheduling, locked_kb, *_ = printed_by(GATE.format(before=WITHOUT_RIGHTS))
+def test_a_guard_without_rights_says_how_to_allow_what_it_lacks() -> None:
+    refusal, scheduling, locked_kb, *_ = printed_by(GUARD.format(before=WITHOUT_RIGHTS))
     assert "ulimit -r 10" in refusal
     assert "(Operation not permitted): allow it with ulimit -l unlimited" in refusal
     assert scheduling == "False False 0"
@@ -127,14 +127,14 @@ def test_windows_is_refused(monkeypatch: pytest.MonkeyPatch, system: str, is_ref
 
 
 @linux
-def test_the_action_loop_is_below_the_gate(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_action_loop_is_below_the_guard(monkeypatch: pytest.MonkeyPatch) -> None:
     asked: list[tuple[int, int, object]] = []
     monkeypatch.setattr(os, "sched_getaffinity", lambda _: {0, 1})
     monkeypatch.setattr(os, "sched_setscheduler", lambda *given: asked.append(given))
     assert settle_thread(realtime=True, cpu=None) is None
     policy = os.SCHED_FIFO | os.SCHED_RESET_ON_FORK
     assert asked == [(0, policy, os.sched_param(ACTION_FIFO_PRIORITY))]
-    assert ACTION_FIFO_PRIORITY < GATE_FIFO_PRIORITY
+    assert ACTION_FIFO_PRIORITY < GUARD_FIFO_PRIORITY
 
 
 @linux

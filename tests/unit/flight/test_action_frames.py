@@ -1,4 +1,4 @@
-"""Actions in the policy's axes and in the gate's, against the states in the same axes."""
+"""Actions in the policy's axes and in the guard's, against the states in the same axes."""
 
 import numpy as np
 import pytest
@@ -35,17 +35,17 @@ def test_actions_in_ros_axes_by_hand_and_back(
     frame = action_frame(
         Contract(action=kind, velocity_frame=velocity_frame, state_frame="enu_flu")
     )
-    sent = frame.to_gate(FOUR)
+    sent = frame.to_guard(FOUR)
     assert type(sent[0]) is type(expected)
     assert sent[0] == expected
-    np.testing.assert_array_equal(frame.from_gate(sent), FOUR)
+    np.testing.assert_array_equal(frame.from_guard(sent), FOUR)
 
 
 @pytest.mark.parametrize("kind", ["sticks", "rates", "attitude", "velocity"])
-def test_actions_in_the_gates_own_axes_are_not_changed(kind: ActionKind) -> None:
+def test_actions_in_the_guards_own_axes_are_not_changed(kind: ActionKind) -> None:
     frame = action_frame(Contract(action=kind))
-    assert frame.to_gate(FOUR) == tuple(tuple(row) for row in FOUR.tolist())
-    np.testing.assert_array_equal(frame.from_gate(frame.to_gate(FOUR)), FOUR)
+    assert frame.to_guard(FOUR) == tuple(tuple(row) for row in FOUR.tolist())
+    np.testing.assert_array_equal(frame.from_guard(frame.to_guard(FOUR)), FOUR)
 
 
 @pytest.mark.parametrize("state_frame", ["ned_frd", "enu_flu"])
@@ -63,10 +63,10 @@ def test_an_action_that_repeats_the_state_asks_for_the_motion_of_now(
     values = state.values  # type: ignore[union-attr]
     velocity = np.array([[*values[VELOCITY], values[RATE][2]]], np.float32)
     frame = action_frame(Contract(action="velocity", state_frame=state_frame))
-    assert frame.to_gate(velocity)[0] == pytest.approx((1.0, 2.0, -3.0, 0.3))
+    assert frame.to_guard(velocity)[0] == pytest.approx((1.0, 2.0, -3.0, 0.3))
     rates = np.array([[0.4, *values[RATE]]], np.float32)
     frame = action_frame(Contract(action="rates", state_frame=state_frame))
-    assert frame.to_gate(rates)[0] == pytest.approx((0.4, 0.1, 0.2, 0.3))
+    assert frame.to_guard(rates)[0] == pytest.approx((0.4, 0.1, 0.2, 0.3))
 
 
 def test_neutral_hovers_by_the_contracts_thrust() -> None:
@@ -74,5 +74,5 @@ def test_neutral_hovers_by_the_contracts_thrust() -> None:
         frame = action_frame(Contract(action=kind, hover_thrust=0.45))
         assert frame.neutral == (thrust, 0.0, 0.0, 0.0)
         np.testing.assert_array_equal(
-            frame.from_gate([frame.neutral]), np.array([[thrust, 0, 0, 0]], np.float32)
+            frame.from_guard([frame.neutral]), np.array([[thrust, 0, 0, 0]], np.float32)
         )

@@ -55,7 +55,7 @@ def test_what_was_sent_comes_back_in_the_policys_own_axes_and_kind() -> None:
     neutral = [0.5, 0, 0, 0]
     assert history.resample(0)[0].tolist() == [neutral] * 4
     history.append(BodyRates(0.25, 1.0, 2.0, -3.0), 0)
-    history.append(AttitudeThrust(0.4, 0.1, 0.1, 0.1), 10 * NS_PER_MS)  # the gate's own levelling
+    history.append(AttitudeThrust(0.4, 0.1, 0.1, 0.1), 10 * NS_PER_MS)  # the guard's own levelling
     history.append(None, 20 * NS_PER_MS)
     history.append(IDLE, 30 * NS_PER_MS)
     own = [0.25, 1, -2, 3]

@@ -15,8 +15,8 @@ from mavbridge.core.records import FlightOutcome, Position, Tick
 from mavbridge.core.stopping import StopRequest
 from mavbridge.core.vehicle import FlightEnd, LinkStats
 from mavbridge.flight.outcome import RUN_OUT_NS, FlightReferee, describe, flight_verdict
-from mavbridge.gate.outcome import Outcome
-from mavbridge.gate.wire import GateStatus, GateSummary
+from mavbridge.guard.outcome import Outcome
+from mavbridge.guard.wire import GuardStatus, GuardSummary
 
 FLOWN = Outcome(flights=1, has_left_ground=True)
 NO_CHUNK = because(Code.NO_CHUNK)
@@ -30,8 +30,8 @@ STATS = LinkStats(
 )
 
 
-def summary(outcome: Outcome) -> GateSummary:
-    return GateSummary(
+def summary(outcome: Outcome) -> GuardSummary:
+    return GuardSummary(
         autopilot="ArduPilot",
         link=STATS,
         failure=None,
@@ -61,7 +61,7 @@ def stopped(number: int | None) -> StopRequest:
         (FLOWN._replace(has_left_ground=False), signal.SIGTERM, 143, "not left the ground"),
         (Outcome(), None, 3, f"the policy has not flown: {NO_CHUNK}"),
         (Outcome(), signal.SIGINT, 130, "the policy has not flown"),
-        (None, signal.SIGINT, 130, None),  # an impatient user, while the gate holds neutral
+        (None, signal.SIGINT, 130, None),  # an impatient user, while the guard holds neutral
         (None, None, 3, None),
     ],
 )
@@ -112,7 +112,7 @@ def test_a_flight_that_hit_something_is_never_a_success(
 
 
 GATES = [CourseGate(Position(north, 0.0, -2.0), 0.0, 2.4) for north in (4.0, 8.0)]
-HOVERING = GateStatus("ardupilot", "LOITER", True, False, (), None)
+HOVERING = GuardStatus("ardupilot", "LOITER", True, False, (), None)
 
 
 def course_ticks(count: int, **changes: Any) -> list[Tick]:
@@ -141,7 +141,7 @@ def judged(
     return outcome
 
 
-def test_a_course_is_over_a_second_after_its_last_gate() -> None:
+def test_a_course_is_over_a_second_after_its_last_guard() -> None:
     referee, ticks = FlightReferee(GATES), course_ticks(300)
     over = [
         tick.index for tick in ticks if referee.emit(tick) or referee.is_course_over(tick.sent_ns)
@@ -155,7 +155,7 @@ def test_a_course_is_over_a_second_after_its_last_gate() -> None:
     assert describe(outcome) == "2 of 2 gates in 0.8 s, 10.0 m/s, no contact seen"
 
 
-def test_without_gates_a_flight_is_told_by_its_end() -> None:
+def test_without_guards_a_flight_is_told_by_its_end() -> None:
     outcome = judged(course_ticks(201), "duration", gates=None)
     assert (outcome.gates_total, outcome.gates_passed, outcome.success) == (None, None, None)
     assert (outcome.height_m, outcome.speed_mps) == (2.0, 10.0)
@@ -175,7 +175,7 @@ def test_a_fault_names_its_reason_and_is_no_example() -> None:
     )
 
 
-def test_what_the_vehicle_hit_is_told_and_counts_also_just_behind_the_last_gate() -> None:
+def test_what_the_vehicle_hit_is_told_and_counts_also_just_behind_the_last_guard() -> None:
     hit = make_tick(90, phase="flying", texts=("vehicle: Crash: hit gate 1 at 9.9 m/s",))
     outcome = judged([*course_ticks(90), hit], "course")
     assert (outcome.gates_passed, outcome.success) == (2, False)
@@ -184,7 +184,7 @@ def test_what_the_vehicle_hit_is_told_and_counts_also_just_behind_the_last_gate(
     assert judged([before, *course_ticks(100)], "course").crash is None
 
 
-def test_a_vehicle_without_a_position_passes_no_gate_and_misses_none() -> None:
+def test_a_vehicle_without_a_position_passes_no_guard_and_misses_none() -> None:
     outcome = judged([make_tick(k, phase="flying") for k in range(50)], "duration")
     assert (outcome.gates_total, outcome.gates_passed, outcome.success) == (2, None, None)
     assert describe(outcome).startswith("no position: ? of 2 gates, no contact seen; ended by")

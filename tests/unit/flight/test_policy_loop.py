@@ -1,4 +1,4 @@
-"""One solve after the other, without a gate; tests/loops has the rest."""
+"""One solve after the other, without a guard; tests/loops has the rest."""
 
 import threading
 from collections.abc import Callable
@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from helpers.factories import make_gate_tick
+from helpers.factories import make_guard_tick
 from helpers.fakes import START_NS, FakeClock, ListSink
 from helpers.wire import WireEnd
 from mavbridge.core.clock import NS_PER_MS
@@ -21,10 +21,10 @@ from mavbridge.flight.observation import ObservationSource
 from mavbridge.flight.policy_loop import MAX_HORIZON, RETRY_NS, PolicyLoop, PolicySettings
 from mavbridge.flight.state import Freshness
 from mavbridge.flight.state_reader import StateReader
-from mavbridge.flight.vehicle_view import VehicleView
-from mavbridge.gate.chunks import Chunk
-from mavbridge.gate.engagement import Phase
-from mavbridge.gate.wire import Absence
+from mavbridge.flight.telemetry_cache import TelemetryCache
+from mavbridge.guard.chunks import Chunk
+from mavbridge.guard.engagement import Phase
+from mavbridge.guard.wire import Absence
 from policy.contract import Contract
 
 MS = NS_PER_MS
@@ -45,7 +45,7 @@ class Rig:
     ) -> None:
         self.clock, self.cache, self.end = FakeClock(), FeatureCache(), WireEnd()
         history = SentHistory(length=2, dt_s=0.05, frame=frame)
-        self.view = VehicleView(
+        self.view = TelemetryCache(
             history=history, sink=ListSink(), state_frame="ned_frd", freshness=FRESH
         )
         self.sent: list[Chunk | Absence] = []
@@ -110,7 +110,7 @@ class Rig:
 
     def begin_flight(self) -> None:
         now_ns = self.clock.now_ns()
-        tick = make_gate_tick(now_ns, phase=Phase.PREPARING, starting_ns=now_ns)
+        tick = make_guard_tick(now_ns, phase=Phase.PREPARING, starting_ns=now_ns)
         self.view.receive(tick)
 
 
@@ -136,7 +136,7 @@ def test_a_chunk_carries_the_moments_that_it_came_from(velocity_ms: int, force_m
     assert chunk.actions == ((0.0,) * 4,) * 3
 
 
-def test_actions_reach_the_gate_in_its_own_kind_and_axes() -> None:
+def test_actions_reach_the_guard_in_its_own_kind_and_axes() -> None:
     frame = action_frame(Contract(action="velocity", state_frame="enu_flu"))
     rig = Rig(lambda: np.array([[[1, 2, 3, 0.5]]], np.float32), frame).measure().see()
     rig.loop.step()
@@ -254,7 +254,7 @@ def test_it_solves_until_it_is_told_to_stop_and_says_when_no_attitude_comes() ->
 
 
 @pytest.mark.parametrize("failure", [RuntimeError, SystemExit, MemoryError])
-def test_a_policy_that_fails_is_told_to_the_gate_at_once(failure: type[BaseException]) -> None:
+def test_a_policy_that_fails_is_told_to_the_guard_at_once(failure: type[BaseException]) -> None:
     rig = Rig().see().measure()
 
     def fail(*_: object) -> FloatArray:

@@ -1,4 +1,4 @@
-"""What the flags and the contract tell the gate."""
+"""What the flags and the contract tell the guard."""
 
 from dataclasses import replace
 from pathlib import Path
@@ -10,11 +10,11 @@ from mavbridge.config.rates import Rates
 from mavbridge.core.errors import UserError
 from mavbridge.core.vehicle import ActionMeaning, StickGains
 from mavbridge.flight.plan import plan_flight
-from mavbridge.flight.settings import action_meaning, gate_settings
-from mavbridge.gate.departure import DepartureSettings
-from mavbridge.gate.engagement import EngagementSettings
-from mavbridge.gate.gate import FlightSettings
-from mavbridge.gate.preparation import PreparationSettings
+from mavbridge.flight.settings import action_meaning, guard_settings
+from mavbridge.guard.departure import DepartureSettings
+from mavbridge.guard.engagement import EngagementSettings
+from mavbridge.guard.guard import FlightSettings
+from mavbridge.guard.preparation import PreparationSettings
 from policy.contract import Contract
 from policy.protocol import Executable
 
@@ -33,7 +33,7 @@ def settings_for(
         act=lambda *inputs: inputs[0],
     )
     contract, is_dual = executable.contract, executable.dual_rate
-    return plan_flight(config or FlyConfig(link=LINK), contract, is_dual=is_dual).gate
+    return plan_flight(config or FlyConfig(link=LINK), contract, is_dual=is_dual).guard
 
 
 def test_the_process_is_told_what_the_flags_say(
@@ -42,10 +42,10 @@ def test_the_process_is_told_what_the_flags_say(
     monkeypatch.setenv("XDG_STATE_HOME", str(tmp_path))
     config = FlyConfig(
         link=replace(LINK, source_system=254),
-        rates=Rates(stick_rate=250.0, realtime=False, gate_cpu=1),
+        rates=Rates(stick_rate=250.0, realtime=False, guard_cpu=1),
         envelope=EnvelopeConfig(min_battery=25.0),
     )
-    settings = gate_settings(config, is_dual=True, tlog_fd=7, wall_offset_ns=5)
+    settings = guard_settings(config, is_dual=True, tlog_fd=7, wall_offset_ns=5)
     link = settings.link
     assert (link.connect, link.source_system) == ("udp:127.0.0.1:14550", 254)
     assert (link.state_hz, link.stick_hz, link.min_battery_percent) == (100.0, 350.0, 25.0)

@@ -4,7 +4,7 @@ from mavbridge.config.flight import Limits
 from mavbridge.core.clock import NS_PER_MS
 from mavbridge.core.errors import UserError
 from mavbridge.flight.settings import contract_with_ages, effective_freshness
-from mavbridge.gate.chunks import FreshnessLimits
+from mavbridge.guard.chunks import FreshnessLimits
 from policy.contract import Contract
 
 CONTRACT = Contract(

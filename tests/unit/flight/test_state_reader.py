@@ -122,7 +122,7 @@ def test_a_goal_is_given_just_where_the_policy_takes_one() -> None:
             encode=lambda rgb, camera=0: np.zeros((1, 1), np.float32),
             act=lambda e, s, h: e,
         )
-        return plan_flight(config(goal), executable.contract, is_dual=executable.dual_rate).gate
+        return plan_flight(config(goal), executable.contract, is_dual=executable.dual_rate).guard
 
     assert config("-10.5, 2,-3").goal_ned_m == (-10.5, 2.0, -3.0)
     with pytest.raises(UserError, match="this policy flies to a goal: give --goal"):

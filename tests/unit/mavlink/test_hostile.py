@@ -27,7 +27,7 @@ OURS, PILOTS = (1600, 1550, 1500, 1700), (1500, 1500, 1500, 1500)
 
 @pytest.mark.parametrize("unit", [b"\xfe\0", b"\xfd\0\0\0\0\0"], ids=["v1", "v2"])
 def test_a_huge_datagram_costs_no_more_than_a_large_one(unit: bytes) -> None:
-    """All of it would have kept the gate from its sticks for 35 ms."""
+    """All of it would have kept the guard from its sticks for 35 ms."""
     ours = codec()
     huge = (unit * 65_507)[:65_507]
     start_s = time.thread_time()

@@ -168,10 +168,10 @@ def test_the_holder_of_a_port_is_named(tmp_path: Path) -> None:
     assert udp_holder(14550, tmp_path / "none") == "another program listens there: stop it"
 
 
-def test_a_gate_that_still_gives_the_sticks_back_should_be_waited_for(tmp_path: Path) -> None:
-    proc = processes(tmp_path, command="python -m mavbridge.gate --connect udp:0.0.0.0:14550")
+def test_a_guard_that_still_gives_the_sticks_back_should_be_waited_for(tmp_path: Path) -> None:
+    proc = processes(tmp_path, command="python -m mavbridge.guard --connect udp:0.0.0.0:14550")
     advice = udp_holder(14550, proc)
-    assert "process 42: python -m mavbridge.gate" in advice
+    assert "process 42: python -m mavbridge.guard" in advice
     assert "giving the sticks back: wait until it has, stop it with kill 42" in advice
 
 

@@ -110,10 +110,10 @@ def become_subreaper() -> None:
 
 
 @pytest.mark.skipif(sys.platform != "linux", reason="containers are Linux")
-def test_the_init_of_a_container_outlives_the_flight_process_until_the_gate_has_ended(
+def test_the_init_of_a_container_outlives_the_flight_process_until_the_guard_has_ended(
     tmp_path: Path,
 ) -> None:
-    """The flight process ends at SIGTERM; its gate goes on until it is told to end."""
+    """The flight process ends at SIGTERM; its guard goes on until it is told to end."""
     flight = tmp_path / "mavbridge"
     flight.write_text(
         "#!/bin/bash\ntrap 'exit 7' TERM\n"
@@ -133,11 +133,11 @@ def test_the_init_of_a_container_outlives_the_flight_process_until_the_gate_has_
     try:
         lines = {init.stdout.readline().strip() for _ in range(2)}
         assert "--arm" in lines
-        (gate,) = (int(line) for line in lines - {"--arm"})
+        (guard,) = (int(line) for line in lines - {"--arm"})
         init.send_signal(signal.SIGTERM)
         with pytest.raises(subprocess.TimeoutExpired):
             init.wait(1.0)
-        os.kill(gate, 0)  # it lives
+        os.kill(guard, 0)  # it lives
         (tmp_path / "end").write_text("now\n")
         assert init.wait(DEADLINE_S) == 7
     finally:

@@ -169,7 +169,7 @@ def test_a_flight_without_any_tick_is_no_error(tmp_path: Path) -> None:
     assert "no moment went wrong" in shown(flight)
 
 
-def test_gates_are_those_of_the_course(tmp_path: Path) -> None:
+def test_guards_are_those_of_the_course(tmp_path: Path) -> None:
     folder = write(tmp_path / "flight", [make_tick(0)], meta=make_meta(course_seed=3))
     assert len(analyse(folder).gates) == 8
     named = tmp_path / "gates.json"
@@ -223,7 +223,7 @@ def test_a_planned_end_is_no_bad_moment_and_any_other_end_is(tmp_path: Path) -> 
     )
 
 
-def test_reasons_of_planned_ends_are_those_of_the_gate() -> None:
+def test_reasons_of_planned_ends_are_those_of_the_guard() -> None:
     ends = {code for code in Code if because(code).kind is Kind.END}
     assert {*ends, Code.OPERATOR} == PLANNED_ENDS
 

@@ -85,7 +85,7 @@ def test_nothing_is_said_about_ticks_that_the_recorder_has_lost() -> None:
 
 
 @pytest.mark.parametrize(
-    ("sending_ms", "cause"), [(2, "the gate woke late"), (8, "sending took long")]
+    ("sending_ms", "cause"), [(2, "the guard woke late"), (8, "sending took long")]
 )
 def test_missed_slots_are_put_down_to_the_send_before_or_to_the_wake_up(
     sending_ms: int, cause: str

@@ -4,7 +4,7 @@ from dataclasses import dataclass
 
 import pytest
 
-from helpers.factories import make_gate_tick
+from helpers.factories import make_guard_tick
 from helpers.fakes import START_NS, ListSink
 from helpers.wire import WireEnd
 from mavbridge.commands.record.pilot_view import STICKS_FRESH_NS, PilotView
@@ -14,7 +14,7 @@ from mavbridge.core.records import Tick
 from mavbridge.core.vehicle import ForwardedPacket, Sticks
 from mavbridge.flight.history import SentHistory
 from mavbridge.flight.state import Freshness
-from mavbridge.gate.wire import GateMessage, GateStatus
+from mavbridge.guard.wire import GuardMessage, GuardStatus
 from mavbridge.mavlink.transport.packet_pipe import PacketPipe
 
 STICKS = Sticks(0.1, 0.2, 0.3, 0.4)
@@ -36,7 +36,7 @@ class Viewed:
         )
 
     def tick(self, at_ns: int) -> Tick:
-        self.view.receive(make_gate_tick(at_ns, reason=because(Code.NO_IMAGE)))
+        self.view.receive(make_guard_tick(at_ns, reason=because(Code.NO_IMAGE)))
         event = self.sink.events[-1]
         assert isinstance(event, Tick)
         return event
@@ -63,8 +63,8 @@ def pipe() -> Iterator[tuple[int, PacketPipe]]:
     os.close(reader)
 
 
-def status(autopilot: str) -> GateStatus:
-    return GateStatus(autopilot, "ALT_HOLD", True, False, (1500,) * 8, STICKS)
+def status(autopilot: str) -> GuardStatus:
+    return GuardStatus(autopilot, "ALT_HOLD", True, False, (1500,) * 8, STICKS)
 
 
 @pytest.mark.parametrize("autopilot", ["ardupilot 4.7.0", "px4 1.18.0"])
@@ -74,7 +74,7 @@ def test_the_message_with_the_sticks_is_counted_by_firmware(viewed: Viewed, auto
     viewed.view.receive(status(autopilot))
     for k in range(1, 4):
         viewed.view.receive(viewed.radio(START_NS + k))
-    viewed.view.receive(GateMessage("a line"))
+    viewed.view.receive(GuardMessage("a line"))
     assert (viewed.view.stick_packets, viewed.view.sticks_ns) == (3, START_NS + 3)
 
 

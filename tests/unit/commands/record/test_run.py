@@ -9,7 +9,7 @@ import pytest
 from helpers.recordings import make_meta
 from mavbridge.__main__ import main
 from mavbridge.commands.record.config import ListenConfig, RecordConfig
-from mavbridge.commands.record.run import CONTRACT, listening_gate, pilot_flight
+from mavbridge.commands.record.run import CONTRACT, listening_guard, pilot_flight
 from mavbridge.core.clock import NS_PER_S, MonotonicClock
 from mavbridge.flight.plan import plan_flight
 from mavbridge.recording.meta import write_meta
@@ -17,12 +17,12 @@ from mavbridge.recording.meta import write_meta
 CONNECT = ("--connect", "udp:127.0.0.1:14999")
 
 
-def test_the_gate_only_listens_and_asks_for_the_pilots_sticks_at_the_rate(tmp_path: Path) -> None:
+def test_the_guard_only_listens_and_asks_for_the_pilots_sticks_at_the_rate(tmp_path: Path) -> None:
     config = RecordConfig(out=tmp_path, vehicle=ListenConfig(connect="udp:x:1"), rate=50.0)
-    gate = listening_gate(config, MonotonicClock())
-    assert gate.link.readonly
-    assert (gate.link.pilot_hz, gate.link.state_hz) == (50.0, 50.0)
-    flight = plan_flight(pilot_flight(config), CONTRACT, is_dual=True).gate
+    guard = listening_guard(config, MonotonicClock())
+    assert guard.link.readonly
+    assert (guard.link.pilot_hz, guard.link.state_hz) == (50.0, 50.0)
+    flight = plan_flight(pilot_flight(config), CONTRACT, is_dual=True).guard
     assert flight.engagement.readonly
     assert flight.stick_period_ns == NS_PER_S // 50
     assert flight.meaning.stick_gains is not None, "the vehicle's sticks in a policy's terms"

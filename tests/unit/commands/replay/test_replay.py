@@ -25,7 +25,7 @@ from mavbridge.simulation.replay.recording import open_source
 NUMPY = FLIGHTS / "numpy_px4"
 
 
-def test_the_recorded_chunks_through_the_gate_are_equal_bit_for_bit(
+def test_the_recorded_chunks_through_the_guard_are_equal_bit_for_bit(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     written = tmp_path / "replay.json"
@@ -35,11 +35,11 @@ def test_the_recorded_chunks_through_the_gate_are_equal_bit_for_bit(
     assert "EQUAL, bit for bit" in capsys.readouterr().out
     document = json.loads(written.read_text())
     assert document["is_equal"] is True
-    assert document["gate"]["differ"] == {}
+    assert document["guard"]["differ"] == {}
     assert document["policy"] is None
 
 
-def test_a_gate_that_smooths_differently_is_found_out(
+def test_a_guard_that_smooths_differently_is_found_out(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     folder = copied("numpy_px4", tmp_path)
@@ -50,7 +50,7 @@ def test_a_gate_that_smooths_differently_is_found_out(
     assert replay(folder, ReplayConfig(source="chunks")) == ExitCode.DIFFERENT
 
     shown = capsys.readouterr().out
-    assert "the gate came out differently, first in the raw of tick" in shown
+    assert "the guard came out differently, first in the raw of tick" in shown
     assert "NOT EQUAL" in shown
 
 

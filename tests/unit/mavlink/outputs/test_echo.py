@@ -94,7 +94,7 @@ class World:
 
     def _step(self) -> None:
         if self._is_due("send", self.send_hz, 0.2) and self.is_sending:
-            pwm_us = self.echo.with_nudge(self.sticks(self.now_ns), self.now_ns)
+            pwm_us = self.echo.with_dither(self.sticks(self.now_ns), self.now_ns)
             self.echo.sent(pwm_us, self.now_ns)
             self._post("stick", pwm_us)
         if self._is_due("joystick", self.joystick_hz, 1.0):
@@ -384,13 +384,13 @@ def test_a_vehicle_that_ignores_us_is_not_taken_for_one_whose_sticks_rest_where_
 
 
 @pytest.mark.parametrize("roll_us", [1100, 1499, 1500, 1501, 1900])
-def test_the_nudge_walks_towards_the_middle_and_shrinks_once_confirmed(roll_us: int) -> None:
+def test_the_dither_walks_towards_the_middle_and_shrinks_once_confirmed(roll_us: int) -> None:
     echo, pwm_us = EchoCheck(OVERRIDE_ECHO), (1500, 1500, 1500, roll_us)
     inwards = 1 if roll_us <= 1500 else -1
-    for step_us in (OVERRIDE_ECHO.seek_nudge, OVERRIDE_ECHO.nudge):
-        nudged = [echo.with_nudge(pwm_us, k * 10 * MS) for k in range(30)]
-        assert {pwm[:3] for pwm in nudged} == {(1500, 1500, 1500)}
-        assert {pwm[3] for pwm in nudged} == {roll_us + k * inwards * step_us for k in range(3)}
+    for step_us in (OVERRIDE_ECHO.seek_dither, OVERRIDE_ECHO.dither):
+        dithered = [echo.with_dither(pwm_us, k * 10 * MS) for k in range(30)]
+        assert {pwm[:3] for pwm in dithered} == {(1500, 1500, 1500)}
+        assert {pwm[3] for pwm in dithered} == {roll_us + k * inwards * step_us for k in range(3)}
         echo.received(RECEIVER, 1, 0)
         echo.sent(pwm_us, 1)
         echo.received(pwm_us, 2, 2)
@@ -444,7 +444,7 @@ def test_a_release_without_a_receiver_is_never_confirmed() -> None:
     assert world.run(5.0) is None
     assert not world.echo.is_released
     assert world.echo.shows_last
-    world.engage()  # the sticks of before are our own: the nudge tells them apart
+    world.engage()  # the sticks of before are our own: the dither tells them apart
     assert world.run(2.0) is None
 
 

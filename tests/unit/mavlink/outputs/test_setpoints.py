@@ -236,7 +236,7 @@ def test_where_no_echo_is_to_be_expected_none_is_missed(state: str) -> None:
         assert flight.problem is None
         assert flight.output.echo_confirmed
     if state == "idle":
-        assert message.thrust == 0.0  # not nudged: the motors stay idle
+        assert message.thrust == 0.0  # not dithered: the motors stay idle
 
 
 def test_the_receiver_is_seen_beside_our_setpoints() -> None:

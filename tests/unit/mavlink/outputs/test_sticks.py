@@ -69,7 +69,7 @@ def test_sticks_mean_to_the_vehicle_what_they_meant_in_training() -> None:
     message = mapped.message(encoded)
     curves = PX4.stick_curves(PX4_VALUES, "ALTCTL", StickGains())
     throttle, yaw, pitch, roll = curves.to_vehicle(WANTED)
-    assert abs(message.r - 1000 * yaw) <= 9  # and the nudge
+    assert abs(message.r - 1000 * yaw) <= 9  # and the dither
     expected = (1000 * pitch, 1000 * roll, 500 * (throttle + 1))
     assert (message.x, message.y, message.z) == pytest.approx(expected, abs=0.51)
     assert yaw > 2 * WANTED.yaw

@@ -1,4 +1,4 @@
-"""The parity gate: which engine flies, and what is said of the others."""
+"""The parity check: which engine flies, and what is said of the others."""
 
 import re
 from collections.abc import Callable

@@ -107,7 +107,7 @@ def test_every_precision_of_this_cpu_is_near(
     expected = chunks_of_samples(make_torch_executable(trained_toge, SETTINGS), samples)
     for (vision, _), executable in shipped.items():
         assert executable.engine.startswith(f"openvino-{vision}")
-        # Three significant digits of bfloat16; whether that is near enough the gate decides.
+        # Three significant digits of bfloat16; whether that is near enough the check decides.
         assert np.abs(chunks_of_samples(executable, samples) - expected).max() < 0.05
 
 

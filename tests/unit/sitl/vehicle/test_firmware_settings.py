@@ -114,9 +114,9 @@ def test_a_dead_zone_is_dead(dead_zone_us, is_dead):
 
 
 def test_the_throttle_s_dead_zone_too():
-    nudged = CENTRED._replace(throttle=0.3)
-    assert hold(nudged).velocity_ned_mps[2] < -0.1
-    assert abs(hold(nudged, throttle_dead_zone_permille=180.0).velocity_ned_mps[2]) < 0.02
+    dithered = CENTRED._replace(throttle=0.3)
+    assert hold(dithered).velocity_ned_mps[2] < -0.1
+    assert abs(hold(dithered, throttle_dead_zone_permille=180.0).velocity_ned_mps[2]) < 0.02
 
 
 @pytest.mark.parametrize(("stick", "speed_mps"), [(1.0, -3.2), (-1.0, 1.8)])

@@ -1,0 +1,232 @@
+"""The guard process as its parent sees it: started, fed with chunks, listened to, waited for."""
+
+import os
+import select
+import socket
+import subprocess
+import sys
+import threading
+from contextlib import suppress
+
+from mavbridge.core.address import SocketAddress
+from mavbridge.core.clock import NS_PER_MS, NS_PER_S, Clock
+from mavbridge.core.errors import ExitCode, MavbridgeError, PeerError, UserError
+from mavbridge.core.processes import child_environment
+from mavbridge.flight.telemetry_cache import TelemetryCache
+from mavbridge.guard.channel import SocketPort, channel_pair
+from mavbridge.guard.engagement import Phase
+from mavbridge.guard.settings import GuardSettings
+from mavbridge.guard.wire import (
+    FromGuard,
+    GuardError,
+    GuardSummary,
+    GuardTick,
+    LastWords,
+    ToGuard,
+    decode_from_guard,
+    encode_to_guard,
+)
+
+LISTEN_S = 0.1
+"""Longest wait for a message before the stop flag is checked."""
+OPEN_S = 20.0
+"""Longest wait for a guard to start and to open the link: it imports little, and TCP is given three
+seconds, but the machine may be busy."""
+CLOSE_S = 5.0
+"""Longest wait for a guard that holds no sticks to end and free its port."""
+
+
+REAP_S = 0.2
+"""Longest wait for a guard whose channel is closed to be gone: nothing is sent while it lives."""
+LATEST_NS = 500 * NS_PER_MS
+"""Oldest sign of life of a guard that is spoken for: a vehicle may have left our sticks since, by
+its own timeout or by its pilot."""
+_STILL_OURS = (Phase.FLYING, Phase.LEAVING, Phase.HOLDING)
+OWN_TIMEOUT = (
+    "the vehicle keeps the last sticks or setpoint until its own timeout (ArduPilot: "
+    "RC_OVERRIDE_TIME, GUID_TIMEOUT; PX4: COM_RC_LOSS_T, COM_OF_LOSS_T)"
+)
+
+
+class GuardDiedError(MavbridgeError):
+    """The guard process is gone without having ended in order."""
+
+    exit_code = ExitCode.FAULT
+
+
+class GuardProcess:
+    """Starts the guard; ``send`` may be called by any thread, ``listen`` runs in one of its own."""
+
+    def __init__(self, settings: GuardSettings, clock: Clock) -> None:
+        """Start the process; it looks for the vehicle from then on."""
+        ours, theirs = channel_pair()
+        self._clock = clock
+        self._port = SocketPort(ours, takes_files=True)
+        self._words: LastWords | None = None
+        self._outlet: int | None = None
+        """The guard's open socket or port, while the vehicle is held."""
+        self._newest: GuardTick | None = None
+        self._lock = threading.Lock()
+        self._process = _spawn(theirs, settings)
+        theirs.close()
+        self._early: list[FromGuard] = []
+        """Messages that came before ``listen``."""
+        self.summary: GuardSummary | None = None
+        """The guard's last words; None until it has ended in order."""
+        self.error: MavbridgeError | None = None
+        """Why the guard could not go on."""
+        self.send(settings)
+
+    @property
+    def pid(self) -> int:
+        """Process id."""
+        return self._process.pid
+
+    def send(self, message: ToGuard) -> bool:
+        """Hand over a message; False: it was dropped. Never waits for the guard."""
+        with self._lock:
+            return self._port.send(encode_to_guard(message))
+
+    def wait_until_open(self, timeout_s: float = OPEN_S) -> None:
+        """Wait for its first word, which says that the link is open; called before ``listen``.
+
+        Raises:
+            PeerError, UserError: the address of the vehicle cannot be used.
+            GuardDiedError: it has ended at once, or says nothing in time.
+        """
+        if not select.select([self._port], [], [], timeout_s)[0]:
+            raise GuardDiedError(f"the guard process has said nothing for {timeout_s:g} s")
+        self._early = [decode_from_guard(data) for data in self._port.receive()]
+        for message in self._early:
+            if isinstance(message, GuardError):
+                raise _as_exception(message)
+        if not self._early and self._port.is_closed:
+            raise GuardDiedError("the guard process has ended before it opened the link")
+
+    def listen(self, stop: threading.Event, view: TelemetryCache) -> None:
+        """Pass the guard's messages to ``view`` until it ends or ``stop`` is set.
+
+        Raises:
+            GuardDiedError: the guard has ended without its summary.
+            PeerError, UserError: the reason that the guard gave.
+        """
+        early, self._early = self._early, []
+        for message in early:
+            self._take(message, view)
+        while not stop.is_set():
+            select.select([self._port], [], [], LISTEN_S)
+            for data in self._port.receive():
+                self._take(decode_from_guard(data), view)
+            if self._port.is_closed:
+                break
+        if self.error is not None:
+            raise self.error
+        if self.summary is None and not stop.is_set():
+            left = self._speak()
+            signal = -(self._process.returncode or 0)
+            by = f" (signal {signal})" if signal > 0 else ""
+            raise GuardDiedError(f"the guard process has died{by}: {left}")
+        if self.summary is not None and self.summary.failure is not None:
+            raise PeerError(str(self.summary.failure))
+
+    def _take(self, message: FromGuard, view: TelemetryCache) -> None:
+        match message:
+            case GuardSummary():
+                self.summary = message
+            case GuardError():
+                self.error = _as_exception(message)
+            case LastWords():
+                self._keep(message)
+            case GuardTick():
+                self._newest = message
+                view.receive(message)
+            case _:
+                view.receive(message)
+
+    def _keep(self, words: LastWords) -> None:
+        """Take the guard's last words, and the file through which they leave."""
+        self._words = words
+        if words.brings_file or not words.packets:
+            self._close_outlet()
+        if words.brings_file and self._port.files:
+            self._outlet = self._port.files.popleft()
+
+    def _close_outlet(self) -> None:
+        if self._outlet is not None:
+            os.close(self._outlet)
+            self._outlet = None
+
+    def _speak(self) -> str:
+        """Send the last words of a guard that is gone once; return what was done, for the user."""
+        died_ns, words, newest = self._clock.now_ns(), self._words, self._newest
+        if words is None or newest is None or not words.packets:
+            return "it held no sticks"
+        if newest.phase is not words.phase and newest.phase not in _STILL_OURS:
+            return "it had given the sticks back"
+        if not self.wait(REAP_S):
+            return f"it does not end, so nothing was sent in its place; {OWN_TIMEOUT}"
+        silent_ns = self._clock.now_ns() - newest.sent_ns
+        if silent_ns > LATEST_NS:
+            silent_s = silent_ns / NS_PER_S
+            return f"silent for {silent_s:.1f} s, too long to speak for it; {OWN_TIMEOUT}"
+        sent = 0
+        for after_ns, packet in words.packets:
+            self._clock.sleep_until_ns(died_ns + after_ns)
+            sent += self._transmit(packet, words.receiver)
+        if sent == 0:
+            return f"its last words could not be sent; {OWN_TIMEOUT}"
+        asked = f", and {words.mode} asked for" if words.mode else ""
+        return (
+            f"its last words were sent in its place (neutral{asked}), but nobody hears the answer: "
+            "take the vehicle over"
+        )
+
+    def _transmit(self, packet: bytes, receiver: SocketAddress | None) -> bool:
+        """Send one packet through the guard's socket or port; never waits."""
+        if self._outlet is None:
+            return False
+        with suppress(OSError):
+            if receiver is None:
+                return os.write(self._outlet, packet) == len(packet)
+            with socket.socket(fileno=os.dup(self._outlet)) as udp:
+                return udp.sendto(packet, receiver) == len(packet)
+        return False
+
+    def wait(self, timeout_s: float) -> bool:
+        """Wait for the process to end by itself; returns whether it has."""
+        try:
+            self._process.wait(timeout_s)
+        except subprocess.TimeoutExpired:
+            return False
+        return True
+
+    def close(self) -> None:
+        """Close the channel: a guard that still runs takes it for our death, and ends by itself."""
+        self._port.close()
+        self.wait(CLOSE_S)
+        self._close_outlet()
+
+
+def _spawn(end: socket.socket, settings: GuardSettings) -> subprocess.Popen[bytes]:
+    passed = [end.fileno()] + ([] if settings.tlog_fd is None else [settings.tlog_fd])
+    return subprocess.Popen(
+        [sys.executable, "-m", "mavbridge.guard", str(end.fileno())],
+        env=child_environment(),
+        stdin=subprocess.DEVNULL,
+        stdout=subprocess.DEVNULL,
+        stderr=subprocess.DEVNULL,
+        pass_fds=passed,
+        start_new_session=True,  # the terminal's signals are not for the guard
+    )
+
+
+def _as_exception(error: GuardError) -> MavbridgeError:
+    match error.kind:
+        case "user":
+            return UserError(error.text)
+        case "peer":
+            return PeerError(error.text)
+        case "bug":
+            return GuardDiedError(
+                f"the guard process has failed, a bug of mavbridge:\n{error.text}"
+            )

@@ -1,0 +1,219 @@
+"""The vehicle and the sticks as the flight process knows them, from the guard's messages."""
+
+import logging
+import threading
+from collections import OrderedDict
+from collections.abc import Callable
+from itertools import groupby
+from typing import NamedTuple
+
+from mavbridge.core.clock import NS_PER_S
+from mavbridge.core.ports import TickSink
+from mavbridge.core.reasons import Reason
+from mavbridge.core.records import Position, Tick, VehicleState
+from mavbridge.core.vehicle import ForwardedPacket, Telemetry
+from mavbridge.flight.history import SentHistory
+from mavbridge.flight.state import Freshness, StateFrame, build_state
+from mavbridge.guard.engagement import Phase
+from mavbridge.guard.wire import (
+    FromGuard,
+    GuardError,
+    GuardMessage,
+    GuardStatus,
+    GuardSummary,
+    GuardTick,
+    LastWords,
+)
+from mavbridge.mavlink.codec.messages import LocalVelocity, Measurement
+from mavbridge.mavlink.codec.packets import Codec
+from mavbridge.mavlink.session.telemetry import TelemetryCollector
+
+_log = logging.getLogger(__name__)
+POSITION_NS = NS_PER_S
+"""Oldest position that a tick tells of; nothing is flown by it."""
+MAX_SOLVES = 256
+"""Chunks whose inputs are remembered until the guard reports that it has flown them."""
+
+
+class SolveInputs(NamedTuple):
+    """Inputs and duration of one chunk."""
+
+    serial: int
+    state: VehicleState
+    feature_frame_id: int
+    feature_captured_ns: int
+    computed_ns: int
+    predict_ns: int
+
+
+class TelemetryCache:
+    """Telemetry, sent sticks and phase; turns the guard's reports into ticks.
+
+    One thread calls ``receive``, another one reads; simulation does both in one.
+    """
+
+    def __init__(
+        self,
+        *,
+        history: SentHistory,
+        sink: TickSink,
+        state_frame: StateFrame,
+        freshness: Freshness,
+        on_attitude: Callable[[], object] = lambda: None,
+        watch_packets: Callable[[tuple[ForwardedPacket, ...]], object] = lambda packets: None,
+    ) -> None:
+        """Start without a vehicle.
+
+        Args:
+            history: takes every stick that was sent.
+            sink: takes a tick for every send, and for every slot without one.
+            state_frame: frame of the states in ticks in which the policy does not fly.
+            freshness: oldest readings that such a state may have.
+            on_attitude: called for each new attitude, in the thread of ``receive``.
+            watch_packets: is given the packets afterwards, in the same thread; must not block.
+        """
+        self._history = history
+        self._sink = sink
+        self._state_frame = state_frame
+        self._freshness = freshness
+        self._on_attitude = on_attitude
+        self._watch_packets = watch_packets
+        self._codec = Codec(source_system=0, source_component=0)
+        self._telemetry = TelemetryCollector()
+        self._solves: OrderedDict[int, SolveInputs] = OrderedDict()
+        self._news = threading.Condition()
+        self._serial = 0
+        self._texts: list[str] = []
+        self.status = GuardStatus("none", None, False, None, (), None)
+        self.height_m: float | None = None
+        """Above the estimator's origin, where it has a position."""
+        self._was_flown = False
+        """The policy moved the sticks at the last tick."""
+        self.phase = Phase.WAITING
+        self.reason: Reason | None = None
+        self.starting_ns = 0
+        """The policy is to be reset for a flight, as of then; 0: it is not."""
+        self.flights = 0
+        """Number of times that the policy took the sticks."""
+
+    # --- the reader's side
+
+    def telemetry(self) -> Telemetry:
+        """The newest reading of each quantity."""
+        return self._telemetry.snapshot()
+
+    @property
+    def is_airborne(self) -> bool:
+        """The policy flies, and the vehicle says that it is not landed."""
+        return self.phase is Phase.FLYING and self.status.is_landed is False
+
+    @property
+    def attitude_ns(self) -> int:
+        """Arrival of the newest attitude; 0 before the first."""
+        return self._telemetry.attitude_arrived_ns
+
+    def wait_for_attitude(self, *, newer_than_ns: int, timeout_ns: int) -> bool:
+        """Wait for an attitude that arrived after ``newer_than_ns``; False: none came in time."""
+        with self._news:
+            return self._news.wait_for(
+                lambda: self.attitude_ns > newer_than_ns, timeout_ns / NS_PER_S
+            )
+
+    def remember(self, solve: SolveInputs) -> None:
+        """Keep the inputs of a chunk for the ticks that will be flown by it."""
+        self._solves[solve.serial] = solve
+        if len(self._solves) > MAX_SOLVES:
+            self._solves.popitem(last=False)
+
+    # --- the guard's side
+
+    def take_texts(self) -> tuple[str, ...]:
+        """Lines for the user that no tick has carried yet."""
+        texts, self._texts = tuple(self._texts), []
+        return texts
+
+    def receive(self, message: FromGuard) -> None:
+        """Take one message of the guard."""
+        match message:
+            case GuardTick():
+                self._receive_tick(message)
+            case GuardStatus():
+                if message[:4] != self.status[:4]:
+                    _log.debug("vehicle: %s, %s, armed %s, landed %s", *message[:4])
+                self.status = message
+            case GuardMessage(text):
+                self._texts.append(text)
+            case GuardError() | GuardSummary() | LastWords():
+                pass  # its end is the business of whoever has started it
+            case packets:
+                self._receive_packets(packets)
+
+    def _receive_packets(self, packets: tuple[ForwardedPacket, ...]) -> None:
+        before_ns = self.attitude_ns
+        for _, datagram in groupby(packets, key=lambda packet: packet.arrived_ns):
+            known_ns = self.attitude_ns
+            for arrived_ns, happened_ns, data in datagram:
+                for message in self._codec.decode_datagram(data):
+                    if isinstance(message.body, Measurement):
+                        self._telemetry.receive(message.body, arrived_ns, happened_ns)
+                        if isinstance(message.body, LocalVelocity) and message.body.position_ned_m:
+                            self.height_m = -message.body.position_ned_m[2]
+            # After each datagram: which of them came in one batch is not in a recording.
+            if self.attitude_ns != known_ns:
+                self._on_attitude()
+        if self.attitude_ns != before_ns:
+            with self._news:
+                self._news.notify_all()
+        self._watch_packets(packets)
+
+    def _receive_tick(self, tick: GuardTick) -> None:
+        if tick.phase is Phase.FLYING and self.phase is not Phase.FLYING:
+            self.flights += 1
+        self.phase, self.reason = tick.phase, tick.reason
+        self.starting_ns = tick.starting_ns
+        self._history.append(tick.sent, tick.sent_ns)
+        self._sink.emit(self._join(tick))
+        self._was_flown = tick.trace is not None
+        self._serial += 1
+
+    def _state_at(self, now_ns: int) -> VehicleState | None:
+        state = build_state(
+            self.telemetry(), now_ns, frame=self._state_frame, freshness=self._freshness
+        )
+        return state if isinstance(state, VehicleState) else None
+
+    def _join(self, sent: GuardTick) -> Tick:
+        """The guard's report together with the inputs of the chunk that was flown."""
+        solve = None if sent.chunk_serial is None else self._solves.get(sent.chunk_serial)
+        state = solve.state if solve else self._state_at(sent.sent_ns)
+        position = self._telemetry.snapshot().position_ned_m
+        is_placed = position is not None and sent.sent_ns - position.arrived_ns <= POSITION_NS
+        texts = self.take_texts()
+        is_flown = sent.phase is Phase.FLYING
+        return Tick(
+            serial=self._serial,
+            index=sent.index,
+            due_ns=sent.due_ns,
+            woke_ns=sent.woke_ns,
+            decided_ns=sent.decided_ns,
+            missed_slots=sent.missed_slots if self._was_flown and sent.trace else 0,
+            predict_ns=solve.predict_ns if solve else None,
+            sent_ns=sent.sent_ns,
+            feature_frame_id=solve.feature_frame_id if solve else None,
+            feature_captured_ns=solve.feature_captured_ns if solve else None,
+            state=state,
+            trace=sent.trace,
+            sent=sent.sent,
+            release_reason=None if is_flown else sent.reason,
+            mode=self.status.mode,
+            armed=self.status.armed,
+            rc_channels_us=self.status.rc_channels_us,
+            rc_sticks=self.status.rc_sticks,
+            texts=texts,
+            is_slot=sent.is_slot,
+            chunk_serial=sent.chunk_serial,
+            is_coasting=sent.is_coasting,
+            phase=sent.phase.value,
+            chunk_computed_ns=solve.computed_ns if solve else None,
+            position_ned_m=Position(*position.values) if position and is_placed else None,
+        )

@@ -1,0 +1,134 @@
+"""The guard process: ``python -m mavbridge.guard FD``, started by the flight process.
+
+It prints nothing, since whatever reads its output might not: messages and errors go through the
+channel, file descriptor FD.
+"""
+
+import select
+import signal
+import socket
+import sys
+import traceback
+
+from mavbridge.core.clock import NS_PER_MS, NS_PER_S, MonotonicClock
+from mavbridge.core.errors import MavbridgeError, UserError
+from mavbridge.core.realtime import settle_guard
+from mavbridge.core.reasons import Code, because
+from mavbridge.guard.channel import SocketPort
+from mavbridge.guard.departure import Ending
+from mavbridge.guard.loop import GuardLoop
+from mavbridge.guard.settings import GuardSettings
+from mavbridge.guard.wire import (
+    GuardError,
+    GuardMessage,
+    GuardSummary,
+    decode_to_guard,
+    encode_from_guard,
+)
+from mavbridge.mavlink.codec.signing import Signing
+from mavbridge.mavlink.link import MavlinkLink
+from mavbridge.mavlink.transport.packet_pipe import PacketPipe
+from mavbridge.mavlink.transport.signing_files import SigningStore
+from mavbridge.mavlink.transport.sockets import make_transport
+
+SETTINGS_TIMEOUT_S = 5.0
+LAST_WORDS_S = 2.0
+"""Time for a busy flight process to take the guard's last message; the sticks are given back."""
+LEAD_NS = 250 * NS_PER_MS // 1000
+"""Sticks are decided this long before their slot: the work before a send takes 0.15 ms or more. A
+chunk that comes meanwhile waits for the slot."""
+_SURVIVED = ("SIGINT", "SIGHUP", "SIGTSTP", "SIGTTIN", "SIGTTOU")
+"""Signals of the terminal, which end or stop the flight process: the guard outlives it."""
+
+
+def main() -> None:
+    """Serve one flight process until the sticks are given back."""
+    for name in _SURVIVED:
+        signal.signal(getattr(signal, name), signal.SIG_IGN)
+    port = SocketPort(socket.socket(fileno=int(sys.argv[1])))
+    select.select([port], [], [], SETTINGS_TIMEOUT_S)
+    first, *later = port.receive() or [b""]
+    settings = decode_to_guard(first) if first else None
+    if not isinstance(settings, GuardSettings):
+        sys.exit("the flight process sent no settings")
+    try:
+        _run(settings, port, later)
+    except MavbridgeError as error:
+        is_user = isinstance(error, UserError)
+        reason = GuardError("user" if is_user else "peer", str(error))
+        port.finish(encode_from_guard(reason), LAST_WORDS_S)
+        sys.exit(1)
+    except Exception:  # noqa: BLE001 - told to the flight process, which shows it
+        port.finish(encode_from_guard(GuardError("bug", traceback.format_exc())), LAST_WORDS_S)
+        sys.exit(2)
+
+
+def _run(settings: GuardSettings, port: SocketPort, received: list[bytes]) -> None:
+    clock, files = MonotonicClock(), settings.link.signing
+    if files is None:
+        _fly(settings, port, received, clock, None)
+        return
+    store = SigningStore(files, clock)
+    with store as signing:
+        if store.problem is not None:
+            port.send(encode_from_guard(GuardMessage(store.problem)))
+        _fly(settings, port, received, clock, signing)
+
+
+def _fly(
+    settings: GuardSettings,
+    port: SocketPort,
+    received: list[bytes],
+    clock: MonotonicClock,
+    signing: Signing | None,
+) -> None:
+    log = None
+    if settings.tlog_fd is not None:
+        log = PacketPipe(settings.tlog_fd, wall_offset_ns=settings.wall_offset_ns)
+    transport = make_transport(settings.link.connect, clock)
+    link = MavlinkLink(
+        transport,
+        clock,
+        settings.link,
+        packet_log=log,
+        forward=lambda p: loop.forward(p),
+        signing=signing,
+    )
+    loop = GuardLoop(clock, link, port, received=received, lead_ns=LEAD_NS)
+    told = Ending(reason=because(Code.TOLD_TO_END))
+    signal.signal(signal.SIGTERM, lambda *_: loop.stop(told))
+    refusal = settle_guard(realtime=settings.realtime, cpu=settings.cpu)
+    if refusal is not None:
+        port.send(encode_from_guard(GuardMessage(refusal)))
+    try:
+        _serve(loop, clock, port, link)
+    except BaseException:
+        loop.abandon()
+        raise
+    finally:
+        link.close()
+    summary = GuardSummary(
+        autopilot=link.autopilot,
+        link=link.stats(),
+        failure=loop.failure,
+        outcome=loop.outcome,
+        params=dict(link.known_params),
+        dropped_messages=port.dropped,
+        dropped_packets=log.dropped if log else 0,
+    )
+    port.finish(encode_from_guard(summary), LAST_WORDS_S)
+
+
+def _serve(loop: GuardLoop, clock: MonotonicClock, port: SocketPort, link: MavlinkLink) -> None:
+    """Step at every arrival and whenever something is due, until the loop is done."""
+    while not loop.is_done:
+        due_ns = loop.step()
+        ends = (None if port.is_closed else port.fileno(), link.fileno())
+        files = [end for end in ends if end is not None]
+        timeout_ns = due_ns - clock.now_ns()
+        if timeout_ns > 0:
+            select.select(files, [], [], timeout_ns / NS_PER_S)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,374 @@
+"""The guard without I/O: what the link and the policy say goes in, what the sticks do comes out.
+
+One class for the guard process, the simulation and the tests. It never waits: every wait is a
+state, and the caller steps it whenever something has arrived and at ``next_ns``.
+"""
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+from mavbridge.core.clock import NS_PER_MS, NS_PER_S
+from mavbridge.core.reasons import Code, Reason, because
+from mavbridge.core.vehicle import (
+    Action,
+    ActionMeaning,
+    ActionTrace,
+    Command,
+    Decision,
+    LinkSnapshot,
+    Output,
+    Reading,
+    Release,
+    Sticks,
+)
+from mavbridge.guard.chunks import Chunk, ChunkBuffer, FreshnessLimits, Lateness
+from mavbridge.guard.departure import Ending
+from mavbridge.guard.engagement import Act, Engagement, EngagementSettings, Phase
+from mavbridge.guard.envelope import Envelope, EnvelopeInput, EnvelopeLimits
+from mavbridge.guard.facts import Facts, Hand, Move
+from mavbridge.guard.grid import Slot, StickGrid
+from mavbridge.guard.limits import first_action, idle_action, neutral_action
+from mavbridge.guard.outcome import Outcome
+from mavbridge.guard.smoothing import ActionSmoother, Smoothing
+
+PILOT_FRESH_NS = 500 * NS_PER_MS
+"""Oldest RC_CHANNELS that still tells where the pilot's sticks are."""
+STOOD_STILL_NS = 60 * NS_PER_MS
+"""A step this late, beyond the slowest grid, says that the guard stood still, and heard nobody."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class FlightSettings:
+    """Settings of a flight, known once its policy is loaded."""
+
+    meaning: ActionMeaning
+    output: Output | None = None
+    """Message that carries the actions; None = the usual one of their kind and the vehicle."""
+    stick_period_ns: int
+    chunk_period_ns: int
+    """Between the policy's chunks."""
+    freshness: FreshnessLimits
+    smoothing: Smoothing
+    envelope: EnvelopeLimits
+    engagement: EngagementSettings
+    watches_home_height: bool
+    """The policy takes the height above home, which the vehicle is asked for then."""
+    watches_position: bool
+    """It takes a position: the flight process is told whether there is one to be trusted."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class GuardInput:
+    """Everything that has arrived since the last step."""
+
+    link: LinkSnapshot
+    chunk: Chunk | None = None
+    absence: Reason | None = None
+    """Why the flight process cannot compute a chunk."""
+    act: Act | None = None
+    stop: Ending | None = None
+    command_fault: Reason | None = None
+    """Error while the last command was made or sent."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class GuardOutput:
+    """Actions to take now, in this order: sticks, requests, messages."""
+
+    decision: Decision | None
+    """None: send nothing now."""
+    slot: Slot | None
+    """The slot of the stick grid that this step serves; None between slots."""
+    trace: ActionTrace | None
+    """The policy's action on its way to ``decision``; None where the policy does not move them."""
+    chunk_serial: int | None
+    is_coasting: bool
+    phase: Phase
+    reason: Reason | None
+    """Why the policy does not fly; None while it does."""
+    mode: str | None
+    """Flight mode to request."""
+    arm: bool
+    takeoff_m: float | None
+    """Height to which the autopilot is to climb by its own means, to request."""
+    messages: tuple[str, ...]
+    """For the user."""
+    starting_ns: int
+    """The policy gets the sticks with its first chunk after a reset from then on; 0: not now."""
+
+
+class Guard:
+    """Decides at each moment whether sticks leave, and which."""
+
+    def __init__(self, settings: FlightSettings, now_ns: int) -> None:
+        self._chunks = ChunkBuffer(
+            settings.freshness, period_ns=settings.chunk_period_ns, kind=settings.meaning.kind
+        )
+        self._meaning = settings.meaning
+        self._neutral, self._idle = neutral_action(self._meaning), idle_action(self._meaning)
+        self._smoother = ActionSmoother(settings.smoothing, self._neutral)
+        self._lead_ns = round(settings.smoothing.tau_s * NS_PER_S)
+        """A chunk is sampled this far ahead of the send, but not beyond its end: the lag of our own
+        low-pass."""
+        self._envelope = Envelope(settings.envelope)
+        self._engagement = Engagement(settings.engagement, chunk_period_ns=settings.chunk_period_ns)
+        self._grid = StickGrid(settings.stick_period_ns, now_ns)
+        self._stepped_ns = self._heard_ns = now_ns
+        """The last step; the last one after which the guard can tell silence of the vehicle."""
+        self._hand: Hand | None = None
+        self._facts_seen: Facts | None = None
+        """Those of the last step."""
+        self._last = self._neutral
+        """As last sent."""
+        self._is_readonly = settings.engagement.readonly
+        self._messages: list[str] = []
+
+    @property
+    def next_ns(self) -> int:
+        """When to step again at the latest: the next slot."""
+        return self._grid.next_ns
+
+    @property
+    def phase(self) -> Phase:
+        """State of the engagement."""
+        return self._engagement.phase
+
+    @property
+    def failure(self) -> Reason | None:
+        """Why there was no flight, or None."""
+        return self._engagement.failure
+
+    @property
+    def outcome(self) -> Outcome:
+        """How the flights went so far."""
+        return self._engagement.outcome
+
+    def rehearse(self) -> Iterator[tuple[int, Decision | None, str | None]]:
+        """Yield the decisions and the modes to ask for, with their delays in ns, that end the
+        flight if the guard dies now."""
+        if self._facts_seen is None:
+            return
+        for after_ns, move in self._engagement.rehearse(self._facts_seen):
+            yield after_ns, self._at_rest(move.hand), move.mode
+
+    def unsent(self) -> None:
+        """The last decision did not leave: the next one starts from what left before it."""
+        if not self._is_readonly:
+            self._smoother.undo()
+
+    def step(self, now_ns: int, given: GuardInput) -> GuardOutput:
+        """Advance to this moment."""
+        # Judged before the news: a guard that stood still itself has let the grace run out.
+        stood_ns, self._stepped_ns = now_ns - self._stepped_ns, now_ns
+        overdue = self._overdue(now_ns, stood_ns, given)
+        has_news = given.chunk is not None and self._chunks.offer(given.chunk, now_ns)
+        if given.absence is not None:
+            self._chunks.explain_absence(given.absence, now_ns)
+        if given.stop is not None:
+            self._engagement.stop(given.stop)
+        phase_before = self._engagement.phase
+        silence = self._silence(now_ns, stood_ns, given.link.telemetry.ned_from_body_wxyz)
+        facts = self._facts_seen = self._facts(now_ns, given, overdue or silence)
+        move = self._engagement.step(facts, given.act)
+        self._change_hand(move.hand, now_ns, given.link)
+        phase = self._engagement.phase
+        # A slot that was just served is left out; a new chunk and a change of hands leave at once.
+        slot = self._grid.take(now_ns)
+        is_urgent = phase is not phase_before or (has_news and move.hand is Hand.POLICY)
+        decision, trace = None, None
+        if slot is not None or is_urgent:
+            self._grid.serve(now_ns)
+            is_thrust = facts.mode in facts.modes.thrust
+            decision, trace = self._decide(move, now_ns, is_thrust=is_thrust)
+        newest = self._chunks.newest
+        return GuardOutput(
+            decision=decision,
+            slot=slot,
+            trace=trace,
+            chunk_serial=newest.serial if trace is not None and newest is not None else None,
+            is_coasting=trace is not None and self._chunks.is_coasting(now_ns),
+            phase=phase,
+            reason=self._engagement.reason,
+            mode=move.mode,
+            arm=move.arm,
+            takeoff_m=move.takeoff_m,
+            messages=self._take_messages(),
+            starting_ns=self._engagement.starting_ns or 0,
+        )
+
+    def _silence(self, now_ns: int, stood_ns: int, attitude: Reading | None) -> Reason | None:
+        """Why the flight must end now, or None: a plan bridges a stall of ours, not a dead link."""
+        if stood_ns > STOOD_STILL_NS:
+            self._heard_ns = now_ns
+        limit_ns = self._chunks.grace_ns
+        if attitude is None or now_ns - max(self._heard_ns, attitude.arrived_ns) <= limit_ns:
+            return None
+        age_ns = now_ns - attitude.arrived_ns
+        return Lateness("attitude", age_ns, limit_ns, "link", age_ns).reason
+
+    def _overdue(self, now_ns: int, stood_ns: int, given: GuardInput) -> Reason | None:
+        """Which input of the policy's flight is too late, or None."""
+        if self._engagement.phase is not Phase.FLYING or not self._chunks.is_over(now_ns):
+            return None
+        seen = given.link.telemetry
+        readings = {
+            "attitude": (seen.ned_from_body_wxyz, seen.rate_body_radps),
+            "velocity": (seen.velocity_ned_mps, seen.specific_force_body_mps2),
+        }
+        late = self._chunks.lateness(
+            now_ns,
+            stood_ns=stood_ns,
+            heard_ns={
+                name: min(reading.arrived_ns for reading in pair if reading is not None)
+                for name, pair in readings.items()
+                if any(pair)
+            },
+        )
+        if late is None:
+            return None
+        # A chunk from the middle of the time shows that the rest of the computer ran.
+        middle_ns, chunk = now_ns - stood_ns // 2, given.chunk
+        if late.place == "computer" and chunk is not None and chunk.computed_ns > middle_ns:
+            late = late._replace(place="guard")
+        return late.reason
+
+    def _facts(self, now_ns: int, given: GuardInput, overdue: Reason | None) -> Facts:
+        link, left, chunk_fault = given.link, None, given.command_fault or overdue
+        status = link.status
+        if chunk_fault is None and self._engagement.phase is Phase.FLYING:
+            chunk_fault = self._chunks.fault(now_ns)
+        starting_ns, newest = self._engagement.starting_ns, self._chunks.newest
+        reset_ns = 0 if newest is None else newest.reset_ns
+        if status is not None:
+            left = self._envelope.check(EnvelopeInput(now_ns, link.telemetry, status))
+        return Facts(
+            now_ns=now_ns,
+            is_connected=status is not None,
+            link_problem=link.problem,
+            interruption=link.interruption,
+            interruptions=link.interruptions,
+            overruled=link.problem if link.is_overruled else None,
+            is_switched_off=link.is_switched_off,
+            mode=status.mode if status else "unknown",
+            modes=link.modes,
+            armed=status is not None and status.armed,
+            is_failsafe=status is not None and status.is_failsafe,
+            has_receiver=status.has_receiver if status else None,
+            pilot_sticks=status.pilot_sticks if status else None,
+            rc_channels_us=status.rc_channels_us if status else (),
+            heard_ns=_newest(link),
+            mode_ns=status.mode_arrived_ns if status else None,
+            channels_ns=status.channels_arrived_ns if status else None,
+            is_receiver_sick=status is not None and status.is_receiver_sick,
+            is_position_valid=status is not None and status.is_position_valid is not False,
+            height_m=-status.position_ned_m[2] if status and status.position_ned_m else None,
+            is_landed=status.is_landed if status else None,
+            echo_confirmed=link.echo_confirmed,
+            is_released=link.is_released,
+            shows_last=link.shows_last,
+            refused_mode=link.refused_mode,
+            chunk_problem=self._chunks.problem(now_ns),
+            chunk_fault=chunk_fault,
+            command_failed=given.command_fault is not None,
+            are_sticks_at_rest=link.are_sticks_at_rest,
+            stick_override_ns=status.stick_override_ns if status else None,
+            slowness=given.command_fault or self._chunks.impossibility,
+            is_policy_reset=reset_ns >= (now_ns if starting_ns is None else starting_ns),
+            envelope_problem=left.reason if left and left.kind == "fault" else None,
+            landing=left.reason if left and left.kind == "landed" else None,
+        )
+
+    def _change_hand(self, hand: Hand | None, now_ns: int, link: LinkSnapshot) -> None:
+        """When the policy or neutral takes the sticks, start from where they are."""
+        before, self._hand = self._hand, hand
+        if hand is Hand.NEUTRAL and before not in (Hand.POLICY, Hand.NEUTRAL):
+            on_ground = before is Hand.IDLE
+            start = self._idle if on_ground else self._first(link, None)
+            self._smoother.reset(start)  # what an earlier flight left in it counts no longer
+        if hand is not Hand.POLICY or before is Hand.POLICY:
+            return
+        self._envelope.reset()
+        self._messages += self._envelope.unwatched
+        status = link.status
+        if before is Hand.IDLE:
+            self._smoother.reset(self._idle)
+            return
+        pilot: Sticks | None = None
+        if status is not None and status.rc_arrived_ns is not None:
+            is_fresh = now_ns - status.rc_arrived_ns <= PILOT_FRESH_NS
+            pilot = status.pilot_sticks if is_fresh and before is None else None
+        self._smoother.reset(self._first(link, pilot))
+
+    def _first(self, link: LinkSnapshot, pilot: Sticks | None) -> Action:
+        """Where the sticks are now; a velocity only as far as one may be asked for.
+
+        One that is wrong would go on for long: at 5 m/s^2 the way back from 100 m/s takes 20 s.
+        """
+        first = first_action(self._meaning, link.telemetry, pilot)
+        is_velocity = self._meaning.kind == "velocity"
+        return self._smoother.limits.clip(first) if is_velocity else first
+
+    def _decide(
+        self, move: Move, now_ns: int, *, is_thrust: bool
+    ) -> tuple[Decision | None, ActionTrace | None]:
+        """The sticks to send now; those of the policy with their trace.
+
+        ``is_thrust`` says that the throttle stick is thrust in the present mode.
+        """
+        action: Action
+        match move.hand:
+            case None:
+                return None, None
+            case Hand.RELEASE:
+                return Release(self._engagement.reason or because(Code.NOT_ENGAGED)), None
+            case Hand.IDLE:
+                action = self._idle
+            case Hand.NEUTRAL:
+                action = self._neutral
+                if self._meaning.kind == "velocity":  # braked within the limits, not at once
+                    action = self._smoother.step(action, now_ns).smoothed
+            case Hand.LEVEL:
+                action = self._level(is_thrust=True)
+            case Hand.POLICY:
+                raw = self._chunks.action_at(now_ns, self._lead_ns)
+                # Beyond the horizon level sticks bridge the rest of the grace.
+                level = self._level(is_thrust=is_thrust)
+                if raw is None and self._meaning.kind == "rates":  # an attitude: not filtered
+                    trace = ActionTrace(raw=level, clipped=level, slewed=level, smoothed=level)
+                else:
+                    trace = self._smoother.step(raw or level, now_ns)
+                    self._last = trace.smoothed
+                return Command(action=trace.smoothed), trace
+        self._last = action
+        return Command(action=action), None
+
+    def _at_rest(self, hand: Hand | None) -> Decision | None:
+        """What a hand other than the policy's would send now; nothing is noted."""
+        if hand is None:
+            return None
+        if hand is Hand.RELEASE:
+            return Release(self._engagement.reason or because(Code.NOT_ENGAGED))
+        resting = {Hand.IDLE: self._idle, Hand.NEUTRAL: self._neutral}
+        return Command(action=resting.get(hand) or self._level(is_thrust=True))
+
+    def _level(self, *, is_thrust: bool) -> Action:
+        """Neutral, with the last throttle where that is thrust."""
+        neutral, last = self._neutral, self._last
+        if isinstance(neutral, Sticks) and isinstance(last, Sticks) and is_thrust:
+            return neutral._replace(throttle=last.throttle)
+        return neutral
+
+    def _take_messages(self) -> tuple[str, ...]:
+        refusal, self._engagement.refusal = self._engagement.refusal, None
+        if refusal is not None:
+            self._messages.append(str(refusal))
+        messages, self._messages = tuple(self._messages), []
+        return messages
+
+
+def _newest(link: LinkSnapshot) -> int | None:
+    """Arrival of the newest of what comes all the time."""
+    status, attitude = link.status, link.telemetry.ned_from_body_wxyz
+    stamps = (status.mode_arrived_ns, status.channels_arrived_ns) if status else ()
+    arrivals = [stamp for stamp in (*stamps, attitude and attitude.arrived_ns) if stamp is not None]
+    return max(arrivals, default=None)

@@ -1,0 +1,382 @@
+"""The guard with its two edges, the link to the vehicle and the channel to the flight process."""
+
+import traceback
+from collections.abc import Callable, Iterable, Sequence
+from contextlib import suppress
+from functools import partial
+from pathlib import Path
+from typing import Protocol, TypeVar
+
+from mavbridge.core.clock import NS_PER_MS, NS_PER_S, Clock
+from mavbridge.core.reasons import Code, Reason, because
+from mavbridge.core.vehicle import (
+    Action,
+    ActionMeaning,
+    Command,
+    Decision,
+    ForwardedPacket,
+    LinkSnapshot,
+    Outlet,
+    Output,
+)
+from mavbridge.guard.channel import Port
+from mavbridge.guard.chunks import Chunk
+from mavbridge.guard.departure import Ending
+from mavbridge.guard.engagement import Act, Phase
+from mavbridge.guard.guard import FlightSettings, Guard, GuardInput, GuardOutput
+from mavbridge.guard.outcome import Outcome
+from mavbridge.guard.wire import (
+    Absence,
+    GuardMessage,
+    GuardStatus,
+    GuardTick,
+    LastWords,
+    decode_to_guard,
+    encode_from_guard,
+    encode_packets,
+    encode_tick,
+)
+
+IDLE_PERIOD_NS = 10 * NS_PER_MS
+"""Between two looks at the link before a policy is loaded."""
+FINISH_NS = 4 * NS_PER_S
+"""Longest that putting parameters back may take, or sending a release that was held up."""
+_Sent = TypeVar("_Sent")
+WORDS_NS, THRUST_WORDS_NS = NS_PER_S, 100 * NS_PER_MS
+"""Oldest last words: signatures must be no older than a minute, and what tells the safe mode may
+change. In modes where the throttle is thrust they repeat the last one, which should be near."""
+_HELD = (Phase.FLYING, Phase.LEAVING, Phase.HOLDING)
+_ENGAGED = (*_HELD, Phase.RELEASING)
+_TAKEN = (*_ENGAGED, Phase.PREPARING)
+
+
+class GuardLink(Protocol):
+    """The part of ``mavlink.link.MavlinkLink`` that the loop uses."""
+
+    is_engaged: bool
+
+    @property
+    def autopilot(self) -> str:
+        """Autopilot and version."""
+
+    @property
+    def is_release_owed(self) -> bool:
+        """A release could not be sent yet."""
+
+    @property
+    def is_restored(self) -> bool:
+        """Every parameter that was set for the flight has its old value."""
+
+    def begin_restore(self) -> None:
+        """Put parameters back; ``service`` does it."""
+
+    def poll(self) -> LinkSnapshot:
+        """Receive everything that has arrived; never blocks."""
+
+    def service(self) -> None:
+        """Send what is due besides sticks; called after them."""
+
+    def begin_flight(self, meaning: ActionMeaning, output: Output | None) -> None:
+        """Choose the message that carries such actions; raises PeerError where none can."""
+
+    def watch_home_height(self) -> None:
+        """Keep the height above home coming."""
+
+    def send(self, decision: Decision, decided_ns: int) -> Action | None:
+        """Send what was decided for that moment; returns the action as rounded and sent, or None
+        when it released."""
+
+    def set_mode(self, mode: str) -> None:
+        """Ask for a flight mode."""
+
+    def arm(self) -> None:
+        """Ask to arm."""
+
+    def takeoff(self, height_m: float) -> None:
+        """Ask the autopilot to climb to this height above the ground by its own means."""
+
+    def announce(self, text: str) -> None:
+        """Tell every ground station."""
+
+    @property
+    def outlet(self) -> Outlet:
+        """Where packets to the vehicle leave now."""
+
+    def rehearse(
+        self, plan: Iterable[tuple[int, Decision | None, str | None]]
+    ) -> tuple[tuple[int, bytes], ...]:
+        """Encode decisions and requests for a mode, for another process to send."""
+
+    def transmit(self, packet: bytes) -> bool:
+        """Send a packet of ``rehearse`` now."""
+
+
+class GuardLoop:
+    """One pass at every wake: receive, decide, send, report. Used by one thread."""
+
+    def __init__(
+        self,
+        clock: Clock,
+        link: GuardLink,
+        flight: Port,
+        *,
+        received: Sequence[bytes] = (),
+        lead_ns: int = 0,
+    ) -> None:
+        """Join link and channel.
+
+        Args:
+            clock: time of everything.
+            link: the vehicle.
+            flight: the flight process.
+            received: messages of it that have come before.
+            lead_ns: how long before a slot its work begins; the sticks wait for the slot itself.
+        """
+        self._received = list(received)
+        self._lead_ns = lead_ns
+        self._clock = clock
+        self._link = link
+        self._flight = flight
+        self._guard: Guard | None = None
+        self._packets: list[ForwardedPacket] = []
+        self._status: GuardStatus | None = None
+        self._watches_position = False
+        self._phase = Phase.WAITING
+        self._stop: Ending | None = None
+        self._command_fault: Reason | None = None
+        """Error of the last pass while a command was made or sent."""
+        self._finish_until_ns: int | None = None
+        self._is_clean = False
+        self._words: tuple[tuple[int, bytes], ...] = ()
+        """Packets with their delays that bring the vehicle into safety if this process dies."""
+        self._words_basis: object = None
+        self._words_due_ns = 0
+        self._words_outlet: Outlet | None = None
+        """That the flight process has open."""
+        self.is_done = False
+        """The sticks are given back, and nobody wants more flights."""
+
+    @property
+    def failure(self) -> Reason | None:
+        """Why there was no flight, or None."""
+        return None if self._guard is None else self._guard.failure
+
+    @property
+    def outcome(self) -> Outcome:
+        """How the flights went."""
+        return Outcome() if self._guard is None else self._guard.outcome
+
+    def forward(self, packet: ForwardedPacket) -> None:
+        """Take a packet of the vehicle for the flight process; the link calls it in ``poll``."""
+        self._packets.append(packet)
+
+    def stop(self, ending: Ending) -> None:
+        """End at the next step, as ``ending`` says."""
+        self._stop = self._stop or ending
+
+    def abandon(self) -> None:
+        """Say the last words without any state machine: the guard ends by a bug of its own."""
+        with suppress(Exception):
+            self._prepare_words(self._link.outlet)
+        died_ns = self._clock.now_ns()
+        for after_ns, packet in self._words:
+            self._clock.sleep_until_ns(died_ns + after_ns)
+            with suppress(Exception):
+                self._link.transmit(packet)
+
+    def _renew_words(self, snapshot: LinkSnapshot, output: GuardOutput) -> None:
+        """Prepare the last words where what they rest on has changed, and from time to time."""
+        now_ns, status, outlet = self._clock.now_ns(), snapshot.status, self._link.outlet
+        basis: tuple[object, ...] = (output.phase, outlet)
+        if status is not None:
+            basis += (status.mode, status.armed, status.is_landed, status.has_receiver)
+            basis += (status.is_position_valid,)
+        is_old = output.slot is not None and now_ns >= self._words_due_ns
+        if basis != self._words_basis or is_old:
+            is_thrust = status is not None and status.mode in snapshot.modes.thrust
+            self._words_due_ns = now_ns + (THRUST_WORDS_NS if is_thrust else WORDS_NS)
+            self._words_basis = basis
+            self._prepare_words(outlet)
+
+    def _prepare_words(self, outlet: Outlet) -> None:
+        """Leave with the flight process what it shall send if this process dies."""
+        if self._guard is None:
+            return
+        is_held = self._guard.phase in _TAKEN and outlet.fd is not None
+        plan = tuple(self._guard.rehearse()) if is_held else ()
+        before, self._words = self._words, self._link.rehearse(plan)
+        if not (before or self._words):
+            return
+        mode = next((mode for _, _, mode in plan if mode is not None), None)
+        is_new = bool(self._words) and outlet != self._words_outlet
+        words = LastWords(self._guard.phase, mode, outlet.receiver, is_new, self._words)
+        is_told = self._flight.send(encode_from_guard(words), outlet.fd if is_new else None)
+        self._words_outlet = outlet if is_told and self._words else None
+
+    def step(self) -> int:
+        """One pass; returns when the next one is due at the latest.
+
+        Raises:
+            PeerError, UserError: the vehicle cannot be found, or cannot be flown.
+        """
+        woke_ns = self._clock.now_ns()
+        snapshot = self._link.poll()
+        self._report_vehicle(snapshot)
+        given = self._receive(snapshot)
+        if self._guard is None:
+            self._link.service()
+            if given.stop is not None:
+                self._finish(woke_ns)
+            return woke_ns + IDLE_PERIOD_NS
+        # A slot that is about to come due is worked for now, so that only the send is left.
+        now_ns, slot_ns = self._clock.now_ns(), self._guard.next_ns
+        at_ns = slot_ns if 0 < slot_ns - now_ns <= self._lead_ns else now_ns
+        output = self._guard.step(at_ns, given)
+        if output.decision is not None and at_ns > now_ns:
+            self._clock.sleep_until_ns(at_ns)
+        self._command_fault = None
+        wanted = output.decision
+        sent = None if wanted is None else self._attempt(partial(self._link.send, wanted, at_ns))
+        if isinstance(wanted, Command) and sent is None:
+            self._guard.unsent()
+        if output.slot is not None or output.decision is not None or output.phase != self._phase:
+            self._report_tick(output, woke_ns, at_ns, sent)
+        self._follow(output)
+        if output.phase is not self._phase:
+            self._change_phase(output)
+        self._link.service()
+        self._renew_words(snapshot, output)
+        if output.phase is Phase.ENDED:
+            self._finish(woke_ns)
+        # A command that failed is answered in a pass that follows at once.
+        return woke_ns if self._command_fault else self._guard.next_ns - self._lead_ns
+
+    def _attempt(self, send: Callable[[], _Sent]) -> _Sent | None:
+        """Send something; an error is a fault of the flight, not the guard's end."""
+        try:
+            return send()
+        except Exception as error:  # noqa: BLE001 - the vehicle is held: end the flight in order
+            at = traceback.extract_tb(error.__traceback__)[-1]
+            self._command_fault = because(
+                Code.COMMAND_FAILED,
+                error=f"{type(error).__name__}: {error}",
+                place=f"{Path(at.filename).name}:{at.lineno}",
+            )
+            return None
+
+    def _follow(self, output: GuardOutput) -> None:
+        """Send the requests, and show the messages."""
+        if output.mode is not None:
+            self._attempt(partial(self._link.set_mode, output.mode))
+        if output.arm:
+            self._link.arm()
+        if output.takeoff_m is not None:
+            self._attempt(partial(self._link.takeoff, output.takeoff_m))
+        for text in output.messages:
+            self._flight.send(encode_from_guard(GuardMessage(text)))
+
+    def _finish(self, now_ns: int) -> None:
+        """Put the vehicle's parameters back, and send what is owed, for a bounded time."""
+        self._link.begin_restore()
+        if self._finish_until_ns is None:
+            self._finish_until_ns = now_ns + FINISH_NS
+        was_clean = self._is_clean
+        self._is_clean = self._link.is_restored and not self._link.is_release_owed
+        # One pass more: it passes on what the link says about the parameters.
+        self.is_done = (was_clean and self._is_clean) or now_ns >= self._finish_until_ns
+
+    def _report_vehicle(self, snapshot: LinkSnapshot) -> None:
+        """Pass the vehicle's packets on, then its status where that has changed."""
+        # Until a policy is loaded nobody reads, and the queue is for what matters then.
+        if self._packets and self._guard is not None:
+            self._flight.send(encode_packets(self._packets))
+        self._packets.clear()
+        vehicle = snapshot.status
+        status = GuardStatus(
+            autopilot=self._link.autopilot,
+            mode=vehicle.mode if vehicle else None,
+            armed=vehicle is not None and vehicle.armed,
+            is_landed=vehicle.is_landed if vehicle else None,
+            rc_channels_us=vehicle.rc_channels_us if vehicle else (),
+            rc_sticks=vehicle.rc_sticks if vehicle else None,
+            has_position=self._watches_position and bool(vehicle and vehicle.position_ned_m),
+        )
+        if status != self._status:
+            self._status = status
+            self._flight.send(encode_from_guard(status))
+        for text in snapshot.texts:
+            self._flight.send(encode_from_guard(GuardMessage(text)))
+
+    def _receive(self, snapshot: LinkSnapshot) -> GuardInput:
+        """Take the messages of the flight process, the newest of each kind."""
+        chunk: Chunk | None = None
+        absence: Reason | None = None
+        act: Act | None = None
+        received, self._received = [*self._received, *self._flight.receive()], []
+        for data in received:
+            match decode_to_guard(data):
+                case Chunk() as chunk:
+                    absence = None
+                case Absence(absence):
+                    pass
+                case FlightSettings() as settings if self._guard is None:
+                    self._guard = Guard(settings, self._clock.now_ns())
+                    self._link.begin_flight(settings.meaning, settings.output)
+                    self._watches_position = settings.watches_position
+                    if settings.watches_home_height:
+                        self._link.watch_home_height()
+                case Ending() as ending:
+                    self.stop(ending)
+                case "engage" | "release" as new:
+                    act = "release" if act == "release" else new  # whatever came after it
+                case _:
+                    pass  # settings that count already
+        if self._flight.is_closed:
+            self.stop(Ending(reason=because(Code.FLIGHT_PROCESS_DIED), is_fault=True))
+        return GuardInput(
+            link=snapshot,
+            chunk=chunk,
+            absence=absence,
+            act=act,
+            stop=self._stop,
+            command_fault=self._command_fault,
+        )
+
+    def _report_tick(
+        self, output: GuardOutput, woke_ns: int, decided_ns: int, sent: Action | None
+    ) -> None:
+        now_ns, slot = self._clock.now_ns(), output.slot
+        tick = GuardTick(
+            index=slot.index if slot else -1,
+            due_ns=slot.due_ns if slot else woke_ns,
+            woke_ns=woke_ns,
+            decided_ns=decided_ns,
+            sent_ns=now_ns,
+            missed_slots=slot.missed if slot else 0,
+            is_slot=slot is not None,
+            is_coasting=output.is_coasting,
+            chunk_serial=output.chunk_serial,
+            trace=output.trace,
+            sent=sent,
+            phase=output.phase,
+            reason=output.reason,
+            starting_ns=output.starting_ns,
+        )
+        self._flight.send(encode_tick(tick))
+
+    def _change_phase(self, output: GuardOutput) -> None:
+        """Tell everybody who holds the sticks now."""
+        before, self._phase = self._phase, output.phase
+        self._link.is_engaged = self._phase in _ENGAGED
+        text: str | None = None
+        match self._phase:
+            case Phase.FLYING:
+                text = "the policy has control"
+            case Phase.LEAVING:
+                text = f"neutral: {output.reason}"
+            case Phase.HOLDING:
+                text = "neutral sticks go on until you disarm or change the mode"
+            case Phase.RELEASING | Phase.RELEASED if before in _HELD:
+                text = f"control given back: {output.reason}"
+        if text is not None:
+            self._link.announce(f"mavbridge: {text}")

@@ -1,0 +1,373 @@
+"""Messages between the flight process and the guard, as bytes.
+
+Little-endian structures where they come at the rates of the loops, JSON where they come seldom, and
+one pickle: the settings, from the parent process that has started the guard.
+"""
+
+import json
+import pickle
+import struct
+from collections.abc import Iterable, Iterator
+from dataclasses import asdict, dataclass, replace
+from typing import Literal, NamedTuple, TypeAlias
+
+from mavbridge.core.address import SocketAddress, socket_address
+from mavbridge.core.reasons import Reason, reason_from_json, reason_to_json
+from mavbridge.core.vehicle import (
+    ACTION_CLASSES,
+    Action,
+    ActionTrace,
+    ForwardedPacket,
+    LinkStats,
+    Percentiles,
+    Sticks,
+)
+from mavbridge.guard.chunks import Chunk
+from mavbridge.guard.departure import Ending
+from mavbridge.guard.engagement import Act, Phase
+from mavbridge.guard.guard import FlightSettings
+from mavbridge.guard.outcome import Outcome
+from mavbridge.guard.settings import GuardSettings
+
+_CHUNK = struct.Struct("<cBqqqqqqqqH")
+_TICK = struct.Struct("<cqqqqqqqB?iBBB20d")
+_PACKET = struct.Struct("<qqH")
+_PHASES = tuple(Phase)
+_CLASSES = tuple(ACTION_CLASSES.values())
+_IS_SLOT, _IS_COASTING, _HAS_TRACE, _HAS_SENT = 1, 2, 4, 8
+_NOTHING = (0.0,) * 4
+_MALFORMED = (
+    *(struct.error, pickle.UnpicklingError, EOFError),
+    *(ValueError, TypeError, LookupError, AttributeError),
+)
+"""Errors of the decoders for bytes that no encoder has made."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class GuardTick:
+    """One send of the guard, or one slot in which it had nothing to send."""
+
+    index: int
+    due_ns: int
+    woke_ns: int
+    decided_ns: int
+    """The moment that the sticks were decided for: the slot, or when a chunk was seen."""
+    sent_ns: int
+    """After the sticks were handed to the kernel."""
+    missed_slots: int
+    is_slot: bool
+    is_coasting: bool
+    chunk_serial: int | None
+    trace: ActionTrace | None
+    sent: Action | None
+    """As sent; None when released, or when nothing was sent."""
+    phase: Phase
+    reason: Reason | None
+    """Why the policy does not fly; None while it does."""
+    starting_ns: int = 0
+    """All has been ready since then: the policy gets the sticks with its first chunk after a reset
+    from then on; 0 where it has them, or all is not ready."""
+
+
+class GuardStatus(NamedTuple):
+    """The vehicle's word about itself; sent when it changes."""
+
+    autopilot: str
+    mode: str | None
+    armed: bool
+    is_landed: bool | None
+    rc_channels_us: tuple[int, ...]
+    rc_sticks: Sticks | None
+    has_position: bool = False
+    """The estimator has a position that may be trusted, and the policy takes one."""
+
+
+class GuardMessage(NamedTuple):
+    """A line for the user."""
+
+    text: str
+
+
+class LastWords(NamedTuple):
+    """What the flight process sends the vehicle if the guard dies; replaces the words before."""
+
+    phase: Phase
+    """That of the guard when it prepared them."""
+    mode: str | None
+    """The safe mode that they ask for."""
+    receiver: SocketAddress | None
+    """Address for the datagrams; None on a stream."""
+    brings_file: bool
+    """The open socket or port of the link comes with this message."""
+    packets: tuple[tuple[int, bytes], ...]
+    """Each with its delay in ns from the death; none: nothing is held, nothing is to be said."""
+
+
+class GuardError(NamedTuple):
+    """The guard ends because of this."""
+
+    kind: Literal["user", "peer", "bug"]
+    text: str
+
+
+class Absence(NamedTuple):
+    """Why the flight process cannot compute a chunk now."""
+
+    reason: Reason
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class GuardSummary:
+    """Last message of a guard that ends in order."""
+
+    autopilot: str
+    link: LinkStats
+    failure: Reason | None
+    """Why there was no flight, or None."""
+    outcome: Outcome
+    params: dict[str, float]
+    """The vehicle's parameters that matter for a flight, by name, as far as they were read."""
+    dropped_messages: int
+    """Messages to the flight process that did not fit into its queue."""
+    dropped_packets: int
+    """Packets that did not fit into the pipe of the telemetry log."""
+
+
+ToGuard: TypeAlias = GuardSettings | FlightSettings | Chunk | Absence | Act | Ending
+FromGuard: TypeAlias = (
+    tuple[ForwardedPacket, ...]
+    | GuardTick
+    | GuardStatus
+    | GuardMessage
+    | LastWords
+    | GuardError
+    | GuardSummary
+)
+
+
+def encode_to_guard(message: ToGuard) -> bytes:
+    """One message of the flight process."""
+    match message:
+        case Chunk():
+            stamps = (*message[:7], message.reset_ns)
+            count = len(message.actions)
+            values = [value for action in message.actions for value in action]
+            kind = _class_index(message.actions[0]) if count else 0
+            return _CHUNK.pack(b"C", kind, *stamps, count) + struct.pack(f"<{4 * count}d", *values)
+        case Absence(reason):
+            return b"N" + _encode_reason(reason)
+        case GuardSettings() | FlightSettings():
+            return b"S" + pickle.dumps(message)
+        case Ending(reason=reason, is_fault=is_fault, end=end):
+            return b"E" + json.dumps([is_fault, end]).encode() + b"\n" + _encode_reason(reason)
+        case "engage" | "release":
+            return b"A" + message.encode()
+
+
+def decode_to_guard(data: bytes) -> ToGuard:
+    """Inverse of ``encode_to_guard``; raises ValueError for anything else."""
+    try:
+        return _decode_to_guard(data)
+    except _MALFORMED as error:
+        raise ValueError(f"not a message to the guard: {data[:16]!r}") from error
+
+
+def _decode_to_guard(data: bytes) -> ToGuard:
+    kind, rest = data[:1], data[1:]
+    match kind:
+        case b"C":
+            return _decode_chunk(data)
+        case b"N":
+            return Absence(_decode_reason(rest))
+        case b"S":
+            settings: GuardSettings | FlightSettings = pickle.loads(rest)  # noqa: S301 - our parent's
+            return settings
+        case b"E":
+            head, _, reason = rest.partition(b"\n")
+            is_fault, end = json.loads(head)
+            return Ending(reason=_decode_reason(reason), is_fault=is_fault, end=end)
+        case b"A" if rest == b"engage":
+            return "engage"
+        case b"A" if rest == b"release":
+            return "release"
+    raise ValueError("unknown kind")
+
+
+def _class_index(action: Action) -> int:
+    return _CLASSES.index(type(action))
+
+
+def _decode_chunk(data: bytes) -> Chunk:
+    _, kind, *stamps, count = _CHUNK.unpack_from(data)
+    serial, attitude_ns, velocity_ns, image_ns, computed_ns, first_ns, step_ns, reset_ns = stamps
+    make = _CLASSES[kind]
+    values = struct.unpack(f"<{4 * count}d", data[_CHUNK.size :])
+    return Chunk(
+        serial=serial,
+        attitude_ns=attitude_ns,
+        velocity_ns=velocity_ns,
+        image_ns=image_ns,
+        computed_ns=computed_ns,
+        first_ns=first_ns,
+        step_ns=step_ns,
+        actions=tuple(make(*values[4 * k : 4 * k + 4]) for k in range(count)),
+        reset_ns=reset_ns,
+    )
+
+
+def encode_tick(tick: GuardTick) -> bytes:
+    """One tick."""
+    flags = (
+        _IS_SLOT * tick.is_slot
+        | _IS_COASTING * tick.is_coasting
+        | _HAS_TRACE * (tick.trace is not None)
+        | _HAS_SENT * (tick.sent is not None)
+    )
+    trace, serial = tick.trace, tick.chunk_serial
+    stages = _NOTHING * 4
+    if trace is not None:
+        stages = (*trace.raw, *trace.clipped, *trace.slewed, *trace.smoothed)
+    packed = _TICK.pack(
+        b"T",
+        *(tick.index, tick.due_ns, tick.woke_ns, tick.decided_ns, tick.sent_ns, tick.starting_ns),
+        *(0 if serial is None else serial, flags, serial is not None, tick.missed_slots),
+        _PHASES.index(tick.phase),
+        0 if trace is None else _class_index(trace.raw),
+        0 if tick.sent is None else _class_index(tick.sent),
+        *stages,
+        *(tick.sent or _NOTHING),
+    )
+    return packed if tick.reason is None else packed + _encode_reason(tick.reason)
+
+
+def _decode_tick(data: bytes) -> GuardTick:
+    _, index, due_ns, woke_ns, decided_ns, sent_ns, starting_ns, *rest = _TICK.unpack_from(data)
+    serial, flags, has_chunk, missed, phase, traced, sent_kind, *values = rest
+    fours = [values[4 * k : 4 * k + 4] for k in range(5)]
+    raw, clipped, slewed, smoothed = (_CLASSES[traced](*four) for four in fours[:4])
+    trace = ActionTrace(raw=raw, clipped=clipped, slewed=slewed, smoothed=smoothed)
+    sent = _CLASSES[sent_kind](*fours[4])
+    return GuardTick(
+        index=index,
+        due_ns=due_ns,
+        woke_ns=woke_ns,
+        decided_ns=decided_ns,
+        sent_ns=sent_ns,
+        missed_slots=missed,
+        is_slot=bool(flags & _IS_SLOT),
+        is_coasting=bool(flags & _IS_COASTING),
+        starting_ns=starting_ns,
+        chunk_serial=serial if has_chunk else None,
+        trace=trace if flags & _HAS_TRACE else None,
+        sent=sent if flags & _HAS_SENT else None,
+        phase=_PHASES[phase],
+        reason=_decode_reason(data[_TICK.size :]) if len(data) > _TICK.size else None,
+    )
+
+
+def encode_packets(packets: Iterable[ForwardedPacket]) -> bytes:
+    """Packets of the vehicle, in order of arrival."""
+    parts = [b"P"]
+    for packet in packets:
+        parts += (
+            _PACKET.pack(packet.arrived_ns, packet.happened_ns, len(packet.data)),
+            packet.data,
+        )
+    return b"".join(parts)
+
+
+def _decode_packets(data: bytes) -> Iterator[ForwardedPacket]:
+    at = 1
+    while at < len(data):
+        arrived_ns, happened_ns, length = _PACKET.unpack_from(data, at)
+        at += _PACKET.size
+        if at + length > len(data):
+            raise ValueError(f"a packet of {length} bytes is cut off")
+        yield ForwardedPacket(arrived_ns, happened_ns, data[at : at + length])
+        at += length
+
+
+def encode_from_guard(
+    message: GuardStatus | GuardMessage | LastWords | GuardError | GuardSummary,
+) -> bytes:
+    """One message of the guard that comes seldom."""
+    match message:
+        case GuardStatus():
+            return b"V" + json.dumps(message).encode()
+        case GuardMessage():
+            return b"M" + json.dumps(message).encode()
+        case LastWords(phase, _, _, _, packets):
+            texts = [(after_ns, packet.hex()) for after_ns, packet in packets]
+            words = message._replace(phase=phase.value, packets=texts)  # type: ignore[arg-type]
+            return b"W" + json.dumps(words).encode()
+        case GuardError():
+            return b"X" + json.dumps(message).encode()
+        case GuardSummary():
+            fault = message.outcome.fault
+            document = asdict(replace(message, failure=None)) | {
+                "outcome": message.outcome._replace(fault=None),
+                "reasons": [each and reason_to_json(each) for each in (message.failure, fault)],
+            }
+            return b"Z" + json.dumps(document).encode()
+
+
+def decode_from_guard(data: bytes) -> FromGuard:
+    """Any message of the guard; raises ValueError for anything else."""
+    try:
+        return _decode_from_guard(data)
+    except _MALFORMED as error:
+        raise ValueError(f"not a message of the guard: {data[:16]!r}") from error
+
+
+def _decode_from_guard(data: bytes) -> FromGuard:
+    match data[:1]:
+        case b"T":
+            return _decode_tick(data)
+        case b"P":
+            return tuple(_decode_packets(data))
+        case b"V":
+            autopilot, mode, armed, is_landed, channels_us, sticks, has_position = json.loads(
+                data[1:]
+            )
+            rc_sticks = None if sticks is None else Sticks(*sticks)
+            channels = tuple(channels_us)
+            return GuardStatus(autopilot, mode, armed, is_landed, channels, rc_sticks, has_position)
+        case b"M":
+            return GuardMessage(*json.loads(data[1:]))
+        case b"W":
+            phase, mode, receiver, brings_file, texts = json.loads(data[1:])
+            packets = tuple((int(after_ns), bytes.fromhex(text)) for after_ns, text in texts)
+            address = None if receiver is None else socket_address(*receiver)
+            return LastWords(Phase(phase), mode, address, bool(brings_file), packets)
+        case b"X":
+            return GuardError(*json.loads(data[1:]))
+        case b"Z":
+            return _summary(json.loads(data[1:]))
+    raise ValueError("unknown kind")
+
+
+def _summary(document: dict[str, object]) -> GuardSummary:
+    link = dict(document.pop("link"))  # type: ignore[call-overload]
+    rtt = link.pop("rtt_ms")
+    rates, saturated = (
+        tuple((name, number) for name, number in link.pop(key))
+        for key in ("messages_per_s", "saturated")
+    )
+    stats = LinkStats(
+        **link,
+        messages_per_s=rates,
+        saturated=saturated,
+        rtt_ms=None if rtt is None else Percentiles(**rtt),
+    )
+    failure, fault = (each and reason_from_json(each) for each in document.pop("reasons"))  # type: ignore[attr-defined]
+    outcome = Outcome(*document.pop("outcome"))._replace(fault=fault)  # type: ignore[misc]
+    document["failure"] = failure
+    return GuardSummary(**document, link=stats, outcome=outcome)  # type: ignore[arg-type]
+
+
+def _encode_reason(reason: Reason) -> bytes:
+    return json.dumps(reason_to_json(reason, has_words=False)).encode()
+
+
+def _decode_reason(data: bytes) -> Reason:
+    return reason_from_json(json.loads(data))

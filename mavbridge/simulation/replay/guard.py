@@ -1,0 +1,331 @@
+"""The guard and the link of a recorded flight once more: its bytes, its chunks, its moments.
+
+``GuardLoop`` and ``MavlinkLink`` run as in the flight; replaced are the socket, the channel to the
+flight process and the clock. Taken from the recording: when the guard woke, for which moment it
+decided and when its sticks had left; which bytes came; which chunk it had seen by then; and what
+the operator or the flight process asked for, as far as the phases show it.
+"""
+
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from mavbridge.config.flight import FlyConfig
+from mavbridge.core.clock import NS_PER_MS
+from mavbridge.core.reasons import Code, Kind, Reason, because
+from mavbridge.core.records import Solve, Tick
+from mavbridge.core.vehicle import Action, LinkSnapshot
+from mavbridge.flight.action_frames import action_frame
+from mavbridge.flight.plan import FlightPlan, plan_flight
+from mavbridge.flight.policy_loop import make_chunk
+from mavbridge.flight.settings import link_settings
+from mavbridge.guard.chunks import Chunk
+from mavbridge.guard.departure import Ending
+from mavbridge.guard.engagement import Act, Phase
+from mavbridge.guard.guard import FlightSettings, Guard, GuardInput, GuardOutput
+from mavbridge.guard.loop import GuardLoop
+from mavbridge.guard.wire import GuardTick, decode_from_guard, encode_to_guard
+from mavbridge.mavlink.link import MavlinkLink
+from mavbridge.mavlink.transport.sockets import Address, Received
+from mavbridge.simulation.clock import SteppedClock
+from mavbridge.simulation.network import VEHICLE
+from mavbridge.simulation.replay.recording import RecordedPacket, ReplaySource
+from policy.contract import Contract
+
+PREPARE_NS = 10 * NS_PER_MS
+"""Longest time between two looks at the link, as while no policy is loaded."""
+_OWN_ENDINGS = (
+    *(Code.SIGNAL, Code.COURSE_DONE, Code.POLICY_FAILED, Code.CAMERA_FAILED, Code.HANGS),
+    *(Code.TOLD_TO_END, Code.FLIGHT_PROCESS_DIED),
+)
+"""Reasons for which the guard was asked to end."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class GuardStep:
+    """One recorded pass of the guard, and what it came to this time."""
+
+    recorded: Tick
+    replayed: GuardTick | None
+    """None: this time nothing was to be sent or told."""
+    snapshot: LinkSnapshot
+    """What the link knew."""
+    chunk_serial: int | None
+    """Chunk that the guard got in this pass."""
+    act: Act | None
+    stop: Ending | None
+
+
+def chunk_of(solve: Solve, contract: Contract) -> Chunk:
+    """The chunk that the policy loop makes of a solve."""
+    return make_chunk(
+        solve.serial,
+        solve.state,
+        action_frame(contract).to_guard(solve.actions[0]),
+        image_ns=solve.image_ns,
+        computed_ns=solve.computed_ns,
+        step_ns=solve.step_ns,
+        reset_ns=solve.reset_ns,
+    )
+
+
+def recorded_plan(source: ReplaySource) -> FlightPlan:
+    """Plan of the recorded flight."""
+    return plan_flight(source.config, source.contract, is_dual=source.meta.mode == "dual")
+
+
+def replay_guard(source: ReplaySource) -> list[GuardStep]:
+    """The recorded chunks through the guard, one step for each recorded tick."""
+    ticks = source.ticks
+    clock = SteppedClock(
+        min(source.packets[0].arrived_ns if source.packets else ticks[0].woke_ns, ticks[0].woke_ns)
+    )
+    transport = _RecordedTransport(clock, source.packets)
+    link = _link(source, clock, transport)
+    port = _RecordedPort(clock)
+    loop = GuardLoop(clock, link, port)
+    settings = recorded_plan(source).guard
+    port.inbox.append(encode_to_guard(settings))
+    # The grid begins where the guard gets its settings.
+    port.begin_ns = ticks[0].due_ns - ticks[0].index * settings.stick_period_ns
+    steps = []
+    for arrivals in _arrivals(source):
+        tick = arrivals.tick
+        _keep_link(link, clock, transport, tick.woke_ns)
+        port.decided_ns, transport.sent_ns = tick.decided_ns or tick.woke_ns, tick.sent_ns
+        port.inbox += [encode_to_guard(message) for message in arrivals.messages]
+        loop.step()
+        steps.append(
+            GuardStep(
+                recorded=tick,
+                replayed=port.take_tick(),
+                snapshot=link.newest,
+                chunk_serial=arrivals.chunk.serial if arrivals.chunk else None,
+                act=arrivals.act,
+                stop=arrivals.stop,
+            )
+        )
+    return steps
+
+
+def _keep_link(
+    link: MavlinkLink, clock: SteppedClock, transport: "_RecordedTransport", until_ns: int
+) -> None:
+    """Let the link receive and ask between two ticks, as it did: at each arrival, or soon.
+
+    It asks just before each arrival as well, since that may be the answer: a vehicle that is chosen
+    a moment later than then would not be listened to yet.
+    """
+    while clock.now_ns() < until_ns:
+        arrival_ns = transport.next_arrival_ns or until_ns
+        if arrival_ns - 1 > clock.now_ns():
+            clock.sleep_until_ns(min(arrival_ns - 1, clock.now_ns() + PREPARE_NS, until_ns))
+            if clock.now_ns() < until_ns:
+                link.service()
+        clock.sleep_until_ns(min(arrival_ns, clock.now_ns() + PREPARE_NS, until_ns))
+        if clock.now_ns() < until_ns:
+            link.poll()
+            link.service()
+
+
+def replay_other(
+    steps: Sequence[GuardStep],
+    settings: FlightSettings,
+    chunks: Mapping[int, Chunk],
+) -> Iterator[GuardOutput]:
+    """Other chunks, or other settings, through the guard, one output for each of ``steps``.
+
+    The vehicle's answers are those to the recorded sticks, so that the link is not asked: its
+    snapshots are taken as they were. Sticks are those of the policy's trace, before the message.
+    """
+    first = steps[0].recorded
+    origin_ns = first.due_ns - first.index * settings.stick_period_ns
+    guard = Guard(settings, origin_ns)
+    for step in steps:
+        chunk = None if step.chunk_serial is None else chunks.get(step.chunk_serial)
+        at_ns = step.recorded.decided_ns or step.recorded.woke_ns
+        yield guard.step(
+            at_ns,
+            GuardInput(link=step.snapshot, chunk=chunk, act=step.act, stop=step.stop),
+        )
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class _Arrivals:
+    """Messages of the flight process that the guard had got by one tick."""
+
+    tick: Tick
+    chunk: Chunk | None
+    act: Act | None
+    stop: Ending | None
+
+    @property
+    def messages(self) -> list[Chunk | Act | Ending]:
+        return [each for each in (self.chunk, self.act, self.stop) if each is not None]
+
+
+def _arrivals(source: ReplaySource) -> Iterator[_Arrivals]:
+    """What each tick shows of them.
+
+    A tick that flies a chunk names it. Before a flight a chunk counts from the end of its solve.
+    """
+    config = source.config
+    is_called = not (config.arm or config.engage_channel or config.engage_on_arm)
+    solves = iter(source.solves)
+    waiting = next(solves, None)
+    before: Tick | None = None
+    for tick in source.ticks:
+        newest: Solve | None = None
+        while waiting is not None and _is_seen(waiting, tick):
+            newest, waiting = waiting, next(solves, None)
+        yield _Arrivals(
+            tick=tick,
+            chunk=None if newest is None else chunk_of(newest, source.contract),
+            act=_act(before, tick, is_called=is_called),
+            stop=_stop(before, tick),
+        )
+        before = tick
+
+
+def _is_seen(solve: Solve, tick: Tick) -> bool:
+    if tick.chunk_serial is not None:
+        return solve.serial <= tick.chunk_serial
+    return solve.computed_ns <= tick.woke_ns
+
+
+def _act(before: Tick | None, tick: Tick, *, is_called: bool) -> Act | None:
+    """The operator's keys, as the phases show them."""
+    was = None if before is None else before.phase
+    if is_called and was in ("waiting", "released") and tick.phase in ("preparing", "flying"):
+        return "engage"
+    if tick.phase != was and _code(tick) is Code.OPERATOR and was in ("preparing", "flying"):
+        return "release"
+    return None
+
+
+def _stop(before: Tick | None, tick: Tick) -> Ending | None:
+    """What the flight process asked for at its own end."""
+    was = None if before is None else before.phase
+    reason = tick.release_reason
+    if reason is not None and reason.code is Code.THEN:
+        reason = dict(reason.data)["first"]  # type: ignore[assignment]
+    if tick.phase != was and isinstance(reason, Reason) and reason.code in _OWN_ENDINGS:
+        return Ending(reason=reason, is_fault=reason.kind is Kind.FAULT)
+    if tick.phase == Phase.ENDED.value != was:  # the second of two stops counts for nothing
+        return Ending(reason=because(Code.SIGNAL))
+    return None
+
+
+def _code(tick: Tick) -> Code | None:
+    return None if tick.release_reason is None else tick.release_reason.code
+
+
+class _WatchedLink(MavlinkLink):
+    """Keeps what it told the guard last."""
+
+    newest: LinkSnapshot
+
+    def poll(self) -> LinkSnapshot:
+        """See ``MavlinkLink``."""
+        self.newest = super().poll()
+        return self.newest
+
+
+def same_action(one: Action | None, other: Action | None) -> bool:
+    """Equal in single precision, in which a recording holds them."""
+    if one is None or other is None:
+        return one is other
+    return np.array_equal(np.array(one, np.float32), np.array(other, np.float32))
+
+
+def _link(
+    source: ReplaySource, clock: SteppedClock, transport: "_RecordedTransport"
+) -> _WatchedLink:
+    config: FlyConfig = source.config
+    # As the guard was started, before a policy was loaded.
+    loops = config.rates.loops(is_dual=source.meta.mode == "dual")
+    settings = link_settings(
+        config.link,
+        state_hz=loops.state_hz,
+        stick_hz=config.rates.stick_rate + loops.action_hz,
+        min_battery_percent=config.envelope.min_battery,
+    )
+    return _WatchedLink(transport, clock, replace(settings, known_params=source.known_params))
+
+
+class _RecordedTransport:
+    """A ``Transport`` from which the recorded packets come; what is sent goes nowhere."""
+
+    def __init__(self, clock: SteppedClock, packets: Sequence[RecordedPacket]) -> None:
+        self._clock = clock
+        self._packets = iter(packets)
+        self._next = next(self._packets, None)
+        self.sent_ns: int | None = None
+        """When the sticks of this pass had left."""
+
+    @property
+    def next_arrival_ns(self) -> int | None:
+        """When the next packet comes; None after the last."""
+        return None if self._next is None else self._next.arrived_ns
+
+    def open(self) -> None:
+        """Nothing to acquire."""
+
+    def drain(self) -> Iterator[Received]:
+        """Everything that had arrived."""
+        now_ns = self._clock.now_ns()
+        while self._next is not None and self._next.arrived_ns <= now_ns:
+            packet, self._next = self._next, next(self._packets, None)
+            yield Received(packet.data, packet.arrived_ns, VEHICLE)
+
+    def fileno(self) -> int | None:
+        """Nothing that ``select`` could wait for."""
+        return None
+
+    def receiver(self, peer: Address | None) -> Address | None:
+        """Nobody."""
+        return None
+
+    def send(self, data: bytes, peer: Address | None = None) -> bool:
+        """Let the time of sending pass."""
+        if self.sent_ns is not None:
+            self._clock.sleep_until_ns(self.sent_ns)
+            self.sent_ns = None
+        return True
+
+    def close(self) -> None:
+        """Nothing to free."""
+
+
+class _RecordedPort:
+    """A ``Port`` to no flight process; the clock goes on to the moment of the decision."""
+
+    def __init__(self, clock: SteppedClock) -> None:
+        self._clock = clock
+        self.inbox: list[bytes] = []
+        self.begin_ns: int | None = None
+        """When the guard had read the settings of the flight, in the next pass."""
+        self.decided_ns: int | None = None
+        self.is_closed = False
+        self._tick: GuardTick | None = None
+
+    def send(self, message: bytes, fd: int | None = None) -> bool:
+        """Keep a tick; everything else has no reader."""
+        decoded = decode_from_guard(message)
+        if isinstance(decoded, GuardTick):
+            self._tick = decoded
+        return True
+
+    def take_tick(self) -> GuardTick | None:
+        """The tick since the last call."""
+        tick, self._tick = self._tick, None
+        return tick
+
+    def receive(self) -> list[bytes]:
+        """What was put in."""
+        until_ns, self.begin_ns = self.begin_ns or self.decided_ns, None
+        if until_ns is not None:
+            self._clock.sleep_until_ns(until_ns)
+        messages, self.inbox = self.inbox, []
+        return messages

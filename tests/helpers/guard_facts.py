@@ -1,0 +1,142 @@
+"""Facts of a vehicle that flies well, and an engagement that is stepped through them."""
+
+from dataclasses import replace
+from typing import Any
+
+from mavbridge.core.clock import NS_PER_MS
+from mavbridge.core.reasons import Code, Reason, Value
+from mavbridge.core.vehicle import NEUTRAL, ModeRoles
+from mavbridge.guard.departure import DepartureSettings
+from mavbridge.guard.engagement import Act, Engagement, EngagementSettings, Phase
+from mavbridge.guard.facts import Facts, Move
+from mavbridge.guard.limits import LimitSettings
+from mavbridge.guard.preparation import PreparationSettings
+from mavbridge.guard.smoothing import Smoothing
+
+MODES = ("ALT_HOLD", "ALTCTL")
+COPTER_MODES = ModeRoles(
+    names=("STABILIZE", "ACRO", "ALT_HOLD", "LOITER", "BRAKE", "LAND", "RTL", "GUIDED"),
+    hold="BRAKE",
+    land="LAND",
+    rtl="RTL",
+    takeoff=("GUIDED",),
+    thrust=("STABILIZE", "ACRO"),
+    setpoint=("GUIDED", "GUIDED_NOGPS"),
+)
+PX4_MODES = ModeRoles(
+    names=("ALTCTL", "POSCTL", "ACRO", "OFFBOARD", "AUTO.LOITER", "AUTO.LAND", "AUTO.RTL"),
+    hold="AUTO.LOITER",
+    land="AUTO.LAND",
+    rtl="AUTO.RTL",
+    takeoff=("AUTO.LOITER", "AUTO.TAKEOFF"),
+    thrust=("MANUAL", "STABILIZED", "ACRO"),
+    setpoint=("OFFBOARD",),
+    needs_setpoints_first=True,
+    is_silence_failsafe=True,
+    override="POSCTL",
+    needs_sticks_first=True,
+)
+STEP_NS = 10 * NS_PER_MS
+
+AIRBORNE = Facts(
+    now_ns=0,
+    is_connected=True,
+    link_problem=None,
+    interruption=None,
+    overruled=None,
+    is_switched_off=False,
+    mode="ALT_HOLD",
+    modes=COPTER_MODES,
+    armed=True,
+    is_failsafe=False,
+    has_receiver=True,
+    pilot_sticks=NEUTRAL,
+    rc_channels_us=(1500,) * 8,
+    is_position_valid=True,
+    height_m=10.0,
+    is_landed=False,
+    echo_confirmed=True,
+    is_released=False,
+    refused_mode=None,
+    chunk_problem=None,
+    chunk_fault=None,
+    envelope_problem=None,
+)
+"""Armed in ALT_HOLD, in the air, with a receiver in the middle and a policy within its limits."""
+ON_GROUND = replace(AIRBORNE, armed=False, echo_confirmed=False, height_m=0.0, is_landed=True)
+
+
+def stick_smoothing(
+    *, max_slew_per_s: float = 0.0, tau_s: float = 0.0, max_dt_s: float = 0.15
+) -> Smoothing:
+    """Filter of sticks; without arguments it changes nothing."""
+    limits = LimitSettings(stick_slew_per_s=max_slew_per_s).of("sticks")
+    return Smoothing(limits=limits, tau_s=tau_s, max_dt_s=max_dt_s)
+
+
+def engagement_settings(**settings: Any) -> EngagementSettings:
+    """Settings of the engagement, those of the way in among them; modes are ``MODES``."""
+    ways_in = ("modes", "mode", "takeoff_m", "is_setpoint")
+    preparation = {name: settings.pop(name) for name in ways_in if name in settings}
+    departure = settings.pop("departure", DepartureSettings())
+    return EngagementSettings(
+        preparation=PreparationSettings(**{"modes": MODES, **preparation}),
+        departure=departure,
+        **settings,
+    )
+
+
+def codes(reason: Reason | None) -> tuple[Code, ...]:
+    """Those of a reason; none while the policy flies."""
+    return () if reason is None else reason.codes
+
+
+def figures(reason: Reason | None, code: Code) -> dict[str, Value]:
+    """Those of the reason with this code, which may be inside another one; else none."""
+    if reason is None:
+        return {}
+    if reason.code is code:
+        return dict(reason.data)
+    inner = (figures(value, code) for _, value in reason.data if isinstance(value, Reason))
+    return next(filter(None, inner), {})
+
+
+class Stepped:
+    """An engagement, its facts, and everything that it decided."""
+
+    def __init__(self, facts: Facts = AIRBORNE, **settings: Any) -> None:
+        self.engagement = Engagement(engagement_settings(**settings))
+        self.facts = facts
+        self.moves: list[Move] = []
+
+    def step(self, act: Act | None = None, **changes: Any) -> Move:
+        """One step, 10 ms after the last; changes of the facts stay."""
+        if changes.get("interruption") is not None:
+            changes.setdefault("interruptions", self.facts.interruptions + 1)
+        self.facts = replace(self.facts, now_ns=self.facts.now_ns + STEP_NS, **changes)
+        self.moves.append(self.engagement.step(self.facts, act))
+        return self.moves[-1]
+
+    def run(self, seconds: float, **changes: Any) -> list[Move]:
+        """Steps for a while; returns their moves."""
+        start = len(self.moves)
+        for _ in range(round(seconds * 100)):
+            self.step(**changes)
+        return self.moves[start:]
+
+    @property
+    def phase(self) -> Phase:
+        return self.engagement.phase
+
+    @property
+    def codes(self) -> tuple[Code, ...]:
+        return codes(self.engagement.reason)
+
+
+def flying(facts: Facts = AIRBORNE, **settings: Any) -> Stepped:
+    """Engaged by the operator's key."""
+    stepped = Stepped(facts, **settings)
+    stepped.step()
+    stepped.step("engage")
+    assert stepped.phase is Phase.FLYING, stepped.engagement.refusal
+    return stepped

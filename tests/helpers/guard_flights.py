@@ -1,0 +1,436 @@
+"""The guard, the policy loop and the simulated vehicle in memory, on a stepped clock.
+
+Everything between the policy and the vehicle's motors is the real thing; the camera is not: each
+solve finds a fresh feature. A test moves the pilot's sticks, breaks the link, and reads the
+vehicle's own record and the bytes that left.
+"""
+
+import math
+from collections.abc import Callable
+from dataclasses import replace
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from pymavlink.dialects.v20 import ardupilotmega as dialect
+
+from helpers.fakes import ListSink
+from helpers.guard_facts import codes
+from helpers.guard_world import Direction, FlightPort, FreshFeatures, Network, NoCamera
+from helpers.wire import WireEnd
+from mavbridge.config.flight import FlyConfig, LinkConfig
+from mavbridge.core.clock import NS_PER_MS, NS_PER_S
+from mavbridge.core.reasons import Code, Reason, because
+from mavbridge.core.vehicle import Sticks
+from mavbridge.flight.bridge import CameraPath, build_bridge
+from mavbridge.flight.plan import plan_flight
+from mavbridge.flight.settings import link_settings
+from mavbridge.guard.departure import Ending
+from mavbridge.guard.engagement import Act, Phase
+from mavbridge.guard.loop import GuardLoop
+from mavbridge.guard.wire import GuardMessage, GuardTick, LastWords, ToGuard, encode_to_guard
+from mavbridge.mavlink.link import MavlinkLink
+from mavbridge.mavlink.transport.sockets import Address, Received
+from mavbridge.simulation.clock import AheadClock, SteppedClock
+from mavbridge.simulation.guard import GuardStepper, MemoryPort, PolicyStepper
+from mavbridge.simulation.network import DelayedChannel
+from mavbridge.simulation.world import NOMINAL_VEHICLE
+from policy.contract import Contract, FloatArray
+from policy.protocol import Executable
+from sitl.ardupilot.autopilot import ArduCopter
+from sitl.ardupilot.flight_modes import Mode
+from sitl.course.layout import AirborneStart
+from sitl.simulated_vehicle import SimulatedVehicle
+from sitl.vehicle.config import IDLE_RECEIVER_US, MID_RECEIVER_US, STEP_NS, VehicleConfig
+
+MS = NS_PER_MS
+HEIGHT_M = 10.0
+SIGNAL = because(Code.SIGNAL)
+NAN = (math.nan,) * 4
+HOVER = (0.0, 0.0, 0.0, 0.0)
+CONTRACT = Contract(feature_dim=1, arrays="numpy")
+Policy = Callable[[float], tuple[float, float, float, float]]
+"""Seconds since the first flight began (negative before it) -> throttle, yaw, pitch, roll."""
+
+
+def hovering(_: float) -> tuple[float, float, float, float]:
+    return HOVER
+
+
+def leaning(_: float) -> tuple[float, float, float, float]:
+    """Far enough from neutral, and from any receiver, to be told apart in every record."""
+    return (0.0, 0.1, 0.2, 0.3)
+
+
+def climbing_first(t_s: float) -> tuple[float, float, float, float]:
+    """Off the ground to some 4 m, then hovering with a lean."""
+    return (0.9, 0.0, 0.0, 0.0) if t_s < 2.5 else (0.0, 0.0, 0.0, 0.25)
+
+
+class StoppableStepper(GuardStepper):
+    """A guard that may stand still, as under SIGSTOP."""
+
+    is_stopped = False
+
+    def step(self) -> None:
+        if not self.is_stopped:
+            super().step()
+
+
+class GuardFlight:
+    """One flight of one vehicle; nothing happens until ``run`` or ``until`` is called."""
+
+    def __init__(
+        self,
+        policy: Policy = leaning,
+        *,
+        receiver_us: tuple[int, ...] | None = MID_RECEIVER_US,
+        params: dict[str, float] | None = None,
+        contract: Contract = CONTRACT,
+        link: dict[str, Any] | None = None,
+        state_folder: Path | None = None,
+        vehicle_type: int = 2,
+        vehicle: VehicleConfig = NOMINAL_VEHICLE,
+        **config: Any,
+    ) -> None:
+        """``config`` are fields of ``FlyConfig``, ``link`` those of ``LinkConfig``."""
+        self.clock = SteppedClock()
+        self.policy = policy
+        self.solve_ns = 3 * MS
+        self._engaged_ns: int | None = None
+        self.is_flight_process_stopped = False
+        """It neither receives nor sends, as under SIGSTOP."""
+        self.vehicle = SimulatedVehicle(
+            links=2,
+            boot_ns=self.clock.now_ns(),
+            config=replace(
+                vehicle,
+                receiver=receiver_us is not None,
+                receiver_us=receiver_us or IDLE_RECEIVER_US,
+                vehicle_type=vehicle_type,
+            ),
+        )
+        for name, value in (params or {}).items():
+            assert self.vehicle.params.set(name, value), name
+        self.up, self.down = Direction(self.clock), Direction(self.clock)
+        self.network = Network(self.clock, self.up, self.down)
+        self._compose(
+            FlyConfig(link=LinkConfig(connect="memory", **(link or {})), **config),
+            contract,
+            state_folder,
+        )
+        self.clock.schedule(self.clock.now_ns() + STEP_NS, self._step_vehicle)
+
+    def _compose(self, config: FlyConfig, contract: Contract, folder: Path | None) -> None:
+        hop_ns = iter(lambda: NS_PER_MS // 10, None)
+        to_guard = DelayedChannel(self.clock, hop_ns)
+        to_flight = DelayedChannel(self.clock, hop_ns)
+        self._port = MemoryPort(outgoing=to_guard, incoming=to_flight)
+        self.guard_port = FlightPort(outgoing=to_flight, incoming=to_guard)
+        self.link = MavlinkLink(
+            self.network,
+            self.clock,
+            link_settings(
+                config.link,
+                state_hz=100.0,
+                stick_hz=config.rates.stick_rate,
+                min_battery_percent=config.envelope.min_battery,
+                folder=folder,
+            ),
+            forward=lambda packet: self.guard.forward(packet),
+        )
+        self.guard = GuardLoop(self.clock, self.link, self.guard_port)
+        self.features = FreshFeatures(self.clock)
+        self.sink = ListSink()
+        executable = self._executable(contract)
+        self._horizon = contract.horizon
+        self._policy_clock = AheadClock(self.clock)
+        plan = plan_flight(config, executable.contract, is_dual=executable.dual_rate)
+        bridge = build_bridge(
+            plan,
+            executable,
+            clock=self._policy_clock,
+            send=self._send,
+            cameras=[CameraPath(camera=NoCamera(), cache=self.features, clock=self.clock)],
+            sinks=[self.sink],
+            watches_images=False,
+        )
+        self.view = bridge.view
+        self.tell(plan.guard)
+        policy = PolicyStepper(
+            self.clock, self._policy_clock, self._port, bridge.policy, bridge.view
+        )
+        stepper = StoppableStepper(self.clock, self.guard)
+        self.guard_stepper = stepper
+        to_flight.on_arrival = lambda: None if self.is_flight_process_stopped else policy.receive()
+        to_guard.on_arrival = self.down.on_arrival = stepper.step
+        self._wake = stepper.step
+
+    # --- the flight process
+
+    def _executable(self, contract: Contract) -> Executable:
+        return Executable(
+            contract=contract,
+            name="test",
+            engine="numpy",
+            dual_rate=True,
+            encode=lambda rgb, camera=0: np.zeros((1, 1), np.float32),
+            act=self._act,
+        )
+
+    def _act(self, encoded: FloatArray, state: FloatArray, history: FloatArray) -> FloatArray:
+        self._policy_clock.ahead_ns += self.solve_ns
+        chunk = np.empty((1, self._horizon, 4), np.float32)
+        chunk[:] = self.policy(self.flown_s)
+        return chunk
+
+    def _send(self, message: ToGuard) -> None:
+        data = encode_to_guard(message)
+        at_ns = self._policy_clock.now_ns()
+        self.clock.schedule(
+            at_ns, lambda: None if self.is_flight_process_stopped else self._port.send(data)
+        )
+
+    def tell(self, message: ToGuard) -> None:
+        """Send the guard a message now."""
+        self._port.send(encode_to_guard(message))
+
+    def act(self, act: Act) -> None:
+        """An explicit act at the terminal."""
+        self.tell(act)
+
+    def stop(self, reason: Reason = SIGNAL, *, is_fault: bool = False) -> None:
+        """Ctrl-C, or a fault of the flight process that it could still report."""
+        self.tell(Ending(reason=reason, is_fault=is_fault))
+
+    def die(self) -> None:
+        """The flight process is killed: the guard reads the end of file."""
+        self.is_flight_process_stopped = True
+        self.guard_port.is_closed = True
+        self._wake()
+
+    def kill_guard(self) -> None:
+        """The guard is killed, and the flight process sends its last words after 2 ms."""
+        self.guard.is_done = True
+        words = [r for r in self.guard_port.reports if isinstance(r, LastWords)][-1]
+        for after_ns, packet in words.packets:
+            at_ns = self.clock.now_ns() + 2 * MS + after_ns
+            self.clock.schedule(at_ns, partial(self.up.send, packet))
+
+    def stand_still(self, seconds: float) -> None:
+        """Both processes stand still, as the machine does in a long stall; then they go on."""
+        self.is_flight_process_stopped = self.guard_stepper.is_stopped = True
+        self.run(seconds)
+        self.is_flight_process_stopped = self.guard_stepper.is_stopped = False
+        self._wake()
+
+    # --- time
+
+    def _step_vehicle(self) -> None:
+        now_ns = self.clock.now_ns()
+        for arrived_ns, data in self.up.receive():
+            self.vehicle.receive(0, data, arrived_ns)
+        self.vehicle.step(now_ns)
+        self.vehicle.take_outgoing(1)
+        if outgoing := self.vehicle.take_outgoing(0):
+            self.down.send(outgoing)
+        self.clock.schedule(now_ns + STEP_NS, self._step_vehicle)
+
+    def run(self, seconds: float) -> None:
+        """Let time pass."""
+        self.clock.sleep_until_ns(self.clock.now_ns() + round(seconds * NS_PER_S))
+
+    def until(self, condition: Callable[[], object], *, within_s: float) -> float:
+        """Let time pass until the condition holds; returns the seconds that it took."""
+        start_ns = self.clock.now_ns()
+        end_ns = start_ns + round(within_s * NS_PER_S)
+        while not condition():
+            assert self.clock.now_ns() < end_ns, f"not within {within_s} s: {self.describe()}"
+            self.clock.sleep_until_ns(self.clock.now_ns() + MS)
+        return (self.clock.now_ns() - start_ns) / NS_PER_S
+
+    def describe(self) -> str:
+        """The state of both ends, for a failed test."""
+        ap = self.vehicle.ap
+        return (
+            f"{self.phase} ({self.reason}); {ap.mode.name}, armed {ap.armed}, "
+            f"height {self.height_m:.1f} m, {self.messages}"
+        )
+
+    @property
+    def t_s(self) -> float:
+        """Seconds since boot: the time of the vehicle's records."""
+        return self.vehicle.log.summary(self.vehicle.ap, 0)["duration_s"]
+
+    @property
+    def flown_s(self) -> float:
+        """Seconds since the policy first flew; negative before."""
+        ticks = (r for r in self.guard_port.reports if isinstance(r, GuardTick))
+        if self._engaged_ns is None:
+            self._engaged_ns = next((t.sent_ns for t in ticks if t.phase is Phase.FLYING), None)
+        if self._engaged_ns is None:
+            return -1.0
+        return (self.clock.now_ns() - self._engaged_ns) / NS_PER_S
+
+    # --- ways into the air
+
+    def launch(self, mode: Mode = Mode.ALT_HOLD) -> "GuardFlight":
+        """Hover armed under the pilot, with the link ready and the policy fresh."""
+        self.vehicle.launch(
+            AirborneStart(
+                position_ned_m=(0.0, 0.0, -HEIGHT_M),
+                velocity_ned_mps=(0.0, 0.0, 0.0),
+                ned_from_body_wxyz=(1.0, 0.0, 0.0, 0.0),
+                next_gate=0,
+            )
+        )
+        self.ap.set_mode(mode)
+        self.until(lambda: self.codes == (Code.NOT_ENGAGED,), within_s=8)
+        return self
+
+    def fly(self, seconds: float = 1.5) -> "GuardFlight":
+        """Launch, engage by the key, and let the policy fly; long enough for the echo."""
+        self.launch()
+        self.act("engage")
+        self.until(lambda: self.phase is Phase.FLYING, within_s=3.0)
+        self.run(seconds)
+        assert self.phase is Phase.FLYING, self.describe()
+        return self
+
+    def take_off(self, seconds: float = 4.0) -> "GuardFlight":
+        """Engage with --arm on the ground, and climb; for a vehicle without a receiver too."""
+        self.until(lambda: self.phase is Phase.FLYING, within_s=12)
+        self.run(seconds)
+        assert self.phase is Phase.FLYING, self.describe()
+        assert self.height_m > 2, self.describe()
+        return self
+
+    # --- what happened
+
+    @property
+    def ap(self) -> ArduCopter:
+        """The vehicle's autopilot since its last boot."""
+        return self.vehicle.ap
+
+    @property
+    def height_m(self) -> float:
+        return -self.vehicle.ap.truth.position_ned_m[2]
+
+    @property
+    def ticks(self) -> list[GuardTick]:
+        """Every report of the guard."""
+        return [r for r in self.guard_port.reports if isinstance(r, GuardTick)]
+
+    @property
+    def last(self) -> GuardTick | None:
+        return next(
+            (r for r in reversed(self.guard_port.reports) if isinstance(r, GuardTick)), None
+        )
+
+    @property
+    def phase(self) -> Phase:
+        return self.last.phase if self.last else Phase.WAITING
+
+    @property
+    def reason(self) -> Reason | None:
+        return self.last.reason if self.last else None
+
+    @property
+    def codes(self) -> tuple[Code, ...]:
+        return codes(self.reason)
+
+    @property
+    def messages(self) -> list[str]:
+        """Lines for the user."""
+        return [r.text for r in self.guard_port.reports if isinstance(r, GuardMessage)]
+
+    def phases(self, since_ns: int = 0) -> list[Phase]:
+        """Phases in order, each once in a row."""
+        found: list[Phase] = []
+        for tick in self.ticks:
+            if tick.sent_ns >= since_ns and (not found or found[-1] is not tick.phase):
+                found.append(tick.phase)
+        return found
+
+    def left(self, since_ns: int = 0) -> list[tuple[int, Any]]:
+        """MAVLink messages that left the guard, with their times, also those that got lost."""
+        end = WireEnd()
+        found = [(at_ns, m) for at_ns, data in self.up.sent for m in end.read(data)]
+        return [(at_ns, m) for at_ns, m in found if at_ns >= since_ns]
+
+    def commands(self, number: int, since_ns: int = 0) -> list[tuple[float, ...]]:
+        """Parameters 1 and 2 of the COMMAND_LONG of this number that left."""
+        return [
+            (m.param1, m.param2)
+            for _, m in self.left(since_ns)
+            if m.get_type() == "COMMAND_LONG" and m.command == number
+        ]
+
+    def modes_asked(self, since_ns: int = 0) -> list[int]:
+        """Numbers of the modes that were requested."""
+        return [int(mode) for _, mode in self.commands(dialect.MAV_CMD_DO_SET_MODE, since_ns)]
+
+    def sticks_sent(self, since_ns: int = 0) -> list[tuple[int, Sticks]]:
+        """Overrides that left, as sticks; releases left out."""
+        return [
+            (t.sent_ns, t.sent) for t in self.ticks if t.sent is not None and t.sent_ns >= since_ns
+        ]
+
+    def overrides(self, since_ns: int = 0) -> list[tuple[int, tuple[int, ...]]]:
+        """The first four channels of each RC_CHANNELS_OVERRIDE that left, in microseconds."""
+        return [
+            (at_ns, (m.chan1_raw, m.chan2_raw, m.chan3_raw, m.chan4_raw))
+            for at_ns, m in self.left(since_ns)
+            if m.get_type() == "RC_CHANNELS_OVERRIDE"
+        ]
+
+    def record(self, since_s: float = 0.0) -> list[dict[str, Any]]:
+        """The vehicle's own record of its sticks, by time since boot."""
+        entries = self.vehicle.log.summary(self.vehicle.ap, 0)["sticks"]
+        return [entry for entry in entries if entry["t_s"] >= since_s]
+
+    @property
+    def modes(self) -> list[str]:
+        """The vehicle's modes in order."""
+        return [entry["mode"] for entry in self.vehicle.log.summary(self.ap, 0)["modes"]]
+
+    # --- others
+
+    def pilot_mode(self, number: int) -> None:
+        """The pilot changes the mode by a ground station."""
+        self.station(
+            lambda mav: mav.command_long_encode(
+                1, 1, dialect.MAV_CMD_DO_SET_MODE, 0, 1, number, 0, 0, 0, 0, 0
+            ),
+            system=42,
+        )
+
+    def station(
+        self, encode: Callable[[dialect.MAVLink], dialect.MAVLink_message], *, system: int = 255
+    ) -> None:
+        """Another station sends a message on a link of its own."""
+        end = WireEnd(system=system, component=190)
+        self.vehicle.receive(1, end.pack(encode(end.mav)), self.clock.now_ns())
+
+    def joystick(self, rate_hz: float, us: tuple[int, int, int, int]) -> None:
+        """A joystick on our system id overrides the same channels from now on."""
+
+        def send() -> None:
+            self.station(lambda mav: mav.rc_channels_override_encode(1, 1, *us, 0, 0, 0, 0))
+            self.clock.schedule(self.clock.now_ns() + round(NS_PER_S / rate_hz), send)
+
+        # In the middle between two sends of ours: just before one it would never be shown.
+        self.clock.schedule(self.clock.now_ns() + 13 * MS // 2, send)
+
+    def receiver(self, **channels_us: int) -> None:
+        """Move sticks and switches of the transmitter: ch3=1500."""
+        values = [0] * 8
+        for name, value_us in channels_us.items():
+            values[int(name.removeprefix("ch")) - 1] = value_us
+        self.vehicle.set_receiver(values)
+
+    def inject(self, data: bytes, sender: Address) -> None:
+        """Bytes reach the guard from another address."""
+        self.network.strangers.append(Received(data, self.clock.now_ns(), sender))
+        self._wake()

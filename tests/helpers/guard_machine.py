@@ -1,0 +1,343 @@
+"""A guard with its real output and sender, and a vehicle, a pilot and a flight process by hand."""
+
+from collections import deque
+from collections.abc import Iterator
+from dataclasses import dataclass, field, replace
+from typing import Any
+
+from helpers.fakes import FOREVER_NS, START_NS, FakeClock, level_telemetry
+from helpers.flown_vehicle import FlownVehicle
+from helpers.guard_facts import engagement_settings
+from helpers.wire import ARDUPILOT as CALIBRATION
+from helpers.wire import WireEnd
+from mavbridge.core.clock import NS_PER_MS
+from mavbridge.core.reasons import Reason
+from mavbridge.core.vehicle import (
+    NEUTRAL,
+    Action,
+    ActionMeaning,
+    LinkSnapshot,
+    Output,
+    Sticks,
+    VehicleStatus,
+    Velocity,
+)
+from mavbridge.guard.chunks import Chunk, FreshnessLimits
+from mavbridge.guard.departure import DepartureSettings, Ending
+from mavbridge.guard.engagement import Act, Phase
+from mavbridge.guard.envelope import EnvelopeLimits
+from mavbridge.guard.guard import FlightSettings, Guard, GuardInput, GuardOutput
+from mavbridge.guard.limits import LimitSettings
+from mavbridge.guard.smoothing import Smoothing
+from mavbridge.mavlink.codec.messages import Body, ManualControl, RcChannels, VelocityTarget
+from mavbridge.mavlink.codec.packets import Codec
+from mavbridge.mavlink.outputs.output import ActionOutput
+from mavbridge.mavlink.outputs.sender import ActionSender
+from mavbridge.mavlink.profiles.ardupilot import ARDUPILOT
+from mavbridge.mavlink.profiles.px4 import PX4
+from mavbridge.mavlink.transport.connection import Connection
+from mavbridge.mavlink.transport.sockets import Address, Received
+
+MS = NS_PER_MS
+STEP_NS, SHOWN_NS = 10 * MS, 20 * MS
+LIMIT_NS, GRACE_NS = 120 * MS, 100 * MS
+HORIZON = 16
+FLIGHT_MODES = {
+    ("ardupilot", "sticks"): "ALT_HOLD",
+    ("ardupilot", "velocity"): "GUIDED",
+    ("px4", "sticks"): "ALTCTL",
+    ("px4", "velocity"): "OFFBOARD",
+}
+CODES = 200
+"""Chunks that are told apart by what the wire shows of them."""
+JOYSTICK = Sticks(0.3, -0.4, -0.6, -0.5)
+
+
+class Wire:
+    """A transport that keeps what is sent; it may be down."""
+
+    def __init__(self) -> None:
+        self.sent: list[bytes] = []
+
+    def open(self) -> None:
+        pass
+
+    def close(self) -> None:
+        pass
+
+    def fileno(self) -> int | None:
+        return None
+
+    def receiver(self, peer: Address | None) -> Address | None:
+        return peer
+
+    def drain(self) -> Iterator[Received]:
+        return iter(())
+
+    def send(self, data: bytes, peer: Address | None = None) -> bool:
+        self.sent.append(data)
+        return True
+
+
+class Copter(FlownVehicle):
+    """The vehicle's word about itself, set by hand."""
+
+    is_failsafe = False
+    switch_us = 1500
+    """Channel 7."""
+
+    def use_output(self, output: Output) -> None:
+        pass
+
+    def status(self, now_ns: int) -> VehicleStatus:
+        return VehicleStatus(
+            mode=self.mode,
+            armed=self.armed,
+            is_failsafe=self.is_failsafe,
+            is_landed=False,
+            has_receiver=self.has_receiver,
+            pilot_sticks=NEUTRAL if self.has_receiver else None,
+            rc_channels_us=(1500,) * 6 + (self.switch_us, 1500),
+            rc_arrived_ns=now_ns,
+            is_position_valid=True,
+            position_ned_m=(0.0, 0.0, -5.0),
+        )
+
+
+@dataclass(frozen=True)
+class Shown:
+    """One packet for the vehicle, as pymavlink reads it."""
+
+    at_ns: int
+    kind: str
+    """policy, neutral, release."""
+    code: int | None
+    """Which chunk a policy's packet is made of."""
+    phase: Phase
+
+
+@dataclass
+class GuardWorld:
+    """Everything around one guard; ``step`` is one wake of it."""
+
+    autopilot: str
+    kind: Any
+    has_receiver: bool
+    departure: DepartureSettings
+    engage_channel: int | None
+    clock: FakeClock = field(default_factory=FakeClock)
+    serial: int = 0
+    act: Act | None = None
+    stop: Ending | None = None
+    link_problem: Reason | None = None
+    interruption: Reason | None = None
+    interruptions: int = 0
+    refused_mode: str | None = None
+    is_switched_off: bool = False
+    has_chunks: bool = True
+    """The flight process computes a chunk every 10 ms."""
+    hears: bool = True
+    """What we send reaches the vehicle."""
+    shows: bool = True
+    """The vehicle's messages that show our sticks reach us."""
+    joystick_ns: int = 0
+    """Period of another source that sends to the vehicle; 0: there is none."""
+    odd_chunk: Chunk | None = None
+    wire: Wire = field(default_factory=Wire)
+    packets: list[Shown] = field(default_factory=list)
+    outputs: deque[GuardOutput] = field(default_factory=lambda: deque(maxlen=4))
+
+    def __post_init__(self) -> None:
+        self.profile = {"ardupilot": ARDUPILOT, "px4": PX4}[self.autopilot]
+        self.mode = FLIGHT_MODES[self.autopilot, self.kind]
+        self.vehicle = Copter(self.profile, CALIBRATION)
+        self.vehicle.mode, self.vehicle.has_receiver = self.mode, self.has_receiver
+        meaning = ActionMeaning(kind=self.kind)
+        codec = Codec(source_system=255, source_component=191)
+        self.sender = ActionSender(Connection(self.wire, codec, self.clock), codec, self.clock)
+        self.sender.begin_flight(meaning, None)
+        self.sender.equip(self.vehicle)  # type: ignore[arg-type]
+        self.guard = Guard(self._settings(meaning), self.clock.now_ns())
+        self.end = WireEnd()
+        self.chunks: dict[int, Chunk] = {}
+        """Those that may be flown, by code."""
+        self.acts_on: tuple[int, ...] | None = None
+        """What the vehicle was told last, as it would show it."""
+        self.others_due_ns = self.shown_ns = 0
+
+    def _settings(self, meaning: ActionMeaning) -> FlightSettings:
+        free = LimitSettings(stick_slew_per_s=0.0, accel_mps2=1e6)
+        return FlightSettings(
+            meaning=meaning,
+            stick_period_ns=STEP_NS,
+            chunk_period_ns=STEP_NS,
+            freshness=FreshnessLimits(
+                state_ns=LIMIT_NS, velocity_ns=LIMIT_NS, feature_ns=2 * LIMIT_NS, chunk_ns=LIMIT_NS
+            ),
+            smoothing=Smoothing(limits=free.of(self.kind), tau_s=0.0),
+            envelope=EnvelopeLimits(),
+            watches_home_height=False,
+            watches_position=False,
+            engagement=engagement_settings(
+                modes=(self.mode,),
+                is_setpoint=self.kind != "sticks",
+                departure=replace(self.departure, is_setpoint=self.kind != "sticks"),
+                engage_channel=self.engage_channel,
+            ),
+        )
+
+    @property
+    def output(self) -> ActionOutput:
+        assert self.sender.output is not None
+        return self.sender.output
+
+    @property
+    def now_ns(self) -> int:
+        return self.clock.now_ns()
+
+    @property
+    def phase(self) -> Phase:
+        return self.guard.phase
+
+    # --- the flight process
+
+    def chunk(self, **changes: Any) -> Chunk:
+        """A fresh chunk, or one with other stamps or actions."""
+        self.serial += 1
+        now_ns = self.now_ns
+        action: Action = Sticks(0.1, 0.0, 0.2 + 0.0025 * (self.serial % CODES), 0.0)
+        if self.kind == "velocity":
+            action = Velocity(1.0 + 0.01 * (self.serial % CODES), 0.0, 0.0, 0.0)
+        fresh = Chunk(
+            serial=self.serial,
+            attitude_ns=now_ns - 5 * MS,
+            velocity_ns=now_ns - 5 * MS,
+            image_ns=now_ns - 30 * MS,
+            computed_ns=now_ns,
+            first_ns=now_ns,
+            step_ns=20 * MS,
+            actions=(action,) * HORIZON,
+            reset_ns=FOREVER_NS,
+        )
+        made = fresh._replace(**changes)
+        self.chunks[self.serial % CODES] = made
+        return made
+
+    # --- time
+
+    def advance(self, ms: int) -> None:
+        """Let time pass; the guard wakes at each slot."""
+        for _ in range(0, ms, 10):
+            self.clock.advance_ns(STEP_NS)
+            self.step()
+
+    def stall(self, ms: int) -> None:
+        """The guard does not run for so long; the vehicle does."""
+        for _ in range(0, ms, 10):
+            self.clock.advance_ns(STEP_NS)
+            self._show()
+
+    def step(self) -> GuardOutput:
+        self._show()
+        chunk = self.odd_chunk or (self.chunk() if self.has_chunks else None)
+        given = GuardInput(link=self._snapshot(), chunk=chunk, act=self.act, stop=self.stop)
+        self.act = self.odd_chunk = None
+        done = self.guard.step(self.now_ns, given)
+        self.outputs.append(done)
+        if done.decision is not None:
+            self.sender.send(done.decision)
+        self._take()
+        return done
+
+    def _snapshot(self) -> LinkSnapshot:
+        """As the link makes it of the output and the session."""
+        output, now_ns = self.output, self.now_ns
+        vehicle: Any = self.vehicle
+        others = output.overruled(now_ns)
+        roles = self.profile.modes.roles
+        return LinkSnapshot(
+            telemetry=level_telemetry(now_ns),
+            status=output.in_policy_terms(vehicle.status(now_ns), vehicle, now_ns),
+            problem=self.link_problem or others or output.unheard(now_ns),
+            is_overruled=others is not None,
+            is_switched_off=output.is_sticks and self.is_switched_off,
+            echo_confirmed=output.echo_confirmed,
+            is_released=output.is_released(vehicle, now_ns),
+            shows_last=output.shows_last,
+            interruption=self.interruption,
+            interruptions=self.interruptions,
+            modes=roles if output.is_sticks else replace(roles, is_silence_failsafe=False),
+            refused_mode=self.refused_mode,
+        )
+
+    # --- the vehicle
+
+    def _show(self) -> None:
+        """The vehicle's message that shows what it acts on, every 20 ms."""
+        if self.joystick_ns and self.now_ns >= self.others_due_ns:
+            self.others_due_ns = self.now_ns + self.joystick_ns
+            self.acts_on = self._as_shown(JOYSTICK)
+        if self.now_ns - self.shown_ns < SHOWN_NS:
+            return
+        self.shown_ns = self.now_ns
+        acts_on = self.acts_on
+        if acts_on is None and self.has_receiver:
+            acts_on = self._as_shown(NEUTRAL)
+        if self.shows and acts_on is not None:
+            vehicle: Any = self.vehicle
+            self.output.receive(self._body(acts_on), vehicle, self.now_ns)
+
+    def _as_shown(self, sticks: Sticks) -> tuple[int, ...]:
+        if self.kind == "velocity":
+            return (-700,)
+        if self.autopilot == "px4":
+            return (round(1000 * sticks.pitch), round(1000 * sticks.roll), 500, 0)
+        return CALIBRATION.to_pwm_us(sticks)
+
+    def _body(self, acts_on: tuple[int, ...]) -> Body:
+        boot_us = (self.now_ns - START_NS) // 1000 + 1
+        if self.kind == "velocity":
+            return VelocityTarget(boot_us, 0x5C7, (0.0, 0.0, acts_on[0] / 1000), 0.0)
+        if self.autopilot == "px4":
+            return ManualControl(*acts_on)
+        throttle, yaw, pitch, roll = acts_on
+        channels_us = (roll, pitch, throttle, yaw, 1500, 1500, self.vehicle.switch_us, 1500)
+        return RcChannels(channels_us, boot_us)
+
+    def _take(self) -> None:
+        """Read what has left, by pymavlink; the vehicle acts on it if it hears it."""
+        sent, self.wire.sent[:] = list(self.wire.sent), []
+        for data in sent:
+            (message,) = self.end.read(data)
+            kind, code, acts_on = _meaning(message)
+            self.packets.append(Shown(self.now_ns, kind, code, self.phase))
+            if self.hears:
+                self.acts_on = acts_on
+
+
+def _meaning(m: Any) -> tuple[str, int | None, tuple[int, ...] | None]:
+    """Kind and code of a packet, and what the vehicle will show of it."""
+    match m.get_type():
+        case "RC_CHANNELS_OVERRIDE":
+            acts_on = (m.chan3_raw, m.chan4_raw, m.chan2_raw, m.chan1_raw)
+            if acts_on == (0, 0, 0, 0):
+                return "release", None, None
+            assert all(1100 <= us <= 1900 for us in acts_on), acts_on
+            return _kind((1500 - m.chan2_raw) / 400), _code((1500 - m.chan2_raw) / 400), acts_on
+        case "MANUAL_CONTROL":
+            assert all(abs(v) <= 1000 for v in (m.x, m.y, m.r)), m
+            assert 0 <= m.z <= 1000, m
+            return _kind(m.x / 1000), _code(m.x / 1000), (m.x, m.y, m.z, m.r)
+        case "SET_POSITION_TARGET_LOCAL_NED":
+            assert abs(m.vx) <= 8.0, m
+            code = round((m.vx - 1.0) / 0.01) if m.vx > 0.5 else None
+            return ("neutral" if code is None else "policy"), code, (round(1000 * m.vz),)
+    raise AssertionError(f"{m.get_type()} was sent")
+
+
+def _kind(pitch: float) -> str:
+    return "policy" if pitch > 0.15 else "neutral"
+
+
+def _code(pitch: float) -> int | None:
+    return round((pitch - 0.2) / 0.0025) if pitch > 0.15 else None

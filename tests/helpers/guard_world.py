@@ -1,0 +1,118 @@
+"""The edges of a flight in memory: a link with faults, a channel that is read, no camera."""
+
+import random
+from collections import deque
+from collections.abc import Iterator
+
+import numpy as np
+
+from mavbridge.core.clock import NS_PER_MS
+from mavbridge.core.reasons import Reason
+from mavbridge.core.records import FeatureFrame, Frame
+from mavbridge.flight.feature_cache import FeatureCache
+from mavbridge.guard.wire import FromGuard, decode_from_guard
+from mavbridge.mavlink.transport.sockets import Address, Received, TransportDownError
+from mavbridge.simulation.clock import SteppedClock
+from mavbridge.simulation.guard import MemoryPort
+from mavbridge.simulation.network import VEHICLE, DelayedChannel, MemoryTransport
+
+MS = NS_PER_MS
+
+
+class Direction(DelayedChannel):
+    """One direction of the link, whose faults may be changed in flight."""
+
+    def __init__(self, clock: SteppedClock) -> None:
+        self.delay_ns = NS_PER_MS * 3 // 10
+        self.loss = 0.0
+        self.is_silent = False
+        self.sent: list[tuple[int, bytes]] = []
+        """Every datagram, also those that got lost, with its time."""
+        self._draw = random.Random(1)
+        self._world = clock
+        super().__init__(clock, self._delays_ns())
+
+    def _delays_ns(self) -> Iterator[int]:
+        while True:
+            yield self.delay_ns
+
+    def send(self, data: bytes) -> None:
+        self.sent.append((self._world.now_ns(), data))
+        if not self.is_silent and self._draw.random() >= self.loss:
+            super().send(data)
+
+
+class Network(MemoryTransport):
+    """The guard's end of the link, which other addresses may write to as well."""
+
+    def __init__(self, clock: SteppedClock, to_vehicle: Direction, from_vehicle: Direction) -> None:
+        super().__init__(clock, to_vehicle=to_vehicle, from_vehicle=from_vehicle)
+        self.address: Address = VEHICLE
+        """Where the vehicle sends from."""
+        self.strangers: deque[Received] = deque()
+        self.is_down = False
+        """The port is gone."""
+
+    def open(self) -> None:
+        if self.is_down:
+            raise TransportDownError("no such port")
+
+    def fileno(self) -> int | None:
+        """So that the guard prepares its last words."""
+        return 7
+
+    def send(self, data: bytes, peer: Address | None = None) -> bool:
+        self.open()
+        return super().send(data, peer)
+
+    def drain(self) -> Iterator[Received]:
+        self.open()
+        for received in super().drain():
+            yield received._replace(sender=self.address)
+        while self.strangers:
+            yield self.strangers.popleft()
+
+
+class FlightPort(MemoryPort):
+    """The guard's end of the channel to the flight process; keeps everything that was reported."""
+
+    def __init__(self, **channels: DelayedChannel) -> None:
+        super().__init__(**channels)
+        self.reports: list[FromGuard] = []
+
+    def send(self, message: bytes, fd: int | None = None) -> bool:
+        self.reports.append(decode_from_guard(message))
+        return super().send(message, fd)
+
+
+class FreshFeatures(FeatureCache):
+    """A camera that never fails, unless told to."""
+
+    def __init__(self, clock: SteppedClock) -> None:
+        super().__init__()
+        self._clock = clock
+        self.fault: Reason | None = None
+        self.stopped_ns: int | None = None
+        """When the last image was exposed; None: just now."""
+
+    def latest(self) -> FeatureFrame:
+        captured_ns = self.stopped_ns or self._clock.now_ns() - 20 * MS
+        return FeatureFrame(
+            frame_id=captured_ns // MS,
+            captured_ns=captured_ns,
+            ready_ns=captured_ns,
+            value=np.zeros((1, 1), np.float32),
+            fault=self.fault,
+        )
+
+
+class NoCamera:
+    """Never read: the features come from ``FreshFeatures``."""
+
+    dropped_frames = 0
+
+    def read(self, timeout_ns: int) -> Frame | None:
+        raise NotImplementedError
+
+    def close(self) -> None:
+        raise NotImplementedError

@@ -1,0 +1,294 @@
+"""Who gets the sticks, and how (docs/SAFETY.md): points 1, 3 and 7 of the guard, on the vehicle."""
+
+from dataclasses import replace
+from itertools import pairwise
+from typing import Any
+
+import pytest
+from pymavlink.dialects.v20 import ardupilotmega as dialect
+
+from helpers.guard_flights import (
+    CONTRACT,
+    MS,
+    GuardFlight,
+    climbing_first,
+    hovering,
+    leaning,
+)
+from mavbridge.core.errors import PeerError, UserError
+from mavbridge.core.reasons import Code, because
+from mavbridge.guard.engagement import Phase
+from sitl.ardupilot.flight_modes import Mode
+
+ARM = dialect.MAV_CMD_COMPONENT_ARM_DISARM
+SWITCH = 7
+TWO_MODES = replace(CONTRACT, modes=("ALT_HOLD", "LOITER"))
+LOW, HIGH = 1000, 2000
+
+
+def arm_by_pilot(flight: GuardFlight) -> None:
+    flight.ap.set_mode(Mode.ALT_HOLD)
+    assert flight.ap.arm(force=False), flight.describe()
+
+
+def test_somebody_elses_arming_is_not_engaging_and_nothing_is_sent() -> None:
+    flight = GuardFlight()
+    flight.run(5)
+    arm_by_pilot(flight)
+    flight.run(3)
+
+    assert flight.phase is Phase.WAITING
+    assert flight.codes == (Code.NOT_ENGAGED,)
+    assert not flight.overrides()
+    assert not flight.commands(ARM)
+    assert not flight.modes_asked()
+
+
+def test_arm_arms_once_and_engages_once() -> None:
+    flight = GuardFlight(climbing_first, arm=True).take_off()
+    assert flight.phases() == [Phase.WAITING, Phase.PREPARING, Phase.FLYING]
+    assert len(flight.commands(ARM)) == 1
+    disarmed_ns = flight.clock.now_ns()
+    flight.ap.disarm(force=True)
+    flight.until(lambda: flight.phase is Phase.RELEASED, within_s=0.5)
+    flight.ap.arm(force=True)
+    flight.run(3)
+
+    assert flight.phase is Phase.RELEASED
+    assert flight.codes == (Code.DISARMED,)
+    assert not flight.commands(ARM, disarmed_ns)
+
+
+def test_arm_idles_the_throttle_until_the_policy_takes_over_from_there() -> None:
+    flight = GuardFlight(climbing_first, receiver_us=None, arm=True).take_off(2.5)
+    sticks = [sticks for _, sticks in flight.sticks_sent()]
+    steps = [b.throttle - a.throttle for a, b in pairwise(sticks)]
+
+    assert sticks[0].throttle == pytest.approx(-1.0, abs=0.05)
+    assert max(steps) < 0.09, "8 /s at 100 Hz, and not a jump from idle to the policy"
+
+
+def test_the_switch_engages_by_going_high_while_armed_in_an_allowed_mode() -> None:
+    flight = GuardFlight(engage_channel=SWITCH)
+    flight.receiver(ch7=HIGH)
+    flight.launch()
+    flight.run(1)
+    assert flight.phase is Phase.WAITING, "it was high when it was first seen"
+
+    flight.receiver(ch7=LOW)
+    flight.run(2)
+    assert flight.phase is Phase.WAITING
+    flight.receiver(ch7=HIGH)
+    took_s = flight.until(lambda: flight.phase is Phase.FLYING, within_s=0.3)
+    assert took_s > 0.2, "the debounce"
+    flight.run(1)
+
+    flight.receiver(ch7=LOW)
+    took_s = flight.until(lambda: flight.phase is Phase.RELEASED, within_s=0.3)
+    assert took_s < 0.2
+    assert flight.codes == (Code.ENGAGE_SWITCH_OFF,)
+    flight.run(2)
+    flight.receiver(ch7=HIGH)
+    flight.until(lambda: flight.phase is Phase.FLYING, within_s=0.3)
+
+
+@pytest.mark.parametrize("dropout", [{"ch7": 988}, {"ch7": 988, "ch3": 950}, {"ch7": 65535}])
+@pytest.mark.parametrize(("is_flying", "seconds"), [(True, 0.6), (False, 1.5)])
+def test_a_receiver_that_drops_out_and_comes_back_engages_nothing(
+    dropout: dict[str, int], is_flying: bool, seconds: float
+) -> None:
+    flight = GuardFlight(engage_channel=SWITCH)
+    flight.receiver(ch7=LOW if is_flying else HIGH)
+    flight.launch()
+    if is_flying:
+        flight.receiver(ch7=HIGH)
+        flight.until(lambda: flight.phase is Phase.FLYING, within_s=0.3)
+    flight.run(0.5)
+    flight.receiver(**dropout)
+    flight.run(seconds)
+    flight.receiver(**dict.fromkeys(dropout, 1500) | {"ch7": HIGH})
+    flight.run(0.5)
+    flight.ap.set_mode(Mode.ALT_HOLD)  # the pilot leaves what a failsafe has chosen
+    flight.run(0.5)
+    assert flight.view.flights == is_flying, flight.describe()
+
+
+def test_engage_on_arm_counts_the_first_arming_alone() -> None:
+    flight = GuardFlight(hovering, engage_on_arm=True)
+    flight.run(5)
+    arm_by_pilot(flight)
+    flight.until(lambda: flight.phase is Phase.FLYING, within_s=0.3)
+    flight.run(1)
+    flight.ap.disarm(force=True)
+    flight.until(lambda: flight.phase is Phase.RELEASED, within_s=1.5)
+    arm_by_pilot(flight)
+    flight.run(2)
+
+    assert flight.phase is Phase.RELEASED
+
+
+def test_the_keys_engage_and_release() -> None:
+    flight = GuardFlight().fly()
+    flight.act("release")
+    flight.until(lambda: flight.phase is Phase.RELEASED, within_s=1.2)
+    assert flight.codes == (Code.OPERATOR,)
+    assert not flight.modes_asked(), "with a receiver the sticks are given back in the same mode"
+
+    flight.act("engage")
+    flight.until(lambda: flight.phase is Phase.FLYING, within_s=0.1)
+
+
+def test_a_key_in_the_wrong_mode_is_refused_with_what_would_be_right() -> None:
+    flight = GuardFlight().launch()
+    flight.ap.set_mode(Mode.LOITER)
+    flight.run(0.3)
+    flight.act("engage")
+    flight.run(1)
+
+    assert flight.phase is Phase.WAITING
+    assert any("may not fly in LOITER, only in ALT_HOLD" in text for text in flight.messages)
+    assert not flight.modes_asked()
+    assert not flight.overrides()
+
+
+def test_engaging_requires_a_fresh_chunk() -> None:
+    flight = GuardFlight().launch()
+    flight.is_flight_process_stopped = True
+    flight.run(0.5)
+    flight.act("engage")
+    flight.run(0.5)
+
+    assert flight.phase is Phase.WAITING
+    assert any("not engaged: " in text for text in flight.messages), flight.messages
+    flight.is_flight_process_stopped = False
+    flight.run(1)
+    assert flight.phase is Phase.WAITING, "an act that was refused is forgotten"
+
+
+def test_a_mode_in_the_air_is_asked_for_while_the_pilot_keeps_the_sticks() -> None:
+    flight = GuardFlight(contract=TWO_MODES, mode="LOITER").launch()
+    flight.act("engage")
+    flight.until(lambda: flight.phase is Phase.FLYING, within_s=0.3)
+
+    assert flight.modes_asked() == [Mode.LOITER]
+    first_ns = flight.overrides()[0][0]
+    assert not flight.modes_asked(first_ns), "the sticks come once the mode has been confirmed"
+    assert flight.phases() == [Phase.WAITING, Phase.PREPARING, Phase.FLYING]
+
+
+def test_a_pilot_who_changes_the_mode_while_ours_is_asked_for_keeps_his() -> None:
+    flight = GuardFlight(contract=TWO_MODES, mode="LOITER").launch()
+    flight.up.is_silent = True  # our request gets lost
+    flight.act("engage")
+    flight.run(0.1)
+    flight.ap.set_mode(Mode.RTL)
+    flight.run(0.2)
+    flight.up.is_silent = False
+    flight.run(3)
+
+    assert flight.phase is Phase.RELEASED, flight.describe()
+    assert Code.MODE_CHANGED in flight.codes
+    assert flight.ap.mode is Mode.RTL
+    assert not flight.overrides()
+
+
+def test_an_act_in_the_air_does_not_come_true_much_later() -> None:
+    flight = GuardFlight(contract=TWO_MODES, mode="LOITER").launch()
+    flight.up.is_silent = True  # the request gets lost, and is repeated
+    flight.act("engage")
+    flight.run(0.01)
+    flight.is_flight_process_stopped = True
+    flight.up.is_silent = False
+    flight.run(5)
+    flight.is_flight_process_stopped = False
+    flight.run(3)
+
+    assert flight.phase is Phase.RELEASED, flight.describe()
+    assert Code.NOT_READY in flight.codes
+    assert not flight.overrides()
+
+
+@pytest.mark.parametrize("act", ["release", "stop"])
+def test_ending_before_the_policy_had_the_sticks_does_not_touch_the_pilots(act: str) -> None:
+    flight = GuardFlight(contract=TWO_MODES, mode="LOITER").launch()
+    flight.up.is_silent = True
+    flight.act("engage")
+    flight.run(0.3)
+    assert flight.phase is Phase.PREPARING
+    flight.up.is_silent = False
+    if act == "release":
+        flight.act("release")
+    else:
+        flight.stop()
+    flight.run(0.5)
+
+    assert flight.phase is (Phase.RELEASED if act == "release" else Phase.ENDED)
+    assert not flight.overrides(), "the pilot was flying all the time"
+
+
+@pytest.mark.parametrize(
+    ("changes", "told"),
+    [
+        ({"mode": "RTL"}, "--mode RTL: this policy flies in ALT_HOLD or ALTCTL only"),
+        ({"mode": "STABILIZE"}, "--mode STABILIZE: this policy flies in ALT_HOLD"),
+        ({"mode": "GUIDED"}, "--mode GUIDED"),
+    ],
+)
+def test_a_mode_that_the_contract_does_not_name_is_refused(
+    changes: dict[str, Any], told: str
+) -> None:
+    with pytest.raises(UserError, match=told):
+        GuardFlight(**changes)
+
+
+@pytest.mark.parametrize("vehicle_type", [dialect.MAV_TYPE_FIXED_WING, dialect.MAV_TYPE_HELICOPTER])
+def test_anything_but_a_multirotor_is_refused_with_one_sentence(vehicle_type: int) -> None:
+    flight = GuardFlight(vehicle_type=vehicle_type)
+    with pytest.raises(PeerError, match="only multirotors are flown"):
+        flight.run(5)
+    assert not flight.overrides()
+
+
+def test_from_pilot_to_policy_without_a_jump_and_back_without_a_blend() -> None:
+    flight = GuardFlight(lambda _: (0.0, 0.0, -0.5, -0.5))
+    flight.receiver(ch1=1620, ch2=1450, ch3=1540)
+    flight.launch()
+    flight.act("engage")
+    flight.until(lambda: flight.phase is Phase.FLYING, within_s=0.1)
+    flight.run(1)
+
+    channels = [us for _, us in flight.overrides()]
+    assert channels[0] == pytest.approx((1620, 1450, 1540, 1500), abs=12)
+    jumps_us = [
+        max(abs(a - b) for a, b in zip(one, other, strict=True))
+        for one, other in pairwise(channels)
+    ]
+    assert max(jumps_us) <= 52, "8 /s at 100 Hz are 40 us, and the echo's steps are 4 or 8"
+    assert channels[-1][:2] == pytest.approx((1250, 1750), abs=10)
+
+    flight.ap.set_mode(Mode.LOITER)
+    taken_s = flight.t_s
+    flight.run(0.06)
+    assert flight.record(taken_s)[-1]["us"] == (1620, 1450, 1540, 1500)
+    between = {entry["us"][0] for entry in flight.record(taken_s)}
+    assert between <= {*range(1240, 1260), 1620}, "the sticks were given back in one step"
+
+
+def test_an_engagement_before_the_last_one_has_ended_is_refused_aloud() -> None:
+    flight = GuardFlight(on_fault="hold").fly()
+    flight.features.fault = because(Code.IMAGE_FROZEN, age_s=0.6)
+    flight.until(lambda: flight.phase is Phase.LEAVING, within_s=0.5)
+    flight.act("engage")
+    flight.run(0.01)
+
+    assert any("the last flight is still ending" in text for text in flight.messages)
+
+
+def test_a_policy_takes_over_where_the_pilot_lands_it_on_the_ground() -> None:
+    """Engaged while landed, the policy's first stick follows the idle throttle."""
+    flight = GuardFlight(leaning, arm=True)
+    flight.until(lambda: flight.phase is Phase.FLYING, within_s=12)
+    flight.run(2)
+    assert flight.ap.landed, "neutral throttle is no take-off"
+    assert flight.phase is Phase.FLYING
+    assert flight.clock.now_ns() - flight.overrides()[-1][0] < 20 * MS

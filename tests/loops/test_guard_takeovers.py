@@ -1,0 +1,260 @@
+"""The pilot or the autopilot takes the sticks: points 2, 5 and 8 of the guard, on the vehicle."""
+
+from collections.abc import Callable
+
+import pytest
+
+from helpers.guard_flights import GuardFlight, climbing_first, hovering, leaning
+from mavbridge.core.clock import NS_PER_MS, NS_PER_S
+from mavbridge.core.reasons import Code, Reason, because
+from mavbridge.guard.engagement import Phase
+from sitl.ardupilot.flight_modes import Mode
+from sitl.vehicle.config import MID_RECEIVER_US
+
+MS = NS_PER_MS
+OVERRIDE_SWITCH = {"RC8_OPTION": 46.0}
+MID = (*MID_RECEIVER_US[:7], 2000)
+
+
+def by_mode(flight: GuardFlight) -> None:
+    flight.pilot_mode(Mode.LOITER)
+
+
+def by_radio(flight: GuardFlight) -> None:
+    flight.receiver(ch5=1680)  # FLTMODE5: LOITER
+
+
+def by_disarming(flight: GuardFlight) -> None:
+    flight.ap.disarm(force=True)
+
+
+def by_failsafe(flight: GuardFlight) -> None:
+    flight.ap.gcs_failsafe.active = True
+
+
+def by_switch(flight: GuardFlight) -> None:
+    flight.receiver(ch8=1000)
+
+
+def by_joystick(flight: GuardFlight) -> None:
+    flight.joystick(50, (1700, 1500, 1500, 1500))
+
+
+TAKEOVERS = [
+    (by_mode, because(Code.MODE_CHANGED, before="ALT_HOLD", after="LOITER"), 0.03),
+    (by_radio, because(Code.MODE_CHANGED, before="ALT_HOLD", after="LOITER"), 0.25),
+    (by_disarming, because(Code.DISARMED), 0.12),
+    (by_failsafe, because(Code.FAILSAFE, mode="ALT_HOLD"), 0.12),
+    (by_switch, because(Code.OVERRIDE_SWITCH_OFF), 0.12),
+    (
+        by_joystick,
+        because(
+            Code.OVERRULED,
+            quantity="sticks",
+            cause="another station is overriding them (a joystick on our system id?)",
+        ),
+        0.5,
+    ),
+]
+
+
+@pytest.mark.parametrize(("take", "reason", "within_s"), TAKEOVERS)
+def test_a_takeover_releases_and_no_mode_command_ever_leaves(
+    take: Callable[[GuardFlight], None], reason: Reason, within_s: float
+) -> None:
+    flight = GuardFlight(receiver_us=MID, params=OVERRIDE_SWITCH).fly()
+    before_ns = flight.clock.now_ns()
+    take(flight)
+    flight.until(lambda: flight.phase is not Phase.FLYING, within_s=within_s)
+    given_ns = flight.clock.now_ns()
+    flight.run(3)
+
+    assert flight.phases(before_ns - 50 * MS) == [Phase.FLYING, Phase.RELEASING, Phase.RELEASED]
+    assert flight.reason == reason
+    assert not flight.modes_asked()
+    releases = flight.overrides(given_ns - MS)
+    assert releases
+    assert {us for _, us in releases} == {(0, 0, 0, 0)}, "after the takeover nothing but releases"
+
+
+@pytest.mark.parametrize(("take", "reason", "within_s"), TAKEOVERS)
+def test_what_was_taken_does_not_come_back_by_itself(
+    take: Callable[[GuardFlight], None], reason: Reason, within_s: float
+) -> None:
+    flight = GuardFlight(receiver_us=MID, params=OVERRIDE_SWITCH).fly()
+    take(flight)
+    flight.until(lambda: flight.phase is Phase.RELEASED, within_s=2)
+    flight.ap.gcs_failsafe.active = False
+    flight.receiver(ch5=1500, ch8=2000)
+    flight.ap.set_mode(Mode.ALT_HOLD)
+    flight.ap.disarm(force=True)
+    flight.run(1)
+    flight.ap.arm(force=True)
+    flight.run(2)
+
+    assert flight.phase is Phase.RELEASED
+    assert flight.reason == reason
+    assert not flight.modes_asked()
+
+
+def test_the_release_leaves_in_the_step_that_hears_of_the_takeover() -> None:
+    flight = GuardFlight().fly()
+    flight.pilot_mode(Mode.LOITER)
+    flight.until(lambda: flight.ap.mode is Mode.LOITER, within_s=0.01)
+    changed_ns = flight.clock.now_ns()
+    flight.run(0.2)
+
+    override_ns = [at_ns for at_ns, us in flight.overrides() if any(us)]
+    release_ns = next(at_ns for at_ns, us in flight.overrides() if not any(us))
+    assert release_ns - changed_ns < 5 * MS, "the vehicle's step, and the way here"
+    assert override_ns[-1] < release_ns
+
+
+def test_the_pilot_has_his_sticks_within_60_ms_by_the_vehicles_record() -> None:
+    flight = GuardFlight(receiver_us=(1450, 1550, 1520, 1500, 1500, 1500, 1500, 1500)).fly()
+    taken_s = flight.t_s
+    flight.pilot_mode(Mode.LOITER)
+    flight.run(1)
+
+    in_loiter = [entry for entry in flight.record(taken_s) if entry["mode"] == "LOITER"]
+    theirs_s = next(e["t_s"] for e in in_loiter if e["us"] == (1450, 1550, 1520, 1500))
+    assert theirs_s - taken_s < 0.06
+    assert all(e["us"][0] == 1450 for e in in_loiter if e["t_s"] >= theirs_s)
+    assert flight.modes == ["ALT_HOLD", "LOITER"], "the bridge never changes the pilot's mode back"
+
+
+def test_a_mode_change_whose_heartbeat_is_lost_is_seen_within_a_tenth_of_a_second() -> None:
+    flight = GuardFlight().fly()
+    flight.down.is_silent = True
+    flight.pilot_mode(Mode.LOITER)
+    flight.run(0.02)
+    flight.down.is_silent = False
+    took_s = flight.until(lambda: flight.phase is not Phase.FLYING, within_s=0.2)
+
+    assert took_s < 0.11
+    assert not flight.modes_asked()
+
+
+def test_a_takeover_on_the_way_out_ends_the_requests_for_a_mode() -> None:
+    flight = GuardFlight(on_fault="hold").fly()
+    flight.up.is_silent = True  # the request for BRAKE gets lost
+    flight.stop(because(Code.CAMERA_FAILED, camera=""), is_fault=True)
+    flight.run(0.02)
+    assert flight.phase is Phase.LEAVING
+    flight.pilot_mode(Mode.LOITER)
+    flight.run(0.02)
+    flight.up.is_silent = False
+    taken_ns = flight.clock.now_ns()
+    flight.run(4)
+
+    assert flight.ap.mode is Mode.LOITER
+    assert not flight.modes_asked(taken_ns)
+    assert flight.codes == (
+        Code.THEN,
+        Code.CAMERA_FAILED,
+        Code.MODE_CHANGED,
+    )
+    assert flight.phase is Phase.ENDED
+
+
+def test_a_takeover_while_neutral_is_held_releases() -> None:
+    flight = GuardFlight(climbing_first, receiver_us=None, arm=True).take_off()
+    flight.stop()
+    flight.until(lambda: flight.phase is Phase.HOLDING, within_s=1)
+    assert flight.ap.mode is Mode.LAND
+    before_ns = flight.clock.now_ns()
+    flight.pilot_mode(Mode.RTL)
+    flight.until(lambda: flight.phase is Phase.RELEASING, within_s=0.05)
+    flight.run(2)
+
+    assert flight.phase is Phase.ENDED
+    assert not flight.modes_asked(before_ns)
+
+
+@pytest.mark.parametrize("rate_hz", [10, 20, 25, 50, 100, 200])
+@pytest.mark.parametrize("policy", [hovering, leaning])
+def test_a_joystick_on_our_system_id_is_noticed_within_half_a_second(
+    rate_hz: float, policy: Callable[[float], tuple[float, float, float, float]]
+) -> None:
+    """At 10 Hz within three of its packets: each is shown for a third of a send period only."""
+    flight = GuardFlight(policy).fly()
+    flight.joystick(rate_hz, (1700, 1450, 1600, 1500))
+    took_s = flight.until(lambda: flight.phase is not Phase.FLYING, within_s=3)
+
+    assert took_s < 0.5, took_s
+    assert Code.OVERRULED in flight.codes
+    assert not flight.modes_asked()
+
+
+@pytest.mark.parametrize("policy", [hovering, leaning])
+def test_a_vehicle_that_hears_us_no_more_is_noticed_while_the_sticks_stand_still(
+    policy: Callable[[float], tuple[float, float, float, float]],
+) -> None:
+    flight = GuardFlight(policy).fly()
+    flight.up.is_silent = True
+    took_s = flight.until(lambda: flight.phase is not Phase.FLYING, within_s=3)
+
+    assert took_s < 0.6
+    assert Code.UNHEARD in flight.codes
+    flight.up.is_silent = False
+    flight.run(0.3)
+    assert flight.record()[-1]["us"] == MID_RECEIVER_US[:4], "the release arrives once it can"
+    flight.run(5)
+    assert flight.phase is Phase.RELEASED, "and the policy does not fly again"
+
+
+def test_a_link_with_a_fifth_of_its_packets_lost_is_flown() -> None:
+    flight = GuardFlight().fly()
+    flight.up.loss = flight.down.loss = 0.2
+    flight.run(10)
+
+    assert flight.phase is Phase.FLYING, flight.describe()
+
+
+def by_parameter(flight: GuardFlight) -> None:
+    flight.station(lambda mav: mav.param_set_encode(1, 1, b"FS_THR_ENABLE", 0.0, 9), system=42)
+    index = flight.vehicle.params.names.index("FS_THR_ENABLE")
+    flight.vehicle.server.links[0].send_param(index)  # ArduPilot tells every link
+
+
+def by_clock(flight: GuardFlight) -> None:
+    """It goes back, which looks like a reboot."""
+    flight.ap.boot_ns += 5 * NS_PER_S
+
+
+@pytest.mark.parametrize(
+    ("take", "mode"),
+    [
+        (by_mode, "LOITER"),
+        (lambda flight: flight.pilot_mode(Mode.STABILIZE), "STABILIZE"),
+        (by_parameter, "ALT_HOLD"),
+        (by_clock, "ALT_HOLD"),
+    ],
+)
+def test_without_a_receiver_no_takeover_leaves_a_lean_behind(
+    take: Callable[[GuardFlight], None], mode: str
+) -> None:
+    """A release alone keeps the last sticks there: for 1 s, or for ever with FS_THR_ENABLE 0."""
+    flight = GuardFlight(climbing_then_leaning, receiver_us=None, arm=True).take_off(5)
+    assert flight.record()[-1]["lean_deg"] > 10
+    before_ns = flight.clock.now_ns()
+    take(flight)
+    flight.until(lambda: flight.phase is not Phase.FLYING, within_s=0.2)
+    given_ns, given_s = flight.clock.now_ns(), flight.record()[-1]["t_s"]
+    flight.run(0.9)
+
+    assert flight.modes[-1] == mode
+    assert not flight.modes_asked(before_ns)
+    overrides = [us for _, us in flight.overrides(given_ns - MS)]
+    (roll, pitch, _, yaw), *releases = overrides
+    assert (roll, pitch, yaw) == (1500, 1500, 1500)
+    assert len(releases) > 10
+    assert set(releases) == {(0, 0, 0, 0)}
+    sticks = [entry["us"] for entry in flight.record(given_s + 0.02)]
+    assert sticks
+    assert all(us[0] == us[1] == us[3] == 1500 for us in sticks)
+
+
+def climbing_then_leaning(t_s: float) -> tuple[float, float, float, float]:
+    """For a takeoff of five seconds that ends in a lean."""
+    return (0.7, 0.0, 0.0, 0.0) if t_s < 3 else (0.2, 0.0, 0.0, 0.5)

@@ -1,0 +1,214 @@
+"""The death of the guard, seen by the flight process, which then sends the last words."""
+
+import os
+import pty
+import socket
+import subprocess
+import threading
+import tty
+from collections.abc import Callable, Iterator
+from contextlib import suppress
+from dataclasses import dataclass, field
+from typing import Any
+
+import pytest
+
+from helpers.factories import make_guard_tick
+from helpers.fakes import START_NS, FakeClock
+from helpers.network import needs_ipv6
+from mavbridge.core.address import SocketAddress
+from mavbridge.core.clock import NS_PER_MS
+from mavbridge.flight import guard_process
+from mavbridge.flight.guard_process import LATEST_NS, GuardDiedError, GuardProcess
+from mavbridge.guard.channel import SocketPort
+from mavbridge.guard.engagement import Phase
+from mavbridge.guard.settings import GuardSettings
+from mavbridge.guard.wire import GuardError, LastWords, encode_from_guard, encode_tick
+from mavbridge.mavlink.settings import LinkSettings
+
+MS = NS_PER_MS
+PACKETS = ((0, b"neutral"), (20 * MS, b"neutral"), (100 * MS, b"mode"))
+WHOLE = [b"neutral", b"neutral", b"mode"]
+
+
+class Child:
+    """The guard's process, which is gone when it is killed."""
+
+    pid, returncode = 4321, None
+
+    def wait(self, timeout_s: float) -> int:
+        if self.returncode is None:
+            raise subprocess.TimeoutExpired("guard", timeout_s)
+        return self.returncode
+
+
+class View:
+    def receive(self, message: Any) -> None:
+        pass
+
+
+@dataclass
+class Rig:
+    """A flight process, and the guard's end of the channel."""
+
+    clock: FakeClock = field(default_factory=FakeClock)
+    child: Any = field(default_factory=Child)
+    port: Any = None
+    guard: Any = None
+
+    def tell(
+        self,
+        phase: Phase = Phase.FLYING,
+        fd: int | None = None,
+        receiver: SocketAddress | None = None,
+        packets: tuple[tuple[int, bytes], ...] = PACKETS,
+    ) -> None:
+        words = LastWords(phase, "BRAKE", receiver, fd is not None, packets)
+        assert self.port.send(encode_from_guard(words), fd)
+
+    def tick(self, phase: Phase = Phase.FLYING) -> None:
+        self.port.send(encode_tick(make_guard_tick(self.clock.now_ns(), phase=phase)))
+
+    def die(self, returncode: int | None = -9) -> str:
+        """Returns what the user is told."""
+        self.child.returncode = returncode
+        self.port.close()
+        with pytest.raises(GuardDiedError) as told:
+            self.guard.listen(threading.Event(), View())
+        return str(told.value)
+
+
+@pytest.fixture
+def rig(monkeypatch: pytest.MonkeyPatch) -> Iterator[Rig]:
+    made = Rig()
+
+    def spawn(end: socket.socket, _settings: GuardSettings) -> Any:
+        made.port = SocketPort(end.dup())
+        return made.child
+
+    monkeypatch.setattr(guard_process, "_spawn", spawn)
+    made.guard = GuardProcess(
+        GuardSettings(link=LinkSettings(connect="udp:127.0.0.1:1")), made.clock
+    )
+    yield made
+    made.port.close()
+    made.child.returncode = 0
+    made.guard.close()
+
+
+@dataclass
+class Link:
+    """The guard's open socket or port, and the vehicle's end."""
+
+    fd: int
+    receiver: SocketAddress | None
+    heard: Callable[[], list[bytes]]
+    close: Callable[[], None]
+
+
+def udp(host: str = "127.0.0.1") -> Link:
+    family = socket.AF_INET6 if ":" in host else socket.AF_INET
+    ours = socket.socket(family, socket.SOCK_DGRAM)
+    vehicle = socket.socket(family, socket.SOCK_DGRAM)
+    for end in (ours, vehicle):
+        end.bind((host, 0))
+        end.setblocking(False)
+    port = ours.getsockname()
+
+    def heard() -> list[bytes]:
+        received = []
+        while True:
+            try:
+                data, sender = vehicle.recvfrom(100)
+            except BlockingIOError:
+                return received
+            assert sender == port
+            received.append(data)
+
+    return Link(ours.detach(), vehicle.getsockname(), heard, vehicle.close)
+
+
+def udp_over_ipv6() -> Link:
+    return udp("::1")
+
+
+def tcp() -> Link:
+    server = socket.create_server(("127.0.0.1", 0))
+    ours = socket.create_connection(server.getsockname())
+    vehicle = server.accept()[0]
+    server.close()
+    return Link(ours.detach(), None, lambda: [vehicle.recv(100)], vehicle.close)
+
+
+def serial() -> Link:
+    vehicle, ours = pty.openpty()
+    tty.setraw(ours)
+    os.set_blocking(vehicle, False)
+
+    def heard() -> list[bytes]:
+        received = []
+        with suppress(BlockingIOError):
+            while True:
+                received.append(os.read(vehicle, 100))
+        return received
+
+    return Link(ours, None, heard, lambda: os.close(vehicle))
+
+
+@pytest.fixture(params=[udp, pytest.param(udp_over_ipv6, marks=needs_ipv6), tcp, serial])
+def link(request: pytest.FixtureRequest) -> Iterator[Link]:
+    made: Link = request.param()
+    yield made
+    made.close()
+
+
+def test_the_last_words_leave_by_the_link_of_a_guard_that_is_gone(rig: Rig, link: Link) -> None:
+    rig.tell(fd=link.fd, receiver=link.receiver)
+    os.close(link.fd)  # the guard's own dies with it
+    rig.tick()
+    text = rig.die()
+    assert b"".join(link.heard()) == b"".join(WHOLE)
+    assert rig.clock.now_ns() == START_NS + 100 * MS
+    assert "signal 9" in text
+    assert "BRAKE" in text
+
+
+def test_newer_words_replace_those_before_and_keep_the_link(rig: Rig, link: Link) -> None:
+    rig.tell(fd=link.fd, receiver=link.receiver)
+    os.close(link.fd)
+    rig.tell(receiver=link.receiver, packets=((0, b"newer"),))
+    rig.tick()
+    rig.die()
+    assert b"".join(link.heard()) == b"newer"
+
+
+@pytest.mark.parametrize("case", ["released", "given back", "old", "alive", "a bug", "silent"])
+def test_nothing_is_sent_where_it_would_be_wrong(rig: Rig, case: str) -> None:
+    link = udp()
+    rig.tell(fd=link.fd, receiver=link.receiver)
+    os.close(link.fd)
+    if case != "silent":
+        rig.tick()
+    if case == "released":
+        rig.tell(Phase.RELEASED, packets=())
+    elif case == "given back":  # and the newer words did not get through
+        rig.tick(Phase.RELEASED)
+    elif case == "old":
+        rig.clock.advance_ns(LATEST_NS + MS)
+    if case == "a bug":  # it has said them itself
+        rig.port.send(encode_from_guard(GuardError("bug", "Traceback")))
+    text = rig.die(None if case == "alive" else -9)
+    assert link.heard() == []
+    assert ("its own timeout" in text) == (case in ("old", "alive"))
+    link.close()
+
+
+def test_the_duplicate_is_closed_as_soon_as_nothing_is_held(rig: Rig) -> None:
+    link = tcp()
+    rig.tell(fd=link.fd)
+    os.close(link.fd)
+    rig.tell(Phase.RELEASED, packets=())
+    rig.tick(Phase.RELEASED)
+    rig.die()
+    assert link.heard() == [b""]  # the vehicle sees the end of the connection
+    link.close()

@@ -1,0 +1,598 @@
+from dataclasses import replace
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from helpers.guard_facts import codes
+from mavbridge.core.clock import NS_PER_MS, NS_PER_S
+from mavbridge.core.reasons import Code, Reason, because
+from mavbridge.core.vehicle import NEUTRAL, BodyRates, Sticks
+from mavbridge.guard.chunks import (
+    GRACE_PERIODS,
+    LEAST_GRACE_NS,
+    MAX_REFUSED,
+    RECENT_GAPS,
+    Chunk,
+    ChunkBuffer,
+    FreshnessLimits,
+)
+
+MS = NS_PER_MS
+LIMITS = FreshnessLimits(
+    state_ns=100 * MS, velocity_ns=250 * MS, feature_ns=300 * MS, chunk_ns=300 * MS
+)
+OLD_IMAGE = because(Code.TOO_OLD, quantity="image", age_ms=301.0, limit_ms=300.0)
+NAN = Sticks(float("nan"), 0.0, 0.0, 0.0)
+
+
+def chunk(serial: int, computed_ms: int, **changes: object) -> Chunk:
+    """Solved in 2 ms from an attitude 3 ms old; the roll stick rises by 1 per second."""
+    computed_ns = computed_ms * MS
+    made = Chunk(
+        serial=serial,
+        attitude_ns=computed_ns - 5 * MS,
+        velocity_ns=computed_ns - 5 * MS,
+        image_ns=computed_ns - 40 * MS,
+        computed_ns=computed_ns,
+        first_ns=computed_ns - 5 * MS,
+        step_ns=50 * MS,
+        actions=tuple(Sticks(0.0, 0.0, 0.0, 0.05 * k) for k in range(16)),
+    )
+    return made._replace(**changes)  # type: ignore[arg-type]
+
+
+def buffer(period_ms: int = 10, limits: FreshnessLimits = LIMITS) -> ChunkBuffer:
+    return ChunkBuffer(limits, period_ns=period_ms * MS, kind="sticks")
+
+
+def figures(reason: Reason | None, *names: str) -> tuple[object, ...]:
+    """Those of a reason by their names, each to 0.01."""
+    assert reason is not None
+    data = dict(reason.data)
+    return tuple(round(each, 2) if isinstance(each := data[n], float) else each for n in names)
+
+
+def too_old(quantity: str, age_ms: float, limit_ms: float) -> Reason:
+    return because(Code.TOO_OLD, quantity=quantity, age_ms=age_ms, limit_ms=limit_ms)
+
+
+def test_actions_are_linear_between_their_times_and_held_at_the_ends() -> None:
+    ramp = chunk(1, 1005)
+    for at_ms, roll in ((900, 0.0), (1000, 0.0), (1025, 0.025), (1500, 0.5), (1900, 0.75)):
+        assert ramp.action_at(at_ms * MS).roll == pytest.approx(roll)
+
+
+def test_beyond_the_horizon_there_is_no_action() -> None:
+    held = buffer()
+    assert held.offer(chunk(1, 1005), 1005 * MS)
+    assert held.action_at((1000 + 16 * 50) * MS) is not None
+    assert held.action_at((1000 + 16 * 50) * MS + 1) is None
+
+
+def test_the_lead_ends_with_the_chunk_and_a_chunk_that_covers_now_is_flown() -> None:
+    held = buffer()
+    held.offer(chunk(1, 1005), 1005 * MS)
+    for at_ms, lead_ms, roll in ((1000, 50, 0.05), (1700, 50, 0.75), (1799, 800, 0.75)):
+        action = held.action_at(at_ms * MS, lead_ms * MS)
+        assert isinstance(action, Sticks)
+        assert action.roll == pytest.approx(roll)
+
+
+@pytest.mark.parametrize("period_ms", [10, 20, 33, 50])
+def test_a_single_action_is_held_for_its_step_from_its_arrival_and_half_a_period(
+    period_ms: int,
+) -> None:
+    held = buffer(period_ms)
+    held.offer(chunk(1, 1000, step_ns=period_ms * MS, actions=(NEUTRAL,)), 1000 * MS)
+    end_ns = 1000 * MS + period_ms * MS * 3 // 2
+    assert (held.action_at(end_ns, 50 * MS), held.is_coasting(end_ns)) == (NEUTRAL, False)
+    assert (held.action_at(end_ns + 1), held.is_coasting(end_ns + 1)) == (None, True)
+
+
+def test_beyond_the_horizon_it_coasts_although_the_next_one_is_not_due() -> None:
+    held = buffer(500)
+    held.offer(chunk(1, 1000, actions=(NEUTRAL,) * 2, step_ns=20 * MS), 1000 * MS)
+    assert not held.is_coasting(1035 * MS)
+    assert held.is_coasting(1035 * MS + 1)
+    assert held.fault(1135 * MS) is None
+    assert held.fault(1135 * MS + 1) is not None
+
+
+def test_chunks_that_come_after_their_own_end_do_not_prolong_the_grace() -> None:
+    held = buffer()
+    held.offer(chunk(1, 1000), 1000 * MS)
+    for serial, now_ms in enumerate(range(1010, 1110, 10), start=2):
+        over = chunk(serial, now_ms, actions=(NEUTRAL,) * 4, step_ns=MS)
+        assert not held.offer(over, now_ms * MS)
+    assert held.fault(1100 * MS) is None
+    assert held.fault(1100 * MS + 1) is not None
+
+
+@pytest.mark.parametrize(
+    ("steps", "step_us", "period_ms", "is_possible"),
+    [(1, 20_000, 20, True), (1, 20_000, 33, False), (1, 33_300, 33, True), (16, 50_000, 10, True)],
+)
+def test_a_horizon_shorter_than_the_time_between_solves_never_flies(
+    steps: int, step_us: int, period_ms: int, is_possible: bool
+) -> None:
+    held = buffer(period_ms)
+    for serial, now_ms in enumerate(range(1000, 1000 + 4 * period_ms, period_ms), start=1):
+        actions = (NEUTRAL,) * steps
+        held.offer(chunk(serial, now_ms, actions=actions, step_ns=step_us * 1000), now_ms * MS)
+    assert (held.impossibility is None) == is_possible
+    assert (held.problem(now_ms * MS) is None) == is_possible
+    if not is_possible:
+        assert codes(held.impossibility) == (Code.HORIZON_TOO_SHORT,)
+        told = figures(held.impossibility, "horizon_ms", "steps", "step_ms", "gap_ms")
+        assert told == (20, 1, 20, 33)
+
+
+def test_a_horizon_that_ends_before_the_next_chunk_comes_begins_no_flight() -> None:
+    short = {"actions": (NEUTRAL,) * 2, "step_ns": 20 * MS}
+    for latency_ms, is_covered in ((5, True), (25, False)):
+        held = buffer(33)
+        for serial, now_ms in enumerate(range(1000, 1166, 33), start=1):
+            held.offer(
+                chunk(serial, now_ms, first_ns=(now_ms - latency_ms) * MS, **short), now_ms * MS
+            )
+        assert (held.problem(now_ms * MS) is None) == is_covered
+        assert held.impossibility is None, "the solves may become faster"
+
+
+@given(
+    steps=st.integers(1, 6),
+    step_ms=st.integers(1, 60),
+    period_ms=st.sampled_from((10, 20, 33, 50)),
+    latency_ms=st.integers(0, 60),
+    lead_ms=st.sampled_from((0, 50, 800)),
+)
+def test_level_sticks_are_coasting_and_last_100_ms_in_all(
+    steps: int, step_ms: int, period_ms: int, latency_ms: int, lead_ms: int
+) -> None:
+    held, level_ms, is_over = buffer(period_ms), 0, False
+    for now_ms in range(1000, 6000):
+        if now_ms % period_ms == 0:
+            actions = (Sticks(0.0, 0.0, 0.0, 0.3),) * steps
+            first_ns = (now_ms - latency_ms) * MS
+            made = chunk(now_ms, now_ms, actions=actions, step_ns=step_ms * MS, first_ns=first_ns)
+            held.offer(made, now_ms * MS)
+        is_over = is_over or (held.newest is not None and held.fault(now_ms * MS) is not None)
+        if held.newest is None or is_over:
+            continue
+        if held.action_at(now_ms * MS, lead_ms * MS) is None:
+            level_ms += 1
+            assert held.is_coasting(now_ms * MS)
+    covered_ms = steps * step_ms - latency_ms if steps > 1 else step_ms + period_ms // 2
+    assert level_ms <= 100 + period_ms
+    if covered_ms >= period_ms:
+        assert (level_ms, is_over) == (0, False)
+    elif covered_ms < period_ms - 1:
+        assert is_over or held.newest is None
+
+
+@pytest.mark.parametrize("age", ["attitude_ns", "velocity_ns", "image_ns", "computed_ns"])
+def test_each_age_is_judged_when_the_chunk_arrives(age: str) -> None:
+    limit_ms = {"attitude_ns": 100, "velocity_ns": 250, "image_ns": 300, "computed_ns": 300}[age]
+    assert buffer().offer(chunk(1, 2000, **{age: (2000 - limit_ms) * MS}), 2000 * MS)
+    late = buffer()
+    assert not late.offer(chunk(1, 2000, **{age: (2000 - limit_ms) * MS - 1}), 2000 * MS)
+    assert codes(late.problem(2000 * MS)) == (Code.TOO_OLD,)
+    assert figures(late.problem(2000 * MS), "limit_ms") == (limit_ms,)
+
+
+def test_a_900_ms_solve_does_not_fly_the_attitude_that_it_began_with() -> None:
+    slow = buffer(period_ms=1000)
+    assert not slow.offer(chunk(1, 2000, attitude_ns=1098 * MS), 2000 * MS)
+    assert slow.problem(2000 * MS) == too_old("attitude", 902, 100)
+
+
+def test_a_computer_that_is_too_slow_for_the_policy_is_told_from_one_slow_solve() -> None:
+    slow = buffer()
+    for serial in range(1, 5):
+        slow.offer(chunk(serial, 1000 * serial, attitude_ns=(1000 * serial - 905) * MS), 0)
+    assert slow.impossibility is None
+    slow.offer(chunk(9, 9000, attitude_ns=8095 * MS), 9000 * MS)
+    expected = because(Code.TOO_SLOW, chunks=5, age_ms=905, limit_ms=100)
+    assert slow.impossibility == expected
+    slow.offer(chunk(10, 9100), 9100 * MS)
+    assert slow.impossibility is None
+    for serial in range(11, 15):  # they count anew
+        slow.offer(chunk(serial, 1000 * serial, attitude_ns=(1000 * serial - 101) * MS), 0)
+    assert slow.impossibility is None
+
+
+def test_solves_that_just_keep_the_limit_of_the_attitude_are_not_too_slow() -> None:
+    held = buffer()
+    for serial in range(1, 8):
+        held.offer(chunk(serial, 1000 * serial, attitude_ns=(1000 * serial - 100) * MS), 0)
+    assert held.impossibility is None
+
+
+def test_a_contract_with_longer_limits_flies_it() -> None:
+    limits = replace(LIMITS, state_ns=2 * NS_PER_S)
+    assert buffer(1000, limits).offer(chunk(1, 2000, attitude_ns=1098 * MS), 2000 * MS)
+
+
+def test_without_a_new_chunk_it_coasts_for_the_grace_and_then_is_at_fault() -> None:
+    held = buffer()
+    held.offer(chunk(1, 1000), 1000 * MS)
+    assert not held.is_coasting(1020 * MS)
+    assert held.is_coasting(1021 * MS)
+    assert held.fault(1100 * MS) is None
+    assert figures(held.fault(1100 * MS + 1), "quantity", "limit_ms") == ("attitude", 100)
+
+
+def test_a_chunk_beyond_its_limits_coasts_although_the_next_one_is_not_due() -> None:
+    held = buffer(500)
+    assert not held.is_coasting(1000 * MS)
+    held.offer(chunk(1, 1000), 1000 * MS)
+    assert not held.is_coasting(1095 * MS)
+    assert held.is_coasting(1096 * MS)
+
+
+@pytest.mark.parametrize(("period_ms", "grace_ms"), [(2, 100), (10, 100), (33, 100), (500, 1500)])
+def test_the_grace_is_100_ms_or_three_periods(period_ms: int, grace_ms: int) -> None:
+    assert buffer(period_ms).grace_ns == grace_ms * MS
+
+
+def test_the_grace_of_a_slow_policy_ends_with_its_limits() -> None:
+    slow = buffer(500)
+    slow.offer(chunk(1, 1000), 1000 * MS)  # from an attitude at 995 ms, which may be 100 ms old
+    assert slow.fault(1195 * MS) is None
+    assert figures(slow.fault(1195 * MS + 1), "quantity", "spent_ms") == ("attitude", 195)
+
+
+def test_a_chunk_that_is_meant_to_be_played_for_a_second_may_be_older_by_that() -> None:
+    played = buffer(500, LIMITS.while_played(NS_PER_S))
+    played.offer(chunk(1, 1000, actions=(NEUTRAL,) * 40), 1000 * MS)
+    assert not played.is_coasting(2000 * MS)
+    assert played.fault(2195 * MS) is None
+    assert figures(played.fault(2195 * MS + 1), "quantity", "spent_ms") == ("attitude", 1195)
+
+
+def test_the_grace_of_a_slow_policy_ends_with_its_horizon() -> None:
+    played = buffer(500, LIMITS.while_played(NS_PER_S))
+    played.offer(chunk(1, 1000), 1000 * MS)  # its last action ends at 1795 ms
+    assert played.fault(1895 * MS) is None
+    assert played.fault(1895 * MS + 1) is not None
+
+
+def test_chunks_that_are_farther_apart_than_one_may_be_flown_begin_no_flight() -> None:
+    slow = buffer(500)
+    for serial, now_ms in enumerate((1000, 1500, 2000), start=1):
+        slow.offer(chunk(serial, now_ms), now_ms * MS)
+    assert codes(slow.problem(2000 * MS)) == (Code.CHUNKS_APART,)
+    assert figures(slow.problem(2000 * MS), "gap_ms", "bridged_ms") == (500, 195)
+    assert "ask for a higher rate" in str(slow.problem(2000 * MS)), "the user is told what to do"
+
+
+STALL = replace(LIMITS, stall_ns=300 * MS)
+
+
+def test_a_stall_is_flown_through_along_the_chunk() -> None:
+    held = buffer(10, STALL)
+    held.offer(chunk(1, 1000), 1000 * MS)
+    for at_ms in range(1021, 1301):
+        assert held.fault(at_ms * MS) is None
+        assert held.is_coasting(at_ms * MS)
+    assert held.action_at(1295 * MS) == pytest.approx((0.0, 0.0, 0.0, 0.3))
+    assert figures(held.fault(1300 * MS + 1), "quantity", "limit_ms") == ("chunk", 300)
+
+
+@pytest.mark.parametrize(("steps", "until_ms"), [(1, 1100), (4, 1195), (6, 1295), (16, 1300)])
+def test_no_stall_is_flown_through_beyond_the_horizon(steps: int, until_ms: int) -> None:
+    held = buffer(10, STALL)
+    held.offer(chunk(1, 1000, actions=(NEUTRAL,) * steps), 1000 * MS)
+    assert held.fault(until_ms * MS) is None
+    assert held.fault(until_ms * MS + 1) is not None
+
+
+@pytest.mark.parametrize(
+    ("refusal", "heard_ms", "until_ms"),
+    [
+        ("absence", 1010, 1100),
+        ("absence", 1130, 1220),
+        ("absence", 1250, 1300),
+        ("stale", 1010, 1100),
+        ("stale", 1130, 1220),
+        ("malformed", 1010, 1100),
+        ("malformed", 1250, 1300),
+    ],
+)
+def test_a_flight_process_that_has_no_chunk_to_give_is_not_stalled_and_gets_the_grace(
+    refusal: str, heard_ms: int, until_ms: int
+) -> None:
+    held = buffer(10, STALL)
+    held.offer(chunk(1, 1000), 1000 * MS)
+    for serial, at_ms in enumerate((heard_ms, heard_ms + 10), start=2):
+        if refusal == "absence":
+            held.explain_absence(OLD_IMAGE, at_ms * MS)
+        else:
+            bad = {"actions": (NAN,)} if refusal == "malformed" else {"image_ns": 600 * MS}
+            assert not held.offer(chunk(serial, at_ms, **bad), at_ms * MS)
+    assert held.fault(until_ms * MS) is None
+    assert held.fault(until_ms * MS + 1) is not None
+    held.offer(chunk(9, until_ms), until_ms * MS)
+    assert held.fault((until_ms + 100) * MS) is None, "the next one that may be flown ends it"
+
+
+def test_a_second_stall_is_flown_through_only_after_eight_chunks_in_time() -> None:
+    held, now_ms = buffer(10, STALL), 1000
+    held.offer(chunk(1, now_ms), now_ms * MS)
+    now_ms += 250
+    for serial in range(2, 2 + RECENT_GAPS):
+        held.offer(chunk(serial, now_ms), now_ms * MS)
+        assert held.fault((now_ms + 100) * MS) is None
+        assert held.fault((now_ms + 101) * MS) is not None
+        now_ms += 10
+    held.offer(chunk(99, now_ms), now_ms * MS)
+    assert held.fault((now_ms + 300) * MS) is None
+
+
+def test_a_policy_whose_chunks_come_as_seldom_as_a_stall_begins_no_flight() -> None:
+    held = buffer(10, STALL)
+    for serial, now_ms in enumerate((1000, 1250, 1500), start=1):
+        held.offer(chunk(serial, now_ms), now_ms * MS)
+    assert codes(held.problem(1500 * MS)) == (Code.CHUNKS_APART,)
+    assert figures(held.problem(1500 * MS), "gap_ms", "bridged_ms") == (250, 100)
+
+
+def began(period_ms: int, *gaps_ms: int, **changes: object) -> tuple[ChunkBuffer, int]:
+    """A buffer with chunks so far apart, the newest with changes, and the moment that it came."""
+    held, now_ms = buffer(period_ms), 1000
+    held.offer(chunk(1, now_ms), now_ms * MS)
+    for serial, gap_ms in enumerate(gaps_ms, start=2):
+        now_ms += gap_ms
+        last = changes if serial == len(gaps_ms) + 1 else {}
+        assert held.offer(chunk(serial, now_ms, **last), now_ms * MS)
+    return held, now_ms * MS
+
+
+def test_a_flight_may_begin_after_three_chunks_in_time() -> None:
+    for gaps_ms in ((), (10,)):
+        held, now_ns = began(10, *gaps_ms)
+        assert held.problem(now_ns) == because(Code.JUST_BEGUN)
+    held, now_ns = began(10, 100, 10)  # as far apart as is bridged
+    assert held.problem(now_ns) is None
+
+
+@pytest.mark.parametrize("gaps_ms", [(101, 10), (10, 101)])
+def test_one_chunk_of_the_last_few_that_was_late_begins_no_flight(gaps_ms: tuple[int, ...]) -> None:
+    held, now_ns = began(10, *gaps_ms)
+    assert codes(held.problem(now_ns)) == (Code.CHUNKS_APART,)
+    assert figures(held.problem(now_ns), "gap_ms", "bridged_ms") == (101, 100)
+    assert "it is too slow here" in str(held.problem(now_ns)), "the user is told what to do"
+    for serial in range(4, 11):  # the eighth gap after it forgets it
+        now_ns += 10 * MS
+        held.offer(chunk(serial, now_ns // MS), now_ns)
+    assert (held.problem(now_ns) is None) == (gaps_ms[0] == 101)
+
+
+def test_without_a_new_chunk_for_the_grace_no_flight_begins_although_its_limits_are_longer() -> (
+    None
+):
+    held, now_ns = began(10, 10, 10, attitude_ns=1020 * MS)
+    assert held.problem(now_ns + 100 * MS) is None
+    assert held.problem(now_ns + 100 * MS + 1) == because(Code.NO_CHUNK)
+
+
+@pytest.mark.parametrize(
+    ("age", "name", "limit_ms"),
+    [
+        ("attitude_ns", "attitude", 100),
+        ("velocity_ns", "velocity", 250),
+        ("image_ns", "image", 300),
+        ("computed_ns", "chunk", 300),
+    ],
+)
+def test_no_flight_begins_beyond_any_limit_of_age(age: str, name: str, limit_ms: int) -> None:
+    held, now_ns = began(10, 10, 10, **{age: (1020 - limit_ms + 50) * MS})
+    assert held.problem(now_ns + 50 * MS) is None
+    assert held.problem(now_ns + 50 * MS + 1) == too_old(name, limit_ms + 1e-6, limit_ms)
+
+
+def test_where_there_never_was_a_chunk_there_is_a_fault_and_no_action() -> None:
+    assert buffer().lateness(0) == ("chunk", 0, 100 * MS, "flight process", 0, None)
+    assert buffer().fault(0) is not None
+    assert buffer().action_at(0) is None
+
+
+@pytest.mark.parametrize(
+    ("period_ms", "gap_ms", "is_fault"),
+    [(10, 249, True), (10, 250, False), (500, 1249, True), (500, 1250, False)],
+)
+def test_unusable_chunks_count_within_a_second_or_ten_periods(
+    period_ms: int, gap_ms: int, is_fault: bool
+) -> None:
+    held = buffer(period_ms)
+    for serial in range(1, MAX_REFUSED + 1):
+        held.offer(chunk(serial, 1000, actions=(NAN,)), serial * gap_ms * MS)
+    held.offer(chunk(9, MAX_REFUSED * gap_ms), MAX_REFUSED * gap_ms * MS)
+    assert (held.fault(MAX_REFUSED * gap_ms * MS) is not None) == is_fault
+
+
+def test_five_unusable_chunks_in_a_row_count_also_where_one_came_long_before() -> None:
+    held = buffer()
+    for serial, at_ms in enumerate((1000, 9000, 9010, 9020, 9030, 9040), start=1):
+        held.offer(chunk(serial, at_ms, actions=(NAN,)), at_ms * MS)
+    assert codes(held.fault(9040 * MS)) == (Code.UNUSABLE_CHUNKS, Code.NOT_FINITE)
+
+
+ages = st.integers(0, 400).map(lambda ms: ms * MS)
+
+
+@given(
+    period_ms=st.integers(2, 2000),
+    play_ns=ages,
+    stall_ns=ages,
+    taken=st.tuples(ages, ages, ages),
+    steps=st.integers(1, 16),
+)
+def test_no_action_is_flown_beyond_the_horizon_nor_100_ms_beyond_a_limit_but_for_a_stall(
+    period_ms: int, play_ns: int, stall_ns: int, taken: tuple[int, int, int], steps: int
+) -> None:
+    limits = replace(LIMITS, stall_ns=stall_ns).while_played(play_ns)
+    now_ns = 1000 * MS
+    held = buffer(period_ms, limits)
+    attitude_ns, image_ns, computed_ns = (now_ns - age_ns for age_ns in taken)
+    offered = chunk(
+        1,
+        1000,
+        attitude_ns=attitude_ns,
+        first_ns=attitude_ns,
+        image_ns=image_ns,
+        computed_ns=computed_ns,
+        actions=(NEUTRAL,) * steps,
+    )
+    kept_ns = min(
+        attitude_ns + limits.state_ns, image_ns + limits.feature_ns, computed_ns + limits.chunk_ns
+    )
+    covers = steps == 1 or now_ns <= offered.end_ns
+    assert held.offer(offered, now_ns) == (now_ns <= kept_ns and covers)
+    for at_ns in range(now_ns, now_ns + 3000 * MS, 25 * MS):
+        if held.fault(at_ns) is None and held.action_at(at_ns) is not None:
+            held_ns = now_ns + offered.step_ns + period_ms * MS // 2
+            assert at_ns <= (held_ns if steps == 1 else offered.end_ns)
+            graced_ns = now_ns + max(LEAST_GRACE_NS, GRACE_PERIODS * period_ms * MS)
+            graced_ns = min(graced_ns, kept_ns + LEAST_GRACE_NS)
+            assert at_ns <= max(graced_ns, now_ns + stall_ns)
+
+
+def test_stale_chunks_that_keep_coming_do_not_prolong_the_grace() -> None:
+    held = buffer()
+    held.offer(chunk(1, 1000), 1000 * MS)
+    for serial, now_ms in enumerate(range(1010, 1110, 10), start=2):
+        assert not held.offer(chunk(serial, now_ms, image_ns=600 * MS), now_ms * MS)
+    assert held.lateness(1101 * MS) == (*("image", 501 * MS, 300 * MS, "camera", 500 * MS, None),)
+
+
+@pytest.mark.parametrize(
+    "changes",
+    [
+        {"actions": (NAN,)},
+        {"actions": (NEUTRAL, NAN, NEUTRAL)},
+        {"actions": (NEUTRAL, BodyRates(0.5, 0.0, 0.0, 0.0))},
+        {"actions": ()},
+        {"step_ns": 0},
+    ],
+    ids=["nan", "one-nan", "another-kind", "none", "step"],
+)
+def test_a_malformed_chunk_is_not_flown(changes: dict[str, object]) -> None:
+    held = buffer()
+    held.offer(chunk(1, 1000), 1000 * MS)
+    assert held.offer(chunk(2, 1010, **changes), 1010 * MS) is False
+    assert held.newest == chunk(1, 1000)
+
+
+def test_the_shortest_step_is_one_of_a_nanosecond() -> None:
+    assert buffer().offer(chunk(1, 1000, step_ns=1, first_ns=1000 * MS), 1000 * MS) is True
+
+
+def test_nan_every_other_time_ends_the_flight_although_good_ones_lie_between() -> None:
+    held = buffer()
+    faults = []
+    for serial in range(1, 2 * MAX_REFUSED + 1):
+        now_ms = 1000 + 10 * serial
+        bad = {} if serial % 2 else {"actions": (NAN,)}
+        held.offer(chunk(serial, now_ms, **bad), now_ms * MS)
+        faults.append(held.fault(now_ms * MS))
+    assert faults[:-1] == [None] * (2 * MAX_REFUSED - 1)
+    assert codes(faults[-1]) == (Code.UNUSABLE_CHUNKS, Code.NOT_FINITE)
+    assert held.problem(now_ms * MS) == faults[-1], "nor may the next flight begin at once"
+    held.offer(chunk(99, now_ms + 1000), (now_ms + 1000) * MS)
+    assert Code.UNUSABLE_CHUNKS not in codes(held.problem((now_ms + 1000) * MS))
+
+
+def test_an_older_chunk_never_replaces_a_newer_one() -> None:
+    held = buffer()
+    held.offer(chunk(2, 1000), 1000 * MS)
+    assert held.offer(chunk(1, 1001), 1001 * MS) is False
+    assert not held.offer(chunk(2, 1001), 1001 * MS)  # nor the same one twice
+
+
+def test_the_reason_for_no_chunk_is_the_flight_processs_own() -> None:
+    held = buffer()
+    held.explain_absence(because(Code.NO_IMAGE), 0)
+    assert held.problem(0) == because(Code.NO_IMAGE)
+    held.offer(chunk(1, 1000), 1000 * MS)
+    held.explain_absence(because(Code.IMAGE_FROZEN, age_s=0.6), 1010 * MS)
+    assert codes(held.fault(1200 * MS)) == (Code.LATE, Code.IMAGE_FROZEN)
+
+
+# --- what a fault names
+
+
+def test_a_silent_flight_process_is_named_with_the_input_that_ran_out_first() -> None:
+    held = buffer()
+    held.offer(chunk(1, 1000), 1000 * MS)
+    assert held.lateness(1100 * MS) is None
+    late = held.lateness(1104 * MS)
+    assert late == ("attitude", 109 * MS, 100 * MS, "flight process", 104 * MS, None)
+    assert held.fault(1104 * MS) == because(
+        Code.LATE,
+        quantity="attitude",
+        age_ms=109,
+        limit_ms=100,
+        place="flight process",
+        spent_ms=104,
+    )
+
+
+def test_a_guard_that_did_not_look_names_the_computer() -> None:
+    held = buffer()
+    held.offer(chunk(1, 1000), 1000 * MS)
+    late = held.lateness(1131 * MS, stood_ns=131 * MS)
+    assert late == ("attitude", 136 * MS, 100 * MS, "computer", 131 * MS, None)
+    late = held.lateness(1131 * MS, stood_ns=10 * MS)
+    assert late is not None
+    assert late.place == "flight process"
+
+
+@pytest.mark.parametrize("name", ["attitude", "velocity"])
+def test_a_link_that_delivers_nothing_is_named_although_the_flight_process_speaks(
+    name: str,
+) -> None:
+    held = buffer()
+    held.offer(chunk(1, 1000, velocity_ns=(995 if name == "attitude" else 760) * MS), 1000 * MS)
+    none = because(Code.NO_READING, quantity=name)
+    held.explain_absence(none, 1090 * MS)
+    late = held.lateness(1110 * MS, heard_ns={"attitude": 1100 * MS, name: 960 * MS})
+    assert late is not None
+    assert late[3:] == ("link", 150 * MS, none)
+    assert (late.name, late.limit_ns) == (name, (100 if name == "attitude" else 250) * MS)
+    assert figures(late.reason, "quantity", "place", "spent_ms") == (name, "link", 150)
+
+
+def test_a_camera_that_delivers_nothing_is_named() -> None:
+    held = buffer()
+    held.offer(chunk(1, 1000, image_ns=710 * MS), 1000 * MS)
+    held.explain_absence(OLD_IMAGE, 1100 * MS)
+    late = held.lateness(1104 * MS, stood_ns=10 * MS)
+    assert late is not None
+    assert late[:5] == ("image", 394 * MS, 300 * MS, "camera", 390 * MS)
+
+
+def test_a_solve_that_took_too_long_is_named() -> None:
+    held = buffer()
+    held.offer(chunk(1, 1000), 1000 * MS)
+    held.offer(chunk(2, 1090, attitude_ns=940 * MS), 1090 * MS)
+    assert held.lateness(1104 * MS) == ("attitude", 164 * MS, 100 * MS, "solve", 150 * MS, None)
+
+
+def test_what_the_flight_process_says_comes_first() -> None:
+    held = buffer()
+    held.offer(chunk(1, 1000), 1000 * MS)
+    held.explain_absence(because(Code.POLICY_REFUSED, said="its server is gone"), 1050 * MS)
+    told = held.fault(1104 * MS)
+    assert codes(told) == (Code.LATE, Code.POLICY_REFUSED)
+    assert str(told) == "its server is gone; attitude 109 ms old (limit 100 ms)"
+
+
+def test_a_grace_that_ends_within_all_limits_names_the_chunk_or_its_horizon() -> None:
+    held = buffer(10, LIMITS.while_played(NS_PER_S))
+    held.offer(chunk(1, 1000), 1000 * MS)
+    assert (held.lateness(1101 * MS) or ())[:3] == ("chunk", 101 * MS, 100 * MS)
+    held = buffer(100, LIMITS.while_played(NS_PER_S))
+    held.offer(chunk(1, 1000, actions=(NEUTRAL,) * 2), 1000 * MS)
+    assert (held.lateness(1196 * MS) or ())[:3] == ("horizon", 196 * MS, 95 * MS)

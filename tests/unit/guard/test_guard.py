@@ -1,0 +1,772 @@
+"""The guard as a whole, without I/O: what leaves at which moment."""
+
+import math
+from dataclasses import replace
+from typing import Any
+
+import pytest
+
+from helpers.fakes import AIRBORNE_STATUS, FOREVER_NS, START_NS
+from helpers.guard_facts import COPTER_MODES, PX4_MODES, codes, engagement_settings, stick_smoothing
+from mavbridge.core.clock import NS_PER_MS
+from mavbridge.core.reasons import Code, Reason, because
+from mavbridge.core.vehicle import (
+    IDLE,
+    NEUTRAL,
+    Action,
+    ActionMeaning,
+    AttitudeThrust,
+    BodyRates,
+    Command,
+    Decision,
+    LinkSnapshot,
+    ModeRoles,
+    Reading,
+    Release,
+    Sticks,
+    Telemetry,
+    Velocity,
+)
+from mavbridge.guard.chunks import Chunk, FreshnessLimits
+from mavbridge.guard.departure import DepartureSettings, Ending
+from mavbridge.guard.engagement import Act, Phase
+from mavbridge.guard.envelope import EnvelopeLimits
+from mavbridge.guard.guard import FlightSettings, Guard, GuardInput, GuardOutput
+from mavbridge.guard.limits import LimitSettings
+from mavbridge.guard.smoothing import Smoothing
+
+MS = NS_PER_MS
+SWITCHED_OFF = because(Code.OVERRIDE_SWITCH_OFF)
+HEARTBEAT_LOST = because(Code.HEARTBEAT_LOST)
+REBOOTED = because(Code.REBOOTED)
+OVERRULED = because(Code.OVERRULED, quantity="sticks", cause="another station")
+WANTED = Sticks(0.4, 0.1, -0.2, 0.3)
+SLOW = stick_smoothing(max_slew_per_s=1.0, tau_s=0.0)
+PILOT = Sticks(0.1, 0.0, -0.3, 0.05)
+AGES = FreshnessLimits(
+    state_ns=300 * MS, velocity_ns=300 * MS, feature_ns=300 * MS, chunk_ns=300 * MS
+)
+
+
+class Stepped:
+    """A guard of 100 Hz at times in ms since its start; attitudes and chunks are 3 ms old."""
+
+    def __init__(
+        self,
+        *,
+        smoothing: Smoothing | None = None,
+        meaning: ActionMeaning | None = None,
+        status: dict[str, Any] | None = None,
+        roles: ModeRoles = COPTER_MODES,
+        freshness: FreshnessLimits = AGES,
+        **rules: Any,
+    ) -> None:
+        engagement = engagement_settings(
+            **({"modes": ("ALT_HOLD",), "departure": DepartureSettings()} | rules)
+        )
+        settings = FlightSettings(
+            meaning=meaning or ActionMeaning(),
+            stick_period_ns=10 * MS,
+            chunk_period_ns=10 * MS,
+            freshness=freshness,
+            smoothing=smoothing or stick_smoothing(),
+            envelope=EnvelopeLimits(),
+            watches_home_height=False,
+            watches_position=False,
+            engagement=engagement,
+        )
+        self.guard = Guard(settings, START_NS)
+        self.status = replace(AIRBORNE_STATUS, **(status or {}))
+        self.roles = roles
+        self.telemetry = Telemetry()
+        self.link: dict[str, Any] = {}
+        """What the link says besides the vehicle's status."""
+        self.is_released = True
+        self.serial = 0
+        self.outputs: list[GuardOutput] = []
+
+    def chunk(self, at_ms: float, sticks: Action = WANTED, *, actions: int = 16) -> Chunk:
+        self.serial += 1
+        now_ns = START_NS + round(at_ms * MS)
+        stamps = {"attitude_ns": now_ns - 3 * MS, "velocity_ns": now_ns - 3 * MS}
+        return Chunk(
+            serial=self.serial,
+            **stamps,
+            image_ns=now_ns - 30 * MS,
+            computed_ns=now_ns,
+            first_ns=now_ns - 3 * MS,
+            step_ns=20 * MS,
+            actions=(sticks,) * actions,
+            reset_ns=FOREVER_NS,
+        )
+
+    def step(
+        self,
+        at_ms: float,
+        chunk: Chunk | None = None,
+        *,
+        act: Act | None = None,
+        stop: Ending | None = None,
+        **changes: Any,
+    ) -> GuardOutput:
+        now_ns = START_NS + round(at_ms * MS)
+        self.status = replace(self.status, **({"rc_arrived_ns": now_ns} | changes))
+        link = replace(
+            LinkSnapshot(
+                telemetry=self.telemetry,
+                status=self.status,
+                problem=None,
+                echo_confirmed=True,
+                is_released=self.is_released,
+                modes=self.roles,
+            ),
+            **self.link,
+        )
+        output = self.guard.step(now_ns, GuardInput(link=link, chunk=chunk, act=act, stop=stop))
+        if output.decision is not None:
+            self.is_released = isinstance(output.decision, Release)
+        self.outputs.append(output)
+        return output
+
+    def engaged(self, *, at_ms: float = 30.0, sticks: Action = WANTED) -> "Stepped":
+        """Three chunks in time, then the operator's key."""
+        for k in range(3):
+            self.step(at_ms - 30 + 10 * k, self.chunk(at_ms - 30 + 10 * k, sticks))
+        self.step(at_ms, self.chunk(at_ms, sticks), act="engage")
+        assert self.guard.phase is Phase.FLYING, self.outputs[-1].messages
+        return self
+
+    @property
+    def decisions(self) -> list[Decision]:
+        return [output.decision for output in self.outputs if output.decision is not None]
+
+
+# --- when
+
+
+def test_while_nobody_asks_us_to_fly_slots_pass_and_nothing_is_sent() -> None:
+    guard = Stepped()
+    slots = [guard.step(at_ms, guard.chunk(at_ms)).slot for at_ms in range(0, 100, 5)]
+    assert [slot.index for slot in slots if slot is not None] == list(range(10))
+    assert guard.decisions == []
+
+
+def test_a_new_chunk_leaves_at_once_and_a_slot_shortly_after_it_is_left_out() -> None:
+    guard = Stepped().engaged()
+    early = guard.step(33, guard.chunk(33))
+    assert (early.decision, early.slot) == (Command(action=WANTED), None)
+    served = guard.step(40)  # 7 ms later
+    assert served.slot is not None
+    assert served.decision == Command(action=WANTED)
+    late = guard.step(46, guard.chunk(46))
+    assert (late.decision, late.slot) == (Command(action=WANTED), None)
+    left_out = guard.step(50)  # 4 ms later
+    assert (left_out.decision, left_out.slot) == (None, None)
+    after = guard.step(60)
+    assert after.slot is not None
+    assert (after.slot.index, after.slot.missed) == (6, 0)
+
+
+@pytest.mark.parametrize(
+    ("changes", "act", "expected"),
+    [
+        (
+            {"mode": "LOITER"},
+            None,
+            Release(because(Code.MODE_CHANGED, before="ALT_HOLD", after="LOITER")),
+        ),
+        ({"armed": False}, None, Release(because(Code.DISARMED))),
+        ({}, "release", Command(action=NEUTRAL)),
+    ],
+)
+def test_a_change_of_hands_does_not_wait_for_a_slot(
+    changes: dict[str, Any], act: Act | None, expected: Decision
+) -> None:
+    guard = Stepped().engaged()
+    output = guard.step(31, act=act, **changes)
+    assert (output.decision, output.slot) == (expected, None)
+
+
+def test_what_has_not_changed_is_not_sent_between_slots() -> None:
+    guard = Stepped().engaged()
+    assert [guard.step(30 + k).decision for k in range(1, 10)] == [None] * 9
+
+
+def test_the_fifth_unusable_chunk_ends_the_flight_as_it_comes() -> None:
+    guard = Stepped().engaged()
+    nan = WANTED._replace(roll=float("nan"))
+    phases = [guard.step(31 + k, guard.chunk(31 + k, nan)).phase for k in range(5)]
+    assert phases == [Phase.FLYING] * 4 + [Phase.LEAVING]
+
+
+def test_without_a_stop_neutral_is_held_on_and_on() -> None:
+    guard = Stepped(status={"has_receiver": False, "pilot_sticks": None}).engaged()
+    guard.link = {"problem": HEARTBEAT_LOST}
+    assert guard.step(31).mode == "BRAKE"
+    guard.link = {}
+    held = [guard.step(at_ms, mode="BRAKE") for at_ms in range(40, 1000, 10)]
+    assert held[-1].phase is Phase.HOLDING
+    assert {(output.decision, output.mode) for output in held[10:]} == {(LEFT, None)}
+
+
+def test_the_policy_gets_the_sticks_with_its_first_chunk_after_the_reset() -> None:
+    guard = Stepped()
+    for at_ms in (0, 10, 20):
+        guard.step(at_ms, guard.chunk(at_ms)._replace(reset_ns=0))
+    asked = guard.step(30, guard.chunk(30)._replace(reset_ns=0), act="engage")
+    assert (asked.phase, asked.starting_ns) == (Phase.PREPARING, START_NS + 30 * MS)
+    held = guard.step(40, guard.chunk(40)._replace(reset_ns=START_NS + 30 * MS - 1))
+    assert (held.phase, held.decision) == (Phase.PREPARING, None)
+    flown = guard.step(50, guard.chunk(50)._replace(reset_ns=START_NS + 41 * MS))
+    assert (flown.phase, flown.starting_ns) == (Phase.FLYING, 0)
+    assert flown.chunk_serial == 6
+
+
+def test_an_act_that_was_taken_back_leaves_no_reset_for_the_next_one() -> None:
+    guard = Stepped()
+    for at_ms in (0, 10, 20):
+        guard.step(at_ms, guard.chunk(at_ms)._replace(reset_ns=0))
+    guard.step(30, guard.chunk(30)._replace(reset_ns=0), act="engage")
+    given_up = guard.step(40, guard.chunk(40)._replace(reset_ns=0), act="release")
+    assert given_up.starting_ns == 0
+    for at_ms in range(50, 2000, 10):
+        guard.step(at_ms, guard.chunk(at_ms)._replace(reset_ns=START_NS + 35 * MS))
+    asked = guard.step(2000, guard.chunk(2000)._replace(reset_ns=START_NS + 35 * MS), act="engage")
+    assert (asked.phase, asked.starting_ns) == (Phase.PREPARING, START_NS + 2000 * MS)
+
+
+def test_a_reset_that_takes_longer_than_the_grace_is_asked_for_once() -> None:
+    guard = Stepped()
+    for at_ms in (0, 10, 20):
+        guard.step(at_ms, guard.chunk(at_ms)._replace(reset_ns=0))
+    guard.step(30, guard.chunk(30)._replace(reset_ns=0), act="engage")
+    starts = {guard.step(at_ms).starting_ns for at_ms in range(40, 400, 10)}
+    assert starts == {START_NS + 30 * MS}
+    for at_ms in range(400, 600, 10):
+        output = guard.step(at_ms, guard.chunk(at_ms)._replace(reset_ns=START_NS + 35 * MS))
+    assert output.phase is Phase.FLYING
+
+
+def test_a_chunk_that_is_not_taken_is_not_news() -> None:
+    guard = Stepped().engaged()
+    nan = guard.chunk(33, WANTED._replace(roll=float("nan")))
+    assert guard.step(33, nan).decision is None
+    assert guard.step(40).decision == Command(action=WANTED)
+
+
+def spent(reason: Reason | None) -> tuple[Any, Any]:
+    """Where the time of a late input went, and how much of it in ms."""
+    assert reason is not None
+    figures = dict(reason.data)
+    return figures["place"], figures["spent_ms"]
+
+
+def test_a_computer_that_stood_still_is_told_as_that() -> None:
+    guard = Stepped().engaged()
+    assert spent(guard.step(30 + 131).reason) == ("computer", 131)
+
+
+def test_slots_that_a_stall_has_missed_are_counted_and_not_made_up_for() -> None:
+    guard = Stepped().engaged()
+    late = guard.step(93, guard.chunk(93))
+    assert late.slot is not None
+    assert (late.slot.index, late.slot.missed) == (9, 5)
+    assert [guard.step(at_ms).decision for at_ms in (94, 95, 96)] == [None] * 3
+    on_time = guard.step(100)
+    assert on_time.slot is not None
+    assert (on_time.slot.index, on_time.slot.missed) == (10, 0)
+
+
+def test_a_guard_that_stood_still_beyond_the_grace_does_not_fly_on_with_a_fresh_chunk() -> None:
+    guard = Stepped().engaged()
+    late = guard.step(30 + 2000, guard.chunk(30 + 2000))
+    assert late.decision == Command(action=NEUTRAL)
+    assert spent(late.reason) == ("guard", 2000)
+    assert guard.step(2040, guard.chunk(2040)).decision in (Command(action=NEUTRAL), None)
+
+
+STALL = replace(AGES, stall_ns=300 * MS)
+
+
+def heard(at_ms: float) -> Telemetry:
+    return Telemetry(ned_from_body_wxyz=Reading(START_NS + round(at_ms * MS), (1.0, 0.0, 0.0, 0.0)))
+
+
+def test_a_stall_of_the_flight_process_is_flown_through_and_a_silent_vehicle_is_not() -> None:
+    def flies_until_ms(heard_until_ms: int) -> int:
+        guard = Stepped(freshness=STALL).engaged()
+        for at_ms in range(40, 1000, 10):
+            guard.telemetry = heard(min(at_ms, heard_until_ms))
+            output = guard.step(at_ms)
+            if guard.guard.phase is not Phase.FLYING:
+                break
+            assert output.is_coasting == (at_ms > 50)
+        assert (spent(output.reason)[0] == "link") == (heard_until_ms < 230)
+        return at_ms - 10
+
+    assert flies_until_ms(1000) == 330, "300 ms after its last chunk"
+    assert flies_until_ms(100) == 200, "100 ms after the vehicle's last attitude"
+
+
+@pytest.mark.parametrize(("stood_still_ms", "flies"), [(130, True), (260, True), (301, False)])
+def test_a_computer_that_stood_still_flies_on_when_chunk_and_vehicle_come_back(
+    stood_still_ms: int, flies: bool
+) -> None:
+    guard = Stepped(freshness=STALL).engaged()
+    guard.telemetry = heard(30)  # a vehicle on the same computer stood still, too
+    guard.step(30 + stood_still_ms)
+    assert (guard.guard.phase is Phase.FLYING) == flies
+    if flies:
+        fresh_ms = 60 + stood_still_ms
+        guard.telemetry = heard(fresh_ms)
+        assert not guard.step(fresh_ms, guard.chunk(fresh_ms)).is_coasting
+        assert guard.guard.phase is Phase.FLYING
+
+
+def test_the_next_step_is_due_at_the_next_slot() -> None:
+    guard = Stepped().engaged()
+    assert guard.guard.next_ns == START_NS + 40 * MS
+    guard.step(36, guard.chunk(36))
+    assert guard.guard.next_ns == START_NS + 40 * MS
+
+
+# --- what link and vehicle say
+
+
+LEFT = Command(action=NEUTRAL)
+
+
+@pytest.mark.parametrize(
+    ("link", "changes", "decision", "mode"),
+    [
+        ({"problem": OVERRULED, "is_overruled": True}, {}, Release(OVERRULED), None),
+        ({"problem": HEARTBEAT_LOST}, {}, LEFT, "BRAKE"),
+        ({"is_switched_off": True}, {}, Release(SWITCHED_OFF), None),
+        ({"interruption": REBOOTED, "interruptions": 1}, {}, Release(REBOOTED), None),
+        ({}, {"is_failsafe": True}, Release(because(Code.FAILSAFE, mode="ALT_HOLD")), None),
+        ({"problem": HEARTBEAT_LOST}, {"is_position_valid": False}, LEFT, "LAND"),
+        ({"problem": HEARTBEAT_LOST}, {"has_receiver": True, "pilot_sticks": NEUTRAL}, LEFT, None),
+        ({"problem": HEARTBEAT_LOST}, {"has_receiver": True, "pilot_sticks": IDLE}, LEFT, "BRAKE"),
+    ],
+)  # fmt: skip
+def test_each_word_of_link_and_vehicle_counts(
+    link: dict[str, Any], changes: dict[str, Any], decision: Decision, mode: str | None
+) -> None:
+    guard = Stepped(status={"has_receiver": False, "pilot_sticks": None}).engaged()
+    guard.link = link
+    output = guard.step(31, **changes)
+    assert (output.decision, output.mode) == (decision, mode)
+
+
+def test_a_refused_mode_is_known() -> None:
+    guard = Stepped(status={"has_receiver": False}).engaged()
+    assert (
+        guard.step(31, stop=Ending(reason=because(Code.GUARD_DIED), is_fault=True)).mode == "BRAKE"
+    )
+    guard.link = {"refused_mode": "BRAKE"}
+    assert guard.step(140).mode == "LAND"
+
+
+def test_a_vehicle_that_does_not_show_our_last_sticks_is_released_for_longer() -> None:
+    guard = Stepped().engaged()
+    guard.link = {"shows_last": False}
+    guard.step(31, mode="LOITER")
+    guard.is_released = False
+    assert guard.step(2000).phase is Phase.RELEASING
+    guard.link = {"shows_last": True}
+    assert guard.step(2010).phase is Phase.RELEASED
+
+
+def test_the_engage_switch_of_the_receiver_engages() -> None:
+    guard = Stepped(engage_channel=5)
+    for k in range(60):
+        us = 1000 if k < 30 else 2000
+        guard.step(10 * k, guard.chunk(10 * k), rc_channels_us=(1500,) * 4 + (us,))
+    assert guard.guard.phase is Phase.FLYING
+
+
+def test_the_envelope_ends_a_flight_as_a_fault() -> None:
+    guard = Stepped().engaged()
+    for at_ms in range(40, 740, 10):
+        guard.step(at_ms, guard.chunk(at_ms), battery_problem="the battery is at 8 %")
+    assert guard.guard.outcome.faults == 1
+    assert because(Code.BATTERY, said="the battery is at 8 %") in [o.reason for o in guard.outputs]
+
+
+def test_a_policy_that_is_too_slow_is_not_armed_for() -> None:
+    guard = Stepped(arm=True, status={"armed": False})
+    for k in range(8):
+        guard.step(10 * k, guard.chunk(10 * k)._replace(attitude_ns=START_NS - 400 * MS))
+    assert codes(guard.guard.failure) == (Code.TOO_SLOW,)
+
+
+def test_the_autopilots_takeoff_goes_by_the_height_above_the_place_of_arming() -> None:
+    guard = Stepped(
+        smoothing=SLOW,
+        arm=True,
+        takeoff_m=10.0,
+        status={"armed": False, "is_landed": True, "mode": "GUIDED", "pilot_sticks": PILOT},
+    )
+    for at_ms in range(0, 1030, 10):
+        output = guard.step(at_ms, guard.chunk(at_ms), position_ned_m=(0.0, 0.0, -2.0))
+    assert output.arm
+    asked = guard.step(1030, guard.chunk(1030), armed=True).takeoff_m
+    for at_ms in range(1040, 3100, 10):
+        asked = guard.step(at_ms, guard.chunk(at_ms), is_landed=asked is None).takeoff_m or asked
+    assert asked == 10.0
+    below = guard.step(3100, guard.chunk(3100), position_ned_m=(0.0, 0.0, -10.9))
+    above = guard.step(3110, guard.chunk(3110), position_ned_m=(0.0, 0.0, -11.1))
+    assert (below.mode, above.mode) == (None, "ALT_HOLD")
+    assert {below.decision, above.decision} == {Command(action=NEUTRAL)}
+    # The sticks were ours: the policy goes on from them, and not from the receiver's.
+    assert guard.step(3120, guard.chunk(3120), mode="ALT_HOLD").decision == Command(action=NEUTRAL)
+    assert guard.guard.phase is Phase.FLYING
+
+
+@pytest.mark.parametrize(("is_landed", "thrust"), [(True, 0.0), (False, 0.4), (None, 0.4)])
+def test_setpoints_end_idle_on_the_ground(is_landed: bool | None, thrust: float) -> None:
+    level = AttitudeThrust(0.4, 0.0, 0.0, 0.0)
+    guard = Stepped(
+        meaning=ActionMeaning(kind="attitude", hover_thrust=0.4),
+        smoothing=Smoothing(limits=LimitSettings().of("attitude"), tau_s=0.0),
+        status={"mode": "GUIDED", "is_landed": is_landed},
+        modes=("GUIDED",),
+        is_setpoint=True,
+        departure=DepartureSettings(is_setpoint=True),
+    )
+    guard.engaged(sticks=level)
+    assert guard.step(31, act="release").decision == Command(action=level._replace(thrust=thrust))
+
+
+# --- from where
+
+ECHO = Sticks(0.9, 0.9, 0.9, 0.9)
+
+
+def first_sticks(guard: Stepped) -> Sticks:
+    (first,) = guard.decisions
+    assert isinstance(first, Command)
+    return first.action
+
+
+def test_the_policy_starts_from_the_pilots_sticks() -> None:
+    guard = Stepped(smoothing=SLOW, status={"pilot_sticks": PILOT, "rc_sticks": ECHO})
+    assert first_sticks(guard.engaged()) == PILOT
+    moved = guard.step(40).decision
+    assert isinstance(moved, Command)
+    assert max(abs(a - b) for a, b in zip(moved.action, PILOT, strict=True)) <= 0.0101
+
+
+def test_without_known_sticks_it_starts_from_neutral_and_never_from_our_own_echo() -> None:
+    guard = Stepped(smoothing=SLOW, status={"pilot_sticks": None, "rc_sticks": ECHO})
+    assert first_sticks(guard.engaged()) == NEUTRAL
+
+
+@pytest.mark.parametrize(("age_ms", "first"), [(500, PILOT), (501, NEUTRAL), (None, NEUTRAL)])
+def test_sticks_that_were_seen_long_ago_are_not_known(age_ms: int | None, first: Sticks) -> None:
+    guard = Stepped(smoothing=SLOW, status={"pilot_sticks": PILOT})
+    for k in range(3):
+        guard.step(570 + 10 * k, guard.chunk(570 + 10 * k))
+    arrived_ns = None if age_ms is None else START_NS + (601 - age_ms) * MS
+    guard.step(601, guard.chunk(601), act="engage", rc_arrived_ns=arrived_ns)
+    assert first_sticks(guard) == first
+
+
+def test_after_arming_it_starts_from_idle() -> None:
+    guard = Stepped(smoothing=SLOW, arm=True, status={"armed": False, "pilot_sticks": PILOT})
+    for k in range(3):
+        output = guard.step(10 * k, guard.chunk(10 * k))
+    assert output.decision == Command(action=IDLE)
+    assert output.arm
+    taken = guard.step(30, guard.chunk(30), armed=True)
+    assert taken.phase is Phase.FLYING
+    assert taken.decision == Command(action=IDLE)
+
+
+def test_chunks_that_are_refused_do_not_start_the_filter_anew() -> None:
+    """Bad ones every other time once made roll creep up by the vehicle's own rounding."""
+    guard = Stepped(smoothing=SLOW, status={"pilot_sticks": NEUTRAL, "rc_sticks": ECHO})
+    guard.engaged(sticks=NEUTRAL)
+    for k in range(8):
+        at_ms = 40 + 10 * k
+        sticks = NEUTRAL if k % 2 else NEUTRAL._replace(roll=float("nan"))
+        guard.step(at_ms, guard.chunk(at_ms, sticks), rc_sticks=ECHO)
+    assert guard.guard.phase is Phase.FLYING
+    assert set(guard.decisions) == {Command(action=NEUTRAL)}
+
+
+# --- which
+
+
+def test_the_trace_shows_what_became_of_the_action() -> None:
+    output = Stepped().engaged(sticks=Sticks(1.5, 0.0, 0.0, 0.0)).outputs[-1]
+    assert output.trace is not None
+    assert (output.trace.raw.throttle, output.trace.clipped.throttle) == (1.5, 1.0)
+    assert output.decision == Command(action=output.trace.smoothed)
+    assert output.chunk_serial == 4
+
+
+def test_beyond_the_horizon_neutral_bridges_the_rest_of_the_grace() -> None:
+    guard = Stepped().engaged()
+    guard.step(33, guard.chunk(33, actions=2))  # acts until 70
+    sent = {at_ms: guard.step(at_ms) for at_ms in range(40, 150, 10)}
+    assert {at_ms for at_ms, out in sent.items() if out.decision == Command(action=WANTED)} == {
+        *(40, 50, 60, 70)
+    }
+    flown = [at_ms for at_ms, out in sent.items() if out.phase is Phase.FLYING]
+    assert flown == list(range(40, 140, 10))
+    assert all(sent[at_ms].decision == Command(action=NEUTRAL) for at_ms in range(80, 150, 10))
+    assert sent[140].phase is Phase.LEAVING
+    assert sent[140].trace is None
+    assert sent[140].chunk_serial is None
+
+
+def test_a_chunk_that_comes_while_the_sticks_are_idle_sends_nothing_between_slots() -> None:
+    guard = Stepped(arm=True, status={"armed": False})
+    for at_ms in (0, 10, 20):
+        assert guard.step(at_ms, guard.chunk(at_ms)).decision == Command(action=IDLE)
+    assert guard.step(23, guard.chunk(23)).decision is None
+
+
+def test_coasting_is_told() -> None:
+    waiting = Stepped()
+    waiting.step(0, waiting.chunk(0))
+    assert not waiting.step(500).is_coasting  # nothing is flown
+    guard = Stepped().engaged()
+    told = {at_ms: guard.step(at_ms).is_coasting for at_ms in range(40, 100, 10)}
+    assert told == {40: False, 50: False, 60: True, 70: True, 80: True, 90: True}
+    assert not guard.step(95, guard.chunk(95)).is_coasting
+
+
+def test_where_the_throttle_is_thrust_it_stays_until_the_safe_mode_is_there() -> None:
+    guard = Stepped(modes=("STABILIZE",), status={"mode": "STABILIZE", "has_receiver": False})
+    guard.engaged()
+    left = guard.step(31, act="release")
+    assert left.decision == Command(action=NEUTRAL._replace(throttle=WANTED.throttle))
+    assert left.mode == "LAND"
+    assert guard.step(40).decision == left.decision
+    assert guard.step(50, mode="LAND").decision == Command(action=NEUTRAL)
+
+
+def test_a_throttle_that_is_thrust_stays_down_where_the_policy_never_had_it() -> None:
+    guard = Stepped(arm=True, modes=("STABILIZE",), status={"mode": "STABILIZE", "armed": False})
+    guard.step(0, guard.chunk(0))
+    assert guard.step(10, armed=True).decision == Command(action=IDLE)  # too few chunks to fly
+    left = guard.step(20, act="release")
+    assert (left.phase, left.decision) == (Phase.LEAVING, Command(action=IDLE))
+
+
+def test_the_policy_is_sampled_ahead_by_the_lag_of_the_low_pass() -> None:
+    guard = Stepped(smoothing=stick_smoothing(tau_s=0.05)).engaged()
+    ramp = guard.chunk(40)._replace(actions=tuple(Sticks(0.01 * k, 0, 0, 0) for k in range(16)))
+    trace = guard.step(40, ramp).trace  # from 37 ms on, 0.01 every 20 ms
+    assert trace is not None
+    assert trace.raw.throttle == pytest.approx(0.0265)
+
+
+def test_neutral_sticks_are_sent_at_once_but_the_horizon_is_left_within_the_limits() -> None:
+    guard = Stepped(smoothing=SLOW, status={"pilot_sticks": WANTED}).engaged()
+    guard.step(33, guard.chunk(33, actions=2))  # acts until 70
+    (before, beyond) = (guard.step(70).decision, guard.step(80).decision)
+    assert isinstance(before, Command)
+    assert isinstance(beyond, Command)
+    assert before.action == pytest.approx(WANTED)
+    assert beyond.action == pytest.approx((0.39, 0.09, -0.19, 0.29))
+    assert guard.step(81, act="release").decision == Command(action=NEUTRAL)
+
+
+def test_read_only_flies_as_if_it_sent() -> None:
+    guard = Stepped(readonly=True)
+    outputs = [guard.step(10 * k, guard.chunk(10 * k), mode="ALT_HOLD") for k in range(4)]
+    assert [out.phase for out in outputs] == [Phase.WAITING] * 2 + [Phase.FLYING] * 2
+    assert outputs[-1].trace is not None
+    assert outputs[-1].decision == Command(action=WANTED)  # which a read-only link does not send
+
+
+def test_a_landing_counts_from_the_beginning_of_each_flight() -> None:
+    guard = Stepped().engaged()
+    guard.step(40, guard.chunk(40))  # in the air
+    for at_ms in range(50, 800, 10):
+        guard.step(at_ms, guard.chunk(at_ms), is_landed=True)
+    assert guard.outputs[-1].phase is Phase.RELEASED
+    assert guard.outputs[-1].reason == because(Code.LANDED)
+    guard.engaged(at_ms=830)  # still armed, on the ground
+    for at_ms in range(840, 1600, 10):
+        guard.step(at_ms, guard.chunk(at_ms))
+    assert guard.outputs[-1].phase is Phase.FLYING
+
+
+# --- words
+
+
+def test_what_is_not_watched_is_told_once_at_the_beginning() -> None:
+    guard = Stepped(status={"position_ned_m": None}).engaged()
+    guard.step(40, guard.chunk(40))
+    told = [text for output in guard.outputs for text in output.messages]
+    assert sum(text.startswith("height is not watched") for text in told) == 1
+
+
+def test_the_reason_why_an_act_had_no_effect_is_told_once() -> None:
+    guard = Stepped(status={"armed": False})
+    (told,) = guard.step(0, guard.chunk(0), act="engage").messages
+    assert "disarmed" in told
+    assert guard.step(10).messages == ()
+
+
+def test_absence_is_the_reason_for_not_flying() -> None:
+    guard = Stepped()
+    link = LinkSnapshot(telemetry=Telemetry(), status=guard.status, problem=None)
+    output = guard.guard.step(START_NS, GuardInput(link=link, absence=because(Code.NO_IMAGE)))
+    assert output.reason == because(Code.NO_IMAGE)
+
+
+def test_why_a_chunk_was_not_taken_is_told_until_the_next_one() -> None:
+    guard = Stepped()
+    guard.step(0, guard.chunk(0)._replace(image_ns=START_NS - 400 * MS))
+    told = because(Code.TOO_OLD, quantity="image", age_ms=400, limit_ms=300)
+    assert guard.step(5).reason == told
+
+
+def test_the_first_arming_engages_where_that_was_asked_for() -> None:
+    guard = Stepped(engage_on_arm=True, status={"armed": False})
+    for at_ms in (0, 10, 20):
+        guard.step(at_ms, guard.chunk(at_ms))
+    assert guard.step(30, guard.chunk(30), armed=True).phase is Phase.FLYING
+
+
+def test_without_a_vehicle_it_waits_and_can_be_ended() -> None:
+    guard = Stepped().guard
+    link = LinkSnapshot(telemetry=Telemetry(), status=None, problem=because(Code.NO_HEARTBEAT))
+    waiting = guard.step(START_NS, GuardInput(link=link, act="engage"))
+    assert (waiting.phase, waiting.decision) == (Phase.WAITING, None)
+    assert waiting.reason == because(Code.NO_HEARTBEAT)
+    ended = guard.step(
+        START_NS + MS, GuardInput(link=link, stop=Ending(reason=because(Code.SIGNAL)))
+    )
+    assert (ended.phase, ended.decision) == (Phase.ENDED, None)
+    assert guard.failure is None
+
+
+def test_body_rates_are_bridged_by_a_level_attitude() -> None:
+    turn = BodyRates(0.5, 1.0, 0.0, 0.0)
+    rates = Smoothing(limits=LimitSettings().of("rates"), tau_s=0.0)
+    guard = Stepped(meaning=ActionMeaning(kind="rates", hover_thrust=0.4), smoothing=rates)
+    for k in range(3):
+        guard.step(10 * k, guard.chunk(10 * k, turn))
+    engaged = guard.step(30, guard.chunk(30, turn, actions=2), act="engage")
+    assert engaged.decision == Command(action=turn)
+    beyond = guard.step(70)
+    assert beyond.decision == Command(action=AttitudeThrust(0.4, 0.0, 0.0, 0.0))
+    assert beyond.trace is not None
+    assert beyond.is_coasting
+    assert guard.step(80, guard.chunk(80, turn)).decision == Command(action=turn)
+
+
+def test_the_level_attitude_that_bridges_body_rates_is_not_filtered_with_them() -> None:
+    turn = BodyRates(0.5, 1.0, 0.0, 0.0)
+    rates = Smoothing(limits=LimitSettings().of("rates"), tau_s=0.05)
+    guard = Stepped(meaning=ActionMeaning(kind="rates", hover_thrust=0.4), smoothing=rates)
+    guard.engaged(sticks=turn)
+    guard.step(40, guard.chunk(40, turn, actions=2))
+    assert guard.step(80).decision == Command(action=AttitudeThrust(0.4, 0.0, 0.0, 0.0))
+
+
+def of_velocities(mode: str, **rules: Any) -> Stepped:
+    limits = LimitSettings(accel_mps2=5.0).of("velocity")
+    return Stepped(
+        meaning=ActionMeaning(kind="velocity"),
+        smoothing=Smoothing(limits=limits, tau_s=0.0),
+        status={"mode": mode},
+        roles=PX4_MODES,
+        modes=("OFFBOARD",),
+        is_setpoint=True,
+        departure=DepartureSettings(is_setpoint=True),
+        **rules,
+    )
+
+
+def test_a_velocity_is_braked_within_the_limit_of_acceleration() -> None:
+    guard = of_velocities("OFFBOARD")
+    guard.telemetry = Telemetry(velocity_ned_mps=Reading(START_NS, (3.0, 0.0, 0.0)))
+    guard.engaged(sticks=Velocity(3.0, 0.0, 0.0, 0.0))
+    braking = guard.step(40, act="release").decision
+    assert isinstance(braking, Command)
+    assert braking.action == pytest.approx((2.95, 0.0, 0.0, 0.0))
+
+
+def test_neutral_velocities_on_the_way_in_begin_with_what_the_vehicle_does() -> None:
+    guard = of_velocities("ALTCTL")
+    guard.telemetry = Telemetry(velocity_ned_mps=Reading(START_NS, (3.0, 0.0, 0.0)))
+    for at_ms in (0, 10, 20):
+        guard.step(at_ms, guard.chunk(at_ms, Velocity(0.0, 0.0, 0.0, 0.0)))
+    guard.telemetry = Telemetry(velocity_ned_mps=Reading(START_NS, (2.0, 0.0, 0.0)))
+    entering = guard.step(30, act="engage")
+    assert entering.phase is Phase.PREPARING
+    assert entering.decision == Command(action=Velocity(2.0, 0.0, 0.0, 0.0))
+    braking = guard.step(40).decision
+    assert isinstance(braking, Command)
+    assert braking.action == pytest.approx((1.95, 0.0, 0.0, 0.0))
+
+
+def test_a_velocity_that_was_idle_on_the_ground_ends_from_rest() -> None:
+    guard = of_velocities("OFFBOARD", arm=True)
+    guard.telemetry = Telemetry(velocity_ned_mps=Reading(START_NS, (0.3, 0.0, 0.0)))  # it drifts
+    rest = Command(action=Velocity(0.0, 0.0, 0.0, 0.0))
+    assert guard.step(0, armed=False).decision == rest
+    assert guard.step(10, armed=True).decision == rest
+    left = guard.step(20, act="release", is_landed=False)
+    assert (left.phase, left.decision) == (Phase.LEAVING, rest)
+
+
+def test_a_chunk_of_another_kind_of_action_is_not_flown() -> None:
+    guard = Stepped().engaged()
+    guard.step(40, guard.chunk(40, BodyRates(0.5, 1.0, 0.0, 0.0)))
+    assert guard.step(50).decision == Command(action=WANTED)
+    for k in range(6, 12):
+        guard.step(10 * k, guard.chunk(10 * k, BodyRates(0.5, 1.0, 0.0, 0.0)))
+    assert guard.guard.phase is Phase.LEAVING
+    assert Code.UNUSABLE_CHUNKS in codes(guard.outputs[-1].reason)
+
+
+def test_neutral_velocities_on_the_way_in_are_not_those_of_an_earlier_flight() -> None:
+    guard = of_velocities("OFFBOARD")
+    fast = Velocity(3.0, 0.0, 0.0, 0.0)
+    guard.engaged(sticks=fast)
+    for at_ms in range(40, 1000, 10):
+        guard.step(at_ms, guard.chunk(at_ms, fast))
+    assert guard.decisions[-1] == Command(action=fast)
+    guard.step(1000, guard.chunk(1000, fast), mode="ALTCTL")
+    guard.is_released = True
+    guard.step(1010, guard.chunk(1010, fast))
+    entering = guard.step(1020, guard.chunk(1020, fast), act="engage")
+    assert guard.guard.phase is Phase.PREPARING
+    assert entering.decision == Command(action=Velocity(0.0, 0.0, 0.0, 0.0))
+
+
+def test_a_flight_by_velocities_begins_within_their_limits_whatever_the_vehicle_says() -> None:
+    """One wrong reading would be asked for, and 20 s later still for most of it."""
+    limits = LimitSettings(speed_mps=8.0, climb_mps=3.0, accel_mps2=5.0).of("velocity")
+    guard = Stepped(
+        meaning=ActionMeaning(kind="velocity"), smoothing=Smoothing(limits=limits, tau_s=0.0)
+    )
+    guard.telemetry = Telemetry(velocity_ned_mps=Reading(START_NS, (3.4e38, 0.0, -90.0)))
+    guard.engaged(sticks=Velocity(0.0, 0.0, 0.0, 0.0))
+    first = guard.decisions[0]
+    assert isinstance(first, Command)
+    assert isinstance(first.action, Velocity)
+    assert math.hypot(first.action.x_mps, first.action.y_mps) <= 8.0
+    assert abs(first.action.z_mps) <= 3.0
+
+
+def test_a_flight_by_attitudes_begins_with_the_lean_that_there_is_also_beyond_the_limit() -> None:
+    limits = LimitSettings(lean_rad=0.5).of("attitude")
+    guard = Stepped(
+        meaning=ActionMeaning(kind="attitude", hover_thrust=0.4),
+        smoothing=Smoothing(limits=limits, tau_s=0.0),
+    )
+    half = (math.cos(0.4), math.sin(0.4), 0.0, 0.0)
+    guard.telemetry = Telemetry(ned_from_body_wxyz=Reading(START_NS, half))
+    guard.engaged(sticks=AttitudeThrust(0.4, 0.0, 0.0, 0.0))
+    first = guard.decisions[0]
+    assert isinstance(first, Command)
+    assert first.action == pytest.approx((0.4, 0.8, 0.0, 0.0))

@@ -1,0 +1,716 @@
+"""The guard between a vehicle and a flight process of fakes."""
+
+from collections.abc import Callable
+from dataclasses import replace
+from typing import Any
+
+import pytest
+
+from helpers.fakes import FOREVER_NS, START_NS, FakeClock, FakeLink
+from helpers.guard_facts import codes, engagement_settings, stick_smoothing
+from mavbridge.core.clock import NS_PER_MS, NS_PER_S
+from mavbridge.core.errors import UserError
+from mavbridge.core.reasons import Code, because
+from mavbridge.core.vehicle import (
+    IDLE,
+    NEUTRAL,
+    Action,
+    ActionMeaning,
+    AttitudeThrust,
+    BodyRates,
+    Command,
+    Decision,
+    Release,
+    Sticks,
+    Velocity,
+)
+from mavbridge.guard.chunks import Chunk, FreshnessLimits
+from mavbridge.guard.departure import DepartureSettings, Ending
+from mavbridge.guard.engagement import Phase
+from mavbridge.guard.envelope import EnvelopeLimits
+from mavbridge.guard.guard import FlightSettings
+from mavbridge.guard.limits import LimitSettings
+from mavbridge.guard.loop import FINISH_NS, IDLE_PERIOD_NS, GuardLoop
+from mavbridge.guard.settings import GuardSettings
+from mavbridge.guard.smoothing import Smoothing
+from mavbridge.guard.wire import (
+    Absence,
+    FromGuard,
+    GuardMessage,
+    GuardStatus,
+    GuardTick,
+    LastWords,
+    ToGuard,
+    decode_from_guard,
+    encode_to_guard,
+)
+from mavbridge.mavlink.codec.packets import CommandRefusedError
+from mavbridge.mavlink.settings import LinkSettings
+
+MS = NS_PER_MS
+WANTED = Sticks(0.4, 0.1, -0.2, 0.3)
+FLIGHT = FlightSettings(
+    meaning=ActionMeaning(),
+    stick_period_ns=10 * MS,
+    chunk_period_ns=10 * MS,
+    freshness=FreshnessLimits(
+        state_ns=300 * MS, velocity_ns=300 * MS, feature_ns=300 * MS, chunk_ns=300 * MS
+    ),
+    smoothing=stick_smoothing(),
+    envelope=EnvelopeLimits(),
+    watches_home_height=False,
+    watches_position=False,
+    engagement=engagement_settings(modes=("ALT_HOLD",), departure=DepartureSettings()),
+)
+
+
+class FakePort:
+    """The flight process: its messages wait in ``inbox``, those of the guard are kept decoded."""
+
+    def __init__(self) -> None:
+        self.inbox: list[bytes] = []
+        self.received: list[FromGuard] = []
+        self.files: list[int] = []
+        """Open files that came with messages."""
+        self.is_closed = False
+        self.takes = True
+
+    def send(self, message: bytes, fd: int | None = None) -> bool:
+        if not self.takes:
+            return False
+        self.received.append(decode_from_guard(message))
+        self.files += [] if fd is None else [fd]
+        return not self.is_closed
+
+    def receive(self) -> list[bytes]:
+        messages, self.inbox = self.inbox, []
+        return messages
+
+
+class Rig:
+    """Steps whenever the loop asks for it; a chunk comes 5 ms after each slot while ``solves``."""
+
+    def __init__(
+        self,
+        *,
+        first: list[ToGuard] | None = None,
+        oversleep_ns: int = 0,
+        lead_ns: int = 0,
+        **status: Any,
+    ) -> None:
+        self.clock = FakeClock(oversleep_ns=oversleep_ns)
+        self.link = FakeLink(self.clock, **status)
+        self.port = FakePort()
+        received = [encode_to_guard(message) for message in first or []]
+        self.loop = GuardLoop(self.clock, self.link, self.port, received=received, lead_ns=lead_ns)
+        self.link.forward = self.loop.forward
+        self.solves = True
+        self.wanted: Action = WANTED
+        self.serial = 0
+
+    def tell(self, *messages: ToGuard) -> None:
+        self.port.inbox += [encode_to_guard(message) for message in messages]
+
+    def chunk(self, **changes: Any) -> Chunk:
+        self.serial += 1
+        now_ns = self.clock.now_ns()
+        chunk = Chunk(
+            serial=self.serial,
+            attitude_ns=now_ns,
+            velocity_ns=now_ns,
+            image_ns=now_ns,
+            computed_ns=now_ns,
+            first_ns=now_ns,
+            step_ns=50 * MS,
+            actions=(self.wanted,) * 4,
+            reset_ns=FOREVER_NS,
+        )
+        return chunk._replace(**changes)
+
+    def run(self, seconds: float) -> "Rig":
+        until_ns = self.clock.now_ns() + round(seconds * NS_PER_S)
+        while self.clock.now_ns() < until_ns and not self.loop.is_done:
+            due_ns = self.loop.step()
+            if self.solves and due_ns - self.clock.now_ns() > 5 * MS:
+                self.clock.sleep_until_ns(due_ns - 5 * MS)
+                self.tell(self.chunk())
+            else:
+                self.clock.sleep_until_ns(due_ns)
+        return self
+
+    def flying(self, flight: FlightSettings = FLIGHT) -> "Rig":
+        self.tell(flight)
+        self.run(0.1)
+        self.tell("engage")
+        self.run(0.1)
+        assert self.ticks[-1].phase is Phase.FLYING, self.texts
+        return self
+
+    def got(self, kind: Any) -> list[Any]:
+        return [message for message in self.port.received if isinstance(message, kind)]
+
+    @property
+    def ticks(self) -> list[GuardTick]:
+        return self.got(GuardTick)
+
+    @property
+    def texts(self) -> list[str]:
+        return [message.text for message in self.got(GuardMessage)]
+
+
+# --- what the flight process hears
+
+
+def test_packets_are_passed_on_before_anything_else_with_their_stamps() -> None:
+    rig = Rig().flying()
+    rig.port.received.clear()
+    rig.link.change(mode="LOITER")
+    rig.link.texts.append("Mode LOITER")
+    rig.link.measure(age_ns=3 * MS)
+    arrived_ns = rig.clock.now_ns()
+    rig.loop.step()
+    packets, *rest = rig.port.received
+    assert isinstance(packets, tuple)
+    assert len(packets) == 3
+    assert {(p.arrived_ns, p.happened_ns) for p in packets} == {(arrived_ns, arrived_ns - 3 * MS)}
+    assert [type(message) for message in rest] == [
+        *(GuardStatus, GuardMessage, GuardTick, LastWords)
+    ]
+
+
+def test_the_vehicles_status_is_told_when_it_changes() -> None:
+    rig = Rig().run(0.1)
+    assert rig.got(GuardStatus) == [GuardStatus("fake 1.0", "ALT_HOLD", True, False, (), None)]
+    rig.link.change(armed=False)
+    rig.run(0.1)
+    rig.link.status = None
+    rig.run(0.1)
+    assert [(s.mode, s.armed) for s in rig.got(GuardStatus)[1:]] == [
+        ("ALT_HOLD", False),
+        (None, False),
+    ]
+
+
+def test_every_stick_is_told_with_its_chunk_as_it_was_sent() -> None:
+    rig = Rig().flying()
+    sent = [tick for tick in rig.ticks if tick.sent is not None]
+    assert [(tick.sent_ns, Command(action=tick.sent)) for tick in sent] == rig.link.decisions
+    assert {tick.sent for tick in sent} == {tick.trace.smoothed for tick in sent if tick.trace}
+    assert sent[-1].sent == pytest.approx(WANTED)
+    assert [tick.chunk_serial for tick in sent] == sorted(tick.chunk_serial for tick in sent)
+
+
+def test_slots_in_which_nothing_is_sent_are_told_too() -> None:
+    rig = Rig()
+    rig.tell(FLIGHT)
+    rig.run(0.1)
+    assert [tick.index for tick in rig.ticks] == list(range(10))
+    assert {(tick.is_slot, tick.sent) for tick in rig.ticks} == {(True, None)}
+
+
+def test_a_change_of_phase_is_told_even_where_nothing_is_sent() -> None:
+    rig = Rig().flying()
+    rig.solves = False
+    rig.link.change(mode="LOITER")
+    for _ in range(2):
+        rig.loop.step()
+    assert not rig.ticks[-1].is_slot
+    phases = list(dict.fromkeys(tick.phase for tick in rig.ticks))
+    assert phases == [Phase.WAITING, Phase.FLYING, Phase.RELEASING, Phase.RELEASED]
+    assert rig.ticks[-1].reason == because(Code.MODE_CHANGED, before="ALT_HOLD", after="LOITER")
+
+
+def test_packets_are_not_passed_on_before_somebody_reads_them() -> None:
+    rig = Rig()
+    for _ in range(1000):
+        rig.link.measure()
+        rig.loop.step()
+    assert rig.got(tuple) == rig.got(GuardStatus)
+    rig.tell(FLIGHT)
+    rig.loop.step()
+    rig.link.measure()
+    rig.loop.step()
+    assert [len(one) for one in rig.got(tuple) if not isinstance(one, GuardStatus)] == [3]
+
+
+# --- what it says
+
+
+def test_before_a_policy_is_loaded_the_link_is_served_all_the_same() -> None:
+    rig = Rig()
+    rig.tell("engage", rig.chunk(), Absence(because(Code.NO_IMAGE)))
+    first_ns = rig.loop.step()
+    assert first_ns == START_NS + IDLE_PERIOD_NS
+    rig.run(0.1)
+    assert rig.link.services >= 10
+    assert rig.ticks == []
+    assert rig.link.decisions == []
+
+
+def test_settings_may_come_with_the_first_messages() -> None:
+    rig = Rig(first=[FLIGHT])
+    assert rig.loop.step() == START_NS + 10 * MS
+    assert rig.ticks[0].phase is Phase.WAITING
+
+
+def test_the_first_settings_of_a_flight_count() -> None:
+    rig = Rig(first=[FLIGHT]).flying()
+    rig.tell(replace(FLIGHT, stick_period_ns=50 * MS), GuardSettings(link=LinkSettings()))
+    rig.run(0.1)
+    assert {
+        b - a
+        for (a, _), (b, _) in zip(rig.link.decisions[2:], rig.link.decisions[3:], strict=False)
+    } <= {*(5 * MS, 10 * MS)}
+    assert rig.ticks[-1].phase is Phase.FLYING
+
+
+def test_the_newest_of_several_chunks_is_flown() -> None:
+    rig = Rig().flying()
+    rig.solves = False
+    old, new = rig.chunk(), rig.chunk(actions=(NEUTRAL,))
+    rig.tell(old, new)
+    rig.loop.step()
+    assert rig.link.decisions[-1] == (rig.clock.now_ns(), Command(action=NEUTRAL))
+    assert rig.ticks[-1].chunk_serial == new.serial
+
+
+def test_an_act_that_has_no_effect_is_answered() -> None:
+    rig = Rig(armed=False)
+    rig.tell(FLIGHT)
+    rig.run(0.1)
+    rig.tell("engage")
+    rig.run(0.1)
+    (told,) = rig.texts
+    assert "disarmed" in told
+
+
+def test_why_there_is_no_chunk_is_passed_on_to_the_user() -> None:
+    rig = Rig()
+    rig.solves = False
+    rig.tell(FLIGHT, Absence(because(Code.IMAGE_BLANK, what="black", age_s=0.6)))
+    rig.run(0.1)
+    assert rig.ticks[-1].reason == because(Code.IMAGE_BLANK, what="black", age_s=0.6)
+
+
+def test_a_chunk_is_the_end_of_the_reason_for_there_being_none() -> None:
+    rig = Rig().flying()
+    rig.solves = False
+    rig.tell(Absence(because(Code.IMAGE_BLANK, what="black", age_s=0.6)), rig.chunk())
+    rig.run(0.2)
+    assert rig.ticks[-1].phase is not Phase.FLYING
+    reason = rig.ticks[-1].reason
+    assert reason is not None
+    assert reason.codes == (Code.LATE,)
+    assert dict(reason.data)["age_ms"] == 110
+    assert dict(reason.data)["limit_ms"] == 100
+
+
+def test_a_message_that_is_none_is_an_error() -> None:
+    rig = Rig()
+    rig.port.inbox.append(b"?")
+    with pytest.raises(ValueError, match="not a message"):
+        rig.loop.step()
+
+
+# --- the vehicle
+
+
+def test_sticks_leave_before_requests_and_other_work() -> None:
+    rig = Rig(has_receiver=False).flying()
+    services, requests = rig.link.services, []
+    rig.link.on_send = lambda: requests.append((rig.link.services, list(rig.link.requests)))
+    rig.tell(Ending(reason=because(Code.SIGNAL)))
+    rig.loop.step()
+    assert requests == [(services, [])]
+    assert rig.link.requests == ["mode LAND"]
+    assert rig.link.services == services + 1
+
+
+def test_the_link_is_engaged_while_we_hold_the_sticks_or_give_them_back() -> None:
+    rig = Rig()
+    rig.tell(FLIGHT)
+    rig.run(0.1)
+    assert not rig.link.is_engaged
+    rig.flying()
+    assert rig.link.is_engaged
+    rig.link.change(mode="LOITER")
+    rig.loop.step()
+    assert rig.link.is_engaged
+    rig.run(0.05)
+    assert not rig.link.is_engaged
+
+
+def test_every_ground_station_is_told_who_holds_the_sticks() -> None:
+    rig = Rig(has_receiver=False).flying()
+    rig.tell(Ending(reason=because(Code.POLICY_FAILED), is_fault=True))
+    rig.run(0.5)
+    assert rig.ticks[-1].phase is Phase.HOLDING
+    assert rig.link.is_engaged
+    rig.link.change(mode="LOITER")
+    rig.run(0.5)
+    assert rig.link.announced == [
+        "mavbridge: the policy has control",
+        "mavbridge: neutral: the policy has failed",
+        "mavbridge: neutral sticks go on until you disarm or change the mode",
+        "mavbridge: control given back: the policy has failed; then mode changed from BRAKE to "
+        "LOITER",
+    ]
+
+
+def test_an_oversleep_delays_slots_and_loses_none() -> None:
+    rig = Rig(oversleep_ns=MS)
+    rig.solves = False
+    rig.tell(FLIGHT)
+    rig.run(5.0)
+    assert sum(tick.missed_slots for tick in rig.ticks) == 0
+    assert [tick.index for tick in rig.ticks] == list(range(len(rig.ticks)))
+    assert {tick.sent_ns - tick.due_ns for tick in rig.ticks[2:]} == {MS}
+
+
+def test_slots_that_the_host_has_slept_through_are_counted_and_not_made_up_for() -> None:
+    rig = Rig().flying()
+    before = len(rig.link.decisions)
+    rig.clock.advance_ns(53 * MS)
+    for _ in range(3):
+        rig.loop.step()
+    assert len(rig.link.decisions) == before + 1
+    assert rig.ticks[-1].missed_slots == 5
+    rig.run(0.1)
+    assert sum(tick.missed_slots for tick in rig.ticks) == 5
+    assert rig.ticks[-1].phase is Phase.FLYING
+
+
+def test_work_that_begins_before_the_slot_sends_at_the_slot() -> None:
+    rig = Rig(lead_ns=MS // 2).flying()
+    rig.port.received.clear()
+    rig.run(0.5)
+    on_grid = [tick for tick in rig.ticks if tick.is_slot]
+    assert len(on_grid) > 40
+    assert {tick.sent_ns - tick.due_ns for tick in on_grid} == {0}
+    assert {tick.due_ns - tick.woke_ns for tick in on_grid} == {MS // 2}
+
+
+# --- the end
+
+
+def test_the_death_of_the_flight_process_is_a_fault() -> None:
+    rig = Rig(pilot_sticks=IDLE).flying()
+    rig.port.is_closed = True
+    rig.loop.step()
+    assert rig.link.decisions[-1][1] == Command(action=NEUTRAL)
+    assert rig.link.requests == ["mode BRAKE"]  # not LAND, as at a normal end
+    rig.run(1.0)
+    died = Release(because(Code.FLIGHT_PROCESS_DIED))
+    assert rig.link.hands[-2:] == [Command(action=NEUTRAL), died]
+    assert rig.loop.is_done
+
+
+# --- commands that cannot be made
+
+
+def refusing(error: Exception, *actions: Action) -> Callable[[Decision], bool]:
+    """A link that raises where it should send one of these actions; without any, each of them."""
+
+    def takes(decision: Decision) -> bool:
+        if isinstance(decision, Command) and (not actions or decision.action in actions):
+            raise error
+        return True
+
+    return takes
+
+
+@pytest.mark.parametrize("error", [CommandRefusedError("1.0000000000000002"), ZeroDivisionError()])
+def test_a_command_that_fails_ends_the_flight_in_order_and_not_the_guard(error: Exception) -> None:
+    rig = Rig(pilot_sticks=IDLE).flying()
+    rig.link.takes = refusing(error, WANTED)
+    rig.run(0.02)
+    assert rig.link.decisions[-1][1] == Command(action=NEUTRAL)
+    assert rig.link.requests == ["mode BRAKE"]
+    rig.run(1.0)
+    assert rig.ticks[-1].phase is Phase.RELEASED
+    assert codes(rig.ticks[-1].reason) == (Code.COMMAND_FAILED,)
+    assert type(error).__name__ in str(rig.ticks[-1].reason), "the user is told which error"
+    assert rig.loop.outcome.faults == 1
+    rig.loop.stop(Ending(reason=because(Code.DURATION)))
+    rig.run(0.1)
+    assert rig.loop.is_done
+    assert rig.link.restores
+
+
+def test_neutral_follows_in_the_same_moment() -> None:
+    rig = Rig().flying()
+    rig.link.takes = refusing(ZeroDivisionError(), WANTED)
+    while (due_ns := rig.loop.step()) > rig.clock.now_ns():
+        rig.clock.sleep_until_ns(due_ns)
+    rig.loop.step()
+    assert rig.link.decisions[-1] == (rig.clock.now_ns(), Command(action=NEUTRAL))
+
+
+def test_neutral_that_cannot_be_made_either_leaves_the_mode_and_the_release() -> None:
+    rig = Rig(pilot_sticks=IDLE).flying()
+    rig.link.takes = refusing(CommandRefusedError("broken"))
+    rig.run(1.0)
+    assert rig.link.requests == ["mode BRAKE"]
+    assert isinstance(rig.link.hands[-1], Release)
+    assert rig.ticks[-1].phase is Phase.RELEASED
+
+
+def test_idle_sticks_that_cannot_be_made_end_the_way_into_a_flight() -> None:
+    rig = Rig(armed=False)
+    rig.link.takes = refusing(CommandRefusedError("broken"))
+    engagement = engagement_settings(modes=("ALT_HOLD",), departure=DepartureSettings(), arm=True)
+    rig.tell(replace(FLIGHT, engagement=engagement))
+    rig.run(1.5)
+    assert rig.loop.is_done
+    assert codes(rig.loop.failure) == (Code.COMMAND_FAILED,)
+    assert "broken" in str(rig.loop.failure)
+
+
+def test_a_mode_that_cannot_be_asked_for_does_not_end_the_guard() -> None:
+    rig = Rig(pilot_sticks=IDLE).flying()
+
+    def refuse(mode: str) -> None:
+        raise UserError(f"no mode {mode}")
+
+    rig.link.set_mode = refuse  # type: ignore[method-assign]
+    rig.loop.stop(Ending(reason=because(Code.DURATION), is_fault=True))
+    rig.run(6.0)
+    assert rig.link.hands[-1] == Command(action=NEUTRAL)  # over an idle receiver
+    assert rig.ticks[-1].phase is Phase.HOLDING
+
+
+def test_its_death_before_a_flight_leaves_the_vehicle_alone() -> None:
+    rig = Rig()
+    rig.tell(FLIGHT)
+    rig.run(0.1)
+    rig.port.is_closed = True
+    rig.run(1.0)
+    assert rig.loop.is_done
+    assert rig.link.decisions == []
+
+
+def test_a_chunk_that_has_come_with_the_end_of_the_channel_does_not_fly() -> None:
+    rig = Rig().flying()
+    rig.tell(rig.chunk(), "engage")
+    rig.port.is_closed = True
+    rig.loop.step()
+    assert rig.link.decisions[-1][1] == Command(action=NEUTRAL)
+
+
+def test_the_first_reason_to_end_is_the_one_that_counts() -> None:
+    rig = Rig().flying()
+    rig.loop.stop(Ending(reason=because(Code.TOLD_TO_END)))
+    rig.tell(Ending(reason=because(Code.POLICY_FAILED), is_fault=True))
+    rig.run(1.0)
+    assert rig.link.hands[-1] == Release(because(Code.TOLD_TO_END))
+    assert rig.loop.is_done
+
+
+@pytest.mark.parametrize("has_policy", [True, False], ids=["flight", "weights still loading"])
+@pytest.mark.parametrize("seconds", [0.5, 60.0])
+def test_parameters_are_put_back_at_the_end_for_a_bounded_time(
+    has_policy: bool, seconds: float
+) -> None:
+    rig = Rig(first=[FLIGHT] if has_policy else [])
+    rig.link.is_restored = False
+    rig.run(0.1)
+    assert rig.link.restores == 0
+    rig.tell(Ending(reason=because(Code.SIGNAL)))
+    stopped_ns = rig.clock.now_ns()
+    services = rig.link.services
+    rig.run(min(seconds, 1.0))
+    assert not rig.loop.is_done
+    assert rig.link.restores > 10
+    assert rig.link.services > services + 10
+    rig.link.is_restored = seconds < 1.0
+    rig.run(seconds)
+    assert rig.loop.is_done
+    took_ns = rig.clock.now_ns() - stopped_ns
+    assert took_ns == pytest.approx(min(seconds * NS_PER_S, FINISH_NS), abs=40 * MS)
+
+
+def test_what_the_link_says_about_putting_back_is_still_passed_on() -> None:
+    rig = Rig(first=[FLIGHT])
+    rig.run(0.1)
+    rig.tell(Ending(reason=because(Code.SIGNAL)))
+    restore = rig.link.begin_restore
+
+    def begin_restore() -> None:
+        restore()
+        if not rig.loop.is_done:
+            rig.link.texts = ["RC_OVERRIDE_TIME put back to 3"]
+
+    rig.link.begin_restore = begin_restore  # type: ignore[method-assign]
+    rig.run(0.1)
+    assert rig.loop.is_done
+    assert "RC_OVERRIDE_TIME put back to 3" in rig.texts
+
+
+# --- last words, for the death of the guard or a bug of its own
+
+ASKED_MS, RELEASES = 250, 5
+
+
+def words(rig: Rig) -> LastWords:
+    newest: LastWords = rig.got(LastWords)[-1]
+    return newest
+
+
+def said(rig: Rig) -> list[tuple[int, str]]:
+    """The newest last words as (ms, text)."""
+    return [(after_ns // MS, packet.decode()) for after_ns, packet in words(rig).packets]
+
+
+def test_before_and_after_a_flight_there_is_nothing_to_say() -> None:
+    rig = Rig()
+    rig.tell(FLIGHT)
+    rig.run(1.0)
+    assert rig.got(LastWords) == []
+    rig.tell("engage")
+    rig.run(0.1)
+    assert words(rig).packets
+    rig.link.change(mode="LOITER")
+    rig.run(2.0)
+    assert rig.ticks[-1].phase is Phase.RELEASED
+    assert words(rig) == LastWords(Phase.RELEASED, None, ("127.0.0.1", 1), False, ())
+
+
+def test_the_last_words_are_there_before_the_step_of_the_first_stick_ends() -> None:
+    rig = Rig()
+    rig.tell(FLIGHT)
+    rig.run(0.1)
+    rig.tell("engage")
+    while not rig.link.decisions:
+        rig.run(0.001)
+    assert words(rig).phase is Phase.FLYING
+
+
+@pytest.mark.parametrize("has_receiver", [True, False])
+def test_the_last_words_are_neutral_then_the_mode_then_the_release(has_receiver: bool) -> None:
+    rig = Rig(has_receiver=has_receiver, pilot_sticks=IDLE).flying()
+    neutral, mode = str(Command(action=NEUTRAL)), "BRAKE"
+    texts = said(rig)
+    assert texts[0] == (0, neutral)
+    assert texts[1] == (0, mode)
+    assert [at for at, text in texts if text == neutral][:4] == [0, 20, 40, 100]
+    assert [at for at, text in texts if text == mode] == [0, 100, 200]
+    releases = [at for at, text in texts if text not in (neutral, mode)]
+    assert len(releases) == (RELEASES if has_receiver else 0)
+    assert all(at >= ASKED_MS for at in releases)
+    assert words(rig).mode == mode
+
+
+def test_a_takeover_leaves_only_releases_to_be_said() -> None:
+    rig = Rig().flying()
+    rig.link.change(mode="LOITER")
+    rig.loop.step()
+    taken = because(Code.MODE_CHANGED, before="ALT_HOLD", after="LOITER")
+    assert {text for _, text in said(rig)} <= {str(Release(taken))}
+    assert words(rig).mode is None
+
+
+@pytest.mark.parametrize(
+    "change",
+    [{"mode": "POSHOLD", "armed": False}, {"has_receiver": False}, {"is_position_valid": False}],
+)
+def test_the_last_words_follow_the_vehicle_at_once(change: dict[str, Any]) -> None:
+    rig = Rig(pilot_sticks=IDLE).flying()
+    before = words(rig)
+    rig.link.change(**change)
+    rig.loop.step()
+    assert words(rig) != before
+
+
+def test_nothing_is_prepared_between_two_seconds_in_which_nothing_changes() -> None:
+    rig = Rig().flying()
+    count = len(rig.got(LastWords))
+    rig.run(5.0)
+    assert len(rig.got(LastWords)) - count == 5
+
+
+def test_the_open_link_is_handed_over_once_and_again_when_it_was_opened_again() -> None:
+    rig = Rig().flying()
+    rig.run(3.0)
+    assert rig.port.files == [7]
+    rig.link.outlet = rig.link.outlet._replace(opened=2, fd=None)
+    rig.loop.step()
+    assert words(rig).packets == ()  # the flight process closes its duplicate
+    rig.link.outlet = rig.link.outlet._replace(fd=8)
+    rig.loop.step()
+    assert rig.port.files == [7, 8]
+    assert words(rig).brings_file
+
+
+def test_what_the_flight_process_did_not_take_is_sent_again_with_the_open_link() -> None:
+    rig = Rig().flying()
+    rig.port.takes = False
+    rig.link.change(has_receiver=False)
+    rig.loop.step()
+    rig.port.takes = True
+    rig.run(1.1)
+    assert words(rig).brings_file
+    assert words(rig).packets
+
+
+def test_a_guard_that_fails_says_its_last_words_itself() -> None:
+    rig = Rig(pilot_sticks=IDLE).flying()
+    expected = said(rig)
+    died_ns = rig.clock.now_ns()
+    rig.loop.abandon()
+    transmitted = [((at_ns - died_ns) // MS, text) for at_ns, text in rig.link.transmitted]
+    assert transmitted == expected
+
+    def explode() -> None:
+        raise OSError("no link")
+
+    rig.link.on_send = explode
+    rig.loop.abandon()  # and hides no first error behind a second one
+
+
+def test_a_guard_that_fails_leaves_no_body_rates_behind() -> None:
+    rig = Rig(pilot_sticks=IDLE)
+    rig.wanted = BodyRates(0.5, 3.0, 0.0, 0.0)
+    limits = LimitSettings().of("rates")
+    meaning = ActionMeaning(kind="rates", hover_thrust=0.4)
+    rig.flying(replace(FLIGHT, meaning=meaning, smoothing=Smoothing(limits=limits, tau_s=0.0)))
+    assert rig.link.decisions[-1][1] == Command(action=rig.wanted)
+    rig.loop.abandon()
+    level = str(Command(action=AttitudeThrust(0.4, 0.0, 0.0, 0.0)))
+    assert rig.link.transmitted[0][1] == level
+
+
+def test_a_guard_that_fails_in_a_flight_by_setpoints_asks_the_vehicle_to_hold() -> None:
+    rig = Rig(mode="GUIDED")
+    rig.wanted = Velocity(1.0, 0.0, 0.0, 0.0)
+    setpoints = engagement_settings(modes=("GUIDED",), is_setpoint=True)
+    rig.tell(replace(FLIGHT, meaning=ActionMeaning(kind="velocity"), engagement=setpoints))
+    rig.run(0.3)
+    rig.tell("engage")
+    rig.run(0.1)
+    assert rig.link.announced == ["mavbridge: the policy has control"]
+    rig.loop.abandon()
+    assert [text for _, text in rig.link.transmitted].count("BRAKE") == 3
+
+
+def test_a_guard_that_fails_after_a_takeover_leaves_the_pilots_mode_alone() -> None:
+    rig = Rig(mode="GUIDED")
+    rig.wanted = Velocity(1.0, 0.0, 0.0, 0.0)
+    setpoints = engagement_settings(modes=("GUIDED",), is_setpoint=True)
+    rig.flying(replace(FLIGHT, meaning=ActionMeaning(kind="velocity"), engagement=setpoints))
+    rig.link.status = replace(rig.link.status, mode="LOITER")
+    rig.run(0.1)
+    rig.loop.abandon()
+    assert "BRAKE" not in [text for _, text in rig.link.transmitted]
+
+
+def test_the_reason_for_no_flight_is_known_at_the_end() -> None:
+    rig = Rig(armed=False, is_landed=True)
+    assert rig.loop.failure is None
+    rig.link.obeys = rig.solves = False
+    engagement = replace(FLIGHT.engagement, arm=True)
+    rig.tell(replace(FLIGHT, engagement=engagement))
+    rig.run(100.0)
+    assert rig.loop.is_done
+    assert codes(rig.loop.failure) == (Code.NOT_READY, Code.NO_CHUNK)
+    assert rig.loop.failure is not None
+    assert dict(rig.loop.failure.data)["after_s"] == 90

@@ -1,0 +1,257 @@
+"""Every message between the processes arrives as it was sent."""
+
+import math
+import struct
+from dataclasses import replace
+from typing import Any
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from helpers.guard_facts import engagement_settings, stick_smoothing
+from mavbridge.core.reasons import Code, because
+from mavbridge.core.vehicle import (
+    ActionMeaning,
+    ActionTrace,
+    ForwardedPacket,
+    LinkStats,
+    Percentiles,
+    Sticks,
+)
+from mavbridge.guard.chunks import Chunk, FreshnessLimits
+from mavbridge.guard.departure import DepartureSettings, Ending
+from mavbridge.guard.engagement import Phase
+from mavbridge.guard.envelope import EnvelopeLimits
+from mavbridge.guard.guard import FlightSettings
+from mavbridge.guard.outcome import Outcome
+from mavbridge.guard.settings import GuardSettings
+from mavbridge.guard.wire import (
+    Absence,
+    FromGuard,
+    GuardError,
+    GuardMessage,
+    GuardStatus,
+    GuardSummary,
+    GuardTick,
+    ToGuard,
+    decode_from_guard,
+    decode_to_guard,
+    encode_from_guard,
+    encode_packets,
+    encode_tick,
+    encode_to_guard,
+)
+from mavbridge.mavlink.settings import LinkSettings
+
+STICKS = Sticks(0.1, -0.2, 0.3, -0.4)
+FLIGHT = FlightSettings(
+    meaning=ActionMeaning(),
+    stick_period_ns=10_000_000,
+    chunk_period_ns=33_333_333,
+    freshness=FreshnessLimits(state_ns=1, velocity_ns=2, feature_ns=3, chunk_ns=4),
+    smoothing=stick_smoothing(max_slew_per_s=8.0, tau_s=0.05),
+    envelope=EnvelopeLimits(height_m=math.inf),
+    watches_home_height=False,
+    watches_position=False,
+    engagement=engagement_settings(modes=("ALT_HOLD",), departure=DepartureSettings(then="rtl")),
+)
+CHUNK = Chunk(
+    serial=7,
+    attitude_ns=1,
+    velocity_ns=2,
+    image_ns=3,
+    computed_ns=4,
+    first_ns=5,
+    step_ns=6,
+    actions=(STICKS, Sticks(1e-300, -0.0, math.inf, 1.0)),
+)
+TICK = GuardTick(
+    index=3,
+    due_ns=10,
+    woke_ns=11,
+    decided_ns=11,
+    sent_ns=12,
+    missed_slots=2,
+    is_slot=True,
+    is_coasting=False,
+    chunk_serial=7,
+    trace=ActionTrace(raw=STICKS, clipped=STICKS, slewed=STICKS, smoothed=STICKS),
+    sent=STICKS,
+    phase=Phase.FLYING,
+    reason=None,
+)
+STATUS = GuardStatus("ArduPilot 4.6.3", "ALT_HOLD", True, False, (1500,) * 8, STICKS, True)
+STATS = LinkStats(
+    messages_per_s=(("ATTITUDE_QUATERNION", 99.9), ("HEARTBEAT", 10.0)),
+    lost_fraction=0.25,
+    rtt_ms=Percentiles(p50=1.0, p99=2.0, p999=3.0, max=4.0),
+    sent_overrides=6000,
+    echo_confirmed=None,
+    vehicle_clock_offset_ns=-5,
+    saturated=(("pitch", 0.25), ("yaw", 0.01)),
+)
+SUMMARY = GuardSummary(
+    autopilot="PX4",
+    link=STATS,
+    failure=because(Code.NO_CHUNK_SINCE_RESET, why=because(Code.NO_IMAGE)),
+    outcome=Outcome(
+        flights=2,
+        has_left_ground=True,
+        faults=1,
+        end="fault",
+        fault=because(Code.IMAGE_FROZEN, age_s=0.6),
+    ),
+    params={"RC_OVERRIDE_TIME": 0.5},
+    dropped_messages=1,
+    dropped_packets=2,
+)
+TO_GUARD: list[ToGuard] = [
+    CHUNK,
+    CHUNK._replace(actions=()),
+    Absence(because(Code.OF_CAMERA, camera="größer", why=because(Code.NO_IMAGE))),
+    GuardSettings(link=LinkSettings(connect="udp:127.0.0.1:14550"), tlog_fd=9, cpu=1),
+    FLIGHT,
+    Ending(reason=because(Code.HANGS, name="policy", idle_s=2.0), is_fault=True),
+    "engage",
+    "release",
+]
+FROM_GUARD: list[FromGuard] = [
+    TICK,
+    replace(TICK, trace=None, sent=None, chunk_serial=None, is_slot=False, is_coasting=True),
+    replace(TICK, chunk_serial=0, sent=None),
+    *(
+        replace(TICK, phase=phase, reason=because(Code.STILL_ENDING, phase=phase.value))
+        for phase in Phase
+    ),
+    (),
+    (ForwardedPacket(1, 2, b"\xfd" * 280), ForwardedPacket(3, 3, b""), ForwardedPacket(4, 1, b"P")),
+    STATUS,
+    GuardStatus("none", None, False, None, (), None),
+    GuardMessage("PreArm: Gyros inconsistent"),
+    GuardError("user", "another guard flies this vehicle"),
+    SUMMARY,
+    replace(SUMMARY, failure=None, link=replace(STATS, rtt_ms=None, lost_fraction=None)),
+]
+
+
+def encoded(message: FromGuard) -> bytes:
+    match message:
+        case GuardTick():
+            return encode_tick(message)
+        case GuardStatus() | GuardMessage() | GuardError() | GuardSummary():
+            return encode_from_guard(message)
+        case packets:
+            return encode_packets(packets)
+
+
+@pytest.mark.parametrize("message", TO_GUARD, ids=lambda m: type(m).__name__)
+def test_what_is_sent_to_the_guard_arrives_as_it_was(message: ToGuard) -> None:
+    received = decode_to_guard(encode_to_guard(message))
+    assert received == message
+    assert type(received) is type(message)
+
+
+@pytest.mark.parametrize("message", FROM_GUARD, ids=lambda m: type(m).__name__)
+def test_what_the_guard_sends_arrives_as_it_was(message: FromGuard) -> None:
+    received = decode_from_guard(encoded(message))
+    assert received == message
+    assert type(received) is type(message)
+
+
+plain = st.sampled_from((Code.NO_IMAGE, Code.DURATION, Code.LANDED)).map(because)
+figures = st.fixed_dictionaries({"age_s": st.floats(allow_nan=False)})
+reasons = st.recursive(
+    plain | figures.map(lambda data: because(Code.IMAGE_FROZEN, **data)),
+    lambda inner: st.builds(because, st.just(Code.OF_CAMERA), camera=st.text(), why=inner),
+)
+stamps = st.integers(-(2**63), 2**63 - 1)
+sticks = st.builds(Sticks, *[st.floats(width=64)] * 4)
+
+
+def bits(values: Any) -> bytes:
+    """NaN is not equal to itself, its bytes are."""
+    return struct.pack(f"<{len(values)}d", *values)
+
+
+@given(st.tuples(*[stamps] * 7), st.lists(sticks, max_size=40))
+def test_any_chunk_arrives_bit_by_bit(seven: tuple[int, ...], actions: list[Sticks]) -> None:
+    sent = Chunk(*seven, tuple(actions))  # type: ignore[call-arg,arg-type]
+    received = decode_to_guard(encode_to_guard(sent))
+    assert isinstance(received, Chunk)
+    assert received[:7] == seven
+    assert [bits(action) for action in received.actions] == [bits(action) for action in actions]
+
+
+@given(
+    st.builds(
+        GuardTick,
+        index=stamps,
+        due_ns=stamps,
+        woke_ns=stamps,
+        decided_ns=stamps,
+        sent_ns=stamps,
+        missed_slots=st.integers(0, 2**31 - 1),
+        is_slot=st.booleans(),
+        is_coasting=st.booleans(),
+        chunk_serial=st.none() | stamps,
+        trace=st.none()
+        | st.builds(ActionTrace, raw=sticks, clipped=sticks, slewed=sticks, smoothed=sticks),
+        sent=st.none() | sticks,
+        phase=st.sampled_from(Phase),
+        reason=st.none() | reasons,
+    )
+)
+def test_any_tick_arrives_bit_by_bit(tick: GuardTick) -> None:
+    received = decode_from_guard(encode_tick(tick))
+    assert isinstance(received, GuardTick)
+    plain = {"trace": None, "sent": None}
+    assert replace(received, **plain) == replace(tick, **plain)  # type: ignore[arg-type]
+    assert (received.trace is None, received.sent is None) == (
+        tick.trace is None,
+        tick.sent is None,
+    )
+    if tick.sent is not None and received.sent is not None:
+        assert bits(received.sent) == bits(tick.sent)
+    if tick.trace is not None and received.trace is not None:
+        for stage in ("raw", "clipped", "slewed", "smoothed"):
+            assert bits(getattr(received.trace, stage)) == bits(getattr(tick.trace, stage))
+
+
+GARBAGE = [b"", b"\0", b"Q", b"A", b"Afly", b"E{}", b"E[]", b"E\xff", b"S", b"Snonsense"]
+
+
+@pytest.mark.parametrize("data", GARBAGE)
+def test_the_guard_refuses_what_is_no_message(data: bytes) -> None:
+    with pytest.raises(ValueError, match="not a message"):
+        decode_to_guard(data)
+
+
+@pytest.mark.parametrize(
+    "data", [b"", b"Q", b"V{}", b"Vnull", b"V[1]", b"M", b"X[]", b"Z{}", b"Z[]"]
+)
+def test_the_flight_process_refuses_what_is_no_message(data: bytes) -> None:
+    with pytest.raises(ValueError, match="not a message"):
+        decode_from_guard(data)
+
+
+@pytest.mark.parametrize("message", TO_GUARD[:1] + TO_GUARD[5:], ids=lambda m: type(m).__name__)
+def test_a_message_to_the_guard_that_is_cut_off_is_refused(message: ToGuard) -> None:
+    whole = encode_to_guard(message)
+    for length in range(len(whole)):
+        with pytest.raises(ValueError, match="not a message"):
+            decode_to_guard(whole[:length])
+
+
+@pytest.mark.parametrize("message", [TICK, FROM_GUARD[-7], STATUS, SUMMARY])
+def test_a_message_of_the_guard_that_is_cut_off_is_refused(message: FromGuard) -> None:
+    whole = encoded(message)
+    at_whole_packets = {1, 1 + 18 + 280, 1 + 18 + 280 + 18} if isinstance(message, tuple) else set()
+    for length in set(range(len(whole))) - at_whole_packets:
+        with pytest.raises(ValueError, match="not a message"):
+            decode_from_guard(whole[:length])
+
+
+def test_a_chunk_with_more_bytes_than_it_says_is_refused() -> None:
+    with pytest.raises(ValueError, match="not a message"):
+        decode_to_guard(encode_to_guard(CHUNK) + b"\0")
