@@ -76,6 +76,9 @@ class GuardLink(Protocol):
     def service(self) -> None:
         """Send what is due besides sticks; called after them."""
 
+    def send_before_action(self) -> None:
+        """Send what should reach the vehicle before the next action."""
+
     def begin_flight(self, meaning: ActionMeaning, output: Output | None) -> None:
         """Choose the message that carries such actions; raises PeerError where none can."""
 
@@ -232,6 +235,8 @@ class GuardLoop:
         now_ns, slot_ns = self._clock.now_ns(), self._guard.next_ns
         at_ns = slot_ns if 0 < slot_ns - now_ns <= self._lead_ns else now_ns
         output = self._guard.step(at_ns, given)
+        if isinstance(output.decision, Command):
+            self._link.send_before_action()
         if output.decision is not None and at_ns > now_ns:
             self._clock.sleep_until_ns(at_ns)
         self._command_fault = None

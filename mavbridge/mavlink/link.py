@@ -52,6 +52,8 @@ from mavbridge.mavlink.transport.connection import REFUSED_NS, Connection, Packe
 from mavbridge.mavlink.transport.sockets import Address, Transport
 
 SOURCE_COMPONENT = dialect.MAV_COMP_ID_ONBOARD_COMPUTER
+_EARLY_REQUEST_NS = 20 * NS_PER_MS
+"""Two periods of the usual sticks: a request leaves before one of them, never after."""
 _HEARTBEAT_HZ = 1.0
 """MAVLink heartbeat protocol; autopilots time a peer out after several seconds."""
 
@@ -297,7 +299,19 @@ class MavlinkLink:
             return
         for request in vehicle.step(now_ns):
             self._connection.send(self._codec.encode_request(vehicle.identity.source, request))
-        if (ts1 := self._timesync.request(now_ns)) is not None:
+        self._request_time(now_ns)
+
+    def send_before_action(self) -> None:
+        """Send a TIMESYNC request that is due soon; called just before an action is sent.
+
+        Where actions fill a queue that drops what does not fit, the place that has become free
+        since the last action goes to the packet that comes first.
+        """
+        if self._vehicle is not None and not self._sender.is_release_owed:
+            self._request_time(self._clock.now_ns(), _EARLY_REQUEST_NS)
+
+    def _request_time(self, now_ns: int, early_ns: int = 0) -> None:
+        if (ts1 := self._timesync.request(now_ns, early_ns)) is not None:
             self._connection.send(self._codec.encode_timesync(ts1))
 
     def _find_vehicle(self, now_ns: int) -> None:

@@ -185,6 +185,9 @@ class FakeLink:
             texts=texts,
         )
 
+    def send_before_action(self) -> None:
+        pass
+
     def begin_flight(self, meaning: ActionMeaning, output: Output | None) -> None:
         self.meaning = meaning
 

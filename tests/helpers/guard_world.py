@@ -6,7 +6,7 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from mavbridge.core.clock import NS_PER_MS
+from mavbridge.core.clock import NS_PER_MS, NS_PER_S
 from mavbridge.core.reasons import Reason
 from mavbridge.core.records import FeatureFrame, Frame
 from mavbridge.flight.feature_cache import FeatureCache
@@ -26,6 +26,9 @@ class Direction(DelayedChannel):
         self.delay_ns = NS_PER_MS * 3 // 10
         self.loss = 0.0
         self.is_silent = False
+        self.bytes_per_s = 0.0
+        """Bandwidth; what finds half a second of packets before it is dropped. 0: unlimited."""
+        self._free_ns = 0
         self.sent: list[tuple[int, bytes]] = []
         """Every datagram, also those that got lost, with its time."""
         self._draw = random.Random(1)
@@ -34,12 +37,19 @@ class Direction(DelayedChannel):
 
     def _delays_ns(self) -> Iterator[int]:
         while True:
-            yield self.delay_ns
+            yield self.delay_ns + max(self._free_ns - self._world.now_ns(), 0)
 
     def send(self, data: bytes) -> None:
-        self.sent.append((self._world.now_ns(), data))
-        if not self.is_silent and self._draw.random() >= self.loss:
-            super().send(data)
+        now_ns = self._world.now_ns()
+        self.sent.append((now_ns, data))
+        if self.is_silent or self._draw.random() < self.loss:
+            return
+        if self.bytes_per_s:
+            if self._free_ns - now_ns > 500 * MS:
+                return
+            self._free_ns = max(self._free_ns, now_ns)
+            self._free_ns += round(len(data) / self.bytes_per_s * NS_PER_S)
+        super().send(data)
 
 
 class Network(MemoryTransport):

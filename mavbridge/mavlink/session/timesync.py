@@ -78,9 +78,9 @@ class TimesyncFilter:
         self._clocks.clear()
         self._best, self._agreeing = None, 0
 
-    def request(self, now_ns: int) -> int | None:
-        """The ts1 of the request that is due, if any."""
-        if now_ns < self._next_ns:
+    def request(self, now_ns: int, early_ns: int = 0) -> int | None:
+        """Return the ts1 of the request that is due now or within ``early_ns``, else None."""
+        if now_ns + early_ns < self._next_ns:
             return None
         self._next_ns = now_ns + period_ns(TIMESYNC_HZ)
         self._outstanding.append(now_ns)

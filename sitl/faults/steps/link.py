@@ -167,7 +167,7 @@ LINK_KINDS: dict[str, Callable[..., LinkStep]] = {
     "silence": Silence,
     "broken": Broken,
     "unread": Unread,
-    "duplicate system": DuplicateSystem,
+    "duplicate-system": DuplicateSystem,
     "rates": Rates,
 }
 """Steps by the key ``do`` of a scenario."""

@@ -59,6 +59,9 @@ class ReadyVehicle:
         status = VehicleStatus(mode="ALT_HOLD", armed=True)
         return LinkSnapshot(telemetry=Telemetry(), status=status, problem=None)
 
+    def send_before_action(self) -> None:
+        pass
+
     def begin_flight(self, meaning: ActionMeaning, output: Output | None) -> None:
         pass
 
