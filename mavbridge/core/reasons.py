@@ -53,6 +53,7 @@ class Code(StrEnum):
     FAILSAFE = auto()
     OVERRULED = auto()
     REBOOTED = auto()
+    CLOCK_SET_BACK = auto()
     REPLACED = auto()
     PARAMETER_CHANGED = auto()
     # Planned ends
@@ -172,6 +173,7 @@ _REASONS: dict[Code, tuple[Kind, str]] = {
     Code.DISARMED: (_VEHICLE, "the vehicle has been disarmed"),
     Code.FAILSAFE: (_VEHICLE, "a failsafe of the vehicle is active (mode {mode})"),
     Code.OVERRULED: (_PILOT, "the vehicle ignores our {quantity}: {cause}"),
+    Code.CLOCK_SET_BACK: (_VEHICLE, "the vehicle's clock went back by {back_s:.1f} s"),
     Code.REBOOTED: (_VEHICLE, "the vehicle has rebooted: its session starts over"),
     Code.REPLACED: (_VEHICLE, "{said}"),
     Code.PARAMETER_CHANGED: (

@@ -30,6 +30,8 @@ from sitl.faults.usage import Usage, growth, read_usage
 POLICY = "Wandering"
 SWITCH, LOW_US, HIGH_US = 7, 1000, 2000
 """Channel of the engage switch, and its ends."""
+REST_S = 2.5
+"""The switch stays low for so long: it must rest for 1.8 s before going high is an act."""
 SETTLE_S = 1.5
 """From the end of a fault until the policy must have lost the sticks."""
 QUIET_NS = NS_PER_S // 2
@@ -175,7 +177,7 @@ def _engage(stage: Stage, transmitter: Transmitter) -> None:
         transmitter.move(SWITCH, LOW_US)
         stage.relay.set_mode("ALT_HOLD")
         stage.relay.arm()
-        stage.observe(SETTLE_S)
+        stage.observe(REST_S)
         transmitter.move(SWITCH, HIGH_US)
         if stage.relay.wait_until(lambda: stage.relay.is_leaning(LEANING_ROWS), ENGAGE_S):
             return

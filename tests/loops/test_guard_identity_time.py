@@ -16,7 +16,7 @@ from mavbridge.core.errors import UserError
 from mavbridge.core.reasons import Code, because
 from mavbridge.guard.engagement import Phase
 from sitl.ardupilot.flight_modes import Mode
-from sitl.vehicle.config import MID_RECEIVER_US
+from sitl.vehicle.config import IDLE_RECEIVER_US, MID_RECEIVER_US
 
 ELSEWHERE = ("sitl", 2)
 
@@ -79,6 +79,19 @@ def test_a_clock_that_wraps_in_flight_is_no_reboot_and_hides_no_age() -> None:
     flight.vehicle.reboot()
     flight.until(lambda: any("has rebooted" in text for text in flight.messages), within_s=8)
     assert flight.phase is not Phase.FLYING
+
+
+@pytest.mark.parametrize("back_s", [0.5, 2.0, 15.0])
+def test_a_clock_that_is_set_back_in_flight_ends_it_in_order(back_s: float) -> None:
+    """No reboot: over an idle receiver the vehicle would sink to the ground after a release."""
+    flight = GuardFlight(receiver_us=IDLE_RECEIVER_US)
+    flight.ap.boot_ns -= 20 * NS_PER_S
+    flight.fly()
+    flight.ap.boot_ns += round(back_s * NS_PER_S)
+    flight.until(lambda: flight.phase is Phase.LEAVING, within_s=0.4)
+    flight.run(2)
+    assert flight.ap.mode is Mode.BRAKE
+    assert not any("has rebooted" in text for text in flight.messages)
 
 
 def test_a_reboot_while_the_sticks_are_given_back_ends_there() -> None:

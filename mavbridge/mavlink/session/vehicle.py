@@ -44,6 +44,8 @@ RECEIVER_WAIT_NS = 2 * NS_PER_S
 SYS_STATUS comes at 2 Hz, and some firmware sends RC_CHANNELS only if it has one."""
 HEARTBEAT_TIMEOUT_NS = 3 * NS_PER_S
 """Heartbeats come at 1 Hz: a vehicle that loses three in a row is lost."""
+_FASTEST_CLOCK, _BOOT_SLACK_NS = 10, NS_PER_S
+"""A vehicle that has rebooted runs for no longer than it was silent, by a simulator's clock too."""
 _VERSION_TIMEOUT_NS = 400 * NS_PER_MS
 _VERSION_ATTEMPTS = 8
 """Its unique id names the file of remembered parameters: worth more than one lost packet."""
@@ -92,7 +94,12 @@ class VehicleSession:
         self._switch = Switch()
         """Override switch; between high and low it stays as it was, as in the vehicle."""
         self._boot_ms = 0
+        self._stamped_ns = 0
+        self._silent_ns = 0
+        """Silence before the first stamp that was old."""
         self._old_stamps = 0
+        self._set_back: tuple[int, Reason] | None = None
+        """When its clock last went back in flight, and how far."""
 
     def use_output(self, output: Output) -> None:
         """Fly with this output from now on: its echo is asked for, its demands are checked."""
@@ -105,7 +112,7 @@ class VehicleSession:
 
     @property
     def has_rebooted(self) -> bool:
-        """Its clock has started again."""
+        """Its clock has started again, no earlier than it was last heard."""
         return self._old_stamps >= RESTART_STAMPS
 
     def receive(self, message: ReceivedMessage, arrived_ns: int) -> None:
@@ -116,7 +123,7 @@ class VehicleSession:
             self.condition.receive(body, arrived_ns, may_be_ours=self.is_receiver_hidden)
         match body:
             case Attitude():
-                self._watch_boot(body.boot_us // 1000)
+                self._watch_boot(body.boot_us // 1000, arrived_ns)
             case RcChannels():
                 self._receive_rc(body, arrived_ns)
             case CommandAck():
@@ -154,11 +161,18 @@ class VehicleSession:
             in_range = switch <= len(rc.channels_us)
             self._switch.read(rc.channels_us[switch - 1] if in_range else 0, arrived_ns)
 
-    def _watch_boot(self, boot_ms: int) -> None:
-        if later_by_us(1000 * boot_ms, 1000 * self._boot_ms) < -RESTART_STEP_US:
-            self._old_stamps += 1
-        else:
+    def _watch_boot(self, boot_ms: int, arrived_ns: int) -> None:
+        back_us = -later_by_us(1000 * boot_ms, 1000 * self._boot_ms)
+        silent_ns, self._stamped_ns = arrived_ns - self._stamped_ns, arrived_ns
+        if self._old_stamps == 0:
+            self._silent_ns = silent_ns
+        if back_us <= RESTART_STEP_US:
             self._old_stamps, self._boot_ms = 0, boot_ms
+        elif boot_ms * NS_PER_MS <= _FASTEST_CLOCK * self._silent_ns + _BOOT_SLACK_NS:
+            self._old_stamps += 1
+        else:  # it has run for longer than the silence: the same flight, by a clock that was set
+            self._old_stamps, self._boot_ms = 0, boot_ms
+            self._set_back = arrived_ns, because(Code.CLOCK_SET_BACK, back_s=back_us / 1_000_000)
 
     def step(self, now_ns: int) -> Iterator[Request]:
         """Requests that are due."""
@@ -242,6 +256,8 @@ class VehicleSession:
             return because(Code.NO_HEARTBEAT)
         if now_ns - self.condition.heartbeat[0] > HEARTBEAT_TIMEOUT_NS:
             return because(Code.HEARTBEAT_LOST)
+        if self._set_back is not None and now_ns - self._set_back[0] < NS_PER_S:
+            return self._set_back[1]
         if (unfinished := self.unfinished(now_ns)) is not None:
             return unfinished
         return self._params.problem()

@@ -570,15 +570,37 @@ def test_a_reboot_is_noticed_by_two_old_stamps() -> None:
 
 
 @given(
-    last_ms=st.one_of(st.integers(5_000, 2**32 - 1), st.integers(2**32 - 5_000, 2**32 - 1)),
-    first_ms=st.integers(1_001, 4_000),
+    last_ms=st.one_of(st.integers(50_000, 2**32 - 1), st.integers(2**32 - 5_000, 2**32 - 1)),
+    first_ms=st.integers(1_001, 40_000),
+    pace=st.floats(0.1, 10.0),
 )
-def test_a_reboot_is_found_wherever_the_clock_stood(last_ms: int, first_ms: int) -> None:
-    """No vehicle sends its attitude within a second of its boot."""
+def test_a_reboot_is_found_wherever_the_clock_stood(
+    last_ms: int, first_ms: int, pace: float
+) -> None:
+    """No vehicle sends its attitude within a second of its boot; a simulator may run faster."""
     session = Session()
-    for boot_ms in (last_ms, first_ms, first_ms + 10):
+    session.put(Attitude(True, 1000 * last_ms, (1, 0, 0, 0), (0, 0, 0)))
+    session.now_ns += round(first_ms * NS_PER_MS / pace)
+    for boot_ms in (first_ms, first_ms + 10):
         session.put(Attitude(True, 1000 * boot_ms, (1, 0, 0, 0), (0, 0, 0)))
     assert session.session.has_rebooted is (last_ms - first_ms > 1000)
+
+
+@given(
+    last_ms=st.integers(5_000, 2**32 - 2_000),
+    back_ms=st.integers(1_001, 2**32),
+    gap_ms=st.integers(0, 100),
+)
+def test_a_vehicle_that_has_run_for_longer_than_it_was_silent_has_not_rebooted(
+    last_ms: int, back_ms: int, gap_ms: int
+) -> None:
+    """Its clock was set: what it does by its old sticks is still the flight's."""
+    session, boot_ms = Session(), last_ms - back_ms % (last_ms - 2_100)
+    session.put(Attitude(True, 1000 * last_ms, (1, 0, 0, 0), (0, 0, 0)))
+    session.now_ns += gap_ms * NS_PER_MS
+    for later_ms in range(0, 50, 10):
+        session.put(Attitude(True, 1000 * (boot_ms + later_ms), (1, 0, 0, 0), (0, 0, 0)))
+        assert not session.session.has_rebooted
 
 
 @given(
