@@ -54,6 +54,7 @@ class Code(StrEnum):
     OVERRULED = auto()
     REBOOTED = auto()
     CLOCK_SET_BACK = auto()
+    MOVED = auto()
     REPLACED = auto()
     PARAMETER_CHANGED = auto()
     # Planned ends
@@ -174,6 +175,7 @@ _REASONS: dict[Code, tuple[Kind, str]] = {
     Code.FAILSAFE: (_VEHICLE, "a failsafe of the vehicle is active (mode {mode})"),
     Code.OVERRULED: (_PILOT, "the vehicle ignores our {quantity}: {cause}"),
     Code.CLOCK_SET_BACK: (_VEHICLE, "the vehicle's clock went back by {back_s:.1f} s"),
+    Code.MOVED: (_VEHICLE, "the vehicle went on from {now} instead of {before}"),
     Code.REBOOTED: (_VEHICLE, "the vehicle has rebooted: its session starts over"),
     Code.REPLACED: (_VEHICLE, "{said}"),
     Code.PARAMETER_CHANGED: (

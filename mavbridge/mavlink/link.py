@@ -54,6 +54,8 @@ from mavbridge.mavlink.transport.sockets import Address, Transport
 SOURCE_COMPONENT = dialect.MAV_COMP_ID_ONBOARD_COMPUTER
 _EARLY_REQUEST_NS = 20 * NS_PER_MS
 """Two periods of the usual sticks: a request leaves before one of them, never after."""
+_MOVED_NS, _MOVED_STAMPS = 250 * NS_PER_MS, 3
+"""Silence of the engaged vehicle, and stamps of its clock in a row that come from elsewhere."""
 _HEARTBEAT_HZ = 1.0
 """MAVLink heartbeat protocol; autopilots time a peer out after several seconds."""
 
@@ -102,6 +104,7 @@ class MavlinkLink:
         self._watches_home_height = False
         self._interruption: Reason | None = None
         self._interruptions = 0
+        self._moved_stamps = 0
         self._duplicate_systems = DuplicateSystems()
 
     def fileno(self) -> int | None:
@@ -174,11 +177,34 @@ class MavlinkLink:
                 self._discovery.receive(message.source, message.body, sender, arrived_ns)
             if vehicle is None or message.source != vehicle.identity.source:
                 continue
-            if sender != vehicle.identity.address:
+            if sender != vehicle.identity.address and not self._is_moved(
+                vehicle, message.body, sender, arrived_ns
+            ):
                 if isinstance(message.body, Heartbeat):
                     self._notice_other(vehicle.identity, sender, arrived_ns)
                 continue
             self._receive(vehicle, message, arrived_ns)
+
+    def _is_moved(
+        self, vehicle: VehicleSession, body: object, sender: Address | None, arrived_ns: int
+    ) -> bool:
+        """Whether the engaged vehicle now sends from here: silent elsewhere, its clock goes on.
+
+        It is followed so that neutral sticks, the safe mode and the release reach it.
+        """
+        if not self.is_engaged or not isinstance(body, Attitude):
+            return False
+        is_silent = arrived_ns - self._counters.heard_ns > _MOVED_NS
+        is_same = is_silent and self._timesync.is_same_clock(body.boot_us, arrived_ns)
+        self._moved_stamps = self._moved_stamps + 1 if is_same else 0
+        if self._moved_stamps < _MOVED_STAMPS:
+            return False
+        self._moved_stamps = 0
+        before, vehicle.identity = vehicle.identity, replace(vehicle.identity, address=sender)
+        self._connection.peer = sender
+        reason = because(Code.MOVED, before=before.place, now=vehicle.identity.place)
+        vehicle.end_engagement(reason, arrived_ns)
+        return True
 
     def _receive(self, vehicle: VehicleSession, message: ReceivedMessage, arrived_ns: int) -> None:
         """Take one message of the chosen vehicle."""

@@ -49,6 +49,21 @@ def test_a_vehicle_that_moves_in_flight_is_latched_until_the_next_act() -> None:
     flight.until(lambda: flight.phase is Phase.FLYING, within_s=0.2)
 
 
+@pytest.mark.parametrize("gap_s", [0.0, 0.1, 1.0])
+def test_a_vehicle_whose_clock_goes_on_elsewhere_is_brought_into_safety_there(
+    gap_s: float,
+) -> None:
+    flight = GuardFlight(receiver_us=IDLE_RECEIVER_US).fly()
+    flight.up.is_silent = flight.down.is_silent = True
+    flight.run(gap_s)
+    flight.up.is_silent = flight.down.is_silent = False
+    flight.network.address = ELSEWHERE
+    flight.until(lambda: flight.ap.mode is Mode.BRAKE, within_s=1.5)
+    flight.run(6)
+    assert flight.ap.mode is Mode.BRAKE
+    assert flight.phase is Phase.RELEASED
+
+
 def test_a_reboot_in_flight_is_latched_and_still_leaves_a_release() -> None:
     flight = GuardFlight().fly()
     flight.run(2)

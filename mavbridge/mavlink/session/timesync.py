@@ -20,6 +20,8 @@ many years."""
 MAX_AHEAD_NS = 20 * NS_PER_MS
 """Most by which a stamp may lie in the future, beyond the error of the offset: clocks of simulators
 are uneven."""
+SAME_CLOCK_NS = 100 * NS_PER_MS
+"""Two vehicles do not boot within this of each other by chance."""
 LONGEST_SENDING_NS = 150 * NS_PER_MS
 """The way to the vehicle: sticks that act so late steer by what was seen too long ago."""
 _LATE_IN_A_ROW = 2
@@ -170,15 +172,25 @@ class TimesyncFilter:
     def happened_ns(self, boot_us: int, arrived_ns: int) -> int:
         """Our time of something that the vehicle stamped ``boot_us`` after its start.
 
-        The arrival where the vehicle's stamp says nothing: it is missing (0), Unix time, or the
-        offset is not good yet. Later than the arrival only by more than ``MAX_AHEAD_NS``: a reading
-        of which the age is not known.
+        The arrival where the vehicle's stamp says nothing. Later than the arrival only by more than
+        ``MAX_AHEAD_NS``: a reading of which the age is not known.
         """
-        is_stamped = 0 < boot_us < UNIX_US and self._agreeing >= GOOD_EXCHANGES
-        if self._best is None or not is_stamped:
+        delay_ns = self._delay_ns(boot_us, arrived_ns)
+        if self._best is None or delay_ns is None:
             return arrived_ns
-        wrap_ns = 1000 * WRAP_US
-        delay_ns = arrived_ns + self._best.offset_ns - 1000 * boot_us
-        delay_ns = (delay_ns + wrap_ns // 2) % wrap_ns - wrap_ns // 2
         is_ahead = -delay_ns > MAX_AHEAD_NS + self._error_ns(self._best, arrived_ns)
         return arrived_ns - delay_ns if delay_ns > 0 or is_ahead else arrived_ns
+
+    def is_same_clock(self, boot_us: int, arrived_ns: int) -> bool:
+        """Whether a stamp comes from the clock that answered, since it is as young as its own."""
+        delay_ns = self._delay_ns(boot_us, arrived_ns)
+        return delay_ns is not None and abs(delay_ns) <= SAME_CLOCK_NS
+
+    def _delay_ns(self, boot_us: int, arrived_ns: int) -> int | None:
+        """Time from a stamp to its arrival; None where the stamp says nothing: it is missing (0),
+        Unix time, or the offset is not good yet."""
+        if self._best is None or not self.is_good or not 0 < boot_us < UNIX_US:
+            return None
+        wrap_ns = 1000 * WRAP_US
+        delay_ns = arrived_ns + self._best.offset_ns - 1000 * boot_us
+        return (delay_ns + wrap_ns // 2) % wrap_ns - wrap_ns // 2

@@ -44,6 +44,7 @@ RECEIVER_WAIT_NS = 2 * NS_PER_S
 SYS_STATUS comes at 2 Hz, and some firmware sends RC_CHANNELS only if it has one."""
 HEARTBEAT_TIMEOUT_NS = 3 * NS_PER_S
 """Heartbeats come at 1 Hz: a vehicle that loses three in a row is lost."""
+_UPSET_NS = NS_PER_S
 _FASTEST_CLOCK, _BOOT_SLACK_NS = 10, NS_PER_S
 """A vehicle that has rebooted runs for no longer than it was silent, by a simulator's clock too."""
 _VERSION_TIMEOUT_NS = 400 * NS_PER_MS
@@ -98,8 +99,7 @@ class VehicleSession:
         self._silent_ns = 0
         """Silence before the first stamp that was old."""
         self._old_stamps = 0
-        self._set_back: tuple[int, Reason] | None = None
-        """When its clock last went back in flight, and how far."""
+        self._upset: tuple[int, Reason] | None = None
 
     def use_output(self, output: Output) -> None:
         """Fly with this output from now on: its echo is asked for, its demands are checked."""
@@ -172,7 +172,8 @@ class VehicleSession:
             self._old_stamps += 1
         else:  # it has run for longer than the silence: the same flight, by a clock that was set
             self._old_stamps, self._boot_ms = 0, boot_ms
-            self._set_back = arrived_ns, because(Code.CLOCK_SET_BACK, back_s=back_us / 1_000_000)
+            reason = because(Code.CLOCK_SET_BACK, back_s=back_us / 1_000_000)
+            self.end_engagement(reason, arrived_ns)
 
     def step(self, now_ns: int) -> Iterator[Request]:
         """Requests that are due."""
@@ -256,11 +257,15 @@ class VehicleSession:
             return because(Code.NO_HEARTBEAT)
         if now_ns - self.condition.heartbeat[0] > HEARTBEAT_TIMEOUT_NS:
             return because(Code.HEARTBEAT_LOST)
-        if self._set_back is not None and now_ns - self._set_back[0] < NS_PER_S:
-            return self._set_back[1]
+        if self._upset is not None and now_ns - self._upset[0] < _UPSET_NS:
+            return self._upset[1]
         if (unfinished := self.unfinished(now_ns)) is not None:
             return unfinished
         return self._params.problem()
+
+    def end_engagement(self, reason: Reason, now_ns: int) -> None:
+        """Have ``problem`` give this reason for long enough to end an engagement in order."""
+        self._upset = now_ns, reason
 
     def output_problem(self, now_ns: int) -> Reason | None:
         """The reason why it cannot be flown with the output now, or None."""

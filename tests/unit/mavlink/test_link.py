@@ -514,12 +514,29 @@ def test_on_the_ground_a_vehicle_that_moves_is_followed_and_said_to_have_moved()
     assert told[0] != told[1]
 
 
-def test_in_flight_a_vehicle_that_moves_is_not_followed() -> None:
+def test_in_flight_a_vehicle_whose_clock_goes_on_elsewhere_is_followed() -> None:
     rig = Rig()
     rig.run(8.0)
     rig.link.is_engaged = True
     rig.run(0.5, Command(action=IDLE))
     rig.vehicle.address = ("127.0.0.1", 2)
+    rig.run(0.25, Command(action=IDLE))
+    assert rig.vehicle.answered_to == ("127.0.0.1", 1)
+    snapshot = rig.run(0.1, Command(action=IDLE))
+    assert rig.vehicle.answered_to == ("127.0.0.1", 2)
+    assert snapshot.interruption is None
+    assert snapshot.problem is not None
+    assert snapshot.problem.code is Code.MOVED
+    assert rig.run(1.0, Command(action=IDLE)).problem is None
+
+
+def test_in_flight_another_clock_elsewhere_is_not_followed() -> None:
+    rig = Rig()
+    rig.run(8.0)
+    rig.link.is_engaged = True
+    rig.run(0.5, Command(action=IDLE))
+    rig.vehicle.address = ("127.0.0.1", 2)
+    rig.vehicle.boot_ns -= 5 * NS_PER_S
     count = len(rig.forwarded)
     snapshot = rig.run(9.0, Command(action=IDLE))
     assert snapshot.interruption is not None
