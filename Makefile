@@ -70,11 +70,13 @@ bench: $(VENV)/installed .venv-peers/installed  ## engines, loops and link here,
 mutants: $(VENV)/installed  ## small changes of the safety core, each of which a test must notice; not part of test
 	$(BIN)/python -m benchmarks.mutants $(MODULES)
 
-faults: $(VENV)/installed  ## every fault of the catalogue with every vehicle; writes docs/faults.md
-	$(BIN)/python -m sitl faults --out docs/faults.md
+FAULTS ?=
+JOBS ?= 1
+faults: $(VENV)/installed  ## every fault with every vehicle, and docs/faults.md; FAULTS="kill stop" flies those alone
+	PYTHONPATH=.:tests $(BIN)/python -m faults --jobs $(JOBS) $(or $(FAULTS),--out docs/faults.md)
 
 soak: $(VENV)/installed  ## SOAK_MINUTES of a flight with a random fault every few seconds
-	$(BIN)/python -m sitl soak --minutes $(SOAK_MINUTES)
+	PYTHONPATH=.:tests $(BIN)/python -m faults --soak $(SOAK_MINUTES)
 
 FUZZ_DATAGRAMS ?= 10000000
 FUZZ_SEED ?=

@@ -1,4 +1,4 @@
-"""Commands: ``python -m sitl`` flies; ``camera``, ``course`` and ``faults`` do what they say."""
+"""Commands: ``python -m sitl`` flies; ``camera`` films, ``course`` prints a course."""
 
 import argparse
 import math
@@ -14,7 +14,6 @@ from sitl.camera.follow import film_vehicle
 from sitl.camera.fpv import CameraOptions
 from sitl.clock import NS_PER_S, stop_on_signal, wall_ns
 from sitl.course.layout import course_to_json, make_course
-from sitl.faults.command import add_faults_command, add_soak_command
 from sitl.pilot.axes import DEFAULT_AXES
 from sitl.vehicle.conditions import NOMINAL, held_out_conditions, random_conditions
 from sitl.vehicle.config import (
@@ -110,8 +109,6 @@ def _parser() -> argparse.ArgumentParser:
     course.set_defaults(run=_print_course)
     course.add_argument("--course", type=_SEED, default=0, metavar="SEED", help="default: 0")
     course.add_argument("--json", action="store_true", help="print JSON instead of a table")
-    add_faults_command(commands)
-    add_soak_command(commands)
     return parser
 
 

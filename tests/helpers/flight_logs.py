@@ -5,7 +5,7 @@ from pathlib import Path
 
 from pymavlink import mavutil
 
-from sitl.faults.stage.relay import Override
+from faults.relay import Override
 
 
 def logged_overrides(path: Path) -> Iterator[Override]:

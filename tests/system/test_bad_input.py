@@ -7,10 +7,10 @@ from pathlib import Path
 
 import pytest
 
+from faults.props import FrameFeed
 from mavbridge.__main__ import main
 from mavbridge.core.processes import free_port
 from sitl.clock import Clock
-from sitl.faults.stage.camera import FrameFeed
 
 pytestmark = pytest.mark.system
 

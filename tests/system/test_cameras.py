@@ -12,6 +12,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from faults.stage import faulty_policy, staged
 from helpers.camera_senders import (
     SIDE,
     RtpSender,
@@ -28,7 +29,6 @@ from mavbridge.core.processes import child_environment
 from mavbridge.recording.flight_folder import open_flight
 from mavbridge.recording.meta import FlightError
 from sitl.camera.shm import FramePublisher
-from sitl.faults.stage.stage import faulty_policy, staged
 
 pytestmark = pytest.mark.system
 

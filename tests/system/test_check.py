@@ -8,9 +8,9 @@ from pathlib import Path
 
 import pytest
 
+from faults.stage import STALLED, STARTS, TIMEOUT_S
 from mavbridge.core.errors import ExitCode
 from mavbridge.core.processes import child_environment, free_port, running
-from sitl.faults.stage.stage import STALLED, STARTS, TIMEOUT_S
 
 pytestmark = pytest.mark.system
 BLIND = ("--policy", "scripted:hover", "--camera", "none")

@@ -9,12 +9,12 @@ from typing import Any
 
 import pytest
 
+from faults.processes import child_of
+from faults.relay import Override
+from faults.stage import ORDERLY, faulty_policy, staged
 from helpers.flight_logs import logged_overrides
 from mavbridge.core.vehicle import Sticks
 from mavbridge.recording.flight_folder import RecordedFlight, open_flight
-from sitl.faults.stage.processes import child_of
-from sitl.faults.stage.relay import Override
-from sitl.faults.stage.stage import ORDERLY, faulty_policy, staged
 
 pytestmark = pytest.mark.system
 

@@ -9,10 +9,10 @@ from pathlib import Path
 
 import pytest
 
+from faults.record import Aftermath, Receiver, VehicleReport, aftermath
+from faults.relay import Override
+from faults.stage import faulty_policy, staged
 from helpers.flight_logs import logged_overrides
-from sitl.faults.record import Aftermath, Receiver, VehicleReport, aftermath
-from sitl.faults.stage.relay import Override
-from sitl.faults.stage.stage import faulty_policy, staged
 
 pytestmark = pytest.mark.system
 

@@ -6,11 +6,11 @@ from pathlib import Path
 
 import pytest
 
-from sitl.faults.record import DITHER_US, aftermath
-from sitl.faults.stage.link import LinkFaults
-from sitl.faults.stage.relay import Relay
-from sitl.faults.stage.stage import ORDERLY, Stage, faulty_policy, free_port, staged
-from sitl.faults.stage.transmitter import Transmitter
+from faults.link import LinkFaults
+from faults.props import Transmitter
+from faults.record import DITHER_US, aftermath
+from faults.relay import Relay
+from faults.stage import ORDERLY, Stage, faulty_policy, free_port, staged
 
 pytestmark = pytest.mark.system
 

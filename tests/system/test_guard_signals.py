@@ -9,14 +9,14 @@ from pathlib import Path
 
 import pytest
 
+from faults.processes import Process
+from faults.record import aftermath
+from faults.relay import Override
+from faults.stage import ORDERLY, faulty_policy, staged
 from mavbridge.flight.guard_process import GuardProcess
 from mavbridge.guard.settings import GuardSettings
 from mavbridge.mavlink.settings import LinkSettings
 from sitl.clock import Clock
-from sitl.faults.record import aftermath
-from sitl.faults.stage.processes import Process
-from sitl.faults.stage.relay import Override
-from sitl.faults.stage.stage import ORDERLY, faulty_policy, staged
 
 pytestmark = pytest.mark.system
 

@@ -6,8 +6,8 @@ from typing import Any
 
 import pytest
 
-from sitl.faults.stage.relay import Sent
-from sitl.faults.stage.stage import Stage, staged
+from faults.relay import Sent
+from faults.stage import Stage, staged
 
 pytestmark = pytest.mark.system
 

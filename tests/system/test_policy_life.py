@@ -5,7 +5,7 @@ from pathlib import Path
 
 import pytest
 
-from sitl.faults.stage.stage import staged
+from faults.stage import staged
 
 pytestmark = pytest.mark.system
 

@@ -14,6 +14,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from faults.processes import child_of
 from helpers.camera_senders import SIDE, depth_scene, encoded, scene
 from helpers.fakes import FakeClock
 from mavbridge.camera.open import check_camera, open_camera
@@ -21,7 +22,6 @@ from mavbridge.camera.pipe import PipeCommand, PipeSource, parse_pipe
 from mavbridge.camera.pipe_frames import RAW_FORMATS, PictureCutter, RawCutter
 from mavbridge.core.clock import NS_PER_MS, MonotonicClock
 from mavbridge.core.errors import CameraError, UserError
-from sitl.faults.stage.processes import child_of
 
 WIDTH, HEIGHT = 32, 16
 WRITER = """

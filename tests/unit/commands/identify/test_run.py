@@ -1,5 +1,6 @@
 import pytest
 
+from faults.stage import faulty_policy
 from helpers.fakes import FakeClock
 from mavbridge.commands.config import IdentifyConfig
 from mavbridge.commands.identify.run import doublet_flight, doublet_policy
@@ -9,7 +10,6 @@ from mavbridge.core.errors import UserError
 from mavbridge.flight.policies import configured_contract
 from policy.contract import Contract
 from policy.scripted.programs import doublet_length_s
-from sitl.faults.stage.stage import faulty_policy
 
 
 def test_the_flight_is_the_users_with_the_doublet_in_place_of_the_policy() -> None:

@@ -8,12 +8,12 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from pymavlink.dialects.v20 import ardupilotmega as mav
 
+from faults.link import FaultyLink, LinkFaults
 from helpers.vehicle_faults import Reboot, SensorFreeze, VehicleFaults
 from sitl.ardupilot.endpoint import ArduPilotStreams
 from sitl.ardupilot.flight_modes import Mode
 from sitl.ardupilot.messages import BUILDERS
 from sitl.clock import NS_PER_MS, NS_PER_S
-from sitl.faults.stage.link import FaultyLink, LinkFaults
 from sitl.simulated_vehicle import SimulatedVehicle
 
 
@@ -330,41 +330,6 @@ def test_streams_never_send_faster_than_asked(gaps_ms, interval_ms):
         sent += len(streams.due(now_ms * NS_PER_MS, 1))
 
     assert sent <= now_ms // interval_ms
-
-
-def test_link_faults_are_the_same_for_the_same_seed():
-    def survivors(seed):
-        link = FaultyLink(LinkFaults(loss=0.2, duplicate=0.1, corrupt=0.1, reorder=0.1), seed)
-        for index in range(500):
-            link.send(bytes([index % 256] * 10), index * NS_PER_MS)
-        return link.receive(NS_PER_S)
-
-    assert survivors(1) == survivors(1)
-    assert survivors(1) != survivors(2)
-    assert 380 < len(survivors(1)) < 500
-
-
-def test_link_faults_delay_and_reorder():
-    link = FaultyLink(LinkFaults(delay_ms=10.0), seed=0)
-    link.send(b"a", 0)
-
-    assert link.receive(9 * NS_PER_MS) == []
-    assert link.receive(10 * NS_PER_MS) == [b"a"]
-
-    late = FaultyLink(LinkFaults(reorder=0.5, reorder_ms=20.0), seed=3)
-    for index in range(50):
-        late.send(bytes([index]), index * NS_PER_MS)
-    order = [packet[0] for packet in late.receive(NS_PER_S)]
-    assert sorted(order) == list(range(50))
-    assert order != sorted(order)
-
-
-def test_a_silent_link_loses_what_is_sent_meanwhile_and_nothing_else():
-    link = FaultyLink(LinkFaults(silence_ns=(3 * NS_PER_MS, 5 * NS_PER_MS), delay_ms=1.0), seed=0)
-    for ms in range(8):
-        link.send(bytes([ms]), ms * NS_PER_MS)
-
-    assert link.receive(NS_PER_S) == [bytes([ms]) for ms in (0, 1, 2, 5, 6, 7)]
 
 
 def test_corrupted_frames_are_counted_and_the_rest_gets_through(station):

@@ -1,4 +1,4 @@
-"""What the vehicle's report (docs/formats/flight_report.md) says of a fault at a known time."""
+"""Judge a fault at a known time by the vehicle's report (docs/formats/flight_report.md)."""
 
 from collections.abc import Sequence
 from itertools import takewhile
@@ -16,8 +16,6 @@ LANDINGS = ("LAND", "RTL", "AUTO.LAND", "AUTO.RTL")
 
 
 class StickEntry(TypedDict):
-    """An entry of ``sticks`` in the report."""
-
     t_s: float
     us: Four
     mode: str
@@ -29,15 +27,13 @@ class StickEntry(TypedDict):
 
 
 class FinalState(TypedDict):
-    """How the vehicle was at the end of the report."""
-
     mode: str
     armed: bool
     landed: bool
 
 
 class VehicleReport(TypedDict):
-    """Those keys of the report that judge a fault."""
+    """The keys of the report that judge a fault."""
 
     start_ns: int
     sticks: Sequence[StickEntry]

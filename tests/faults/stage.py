@@ -11,16 +11,21 @@ import threading
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager, suppress
 from pathlib import Path
-from typing import Any, Literal, TypeAlias, cast
+from typing import Any, Literal
 
+from faults.link import Carrier, UdpCarrier
+from faults.processes import (
+    Process,
+    StageError,
+    child_of,
+    mapped_memory,
+    processes_with,
+)
+from faults.props import FrameFeed, Transmitter, Viewer
+from faults.record import VehicleReport
+from faults.relay import Relay
+from mavbridge.core.reasons import reason_from_json
 from sitl.clock import NS_PER_MS, Clock
-from sitl.faults.record import VehicleReport
-from sitl.faults.stage.camera import FrameFeed
-from sitl.faults.stage.carriers import Carrier, UdpCarrier
-from sitl.faults.stage.processes import Process, StageError, child_of, mapped_memory, processes_with
-from sitl.faults.stage.relay import Relay
-from sitl.faults.stage.transmitter import Transmitter
-from sitl.faults.stage.viewer import Viewer
 
 TIMEOUT_S = 90.0
 STARTS = 3
@@ -31,13 +36,12 @@ STICKS_OVER_NS = 200 * NS_PER_MS
 STALLED = ("delivered no attitude", "stood still")
 ORDERLY = (0, 4)
 """Exit statuses of a flight that ended in order; 4: a busy machine made the guard end it before."""
-MARK = "SITL_FAULT_MARK"
+MARK = "FAULT_MARK"
 """Environment variable: the file into which a policy of the catalogue writes the moment, in ns of
 CLOCK_MONOTONIC, when its fault begins."""
 PIPE_BLOCK = 4096
-NEWEST_LINES = 30
-CATALOGUE = Path(__file__).parents[1] / "catalogue"
-ProcessName: TypeAlias = Literal["flight", "guard", "recorder"]
+CATALOGUE = Path(__file__).parent / "catalogue"
+ProcessName = Literal["flight", "guard", "recorder"]
 """``recorder`` is the process that writes the video of a recording."""
 
 
@@ -162,13 +166,13 @@ class Stage:
 
         for _ in range(STARTS):
             if not self.relay.wait_until(lambda: is_leaning() or is_over(), TIMEOUT_S):
-                raise StageError(f"the policy has not flown:\n{self._text}")
+                raise StageError(f"the policy has not flown:\n{self.output}")
             self.guard.has_ended(0)  # finds it while its parent lives
             if is_leaning():
                 self.memory |= mapped_memory(self.bridge_pid)
                 return
             self._start_over()
-        raise StageError(f"the flight ended {STARTS} times before its fault:\n{self._text}")
+        raise StageError(f"the flight ended {STARTS} times before its fault:\n{self.output}")
 
     def fly(self, *flags: str) -> tuple[int, str]:
         """Start a bridge that ends by itself; its exit status and everything that it printed.
@@ -198,12 +202,7 @@ class Stage:
         self.start(*self._flags, is_read=self._is_read)
 
     @property
-    def newest_output(self) -> str:
-        """The last lines that the bridge has printed."""
-        return "".join(self._lines[-NEWEST_LINES:])
-
-    @property
-    def _text(self) -> str:
+    def output(self) -> str:
         return "".join(self._lines)
 
     def fill_output(self) -> None:
@@ -222,7 +221,7 @@ class Stage:
     def fault_ns(self) -> int:
         """When the policy's own fault began; waits for it."""
         if not self.relay.wait_until(self._mark.exists, TIMEOUT_S):
-            raise StageError(f"the policy's fault has not begun:\n{self._text}")
+            raise StageError(f"the policy's fault has not begun:\n{self.output}")
         return int(self._mark.read_text())
 
     @property
@@ -236,10 +235,6 @@ class Stage:
         if self._guard is None:
             self._guard = Process(child_of(self.bridge_pid, b"mavbridge.guard"), self.clock)
         return self._guard
-
-    def recorder(self) -> Process:
-        """The process that writes the video of a recording."""
-        return Process(self.pid_of("recorder"), self.clock)
 
     def pid_of(self, name: ProcessName) -> int:
         """Process id, while the bridge lives."""
@@ -260,7 +255,7 @@ class Stage:
             return not leans or self.clock.now_ns() - leans[-1] > STICKS_OVER_NS
 
         if not self.relay.wait_until(is_over, TIMEOUT_S):
-            raise StageError(f"the policy goes on flying:\n{self._text}")
+            raise StageError(f"the policy goes on flying:\n{self.output}")
         return [row.at_ns for row in sent if row.leans][-1]
 
     def kill(self, number: signal.Signals) -> int:
@@ -282,10 +277,10 @@ class Stage:
         try:
             bridge.wait(TIMEOUT_S)
         except subprocess.TimeoutExpired as error:
-            raise StageError(f"the bridge has not ended:\n{self._text}") from error
+            raise StageError(f"the bridge has not ended:\n{self.output}") from error
         finally:
             self.close()
-        return bridge.returncode, self._text
+        return bridge.returncode, self.output
 
     def close(self) -> None:
         """Free everything, and end what a failed test has left."""
@@ -312,9 +307,14 @@ class Stage:
         """The bridge's, of ``--report``."""
         return json.loads((self.folder / "report.json").read_text())
 
+    def release_codes(self) -> set[str]:
+        """Codes of all reasons for which the policy lost the sticks, those inside others too."""
+        reasons = [reason_from_json(release["reason"]) for release in self.report()["releases"]]
+        return {code.value for reason in reasons for code in reason.codes}
+
     def vehicle_report(self) -> VehicleReport:
         """Only after the ``staged`` block, which ends the vehicle."""
-        return cast(VehicleReport, json.loads((self.folder / "fc.json").read_text()))
+        return json.loads((self.folder / "fc.json").read_text())
 
 
 @contextmanager

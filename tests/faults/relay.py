@@ -7,16 +7,15 @@ import threading
 from collections.abc import Callable
 from contextlib import suppress
 from itertools import count, islice
-from typing import Any, NamedTuple, TypeAlias
+from typing import Any, NamedTuple
 
 from pymavlink.dialects.v20 import ardupilotmega as dialect
 
+from faults.link import LOOPBACK, Carrier, FaultyLink, LinkFaults
+from faults.record import DITHER_US, NEUTRAL_US
 from sitl.clock import NS_PER_S, Clock
-from sitl.faults.record import DITHER_US, NEUTRAL_US
-from sitl.faults.stage.carriers import LOOPBACK, Carrier
-from sitl.faults.stage.link import FaultyLink, LinkFaults
 
-Message: TypeAlias = Any  # a pymavlink message (the library has no types)
+Message = Any  # a pymavlink message (the library has no types)
 FOREVER_NS = 1 << 62
 PILOTS_STATION = 42
 """System id of another ground station than the bridge's 255."""
@@ -60,9 +59,7 @@ class Sent(NamedTuple):
 
     @property
     def name(self) -> str:
-        """The message's type."""
-        name: str = self.message.get_type()
-        return name
+        return self.message.get_type()
 
     @property
     def is_command(self) -> bool:
@@ -71,7 +68,6 @@ class Sent(NamedTuple):
 
     @property
     def asks_mode(self) -> bool:
-        """A request for a flight mode."""
         is_command = self.name in ("COMMAND_LONG", "COMMAND_INT")
         return self.name == "SET_MODE" or (
             is_command and self.message.command == dialect.MAV_CMD_DO_SET_MODE
@@ -91,7 +87,7 @@ class Sent(NamedTuple):
 
     @property
     def steers(self) -> bool:
-        """Is a message of sticks, whatever they say."""
+        """A message of sticks, whatever they say."""
         return self.name in ("RC_CHANNELS_OVERRIDE", "MANUAL_CONTROL")
 
     @property
@@ -99,22 +95,15 @@ class Sent(NamedTuple):
         """The throttle is above the middle, as only a policy's is."""
         if (sticks := self.override) is not None:
             return NEUTRAL_US[2] < sticks.throttle < IGNORED_US
-        return self.name == "MANUAL_CONTROL" and bool(self.message.z > NEUTRAL_Z)
+        return self.name == "MANUAL_CONTROL" and self.message.z > NEUTRAL_Z
 
     @property
     def leans(self) -> bool:
         """Steers to a side, ahead or around, as only a policy does."""
         if (sticks := self.override) is not None:
             turned = (sticks.roll, sticks.pitch, sticks.yaw)
-            centre = (NEUTRAL_US[0], NEUTRAL_US[1], NEUTRAL_US[3])
-            return any(
-                us not in (0, IGNORED_US) and abs(us - middle) > DITHER_US
-                for us, middle in zip(turned, centre, strict=True)
-            )
-        if self.name == "MANUAL_CONTROL":
-            message = self.message
-            return bool(max(abs(message.x), abs(message.y), abs(message.r)) > DITHER_US)
-        return False
+            return any(us not in (0, IGNORED_US) and abs(us - 1500) > DITHER_US for us in turned)
+        return self.name == "MANUAL_CONTROL" and self._most_turned > DITHER_US
 
     @property
     def is_within_limits(self) -> bool:
@@ -122,10 +111,12 @@ class Sent(NamedTuple):
         if (sticks := self.override) is not None:
             return all(us in (0, IGNORED_US) or 1000 <= us <= 2000 for us in sticks)
         if self.name == "MANUAL_CONTROL":
-            message = self.message
-            turned = max(abs(message.x), abs(message.y), abs(message.r))
-            return bool(turned <= 1000 and 0 <= message.z <= 1000)
+            return self._most_turned <= 1000 and 0 <= self.message.z <= 1000
         return True
+
+    @property
+    def _most_turned(self) -> int:
+        return max(abs(self.message.x), abs(self.message.y), abs(self.message.r))
 
 
 class _Way:

@@ -4,13 +4,13 @@ import tomllib
 from collections.abc import Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, Literal
+from typing import Literal, get_args
 
+from faults.record import Receiver
+from faults.stage import CATALOGUE
+from faults.steps import Step, make_step
+from mavbridge.core.reasons import Code
 from sitl import UsageError
-from sitl.faults.record import Receiver
-from sitl.faults.stage.carriers import CarrierName
-from sitl.faults.stage.stage import CATALOGUE
-from sitl.faults.steps.common import Step, make, make_step
 from sitl.vehicle.config import AutopilotName
 
 Outcome = Literal["loses", "keeps", "either", "refused"]
@@ -29,7 +29,7 @@ class Scenario:
     what: str
     """One line for a reader."""
     steps: tuple[Step, ...]
-    """The first that is more than a wait is the fault."""
+    """The first that returns a moment is the fault."""
     before: tuple[Step, ...] = ()
     """Carried out on the vehicle before the bridge starts."""
     outcome: Outcome
@@ -40,8 +40,10 @@ class Scenario:
     """From the fault until the last stick of the policy leaves the bridge; 0: ``limit_ms``."""
     exit: list[int] = field(default_factory=list)
     """Allowed exit statuses of the flight process; a signal is negative. Empty: by the outcome."""
+    code: str = ""
+    """``Code`` of a reason, in the bridge's report, for which the policy lost the sticks."""
     says: str = ""
-    """The bridge prints this."""
+    """The bridge prints this, where no reason tells it: a warning, refusal or foreign error."""
     modes: list[str] = field(default_factory=list)
     """Allowed first mode after the fault; empty: any, also none."""
     receivers: list[Receiver] = field(default_factory=list)
@@ -57,10 +59,9 @@ class Scenario:
     """The bridge can still give an ArduPilot with a receiver its sticks back."""
     transmitter: bool = False
     """The pilot has one, which steps can move; its switches are on at the start."""
-    carrier: CarrierName = "udp"
+    carrier: Literal["udp", "tcp", "serial"] = "udp"
     """The bridge's link."""
     baud: int = 115_200
-    """Bits a second of a serial port."""
     policy: str = "Leaning"
     """Class in ``catalogue/policies.py``."""
     flags: list[str] = field(default_factory=list)
@@ -74,12 +75,10 @@ class Scenario:
 
     @property
     def exits(self) -> list[int]:
-        """Allowed exit statuses."""
         return self.exit or EXITS[self.outcome]
 
     @property
     def last_stick_limit_ms(self) -> float:
-        """Latest last stick of the policy after the fault."""
         return self.stick_limit_ms or self.limit_ms
 
     @property
@@ -105,7 +104,6 @@ class Variant:
 
     @property
     def text(self) -> str:
-        """For tables and messages."""
         receiver = "no receiver" if self.receiver == "none" else f"receiver {self.receiver}"
         return f"{self.autopilot}, {receiver}"
 
@@ -116,25 +114,20 @@ class Variant:
 
 
 def load_catalogue(folder: Path = CATALOGUE) -> dict[str, Scenario]:
-    """Every scenario by its name, in the order of the files.
-
-    Raises:
-        UsageError: a file is no TOML, or a scenario has unknown or missing keys.
-    """
-    return {
-        scenario.name: scenario
-        for path in sorted(folder.glob("*.toml"))
-        for scenario in _read(path)
-    }
+    """Every scenario by its name, in the order of the files; raises UsageError if one is wrong."""
+    files = sorted(folder.glob("*.toml"))
+    return {scenario.name: scenario for path in files for scenario in _read(path)}
 
 
 def _read(path: Path) -> Iterator[Scenario]:
-    try:
-        tables: dict[str, dict[str, Any]] = tomllib.loads(path.read_text())
-    except tomllib.TOMLDecodeError as error:
-        raise UsageError(f"{path}: {error}") from error
-    for name, table in tables.items():
-        where = f"{path}: [{name}]"
+    for name, table in tomllib.loads(path.read_text()).items():
+        where = f"{path.name}: [{name}]"
         for key in ("steps", "before"):
             table[key] = tuple(make_step(step, where) for step in table.get(key, []))
-        yield make(Scenario, {"name": name, "group": path.stem, **table}, where)
+        try:
+            scenario = Scenario(name=name, group=path.stem, **table)
+        except TypeError as error:
+            raise UsageError(f"{where}: {error}") from error
+        if scenario.outcome not in get_args(Outcome) or scenario.code not in ("", *Code):
+            raise UsageError(f"{where}: outcome {scenario.outcome}, code {scenario.code}")
+        yield scenario

@@ -2,7 +2,7 @@
 
 import pytest
 
-from sitl.faults.record import Ending, StickEntry, VehicleReport, ending
+from faults.record import Ending, StickEntry, VehicleReport, ending
 
 
 def entry(t_s: float, height_m: float, mode: str = "BRAKE") -> StickEntry:

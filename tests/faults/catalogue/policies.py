@@ -1,7 +1,4 @@
-"""Policies as a user might write them, with what can go wrong in them.
-
-The bridge loads this file; the simulator does not.
-"""
+"""Policies as a user might write them, with what can go wrong in them; the bridge loads them."""
 
 import ctypes
 import os
@@ -32,18 +29,14 @@ class Climbing:
     def encode_visual(self, image: Array) -> Array:
         return np.zeros((1, 1), dtype=np.float32)
 
-    def predict_fast(
-        self, feature: Array, state: Array, action_history: Array, num_diffusion_steps: int
-    ) -> Array:
+    def predict_fast(self, feature: Array, state: Array, history: Array, steps: int) -> Array:
         self._calls += 1
         chunk = np.zeros((1, self.contract.horizon, 4), dtype=np.float32)
         chunk[..., 0] = 0.5
         return chunk
 
-    def predict(
-        self, image: Array, state: Array, action_history: Array, num_diffusion_steps: int
-    ) -> Array:
-        return self.predict_fast(image, state, action_history, num_diffusion_steps)
+    def predict(self, image: Array, state: Array, history: Array, steps: int) -> Array:
+        return self.predict_fast(image, state, history, steps)
 
 
 class SingleRate:
@@ -51,9 +44,7 @@ class SingleRate:
 
     contract = Contract(arrays="numpy")
 
-    def predict(
-        self, image: Array, state: Array, action_history: Array, num_diffusion_steps: int
-    ) -> Array:
+    def predict(self, image: Array, state: Array, history: Array, steps: int) -> Array:
         chunk = np.zeros((1, self.contract.horizon, 4), dtype=np.float32)
         chunk[..., 0] = 0.5
         return chunk
@@ -61,6 +52,8 @@ class SingleRate:
 
 class Leaning(Climbing):
     """Takes off, then leans, turns and climbs; ``misbehave`` is called once it leans steadily."""
+
+    marks_fault = True
 
     contract = Contract(arrays="numpy", feature_dim=1, image_height=32, image_width=32)
     lean_calls, fault_calls = 120, 260
@@ -77,10 +70,8 @@ class Leaning(Climbing):
         """A flight begins, or loading is done."""
         self._flown = -1 if self._flown is None else 0
 
-    def predict_fast(
-        self, feature: Array, state: Array, action_history: Array, num_diffusion_steps: int
-    ) -> Array:
-        chunk = super().predict_fast(feature, state, action_history, num_diffusion_steps)
+    def predict_fast(self, feature: Array, state: Array, history: Array, steps: int) -> Array:
+        chunk = super().predict_fast(feature, state, history, steps)
         if self._flown is None or self._flown < 0:
             return chunk
         self._flown += 1
@@ -88,12 +79,18 @@ class Leaning(Climbing):
             self._flown -= 1
         if self._flown > self.lean_calls:
             chunk[:] = (0.3, 0.25, 0.0, 0.5)
-        if self._flown > self.fault_calls:
+        if self.is_faulty:
+            if self.has_begun and self.marks_fault:
+                mark_fault()
             self.misbehave(chunk)
         return chunk
 
     def misbehave(self, chunk: Array) -> None:
         """A policy without a fault."""
+
+    @property
+    def is_faulty(self) -> bool:
+        return self._flown is not None and self._flown > self.fault_calls
 
     @property
     def has_begun(self) -> bool:
@@ -105,10 +102,8 @@ class Wandering(Leaning):
 
     climb_calls, turn_calls = 200, 400
 
-    def predict_fast(
-        self, feature: Array, state: Array, action_history: Array, num_diffusion_steps: int
-    ) -> Array:
-        chunk = Climbing.predict_fast(self, feature, state, action_history, num_diffusion_steps)
+    def predict_fast(self, feature: Array, state: Array, history: Array, steps: int) -> Array:
+        chunk = Climbing.predict_fast(self, feature, state, history, steps)
         if self._flown is not None and self._flown >= 0:
             self._flown += 1
             side = 1.0 if self._flown // self.turn_calls % 2 else -1.0
@@ -124,16 +119,20 @@ class Deliberate(Leaning):
     )
     lean_calls = 8
 
-    def predict_fast(
-        self, feature: Array, state: Array, action_history: Array, num_diffusion_steps: int
-    ) -> Array:
+    def predict_fast(self, feature: Array, state: Array, history: Array, steps: int) -> Array:
         time.sleep(0.3)  # noqa: TID251 - the slow policy itself
-        return super().predict_fast(feature, state, action_history, num_diffusion_steps)
+        return super().predict_fast(feature, state, history, steps)
+
+
+def compute() -> None:
+    deadline_ns = time.monotonic_ns() + HANG_S * 10**9
+    while time.monotonic_ns() < deadline_ns:
+        pass
 
 
 def mark_fault() -> None:
     """Tell the catalogue when the fault began."""
-    path = Path(os.environ["SITL_FAULT_MARK"])
+    path = Path(os.environ["FAULT_MARK"])
     draft = path.with_suffix(".draft")
     draft.write_text(str(time.monotonic_ns()))
     draft.rename(path)
@@ -149,7 +148,6 @@ class Heavy(Leaning):
 
 class Segfaulting(Leaning):
     def misbehave(self, chunk: Array) -> None:
-        mark_fault()
         ctypes.string_at(0)
 
 
@@ -158,7 +156,6 @@ class HangingNatively(Heavy):
 
     def misbehave(self, chunk: Array) -> None:
         if self.has_begun:
-            mark_fault()
             libc = ctypes.PyDLL(None)
             for _ in range(HANG_S * 10):
                 libc.usleep(100_000)
@@ -167,17 +164,16 @@ class HangingNatively(Heavy):
 class HangingInPython(Leaning):
     def misbehave(self, chunk: Array) -> None:
         if self.has_begun:
-            mark_fault()
-            deadline_ns = time.monotonic_ns() + HANG_S * 10**9
-            while time.monotonic_ns() < deadline_ns:
-                pass
+            compute()
 
 
 class HangingEncoder(Leaning):
     """Its encoder stops answering once the flight leans."""
 
+    marks_fault = False
+
     def encode_visual(self, image: Array) -> Array:
-        if self._flown is not None and self._flown > self.fault_calls:
+        if self.is_faulty:
             mark_fault()
             time.sleep(HANG_S)  # noqa: TID251 - the hang itself
         return super().encode_visual(image)
@@ -200,19 +196,19 @@ class TwoEyed(Leaning):
     def encode_visual(self, image: Array, camera: int = 0) -> Array:
         return np.full((1, 2), camera, np.float32)
 
-    def predict_fast(
-        self, feature: Array, state: Array, action_history: Array, num_diffusion_steps: int
-    ) -> Array:
+    def predict_fast(self, feature: Array, state: Array, history: Array, steps: int) -> Array:
         if feature.tolist() != [[[0, 0, 1, 1]] * 2] or state.shape != (1, 2, 13):
             raise ValueError(f"features {feature.tolist()}, states {state.shape}")
-        return super().predict_fast(feature, state, action_history, num_diffusion_steps)
+        return super().predict_fast(feature, state, history, steps)
 
 
 class HangingBelow(TwoEyed):
     """The encoder of the second camera stops answering once the flight leans."""
 
+    marks_fault = False
+
     def encode_visual(self, image: Array, camera: int = 0) -> Array:
-        if camera == 1 and self._flown is not None and self._flown > self.fault_calls:
+        if camera == 1 and self.is_faulty:
             mark_fault()
             time.sleep(HANG_S)  # noqa: TID251 - the hang itself
         return super().encode_visual(image, camera)
@@ -220,15 +216,11 @@ class HangingBelow(TwoEyed):
 
 class AlwaysNan(Leaning):
     def misbehave(self, chunk: Array) -> None:
-        if self.has_begun:
-            mark_fault()
         chunk[:] = np.nan
 
 
 class NanEveryOther(Leaning):
     def misbehave(self, chunk: Array) -> None:
-        if self.has_begun:
-            mark_fault()
         if self._flown is not None and self._flown % 2:
             chunk[:] = np.nan
 
@@ -236,41 +228,29 @@ class NanEveryOther(Leaning):
 class Slow(Leaning):
     """Each call takes longer than its own contract allows."""
 
-    def predict_fast(
-        self, feature: Array, state: Array, action_history: Array, num_diffusion_steps: int
-    ) -> Array:
+    def predict_fast(self, feature: Array, state: Array, history: Array, steps: int) -> Array:
         time.sleep(0.9)  # noqa: TID251 - the slow policy itself
-        return super().predict_fast(feature, state, action_history, num_diffusion_steps)
+        return super().predict_fast(feature, state, history, steps)
 
 
 class SlowInFlight(Leaning):
     """Each call takes 0.9 s from the fault on."""
 
     def misbehave(self, chunk: Array) -> None:
-        if self.has_begun:
-            mark_fault()
         time.sleep(0.9)  # noqa: TID251 - the slow policy itself
 
 
 class Infinite(Leaning):
     def misbehave(self, chunk: Array) -> None:
-        if self.has_begun:
-            mark_fault()
         chunk[..., 3] = np.inf
 
 
 class Misshapen(Leaning):
     """Returns chunks without their first dimension."""
 
-    def predict_fast(
-        self, feature: Array, state: Array, action_history: Array, num_diffusion_steps: int
-    ) -> Array:
-        chunk = super().predict_fast(feature, state, action_history, num_diffusion_steps)
-        return chunk[0] if self._flown is not None and self._flown > self.fault_calls else chunk
-
-    def misbehave(self, chunk: Array) -> None:
-        if self.has_begun:
-            mark_fault()
+    def predict_fast(self, feature: Array, state: Array, history: Array, steps: int) -> Array:
+        chunk = super().predict_fast(feature, state, history, steps)
+        return chunk[0] if self.is_faulty else chunk
 
 
 class Erratic(Leaning):
@@ -290,7 +270,6 @@ class Erratic(Leaning):
 
 class Exploding(Leaning):
     def misbehave(self, chunk: Array) -> None:
-        mark_fault()
         raise RuntimeError("the user's policy is broken")
 
 
@@ -298,7 +277,6 @@ class Leaving(Leaning):
     """Ends its process, as it believes."""
 
     def misbehave(self, chunk: Array) -> None:
-        mark_fault()
         sys.exit()
 
 
@@ -310,7 +288,6 @@ class Greedy(Leaning):
         self._hoard: list[Array] = []
 
     def misbehave(self, chunk: Array) -> None:
-        mark_fault()
         pages = int(Path("/proc/self/statm").read_text().split()[0])
         limit = pages * resource.getpagesize() + (64 << 20)
         resource.setrlimit(resource.RLIMIT_AS, (limit, limit))
@@ -327,10 +304,8 @@ class Chatty(Leaning):
     """Prints a page at each call."""
 
     def misbehave(self, chunk: Array) -> None:
-        if self.has_begun:
-            mark_fault()
         for row in range(25):
-            print(f"{row:3d} {'the policy thinks aloud ' * 5}")  # noqa: T201
+            print(f"{row:3d} {'the policy thinks aloud ' * 5}")
 
 
 class Hogging(Leaning):
@@ -338,13 +313,10 @@ class Hogging(Leaning):
 
     def misbehave(self, chunk: Array) -> None:
         if self.has_begun:
-            mark_fault()
             threading.Thread(target=self._compute, name="users-thread", daemon=True).start()
 
     def _compute(self) -> None:
-        deadline_ns = time.monotonic_ns() + HANG_S * 10**9
-        while time.monotonic_ns() < deadline_ns:
-            pass
+        compute()
 
 
 class HoggingNatively(Hogging):

@@ -5,9 +5,8 @@ import tty
 
 import pytest
 
+from faults.link import FaultyLink, LinkFaults, SerialCarrier
 from sitl.clock import NS_PER_MS, NS_PER_S, Clock
-from sitl.faults.stage.carriers import SerialCarrier
-from sitl.faults.stage.link import FaultyLink, LinkFaults
 
 
 class SetClock(Clock):
@@ -54,6 +53,33 @@ def test_a_narrow_link_delays_packets_up_to_its_queue_and_drops_the_rest() -> No
         link.send(bytes(100), 0)  # each takes 100 ms
     assert len(link.receive(300 * NS_PER_MS)) == 3
     assert len(link.receive(10 * NS_PER_S)) == 3  # of half a second, and the one that fills it
+
+
+def test_link_faults_are_the_same_for_the_same_seed():
+    def survivors(seed):
+        link = FaultyLink(LinkFaults(loss=0.2, duplicate=0.1, corrupt=0.1, reorder=0.1), seed)
+        for index in range(500):
+            link.send(bytes([index % 256] * 10), index * NS_PER_MS)
+        return link.receive(NS_PER_S)
+
+    assert survivors(1) == survivors(1)
+    assert survivors(1) != survivors(2)
+    assert 380 < len(survivors(1)) < 500
+
+
+def test_link_faults_delay_and_reorder():
+    link = FaultyLink(LinkFaults(delay_ms=10.0), seed=0)
+    link.send(b"a", 0)
+
+    assert link.receive(9 * NS_PER_MS) == []
+    assert link.receive(10 * NS_PER_MS) == [b"a"]
+
+    late = FaultyLink(LinkFaults(reorder=0.5, reorder_ms=20.0), seed=3)
+    for index in range(50):
+        late.send(bytes([index]), index * NS_PER_MS)
+    order = [packet[0] for packet in late.receive(NS_PER_S)]
+    assert sorted(order) == list(range(50))
+    assert order != sorted(order)
 
 
 def test_a_serial_carrier_passes_bytes_at_the_pace_of_its_baud_rate_and_may_stop_reading() -> None:

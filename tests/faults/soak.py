@@ -3,29 +3,18 @@
 import json
 import random
 import signal
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
+from statistics import median
 from typing import NamedTuple
 
-from pymavlink import mavutil
-
+from faults.processes import StageError, status_of
+from faults.props import Transmitter
+from faults.stage import ORDERLY, Stage, faulty_policy, free_port, staged
+from faults.steps import make_step
+from helpers.flight_logs import logged_overrides
 from sitl.clock import NS_PER_S
-from sitl.faults.stage.processes import StageError
-from sitl.faults.stage.stage import ORDERLY, Stage, faulty_policy, free_port, staged
-from sitl.faults.stage.transmitter import Transmitter
-from sitl.faults.steps.common import (
-    Images,
-    Joystick,
-    Messages,
-    Pilot,
-    Signal,
-    Step,
-    Wait,
-    WholeMessages,
-)
-from sitl.faults.steps.link import Link
-from sitl.faults.usage import Usage, growth, read_usage
 
 POLICY = "Wandering"
 SWITCH, LOW_US, HIGH_US = 7, 1000, 2000
@@ -38,6 +27,18 @@ QUIET_NS = NS_PER_S // 2
 """Until the end of that nothing that leans may have left the bridge."""
 LEANING_ROWS = 50
 """Messages of sticks that lean, in a row: the policy has the sticks."""
+SETTLED = 0.3
+"""Part of a soak after which everything that is needed has been loaded and allocated."""
+
+
+class Usage(NamedTuple):
+    """Memory, descriptors and threads of a process."""
+
+    rss_mb: float
+    descriptors: int
+    threads: int
+
+
 MOST_GROWTH = {
     "flight": Usage(rss_mb=40.0, descriptors=2, threads=0),
     "guard": Usage(rss_mb=4.0, descriptors=1, threads=0),
@@ -51,32 +52,46 @@ ENGAGE_TRIES = 6
 class Fault(NamedTuple):
     """A fault from which the pilot's switch gets the policy back."""
 
-    name: str
-    steps: tuple[Step, ...]
-    loses: bool
+    steps: tuple[dict[str, object], ...]
+    loses: bool = True
     """The policy must lose the sticks; else it must keep them."""
 
 
-FAULTS = (
-    Fault("silence of the vehicle", (Link(way="to_bridge", loss=1.0), Wait(s=1.0), Link()), True),
-    Fault("silence of both", (Link(loss=1.0), Wait(s=1.5), Link()), True),
-    Fault("the pilot's mode", (Pilot(act="mode", mode="LOITER"),), True),
-    Fault("images gone", (Images(show="gone"), Wait(s=1.0), Images(show="none")), True),
-    Fault("images frozen", (Images(show="frozen"), Wait(s=3.0), Images(show="none")), True),
-    Fault(
-        "stopped",
-        (Signal(name="SIGSTOP", to="group"), Wait(s=1.0), Signal(name="SIGCONT", to="group")),
-        True,
+def _wait(s: float) -> dict[str, object]:
+    return {"do": "wait", "s": s}
+
+
+WHOLE: dict[str, object] = {"do": "link"}
+FAULTS = {
+    "silence of the vehicle": Fault(({"do": "silence", "way": "to_bridge", "s": 1.0},)),
+    "silence of both": Fault(({"do": "silence", "s": 1.5},)),
+    "the pilot's mode": Fault(({"do": "pilot", "act": "mode", "mode": "LOITER"},)),
+    "images gone": Fault(
+        ({"do": "images", "show": "gone"}, _wait(1.0), {"do": "images", "show": "none"})
     ),
-    Fault("joystick on our id", (Joystick(hz=50, s=1.5),), True),
-    Fault(
-        "no attitude",
-        (Messages(names=["ATTITUDE", "ATTITUDE_QUATERNION"]), Wait(s=1.0), WholeMessages()),
-        True,
+    "images frozen": Fault(
+        ({"do": "images", "show": "frozen"}, _wait(3.0), {"do": "images", "show": "none"})
     ),
-    Fault("loss", (Link(loss=0.2, duplicate=0.2, reorder=0.2), Wait(s=3.0), Link()), False),
-    Fault("corruption", (Link(corrupt=0.2), Wait(s=2.0), Link()), False),
-)
+    "stopped": Fault(
+        (
+            {"do": "signal", "name": "SIGSTOP", "to": "group"},
+            _wait(1.0),
+            {"do": "signal", "name": "SIGCONT", "to": "group"},
+        )
+    ),
+    "joystick on our id": Fault(({"do": "joystick", "hz": 50, "s": 1.5},)),
+    "no attitude": Fault(
+        (
+            {"do": "messages", "names": ["ATTITUDE", "ATTITUDE_QUATERNION"]},
+            _wait(1.0),
+            {"do": "whole messages"},
+        )
+    ),
+    "loss": Fault(
+        ({"do": "link", "loss": 0.2, "duplicate": 0.2, "reorder": 0.2}, _wait(3.0), WHOLE), False
+    ),
+    "corruption": Fault(({"do": "link", "corrupt": 0.2}, _wait(2.0), WHOLE), False),
+}
 
 
 @dataclass(kw_only=True)
@@ -96,13 +111,9 @@ class SoakResult:
 
 
 def soak(minutes: float, seed: int, folder: Path, report: Callable[[str], None]) -> SoakResult:
-    """Fly for some minutes, with a random fault every few seconds.
+    """Fly for some minutes, with a random fault every few seconds, in an order given by the seed.
 
-    Args:
-        minutes: of the flight.
-        seed: of the faults' order.
-        folder: empty; gets the recording.
-        report: is given a line for a person now and then.
+    ``folder`` is empty and gets the recording; ``report`` is given a line now and then.
     """
     result = SoakResult(minutes=minutes)
     transmitter = Transmitter(free_port(), "mid")
@@ -117,7 +128,7 @@ def soak(minutes: float, seed: int, folder: Path, report: Callable[[str], None])
             raise StageError("the bridge is not ready to engage")
         stage.guard.has_ended(0)  # finds it while its parent lives
         _engage(stage, transmitter)
-        usages = _fly(stage, transmitter, result, minutes, random.Random(seed), report)  # noqa: S311
+        usages = _fly(stage, transmitter, result, minutes, random.Random(seed), report)
         stage.kill_group(signal.SIGINT)
         stage.observe(SETTLE_S)
         stage.relay.disarm()
@@ -148,23 +159,23 @@ def _fly(
     usages: dict[str, list[Usage]] = {name: [] for name in pids}
     end_ns = stage.clock.now_ns() + round(minutes * 60 * NS_PER_S)
     while stage.clock.now_ns() < end_ns:
-        fault = chance.choice(FAULTS)
-        result.faults[fault.name] = result.faults.get(fault.name, 0) + 1
-        for step in fault.steps:
-            step.perform(stage)
+        name, fault = chance.choice(list(FAULTS.items()))
+        result.faults[name] = result.faults.get(name, 0) + 1
+        for table in fault.steps:
+            make_step(table, name).perform(stage)
         stage.observe(SETTLE_S)
         quiet_ns = stage.clock.now_ns() - QUIET_NS
         newest = stage.relay.newest_steering(LEANING_ROWS)
         has_lost = not any(sent.leans for sent in newest if sent.at_ns > quiet_ns)
         if fault.loses and not has_lost:
-            result.failures.append(f"{fault.name}: the policy kept the sticks")
+            result.failures.append(f"{name}: the policy kept the sticks")
         if has_lost and not fault.loses:
             result.stalls += 1  # a busy machine, or a loss that lasted: the flight ended in order
         result.sent += stage.relay.forget()
         if has_lost:
             _engage(stage, transmitter)
-        for name, pid in pids.items():
-            usages[name].append(read_usage(pid))
+        for process, pid in pids.items():
+            usages[process].append(read_usage(pid))
         if sum(result.faults.values()) % REPORT_EVERY == 0:
             held = {name: usages[name][-1] for name in pids}
             report(f"{sum(result.faults.values())} faults, {held}")
@@ -181,11 +192,11 @@ def _engage(stage: Stage, transmitter: Transmitter) -> None:
         transmitter.move(SWITCH, HIGH_US)
         if stage.relay.wait_until(lambda: stage.relay.is_leaning(LEANING_ROWS), ENGAGE_S):
             return
-    raise StageError(f"the policy did not get the sticks by the switch:\n{stage.newest_output}")
+    raise StageError(f"the policy did not get the sticks by the switch:\n{stage.output}")
 
 
 def _lost(recording: Path, result: SoakResult) -> list[str]:
-    """Whatever the recording lacks."""
+    """What the recording lacks."""
     meta = json.loads((recording / "meta.json").read_text())
     failures = [
         f"{key} is {meta[key]}"
@@ -194,19 +205,28 @@ def _lost(recording: Path, result: SoakResult) -> list[str]:
     ]
     if not meta["finished"]:
         failures.append("the recording is not finished")
-    logged = _count_overrides(recording / "link.tlog")
+    logged = sum(1 for _ in logged_overrides(recording / "link.tlog"))
     if logged != result.sent:
         failures.append(f"link.tlog has {logged} of {result.sent} overrides")
     return failures
 
 
-def _count_overrides(path: Path) -> int:
-    log = mavutil.mavlogfile(str(path))
-    count = 0
-    while log.recv_match(type="RC_CHANNELS_OVERRIDE") is not None:
-        count += 1
-    log.f.close()
-    return count
+def read_usage(pid: int) -> Usage:
+    status = status_of(pid)
+    descriptors = sum(1 for _ in Path(f"/proc/{pid}/fd").iterdir())
+    return Usage(int(status["VmRSS"].split()[0]) / 1024, descriptors, int(status["Threads"]))
+
+
+def growth(samples: Sequence[Usage]) -> Usage:
+    """From the first settled sample to the last: the medians of the first and last third after it.
+
+    Medians, because a sample may fall into a moment in which a file or a thread is in use.
+    """
+    settled = samples[round(len(samples) * SETTLED) :]
+    third = max(len(settled) // 3, 1)
+    first, last = zip(*settled[:third], strict=True), zip(*settled[-third:], strict=True)
+    rss, *counts = (median(b) - median(a) for a, b in zip(first, last, strict=True))
+    return Usage(rss, *map(round, counts))
 
 
 def make_summary(result: SoakResult) -> str:

@@ -1,14 +1,18 @@
-"""Processes of a flight, found and watched from outside."""
+"""Processes of a flight, found and watched from outside, and what they leave behind."""
 
 import os
 import select
 import signal
+import threading
+from collections.abc import Callable, Set
 from contextlib import suppress
 from pathlib import Path
 
 from sitl.clock import Clock
 
-MEMORY = Path("/dev/shm")  # noqa: S108 - the system's place for shared memory
+MEMORY = Path("/dev/shm")
+LEFT_WAIT_S, LEFT_POLL_S = 10.0, 0.1
+"""A recorder's writer ends after the processes that fed it."""
 
 
 class StageError(Exception):
@@ -35,15 +39,18 @@ class Process:
         return at_ns
 
     def peak_memory_mb(self) -> float:
-        """Largest resident set so far."""
-        status = Path(f"/proc/{self.pid}/status").read_text()
-        (line,) = [line for line in status.splitlines() if line.startswith("VmHWM:")]
-        return int(line.split()[1]) / 1024
+        return int(status_of(self.pid)["VmHWM"].split()[0]) / 1024
 
     def close(self) -> None:
         """End it if it still runs."""
         self.kill(signal.SIGKILL)
         os.close(self._fd)
+
+
+def status_of(pid: int) -> dict[str, str]:
+    """/proc/PID/status by its keys."""
+    lines = Path(f"/proc/{pid}/status").read_text().splitlines()
+    return dict(line.split(":", 1) for line in lines if ":" in line)
 
 
 def processes_with(variable: str) -> list[tuple[int, str]]:
@@ -65,11 +72,7 @@ def mapped_memory(pid: int) -> set[str]:
 
 
 def child_of(parent_pid: int, text: bytes) -> int:
-    """The child process whose command line contains a text.
-
-    Raises:
-        StageError: it has no such child.
-    """
+    """The child process whose command line contains a text."""
     for entry in Path("/proc").glob("[0-9]*"):
         try:
             parent = int((entry / "stat").read_text().rpartition(")")[2].split()[1])
@@ -79,3 +82,30 @@ def child_of(parent_pid: int, text: bytes) -> int:
         if parent == parent_pid and text in command:
             return int(entry.name)
     raise StageError(f"process {parent_pid} has no child with {text!r} in its command line")
+
+
+def thread_names() -> frozenset[str]:
+    """Threads of this process now."""
+    return frozenset(thread.name for thread in threading.enumerate())
+
+
+def leaks(
+    processes: Callable[[], list[tuple[int, str]]],
+    memory: Set[str],
+    temporary: Path,
+    threads_before: Set[str],
+) -> list[str]:
+    """Name the processes, shared memory, files and threads that a flight has left behind.
+
+    Waits up to ``LEFT_WAIT_S`` for what is still ending.
+    """
+    pause, left = threading.Event(), [""]
+    for _ in range(1 + round(LEFT_WAIT_S / LEFT_POLL_S)):
+        left = [f"process {pid}: {name}" for pid, name in processes()]
+        left += [f"shared memory {name}" for name in memory if (MEMORY / name).exists()]
+        left += [f"temporary {path.name}" for path in temporary.iterdir()]
+        left += [f"thread {name}" for name in sorted(thread_names() - threads_before)]
+        if not left or not LEFT_WAIT_S:
+            break
+        pause.wait(LEFT_POLL_S)
+    return left

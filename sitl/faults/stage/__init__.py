@@ -1,1 +1,0 @@
-"""The processes of a flight that is broken on purpose: vehicle, relay, camera, bridge, viewer."""
