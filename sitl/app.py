@@ -12,12 +12,9 @@ from sitl import UsageError
 from sitl.camera.fpv import CameraOptions, FpvRenderer
 from sitl.camera.shm import FramePublisher
 from sitl.clock import NS_PER_S, Clock, StopRequest, stop_on_signal
-from sitl.course.layout import Course
-from sitl.link.rc_input import RcInput
-from sitl.link.transport import Transport, open_transport
-from sitl.pilot.axes import parse_axes
-from sitl.pilot.expert import ExpertPilot
-from sitl.pilot.transmitter import Pilot
+from sitl.course import Course
+from sitl.link.transport import RcInput, Transport, open_transport
+from sitl.pilot.transmitter import ExpertPilot, Pilot, parse_axes
 from sitl.report import write_report
 from sitl.simulated_vehicle import SimulatedVehicle
 from sitl.vehicle.config import STEP_NS, AutopilotName, VehicleConfig
@@ -36,7 +33,7 @@ class PilotOptions(NamedTuple):
 
     name: PilotName
     axes: str
-    """Axes of a gamepad, as ``sitl.pilot.axes`` reads them."""
+    """Axes of a gamepad, as ``sitl.pilot.transmitter`` reads them."""
     speed_mps: float
     """Speed of the expert."""
 
@@ -133,19 +130,19 @@ def make_pilot(
     try:
         import pygame
 
-        from sitl.pilot import gamepad, keyboard
+        from sitl.pilot import devices
     except ModuleNotFoundError as error:
         if error.name != "pygame":
             raise
         raise UsageError(f"--pilot {name} needs pygame: pip install pygame-ce") from error
     try:
         if name == "keyboard":
-            return keyboard.KeyboardPilot(clock), keyboard.HELP
-        pad = gamepad.PygamePad()
+            return devices.KeyboardPilot(clock), devices.KEYS_HELP
+        pad = devices.PygamePad()
     except pygame.error as error:
         raise UsageError(f"--pilot {name} needs a display: {error}") from error
     found = pad.description or "no gamepad yet: plug one in (until then the receiver has no signal)"
-    return gamepad.GamepadPilot(pad, wanted, clock), f"{found}; {gamepad.HELP}"
+    return devices.GamepadPilot(pad, wanted, clock), f"{found}; {devices.PAD_HELP}"
 
 
 def fly(

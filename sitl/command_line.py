@@ -13,8 +13,8 @@ from sitl.app import PILOTS, PilotOptions, print_status, run_vehicle
 from sitl.camera.follow import film_vehicle
 from sitl.camera.fpv import CameraOptions
 from sitl.clock import NS_PER_S, stop_on_signal, wall_ns
-from sitl.course.layout import course_to_json, make_course
-from sitl.pilot.axes import DEFAULT_AXES
+from sitl.course import course_to_json, make_course
+from sitl.pilot.transmitter import DEFAULT_AXES
 from sitl.vehicle.conditions import NOMINAL, held_out_conditions, random_conditions
 from sitl.vehicle.config import (
     IDLE_RECEIVER_US,

@@ -11,8 +11,7 @@ from typing import Any, Literal, NamedTuple, TypeAlias
 import numpy as np
 
 from sitl.clock import NS_PER_MS, NS_PER_S
-from sitl.course.layout import Course
-from sitl.course.referee import Crash, GateCounter, GatePass, struck_gate
+from sitl.course import Course, Crash, GateCounter, GatePass, struck_gate
 from sitl.firmware import Autopilot
 from sitl.rotation import Vec3, cos_tilt, to_euler
 

@@ -8,7 +8,7 @@ from sitl.ardupilot.autopilot import ArduCopter
 from sitl.ardupilot.params import ArduPilotParams
 from sitl.ardupilot.server import ArduPilotServer
 from sitl.clock import NS_PER_S
-from sitl.course.layout import AirborneStart, Course
+from sitl.course import AirborneStart, Course
 from sitl.firmware import Autopilot, Params, StatusText
 from sitl.link.server import MavlinkServer
 from sitl.px4.autopilot import Px4

@@ -31,7 +31,7 @@ from mavbridge.simulation.flight import SimulatedFlight, SimulationSettings
 from mavbridge.simulation.world import NOMINAL_VEHICLE, Exposure
 from policy.contract import ACTION_DIM, Contract, FloatArray
 from policy.protocol import Executable
-from sitl.course.layout import gate_truth
+from sitl.course import gate_truth
 from sitl.expert.demonstrator import Expert, RateExpert
 from sitl.expert.disturbance import RATE_STRENGTHS, STICK_STRENGTHS, Disturbance, random_start
 from sitl.vehicle.conditions import NOMINAL, Conditions, random_conditions

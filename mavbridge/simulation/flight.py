@@ -40,7 +40,7 @@ from mavbridge.simulation.world import (
 from policy.contract import Contract, FloatArray
 from policy.protocol import Executable
 from sitl.camera.fpv import FpvRenderer
-from sitl.course.layout import make_course
+from sitl.course import make_course
 from sitl.rotation import Quat
 from sitl.simulated_vehicle import SimulatedVehicle
 from sitl.vehicle.config import STEP_NS, VehicleConfig

@@ -13,7 +13,7 @@ from mavbridge.core.reasons import Reason
 from mavbridge.core.records import Event, Tick
 from mavbridge.core.vehicle import Action
 from policy.contract import ACTION_DIM
-from sitl.course.layout import make_course
+from sitl.course import make_course
 from sitl.simulated_vehicle import SimulatedVehicle
 
 READY_NS = 30 * NS_PER_S

@@ -17,8 +17,7 @@ from sitl.rotation import (
     to_heading,
     yaw_of,
 )
-from sitl.vehicle.control import clamp
-from sitl.vehicle.dynamics import GRAVITY_MPS2, BodyState
+from sitl.vehicle.dynamics import GRAVITY_MPS2, BodyState, clamp
 
 RATE_GAIN_PER_S: Vec3 = (18.0, 18.0, 6.0)
 """At the default gains. With a 28 ms motor lag 18/s keeps the rate loop at a damping ratio of about

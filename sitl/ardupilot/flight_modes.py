@@ -9,8 +9,7 @@ from sitl.ardupilot.guided import GuidedControl
 from sitl.ardupilot.params import ArduPilotParams
 from sitl.ardupilot.sticks import Sticks
 from sitl.rotation import Quat, Vec3, to_euler, wrap_pi
-from sitl.vehicle.control import HeightController, mix, thrust_for
-from sitl.vehicle.dynamics import BodyState
+from sitl.vehicle.dynamics import BodyState, HeightController, mix, thrust_for
 
 IDLE = (0.03, 0.03, 0.03, 0.03)  # armed on the ground, throttle down
 

@@ -13,8 +13,7 @@ from sitl.ardupilot.params import ArduPilotParams
 from sitl.clock import NS_PER_MS, NS_PER_S
 from sitl.firmware import AttitudeSetpoint
 from sitl.rotation import Vec3, from_euler, integrate, to_euler
-from sitl.vehicle.control import HeightController, clamp, thrust_for
-from sitl.vehicle.dynamics import BodyState
+from sitl.vehicle.dynamics import BodyState, HeightController, clamp, thrust_for
 
 OPTION_THRUST = 8
 """GUID_OPTIONS: SET_ATTITUDE_TARGET.thrust is a collective; else it is a climb rate."""

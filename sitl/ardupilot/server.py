@@ -15,10 +15,8 @@ from sitl.ardupilot.autopilot import ArduCopter
 from sitl.ardupilot.endpoint import ArduPilotEndpoint
 from sitl.ardupilot.flight_modes import Mode
 from sitl.ardupilot.guided import VelocitySetpoint
-from sitl.ardupilot.rc import IGNORE, PRIMARY_CHANNELS, RELEASE
-from sitl.ardupilot.sticks import Axes
+from sitl.ardupilot.sticks import IGNORE, PRIMARY_CHANNELS, RELEASE, Axes
 from sitl.firmware import AttitudeSetpoint
-from sitl.link.endpoint import Message
 from sitl.link.server import (
     ACCEPTED,
     COMMAND_FIELDS,
@@ -28,6 +26,7 @@ from sitl.link.server import (
     MAX_RC_FIELDS,
     UNSUPPORTED,
     MavlinkServer,
+    Message,
     Params7,
     send_ack,
     sender_of,

@@ -17,8 +17,8 @@ from pymavlink.dialects.v20 import ardupilotmega as mav
 from sitl.camera.fpv import CameraOptions, FpvRenderer
 from sitl.camera.shm import FramePublisher
 from sitl.clock import NS_PER_S, Clock
-from sitl.course.layout import Course
-from sitl.link.endpoint import Message
+from sitl.course import Course
+from sitl.link.server import Message
 from sitl.link.transport import FOLLOWER_KINDS, open_transport
 from sitl.rotation import Quat, Vec3, from_euler, integrate
 

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from sitl import UsageError
 from sitl.camera import scenery
 from sitl.camera.scenery import FloatArray, Image
-from sitl.course.layout import Course
+from sitl.course import Course
 from sitl.rotation import Quat, Vec3, from_euler, rotate
 from sitl.vehicle.conditions import NOMINAL, Conditions
 

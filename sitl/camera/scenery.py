@@ -9,7 +9,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from sitl.course.layout import BAR_M, DEPTH_M, Course, Gate
+from sitl.course import BAR_M, DEPTH_M, Course, Gate
 from sitl.rotation import Vec3, wrap_pi
 from sitl.vehicle.conditions import NOMINAL, Conditions, Rgb
 

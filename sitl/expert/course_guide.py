@@ -20,10 +20,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sitl import UsageError
-from sitl.course.layout import Course, Gate
-from sitl.course.referee import GateCounter, crossing
+from sitl.course import Course, Gate, GateCounter, crossing
 from sitl.rotation import Vec3, wrap_pi
-from sitl.vehicle.control import clamp
+from sitl.vehicle.dynamics import clamp
 
 FloatArray = NDArray[np.float64]
 

@@ -1,13 +1,129 @@
 """Experts that fly a gate course from the true pose: by sticks in ALT_HOLD, or by body rates."""
 
+import cmath
+import math
+from typing import NamedTuple
+
 from sitl.ardupilot.params import ArduPilotParams
-from sitl.course.layout import Course
-from sitl.expert.course_guide import Agility, CourseGuide, Predicted
-from sitl.expert.rate_response import RateCommand, rate_command
-from sitl.expert.stick_response import StickPositions, StickResponse
-from sitl.rotation import Vec3, integrate, rotate, to_euler, wrap_pi
+from sitl.course import Course
+from sitl.expert.course_guide import Agility, CourseGuide, Demand, Predicted
+from sitl.rotation import Quat, Vec3, conjugate, integrate, rotate, to_euler, wrap_pi
 from sitl.vehicle.conditions import NOMINAL
-from sitl.vehicle.dynamics import GRAVITY_MPS2, BodyState
+from sitl.vehicle.dynamics import GRAVITY_MPS2, BodyState, clamp
+
+HOVER_THRUST = 0.39
+TILT_GAIN_PER_S = 8.0
+CLIMB_GAIN_PER_S = 4.0
+MAX_TILT_RAD = math.radians(62.0)
+FORCE_MPS2 = (3.0, 21.0)
+"""Least and most specific force."""
+MAX_RATE_RADPS = math.radians(200.0)
+MAX_YAW_RATE_RADPS = math.radians(115.0)
+
+
+class RateCommand(NamedTuple):
+    """Collective thrust and body rates, in FRD axes and the order of the action vector."""
+
+    thrust: float
+    """In [0, 1]; ``HOVER_THRUST`` hovers."""
+    roll_radps: float
+    pitch_radps: float
+    yaw_radps: float
+
+
+def rate_command(
+    demand: Demand, state: Predicted, ned_from_body: Quat, drag_ned_mps2: Vec3
+) -> RateCommand:
+    """Thrust and rates for a demand, in a predicted state and attitude, against this drag.
+
+    The thrust points where the demand needs it, turned there the shorter way round. The tilt has a
+    loop of its own, and the heading follows by its rate alone: the thrust's direction matters more
+    than where the nose points (Brescianini and D'Andrea, "Tilt-Prioritized Quadrocopter Attitude
+    Control", 2018).
+    """
+    force_ned = _specific_force(demand, state, drag_ned_mps2)
+    size = math.hypot(*force_ned)
+    body_from_ned = conjugate(ned_from_body)
+    x, y, z = (part / size for part in rotate(body_from_ned, force_ned))
+    # The rotation vector that takes the thrust, along -z of the body, to the force.
+    sine = math.hypot(x, y)
+    angle_rad = math.atan2(sine, -z)
+    per_sine = TILT_GAIN_PER_S * angle_rad / sine if sine > 1e-6 else TILT_GAIN_PER_S
+    turn = tuple(demand.yaw_rate_radps * down for down in rotate(body_from_ned, (0, 0, 1.0)))
+    return RateCommand(
+        thrust=HOVER_THRUST * size * max(0.2, -z) / GRAVITY_MPS2,
+        roll_radps=clamp(per_sine * y + turn[0], MAX_RATE_RADPS),
+        pitch_radps=clamp(-per_sine * x + turn[1], MAX_RATE_RADPS),
+        yaw_radps=clamp(turn[2], MAX_YAW_RATE_RADPS),
+    )
+
+
+def _specific_force(demand: Demand, state: Predicted, drag_ned_mps2: Vec3) -> Vec3:
+    """Specific force of the thrust in NED, with a bounded tilt and size."""
+    drag_n, drag_e, drag_d = drag_ned_mps2
+    north = demand.accel_mps2.real - drag_n
+    east = demand.accel_mps2.imag - drag_e
+    climb_error_mps = demand.climb_mps + state.velocity_ned_mps[2]
+    up = GRAVITY_MPS2 + CLIMB_GAIN_PER_S * climb_error_mps + drag_d
+    up = max(FORCE_MPS2[0], min(FORCE_MPS2[1], up))
+    level = math.hypot(north, east)
+    most = min(up * math.tan(MAX_TILT_RAD), math.sqrt(max(FORCE_MPS2[1] ** 2 - up**2, 1.0)))
+    scale = min(1.0, most / max(level, 1e-6))
+    return (scale * north, scale * east, -up)
+
+
+DEAD_ZONE_SLOPE = 0.08
+"""A dead zone is crossed within about this share of full scale: by a slope, not by a jump."""
+
+
+class StickPositions(NamedTuple):
+    """Stick positions in [-1, 1], in the order of the action vector."""
+
+    throttle: float  # 0 = mid-stick, + up
+    yaw: float  # + nose right
+    pitch: float  # + stick forward, nose down
+    roll: float  # + right
+
+
+CENTRED = StickPositions(0.0, 0.0, 0.0, 0.0)
+
+
+class StickResponse:
+    """Inverse of the vehicle's ALT_HOLD stick curves."""
+
+    def __init__(self, params: ArduPilotParams) -> None:
+        self._lean_rad = math.radians(params["ANGLE_MAX"] / 100.0)
+        self._yaw_radps = math.radians(params["PILOT_Y_RATE"])
+        self._yaw_expo = params["PILOT_Y_EXPO"]
+        self._climb_mps = params["PILOT_SPEED_UP"] / 100.0
+        self._descent_mps = params["PILOT_SPEED_DN"] / 100.0 or self._climb_mps
+        self._roll_dead = params["RC1_DZ"] / 500.0
+        self._pitch_dead = params["RC2_DZ"] / 500.0
+        self._yaw_dead = params["RC4_DZ"] / 500.0
+        half = (1000.0 - params["RC3_DZ"]) / 2.0
+        self._throttle_dead = 2.0 * params["THR_DZ"] * (half / 500.0) / 1000.0
+
+    def sticks(self, demand: Demand, drag_mps2: complex, yaw_rad: float) -> StickPositions:
+        """Leans by the ratio to gravity in heading axes, against this drag, rates by full scale."""
+        accel_mps2 = demand.accel_mps2 - drag_mps2
+        forward_right = accel_mps2 * cmath.rect(1.0, -yaw_rad) / GRAVITY_MPS2
+        nose_down_rad = math.atan(forward_right.real)
+        right_rad = math.atan(forward_right.imag * math.cos(nose_down_rad))
+        full_mps = self._climb_mps if demand.climb_mps > 0.0 else self._descent_mps
+        turn = demand.yaw_rate_radps / self._yaw_radps
+        turn_input = turn / (1.0 - self._yaw_expo * (1.0 - abs(turn)))  # inverse of `input_expo`
+        return StickPositions(
+            throttle=_past_dead_zone(demand.climb_mps / full_mps, self._throttle_dead),
+            yaw=_past_dead_zone(turn_input, self._yaw_dead),
+            pitch=_past_dead_zone(nose_down_rad / self._lean_rad, self._pitch_dead),
+            roll=_past_dead_zone(right_rad / self._lean_rad, self._roll_dead),
+        )
+
+
+def _past_dead_zone(value: float, dead: float) -> float:
+    """The stick whose effect is ``value`` of full scale."""
+    return clamp((1.0 - dead) * value + dead * math.tanh(value / DEAD_ZONE_SLOPE), 1.0)
+
 
 STICK_LAG_S = 0.17  # from stick to lean, of the nominal vehicle
 STICK_AGILITY = Agility(

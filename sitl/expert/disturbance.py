@@ -10,11 +10,10 @@ from typing import Literal, NamedTuple, TypeAlias, TypeVar
 
 import numpy as np
 
-from sitl.course.layout import RACE_SEEDS, AirborneStart, Course
-from sitl.expert.rate_response import RateCommand
-from sitl.expert.stick_response import StickPositions
+from sitl.course import RACE_SEEDS, AirborneStart, Course
+from sitl.expert.demonstrator import RateCommand, StickPositions
 from sitl.rotation import from_euler
-from sitl.vehicle.control import clamp
+from sitl.vehicle.dynamics import clamp
 
 Numbers: TypeAlias = tuple[float, ...]
 Commanded = TypeVar("Commanded", StickPositions, RateCommand)

@@ -7,7 +7,7 @@ from typing import NamedTuple
 from pymavlink.dialects.v20 import ardupilotmega as mav
 
 from sitl.firmware import Autopilot
-from sitl.link.endpoint import Message
+from sitl.link.server import Message
 from sitl.rotation import Vec3, conjugate, rotate, to_euler
 from sitl.vehicle.dynamics import GRAVITY_MPS2
 

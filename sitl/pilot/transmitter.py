@@ -1,10 +1,14 @@
 """From a hand on the sticks to the channels of a receiver."""
 
+import re
 from collections.abc import Sequence
 from typing import Literal, NamedTuple, Protocol
 
+from sitl import UsageError
 from sitl.clock import NS_PER_MS, NS_PER_S
-from sitl.expert.stick_response import CENTRED, StickPositions
+from sitl.course import Course
+from sitl.expert.demonstrator import CENTRED, Expert, StickPositions
+from sitl.simulated_vehicle import SimulatedVehicle
 
 SWITCH_CHANNEL = 7
 """Channel of the pilot's spare switch, from 1; `mavbridge record --episode-channel 7`."""
@@ -72,3 +76,121 @@ class Transmitter:
 def _us(position: float) -> int:
     """Less is left, nose down and descent, as ArduCopter and PX4 have them."""
     return round(1500 + 500 * max(-1.0, min(1.0, position)))
+
+
+DEAD_ZONE = 0.08
+"""Share of the travel to each side that counts as centred; springs come back to within 0.05."""
+
+
+class Axis(NamedTuple):
+    """One axis, from 0, as the system numbers them; a pad's vertical ones are negative upwards."""
+
+    number: int
+    is_reversed: bool
+
+
+class Axes(NamedTuple):
+    """The axis of each stick."""
+
+    throttle: Axis
+    yaw: Axis
+    pitch: Axis
+    roll: Axis
+
+    def sticks(self, values: Sequence[float]) -> StickPositions:
+        """Positions of the sticks where the pad's axes have these values; an absent one is 0."""
+        positions = []
+        for axis in self:
+            value = values[axis.number] if axis.number < len(values) else 0.0
+            positions.append(past_dead_zone(-value if axis.is_reversed else value))
+        return StickPositions(*positions)
+
+
+DEFAULT_AXES = "throttle=-1,yaw=0,pitch=-4,roll=3"
+"""Mode 2 on the usual pad: the left stick climbs and turns, the right one leans."""
+
+
+def parse_axes(text: str) -> Axes:
+    """Read ``throttle=-1,yaw=0,pitch=-4,roll=3``; a minus reverses the axis.
+
+    Raises:
+        UsageError: not the four sticks, each once, with the number of an axis.
+    """
+    found: dict[str, Axis] = {}
+    for part in text.split(","):
+        match = re.fullmatch(r"\s*(throttle|yaw|pitch|roll)=(-?)(\d{1,2})\s*", part)
+        if match is None or match[1] in found:
+            break
+        found[match[1]] = Axis(int(match[3]), is_reversed=match[2] == "-")
+    if len(found) != len(Axes._fields) or text.count(",") != len(found) - 1:
+        raise UsageError(
+            f"--pilot-axes {text}: give the axis of each stick, with a minus to reverse it, such "
+            f"as {DEFAULT_AXES}"
+        )
+    return Axes(**found)
+
+
+def past_dead_zone(value: float) -> float:
+    """A position in [-1, 1] without its dead zone; full deflection stays full."""
+    beyond = max(0.0, min(1.0, abs(value)) - DEAD_ZONE) / (1.0 - DEAD_ZONE)
+    return beyond if value > 0.0 else -beyond
+
+
+WAIT_NS = 8 * NS_PER_S
+"""From boot to the arming gesture: the estimator needs 3 s for the attitude and 5 s for the
+position, and whoever records asks for parameters and streams."""
+HOVER_NS = 2 * NS_PER_S
+"""After the last gate, before the landing."""
+IDLE = CENTRED._replace(throttle=-1.0)
+DESCENT = CENTRED._replace(throttle=-0.8)
+
+
+class ExpertPilot:
+    """A `Pilot` for one flight over the course."""
+
+    def __init__(self, vehicle: SimulatedVehicle, course: Course, *, speed_mps: float) -> None:
+        self._vehicle = vehicle
+        self._expert = Expert(course, speed_mps)
+        self._start_ns = vehicle.ap.now_ns
+        self._transmitter = Transmitter(self._start_ns)
+        self._phase: Literal["waiting", "flying", "landing", "over"] = "waiting"
+        self._over_course_ns: int | None = None
+
+    def latest(self) -> Sequence[int] | None:
+        """See `Pilot`."""
+        now_ns = self._vehicle.ap.now_ns
+        if not self._transmitter.begins_frame(now_ns):
+            return None
+        return self._transmitter.channels_us(self._hand(now_ns), now_ns)
+
+    def _hand(self, now_ns: int) -> Hand:
+        ap = self._vehicle.ap
+        if self._phase == "waiting":
+            if ap.armed:
+                self._phase = "flying"
+            elif now_ns - self._start_ns >= WAIT_NS:
+                return Hand(IDLE, gesture="arm")
+            return Hand(IDLE)
+        if not ap.armed:
+            self._phase = "over"
+            return Hand(IDLE)
+        if self._phase == "flying":
+            return Hand(self._fly(now_ns), switch=self._switch)
+        return Hand(DESCENT, gesture="disarm" if ap.landed else None)
+
+    @property
+    def _switch(self) -> Switch:
+        """High over the course."""
+        return "high" if self._over_course_ns is None else "low"
+
+    def _fly(self, now_ns: int) -> StickPositions:
+        sticks = self._expert.sticks(self._vehicle.ap.truth, now_ns / NS_PER_S)
+        if self._expert.next_gate is None:
+            if self._over_course_ns is None:
+                self._over_course_ns = now_ns
+            if now_ns - self._over_course_ns >= HOVER_NS:
+                self._phase = "landing"
+        return sticks
+
+    def close(self) -> None:
+        """Nothing to free."""

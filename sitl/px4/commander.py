@@ -4,14 +4,56 @@ The intended mode is what the pilot or a command asked for last; the mode is wha
 failsafe may change without touching the intended one.
 """
 
+import struct
+from typing import NamedTuple
+
 from sitl.clock import NS_PER_MS, NS_PER_S
 from sitl.firmware import StatusText
-from sitl.px4 import events as ev
-from sitl.px4.events import Event
-from sitl.px4.failsafe import LostSticks, Phase, mode_without_stream
-from sitl.px4.modes import Mode
+from sitl.px4.modes import LostSticks, Mode, Phase, mode_without_stream
 from sitl.px4.params import Px4Params
 from sitl.px4.sticks import StickInput
+
+SEVERITY_CRITICAL, SEVERITY_INFO = 2, 6
+LEVELS_INFO, LEVELS_DENIED, LEVELS_FAILSAFE = 0x66, 0x62, 0x42
+"""Levels for the outside and, in the upper half, for the vehicle's own log: 2 critical, 6 info."""
+_AUTOPILOT_COMPONENT = 1 << 24
+_FNV1A_32_OFFSET, _FNV1A_32_PRIME = 0x811C9DC5, 0x01000193
+
+ARM_REASON_GESTURE, ARM_REASON_COMMAND, ARM_REASON_LANDING = 1, 4, 6
+ARM_REASON_INACTION = 7
+"""Reasons of arming and disarming, as the events carry them."""
+REASON_NAMES = {
+    ARM_REASON_GESTURE: "stick gesture",
+    ARM_REASON_COMMAND: "external command",
+    ARM_REASON_LANDING: "landing",
+    ARM_REASON_INACTION: "auto preflight disarming",
+}
+
+ACTION_POSCTL, ACTION_RTL, ACTION_TERMINATE = 2, 6, 10
+CAUSE_STICKS_LOST = 1
+
+
+class Event(NamedTuple):
+    """One EVENT; ``uptime_ms`` is its time since boot."""
+
+    name: str
+    levels: int
+    arguments: bytes
+    uptime_ms: int
+
+    @property
+    def number(self) -> int:
+        """The id on the wire."""
+        value = _FNV1A_32_OFFSET
+        for letter in self.name.encode():
+            value = (value ^ letter) * _FNV1A_32_PRIME & 0xFFFFFFFF
+        return _AUTOPILOT_COMPONENT | value & 0xFFFFFF
+
+
+def pack(layout: str, *values: float) -> bytes:
+    """Arguments of an event: `struct` letters without padding."""
+    return struct.pack("<" + layout, *values)
+
 
 CHECK_PERIOD_NS = 20 * NS_PER_MS
 LOW_THROTTLE, MIDDLE_THROTTLE = -0.8, 0.2
@@ -69,7 +111,7 @@ class Commander:
         """Arming would not be refused for the vehicle's health; sticks may still be too high."""
         return self.estimator_ready and self.intended.armable and self.can_fly(self.intended)
 
-    def arm(self, reason: int = ev.ARM_REASON_COMMAND) -> bool:
+    def arm(self, reason: int = ARM_REASON_COMMAND) -> bool:
         """Start the motors; a refusal becomes a text. True if armed afterwards."""
         if self.armed:
             return True
@@ -91,8 +133,8 @@ class Commander:
             )
             return False
         self.start(ignores_sticks=not self._sticks.valid)
-        self._say(ev.SEVERITY_INFO, f"Armed by {ev.REASON_NAMES[reason]}")
-        self._emit("commander_armed_by", ev.LEVELS_INFO, ev.pack("B", reason))
+        self._say(SEVERITY_INFO, f"Armed by {REASON_NAMES[reason]}")
+        self._emit("commander_armed_by", LEVELS_INFO, pack("B", reason))
         return True
 
     def start(self, *, ignores_sticks: bool) -> None:
@@ -102,7 +144,7 @@ class Commander:
         self._ignores_sticks = ignores_sticks
         self._sticks_missed = not self._sticks.valid
 
-    def disarm(self, *, force: bool, reason: int = ev.ARM_REASON_COMMAND) -> bool:
+    def disarm(self, *, force: bool, reason: int = ARM_REASON_COMMAND) -> bool:
         """Stop the motors; refused in flight unless forced. True if disarmed afterwards."""
         if not self.armed:
             return True
@@ -111,8 +153,8 @@ class Commander:
             return False
         self.armed = self._fallback = False
         self.lost_sticks.clear()
-        self._say(ev.SEVERITY_INFO, f"Disarmed by {ev.REASON_NAMES[reason]}")
-        self._emit("commander_disarmed_by", ev.LEVELS_INFO, ev.pack("B", reason))
+        self._say(SEVERITY_INFO, f"Disarmed by {REASON_NAMES[reason]}")
+        self._emit("commander_disarmed_by", LEVELS_INFO, pack("B", reason))
         if not self.intended.armable and not self.terminated:
             self.intended = self._last_armable
         self.mode = self.intended
@@ -123,7 +165,7 @@ class Commander:
         if self.terminated:
             return False
         if self.armed and mode is not Mode.AUTO_LAND and not self.can_fly(mode):
-            arguments = ev.pack("IB", self.mode.custom_mode, mode.event_number)
+            arguments = pack("IB", self.mode.custom_mode, mode.event_number)
             text = f"Switching to {mode.spoken} is currently not available"
             if says_why:
                 self._deny(text, "commander_modeswitch_not_avail", arguments)
@@ -136,9 +178,9 @@ class Commander:
         mode = self.mode.custom_mode
         self.terminated = True
         self._intend(Mode.TERMINATION)
-        self._say(ev.SEVERITY_CRITICAL, "Failsafe activated")
-        arguments = ev.pack("IB", mode, ev.ACTION_TERMINATE)
-        self._emit("commander_failsafe_enter_generic", ev.LEVELS_FAILSAFE, arguments)
+        self._say(SEVERITY_CRITICAL, "Failsafe activated")
+        arguments = pack("IB", mode, ACTION_TERMINATE)
+        self._emit("commander_failsafe_enter_generic", LEVELS_FAILSAFE, arguments)
 
     def refuse_frame(self, frame: int) -> None:
         """A velocity setpoint came in axes that PX4 does not take."""
@@ -146,7 +188,7 @@ class Commander:
         self._deny(
             f"{name} coordinate frame {frame} unsupported",
             "mavlink_rcv_sp_target_unsup_coord",
-            ev.pack("B", frame),
+            pack("B", frame),
         )
 
     def finish_takeoff(self) -> None:
@@ -160,15 +202,15 @@ class Commander:
         self._landed_ns = self.now_ns
         self._has_flown = self._has_flown or not landed
         what = "landing" if landed else "takeoff"
-        self._say(ev.SEVERITY_INFO, f"{what.capitalize()} detected")
-        self._emit(f"commander_{what}_detected", ev.LEVELS_INFO)
+        self._say(SEVERITY_INFO, f"{what.capitalize()} detected")
+        self._emit(f"commander_{what}_detected", LEVELS_INFO)
 
     def update(self, now_ns: int) -> None:
         """Look at sticks, setpoints and time; decide on the mode."""
         dt_ns, self.now_ns = now_ns - self.now_ns, now_ns
         self._read_gestures()
         if self.lost_sticks.update(dt_ns):
-            self._say_failsafe(ev.ACTION_RTL)
+            self._say_failsafe(ACTION_RTL)
         if now_ns >= self._check_due_ns:
             self._check_due_ns = now_ns + CHECK_PERIOD_NS
             self._watch_sticks()
@@ -182,22 +224,22 @@ class Commander:
         if not gesture or not self._params.integer("MAN_ARM_GESTURE"):
             return
         if gesture > 0:
-            self.arm(ev.ARM_REASON_GESTURE)
+            self.arm(ARM_REASON_GESTURE)
         elif self.landed:
-            self.disarm(force=False, reason=ev.ARM_REASON_GESTURE)
+            self.disarm(force=False, reason=ARM_REASON_GESTURE)
 
     def _watch_sticks(self) -> None:
         """Start the failsafe when sticks are lost in flight; absence at arming is ignored."""
         if self._sticks.valid:
             if self._sticks_missed and self._lost_ns is not None:
                 gap_s = (self.now_ns - self._lost_ns) / NS_PER_S
-                self._emit("commander_rc_regained", ev.LEVELS_INFO, ev.pack("f", gap_s))
+                self._emit("commander_rc_regained", LEVELS_INFO, pack("f", gap_s))
             self._sticks_missed = self._ignores_sticks = False
             return
         if self._sticks_missed:
             return
         self._sticks_missed, self._lost_ns = True, self.now_ns
-        self._emit("commander_rc_lost", ev.LEVELS_INFO)
+        self._emit("commander_rc_lost", LEVELS_INFO)
         is_excepted = self.lost_sticks.is_excepted(self.intended)
         if not self.armed or self._ignores_sticks or is_excepted or self.lost_sticks.active:
             return
@@ -205,9 +247,9 @@ class Commander:
             return
         self.lost_sticks.start()
         if self.lost_sticks.phase is Phase.HOLDING:
-            self._say_failsafe(ev.ACTION_RTL, hold_s=self.lost_sticks.delay_s)
+            self._say_failsafe(ACTION_RTL, hold_s=self.lost_sticks.delay_s)
         else:
-            self._say_failsafe(ev.ACTION_RTL)
+            self._say_failsafe(ACTION_RTL)
 
     def _yield_to_pilot(self) -> None:
         """Fast sticks take an autonomous flight over; not in the Hold before the action."""
@@ -219,10 +261,10 @@ class Commander:
             was_failsafe = self.in_failsafe
             self._intend(Mode.POSCTL if self.position_ready else Mode.ALTCTL)
             if was_failsafe:
-                self._emit("failsafe_rc_override", ev.LEVELS_INFO)
+                self._emit("failsafe_rc_override", LEVELS_INFO)
             else:
-                self._say(ev.SEVERITY_INFO, "Pilot took over using sticks")
-                self._emit("commander_rc_override", ev.LEVELS_INFO)
+                self._say(SEVERITY_INFO, "Pilot took over using sticks")
+                self._emit("commander_rc_override", LEVELS_INFO)
 
     def _disarm_by_time(self) -> None:
         if not self.landed:
@@ -231,7 +273,7 @@ class Commander:
         since_ns = self._landed_ns if self._has_flown else self.armed_ns
         limit_s = self._params[name]
         if limit_s > 0.0 and self.now_ns - since_ns >= limit_s * NS_PER_S:
-            reason = ev.ARM_REASON_LANDING if self._has_flown else ev.ARM_REASON_INACTION
+            reason = ARM_REASON_LANDING if self._has_flown else ARM_REASON_INACTION
             self.disarm(force=False, reason=reason)
 
     def _choose_mode(self) -> None:
@@ -248,7 +290,7 @@ class Commander:
         was_fallback, self._fallback = self._fallback, wanted is not self.intended
         self.mode = wanted
         if self._fallback and not was_fallback:
-            self._say_failsafe(ev.ACTION_POSCTL if wanted.piloted else ev.ACTION_RTL)
+            self._say_failsafe(ACTION_POSCTL if wanted.piloted else ACTION_RTL)
 
     def _with_position(self, mode: Mode) -> Mode:
         """The mode, or one that does without a position."""
@@ -267,19 +309,19 @@ class Commander:
     def _say_failsafe(self, action: int, hold_s: float | None = None) -> None:
         mode = self.intended.custom_mode
         if hold_s is None:
-            self._say(ev.SEVERITY_CRITICAL, "Failsafe activated")
-            arguments = ev.pack("IBB", mode, action, ev.CAUSE_STICKS_LOST)
-            self._emit("commander_failsafe_enter", ev.LEVELS_FAILSAFE, arguments)
+            self._say(SEVERITY_CRITICAL, "Failsafe activated")
+            arguments = pack("IBB", mode, action, CAUSE_STICKS_LOST)
+            self._emit("commander_failsafe_enter", LEVELS_FAILSAFE, arguments)
             return
         seconds = int(hold_s)
         text = f"Failsafe activated: entering Hold for {seconds} seconds"
-        self._say(ev.SEVERITY_CRITICAL, text)
-        arguments = ev.pack("IBHB", mode, action, seconds, ev.CAUSE_STICKS_LOST)
-        self._emit("commander_failsafe_enter_hold", ev.LEVELS_FAILSAFE, arguments)
+        self._say(SEVERITY_CRITICAL, text)
+        arguments = pack("IBHB", mode, action, seconds, CAUSE_STICKS_LOST)
+        self._emit("commander_failsafe_enter_hold", LEVELS_FAILSAFE, arguments)
 
     def _deny(self, text: str, event: str, arguments: bytes = b"") -> None:
-        self._say(ev.SEVERITY_CRITICAL, text)
-        self._emit(event, ev.LEVELS_DENIED, arguments)
+        self._say(SEVERITY_CRITICAL, text)
+        self._emit(event, LEVELS_DENIED, arguments)
 
     def _say(self, severity: int, text: str) -> None:
         # The tab marks a text that exists as an event as well; ground stations hide it.

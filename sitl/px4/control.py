@@ -20,8 +20,7 @@ from sitl.rotation import (
     rotation_vector,
     to_heading,
 )
-from sitl.vehicle.control import clamp
-from sitl.vehicle.dynamics import GRAVITY_MPS2, Airframe, BodyState
+from sitl.vehicle.dynamics import GRAVITY_MPS2, Airframe, BodyState, clamp
 
 SIH_QUAD = Airframe(
     mass_kg=1.0,

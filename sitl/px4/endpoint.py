@@ -12,9 +12,9 @@ from types import MappingProxyType
 from pymavlink.dialects.v20 import ardupilotmega as mav
 
 from sitl.clock import NS_PER_S
-from sitl.link.endpoint import MAX_STATUSTEXT, Endpoint
+from sitl.link.server import MAX_STATUSTEXT, Endpoint
 from sitl.px4.autopilot import Px4
-from sitl.px4.events import Event
+from sitl.px4.commander import Event
 from sitl.px4.messages import (
     BUILDERS,
     BUILDERS_1_14,

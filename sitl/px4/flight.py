@@ -18,8 +18,7 @@ from sitl.px4.modes import Mode
 from sitl.px4.params import Px4Params
 from sitl.px4.sticks import Sticks
 from sitl.rotation import IDENTITY, Quat, Vec3, cos_tilt, from_euler, from_heading, yaw_of
-from sitl.vehicle.control import HeightController, mix, thrust_for
-from sitl.vehicle.dynamics import BodyState
+from sitl.vehicle.dynamics import BodyState, HeightController, mix, thrust_for
 
 IDLE = (0.05, 0.05, 0.05, 0.05)  # armed on the ground
 STILL_YAW_RADPS = 0.01  # a slower yaw stick holds the heading

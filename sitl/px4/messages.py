@@ -12,7 +12,7 @@ import numpy as np
 from pymavlink.dialects.v20 import ardupilotmega as mav
 
 from sitl.clock import NS_PER_MS
-from sitl.link.endpoint import Message
+from sitl.link.server import Message
 from sitl.link.telemetry import (
     Home,
     autopilot_version,
@@ -24,7 +24,7 @@ from sitl.link.telemetry import (
     vfr_hud,
 )
 from sitl.px4.autopilot import Px4
-from sitl.px4.events import Event
+from sitl.px4.commander import Event
 from sitl.px4.flight import PositionSetpoint
 from sitl.px4.modes import Mode
 from sitl.rotation import conjugate, rotate

@@ -9,7 +9,6 @@ import math
 from pymavlink.dialects.v20 import ardupilotmega as mav
 
 from sitl.firmware import AttitudeSetpoint
-from sitl.link.endpoint import Message
 from sitl.link.server import (
     ACCEPTED,
     DENIED,
@@ -18,6 +17,7 @@ from sitl.link.server import (
     MAX_RC_FIELDS,
     REJECTED,
     MavlinkServer,
+    Message,
     Params7,
     send_ack,
     sender_of,

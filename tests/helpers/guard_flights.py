@@ -40,7 +40,7 @@ from policy.contract import Contract, FloatArray
 from policy.protocol import Executable
 from sitl.ardupilot.autopilot import ArduCopter
 from sitl.ardupilot.flight_modes import Mode
-from sitl.course.layout import AirborneStart
+from sitl.course import AirborneStart
 from sitl.simulated_vehicle import SimulatedVehicle
 from sitl.vehicle.config import IDLE_RECEIVER_US, MID_RECEIVER_US, STEP_NS, VehicleConfig
 

@@ -22,7 +22,7 @@ from policy.scripted.programs import LEG_MPS, LEG_S, Motion, Program, Push, make
 from sitl.ardupilot.autopilot import ArduCopter
 from sitl.ardupilot.flight_modes import Mode as ArduMode
 from sitl.ardupilot.guided import Submode
-from sitl.course.layout import AirborneStart
+from sitl.course import AirborneStart
 from sitl.px4.autopilot import Px4
 from sitl.px4.flight import PositionSetpoint
 from sitl.px4.modes import Mode as Px4Mode

@@ -7,7 +7,7 @@ from pymavlink.dialects.v20 import ardupilotmega as dialect
 from helpers.output_flights import OutputFlight
 from mavbridge.core.clock import NS_PER_S
 from sitl.ardupilot.flight_modes import Mode as ArduMode
-from sitl.px4.failsafe import Phase as LostPhase
+from sitl.px4.modes import Phase as LostPhase
 
 FORCE = 21196
 """Parameter 2 of a disarming that is not refused in flight."""

@@ -167,7 +167,7 @@ def course_gates(seed: int | None) -> tuple[CourseGate, ...]:
     """The gates of a simulated course; none without a seed."""
     if seed is None:
         return ()
-    from sitl.course.layout import make_course
+    from sitl.course import make_course
 
     return tuple(
         CourseGate(Position(*gate.center_ned_m), gate.yaw_rad, gate.size_m)

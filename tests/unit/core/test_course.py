@@ -11,8 +11,7 @@ from hypothesis import strategies as st
 from mavbridge.core.course import CourseGate, CourseProgress, read_gates
 from mavbridge.core.errors import UserError
 from mavbridge.core.records import Position
-from sitl.course.layout import course_to_json, make_course
-from sitl.course.referee import GateCounter
+from sitl.course import GateCounter, course_to_json, make_course
 
 COURSE = make_course(3)
 GATES = tuple(CourseGate(Position(*g.center_ned_m), g.yaw_rad, g.size_m) for g in COURSE.gates)

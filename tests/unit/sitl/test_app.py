@@ -18,8 +18,7 @@ from sitl.app import filming, fly, fly_on
 from sitl.ardupilot.flight_modes import Mode
 from sitl.camera.fpv import CameraOptions
 from sitl.clock import NS_PER_MS, NS_PER_S, Clock, StopRequest, stop_on_signal
-from sitl.course.layout import AirborneStart, make_course
-from sitl.course.referee import Crash
+from sitl.course import AirborneStart, Crash, make_course
 from sitl.link.transport import Received
 from sitl.simulated_vehicle import SimulatedVehicle
 from sitl.vehicle.config import STEP_NS, VehicleConfig

@@ -18,7 +18,7 @@ from mavbridge.commands.evaluate.results import (
 from mavbridge.core.clock import NS_PER_MS
 from mavbridge.core.vehicle import NEUTRAL, Sticks
 from mavbridge.simulation.referee import EpisodeResult, StickMeter
-from sitl.course.layout import make_course
+from sitl.course import make_course
 
 
 def evaluation(*episodes: EpisodeResult) -> Evaluation:

@@ -8,8 +8,7 @@ from hypothesis import strategies as st
 
 from sitl.ardupilot import sticks as pilot_sticks
 from sitl.ardupilot.params import ArduPilotParams
-from sitl.ardupilot.rc import RcEngine
-from sitl.ardupilot.sticks import Sticks, read_sticks
+from sitl.ardupilot.sticks import RcEngine, Sticks, read_sticks
 from sitl.clock import NS_PER_MS, NS_PER_S
 from sitl.vehicle.config import IDLE_RECEIVER_US
 

@@ -10,9 +10,8 @@ from pymavlink.dialects.v20 import ardupilotmega as mav
 
 from faults.link import FaultyLink, LinkFaults
 from helpers.vehicle_faults import Reboot, SensorFreeze, VehicleFaults
-from sitl.ardupilot.endpoint import ArduPilotStreams
+from sitl.ardupilot.endpoint import BUILDERS, ArduPilotStreams
 from sitl.ardupilot.flight_modes import Mode
-from sitl.ardupilot.messages import BUILDERS
 from sitl.clock import NS_PER_MS, NS_PER_S
 from sitl.simulated_vehicle import SimulatedVehicle
 

@@ -11,7 +11,7 @@ from mavbridge.core.clock import NS_PER_S, MonotonicClock
 from sitl.camera.follow import film_vehicle
 from sitl.camera.fpv import CameraOptions, FpvRenderer
 from sitl.clock import StopRequest
-from sitl.course.layout import make_course
+from sitl.course import make_course
 from sitl.rotation import IDENTITY
 
 SHM = "mb-test-follow"

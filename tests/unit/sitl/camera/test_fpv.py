@@ -8,7 +8,7 @@ from hypothesis import strategies as st
 from sitl import UsageError
 from sitl.camera import scenery
 from sitl.camera.fpv import NEAR_M, FpvRenderer, clip_near
-from sitl.course.layout import Course, Gate, make_course
+from sitl.course import Course, Gate, make_course
 from sitl.rotation import IDENTITY, from_euler
 from sitl.vehicle.conditions import NOMINAL, held_out_conditions
 

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from sitl.camera.fpv import FpvRenderer, Shutter, rotation_matrix
-from sitl.course.layout import make_course
+from sitl.course import make_course
 from sitl.rotation import IDENTITY, from_euler, integrate
 from sitl.vehicle.conditions import NOMINAL
 

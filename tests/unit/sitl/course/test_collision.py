@@ -2,8 +2,7 @@ import pytest
 from pymavlink.dialects.v20 import ardupilotmega as mav
 
 from sitl.ardupilot.flight_modes import Mode
-from sitl.course.layout import BAR_M, DEPTH_M, AirborneStart, Course, Gate
-from sitl.course.referee import VEHICLE_RADIUS_M, struck_gate
+from sitl.course import BAR_M, DEPTH_M, VEHICLE_RADIUS_M, AirborneStart, Course, Gate, struck_gate
 from sitl.rotation import IDENTITY
 from sitl.simulated_vehicle import SimulatedVehicle
 from sitl.vehicle.config import STEP_NS, VehicleConfig

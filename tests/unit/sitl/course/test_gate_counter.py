@@ -4,12 +4,12 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from sitl.course.layout import (
+from sitl.course import (
     Course,
     Gate,
+    GateCounter,
     make_course,
 )
-from sitl.course.referee import GateCounter
 
 NORTH_GATE = Gate(center_ned_m=(10.0, 0.0, -2.0), yaw_rad=0.0, size_m=2.0, index=0)
 EAST_GATE = Gate(center_ned_m=(20.0, 5.0, -2.0), yaw_rad=math.pi / 2, size_m=2.0, index=1)

@@ -8,7 +8,7 @@ from hypothesis import strategies as st
 
 from mavbridge.config.courses import RACE_COURSE_SEED
 from sitl import UsageError
-from sitl.course.layout import (
+from sitl.course import (
     EASY,
     RACE,
     RACE_SEEDS,

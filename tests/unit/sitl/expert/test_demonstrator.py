@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from helpers.course_flights import fly_course
 from sitl import UsageError
 from sitl.camera.fpv import body_from_camera
-from sitl.course.layout import AirborneStart, gate_truth, make_course
+from sitl.course import AirborneStart, gate_truth, make_course
 from sitl.expert.course_guide import Waypoint, least_acceleration
 from sitl.expert.demonstrator import Expert
 from sitl.expert.disturbance import Disturbance, random_start

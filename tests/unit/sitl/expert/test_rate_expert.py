@@ -11,10 +11,9 @@ from sitl.ardupilot.control import boosted
 from sitl.ardupilot.flight_modes import Mode
 from sitl.ardupilot.params import ArduPilotParams
 from sitl.clock import NS_PER_MS, NS_PER_S
-from sitl.course.layout import RACE_SEEDS, AirborneStart, Course, make_course
-from sitl.expert.demonstrator import RateExpert
+from sitl.course import RACE_SEEDS, AirborneStart, Course, make_course
+from sitl.expert.demonstrator import HOVER_THRUST, RateCommand, RateExpert
 from sitl.expert.disturbance import RATE_STRENGTHS, Disturbance, random_start
-from sitl.expert.rate_response import HOVER_THRUST, RateCommand
 from sitl.firmware import AttitudeSetpoint
 from sitl.px4.autopilot import Px4
 from sitl.px4.control import HOVER_THRUST as PX4_HOVER_THRUST

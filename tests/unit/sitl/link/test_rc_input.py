@@ -7,7 +7,7 @@ from contextlib import closing
 import pytest
 
 from sitl import UsageError
-from sitl.link.rc_input import RcInput
+from sitl.link.transport import RcInput
 
 PWM = (1500, 1501, 1000, 1499, 1800, 1200, 1500, 1900)
 

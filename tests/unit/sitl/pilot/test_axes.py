@@ -1,7 +1,7 @@
 import pytest
 
 from sitl import UsageError
-from sitl.pilot.axes import DEAD_ZONE, DEFAULT_AXES, Axis, parse_axes, past_dead_zone
+from sitl.pilot.transmitter import DEAD_ZONE, DEFAULT_AXES, Axis, parse_axes, past_dead_zone
 
 
 def test_axes_are_read_and_may_be_reversed():

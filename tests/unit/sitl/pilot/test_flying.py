@@ -6,10 +6,9 @@ from sitl import UsageError
 from sitl.__main__ import main
 from sitl.app import PilotOptions, make_pilot, prepare_vehicle
 from sitl.clock import NS_PER_S, Clock
-from sitl.course.layout import make_course
-from sitl.expert.stick_response import CENTRED
-from sitl.pilot.axes import DEFAULT_AXES
-from sitl.pilot.transmitter import OFF_US, Hand, Transmitter
+from sitl.course import make_course
+from sitl.expert.demonstrator import CENTRED
+from sitl.pilot.transmitter import DEFAULT_AXES, OFF_US, Hand, Transmitter
 from sitl.simulated_vehicle import SimulatedVehicle
 from sitl.vehicle.config import STEP_NS, VehicleConfig
 

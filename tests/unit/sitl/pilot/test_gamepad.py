@@ -1,8 +1,7 @@
 import pytest
 
 from sitl.clock import NS_PER_MS, NS_PER_S
-from sitl.pilot.axes import DEFAULT_AXES, parse_axes
-from sitl.pilot.gamepad import (
+from sitl.pilot.devices import (
     ARM_BUTTON,
     BAD_BUTTON,
     DISARM_BUTTON,
@@ -10,7 +9,7 @@ from sitl.pilot.gamepad import (
     GamepadPilot,
     PygamePad,
 )
-from sitl.pilot.transmitter import OFF_US, PERIOD_NS
+from sitl.pilot.transmitter import DEFAULT_AXES, OFF_US, PERIOD_NS, parse_axes
 
 
 class Clock:

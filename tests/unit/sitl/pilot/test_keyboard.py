@@ -2,7 +2,7 @@ import pygame
 import pytest
 
 from sitl.clock import NS_PER_MS, NS_PER_S
-from sitl.pilot.keyboard import KeyboardPilot
+from sitl.pilot.devices import KeyboardPilot
 from sitl.pilot.transmitter import OFF_US, PERIOD_NS
 
 

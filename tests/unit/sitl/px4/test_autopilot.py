@@ -6,7 +6,7 @@ from dataclasses import replace
 import pytest
 from pymavlink.dialects.v20 import ardupilotmega as mav
 
-from sitl.course.layout import AirborneStart
+from sitl.course import AirborneStart
 from sitl.px4.modes import Mode, mode_of
 from sitl.rotation import from_euler
 

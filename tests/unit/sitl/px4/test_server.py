@@ -7,7 +7,7 @@ from pymavlink.dialects.v20 import ardupilotmega as mav
 from pymavlink.dialects.v20 import development
 
 from sitl.clock import NS_PER_S
-from sitl.px4.events import Event
+from sitl.px4.commander import Event
 from sitl.px4.messages import CURRENT_MODE, event_message
 from sitl.px4.modes import Mode
 

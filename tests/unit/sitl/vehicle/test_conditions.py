@@ -12,7 +12,7 @@ from sitl.ardupilot.flight_modes import Mode
 from sitl.ardupilot.params import ArduPilotParams
 from sitl.camera.fpv import FpvRenderer
 from sitl.camera.scenery import STRAY_CLEARANCE_M, course_faces
-from sitl.course.layout import make_course
+from sitl.course import make_course
 from sitl.rotation import from_euler, multiply
 from sitl.vehicle.conditions import (
     NOMINAL,

@@ -11,9 +11,8 @@ from helpers.course_flights import fly_course, pwm_us
 from sitl.ardupilot.endpoint import ArduPilotStreams
 from sitl.ardupilot.params import ArduPilotParams
 from sitl.clock import NS_PER_MS, NS_PER_S
-from sitl.course.layout import AirborneStart, make_course
-from sitl.expert.demonstrator import Expert
-from sitl.expert.stick_response import StickPositions
+from sitl.course import AirborneStart, make_course
+from sitl.expert.demonstrator import Expert, StickPositions
 from sitl.rotation import IDENTITY, to_euler
 from sitl.simulated_vehicle import SimulatedVehicle
 from sitl.vehicle.conditions import NOMINAL, random_conditions

@@ -1,1 +1,0 @@
-"""Gate courses, ground truth about them, and the referee of a flight."""
