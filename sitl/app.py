@@ -190,7 +190,6 @@ def fly_on(vehicle: SimulatedVehicle, duration_s: float) -> None:
 
 
 def print_status(line: str) -> None:
-    """Print a line for the user on stderr."""
     sys.stderr.write(f"sitl: {line}\n")
     sys.stderr.flush()
 
@@ -211,7 +210,6 @@ class _Status:
             print_status(f"link {link_id} connected")
 
     def print_changes(self) -> None:
-        """Compare with the last step."""
         ap, log = self._vehicle.ap, self._vehicle.log
         if ap.mode_name != self._mode:
             print_status(f"mode {ap.mode_name}")

@@ -13,7 +13,6 @@ class Clock:
     """CLOCK_MONOTONIC: never set back, one origin for all processes; tests inject a stepped one."""
 
     def now_ns(self) -> int:
-        """Nanoseconds since an arbitrary origin."""
         return time.monotonic_ns()
 
     def sleep_until_ns(self, deadline_ns: int) -> None:
@@ -43,11 +42,9 @@ class StopRequest:
         self._is_set = False
 
     def set(self) -> None:
-        """Request the stop."""
         self._is_set = True
 
     def is_set(self) -> bool:
-        """True once a stop was requested."""
         return self._is_set
 
 

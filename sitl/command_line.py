@@ -31,7 +31,6 @@ SIGNING_TICK_NS = 10_000
 
 
 def run(argv: Sequence[str] | None = None) -> int:
-    """Run the command; returns the exit code, 2 for a usage error."""
     args = _parser().parse_args(argv)
     try:
         args.run(args)

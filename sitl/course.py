@@ -220,7 +220,6 @@ class GateCounter:
 
     @property
     def next_gate(self) -> int | None:
-        """Index of the gate to be passed next; None after the last."""
         index = self._first + len(self.passed)
         return index if index < len(self._gates) else None
 

@@ -159,8 +159,7 @@ class Autopilot(ABC):
 
     @property
     @abstractmethod
-    def armed(self) -> bool:
-        """The motors may turn."""
+    def armed(self) -> bool: ...
 
     @property
     @abstractmethod
@@ -186,7 +185,6 @@ class Autopilot(ABC):
 
     @property
     def step_s(self) -> float:
-        """Control period in seconds."""
         return self.step_ns / NS_PER_S
 
     @property
@@ -196,12 +194,10 @@ class Autopilot(ABC):
 
     @property
     def yaw_rad(self) -> float:
-        """Sensed heading of the nose."""
         return yaw_of(self.sensed.ned_from_body_wxyz)
 
     @property
     def system_id(self) -> int:
-        """MAVLink system id of the vehicle."""
         return self.params.integer(self.id_param)
 
     @property
@@ -216,12 +212,10 @@ class Autopilot(ABC):
 
     @property
     def position_ready(self) -> bool:
-        """True once there is a horizontal position."""
         is_settled = self.uptime_ns >= self.config.position_ready_s * NS_PER_S
         return is_settled and not self.position_lost
 
     def step(self) -> None:
-        """Advance everything by one control period."""
         self.now_ns += self.step_ns
         self._read_inputs()
         self.motor_commands = self._motors()
@@ -277,7 +271,6 @@ class Autopilot(ABC):
             self._set_landed(landed=True)
 
     def _since(self, since_ns: int | None, condition: bool) -> int | None:
-        """Start of the time for which the condition has held; None if it does not hold."""
         if not condition:
             return None
         return self.now_ns if since_ns is None else since_ns

@@ -60,7 +60,6 @@ class FlightLog:
 
     @property
     def crashed(self) -> bool:
-        """True once the frame of a gate, or the ground, was hit hard."""
         return self.crash is not None
 
     @property
@@ -70,12 +69,10 @@ class FlightLog:
 
     @property
     def gates_total(self) -> int:
-        """Number of gates on the course."""
         return len(self._course.gates)
 
     @property
     def gates_passed(self) -> tuple[GatePass, ...]:
-        """Gates passed so far, in order."""
         return tuple(self._gates.passed)
 
     def start_over(self, next_gate: int) -> None:
@@ -127,12 +124,10 @@ class FlightLog:
             self._release_times_s.append(self._t_s(arrived_ns))
 
     def on_text(self, now_ns: int, text: str) -> None:
-        """Log a STATUSTEXT of the vehicle."""
         if len(self.texts) < MAX_TEXTS:
             self.texts.append({"t_s": self._t_s(now_ns), "text": text})
 
     def on_step(self, ap: Autopilot) -> None:
-        """Measure the vehicle after a control step."""
         if not self._modes or self._modes[-1]["mode"] != ap.mode_name:
             self._modes.append({"t_s": self._t_s(ap.now_ns), "mode": ap.mode_name})
         self._sticks.update(ap, max(ap.now_ns, self._arrived_ns))
@@ -169,7 +164,6 @@ class FlightLog:
             self.crash = Crash(t_s=self._t_s(now_ns), hit=hit, speed_mps=self._speed_mps)
 
     def summary(self, ap: Autopilot, bad_frames: int) -> dict[str, Any]:
-        """The report, ready for JSON."""
         body = ap.truth
         angles = to_euler(body.ned_from_body_wxyz)
         passed = [asdict(gate) for gate in self._gates.passed]
@@ -242,7 +236,6 @@ class _StickRecord:
         self._entries.append(entry)
 
     def summary(self, start_ns: int) -> list[dict[str, Any]]:
-        """The ``sticks`` list of the report."""
         return [
             {
                 "t_s": (entry.stamp_ns - start_ns) / NS_PER_S,
@@ -268,7 +261,6 @@ class _ArrivalStats:
         self._gaps_ms = array("f")
 
     def add(self, arrived_ns: int) -> None:
-        """Count an override."""
         if self._count == 0:
             self._first_ns = arrived_ns
         self.interrupt(arrived_ns)
@@ -283,7 +275,6 @@ class _ArrivalStats:
         self._engaged = False
 
     def summary(self, start_ns: int) -> dict[str, Any]:
-        """The ``overrides`` block of the report."""
         span_s = (self._last_ns - self._first_ns) / NS_PER_S
         gap_ms = None
         if self._gaps_ms:

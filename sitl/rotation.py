@@ -14,7 +14,6 @@ IDENTITY: Quat = (1.0, 0.0, 0.0, 0.0)
 
 
 def multiply(a: Quat, b: Quat) -> Quat:
-    """Hamilton product."""
     aw, ax, ay, az = a
     bw, bx, by, bz = b
     return (
@@ -26,7 +25,6 @@ def multiply(a: Quat, b: Quat) -> Quat:
 
 
 def conjugate(q: Quat) -> Quat:
-    """Inverse rotation."""
     w, x, y, z = q
     return (w, -x, -y, -z)
 
@@ -46,7 +44,6 @@ def rotate(q: Quat, v: Vec3) -> Vec3:
 
 
 def from_euler(roll: float, pitch: float, yaw: float) -> Quat:
-    """Unit quaternion of the angles, radians."""
     cr, sr = math.cos(roll / 2.0), math.sin(roll / 2.0)
     cp, sp = math.cos(pitch / 2.0), math.sin(pitch / 2.0)
     cy, sy = math.cos(yaw / 2.0), math.sin(yaw / 2.0)
@@ -95,12 +92,10 @@ def cos_tilt(q: Quat) -> float:
 
 
 def wrap_pi(angle: float) -> float:
-    """The angle in [-pi, pi]."""
     return math.remainder(angle, 2.0 * math.pi)
 
 
 def yaw_of(q: Quat) -> float:
-    """Heading in radians."""
     return to_euler(q)[2]
 
 

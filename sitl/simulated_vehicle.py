@@ -68,11 +68,9 @@ class SimulatedVehicle:
 
     @property
     def bad_frames(self) -> int:
-        """Unreadable frames on all links."""
         return sum(link.bad_frames for link in self.server.links)
 
     def receive(self, link_id: int, data: bytes, now_ns: int) -> None:
-        """Act on bytes that arrived on a link at ``now_ns``."""
         self.log.on_received(now_ns)
         self.server.receive(link_id, data, now_ns)
 
@@ -101,7 +99,6 @@ class SimulatedVehicle:
             self.reboot()
 
     def take_outgoing(self, link_id: int) -> bytes:
-        """Bytes to send on a link: whole frames, in order."""
         outgoing: bytes = self.server.links[link_id].take_outgoing()
         return outgoing
 

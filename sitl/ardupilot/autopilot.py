@@ -71,7 +71,6 @@ class GcsFailsafe:
         self.active = False
 
     def on_contact(self, now_ns: int) -> None:
-        """Record a heartbeat, override or manual control of the ground station."""
         self._last_contact_ns = now_ns
 
     def update(self, now_ns: int) -> bool:
@@ -132,31 +131,25 @@ class ArduCopter(Autopilot):
 
     @property
     def armed(self) -> bool:
-        """The motors may turn."""
         return self._armed
 
     @property
     def mode_name(self) -> str:
-        """Name of the flight mode."""
         return self.mode.name
 
     @property
     def in_failsafe(self) -> bool:
-        """The radio failsafe is active."""
         return self.radio_failsafe.active
 
     @property
     def sticks_us(self) -> tuple[int, int, int, int]:
-        """Roll, pitch, throttle and yaw after overrides; 0: never had a value."""
         return self.rc.sticks_us()
 
     def set_receiver(self, values_us: Sequence[int]) -> None:
-        """Move the pilot's sticks and switches (`RcEngine.set_receiver`)."""
         self.rc.set_receiver(values_us)
 
     @property
     def has_gps(self) -> bool:
-        """False for a vehicle that never has a position."""
         return math.isfinite(self.config.position_ready_s)
 
     @property
@@ -253,7 +246,6 @@ class ArduCopter(Autopilot):
         return True
 
     def step(self) -> None:
-        """Advance everything by one control period."""
         super().step()
         self._detect_crash()
 

@@ -149,7 +149,6 @@ class AttitudeController:
         return rate_radps + clamp(wanted_radps - rate_radps, max_accel_radps2 * dt_s)
 
     def _limit(self, name: str) -> float:
-        """The parameter; infinite where it is 0."""
         limit = self._params[name]
         return limit if limit > 0.0 else math.inf
 
@@ -168,13 +167,11 @@ class _Response:
         self._yaw_accel_radps2 = 0.0
 
     def reset(self, body: BodyState) -> None:
-        """Begin at the present attitude, at rest."""
         self.attitude = body.ned_from_body_wxyz
         self.rate_radps = self._command_radps = (0.0, 0.0, 0.0)
         self._yaw_accel_radps2 = 0.0
 
     def step(self, target: Quat, rate_radps: Vec3, dt_s: float) -> Vec3:
-        """Advance by one step; the body angular acceleration (rad/s^2) that makes it so."""
         error = rotation_vector(multiply(conjugate(self.attitude), target))
         roll, pitch, yaw = (rate_radps[k] + CATCH_UP_PER_S * error[k] for k in range(3))
         before = self._command_radps

@@ -337,13 +337,11 @@ class ArduPilotEndpoint(Endpoint[ArduCopter]):
         super().__init__(ap, BUILDERS)
 
     def restart(self, ap: ArduCopter) -> None:
-        """Begin again with a vehicle that has just booted."""
         super().restart(ap)
         self._streams = ArduPilotStreams(BUILDERS, ap.now_ns, ap.config.conditions)
         self._timesync_due_ns = ap.now_ns + TIMESYNC_PERIOD_NS
 
     def step(self, _now_ns: int) -> None:
-        """Queue what is due by the vehicle's clock."""
         now_ns = self._ap.now_ns
         self._send_next_param(now_ns)
         for message_id in self._streams.due(now_ns, PARAM_SLOWDOWN if self._queued_params else 1):
@@ -354,23 +352,19 @@ class ArduPilotEndpoint(Endpoint[ArduCopter]):
             self.send(mav.MAVLink_timesync_message(0, uptime_ns + self._ap.system_id))
 
     def set_interval(self, message_id: int, interval_us: int) -> str | None:
-        """Change a stream; returns the reason if refused."""
         loop_hz = self._ap.params["SCHED_LOOP_RATE"]
         return self._streams.set_interval(
             message_id, interval_us, loop_hz=loop_hz, now_ns=self._ap.now_ns
         )
 
     def set_group(self, group: int, rate_hz: int) -> None:
-        """Change the group of streams of a REQUEST_DATA_STREAM; rate 0 stops it."""
         loop_hz = self._ap.params["SCHED_LOOP_RATE"]
         self._streams.set_group(group, rate_hz, loop_hz=loop_hz, now_ns=self._ap.now_ns)
 
     def interval_us(self, message_id: int) -> int:
-        """The interval that MESSAGE_INTERVAL reports."""
         return self._streams.interval_us(message_id)
 
     def send_text(self, severity: int, text: str) -> None:
-        """Send STATUSTEXT, in as many messages as the text needs."""
         for start in range(0, len(text), MAX_STATUSTEXT):
             chunk = text[start : start + MAX_STATUSTEXT].encode("ascii", "replace")
             self.send(mav.MAVLink_statustext_message(severity, chunk))

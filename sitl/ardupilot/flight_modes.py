@@ -44,17 +44,14 @@ class Mode(IntEnum):
 
     @property
     def piloted(self) -> bool:
-        """The sticks fly it."""
         return self.manual_throttle or self.throttle_is_climb_rate
 
     @property
     def is_guided(self) -> bool:
-        """Setpoints fly it; the sticks do nothing."""
         return self in (Mode.GUIDED, Mode.GUIDED_NOGPS)
 
     @property
     def can_arm(self) -> bool:
-        """The motors may be started in it."""
         return self.piloted or self.is_guided
 
     @property
@@ -93,11 +90,9 @@ class CopterControl:
 
     @property
     def target(self) -> tuple[Quat, Vec3]:
-        """Shaped target: attitude (NED from body) and body rates in rad/s."""
         return self._attitude.target
 
     def enter(self, mode: Mode, body: BodyState) -> None:
-        """Begin with a mode, or with a flight in it."""
         self.reset(body)
         self.guided.enter(body, with_position=mode is Mode.GUIDED)
 
@@ -110,12 +105,10 @@ class CopterControl:
         self.thrust = self.collective = 0.0
 
     def idle(self, body: BodyState) -> tuple[float, ...]:
-        """Motors of an armed vehicle that stays on the ground."""
         self.reset(body)
         return IDLE
 
     def wants_takeoff(self, mode: Mode, sticks: Sticks) -> bool:
-        """True if the sticks command a landed vehicle to take off."""
         if mode.manual_throttle:
             return sticks.throttle > 0.0
         is_climb = pilot.climb_rate_mps(sticks, self._params) > 0.0
@@ -131,7 +124,6 @@ class CopterControl:
         has_position: bool,
         dt_s: float,
     ) -> tuple[float, ...]:
-        """Motor commands of a flying vehicle, each in [0, 1]."""
         if mode.is_guided:
             turn, self.thrust = self.guided.fly(body, now_ns, has_position=has_position, dt_s=dt_s)
             self.collective = boosted(self.thrust, body, self._params)
@@ -205,7 +197,6 @@ class CopterControl:
         return _lean_towards(wanted_n, wanted_e, body, HOLD_ACCEL_MPS2)
 
     def _acro_rates(self, sticks: Sticks, body: BodyState) -> Vec3:
-        """Stick rates, bent back towards level by ACRO_TRAINER."""
         roll_rate, pitch_rate, yaw_rate = pilot.acro_rates_radps(sticks, self._params)
         trainer = self._params.integer("ACRO_TRAINER")
         if trainer == 0:

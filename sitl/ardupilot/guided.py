@@ -81,7 +81,6 @@ class GuidedControl:
         self._start(Submode.VELOCITY, body)
 
     def follow_attitude(self, setpoint: AttitudeSetpoint, body: BodyState, now_ns: int) -> None:
-        """Follow this setpoint until the next one, or until GUID_TIMEOUT."""
         has_thrust = bool(self._params.integer("GUID_OPTIONS") & OPTION_THRUST)
         if self._has_thrust and not has_thrust:
             self._height.reset(body)
@@ -91,7 +90,6 @@ class GuidedControl:
         self.submode = Submode.ATTITUDE
 
     def follow_velocity(self, setpoint: VelocitySetpoint, body: BodyState, now_ns: int) -> None:
-        """Follow this setpoint until the next one, or until GUID_TIMEOUT."""
         self._start(Submode.VELOCITY, body)
         self.velocity = setpoint
         self._received_ns = now_ns
@@ -217,7 +215,6 @@ class _Track:
         self._accel_mps2 = [0.0, 0.0]
 
     def reset(self, body: BodyState) -> None:
-        """Begin where the vehicle is, at its velocity."""
         self._position_m = list(body.position_ned_m[:2])
         self._velocity_mps = list(body.velocity_ned_mps[:2])
         self._accel_mps2 = [0.0, 0.0]

@@ -92,12 +92,10 @@ class ArduPilotServer(MavlinkServer[ArduCopter, ArduPilotEndpoint]):
         }
 
     def restart(self, ap: ArduCopter) -> None:
-        """Serve a vehicle that has just booted."""
         super().restart(ap)
         self._mode = ap.mode
 
-    def _pass_on(self, link: ArduPilotEndpoint, message: Message) -> None:
-        """No-op: this vehicle forwards nothing."""
+    def _pass_on(self, link: ArduPilotEndpoint, message: Message) -> None: ...
 
     def _announce(self) -> None:
         """A change of mode sends a heartbeat at once."""

@@ -48,12 +48,10 @@ class RcEngine:
 
     @property
     def has_receiver(self) -> bool:
-        """A receiver has sent values, now or earlier."""
         return self._receiver_us is not None
 
     @property
     def channel_count(self) -> int:
-        """Channels of the receiver, at least eight."""
         return max(PRIMARY_CHANNELS, len(self._receiver_us or ()))
 
     def set_receiver(self, values_us: Sequence[int]) -> None:
@@ -98,7 +96,6 @@ class RcEngine:
             self._set(index, RELEASE if value == AXIS_ABSENT else pwm, now_ns)
 
     def clear_overrides(self) -> None:
-        """Drop every override at once."""
         self._override_us = [RELEASE] * CHANNELS
 
     def index_of(self, axis: str) -> int:
@@ -288,7 +285,6 @@ def lean_angles(sticks: Sticks, params: ArduPilotParams) -> tuple[float, float]:
 
 
 def yaw_rate_radps(sticks: Sticks, params: ArduPilotParams) -> float:
-    """Yaw rate of the angle modes."""
     return math.radians(params["PILOT_Y_RATE"]) * _expo(sticks.yaw, params["PILOT_Y_EXPO"])
 
 
@@ -376,7 +372,6 @@ class SimpleMode:
         self._aux: Axes | None = None
 
     def arm(self, yaw_rad: float) -> None:
-        """Remember the heading at arming."""
         self._arming_rad = self._home_rad = yaw_rad
 
     def read_mode_switch(self, position: int) -> None:

@@ -140,7 +140,6 @@ class PoseListener:
             self._attitude = (arrived_ns, (w, x, y, z), rate_radps)
 
     def _missing(self) -> list[int]:
-        """Ids of the messages to request."""
         if self._vehicle is None:
             return []
         wanted = [QUATERNION, POSITION]

@@ -104,7 +104,6 @@ class FpvRenderer:
         return self._sensor.expose(image)
 
     def _draw_backdrop(self, eye_ned_m: FloatArray, ned_from_camera: FloatArray) -> Image:
-        """Draw sky and ground; a ray of unit depth falls by a linear function of the pixel."""
         ned_ray_from_pixel = ned_from_camera @ self._ray_from_pixel
         per_u, per_v, offset = ned_ray_from_pixel[2].astype(np.float32)
         falls = per_u * self._u_px + (per_v * self._v_px + offset)

@@ -250,7 +250,6 @@ def ridge_directions(seed: int) -> FloatArray:
 
 
 def tinted(rgb: Rgb, tint: Vec3) -> FloatArray:
-    """Colour [3] under a tint, within 0..255."""
     return np.asarray(np.clip(np.array(rgb) * np.array(tint), 0, 255))
 
 

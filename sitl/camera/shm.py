@@ -51,7 +51,6 @@ class FramePublisher:
 
     @property
     def path(self) -> Path:
-        """The file that readers map."""
         return self._path
 
     def publish(

@@ -110,7 +110,6 @@ class CourseGuide:
 
     @property
     def next_gate(self) -> int | None:
-        """Index of the gate to be passed next; None after the last."""
         return self._referee.next_gate
 
     def demand(self, position_ned_m: Vec3, t_s: float, state: "Predicted") -> Demand:
@@ -154,7 +153,6 @@ class Predicted:
 
     @property
     def velocity_mps(self) -> complex:
-        """Horizontal velocity, north + 1j * east."""
         north, east, _ = self.velocity_ned_mps
         return complex(north, east)
 
@@ -338,7 +336,6 @@ def _back_off(state: Predicted, gate: Gate, agility: Agility) -> Demand:
 
 
 def _brake(state: Predicted, agility: Agility) -> Demand:
-    """Brake to a hover."""
     most_mps = -agility.along_accel_mps2[0] / BRAKING_GAIN_PER_S
     gain = BRAKING_GAIN_PER_S * min(1.0, most_mps / max(1e-6, _length(state.velocity_mps)))
     return Demand(-gain * state.velocity_mps, 0.0, 0.0)
@@ -350,7 +347,6 @@ def _yaw_rate(error_rad: float, lead_radps: float) -> float:
 
 
 def _blend(a: Demand, b: Demand, share: float) -> Demand:
-    """``a`` at a share of 0, ``b`` at 1."""
     return Demand(
         accel_mps2=a.accel_mps2 + share * (b.accel_mps2 - a.accel_mps2),
         climb_mps=a.climb_mps + share * (b.climb_mps - a.climb_mps),

@@ -178,7 +178,6 @@ class Expert:
 
     @property
     def next_gate(self) -> int | None:
-        """Index of the gate to be passed next; None after the last."""
         return self._guide.next_gate
 
     def sticks(self, body: BodyState, t_s: float) -> StickPositions:
@@ -201,11 +200,9 @@ class RateExpert:
 
     @property
     def next_gate(self) -> int | None:
-        """Index of the gate to be passed next; None after the last."""
         return self._guide.next_gate
 
     def command(self, body: BodyState, t_s: float) -> RateCommand:
-        """Thrust and rates for this state; as ``Expert.sticks``."""
         ned_from_body = integrate(body.ned_from_body_wxyz, body.rate_body_radps, RATE_LAG_S)
         state = _predict_free(body, RATE_LAG_S)
         demand = self._guide.demand(body.position_ned_m, t_s, state)

@@ -47,7 +47,6 @@ class Endpoint(ABC, Generic[Ap]):
         self.restart(ap)
 
     def restart(self, ap: Ap) -> None:
-        """Begin again with a vehicle that has just booted."""
         self._ap = ap
         self._queued_params: deque[int] = deque()
         self._param_due_ns = ap.now_ns
@@ -57,12 +56,10 @@ class Endpoint(ABC, Generic[Ap]):
         """Queue what is due; ``now_ns`` is at most one control step ahead of the vehicle."""
 
     @abstractmethod
-    def interval_us(self, message_id: int) -> int:
-        """The interval that MESSAGE_INTERVAL reports."""
+    def interval_us(self, message_id: int) -> int: ...
 
     @abstractmethod
-    def send_text(self, severity: int, text: str) -> None:
-        """Send STATUSTEXT, in as many messages as the text needs."""
+    def send_text(self, severity: int, text: str) -> None: ...
 
     def parse(self, data: bytes) -> Iterator[Message]:
         """Complete messages in these bytes; unreadable frames are counted and skipped."""
@@ -73,13 +70,11 @@ class Endpoint(ABC, Generic[Ap]):
                 yield message
 
     def send(self, message: Message) -> None:
-        """Queue a message of the vehicle."""
         self._mav.srcSystem = self._ap.system_id
         self._outgoing += message.pack(self._mav)
         self._mav.seq = (self._mav.seq + 1) % 256
 
     def pass_on(self, frame: bytes) -> None:
-        """Queue another sender's frame as it is."""
         self._outgoing += frame
 
     def take_outgoing(self) -> bytes:
@@ -97,7 +92,6 @@ class Endpoint(ABC, Generic[Ap]):
         return build is not None
 
     def send_interval(self, message_id: int) -> None:
-        """Send MESSAGE_INTERVAL."""
         interval_us = self.interval_us(message_id)
         self.send(mav.MAVLink_message_interval_message(message_id, interval_us))
 
@@ -167,7 +161,6 @@ class MavlinkServer(ABC, Generic[Ap, Link]):
         """By number: MAV_RESULT for the ack, None for no ack."""
 
     def restart(self, ap: Ap) -> None:
-        """Serve a vehicle that has just booted."""
         self._ap = ap
         self.reboot_requested = False
         for link in self.links:

@@ -97,7 +97,6 @@ class Home(NamedTuple):
 
     @property
     def temperature_cdeg(self) -> int:
-        """In hundredths of a degree."""
         return round(100.0 * self.temperature_c)
 
     def builders(self) -> dict[int, Callable[[Autopilot], Message | None]]:
@@ -127,7 +126,6 @@ def boot_ms(ap: Autopilot) -> int:
 
 
 def boot_us(ap: Autopilot) -> int:
-    """Time since boot in whole microseconds."""
     return ap.uptime_ns // 1_000
 
 
@@ -192,7 +190,6 @@ def autopilot_version(ap: Autopilot, *, capabilities: int, version: int) -> Mess
 def extended_sys_state(
     ap: Autopilot, vtol: int, *, is_landing: bool, is_taking_off: bool
 ) -> Message:
-    """EXTENDED_SYS_STATE."""
     state = mav.MAV_LANDED_STATE_IN_AIR
     if ap.landed:
         state = mav.MAV_LANDED_STATE_ON_GROUND

@@ -125,7 +125,6 @@ class UdpLink:
                         raise
 
     def close(self) -> None:
-        """Free the port."""
         self._socket.close()
 
     def _arrival_ns(self, ancillary: list[tuple[int, int, bytes]]) -> int:
@@ -185,7 +184,6 @@ class TcpLink:
                 self._drop(connection)
 
     def close(self) -> None:
-        """Close every connection and free the port."""
         for connection in tuple(self._connections):
             self._drop(connection)
         if self._server is not None:
@@ -261,5 +259,4 @@ class RcInput:
         return newest
 
     def close(self) -> None:
-        """Free the port."""
         self._socket.close()

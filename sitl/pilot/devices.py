@@ -20,8 +20,7 @@ PAD_HELP = (
 class Pad(Protocol):
     """A gamepad as far as it is used here."""
 
-    def poll(self) -> bool:
-        """Take what has happened; False while none is connected."""
+    def poll(self) -> bool: ...
 
     def axes(self) -> Sequence[float]:
         """Positions in [-1, 1], by number."""
@@ -42,7 +41,6 @@ class GamepadPilot:
         self._pressed: set[int] = set()
 
     def latest(self) -> Sequence[int] | None:
-        """See `Pilot`."""
         now_ns = self._clock.now_ns()
         if not self._transmitter.begins_frame(now_ns):
             return None
@@ -66,7 +64,6 @@ class GamepadPilot:
             self._switch = "middle"
 
     def close(self) -> None:
-        """See `Pilot`."""
         pygame.quit()
 
 
@@ -87,7 +84,6 @@ class PygamePad:
         return f"{pad.get_name()}: {pad.get_numaxes()} axes, {pad.get_numbuttons()} buttons"
 
     def poll(self) -> bool:
-        """See `Pad`."""
         for event in pygame.event.get():
             is_ours = self._pad is not None and (
                 getattr(event, "instance_id", None) == self._pad.get_instance_id()
@@ -99,12 +95,10 @@ class PygamePad:
         return self._pad is not None
 
     def axes(self) -> Sequence[float]:
-        """See `Pad`."""
         pad = self._pad
         return () if pad is None else [pad.get_axis(k) for k in range(pad.get_numaxes())]
 
     def buttons(self) -> Sequence[bool]:
-        """See `Pad`."""
         pad = self._pad
         return () if pad is None else [pad.get_button(k) for k in range(pad.get_numbuttons())]
 
@@ -144,7 +138,6 @@ class KeyboardPilot:
         self._is_open = True
 
     def latest(self) -> Sequence[int] | None:
-        """See `Pilot`."""
         now_ns = self._clock.now_ns()
         if not self._transmitter.begins_frame(now_ns):
             return None
@@ -184,5 +177,4 @@ class KeyboardPilot:
         return StickPositions(*self._position)
 
     def close(self) -> None:
-        """See `Pilot`."""
         pygame.quit()

@@ -42,8 +42,7 @@ class Pilot(Protocol):
     def latest(self) -> Sequence[int] | None:
         """Channels in microseconds, as ``Autopilot.set_receiver`` takes them; None = as before."""
 
-    def close(self) -> None:
-        """Free what it has opened."""
+    def close(self) -> None: ...
 
 
 class Transmitter:
@@ -157,7 +156,6 @@ class ExpertPilot:
         self._over_course_ns: int | None = None
 
     def latest(self) -> Sequence[int] | None:
-        """See `Pilot`."""
         now_ns = self._vehicle.ap.now_ns
         if not self._transmitter.begins_frame(now_ns):
             return None
@@ -180,7 +178,6 @@ class ExpertPilot:
 
     @property
     def _switch(self) -> Switch:
-        """High over the course."""
         return "high" if self._over_course_ns is None else "low"
 
     def _fly(self, now_ns: int) -> StickPositions:
@@ -192,5 +189,4 @@ class ExpertPilot:
                 self._phase = "landing"
         return sticks
 
-    def close(self) -> None:
-        """Nothing to free."""
+    def close(self) -> None: ...

@@ -53,22 +53,18 @@ class Px4(Autopilot):
 
     @property
     def mode(self) -> Mode:
-        """The mode that flies."""
         return self.commander.mode
 
     @property
     def mode_name(self) -> str:
-        """Name of the flight mode: ALTCTL, AUTO.RTL."""
         return self.mode.label
 
     @property
     def armed(self) -> bool:
-        """The motors may turn."""
         return self.commander.armed
 
     @property
     def in_failsafe(self) -> bool:
-        """A failsafe has changed the mode."""
         return self.commander.in_failsafe
 
     @property
@@ -94,7 +90,6 @@ class Px4(Autopilot):
         self.commander.setpoint_fresh = True
 
     def prepare_takeoff(self, height_m: float | None) -> None:
-        """Set AUTO.TAKEOFF's height above home; None: MIS_TAKEOFF_ALT above here."""
         above_m = self.params["MIS_TAKEOFF_ALT"] - self.sensed.position_ned_m[2]
         self.flight.takeoff_to_m = above_m if height_m is None else height_m
 

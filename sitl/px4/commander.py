@@ -43,7 +43,6 @@ class Event(NamedTuple):
 
     @property
     def number(self) -> int:
-        """The id on the wire."""
         value = _FNV1A_32_OFFSET
         for letter in self.name.encode():
             value = (value ^ letter) * _FNV1A_32_PRIME & 0xFFFFFFFF
@@ -69,7 +68,6 @@ class Commander:
     def __init__(
         self, params: Px4Params, sticks: StickInput, boot_ns: int, texts: list[StatusText]
     ) -> None:
-        """``texts`` is the list that status texts wait in."""
         self._params = params
         self._sticks = sticks
         self._boot_ns = self.now_ns = boot_ns
@@ -96,7 +94,6 @@ class Commander:
 
     @property
     def in_failsafe(self) -> bool:
-        """A failsafe has changed the mode."""
         return self.armed and (self.lost_sticks.active or self._fallback)
 
     def can_fly(self, mode: Mode) -> bool:
@@ -138,7 +135,6 @@ class Commander:
         return True
 
     def start(self, *, ignores_sticks: bool) -> None:
-        """Be armed from now on."""
         self.armed, self._has_flown = True, False
         self.armed_ns = self.now_ns
         self._ignores_sticks = ignores_sticks
@@ -192,12 +188,10 @@ class Commander:
         )
 
     def finish_takeoff(self) -> None:
-        """AUTO.TAKEOFF has reached its height."""
         if self.intended is Mode.AUTO_TAKEOFF:
             self._intend(Mode.AUTO_LOITER)
 
     def on_landed_change(self, *, landed: bool) -> None:
-        """The vehicle has left the ground, or has come to rest on it."""
         self.landed = landed
         self._landed_ns = self.now_ns
         self._has_flown = self._has_flown or not landed
@@ -206,7 +200,6 @@ class Commander:
         self._emit(f"commander_{what}_detected", LEVELS_INFO)
 
     def update(self, now_ns: int) -> None:
-        """Look at sticks, setpoints and time; decide on the mode."""
         dt_ns, self.now_ns = now_ns - self.now_ns, now_ns
         self._read_gestures()
         if self.lost_sticks.update(dt_ns):
@@ -293,7 +286,6 @@ class Commander:
             self._say_failsafe(ACTION_POSCTL if wanted.piloted else ACTION_RTL)
 
     def _with_position(self, mode: Mode) -> Mode:
-        """The mode, or one that does without a position."""
         if self.position_ready or not mode.needs_position:
             return mode
         is_stick_flown = mode is Mode.POSCTL and self._sticks.valid

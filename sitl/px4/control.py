@@ -59,7 +59,6 @@ class RateController:
         """Demanded body rates, as ATTITUDE_TARGET reports them."""
 
     def reset(self) -> None:
-        """Forget the filtered torque and the targets that are under way."""
         self._yaw_accel_radps2 = 0.0
         self._targets.clear()
         self.rates_radps = (0.0, 0.0, 0.0)
@@ -163,7 +162,6 @@ class Horizontal:
         self._reaction_s = 0.0
 
     def reset(self, body: BodyState, accel_mps2: NorthEast) -> None:
-        """Begin in the present motion, with the acceleration that was asked for until now."""
         self._velocity.reset(accel_mps2)
         self.accel_mps2 = accel_mps2
         self.speed_mps = (body.velocity_ned_mps[0], body.velocity_ned_mps[1])

@@ -155,7 +155,6 @@ class Px4Endpoint(Endpoint[Px4]):
         super().__init__(ap, BUILDERS_1_14 if ap.config.px4_release == "1.14" else BUILDERS)
 
     def restart(self, ap: Px4) -> None:
-        """Begin again with a vehicle that has just booted."""
         super().restart(ap)
         self.has_gcs = False
         """A ground station's heartbeat has come; without one no text is sent."""
@@ -183,7 +182,6 @@ class Px4Endpoint(Endpoint[Px4]):
         return True
 
     def interval_us(self, message_id: int) -> int:
-        """The interval that MESSAGE_INTERVAL reports."""
         return self._streams.interval_us(message_id)
 
     def send_text(self, severity: int, text: str) -> None:
@@ -200,6 +198,5 @@ class Px4Endpoint(Endpoint[Px4]):
             self.send(mav.MAVLink_statustext_message(severity, chunk, self._text_id, index))
 
     def send_event(self, event: Event) -> None:
-        """Send EVENT, whoever listens."""
         self._event_sequence = (self._event_sequence + 1) % 65536
         self.send(event_message(event, self._event_sequence))

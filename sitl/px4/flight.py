@@ -68,11 +68,9 @@ class Px4Control:
 
     @property
     def rates_radps(self) -> Vec3:
-        """Demanded body rates."""
         return self._rates.rates_radps
 
     def reset(self, body: BodyState) -> None:
-        """Forget the targets: before flight and at each mode change."""
         self._rates.reset()
         self._horizontal.reset(body, self._accel_mps2)
         self._height.reset(body)
@@ -86,7 +84,6 @@ class Px4Control:
         self.thrust = 0.0
 
     def idle(self, body: BodyState) -> tuple[float, ...]:
-        """Motors of an armed vehicle that stays on the ground."""
         self._accel_mps2 = STILL
         self.reset(body)
         return IDLE
@@ -94,7 +91,6 @@ class Px4Control:
     def wants_takeoff(
         self, mode: Mode, sticks: Sticks, setpoint: Setpoint | None, body: BodyState
     ) -> bool:
-        """True if sticks, setpoint or mode command a landed vehicle to take off."""
         if mode is Mode.AUTO_TAKEOFF:
             return -body.position_ned_m[2] < self.takeoff_to_m
         if mode.manual_throttle:
@@ -109,7 +105,6 @@ class Px4Control:
 
     @staticmethod
     def is_direct(mode: Mode, setpoint: Setpoint | None) -> bool:
-        """Stick or setpoint is thrust, not a climb rate."""
         is_velocity = isinstance(setpoint, PositionSetpoint)
         return mode.manual_throttle or (mode is Mode.OFFBOARD and not is_velocity)
 
@@ -123,7 +118,6 @@ class Px4Control:
         has_position: bool,
         dt_s: float,
     ) -> tuple[float, ...]:
-        """Motor commands of a flying vehicle, each in [0, 1]."""
         if mode is Mode.OFFBOARD and setpoint is not None:
             return self._fly_offboard(setpoint, body, dt_s)
         if mode is Mode.ACRO:
@@ -195,7 +189,6 @@ class Px4Control:
         return mix(thrust, self._rates.rates(body, rates_radps, dt_s), SIH_QUAD)
 
     def _stick_yaw(self, sticks: Sticks, body: BodyState, dt_s: float) -> float:
-        """Yaw rate behind MPC_MAN_Y_TAU."""
         wanted = pilot.yaw_rate_radps(sticks, self._params)
         lag_s = max(dt_s, self._params["MPC_MAN_Y_TAU"])
         self._yaw_rate_radps += (wanted - self._yaw_rate_radps) * dt_s / lag_s
@@ -211,7 +204,6 @@ class Px4Control:
         return 0.0
 
     def _climb(self, climb_mps: float, body: BodyState, dt_s: float) -> float:
-        """Collective that brings about a climb rate."""
         climb_mps = min(climb_mps, self.most_climb_mps)
         max_accel_mps2 = self._params["MPC_ACC_UP_MAX" if climb_mps > 0 else "MPC_ACC_DOWN_MAX"]
         accel = self._height.update(body, climb_mps, max_accel_mps2, dt_s)

@@ -66,13 +66,11 @@ class HandPacked(mav.MAVLink_message):  # type: ignore[misc]  # the library has 
         self._hand_crc_extra = crc_extra
 
     def pack(self, sender: Message, force_mavlink1: bool = False) -> bytes:
-        """The frame."""
         packed = self._pack(sender, self._hand_crc_extra, self._hand_packed, force_mavlink1)
         return bytes(packed)
 
 
 def event_message(event: Event, sequence: int) -> Message:
-    """EVENT to everybody."""
     arguments = event.arguments.ljust(EVENT_ARGUMENT_BYTES, b"\0")
     payload = _EVENT.pack(event.number, event.uptime_ms, sequence, 0, 0, event.levels, arguments)
     return HandPacked(EVENT, "EVENT", payload, EVENT_CRC_EXTRA)
@@ -135,7 +133,6 @@ def _local_position_ned(ap: Px4) -> Message:
 
 
 def _odometry(ap: Px4) -> Message:
-    """Velocity in body axes."""
     body = ap.sensed
     velocity = rotate(conjugate(body.ned_from_body_wxyz), body.velocity_ned_mps)
     return mav.MAVLink_odometry_message(

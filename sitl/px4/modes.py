@@ -36,12 +36,10 @@ class Mode(Enum):
 
     @property
     def custom_mode(self) -> int:
-        """The number in HEARTBEAT and CURRENT_MODE."""
         return self.main << 16 | self.sub << 24
 
     @property
     def label(self) -> str:
-        """The name in PX4's words: AUTO.LOITER."""
         return self.name.replace("_", ".")
 
     @property
@@ -56,7 +54,6 @@ class Mode(Enum):
 
     @property
     def is_auto(self) -> bool:
-        """One of the AUTO modes."""
         return self.main == MAIN_AUTO
 
     @property
@@ -128,7 +125,6 @@ class LostSticks:
 
     @property
     def active(self) -> bool:
-        """The failsafe has the vehicle."""
         return self.phase is not Phase.NONE
 
     @property
@@ -137,7 +133,6 @@ class LostSticks:
         return max(0.0, self._params["COM_FAIL_ACT_T"] - self._spent_s)
 
     def is_excepted(self, mode: Mode) -> bool:
-        """Lost sticks do not matter in this mode."""
         bits = self._params.integer("COM_RCL_EXCEPT")
         if mode in (Mode.AUTO_RTL, Mode.AUTO_LAND, Mode.TERMINATION):
             return True
@@ -148,7 +143,6 @@ class LostSticks:
         return mode.is_auto and bool(bits & _EXCEPT_AUTO)
 
     def start(self) -> None:
-        """The sticks have just been lost."""
         self.phase = Phase.HOLDING if self.delay_s > 0.0 else Phase.ACTING
 
     def clear(self) -> None:
@@ -169,7 +163,6 @@ class LostSticks:
         return True
 
     def mode(self) -> Mode:
-        """The mode that it demands now."""
         if self.phase is Phase.HOLDING:
             return Mode.AUTO_LOITER
         return _STICKS_LOST_MODES.get(self._params.integer("NAV_RCL_ACT"), Mode.AUTO_RTL)

@@ -177,5 +177,4 @@ class Px4Params(Params):
 
     @property
     def dead_zone(self) -> float:
-        """Share of the stick, on each side of the middle."""
         return self._values[DEAD_ZONE if DEAD_ZONE in self._values else "MPC_HOLD_DZ"]

@@ -173,7 +173,6 @@ class Px4Server(MavlinkServer[Px4, Px4Endpoint]):
         send_ack(link, message, mav.MAV_CMD_DO_SET_MODE, result)
 
     def _execute(self, message: Message, params: Params7, link: Px4Endpoint) -> int | None:
-        """As in the base; a change of mode depends on who asks."""
         if message.command == mav.MAV_CMD_DO_SET_MODE:
             return self._change_mode(message, *params[:3])
         return super()._execute(message, params, link)

@@ -103,7 +103,6 @@ class StickInput:
 
     @property
     def source(self) -> int | None:
-        """The link that wins, RC_SOURCE, or None."""
         return self._source if self.valid else None
 
     def pretend_centred(self, now_ns: int) -> None:
@@ -112,7 +111,6 @@ class StickInput:
         self._never_ages = True
 
     def on_sticks(self, source: int, sticks: Sticks, now_ns: int) -> None:
-        """Sticks have come from a source."""
         if self._wins(source):
             self._source = source
             if self._first_source is None:
@@ -156,7 +154,6 @@ class StickInput:
         return mode in _PRIORITIES and self._rank(source, mode) < self._rank(self._source, mode)
 
     def _rank(self, source: int | None, mode: int) -> float:
-        """The lowest wins."""
         receiver, links = _PRIORITIES[mode]
         if source is None:
             return math.inf
@@ -205,7 +202,6 @@ def climb_mps(sticks: Sticks, params: Px4Params) -> float:
 
 
 def yaw_rate_radps(sticks: Sticks, params: Px4Params) -> float:
-    """Yaw rate of every mode but ACRO."""
     share = curve(sticks.yaw, params.dead_zone, params.get("MPC_YAW_EXPO", EXPO))
     return math.radians(params["MPC_MAN_Y_MAX"]) * share
 
@@ -225,7 +221,6 @@ def lean_rad(sticks: Sticks, params: Px4Params) -> tuple[float, float]:
 
 
 def acro_rates_radps(sticks: Sticks, params: Px4Params) -> Vec3:
-    """Body rates of ACRO, linear."""
     return (
         math.radians(params["MC_ACRO_R_MAX"]) * sticks.right,
         -math.radians(params["MC_ACRO_P_MAX"]) * sticks.forward,

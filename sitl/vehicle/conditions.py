@@ -145,7 +145,6 @@ class _Draw:
         self.strength = strength
 
     def offset(self, half: float) -> float:
-        """Within +-half."""
         return self.strength * float(self.random.uniform(-half, half))
 
     def factor(self, most: float) -> float:
@@ -153,7 +152,6 @@ class _Draw:
         return math.exp(self.offset(math.log(most)))
 
     def amount(self, most: float) -> float:
-        """Within 0 .. most."""
         return self.strength * float(self.random.uniform(0.0, most))
 
     def tint(self, most: float) -> Vec3:
@@ -161,7 +159,6 @@ class _Draw:
         return (self.factor(most), self.factor(most), self.factor(most))
 
     def light(self, most_tint: float, most_brightness: float) -> Vec3:
-        """A tint of any brightness."""
         red, green, blue = self.tint(most_tint)
         brightness = self.factor(most_brightness)
         return (brightness * red, brightness * green, brightness * blue)
@@ -182,7 +179,6 @@ class _Draw:
 
 
 def _direction_ned(azimuth_rad: float, elevation_rad: float) -> Vec3:
-    """Unit vector to a point of the sky."""
     return (
         math.cos(elevation_rad) * math.cos(azimuth_rad),
         math.cos(elevation_rad) * math.sin(azimuth_rad),

@@ -237,7 +237,6 @@ class SensorNoise:
         self._is_exact = not self._sigma.any()
 
     def sense(self, truth: BodyState) -> BodyState:
-        """The state as the sensors report it."""
         if self._is_exact:
             return truth
         exact = (truth.velocity_ned_mps, truth.rate_body_radps, truth.specific_force_body_mps2)
@@ -254,7 +253,6 @@ SPIN_MIN = 0.05  # lowest thrust of an armed, flying motor
 
 
 def clamp(value: float, limit: float) -> float:
-    """The value within +-limit."""
     return max(-limit, min(limit, value))
 
 
@@ -272,7 +270,6 @@ class HeightController:
         self._height_m = self._climb_mps = self._integral_mps2 = 0.0
 
     def reset(self, body: BodyState) -> None:
-        """Start from the present height and climb rate."""
         self._height_m = -body.position_ned_m[2]
         self._climb_mps = -body.velocity_ned_mps[2]
         self._integral_mps2 = 0.0

@@ -45,6 +45,8 @@ MOST_GROWTH = {
 }
 """Growth of a process that is no leak yet: allocators keep what they once had."""
 REPORT_EVERY = 20
+REST_S = 2.5
+"""The engage switch must have rested low for 2 s."""
 ENGAGE_S = 10.0
 ENGAGE_TRIES = 6
 
