@@ -32,10 +32,8 @@ class PilotOptions(NamedTuple):
     """Who moves the receiver."""
 
     name: PilotName
-    axes: str
-    """Axes of a gamepad, as ``sitl.pilot.transmitter`` reads them."""
-    speed_mps: float
-    """Speed of the expert."""
+    axes: str  # axes of a gamepad, as ``sitl.pilot.transmitter`` reads them
+    speed_mps: float  # speed of the expert
 
 
 def run_vehicle(

@@ -16,8 +16,7 @@ from sitl.rotation import Quat, Vec3, conjugate, rotate, to_euler, wrap_pi
 OPENING_M = 2.4  # side of the opening: five times the width of a 0.5 m quadrotor
 BAR_M = 0.32  # width of the bars around an opening
 DEPTH_M = 0.24  # depth of the frame along the passage; the gate's centre is halfway in
-RACE_SEEDS = 1_000_000_000
-"""Seeds from here on are race courses, those below are easy ones."""
+RACE_SEEDS = 1_000_000_000  # seeds from here on are race courses, those below are easy ones
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -27,10 +26,8 @@ class Family:
     gate_count: int
     first_leg_m: float
     leg_m: tuple[float, float]
-    turn_rad: float
-    """Largest turn from one leg to the next, to either side."""
-    climb_m: float
-    """Largest change of height from gate to gate, up or down."""
+    turn_rad: float  # largest turn from one leg to the next, to either side
+    climb_m: float  # largest change of height from gate to gate, up or down
     first_altitude_m: tuple[float, float]
     altitude_m: tuple[float, float]
 

@@ -58,8 +58,7 @@ class Params:
         self._integers = integers
         self.names: tuple[str, ...] = tuple(self._values)
         """Names on the wire, in PARAM_VALUE's order."""
-        self.changes = 0
-        """Number of changed values: PX4 tells its modules, not which one."""
+        self.changes = 0  # number of changed values: PX4 tells its modules, not which one
 
     def __getitem__(self, name: str) -> float:
         return self._values[name]
@@ -115,25 +114,20 @@ class Params:
 class Autopilot(ABC):
     """One boot of the flight controller without its links; stamps are the caller's clock."""
 
-    step_ns: ClassVar[int]
-    """Control period: what `step` advances by."""
+    step_ns: ClassVar[int]  # control period: what `step` advances by
     airframe: ClassVar[Airframe]
     gps_period_ns: ClassVar[int]
     gyro_noise_radps: ClassVar[float] = 0.0
     """Noise of the body rates on each axis, on top of the conditions'."""
-    id_param: ClassVar[str]
-    """Parameter of the vehicle's system id."""
+    id_param: ClassVar[str]  # parameter of the vehicle's system id
 
     def __init__(self, params: Params, config: VehicleConfig, boot_ns: int) -> None:
-        self.params = params
-        """A reboot leaves them."""
+        self.params = params  # a reboot leaves them
         self.config = config
         self.boot_ns = boot_ns
-        self.now_ns = boot_ns
-        """Time of the last control step."""
+        self.now_ns = boot_ns  # time of the last control step
         self.landed = True
-        self.battery = Battery()
-        """Replaced as a whole by whoever wants another one."""
+        self.battery = Battery()  # replaced as a whole by whoever wants another one
         self.sensors_frozen = False
         """Fault: telemetry and control keep the last state, the physics goes on."""
         self.position_lost = False
@@ -148,8 +142,7 @@ class Autopilot(ABC):
         self._noise = SensorNoise(replace(conditions, rate_noise_radps=rate_noise_radps))
         self._physics = self._quad.at_rest()
         self.sensed = self._physics.body
-        self.gps = self._physics.body
-        """State at the last fix."""
+        self.gps = self._physics.body  # state at the last fix
         self._gps_due_ns = boot_ns
         self._still_since_ns: int | None = boot_ns
 

@@ -44,10 +44,8 @@ class SimulatedVehicle:
     ) -> None:
         config = config or VehicleConfig()
         self.log = FlightLog(boot_ns, course)
-        self.ap: Autopilot
-        """The flight controller since its last boot."""
-        self.server: MavlinkServer[Any, Any]
-        """The vehicle's links."""
+        self.ap: Autopilot  # the flight controller since its last boot
+        self.server: MavlinkServer[Any, Any]  # the vehicle's links
         if config.autopilot == "px4":
             px4_params = Px4Params(
                 config.conditions, receiver=config.receiver, release=config.px4_release

@@ -58,8 +58,7 @@ class GuidedControl:
         self._attitude = attitude
         self._height = height
         self.submode = Submode.ATTITUDE
-        self.velocity = VelocitySetpoint((0.0, 0.0, 0.0), 0.0)
-        """Followed in Submode.VELOCITY."""
+        self.velocity = VelocitySetpoint((0.0, 0.0, 0.0), 0.0)  # followed in Submode.VELOCITY
         self._takeoff_height_m = 0.0
         self._setpoint: AttitudeSetpoint | None = None
         self._has_thrust = False

@@ -13,8 +13,7 @@ from sitl.vehicle.conditions import NOMINAL, Conditions
 from sitl.vehicle.config import ArduPilotRelease
 
 RC_CHANNELS_WITH_PARAMS = 8
-DEFAULT_RATE_P = float32(0.135)
-"""Gain of the loop from body rates to torque, roll and pitch."""
+DEFAULT_RATE_P = float32(0.135)  # gain of the loop from body rates to torque, roll and pitch
 _FIXED = {
     "ACRO_BAL_PITCH": 1.0,
     "ACRO_BAL_ROLL": 1.0,

@@ -43,8 +43,7 @@ class RcEngine:
         self._switch = _OverrideSwitch()
         self.channels_us = [0] * CHANNELS
         """Channels that RC_CHANNELS reports and the modes use; 0 = never had a value."""
-        self.found = receiver_us is not None
-        """True with a receiver, or once an override has come."""
+        self.found = receiver_us is not None  # true with a receiver, or once an override has come
 
     @property
     def has_receiver(self) -> bool:
@@ -212,8 +211,7 @@ class _OverrideSwitch:
 
 
 THROTTLE_FULL = 1000.0
-GESTURE_NS = 2 * NS_PER_S
-"""ArduCopter's ARM_DELAY and DISARM_DELAY of the sticks."""
+GESTURE_NS = 2 * NS_PER_S  # ArduCopter's ARM_DELAY and DISARM_DELAY of the sticks
 FULL_YAW = 4000 / 4500
 _OPTION_SIMPLE, _OPTION_SUPER_SIMPLE = 3, 13
 _LOW_US, _HIGH_US = 1200, 1800

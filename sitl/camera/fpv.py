@@ -25,18 +25,15 @@ LOWEST_EYE_M = 0.12
 GATE_HAZE_M = 90.0  # distance at which a gate has lost 63 % of its contrast
 GROUND_FADE_M = 14.0
 """Distance at which the ground has lost 3/4 of its contrast; farther out it would alias."""
-GLOW_SHARE = 0.18
-"""Share of the image's width at which the sun's glow has lost 63 %."""
+GLOW_SHARE = 0.18  # share of the image's width at which the sun's glow has lost 63 %
 SUBPIXEL_BITS = 4  # corners are rounded to 1/16 pixel
 REFERENCE_WIDTH_PX = 224  # image width for which the conditions give the blur
 NOISE_MARGIN_PX = 61
 """Noise is drawn once, this much larger than the image, and cropped anew for every frame."""
 SMEAR_STEP_PX = 1.5
 """Motion on the optical axis between two of the images that a smeared one is the mean of."""
-MOST_SMEARED = 8
-"""Most images in that mean."""
-STILL: Vec3 = (0.0, 0.0, 0.0)
-"""The rate of a camera that does not turn."""
+MOST_SMEARED = 8  # most images in that mean
+STILL: Vec3 = (0.0, 0.0, 0.0)  # the rate of a camera that does not turn
 
 Pixels = NDArray[np.float32]
 

@@ -21,15 +21,13 @@ PIP_M = 0.16
 PIP_PITCH_M = 0.32  # white squares on the front of the top bar: the gate's number, counted from one
 INSIDE_BRIGHTNESS = 0.7
 SHADE_BRIGHTNESS = 0.4
-PANEL_AHEAD_M = (2.0, 4.5)
-"""Distance before the gate of a panel that hides a part of it."""
+PANEL_AHEAD_M = (2.0, 4.5)  # distance before the gate of a panel that hides a part of it
 PANEL_ASIDE_M = (1.3, 1.9)
 """From the way to its middle, to either side. Nothing flies through one, and nothing can hit it."""
 PANEL_WIDTH_M = 1.2
 STRAY_AHEAD_M = (-3.0, 3.0)
 """Distance of a gate that is out of order beyond the one that it stands beside."""
-STRAY_ASIDE_M = (5.0, 8.0)
-"""From the middle of that gate, to either side. It cannot be hit."""
+STRAY_ASIDE_M = (5.0, 8.0)  # from the middle of that gate, to either side. It cannot be hit.
 STRAY_TURN_RAD = math.radians(120.0)
 """Largest turn of its passage against the other's, to either side."""
 STRAY_CLEARANCE_M = 4.5
@@ -76,12 +74,10 @@ class _Face(NamedTuple):
 class Faces:
     """Flat quadrilaterals in world coordinates."""
 
-    corners_ned_m: FloatArray
-    """[N, 4, 3]"""
+    corners_ned_m: FloatArray  # [N, 4, 3]
     normals_ned: FloatArray
     """[N, 3] unit, towards the side from which a face is seen; zero = it is seen from both."""
-    rgb: FloatArray
-    """[N, 3], lit by the sun."""
+    rgb: FloatArray  # [N, 3], lit by the sun
     owner: NDArray[np.intp]
     """[N] row in ``centers_ned_m`` of what a face belongs to. Of the faces of one that are seen
     from a point, a later one is never hidden by an earlier one."""

@@ -66,17 +66,13 @@ class Agility:
     corner_accel_mps2: float
     """Most that the planned path may need before it slows down; the rest is for gusts and
     mistakes."""
-    along_accel_mps2: tuple[float, float]
-    """Braking, negative, and speeding up."""
+    along_accel_mps2: tuple[float, float]  # braking, negative, and speeding up
     planned_braking_mps2: float
     planned_accel_mps2: float
-    climb_accel_mps2: float
-    """Vertical; what it counts on to get into the opening of a gate."""
-    climb_lead_s: float
-    """The climb rate that is demanded is the planned one so much later."""
+    climb_accel_mps2: float  # vertical; what it counts on to get into the opening of a gate
+    climb_lead_s: float  # the climb rate that is demanded is the planned one so much later
     takeoff_climb_mps: float
-    braking_distance_m: float
-    """Beyond the last gate, until it brakes in full."""
+    braking_distance_m: float  # beyond the last gate, until it brakes in full
 
 
 class CourseGuide:

@@ -15,8 +15,7 @@ HOVER_THRUST = 0.39
 TILT_GAIN_PER_S = 8.0
 CLIMB_GAIN_PER_S = 4.0
 MAX_TILT_RAD = math.radians(62.0)
-FORCE_MPS2 = (3.0, 21.0)
-"""Least and most specific force."""
+FORCE_MPS2 = (3.0, 21.0)  # least and most specific force
 MAX_RATE_RADPS = math.radians(200.0)
 MAX_YAW_RATE_RADPS = math.radians(115.0)
 
@@ -24,8 +23,7 @@ MAX_YAW_RATE_RADPS = math.radians(115.0)
 class RateCommand(NamedTuple):
     """Collective thrust and body rates, in FRD axes and the order of the action vector."""
 
-    thrust: float
-    """In [0, 1]; ``HOVER_THRUST`` hovers."""
+    thrust: float  # in [0, 1]; ``HOVER_THRUST`` hovers
     roll_radps: float
     pitch_radps: float
     yaw_radps: float

@@ -140,8 +140,7 @@ class MavlinkServer(ABC, Generic[Ap, Link]):
 
     def __init__(self, ap: Ap, links: Sequence[Link], log: FlightLog) -> None:
         self.links = tuple(links)
-        self.reboot_requested = False
-        """A command has requested a reboot."""
+        self.reboot_requested = False  # a command has requested a reboot
         self._ap = ap
         self._log = log
         self._handlers: dict[str, Callable[[Link, Message, int], None]] = {
@@ -156,7 +155,7 @@ class MavlinkServer(ABC, Generic[Ap, Link]):
         }
         """By message: the link, the message, its arrival."""
         self._commands: dict[int, Callable[[Params7, Link], int | None]] = {
-            mav.MAV_CMD_GET_MESSAGE_INTERVAL: self._get_interval,
+            mav.MAV_CMD_GET_MESSAGE_INTERVAL: self._get_interval
         }
         """By number: MAV_RESULT for the ack, None for no ack."""
 

@@ -21,12 +21,9 @@ class Home(NamedTuple):
 
     lat_deg: float
     lon_deg: float
-    alt_m: float
-    """Above mean sea level."""
-    field_ned_gauss: Vec3
-    """Magnetic field of the earth."""
-    pressure_hpa: float
-    """Of the air at this altitude."""
+    alt_m: float  # above mean sea level
+    field_ned_gauss: Vec3  # magnetic field of the earth
+    pressure_hpa: float  # of the air at this altitude
     temperature_c: float
 
     def lat_lon_e7(self, north_m: float, east_m: float) -> tuple[int, int]:

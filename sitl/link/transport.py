@@ -221,8 +221,7 @@ def split_frames(data: bytes, limit: int) -> Iterator[bytes]:
 
 
 HOST = "127.0.0.1"
-MAX_RC_READS = 100
-"""Per call, so that a flood cannot stop the loop."""
+MAX_RC_READS = 100  # per call, so that a flood cannot stop the loop
 _LAYOUTS = {layout.size: layout for layout in (struct.Struct("<8H"), struct.Struct("<16H"))}
 
 

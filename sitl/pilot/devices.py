@@ -107,8 +107,7 @@ KEYS_HELP = (
     "W S climb, A D turn, arrows lean; hold Enter to arm, Backspace to disarm; Space moves the "
     "switch of channel 7 up and down, X to its middle"
 )
-DEFLECTION = 0.7
-"""Share of full travel; with Shift all of it."""
+DEFLECTION = 0.7  # share of full travel; with Shift all of it
 TRAVEL_PER_S = 4.0
 """Sticks move towards where the keys want them at this speed: a thumb's, and not a jump."""
 _SIZE_PX = (460, 120)

@@ -12,10 +12,8 @@ from sitl.simulated_vehicle import SimulatedVehicle
 
 SWITCH_CHANNEL = 7
 """Channel of the pilot's spare switch, from 1; `mavbridge record --episode-channel 7`."""
-OFF_US = (0,) * 8
-"""No signal: the receiver has lost the transmitter."""
-PERIOD_NS = 20 * NS_PER_MS
-"""Between two frames of a receiver."""
+OFF_US = (0,) * 8  # no signal: the receiver has lost the transmitter
+PERIOD_NS = 20 * NS_PER_MS  # between two frames of a receiver
 GESTURE_THROTTLE, GESTURE_YAW = -1.0, 1.0
 _SWITCH_US = {"low": 1000, "middle": 1500, "high": 2000}
 _FIRST_MODE_US, _MODE_US = 1100, 1500
@@ -138,8 +136,7 @@ def past_dead_zone(value: float) -> float:
 WAIT_NS = 8 * NS_PER_S
 """From boot to the arming gesture: the estimator needs 3 s for the attitude and 5 s for the
 position, and whoever records asks for parameters and streams."""
-HOVER_NS = 2 * NS_PER_S
-"""After the last gate, before the landing."""
+HOVER_NS = 2 * NS_PER_S  # after the last gate, before the landing
 IDLE = CENTRED._replace(throttle=-1.0)
 DESCENT = CENTRED._replace(throttle=-0.8)
 

@@ -21,7 +21,6 @@ _FNV1A_32_OFFSET, _FNV1A_32_PRIME = 0x811C9DC5, 0x01000193
 
 ARM_REASON_GESTURE, ARM_REASON_COMMAND, ARM_REASON_LANDING = 1, 4, 6
 ARM_REASON_INACTION = 7
-"""Reasons of arming and disarming, as the events carry them."""
 REASON_NAMES = {
     ARM_REASON_GESTURE: "stick gesture",
     ARM_REASON_COMMAND: "external command",
@@ -75,13 +74,11 @@ class Commander:
         self.mode = self.intended = self._last_armable = boot_mode
         self.armed = False
         self.terminated = False
-        self.landed = True
-        """Told by the autopilot, as the next three."""
+        self.landed = True  # told by the autopilot, as the next three
         self.estimator_ready = self.position_ready = False
         self.setpoint_fresh = False
         self.lost_sticks = LostSticks(params)
-        self.events: list[Event] = []
-        """Events to send; the reader empties the list."""
+        self.events: list[Event] = []  # events to send; the reader empties the list
         self._texts = texts
         self._fallback = False
         self._sticks_missed = True  # lost, and that is known

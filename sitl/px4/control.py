@@ -37,15 +37,13 @@ STILL: NorthEast = (0.0, 0.0)
 
 RATE_GAIN_PER_S = 14.0  # roll and pitch, at the default MC_ROLLRATE_P and MC_PITCHRATE_P
 YAW_GAIN_PER_S = 2.6
-TARGET_DELAY_STEPS = 9
-"""Control steps until an attitude that is asked for is flown: 36 ms."""
+TARGET_DELAY_STEPS = 9  # control steps until an attitude that is asked for is flown: 36 ms
 YAW_TORQUE_LAG_S = 0.08  # MC_YAW_TQ_CUTOFF 2 Hz
 MAX_VELOCITY_INTEGRAL_MPS2 = 4.0
 HOLD_BELOW_MPS = 0.3  # braking ends at this speed, and the place of that moment is held
 BRAKING_PER_S = 1.0  # of POSCTL with centred sticks
 MOVING_MPS = 0.5
-REACTION_S = 0.85
-"""How long AUTO keeps the lean of a moving vehicle before it brakes, as measured."""
+REACTION_S = 0.85  # how long AUTO keeps the lean of a moving vehicle before it brakes, as measured
 
 
 class RateController:
@@ -152,10 +150,8 @@ class Horizontal:
     def __init__(self, params: Px4Params) -> None:
         self._params = params
         self._velocity = VelocityController(params)
-        self.accel_mps2 = STILL
-        """Acceleration that was asked for last."""
-        self.speed_mps = STILL
-        """Velocity that was asked for last."""
+        self.accel_mps2 = STILL  # acceleration that was asked for last
+        self.speed_mps = STILL  # velocity that was asked for last
         self._path_accel = STILL
         self._place_m: NorthEast | None = None  # on the path, or the place that POSCTL holds
         self._stop_m = STILL
@@ -228,10 +224,7 @@ class Horizontal:
         accel_n = now_n + clamp(wanted[0] - now_n, step)
         accel_e = now_e + clamp(wanted[1] - now_e, step)
         self._path_accel = (accel_n, accel_e)
-        self.speed_mps = (
-            self.speed_mps[0] + accel_n * dt_s,
-            self.speed_mps[1] + accel_e * dt_s,
-        )
+        self.speed_mps = (self.speed_mps[0] + accel_n * dt_s, self.speed_mps[1] + accel_e * dt_s)
 
     def _towards(self, place_m: NorthEast, body: BodyState) -> NorthEast:
         gain = self._params["MPC_XY_P"]

@@ -15,13 +15,7 @@ from sitl.clock import NS_PER_S
 from sitl.link.server import MAX_STATUSTEXT, Endpoint
 from sitl.px4.autopilot import Px4
 from sitl.px4.commander import Event
-from sitl.px4.messages import (
-    BUILDERS,
-    BUILDERS_1_14,
-    CURRENT_MODE,
-    event_message,
-    topic_version,
-)
+from sitl.px4.messages import BUILDERS, BUILDERS_1_14, CURRENT_MODE, event_message, topic_version
 
 NS_PER_US = 1000
 LOWEST_SCALE = 0.05
@@ -156,8 +150,7 @@ class Px4Endpoint(Endpoint[Px4]):
 
     def restart(self, ap: Px4) -> None:
         super().restart(ap)
-        self.has_gcs = False
-        """A ground station's heartbeat has come; without one no text is sent."""
+        self.has_gcs = False  # a ground station's heartbeat has come; without one no text is sent
         self._streams = Px4Streams(self._default_hz, ap.config.link_bytes_ps, ap.now_ns)
         self._heartbeat_due_ns = ap.now_ns
         self._looked_ns = ap.now_ns

@@ -53,18 +53,14 @@ class Px4Control:
         self._target_m: NorthEast | None = None
         self._home_reached = False
         self._returns_to_m: float | None = None
-        self.takeoff_to_m = 0.0
-        """Height at which AUTO.TAKEOFF ends."""
+        self.takeoff_to_m = 0.0  # height at which AUTO.TAKEOFF ends
         self.most_climb_mps = math.inf
         """Bound on the climb rate while the vehicle leaves the ground."""
-        self.thrust = 0.0
-        """Commanded collective, 0..1."""
-        self.attitude: Quat = IDENTITY
-        """Demanded attitude, as ATTITUDE_TARGET reports it."""
+        self.thrust = 0.0  # commanded collective, 0..1
+        self.attitude: Quat = IDENTITY  # demanded attitude, as ATTITUDE_TARGET reports it
         self.velocity_ned_mps: Vec3 = (0.0, 0.0, 0.0)
         """Demanded velocity, as POSITION_TARGET_LOCAL_NED reports it."""
-        self.yaw_rate_radps = 0.0
-        """Demanded yaw rate, in the same message."""
+        self.yaw_rate_radps = 0.0  # demanded yaw rate, in the same message
 
     @property
     def rates_radps(self) -> Vec3:

@@ -23,17 +23,11 @@ GESTURE_LOW_THROTTLE, GESTURE_FULL_YAW, GESTURE_MOST_LEAN = -0.9, 0.9, 0.3
 FAST_SAMPLES = 3
 """1.18: so many movements in a row the same way are a hand's (MIN_SIGN_CONSECUTIVE); samples at
 rest between them do not count, so that a stick which has come to rest keeps them."""
-OLD_TAU_S, TAU_S = 0.1, 0.05
-"""Of the low-pass of a stick's speed, before 1.18 and there."""
+OLD_TAU_S, TAU_S = 0.1, 0.05  # of the low-pass of a stick's speed, before 1.18 and there
 
 _ANY_SOURCE_MODES = (2, 3, 5, 6, 7, 8)
 _KEEP_FIRST = 3
-_PRIORITIES = {
-    5: (RC_SOURCE, "low"),
-    6: (None, "low"),
-    7: (RC_SOURCE, "high"),
-    8: (None, "high"),
-}
+_PRIORITIES = {5: (RC_SOURCE, "low"), 6: (None, "low"), 7: (RC_SOURCE, "high"), 8: (None, "high")}
 """COM_RC_IN_MODE: whether the receiver comes first (else last), and which link wins."""
 
 
@@ -62,8 +56,7 @@ class StickSpeed:
 
     def __init__(self) -> None:
         self.per_s = 0.0
-        self.moves_one_way = 0
-        """Movements in a row in one direction."""
+        self.moves_one_way = 0  # movements in a row in one direction
         self._last: float | None = None
         self._is_up = False
 
@@ -85,10 +78,8 @@ class StickInput:
     def __init__(self, params: Px4Params) -> None:
         self._params = params
         self.sticks = Sticks()
-        self.valid = False
-        """The winner still sends."""
-        self.count = 0
-        """Samples chosen so far: a reader sees by it that there is a new one."""
+        self.valid = False  # the winner still sends
+        self.count = 0  # samples chosen so far: a reader sees by it that there is a new one
         self.sampled_ns = 0
         self.moved_fast = False
         """A stick moves faster than COM_RC_STICK_OV, or MAN_OVERRIDE_SPD, allows."""

@@ -332,9 +332,7 @@ def _make_glare(usual: Conditions, draw: _Draw) -> Conditions:
     """The sun stands ahead on the first leg, to 60 degrees to either side."""
     azimuth_rad, elevation_rad = draw.offset(math.pi / 3), math.radians(4.0 + draw.amount(14.0))
     return replace(
-        usual,
-        glare=0.5 + draw.amount(0.5),
-        sun_ned=_direction_ned(azimuth_rad, elevation_rad),
+        usual, glare=0.5 + draw.amount(0.5), sun_ned=_direction_ned(azimuth_rad, elevation_rad)
     )
 
 

@@ -5,8 +5,7 @@ from typing import Literal, NamedTuple, TypeAlias
 
 from sitl.vehicle.conditions import NOMINAL, Conditions
 
-STEP_NS = 2_500_000
-"""Grid on which a vehicle is served: receive, advance to now, send."""
+STEP_NS = 2_500_000  # grid on which a vehicle is served: receive, advance to now, send
 
 IDLE_RECEIVER_US = (1500, 1500, 1000, 1500, 1500, 1500, 1500, 1500)
 """An untouched transmitter: throttle down, the rest centred."""
@@ -36,10 +35,8 @@ class Battery(NamedTuple):
 class SigningKey(NamedTuple):
     """MAVLink 2 signing of every link."""
 
-    key: bytes
-    """32 bytes."""
-    timestamp: int
-    """Timestamp of the first packet, in units of 10 us since 2015."""
+    key: bytes  # 32 bytes
+    timestamp: int  # timestamp of the first packet, in units of 10 us since 2015
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

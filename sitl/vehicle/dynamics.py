@@ -38,8 +38,7 @@ class Airframe:
     rotor_drag_nspm: float = 0.15
     """Linear drag of spinning rotors, about 0.1 1/s of mass at this size; body drag is MuJoCo's own
     quadratic model on the equivalent inertia box."""
-    air_density_kgpm3: float = 1.225
-    """0 leaves the rotors' drag alone."""
+    air_density_kgpm3: float = 1.225  # 0 leaves the rotors' drag alone
     step_ns: int = 1_250_000
     """Step of the physics; a firmware's control period is a whole number of them."""
 

@@ -15,19 +15,12 @@ from helpers.copter_companion import CopterCompanion
 from helpers.px4_companion import Px4Companion
 from sitl.vehicle.config import IDLE_RECEIVER_US, AutopilotName, VehicleConfig
 
-PEER, ALLOW, RECEIVER = (
-    "MAVBRIDGE_TEST_PEER",
-    "MAVBRIDGE_TEST_ALLOW",
-    "MAVBRIDGE_TEST_RECEIVER",
-)
+PEER, ALLOW, RECEIVER = ("MAVBRIDGE_TEST_PEER", "MAVBRIDGE_TEST_ALLOW", "MAVBRIDGE_TEST_RECEIVER")
 PERMISSIONS = ("ground", "arm", "fly")
 """What tests may do to a real flight controller; each allows what is before it, too."""
 COPTER_FIXTURES = ("companion", "armable", "grounded", "flying", "expendable", "without_receiver")
 PX4_FIXTURES = ("px4", "px4_armable", "px4_grounded", "px4_flying", "px4_expendable")
-FIRMWARES = {
-    mav.MAV_AUTOPILOT_ARDUPILOTMEGA: COPTER_FIXTURES,
-    mav.MAV_AUTOPILOT_PX4: PX4_FIXTURES,
-}
+FIRMWARES = {mav.MAV_AUTOPILOT_ARDUPILOTMEGA: COPTER_FIXTURES, mav.MAV_AUTOPILOT_PX4: PX4_FIXTURES}
 FOUND_WITHIN_S = 30.0
 
 

@@ -14,13 +14,7 @@ from pathlib import Path
 from typing import Any, Literal
 
 from faults.link import Carrier, UdpCarrier
-from faults.processes import (
-    Process,
-    StageError,
-    child_of,
-    mapped_memory,
-    processes_with,
-)
+from faults.processes import Process, StageError, child_of, mapped_memory, processes_with
 from faults.props import FrameFeed, Transmitter, Viewer
 from faults.record import VehicleReport
 from faults.relay import Relay

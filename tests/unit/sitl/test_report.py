@@ -40,18 +40,6 @@ def test_a_release_is_no_gap():
     assert summary["releases"] == {"count": 2, "t_s": [0.03, 0.04]}
 
 
-def test_a_report_without_overrides_holds_nulls_not_zeros():
-    overrides = logged([])["overrides"]
-
-    assert overrides == {
-        "count": 0,
-        "first_t_s": None,
-        "last_t_s": None,
-        "rate_hz": None,
-        "gap_ms": None,
-    }
-
-
 def test_releases_and_foreign_overrides_on_the_link_are_distinguished():
     vehicle = SimulatedVehicle(links=1, boot_ns=0)
     sender = mav.MAVLink(None, srcSystem=255)
@@ -111,13 +99,6 @@ def test_after_a_stall_a_stick_is_not_recorded_before_it_came():
 
     changed = vehicle.log.summary(vehicle.ap, 0)["sticks"][1]
     assert (changed["us"][0], changed["t_s"]) == (1700, 0.3)
-
-
-def test_a_vehicle_at_rest_adds_nothing_to_the_record(pilot):
-    log, watch = flown(pilot)
-    pilot.hold(3.0, thr=1000, watch=watch)
-
-    assert len(log.summary(pilot.ap, 0)["sticks"]) == 1
 
 
 def flown(pilot, course=None):

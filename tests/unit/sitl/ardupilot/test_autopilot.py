@@ -7,16 +7,6 @@ import pytest
 from sitl.ardupilot.flight_modes import Mode
 
 
-def test_alt_hold_holds_the_height_within_30_cm(pilot):
-    pilot.take_off()
-    start_m = pilot.height_m
-    heights_m = []
-
-    pilot.hold(20.0, watch=lambda ap: heights_m.append(-ap.truth.position_ned_m[2]))
-
-    assert max(abs(height - start_m) for height in heights_m) < 0.3
-
-
 def test_alt_hold_keeps_its_height_while_leaning(pilot):
     pilot.take_off()
     start_m = pilot.height_m
@@ -37,15 +27,6 @@ def test_a_roll_step_acts_within_the_measured_time(pilot):
     first_ns = samples[0][0]
     reached = next(stamp_ns for stamp_ns, roll_deg in samples if roll_deg >= 2.0)
     assert 0.06 <= (reached - first_ns) / 1e9 <= 0.126
-
-
-def test_yaw_turns_at_the_commanded_rate_and_stays_level(pilot):
-    pilot.take_off()
-    pilot.hold(2.5, yaw=1700)
-    roll, pitch, _ = pilot.angles_deg()
-
-    assert math.degrees(pilot.ap.truth.rate_body_radps[2]) == pytest.approx(75.9, abs=1.0)
-    assert (roll, pitch) == pytest.approx((0.0, 0.0), abs=0.5)
 
 
 def test_stabilize_hovers_at_mid_stick_and_climbs_above(pilot):
@@ -81,23 +62,6 @@ def test_acro_trainer_limits_the_lean_and_without_it_there_is_none(pilot):
     leans_deg.clear()
     pilot.hold(1.0, roll=2000, watch=lambda ap: leans_deg.append(abs(pilot.angles_deg()[0])))
     assert max(leans_deg) > 150.0
-
-
-def test_land_comes_down_gently_and_disarms_itself(pilot):
-    pilot.take_off()
-    assert pilot.ap.set_mode(Mode.LAND)
-    touch_speeds = []
-
-    def watch(ap):
-        if not ap.truth.touching:
-            touch_speeds.append(ap.truth.velocity_ned_mps[2])
-
-    pilot.hold(20.0, watch=watch)
-
-    assert not pilot.ap.armed
-    assert pilot.ap.landed
-    assert touch_speeds[-1] < 0.8
-    assert "Disarming motors" in pilot.texts()
 
 
 def test_rtl_comes_home_and_lands(pilot):
@@ -136,16 +100,6 @@ def test_full_throttle_down_in_alt_hold_lands_and_disarms_after_the_delay(pilot)
     assert not pilot.ap.armed
 
 
-def test_a_landed_vehicle_takes_off_again(pilot):
-    pilot.take_off(height_m=2.0)
-    pilot.hold(4.0, thr=1000)
-    assert pilot.ap.landed
-
-    pilot.hold(3.0, thr=1800)
-
-    assert pilot.height_m > 1.0
-
-
 def test_a_tipped_vehicle_stops_its_motors(pilot):
     pilot.ap.params.set("ACRO_TRAINER", 0.0)
     pilot.take_off(height_m=3.0, mode=Mode.ACRO)
@@ -163,10 +117,6 @@ def test_arming_waits_for_the_estimator(pilot):
 
     pilot.hold(1.1, thr=1000)
     assert pilot.ap.arm(force=False)
-
-
-def test_forced_arming_skips_the_checks(pilot):
-    assert pilot.ap.arm(force=True)
 
 
 @pytest.mark.parametrize("mode", [Mode.LAND, Mode.RTL, Mode.BRAKE])
@@ -217,53 +167,6 @@ def test_without_a_receiver_silence_becomes_rtl_out_of_every_mode(pilot_without_
 
     assert pilot.ap.mode is Mode.RTL
     assert pilot.texts() == ["Radio Failsafe"]
-
-
-def test_a_mode_set_after_the_radio_failsafe_fired_stays(pilot_without_receiver):
-    pilot = pilot_without_receiver
-    pilot.take_off()
-    pilot.silence(1.5)
-    assert pilot.ap.set_mode(Mode.BRAKE)
-
-    pilot.silence(5.0)
-
-    assert pilot.ap.mode is Mode.BRAKE
-
-
-@pytest.mark.parametrize(
-    ("mode", "after", "text"),
-    [
-        (Mode.LAND, Mode.LAND, "Radio Failsafe - Continuing Landing"),
-        (Mode.BRAKE, Mode.RTL, "Radio Failsafe"),
-    ],
-)
-def test_fs_options_bit_3_lets_a_landing_go_on(pilot_without_receiver, mode, after, text):
-    pilot = pilot_without_receiver
-    pilot.ap.params.set("FS_OPTIONS", 24.0)
-    pilot.take_off(mode=mode)
-
-    pilot.silence(1.1)
-
-    assert pilot.ap.mode is after
-    assert pilot.texts() == [text]
-
-
-@pytest.mark.parametrize(("choice", "is_level_after_3_s"), [(1.0, True), (0.0, False)])
-def test_zeros_without_a_receiver_leave_the_lean(
-    pilot_without_receiver, choice, is_level_after_3_s
-):
-    """For a second, until the failsafe; with that switched off for good, whatever the timeout."""
-    pilot = pilot_without_receiver
-    pilot.ap.params.set("FS_THR_ENABLE", choice)
-    pilot.take_off(height_m=8.0)
-    pilot.hold(1.0, roll=1700)
-    pilot.ap.rc.override([0] * 8, pilot.ap.now_ns)
-    pilot.silence(0.95)
-    held_deg = pilot.angles_deg()[0]
-    pilot.silence(3.05)
-
-    assert held_deg == pytest.approx(11.25, abs=0.1)
-    assert (pilot.angles_deg()[0] < 2.0) == is_level_after_3_s
 
 
 def test_the_transmitter_switched_off_is_a_radio_failsafe(pilot):
@@ -330,38 +233,6 @@ def test_a_throttle_below_fs_thr_value_is_a_radio_failsafe_after_three_reads(pil
     assert pilot.texts() == ["Radio Failsafe", "Radio Failsafe Cleared"]
 
 
-def test_with_a_receiver_silence_gives_the_sticks_back_after_three_seconds(pilot):
-    pilot.take_off()
-    pilot.hold(0.5, roll=1600)
-    pilot.silence(2.9)
-    held_deg = pilot.angles_deg()[0]
-    pilot.silence(2.0)
-
-    assert held_deg == pytest.approx(5.0, abs=0.2)
-    assert pilot.ap.truth.velocity_ned_mps[2] > 1.5
-    assert pilot.ap.mode is Mode.ALT_HOLD
-    assert pilot.texts() == []
-
-
-def test_gcs_failsafe_drops_overrides_and_leaves_the_pilot_in_control(pilot):
-    pilot.ap.params.set("FS_GCS_ENABLE", 1.0)
-    pilot.ap.params.set("RC_OVERRIDE_TIME", -1.0)
-    pilot.take_off()
-    pilot.ap.gcs_failsafe.on_contact(pilot.ap.now_ns)
-    pilot.hold(0.1, roll=1600)
-    pilot.silence(4.8)
-    assert pilot.ap.rc.channels_us[0] == 1600
-
-    pilot.silence(0.7)
-
-    assert pilot.texts() == ["GCS Failsafe - Continuing Pilot Control"]
-    assert pilot.ap.mode is Mode.ALT_HOLD
-    assert pilot.ap.rc.channels_us[0] == 1500
-    pilot.ap.gcs_failsafe.on_contact(pilot.ap.now_ns)
-    pilot.silence(0.5)
-    assert pilot.texts() == ["GCS Failsafe Cleared"]
-
-
 @pytest.mark.parametrize(("choice", "mode"), [(1, Mode.RTL), (5, Mode.LAND)])
 def test_gcs_failsafe_can_end_the_flight(pilot, choice, mode):
     pilot.ap.params.set("FS_GCS_ENABLE", float(choice))
@@ -372,12 +243,3 @@ def test_gcs_failsafe_can_end_the_flight(pilot, choice, mode):
     pilot.silence(5.5)
 
     assert pilot.ap.mode is mode
-
-
-def test_two_runs_are_identical(pilot, pilot_without_receiver):
-    other = type(pilot)(pilot.ap.config)
-    for one in (pilot, other):
-        one.take_off()
-        one.hold(1.0, roll=1650, yaw=1400)
-
-    assert pilot.ap.truth == other.ap.truth

@@ -12,7 +12,6 @@ from sitl.rotation import from_euler, to_euler
 from sitl.vehicle.config import MID_RECEIVER_US, STEP_NS, VehicleConfig
 
 ZERO = (0.0, 0.0, 0.0)
-LEVEL = from_euler(0.0, 0.0, 0.0)
 BOTH = (Mode.GUIDED, Mode.GUIDED_NOGPS)
 
 
@@ -133,18 +132,6 @@ def test_velocity_steps_take_the_measured_times(pilot, setpoint, read, final, me
     assert times == pytest.approx(measured_ms, rel=0.09, abs=45)
 
 
-def test_a_velocity_that_stopped_fades_after_the_timeout(pilot):
-    in_the_air(pilot)
-    stream(pilot, 4.0, move(north=2.0))
-
-    pilot.silence(3.3)
-    held_mps = pilot.ap.truth.velocity_ned_mps[0]
-    pilot.silence(1.2)
-
-    assert held_mps > 1.8
-    assert abs(pilot.ap.truth.velocity_ned_mps[0]) < 0.2
-
-
 def test_rates_go_on_until_the_timeout_then_it_is_level_at_its_height(pilot):
     in_the_air(pilot, Mode.GUIDED_NOGPS)
     pilot.ap.params.set("GUID_OPTIONS", 8.0)
@@ -227,28 +214,6 @@ def test_a_vehicle_landed_by_thrust_stays_armed(pilot):
     assert pilot.ap.armed
 
 
-def test_on_the_ground_an_idle_throttle_disarms_after_the_delay(pilot):
-    pilot = type(pilot)(VehicleConfig())
-    armed(pilot, Mode.GUIDED_NOGPS)
-
-    pilot.silence(9.5)
-    assert pilot.ap.armed
-    pilot.silence(1.0)
-
-    assert not pilot.ap.armed
-
-
-def test_a_takeoff_does_not_survive_disarming(pilot):
-    armed(pilot, Mode.GUIDED)
-    assert pilot.ap.take_off(6.0)
-    assert pilot.ap.disarm(force=False)
-    assert pilot.ap.arm(force=False)
-
-    pilot.silence(6.0)
-
-    assert pilot.ap.landed
-
-
 def test_guided_nogps_accepts_a_takeoff_and_stays(pilot):
     armed(pilot, Mode.GUIDED_NOGPS)
     assert pilot.ap.take_off(6.0)
@@ -256,13 +221,6 @@ def test_guided_nogps_accepts_a_takeoff_and_stays(pilot):
     pilot.silence(6.0)
 
     assert pilot.ap.landed
-
-
-@pytest.mark.parametrize(("mode", "height_m"), [(Mode.ALT_HOLD, 5.0), (Mode.GUIDED, -1.0)])
-def test_no_takeoff_in_other_modes_or_downwards(pilot, mode, height_m):
-    armed(pilot, mode)
-
-    assert not pilot.ap.take_off(height_m)
 
 
 def test_without_gps_guided_is_taken_on_the_ground_but_arms_only_in_nogps(pilot):
@@ -281,13 +239,3 @@ def test_without_gps_guided_is_taken_on_the_ground_but_arms_only_in_nogps(pilot)
     assert pilot.texts() == ["Mode change to GUIDED failed: requires position"]
     assert pilot.ap.set_mode(Mode.LAND)
     assert pilot.ap.set_mode(Mode.GUIDED_NOGPS)
-
-
-def test_the_thrust_of_a_climb_rate_is_that_of_the_height_controller(pilot):
-    in_the_air(pilot, Mode.GUIDED_NOGPS)
-    stream(pilot, 2.0, lean(thrust=0.5))
-
-    assert pilot.ap.control.thrust == pytest.approx(pilot.ap.params["MOT_THST_HOVER"], abs=0.02)
-    attitude, rate_radps = pilot.ap.control.target
-    assert attitude == pytest.approx(LEVEL, abs=0.01)
-    assert rate_radps == pytest.approx(ZERO, abs=0.01)

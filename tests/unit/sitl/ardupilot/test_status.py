@@ -1,7 +1,5 @@
 """What the vehicle says about itself: heartbeats, SYS_STATUS, battery, landed state; two pilots."""
 
-from itertools import pairwise
-
 import pytest
 from pymavlink.dialects.v20 import ardupilotmega as mav
 
@@ -94,20 +92,6 @@ def test_a_radio_failsafe_shows_in_heartbeat_and_receiver_health(station_of):
     assert latest(messages, "HEARTBEAT").custom_mode == Mode.RTL
 
 
-def test_without_a_receiver_channels_are_zero_and_then_the_last_ones_stay(station_of):
-    station = station_of(config=WITHOUT_RECEIVER)
-    station.interval(mav.MAVLINK_MSG_ID_RC_CHANNELS, 50)
-
-    def channels_us(messages):
-        message = latest(messages, "RC_CHANNELS")
-        return [getattr(message, f"chan{n}_raw") for n in range(1, 9)]
-
-    assert channels_us(station.run(0.1)) == [0] * 8
-    override(station, 1510, 1490, 1100, 1505)
-
-    assert channels_us(station.run(5.0)) == [1510, 1490, 1100, 1505, 0, 0, 0, 0]
-
-
 @pytest.mark.parametrize("is_low", [False, True])
 def test_the_battery_is_reported_as_set(station, is_low):
     station.vehicle.ap.battery = Battery(
@@ -125,33 +109,6 @@ def test_the_battery_is_reported_as_set(station, is_low):
     assert bool(status.onboard_control_sensors_health & BATTERY) != is_low
     assert (battery.charge_state == mav.MAV_BATTERY_CHARGE_STATE_LOW) == is_low
     assert (heartbeat.system_status == mav.MAV_STATE_CRITICAL) == is_low
-
-
-def test_two_senders_of_one_system_id_flip_the_sticks(station_of):
-    """The last writer wins; the vehicle arbitrates nothing."""
-    station = station_of(links=2)
-    station.interval(mav.MAVLINK_MSG_ID_RC_CHANNELS, 100)
-    rolls_us = []
-    for _ in range(50):
-        override(station, 1600, link=0, seconds=0.01)
-        override(station, 1400, link=1, seconds=0.01)
-        rolls_us.append(station.vehicle.ap.rc.channels_us[0])
-        override(station, 1600, link=0, seconds=0.01)
-        rolls_us.append(station.vehicle.ap.rc.channels_us[0])
-
-    assert set(rolls_us) == {1400, 1600}
-    assert all(before != after for before, after in pairwise(rolls_us))
-
-
-def test_the_override_timeout_changes_while_an_override_is_held(station):
-    override(station, 1700, seconds=0.4)
-    assert station.vehicle.ap.rc.channels_us[0] == 1700
-
-    message = mav.MAVLink_param_set_message(1, 1, b"RC_OVERRIDE_TIME", 0.5, 9)
-    station.send(message)
-    station.run(0.15)
-
-    assert station.vehicle.ap.rc.channels_us[0] == 1500
 
 
 def test_a_reboot_leaves_the_transmitter_as_it_was(station):

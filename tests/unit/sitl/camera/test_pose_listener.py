@@ -134,13 +134,6 @@ def test_nothing_is_lost_after_what_looks_like_a_frame(listener, vehicle, length
     assert position_m == (5.0, 6.0, -7.0)
 
 
-def test_a_truncated_datagram_costs_nothing_but_itself(listener, vehicle):
-    listener.receive(vehicle.position()[:20], T0_NS)
-    listener.receive(vehicle.quaternion() + vehicle.position((5.0, 6.0, -7.0)), T0_NS)
-    position_m, _ = listener.pose_at(T0_NS)
-    assert position_m == (5.0, 6.0, -7.0)
-
-
 def test_only_the_first_autopilot_is_followed():
     listener, camera, other = PoseListener(rate_hz=RATE_HZ), Vehicle(1, 100), Vehicle(2)
     listener.receive(Vehicle(255, 190).heartbeat(mavlink.MAV_AUTOPILOT_INVALID), T0_NS)

@@ -96,8 +96,7 @@ def test_a_frame_without_pixels_is_refused(name):
 
 
 @pytest.mark.parametrize(
-    "image",
-    [np.zeros((HEIGHT, WIDTH, 4), np.uint8), np.zeros((HEIGHT, WIDTH, 3), np.float32)],
+    "image", [np.zeros((HEIGHT, WIDTH, 4), np.uint8), np.zeros((HEIGHT, WIDTH, 3), np.float32)]
 )
 def test_a_frame_of_another_kind_is_refused(publisher, image):
     with pytest.raises(ValueError, match="want uint8"):

@@ -4,12 +4,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from sitl.course import (
-    Course,
-    Gate,
-    GateCounter,
-    make_course,
-)
+from sitl.course import Course, Gate, GateCounter, make_course
 
 NORTH_GATE = Gate(center_ned_m=(10.0, 0.0, -2.0), yaw_rad=0.0, size_m=2.0, index=0)
 EAST_GATE = Gate(center_ned_m=(20.0, 5.0, -2.0), yaw_rad=math.pi / 2, size_m=2.0, index=1)
@@ -67,11 +62,6 @@ def test_one_long_step_passes_several_gates_in_order_only():
     ]
     counter = GateCounter(Course(seed=0, gates=tuple(gates)))
     assert fly(counter, (0, 0, -2), (30, 0, -2)) == [0, 1]
-
-
-def test_nothing_counts_after_the_last_gate():
-    counter = GateCounter(Course(seed=0, gates=(NORTH_GATE,)))
-    assert fly(counter, (9, 0, -2), (11, 0, -2), (9, 5, -2), (9, 0, -2), (11, 0, -2)) == [0]
 
 
 @given(st.integers(0, 2**32))

@@ -8,15 +8,7 @@ from hypothesis import strategies as st
 
 from mavbridge.config.courses import RACE_COURSE_SEED
 from sitl import UsageError
-from sitl.course import (
-    EASY,
-    RACE,
-    RACE_SEEDS,
-    Family,
-    Gate,
-    course_to_json,
-    make_course,
-)
+from sitl.course import EASY, RACE, RACE_SEEDS, Family, Gate, course_to_json, make_course
 
 
 @given(st.integers(0, RACE_SEEDS - 1))

@@ -59,13 +59,6 @@ def test_a_launch_under_sticks_leaves_them(ends):
     assert not ends.ap.stick_input.valid
 
 
-def test_it_hovers_at_the_thrust_of_sih(airborne):
-    airborne.run(3.0, {0: MID})
-    motors = airborne.ap.truth.motors
-
-    assert sum(motors) / 4.0 == pytest.approx(0.484, abs=0.01)
-
-
 def test_its_speed_ends_where_drag_holds_the_lean(airborne):
     airborne.run(6.0, {0: (0, 1000, 500, 0)})
 

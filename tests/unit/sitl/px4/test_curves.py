@@ -20,18 +20,6 @@ def test_climb(z, climb_mps):
     assert curves.climb_mps(sticks(z=z), Px4Params()) == pytest.approx(climb_mps, abs=0.02)
 
 
-@pytest.mark.parametrize(("r", "degps"), [(100, 0.0), (500, 34.5), (-500, -34.5), (1000, 150.0)])
-def test_yaw(r, degps):
-    rate = curves.yaw_rate_radps(sticks(r=r), Px4Params())
-    assert math.degrees(rate) == pytest.approx(degps, abs=0.5)
-
-
-@pytest.mark.parametrize(("y", "lean_deg"), [(50, 2.0), (100, 4.0), (500, 19.3), (1000, 35.0)])
-def test_altctl_leans_by_the_tangent(y, lean_deg):
-    _, right = curves.lean_accel_mps2(sticks(y=y), Px4Params())
-    assert math.degrees(math.atan(right / 9.80665)) == pytest.approx(lean_deg, abs=0.1)
-
-
 def test_both_sticks_share_the_lean():
     accel = curves.lean_accel_mps2(sticks(x=1000, y=1000), Px4Params())
     assert math.degrees(math.atan(math.hypot(*accel) / 9.80665)) == pytest.approx(35.0)

@@ -12,7 +12,6 @@ from sitl.px4.messages import CURRENT_MODE, event_message
 from sitl.px4.modes import Mode
 
 MID = (0, 0, 500, 0)
-FULL_RIGHT = (0, 1000, 500, 0)
 ACCEPTED = mav.MAV_RESULT_ACCEPTED
 REJECTED = mav.MAV_RESULT_TEMPORARILY_REJECTED
 

@@ -62,22 +62,6 @@ def test_zero_restores_the_links_default_and_minus_one_stops():
     assert streams.interval_us(ATTITUDE) == 20_000
 
 
-def test_a_slow_link_slows_every_stream_alike_and_nobody_is_told():
-    streams = Px4Streams(ONBOARD_HZ, 4000.0, 0)
-
-    assert streams.scale == pytest.approx(0.118, abs=0.004)
-    assert streams.interval_us(ATTITUDE) == 10_000
-    assert len(sent_ms(streams, 10.0)) / 10.0 == pytest.approx(11.8, abs=0.5)
-
-
-def test_a_hopeless_link_keeps_a_twentieth():
-    assert Px4Streams(ONBOARD_HZ, 10.0, 0).scale == 0.05
-
-
-def test_a_fast_link_is_not_scaled():
-    assert Px4Streams(ONBOARD_HZ, 4_000_000.0, 0).scale == 1.0
-
-
 def test_links_differ_in_what_they_send_unasked():
     for name in ("HIGHRES_IMU", "ODOMETRY", "TIMESYNC"):
         number = getattr(mav, f"MAVLINK_MSG_ID_{name}")

@@ -7,13 +7,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from sitl import rotation
-from sitl.vehicle.dynamics import (
-    GRAVITY_MPS2,
-    QUAD,
-    Quadrotor,
-)
+from sitl.vehicle.dynamics import GRAVITY_MPS2, QUAD, Quadrotor
 
-HOVER = QUAD.mass_kg * GRAVITY_MPS2 / (4.0 * QUAD.max_motor_thrust_n)
 STEPS_PER_S = 1_000_000_000 // QUAD.step_ns
 
 
@@ -34,24 +29,6 @@ def test_motors_follow_with_a_first_order_lag():
     body = fly((1.0,) * 4, QUAD.motor_lag_s).body
 
     assert body.motors == pytest.approx([1.0 - math.exp(-1.0)] * 4, rel=0.03)
-
-
-def test_thrust_lifts_against_gravity():
-    state = fly((2.0 * HOVER,) * 4, 0.5)
-    up_mps = -state.body.velocity_ned_mps[2]
-
-    assert up_mps == pytest.approx(GRAVITY_MPS2 * (0.5 - 2.0 * QUAD.motor_lag_s), rel=0.1)
-    assert not state.body.touching
-
-
-def test_free_fall_feels_nothing_and_drag_limits_speed():
-    quad = Quadrotor()
-    high = fly((1.0,) * 4, 8.0, quad=quad)
-    falling = fly((0.0,) * 4, 5.0, state=high, quad=quad)
-    slow = fly((0.0,) * 4, 0.5, state=high, quad=quad).body
-
-    assert abs(slow.specific_force_body_mps2[2]) < GRAVITY_MPS2
-    assert falling.body.velocity_ned_mps[2] < 0.9 * GRAVITY_MPS2 * 5.0
 
 
 @pytest.mark.parametrize(

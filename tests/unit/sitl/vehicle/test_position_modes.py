@@ -31,16 +31,6 @@ def test_it_stops_and_stays_there_in_the_wind(pilot, mode):
     assert pilot.height_m == pytest.approx(start_m, abs=0.3)
 
 
-def test_brake_ignores_every_stick(pilot):
-    pilot.take_off(mode=Mode.BRAKE)
-    start_ned_m, start_yaw_deg = pilot.ap.truth.position_ned_m, pilot.angles_deg()[2]
-
-    pilot.hold(5.0, roll=1900, pitch=1100, thr=1000, yaw=1900)
-
-    assert math.dist(pilot.ap.truth.position_ned_m, start_ned_m) < 0.1
-    assert pilot.angles_deg()[2] == pytest.approx(start_yaw_deg, abs=0.5)
-
-
 @pytest.mark.parametrize("mode", PILOTED)
 def test_sticks_lean_turn_and_climb_as_in_alt_hold(pilot, mode):
     in_alt_hold = type(pilot)(pilot.ap.config)
@@ -55,19 +45,6 @@ def test_sticks_lean_turn_and_climb_as_in_alt_hold(pilot, mode):
     assert pilot.angles_deg() == pytest.approx(in_alt_hold.angles_deg(), abs=0.3)
     assert flown.velocity_ned_mps == pytest.approx(wanted.velocity_ned_mps, abs=0.05)
     assert flown.rate_body_radps == pytest.approx(wanted.rate_body_radps, abs=0.02)
-
-
-@pytest.mark.parametrize("mode", PILOTED)
-def test_it_arms_takes_off_and_sinks_under_an_idle_throttle(pilot, mode):
-    pilot.hold(6.0, thr=1000)
-    assert pilot.ap.set_mode(mode)
-    assert pilot.ap.arm(force=False), pilot.texts()
-    pilot.hold(4.0, thr=1900)
-    assert pilot.height_m > 2.0
-
-    pilot.hold(2.0, thr=1000)
-
-    assert pilot.ap.truth.velocity_ned_mps[2] > 2.0
 
 
 def test_without_a_position_it_is_refused_in_the_air(pilot):
