@@ -6,7 +6,6 @@ import sys
 from collections.abc import Callable, Sequence
 from contextlib import suppress
 from pathlib import Path
-from typing import get_args
 
 from sitl import UsageError
 from sitl.app import PILOTS, PilotOptions, print_status, run_vehicle
@@ -15,11 +14,10 @@ from sitl.camera.fpv import CameraOptions
 from sitl.clock import NS_PER_S, stop_on_signal, wall_ns
 from sitl.course import course_to_json, make_course
 from sitl.pilot.transmitter import DEFAULT_AXES
-from sitl.vehicle.conditions import NOMINAL, held_out_conditions, random_conditions
+from sitl.vehicle.conditions import NOMINAL, random_conditions
 from sitl.vehicle.config import (
     IDLE_RECEIVER_US,
     MID_RECEIVER_US,
-    Px4Release,
     SigningKey,
     VehicleConfig,
 )
@@ -55,8 +53,6 @@ def _parser() -> argparse.ArgumentParser:
     add("--connect-onboard", action="append", metavar="LINK", help=onboard_help)
     names = ("ardupilot", "px4")
     add("--autopilot", choices=names, default=names[0], help="firmware (default: ardupilot)")
-    release_help = "PX4 whose parameters, stick override and messages it has (default: 1.18)"
-    add("--px4-release", choices=get_args(Px4Release), default="1.18", help=release_help)
     add(
         "--report", type=Path, metavar="FILE", help="write a report (docs/formats/flight_report.md)"
     )
@@ -68,33 +64,22 @@ def _parser() -> argparse.ArgumentParser:
     receiver_help = "RC receiver: throttle down, every stick centred, or none (default: mid; "
     receiver_help += "none with PX4, which looks at one only if COM_RC_IN_MODE tells it to)"
     add("--receiver", choices=("idle", "mid", "none"), help=receiver_help)
-    rc_help = "take the receiver's values from UDP datagrams on this port (sitl/link/rc_input.py)"
+    rc_help = "take the receiver's values from UDP datagrams on this port (sitl/link/transport.py)"
     add("--rc-in", type=_PORT, metavar="PORT", help=rc_help)
     pilot_help = "a gamepad, the keys of a window, or the expert over the course moves the receiver"
     add("--pilot", choices=PILOTS, help=pilot_help)
     axes_help = f"axes of the gamepad, a minus reverses one (default: {DEFAULT_AXES})"
     add("--pilot-axes", default=DEFAULT_AXES, metavar="AXES", help=axes_help)
     add("--pilot-speed", type=_POSITIVE, default=4.0, metavar="MPS", help="of the expert")
-    type_help = "MAV_TYPE of its heartbeats (default: 2, quadrotor)"
-    add("--vehicle-type", type=_MAV_TYPE, default=2, metavar="N", help=type_help)
     key_help = "sign with this key (MAVLink 2): a file of 32 bytes or 64 hexadecimal digits"
     add("--signing-key-file", type=Path, metavar="FILE", help=key_help)
     conditions_help = "random airframe, firmware settings, wind, light and lens by seed"
-    conditions = parser.add_mutually_exclusive_group()
-    conditions.add_argument(
+    add(
         "--conditions",
         type=lambda text: random_conditions(int(_SEED(text))),
         default=NOMINAL,
         metavar="SEED",
         help=conditions_help,
-    )
-    conditions.add_argument(
-        "--held-out-conditions",
-        dest="conditions",
-        type=lambda text: held_out_conditions(int(_SEED(text))),
-        default=argparse.SUPPRESS,
-        metavar="SEED",
-        help="the same, and gates partly hidden, in shadow, at night or against the sun",
     )
     _add_camera_flags(parser)
     commands = parser.add_subparsers(title="other commands", metavar="COMMAND")
@@ -132,11 +117,9 @@ def _fly(args: argparse.Namespace) -> None:
         links + onboard,
         VehicleConfig(
             autopilot=args.autopilot,
-            px4_release=args.px4_release,
             onboard_links=frozenset(range(len(links), len(links + onboard))),
             receiver=receiver != "none",
             receiver_us=IDLE_RECEIVER_US if receiver == "idle" else MID_RECEIVER_US,
-            vehicle_type=args.vehicle_type,
             signing=args.signing_key_file and _signing_key(args.signing_key_file),
             conditions=args.conditions,
         ),
@@ -207,7 +190,6 @@ def _number(
 _POSITIVE = _number(float, sys.float_info.min, sys.float_info.max, "a positive number")
 _SEED = _number(int, 0, math.inf, "a whole number, 0 or more")
 _PORT = _number(int, 1, 65535, "a port, 1 to 65535")
-_MAV_TYPE = _number(int, 0, 255, "a number of MAV_TYPE, 0 to 255")
 _IMAGE_SIZE = _number(int, 16, 4096, "16 to 4096 pixels")
 
 

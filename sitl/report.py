@@ -43,9 +43,9 @@ class FlightLog:
         self._course = course or Course(seed=0, gates=())
         self._has_course = course is not None
         self._gates = GateCounter(self._course)
-        self._overrides = _ArrivalStats()
-        self._manual_controls = _ArrivalStats()
-        self._setpoints = _ArrivalStats()
+        self.overrides = _ArrivalStats()  # RC_CHANNELS_OVERRIDE that drives at least one stick
+        self.manual_controls = _ArrivalStats()  # of senders that the vehicle listens to
+        self.setpoints = _ArrivalStats()  # attitudes, rates and velocities that it follows
         self._release_times_s: list[float] = []
         self._releases = 0
         self._sticks = _StickRecord()
@@ -104,21 +104,9 @@ class FlightLog:
         """
         self._arrived_ns = max(self._arrived_ns, arrived_ns)
 
-    def on_override(self, arrived_ns: int) -> None:
-        """Count an RC_CHANNELS_OVERRIDE that drives at least one stick."""
-        self._overrides.add(arrived_ns)
-
-    def on_manual_control(self, arrived_ns: int) -> None:
-        """Count a MANUAL_CONTROL from a sender that the vehicle listens to."""
-        self._manual_controls.add(arrived_ns)
-
-    def on_setpoint(self, arrived_ns: int) -> None:
-        """Count a setpoint of an attitude, rates or a velocity that the vehicle follows."""
-        self._setpoints.add(arrived_ns)
-
     def on_release(self, arrived_ns: int) -> None:
         """Count an RC_CHANNELS_OVERRIDE that only releases sticks."""
-        self._overrides.interrupt(arrived_ns)
+        self.overrides.interrupt(arrived_ns)
         self._releases += 1
         if len(self._release_times_s) < MAX_RELEASE_TIMES:
             self._release_times_s.append(self._t_s(arrived_ns))
@@ -170,10 +158,10 @@ class FlightLog:
         return {
             "start_ns": self._start_ns,
             "duration_s": self._t_s(ap.now_ns),
-            "overrides": self._overrides.summary(self._start_ns),
+            "overrides": self.overrides.summary(self._start_ns),
             "releases": {"count": self._releases, "t_s": self._release_times_s},
-            "manual_control": self._manual_controls.summary(self._start_ns),
-            "setpoints": self._setpoints.summary(self._start_ns),
+            "manual_control": self.manual_controls.summary(self._start_ns),
+            "setpoints": self.setpoints.summary(self._start_ns),
             "refused_messages": self.refused_messages,
             "bad_frames": bad_frames,
             "armed_s": self._armed_ns / NS_PER_S,
@@ -236,19 +224,13 @@ class _StickRecord:
         self._entries.append(entry)
 
     def summary(self, start_ns: int) -> list[dict[str, Any]]:
-        return [
-            {
-                "t_s": (entry.stamp_ns - start_ns) / NS_PER_S,
-                "us": entry.us,
-                "mode": entry.mode,
-                "armed": entry.armed,
-                "failsafe": entry.failsafe,
-                "lean_deg": round(entry.lean_deg, 2),
-                "climb_mps": round(entry.climb_mps, 3),
-                "height_m": round(entry.height_m, 3),
-            }
-            for entry in self._entries
-        ]
+        rows = []
+        for stamp_ns, *state, lean_deg, climb_mps, height_m in self._entries:
+            row: dict[str, Any] = {"t_s": (stamp_ns - start_ns) / NS_PER_S}
+            row |= dict(zip(("us", "mode", "armed", "failsafe"), state, strict=True))
+            row |= {"lean_deg": round(lean_deg, 2), "climb_mps": round(climb_mps, 3)}
+            rows.append(row | {"height_m": round(height_m, 3)})
+        return rows
 
 
 class _ArrivalStats:

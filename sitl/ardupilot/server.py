@@ -135,7 +135,7 @@ class ArduPilotServer(MavlinkServer[ArduCopter, ArduPilotEndpoint]):
         raw_us = [getattr(message, f"chan{n}_raw") for n in range(1, MAX_RC_FIELDS + 1)]
         primary = set(raw_us[:PRIMARY_CHANNELS])
         if primary - {RELEASE, IGNORE}:
-            self._log.on_override(arrived_ns)
+            self._log.overrides.add(arrived_ns)
         elif RELEASE in primary:
             self._log.on_release(arrived_ns)
         self._ap.rc.override(raw_us, arrived_ns)
@@ -145,7 +145,7 @@ class ArduPilotServer(MavlinkServer[ArduCopter, ArduPilotEndpoint]):
         if not is_for_us or not self._is_from_gcs(message):
             return
         self._ap.gcs_failsafe.on_contact(arrived_ns)
-        self._log.on_manual_control(arrived_ns)
+        self._log.manual_controls.add(arrived_ns)
         self._ap.rc.manual_control(
             x=message.x, y=message.y, z=message.z, r=message.r, now_ns=arrived_ns
         )
@@ -157,7 +157,7 @@ class ArduPilotServer(MavlinkServer[ArduCopter, ArduPilotEndpoint]):
         setpoint = _attitude_setpoint(message)
         if setpoint is not None:
             ap.guided.follow_attitude(setpoint, ap.sensed, arrived_ns)
-            self._log.on_setpoint(arrived_ns)
+            self._log.setpoints.add(arrived_ns)
         elif ap.mode is Mode.GUIDED:
             ap.guided.brake(ap.sensed)
 
@@ -171,7 +171,7 @@ class ArduPilotServer(MavlinkServer[ArduCopter, ArduPilotEndpoint]):
             ap.guided.brake(ap.sensed)
         else:
             ap.guided.follow_velocity(setpoint, ap.sensed, arrived_ns)
-            self._log.on_setpoint(arrived_ns)
+            self._log.setpoints.add(arrived_ns)
 
     def _set_mode(self, link: ArduPilotEndpoint, message: Message, _arrived_ns: int) -> None:
         has_mode = message.base_mode & mav.MAV_MODE_FLAG_CUSTOM_MODE_ENABLED

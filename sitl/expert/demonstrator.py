@@ -7,7 +7,7 @@ from typing import NamedTuple
 from sitl.ardupilot.params import ArduPilotParams
 from sitl.course import Course
 from sitl.expert.course_guide import Agility, CourseGuide, Demand, Predicted
-from sitl.rotation import Quat, Vec3, conjugate, integrate, rotate, to_euler, wrap_pi
+from sitl.rotation import Quat, Vec3, conjugate, integrate, rotate, wrap_pi, yaw_of
 from sitl.vehicle.conditions import NOMINAL
 from sitl.vehicle.dynamics import GRAVITY_MPS2, BodyState, clamp
 
@@ -181,7 +181,7 @@ class Expert:
     def sticks(self, body: BodyState, t_s: float) -> StickPositions:
         """Sticks for this state; the positions of successive calls are the flown trajectory."""
         north_mps2, east_mps2, _ = drag_ned_mps2 = _drag_ned_mps2(body)
-        state = _predict_level(body, drag_ned_mps2, self._lag_s)
+        state = _predict(body, _level_accel_mps2(body, drag_ned_mps2), self._lag_s)
         demand = self._guide.demand(body.position_ned_m, t_s, state)
         return self._response.sticks(demand, complex(north_mps2, east_mps2), state.yaw_rad)
 
@@ -202,7 +202,8 @@ class RateExpert:
 
     def command(self, body: BodyState, t_s: float) -> RateCommand:
         ned_from_body = integrate(body.ned_from_body_wxyz, body.rate_body_radps, RATE_LAG_S)
-        state = _predict_free(body, RATE_LAG_S)
+        north, east, down = rotate(body.ned_from_body_wxyz, body.specific_force_body_mps2)
+        state = _predict(body, (north, east, down + GRAVITY_MPS2), RATE_LAG_S)
         demand = self._guide.demand(body.position_ned_m, t_s, state)
         return rate_command(demand, state, ned_from_body, _drag_ned_mps2(body))
 
@@ -218,31 +219,15 @@ def _drag_ned_mps2(body: BodyState) -> Vec3:
     return rotate(body.ned_from_body_wxyz, (drag_x, drag_y, 0.0))
 
 
-def _predict_level(body: BodyState, drag_ned_mps2: Vec3, lag_s: float) -> Predicted:
-    """Extrapolate by the lag, with the acceleration of the present lean in level flight."""
+def _level_accel_mps2(body: BodyState, drag_ned_mps2: Vec3) -> Vec3:
+    """Acceleration of the present lean in level flight."""
     thrust_n, thrust_e, thrust_d = rotate(body.ned_from_body_wxyz, (0.0, 0.0, -1.0))
     per_g = GRAVITY_MPS2 / max(0.5, -thrust_d)
-    velocity_n, velocity_e, velocity_d = body.velocity_ned_mps
-    accel_n = thrust_n * per_g + drag_ned_mps2[0]
-    accel_e = thrust_e * per_g + drag_ned_mps2[1]
-    half = lag_s * lag_s / 2
-    north_m, east_m, down_m = body.position_ned_m
-    _, _, yaw = to_euler(body.ned_from_body_wxyz)
-    return Predicted(
-        position_ned_m=(
-            north_m + velocity_n * lag_s + accel_n * half,
-            east_m + velocity_e * lag_s + accel_e * half,
-            down_m + velocity_d * lag_s,
-        ),
-        velocity_ned_mps=(velocity_n + accel_n * lag_s, velocity_e + accel_e * lag_s, velocity_d),
-        yaw_rad=wrap_pi(yaw + body.rate_body_radps[2] * lag_s),
-    )
+    return thrust_n * per_g + drag_ned_mps2[0], thrust_e * per_g + drag_ned_mps2[1], 0.0
 
 
-def _predict_free(body: BodyState, lag_s: float) -> Predicted:
-    """Extrapolate by the lag, with the present specific force."""
-    force_n, force_e, force_d = rotate(body.ned_from_body_wxyz, body.specific_force_body_mps2)
-    accel_mps2 = (force_n, force_e, force_d + GRAVITY_MPS2)
+def _predict(body: BodyState, accel_mps2: Vec3, lag_s: float) -> Predicted:
+    """Extrapolate by the lag at this acceleration."""
     half = lag_s * lag_s / 2
     north, east, down = (
         (place + speed * lag_s + accel * half, speed + accel * lag_s)
@@ -250,9 +235,8 @@ def _predict_free(body: BodyState, lag_s: float) -> Predicted:
             body.position_ned_m, body.velocity_ned_mps, accel_mps2, strict=True
         )
     )
-    _, _, yaw = to_euler(body.ned_from_body_wxyz)
     return Predicted(
         position_ned_m=(north[0], east[0], down[0]),
         velocity_ned_mps=(north[1], east[1], down[1]),
-        yaw_rad=wrap_pi(yaw + body.rate_body_radps[2] * lag_s),
+        yaw_rad=wrap_pi(yaw_of(body.ned_from_body_wxyz) + body.rate_body_radps[2] * lag_s),
     )

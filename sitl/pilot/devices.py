@@ -1,5 +1,6 @@
-"""A gamepad, or a transmitter on USB, as the pilot."""
+"""The pilot at a gamepad (or a transmitter on USB) or at the keys of a window."""
 
+from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from typing import Protocol
 
@@ -7,7 +8,7 @@ import pygame
 
 from sitl.clock import NS_PER_S, Clock
 from sitl.expert.demonstrator import StickPositions
-from sitl.pilot.transmitter import OFF_US, Axes, Hand, Switch, Transmitter
+from sitl.pilot.transmitter import OFF_US, Axes, Gesture, Hand, Switch, Transmitter
 
 RECORD_BUTTON, BAD_BUTTON, DISARM_BUTTON, ARM_BUTTON = 0, 1, 6, 7
 """A, B, back and start of the usual pad."""
@@ -29,42 +30,63 @@ class Pad(Protocol):
         """Those that are pressed, by number."""
 
 
-class GamepadPilot:
-    """A `Pilot`; without the pad the receiver has no signal."""
+class _DevicePilot(ABC):
+    """A `Pilot` at a device: its transmitter, gestures and switch."""
 
-    def __init__(self, pad: Pad, axes: Axes, clock: Clock) -> None:
-        self._pad = pad
-        self._axes = axes
+    def __init__(self, clock: Clock, *, arm: int, disarm: int, up: int, middle: int) -> None:
+        """The keys or buttons of the gestures, and of the switch: up and down, to its middle."""
         self._clock = clock
         self._transmitter = Transmitter(clock.now_ns())
         self._switch: Switch = "low"
-        self._pressed: set[int] = set()
+        self._down: set[int] = set()
+        self._arm, self._disarm, self._up, self._middle = arm, disarm, up, middle
 
     def latest(self) -> Sequence[int] | None:
         now_ns = self._clock.now_ns()
         if not self._transmitter.begins_frame(now_ns):
             return None
-        if not self._pad.poll():
-            self._pressed = set()
+        if (sticks := self._poll(now_ns)) is None:
             return OFF_US
-        pressed = {number for number, is_down in enumerate(self._pad.buttons()) if is_down}
-        self._move_switch(pressed - self._pressed)
-        self._pressed = pressed
-        hand = Hand(sticks=self._axes.sticks(self._pad.axes()), switch=self._switch)
-        if ARM_BUTTON in pressed:
-            hand = hand._replace(gesture="arm")
-        elif DISARM_BUTTON in pressed:
-            hand = hand._replace(gesture="disarm")
-        return self._transmitter.channels_us(hand, now_ns)
+        gesture: Gesture | None = "arm" if self._arm in self._down else None
+        if gesture is None and self._disarm in self._down:
+            gesture = "disarm"
+        return self._transmitter.channels_us(Hand(sticks, gesture, self._switch), now_ns)
 
-    def _move_switch(self, newly: set[int]) -> None:
-        if RECORD_BUTTON in newly:
+    @abstractmethod
+    def _poll(self, now_ns: int) -> StickPositions | None:
+        """Take what has happened; the sticks, or None while the receiver has no signal."""
+
+    def _press(self, number: int) -> None:
+        self._down.add(number)
+        if number == self._up:
             self._switch = "low" if self._switch == "high" else "high"
-        if BAD_BUTTON in newly:
+        elif number == self._middle:
             self._switch = "middle"
 
     def close(self) -> None:
         pygame.quit()
+
+
+class GamepadPilot(_DevicePilot):
+    """Without the pad the receiver has no signal."""
+
+    def __init__(self, pad: Pad, axes: Axes, clock: Clock) -> None:
+        super().__init__(
+            clock, arm=ARM_BUTTON, disarm=DISARM_BUTTON, up=RECORD_BUTTON, middle=BAD_BUTTON
+        )
+        self._pad = pad
+        self._axes = axes
+
+    def _poll(self, _now_ns: int) -> StickPositions | None:
+        if not self._pad.poll():
+            self._down.clear()
+            return None
+        for number, is_down in enumerate(self._pad.buttons()):
+            if not is_down:
+                self._down.discard(number)
+            elif number not in self._down:
+                self._press(number)
+        return self._axes.sticks(self._pad.axes())
 
 
 class PygamePad:
@@ -120,50 +142,36 @@ _AXES = (
 """Keys up and down each stick: throttle, yaw, pitch, roll."""
 
 
-class KeyboardPilot:
-    """A `Pilot`; with its window closed the receiver has no signal."""
+class KeyboardPilot(_DevicePilot):
+    """With its window closed the receiver has no signal."""
 
     def __init__(self, clock: Clock) -> None:
         """Open the window; raises pygame.error without a display."""
         pygame.display.init()
         pygame.display.set_caption(f"pilot: {KEYS_HELP}")
         pygame.display.set_mode(_SIZE_PX)
-        self._clock = clock
-        self._transmitter = Transmitter(clock.now_ns())
+        super().__init__(
+            clock,
+            arm=pygame.K_RETURN,
+            disarm=pygame.K_BACKSPACE,
+            up=pygame.K_SPACE,
+            middle=pygame.K_x,
+        )
         self._moved_ns = clock.now_ns()
-        self._down: set[int] = set()
         self._position = [0.0] * len(_AXES)
-        self._switch: Switch = "low"
         self._is_open = True
 
-    def latest(self) -> Sequence[int] | None:
-        now_ns = self._clock.now_ns()
-        if not self._transmitter.begins_frame(now_ns):
-            return None
+    def _poll(self, now_ns: int) -> StickPositions | None:
         for event in pygame.event.get():
-            self._take(event)
-        if not self._is_open:
-            return OFF_US
-        hand = Hand(sticks=self._sticks(now_ns), switch=self._switch)
-        if pygame.K_RETURN in self._down:
-            hand = hand._replace(gesture="arm")
-        elif pygame.K_BACKSPACE in self._down:
-            hand = hand._replace(gesture="disarm")
-        return self._transmitter.channels_us(hand, now_ns)
-
-    def _take(self, event: pygame.event.Event) -> None:
-        if event.type == pygame.QUIT:
-            self._is_open = False
-        elif event.type == pygame.WINDOWFOCUSLOST:
-            self._down.clear()  # their releases go to another window
-        elif event.type == pygame.KEYUP:
-            self._down.discard(event.key)
-        elif event.type == pygame.KEYDOWN:
-            self._down.add(event.key)
-            if event.key == pygame.K_SPACE:
-                self._switch = "low" if self._switch == "high" else "high"
-            elif event.key == pygame.K_x:
-                self._switch = "middle"
+            if event.type == pygame.QUIT:
+                self._is_open = False
+            elif event.type == pygame.WINDOWFOCUSLOST:
+                self._down.clear()  # their releases go to another window
+            elif event.type == pygame.KEYUP:
+                self._down.discard(event.key)
+            elif event.type == pygame.KEYDOWN:
+                self._press(event.key)
+        return self._sticks(now_ns) if self._is_open else None
 
     def _sticks(self, now_ns: int) -> StickPositions:
         step = TRAVEL_PER_S * (now_ns - self._moved_ns) / NS_PER_S
@@ -174,6 +182,3 @@ class KeyboardPilot:
             missing = wanted - self._position[index]
             self._position[index] += max(-step, min(step, missing))
         return StickPositions(*self._position)
-
-    def close(self) -> None:
-        pygame.quit()

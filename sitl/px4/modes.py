@@ -30,57 +30,26 @@ class Mode(Enum):
 
     def __init__(self, main: int, sub: int, spoken: str, event_number: int, standard: int) -> None:
         self.main, self.sub = main, sub
-        self.spoken = spoken
-        self.event_number = event_number
-        self.standard = standard
-
-    @property
-    def custom_mode(self) -> int:
-        return self.main << 16 | self.sub << 24
+        self.spoken, self.event_number, self.standard = spoken, event_number, standard
+        self.custom_mode = main << 16 | sub << 24
+        self.is_auto = main == MAIN_AUTO
+        self.manual_throttle = main in (1, 5, 7)  # the stick is thrust: down for arming
+        self.piloted = main in (1, 2, 3, 5, 7)  # the sticks fly it: refused without them
+        self.needs_position = main == 3 or (self.is_auto and sub != 6)
+        self.armable = main != 10 and (main, sub) not in ((4, 4), (4, 5), (4, 6))
+        flags = mav.MAV_MODE_FLAG_CUSTOM_MODE_ENABLED
+        if self.piloted:
+            flags |= mav.MAV_MODE_FLAG_MANUAL_INPUT_ENABLED
+        if self.is_auto:
+            flags |= mav.MAV_MODE_FLAG_GUIDED_ENABLED | mav.MAV_MODE_FLAG_AUTO_ENABLED
+        if (self.piloted and main != 5) or self.is_auto:
+            flags |= mav.MAV_MODE_FLAG_STABILIZE_ENABLED
+        self.base_flags = int(flags)
+        """MAV_MODE_FLAG of the heartbeat, without the armed bit; OFFBOARD's is the plain one."""
 
     @property
     def label(self) -> str:
         return self.name.replace("_", ".")
-
-    @property
-    def manual_throttle(self) -> bool:
-        """The throttle stick is thrust: for arming it must be down."""
-        return self in (Mode.MANUAL, Mode.STAB, Mode.ACRO)
-
-    @property
-    def piloted(self) -> bool:
-        """The sticks fly it: refused without them."""
-        return self.manual_throttle or self in (Mode.ALTCTL, Mode.POSCTL)
-
-    @property
-    def is_auto(self) -> bool:
-        return self.main == MAIN_AUTO
-
-    @property
-    def needs_position(self) -> bool:
-        """Refused in flight, and for arming, while there is no position."""
-        return self is Mode.POSCTL or (self.is_auto and self is not Mode.AUTO_LAND)
-
-    @property
-    def armable(self) -> bool:
-        """The vehicle can be armed in it, where its other needs are met."""
-        return self not in (Mode.AUTO_LAND, Mode.AUTO_RTL, Mode.AUTO_MISSION, Mode.TERMINATION)
-
-    @property
-    def base_flags(self) -> int:
-        """MAV_MODE_FLAG of the heartbeat, without the armed bit; OFFBOARD's is the plain one."""
-        if self.is_auto:
-            stabilized = mav.MAV_MODE_FLAG_STABILIZE_ENABLED | mav.MAV_MODE_FLAG_GUIDED_ENABLED
-            return _CUSTOM | int(stabilized) | int(mav.MAV_MODE_FLAG_AUTO_ENABLED)
-        if self is Mode.ACRO:
-            return _CUSTOM | int(mav.MAV_MODE_FLAG_MANUAL_INPUT_ENABLED)
-        if self.piloted:
-            manual = mav.MAV_MODE_FLAG_MANUAL_INPUT_ENABLED | mav.MAV_MODE_FLAG_STABILIZE_ENABLED
-            return _CUSTOM | int(manual)
-        return _CUSTOM
-
-
-_CUSTOM = int(mav.MAV_MODE_FLAG_CUSTOM_MODE_ENABLED)
 
 
 def mode_of(main: int, sub: int) -> Mode | None:

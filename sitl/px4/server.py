@@ -110,13 +110,13 @@ class Px4Server(MavlinkServer[Px4, Px4Endpoint]):
             link.has_gcs = True
 
     def _manual_control(self, link: Px4Endpoint, message: Message, arrived_ns: int) -> None:
-        self._log.on_manual_control(arrived_ns)
+        self._log.manual_controls.add(arrived_ns)
         sticks = from_manual_control(message.x, message.y, message.z, message.r)
         self._ap.stick_input.on_sticks(self.links.index(link), sticks, arrived_ns)
 
     def _override(self, _link: Px4Endpoint, message: Message, arrived_ns: int) -> None:
         """No override: the values become those of a receiver."""
-        self._log.on_override(arrived_ns)
+        self._log.overrides.add(arrived_ns)
         values = [getattr(message, f"chan{n}_raw") for n in range(1, MAX_RC_FIELDS + 1)]
         self._ap.set_receiver([0 if value == _RC_IGNORE else value for value in values])
 
@@ -164,7 +164,7 @@ class Px4Server(MavlinkServer[Px4, Px4Endpoint]):
     def _follow(self, setpoint: Setpoint, arrived_ns: int) -> None:
         self._ap.set_setpoint(setpoint, arrived_ns)
         if self._ap.mode_name == "OFFBOARD":
-            self._log.on_setpoint(arrived_ns)
+            self._log.setpoints.add(arrived_ns)
 
     def _set_mode(self, link: Px4Endpoint, message: Message, _arrived_ns: int) -> None:
         """The old message: acknowledged as the command that replaced it."""

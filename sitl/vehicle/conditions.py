@@ -133,8 +133,16 @@ def held_out_conditions(seed: int) -> Conditions:
     """
     conditions = random_conditions(seed)
     draw = _Draw(np.random.Generator(np.random.PCG64((seed, 7))), 1.0)
-    looks = (_hide_gates, _shade_gates, _make_night, _make_glare, _scatter_gates)
-    return looks[seed % len(looks)](conditions, draw)
+    match seed % 5:
+        case 0:
+            return replace(conditions, hidden_gates=0.7)
+        case 1:
+            return replace(conditions, shaded_gates=0.6, ground_contrast=2.0 * draw.factor(1.3))
+        case 2:
+            return _make_night(conditions, draw)
+        case 3:
+            return _make_glare(conditions, draw)
+    return replace(conditions, stray_gates=0.8)
 
 
 class _Draw:
@@ -274,8 +282,9 @@ def _vary_streams(nominal: Conditions, draw: _Draw) -> Conditions:
     )
 
 
-def _vary_airframe(nominal: Conditions, draw: _Draw) -> Conditions:
-    """From a racing frame to the drag of PX4's SIH, 1 N per m/s; half of them have little."""
+def _vary_airframe_and_shutter(nominal: Conditions, draw: _Draw) -> Conditions:
+    """Drag from a racing frame's to that of PX4's SIH, 1 N per m/s; half of them have little.
+    Exposure and read-out up to those of the rolling shutter of a usual 30 Hz camera."""
     is_heavy = draw.random.random() < 0.5
     heavy_nspm = 0.15 * math.exp(draw.amount(math.log(1.0 / 0.15)))
     return replace(
@@ -283,17 +292,10 @@ def _vary_airframe(nominal: Conditions, draw: _Draw) -> Conditions:
         min_rotor_drag_nspm=heavy_nspm if is_heavy else 0.0,
         motor_lag_factor=draw.factor(1.5),
         rate_gain_factor=round(draw.factor(1.35), 3),
+        exposure_time_s=draw.amount(0.012),
+        readout_time_s=draw.amount(0.025),
+        ground_contrast=draw.factor(1.5),
     )
-
-
-def _vary_shutter(nominal: Conditions, draw: _Draw) -> Conditions:
-    """Up to the exposure and the read-out of a rolling shutter of a usual 30 Hz camera."""
-    exposure_time_s, readout_time_s = draw.amount(0.012), draw.amount(0.025)
-    return replace(nominal, exposure_time_s=exposure_time_s, readout_time_s=readout_time_s)
-
-
-def _vary_ground(nominal: Conditions, draw: _Draw) -> Conditions:
-    return replace(nominal, ground_contrast=draw.factor(1.5))
 
 
 _VARIATIONS = (
@@ -302,19 +304,9 @@ _VARIATIONS = (
     _vary_scene,
     _vary_firmware,
     _vary_streams,
-    _vary_airframe,
-    _vary_shutter,
-    _vary_ground,
+    _vary_airframe_and_shutter,
 )
 """In the order in which they draw, which is part of the seed's meaning."""
-
-
-def _hide_gates(usual: Conditions, draw: _Draw) -> Conditions:
-    return replace(usual, hidden_gates=0.7)
-
-
-def _shade_gates(usual: Conditions, draw: _Draw) -> Conditions:
-    return replace(usual, shaded_gates=0.6, ground_contrast=2.0 * draw.factor(1.3))
 
 
 def _make_night(usual: Conditions, draw: _Draw) -> Conditions:
@@ -334,7 +326,3 @@ def _make_glare(usual: Conditions, draw: _Draw) -> Conditions:
     return replace(
         usual, glare=0.5 + draw.amount(0.5), sun_ned=_direction_ned(azimuth_rad, elevation_rad)
     )
-
-
-def _scatter_gates(usual: Conditions, draw: _Draw) -> Conditions:
-    return replace(usual, stray_gates=0.8)

@@ -17,7 +17,7 @@ from sitl.vehicle.config import STEP_NS
 
 def logged(arrivals_ms, releases_ms=()):
     log = FlightLog(0, None)
-    events = [(ms, log.on_override) for ms in arrivals_ms]
+    events = [(ms, log.overrides.add) for ms in arrivals_ms]
     events += [(ms, log.on_release) for ms in releases_ms]
     for ms, happens in sorted(events, key=lambda event: event[0]):
         happens(ms * NS_PER_MS)
