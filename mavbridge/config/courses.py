@@ -10,7 +10,7 @@ ConditionsKind = Literal["nominal", "random", "held-out"]
 that no demonstration has."""
 
 RACE_COURSE_SEED = 1_000_000_000
-"""Seeds of race courses begin here (`sitl.course.layout.RACE_SEEDS`)."""
+"""Seeds of race courses begin here (`sitl.course.RACE_SEEDS`)."""
 
 CHECK_COURSE_SEED = 900_000
 """Courses from here on are flown during training, and neither learned from nor evaluated."""

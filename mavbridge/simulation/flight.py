@@ -84,7 +84,7 @@ class SimulatedFlight:
         settings: SimulationSettings | None = None,
         vehicle: VehicleConfig = NOMINAL_VEHICLE,
     ) -> None:
-        """Put the vehicle on the course of ``sitl.course.layout.make_course``.
+        """Put the vehicle on the course of ``sitl.course.make_course``.
 
         ``seed`` decides the delays and the phases of vehicle and camera; the vehicle's conditions
         also decide how the course looks.

@@ -245,12 +245,10 @@ class Relay:
         return self.inject(dialect.MAVLink_command_long_message(*VEHICLE, number, 0, *padded))
 
     def set_mode(self, mode: str) -> int:
-        """The pilot changes the mode at another station."""
         custom = PX4_MODES.get(mode, ()) or (COPTER_MODES[mode],)
         return self.command(dialect.MAV_CMD_DO_SET_MODE, 1, *custom)
 
     def arm(self) -> int:
-        """The pilot arms at another station."""
         return self.command(dialect.MAV_CMD_COMPONENT_ARM_DISARM, 1)
 
     def disarm(self) -> int:
@@ -258,12 +256,10 @@ class Relay:
         return self.command(dialect.MAV_CMD_COMPONENT_ARM_DISARM, 0, FORCE)
 
     def wait_until(self, condition: Callable[[], bool], timeout_s: float = 60.0) -> bool:
-        """Wait for something to become true of what the bridge has sent."""
         with self._news:
             return self._news.wait_for(condition, timeout_s)
 
     def sent_since(self, at_ns: int, name: str) -> list[Sent]:
-        """Messages of this name that came after a moment."""
         return [sent for sent in self.sent if sent.at_ns > at_ns and sent.name == name]
 
     def _run(self) -> None:

@@ -14,6 +14,7 @@ from faults.props import Transmitter
 from faults.stage import ORDERLY, Stage, faulty_policy, free_port, staged
 from faults.steps import make_step
 from helpers.flight_logs import logged_overrides
+from mavbridge.core.reasons import Code, because
 from sitl.clock import NS_PER_S
 
 POLICY = "Wandering"
@@ -45,8 +46,6 @@ MOST_GROWTH = {
 }
 """Growth of a process that is no leak yet: allocators keep what they once had."""
 REPORT_EVERY = 20
-REST_S = 2.5
-"""The engage switch must have rested low for 2 s."""
 ENGAGE_S = 10.0
 ENGAGE_TRIES = 6
 
@@ -126,7 +125,7 @@ def soak(minutes: float, seed: int, folder: Path, report: Callable[[str], None])
             "--max-height", "0", "--max-distance", "0",
             "--engage-channel", str(SWITCH), "--record", str(recording),
         )  # fmt: skip
-        if not stage.wait_for("not engaged: press e, use the engage switch"):
+        if not stage.wait_for(str(because(Code.NOT_ENGAGED))):
             raise StageError("the bridge is not ready to engage")
         stage.guard.has_ended(0)  # finds it while its parent lives
         _engage(stage, transmitter)

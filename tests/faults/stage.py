@@ -81,7 +81,6 @@ class Stage:
 
     @property
     def is_px4(self) -> bool:
-        """The vehicle's firmware is PX4, not ArduPilot."""
         return "px4" in self._vehicle_flags
 
     def _start_vehicle(self) -> subprocess.Popen[bytes]:
@@ -110,7 +109,6 @@ class Stage:
             self._reader.start()
 
     def command(self, report: Path) -> list[str]:
-        """A bridge for this vehicle, without any flag of its flight."""
         command = [sys.executable, "-m", "mavbridge", "--connect", self.relay.carrier.address]
         sources = [f"{name}=shm:{self._shm}" for name in self.cameras] or [f"shm:{self._shm}"]
         cameras = [flag for source in sources for flag in ("--camera", source)]
@@ -126,19 +124,12 @@ class Stage:
         return self.folder / "mark"
 
     def _read(self) -> None:
-        bridge = self._running()
-        for line in bridge.stdout or ():
+        for line in self._bridge.stdout:
             with self._news:
                 self._lines.append(line)
                 self._news.notify_all()
 
-    def _running(self) -> subprocess.Popen[str]:
-        if self._bridge is None:
-            raise StageError("the bridge has not been started")
-        return self._bridge
-
     def wait_for(self, text: str) -> bool:
-        """The bridge has said this."""
         with self._news:
             return self._news.wait_for(
                 lambda: any(text in line for line in self._lines), timeout=TIMEOUT_S
@@ -209,7 +200,6 @@ class Stage:
         os.close(fd)
 
     def observe(self, seconds: float) -> None:
-        """Let time pass in which something must not happen."""
         threading.Event().wait(seconds)
 
     def fault_ns(self) -> int:
@@ -220,8 +210,7 @@ class Stage:
 
     @property
     def bridge_pid(self) -> int:
-        """The flight process."""
-        return self._running().pid
+        return self._bridge.pid
 
     @property
     def guard(self) -> Process:
@@ -231,7 +220,6 @@ class Stage:
         return self._guard
 
     def pid_of(self, name: ProcessName) -> int:
-        """Process id, while the bridge lives."""
         if name == "recorder":
             return child_of(self.bridge_pid, b"spawn_main")
         return self.guard.pid if name == "guard" else self.bridge_pid
@@ -255,7 +243,7 @@ class Stage:
     def kill(self, number: signal.Signals) -> int:
         """Send a signal to the bridge alone; returns the moment."""
         at_ns = self.clock.now_ns()
-        self._running().send_signal(number)
+        self._bridge.send_signal(number)
         return at_ns
 
     def kill_group(self, number: signal.Signals) -> int:
@@ -266,8 +254,7 @@ class Stage:
         return at_ns
 
     def end(self) -> tuple[int, str]:
-        """Exit status and everything that the bridge printed."""
-        bridge = self._running()
+        bridge = self._bridge
         try:
             bridge.wait(TIMEOUT_S)
         except subprocess.TimeoutExpired as error:
@@ -277,7 +264,6 @@ class Stage:
         return bridge.returncode, self.output
 
     def close(self) -> None:
-        """Free everything, and end what a failed test has left."""
         if self._guard is not None:
             self._guard.close()
             self._guard = None
@@ -293,12 +279,10 @@ class Stage:
             self._bridge.stdout.close()
 
     def end_vehicle(self) -> None:
-        """The vehicle writes its report."""
         self._vehicle.terminate()
         self._vehicle.wait(TIMEOUT_S)
 
     def report(self) -> Any:
-        """The bridge's, of ``--report``."""
         return json.loads((self.folder / "report.json").read_text())
 
     def release_codes(self) -> set[str]:
