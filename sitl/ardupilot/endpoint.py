@@ -10,7 +10,7 @@ from sitl.ardupilot.autopilot import ArduCopter
 from sitl.ardupilot.flight_modes import Mode
 from sitl.ardupilot.guided import Submode
 from sitl.clock import NS_PER_MS, NS_PER_S
-from sitl.link.server import MAX_STATUSTEXT, Endpoint, Message
+from sitl.link.server import MAX_STATUSTEXT, Endpoint, Message, flags
 from sitl.link.telemetry import (
     Home,
     autopilot_version,
@@ -30,24 +30,15 @@ HOME = Home(-35.3632621, 149.1652374, 584.0, (0.2322, 0.0520, -0.5280), 945.0, 3
 GYRO_BIAS_RADPS: Vec3 = (0.003, -0.002, 0.001)
 """Subtracted by the estimator; raw IMU messages still carry it."""
 
-_SENSORS = (
-    mav.MAV_SYS_STATUS_SENSOR_3D_GYRO
-    | mav.MAV_SYS_STATUS_SENSOR_3D_ACCEL
-    | mav.MAV_SYS_STATUS_SENSOR_3D_MAG
-    | mav.MAV_SYS_STATUS_SENSOR_ABSOLUTE_PRESSURE
-    | mav.MAV_SYS_STATUS_SENSOR_GPS
-    | mav.MAV_SYS_STATUS_SENSOR_ANGULAR_RATE_CONTROL
-    | mav.MAV_SYS_STATUS_SENSOR_ATTITUDE_STABILIZATION
-    | mav.MAV_SYS_STATUS_AHRS
-    | mav.MAV_SYS_STATUS_SENSOR_BATTERY
+_SENSORS = flags(
+    "MAV_SYS_STATUS_",
+    "SENSOR_3D_GYRO SENSOR_3D_ACCEL SENSOR_3D_MAG SENSOR_ABSOLUTE_PRESSURE SENSOR_GPS "
+    "SENSOR_ANGULAR_RATE_CONTROL SENSOR_ATTITUDE_STABILIZATION AHRS SENSOR_BATTERY",
 )
-_CAPABILITIES = (
-    mav.MAV_PROTOCOL_CAPABILITY_PARAM_FLOAT
-    | mav.MAV_PROTOCOL_CAPABILITY_MISSION_INT
-    | mav.MAV_PROTOCOL_CAPABILITY_COMMAND_INT
-    | mav.MAV_PROTOCOL_CAPABILITY_MAVLINK2
-    | mav.MAV_PROTOCOL_CAPABILITY_SET_ATTITUDE_TARGET
-    | mav.MAV_PROTOCOL_CAPABILITY_SET_POSITION_TARGET_LOCAL_NED
+_CAPABILITIES = flags(
+    "MAV_PROTOCOL_CAPABILITY_",
+    "PARAM_FLOAT MISSION_INT COMMAND_INT MAVLINK2 SET_ATTITUDE_TARGET "
+    "SET_POSITION_TARGET_LOCAL_NED",
 )
 """No FTP: clients then fetch parameters with PARAM_REQUEST_LIST."""
 _FIRMWARE_VERSIONS: dict[ArduPilotRelease, int] = {
@@ -56,12 +47,8 @@ _FIRMWARE_VERSIONS: dict[ArduPilotRelease, int] = {
     "4.7": 4 << 24 | 7 << 16 | mav.FIRMWARE_VERSION_TYPE_OFFICIAL,
 }
 _EKF_VERTICAL = mav.EKF_ATTITUDE | mav.EKF_VELOCITY_VERT | mav.EKF_POS_VERT_ABS
-_EKF_HORIZONTAL = (
-    mav.EKF_VELOCITY_HORIZ
-    | mav.EKF_POS_HORIZ_REL
-    | mav.EKF_POS_HORIZ_ABS
-    | mav.EKF_PRED_POS_HORIZ_REL
-    | mav.EKF_PRED_POS_HORIZ_ABS
+_EKF_HORIZONTAL = flags(
+    "EKF_", "VELOCITY_HORIZ POS_HORIZ_REL POS_HORIZ_ABS PRED_POS_HORIZ_REL PRED_POS_HORIZ_ABS"
 )
 _VELOCITY_ONLY = 3079  # POSITION_TARGET_LOCAL_NED.type_mask: all but velocity and acceleration
 _POSITION_ONLY = 3576  # all but the position
@@ -217,26 +204,18 @@ TIMESYNC_PERIOD_NS = 10 * NS_PER_S
 PARAM_SLOWDOWN = 4  # factor on all intervals while a parameter list is being sent
 
 STREAM_GROUPS: dict[int, tuple[int, ...]] = {
-    mav.MAV_DATA_STREAM_RAW_SENSORS: (mav.MAVLINK_MSG_ID_RAW_IMU, mav.MAVLINK_MSG_ID_SCALED_IMU2),
-    mav.MAV_DATA_STREAM_EXTENDED_STATUS: (
-        mav.MAVLINK_MSG_ID_SYS_STATUS,
-        mav.MAVLINK_MSG_ID_GPS_RAW_INT,
-    ),
-    mav.MAV_DATA_STREAM_RC_CHANNELS: (
-        mav.MAVLINK_MSG_ID_RC_CHANNELS,
-        mav.MAVLINK_MSG_ID_SERVO_OUTPUT_RAW,
-    ),
-    mav.MAV_DATA_STREAM_POSITION: (
-        mav.MAVLINK_MSG_ID_GLOBAL_POSITION_INT,
-        mav.MAVLINK_MSG_ID_LOCAL_POSITION_NED,
-    ),
-    mav.MAV_DATA_STREAM_EXTRA1: (mav.MAVLINK_MSG_ID_ATTITUDE,),
-    mav.MAV_DATA_STREAM_EXTRA2: (mav.MAVLINK_MSG_ID_VFR_HUD,),
-    mav.MAV_DATA_STREAM_EXTRA3: (
-        mav.MAVLINK_MSG_ID_SYSTEM_TIME,
-        mav.MAVLINK_MSG_ID_BATTERY_STATUS,
-        mav.MAVLINK_MSG_ID_EKF_STATUS_REPORT,
-    ),
+    getattr(mav, f"MAV_DATA_STREAM_{group}"): tuple(
+        getattr(mav, f"MAVLINK_MSG_ID_{name}") for name in names.split()
+    )
+    for group, names in (
+        ("RAW_SENSORS", "RAW_IMU SCALED_IMU2"),
+        ("EXTENDED_STATUS", "SYS_STATUS GPS_RAW_INT"),
+        ("RC_CHANNELS", "RC_CHANNELS SERVO_OUTPUT_RAW"),
+        ("POSITION", "GLOBAL_POSITION_INT LOCAL_POSITION_NED"),
+        ("EXTRA1", "ATTITUDE"),
+        ("EXTRA2", "VFR_HUD"),
+        ("EXTRA3", "SYSTEM_TIME BATTERY_STATUS EKF_STATUS_REPORT"),
+    )
 }
 
 

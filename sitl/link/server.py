@@ -22,7 +22,18 @@ Ap = TypeVar("Ap", bound=Autopilot)
 Builders: TypeAlias = Mapping[int, Callable[[Ap], Message | None]]
 
 PARAM_PERIOD_NS = 4 * NS_PER_MS
+Value = TypeVar("Value")
 MAX_STATUSTEXT = 50
+
+
+def by_message(**values: Value) -> dict[int, Value]:
+    """Values of messages by their number in the dialect, given by name."""
+    return {getattr(mav, f"MAVLINK_MSG_ID_{name}"): value for name, value in values.items()}
+
+
+def flags(prefix: str, names: str) -> int:
+    """The sum of the dialect's constants with this prefix."""
+    return sum(int(getattr(mav, prefix + name)) for name in names.split())
 
 
 class Endpoint(ABC, Generic[Ap]):

@@ -12,7 +12,7 @@ from types import MappingProxyType
 from pymavlink.dialects.v20 import ardupilotmega as mav
 
 from sitl.clock import NS_PER_S
-from sitl.link.server import MAX_STATUSTEXT, Endpoint
+from sitl.link.server import MAX_STATUSTEXT, Endpoint, by_message
 from sitl.px4.autopilot import Px4
 from sitl.px4.commander import Event
 from sitl.px4.messages import BUILDERS, BUILDERS_1_14, CURRENT_MODE, event_message, topic_version
@@ -23,50 +23,23 @@ FRAME_BYTES = 12
 OTHER_STREAMS_BYTES_PS = 9000
 """What PX4 sends besides the streams that this vehicle has; it counts for the bandwidth."""
 
-_BOTH = {
-    mav.MAVLINK_MSG_ID_SYSTEM_TIME: 1.0,
-    mav.MAVLINK_MSG_ID_BATTERY_STATUS: 0.5,
-    mav.MAVLINK_MSG_ID_HOME_POSITION: 0.5,
-    mav.MAVLINK_MSG_ID_ESTIMATOR_STATUS: 1.0,
-    CURRENT_MODE: 0.5,
-}
+_BOTH = by_message(SYSTEM_TIME=1.0, BATTERY_STATUS=0.5, HOME_POSITION=0.5, ESTIMATOR_STATUS=1.0)
+_BOTH[CURRENT_MODE] = 0.5
 ONBOARD_HZ: Mapping[int, float] = MappingProxyType(
     _BOTH
-    | {
-        mav.MAVLINK_MSG_ID_ATTITUDE: 100.0,
-        mav.MAVLINK_MSG_ID_ATTITUDE_QUATERNION: 50.0,
-        mav.MAVLINK_MSG_ID_GLOBAL_POSITION_INT: 50.0,
-        mav.MAVLINK_MSG_ID_HIGHRES_IMU: 50.0,
-        mav.MAVLINK_MSG_ID_LOCAL_POSITION_NED: 30.0,
-        mav.MAVLINK_MSG_ID_ODOMETRY: 30.0,
-        mav.MAVLINK_MSG_ID_RC_CHANNELS: 20.0,
-        mav.MAVLINK_MSG_ID_TIMESYNC: 10.0,
-        mav.MAVLINK_MSG_ID_ATTITUDE_TARGET: 10.0,
-        mav.MAVLINK_MSG_ID_POSITION_TARGET_LOCAL_NED: 10.0,
-        mav.MAVLINK_MSG_ID_SERVO_OUTPUT_RAW: 10.0,
-        mav.MAVLINK_MSG_ID_VFR_HUD: 10.0,
-        mav.MAVLINK_MSG_ID_GPS_RAW_INT: 5.0,
-        mav.MAVLINK_MSG_ID_EXTENDED_SYS_STATE: 5.0,
-        mav.MAVLINK_MSG_ID_SYS_STATUS: 5.0,
-    }
+    | by_message(ATTITUDE=100.0, ATTITUDE_QUATERNION=50.0, GLOBAL_POSITION_INT=50.0)
+    | by_message(HIGHRES_IMU=50.0, LOCAL_POSITION_NED=30.0, ODOMETRY=30.0, RC_CHANNELS=20.0)
+    | by_message(TIMESYNC=10.0, ATTITUDE_TARGET=10.0, POSITION_TARGET_LOCAL_NED=10.0)
+    | by_message(SERVO_OUTPUT_RAW=10.0, VFR_HUD=10.0, GPS_RAW_INT=5.0, EXTENDED_SYS_STATE=5.0)
+    | by_message(SYS_STATUS=5.0)
 )
 """Message rates on a link to a companion computer (mode Onboard)."""
 GCS_HZ: Mapping[int, float] = MappingProxyType(
     _BOTH
-    | {
-        mav.MAVLINK_MSG_ID_ATTITUDE: 50.0,
-        mav.MAVLINK_MSG_ID_ATTITUDE_QUATERNION: 50.0,
-        mav.MAVLINK_MSG_ID_ATTITUDE_TARGET: 50.0,
-        mav.MAVLINK_MSG_ID_LOCAL_POSITION_NED: 50.0,
-        mav.MAVLINK_MSG_ID_GLOBAL_POSITION_INT: 50.0,
-        mav.MAVLINK_MSG_ID_SERVO_OUTPUT_RAW: 50.0,
-        mav.MAVLINK_MSG_ID_RC_CHANNELS: 20.0,
-        mav.MAVLINK_MSG_ID_VFR_HUD: 4.0,
-        mav.MAVLINK_MSG_ID_POSITION_TARGET_LOCAL_NED: 1.5,
-        mav.MAVLINK_MSG_ID_GPS_RAW_INT: 1.0,
-        mav.MAVLINK_MSG_ID_EXTENDED_SYS_STATE: 1.0,
-        mav.MAVLINK_MSG_ID_SYS_STATUS: 1.0,
-    }
+    | by_message(ATTITUDE=50.0, ATTITUDE_QUATERNION=50.0, ATTITUDE_TARGET=50.0)
+    | by_message(LOCAL_POSITION_NED=50.0, GLOBAL_POSITION_INT=50.0, SERVO_OUTPUT_RAW=50.0)
+    | by_message(RC_CHANNELS=20.0, VFR_HUD=4.0, POSITION_TARGET_LOCAL_NED=1.5, GPS_RAW_INT=1.0)
+    | by_message(EXTENDED_SYS_STATE=1.0, SYS_STATUS=1.0)
 )
 """Rates on a link to a ground station (mode Normal, with what PX4's SITL script adds)."""
 
