@@ -25,7 +25,7 @@ class CourseGate(NamedTuple):
 class CourseProgress:
     """Gates that a path has passed: in order, forward, inside the opening.
 
-    A gate that was flown around stays the next one. ``sitl.course.referee.GateCounter`` judges the
+    A gate that was flown around stays the next one. ``sitl.course.GateCounter`` judges the
     truth of a simulated vehicle by the same rule; a property holds the two equal.
     """
 

@@ -1,0 +1,208 @@
+"""Gamepad and keyboard as the pilot: sticks, gestures, the switch, and a lost signal."""
+
+import pygame
+import pytest
+
+from sitl import UsageError
+from sitl.clock import NS_PER_MS, NS_PER_S
+from sitl.pilot import devices
+from sitl.pilot.devices import GamepadPilot, KeyboardPilot, PygamePad
+from sitl.pilot.transmitter import (
+    DEAD_ZONE,
+    DEFAULT_AXES,
+    OFF_US,
+    PERIOD_NS,
+    Axis,
+    parse_axes,
+    past_dead_zone,
+)
+
+MIDDLE = (1500, 1500, 1500, 1500)
+
+
+class Clock:
+    now = 0
+
+    def now_ns(self):
+        return self.now
+
+
+def test_axes_are_read_and_may_be_reversed():
+    axes = parse_axes("roll=0,pitch=-1, throttle=2,yaw=-0")
+    assert (axes.roll, axes.pitch, axes.yaw) == (Axis(0, False), Axis(1, True), Axis(0, True))
+    sticks = axes.sticks([1.0, 1.0, -1.0])
+    assert (sticks.roll, sticks.pitch, sticks.throttle, sticks.yaw) == (1.0, -1.0, -1.0, -1.0)
+
+
+def test_the_usual_pad_flies_by_mode_2_and_an_axis_that_it_lacks_is_centred():
+    """A pad's vertical axes are negative upwards."""
+    sticks = parse_axes(DEFAULT_AXES).sticks([0.5, -1.0, 0.0, 0.7, -1.0, 0.0])
+    assert (sticks.throttle, sticks.pitch) == (1.0, 1.0)
+    assert 0.4 < sticks.yaw < 0.5
+    assert 0.6 < sticks.roll < 0.7
+    assert parse_axes(DEFAULT_AXES).sticks([0.0, -1.0]).roll == 0.0
+
+
+@pytest.mark.parametrize("rest", ["", ",roll=3,roll=2", ",lean=3", ",roll=x", ",roll=3,"])
+def test_other_axes_are_refused_with_an_example(rest):
+    with pytest.raises(UsageError, match=DEFAULT_AXES):
+        parse_axes(f"throttle=1,yaw=0,pitch=4{rest}")
+
+
+def test_the_dead_zone_is_left_without_a_jump_and_full_stays_full():
+    assert past_dead_zone(DEAD_ZONE) == past_dead_zone(-DEAD_ZONE) == 0.0
+    assert past_dead_zone(DEAD_ZONE + 0.01) == pytest.approx(0.01 / (1 - DEAD_ZONE))
+    assert (past_dead_zone(-1.0), past_dead_zone(1.5)) == (-1.0, 1.0)
+
+
+class FakePad:
+    def __init__(self):
+        self.is_there = True
+        self.values = [0.0] * 6
+        self.down = set()
+        self.clock = Clock()
+        self.pilot = GamepadPilot(self, parse_axes(DEFAULT_AXES), self.clock)
+
+    def poll(self):
+        return self.is_there
+
+    def axes(self):
+        return self.values
+
+    def buttons(self):
+        return [number in self.down for number in range(12)]
+
+    def frame(self, *buttons):
+        """Channels of the next frame."""
+        self.down = set(buttons)
+        self.clock.now += PERIOD_NS
+        return self.pilot.latest()
+
+
+class Keys:
+    def __init__(self):
+        self.clock = Clock()
+        self.pilot = KeyboardPilot(self.clock)
+
+    def post(self, kind, *keys):
+        for key in keys:
+            pygame.event.post(pygame.event.Event(kind, key=key))
+
+    def press(self, *keys):
+        self.post(pygame.KEYDOWN, *keys)
+
+    def release(self, *keys):
+        self.post(pygame.KEYUP, *keys)
+
+    def frame(self, seconds=0.0):
+        """The last frame of this time."""
+        for _ in range(max(1, round(seconds * NS_PER_S / PERIOD_NS))):
+            self.clock.now += PERIOD_NS
+            frame = self.pilot.latest()
+        return frame
+
+
+@pytest.fixture
+def pad():
+    return FakePad()
+
+
+@pytest.fixture
+def keys(monkeypatch):
+    monkeypatch.setenv("SDL_VIDEODRIVER", "dummy")
+    made = Keys()
+    yield made
+    made.pilot.close()
+
+
+@pytest.mark.parametrize("device", ["pad", "keys"])
+def test_frames_come_at_the_rate_of_a_receiver(request, device):
+    device = request.getfixturevalue(device)
+    assert device.frame() is not None
+    device.clock.now += 2 * NS_PER_MS
+    assert device.pilot.latest() is None
+    assert device.frame() is not None
+
+
+def test_sticks_are_channels_as_the_autopilots_have_them(pad):
+    pad.values = [1.0, -1.0, 0.0, -1.0, -1.0, 0.0]
+    assert pad.frame()[:4] == (1000, 1000, 2000, 2000)  # left, nose down, up, right
+    pad.values = [0.0] * 6
+    assert pad.frame()[:4] == MIDDLE
+
+
+def test_without_the_pad_the_receiver_has_no_signal_until_it_is_back(pad):
+    assert pad.frame() != OFF_US
+    pad.is_there = False
+    assert pad.frame() == pad.frame() == OFF_US
+    pad.is_there = True
+    assert pad.frame()[:4] == MIDDLE
+
+
+def test_buttons_hold_the_gestures(pad):
+    pad.values = [0.0, 0.0, 0.0, 1.0, 0.0, 0.0]
+    assert pad.frame(devices.ARM_BUTTON)[:4] == (1500, 1500, 1000, 2000)
+    assert pad.frame(devices.DISARM_BUTTON)[:4] == (1500, 1500, 1000, 1000)
+    assert pad.frame()[:4] == (2000, 1500, 1500, 1500)
+
+
+def test_buttons_move_the_switch_once_each_time(pad):
+    record, bad = devices.RECORD_BUTTON, devices.BAD_BUTTON
+    pressed = [(), (record,), (record,), (), (bad,), (record,), (), (record,)]
+    positions = [pad.frame(*buttons)[6] for buttons in pressed]
+    assert positions == [1000, 2000, 2000, 2000, 1500, 2000, 2000, 1000]
+
+
+def test_the_mode_switch_is_moved_once_after_the_start(pad):
+    assert pad.frame()[4] == 1100
+    pad.clock.now += NS_PER_S
+    assert pad.frame()[4] == 1500
+
+
+def test_a_computer_without_a_gamepad(monkeypatch):
+    monkeypatch.setenv("SDL_VIDEODRIVER", "dummy")
+    monkeypatch.setenv("SDL_JOYSTICK_DISABLE_UDEV", "1")
+    pad = PygamePad()
+    pilot = GamepadPilot(pad, parse_axes(DEFAULT_AXES), Clock())
+    if pad.description is None:
+        assert pilot.latest() == OFF_US
+        assert (pad.axes(), pad.buttons()) == ((), ())
+    else:
+        assert "axes" in pad.description
+    pilot.close()
+
+
+def test_keys_move_the_sticks_as_fast_as_a_thumb(keys):
+    assert keys.frame()[:4] == MIDDLE
+    keys.press(pygame.K_UP, pygame.K_RIGHT)
+    assert keys.frame()[:4] == (1540, 1460, 1500, 1500)  # 0.08 in 20 ms
+    assert keys.frame(1.0)[:4] == (1850, 1150, 1500, 1500)
+    keys.press(pygame.K_LSHIFT)
+    assert keys.frame(1.0)[:4] == (2000, 1000, 1500, 1500)
+    keys.release(pygame.K_UP, pygame.K_RIGHT, pygame.K_LSHIFT)
+    keys.press(pygame.K_w, pygame.K_a)
+    assert keys.frame(1.0)[:4] == (1500, 1500, 1850, 1150)
+    keys.press(pygame.K_s)
+    assert keys.frame(1.0)[2] == 1500, "both ways are none"
+
+
+def test_keys_hold_the_gestures_and_move_the_switch(keys):
+    for key, yaw_us in ((pygame.K_RETURN, 2000), (pygame.K_BACKSPACE, 1000)):
+        keys.press(key)
+        assert keys.frame()[:4] == (1500, 1500, 1000, yaw_us)
+        keys.release(key)
+    for key, us in zip("x  ", (1500, 2000, 1000), strict=True):
+        keys.press(ord(key))
+        assert keys.frame()[6] == us
+
+
+def test_keys_that_go_to_another_window_are_released(keys):
+    keys.press(pygame.K_w)
+    assert keys.frame(1.0)[2] == 1850
+    pygame.event.post(pygame.event.Event(pygame.WINDOWFOCUSLOST))
+    assert keys.frame(1.0)[2] == 1500
+
+
+def test_a_closed_window_is_a_lost_signal(keys):
+    pygame.event.post(pygame.event.Event(pygame.QUIT))
+    assert keys.frame() == keys.frame(1.0) == OFF_US
