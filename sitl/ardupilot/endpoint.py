@@ -1,4 +1,9 @@
-"""One link of an ArduPilot vehicle: message intervals with its rounding, caps and buckets."""
+"""One link of an ArduPilot vehicle: messages, and their intervals with rounding, caps and buckets.
+
+Units and oddities are those measured on ArduCopter 4.7: scaled integers in RAW_IMU, a HIGHRES_IMU
+whose gyro keeps its bias and whose magnetometer is a million times too large, positions that are
+withheld until the estimator has one.
+"""
 
 from collections.abc import Callable, Collection
 from dataclasses import dataclass

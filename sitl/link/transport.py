@@ -226,7 +226,11 @@ _LAYOUTS = {layout.size: layout for layout in (struct.Struct("<8H"), struct.Stru
 
 
 class RcInput:
-    """A UDP port of this computer that takes receiver values; never blocks.
+    """A UDP port of this computer that takes receiver values, as ArduPilot's SITL does; never
+    blocks.
+
+    A datagram is 8 or 16 little-endian uint16, one PWM value in microseconds a channel. A 0 leaves
+    its channel as it is; all zeros switch the transmitter off.
 
     Raises:
         UsageError: the port is taken.

@@ -33,7 +33,10 @@ CAUSE_STICKS_LOST = 1
 
 
 class Event(NamedTuple):
-    """One EVENT; ``uptime_ms`` is its time since boot."""
+    """One EVENT(410); ``uptime_ms`` is its time since boot.
+
+    Its number is the autopilot's component above a hash of its name (MAVLink's events interface).
+    """
 
     name: str
     levels: int

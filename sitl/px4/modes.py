@@ -1,4 +1,4 @@
-"""Flight modes: PX4's main and sub modes, what each needs, and the flags of its heartbeat."""
+"""PX4's flight modes, and those that a failsafe changes to."""
 
 from enum import Enum
 
@@ -84,7 +84,12 @@ class Phase(Enum):
 
 
 class LostSticks:
-    """The latched failsafe of lost sticks, and its budget of delay."""
+    """The latched failsafe of lost sticks: a Hold of COM_FAIL_ACT_T, then the act of NAV_RCL_ACT,
+    whatever the sticks do meanwhile.
+
+    The delay is a budget that shrinks in such a Hold, and comes back at a quarter of that speed, or
+    at once when any parameter changes.
+    """
 
     def __init__(self, params: Px4Params) -> None:
         self._params = params
