@@ -6,16 +6,16 @@ from rich.console import Console
 
 from mavbridge.commands.config import ContractConfig
 from mavbridge.core.errors import UserError
-from policy.data.lerobot import is_lerobot
-from policy.foreign.drafts.entries import Entry, draft_text
-from policy.foreign.drafts.lerobot import (
+from policy.adapters.drafts.entries import Entry, draft_text
+from policy.adapters.drafts.lerobot import (
     checkpoint_entries,
     dataset_entries,
     dataset_of,
 )
-from policy.foreign.drafts.onnx import onnx_entries, onnx_files
-from policy.foreign.interface import CONTRACT_FILE, UNANSWERED
-from policy.foreign.lerobot.config import CONFIG_FILE
+from policy.adapters.drafts.onnx import onnx_entries, onnx_files
+from policy.adapters.interface import CONTRACT_FILE, UNANSWERED
+from policy.adapters.lerobot.config import CONFIG_FILE
+from policy.data.lerobot import is_lerobot
 
 
 def contract(source: Path, config: ContractConfig) -> int:

@@ -3,8 +3,8 @@
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from policy.adapters.user_class import FORMS
 from policy.errors import PolicyError
-from policy.foreign.user_class import FORMS
 from policy.loading.request import PolicyRequest, default_contract
 from policy.nets.names import BACKBONE_NAMES, SIZE_NAMES, BackboneName, Size
 

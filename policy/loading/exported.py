@@ -3,16 +3,16 @@
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from policy.adapters.archive import read_description
+from policy.adapters.description import Description
+from policy.adapters.onnx.files import OnnxFiles, find_onnx_files
 from policy.errors import PolicyError
 from policy.files import user_path
-from policy.foreign.archive import read_description
-from policy.foreign.description import Description
-from policy.foreign.onnx.files import OnnxFiles, find_onnx_files
 from policy.loading.request import PolicyRequest
 from policy.protocol import SingleRatePolicy
 
 if TYPE_CHECKING:
-    from policy.foreign.onnx.policies import OnnxPolicy
+    from policy.adapters.onnx.policies import OnnxPolicy
 
 ONNX, TORCHSCRIPT = "onnx", "torchscript"
 
@@ -35,7 +35,7 @@ def check_onnx(request: PolicyRequest) -> OnnxFiles:
 
 def load_onnx(request: PolicyRequest) -> tuple["OnnxPolicy", list[str]]:
     """The policy in float32, and notes for the user; raises as ``check_onnx``."""
-    from policy.foreign.onnx.policies import OnnxGraphs
+    from policy.adapters.onnx.policies import OnnxGraphs
 
     graphs = OnnxGraphs(check_onnx(request), request.seed)
     files = [each.name for each in (graphs.files.encoder, graphs.files.rest) if each is not None]
@@ -59,7 +59,7 @@ def check_torchscript(request: PolicyRequest) -> Description:
 
 def load_archive(request: PolicyRequest) -> tuple[SingleRatePolicy, list[str]]:
     """The policy, and notes for the user; raises as ``check_torchscript``."""
-    from policy.foreign.torchscript import load_torchscript
+    from policy.adapters.torchscript import load_torchscript
 
     description = check_torchscript(request)
     path = _path(request, "torchscript:FILE.pt")

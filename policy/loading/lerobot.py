@@ -2,13 +2,13 @@
 
 from typing import TYPE_CHECKING
 
+from policy.adapters.lerobot.plan import Plan, read_plan
 from policy.errors import PolicyError
 from policy.files import user_path
-from policy.foreign.lerobot.plan import Plan, read_plan
 from policy.loading.request import PolicyRequest
 
 if TYPE_CHECKING:
-    from policy.foreign.lerobot.policy import LeRobotPolicy
+    from policy.adapters.lerobot.policy import LeRobotPolicy
 
 LEROBOT = "lerobot"
 
@@ -30,7 +30,7 @@ def check_lerobot(request: PolicyRequest) -> Plan:
 
 def load_lerobot(request: PolicyRequest) -> tuple["LeRobotPolicy", list[str]]:
     """The policy with its weights, and notes for the user; raises as ``check_lerobot``."""
-    from policy.foreign.lerobot.load import load_policy_of
+    from policy.adapters.lerobot.load import load_policy_of
 
     return load_policy_of(
         check_lerobot(request),

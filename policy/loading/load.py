@@ -20,15 +20,15 @@ from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
 
+from policy.adapters.user_class import check_user_class, load_user_class
+from policy.adapters.websocket.kind import SCHEMES, check_server, load_server_policy
+from policy.checkpoints.detect import detect
 from policy.checkpoints.header import read_contract
-from policy.checkpoints.what_file import recognise
 from policy.contract import Contract
 from policy.engines.devices import require_devices
 from policy.engines.executable import ExecutionSettings, make_numpy_executable
 from policy.errors import PolicyError
 from policy.files import user_path
-from policy.foreign.user_class import check_user_class, load_user_class
-from policy.foreign.websocket.kind import SCHEMES, check_server, load_server_policy
 from policy.loading.builtin import BUILTIN_KINDS, builtin_checkpoint, load_builtin, parse_builtin
 from policy.loading.exported import (
     ONNX,
@@ -189,7 +189,7 @@ def _executable(
 ) -> tuple[Executable, tuple[str, ...]]:
     """An engine that takes the policy's kind of arrays, and notes about the choice."""
     if request.spec.partition(":")[0] == ONNX:
-        from policy.foreign.onnx.policies import OnnxPolicy, choose_precision
+        from policy.adapters.onnx.policies import OnnxPolicy, choose_precision
 
         if isinstance(policy, OnnxPolicy):
             return choose_precision(policy, settings)
@@ -222,7 +222,7 @@ def _require_flags_of_kind(kind: str, request: PolicyRequest) -> None:
     """Refuse a contract file where it has no use, and a file of another kind than was named."""
     if kind in (LEROBOT, ONNX, TORCHSCRIPT):
         path = user_path(request.spec.partition(":")[2])
-        sentence = recognise(path) if path.is_file() else None
+        sentence = detect(path) if path.is_file() else None
         own = tuple(f"--policy {kind}:{each}" for each in (path, path.parent))
         if sentence is not None and not sentence.endswith(own):
             raise PolicyError(f"--policy {request.spec}: {sentence}")
@@ -240,7 +240,7 @@ def _require_no_path(spec: str) -> None:
         return
     if path.exists():
         advice = f"{spec} is a file: give weights of ours as --checkpoint {spec}"
-        raise PolicyError(f"--policy {recognise(path) or advice}")
+        raise PolicyError(f"--policy {detect(path) or advice}")
     if path.name != spec:
         raise PolicyError(
             f"--policy {spec}: there is no such file or folder; a model of the Hugging Face hub is "

@@ -6,6 +6,7 @@ from pathlib import Path
 import pytest
 
 from mavbridge.__main__ import main
+from policy.adapters.interface import read_interface
 from policy.errors import ContractError
 from policy.files import (
     MAX_TOML_BYTES,
@@ -16,7 +17,6 @@ from policy.files import (
     read_toml,
     user_path,
 )
-from policy.foreign.interface import read_interface
 
 
 @pytest.fixture
