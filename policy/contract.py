@@ -115,9 +115,6 @@ class Contract:
     Times are seconds, never ticks: one checkpoint behaves the same at 50, 100 or 250 Hz. Ages are
     judged when a stick leaves for the autopilot, not when a computation starts; the configuration
     of a flight may tighten their limits, never loosen them.
-
-    Raises:
-        ContractError: a field is out of its range.
     """
 
     state_frame: StateFrame = "ned_frd"
@@ -201,7 +198,6 @@ class Contract:
     version: int = field(default=CONTRACT_VERSION, init=False)
 
     def __post_init__(self) -> None:
-        """Refuse values that no runtime could serve."""
         try:
             self._require_values()
             self._require_images()
@@ -383,11 +379,7 @@ class Contract:
 
     @classmethod
     def from_json(cls, text: str) -> "Contract":
-        """Read the header form; an older one gets the defaults of the fields that came later.
-
-        Raises:
-            ContractError: not JSON, another version, unknown keys, or values out of range.
-        """
+        """Read the header form; an older one gets the defaults of the fields that came later."""
         try:
             data: Any = parse_json(text)
         except ValueError as error:

@@ -10,12 +10,7 @@ from policy.files import why_unreadable
 
 
 def read_description(spec: str, path: Path, contract_file: Path | None) -> Description:
-    """What the archive of the policy ``spec`` says of itself: milliseconds.
-
-    Raises:
-        PolicyError: it is no such archive, something is malformed, or nothing says what the
-            contract is.
-    """
+    """What the archive of the policy ``spec`` says of itself: milliseconds."""
     try:
         with zipfile.ZipFile(path) as archive:
             names = archive.namelist()

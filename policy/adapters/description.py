@@ -66,9 +66,6 @@ def describe(
     ``text`` is the JSON of this module's docstring, read from ``where``, if there is one; the
     contract is that of ``contract_file``, else that of the text, else that of mavbridge.toml in the
     folder ``beside``.
-
-    Raises:
-        PolicyError: something is malformed, or nothing says what the contract is.
     """
     data = {} if text is None else _parsed(where, text)
     rest = {name: data.get(name, {}) for name in TABLES if name != "contract"}

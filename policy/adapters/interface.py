@@ -55,11 +55,7 @@ ACTION_FIELDS: dict[str, tuple[str, ...]] = {
 
 @dataclass(frozen=True, kw_only=True)
 class Interface:
-    """How a policy names and orders what it takes and gives.
-
-    Raises:
-        ContractError: a name that is unknown, or a number that is missing.
-    """
+    """How a policy names and orders what it takes and gives."""
 
     contract: Contract
     state_names: tuple[str, ...] = ()
@@ -81,7 +77,6 @@ class Interface:
     """The task in words, for policies that are given one."""
 
     def __post_init__(self) -> None:
-        """Refuse what cannot be mapped."""
         known = (*self.contract.state_names, *DERIVED_NAMES)
         if unknown := [name for name in self.state_names if name not in known]:
             raise ContractError(f"[state] names {unknown} are unknown; known are {list(known)}")
@@ -171,9 +166,6 @@ def read_interface(path: Path, derived: Mapping[str, object] | None = None) -> I
 
     ``derived`` are fields of the contract that the policy's own files say: the contract file may
     repeat them, not contradict them.
-
-    Raises:
-        ContractError: it cannot be read, is not TOML, or says something unknown or malformed.
     """
     try:
         data: dict[str, Any] = read_toml(path)

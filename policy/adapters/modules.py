@@ -50,9 +50,6 @@ def adopt_modules(
     A contract without feature_dim gets it from the encoder's output. ``inputs`` names the state
     of a forward that takes no image, ``outputs`` says which of several values that a module returns
     is its result, both as ``adapters.description``.
-
-    Raises:
-        PolicyError: the encoder fails on a dummy image, or a part is missing.
     """
     encoder, head, denoiser = (
         getattr(holder, part, None) for part in ("visual_encoder", "action_head", "denoiser")

@@ -20,11 +20,7 @@ from policy.protocol import SingleRatePolicy
 def load_torchscript(
     spec: str, path: Path, description: Description, seed: int
 ) -> SingleRatePolicy:
-    """The policy of an archive, on the CPU.
-
-    Raises:
-        PolicyError: the archive is damaged, or has no modules that make a policy.
-    """
+    """The policy of an archive, on the CPU."""
     try:
         # torch says that this will go one day, in favour of a format that few export to so far.
         with warnings.catch_warnings(action="ignore", category=DeprecationWarning):

@@ -32,11 +32,7 @@ OUR_PACKAGES = ("policy", "sitl", "mavbridge")
 
 
 def check_user_class(spec: str) -> None:
-    """Refuse, without running any code of the user's, what cannot be a class.
-
-    Raises:
-        PolicyError: the form is wrong, or there is no such file or module.
-    """
+    """Refuse, without running any code of the user's, what cannot be a class."""
     where, _ = _split(spec)
     if isinstance(where, Path):
         _require_python_file(spec, where)
@@ -61,9 +57,6 @@ def load_user_class(spec: str, checkpoint: Path | None, *, seed: int = 0) -> Sin
 
     It may also name the torch modules of its policy, as ``adapters.modules`` says; ``seed`` is that
     of a denoiser's initial noise.
-
-    Raises:
-        PolicyError: there is no such class, it cannot be made, or a member is missing.
     """
     check_user_class(spec)
     where, class_name = _split(spec)

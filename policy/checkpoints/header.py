@@ -43,11 +43,7 @@ def require_header(path: Path, header: dict[str, str]) -> None:
 
 
 def read_contract(path: Path) -> Contract | None:
-    """The contract in a policy's file; None where it is a ``.pt``, which only torch can read.
-
-    Raises:
-        ContractError: the contract is malformed or of another version.
-    """
+    """The contract in a policy's file; None where it is a ``.pt``, which only torch can read."""
     require_file(path, SUFFIXES)
     if path.suffix != ".safetensors":
         return None

@@ -87,9 +87,6 @@ def save_checkpoint(
 
     ``training`` is JSON that says how it was trained, for people and reports. ``packed`` makes a
     third of the size, rounded as ``pack`` says; the test vector is then of rounded weights.
-
-    Raises:
-        CheckpointError: weights that are not finite, or a path that cannot be written.
     """
     state = {name: value.detach().contiguous() for name, value in policy.state_dict().items()}
     require_finite(path, state)
@@ -112,10 +109,6 @@ def load_checkpoint(path: Path, *, fallback: BuiltinConfig) -> BuiltinPolicy:
 
     ``fallback`` is the policy that was asked for: its kind must be the file's, and its values serve
     for what a ``.pt`` does not say.
-
-    Raises:
-        CheckpointError: missing, corrupt, of another policy or contract version, not finite, or
-            it no longer makes the chunks of its test vector.
     """
     return load_checkpoint_with_notes(path, fallback=fallback)[0]
 

@@ -44,9 +44,6 @@ def find_weights(path: Path, loaded: Mapping[Any, Any], wanted: Shapes) -> Found
 
     They may lie under keys (``state_dict``, ``ema``) and behind prefixes (``module.``, ``net.``).
     Averaged weights are preferred to those that they are the average of.
-
-    Raises:
-        CheckpointError: there are no weights, or quantised ones.
     """
     tables = {} if "param_groups" in loaded else dict(_tables(loaded))
     if not tables:

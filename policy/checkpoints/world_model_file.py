@@ -30,9 +30,6 @@ def save_world_model(
 
     ``training`` is JSON that says how it was trained, for people and reports. ``half`` stores
     float16, at half the size and some thousandth of rounding.
-
-    Raises:
-        CheckpointError: weights that are not finite as stored, or a path that cannot be written.
     """
     dtype = torch.float16 if half else torch.float32
     state = {
@@ -48,11 +45,7 @@ def save_world_model(
 
 
 def load_world_model(path: Path) -> WorldModel:
-    """Read a world model, in float32 on the CPU and in eval mode.
-
-    Raises:
-        CheckpointError: missing, damaged, of another kind or version, or not finite.
-    """
+    """Read a world model, in float32 on the CPU and in eval mode."""
     if path.suffix != ".safetensors":
         raise CheckpointError(f"{path}: world models are stored as .safetensors")
     require_file(path, (".safetensors",))

@@ -75,9 +75,6 @@ def store_frames(
 
     It has a file of images of ``size`` pixels a side for each flight, named by the content of its
     video and the size. ``progress`` is called with the fraction done.
-
-    Raises:
-        DatasetError: no image in a flight, or no room on the disk.
     """
     try:
         folder.mkdir(parents=True, exist_ok=True)

@@ -44,9 +44,6 @@ def convert(policy: nn.Module, function: Callable[..., Any], shapes: Sequence[Sh
     """``function`` of float32 tensors of these shapes, which uses the weights of ``policy``.
 
     It is traced: what it decides by a tensor's values is decided once, by zeros.
-
-    Raises:
-        PolicyError: the tracer or the converter does not know an operation.
     """
     log_level = logging.root.level
     try:

@@ -74,11 +74,7 @@ def make_module_executable(
 
 
 class ModuleConverter:
-    """Converts functions of a policy; a graph that is needed at two precisions, only once.
-
-    Raises:
-        PolicyError: the policy holds no modules.
-    """
+    """Converts functions of a policy; a graph that is needed at two precisions, only once."""
 
     def __init__(self, policy: object, name: str) -> None:
         self._modules = nn.ModuleList(modules_of(policy)).eval()
@@ -97,12 +93,7 @@ class ModuleConverter:
     def compile(
         self, function: Callable[..., Any], shapes: Sequence[Shape], precision: Precision
     ) -> ArrayFunction:
-        """``function`` of float32 tensors of these shapes, compiled or from the user's cache.
-
-        Raises:
-            PolicyError: it decides by a tensor's values, has an operation that cannot be
-                converted, or is too large.
-        """
+        """``function`` of float32 tensors of these shapes, compiled or from the user's cache."""
         module = _Traceable(self._modules, function).eval()
         examples = tuple(torch.zeros(shape) for shape in shapes)
         with user_code(f"{self._name} cannot be converted"), _quiet(), torch.no_grad():
@@ -207,11 +198,7 @@ def _tensors(program: ExportedProgram) -> Iterator[tuple[str, Tensor, int]]:
 
 
 def _digest_of_script(module: nn.Module, examples: tuple[Tensor, ...]) -> str:
-    """As ``_digest`` of a module that calls TorchScript.
-
-    Raises:
-        PolicyError: it is too large to be converted.
-    """
+    """As ``_digest`` of a module that calls TorchScript."""
     graph = _traced(module, examples).inlined_graph
     operations = sum(1 for _ in graph.nodes())
     if operations > MAX_SCRIPT_OPERATIONS:

@@ -28,11 +28,7 @@ def make_stepwise_executable(
     engine: str,
     settings: ExecutionSettings,
 ) -> Executable:
-    """As ``executable.make_executable``; ``compile_end`` is for ``to_chunk``, the end of a solve.
-
-    Raises:
-        PolicyError: the policy failed on the dummy sample.
-    """
+    """``executable.make_executable``; ``compile_end`` is for ``to_chunk``, the end of a solve."""
     contract = policy.contract
     image = ((1, *contract.image_shape[-3:]),)
     encode = [compile_vision(method, image) for method in encoders(policy)]

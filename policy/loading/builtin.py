@@ -19,11 +19,7 @@ BUILTIN_KINDS = ("toge", "toge-rates", "resnet-unet")
 
 
 def builtin_config(spec: str, *, image_size: int) -> "BuiltinConfig":
-    """The built-in network that ``spec`` names, with the default contract at that image size.
-
-    Raises:
-        PolicyError: it names none.
-    """
+    """The built-in network that ``spec`` names, with the default contract at that image size."""
     kind, *options = spec.split(":")
     if kind not in BUILTIN_KINDS:
         raise PolicyError(

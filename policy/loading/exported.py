@@ -18,11 +18,7 @@ ONNX, TORCHSCRIPT = "onnx", "torchscript"
 
 
 def check_onnx(request: PolicyRequest) -> OnnxFiles:
-    """Where its graphs lie and what is said of them, in milliseconds; no graph is read.
-
-    Raises:
-        PolicyError: a file is missing or malformed, or a flag does not go with ONNX.
-    """
+    """Where its graphs lie and what is said of them, in milliseconds; no graph is read."""
     path = _path(request, "onnx:DIR or onnx:FILE.onnx")
     devices = {request.vision_device or request.device, request.action_device or request.device}
     if request.engine not in ("auto", "openvino") or devices != {"cpu"}:
@@ -46,11 +42,7 @@ def load_onnx(request: PolicyRequest) -> tuple["OnnxPolicy", list[str]]:
 
 
 def check_torchscript(request: PolicyRequest) -> Description:
-    """What the archive says of itself, in milliseconds; no module of it is loaded.
-
-    Raises:
-        PolicyError: it is missing, no such archive, or says nothing of its contract.
-    """
+    """What the archive says of itself, in milliseconds; no module of it is loaded."""
     path = _path(request, "torchscript:FILE.pt")
     if not path.is_file():
         raise PolicyError(f"--policy {request.spec}: there is no file {path}")

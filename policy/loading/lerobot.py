@@ -14,11 +14,7 @@ LEROBOT = "lerobot"
 
 
 def check_lerobot(request: PolicyRequest) -> Plan:
-    """All that its folder and the contract file say, in milliseconds; the weights are not read.
-
-    Raises:
-        PolicyError: a file is missing, not supported, or contradicts another.
-    """
+    """All that its folder and the contract file say, in milliseconds; the weights are not read."""
     folder = request.spec.partition(":")[2]
     if not folder or request.checkpoint is not None:
         raise PolicyError(

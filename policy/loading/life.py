@@ -11,11 +11,7 @@ _WHEN = {"reset": "when a flight begins", "close": "when it is not needed any mo
 
 
 def life_method(policy: SingleRatePolicy, name: str, spec: str) -> Callable[[], None]:
-    """The policy's own ``reset`` or ``close``, ready to call; one that does nothing if it has none.
-
-    Raises:
-        PolicyError: it is no method, or needs arguments.
-    """
+    """The policy's own ``reset`` or ``close``, ready to call; a no-op if it has none."""
     method: object = getattr(policy, name, None)
     if method is None:
         return keep_nothing

@@ -27,9 +27,6 @@ def size_dims(size: Size) -> SizeDims:
 
     On a CPU every diffusion step reads all weights once: 100 Hz with 10 steps leaves room for about
     3 million of them on one core.
-
-    Raises:
-        PolicyError: the size is unknown.
     """
     match size:
         case "small":

@@ -44,11 +44,7 @@ def build_backbone(name: BackboneName) -> Backbone:
 
 
 def load_imagenet_state(backbone: Backbone, state: Mapping[str, Tensor]) -> None:
-    """Load torchvision's state dict of the same architecture; its classifier is left out.
-
-    Raises:
-        PolicyError: names or shapes do not fit.
-    """
+    """Load torchvision's state dict of the same architecture; its classifier is left out."""
     kept = {name: value for name, value in state.items() if name not in backbone.classifier_keys}
     try:
         backbone.load_state_dict(kept)

@@ -48,11 +48,7 @@ class DdimStep:
 
 @dataclass(frozen=True, kw_only=True)
 class NoiseSchedule:
-    """The noise schedule of training, and which quantity the net was trained to predict.
-
-    Raises:
-        PolicyError: a field is out of its range.
-    """
+    """The noise schedule of training, and which quantity the net was trained to predict."""
 
     num_train_timesteps: int = TRAIN_TIMESTEPS
     betas: BetaSchedule = "squared_cosine"
@@ -61,7 +57,6 @@ class NoiseSchedule:
     is divided by sqrt(a_t), which is 5e-4 at t = 99: with few steps ``sample`` is the safer one."""
 
     def __post_init__(self) -> None:
-        """Refuse a value that has no schedule."""
         if not (
             isinstance(self.num_train_timesteps, int) and 1 <= self.num_train_timesteps <= 1000
         ):
@@ -84,9 +79,6 @@ class NoiseSchedule:
 
         Timesteps are spaced evenly and end at the noisiest one ("trailing", Lin et al. 2024), so
         that every count starts from pure noise, and count 1 is the net's x_0 of pure noise.
-
-        Raises:
-            PolicyError: count is not in 1..num_train_timesteps.
         """
         total = self.num_train_timesteps
         if not isinstance(count, int) or isinstance(count, bool) or not 1 <= count <= total:
@@ -97,11 +89,7 @@ class NoiseSchedule:
         return _ddim_steps(total, self.betas, count)
 
     def add_noise(self, clean: Tensor, noise: Tensor, timestep: Tensor) -> Tensor:
-        """Forward process, for training: clean [B, ...] and standard normal noise -> noisy.
-
-        Raises:
-            PolicyError: shapes do not fit, or a timestep [B] is not in 0..num_train_timesteps-1.
-        """
+        """Forward process, for training: clean [B, ...] and standard normal noise -> noisy."""
         if clean.shape != noise.shape or timestep.shape != clean.shape[:1]:
             raise PolicyError(
                 f"add_noise needs clean and noise of one shape and a timestep per sample, got "

@@ -81,9 +81,6 @@ class UNet1d(nn.Module):
 
     ``widths`` are the channels of each level, multiples of 8; the length halves from one level to
     the next.
-
-    Raises:
-        PolicyError: the horizon cannot be halved so often.
     """
 
     def __init__(self, *, horizon: int, condition_dim: int, widths: tuple[int, ...]) -> None:

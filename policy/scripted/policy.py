@@ -34,9 +34,6 @@ class ScriptedPolicy:
     is left late costs nothing, and it drifts as the vehicle's own velocity estimate does. A state
     at rest on the ground is that of a hover, so whoever begins in the air has to say so. Used by
     one thread.
-
-    Raises:
-        PolicyError: the program or the kind of action is unknown.
     """
 
     def __init__(
@@ -116,9 +113,6 @@ class ScriptedPolicy:
         """State [1, 13] in ``ned_frd`` -> chunk [1, 16, 4]; the other arguments are not used.
 
         Each action is the program's motion at its own time with the feedback of now.
-
-        Raises:
-            PolicyError: the state is not [1, 13].
         """
         if state.shape != (1, STATE_DIM):
             raise PolicyError(f"state must be [1, {STATE_DIM}], got {list(state.shape)}")

@@ -17,9 +17,6 @@ def make_scripted(
 
     Without a program it hovers, without a kind of action it moves sticks. ``air``: it begins in the
     air, and keeps the altitude of then.
-
-    Raises:
-        PolicyError: there is no such program or kind of action.
     """
     starts_in_air = options[-1:] == [IN_AIR]
     named = [*options[: len(options) - starts_in_air], "", ""]

@@ -65,12 +65,6 @@ def train_policy(
     """Train, and write the best weights on held-out flights to ``settings.out``.
 
     The best are those with the least validation loss, or the highest score by ``check``.
-
-    Raises:
-        DatasetError: flights that cannot be learned from.
-        TrainingError: a run that cannot be resumed or kept, or that diverged.
-        TrainingStoppedError: ``hooks.should_stop`` ended it.
-        PolicyError: weights to start from that do not fit.
     """
     folder = open_run(settings, network, flights)
     return _PolicyRun(flights, network, settings, folder, hooks, check).finish()

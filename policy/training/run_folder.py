@@ -77,11 +77,7 @@ class RunFolder:
             raise TrainingError(f"the training cannot be kept: {reason}") from error
 
     def load(self) -> tuple[Position, dict[str, Any]]:
-        """The state that was saved last.
-
-        Raises:
-            TrainingError: there is none, it is damaged, or of another run.
-        """
+        """The state that was saved last."""
         path = self._state
         if not path.is_file():
             raise TrainingError(f"{self.path} holds no run to resume: leave out --resume")

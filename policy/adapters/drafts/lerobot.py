@@ -32,11 +32,7 @@ class _Vectors:
 
 
 def dataset_entries(folder: Path) -> list[Entry]:
-    """All that a dataset (v2 or v3) says: names, rate, cameras, and axes if it is one of ours.
-
-    Raises:
-        CheckpointError: not a dataset, or damaged.
-    """
+    """All that a dataset (v2 or v3) says: names, rate, cameras, and axes if it is one of ours."""
     info = read_json(folder / INFO)
     features = _table(folder / INFO, info, "features")
     images = [key for key, value in features.items() if value.get("dtype") in ("video", "image")]
@@ -49,11 +45,7 @@ def dataset_entries(folder: Path) -> list[Entry]:
 
 
 def checkpoint_entries(folder: Path, dataset: Path | None) -> list[Entry]:
-    """All that a policy's folder says: shapes; and of the dataset, if there is one, the rest.
-
-    Raises:
-        CheckpointError: not a policy's folder, damaged, or not of this dataset.
-    """
+    """All that a policy's folder says: shapes; and of the dataset, if there is one, the rest."""
     path = folder / CONFIG_FILE
     config = read_json(path)
     inputs, outputs = (

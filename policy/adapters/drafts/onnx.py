@@ -34,11 +34,7 @@ def onnx_files(source: Path) -> list[Path]:
 
 
 def onnx_entries(files: Sequence[Path]) -> list[Entry]:
-    """All that graphs say: names and sizes of image, state, history and chunk.
-
-    Raises:
-        CheckpointError: one of them cannot be read.
-    """
+    """All that graphs say: names and sizes of image, state, history and chunk."""
     inputs, outputs = _ports(files)
     images = [port for port in inputs if len(port.shape) >= 4 and port.shape[-3] in (1, 3)]
     histories = [port for port in inputs if "history" in port.name and len(port.shape) >= 2]

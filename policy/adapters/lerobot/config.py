@@ -140,11 +140,7 @@ def map_size(height: int, width: int) -> tuple[int, int]:
 
 
 def read_config(folder: Path) -> tuple[Config, list[str]]:
-    """The policy that a folder holds, and notes for the user.
-
-    Raises:
-        CheckpointError: there is no such file, or it says something that is not supported here.
-    """
+    """The policy that a folder holds, and notes for the user."""
     path = folder / CONFIG_FILE
     if not path.is_file():
         raise CheckpointError(f"{folder}: holds no {CONFIG_FILE}; {_where_to_look(folder)}")

@@ -114,11 +114,7 @@ class Diffusion(nn.Module):
         return prediction
 
     def act(self, feature: Tensor, state: Tensor, num_diffusion_steps: int) -> Tensor:
-        """A whole solve -> actions from now on [B, horizon, 4].
-
-        Raises:
-            PolicyError: more steps than in training.
-        """
+        """A whole solve -> actions from now on [B, horizon, 4]."""
         of_condition = self.film_of_condition(feature, state)
         sample = self.initial_noise.expand(feature.shape[0], -1, -1)
         for step in self.schedule.ddim_steps(num_diffusion_steps):

@@ -23,9 +23,6 @@ def load_policy_of(
     """Build a policy and load its weights; with notes for the user.
 
     ``seed`` is that of a flight's initial noise.
-
-    Raises:
-        CheckpointError: the weights cannot be read, or are not of the policy that config.json says.
     """
     policy = build_policy_of(plan)
     policy.net.load_state_dict(_read(plan.folder / WEIGHTS_FILE, policy))

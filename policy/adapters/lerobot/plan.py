@@ -29,12 +29,7 @@ class Plan:
 
 
 def read_plan(folder: Path, contract_file: Path | None) -> Plan:
-    """Read everything but the weights: milliseconds, and no torch.
-
-    Raises:
-        CheckpointError: a file is missing, or says something that is not supported here.
-        ContractError: there is no contract file, or it contradicts the policy.
-    """
+    """Read everything but the weights: milliseconds, and no torch."""
     config, notes = read_config(folder)
     if not (folder / WEIGHTS_FILE).is_file():
         raise CheckpointError(f"{folder / WEIGHTS_FILE} is missing: copy the whole folder")

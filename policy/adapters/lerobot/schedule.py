@@ -28,9 +28,6 @@ class DdimSchedule:
 
         Their timesteps are multiples of the spacing from 0 on ("leading", Lin et al. 2024), so that
         few steps do not begin at the noisiest one.
-
-        Raises:
-            PolicyError: count is not in 1..num_train_timesteps.
         """
         total = self._config.num_train_timesteps
         if not 1 <= count <= total:

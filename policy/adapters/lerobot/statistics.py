@@ -94,11 +94,7 @@ class _Statistics:
 
 
 def read_normalisation(folder: Path, features: Features) -> tuple[Normalisation, list[str]]:
-    """What a policy's files say, and notes for the user.
-
-    Raises:
-        CheckpointError: a file or a statistic is missing, or a step of a processor is unknown.
-    """
+    """What a policy's files say, and notes for the user."""
     renamed: dict[str, str] = {}
     if (folder / PREPROCESSOR).is_file():
         inputs, renamed = _processor(folder / PREPROCESSOR, "normalizer_processor")

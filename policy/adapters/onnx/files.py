@@ -51,11 +51,7 @@ class OnnxFiles:
 
 
 def find_onnx_files(spec: str, path: Path, contract_file: Path | None) -> OnnxFiles:
-    """Read everything but the graphs of the policy ``spec``: milliseconds.
-
-    Raises:
-        PolicyError: a file is missing or malformed, or nothing says what the contract is.
-    """
+    """Read everything but the graphs of the policy ``spec``: milliseconds."""
     if not path.exists():
         raise CheckpointError(f"--policy {spec}: there is no such file or folder")
     folder = path if path.is_dir() else path.parent
@@ -91,11 +87,7 @@ def _graphs(spec: str, path: Path) -> tuple[Path | None, Path]:
 
 
 def read_graph(path: Path) -> "ov.Model":
-    """Read an ONNX file and the files of its weights.
-
-    Raises:
-        CheckpointError: one of them is missing, cut short, or no such file.
-    """
+    """Read an ONNX file and the files of its weights."""
     from openvino import Core  # not needed to find the files
 
     _require_external_data(path)

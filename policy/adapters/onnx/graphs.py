@@ -74,12 +74,7 @@ class RoleGraph:
 
 
 class GraphFile:
-    """An ONNX file, read once and compiled at any precision.
-
-    Raises:
-        CheckpointError: it cannot be read, its inputs or outputs cannot be told apart, or it does
-            not take the contract's shapes or types.
-    """
+    """An ONNX file, read once and compiled at any precision."""
 
     @signal_stack_kept()
     def __init__(self, path: Path, ports: Ports) -> None:

@@ -30,11 +30,7 @@ from policy.protocol import Executable
 
 
 class OnnxGraphs:
-    """The graphs of a policy, read and checked against its contract.
-
-    Raises:
-        PolicyError: a file cannot be read, or does not fit the contract.
-    """
+    """The graphs of a policy, read and checked against its contract."""
 
     def __init__(self, files: OnnxFiles, seed: int) -> None:
         wanted = _wanted(files)
@@ -181,10 +177,6 @@ def choose_precision(
 
     ``policy`` is in float32. There is nothing else to compare with: that these graphs are the
     policy is taken from the files.
-
-    Raises:
-        PolicyError: the policy fails on a dummy sample, or gives other shapes than the contract's,
-            or no numbers.
     """
     samples = make_parity_samples(policy.contract)
 

@@ -32,22 +32,14 @@ TERMS = (
 
 
 def require_packages(what: str) -> None:
-    """Refuse what cannot be done without the extra.
-
-    Raises:
-        PolicyError: a package of it is missing; ``what`` needs it.
-    """
+    """Refuse what cannot be done without the extra."""
     if missing := [name for name in PACKAGES if find_spec(name) is None]:
         names = " and ".join(missing), " ".join(missing)
         raise PolicyError("{} needs {}: pip install {}".format(what, *names))
 
 
 def check_server(url: str, contract_file: Path | None, checkpoint: Path | None) -> None:
-    """Refuse in milliseconds an address, a contract file or a flag that cannot serve.
-
-    Raises:
-        PolicyError: with what was wrong and what to write.
-    """
+    """Refuse in milliseconds an address, a contract file or a flag that cannot serve."""
     require_packages(f"--policy {url}")
     try:
         parts = urlsplit(url)
@@ -67,12 +59,7 @@ def check_server(url: str, contract_file: Path | None, checkpoint: Path | None) 
 
 
 def load_server_policy(url: str, contract_file: Path | None) -> tuple["RemotePolicy", list[str]]:
-    """Connect to a policy server, find its contract and try it; with lines for the user.
-
-    Raises:
-        PolicyError: nobody serves a policy there, its contract is not known, or what it answers is
-            no chunk by that contract.
-    """
+    """Connect to a policy server, find its contract and try it; with lines for the user."""
     from policy.adapters.websocket.link import API_KEY_VARIABLE, ServerLink
     from policy.adapters.websocket.messages import CONTRACT_KEY
     from policy.adapters.websocket.remote_policy import RemotePolicy

@@ -69,20 +69,12 @@ class ServerLink:
         )
 
     def connect(self) -> Message:
-        """Connect for the first time; returns the metadata of the server.
-
-        Raises:
-            PolicyError: nobody listens there, or it is no policy server.
-        """
+        """Connect for the first time; returns the metadata of the server."""
         self._thread.start()
         return self._metadata.result(2 * CONNECT_S + CLOSE_S + JOIN_S)
 
     def ask(self, payload: bytes, timeout_s: float) -> Answer:
-        """Send a request and wait for its answer.
-
-        Raises:
-            NoChunkError: there is none in time, or the connection is lost.
-        """
+        """Send a request and wait for its answer."""
         if self._problem is not None:
             raise NoChunkError(self._problem)
         request = _Request(payload, max(timeout_s, LOST_S), Future())

@@ -39,9 +39,6 @@ def unpack(data: bytes | str) -> Message:
     """Read a message; arrays are read-only views of ``data``.
 
     Nothing in it can claim more memory than a small multiple of its own length.
-
-    Raises:
-        MessageError: it is no msgpack map, or holds an array that is malformed.
     """
     if isinstance(data, str):
         raise MessageError(f"a text in place of a msgpack map: {last_line(data)}")
@@ -106,11 +103,7 @@ def _dtype(text: object) -> np.dtype[np.generic]:
 
 
 def number_array(message: Message, key: str) -> NDArray[np.generic]:
-    """An array of numbers in a message, or a list of them.
-
-    Raises:
-        MessageError: there is none of that name.
-    """
+    """An array of numbers in a message, or a list of them."""
     if key not in message:
         raise MessageError(f"no {key!r} in it; it has {sorted(message)}")
     try:

@@ -46,11 +46,7 @@ def to_message(
 def from_message(
     interface: Interface, message: Message
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Image, state and history of a request, with the batch, as ``predict`` takes them.
-
-    Raises:
-        MessageError: something is missing, or of another type or shape than the contract's.
-    """
+    """Image, state and history of a request, with the batch, as ``predict`` takes them."""
     contract = interface.contract
     stack = () if contract.observation_steps == 1 else (contract.observation_steps,)
     shape, kind = (*stack, *contract.picture_shape), "f" if contract.is_depth else "u"

@@ -62,11 +62,7 @@ class RemotePolicy:
         action_history: FloatArray,
         num_diffusion_steps: int,
     ) -> FloatArray:
-        """Ask the server for a chunk; it has diffusion steps of its own.
-
-        Raises:
-            NoChunkError: no answer in time, none at all, or none that is a chunk.
-        """
+        """Ask the server for a chunk; it has diffusion steps of its own."""
         history = action_history[0] if self._is_ours else None
         message = to_message(self._interface, image[0], state[0], history=history)
         if self._is_ours and self._has_begun:
@@ -90,11 +86,7 @@ class RemotePolicy:
         self._link.close()
 
     def try_out(self) -> str:
-        """Ask for two chunks of a dummy sample; returns a line with the time of the second one.
-
-        Raises:
-            NoChunkError: there are none.
-        """
+        """Ask for two chunks of a dummy sample; returns a line with the time of the second one."""
         contract = self.contract
         image = np.zeros((1, *contract.image_shape), np.float32)
         history = np.zeros((1, contract.history_len, ACTION_DIM), np.float32)
