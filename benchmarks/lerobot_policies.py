@@ -20,9 +20,8 @@ import numpy as np
 import torch
 
 from mavbridge.core.clock import NS_PER_MS, NS_PER_S, MonotonicClock
-from policy.adapters.lerobot.load import load_policy_of
 from policy.adapters.lerobot.plan import read_plan
-from policy.adapters.lerobot.policy import LeRobotDiffusion, LeRobotPolicy
+from policy.adapters.lerobot.policy import LeRobotDiffusion, LeRobotPolicy, load_policy_of
 from policy.contract import FloatArray
 from policy.engines.executable import (
     ExecutionSettings,

@@ -24,7 +24,7 @@ from policy.errors import user_code
 from policy.nets.action_head import DiffusionHead, size_dims
 from policy.nets.resnet_unet import ResnetUnet
 from policy.nets.toge import Toge
-from policy.nets.unet1d import Conv, Norm, ResidualBlock, UNet1d
+from policy.nets.unet1d import Conv, ResidualBlock, UNet1d, norm_of_groups
 from policy.preprocess import egocentric_scale
 
 
@@ -152,8 +152,8 @@ def _unet(unet: UNet1d, noisy: Tensor, film: Tensor) -> Tensor:
 
 def _residual_block(block: ResidualBlock, x: Tensor, film: Tensor) -> Tensor:
     scale, shift = film.chunk(2, dim=1)
-    hidden = F.silu(_norm(block.norm1, _conv(block.conv1, x)))
-    hidden = F.silu(_norm(block.norm2, _conv(block.conv2, hidden * scale + shift)))
+    hidden = F.silu(norm_of_groups(block.norm1, _conv(block.conv1, x)))
+    hidden = F.silu(norm_of_groups(block.norm2, _conv(block.conv2, hidden * scale + shift)))
     shortcut = block.shortcut
     return hidden + (_pointwise(shortcut, x) if isinstance(shortcut, nn.Linear) else x)
 
@@ -166,10 +166,3 @@ def _conv(conv: Conv, x: Tensor) -> Tensor:
 
 def _pointwise(linear: nn.Linear, x: Tensor) -> Tensor:
     return F.conv2d(x, linear.weight[:, :, None, None], linear.bias)
-
-
-def _norm(norm: Norm, x: Tensor) -> Tensor:
-    # A layer norm of each group: in bf16 the CPU plugin takes a group norm apart into slower parts.
-    groups = x.reshape(1, norm.num_groups, -1)
-    normed = F.layer_norm(groups, [int(groups.shape[-1])], eps=norm.eps).reshape(x.shape)
-    return normed * norm.weight[:, None, None] + norm.bias[:, None, None]

@@ -26,7 +26,7 @@ def check_lerobot(request: PolicyRequest) -> Plan:
 
 def load_lerobot(request: PolicyRequest) -> tuple["LeRobotPolicy", list[str]]:
     """The policy with its weights, and notes for the user; raises as ``check_lerobot``."""
-    from policy.adapters.lerobot.load import load_policy_of
+    from policy.adapters.lerobot.policy import load_policy_of
 
     return load_policy_of(
         check_lerobot(request),

@@ -13,7 +13,7 @@ from policy.errors import PolicyError
 from policy.nets.convnext import ConvNextTiny
 from policy.nets.efficientnet import EfficientNetB3
 from policy.nets.names import BackboneName
-from policy.nets.resnet import BasicBlock, Bottleneck, ResNet, ResNet8
+from policy.nets.resnet import ResNet, ResNet8
 
 Backbone: TypeAlias = EfficientNetB3 | ConvNextTiny | ResNet | ResNet8
 """Image [B, 3, H, W] normalised -> feature [B, out_dim]."""
@@ -29,10 +29,8 @@ def build_backbone(name: BackboneName) -> Backbone:
             backbone = ConvNextTiny()
         case "resnet8":
             backbone = ResNet8()
-        case "resnet18":
-            backbone = ResNet(BasicBlock, (2, 2, 2, 2))
-        case "resnet50":
-            backbone = ResNet(Bottleneck, (3, 4, 6, 3))
+        case _:
+            backbone = ResNet(name)
     # He et al. 2015, fan-in: the signal survives the depth before any batch norm has statistics.
     # With torch's own default an untrained EfficientNet-B3 maps every image to about 1e-13.
     for module in backbone.modules():

@@ -150,13 +150,14 @@ def _signal_power(total: int, betas: BetaSchedule) -> tuple[float, ...]:
             # 1e-4..0.02 is made for 1000 steps; the same noise in fewer steps needs larger ones.
             beta = (1e-4 + (0.02 - 1e-4) * t / max(total - 1, 1)) * 1000 / total
         else:
-            beta = 1 - _cosine_power((t + 1) / total) / _cosine_power(t / total)
+            beta = 1 - cosine_power((t + 1) / total) / cosine_power(t / total)
         power *= 1 - min(beta, 0.999)
         powers.append(power)
     return tuple(powers)
 
 
-def _cosine_power(fraction: float) -> float:
+def cosine_power(fraction: float) -> float:
+    """Signal power after a share of the process, by the squared cosine."""
     return math.cos((fraction + 0.008) / 1.008 * math.pi / 2) ** 2
 
 

@@ -1,7 +1,7 @@
 """ACT (Zhao et al. 2023) as LeRobot saves it: a ResNet's cells and a state, through a transformer.
 
 Only what inference needs: the encoder of the training's latent is left out, and the latent is zero.
-Parameters have LeRobot's names.
+Parameters have LeRobot's names, but for those of attention.
 """
 
 import math
@@ -10,96 +10,65 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-from policy.adapters.lerobot.backbone import Backbone
 from policy.adapters.lerobot.config import ActConfig, map_size
 from policy.contract import ACTION_DIM
+from policy.nets.attention import Attention
+from policy.nets.resnet import LastMap
+
+_ATTENTION_NAMES = {"in_proj_": "qkv.", "out_proj.": "project."}
+"""Parts of LeRobot's names of parameters, and of ours."""
 
 
-class Attention(nn.Module):
-    """Attention of several heads over [B, L, D], with the parameters of ``nn.MultiheadAttention``.
-
-    That class traces to one operation of torch's own, which no other engine knows.
-    """
-
-    def __init__(self, dim: int, heads: int) -> None:
-        super().__init__()
-        self.heads = heads
-        self.in_proj_weight = nn.Parameter(torch.empty(3 * dim, dim))
-        self.in_proj_bias = nn.Parameter(torch.empty(3 * dim))
-        self.out_proj = nn.Linear(dim, dim)
-
-    def forward(self, query: Tensor, key: Tensor, value: Tensor) -> Tensor:
-        """Query [B, L, D], key and value [B, M, D] -> [B, L, D]."""
-        weights, biases = self.in_proj_weight.chunk(3), self.in_proj_bias.chunk(3)
-        q, k, v = (
-            F.linear(x, weight, bias).reshape(*x.shape[:2], self.heads, -1).transpose(1, 2)
-            for x, weight, bias in zip((query, key, value), weights, biases, strict=True)
-        )
-        mixed = F.scaled_dot_product_attention(q, k, v)
-        out: Tensor = self.out_proj(mixed.transpose(1, 2).flatten(2))
-        return out
-
-
-class FeedForward(nn.Module):
-    """The part of a layer that both kinds of layers share."""
+class EncoderLayer(nn.Module):
+    """Self-attention and feed-forward layers, each with a norm before or after it."""
 
     def __init__(self, config: ActConfig) -> None:
         super().__init__()
         dim, hidden = config.dim_model, config.dim_feedforward
+        self.self_attn = Attention(dim, config.n_heads)
         self.linear1, self.linear2 = nn.Linear(dim, hidden), nn.Linear(hidden, dim)
         self.norm1, self.norm2 = nn.LayerNorm(dim), nn.LayerNorm(dim)
-        self.gelu = config.feedforward_activation == "gelu"
+        self.activation = F.gelu if config.feedforward_activation == "gelu" else F.relu
         self.pre_norm = config.pre_norm
-
-    def before(self, x: Tensor, norm: nn.Module) -> Tensor:
-        """What a sublayer takes."""
-        return norm(x) if self.pre_norm else x
-
-    def after(self, x: Tensor, change: Tensor, norm: nn.Module) -> Tensor:
-        """What a sublayer gives."""
-        return x + change if self.pre_norm else norm(x + change)
-
-    def feed_forward(self, x: Tensor) -> Tensor:
-        """Two layers, [B, L, D]."""
-        hidden = self.linear1(x)
-        out: Tensor = self.linear2(F.gelu(hidden) if self.gelu else F.relu(hidden))
-        return out
-
-
-class EncoderLayer(FeedForward):
-    """Self-attention and feed-forward layers."""
-
-    def __init__(self, config: ActConfig) -> None:
-        super().__init__(config)
-        self.self_attn = Attention(config.dim_model, config.n_heads)
 
     def forward(self, x: Tensor, position: Tensor) -> Tensor:
         """[B, L, D]; positions go to queries and keys alone."""
+        return self.feed_forward(self.attend(x, position), self.norm2)
+
+    def attend(self, x: Tensor, position: Tensor) -> Tensor:
+        """Self-attention around its shortcut."""
         own = self.before(x, self.norm1)
         at = own + position
-        x = self.after(x, self.self_attn(at, at, own), self.norm1)
-        return self.after(x, self.feed_forward(self.before(x, self.norm2)), self.norm2)
+        return self.after(x, self.self_attn(at, at, own), self.norm1)
+
+    def feed_forward(self, x: Tensor, norm: nn.Module) -> Tensor:
+        """Two layers around their shortcut."""
+        hidden = self.activation(self.linear1(self.before(x, norm)))
+        return self.after(x, self.linear2(hidden), norm)
+
+    def before(self, x: Tensor, norm: nn.Module) -> Tensor:
+        """Input of a sublayer."""
+        return norm(x) if self.pre_norm else x
+
+    def after(self, x: Tensor, change: Tensor, norm: nn.Module) -> Tensor:
+        """Sum of a sublayer's output and its shortcut."""
+        return x + change if self.pre_norm else norm(x + change)
 
 
-class DecoderLayer(FeedForward):
+class DecoderLayer(EncoderLayer):
     """Self-attention, attention to the encoder's tokens, and feed-forward layers."""
 
     def __init__(self, config: ActConfig) -> None:
         super().__init__(config)
         self.norm3 = nn.LayerNorm(config.dim_model)
-        self.self_attn = Attention(config.dim_model, config.n_heads)
         self.multihead_attn = Attention(config.dim_model, config.n_heads)
 
-    def forward(
-        self, x: Tensor, position: Tensor, tokens: Tensor, token_position: Tensor
-    ) -> Tensor:
+    def decode(self, x: Tensor, position: Tensor, tokens: Tensor, token_position: Tensor) -> Tensor:
         """Actions [B, L, D] and tokens [B, M, D], each with its positions."""
-        own = self.before(x, self.norm1)
-        at = own + position
-        x = self.after(x, self.self_attn(at, at, own), self.norm1)
+        x = self.attend(x, position)
         query = self.before(x, self.norm2) + position
         x = self.after(x, self.multihead_attn(query, tokens + token_position, tokens), self.norm2)
-        return self.after(x, self.feed_forward(self.before(x, self.norm3)), self.norm3)
+        return self.feed_forward(x, self.norm3)
 
 
 class Encoder(nn.Module):
@@ -129,9 +98,9 @@ class Decoder(nn.Module):
     def forward(
         self, x: Tensor, position: Tensor, tokens: Tensor, token_position: Tensor
     ) -> Tensor:
-        """As ``DecoderLayer.forward``."""
+        """As ``DecoderLayer.decode``."""
         for layer in self.layers:
-            x = layer(x, position, tokens, token_position)
+            x = layer.decode(x, position, tokens, token_position)  # type: ignore[operator]
         out: Tensor = self.norm(x)
         return out
 
@@ -149,7 +118,7 @@ class Act(nn.Module):
         super().__init__()
         dim, state_dim = config.dim_model, config.features.state_dim
         self.cameras, self.latent_dim = len(config.features.image_keys), config.latent_dim
-        self.backbone = Backbone(config.vision_backbone, group_norm=False)
+        self.backbone = LastMap(config.vision_backbone)
         self.encoder_img_feat_input_proj = nn.Conv2d(self.backbone.channels, dim, 1)
         self.encoder_latent_input_proj = nn.Linear(config.latent_dim, dim)
         self.encoder_robot_state_input_proj = nn.Linear(state_dim, dim) if state_dim else None
@@ -164,6 +133,8 @@ class Act(nn.Module):
     @staticmethod
     def own_name(name: str) -> str | None:
         """Our name of a parameter in LeRobot's file, without the prefix; None: not needed."""
+        for theirs, ours in _ATTENTION_NAMES.items():
+            name = name.replace(theirs, ours)
         return None if name.startswith("vae_encoder") else name
 
     def encode(self, image: Tensor, _camera: int) -> Tensor:

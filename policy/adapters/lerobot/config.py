@@ -1,14 +1,15 @@
-"""What config.json of a LeRobot policy says, as far as inference depends on it.
+"""Entries of a LeRobot policy's config.json that inference depends on.
 
 LeRobot writes every entry that its version knows, so an entry is missing only where a version did
 not have it yet. Those have the one value that this version computed with; all others must be there,
 because the defaults of LeRobot's own code changed with 0.6.0.
 """
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Literal
+from types import NoneType
+from typing import Any, Literal, TypeVar, get_args, get_origin, get_type_hints
 
 from policy import files
 from policy.contract import ACTION_DIM, EXTRA_NAMES
@@ -20,8 +21,9 @@ ENVIRONMENT_KEY = "observation.environment_state"
 """LeRobot's input for what is known of the world; here the goal of the flight."""
 NO_IMAGE_PX = 16
 """Side of the blank image of a policy without a camera: the smallest of a contract."""
-BACKBONES = ("resnet18", "resnet34", "resnet50", "resnet101", "resnet152")
-MODES = ("IDENTITY", "MEAN_STD", "MIN_MAX", "QUANTILES", "QUANTILE10")
+BackboneName = Literal["resnet18", "resnet34", "resnet50", "resnet101", "resnet152"]
+Size = tuple[int, int]
+"""Height and width."""
 _WITHOUT_EFFECT = {
     *("type", "device", "use_amp", "use_peft", "push_to_hub", "repo_id", "private", "tags"),
     *("license", "pretrained_path", "pretrained_revision", "pretrained_backbone_weights"),
@@ -37,7 +39,7 @@ _WITHOUT_EFFECT = {
 
 @dataclass(frozen=True, kw_only=True)
 class Features:
-    """What a policy takes and gives, by LeRobot's names."""
+    """Inputs and outputs of a policy, by LeRobot's names."""
 
     image_keys: tuple[str, ...]
     """Its cameras, in the order of their features; empty for a policy that looks at no image."""
@@ -48,15 +50,15 @@ class Features:
     takes_goal: bool
     """observation.environment_state is the vector to the goal, ``policy.contract.EXTRA_NAMES``."""
     modes: Mapping[str, str]
-    """Normalisation of STATE, VISUAL and ACTION: one of ``MODES``."""
+    """Normalisation of STATE, VISUAL and ACTION, ``statistics.MODES``."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class ActConfig:
-    """An Action Chunking Transformer (Zhao et al. 2023)."""
+    """An Action Chunking Transformer (Zhao et al. 2023); fields are named as in config.json."""
 
     features: Features
-    vision_backbone: str
+    vision_backbone: BackboneName
     chunk_size: int
     dim_model: int
     n_heads: int
@@ -70,7 +72,7 @@ class ActConfig:
 
     @property
     def n_obs_steps(self) -> int:
-        """Observations that it takes: one."""
+        """Observations that it takes."""
         return 1
 
     @property
@@ -87,15 +89,16 @@ class ActConfig:
 
 @dataclass(frozen=True, kw_only=True)
 class DiffusionConfig:
-    """A diffusion policy (Chi et al. 2023) with a 1-D U-Net."""
+    """A diffusion policy (Chi et al. 2023) with a 1-D U-Net; fields as in config.json."""
 
     features: Features
-    vision_backbone: str
+    vision_backbone: BackboneName
     n_obs_steps: int
     predicted: int
-    """Actions of a chunk; the first of them acts at the oldest observation."""
-    resize_shape: tuple[int, int] | None
-    crop_shape: tuple[int, int] | None
+    """config.json's horizon: actions of a chunk, the first of which acts at the oldest
+    observation."""
+    resize_shape: Size | None
+    crop_shape: Size | None
     use_group_norm: bool
     spatial_softmax_num_keypoints: int
     use_separate_rgb_encoder_per_camera: bool
@@ -104,10 +107,10 @@ class DiffusionConfig:
     n_groups: int
     diffusion_step_embed_dim: int
     use_film_scale_modulation: bool
-    noise_scheduler_type: str
+    noise_scheduler_type: Literal["DDPM", "DDIM"]
     num_inference_steps: int
     num_train_timesteps: int
-    beta_schedule: str
+    beta_schedule: Literal["squaredcos_cap_v2", "linear", "scaled_linear"]
     beta_start: float
     beta_end: float
     prediction_type: Literal["epsilon", "sample"]
@@ -125,28 +128,29 @@ class DiffusionConfig:
         return 2 * self.spatial_softmax_num_keypoints if self.features.image_keys else 1
 
     @property
-    def encoded_size(self) -> tuple[int, int]:
+    def encoded_size(self) -> Size:
         """Height and width of the image that the encoder sees."""
         image = (self.features.image_height, self.features.image_width)
         return self.crop_shape or self.resize_shape or image
 
 
 Config = ActConfig | DiffusionConfig
+C = TypeVar("C", ActConfig, DiffusionConfig)
 
 
-def map_size(height: int, width: int) -> tuple[int, int]:
+def map_size(height: int, width: int) -> Size:
     """Size of a ResNet's last map: its five layers of stride 2 halve it, rounding up."""
     return -(-height // 32), -(-width // 32)
 
 
 def read_config(folder: Path) -> tuple[Config, list[str]]:
-    """The policy that a folder holds, and notes for the user."""
+    """Return the policy that a folder holds, and notes for the user."""
     path = folder / CONFIG_FILE
     if not path.is_file():
         raise CheckpointError(f"{folder}: holds no {CONFIG_FILE}; {_where_to_look(folder)}")
     entries = _Entries(path)
-    kind = entries.text("type", ("act", "diffusion"))
-    if entries.flag("use_peft", default=False):
+    kind = entries.get("type", Literal["act", "diffusion"])
+    if entries.get("use_peft", bool, default=False):
         raise CheckpointError(f"{path}: weights of an adapter (use_peft); merge them before")
     features = _features(entries)
     config: Config
@@ -161,7 +165,7 @@ def read_config(folder: Path) -> tuple[Config, list[str]]:
 
 
 def read_json(path: Path) -> dict[str, Any]:
-    """A JSON object; raises CheckpointError."""
+    """Read a JSON object."""
     try:
         data = files.read_json(path)
     except OSError as error:
@@ -177,10 +181,7 @@ def _where_to_look(folder: Path) -> str:
     for below in ("pretrained_model", "last/pretrained_model", "checkpoints/last/pretrained_model"):
         if (folder / below / CONFIG_FILE).is_file():
             return f"{folder / below} does: name that one"
-    return (
-        "lerobot:DIR takes the folder that LeRobot's save_pretrained or lerobot-train wrote, "
-        "usually .../checkpoints/last/pretrained_model"
-    )
+    return "name the folder that LeRobot wrote, usually .../checkpoints/last/pretrained_model"
 
 
 def _act(entries: "_Entries", features: Features) -> ActConfig:
@@ -191,53 +192,21 @@ def _act(entries: "_Entries", features: Features) -> ActConfig:
             "fly from their files; run this one behind --policy ws://HOST:PORT"
         )
     entries.only("replace_final_stride_with_dilation", False)
-    return ActConfig(
-        features=features,
-        vision_backbone=entries.text("vision_backbone", BACKBONES),
-        chunk_size=entries.integer("chunk_size"),
-        dim_model=entries.integer("dim_model"),
-        n_heads=entries.integer("n_heads"),
-        dim_feedforward=entries.integer("dim_feedforward"),
-        feedforward_activation=entries.text("feedforward_activation", ("relu", "gelu")),
-        n_encoder_layers=entries.integer("n_encoder_layers"),
-        n_decoder_layers=entries.integer("n_decoder_layers"),
-        pre_norm=entries.flag("pre_norm"),
-        latent_dim=entries.integer("latent_dim"),
-        temporal_ensemble_coeff=entries.number_or_none("temporal_ensemble_coeff"),
-    )
+    return entries.fill(ActConfig, features=features)
 
 
 def _diffusion(entries: "_Entries", features: Features) -> DiffusionConfig:
     resize, crop = _resize_and_crop(entries, features)
     if features.state_dim is None:
         raise CheckpointError(f"{entries.path}: a diffusion policy takes {STATE_KEY}")
-    train_steps = entries.integer("num_train_timesteps")
-    config = DiffusionConfig(
+    train_steps = entries.get("num_train_timesteps", int)
+    config = entries.fill(
+        DiffusionConfig,
         features=features,
-        vision_backbone=entries.text("vision_backbone", BACKBONES),
-        n_obs_steps=entries.integer("n_obs_steps"),
-        predicted=entries.integer("horizon"),
+        predicted=entries.get("horizon", int),
         resize_shape=resize,
         crop_shape=crop,
-        use_group_norm=entries.flag("use_group_norm"),
-        spatial_softmax_num_keypoints=entries.integer("spatial_softmax_num_keypoints"),
-        use_separate_rgb_encoder_per_camera=entries.flag("use_separate_rgb_encoder_per_camera"),
-        down_dims=entries.integers("down_dims"),
-        kernel_size=entries.integer("kernel_size"),
-        n_groups=entries.integer("n_groups"),
-        diffusion_step_embed_dim=entries.integer("diffusion_step_embed_dim"),
-        use_film_scale_modulation=entries.flag("use_film_scale_modulation"),
-        noise_scheduler_type=entries.text("noise_scheduler_type", ("DDPM", "DDIM")),
-        num_inference_steps=entries.integer("num_inference_steps", default=train_steps),
-        num_train_timesteps=train_steps,
-        beta_schedule=entries.text(
-            "beta_schedule", ("squaredcos_cap_v2", "linear", "scaled_linear")
-        ),
-        beta_start=entries.number("beta_start"),
-        beta_end=entries.number("beta_end"),
-        prediction_type=entries.text("prediction_type", ("epsilon", "sample")),
-        clip_sample=entries.flag("clip_sample"),
-        clip_sample_range=entries.number("clip_sample_range"),
+        num_inference_steps=entries.get("num_inference_steps", int, default=train_steps),
     )
     if config.predicted % 2 ** len(config.down_dims) or config.horizon < 1:
         raise CheckpointError(
@@ -247,13 +216,13 @@ def _diffusion(entries: "_Entries", features: Features) -> DiffusionConfig:
     return config
 
 
-def _resize_and_crop(
-    entries: "_Entries", features: Features
-) -> tuple[tuple[int, int] | None, tuple[int, int] | None]:
+def _resize_and_crop(entries: "_Entries", features: Features) -> tuple[Size | None, Size | None]:
     # Both came after 0.4.0; before, nothing was resized.
-    resize = entries.size("resize_shape") if "resize_shape" in entries.data else None
-    ratio = entries.number("crop_ratio", default=1.0)
-    crop = entries.size("crop_shape")
+    resize = entries.get("resize_shape", Size | None) if "resize_shape" in entries.data else None
+    ratio, crop = (
+        entries.get("crop_ratio", float, default=1.0),
+        entries.get("crop_shape", Size | None),
+    )
     if resize is not None:  # then LeRobot takes the crop from the ratio, whatever crop_shape says
         crop = None if ratio == 1.0 else (int(resize[0] * ratio), int(resize[1] * ratio))
     before = resize or (features.image_height, features.image_width)
@@ -270,7 +239,7 @@ def _features(entries: "_Entries") -> Features:
     LeRobot's ACT and DiffusionPolicy look at no other feature of type STATE than observation.state,
     and at no other of type ENV than observation.environment_state.
     """
-    inputs, outputs = entries.table("input_features"), entries.table("output_features")
+    inputs, outputs = entries.get("input_features", dict), entries.get("output_features", dict)
     kinds = {key: _feature(entries.path, key, value) for key, value in inputs.items()}
     goal = (len(EXTRA_NAMES["goal"]),)
     takes_goal = kinds.pop(ENVIRONMENT_KEY, None) == ("ENV", goal)
@@ -295,14 +264,14 @@ def _features(entries: "_Entries") -> Features:
             f"{entries.path}: its action has the shape {list(action)}, but {ACTION_DIM} numbers "
             "fly a multirotor: train it on four (sticks, rates, attitude or velocity)"
         )
-    modes = {str(kind): str(mode) for kind, mode in entries.table("normalization_mapping").items()}
+    modes = entries.get("normalization_mapping", dict)
     return Features(
         image_keys=tuple(images),
         image_height=shapes[0][1],
         image_width=shapes[0][2],
         state_dim=state[0] if state else None,
         takes_goal=takes_goal,
-        modes=modes,
+        modes={str(kind): str(mode) for kind, mode in modes.items()},
     )
 
 
@@ -314,6 +283,21 @@ def _feature(path: Path, key: str, value: object) -> tuple[str, tuple[int, ...]]
     raise CheckpointError(f"{path}: the feature {key} must have a type and a shape, got {value!r}")
 
 
+def _are_counts(value: Any) -> bool:
+    return isinstance(value, list) and all(type(n) is int and n > 0 for n in value)
+
+
+_KINDS: dict[object, tuple[str, Callable[[Any], bool]]] = {
+    bool: ("true or false", lambda value: isinstance(value, bool)),
+    int: ("a positive integer", lambda value: type(value) is int and value > 0),
+    float: ("a number", lambda value: type(value) in (int, float)),
+    dict: ("an object", lambda value: isinstance(value, dict)),
+    tuple[int, ...]: ("positive integers", _are_counts),
+    Size: ("a height and a width", lambda value: _are_counts(value) and len(value) == 2),
+}
+"""By the type of a field: its name in messages, and the check of a JSON value."""
+
+
 class _Entries:
     """The entries of one config.json, each checked where it is read."""
 
@@ -321,76 +305,38 @@ class _Entries:
         self.path, self.data = path, read_json(path)
         self.read: set[str] = set()
 
-    def _value(self, name: str, default: object = None, *, or_none: bool = False) -> Any:
+    def get(self, name: str, kind: Any, *, default: object = None) -> Any:
+        """Return an entry of the type ``kind``, which may be a Literal, or optional for null."""
         self.read.add(name)
         value = self.data.get(name)
+        value = default if value is None else value
+        kinds = [each for each in get_args(kind) if each is not NoneType]
+        if value is None and len(kinds) < len(get_args(kind)) and name in self.data:
+            return None
         if value is None:
-            value = default
-        if value is None and not (or_none and name in self.data):
             raise CheckpointError(
                 f"{self.path}: no entry {name!r}, and its default differs between versions of "
                 "LeRobot: add what it was trained with, or save the policy again with LeRobot"
             )
-        return value
-
-    def _refuse(self, name: str, value: object, wanted: str) -> CheckpointError:
-        return CheckpointError(f"{self.path}: {name} must be {wanted}, got {value!r}")
+        if get_origin(kind) is Literal:
+            wanted, is_right = f"one of {', '.join(kinds)}", value in kinds
+        else:
+            wanted, check = _KINDS[kind if kind in _KINDS else kinds[0]]
+            is_right = check(value)
+        if not is_right:
+            raise CheckpointError(f"{self.path}: {name} must be {wanted}, got {value!r}")
+        return tuple(value) if isinstance(value, list) else value
 
     def only(self, name: str, wanted: object) -> None:
         """Refuse any other value than the one that is supported."""
-        if (value := self._value(name)) != wanted:
-            raise self._refuse(name, value, f"{wanted!r}, which alone is supported")
+        self.read.add(name)
+        if (value := self.data.get(name)) != wanted:
+            raise CheckpointError(
+                f"{self.path}: {name} must be {wanted!r}, which alone is supported, got {value!r}"
+            )
 
-    def text(self, name: str, choices: tuple[str, ...]) -> Any:
-        """One of ``choices``."""
-        if (value := self._value(name)) not in choices:
-            raise self._refuse(name, value, f"one of {', '.join(choices)}")
-        return value
-
-    def flag(self, name: str, *, default: bool | None = None) -> bool:
-        """True or false."""
-        value = self._value(name, default)
-        if not isinstance(value, bool):
-            raise self._refuse(name, value, "true or false")
-        return value
-
-    def integer(self, name: str, *, default: int | None = None) -> int:
-        """A positive integer."""
-        value = self._value(name, default)
-        if not isinstance(value, int) or isinstance(value, bool) or value < 1:
-            raise self._refuse(name, value, "a positive integer")
-        return value
-
-    def number(self, name: str, *, default: float | None = None) -> float:
-        """A number."""
-        value = self._value(name, default)
-        if not isinstance(value, int | float) or isinstance(value, bool):
-            raise self._refuse(name, value, "a number")
-        return float(value)
-
-    def number_or_none(self, name: str) -> float | None:
-        """A number, or null."""
-        return None if self._value(name, or_none=True) is None else self.number(name)
-
-    def integers(self, name: str) -> tuple[int, ...]:
-        """Some positive integers."""
-        value = self._value(name)
-        if not isinstance(value, list) or not all(isinstance(n, int) and n > 0 for n in value):
-            raise self._refuse(name, value, "positive integers")
-        return tuple(value)
-
-    def size(self, name: str) -> tuple[int, int] | None:
-        """Height and width, or null."""
-        if self._value(name, or_none=True) is None:
-            return None
-        values = self.integers(name)
-        if len(values) != 2:
-            raise self._refuse(name, list(values), "a height and a width")
-        return values[0], values[1]
-
-    def table(self, name: str) -> dict[str, Any]:
-        """An object."""
-        value = self._value(name)
-        if not isinstance(value, dict):
-            raise self._refuse(name, value, "an object")
-        return value
+    def fill(self, config: type[C], **given: Any) -> C:
+        """Return a config with the entries of its fields' names, but for those that are given."""
+        hints = get_type_hints(config)
+        read = {name: self.get(name, kind) for name, kind in hints.items() if name not in given}
+        return config(**given, **read)

@@ -1,15 +1,21 @@
 """A LeRobot policy as this project's: from the contract's images and states to its actions."""
 
+from pathlib import Path
+
 import torch
 from torch import Tensor, nn
 
 from policy.adapters.lerobot.act import Act
 from policy.adapters.lerobot.config import ActConfig, DiffusionConfig
-from policy.adapters.lerobot.diffusion import Diffusion
+from policy.adapters.lerobot.diffusion import DdimSchedule, Diffusion
 from policy.adapters.lerobot.plan import Plan
-from policy.adapters.lerobot.schedule import DdimSchedule
-from policy.adapters.lerobot.statistics import Affine
+from policy.adapters.lerobot.statistics import WEIGHTS_FILE, Affine
 from policy.contract import EXTRA_NAMES, Contract
+from policy.errors import CheckpointError
+from policy.files import open_safetensors
+
+_STATISTICS = ("normalize_inputs.", "normalize_targets.", "unnormalize_outputs.")
+"""Prefixes of the statistics in checkpoints before 0.4, which are read apart."""
 
 
 class Normaliser(nn.Module):
@@ -51,13 +57,12 @@ class LeRobotPolicy(nn.Module):
     def __init__(self, plan: Plan) -> None:
         super().__init__()
         self.contract: Contract = plan.interface.contract
-        normalisation, interface = plan.normalisation, plan.interface
-        self._policy_cameras = plan.policy_cameras
+        normalisation = plan.normalisation
+        self._interface, self._policy_cameras = plan.interface, plan.policy_cameras
         keys = plan.config.features.image_keys
         self._images = nn.ModuleList(Normaliser(normalisation.images[key]) for key in keys)
         self._state = Normaliser(normalisation.state)
         self._action = Normaliser(normalisation.action)
-        self._interface = interface
 
     def encode_visual(self, image: Tensor, camera: int = 0) -> Tensor:
         """Image [B, 3, H, W] of that camera of the contract -> feature [B, feature_dim]; zeros for
@@ -71,7 +76,6 @@ class LeRobotPolicy(nn.Module):
         self, feature: Tensor, state: Tensor, action_history: Tensor, num_diffusion_steps: int
     ) -> Tensor:
         """Cached features [B, (T,) cameras * F] and states [B, (T,) S] -> chunk [B, horizon, 4]."""
-        del action_history
         inputs = self._network_inputs(feature, state)
         return self._in_units(self.net.act(*inputs, num_diffusion_steps))
 
@@ -119,12 +123,8 @@ class LeRobotDiffusion(LeRobotPolicy):
     def __init__(self, plan: Plan, config: DiffusionConfig) -> None:
         super().__init__(plan)
         self.net = Diffusion(config)
-        names = self.contract.state_names
-        self._goal_columns = (
-            [names.index(name) for name in EXTRA_NAMES["goal"]]
-            if config.features.takes_goal
-            else []
-        )
+        goal = EXTRA_NAMES["goal"] if config.features.takes_goal else ()
+        self._goal_columns = [self.contract.state_names.index(name) for name in goal]
         self._goal = Normaliser(plan.normalisation.goal)
 
     def _network_inputs(self, feature: Tensor, state: Tensor) -> tuple[Tensor, Tensor]:
@@ -161,7 +161,6 @@ class LeRobotDiffusion(LeRobotPolicy):
         action_history: Tensor,
     ) -> Tensor:
         """One call of the network: noisy actions [B, predicted, 4] at timesteps [B]."""
-        del action_history
         of_condition = self.net.film_of_condition(*self._network_inputs(feature, state))
         return self.net.denoise(noisy, timestep, of_condition)
 
@@ -171,7 +170,63 @@ class LeRobotDiffusion(LeRobotPolicy):
 
 
 def build_policy_of(plan: Plan) -> LeRobotPolicy:
-    """A policy with random weights."""
+    """Return a policy with random weights."""
     if isinstance(plan.config, ActConfig):
         return LeRobotAct(plan, plan.config)
     return LeRobotDiffusion(plan, plan.config)
+
+
+def load_policy_of(
+    plan: Plan, *, seed: int, num_diffusion_steps: int
+) -> tuple[LeRobotPolicy, list[str]]:
+    """Build a policy and load its weights; with notes for the user.
+
+    ``seed`` is that of a flight's initial noise.
+    """
+    policy = build_policy_of(plan)
+    policy.net.load_state_dict(_read(plan.folder / WEIGHTS_FILE, policy.net))
+    policy.eval().requires_grad_(False)
+    config, kind = plan.config, "ACT" if isinstance(plan.config, ActConfig) else "DiffusionPolicy"
+    millions = sum(parameter.numel() for parameter in policy.parameters()) / 1e6
+    notes = [*plan.notes, f"LeRobot's {kind} of {plan.folder}, {millions:.1f} M parameters"]
+    if isinstance(config, ActConfig):
+        if config.temporal_ensemble_coeff is not None:
+            notes.append(
+                "its temporal ensembling is not computed: the guard smooths from chunk to chunk"
+            )
+    elif isinstance(policy, LeRobotDiffusion):
+        policy.net.seed_noise(seed)
+        notes.append(
+            f"solved by DDIM in {num_diffusion_steps} steps (--num-diffusion-steps) from noise of "
+            f"seed {seed}; its config.json says {config.noise_scheduler_type} in "
+            f"{config.num_inference_steps}. More steps come closer to that, and take longer"
+        )
+    return policy, notes
+
+
+def _read(path: Path, net: Act | Diffusion) -> dict[str, Tensor]:
+    wanted = net.state_dict()
+    with open_safetensors(path, "pt") as file:
+        tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
+    state = {name: value for name, value in wanted.items() if name.endswith("num_batches_tracked")}
+    problems, seen = [], set(state)
+    for name, value in tensors.items():
+        own = net.own_name(name.removeprefix(net.prefix)) if name.startswith(net.prefix) else name
+        if own is None or name.startswith(_STATISTICS):
+            continue
+        seen.add(own)
+        if own not in wanted:
+            problems.append(f"unexpected {name!r}")
+        elif value.shape != wanted[own].shape:
+            problems.append(f"{name!r} is {list(value.shape)}, not {list(wanted[own].shape)}")
+        elif not torch.isfinite(value).all():
+            problems.append(f"{name!r} holds NaN or infinity")
+        else:
+            state[own] = value.to(wanted[own].dtype)
+    problems += [f"missing {name!r}" for name in wanted if name not in seen]
+    if problems:
+        raise CheckpointError(
+            f"{path}: does not fit the policy of its config.json in {len(problems)} places: "
+            f"{'; '.join(problems[:4])}. Copy both files again, from one folder"
+        )
+    return state

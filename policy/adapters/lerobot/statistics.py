@@ -13,7 +13,6 @@ import numpy as np
 from policy.adapters.lerobot.config import (
     ACTION_KEY,
     ENVIRONMENT_KEY,
-    MODES,
     STATE_KEY,
     Features,
     read_json,
@@ -24,8 +23,15 @@ from policy.files import open_safetensors
 
 PREPROCESSOR, POSTPROCESSOR = "policy_preprocessor.json", "policy_postprocessor.json"
 WEIGHTS_FILE = "model.safetensors"
+MODES: dict[str, tuple[str, ...]] = {
+    "IDENTITY": (),
+    "MEAN_STD": ("mean", "std"),
+    "MIN_MAX": ("min", "max"),
+    "QUANTILES": ("q01", "q99"),
+    "QUANTILE10": ("q10", "q90"),
+}
+"""Statistics that each mode of normalisation needs."""
 _HARMLESS = ("to_batch_processor", "device_processor")
-_BOUNDS = {"MIN_MAX": ("min", "max"), "QUANTILES": ("q01", "q99"), "QUANTILE10": ("q10", "q90")}
 _EPSILON = 1e-8
 _CONSTANT = 1e-6
 """A number of the state that varied by less did not vary."""
@@ -55,7 +61,7 @@ class Normalisation:
     """Of observation.environment_state."""
     action: Affine | None
     renamed: Mapping[str, str]
-    """What the data called an input -> its name in config.json."""
+    """Name of an input in the data -> its name in config.json."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -68,7 +74,7 @@ class _Statistics:
     arrays: Mapping[str, Mapping[str, FloatArray]]
 
     def affine(self, key: str, kind: str) -> Affine | None:
-        """The transformation of one feature; None where it stays as it is."""
+        """Return the transformation of one feature; None where it stays as it is."""
         mode, own = self.modes.get(kind, "IDENTITY"), self.arrays.get(key, {})
         if mode not in MODES:
             raise CheckpointError(
@@ -76,14 +82,13 @@ class _Statistics:
             )
         if mode == "IDENTITY" or not own:
             return None
-        names = _BOUNDS.get(mode, ("mean", "std"))
-        if missing := [name for name in names if name not in own]:
+        if missing := [name for name in MODES[mode] if name not in own]:
             raise CheckpointError(
                 f"{self.path}: {key} is normalised by {mode}, but its statistics lack {missing}; "
                 f"there are {sorted(own)}"
             )
         shape = (3, 1, 1) if kind == "VISUAL" else (-1,)
-        low, high = (own[name].astype(np.float32).reshape(shape) for name in names)
+        low, high = (own[name].astype(np.float32).reshape(shape) for name in MODES[mode])
         if not (np.isfinite(low).all() and np.isfinite(high).all()):
             raise CheckpointError(f"{self.path}: the statistics of {key} hold NaN or infinity")
         epsilon = np.float32(self.epsilon)
@@ -94,13 +99,13 @@ class _Statistics:
 
 
 def read_normalisation(folder: Path, features: Features) -> tuple[Normalisation, list[str]]:
-    """What a policy's files say, and notes for the user."""
+    """Read how a policy normalises; with notes for the user."""
     renamed: dict[str, str] = {}
     if (folder / PREPROCESSOR).is_file():
         inputs, renamed = _processor(folder / PREPROCESSOR, "normalizer_processor")
         outputs, _ = _processor(folder / POSTPROCESSOR, "unnormalizer_processor")
     else:
-        inputs = outputs = _legacy(folder, features)
+        inputs = outputs = _in_weights(folder, features)
     normalisation = Normalisation(
         images={key: inputs.affine(key, "VISUAL") for key in features.image_keys},
         state=inputs.affine(STATE_KEY, "STATE") if features.state_dim else None,
@@ -112,17 +117,17 @@ def read_normalisation(folder: Path, features: Features) -> tuple[Normalisation,
 
 
 def _notes(folder: Path, features: Features, normalisation: Normalisation) -> list[str]:
-    """What LeRobot would compute without a word, and what is seldom meant."""
+    """Warn of what LeRobot computes without a word, and what is seldom meant."""
     found = [(key, "VISUAL", affine) for key, affine in normalisation.images.items()]
     found += [(ACTION_KEY, "ACTION", normalisation.action)]
     found += [(ENVIRONMENT_KEY, "ENV", normalisation.goal)] if features.takes_goal else []
-    state = normalisation.state
-    found += [(STATE_KEY, "STATE", state)] if features.state_dim else []
+    found += [(STATE_KEY, "STATE", normalisation.state)] if features.state_dim else []
     notes = [
         f"warning: {folder} holds no statistics of {key}: it flies as it is, not normalised"
         for key, kind, affine in found
         if affine is None and features.modes.get(kind, "IDENTITY") != "IDENTITY"
     ]
+    state = normalisation.state
     if state is not None and (constant := np.flatnonzero(state.divisor < _CONSTANT).tolist()):
         notes.append(
             f"warning: numbers {constant} (from 0) of {STATE_KEY} never changed in the training "
@@ -132,7 +137,7 @@ def _notes(folder: Path, features: Features, normalisation: Normalisation) -> li
 
 
 def _processor(path: Path, normaliser: str) -> tuple[_Statistics, dict[str, str]]:
-    """What the steps of a processor do to values: at most one normalisation, and renamings."""
+    """Read the steps of a processor: at most one normalisation, and renamings."""
     renamed: dict[str, str] = {}
     found = _Statistics(path=path, modes={}, epsilon=0.0, arrays={})
     steps = read_json(path).get("steps")
@@ -145,25 +150,19 @@ def _processor(path: Path, normaliser: str) -> tuple[_Statistics, dict[str, str]
         elif name == normaliser:
             file, only = step.get("state_file"), config.get("normalize_observation_keys")
             arrays = _by_feature(_read_arrays(path.parent / file)) if file else {}
-            found = _Statistics(
-                path=path,
-                modes=config.get("norm_map", {}),
-                epsilon=float(config.get("eps", _EPSILON)),
-                arrays={
-                    k: v for k, v in arrays.items() if only is None or k in (*only, ACTION_KEY)
-                },
-            )
+            kept = {k: v for k, v in arrays.items() if only is None or k in (*only, ACTION_KEY)}
+            modes, epsilon = config.get("norm_map", {}), float(config.get("eps", _EPSILON))
+            found = _Statistics(path=path, modes=modes, epsilon=epsilon, arrays=kept)
         elif name not in _HARMLESS:
-            known = ("rename_observations_processor", normaliser, *_HARMLESS)
             raise CheckpointError(
-                f"{path}: the step {name!r} is not supported; supported are {', '.join(known)}. "
-                "Serve it from its own environment, and fly --policy ws://HOST:PORT"
+                f"{path}: the step {name!r} is not supported: serve the policy from its own "
+                "environment, and fly --policy ws://HOST:PORT"
             )
     return found, renamed
 
 
-def _legacy(folder: Path, features: Features) -> _Statistics:
-    """Statistics in the weights: ``normalize_inputs``, and ``unnormalize_outputs`` of actions."""
+def _in_weights(folder: Path, features: Features) -> _Statistics:
+    """Statistics as LeRobot kept them before 0.4, in the weights."""
     path = folder / WEIGHTS_FILE
     sides = ("normalize_inputs.buffer_", "unnormalize_outputs.buffer_")
     found = _by_feature(_read_arrays(path, sides))
@@ -180,7 +179,7 @@ def _legacy(folder: Path, features: Features) -> _Statistics:
 
 
 def _by_feature(arrays: Mapping[str, FloatArray]) -> dict[str, dict[str, FloatArray]]:
-    """``observation.state.mean`` and the like, by what is before the last dot, then behind it."""
+    """Group ``observation.state.mean`` and the like by feature, then by statistic."""
     found: dict[str, dict[str, FloatArray]] = {}
     for name, array in arrays.items():
         key, _, statistic = name.rpartition(".")

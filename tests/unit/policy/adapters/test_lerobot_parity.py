@@ -11,8 +11,8 @@ from safetensors.numpy import save_file
 from helpers import lerobot_checkpoints as formula
 from policy.adapters.lerobot.config import read_config
 from policy.adapters.lerobot.diffusion import Diffusion
-from policy.adapters.lerobot.load import load_policy_of
 from policy.adapters.lerobot.plan import read_plan
+from policy.adapters.lerobot.policy import load_policy_of
 from policy.contract import STATE_NAMES
 from policy.engines.choose import chunks_of_samples
 from policy.engines.executable import ExecutionSettings
