@@ -97,7 +97,7 @@ def _trained(
     if checkpoint.suffix != ".safetensors":
         contract, schedule = policy.contract, policy.config.schedule
         notes.append(
-            f"warning: {checkpoint} may hold no contract; it is flown with frame "
+            f"warning: {checkpoint} holds no contract; it is flown with frame "
             f"{contract.state_frame}, image {contract.image_width}x{contract.image_height}, "
             f"chunk of {contract.horizon} every {contract.chunk_dt_s:g} s, history of "
             f"{contract.history_len} every {contract.history_dt_s:g} s, prediction of the "
