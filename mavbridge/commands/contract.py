@@ -6,13 +6,15 @@ from rich.console import Console
 
 from mavbridge.commands.config import ContractConfig
 from mavbridge.core.errors import UserError
-from policy.adapters.drafts.entries import Entry, draft_text
-from policy.adapters.drafts.lerobot import (
+from policy.adapters.drafts import (
+    Entry,
     checkpoint_entries,
     dataset_entries,
     dataset_of,
+    draft_text,
+    onnx_entries,
+    onnx_files,
 )
-from policy.adapters.drafts.onnx import onnx_entries, onnx_files
 from policy.adapters.interface import CONTRACT_FILE, UNANSWERED
 from policy.adapters.lerobot.config import CONFIG_FILE
 from policy.data.lerobot import is_lerobot

@@ -20,9 +20,7 @@ from mavbridge.core.clock import NS_PER_MS
 from mavbridge.core.errors import UserError
 from mavbridge.core.records import ImageArray
 from mavbridge.core.stopping import stop_on_signals
-from policy.adapters.drafts.entries import Entry, draft_text
-from policy.adapters.drafts.lerobot import dataset_entries
-from policy.adapters.drafts.recorded import recorded_entries
+from policy.adapters.drafts import Entry, dataset_entries, draft_text, recorded_entries
 from policy.adapters.interface import CONTRACT_FILE
 from policy.adapters.state import BODY_STATE_NAMES
 from policy.contract import STATE_NAMES

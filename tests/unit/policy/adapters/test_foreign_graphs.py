@@ -15,8 +15,7 @@ pytest.importorskip("onnx", reason="the extra onnx writes the graphs")
 from onnx import TensorProto, helper
 
 from helpers import foreign_graphs as graphs
-from mavbridge.__main__ import main
-from policy.adapters.drafts.onnx import onnx_entries
+from policy.adapters.drafts import onnx_entries
 from policy.engines.executable import level_state
 from policy.errors import PolicyError
 from policy.loading.load import load_policy
@@ -64,9 +63,7 @@ def test_the_output_that_is_asked_for_is_flown(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("hidden", [("h_in", "h_out"), ("state_in_0", "state_out_0"), ("h", "hn")])
-def test_a_hidden_state_goes_from_call_to_call_until_reset(
-    tmp_path: Path, hidden: tuple[str, str]
-) -> None:
+def test_a_hidden_state_goes_from_call_to_call_until_reset(tmp_path, hidden):
     graphs.write_contract(tmp_path)
     graphs.recurrent(tmp_path / "policy.onnx", hidden=hidden)
     if hidden == ("h", "hn"):
@@ -187,12 +184,6 @@ REFUSED: dict[str, tuple[Write, str]] = {
         r"onnx:.*NaN or infinity",
     ),
 }
-COMMANDS: dict[str, Callable[[Path], list[str]]] = {
-    "flight": lambda folder: [*LINK, "--readonly", "--policy", f"onnx:{folder}"],
-    "check": lambda folder: ["check", *LINK, "--policy", f"onnx:{folder}"],
-    "contract": lambda folder: ["contract", f"{folder}/policy.onnx", "--out", f"{folder}/d.toml"],
-}
-LINK = ["--connect", "udp:127.0.0.1:17180", "--camera", "none", "--connect-timeout", "0.1"]
 
 
 @pytest.mark.parametrize("case", REFUSED)
@@ -204,25 +195,6 @@ def test_what_cannot_fly_is_refused_by_its_cause(tmp_path: Path, case: str) -> N
         load(f"onnx:{tmp_path}")
 
 
-@pytest.mark.parametrize("command", COMMANDS)
-@pytest.mark.parametrize("case", REFUSED)
-def test_every_reader_names_the_cause_and_no_library_speaks(
-    tmp_path: Path, case: str, command: str, capfd: pytest.CaptureFixture[str]
-) -> None:
-    write, _ = REFUSED[case]
-    graphs.write_contract(tmp_path)
-    write(tmp_path)
-    with pytest.raises(SystemExit) as ended:
-        main(COMMANDS[command](tmp_path))
-    shown = "".join(capfd.readouterr())
-    drafted = command == "contract" and (tmp_path / "d.toml").is_file()
-    assert ended.value.code == (0 if drafted else 3 if command == "check" else 2)
-    assert "Traceback" not in shown
-    assert "GraphDef" not in shown
-    if not drafted:
-        assert tmp_path.name in shown.replace("\n", "").replace(" ", "")
-
-
 def test_a_draft_has_the_state_whatever_its_input_is_called(tmp_path: Path) -> None:
     graphs.actor(tmp_path / "policy.onnx", state="obs")
     graphs.recurrent(tmp_path / "recurrent.onnx")
@@ -230,14 +202,6 @@ def test_a_draft_has_the_state_whatever_its_input_is_called(tmp_path: Path) -> N
         found = {(each.table, each.name): each.value for each in onnx_entries([tmp_path / name])}
         assert found["state", "key"] == "obs"
         assert found["state", "names"] == ["?"] * 13
-
-
-@pytest.mark.parametrize("case", [each for each in REFUSED if "external" in each])
-def test_a_draft_of_its_contract_names_the_same_cause(tmp_path: Path, case: str) -> None:
-    write, told = REFUSED[case]
-    write(tmp_path)
-    with pytest.raises(PolicyError, match=told):
-        onnx_entries([tmp_path / "policy.onnx"])
 
 
 def test_a_tuple_of_torchscript_needs_to_be_told_apart(tmp_path: Path) -> None:
