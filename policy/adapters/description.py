@@ -17,6 +17,8 @@ entry.
 """
 
 import json
+import zipfile
+import zlib
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -24,7 +26,7 @@ from typing import Any
 from policy.adapters.interface import CONTRACT_FILE, Interface, read_interface
 from policy.contract import Contract
 from policy.errors import CheckpointError, PolicyError
-from policy.files import parse_json
+from policy.files import parse_json, why_unreadable
 
 DESCRIPTION = "policy.json"
 ROLES = ("image", "feature", "state", "action_history", "noisy", "timestep")
@@ -99,3 +101,21 @@ def _parsed(where: Path, text: str) -> dict[str, dict[str, Any]]:
     if wrong := [name for name, value in data.items() if not isinstance(value, dict)]:
         raise CheckpointError(f"{where}: {wrong} must be objects")
     return data
+
+
+def read_description(spec: str, path: Path, contract_file: Path | None) -> Description:
+    """What the archive of the policy ``spec`` says of itself: milliseconds."""
+    try:
+        with zipfile.ZipFile(path) as archive:
+            names = archive.namelist()
+            extra = [name for name in names if name.endswith(f"/extra/{DESCRIPTION}")]
+            text = archive.read(extra[0]).decode() if extra else None
+    except (OSError, zipfile.BadZipFile, zlib.error, RuntimeError, EOFError, ValueError) as error:
+        raise CheckpointError(f"--policy {spec}: {why_unreadable(path, error)}") from error
+    if not any("/code/" in name for name in names):
+        raise CheckpointError(
+            f"--policy {spec}: {path} is not a TorchScript archive: write it with "
+            "torch.jit.script(module).save(FILE), or torch.jit.trace"
+        )
+    where = path / DESCRIPTION
+    return describe(spec, text, where=where, beside=path.parent, contract_file=contract_file)

@@ -10,12 +10,13 @@
 Shapes are those of ``policy.protocol``; ``forward`` and ``action_head`` return chunks
 [B, horizon, 4], ``denoiser`` what the schedule says that the network predicts; ``timestep`` is [B]
 float32. What is behind the last argument that a function declares is left out. A TorchScript
-archive may have methods of these names, too.
+archive may have methods of these names, too, and a policy.json (``adapters.description``).
 """
 
 import inspect
 import json
 import sys
+import warnings
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -24,11 +25,12 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
-from policy.adapters.description import USUAL_NAMES
+from policy.adapters.description import USUAL_NAMES, Description
 from policy.adapters.interface import Interface
 from policy.contract import ACTION_DIM
 from policy.engines.kept import modules_of
-from policy.errors import PolicyError, user_code
+from policy.errors import CheckpointError, PolicyError, user_code
+from policy.files import why_unreadable
 from policy.nets.diffusion import NoiseSchedule, ddim_solve
 from policy.protocol import SingleRatePolicy
 
@@ -73,6 +75,32 @@ def adopt_modules(
     schedule = schedule or getattr(holder, "noise_schedule", None) or NoiseSchedule()
     call = _Call(name, denoiser, "prediction", picks)
     return _with_life(DenoiserPolicy(interface, holder, encode, call, schedule, seed), holder)
+
+
+def load_torchscript(
+    spec: str, path: Path, description: Description, seed: int
+) -> SingleRatePolicy:
+    """The policy of an archive, on the CPU."""
+    try:
+        # torch says that this will go one day, in favour of a format that few export to so far.
+        with warnings.catch_warnings(action="ignore", category=DeprecationWarning):
+            module = torch.jit.load(path, map_location="cpu").eval()  # type: ignore[no-untyped-call]
+    except (RuntimeError, OSError) as error:
+        raise CheckpointError(why_unreadable(path, error)) from error
+    contract = replace(description.interface.contract, arrays="torch")
+    schedule = make_schedule(path, description.schedule) if description.schedule else None
+    policy = adopt_modules(
+        spec,
+        module,
+        replace(description.interface, contract=contract),
+        schedule=schedule,
+        seed=seed,
+        inputs=description.inputs,
+        outputs=description.outputs,
+    )
+    if policy is None:
+        raise CheckpointError(f"--policy {spec}: the archive has none of {PARTS}")
+    return policy
 
 
 def make_schedule(where: Path, fields: dict[str, Any]) -> NoiseSchedule:

@@ -104,36 +104,20 @@ def _split(spec: str) -> tuple[Path | str, str]:
     if not colon:
         where, class_name = spec, ""
     is_file = where.endswith(".py") or os.sep in where
-    named = user_path(where) if is_file else where
     if is_file and not class_name:
         raise PolicyError(f"--policy {spec} names no class: write {where}:Class")
     is_module = all(name.isidentifier() for name in where.split("."))
     if not class_name.isidentifier() or not (is_file or is_module):
-        package, _, last = where.rpartition(".")
-        meant = f"; did you mean {package}:{last}?" if is_module and package and not colon else ""
-        raise PolicyError(f"policy {spec!r} is unknown{meant or f'; write {FORMS}'}")
-    return named, class_name
+        raise PolicyError(f"policy {spec!r} is unknown; write {FORMS}")
+    return user_path(where) if is_file else where, class_name
 
 
 def _require_python_file(spec: str, path: Path) -> None:
-    class_name = spec.rpartition(":")[2]
-    if path.is_dir():
-        raise PolicyError(
-            f"--policy {spec}: {path} is a folder; name the file in it ({path}/file.py:"
-            f"{class_name}), or, for a package, {path.name}:{class_name} with the folder around it "
-            "on PYTHONPATH"
-        )
-    if path.suffix != ".py":
-        with_suffix = path.with_name(path.name + ".py")
-        meant = f"; did you mean {with_suffix}:{class_name}?" if with_suffix.is_file() else ""
-        raise PolicyError(
-            f"--policy {spec}: {path} is not a Python file{meant or f'; write {FORMS}'}"
-        )
-    if not path.is_file():
-        there = sorted(each.name for each in path.parent.glob("*.py"))[:8]
-        raise PolicyError(
-            f"--policy {spec}: there is no file {path}; Python files in its folder: {there}"
-        )
+    if path.is_file() and path.suffix == ".py":
+        return
+    there = sorted(each.name for each in path.parent.glob("*.py"))[:8]
+    what = "there is no file" if not path.exists() else "not a Python file:"
+    raise PolicyError(f"--policy {spec}: {what} {path}; Python files in its folder: {there}")
 
 
 def _import_file(path: Path) -> ModuleType:
@@ -158,18 +142,12 @@ def _import_file(path: Path) -> ModuleType:
 
 
 def _import_hint(error: BaseException | None) -> str:
-    """What to do about a failed import."""
+    """Say what to do about a failed import."""
     name = error.name if isinstance(error, ImportError) and error.name else ""
     if name.partition(".")[0] in OUR_PACKAGES:
-        return (
-            f"{name.partition('.')[0]} is a package of mavbridge: one of yours needs another name, "
-            "or a Python of its own behind --policy ws://HOST:PORT"
-        )
+        return f"{name.partition('.')[0]} is a package of mavbridge: yours needs another name"
     if isinstance(error, ImportError) and "relative import" in str(error):
-        return (
-            "a file on its own has no package: import its neighbours by their plain names, or name "
-            "it as package.module:Class"
-        )
+        return "import its neighbours by their plain names, or name it as package.module:Class"
     if isinstance(error, ModuleNotFoundError):
         return f"install {name} beside mavbridge, or put its folder on PYTHONPATH"
     return f"mend that, or write {FORMS}"
@@ -180,14 +158,10 @@ def _instance(spec: str, found: type, checkpoint: Path | None, seed: int) -> Sin
     try:
         inspect.signature(found).bind(**arguments)
     except (TypeError, ValueError) as error:
-        call, advice = "Class(checkpoint=path)", "leave --checkpoint out, or take it in __init__"
-        if checkpoint is None:
-            call, advice = (
-                "Class()",
-                "give its arguments defaults; --checkpoint FILE is the only one",
-            )
+        call = "Class()" if checkpoint is None else "Class(checkpoint=path)"
         raise PolicyError(
-            f"--policy {spec}: cannot be made with {call}: {error}; {advice}"
+            f"--policy {spec}: cannot be made with {call}: {error}; its only argument is the "
+            "checkpoint of --checkpoint, if that is given"
         ) from error
     with user_code(f"--policy {spec}: making it failed"):
         policy: object = found(**arguments)

@@ -57,6 +57,13 @@ class OnnxGraphs:
             raise PolicyError(f"{files.rest}: a denoiser cannot have a hidden state")
         require_roles(self.rest, files.rest, needed)
 
+    def describe(self, num_diffusion_steps: int) -> str:
+        """Return a line for the user: the files, and how a denoiser is solved."""
+        named = [each.name for each in (self.files.encoder, self.files.rest) if each is not None]
+        solved = f", solved in {num_diffusion_steps} steps from noise of seed {self.seed}"
+        where = f"{' and '.join(named)} of {self.files.rest.parent}"
+        return where if self.schedule is None else where + solved
+
     def at(self, vision: Precision, action: Precision) -> "OnnxPolicy":
         """The policy with its encoder and the rest compiled at these precisions."""
         kind = HeadPolicy if self.schedule is None else DenoiserPolicy

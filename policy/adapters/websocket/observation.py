@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from policy.adapters.interface import Interface
 from policy.adapters.websocket.messages import Message, MessageError, number_array
 from policy.contract import ACTION_DIM, Contract, FloatArray
-from policy.preprocess import image_to_input
+from policy.preprocess import image_to_input, input_to_bytes
 
 HISTORY_KEY = "action_history"
 """Key in requests to our own server: float32 [K, 4]."""
@@ -80,16 +80,8 @@ def to_uint8(planes: FloatArray, contract: Contract) -> NDArray[np.uint8]:
 
     float32 keeps the levels of a byte far apart: they come back with an error below 0.001.
     """
-    order = slice(None) if contract.image_channels == "rgb" else slice(None, None, -1)
-    mean, std = (
-        255.0 * np.array(values, np.float32)[order, None, None]
-        for values in (contract.image_mean_rgb, contract.image_std_rgb)
-    )
-    levels = planes * std
-    levels += mean
-    np.rint(levels, out=levels)
-    np.clip(levels, 0.0, 255.0, out=levels)
-    return np.ascontiguousarray(np.moveaxis(levels.astype(np.uint8), -3, -1))
+    levels = input_to_bytes(planes, contract).astype(np.uint8)
+    return np.ascontiguousarray(np.moveaxis(levels, -3, -1))
 
 
 def from_uint8(images: NDArray[np.uint8], contract: Contract) -> FloatArray:

@@ -45,13 +45,6 @@ def test_the_contract_has_what_the_files_say(folder):
     assert contract.image_std_rgb == (1, 1, 1)
 
 
-def test_a_named_contract_file_goes_before_the_one_in_the_folder(folder, tmp_path):
-    other = tmp_path / "other.toml"
-    other.write_text("[contract]\nchunk_dt_s = 0.25\n")
-    request = PolicyRequest(spec=f"lerobot:{folder}", contract_file=other)
-    assert read_policy_contract(request).chunk_dt_s == 0.25
-
-
 def test_the_contract_of_an_act_is_that_of_its_map(tmp_path):
     shutil.copytree(GOLDENS / "act", tmp_path, dirs_exist_ok=True)
     save_file({}, tmp_path / "model.safetensors")
@@ -163,12 +156,6 @@ def test_a_contract_that_contradicts_the_policy_is_refused(folder, contract, sai
     (folder / "mavbridge.toml").write_text(CONTRACT + contract + "\n")
     with pytest.raises(ContractError, match=said):
         read_plan(folder, None)
-
-
-def test_what_the_files_say_may_be_said_again(folder):
-    said = "image_height = 64\nimage_width = 96\nhorizon = 7\nobservation_steps = 2\n"
-    (folder / "mavbridge.toml").write_text(CONTRACT + said)
-    assert read_plan(folder, None).interface.contract.horizon == 7
 
 
 def test_a_renamed_camera_is_known_by_both_names(folder):

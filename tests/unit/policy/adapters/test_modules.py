@@ -7,8 +7,7 @@ import pytest
 import torch
 from torch import nn
 
-from helpers import torch_policies
-from helpers.torch_policies import DUAL, SINGLE, Encoder, ForwardOnly, NamedDenoiser, NamedHead
+from helpers.torch_policies import DUAL, SINGLE, Encoder, ForwardOnly, NamedDenoiser
 from policy.engines.choose import chunks_of_samples
 from policy.engines.parity import make_parity_samples, parity_failure
 from policy.errors import PolicyError
@@ -145,23 +144,6 @@ def test_the_decisions_of_a_script_are_kept(tmp_path: Path) -> None:
         assert executable.act(image, state, history)[0, 0, 0] == throttle
 
 
-def test_the_actions_of_a_file_are_those_of_the_contract_file(tmp_path: Path) -> None:
-    path = archive(tmp_path, torch.jit.trace(ForwardOnly().eval(), FORWARD_EXAMPLES))
-    (tmp_path / "mavbridge.toml").write_text(
-        CONTRACT
-        + '[action]\nnames = ["roll", "pitch", "yaw", "throttle"]\nscale = [0.5, 1, 1, 1]\n'
-        + "offset = [0, 0, 0.25, 0]\n"
-    )
-    executable, _ = loaded(PolicyRequest(spec=f"torchscript:{path}", dual_rate=False))
-    plain, _ = loaded(
-        PolicyRequest(spec="helpers.torch_policies:ForwardOnly", dual_rate=False, engine="torch")
-    )
-    samples = make_parity_samples(SINGLE)
-    theirs = chunks_of_samples(plain, samples)
-    wanted = theirs[..., [3, 2, 1, 0]] * [1, 1, 1, 0.5] + [0, 0.25, 0, 0]
-    assert parity_failure(wanted, chunks_of_samples(executable, samples)) is None
-
-
 @pytest.mark.parametrize(
     ("content", "reason"),
     [(None, "there is no file"), (b"junk", "cannot be read"), (b"", "is empty, or cut short")],
@@ -178,19 +160,3 @@ def test_weights_alone_are_no_archive(tmp_path: Path) -> None:
     torch.save(Encoder().state_dict(), tmp_path / "mine.pt")
     with pytest.raises(PolicyError, match="is not a TorchScript archive"):
         check_request(PolicyRequest(spec=f"torchscript:{tmp_path / 'mine.pt'}"))
-
-
-def test_a_class_that_names_modules_keeps_its_reset() -> None:
-    class Kept(NamedHead):
-        calls = 0
-
-        def reset(self) -> None:
-            self.calls += 1
-
-    torch_policies.Kept = Kept  # type: ignore[attr-defined]
-    try:
-        executable, notes = loaded(PolicyRequest(spec="helpers.torch_policies:Kept"))
-    finally:
-        del torch_policies.Kept  # type: ignore[attr-defined]
-    assert executable.engine == "torch"
-    assert "has reset" in notes

@@ -60,9 +60,7 @@ def require_same(a: Executable, b: Executable) -> None:
 
 
 @pytest.mark.parametrize("dual_rate", [True, False])
-def test_our_policy_is_the_same_from_image_to_stick(
-    trained_toge: Toge, exported_toge: Path, dual_rate: bool
-) -> None:
+def test_our_policy_is_the_same_from_image_to_stick(trained_toge, exported_toge, dual_rate):
     request = PolicyRequest(
         spec=f"onnx:{exported_toge}",
         dual_rate=dual_rate,
@@ -178,9 +176,7 @@ def test_several_cameras_and_observations(tmp_path: Path, dual_rate: bool) -> No
     require_same(executable, loaded(mine)[0])
 
 
-def test_bf16_is_flown_only_where_it_agrees(
-    exported_toge: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_bf16_is_flown_only_where_it_agrees(exported_toge, monkeypatch):
     failures = iter(["a stick is off", "a stick is off"])
     monkeypatch.setattr(policies, "precisions", lambda: (("bf16", "bf16"), ("f32", "f32")))
     monkeypatch.setattr(policies, "parity_failure", lambda *_: next(failures))
@@ -203,9 +199,7 @@ def test_bf16_is_flown_only_where_it_agrees(
         (("encoder.onnx", "denoiser.onnx"), '{"contract": {}}', "needs the noise schedule"),
     ],
 )
-def test_a_folder_that_is_no_policy_is_refused_in_milliseconds(
-    tmp_path: Path, names: tuple[str, ...], description: str | None, reason: str
-) -> None:
+def test_a_folder_that_is_no_policy_is_refused_at_once(tmp_path, names, description, reason):
     for name in names:
         (tmp_path / name).write_bytes(b"")
     if description is not None:
@@ -215,9 +209,7 @@ def test_a_folder_that_is_no_policy_is_refused_in_milliseconds(
 
 
 @pytest.mark.parametrize("flags", [{"engine": "torch"}, {"device": "cuda"}, {"checkpoint": "x"}])
-def test_flags_that_do_not_go_with_onnx_are_refused(
-    exported_toge: Path, flags: dict[str, str]
-) -> None:
+def test_flags_that_do_not_go_with_onnx_are_refused(exported_toge, flags):
     with pytest.raises(PolicyError, match="leave out"):
         check_request(PolicyRequest(spec=f"onnx:{exported_toge}", **flags))  # type: ignore[arg-type]
 
@@ -231,24 +223,6 @@ def one_file(tmp_path: Path, shapes: dict[str, tuple[int, ...]]) -> PolicyReques
 def test_inputs_that_are_not_known_are_named(tmp_path: Path) -> None:
     request = one_file(tmp_path, {"image": IMAGE, "thing": STATE})
     with pytest.raises(PolicyError, match=r"input \['thing'\] is unknown.*'state': \[.*'proprio'"):
-        loaded(request)
-
-
-def test_inputs_of_another_shape_are_named(tmp_path: Path) -> None:
-    request = one_file(tmp_path, {"image": IMAGE, "state": STATE})
-    contract = json.loads(SINGLE.to_json()) | {"since_exposure": True}
-    (tmp_path / "policy.json").write_text(json.dumps({"contract": contract}))
-    with pytest.raises(
-        PolicyError, match=r"by the contract its inputs would be .*'state': \[1, 20"
-    ):
-        loaded(request)
-
-
-@pytest.mark.parametrize("content", [b"", b"junk", b"\x08\x07"])
-def test_a_damaged_file_is_refused(tmp_path: Path, content: bytes) -> None:
-    request = one_file(tmp_path, {"image": IMAGE, "state": STATE})
-    (tmp_path / "policy.onnx").write_bytes(content)
-    with pytest.raises(PolicyError, match=r"policy\.onnx"):
         loaded(request)
 
 
