@@ -105,7 +105,7 @@ def load_checkpoint_with_notes(
         header, tensors = read_tensors(path)
         require_header(path, header)
     else:
-        header, tensors = {}, _read_torch(path)
+        header, tensors = {}, read_torch(path)
     try:
         policy = build_policy(_config_of(header, fallback) if is_ours else fallback)
     except (PolicyError, RecursionError) as error:
@@ -206,7 +206,8 @@ def _architecture_from_json(text: str, contract: Contract) -> BuiltinConfig:
     raise CheckpointError(f"policy {kind!r} is unknown; this build knows 'toge', 'resnet-unet'")
 
 
-def _read_torch(path: Path) -> dict[Any, Any]:
+def read_torch(path: Path) -> dict[Any, Any]:
+    """Read a dictionary of weights that torch saved; no pickle in it is executed."""
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")  # of file formats; what matters is refused below

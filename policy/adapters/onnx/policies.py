@@ -66,12 +66,11 @@ class OnnxGraphs:
 
     def at(self, vision: Precision, action: Precision) -> "OnnxPolicy":
         """The policy with its encoder and the rest compiled at these precisions."""
-        kind = HeadPolicy if self.schedule is None else DenoiserPolicy
-        return (WholePolicy if self.encoder is None else kind)(self, vision, action)
+        return (OnnxPolicy if self.encoder is None else EncoderPolicy)(self, vision, action)
 
 
 class OnnxPolicy:
-    """What all three kinds of policy share."""
+    """Image, state and history in, a chunk out: single rate."""
 
     def __init__(self, graphs: OnnxGraphs, _vision: Precision, action: Precision) -> None:
         self.graphs = graphs
@@ -86,8 +85,9 @@ class OnnxPolicy:
     def predict(
         self, image: FloatArray, state: FloatArray, action_history: FloatArray, steps: int
     ) -> FloatArray:
-        """Image, state and history -> chunk [1, horizon, 4]."""
-        raise NotImplementedError
+        """One call of the graph."""
+        seen = self._image(self.graphs.rest, image)
+        return self._interface.to_actions(self._call(state, action_history, image=seen))
 
     def _call(self, state: FloatArray, history: FloatArray, **arrays: FloatArray) -> FloatArray:
         """The graph on a state and a history as the policy orders and scales them."""
@@ -102,20 +102,11 @@ class OnnxPolicy:
         return input_to_bytes(image, self.contract) if graph.takes_bytes else image
 
 
-class WholePolicy(OnnxPolicy):
-    """Image, state and history in, a chunk out: single rate."""
+class EncoderPolicy(OnnxPolicy):
+    """An encoder, and a head that makes a chunk in one call or one step of a solve: dual rate.
 
-    def predict(
-        self, image: FloatArray, state: FloatArray, action_history: FloatArray, steps: int
-    ) -> FloatArray:
-        """One call of the graph."""
-        return self._interface.to_actions(
-            self._call(state, action_history, image=self._image(self.graphs.rest, image))
-        )
-
-
-class HeadPolicy(OnnxPolicy):
-    """An encoder and a head that makes a chunk in one call: dual rate."""
+    The noise that a solve starts from is that of our own policies for the same seed.
+    """
 
     def __init__(self, graphs: OnnxGraphs, vision: Precision, action: Precision) -> None:
         super().__init__(graphs, vision, action)
@@ -123,6 +114,11 @@ class HeadPolicy(OnnxPolicy):
             raise PolicyError("a policy at two rates needs an encoder")
         self._encoder_file = graphs.encoder
         self._encoder = graphs.encoder.compile(vision)
+        shape = (1, self.contract.horizon, ACTION_DIM)
+        noise = torch.randn(shape, generator=torch.Generator().manual_seed(graphs.seed))
+        self._noise = noise.numpy()
+        solver = partial(solver_segment, self._denoise, graphs.schedule)
+        self._solver = lru_cache(maxsize=64)(solver)
 
     def encode_visual(self, image: FloatArray, camera: int = 0) -> FloatArray:
         """Image [1, 3, H, W] -> feature [1, F], by one encoder for every camera."""
@@ -131,8 +127,12 @@ class HeadPolicy(OnnxPolicy):
     def predict_fast(
         self, feature: FloatArray, state: FloatArray, action_history: FloatArray, steps: int
     ) -> FloatArray:
-        """One call of the head."""
-        return self._interface.to_actions(self._call(state, action_history, feature=feature))
+        """One call of the head, or a whole solve."""
+        if self.graphs.schedule is None:
+            chunk = self._call(state, action_history, feature=feature)
+        else:
+            chunk = self._solver(steps)(feature, state, action_history, self._noise)
+        return self._interface.to_actions(chunk)
 
     def predict(
         self, image: FloatArray, state: FloatArray, action_history: FloatArray, steps: int
@@ -142,29 +142,6 @@ class HeadPolicy(OnnxPolicy):
         features = np.stack([self.encode_visual(each) for each in images])
         feature = features.reshape(1, *self.contract.feature_shape)
         return self.predict_fast(feature, state, action_history, steps)
-
-
-class DenoiserPolicy(HeadPolicy):
-    """An encoder and one step of a diffusion solve: dual rate.
-
-    The noise that it starts from is that of our own policies for the same seed.
-    """
-
-    def __init__(self, graphs: OnnxGraphs, vision: Precision, action: Precision) -> None:
-        super().__init__(graphs, vision, action)
-        self._schedule = graphs.schedule or NoiseSchedule()
-        shape = (1, self.contract.horizon, ACTION_DIM)
-        noise = torch.randn(shape, generator=torch.Generator().manual_seed(graphs.seed))
-        self._noise = noise.numpy()
-        solver = partial(solver_segment, self._denoise, self._schedule)
-        self._solver = lru_cache(maxsize=64)(solver)
-
-    def predict_fast(
-        self, feature: FloatArray, state: FloatArray, action_history: FloatArray, steps: int
-    ) -> FloatArray:
-        """A whole solve."""
-        solve = self._solver(steps)
-        return self._interface.to_actions(solve(feature, state, action_history, self._noise))
 
     def _denoise(
         self,
