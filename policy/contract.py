@@ -100,11 +100,8 @@ MOST_PIXEL = 1e3
 """Largest mean and deviation of an image, whose pixels are in [0, 1]."""
 MAX_AGE_LIMIT_S = 60.0
 ENVELOPE_TERMS = ("max_tilt_deg", "max_speed_mps", "max_height_m", "max_distance_m")
-FLIGHT_TERMS = (
-    *("action", "modes"),
-    *("max_state_age_s", "max_velocity_age_s", "max_feature_age_s", "max_chunk_age_s"),
-    *ENVELOPE_TERMS,
-)
+_CHUNK_AGES = ("max_state_age_s", "max_velocity_age_s", "max_feature_age_s", "max_chunk_age_s")
+FLIGHT_TERMS = ("action", "modes", *_CHUNK_AGES, *ENVELOPE_TERMS)
 """What decides how a policy is flown, and not what its network computes."""
 _TUPLES = (
     *("cameras", "camera_rates_hz", "image_crop", "state_extras"),
@@ -127,11 +124,7 @@ _INTEGERS = {
 }
 _NUMBERS: dict[str, tuple[float, float, str]] = {
     **dict.fromkeys(("chunk_dt_s", "history_dt_s", "observation_dt_s"), (LEAST, 1.0, "seconds")),
-    **dict.fromkeys(
-        ("max_state_age_s", "max_velocity_age_s", "max_feature_age_s", "max_chunk_age_s"),
-        (LEAST, MAX_AGE_LIMIT_S, "seconds"),
-    ),
-    "max_stall_s": (LEAST, MAX_AGE_LIMIT_S, "seconds"),
+    **dict.fromkeys((*_CHUNK_AGES, "max_stall_s"), (LEAST, MAX_AGE_LIMIT_S, "seconds")),
     "max_tilt_deg": (LEAST, 180.0, "degrees"),
     "max_speed_mps": (LEAST, 1e3, "m/s"),
     "max_height_m": (LEAST, 1e5, "m"),
@@ -139,8 +132,7 @@ _NUMBERS: dict[str, tuple[float, float, str]] = {
     "hover_thrust": (LEAST, 1.0, "of full thrust"),
     "full_lean_deg": (LEAST, 80.0, "degrees"),
     "full_yaw_rate_degps": (LEAST, 2000.0, "degrees/s"),
-    "full_climb_mps": (LEAST, 100.0, "m/s"),
-    "full_descent_mps": (LEAST, 100.0, "m/s"),
+    **dict.fromkeys(("full_climb_mps", "full_descent_mps"), (LEAST, 100.0, "m/s")),
     "depth_unit_m": (1e-6, 1.0, "m"),
 }
 """Least and most of each number, and their unit."""

@@ -27,11 +27,10 @@ from torch import Tensor, nn
 
 from policy.adapters.description import USUAL_NAMES, Description
 from policy.adapters.interface import Interface
-from policy.contract import ACTION_DIM
 from policy.engines.kept import modules_of
 from policy.errors import CheckpointError, PolicyError, user_code
 from policy.files import why_unreadable
-from policy.nets.diffusion import NoiseSchedule, ddim_solve
+from policy.nets.diffusion import NoiseSchedule, ddim_solve, flight_noise
 from policy.protocol import SingleRatePolicy
 
 PARTS = "forward alone, visual_encoder and action_head, or visual_encoder and denoiser"
@@ -189,8 +188,7 @@ class DenoiserPolicy(HeadPolicy):
             )
         self.schedule = schedule
         self.initial_noise: Tensor
-        shape = (1, self.contract.horizon, ACTION_DIM)
-        noise = torch.randn(shape, generator=torch.Generator().manual_seed(seed))
+        noise = flight_noise(seed, self.contract.horizon)
         self.register_buffer("initial_noise", noise, persistent=False)
 
     def denoise(

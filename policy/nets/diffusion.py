@@ -20,7 +20,7 @@ from typing import Any, Literal, TypeVar
 import torch
 from torch import Tensor
 
-from policy.contract import FloatArray
+from policy.contract import ACTION_DIM, FloatArray
 from policy.errors import PolicyError
 
 BetaSchedule = Literal["squared_cosine", "linear"]
@@ -126,6 +126,11 @@ class NoiseSchedule:
             noise = (noisy - step.signal * clean) / step.noise
             after = step.next_signal * clean + step.next_noise * noise
         return after
+
+
+def flight_noise(seed: int, steps: int) -> Tensor:
+    """Noise [1, steps, 4] that the solves of a flight start from: the same on every device."""
+    return torch.randn(1, steps, ACTION_DIM, generator=torch.Generator().manual_seed(seed))
 
 
 def ddim_solve(

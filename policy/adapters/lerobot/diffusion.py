@@ -16,7 +16,7 @@ from torch import Tensor, nn
 from policy.adapters.lerobot.config import DiffusionConfig, map_size
 from policy.contract import ACTION_DIM, EXTRA_NAMES
 from policy.errors import PolicyError
-from policy.nets.diffusion import Chunk, DdimStep, cosine_power
+from policy.nets.diffusion import Chunk, DdimStep, cosine_power, flight_noise
 from policy.nets.resnet import LastMap
 from policy.nets.unet1d import norm_of_groups, sinusoid_frequencies
 
@@ -290,9 +290,7 @@ class Diffusion(nn.Module):
 
     def seed_noise(self, seed: int) -> None:
         """Draw the noise of a flight."""
-        generator = torch.Generator().manual_seed(seed)
-        noise = torch.randn(self.initial_noise.shape, generator=generator)
-        self.initial_noise.copy_(noise)
+        self.initial_noise.copy_(flight_noise(seed, self.initial_noise.shape[1]))
 
     def encode(self, image: Tensor, camera: int) -> Tensor:
         """[B, 3, H, W] of one camera -> feature [B, F]."""

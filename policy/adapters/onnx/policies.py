@@ -6,7 +6,6 @@ from functools import lru_cache, partial
 from pathlib import Path
 
 import numpy as np
-import torch
 
 from policy.adapters.description import USUAL_NAMES
 from policy.adapters.modules import make_schedule
@@ -24,7 +23,7 @@ from policy.engines.openvino_compile import engine_name, precisions
 from policy.engines.parity import make_parity_samples, parity_failure
 from policy.engines.stepwise import solver_segment
 from policy.errors import PolicyError
-from policy.nets.diffusion import NoiseSchedule
+from policy.nets.diffusion import NoiseSchedule, flight_noise
 from policy.preprocess import input_to_bytes
 from policy.protocol import Executable
 
@@ -114,9 +113,7 @@ class EncoderPolicy(OnnxPolicy):
             raise PolicyError("a policy at two rates needs an encoder")
         self._encoder_file = graphs.encoder
         self._encoder = graphs.encoder.compile(vision)
-        shape = (1, self.contract.horizon, ACTION_DIM)
-        noise = torch.randn(shape, generator=torch.Generator().manual_seed(graphs.seed))
-        self._noise = noise.numpy()
+        self._noise = flight_noise(graphs.seed, self.contract.horizon).numpy()
         solver = partial(solver_segment, self._denoise, graphs.schedule)
         self._solver = lru_cache(maxsize=64)(solver)
 
