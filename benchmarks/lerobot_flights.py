@@ -24,8 +24,8 @@ from mavbridge.config.policy import PolicyConfig
 from mavbridge.config.rates import Rates
 from mavbridge.core.errors import UserError
 from mavbridge.core.vehicle import Percentiles
+from policy.adapters.lerobot.plan import read_plan
 from policy.contract import ACTION_DIM
-from policy.foreign.lerobot.plan import read_plan
 
 CONTRACT_FILE = "mavbridge.toml"
 HEAD = (

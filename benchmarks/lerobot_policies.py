@@ -20,6 +20,8 @@ import numpy as np
 import torch
 
 from mavbridge.core.clock import NS_PER_MS, NS_PER_S, MonotonicClock
+from policy.adapters.lerobot.plan import read_plan
+from policy.adapters.lerobot.policy import LeRobotDiffusion, LeRobotPolicy, load_policy_of
 from policy.contract import FloatArray
 from policy.engines.executable import (
     ExecutionSettings,
@@ -31,9 +33,6 @@ from policy.engines.openvino_compile import precisions
 from policy.engines.openvino_modules import ModuleConverter, make_module_executable
 from policy.engines.parity import make_parity_samples
 from policy.engines.torch_eager import make_torch_executable
-from policy.foreign.lerobot.load import load_policy_of
-from policy.foreign.lerobot.plan import read_plan
-from policy.foreign.lerobot.policy import LeRobotDiffusion, LeRobotPolicy
 from policy.protocol import Executable
 
 PEER = Path(__file__).with_name("lerobot_peer.py")

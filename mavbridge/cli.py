@@ -35,8 +35,8 @@ from mavbridge.core.errors import UserError
 from mavbridge.core.log import run_log
 from mavbridge.core.realtime import require_supported_system
 from mavbridge.recording.folder import require_extra
+from policy.adapters.websocket.kind import require_packages
 from policy.files import read_toml, user_path
-from policy.foreign.websocket.kind import require_packages
 from policy.training.settings import RunSettings, TrainSettings, WorldModelSettings
 
 HELP = """Fly an ArduPilot or PX4 vehicle with a vision policy.

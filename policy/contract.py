@@ -15,7 +15,8 @@ from numpy.typing import NDArray
 from policy.errors import ContractError
 from policy.files import parse_json
 
-CONTRACT_VERSION = 6
+CONTRACT_VERSION, OLDEST_VERSION = 6, 4
+"""Of contracts that are written, and the oldest that are read."""
 NS_PER_S = 1_000_000_000
 
 STATE_NAMES = (
@@ -99,13 +100,42 @@ MOST_PIXEL = 1e3
 """Largest mean and deviation of an image, whose pixels are in [0, 1]."""
 MAX_AGE_LIMIT_S = 60.0
 ENVELOPE_TERMS = ("max_tilt_deg", "max_speed_mps", "max_height_m", "max_distance_m")
-FLIGHT_TERMS = (
-    *("action", "modes"),
-    *("max_state_age_s", "max_velocity_age_s", "max_feature_age_s", "max_chunk_age_s"),
-    *ENVELOPE_TERMS,
-)
+_CHUNK_AGES = ("max_state_age_s", "max_velocity_age_s", "max_feature_age_s", "max_chunk_age_s")
+FLIGHT_TERMS = ("action", "modes", *_CHUNK_AGES, *ENVELOPE_TERMS)
 """What decides how a policy is flown, and not what its network computes."""
-_TUPLES = ("cameras", "camera_rates_hz", "image_crop", "state_extras")
+_TUPLES = (
+    *("cameras", "camera_rates_hz", "image_crop", "state_extras"),
+    *("image_mean_rgb", "image_std_rgb"),
+)
+_CHOICES: dict[str, Any] = {
+    "state_frame": StateFrame,
+    "arrays": Arrays,
+    "velocity_frame": VelocityFrame,
+    "image_fit": ImageFit,
+    "image_channels": ImageChannels,
+}
+_INTEGERS = {
+    "image_height": (16, 4096),
+    "image_width": (16, 4096),
+    "feature_dim": (0, 1 << 20),  # the cells of an ACT at 640x480 are 153,600
+    "horizon": (1, 1024),
+    "history_len": (1, 1024),
+    "observation_steps": (1, 16),
+}
+_NUMBERS: dict[str, tuple[float, float, str]] = {
+    **dict.fromkeys(("chunk_dt_s", "history_dt_s", "observation_dt_s"), (LEAST, 1.0, "seconds")),
+    **dict.fromkeys((*_CHUNK_AGES, "max_stall_s"), (LEAST, MAX_AGE_LIMIT_S, "seconds")),
+    "max_tilt_deg": (LEAST, 180.0, "degrees"),
+    "max_speed_mps": (LEAST, 1e3, "m/s"),
+    "max_height_m": (LEAST, 1e5, "m"),
+    "max_distance_m": (LEAST, 1e6, "m"),
+    "hover_thrust": (LEAST, 1.0, "of full thrust"),
+    "full_lean_deg": (LEAST, 80.0, "degrees"),
+    "full_yaw_rate_degps": (LEAST, 2000.0, "degrees/s"),
+    **dict.fromkeys(("full_climb_mps", "full_descent_mps"), (LEAST, 100.0, "m/s")),
+    "depth_unit_m": (1e-6, 1.0, "m"),
+}
+"""Least and most of each number, and their unit."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -115,9 +145,6 @@ class Contract:
     Times are seconds, never ticks: one checkpoint behaves the same at 50, 100 or 250 Hz. Ages are
     judged when a stick leaves for the autopilot, not when a computation starts; the configuration
     of a flight may tighten their limits, never loosen them.
-
-    Raises:
-        ContractError: a field is out of its range.
     """
 
     state_frame: StateFrame = "ned_frd"
@@ -201,61 +228,49 @@ class Contract:
     version: int = field(default=CONTRACT_VERSION, init=False)
 
     def __post_init__(self) -> None:
-        """Refuse values that no runtime could serve."""
         try:
             self._require_values()
             self._require_images()
             self._require_observation()
-            self._require_flight_terms()
+            self._require_modes()
         except (TypeError, ValueError, OverflowError, AttributeError) as error:
             raise ContractError(f"malformed contract: {error}") from error
 
     def _require_values(self) -> None:
+        for name in ("modes", *_TUPLES):
+            if isinstance(value := getattr(self, name), list):
+                object.__setattr__(self, name, tuple(value))
         if self.modes == () and self.action in ACTION_MODES:
             modes = ("ALT_HOLD", "ALTCTL") if self.action == "sticks" else ACTION_MODES[self.action]
             object.__setattr__(self, "modes", modes)
-        for name, known in (
-            ("state_frame", StateFrame),
-            ("arrays", Arrays),
-            ("velocity_frame", VelocityFrame),
-            ("image_fit", ImageFit),
-            ("image_channels", ImageChannels),
-        ):
+        for name, known in _CHOICES.items():
             if (value := getattr(self, name)) not in get_args(known):
                 choices = " or ".join(map(repr, get_args(known)))
                 raise ContractError(f"{name} {value!r} is unknown; use {choices}")
-        if not isinstance(self.since_exposure, bool):
-            raise ContractError(
-                f"since_exposure must be true or false, got {self.since_exposure!r}"
-            )
-        for name, low, high in (
-            ("image_height", 16, 4096),
-            ("image_width", 16, 4096),
-            ("feature_dim", 0, 1 << 20),  # the cells of an ACT at 640x480 are 153,600
-            ("horizon", 1, 1024),
-            ("history_len", 1, 1024),
-            ("observation_steps", 1, 16),
-        ):
+        self._require("since_exposure", isinstance(self.since_exposure, bool), "true or false")
+        for name, (low, high) in _INTEGERS.items():
             value = getattr(self, name)
-            if not isinstance(value, int) or isinstance(value, bool) or not low <= value <= high:
-                raise ContractError(f"{name} must be an integer in {low}..{high}, got {value!r}")
-        for name in ("chunk_dt_s", "history_dt_s", "observation_dt_s"):
+            is_right = type(value) is int and low <= value <= high
+            self._require(name, is_right, f"an integer in {low}..{high}")
+        for name, (least, most, unit) in _NUMBERS.items():
             value = getattr(self, name)
-            if not _is_within(value, LEAST, 1.0):
-                raise ContractError(f"{name} must be in [{LEAST:g}, 1] seconds, got {value!r}")
+            is_right = _is_within(value, least, most) or (value is None and name in ENVELOPE_TERMS)
+            self._require(name, is_right, f"in [{least:g}, {most:g}] {unit}")
+        for name in ("lean_dead_zone", "yaw_dead_zone", "throttle_dead_zone"):
+            share = getattr(self, name)
+            self._require(name, _is_within(share, 0, 0.9) and share < 0.9, "in [0, 0.9) of travel")
+
+    def _require(self, name: str, is_right: bool, wanted: str) -> None:
+        if not is_right:
+            raise ContractError(f"{name} must be {wanted}, got {getattr(self, name)!r}")
 
     def _require_images(self) -> None:
+        for name in _TUPLES:
+            self._require(name, isinstance(getattr(self, name), tuple), "a list")
         for name, low in (("image_mean_rgb", -MOST_PIXEL), ("image_std_rgb", 1e-6)):
             rgb = getattr(self, name)
-            if len(rgb) != 3 or not all(_is_within(value, low, MOST_PIXEL) for value in rgb):
-                raise ContractError(
-                    f"{name} must be three numbers in [{low:g}, {MOST_PIXEL:g}], got {rgb!r}"
-                )
-        for name in _TUPLES:
-            if not isinstance(getattr(self, name), tuple):
-                raise ContractError(f"{name} must be a list, got {getattr(self, name)!r}")
-        if not _is_within(self.depth_unit_m, 1e-6, 1.0):
-            raise ContractError(f"depth_unit_m must be in [1e-06, 1] m, got {self.depth_unit_m!r}")
+            is_right = len(rgb) == 3 and all(_is_within(value, low, MOST_PIXEL) for value in rgb)
+            self._require(name, is_right, f"three numbers in [{low:g}, {MOST_PIXEL:g}]")
         scaling = (self.image_mean_rgb, self.image_std_rgb)
         if self.is_depth and scaling != (IMAGENET_MEAN_RGB, IMAGENET_STD_RGB):
             raise ContractError(
@@ -264,74 +279,38 @@ class Contract:
             )
         crop = self.image_crop
         is_crop = len(crop) == 4 and all(_is_within(share, 0, 1) for share in crop)
-        if not is_crop or min(crop[2] - crop[0], crop[3] - crop[1]) < LEAST:
-            raise ContractError(
-                "image_crop must be top, left, bottom, right within [0, 1], at least "
-                f"{LEAST:g} apart, got {self.image_crop}"
-            )
+        is_crop = is_crop and min(crop[2] - crop[0], crop[3] - crop[1]) >= LEAST
+        wanted = f"top, left, bottom, right within [0, 1], at least {LEAST:g} apart"
+        self._require("image_crop", is_crop, wanted)
 
     def _require_observation(self) -> None:
-        names = self.cameras
-        if not names or len(set(names)) < len(names) or not all(map(str.isidentifier, names)):
-            raise ContractError(f"cameras must be one or more different names, got {names!r}")
-        rates_hz = self.camera_rates_hz
-        if len(rates_hz) not in (0, len(names)) or not all(
-            _is_within(hz, LEAST_RATE_HZ, 240) for hz in rates_hz
-        ):
-            raise ContractError(
-                f"camera_rates_hz must be a rate in [{LEAST_RATE_HZ:g}, 240] Hz for each of "
-                f"{names}, got {rates_hz}"
-            )
-        extras = self.state_extras
-        if len(set(extras)) < len(extras) or not set(extras) <= set(EXTRA_NAMES):
-            raise ContractError(
-                f"state_extras must be some of {', '.join(EXTRA_NAMES)}, each once, got {extras!r}"
-            )
+        names, rates_hz, extras = self.cameras, self.camera_rates_hz, self.state_extras
+        are_names = len(names) > 0 and len(set(names)) == len(names)
+        are_names = are_names and all(map(str.isidentifier, names))
+        self._require("cameras", are_names, "one or more different names")
+        are_rates = all(_is_within(hz, LEAST_RATE_HZ, 240) for hz in rates_hz)
+        wanted = f"a rate in [{LEAST_RATE_HZ:g}, 240] Hz for each of {names}"
+        self._require("camera_rates_hz", are_rates and len(rates_hz) in (0, len(names)), wanted)
+        are_extras = len(set(extras)) == len(extras) and set(extras) <= set(EXTRA_NAMES)
+        wanted = f"some of {', '.join(EXTRA_NAMES)}, each once"
+        self._require("state_extras", are_extras, wanted)
         longest_s = self.horizon * self.chunk_dt_s
-        if not _is_within(self.play_s, 0, longest_s) or 0 < self.play_s < LEAST:
-            raise ContractError(
-                f"play_s must be 0, or at least {LEAST:g} and at most the {longest_s:g} s of a "
-                f"chunk, got {self.play_s!r}"
-            )
+        is_play = _is_within(self.play_s, 0, longest_s) and not 0 < self.play_s < LEAST
+        wanted = f"0, or at least {LEAST:g} and at most the {longest_s:g} s of a chunk"
+        self._require("play_s", is_play, wanted)
 
-    def _require_flight_terms(self) -> None:
+    def _require_modes(self) -> None:
         if self.action not in ACTION_MODES:
             raise ContractError(
                 f"action {self.action!r} is unknown; use one of {', '.join(ACTION_MODES)}"
             )
-        if not isinstance(self.modes, tuple) or not self.modes:
-            raise ContractError(f"modes must be a tuple of at least one mode, got {self.modes!r}")
+        is_some = isinstance(self.modes, tuple) and len(self.modes) > 0
+        self._require("modes", is_some, "a tuple of at least one mode")
         known = ACTION_MODES[self.action]
         if unknown := [mode for mode in self.modes if mode not in known]:
             raise ContractError(
                 f"modes {unknown} are not flown with {self.action}; known are {', '.join(known)}"
             )
-        for name, value, high, unit in (
-            ("max_state_age_s", self.max_state_age_s, MAX_AGE_LIMIT_S, "seconds"),
-            ("max_velocity_age_s", self.max_velocity_age_s, MAX_AGE_LIMIT_S, "seconds"),
-            ("max_feature_age_s", self.max_feature_age_s, MAX_AGE_LIMIT_S, "seconds"),
-            ("max_chunk_age_s", self.max_chunk_age_s, MAX_AGE_LIMIT_S, "seconds"),
-            ("max_stall_s", self.max_stall_s, MAX_AGE_LIMIT_S, "seconds"),
-            ("max_tilt_deg", self.max_tilt_deg, 180.0, "degrees"),
-            ("max_speed_mps", self.max_speed_mps, 1e3, "m/s"),
-            ("max_height_m", self.max_height_m, 1e5, "m"),
-            ("max_distance_m", self.max_distance_m, 1e6, "m"),
-            ("hover_thrust", self.hover_thrust, 1.0, "of full thrust"),
-            ("full_lean_deg", self.full_lean_deg, 80.0, "degrees"),
-            ("full_yaw_rate_degps", self.full_yaw_rate_degps, 2000.0, "degrees/s"),
-            ("full_climb_mps", self.full_climb_mps, 100.0, "m/s"),
-            ("full_descent_mps", self.full_descent_mps, 100.0, "m/s"),
-        ):
-            if value is None and name in ENVELOPE_TERMS:
-                continue
-            if not _is_within(value, LEAST, high):
-                raise ContractError(
-                    f"{name} must be in [{LEAST:g}, {high:g}] {unit}, got {value!r}"
-                )
-        for name in ("lean_dead_zone", "yaw_dead_zone", "throttle_dead_zone"):
-            share = getattr(self, name)
-            if not _is_within(share, 0, 0.9) or share == 0.9:
-                raise ContractError(f"{name} must be in [0, 0.9) of the travel, got {share!r}")
 
     @property
     def state_names(self) -> tuple[str, ...]:
@@ -383,11 +362,7 @@ class Contract:
 
     @classmethod
     def from_json(cls, text: str) -> "Contract":
-        """Read the header form; an older one gets the defaults of the fields that came later.
-
-        Raises:
-            ContractError: not JSON, another version, unknown keys, or values out of range.
-        """
+        """Read the header form; an older one gets the defaults of the fields that came later."""
         try:
             data: Any = parse_json(text)
         except ValueError as error:
@@ -395,24 +370,15 @@ class Contract:
         if not isinstance(data, dict):
             raise ContractError("the contract in the checkpoint is not a JSON object")
         version = data.pop("version", CONTRACT_VERSION)
-        if not isinstance(version, int) or not 1 <= version <= CONTRACT_VERSION:
+        if not isinstance(version, int) or not OLDEST_VERSION <= version <= CONTRACT_VERSION:
             raise ContractError(
-                f"contract version {version!r} is not supported; this build reads versions up to "
-                f"{CONTRACT_VERSION}: export the checkpoint again, or update mavbridge"
+                f"contract version {version!r} is not supported; this build reads versions "
+                f"{OLDEST_VERSION} to {CONTRACT_VERSION}: export it again, or update mavbridge"
             )
         known = {each.name for each in fields(cls) if each.init}
         if unknown := sorted(set(data) - known):
             raise ContractError(f"unknown contract keys {unknown}; there are {sorted(known)}")
-        for name in ("modes", *_TUPLES):
-            if isinstance(data.get(name), list):
-                data[name] = tuple(data[name])
-        for name in ("image_mean_rgb", "image_std_rgb"):
-            if isinstance(data.get(name), list):
-                data[name] = tuple(data[name])
-        try:
-            return cls(**data)
-        except TypeError as error:
-            raise ContractError(f"malformed contract: {error}") from error
+        return cls(**data)
 
 
 def _is_within(value: object, low: float, high: float) -> bool:

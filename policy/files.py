@@ -99,6 +99,17 @@ def why_unreadable(path: Path, error: Exception, kind: str = "") -> str:
 
 
 @contextmanager
+def whole_file(path: Path) -> Iterator[Path]:
+    """Yield the path of a draft, which takes the place of ``path`` at the end, or goes."""
+    draft = path.with_name(f"{path.name}.{os.getpid()}.partial")
+    try:
+        yield draft
+        draft.replace(path)
+    finally:
+        draft.unlink(missing_ok=True)
+
+
+@contextmanager
 def open_safetensors(path: Path, framework: str) -> Iterator[Any]:
     """Open a safetensors file; raises CheckpointError if it is damaged, also while it is read."""
     try:

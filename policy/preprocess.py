@@ -80,9 +80,6 @@ def image_to_input(image: CameraImage, contract: Contract) -> FloatArray:
 
     It is fitted by ``fit_image``, then normalised as ``(value / 255 - mean) / std`` by the
     contract, with the channels in the contract's order; depth becomes metres.
-
-    Raises:
-        PolicyError: the array is not an image of the contract's kind.
     """
     fitted = fit_image(image, contract)
     if contract.is_depth:
@@ -96,11 +93,7 @@ def image_to_input(image: CameraImage, contract: Contract) -> FloatArray:
 
 
 def input_to_bytes(planes: FloatArray, contract: Contract) -> FloatArray:
-    """Undo the normalisation of ``image_to_input``: [..., 3, H, W] -> whole numbers 0 to 255.
-
-    Raises:
-        PolicyError: the contract's images are depth, which has no bytes.
-    """
+    """Undo the normalisation of ``image_to_input``: [..., 3, H, W] -> whole numbers 0 to 255."""
     if contract.is_depth:
         raise PolicyError(
             "it takes its image as uint8, and the contract's is depth in metres: export it with "
@@ -124,11 +117,7 @@ def dummy_images(contract: Contract) -> CameraImage:
 
 
 def fit_image(image: CameraImage, contract: Contract) -> CameraImage:
-    """Camera's image of any size -> the contract's part of it, of ``Contract.picture_shape``.
-
-    Raises:
-        PolicyError: the array is not an image of the contract's kind.
-    """
+    """Camera's image of any size -> the contract's part of it, of ``Contract.picture_shape``."""
     kind = (np.dtype(np.uint16), ()) if contract.is_depth else (np.dtype(np.uint8), (3,))
     if image.ndim < 2 or (image.dtype, image.shape[2:]) != kind or 0 in image.shape:
         wanted = (

@@ -90,9 +90,6 @@ def flown_by_rates(executable: Executable) -> Executable:
     """An executable whose chunks are sticks, flown by thrust and body rates.
 
     Its network gets a history of centred sticks: what was sent are rates.
-
-    Raises:
-        ContractError: the state is not in ned_frd.
     """
     loop = StickLoop(by_rates(executable.contract))
     centred = np.zeros((1, executable.contract.history_len, ACTION_DIM), np.float32)
@@ -109,15 +106,11 @@ class StickLoop:
 
     Sticks are throttle, yaw, pitch, roll in [-1, 1], full stick by ``contract``; rates are thrust
     in [0, 1] and roll, pitch, yaw rate in rad/s about FRD axes.
-
-    Raises:
-        ContractError: the state is not in ned_frd.
     """
 
     contract: Contract
 
     def __post_init__(self) -> None:
-        """Refuse other axes."""
         if self.contract.state_frame != "ned_frd":
             raise ContractError(
                 "a network flies by rates with its state in ned_frd, not in "

@@ -6,16 +6,18 @@ from rich.console import Console
 
 from mavbridge.commands.config import ContractConfig
 from mavbridge.core.errors import UserError
-from policy.data.lerobot import is_lerobot
-from policy.foreign.drafts.entries import Entry, draft_text
-from policy.foreign.drafts.lerobot import (
+from policy.adapters.drafts import (
+    Entry,
     checkpoint_entries,
     dataset_entries,
     dataset_of,
+    draft_text,
+    onnx_entries,
+    onnx_files,
 )
-from policy.foreign.drafts.onnx import onnx_entries, onnx_files
-from policy.foreign.interface import CONTRACT_FILE, UNANSWERED
-from policy.foreign.lerobot.config import CONFIG_FILE
+from policy.adapters.interface import CONTRACT_FILE, UNANSWERED
+from policy.adapters.lerobot.config import CONFIG_FILE
+from policy.data.lerobot import is_lerobot
 
 
 def contract(source: Path, config: ContractConfig) -> int:

@@ -32,13 +32,13 @@ from mavbridge.core.clock import NS_PER_MS, Clock, MonotonicClock
 from mavbridge.core.errors import UserError
 from mavbridge.core.workers import Worker
 from mavbridge.flight.policies import check_configured_policy, load_configured_policy
+from policy.adapters.interface import Interface
+from policy.adapters.websocket.link import API_KEY_VARIABLE
+from policy.adapters.websocket.messages import CONTRACT_KEY, pack, unpack
+from policy.adapters.websocket.observation import RESET_KEY, from_message
+from policy.adapters.websocket.remote_policy import ACTIONS_KEY
 from policy.contract import Contract
 from policy.errors import PolicyError
-from policy.foreign.interface import Interface
-from policy.foreign.websocket.link import API_KEY_VARIABLE
-from policy.foreign.websocket.messages import CONTRACT_KEY, pack, unpack
-from policy.foreign.websocket.observation import RESET_KEY, from_message
-from policy.foreign.websocket.remote_policy import ACTIONS_KEY
 from policy.protocol import Executable, keep_nothing
 
 MAX_CLIENTS = 4

@@ -6,7 +6,7 @@ What is wrong with a file is raised as a ``CheckpointError``.
 from collections.abc import Sequence
 from pathlib import Path
 
-from policy.checkpoints.what_file import recognise
+from policy.checkpoints.detect import detect
 from policy.contract import Contract
 from policy.errors import CheckpointError
 from policy.files import open_safetensors
@@ -20,7 +20,7 @@ SUFFIXES = (".safetensors", ".pt", ".pth", ".ckpt")
 
 def require_file(path: Path, suffixes: Sequence[str]) -> None:
     """Refuse a path that is not a file of one of these suffixes, and say what is there."""
-    if (sentence := recognise(path)) is not None:
+    if (sentence := detect(path)) is not None:
         raise CheckpointError(sentence)
     if path.suffix not in suffixes:
         raise CheckpointError(f"{path}: not a checkpoint; use one of {', '.join(suffixes)}")
@@ -43,11 +43,7 @@ def require_header(path: Path, header: dict[str, str]) -> None:
 
 
 def read_contract(path: Path) -> Contract | None:
-    """The contract in a policy's file; None where it is a ``.pt``, which only torch can read.
-
-    Raises:
-        ContractError: the contract is malformed or of another version.
-    """
+    """The contract in a policy's file; None where it is a ``.pt``, which only torch can read."""
     require_file(path, SUFFIXES)
     if path.suffix != ".safetensors":
         return None

@@ -11,7 +11,7 @@ import json
 import pickle
 import struct
 import warnings
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any, TypeAlias
 
@@ -37,7 +37,6 @@ from policy.checkpoints.tensors import (
     unpack,
     write_tensors,
 )
-from policy.checkpoints.which_of_ours import which_of_ours
 from policy.contract import Contract, FloatArray
 from policy.engines.parity import ParitySamples, make_parity_samples, parity_failure
 from policy.errors import CheckpointError, PolicyError
@@ -63,18 +62,6 @@ _DAMAGED = (
 """Raised by torch.load on flipped bytes, which its reader interprets before it checks them."""
 
 
-@dataclass(frozen=True, kw_only=True)
-class _Contents:
-    """Contents of a file; texts are None and the rest is empty where it does not say."""
-
-    state: dict[str, Tensor] = field(default_factory=dict)
-    vector: dict[str, Tensor] = field(default_factory=dict)
-    loaded: dict[Any, Any] = field(default_factory=dict)
-    """Everything in a torch file: which of it are the weights depends on the network."""
-    contract: str | None
-    architecture: str | None
-
-
 def build_policy(config: BuiltinConfig) -> BuiltinPolicy:
     """The network of ``config``, with random weights of torch's global generator."""
     return Toge(config) if isinstance(config, TogeConfig) else ResnetUnet(config)
@@ -87,9 +74,6 @@ def save_checkpoint(
 
     ``training`` is JSON that says how it was trained, for people and reports. ``packed`` makes a
     third of the size, rounded as ``pack`` says; the test vector is then of rounded weights.
-
-    Raises:
-        CheckpointError: weights that are not finite, or a path that cannot be written.
     """
     state = {name: value.detach().contiguous() for name, value in policy.state_dict().items()}
     require_finite(path, state)
@@ -107,40 +91,51 @@ def save_checkpoint(
     write_tensors(path, state, header)
 
 
-def load_checkpoint(path: Path, *, fallback: BuiltinConfig) -> BuiltinPolicy:
-    """Read a checkpoint into the network that it was made for, on the CPU, in eval mode.
-
-    ``fallback`` is the policy that was asked for: its kind must be the file's, and its values serve
-    for what a ``.pt`` does not say.
-
-    Raises:
-        CheckpointError: missing, corrupt, of another policy or contract version, not finite, or
-            it no longer makes the chunks of its test vector.
-    """
-    return load_checkpoint_with_notes(path, fallback=fallback)[0]
-
-
 def load_checkpoint_with_notes(
     path: Path, *, fallback: BuiltinConfig
 ) -> tuple[BuiltinPolicy, tuple[str, ...]]:
-    """``load_checkpoint``, and what a person should know of where the weights were found."""
+    """Read a checkpoint into the network that it was made for, on the CPU, in eval mode.
+
+    ``fallback`` is the policy that was asked for: its kind must be the file's, and its values serve
+    for what a ``.pt`` does not say. The notes say where in a ``.pt`` the weights were found.
+    """
     require_file(path, SUFFIXES)
-    is_safetensors = path.suffix == ".safetensors"
-    contents = _read_safetensors(path) if is_safetensors else _read_torch(path)
+    is_ours = path.suffix == ".safetensors"
+    if is_ours:
+        header, tensors = read_tensors(path)
+        require_header(path, header)
+    else:
+        header, tensors = {}, read_torch(path)
     try:
-        policy = build_policy(_config_of(contents, fallback))
-    except PolicyError as error:
-        raise CheckpointError(f"{path}: {error}") from error
-    found = FoundWeights(state=contents.state)
-    if not is_safetensors:
-        found = find_weights(path, contents.loaded, shapes_of(policy))
+        policy = build_policy(_config_of(header, fallback) if is_ours else fallback)
+    except (PolicyError, RecursionError) as error:
+        told = str(error) if isinstance(error, PolicyError) else "its header is nested too deeply"
+        raise CheckpointError(f"{path}: {told}") from error
+    vector = {
+        name.removeprefix(VECTOR_PREFIX): tensors.pop(name)
+        for name in (list(tensors) if is_ours else ())
+        if name.startswith(VECTOR_PREFIX)
+    }
+    require_finite(path, vector)
+    if is_ours:
+        found = FoundWeights(state=unpack(tensors))
+    else:
+        found = find_weights(path, tensors, shapes_of(policy))
     require_finite(path, found.state)
-    require_fit(path, policy, found.state, lambda: which_of_ours(found.state, policy.contract))
+    require_fit(
+        *(path, policy, found.state),
+        "Name the size and encoder of its training, as in --policy toge:medium:resnet18",
+    )
     policy.load_state_dict(found.state)
     policy.eval()
-    if contents.vector:
-        _require_reproduced(path, policy, contents.vector)
+    if vector:
+        _require_reproduced(path, policy, vector)
     return policy, () if found.note is None else (found.note,)
+
+
+def load_checkpoint(path: Path, *, fallback: BuiltinConfig) -> BuiltinPolicy:
+    """Read a checkpoint as ``load_checkpoint_with_notes`` does, without the notes."""
+    return load_checkpoint_with_notes(path, fallback=fallback)[0]
 
 
 def _make_vector(policy: BuiltinPolicy) -> dict[str, Tensor]:
@@ -180,16 +175,9 @@ def _require_reproduced(path: Path, policy: BuiltinPolicy, vector: dict[str, Ten
         )
 
 
-def _config_of(contents: _Contents, fallback: BuiltinConfig) -> BuiltinConfig:
-    contract = fallback.contract
-    try:
-        if contents.contract is not None:
-            contract = Contract.from_json(contents.contract)
-        if contents.architecture is None:
-            return replace(fallback, contract=contract)
-        config = _architecture_from_json(contents.architecture, contract)
-    except RecursionError as error:
-        raise CheckpointError("the header is not JSON that any build of ours wrote") from error
+def _config_of(header: dict[str, str], fallback: BuiltinConfig) -> BuiltinConfig:
+    contract = Contract.from_json(header[CONTRACT_KEY])
+    config = _architecture_from_json(header[ARCHITECTURE_KEY], contract)
     if type(config) is not type(fallback):
         raise CheckpointError(
             f"it holds a {_kind(config)!r} policy, not a {_kind(fallback)!r} one: "
@@ -218,24 +206,8 @@ def _architecture_from_json(text: str, contract: Contract) -> BuiltinConfig:
     raise CheckpointError(f"policy {kind!r} is unknown; this build knows 'toge', 'resnet-unet'")
 
 
-def _read_safetensors(path: Path) -> _Contents:
-    header, state = read_tensors(path)
-    require_header(path, header)
-    vector = {
-        name.removeprefix(VECTOR_PREFIX): state.pop(name)
-        for name in list(state)
-        if name.startswith(VECTOR_PREFIX)
-    }
-    require_finite(path, vector)
-    return _Contents(
-        state=unpack(state),
-        vector=vector,
-        contract=header[CONTRACT_KEY],
-        architecture=header[ARCHITECTURE_KEY],
-    )
-
-
-def _read_torch(path: Path) -> _Contents:
+def read_torch(path: Path) -> dict[Any, Any]:
+    """Read a dictionary of weights that torch saved; no pickle in it is executed."""
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")  # of file formats; what matters is refused below
@@ -252,15 +224,4 @@ def _read_torch(path: Path) -> _Contents:
             f"{path}: holds a {type(loaded).__name__}, not a dict of weights; "
             "save model.state_dict()"
         )
-    return _Contents(
-        loaded=loaded,
-        contract=_text_or_none(path, loaded, CONTRACT_KEY),
-        architecture=_text_or_none(path, loaded, ARCHITECTURE_KEY),
-    )
-
-
-def _text_or_none(path: Path, loaded: dict[Any, Any], key: str) -> str | None:
-    value = loaded.get(key)
-    if value is None or isinstance(value, str):
-        return value
-    raise CheckpointError(f"{path}: {key!r} must be JSON text, got {type(value).__name__}")
+    return loaded

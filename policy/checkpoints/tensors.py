@@ -1,6 +1,6 @@
 """Files of weights, whatever the network: read, written, and refused by a ``CheckpointError``."""
 
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from pathlib import Path
 
 import torch
@@ -10,7 +10,7 @@ from torch import Tensor, nn
 
 from policy.checkpoints.state_dicts import Shapes, misfits
 from policy.errors import CheckpointError
-from policy.files import open_safetensors
+from policy.files import open_safetensors, whole_file
 
 SCALE = ".int8_scale"
 """After a weight's name: its scales, one an output channel."""
@@ -21,12 +21,10 @@ def write_tensors(path: Path, tensors: Mapping[str, Tensor], header: Mapping[str
     """Write a ``.safetensors`` file; replaces ``path`` at once or not at all."""
     if path.suffix != ".safetensors":
         raise CheckpointError(f"{path}: checkpoints are written as .safetensors; rename it")
-    partial = path.with_name(path.name + ".partial")
     try:
-        save_file(dict(tensors), partial, metadata=dict(header))
-        partial.replace(path)
+        with whole_file(path) as draft:
+            save_file(dict(tensors), draft, metadata=dict(header))
     except (OSError, SafetensorError) as error:
-        partial.unlink(missing_ok=True)
         raise CheckpointError(f"cannot write {path}: {error}") from error
 
 
@@ -52,14 +50,12 @@ def shapes_of(network: nn.Module) -> Shapes:
     return {name: tuple(value.shape) for name, value in network.state_dict().items()}
 
 
-def require_fit(
-    path: Path, policy: nn.Module, state: Mapping[str, Tensor], advise: Callable[[], str]
-) -> None:
+def require_fit(path: Path, policy: nn.Module, state: Mapping[str, Tensor], advice: str) -> None:
     """Name the first weights that do not fit, and what to do; torch's message lists hundreds."""
     if problems := misfits(state, shapes_of(policy)):
         raise CheckpointError(
             f"{path}: does not fit this policy in {len(problems)} places: "
-            f"{'; '.join(problems[:4])}. {advise()}"
+            f"{'; '.join(problems[:4])}. {advice}"
         )
 
 

@@ -13,14 +13,6 @@ from policy.world_model.model import WorldModel
 
 WORLD_MODEL_KEY = "world_model"
 """Key in the header; a policy's file has ``architecture`` instead."""
-_RENAMED = {
-    "foresight.begin.": "motion_predictor.initial_hidden.",
-    "foresight.read.": "motion_predictor.gru.",
-    "foresight.tell.": "motion_predictor.output.",
-    "foresight.usual": "motion_predictor.mean_motion",
-    "carried_view.nearness.": "frame_warp.inverse_depth.",
-}
-"""Prefixes of weights in files of version 0.1, and what they are called now."""
 
 
 def save_world_model(
@@ -30,9 +22,6 @@ def save_world_model(
 
     ``training`` is JSON that says how it was trained, for people and reports. ``half`` stores
     float16, at half the size and some thousandth of rounding.
-
-    Raises:
-        CheckpointError: weights that are not finite as stored, or a path that cannot be written.
     """
     dtype = torch.float16 if half else torch.float32
     state = {
@@ -48,19 +37,11 @@ def save_world_model(
 
 
 def load_world_model(path: Path) -> WorldModel:
-    """Read a world model, in float32 on the CPU and in eval mode.
-
-    Raises:
-        CheckpointError: missing, damaged, of another kind or version, or not finite.
-    """
+    """Read a world model, in float32 on the CPU and in eval mode."""
     if path.suffix != ".safetensors":
         raise CheckpointError(f"{path}: world models are stored as .safetensors")
     require_file(path, (".safetensors",))
-    header, tensors = read_tensors(path)
-    state = {}
-    for name, value in tensors.items():
-        old = next((prefix for prefix in _RENAMED if name.startswith(prefix)), "")
-        state[_RENAMED.get(old, "") + name.removeprefix(old)] = value
+    header, state = read_tensors(path)
     if WORLD_MODEL_KEY not in header or CONTRACT_KEY not in header:
         held = "a policy" if ARCHITECTURE_KEY in header else f"no world model ({sorted(header)})"
         raise CheckpointError(f"{path} holds {held}: name a file of mavbridge train-world-model")
@@ -70,6 +51,6 @@ def load_world_model(path: Path) -> WorldModel:
         model = WorldModel(WorldModelConfig.from_json(header[WORLD_MODEL_KEY], contract))
     except PolicyError as error:
         raise CheckpointError(f"{path}: {error}") from error
-    require_fit(path, model, state, lambda: "Train it again with this version of mavbridge")
+    require_fit(path, model, state, "Train it again with this version of mavbridge")
     model.load_state_dict(state)
     return model.eval()

@@ -50,11 +50,7 @@ STICK_TERMS = ActionTerms()
 
 @dataclass(frozen=True, kw_only=True)
 class FlightData:
-    """One flight; its stamps are of one monotonic clock, and no list of them ever falls.
-
-    Raises:
-        DatasetError: shapes that do not fit, stamps that run backwards, numbers that are not.
-    """
+    """One flight; its stamps are of one monotonic clock, and no list of them ever falls."""
 
     name: str
     """For messages, e.g. its folder."""
@@ -90,7 +86,6 @@ class FlightData:
     """What of its files was skipped, in sentences for the user."""
 
     def __post_init__(self) -> None:
-        """Refuse what would train a net on nonsense."""
         for at, of, width in (
             ("tick_ns", "state", STATE_DIM),
             ("target_ns", "target", ACTION_DIM),
@@ -140,11 +135,7 @@ class FlightData:
 
 
 def common_frame(flights: Sequence[FlightData]) -> StateFrame:
-    """The state frame that all flights share.
-
-    Raises:
-        DatasetError: no flights, or two frames.
-    """
+    """The state frame that all flights share."""
     if not flights:
         raise DatasetError("no flights to learn from: name at least one flight folder")
     first = flights[0]
@@ -158,11 +149,7 @@ def common_frame(flights: Sequence[FlightData]) -> StateFrame:
 
 
 def common_terms(flights: Sequence[FlightData]) -> ActionTerms:
-    """The kind of actions that all flights share, and the largest of their tilts.
-
-    Raises:
-        DatasetError: two kinds, or two thrusts that hover.
-    """
+    """The kind of actions that all flights share, and the largest of their tilts."""
     first = flights[0]
     for flight in flights:
         if flight.terms[:2] != first.terms[:2]:

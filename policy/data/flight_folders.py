@@ -36,11 +36,7 @@ _FRAME_COLUMNS = ("captured_ns",)
 
 
 def find_flights(paths: Sequence[Path]) -> list[Path]:
-    """Each path that is a flight, and the flights directly in each that is a folder of flights.
-
-    Raises:
-        DatasetError: a path that is neither.
-    """
+    """Each path that is a flight, and the flights directly in each that is a folder of flights."""
     if not paths:
         raise DatasetError("no flights to learn from: name at least one flight folder")
     found: list[Path] = []
@@ -87,11 +83,7 @@ def failure_of(folder: Path) -> str | None:
 def leave_out_failed(
     folders: Sequence[Path], *, include_failed: bool
 ) -> tuple[list[Path], str | None]:
-    """The flights to learn from, and a line that says how many were left out, and why.
-
-    Raises:
-        DatasetError: every flight has failed.
-    """
+    """The flights to learn from, and a line that says how many were left out, and why."""
     if include_failed:
         return list(folders), None
     failures = {folder: failure_of(folder) for folder in folders}
@@ -116,9 +108,6 @@ def read_flight(folder: Path) -> FlightData:
 
     The sticks to imitate are ``expert`` where there is such a column; otherwise those that were
     sent; in a flight where nothing was sent (``--readonly``), those of the pilot.
-
-    Raises:
-        DatasetError: not a flight of ours, or damaged, or nobody flew in it.
     """
     name, contract = str(folder), _contract(folder)
     state_frame, terms = (
@@ -192,11 +181,7 @@ def _sent(name: str, ticks: pa.Table, terms: ActionTerms) -> FloatArray:
 
 
 def read_ages(folder: Path) -> Nanoseconds:
-    """Ages of the image that were measured at the ticks of a flight, sorted.
-
-    Raises:
-        DatasetError: not a flight, or no policy looked in it.
-    """
+    """Ages of the image that were measured at the ticks of a flight, sorted."""
     parse_state_frame(str(folder), _contract(folder).get("state_frame"))
     ages = _ages(_read_table(folder, "ticks", ("woke_ns", "feature_captured_ns"), [])[0])
     if not (ages > 0).any():
@@ -205,11 +190,7 @@ def read_ages(folder: Path) -> Nanoseconds:
 
 
 def decode_video(path: Path, numbers: NDArray[np.int64]) -> Iterator[ImageArray]:
-    """Yield the images of these numbers of a flight's video, [H, W, 3] RGB.
-
-    Raises:
-        DatasetError: one of them cannot be decoded, or they are depth.
-    """
+    """Yield the images of these numbers of a flight's video, [H, W, 3] RGB."""
     count = 0
     try:
         for image in decode_images(path, video_parts(path), numbers.tolist()):
@@ -242,11 +223,7 @@ def _contract(folder: Path) -> dict[str, Any]:
 
 
 def _terms(name: str, contract: Mapping[str, Any]) -> ActionTerms:
-    """From the contract of a flight; the first ones were flown by sticks.
-
-    Raises:
-        DatasetError: actions that nothing here learns from.
-    """
+    """From the contract of a flight; the first ones were flown by sticks."""
     action = contract.get("action", "sticks")
     if action not in ("sticks", "rates"):
         raise DatasetError(

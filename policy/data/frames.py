@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from policy.data.flight_data import DatasetError, FlightData, ImageArray
+from policy.files import whole_file
 from policy.preprocess import resize
 
 _SPARE_BYTES = 1 << 30
@@ -75,9 +76,6 @@ def store_frames(
 
     It has a file of images of ``size`` pixels a side for each flight, named by the content of its
     video and the size. ``progress`` is called with the fraction done.
-
-    Raises:
-        DatasetError: no image in a flight, or no room on the disk.
     """
     try:
         folder.mkdir(parents=True, exist_ok=True)
@@ -116,15 +114,9 @@ def _decode(path: Path, flight: FlightData, size: int) -> None:
 
     Written, not mapped: a disk that fills up under a map would kill the process.
     """
-    partial = path.with_suffix(".partial")
-    count = 0
-    try:
-        with partial.open("wb") as file:
+    with whole_file(path) as draft:
+        with draft.open("wb") as file:
             for image in islice(flight.decode(), len(flight.captured_ns)):
                 file.write(np.ascontiguousarray(resize(image, size, size)).data)
-                count += 1
-        if count == 0:
+        if draft.stat().st_size == 0:
             raise DatasetError(f"{flight.name}: no frame of its video can be read")
-        partial.replace(path)
-    finally:
-        partial.unlink(missing_ok=True)

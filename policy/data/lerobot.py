@@ -45,9 +45,6 @@ def read_dataset(folder: Path, camera_key: str | None = None) -> list[FlightData
     are of its ``timestamp``. A LeRobot dataset does not say how old an image was when a policy
     acted on it: ``age_ns`` is empty. ``camera_key`` is the feature with the images, by default the
     only one.
-
-    Raises:
-        DatasetError: another version, other features, or damaged; the message says what to do.
     """
     info = _read_info(folder, camera_key)
     rows = _read_episodes(info)

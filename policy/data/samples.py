@@ -92,9 +92,6 @@ class Timeline:
         """Lay out the flights in the order in which their images are counted.
 
         An image's age in a sample is drawn from ``ages_ns``, which are sorted.
-
-        Raises:
-            DatasetError: not one image has a tick at any such age.
         """
         self.contract = contract
         self.by_rates = contract.action == "rates"

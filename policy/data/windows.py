@@ -74,9 +74,6 @@ def find_windows(
     """Every run of ``context_frames + frames`` frames, ``frame_dt_s`` apart, of one flight.
 
     No window crosses a gap: each of its frames is near its place, and has a state.
-
-    Raises:
-        DatasetError: there is none.
     """
     dt_ns = round(frame_dt_s * NS_PER_S)
     states, sent, windows, first = [], [], [], 0

@@ -29,12 +29,7 @@ Candidate = tuple[str, Callable[[], Executable]]
 def choose_executable(
     policy: SingleRatePolicy, engine: EngineName, settings: ExecutionSettings
 ) -> tuple[Executable, tuple[str, ...]]:
-    """The executable and lines for a person: the engine, and why faster ones were passed over.
-
-    Raises:
-        PolicyError: the engine asked for is absent here or does not serve this policy or device;
-            or the policy itself failed.
-    """
+    """The executable and lines for a person: the engine, and why faster ones were passed over."""
     modules = modules_of(policy)
     for module in modules:
         module.eval()  # before any engine looks: a flight trains nothing
@@ -61,11 +56,7 @@ def choose_executable(
 def first_that_agrees(
     policy: SingleRatePolicy, candidates: list[Candidate], settings: ExecutionSettings
 ) -> tuple[Executable, tuple[str, ...]]:
-    """The first candidate that passes the check, or torch, with a line for each one passed over.
-
-    Raises:
-        PolicyError: the policy fails on torch itself.
-    """
+    """The first candidate that passes the check, or torch, with a line for each one passed over."""
     notes: list[str] = []
     if candidates:
         on_cpu = replace(settings, vision_device="cpu", action_device="cpu")

@@ -6,11 +6,7 @@ CPU = "cpu"
 
 
 def require_devices(*wanted: str) -> None:
-    """Refuse a device that is not here; torch is imported only to look for another than the CPU.
-
-    Raises:
-        PolicyError: with what is available, and why nothing else is.
-    """
+    """Refuse a device that is not here; torch is imported only to look for another than the CPU."""
     others = sorted({*wanted} - {CPU})
     if not others:
         return

@@ -49,9 +49,6 @@ def make_executable(
     """Compile a policy's methods for the loops and try them on a dummy sample.
 
     ``vision`` encodes images and ``action`` samples chunks: one policy, perhaps on two devices.
-
-    Raises:
-        PolicyError: no fast path where one was asked for, or the policy failed on the sample.
     """
     contract, steps = action.contract, settings.num_diffusion_steps
     rest = ((1, *contract.state_shape), (1, contract.history_len, ACTION_DIM))
@@ -82,11 +79,7 @@ def encoders(vision: DualRatePolicy) -> list[Callable[..., Any]]:
 
 
 def make_numpy_executable(policy: SingleRatePolicy, settings: ExecutionSettings) -> Executable:
-    """Wrap a numpy policy for the loops; tried once.
-
-    Raises:
-        PolicyError: no fast path where one was asked for, or it failed on a dummy sample.
-    """
+    """Wrap a numpy policy for the loops; tried once."""
 
     def compile_(method: Callable[..., Any], _shapes: Sequence[Shape]) -> ArrayFunction:
         def run(*arrays: FloatArray) -> FloatArray:
@@ -116,9 +109,6 @@ def assemble(
 
     ``encode`` has a function for each camera, which takes a normalised image [1, 3, H, W]; without
     a fast path it is empty. ``act`` is that of ``Executable``.
-
-    Raises:
-        PolicyError: a function failed on the sample, or returned the wrong shape or no numbers.
     """
 
     def encode_image(image: CameraImage, camera: int = 0, /) -> FloatArray:

@@ -5,8 +5,10 @@ Threads are not pinned to cores: measured beside a second loop, pinning was slow
 difference.
 """
 
+import contextlib
 import hashlib
 import io
+import os
 from collections.abc import Callable
 from pathlib import Path
 
@@ -15,10 +17,67 @@ import openvino as ov
 import torch
 
 from policy.contract import FloatArray
-from policy.engines.compile_cache import CompileCache, user_cache_folder
 from policy.engines.executable import Precision
 from policy.engines.signal_stack import signal_stack_kept
 from policy.errors import PolicyError
+from policy.files import whole_file
+
+MAX_ENTRIES = 24
+"""Files kept, about eight policies of two graphs each, some at two precisions; the least recently
+used is dropped first."""
+MAX_BYTES = 2_000_000_000
+"""Size of all files together: the graphs of a large policy are as large as its weights."""
+_DIGEST_BYTES = hashlib.sha256().digest_size
+
+
+def user_cache_folder() -> Path:
+    """XDG base directory specification: $XDG_CACHE_HOME or ~/.cache; an own folder in it."""
+    base = os.environ.get("XDG_CACHE_HOME", "")
+    # The specification says to ignore a relative path.
+    root = Path(base) if Path(base).is_absolute() else Path("~/.cache").expanduser()
+    return root / "mavbridge"
+
+
+class CompileCache:
+    """Bytes by key, in one folder of a file each."""
+
+    def __init__(self, folder: Path) -> None:
+        self._folder = folder
+
+    def load(self, key: str) -> bytes | None:
+        """The bytes stored under ``key``; None if there are none, or they are damaged."""
+        path = self._path(key)
+        try:
+            content = path.read_bytes()
+            path.touch()
+        except OSError:
+            return None
+        digest, blob = content[:_DIGEST_BYTES], content[_DIGEST_BYTES:]
+        return blob if hashlib.sha256(blob).digest() == digest else None
+
+    def store(self, key: str, blob: bytes) -> None:
+        """Keep ``blob`` if possible; the oldest beyond ``MAX_ENTRIES`` or ``MAX_BYTES`` go."""
+        with contextlib.suppress(OSError):
+            self._folder.mkdir(parents=True, exist_ok=True)
+            with whole_file(self._path(key)) as draft:
+                draft.write_bytes(hashlib.sha256(blob).digest() + blob)
+            self._make_room()
+
+    def _path(self, key: str) -> Path:
+        return self._folder / f"{hashlib.sha256(key.encode()).hexdigest()}.graph"
+
+    def _make_room(self) -> None:
+        entries = []
+        for path in self._folder.glob("*.graph*"):  # leftovers of a killed process count too
+            with contextlib.suppress(FileNotFoundError):  # another process made room
+                stat = path.stat()
+                entries.append((stat.st_mtime_ns, path, stat.st_size))
+        total = 0
+        for place, (_, path, size) in enumerate(sorted(entries, reverse=True)):
+            total += size
+            if place >= MAX_ENTRIES or total > MAX_BYTES:
+                path.unlink(missing_ok=True)
+
 
 NAME = "openvino"
 DEVICE = "CPU"

@@ -13,8 +13,8 @@ from policy.engines.executable import (
 from policy.engines.openvino_compile import GraphCompiler, engine_name
 from policy.engines.openvino_graph import denoise_graph, step_inputs, vision_graph
 from policy.engines.openvino_modules import ModuleConverter, make_module_executable
-from policy.engines.segments import Segment, sample_in_segments, to_numpy
 from policy.engines.signal_stack import signal_stack_kept
+from policy.engines.stepwise import Segment, sample_in_segments, to_numpy
 from policy.nets.resnet_unet import ResnetUnet
 from policy.nets.toge import Toge
 from policy.preprocess import egocentric

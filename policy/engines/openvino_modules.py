@@ -7,11 +7,8 @@ and it tells the size and the content of the graph before any time is spent on i
 """
 
 import hashlib
-import logging
 import re
-import warnings
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
 from typing import Any
 
 import openvino as ov
@@ -29,6 +26,7 @@ from policy.engines.executable import (
 )
 from policy.engines.kept import modules_of
 from policy.engines.openvino_compile import GraphCompiler, engine_name
+from policy.engines.openvino_graph import Traceable, quiet
 from policy.engines.signal_stack import signal_stack_kept
 from policy.engines.stepwise import make_stepwise_executable
 from policy.engines.torch_eager import run_eagerly
@@ -74,11 +72,7 @@ def make_module_executable(
 
 
 class ModuleConverter:
-    """Converts functions of a policy; a graph that is needed at two precisions, only once.
-
-    Raises:
-        PolicyError: the policy holds no modules.
-    """
+    """Converts functions of a policy; a graph that is needed at two precisions, only once."""
 
     def __init__(self, policy: object, name: str) -> None:
         self._modules = nn.ModuleList(modules_of(policy)).eval()
@@ -97,15 +91,10 @@ class ModuleConverter:
     def compile(
         self, function: Callable[..., Any], shapes: Sequence[Shape], precision: Precision
     ) -> ArrayFunction:
-        """``function`` of float32 tensors of these shapes, compiled or from the user's cache.
-
-        Raises:
-            PolicyError: it decides by a tensor's values, has an operation that cannot be
-                converted, or is too large.
-        """
-        module = _Traceable(self._modules, function).eval()
+        """``function`` of float32 tensors of these shapes, compiled or from the user's cache."""
+        module = Traceable(self._modules, lambda *a: _float_tensor(function(*a))).eval()
         examples = tuple(torch.zeros(shape) for shape in shapes)
-        with user_code(f"{self._name} cannot be converted"), _quiet(), torch.no_grad():
+        with user_code(f"{self._name} cannot be converted"), quiet(), torch.no_grad():
             if self._is_script:
                 digest = _digest_of_script(module, examples)
             else:
@@ -121,37 +110,10 @@ class ModuleConverter:
             return GraphCompiler(digest).compile("module", precision, build)
 
 
-class _Traceable(nn.Module):
-    """A function of tensors as a module, with the modules whose weights it uses."""
-
-    def __init__(self, modules: nn.ModuleList, function: Callable[..., Any]) -> None:
-        super().__init__()
-        self.modules_of_policy = modules
-        self.function = function
-
-    def forward(self, *arrays: Tensor) -> Tensor:
-        result = self.function(*arrays)
-        if not isinstance(result, Tensor):
-            raise PolicyError(f"it returns {type(result).__name__}, not a tensor")
-        return result.float()
-
-
-@contextmanager
-def _quiet() -> Iterator[None]:
-    """Keep tracer and converter from writing to the terminal, and from muting others for good."""
-    level, disabled = logging.root.level, logging.root.manager.disable
-    fast_path = torch.backends.mha.get_fastpath_enabled()
-    try:
-        logging.disable(logging.CRITICAL)
-        # The fused layer of torch's own transformers is an operation that no converter knows.
-        torch.backends.mha.set_fastpath_enabled(False)
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore")
-            yield
-    finally:
-        torch.backends.mha.set_fastpath_enabled(fast_path)
-        logging.disable(disabled)
-        logging.root.setLevel(level)
+def _float_tensor(result: object) -> Tensor:
+    if not isinstance(result, Tensor):
+        raise PolicyError(f"it returns {type(result).__name__}, not a tensor")
+    return result.float()
 
 
 def _exported(module: nn.Module, examples: tuple[Tensor, ...]) -> ExportedProgram:
@@ -207,11 +169,7 @@ def _tensors(program: ExportedProgram) -> Iterator[tuple[str, Tensor, int]]:
 
 
 def _digest_of_script(module: nn.Module, examples: tuple[Tensor, ...]) -> str:
-    """As ``_digest`` of a module that calls TorchScript.
-
-    Raises:
-        PolicyError: it is too large to be converted.
-    """
+    """As ``_digest`` of a module that calls TorchScript."""
     graph = _traced(module, examples).inlined_graph
     operations = sum(1 for _ in graph.nodes())
     if operations > MAX_SCRIPT_OPERATIONS:

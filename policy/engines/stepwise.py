@@ -1,6 +1,6 @@
 """A diffusion policy whose network is compiled alone: the solver runs around it, in numpy."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import numpy as np
@@ -14,9 +14,34 @@ from policy.engines.executable import (
     assemble,
     encoders,
 )
-from policy.engines.segments import Segment, to_numpy
 from policy.errors import user_code
 from policy.protocol import Executable, StepwisePolicy
+
+Segment = Callable[[FloatArray, FloatArray, FloatArray, FloatArray], FloatArray]
+"""(encoded image, state, history, noisy chunk [1, horizon, 4]) -> less noisy chunk."""
+
+
+def sample_in_segments(
+    noise: FloatArray, segment: Callable[[int, int], Segment], steps: int, at_once: int
+) -> Callable[[FloatArray, FloatArray, FloatArray], FloatArray]:
+    """(encoded image, state, history) -> chunk [1, horizon, 4], by ``steps`` from ``noise`` on.
+
+    ``segment`` makes the function that runs (first, at most ``at_once``) steps.
+    """
+    segments = [segment(first, min(at_once, steps - first)) for first in range(0, steps, at_once)]
+
+    def sample(encoded: FloatArray, state: FloatArray, history: FloatArray) -> FloatArray:
+        noisy = noise
+        for run in segments:
+            noisy = run(encoded, state, history, noisy)
+        return noisy
+
+    return sample
+
+
+def to_numpy(array: Any) -> FloatArray:
+    """A float32 copy of an array of any kind, on any device."""
+    return np.array(array.cpu().numpy() if hasattr(array, "cpu") else array, np.float32)
 
 
 def make_stepwise_executable(
@@ -28,11 +53,7 @@ def make_stepwise_executable(
     engine: str,
     settings: ExecutionSettings,
 ) -> Executable:
-    """As ``executable.make_executable``; ``compile_end`` is for ``to_chunk``, the end of a solve.
-
-    Raises:
-        PolicyError: the policy failed on the dummy sample.
-    """
+    """``executable.make_executable``; ``compile_end`` is for ``to_chunk``, the end of a solve."""
     contract = policy.contract
     image = ((1, *contract.image_shape[-3:]),)
     encode = [compile_vision(method, image) for method in encoders(policy)]

@@ -27,9 +27,6 @@ def make_torch_executable(policy: SingleRatePolicy, settings: ExecutionSettings)
 
     A module is moved to the action device, and copied to the vision device where that is another
     one. In dual rate torch is told to use one thread an operator, in the whole process.
-
-    Raises:
-        PolicyError: no fast path, or the policy failed on a dummy sample.
     """
     if settings.dual_rate:
         torch.set_num_threads(1)  # two loops infer at once: one core each, no pool to fight over

@@ -3,8 +3,8 @@
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from policy.adapters.user_class import FORMS
 from policy.errors import PolicyError
-from policy.foreign.user_class import FORMS
 from policy.loading.request import PolicyRequest, default_contract
 from policy.nets.names import BACKBONE_NAMES, SIZE_NAMES, BackboneName, Size
 
@@ -19,11 +19,7 @@ BUILTIN_KINDS = ("toge", "toge-rates", "resnet-unet")
 
 
 def builtin_config(spec: str, *, image_size: int) -> "BuiltinConfig":
-    """The built-in network that ``spec`` names, with the default contract at that image size.
-
-    Raises:
-        PolicyError: it names none.
-    """
+    """The built-in network that ``spec`` names, with the default contract at that image size."""
     kind, *options = spec.split(":")
     if kind not in BUILTIN_KINDS:
         raise PolicyError(
@@ -101,7 +97,7 @@ def _trained(
     if checkpoint.suffix != ".safetensors":
         contract, schedule = policy.contract, policy.config.schedule
         notes.append(
-            f"warning: {checkpoint} may hold no contract; it is flown with frame "
+            f"warning: {checkpoint} holds no contract; it is flown with frame "
             f"{contract.state_frame}, image {contract.image_width}x{contract.image_height}, "
             f"chunk of {contract.horizon} every {contract.chunk_dt_s:g} s, history of "
             f"{contract.history_len} every {contract.history_dt_s:g} s, prediction of the "

@@ -15,103 +15,93 @@
 torch is imported only where a policy needs it.
 """
 
+import inspect
 from collections.abc import Callable
-from contextlib import suppress
+from contextlib import ExitStack, suppress
 from dataclasses import replace
 from pathlib import Path
 
+from policy.adapters.description import Description, read_description
+from policy.adapters.lerobot.plan import Plan, read_plan
+from policy.adapters.onnx.files import OnnxFiles, find_onnx_files
+from policy.adapters.user_class import check_user_class, load_user_class
+from policy.adapters.websocket.kind import SCHEMES, check_server, load_server_policy
+from policy.checkpoints.detect import detect
 from policy.checkpoints.header import read_contract
-from policy.checkpoints.what_file import recognise
 from policy.contract import Contract
 from policy.engines.devices import require_devices
 from policy.engines.executable import ExecutionSettings, make_numpy_executable
-from policy.errors import PolicyError
+from policy.errors import PolicyError, user_code
 from policy.files import user_path
-from policy.foreign.user_class import check_user_class, load_user_class
-from policy.foreign.websocket.kind import SCHEMES, check_server, load_server_policy
 from policy.loading.builtin import BUILTIN_KINDS, builtin_checkpoint, load_builtin, parse_builtin
-from policy.loading.exported import (
-    ONNX,
-    TORCHSCRIPT,
-    check_onnx,
-    check_torchscript,
-    load_archive,
-    load_onnx,
-)
-from policy.loading.lerobot import LEROBOT, check_lerobot, load_lerobot
-from policy.loading.life import life_method
 from policy.loading.request import LoadedPolicy, PolicyRequest, default_contract
 from policy.loading.timing import measure_times
-from policy.protocol import (
-    DualRatePolicy,
-    Executable,
-    SingleRatePolicy,
-    keep_nothing,
-)
-from policy.scripted.spec import IN_AIR, make_scripted
+from policy.protocol import DualRatePolicy, Executable, SingleRatePolicy, keep_nothing
+from policy.scripted.policy import IN_AIR, ScriptedPolicy, make_scripted
 from policy.stick_loop import by_rates, flown_by_rates
 
+LEROBOT, ONNX, TORCHSCRIPT = "lerobot", "onnx", "torchscript"
+FORMS = {LEROBOT: "lerobot:DIR", ONNX: "onnx:DIR or onnx:FILE", TORCHSCRIPT: "torchscript:FILE.pt"}
+"""Forms of the kinds that are read from files of other programs."""
+_WHEN = {"reset": "when a flight begins", "close": "when it is not needed any more"}
 
-def check_request(request: PolicyRequest) -> None:
+
+def check_request(request: PolicyRequest) -> Contract | None:
     """Refuse what can be refused in milliseconds: before weights, torch or a user's code is loaded.
 
     That is the spec, the checkpoint's file and contract, the image size, and the device. Only to
     look for a device other than the CPU is torch imported.
+
+    Returns:
+        The policy's contract, where files say it.
 
     Raises:
         PolicyError: with what was wrong, what was available and what to do.
     """
     kind, *options = request.spec.split(":")
     _require_flags_of_kind(kind, request)
-    if request.by_rates and kind not in BUILTIN_KINDS:
-        raise PolicyError(
-            f"--by-rates is for {' and '.join(BUILTIN_KINDS)}, whose sticks are known to the "
-            f"degree: {request.spec} flies by what its contract says"
-        )
+    contract: Contract | None = None
     if kind == "scripted":
-        _scripted(options, request, lambda: 0.0)
+        contract = _scripted(options, request, lambda: 0.0).contract
     elif kind in BUILTIN_KINDS:
         parse_builtin(kind, options)
         default_contract(request.image_size)
-        checkpoint = builtin_checkpoint(request)
-        if checkpoint is not None and (contract := read_contract(checkpoint)) is not None:
-            _require_image_size(contract, request.image_size)
+        if (checkpoint := builtin_checkpoint(request)) is not None:
+            contract = read_contract(checkpoint)
     elif kind == LEROBOT:
-        check_lerobot(request)
+        contract = _plan(request).interface.contract
     elif kind in SCHEMES:
         check_server(request.spec, request.contract_file, request.checkpoint)
     elif kind == ONNX:
-        _require_image_size(check_onnx(request).description.interface.contract, request.image_size)
+        contract = _onnx_files(request).description.interface.contract
     elif kind == TORCHSCRIPT:
-        _require_image_size(check_torchscript(request).interface.contract, request.image_size)
+        contract = _archive(request).interface.contract
     else:
         _require_no_path(request.spec)
         check_user_class(request.spec)
-    _require_devices(request)
+    if contract is not None:
+        _require_image_size(contract, request.image_size)
+    require_devices(
+        request.vision_device or request.device, request.action_device or request.device
+    )
+    return contract
 
 
 def read_policy_contract(request: PolicyRequest) -> Contract:
-    """Contract of a policy; a network of ours is not loaded for it.
+    """Return the contract of a policy; a network of ours is not loaded for it.
 
     Raises:
         PolicyError: as ``check_request``; or a user's class cannot be made.
     """
-    check_request(request)
-    kind = request.spec.partition(":")[0]
-    if kind == LEROBOT:
-        return check_lerobot(request).interface.contract
-    if kind == ONNX:
-        return check_onnx(request).description.interface.contract
-    if kind == TORCHSCRIPT:
-        return check_torchscript(request).interface.contract
-    if kind not in BUILTIN_KINDS:
+    contract = check_request(request)
+    if request.spec.partition(":")[0] in BUILTIN_KINDS:
+        contract = contract or default_contract(request.image_size)
+        return by_rates(contract) if request.by_rates else contract
+    if contract is None:
         policy, _ = _find(request, lambda: 0.0)
-        life_method(policy, "close", request.spec)()
-        return policy.contract
-    checkpoint = builtin_checkpoint(request)
-    contract = None if checkpoint is None else read_contract(checkpoint)
-    contract = contract or default_contract(request.image_size)
-    return by_rates(contract) if request.by_rates else contract
+        _life_method(policy, "close", request.spec)()
+        contract = policy.contract
+    return contract
 
 
 def load_policy(request: PolicyRequest, *, now_s: Callable[[], float]) -> LoadedPolicy:
@@ -124,7 +114,7 @@ def load_policy(request: PolicyRequest, *, now_s: Callable[[], float]) -> Loaded
     """
     check_request(request)
     policy, notes = _find(request, now_s)
-    reset, close = (life_method(policy, name, request.spec) for name in ("reset", "close"))
+    reset, close = (_life_method(policy, name, request.spec) for name in ("reset", "close"))
     try:
         executable, engine_notes = _on_engine(policy, request, notes)
         if executable.reset is keep_nothing:  # an engine that keeps the state has its own
@@ -151,7 +141,6 @@ def _on_engine(
             "flies in single-rate mode, the whole network for every action (--single-rate: as "
             "intended)"
         )
-    is_ours = request.spec.partition(":")[0] in BUILTIN_KINDS
     settings = ExecutionSettings(
         name=request.spec,
         vision_device=request.vision_device or request.device,
@@ -159,37 +148,9 @@ def _on_engine(
         num_diffusion_steps=request.num_diffusion_steps,
         dual_rate=dual_rate,
     )
-    executable, engine_notes = _executable(policy, request, settings)
-    if is_ours and (request.by_rates or policy.contract.action == "rates"):
-        executable = flown_by_rates(executable)
-    return executable, engine_notes
-
-
-def _find(request: PolicyRequest, now_s: Callable[[], float]) -> tuple[SingleRatePolicy, list[str]]:
-    kind, *options = request.spec.split(":")
-    if kind == "scripted":
-        note = f"{request.spec}: flies a fixed program, the camera is not looked at"
-        return _scripted(options, request, now_s), [note]
-    if kind == LEROBOT:
-        return load_lerobot(request)
-    if kind in SCHEMES:
-        return load_server_policy(request.spec, request.contract_file)
+    kind = request.spec.partition(":")[0]
     if kind == ONNX:
-        return load_onnx(request)
-    if kind == TORCHSCRIPT:
-        return load_archive(request)
-    if kind not in BUILTIN_KINDS:
-        policy = load_user_class(request.spec, request.checkpoint, seed=request.seed)
-        return policy, [f"{request.spec}: a class of yours"]
-    return load_builtin(request)
-
-
-def _executable(
-    policy: SingleRatePolicy, request: PolicyRequest, settings: ExecutionSettings
-) -> tuple[Executable, tuple[str, ...]]:
-    """An engine that takes the policy's kind of arrays, and notes about the choice."""
-    if request.spec.partition(":")[0] == ONNX:
-        from policy.foreign.onnx.policies import OnnxPolicy, choose_precision
+        from policy.adapters.onnx.policies import OnnxPolicy, choose_precision
 
         if isinstance(policy, OnnxPolicy):
             return choose_precision(policy, settings)
@@ -202,12 +163,75 @@ def _executable(
         return make_numpy_executable(policy, settings), ()
     from policy.engines.choose import choose_executable
 
-    return choose_executable(policy, request.engine, settings)
+    executable, engine_notes = choose_executable(policy, request.engine, settings)
+    if kind in BUILTIN_KINDS and (request.by_rates or policy.contract.action == "rates"):
+        executable = flown_by_rates(executable)
+    return executable, engine_notes
+
+
+def _find(request: PolicyRequest, now_s: Callable[[], float]) -> tuple[SingleRatePolicy, list[str]]:
+    """Make the policy, and notes for the user."""
+    kind, *options = request.spec.split(":")
+    if kind == "scripted":
+        note = f"{request.spec}: flies a fixed program, the camera is not looked at"
+        return _scripted(options, request, now_s), [note]
+    if kind in BUILTIN_KINDS:
+        return load_builtin(request)
+    if kind in SCHEMES:
+        return load_server_policy(request.spec, request.contract_file)
+    if kind == LEROBOT:
+        from policy.adapters.lerobot.policy import load_policy_of
+
+        steps = request.num_diffusion_steps
+        return load_policy_of(_plan(request), seed=request.seed, num_diffusion_steps=steps)
+    if kind == ONNX:
+        from policy.adapters.onnx.policies import OnnxGraphs
+
+        graphs = OnnxGraphs(_onnx_files(request), request.seed)
+        return graphs.at("f32", "f32"), [graphs.describe(request.num_diffusion_steps)]
+    if kind == TORCHSCRIPT:
+        from policy.adapters.modules import load_torchscript
+
+        path = _path(request)
+        policy = load_torchscript(request.spec, path, _archive(request), request.seed)
+        return policy, [f"TorchScript archive {path}"]
+    policy = load_user_class(request.spec, request.checkpoint, seed=request.seed)
+    return policy, [f"{request.spec}: a class of yours"]
+
+
+def _path(request: PolicyRequest) -> Path:
+    kind, _, path = request.spec.partition(":")
+    if not path or request.checkpoint is not None:
+        form = FORMS[kind]
+        raise PolicyError(f"--policy {request.spec}: write {form}, and leave out --checkpoint")
+    return user_path(path)
+
+
+def _plan(request: PolicyRequest) -> Plan:
+    return read_plan(_path(request), request.contract_file)
+
+
+def _onnx_files(request: PolicyRequest) -> OnnxFiles:
+    path = _path(request)
+    devices = {request.vision_device or request.device, request.action_device or request.device}
+    if request.engine not in ("auto", "openvino") or devices != {"cpu"}:
+        raise PolicyError(
+            f"--policy {request.spec} runs through OpenVINO on the CPU: leave out --engine and "
+            "--device"
+        )
+    return find_onnx_files(request.spec, path, request.contract_file)
+
+
+def _archive(request: PolicyRequest) -> Description:
+    path = _path(request)
+    if not path.is_file():
+        raise PolicyError(f"--policy {request.spec}: there is no file {path}")
+    return read_description(request.spec, path, request.contract_file)
 
 
 def _scripted(
     options: list[str], request: PolicyRequest, now_s: Callable[[], float]
-) -> SingleRatePolicy:
+) -> ScriptedPolicy:
     if request.checkpoint is not None:
         raise PolicyError(
             f"scripted policies have no weights: leave out --checkpoint {request.checkpoint}"
@@ -218,11 +242,48 @@ def _scripted(
     return make_scripted(options, now_s, contract=contract)
 
 
+def _life_method(policy: SingleRatePolicy, name: str, spec: str) -> Callable[[], None]:
+    """The policy's own ``reset`` or ``close``, ready to call; a no-op if it has none."""
+    method: object = getattr(policy, name, None)
+    if method is None:
+        return keep_nothing
+    if not callable(method):
+        raise PolicyError(
+            f"--policy {spec}: {name} must be a method without arguments, which is called "
+            f"{_WHEN[name]}; it is {method!r}"
+        )
+    try:
+        inspect.signature(method).bind()
+    except (TypeError, ValueError) as error:
+        raise PolicyError(
+            f"--policy {spec}: {name} is called without arguments {_WHEN[name]}, and cannot be: "
+            f"{error}; give its parameters defaults, or give it another name"
+        ) from error
+    with_torch = policy.contract.arrays == "torch"
+
+    def call() -> None:
+        with ExitStack() as stack:
+            stack.enter_context(user_code(f"{spec} failed to {name}"))
+            if with_torch:
+                import torch
+
+                # As chunks are computed: torch refuses to change their tensors in place elsewhere.
+                stack.enter_context(torch.inference_mode())
+            method()
+
+    return call
+
+
 def _require_flags_of_kind(kind: str, request: PolicyRequest) -> None:
-    """Refuse a contract file where it has no use, and a file of another kind than was named."""
-    if kind in (LEROBOT, ONNX, TORCHSCRIPT):
+    """Refuse flags where they have no use, and a file of another kind than was named."""
+    if request.by_rates and kind not in BUILTIN_KINDS:
+        raise PolicyError(
+            f"--by-rates is for {' and '.join(BUILTIN_KINDS)}, whose sticks are known to the "
+            f"degree: {request.spec} flies by what its contract says"
+        )
+    if kind in FORMS:
         path = user_path(request.spec.partition(":")[2])
-        sentence = recognise(path) if path.is_file() else None
+        sentence = detect(path) if path.is_file() else None
         own = tuple(f"--policy {kind}:{each}" for each in (path, path.parent))
         if sentence is not None and not sentence.endswith(own):
             raise PolicyError(f"--policy {request.spec}: {sentence}")
@@ -240,7 +301,7 @@ def _require_no_path(spec: str) -> None:
         return
     if path.exists():
         advice = f"{spec} is a file: give weights of ours as --checkpoint {spec}"
-        raise PolicyError(f"--policy {recognise(path) or advice}")
+        raise PolicyError(f"--policy {detect(path) or advice}")
     if path.name != spec:
         raise PolicyError(
             f"--policy {spec}: there is no such file or folder; a model of the Hugging Face hub is "
@@ -256,9 +317,3 @@ def _require_image_size(contract: Contract, image_size: int | None) -> None:
             f"--image-size {image_size} contradicts the policy's contract, which takes "
             f"{height}x{width}: leave the flag out"
         )
-
-
-def _require_devices(request: PolicyRequest) -> None:
-    require_devices(
-        request.vision_device or request.device, request.action_device or request.device
-    )

@@ -20,7 +20,7 @@ class PolicyRequest:
     """Weights; a user's class gets them as ``Class(checkpoint=path)``. Without any, ``toge`` takes
     the shipped ones."""
     contract_file: Path | None = None
-    """What the files of a policy that was trained elsewhere do not say: ``foreign.interface``."""
+    """What the files of a policy that was trained elsewhere do not say: ``adapters.interface``."""
     allow_untrained: bool = False
     """Accept seeded random weights where there is no checkpoint."""
     engine: EngineName = "auto"

@@ -7,7 +7,7 @@ from torch import Tensor, nn
 
 from policy.contract import ACTION_DIM, Contract
 from policy.errors import PolicyError
-from policy.nets.diffusion import NoiseSchedule, ddim_solve
+from policy.nets.diffusion import NoiseSchedule, ddim_solve, flight_noise
 from policy.nets.names import SIZE_NAMES, Size
 from policy.nets.unet1d import UNet1d
 
@@ -27,9 +27,6 @@ def size_dims(size: Size) -> SizeDims:
 
     On a CPU every diffusion step reads all weights once: 100 Hz with 10 steps leaves room for about
     3 million of them on one core.
-
-    Raises:
-        PolicyError: the size is unknown.
     """
     match size:
         case "small":
@@ -73,9 +70,8 @@ class DiffusionHead(nn.Module):
         self.seed_noise(0)
 
     def seed_noise(self, seed: int) -> None:
-        """Draw the initial noise of a flight, the same for the same seed on every device."""
-        generator = torch.Generator().manual_seed(seed)
-        self.initial_noise.copy_(torch.randn(self.initial_noise.shape, generator=generator))
+        """Draw the initial noise of a flight."""
+        self.initial_noise.copy_(flight_noise(seed, self.initial_noise.shape[1]))
 
     def denoise(self, noisy: Tensor, timestep: Tensor, condition: Tensor) -> Tensor:
         """One network call: [B, horizon, 4], [B] int64, [B, C] -> the schedule's prediction."""

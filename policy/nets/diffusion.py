@@ -20,7 +20,7 @@ from typing import Any, Literal, TypeVar
 import torch
 from torch import Tensor
 
-from policy.contract import FloatArray
+from policy.contract import ACTION_DIM, FloatArray
 from policy.errors import PolicyError
 
 BetaSchedule = Literal["squared_cosine", "linear"]
@@ -48,11 +48,7 @@ class DdimStep:
 
 @dataclass(frozen=True, kw_only=True)
 class NoiseSchedule:
-    """The noise schedule of training, and which quantity the net was trained to predict.
-
-    Raises:
-        PolicyError: a field is out of its range.
-    """
+    """The noise schedule of training, and which quantity the net was trained to predict."""
 
     num_train_timesteps: int = TRAIN_TIMESTEPS
     betas: BetaSchedule = "squared_cosine"
@@ -61,7 +57,6 @@ class NoiseSchedule:
     is divided by sqrt(a_t), which is 5e-4 at t = 99: with few steps ``sample`` is the safer one."""
 
     def __post_init__(self) -> None:
-        """Refuse a value that has no schedule."""
         if not (
             isinstance(self.num_train_timesteps, int) and 1 <= self.num_train_timesteps <= 1000
         ):
@@ -84,9 +79,6 @@ class NoiseSchedule:
 
         Timesteps are spaced evenly and end at the noisiest one ("trailing", Lin et al. 2024), so
         that every count starts from pure noise, and count 1 is the net's x_0 of pure noise.
-
-        Raises:
-            PolicyError: count is not in 1..num_train_timesteps.
         """
         total = self.num_train_timesteps
         if not isinstance(count, int) or isinstance(count, bool) or not 1 <= count <= total:
@@ -97,11 +89,7 @@ class NoiseSchedule:
         return _ddim_steps(total, self.betas, count)
 
     def add_noise(self, clean: Tensor, noise: Tensor, timestep: Tensor) -> Tensor:
-        """Forward process, for training: clean [B, ...] and standard normal noise -> noisy.
-
-        Raises:
-            PolicyError: shapes do not fit, or a timestep [B] is not in 0..num_train_timesteps-1.
-        """
+        """Forward process, for training: clean [B, ...] and standard normal noise -> noisy."""
         if clean.shape != noise.shape or timestep.shape != clean.shape[:1]:
             raise PolicyError(
                 f"add_noise needs clean and noise of one shape and a timestep per sample, got "
@@ -140,6 +128,11 @@ class NoiseSchedule:
         return after
 
 
+def flight_noise(seed: int, steps: int) -> Tensor:
+    """Noise [1, steps, 4] that the solves of a flight start from: the same on every device."""
+    return torch.randn(1, steps, ACTION_DIM, generator=torch.Generator().manual_seed(seed))
+
+
 def ddim_solve(
     schedule: NoiseSchedule,
     steps: Sequence[DdimStep],
@@ -162,13 +155,14 @@ def _signal_power(total: int, betas: BetaSchedule) -> tuple[float, ...]:
             # 1e-4..0.02 is made for 1000 steps; the same noise in fewer steps needs larger ones.
             beta = (1e-4 + (0.02 - 1e-4) * t / max(total - 1, 1)) * 1000 / total
         else:
-            beta = 1 - _cosine_power((t + 1) / total) / _cosine_power(t / total)
+            beta = 1 - cosine_power((t + 1) / total) / cosine_power(t / total)
         power *= 1 - min(beta, 0.999)
         powers.append(power)
     return tuple(powers)
 
 
-def _cosine_power(fraction: float) -> float:
+def cosine_power(fraction: float) -> float:
+    """Signal power after a share of the process, by the squared cosine."""
     return math.cos((fraction + 0.008) / 1.008 * math.pi / 2) ** 2
 
 

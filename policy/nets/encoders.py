@@ -1,11 +1,11 @@
 """Encoders of the state and the action history, and their fusion with the visual feature."""
 
 import torch
-import torch.nn.functional as F
 from torch import Tensor, nn
 
 from policy.contract import ACTION_DIM, Contract
 from policy.errors import ContractError, PolicyError
+from policy.nets.attention import Attention, is_tracing
 from policy.preprocess import egocentric_columns, egocentric_scale
 
 HEADS = 4
@@ -47,28 +47,17 @@ class StateEncoder(nn.Module):
         return token
 
 
-class AttentionBlock(nn.Module):
+class AttentionBlock(Attention):
     """Self-attention and an MLP, each behind a norm and around a shortcut; [B, T, dim] -> same."""
 
     def __init__(self, dim: int) -> None:
-        super().__init__()
+        super().__init__(dim, HEADS)
         self.norm1, self.norm2 = nn.LayerNorm(dim), nn.LayerNorm(dim)
-        self.qkv, self.project = nn.Linear(dim, 3 * dim), nn.Linear(dim, dim)
         self.mlp = nn.Sequential(nn.Linear(dim, 2 * dim), nn.SiLU(), nn.Linear(2 * dim, dim))
 
-    def forward(self, tokens: Tensor) -> Tensor:
+    def transform(self, tokens: Tensor) -> Tensor:
         """Tokens [B, T, dim] -> the same, each informed by all."""
-        batch, count, dim = tokens.shape
-        qkv = self.qkv(self.norm1(tokens)).reshape(batch, count, 3, HEADS, dim // HEADS)
-        heads = qkv.permute(2, 0, 3, 1, 4)
-        if torch.jit.is_tracing():  # type: ignore[attr-defined, no-untyped-call]
-            # For OpenVINO (2026.4), whose fused attention over so few tokens is wrong in float32.
-            query, key, value = heads.chunk(3)
-            scores = query @ key.transpose(-2, -1) * (dim // HEADS) ** -0.5
-            attended = (scores.softmax(dim=-1) @ value).squeeze(0)
-        else:
-            attended = F.scaled_dot_product_attention(*heads.unbind(0))
-        tokens = tokens + self.project(attended.transpose(1, 2).reshape(batch, count, dim))
+        tokens = tokens + self.among(self.norm1(tokens), plainly=is_tracing())
         out: Tensor = tokens + self.mlp(self.norm2(tokens))
         return out
 
@@ -85,7 +74,7 @@ class HistoryEncoder(nn.Module):
 
     def forward(self, action_history: Tensor) -> Tensor:
         """Past actions [B, K, 4] -> tokens side by side [B, K * dim]."""
-        tokens: Tensor = self.attention(self.embed(action_history) + self.position)
+        tokens = self.attention.transform(self.embed(action_history) + self.position)
         return tokens.flatten(1)
 
 

@@ -1,4 +1,4 @@
-"""ResNet-18 and ResNet-50 (He et al. 2016) with torchvision's parameter names, and ResNet-8.
+"""ResNets (He et al. 2016) with torchvision's parameter names, and ResNet-8.
 
 ResNet-50 strides in the 3x3 convolution ("v1.5"), as torchvision's weights do.
 """
@@ -65,35 +65,52 @@ class Bottleneck(nn.Module):
         return out
 
 
-class ResNet(nn.Module):
-    """Image [B, 3, H, W] -> moments [B, out_dim]; torchvision's ``fc`` is left out."""
+_DEPTHS: dict[str, tuple[type[BasicBlock] | type[Bottleneck], tuple[int, int, int, int]]] = {
+    "resnet18": (BasicBlock, (2, 2, 2, 2)),
+    "resnet34": (BasicBlock, (3, 4, 6, 3)),
+    "resnet50": (Bottleneck, (3, 4, 6, 3)),
+    "resnet101": (Bottleneck, (3, 4, 23, 3)),
+    "resnet152": (Bottleneck, (3, 8, 36, 3)),
+}
+"""Kind and number of the blocks of each layer."""
 
-    classifier_keys = ("fc.weight", "fc.bias")
 
-    def __init__(
-        self, block: type[BasicBlock] | type[Bottleneck], depths: tuple[int, int, int, int]
-    ) -> None:
+class LastMap(nn.Module):
+    """Image [B, 3, H, W] -> last map [B, channels, ceil(H / 32), ceil(W / 32)] of a ResNet."""
+
+    def __init__(self, name: str) -> None:
         super().__init__()
+        block, depths = _DEPTHS[name]
+        wide = block.expansion
         self.conv1 = nn.Conv2d(3, 64, 7, stride=2, padding=3, bias=False)
         self.bn1 = nn.BatchNorm2d(64)
         self.relu = nn.ReLU(inplace=True)
         self.maxpool = nn.MaxPool2d(3, stride=2, padding=1)
-        wide = block.expansion
         self.layer1 = _layer(block, 64, 64, depths[0], stride=1)
         self.layer2 = _layer(block, 64 * wide, 128, depths[1], stride=2)
         self.layer3 = _layer(block, 128 * wide, 256, depths[2], stride=2)
         self.layer4 = _layer(block, 256 * wide, 512, depths[3], stride=2)
-        self.out_dim = MOMENTS * 512 * wide
+        self.channels = 512 * wide
 
-    def last_map(self, image: Tensor) -> Tensor:
-        """Image -> [B, 512 * expansion, ceil(H / 32), ceil(W / 32)]."""
+    def forward(self, image: Tensor) -> Tensor:
+        """The map itself."""
         x = self.maxpool(self.relu(self.bn1(self.conv1(image))))
         out: Tensor = self.layer4(self.layer3(self.layer2(self.layer1(x))))
         return out
 
+
+class ResNet(LastMap):
+    """Image [B, 3, H, W] -> moments [B, out_dim]; torchvision's ``fc`` is left out."""
+
+    classifier_keys = ("fc.weight", "fc.bias")
+
+    def __init__(self, name: str) -> None:
+        super().__init__(name)
+        self.out_dim = MOMENTS * self.channels
+
     def forward(self, image: Tensor) -> Tensor:
         """``pooling.moments`` of the last map, flat."""
-        pooled: Tensor = moments(self.last_map(image)).flatten(1)
+        pooled: Tensor = moments(super().forward(image)).flatten(1)
         return pooled
 
 

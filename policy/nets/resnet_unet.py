@@ -16,18 +16,13 @@ from policy.nets.names import Size
 
 @dataclass(frozen=True, kw_only=True)
 class ResnetUnetConfig:
-    """All that fixes the architecture.
-
-    Raises:
-        PolicyError: a value is unknown, or the contract promises a fast path.
-    """
+    """All that fixes the architecture."""
 
     size: Size = "small"
     contract: Contract = field(default_factory=Contract)
     schedule: NoiseSchedule = field(default_factory=NoiseSchedule)
 
     def __post_init__(self) -> None:
-        """Refuse a contract of another network."""
         size_dims(self.size)
         if self.contract.feature_dim != 0 or self.contract.arrays != "torch":
             raise ContractError(
@@ -72,11 +67,7 @@ class ResnetUnet(nn.Module):
     def encode_observation(
         self, image: Tensor, state: Tensor, action_history: Tensor | None = None
     ) -> Tensor:
-        """Image, state, history [B, K, 4] or None (no action sent yet) -> condition [B, C].
-
-        Raises:
-            PolicyError: a shape is not the contract's.
-        """
+        """Image, state, history [B, K, 4] or None (no action sent yet) -> condition [B, C]."""
         contract = self.contract
         if action_history is None:
             action_history = state.new_zeros(len(state), contract.history_len, ACTION_DIM)
@@ -93,10 +84,6 @@ class ResnetUnet(nn.Module):
         action_history: Tensor | None = None,
         num_diffusion_steps: int = 10,
     ) -> Tensor:
-        """Image, state and history -> chunk [B, horizon, 4] in [-1, 1].
-
-        Raises:
-            PolicyError: a shape is not the contract's, or the steps are not 1..100.
-        """
+        """Image, state and history -> chunk [B, horizon, 4] in [-1, 1]."""
         condition = self.encode_observation(image, state, action_history)
         return self.head.sample(condition, num_diffusion_steps)

@@ -22,11 +22,7 @@ from policy.nets.names import BACKBONE_NAMES, BackboneName, Size
 
 @dataclass(frozen=True, kw_only=True)
 class TogeConfig:
-    """All that fixes TOGE's architecture.
-
-    Raises:
-        PolicyError: a value is unknown, or the contract is not one that this size can keep.
-    """
+    """All that fixes TOGE's architecture."""
 
     size: Size = "small"
     backbone: BackboneName = "efficientnet_b3"
@@ -35,7 +31,6 @@ class TogeConfig:
     schedule: NoiseSchedule = field(default_factory=NoiseSchedule)
 
     def __post_init__(self) -> None:
-        """Refuse a contract of another network."""
         if self.backbone not in BACKBONE_NAMES:
             raise PolicyError(
                 f"backbone {self.backbone!r} is unknown; use one of {list(BACKBONE_NAMES)}"

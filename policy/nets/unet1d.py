@@ -53,6 +53,18 @@ class Norm(nn.GroupNorm):
         return super().forward(x.transpose(1, 2)).transpose(1, 2)
 
 
+def norm_of_groups(norm: nn.GroupNorm, x: Tensor) -> Tensor:
+    """Apply a group norm to [B, C, ...] as a layer norm of each group.
+
+    OpenVINO's CPU plugin takes a group norm apart into slower parts; and 2026.4 ends the process by
+    a segmentation fault where it compiles a ResNet-18 with group norms in float32.
+    """
+    groups = x.reshape(x.shape[0], norm.num_groups, -1)
+    normed = F.layer_norm(groups, [int(groups.shape[-1])], eps=norm.eps).reshape(x.shape)
+    channels = [-1, *[1] * (x.ndim - 2)]
+    return normed * norm.weight.reshape(channels) + norm.bias.reshape(channels)
+
+
 class ResidualBlock(nn.Module):
     """Two convolutions with FiLM between them, around a shortcut; [B, L, C_in] -> [B, L, C_out]."""
 
@@ -81,9 +93,6 @@ class UNet1d(nn.Module):
 
     ``widths`` are the channels of each level, multiples of 8; the length halves from one level to
     the next.
-
-    Raises:
-        PolicyError: the horizon cannot be halved so often.
     """
 
     def __init__(self, *, horizon: int, condition_dim: int, widths: tuple[int, ...]) -> None:

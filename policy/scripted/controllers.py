@@ -38,9 +38,13 @@ MAX_INTEGRAL_MPS2 = 3.5
 """Enough for a vehicle that hovers at a third more, or less, than the contract's thrust."""
 LEAST_THRUST, MOST_THRUST = 0.1, 0.85
 
-FULL_PUSH_MPS: dict[Axis, float] = {"pitch": 4.0, "roll": 4.0, "climb": 1.5}
-FULL_PUSH_YAW_RADPS = math.radians(90.0)
-"""Full range of a push where the output is not a stick; a lean is ``FULL_LEAN_RAD``."""
+_FULL_YAW_PUSH = math.radians(90.0)
+_FULL_PUSHES: dict[ActionKind, dict[Axis, float]] = {
+    "sticks": {"climb": 1.0, "yaw": 1.0, "pitch": 1.0, "roll": 1.0},
+    "velocity": {"climb": 1.5, "yaw": _FULL_YAW_PUSH, "pitch": 4.0, "roll": 4.0},
+    "attitude": {"yaw": _FULL_YAW_PUSH, "pitch": 1.0, "roll": 1.0},
+}
+"""Full range of a push of each axis: of sticks, m/s, rad/s, or ``FULL_LEAN_RAD``."""
 
 
 class Measured(NamedTuple):
@@ -107,22 +111,20 @@ class ThrustLoop:
         return max(LEAST_THRUST, min(MOST_THRUST, thrust))
 
 
+def _pushed(kind: ActionKind, wanted: Motion, outputs: dict[Axis, float]) -> dict[Axis, float]:
+    """Outputs by axis, with the push of the program in place of the feedback."""
+    if (push := wanted.push) is None or push.axis not in _FULL_PUSHES[kind]:
+        return outputs
+    return outputs | {push.axis: push.share * _FULL_PUSHES[kind][push.axis]}
+
+
 def sticks(wanted: Motion, measured: Measured, climb: Climb) -> Four:
     """Throttle, yaw, pitch, roll: +pitch leans forward, +roll leans right."""
     pitch, roll = _leans(wanted, measured)
     yaw = clip(_yaw_rate(wanted, measured) / FULL_YAW_RATE_RADPS, 1.0)
-    if (push := wanted.push) is None:
-        return _throttle(measured, climb), yaw, pitch, roll
-    match push.axis:
-        case "climb":
-            return push.share, yaw, pitch, roll
-        case "yaw":
-            yaw = push.share
-        case "pitch":
-            pitch = push.share
-        case "roll":
-            roll = push.share
-    return _throttle(measured, climb), yaw, pitch, roll
+    throttle = _throttle(measured, climb)
+    out = _pushed("sticks", wanted, {"climb": throttle, "yaw": yaw, "pitch": pitch, "roll": roll})
+    return out["climb"], out["yaw"], out["pitch"], out["roll"]
 
 
 def _throttle(measured: Measured, climb: Climb) -> float:
@@ -135,34 +137,19 @@ def _throttle(measured: Measured, climb: Climb) -> float:
 
 def velocity(wanted: Motion, measured: Measured, climb: Climb) -> Four:
     """Forward, right, down in m/s, and the yaw rate: the autopilot has the feedback."""
-    forward, right = wanted.forward_mps, wanted.right_mps
-    up, yaw_rate = climb.wanted_mps, wanted.yaw_rate_radps
-    if (push := wanted.push) is not None:
-        match push.axis:
-            case "climb":
-                up = push.share * FULL_PUSH_MPS["climb"]
-            case "yaw":
-                yaw_rate = push.share * FULL_PUSH_YAW_RADPS
-            case "pitch":
-                forward = push.share * FULL_PUSH_MPS["pitch"]
-            case "roll":
-                right = push.share * FULL_PUSH_MPS["roll"]
-    return forward, right, -up, yaw_rate
+    own: dict[Axis, float] = {"pitch": wanted.forward_mps, "roll": wanted.right_mps}
+    out = _pushed(
+        "velocity", wanted, own | {"climb": climb.wanted_mps, "yaw": wanted.yaw_rate_radps}
+    )
+    return out["pitch"], out["roll"], -out["climb"], out["yaw"]
 
 
 def attitude(wanted: Motion, measured: Measured, climb: Climb) -> Four:
     """Thrust, roll, pitch (+ nose up) and yaw rate."""
-    forward_lean, right_lean = _leans(wanted, measured)
-    yaw_rate = _yaw_rate(wanted, measured)
-    if (push := wanted.push) is not None:
-        match push.axis:
-            case "yaw":
-                yaw_rate = push.share * FULL_PUSH_YAW_RADPS
-            case "pitch":
-                forward_lean = push.share
-            case "roll":
-                right_lean = push.share
-    return climb.thrust, right_lean * FULL_LEAN_RAD, -forward_lean * FULL_LEAN_RAD, yaw_rate
+    forward, right = _leans(wanted, measured)
+    own: dict[Axis, float] = {"pitch": forward, "roll": right}
+    out = _pushed("attitude", wanted, own | {"yaw": _yaw_rate(wanted, measured)})
+    return climb.thrust, out["roll"] * FULL_LEAN_RAD, -out["pitch"] * FULL_LEAN_RAD, out["yaw"]
 
 
 def rates(wanted: Motion, measured: Measured, climb: Climb) -> Four:

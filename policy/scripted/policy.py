@@ -1,7 +1,8 @@
 """The policy: climbs, follows a program, and plans it for the length of a chunk."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import replace
+from typing import get_args
 
 import numpy as np
 
@@ -34,9 +35,6 @@ class ScriptedPolicy:
     is left late costs nothing, and it drifts as the vehicle's own velocity estimate does. A state
     at rest on the ground is that of a hover, so whoever begins in the air has to say so. Used by
     one thread.
-
-    Raises:
-        PolicyError: the program or the kind of action is unknown.
     """
 
     def __init__(
@@ -116,9 +114,6 @@ class ScriptedPolicy:
         """State [1, 13] in ``ned_frd`` -> chunk [1, 16, 4]; the other arguments are not used.
 
         Each action is the program's motion at its own time with the feedback of now.
-
-        Raises:
-            PolicyError: the state is not [1, 13].
         """
         if state.shape != (1, STATE_DIM):
             raise PolicyError(f"state must be [1, {STATE_DIM}], got {list(state.shape)}")
@@ -162,3 +157,28 @@ class ScriptedPolicy:
         if is_low and wanted.push is not None and wanted.push.axis == "climb":
             return Motion()
         return wanted
+
+
+IN_AIR = "air"
+
+
+def make_scripted(
+    options: Sequence[str], now_s: Callable[[], float], *, contract: Contract
+) -> ScriptedPolicy:
+    """The policy that ``[PROGRAM][:ACTION][:air]``, split at the colons, names.
+
+    Without a program it hovers, without a kind of action it moves sticks. ``air``: it begins in the
+    air, and keeps the altitude of then.
+    """
+    starts_in_air = options[-1:] == [IN_AIR]
+    named = [*options[: len(options) - starts_in_air], "", ""]
+    program, action, *rest = named[0] or "hover", named[1] or "sticks", *filter(None, named[2:])
+    kind = next((kind for kind in get_args(ActionKind) if kind == action), None)
+    if kind is None or rest:
+        raise PolicyError(
+            f"scripted:{':'.join(options)}: after the program comes one of "
+            f"{', '.join(get_args(ActionKind))}, then perhaps {IN_AIR}; got {[action, *rest]}"
+        )
+    return ScriptedPolicy(
+        program, now_s, action=kind, starts_in_air=starts_in_air, contract=contract
+    )

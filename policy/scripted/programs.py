@@ -150,11 +150,7 @@ PROGRAM_NAMES = (*_MOTIONS, DOUBLET)
 
 
 def make_program(name: str, action: ActionKind) -> Program:
-    """A program of ``PROGRAM_NAMES`` for a policy that puts out this kind of action.
-
-    Raises:
-        PolicyError: there is none of that name.
-    """
+    """A program of ``PROGRAM_NAMES`` for a policy that puts out this kind of action."""
     if name == DOUBLET:
         return Program(motion=_doublet(action), altitude_m=DOUBLET_ALTITUDE_M)
     if name not in _MOTIONS:

@@ -53,9 +53,6 @@ def encode_rows(
     """Encode images to ``path``, as rows of ``dim`` float16, in the order of the jobs.
 
     ``should_continue`` takes the share that is done; False ends the encoding.
-
-    Raises:
-        DatasetError: no room on the disk.
     """
     most = max(int(part.max()) for job in jobs for part, _ in job)
     row_of = np.full((2, most + 1), -1, np.int64)

@@ -15,6 +15,7 @@ from policy.checkpoints.policy_file import (
     BuiltinPolicy,
     build_policy,
     load_checkpoint,
+    read_torch,
     save_checkpoint,
 )
 from policy.contract import FLIGHT_TERMS, STATE_NAMES
@@ -23,7 +24,7 @@ from policy.data.flight_folders import read_ages
 from policy.data.frames import FrameStore
 from policy.data.interpolation import Indices
 from policy.data.samples import Timeline
-from policy.engines.openvino_bulk import BulkEncoder
+from policy.engines.openvino_graph import BulkEncoder
 from policy.errors import PolicyError
 from policy.nets.backbones import load_imagenet_state
 from policy.nets.resnet_unet import ResnetUnetConfig
@@ -65,12 +66,6 @@ def train_policy(
     """Train, and write the best weights on held-out flights to ``settings.out``.
 
     The best are those with the least validation loss, or the highest score by ``check``.
-
-    Raises:
-        DatasetError: flights that cannot be learned from.
-        TrainingError: a run that cannot be resumed or kept, or that diverged.
-        TrainingStoppedError: ``hooks.should_stop`` ended it.
-        PolicyError: weights to start from that do not fit.
     """
     folder = open_run(settings, network, flights)
     return _PolicyRun(flights, network, settings, folder, hooks, check).finish()
@@ -250,7 +245,7 @@ def _starting_trainee(network: Network, settings: TrainSettings) -> Trainee:
             return Trainee(_checkpoint(network, settings.start_from), settings.gate_weight)
         policy = build_policy(network)
         if settings.backbone_weights is not None:
-            load_imagenet_state(policy.backbone, _state_dict(settings.backbone_weights))
+            load_imagenet_state(policy.backbone, read_torch(settings.backbone_weights))
         return Trainee(policy, settings.gate_weight)
 
 
@@ -274,18 +269,6 @@ def _checkpoint(network: Network, path: Path) -> BuiltinPolicy:
             f"--start-from {path} holds another policy: {', '.join(other)}; ask for the same one"
         )
     return policy.train()
-
-
-def _state_dict(path: Path) -> dict[str, torch.Tensor]:
-    try:
-        loaded: object = torch.load(path, map_location="cpu", weights_only=True)
-    except Exception as error:
-        raise PolicyError(
-            f"--backbone-weights {path}: not a readable torch file: {error}"
-        ) from error
-    if not isinstance(loaded, dict):
-        raise PolicyError(f"--backbone-weights {path}: no state dict in it")
-    return {str(name): value for name, value in loaded.items() if isinstance(value, torch.Tensor)}
 
 
 def _source_of_ages(flights: Sequence[FlightData], settings: TrainSettings) -> str:

@@ -48,12 +48,7 @@ def open_run(
     network: TogeConfig | ResnetUnetConfig | WorldModelConfig,
     flights: Sequence[FlightData],
 ) -> RunFolder:
-    """Open the folder of a run, to begin it or to resume it.
-
-    Raises:
-        DatasetError: the flights hold states in another frame than the network takes.
-        TrainingError: no folder for the checkpoint, or an unfinished run that is not to be resumed.
-    """
+    """Open the folder of a run, to begin it or to resume it."""
     if not settings.out.parent.is_dir():
         raise TrainingError(f"--out {settings.out}: there is no folder {settings.out.parent}")
     folder = RunFolder(settings.work_folder, identity_of(settings, network, flights))
@@ -160,12 +155,7 @@ class TrainingRun(ABC, Generic[M, B]):
     # ---- the run ----
 
     def finish(self) -> TrainResult:
-        """Run all stages that are left; then the files of the run are removed.
-
-        Raises:
-            TrainingError: a run that cannot be resumed or kept, or that diverged.
-            TrainingStoppedError: the run was stopped, and is kept.
-        """
+        """Run all stages that are left; then the files of the run are removed."""
         if self.settings.resume:
             self._restore()
         else:

@@ -14,6 +14,7 @@ import torch
 from policy.data.flight_data import FlightData
 from policy.data.frames import disk_error
 from policy.errors import PolicyError
+from policy.files import whole_file
 from policy.training.settings import RunSettings
 
 
@@ -66,22 +67,16 @@ class RunFolder:
 
     def save(self, position: Position, tensors: Mapping[str, Any]) -> None:
         """Write the state in one piece, or raise a ``TrainingError``."""
-        target, partial = self._state, self.path / "state.pt.partial"
         contents = {"identity": self._identity, "position": asdict(position), **tensors}
         try:
-            torch.save(contents, partial)
-            partial.replace(target)
+            with whole_file(self._state) as draft:
+                torch.save(contents, draft)
         except (OSError, RuntimeError) as error:  # torch's writer raises RuntimeError
-            partial.unlink(missing_ok=True)
-            reason = disk_error(target, error) if isinstance(error, OSError) else error
+            reason = disk_error(self._state, error) if isinstance(error, OSError) else error
             raise TrainingError(f"the training cannot be kept: {reason}") from error
 
     def load(self) -> tuple[Position, dict[str, Any]]:
-        """The state that was saved last.
-
-        Raises:
-            TrainingError: there is none, it is damaged, or of another run.
-        """
+        """The state that was saved last."""
         path = self._state
         if not path.is_file():
             raise TrainingError(f"{self.path} holds no run to resume: leave out --resume")

@@ -35,11 +35,7 @@ _RANGES: dict[str, tuple[float, float]] = {
 
 @dataclass(frozen=True, kw_only=True)
 class RunSettings:
-    """Settings of every training run.
-
-    Raises:
-        PolicyError: a value is out of its range; the message names its flag.
-    """
+    """Settings of every training run."""
 
     out: Path
     """Checkpoint to write (.safetensors); an unfinished run is kept beside it."""
@@ -78,7 +74,6 @@ class RunSettings:
     """Camera of a LeRobot dataset that has several, e.g. observation.images.front."""
 
     def __post_init__(self) -> None:
-        """Refuse values that no run could use."""
         if self.out.suffix != ".safetensors":
             raise PolicyError(f"--out {self.out}: checkpoints are written as .safetensors")
         if self.minutes is not None and self.steps is not None:
@@ -112,11 +107,7 @@ class RunSettings:
 
 @dataclass(frozen=True, kw_only=True)
 class TrainSettings(RunSettings):
-    """Settings of the training of a policy.
-
-    Raises:
-        PolicyError: a value is out of its range; the message names its flag.
-    """
+    """Settings of the training of a policy."""
 
     policy: str = "toge"
     """toge[:small|medium|large][:BACKBONE] or resnet-unet[:SIZE]."""
@@ -152,7 +143,6 @@ class TrainSettings(RunSettings):
     """Validations between two such checks."""
 
     def __post_init__(self) -> None:
-        """Refuse values that no run could use."""
         super().__post_init__()
         if self.start_from is not None and self.backbone_weights is not None:
             raise PolicyError("--start-from holds an encoder: leave out --backbone-weights")
@@ -180,11 +170,7 @@ class TrainSettings(RunSettings):
 
 @dataclass(frozen=True, kw_only=True)
 class WorldModelSettings(RunSettings):
-    """Settings of the training of a world model.
-
-    Raises:
-        PolicyError: a value is out of its range; the message names its flag.
-    """
+    """Settings of the training of a world model."""
 
     image_size: int = 64
     """Pixels along a side of the frames."""

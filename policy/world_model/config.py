@@ -26,11 +26,7 @@ _RANGES = {
 
 @dataclass(frozen=True, kw_only=True)
 class WorldModelConfig:
-    """Shape of a world model.
-
-    Raises:
-        PolicyError: a field is out of its range.
-    """
+    """Shape of a world model."""
 
     image_size: int = 64
     """Side of the square frames, px."""
@@ -57,7 +53,6 @@ class WorldModelConfig:
     schedule: NoiseSchedule = field(default_factory=NoiseSchedule)
 
     def __post_init__(self) -> None:
-        """Refuse a shape that cannot be built."""
         for name, (low, high) in _RANGES.items():
             value = getattr(self, name)
             if not isinstance(value, int) or not low <= value <= high:
@@ -95,11 +90,7 @@ class WorldModelConfig:
 
     @classmethod
     def from_json(cls, text: str, contract: Contract) -> "WorldModelConfig":
-        """Read the header form.
-
-        Raises:
-            PolicyError: malformed, or values out of range.
-        """
+        """Read the header form."""
         try:
             data = json.loads(text)
             known = {each.name for each in fields(cls)} - {"contract"}

@@ -13,6 +13,7 @@ import torch.nn.functional as F
 from torch import Tensor, nn
 
 from policy.contract import ACTION_DIM
+from policy.nets.attention import Attention
 from policy.nets.unet1d import TIME_DIM, sinusoid_frequencies
 from policy.world_model.config import HEAD_DIM, WorldModelConfig
 from policy.world_model.relative_state import MOTION_DIM, features_dim
@@ -126,7 +127,7 @@ class _Layer(nn.Module):
 
     def __init__(self, width: int) -> None:
         super().__init__()
-        self.time, self.space = _Attention(width), _Attention(width)
+        self.time, self.space = (Attention(width, width // HEAD_DIM) for _ in range(2))
         self.mlp = nn.Sequential(
             nn.Linear(width, 2 * width), nn.GELU(approximate="tanh"), nn.Linear(2 * width, width)
         )
@@ -142,27 +143,12 @@ class _Layer(nn.Module):
             x = F.layer_norm(tokens, self._shape)
             return x * (1 + scales[:, index]) + shifts[:, index]
 
-        over_time = self.time(normed(0).transpose(1, 2), is_causal=True)
-        tokens = tokens + over_time.transpose(1, 2)
-        tokens = tokens + self.space(normed(1), is_causal=False)
+        by_place = normed(0).transpose(1, 2)
+        over_time = self.time.among(by_place.flatten(0, 1), is_causal=True)
+        tokens = tokens + over_time.reshape(by_place.shape).transpose(1, 2)
+        by_frame = normed(1)
+        tokens = tokens + self.space.among(by_frame.flatten(0, 1)).reshape(by_frame.shape)
         out: Tensor = tokens + self.mlp(normed(2))
-        return out
-
-
-class _Attention(nn.Module):
-    """Self-attention over the last but one axis of [B, N, L, width]."""
-
-    def __init__(self, width: int) -> None:
-        super().__init__()
-        self.qkv, self.project = nn.Linear(width, 3 * width), nn.Linear(width, width)
-
-    def forward(self, tokens: Tensor, *, is_causal: bool) -> Tensor:
-        """Attend to all tokens, or only to earlier ones."""
-        batch, count, length, width = tokens.shape
-        qkv = self.qkv(tokens).reshape(batch * count, length, 3, width // HEAD_DIM, HEAD_DIM)
-        query, key, value = qkv.permute(2, 0, 3, 1, 4).unbind(0)
-        attended = F.scaled_dot_product_attention(query, key, value, is_causal=is_causal)
-        out: Tensor = self.project(attended.transpose(1, 2).reshape(tokens.shape))
         return out
 
 

@@ -12,8 +12,8 @@ import torch
 from onnx import TensorProto, helper, numpy_helper
 from torch import Tensor, nn
 
-from policy.foreign.description import DESCRIPTION
-from policy.foreign.interface import CONTRACT_FILE
+from policy.adapters.description import DESCRIPTION
+from policy.adapters.interface import CONTRACT_FILE
 
 IMAGE_PX = 32
 CONTRACT = f"""[contract]

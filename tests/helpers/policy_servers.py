@@ -13,8 +13,8 @@ from websockets.exceptions import ConnectionClosed
 from mavbridge.commands.serve import AnswerLoop, PolicyServer
 from mavbridge.core.clock import NS_PER_S, MonotonicClock
 from mavbridge.core.workers import Worker
+from policy.adapters.websocket.messages import Message, pack, unpack
 from policy.errors import PolicyError
-from policy.foreign.websocket.messages import Message, pack, unpack
 from policy.loading.request import LoadedPolicy
 from policy.protocol import Executable
 

@@ -24,10 +24,10 @@ from mavbridge.commands.inspect.analysis import analyse
 from mavbridge.core.errors import MavbridgeError
 from mavbridge.recording.flight_folder import open_flight
 from mavbridge.simulation.replay.recording import open_source
+from policy.adapters.interface import read_interface
 from policy.checkpoints.header import read_contract
 from policy.data.tables import MAX_ROWS
 from policy.errors import PolicyError
-from policy.foreign.interface import read_interface
 from sitl.camera.shm import FramePublisher
 
 FLIGHT = Path(__file__).parents[1] / "data" / "flights" / "numpy_px4"

@@ -1,6 +1,5 @@
 import io
 import pickle
-from pathlib import Path
 
 import pytest
 import torch
@@ -35,9 +34,7 @@ FILES = {
 @pytest.mark.parametrize("name", FILES)
 @settings(deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(data=st.data())
-def test_flipped_and_missing_bytes_are_refused(
-    tmp_path: Path, name: str, data: st.DataObject
-) -> None:
+def test_flipped_and_missing_bytes_are_refused(tmp_path, name, data):
     """None of these files fits a policy, so nothing but a refusal may come out, however damaged."""
     content = bytearray(FILES[name])
     places = st.integers(0, len(content) - 1)

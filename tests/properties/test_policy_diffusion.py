@@ -25,9 +25,7 @@ def test_any_net_gives_actions_in_range(schedule: NoiseSchedule, data: st.DataOb
 
 
 @given(schedule=SCHEDULES, data=st.data())
-def test_add_noise_is_undone_by_one_perfect_step(
-    schedule: NoiseSchedule, data: st.DataObject
-) -> None:
+def test_add_noise_is_undone_by_one_perfect_step(schedule, data):
     count = data.draw(st.integers(1, schedule.num_train_timesteps))
     step = data.draw(st.sampled_from(schedule.ddim_steps(count)))
     clean = torch.linspace(-1, 1, 9, dtype=torch.float64).reshape(1, 9)

@@ -17,10 +17,10 @@ import torch
 from helpers.flight_folders import write_spot_flight
 from mavbridge.__main__ import main
 from mavbridge.commands.export.rows import stretches
+from policy.adapters.lerobot.plan import read_plan
+from policy.adapters.lerobot.policy import load_policy_of
 from policy.data.flight_folders import read_flight
 from policy.data.lerobot_format import STATE_KEY
-from policy.foreign.lerobot.load import load_policy_of
-from policy.foreign.lerobot.plan import read_plan
 from policy.preprocess import image_to_input
 
 PYTHON = os.environ.get("MAVBRIDGE_LEROBOT_PYTHON", "")

@@ -23,6 +23,10 @@ from helpers.policy_servers import Guard, Reply, chunk_of, our_server, scripted_
 from mavbridge.commands import serve as server
 from mavbridge.core.clock import NS_PER_S, MonotonicClock
 from mavbridge.core.processes import free_port
+from policy.adapters.websocket import link, remote_policy
+from policy.adapters.websocket.kind import load_server_policy
+from policy.adapters.websocket.messages import Message, number_array, pack, unpack
+from policy.adapters.websocket.remote_policy import RemotePolicy, answer_deadline_s
 from policy.contract import Contract, FloatArray
 from policy.engines.executable import (
     ExecutionSettings,
@@ -31,10 +35,6 @@ from policy.engines.executable import (
     make_numpy_executable,
 )
 from policy.errors import NoChunkError, PolicyError
-from policy.foreign.websocket import link, remote_policy
-from policy.foreign.websocket.kind import load_server_policy
-from policy.foreign.websocket.messages import Message, number_array, pack, unpack
-from policy.foreign.websocket.remote_policy import RemotePolicy, answer_deadline_s
 from policy.loading.load import load_policy, read_policy_contract
 from policy.loading.request import PolicyRequest
 from policy.protocol import Executable

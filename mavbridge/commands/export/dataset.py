@@ -22,10 +22,10 @@ from mavbridge.commands.export.files import (
 from mavbridge.commands.export.rows import MIN_ROWS, Stretch
 from mavbridge.core.records import ImageArray
 from mavbridge.recording.video.file import VideoError
+from policy.adapters.state import state_values
 from policy.contract import ACTION_NAMES, STATE_NAMES
 from policy.data import lerobot_format as names
 from policy.files import library_name
-from policy.foreign.state import state_values
 from policy.preprocess import resize
 
 QUANTILES = {"q01": 0.01, "q10": 0.10, "q50": 0.50, "q90": 0.90, "q99": 0.99}

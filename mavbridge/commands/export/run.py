@@ -20,15 +20,13 @@ from mavbridge.core.clock import NS_PER_MS
 from mavbridge.core.errors import UserError
 from mavbridge.core.records import ImageArray
 from mavbridge.core.stopping import stop_on_signals
+from policy.adapters.drafts import Entry, dataset_entries, draft_text, recorded_entries
+from policy.adapters.interface import CONTRACT_FILE
+from policy.adapters.state import BODY_STATE_NAMES
 from policy.contract import STATE_NAMES
 from policy.data.flight_data import FlightData, common_frame, common_terms
 from policy.data.flight_folders import find_flights, leave_out_failed, read_flight
 from policy.data.tables import read_json
-from policy.foreign.drafts.entries import Entry, draft_text
-from policy.foreign.drafts.lerobot import dataset_entries
-from policy.foreign.drafts.recorded import recorded_entries
-from policy.foreign.interface import CONTRACT_FILE
-from policy.foreign.state import BODY_STATE_NAMES
 
 
 @dataclass(frozen=True, kw_only=True)

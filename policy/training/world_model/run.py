@@ -44,14 +44,7 @@ def train_world_model(
     settings: WorldModelSettings,
     hooks: Hooks,
 ) -> TrainResult:
-    """Train, and write the best weights on held-out flights to ``settings.out``.
-
-    Raises:
-        DatasetError: flights that cannot be learned from.
-        TrainingError: a run that cannot be resumed or kept, or that diverged.
-        TrainingStoppedError: ``hooks.should_stop`` ended it.
-        PolicyError: an autoencoder to keep that does not fit.
-    """
+    """Train, and write the best weights on held-out flights to ``settings.out``."""
     folder = open_run(settings, config, flights)
     return _WorldModelRun(flights, config, settings, folder, hooks).finish()
 

@@ -7,8 +7,8 @@ import pytest
 
 from mavbridge.core.own_packages import OUR_SAFE_PATH, OURS, SAFE_PATH, hidden_package
 from mavbridge.core.processes import child_environment, user_environment
+from policy.adapters.user_class import load_user_class
 from policy.errors import PolicyError
-from policy.foreign.user_class import load_user_class
 
 ROOT = Path(__file__).parents[3]
 

@@ -6,6 +6,7 @@ from pathlib import Path
 import pytest
 
 from mavbridge.__main__ import main
+from policy.adapters.interface import read_interface
 from policy.errors import ContractError
 from policy.files import (
     MAX_TOML_BYTES,
@@ -16,7 +17,6 @@ from policy.files import (
     read_toml,
     user_path,
 )
-from policy.foreign.interface import read_interface
 
 
 @pytest.fixture
@@ -43,9 +43,7 @@ def test_a_pipe_is_no_file_and_is_not_waited_for(pipe: Path) -> None:
             open_regular(path)
 
 
-def test_settings_from_a_pipe_are_refused_at_once(
-    pipe: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_settings_from_a_pipe_are_refused_at_once(pipe, capsys):
     with pytest.raises(SystemExit):
         main(["--config", str(pipe)])
     assert "not a file" in capsys.readouterr().err
@@ -71,9 +69,7 @@ def test_json_that_is_nested_too_deeply_is_a_value_error(text: str) -> None:
         (b"a = \0", "Invalid"),
     ],
 )
-def test_toml_that_would_fill_the_memory_is_refused(
-    content: bytes, told: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_toml_that_would_fill_the_memory_is_refused(content, told, tmp_path, capsys):
     path = tmp_path / "settings.toml"
     path.write_bytes(content)
     with pytest.raises(ValueError, match=told):
@@ -128,12 +124,7 @@ def test_a_home_directory_is_expanded(monkeypatch: pytest.MonkeyPatch) -> None:
 @pytest.mark.parametrize(
     "words", [["--policy", "lerobot:~/act"], ["--policy=lerobot:~/act"], ["--config", "~/fly.toml"]]
 )
-def test_the_command_line_expands_what_shells_leave(
-    words: list[str],
-    tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
-    capsys: pytest.CaptureFixture[str],
-) -> None:
+def test_the_command_line_expands_what_shells_leave(words, tmp_path, monkeypatch, capsys):
     monkeypatch.setenv("HOME", str(tmp_path))
     (tmp_path / "fly.toml").write_text('policy = "lerobot:~/act"')
     with pytest.raises(SystemExit) as ended:

@@ -70,9 +70,7 @@ def test_scripted_flies_dual_rate_without_weights(spec: str, action: str) -> Non
         ("scripted:hover:velocity", False, True),
     ],
 )
-def test_a_scripted_program_climbs_unless_it_starts_in_the_air(
-    spec: str, starts_in_air: bool, climbs: bool
-) -> None:
+def test_a_scripted_program_climbs_unless_it_starts_in_the_air(spec, starts_in_air, climbs):
     action = act(load(spec, starts_in_air=starts_in_air))[0, 0]
     up = -action[2] if "velocity" in spec else action[0]
     assert bool(up > 0.2) is climbs
@@ -111,23 +109,6 @@ def test_the_fastest_engine_that_agrees_flies_and_is_named(checkpoint: Path) -> 
     np.testing.assert_allclose(act(fast), act(reference), atol=0.01)
 
 
-def test_single_rate_takes_the_fast_engine_too(tmp_path: Path) -> None:
-    contract = Contract(image_height=32, image_width=32)
-    path = tmp_path / "a.safetensors"
-    save_checkpoint(path, build_policy(ResnetUnetConfig(contract=contract)))
-    fast, reference = (
-        load("resnet-unet", checkpoint=path, engine=engine, dual_rate=False)
-        for engine in ("openvino", "torch")
-    )
-    assert fast.executable.engine.startswith("openvino")
-    np.testing.assert_allclose(act(fast), act(reference), atol=0.01)
-
-
-def test_untrained_needs_permission() -> None:
-    with pytest.raises(PolicyError, match="--allow-untrained"):
-        load("toge:medium")
-
-
 @pytest.mark.parametrize("spec", ["toge", "toge:small", "toge:small:resnet18", "toge:resnet18"])
 def test_a_checkpoint_decides_what_is_built(spec: str, checkpoint: Path, small_toge: Toge) -> None:
     loaded = load(spec, checkpoint=checkpoint)
@@ -140,23 +121,6 @@ def test_a_checkpoint_decides_what_is_built(spec: str, checkpoint: Path, small_t
 def test_a_spec_that_contradicts_the_checkpoint_is_refused(spec: str, checkpoint: Path) -> None:
     with pytest.raises(PolicyError, match="holds small:resnet18"):
         load(spec, checkpoint=checkpoint)
-
-
-def test_an_image_size_that_contradicts_the_checkpoint_is_refused(checkpoint: Path) -> None:
-    assert load("toge", checkpoint=checkpoint, image_size=32).executable.dual_rate
-    with pytest.raises(PolicyError, match="--image-size 224 contradicts"):
-        load("toge", checkpoint=checkpoint, image_size=224)
-
-
-def test_the_seed_sets_the_noise_of_the_flight(tmp_path: Path, small_toge: Toge) -> None:
-    path = tmp_path / "a.pt"
-    torch.save(small_toge.state_dict(), path)
-    chunks = [
-        act(load("toge:small:resnet18", checkpoint=path, image_size=32, seed=seed))
-        for seed in (0, 0, 1)
-    ]
-    np.testing.assert_array_equal(chunks[0], chunks[1])
-    assert not np.array_equal(chunks[0], chunks[2])
 
 
 def test_a_policy_without_fast_path_becomes_single_rate_with_one_warning(tmp_path: Path) -> None:
@@ -221,9 +185,7 @@ def test_sticks_are_flown_by_rates_where_that_is_asked_for(checkpoint: Path) -> 
     np.testing.assert_allclose(act(rates), flown, atol=1e-6)
 
 
-def test_weights_that_learned_from_rates_are_flown_by_them(
-    small_toge: Toge, checkpoint: Path, tmp_path: Path
-) -> None:
+def test_weights_that_learned_from_rates_are_flown_by_them(small_toge, checkpoint, tmp_path):
     network = copy.deepcopy(small_toge)
     network.contract = rates_contract(network.contract)
     network.config = replace(network.config, contract=network.contract)
@@ -247,20 +209,11 @@ def test_weights_that_learned_from_rates_are_flown_by_them(
         ({"spec": "toge:medium", "checkpoint": None}, "--allow-untrained"),
     ],
 )
-def test_cheap_checks_refuse_without_loading(
-    checkpoint: Path, changes: dict[str, Any], message: str
-) -> None:
+def test_cheap_checks_refuse_without_loading(checkpoint, changes, message):
     good = {"spec": "toge", "checkpoint": checkpoint}
     check_request(PolicyRequest(**good))
     with pytest.raises(PolicyError, match=message):
         check_request(PolicyRequest(**{**good, **changes}))
-
-
-def test_cheap_checks_read_the_header(checkpoint: Path, tmp_path: Path) -> None:
-    damaged = tmp_path / "a.safetensors"
-    damaged.write_bytes(checkpoint.read_bytes()[:100])
-    with pytest.raises(PolicyError, match=r"a\.safetensors cannot be read"):
-        check_request(PolicyRequest(spec="toge", checkpoint=damaged))
 
 
 USER_CLASSES = """
@@ -370,9 +323,7 @@ def test_a_class_of_the_users_flies(user_module: str) -> None:
 @pytest.mark.parametrize(
     ("name", "engine", "step"), [("Remembers", "auto", 0.01), ("TorchRemembers", "torch", 0.25)]
 )
-def test_a_policy_that_remembers_is_reset_after_loading_and_by_its_executable(
-    user_module: str, name: str, engine: str, step: float
-) -> None:
+def test_a_policy_that_remembers_is_reset_after_loading(user_module, name, engine, step):
     loaded = load(f"{user_module}:{name}", engine=engine)
     assert [float(act(loaded).max()) for _ in range(2)] == pytest.approx([step, 2 * step])
     loaded.executable.reset()
@@ -394,13 +345,6 @@ def test_a_policy_that_remembers_is_reset_after_loading_and_by_its_executable(
         ("Other", {}, "'Dual'"),
     ],
 )
-def test_a_class_that_will_not_do_is_refused(
-    user_module: str, name: str, changes: dict[str, Any], message: str
-) -> None:
+def test_a_class_that_will_not_do_is_refused(user_module, name, changes, message):
     with pytest.raises(PolicyError, match=message):
         load(f"{user_module}:{name}", **changes)
-
-
-def test_a_module_with_a_syntax_error_is_refused(user_module: str) -> None:
-    with pytest.raises(PolicyError, match="importing my_broken_policies failed"):
-        load("my_broken_policies:Policy")

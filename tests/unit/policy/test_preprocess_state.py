@@ -26,9 +26,7 @@ attitudes = st.tuples(*[st.floats(-1, 1)] * 4).filter(lambda q: np.linalg.norm(q
 
 
 @given(attitudes, st.tuples(number, number, number), angle)
-def test_it_is_the_same_on_every_heading(
-    q: np.ndarray, velocity: tuple[float, float, float], turn: float
-) -> None:
+def test_it_is_the_same_on_every_heading(q, velocity, turn):
     here = state(q, velocity)
     there = here.copy()
     about = about_z(np.array([turn]))
@@ -39,9 +37,7 @@ def test_it_is_the_same_on_every_heading(
 
 
 @given(attitudes, st.tuples(number, number, number))
-def test_velocity_and_vertical_are_those_of_the_body(
-    q: np.ndarray, velocity: tuple[float, float, float]
-) -> None:
+def test_velocity_and_vertical_are_those_of_the_body(q, velocity):
     seen = egocentric(state(q, velocity), Contract())[0]
     back = rotation.conjugate(q[None])
     expected = rotation.rotate(back, np.array([velocity]))[0] / 5

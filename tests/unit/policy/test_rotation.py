@@ -21,9 +21,7 @@ def test_a_quarter_turn_about_the_third_axis_takes_x_to_y() -> None:
 
 
 @given(ANGLE, ANGLE, st.integers(0, 2), st.integers(0, 2))
-def test_a_product_rotates_as_its_factors_one_after_the_other(
-    a: float, b: float, i: int, j: int
-) -> None:
+def test_a_product_rotates_as_its_factors_one_after_the_other(a, b, i, j):
     first, second = about(i, a), about(j, b)
     vector = np.array([[0.3, -1.2, 0.7]])
     together = rotation.rotate(rotation.multiply(second, first), vector)

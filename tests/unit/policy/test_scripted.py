@@ -1,27 +1,38 @@
+"""Scripted programs in every kind of action, flown in closed loop against a small vehicle."""
+
 import math
-from dataclasses import dataclass
+from collections import deque
+from dataclasses import dataclass, field
 
 import numpy as np
 import pytest
 
+from policy.contract import ActionKind
 from policy.errors import PolicyError
 from policy.protocol import DualRatePolicy
 from policy.scripted import PROGRAM_NAMES, ScriptedPolicy
+from policy.scripted.programs import doublet_length_s, doublet_steps
 
 STEP_S = 0.01
-LEAN_ACCEL_MPS2 = 9.81 * math.tan(math.radians(30))
+DELAY_STEPS = 4
+"""From a state to the action that was computed from it."""
+GRAVITY_MPS2 = 9.81
+FEATURE, HISTORY = np.zeros((1, 8), np.float32), np.zeros((1, 4, 4), np.float32)
+KINDS: tuple[ActionKind, ...] = ("sticks", "rates", "attitude", "velocity")
 
 
-def beyond(stick: float, deadzone: float) -> float:
-    return math.copysign(max(0.0, abs(stick) - deadzone) / (1 - deadzone), stick)
+def beyond(stick: float, dead_zone: float) -> float:
+    return math.copysign(max(0.0, abs(stick) - dead_zone) / (1 - dead_zone), stick)
 
 
 @dataclass
-class PointMass:
-    """A vehicle that holds altitude at mid-stick: every response is of first order."""
+class Vehicle:
+    """Lags of first order from an action to body rate, lean, climb and velocity; may stand."""
 
+    action: ActionKind
+    hover_thrust: float = 0.39
     leaves_ground_at_s: float = 0.0
-    throttle_deadzone: float = 0.2
+    throttle_dead_zone: float = 0.2
     now_s: float = 0.0
     north_m: float = 0.0
     east_m: float = 0.0
@@ -29,153 +40,229 @@ class PointMass:
     north_mps: float = 0.0
     east_mps: float = 0.0
     climb_mps: float = 0.0
-    heading_rad: float = 0.0
-    yaw_rate_radps: float = 0.0
-    forward_accel_mps2: float = 0.0
-    right_accel_mps2: float = 0.0
+    roll_rad: float = 0.0
+    pitch_rad: float = 0.0
+    yaw_rad: float = 0.0
+    rates: list[float] = field(default_factory=lambda: [0.0, 0.0, 0.0])
+    thrust: float = 0.0
 
     def state(self) -> np.ndarray:
-        half = self.heading_rad / 2
-        values = [self.north_mps, self.east_mps, -self.climb_mps]
-        values += [math.cos(half), 0.0, 0.0, math.sin(half), 0.0, 0.0, self.yaw_rate_radps]
-        return np.array([[*values, 0.0, 0.0, -9.81]], np.float32)
+        cr, sr = math.cos(self.roll_rad / 2), math.sin(self.roll_rad / 2)
+        cp, sp = math.cos(self.pitch_rad / 2), math.sin(self.pitch_rad / 2)
+        cy, sy = math.cos(self.yaw_rad / 2), math.sin(self.yaw_rad / 2)
+        quaternion = (
+            cr * cp * cy + sr * sp * sy,
+            sr * cp * cy - cr * sp * sy,
+            cr * sp * cy + sr * cp * sy,
+            cr * cp * sy - sr * sp * cy,
+        )
+        velocity = (self.north_mps, self.east_mps, -self.climb_mps)
+        return np.array([[*velocity, *quaternion, *self.rates, 0.0, 0.0, -9.81]], np.float32)
 
-    def step(self, sticks: np.ndarray) -> None:
-        throttle, yaw, pitch, roll = (float(stick) for stick in sticks)
+    def step(self, action: np.ndarray) -> None:
+        four = [float(number) for number in action]
         self.now_s += STEP_S
         if self.now_s < self.leaves_ground_at_s:
             return
-        climb = 2.5 * beyond(throttle, self.throttle_deadzone)
-        self.climb_mps += (climb - self.climb_mps) * STEP_S / 0.4
-        self.up_m += self.climb_mps * STEP_S
-        if self.up_m < 0.0:
-            self.up_m, self.climb_mps = 0.0, 0.0
-        rate = math.radians(202.5) * beyond(yaw, 0.04)
-        self.yaw_rate_radps += (rate - self.yaw_rate_radps) * STEP_S / 0.1
-        self.heading_rad += self.yaw_rate_radps * STEP_S
-        forward, right = (LEAN_ACCEL_MPS2 * beyond(stick, 0.04) for stick in (pitch, roll))
-        self.forward_accel_mps2 += (forward - self.forward_accel_mps2) * STEP_S / 0.15
-        self.right_accel_mps2 += (right - self.right_accel_mps2) * STEP_S / 0.15
-        cos, sin = math.cos(self.heading_rad), math.sin(self.heading_rad)
-        north = cos * self.forward_accel_mps2 - sin * self.right_accel_mps2
-        east = sin * self.forward_accel_mps2 + cos * self.right_accel_mps2
-        self.north_mps += (north - 0.2 * self.north_mps) * STEP_S
-        self.east_mps += (east - 0.2 * self.east_mps) * STEP_S
+        match self.action:
+            case "sticks":
+                self._follow_sticks(*four)
+            case "velocity":
+                self._follow_velocity(*four)
+            case _:
+                self._follow_thrust(*four)
+        self.yaw_rad += self.rates[2] * STEP_S
         self.north_m += self.north_mps * STEP_S
         self.east_m += self.east_mps * STEP_S
+        self.up_m += self.climb_mps * STEP_S
+        if self.up_m <= 0.0 and self.climb_mps < 0.0:
+            self.up_m = self.climb_mps = 0.0
+
+    def _follow_sticks(self, throttle: float, yaw: float, pitch: float, roll: float) -> None:
+        climb = 2.5 * beyond(throttle, self.throttle_dead_zone)
+        self.climb_mps += (climb - self.climb_mps) * STEP_S / 0.4
+        rate = math.radians(202.5) * beyond(yaw, 0.04)
+        self.rates[2] += (rate - self.rates[2]) * STEP_S / 0.1
+        full = math.radians(30.0)
+        self.roll_rad += (full * beyond(roll, 0.04) - self.roll_rad) * STEP_S / 0.15
+        self.pitch_rad += (-full * beyond(pitch, 0.04) - self.pitch_rad) * STEP_S / 0.15
+        self._push(-GRAVITY_MPS2 * math.tan(self.pitch_rad), GRAVITY_MPS2 * math.tan(self.roll_rad))
+
+    def _follow_velocity(self, forward: float, right: float, down: float, yaw: float) -> None:
+        cos, sin = math.cos(self.yaw_rad), math.sin(self.yaw_rad)
+        north, east = cos * forward - sin * right, sin * forward + cos * right
+        self.north_mps += (north - self.north_mps) * STEP_S / 0.4
+        self.east_mps += (east - self.east_mps) * STEP_S / 0.4
+        self.climb_mps += (-down - self.climb_mps) * STEP_S / 0.4
+        self.rates[2] += (yaw - self.rates[2]) * STEP_S / 0.2
+
+    def _follow_thrust(self, thrust: float, roll: float, pitch: float, yaw: float) -> None:
+        if self.action == "attitude":
+            roll, pitch = 6.0 * (roll - self.roll_rad), 6.0 * (pitch - self.pitch_rad)
+        for index, wanted in enumerate((roll, pitch, yaw)):
+            self.rates[index] += (wanted - self.rates[index]) * STEP_S / (0.06, 0.06, 0.2)[index]
+        self.roll_rad += self.rates[0] * STEP_S
+        self.pitch_rad += self.rates[1] * STEP_S
+        self.thrust += (thrust - self.thrust) * STEP_S / 0.05
+        accel = GRAVITY_MPS2 * self.thrust / self.hover_thrust
+        up = accel * math.cos(self.roll_rad) * math.cos(self.pitch_rad)
+        self._push(-accel * math.sin(self.pitch_rad), accel * math.sin(self.roll_rad))
+        if self.up_m > 0.0 or up > GRAVITY_MPS2:
+            self.climb_mps += (up - GRAVITY_MPS2 - 0.2 * self.climb_mps) * STEP_S
+
+    def _push(self, forward: float, right: float) -> None:
+        cos, sin = math.cos(self.yaw_rad), math.sin(self.yaw_rad)
+        self.north_mps += (cos * forward - sin * right - 0.2 * self.north_mps) * STEP_S
+        self.east_mps += (sin * forward + cos * right - 0.2 * self.east_mps) * STEP_S
+
+    @property
+    def forward_mps(self) -> float:
+        return math.cos(self.yaw_rad) * self.north_mps + math.sin(self.yaw_rad) * self.east_mps
+
+    @property
+    def right_mps(self) -> float:
+        return math.cos(self.yaw_rad) * self.east_mps - math.sin(self.yaw_rad) * self.north_mps
+
+    @property
+    def speed_mps(self) -> float:
+        return math.hypot(self.north_mps, self.east_mps)
 
 
-FEATURE, HISTORY = np.zeros((1, 8), np.float32), np.zeros((1, 4, 4), np.float32)
+def fly(
+    program: str, duration_s: float, vehicle: Vehicle, *, starts_in_air: bool = False
+) -> tuple[ScriptedPolicy, list[Vehicle]]:
+    """Closed loop at 100 Hz with a delay; copies of the vehicle, one a step."""
+    policy = ScriptedPolicy(
+        program, lambda: vehicle.now_s, action=vehicle.action, starts_in_air=starts_in_air
+    )
+    return policy, fly_on(policy, duration_s, vehicle)
 
 
-def fly(program: str, duration_s: float, vehicle: PointMass) -> list[PointMass]:
-    """Closed loop at 100 Hz; copies of the vehicle, one a step."""
-    policy = ScriptedPolicy(program, lambda: vehicle.now_s)
+def fly_on(policy: ScriptedPolicy, duration_s: float, vehicle: Vehicle) -> list[Vehicle]:
+    on_the_way: deque[np.ndarray] = deque(maxlen=DELAY_STEPS)
     flown = []
     for _ in range(round(duration_s / STEP_S)):
-        chunk = policy.predict_fast(FEATURE, vehicle.state(), HISTORY, 10)
-        vehicle.step(chunk[0, 0])
-        flown.append(PointMass(**vars(vehicle)))
+        on_the_way.append(policy.predict_fast(FEATURE, vehicle.state(), HISTORY, 10)[0, 0])
+        vehicle.step(on_the_way[0])
+        flown.append(Vehicle(**{**vars(vehicle), "rates": list(vehicle.rates)}))
     return flown
 
 
-def start_of_program(flown: list[PointMass]) -> int:
-    return next(index for index, v in enumerate(flown) if v.up_m > 2.8) + 200
+def at(flown: list[Vehicle], time_s: float) -> Vehicle:
+    return flown[round(time_s / STEP_S)]
 
 
-@pytest.mark.parametrize("deadzone", [0.0, 0.2])
-@pytest.mark.parametrize("late_s", [0.0, 3.0])
-def test_takes_off_to_three_metres_and_stays(late_s: float, deadzone: float) -> None:
-    vehicle = PointMass(leaves_ground_at_s=late_s, throttle_deadzone=deadzone)
-    flown = fly("hover", late_s + 20.0, vehicle)
-    assert max(v.up_m for v in flown) < 3.5
-    settled = flown[round((late_s + 6.0) / STEP_S) :]
-    assert all(2.5 < v.up_m < 3.5 for v in settled)
-    assert max(abs(v.climb_mps) for v in settled[500:]) < 0.2
+@pytest.mark.parametrize(
+    "vehicle",
+    [
+        *(Vehicle("sticks", throttle_dead_zone=zone) for zone in (0.0, 0.2)),
+        *(Vehicle(kind, thrust) for kind in KINDS[1:] for thrust in (0.33, 0.5)),
+        Vehicle("sticks", leaves_ground_at_s=3.0),
+    ],
+)
+def test_takes_off_to_three_metres_and_stays(vehicle: Vehicle) -> None:
+    flown = fly("hover", vehicle.leaves_ground_at_s + 25.0, vehicle)[1]
+    assert max(v.up_m for v in flown) < 4.2
+    assert all(2.5 < v.up_m < 3.5 for v in flown[1500:])
+    assert flown[-1].speed_mps < 0.05
 
 
-def test_reset_begins_again_from_the_altitude_of_now() -> None:
-    vehicle = PointMass()
-    policy = ScriptedPolicy("square", lambda: vehicle.now_s)
-
-    def fly_on(duration_s: float) -> None:
-        for _ in range(round(duration_s / STEP_S)):
-            vehicle.step(policy.predict_fast(FEATURE, vehicle.state(), HISTORY, 10)[0, 0])
-
-    fly_on(10.0)
-    assert vehicle.up_m == pytest.approx(3.0, abs=0.5)
-    policy.reset()
-    fly_on(4.0)
-    assert vehicle.up_m == pytest.approx(6.0, abs=0.7)
-    assert math.hypot(vehicle.north_mps, vehicle.east_mps) < 0.25
+@pytest.mark.parametrize("kind", KINDS)
+def test_flies_its_square_along_its_heading(kind: ActionKind) -> None:
+    policy, flown = fly("square", 32.0, Vehicle(kind, yaw_rad=0.7))
+    start_s = policy.program_start_s
+    assert start_s is not None
+    for leg, wanted in enumerate([(1.5, 0.0), (0.0, 1.5), (-1.5, 0.0), (0.0, -1.5)]):
+        end = at(flown, start_s + 4.0 * (leg + 1) - 0.1)
+        assert (end.forward_mps, end.right_mps) == pytest.approx(wanted, abs=0.35)
+    begin, back = at(flown, start_s), at(flown, start_s + 16.0)
+    assert math.hypot(back.north_m - begin.north_m, back.east_m - begin.east_m) < 2.0
+    assert all(2.5 < v.up_m < 3.5 for v in flown[round(start_s / STEP_S) :])
 
 
-def test_hover_stops_a_drift() -> None:
-    vehicle = PointMass(north_mps=2.0, east_mps=-1.0)
-    last = fly("hover", 12.0, vehicle)[-1]
-    assert math.hypot(last.north_mps, last.east_mps) < 0.25
-
-
-def test_square_flies_its_legs_in_order_and_comes_back() -> None:
-    flown = fly("square", 40.0, PointMass())
-    start = start_of_program(flown)
-    for leg, (north, east) in enumerate([(1.5, 0.0), (0.0, 1.5), (-1.5, 0.0), (0.0, -1.5)]):
-        end = flown[start + (leg + 1) * 400 - 10]
-        assert end.north_mps == pytest.approx(north, abs=0.35)
-        assert end.east_mps == pytest.approx(east, abs=0.35)
-    corner, back = flown[start + 800], flown[start + 1600]
-    assert corner.north_m - flown[start].north_m > 4.0
-    assert corner.east_m - flown[start].east_m > 3.0
-    assert math.hypot(back.north_m - flown[start].north_m, back.east_m - flown[start].east_m) < 2.0
-    assert all(2.5 < v.up_m < 3.5 for v in flown[start:])
-
-
-def test_circle_turns_while_it_flies() -> None:
-    flown = fly("circle", 40.0, PointMass())
-    lap = flown[start_of_program(flown) + 500 :][:1200]
-    assert lap[-1].heading_rad - lap[0].heading_rad == pytest.approx(2 * math.pi, rel=0.25)
-    speeds = [math.hypot(v.north_mps, v.east_mps) for v in lap]
-    assert min(speeds) > 1.0
-    assert max(speeds) < 2.0
-    assert 3.0 < max(v.north_m for v in lap) - min(v.north_m for v in lap) < 9.0
+@pytest.mark.parametrize("kind", KINDS)
+def test_circles(kind: ActionKind) -> None:
+    policy, flown = fly("circle", 30.0, Vehicle(kind))
+    assert policy.program_start_s is not None
+    early, late = (at(flown, policy.program_start_s + s) for s in (5.0, 17.0))
+    assert late.yaw_rad - early.yaw_rad == pytest.approx(math.tau, rel=0.25)
+    assert 1.0 < late.speed_mps < 2.0
+    assert math.hypot(late.north_m - early.north_m, late.east_m - early.east_m) < 3.0
 
 
 def test_yaw_turns_on_the_spot() -> None:
-    flown = fly("yaw", 20.0, PointMass())
-    start = start_of_program(flown)
-    turned = flown[start + 500].heading_rad - flown[start].heading_rad
-    assert turned == pytest.approx(5 * math.radians(30), rel=0.25)
+    policy, flown = fly("yaw", 20.0, Vehicle("sticks"))
+    assert policy.program_start_s is not None
+    early, late = (at(flown, policy.program_start_s + s) for s in (0.0, 5.0))
+    assert late.yaw_rad - early.yaw_rad == pytest.approx(5 * math.radians(30), rel=0.25)
     assert max(math.hypot(v.north_m, v.east_m) for v in flown) < 0.2
 
 
-def test_heading_frame_is_used_not_north() -> None:
-    facing_east = PointMass(heading_rad=math.pi / 2)
-    flown = fly("square", 12.0, facing_east)
-    first_leg_end = flown[start_of_program(flown) + 390]
-    assert first_leg_end.east_mps == pytest.approx(1.5, abs=0.35)
-    assert abs(first_leg_end.north_mps) < 0.2
+@pytest.mark.parametrize("kind", KINDS)
+def test_begun_in_the_air_it_stops_a_drift_and_keeps_its_altitude(kind: ActionKind) -> None:
+    drifting = Vehicle(kind, up_m=9.0, north_mps=3.0, east_mps=-2.0, thrust=0.39)
+    policy, flown = fly("hover", 10.0, drifting, starts_in_air=True)
+    assert policy.program_start_s == pytest.approx(2.0, abs=0.02)
+    assert flown[-1].speed_mps < 0.25
+    assert all(8.0 < v.up_m < 10.0 for v in flown)
+
+
+def test_reset_begins_again_from_the_altitude_of_now() -> None:
+    vehicle = Vehicle("sticks")
+    policy, _ = fly("square", 10.0, vehicle)
+    assert vehicle.up_m == pytest.approx(3.0, abs=0.5)
+    policy.reset()
+    fly_on(policy, 4.0, vehicle)
+    assert vehicle.up_m == pytest.approx(6.0, abs=0.7)
+    assert vehicle.speed_mps < 0.25
+
+
+@pytest.mark.parametrize("kind", KINDS[1:])
+def test_the_doublet_pushes_every_axis_to_both_sides_and_comes_back(kind: ActionKind) -> None:
+    policy, flown = fly("doublet", 15.0 + doublet_length_s(kind), Vehicle(kind))
+    start_s = policy.program_start_s
+    assert start_s is not None
+    for step in doublet_steps(kind):
+        middle_s = step.begin_s + step.half_s
+        one, other = (at(flown, start_s + s - 0.02) for s in (middle_s, step.end_s))
+        moved = {
+            "yaw": lambda v: v.rates[2],
+            "climb": lambda v: v.climb_mps,
+            "roll": lambda v: v.right_mps if kind == "velocity" else v.roll_rad,
+            "pitch": lambda v: v.forward_mps if kind == "velocity" else -v.pitch_rad,
+        }[step.axis]
+        assert moved(one) > 0.15 * step.share, step
+        assert moved(other) < -0.15 * step.share, step
+        settled = at(flown, start_s + step.end_s + step.settle_s - 0.02)
+        assert settled.speed_mps < 0.6, step
+    assert all(v.up_m > 4.0 for v in flown[round(start_s / STEP_S) :])
+
+
+def test_a_push_down_ends_before_the_ground() -> None:
+    """The vehicle sinks at twice the speed at which it climbs."""
+
+    class Sinking(Vehicle):
+        def _follow_velocity(self, forward: float, right: float, down: float, yaw: float) -> None:
+            super()._follow_velocity(forward, right, down * (2.5 if down > 0 else 1.0), yaw)
+
+    _, flown = fly("doublet", 15.0 + doublet_length_s("velocity"), Sinking("velocity"))
+    assert min(v.up_m for v in flown[1000:]) > 3.0
 
 
 def test_chunk_is_the_plan_of_the_next_seconds() -> None:
-    vehicle = PointMass()
-    policy = ScriptedPolicy("square", lambda: vehicle.now_s)
-    while not (vehicle.up_m > 2.8 and policy_turns(policy, vehicle)):
-        vehicle.step(policy.predict_fast(FEATURE, vehicle.state(), HISTORY, 1)[0, 0])
+    vehicle = Vehicle("sticks")
+    policy, _ = fly("square", 5.0, vehicle)
+    while True:
+        fly_on(policy, STEP_S, vehicle)
+        chunk = policy.predict_fast(FEATURE, vehicle.state(), HISTORY, 1)[0]
         assert vehicle.now_s < 20.0
-    chunk = policy.predict_fast(FEATURE, vehicle.state(), HISTORY, 1)[0]
-    pitch, roll = chunk[:, 2], chunk[:, 3]
-    assert pitch[0] > pitch[-1] + 0.3  # forward now, not any more after the corner
-    assert roll[-1] > roll[0] + 0.3
-
-
-def policy_turns(policy: ScriptedPolicy, vehicle: PointMass) -> bool:
-    """Whether the chunk holds the corner from the first leg to the second."""
-    chunk = policy.predict_fast(FEATURE, vehicle.state(), HISTORY, 1)[0]
-    return bool(chunk[-1, 3] > chunk[0, 3] + 0.3)
+        if chunk[-1, 3] > chunk[0, 3] + 0.3:  # to the right after the corner, not yet now
+            break
+    assert chunk[0, 2] > chunk[-1, 2] + 0.3
 
 
 def test_a_pause_of_the_loop_is_not_integrated_as_climb() -> None:
-    vehicle = PointMass(climb_mps=1.0)
+    vehicle = Vehicle("sticks", climb_mps=1.0)
     policy = ScriptedPolicy("hover", lambda: vehicle.now_s)
     policy.predict_fast(FEATURE, vehicle.state(), HISTORY, 1)
     vehicle.now_s += 60.0
@@ -183,18 +270,19 @@ def test_a_pause_of_the_loop_is_not_integrated_as_climb() -> None:
     assert throttle > 0.2
 
 
+@pytest.mark.parametrize("kind", KINDS)
 @pytest.mark.parametrize("program", PROGRAM_NAMES)
-def test_speaks_the_whole_protocol(program: str) -> None:
-    policy = ScriptedPolicy(program, lambda: 0.0)
+def test_speaks_the_whole_protocol(program: str, kind: ActionKind) -> None:
+    policy = ScriptedPolicy(program, lambda: 0.0, action=kind)
     assert isinstance(policy, DualRatePolicy)
+    contract = policy.contract
+    assert (contract.action, contract.velocity_frame) == (kind, "heading")
+    assert (contract.state_frame, contract.hover_thrust) == ("ned_frd", 0.39)
     image = np.random.default_rng(0).normal(size=(1, 3, 224, 224)).astype(np.float32)
     feature = policy.encode_visual(image)
-    assert feature.shape == (1, policy.contract.feature_dim)
-    assert feature.dtype == np.float32
-    np.testing.assert_allclose(feature[0, :3], image.mean(axis=(0, 2, 3)), atol=0.05)
-    chunk = policy.predict(image, PointMass().state(), HISTORY, 10)
-    assert chunk.shape == (1, 16, 4)
-    assert chunk.dtype == np.float32
+    assert (feature.shape, feature.dtype) == ((1, contract.feature_dim), np.float32)
+    chunk = policy.predict(image, Vehicle(kind).state(), HISTORY, 10)
+    assert (chunk.shape, chunk.dtype) == ((1, 16, 4), np.float32)
 
 
 def test_refuses_what_it_cannot_fly() -> None:
@@ -202,3 +290,5 @@ def test_refuses_what_it_cannot_fly() -> None:
         ScriptedPolicy("loop", lambda: 0.0)
     with pytest.raises(PolicyError, match=r"\[1, 13\]"):
         ScriptedPolicy("hover", lambda: 0.0).predict_fast(FEATURE, np.zeros((2, 13)), HISTORY, 1)
+    with pytest.raises(PolicyError, match="velocity"):
+        ScriptedPolicy("hover", lambda: 0.0, action="position")  # type: ignore[arg-type]

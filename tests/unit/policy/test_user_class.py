@@ -71,9 +71,7 @@ def test_files_of_one_name_are_two_policies(folder: Path) -> None:
     assert values == pytest.approx([0.1, 0.2, 0.1])
 
 
-def test_a_package_offers_what_its_init_names(
-    folder: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_package_offers_what_its_init_names(folder, monkeypatch):
     package = folder / "user_package_of_a_test"
     package.mkdir()
     (package / "__init__.py").write_text("from .inner import Flying as Flying\n")
@@ -89,19 +87,16 @@ def test_a_package_offers_what_its_init_names(
     [
         ("./flying.py", r"names no class: write \./flying\.py:Class"),
         ("./absent.py:Flying", r"no file absent\.py.*\['flying\.py', 'neighbour\.py'\]"),
-        ("./flying:Flying", r"is not a Python file; did you mean flying\.py:Flying\?"),
-        ("./weights.txt:Flying", r"is not a Python file; write toge"),
-        ("./:Flying", "is a folder"),
+        ("./weights.txt:Flying", r"not a Python file: weights\.txt; .*'flying\.py'"),
+        ("./:Flying", "not a Python file"),
         ("./flying.py:", "names no class"),
         ("./flying.py:Fly-ing", "is unknown; write"),
-        ("flying.Flying", "did you mean flying:Flying"),
+        ("flying.Flying", "is unknown; write"),
         ("flying:Flying:5", "is unknown; write"),
         ("no_such_module:Flying", r"no module no_such_module.*\./file\.py:Class"),
     ],
 )
-def test_a_wrong_form_is_refused_before_any_code_of_the_users_runs(
-    folder: Path, spec: str, message: str
-) -> None:
+def test_a_wrong_form_is_refused_before_any_code_of_the_users_runs(folder, spec, message):
     with pytest.raises(PolicyError, match=message):
         check_request(PolicyRequest(spec=spec))
 
@@ -121,11 +116,6 @@ def test_a_file_that_cannot_be_imported_says_why(folder: Path, code: str, messag
     for _ in range(2):  # nothing half imported is left behind
         with pytest.raises(PolicyError, match=message):
             load("./broken.py:Flying")
-
-
-def test_other_classes_of_a_file_are_named(folder: Path) -> None:
-    with pytest.raises(PolicyError, match=r"no class Walking there; it has \['Flying'\]"):
-        load("./flying.py:Walking")
 
 
 LIFE = """
@@ -239,8 +229,6 @@ def test_a_failure_to_close_is_said_and_hides_no_other(life: str) -> None:
         ("CloseIsNoMethod", "close must be a method without arguments.*it is 3"),
     ],
 )
-def test_a_close_that_cannot_be_called_is_refused_at_loading(
-    life: str, name: str, message: str
-) -> None:
+def test_a_close_that_cannot_be_called_is_refused_at_loading(life, name, message):
     with pytest.raises(PolicyError, match=message):
         load(f"{life}:{name}")

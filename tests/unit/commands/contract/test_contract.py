@@ -9,9 +9,9 @@ from typing import Any
 import pytest
 
 from mavbridge.__main__ import main
+from policy.adapters.interface import read_interface
 from policy.contract import ACTION_NAMES, STATE_NAMES
 from policy.errors import ContractError
-from policy.foreign.interface import read_interface
 
 CAMERA = "observation.images.front"
 

@@ -7,8 +7,8 @@ import pytest
 
 from mavbridge.commands.config import ContractConfig
 from mavbridge.commands.contract import contract
+from policy.adapters.interface import read_interface
 from policy.errors import CheckpointError, ContractError
-from policy.foreign.interface import read_interface
 
 onnx = pytest.importorskip("onnx", reason="the extra onnx writes the graphs")
 

@@ -14,6 +14,8 @@ from mavbridge.commands.config import ExportConfig
 from mavbridge.commands.export.rows import stretches
 from mavbridge.commands.export.run import export
 from mavbridge.core.errors import UserError
+from policy.adapters.interface import Interface, read_interface
+from policy.adapters.state import BODY_STATE_NAMES
 from policy.contract import Contract
 from policy.data.flight_data import DatasetError
 from policy.data.flight_folders import read_flight
@@ -21,8 +23,6 @@ from policy.data.lerobot import read_dataset
 from policy.data.lerobot_format import STATE_KEY
 from policy.data.tables import vectors
 from policy.errors import ContractError
-from policy.foreign.interface import Interface, read_interface
-from policy.foreign.state import BODY_STATE_NAMES
 from policy.preprocess import resize
 
 USUAL = Contract()

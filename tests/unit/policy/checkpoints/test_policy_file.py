@@ -1,7 +1,6 @@
 import json
 import os
 import pickle
-import struct
 from pathlib import Path
 from typing import Any
 
@@ -90,9 +89,7 @@ def test_a_test_vector_is_carried_and_kept(small_toge: Toge, saved: Path) -> Non
         ({"head.unet.out.weight": lambda x: -x}, "do not make the sticks that they made"),
     ],
 )
-def test_weights_that_do_not_make_their_vector_are_refused(
-    small_toge: Toge, saved: Path, tmp_path: Path, changes: dict[str, Any], message: str
-) -> None:
+def test_weights_that_do_not_make_their_vector(small_toge, saved, tmp_path, changes, message):
     contents = contents_of(saved)
     for name, change in changes.items():
         changed = change(contents.pop(name))
@@ -104,15 +101,6 @@ def test_weights_that_do_not_make_their_vector_are_refused(
         load_checkpoint(path, fallback=small_toge.config)
 
 
-@pytest.mark.parametrize("size", [(224, 224), (40, 64)])
-def test_a_vector_of_any_image_size_is_written(size: tuple[int, int], tmp_path: Path) -> None:
-    contract = Contract(image_height=size[0], image_width=size[1])
-    config = TogeConfig(backbone="resnet18", contract=contract)
-    save_checkpoint(tmp_path / "a.safetensors", build_policy(config).eval())
-    policy = load_checkpoint(tmp_path / "a.safetensors", fallback=config)
-    assert (policy.contract.image_height, policy.contract.image_width) == size
-
-
 def test_resnet_unet_round_trips(tmp_path: Path) -> None:
     policy = build_policy(ResnetUnetConfig(contract=SMALL))
     save_checkpoint(tmp_path / "a.safetensors", policy)
@@ -122,24 +110,12 @@ def test_resnet_unet_round_trips(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("key", ["model_state_dict", "state_dict", None])
 @pytest.mark.parametrize("suffix", [".pt", ".pth"])
-def test_torch_files_load_in_their_usual_forms(
-    small_toge: Toge, tmp_path: Path, key: str | None, suffix: str
-) -> None:
+def test_torch_files_load_in_their_usual_forms(small_toge, tmp_path, key, suffix):
     path = tmp_path / f"a{suffix}"
     state = small_toge.state_dict()
     torch.save({key: state, "epoch": 3} if key else state, path)
     loaded = load_checkpoint(path, fallback=small_toge.config)
     assert torch.equal(loaded.state_dict()["fusion.mlp.0.weight"], state["fusion.mlp.0.weight"])
-
-
-def test_a_torch_file_may_carry_the_header(small_toge: Toge, saved: Path, tmp_path: Path) -> None:
-    header = header_of(saved)
-    path = tmp_path / "a.pt"
-    torch.save({**header, "state_dict": small_toge.state_dict()}, path)
-    assert load_checkpoint(path, fallback=TogeConfig(size="large")).config == small_toge.config
-    torch.save({**header, "contract": {"horizon": 16}, **small_toge.state_dict()}, path)
-    with pytest.raises(CheckpointError, match="'contract' must be JSON text"):
-        load_checkpoint(path, fallback=TogeConfig())
 
 
 class Malicious:
@@ -153,9 +129,7 @@ class Malicious:
 
 
 @pytest.mark.parametrize("protocol", [None, 0, 2, 4])
-def test_a_malicious_pickle_is_refused_and_not_run(
-    small_toge: Toge, tmp_path: Path, protocol: int | None
-) -> None:
+def test_a_malicious_pickle_is_refused_and_not_run(small_toge, tmp_path, protocol):
     marker, path = tmp_path / "ran", tmp_path / "a.pt"
     content = {"state_dict": {"weight": Malicious(marker)}}
     if protocol is None:
@@ -167,43 +141,6 @@ def test_a_malicious_pickle_is_refused_and_not_run(
     assert not marker.exists()
 
 
-@pytest.mark.parametrize("suffix", [".safetensors", ".pt"])
-@pytest.mark.parametrize("kept", [0.0, 0.001, 0.5, 0.999])
-def test_a_truncated_file_is_refused(
-    small_toge: Toge, saved: Path, tmp_path: Path, suffix: str, kept: float
-) -> None:
-    whole = saved
-    if suffix == ".pt":
-        whole = tmp_path / "whole.pt"
-        torch.save(small_toge.state_dict(), whole)
-    content = whole.read_bytes()
-    path = tmp_path / f"cut{suffix}"
-    path.write_bytes(content[: int(kept * len(content))])
-    with pytest.raises(CheckpointError, match=path.name):
-        load_checkpoint(path, fallback=small_toge.config)
-
-
-@pytest.mark.parametrize("suffix", [".safetensors", ".pt"])
-@pytest.mark.parametrize(
-    "content",
-    [b"\x00" * 64, b"not a checkpoint", b"PK\x03\x04 not really a zip", b"\x80\x02]q\x00."],
-)
-def test_a_corrupt_file_is_refused(
-    small_toge: Toge, tmp_path: Path, suffix: str, content: bytes
-) -> None:
-    path = tmp_path / f"bad{suffix}"
-    path.write_bytes(content)
-    with pytest.raises(CheckpointError, match=path.name):
-        load_checkpoint(path, fallback=small_toge.config)
-
-
-def test_a_lying_header_length_is_refused(small_toge: Toge, tmp_path: Path) -> None:
-    path = tmp_path / "bad.safetensors"
-    path.write_bytes(struct.pack("<Q", 1 << 60) + b"{}")
-    with pytest.raises(CheckpointError, match="cannot be read"):
-        load_checkpoint(path, fallback=small_toge.config)
-
-
 def test_a_missing_file_names_what_is_there(small_toge: Toge, saved: Path) -> None:
     with pytest.raises(CheckpointError, match=r"no such file.*toge\.safetensors"):
         load_checkpoint(saved.with_name("other.pt"), fallback=small_toge.config)
@@ -211,9 +148,7 @@ def test_a_missing_file_names_what_is_there(small_toge: Toge, saved: Path) -> No
         load_checkpoint(saved.with_suffix(".onnx"), fallback=small_toge.config)
 
 
-def test_nan_weights_are_refused_on_both_ways(
-    small_toge: Toge, saved: Path, tmp_path: Path
-) -> None:
+def test_nan_weights_are_refused_on_both_ways(small_toge, saved, tmp_path):
     path = tmp_path / "a.safetensors"
     poisoned = {"fine": torch.zeros(2), "fusion.mlp.0.weight": torch.tensor([1.0, float("nan")])}
     save_file(poisoned, path, metadata=header_of(saved))
@@ -234,9 +169,7 @@ def test_nan_weights_are_refused_on_both_ways(
         ("fusion.mlp.0.bias", torch.zeros(3, 7), r"is \[3, 7\], must be \[512\]"),
     ],
 )
-def test_weights_that_do_not_fit_are_named(
-    small_toge: Toge, tmp_path: Path, name: str, tensor: torch.Tensor | None, message: str
-) -> None:
+def test_weights_that_do_not_fit_are_named(small_toge, tmp_path, name, tensor, message):
     state = {**small_toge.state_dict(), name: tensor}
     path = tmp_path / "a.pt"
     torch.save({key: value for key, value in state.items() if value is not None}, path)
@@ -259,9 +192,7 @@ def test_weights_that_do_not_fit_are_named(
         ("architecture", {"schedule": {"betas": "quadratic"}}, "betas 'quadratic' is unknown"),
     ],
 )
-def test_headers_of_another_build_are_refused(
-    saved: Path, tmp_path: Path, key: str, changes: dict[str, Any], message: str
-) -> None:
+def test_headers_of_another_build_are_refused(saved, tmp_path, key, changes, message):
     header = header_of(saved)
     header[key] = json.dumps({**json.loads(header[key]), **changes})
     path = with_header(tmp_path / "a.safetensors", header)
@@ -277,18 +208,14 @@ NONSENSE = ["[" * 100_000, "null", "[]", "{"]
     ("key", "text"),
     [*(("contract", text) for text in NONSENSE), *(("architecture", t) for t in [*NONSENSE, "{}"])],
 )
-def test_header_text_that_is_nonsense_is_refused(
-    saved: Path, tmp_path: Path, key: str, text: str
-) -> None:
+def test_header_text_that_is_nonsense_is_refused(saved, tmp_path, key, text):
     path = with_header(tmp_path / "a.safetensors", {**header_of(saved), key: text})
     with pytest.raises(CheckpointError, match=r"a\.safetensors"):
         load_checkpoint(path, fallback=TogeConfig())
 
 
 @pytest.mark.parametrize("key", ["contract", "architecture"])
-def test_a_file_without_header_says_how_to_convert_it(
-    saved: Path, tmp_path: Path, key: str
-) -> None:
+def test_a_file_without_header_says_how_to_convert_it(saved, tmp_path, key):
     header = header_of(saved)
     del header[key]
     path = with_header(tmp_path / "a.safetensors", header)
@@ -299,16 +226,6 @@ def test_a_file_without_header_says_how_to_convert_it(
 def test_another_kind_of_policy_is_refused(saved: Path) -> None:
     with pytest.raises(CheckpointError, match="--policy toge"):
         load_checkpoint(saved, fallback=ResnetUnetConfig())
-
-
-@pytest.mark.parametrize("content", [[1, 2], {"epoch": 3}, {}, torch.zeros(3), {"state_dict": {}}])
-def test_a_torch_file_without_weights_is_refused(
-    small_toge: Toge, tmp_path: Path, content: Any
-) -> None:
-    path = tmp_path / "a.pt"
-    torch.save(content, path)
-    with pytest.raises(CheckpointError):
-        load_checkpoint(path, fallback=small_toge.config)
 
 
 def test_a_path_that_cannot_be_written_is_refused(small_toge: Toge, tmp_path: Path) -> None:

@@ -230,9 +230,7 @@ def test_some_flights_are_held_out_and_some_are_kept(tmp_path: Path) -> None:
         ({"source": "pilot", "success": False}, "marked as bad"),
     ],
 )
-def test_a_failed_flight_is_nothing_to_imitate(
-    tmp_path: Path, meta: dict[str, object], failure: str | None
-) -> None:
+def test_a_failed_flight_is_nothing_to_imitate(tmp_path, meta, failure):
     write_meta(tmp_path / "flight", **meta)
     assert failure_of(tmp_path / "flight") == failure
 
@@ -249,9 +247,7 @@ def test_a_failed_flight_is_nothing_to_imitate(
         ({"action": "rates"}, "without an expert"),
     ],
 )
-def test_actions_that_nothing_here_learns_from_are_refused(
-    tmp_path: Path, contract: dict[str, object], says: str
-) -> None:
+def test_actions_that_nothing_here_learns_from_are_refused(tmp_path, contract, says):
     folder = flight(
         tmp_path / "a",
         ticks_table(woke_ns=WOKE, expert=None, sent=[STICK] * 3),

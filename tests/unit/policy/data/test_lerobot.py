@@ -211,9 +211,7 @@ def _scalar_state(root: Path) -> None:
         (lambda root: (root / "meta/info.json").write_text("{"), "not JSON"),
     ],
 )
-def test_a_damaged_dataset_is_refused(
-    spoil: Callable[[Path], object], says: str, tmp_path: Path
-) -> None:
+def test_a_damaged_dataset_is_refused(spoil, says, tmp_path):
     spoil(write(tmp_path / "a"))
     with pytest.raises(DatasetError, match=says):
         read_dataset(tmp_path / "a")

@@ -169,11 +169,6 @@ def test_the_runtime_gives_the_same_motion_since_exposure() -> None:
             np.testing.assert_allclose(told, expected, atol=1e-6)
 
 
-def test_without_since_exposure_the_state_has_13_numbers() -> None:
-    line = timeline(flown(), contract=Contract())
-    np.testing.assert_array_equal(line.states(line.frames[:1], np.array([50])), flown().state[[50]])
-
-
 def test_ticks_are_drawn_at_measured_ages() -> None:
     line = timeline(flown(), flown(seed=1))
     random = np.random.default_rng(0)

@@ -10,11 +10,9 @@ import pytest
 import torch
 
 from policy.contract import Contract, FloatArray
-from policy.engines.choose import Candidate, choose_executable, chunks_of_samples, first_that_agrees
-from policy.engines.executable import EngineName, ExecutionSettings
-from policy.engines.openvino_compile import precisions
-from policy.engines.openvino_cpu import make_openvino_executable
-from policy.engines.parity import MAX_STICK_ERROR, make_parity_samples, parity_failure
+from policy.engines.choose import Candidate, choose_executable, first_that_agrees
+from policy.engines.executable import ExecutionSettings
+from policy.engines.parity import MAX_STICK_ERROR
 from policy.engines.torch_eager import make_torch_executable
 from policy.errors import PolicyError
 from policy.nets.toge import Toge
@@ -64,9 +62,7 @@ def shifted(chunk: FloatArray) -> FloatArray:
         (lambda chunk: chunk[:, :8], r"chunks of shape \[4, 8, 4\]"),
     ],
 )
-def test_a_wrong_engine_is_passed_over_with_its_reason(
-    small_toge: Toge, alter: Callable[[FloatArray], FloatArray], reason: str
-) -> None:
+def test_a_wrong_engine_is_passed_over_with_its_reason(small_toge, alter, reason):
     executable, notes = first_that_agrees(small_toge, [altered(small_toge, alter)], SETTINGS)
     assert executable.engine == "torch"
     assert len(notes) == 1
@@ -87,39 +83,6 @@ def test_an_engine_that_fails_is_passed_over(small_toge: Toge, error: Exception)
     assert "agrees with torch" in notes[1]
 
 
-def test_the_default_on_a_cpu_is_openvino(small_toge: Toge) -> None:
-    executable, notes = choose_executable(small_toge, "auto", SETTINGS)
-    assert executable.engine.startswith("openvino")
-    assert "agrees with torch" in notes[-1]
-    samples = make_parity_samples(small_toge.contract)
-    reference, quiet = choose_executable(small_toge, "torch", SETTINGS)
-    assert (reference.engine, quiet) == ("torch", ())
-    assert (
-        parity_failure(
-            chunks_of_samples(reference, samples), chunks_of_samples(executable, samples)
-        )
-        is None
-    )
-
-
-def test_the_fastest_precision_that_passes_is_taken_and_the_others_are_named(
-    trained_toge: Toge,
-) -> None:
-    policy, settings = trained_toge, ExecutionSettings(name="toge", num_diffusion_steps=1)
-    samples = make_parity_samples(policy.contract)
-    expected = chunks_of_samples(make_torch_executable(policy, settings), samples)
-    failed = []
-    for vision, action in precisions():
-        first = make_openvino_executable(policy, settings, vision, action)
-        if parity_failure(expected, chunks_of_samples(first, samples)) is None:
-            break
-        failed.append(f"openvino (images {vision}, actions {action}) is passed over: a stick is")
-    executable, notes = choose_executable(policy, "auto", settings)
-    assert executable.engine == first.engine
-    assert len(notes) == len(failed) + 1
-    assert all(reason in note for reason, note in zip(failed, notes[:-1], strict=True))
-
-
 def test_without_openvino_torch_flies(small_toge: Toge, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("policy.engines.choose.find_spec", lambda name: None)
     executable, _ = choose_executable(small_toge, "auto", SETTINGS)
@@ -135,9 +98,7 @@ def test_without_openvino_torch_flies(small_toge: Toge, monkeypatch: pytest.Monk
         ("openvino", "cuda:1", "runs on --device cpu, not on"),
     ],
 )
-def test_an_engine_asked_for_on_the_wrong_device_is_refused(
-    small_toge: Toge, engine: EngineName, device: str, message: str
-) -> None:
+def test_an_engine_asked_for_on_the_wrong_device_is_refused(small_toge, engine, device, message):
     settings = replace(SETTINGS, vision_device=device, action_device=device)
     with pytest.raises(PolicyError, match=message):
         choose_executable(small_toge, engine, settings)
@@ -156,16 +117,3 @@ def test_engines_of_our_networks_do_not_take_others() -> None:
     assert choose_executable(policy, "auto", single)[0].engine == "torch"
     with pytest.raises(PolicyError, match=r"takes a torch\.nn\.Module"):
         choose_executable(policy, "openvino", single)
-
-
-def test_the_probe_reaches_all_that_a_policy_looks_at(small_toge: Toge) -> None:
-    samples = make_parity_samples(small_toge.contract)
-    again = make_parity_samples(small_toge.contract)
-    np.testing.assert_array_equal(samples.rgb, again.rgb)
-    assert samples.rgb.min() < 30 < 220 < samples.rgb.max()
-    assert not np.array_equal(samples.rgb[0], samples.rgb[1])
-    np.testing.assert_allclose(np.linalg.norm(samples.state[:, 3:7], axis=1), 1, rtol=1e-6)
-    asked = make_parity_samples(replace(small_toge.contract, since_exposure=True))
-    np.testing.assert_array_equal(asked.state[:, :13], samples.state)
-    assert asked.state.shape == (4, 20)
-    assert (asked.state[:, 13:] != 0).all()

@@ -12,7 +12,7 @@ from policy.engines.torch_eager import make_torch_executable
 from policy.errors import PolicyError
 from policy.nets.toge import Toge
 from policy.preprocess import image_to_input
-from policy.protocol import Executable, SingleRatePolicy
+from policy.protocol import SingleRatePolicy
 from policy.scripted import ScriptedPolicy
 
 RGB = np.random.default_rng(0).integers(0, 255, (120, 160, 3), dtype=np.uint8)
@@ -71,9 +71,7 @@ def test_numpy_policies_are_called_as_they_are(dual_rate: bool) -> None:
 
 
 @pytest.mark.parametrize("make", [make_numpy_executable, make_torch_executable])
-def test_a_persons_policy_that_asks_gets_the_motion_since_the_exposure(
-    make: Callable[..., Executable],
-) -> None:
+def test_a_persons_policy_that_asks_gets_the_motion_since_the_exposure(make):
     seen: list[tuple[int, ...]] = []
     policy = Fake(act=lambda feature, state: seen.append(tuple(state.shape)) or CHUNK)
     policy.contract = replace(policy.contract, since_exposure=True)
@@ -125,9 +123,7 @@ def raises(error: Exception) -> Callable[..., Any]:
         ({"act": raises(KeyError("x"))}, r"image \[1, 3, 16, 16\], state \[1, 13\]"),
     ],
 )
-def test_a_policy_that_breaks_its_contract_never_flies(
-    parts: dict[str, Callable[..., Any]], message: str
-) -> None:
+def test_a_policy_that_breaks_its_contract_never_flies(parts, message):
     with pytest.raises(PolicyError, match=message):
         make_numpy_executable(Fake(**parts), ExecutionSettings(name="fake"))
 

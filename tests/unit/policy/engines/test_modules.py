@@ -66,9 +66,7 @@ def test_the_solver_runs_around_a_graph_of_one_step(dual_rate: bool) -> None:
     require_parity(Stepwise(), replace(SETTINGS, num_diffusion_steps=10, dual_rate=dual_rate))
 
 
-def test_a_solver_that_is_no_policy_s_own_step_is_not_unrolled_over_its_weights(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
+def test_a_solver_that_is_no_policy_s_own_step_is_not_unrolled_over_its_weights(monkeypatch):
     weights = sum(value.numel() for value in Stepwise().parameters())
     monkeypatch.setattr(openvino_modules, "MAX_WEIGHTS", weights)
     require_parity(Stepwise(), SETTINGS)

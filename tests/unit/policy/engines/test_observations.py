@@ -74,9 +74,7 @@ def seen_by(executable: Executable, policy: Remembering) -> tuple[np.ndarray, np
         (2, 2, [[10, 0, 0, 20, 1, 0], [30, 0, 0, 40, 1, 0]]),
     ],
 )
-def test_features_stand_side_by_side_by_camera_and_oldest_first(
-    steps: int, cameras: int, expected: list[Any]
-) -> None:
+def test_features_stand_side_by_side_by_camera_and_oldest_first(steps, cameras, expected):
     policy = Remembering(contract_of(steps, cameras))
     executable = make_numpy_executable(policy, ExecutionSettings(name="mine"))
     feature, _ = seen_by(executable, policy)
@@ -88,9 +86,7 @@ def test_features_stand_side_by_side_by_camera_and_oldest_first(
     ("steps", "cameras", "expected"),
     [(1, 1, 10), (1, 2, [10, 20]), (2, 1, [10, 30]), (2, 2, GREYS)],
 )
-def test_single_rate_images_keep_camera_and_time_apart(
-    steps: int, cameras: int, expected: Any
-) -> None:
+def test_single_rate_images_keep_camera_and_time_apart(steps, cameras, expected):
     policy = Remembering(contract_of(steps, cameras))
     settings = ExecutionSettings(name="mine", dual_rate=False)
     image, _ = seen_by(make_numpy_executable(policy, settings), policy)

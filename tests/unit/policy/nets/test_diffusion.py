@@ -6,9 +6,8 @@ import torch
 from torch import Tensor
 
 from policy.errors import PolicyError
-from policy.nets.diffusion import BetaSchedule, NoiseSchedule, Prediction, ddim_solve
+from policy.nets.diffusion import BetaSchedule, NoiseSchedule, ddim_solve
 
-STEP_COUNTS = [1, 2, 3, 7, 10, 33, 50, 99, 100]
 SCHEDULES: list[BetaSchedule] = ["squared_cosine", "linear"]
 
 
@@ -21,10 +20,6 @@ def solve(schedule: NoiseSchedule, count: int, denoise: object, noise: Tensor) -
         lambda index, x: denoise(steps[index].signal, steps[index].noise, x),  # type: ignore[operator]
         noise,
     )
-
-
-def standard_normal(*shape: int) -> Tensor:
-    return torch.randn(*shape, generator=torch.Generator().manual_seed(1), dtype=torch.float64)
 
 
 def test_squared_cosine_schedule_by_hand() -> None:
@@ -44,13 +39,6 @@ def test_linear_schedule_by_hand() -> None:
     assert power[99] < 1e-4
 
 
-@pytest.mark.parametrize("betas", SCHEDULES)
-def test_signal_falls_at_every_timestep(betas: BetaSchedule) -> None:
-    power = NoiseSchedule(betas=betas).signal_power()
-    assert all(after < before for before, after in pairwise(power))
-    assert 0 < power[-1] < power[0] < 1
-
-
 @pytest.mark.parametrize("count", range(1, 101))
 def test_steps_start_at_pure_noise_and_end_clean(count: int) -> None:
     steps = NoiseSchedule().ddim_steps(count)
@@ -63,22 +51,6 @@ def test_steps_start_at_pure_noise_and_end_clean(count: int) -> None:
     for step, following in pairwise(steps):
         assert (step.next_signal, step.next_noise) == (following.signal, following.noise)
         assert step.signal**2 + step.noise**2 == pytest.approx(1.0)
-
-
-@pytest.mark.parametrize("prediction", ["epsilon", "sample"])
-@pytest.mark.parametrize("betas", SCHEDULES)
-@pytest.mark.parametrize("count", STEP_COUNTS)
-def test_a_perfect_net_recovers_the_clean_sample(
-    count: int, betas: BetaSchedule, prediction: Prediction
-) -> None:
-    schedule = NoiseSchedule(betas=betas, prediction=prediction)
-    clean = standard_normal(2, 16, 4).clamp(-1, 1)
-
-    def denoise(signal: float, noise_scale: float, x: Tensor) -> Tensor:
-        return clean if prediction == "sample" else (x - signal * clean) / noise_scale
-
-    result = solve(schedule, count, denoise, standard_normal(2, 16, 4))
-    torch.testing.assert_close(result, clean, atol=1e-9, rtol=0)
 
 
 def test_one_step_is_the_nets_estimate_of_the_clean_sample() -> None:
@@ -117,27 +89,11 @@ def gaussian_error(schedule: NoiseSchedule, count: int) -> float:
 
 @pytest.mark.parametrize("prediction", ["epsilon", "sample"])
 @pytest.mark.parametrize("betas", SCHEDULES)
-def test_gaussian_data_converges_to_the_probability_flow(
-    betas: BetaSchedule, prediction: Prediction
-) -> None:
+def test_gaussian_data_converges_to_the_probability_flow(betas, prediction):
     schedule = NoiseSchedule(betas=betas, prediction=prediction)
     errors = [gaussian_error(schedule, count) for count in (5, 10, 25, 50, 100)]
     assert errors == sorted(errors, reverse=True)
     assert errors[-1] < 0.15
-
-
-@pytest.mark.parametrize("betas", SCHEDULES)
-def test_solver_is_of_first_order(betas: BetaSchedule) -> None:
-    schedule = NoiseSchedule(betas=betas, num_train_timesteps=1000)
-    coarse, fine = (gaussian_error(schedule, count) for count in (250, 1000))
-    assert coarse / fine == pytest.approx(4.0, rel=0.3)
-    assert fine < 0.03
-
-
-def test_one_step_on_gaussian_data_collapses_to_the_mean() -> None:
-    noise = torch.linspace(-3, 3, 13, dtype=torch.float64)
-    result = solve(NoiseSchedule(), 1, gaussian_posterior_mean, noise)
-    assert float(result.abs().max()) < 1e-4
 
 
 def test_add_noise_has_the_schedules_mean_and_variance() -> None:
@@ -149,13 +105,6 @@ def test_add_noise_has_the_schedules_mean_and_variance() -> None:
         power = schedule.signal_power()[t]
         assert float(noisy.mean()) == pytest.approx(0.5 * math.sqrt(power), abs=0.03)
         assert float(noisy.var()) == pytest.approx(1 - power, rel=0.05)
-
-
-def test_add_noise_takes_a_timestep_per_sample() -> None:
-    schedule = NoiseSchedule()
-    noisy = schedule.add_noise(torch.ones(2, 3), torch.zeros(2, 3), torch.tensor([0, 99]))
-    expected = [math.sqrt(schedule.signal_power()[t]) for t in (0, 99)]
-    torch.testing.assert_close(noisy, torch.tensor(expected)[:, None].expand(2, 3))
 
 
 @pytest.mark.parametrize("count", [0, -1, 101, 10.0, True, "10"])
@@ -182,9 +131,7 @@ def test_refuses_unknown_schedules(changes: dict[str, object]) -> None:
     ("noise_shape", "timestep"),
     [((2, 4), [0, 0]), ((2, 3), [0]), ((2, 3), [0, 100]), ((2, 3), [-1, 0])],
 )
-def test_add_noise_refuses_what_does_not_fit(
-    noise_shape: tuple[int, ...], timestep: list[int]
-) -> None:
+def test_add_noise_refuses_what_does_not_fit(noise_shape, timestep):
     with pytest.raises(PolicyError):
         NoiseSchedule().add_noise(
             torch.zeros(2, 3), torch.zeros(noise_shape), torch.tensor(timestep)

@@ -6,7 +6,7 @@ from policy.checkpoints.policy_file import BuiltinPolicy
 from policy.contract import Contract
 from policy.errors import ContractError, PolicyError
 from policy.nets.action_head import DiffusionHead
-from policy.nets.diffusion import NoiseSchedule, Prediction
+from policy.nets.diffusion import NoiseSchedule
 from policy.nets.resnet_unet import ResnetUnet, ResnetUnetConfig
 from policy.nets.toge import Toge, TogeConfig
 from policy.protocol import DualRatePolicy, SingleRatePolicy
@@ -18,11 +18,6 @@ def sample(batch: int = 1) -> tuple[Tensor, Tensor, Tensor]:
     image = torch.randn(batch, 3, 32, 32, generator=generator)
     state = torch.randn(batch, 13, generator=generator)
     return image, state, torch.rand(batch, 4, 4, generator=generator) * 2 - 1
-
-
-def test_keeps_the_dual_rate_protocol(small_toge: Toge) -> None:
-    assert isinstance(small_toge, DualRatePolicy)
-    assert small_toge.contract.feature_dim == 256
 
 
 @torch.inference_mode()
@@ -74,13 +69,6 @@ def test_every_input_reaches_the_sticks(small_toge: Toge, changed: str) -> None:
 
 
 @torch.inference_mode()
-def test_order_of_the_history_matters(small_toge: Toge) -> None:
-    image, state, history = sample()
-    base = small_toge.predict(image, state, history, 2)
-    assert not torch.equal(small_toge.predict(image, state, history.flip(1), 2), base)
-
-
-@torch.inference_mode()
 def test_a_quaternion_and_its_negative_are_one_attitude(small_toge: Toge) -> None:
     image, state, history = sample()
     state[:, 3:7] = torch.tensor([0.5, -0.5, 0.5, 0.5])
@@ -118,13 +106,6 @@ def test_a_seed_fixes_the_noise_of_a_flight() -> None:
 
 
 @torch.inference_mode()
-@pytest.mark.parametrize("steps", [0, 101])
-def test_refuses_impossible_step_counts(small_toge: Toge, steps: int) -> None:
-    with pytest.raises(PolicyError, match=r"1\.\.100"):
-        small_toge.predict(*sample(), steps)
-
-
-@torch.inference_mode()
 def test_refuses_wrong_shapes_and_names_them(small_toge: Toge) -> None:
     image, state, history = sample()
     with pytest.raises(PolicyError, match=r"image must be \[B, 3, 32, 32\]"):
@@ -140,9 +121,7 @@ def test_refuses_wrong_shapes_and_names_them(small_toge: Toge) -> None:
 
 @torch.inference_mode()
 @pytest.mark.parametrize("kind", [TogeConfig, ResnetUnetConfig])
-def test_every_number_since_the_exposure_reaches_the_sticks(
-    kind: type[TogeConfig | ResnetUnetConfig],
-) -> None:
+def test_every_number_since_the_exposure_reaches_the_sticks(kind):
     image, state, history = sample()
     contract = Contract(image_height=32, image_width=32, since_exposure=True)
     if kind is TogeConfig:
@@ -195,27 +174,8 @@ def test_resnet_unet_flies_single_rate_only() -> None:
         policy.predict(image, state, history[:, :2], 3)
 
 
-@torch.inference_mode()
-def test_reference_network_at_its_real_size() -> None:
-    torch.manual_seed(0)
-    policy = Toge(TogeConfig()).eval()
-    feature = policy.encode_visual(torch.randn(1, 3, 224, 224))
-    chunk = policy.predict_fast(feature, torch.zeros(1, 13), torch.zeros(1, 4, 4), 2)
-    assert feature.shape == (1, 256)
-    assert chunk.shape == (1, 16, 4)
-    assert torch.isfinite(chunk).all()
-
-
-def test_no_history_is_one_of_centred_sticks(small_toge: Toge) -> None:
-    image, state, history = sample()
-    without = small_toge.predict(image, state, None, 2)
-    assert torch.equal(without, small_toge.predict(image, state, torch.zeros_like(history), 2))
-
-
 @pytest.mark.parametrize("prediction", ["sample", "epsilon"])
-def test_a_u_net_without_an_opinion_leaves_the_sticks_to_what_is_read_off_the_condition(
-    prediction: Prediction,
-) -> None:
+def test_a_u_net_without_an_opinion_leaves_the_sticks_to_what_is_read_off_the_condition(prediction):
     torch.manual_seed(0)
     head = DiffusionHead("small", Contract(), NoiseSchedule(prediction=prediction)).eval()
     torch.nn.init.zeros_(head.unet.out.weight)

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from policy.training.disturb import SHARE, disturb
+from policy.training.batches import SHARE, disturb
 
 
 def grey(count: int) -> np.ndarray:

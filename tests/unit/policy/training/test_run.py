@@ -106,31 +106,23 @@ def whole(flights: list[FlightData], tmp_path_factory: pytest.TempPathFactory) -
 
 
 @pytest.mark.parametrize("killed_at", [4, 6])  # in the encoder; in the head
-def test_a_run_that_was_killed_resumes_as_if_it_had_not_been(
-    flights: list[FlightData], whole: TrainResult, tmp_path: Path, killed_at: int
-) -> None:
+def test_a_run_that_was_killed_resumes_as_if_it_had_not_been(flights, whole, tmp_path, killed_at):
     train = partial(train_shortly, folder=tmp_path)
     check_resuming(train, flights, whole, killed_at=killed_at)
 
 
-def test_a_run_that_was_stopped_resumes_as_if_it_had_not_been(
-    flights: list[FlightData], whole: TrainResult, tmp_path: Path
-) -> None:
+def test_a_run_that_was_stopped_resumes_as_if_it_had_not_been(flights, whole, tmp_path):
     check_stopping(partial(train_shortly, folder=tmp_path), flights, whole, validated_at=4)
 
 
-def test_resnet_unet_trains_too_and_an_ablation_is_a_weight_of_zero(
-    flights: list[FlightData], tmp_path: Path
-) -> None:
+def test_resnet_unet_trains_too_and_an_ablation_is_a_weight_of_zero(flights, tmp_path):
     network = ResnetUnetConfig(contract=CONTRACT)
     made = settings(tmp_path, gate_weight=0.0, mirror=False, validations=1)
     result = run(flights[:2], made, network=network)
     assert load_checkpoint(result.checkpoint, fallback=network).contract == CONTRACT
 
 
-def test_a_closed_loop_check_decides_and_a_checkpoint_is_gone_on_from(
-    flights: list[FlightData], tmp_path: Path
-) -> None:
+def test_a_closed_loop_check_decides_and_a_checkpoint_is_gone_on_from(flights, tmp_path):
     scores = iter([0.9, 0.3])
     seen: list[Path] = []
 
@@ -169,9 +161,7 @@ def with_contract(checkpoint: Path, contract: Contract, path: Path) -> Path:
     return path
 
 
-def test_a_frozen_encoder_stays_and_the_head_learns(
-    flights: list[FlightData], tmp_path: Path, whole: TrainResult
-) -> None:
+def test_a_frozen_encoder_stays_and_the_head_learns(flights, tmp_path, whole):
     wider = replace(CONTRACT, modes=("LOITER",), max_chunk_age_s=1.0)
     start_from = with_contract(whole.checkpoint, wider, tmp_path / "start.safetensors")
     made = settings(tmp_path, start_from=start_from, freeze_encoder=True, steps=3)
@@ -189,9 +179,7 @@ def test_a_frozen_encoder_stays_and_the_head_learns(
 
 
 @pytest.mark.parametrize(("images", "rows"), [(4, [8, 8]), (16, [16, 32]), (64, [32, 128])])
-def test_in_training_the_denoiser_sees_a_part_of_many_samples(
-    flights: list[FlightData], tmp_path: Path, images: int, rows: list[int]
-) -> None:
+def test_in_training_the_denoiser_sees_a_part_of_many_samples(flights, tmp_path, images, rows):
     asked = settings(tmp_path, batch_size=images)
     store = store_frames(flights, tmp_path / "frames", 32)
     timeline = Timeline(flights, CONTRACT, np.array([40_000_000]))
@@ -205,9 +193,7 @@ def test_in_training_the_denoiser_sees_a_part_of_many_samples(
     assert seen == rows
 
 
-def test_images_are_disturbed_in_training_and_never_in_validation(
-    flights: list[FlightData], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_images_are_disturbed_in_training_and_never_in_validation(flights, tmp_path, monkeypatch):
     monkeypatch.setattr(batches_module, "disturb", lambda images, _random: images.fill(255))
     asked = settings(tmp_path)
     store = store_frames(flights, tmp_path / "frames", 32)
@@ -221,17 +207,13 @@ def test_images_are_disturbed_in_training_and_never_in_validation(
     assert not (batches.images(batches.frames[:4], is_mirrored=False) == 255).all()
 
 
-def test_a_packed_checkpoint_is_smaller_and_flies_alike(
-    flights: list[FlightData], tmp_path: Path, whole: TrainResult
-) -> None:
+def test_a_packed_checkpoint_is_smaller_and_flies_alike(flights, tmp_path, whole):
     result = run(flights, settings(tmp_path, pack=True))
     assert result.checkpoint.stat().st_size < whole.checkpoint.stat().st_size / 1.8
     load_checkpoint(result.checkpoint, fallback=NETWORK)
 
 
-def test_a_budget_of_time_ends_and_has_time_for_the_head(
-    flights: list[FlightData], tmp_path: Path
-) -> None:
+def test_a_budget_of_time_ends_and_has_time_for_the_head(flights, tmp_path):
     stages: list[str] = []
     result = run(
         flights[:2],
@@ -247,9 +229,7 @@ def test_weights_that_diverge_are_refused(flights: list[FlightData], tmp_path: P
         run(flights[:2], settings(tmp_path, steps=44, learning_rate=1e30))
 
 
-def test_flights_in_which_no_policy_looked_are_trained_for_the_usual_ages(
-    flights: list[FlightData], tmp_path: Path
-) -> None:
+def test_flights_in_which_no_policy_looked_are_trained_for_the_usual_ages(flights, tmp_path):
     blind = [replace(flight, age_ns=np.zeros(0, np.int64)) for flight in flights[:2]]
     notes: list[str | None] = []
     run(blind, settings(tmp_path, steps=2), lambda progress: notes.append(progress.note))
@@ -284,9 +264,7 @@ def test_flights_that_do_not_fit_are_refused(flights: list[FlightData], tmp_path
         ({"ages": "few:many"}, "LOW:HIGH"),
     ],
 )
-def test_settings_that_no_run_could_use_are_refused(
-    tmp_path: Path, changes: dict[str, object], says: str
-) -> None:
+def test_settings_that_no_run_could_use_are_refused(tmp_path, changes, says):
     with pytest.raises(PolicyError, match=says):
         settings(tmp_path, **changes)
     with pytest.raises(PolicyError, match="safetensors"):

@@ -12,7 +12,7 @@ import torch
 from safetensors import safe_open
 
 from helpers.steered_flights import steered_flight
-from helpers.training_runs import check_resuming, check_stopping, make_hooks, weights_of
+from helpers.training_runs import check_resuming, make_hooks, weights_of
 from policy.checkpoints.policy_file import TRAINING_KEY
 from policy.checkpoints.world_model_file import load_world_model
 from policy.contract import QUATERNION, VELOCITY, Contract
@@ -92,9 +92,7 @@ def trained(tmp_path_factory: pytest.TempPathFactory) -> tuple[TrainResult, Worl
     return run([steered_flight(seed) for seed in range(6)], made, model=WIDER), made
 
 
-def test_sticks_tell_how_the_vehicle_will_move(
-    trained: tuple[TrainResult, WorldModelSettings],
-) -> None:
+def test_sticks_tell_how_the_vehicle_will_move(trained):
     result, made = trained
     held_out = result.validation
     assert isinstance(held_out, WorldModelValidation)
@@ -130,9 +128,7 @@ def test_other_sticks_make_another_future(trained: tuple[TrainResult, WorldModel
     assert forward > 0.5 > -0.5 > backward  # 1.9 m/s each way
 
 
-def test_a_checkpoint_says_how_it_was_trained(
-    trained: tuple[TrainResult, WorldModelSettings],
-) -> None:
+def test_a_checkpoint_says_how_it_was_trained(trained):
     with safe_open(trained[0].checkpoint, framework="pt") as file:
         card = json.loads(file.metadata()[TRAINING_KEY])
     assert card["flights"] == 5
@@ -154,22 +150,12 @@ def whole(flights: list[FlightData], tmp_path_factory: pytest.TempPathFactory) -
 
 
 @pytest.mark.parametrize("killed_at", [4, 6])  # in the autoencoder; in the dynamics
-def test_a_run_that_was_killed_resumes_as_if_it_had_not_been(
-    flights: list[FlightData], whole: TrainResult, tmp_path: Path, killed_at: int
-) -> None:
+def test_a_run_that_was_killed_resumes_as_if_it_had_not_been(flights, whole, tmp_path, killed_at):
     train = partial(train_shortly, folder=tmp_path)
     check_resuming(train, flights, whole, killed_at=killed_at)
 
 
-def test_a_run_that_was_stopped_resumes_as_if_it_had_not_been(
-    flights: list[FlightData], whole: TrainResult, tmp_path: Path
-) -> None:
-    check_stopping(partial(train_shortly, folder=tmp_path), flights, whole, validated_at=4)
-
-
-def test_an_autoencoder_that_is_kept_stays_as_it_is(
-    flights: list[FlightData], whole: TrainResult, tmp_path: Path
-) -> None:
+def test_an_autoencoder_that_is_kept_stays_as_it_is(flights, whole, tmp_path):
     stages: set[str] = set()
     made = settings(tmp_path, start_from=whole.checkpoint)
     result = run(flights, made, lambda progress: stages.add(progress.stage))
@@ -185,16 +171,6 @@ def test_an_autoencoder_that_is_kept_stays_as_it_is(
         run(flights, made, model=replace(MODEL, latent_channels=8))
 
 
-def test_a_budget_of_time_ends_with_a_checkpoint(flights: list[FlightData], tmp_path: Path) -> None:
-    stages: list[str] = []
-    made = settings(tmp_path, steps=None, minutes=0.2, validation_fraction=0.0, mirror=True)
-    result = run(flights[:2], made, lambda progress: stages.append(progress.note or ""))
-    assert result.validation is None
-    assert 2 < result.steps < 200
-    assert any("held out" in note for note in stages)
-    load_world_model(result.checkpoint)
-
-
 def latents_of(windows_frames: int, path: Path, *, mirror: bool) -> FeatureStore:
     """Latents that tell their frame, and whether it was mirrored."""
 
@@ -207,9 +183,7 @@ def latents_of(windows_frames: int, path: Path, *, mirror: bool) -> FeatureStore
     return encode_rows(path, jobs, encode, dim=64, should_continue=lambda done: True)
 
 
-def test_batches_follow_from_seed_and_step_and_mirror_all_that_a_mirror_shows(
-    tmp_path: Path,
-) -> None:
+def test_batches_follow_from_seed_and_step_and_mirror_all_that_a_mirror_shows(tmp_path):
     windows = find_windows([steered_flight(0)], context_frames=2, frames=4, frame_dt_s=0.1)
     latents = latents_of(91, tmp_path / "latents", mirror=True)
     asked = settings(tmp_path, seed=3, mirror=True, decision_share=0.25, window_batch_size=64)
@@ -283,9 +257,7 @@ def test_known_sticks_are_no_loss(tmp_path: Path) -> None:
         assert float(metrics["latents"]) > 0
 
 
-def test_the_change_of_latents_is_in_units_of_what_copying_the_last_frame_costs(
-    tmp_path: Path,
-) -> None:
+def test_the_change_of_latents_is_in_units_of_what_copying_the_last_frame_costs(tmp_path):
     windows = find_windows([steered_flight(0)], context_frames=2, frames=4, frame_dt_s=0.1)
     latents = latents_of(91, tmp_path / "latents", mirror=False)
     model = WorldModel(MODEL)
@@ -324,11 +296,6 @@ def test_psnr_is_that_of_the_mean_squared_error() -> None:
     assert psnr_db(grey, black).tolist() == pytest.approx([20 * np.log10(5), 99.0])
 
 
-def test_weights_that_diverge_are_refused(flights: list[FlightData], tmp_path: Path) -> None:
-    with pytest.raises(TrainingError, match="diverged"):
-        run(flights[:2], settings(tmp_path, steps=60, learning_rate=1e30))
-
-
 def test_flights_that_do_not_fit_are_refused(flights: list[FlightData], tmp_path: Path) -> None:
     with pytest.raises(DatasetError, match="no flights"):
         run([], settings(tmp_path))
@@ -341,14 +308,3 @@ def test_flights_that_do_not_fit_are_refused(flights: list[FlightData], tmp_path
     hasty = settings(tmp_path, steps=None, minutes=0.01)
     with pytest.raises(DatasetError, match="--minutes"):
         run([steered_flight(seed, seconds=9.0) for seed in range(2)], hasty)
-
-
-def test_settings_that_no_run_could_use_are_refused(tmp_path: Path) -> None:
-    for changes in (
-        {"window_batch_size": 0},
-        {"autoencoder_share": 1.0},
-        {"decision_share": 1.5},
-        {"batch_size": 1},
-    ):
-        with pytest.raises(PolicyError):
-            settings(tmp_path, **changes)

@@ -1,0 +1,382 @@
+"""First drafts of contract files: what was read, what was guessed, and what only the user knows.
+
+A draft is TOML for ``interface.read_interface``, in which every entry has a comment that says where
+its value comes from. An entry that nobody but the user can answer holds ``interface.UNANSWERED``.
+"""
+
+import json
+import textwrap
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Literal, NamedTuple
+
+from policy import files
+from policy.adapters.interface import ACTION_FIELDS, UNANSWERED
+from policy.adapters.lerobot.config import CONFIG_FILE, read_json
+from policy.adapters.onnx.files import read_graph
+from policy.adapters.state import DERIVED_NAMES
+from policy.contract import (
+    ACTION_DIM,
+    ENVELOPE_TERMS,
+    IMAGENET_MEAN_RGB,
+    IMAGENET_STD_RGB,
+    STATE_NAMES,
+    Contract,
+)
+from policy.data.lerobot_format import ACTION_KEY, INFO, STATE_FRAME, STATE_KEY, STATS
+from policy.errors import CheckpointError
+
+Table = Literal["contract", "state", "action", "images", "task"]
+Origin = Literal["read", "guessed", "to answer", "optional"]
+TRAIN_CONFIG_FILE = "train_config.json"
+_WIDTH = 96
+_SPELLINGS: Mapping[str, Sequence[str]] = {
+    "vx_mps": ("vx", "vel_x", "velocity_x"),
+    "vy_mps": ("vy", "vel_y", "velocity_y"),
+    "vz_mps": ("vz", "vel_z", "velocity_z"),
+    "qw": ("quat_w", "q_w", "orientation_w"),
+    "qx": ("quat_x", "q_x", "orientation_x"),
+    "qy": ("quat_y", "q_y", "orientation_y"),
+    "qz": ("quat_z", "q_z", "orientation_z"),
+    "wx_radps": ("wx", "rollspeed", "roll_rate", "angular_velocity_x", "gyro_x"),
+    "wy_radps": ("wy", "pitchspeed", "pitch_rate", "angular_velocity_y", "gyro_y"),
+    "wz_radps": ("wz", "yawspeed", "yaw_rate", "angular_velocity_z", "gyro_z"),
+    "ax_mps2": ("ax", "acc_x", "accel_x", "linear_acceleration_x"),
+    "ay_mps2": ("ay", "acc_y", "accel_y", "linear_acceleration_y"),
+    "az_mps2": ("az", "acc_z", "accel_z", "linear_acceleration_z"),
+    "roll_rad": ("roll",),
+    "pitch_rad": ("pitch",),
+    "yaw_rad": ("yaw", "heading"),
+}
+"""Usual names of others for numbers of the state; their units are a guess."""
+_STICKS = (
+    *("modes", "full_lean_deg", "full_yaw_rate_degps", "full_climb_mps", "full_descent_mps"),
+    *("lean_dead_zone", "yaw_dead_zone", "throttle_dead_zone"),
+)
+"""Terms of recorded flights that are written into every draft."""
+_LIMITS = (
+    *("max_state_age_s", "max_velocity_age_s", "max_feature_age_s", "max_chunk_age_s"),
+    *("max_stall_s", *ENVELOPE_TERMS),
+)
+"""Terms that are written where the flights had others than the usual ones."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Entry:
+    """A line of a draft."""
+
+    table: Table
+    name: str
+    value: str | float | Sequence[str] | Sequence[float]
+    origin: Origin
+    """Optional entries are written as comments."""
+    why: str
+    """Where the value comes from, or the question to the user."""
+
+
+def draft_text(title: str, entries: Sequence[Entry]) -> str:
+    """Return a contract file that begins with ``title``, each entry below its origin."""
+    lines = _comment(title)
+    for table in ("contract", "state", "action", "images", "task"):
+        inside = [entry for entry in entries if entry.table == table]
+        if inside:
+            lines += ["", f"[{table}]"]
+        said: list[str] = []
+        for entry in inside:
+            comment = _comment(f"{entry.origin.upper()}: {entry.why}")
+            lines += comment if comment != said else []
+            said = comment
+            # JSON's texts, numbers and lists are TOML's as well.
+            line = f"{entry.name} = {json.dumps(entry.value)}"
+            lines.append(f"# {line}" if entry.origin == "optional" else line)
+    return "\n".join(lines) + "\n"
+
+
+def _comment(text: str) -> list[str]:
+    return textwrap.wrap(text, _WIDTH, initial_indent="# ", subsequent_indent="# ")
+
+
+def _entry(table: Table, name: str, value: Any, origin: Origin, why: str) -> Entry:
+    origin = "to answer" if value == UNANSWERED else origin
+    return Entry(table=table, name=name, value=value, origin=origin, why=why)
+
+
+# --- LeRobot's folders: datasets, and policies trained on them
+
+
+def dataset_entries(folder: Path) -> list[Entry]:
+    """Draft from a dataset (v2 or v3): names, rate, cameras, and axes if it is one of ours."""
+    path = folder / INFO
+    features = _features(path, read_json(path), "features")
+    images = [key for key, value in features.items() if value.get("dtype") in ("video", "image")]
+    dims = _width(features.get(STATE_KEY)), _width(features.get(ACTION_KEY))
+    return _lerobot_entries(*dims, sorted(images), path, folder)
+
+
+def checkpoint_entries(folder: Path, dataset: Path | None) -> list[Entry]:
+    """Draft from a policy's shapes and, if there is one, its dataset's names and rate."""
+    path = folder / CONFIG_FILE
+    config = read_json(path)
+    inputs, outputs = (
+        _features(path, config, name) for name in ("input_features", "output_features")
+    )
+    images = [key for key, value in inputs.items() if value.get("type") == "VISUAL"]
+    dims = _width(inputs.get(STATE_KEY)), _width(outputs.get(ACTION_KEY))
+    return _lerobot_entries(*dims, images, path, dataset)
+
+
+def dataset_of(checkpoint: Path) -> Path | None:
+    """Return the dataset that LeRobot's training noted beside a policy, if it is here."""
+    try:
+        noted = files.read_json(checkpoint / TRAIN_CONFIG_FILE)["dataset"]
+        home = Path.home() / ".cache" / "huggingface" / "lerobot"  # LeRobot's own default
+        folder = Path(noted["root"]) if noted.get("root") else home / str(noted["repo_id"])
+    except (OSError, ValueError, KeyError, TypeError, AttributeError):
+        return None
+    return folder if (folder / INFO).is_file() else None
+
+
+def _lerobot_entries(
+    state_dim: int, action_dim: int, image_keys: Sequence[str], path: Path, dataset: Path | None
+) -> list[Entry]:
+    if action_dim != ACTION_DIM:
+        raise CheckpointError(
+            f"{path}: its action has {action_dim} numbers, but {ACTION_DIM} fly a "
+            "multirotor: sticks, or thrust and rates, or thrust and attitude, or a velocity"
+        )
+    names: dict[str, list[str] | None] = {STATE_KEY: None, ACTION_KEY: None}
+    rate_hz, where, frame = None, path.name, _frame_entry(UNANSWERED, "to answer", "")
+    if dataset is not None:
+        info, where = read_json(dataset / INFO), f"the dataset's {INFO}"
+        features = _features(dataset / INFO, info, "features")
+        names = {key: _names(features.get(key)) for key in names}
+        fps = info.get("fps")
+        rate_hz = float(fps) if isinstance(fps, int | float) else None
+        frame = _frame(dataset, features, names[STATE_KEY])
+    return [
+        _rate_entry(rate_hz, where),
+        frame,
+        *_action_entries(names[ACTION_KEY], where),
+        *_state_entries(names[STATE_KEY], state_dim, where),
+        *_camera_entries(image_keys, path.name),
+    ]
+
+
+def _frame(dataset: Path, features: Mapping[str, Any], names: Sequence[str] | None) -> Entry:
+    """As our export notes it; else by gravity: in level flight -z is up in FRD, +z in FLU."""
+    about = features.get(STATE_KEY, {}).get("info")
+    if isinstance(about, dict) and STATE_FRAME in about:
+        return _frame_entry(str(about[STATE_FRAME]), "read", f"the dataset's {INFO}")
+    try:
+        stats = files.read_json(dataset / STATS)
+        mean = float(stats[STATE_KEY]["mean"][list(names or ()).index("az_mps2")])
+    except (OSError, ValueError, KeyError, IndexError, TypeError):
+        return _frame_entry(UNANSWERED, "to answer", "")
+    frame = "ned_frd" if mean < 0 else "enu_flu"
+    return _frame_entry(frame, "guessed", f"the mean of az_mps2 is {mean:.1f}, by {STATS}")
+
+
+def _names(feature: object) -> list[str] | None:
+    names = feature.get("names") if isinstance(feature, dict) else None
+    if isinstance(names, dict) and len(names) == 1:  # {"motors": [...]}, as older datasets have it
+        names = next(iter(names.values()))
+    return [str(name) for name in names] if isinstance(names, list) else None
+
+
+def _width(feature: object) -> int:
+    shape = feature.get("shape") if isinstance(feature, dict) else None
+    is_vector = isinstance(shape, list) and len(shape) == 1 and isinstance(shape[0], int)
+    return int(shape[0]) if is_vector and shape else 0
+
+
+def _features(path: Path, data: Mapping[str, Any], name: str) -> dict[str, dict[str, Any]]:
+    table = data.get(name)
+    if not isinstance(table, dict) or not all(isinstance(v, dict) for v in table.values()):
+        raise CheckpointError(f"{path}: {name} must be an object of features, got {table!r}")
+    return table
+
+
+# --- ONNX: names and sizes of inputs and outputs
+
+
+class _Port(NamedTuple):
+    """An input or output."""
+
+    name: str
+    where: str
+    shape: tuple[int | None, ...]
+    """None where the size is open."""
+
+
+def onnx_files(source: Path) -> list[Path]:
+    """Return the graphs of a file, or of a folder; empty where it is neither."""
+    if source.is_dir():
+        return sorted(source.glob("*.onnx"))
+    return [source] if source.suffix == ".onnx" and source.is_file() else []
+
+
+def onnx_entries(graphs: Sequence[Path]) -> list[Entry]:
+    """Draft from graphs: names and sizes of image, state, history and chunk."""
+    inputs, outputs = _ports(graphs)
+    images = [port for port in inputs if len(port.shape) >= 4 and port.shape[-3] in (1, 3)]
+    histories = [port for port in inputs if "history" in port.name and len(port.shape) >= 2]
+    given = [port.shape for port in outputs]  # an input of the shape of an output is a hidden state
+    others = [
+        port
+        for port in inputs
+        if port not in images + histories and len(port.shape) >= 2 and port.shape not in given
+    ]
+    states = [port for port in others if "state" in port.name] or others
+    chunks = [port for port in outputs if port.shape[-1:] == (ACTION_DIM,) and len(port.shape) > 1]
+    entries = [
+        _rate_entry(None, ""),
+        _frame_entry(UNANSWERED, "to answer", ""),
+        *_action_entries(None, ""),
+    ]
+    for name, ports, axis in (
+        ("image_height", images, -2),
+        ("image_width", images, -1),
+        ("history_len", histories, -2),
+        ("horizon", chunks, -2),
+    ):
+        for port in ports[:1]:
+            size, why = port.shape[axis], f"{port.where} leaves its size open"
+            entries.append(
+                _entry("contract", name, UNANSWERED, "to answer", why)
+                if size is None
+                else _entry("contract", name, size, "read", port.where)
+            )
+    for port in images[:1]:
+        entries += _pixel_entries(port.shape[-3] == 1)
+        entries += _camera_entries([port.name], port.where)
+    for port in states[:1]:
+        entries.append(_entry("state", "key", port.name, "read", port.where))
+        entries += _state_entries(None, port.shape[-1] or 0, port.where)
+    return entries
+
+
+def _pixel_entries(is_depth: bool) -> list[Entry]:
+    if is_depth:
+        why = "it takes one channel: depth in metres, 0 where it is not known"
+        return [_entry("contract", "image_channels", "depth", "guessed", why)]
+    why = "it takes (rgb / 255 - mean) / std; zeros and ones for images in [0, 1]"
+    scaling = (("image_mean_rgb", IMAGENET_MEAN_RGB), ("image_std_rgb", IMAGENET_STD_RGB))
+    return [_entry("contract", name, list(value), "guessed", why) for name, value in scaling]
+
+
+def _ports(graphs: Sequence[Path]) -> tuple[list[_Port], list[_Port]]:
+    """Inputs and outputs of all graphs."""
+    found: dict[str, list[_Port]] = {"input": [], "output": []}
+    for file in graphs:
+        model = read_graph(file)
+        for kind, ports in (("input", model.inputs), ("output", model.outputs)):
+            for port in ports:
+                name = min(port.get_names(), default="")
+                sizes = port.get_partial_shape()
+                shape = tuple(size.get_length() if size.is_static else None for size in sizes)
+                found[kind].append(_Port(name, f"{kind} {name} of {file.name}", shape))
+    return found["input"], found["output"]
+
+
+# --- Recorded flights
+
+
+def recorded_entries(contracts: Sequence[Mapping[str, Any]]) -> list[Entry]:
+    """Draft the terms that all flights share; ask for those in which they differ.
+
+    ``contracts`` are those of the flights' ``meta.json``; entries that one lacks have the default.
+    """
+    usual = json.loads(Contract().to_json())
+    entries = []
+    for name in (*_STICKS, *_LIMITS):
+        found = sorted({json.dumps(each.get(name, usual[name])) for each in contracts})
+        value = json.loads(found[0]) if found else usual[name]
+        if len(found) > 1:
+            why = f"the flights were flown with different ones: {', '.join(found)}"
+            entries.append(_entry("contract", name, UNANSWERED, "to answer", why))
+        elif name in _STICKS or value != usual[name]:
+            entries.append(_entry("contract", name, value, "read", "as the flights were flown"))
+    return entries
+
+
+# --- Entries of all kinds of drafts
+
+
+def _state_entries(names: Sequence[str] | None, dim: int, where: str) -> list[Entry]:
+    """The state's names: known, guessed by their spelling, or to be answered."""
+    if dim == 0:
+        return []
+    known = (*STATE_NAMES, *DERIVED_NAMES)
+    guesses = {other: name for name, others in _SPELLINGS.items() for other in others}
+    given = list(names) if names is not None and len(names) == dim else [""] * dim
+    found = [name if name in known else guesses.get(name.lower(), UNANSWERED) for name in given]
+    called = f"{where} calls them {', '.join(given)}"
+    if UNANSWERED in found:
+        why = f"names of its {dim} numbers in their order, of {', '.join(known)}"
+        origin: Origin = "to answer"
+        why += f"; {called}" if any(given) else ""
+    elif found == given:
+        origin, why = "read", where
+    else:
+        origin, why = "guessed", f"{called}; are these its units, and its axes?"
+    factor = "factor from the units above to the policy's, e.g. 57.29578 for degrees"
+    return [
+        _entry("state", "names", found, origin, why),
+        _entry("state", "scale", [1.0] * dim, "optional", factor),
+    ]
+
+
+def _action_entries(names: Sequence[str] | None, where: str) -> list[Entry]:
+    """The kind of action, and its names: known, or to be answered."""
+    kinds = [kind for kind, own in ACTION_FIELDS.items() if sorted(own) == sorted(names or ())]
+    if kinds and names:
+        return [
+            _entry("contract", "action", kinds[0], "read", where),
+            _entry("action", "names", list(names), "read", where),
+        ]
+    choices = "; ".join(f"{kind}: {', '.join(own)}" for kind, own in ACTION_FIELDS.items())
+    called = f"; {where} calls them {', '.join(names)}" if names else ""
+    asked = f"what its four actions are. {choices}{called}"
+    order, units = (
+        "the four names of that kind, in the policy's order",
+        "from the policy's units to those of the names",
+    )
+    return [
+        _entry("contract", "action", UNANSWERED, "to answer", asked),
+        _entry("action", "names", [UNANSWERED] * 4, "to answer", order),
+        _entry(
+            *("action", "scale", [1.0] * 4, "optional"),
+            f"{units}: a factor, e.g. -1.0 for another sign",
+        ),
+        _entry("action", "offset", [0.0] * 4, "optional", f"{units}: added after the factor"),
+    ]
+
+
+def _rate_entry(rate_hz: float | None, where: str) -> Entry:
+    """The time between actions."""
+    if rate_hz is not None and rate_hz >= 1.0:
+        why = f"{where}: {rate_hz:g} a second"
+        return _entry("contract", "chunk_dt_s", round(1.0 / rate_hz, 6), "read", why)
+    why = "seconds from one action of a chunk to the next: 1 / frames a second of its dataset"
+    return _entry("contract", "chunk_dt_s", UNANSWERED, "to answer", why)
+
+
+def _frame_entry(state_frame: str, origin: Origin, why: str) -> Entry:
+    """The axes of state and action."""
+    if state_frame == UNANSWERED:
+        why = "axes of its state and action: ned_frd (z down, as MAVLink) or enu_flu (z up, as ROS)"
+    return _entry("contract", "state_frame", state_frame, origin, why)
+
+
+def _camera_entries(keys: Sequence[str], where: str) -> list[Entry]:
+    """Names of the cameras here, and the policy's names of them."""
+    cameras = ["front"] if len(keys) == 1 else [key.rpartition(".")[2] for key in keys]
+    if len(set(cameras)) < len(keys) or not all(name.isidentifier() for name in cameras):
+        cameras = [f"camera_{number}" for number in range(len(keys))]
+    why = "names of the vehicle's cameras; with several, those that --camera gives them"
+    images = [
+        _entry("images", camera, key, "read", where)
+        for camera, key in zip(cameras, keys, strict=True)
+    ]
+    return [_entry("contract", "cameras", cameras, "guessed", why), *images] if images else []

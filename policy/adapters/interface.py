@@ -1,0 +1,252 @@
+"""What the files of a policy that was trained elsewhere do not say: a TOML file of the user's.
+
+    [contract]                   # fields of policy.contract.Contract
+    action = "sticks"
+    chunk_dt_s = 0.0333
+
+    [state]                      # the state vector that it was trained on
+    key = "observation.state"
+    names = ["vx_mps", "vy_mps", "vz_mps", "roll_rad", "pitch_rad", "yaw_rad"]
+    scale = [1.0, 1.0, 1.0, 57.29578, 57.29578, 57.29578]  # it takes its angles in degrees
+
+    [action]                     # its action vector; scaled and shifted it is the contract's
+    key = "action"
+    names = ["throttle", "yaw", "pitch", "roll"]
+    scale = [1.0, 1.0, 1.0, 1.0]
+    offset = [0.0, 0.0, 0.0, 0.0]
+
+    [images]                     # its name of each camera of the contract
+    front = "observation.images.front"
+
+    [task]
+    prompt = "fly through the gates"
+
+All of it is optional but what the kind of policy asks for. State names are those of the contract
+and of ``adapters.state``. A draft has the text "?" where only the user knows the answer, and is not
+flown before each has one: ``adapters.drafts`` writes them.
+"""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, fields
+from pathlib import Path
+from typing import Any, TypeVar, cast
+
+import numpy as np
+
+from policy.adapters.state import DERIVED_NAMES, state_values
+from policy.contract import ACTION_DIM, ACTION_NAMES, Contract
+from policy.errors import ContractError, PolicyError
+from policy.files import read_toml
+
+ArrayOrTensor = TypeVar("ArrayOrTensor")
+CONTRACT_FILE = "mavbridge.toml"
+"""Its name beside a policy or dataset, where flights find it without --contract."""
+UNANSWERED = "?"
+"""In a contract file: the user has to say."""
+
+ACTION_FIELDS: dict[str, tuple[str, ...]] = {
+    "sticks": ACTION_NAMES,
+    "rates": ("thrust", "roll_rate_radps", "pitch_rate_radps", "yaw_rate_radps"),
+    "attitude": ("thrust", "roll_rad", "pitch_rad", "yaw_rate_radps"),
+    "velocity": ("vx_mps", "vy_mps", "vz_mps", "yaw_rate_radps"),
+}
+"""Names of the four numbers of each kind of action, in the contract's order."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Interface:
+    """How a policy names and orders what it takes and gives."""
+
+    contract: Contract
+    state_names: tuple[str, ...] = ()
+    """Its state vector, as names of ``contract.state_names`` and ``state.DERIVED_NAMES``; empty:
+    the same as the contract's."""
+    state_scale: tuple[float, ...] = ()
+    """Factor from the contract's unit to the policy's of each of them; empty: ones."""
+    action_names: tuple[str, ...] = ()
+    """Its action vector, as names of ``ACTION_FIELDS``; empty: the same as the contract's."""
+    action_scale: tuple[float, ...] = ()
+    """Factor of each action as the policy orders them; empty: ones."""
+    action_offset: tuple[float, ...] = ()
+    """Added after the factor; empty: zeros."""
+    state_key: str = "observation.state"
+    action_key: str = "action"
+    image_keys: tuple[str, ...] = ()
+    """Its name of each camera, in the contract's order; empty: observation.images.NAME."""
+    prompt: str = ""
+    """The task in words, for policies that are given one."""
+
+    def __post_init__(self) -> None:
+        known = (*self.contract.state_names, *DERIVED_NAMES)
+        if unknown := [name for name in self.state_names if name not in known]:
+            raise ContractError(f"[state] names {unknown} are unknown; known are {list(known)}")
+        wanted = ACTION_FIELDS[self.contract.action]
+        if self.action_names and sorted(self.action_names) != sorted(wanted):
+            raise ContractError(
+                f"[action] names must be {list(wanted)} in some order for action "
+                f"{self.contract.action!r}, got {list(self.action_names)}"
+            )
+        if len(self.state_scale) not in (0, self.state_dim):
+            raise ContractError(
+                f"[state] scale must be {self.state_dim} numbers, one a name, got "
+                f"{list(self.state_scale)}"
+            )
+        for name, values in (("scale", self.action_scale), ("offset", self.action_offset)):
+            if values and len(values) != ACTION_DIM:
+                raise ContractError(f"[action] {name} must be {ACTION_DIM} numbers, got {values}")
+        if 0 in self.action_scale:
+            raise ContractError(f"[action] scale must not be 0, got {self.action_scale}")
+        if self.image_keys and len(self.image_keys) != len(self.contract.cameras):
+            raise ContractError(
+                f"[images] must name each of the cameras {list(self.contract.cameras)}"
+            )
+
+    @property
+    def state_dim(self) -> int:
+        """Width of the policy's state."""
+        return len(self.state_names or self.contract.state_names)
+
+    def to_state(self, state: ArrayOrTensor) -> ArrayOrTensor:
+        """The contract's state [..., S] -> the policy's [..., state_dim], float32.
+
+        Both are numpy arrays or both torch tensors; in torch, the operations can be traced.
+        """
+        names = self.contract.state_names
+        wanted = self.state_names or names
+        values: Any = state
+        library, options = _library(state)
+        if not set(wanted) <= set(names):
+            columns = [values[..., column] for column in range(len(names))]
+            derived = state_values(columns, names, wanted, library.arctan2)
+            values = library.stack(derived, -1)
+        elif wanted != names:
+            values = values[..., [names.index(name) for name in wanted]]
+        if self.state_scale:
+            values = values * library.asarray(self.state_scale, **options)
+        return cast(ArrayOrTensor, values)
+
+    @property
+    def action_columns(self) -> list[int]:
+        """Column of the policy's action of each number of the contract's."""
+        wanted = ACTION_FIELDS[self.contract.action]
+        return [(self.action_names or wanted).index(name) for name in wanted]
+
+    @property
+    def camera_keys(self) -> tuple[str, ...]:
+        """The policy's name of each camera, in the contract's order."""
+        return self.image_keys or tuple(f"observation.images.{n}" for n in self.contract.cameras)
+
+    def to_actions(self, actions: ArrayOrTensor) -> ArrayOrTensor:
+        """The policy's actions [..., 4] -> the contract's [..., 4], arrays or tensors."""
+        values: Any = actions
+        if values.shape[-1] != ACTION_DIM:
+            raise PolicyError(
+                f"its chunk is {list(values.shape)}, and its last axis must be the {ACTION_DIM} "
+                "numbers of an action"
+            )
+        scale, offset = self._action_units(actions)
+        return cast(ArrayOrTensor, _columns(values * scale + offset, self.action_columns))
+
+    def from_actions(self, actions: ArrayOrTensor) -> ArrayOrTensor:
+        """The contract's actions [..., 4] -> the policy's [..., 4]: ``to_actions``, undone."""
+        columns = self.action_columns
+        scale, offset = self._action_units(actions)
+        theirs = _columns(actions, [columns.index(column) for column in range(ACTION_DIM)])
+        return cast(ArrayOrTensor, (theirs - offset) / scale)
+
+    def _action_units(self, actions: object) -> tuple[Any, Any]:
+        """Factor and offset of each action, in the library of ``actions``."""
+        library, options = _library(actions)
+        scale = library.asarray(self.action_scale or (1.0,) * ACTION_DIM, **options)
+        return scale, library.asarray(self.action_offset or (0.0,) * ACTION_DIM, **options)
+
+
+def read_interface(path: Path, derived: Mapping[str, object] | None = None) -> Interface:
+    """Read a contract file.
+
+    ``derived`` are fields of the contract that the policy's own files say: the contract file may
+    repeat them, not contradict them.
+    """
+    try:
+        data: dict[str, Any] = read_toml(path)
+    except OSError as error:
+        raise ContractError(f"--contract {path}: {error.strerror}") from error
+    except ValueError as error:
+        raise ContractError(f"--contract {path} is not TOML: {error}") from error
+    try:
+        return _interface(data, derived or {})
+    except (ContractError, TypeError, ValueError) as error:
+        raise ContractError(f"--contract {path}: {error}") from error
+
+
+def _interface(data: dict[str, Any], derived: Mapping[str, object]) -> Interface:
+    if unanswered := _unanswered(data):
+        raise ContractError(
+            f"this is a draft, in which {len(unanswered)} answers are missing: "
+            f"{', '.join(unanswered)}. Replace each {UNANSWERED!r} there, by what the comment asks"
+        )
+    tables = {name: dict(data.pop(name, {})) for name in ("contract", "state", "action", "images")}
+    task = dict(data.pop("task", {}))
+    known = {field.name for field in fields(Contract) if field.init}
+    if unknown := sorted(set(tables["contract"]) - known):
+        raise ContractError(f"[contract] has unknown fields {unknown}; known are {sorted(known)}")
+    said = {name: _frozen(value) for name, value in tables["contract"].items()}
+    for name, value in derived.items():
+        if said.setdefault(name, value) != value:
+            raise ContractError(
+                f"[contract] {name} = {said[name]!r} contradicts the policy's own files, which say "
+                f"{value!r}: leave it out"
+            )
+    contract = Contract(**said)
+    state, action, images = tables["state"], tables["action"], tables["images"]
+    if images and sorted(images) != sorted(contract.cameras):
+        raise ContractError(
+            f"[images] names {sorted(images)}, the contract's cameras are {list(contract.cameras)}"
+        )
+    interface = Interface(
+        contract=contract,
+        state_names=tuple(state.pop("names", ())),
+        state_scale=tuple(float(value) for value in state.pop("scale", ())),
+        state_key=str(state.pop("key", Interface.state_key)),
+        action_names=tuple(action.pop("names", ())),
+        action_key=str(action.pop("key", Interface.action_key)),
+        action_scale=tuple(float(value) for value in action.pop("scale", ())),
+        action_offset=tuple(float(value) for value in action.pop("offset", ())),
+        image_keys=tuple(str(images[name]) for name in contract.cameras) if images else (),
+        prompt=str(task.pop("prompt", "")),
+    )
+    if rest := sorted((*data, *state, *action, *task)):
+        raise ContractError(f"unknown entries {rest}")
+    return interface
+
+
+def _unanswered(data: Mapping[str, Any]) -> list[str]:
+    """Entries that are, or hold, ``UNANSWERED``."""
+    return [
+        f"[{table}] {name}"
+        for table, entries in data.items()
+        if isinstance(entries, dict)
+        for name, value in entries.items()
+        if value == UNANSWERED or (isinstance(value, list) and UNANSWERED in value)
+    ]
+
+
+def _columns(values: Any, columns: list[int]) -> Any:
+    """Columns of the last axis in another order; an array's in one piece of memory."""
+    ordered = values[..., columns]
+    return np.ascontiguousarray(ordered) if isinstance(ordered, np.ndarray) else ordered
+
+
+def _library(state: object) -> tuple[Any, dict[str, Any]]:
+    """The library of an array or tensor, and how its constants are made."""
+    if isinstance(state, np.ndarray):
+        return np, {"dtype": np.float32}
+    import torch
+
+    if not isinstance(state, torch.Tensor):
+        raise TypeError(f"neither an array nor a tensor: {type(state)}")
+    return torch, {"dtype": torch.float32, "device": state.device}
+
+
+def _frozen(value: object) -> Any:
+    return tuple(value) if isinstance(value, list) else value

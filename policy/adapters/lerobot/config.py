@@ -1,0 +1,342 @@
+"""Entries of a LeRobot policy's config.json that inference depends on.
+
+LeRobot writes every entry that its version knows, so an entry is missing only where a version did
+not have it yet. Those have the one value that this version computed with; all others must be there,
+because the defaults of LeRobot's own code changed with 0.6.0.
+"""
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from types import NoneType
+from typing import Any, Literal, TypeVar, get_args, get_origin, get_type_hints
+
+from policy import files
+from policy.contract import ACTION_DIM, EXTRA_NAMES
+from policy.errors import CheckpointError
+
+CONFIG_FILE = "config.json"
+STATE_KEY, ACTION_KEY = "observation.state", "action"
+ENVIRONMENT_KEY = "observation.environment_state"
+"""LeRobot's input for what is known of the world; here the goal of the flight."""
+NO_IMAGE_PX = 16
+"""Side of the blank image of a policy without a camera: the smallest of a contract."""
+BackboneName = Literal["resnet18", "resnet34", "resnet50", "resnet101", "resnet152"]
+Size = tuple[int, int]
+"""Height and width."""
+_WITHOUT_EFFECT = {
+    *("type", "device", "use_amp", "use_peft", "push_to_hub", "repo_id", "private", "tags"),
+    *("license", "pretrained_path", "pretrained_revision", "pretrained_backbone_weights"),
+    *("input_features", "output_features", "normalization_mapping", "n_obs_steps"),
+    *("n_action_steps", "drop_n_last_frames", "crop_is_random", "compile_model", "compile_mode"),
+    *("gradient_checkpointing", "use_vae", "latent_dim", "n_vae_encoder_layers", "dropout"),
+    *("kl_weight", "do_mask_loss_for_padding", "optimizer_lr", "optimizer_weight_decay"),
+    *("optimizer_lr_backbone", "optimizer_betas", "optimizer_eps"),
+    *("scheduler_name", "scheduler_warmup_steps"),
+}
+"""Entries that only training looks at, or that are read apart from the network's own."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Features:
+    """Inputs and outputs of a policy, by LeRobot's names."""
+
+    image_keys: tuple[str, ...]
+    """Its cameras, in the order of their features; empty for a policy that looks at no image."""
+    image_height: int
+    image_width: int
+    state_dim: int | None
+    """Width of observation.state; None where it takes none."""
+    takes_goal: bool
+    """observation.environment_state is the vector to the goal, ``policy.contract.EXTRA_NAMES``."""
+    modes: Mapping[str, str]
+    """Normalisation of STATE, VISUAL and ACTION, ``statistics.MODES``."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class ActConfig:
+    """An Action Chunking Transformer (Zhao et al. 2023); fields are named as in config.json."""
+
+    features: Features
+    vision_backbone: BackboneName
+    chunk_size: int
+    dim_model: int
+    n_heads: int
+    dim_feedforward: int
+    feedforward_activation: Literal["relu", "gelu"]
+    n_encoder_layers: int
+    n_decoder_layers: int
+    pre_norm: bool
+    latent_dim: int
+    temporal_ensemble_coeff: float | None
+
+    @property
+    def n_obs_steps(self) -> int:
+        """Observations that it takes."""
+        return 1
+
+    @property
+    def horizon(self) -> int:
+        """Actions from now on."""
+        return self.chunk_size
+
+    @property
+    def feature_dim(self) -> int:
+        """The cells of one image's last map, each projected to the transformer's width."""
+        height, width = map_size(self.features.image_height, self.features.image_width)
+        return self.dim_model * height * width
+
+
+@dataclass(frozen=True, kw_only=True)
+class DiffusionConfig:
+    """A diffusion policy (Chi et al. 2023) with a 1-D U-Net; fields as in config.json."""
+
+    features: Features
+    vision_backbone: BackboneName
+    n_obs_steps: int
+    predicted: int
+    """config.json's horizon: actions of a chunk, the first of which acts at the oldest
+    observation."""
+    resize_shape: Size | None
+    crop_shape: Size | None
+    use_group_norm: bool
+    spatial_softmax_num_keypoints: int
+    use_separate_rgb_encoder_per_camera: bool
+    down_dims: tuple[int, ...]
+    kernel_size: int
+    n_groups: int
+    diffusion_step_embed_dim: int
+    use_film_scale_modulation: bool
+    noise_scheduler_type: Literal["DDPM", "DDIM"]
+    num_inference_steps: int
+    num_train_timesteps: int
+    beta_schedule: Literal["squaredcos_cap_v2", "linear", "scaled_linear"]
+    beta_start: float
+    beta_end: float
+    prediction_type: Literal["epsilon", "sample"]
+    clip_sample: bool
+    clip_sample_range: float
+
+    @property
+    def horizon(self) -> int:
+        """Actions from now on: those before the newest observation are past."""
+        return self.predicted - self.n_obs_steps + 1
+
+    @property
+    def feature_dim(self) -> int:
+        """Two coordinates of each keypoint, through one layer; one zero without a camera."""
+        return 2 * self.spatial_softmax_num_keypoints if self.features.image_keys else 1
+
+    @property
+    def encoded_size(self) -> Size:
+        """Height and width of the image that the encoder sees."""
+        image = (self.features.image_height, self.features.image_width)
+        return self.crop_shape or self.resize_shape or image
+
+
+Config = ActConfig | DiffusionConfig
+C = TypeVar("C", ActConfig, DiffusionConfig)
+
+
+def map_size(height: int, width: int) -> Size:
+    """Size of a ResNet's last map: its five layers of stride 2 halve it, rounding up."""
+    return -(-height // 32), -(-width // 32)
+
+
+def read_config(folder: Path) -> tuple[Config, list[str]]:
+    """Return the policy that a folder holds, and notes for the user."""
+    path = folder / CONFIG_FILE
+    if not path.is_file():
+        raise CheckpointError(f"{folder}: holds no {CONFIG_FILE}; {_where_to_look(folder)}")
+    entries = _Entries(path)
+    kind = entries.get("type", Literal["act", "diffusion"])
+    if entries.get("use_peft", bool, default=False):
+        raise CheckpointError(f"{path}: weights of an adapter (use_peft); merge them before")
+    features = _features(entries)
+    config: Config
+    config = _act(entries, features) if kind == "act" else _diffusion(entries, features)
+    notes = []
+    if unknown := sorted(set(entries.data) - entries.read - _WITHOUT_EFFECT):
+        notes.append(
+            f"warning: {path} has entries that this build does not know: {', '.join(unknown)}. If "
+            "they change what the policy computes, it flies wrongly"
+        )
+    return config, notes
+
+
+def read_json(path: Path) -> dict[str, Any]:
+    """Read a JSON object."""
+    try:
+        data = files.read_json(path)
+    except OSError as error:
+        raise CheckpointError(f"{path}: {error.strerror}") from error
+    except ValueError as error:
+        raise CheckpointError(f"{path}: not JSON ({error})") from error
+    if not isinstance(data, dict):
+        raise CheckpointError(f"{path}: not a JSON object")
+    return data
+
+
+def _where_to_look(folder: Path) -> str:
+    for below in ("pretrained_model", "last/pretrained_model", "checkpoints/last/pretrained_model"):
+        if (folder / below / CONFIG_FILE).is_file():
+            return f"{folder / below} does: name that one"
+    return "name the folder that LeRobot wrote, usually .../checkpoints/last/pretrained_model"
+
+
+def _act(entries: "_Entries", features: Features) -> ActConfig:
+    entries.only("n_obs_steps", 1)
+    if features.takes_goal or not features.image_keys:
+        raise CheckpointError(
+            f"{entries.path}: of LeRobot's ACT those with cameras and without {ENVIRONMENT_KEY} "
+            "fly from their files; run this one behind --policy ws://HOST:PORT"
+        )
+    entries.only("replace_final_stride_with_dilation", False)
+    return entries.fill(ActConfig, features=features)
+
+
+def _diffusion(entries: "_Entries", features: Features) -> DiffusionConfig:
+    resize, crop = _resize_and_crop(entries, features)
+    if features.state_dim is None:
+        raise CheckpointError(f"{entries.path}: a diffusion policy takes {STATE_KEY}")
+    train_steps = entries.get("num_train_timesteps", int)
+    config = entries.fill(
+        DiffusionConfig,
+        features=features,
+        predicted=entries.get("horizon", int),
+        resize_shape=resize,
+        crop_shape=crop,
+        num_inference_steps=entries.get("num_inference_steps", int, default=train_steps),
+    )
+    if config.predicted % 2 ** len(config.down_dims) or config.horizon < 1:
+        raise CheckpointError(
+            f"{entries.path}: a horizon of {config.predicted} does not suit "
+            f"{len(config.down_dims)} down_dims and {config.n_obs_steps} n_obs_steps"
+        )
+    return config
+
+
+def _resize_and_crop(entries: "_Entries", features: Features) -> tuple[Size | None, Size | None]:
+    # Both came after 0.4.0; before, nothing was resized.
+    resize = entries.get("resize_shape", Size | None) if "resize_shape" in entries.data else None
+    ratio, crop = (
+        entries.get("crop_ratio", float, default=1.0),
+        entries.get("crop_shape", Size | None),
+    )
+    if resize is not None:  # then LeRobot takes the crop from the ratio, whatever crop_shape says
+        crop = None if ratio == 1.0 else (int(resize[0] * ratio), int(resize[1] * ratio))
+    before = resize or (features.image_height, features.image_width)
+    if not features.image_keys:
+        return None, None
+    if crop is not None and (crop[0] > before[0] or crop[1] > before[1]):
+        raise CheckpointError(f"{entries.path}: cannot crop images of {before} to {crop}")
+    return resize, crop
+
+
+def _features(entries: "_Entries") -> Features:
+    """Cameras, state and action.
+
+    LeRobot's ACT and DiffusionPolicy look at no other feature of type STATE than observation.state,
+    and at no other of type ENV than observation.environment_state.
+    """
+    inputs, outputs = entries.get("input_features", dict), entries.get("output_features", dict)
+    kinds = {key: _feature(entries.path, key, value) for key, value in inputs.items()}
+    goal = (len(EXTRA_NAMES["goal"]),)
+    takes_goal = kinds.pop(ENVIRONMENT_KEY, None) == ("ENV", goal)
+    others = [key for key in inputs if key not in kinds and not takes_goal]
+    if others := others + [k for k, (kind, _) in kinds.items() if kind not in ("STATE", "VISUAL")]:
+        raise CheckpointError(
+            f"{entries.path}: takes {others}, which no vehicle measures; supported are images, "
+            f"{STATE_KEY}, and {ENVIRONMENT_KEY} of {goal[0]} numbers: {EXTRA_NAMES['goal']}"
+        )
+    images = {key: shape for key, (kind, shape) in kinds.items() if kind == "VISUAL"}
+    shapes = sorted(set(images.values()))
+    if not images and takes_goal:
+        shapes = [(3, NO_IMAGE_PX, NO_IMAGE_PX)]
+    if len(shapes) != 1 or len(shapes[0]) != 3 or shapes[0][0] != 3:
+        raise CheckpointError(
+            f"{entries.path}: images must be of one shape [3, height, width], got {images}"
+        )
+    state = kinds.get(STATE_KEY, ("", ()))[1]
+    action = _feature(entries.path, ACTION_KEY, outputs.get(ACTION_KEY))[1]
+    if action != (ACTION_DIM,):
+        raise CheckpointError(
+            f"{entries.path}: its action has the shape {list(action)}, but {ACTION_DIM} numbers "
+            "fly a multirotor: train it on four (sticks, rates, attitude or velocity)"
+        )
+    modes = entries.get("normalization_mapping", dict)
+    return Features(
+        image_keys=tuple(images),
+        image_height=shapes[0][1],
+        image_width=shapes[0][2],
+        state_dim=state[0] if state else None,
+        takes_goal=takes_goal,
+        modes={str(kind): str(mode) for kind, mode in modes.items()},
+    )
+
+
+def _feature(path: Path, key: str, value: object) -> tuple[str, tuple[int, ...]]:
+    if isinstance(value, dict):
+        kind, shape = value.get("type"), value.get("shape")
+        if isinstance(shape, list) and all(isinstance(n, int) and n > 0 for n in shape):
+            return str(kind), tuple(shape)
+    raise CheckpointError(f"{path}: the feature {key} must have a type and a shape, got {value!r}")
+
+
+def _are_counts(value: Any) -> bool:
+    return isinstance(value, list) and all(type(n) is int and n > 0 for n in value)
+
+
+_KINDS: dict[object, tuple[str, Callable[[Any], bool]]] = {
+    bool: ("true or false", lambda value: isinstance(value, bool)),
+    int: ("a positive integer", lambda value: type(value) is int and value > 0),
+    float: ("a number", lambda value: type(value) in (int, float)),
+    dict: ("an object", lambda value: isinstance(value, dict)),
+    tuple[int, ...]: ("positive integers", _are_counts),
+    Size: ("a height and a width", lambda value: _are_counts(value) and len(value) == 2),
+}
+"""By the type of a field: its name in messages, and the check of a JSON value."""
+
+
+class _Entries:
+    """The entries of one config.json, each checked where it is read."""
+
+    def __init__(self, path: Path) -> None:
+        self.path, self.data = path, read_json(path)
+        self.read: set[str] = set()
+
+    def get(self, name: str, kind: Any, *, default: object = None) -> Any:
+        """Return an entry of the type ``kind``, which may be a Literal, or optional for null."""
+        self.read.add(name)
+        value = self.data.get(name)
+        value = default if value is None else value
+        kinds = [each for each in get_args(kind) if each is not NoneType]
+        if value is None and len(kinds) < len(get_args(kind)) and name in self.data:
+            return None
+        if value is None:
+            raise CheckpointError(
+                f"{self.path}: no entry {name!r}, and its default differs between versions of "
+                "LeRobot: add what it was trained with, or save the policy again with LeRobot"
+            )
+        if get_origin(kind) is Literal:
+            wanted, is_right = f"one of {', '.join(kinds)}", value in kinds
+        else:
+            wanted, check = _KINDS[kind if kind in _KINDS else kinds[0]]
+            is_right = check(value)
+        if not is_right:
+            raise CheckpointError(f"{self.path}: {name} must be {wanted}, got {value!r}")
+        return tuple(value) if isinstance(value, list) else value
+
+    def only(self, name: str, wanted: object) -> None:
+        """Refuse any other value than the one that is supported."""
+        self.read.add(name)
+        if (value := self.data.get(name)) != wanted:
+            raise CheckpointError(
+                f"{self.path}: {name} must be {wanted!r}, which alone is supported, got {value!r}"
+            )
+
+    def fill(self, config: type[C], **given: Any) -> C:
+        """Return a config with the entries of its fields' names, but for those that are given."""
+        hints = get_type_hints(config)
+        read = {name: self.get(name, kind) for name, kind in hints.items() if name not in given}
+        return config(**given, **read)

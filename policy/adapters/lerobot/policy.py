@@ -1,0 +1,232 @@
+"""A LeRobot policy as this project's: from the contract's images and states to its actions."""
+
+from pathlib import Path
+
+import torch
+from torch import Tensor, nn
+
+from policy.adapters.lerobot.act import Act
+from policy.adapters.lerobot.config import ActConfig, DiffusionConfig
+from policy.adapters.lerobot.diffusion import DdimSchedule, Diffusion
+from policy.adapters.lerobot.plan import Plan
+from policy.adapters.lerobot.statistics import WEIGHTS_FILE, Affine
+from policy.contract import EXTRA_NAMES, Contract
+from policy.errors import CheckpointError
+from policy.files import open_safetensors
+
+_STATISTICS = ("normalize_inputs.", "normalize_targets.", "unnormalize_outputs.")
+"""Prefixes of the statistics in checkpoints before 0.4, which are read apart."""
+
+
+class Normaliser(nn.Module):
+    """``Affine`` and its inverse on tensors; the identity where there is none."""
+
+    def __init__(self, affine: Affine | None) -> None:
+        super().__init__()
+        self.affine = affine
+        self.shift: Tensor
+        self.divisor: Tensor
+        self.span: Tensor
+        for name in ("shift", "divisor", "span"):
+            array = torch.zeros(1) if affine is None else torch.from_numpy(getattr(affine, name))
+            self.register_buffer(name, array, persistent=False)
+
+    def forward(self, value: Tensor) -> Tensor:
+        """To the range that the network takes."""
+        if self.affine is None:
+            return value
+        return self.affine.gain * (value - self.shift) / self.divisor - self.affine.bias
+
+    def back(self, value: Tensor) -> Tensor:
+        """From the range that the network gives."""
+        if self.affine is None:
+            return value
+        return (value + self.affine.bias) / self.affine.gain * self.span + self.shift
+
+
+class LeRobotPolicy(nn.Module):
+    """An ACT or a DiffusionPolicy; keeps ``policy.protocol.DualRatePolicy``.
+
+    Images are RGB in [0, 1]; LeRobot's own statistics are applied inside, and the state's and
+    action's numbers are put into the order, and the actions into the units, of the contract. Past
+    actions are not looked at, and ACT ignores ``num_diffusion_steps``.
+    """
+
+    net: Act | Diffusion
+
+    def __init__(self, plan: Plan) -> None:
+        super().__init__()
+        self.contract: Contract = plan.interface.contract
+        normalisation = plan.normalisation
+        self._interface, self._policy_cameras = plan.interface, plan.policy_cameras
+        keys = plan.config.features.image_keys
+        self._images = nn.ModuleList(Normaliser(normalisation.images[key]) for key in keys)
+        self._state = Normaliser(normalisation.state)
+        self._action = Normaliser(normalisation.action)
+
+    def encode_visual(self, image: Tensor, camera: int = 0) -> Tensor:
+        """Image [B, 3, H, W] of that camera of the contract -> feature [B, feature_dim]; zeros for
+        a policy without a camera."""
+        if not self._policy_cameras:
+            return image.new_zeros(image.shape[0], self.contract.feature_dim)
+        own = self._policy_cameras[camera]
+        return self.net.encode(self._images[own](image), own)
+
+    def predict_fast(
+        self, feature: Tensor, state: Tensor, action_history: Tensor, num_diffusion_steps: int
+    ) -> Tensor:
+        """Cached features [B, (T,) cameras * F] and states [B, (T,) S] -> chunk [B, horizon, 4]."""
+        inputs = self._network_inputs(feature, state)
+        return self._in_units(self.net.act(*inputs, num_diffusion_steps))
+
+    def predict(
+        self, image: Tensor, state: Tensor, action_history: Tensor, num_diffusion_steps: int
+    ) -> Tensor:
+        """Images [B, (T,) (cameras,) 3, H, W]: encode all of them and sample one chunk."""
+        contract = self.contract
+        batch, steps, cameras = image.shape[0], contract.observation_steps, len(contract.cameras)
+        images = image.reshape(batch, steps, cameras, *image.shape[-3:])
+        features = [
+            self.encode_visual(images[:, step, camera], camera)
+            for step in range(steps)
+            for camera in range(cameras)
+        ]
+        feature = torch.cat(features, dim=1).reshape(batch, *contract.feature_shape)
+        return self.predict_fast(feature, state, action_history, num_diffusion_steps)
+
+    def _network_inputs(self, feature: Tensor, state: Tensor) -> tuple[Tensor, Tensor]:
+        """Features [B, T, cameras, F] and normalised states [B, T, S], in the policy's order."""
+        steps, cameras = self.contract.observation_steps, len(self._policy_cameras)
+        by_camera = feature.reshape(feature.shape[0], steps, cameras, self.contract.feature_dim)
+        if self._policy_cameras != tuple(range(cameras)):
+            by_camera = by_camera[:, :, [self._policy_cameras.index(own) for own in range(cameras)]]
+        own_state = self._interface.to_state(state.reshape(state.shape[0], steps, -1))
+        return by_camera, self._state(own_state)
+
+    def _in_units(self, actions: Tensor) -> Tensor:
+        return self._interface.to_actions(self._action.back(actions))
+
+
+class LeRobotAct(LeRobotPolicy):
+    """An ACT."""
+
+    def __init__(self, plan: Plan, config: ActConfig) -> None:
+        super().__init__(plan)
+        self.net = Act(config)
+
+
+class LeRobotDiffusion(LeRobotPolicy):
+    """A DiffusionPolicy; keeps ``policy.protocol.StepwisePolicy``."""
+
+    net: Diffusion
+
+    def __init__(self, plan: Plan, config: DiffusionConfig) -> None:
+        super().__init__(plan)
+        self.net = Diffusion(config)
+        goal = EXTRA_NAMES["goal"] if config.features.takes_goal else ()
+        self._goal_columns = [self.contract.state_names.index(name) for name in goal]
+        self._goal = Normaliser(plan.normalisation.goal)
+
+    def _network_inputs(self, feature: Tensor, state: Tensor) -> tuple[Tensor, Tensor]:
+        """Features of all cameras and the goal [B, T, 1, X], normalised states [B, T, S].
+
+        LeRobot's order: images, then the environment (``_prepare_global_conditioning``).
+        """
+        if not self._goal_columns:
+            return super()._network_inputs(feature, state)
+        states = state.reshape(state.shape[0], self.contract.observation_steps, -1)
+        parts = [self._goal(states[..., self._goal_columns])]
+        own = self._state(self._interface.to_state(states))
+        if self._policy_cameras:
+            by_camera, own = super()._network_inputs(feature, state)
+            parts.insert(0, by_camera.flatten(2))
+        return torch.cat(parts, dim=-1).unsqueeze(2), own
+
+    @property
+    def schedule(self) -> DdimSchedule:
+        """The steps of a solve."""
+        return self.net.schedule
+
+    @property
+    def initial_noise(self) -> Tensor:
+        """[1, predicted, 4]; the same for a whole flight."""
+        return self.net.initial_noise
+
+    def denoise(
+        self,
+        noisy: Tensor,
+        timestep: Tensor,
+        feature: Tensor,
+        state: Tensor,
+        action_history: Tensor,
+    ) -> Tensor:
+        """One call of the network: noisy actions [B, predicted, 4] at timesteps [B]."""
+        of_condition = self.net.film_of_condition(*self._network_inputs(feature, state))
+        return self.net.denoise(noisy, timestep, of_condition)
+
+    def to_chunk(self, sample: Tensor) -> Tensor:
+        """The end of a solve [B, predicted, 4] -> chunk [B, horizon, 4]."""
+        return self._in_units(self.net.from_now(sample))
+
+
+def build_policy_of(plan: Plan) -> LeRobotPolicy:
+    """Return a policy with random weights."""
+    if isinstance(plan.config, ActConfig):
+        return LeRobotAct(plan, plan.config)
+    return LeRobotDiffusion(plan, plan.config)
+
+
+def load_policy_of(
+    plan: Plan, *, seed: int, num_diffusion_steps: int
+) -> tuple[LeRobotPolicy, list[str]]:
+    """Build a policy and load its weights; with notes for the user.
+
+    ``seed`` is that of a flight's initial noise.
+    """
+    policy = build_policy_of(plan)
+    policy.net.load_state_dict(_read(plan.folder / WEIGHTS_FILE, policy.net))
+    policy.eval().requires_grad_(False)
+    config, kind = plan.config, "ACT" if isinstance(plan.config, ActConfig) else "DiffusionPolicy"
+    millions = sum(parameter.numel() for parameter in policy.parameters()) / 1e6
+    notes = [*plan.notes, f"LeRobot's {kind} of {plan.folder}, {millions:.1f} M parameters"]
+    if isinstance(config, ActConfig):
+        if config.temporal_ensemble_coeff is not None:
+            notes.append(
+                "its temporal ensembling is not computed: the guard smooths from chunk to chunk"
+            )
+    elif isinstance(policy, LeRobotDiffusion):
+        policy.net.seed_noise(seed)
+        notes.append(
+            f"solved by DDIM in {num_diffusion_steps} steps (--num-diffusion-steps) from noise of "
+            f"seed {seed}; its config.json says {config.noise_scheduler_type} in "
+            f"{config.num_inference_steps}. More steps come closer to that, and take longer"
+        )
+    return policy, notes
+
+
+def _read(path: Path, net: Act | Diffusion) -> dict[str, Tensor]:
+    wanted = net.state_dict()
+    with open_safetensors(path, "pt") as file:
+        tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
+    state = {name: value for name, value in wanted.items() if name.endswith("num_batches_tracked")}
+    problems, seen = [], set(state)
+    for name, value in tensors.items():
+        own = net.own_name(name.removeprefix(net.prefix)) if name.startswith(net.prefix) else name
+        if own is None or name.startswith(_STATISTICS):
+            continue
+        seen.add(own)
+        if own not in wanted:
+            problems.append(f"unexpected {name!r}")
+        elif value.shape != wanted[own].shape:
+            problems.append(f"{name!r} is {list(value.shape)}, not {list(wanted[own].shape)}")
+        elif not torch.isfinite(value).all():
+            problems.append(f"{name!r} holds NaN or infinity")
+        else:
+            state[own] = value.to(wanted[own].dtype)
+    problems += [f"missing {name!r}" for name in wanted if name not in seen]
+    if problems:
+        raise CheckpointError(
+            f"{path}: does not fit the policy of its config.json in {len(problems)} places: "
+            f"{'; '.join(problems[:4])}. Copy both files again, from one folder"
+        )
+    return state

@@ -1,0 +1,320 @@
+"""Torch modules as a policy: those that a user's class names, and those of a TorchScript archive.
+
+    forward(image, state, action_history)            alone: a single-rate policy
+    visual_encoder(image)                            with one of the next two: dual rate
+    action_head(feature, state, action_history)      a chunk in one call
+    denoiser(noisy, timestep, feature, state, action_history)
+                                                     one step of a diffusion policy; the loop is
+                                                     ours, by ``noise_schedule``
+
+Shapes are those of ``policy.protocol``; ``forward`` and ``action_head`` return chunks
+[B, horizon, 4], ``denoiser`` what the schedule says that the network predicts; ``timestep`` is [B]
+float32. What is behind the last argument that a function declares is left out. A TorchScript
+archive may have methods of these names, too, and a policy.json (``adapters.description``).
+"""
+
+import inspect
+import json
+import sys
+import warnings
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import torch
+from torch import Tensor, nn
+
+from policy.adapters.description import USUAL_NAMES, Description
+from policy.adapters.interface import Interface
+from policy.engines.kept import modules_of
+from policy.errors import CheckpointError, PolicyError, user_code
+from policy.files import why_unreadable
+from policy.nets.diffusion import NoiseSchedule, ddim_solve, flight_noise
+from policy.protocol import SingleRatePolicy
+
+PARTS = "forward alone, visual_encoder and action_head, or visual_encoder and denoiser"
+
+
+def adopt_modules(
+    name: str,
+    holder: object,
+    interface: Interface,
+    *,
+    schedule: NoiseSchedule | None,
+    seed: int,
+    inputs: Mapping[str, str] | None = None,
+    outputs: Mapping[str, str | int] | None = None,
+) -> SingleRatePolicy | None:
+    """The policy that the modules or methods of ``holder`` are; None where it has none of them.
+
+    A contract without feature_dim gets it from the encoder's output. ``inputs`` names the state
+    of a forward that takes no image, ``outputs`` says which of several values that a module returns
+    is its result, both as ``adapters.description``.
+    """
+    encoder, head, denoiser = (
+        getattr(holder, part, None) for part in ("visual_encoder", "action_head", "denoiser")
+    )
+    picks = outputs or {}
+    if encoder is None and head is None and denoiser is None:
+        if not _has_forward(holder):
+            return None
+        call = _Call(name, holder, "chunk", picks)
+        call.skip = int(_takes_no_image(call, interface, (inputs or {}).get("state")))
+        return _with_life(ForwardPolicy(interface, holder, call), holder)
+    if encoder is None or (head is None) == (denoiser is None):
+        raise PolicyError(f"{name}: its modules do not make a policy: it takes {PARTS}")
+    for module in modules_of(holder):
+        module.eval()
+    encode = _Call(name, encoder, "feature", picks)
+    interface = _with_feature(name, encode, interface)
+    if head is not None:
+        call = _Call(name, head, "chunk", picks)
+        return _with_life(HeadPolicy(interface, holder, encode, call), holder)
+    schedule = schedule or getattr(holder, "noise_schedule", None) or NoiseSchedule()
+    call = _Call(name, denoiser, "prediction", picks)
+    return _with_life(DenoiserPolicy(interface, holder, encode, call, schedule, seed), holder)
+
+
+def load_torchscript(
+    spec: str, path: Path, description: Description, seed: int
+) -> SingleRatePolicy:
+    """The policy of an archive, on the CPU."""
+    try:
+        # torch says that this will go one day, in favour of a format that few export to so far.
+        with warnings.catch_warnings(action="ignore", category=DeprecationWarning):
+            module = torch.jit.load(path, map_location="cpu").eval()  # type: ignore[no-untyped-call]
+    except (RuntimeError, OSError) as error:
+        raise CheckpointError(why_unreadable(path, error)) from error
+    contract = replace(description.interface.contract, arrays="torch")
+    schedule = make_schedule(path, description.schedule) if description.schedule else None
+    policy = adopt_modules(
+        spec,
+        module,
+        replace(description.interface, contract=contract),
+        schedule=schedule,
+        seed=seed,
+        inputs=description.inputs,
+        outputs=description.outputs,
+    )
+    if policy is None:
+        raise CheckpointError(f"--policy {spec}: the archive has none of {PARTS}")
+    return policy
+
+
+def make_schedule(where: Path, fields: dict[str, Any]) -> NoiseSchedule:
+    """A schedule from the fields of a description; a PolicyError names the file of a wrong one."""
+    try:
+        return NoiseSchedule(**fields)
+    except (TypeError, PolicyError) as error:
+        raise PolicyError(
+            f"{where}: schedule {fields} is malformed ({error}): it takes num_train_timesteps, "
+            "betas and prediction"
+        ) from error
+
+
+class ForwardPolicy(nn.Module):
+    """Image, state and history in, a chunk out: single rate."""
+
+    def __init__(self, interface: Interface, holder: object, call: "_Call") -> None:
+        super().__init__()
+        self.contract = interface.contract
+        self.held = nn.ModuleList(modules_of(holder))
+        self._call = call
+        self._interface = interface
+
+    def predict(self, image: Tensor, state: Tensor, action_history: Tensor, steps: int) -> Tensor:
+        """One call of the module."""
+        return self.to_chunk(self._call(image, *self._own(state, action_history)))
+
+    def to_chunk(self, sample: Tensor) -> Tensor:
+        """Return the contract's actions for the policy's, [B, L, 4]; [B, 4] is one action."""
+        if sample.ndim == 2 and self.contract.horizon == 1:
+            sample = sample[:, None]
+        return self._interface.to_actions(sample)
+
+    def _own(self, state: Tensor, history: Tensor) -> tuple[Tensor, Tensor]:
+        """State and history as the policy orders and scales them."""
+        return self._interface.to_state(state), self._interface.from_actions(history)
+
+
+class HeadPolicy(ForwardPolicy):
+    """An encoder and a head that makes a chunk in one call: dual rate."""
+
+    def __init__(
+        self, interface: Interface, holder: object, encode: "_Call", head: "_Call"
+    ) -> None:
+        super().__init__(interface, holder, head)
+        self._encoder = encode
+
+    def encode_visual(self, image: Tensor, camera: int = 0) -> Tensor:
+        """Image [B, 3, H, W] -> feature [B, F], by one encoder for every camera."""
+        return self._encoder(image).flatten(1)
+
+    def predict_fast(
+        self, feature: Tensor, state: Tensor, action_history: Tensor, steps: int
+    ) -> Tensor:
+        """One call of the head."""
+        return self.to_chunk(self._call(feature, *self._own(state, action_history)))
+
+    def predict(self, image: Tensor, state: Tensor, action_history: Tensor, steps: int) -> Tensor:
+        """Encode the images, then as ``predict_fast``."""
+        feature = self.encode_visual(image.reshape(-1, *image.shape[-3:]))
+        shaped = feature.reshape(-1, *self.contract.feature_shape)
+        return self.predict_fast(shaped, state, action_history, steps)
+
+
+class DenoiserPolicy(HeadPolicy):
+    """An encoder and one step of a diffusion solve, as ``protocol.StepwisePolicy``: dual rate."""
+
+    def __init__(
+        self,
+        interface: Interface,
+        holder: object,
+        encode: "_Call",
+        denoiser: "_Call",
+        schedule: NoiseSchedule,
+        seed: int,
+    ) -> None:
+        super().__init__(interface, holder, encode, denoiser)
+        if not isinstance(schedule, NoiseSchedule):
+            raise PolicyError(
+                f"noise_schedule must be a policy.nets.diffusion.NoiseSchedule, got {schedule!r}"
+            )
+        if interface.action_scale or interface.action_offset or interface.action_names:
+            raise PolicyError(
+                "a denoiser works on the contract's actions as they are: leave [action] out of "
+                "the contract file"
+            )
+        self.schedule = schedule
+        self.initial_noise: Tensor
+        noise = flight_noise(seed, self.contract.horizon)
+        self.register_buffer("initial_noise", noise, persistent=False)
+
+    def denoise(
+        self,
+        noisy: Tensor,
+        timestep: Tensor,
+        feature: Tensor,
+        state: Tensor,
+        action_history: Tensor,
+    ) -> Tensor:
+        """One call of the denoiser."""
+        return self._call(noisy, timestep, feature, *self._own(state, action_history))
+
+    def predict_fast(
+        self, feature: Tensor, state: Tensor, action_history: Tensor, steps: int
+    ) -> Tensor:
+        """A whole solve."""
+        noise = self.initial_noise.expand(len(state), -1, -1)
+        ddim = self.schedule.ddim_steps(steps)
+
+        def denoise(index: int, noisy: Tensor) -> Tensor:
+            timestep = noisy.new_full((len(noisy),), float(ddim[index].timestep))
+            return self.denoise(noisy, timestep, feature, state, action_history)
+
+        return ddim_solve(self.schedule, ddim, denoise, noise)
+
+
+def _with_feature(name: str, encode: "_Call", interface: Interface) -> Interface:
+    """The interface, with feature_dim by the encoder's output if it has none."""
+    contract = interface.contract
+    if contract.feature_dim > 0:
+        return interface
+    with user_code(f"{name}: visual_encoder failed on a dummy image"), torch.inference_mode():
+        image = torch.zeros(1, *contract.image_shape[-3:])
+        dim = encode(image).flatten(1).shape[1]
+    return replace(interface, contract=replace(contract, feature_dim=dim))
+
+
+def _with_life(policy: ForwardPolicy, holder: object) -> ForwardPolicy:
+    """The policy with ``reset`` and ``close`` of the object whose modules it uses."""
+    for name in ("reset", "close"):
+        if (method := getattr(holder, name, None)) is not None:
+            # A method of TorchScript has no signature that Python could inspect.
+            setattr(policy, name, (lambda call=method: call()) if _is_script(method) else method)
+    return policy
+
+
+def _is_script(method: object) -> bool:
+    return getattr(method, "schema", None) is not None
+
+
+def _takes_no_image(call: "_Call", interface: Interface, state_name: str | None) -> bool:
+    """Return True if the first argument of a forward is the state.
+
+    By its name, or, where it is the only one and its name says nothing, by what it accepts.
+    """
+    first = next(iter(call.names), "")
+    if first in (state_name, *USUAL_NAMES["state"]):
+        return True
+    if len(call.names) != 1 or first in (*USUAL_NAMES["image"], *interface.camera_keys):
+        return False
+    contract = interface.contract
+    shapes = ((*contract.state_shape[:-1], interface.state_dim), contract.image_shape)
+    accepted = []
+    for shape in shapes:
+        with torch.inference_mode():
+            try:
+                call(torch.zeros(1, *shape))
+                accepted.append(True)
+            except PolicyError:  # it ran: what it returned is judged later
+                accepted.append(True)
+            except Exception:  # noqa: BLE001 - a stranger's module may raise anything
+                accepted.append(False)
+    return accepted == [True, False]
+
+
+def _has_forward(holder: object) -> bool:
+    if isinstance(holder, torch.jit.ScriptModule):
+        return _is_script(getattr(holder, "forward", None))
+    return isinstance(holder, nn.Module) and type(holder).forward is not nn.Module.forward
+
+
+class _Call:
+    """A module or function: takes as many arguments as it declares, gives one tensor."""
+
+    def __init__(
+        self, name: str, function: Any, result: str, outputs: Mapping[str, str | int]
+    ) -> None:
+        """Prepare the calls; ``outputs[result]`` says which of several values is the result."""
+        self._name, self._function = name, function
+        self._result, self._pick = result, outputs.get(result)
+        self.skip = 0
+        """Arguments before those that it takes: 1 for a policy that takes no image."""
+        self.names: list[str]
+        called = function.forward if isinstance(function, nn.Module) else function
+        schema = getattr(called, "schema", None)  # of TorchScript
+        if schema is not None:
+            self.names = [each.name for each in schema.arguments[1:]]  # less self
+            self._count = len(self.names)
+            return
+        parameters = inspect.signature(called).parameters
+        self.names = list(parameters)
+        takes_any = any(each.kind is each.VAR_POSITIONAL for each in parameters.values())
+        self._count = sys.maxsize if takes_any else len(parameters)
+
+    def __call__(self, *arguments: Tensor) -> Tensor:
+        returned: object = self._function(*arguments[self.skip :][: self._count])
+        values = returned
+        if isinstance(values, Sequence):
+            values = dict(enumerate(values))
+        if isinstance(values, Mapping):
+            if self._pick not in values:
+                raise PolicyError(
+                    f"{self._name}: it returns {len(values)} values "
+                    f"({', '.join(map(str, values))}): say which "
+                    f'is the {self._result}, in policy.json, "outputs": {{"{self._result}": '
+                    f"{json.dumps(next(iter(values), 0))}}}"
+                )
+            returned = values[self._pick]
+        if not isinstance(returned, Tensor):
+            raise PolicyError(
+                f"{self._name}: its {self._result} is a {type(returned).__name__}, not a tensor"
+            )
+        if not returned.is_floating_point():
+            raise PolicyError(
+                f"{self._name}: its {self._result} is of type {returned.dtype}, and the contract's "
+                "numbers are not whole: what do they count? Export the continuous actions"
+            )
+        return returned

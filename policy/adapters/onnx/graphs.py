@@ -1,0 +1,251 @@
+"""One ONNX file as a compiled graph whose inputs are given by their role."""
+
+import hashlib
+import re
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+import openvino as ov
+
+from policy.adapters.onnx.files import read_graph
+from policy.contract import FloatArray
+from policy.engines.executable import Precision, Shape
+from policy.engines.openvino_compile import Graph, GraphCompiler
+from policy.engines.signal_stack import signal_stack_kept
+from policy.errors import CheckpointError, PolicyError
+from policy.files import last_line
+
+_ALONE = {2: "state", 4: "image"}
+"""Role of the only input of a graph, by its number of axes, where its name says nothing."""
+_HIDDEN_IN = re.compile(r"(.+)_in(_\d+)?")
+_FLOATS = ("f16", "bf16", "f32", "f64")
+
+
+@dataclass(frozen=True, kw_only=True)
+class Wanted:
+    """Names by which one input of a policy is known, and its shape with the batch of one."""
+
+    names: tuple[str, ...]
+    shape: Shape
+
+
+@dataclass(frozen=True, kw_only=True)
+class Ports:
+    """Inputs and outputs that a caller of a graph asks for."""
+
+    inputs: Mapping[str, Wanted]
+    """By role."""
+    result: str
+    """Result that the graph computes, one of ``description.RESULTS``."""
+    output: str | int | None = None
+    """Name or place of the output with the result; None where there is only one."""
+    hidden: Mapping[str, str] = field(default_factory=dict)
+    """Output that each hidden input takes at the next call, as far as the user says so."""
+
+
+class RoleGraph:
+    """A compiled graph with its hidden state, zeros at first; for one thread."""
+
+    def __init__(
+        self, graph: Graph, roles: list[str], output_shape: Shape, hidden: Mapping[str, Shape]
+    ) -> None:
+        self._graph = graph
+        self.roles = roles
+        """Role of each input, in the graph's order; a hidden one's is its name."""
+        self.output_shape = output_shape
+        self._hidden_shapes = hidden
+        self._hidden: dict[str, FloatArray] = {}
+        self.reset()
+
+    def reset(self) -> None:
+        """Set the hidden state to zeros."""
+        shapes = self._hidden_shapes.items()
+        self._hidden = {name: np.zeros(shape, np.float32) for name, shape in shapes}
+
+    def __call__(self, **arrays: FloatArray) -> FloatArray:
+        """Run it on float32 arrays by role; those that it does not take are left out."""
+        given = arrays | self._hidden if self._hidden else arrays
+        result = self._graph(*[given[role] for role in self.roles])
+        if self._hidden:
+            self._hidden = dict(zip(self._hidden, self._graph.rest(), strict=True))
+        return result
+
+
+class GraphFile:
+    """An ONNX file, read once and compiled at any precision."""
+
+    @signal_stack_kept()
+    def __init__(self, path: Path, ports: Ports) -> None:
+        self._path = path
+        model = read_graph(path)
+        pairs = self._hidden_pairs(model, ports)
+        visible = [port for port in model.inputs if not port.get_names() & set(pairs)]
+        roles = [
+            next(iter(port.get_names() & set(pairs)), "")
+            or self._role(port, ports.inputs, is_alone=len(visible) == 1)
+            for port in model.inputs
+        ]
+        if len(set(roles)) < len(roles):
+            raise CheckpointError(f"{path}: two inputs are the {_twice(roles)}")
+        self.roles = roles
+        self.takes_bytes = self._require_types(model, roles, pairs)
+        """Its image is uint8, 0 to 255."""
+        self.hidden = {
+            name: _sizes(model.inputs[roles.index(name)], open_size=1)
+            for name in roles
+            if name in pairs
+        }
+        kept = [self._output(model, ports, pairs), *(model.output(pairs[n]) for n in self.hidden)]
+        self._model = ov.Model(
+            [port.get_node().input_value(0) for port in kept], model.get_parameters(), "policy"
+        )
+        self._make_static({role: each.shape for role, each in ports.inputs.items()} | self.hidden)
+        self.output_shape = tuple(self._model.outputs[0].shape)
+
+    @signal_stack_kept()
+    def compile(self, precision: Precision) -> RoleGraph:
+        """Compile it, or take it from the user's cache.
+
+        Raises:
+            RuntimeError: OpenVINO cannot compile it.
+        """
+        shapes = [list(port.shape) for port in self._model.inputs]
+        compiler = GraphCompiler(f"{_digest(self._path, self._model)} {shapes}")
+        graph = compiler.compile("onnx", precision, lambda: self._model)
+        return RoleGraph(graph, self.roles, self.output_shape, self.hidden)
+
+    def _hidden_pairs(self, model: "ov.Model", ports: Ports) -> dict[str, str]:
+        """Return the output whose value each hidden input takes at the next call, by name."""
+        inputs, outputs = (
+            {name for port in side for name in port.get_names()}
+            for side in (model.inputs, model.outputs)
+        )
+        pairs = {
+            name: f"{found[1]}_out{found[2] or ''}"
+            for name in inputs
+            if (found := _HIDDEN_IN.fullmatch(name)) is not None
+        }
+        pairs = {name: out for name, out in pairs.items() if out in outputs} | dict(ports.hidden)
+        for name, out in pairs.items():
+            if name not in inputs or out not in outputs:
+                raise CheckpointError(
+                    f'{self._path} has no input {name} with an output {out}, as "hidden" in '
+                    f"policy.json says; it has {sorted(inputs)} and {sorted(outputs)}"
+                )
+            taken, given = (_sizes(port, 1) for port in (model.input(name), model.output(out)))
+            if taken != given:
+                raise CheckpointError(
+                    f"{self._path}: hidden input {name} is {list(taken)} and its output {out} "
+                    f"{list(given)}: they must be of one shape"
+                )
+        return pairs
+
+    def _role(self, port: "ov.Output", wanted: Mapping[str, Wanted], *, is_alone: bool) -> str:
+        names = port.get_names()
+        for role, each in wanted.items():
+            if names & set(each.names):
+                return role
+        rank = port.get_partial_shape().rank
+        by_axes = _ALONE.get(rank.get_length(), "") if is_alone and rank.is_static else ""
+        if by_axes in wanted:
+            return by_axes
+        known = {role: list(each.names) for role, each in wanted.items()}
+        raise CheckpointError(
+            f"{self._path}: input {sorted(names)} is unknown; known names by meaning are {known}. "
+            'Say what it is in policy.json, "inputs": {"state": "its name"}, or by --contract'
+        )
+
+    def _require_types(self, model: "ov.Model", roles: list[str], pairs: Mapping[str, str]) -> bool:
+        """Refuse element types whose values the contract does not say; True for images of bytes."""
+        takes_bytes = False
+        for port, role in zip(model.inputs, roles, strict=True):
+            kind = port.get_element_type().get_type_name()
+            if role == "image" and kind == "u8":
+                takes_bytes = True
+            elif kind not in _FLOATS and not (role == "timestep" and kind in ("i32", "i64")):
+                raise CheckpointError(
+                    f"{self._path}: input {sorted(port.get_names())} is of type {kind}, and the "
+                    f"contract's {role} is made of floating-point numbers (an image may be uint8, "
+                    "0 to 255): export the graph with float inputs"
+                )
+        for port in model.outputs:
+            kind = port.get_element_type().get_type_name()
+            if port.get_names() & set(pairs.values()) and kind not in _FLOATS:
+                raise CheckpointError(f"{self._path}: hidden output of type {kind}, not a float")
+        return takes_bytes
+
+    def _output(self, model: "ov.Model", ports: Ports, pairs: Mapping[str, str]) -> "ov.Output":
+        """Return the output with the result that is asked for."""
+        visible = [port for port in model.outputs if not port.get_names() & set(pairs.values())]
+        names = [
+            ", ".join(sorted(port.get_names())) or f"number {at}" for at, port in enumerate(visible)
+        ]
+        asked = ports.output
+        chosen = [
+            port for at, port in enumerate(visible) if asked in port.get_names() or asked == at
+        ]
+        if asked is None and len(visible) == 1:
+            chosen = visible
+        if len(chosen) != 1:
+            said = f"no output {asked!r}" if asked is not None else f"{len(visible)} outputs"
+            raise CheckpointError(
+                f"{self._path} has {said} ({'; '.join(names)}): say which is the {ports.result}, "
+                f'in policy.json beside it, "outputs": {{"{ports.result}": "its name"}}'
+            )
+        kind = chosen[0].get_element_type().get_type_name()
+        if kind not in _FLOATS:
+            raise CheckpointError(
+                f"{self._path}: its {ports.result} is of type {kind}, and the contract's numbers "
+                "are not whole: what do they count? Export the continuous actions"
+            )
+        return chosen[0]
+
+    def _make_static(self, wanted: Mapping[str, Shape]) -> None:
+        model = self._model
+        shapes = {}
+        for port, role in zip(model.inputs, self.roles, strict=True):
+            scalar = role == "timestep" and port.get_partial_shape().rank == ov.Dimension(0)
+            shapes[port] = [] if scalar else list(wanted[role])
+        try:
+            model.reshape(shapes)
+            process = ov.preprocess.PrePostProcessor(model)
+            for at in range(len(model.inputs)):
+                process.input(at).tensor().set_element_type(ov.Type.f32)
+            for at in range(len(model.outputs)):
+                process.output(at).tensor().set_element_type(ov.Type.f32)
+            self._model = process.build()
+        except RuntimeError as error:
+            asked = dict(zip(self.roles, shapes.values(), strict=True))
+            theirs = [str(port.get_partial_shape()) for port in model.inputs]
+            raise CheckpointError(
+                f"{self._path} takes {theirs}, and by the contract its inputs would be {asked}: "
+                f"{last_line(error)}"
+            ) from error
+
+
+def require_roles(file: GraphFile, path: Path, roles: tuple[str, ...]) -> None:
+    """Refuse a graph that does not take an input without which it cannot be what it should be."""
+    if missing := [role for role in roles if role not in file.roles]:
+        raise PolicyError(f"{path} takes {file.roles}, but not the {' and the '.join(missing)}")
+
+
+def _sizes(port: "ov.Output", open_size: int) -> Shape:
+    """Return a port's shape, with ``open_size`` for each axis of unknown size."""
+    return tuple(
+        size.get_length() if size.is_static else open_size for size in port.get_partial_shape()
+    )
+
+
+def _twice(roles: list[str]) -> str:
+    return next(role for role in roles if roles.count(role) > 1)
+
+
+def _digest(path: Path, model: ov.Model) -> str:
+    """A text that differs wherever the file, or weights that lie in other files, do."""
+    digest = hashlib.sha256(path.read_bytes())
+    for node in model.get_ordered_ops():
+        if node.get_type_name() == "Constant":
+            digest.update(np.ascontiguousarray(node.data).view(np.uint8).data)
+    return digest.hexdigest()

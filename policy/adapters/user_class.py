@@ -1,0 +1,189 @@
+"""A policy of the user's own: any class with the members of ``policy.protocol``.
+
+package.module:Class   imported as Python imports it, or from the working directory
+package:Class          from the package's ``__init__``
+path/to/file.py:Class  a file; its folder joins the search path, so that it finds what lies there
+"""
+
+import importlib
+import importlib.util
+import inspect
+import os
+import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
+from hashlib import sha256
+from pathlib import Path
+from types import ModuleType
+
+from policy.adapters.interface import Interface
+from policy.contract import Contract
+from policy.errors import PolicyError, user_code
+from policy.files import user_path
+from policy.protocol import DualRatePolicy, SingleRatePolicy
+
+FORMS = (
+    "toge[:SIZE][:BACKBONE], resnet-unet[:SIZE], scripted[:PROGRAM][:ACTION][:air], "
+    "lerobot:DIR, onnx:DIR_OR_FILE, torchscript:FILE, ws://HOST:PORT, package.module:Class or "
+    "./file.py:Class"
+)
+"""What a user may write to name a policy."""
+OUR_PACKAGES = ("policy", "sitl", "mavbridge")
+
+
+def check_user_class(spec: str) -> None:
+    """Refuse, without running any code of the user's, what cannot be a class."""
+    where, _ = _split(spec)
+    if isinstance(where, Path):
+        _require_python_file(spec, where)
+        return
+    package = where.partition(".")[0]
+    if package in OUR_PACKAGES:
+        raise PolicyError(
+            f"--policy {spec}: {package} is a package of mavbridge; a file of that name flies by "
+            f"its path: --policy ./{package}.py:{spec.rpartition(':')[2]}"
+        )
+    with _working_directory():
+        is_known = package in sys.modules or importlib.util.find_spec(package) is not None
+    if not is_known:
+        raise PolicyError(
+            f"--policy {spec}: there is no module {package}; put its folder on PYTHONPATH or "
+            f"install it, name its file (./file.py:Class), or write {FORMS}"
+        )
+
+
+def load_user_class(spec: str, checkpoint: Path | None, *, seed: int = 0) -> SingleRatePolicy:
+    """Import a class that keeps the protocol of ``policy.protocol``, and make one.
+
+    It may also name the torch modules of its policy, as ``adapters.modules`` says; ``seed`` is that
+    of a denoiser's initial noise.
+    """
+    check_user_class(spec)
+    where, class_name = _split(spec)
+    try:
+        with user_code(f"importing {where} failed"):
+            if isinstance(where, Path):
+                module = _import_file(where)
+            else:
+                with _working_directory():
+                    module = importlib.import_module(where)
+    except PolicyError as error:
+        raise PolicyError(f"--policy {spec}: {error}; {_import_hint(error.__cause__)}") from error
+    found = getattr(module, class_name, None)
+    if not isinstance(found, type):
+        classes = sorted(
+            name
+            for name, value in vars(module).items()
+            if isinstance(value, type)
+            and (value.__module__ == module.__name__ or hasattr(value, "predict"))
+        )
+        raise PolicyError(f"--policy {spec}: no class {class_name} there; it has {classes}")
+    return _instance(spec, found, checkpoint, seed)
+
+
+@contextmanager
+def _working_directory() -> Iterator[None]:
+    """Search it too, after everything that is installed; only where a module of it is named.
+
+    At any other time a module that lies beside weights would run for a package that is missing.
+    """
+    here = str(Path.cwd())
+    is_added = here not in sys.path
+    if is_added:
+        sys.path.append(here)
+    try:
+        yield
+    finally:
+        if is_added:
+            sys.path.remove(here)
+
+
+def _split(spec: str) -> tuple[Path | str, str]:
+    """(file or package.module, Class); raises PolicyError if ``spec`` has another form."""
+    where, colon, class_name = spec.rpartition(":")
+    if not colon:
+        where, class_name = spec, ""
+    is_file = where.endswith(".py") or os.sep in where
+    if is_file and not class_name:
+        raise PolicyError(f"--policy {spec} names no class: write {where}:Class")
+    is_module = all(name.isidentifier() for name in where.split("."))
+    if not class_name.isidentifier() or not (is_file or is_module):
+        raise PolicyError(f"policy {spec!r} is unknown; write {FORMS}")
+    return user_path(where) if is_file else where, class_name
+
+
+def _require_python_file(spec: str, path: Path) -> None:
+    if path.is_file() and path.suffix == ".py":
+        return
+    there = sorted(each.name for each in path.parent.glob("*.py"))[:8]
+    what = "there is no file" if not path.exists() else "not a Python file:"
+    raise PolicyError(f"--policy {spec}: {what} {path}; Python files in its folder: {there}")
+
+
+def _import_file(path: Path) -> ModuleType:
+    """Import a file under a name that no other module has, once in a process."""
+    resolved = path.resolve()
+    folder = str(resolved.parent)
+    if folder not in sys.path:
+        sys.path.append(folder)  # last: nothing in it can stand in for an installed module
+    name = f"_policy_file_{sha256(str(resolved).encode()).hexdigest()[:8]}_{resolved.stem}"
+    if name in sys.modules:
+        return sys.modules[name]
+    spec = importlib.util.spec_from_file_location(name, resolved)
+    if spec is None or spec.loader is None:
+        raise PolicyError(f"{path} cannot be imported as Python")
+    module = sys.modules[name] = importlib.util.module_from_spec(spec)
+    try:
+        spec.loader.exec_module(module)
+    except BaseException:
+        del sys.modules[name]
+        raise
+    return module
+
+
+def _import_hint(error: BaseException | None) -> str:
+    """Say what to do about a failed import."""
+    name = error.name if isinstance(error, ImportError) and error.name else ""
+    if name.partition(".")[0] in OUR_PACKAGES:
+        return f"{name.partition('.')[0]} is a package of mavbridge: yours needs another name"
+    if isinstance(error, ImportError) and "relative import" in str(error):
+        return "import its neighbours by their plain names, or name it as package.module:Class"
+    if isinstance(error, ModuleNotFoundError):
+        return f"install {name} beside mavbridge, or put its folder on PYTHONPATH"
+    return f"mend that, or write {FORMS}"
+
+
+def _instance(spec: str, found: type, checkpoint: Path | None, seed: int) -> SingleRatePolicy:
+    arguments: dict[str, Path] = {} if checkpoint is None else {"checkpoint": checkpoint}
+    try:
+        inspect.signature(found).bind(**arguments)
+    except (TypeError, ValueError) as error:
+        call = "Class()" if checkpoint is None else "Class(checkpoint=path)"
+        raise PolicyError(
+            f"--policy {spec}: cannot be made with {call}: {error}; its only argument is the "
+            "checkpoint of --checkpoint, if that is given"
+        ) from error
+    with user_code(f"--policy {spec}: making it failed"):
+        policy: object = found(**arguments)
+    contract = getattr(policy, "contract", None)
+    if isinstance(contract, Contract) and not hasattr(policy, "predict") and "torch" in sys.modules:
+        from policy.adapters.modules import adopt_modules  # imports torch
+
+        interface = Interface(contract=contract)
+        adopted = adopt_modules(f"--policy {spec}", policy, interface, schedule=None, seed=seed)
+        if adopted is not None:
+            return adopted
+    lacking = [] if isinstance(contract, Contract) else ["contract"]
+    lacking += [] if hasattr(policy, "predict") else ["predict"]
+    if not isinstance(policy, SingleRatePolicy) or not isinstance(contract, Contract):
+        raise PolicyError(
+            f"--policy {spec}: a policy needs a member contract (a policy.contract.Contract) and "
+            "predict(image, state, action_history, num_diffusion_steps); for the dual-rate mode "
+            "also encode_visual(image) and predict_fast(feature, state, action_history, "
+            "num_diffusion_steps); or torch modules as attributes (visual_encoder and action_head "
+            "or denoiser), or be one with forward(image, state, action_history). Missing or wrong "
+            f"here: {lacking}"
+        )
+    if isinstance(policy, DualRatePolicy) and contract.feature_dim == 0:
+        raise PolicyError(f"--policy {spec}: its contract needs feature_dim, F of encode_visual")
+    return policy

@@ -1,0 +1,106 @@
+"""``--policy ws://HOST:PORT``: what is checked of it, and how it is loaded.
+
+msgpack and websockets are an extra, and imported only where such a policy is loaded.
+"""
+
+import os
+from dataclasses import fields, replace
+from importlib.util import find_spec
+from pathlib import Path
+from typing import TYPE_CHECKING
+from urllib.parse import urlsplit
+
+from policy.adapters.interface import Interface, read_interface
+from policy.contract import ENVELOPE_TERMS, Contract
+from policy.errors import ContractError, PolicyError
+from policy.files import read_toml
+
+if TYPE_CHECKING:
+    from policy.adapters.websocket.messages import Message
+    from policy.adapters.websocket.remote_policy import RemotePolicy
+
+SCHEMES = ("ws", "wss")
+PACKAGES = ("msgpack", "websockets")
+"""Those of the extra ``remote``."""
+
+
+TERMS = (
+    *("play_s", "modes", "max_state_age_s", "max_velocity_age_s", "max_feature_age_s"),
+    *("max_chunk_age_s", "max_stall_s", *ENVELOPE_TERMS),
+)
+"""Fields of the contract of our own server that a contract file may replace: when it may fly."""
+
+
+def require_packages(what: str) -> None:
+    """Refuse what cannot be done without the extra."""
+    if missing := [name for name in PACKAGES if find_spec(name) is None]:
+        names = " and ".join(missing), " ".join(missing)
+        raise PolicyError("{} needs {}: pip install {}".format(what, *names))
+
+
+def check_server(url: str, contract_file: Path | None, checkpoint: Path | None) -> None:
+    """Refuse in milliseconds an address, a contract file or a flag that cannot serve."""
+    require_packages(f"--policy {url}")
+    try:
+        parts = urlsplit(url)
+        is_good = bool(parts.hostname) and (parts.port is not None or parts.scheme == "wss")
+    except ValueError:
+        is_good = False
+    if not is_good:
+        raise PolicyError(f"--policy {url}: write ws://HOST:PORT, as in ws://127.0.0.1:8000")
+    if parts.username is not None or parts.password is not None:
+        raise PolicyError("--policy: leave the name and password out of the address")
+    if checkpoint is not None:
+        raise PolicyError(
+            f"--policy {url}: the server has the weights; leave out --checkpoint {checkpoint}"
+        )
+    if contract_file is not None:
+        read_interface(contract_file)
+
+
+def load_server_policy(url: str, contract_file: Path | None) -> tuple["RemotePolicy", list[str]]:
+    """Connect to a policy server, find its contract and try it; with lines for the user."""
+    from policy.adapters.websocket.link import API_KEY_VARIABLE, ServerLink
+    from policy.adapters.websocket.messages import CONTRACT_KEY
+    from policy.adapters.websocket.remote_policy import RemotePolicy
+
+    link = ServerLink(url, api_key=os.environ.get(API_KEY_VARIABLE))
+    try:
+        metadata = link.connect()
+        interface = _interface(contract_file, metadata)
+        policy = RemotePolicy(link, interface, is_ours=CONTRACT_KEY in metadata)
+        return policy, [policy.try_out()]
+    except PolicyError as error:
+        link.close()
+        told = str(error)
+        raise PolicyError(told if url in told else f"--policy {url}: {told}") from error
+    except BaseException:
+        link.close()
+        raise
+
+
+def _interface(contract_file: Path | None, metadata: "Message") -> Interface:
+    """That of our own server, under the terms of the user's file; or that of the file alone."""
+    from policy.adapters.websocket.messages import CONTRACT_KEY
+
+    served = metadata.get(CONTRACT_KEY)
+    if not isinstance(served, str):
+        if contract_file is not None:
+            return read_interface(contract_file)
+        raise PolicyError(
+            "the server does not say its rate nor what its state and actions mean: write that in a "
+            "file, and give --contract FILE; docs/policies.md has one to begin with"
+        )
+    try:
+        contract = replace(Contract.from_json(served), arrays="numpy", feature_dim=0)
+    except ContractError as error:
+        raise ContractError(f"the server's contract cannot be used: {error}") from error
+    if contract_file is None:
+        return Interface(contract=contract)
+    said = read_toml(contract_file).get("contract", {})
+    kept = {
+        field.name: getattr(contract, field.name)
+        for field in fields(Contract)
+        if field.init and not (field.name in TERMS and field.name in said)
+    }
+    return read_interface(contract_file, kept)

@@ -1,0 +1,190 @@
+"""Identify a file or folder that was passed as a policy's weights and is not ours.
+
+Everything is read by hand: no torch, and no pickle is executed.
+"""
+
+import io
+import json
+import pickletools
+import struct
+import zipfile
+import zlib
+from contextlib import suppress
+from pathlib import Path
+from typing import Any
+
+from policy.files import open_regular, read_json, stand_in_of
+
+HEAD_BYTES = 4096
+MAX_HEADER_BYTES = 100_000_000
+"""Longest header of safetensors, as its own reader has it."""
+MAX_PICKLE_BYTES = 16_000_000
+MAX_PICKLES = 4
+LEROBOT_TYPES = ("act", "diffusion")
+"""Types of LeRobot policies that fly from their files."""
+_PREFACE = ("PROTO", "FRAME", "MARK", "MEMOIZE", "PUT", "BINPUT", "LONG_BINPUT")
+"""Opcodes that come before, or between, those that say what is pickled."""
+_TENSOR_MODULES = ("torch", "torch._utils", "torch.nn.parameter", "torch.serialization")
+_PLAIN_MODULES = ("collections", "_codecs", "builtins", "__builtin__", "copyreg", "copy_reg")
+_FOLDERS: tuple[tuple[str, str, str], ...] = (
+    ("pretrained_model/", "a folder of LeRobot's training", "fly it with --policy lerobot:{0}/{1}"),
+    (
+        "checkpoints/last/pretrained_model/",
+        "a folder of LeRobot's training",
+        "fly it with --policy lerobot:{0}/{1}",
+    ),
+    ("meta/info.json", "a LeRobot data set, not a policy", "train one: mavbridge train {0}"),
+    ("ticks.parquet", "a recorded flight, not a policy", "train one: mavbridge train {0}"),
+    ("*.onnx", "a folder of ONNX models", "fly it with --policy onnx:{0}"),
+)
+"""Entry of a folder, what the folder is, what to do."""
+
+
+def detect(path: Path) -> str | None:
+    """Return what a file or folder is and how it flies; None if it is unknown, or may be ours."""
+    try:
+        found = _folder(path) if path.is_dir() else _file(path)
+    except OSError:
+        return None  # whoever opens it says why it cannot be read
+    if found is None:
+        return None
+    what, advice = found
+    return f"{path} is {what}: {advice}"
+
+
+def _file(path: Path) -> tuple[str, str] | None:
+    with open_regular(path) as file:
+        head = file.read(HEAD_BYTES)
+        file.seek(0)
+        if (found := stand_in_of(head)) is not None:
+            return found
+        if head.startswith(b"PK\x03\x04"):
+            return _zip(path)
+        if head[8:9] == b"{":
+            (length,) = struct.unpack("<Q", file.read(8))
+            return _safetensors(path, file.read(min(length, MAX_HEADER_BYTES)))
+        if head.startswith(b"\x80"):
+            return _pickle(path, file.read(MAX_PICKLE_BYTES))
+    if path.suffix == ".onnx":
+        return "an ONNX model", f"fly it with --policy onnx:{path}"
+    return None
+
+
+def _zip(path: Path) -> tuple[str, str] | None:
+    try:
+        with zipfile.ZipFile(path) as archive:
+            names = archive.namelist()
+            if any("/code/" in name or name.endswith("/constants.pkl") for name in names):
+                return "a TorchScript archive", f"fly it with --policy torchscript:{path}"
+            if (pickled := next((n for n in names if n.endswith("data.pkl")), None)) is None:
+                return "a zip archive", "unpack it, and name what is in it"
+            with archive.open(pickled) as file:
+                return _pickle(path, file.read(MAX_PICKLE_BYTES))
+    except (zipfile.BadZipFile, zlib.error, RuntimeError, EOFError, ValueError):
+        return "cut short, or damaged", "copy or download it again, and compare its size"
+
+
+def _pickle(path: Path, content: bytes) -> tuple[str, str] | None:
+    """Name the classes that a pickle would look up; None where tensors alone will do."""
+    names, is_object = _globals_of(content)
+    classes = [
+        f"{module}.{name}"
+        for module, name in names
+        if module not in (*_TENSOR_MODULES, *_PLAIN_MODULES)
+    ]
+    if not classes:
+        return None
+    if is_object:
+        return (
+            f"a whole pickled object ({classes[0]}), and loading that could run any program",
+            "where it was trained, save model.state_dict() for a network of this project; for "
+            "another one save torch.jit.trace(model, example) (--policy torchscript:FILE) or write "
+            "a class that builds it (--policy ./file.py:Class)",
+        )
+    return (
+        f"weights with other pickled objects beside them ({', '.join(classes[:3])}), and loading "
+        "those could run any program",
+        "where you trust it, save the weights alone: torch.save({'state_dict': "
+        f"torch.load('{path.name}', weights_only=False)['state_dict']}}, 'weights.pt')",
+    )
+
+
+def _globals_of(content: bytes) -> tuple[list[tuple[str, str]], bool]:
+    """(module, name) of everything that pickles would look up, and whether one of them begins so.
+
+    Old files of torch are four pickles in a row. A damaged one gives what comes before the damage.
+    """
+    found: list[tuple[str, str]] = []
+    has_object = False
+    stream = io.BytesIO(content)
+    with suppress(Exception):  # pickletools raises whatever the bytes lead it to
+        for _ in range(MAX_PICKLES):
+            texts: list[str] = []
+            is_first = True
+            for opcode, argument, _ in pickletools.genops(stream):
+                before = len(found)
+                if opcode.name in ("GLOBAL", "INST"):
+                    module, _, name = str(argument).partition(" ")
+                    found.append((module, name))
+                elif opcode.name == "STACK_GLOBAL" and len(texts) >= 2:
+                    found.append((texts[-2], texts[-1]))
+                elif isinstance(argument, str):
+                    texts.append(argument)
+                    continue
+                elif opcode.name in _PREFACE:
+                    continue
+                if is_first and len(found) > before:
+                    has_object = has_object or found[-1][0] not in _PLAIN_MODULES
+                is_first = False
+    return found, has_object
+
+
+def _safetensors(path: Path, text: bytes) -> tuple[str, str] | None:
+    try:
+        header: Any = json.loads(text)
+        metadata = header.pop("__metadata__", {}) or {}
+        if "contract" in metadata:
+            return None
+        names = [str(name) for name in header]
+    except (ValueError, TypeError, AttributeError, RecursionError):
+        return None  # its reader says what is wrong with it
+    if (beside := _lerobot(path.parent)) is not None:
+        what, advice = beside
+        return f"the weights of {what}", advice
+    theirs = ("diffusion.unet.", "model.action_head.", "normalize_inputs.")
+    if any(name.startswith(theirs) for name in names):
+        return (
+            "the weights of a LeRobot policy, without the config.json that belongs beside them",
+            "name the whole folder: --policy lerobot:DIR",
+        )
+    return None
+
+
+def _folder(path: Path) -> tuple[str, str]:
+    if (kind := _lerobot(path)) is not None:
+        return kind
+    for sign, what, advice in _FOLDERS:
+        if any(path.glob(sign)):
+            return what, advice.format(path, sign.rstrip("/"))
+    there = sorted(each.name for each in path.iterdir())[:8]
+    return "a folder", f"name a file; it holds {there}"
+
+
+def _lerobot(folder: Path) -> tuple[str, str] | None:
+    """Name the LeRobot policy in a folder and what to do with it; None if there is none."""
+    try:
+        config: Any = read_json(folder / "config.json")
+    except (OSError, ValueError):
+        return None
+    if not isinstance(config, dict) or "type" not in config:
+        return None
+    kind = config["type"]
+    if kind in LEROBOT_TYPES:
+        return f"a LeRobot policy ({kind})", f"fly its folder with --policy lerobot:{folder}"
+    if "input_features" not in config:
+        return None
+    return (
+        f"a LeRobot policy of type {kind!r}",
+        f"of its types {' and '.join(LEROBOT_TYPES)} fly from their files; run this one in "
+        "LeRobot's own environment behind --policy ws://HOST:PORT",
+    )

@@ -1,0 +1,177 @@
+"""Policies that LeRobot's own code wrote: the same actions from the same inputs."""
+
+import shutil
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from safetensors.numpy import save_file
+
+from helpers import lerobot_checkpoints as formula
+from policy.adapters.lerobot.plan import read_plan
+from policy.adapters.lerobot.policy import load_policy_of
+from policy.contract import STATE_NAMES
+from policy.engines.choose import chunks_of_samples
+from policy.engines.executable import ExecutionSettings
+from policy.engines.openvino_modules import ModuleConverter, make_module_executable
+from policy.engines.parity import make_parity_samples
+from policy.engines.stepwise import solver_segment
+from policy.engines.torch_eager import make_torch_executable
+from policy.errors import CheckpointError
+from policy.protocol import StepwisePolicy
+
+GOLDENS = Path(__file__).parents[3] / "data" / "lerobot"
+CASES = sorted(path.parent.name for path in GOLDENS.glob("*/config.json"))
+ATOL = 5e-5
+"""Of actions up to some 20 units, where float32 resolves 2e-6; each torch rounds differently."""
+STATE = tuple(reversed(STATE_NAMES))
+ACTION = ("roll", "throttle", "pitch", "yaw")
+SCALE, OFFSET = (1.0, -2.0, 0.5, 3.0), (0.0, 1.0, -1.0, 0.25)
+CAMERAS = {
+    "act_two_cameras_pre_norm": ("down", "front"),
+    "diffusion_sample": ("down", "front"),
+    "diffusion_separate": ("front", "down"),
+}
+"""Of the contract; in the other order than config.json's."""
+
+
+def contract_file(folder, case, state_dim):
+    cameras = CAMERAS.get(case, ("front",))
+    file = folder / "mavbridge.toml"
+    file.write_text(
+        f"""
+        [contract]
+        chunk_dt_s = 0.1
+        cameras = {list(cameras)}
+        [state]
+        names = {list(STATE[:state_dim])}
+        [action]
+        names = {list(ACTION)}
+        scale = {list(SCALE)}
+        offset = {list(OFFSET)}
+        """
+    )
+    return cameras
+
+
+@pytest.fixture(scope="module", params=CASES)
+def golden(request, tmp_path_factory):
+    """(case, expected, the policy that was loaded, cameras of its contract)."""
+    case = request.param
+    folder = tmp_path_factory.mktemp(case)
+    shutil.copytree(GOLDENS / case, folder, dirs_exist_ok=True)
+    expected = dict(np.load(folder / "expected.npz"))
+    save_file(formula.weights(folder, expected), folder / "model.safetensors")
+    cameras = contract_file(folder, case, expected["state"].shape[-1])
+    plan = read_plan(folder, None)
+    policy, _ = load_policy_of(plan, seed=0, num_diffusion_steps=4)
+    yield case, expected, policy, cameras
+    shutil.rmtree(folder)
+
+
+def inputs(policy, expected, cameras):
+    """What the loops would give: stacked by the contract, in the contract's order."""
+    contract = policy.contract
+    samples, steps, state_dim = expected["state"].shape
+    state = np.zeros((samples, steps, 13), np.float32)
+    state[:, :, [STATE_NAMES.index(name) for name in STATE[:state_dim]]] = expected["state"]
+    size = contract.image_height, contract.image_width
+    keys = {"front": 0, "down": 1} if policy_order(policy) == "front" else {"down": 0, "front": 1}
+    frames = [formula.images((samples, steps, 3, *size), keys[name]) for name in cameras]
+    stacked = np.stack(frames, axis=2).reshape(samples, *contract.image_shape)
+    return torch.from_numpy(stacked), torch.from_numpy(
+        state.reshape(samples, *contract.state_shape)
+    )
+
+
+def policy_order(policy):
+    """The camera that comes first in config.json."""
+    return policy.contract.cameras[policy._policy_cameras.index(0)]
+
+
+def in_contract_units(actions):
+    """LeRobot's actions by the contract file."""
+    ours = actions * np.array(SCALE, np.float32) + np.array(OFFSET, np.float32)
+    return ours[..., [ACTION.index(name) for name in ("throttle", "yaw", "pitch", "roll")]]
+
+
+@torch.inference_mode()
+def test_actions_are_those_of_lerobot(golden):
+    case, expected, policy, cameras = golden
+    image, state = inputs(policy, expected, cameras)
+    if case.startswith("diffusion"):
+        shape = policy.net.initial_noise.shape
+        policy.net.initial_noise.copy_(torch.from_numpy(formula.drawn("noise", tuple(shape))))
+    steps = 7 if case == "diffusion_sample" else 4
+    actions = policy.predict(image, state, torch.zeros(len(image), 4, 4), steps).numpy()
+    wanted = in_contract_units(expected["actions"])
+    assert actions.shape == (len(image), policy.contract.horizon, 4)
+    # Solves of several steps magnify rounding: 6e-4 where a CPU has no AVX-512.
+    atol = 1e-3 if case.startswith("diffusion") else ATOL
+    np.testing.assert_allclose(actions, wanted, rtol=1e-4, atol=atol)
+
+
+@torch.inference_mode()
+def test_the_loops_get_the_same_actions_from_cached_features(golden):
+    _, expected, policy, cameras = golden
+    image, state = inputs(policy, expected, cameras)
+    contract, history = policy.contract, torch.zeros(1, 4, 4)
+    images = image[:1].reshape(-1, len(cameras), 1, *image.shape[-3:])
+    rows = [
+        torch.cat([policy.encode_visual(each, camera) for camera, each in enumerate(row)], dim=1)
+        for row in images
+    ]
+    feature = torch.stack(rows, dim=1).reshape(1, *contract.feature_shape)
+    actions = policy.predict_fast(feature, state[:1], history, 4)
+    torch.testing.assert_close(actions, policy.predict(image[:1], state[:1], history, 4))
+
+
+@torch.inference_mode()
+def test_a_solve_step_by_step_is_the_whole_one(golden):
+    case, _, policy, _ = golden
+    assert isinstance(policy, StepwisePolicy) == case.startswith("diffusion")
+    if not isinstance(policy, StepwisePolicy):
+        return
+    contract = policy.contract
+    feature = formula.drawn("feature", (1, *contract.feature_shape))
+    state = formula.drawn("any state", (1, *contract.state_shape))
+
+    def denoise(*arrays):
+        return policy.denoise(*(torch.from_numpy(array) for array in arrays)).numpy()
+
+    solve = solver_segment(denoise, policy.schedule, 3)
+    noise = policy.initial_noise.numpy()
+    sample = solve(feature, state, np.zeros((1, 4, 4), np.float32), noise)
+    whole = policy.predict_fast(*map(torch.from_numpy, (feature, state)), None, 3)
+    torch.testing.assert_close(
+        policy.to_chunk(torch.from_numpy(sample)), whole, rtol=0, atol=2 * ATOL
+    )
+
+
+@pytest.mark.parametrize("golden", ["act", "diffusion", "diffusion_separate"], indirect=True)
+def test_the_openvino_engine_computes_the_same(golden):
+    _, _, policy, _ = golden
+    settings = ExecutionSettings(name="lerobot", num_diffusion_steps=2)
+    converter = ModuleConverter(policy, "lerobot")
+    graphs = make_module_executable(policy, settings, "f32", "f32", converter)
+    samples = make_parity_samples(policy.contract)
+    samples.state[..., STATE_NAMES.index(STATE[12])] = policy._state.shift[12]  # a constant there
+    expected = chunks_of_samples(make_torch_executable(policy, settings), samples)
+    found = chunks_of_samples(graphs, samples)
+    np.testing.assert_allclose(found, expected, rtol=0, atol=1e-3 * np.abs(expected).max())
+
+
+def test_weights_of_another_network_are_refused(tmp_path):
+    shutil.copytree(GOLDENS / "act", tmp_path, dirs_exist_ok=True)
+    weights = formula.weights(tmp_path, dict(np.load(tmp_path / "expected.npz")))
+    del weights["model.action_head.bias"]
+    weights["model.action_head.weight"] = np.zeros((4, 31), np.float32)
+    weights["model.decoder_pos_embed.weight"][0] = np.nan
+    weights["model.nose.weight"] = np.zeros(1, np.float32)
+    save_file(weights, tmp_path / "model.safetensors")
+    contract_file(tmp_path, "act", 13)
+    with pytest.raises(CheckpointError) as caught:
+        load_policy_of(read_plan(tmp_path, None), seed=0, num_diffusion_steps=4)
+    for said in ("4 places", "[4, 31], not [4, 32]", "NaN", "unexpected 'model.nose"):
+        assert said in str(caught.value)

@@ -1,0 +1,219 @@
+"""What a LeRobot folder and a contract file say, and what is refused before weights are read."""
+
+import json
+import shutil
+from pathlib import Path
+
+import numpy as np
+import pytest
+from safetensors.numpy import load_file, save_file
+
+from policy.adapters.lerobot.plan import read_plan
+from policy.errors import CheckpointError, ContractError, PolicyError
+from policy.loading.load import check_request, read_policy_contract
+from policy.loading.request import PolicyRequest
+
+GOLDENS = Path(__file__).parents[3] / "data" / "lerobot"
+CONTRACT = '[contract]\nchunk_dt_s = 0.1\naction = "velocity"\n'
+
+
+@pytest.fixture
+def folder(tmp_path):
+    """Of a diffusion policy of two observations of one camera of 64x96, and 13 numbers of state."""
+    shutil.copytree(GOLDENS / "diffusion", tmp_path, dirs_exist_ok=True)
+    save_file({"diffusion.unet.final_conv.1.bias": np.zeros(4, np.float32)},
+              tmp_path / "model.safetensors")  # fmt: skip
+    (tmp_path / "mavbridge.toml").write_text(CONTRACT)
+    return tmp_path
+
+
+def edit(path, change):
+    data = json.loads(path.read_text())
+    change(data)
+    path.write_text(json.dumps(data))
+
+
+def test_the_contract_has_what_the_files_say(folder):
+    contract = read_policy_contract(PolicyRequest(spec=f"lerobot:{folder}"))
+    assert (contract.image_height, contract.image_width) == (64, 96)
+    assert contract.observation_steps == 2
+    assert contract.observation_dt_s == contract.chunk_dt_s == 0.1
+    assert contract.horizon == 7, "8 actions, the first of which acts at the older observation"
+    assert contract.feature_dim == 8, "two coordinates of 4 keypoints"
+    assert contract.action == "velocity"
+    assert contract.image_mean_rgb == (0, 0, 0)
+    assert contract.image_std_rgb == (1, 1, 1)
+
+
+def test_the_contract_of_an_act_is_that_of_its_map(tmp_path):
+    shutil.copytree(GOLDENS / "act", tmp_path, dirs_exist_ok=True)
+    save_file({}, tmp_path / "model.safetensors")
+    (tmp_path / "mavbridge.toml").write_text(CONTRACT)
+    contract = read_plan(tmp_path, None).interface.contract
+    assert contract.feature_dim == 32 * 2 * 3
+    assert contract.horizon == 10
+    assert contract.observation_steps == 1
+
+
+@pytest.mark.parametrize(
+    ("change", "said"),
+    [
+        ({"type": "pi0"}, "type must be one of act, diffusion, got 'pi0'"),
+        ({"vision_backbone": "vit"}, "vision_backbone must be one of resnet18"),
+        ({"prediction_type": "v_prediction"}, "prediction_type must be one of epsilon, sample"),
+        ({"use_group_norm": None}, "no entry 'use_group_norm', and its default differs"),
+        ({"down_dims": [16, 32, 64, 128]}, "a horizon of 8 does not suit"),
+        ({"crop_shape": [65, 65]}, "cannot crop"),
+        ({"crop_shape": [65]}, "crop_shape must be a height and a width"),
+        ({"kernel_size": True}, "kernel_size must be a positive integer"),
+        ({"clip_sample": 1}, "clip_sample must be true or false"),
+        ({"beta_start": "0"}, "beta_start must be a number"),
+        ({"use_peft": True}, "merge"),
+        ({"input_features": {}}, "images must be of one shape"),
+        (
+            {"output_features": {"action": {"type": "ACTION", "shape": [6]}}},
+            r"its action has the shape \[6\]",
+        ),
+    ],
+)
+def test_a_config_that_is_not_supported_is_refused(folder, change, said):
+    edit(folder / "config.json", lambda data: data.update(change))
+    with pytest.raises(CheckpointError, match=said):
+        read_plan(folder, None)
+
+
+@pytest.mark.parametrize(
+    "feature",
+    [
+        {"observation.environment_state": {"type": "ENV", "shape": [4]}},
+        {"observation.wind": {"type": "ENV", "shape": [3]}},
+        {"observation.goal": {"type": "GOAL", "shape": [3]}},
+    ],
+)
+def test_inputs_that_no_vehicle_measures_are_refused(folder, feature):
+    edit(folder / "config.json", lambda data: data["input_features"].update(feature))
+    with pytest.raises(CheckpointError, match=next(iter(feature))):
+        read_plan(folder, None)
+
+
+def test_an_entry_of_a_later_version_is_a_warning(folder):
+    edit(folder / "config.json", lambda data: data.update(use_new_trick=True))
+    assert any("use_new_trick" in note for note in read_plan(folder, None).notes)
+
+
+def test_a_number_that_never_changed_in_training_is_a_warning(folder):
+    assert any("numbers [12]" in note for note in read_plan(folder, None).notes)
+
+
+def test_entries_that_older_versions_lack_have_the_value_of_then(folder):
+    def older(data):
+        for name in ("resize_shape", "crop_ratio", "compile_model", "compile_mode", "use_peft"):
+            del data[name]
+
+    before = read_plan(folder, None)
+    edit(folder / "config.json", older)
+    assert read_plan(folder, None).config == before.config
+
+
+def test_a_folder_above_is_told_from_one_that_holds_nothing(folder, tmp_path):
+    below = tmp_path / "run" / "checkpoints" / "last" / "pretrained_model"
+    below.mkdir(parents=True)
+    (below / "config.json").write_text("{}")
+    with pytest.raises(CheckpointError, match=r"last/pretrained_model does: name that one"):
+        read_plan(tmp_path / "run", None)
+    with pytest.raises(CheckpointError, match="usually"):
+        read_plan(tmp_path / "nowhere", None)
+
+
+@pytest.mark.parametrize(
+    ("file", "said"),
+    [
+        ("model.safetensors", "copy the whole folder"),
+        ("policy_postprocessor.json", "No such file"),
+        ("policy_preprocessor_step_3_normalizer_processor.safetensors", "is missing"),
+        ("mavbridge.toml", "mavbridge contract"),
+    ],
+)
+def test_a_missing_file_is_named(folder, file, said):
+    (folder / file).unlink()
+    with pytest.raises(PolicyError, match=said) as caught:
+        check_request(PolicyRequest(spec=f"lerobot:{folder}"))
+    assert file in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    ("contract", "said"),
+    [
+        ("image_height = 224", "image_height = 224 contradicts .* 64"),
+        ("horizon = 16", "horizon = 16 contradicts .* 7"),
+        ('cameras = ["front", "down"]', r"policy's images are \['observation.images.front'\]"),
+        ('[state]\nnames = ["vx_mps", "qw"]', "takes a state of 13 numbers, and these are 2"),
+        ('[state]\nkey = "state"', "LeRobot's is 'observation.state'"),
+        ('[images]\nfront = "observation.images.nose"', "name all cameras"),
+    ],
+)
+def test_a_contract_that_contradicts_the_policy_is_refused(folder, contract, said):
+    (folder / "mavbridge.toml").write_text(CONTRACT + contract + "\n")
+    with pytest.raises(ContractError, match=said):
+        read_plan(folder, None)
+
+
+def test_a_renamed_camera_is_known_by_both_names(folder):
+    def rename(data):
+        data["steps"][0]["config"]["rename_map"] = {"observation.images.nose": FRONT}
+
+    edit(folder / "policy_preprocessor.json", rename)
+    for key in ("observation.images.nose", FRONT):
+        (folder / "mavbridge.toml").write_text(f'{CONTRACT}[images]\nfront = "{key}"\n')
+        assert read_plan(folder, None).policy_cameras == (0,)
+
+
+FRONT = "observation.images.front"
+
+
+def test_an_unknown_step_of_a_processor_is_refused(folder):
+    step = {"registry_name": "relative_actions_processor", "config": {}}
+    edit(folder / "policy_preprocessor.json", lambda data: data["steps"].append(step))
+    with pytest.raises(CheckpointError, match="relative_actions_processor"):
+        read_plan(folder, None)
+
+
+def test_statistics_before_version_0_4_lie_in_the_weights(folder):
+    new = read_plan(folder, None).normalisation
+    statistics = load_file(folder / "policy_preprocessor_step_3_normalizer_processor.safetensors")
+    for name in ("policy_preprocessor.json", "policy_postprocessor.json"):
+        (folder / name).unlink()
+    weights = {}
+    for name, value in statistics.items():
+        key, _, statistic = name.rpartition(".")
+        side = "unnormalize_outputs" if key == "action" else "normalize_inputs"
+        weights[f"{side}.buffer_{key.replace('.', '_')}.{statistic}"] = value
+    save_file(weights, folder / "model.safetensors")
+    old = read_plan(folder, None).normalisation
+    for ours, theirs in (
+        (old.state, new.state),
+        (old.action, new.action),
+        (old.images[FRONT], new.images[FRONT]),
+    ):
+        np.testing.assert_array_equal(ours.shift, theirs.shift)
+        np.testing.assert_array_equal(ours.divisor, theirs.divisor)
+        assert (ours.gain, ours.bias) == (theirs.gain, theirs.bias)
+
+
+def test_a_folder_without_any_statistics_is_refused(folder):
+    (folder / "policy_preprocessor.json").unlink()
+    with pytest.raises(CheckpointError, match="holds no statistics"):
+        read_plan(folder, None)
+
+
+def test_statistics_that_a_mode_needs_are_named(folder):
+    path = folder / "policy_preprocessor_step_3_normalizer_processor.safetensors"
+    save_file({k: v for k, v in load_file(path).items() if not k.endswith("state.max")}, path)
+    with pytest.raises(CheckpointError, match=r"observation.state is normalised by MIN_MAX.*'max'"):
+        read_plan(folder, None)
+
+
+def test_weights_are_named_by_the_folder_alone(folder):
+    request = PolicyRequest(spec=f"lerobot:{folder}", checkpoint=folder / "model.safetensors")
+    with pytest.raises(PolicyError, match="leave out --checkpoint"):
+        check_request(request)

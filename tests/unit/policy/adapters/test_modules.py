@@ -1,0 +1,162 @@
+"""Policies that are torch modules by name: of a user's class, or of a TorchScript archive."""
+
+import json
+from pathlib import Path
+
+import pytest
+import torch
+from torch import nn
+
+from helpers.torch_policies import DUAL, SINGLE, Encoder, ForwardOnly, NamedDenoiser
+from policy.engines.choose import chunks_of_samples
+from policy.engines.parity import make_parity_samples, parity_failure
+from policy.errors import PolicyError
+from policy.loading.load import check_request, load_policy, read_policy_contract
+from policy.loading.request import PolicyRequest
+from policy.protocol import Executable
+
+pytestmark = [
+    pytest.mark.filterwarnings("ignore:.*torch.jit:DeprecationWarning"),
+    pytest.mark.filterwarnings("ignore::torch.jit.TracerWarning"),
+]
+
+CONTRACT = """
+[contract]
+image_height = 32
+image_width = 32
+horizon = 8
+"""
+
+
+@pytest.fixture(autouse=True)
+def own_cache(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
+
+
+def loaded(request: PolicyRequest) -> tuple[Executable, str]:
+    policy = load_policy(request, now_s=lambda: 0.0)
+    return policy.executable, "\n".join(policy.notes)
+
+
+def require_same(a: Executable, b: Executable) -> None:
+    samples = make_parity_samples(a.contract)
+    assert parity_failure(chunks_of_samples(a, samples), chunks_of_samples(b, samples)) is None
+
+
+@pytest.mark.parametrize(
+    ("name", "dual_rate"),
+    [
+        ("ForwardOnly", False),
+        ("NamedHead", True),
+        ("NamedHead", False),
+        ("NamedDenoiser", True),
+        ("NamedDenoiser", False),
+        ("Wide", True),
+        ("Wide", False),
+    ],
+)
+def test_a_class_that_names_its_modules_flies_converted(name: str, dual_rate: bool) -> None:
+    request = PolicyRequest(
+        spec=f"helpers.torch_policies:{name}",
+        dual_rate=dual_rate,
+        num_diffusion_steps=4,
+    )
+    executable, notes = loaded(request)
+    assert executable.engine.startswith("openvino"), notes
+    assert executable.contract.feature_dim == (0 if name == "ForwardOnly" else DUAL.feature_dim)
+
+
+def test_modules_that_make_no_policy_are_refused() -> None:
+    with pytest.raises(PolicyError, match="it takes forward alone, visual_encoder and action_head"):
+        loaded(PolicyRequest(spec="helpers.torch_policies:Incomplete"))
+
+
+FORWARD_EXAMPLES = (torch.zeros(1, 3, 32, 32), torch.zeros(1, SINGLE.state_dim))
+
+
+def archive(tmp_path: Path, module: nn.Module, description: object = None) -> Path:
+    path = tmp_path / "mine.pt"
+    extra = {} if description is None else {"policy.json": json.dumps(description)}
+    torch.jit.script(module.eval()).save(path, _extra_files=extra)
+    return path
+
+
+class Container(nn.Module):
+    """A module without forward that holds those of another policy."""
+
+    def __init__(self, holder: object) -> None:
+        super().__init__()
+        for name, module in vars(holder).items():
+            examples: tuple[torch.Tensor, ...] = (torch.zeros(1, 3, 32, 32),)
+            if name != "visual_encoder":
+                feature, state = torch.zeros(1, DUAL.feature_dim), torch.zeros(1, 13)
+                examples = (feature, state, torch.zeros(1, 4, 4))
+                if name == "denoiser":
+                    examples = (torch.zeros(1, DUAL.horizon, 4), torch.zeros(1), *examples)
+            trace = torch.jit.trace
+            self.add_module(name, trace(module.eval(), examples, check_trace=False))
+
+
+def described(**more: object) -> dict[str, object]:
+    return {"contract": json.loads(SINGLE.to_json()), **more}
+
+
+def test_an_archive_with_named_modules_says_all_of_itself(tmp_path: Path) -> None:
+    schedule = {"prediction": "epsilon", "betas": "linear"}
+    path = archive(tmp_path, Container(NamedDenoiser()), described(schedule=schedule))
+    request = PolicyRequest(spec=f"torchscript:{path}", num_diffusion_steps=4)
+    assert read_policy_contract(request).horizon == SINGLE.horizon
+    executable, notes = loaded(request)
+    assert executable.engine.startswith("openvino"), notes
+    mine = PolicyRequest(spec="helpers.torch_policies:NamedDenoiser", num_diffusion_steps=4)
+    require_same(executable, loaded(mine)[0])
+
+
+def test_an_archive_with_forward_flies_by_a_contract_file(tmp_path: Path) -> None:
+    path = archive(tmp_path, torch.jit.trace(ForwardOnly().eval(), FORWARD_EXAMPLES))
+    (tmp_path / "mine.toml").write_text(CONTRACT)
+    request = PolicyRequest(
+        spec=f"torchscript:{path}", contract_file=tmp_path / "mine.toml", dual_rate=False
+    )
+    executable, notes = loaded(request)
+    assert executable.engine.startswith("openvino"), notes
+    mine = PolicyRequest(spec="helpers.torch_policies:ForwardOnly", dual_rate=False)
+    require_same(executable, loaded(mine)[0])
+    with pytest.raises(PolicyError, match=r"give --contract FILE\.toml"):
+        check_request(PolicyRequest(spec=f"torchscript:{path}"))
+
+
+class Branching(nn.Module):
+    def forward(self, image: torch.Tensor, state: torch.Tensor) -> torch.Tensor:
+        chunk = torch.zeros(1, 8, 4)
+        if bool(state[0, 0] > 0):
+            chunk += 0.5
+        return chunk
+
+
+def test_the_decisions_of_a_script_are_kept(tmp_path: Path) -> None:
+    path = archive(tmp_path, Branching(), described())
+    executable, _ = loaded(PolicyRequest(spec=f"torchscript:{path}", dual_rate=False))
+    image = executable.encode(make_parity_samples(SINGLE).rgb[0])
+    history = torch.zeros(1, 4, 4).numpy()
+    for vx, throttle in ((1.0, 0.5), (-1.0, 0.0)):
+        state = torch.tensor([[vx, 0, 0, 1, *[0] * 9]]).numpy()
+        assert executable.act(image, state, history)[0, 0, 0] == throttle
+
+
+@pytest.mark.parametrize(
+    ("content", "reason"),
+    [(None, "there is no file"), (b"junk", "cannot be read"), (b"", "is empty, or cut short")],
+)
+def test_what_is_no_archive_is_refused(tmp_path: Path, content: bytes | None, reason: str) -> None:
+    path = tmp_path / "mine.pt"
+    if content is not None:
+        path.write_bytes(content)
+    with pytest.raises(PolicyError, match=reason):
+        check_request(PolicyRequest(spec=f"torchscript:{path}"))
+
+
+def test_weights_alone_are_no_archive(tmp_path: Path) -> None:
+    torch.save(Encoder().state_dict(), tmp_path / "mine.pt")
+    with pytest.raises(PolicyError, match="is not a TorchScript archive"):
+        check_request(PolicyRequest(spec=f"torchscript:{tmp_path / 'mine.pt'}"))

@@ -1,0 +1,253 @@
+"""Policies in ONNX files, and ours written as such."""
+
+import json
+import warnings
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+
+from helpers.torch_policies import DUAL, SINGLE, WIDE, ForwardOnly, TwoRates, Wide
+from policy.adapters.export import OurPolicy, export_onnx, export_torchscript
+from policy.adapters.onnx import policies
+from policy.adapters.onnx.graphs import GraphFile, Ports, Wanted
+from policy.contract import Contract
+from policy.engines.choose import chunks_of_samples
+from policy.engines.executable import ExecutionSettings
+from policy.engines.parity import make_parity_samples, parity_failure
+from policy.engines.torch_eager import make_torch_executable
+from policy.errors import PolicyError
+from policy.loading.load import check_request, load_policy, read_policy_contract
+from policy.loading.request import PolicyRequest
+from policy.nets.resnet_unet import ResnetUnet, ResnetUnetConfig
+from policy.nets.toge import Toge
+from policy.protocol import Executable
+
+STEPS = 4
+
+
+@pytest.fixture(scope="module", autouse=True)
+def own_cache(tmp_path_factory: pytest.TempPathFactory) -> object:
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("XDG_CACHE_HOME", str(tmp_path_factory.mktemp("cache")))
+        yield
+
+
+@pytest.fixture(scope="module")
+def exported_toge(trained_toge: Toge, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("toge")
+    export_onnx(trained_toge, folder)
+    return folder
+
+
+def loaded(request: PolicyRequest) -> tuple[Executable, str]:
+    policy = load_policy(request, now_s=lambda: 0.0)
+    return policy.executable, "\n".join(policy.notes)
+
+
+def reference(
+    policy: OurPolicy | TwoRates | ForwardOnly, settings: ExecutionSettings
+) -> Executable:
+    return make_torch_executable(policy, settings)  # type: ignore[arg-type]
+
+
+def require_same(a: Executable, b: Executable) -> None:
+    samples = make_parity_samples(a.contract)
+    assert parity_failure(chunks_of_samples(a, samples), chunks_of_samples(b, samples)) is None
+
+
+@pytest.mark.parametrize("dual_rate", [True, False])
+def test_our_policy_is_the_same_from_image_to_stick(trained_toge, exported_toge, dual_rate):
+    request = PolicyRequest(
+        spec=f"onnx:{exported_toge}",
+        dual_rate=dual_rate,
+        num_diffusion_steps=STEPS,
+    )
+    settings = ExecutionSettings(
+        name="toge",
+        dual_rate=dual_rate,
+        num_diffusion_steps=STEPS,
+    )
+    executable, notes = loaded(request)
+    assert executable.engine.startswith("openvino")
+    assert "agrees with float32" in notes or executable.engine == "openvino-f32"
+    assert executable.contract == replace(trained_toge.contract, arrays="numpy")
+    trained_toge.seed_noise(0)
+    require_same(executable, reference(trained_toge, settings))
+
+
+def test_the_archive_of_our_policy_is_the_same(trained_toge: Toge, tmp_path: Path) -> None:
+    export_torchscript(trained_toge, tmp_path / "toge.pt")
+    request = PolicyRequest(spec=f"torchscript:{tmp_path / 'toge.pt'}", num_diffusion_steps=STEPS)
+    trained_toge.seed_noise(0)
+    settings = ExecutionSettings(name="toge", num_diffusion_steps=STEPS)
+    executable, notes = loaded(request)
+    assert executable.engine.startswith("openvino"), notes
+    require_same(executable, reference(trained_toge, settings))
+
+
+def test_a_single_rate_policy_of_ours_gains_a_fast_path(tmp_path: Path) -> None:
+    with torch.random.fork_rng(devices=[]):
+        torch.manual_seed(0)
+        contract = Contract(image_height=32, image_width=32)
+        policy = ResnetUnet(ResnetUnetConfig(contract=contract)).eval()
+    export_onnx(policy, tmp_path)
+    settings = ExecutionSettings(name="it", dual_rate=False, num_diffusion_steps=STEPS)
+    expected = reference(policy, settings)
+    samples = make_parity_samples(policy.contract)
+    for dual_rate in (False, True):
+        request = PolicyRequest(
+            spec=f"onnx:{tmp_path}", dual_rate=dual_rate, num_diffusion_steps=STEPS
+        )
+        executable, _ = loaded(request)
+        assert executable.dual_rate == dual_rate
+        chunks = chunks_of_samples(executable, samples)
+        assert parity_failure(chunks_of_samples(expected, samples), chunks) is None
+
+
+def write(module: torch.nn.Module, path: Path, shapes: dict[str, tuple[int, ...]]) -> None:
+    with warnings.catch_warnings(action="ignore"):
+        torch.onnx.export(
+            module.eval(),
+            tuple(torch.zeros(shape) for shape in shapes.values()),
+            path,
+            input_names=list(shapes),
+            output_names=["out"],
+            dynamic_axes={name: {0: "batch"} for name in shapes},
+            dynamo=False,
+        )
+
+
+IMAGE, STATE = (1, 3, 32, 32), (1, 13)
+
+
+def test_one_file_by_the_names_of_a_contract_file(tmp_path: Path) -> None:
+    policy = ForwardOnly()
+    shapes = {"observation.images.front": IMAGE, "observation.state": STATE}
+    write(policy, tmp_path / "mine.onnx", shapes)
+    (tmp_path / "mavbridge.toml").write_text(
+        "[contract]\nimage_height = 32\nimage_width = 32\nhorizon = 8\n"
+    )
+    request = PolicyRequest(spec=f"onnx:{tmp_path / 'mine.onnx'}", dual_rate=False)
+    executable, notes = loaded(request)
+    assert "mine.onnx" in notes
+    samples = make_parity_samples(SINGLE)
+    for rgb, state, chunk in zip(
+        samples.rgb, samples.state, chunks_of_samples(executable, samples), strict=True
+    ):
+        image = torch.from_numpy(loaded_image(executable, rgb))
+        with torch.inference_mode():
+            wanted = policy(image.reshape(IMAGE), torch.from_numpy(state[None]))[0].numpy()
+        np.testing.assert_allclose(chunk, wanted, atol=0.01)
+
+
+def loaded_image(executable: Executable, rgb: np.ndarray) -> np.ndarray:
+    return executable.encode(rgb)
+
+
+def test_an_encoder_and_a_head(tmp_path: Path) -> None:
+    policy = TwoRates()
+    write(policy.visual_encoder, tmp_path / "encoder.onnx", {"x": IMAGE})
+    shapes = {"feature": (1, DUAL.feature_dim), "state": STATE, "history": (1, 4, 4)}
+    write(policy.head, tmp_path / "head.onnx", shapes)
+    description = {"contract": json.loads(SINGLE.to_json()), "inputs": {"image": "x"}}
+    (tmp_path / "policy.json").write_text(json.dumps(description))
+    request = PolicyRequest(spec=f"onnx:{tmp_path}")
+    assert read_policy_contract(request).feature_dim == 0
+    executable, _ = loaded(request)
+    assert executable.contract.feature_dim == DUAL.feature_dim
+    require_same(executable, reference(policy, ExecutionSettings(name="it")))
+
+
+@pytest.mark.parametrize("dual_rate", [True, False])
+def test_several_cameras_and_observations(tmp_path: Path, dual_rate: bool) -> None:
+    policy = Wide()
+    write(policy.visual_encoder, tmp_path / "encoder.onnx", {"image": IMAGE})
+    shapes = {"sample": (1, 8, 4), "timestep": (1,), "global_cond": (1, 2, 24), "state": (1, 2, 13)}
+    write(policy.denoiser, tmp_path / "denoiser.onnx", shapes)
+    description = {"contract": json.loads(WIDE.to_json()), "schedule": {"prediction": "sample"}}
+    (tmp_path / "policy.json").write_text(json.dumps(description))
+    flags: dict[str, Any] = {"dual_rate": dual_rate, "num_diffusion_steps": STEPS}
+    executable, _ = loaded(PolicyRequest(spec=f"onnx:{tmp_path}", **flags))
+    mine = PolicyRequest(spec="helpers.torch_policies:Wide", engine="torch", **flags)
+    require_same(executable, loaded(mine)[0])
+
+
+def test_bf16_is_flown_only_where_it_agrees(exported_toge, monkeypatch):
+    failures = iter(["a stick is off", "a stick is off"])
+    monkeypatch.setattr(policies, "precisions", lambda: (("bf16", "bf16"), ("f32", "f32")))
+    monkeypatch.setattr(policies, "parity_failure", lambda *_: next(failures))
+    executable, notes = loaded(PolicyRequest(spec=f"onnx:{exported_toge}"))
+    assert executable.engine == "openvino-f32"
+    assert "openvino-bf16 is passed over: a stick is off" in notes
+
+
+@pytest.mark.parametrize(
+    ("names", "description", "reason"),
+    [
+        ((), None, "must hold encoder.onnx and denoiser.onnx"),
+        (("encoder.onnx",), None, r"it holds \['encoder.onnx'\]"),
+        (("encoder.onnx", "head.onnx", "denoiser.onnx"), None, "must hold"),
+        (("policy.onnx",), None, "nothing says at which rate"),
+        (("policy.onnx",), "{", "is not JSON"),
+        (("policy.onnx",), '{"colour": 1}', r"must be an object of \['contract'"),
+        (("policy.onnx",), '{"contract": {"horizon": 0}}', "horizon must be an integer"),
+        (("policy.onnx",), '{"inputs": {"depth": "d"}}', "inputs .'depth'. are unknown"),
+        (("encoder.onnx", "denoiser.onnx"), '{"contract": {}}', "needs the noise schedule"),
+    ],
+)
+def test_a_folder_that_is_no_policy_is_refused_at_once(tmp_path, names, description, reason):
+    for name in names:
+        (tmp_path / name).write_bytes(b"")
+    if description is not None:
+        (tmp_path / "policy.json").write_text(description)
+    with pytest.raises(PolicyError, match=reason):
+        check_request(PolicyRequest(spec=f"onnx:{tmp_path}"))
+
+
+@pytest.mark.parametrize("flags", [{"engine": "torch"}, {"device": "cuda"}, {"checkpoint": "x"}])
+def test_flags_that_do_not_go_with_onnx_are_refused(exported_toge, flags):
+    with pytest.raises(PolicyError, match="leave out"):
+        check_request(PolicyRequest(spec=f"onnx:{exported_toge}", **flags))  # type: ignore[arg-type]
+
+
+def one_file(tmp_path: Path, shapes: dict[str, tuple[int, ...]]) -> PolicyRequest:
+    write(ForwardOnly(), tmp_path / "policy.onnx", shapes)
+    (tmp_path / "policy.json").write_text(json.dumps({"contract": json.loads(SINGLE.to_json())}))
+    return PolicyRequest(spec=f"onnx:{tmp_path}", dual_rate=False)
+
+
+def test_inputs_that_are_not_known_are_named(tmp_path: Path) -> None:
+    request = one_file(tmp_path, {"image": IMAGE, "thing": STATE})
+    with pytest.raises(PolicyError, match=r"input \['thing'\] is unknown.*'state': \[.*'proprio'"):
+        loaded(request)
+
+
+@pytest.mark.parametrize("weights_file", ["policy.onnx_data", "weights.bin"])
+def test_new_weights_in_a_file_of_their_own_are_flown(tmp_path: Path, weights_file: str) -> None:
+    onnx = pytest.importorskip("onnx", reason="the extra onnx writes the graphs")
+
+    def compiled(factor: float) -> float:
+        for old in tmp_path.iterdir():
+            old.unlink()
+        weights = onnx.numpy_helper.from_array(factor * np.eye(13, dtype=np.float32), "w")
+        ends = [
+            onnx.helper.make_tensor_value_info(name, onnx.TensorProto.FLOAT, [1, 13])
+            for name in ("state", "out")
+        ]
+        product = onnx.helper.make_node("MatMul", ["state", "w"], ["out"])
+        graph = onnx.helper.make_graph([product], "graph", ends[:1], ends[1:], [weights])
+        opsets = [onnx.helper.make_opsetid("", 18)]
+        path = tmp_path / "policy.onnx"
+        model = onnx.helper.make_model(graph, opset_imports=opsets, ir_version=9)
+        onnx.save_model(
+            model, path, save_as_external_data=True, location=weights_file, size_threshold=0
+        )
+        state = Wanted(names=("state",), shape=(1, 13))
+        file = GraphFile(path, Ports(inputs={"state": state}, result="chunk"))
+        return float(file.compile("f32")(state=np.ones((1, 13), np.float32))[0, 0])
+
+    assert [compiled(1.0), compiled(2.0)] == [1.0, 2.0]

@@ -1,0 +1,215 @@
+"""Foreign files and folders, made up small: each is named, and its way to fly."""
+
+import io
+import json
+import os
+import pickle
+import struct
+import zipfile
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+from safetensors.torch import save_file
+from torch import nn
+
+from policy.checkpoints.detect import detect
+from policy.checkpoints.header import read_contract
+from policy.errors import CheckpointError, PolicyError
+from policy.loading.load import check_request
+from policy.loading.request import PolicyRequest
+
+ACT = json.dumps({"type": "act", "input_features": {}, "output_features": {}})
+PI0 = json.dumps({"type": "pi0", "input_features": {}, "output_features": {}})
+SAFETENSORS, TORCH = "model.safetensors", "model.pt"
+
+
+@pytest.mark.parametrize("name", ["weights.safetensors", "weights.pt"])
+def test_a_pipe_is_refused_and_not_waited_for(tmp_path: Path, name: str) -> None:
+    os.mkfifo(tmp_path / name)
+    with pytest.raises(CheckpointError, match="not a file but a pipe or a device"):
+        read_contract(tmp_path / name)
+
+
+class Runs:
+    """Makes a folder if it is unpickled."""
+
+    def __init__(self, marker: Path) -> None:
+        self.marker = marker
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        return os.mkdir, (str(self.marker),)
+
+
+def tensors(*names: str, dtype: torch.dtype = torch.float32) -> dict[str, torch.Tensor]:
+    return {name: torch.zeros(2, 2, dtype=dtype) for name in names}
+
+
+def saved(content: object, **options: bool) -> bytes:
+    buffer = io.BytesIO()
+    torch.save(content, buffer, **options)
+    return buffer.getvalue()
+
+
+def zipped(*names: str) -> bytes:
+    buffer = io.BytesIO()
+    with zipfile.ZipFile(buffer, "w") as archive:
+        for name in names:
+            archive.writestr(name, "text")
+    return buffer.getvalue()
+
+
+def header_of(entries: dict[str, str]) -> bytes:
+    """A safetensors file of scalars with any dtypes; no reader looks at its data here."""
+    text = json.dumps({name: {"dtype": kind} for name, kind in entries.items()}).encode()
+    return struct.pack("<Q", len(text)) + text
+
+
+LFS = b"version https://git-lfs.github.com/spec/v1\noid sha256:00\nsize 1\n"
+LEGACY = {"_use_new_zipfile_serialization": False}
+FILES: list[tuple[str, Callable[[], bytes], str]] = [
+    (TORCH, lambda: b"", "is empty, or cut short: copy it again"),
+    (SAFETENSORS, lambda: LFS, "is a pointer of Git LFS.*git lfs pull"),
+    (SAFETENSORS, lambda: b"\n<!DOCTYPE html><html>", "is a web page.*download it again"),
+    ("m.onnx", lambda: b"\x08\x08\x12\x07pytorch", r"--policy onnx:.*m\.onnx"),
+    (
+        TORCH,
+        lambda: zipped("m/data.pkl", "m/code/m.py"),
+        r"TorchScript archive.*torchscript:.*\.pt",
+    ),
+    ("m.zip", lambda: zipped("a/weights.bin"), "a zip archive: unpack"),
+    (TORCH, lambda: saved(tensors("a"))[:300], "cut short, or damaged"),
+    (TORCH, lambda: saved(nn.Linear(2, 2)), r"pickled object \(torch.nn.*state_dict\(\)"),
+    (TORCH, lambda: pickle.dumps(nn.Linear(2, 2)), "pickled object.*torchscript:FILE"),
+    (TORCH, lambda: saved(nn.Linear(2, 2), **LEGACY), r"pickled object \(torch.nn"),
+    (TORCH, lambda: saved({"model": nn.Linear(2, 2)}), r"other pickled objects .*\(torch\.nn"),
+    (
+        TORCH,
+        lambda: saved({"state_dict": tensors("a"), "hyper_parameters": {"path": Path("x")}}),
+        r"other pickled objects beside them \(pathlib.*weights_only=False",
+    ),
+    (
+        SAFETENSORS,
+        lambda: header_of({"diffusion.unet.down.weight": "F32"}),
+        "LeRobot policy, without the config.json.*lerobot:DIR",
+    ),
+]
+
+
+@pytest.mark.parametrize(("name", "make", "message"), FILES)
+def test_a_foreign_file_is_named_with_its_way_to_fly(tmp_path, name, make, message):
+    path = tmp_path / name
+    path.write_bytes(make())
+    for refuse in (
+        lambda: read_contract(path),
+        lambda: check_request(PolicyRequest(spec="toge", checkpoint=path)),
+        lambda: check_request(PolicyRequest(spec=str(path))),
+    ):
+        with pytest.raises(PolicyError, match=message) as caught:
+            refuse()
+        assert str(path) in str(caught.value)
+
+
+FOLDERS: list[tuple[dict[str, str], str]] = [
+    ({"config.json": ACT}, r"LeRobot policy \(act\).*--policy lerobot:{}$"),
+    ({"config.json": PI0}, "of type 'pi0'.*act and diffusion fly.*ws://"),
+    ({"pretrained_model/config.json": ACT}, "--policy lerobot:{}/pretrained_model"),
+    (
+        {"checkpoints/last/pretrained_model/config.json": ACT},
+        "--policy lerobot:{}/checkpoints/last/pretrained_model",
+    ),
+    ({"meta/info.json": "{}"}, "data set, not a policy: train one: mavbridge train {}"),
+    ({"ticks.parquet": ""}, "recorded flight, not a policy"),
+    ({"encoder.onnx": "", "step.onnx": ""}, "--policy onnx:{}"),
+    ({"notes.txt": "", "config.json": "[]"}, r"a folder.*'notes\.txt'"),
+    ({"config.json": "[" * 100_000}, "a folder"),
+]
+
+
+@pytest.mark.parametrize(("files", "message"), FOLDERS)
+def test_a_foreign_folder_is_named_with_its_way_to_fly(tmp_path, files, message):
+    for name, text in files.items():
+        (tmp_path / name).parent.mkdir(parents=True, exist_ok=True)
+        (tmp_path / name).write_text(text)
+    for request in (
+        PolicyRequest(spec="toge", checkpoint=tmp_path),
+        PolicyRequest(spec=str(tmp_path)),
+    ):
+        with pytest.raises(PolicyError, match=message.replace("{}", str(tmp_path))):
+            check_request(request)
+
+
+def test_weights_of_a_lerobot_folder_name_the_folder(tmp_path: Path) -> None:
+    save_file(tensors("model.encoder.weight"), tmp_path / SAFETENSORS)
+    (tmp_path / "config.json").write_text(ACT)
+    with pytest.raises(CheckpointError, match=f"the weights of a LeRobot.*lerobot:{tmp_path}$"):
+        read_contract(tmp_path / SAFETENSORS)
+
+
+@pytest.mark.parametrize("protocol", [None, 2, 4])
+def test_no_pickle_is_run_to_be_named(tmp_path: Path, protocol: int | None) -> None:
+    marker, path = tmp_path / "ran", tmp_path / TORCH
+    content = {"state_dict": Runs(marker)}
+    path.write_bytes(saved(content) if protocol is None else pickle.dumps(content, protocol))
+    assert "could run any program" in str(detect(path))
+    assert not marker.exists()
+
+
+@pytest.mark.parametrize(
+    "content",
+    [tensors("a"), {"state_dict": tensors("a"), "epoch": 3}, nn.Linear(2, 2).state_dict()],
+)
+def test_plain_weights_are_left_to_their_reader(tmp_path: Path, content: object) -> None:
+    (tmp_path / TORCH).write_bytes(saved(content))
+    assert detect(tmp_path / TORCH) is None
+
+
+@pytest.mark.parametrize(
+    "content", [b"\x80", b"PK", b"\x80\x02cos", b"\xff" * 64, b"12345678{", b"{"]
+)
+def test_what_is_unknown_is_left_to_its_reader(tmp_path: Path, content: bytes) -> None:
+    (tmp_path / TORCH).write_bytes(content)
+    assert detect(tmp_path / TORCH) is None
+
+
+@pytest.mark.parametrize("kind", ["lerobot", "onnx", "torchscript"])
+@pytest.mark.parametrize(
+    ("content", "message"),
+    [
+        (b"<html>", "is a web page"),
+        (b"\x80\x02ctorch.nn.modules.linear\nLinear\n.", "is a whole pickled object"),
+        (b"version https://git-lfs.github.com/spec/v1\n", "git lfs pull"),
+    ],
+)
+def test_a_form_of_a_foreign_policy_names_what_else_its_file_is(tmp_path, kind, content, message):
+    path = tmp_path / "policy.onnx"
+    path.write_bytes(content)
+    with pytest.raises(PolicyError, match=rf"^--policy {kind}:{path}: .*{message}"):
+        check_request(PolicyRequest(spec=f"{kind}:{path}"))
+
+
+@pytest.mark.parametrize("spec", ["toge", "scripted:hover", "./mine.py:Mine"])
+def test_a_contract_file_that_has_no_use_is_refused(tmp_path: Path, spec: str) -> None:
+    with pytest.raises(PolicyError, match=r"has a contract of its own.*leave it out"):
+        check_request(PolicyRequest(spec=spec, contract_file=tmp_path / "contract.toml"))
+
+
+@pytest.mark.parametrize(
+    ("spec", "message"),
+    [
+        ("lerobot/diffusion_pusht", "hf download lerobot/diffusion_pusht --local-dir DIR"),
+        ("./absent.onnx", "no such file or folder"),
+    ],
+)
+def test_a_name_of_the_hub_is_not_taken_for_a_path(spec: str, message: str) -> None:
+    with pytest.raises(PolicyError, match=message):
+        check_request(PolicyRequest(spec=spec))
+
+
+def test_weights_of_ours_given_as_the_policy_say_which_flag(tmp_path: Path) -> None:
+    path = tmp_path / TORCH
+    path.write_bytes(saved(tensors("a")))
+    with pytest.raises(PolicyError, match=f"--checkpoint {path}"):
+        check_request(PolicyRequest(spec=str(path)))
