@@ -27,8 +27,13 @@ MODULES ?=
 
 .PHONY: fly check test lint bench faults fuzz mutants soak clean
 
-$(VENV)/installed: pyproject.toml constraints.txt
+# What flies, records and trains; `installed` adds what tests, plots and computes on many machines.
+$(VENV)/flies: pyproject.toml constraints.txt
 	$(PYTHON) -m venv $(VENV)
+	$(PIP) --editable '.[sitl,record,remote,screen,pilot]'
+	touch $@
+
+$(VENV)/installed: $(VENV)/flies
 	$(PIP) --editable '.[sitl,record,remote,screen,pilot,bench,onnx,cluster,dev]'
 	touch $@
 
@@ -39,7 +44,7 @@ $(VENV)/installed: pyproject.toml constraints.txt
 		MAVProxy mavsdk
 	touch $@
 
-fly: $(VENV)/installed  ## a simulated vehicle in its own process, and a policy flying its course over UDP
+fly: $(VENV)/flies  ## a simulated vehicle in its own process, and a policy flying its course over UDP
 	@mkdir -p out
 	@$(BIN)/python -m sitl course --course $(COURSE) --json > out/gates.json
 	@$(BIN)/python -m sitl --autopilot $(AUTOPILOT) --connect udpout:127.0.0.1:$(PORT) \
