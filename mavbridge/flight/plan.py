@@ -16,7 +16,7 @@ from mavbridge.flight.settings import (
     require_goal,
 )
 from mavbridge.guard.chunks import FreshnessLimits
-from mavbridge.guard.guard import FlightSettings
+from mavbridge.guard.settings import FlightSettings
 from mavbridge.guard.smoothing import Smoothing
 from policy.contract import Contract
 

@@ -14,7 +14,7 @@ from mavbridge.config.flight import Limits
 from mavbridge.core.clock import NS_PER_S
 from mavbridge.core.reasons import Code, Reason, Value, because
 from mavbridge.core.vehicle import IDLE, NEUTRAL, Command, Decision, Release, Sticks
-from mavbridge.guard.engagement import Phase
+from mavbridge.guard.values import Phase
 
 PERIOD_NS = 10 * MS
 QUARTER = Command(action=Sticks(0.25, 0.25, 0.25, 0.25))

@@ -17,7 +17,7 @@ from helpers.guard_flights import (
 )
 from mavbridge.core.errors import PeerError, UserError
 from mavbridge.core.reasons import Code, because
-from mavbridge.guard.engagement import Phase
+from mavbridge.guard.values import Phase
 from sitl.ardupilot.flight_modes import Mode
 
 ARM = dialect.MAV_CMD_COMPONENT_ARM_DISARM

@@ -8,7 +8,7 @@ import pytest
 from helpers.guard_flights import CONTRACT, MS, GuardFlight, climbing_first
 from mavbridge.core.reasons import Code, because
 from mavbridge.core.vehicle import NEUTRAL
-from mavbridge.guard.engagement import Phase
+from mavbridge.guard.values import Phase
 from sitl.ardupilot.flight_modes import Mode
 from sitl.vehicle.config import IDLE_RECEIVER_US, MID_RECEIVER_US
 

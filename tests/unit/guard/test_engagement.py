@@ -9,12 +9,11 @@ from helpers.guard_facts import AIRBORNE, COPTER_MODES, ON_GROUND, Stepped, code
 from mavbridge.core.clock import NS_PER_S
 from mavbridge.core.reasons import Code, Reason, because
 from mavbridge.core.vehicle import NEUTRAL
-from mavbridge.guard.departure import DepartureSettings, Ending
-from mavbridge.guard.engagement import ACT_TIMEOUT_NS, PREPARE_TIMEOUT_NS, Phase
-from mavbridge.guard.facts import Hand, Move
-from mavbridge.guard.outcome import Outcome
+from mavbridge.guard.sequences import DisengageSettings
+from mavbridge.guard.table import ACT_TIMEOUT_NS, PREPARE_TIMEOUT_NS
+from mavbridge.guard.values import Actions, ControlSource, EndRequest, Outcome, Phase
 
-NOTHING = Move()
+NOTHING = Actions()
 LOW, HIGH = (1500,) * 7 + (1000,), (1500,) * 7 + (2000,)
 OLD_IMAGE = because(Code.TOO_OLD, quantity="image", age_ms=400.0, limit_ms=300.0)
 READING = because(Code.READING_PARAMETERS)
@@ -45,12 +44,14 @@ def test_somebody_elses_arming_is_not_engaging() -> None:
 
 def test_arm_brings_the_vehicle_into_its_mode_arms_it_and_flies_once() -> None:
     stepped = Stepped(replace(ON_GROUND, mode="STABILIZE"), arm=True)
-    assert stepped.step() == Move(hand=Hand.IDLE)  # until the vehicle shows our sticks
-    assert stepped.step(echo_confirmed=True) == Move(hand=Hand.IDLE, mode="ALT_HOLD")
+    assert stepped.step() == Actions(
+        control=ControlSource.IDLE
+    )  # until the vehicle shows our sticks
+    assert stepped.step(echo_confirmed=True) == Actions(control=ControlSource.IDLE, mode="ALT_HOLD")
     stepped.run(1)
     assert stepped.step(mode="ALT_HOLD").mode is None
-    assert Move(hand=Hand.IDLE, arm=True) in stepped.run(1.1)
-    assert stepped.step(armed=True) == Move(hand=Hand.POLICY)
+    assert Actions(control=ControlSource.IDLE, arm=True) in stepped.run(1.1)
+    assert stepped.step(armed=True) == Actions(control=ControlSource.POLICY)
     assert stepped.phase is Phase.FLYING
 
 
@@ -77,9 +78,9 @@ def test_a_mode_that_the_vehicle_lacks_is_a_failure_at_once() -> None:
 def test_in_the_air_nothing_is_sent_before_the_policy_flies() -> None:
     stepped = Stepped(replace(AIRBORNE, mode="LOITER"), mode="ALT_HOLD")
     stepped.step()
-    assert stepped.step("engage") == Move(mode="ALT_HOLD")
+    assert stepped.step("engage") == Actions(mode="ALT_HOLD")
     assert stepped.step() == NOTHING
-    assert stepped.step(mode="ALT_HOLD") == Move(hand=Hand.POLICY)
+    assert stepped.step(mode="ALT_HOLD") == Actions(control=ControlSource.POLICY)
 
 
 @pytest.mark.parametrize("reason", ["release", "stop", "time"])
@@ -89,13 +90,13 @@ def test_a_pilot_who_never_lost_the_sticks_keeps_them(reason: str) -> None:
     stepped.step("engage")
     before = len(stepped.moves)
     if reason == "stop":
-        stepped.engagement.stop(Ending(reason=because(Code.FLIGHT_PROCESS_DIED), is_fault=True))
+        stepped.engagement.stop(EndRequest(reason=because(Code.FLIGHT_PROCESS_DIED), is_fault=True))
     stepped.run(PREPARE_TIMEOUT_NS / NS_PER_S + 1 if reason == "time" else 0)
     stepped.step("release" if reason == "release" else None)
     stepped.run(0.1)
     asked = [move for move in stepped.moves[before:] if move.mode not in (None, "ALT_HOLD")]
     assert not asked
-    assert {move.hand for move in stepped.moves} <= {None, Hand.RELEASE}
+    assert {move.control for move in stepped.moves} <= {None, ControlSource.RELEASE}
     assert stepped.phase in (Phase.RELEASED, Phase.ENDED)
 
 
@@ -105,7 +106,7 @@ def test_a_vehicle_that_does_not_get_ready_ends_it_with_a_reason() -> None:
     assert stepped.phase is Phase.ENDED
     assert codes(stepped.engagement.failure) == (Code.NOT_READY,)
     assert after_s(stepped.engagement.failure) == 90
-    assert stepped.moves[-2].hand is not Hand.IDLE
+    assert stepped.moves[-2].control is not ControlSource.IDLE
 
 
 def test_a_policy_that_is_too_slow_is_refused_before_arming() -> None:
@@ -151,15 +152,15 @@ def test_an_act_that_cannot_be_followed_is_refused_and_forgotten(
     assert stepped.engagement.refusal == because(Code.NOT_ENGAGED_SINCE, why=told)
     good = {name: getattr(AIRBORNE, name) for name in changes}
     assert set(stepped.run(2, **good)) == {NOTHING}
-    assert stepped.step("engage") == Move(hand=Hand.POLICY)
+    assert stepped.step("engage") == Actions(control=ControlSource.POLICY)
 
 
 def test_the_switch_engages_by_going_high_while_armed_and_releases_by_going_low() -> None:
     stepped = Stepped(replace(AIRBORNE, rc_channels_us=HIGH), engage_channel=8)
     assert set(stepped.run(1)) == {NOTHING}  # it was high from the start
     stepped.run(2, rc_channels_us=LOW)
-    assert stepped.run(0.21, rc_channels_us=HIGH)[-1] == Move(hand=Hand.POLICY)
-    assert stepped.step(rc_channels_us=LOW) == Move(hand=Hand.RELEASE)
+    assert stepped.run(0.21, rc_channels_us=HIGH)[-1] == Actions(control=ControlSource.POLICY)
+    assert stepped.step(rc_channels_us=LOW) == Actions(control=ControlSource.RELEASE)
     assert Code.ENGAGE_SWITCH_OFF in stepped.codes
 
 
@@ -167,7 +168,7 @@ def test_a_switch_that_was_never_high_needs_the_debounce_alone() -> None:
     stepped = Stepped(replace(AIRBORNE, rc_channels_us=LOW), engage_channel=8)
     stepped.run(0.21)
     assert set(stepped.run(0.2, rc_channels_us=HIGH)) == {NOTHING}
-    assert stepped.step() == Move(hand=Hand.POLICY)
+    assert stepped.step() == Actions(control=ControlSource.POLICY)
 
 
 LOST = (1500,) * 7
@@ -182,7 +183,7 @@ def test_only_a_radios_range_is_a_reading(unused_us: int, before: tuple[int, ...
     assert set(stepped.run(3, rc_channels_us=(*LOST, unused_us))) == {NOTHING}
     assert set(stepped.run(1, rc_channels_us=HIGH)) == {NOTHING}, "after a gap"
     stepped.run(2, rc_channels_us=LOW)
-    assert Move(hand=Hand.POLICY) in stepped.run(0.3, rc_channels_us=HIGH)
+    assert Actions(control=ControlSource.POLICY) in stepped.run(0.3, rc_channels_us=HIGH)
 
 
 @pytest.mark.parametrize("seconds", [0.02, 0.3, 0.6, 1.0, 1.5, 1.7])
@@ -193,10 +194,12 @@ def test_a_dropout_that_puts_the_switch_low_is_no_act(seconds: float, is_flying:
     if is_flying:
         stepped.step("engage")
     first, *rest = stepped.run(seconds, rc_channels_us=LOW)
-    assert first == (Move(hand=Hand.RELEASE) if is_flying else NOTHING), "low is taken at its word"
-    assert {move.hand for move in (*rest, *stepped.run(2, rc_channels_us=HIGH))} <= {
+    assert first == (Actions(control=ControlSource.RELEASE) if is_flying else NOTHING), (
+        "low is taken at its word"
+    )
+    assert {move.control for move in (*rest, *stepped.run(2, rc_channels_us=HIGH))} <= {
         None,
-        Hand.RELEASE,
+        ControlSource.RELEASE,
     }
     assert stepped.engagement.outcome.flights == is_flying
 
@@ -222,7 +225,7 @@ def test_a_receiver_that_was_lost_has_to_show_the_switch_low_again(
     assert set(stepped.run(1, rc_channels_us=HIGH, **well)) == {NOTHING}
     assert codes(stepped.engagement.refusal) == (Code.NOT_ENGAGED_SINCE, Code.SWITCH_NOT_RESTED)
     stepped.run(2, rc_channels_us=LOW)
-    assert Move(hand=Hand.POLICY) in stepped.run(0.3, rc_channels_us=HIGH)
+    assert Actions(control=ControlSource.POLICY) in stepped.run(0.3, rc_channels_us=HIGH)
 
 
 def test_a_switch_that_bounces_is_no_act() -> None:
@@ -258,7 +261,7 @@ def test_the_key_does_not_overrule_a_switch_that_is_off() -> None:
 def test_engage_on_arm_counts_the_first_arming_alone() -> None:
     stepped = Stepped(ON_GROUND, engage_on_arm=True)
     stepped.run(0.1)
-    assert stepped.step(armed=True) == Move(hand=Hand.POLICY)
+    assert stepped.step(armed=True) == Actions(control=ControlSource.POLICY)
     stepped.step(armed=False)
     stepped.run(2, is_released=True)
     assert set(stepped.run(2, armed=True)) == {NOTHING}
@@ -286,8 +289,8 @@ TAKEOVERS: list[tuple[dict[str, Any], Reason]] = [
 def test_a_takeover_releases_at_once_and_sends_no_mode(
     changes: dict[str, Any], told: Reason, on_fault: Any
 ) -> None:
-    stepped = flying(departure=DepartureSettings(on_fault=on_fault, then=on_fault))
-    assert stepped.step(**changes) == Move(hand=Hand.RELEASE)
+    stepped = flying(disengage=DisengageSettings(on_fault=on_fault, then=on_fault))
+    assert stepped.step(**changes) == Actions(control=ControlSource.RELEASE)
     assert stepped.engagement.reason == told
     moves = stepped.run(3, is_released=False)
     assert {move.mode for move in moves} == {None}
@@ -306,7 +309,7 @@ def test_what_was_taken_comes_back_only_by_an_act(changes: dict[str, Any], told:
     stepped.run(1, armed=False)
     assert set(stepped.run(1, armed=True)) == {NOTHING}  # disarming resets nothing
     assert stepped.engagement.reason == told
-    assert stepped.step("engage") == Move(hand=Hand.POLICY)
+    assert stepped.step("engage") == Actions(control=ControlSource.POLICY)
 
 
 def test_a_release_that_is_confirmed_ends_at_once() -> None:
@@ -328,10 +331,10 @@ FAULTS = [
 @pytest.mark.parametrize("changes", FAULTS)
 def test_a_fault_is_neutral_in_the_same_step_then_a_safe_mode(changes: dict[str, Any]) -> None:
     stepped = flying(replace(AIRBORNE, pilot_sticks=NEUTRAL._replace(throttle=-1.0)))
-    assert stepped.step(**changes) == Move(hand=Hand.NEUTRAL, mode="BRAKE")
+    assert stepped.step(**changes) == Actions(control=ControlSource.NEUTRAL, mode="BRAKE")
     assert stepped.phase is Phase.LEAVING
-    assert {move.hand for move in stepped.run(0.05)} == {Hand.NEUTRAL}
-    assert stepped.step(mode="BRAKE") == Move(hand=Hand.RELEASE)
+    assert {move.control for move in stepped.run(0.05)} == {ControlSource.NEUTRAL}
+    assert stepped.step(mode="BRAKE") == Actions(control=ControlSource.RELEASE)
 
 
 @pytest.mark.parametrize("changes", FAULTS)
@@ -342,13 +345,13 @@ def test_inputs_that_come_back_do_not_fly_again(changes: dict[str, Any]) -> None
     back = dict.fromkeys(changes)
     moves = stepped.run(3, is_released=True, **back)
     assert moves[-1] == NOTHING
-    assert all(move.hand is not Hand.POLICY for move in moves)
+    assert all(move.control is not ControlSource.POLICY for move in moves)
 
 
 def test_the_flight_process_dies() -> None:
     stepped = flying()
-    stepped.engagement.stop(Ending(reason=because(Code.FLIGHT_PROCESS_DIED), is_fault=True))
-    assert stepped.step().hand is Hand.NEUTRAL
+    stepped.engagement.stop(EndRequest(reason=because(Code.FLIGHT_PROCESS_DIED), is_fault=True))
+    assert stepped.step().control is ControlSource.NEUTRAL
     stepped.run(0.1)
     stepped.step(is_released=True)
     stepped.step()
@@ -361,7 +364,7 @@ def test_the_duration_counts_from_the_first_engagement() -> None:
     stepped.step("engage")
     stepped.run(0.99)
     assert stepped.phase is Phase.FLYING
-    assert stepped.step().hand is Hand.NEUTRAL
+    assert stepped.step().control is ControlSource.NEUTRAL
     stepped.run(0.1, is_released=True)
     assert stepped.phase is Phase.ENDED
 
@@ -377,24 +380,24 @@ def test_the_duration_ends_it_also_after_a_takeover() -> None:
 
 def test_the_operators_release_is_a_normal_end_and_the_guard_stays() -> None:
     stepped = flying()
-    assert stepped.step("release").hand is Hand.NEUTRAL
+    assert stepped.step("release").control is ControlSource.NEUTRAL
     stepped.run(1, is_released=True)
     assert stepped.phase is Phase.RELEASED
-    assert stepped.step("engage").hand is Hand.POLICY
+    assert stepped.step("engage").control is ControlSource.POLICY
 
 
 def test_a_stop_before_any_flight_ends_without_a_word_to_the_vehicle() -> None:
     stepped = Stepped()
-    stepped.engagement.stop(Ending(reason=because(Code.DURATION)))
+    stepped.engagement.stop(EndRequest(reason=because(Code.DURATION)))
     assert stepped.step() == NOTHING
     assert stepped.phase is Phase.ENDED
 
 
 def test_readonly_flies_whenever_it_could_and_never_asks() -> None:
     stepped = Stepped(replace(AIRBORNE, armed=False, mode="RTL"), readonly=True)
-    assert {move.hand for move in stepped.run(1)} == {Hand.POLICY}
+    assert {move.control for move in stepped.run(1)} == {ControlSource.POLICY}
     assert stepped.step(chunk_problem=because(Code.NO_CHUNK)) == NOTHING
-    assert stepped.step(chunk_problem=None).hand is Hand.POLICY
+    assert stepped.step(chunk_problem=None).control is ControlSource.POLICY
     assert not any(move.arm or move.mode for move in stepped.moves)
 
 
@@ -404,20 +407,20 @@ def test_readonly_flies_whenever_it_could_and_never_asks() -> None:
 def test_a_takeover_releases_at_least_once_even_if_nothing_seems_to_be_held() -> None:
     stepped = flying()
     move = stepped.step(is_released=True, interruption=because(Code.REBOOTED))
-    assert move == Move(hand=Hand.RELEASE)
-    assert stepped.step() == Move()
+    assert move == Actions(control=ControlSource.RELEASE)
+    assert stepped.step() == Actions()
     assert stepped.phase is Phase.RELEASED
 
 
 def test_a_takeover_in_the_very_step_of_a_fault_wins() -> None:
-    stepped = flying(departure=DepartureSettings(on_fault="hold"))
+    stepped = flying(disengage=DisengageSettings(on_fault="hold"))
     move = stepped.step(mode="RTL", chunk_fault=because(Code.NO_CHUNK), envelope_problem=TILT)
-    assert move == Move(hand=Hand.RELEASE)
+    assert move == Actions(control=ControlSource.RELEASE)
     assert not any(move.mode for move in stepped.run(3))
 
 
 def test_the_safe_mode_of_the_last_flight_is_the_pilots_in_the_next_one() -> None:
-    stepped = flying(departure=DepartureSettings(on_fault="hold"))
+    stepped = flying(disengage=DisengageSettings(on_fault="hold"))
     stepped.step(chunk_fault=because(Code.NO_CHUNK))
     stepped.run(0.2, mode="BRAKE")
     stepped.run(1.5)
@@ -434,9 +437,9 @@ def test_an_act_that_waits_for_a_mode_is_given_up_soon_and_touches_no_stick() ->
     )
     stepped.step()
     stepped.step("engage")
-    assert stepped.moves[-1] == Move(mode="LOITER")
+    assert stepped.moves[-1] == Actions(mode="LOITER")
     moves = stepped.run(ACT_TIMEOUT_NS / NS_PER_S + 1.5)
-    assert {move.hand for move in moves} <= {None, Hand.RELEASE}
+    assert {move.control for move in moves} <= {None, ControlSource.RELEASE}
     assert stepped.phase is Phase.RELEASED
     assert stepped.engagement.failure is None
     assert codes(stepped.engagement.refusal) == (Code.NOT_ENGAGED_SINCE, Code.NOT_READY)
@@ -456,7 +459,7 @@ def test_a_pilots_mode_is_not_changed_back_while_ours_is_awaited() -> None:
 def test_an_act_while_the_last_flight_ends_is_refused_aloud(phase: str) -> None:
     stepped = flying(
         replace(AIRBORNE, has_receiver=phase == "leaving", pilot_sticks=None),
-        departure=DepartureSettings(on_fault="hold"),
+        disengage=DisengageSettings(on_fault="hold"),
     )
     if phase == "releasing":
         stepped.step(mode="RTL")
@@ -475,7 +478,7 @@ def test_an_act_while_the_last_flight_ends_is_refused_aloud(phase: str) -> None:
 def test_a_flight_in_order_is_told_so() -> None:
     stepped = flying()
     stepped.run(1, is_landed=False)
-    stepped.engagement.stop(Ending(reason=because(Code.COURSE_DONE), end="course"))
+    stepped.engagement.stop(EndRequest(reason=because(Code.COURSE_DONE), end="course"))
     stepped.run(1)
     expected = Outcome(flights=1, has_left_ground=True, end="course")
     assert stepped.engagement.outcome == expected
@@ -509,7 +512,7 @@ def test_each_planned_end_has_its_code_until_the_next_flight() -> None:
     stepped.run(2, is_released=True)
     stepped.step("engage")
     assert stepped.engagement.outcome.end is None
-    stepped.engagement.stop(Ending(reason=because(Code.SIGNAL)))
+    stepped.engagement.stop(EndRequest(reason=because(Code.SIGNAL)))
     stepped.step()
     assert stepped.engagement.outcome.end == "signal"
     timed = flying(duration_ns=NS_PER_S)

@@ -9,17 +9,15 @@ from helpers.guard_facts import AIRBORNE, ON_GROUND, PX4_MODES, Stepped, flying
 from mavbridge.core.clock import NS_PER_S
 from mavbridge.core.reasons import Code, Reason, because
 from mavbridge.core.vehicle import NEUTRAL
-from mavbridge.guard.departure import DepartureSettings, Ending
-from mavbridge.guard.engagement import Phase
-from mavbridge.guard.facts import Hand, Move
-from mavbridge.guard.outcome import Outcome
+from mavbridge.guard.sequences import DisengageSettings
+from mavbridge.guard.values import Actions, ControlSource, EndRequest, Outcome, Phase
 
-NOTHING = Move()
+NOTHING = Actions()
 LOW, HIGH = (1500,) * 7 + (1000,), (1500,) * 7 + (2000,)
 NO_RECEIVER = replace(AIRBORNE, has_receiver=False, pilot_sticks=None)
 FAULT = {"chunk_fault": because(Code.NO_CHUNK)}
 REBOOTED = {"interruption": because(Code.REBOOTED), "interruptions": 1}
-OVER = Ending(reason=because(Code.DURATION))
+OVER = EndRequest(reason=because(Code.DURATION))
 
 
 def changed(before: str, after: str) -> Reason:
@@ -67,7 +65,7 @@ def test_the_switch_engages_from_below_1200_to_above_1800(
 def test_a_switch_on_a_channel_that_does_not_arrive_is_not_off() -> None:
     stepped = Stepped(engage_channel=9)
     stepped.step()
-    assert stepped.step("engage") == Move(hand=Hand.POLICY)
+    assert stepped.step("engage") == Actions(control=ControlSource.POLICY)
 
 
 def test_a_switch_engages_once_each_time_it_goes_high() -> None:
@@ -78,7 +76,7 @@ def test_a_switch_engages_once_each_time_it_goes_high() -> None:
     stepped.run(0.1, is_released=True)
     assert set(stepped.run(1, mode="ALT_HOLD")) == {NOTHING}
     stepped.run(2, rc_channels_us=LOW)
-    assert Move(hand=Hand.POLICY) in stepped.run(0.3, rc_channels_us=HIGH)
+    assert Actions(control=ControlSource.POLICY) in stepped.run(0.3, rc_channels_us=HIGH)
 
 
 @pytest.mark.parametrize("way", ["switch", "arming"])
@@ -112,7 +110,7 @@ def test_a_switch_that_goes_low_on_the_way_out_changes_nothing() -> None:
     stepped.run(0.3)
     stepped.run(0.3, rc_channels_us=HIGH)
     stepped.step(**FAULT)
-    assert stepped.step(rc_channels_us=LOW).hand is Hand.NEUTRAL
+    assert stepped.step(rc_channels_us=LOW).control is ControlSource.NEUTRAL
     assert stepped.phase is Phase.LEAVING
 
 
@@ -169,9 +167,9 @@ def test_a_stop_keeps_a_vehicle_from_being_armed() -> None:
 
 
 def test_the_first_stop_is_the_one_that_counts() -> None:
-    stepped = flying(NO_RECEIVER, departure=DepartureSettings(on_fault="rtl", then="land"))
+    stepped = flying(NO_RECEIVER, disengage=DisengageSettings(on_fault="rtl", then="land"))
     stepped.engagement.stop(OVER)
-    stepped.engagement.stop(Ending(reason=because(Code.FLIGHT_PROCESS_DIED), is_fault=True))
+    stepped.engagement.stop(EndRequest(reason=because(Code.FLIGHT_PROCESS_DIED), is_fault=True))
     assert stepped.step().mode == "LAND"
     assert stepped.codes == (Code.DURATION,)
 
@@ -198,7 +196,7 @@ def test_the_way_in_may_take_90_s_and_the_time_of_a_climb_at_1_mps(
 
 
 def test_a_vehicle_that_is_armed_and_not_ready_in_time_is_left_as_after_a_fault() -> None:
-    stepped = Stepped(ON_GROUND, arm=True, departure=DepartureSettings(on_fault="rtl", then="land"))
+    stepped = Stepped(ON_GROUND, arm=True, disengage=DisengageSettings(on_fault="rtl", then="land"))
     stepped.run(0.1, echo_confirmed=True)
     stepped.run(89.9, armed=True, chunk_problem=because(Code.NO_IMAGE))
     assert stepped.phase is Phase.PREPARING
@@ -236,7 +234,7 @@ def test_a_mode_that_is_changed_once_ours_is_there_is_a_takeover_although_disarm
 def test_sticks_that_idled_on_the_ground_are_released_although_none_seems_to_be_held() -> None:
     stepped = Stepped(replace(ON_GROUND, is_released=True), arm=True)
     stepped.run(0.1)
-    assert stepped.step("release") == Move(hand=Hand.RELEASE)
+    assert stepped.step("release") == Actions(control=ControlSource.RELEASE)
 
 
 def test_an_interruption_before_the_act_is_forgotten_one_after_it_is_not() -> None:
@@ -244,14 +242,16 @@ def test_an_interruption_before_the_act_is_forgotten_one_after_it_is_not() -> No
     stepped.run(0.1, echo_confirmed=True)
     assert stepped.phase is Phase.PREPARING
     stepped.step(armed=True)
-    assert stepped.step().hand is Hand.POLICY
-    assert stepped.step(interruption=because(Code.REBOOTED)) == Move(hand=Hand.RELEASE)
+    assert stepped.step().control is ControlSource.POLICY
+    assert stepped.step(interruption=because(Code.REBOOTED)) == Actions(
+        control=ControlSource.RELEASE
+    )
     assert stepped.codes == (Code.REBOOTED,)
 
 
 def test_in_the_air_too_an_interruption_before_the_act_is_forgotten() -> None:
     stepped = flying(replace(AIRBORNE, **REBOOTED))
-    assert {move.hand for move in stepped.run(0.1)} == {Hand.POLICY}
+    assert {move.control for move in stepped.run(0.1)} == {ControlSource.POLICY}
 
 
 def test_sticks_that_were_never_ours_are_not_released() -> None:
@@ -271,10 +271,10 @@ def test_a_pilot_who_has_armed_it_and_changes_the_mode_meanwhile_keeps_it() -> N
 
 
 def test_a_stop_while_preparing_is_told_and_followed_as_what_it_is() -> None:
-    stepped = Stepped(ON_GROUND, arm=True, departure=DepartureSettings(on_fault="rtl", then="land"))
+    stepped = Stepped(ON_GROUND, arm=True, disengage=DisengageSettings(on_fault="rtl", then="land"))
     stepped.run(0.1, echo_confirmed=True)
     stepped.step(armed=True, chunk_problem=because(Code.NO_IMAGE))
-    stepped.engagement.stop(Ending(reason=because(Code.FLIGHT_PROCESS_DIED), is_fault=True))
+    stepped.engagement.stop(EndRequest(reason=because(Code.FLIGHT_PROCESS_DIED), is_fault=True))
     assert stepped.step().mode == "RTL"
     assert stepped.codes == (Code.FLIGHT_PROCESS_DIED,)
 
@@ -307,8 +307,10 @@ def test_a_signal_after_the_duration_is_over_does_not_begin_the_way_out_again() 
     stepped.run(1)
     stepped.run(0.2, mode="LAND")
     assert stepped.phase is Phase.HOLDING
-    stepped.engagement.stop(Ending(reason=because(Code.SIGNAL)))
-    assert {(move.hand, move.mode) for move in stepped.run(0.2)} == {(Hand.NEUTRAL, None)}
+    stepped.engagement.stop(EndRequest(reason=because(Code.SIGNAL)))
+    assert {(move.control, move.mode) for move in stepped.run(0.2)} == {
+        (ControlSource.NEUTRAL, None)
+    }
     assert (stepped.phase, stepped.codes) == (Phase.HOLDING, (Code.DURATION,))
 
 
@@ -318,7 +320,7 @@ def test_each_flight_and_each_fault_counts() -> None:
         stepped.step(**FAULT)
         stepped.run(0.2, chunk_fault=None, is_released=True)
         assert stepped.engagement.outcome.faults == flights
-        assert stepped.step("engage").hand is Hand.POLICY
+        assert stepped.step("engage").control is ControlSource.POLICY
         assert stepped.engagement.outcome.flights == flights + 1
 
 
@@ -346,12 +348,12 @@ def test_the_duration_goes_on_through_takeovers() -> None:
     stepped.step("engage")
     stepped.run(0.37)
     assert stepped.phase is Phase.FLYING
-    assert stepped.step().hand is Hand.NEUTRAL
+    assert stepped.step().control is ControlSource.NEUTRAL
     assert stepped.codes == (Code.DURATION,)
 
 
 def test_a_landing_ends_it_in_order_and_the_next_act_flies_again() -> None:
-    stepped = flying(departure=DepartureSettings(on_fault="rtl", then="land"))
+    stepped = flying(disengage=DisengageSettings(on_fault="rtl", then="land"))
     assert stepped.step(landing=because(Code.LANDED)).mode == "LAND"
     assert stepped.codes == (Code.LANDED,)
     assert stepped.engagement.outcome.faults == 0
@@ -361,7 +363,7 @@ def test_a_landing_ends_it_in_order_and_the_next_act_flies_again() -> None:
 
 def test_a_stop_after_a_fault_of_another_process_counts_as_a_fault() -> None:
     stepped = flying()
-    stepped.engagement.stop(Ending(reason=because(Code.FLIGHT_PROCESS_DIED), is_fault=True))
+    stepped.engagement.stop(EndRequest(reason=because(Code.FLIGHT_PROCESS_DIED), is_fault=True))
     stepped.step()
     assert stepped.engagement.outcome.faults == 1
     assert stepped.codes == (Code.FLIGHT_PROCESS_DIED,)
@@ -374,7 +376,7 @@ def test_a_stop_on_the_way_out_waits_for_it_and_then_ends_it() -> None:
     stepped = flying()
     stepped.step(**FAULT)
     stepped.engagement.stop(OVER)
-    assert stepped.step().hand is Hand.NEUTRAL
+    assert stepped.step().control is ControlSource.NEUTRAL
     stepped.run(0.2, is_released=True)
     assert stepped.phase is Phase.ENDED
 
@@ -385,12 +387,12 @@ def test_the_stop_that_began_the_way_out_does_not_begin_it_again() -> None:
     stepped.step()
     stepped.run(0.2, mode="LAND")
     assert stepped.phase is Phase.HOLDING
-    assert {(move.hand, move.mode) for move in stepped.run(1)} == {(Hand.NEUTRAL, None)}
+    assert {(move.control, move.mode) for move in stepped.run(1)} == {(ControlSource.NEUTRAL, None)}
     assert stepped.phase is Phase.HOLDING
 
 
 def test_the_operators_release_on_the_way_out_does_not_begin_it_again() -> None:
-    stepped = flying(departure=DepartureSettings(on_fault="rtl", then="land"))
+    stepped = flying(disengage=DisengageSettings(on_fault="rtl", then="land"))
     stepped.step(**FAULT)
     assert stepped.step("release").mode is None
     assert stepped.codes == (Code.NO_CHUNK,)
@@ -402,7 +404,7 @@ def test_a_vehicle_is_lost_after_30_s_without_a_word_while_held() -> None:
     assert stepped.phase is Phase.HOLDING, "it is heard"
     stepped.run(30.2, heard_ns=stepped.facts.now_ns)
     assert stepped.phase is Phase.HOLDING
-    assert stepped.run(0.1)[-1].hand is Hand.RELEASE
+    assert stepped.run(0.1)[-1].control is ControlSource.RELEASE
     assert stepped.engagement.reason == held_until(because(Code.VEHICLE_LOST, after_s=30))
 
 
@@ -451,7 +453,7 @@ def test_a_mode_that_was_not_confirmed_is_told_once() -> None:
 
 def test_going_back_from_the_safe_mode_to_the_policys_is_a_takeover() -> None:
     stepped = holding()
-    assert stepped.step(mode="ALT_HOLD") == Move(hand=Hand.RELEASE)
+    assert stepped.step(mode="ALT_HOLD") == Actions(control=ControlSource.RELEASE)
     assert stepped.engagement.reason == held_until(changed("BRAKE", "ALT_HOLD"))
 
 
@@ -461,7 +463,7 @@ def test_a_release_is_repeated_until_it_shows_or_for_so_long(
 ) -> None:
     stepped = flying(replace(AIRBORNE, shows_last=shows_last))
     stepped.step(mode="LOITER")
-    assert {move.hand for move in stepped.run(limit_s - 0.01)} == {Hand.RELEASE}
+    assert {move.control for move in stepped.run(limit_s - 0.01)} == {ControlSource.RELEASE}
     assert stepped.step() == NOTHING
     assert stepped.phase is Phase.RELEASED
     assert stepped.engagement.refusal == because(Code.RELEASE_NOT_SEEN)
@@ -478,7 +480,7 @@ def test_while_it_is_released_nothing_ends_it_sooner() -> None:
     stepped = flying()
     stepped.step(mode="LOITER")
     stepped.engagement.stop(OVER)
-    assert stepped.step().hand is Hand.RELEASE
+    assert stepped.step().control is ControlSource.RELEASE
     stepped.step(is_released=True)
     stepped.step()
     assert stepped.phase is Phase.ENDED
@@ -489,7 +491,7 @@ def test_while_it_is_released_nothing_ends_it_sooner() -> None:
 OFFBOARD: dict[str, Any] = {
     "is_setpoint": True,
     "modes": ("OFFBOARD",),
-    "departure": DepartureSettings(is_setpoint=True, on_fault="land", then="rtl"),
+    "disengage": DisengageSettings(is_setpoint=True, on_fault="land", then="rtl"),
 }
 IN_OFFBOARD = replace(AIRBORNE, mode="OFFBOARD", modes=PX4_MODES)
 
@@ -497,16 +499,16 @@ IN_OFFBOARD = replace(AIRBORNE, mode="OFFBOARD", modes=PX4_MODES)
 def test_a_takeover_in_a_mode_of_setpoints_is_left_as_after_a_fault_and_told_once() -> None:
     stepped = flying(IN_OFFBOARD, **OFFBOARD)
     move = stepped.step(interruption=because(Code.REPLACED, said="another address"))
-    assert move == Move(hand=Hand.NEUTRAL, mode="AUTO.LAND")
+    assert move == Actions(control=ControlSource.NEUTRAL, mode="AUTO.LAND")
     assert (stepped.phase, stepped.codes) == (Phase.LEAVING, (Code.REPLACED,))
-    assert stepped.step().hand is Hand.NEUTRAL
+    assert stepped.step().control is ControlSource.NEUTRAL
     assert stepped.engagement.outcome.faults == 0
 
 
 def test_in_a_mode_that_follows_no_setpoints_a_takeover_is_silence() -> None:
     stepped = flying(replace(IN_OFFBOARD, mode="POSCTL"), **{**OFFBOARD, "modes": ("POSCTL",)})
-    assert stepped.step(interruption=because(Code.REPLACED, said="another address")) == Move(
-        hand=Hand.RELEASE
+    assert stepped.step(interruption=because(Code.REPLACED, said="another address")) == Actions(
+        control=ControlSource.RELEASE
     )
 
 
@@ -529,7 +531,7 @@ def test_an_act_in_a_mode_of_setpoints_that_is_late_is_left_as_after_a_fault() -
 @pytest.mark.parametrize("ends", ["stop", "duration"])
 def test_watching_ends_as_a_flight_does(ends: str) -> None:
     stepped = Stepped(readonly=True, duration_ns=NS_PER_S if ends == "duration" else None)
-    assert {move.hand for move in stepped.run(1)} == {Hand.POLICY}
+    assert {move.control for move in stepped.run(1)} == {ControlSource.POLICY}
     if ends == "stop":
         stepped.engagement.stop(OVER)
     assert stepped.step() == NOTHING

@@ -28,12 +28,13 @@ from mavbridge.core.vehicle import (
     Velocity,
 )
 from mavbridge.guard.chunks import Chunk, FreshnessLimits
-from mavbridge.guard.departure import DepartureSettings, Ending
-from mavbridge.guard.engagement import Act, Phase
 from mavbridge.guard.envelope import EnvelopeLimits
-from mavbridge.guard.guard import FlightSettings, Guard, GuardInput, GuardOutput
+from mavbridge.guard.guard import Guard, GuardInput, GuardOutput
 from mavbridge.guard.limits import LimitSettings
+from mavbridge.guard.sequences import DisengageSettings
+from mavbridge.guard.settings import FlightSettings
 from mavbridge.guard.smoothing import Smoothing
+from mavbridge.guard.values import EndRequest, OperatorCommand, Phase
 
 MS = NS_PER_MS
 SWITCHED_OFF = because(Code.OVERRIDE_SWITCH_OFF)
@@ -62,7 +63,7 @@ class Stepped:
         **rules: Any,
     ) -> None:
         engagement = engagement_settings(
-            **({"modes": ("ALT_HOLD",), "departure": DepartureSettings()} | rules)
+            **({"modes": ("ALT_HOLD",), "disengage": DisengageSettings()} | rules)
         )
         settings = FlightSettings(
             meaning=meaning or ActionMeaning(),
@@ -105,8 +106,8 @@ class Stepped:
         at_ms: float,
         chunk: Chunk | None = None,
         *,
-        act: Act | None = None,
-        stop: Ending | None = None,
+        act: OperatorCommand | None = None,
+        stop: EndRequest | None = None,
         **changes: Any,
     ) -> GuardOutput:
         now_ns = START_NS + round(at_ms * MS)
@@ -180,7 +181,7 @@ def test_a_new_chunk_leaves_at_once_and_a_slot_shortly_after_it_is_left_out() ->
     ],
 )
 def test_a_change_of_hands_does_not_wait_for_a_slot(
-    changes: dict[str, Any], act: Act | None, expected: Decision
+    changes: dict[str, Any], act: OperatorCommand | None, expected: Decision
 ) -> None:
     guard = Stepped().engaged()
     output = guard.step(31, act=act, **changes)
@@ -361,7 +362,8 @@ def test_each_word_of_link_and_vehicle_counts(
 def test_a_refused_mode_is_known() -> None:
     guard = Stepped(status={"has_receiver": False}).engaged()
     assert (
-        guard.step(31, stop=Ending(reason=because(Code.GUARD_DIED), is_fault=True)).mode == "BRAKE"
+        guard.step(31, stop=EndRequest(reason=because(Code.GUARD_DIED), is_fault=True)).mode
+        == "BRAKE"
     )
     guard.link = {"refused_mode": "BRAKE"}
     assert guard.step(140).mode == "LAND"
@@ -432,7 +434,7 @@ def test_setpoints_end_idle_on_the_ground(is_landed: bool | None, thrust: float)
         status={"mode": "GUIDED", "is_landed": is_landed},
         modes=("GUIDED",),
         is_setpoint=True,
-        departure=DepartureSettings(is_setpoint=True),
+        disengage=DisengageSettings(is_setpoint=True),
     )
     guard.engaged(sticks=level)
     assert guard.step(31, act="release").decision == Command(action=level._replace(thrust=thrust))
@@ -641,7 +643,7 @@ def test_without_a_vehicle_it_waits_and_can_be_ended() -> None:
     assert (waiting.phase, waiting.decision) == (Phase.WAITING, None)
     assert waiting.reason == because(Code.NO_HEARTBEAT)
     ended = guard.step(
-        START_NS + MS, GuardInput(link=link, stop=Ending(reason=because(Code.SIGNAL)))
+        START_NS + MS, GuardInput(link=link, stop=EndRequest(reason=because(Code.SIGNAL)))
     )
     assert (ended.phase, ended.decision) == (Phase.ENDED, None)
     assert guard.failure is None
@@ -680,7 +682,7 @@ def of_velocities(mode: str, **rules: Any) -> Stepped:
         roles=PX4_MODES,
         modes=("OFFBOARD",),
         is_setpoint=True,
-        departure=DepartureSettings(is_setpoint=True),
+        disengage=DisengageSettings(is_setpoint=True),
         **rules,
     )
 

@@ -7,16 +7,15 @@ import pytest
 from helpers.guard_facts import AIRBORNE, COPTER_MODES, ON_GROUND, PX4_MODES, Stepped, flying
 from mavbridge.core.reasons import Code, because
 from mavbridge.core.vehicle import OnFault
-from mavbridge.guard.departure import DepartureSettings
-from mavbridge.guard.engagement import Phase
-from mavbridge.guard.facts import Hand, Move
+from mavbridge.guard.sequences import DisengageSettings
+from mavbridge.guard.values import Actions, ControlSource, Phase
 
 GROUND = replace(ON_GROUND, mode="STABILIZE", modes=COPTER_MODES, echo_confirmed=True)
 NO_ECHO = because(Code.NO_ECHO, message="RC_CHANNELS", quantity="sticks")
 PX4_GROUND = replace(GROUND, mode="AUTO.LOITER", modes=PX4_MODES)
 
 
-def requests(moves: list[Move]) -> list[str]:
+def requests(moves: list[Actions]) -> list[str]:
     """Everything that was asked for, in order."""
     asked: list[str] = []
     for move in moves:
@@ -30,10 +29,10 @@ def test_the_autopilot_takes_off_before_sticks_fly() -> None:
     stepped = Stepped(GROUND, arm=True, takeoff_m=8.0)
     assert requests(stepped.run(0.5)) == ["mode GUIDED"]
     assert requests(stepped.run(1.0, mode="GUIDED")) == ["arm"]
-    assert {move.hand for move in stepped.moves} == {Hand.IDLE}
+    assert {move.control for move in stepped.moves} == {ControlSource.IDLE}
     climbing = stepped.run(2.5, armed=True)
     assert requests(climbing) == ["climb 8"] * 2
-    assert {move.hand for move in climbing} == {Hand.NEUTRAL}
+    assert {move.control for move in climbing} == {ControlSource.NEUTRAL}
     assert requests(stepped.run(2.0, is_landed=False, height_m=4.0)) == []
     assert stepped.engagement.reason == because(Code.TAKING_OFF, height_m=8)
     assert requests(stepped.run(0.5, height_m=7.3)) == ["mode ALT_HOLD"]
@@ -61,7 +60,7 @@ def test_setpoints_would_end_a_takeoff_so_none_is_sent() -> None:
         replace(GROUND, mode="GUIDED"), arm=True, takeoff_m=8.0, is_setpoint=True, modes=("GUIDED",)
     )
     moves = [*stepped.run(0.1), *stepped.run(1.1, armed=True), *stepped.run(1.0, height_m=5.0)]
-    assert {move.hand for move in moves} == {None}
+    assert {move.control for move in moves} == {None}
     stepped.step(height_m=7.9)
     assert stepped.phase is Phase.FLYING
 
@@ -76,7 +75,7 @@ def test_px4_takes_off_through_its_own_modes_and_gets_setpoints_before_offboard(
     stepped.step(height_m=4.9)
     entering = stepped.run(0.3, mode="AUTO.LOITER")
     assert requests(stepped.moves[-31:]) == ["mode OFFBOARD"]
-    assert {move.hand for move in entering} == {Hand.NEUTRAL}
+    assert {move.control for move in entering} == {ControlSource.NEUTRAL}
     stepped.step(mode="OFFBOARD")
     assert stepped.phase is Phase.FLYING
 
@@ -86,13 +85,17 @@ def test_another_mode_during_the_takeoff_is_the_pilots() -> None:
     stepped.run(0.1)
     stepped.run(1.0, armed=True, is_landed=False, height_m=2.0)
     move = stepped.step(mode="LOITER")
-    assert (stepped.phase, move.hand, move.mode) == (Phase.RELEASING, Hand.RELEASE, None)
+    assert (stepped.phase, move.control, move.mode) == (
+        Phase.RELEASING,
+        ControlSource.RELEASE,
+        None,
+    )
 
 
 def test_on_the_ground_idle_setpoints_flow_before_offboard_and_arming() -> None:
     stepped = Stepped(PX4_GROUND, arm=True, is_setpoint=True, modes=("OFFBOARD",))
     moves = [*stepped.run(0.1), *stepped.run(1.0, mode="OFFBOARD")]
-    assert {move.hand for move in moves} == {Hand.IDLE}
+    assert {move.control for move in moves} == {ControlSource.IDLE}
     assert requests(moves) == ["mode OFFBOARD", "arm"]
 
 
@@ -101,9 +104,9 @@ def test_in_the_air_an_act_asks_for_the_mode_that_only_our_setpoints_can_enter()
     stepped = Stepped(facts, is_setpoint=True, modes=("OFFBOARD",))
     stepped.step()
     flow = [stepped.step("engage"), *stepped.run(0.09)]
-    assert {(move.hand, move.mode) for move in flow} == {(Hand.NEUTRAL, None)}
+    assert {(move.control, move.mode) for move in flow} == {(ControlSource.NEUTRAL, None)}
     move = stepped.step()
-    assert (move.hand, move.mode) == (Hand.NEUTRAL, "OFFBOARD")
+    assert (move.control, move.mode) == (ControlSource.NEUTRAL, "OFFBOARD")
     stepped.step(mode="OFFBOARD")
     assert stepped.phase is Phase.FLYING
 
@@ -113,7 +116,7 @@ def test_in_the_air_nothing_flows_where_the_mode_needs_nothing() -> None:
     stepped = Stepped(facts, is_setpoint=True, modes=("GUIDED",), mode="GUIDED")
     stepped.step()
     move = stepped.step("engage")
-    assert (move.hand, move.mode) == (None, "GUIDED")
+    assert (move.control, move.mode) == (None, "GUIDED")
 
 
 def test_a_policy_of_setpoints_is_not_engaged_in_a_mode_of_sticks() -> None:
@@ -132,11 +135,11 @@ def test_a_takeoff_that_is_broken_off_does_not_climb_on(choice: OnFault) -> None
         replace(GROUND, mode="GUIDED"),
         arm=True,
         takeoff_m=8.0,
-        departure=DepartureSettings(then=choice),
+        disengage=DisengageSettings(then=choice),
     )
     stepped.run(0.1)
     stepped.run(1.0, armed=True, is_landed=False, height_m=2.0)
-    assert stepped.step("release") == Move(hand=Hand.NEUTRAL, mode="BRAKE")
+    assert stepped.step("release") == Actions(control=ControlSource.NEUTRAL, mode="BRAKE")
 
 
 def entering_offboard() -> Stepped:
@@ -146,7 +149,7 @@ def entering_offboard() -> Stepped:
         facts,
         is_setpoint=True,
         modes=("OFFBOARD",),
-        departure=DepartureSettings(is_setpoint=True),
+        disengage=DisengageSettings(is_setpoint=True),
     )
     stepped.step()
     stepped.step("engage")
@@ -162,7 +165,7 @@ def entering_offboard() -> Stepped:
 
 def test_offboard_once_entered_is_kept_by_neutral_until_the_policy_is_ready() -> None:
     stepped = entering_offboard()
-    assert {move.hand for move in stepped.run(2.0)} == {Hand.NEUTRAL}
+    assert {move.control for move in stepped.run(2.0)} == {ControlSource.NEUTRAL}
     stepped.step(chunk_problem=None)
     assert stepped.phase is Phase.FLYING
 
@@ -207,7 +210,7 @@ def test_neutral_goes_on_in_a_climb_whose_echo_is_lost() -> None:
     """Without a receiver silence would be its radio failsafe; on the ground nothing is sent."""
     stepped = Stepped(replace(GROUND, mode="GUIDED", has_receiver=False), arm=True, takeoff_m=8.0)
     stepped.run(0.1)
-    assert {move.hand for move in stepped.run(0.1, link_problem=NO_ECHO)} == {None}
+    assert {move.control for move in stepped.run(0.1, link_problem=NO_ECHO)} == {None}
     stepped.run(1.0, armed=True, is_landed=False, height_m=2.0, link_problem=None)
     moves = stepped.run(1.0, link_problem=NO_ECHO)
-    assert {move.hand for move in moves} == {Hand.NEUTRAL}
+    assert {move.control for move in moves} == {ControlSource.NEUTRAL}
