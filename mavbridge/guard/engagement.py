@@ -3,22 +3,12 @@
 from collections.abc import Iterator, Sequence
 from copy import deepcopy
 from dataclasses import replace
-from typing import Any
 
 from mavbridge.core.clock import NS_PER_MS, NS_PER_S
 from mavbridge.core.reasons import Code, because
-from mavbridge.guard.memory import REST_NS, EngagementSettings, Memory
+from mavbridge.guard.memory import ACT_TIMEOUT_NS, REST_NS, EngagementSettings, Memory, not_engaged
 from mavbridge.guard.sequences import STICK_REST_NS, DisengageSequence, EngageSequence
-from mavbridge.guard.table import (
-    ACT_TIMEOUT_NS,
-    PROGRESS,
-    TABLE,
-    Row,
-    ended,
-    fly,
-    not_engaged,
-    objection,
-)
+from mavbridge.guard.table import PROGRESS, TABLE, Row, ended, objection
 from mavbridge.guard.values import (
     Actions,
     ControlSource,
@@ -78,10 +68,15 @@ class Engagement(Memory):
         begun = self._read(PROGRESS, now)
         return self._control(now) if begun in (Phase.FLYING, Phase.RELEASING) else actions
 
-    def _read(self, rows: Sequence[Row[Any]], now: EngagementInputs) -> Phase | None:
+    def _read(self, rows: Sequence[Row], now: EngagementInputs) -> Phase | None:
         """Take a row; returns the state that begins, if any."""
         for row in rows:
-            if self.phase in row.states and row.take(self, now) and row.next is not None:
+            if self.phase not in row.states or not (cause := row.event(self, now)):
+                continue
+            if row.where is not None and not row.where(self, now):
+                continue
+            row.does(self, now, cause)
+            if row.next is not None:
                 self.phase, self.act, self.starting_ns = row.next, None, None
                 return row.next
         return None
@@ -135,7 +130,7 @@ class Engagement(Memory):
             self._start(now, is_ready=problem is None)
             if self.starting_ns is None or not now.is_policy_reset or now.chunk_problem is not None:
                 return Actions()
-            fly(self, now, True)
+            self.fly(now, True)
             self.phase, self.starting_ns = Phase.FLYING, None
         return Actions(control=ControlSource.POLICY)
 

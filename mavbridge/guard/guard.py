@@ -22,12 +22,9 @@ from mavbridge.core.vehicle import (
 from mavbridge.guard.chunks import Chunk, ChunkBuffer, Lateness
 from mavbridge.guard.engagement import Engagement
 from mavbridge.guard.envelope import Envelope, EnvelopeInput
-from mavbridge.guard.grid import Slot, StickGrid
-from mavbridge.guard.limits import first_action, idle_action, neutral_action
+from mavbridge.guard.limits import ActionSmoother, first_action, idle_action, neutral_action
 from mavbridge.guard.settings import FlightSettings
-from mavbridge.guard.smoothing import ActionSmoother
 from mavbridge.guard.values import (
-    Actions,
     ControlSource,
     EndRequest,
     EngagementInputs,
@@ -40,6 +37,56 @@ PILOT_FRESH_NS = 500 * NS_PER_MS
 """Oldest RC_CHANNELS that still tells where the pilot's sticks are."""
 STOOD_STILL_NS = 60 * NS_PER_MS
 """A step this late, beyond the slowest grid, says that the guard stood still, and heard nobody."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Slot:
+    """One point of the stick grid that has come due."""
+
+    index: int
+    due_ns: int
+    missed: int
+    """Slots before it for which no stick left within one period."""
+
+
+class StickGrid:
+    """Slots at ``origin + index * period``, whatever happens between them.
+
+    A slot is served by the first send from half a period before it to one period after it, so one
+    that was served early is left out, and one that nobody served in time is missed, never made up
+    for.
+    """
+
+    def __init__(self, period_ns: int, origin_ns: int) -> None:
+        self._period_ns = period_ns
+        self._origin_ns = origin_ns
+        self._index = -1
+        self._served_ns = origin_ns - period_ns
+        """Last send, or the last slot in which nothing was to be sent."""
+
+    @property
+    def next_ns(self) -> int:
+        """When the next slot is due."""
+        return self._origin_ns + (self._index + 1) * self._period_ns
+
+    def take(self, now_ns: int) -> Slot | None:
+        """The newest slot that has come due since the last call; None if there is none to serve."""
+        index = (now_ns - self._origin_ns) // self._period_ns
+        if index <= self._index:
+            return None
+        first, self._index = self._index + 1, index
+        missed = index - first
+        first_ns = self._origin_ns + first * self._period_ns
+        if first_ns - self._served_ns < self._period_ns // 2:
+            if not missed:
+                return None
+            missed -= 1
+        due_ns = self._origin_ns + index * self._period_ns
+        return Slot(index=index, due_ns=due_ns, missed=missed)
+
+    def serve(self, sent_ns: int) -> None:
+        """Note that sticks have left, or that none were to be sent."""
+        self._served_ns = sent_ns
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -105,7 +152,6 @@ class Guard:
         """Those of the last step."""
         self._last = self._neutral
         """As last sent."""
-        self._is_readonly = settings.engagement.readonly
         self._messages: list[str] = []
 
     @property
@@ -138,7 +184,7 @@ class Guard:
 
     def unsent(self) -> None:
         """The last decision did not leave: the next one starts from what left before it."""
-        if not self._is_readonly:
+        if not self._engagement.settings.readonly:
             self._smoother.undo()
 
     def step(self, now_ns: int, given: GuardInput) -> GuardOutput:
@@ -166,7 +212,7 @@ class Guard:
         if slot is not None or is_urgent:
             self._grid.serve(now_ns)
             is_thrust = inputs.mode in inputs.modes.thrust
-            decision, trace = self._decide(actions, now_ns, is_thrust=is_thrust)
+            decision, trace = self._decide(actions.control, now_ns, is_thrust=is_thrust)
         newest = self._chunks.newest
         return GuardOutput(
             decision=decision,
@@ -270,10 +316,7 @@ class Guard:
     ) -> None:
         """When the policy or neutral takes the sticks, start from where they are."""
         before, self._control = self._control, control
-        if control is ControlSource.NEUTRAL and before not in (
-            ControlSource.POLICY,
-            ControlSource.NEUTRAL,
-        ):
+        if control is ControlSource.NEUTRAL and before not in (control, ControlSource.POLICY):
             on_ground = before is ControlSource.IDLE
             start = self._idle if on_ground else self._first(link, None)
             self._smoother.reset(start)  # what an earlier flight left in it counts no longer
@@ -301,38 +344,29 @@ class Guard:
         return self._smoother.limits.clip(first) if is_velocity else first
 
     def _decide(
-        self, actions: Actions, now_ns: int, *, is_thrust: bool
+        self, control: ControlSource | None, now_ns: int, *, is_thrust: bool
     ) -> tuple[Decision | None, ActionTrace | None]:
         """The sticks to send now; those of the policy with their trace.
 
         ``is_thrust`` says that the throttle stick is thrust in the present mode.
         """
-        action: Action
-        match actions.control:
-            case None:
-                return None, None
-            case ControlSource.RELEASE:
-                return Release(self._engagement.reason or because(Code.NOT_ENGAGED)), None
-            case ControlSource.IDLE:
-                action = self._idle
-            case ControlSource.NEUTRAL:
-                action = self._neutral
-                if self._meaning.kind == "velocity":  # braked within the limits, not at once
-                    action = self._smoother.step(action, now_ns).smoothed
-            case ControlSource.LEVEL:
-                action = self._level(is_thrust=True)
-            case ControlSource.POLICY:
-                raw = self._chunks.action_at(now_ns, self._lead_ns)
-                # Beyond the horizon level sticks bridge the rest of the grace.
-                level = self._level(is_thrust=is_thrust)
-                if raw is None and self._meaning.kind == "rates":  # an attitude: not filtered
-                    trace = ActionTrace(raw=level, clipped=level, slewed=level, smoothed=level)
-                else:
-                    trace = self._smoother.step(raw or level, now_ns)
-                    self._last = trace.smoothed
-                return Command(action=trace.smoothed), trace
-        self._last = action
-        return Command(action=action), None
+        if control is not ControlSource.POLICY:
+            decision = self._at_rest(control)
+            if isinstance(decision, Command):
+                is_neutral = control is ControlSource.NEUTRAL
+                if is_neutral and self._meaning.kind == "velocity":  # braked within the limits
+                    decision = Command(action=self._smoother.step(self._neutral, now_ns).smoothed)
+                self._last = decision.action
+            return decision, None
+        raw = self._chunks.action_at(now_ns, self._lead_ns)
+        # Beyond the horizon level sticks bridge the rest of the grace.
+        level = self._level(is_thrust=is_thrust)
+        if raw is None and self._meaning.kind == "rates":  # an attitude: not filtered
+            trace = ActionTrace(raw=level, clipped=level, slewed=level, smoothed=level)
+        else:
+            trace = self._smoother.step(raw or level, now_ns)
+            self._last = trace.smoothed
+        return Command(action=trace.smoothed), trace
 
     def _at_rest(self, control: ControlSource | None) -> Decision | None:
         """What a source other than the policy's would send now; nothing is noted."""

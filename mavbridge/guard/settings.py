@@ -5,8 +5,8 @@ from dataclasses import dataclass
 from mavbridge.core.vehicle import ActionMeaning, Output
 from mavbridge.guard.chunks import FreshnessLimits
 from mavbridge.guard.envelope import EnvelopeLimits
+from mavbridge.guard.limits import Smoothing
 from mavbridge.guard.memory import EngagementSettings
-from mavbridge.guard.smoothing import Smoothing
 from mavbridge.mavlink.settings import LinkSettings
 
 

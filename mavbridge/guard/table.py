@@ -6,32 +6,27 @@ Rules that every row keeps:
    high after a rest, the first arming with ``--engage-on-arm``. Nothing that recovers, comes back
    or is armed again does, and an act that no row follows is forgotten.
 2. Who takes the vehicle wins over everything else that happens in the same step: the sticks are
-   released in that step, and no mode is asked for.
+   released in that step, and no mode is asked for. Only a vehicle that would go on with our last
+   setpoint is left as after a fault.
 3. What ends by our own doing is neutral in the same step, then in a safe mode, then released, and
    only to a hand that would hold it.
 4. In WAITING, RELEASED and ENDED nothing is sent.
 
 In each step the rows of the state are read from the top. The first one whose event happens and
 whose condition holds is taken; one without a next state goes on to those below. ``TABLE`` is read
-with what comes from outside, then the state acts (``CONTROLS``), then ``PROGRESS`` is read with
-what its sequence has reached. The first lines of the docstrings are the texts of docs/SAFETY.md.
+with what comes from outside, then the state acts (``Engagement``), then ``PROGRESS`` is read with
+what its sequence has reached. The docstrings are the texts of docs/SAFETY.md.
 """
 
 from collections.abc import Callable
-from dataclasses import dataclass
-from typing import Generic, TypeVar
+from typing import Any, NamedTuple
 
 from mavbridge.core.clock import NS_PER_S
 from mavbridge.core.reasons import Code, Reason, because
-from mavbridge.core.vehicle import FlightEnd
-from mavbridge.guard.memory import Memory
+from mavbridge.guard.memory import Memory, not_engaged
 from mavbridge.guard.values import EndRequest, EngagementInputs, Phase
 
 WAITING, PREPARING, FLYING, LEAVING, HOLDING, RELEASING, RELEASED, ENDED = Phase
-PREPARE_TIMEOUT_NS = 90 * NS_PER_S
-"""For mode change and arming, without the climb; a cold estimator needs some 40 s."""
-ACT_TIMEOUT_NS = 3 * NS_PER_S
-"""For the change of mode that an act asks for while armed: no act comes true much later."""
 RELEASE_TIMEOUT_NS = NS_PER_S
 """Wait for the vehicle to show other sticks than ours. Without a receiver it never does."""
 UNHEARD_RELEASE_TIMEOUT_NS = 4 * NS_PER_S
@@ -44,28 +39,32 @@ LOST_NS = 30 * NS_PER_S
 # --- events: pure, of what is remembered and what comes in
 
 
-def engage_while_ending(m: Memory, _: EngagementInputs) -> Reason | None:
-    """an act"""
-    if m.act != "engage":
-        return None
-    return because(Code.STILL_ENDING, phase=m.phase.value)
-
-
 def ended(m: Memory, now: EngagementInputs) -> bool:
-    """the end: `--duration`, a signal, the death of the flight process"""
+    """the end
+
+    `--duration` is over, a signal, the death of the flight process.
+    """
     return m.end_request is not None or duration_over(m, now) is not None
 
 
 def arm_flag(m: Memory, now: EngagementInputs) -> bool:
-    """`--arm`, once, as soon as the link is ready"""
+    """`--arm`
+
+    Once, as soon as the link is ready.
+    """
     return m.wants_arm and now.link_problem is None
 
 
 def unfit_engage(m: Memory, now: EngagementInputs) -> Reason | None:
-    """an act, but disarmed, in a failsafe, outside the envelope, with the engage switch low, in a
-    mode that is neither allowed nor ours to change, without link or fresh chunk"""
+    """an act that cannot be followed
+
+    Disarmed, in a failsafe, outside the envelope, the engage switch low, a mode that is neither
+    allowed nor ours to change, no link, no fresh chunk; while a flight is still ending.
+    """
     if m.act != "engage":
         return None
+    if m.phase in (LEAVING, HOLDING, RELEASING):
+        return because(Code.STILL_ENDING, phase=m.phase.value)
     if not now.armed:
         return because(Code.NOT_ARMED)
     if (reason := objection(m, now) or now.chunk_problem) is not None:
@@ -77,34 +76,46 @@ def unfit_engage(m: Memory, now: EngagementInputs) -> Reason | None:
 
 
 def engage(m: Memory, _: EngagementInputs) -> bool:
-    """an act: the key `e`, the engage switch, the first arming with `--engage-on-arm`"""
+    """an act
+
+    The key `e`, the engage switch, the first arming with `--engage-on-arm`.
+    """
     return m.act == "engage"
 
 
 def stopped(m: Memory, _: EngagementInputs) -> EndRequest | None:
-    """the key `q`, a signal, the death or a fault of the flight process"""
+    """a stop
+
+    The key `q`, a signal, the death or a fault of the flight process, the last gate of `--gates`.
+    """
     if m.end_request is None and m.act == "release":
         return EndRequest(because(Code.OPERATOR), end="operator")
     return m.end_request
 
 
 def stopped_anew(m: Memory, now: EngagementInputs) -> EndRequest | None:
-    """the key `q`, or the first end after a fault"""
+    """the key `q`, or the first stop after a fault"""
     return stopped(m, now) if m.must_stop or m.act == "release" else None
 
 
 def taken(m: Memory, now: EngagementInputs) -> EndRequest | None:
-    """**takeover**: mode changed, disarmed, failsafe, override switch low, engage switch low (where
-    the policy flies or an act is followed), other sticks than ours followed, reboot, another
-    address, a parameter that matters changed"""
+    """**takeover**
+
+    Mode changed, disarmed, failsafe, override switch low, engage switch low (where the policy flies
+    or an act is followed), other sticks than ours followed, reboot, another address, a parameter
+    that matters changed.
+    """
     if (reason := _takeover(m, now)) is None:
         return None
     return EndRequest(reason, is_fault=True, end="takeover" if now.armed else "disarmed")
 
 
 def late(m: Memory, now: EngagementInputs) -> EndRequest | None:
-    """not ready in time: 90 s with `--arm`, and a second for each metre of `--takeoff`; 3 s after
-    another act. Never ready: a mode that the vehicle lacks, a policy that is too slow"""
+    """not ready in time
+
+    90 s with `--arm`, and a second for each metre of `--takeoff`; 3 s after another act; at once
+    where it can never be: a mode that the vehicle lacks, a policy that is too slow.
+    """
     problem = m.engage.impossibility(now)
     if problem is None and now.now_ns <= m.until_ns:
         return None
@@ -120,7 +131,7 @@ def late(m: Memory, now: EngagementInputs) -> EndRequest | None:
             is_echoed=now.echo_confirmed,
             inputs=now.chunk_problem or "fine",
         )
-    return EndRequest(not_engaged(problem) if is_act(m) else problem, is_fault=True)
+    return EndRequest(not_engaged(problem) if m.is_act else problem, is_fault=True)
 
 
 def duration_over(m: Memory, now: EngagementInputs) -> EndRequest | None:
@@ -137,9 +148,12 @@ def landed(_: Memory, now: EngagementInputs) -> EndRequest | None:
 
 
 def fault(_: Memory, now: EngagementInputs) -> EndRequest | None:
-    """**fault**: no usable chunk for longer than [the grace](#the-grace), no attitude from the
-    vehicle for as long, 5 malformed chunks (NaN), envelope left, link lost, our packets refused by
-    the system for 100 ms or our sticks not heard, a command that cannot be made"""
+    """**fault**
+
+    No usable chunk for longer than [the grace](#the-grace), no attitude from the vehicle for as
+    long, 5 malformed chunks (NaN), envelope left, link lost, our packets refused by the system for
+    100 ms or our sticks not heard, a command that cannot be made.
+    """
     reason = now.link_problem or now.chunk_fault or now.envelope_problem
     return None if reason is None else EndRequest(reason, is_fault=True)
 
@@ -151,32 +165,28 @@ def vanished(m: Memory, now: EngagementInputs) -> EndRequest | None:
     return EndRequest(because(Code.VEHICLE_LOST, after_s=LOST_NS / NS_PER_S), is_fault=True)
 
 
-def release_seen(m: Memory, now: EngagementInputs) -> bool:
-    """the vehicle shows other sticks than ours"""
-    return now.is_released and not m.owes_release
+def released(m: Memory, now: EngagementInputs) -> bool:
+    """the vehicle shows other sticks than ours, or does not for 1 s
 
-
-def release_unseen(m: Memory, now: EngagementInputs) -> Reason | None:
-    """1 s over; 4 s where the vehicle does not even show our last sticks"""
+    4 s where it does not even show our last ones; then it is said that the release was not seen.
+    """
     timeout_ns = RELEASE_TIMEOUT_NS if now.shows_last else UNHEARD_RELEASE_TIMEOUT_NS
-    return because(Code.RELEASE_NOT_SEEN) if now.now_ns - m.released_ns >= timeout_ns else None
+    return (now.is_released and not m.owes_release) or now.now_ns - m.released_ns >= timeout_ns
 
 
 def ready(m: Memory, now: EngagementInputs) -> bool:
-    """armed, in its mode, and the first chunk that was solved after a reset"""
+    """ready
+
+    Armed, in its mode, and the first chunk that was solved after a reset.
+    """
     return m.engage.waits_for is None and now.is_policy_reset and now.chunk_problem is None
 
 
-def unconfirmed(m: Memory, now: EngagementInputs) -> Reason | None:
-    """the safe mode is not confirmed in time"""
-    mode = m.disengage.mode
-    if not m.disengage.is_done or mode in (None, now.mode):
-        return None
-    return because(Code.MODE_NOT_CONFIRMED, mode=mode or "")
-
-
 def over(m: Memory, _: EngagementInputs) -> bool:
-    """mode confirmed, after 50 ms of neutral at least; or not in 3 s, while the vehicle is heard"""
+    """the way out is at its end
+
+    Mode confirmed, after 50 ms of neutral at least; or not within 3 s, while the vehicle is heard.
+    """
     return m.disengage.is_done
 
 
@@ -184,13 +194,19 @@ def over(m: Memory, _: EngagementInputs) -> bool:
 
 
 def is_ours(m: Memory, now: EngagementInputs) -> bool:
-    """armed by us or flown by our neutral sticks; or it follows our setpoints"""
+    """the vehicle is ours
+
+    We have armed it, or it flies by our neutral sticks or setpoints.
+    """
     return (m.engage.has_sticks and now.armed) or follows_us(m, now)
 
 
 def follows_us(m: Memory, now: EngagementInputs) -> bool:
-    """it would go on with our last setpoint: still armed, in our mode, without a failsafe, and
-    following nobody else"""
+    """it would follow our last setpoint
+
+    Still armed in the mode that follows setpoints, without a failsafe, and nobody else is followed:
+    silence would be the last setpoint for up to 3 s, and sticks do nothing in that mode.
+    """
     is_own = m.phase is not Phase.PREPARING or m.engage.is_own_mode(now)
     return (
         (m.settings.engage.is_setpoint and now.armed and is_own)
@@ -200,106 +216,11 @@ def follows_us(m: Memory, now: EngagementInputs) -> bool:
 
 
 def may_release(m: Memory, _: EngagementInputs) -> bool:
-    """a hand would hold the vehicle, and silence is no failsafe; setpoints"""
+    """it may be released
+
+    A hand would hold the vehicle and silence is no failsafe, or the actions are setpoints.
+    """
     return not m.disengage.must_hold
-
-
-# --- what is done
-
-
-def nothing(_m: Memory, _now: EngagementInputs, _cause: object) -> None:
-    """nothing"""
-
-
-def refuse(m: Memory, _: EngagementInputs, why: Reason) -> None:
-    """refused, and forgotten; says why"""
-    m.refusal, m.act = not_engaged(why), None
-
-
-def say(m: Memory, _: EngagementInputs, what: Reason) -> None:
-    """says so"""
-    m.refusal = what
-
-
-def prepare(m: Memory, now: EngagementInputs, _cause: bool) -> None:
-    """[the way in](#the-way-in); the policy is reset once all else is ready"""
-    m.own_mode = now.mode if now.armed else None
-    m.engage.begin(now)
-    m.allowed_ns = ACT_TIMEOUT_NS
-    if m.wants_arm:
-        climb_s = m.settings.engage.takeoff_m or 0.0  # at 1 m/s; 1.5 m/s are usual
-        m.allowed_ns = PREPARE_TIMEOUT_NS + round(climb_s * NS_PER_S)
-    m.wants_arm = m.was_armed = False
-    m.until_ns = now.now_ns + m.allowed_ns
-    m.seen_interruptions = now.interruptions
-
-
-def give_up(m: Memory, _: EngagementInputs, cause: EndRequest) -> None:
-    """says why; the guard ends after `--arm`"""
-    if is_act(m):
-        m.refusal = cause.reason  # the act may be repeated
-    else:
-        m.failure = cause.reason
-        m.end_request, m.must_stop = cause, True
-
-
-def fly(m: Memory, now: EngagementInputs, _cause: bool) -> None:
-    """the policy's sticks, from the pilot's or idle ones"""
-    flights = m.outcome.flights + 1
-    m.outcome = m.outcome._replace(flights=flights, is_disarmed=False, end=None)
-    m.reason, m.own_mode, m.seen_interruptions = None, now.mode, now.interruptions
-    m.engaged_ns = now.now_ns if m.engaged_ns is None else m.engaged_ns
-
-
-def leave(m: Memory, now: EngagementInputs, cause: EndRequest) -> None:
-    """neutral in the same step, then the mode of `--on-fault` after a fault or a takeover, of
-    `--then` after an end: [the way out](#the-way-out)"""
-    _note_end(m, cause)
-    m.reason = cause.reason
-    m.must_stop = m.must_stop and cause != m.end_request
-    if cause.end in ("takeover", "disarmed"):
-        m.seen_interruptions = now.interruptions
-    m.refusal = m.disengage.begin(now, is_fault=cause.is_fault) or m.refusal
-    m.heard_ns = now.now_ns
-
-
-def leave_for_good(m: Memory, now: EngagementInputs, cause: EndRequest) -> None:
-    """the same, and the guard ends"""
-    m.end_request = cause
-    leave(m, now, cause)
-
-
-def release(m: Memory, now: EngagementInputs, cause: EndRequest) -> None:
-    """**release in the same step, no mode**"""
-    _note_end(m, cause)
-    reason = cause.reason
-    if m.phase in (Phase.LEAVING, Phase.HOLDING) and m.reason is not None:
-        reason = because(Code.THEN, first=m.reason, then=reason)
-    m.reason, m.released_ns = reason, now.now_ns
-    m.owes_release = m.phase is not Phase.PREPARING or m.engage.has_sticks
-
-
-def hand_over(m: Memory, now: EngagementInputs, _cause: bool) -> None:
-    """release"""
-    m.released_ns, m.owes_release = now.now_ns, True
-
-
-def forget(m: Memory, _: EngagementInputs, cause: bool | Reason) -> None:
-    """nothing"""
-    m.disengage.mode = None  # from now on every mode change is somebody else's
-    if isinstance(cause, Reason):
-        m.refusal = cause
-
-
-def _note_end(m: Memory, cause: EndRequest) -> None:
-    """Note how a flight has ended, and whether by a fault of ours."""
-    if m.phase is not FLYING:
-        return
-    is_fault = cause.is_fault and cause.end not in ("takeover", "disarmed")
-    end: FlightEnd = "fault" if is_fault else cause.end
-    m.outcome = m.outcome._replace(end=end, is_disarmed=end == "disarmed")
-    if is_fault:
-        m.outcome = m.outcome._replace(faults=m.outcome.faults + 1, fault=cause.reason)
 
 
 def objection(m: Memory, now: EngagementInputs) -> Reason | None:
@@ -311,16 +232,6 @@ def objection(m: Memory, now: EngagementInputs) -> Reason | None:
     if m.switch.is_off:
         return _switch_off(m)
     return now.envelope_problem
-
-
-def is_act(m: Memory) -> bool:
-    """True if the way in follows an act, and not ``--arm``."""
-    return m.allowed_ns == ACT_TIMEOUT_NS
-
-
-def not_engaged(why: Reason) -> Reason:
-    """Reason for an act that has no effect."""
-    return because(Code.NOT_ENGAGED_SINCE, why=why)
 
 
 def _switch_off(m: Memory) -> Reason:
@@ -335,7 +246,7 @@ def _takeover(m: Memory, now: EngagementInputs) -> Reason | None:
         return now.overruled
     if now.is_switched_off:
         return because(Code.OVERRIDE_SWITCH_OFF)
-    if m.switch.is_off and (m.phase is Phase.FLYING or (is_preparing and is_act(m))):
+    if m.switch.is_off and (m.phase is Phase.FLYING or (is_preparing and m.is_act)):
         return _switch_off(m)
     if not now.armed and not is_preparing:
         return because(Code.DISARMED)
@@ -347,54 +258,42 @@ def _takeover(m: Memory, now: EngagementInputs) -> Reason | None:
     return because(Code.DISARMED) if is_preparing and m.was_armed and not now.armed else None
 
 
-T = TypeVar("T")
-
-
-@dataclass(frozen=True, slots=True)
-class Row(Generic[T]):
+class Row(NamedTuple):
     """One row: in these states, where this happens, that is done."""
 
     states: tuple[Phase, ...]
-    event: Callable[[Memory, EngagementInputs], T | None]
-    does: Callable[[Memory, EngagementInputs, T], None]
+    event: Callable[[Memory, EngagementInputs], EndRequest | Reason | bool | None]
+    does: Callable[[Memory, EngagementInputs, Any], None]
+    """With what the event returned."""
     next: Phase | None = None
     """None: the same, and the rows below are read."""
     where: Callable[[Memory, EngagementInputs], bool] | None = None
 
-    def take(self, m: Memory, now: EngagementInputs) -> bool:
-        """Do it if it happens; returns whether it did."""
-        if not (cause := self.event(m, now)) or not (self.where is None or self.where(m, now)):
-            return False
-        self.does(m, now, cause)
-        return True
 
-
+AT_REST = (WAITING, RELEASED)
 TABLE = (
-    Row((WAITING, RELEASED), ended, nothing, ENDED),
-    Row((WAITING, RELEASED), arm_flag, prepare, PREPARING),
-    Row((WAITING, RELEASED), unfit_engage, refuse),
-    Row((WAITING, RELEASED), engage, prepare, PREPARING),
-    Row((PREPARING,), stopped, leave, LEAVING, where=is_ours),
-    Row((PREPARING,), stopped, release, RELEASING),
-    Row((PREPARING, FLYING), taken, leave, LEAVING, where=follows_us),
-    Row((PREPARING, FLYING), taken, release, RELEASING),
-    Row((PREPARING,), late, give_up),
-    Row((PREPARING,), late, leave, LEAVING, where=is_ours),
-    Row((PREPARING,), late, release, RELEASING),
-    Row((FLYING,), stopped, leave, LEAVING),
-    Row((FLYING,), duration_over, leave_for_good, LEAVING),
-    Row((FLYING,), landed, leave, LEAVING),
-    Row((FLYING,), fault, leave, LEAVING),
-    Row((LEAVING, HOLDING, RELEASING), engage_while_ending, refuse),
-    Row((HOLDING,), stopped_anew, leave, LEAVING),
-    Row((LEAVING, HOLDING), taken, release, RELEASING),
-    Row((LEAVING, HOLDING), vanished, release, RELEASING),
-    Row((RELEASING,), release_seen, forget, RELEASED),
-    Row((RELEASING,), release_unseen, forget, RELEASED),
+    Row(AT_REST, ended, Memory.nothing, ENDED),
+    Row((WAITING,), arm_flag, Memory.prepare, PREPARING),
+    Row((*AT_REST, LEAVING, HOLDING, RELEASING), unfit_engage, Memory.refuse),
+    Row(AT_REST, engage, Memory.prepare, PREPARING),
+    Row((PREPARING,), stopped, Memory.leave, LEAVING, where=is_ours),
+    Row((PREPARING,), stopped, Memory.release, RELEASING),
+    Row((PREPARING, FLYING), taken, Memory.leave, LEAVING, where=follows_us),
+    Row((PREPARING, FLYING), taken, Memory.release, RELEASING),
+    Row((PREPARING,), late, Memory.give_up),
+    Row((PREPARING,), late, Memory.leave, LEAVING, where=is_ours),
+    Row((PREPARING,), late, Memory.release, RELEASING),
+    Row((FLYING,), stopped, Memory.leave, LEAVING),
+    Row((FLYING,), duration_over, Memory.leave_for_good, LEAVING),
+    Row((FLYING,), landed, Memory.leave, LEAVING),
+    Row((FLYING,), fault, Memory.leave, LEAVING),
+    Row((HOLDING,), stopped_anew, Memory.leave, LEAVING),
+    Row((LEAVING, HOLDING), taken, Memory.release, RELEASING),
+    Row((LEAVING, HOLDING), vanished, Memory.release, RELEASING),
+    Row((RELEASING,), released, Memory.forget, RELEASED),
 )
 PROGRESS = (
-    Row((PREPARING,), ready, fly, FLYING),
-    Row((LEAVING,), unconfirmed, say),
-    Row((LEAVING, HOLDING), over, hand_over, RELEASING, where=may_release),
-    Row((LEAVING,), over, nothing, HOLDING),
+    Row((PREPARING,), ready, Memory.fly, FLYING),
+    Row((LEAVING, HOLDING), over, Memory.finish, RELEASING, where=may_release),
+    Row((LEAVING,), over, Memory.finish, HOLDING),
 )

@@ -7,11 +7,10 @@ from mavbridge.core.clock import NS_PER_MS
 from mavbridge.core.reasons import Code, Reason, Value
 from mavbridge.core.vehicle import NEUTRAL, ModeRoles
 from mavbridge.guard.engagement import Engagement
-from mavbridge.guard.limits import LimitSettings
+from mavbridge.guard.limits import LimitSettings, Smoothing
 from mavbridge.guard.memory import EngagementSettings
 from mavbridge.guard.sequences import DisengageSettings, EngageSettings
-from mavbridge.guard.smoothing import Smoothing
-from mavbridge.guard.values import Actions, EngagementInputs, OperatorCommand, Phase
+from mavbridge.guard.values import Actions, EndRequest, EngagementInputs, OperatorCommand, Phase
 
 MODES = ("ALT_HOLD", "ALTCTL")
 COPTER_MODES = ModeRoles(
@@ -109,8 +108,12 @@ class Stepped:
         self.facts = facts
         self.moves: list[Actions] = []
 
-    def step(self, act: OperatorCommand | None = None, **changes: Any) -> Actions:
+    def step(
+        self, act: OperatorCommand | None = None, *, stop: EndRequest | None = None, **changes: Any
+    ) -> Actions:
         """One step, 10 ms after the last; changes of the facts stay."""
+        if stop is not None:
+            self.engagement.stop(stop)
         if changes.get("interruption") is not None:
             changes.setdefault("interruptions", self.facts.interruptions + 1)
         self.facts = replace(self.facts, now_ns=self.facts.now_ns + STEP_NS, **changes)

@@ -25,10 +25,9 @@ from mavbridge.core.vehicle import (
 from mavbridge.guard.chunks import Chunk, FreshnessLimits
 from mavbridge.guard.envelope import EnvelopeLimits
 from mavbridge.guard.guard import Guard, GuardInput, GuardOutput
-from mavbridge.guard.limits import LimitSettings
+from mavbridge.guard.limits import LimitSettings, Smoothing
 from mavbridge.guard.sequences import DisengageSettings
 from mavbridge.guard.settings import FlightSettings
-from mavbridge.guard.smoothing import Smoothing
 from mavbridge.guard.values import EndRequest, OperatorCommand, Phase
 from mavbridge.mavlink.codec.messages import Body, ManualControl, RcChannels, VelocityTarget
 from mavbridge.mavlink.codec.packets import Codec

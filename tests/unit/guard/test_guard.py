@@ -30,10 +30,9 @@ from mavbridge.core.vehicle import (
 from mavbridge.guard.chunks import Chunk, FreshnessLimits
 from mavbridge.guard.envelope import EnvelopeLimits
 from mavbridge.guard.guard import Guard, GuardInput, GuardOutput
-from mavbridge.guard.limits import LimitSettings
+from mavbridge.guard.limits import LimitSettings, Smoothing
 from mavbridge.guard.sequences import DisengageSettings
 from mavbridge.guard.settings import FlightSettings
-from mavbridge.guard.smoothing import Smoothing
 from mavbridge.guard.values import EndRequest, OperatorCommand, Phase
 
 MS = NS_PER_MS
@@ -200,16 +199,6 @@ def test_the_fifth_unusable_chunk_ends_the_flight_as_it_comes() -> None:
     assert phases == [Phase.FLYING] * 4 + [Phase.LEAVING]
 
 
-def test_without_a_stop_neutral_is_held_on_and_on() -> None:
-    guard = Stepped(status={"has_receiver": False, "pilot_sticks": None}).engaged()
-    guard.link = {"problem": HEARTBEAT_LOST}
-    assert guard.step(31).mode == "BRAKE"
-    guard.link = {}
-    held = [guard.step(at_ms, mode="BRAKE") for at_ms in range(40, 1000, 10)]
-    assert held[-1].phase is Phase.HOLDING
-    assert {(output.decision, output.mode) for output in held[10:]} == {(LEFT, None)}
-
-
 def test_the_policy_gets_the_sticks_with_its_first_chunk_after_the_reset() -> None:
     guard = Stepped()
     for at_ms in (0, 10, 20):
@@ -265,17 +254,6 @@ def spent(reason: Reason | None) -> tuple[Any, Any]:
 def test_a_computer_that_stood_still_is_told_as_that() -> None:
     guard = Stepped().engaged()
     assert spent(guard.step(30 + 131).reason) == ("computer", 131)
-
-
-def test_slots_that_a_stall_has_missed_are_counted_and_not_made_up_for() -> None:
-    guard = Stepped().engaged()
-    late = guard.step(93, guard.chunk(93))
-    assert late.slot is not None
-    assert (late.slot.index, late.slot.missed) == (9, 5)
-    assert [guard.step(at_ms).decision for at_ms in (94, 95, 96)] == [None] * 3
-    on_time = guard.step(100)
-    assert on_time.slot is not None
-    assert (on_time.slot.index, on_time.slot.missed) == (10, 0)
 
 
 def test_a_guard_that_stood_still_beyond_the_grace_does_not_fly_on_with_a_fresh_chunk() -> None:
@@ -577,14 +555,6 @@ def test_neutral_sticks_are_sent_at_once_but_the_horizon_is_left_within_the_limi
     assert guard.step(81, act="release").decision == Command(action=NEUTRAL)
 
 
-def test_read_only_flies_as_if_it_sent() -> None:
-    guard = Stepped(readonly=True)
-    outputs = [guard.step(10 * k, guard.chunk(10 * k), mode="ALT_HOLD") for k in range(4)]
-    assert [out.phase for out in outputs] == [Phase.WAITING] * 2 + [Phase.FLYING] * 2
-    assert outputs[-1].trace is not None
-    assert outputs[-1].decision == Command(action=WANTED)  # which a read-only link does not send
-
-
 def test_a_landing_counts_from_the_beginning_of_each_flight() -> None:
     guard = Stepped().engaged()
     guard.step(40, guard.chunk(40))  # in the air
@@ -620,20 +590,6 @@ def test_absence_is_the_reason_for_not_flying() -> None:
     link = LinkSnapshot(telemetry=Telemetry(), status=guard.status, problem=None)
     output = guard.guard.step(START_NS, GuardInput(link=link, absence=because(Code.NO_IMAGE)))
     assert output.reason == because(Code.NO_IMAGE)
-
-
-def test_why_a_chunk_was_not_taken_is_told_until_the_next_one() -> None:
-    guard = Stepped()
-    guard.step(0, guard.chunk(0)._replace(image_ns=START_NS - 400 * MS))
-    told = because(Code.TOO_OLD, quantity="image", age_ms=400, limit_ms=300)
-    assert guard.step(5).reason == told
-
-
-def test_the_first_arming_engages_where_that_was_asked_for() -> None:
-    guard = Stepped(engage_on_arm=True, status={"armed": False})
-    for at_ms in (0, 10, 20):
-        guard.step(at_ms, guard.chunk(at_ms))
-    assert guard.step(30, guard.chunk(30), armed=True).phase is Phase.FLYING
 
 
 def test_without_a_vehicle_it_waits_and_can_be_ended() -> None:
@@ -718,16 +674,6 @@ def test_a_velocity_that_was_idle_on_the_ground_ends_from_rest() -> None:
     assert guard.step(10, armed=True).decision == rest
     left = guard.step(20, act="release", is_landed=False)
     assert (left.phase, left.decision) == (Phase.LEAVING, rest)
-
-
-def test_a_chunk_of_another_kind_of_action_is_not_flown() -> None:
-    guard = Stepped().engaged()
-    guard.step(40, guard.chunk(40, BodyRates(0.5, 1.0, 0.0, 0.0)))
-    assert guard.step(50).decision == Command(action=WANTED)
-    for k in range(6, 12):
-        guard.step(10 * k, guard.chunk(10 * k, BodyRates(0.5, 1.0, 0.0, 0.0)))
-    assert guard.guard.phase is Phase.LEAVING
-    assert Code.UNUSABLE_CHUNKS in codes(guard.outputs[-1].reason)
 
 
 def test_neutral_velocities_on_the_way_in_are_not_those_of_an_earlier_flight() -> None:
