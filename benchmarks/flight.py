@@ -31,7 +31,7 @@ from mavbridge.core.records import Event, Tick
 from mavbridge.flight.app import fly_executable, start_guard
 from mavbridge.flight.plan import plan_flight
 from mavbridge.flight.policies import load_configured_policy
-from mavbridge.guard.departure import Ending
+from mavbridge.guard.values import EndRequest
 from mavbridge.observe.output import flight_console
 from mavbridge.observe.timing import FlightTiming, ObserverDrops, TimingReport
 from policy.contract import FloatArray
@@ -160,7 +160,7 @@ def _measure(
     with ExitStack() as stack:
         guard = start_guard(config, clock, stack)
         probe, console = GuardProbe(guard.process.pid, clock), flight_console()
-        watch = ReleaseWatch(lambda reason: guard.process.send(Ending(reason=reason)))
+        watch = ReleaseWatch(lambda reason: guard.process.send(EndRequest(reason=reason)))
         sinks = (meter, probe, watch)
         plan = plan_flight(config, climb.contract, is_dual=climb.dual_rate)
         fly_executable(plan, climb, clock=clock, console=console, sinks=sinks, guard=guard)

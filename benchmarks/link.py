@@ -36,7 +36,7 @@ from mavbridge.flight.feature_cache import FeatureCache
 from mavbridge.flight.guard_process import GuardProcess
 from mavbridge.flight.plan import FlightPlan, plan_flight
 from mavbridge.flight.settings import guard_settings
-from mavbridge.guard.departure import Ending
+from mavbridge.guard.values import EndRequest
 from policy.contract import ACTION_DIM, ACTION_NAMES, RATE, Contract
 from policy.protocol import Executable
 
@@ -169,7 +169,7 @@ def _serve(bridge: Bridge, guard: GuardProcess, stop: threading.Event) -> None:
     policy.start()
     while listener.is_alive and policy.is_alive and not stop.wait(WATCH_S):
         pass
-    guard.send(Ending(reason=because(Code.FINISHED, what="measurement")))
+    guard.send(EndRequest(reason=because(Code.FINISHED, what="measurement")))
     listener.ends_within(END_S)
     for worker in (policy, listener):
         worker.join(END_S)

@@ -45,8 +45,7 @@ from mavbridge.flight.policies import (
 )
 from mavbridge.flight.settings import guard_settings
 from mavbridge.flight.speed import require_speed
-from mavbridge.guard.departure import Ending
-from mavbridge.guard.engagement import Phase
+from mavbridge.guard.values import EndRequest, Phase
 from mavbridge.observe.keyboard import ENGAGE_KEY, KEYS_HINT, Keyboard
 from mavbridge.observe.output import flight_console
 from mavbridge.recording.tlog import TlogPipe, open_tlog_pipe
@@ -187,7 +186,7 @@ class _Flight:
         self._stack = stack
         self._guard = guard.process
         self._has_hung = False
-        self._ending = Ending(reason=because(Code.GUARD_DIED), is_fault=True)
+        self._ending = EndRequest(reason=because(Code.GUARD_DIED), is_fault=True)
         """What it was asked to end for; until then only its death ends it without a summary."""
         self._hang_ns = max(
             LEAST_HANG_NS,
@@ -284,14 +283,14 @@ class _Flight:
         self._stack.callback(keyboard.stop, JOIN_S)
         has_keys = not self._config.link.readonly and keyboard.start()
         screen.start(hint=KEYS_HINT if has_keys else None)
-        ending = Ending(reason=because(Code.SIGNAL))
+        ending = EndRequest(reason=because(Code.SIGNAL))
         referee = self._observers.referee
         while listener.is_alive and not stop.is_set():
             if (fault := self._fault(visions, policy)) is not None:
-                ending = Ending(reason=fault, is_fault=True)
+                ending = EndRequest(reason=fault, is_fault=True)
                 break
             if referee.is_course_over(self._clock.now_ns()):
-                ending = Ending(reason=because(Code.COURSE_DONE), end="course")
+                ending = EndRequest(reason=because(Code.COURSE_DONE), end="course")
                 break
             stop.wait(1 / STATUS_HZ)
         self._end(ending, listener, stop)
@@ -364,7 +363,7 @@ class _Flight:
         """The name of one of several cameras, for a message."""
         return f" {prefix}{camera}" if len(self._cameras) > 1 else ""
 
-    def _end(self, ending: Ending, listener: Worker, stop: StopRequest) -> None:
+    def _end(self, ending: EndRequest, listener: Worker, stop: StopRequest) -> None:
         """Have the guard give the sticks back, and wait for it while it holds any."""
         self._ending = ending
         self._guard.send(ending)

@@ -25,7 +25,7 @@ from mavbridge.flight.telemetry_cache import TelemetryCache
 from mavbridge.flight.vision_loop import VisionLoop
 from mavbridge.flight.vision_rate import AdaptiveRate
 from mavbridge.guard.chunks import Chunk
-from mavbridge.guard.wire import Absence
+from mavbridge.guard.wire import NoChunk
 from policy.contract import Contract
 from policy.protocol import Executable
 
@@ -61,7 +61,7 @@ def build_bridge(
     executable: Executable,
     *,
     clock: Clock,
-    send: Callable[[Chunk | Absence], object],
+    send: Callable[[Chunk | NoChunk], object],
     cameras: Sequence[CameraPath],
     sinks: Sequence[TickSink],
     watches_images: bool,

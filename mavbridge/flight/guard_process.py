@@ -14,8 +14,8 @@ from mavbridge.core.errors import ExitCode, MavbridgeError, PeerError, UserError
 from mavbridge.core.processes import child_environment
 from mavbridge.flight.telemetry_cache import TelemetryCache
 from mavbridge.guard.channel import SocketPort, channel_pair
-from mavbridge.guard.engagement import Phase
 from mavbridge.guard.settings import GuardSettings
+from mavbridge.guard.values import Phase
 from mavbridge.guard.wire import (
     FromGuard,
     GuardError,

@@ -10,9 +10,9 @@ import numpy as np
 from mavbridge.core.clock import NS_PER_MS, NS_PER_S
 from mavbridge.core.reasons import Code, Reason, because
 from mavbridge.core.records import FeatureFrame, FloatArray, VehicleState
-from mavbridge.core.vehicle import Release
 from mavbridge.flight.ego_motion import EgoMotion
 from mavbridge.flight.feature_cache import FeatureCache
+from mavbridge.flight.state import Unavailable
 from policy.contract import Contract
 
 Join: TypeAlias = Callable[[Sequence[Sequence[FloatArray]]], FloatArray]
@@ -109,7 +109,7 @@ class ObservationSource:
             self._ego_motion.push(past)
         self._ego_motion.push(state)
 
-    def observe(self, state: VehicleState, now_ns: int) -> Observation | Release:
+    def observe(self, state: VehicleState, now_ns: int) -> Observation | Unavailable:
         """The inputs of a chunk from ``state``, which was pushed; or what is missing for one."""
         newest = []
         for camera, cache in enumerate(self._caches):
@@ -161,11 +161,11 @@ class ObservationSource:
             row = np.append(row, np.array([state.extras], np.float32), axis=1)
         return row
 
-    def _missing(self, camera: int, why: Reason) -> Release:
+    def _missing(self, camera: int, why: Reason) -> Unavailable:
         """``why``, with the camera's name where there are several."""
         is_only = len(self._cameras) == 1
         name = self._cameras[camera]
-        return Release(why if is_only else because(Code.OF_CAMERA, camera=name, why=why))
+        return Unavailable(why if is_only else because(Code.OF_CAMERA, camera=name, why=why))
 
 
 def observation_ages_ns(contract: Contract) -> tuple[int, ...]:

@@ -14,7 +14,7 @@ from mavbridge.core.reasons import Reason
 from mavbridge.core.records import Event, FlightOutcome, Tick
 from mavbridge.core.stopping import StopRequest
 from mavbridge.core.vehicle import FlightEnd
-from mavbridge.guard.engagement import Phase
+from mavbridge.guard.values import Phase
 from mavbridge.guard.wire import GuardStatus, GuardSummary
 from mavbridge.recording.crash import CrashWatch
 

@@ -16,8 +16,8 @@ from mavbridge.flight.settings import (
     require_goal,
 )
 from mavbridge.guard.chunks import FreshnessLimits
-from mavbridge.guard.guard import FlightSettings
-from mavbridge.guard.smoothing import Smoothing
+from mavbridge.guard.limits import Smoothing
+from mavbridge.guard.settings import FlightSettings
 from policy.contract import Contract
 
 

@@ -8,15 +8,15 @@ from typing import TypeAlias
 from mavbridge.core.clock import NS_PER_MS, NS_PER_S, Clock
 from mavbridge.core.reasons import Code, Reason, because
 from mavbridge.core.records import FloatArray, Solve, VehicleState
-from mavbridge.core.vehicle import Action, Release
+from mavbridge.core.vehicle import Action
 from mavbridge.flight.action_frames import ActionFrame
 from mavbridge.flight.history import SentHistory
 from mavbridge.flight.observation import Observation, ObservationSource
-from mavbridge.flight.state import FrozenStateCheck
+from mavbridge.flight.state import FrozenStateCheck, Unavailable
 from mavbridge.flight.state_reader import StateReader
 from mavbridge.flight.telemetry_cache import SolveInputs, TelemetryCache
 from mavbridge.guard.chunks import Chunk
-from mavbridge.guard.wire import Absence
+from mavbridge.guard.wire import NoChunk
 from policy.errors import NoChunkError
 
 Act: TypeAlias = Callable[[FloatArray, FloatArray, FloatArray], FloatArray]
@@ -61,7 +61,7 @@ class PolicyLoop:
         history: SentHistory,
         act: Act,
         reset: Callable[[], None],
-        send: Callable[[Chunk | Absence], object],
+        send: Callable[[Chunk | NoChunk], object],
         settings: PolicySettings,
         watch: Callable[[Solve], object] | None = None,
     ) -> None:
@@ -90,7 +90,7 @@ class PolicyLoop:
         try:
             self._run(stop)
         except BaseException:
-            self._send(Absence(because(Code.POLICY_FAILED)))
+            self._send(NoChunk(because(Code.POLICY_FAILED)))
             raise
 
     def _run(self, stop: threading.Event) -> None:
@@ -103,7 +103,7 @@ class PolicyLoop:
             elif self._view.wait_for_attitude(newer_than_ns=self.start_ns - 1, timeout_ns=WAIT_NS):
                 self.step()
             else:
-                self._send(Absence(because(Code.NO_READING, quantity="attitude")))
+                self._send(NoChunk(because(Code.NO_READING, quantity="attitude")))
             self.alive_ns = self._clock.now_ns()
 
     @property
@@ -137,21 +137,21 @@ class PolicyLoop:
         has_position = self._view.status.has_position
         state = self._reader.read(self._view.telemetry(), now_ns, has_position=has_position)
         observation = self._observe(state, now_ns) if isinstance(state, VehicleState) else state
-        if isinstance(observation, Release):
+        if isinstance(observation, Unavailable):
             self._refuse(observation.reason)
         else:
             self._solve(observation, now_ns)
 
-    def _observe(self, state: VehicleState, now_ns: int) -> Observation | Release:
+    def _observe(self, state: VehicleState, now_ns: int) -> Observation | Unavailable:
         self._observations.push(state)
         frozen = self._frozen.problem(state)
-        return self._observations.observe(state, now_ns) if frozen is None else Release(frozen)
+        return self._observations.observe(state, now_ns) if frozen is None else Unavailable(frozen)
 
     def _refuse(self, reason: Reason) -> None:
         if self._due_ns is not None:
             soon_ns = self._clock.now_ns() + RETRY_NS + self._settings.period_ns // 4
             self._due_ns = min(self._due_ns, soon_ns)
-        self._send(Absence(reason))
+        self._send(NoChunk(reason))
 
     def _solve(self, observation: Observation, now_ns: int) -> None:
         state, feature = observation.state, observation.feature

@@ -10,11 +10,10 @@ from mavbridge.core.clock import NS_PER_S
 from mavbridge.core.errors import UserError
 from mavbridge.core.vehicle import ActionMeaning, StickGains
 from mavbridge.guard.chunks import FreshnessLimits
-from mavbridge.guard.departure import DepartureSettings
-from mavbridge.guard.engagement import EngagementSettings
 from mavbridge.guard.envelope import EnvelopeLimits
 from mavbridge.guard.limits import LimitSettings
-from mavbridge.guard.preparation import PreparationSettings
+from mavbridge.guard.memory import EngagementSettings
+from mavbridge.guard.sequences import DisengageSettings, EngageSettings
 from mavbridge.guard.settings import GuardSettings
 from mavbridge.mavlink.settings import LinkSettings, SigningFiles
 from policy.contract import ActionKind, Contract
@@ -96,7 +95,7 @@ def engagement_settings(config: FlyConfig, contract: Contract) -> EngagementSett
         )
     is_setpoint = contract.action != "sticks"
     return EngagementSettings(
-        preparation=PreparationSettings(
+        engage=EngageSettings(
             modes=contract.modes, mode=mode, takeoff_m=config.takeoff, is_setpoint=is_setpoint
         ),
         arm=config.arm,
@@ -104,7 +103,7 @@ def engagement_settings(config: FlyConfig, contract: Contract) -> EngagementSett
         engage_on_arm=config.engage_on_arm,
         readonly=config.link.readonly,
         duration_ns=None if config.duration is None else round(config.duration * NS_PER_S),
-        departure=DepartureSettings(
+        disengage=DisengageSettings(
             on_fault=config.on_fault, then=config.then, is_setpoint=is_setpoint
         ),
     )

@@ -2,14 +2,14 @@
 
 import math
 from dataclasses import dataclass
-from typing import Literal
+from typing import Literal, NamedTuple
 
 import numpy as np
 
 from mavbridge.core.clock import NS_PER_MS
 from mavbridge.core.reasons import Code, Reason, because
 from mavbridge.core.records import VehicleState
-from mavbridge.core.vehicle import Reading, Release, Telemetry
+from mavbridge.core.vehicle import Reading, Telemetry
 
 StateFrame = Literal["ned_frd", "enu_flu"]
 
@@ -17,6 +17,12 @@ _HALF_SQRT2 = math.sqrt(0.5)
 LEAST_RATE_RADPS = 1e-4
 """A body that turns at this rate cannot keep its attitude: a hundredth of a gyroscope's noise, and
 more than what is left of a turn where a simulator without noise hovers."""
+
+
+class Unavailable(NamedTuple):
+    """Returned where there is no state or observation now."""
+
+    reason: Reason
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -31,8 +37,8 @@ class Freshness:
 
 def build_state(
     telemetry: Telemetry, now_ns: int, *, frame: StateFrame, freshness: Freshness
-) -> VehicleState | Release:
-    """Join the newest readings; a part that is missing or too old is a release, never a zero.
+) -> VehicleState | Unavailable:
+    """Join the newest readings; one that is missing or too old is ``Unavailable``, never a zero.
 
     The state is returned in ``frame``, that of the contract.
     """
@@ -85,15 +91,15 @@ class FrozenStateCheck:
         return because(Code.ATTITUDE_FROZEN, age_ms=age_ms, limit_ms=limit_ms)
 
 
-def stale(reading: Reading | None, quantity: str, now_ns: int, limit_ns: int) -> Release:
+def stale(reading: Reading | None, quantity: str, now_ns: int, limit_ns: int) -> Unavailable:
     """Say why a reading is none to fly by."""
     if reading is None:
-        return Release(because(Code.NO_READING, quantity=quantity))
+        return Unavailable(because(Code.NO_READING, quantity=quantity))
     if reading.delay_ns < 0:
         ahead_ms = -reading.delay_ns / NS_PER_MS
-        return Release(because(Code.READING_AHEAD, quantity=quantity, ahead_ms=ahead_ms))
+        return Unavailable(because(Code.READING_AHEAD, quantity=quantity, ahead_ms=ahead_ms))
     age_ms, limit_ms = (now_ns - reading.happened_ns) / NS_PER_MS, limit_ns / NS_PER_MS
-    return Release(because(Code.TOO_OLD, quantity=quantity, age_ms=age_ms, limit_ms=limit_ms))
+    return Unavailable(because(Code.TOO_OLD, quantity=quantity, age_ms=age_ms, limit_ms=limit_ms))
 
 
 _Parts = tuple[tuple[float, ...], tuple[float, ...], tuple[float, ...], tuple[float, ...]]

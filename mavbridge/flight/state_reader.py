@@ -7,8 +7,8 @@ from dataclasses import replace
 
 from mavbridge.core.reasons import Code, because
 from mavbridge.core.records import VehicleState
-from mavbridge.core.vehicle import Reading, Release, Telemetry
-from mavbridge.flight.state import Freshness, build_state, stale
+from mavbridge.core.vehicle import Reading, Telemetry
+from mavbridge.flight.state import Freshness, Unavailable, build_state, stale
 from policy.contract import Contract
 
 Ned = tuple[float, float, float]
@@ -29,10 +29,10 @@ class StateReader:
 
     def read(
         self, telemetry: Telemetry, now_ns: int, *, has_position: bool
-    ) -> VehicleState | Release:
+    ) -> VehicleState | Unavailable:
         """The state of now; ``has_position``: the vehicle's position may be trusted."""
         state = build_state(telemetry, now_ns, frame=self._frame, freshness=self._freshness)
-        if isinstance(state, Release) or not self._extras:
+        if isinstance(state, Unavailable) or not self._extras:
             return state
         position = telemetry.position_ned_m if has_position else None
         numbers: list[float] = []
@@ -48,10 +48,10 @@ class StateReader:
                 numbers.append(reading.values[0] if extra == "height" else -reading.values[2])
         return replace(state, extras=tuple(numbers), extras_ns=min(stamps_ns))
 
-    def _missing(self, extra: str, reading: Reading | None, now_ns: int) -> Release:
+    def _missing(self, extra: str, reading: Reading | None, now_ns: int) -> Unavailable:
         what = _READINGS[extra]
         if reading is None:
-            return Release(because(Code.NO_TRUSTED_READING, quantity=what))
+            return Unavailable(because(Code.NO_TRUSTED_READING, quantity=what))
         return stale(reading, what, now_ns, self._freshness.velocity_ns)
 
     def _to_goal(self, position_ned_m: tuple[float, ...]) -> list[float]:

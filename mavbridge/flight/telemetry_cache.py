@@ -14,7 +14,7 @@ from mavbridge.core.records import Position, Tick, VehicleState
 from mavbridge.core.vehicle import ForwardedPacket, Telemetry
 from mavbridge.flight.history import SentHistory
 from mavbridge.flight.state import Freshness, StateFrame, build_state
-from mavbridge.guard.engagement import Phase
+from mavbridge.guard.values import Phase
 from mavbridge.guard.wire import (
     FromGuard,
     GuardError,

@@ -15,9 +15,9 @@ from mavbridge.core.errors import MavbridgeError, UserError
 from mavbridge.core.realtime import settle_guard
 from mavbridge.core.reasons import Code, because
 from mavbridge.guard.channel import SocketPort
-from mavbridge.guard.departure import Ending
 from mavbridge.guard.loop import GuardLoop
 from mavbridge.guard.settings import GuardSettings
+from mavbridge.guard.values import EndRequest
 from mavbridge.guard.wire import (
     GuardError,
     GuardMessage,
@@ -95,7 +95,7 @@ def _fly(
         signing=signing,
     )
     loop = GuardLoop(clock, link, port, received=received, lead_ns=LEAD_NS)
-    told = Ending(reason=because(Code.TOLD_TO_END))
+    told = EndRequest(reason=because(Code.TOLD_TO_END))
     signal.signal(signal.SIGTERM, lambda *_: loop.stop(told))
     refusal = settle_guard(realtime=settings.realtime, cpu=settings.cpu)
     if refusal is not None:

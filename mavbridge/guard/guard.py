@@ -11,25 +11,27 @@ from mavbridge.core.clock import NS_PER_MS, NS_PER_S
 from mavbridge.core.reasons import Code, Reason, because
 from mavbridge.core.vehicle import (
     Action,
-    ActionMeaning,
     ActionTrace,
     Command,
     Decision,
     LinkSnapshot,
-    Output,
     Reading,
     Release,
     Sticks,
 )
-from mavbridge.guard.chunks import Chunk, ChunkBuffer, FreshnessLimits, Lateness
-from mavbridge.guard.departure import Ending
-from mavbridge.guard.engagement import Act, Engagement, EngagementSettings, Phase
-from mavbridge.guard.envelope import Envelope, EnvelopeInput, EnvelopeLimits
-from mavbridge.guard.facts import Facts, Hand, Move
-from mavbridge.guard.grid import Slot, StickGrid
-from mavbridge.guard.limits import first_action, idle_action, neutral_action
-from mavbridge.guard.outcome import Outcome
-from mavbridge.guard.smoothing import ActionSmoother, Smoothing
+from mavbridge.guard.chunks import Chunk, ChunkBuffer, Lateness
+from mavbridge.guard.engagement import Engagement
+from mavbridge.guard.envelope import Envelope, EnvelopeInput
+from mavbridge.guard.limits import ActionSmoother, first_action, idle_action, neutral_action
+from mavbridge.guard.settings import FlightSettings
+from mavbridge.guard.values import (
+    ControlSource,
+    EndRequest,
+    EngagementInputs,
+    OperatorCommand,
+    Outcome,
+    Phase,
+)
 
 PILOT_FRESH_NS = 500 * NS_PER_MS
 """Oldest RC_CHANNELS that still tells where the pilot's sticks are."""
@@ -38,23 +40,53 @@ STOOD_STILL_NS = 60 * NS_PER_MS
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class FlightSettings:
-    """Settings of a flight, known once its policy is loaded."""
+class Slot:
+    """One point of the stick grid that has come due."""
 
-    meaning: ActionMeaning
-    output: Output | None = None
-    """Message that carries the actions; None = the usual one of their kind and the vehicle."""
-    stick_period_ns: int
-    chunk_period_ns: int
-    """Between the policy's chunks."""
-    freshness: FreshnessLimits
-    smoothing: Smoothing
-    envelope: EnvelopeLimits
-    engagement: EngagementSettings
-    watches_home_height: bool
-    """The policy takes the height above home, which the vehicle is asked for then."""
-    watches_position: bool
-    """It takes a position: the flight process is told whether there is one to be trusted."""
+    index: int
+    due_ns: int
+    missed: int
+    """Slots before it for which no stick left within one period."""
+
+
+class StickGrid:
+    """Slots at ``origin + index * period``, whatever happens between them.
+
+    A slot is served by the first send from half a period before it to one period after it, so one
+    that was served early is left out, and one that nobody served in time is missed, never made up
+    for.
+    """
+
+    def __init__(self, period_ns: int, origin_ns: int) -> None:
+        self._period_ns = period_ns
+        self._origin_ns = origin_ns
+        self._index = -1
+        self._served_ns = origin_ns - period_ns
+        """Last send, or the last slot in which nothing was to be sent."""
+
+    @property
+    def next_ns(self) -> int:
+        """When the next slot is due."""
+        return self._origin_ns + (self._index + 1) * self._period_ns
+
+    def take(self, now_ns: int) -> Slot | None:
+        """The newest slot that has come due since the last call; None if there is none to serve."""
+        index = (now_ns - self._origin_ns) // self._period_ns
+        if index <= self._index:
+            return None
+        first, self._index = self._index + 1, index
+        missed = index - first
+        first_ns = self._origin_ns + first * self._period_ns
+        if first_ns - self._served_ns < self._period_ns // 2:
+            if not missed:
+                return None
+            missed -= 1
+        due_ns = self._origin_ns + index * self._period_ns
+        return Slot(index=index, due_ns=due_ns, missed=missed)
+
+    def serve(self, sent_ns: int) -> None:
+        """Note that sticks have left, or that none were to be sent."""
+        self._served_ns = sent_ns
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -65,8 +97,8 @@ class GuardInput:
     chunk: Chunk | None = None
     absence: Reason | None = None
     """Why the flight process cannot compute a chunk."""
-    act: Act | None = None
-    stop: Ending | None = None
+    act: OperatorCommand | None = None
+    stop: EndRequest | None = None
     command_fault: Reason | None = None
     """Error while the last command was made or sent."""
 
@@ -115,12 +147,11 @@ class Guard:
         self._grid = StickGrid(settings.stick_period_ns, now_ns)
         self._stepped_ns = self._heard_ns = now_ns
         """The last step; the last one after which the guard can tell silence of the vehicle."""
-        self._hand: Hand | None = None
-        self._facts_seen: Facts | None = None
+        self._control: ControlSource | None = None
+        self._seen: EngagementInputs | None = None
         """Those of the last step."""
         self._last = self._neutral
         """As last sent."""
-        self._is_readonly = settings.engagement.readonly
         self._messages: list[str] = []
 
     @property
@@ -146,14 +177,14 @@ class Guard:
     def rehearse(self) -> Iterator[tuple[int, Decision | None, str | None]]:
         """Yield the decisions and the modes to ask for, with their delays in ns, that end the
         flight if the guard dies now."""
-        if self._facts_seen is None:
+        if self._seen is None:
             return
-        for after_ns, move in self._engagement.rehearse(self._facts_seen):
-            yield after_ns, self._at_rest(move.hand), move.mode
+        for after_ns, actions in self._engagement.rehearse(self._seen):
+            yield after_ns, self._at_rest(actions.control), actions.mode
 
     def unsent(self) -> None:
         """The last decision did not leave: the next one starts from what left before it."""
-        if not self._is_readonly:
+        if not self._engagement.settings.readonly:
             self._smoother.undo()
 
     def step(self, now_ns: int, given: GuardInput) -> GuardOutput:
@@ -168,18 +199,20 @@ class Guard:
             self._engagement.stop(given.stop)
         phase_before = self._engagement.phase
         silence = self._silence(now_ns, stood_ns, given.link.telemetry.ned_from_body_wxyz)
-        facts = self._facts_seen = self._facts(now_ns, given, overdue or silence)
-        move = self._engagement.step(facts, given.act)
-        self._change_hand(move.hand, now_ns, given.link)
+        inputs = self._seen = self._inputs(now_ns, given, overdue or silence)
+        actions = self._engagement.step(inputs, given.act)
+        self._change_control(actions.control, now_ns, given.link)
         phase = self._engagement.phase
         # A slot that was just served is left out; a new chunk and a change of hands leave at once.
         slot = self._grid.take(now_ns)
-        is_urgent = phase is not phase_before or (has_news and move.hand is Hand.POLICY)
+        is_urgent = phase is not phase_before or (
+            has_news and actions.control is ControlSource.POLICY
+        )
         decision, trace = None, None
         if slot is not None or is_urgent:
             self._grid.serve(now_ns)
-            is_thrust = facts.mode in facts.modes.thrust
-            decision, trace = self._decide(move, now_ns, is_thrust=is_thrust)
+            is_thrust = inputs.mode in inputs.modes.thrust
+            decision, trace = self._decide(actions.control, now_ns, is_thrust=is_thrust)
         newest = self._chunks.newest
         return GuardOutput(
             decision=decision,
@@ -189,9 +222,9 @@ class Guard:
             is_coasting=trace is not None and self._chunks.is_coasting(now_ns),
             phase=phase,
             reason=self._engagement.reason,
-            mode=move.mode,
-            arm=move.arm,
-            takeoff_m=move.takeoff_m,
+            mode=actions.mode,
+            arm=actions.arm,
+            takeoff_m=actions.takeoff_m,
             messages=self._take_messages(),
             starting_ns=self._engagement.starting_ns or 0,
         )
@@ -232,7 +265,7 @@ class Guard:
             late = late._replace(place="guard")
         return late.reason
 
-    def _facts(self, now_ns: int, given: GuardInput, overdue: Reason | None) -> Facts:
+    def _inputs(self, now_ns: int, given: GuardInput, overdue: Reason | None) -> EngagementInputs:
         link, left, chunk_fault = given.link, None, given.command_fault or overdue
         status = link.status
         if chunk_fault is None and self._engagement.phase is Phase.FLYING:
@@ -241,7 +274,7 @@ class Guard:
         reset_ns = 0 if newest is None else newest.reset_ns
         if status is not None:
             left = self._envelope.check(EnvelopeInput(now_ns, link.telemetry, status))
-        return Facts(
+        return EngagementInputs(
             now_ns=now_ns,
             is_connected=status is not None,
             link_problem=link.problem,
@@ -278,19 +311,21 @@ class Guard:
             landing=left.reason if left and left.kind == "landed" else None,
         )
 
-    def _change_hand(self, hand: Hand | None, now_ns: int, link: LinkSnapshot) -> None:
+    def _change_control(
+        self, control: ControlSource | None, now_ns: int, link: LinkSnapshot
+    ) -> None:
         """When the policy or neutral takes the sticks, start from where they are."""
-        before, self._hand = self._hand, hand
-        if hand is Hand.NEUTRAL and before not in (Hand.POLICY, Hand.NEUTRAL):
-            on_ground = before is Hand.IDLE
+        before, self._control = self._control, control
+        if control is ControlSource.NEUTRAL and before not in (control, ControlSource.POLICY):
+            on_ground = before is ControlSource.IDLE
             start = self._idle if on_ground else self._first(link, None)
             self._smoother.reset(start)  # what an earlier flight left in it counts no longer
-        if hand is not Hand.POLICY or before is Hand.POLICY:
+        if control is not ControlSource.POLICY or before is ControlSource.POLICY:
             return
         self._envelope.reset()
         self._messages += self._envelope.unwatched
         status = link.status
-        if before is Hand.IDLE:
+        if before is ControlSource.IDLE:
             self._smoother.reset(self._idle)
             return
         pilot: Sticks | None = None
@@ -309,47 +344,38 @@ class Guard:
         return self._smoother.limits.clip(first) if is_velocity else first
 
     def _decide(
-        self, move: Move, now_ns: int, *, is_thrust: bool
+        self, control: ControlSource | None, now_ns: int, *, is_thrust: bool
     ) -> tuple[Decision | None, ActionTrace | None]:
         """The sticks to send now; those of the policy with their trace.
 
         ``is_thrust`` says that the throttle stick is thrust in the present mode.
         """
-        action: Action
-        match move.hand:
-            case None:
-                return None, None
-            case Hand.RELEASE:
-                return Release(self._engagement.reason or because(Code.NOT_ENGAGED)), None
-            case Hand.IDLE:
-                action = self._idle
-            case Hand.NEUTRAL:
-                action = self._neutral
-                if self._meaning.kind == "velocity":  # braked within the limits, not at once
-                    action = self._smoother.step(action, now_ns).smoothed
-            case Hand.LEVEL:
-                action = self._level(is_thrust=True)
-            case Hand.POLICY:
-                raw = self._chunks.action_at(now_ns, self._lead_ns)
-                # Beyond the horizon level sticks bridge the rest of the grace.
-                level = self._level(is_thrust=is_thrust)
-                if raw is None and self._meaning.kind == "rates":  # an attitude: not filtered
-                    trace = ActionTrace(raw=level, clipped=level, slewed=level, smoothed=level)
-                else:
-                    trace = self._smoother.step(raw or level, now_ns)
-                    self._last = trace.smoothed
-                return Command(action=trace.smoothed), trace
-        self._last = action
-        return Command(action=action), None
+        if control is not ControlSource.POLICY:
+            decision = self._at_rest(control)
+            if isinstance(decision, Command):
+                is_neutral = control is ControlSource.NEUTRAL
+                if is_neutral and self._meaning.kind == "velocity":  # braked within the limits
+                    decision = Command(action=self._smoother.step(self._neutral, now_ns).smoothed)
+                self._last = decision.action
+            return decision, None
+        raw = self._chunks.action_at(now_ns, self._lead_ns)
+        # Beyond the horizon level sticks bridge the rest of the grace.
+        level = self._level(is_thrust=is_thrust)
+        if raw is None and self._meaning.kind == "rates":  # an attitude: not filtered
+            trace = ActionTrace(raw=level, clipped=level, slewed=level, smoothed=level)
+        else:
+            trace = self._smoother.step(raw or level, now_ns)
+            self._last = trace.smoothed
+        return Command(action=trace.smoothed), trace
 
-    def _at_rest(self, hand: Hand | None) -> Decision | None:
-        """What a hand other than the policy's would send now; nothing is noted."""
-        if hand is None:
+    def _at_rest(self, control: ControlSource | None) -> Decision | None:
+        """What a source other than the policy's would send now; nothing is noted."""
+        if control is None:
             return None
-        if hand is Hand.RELEASE:
+        if control is ControlSource.RELEASE:
             return Release(self._engagement.reason or because(Code.NOT_ENGAGED))
-        resting = {Hand.IDLE: self._idle, Hand.NEUTRAL: self._neutral}
-        return Command(action=resting.get(hand) or self._level(is_thrust=True))
+        resting = {ControlSource.IDLE: self._idle, ControlSource.NEUTRAL: self._neutral}
+        return Command(action=resting.get(control) or self._level(is_thrust=True))
 
     def _level(self, *, is_thrust: bool) -> Action:
         """Neutral, with the last throttle where that is thrust."""

@@ -21,16 +21,15 @@ from mavbridge.core.vehicle import (
 )
 from mavbridge.guard.channel import Port
 from mavbridge.guard.chunks import Chunk
-from mavbridge.guard.departure import Ending
-from mavbridge.guard.engagement import Act, Phase
-from mavbridge.guard.guard import FlightSettings, Guard, GuardInput, GuardOutput
-from mavbridge.guard.outcome import Outcome
+from mavbridge.guard.guard import Guard, GuardInput, GuardOutput
+from mavbridge.guard.settings import FlightSettings
+from mavbridge.guard.values import EndRequest, OperatorCommand, Outcome, Phase
 from mavbridge.guard.wire import (
-    Absence,
     GuardMessage,
     GuardStatus,
     GuardTick,
     LastWords,
+    NoChunk,
     decode_to_guard,
     encode_from_guard,
     encode_packets,
@@ -145,7 +144,7 @@ class GuardLoop:
         self._status: GuardStatus | None = None
         self._watches_position = False
         self._phase = Phase.WAITING
-        self._stop: Ending | None = None
+        self._stop: EndRequest | None = None
         self._command_fault: Reason | None = None
         """Error of the last pass while a command was made or sent."""
         self._finish_until_ns: int | None = None
@@ -173,7 +172,7 @@ class GuardLoop:
         """Take a packet of the vehicle for the flight process; the link calls it in ``poll``."""
         self._packets.append(packet)
 
-    def stop(self, ending: Ending) -> None:
+    def stop(self, ending: EndRequest) -> None:
         """End at the next step, as ``ending`` says."""
         self._stop = self._stop or ending
 
@@ -316,13 +315,13 @@ class GuardLoop:
         """Take the messages of the flight process, the newest of each kind."""
         chunk: Chunk | None = None
         absence: Reason | None = None
-        act: Act | None = None
+        act: OperatorCommand | None = None
         received, self._received = [*self._received, *self._flight.receive()], []
         for data in received:
             match decode_to_guard(data):
                 case Chunk() as chunk:
                     absence = None
-                case Absence(absence):
+                case NoChunk(absence):
                     pass
                 case FlightSettings() as settings if self._guard is None:
                     self._guard = Guard(settings, self._clock.now_ns())
@@ -330,14 +329,14 @@ class GuardLoop:
                     self._watches_position = settings.watches_position
                     if settings.watches_home_height:
                         self._link.watch_home_height()
-                case Ending() as ending:
+                case EndRequest() as ending:
                     self.stop(ending)
                 case "engage" | "release" as new:
                     act = "release" if act == "release" else new  # whatever came after it
                 case _:
                     pass  # settings that count already
         if self._flight.is_closed:
-            self.stop(Ending(reason=because(Code.FLIGHT_PROCESS_DIED), is_fault=True))
+            self.stop(EndRequest(reason=because(Code.FLIGHT_PROCESS_DIED), is_fault=True))
         return GuardInput(
             link=snapshot,
             chunk=chunk,

@@ -23,11 +23,8 @@ from mavbridge.core.vehicle import (
     Sticks,
 )
 from mavbridge.guard.chunks import Chunk
-from mavbridge.guard.departure import Ending
-from mavbridge.guard.engagement import Act, Phase
-from mavbridge.guard.guard import FlightSettings
-from mavbridge.guard.outcome import Outcome
-from mavbridge.guard.settings import GuardSettings
+from mavbridge.guard.settings import FlightSettings, GuardSettings
+from mavbridge.guard.values import EndRequest, OperatorCommand, Outcome, Phase
 
 _CHUNK = struct.Struct("<cBqqqqqqqqH")
 _TICK = struct.Struct("<cqqqqqqqB?iBBB20d")
@@ -110,7 +107,7 @@ class GuardError(NamedTuple):
     text: str
 
 
-class Absence(NamedTuple):
+class NoChunk(NamedTuple):
     """Why the flight process cannot compute a chunk now."""
 
     reason: Reason
@@ -133,7 +130,7 @@ class GuardSummary:
     """Packets that did not fit into the pipe of the telemetry log."""
 
 
-ToGuard: TypeAlias = GuardSettings | FlightSettings | Chunk | Absence | Act | Ending
+ToGuard: TypeAlias = GuardSettings | FlightSettings | Chunk | NoChunk | OperatorCommand | EndRequest
 FromGuard: TypeAlias = (
     tuple[ForwardedPacket, ...]
     | GuardTick
@@ -154,11 +151,11 @@ def encode_to_guard(message: ToGuard) -> bytes:
             values = [value for action in message.actions for value in action]
             kind = _class_index(message.actions[0]) if count else 0
             return _CHUNK.pack(b"C", kind, *stamps, count) + struct.pack(f"<{4 * count}d", *values)
-        case Absence(reason):
+        case NoChunk(reason):
             return b"N" + _encode_reason(reason)
         case GuardSettings() | FlightSettings():
             return b"S" + pickle.dumps(message)
-        case Ending(reason=reason, is_fault=is_fault, end=end):
+        case EndRequest(reason=reason, is_fault=is_fault, end=end):
             return b"E" + json.dumps([is_fault, end]).encode() + b"\n" + _encode_reason(reason)
         case "engage" | "release":
             return b"A" + message.encode()
@@ -178,14 +175,14 @@ def _decode_to_guard(data: bytes) -> ToGuard:
         case b"C":
             return _decode_chunk(data)
         case b"N":
-            return Absence(_decode_reason(rest))
+            return NoChunk(_decode_reason(rest))
         case b"S":
             settings: GuardSettings | FlightSettings = pickle.loads(rest)  # noqa: S301 - our parent's
             return settings
         case b"E":
             head, _, reason = rest.partition(b"\n")
             is_fault, end = json.loads(head)
-            return Ending(reason=_decode_reason(reason), is_fault=is_fault, end=end)
+            return EndRequest(reason=_decode_reason(reason), is_fault=is_fault, end=end)
         case b"A" if rest == b"engage":
             return "engage"
         case b"A" if rest == b"release":

@@ -17,8 +17,8 @@ from mavbridge.flight.bridge import CameraPath, build_bridge
 from mavbridge.flight.observation import observation_ages_ns
 from mavbridge.flight.plan import plan_flight
 from mavbridge.flight.settings import link_settings
-from mavbridge.guard.departure import Ending
 from mavbridge.guard.loop import GuardLoop
+from mavbridge.guard.values import EndRequest
 from mavbridge.mavlink.link import MavlinkLink
 from mavbridge.simulation.clock import AheadClock, SteppedClock
 from mavbridge.simulation.delays import Delays, Stalls
@@ -157,7 +157,7 @@ class SimulatedFlight:
         guard = self._compose(executable, (referee, *sinks))
         while not referee.stop.is_set():
             self.clock.sleep_until_ns(self.clock.now_ns() + STEP_NS)
-        guard.stop(Ending(reason=because(Code.DURATION)))
+        guard.stop(EndRequest(reason=because(Code.DURATION)))
         end_ns = self.clock.now_ns() + END_NS
         while not guard.is_done and self.clock.now_ns() < end_ns:
             self.clock.sleep_until_ns(self.clock.now_ns() + STEP_NS)

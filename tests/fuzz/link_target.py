@@ -22,7 +22,8 @@ from helpers.wire import WireEnd
 from mavbridge.core.clock import NS_PER_MS
 from mavbridge.core.errors import PeerError
 from mavbridge.core.vehicle import ActionKind
-from mavbridge.guard.engagement import ACT_TIMEOUT_NS, Phase
+from mavbridge.guard.memory import ACT_TIMEOUT_NS
+from mavbridge.guard.values import Phase
 from mavbridge.guard.wire import GuardMessage, GuardTick
 from mavbridge.mavlink.transport.sockets import Address, Received
 from mavbridge.simulation.network import VEHICLE

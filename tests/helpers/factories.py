@@ -14,7 +14,7 @@ from mavbridge.core.clock import NS_PER_MS, NS_PER_S
 from mavbridge.core.reasons import Code, Reason, because
 from mavbridge.core.records import Tick, VehicleState, VisionTick
 from mavbridge.core.vehicle import NEUTRAL, ActionTrace, Sticks
-from mavbridge.guard.engagement import Phase
+from mavbridge.guard.values import Phase
 from mavbridge.guard.wire import GuardTick
 
 START_NS = 1_000 * NS_PER_S

@@ -6,12 +6,11 @@ from typing import Any
 from mavbridge.core.clock import NS_PER_MS
 from mavbridge.core.reasons import Code, Reason, Value
 from mavbridge.core.vehicle import NEUTRAL, ModeRoles
-from mavbridge.guard.departure import DepartureSettings
-from mavbridge.guard.engagement import Act, Engagement, EngagementSettings, Phase
-from mavbridge.guard.facts import Facts, Move
-from mavbridge.guard.limits import LimitSettings
-from mavbridge.guard.preparation import PreparationSettings
-from mavbridge.guard.smoothing import Smoothing
+from mavbridge.guard.engagement import Engagement
+from mavbridge.guard.limits import LimitSettings, Smoothing
+from mavbridge.guard.memory import EngagementSettings
+from mavbridge.guard.sequences import DisengageSettings, EngageSettings
+from mavbridge.guard.values import Actions, EndRequest, EngagementInputs, OperatorCommand, Phase
 
 MODES = ("ALT_HOLD", "ALTCTL")
 COPTER_MODES = ModeRoles(
@@ -38,7 +37,7 @@ PX4_MODES = ModeRoles(
 )
 STEP_NS = 10 * NS_PER_MS
 
-AIRBORNE = Facts(
+AIRBORNE = EngagementInputs(
     now_ns=0,
     is_connected=True,
     link_problem=None,
@@ -77,11 +76,11 @@ def stick_smoothing(
 def engagement_settings(**settings: Any) -> EngagementSettings:
     """Settings of the engagement, those of the way in among them; modes are ``MODES``."""
     ways_in = ("modes", "mode", "takeoff_m", "is_setpoint")
-    preparation = {name: settings.pop(name) for name in ways_in if name in settings}
-    departure = settings.pop("departure", DepartureSettings())
+    engage = {name: settings.pop(name) for name in ways_in if name in settings}
+    disengage = settings.pop("disengage", DisengageSettings())
     return EngagementSettings(
-        preparation=PreparationSettings(**{"modes": MODES, **preparation}),
-        departure=departure,
+        engage=EngageSettings(**{"modes": MODES, **engage}),
+        disengage=disengage,
         **settings,
     )
 
@@ -104,20 +103,24 @@ def figures(reason: Reason | None, code: Code) -> dict[str, Value]:
 class Stepped:
     """An engagement, its facts, and everything that it decided."""
 
-    def __init__(self, facts: Facts = AIRBORNE, **settings: Any) -> None:
+    def __init__(self, facts: EngagementInputs = AIRBORNE, **settings: Any) -> None:
         self.engagement = Engagement(engagement_settings(**settings))
         self.facts = facts
-        self.moves: list[Move] = []
+        self.moves: list[Actions] = []
 
-    def step(self, act: Act | None = None, **changes: Any) -> Move:
+    def step(
+        self, act: OperatorCommand | None = None, *, stop: EndRequest | None = None, **changes: Any
+    ) -> Actions:
         """One step, 10 ms after the last; changes of the facts stay."""
+        if stop is not None:
+            self.engagement.stop(stop)
         if changes.get("interruption") is not None:
             changes.setdefault("interruptions", self.facts.interruptions + 1)
         self.facts = replace(self.facts, now_ns=self.facts.now_ns + STEP_NS, **changes)
         self.moves.append(self.engagement.step(self.facts, act))
         return self.moves[-1]
 
-    def run(self, seconds: float, **changes: Any) -> list[Move]:
+    def run(self, seconds: float, **changes: Any) -> list[Actions]:
         """Steps for a while; returns their moves."""
         start = len(self.moves)
         for _ in range(round(seconds * 100)):
@@ -133,7 +136,7 @@ class Stepped:
         return codes(self.engagement.reason)
 
 
-def flying(facts: Facts = AIRBORNE, **settings: Any) -> Stepped:
+def flying(facts: EngagementInputs = AIRBORNE, **settings: Any) -> Stepped:
     """Engaged by the operator's key."""
     stepped = Stepped(facts, **settings)
     stepped.step()

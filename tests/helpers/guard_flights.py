@@ -26,9 +26,8 @@ from mavbridge.core.vehicle import Sticks
 from mavbridge.flight.bridge import CameraPath, build_bridge
 from mavbridge.flight.plan import plan_flight
 from mavbridge.flight.settings import link_settings
-from mavbridge.guard.departure import Ending
-from mavbridge.guard.engagement import Act, Phase
 from mavbridge.guard.loop import GuardLoop
+from mavbridge.guard.values import EndRequest, OperatorCommand, Phase
 from mavbridge.guard.wire import GuardMessage, GuardTick, LastWords, ToGuard, encode_to_guard
 from mavbridge.mavlink.link import MavlinkLink
 from mavbridge.mavlink.transport.sockets import Address, Received
@@ -196,13 +195,13 @@ class GuardFlight:
         """Send the guard a message now."""
         self._port.send(encode_to_guard(message))
 
-    def act(self, act: Act) -> None:
+    def act(self, act: OperatorCommand) -> None:
         """An explicit act at the terminal."""
         self.tell(act)
 
     def stop(self, reason: Reason = SIGNAL, *, is_fault: bool = False) -> None:
         """Ctrl-C, or a fault of the flight process that it could still report."""
-        self.tell(Ending(reason=reason, is_fault=is_fault))
+        self.tell(EndRequest(reason=reason, is_fault=is_fault))
 
     def die(self) -> None:
         """The flight process is killed: the guard reads the end of file."""

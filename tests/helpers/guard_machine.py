@@ -23,12 +23,12 @@ from mavbridge.core.vehicle import (
     Velocity,
 )
 from mavbridge.guard.chunks import Chunk, FreshnessLimits
-from mavbridge.guard.departure import DepartureSettings, Ending
-from mavbridge.guard.engagement import Act, Phase
 from mavbridge.guard.envelope import EnvelopeLimits
-from mavbridge.guard.guard import FlightSettings, Guard, GuardInput, GuardOutput
-from mavbridge.guard.limits import LimitSettings
-from mavbridge.guard.smoothing import Smoothing
+from mavbridge.guard.guard import Guard, GuardInput, GuardOutput
+from mavbridge.guard.limits import LimitSettings, Smoothing
+from mavbridge.guard.sequences import DisengageSettings
+from mavbridge.guard.settings import FlightSettings
+from mavbridge.guard.values import EndRequest, OperatorCommand, Phase
 from mavbridge.mavlink.codec.messages import Body, ManualControl, RcChannels, VelocityTarget
 from mavbridge.mavlink.codec.packets import Codec
 from mavbridge.mavlink.outputs.output import ActionOutput
@@ -123,12 +123,12 @@ class GuardWorld:
     autopilot: str
     kind: Any
     has_receiver: bool
-    departure: DepartureSettings
+    disengage: DisengageSettings
     engage_channel: int | None
     clock: FakeClock = field(default_factory=FakeClock)
     serial: int = 0
-    act: Act | None = None
-    stop: Ending | None = None
+    act: OperatorCommand | None = None
+    stop: EndRequest | None = None
     link_problem: Reason | None = None
     interruption: Reason | None = None
     interruptions: int = 0
@@ -181,7 +181,7 @@ class GuardWorld:
             engagement=engagement_settings(
                 modes=(self.mode,),
                 is_setpoint=self.kind != "sticks",
-                departure=replace(self.departure, is_setpoint=self.kind != "sticks"),
+                disengage=replace(self.disengage, is_setpoint=self.kind != "sticks"),
                 engage_channel=self.engage_channel,
             ),
         )

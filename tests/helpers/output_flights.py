@@ -13,7 +13,7 @@ from pymavlink.dialects.v20 import ardupilotmega as dialect
 from helpers.guard_flights import HEIGHT_M, GuardFlight
 from mavbridge.core.clock import NS_PER_S
 from mavbridge.core.reasons import Code
-from mavbridge.guard.engagement import Phase
+from mavbridge.guard.values import Phase
 from mavbridge.simulation.world import NOMINAL_VEHICLE
 from policy.contract import ActionKind, Contract, FloatArray
 from policy.protocol import Executable

@@ -16,9 +16,8 @@ from mavbridge.core.records import FloatArray, Frame, ImageArray, Tick
 from mavbridge.core.vehicle import Command, Sticks
 from mavbridge.flight.bridge import CameraPath, build_bridge
 from mavbridge.flight.plan import plan_flight
-from mavbridge.guard.departure import Ending
-from mavbridge.guard.engagement import Phase
 from mavbridge.guard.loop import GuardLoop
+from mavbridge.guard.values import EndRequest, Phase
 from mavbridge.simulation.clock import AheadClock, SteppedClock
 from mavbridge.simulation.guard import GuardStepper, MemoryPort, PolicyStepper, sender
 from mavbridge.simulation.network import DelayedChannel
@@ -189,7 +188,7 @@ class VirtualFlight:
         self._send(message)
 
     def stop(self, reason: Reason = SIGNAL) -> None:
-        self.tell(Ending(reason=reason))
+        self.tell(EndRequest(reason=reason))
 
     def fly(self, seconds: float) -> "VirtualFlight":
         """Let time pass."""

@@ -8,7 +8,7 @@ import pytest
 from helpers.guard_flights import NAN, GuardFlight, climbing_first, leaning
 from helpers.output_flights import OutputFlight
 from mavbridge.core.reasons import Code, because
-from mavbridge.guard.engagement import Phase
+from mavbridge.guard.values import Phase
 from sitl.vehicle.config import IDLE_RECEIVER_US
 
 AFTER_S = 10.0

@@ -12,12 +12,11 @@ from helpers.guard_flights import (
     MS,
     GuardFlight,
     climbing_first,
-    hovering,
     leaning,
 )
 from mavbridge.core.errors import PeerError, UserError
-from mavbridge.core.reasons import Code, because
-from mavbridge.guard.engagement import Phase
+from mavbridge.core.reasons import Code
+from mavbridge.guard.values import Phase
 from sitl.ardupilot.flight_modes import Mode
 
 ARM = dialect.MAV_CMD_COMPONENT_ARM_DISARM
@@ -29,34 +28,6 @@ LOW, HIGH = 1000, 2000
 def arm_by_pilot(flight: GuardFlight) -> None:
     flight.ap.set_mode(Mode.ALT_HOLD)
     assert flight.ap.arm(force=False), flight.describe()
-
-
-def test_somebody_elses_arming_is_not_engaging_and_nothing_is_sent() -> None:
-    flight = GuardFlight()
-    flight.run(5)
-    arm_by_pilot(flight)
-    flight.run(3)
-
-    assert flight.phase is Phase.WAITING
-    assert flight.codes == (Code.NOT_ENGAGED,)
-    assert not flight.overrides()
-    assert not flight.commands(ARM)
-    assert not flight.modes_asked()
-
-
-def test_arm_arms_once_and_engages_once() -> None:
-    flight = GuardFlight(climbing_first, arm=True).take_off()
-    assert flight.phases() == [Phase.WAITING, Phase.PREPARING, Phase.FLYING]
-    assert len(flight.commands(ARM)) == 1
-    disarmed_ns = flight.clock.now_ns()
-    flight.ap.disarm(force=True)
-    flight.until(lambda: flight.phase is Phase.RELEASED, within_s=0.5)
-    flight.ap.arm(force=True)
-    flight.run(3)
-
-    assert flight.phase is Phase.RELEASED
-    assert flight.codes == (Code.DISARMED,)
-    assert not flight.commands(ARM, disarmed_ns)
 
 
 def test_arm_idles_the_throttle_until_the_policy_takes_over_from_there() -> None:
@@ -113,20 +84,6 @@ def test_a_receiver_that_drops_out_and_comes_back_engages_nothing(
     assert flight.view.flights == is_flying, flight.describe()
 
 
-def test_engage_on_arm_counts_the_first_arming_alone() -> None:
-    flight = GuardFlight(hovering, engage_on_arm=True)
-    flight.run(5)
-    arm_by_pilot(flight)
-    flight.until(lambda: flight.phase is Phase.FLYING, within_s=0.3)
-    flight.run(1)
-    flight.ap.disarm(force=True)
-    flight.until(lambda: flight.phase is Phase.RELEASED, within_s=1.5)
-    arm_by_pilot(flight)
-    flight.run(2)
-
-    assert flight.phase is Phase.RELEASED
-
-
 def test_the_keys_engage_and_release() -> None:
     flight = GuardFlight().fly()
     flight.act("release")
@@ -138,33 +95,6 @@ def test_the_keys_engage_and_release() -> None:
     flight.until(lambda: flight.phase is Phase.FLYING, within_s=0.1)
 
 
-def test_a_key_in_the_wrong_mode_is_refused_with_what_would_be_right() -> None:
-    flight = GuardFlight().launch()
-    flight.ap.set_mode(Mode.LOITER)
-    flight.run(0.3)
-    flight.act("engage")
-    flight.run(1)
-
-    assert flight.phase is Phase.WAITING
-    assert any("may not fly in LOITER, only in ALT_HOLD" in text for text in flight.messages)
-    assert not flight.modes_asked()
-    assert not flight.overrides()
-
-
-def test_engaging_requires_a_fresh_chunk() -> None:
-    flight = GuardFlight().launch()
-    flight.is_flight_process_stopped = True
-    flight.run(0.5)
-    flight.act("engage")
-    flight.run(0.5)
-
-    assert flight.phase is Phase.WAITING
-    assert any("not engaged: " in text for text in flight.messages), flight.messages
-    flight.is_flight_process_stopped = False
-    flight.run(1)
-    assert flight.phase is Phase.WAITING, "an act that was refused is forgotten"
-
-
 def test_a_mode_in_the_air_is_asked_for_while_the_pilot_keeps_the_sticks() -> None:
     flight = GuardFlight(contract=TWO_MODES, mode="LOITER").launch()
     flight.act("engage")
@@ -174,38 +104,6 @@ def test_a_mode_in_the_air_is_asked_for_while_the_pilot_keeps_the_sticks() -> No
     first_ns = flight.overrides()[0][0]
     assert not flight.modes_asked(first_ns), "the sticks come once the mode has been confirmed"
     assert flight.phases() == [Phase.WAITING, Phase.PREPARING, Phase.FLYING]
-
-
-def test_a_pilot_who_changes_the_mode_while_ours_is_asked_for_keeps_his() -> None:
-    flight = GuardFlight(contract=TWO_MODES, mode="LOITER").launch()
-    flight.up.is_silent = True  # our request gets lost
-    flight.act("engage")
-    flight.run(0.1)
-    flight.ap.set_mode(Mode.RTL)
-    flight.run(0.2)
-    flight.up.is_silent = False
-    flight.run(3)
-
-    assert flight.phase is Phase.RELEASED, flight.describe()
-    assert Code.MODE_CHANGED in flight.codes
-    assert flight.ap.mode is Mode.RTL
-    assert not flight.overrides()
-
-
-def test_an_act_in_the_air_does_not_come_true_much_later() -> None:
-    flight = GuardFlight(contract=TWO_MODES, mode="LOITER").launch()
-    flight.up.is_silent = True  # the request gets lost, and is repeated
-    flight.act("engage")
-    flight.run(0.01)
-    flight.is_flight_process_stopped = True
-    flight.up.is_silent = False
-    flight.run(5)
-    flight.is_flight_process_stopped = False
-    flight.run(3)
-
-    assert flight.phase is Phase.RELEASED, flight.describe()
-    assert Code.NOT_READY in flight.codes
-    assert not flight.overrides()
 
 
 @pytest.mark.parametrize("act", ["release", "stop"])
@@ -272,16 +170,6 @@ def test_from_pilot_to_policy_without_a_jump_and_back_without_a_blend() -> None:
     assert flight.record(taken_s)[-1]["us"] == (1620, 1450, 1540, 1500)
     between = {entry["us"][0] for entry in flight.record(taken_s)}
     assert between <= {*range(1240, 1260), 1620}, "the sticks were given back in one step"
-
-
-def test_an_engagement_before_the_last_one_has_ended_is_refused_aloud() -> None:
-    flight = GuardFlight(on_fault="hold").fly()
-    flight.features.fault = because(Code.IMAGE_FROZEN, age_s=0.6)
-    flight.until(lambda: flight.phase is Phase.LEAVING, within_s=0.5)
-    flight.act("engage")
-    flight.run(0.01)
-
-    assert any("the last flight is still ending" in text for text in flight.messages)
 
 
 def test_a_policy_takes_over_where_the_pilot_lands_it_on_the_ground() -> None:

@@ -18,7 +18,7 @@ from mavbridge.core.reasons import Code, because
 from mavbridge.core.records import FloatArray
 from mavbridge.core.vehicle import NEUTRAL
 from mavbridge.flight.settings import TAU_S
-from mavbridge.guard.engagement import Phase
+from mavbridge.guard.values import Phase
 from sitl.ardupilot.flight_modes import Mode
 from sitl.vehicle.config import MID_RECEIVER_US, Battery
 

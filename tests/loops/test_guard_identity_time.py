@@ -14,7 +14,7 @@ from mavbridge.config.flight import FlyConfig
 from mavbridge.core.clock import NS_PER_S
 from mavbridge.core.errors import UserError
 from mavbridge.core.reasons import Code, because
-from mavbridge.guard.engagement import Phase
+from mavbridge.guard.values import Phase
 from sitl.ardupilot.flight_modes import Mode
 from sitl.vehicle.config import IDLE_RECEIVER_US, MID_RECEIVER_US
 

@@ -4,7 +4,7 @@ import pytest
 
 from helpers.guard_flights import GuardFlight
 from helpers.output_flights import OutputFlight
-from mavbridge.guard.engagement import Phase
+from mavbridge.guard.values import Phase
 from mavbridge.mavlink.transport.connection import REFUSED_NS
 from policy.contract import ActionKind
 from sitl.vehicle.config import AutopilotName

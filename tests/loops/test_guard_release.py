@@ -8,7 +8,7 @@ import pytest
 from helpers.guard_flights import CONTRACT, MS, GuardFlight, climbing_first
 from mavbridge.core.reasons import Code, because
 from mavbridge.core.vehicle import NEUTRAL
-from mavbridge.guard.engagement import Phase
+from mavbridge.guard.values import Phase
 from sitl.ardupilot.flight_modes import Mode
 from sitl.vehicle.config import IDLE_RECEIVER_US, MID_RECEIVER_US
 
@@ -61,27 +61,6 @@ def test_with_an_idle_receiver_hold_keeps_the_height() -> None:
     flight.run(5)
 
     assert flight.height_m == pytest.approx(height_m, abs=0.5)
-
-
-def test_hold_without_a_position_is_land() -> None:
-    flight = GuardFlight(on_fault="hold").fly()
-    flight.ap.position_lost = True
-    flight.run(0.3)
-    fault(flight)
-    assert flight.ap.mode is Mode.LAND
-
-
-def test_a_brake_that_is_refused_becomes_land() -> None:
-    flight = GuardFlight(on_fault="hold").fly()
-    flight.ap.position_lost = True  # the guard has not heard of it yet
-    flight.down.is_silent = True
-    flight.stop(FAULT, is_fault=True)
-    flight.run(0.01)
-    flight.down.is_silent = False
-    flight.until(lambda: flight.guard.is_done, within_s=5)
-
-    assert Mode.LAND in flight.modes_asked()
-    assert flight.ap.mode is Mode.LAND
 
 
 @pytest.mark.parametrize("loss", [0.2, 0.5])
@@ -139,33 +118,7 @@ def test_without_a_receiver_a_fault_holds_the_place_for_as_long_as_it_takes() ->
     assert not flight.guard.is_done
 
 
-def test_stopping_twice_changes_nothing() -> None:
-    flight = GuardFlight(climbing_first, receiver_us=None, arm=True).take_off()
-    flight.stop(because(Code.COURSE_DONE))
-    flight.run(0.5)
-    flight.stop(FAULT, is_fault=True)
-    flight.run(2)
-
-    assert flight.phase is Phase.HOLDING
-    assert flight.codes == (Code.COURSE_DONE,)
-    assert flight.modes_asked()[-1] == Mode.LAND
-
-
 # --- normal ends
-
-
-@pytest.mark.parametrize(
-    ("then", "mode"),
-    [("auto", Mode.ALT_HOLD), ("land", Mode.LAND), ("rtl", Mode.RTL), ("hold", Mode.BRAKE)],
-)
-def test_a_normal_end_does_what_then_says(then: Any, mode: Mode) -> None:
-    flight = GuardFlight(then=then, duration=2.0).launch()
-    flight.act("engage")
-    flight.until(lambda: flight.guard.is_done, within_s=6)
-
-    assert flight.ap.mode is mode
-    assert flight.codes == (Code.DURATION,)
-    assert flight.phase is Phase.ENDED
 
 
 def test_the_duration_may_end_while_coasting() -> None:

@@ -6,7 +6,7 @@ import pytest
 
 from helpers.guard_flights import GuardFlight, climbing_first
 from mavbridge.core.reasons import Code
-from mavbridge.guard.engagement import Phase
+from mavbridge.guard.values import Phase
 from mavbridge.simulation.world import NOMINAL_VEHICLE
 from sitl.vehicle.config import ArduPilotRelease
 

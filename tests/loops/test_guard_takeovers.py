@@ -4,10 +4,10 @@ from collections.abc import Callable
 
 import pytest
 
-from helpers.guard_flights import GuardFlight, climbing_first, hovering, leaning
+from helpers.guard_flights import GuardFlight, hovering, leaning
 from mavbridge.core.clock import NS_PER_MS, NS_PER_S
 from mavbridge.core.reasons import Code, Reason, because
-from mavbridge.guard.engagement import Phase
+from mavbridge.guard.values import Phase
 from sitl.ardupilot.flight_modes import Mode
 from sitl.vehicle.config import MID_RECEIVER_US
 
@@ -77,26 +77,6 @@ def test_a_takeover_releases_and_no_mode_command_ever_leaves(
     assert {us for _, us in releases} == {(0, 0, 0, 0)}, "after the takeover nothing but releases"
 
 
-@pytest.mark.parametrize(("take", "reason", "within_s"), TAKEOVERS)
-def test_what_was_taken_does_not_come_back_by_itself(
-    take: Callable[[GuardFlight], None], reason: Reason, within_s: float
-) -> None:
-    flight = GuardFlight(receiver_us=MID, params=OVERRIDE_SWITCH).fly()
-    take(flight)
-    flight.until(lambda: flight.phase is Phase.RELEASED, within_s=2)
-    flight.ap.gcs_failsafe.active = False
-    flight.receiver(ch5=1500, ch8=2000)
-    flight.ap.set_mode(Mode.ALT_HOLD)
-    flight.ap.disarm(force=True)
-    flight.run(1)
-    flight.ap.arm(force=True)
-    flight.run(2)
-
-    assert flight.phase is Phase.RELEASED
-    assert flight.reason == reason
-    assert not flight.modes_asked()
-
-
 def test_the_release_leaves_in_the_step_that_hears_of_the_takeover() -> None:
     flight = GuardFlight().fly()
     flight.pilot_mode(Mode.LOITER)
@@ -133,42 +113,6 @@ def test_a_mode_change_whose_heartbeat_is_lost_is_seen_within_a_tenth_of_a_secon
 
     assert took_s < 0.11
     assert not flight.modes_asked()
-
-
-def test_a_takeover_on_the_way_out_ends_the_requests_for_a_mode() -> None:
-    flight = GuardFlight(on_fault="hold").fly()
-    flight.up.is_silent = True  # the request for BRAKE gets lost
-    flight.stop(because(Code.CAMERA_FAILED, camera=""), is_fault=True)
-    flight.run(0.02)
-    assert flight.phase is Phase.LEAVING
-    flight.pilot_mode(Mode.LOITER)
-    flight.run(0.02)
-    flight.up.is_silent = False
-    taken_ns = flight.clock.now_ns()
-    flight.run(4)
-
-    assert flight.ap.mode is Mode.LOITER
-    assert not flight.modes_asked(taken_ns)
-    assert flight.codes == (
-        Code.THEN,
-        Code.CAMERA_FAILED,
-        Code.MODE_CHANGED,
-    )
-    assert flight.phase is Phase.ENDED
-
-
-def test_a_takeover_while_neutral_is_held_releases() -> None:
-    flight = GuardFlight(climbing_first, receiver_us=None, arm=True).take_off()
-    flight.stop()
-    flight.until(lambda: flight.phase is Phase.HOLDING, within_s=1)
-    assert flight.ap.mode is Mode.LAND
-    before_ns = flight.clock.now_ns()
-    flight.pilot_mode(Mode.RTL)
-    flight.until(lambda: flight.phase is Phase.RELEASING, within_s=0.05)
-    flight.run(2)
-
-    assert flight.phase is Phase.ENDED
-    assert not flight.modes_asked(before_ns)
 
 
 @pytest.mark.parametrize("rate_hz", [10, 20, 25, 50, 100, 200])

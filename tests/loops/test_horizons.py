@@ -7,7 +7,7 @@ from helpers.guard_flights import MS, GuardFlight, leaning
 from mavbridge.config.flight import Limits
 from mavbridge.config.rates import Rates
 from mavbridge.core.reasons import Code
-from mavbridge.guard.engagement import Phase
+from mavbridge.guard.values import Phase
 from policy.contract import Contract
 
 

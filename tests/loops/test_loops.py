@@ -11,7 +11,7 @@ from mavbridge.config.rates import Rates
 from mavbridge.core.clock import NS_PER_S
 from mavbridge.core.records import Frame
 from mavbridge.core.vehicle import Sticks
-from mavbridge.guard.engagement import Phase
+from mavbridge.guard.values import Phase
 from policy.contract import Contract
 
 PERIOD_NS = 10 * MS

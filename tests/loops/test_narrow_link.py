@@ -3,7 +3,7 @@
 import pytest
 
 from helpers.output_flights import OutputFlight
-from mavbridge.guard.engagement import Phase
+from mavbridge.guard.values import Phase
 from policy.contract import ActionKind
 from sitl.vehicle.config import AutopilotName
 

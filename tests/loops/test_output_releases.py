@@ -12,7 +12,7 @@ from helpers import release_paths as paths
 from helpers.output_flights import COMBINATIONS, Aftermath, OutputFlight
 from mavbridge.core.reasons import Code
 from mavbridge.core.vehicle import Action
-from mavbridge.guard.engagement import Phase
+from mavbridge.guard.values import Phase
 from mavbridge.mavlink.codec.packets import CommandRefusedError
 from mavbridge.mavlink.session.vehicle import VehicleSession
 from policy.contract import ActionKind

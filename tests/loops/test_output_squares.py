@@ -6,7 +6,7 @@ from itertools import pairwise
 import pytest
 
 from helpers.output_flights import COMBINATIONS, LEG_M, SQUARE, SQUARE_S, OutputFlight
-from mavbridge.guard.engagement import Phase
+from mavbridge.guard.values import Phase
 from policy.contract import ActionKind
 from policy.scripted.programs import LEG_S
 from sitl.vehicle.config import AutopilotName

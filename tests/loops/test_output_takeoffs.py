@@ -6,7 +6,7 @@ from pymavlink.dialects.v20 import ardupilotmega as dialect
 from helpers import release_paths as paths
 from helpers.output_flights import HOVERING, OutputFlight
 from mavbridge.core.reasons import Code
-from mavbridge.guard.engagement import Phase
+from mavbridge.guard.values import Phase
 from policy.contract import ActionKind
 from sitl.vehicle.config import AutopilotName
 

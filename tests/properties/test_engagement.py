@@ -17,9 +17,9 @@ from helpers.guard_facts import AIRBORNE, COPTER_MODES, STEP_NS, Stepped
 from mavbridge.core.clock import NS_PER_S
 from mavbridge.core.reasons import Code, Reason, because
 from mavbridge.core.vehicle import NEUTRAL
-from mavbridge.guard.departure import MODE_TIMEOUT_NS, NEUTRAL_NS, DepartureSettings, Ending
-from mavbridge.guard.engagement import RELEASE_TIMEOUT_NS, Act, Phase
-from mavbridge.guard.facts import Hand, Move
+from mavbridge.guard.sequences import MODE_TIMEOUT_NS, NEUTRAL_NS, DisengageSettings
+from mavbridge.guard.table import RELEASE_TIMEOUT_NS
+from mavbridge.guard.values import Actions, ControlSource, EndRequest, OperatorCommand, Phase
 
 MODES = ("ALT_HOLD", "LOITER")
 JOYSTICK = because(Code.OVERRULED, quantity="sticks", cause="a joystick")
@@ -44,7 +44,7 @@ class EngagementMachine(RuleBasedStateMachine):
         mode=st.sampled_from((None, *MODES)),
     )
     def begin(self, *, has_receiver: bool, **chosen: Any) -> None:
-        departure = DepartureSettings(on_fault=chosen["on_fault"], then=chosen["then"])
+        departure = DisengageSettings(on_fault=chosen["on_fault"], then=chosen["then"])
         facts = replace(
             AIRBORNE,
             has_receiver=has_receiver,
@@ -54,7 +54,7 @@ class EngagementMachine(RuleBasedStateMachine):
         self.vehicle = Stepped(
             facts,
             modes=MODES,
-            departure=departure,
+            disengage=departure,
             mode=chosen["mode"],
             engage_channel=chosen["engage_channel"],
         )
@@ -65,13 +65,13 @@ class EngagementMachine(RuleBasedStateMachine):
         self.was_taken = False
         """Somebody has taken the sticks, and no act has come since."""
         self.stopped_ns: int | None = None
-        self.last = Move()
+        self.last = Actions()
         self.good = facts
         self.step()
         self.press("engage")
         assert self.vehicle.phase is Phase.FLYING
 
-    def step(self, act: Act | None = None, **changes: Any) -> Move:
+    def step(self, act: OperatorCommand | None = None, **changes: Any) -> Actions:
         """One step; notes acts and losses as an observer of the facts would."""
         before, facts = self.vehicle.phase, self.vehicle.facts
         switch_us = changes.get("rc_channels_us", facts.rc_channels_us)[6]
@@ -80,7 +80,7 @@ class EngagementMachine(RuleBasedStateMachine):
         if not 1200 <= switch_us <= 1800:  # a switch of three positions passes through the middle
             self.switch_is_low = switch_us < 1200
         is_mode = changes.get("mode", facts.mode)
-        own, asked = self.vehicle.engagement._own_mode, self.vehicle.engagement._departure.mode
+        own, asked = self.vehicle.engagement.own_mode, self.vehicle.engagement.disengage.mode
         if before is Phase.FLYING:
             own, asked = facts.mode, None
         takes = before in HOLDS_STICKS and (
@@ -94,7 +94,9 @@ class EngagementMachine(RuleBasedStateMachine):
         after = self.vehicle.phase
         if takes:
             self.was_taken = True
-            assert self.last == Move(hand=Hand.RELEASE), "in this same step, and no mode"
+            assert self.last == Actions(control=ControlSource.RELEASE), (
+                "in this same step, and no mode"
+            )
             assert after is Phase.RELEASING
         if before is Phase.FLYING and after is not Phase.FLYING:
             self.has_act = False
@@ -103,7 +105,7 @@ class EngagementMachine(RuleBasedStateMachine):
     # --- the operator
 
     @rule(act=st.sampled_from(("engage", "release")))
-    def press(self, act: Act) -> None:
+    def press(self, act: OperatorCommand) -> None:
         if act == "engage" and self.vehicle.phase in (Phase.WAITING, Phase.RELEASED):
             self.was_taken = False
         self.step(act)
@@ -128,13 +130,13 @@ class EngagementMachine(RuleBasedStateMachine):
             )
             self.holds()
         self.press("engage")
-        if self.vehicle.engagement._settings.engage_channel is None and self.stopped_ns is None:
+        if self.vehicle.engagement.settings.engage_channel is None and self.stopped_ns is None:
             assert self.vehicle.phase not in (Phase.WAITING, Phase.RELEASED), "it can be flown"
 
     @rule(is_fault=st.booleans())
     @precondition(lambda self: len(self.vehicle.moves) > 300)
     def stop(self, is_fault: bool) -> None:
-        self.vehicle.engagement.stop(Ending(reason=because(Code.SIGNAL), is_fault=is_fault))
+        self.vehicle.engagement.stop(EndRequest(reason=because(Code.SIGNAL), is_fault=is_fault))
         if self.stopped_ns is None:
             self.stopped_ns = self.vehicle.facts.now_ns
         self.step()
@@ -208,16 +210,16 @@ class EngagementMachine(RuleBasedStateMachine):
         if not hasattr(self, "vehicle"):
             return
         vehicle, move = self.vehicle, self.last
-        if move.hand is Hand.POLICY:
+        if move.control is ControlSource.POLICY:
             assert self.has_act, "the policy flies, and nobody has asked for it"
             assert vehicle.phase is Phase.FLYING
             assert vehicle.facts.armed
         if self.was_taken:
             assert move.mode is None, "a mode is asked for after a takeover"
             assert not move.arm
-            assert move.hand in (Hand.RELEASE, None)
+            assert move.control in (ControlSource.RELEASE, None)
         if vehicle.phase in (Phase.WAITING, Phase.RELEASED, Phase.ENDED):
-            assert move == Move() or move.hand is None
+            assert move == Actions() or move.control is None
         if move.arm:
             assert vehicle.phase is Phase.PREPARING
             assert not vehicle.facts.armed

@@ -12,8 +12,8 @@ from helpers.guard_machine import FLIGHT_MODES, GRACE_NS, LIMIT_NS, MS, STEP_NS,
 from mavbridge.core.reasons import Code, because
 from mavbridge.core.switch import DWELL_NS
 from mavbridge.core.vehicle import Sticks
-from mavbridge.guard.departure import DepartureSettings, Ending
-from mavbridge.guard.engagement import Act, Phase
+from mavbridge.guard.sequences import DisengageSettings
+from mavbridge.guard.values import EndRequest, OperatorCommand, Phase
 
 ENDINGS = st.sampled_from(("auto", "release", "hold", "land", "rtl"))
 AT_REST = (Phase.WAITING, Phase.RELEASED, Phase.ENDED)
@@ -38,8 +38,8 @@ class GuardMachine(RuleBasedStateMachine):
         engage_channel=st.sampled_from((None, None, 7)),
     )
     def begin(self, combination: tuple[str, str], on_fault: Any, then: Any, **chosen: Any) -> None:
-        departure = DepartureSettings(on_fault=on_fault, then=then)
-        self.world = GuardWorld(*combination, departure=departure, **chosen)
+        departure = DisengageSettings(on_fault=on_fault, then=then)
+        self.world = GuardWorld(*combination, disengage=departure, **chosen)
         self.has_act = False
         """An explicit act has come that no flight has used up."""
         self.must_end = False
@@ -167,7 +167,7 @@ class GuardMachine(RuleBasedStateMachine):
     # --- the operator, the pilot, and whoever else holds sticks
 
     @rule(what=st.sampled_from(("engage", "engage", "release")))
-    def act(self, what: Act) -> None:
+    def act(self, what: OperatorCommand) -> None:
         self.world.act = what
         channel, is_low = self.world.engage_channel, self.switch_is_low
         self.has_act = what == "engage"
@@ -314,7 +314,7 @@ class GuardMachine(RuleBasedStateMachine):
         code = {"dies": Code.FLIGHT_PROCESS_DIED, "ends": Code.SIGNAL, "fails": Code.POLICY_FAILED}[
             how
         ]
-        self.world.stop = Ending(reason=because(code), is_fault=how != "ends")
+        self.world.stop = EndRequest(reason=because(code), is_fault=how != "ends")
         if how == "dies":
             self.world.has_chunks = False
             self.silent_ns = self.silent_ns or self.world.now_ns

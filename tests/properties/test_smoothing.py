@@ -10,8 +10,7 @@ from hypothesis import strategies as st
 from helpers.guard_facts import stick_smoothing
 from mavbridge.core.clock import NS_PER_S
 from mavbridge.core.vehicle import NEUTRAL, AttitudeThrust, Sticks
-from mavbridge.guard.limits import LimitSettings
-from mavbridge.guard.smoothing import ActionSmoother, Smoothing
+from mavbridge.guard.limits import ActionSmoother, LimitSettings, Smoothing
 
 SLEW_PER_S = 8.0
 SETTINGS = stick_smoothing(max_slew_per_s=SLEW_PER_S, tau_s=0.05)

@@ -14,7 +14,7 @@ from mavbridge.core.clock import Clock
 from mavbridge.core.errors import MavbridgeError
 from mavbridge.core.vehicle import ActionMeaning, LinkSnapshot, VehicleStatus
 from mavbridge.flight.settings import action_meaning, guard_settings
-from mavbridge.guard.departure import MIDDLE_STICK
+from mavbridge.guard.sequences import MIDDLE_STICK
 from mavbridge.mavlink.link import MavlinkLink
 from mavbridge.mavlink.session.vehicle import VehicleSession
 from mavbridge.mavlink.settings import LinkSettings

@@ -37,8 +37,8 @@ from mavbridge.flight.plan import plan_flight
 from mavbridge.flight.settings import guard_settings
 from mavbridge.flight.state import Freshness
 from mavbridge.flight.vision_loop import VisionLoop
-from mavbridge.guard.departure import Ending
 from mavbridge.guard.settings import GuardSettings
+from mavbridge.guard.values import EndRequest
 from mavbridge.mavlink.transport.sockets import make_transport
 from mavbridge.observe.keyboard import Keyboard
 from mavbridge.observe.output import flight_console
@@ -242,7 +242,7 @@ class _Session:
             f"{self._episodes.finished} episodes recorded in {out}: {counts[True]} good, "
             f"{counts[False]} bad, {counts[None]} not marked"
         )
-        self._guard.send(Ending(reason=because(Code.FINISHED, what="recording")))
+        self._guard.send(EndRequest(reason=because(Code.FINISHED, what="recording")))
         listener.ends_within(GUARD_END_S)
 
     def _listen(self, stop: threading.Event) -> None:

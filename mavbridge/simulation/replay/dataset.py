@@ -11,11 +11,12 @@ from mavbridge.config.flight import FlyConfig
 from mavbridge.core.clock import NS_PER_S
 from mavbridge.core.errors import UserError
 from mavbridge.core.records import FeatureFrame, VehicleState
-from mavbridge.core.vehicle import Release, Sticks
+from mavbridge.core.vehicle import Sticks
 from mavbridge.flight.feature_cache import FeatureCache
 from mavbridge.flight.history import SentHistory
 from mavbridge.flight.observation import ObservationSource, StateHistory, observation_ages_ns
 from mavbridge.flight.settings import effective_freshness
+from mavbridge.flight.state import Unavailable
 from mavbridge.simulation.clock import START_NS, SteppedClock
 from mavbridge.simulation.replay.actions import ActionPair
 from policy.contract import Contract
@@ -95,7 +96,7 @@ class EpisodeReplay:
             self._states.push(state)
         self._observations.push(state)
         seen = self._observations.observe(state, now_ns)
-        if isinstance(seen, Release):
+        if isinstance(seen, Unavailable):
             return None
         history = self._history.resample(now_ns)
         try:

@@ -21,10 +21,10 @@ from mavbridge.flight.plan import FlightPlan, plan_flight
 from mavbridge.flight.policy_loop import make_chunk
 from mavbridge.flight.settings import link_settings
 from mavbridge.guard.chunks import Chunk
-from mavbridge.guard.departure import Ending
-from mavbridge.guard.engagement import Act, Phase
-from mavbridge.guard.guard import FlightSettings, Guard, GuardInput, GuardOutput
+from mavbridge.guard.guard import Guard, GuardInput, GuardOutput
 from mavbridge.guard.loop import GuardLoop
+from mavbridge.guard.settings import FlightSettings
+from mavbridge.guard.values import EndRequest, OperatorCommand, Phase
 from mavbridge.guard.wire import GuardTick, decode_from_guard, encode_to_guard
 from mavbridge.mavlink.link import MavlinkLink
 from mavbridge.mavlink.transport.sockets import Address, Received
@@ -53,8 +53,8 @@ class GuardStep:
     """What the link knew."""
     chunk_serial: int | None
     """Chunk that the guard got in this pass."""
-    act: Act | None
-    stop: Ending | None
+    act: OperatorCommand | None
+    stop: EndRequest | None
 
 
 def chunk_of(solve: Solve, contract: Contract) -> Chunk:
@@ -157,11 +157,11 @@ class _Arrivals:
 
     tick: Tick
     chunk: Chunk | None
-    act: Act | None
-    stop: Ending | None
+    act: OperatorCommand | None
+    stop: EndRequest | None
 
     @property
-    def messages(self) -> list[Chunk | Act | Ending]:
+    def messages(self) -> list[Chunk | OperatorCommand | EndRequest]:
         return [each for each in (self.chunk, self.act, self.stop) if each is not None]
 
 
@@ -194,7 +194,7 @@ def _is_seen(solve: Solve, tick: Tick) -> bool:
     return solve.computed_ns <= tick.woke_ns
 
 
-def _act(before: Tick | None, tick: Tick, *, is_called: bool) -> Act | None:
+def _act(before: Tick | None, tick: Tick, *, is_called: bool) -> OperatorCommand | None:
     """The operator's keys, as the phases show them."""
     was = None if before is None else before.phase
     if is_called and was in ("waiting", "released") and tick.phase in ("preparing", "flying"):
@@ -204,16 +204,16 @@ def _act(before: Tick | None, tick: Tick, *, is_called: bool) -> Act | None:
     return None
 
 
-def _stop(before: Tick | None, tick: Tick) -> Ending | None:
+def _stop(before: Tick | None, tick: Tick) -> EndRequest | None:
     """What the flight process asked for at its own end."""
     was = None if before is None else before.phase
     reason = tick.release_reason
     if reason is not None and reason.code is Code.THEN:
         reason = dict(reason.data)["first"]  # type: ignore[assignment]
     if tick.phase != was and isinstance(reason, Reason) and reason.code in _OWN_ENDINGS:
-        return Ending(reason=reason, is_fault=reason.kind is Kind.FAULT)
+        return EndRequest(reason=reason, is_fault=reason.kind is Kind.FAULT)
     if tick.phase == Phase.ENDED.value != was:  # the second of two stops counts for nothing
-        return Ending(reason=because(Code.SIGNAL))
+        return EndRequest(reason=because(Code.SIGNAL))
     return None
 
 

@@ -24,8 +24,8 @@ from mavbridge.flight.observation import observation_ages_ns
 from mavbridge.flight.plan import plan_flight
 from mavbridge.flight.settings import action_meaning
 from mavbridge.guard.chunks import Chunk
-from mavbridge.guard.engagement import Phase
-from mavbridge.guard.wire import Absence, GuardStatus, GuardTick
+from mavbridge.guard.values import Phase
+from mavbridge.guard.wire import GuardStatus, GuardTick, NoChunk
 from mavbridge.simulation.clock import START_NS, SteppedClock
 from mavbridge.simulation.replay.actions import ActionPair
 from mavbridge.simulation.replay.telemetry_log import PilotSticks, TelemetryLog
@@ -214,8 +214,8 @@ class LogReplay:
             reason=None,
         )
 
-    def _sent(self, message: Chunk | Absence) -> None:
-        if isinstance(message, Absence):
+    def _sent(self, message: Chunk | NoChunk) -> None:
+        if isinstance(message, NoChunk):
             reason = message.reason
             self.refusals[self._sentences.setdefault(reason.key, str(reason))] += 1
 

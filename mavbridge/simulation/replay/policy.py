@@ -28,8 +28,8 @@ from mavbridge.flight.state import Freshness
 from mavbridge.flight.state_reader import StateReader
 from mavbridge.flight.telemetry_cache import TelemetryCache
 from mavbridge.guard.chunks import Chunk
-from mavbridge.guard.engagement import Phase
-from mavbridge.guard.wire import Absence, GuardStatus, GuardTick
+from mavbridge.guard.values import Phase
+from mavbridge.guard.wire import GuardStatus, GuardTick, NoChunk
 from mavbridge.mavlink.codec.messages import Measurement
 from mavbridge.mavlink.codec.packets import Codec
 from mavbridge.mavlink.session.telemetry import TelemetryCollector
@@ -127,8 +127,8 @@ class _Loop:
             self._clock.sleep_until_ns(recorded.computed_ns)
         return chunk
 
-    def _sent(self, message: Chunk | Absence) -> None:
-        if isinstance(message, Absence):
+    def _sent(self, message: Chunk | NoChunk) -> None:
+        if isinstance(message, NoChunk):
             self._refusal = message.reason
 
     def _keep(self, solve: Solve) -> None:

@@ -21,8 +21,8 @@ from mavbridge.core.clock import NS_PER_MS
 from mavbridge.flight import guard_process
 from mavbridge.flight.guard_process import LATEST_NS, GuardDiedError, GuardProcess
 from mavbridge.guard.channel import SocketPort
-from mavbridge.guard.engagement import Phase
 from mavbridge.guard.settings import GuardSettings
+from mavbridge.guard.values import Phase
 from mavbridge.guard.wire import GuardError, LastWords, encode_from_guard, encode_tick
 from mavbridge.mavlink.settings import LinkSettings
 

@@ -8,7 +8,6 @@ import pytest
 from mavbridge.core.clock import NS_PER_MS
 from mavbridge.core.reasons import Code, Reason, because
 from mavbridge.core.records import FeatureFrame, VehicleState
-from mavbridge.core.vehicle import Release
 from mavbridge.flight.feature_cache import MAX_PAST, FeatureCache
 from mavbridge.flight.observation import (
     MAX_STATES,
@@ -17,6 +16,7 @@ from mavbridge.flight.observation import (
     StateHistory,
     observation_ages_ns,
 )
+from mavbridge.flight.state import Unavailable
 from policy.contract import Contract
 from policy.protocol import Executable
 
@@ -78,7 +78,7 @@ def cache_of(*ago_ms: float, span_ms: int = 200) -> FeatureCache:
     return cache
 
 
-def observed(found: Observation | Release) -> Observation:
+def observed(found: Observation | Unavailable) -> Observation:
     assert isinstance(found, Observation)
     return found
 
@@ -162,7 +162,7 @@ def test_no_camera_may_be_missing_old_or_at_fault(
         if frame is not None:
             cache.publish(frame)
     found = source(TWO_CAMERAS, *caches).observe(felt(0), NOW_NS)
-    assert (found.reason if isinstance(found, Release) else None) == reason
+    assert (found.reason if isinstance(found, Unavailable) else None) == reason
 
 
 def test_the_age_is_that_of_the_oldest_of_the_newest_images() -> None:

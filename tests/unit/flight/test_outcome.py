@@ -15,7 +15,7 @@ from mavbridge.core.records import FlightOutcome, Position, Tick
 from mavbridge.core.stopping import StopRequest
 from mavbridge.core.vehicle import FlightEnd, LinkStats
 from mavbridge.flight.outcome import RUN_OUT_NS, FlightReferee, describe, flight_verdict
-from mavbridge.guard.outcome import Outcome
+from mavbridge.guard.values import Outcome
 from mavbridge.guard.wire import GuardStatus, GuardSummary
 
 FLOWN = Outcome(flights=1, has_left_ground=True)

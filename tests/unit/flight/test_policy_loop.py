@@ -23,8 +23,8 @@ from mavbridge.flight.state import Freshness
 from mavbridge.flight.state_reader import StateReader
 from mavbridge.flight.telemetry_cache import TelemetryCache
 from mavbridge.guard.chunks import Chunk
-from mavbridge.guard.engagement import Phase
-from mavbridge.guard.wire import Absence
+from mavbridge.guard.values import Phase
+from mavbridge.guard.wire import NoChunk
 from policy.contract import Contract
 
 MS = NS_PER_MS
@@ -48,7 +48,7 @@ class Rig:
         self.view = TelemetryCache(
             history=history, sink=ListSink(), state_frame="ned_frd", freshness=FRESH
         )
-        self.sent: list[Chunk | Absence] = []
+        self.sent: list[Chunk | NoChunk] = []
         self.solves = self.resets = 0
         self._chunk = chunk or (lambda: np.zeros((1, 3, 4), np.float32))
         self.loop = PolicyLoop(
@@ -167,7 +167,7 @@ def test_without_usable_inputs_the_policy_is_not_asked(
 ) -> None:
     rig = prepare(Rig())
     rig.loop.step()
-    assert rig.sent == [Absence(reason)]
+    assert rig.sent == [NoChunk(reason)]
     assert rig.solves == 0
 
 
@@ -178,7 +178,7 @@ def test_a_chunk_of_another_shape_is_not_passed_on(shape: tuple[int, ...]) -> No
     rig = Rig(lambda: np.zeros(shape, np.float32)).measure().see()
     rig.loop.step()
     (refused,) = rig.sent
-    assert isinstance(refused, Absence)
+    assert isinstance(refused, NoChunk)
     assert refused.reason == because(Code.WRONG_SHAPE, shape=str(list(shape)), most=MAX_HORIZON)
 
 
@@ -248,8 +248,8 @@ def test_it_solves_until_it_is_told_to_stop_and_says_when_no_attitude_comes() ->
     rig.view.wait_for_attitude = wait  # type: ignore[method-assign]
     before_ns = rig.loop.alive_ns
     rig.loop.run(stop)
-    told = [one if isinstance(one, Absence) else one.serial for one in rig.sent]
-    assert told == [1, Absence(NO_ATTITUDE), 2, Absence(NO_ATTITUDE)]
+    told = [one if isinstance(one, NoChunk) else one.serial for one in rig.sent]
+    assert told == [1, NoChunk(NO_ATTITUDE), 2, NoChunk(NO_ATTITUDE)]
     assert rig.loop.alive_ns > before_ns
 
 
@@ -263,4 +263,4 @@ def test_a_policy_that_fails_is_told_to_the_guard_at_once(failure: type[BaseExce
     rig.loop._act = fail
     with pytest.raises(failure):
         rig.loop.run(threading.Event())
-    assert rig.sent == [Absence(because(Code.POLICY_FAILED))]
+    assert rig.sent == [NoChunk(because(Code.POLICY_FAILED))]

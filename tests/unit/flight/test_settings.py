@@ -11,10 +11,9 @@ from mavbridge.core.errors import UserError
 from mavbridge.core.vehicle import ActionMeaning, StickGains
 from mavbridge.flight.plan import plan_flight
 from mavbridge.flight.settings import action_meaning, guard_settings
-from mavbridge.guard.departure import DepartureSettings
-from mavbridge.guard.engagement import EngagementSettings
-from mavbridge.guard.guard import FlightSettings
-from mavbridge.guard.preparation import PreparationSettings
+from mavbridge.guard.memory import EngagementSettings
+from mavbridge.guard.sequences import DisengageSettings, EngageSettings
+from mavbridge.guard.settings import FlightSettings
 from policy.contract import Contract
 from policy.protocol import Executable
 
@@ -116,12 +115,12 @@ def test_engaging_and_leaving_follow_the_flags() -> None:
         duration=1.5,
     )
     assert settings_for(config).engagement == EngagementSettings(
-        preparation=PreparationSettings(modes=("ALT_HOLD", "ALTCTL"), mode="ALTCTL"),
+        engage=EngageSettings(modes=("ALT_HOLD", "ALTCTL"), mode="ALTCTL"),
         arm=True,
         engage_channel=8,
         engage_on_arm=True,
         duration_ns=1_500_000_000,
-        departure=DepartureSettings(on_fault="rtl", then="hold"),
+        disengage=DisengageSettings(on_fault="rtl", then="hold"),
     )
     assert settings_for(FlyConfig(link=replace(LINK, readonly=True))).engagement.readonly
 

@@ -10,9 +10,9 @@ from mavbridge.core.clock import NS_PER_MS
 from mavbridge.core.errors import UserError
 from mavbridge.core.reasons import Code, because
 from mavbridge.core.records import VehicleState
-from mavbridge.core.vehicle import Reading, Release, Telemetry
+from mavbridge.core.vehicle import Reading, Telemetry
 from mavbridge.flight.plan import plan_flight
-from mavbridge.flight.state import Freshness
+from mavbridge.flight.state import Freshness, Unavailable
 from mavbridge.flight.state_reader import StateReader
 from policy.contract import Contract, StateExtra
 from policy.protocol import Executable
@@ -43,7 +43,7 @@ def read(
     *extras: StateExtra,
     has_position: bool = True,
     **contract: object,
-) -> VehicleState | Release:
+) -> VehicleState | Unavailable:
     asked = Contract(state_extras=extras, **contract)  # type: ignore[arg-type]
     reader = StateReader(asked, freshness=FRESH, goal_ned_m=GOAL)
     return reader.read(telemetry, NOW_NS, has_position=has_position)
@@ -75,11 +75,11 @@ def test_what_is_missing_or_old_is_a_reason_and_never_a_zero(extra: StateExtra, 
     what = "position" if field == "position_ned_m" else "height above home"
     reading = getattr(FLYING, field)
     missing = read(replace(FLYING, **{field: None}), extra)
-    assert missing == Release(because(Code.NO_TRUSTED_READING, quantity=what))
+    assert missing == Unavailable(because(Code.NO_TRUSTED_READING, quantity=what))
     just = replace(FLYING, **{field: at(250, *reading.values)})
     assert isinstance(read(just, extra), VehicleState)
     old = replace(FLYING, **{field: at(252, *reading.values)})
-    assert read(old, extra) == Release(
+    assert read(old, extra) == Unavailable(
         because(Code.TOO_OLD, quantity=what, age_ms=252.0, limit_ms=250.0)
     )
     assert isinstance(read(old), VehicleState)  # nobody asks for it
@@ -87,7 +87,7 @@ def test_what_is_missing_or_old_is_a_reason_and_never_a_zero(extra: StateExtra, 
 
 def test_a_state_that_is_missing_is_a_reason_also_where_extras_are_asked_for() -> None:
     refused = read(replace(FLYING, ned_from_body_wxyz=None), "height")
-    assert refused == Release(because(Code.NO_READING, quantity="attitude"))
+    assert refused == Unavailable(because(Code.NO_READING, quantity="attitude"))
 
 
 def test_a_contract_with_a_goal_is_not_flown_without_one() -> None:
@@ -98,7 +98,7 @@ def test_a_contract_with_a_goal_is_not_flown_without_one() -> None:
 
 def test_a_position_that_the_estimator_does_not_trust_is_none() -> None:
     for extra in ("goal", "altitude"):
-        assert isinstance(read(FLYING, extra, has_position=False), Release)  # type: ignore[arg-type]
+        assert isinstance(read(FLYING, extra, has_position=False), Unavailable)  # type: ignore[arg-type]
     assert isinstance(read(FLYING, "height", has_position=False), VehicleState)
 
 

@@ -17,7 +17,7 @@ from mavbridge.core.vehicle import ForwardedPacket, Sticks
 from mavbridge.flight.history import SentHistory
 from mavbridge.flight.state import Freshness
 from mavbridge.flight.telemetry_cache import MAX_SOLVES, SolveInputs, TelemetryCache
-from mavbridge.guard.engagement import Phase
+from mavbridge.guard.values import Phase
 from mavbridge.guard.wire import GuardError, GuardMessage, GuardStatus, GuardTick
 from mavbridge.observe.terminal import FlightScreen
 from mavbridge.observe.timing import FlightTiming, ObserverDrops

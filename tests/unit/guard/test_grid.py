@@ -1,5 +1,5 @@
 from mavbridge.core.clock import NS_PER_MS
-from mavbridge.guard.grid import StickGrid
+from mavbridge.guard.guard import StickGrid
 
 MS = NS_PER_MS
 PERIOD = 10 * MS

@@ -18,10 +18,10 @@ from mavbridge.core.vehicle import (
     VehicleStatus,
 )
 from mavbridge.guard.chunks import Chunk, FreshnessLimits
-from mavbridge.guard.departure import DepartureSettings
 from mavbridge.guard.envelope import EnvelopeLimits
-from mavbridge.guard.guard import FlightSettings
 from mavbridge.guard.loop import GuardLoop
+from mavbridge.guard.sequences import DisengageSettings
+from mavbridge.guard.settings import FlightSettings
 from mavbridge.guard.wire import encode_to_guard
 
 PERIOD_NS = 10 * NS_PER_MS
@@ -38,7 +38,7 @@ FLIGHT = FlightSettings(
     envelope=EnvelopeLimits(),
     watches_home_height=False,
     watches_position=False,
-    engagement=engagement_settings(modes=("ALT_HOLD",), departure=DepartureSettings()),
+    engagement=engagement_settings(modes=("ALT_HOLD",), disengage=DisengageSettings()),
 )
 
 

@@ -22,8 +22,14 @@ from mavbridge.core.vehicle import (
     Telemetry,
     Velocity,
 )
-from mavbridge.guard.limits import LimitSettings, first_action, idle_action, neutral_action
-from mavbridge.guard.smoothing import ActionSmoother, Smoothing
+from mavbridge.guard.limits import (
+    ActionSmoother,
+    LimitSettings,
+    Smoothing,
+    first_action,
+    idle_action,
+    neutral_action,
+)
 from mavbridge.mavlink.codec.packets import MOST_LEAN_RAD
 
 SETTINGS = LimitSettings(

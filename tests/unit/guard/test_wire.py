@@ -20,20 +20,18 @@ from mavbridge.core.vehicle import (
     Sticks,
 )
 from mavbridge.guard.chunks import Chunk, FreshnessLimits
-from mavbridge.guard.departure import DepartureSettings, Ending
-from mavbridge.guard.engagement import Phase
 from mavbridge.guard.envelope import EnvelopeLimits
-from mavbridge.guard.guard import FlightSettings
-from mavbridge.guard.outcome import Outcome
-from mavbridge.guard.settings import GuardSettings
+from mavbridge.guard.sequences import DisengageSettings
+from mavbridge.guard.settings import FlightSettings, GuardSettings
+from mavbridge.guard.values import EndRequest, Outcome, Phase
 from mavbridge.guard.wire import (
-    Absence,
     FromGuard,
     GuardError,
     GuardMessage,
     GuardStatus,
     GuardSummary,
     GuardTick,
+    NoChunk,
     ToGuard,
     decode_from_guard,
     decode_to_guard,
@@ -54,7 +52,7 @@ FLIGHT = FlightSettings(
     envelope=EnvelopeLimits(height_m=math.inf),
     watches_home_height=False,
     watches_position=False,
-    engagement=engagement_settings(modes=("ALT_HOLD",), departure=DepartureSettings(then="rtl")),
+    engagement=engagement_settings(modes=("ALT_HOLD",), disengage=DisengageSettings(then="rtl")),
 )
 CHUNK = Chunk(
     serial=7,
@@ -109,10 +107,10 @@ SUMMARY = GuardSummary(
 TO_GUARD: list[ToGuard] = [
     CHUNK,
     CHUNK._replace(actions=()),
-    Absence(because(Code.OF_CAMERA, camera="größer", why=because(Code.NO_IMAGE))),
+    NoChunk(because(Code.OF_CAMERA, camera="größer", why=because(Code.NO_IMAGE))),
     GuardSettings(link=LinkSettings(connect="udp:127.0.0.1:14550"), tlog_fd=9, cpu=1),
     FLIGHT,
-    Ending(reason=because(Code.HANGS, name="policy", idle_s=2.0), is_fault=True),
+    EndRequest(reason=because(Code.HANGS, name="policy", idle_s=2.0), is_fault=True),
     "engage",
     "release",
 ]

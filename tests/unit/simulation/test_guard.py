@@ -6,7 +6,7 @@ from typing import Any
 from helpers.fakes import START_NS
 from mavbridge.core.clock import NS_PER_MS
 from mavbridge.core.reasons import Code, because
-from mavbridge.guard.wire import Absence, GuardMessage, decode_to_guard, encode_from_guard
+from mavbridge.guard.wire import GuardMessage, NoChunk, decode_to_guard, encode_from_guard
 from mavbridge.simulation.clock import AheadClock, SteppedClock
 from mavbridge.simulation.guard import GuardStepper, MemoryPort, PolicyStepper, sender
 from mavbridge.simulation.network import DelayedChannel
@@ -90,9 +90,9 @@ def test_a_message_leaves_when_its_maker_is_done_and_arrives_a_hop_later() -> No
     port = MemoryPort(outgoing=to_guard, incoming=DelayedChannel(world, repeat(0)))
     guard = MemoryPort(outgoing=DelayedChannel(world, repeat(0)), incoming=to_guard)
     clock.ahead_ns = 3 * MS
-    sender(world, clock, port)(Absence(because(Code.NO_IMAGE)))
+    sender(world, clock, port)(NoChunk(because(Code.NO_IMAGE)))
     clock.ahead_ns = 0
     world.sleep_until_ns(START_NS + 3 * MS + MS // 10 - 1)
     assert guard.receive() == []
     world.sleep_until_ns(START_NS + 3 * MS + MS // 10)
-    assert [decode_to_guard(one) for one in guard.receive()] == [Absence(because(Code.NO_IMAGE))]
+    assert [decode_to_guard(one) for one in guard.receive()] == [NoChunk(because(Code.NO_IMAGE))]

@@ -27,16 +27,6 @@ def run(rc, start_ms, end_ms):
         rc.update(ms * NS_PER_MS)
 
 
-def test_without_receiver_a_release_leaves_the_stick_latched():
-    rc, _ = engine(receiver=False)
-    rc.override([1700] + [KEEP] * 7, 0)
-    rc.update(0)
-    rc.override([0] + [KEEP] * 7, NS_PER_MS)
-
-    assert not rc.update(NS_PER_MS)
-    assert rc.channels_us[0] == 1700
-
-
 def test_ignore_overrides_option_works_live():
     rc, params = engine()
     rc.override([1700] + [KEEP] * 7, 0)

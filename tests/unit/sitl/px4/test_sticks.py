@@ -59,20 +59,6 @@ def test_a_receiver_counts_where_the_mode_says_so(in_mode, source):
     assert Senders(in_mode).send(0.2, RC_SOURCE, GCS) == source
 
 
-@pytest.mark.parametrize(("loss_s", "lost_s"), [(0.5, 0.6), (2.0, 2.0), (0.1, 0.2)])
-def test_a_loss_is_noticed_at_the_next_fifth_of_a_second(loss_s, lost_s):
-    senders = Senders()
-    senders.params.set("COM_RC_LOSS_T", loss_s)
-    senders.send(0.1, GCS, sticks=Sticks(right=0.7))
-
-    senders.send(lost_s - 0.02)
-    assert senders.input.valid
-    senders.send(0.02)
-
-    assert not senders.input.valid
-    assert senders.input.sticks.right == 0.7, "the last one is held"
-
-
 @pytest.mark.parametrize(("ramp_s", "is_fast"), [(0.9, True), (1.2, False)])
 def test_the_pilots_will_is_a_ramp_faster_than_full_stick_a_second(ramp_s, is_fast):
     senders = Senders()
@@ -92,26 +78,6 @@ def test_override_speed_minus_one_switches_it_off():
         senders.send(0.02, GCS, sticks=Sticks(right=step * 0.1))
 
     assert not senders.input.moved_fast
-
-
-@pytest.mark.parametrize(
-    ("sticks", "gesture"),
-    [
-        (Sticks(throttle=-1.0, yaw=1.0), 1),
-        (Sticks(throttle=-1.0, yaw=-1.0), -1),
-        (Sticks(throttle=-0.5, yaw=1.0), 0),
-        (Sticks(throttle=-1.0, yaw=1.0, right=0.5), 0),
-    ],
-)
-def test_a_gesture_is_held_for_a_second_and_told_once(sticks, gesture):
-    senders = Senders()
-    senders.send(0.98, GCS, sticks=sticks)
-    assert senders.input.gesture(senders.now_ns) == 0
-
-    senders.send(0.1, GCS, sticks=sticks)
-
-    assert senders.input.gesture(senders.now_ns) == gesture
-    assert senders.input.gesture(senders.now_ns) == 0
 
 
 def test_pretended_sticks_stay_until_real_ones_come():

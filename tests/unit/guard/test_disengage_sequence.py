@@ -6,14 +6,15 @@ from typing import Any
 import pytest
 
 from helpers.guard_facts import AIRBORNE, COPTER_MODES, PX4_MODES, codes, flying
-from mavbridge.core.reasons import Code, Reason, because
-from mavbridge.core.vehicle import NEUTRAL, ModeRoles
-from mavbridge.guard.departure import DepartureSettings, Ending
-from mavbridge.guard.engagement import Phase
-from mavbridge.guard.facts import Hand, Move
+from mavbridge.core.reasons import Code, because
+from mavbridge.core.vehicle import NEUTRAL as CENTRED
+from mavbridge.core.vehicle import ModeRoles
+from mavbridge.guard.sequences import DisengageSettings
+from mavbridge.guard.values import Actions, ControlSource, EndRequest, Phase
 
-MIDDLE = replace(AIRBORNE, pilot_sticks=NEUTRAL)
-IDLE_RECEIVER = replace(AIRBORNE, pilot_sticks=NEUTRAL._replace(throttle=-1.0))
+IDLE, POLICY, NEUTRAL, LEVEL, RELEASE = ControlSource
+MIDDLE = replace(AIRBORNE, pilot_sticks=CENTRED)
+IDLE_RECEIVER = replace(AIRBORNE, pilot_sticks=CENTRED._replace(throttle=-1.0))
 NO_RECEIVER = replace(AIRBORNE, has_receiver=False, pilot_sticks=None)
 PX4 = replace(NO_RECEIVER, mode="ALTCTL", modes=PX4_MODES)
 FAULT = {"chunk_fault": because(Code.NO_CHUNK)}
@@ -25,8 +26,8 @@ OVERRULED = because(Code.OVERRULED, quantity="setpoints", cause="another station
     ("facts", "choice", "mode"),
     [
         (MIDDLE, "auto", None),
-        (replace(AIRBORNE, pilot_sticks=NEUTRAL._replace(throttle=-0.2)), "auto", None),
-        (replace(AIRBORNE, pilot_sticks=NEUTRAL._replace(throttle=0.21)), "auto", "BRAKE"),
+        (replace(AIRBORNE, pilot_sticks=CENTRED._replace(throttle=-0.2)), "auto", None),
+        (replace(AIRBORNE, pilot_sticks=CENTRED._replace(throttle=0.21)), "auto", "BRAKE"),
         (IDLE_RECEIVER, "auto", "BRAKE"),
         (NO_RECEIVER, "auto", "BRAKE"),
         (replace(MIDDLE, has_receiver=False), "auto", "BRAKE"),
@@ -48,8 +49,8 @@ OVERRULED = because(Code.OVERRULED, quantity="setpoints", cause="another station
     ],
 )
 def test_the_mode_after_a_fault(facts: Any, choice: Any, mode: str | None) -> None:
-    stepped = flying(facts, departure=DepartureSettings(on_fault=choice))
-    assert stepped.step(**FAULT) == Move(hand=Hand.NEUTRAL, mode=mode)
+    stepped = flying(facts, disengage=DisengageSettings(on_fault=choice))
+    assert stepped.step(**FAULT) == Actions(control=NEUTRAL, mode=mode)
 
 
 @pytest.mark.parametrize(
@@ -58,14 +59,14 @@ def test_the_mode_after_a_fault(facts: Any, choice: Any, mode: str | None) -> No
 def test_where_moving_sticks_would_leave_the_mode_it_is_asked_for_once_they_rest(
     choice: Any, mode: str
 ) -> None:
-    stepped = flying(PX4, departure=DepartureSettings(on_fault=choice))
+    stepped = flying(PX4, disengage=DisengageSettings(on_fault=choice))
     moves = [stepped.step(**FAULT)]  # at rest, but neutral has not left yet
     moves += [stepped.step(**FAULT, are_sticks_at_rest=False) for _ in range(40)]
-    assert {(move.hand, move.mode) for move in moves} == {(Hand.NEUTRAL, None)}
-    assert stepped.step(are_sticks_at_rest=True) == Move(hand=Hand.NEUTRAL, mode=mode)
+    assert {(move.control, move.mode) for move in moves} == {(NEUTRAL, None)}
+    assert stepped.step(are_sticks_at_rest=True) == Actions(control=NEUTRAL, mode=mode)
 
 
-def leave_for_a_hand(*, is_told: bool, **changes: Any) -> list[Move]:
+def leave_for_a_hand(*, is_told: bool, **changes: Any) -> list[Actions]:
     """AUTO.LOITER becomes POSCTL 20 ms after it was entered; what follows in 0.2 s."""
     stepped = flying(PX4)
     stepped.step(**FAULT)
@@ -79,14 +80,14 @@ def leave_for_a_hand(*, is_told: bool, **changes: Any) -> list[Move]:
 def test_a_mode_that_is_left_for_a_hand_of_nobody_is_asked_for_again() -> None:
     moves = leave_for_a_hand(is_told=True)
     assert "AUTO.LOITER" in {move.mode for move in moves}
-    assert {move.hand for move in moves} == {Hand.NEUTRAL}
+    assert {move.control for move in moves} == {NEUTRAL}
 
 
 @pytest.mark.parametrize("changes", [{"is_told": False}, {"is_told": True, "overruled": OVERRULED}])
 def test_another_stations_mode_and_a_hand_of_the_pilots_win(changes: Any) -> None:
     moves = leave_for_a_hand(**changes)
     assert {move.mode for move in moves} == {None}
-    assert moves[-1].hand is not Hand.NEUTRAL
+    assert moves[-1].control is not NEUTRAL
 
 
 @pytest.mark.parametrize(
@@ -102,16 +103,16 @@ def test_another_stations_mode_and_a_hand_of_the_pilots_win(changes: Any) -> Non
     ],
 )
 def test_the_mode_at_a_normal_end(facts: Any, choice: Any, mode: str | None) -> None:
-    stepped = flying(facts, departure=DepartureSettings(then=choice))
-    assert stepped.step("release") == Move(hand=Hand.NEUTRAL, mode=mode)
+    stepped = flying(facts, disengage=DisengageSettings(then=choice))
+    assert stepped.step("release") == Actions(control=NEUTRAL, mode=mode)
 
 
 def test_the_mode_is_asked_for_until_it_is_confirmed() -> None:
     stepped = flying(IDLE_RECEIVER)
     moves = [stepped.step(**FAULT), *stepped.run(0.99)]
     assert sum(move.mode == "BRAKE" for move in moves) == 10
-    assert {move.hand for move in moves} == {Hand.NEUTRAL}
-    assert stepped.step(mode="BRAKE").hand is Hand.RELEASE
+    assert {move.control for move in moves} == {NEUTRAL}
+    assert stepped.step(mode="BRAKE").control is RELEASE
 
 
 def test_a_refused_mode_becomes_land() -> None:
@@ -119,7 +120,7 @@ def test_a_refused_mode_becomes_land() -> None:
     stepped.step(**FAULT)
     moves = stepped.run(0.2, refused_mode="BRAKE")
     assert "LAND" in {move.mode for move in moves}
-    assert stepped.step(mode="LAND", refused_mode=None).hand is Hand.RELEASE
+    assert stepped.step(mode="LAND", refused_mode=None).control is RELEASE
 
 
 @pytest.mark.parametrize("hold", ["", "BRAKE"])
@@ -127,7 +128,7 @@ def test_where_the_vehicle_has_no_such_mode_neutral_holds_it(hold: str) -> None:
     facts = replace(IDLE_RECEIVER, modes=replace(COPTER_MODES, hold=hold, land=""))
     stepped = flying(facts)
     stepped.step(**FAULT)
-    assert {move.hand for move in stepped.run(5, refused_mode="BRAKE")} == {Hand.NEUTRAL}
+    assert {move.control for move in stepped.run(5, refused_mode="BRAKE")} == {NEUTRAL}
     assert stepped.phase is Phase.HOLDING
 
 
@@ -137,18 +138,18 @@ def test_where_the_vehicle_has_no_such_mode_neutral_holds_it(hold: str) -> None:
 def test_no_hand_gets_the_sticks_that_would_not_hold_the_vehicle(
     throttle: float | None, is_fault: bool, settings: Any
 ) -> None:
-    sticks = None if throttle is None else NEUTRAL._replace(throttle=throttle)
+    sticks = None if throttle is None else CENTRED._replace(throttle=throttle)
     stepped = flying(
-        replace(AIRBORNE, pilot_sticks=sticks), departure=DepartureSettings(**settings)
+        replace(AIRBORNE, pilot_sticks=sticks), disengage=DisengageSettings(**settings)
     )
-    stepped.engagement.stop(Ending(reason=because(Code.DURATION), is_fault=is_fault))
+    stepped.engagement.stop(EndRequest(reason=because(Code.DURATION), is_fault=is_fault))
     mode = stepped.step().mode
     assert mode == ("BRAKE" if is_fault else "LAND")
     throttle_code = Code.THROTTLE_UNKNOWN if throttle is None else Code.THROTTLE_RESTS
     refusal = (Code.NOT_RELEASED, throttle_code) if settings else ()
     assert codes(stepped.engagement.refusal) == refusal
-    assert {move.hand for move in stepped.run(40)} == {Hand.NEUTRAL}, "never confirmed"
-    assert stepped.step(mode=mode).hand is Hand.RELEASE
+    assert {move.control for move in stepped.run(40)} == {NEUTRAL}, "never confirmed"
+    assert stepped.step(mode=mode).control is RELEASE
 
 
 def test_a_late_refusal_does_not_stop_the_landing() -> None:
@@ -165,67 +166,52 @@ def test_an_unconfirmed_mode_is_given_up_after_three_seconds() -> None:
     stepped.step(**FAULT)
     stepped.run(2.98)
     assert stepped.phase is Phase.LEAVING
-    assert {move.hand for move in stepped.run(0.03)} == {Hand.NEUTRAL}
+    assert {move.control for move in stepped.run(0.03)} == {NEUTRAL}
     assert stepped.phase is Phase.HOLDING
     assert stepped.engagement.refusal == because(Code.MODE_NOT_CONFIRMED, mode="BRAKE")
     assert sum(move.mode == "BRAKE" for move in stepped.run(5)) == 5, "asked for again"
-    assert stepped.step(mode="BRAKE").hand is Hand.RELEASE
+    assert stepped.step(mode="BRAKE").control is RELEASE
     stepped.run(1)
     assert stepped.phase is Phase.RELEASED
     assert stepped.engagement.refusal == because(Code.RELEASE_NOT_SEEN)
 
 
-def test_while_not_even_our_last_sticks_have_arrived_the_release_goes_on() -> None:
-    stepped = flying(MIDDLE)
-    stepped.step(**FAULT)
-    moves = stepped.run(4, shows_last=False)[6:]
-    assert {move.hand for move in moves} == {Hand.RELEASE}
-    stepped.run(0.1)
-    assert stepped.phase is Phase.RELEASED
-
-
-def test_a_receiver_gets_the_sticks_after_50_ms_of_neutral() -> None:
-    stepped = flying(MIDDLE)
-    moves = [stepped.step(**FAULT), *stepped.run(0.06)]
-    assert [move.hand for move in moves] == [Hand.NEUTRAL] * 5 + [Hand.RELEASE] * 2
-
-
 @pytest.mark.parametrize(
     ("facts", "settings"),
     [
-        (NO_RECEIVER, DepartureSettings()),
-        (replace(PX4, has_receiver=True), DepartureSettings()),
+        (NO_RECEIVER, DisengageSettings()),
+        (replace(PX4, has_receiver=True), DisengageSettings()),
     ],
 )
 def test_where_silence_is_a_failsafe_neutral_goes_on_until_disarmed(
     facts: Any, settings: Any
 ) -> None:
-    stepped = flying(facts, departure=settings)
+    stepped = flying(facts, disengage=settings)
     stepped.step(**FAULT)
     moves = stepped.run(0.2, mode="BRAKE" if facts.mode == "ALT_HOLD" else "AUTO.LOITER")
-    assert {move.hand for move in moves} == {Hand.NEUTRAL}
+    assert {move.control for move in moves} == {NEUTRAL}
     assert stepped.phase is Phase.HOLDING
-    assert {move.hand for move in stepped.run(60)} == {Hand.NEUTRAL}
-    assert stepped.step(armed=False).hand is Hand.RELEASE
+    assert {move.control for move in stepped.run(60)} == {NEUTRAL}
+    assert stepped.step(armed=False).control is RELEASE
 
 
 def test_on_the_ground_a_release_without_a_receiver_holds_neutral_in_the_same_mode() -> None:
     landed = replace(NO_RECEIVER, is_landed=True)
-    stepped = flying(landed, departure=DepartureSettings(on_fault="release"))
+    stepped = flying(landed, disengage=DisengageSettings(on_fault="release"))
     stepped.step(**FAULT)
-    assert {(move.hand, move.mode) for move in stepped.run(20)} == {(Hand.NEUTRAL, None)}
+    assert {(move.control, move.mode) for move in stepped.run(20)} == {(NEUTRAL, None)}
     assert stepped.phase is Phase.HOLDING
 
 
 def test_a_vehicle_that_has_vanished_is_not_held_for_ever() -> None:
     stepped = flying(NO_RECEIVER)
-    stepped.engagement.stop(Ending(reason=because(Code.FLIGHT_PROCESS_DIED), is_fault=True))
+    stepped.engagement.stop(EndRequest(reason=because(Code.FLIGHT_PROCESS_DIED), is_fault=True))
     stepped.step()
     stepped.run(0.2, mode="BRAKE")
     assert stepped.phase is Phase.HOLDING
     for _ in range(2):
         moves = stepped.run(29, heard_ns=stepped.facts.now_ns, mode_ns=stepped.facts.now_ns)
-        assert {move.hand for move in moves} == {Hand.NEUTRAL}
+        assert {move.control for move in moves} == {NEUTRAL}
         stepped.run(1, heard_ns=None, mode_ns=None)
     stepped.run(33, heard_ns=stepped.facts.now_ns, mode_ns=stepped.facts.now_ns)
     died = because(Code.FLIGHT_PROCESS_DIED)
@@ -233,37 +219,26 @@ def test_a_vehicle_that_has_vanished_is_not_held_for_ever() -> None:
     assert stepped.phase is Phase.ENDED
 
 
-def test_the_pilot_wins_on_the_way_out() -> None:
-    stepped = flying(NO_RECEIVER)
-    stepped.step(**FAULT)
-    stepped.run(0.1, mode="BRAKE")
-    assert stepped.phase is Phase.HOLDING
-    assert stepped.step(mode="LOITER") == Move(hand=Hand.RELEASE)
-    changed = because(Code.MODE_CHANGED, before="BRAKE", after="LOITER")
-    first = FAULT["chunk_fault"]
-    assert stepped.engagement.reason == because(Code.THEN, first=first, then=changed)
-
-
 @pytest.mark.parametrize("mode", ["STABILIZE", "ACRO"])
 def test_where_the_throttle_is_thrust_the_mode_goes_before_neutral(mode: str) -> None:
     stepped = flying(replace(IDLE_RECEIVER, mode=mode), modes=(mode,))
     moves = [stepped.step(**FAULT), *stepped.run(0.1)]
-    assert {move.hand for move in moves} == {Hand.LEVEL}
+    assert {move.control for move in moves} == {LEVEL}
     assert moves[0].mode == "BRAKE"
-    assert stepped.step(mode="BRAKE").hand in (Hand.NEUTRAL, Hand.RELEASE)
+    assert stepped.step(mode="BRAKE").control in (NEUTRAL, RELEASE)
 
 
 def test_where_the_throttle_is_thrust_no_hand_holds_the_vehicle() -> None:
     stepped = flying(replace(MIDDLE, mode="STABILIZE"), modes=("STABILIZE",))
     moves = [stepped.step(**FAULT), *stepped.run(5)]
-    assert {move.hand for move in moves} == {Hand.LEVEL}
+    assert {move.control for move in moves} == {LEVEL}
     assert moves[0].mode == "BRAKE"
 
 
 def test_where_the_throttle_is_thrust_it_stays_until_a_release_on_the_ground() -> None:
     stepped = flying(replace(MIDDLE, mode="STABILIZE", is_landed=True), modes=("STABILIZE",))
     moves = [stepped.step(**FAULT), *stepped.run(0.06)]
-    assert [move.hand for move in moves] == [Hand.LEVEL] * 5 + [Hand.RELEASE] * 2
+    assert [move.control for move in moves] == [LEVEL] * 5 + [RELEASE] * 2
 
 
 def test_a_mode_that_is_there_already_is_not_asked_for() -> None:
@@ -272,34 +247,22 @@ def test_a_mode_that_is_there_already_is_not_asked_for() -> None:
     assert {move.mode for move in moves} == {None}
 
 
-def test_an_unconfirmed_mode_is_asked_for_once_a_second_while_neutral_holds() -> None:
-    stepped = flying(NO_RECEIVER)
-    stepped.step(**FAULT)
-    stepped.run(3.1)
-    assert stepped.phase is Phase.HOLDING
-    moves = stepped.run(5)
-    assert {move.hand for move in moves} == {Hand.NEUTRAL}
-    assert sum(move.mode == "BRAKE" for move in moves) == 5
-    stepped.step(mode="BRAKE")
-    assert {move.mode for move in stepped.run(5)} == {None}
-
-
 # --- a vehicle that is not heard, and our own standstill
 
 
-def silence(stepped: Any, seconds: float) -> list[Move]:
+def silence(stepped: Any, seconds: float) -> list[Actions]:
     """No packet of the vehicle for a while."""
     now_ns = stepped.facts.now_ns
-    moves: list[Move] = stepped.run(seconds, heard_ns=now_ns, mode_ns=now_ns)
+    moves: list[Actions] = stepped.run(seconds, heard_ns=now_ns, mode_ns=now_ns)
     return moves
 
 
-def standstill(stepped: Any, seconds: float, **changes: Any) -> Move:
+def standstill(stepped: Any, seconds: float, **changes: Any) -> Actions:
     """The guard does not run for a while; the first step after it."""
     facts = stepped.facts
     now_ns = facts.now_ns + round(seconds * 1e9)
     stepped.facts = replace(facts, now_ns=now_ns)
-    move: Move = stepped.step(mode_ns=now_ns - 1_000_000, **changes)
+    move: Actions = stepped.step(mode_ns=now_ns - 1_000_000, **changes)
     return move
 
 
@@ -313,12 +276,12 @@ def test_a_vehicle_that_is_not_heard_is_asked_only_until_its_own_failsafe(
     stepped.step(**FAULT)
     moves = silence(stepped, 20)
     assert stepped.phase is Phase.LEAVING, "it is not given up"
-    assert {move.hand for move in moves} == {Hand.NEUTRAL}
+    assert {move.control for move in moves} == {NEUTRAL}
     asked = [k / 100 for k, move in enumerate(moves) if move.mode is not None]
     assert blind_s - 0.11 <= asked[-1] <= blind_s
     assert {move.mode for move in stepped.run(0.1, heard_ns=None)} == {None}, "not which mode"
     found = stepped.step(mode_ns=None)
-    assert (found.hand, found.mode) == (Hand.NEUTRAL, facts.modes.hold)
+    assert (found.control, found.mode) == (NEUTRAL, facts.modes.hold)
 
 
 @pytest.mark.parametrize(
@@ -335,7 +298,7 @@ def test_a_failsafe_of_its_own_is_its_way_out_after_a_silence(
     else:
         standstill(stepped, 4)
     news = {"heard_ns": None, "mode_ns": None, "mode": own, "is_failsafe": True}
-    assert stepped.step(**news) == Move(hand=Hand.RELEASE)
+    assert stepped.step(**news) == Actions(control=RELEASE)
     assert {move.mode for move in stepped.run(5)} == {None}
 
 
@@ -343,7 +306,7 @@ def test_a_failsafe_of_its_own_is_its_way_out_after_a_silence(
 def test_after_a_standstill_of_ours_what_had_arrived_tells_no_mode(facts: Any) -> None:
     stepped = flying(facts)
     first = standstill(stepped, 4, **FAULT)
-    assert (first.hand, first.mode) == (Hand.NEUTRAL, None), "the mode is of before"
+    assert (first.control, first.mode) == (NEUTRAL, None), "the mode is of before"
     assert {move.mode for move in stepped.run(1)} == {None}
     assert stepped.step(mode_ns=None).mode == facts.modes.hold
 
@@ -357,56 +320,16 @@ def test_a_vehicle_that_is_heard_again_has_its_time_to_answer() -> None:
     assert stepped.phase is Phase.LEAVING
 
 
-def test_a_vehicle_that_has_vanished_is_not_asked_for_ever() -> None:
-    stepped = flying(IDLE_RECEIVER)
-    stepped.step(**FAULT)
-    assert silence(stepped, 29)[-1].hand is Hand.NEUTRAL
-    stepped.run(6)
-    first = FAULT["chunk_fault"]
-    assert stepped.engagement.reason == because(Code.THEN, first=first, then=LOST)
-
-
 def test_a_refusal_that_comes_after_the_mode_is_there_asks_for_nothing() -> None:
     stepped = flying(NO_RECEIVER)
     stepped.step(**FAULT)
     stepped.run(0.2, mode="BRAKE")
     assert stepped.phase is Phase.HOLDING
     moves = stepped.run(1, refused_mode="BRAKE")
-    assert {(move.hand, move.mode) for move in moves} == {(Hand.NEUTRAL, None)}
+    assert {(move.control, move.mode) for move in moves} == {(NEUTRAL, None)}
 
 
-def test_where_the_throttle_was_thrust_neutral_comes_with_the_mode() -> None:
-    stepped = flying(replace(NO_RECEIVER, mode="STABILIZE"), modes=("STABILIZE",))
-    assert stepped.step(**FAULT).hand is Hand.LEVEL
-    assert stepped.step(mode="BRAKE").hand is Hand.NEUTRAL
-
-
-def test_sticks_on_the_ground_end_in_neutral_as_in_the_air() -> None:
-    assert flying(replace(NO_RECEIVER, is_landed=True)).step(**FAULT).hand is Hand.NEUTRAL
-
-
-def test_a_stop_while_holding_after_a_fault_lands_as_a_normal_end_does() -> None:
-    stepped = flying(NO_RECEIVER)
-    stepped.step(**FAULT)
-    stepped.run(0.2, mode="BRAKE", chunk_fault=None)
-    assert stepped.phase is Phase.HOLDING
-    stepped.engagement.stop(Ending(reason=because(Code.SIGNAL)))
-    assert stepped.step() == Move(hand=Hand.NEUTRAL, mode="LAND")
-    stepped.run(0.2, mode="LAND")
-    assert stepped.phase is Phase.HOLDING
-    stepped.step(armed=False)
-    stepped.run(0.1, is_released=True)
-    assert stepped.phase is Phase.ENDED
-
-
-def test_the_operators_release_while_holding_lands_too() -> None:
-    stepped = flying(NO_RECEIVER)
-    stepped.step(**FAULT)
-    stepped.run(0.2, mode="BRAKE")
-    assert stepped.step("release") == Move(hand=Hand.NEUTRAL, mode="LAND")
-
-
-SETPOINTS = DepartureSettings(is_setpoint=True)
+SETPOINTS = DisengageSettings(is_setpoint=True)
 
 
 @pytest.mark.parametrize("has_receiver", [True, False])
@@ -421,112 +344,56 @@ def test_setpoints_end_in_a_mode_that_holds_and_then_in_silence(
     has_receiver: bool, mode: str, modes: ModeRoles, hold: str, land: str
 ) -> None:
     facts = replace(AIRBORNE, mode=mode, modes=modes, has_receiver=has_receiver)
-    rules = {"departure": SETPOINTS, "modes": (mode,), "is_setpoint": True}
+    rules = {"disengage": SETPOINTS, "modes": (mode,), "is_setpoint": True}
     stepped = flying(facts, **rules)
     fault = stepped.step(**FAULT)
-    assert (fault.hand, fault.mode) == (Hand.NEUTRAL, hold)
+    assert (fault.control, fault.mode) == (NEUTRAL, hold)
     after = stepped.run(0.2, mode=hold)
-    assert after[-1].hand is Hand.RELEASE
+    assert after[-1].control is RELEASE
     assert stepped.phase is Phase.RELEASING
     ended = flying(facts, **rules)
-    ended.engagement.stop(Ending(reason=because(Code.DURATION)))
+    ended.engagement.stop(EndRequest(reason=because(Code.DURATION)))
     assert ended.step().mode == (hold if has_receiver else land)
 
 
 def test_setpoints_never_end_in_silence_alone_not_even_in_another_mode() -> None:
     facts = replace(AIRBORNE, mode="LOITER")
     departure = replace(SETPOINTS, on_fault="release")
-    stepped = flying(facts, departure=departure, modes=("LOITER",), is_setpoint=True)
+    stepped = flying(facts, disengage=departure, modes=("LOITER",), is_setpoint=True)
     assert stepped.step(**FAULT).mode == "BRAKE"
 
 
 def test_a_vehicle_that_does_not_answer_gets_no_more_setpoints_which_might_take_it_back() -> None:
     facts = replace(AIRBORNE, mode="OFFBOARD", modes=PX4_MODES)
-    stepped = flying(facts, departure=SETPOINTS, modes=("OFFBOARD",), is_setpoint=True)
+    stepped = flying(facts, disengage=SETPOINTS, modes=("OFFBOARD",), is_setpoint=True)
     moves = [stepped.step(**FAULT), *stepped.run(0.5)]
-    assert {move.hand for move in moves} == {Hand.NEUTRAL}
+    assert {move.control for move in moves} == {NEUTRAL}
     unheard = stepped.run(2.4)
-    assert {move.hand for move in unheard} == {None}
+    assert {move.control for move in unheard} == {None}
     assert sum(move.mode == "AUTO.LOITER" for move in unheard) == 24
     failed = stepped.step(mode="AUTO.RTL", is_failsafe=True)
-    assert failed == Move(hand=Hand.RELEASE)
-
-
-def test_a_refused_hold_of_setpoints_becomes_a_landing() -> None:
-    facts = replace(AIRBORNE, mode="GUIDED")
-    stepped = flying(facts, departure=SETPOINTS, modes=("GUIDED",), is_setpoint=True)
-    stepped.step(**FAULT)
-    moves = stepped.run(0.3, refused_mode="BRAKE")
-    assert "LAND" in {move.mode for move in moves}
+    assert failed == Actions(control=RELEASE)
 
 
 GUIDED = replace(AIRBORNE, mode="GUIDED")
 
 
-@pytest.mark.parametrize(
-    "change",
-    [
-        {
-            "interruption": because(
-                Code.PARAMETER_CHANGED, name="GUID_OPTIONS", before=8.0, after=0.0
-            )
-        },
-        {"rc_channels_us": (1500,) * 6 + (1000,) + (1500,)},
-    ],
-)
-def test_a_takeover_that_leaves_the_mode_does_not_leave_the_last_setpoint(change: Any) -> None:
-    """Silence alone would be the last body rates for as long as GUID_TIMEOUT or COM_OF_LOSS_T."""
-    stepped = flying(
-        GUIDED, is_setpoint=True, modes=("GUIDED",), departure=SETPOINTS, engage_channel=7
-    )
-    assert stepped.step(**change) == Move(hand=Hand.NEUTRAL, mode="BRAKE")
-    moves = stepped.run(0.1)
-    assert {move.hand for move in moves} == {Hand.NEUTRAL}
-    stepped.step(mode="BRAKE")
-    assert (stepped.phase, stepped.run(0.1)[-1].hand) == (Phase.RELEASING, Hand.RELEASE)
-
-
-@pytest.mark.parametrize(
-    ("change", "reason"),
-    [
-        ({"mode": mode}, because(Code.MODE_CHANGED, before="GUIDED", after=mode))
-        for mode in ("LOITER", "GUIDED_NOGPS")
-    ]
-    + [
-        ({"armed": False}, because(Code.DISARMED)),
-        ({"is_failsafe": True}, because(Code.FAILSAFE, mode="GUIDED")),
-        ({"overruled": OVERRULED}, OVERRULED),
-    ],
-)
-def test_setpoints_end_at_once_where_somebody_else_chose_what_it_does(
-    change: Any, reason: Reason
-) -> None:
-    stepped = flying(GUIDED, is_setpoint=True, modes=("GUIDED",), departure=SETPOINTS)
-    assert stepped.step(**change) == Move(hand=Hand.RELEASE)
-    assert stepped.engagement.reason == reason
-
-
-def test_sticks_leave_no_setpoint_behind_in_whichever_mode() -> None:
-    stepped = flying(GUIDED, modes=("GUIDED",))
-    assert stepped.step(interruption=because(Code.REBOOTED)) == Move(hand=Hand.RELEASE)
-
-
-@pytest.mark.parametrize(("is_landed", "hand"), [(True, Hand.IDLE), (False, Hand.NEUTRAL)])
+@pytest.mark.parametrize(("is_landed", "hand"), [(True, IDLE), (False, NEUTRAL)])
 def test_on_the_ground_setpoints_end_idle_since_the_thrust_that_hovers_lifts(
-    is_landed: bool, hand: Hand
+    is_landed: bool, hand: ControlSource
 ) -> None:
     facts = replace(GUIDED, is_landed=is_landed)
-    stepped = flying(facts, is_setpoint=True, modes=("GUIDED",), departure=SETPOINTS)
-    assert stepped.step("release").hand is hand
+    stepped = flying(facts, is_setpoint=True, modes=("GUIDED",), disengage=SETPOINTS)
+    assert stepped.step("release").control is hand
 
 
 @pytest.mark.parametrize(
     ("facts", "last"),
-    [(GUIDED, Hand.NEUTRAL), (replace(GUIDED, mode="OFFBOARD", modes=PX4_MODES), None)],
+    [(GUIDED, NEUTRAL), (replace(GUIDED, mode="OFFBOARD", modes=PX4_MODES), None)],
 )
 def test_neutral_goes_on_unanswered_where_it_cannot_bring_the_mode_back(
-    facts: Any, last: Hand | None
+    facts: Any, last: ControlSource | None
 ) -> None:
-    stepped = flying(facts, is_setpoint=True, modes=(facts.mode,), departure=SETPOINTS)
+    stepped = flying(facts, is_setpoint=True, modes=(facts.mode,), disengage=SETPOINTS)
     stepped.step(**FAULT)
-    assert stepped.run(2.0)[-1].hand is last
+    assert stepped.run(2.0)[-1].control is last

@@ -1,0 +1,69 @@
+"""The state table of docs/SAFETY.md, made of the guard's: ``python -m benchmarks.safety_table``."""
+
+import inspect
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+from mavbridge.guard.table import PROGRESS, TABLE
+from mavbridge.guard.values import Phase
+
+PAGE = Path(__file__).parents[1] / "docs" / "SAFETY.md"
+_BEGIN, _END = "<!-- made by python -m benchmarks.safety_table -->\n", "<!-- end -->\n"
+_CONTROLLED_BY = {
+    Phase.WAITING: "the pilot; nothing is sent",
+    Phase.PREPARING: "the pilot, or idle or neutral sticks: [the way in](#the-way-in)",
+    Phase.FLYING: "the policy",
+    Phase.LEAVING: "neutral sticks or setpoints, until a safe mode is confirmed",
+    Phase.HOLDING: "neutral sticks, since silence would be a failsafe",
+    Phase.RELEASING: "nobody: a release leaves every 50 ms, also after a reopen of the link",
+    Phase.RELEASED: "the pilot; nothing is sent. As in WAITING",
+    Phase.ENDED: "the pilot; parameters of `--set` are put back (4 s at most), the process exits",
+}
+
+
+def table() -> str:
+    """Every state with who controls the vehicle, its rows in the order of their reading, the words.
+
+    A row is repeated in each of its states.
+    """
+    lines = ["| State | Event | Action | Next |", "|---|---|---|---|"]
+    for phase in Phase:
+        lines += _lines(phase)
+    words = {
+        _words(each) for row in (*TABLE, *PROGRESS) for each in (row.event, row.where, row.does)
+    }
+    lines += ["", "| | which is |", "|---|---|"]
+    lines += sorted(f"| {name} | {meaning} |" for name, meaning in words if meaning)
+    return "\n".join(lines) + "\n"
+
+
+def _lines(phase: Phase) -> Iterator[str]:
+    yield f"| **{phase.name}** | | {_CONTROLLED_BY[phase]} | |"
+    if phase is Phase.RELEASED:
+        return
+    condition: object = None
+    for row in (row for row in (*TABLE, *PROGRESS) if phase in row.states):
+        event = _words(row.event)[0]
+        if row.where is not None:
+            event += f", and {_words(row.where)[0]}"
+        elif row.event is condition:
+            event += ", else"
+        condition = row.event if row.where is not None else None
+        yield f"| | {event} | {_words(row.does)[0]} | {row.next.name if row.next else 'same'} |"
+
+
+def _words(function: Callable[..., object] | None) -> tuple[str, str]:
+    """First line of a docstring, and the rest of it as one line."""
+    name, _, meaning = (inspect.getdoc(function) or "").partition("\n") if function else ("",) * 3
+    return name, " ".join(meaning.split())
+
+
+def with_table(page: str) -> str:
+    """Return the page with the table of now."""
+    before, _, rest = page.partition(_BEGIN)
+    _, _, after = rest.partition(_END)
+    return before + _BEGIN + table() + _END + after
+
+
+if __name__ == "__main__":
+    PAGE.write_text(with_table(PAGE.read_text()))

@@ -1,0 +1,190 @@
+"""What the engagement remembers, and what the rows of its table do to that."""
+
+from dataclasses import dataclass, field
+
+from mavbridge.core.clock import NS_PER_MS, NS_PER_S
+from mavbridge.core.reasons import Code, Reason, because
+from mavbridge.core.switch import Switch
+from mavbridge.core.vehicle import FlightEnd
+from mavbridge.guard.sequences import (
+    DisengageSequence,
+    DisengageSettings,
+    EngageSequence,
+    EngageSettings,
+)
+from mavbridge.guard.values import EndRequest, EngagementInputs, OperatorCommand, Outcome, Phase
+
+PREPARE_TIMEOUT_NS = 90 * NS_PER_S
+"""For mode change and arming, without the climb; a cold estimator needs some 40 s."""
+ACT_TIMEOUT_NS = 3 * NS_PER_S
+"""For the change of mode that an act asks for while armed: no act comes true much later."""
+REST_NS = 1_800 * NS_PER_MS
+"""Least rest of the engage switch, low, before going high is an act: receivers that dropped out for
+0.6 to 1.5 s, with a preset that puts the switch low, have looked like a hand."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class EngagementSettings:
+    """The acts that may engage, and the ways in and out."""
+
+    engage: EngageSettings
+    disengage: DisengageSettings
+    arm: bool = False
+    """Arm once and engage once, as soon as everything is ready."""
+    engage_channel: int | None = None
+    """Receiver channel, from 1, that engages when it goes high after a rest low."""
+    engage_on_arm: bool = False
+    """Engage when the vehicle is armed for the first time."""
+    readonly: bool = False
+    """Fly without sending anything."""
+    duration_ns: int | None = None
+    """Flight time from the first engagement on; None = until told otherwise."""
+
+
+@dataclass(slots=True, kw_only=True)
+class Memory:
+    """Everything that the states remember."""
+
+    settings: EngagementSettings
+    first_chunk_ns: int
+    """Time for the policy's first chunk after its reset."""
+    engage: EngageSequence
+    disengage: DisengageSequence
+    phase: Phase = Phase.WAITING
+    reason: Reason | None = field(default_factory=lambda: because(Code.NOT_ENGAGED))
+    """Why the policy does not fly; None while it does."""
+    refusal: Reason | None = None
+    """Why the last act had no effect, or what the vehicle has not confirmed; its reader resets it.
+    """
+    failure: Reason | None = None
+    """Why there was no flight: the vehicle did not take the mode or arm in time."""
+    outcome: Outcome = field(default_factory=Outcome)
+    act: OperatorCommand | None = None
+    """Act of this step, whoever's, until a row follows it."""
+    end_request: EndRequest | None = None
+    """The first one: after this flight the guard ends."""
+    must_stop: bool = False
+    """It has not been acted upon."""
+    wants_arm: bool
+    """``--arm`` has not been followed yet."""
+    engaged_ns: int | None = None
+    """First moment of flight."""
+    own_mode: str | None = None
+    """The mode that we fly in, or asked for and got; any change of it is a takeover."""
+    seen_interruptions: int = 0
+    was_armed: bool = False
+    """The vehicle was armed at the last step of preparing."""
+    starting_ns: int | None = None
+    """When all was ready but the policy, which is reset then; None before and after."""
+    allowed_ns: int = 0
+    """Time to get ready."""
+    until_ns: int = 0
+    """End of it."""
+    released_ns: int = 0
+    owes_release: bool = False
+    """No release was sent yet: one is, also where nothing seems to be held."""
+    stepped_ns: int | None = None
+    unheard_ns: int | None = None
+    """The vehicle's last word before a silence or a standstill; None: its mode is known."""
+    news_from_ns: int = 0
+    """What has arrived before tells of the time before the silence."""
+    heard_ns: int = 0
+    """The mode was last known; when we began to leave, at the earliest."""
+    is_arming_awaited: bool | None = None
+    """The vehicle has not been armed yet; None before it was found."""
+    switch: Switch = field(default_factory=lambda: Switch(rest_ns=REST_NS))
+
+    @property
+    def is_act(self) -> bool:
+        """The way in follows an act, and not ``--arm``."""
+        return self.allowed_ns == ACT_TIMEOUT_NS
+
+    def nothing(self, _now: EngagementInputs, _cause: object) -> None:
+        """nothing"""
+
+    def refuse(self, _: EngagementInputs, why: Reason) -> None:
+        """refused and forgotten, and said why"""
+        self.refusal, self.act = not_engaged(why), None
+
+    def prepare(self, now: EngagementInputs, _cause: bool) -> None:
+        """[the way in](#the-way-in)"""
+        self.own_mode = now.mode if now.armed else None
+        self.engage.begin(now)
+        self.allowed_ns = ACT_TIMEOUT_NS
+        if self.wants_arm:
+            climb_s = self.settings.engage.takeoff_m or 0.0  # at 1 m/s; 1.5 m/s are usual
+            self.allowed_ns = PREPARE_TIMEOUT_NS + round(climb_s * NS_PER_S)
+        self.wants_arm = self.was_armed = False
+        self.until_ns = now.now_ns + self.allowed_ns
+        self.seen_interruptions = now.interruptions
+
+    def give_up(self, _: EngagementInputs, cause: EndRequest) -> None:
+        """said why; after `--arm` the guard ends"""
+        if self.is_act:
+            self.refusal = cause.reason  # the act may be repeated
+        else:
+            self.failure = cause.reason
+            self.end_request, self.must_stop = cause, True
+
+    def fly(self, now: EngagementInputs, _cause: bool) -> None:
+        """the policy's sticks, from the pilot's or idle ones"""
+        flights = self.outcome.flights + 1
+        self.outcome = self.outcome._replace(flights=flights, is_disarmed=False, end=None)
+        self.reason, self.own_mode, self.seen_interruptions = None, now.mode, now.interruptions
+        self.engaged_ns = now.now_ns if self.engaged_ns is None else self.engaged_ns
+
+    def leave(self, now: EngagementInputs, cause: EndRequest) -> None:
+        """neutral in the same step, then a safe mode
+
+        That of `--on-fault` after a fault or a takeover, that of `--then` after an end: see
+        [the way out](#the-way-out).
+        """
+        self._note_end(cause)
+        self.reason = cause.reason
+        self.must_stop = self.must_stop and cause != self.end_request
+        if cause.end in ("takeover", "disarmed"):
+            self.seen_interruptions = now.interruptions
+        self.refusal = self.disengage.begin(now, is_fault=cause.is_fault) or self.refusal
+        self.heard_ns = now.now_ns
+
+    def leave_for_good(self, now: EngagementInputs, cause: EndRequest) -> None:
+        """the same, and the guard ends"""
+        self.end_request = cause
+        self.leave(now, cause)
+
+    def release(self, now: EngagementInputs, cause: EndRequest) -> None:
+        """**release in the same step, no mode**"""
+        self._note_end(cause)
+        reason = cause.reason
+        if self.phase in (Phase.LEAVING, Phase.HOLDING) and self.reason is not None:
+            reason = because(Code.THEN, first=self.reason, then=reason)
+        self.reason, self.released_ns = reason, now.now_ns
+        self.owes_release = self.phase is not Phase.PREPARING or self.engage.has_sticks
+
+    def finish(self, now: EngagementInputs, _cause: bool) -> None:
+        """as the next state says; told, if the safe mode is not confirmed"""
+        mode = self.disengage.mode
+        if self.phase is Phase.LEAVING and mode is not None and mode != now.mode:
+            self.refusal = because(Code.MODE_NOT_CONFIRMED, mode=mode)
+        self.released_ns, self.owes_release = now.now_ns, True
+
+    def forget(self, now: EngagementInputs, _cause: bool) -> None:
+        """nothing"""
+        self.disengage.mode = None  # from now on every mode change is somebody else's
+        if not now.is_released:
+            self.refusal = because(Code.RELEASE_NOT_SEEN)
+
+    def _note_end(self, cause: EndRequest) -> None:
+        """Note how a flight has ended, and whether by a fault of ours."""
+        if self.phase is not Phase.FLYING:
+            return
+        is_fault = cause.is_fault and cause.end not in ("takeover", "disarmed")
+        end: FlightEnd = "fault" if is_fault else cause.end
+        self.outcome = self.outcome._replace(end=end, is_disarmed=end == "disarmed")
+        if is_fault:
+            self.outcome = self.outcome._replace(faults=self.outcome.faults + 1, fault=cause.reason)
+
+
+def not_engaged(why: Reason) -> Reason:
+    """Reason for an act that has no effect."""
+    return because(Code.NOT_ENGAGED_SINCE, why=why)

@@ -1,0 +1,299 @@
+"""Who controls the vehicle: the states, what happens in them, and what follows from it.
+
+Rules that every row keeps:
+
+1. Only an explicit act engages: ``--arm`` (once), the operator's key, the engage switch that goes
+   high after a rest, the first arming with ``--engage-on-arm``. Nothing that recovers, comes back
+   or is armed again does, and an act that no row follows is forgotten.
+2. Who takes the vehicle wins over everything else that happens in the same step: the sticks are
+   released in that step, and no mode is asked for. Only a vehicle that would go on with our last
+   setpoint is left as after a fault.
+3. What ends by our own doing is neutral in the same step, then in a safe mode, then released, and
+   only to a hand that would hold it.
+4. In WAITING, RELEASED and ENDED nothing is sent.
+
+In each step the rows of the state are read from the top. The first one whose event happens and
+whose condition holds is taken; one without a next state goes on to those below. ``TABLE`` is read
+with what comes from outside, then the state acts (``Engagement``), then ``PROGRESS`` is read with
+what its sequence has reached. The docstrings are the texts of docs/SAFETY.md.
+"""
+
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+from mavbridge.core.clock import NS_PER_S
+from mavbridge.core.reasons import Code, Reason, because
+from mavbridge.guard.memory import Memory, not_engaged
+from mavbridge.guard.values import EndRequest, EngagementInputs, Phase
+
+WAITING, PREPARING, FLYING, LEAVING, HOLDING, RELEASING, RELEASED, ENDED = Phase
+RELEASE_TIMEOUT_NS = NS_PER_S
+"""Wait for the vehicle to show other sticks than ours. Without a receiver it never does."""
+UNHEARD_RELEASE_TIMEOUT_NS = 4 * NS_PER_S
+"""The same where it does not even show the last ones that we sent, so that the releases may be lost
+as well: longer than it holds ours on its own (RC_OVERRIDE_TIME, 3 s by default)."""
+LOST_NS = 30 * NS_PER_S
+"""A vehicle that was held for so long without a word from it is gone: nothing can be held."""
+
+
+# --- events: pure, of what is remembered and what comes in
+
+
+def ended(m: Memory, now: EngagementInputs) -> bool:
+    """the end
+
+    `--duration` is over, a signal, the death of the flight process.
+    """
+    return m.end_request is not None or duration_over(m, now) is not None
+
+
+def arm_flag(m: Memory, now: EngagementInputs) -> bool:
+    """`--arm`
+
+    Once, as soon as the link is ready.
+    """
+    return m.wants_arm and now.link_problem is None
+
+
+def unfit_engage(m: Memory, now: EngagementInputs) -> Reason | None:
+    """an act that cannot be followed
+
+    Disarmed, in a failsafe, outside the envelope, the engage switch low, a mode that is neither
+    allowed nor ours to change, no link, no fresh chunk; while a flight is still ending.
+    """
+    if m.act != "engage":
+        return None
+    if m.phase in (LEAVING, HOLDING, RELEASING):
+        return because(Code.STILL_ENDING, phase=m.phase.value)
+    if not now.armed:
+        return because(Code.NOT_ARMED)
+    if (reason := objection(m, now) or now.chunk_problem) is not None:
+        return reason
+    modes = m.settings.engage.modes
+    if m.engage.may_change_mode(now) or now.mode in modes:
+        return None
+    return because(Code.WRONG_MODE, mode=now.mode, allowed=" or ".join(modes))
+
+
+def engage(m: Memory, _: EngagementInputs) -> bool:
+    """an act
+
+    The key `e`, the engage switch, the first arming with `--engage-on-arm`.
+    """
+    return m.act == "engage"
+
+
+def stopped(m: Memory, _: EngagementInputs) -> EndRequest | None:
+    """a stop
+
+    The key `q`, a signal, the death or a fault of the flight process, the last gate of `--gates`.
+    """
+    if m.end_request is None and m.act == "release":
+        return EndRequest(because(Code.OPERATOR), end="operator")
+    return m.end_request
+
+
+def stopped_anew(m: Memory, now: EngagementInputs) -> EndRequest | None:
+    """the key `q`, or the first stop after a fault"""
+    return stopped(m, now) if m.must_stop or m.act == "release" else None
+
+
+def taken(m: Memory, now: EngagementInputs) -> EndRequest | None:
+    """**takeover**
+
+    Mode changed, disarmed, failsafe, override switch low, engage switch low (where the policy flies
+    or an act is followed), other sticks than ours followed, reboot, another address, a parameter
+    that matters changed.
+    """
+    if (reason := _takeover(m, now)) is None:
+        return None
+    return EndRequest(reason, is_fault=True, end="takeover" if now.armed else "disarmed")
+
+
+def late(m: Memory, now: EngagementInputs) -> EndRequest | None:
+    """not ready in time
+
+    90 s with `--arm`, and a second for each metre of `--takeoff`; 3 s after another act; at once
+    where it can never be: a mode that the vehicle lacks, a policy that is too slow.
+    """
+    problem = m.engage.impossibility(now)
+    if problem is None and now.now_ns <= m.until_ns:
+        return None
+    if problem is None and m.starting_ns is not None:
+        why = now.chunk_problem or because(Code.NO_CHUNK)
+        problem = because(Code.NO_CHUNK_SINCE_RESET, why=why)
+    if problem is None:
+        problem = because(
+            Code.NOT_READY,
+            after_s=m.allowed_ns / NS_PER_S,
+            mode=now.mode,
+            is_armed=now.armed,
+            is_echoed=now.echo_confirmed,
+            inputs=now.chunk_problem or "fine",
+        )
+    return EndRequest(not_engaged(problem) if m.is_act else problem, is_fault=True)
+
+
+def duration_over(m: Memory, now: EngagementInputs) -> EndRequest | None:
+    """`--duration` is over"""
+    duration_ns = m.settings.duration_ns
+    if m.engaged_ns is None or duration_ns is None or now.now_ns - m.engaged_ns < duration_ns:
+        return None
+    return EndRequest(because(Code.DURATION), end="duration")
+
+
+def landed(_: Memory, now: EngagementInputs) -> EndRequest | None:
+    """landed"""
+    return None if now.landing is None else EndRequest(now.landing, end="landed")
+
+
+def fault(_: Memory, now: EngagementInputs) -> EndRequest | None:
+    """**fault**
+
+    No usable chunk for longer than [the grace](#the-grace), no attitude from the vehicle for as
+    long, 5 malformed chunks (NaN), envelope left, link lost, our packets refused by the system for
+    100 ms or our sticks not heard, a command that cannot be made.
+    """
+    reason = now.link_problem or now.chunk_fault or now.envelope_problem
+    return None if reason is None else EndRequest(reason, is_fault=True)
+
+
+def vanished(m: Memory, now: EngagementInputs) -> EndRequest | None:
+    """30 s without a word from the vehicle"""
+    if now.now_ns - m.heard_ns < LOST_NS:
+        return None
+    return EndRequest(because(Code.VEHICLE_LOST, after_s=LOST_NS / NS_PER_S), is_fault=True)
+
+
+def released(m: Memory, now: EngagementInputs) -> bool:
+    """the vehicle shows other sticks than ours, or does not for 1 s
+
+    4 s where it does not even show our last ones; then it is said that the release was not seen.
+    """
+    timeout_ns = RELEASE_TIMEOUT_NS if now.shows_last else UNHEARD_RELEASE_TIMEOUT_NS
+    return (now.is_released and not m.owes_release) or now.now_ns - m.released_ns >= timeout_ns
+
+
+def ready(m: Memory, now: EngagementInputs) -> bool:
+    """ready
+
+    Armed, in its mode, and the first chunk that was solved after a reset.
+    """
+    return m.engage.waits_for is None and now.is_policy_reset and now.chunk_problem is None
+
+
+def over(m: Memory, _: EngagementInputs) -> bool:
+    """the way out is at its end
+
+    Mode confirmed, after 50 ms of neutral at least; or not within 3 s, while the vehicle is heard.
+    """
+    return m.disengage.is_done
+
+
+# --- conditions
+
+
+def is_ours(m: Memory, now: EngagementInputs) -> bool:
+    """the vehicle is ours
+
+    We have armed it, or it flies by our neutral sticks or setpoints.
+    """
+    return (m.engage.has_sticks and now.armed) or follows_us(m, now)
+
+
+def follows_us(m: Memory, now: EngagementInputs) -> bool:
+    """it would follow our last setpoint
+
+    Still armed in the mode that follows setpoints, without a failsafe, and nobody else is followed:
+    silence would be the last setpoint for up to 3 s, and sticks do nothing in that mode.
+    """
+    is_own = m.phase is not Phase.PREPARING or m.engage.is_own_mode(now)
+    return (
+        (m.settings.engage.is_setpoint and now.armed and is_own)
+        and (now.overruled is None and not now.is_failsafe)
+        and (now.mode == m.own_mode and now.mode in now.modes.setpoint)
+    )
+
+
+def may_release(m: Memory, _: EngagementInputs) -> bool:
+    """it may be released
+
+    A hand would hold the vehicle and silence is no failsafe, or the actions are setpoints.
+    """
+    return not m.disengage.must_hold
+
+
+def objection(m: Memory, now: EngagementInputs) -> Reason | None:
+    """Return why the policy may not take the sticks of an armed vehicle now, or None."""
+    if now.link_problem is not None:
+        return now.link_problem
+    if now.is_failsafe:
+        return because(Code.FAILSAFE, mode=now.mode)
+    if m.switch.is_off:
+        return _switch_off(m)
+    return now.envelope_problem
+
+
+def _switch_off(m: Memory) -> Reason:
+    return because(Code.ENGAGE_SWITCH_OFF, channel=m.settings.engage_channel or 0)
+
+
+def _takeover(m: Memory, now: EngagementInputs) -> Reason | None:
+    is_preparing = m.phase is Phase.PREPARING
+    if now.interruptions != m.seen_interruptions:
+        return now.interruption
+    if now.overruled is not None:
+        return now.overruled
+    if now.is_switched_off:
+        return because(Code.OVERRIDE_SWITCH_OFF)
+    if m.switch.is_off and (m.phase is Phase.FLYING or (is_preparing and m.is_act)):
+        return _switch_off(m)
+    if not now.armed and not is_preparing:
+        return because(Code.DISARMED)
+    if now.is_failsafe and now.armed:
+        return because(Code.FAILSAFE, mode=now.mode)
+    is_ours = now.mode in (m.own_mode, m.disengage.mode) or m.disengage.is_undone(now)
+    if m.own_mode is not None and not is_ours:
+        return because(Code.MODE_CHANGED, before=m.own_mode, after=now.mode)
+    return because(Code.DISARMED) if is_preparing and m.was_armed and not now.armed else None
+
+
+class Row(NamedTuple):
+    """One row: in these states, where this happens, that is done."""
+
+    states: tuple[Phase, ...]
+    event: Callable[[Memory, EngagementInputs], EndRequest | Reason | bool | None]
+    does: Callable[[Memory, EngagementInputs, Any], None]
+    """With what the event returned."""
+    next: Phase | None = None
+    """None: the same, and the rows below are read."""
+    where: Callable[[Memory, EngagementInputs], bool] | None = None
+
+
+AT_REST = (WAITING, RELEASED)
+TABLE = (
+    Row(AT_REST, ended, Memory.nothing, ENDED),
+    Row((WAITING,), arm_flag, Memory.prepare, PREPARING),
+    Row((*AT_REST, LEAVING, HOLDING, RELEASING), unfit_engage, Memory.refuse),
+    Row(AT_REST, engage, Memory.prepare, PREPARING),
+    Row((PREPARING,), stopped, Memory.leave, LEAVING, where=is_ours),
+    Row((PREPARING,), stopped, Memory.release, RELEASING),
+    Row((PREPARING, FLYING), taken, Memory.leave, LEAVING, where=follows_us),
+    Row((PREPARING, FLYING), taken, Memory.release, RELEASING),
+    Row((PREPARING,), late, Memory.give_up),
+    Row((PREPARING,), late, Memory.leave, LEAVING, where=is_ours),
+    Row((PREPARING,), late, Memory.release, RELEASING),
+    Row((FLYING,), stopped, Memory.leave, LEAVING),
+    Row((FLYING,), duration_over, Memory.leave_for_good, LEAVING),
+    Row((FLYING,), landed, Memory.leave, LEAVING),
+    Row((FLYING,), fault, Memory.leave, LEAVING),
+    Row((HOLDING,), stopped_anew, Memory.leave, LEAVING),
+    Row((LEAVING, HOLDING), taken, Memory.release, RELEASING),
+    Row((LEAVING, HOLDING), vanished, Memory.release, RELEASING),
+    Row((RELEASING,), released, Memory.forget, RELEASED),
+)
+PROGRESS = (
+    Row((PREPARING,), ready, Memory.fly, FLYING),
+    Row((LEAVING, HOLDING), over, Memory.finish, RELEASING, where=may_release),
+    Row((LEAVING,), over, Memory.finish, HOLDING),
+)

@@ -1,0 +1,303 @@
+"""The way into a flight: mode, arming, takeoff by the autopilot, setpoints that flow first."""
+
+from dataclasses import replace
+from typing import Any
+
+import pytest
+
+from helpers.guard_facts import AIRBORNE, COPTER_MODES, ON_GROUND, PX4_MODES, Stepped
+from mavbridge.core.clock import NS_PER_S
+from mavbridge.core.reasons import Code, because
+from mavbridge.core.vehicle import OnFault
+from mavbridge.guard.sequences import (
+    FLOW_NS,
+    DisengageSettings,
+    EngageSequence,
+    EngageSettings,
+)
+from mavbridge.guard.values import Actions, ControlSource, EngagementInputs, Phase
+
+IDLE, POLICY, NEUTRAL, LEVEL, RELEASE = ControlSource
+GROUND = replace(ON_GROUND, mode="STABILIZE", modes=COPTER_MODES, echo_confirmed=True)
+NO_ECHO = because(Code.NO_ECHO, message="RC_CHANNELS", quantity="sticks")
+PX4_GROUND = replace(GROUND, mode="AUTO.LOITER", modes=PX4_MODES)
+
+
+def requests(moves: list[Actions]) -> list[str]:
+    """Everything that was asked for, in order."""
+    asked: list[str] = []
+    for move in moves:
+        asked += [f"mode {move.mode}"] if move.mode else []
+        asked += ["arm"] if move.arm else []
+        asked += [f"climb {move.takeoff_m:g}"] if move.takeoff_m else []
+    return asked
+
+
+def test_the_autopilot_takes_off_before_sticks_fly() -> None:
+    stepped = Stepped(GROUND, arm=True, takeoff_m=8.0)
+    assert requests(stepped.run(0.5)) == ["mode GUIDED"]
+    assert requests(stepped.run(1.0, mode="GUIDED")) == ["arm"]
+    assert {move.control for move in stepped.moves} == {IDLE}
+    climbing = stepped.run(2.5, armed=True)
+    assert requests(climbing) == ["climb 8"] * 2
+    assert {move.control for move in climbing} == {NEUTRAL}
+    assert requests(stepped.run(2.0, is_landed=False, height_m=4.0)) == []
+    assert stepped.engagement.reason == because(Code.TAKING_OFF, height_m=8)
+    assert requests(stepped.run(0.5, height_m=7.3)) == ["mode ALT_HOLD"]
+    stepped.step(mode="ALT_HOLD")
+    assert stepped.phase is Phase.FLYING
+
+
+def test_setpoints_would_end_a_takeoff_so_none_is_sent() -> None:
+    stepped = Stepped(
+        replace(GROUND, mode="GUIDED"), arm=True, takeoff_m=8.0, is_setpoint=True, modes=("GUIDED",)
+    )
+    moves = [*stepped.run(0.1), *stepped.run(1.1, armed=True), *stepped.run(1.0, height_m=5.0)]
+    assert {move.control for move in moves} == {None}
+    stepped.step(height_m=7.9)
+    assert stepped.phase is Phase.FLYING
+
+
+def test_px4_takes_off_through_its_own_modes_and_gets_setpoints_before_offboard() -> None:
+    stepped = Stepped(
+        PX4_GROUND, arm=True, takeoff_m=5.0, is_setpoint=True, modes=("GUIDED", "OFFBOARD")
+    )
+    assert requests(stepped.run(0.1)) == ["arm"]
+    assert requests(stepped.run(1.0, armed=True)) == ["climb 5"]
+    stepped.run(2.0, mode="AUTO.TAKEOFF", is_landed=False, height_m=3.0)
+    stepped.step(height_m=4.9)
+    entering = stepped.run(0.3, mode="AUTO.LOITER")
+    assert requests(stepped.moves[-31:]) == ["mode OFFBOARD"]
+    assert {move.control for move in entering} == {NEUTRAL}
+    stepped.step(mode="OFFBOARD")
+    assert stepped.phase is Phase.FLYING
+
+
+def test_on_the_ground_idle_setpoints_flow_before_offboard_and_arming() -> None:
+    stepped = Stepped(PX4_GROUND, arm=True, is_setpoint=True, modes=("OFFBOARD",))
+    moves = [*stepped.run(0.1), *stepped.run(1.0, mode="OFFBOARD")]
+    assert {move.control for move in moves} == {IDLE}
+    assert requests(moves) == ["mode OFFBOARD", "arm"]
+
+
+def test_in_the_air_an_act_asks_for_the_mode_that_only_our_setpoints_can_enter() -> None:
+    facts = replace(AIRBORNE, mode="AUTO.LOITER", modes=PX4_MODES)
+    stepped = Stepped(facts, is_setpoint=True, modes=("OFFBOARD",))
+    stepped.step()
+    flow = [stepped.step("engage"), *stepped.run(0.09)]
+    assert {(move.control, move.mode) for move in flow} == {(NEUTRAL, None)}
+    move = stepped.step()
+    assert (move.control, move.mode) == (NEUTRAL, "OFFBOARD")
+    stepped.step(mode="OFFBOARD")
+    assert stepped.phase is Phase.FLYING
+
+
+@pytest.mark.parametrize("choice", ["auto", "release"])
+def test_a_takeoff_that_is_broken_off_does_not_climb_on(choice: OnFault) -> None:
+    """The receiver's sticks, which a release would give it, do nothing in GUIDED."""
+    stepped = Stepped(
+        replace(GROUND, mode="GUIDED"),
+        arm=True,
+        takeoff_m=8.0,
+        disengage=DisengageSettings(then=choice),
+    )
+    stepped.run(0.1)
+    stepped.run(1.0, armed=True, is_landed=False, height_m=2.0)
+    assert stepped.step("release") == Actions(control=NEUTRAL, mode="BRAKE")
+
+
+def entering_offboard() -> Stepped:
+    """By an act in the air; the mode has come, and the policy is late."""
+    facts = replace(AIRBORNE, mode="AUTO.LOITER", modes=PX4_MODES)
+    stepped = Stepped(
+        facts,
+        is_setpoint=True,
+        modes=("OFFBOARD",),
+        disengage=DisengageSettings(is_setpoint=True),
+    )
+    stepped.step()
+    stepped.step("engage")
+    stepped.run(0.12)
+    assert "OFFBOARD" in [move.mode for move in stepped.moves]
+    stepped.step(
+        mode="OFFBOARD",
+        chunk_problem=because(Code.TOO_OLD, quantity="chunk", age_ms=300.0, limit_ms=100.0),
+    )
+    assert stepped.phase is Phase.PREPARING
+    return stepped
+
+
+def test_offboard_once_entered_is_kept_by_neutral_until_the_policy_is_ready() -> None:
+    stepped = entering_offboard()
+    assert {move.control for move in stepped.run(2.0)} == {NEUTRAL}
+    stepped.step(chunk_problem=None)
+    assert stepped.phase is Phase.FLYING
+
+
+def test_a_mode_of_setpoints_that_the_pilot_chose_is_not_left() -> None:
+    facts = replace(AIRBORNE, mode="GUIDED", chunk_problem=None)
+    modes = ("GUIDED_NOGPS",)
+    stepped = Stepped(facts, is_setpoint=True, modes=modes, mode="GUIDED_NOGPS")
+    stepped.facts = replace(
+        facts, modes=replace(COPTER_MODES, names=(*COPTER_MODES.names, "GUIDED_NOGPS"))
+    )
+    stepped.step()
+    stepped.step("engage")
+    move = stepped.step("release")
+    assert (stepped.phase, move.mode) == (Phase.RELEASING, None)
+
+
+def test_neutral_goes_on_in_a_climb_whose_echo_is_lost() -> None:
+    """Without a receiver silence would be its radio failsafe; on the ground nothing is sent."""
+    stepped = Stepped(replace(GROUND, mode="GUIDED", has_receiver=False), arm=True, takeoff_m=8.0)
+    stepped.run(0.1)
+    assert {move.control for move in stepped.run(0.1, link_problem=NO_ECHO)} == {None}
+    stepped.run(1.0, armed=True, is_landed=False, height_m=2.0, link_problem=None)
+    moves = stepped.run(1.0, link_problem=NO_ECHO)
+    assert {move.control for move in moves} == {NEUTRAL}
+
+
+# --- single steps, each condition by itself
+
+
+def begun(
+    facts: EngagementInputs, *, modes: tuple[str, ...] = ("ALT_HOLD", "LOITER"), **given: Any
+) -> EngageSequence:
+    sequence = EngageSequence(EngageSettings(modes=modes, **given))
+    sequence.begin(facts)
+    return sequence
+
+
+def test_the_first_step_asks_at_once_and_the_second_a_second_later() -> None:
+    sequence = begun(GROUND)
+    assert sequence.step(GROUND, None).mode == "ALT_HOLD"
+    just_before = replace(GROUND, now_ns=NS_PER_S - 1)
+    assert sequence.step(just_before, None).mode is None
+    assert sequence.step(replace(GROUND, now_ns=NS_PER_S), None).mode == "ALT_HOLD"
+
+
+IN_STABILIZE = replace(AIRBORNE, mode="STABILIZE", echo_confirmed=False)
+LOITERING = replace(AIRBORNE, mode="AUTO.LOITER", modes=PX4_MODES)
+IN_GUIDED = replace(GROUND, mode="GUIDED")
+ARMED = {"mode": "ALT_HOLD", "armed": True}
+CLIMB: dict[str, Any] = {"takeoff_m": 10.0}
+SETPOINTS: dict[str, Any] = {"is_setpoint": True, "modes": ("OFFBOARD",)}
+IN_OFFBOARD = {"armed": True, "mode": "OFFBOARD", "modes": PX4_MODES}
+
+
+@pytest.mark.parametrize(
+    ("begin", "given", "changes", "control", "asked", "waits_for"),
+    [
+        (GROUND, {}, {}, IDLE, ["mode ALT_HOLD"], Code.WAITING_FOR_MODE),
+        (GROUND, {}, {"echo_confirmed": False}, IDLE, [], Code.WAITING_FOR_MODE),
+        (IN_STABILIZE, {}, {}, None, ["mode ALT_HOLD"], Code.WAITING_FOR_MODE),
+        (
+            GROUND,
+            {},
+            {"mode": "ALT_HOLD", "height_m": None},
+            IDLE,
+            ["arm"],
+            Code.WAITING_FOR_ARMING,
+        ),
+        (GROUND, {}, ARMED, IDLE, [], None),
+        (GROUND, {}, {**ARMED, "link_problem": NO_ECHO}, None, [], Code.NO_ECHO),
+        (AIRBORNE, CLIMB, {"link_problem": NO_ECHO}, None, [], Code.NO_ECHO),
+        (IN_GUIDED, CLIMB, {"armed": True}, NEUTRAL, ["climb 10"], Code.TAKING_OFF),
+        (IN_GUIDED, CLIMB, {"armed": True, "is_landed": False}, NEUTRAL, [], Code.TAKING_OFF),
+        (
+            IN_GUIDED,
+            CLIMB,
+            {"armed": True, "height_m": None, "is_landed": False},
+            NEUTRAL,
+            [],
+            Code.TAKEOFF_NEEDS_POSITION,
+        ),
+        (GROUND, CLIMB | SETPOINTS, IN_OFFBOARD, None, ["climb 10"], Code.TAKING_OFF),
+        (LOITERING, SETPOINTS, {}, NEUTRAL, [], Code.WAITING_FOR_MODE),
+        (
+            LOITERING,
+            SETPOINTS | {"modes": ("POSCTL",)},
+            {},
+            None,
+            ["mode POSCTL"],
+            Code.WAITING_FOR_MODE,
+        ),
+    ],
+)
+def test_one_step(
+    begin: EngagementInputs,
+    given: dict[str, Any],
+    changes: dict[str, Any],
+    control: ControlSource | None,
+    asked: list[str],
+    waits_for: Code | None,
+) -> None:
+    sequence, now = begun(begin, **given), replace(begin, **changes)
+    actions = sequence.step(now, now.link_problem)
+    assert (actions.control, requests([actions])) == (control, asked)
+    assert (sequence.waits_for and sequence.waits_for.code) is waits_for
+
+
+def test_with_an_objection_nothing_is_asked_for() -> None:
+    sequence = begun(GROUND)
+    assert sequence.step(GROUND, because(Code.NO_CHUNK)) == Actions(control=IDLE)
+    assert sequence.waits_for == because(Code.NO_CHUNK)
+
+
+def test_which_mode_is_wanted() -> None:
+    first = begun(GROUND)
+    assert first.wanted_mode(GROUND) == "ALT_HOLD"
+    assert first.wanted_mode(replace(GROUND, mode="LOITER")) is None
+    nameless = replace(GROUND, modes=replace(COPTER_MODES, names=()))
+    assert first.wanted_mode(nameless) == "ALT_HOLD"
+    assert first.impossibility(nameless) is None
+    assert begun(GROUND, mode="LOITER").wanted_mode(GROUND) == "LOITER"
+    with_loiter_alone = replace(GROUND, modes=replace(COPTER_MODES, names=("LOITER",)))
+    assert first.wanted_mode(with_loiter_alone) == "LOITER"
+
+
+def test_the_modes_of_a_takeoff_are_our_own_only_if_we_take_off() -> None:
+    in_guided = replace(AIRBORNE, mode="GUIDED")
+    assert begun(GROUND, takeoff_m=8.0).is_own_mode(in_guided)
+    assert not begun(GROUND).is_own_mode(in_guided)
+    assert not begun(AIRBORNE, takeoff_m=8.0).is_own_mode(in_guided)
+
+
+def test_an_act_changes_the_mode_only_where_our_setpoints_are_needed_to_enter_it() -> None:
+    loitering = replace(AIRBORNE, mode="AUTO.LOITER", modes=PX4_MODES)
+    setpoints = begun(loitering, modes=("OFFBOARD",), is_setpoint=True)
+    assert setpoints.may_change_mode(loitering)
+    assert not setpoints.may_change_mode(replace(loitering, mode="OFFBOARD"))
+    assert not begun(loitering, modes=("ALTCTL",)).may_change_mode(loitering)
+
+
+def test_the_setpoints_of_a_second_way_in_flow_as_long_as_those_of_the_first() -> None:
+    facts = replace(AIRBORNE, mode="AUTO.LOITER", modes=PX4_MODES)
+    sequence = begun(facts, modes=("OFFBOARD",), is_setpoint=True)
+    sequence.step(facts, None)
+    asked = sequence.step(replace(facts, now_ns=FLOW_NS), None)
+    assert (asked.control, asked.mode) == (NEUTRAL, "OFFBOARD")
+    sequence.begin(facts)
+    assert not sequence.is_own_mode(replace(facts, mode="OFFBOARD"))
+    later = replace(facts, now_ns=FLOW_NS + 2 * NS_PER_S)
+    assert sequence.step(later, None).mode is None
+
+
+# --- the autopilot's takeoff
+
+
+def test_nine_tenths_of_the_height_are_enough_and_count_from_where_it_stood() -> None:
+    sequence = begun(replace(GROUND, mode="GUIDED"), takeoff_m=10.0)
+    for height_m in (0.0, -3.0):  # it drifts as long as it stands
+        sequence.step(replace(GROUND, mode="GUIDED", height_m=height_m), None)
+    climbing = replace(GROUND, mode="GUIDED", armed=True, is_landed=False, height_m=5.5)
+    sequence.step(climbing, None)
+    assert not sequence.is_up
+    sequence.step(replace(climbing, height_m=6.0), None)
+    assert sequence.is_up
+
+
+def test_the_mode_in_which_it_climbs_is_left_to_the_autopilot() -> None:
+    climbing = replace(GROUND, armed=True, mode="AUTO.TAKEOFF", modes=PX4_MODES)
+    sequence = begun(replace(GROUND, modes=PX4_MODES), takeoff_m=10.0)
+    assert sequence.wanted_mode(climbing) is None

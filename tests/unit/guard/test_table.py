@@ -1,0 +1,380 @@
+"""The table of the engagement, row by row: docs/SAFETY.md shows it to pilots."""
+
+from collections.abc import Callable
+from dataclasses import replace
+from functools import partial
+from typing import Any, NamedTuple
+
+import pytest
+
+from benchmarks.safety_table import PAGE, with_table
+from helpers.guard_facts import (
+    AIRBORNE,
+    ON_GROUND,
+    PX4_MODES,
+    Stepped,
+    codes,
+    flying,
+)
+from mavbridge.core.clock import NS_PER_S
+from mavbridge.core.reasons import Code, because
+from mavbridge.core.vehicle import NEUTRAL as CENTRED
+from mavbridge.guard import engagement
+from mavbridge.guard.sequences import DisengageSettings
+from mavbridge.guard.table import PROGRESS, TABLE, Row
+from mavbridge.guard.values import Actions, ControlSource, EndRequest, Phase
+
+IDLE, POLICY, NEUTRAL, LEVEL, RELEASE = ControlSource
+WAITING, PREPARING, FLYING, LEAVING, HOLDING, RELEASING, RELEASED, ENDED = Phase
+NO_CHUNK, NO_IMAGE, LOST = because(Code.NO_CHUNK), because(Code.NO_IMAGE), Code.HEARTBEAT_LOST
+TILT = because(Code.BEYOND, quantity="tilt", value=70.0, limit=60.0, unit="deg")
+OVERRULED = because(Code.OVERRULED, quantity="sticks", cause="a joystick")
+REBOOT = {"interruption": because(Code.REBOOTED)}
+RADIO_FAILSAFE = {"is_failsafe": True, "mode": "RTL"}
+DEATH = EndRequest(because(Code.FLIGHT_PROCESS_DIED), is_fault=True)
+SIGNAL = EndRequest(because(Code.SIGNAL))
+SWITCH_LOW = {"rc_channels_us": (1500,) * 6 + (1000, 1500)}
+NO_RECEIVER = replace(AIRBORNE, has_receiver=False, pilot_sticks=None)
+IDLE_RECEIVER = replace(AIRBORNE, pilot_sticks=CENTRED._replace(throttle=-1.0))
+LANDS = DisengageSettings(on_fault="rtl", then="land")
+OFFBOARD = replace(AIRBORNE, mode="OFFBOARD", modes=PX4_MODES)
+SETPOINTS: dict[str, Any] = {
+    "is_setpoint": True,
+    "modes": ("OFFBOARD",),
+    "disengage": DisengageSettings(is_setpoint=True, on_fault="land", then="rtl"),
+    "engage_channel": 7,
+}
+
+
+def waiting(facts: Any = AIRBORNE, **settings: Any) -> Stepped:
+    stepped = Stepped(facts, **settings)
+    stepped.step()
+    return stepped
+
+
+def arming(**settings: Any) -> Stepped:
+    """By ``--arm``, still disarmed."""
+    stepped = Stepped(ON_GROUND, arm=True, disengage=LANDS, **settings)
+    stepped.run(0.1, echo_confirmed=True)
+    return stepped
+
+
+def armed(**settings: Any) -> Stepped:
+    """By ``--arm``; the policy is late."""
+    stepped = arming(**settings)
+    stepped.step(armed=True, chunk_problem=NO_IMAGE)
+    return stepped
+
+
+def asked() -> Stepped:
+    """For ALT_HOLD, by an act in the air; the pilot has the sticks."""
+    facts = replace(AIRBORNE, mode="LOITER", is_released=True)
+    stepped = waiting(facts, mode="ALT_HOLD", engage_channel=7)
+    stepped.step("engage")
+    return stepped
+
+
+def flowing() -> Stepped:
+    """OFFBOARD was asked for, by an act in the air."""
+    stepped = waiting(replace(OFFBOARD, mode="AUTO.LOITER", is_released=True), **SETPOINTS)
+    stepped.step("engage")
+    stepped.run(0.12)
+    return stepped
+
+
+def entering() -> Stepped:
+    """OFFBOARD has come; the policy is late."""
+    stepped = flowing()
+    stepped.step(mode="OFFBOARD", chunk_problem=NO_IMAGE)
+    return stepped
+
+
+def leaving(facts: Any = NO_RECEIVER, **settings: Any) -> Stepped:
+    stepped = flying(facts, disengage=LANDS, **settings)
+    stepped.step(chunk_fault=NO_CHUNK)
+    return stepped
+
+
+def holding(**settings: Any) -> Stepped:
+    stepped = leaving(**settings)
+    stepped.run(0.2, mode="RTL", chunk_fault=None)
+    return stepped
+
+
+def releasing(facts: Any = AIRBORNE, **settings: Any) -> Stepped:
+    stepped = flying(facts, **settings)
+    stepped.step(mode="LOITER")
+    return stepped
+
+
+def released(**settings: Any) -> Stepped:
+    stepped = releasing(**settings)
+    stepped.step(is_released=True, mode="ALT_HOLD")
+    return stepped
+
+
+def after(start: Callable[[], Stepped], seconds: float, **changes: Any) -> Stepped:
+    stepped = start()
+    stepped.run(seconds, **changes)
+    return stepped
+
+
+class Case(NamedTuple):
+    """What one step makes of a situation."""
+
+    start: Callable[[], Stepped]
+    changes: dict[str, Any]
+    """What happens in the step: of the facts, an ``act``, or to ``stop``."""
+    phase: Phase
+    control: ControlSource | None = None
+    mode: str | None = None
+    why: Code | None = None
+    """The last code of the reason for not flying."""
+    refusal: Code | None = None
+    """The last code of what is said."""
+
+
+ACT, KEY = {"act": "engage"}, {"act": "release"}
+in_offboard = partial(flying, OFFBOARD, **SETPOINTS)
+silent = {"heard_ns": 0}
+# fmt: off
+CASES = {
+    # WAITING and RELEASED
+    "somebody arms": Case(partial(waiting, ON_GROUND), {"armed": True}, WAITING),
+    "it says what it waits for": Case(waiting, {"link_problem": because(LOST), "chunk_problem":
+        NO_IMAGE}, WAITING, why=LOST),
+    "no image": Case(waiting, {"chunk_problem": NO_IMAGE}, WAITING, why=Code.NO_IMAGE),
+    "end before a flight": Case(waiting, {"stop": SIGNAL}, ENDED),
+    "end before --arm": Case(partial(Stepped, ON_GROUND, arm=True), {"stop": SIGNAL}, ENDED),
+    "end after a flight": Case(released, {"stop": SIGNAL}, ENDED),
+    "duration over after a takeover": Case(lambda: after(partial(released, duration_ns=NS_PER_S),
+        0.97), {}, ENDED),
+    "--arm waits for the link": Case(partial(waiting, replace(ON_GROUND,
+        link_problem=because(LOST)), arm=True), {}, WAITING),
+    "--arm": Case(partial(Stepped, ON_GROUND, arm=True), {}, PREPARING, IDLE,
+        why=Code.WAITING_FOR_ARMING),
+    "--arm counts once": Case(lambda: after(lambda: after(arming, 0.01, is_switched_off=True), 0.1,
+        is_released=True), {"is_switched_off": False}, RELEASED, why=Code.OVERRIDE_SWITCH_OFF),
+    "act": Case(waiting, ACT, FLYING, POLICY),
+    "act after a takeover": Case(released, ACT, FLYING, POLICY),
+    "act, the policy not reset": Case(waiting, {**ACT, "is_policy_reset": False}, PREPARING,
+        why=Code.FIRST_CHUNK),
+    "act, another mode wanted": Case(partial(waiting, replace(AIRBORNE, mode="LOITER"),
+        mode="ALT_HOLD"), ACT, PREPARING, mode="ALT_HOLD"),
+    "act in a step with the key": Case(partial(waiting, ON_GROUND, engage_on_arm=True), {**KEY,
+        "armed": True}, WAITING),
+    **{
+        f"act refused: {code.value}": Case(waiting, {**ACT, **changes}, WAITING, refusal=code)
+        for code, changes in (
+            (Code.NOT_ARMED, {"armed": False}),
+            (Code.WRONG_MODE, {"mode": "LOITER"}),
+            (Code.NO_IMAGE, {"chunk_problem": NO_IMAGE}),
+            (LOST, {"link_problem": because(LOST), "chunk_problem": NO_IMAGE}),
+            (Code.FAILSAFE, {"is_failsafe": True, "envelope_problem": TILT}),
+            (Code.BEYOND, {"envelope_problem": TILT, "chunk_problem": NO_IMAGE}),
+        )
+    },
+    "act refused: the switch is low": Case(partial(waiting, replace(AIRBORNE, **SWITCH_LOW),
+        engage_channel=7), {**ACT, "envelope_problem": TILT}, WAITING,
+        refusal=Code.ENGAGE_SWITCH_OFF),
+    "act refused after a takeover": Case(released, {**ACT, "chunk_problem": NO_IMAGE}, RELEASED,
+        refusal=Code.NO_IMAGE),
+    # PREPARING
+    "key, not armed yet": Case(arming, KEY, RELEASING, RELEASE, why=Code.OPERATOR),
+    "key, armed by us": Case(armed, KEY, LEAVING, NEUTRAL, "LAND", Code.OPERATOR),
+    "death, armed by us": Case(armed, {"stop": DEATH}, LEAVING, NEUTRAL, "RTL", DEATH.reason.code),
+    "key, the pilot has the sticks": Case(asked, KEY, RELEASED, why=Code.OPERATOR),
+    "key, the vehicle shows ours": Case(asked, {**KEY, "is_released": False}, RELEASING, RELEASE,
+        why=Code.OPERATOR),
+    "key, in our OFFBOARD": Case(entering, KEY, LEAVING, NEUTRAL, "AUTO.RTL", Code.OPERATOR),
+    "key, as our OFFBOARD comes": Case(flowing, {**KEY, "mode": "OFFBOARD"}, LEAVING, NEUTRAL,
+        "AUTO.RTL", Code.OPERATOR),
+    "pilot's mode": Case(asked, {"mode": "STABILIZE"}, RELEASED, why=Code.MODE_CHANGED),
+    "switch low after an act": Case(asked, SWITCH_LOW, RELEASED, why=Code.ENGAGE_SWITCH_OFF),
+    "switch low with --arm": Case(partial(arming, engage_channel=7), SWITCH_LOW, PREPARING, IDLE),
+    "another mode on the ground": Case(arming, {"mode": "LOITER"}, RELEASING, RELEASE,
+        why=Code.MODE_CHANGED),
+    "another mode before ours is there": Case(partial(waiting, replace(ON_GROUND, mode="STABILIZE"),
+        arm=True), {"mode": "LOITER"}, PREPARING, IDLE),
+    "failsafe on the ground": Case(arming, {"is_failsafe": True}, PREPARING, IDLE),
+    "failsafe": Case(armed, RADIO_FAILSAFE, RELEASING, RELEASE, why=Code.FAILSAFE),
+    "disarmed": Case(armed, {"armed": False}, RELEASING, RELEASE, why=Code.DISARMED),
+    "reboot": Case(armed, {**REBOOT, "armed": False}, RELEASING, RELEASE, why=Code.REBOOTED),
+    "parameter, in our OFFBOARD": Case(entering, REBOOT, LEAVING, NEUTRAL, "AUTO.LAND",
+        Code.REBOOTED),
+    "no such mode": Case(partial(Stepped, ON_GROUND, arm=True, mode="ALTCTL"), {}, RELEASING,
+        RELEASE, why=Code.NO_SUCH_MODE),
+    "too slow": Case(arming, {"slowness": because(Code.HANGS, name="x", idle_s=1.0)}, RELEASING,
+        RELEASE, why=Code.HANGS),
+    "late, not armed": Case(lambda: after(arming, 89.91), {}, RELEASING, RELEASE,
+        why=Code.NOT_READY),
+    "not late yet": Case(lambda: after(arming, 89.9), {}, PREPARING, IDLE),
+    "late, armed": Case(lambda: after(armed, 89.9), {}, LEAVING, NEUTRAL, "RTL", Code.NO_IMAGE),
+    "late for a climb": Case(lambda: after(partial(arming, takeoff_m=100.0), 189.91), {}, RELEASING,
+        RELEASE, why=Code.NOT_READY),
+    "not late for a climb yet": Case(lambda: after(partial(arming, takeoff_m=100.0), 189.9), {},
+        PREPARING, IDLE, "GUIDED"),
+    "late for an act": Case(lambda: after(asked, 3.0), {}, RELEASED, why=Code.NOT_READY,
+        refusal=Code.NOT_READY),
+    "late in our OFFBOARD": Case(lambda: after(entering, 2.87), {}, LEAVING, NEUTRAL, "AUTO.LAND",
+        Code.NO_IMAGE, Code.NO_IMAGE),
+    "no chunk since the reset": Case(lambda: after(lambda: after(waiting, 0.01, act="engage",
+        is_policy_reset=False, is_released=True), 3.0, act=None), {}, RELEASED, why=Code.NO_CHUNK,
+        refusal=Code.NO_CHUNK),
+    "ready": Case(armed, {"chunk_problem": None}, FLYING, POLICY),
+    "ready in our OFFBOARD": Case(entering, {"chunk_problem": None}, FLYING, POLICY),
+    # FLYING
+    **{
+        f"takeover: {code.value}": Case(flying, changes, RELEASING, RELEASE, why=code)
+        for code, changes in (
+            (Code.REBOOTED, {**REBOOT, "overruled": OVERRULED}),
+            (Code.OVERRULED, {"overruled": OVERRULED, "is_switched_off": True}),
+            (Code.OVERRIDE_SWITCH_OFF, {"is_switched_off": True, "armed": False}),
+            (Code.DISARMED, {"armed": False, "is_failsafe": True}),
+            (Code.FAILSAFE, RADIO_FAILSAFE),
+            (
+                Code.MODE_CHANGED,
+                {"mode": "LOITER", "chunk_fault": NO_CHUNK, "envelope_problem": TILT},
+            ),
+        )
+    },
+    "takeover: switch low": Case(partial(flying, engage_channel=7), {**SWITCH_LOW, "armed": False},
+        RELEASING, RELEASE, why=Code.ENGAGE_SWITCH_OFF),
+    "setpoints, takeover that leaves the mode": Case(in_offboard, REBOOT, LEAVING, NEUTRAL,
+        "AUTO.LAND", Code.REBOOTED),
+    "setpoints, switch low": Case(in_offboard, SWITCH_LOW, LEAVING, NEUTRAL, "AUTO.LAND",
+        Code.ENGAGE_SWITCH_OFF),
+    **{
+        f"setpoints, takeover: {code.value}": Case(
+            in_offboard, changes, RELEASING, RELEASE, why=code
+        )
+        for code, changes in (
+            (Code.MODE_CHANGED, {"mode": "AUTO.LOITER"}),
+            (Code.DISARMED, {"armed": False}),
+            (Code.FAILSAFE, {"is_failsafe": True}),
+            (Code.OVERRULED, {"overruled": OVERRULED}),
+            (Code.OVERRIDE_SWITCH_OFF, {"is_switched_off": True}),
+        )
+    },
+    "setpoints in a mode of sticks": Case(partial(flying, replace(OFFBOARD, mode="POSCTL"),
+        **{**SETPOINTS, "modes": ("POSCTL")}), REBOOT, RELEASING, RELEASE),
+    "sticks in a mode of setpoints": Case(partial(flying, replace(AIRBORNE, mode="GUIDED"),
+        modes=("GUIDED")), REBOOT, RELEASING, RELEASE),
+    "key": Case(partial(flying, disengage=LANDS), KEY, LEAVING, NEUTRAL, "LAND", Code.OPERATOR),
+    "signal": Case(partial(flying, disengage=LANDS), {"stop": SIGNAL, **KEY}, LEAVING, NEUTRAL,
+        "LAND", Code.SIGNAL),
+    "death": Case(partial(flying, disengage=LANDS), {"stop": DEATH}, LEAVING, NEUTRAL, "RTL",
+        DEATH.reason.code),
+    "duration": Case(lambda: after(partial(flying, disengage=LANDS, duration_ns=NS_PER_S), 0.99),
+        {"landing": because(Code.LANDED)}, LEAVING, NEUTRAL, "LAND", Code.DURATION),
+    "not the duration yet": Case(lambda: after(partial(flying, duration_ns=NS_PER_S), 0.98), {},
+        FLYING, POLICY),
+    "landed": Case(partial(flying, disengage=LANDS), {"landing": because(Code.LANDED),
+        "chunk_fault": NO_CHUNK}, LEAVING, NEUTRAL, "LAND", Code.LANDED),
+    **{
+        f"fault: {code.value}": Case(
+            partial(flying, disengage=LANDS), changes, LEAVING, NEUTRAL, "RTL", code
+        )
+        for code, changes in (
+            (LOST, {"link_problem": because(LOST), "chunk_fault": NO_CHUNK}),
+            (Code.NO_CHUNK, {"chunk_fault": NO_CHUNK, "envelope_problem": TILT}),
+            (Code.BEYOND, {"envelope_problem": TILT}),
+        )
+    },
+    "a stale chunk alone": Case(flying, {"chunk_problem": NO_IMAGE}, FLYING, POLICY),
+    # LEAVING and HOLDING
+    "act while leaving": Case(leaving, ACT, LEAVING, NEUTRAL, refusal=Code.STILL_ENDING),
+    "key while leaving": Case(leaving, KEY, LEAVING, NEUTRAL, why=Code.NO_CHUNK),
+    "signal while leaving": Case(leaving, {"stop": SIGNAL}, LEAVING, NEUTRAL, why=Code.NO_CHUNK),
+    "switch low while leaving": Case(partial(leaving, engage_channel=7), SWITCH_LOW, LEAVING,
+        NEUTRAL),
+    "takeover while leaving": Case(leaving, {"mode": "LOITER"}, RELEASING, RELEASE,
+        why=Code.MODE_CHANGED),
+    "our mode while leaving": Case(leaving, {"mode": "RTL"}, LEAVING, NEUTRAL),
+    "30 s without a word": Case(lambda: after(leaving, 30.21, heard_ns=0), {}, RELEASING, RELEASE,
+        why=Code.VEHICLE_LOST),
+    "not 30 s yet": Case(lambda: after(leaving, 30.2, heard_ns=0), {}, LEAVING, NEUTRAL),
+    "confirmed, a hand holds it": Case(lambda: after(partial(leaving, AIRBORNE), 0.04, mode="RTL"),
+        {}, RELEASING, RELEASE),
+    "neutral for 50 ms first": Case(lambda: after(partial(leaving, AIRBORNE), 0.03, mode="RTL"), {},
+        LEAVING, NEUTRAL),
+    "confirmed, no hand": Case(lambda: after(leaving, 0.04, mode="RTL"), {}, HOLDING, NEUTRAL),
+    "not confirmed, no hand": Case(lambda: after(leaving, 2.99), {}, HOLDING, NEUTRAL, "RTL",
+        refusal=Code.MODE_NOT_CONFIRMED),
+    "confirmed late, a hand holds it": Case(lambda: after(partial(leaving, IDLE_RECEIVER), 3.0),
+        {"mode": "RTL"}, RELEASING, RELEASE),
+    "act while holding": Case(holding, ACT, HOLDING, NEUTRAL, refusal=Code.STILL_ENDING),
+    "key while holding": Case(holding, KEY, LEAVING, NEUTRAL, "LAND", Code.OPERATOR),
+    "first stop while holding": Case(holding, {"stop": SIGNAL}, LEAVING, NEUTRAL, "LAND",
+        Code.SIGNAL),
+    "second stop while holding": Case(lambda: after(lambda: after(partial(flying, NO_RECEIVER),
+        0.01, stop=DEATH), 0.2, mode="BRAKE"), {"stop": SIGNAL}, HOLDING, NEUTRAL,
+        why=DEATH.reason.code),
+    "signal after the duration": Case(lambda: after(lambda: after(partial(flying, NO_RECEIVER,
+        duration_ns=NS_PER_S), 1.0), 0.2, mode="LAND"), {"stop": SIGNAL}, HOLDING, NEUTRAL,
+        why=Code.DURATION),
+    "takeover while holding": Case(holding, {"mode": "ALT_HOLD"}, RELEASING, RELEASE,
+        why=Code.MODE_CHANGED),
+    "disarmed while holding": Case(holding, {"armed": False}, RELEASING, RELEASE,
+        why=Code.DISARMED),
+    "held for long": Case(lambda: after(holding, 60.0), {}, HOLDING, NEUTRAL),
+    "held, and not heard": Case(lambda: after(holding, 30.01, heard_ns=0), {}, RELEASING, RELEASE,
+        why=Code.VEHICLE_LOST),
+    # RELEASING
+    "act while releasing": Case(releasing, ACT, RELEASING, RELEASE, refusal=Code.STILL_ENDING),
+    "stop while releasing": Case(releasing, {"stop": SIGNAL}, RELEASING, RELEASE),
+    "release seen": Case(releasing, {"is_released": True}, RELEASED, why=Code.MODE_CHANGED),
+    "released although nothing was held": Case(flying, {**REBOOT, "is_released": True}, RELEASING,
+        RELEASE),
+    "release not seen": Case(lambda: after(releasing, 0.99), {}, RELEASED,
+        refusal=Code.RELEASE_NOT_SEEN),
+    "release not seen yet": Case(lambda: after(releasing, 0.98), {}, RELEASING, RELEASE),
+    "release perhaps not heard": Case(lambda: after(releasing, 3.99, shows_last=False), {},
+        RELEASED, refusal=Code.RELEASE_NOT_SEEN),
+    "release perhaps not heard yet": Case(lambda: after(releasing, 3.98, shows_last=False), {},
+        RELEASING, RELEASE),
+    "ended": Case(lambda: after(waiting, 0.01, stop=SIGNAL), {**ACT, "mode": "LOITER"}, ENDED),
+}
+# fmt: on
+
+
+def take(case: Case) -> tuple[Stepped, Actions]:
+    stepped = case.start()
+    stepped.engagement.refusal = None
+    return stepped, stepped.step(**case.changes)
+
+
+@pytest.mark.parametrize("name", CASES)
+def test_rows(name: str) -> None:
+    case = CASES[name]
+    stepped, actions = take(case)
+    assert (stepped.phase, actions.control, actions.mode) == (case.phase, case.control, case.mode)
+    if case.why is not None:
+        assert stepped.codes[-1:] == (case.why,)
+    assert codes(stepped.engagement.refusal)[-1:] == (
+        () if case.refusal is None else (case.refusal,)
+    )
+    assert (stepped.engagement.reason is None) == (case.phase is FLYING)
+
+
+def test_every_row_has_a_case(monkeypatch: pytest.MonkeyPatch) -> None:
+    taken: set[tuple[Row, Phase]] = set()
+
+    def noting(row: Row) -> Row:
+        def does(memory: Any, now: Any, cause: Any) -> None:
+            taken.add((row, memory.phase))
+            row.does(memory, now, cause)
+
+        return row._replace(does=does)
+
+    for name, rows in (("TABLE", TABLE), ("PROGRESS", PROGRESS)):
+        monkeypatch.setattr(engagement, name, tuple(noting(row) for row in rows))
+    for case in CASES.values():
+        take(case)
+    missing = {(row, phase) for row in (*TABLE, *PROGRESS) for phase in row.states} - taken
+    assert not {(row.event.__name__, phase) for row, phase in missing}
+
+
+def test_the_page_for_pilots_shows_this_table() -> None:
+    page = PAGE.read_text()
+    assert with_table(page) == page, "run: python -m benchmarks.safety_table"
