@@ -102,8 +102,8 @@ def taken(m: Memory, now: EngagementInputs) -> EndRequest | None:
     """**takeover**
 
     Mode changed, disarmed, failsafe, override switch low, engage switch low (where the policy flies
-    or an act is followed), other sticks than ours followed, reboot, another address, a parameter
-    that matters changed.
+    or an act is followed), other sticks than ours followed, reboot, silence while another vehicle
+    uses its id, a parameter that matters changed.
     """
     if (reason := _takeover(m, now)) is None:
         return None
@@ -152,7 +152,8 @@ def fault(_: Memory, now: EngagementInputs) -> EndRequest | None:
 
     No usable chunk for longer than [the grace](#the-grace), no attitude from the vehicle for as
     long, 5 malformed chunks (NaN), envelope left, link lost, our packets refused by the system for
-    100 ms or our sticks not heard, a command that cannot be made.
+    100 ms or our sticks not heard, a command that cannot be made, the vehicle's clock set back, or
+    the vehicle at another address.
     """
     reason = now.link_problem or now.chunk_fault or now.envelope_problem
     return None if reason is None else EndRequest(reason, is_fault=True)
