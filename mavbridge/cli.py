@@ -136,8 +136,7 @@ def replay(flight: Path, config: ReplayConfig | None = None) -> int:
     """Compute a recorded flight once more, and compare the sticks; exit status 5: they differ.
 
     Args:
-        flight: folder of a flight; or somebody else's telemetry log or LeRobot dataset, beside
-            which a policy decides.
+        flight: folder of a flight, as --record makes it.
         config: the settings.
     """
     require_extra("replay")

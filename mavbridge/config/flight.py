@@ -162,10 +162,8 @@ class LinkConfig:
     """Sign every packet, and take only signed ones (MAVLink 2): a file with the vehicle's key, 32
     bytes or 64 hexadecimal digits, which only you may read."""
     set: Annotated[tuple[str, ...], Parameter(negative="", show_default=False)] = ()
-    """NAME=VALUE: set a parameter of the vehicle before arming, put the old value back at the end;
-    may be given more than once."""
-    restore_params: Annotated[bool, Parameter(negative="", group=RARE)] = False
-    """Put back the parameters that a flight which did not end in order has left set."""
+    """NAME=VALUE: set a parameter of the vehicle before arming, put the old value back at an
+    orderly end; may be given more than once."""
     accept_risk: Annotated[
         tuple[Risk, ...], Parameter(negative="", show_default=False, group=RARE)
     ] = ()
@@ -173,8 +171,8 @@ class LinkConfig:
 
     def __post_init__(self) -> None:
         """Refuse ids that MAVLink has no room for, and parameters that cannot be set."""
-        if (self.set_params or self.restore_params) and self.readonly:
-            raise UserError("--readonly sets no parameter: leave out --set and --restore-params")
+        if self.set_params and self.readonly:
+            raise UserError("--readonly sets no parameter: leave out --set")
         check_range("source-system", self.source_system, 1, 255, "")
         check_range("target-system", self.target_system, 0, 254, "")
         check_range("connect-timeout", self.connect_timeout, 0.1, 3600, "s")

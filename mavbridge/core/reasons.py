@@ -89,7 +89,12 @@ class Code(StrEnum):
     READING_PARAMETERS = auto()
     REQUESTING_TELEMETRY = auto()
     LOOKING_FOR_RECEIVER = auto()
-    PARAMETERS = auto()
+    SETTING_PARAMETERS = auto()
+    SET_NEEDS_DISARMING = auto()
+    SET_ABSENT = auto()
+    SET_UNANSWERED = auto()
+    SET_REFUSED = auto()
+    CALIBRATION_UNUSABLE = auto()
     OBSTACLE = auto()
     CALIBRATION_CHANGED = auto()
     RISK = auto()
@@ -225,7 +230,24 @@ _REASONS: dict[Code, tuple[Kind, str]] = {
     Code.READING_PARAMETERS: (_WAITING, "reading the vehicle's parameters"),
     Code.REQUESTING_TELEMETRY: (_WAITING, "requesting telemetry from the vehicle"),
     Code.LOOKING_FOR_RECEIVER: (_WAITING, "looking for the pilot's radio receiver"),
-    Code.PARAMETERS: (_VEHICLE, "{said}"),
+    Code.SETTING_PARAMETERS: (_WAITING, "setting the vehicle's parameters"),
+    Code.SET_NEEDS_DISARMING: (_WAITING, "--set waits until the vehicle is disarmed"),
+    Code.SET_ABSENT: (
+        _VEHICLE,
+        "--set {name}={value:g}: the vehicle has sent no such parameter; check its name, then "
+        "start again",
+    ),
+    Code.SET_UNANSWERED: (
+        _VEHICLE,
+        "the vehicle has not answered --set {name}={value:g}: set it with your ground station, or "
+        "leave the flag out",
+    ),
+    Code.SET_REFUSED: (
+        _VEHICLE,
+        "the vehicle did not take --set {name}={value:g}: it stays at {stays:g}; set it with your "
+        "ground station, or leave the flag out",
+    ),
+    Code.CALIBRATION_UNUSABLE: (_VEHICLE, "the vehicle's radio calibration is unusable: {cause}"),
     Code.OBSTACLE: (_VEHICLE, "the vehicle would {what}: {causes}"),
     Code.CALIBRATION_CHANGED: (
         _PILOT,

@@ -37,7 +37,6 @@ def guard_settings(
             state_hz=rates.loops(is_dual=is_dual).state_hz,
             stick_hz=rates.stick_rate + rates.loops(is_dual=is_dual).action_hz,
             min_battery_percent=config.envelope.min_battery,
-            folder=state_folder(),
         ),
         realtime=config.rates.realtime,
         cpu=config.rates.guard_cpu,
@@ -123,13 +122,8 @@ def link_settings(
     state_hz: float,
     stick_hz: float,
     min_battery_percent: float,
-    folder: Path | None = None,
 ) -> LinkSettings:
-    """Settings of a link that asks for telemetry at ``state_hz``.
-
-    ``folder`` remembers the old values of parameters, None: nothing is looked up there, and
-    ``--set`` is an error.
-    """
+    """Settings of a link that asks for telemetry at ``state_hz``."""
     signing = None
     if config.signing_key_file is not None:
         signing = SigningFiles(key_file=config.signing_key_file, state_folder=state_folder())
@@ -143,9 +137,7 @@ def link_settings(
         min_battery_percent=min_battery_percent,
         stick_hz=stick_hz,
         set_params=config.set_params,
-        restore_params=config.restore_params,
         accepted_risks=config.accept_risk,
-        state_folder=folder,
         signing=signing,
     )
 

@@ -101,6 +101,7 @@ class MavlinkLink:
         """We hold the vehicle's sticks, or are giving them back: no other address is followed."""
         self._started_ns = self._heartbeat_due_ns = clock.now_ns()
         self._vehicle: VehicleSession | None = None
+        self._old_params: dict[str, float] = {}
         self._watches_home_height = False
         self._interruption: Reason | None = None
         self._interruptions = 0
@@ -367,6 +368,7 @@ class MavlinkLink:
         self._vehicle = VehicleSession(
             identity,
             self._config,
+            old_params=self._old_params,
             report=self._report,
             has_slow_clock=lambda: self._timesync.slow_pace is not None,
         )

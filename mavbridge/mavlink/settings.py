@@ -40,18 +40,9 @@ class LinkSettings:
     stick_hz: float = 100.0
     """Rate at which sticks will be sent."""
     set_params: tuple[tuple[str, float], ...] = ()
-    """Parameters to set for the flight, by name; needs a state folder."""
-    restore_params: bool = False
-    """Put back what an earlier flight that did not end in order has left set."""
+    """Parameters to set for the flight, by name."""
     accepted_risks: tuple[Risk, ...] = ()
-    state_folder: Path | None = None
-    """Where the old values of parameters are remembered; None: nowhere, and nothing is set."""
     known_params: frozenset[str] | None = None
     """Parameters to ask for, of those that matter: a replay asks as the flight did. None: all."""
     signing: SigningFiles | None = None
     """Sign what is sent, and take only what is signed."""
-
-    def __post_init__(self) -> None:
-        """Refuse to set what could not be remembered."""
-        if self.state_folder is None and (self.set_params or self.restore_params):
-            raise ValueError("parameters are set and put back only with a state_folder")

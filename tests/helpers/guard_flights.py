@@ -9,7 +9,6 @@ import math
 from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -88,7 +87,6 @@ class GuardFlight:
         params: dict[str, float] | None = None,
         contract: Contract = CONTRACT,
         link: dict[str, Any] | None = None,
-        state_folder: Path | None = None,
         vehicle_type: int = 2,
         vehicle: VehicleConfig = NOMINAL_VEHICLE,
         **config: Any,
@@ -117,11 +115,10 @@ class GuardFlight:
         self._compose(
             FlyConfig(link=LinkConfig(connect="memory", **(link or {})), **config),
             contract,
-            state_folder,
         )
         self.clock.schedule(self.clock.now_ns() + STEP_NS, self._step_vehicle)
 
-    def _compose(self, config: FlyConfig, contract: Contract, folder: Path | None) -> None:
+    def _compose(self, config: FlyConfig, contract: Contract) -> None:
         hop_ns = iter(lambda: NS_PER_MS // 10, None)
         to_guard = DelayedChannel(self.clock, hop_ns)
         to_flight = DelayedChannel(self.clock, hop_ns)
@@ -135,7 +132,6 @@ class GuardFlight:
                 state_hz=100.0,
                 stick_hz=config.rates.stick_rate,
                 min_battery_percent=config.envelope.min_battery,
-                folder=folder,
             ),
             forward=lambda packet: self.guard.forward(packet),
         )

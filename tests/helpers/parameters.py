@@ -2,7 +2,6 @@
 
 import random
 from collections.abc import Callable, Iterator
-from pathlib import Path
 from typing import Any
 
 from helpers.wire import CALIBRATION
@@ -61,7 +60,6 @@ class ParamVehicle:
         *,
         profile: Profile = ARDUPILOT,
         output: Output | None = "rc-override",
-        folder: Path | None = None,
         loses: Callable[[int], bool] = lambda _: False,
         values: dict[str, float] | None = None,
         **settings: Any,
@@ -70,13 +68,12 @@ class ParamVehicle:
         self.values = {k: v for k, v in found.items() if v is not None}
         if values is not None:
             self.values = values
-        self.folder = folder if folder is not None else Path("unused")
         self.texts: list[str] = []
         self.params = VehicleParams(
             profile,
-            1,
-            LinkSettings(state_folder=folder, **settings),
+            LinkSettings(**settings),
             streams=profile.streams(state_hz=100.0),
+            old_params={},
             report=self.texts.append,
         )
         if output is not None:
@@ -89,7 +86,6 @@ class ParamVehicle:
         """Parameters that stand byte for byte in the float."""
         self.refuses: set[str] = set()
         """Parameters that keep their value."""
-        self.unique_id: str | None = "ab12"
         self._loses = loses
         self._packets = 0
         self._answers: list[ParamValue] = []
@@ -122,7 +118,7 @@ class ParamVehicle:
         for answer in answers:
             if self._arrives():
                 self.params.receive(answer, report)
-        for request in self.params.step(self.now_ns, report, unique_id=self.unique_id):
+        for request in self.params.step(self.now_ns, report):
             self.requests.append(request)
             if self._arrives() and not isinstance(request, CommandRequest):
                 self._answers += self._answer(request)

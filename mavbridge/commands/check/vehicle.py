@@ -191,8 +191,6 @@ def checking_settings(config: FlyConfig, policy: PolicyFindings, *, sends: bool)
         guard.link,
         readonly=not sends,
         set_params=(),
-        restore_params=False,
-        state_folder=None,
     )
 
 

@@ -19,12 +19,6 @@ ReplayFrom = Literal["auto", "chunks", "features", "video"]
 class ReplayConfig:
     """What is computed once more, and what is different from the flight; nothing by default."""
 
-    video: Annotated[Path | None, Parameter(group=POLICY)] = None
-    """Images to a telemetry log."""
-    video_start: Annotated[float, Parameter(group=POLICY)] = 0.0
-    """Seconds from the first packet of the log to the first image of --video."""
-    episode: Annotated[int, Parameter(group=POLICY)] = 0
-    """Number of the episode, where a LeRobot dataset is replayed."""
     source: Annotated[ReplayFrom, Parameter(name="--from", group=POLICY)] = "auto"
     """chunks: the guard alone, with the recorded chunks and without a policy; features: the policy
     from the recorded features; video: the encoder as well, from the recorded video, which is lossy.
@@ -65,14 +59,6 @@ class ReplayConfig:
             raise UserError(
                 "--from chunks takes the recorded chunks and asks no policy: leave out the flags "
                 "of the policy, or use --from features or video"
-            )
-
-    def require_others(self) -> None:
-        """Refuse what only a flight of our own can be asked for; raises UserError."""
-        if self.source != "auto" or self.changes_limits or self.tolerance is not None:
-            raise UserError(
-                "--from, --tolerance and the limits are for flights recorded by mavbridge: another "
-                "recording has no chunks, features or guard to compute once more"
             )
 
     @property

@@ -2,11 +2,12 @@
 
 import json
 from dataclasses import asdict, dataclass
+from pathlib import Path
 
 from rich.console import Console
 from rich.text import Text
 
-from mavbridge.commands.output import make_table
+from mavbridge.commands.output import BLUE, FIGURE_DPI, FIGURE_STYLE, GREY, MUTED, make_table
 from mavbridge.commands.replay.config import ReplayFrom
 from mavbridge.core.vehicle import ACTION_CLASSES
 from mavbridge.simulation.replay.compare import (
@@ -138,3 +139,29 @@ def _finite(value: object) -> object:
     if isinstance(value, list | tuple):
         return [_finite(each) for each in value]
     return None if isinstance(value, float) and value in (float("inf"),) else value
+
+
+def draw(result: ReplayResult, path: Path) -> None:
+    """Draw the smoothed sticks, recorded and replayed: one row each, over the time."""
+    from matplotlib import rc_context
+    from matplotlib.figure import Figure
+
+    names = ACTION_CLASSES[result.source.contract.action]._fields
+    sticks = result.sticks
+    with rc_context(FIGURE_STYLE):
+        figure = Figure(figsize=(12.0, 8.0), dpi=FIGURE_DPI, facecolor="white")
+        rows = figure.subplots(4, 1, sharex=True)
+        for number, (axes, name) in enumerate(zip(rows, names, strict=True)):
+            for values, label, color, width in (
+                (sticks.recorded, "recorded", GREY, 3.0),
+                (sticks.replayed, "replayed", BLUE, 1.2),
+            ):
+                axes.plot(sticks.times_s, values[:, number], color=color, lw=width, label=label)
+            largest = sticks.deviation.largest[number]
+            axes.set_title(f"{name}, largest difference {largest:.2g}", fontsize=10)
+        rows[0].legend(loc="upper right", ncols=2)
+        rows[-1].set_xlabel("s since the first tick")
+        title = f"{result.source.folder.name}: smoothed actions, replayed from {result.chosen}"
+        figure.suptitle(title, x=0.012, ha="left", color=MUTED, fontsize=10)
+        figure.tight_layout(rect=(0, 0, 1, 0.98))
+        figure.savefig(path)

@@ -9,8 +9,7 @@ import cv2
 
 from mavbridge.commands.output import print_status, require_outputs, table_console
 from mavbridge.commands.replay.config import ReplayConfig, ReplayFrom
-from mavbridge.commands.replay.others import replay_dataset, replay_log
-from mavbridge.commands.replay.results import ReplayResult, print_replay, to_json
+from mavbridge.commands.replay.results import ReplayResult, draw, print_replay, to_json
 from mavbridge.config.flight import FlyConfig
 from mavbridge.config.trust import foreign_policy
 from mavbridge.core.clock import NS_PER_S
@@ -37,7 +36,6 @@ from mavbridge.simulation.replay.guard import (
 )
 from mavbridge.simulation.replay.policy import SolvePair, replay_policy
 from mavbridge.simulation.replay.recording import ReplaySource, open_source
-from policy.data.lerobot import is_lerobot
 from policy.protocol import Executable
 
 VIDEO_TOLERANCE = 0.15
@@ -52,19 +50,11 @@ CLOCK_TOLERANCE = 0.01
 def replay(folder: Path, config: ReplayConfig) -> int:
     """Compute a recorded flight once more; returns an ``ExitCode``.
 
-    ``folder`` may be a recording of somebody else, see ``others``.
-
     Raises:
         MavbridgeError: the flight cannot be read or replayed, or the policy not be loaded.
     """
     require_extra("replay")
     require_outputs(config.json, config.plot)
-    if folder.is_file():
-        return replay_log(folder, other_config(FlyConfig(), config), config)
-    if config.video is not None:
-        raise UserError(f"--video belongs to a telemetry log, and {folder} is none")
-    if is_lerobot(folder):
-        return replay_dataset(folder, other_config(FlyConfig(), config), config)
     source = open_source(folder)
     config = _trusted(source, config)
     chosen = _source_of(source, config)
@@ -107,7 +97,11 @@ def replay(folder: Path, config: ReplayConfig) -> int:
             is_scripted=is_scripted(flown.config.policy),
         ),
     )
-    _write(result, config)
+    print_replay(result, table_console())
+    if config.json is not None:
+        config.json.write_text(to_json(result))
+    if config.plot is not None:
+        draw(result, config.plot)
     return ExitCode.DONE if result.is_equal else ExitCode.DIFFERENT
 
 
@@ -253,13 +247,3 @@ def _other_chunks(executable: Executable, pairs: Sequence[SolvePair]) -> dict[in
         for pair in pairs
         if pair.replayed is not None
     }
-
-
-def _write(result: ReplayResult, config: ReplayConfig) -> None:
-    print_replay(result, table_console())
-    if config.json is not None:
-        config.json.write_text(to_json(result))
-    if config.plot is not None:
-        from mavbridge.commands.replay.figure import make_figure
-
-        make_figure(result).savefig(config.plot)

@@ -214,8 +214,6 @@ class AutopilotVersion(NamedTuple):
     """AUTOPILOT_VERSION (148)."""
 
     version: str
-    unique_id: str = ""
-    """The hardware's own number in hexadecimal digits; empty if it has none."""
 
 
 Body: TypeAlias = (

@@ -174,9 +174,7 @@ def _velocity_target(m: dialect.MAVLink_position_target_local_ned_message) -> Bo
 
 def _autopilot_version(m: dialect.MAVLink_autopilot_version_message) -> Body:
     v = m.flight_sw_version
-    version = f"{v >> 24 & 255}.{v >> 16 & 255}.{v >> 8 & 255}"
-    number = bytes(m.uid2).rstrip(b"\0").hex() or (f"{m.uid:x}" if m.uid else "")
-    return AutopilotVersion(version=version, unique_id=number)
+    return AutopilotVersion(f"{v >> 24 & 255}.{v >> 16 & 255}.{v >> 8 & 255}")
 
 
 READERS: dict[str, Callable[[dialect.MAVLink_message], Body | None]] = {

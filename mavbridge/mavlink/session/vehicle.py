@@ -49,7 +49,6 @@ _FASTEST_CLOCK, _BOOT_SLACK_NS = 10, NS_PER_S
 """A vehicle that has rebooted runs for no longer than it was silent, by a simulator's clock too."""
 _VERSION_TIMEOUT_NS = 400 * NS_PER_MS
 _VERSION_ATTEMPTS = 8
-"""Its unique id names the file of remembered parameters: worth more than one lost packet."""
 
 
 class VehicleSession:
@@ -67,9 +66,11 @@ class VehicleSession:
         identity: VehicleIdentity,
         config: LinkSettings,
         *,
+        old_params: dict[str, float],
         report: Callable[[str], None],
         has_slow_clock: Callable[[], bool] = lambda: False,
     ) -> None:
+        """``old_params``: filled with the values from before ``--set``, by name."""
         self.profile = require_profile(identity.autopilot, identity.vehicle_type)
         self.identity = identity
         self._report = report
@@ -82,13 +83,12 @@ class VehicleSession:
         self.is_released = True
         """Other sticks than ours were seen since, or none of ours was sent."""
         self.version: str | None = None
-        self._unique_id = ""
         self._version_attempts = 0
         self._version_due_ns = 0
         streams = self.profile.streams(state_hz=config.state_hz, pilot_hz=config.pilot_hz)
         self._streams = StreamRequester(streams, report=report, has_slow_clock=has_slow_clock)
         self._params = VehicleParams(
-            self.profile, identity.source.system, config, streams=streams, report=report
+            self.profile, config, streams=streams, old_params=old_params, report=report
         )
         self._receiver_due_ns: int | None = None
         """End of the wait for a receiver to show; None until the streams are granted."""
@@ -132,8 +132,8 @@ class VehicleSession:
                 self._params.receive(body, self.status(arrived_ns))
             case ParamAbsent(name):
                 self._params.absent(name)
-            case AutopilotVersion(version, unique_id):
-                self.version, self._unique_id = version, unique_id
+            case AutopilotVersion(version):
+                self.version = version
             case StatusText():
                 self._show(*self._texts.receive(body, arrived_ns))
             case Event(event_id) if (meaning := self.profile.events.get(event_id)) is not None:
@@ -185,8 +185,7 @@ class VehicleSession:
             number = float(message_id("AUTOPILOT_VERSION"))
             yield CommandRequest(dialect.MAV_CMD_REQUEST_MESSAGE, (number,))
         # Streams come after parameters: a vehicle slows its streams down while it sends those.
-        unique_id = None if is_version_open else self._unique_id
-        yield from self._params.step(now_ns, self.status(now_ns), unique_id=unique_id)
+        yield from self._params.step(now_ns, self.status(now_ns))
         if not self._params.is_read:
             return
         if (request := self._streams.step(now_ns)) is not None:

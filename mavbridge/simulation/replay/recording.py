@@ -78,7 +78,7 @@ def open_source(folder: Path) -> ReplaySource:
     config = settings.config
     config = replace(
         config,
-        link=replace(config.link, set=(), restore_params=False),
+        link=replace(config.link, set=()),
         policy=replace(config.policy, dual_rate=meta.mode == "dual"),
         record=None,
     )

@@ -1,7 +1,6 @@
 """What the flags and the contract tell the guard."""
 
 from dataclasses import replace
-from pathlib import Path
 
 import pytest
 
@@ -35,10 +34,7 @@ def settings_for(
     return plan_flight(config or FlyConfig(link=LINK), contract, is_dual=is_dual).guard
 
 
-def test_the_process_is_told_what_the_flags_say(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setenv("XDG_STATE_HOME", str(tmp_path))
+def test_the_process_is_told_what_the_flags_say() -> None:
     config = FlyConfig(
         link=replace(LINK, source_system=254),
         rates=Rates(stick_rate=250.0, realtime=False, guard_cpu=1),
@@ -48,7 +44,6 @@ def test_the_process_is_told_what_the_flags_say(
     link = settings.link
     assert (link.connect, link.source_system) == ("udp:127.0.0.1:14550", 254)
     assert (link.state_hz, link.stick_hz, link.min_battery_percent) == (100.0, 350.0, 25.0)
-    assert link.state_folder == tmp_path / "mavbridge"
     assert (settings.realtime, settings.cpu) == (False, 1)
     assert (settings.tlog_fd, settings.wall_offset_ns) == (7, 5)
 

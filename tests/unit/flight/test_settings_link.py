@@ -8,23 +8,18 @@ import pytest
 from mavbridge.config.flight import LinkConfig
 from mavbridge.core.errors import UserError
 from mavbridge.flight.settings import link_settings, state_folder
-from mavbridge.mavlink.settings import LinkSettings
 
 
-def test_parameters_and_risks_reach_the_link(tmp_path: Path) -> None:
+def test_parameters_and_risks_reach_the_link() -> None:
     config = LinkConfig(
         set=("rc_override_time=0.5", "FS_THR_ENABLE=1"),
-        restore_params=True,
         accept_risk=("slow-serial",),
     )
-    settings = link_settings(
-        config, state_hz=100.0, stick_hz=200.0, min_battery_percent=15.0, folder=tmp_path
-    )
+    settings = link_settings(config, state_hz=100.0, stick_hz=200.0, min_battery_percent=15.0)
     assert settings.set_params == (("RC_OVERRIDE_TIME", 0.5), ("FS_THR_ENABLE", 1.0))
-    assert settings.restore_params
     assert settings.accepted_risks == ("slow-serial",)
     assert settings.min_battery_percent == 15.0
-    assert (settings.stick_hz, settings.state_folder) == (200.0, tmp_path)
+    assert settings.stick_hz == 200.0
 
 
 @pytest.mark.parametrize(
@@ -39,17 +34,11 @@ def test_parameters_and_risks_reach_the_link(tmp_path: Path) -> None:
         ({"set": ("../../A=1",)}, "NAME=VALUE"),
         ({"set": ("A=1", "a=2")}, "names A twice"),
         ({"set": ("A=1",), "readonly": True}, "--readonly sets no parameter"),
-        ({"restore_params": True, "readonly": True}, "--readonly sets no parameter"),
     ],
 )
 def test_what_cannot_be_set_is_refused_at_the_door(flags: dict[str, Any], message: str) -> None:
     with pytest.raises(UserError, match=message):
         LinkConfig(**flags)
-
-
-def test_nothing_is_set_that_would_be_remembered_nowhere() -> None:
-    with pytest.raises(ValueError, match="state_folder"):
-        LinkSettings(set_params=(("A", 1.0),))
 
 
 def test_the_state_folder_follows_the_users_environment(

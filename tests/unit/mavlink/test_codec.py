@@ -150,16 +150,6 @@ CASES: list[tuple[dialect.MAVLink_message, Body]] = [
         m.autopilot_version_encode(0, 0x04070100, 0, 0, 0, *[b"\0" * 8] * 3, 0, 0, 0),
         AutopilotVersion(version="4.7.1"),
     ),
-    (
-        m.autopilot_version_encode(0, 0x04070100, 0, 0, 0, *[b"\0" * 8] * 3, 0, 0, 0xAB),
-        AutopilotVersion(version="4.7.1", unique_id="ab"),
-    ),
-    (
-        m.autopilot_version_encode(
-            0, 0x04070100, 0, 0, 0, *[b"\0" * 8] * 3, 0, 0, 1, b"\x01\xff".ljust(18, b"\0")
-        ),
-        AutopilotVersion(version="4.7.1", unique_id="01ff"),
-    ),
 ]
 
 

@@ -1,6 +1,5 @@
 """Parameters: read, judged before a flight, watched in flight."""
 
-from pathlib import Path
 from typing import Any
 
 import pytest
@@ -269,14 +268,12 @@ def test_a_vehicle_without_the_decisive_parameters_is_flown_with_a_warning() -> 
     [("SIMPLE", 63.0, "SIMPLE=0"), ("RC7_OPTION", 13.0, "RC7_OPTION=0"), ("THR_DZ", 90.0, "")],
 )
 def test_simple_mode_that_is_set_off_is_switched_off_as_well(
-    name: str, before: float, flag: str, tmp_path: Path
+    name: str, before: float, flag: str
 ) -> None:
     """By its parameter alone it would last until the mode switch moves."""
     wanted = flag or "THR_DZ=100"
     key, _, value = wanted.partition("=")
-    vehicle = ParamVehicle(
-        {name: before, "SUPER_SIMPLE": 0.0}, folder=tmp_path, set_params=((key, float(value)),)
-    )
+    vehicle = ParamVehicle({name: before, "SUPER_SIMPLE": 0.0}, set_params=((key, float(value)),))
     vehicle.run(10.0)
     off = CommandRequest(dialect.MAV_CMD_DO_AUX_FUNCTION, (3.0, 0.0))
 
@@ -442,10 +439,9 @@ def test_a_px4_that_does_not_listen_to_mavlinks_sticks_is_refused(mode: float) -
     assert setpoints.problem() is None
 
 
-def test_px4s_parameters_are_set_with_their_type_and_put_back(tmp_path: Path) -> None:
+def test_px4s_parameters_are_set_with_their_type_and_put_back() -> None:
     vehicle = px4_vehicle(
         {"COM_RC_IN_MODE": 0.0},
-        folder=tmp_path,
         set_params=(("COM_RC_IN_MODE", 1.0), ("COM_RC_LOSS_T", 0.3)),
     )
     vehicle.integers = {"COM_RC_IN_MODE"}

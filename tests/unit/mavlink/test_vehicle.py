@@ -66,7 +66,10 @@ class Session:
     def __init__(self, autopilot: str = "ardupilot", *, is_ready: bool = True, **link: Any) -> None:
         self.texts: list[str] = []
         self.session = VehicleSession(
-            identity(AUTOPILOTS[autopilot]), LinkSettings(**link), report=self.texts.append
+            identity(AUTOPILOTS[autopilot]),
+            LinkSettings(**link),
+            old_params={},
+            report=self.texts.append,
         )
         self.output = choose_output(
             ActionMeaning(),
@@ -135,7 +138,9 @@ class Session:
 def test_what_cannot_be_flown_is_refused() -> None:
     for autopilot, vehicle_type in ((3, 1), (12, 1), (0, 2), (8, 2)):
         with pytest.raises(PeerError, match="flown"):
-            VehicleSession(identity(autopilot, vehicle_type), LinkSettings(), report=print)
+            VehicleSession(
+                identity(autopilot, vehicle_type), LinkSettings(), old_params={}, report=print
+            )
 
 
 @pytest.mark.parametrize(

@@ -40,7 +40,7 @@ def assess(profile: Profile, values: Mapping[str, float], context: ParamContext)
     try:
         ours = profile.calibration(values)
     except ValueError as error:
-        unusable = f"the vehicle's radio calibration is unusable: {error}" if is_override else None
+        unusable = str(error) if is_override else None
     return Assessment(
         ours,
         unusable,

@@ -35,14 +35,13 @@ class VehicleParams:
     def __init__(
         self,
         profile: Profile,
-        system: int,
         config: LinkSettings,
         *,
         streams: tuple[StreamGroup, ...],
+        old_params: dict[str, float],
         report: Callable[[str], None],
     ) -> None:
         self._profile = profile
-        self._system = system
         self._config = config
         self._report = report
         self._output: Output | None = None
@@ -54,10 +53,10 @@ class VehicleParams:
         """MAV_PARAM_TYPE of each parameter that matters and was heard."""
         self._has_asked_more = False
         self._again_ns = 0
+        self._reader.request(tuple(name for name, _ in config.set_params))
         self._changes = TemporaryParams(
             config.set_params,
-            restores_leftovers=config.restore_params,
-            folder=config.state_folder,
+            before=old_params,
             report=report,
         )
         self._follow_up: CommandRequest | None = None
@@ -134,15 +133,9 @@ class VehicleParams:
         return assessment
 
     def step(
-        self, now_ns: int, status: VehicleStatus | None, *, unique_id: str | None
+        self, now_ns: int, status: VehicleStatus | None
     ) -> Iterator[ParamRequest | ParamWrite | CommandRequest]:
-        """Requests that are due.
-
-        ``unique_id`` is the autopilot's own, empty if it has none, and None while it is not known.
-        """
-        if self._changes.is_opening and unique_id is not None:
-            name = f"vehicle-{self._system}-{unique_id}" if unique_id else f"vehicle-{self._system}"
-            self._reader.request(self._changes.open(name))
+        """Requests that are due."""
         yield from self._reader.step(now_ns)
         if self._reader.is_done:
             self._ask_for_missing(now_ns, status)
@@ -217,8 +210,7 @@ class VehicleParams:
         """Why nothing may begin yet, whatever the output, or None."""
         if not self.is_read:
             return because(Code.READING_PARAMETERS)
-        said = self._changes.problem()
-        return None if said is None else because(Code.PARAMETERS, said=said)
+        return self._changes.problem()
 
     def output_problem(self, status: VehicleStatus | None) -> Reason | None:
         """Why a flight with the output may not begin or go on with these parameters, or None."""
@@ -234,7 +226,7 @@ class VehicleParams:
             )
             return because(Code.OBSTACLE, what=what, causes="; ".join(assessment.obstacles))
         if assessment.unusable is not None:
-            return because(Code.PARAMETERS, said=assessment.unusable)
+            return because(Code.CALIBRATION_UNUSABLE, cause=assessment.unusable)
         if self._output == "rc-override" and assessment.calibration != self.calibration:
             return because(Code.CALIBRATION_CHANGED)
         for danger in self._dangers(assessment):
