@@ -49,7 +49,7 @@ def main(job: FlightJob) -> None:
 
 
 def eager_toge(policy: PolicyConfig) -> Toge:
-    """The network alone: the shipped TOGE, or with ``--allow-untrained`` seeded random weights."""
+    """The network alone: the shipped TOGE, or seeded weights by ``network.allow_untrained``."""
     torch.manual_seed(policy.seed)
     if policy.allow_untrained:
         net = build_policy(TogeConfig(size="small"))

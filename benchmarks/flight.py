@@ -14,6 +14,7 @@ from contextlib import ExitStack
 from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
+from typing import get_type_hints
 
 from cyclopts import App, Parameter
 
@@ -112,14 +113,18 @@ def fly(
 def to_flags(config: FlightJob | PolicyConfig | Rates) -> tuple[str, ...]:
     """The command line that is parsed back into ``config``."""
     flags: list[str] = []
+    hints = get_type_hints(type(config), include_extras=True)
     for each in fields(config):
-        name, value = each.name.replace("_", "-"), getattr(config, each.name)
+        value = getattr(config, each.name)
+        marks = getattr(hints[each.name], "__metadata__", ())
+        names = [name for mark in marks if isinstance(mark, Parameter) for name in mark.name or ()]
+        name = names[0] if names else f"--{each.name.replace('_', '-')}"
         if isinstance(value, PolicyConfig | Rates):
             flags += to_flags(value)
         elif isinstance(value, bool):
-            flags.append(f"--{name}" if value else f"--no-{name}")
+            flags.append(f"{name}={str(value).lower()}")
         elif value is not None:
-            flags += [f"--{name}", str(value)]
+            flags += [name, str(value)]
     return tuple(flags)
 
 

@@ -15,12 +15,11 @@ from cyclopts import App, Parameter
 from rich.console import Console
 
 from benchmarks.results import to_json
+from benchmarks.serial_rollout import SerialOutput
+from mavbridge.commands.imagine.inputs import RolloutStart, Sampler, torch_threads
 from mavbridge.commands.imagine.loop import RolloutPlan, WorldModelDecider
-from mavbridge.commands.imagine.output import SerialOutput
+from mavbridge.commands.imagine.output import StreamedOutput
 from mavbridge.commands.imagine.run import load_model, run_rollout
-from mavbridge.commands.imagine.sampling import Sampler, torch_threads
-from mavbridge.commands.imagine.start import RolloutStart
-from mavbridge.commands.imagine.streamed import StreamedOutput
 from mavbridge.core.clock import NS_PER_S, MonotonicClock
 from mavbridge.core.records import ImageArray, RolloutFrame
 from mavbridge.core.vehicle import NEUTRAL

@@ -45,33 +45,43 @@ class Setting(NamedTuple):
     flags: str
 
 
+def rates(visual_hz: int, action_hz: int) -> str:
+    """Return the flags for these rates."""
+    return f"--set-config rates.visual={visual_hz} --set-config rates.action={action_hz}"
+
+
 SETTINGS = (
     Setting("rates", "30 images, 100 actions a second; 1 step", DUAL),
-    Setting("rates", "14 and 32", f"{FROM_NOISE} 10 --visual-rate 14 --action-rate 32"),
+    Setting("rates", "14 and 32", f"{FROM_NOISE} 10 {rates(14, 32)}"),
     Setting(  # eager torch takes 55 ms longer than 11 ms for an image, at 14 images a second
         "rates",
         "14 and 32, encoding 55 ms longer: eager torch",
-        f"{FROM_NOISE} 10 --visual-rate 14 --action-rate 32 "
-        "--max-feature-age 0.5 --vision-delay 55",
+        f"{FROM_NOISE} 10 {rates(14, 32)} --set-config limits.feature_age=0.5 --vision-delay 55",
     ),
     Setting(  # benchmarks.baseline with EfficientNet-B3 on two cores without AVX-512
         "rates",
         "5 and 10, encoding 170 ms longer: baseline",
-        f"{FROM_NOISE} 10 --visual-rate 5 --action-rate 10 --max-feature-age 1 --vision-delay 170",
+        f"{FROM_NOISE} 10 {rates(5, 10)} --set-config limits.feature_age=1 --vision-delay 170",
     ),
-    Setting("rates", "single rate, 30", f"--single-rate --rate 30 {FROM_NOISE} 10"),
-    Setting("rates", "50 actions", f"{DUAL} --action-rate 50"),
-    Setting("rates", "250 actions", f"{DUAL} --action-rate 250"),
+    Setting(
+        "rates", "single rate, 30", f"--single-rate --set-config rates.single=30 {FROM_NOISE} 10"
+    ),
+    Setting("rates", "50 actions", f"{DUAL} --set-config rates.action=50"),
+    Setting("rates", "250 actions", f"{DUAL} --set-config rates.action=250"),
     Setting("steps", "10 steps, from noise", f"{FROM_NOISE} 10"),
     Setting("steps", "4 steps, from noise", f"{FROM_NOISE} 4"),
     Setting("steps", "2 steps, from noise", f"{FROM_NOISE} 2"),
-    Setting("smoothing", "no smoothing", f"{DUAL} --tau 0 --max-slew 1000"),
+    Setting(
+        "smoothing",
+        "no smoothing",
+        f"{DUAL} --set-config limits.tau=0 --set-config limits.slew=1000",
+    ),
     Setting("vehicle", "other vehicles, firmware, wind, light", f"{DUAL} --conditions random"),
     *(
         Setting(
             group,
             f"images {delay_ms} ms later{group.removeprefix(DELAYED)}",
-            f"{DUAL} --max-feature-age 0.5 --vision-delay {delay_ms}",
+            f"{DUAL} --set-config limits.feature_age=0.5 --vision-delay {delay_ms}",
         )
         for group in (DELAYED, DELAYED_WITHOUT_AGE)
         for delay_ms in DELAYS_MS

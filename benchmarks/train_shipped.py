@@ -26,6 +26,8 @@ app = App(help=__doc__)
 
 HERE = Path(__file__).parent
 
+SIZE = "--set-config network.image_size=96"
+"""Of the recorded images."""
 NET = "--policy toge:small:resnet8 --image-size 96 --batch-size 64"
 RACES, PX4 = "--action rates --courses race", "--autopilot px4"
 STICK_AGES, RATE_AGES = "--ages 10:220", "--ages 10:140"
@@ -106,7 +108,7 @@ def main(policy: Literal["toge", "toge-rates"], *, out: Path, workers: int = 2) 
         copy_weights_before(folder / "before.safetensors")
     for step in STEPS[policy]:
         if step.command.startswith("demonstrate"):
-            run(folder, f"{step.command} --image-size 96 --workers {workers} --out {step.makes}")
+            run(folder, f"{step.command} {SIZE} --workers {workers} --out {step.makes}")
         elif not (folder / step.makes).exists():
             unfinished = folder / Path(step.makes).with_suffix(".training")
             resume = " --resume" if unfinished.exists() else ""

@@ -48,7 +48,10 @@ MOST_HZ = 100.0
 """Most that a single loop is asked for: the rate of the vehicle's state."""
 CAMERA_HZ = 30.0
 PANELS_A_ROW = 3
-LOOSE = "--max-attitude-age 2 --max-velocity-age 2 --max-feature-age 2 --max-chunk-age 2"
+LOOSE = " ".join(
+    f"--set-config limits.{age}=2"
+    for age in ("attitude_age", "velocity_age", "feature_age", "chunk_age")
+)
 """Nothing is refused for its age: what age costs is what is measured."""
 app = App(help=__doc__)
 
@@ -161,9 +164,14 @@ def flags_of(loop: Loop, encoder_ms: int) -> str:
     images_hz = min(CAMERA_HZ, 1000 / encoder_ms)
     if loop == "one rate":
         rate_hz = min(MOST_HZ, 1000 / (encoder_ms + HEAD_MS))
-        return f"--single-rate --rate {rate_hz:.4g} --visual-rate {max(CAMERA_HZ, rate_hz):.4g}"
+        images_hz = max(CAMERA_HZ, rate_hz)
+        return (
+            f"--single-rate --set-config rates.single={rate_hz:.4g} "
+            f"--set-config rates.visual={images_hz:.4g}"
+        )
     action_hz = loop.partition(" ")[0]
-    return f"--dual-rate --visual-rate {images_hz:.4g} --action-rate {action_hz}"
+    visual = f"--set-config rates.visual={images_hz:.4g}"
+    return f"--dual-rate {visual} --set-config rates.action={action_hz}"
 
 
 def evaluate(

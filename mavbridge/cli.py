@@ -2,35 +2,37 @@
 
 import difflib
 import os
-import re
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated
 
 from cyclopts import App, CycloptsError, Parameter, UnusedCliTokensError
-from cyclopts.argument import ArgumentCollection, update_argument_collection
-from cyclopts.config import Dict
 from rich.text import Text
 
 import mavbridge
 from mavbridge.commands.config import (
     CheckConfig,
     ContractConfig,
-    DemonstrateConfig,
     ExportConfig,
     ExportPolicyConfig,
     IdentifyConfig,
     ImagineConfig,
     InspectConfig,
+    RecordConfig,
+    ReplayConfig,
     ServeConfig,
 )
-from mavbridge.commands.evaluate.config import EvaluateConfig
-from mavbridge.commands.record.config import RecordConfig
-from mavbridge.commands.replay.config import ReplayConfig
+from mavbridge.config.episodes import DemonstrateConfig, EvaluateConfig
+from mavbridge.config.flags import RARE
 from mavbridge.config.flight import FlyConfig
-from mavbridge.config.groups import RARE
-from mavbridge.config.trust import untrusted_settings
+from mavbridge.config.settings_files import (
+    Settings,
+    given_settings,
+    print_settings,
+    untrusted_settings,
+    with_home,
+)
 from mavbridge.core.errors import UserError
 from mavbridge.core.log import run_log
 from mavbridge.core.realtime import require_supported_system
@@ -51,10 +53,6 @@ EXIT_CODES = """Exit status: 0 done, and a flight flown and ended in order; 1 a 
 off the ground, or disarmed under the policy; 4 flown, and ended by a fault; 6 flown, and
 crashed; 128 + its number: a signal before the flight.
 """
-
-
-_HOME = re.compile(r"((?:--[\w.-]+=)?(?:[a-z]+:)?)(~[^/]*(?:/.*)?)")
-"""A path below a home directory, behind a flag's name or a prefix such as ``lerobot:``."""
 
 
 def _shown_default(value: object) -> str | None:
@@ -84,13 +82,18 @@ cli.register_install_completion_command(
 cli.meta.error_formatter = _as_ours
 
 
+def _require_vehicle(connect: str) -> None:
+    if not connect:
+        raise UserError("name the vehicle: --connect udp:127.0.0.1:14550 (see --help)")
+    require_supported_system()
+
+
 @cli.command(name="fly")
 @cli.default
 def fly(config: FlyConfig | None = None) -> int:
     """Fly; the default command. The policy gets the sticks by an explicit act, such as --arm."""
-    if config is None or not config.link.connect:
-        raise UserError("name the vehicle: --connect udp:127.0.0.1:14550 (see --help)")
-    require_supported_system()
+    config = config or FlyConfig()
+    _require_vehicle(config.link.connect)
     from mavbridge.flight.app import fly as run_flight
 
     return run_flight(config)
@@ -100,9 +103,8 @@ def fly(config: FlyConfig | None = None) -> int:
 def check(config: CheckConfig | None = None) -> int:
     """Say whether a flight could begin: give it the flags of the flight. --connect none, --policy
     none and --camera none leave those out. Exit status: 0 go, 3 no-go."""
-    if config is None or not config.flight.link.connect:
-        raise UserError("name the vehicle: --connect udp:127.0.0.1:14550 (see --help)")
-    require_supported_system()
+    config = config or CheckConfig()
+    _require_vehicle(config.flight.link.connect)
     from mavbridge.commands.check.run import check as run_check
 
     return run_check(config)
@@ -111,10 +113,9 @@ def check(config: CheckConfig | None = None) -> int:
 @cli.command
 def identify(config: IdentifyConfig | None = None) -> int:
     """Fly steps on each axis, and compare the vehicle's gains and lags with a policy's training."""
-    if config is None or not config.flight.link.connect:
-        raise UserError("name the vehicle: --connect udp:127.0.0.1:14550 (see --help)")
-    require_supported_system()
-    from mavbridge.commands.identify.run import identify as run_identification
+    config = config or IdentifyConfig()
+    _require_vehicle(config.flight.link.connect)
+    from mavbridge.commands.identify import identify as run_identification
 
     return run_identification(config)
 
@@ -122,9 +123,7 @@ def identify(config: IdentifyConfig | None = None) -> int:
 @cli.command
 def record(config: RecordConfig) -> int:
     """Record a human pilot's flights, to learn from; nothing is sent but requests."""
-    if not config.vehicle.connect:
-        raise UserError("name the vehicle: --connect udp:127.0.0.1:14550 (see --help)")
-    require_supported_system()
+    _require_vehicle(config.vehicle.connect)
     require_extra("record")
     from mavbridge.commands.record.run import record as run_recording
 
@@ -309,6 +308,8 @@ def contract(source: Path, config: ContractConfig | None = None) -> int:
 def with_config(
     *tokens: Annotated[str, Parameter(show=False, allow_leading_hyphen=True)],
     config: Annotated[Path | None, Parameter(group=RARE)] = None,
+    set_config: Annotated[tuple[str, ...], Parameter(negative="", group=RARE)] = (),
+    print_config: Annotated[bool, Parameter(negative="", group=RARE)] = False,
     trust_config: Annotated[bool, Parameter(negative="", group=RARE)] = False,
     verbose: Annotated[bool, Parameter(name=("--verbose", "-v"), negative="", group=RARE)] = False,
     log_file: Annotated[Path | None, Parameter(group=RARE)] = None,
@@ -317,14 +318,21 @@ def with_config(
 
     Args:
         tokens: the rest of the command line.
-        config: TOML file with flags as keys; flags given on the command line win.
+        config: TOML file with flags as keys, and with sections of further settings; flags given on
+            the command line win.
+        set_config: SECTION.KEY=VALUE: one setting of such a file, as in limits.attitude_age=0.2;
+            may be given more than once.
+        print_config: print a settings file with every setting of the command, and end.
         trust_config: let that file name programs (a policy in Python, pipe: cameras), other
             computers, and places outside the working directory to write to.
         verbose: show details: engine, vehicle, streams, parameters.
         log_file: add what is shown, details and times to this file.
     """
     _check_command(tokens)
-    cli.config = []
+    if print_config:
+        print_settings(cli[tokens[0]] if tokens and tokens[0] in cli else cli)
+        return 0
+    cli.config = [Settings(given_settings(set_config), source="--set-config", commands=tuple(cli))]
     if config is not None:
         try:
             document = read_toml(user_path(config))
@@ -337,40 +345,10 @@ def with_config(
                 f"--config {config}: {flag} {value!r} names {what}, which a file may not do by "
                 f"itself: give {flag} on the command line, or --trust-config if you know the file"
             )
-        cli.config = [_Settings(_with_home(document), source=str(config))]
+        cli.config = [*cli.config, Settings(document, source=str(config), commands=tuple(cli))]
     with run_log(log_file, verbose=verbose):
-        status: int | None = cli(_with_home(list(tokens)))
+        status: int | None = cli(with_home(list(tokens)))
     return status or 0
-
-
-class _Settings(Dict):
-    """A settings file. Its keys are flags, of which some are named as commands: record, serve."""
-
-    def __call__(self, app: App, commands: tuple[str, ...], arguments: ArgumentCollection) -> None:
-        """See ``Dict``, which leaves such keys out; tables for other commands stay left out."""
-        flags = {k: v for k, v in self.data.items() if not (isinstance(v, dict) and k in cli)}
-        update_argument_collection(
-            flags,
-            self.source,
-            arguments,
-            app.app_stack.stack[-1],
-            root_keys=(),
-            allow_unknown=self.allow_unknown,
-        )
-
-
-def _with_home(value: Any) -> Any:
-    """Return words or settings with ``~`` expanded in each text that names a path.
-
-    Shells leave it alone behind a colon or an equals sign: ``lerobot:~/act``, ``--out=~/flights``.
-    """
-    if isinstance(value, str) and (found := _HOME.match(value)) is not None:
-        return f"{found[1]}{user_path(found[2])}"
-    if isinstance(value, list):
-        return [_with_home(each) for each in value]
-    if isinstance(value, dict):
-        return {name: _with_home(each) for name, each in value.items()}
-    return value
 
 
 def _check_command(tokens: tuple[str, ...]) -> None:

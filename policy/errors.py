@@ -1,6 +1,7 @@
-"""The root of every expected error, and those of policies; ``mavbridge.core.errors`` has the rest.
+"""The root of every expected error, those of policies, and notes that warn.
 
-They lie here because ``policy`` imports nothing of ``mavbridge``.
+``mavbridge.core.errors`` has the rest. They lie here because ``policy`` imports nothing of
+``mavbridge``.
 """
 
 import traceback
@@ -9,6 +10,7 @@ from contextlib import contextmanager
 from pathlib import Path
 
 _OURS = Path(__file__).parent
+_WARNING = "warning: "
 
 
 class MavbridgeError(Exception):
@@ -36,6 +38,28 @@ class NoChunkError(PolicyError):
     The flight goes on by the last chunk for as long as its limits permit. The message is the reason
     that the user is shown.
     """
+
+
+class Warned(str):
+    """A note that something is not as it was asked for."""
+
+    __slots__ = ()
+
+    @property
+    def text(self) -> str:
+        """The note without the word in front."""
+        return self[len(_WARNING) :]
+
+
+class Agreed(str):
+    """A note that the engine computes what torch computes."""
+
+    __slots__ = ()
+
+
+def warned(text: str) -> Warned:
+    """Return a warning, shown with that word in front."""
+    return Warned(_WARNING + text)
 
 
 @contextmanager

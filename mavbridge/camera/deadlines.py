@@ -46,7 +46,7 @@ def wait_for_first_frame(
             )
             told = reason
     raise CameraError(
-        f"the camera has delivered no frame within {timeout_s:g} s (--camera-timeout): "
+        f"the camera has delivered no frame within {timeout_s:g} s (link.camera_timeout): "
         f"{camera.waiting_reason}"
     )
 

@@ -1,23 +1,14 @@
-"""Settings of the commands; those of evaluate, record and replay are in their packages."""
+"""Settings of the commands; those that fly episodes are in ``mavbridge.config.episodes``."""
 
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated, Literal
 
-from cyclopts import Parameter
+from cyclopts import Group, Parameter
 
-from mavbridge.config.checks import check_range
-from mavbridge.config.courses import (
-    CHECK_COURSE_SEED,
-    MAX_EPISODES,
-    AutopilotKind,
-    CourseKind,
-    first_seed,
-)
-from mavbridge.config.flight import FlyConfig
-from mavbridge.config.groups import OUTPUT, RATES, VEHICLE
-from mavbridge.config.policy import PolicyConfig
-from mavbridge.config.workers import WorkersConfig
+from mavbridge.config.flags import CAMERA, OUTPUT, POLICY, RATES, VEHICLE, check_range, hidden
+from mavbridge.config.flight import FlyConfig, ListenConfig
+from mavbridge.config.policy import Engine, PolicyConfig
 from mavbridge.core.errors import UserError
 
 DeciderName = Literal["toge", "world-model"]
@@ -33,43 +24,6 @@ class ContractConfig:
     dataset: Path | None = None
     """The LeRobot dataset that the policy was trained on; by default the one that LeRobot's
     training noted beside the policy, if it is here."""
-
-
-@Parameter(name="*")
-@dataclass(frozen=True, kw_only=True)
-class DemonstrateConfig:
-    """Flights to learn from."""
-
-    out: Path
-    """Folder for the flights, each in a folder of its own; finished ones are kept."""
-    episodes: int = 100
-    """Flights in all."""
-    speed: float = 5.0
-    """Speed of the expert along the course, in m/s; 1.5 to 10 by sticks, to 14 by rates."""
-    action: Literal["sticks", "rates"] = "sticks"
-    """What the expert flies by: sticks in ALT_HOLD, or thrust and body rates."""
-    autopilot: AutopilotKind = "ardupilot"
-    """Firmware of the bundled flight controller: its modes, stick curves and airframe."""
-    courses: CourseKind = "easy"
-    """easy, or race: longer, with sharper turns, climbs and dives."""
-    max_time: float = 40.0
-    """Seconds after which a flight ends, on the course or not; a short one can start a rollout."""
-    policy: PolicyConfig = field(default_factory=PolicyConfig)
-    """With --checkpoint the policy flies most of the time, and the expert's actions are recorded as
-    labels (DAgger)."""
-    workers: WorkersConfig = field(default_factory=WorkersConfig)
-
-    def __post_init__(self) -> None:
-        """Refuse what cannot be flown."""
-        check_range("episodes", self.episodes, 1, MAX_EPISODES, "")
-        check_range("speed", self.speed, 1.5, 14 if self.action == "rates" else 10, "m/s")
-        check_range("max-time", self.max_time, 1, 3600, "s")
-        check_range("seed", self.policy.seed, 0, CHECK_COURSE_SEED // MAX_EPISODES - 1, "")
-
-    @property
-    def first_course_seed(self) -> int:
-        """Course of the first flight; neither training nor evaluation flies any of these."""
-        return first_seed(self.courses) + self.policy.seed * MAX_EPISODES
 
 
 ExportFormat = Literal["onnx", "torchscript"]
@@ -197,8 +151,6 @@ class ImagineConfig:
     """Write a video; without it only the rows are written."""
     fast_policy_no_decode: bool = False
     """Let the world model decide from its latents, without decoding and encoding them again."""
-    serial: bool = False
-    """Take the plain way, for comparison: decode everything at once, write it all at the end."""
     rerun: Annotated[str, Parameter(help="spawn, connect[=URL], FILE.rrd, or off.")] = "off"
 
     def __post_init__(self) -> None:
@@ -225,3 +177,141 @@ class InspectConfig:
     gates: Path | None = None
     """Draw the gates of this file, that of python -m sitl course --json; a recording by the
     simulator knows its own."""
+
+
+EPISODES = Group("Episodes", sort_key=1.5)
+
+
+@Parameter(name="*", group=CAMERA)
+@dataclass(frozen=True, kw_only=True)
+class FilmConfig:
+    """The camera, whose images are recorded in the size in which they come."""
+
+    camera: str = "0"
+    """Device index or /dev/videoN, rtsp:// udp:// http:// URL, video file, shm:NAME,
+    screen:WINDOW TITLE, pipe:COMMAND, or jpeg-udp:[HOST:]PORT."""
+    camera_size: int = 224
+    """Pixels a side that the image must cover; a device is asked for such a mode."""
+    camera_timeout: Annotated[float, hidden("link.camera-timeout")] = 10.0
+    """Seconds to wait for the camera's first frame."""
+    camera_latency: float = 0.0
+    """Milliseconds from exposure to arrival here; not for shm:, whose frames carry their own
+    stamps."""
+    visual_rate: float = 30.0
+    """Most frames a second."""
+
+    def __post_init__(self) -> None:
+        """Refuse sizes and times that no camera has."""
+        check_range("camera-size", self.camera_size, 32, 4096, "pixels")
+        check_range("link.camera_timeout", self.camera_timeout, 0.1, 3600, "s")
+        check_range("camera-latency", self.camera_latency, 0, 2000, "ms")
+        check_range("visual-rate", self.visual_rate, 0.5, 240, "Hz")
+
+
+@Parameter(name="*")
+@dataclass(frozen=True, kw_only=True)
+class RecordConfig:
+    """Recorded flights of a human pilot."""
+
+    out: Annotated[Path, Parameter(group=OUTPUT)]
+    """Folder for the flights, each in a folder of its own; more are added to those in it."""
+    vehicle: ListenConfig = field(default_factory=ListenConfig)
+    film: FilmConfig = field(default_factory=FilmConfig)
+    rate: Annotated[float, Parameter(group=RATES)] = 100.0
+    """Rows a second of sticks and state, for which the vehicle is asked, too."""
+    episode_channel: Annotated[int | None, Parameter(group=EPISODES)] = None
+    """Radio channel, from 5, whose switch records while it is high; the middle of a switch of three
+    positions ends the episode and marks it as bad."""
+    on_arm: Annotated[bool, Parameter(group=EPISODES, negative="")] = False
+    """Record while the vehicle is armed."""
+    episodes: Annotated[int | None, Parameter(group=EPISODES)] = None
+    """End after so many."""
+    rerun: Annotated[str, Parameter(group=OUTPUT)] = "off"
+    """Rerun viewer: spawn, connect[=URL], FILE.rrd, or off."""
+    disk_reserve: Annotated[float, Parameter(group=OUTPUT)] = 1.0
+    """Gigabytes of the disk that stay free: an episode ends when only these are left, and none
+    begins with less than a minute of recording before that."""
+
+    def __post_init__(self) -> None:
+        """Refuse contradictions, and rates that no autopilot serves."""
+        check_range("rate", self.rate, 20, 250, "Hz")
+        check_range("disk-reserve", self.disk_reserve, 0.05, 10_000, "GB")
+        if self.episode_channel is not None:
+            check_range("episode-channel", self.episode_channel, 5, 18, "")
+        if self.episodes is not None:
+            check_range("episodes", self.episodes, 1, 9999, "")
+        if self.on_arm and self.episode_channel is not None:
+            raise UserError("--on-arm and --episode-channel both say when to record: leave one out")
+
+
+ReplayFrom = Literal["auto", "chunks", "features", "video"]
+
+
+@Parameter(name="*", group=OUTPUT)
+@dataclass(frozen=True, kw_only=True)
+class ReplayConfig:
+    """What is computed once more, and what is different from the flight; nothing by default."""
+
+    source: Annotated[ReplayFrom, Parameter(name="--from", group=POLICY)] = "auto"
+    """chunks: the guard alone, with the recorded chunks and without a policy; features: the policy
+    from the recorded features; video: the encoder as well, from the recorded video, which is lossy.
+    auto: features, where there are any and the encoder is the same."""
+    policy: Annotated[str | None, Parameter(group=POLICY)] = None
+    """Another policy, as --policy of a flight."""
+    checkpoint: Annotated[Path | None, Parameter(group=POLICY)] = None
+    """Other weights."""
+    contract: Annotated[Path | None, Parameter(group=POLICY)] = None
+    """Contract file of another policy."""
+    num_diffusion_steps: Annotated[int | None, Parameter(group=POLICY)] = None
+    """Another number of steps of the action head."""
+    engine: Annotated[Engine | None, hidden("network.engine")] = None
+    """Another engine, such as torch."""
+    device: Annotated[str | None, Parameter(group=POLICY)] = None
+    """Another torch device."""
+    tau: Annotated[float | None, hidden("limits.tau")] = None
+    """Another time constant of the low-pass, in seconds."""
+    max_slew: Annotated[float | None, hidden("limits.slew")] = None
+    """Another limit of stick movement, in full deflections a second."""
+    max_feature_age: Annotated[float | None, hidden("limits.feature-age")] = None
+    """Another age of the oldest image to act on, in seconds."""
+    max_chunk_age: Annotated[float | None, hidden("limits.chunk-age")] = None
+    """Another time for which one chunk may be flown, in seconds."""
+    tolerance: float | None = None
+    """Largest difference of a stick that still counts as equal; by default 0 for the same engine,
+    and more for another one and for the video. Where something else was asked for there is none."""
+    plot: Path | None = None
+    """Draw the sticks, recorded and replayed, into this PNG."""
+    json: Path | None = None
+    """Write all figures here as JSON."""
+
+    def __post_init__(self) -> None:
+        """Refuse what cannot be combined."""
+        if self.tolerance is not None:
+            check_range("tolerance", self.tolerance, 0, 10, "")
+        if self.source == "chunks" and self.changes_policy:
+            raise UserError(
+                "--from chunks takes the recorded chunks and asks no policy: leave out the flags "
+                "of the policy, or use --from features or video"
+            )
+
+    @property
+    def changes_encoder(self) -> bool:
+        """The recorded features may be of another network."""
+        given = (self.policy, self.checkpoint, self.contract)
+        return any(value is not None for value in given)
+
+    @property
+    def changes_policy(self) -> bool:
+        """Something of the policy is not as it was."""
+        return self.is_other_policy or self.engine is not None or self.device is not None
+
+    @property
+    def is_other_policy(self) -> bool:
+        """It is to decide differently; another engine is to decide the same."""
+        return self.changes_encoder or self.num_diffusion_steps is not None
+
+    @property
+    def changes_limits(self) -> bool:
+        """The guard is to do something else with the chunks."""
+        given = (self.tau, self.max_slew, self.max_feature_age, self.max_chunk_age)
+        return any(value is not None for value in given)

@@ -12,9 +12,9 @@ from rich.console import Console
 from rich.text import Text
 
 import mavbridge
-from mavbridge.commands.config import DemonstrateConfig
 from mavbridge.commands.episode_workers import fly_jobs
 from mavbridge.commands.output import progress_bar
+from mavbridge.config.episodes import DemonstrateConfig
 from mavbridge.config.rates import SIM_CAMERA_PX, Rates
 from mavbridge.core.clock import NS_PER_MS, NS_PER_S, MonotonicClock
 from mavbridge.core.errors import UserError
@@ -28,7 +28,7 @@ from mavbridge.recording.meta import FlightError, FlightMeta, read_meta
 from mavbridge.recording.rows import FrameTruth, TickLabels
 from mavbridge.simulation.delays import Delay, Delays
 from mavbridge.simulation.flight import SimulatedFlight, SimulationSettings
-from mavbridge.simulation.world import NOMINAL_VEHICLE, Exposure
+from mavbridge.simulation.world import Exposure, make_vehicle
 from policy.contract import ACTION_DIM, Contract, FloatArray
 from policy.protocol import Executable
 from sitl.course import gate_truth
@@ -43,16 +43,11 @@ STUDENT_TURN_S, EXPERT_TURN_S = (1.5, 6.0), (0.4, 1.6)
 """Least and most length of a turn. Where a student flies, the expert takes over now and then: a
 student that crashes at the first gate would otherwise learn nothing about the later ones (DAgger,
 Ross et al. 2011, mixes the two at random)."""
-SOLVES_KEPT = 64
-"""Solves whose expert actions are kept until their ticks are recorded."""
-NOMINAL_SHARE = 0.25
-"""Flights without random conditions: what most users fly first."""
-AIRBORNE_SHARE = 0.35
-"""Flights that start in the air and off the course."""
-UNDISTURBED_SHARE = 0.3
-"""Flights without disturbed actions: examples of a good flight."""
-TRUTHS_KEPT = 64
-"""Exposures whose frames may still be on their way."""
+SOLVES_KEPT = TRUTHS_KEPT = 64
+"""Solves and exposures that are kept until their ticks and frames are recorded."""
+NOMINAL_SHARE, AIRBORNE_SHARE, UNDISTURBED_SHARE = 0.25, 0.35, 0.3
+"""Flights without random conditions, as most users fly first; flights that start in the air and off
+the course; flights without disturbed actions: examples of a good flight."""
 RATE_TILT_DEG = 80.0
 """Largest tilt of a policy that learns from an expert by body rates, which leans by up to 62."""
 
@@ -180,16 +175,12 @@ class Pilot:
         The expert does not know the vehicle's parameters, which no learner could see: it flies as
         many courses without them (37 of 40, and 37 of 40 with).
         """
-        if not self._variation.starts_airborne:
-            self.begin_ns = now_ns
-            return self._make_expert(0)
-        seed = self._variation.seed
-        start = random_start(self._flight.course, seed, speed_mps=self._speed_mps)
-        self._flight.vehicle.launch(start)
-        self.begin_ns = now_ns + SETTLE_NS
-        return self._make_expert(start.next_gate)
-
-    def _make_expert(self, next_gate: int) -> Expert | RateExpert:
+        self.begin_ns, next_gate = now_ns, 0
+        if self._variation.starts_airborne:
+            seed = self._variation.seed
+            start = random_start(self._flight.course, seed, speed_mps=self._speed_mps)
+            self._flight.vehicle.launch(start)
+            self.begin_ns, next_gate = now_ns + SETTLE_NS, start.next_gate
         make = RateExpert if self._by_rates else Expert
         return make(self._flight.course, self._speed_mps, next_gate=next_gate)
 
@@ -243,7 +234,7 @@ def fly_demonstration(spec: DemonstrationSpec, should_stop: Callable[[], bool]) 
 
 
 def _fly(spec: DemonstrationSpec, should_stop: Callable[[], bool], stack: ExitStack) -> bool:
-    """The same, with the student's life on ``stack``."""
+    """Fly and record one course; the student is closed with ``stack``."""
     variation, wanted = draw_variation(spec.seed), spec.config.policy
     student: Executable | None = None
     size_px = wanted.image_size or SIM_CAMERA_PX
@@ -270,11 +261,7 @@ def _fly(spec: DemonstrationSpec, should_stop: Callable[[], bool], stack: ExitSt
         settings=SimulationSettings(
             delays=variation.delays, least_camera_px=SIM_CAMERA_PX if student else 1
         ),
-        vehicle=replace(
-            NOMINAL_VEHICLE,
-            conditions=variation.conditions,
-            autopilot=spec.config.autopilot,
-        ),
+        vehicle=make_vehicle(autopilot=spec.config.autopilot, conditions=variation.conditions),
     )
     pilot = Pilot(
         flight, variation, speed_mps=spec.config.speed, contract=contract, student=student

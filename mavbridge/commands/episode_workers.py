@@ -17,7 +17,7 @@ from functools import partial
 from multiprocessing.connection import Connection
 from typing import TypeAlias, TypeVar
 
-from mavbridge.config.workers import WorkersConfig
+from mavbridge.config.episodes import WorkersConfig
 from mavbridge.core.address import host_port
 from mavbridge.core.errors import MavbridgeError, PeerError, UserError
 from mavbridge.simulation.referee import EpisodeInterruptedError

@@ -9,8 +9,8 @@ from rich.console import Console
 from rich.text import Text
 
 from mavbridge.commands.output import progress_bar
-from mavbridge.config.checks import check_range
-from mavbridge.config.courses import CHECK_COURSE_SEED, MAX_EPISODES, first_seed
+from mavbridge.config.episodes import CHECK_COURSE_SEED, MAX_EPISODES, first_seed
+from mavbridge.config.flags import check_range
 from mavbridge.config.policy import PolicyConfig
 from mavbridge.core.clock import NS_PER_S, MonotonicClock
 from mavbridge.core.errors import UserError

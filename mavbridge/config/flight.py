@@ -8,17 +8,7 @@ from typing import Annotated, Literal
 
 from cyclopts import Parameter
 
-from mavbridge.config.checks import check_range
-from mavbridge.config.groups import (
-    CAMERA,
-    ENGAGING,
-    ENVELOPE,
-    LIMITS,
-    OUTPUT,
-    RARE,
-    SETPOINTS,
-    VEHICLE,
-)
+from mavbridge.config.flags import CAMERA, ENGAGING, OUTPUT, VEHICLE, check_range, hidden, section
 from mavbridge.config.policy import PolicyConfig
 from mavbridge.config.rates import Rates
 from mavbridge.core.errors import UserError
@@ -31,7 +21,7 @@ _FLOAT32_MAX = 3.4e38
 """Largest value of a MAVLink parameter."""
 
 
-@Parameter(name="*", group=LIMITS)
+@section("limits")
 @dataclass(frozen=True, kw_only=True)
 class Limits:
     """Oldest inputs to act on, and the fastest stick movement."""
@@ -47,7 +37,7 @@ class Limits:
     """Longest time to act on one chunk of actions, in seconds since it was computed."""
     max_stall: float | None = None
     """Longest time in seconds to fly on along one chunk when no newer one comes."""
-    max_frozen_state: Annotated[float, Parameter(group=RARE)] = 0.5
+    max_frozen_state: float = 0.5
     """Longest time in seconds for which the attitude may stay exactly the same while the vehicle
     turns; 0 = no limit."""
     tau: float | None = None
@@ -58,22 +48,21 @@ class Limits:
 
     def __post_init__(self) -> None:
         """Refuse values that would switch a limit off by accident."""
-        for name, age in (
-            ("max-attitude-age", self.max_attitude_age),
-            ("max-velocity-age", self.max_velocity_age),
-            ("max-feature-age", self.max_feature_age),
-            ("max-chunk-age", self.max_chunk_age),
-            ("max-stall", self.max_stall),
+        for name, unit, least, largest in (
+            ("max_attitude_age", "s", 0.01, 60),
+            ("max_velocity_age", "s", 0.01, 60),
+            ("max_feature_age", "s", 0.01, 60),
+            ("max_chunk_age", "s", 0.01, 60),
+            ("max_stall", "s", 0.01, 60),
+            ("max_frozen_state", "s", 0, 60),
+            ("tau", "s", 0, 2),
+            ("max_slew", "1/s", 0, 1000),
         ):
-            if age is not None:
-                check_range(name, age, 0.01, 60, "s")
-        check_range("max-frozen-state", self.max_frozen_state, 0, 60, "s")
-        if self.tau is not None:
-            check_range("tau", self.tau, 0, 2, "s")
-        check_range("max-slew", self.max_slew, 0, 1000, "1/s")
+            if (value := getattr(self, name)) is not None:
+                check_range(f"limits.{name.removeprefix('max_')}", value, least, largest, unit)
 
 
-@Parameter(name="*", group=ENVELOPE)
+@section("envelope")
 @dataclass(frozen=True, kw_only=True)
 class EnvelopeConfig:
     """Where the vehicle may fly; without a flag the wider of the default and the policy's own."""
@@ -99,10 +88,10 @@ class EnvelopeConfig:
             ("min_battery", "%", 100),
         ):
             if (value := getattr(self, name)) is not None:
-                check_range(name.replace("_", "-"), value, 0, largest, unit)
+                check_range(f"envelope.{name.removeprefix('max_')}", value, 0, largest, unit)
 
 
-@Parameter(name="*", group=SETPOINTS)
+@section("setpoints")
 @dataclass(frozen=True, kw_only=True)
 class SetpointLimits:
     """The most that is asked of the vehicle by setpoints; the autopilot limits few of them."""
@@ -133,49 +122,59 @@ class SetpointLimits:
             ("setpoint_climb", "m/s", 50),
             ("setpoint_accel", "m/s^2", 100),
         ):
-            check_range(name.replace("_", "-"), getattr(self, name), 0.01, largest, unit)
+            key = f"setpoints.{name.removeprefix('setpoint_')}"
+            check_range(key, getattr(self, name), 0.01, largest, unit)
 
 
 @Parameter(name="*", group=VEHICLE)
 @dataclass(frozen=True, kw_only=True)
-class LinkConfig:
-    """The vehicle and how to reach it."""
+class ListenConfig:
+    """A vehicle that is listened to."""
 
     connect: Annotated[str, Parameter(show_default=False)] = ""
     """The vehicle: udp:HOST:PORT (listen), udpout:HOST:PORT, tcp:HOST:PORT, /dev/ttyX,BAUD; or as
     MAVSDK writes it: udpin://0.0.0.0:14540, serial:///dev/ttyACM0:921600."""
-    source_system: Annotated[int, Parameter(group=RARE)] = 255
-    """Our MAVLink system id; ArduPilot obeys overrides from its MAV_GCS_SYSID (255) only."""
-    target_system: Annotated[int, Parameter(group=RARE)] = 0
+    signing_key_file: Annotated[Path | None, Parameter(show_default=False)] = None
+    """Sign every packet, and take only signed ones (MAVLink 2): a file with the vehicle's key, 32
+    bytes or 64 hexadecimal digits, which only you may read."""
+    target_system: Annotated[int, hidden("link.target-system")] = 0
     """System id of the vehicle to fly; 0 = the only one on the link."""
-    connect_timeout: Annotated[float, Parameter(group=RARE)] = 30.0
+    connect_timeout: Annotated[float, hidden("link.timeout")] = 30.0
     """Seconds to wait for the vehicle's first heartbeat."""
+
+    def __post_init__(self) -> None:
+        """Refuse ids and times that no vehicle has."""
+        check_range("link.target_system", self.target_system, 0, 254, "")
+        check_range("link.timeout", self.connect_timeout, 0.1, 3600, "s")
+
+
+@Parameter(name="*", group=VEHICLE)
+@dataclass(frozen=True, kw_only=True)
+class LinkConfig(ListenConfig):
+    """The vehicle and how to reach it."""
+
+    source_system: Annotated[int, hidden("link.source-system")] = 255
+    """Our MAVLink system id; ArduPilot obeys overrides from its MAV_GCS_SYSID (255) only."""
     output: OutputChoice = "auto"
     """Message that carries the actions: rc-override or manual-control (sticks), attitude, rates,
     velocity. auto: by the policy's actions and the firmware."""
-    raw_sticks: Annotated[bool, Parameter(negative="", group=RARE)] = False
+    raw_sticks: Annotated[bool, hidden("link.raw-sticks")] = False
     """Send the policy's sticks as they are. By default they are changed where this vehicle leans,
     turns or climbs more or less at full stick than the one that the policy was trained for."""
     readonly: bool = False
     """Run everything, send no stick, mode or arm command."""
-    signing_key_file: Annotated[Path | None, Parameter(show_default=False)] = None
-    """Sign every packet, and take only signed ones (MAVLink 2): a file with the vehicle's key, 32
-    bytes or 64 hexadecimal digits, which only you may read."""
     set: Annotated[tuple[str, ...], Parameter(negative="", show_default=False)] = ()
     """NAME=VALUE: set a parameter of the vehicle before arming, put the old value back at an
     orderly end; may be given more than once."""
-    accept_risk: Annotated[
-        tuple[Risk, ...], Parameter(negative="", show_default=False, group=RARE)
-    ] = ()
-    """Fly in spite of a setting that a flight was refused for; may be given more than once."""
+    accept_risk: Annotated[tuple[Risk, ...], hidden("link.accept-risk")] = ()
+    """Fly in spite of a setting that a flight was refused for."""
 
     def __post_init__(self) -> None:
         """Refuse ids that MAVLink has no room for, and parameters that cannot be set."""
+        super().__post_init__()
         if self.set_params and self.readonly:
             raise UserError("--readonly sets no parameter: leave out --set")
-        check_range("source-system", self.source_system, 1, 255, "")
-        check_range("target-system", self.target_system, 0, 254, "")
-        check_range("connect-timeout", self.connect_timeout, 0.1, 3600, "s")
+        check_range("link.source_system", self.source_system, 1, 255, "")
 
     @property
     def set_params(self) -> tuple[tuple[str, float], ...]:
@@ -209,24 +208,22 @@ class CameraConfig:
     (raw; gray16le: depth), jpeg-udp:[HOST:]PORT (a simulator's chunks of JPEG), or none for a
     policy that looks at no image. For a policy with several cameras give each by its name in the
     contract: --camera front=0 --camera down=/dev/video2."""
-    window_name: Annotated[str | None, Parameter(group=RARE)] = None
-    """Same as --camera "screen:WINDOW TITLE"."""
-    camera_timeout: Annotated[float, Parameter(group=RARE)] = 10.0
+    camera_timeout: Annotated[float, hidden("link.camera-timeout")] = 10.0
     """Seconds to wait for the camera's first frame."""
     camera_latency: float = 0.0
     """Milliseconds from exposure to arrival here; not for shm:, whose frames carry their own
     stamps."""
-    max_frozen_image: Annotated[float, Parameter(group=LIMITS)] = 0.5
+    max_frozen_image: Annotated[float, hidden("limits.frozen-image")] = 0.5
     """Longest time in seconds for which the image may stay the same in flight; 0 = no limit."""
-    max_black_image: Annotated[float, Parameter(group=LIMITS)] = 0.5
+    max_black_image: Annotated[float, hidden("limits.black-image")] = 0.5
     """Longest time in seconds for which the image may be black or of one colour; 0 = no limit."""
 
     def __post_init__(self) -> None:
         """Refuse times that no camera has."""
-        check_range("camera-timeout", self.camera_timeout, 0.1, 3600, "s")
+        check_range("link.camera_timeout", self.camera_timeout, 0.1, 3600, "s")
         check_range("camera-latency", self.camera_latency, 0, 2000, "ms")
-        check_range("max-frozen-image", self.max_frozen_image, 0, 60, "s")
-        check_range("max-black-image", self.max_black_image, 0, 60, "s")
+        check_range("limits.frozen_image", self.max_frozen_image, 0, 60, "s")
+        check_range("limits.black_image", self.max_black_image, 0, 60, "s")
 
         names = [name for name, _ in self._named]
         if len(set(names)) < len(names) or (len(names) > 1 and "" in names):
@@ -238,8 +235,6 @@ class CameraConfig:
     @property
     def _named(self) -> tuple[tuple[str, str], ...]:
         """Name and source of each; an empty name where none was given."""
-        if self.window_name is not None:
-            return (("", f"screen:{self.window_name}"),)
         matches = [re.fullmatch(r"(?:([A-Za-z_]\w*)=)?(.*)", text) for text in self.camera]
         return tuple((match[1] or "", match[2]) for match in matches if match)
 

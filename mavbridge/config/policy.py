@@ -6,8 +6,7 @@ from typing import Annotated, Literal
 
 from cyclopts import Parameter
 
-from mavbridge.config.checks import check_range
-from mavbridge.config.groups import POLICY, RARE
+from mavbridge.config.flags import POLICY, RARE, check_range, hidden
 
 STEPS, TOGE_STEPS = 10, 1
 """DDIM steps from noise of most policies, and of toge and toge-rates, which fly as well in one
@@ -39,20 +38,20 @@ class PolicyConfig:
     default wherever the policy can (encode_visual and predict_fast)."""
     num_diffusion_steps: Annotated[int | None, Parameter(show_default=False)] = None
     """DDIM steps of the action head: by default 10, and 1 for toge and toge-rates."""
-    allow_untrained: Annotated[bool, Parameter(group=RARE)] = False
+    allow_untrained: Annotated[bool, hidden("network.allow-untrained")] = False
     """Fly TOGE with random weights: for timing and bring-up only."""
     by_rates: bool = False
     """Fly the sticks of toge or resnet-unet by thrust and body rates, attitude and climb closed by
     the policy from the newest state; in GUIDED_NOGPS, GUIDED or OFFBOARD."""
-    image_size: Annotated[int | None, Parameter(group=RARE)] = None
+    image_size: Annotated[int | None, hidden("network.image-size")] = None
     """Pixels a side into the encoder; by default what the policy's contract says (224)."""
-    engine: Annotated[Engine, Parameter(group=RARE)] = "auto"
+    engine: Annotated[Engine, hidden("network.engine")] = "auto"
     """What runs the network; auto takes the fastest that agrees with torch."""
     device: str = "cpu"
     """torch device: cpu, cuda, cuda:1, mps."""
-    vision_device: Annotated[str | None, Parameter(group=RARE)] = None
+    vision_device: Annotated[str | None, hidden("network.vision-device")] = None
     """Device of the image encoder, where it differs from --device."""
-    action_device: Annotated[str | None, Parameter(group=RARE)] = None
+    action_device: Annotated[str | None, hidden("network.action-device")] = None
     """Device of the action head, where it differs from --device."""
     seed: Annotated[int, Parameter(group=RARE)] = 0
     """Seed of random weights, diffusion noise and, in simulation, of courses and delays."""
@@ -61,7 +60,7 @@ class PolicyConfig:
         """Refuse what the scheduler and encoders cannot serve."""
         check_range("num-diffusion-steps", self.steps, 1, 100, "steps")
         if self.image_size is not None:
-            check_range("image-size", self.image_size, 32, 1024, "pixels")
+            check_range("network.image_size", self.image_size, 32, 1024, "pixels")
         check_range("seed", self.seed, 0, 2**63 - 1, "")
 
     @property

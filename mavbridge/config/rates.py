@@ -6,13 +6,12 @@ from typing import Annotated
 
 from cyclopts import Parameter
 
-from mavbridge.config.checks import check_range
-from mavbridge.config.groups import RARE, RATES
+from mavbridge.config.flags import RATES, check_range, hidden
 from mavbridge.core.errors import UserError
 
 LEAST_HZ = 0.5
 AUTO_VISUAL_HZ = (10.0, 60.0)
-"""Limits of --visual-rate auto where none are given."""
+"""Limits of rates.visual = "auto" where none are given."""
 ACTION_HZ, SINGLE_HZ = 100.0, 30.0
 """Most chunks a second, by dual and by single rate, where neither a flag nor the policy says it."""
 SOLVES_PER_PLAY = 2.0
@@ -49,35 +48,36 @@ class LoopRates:
 class Rates:
     """Loop rates in Hz."""
 
-    visual_rate: float | str = 30.0
+    visual_rate: Annotated[float | str, hidden("rates.visual")] = 30.0
     """Most frames a second through the image encoder (dual rate); auto[:MIN:MAX] encodes more often
     when the vehicle turns or the image changes."""
-    action_rate: float | None = None
+    action_rate: Annotated[float | None, hidden("rates.action")] = None
     """Most chunks of actions a second, each from the newest attitude (dual rate). By default 100,
     or 2 for each time that the policy is meant to play a chunk (play_s of its contract)."""
-    rate: float | None = None
-    """The same in single-rate mode, each with the newest image. By default 30, or likewise."""
-    stick_rate: float = 100.0
+    rate: Annotated[float | None, hidden("rates.single")] = None
+    """Most chunks a second in single-rate mode, each with the newest image. By default 30, or 2 for
+    each time that the policy is meant to play a chunk."""
+    stick_rate: Annotated[float, hidden("rates.stick")] = 100.0
     """Stick commands a second that leave for the autopilot, whatever the policy's rate."""
-    realtime: Annotated[bool, Parameter(group=RARE)] = True
+    realtime: Annotated[bool, hidden("scheduling.realtime")] = True
     """Real-time scheduling (SCHED_FIFO) of the guard and of the policy, where the system permits
     it."""
-    guard_cpu: Annotated[int | None, Parameter(group=RARE)] = None
+    guard_cpu: Annotated[int | None, hidden("scheduling.guard-cpu")] = None
     """Run the guard on this CPU alone."""
-    action_cpu: Annotated[int | None, Parameter(group=RARE)] = None
+    action_cpu: Annotated[int | None, hidden("scheduling.action-cpu")] = None
     """Run the policy on this CPU alone."""
-    vision_cpu: Annotated[int | None, Parameter(group=RARE)] = None
+    vision_cpu: Annotated[int | None, hidden("scheduling.vision-cpu")] = None
     """Run the vision loop on this CPU alone."""
 
     def __post_init__(self) -> None:
         """Refuse rates that no autopilot serves."""
         low_hz, high_hz = self.visual_limits_hz
-        check_range("visual-rate", low_hz, 0.5, high_hz, "Hz")
-        check_range("visual-rate", high_hz, low_hz, 240, "Hz")
-        for name, rate_hz in (("action-rate", self.action_rate), ("rate", self.rate)):
+        check_range("rates.visual", low_hz, 0.5, high_hz, "Hz")
+        check_range("rates.visual", high_hz, low_hz, 240, "Hz")
+        for name, rate_hz in (("rates.action", self.action_rate), ("rates.single", self.rate)):
             if rate_hz is not None:
                 check_range(name, rate_hz, LEAST_HZ, 500, "Hz")
-        check_range("stick-rate", self.stick_rate, 20, 400, "Hz")
+        check_range("rates.stick", self.stick_rate, 20, 400, "Hz")
 
     @property
     def visual_limits_hz(self) -> tuple[float, float]:
@@ -91,7 +91,7 @@ class Rates:
             low_hz, high_hz = math.nan, math.nan
         if kind != "auto" or math.isnan(low_hz) or math.isnan(high_hz):
             raise UserError(
-                f"--visual-rate {self.visual_rate} is neither a rate in Hz nor auto[:MIN:MAX]"
+                f"rates.visual {self.visual_rate} is neither a rate in Hz nor auto[:MIN:MAX]"
             )
         return low_hz, high_hz
 

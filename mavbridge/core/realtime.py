@@ -114,7 +114,8 @@ def _use_fifo(priority: int, who: str, *, resets_on_fork: bool) -> str | None:
     try:
         os.sched_setscheduler(0, policy, os.sched_param(priority))
     except OSError:
-        return f"{lacking}: allow it with ulimit -r 10 or CAP_SYS_NICE, or use --no-realtime"
+        cure = "allow it with ulimit -r 10 or CAP_SYS_NICE, or set scheduling.realtime=false"
+        return f"{lacking}: {cure}"
     return None
 
 

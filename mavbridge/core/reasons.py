@@ -262,7 +262,7 @@ _REASONS: dict[Code, tuple[Kind, str]] = {
     Code.SLOW_CLOCK: (_VEHICLE, "{hint}; {first}"),
     Code.BEYOND: (
         _FAULT,
-        "{quantity} {value:.1f} {unit} is beyond {limit:g} {unit} (--max-{quantity})",
+        "{quantity} {value:.1f} {unit} is beyond {limit:g} {unit} (envelope.{quantity})",
     ),
     Code.ESTIMATOR_LOST: (_VEHICLE, "the vehicle's estimator has lost its position"),
     Code.BATTERY: (_VEHICLE, "{said}"),
@@ -281,7 +281,7 @@ _REASONS: dict[Code, tuple[Kind, str]] = {
         _FAULT,
         "the policy's horizon of {horizon_ms:.3g} ms ({steps} x {step_ms:.3g} ms) is too short for "
         "its rate: a chunk ends {covered_ms:.0f} ms after it came, and chunks come {gap_ms:.0f} ms "
-        "apart; ask for a higher --rate or --action-rate, or use a policy of a longer horizon",
+        "apart; ask for a higher rates.single or rates.action, or use a policy of a longer horizon",
     ),
     Code.TOO_SLOW: (
         _FAULT,

@@ -262,6 +262,30 @@ class LinkSnapshot:
     """Status texts of the vehicle and warnings of the link since the last snapshot."""
 
 
+_VEHICLE_SAYS = "vehicle: "
+
+
+class VehicleText(str):
+    """A status text of the vehicle, among those of the link; shown with that word in front."""
+
+    __slots__ = ()
+
+    @property
+    def said(self) -> str:
+        """The text without the word in front."""
+        return self[len(_VEHICLE_SAYS) :]
+
+
+def said_by_vehicle(text: str) -> VehicleText:
+    """Return a text of the vehicle."""
+    return VehicleText(_VEHICLE_SAYS + text)
+
+
+def recorded_text(text: str) -> str:
+    """Return a text of a recording, or of another process, as what it was in the link."""
+    return VehicleText(text) if text.startswith(_VEHICLE_SAYS) else text
+
+
 class Outlet(NamedTuple):
     """Where packets to the vehicle leave, for a process that may send in place of the guard."""
 

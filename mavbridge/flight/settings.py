@@ -143,7 +143,7 @@ def link_settings(
 
 
 def action_meaning(contract: Contract, config: LinkConfig) -> ActionMeaning:
-    """Meaning of the policy's actions; with ``--raw-sticks`` its sticks have none."""
+    """Meaning of the policy's actions; with ``link.raw_sticks`` its sticks have none."""
     gains = StickGains(
         lean_deg=contract.full_lean_deg,
         yaw_rate_degps=contract.full_yaw_rate_degps,
@@ -180,12 +180,12 @@ def effective_freshness(contract: Contract, limits: Limits) -> FreshnessLimits:
         UserError: a flag would loosen a limit of the contract.
     """
     return FreshnessLimits(
-        state_ns=_tightened_ns(contract.max_state_age_s, "attitude-age", limits.max_attitude_age),
+        state_ns=_tightened_ns(contract.max_state_age_s, "attitude_age", limits.max_attitude_age),
         velocity_ns=_tightened_ns(
-            contract.max_velocity_age_s, "velocity-age", limits.max_velocity_age
+            contract.max_velocity_age_s, "velocity_age", limits.max_velocity_age
         ),
-        feature_ns=_tightened_ns(contract.max_feature_age_s, "feature-age", limits.max_feature_age),
-        chunk_ns=_tightened_ns(contract.max_chunk_age_s, "chunk-age", limits.max_chunk_age),
+        feature_ns=_tightened_ns(contract.max_feature_age_s, "feature_age", limits.max_feature_age),
+        chunk_ns=_tightened_ns(contract.max_chunk_age_s, "chunk_age", limits.max_chunk_age),
         stall_ns=_tightened_ns(contract.max_stall_s, "stall", limits.max_stall),
     )
 
@@ -193,7 +193,7 @@ def effective_freshness(contract: Contract, limits: Limits) -> FreshnessLimits:
 def _tightened_ns(allowed_s: float, what: str, asked_s: float | None) -> int:
     if asked_s is not None and asked_s > allowed_s:
         raise UserError(
-            f"--max-{what} {asked_s:g} is looser than the {allowed_s:g} s of this policy's "
+            f"limits.{what}={asked_s:g} is looser than the {allowed_s:g} s of this policy's "
             "contract: give less, or leave it out"
         )
     return round((allowed_s if asked_s is None else asked_s) * NS_PER_S)

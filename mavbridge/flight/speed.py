@@ -8,6 +8,7 @@ from mavbridge.core.errors import PolicyError
 from mavbridge.flight.plan import FlightPlan
 from mavbridge.guard.chunks import PERIOD_TOLERANCE, FreshnessLimits
 from policy.contract import Contract
+from policy.errors import warned
 from policy.loading.timing import SolveTimes
 
 CLEARLY = 1.5
@@ -15,7 +16,8 @@ CLEARLY = 1.5
 NEARLY = 1.1
 """A rate is not reached from this factor on."""
 FASTER = (
-    "Take fewer --num-diffusion-steps, a smaller policy, another --engine or --device, a faster "
+    "Take fewer --num-diffusion-steps, a smaller policy, another network.engine or --device, a "
+    "faster "
     "computer, or one that serves the policy (ws://); if it was trained to play each chunk for "
     "longer, its contract may say so (play_s)"
 )
@@ -49,12 +51,13 @@ def require_speed(plan: FlightPlan, name: str, times: SolveTimes | None) -> tupl
     """
     contract, is_dual, loops, rates = plan.contract, plan.is_dual, plan.loops, plan.config.rates
     action_hz, image_hz = loops.action_hz, min((loops.max_vision_hz, *contract.camera_rates_hz))
-    flag = "--action-rate" if is_dual else "--rate"
-    notes = []
+    flag = "rates.action" if is_dual else "rates.single"
+    notes: list[str] = []
     if is_dual and rates.rate is not None and rates.action_rate is None:
-        notes.append(f"warning: --rate {rates.rate:g} is of a single rate: add --single-rate")
+        notes.append(warned(f"rates.single={rates.rate:g} is of a single rate: add --single-rate"))
     if not is_dual and rates.action_rate is not None and rates.rate is None:
-        notes.append(f"warning: --action-rate {rates.action_rate:g} is of two rates: give --rate")
+        told = f"rates.action={rates.action_rate:g} is of two rates"
+        notes.append(warned(f"{told}: give rates.single"))
     if contract.play_s and (rates.action_rate if is_dual else rates.rate) is None:
         notes.append(
             f"{action_hz:.3g} chunks a second, since this policy is meant to play each one for "
@@ -73,18 +76,18 @@ def require_speed(plan: FlightPlan, name: str, times: SolveTimes | None) -> tupl
     if worst.share > CLEARLY:
         fastest = _worst(contract, limits, times, action_hz=math.inf, image_hz=math.inf)
         is_by_rate = fastest.share <= CLEARLY
-        advice = f"Ask for a higher {flag} or --visual-rate" if is_by_rate else FASTER
+        advice = f"Ask for a higher {flag} or rates.visual" if is_by_rate else FASTER
         fault = "has too short a horizon" if worst.by == "horizon" else "is too slow"
         raise PolicyError(f"{name} {fault}: {told}. {advice}")
     if worst.share > 1:
-        notes.append(f"warning: {told}: it will coast")
+        notes.append(warned(f"{told}: it will coast"))
     for what, asked_hz, each_s in (
         ("chunks", action_hz, times.act_s),
         ("images", image_hz, times.encode_s),
     ):
         if each_s * asked_hz > NEARLY:
             reached = f"this computer makes some {1 / each_s:.2g}"
-            notes.append(f"warning: asked for {asked_hz:.3g} {what} a second, {reached}: {figures}")
+            notes.append(warned(f"asked for {asked_hz:.3g} {what} a second, {reached}: {figures}"))
     return tuple(notes)
 
 

@@ -4,6 +4,7 @@ import math
 
 from mavbridge.core.clock import NS_PER_MS, NS_PER_S
 from mavbridge.core.records import FloatArray, Tick
+from mavbridge.core.vehicle import VehicleText, recorded_text
 
 OVERTURNED_NS = 500 * NS_PER_MS
 """Time beyond 90 degrees of tilt, armed, that is a crash: a flip takes less."""
@@ -13,8 +14,6 @@ FALL_MPS = 1.5
 """Speed while disarmed that no vehicle at rest reports, and less than that of any fall."""
 _WORDS = ("crash", "flight termination", "lockdown")
 """What ArduPilot ("Crash: Disarming") and PX4 ("Flight termination active", "Lockdown") say."""
-_FROM_VEHICLE = "vehicle: "
-"""How the link begins a text of the vehicle."""
 
 
 class CrashWatch:
@@ -35,10 +34,9 @@ class CrashWatch:
                 self.reason = self.reason or fallen
 
     def _said(self, tick: Tick) -> str | None:
-        for text in tick.texts:
-            said = text.removeprefix(_FROM_VEHICLE)
-            if said != text and any(word in said.lower() for word in _WORDS):
-                return f"the vehicle said {said!r}"
+        for text in map(recorded_text, tick.texts):
+            if isinstance(text, VehicleText) and any(word in text.lower() for word in _WORDS):
+                return f"the vehicle said {text.said!r}"
         return None
 
     def _overturned(self, tick: Tick) -> str | None:

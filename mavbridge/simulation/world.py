@@ -9,7 +9,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from mavbridge.config.courses import ConditionsKind
+from mavbridge.config.episodes import ConditionsKind
 from mavbridge.core.ports import TickSink
 from mavbridge.core.records import Event, FeatureFrame, Frame, ImageArray, VisionTick
 from mavbridge.flight.feature_cache import FeatureCache
@@ -56,14 +56,6 @@ def draw_conditions(kind: ConditionsKind, seed: int) -> Conditions:
             return random_conditions(seed)
         case "held-out":
             return held_out_conditions(seed)
-
-
-CONDITIONS_FLAGS: dict[ConditionsKind, str | None] = {
-    "nominal": None,
-    "random": "--conditions",
-    "held-out": "--held-out-conditions",
-}
-"""Flags of ``python -m sitl`` that ask for them; each takes the seed."""
 
 
 def make_vehicle(

@@ -17,7 +17,7 @@ from policy.engines.executable import EngineName, ExecutionSettings, encode_all
 from policy.engines.kept import changes, modules_of, snapshot
 from policy.engines.parity import ParitySamples, make_parity_samples, parity_failure
 from policy.engines.torch_eager import make_torch_executable
-from policy.errors import PolicyError
+from policy.errors import Agreed, PolicyError, warned
 from policy.nets.resnet_unet import ResnetUnet
 from policy.nets.toge import Toge
 from policy.protocol import Executable, SingleRatePolicy
@@ -37,7 +37,7 @@ def choose_executable(
         return make_torch_executable(policy, settings), ()
     if not modules:
         raise PolicyError(
-            f"--engine {engine} takes a torch.nn.Module, or a class that holds one as an "
+            f"network.engine={engine} takes a torch.nn.Module, or a class that holds one as an "
             f"attribute: leave it out, and {settings.name} runs on torch"
         )
     if engine == "auto" and not isinstance(policy, Toge | ResnetUnet):
@@ -73,8 +73,8 @@ def first_that_agrees(
         except (PolicyError, RuntimeError, TypeError) as error:
             reason = f"{type(error).__name__}: {str(error).strip().splitlines()[0]}"
         if reason is None:
-            return executable, (*notes, f"engine {executable.engine}: agrees with torch")
-        notes.append(f"warning: engine {label} is passed over: {reason}")
+            return executable, (*notes, Agreed(f"engine {executable.engine}: agrees with torch"))
+        notes.append(warned(f"engine {label} is passed over: {reason}"))
     return make_torch_executable(policy, settings), tuple(notes)
 
 
@@ -113,9 +113,11 @@ def _candidates(
 ) -> list[Candidate]:
     devices = {settings.vision_device.split(":")[0], settings.action_device.split(":")[0]}
     if engine == "openvino" and devices != {"cpu"}:
-        raise PolicyError(f"--engine openvino runs on --device cpu, not on {sorted(devices)}")
+        raise PolicyError(f"network.engine=openvino runs on --device cpu, not on {sorted(devices)}")
     if engine == "cuda-graph" and devices != {"cuda"}:
-        raise PolicyError(f"--engine cuda-graph runs on --device cuda, not on {sorted(devices)}")
+        raise PolicyError(
+            f"network.engine=cuda-graph runs on --device cuda, not on {sorted(devices)}"
+        )
     if devices == {"cpu"} and find_spec("openvino") is not None:
         from policy.engines.openvino_compile import precisions
         from policy.engines.openvino_cpu import make_openvino_executable
@@ -131,7 +133,7 @@ def _candidates(
             for vision, action in precisions()
         ]
     if engine == "openvino":
-        raise PolicyError("--engine openvino: the package is missing; pip install openvino")
+        raise PolicyError("network.engine=openvino: the package is missing; pip install openvino")
     if devices == {"cuda"} and torch.cuda.is_available():
         from policy.engines.cuda_graph import make_cuda_graph_executable
 

@@ -4,7 +4,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from policy.adapters.user_class import FORMS
-from policy.errors import PolicyError
+from policy.errors import PolicyError, warned
 from policy.loading.request import PolicyRequest, default_contract
 from policy.nets.names import BACKBONE_NAMES, SIZE_NAMES, BackboneName, Size
 
@@ -46,8 +46,9 @@ def builtin_checkpoint(request: PolicyRequest) -> Path | None:
     if shipped is not None and shipped.is_file():
         return shipped
     raise PolicyError(
-        f"{request.spec} needs trained weights: give --checkpoint FILE, or --allow-untrained for "
-        "seeded random ones (timing and bring-up), or fly --policy scripted"
+        f"{request.spec} needs trained weights: give --checkpoint FILE, or "
+        "network.allow_untrained=true for seeded random ones (timing and bring-up), or fly "
+        "--policy scripted"
     )
 
 
@@ -97,11 +98,13 @@ def _trained(
     if checkpoint.suffix != ".safetensors":
         contract, schedule = policy.contract, policy.config.schedule
         notes.append(
-            f"warning: {checkpoint} holds no contract; it is flown with frame "
-            f"{contract.state_frame}, image {contract.image_width}x{contract.image_height}, "
-            f"chunk of {contract.horizon} every {contract.chunk_dt_s:g} s, history of "
-            f"{contract.history_len} every {contract.history_dt_s:g} s, prediction of the "
-            f"{schedule.prediction}, {schedule.betas} betas: is that how it was trained?"
+            warned(
+                f"{checkpoint} holds no contract; it is flown with frame "
+                f"{contract.state_frame}, image {contract.image_width}x{contract.image_height}, "
+                f"chunk of {contract.horizon} every {contract.chunk_dt_s:g} s, history of "
+                f"{contract.history_len} every {contract.history_dt_s:g} s, prediction of the "
+                f"{schedule.prediction}, {schedule.betas} betas: is that how it was trained?"
+            )
         )
     return policy, notes
 

@@ -31,7 +31,7 @@ from policy.checkpoints.header import read_contract
 from policy.contract import Contract
 from policy.engines.devices import require_devices
 from policy.engines.executable import ExecutionSettings, make_numpy_executable
-from policy.errors import PolicyError, user_code
+from policy.errors import PolicyError, user_code, warned
 from policy.files import user_path
 from policy.loading.builtin import BUILTIN_KINDS, builtin_checkpoint, load_builtin, parse_builtin
 from policy.loading.request import LoadedPolicy, PolicyRequest, default_contract
@@ -137,9 +137,11 @@ def _on_engine(
     dual_rate = request.dual_rate and isinstance(policy, DualRatePolicy)
     if request.dual_rate and not dual_rate:
         notes.append(
-            f"warning: {request.spec} has no fast path (encode_visual and predict_fast), so it "
-            "flies in single-rate mode, the whole network for every action (--single-rate: as "
-            "intended)"
+            warned(
+                f"{request.spec} has no fast path (encode_visual and predict_fast), so it "
+                "flies in single-rate mode, the whole network for every action (--single-rate: as "
+                "intended)"
+            )
         )
     settings = ExecutionSettings(
         name=request.spec,
@@ -157,8 +159,8 @@ def _on_engine(
     if policy.contract.arrays == "numpy":
         if request.engine != "auto":
             raise PolicyError(
-                f"{request.spec} computes in numpy, which --engine {request.engine} cannot run: "
-                "leave the flag out"
+                f"{request.spec} computes in numpy, which network.engine={request.engine} cannot "
+                "run: leave it out"
             )
         return make_numpy_executable(policy, settings), ()
     from policy.engines.choose import choose_executable
@@ -216,8 +218,8 @@ def _onnx_files(request: PolicyRequest) -> OnnxFiles:
     devices = {request.vision_device or request.device, request.action_device or request.device}
     if request.engine not in ("auto", "openvino") or devices != {"cpu"}:
         raise PolicyError(
-            f"--policy {request.spec} runs through OpenVINO on the CPU: leave out --engine and "
-            "--device"
+            f"--policy {request.spec} runs through OpenVINO on the CPU: leave out "
+            "network.engine and --device"
         )
     return find_onnx_files(request.spec, path, request.contract_file)
 
@@ -314,6 +316,6 @@ def _require_image_size(contract: Contract, image_size: int | None) -> None:
     height, width = contract.image_height, contract.image_width
     if image_size is not None and (height, width) != (image_size, image_size):
         raise PolicyError(
-            f"--image-size {image_size} contradicts the policy's contract, which takes "
+            f"network.image_size={image_size} contradicts the policy's contract, which takes "
             f"{height}x{width}: leave the flag out"
         )

@@ -122,7 +122,7 @@ def soak(minutes: float, seed: int, folder: Path, report: Callable[[str], None])
     with staged(folder, "--receiver", "mid", *transmitter.flags, renders=False) as stage:
         stage.start(
             "--dual-rate", "--mode", "ALT_HOLD", "--policy", faulty_policy(POLICY),
-            "--max-height", "0", "--max-distance", "0",
+            "--set-config", "envelope.height=0", "--set-config", "envelope.distance=0",
             "--engage-channel", str(SWITCH), "--record", str(recording),
         )  # fmt: skip
         if not stage.wait_for(str(because(Code.NOT_ENGAGED))):

@@ -9,8 +9,10 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from benchmarks.serial_rollout import SerialOutput
 from helpers.factories import START_NS, TICK_NS, make_state, make_tick, make_vision_tick
 from helpers.recordings import make_meta, without_writer_process
+from mavbridge.commands.imagine.inputs import RolloutStart, Sampler, read_start
 from mavbridge.commands.imagine.loop import (
     Decider,
     PolicyDecider,
@@ -19,10 +21,7 @@ from mavbridge.commands.imagine.loop import (
     WorldModelDecider,
     rollout,
 )
-from mavbridge.commands.imagine.output import OnFrame, SerialOutput, ignore_frame
-from mavbridge.commands.imagine.sampling import Sampler
-from mavbridge.commands.imagine.start import RolloutStart, read_start
-from mavbridge.commands.imagine.streamed import StreamedOutput
+from mavbridge.commands.imagine.output import OnFrame, StreamedOutput, ignore_frame
 from mavbridge.core.clock import NS_PER_S, MonotonicClock
 from mavbridge.core.records import FloatArray, ImageArray
 from mavbridge.core.vehicle import Sticks

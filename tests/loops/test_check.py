@@ -124,7 +124,7 @@ def test_a_px4_is_told_what_its_sticks_cannot_do(receiver: bool) -> None:
         ("ardupilot", {"RC_OVERRIDE_TIME": 0}, "RC_OVERRIDE_TIME", "--set RC_OVERRIDE_TIME=0.5"),
         ("ardupilot", {"RC_OVERRIDE_TIME": -1}, "RC_OVERRIDE_TIME", "--set RC_OVERRIDE_TIME=0.5"),
         ("ardupilot", {"RC_OPTIONS": 2}, "RC_OPTIONS", "--set RC_OPTIONS=0"),
-        ("ardupilot", {"MAV_GCS_SYSID": 42}, "MAV_GCS_SYSID", "--source-system 42"),
+        ("ardupilot", {"MAV_GCS_SYSID": 42}, "MAV_GCS_SYSID", "--set-config link.source_system=42"),
         ("px4", {"COM_RC_IN_MODE": 0}, "COM_RC_IN_MODE", "--set COM_RC_IN_MODE=1"),
     ],
 )
@@ -171,7 +171,7 @@ def test_a_refused_setting_is_judged_as_the_flight_would_set_it() -> None:
 def test_a_vehicle_that_obeys_another_system_fails_the_echo_test() -> None:
     rows = Bench(params={"MAV_GCS_SYSID": 42}).check(echo_test=True)
     assert rows["echo test"].verdict == "no-go"
-    assert "--source-system 42" in rows["echo test"].commands
+    assert "--set-config link.source_system=42" in rows["echo test"].commands
 
 
 def test_without_the_flag_nothing_is_sent_but_requests() -> None:

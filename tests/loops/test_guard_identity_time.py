@@ -172,7 +172,7 @@ def test_what_would_hold_the_last_stick_for_ever_is_refused_unless_accepted(
     assert flight.phase is Phase.WAITING
     assert figures(flight.reason, Code.RISK)["risk"] == risk
     assert told in str(flight.reason)
-    assert f"--accept-risk {risk}" in str(flight.reason)
+    assert f"--set-config link.accept_risk={risk}" in str(flight.reason)
     assert not flight.ap.armed
     assert not flight.overrides()
 

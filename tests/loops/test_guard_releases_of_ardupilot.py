@@ -32,4 +32,4 @@ def test_a_vehicle_of_any_release_that_listens_to_another_station_is_refused(
 
     assert flight.phase is not Phase.FLYING
     assert Code.OBSTACLE in flight.codes
-    assert "--source-system 42" in str(flight.reason)
+    assert "--set-config link.source_system=42" in str(flight.reason)

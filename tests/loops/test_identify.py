@@ -2,9 +2,8 @@
 
 import pytest
 
-from mavbridge.commands.identify.analysis import full_stick, identify_pushes
-from mavbridge.commands.identify.fit import ResponseRecording
-from mavbridge.commands.identify.run import doublet_policy
+from mavbridge.commands.identify import doublet_policy, full_stick, identify_pushes
+from mavbridge.commands.step_response import ResponseRecording
 from mavbridge.simulation.flight import SimulatedFlight, SimulationSettings
 from mavbridge.simulation.world import make_vehicle
 from policy.contract import Contract
@@ -24,11 +23,8 @@ def test_the_parameters_of_a_vehicle_are_found_in_flight() -> None:
     assert found.missing == ()
     for axis, full in (("roll", 15.0), ("pitch", 15.0), ("yaw", 101.25), ("climb", 1.25)):
         pushes = [push for push in found.pushes if push.axis == axis]
-        up, down = (full_stick(pushes, contract, is_up=is_up) for is_up in (True, False))
-        assert up is not None
-        assert down is not None
-        assert (up.reached, down.reached) == (
+        assert full_stick(pushes) == (
             *(pytest.approx(full, rel=0.04), pytest.approx(-full, rel=0.04)),
         )
-        assert pushes[-1].up.ratio == pytest.approx(0.5, rel=0.05)
+        assert pushes[-1].ratio[0] == pytest.approx(0.5, rel=0.05)
         assert 0.03 < pushes[-1].dead_time_s < pushes[-1].time_63_s < 0.6

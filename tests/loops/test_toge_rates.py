@@ -2,7 +2,7 @@
 
 import pytest
 
-from mavbridge.config.courses import AutopilotKind
+from mavbridge.config.episodes import AutopilotKind
 from mavbridge.config.policy import PolicyConfig
 from mavbridge.core.clock import MonotonicClock
 from mavbridge.flight.policies import load_configured_policy

@@ -29,12 +29,14 @@ def run(capsys: pytest.CaptureFixture[str], *flags: str) -> tuple[int, str]:
 def test_help_names_every_flag_of_the_contract(capsys: pytest.CaptureFixture[str]) -> None:
     status, text = run(capsys, "--help")
     assert status == 0
-    flags = """--connect --policy --checkpoint --dual-rate --visual-rate --action-rate --rate
-        --num-diffusion-steps --allow-untrained --camera --window-name --image-size --device --tau
-        --max-slew --output --readonly --source-system --mode --arm --duration --rerun --report
-        --record --config"""
+    flags = """--connect --policy --checkpoint --dual-rate --num-diffusion-steps --camera --device
+        --output --readonly --mode --arm --duration --rerun --report --record --config --set-config
+        --print-config"""
     missing = [flag for flag in flags.split() if flag not in text]
     assert missing == []
+
+
+FLY = ("--connect", "udp:127.0.0.1:1")
 
 
 @pytest.mark.parametrize(
@@ -42,16 +44,22 @@ def test_help_names_every_flag_of_the_contract(capsys: pytest.CaptureFixture[str
     [
         ([], "--connect"),
         (["--connect", "udp:127.0.0.1:1", "--fly-high"], "Unknown option: --fly-high"),
-        (["--connect", "udp:127.0.0.1:1", "--action-rate", "fast"], "--action-rate"),
-        (["--connect", "udp:127.0.0.1:1", "--action-rate", "0"], "between 0.5 and 500 Hz"),
+        (["--connect", "udp:127.0.0.1:1", "--set-config", "rates.action=fast"], "rates.action"),
+        (
+            ["--connect", "udp:127.0.0.1:1", "--set-config", "rates.action=0"],
+            "between 0.5 and 500 Hz",
+        ),
         (["--connect", "udp:127.0.0.1:1", "--num-diffusion-steps", "0"], "between 1 and 100"),
         (["--connect", "udp:127.0.0.1:1", "--readonly", "--arm"], "--readonly sends nothing"),
         (["--connect", "udp:127.0.0.1:1", "--set", "RC_OVERRIDE_TIME"], "use NAME=VALUE"),
-        (["--connect", "udp:127.0.0.1:1", "--accept-risk", "all"], "endless-override"),
+        (
+            ["--connect", "udp:127.0.0.1:1", "--set-config", "link.accept_risk=all"],
+            "endless-override",
+        ),
         (["--connect", "udp:127.0.0.1:1", "--config", "none.toml"], "none.toml"),
         (["--connect", "udp:127.0.0.1:1", "--serve", "9090"], "use HOST:PORT"),
         (["--connect", "udp:127.0.0.1:1", "--gates", "none.json"], "--gates none.json"),
-        (["--connect", "udp:127.0.0.1:1", "--policy", "toge:medium"], "--allow-untrained"),
+        (["--connect", "udp:127.0.0.1:1", "--policy", "toge:medium"], "network.allow_untrained"),
         (["--connect", "udp:127.0.0.1:1", "--policy", "tog"], "tog"),
         (["--connect", "udp:127.0.0.1:1", "--policy", "nowhere.at_all:Policy"], "nowhere"),
         (
@@ -66,7 +74,7 @@ def test_help_names_every_flag_of_the_contract(capsys: pytest.CaptureFixture[str
         (["identify", "--connect", "udp:127.0.0.1:1", "--json", "/proc/none/x.json"], "--json"),
         (["--connect", "udp:127.0.0.1:1", "--checkpoint", "no.safetensors"], "no.safetensors"),
         (
-            ["--connect", "udp:127.0.0.1:1", "--policy", "toge:huge", "--allow-untrained"],
+            ["--connect", "udp:127.0.0.1:1", "--policy", "toge:huge"],
             "small",
         ),
         (["--connect", "udp:127.0.0.1:1", "--policy", "scripted", "--camera", "no.mp4"], "no.mp4"),
@@ -83,7 +91,7 @@ def test_help_names_every_flag_of_the_contract(capsys: pytest.CaptureFixture[str
             "cannot be written",
         ),
         (["fly", "now", "--connect", "udp:127.0.0.1:1"], "unexpected word 'now'"),
-        (["--connect", "udp:127.0.0.1:1", "--tau"], "--tau requires an argument"),
+        (["--connect", "udp:127.0.0.1:1", "--mode"], "--mode requires an argument"),
         (["--connect", "udp:127.0.0.1:1", "--duration", "-5"], "between 0.1 and 86400"),
         (["evalute"], "did you mean evaluate?"),
         (["--connect", "/dev/null,57600", "--policy=scripted", "--camera=none"], "no serial port"),
@@ -200,7 +208,7 @@ def test_a_viewer_and_a_camera_that_are_not_there_are_told_before_the_policy_is_
 
 def test_no_heartbeat(camera: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     report = tmp_path / "report.json"
-    flags = ("--policy", "scripted", "--camera", camera, "--connect-timeout", "0.2")
+    flags = ("--policy", "scripted", "--camera", camera, "--set-config", "link.timeout=0.2")
     kept = ("--record", str(tmp_path / "flights" / "1"), "--rerun", str(tmp_path / "flight.rrd"))
     connect = f"udp:127.0.0.1:{free_port()}"
     status, text = run(capsys, "--connect", connect, *flags, *kept, "--report", str(report))

@@ -11,7 +11,7 @@ import pytest
 
 from helpers.worker_jobs import Job, run
 from mavbridge.commands.episode_workers import fly_jobs
-from mavbridge.config.workers import WorkersConfig
+from mavbridge.config.episodes import WorkersConfig
 from mavbridge.core.errors import PeerError
 
 pytestmark = pytest.mark.system
@@ -34,7 +34,7 @@ def test_a_worker_that_dies_ends_the_run_and_its_job_is_named(tmp_path: Path) ->
 KILLED_PARENT = """
 from helpers.worker_jobs import Job, run
 from mavbridge.commands.episode_workers import fly_jobs
-from mavbridge.config.workers import WorkersConfig
+from mavbridge.config.episodes import WorkersConfig
 if __name__ == "__main__":
     jobs = [Job(number=1, waits_for_stop=True), Job(number=2, kills_parent=True)]
     list(fly_jobs(run, jobs, WorkersConfig(workers=2), lambda: False))

@@ -1,14 +1,12 @@
-"""Evaluation in real processes: workers, and a flight on the wall clock."""
+"""Evaluation in several processes."""
 
 from pathlib import Path
 
 import pytest
 
-from mavbridge.commands.evaluate.config import EvaluateConfig
-from mavbridge.commands.evaluate.episodes import EpisodeSpec, fly_on_wall_clock
 from mavbridge.commands.evaluate.run import evaluate
+from mavbridge.config.episodes import EvaluateConfig, WorkersConfig
 from mavbridge.config.policy import PolicyConfig
-from mavbridge.config.workers import WorkersConfig
 
 pytestmark = pytest.mark.system
 
@@ -27,14 +25,3 @@ def test_two_workers_write_what_one_writes(tmp_path: Path) -> None:
         )
         assert evaluate(config) == 0
     assert (tmp_path / "1.json").read_bytes() == (tmp_path / "2.json").read_bytes()
-
-
-def test_an_episode_flies_on_the_wall_clock() -> None:
-    config = EvaluateConfig(
-        policy=CIRCLE, episodes=1, max_time=2.0, clock="wall", conditions="random"
-    )
-    flown = fly_on_wall_clock(EpisodeSpec(config=config, index=0), lambda: False)
-    assert flown.engine == "numpy"
-    assert flown.result.outcome == "timed out"
-    assert flown.result.flown_s >= 2.0
-    assert flown.result.distance_m > 0.2

@@ -16,7 +16,7 @@ import torch
 
 from helpers.flight_folders import write_spot_flight
 from mavbridge.__main__ import main
-from mavbridge.commands.export.rows import stretches
+from mavbridge.commands.export.files import stretches
 from policy.adapters.lerobot.plan import read_plan
 from policy.adapters.lerobot.policy import load_policy_of
 from policy.data.flight_folders import read_flight
@@ -118,7 +118,7 @@ def test_the_policy_flies_by_the_file_that_mavbridge_contract_finds(
     assert contract.read_text() == (dataset / "mavbridge.toml").read_text()
     report = tmp_path / "report.json"
     mavbridge(
-        *("evaluate", "--policy", f"lerobot:{checkpoint}", "--engine", "torch"),
+        *("evaluate", "--policy", f"lerobot:{checkpoint}", "--set-config", "network.engine=torch"),
         *("--episodes", "1", "--max-time", "3", "--json", str(report)),
     )
     contract.unlink()

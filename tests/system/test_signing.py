@@ -45,7 +45,7 @@ def test_a_vehicle_that_signs_with_another_key_is_recognised(
     flags = ("--signing-key-file", make_key(tmp_path, "ours")) if ours == "another" else ()
     key = make_key(tmp_path)
     with staged(tmp_path, "--signing-key-file", key, renders=False) as stage:
-        stage.start(*FLY, *flags, "--connect-timeout", "10", "--duration", "10")
+        stage.start(*FLY, *flags, "--set-config", "link.timeout=10", "--duration", "10")
         told = "with another key than" if flags else "the vehicle signs its packets"
         assert stage.wait_for(told)
         stage.kill_group(2)

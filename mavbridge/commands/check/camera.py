@@ -146,7 +146,7 @@ def _rate_row(need: CameraNeeds, seen: Seen) -> Row:
     is_slow = seen.rate_hz < _ENOUGH * need.rate_hz
     advice = (
         f"the camera delivers {seen.rate_hz:.1f} images a second of {need.rate_hz:.3g}: more "
-        "light, a smaller image or another mode may help; or ask for fewer by --visual-rate"
+        "light, a smaller image or another mode may help; or ask for fewer by rates.visual"
     )
     return _row(
         need,
@@ -212,6 +212,4 @@ def _row(
     advice: str = "",
 ) -> Row:
     name = " ".join(filter(None, (need.name or need.source, part)))
-    return Row(
-        area="camera", name=name, found=found, expected=expected, verdict=verdict, advice=advice
-    )
+    return Row("camera", name, found, expected, verdict, advice)

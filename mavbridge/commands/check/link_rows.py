@@ -181,7 +181,7 @@ def _rate_verdict(
         return "warn", (
             f"{name} comes at {rate_hz:.1f} Hz of {asked_hz:.3g}: a faster link (a higher baud "
             "rate; on PX4 also MAV_n_RATE), another station that asks for other rates, or a lower "
-            "--action-rate"
+            "rates.action"
         )
     return "go", ""
 

@@ -9,7 +9,13 @@ from typing import NamedTuple
 from mavbridge.commands.check.rows import Row, Verdict
 from mavbridge.config.flight import FlyConfig
 from mavbridge.core.address import serial_baud
-from mavbridge.core.vehicle import ActionKind, StickGains, Sticks, VehicleStatus
+from mavbridge.core.reasons import Code, because
+from mavbridge.core.vehicle import (
+    ActionKind,
+    StickGains,
+    Sticks,
+    VehicleStatus,
+)
 from mavbridge.flight.settings import action_meaning
 from mavbridge.mavlink.codec.calibration import RcCalibration, RcChannel
 from mavbridge.mavlink.profiles.profile import Danger, ParamContext, Profile, StreamGroup
@@ -116,7 +122,8 @@ class Terms:
         assessment = assess(self.profile, values, context)
         yield from (Sentence("no-go", text) for text in assessment.obstacles)
         if assessment.unusable is not None:
-            yield Sentence("no-go", assessment.unusable)
+            unusable = because(Code.CALIBRATION_UNUSABLE, cause=assessment.unusable)
+            yield Sentence("no-go", str(unusable))
         serial = baud_danger(
             serial_baud(self.settings.connect),
             streams=self.streams,
@@ -184,13 +191,14 @@ def _curve_rows(terms: Terms) -> Iterator[Row]:
     if gains is None or mode is None or not terms.is_sticks:
         return
     curves = terms.profile.stick_curves(terms.values, mode, gains)
+    shortfalls: dict[str, str] = dict(curves.shortfalls)
     if (
         curves is IDENTITY
     ):  # the very object that stands for a mode whose sticks mean something else
         yield _row("sticks", f"sent as they are in {mode}", "a mode in which they are mapped")
         return
-    if curves.is_identity and curves.notes:
-        yield _row("sticks", "not mapped", "mapped", "warn", "; ".join(curves.notes))
+    if curves.unmapped is not None:
+        yield _row("sticks", "not mapped", "mapped", "warn", curves.unmapped)
         return
     throttle, yaw, lean = curves.throttle, curves.yaw, curves.lean
     lean_half = (
@@ -202,12 +210,12 @@ def _curve_rows(terms: Terms) -> Iterator[Row]:
         ("climb", "m/s", gains.climb_mps, throttle and throttle.vehicle.above),
         ("descent", "m/s", gains.descent_mps, throttle and throttle.vehicle.below),
     ):
-        note = next((text for text in curves.notes if text.startswith(f"full {noun} ")), "")
+        note = shortfalls.get(noun, "")
         found = f"{trained:.3g} {unit}, as in training"
         if half is not None:
             found = f"{half.full:.3g} {unit} ({half.parameter})"
             if terms.config.link.raw_sticks:
-                note = note or f"--raw-sticks: full {noun} is not what it was in training"
+                note = note or f"link.raw_sticks: full {noun} is not what it was in training"
             elif not note:
                 found += ", sticks are mapped"
         yield _row(f"full {noun}", found, f"{trained:.3g} {unit}", "warn" if note else "go", note)

@@ -20,7 +20,7 @@ from mavbridge.flight.policies import load_configured_policy
 from mavbridge.flight.speed import require_speed
 from policy.contract import ACTION_DIM, Contract
 from policy.engines.executable import encode_all, level_state
-from policy.errors import NoChunkError
+from policy.errors import Agreed, NoChunkError, Warned
 from policy.loading.request import LoadedPolicy
 from policy.preprocess import dummy_images
 from policy.protocol import Executable
@@ -68,14 +68,14 @@ def check_policy(config: FlyConfig, clock: Clock, *, timing_s: float) -> PolicyF
 def _engine_row(loaded: LoadedPolicy) -> Row:
     """The engine and its agreement with torch; what is not as it was asked for is a warning."""
     executable = loaded.executable
-    warnings = [note for note in loaded.notes if note.startswith("warning:")]
-    agrees = any("agrees with torch" in note for note in loaded.notes)
+    warnings = [note.text for note in loaded.notes if isinstance(note, Warned)]
+    agrees = any(isinstance(note, Agreed) for note in loaded.notes)
     found = f"{executable.name} on {executable.engine}{', agrees with torch' if agrees else ''}"
     return _row(
         "engine",
         found,
         "warn" if warnings else "go",
-        "; ".join(note.removeprefix("warning: ") for note in warnings),
+        "; ".join(warnings),
         expected="the fastest that agrees with torch",
     )
 
@@ -97,7 +97,7 @@ def _speed_rows(
     except MavbridgeError as error:
         yield _row("speed", "too slow", "no-go", str(error), expected=expected)
         return
-    warnings = [note.removeprefix("warning: ") for note in notes if note.startswith("warning:")]
+    warnings = [note.text for note in notes if isinstance(note, Warned)]
     if warnings:
         yield _row("speed", "slower than asked", "warn", "; ".join(warnings), expected=expected)
 
@@ -210,6 +210,4 @@ def _contract_rows(config: FlyConfig, executable: Executable) -> list[Row]:
 def _row(
     name: str, found: str, verdict: Verdict = "go", advice: str = "", *, expected: str = ""
 ) -> Row:
-    return Row(
-        area="policy", name=name, found=found, expected=expected, verdict=verdict, advice=advice
-    )
+    return Row("policy", name, found, expected, verdict, advice)

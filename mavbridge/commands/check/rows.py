@@ -14,7 +14,9 @@ from mavbridge.core.provenance import without_secrets
 
 Area: TypeAlias = Literal["link", "vehicle", "parameters", "camera", "policy", "computer"]
 Verdict: TypeAlias = Literal["go", "warn", "no-go"]
-_FLAG = re.compile(r"--set [A-Z0-9_]+=-?\d+(?:\.\d+)?|--source-system \d+|ulimit -\w \w+")
+_FLAG = re.compile(
+    r"--set [A-Z0-9_]+=-?\d+(?:\.\d+)?|--set-config link\.source_system=\d+|ulimit -\w \w+"
+)
 _STYLES: dict[Verdict, str] = {"go": "green", "warn": "yellow", "no-go": "bold red"}
 _FOOT = (
     "Nothing was set, armed or flown. What a flight asks for was asked for as well: message "

@@ -1,10 +1,11 @@
-"""``mavbridge check`` from its config to its exit status, and the rows about this computer."""
+"""``mavbridge check``: its rows, its table, and those about this computer."""
 
 import json
 import os
 import platform
 import subprocess
 import sys
+from functools import partial
 from pathlib import Path
 
 import cv2
@@ -35,6 +36,7 @@ _CORES = 2
 _RIGHTS_TIMEOUT_S = 10.0
 _TRY_RIGHTS = """
 import sys
+from functools import partial
 from mavbridge.core.realtime import settle_guard, settle_thread
 cpus = [int(word) if word else None for word in sys.argv[2:]]
 realtime = sys.argv[1] == "yes"
@@ -45,48 +47,45 @@ print("; ".join(filter(None, refusals)))
 """A process of its own asks as the guard does, and ends: nothing of it stays with this one."""
 STDOUT = Path("-")
 NO_VEHICLE = "none"
+_row = partial(Row, "computer")
+_camera_row = partial(Row, "camera", "cameras")
 
 
 def computer_rows(rates: Rates) -> list[Row]:
-    """Clock source, cores, real-time scheduling and locked memory."""
-    return [_clock_row(), _cores_row(), _rights_row(rates)]
-
-
-def _clock_row() -> Row:
+    """Return rows about clock source, cores, real-time scheduling and locked memory."""
     try:
         source = _CLOCK_SOURCE.read_text().strip()
     except OSError:  # no such file on macOS, or in some containers
         source = ""
-    is_slow = source in _SLOW_CLOCKS
-    return Row(
-        area="computer",
-        name="clock",
-        found=source or f"not told by {platform.system()}",
-        expected="one that the processor reads by itself, such as tsc",
-        verdict="warn" if is_slow else "go",
-        advice=f"the clock source {source} is slow to read or coarse: stamps are late by its time; "
-        "see current_clocksource in the kernel's documentation"
-        if is_slow
-        else "",
+    slow = (
+        f"the clock source {source} is slow to read or coarse: stamps are late by its time; see "
+        "current_clocksource in the kernel's documentation"
     )
-
-
-def _cores_row() -> Row:
     has_affinity = hasattr(os, "sched_getaffinity")
     cores = len(os.sched_getaffinity(0)) if has_affinity else os.cpu_count() or 1
-    return Row(
-        area="computer",
-        name="cores",
-        found=str(cores),
-        expected=f"{_CORES} or more",
-        verdict="go" if cores >= _CORES else "warn",
-        advice=""
-        if cores >= _CORES
-        else "guard and policy share one core: a slow policy delays the sticks",
-    )
+    shared = "guard and policy share one core: a slow policy delays the sticks"
+    refused = _refused_rights(rates)
+    return [
+        _row(
+            "clock",
+            source or f"not told by {platform.system()}",
+            "one that the processor reads by itself, such as tsc",
+            *(("warn", slow) if source in _SLOW_CLOCKS else ()),
+        ),
+        _row(
+            "cores", str(cores), f"{_CORES} or more", *(() if cores >= _CORES else ("warn", shared))
+        ),
+        _row(
+            "rights of the guard",
+            "refused in part" if refused else "granted",
+            "SCHED_FIFO and locked memory" if rates.realtime else "locked memory",
+            *(("warn", refused) if refused else ()),
+        ),
+    ]
 
 
-def _rights_row(rates: Rates) -> Row:
+def _refused_rights(rates: Rates) -> str:
+    """Return what this system does not permit the guard, empty if all is granted."""
     words = ["yes" if rates.realtime else "no"]
     cpus = (rates.guard_cpu, rates.action_cpu, rates.vision_cpu)
     words += ["" if cpu is None else str(cpu) for cpu in cpus]
@@ -99,18 +98,9 @@ def _rights_row(rates: Rates) -> Row:
             timeout=_RIGHTS_TIMEOUT_S,
             check=True,
         )
-        refused = tried.stdout.strip()
     except (OSError, subprocess.SubprocessError) as error:
-        refused = f"the rights of the guard could not be tried: {error}"
-    wanted = "SCHED_FIFO and locked memory" if rates.realtime else "locked memory"
-    return Row(
-        area="computer",
-        name="rights of the guard",
-        found="refused in part" if refused else "granted",
-        expected=wanted,
-        verdict="warn" if refused else "go",
-        advice=refused,
-    )
+        return f"the rights of the guard could not be tried: {error}"
+    return tried.stdout.strip()
 
 
 def check(config: CheckConfig) -> int:
@@ -141,7 +131,7 @@ def check_all(config: CheckConfig) -> list[Row]:
     policy = check_policy(flight, clock, timing_s=config.timing)
     cameras = _check_cameras(flight, policy, clock)
     if flight.link.connect == NO_VEHICLE:
-        vehicle = [Row(area="link", name="vehicle", found="none", expected="none for this check")]
+        vehicle = [Row("link", "vehicle", "none", "none for this check")]
     else:
         print_status(f"listening to the vehicle on {flight.link.connect}")
         vehicle = check_vehicle(flight, policy, clock, echo_test=config.echo_test)
@@ -156,10 +146,9 @@ def _check_cameras(config: FlyConfig, policy: PolicyFindings, clock: Clock) -> l
         require_images(config)
         needs = _camera_needs(config, policy)
     except MavbridgeError as error:
-        found = " ".join(config.camera.sources)
-        return [Row(area="camera", name="cameras", found=found, verdict="no-go", advice=str(error))]
+        return [_camera_row(" ".join(config.camera.sources), "", "no-go", str(error))]
     if not needs:
-        return [Row(area="camera", name="cameras", found="none", expected="none for this flight")]
+        return [_camera_row("none", "none for this flight")]
     print_status("watching the camera")
     return camera_rows(needs, config.camera, clock)
 

@@ -8,11 +8,16 @@ from functools import partial
 from mavbridge.commands.check.link_rows import VehicleProbe, echo_row, link_rows
 from mavbridge.commands.check.param_rows import Terms, param_rows
 from mavbridge.commands.check.policy import PolicyFindings
-from mavbridge.commands.check.rows import Row, Verdict
+from mavbridge.commands.check.rows import Row
 from mavbridge.config.flight import FlyConfig
 from mavbridge.core.clock import Clock
 from mavbridge.core.errors import MavbridgeError
-from mavbridge.core.vehicle import ActionMeaning, LinkSnapshot, VehicleStatus
+from mavbridge.core.vehicle import (
+    ActionMeaning,
+    LinkSnapshot,
+    VehicleStatus,
+    VehicleText,
+)
 from mavbridge.flight.settings import action_meaning, guard_settings
 from mavbridge.guard.sequences import MIDDLE_STICK
 from mavbridge.mavlink.link import MavlinkLink
@@ -22,6 +27,8 @@ from mavbridge.mavlink.transport.signing_files import SigningStore
 from mavbridge.mavlink.transport.sockets import Transport, make_transport
 
 _TEXTS_SHOWN = 4
+REFUSES_TO_ARM = "PreArm"
+"""ArduPilot begins so the texts of its checks before arming."""
 _row = partial(Row, "vehicle")
 
 
@@ -40,7 +47,7 @@ def vehicle_rows(
         yield _arming_row(is_ready=is_ready)
     if vehicle.switch_problem is not None:
         yield _row("override switch", "off", "on", "warn", str(vehicle.switch_problem))
-    yield from _text_rows(terms, texts)
+    yield from _text_rows(terms, texts, None if status is None else status.mode)
 
 
 def _mode_rows(terms: Terms) -> Iterator[Row]:
@@ -126,19 +133,18 @@ def _arming_row(*, is_ready: bool) -> Row:
     )
 
 
-def _text_rows(terms: Terms, texts: Sequence[str]) -> Iterator[Row]:
+def _text_rows(terms: Terms, texts: Sequence[str], present_mode: str | None) -> Iterator[Row]:
     """What was said besides the parameters' sentences, which have rows of their own."""
     told = {sentence.text for sentence in terms.sentences()}
-    new = [text for text in texts if text not in told and not text.startswith("full ")]
-    for text in new[-_TEXTS_SHOWN:]:
-        is_own = text.startswith("vehicle: ")
-        is_quiet = is_own and "PreArm" not in text
-        name, said = ("it says", text.removeprefix("vehicle: ")) if is_own else ("link", text)
-        yield _row(name, "see below" if not is_quiet else said, "", *_judged(said, is_quiet))
-
-
-def _judged(said: str, is_quiet: bool) -> tuple[Verdict, str]:
-    return ("go", "") if is_quiet else ("warn", said)
+    for mode in filter(None, {terms.mode, present_mode}):
+        told |= set(terms.profile.stick_curves(terms.values, mode, terms.gains).notes)
+    for text in [text for text in texts if text not in told][-_TEXTS_SHOWN:]:
+        if not isinstance(text, VehicleText):
+            yield _row("link", "see below", "", "warn", text)
+        elif text.said.startswith(REFUSES_TO_ARM):
+            yield _row("it says", "see below", "", "warn", text.said)
+        else:
+            yield _row("it says", text.said)
 
 
 def check_vehicle(
@@ -180,7 +186,8 @@ def check_vehicle(
             rows += vehicle_rows(vehicle, snapshot, terms, texts=texts)
             rows += param_rows(terms)
     except MavbridgeError as error:
-        rows.append(_absent(error))
+        expected = "ArduCopter or a PX4 multicopter"
+        rows.append(Row("link", "vehicle", "none that can be flown", expected, "no-go", str(error)))
     return rows
 
 
@@ -191,15 +198,4 @@ def checking_settings(config: FlyConfig, policy: PolicyFindings, *, sends: bool)
         guard.link,
         readonly=not sends,
         set_params=(),
-    )
-
-
-def _absent(error: MavbridgeError) -> Row:
-    return Row(
-        area="link",
-        name="vehicle",
-        found="none that can be flown",
-        expected="ArduCopter or a PX4 multicopter",
-        verdict="no-go",
-        advice=str(error),
     )

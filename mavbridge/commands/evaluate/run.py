@@ -1,32 +1,103 @@
-"""``mavbridge evaluate`` from its config to its exit status: fly or go on, print, write, draw."""
+"""``mavbridge evaluate``: fly or go on, print, write, draw."""
 
 import hashlib
 from collections.abc import Callable, Generator, Mapping
 from contextlib import closing
-from dataclasses import replace
-from pathlib import Path
+from dataclasses import dataclass, replace
 
 from rich.console import Console
 from rich.text import Text
 
 from mavbridge.commands.episode_workers import fly_jobs
-from mavbridge.commands.evaluate.config import EvaluateConfig
-from mavbridge.commands.evaluate.episodes import (
-    EpisodeSpec,
-    FlownEpisode,
-    fly_on_wall_clock,
-    fly_simulated,
-)
-from mavbridge.commands.evaluate.results import Evaluation, print_evaluation, to_json
+from mavbridge.commands.evaluate.results import Evaluation, draw, print_evaluation, to_json
 from mavbridge.commands.output import progress_bar, require_outputs
-from mavbridge.config.courses import MAX_EPISODES
-from mavbridge.config.workers import WorkersConfig
+from mavbridge.config.episodes import (
+    HELD_OUT_COURSE_SEED,
+    MAX_EPISODES,
+    EvaluateConfig,
+    WorkersConfig,
+    first_seed,
+)
+from mavbridge.core.clock import NS_PER_MS
 from mavbridge.core.errors import MavbridgeError, UserError
+from mavbridge.core.files import write_durably
 from mavbridge.core.provenance import digests, git_revision, versions
 from mavbridge.core.stopping import INTERRUPTED, stop_on_signals
-from mavbridge.flight.policies import policy_files
+from mavbridge.flight.policies import is_scripted, load_for_episodes, policy_files
+from mavbridge.flight.settings import contract_with_ages
+from mavbridge.simulation.delays import Delay, Delays
+from mavbridge.simulation.flight import SimulatedFlight, SimulationSettings
 from mavbridge.simulation.referee import EpisodeResult
+from mavbridge.simulation.world import (
+    draw_conditions,
+    make_vehicle,
+)
 from policy.files import read_json
+
+
+@dataclass(frozen=True, kw_only=True)
+class EpisodeSpec:
+    """An episode to fly; its seeds follow from the evaluation's seed and its index alone."""
+
+    config: EvaluateConfig
+    index: int
+
+    @property
+    def seed(self) -> int:
+        """Seed of delays and phases; seed S of the evaluation has S * MAX_EPISODES and on."""
+        return self.config.policy.seed * MAX_EPISODES + self.index
+
+    @property
+    def course_seed(self) -> int:
+        """A held-out course."""
+        return first_seed(self.config.courses) + HELD_OUT_COURSE_SEED + self.seed
+
+    def __str__(self) -> str:
+        return f"course {self.course_seed}"
+
+
+@dataclass(frozen=True, kw_only=True)
+class FlownEpisode:
+    """An episode's result, and what flew it."""
+
+    engine: str
+    notes: tuple[str, ...] = ()
+    result: EpisodeResult
+
+
+def fly_simulated(spec: EpisodeSpec, should_stop: Callable[[], bool]) -> FlownEpisode:
+    """Fly one episode in lockstep with the simulator.
+
+    Raises:
+        EpisodeInterruptedError: ``should_stop`` ended it.
+        MavbridgeError: it cannot be flown.
+    """
+    config, delays = spec.config, Delays()
+    vision = delays.vision
+    if config.vision_time is not None:
+        vision = Delay(p50_ns=round(config.vision_time * NS_PER_MS))
+    vision = replace(vision, offset_ns=round(config.vision_delay * NS_PER_MS))
+    settings = SimulationSettings(
+        rates=config.rates,
+        limits=config.limits,
+        delays=replace(delays, vision=vision, stall_ns=round(config.stalls * NS_PER_MS)),
+        raw_sticks=config.raw_sticks,
+        draw_images=not is_scripted(config.policy),
+    )
+    conditions = draw_conditions(config.conditions, spec.course_seed)
+    if config.gusts is not None:
+        conditions = replace(conditions, seed=spec.course_seed, gust_rms_mps=config.gusts)
+    flight = SimulatedFlight(
+        course_seed=spec.course_seed,
+        seed=spec.seed,
+        settings=settings,
+        vehicle=make_vehicle(autopilot=config.autopilot, gains=config.gains, conditions=conditions),
+    )
+    with load_for_episodes(config.policy, flight.clock) as loaded:
+        contract = contract_with_ages(loaded.executable.contract, config.limits)
+        executable = replace(loaded.executable, contract=contract)
+        result = flight.fly(executable, max_time_s=config.max_time, should_stop=should_stop)
+    return FlownEpisode(engine=loaded.executable.engine, notes=tuple(loaded.notes), result=result)
 
 
 def identity(config: EvaluateConfig) -> str:
@@ -102,17 +173,6 @@ def require_same_engine(flown: Mapping[int, FlownEpisode], engine: str) -> None:
         )
 
 
-def write_whole(path: Path, text: str) -> None:
-    """Replace a file as a whole, so that one that is interrupted leaves the old one."""
-    draft = path.with_name(f".{path.name}.part")
-    try:
-        draft.write_text(text)
-        draft.replace(path)
-    except OSError as error:
-        draft.unlink(missing_ok=True)
-        raise UserError(f"cannot write --json {path}: {error.strerror or error}") from error
-
-
 def evaluate(config: EvaluateConfig) -> int:
     """Fly every episode of the config; 130 if interrupted, with the results so far.
 
@@ -139,9 +199,7 @@ def evaluate(config: EvaluateConfig) -> int:
     if flown:
         print_evaluation(evaluation, Console())
         if config.plot is not None:
-            from mavbridge.commands.evaluate.figure import make_figure
-
-            make_figure(evaluation).savefig(config.plot)
+            draw(evaluation, config.plot)
     if config.json is not None and (flown or failure is None):
         config.json.write_text(to_json(evaluation, flown_by))
     if failure is not None or was_stopped:
@@ -155,7 +213,11 @@ def evaluate(config: EvaluateConfig) -> int:
 def _keep(config: EvaluateConfig, flown: dict[int, FlownEpisode], flown_by: str) -> None:
     """Write what was flown so far, where that is to be gone on with."""
     if config.resume and config.json is not None:
-        write_whole(config.json, to_json(_evaluation(config, flown), flown_by))
+        try:
+            write_durably(config.json, to_json(_evaluation(config, flown), flown_by))
+        except OSError as error:
+            reason = error.strerror or error
+            raise UserError(f"cannot write --json {config.json}: {reason}") from error
 
 
 def _evaluation(config: EvaluateConfig, flown: dict[int, FlownEpisode]) -> Evaluation:
@@ -177,10 +239,9 @@ def _fly(
     indices = [index for index in range(config.episodes) if index not in before]
     specs = [EpisodeSpec(config=config, index=index) for index in indices]
     done, finished = len(before), sum(one.result.has_finished for one in before.values())
-    fly = fly_on_wall_clock if config.is_wall_clock else fly_simulated
     with progress_bar(console) as progress:
         bar = progress.add_task("flying", total=config.episodes, completed=done)
-        for at, episode in fly_jobs(fly, specs, config.workers, should_stop):
+        for at, episode in fly_jobs(fly_simulated, specs, config.workers, should_stop):
             for note in () if done > len(before) else episode.notes:
                 console.print(Text(note, style="yellow"))
             yield indices[at], episode

@@ -14,12 +14,13 @@ from numpy.typing import NDArray
 from mavbridge.commands.export.files import (
     DATA_FILE_MB,
     FILES_A_CHUNK,
+    MIN_ROWS,
     VIDEO_FILE_MB,
     DatasetSpec,
+    Stretch,
     TableFiles,
     VideoFiles,
 )
-from mavbridge.commands.export.rows import MIN_ROWS, Stretch
 from mavbridge.core.records import ImageArray
 from mavbridge.recording.video.file import VideoError
 from policy.adapters.state import state_values

@@ -1,12 +1,18 @@
-"""Videos and tables that hold many episodes one after the other, in files of a limited size.
+"""Rows of the frames of flights, and the videos and tables of limited size that hold them.
+
+A row holds what was known at the exposure of its image: the state of the newest tick all of whose
+messages had arrived by then, and the newest sticks to imitate of then or before. Nothing is
+interpolated; the stamps say how old each of them was.
 
 LeRobot's reader wants frame k of an episode at ``from_timestamp + k / fps``, within 0.1 ms
 (lerobot 0.6.1, ``datasets/lerobot_dataset.py`` ``tolerance_s``, ``datasets/video_utils.py``), so a
 video has one frame every 1/fps exactly, from 0 on.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from fractions import Fraction
+from itertools import groupby, pairwise
 from pathlib import Path
 from typing import NamedTuple
 
@@ -18,10 +24,123 @@ from av.container import OutputContainer
 from av.video.stream import VideoStream
 from numpy.typing import NDArray
 
+from mavbridge.core.clock import NS_PER_S
+from mavbridge.core.errors import UserError
 from mavbridge.core.records import ImageArray
-from policy.contract import STATE_NAMES, StateFrame
+from policy.contract import ACTION_DIM, STATE_NAMES, StateFrame
 from policy.data import lerobot_format as names
+from policy.data.flight_data import FlightData, Nanoseconds
+from policy.data.interpolation import MAX_GAP_NS
 from policy.files import library_name
+
+MAX_HELD_NS = MAX_GAP_NS
+"""A state or sticks older than this do not belong to a frame any more."""
+MAX_MISSING_FRAMES = 1
+"""Consecutive frames that may be missing; after more a new episode begins, for LeRobot takes rows
+to be even in time."""
+MIN_ROWS = 2
+"""Fewer rows show no motion."""
+MAX_RATE_OFF = 0.2
+"""Largest share by which the rate of a flight may differ from the common one."""
+
+
+@dataclass(frozen=True)
+class Stretch:
+    """Consecutive frames of a flight in each of which it was flown: one episode of LeRobot."""
+
+    episode: FlightData
+    first_frame: int
+    columns: dict[str, NDArray[np.generic]]
+    """State [N, 13], action and sent sticks [N, 4], then the stamps [N], under their names in the
+    dataset. Sent sticks are zeros where they were released or nothing had been sent yet."""
+
+    def __len__(self) -> int:
+        return len(self.captured_ns)
+
+    @property
+    def captured_ns(self) -> Nanoseconds:
+        """[N] exposures."""
+        return self.columns[names.CAPTURED].astype(np.int64, copy=False)
+
+    def part(self, start: int, stop: int) -> "Stretch":
+        """The rows from ``start`` up to ``stop``."""
+        columns = {name: values[start:stop] for name, values in self.columns.items()}
+        return Stretch(self.episode, self.first_frame + start, columns)
+
+
+def stretches(episode: FlightData) -> list[Stretch]:
+    """Align a flight to its frames, and leave out those without a state or sticks."""
+    captured_ns = episode.captured_ns
+    arrived_ns = np.maximum.accumulate(np.maximum(episode.attitude_ns, episode.velocity_ns))
+    tick = _newest(arrived_ns, captured_ns)
+    target = _newest(episode.target_ns, captured_ns)
+    sent = _newest(episode.sent_ns, captured_ns)
+    is_known = (tick >= 0) & (target >= 0)
+    is_known &= captured_ns - arrived_ns[tick] <= MAX_HELD_NS
+    is_known &= captured_ns - episode.target_ns[target] <= MAX_HELD_NS
+    is_known &= np.isfinite(episode.state[tick]).all(axis=1)
+    # Where nothing had been sent yet, index -1 is the row that is appended.
+    sent_sticks = np.concatenate([episode.sent, np.zeros((1, ACTION_DIM), np.float32)])[sent]
+    sent_ns = np.where(sent < 0, captured_ns, np.append(episode.sent_ns, 0)[sent])
+    stamps = (
+        *(captured_ns, episode.tick_ns[tick], episode.attitude_ns[tick]),
+        *(episode.velocity_ns[tick], episode.target_ns[target], sent_ns.astype(np.int64)),
+    )
+    columns: dict[str, NDArray[np.generic]] = {
+        names.STATE_KEY: episode.state[tick],
+        names.ACTION_KEY: episode.target[target],
+        names.SENT: sent_sticks,
+        **dict(zip(names.STAMPS, stamps, strict=True)),
+    }
+    whole = Stretch(episode, 0, columns)
+    return [whole.part(start, stop) for start, stop in _runs(captured_ns, is_known)]
+
+
+def _newest(stamps_ns: Nanoseconds, at_ns: Nanoseconds) -> NDArray[np.intp]:
+    """[N] index of the newest stamp at or before each time; -1 where there is none."""
+    return np.searchsorted(stamps_ns, at_ns, side="right") - 1
+
+
+def _runs(captured_ns: Nanoseconds, is_known: NDArray[np.bool_]) -> list[tuple[int, int]]:
+    """Consecutive frames that are known and have no hole between them: from and up to."""
+    if len(captured_ns) < MIN_ROWS:
+        return []
+    periods = np.diff(captured_ns)
+    longest = (MAX_MISSING_FRAMES + 1.5) * np.median(periods)
+    is_cut = (periods > longest) | (is_known[1:] != is_known[:-1])
+    edges = [0, *(np.flatnonzero(is_cut) + 1).tolist(), len(captured_ns)]
+    return [(a, b) for a, b in pairwise(edges) if is_known[a] and b - a >= MIN_ROWS]
+
+
+def common_fps(parts: Sequence[Stretch]) -> int:
+    """The whole number of frames a second that LeRobot takes all of them to have.
+
+    Raises:
+        UserError: flights of several rates.
+    """
+    fps = max(1, round(_rate_hz(np.concatenate([np.diff(p.captured_ns) for p in parts]))))
+    # By flight, since a stretch of a few frames has no rate of its own.
+    for _, of_flight in groupby(parts, key=lambda part: id(part.episode)):
+        whole = list(of_flight)
+        own = _rate_hz(np.concatenate([np.diff(part.captured_ns) for part in whole]))
+        if abs(own / fps - 1.0) > MAX_RATE_OFF:
+            raise UserError(
+                f"{whole[0].episode.name} has {own:.3g} frames a second, most of the rest {fps}: a "
+                "LeRobot dataset has one rate, so export them apart"
+            )
+    return fps
+
+
+def _rate_hz(periods_ns: Nanoseconds) -> float:
+    whole = periods_ns[periods_ns <= 1.5 * np.median(periods_ns)]
+    return NS_PER_S / float(np.maximum(whole.mean(), 1.0))
+
+
+def worst_shift_ns(part: Stretch, fps: int) -> int:
+    """Largest distance of a frame from its place on LeRobot's even grid."""
+    even_ns = np.round(np.arange(len(part)) * (NS_PER_S / fps)).astype(np.int64)
+    return int(np.abs(part.captured_ns - part.captured_ns[0] - even_ns).max())
+
 
 MB = 1024**2
 DATA_FILE_MB, VIDEO_FILE_MB = 100, 200

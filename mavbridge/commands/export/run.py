@@ -13,8 +13,16 @@ from rich.progress import TaskID
 
 from mavbridge.commands.config import ExportConfig
 from mavbridge.commands.export.dataset import DatasetWriter, fit_size
-from mavbridge.commands.export.files import DATA_FILE_MB, MB, VIDEO_FILE_MB, DatasetSpec
-from mavbridge.commands.export.rows import Stretch, common_fps, stretches, worst_shift_ns
+from mavbridge.commands.export.files import (
+    DATA_FILE_MB,
+    MB,
+    VIDEO_FILE_MB,
+    DatasetSpec,
+    Stretch,
+    common_fps,
+    stretches,
+    worst_shift_ns,
+)
 from mavbridge.commands.output import progress_bar
 from mavbridge.core.clock import NS_PER_MS
 from mavbridge.core.errors import UserError

@@ -8,6 +8,6 @@
                            rollout.parquet
 
 ``loop.rollout`` is the loop and knows no files. ``StreamedOutput`` writes its segments as they
-come; ``SerialOutput``, the plain reference, writes the same frames, bit for bit, at the end.
+come; the benchmarks' ``SerialOutput`` writes the same frames, bit for bit, at the end.
 Nothing grows with the number of iterations but the files.
 """

@@ -10,8 +10,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from mavbridge.commands.imagine.sampling import ImaginedSteps, Sampler
-from mavbridge.commands.imagine.start import RolloutStart
+from mavbridge.commands.imagine.inputs import ImaginedSteps, RolloutStart, Sampler
 from mavbridge.core.clock import NS_PER_S
 from mavbridge.core.errors import UserError
 from mavbridge.core.records import FloatArray, ImageArray

@@ -1,28 +1,39 @@
 """Writes a rollout's segments: ``NAME.mp4``, and ``NAME.parquet`` with a row for each frame.
 
-While it grows, and after a crash, the table is ``NAME.arrows``, as with recorded flights.
+While it grows, and after a crash, the table is ``NAME.arrows``, as with recorded flights. A thread
+decodes, the writer process writes.
 """
 
 import hashlib
-from abc import ABC, abstractmethod
+import queue
+from collections import deque
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import closing, contextmanager
+from contextlib import contextmanager, suppress
+from dataclasses import dataclass
 from pathlib import Path
+from threading import Event
 from typing import Any, TypeAlias
 
 import numpy as np
 import pyarrow as pa
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
 
+from mavbridge.commands.imagine.inputs import Sampler, torch_threads
 from mavbridge.commands.imagine.loop import RolloutPlan, Segment
-from mavbridge.commands.imagine.sampling import Sampler
 from mavbridge.core.clock import NS_PER_S
 from mavbridge.core.errors import MavbridgeError, UserError
 from mavbridge.core.files import require_writable
 from mavbridge.core.records import ImageArray, RolloutFrame
+from mavbridge.core.workers import HungError, Worker
 from mavbridge.recording.folder import require_extra
+from mavbridge.recording.rows import FrameRow
 from mavbridge.recording.tables import TableWriter, read_table
-from mavbridge.recording.video.file import WRITE_ERRORS, FragmentedMp4, count_frames
+from mavbridge.recording.video.file import WRITE_ERRORS, count_frames
+from mavbridge.recording.video.writer import VideoWriter
 from policy.contract import ACTION_DIM, STATE_DIM
+from policy.world_model.model import WorldModel
 
 SCHEMA = pa.schema(
     [
@@ -96,8 +107,82 @@ def captured_ns(frame: RolloutFrame) -> int:
     return round(frame.number * frame.frame_dt_s * NS_PER_S)
 
 
-class RolloutOutput(ABC):
-    """Takes segments; used by the loop's thread.
+QUEUED_SEGMENTS = 2
+"""Segments that may wait for the decoder; then the loop waits. The slowest part sets the pace."""
+STALL_S = 120.0
+"""Longest time in which not one frame gets through."""
+END_S = 45.0
+"""Longer than a writer process that hangs is waited for."""
+PINNED_FRAMES = 4
+"""Frames that may be on their way from the GPU at a time."""
+_POLL_S = 0.1
+
+
+class FrameDecoder:
+    """Latents to images, one frame at a time, since the loop wants the processor, too.
+
+    On a GPU, on a stream beside the sampler's: frames come back through a ring of pinned memory.
+    Used by one thread.
+    """
+
+    def __init__(self, model: WorldModel) -> None:
+        self._model = model
+        device = next(model.parameters()).device
+        self._stream: torch.cuda.Stream | None = None
+        if device.type == "cuda":
+            self._stream = torch.cuda.Stream(device)  # type: ignore[no-untyped-call]
+            shape = (PINNED_FRAMES, *(model.config.image_size,) * 2, 3)
+            self._ring = torch.empty(shape, dtype=torch.uint8, pin_memory=True)
+            self._views: NDArray[np.uint8] = self._ring.numpy()
+
+    def frames(self, latents: Tensor, ready: torch.cuda.Event | None) -> Iterator[ImageArray]:
+        """Images [H, W, 3] of latents [N, C, h, w], each to be used before the next is taken.
+
+        On a GPU the latents may be read after the event ``ready``.
+        """
+        if self._stream is None:
+            for latent in latents:
+                with torch.inference_mode():
+                    pixels = self._model.decode(latent[None])
+                yield pixels[0].cpu().numpy()
+            return
+        under_way: deque[tuple[int, torch.cuda.Event]] = deque()
+        if ready is not None:
+            self._stream.wait_event(ready)
+        # Freed by the loop's stream, the memory must not be given away before this one is done.
+        latents.record_stream(self._stream)
+        for row, latent in enumerate(latents):
+            if len(under_way) == PINNED_FRAMES:  # a slot is free once its frame was used
+                yield self._arrived(*under_way.popleft())
+            slot = row % PINNED_FRAMES
+            under_way.append((slot, self._launch(latent, slot, self._stream)))
+        while under_way:
+            yield self._arrived(*under_way.popleft())
+
+    def _launch(self, latent: Tensor, slot: int, stream: torch.cuda.Stream) -> torch.cuda.Event:
+        with torch.inference_mode(), torch.cuda.stream(stream):
+            self._ring[slot].copy_(self._model.decode(latent[None])[0], non_blocking=True)
+            event: torch.cuda.Event = stream.record_event()
+        return event
+
+    def _arrived(self, slot: int, event: torch.cuda.Event) -> ImageArray:
+        event.synchronize()
+        view: ImageArray = self._views[slot]
+        return view
+
+
+@dataclass(frozen=True, kw_only=True)
+class _DecodeJob:
+    frames: list[RolloutFrame]
+    decoded: dict[int, ImageArray]
+    missing: Tensor | None
+    """Latents of the frames that are not decoded yet, in order; None: no video is wanted."""
+    ready: torch.cuda.Event | None
+    """Event of the GPU after which they may be read."""
+
+
+class StreamedOutput:
+    """Writes frames and rows of segments to the disk as they come; used by the loop's thread.
 
     Methods raise ``MavbridgeError`` if something, now or before, could not be written.
     """
@@ -125,6 +210,22 @@ class RolloutOutput(ABC):
         """Frames decoded beside the loop's thread, whose own are in its meter."""
         self._open()
 
+    def _open(self) -> None:
+        self._decoder = FrameDecoder(self._sampler.model)
+        self._jobs: queue.Queue[_DecodeJob | None] = queue.Queue(QUEUED_SEGMENTS)
+        self._table_path = self.out.with_suffix(".arrows")
+        self._video: VideoWriter | None = None
+        with writing(self._table_path):
+            self._table = TableWriter(self.out, SCHEMA)
+        if self._decode_video:
+            try:
+                self._video = VideoWriter(self.out, pressure="offline", hz=1 / self._frame_dt_s)
+            except BaseException:
+                self._table.abandon()
+                raise
+        self._worker = Worker("mavbridge-rollout-decode", self._serve)
+        self._worker.start()
+
     @property
     def sha256(self) -> str:
         """SHA-256 of all frames so far, raw, in their order."""
@@ -133,33 +234,111 @@ class RolloutOutput(ABC):
     @property
     def decode_queue(self) -> int:
         """Segments that wait to be decoded."""
-        return 0
+        return self._jobs.qsize()
 
     @property
-    @abstractmethod
     def writer_queue(self) -> int:
         """Frames that wait to be written."""
+        return 0 if self._video is None else self._video.lost
 
     @property
     def writer_pid(self) -> int | None:
         """Process id of the writer; None where there is none."""
-        return None
+        return None if self._video is None else self._video.pid
 
-    @abstractmethod
-    def _open(self) -> None:
-        """Create what can be created before the first segment."""
-
-    @abstractmethod
     def put(self, segment: Segment) -> None:
-        """Take the next segment; may block."""
+        """Queue a segment; waits while the queue is full."""
+        frames = self._rows(segment)
+        missing = ready = None
+        if self._video is not None:
+            missing = segment.latents[[k for k in range(len(frames)) if k not in segment.decoded]]
+            if missing.is_cuda:
+                ready = torch.cuda.current_stream(missing.device).record_event()
+        job = _DecodeJob(frames=frames, decoded=segment.decoded, missing=missing, ready=ready)
+        with self._sampler.meter.decode:
+            self._enqueue(job)
 
-    @abstractmethod
+    def _enqueue(self, job: _DecodeJob | None, on_wait: Callable[[], None] = lambda: None) -> None:
+        def was_put() -> bool:
+            if not self._worker.is_alive:
+                self._worker.join(END_S)  # raises what the thread has raised
+                raise RuntimeError("the thread ended before its work did")
+            try:
+                self._jobs.put(job, timeout=_POLL_S)
+            except queue.Full:
+                return False
+            return True
+
+        self._wait_until(was_put, on_wait)
+
+    def _wait_until(self, condition: Callable[[], bool], on_wait: Callable[[], None]) -> None:
+        """Wait as long as frames get through; the condition itself waits a little."""
+        seen, since_ns = self.frames, self._clock.now_ns()
+        while not condition():
+            on_wait()
+            if self.frames != seen:
+                seen, since_ns = self.frames, self._clock.now_ns()
+            elif self._clock.now_ns() - since_ns > STALL_S * NS_PER_S:
+                raise HungError(f"no frame has been decoded and written for {STALL_S:g} s")
+
     def finish(self, on_wait: Callable[[], None] = lambda: None) -> None:
-        """Write everything and close the files; ``on_wait`` is called now and then meanwhile."""
+        """Work off the queue, close the files, and compare their lengths."""
+        with self._sampler.meter.decode:
+            self._enqueue(None, on_wait)
+            self._wait_until(lambda: self._worker.ends_within(_POLL_S), on_wait)
+            self._worker.join(END_S)
+        with self._sampler.meter.write:
+            if self._video is not None:
+                self._video.finish()
+                if self._video.written != self._table.rows:
+                    raise RolloutError(
+                        f"{self._video.written} frames were written for {self._table.rows} rows"
+                    )
+            with writing(self._table_path):
+                self._table.finish()
 
-    @abstractmethod
     def close(self) -> None:
-        """Leave things as they are, after an error; may be called twice."""
+        """Stop the thread and the writer; what is written stays readable."""
+        with suppress(BaseException):  # it is what led here
+            self._worker.join(END_S)
+        if self._video is not None:
+            self._video.close()
+        self._table.abandon()
+
+    def _serve(self, stop: Event) -> None:
+        with torch_threads(1):
+            while not stop.is_set():
+                try:
+                    job = self._jobs.get(timeout=_POLL_S)
+                except queue.Empty:
+                    continue
+                if job is None:
+                    return
+                self._write(job, stop)
+
+    def _write(self, job: _DecodeJob, stop: Event) -> None:
+        # Rows first: after a crash there may be rows without a frame, but no frame without a row.
+        with writing(self._table_path):
+            self._table.append(rows_batch(job.frames))
+        images: Iterator[ImageArray] = iter(())
+        if job.missing is not None:
+            images = self._decoder.frames(job.missing, job.ready)
+        for frame in job.frames:
+            if stop.is_set():
+                return
+            rgb = None
+            if self._video is not None:
+                rgb = job.decoded.get(frame.frame)
+                if rgb is None:
+                    rgb = next(images)
+                    self.frames_decoded += 1
+                row = FrameRow(
+                    frame_id=frame.number,
+                    captured_ns=captured_ns(frame),
+                    ready_ns=self._clock.now_ns(),
+                )
+                self._video.submit(rgb, row)
+            self._show(frame, rgb)
 
     def _rows(self, segment: Segment) -> list[RolloutFrame]:
         plan = self._plan
@@ -183,49 +362,3 @@ class RolloutOutput(ABC):
             self._digest.update(np.ascontiguousarray(rgb).data)
         self._on_frame(frame, rgb)
         self.frames += 1
-
-
-class SerialOutput(RolloutOutput):
-    """The plain form, kept as the reference: all frames in a list, everything written at the end.
-
-    Every frame must have been decoded by the loop.
-    """
-
-    def _open(self) -> None:
-        self._collected: list[tuple[RolloutFrame, ImageArray]] = []
-        self._written = 0
-
-    @property
-    def writer_queue(self) -> int:
-        """Frames that wait to be written."""
-        return len(self._collected) - self._written
-
-    def put(self, segment: Segment) -> None:
-        """Keep a segment."""
-        for frame in self._rows(segment):
-            rgb = segment.decoded[frame.frame]
-            self._collected.append((frame, rgb))
-            self._show(frame, rgb if self._decode_video else None)
-
-    def finish(self, on_wait: Callable[[], None] = lambda: None) -> None:
-        """Write everything."""
-        with self._sampler.meter.write, writing(self.out):
-            table = TableWriter(self.out, SCHEMA)
-            try:
-                table.append(rows_batch([frame for frame, _ in self._collected]))
-                if self._decode_video:
-                    size = self._sampler.config.image_size
-                    with closing(
-                        FragmentedMp4(self.out, height=size, width=size, hz=1 / self._frame_dt_s)
-                    ) as video:
-                        for frame, rgb in self._collected:
-                            video.append(rgb, captured_ns(frame))
-                            self._written += 1
-                            on_wait()
-            except BaseException:
-                table.abandon()
-                raise
-            table.finish()
-
-    def close(self) -> None:
-        """Nothing is open between two calls."""

@@ -1,4 +1,4 @@
-"""``mavbridge imagine``: from the settings to the files of a rollout."""
+"""``mavbridge imagine``: from a recorded flight and the settings to the files of a rollout."""
 
 from contextlib import ExitStack, closing
 from dataclasses import replace
@@ -10,6 +10,13 @@ from rich.text import Text
 
 import policy
 from mavbridge.commands.config import ImagineConfig
+from mavbridge.commands.imagine.inputs import (
+    RealFrames,
+    RolloutStart,
+    Sampler,
+    read_start,
+    torch_threads,
+)
 from mavbridge.commands.imagine.loop import (
     Decider,
     PolicyDecider,
@@ -20,14 +27,10 @@ from mavbridge.commands.imagine.loop import (
 from mavbridge.commands.imagine.output import (
     OnFrame,
     RolloutError,
-    RolloutOutput,
-    SerialOutput,
+    StreamedOutput,
     ignore_frame,
     prepare_out,
 )
-from mavbridge.commands.imagine.sampling import Sampler, torch_threads
-from mavbridge.commands.imagine.start import RealFrames, RolloutStart, read_start
-from mavbridge.commands.imagine.streamed import StreamedOutput
 from mavbridge.commands.output import progress_bar
 from mavbridge.core.clock import Clock, MonotonicClock
 from mavbridge.core.errors import MavbridgeError, UserError
@@ -36,6 +39,7 @@ from mavbridge.flight.policies import load_configured_policy
 from mavbridge.recording.flight_folder import open_flight
 from policy.checkpoints.world_model_file import load_world_model
 from policy.engines.devices import require_devices
+from policy.errors import Warned
 from policy.world_model.model import WorldModel
 
 SHIPPED = Path(policy.__file__).parent / "weights" / "world_model.safetensors"
@@ -64,9 +68,9 @@ def imagine(config: ImagineConfig) -> int:
             "imagines: lower it"
         )
     start = read_start(flight, model.config, config.start_at)
-    sampler = Sampler(model, ddim_steps=plan.ddim_steps, decode_all=config.serial, clock=clock)
+    sampler = Sampler(model, ddim_steps=plan.ddim_steps, clock=clock)
     # One core is left for the decoder: torch's threads spin at the end of every operation until the
-    # last is done. Serially, too: how a sum is split up decides how it is rounded.
+    # last is done.
     free = torch.get_num_threads() - 1
     with ExitStack() as stack:
         decider = _make_decider(config, sampler, clock, console, stack)
@@ -78,8 +82,7 @@ def imagine(config: ImagineConfig) -> int:
             real = RealFrames(flight, model.config, start.newest_ns)
             view = stack.enter_context(closing(RolloutView(config.rerun, real=real.at)))
             on_frame = view.show
-        kind = SerialOutput if config.serial else StreamedOutput
-        output = kind(
+        output = StreamedOutput(
             config.out, sampler, plan, decode_video=config.decode_video, on_frame=on_frame
         )
         was_stopped = run_rollout(sampler, decider, start, plan, output, console)
@@ -94,7 +97,7 @@ def run_rollout(
     decider: Decider,
     start: RolloutStart,
     plan: RolloutPlan,
-    output: RolloutOutput,
+    output: StreamedOutput,
     console: Console,
 ) -> bool:
     """Run the iterations; returns whether a signal ended them early.
@@ -138,16 +141,10 @@ def load_model(world_model: Path | None, *, ddim_steps: int, device: str) -> Wor
     """Load a world model, by default the one that comes with mavbridge, onto a torch device.
 
     Raises:
-        UserError: none comes with mavbridge.
         PolicyError: there is no such device, the weights cannot be used, or not with so many steps.
     """
     require_devices(device)
-    path = world_model or SHIPPED
-    if world_model is None and not path.exists():
-        raise UserError(
-            f"no world model comes with this build ({path} is not there): give --world-model FILE"
-        )
-    model = load_world_model(path)
+    model = load_world_model(world_model or SHIPPED)
     model.config.schedule.ddim_steps(ddim_steps)  # refuses what it cannot do
     return model.to(torch.device(device)).eval()
 
@@ -165,11 +162,11 @@ def _make_decider(
     wanted = replace(config.policy, dual_rate=True)
     loaded = stack.enter_context(load_configured_policy(wanted, clock))
     for note in loaded.notes:
-        console.print(Text(note, style="yellow" if note.startswith("warning") else "dim"))
+        console.print(Text(note, style="yellow" if isinstance(note, Warned) else "dim"))
     return PolicyDecider(loaded.executable, sampler)
 
 
-def _print_summary(config: ImagineConfig, sampler: Sampler, output: RolloutOutput) -> None:
+def _print_summary(config: ImagineConfig, sampler: Sampler, output: StreamedOutput) -> None:
     console = Console(highlight=False)
     meter = sampler.meter
     decoded = meter.frames_decoded + output.frames_decoded

@@ -277,10 +277,3 @@ def _images(
         exposed_s=(exposed_ns - start_ns) / NS_PER_S,
         latency_ms=latency.percentiles_ms(),
     )
-
-
-def histogram(values_ms: FloatColumn, *, edges_ms: FloatColumn) -> list[int]:
-    """How many values lie between each pair of edges; the last bin takes all beyond it."""
-    known = values_ms[np.isfinite(values_ms)]
-    counts, _ = np.histogram(np.minimum(known, edges_ms[-1]), bins=edges_ms)
-    return [int(count) for count in counts]

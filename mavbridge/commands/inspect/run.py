@@ -1,31 +1,276 @@
-"""``mavbridge inspect`` from its arguments to its exit status."""
+"""``mavbridge inspect``: flights on the terminal, one in full or two side by side, and in files."""
 
 import heapq
 import json
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import closing
 from dataclasses import asdict
 from itertools import islice
 from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+from rich.console import Console
+from rich.table import Table
+from rich.text import Text
 
 from mavbridge.commands.config import InspectConfig
-from mavbridge.commands.inspect.analysis import FlightAnalysis, analyse
+from mavbridge.commands.inspect.analysis import FlightAnalysis, HolderSpan, analyse
 from mavbridge.commands.inspect.delays import flown_limits, recorded_solves
 from mavbridge.commands.inspect.page import write_page
-from mavbridge.commands.inspect.tables import print_comparison, print_flight
-from mavbridge.commands.output import print_status, table_console
+from mavbridge.commands.output import number, print_status, table_console
 from mavbridge.core.clock import NS_PER_S
 from mavbridge.core.errors import UserError
 from mavbridge.core.files import require_writable
 from mavbridge.core.reasons import reason_to_json
 from mavbridge.core.records import Observed, Solve, Tick, VisionTick
+from mavbridge.core.vehicle import Percentiles
 from mavbridge.flight.action_frames import action_frame
+from mavbridge.flight.outcome import describe
+from mavbridge.observe.report_table import rate_style, shown_rate, timing_table, verdicts
 from mavbridge.observe.timing import report_document
 from mavbridge.observe.viewer.flight import RerunView
 from mavbridge.observe.viewer.layout import ViewedFlight
 from mavbridge.observe.viewer.target import check_target
 from mavbridge.recording.flight_folder import RecordedFlight, open_flight
 from policy.contract import Contract
+
+HOLDERS_SHOWN = 12
+NOTABLE = 0.1
+"""Relative difference of two flights' figures that is marked."""
+_SOURCES = {
+    "flight": "a policy's flight",
+    "demonstration": "a demonstration by the expert",
+    "dagger": "a flight by the policy, with the expert's labels",
+    "imagined": "an imagined flight",
+    "pilot": "a pilot's flight",
+}
+
+
+class Figure(NamedTuple):
+    """One row of the comparison of two flights."""
+
+    name: str
+    unit: str
+    value: Callable[[FlightAnalysis], float | None]
+    digits: int = 1
+    more_is_better: bool | None = False
+    """None: neither is better."""
+
+
+def print_flight(flight: FlightAnalysis, console: Console) -> None:
+    """Everything about one flight."""
+    for line in _facts(flight):
+        console.print(line)
+    print_damage(flight, console)
+    if (table := timing_table(flight.report)) is not None:
+        console.print(table)
+    for line in _pilot_lines(flight) if flight.meta.source == "pilot" else verdicts(flight.report):
+        console.print(line)
+    for images in flight.cameras:
+        if (latency := images.latency_ms) is not None:
+            text = f"p50 {latency.p50:.1f}, p99 {latency.p99:.1f} ms from exposure to feature"
+            name = f"{images.camera}: " if len(flight.cameras) > 1 else ""
+            console.print(Text.assemble(("images   ", "bold"), name + text))
+    if flight.causes:
+        causes = ", ".join(f"{cause} ({count})" for cause, count in flight.causes)
+        console.print(Text.assemble(("causes   ", "bold"), (causes, "yellow")))
+    console.print(_holders_table(flight))
+    console.print(_moments_table(flight))
+
+
+def print_damage(flight: FlightAnalysis, console: Console) -> None:
+    """Say what of the recording was skipped."""
+    for text in flight.damage:
+        console.print(Text.assemble(("damage   ", "bold"), (text, "red")))
+
+
+def _facts(flight: FlightAnalysis) -> Iterator[Text]:
+    meta = flight.meta
+    yield Text.assemble(
+        (str(flight.folder), "bold"), f": {_SOURCES[meta.source]}, {meta.started_at}"
+    )
+    if not meta.finished:
+        yield Text("cut off: it is shown up to its last whole batch of rows", style="yellow")
+    if meta.crash is not None:
+        yield Text(f"crashed: {meta.crash}", style="red")
+    if meta.outcome is not None:
+        yield Text(describe(meta.outcome))
+    if meta.gates_passed is not None:
+        result = {True: "finished", False: "not finished", None: "no verdict"}[meta.success]
+        yield Text(f"course {meta.course_seed}: {meta.gates_passed} gates passed, {result}")
+    if flight.track is not None and len(flight.track.t_s):
+        heights_m = -flight.track.position_ned_m[:, 2]
+        yield Text(f"highest {heights_m.max():.1f} m, path of {path_length_m(flight):.0f} m")
+
+
+def _pilot_lines(flight: FlightAnalysis) -> Iterator[Text]:
+    """What takes the place of the loops' verdicts where no policy flew."""
+    t_s, vision = flight.series.t_s, flight.report.vision
+    rows_hz = (len(t_s) - 1) / t_s[-1] if len(t_s) > 1 and t_s[-1] > 0 else None
+    known = np.isfinite(flight.series.echo[:, 0])
+    share = f", the pilot's sticks known in {known.mean():.1%} of them" if len(known) else ""
+    for name, rate_hz, target_hz, rest in (
+        ("rows", rows_hz, flight.meta.action_hz, share),
+        ("vision", vision.rate_hz, vision.target_hz, ""),
+    ):
+        text = f"{shown_rate(rate_hz)} Hz of {target_hz:.4g} Hz{rest}"
+        yield Text.assemble((f"{name:9}", "bold"), (text, rate_style(rate_hz, target_hz)))
+    if flight.report.observer_drops.recorder:
+        text = f"missed {flight.report.observer_drops.recorder} events"
+        yield Text.assemble((f"{'recorder':9}", "bold"), (text, "yellow"))
+
+
+def path_length_m(flight: FlightAnalysis) -> float:
+    """Length of the flown path; 0 where no position is known."""
+    if flight.track is None:
+        return 0.0
+    position = flight.track.position_ned_m
+    steps = position[1:] - position[:-1]
+    return float(((steps**2).sum(axis=1) ** 0.5).sum())
+
+
+def _holders_table(flight: FlightAnalysis) -> Table:
+    spans = flight.holders
+    is_expert = flight.meta.source == "demonstration"
+    table = Table(title="Who held the sticks", title_justify="left")
+    for name in ("from s", "to s"):
+        table.add_column(name, justify="right")
+    table.add_column("holder", no_wrap=True)
+    table.add_column("why the policy did not fly")
+    shown = spans if len(spans) <= HOLDERS_SHOWN else _longest(spans)
+    for span in shown:
+        holder = "expert" if is_expert and span.holder == "policy" else span.holder
+        table.add_row(
+            f"{span.start_s:.2f}",
+            f"{span.end_s:.2f}",
+            holder,
+            Text(str(span.reason or "")),
+        )
+    if len(shown) < len(spans):
+        table.caption = f"the {len(shown)} longest of {len(spans)}"
+    return table
+
+
+def _longest(spans: Sequence[HolderSpan]) -> list[HolderSpan]:
+    longest = sorted(spans, key=lambda span: span.start_s - span.end_s)[:HOLDERS_SHOWN]
+    return sorted(longest, key=lambda span: span.start_s)
+
+
+def _moments_table(flight: FlightAnalysis) -> Table | Text:
+    if not flight.moments:
+        return Text("no moment went wrong", style="green")
+    table = Table(title="The worst moments, the worst one first", title_justify="left")
+    table.add_column("s", justify="right")
+    table.add_column("what", no_wrap=True)
+    table.add_column("what happened")
+    for moment in flight.moments:
+        table.add_row(f"{moment.t_s:.2f}", moment.what, Text(moment.detail))
+    return table
+
+
+def print_comparison(flights: Sequence[FlightAnalysis], console: Console) -> None:
+    """Two flights side by side; a tenth and more is marked as better or worse."""
+    first, second = flights
+    table = Table(title="Two flights", title_justify="left")
+    table.add_column("", no_wrap=True)
+    for name in _names(first, second):
+        table.add_column(name, justify="right", overflow="fold")
+    table.add_column("second by first", justify="right")
+    for label, one, other in _texts(first, second):
+        table.add_row(label, Text(one), Text(other), "" if one == other else "differs")
+    table.add_section()
+    for figure in FIGURES:
+        one_value, other_value = figure.value(first), figure.value(second)
+        if one_value is None and other_value is None:
+            continue
+        table.add_row(
+            Text(f"{figure.name}{figure.unit and ' [' + figure.unit + ']'}"),
+            number(one_value, figure.digits),
+            number(other_value, figure.digits),
+            _difference(figure, one_value, other_value),
+        )
+    console.print(table)
+    for flight in flights:
+        print_damage(flight, console)
+
+
+def _names(first: FlightAnalysis, second: FlightAnalysis) -> tuple[str, str]:
+    names = (first.folder.name, second.folder.name)
+    return names if names[0] != names[1] else (str(first.folder), str(second.folder))
+
+
+def _texts(first: FlightAnalysis, second: FlightAnalysis) -> Iterator[tuple[str, str, str]]:
+    for label, text in (
+        ("policy", lambda flight: flight.report.policy),
+        ("engine", lambda flight: flight.report.engine),
+        ("vehicle", lambda flight: flight.report.autopilot or "-"),
+        ("loops", lambda flight: f"{flight.meta.mode} rate"),
+        ("ended", _end),
+    ):
+        yield label, text(first), text(second)
+
+
+def _end(flight: FlightAnalysis) -> str:
+    if flight.meta.crash is not None:
+        return "crashed"
+    return "in order" if flight.meta.finished else "cut off"
+
+
+def _difference(figure: Figure, one: float | None, other: float | None) -> Text:
+    if one is None or other is None:
+        return Text("-")
+    if one == other:
+        return Text("=")
+    if not one:
+        is_notable, shown = True, f"{other - one:+.{figure.digits}f}"
+    else:
+        is_notable, shown = abs(other / one - 1) >= NOTABLE, f"{other / one - 1:+.0%}"
+    if not is_notable or figure.more_is_better is None:
+        return Text(shown)
+    if (other > one) == figure.more_is_better:
+        return Text(f"{shown} better", style="green")
+    return Text(f"{shown} worse", style="red")
+
+
+def _percentile(
+    name: str, measured: Callable[[FlightAnalysis], Percentiles | None]
+) -> tuple[Figure, Figure]:
+    def at(pick: Callable[[Percentiles], float]) -> Callable[[FlightAnalysis], float | None]:
+        def value(flight: FlightAnalysis) -> float | None:
+            found = measured(flight)
+            return None if found is None else pick(found)
+
+        return value
+
+    return (
+        Figure(f"{name}, p50", "ms", at(lambda p: p.p50), 2),
+        Figure(f"{name}, p99", "ms", at(lambda p: p.p99), 2),
+    )
+
+
+FIGURES = (
+    Figure("duration", "s", lambda f: f.report.duration_s, more_is_better=None),
+    Figure("flown by the policy", "s", lambda f: f.report.sticks.flying_s, more_is_better=None),
+    Figure("sticks", "1/s", lambda f: f.report.sticks.rate_hz, more_is_better=None),
+    Figure("chunks", "1/s", lambda f: f.report.action.rate_hz, more_is_better=True),
+    Figure("images", "1/s", lambda f: f.report.vision.rate_hz, more_is_better=True),
+    Figure("missed slots", "", lambda f: f.report.sticks.missed_slots, 0),
+    Figure("late chunks", "", lambda f: f.report.action.late_chunks, 0),
+    Figure("sends coasting", "", lambda f: f.report.sticks.coasting_sends, 0),
+    Figure("releases", "", lambda f: f.report.release_count, 0),
+    *_percentile("stick lateness", lambda f: f.report.sticks.lateness_ms),
+    *_percentile("chunk period", lambda f: f.report.action.period_ms),
+    *_percentile("predict", lambda f: f.report.action.predict_ms),
+    *_percentile("feature age at send", lambda f: f.report.feature_age_ms),
+    *_percentile("attitude age at send", lambda f: f.report.state_age_ms),
+    *_percentile("new attitude to wire", lambda f: f.report.state_to_wire_ms),
+    *_percentile("exposure to feature", lambda f: f.images.latency_ms),
+    Figure("path", "m", path_length_m, more_is_better=None),
+    Figure("gates passed", "", lambda f: f.meta.gates_passed, 0, more_is_better=True),
+)
+"""What is compared, in the order of the rows."""
+
 
 MAX_FLIGHTS = 2
 BATCH_EVENTS = 25

@@ -14,13 +14,20 @@ from rich.text import Text
 import mavbridge
 from mavbridge.camera.image_watch import ImageWatch
 from mavbridge.camera.open import NO_CAMERA, check_camera, open_camera, require_present
-from mavbridge.commands.record.config import RecordConfig
-from mavbridge.commands.record.control import KEYS, KEYS_HINT, EpisodeControl, Orders, Seen
-from mavbridge.commands.record.disk import LEAST_S, DiskWatch
-from mavbridge.commands.record.episodes import Episodes, prepare_out
-from mavbridge.commands.record.pilot_view import STICKS_FRESH_NS, PilotView
-from mavbridge.commands.record.screen import RecordScreen, Shown
-from mavbridge.config.flight import FlyConfig
+from mavbridge.commands.config import RecordConfig
+from mavbridge.commands.record.episodes import (
+    KEYS,
+    KEYS_HINT,
+    LEAST_S,
+    DiskWatch,
+    EpisodeControl,
+    Episodes,
+    Orders,
+    Seen,
+    prepare_out,
+)
+from mavbridge.commands.record.view import STICKS_FRESH_NS, PilotView, RecordScreen, Shown
+from mavbridge.config.flight import FlyConfig, LinkConfig
 from mavbridge.config.rates import Rates
 from mavbridge.core.clock import NS_PER_S, Clock, MonotonicClock, period_ns, wall_offset_ns
 from mavbridge.core.errors import UserError
@@ -97,7 +104,7 @@ def pilot_flight(config: RecordConfig) -> FlyConfig:
         visual_rate=config.film.visual_rate,
         realtime=False,
     )
-    return FlyConfig(link=config.vehicle.link, rates=rates)
+    return FlyConfig(link=LinkConfig(**vars(config.vehicle), readonly=True), rates=rates)
 
 
 def listening_guard(config: RecordConfig, clock: Clock) -> GuardSettings:

@@ -7,8 +7,8 @@ from pathlib import Path
 from rich.console import Console
 from rich.text import Text
 
+from mavbridge.commands.config import ReplayFrom
 from mavbridge.commands.output import BLUE, FIGURE_DPI, FIGURE_STYLE, GREY, MUTED, make_table
-from mavbridge.commands.replay.config import ReplayFrom
 from mavbridge.core.vehicle import ACTION_CLASSES
 from mavbridge.simulation.replay.compare import (
     PAST_INPUTS,

@@ -7,11 +7,11 @@ from typing import Any
 
 import cv2
 
+from mavbridge.commands.config import ReplayConfig, ReplayFrom
 from mavbridge.commands.output import print_status, require_outputs, table_console
-from mavbridge.commands.replay.config import ReplayConfig, ReplayFrom
 from mavbridge.commands.replay.results import ReplayResult, draw, print_replay, to_json
 from mavbridge.config.flight import FlyConfig
-from mavbridge.config.trust import foreign_policy
+from mavbridge.config.settings_files import foreign_policy
 from mavbridge.core.clock import NS_PER_S
 from mavbridge.core.errors import ExitCode, UserError
 from mavbridge.core.records import FeatureFrame

@@ -165,7 +165,8 @@ def override_obstacles(values: Mapping[str, float], source_system: int) -> Itera
         if not low <= source_system <= high:
             yield (
                 f"it obeys system {low:.0f} and we are system {source_system}: use "
-                f"--source-system {low:.0f}, or set MAV_GCS_SYSID (SYSID_MYGCS on older firmware)"
+                f"--set-config link.source_system={low:.0f}, or set MAV_GCS_SYSID (SYSID_MYGCS on "
+                "older firmware)"
             )
     options = int(values.get("RC_OPTIONS", 0))
     if options & _IGNORE_OVERRIDES:

@@ -75,7 +75,7 @@ class Danger(NamedTuple):
     @property
     def refusal(self) -> str:
         """The sentence for a flight that is not begun."""
-        return f"{self.text}, or --accept-risk {self.risk} to fly all the same"
+        return f"{self.text}, or --set-config link.accept_risk={self.risk} to fly all the same"
 
 
 LONGEST_SETPOINT_S = 3.0

@@ -8,7 +8,7 @@ policy's curve to a motion, and by the inverse of the vehicle's to the stick tha
 import math
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
-from typing import NamedTuple, Protocol
+from typing import Literal, NamedTuple, Protocol
 
 from mavbridge.core.vehicle import StickGains, Sticks
 
@@ -188,6 +188,9 @@ def _within(full: float, pitch: float, roll: float) -> tuple[float, float]:
     return pitch * full / length, roll * full / length
 
 
+Quantity = Literal["climb", "descent", "yaw rate", "lean"]
+
+
 @dataclass(frozen=True, slots=True, kw_only=True)
 class StickCurves:
     """The map of one policy's sticks to one vehicle's, in one flight mode.
@@ -199,8 +202,15 @@ class StickCurves:
     throttle: AxisMap | None = None
     yaw: AxisMap | None = None
     lean: LeanMap | None = None
-    notes: tuple[str, ...] = ()
-    """For the user, at the start: what this vehicle cannot do, or why nothing is mapped."""
+    shortfalls: tuple[tuple[Quantity, str], ...] = ()
+    """What this vehicle cannot do, each with a sentence."""
+    unmapped: str | None = None
+    """Why nothing is mapped although it should be."""
+
+    @property
+    def notes(self) -> tuple[str, ...]:
+        """For the user, at the start."""
+        return (*filter(None, [self.unmapped]), *(text for _, text in self.shortfalls))
 
     @property
     def is_identity(self) -> bool:
@@ -280,7 +290,7 @@ def curves_between(gains: StickGains, vehicle: VehicleCurves) -> StickCurves:
         throttle=None if throttle is None or _is_same(throttle) else throttle,
         yaw=None if _is_same(yaw) else yaw,
         lean=None if lean.vehicle.is_like(lean.policy) else lean,
-        notes=(*_axis_notes(throttle, yaw), *_lean_notes(lean)),
+        shortfalls=(*_axis_notes(throttle, yaw), *_lean_notes(lean)),
     )
 
 
@@ -288,7 +298,7 @@ def _is_same(axis: AxisMap) -> bool:
     return axis.vehicle.is_like(axis.policy)
 
 
-def _axis_notes(throttle: AxisMap | None, yaw: AxisMap) -> Iterator[str]:
+def _axis_notes(throttle: AxisMap | None, yaw: AxisMap) -> Iterator[tuple[Quantity, str]]:
     if throttle is not None:
         up, down = throttle.vehicle
         yield from _note("climb", "climbs", "m/s", throttle.policy.above, up.full, up.parameter)
@@ -299,20 +309,21 @@ def _axis_notes(throttle: AxisMap | None, yaw: AxisMap) -> Iterator[str]:
     yield from _note("yaw rate", "turns", "deg/s", yaw.policy.above, right.full, right.parameter)
 
 
-def _lean_notes(lean: LeanMap) -> Iterator[str]:
+def _lean_notes(lean: LeanMap) -> Iterator[tuple[Quantity, str]]:
     vehicle = lean.vehicle
     yield from _note("lean", "leans", "deg", lean.policy.above, vehicle.full_deg, vehicle.parameter)
 
 
 def _note(
-    noun: str, verb: str, unit: str, policy: Half, most: float, parameter: str
-) -> Iterator[str]:
+    noun: Quantity, verb: str, unit: str, policy: Half, most: float, parameter: str
+) -> Iterator[tuple[Quantity, str]]:
     """A sentence if the vehicle cannot do all that the policy's stick means."""
     if most < policy.full * (1.0 - SAME_GAIN):
         yield (
+            noun,
             f"full {noun} of the policy is {policy.full:.3g} {unit} and this vehicle {verb} "
             f"{most:.3g} {unit} at most ({parameter}): beyond {policy.travel(most):.2f} of the "
-            "stick it does less"
+            "stick it does less",
         )
 
 
@@ -322,7 +333,7 @@ def unusable(
     """No map, and the sentence that says why, if parameters are missing or cannot be; else None."""
     as_they_are = "the policy's sticks go to the vehicle as they are, whatever they mean to it"
     if missing := [name for name in needed if name not in values]:
-        return StickCurves(notes=(f"{as_they_are}: it did not send {', '.join(missing)}",))
+        return StickCurves(unmapped=f"{as_they_are}: it did not send {', '.join(missing)}")
     if bad := [f"{name} is {values[name]:g}" for name in positive if not values[name] > 0.0]:
-        return StickCurves(notes=(f"{as_they_are}: {', '.join(bad)}",))
+        return StickCurves(unmapped=f"{as_they_are}: {', '.join(bad)}")
     return None

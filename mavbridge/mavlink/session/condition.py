@@ -249,6 +249,6 @@ class VehicleCondition:
         if system.present & bit and not system.healthy & bit:
             return "the vehicle reports its battery as low or failed"
         if 0 <= system.battery_percent < self._min_battery_percent:
-            least = f"{self._min_battery_percent:g} % (--min-battery)"
+            least = f"{self._min_battery_percent:g} % (envelope.min_battery)"
             return f"the battery is at {system.battery_percent} %, below {least}"
         return None

@@ -111,7 +111,7 @@ class VehicleDiscovery:
         if len(systems) > 1:
             raise PeerError(
                 f"several vehicles are on this link (systems {systems}): "
-                "choose one with --target-system"
+                "choose one with link.target_system"
             )
         if len(wanted) > 1:
             addresses = " and ".join(vehicle.place for vehicle in wanted)
@@ -135,7 +135,7 @@ class VehicleDiscovery:
         if self._heard_ns:
             heard = ", ".join(str(s) for s in sorted({v.source.system for v in self._heard_ns}))
             silent = f"system {self._target_system} is silent"
-            return f"{silent}, but system {heard} was heard: correct --target-system"
+            return f"{silent}, but system {heard} was heard: correct link.target_system"
         if self._odd_components:
             found = ", ".join(map(str, sorted(self._odd_components)))
             return (

@@ -12,7 +12,7 @@ from pymavlink.dialects.v20 import ardupilotmega as dialect
 from mavbridge.core.clock import NS_PER_MS, NS_PER_S
 from mavbridge.core.reasons import Code, Reason, because
 from mavbridge.core.switch import Switch
-from mavbridge.core.vehicle import Output, VehicleStatus
+from mavbridge.core.vehicle import Output, VehicleStatus, said_by_vehicle
 from mavbridge.mavlink.codec.calibration import RcCalibration
 from mavbridge.mavlink.codec.messages import (
     RESTART_STAMPS,
@@ -141,7 +141,7 @@ class VehicleSession:
 
     def _show(self, *texts: str) -> None:
         for text in texts:
-            self._report(f"vehicle: {text}")
+            self._report(said_by_vehicle(text))
 
     def _receive_rc(self, rc: RcChannels, arrived_ns: int) -> None:
         calibration = self.calibration

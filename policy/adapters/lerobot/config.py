@@ -13,7 +13,7 @@ from typing import Any, Literal, TypeVar, get_args, get_origin, get_type_hints
 
 from policy import files
 from policy.contract import ACTION_DIM, EXTRA_NAMES
-from policy.errors import CheckpointError
+from policy.errors import CheckpointError, warned
 
 CONFIG_FILE = "config.json"
 STATE_KEY, ACTION_KEY = "observation.state", "action"
@@ -155,11 +155,13 @@ def read_config(folder: Path) -> tuple[Config, list[str]]:
     features = _features(entries)
     config: Config
     config = _act(entries, features) if kind == "act" else _diffusion(entries, features)
-    notes = []
+    notes: list[str] = []
     if unknown := sorted(set(entries.data) - entries.read - _WITHOUT_EFFECT):
         notes.append(
-            f"warning: {path} has entries that this build does not know: {', '.join(unknown)}. If "
-            "they change what the policy computes, it flies wrongly"
+            warned(
+                f"{path} has entries that this build does not know: {', '.join(unknown)}. If "
+                "they change what the policy computes, it flies wrongly"
+            )
         )
     return config, notes
 

@@ -18,7 +18,7 @@ from policy.adapters.lerobot.config import (
     read_json,
 )
 from policy.contract import FloatArray
-from policy.errors import CheckpointError
+from policy.errors import CheckpointError, warned
 from policy.files import open_safetensors
 
 PREPROCESSOR, POSTPROCESSOR = "policy_preprocessor.json", "policy_postprocessor.json"
@@ -122,16 +122,19 @@ def _notes(folder: Path, features: Features, normalisation: Normalisation) -> li
     found += [(ACTION_KEY, "ACTION", normalisation.action)]
     found += [(ENVIRONMENT_KEY, "ENV", normalisation.goal)] if features.takes_goal else []
     found += [(STATE_KEY, "STATE", normalisation.state)] if features.state_dim else []
-    notes = [
-        f"warning: {folder} holds no statistics of {key}: it flies as it is, not normalised"
+    notes: list[str] = [
+        warned(f"{folder} holds no statistics of {key}: it flies as it is, not normalised")
         for key, kind, affine in found
         if affine is None and features.modes.get(kind, "IDENTITY") != "IDENTITY"
     ]
     state = normalisation.state
     if state is not None and (constant := np.flatnonzero(state.divisor < _CONSTANT).tolist()):
         notes.append(
-            f"warning: numbers {constant} (from 0) of {STATE_KEY} never changed in the training "
-            "data: any other value is divided by almost nothing, as in LeRobot, and rules the chunk"
+            warned(
+                f"numbers {constant} (from 0) of {STATE_KEY} never changed in the training "
+                "data: any other value is divided by almost nothing, as in LeRobot, and rules the "
+                "chunk"
+            )
         )
     return notes
 

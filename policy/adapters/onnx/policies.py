@@ -22,7 +22,7 @@ from policy.engines.executable import (
 from policy.engines.openvino_compile import engine_name, precisions
 from policy.engines.parity import make_parity_samples, parity_failure
 from policy.engines.stepwise import solver_segment
-from policy.errors import PolicyError
+from policy.errors import PolicyError, warned
 from policy.nets.diffusion import NoiseSchedule, flight_noise
 from policy.preprocess import input_to_bytes
 from policy.protocol import Executable
@@ -182,7 +182,7 @@ def choose_precision(
             reason = f"{type(error).__name__}: {str(error).strip().splitlines()[0]}"
         if reason is None:
             return candidate, (*notes, f"engine {candidate.engine}: agrees with float32")
-        notes.append(f"warning: {engine_name(vision, action)} is passed over: {reason}")
+        notes.append(warned(f"{engine_name(vision, action)} is passed over: {reason}"))
     return reference, (*notes, f"engine {reference.engine}")
 
 

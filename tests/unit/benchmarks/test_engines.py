@@ -31,5 +31,5 @@ def test_a_policy_that_no_engine_compiles_is_timed_as_it_flies() -> None:
 
 
 def test_a_policy_that_cannot_be_loaded_is_refused() -> None:
-    with pytest.raises(PolicyError, match="--allow-untrained"):
+    with pytest.raises(PolicyError, match=r"network\.allow_untrained"):
         time_engines((PolicyConfig(policy=TINY),), rounds=1, block_s=0.01)

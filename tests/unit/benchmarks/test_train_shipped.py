@@ -7,6 +7,7 @@ import pytest
 from benchmarks import train_shipped
 from benchmarks.train_shipped import STEPS
 from mavbridge.cli import cli
+from mavbridge.config.settings_files import Settings, given_settings
 
 
 @pytest.fixture
@@ -31,7 +32,11 @@ def test_every_command_is_one_of_ours(
     assert len(commands) == len(STEPS[policy])
     monkeypatch.chdir(tmp_path / policy)
     for command in commands:
-        cli.parse_args(command.split(), print_error=False, exit_on_error=False)
+        _, outer, _ = cli.meta.parse_args(command.split(), print_error=False, exit_on_error=False)
+        settings = given_settings(outer.arguments.get("set_config", ()))
+        own = Settings(settings, source="test", commands=tuple(cli))
+        monkeypatch.setattr(cli, "config", [own])
+        cli.parse_args(list(outer.args), print_error=False, exit_on_error=False)
 
 
 def test_weights_that_are_there_are_not_trained_again(commands: list[str], tmp_path: Path) -> None:

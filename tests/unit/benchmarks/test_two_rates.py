@@ -34,10 +34,10 @@ def made(control: Control, loop: Loop, encoder_ms: int, weights: Path, episodes:
 
 
 def test_a_single_loop_waits_for_its_encoder_and_two_rates_do_not() -> None:
-    assert "--single-rate --rate 18.52" in flags_of("one rate", 50)
-    assert "--single-rate --rate 100 " in flags_of("one rate", 5)
-    assert "--visual-rate 20 --action-rate 100" in flags_of("100 actions a second", 50)
-    assert "--visual-rate 30 --action-rate 250" in flags_of("250 actions a second", 5)
+    assert "--single-rate --set-config rates.single=18.52" in flags_of("one rate", 50)
+    assert "--single-rate --set-config rates.single=100 " in flags_of("one rate", 5)
+    assert "rates.visual=20 --set-config rates.action=100" in flags_of("100 actions a second", 50)
+    assert "rates.visual=30 --set-config rates.action=250" in flags_of("250 actions a second", 5)
 
 
 def test_an_interrupted_map_resumes_and_other_weights_begin_anew(

@@ -134,7 +134,7 @@ def test_shared_memory():
 @pytest.mark.skipif(not Path("/dev/shm").is_dir(), reason="needs /dev/shm")
 def test_shared_memory_that_never_appears_is_counted_down_and_refused():
     lines = []
-    with pytest.raises(CameraError, match=r"no frame within 3 s \(--camera-timeout\): shm:mb-none"):
+    with pytest.raises(CameraError, match=r"within 3 s \(link.camera_timeout\): shm:mb-none"):
         open_camera(
             "shm:mb-none", image_size=224, clock=FakeClock(), timeout_s=3.0, report=lines.append
         )
@@ -172,10 +172,10 @@ def test_the_screen_without_its_packages_names_the_extra(monkeypatch, package):
 @pytest.mark.parametrize(
     ("settings", "complaint"),
     [
-        ({"camera_timeout": 0.0}, "--camera-timeout must be between 0.1 and 3600 s"),
+        ({"camera_timeout": 0.0}, "link.camera_timeout must be between 0.1 and 3600 s"),
         ({"camera_latency": -1.0}, "--camera-latency must be between 0 and 2000 ms"),
-        ({"max_frozen_image": -0.1}, "--max-frozen-image must be between 0 and 60 s"),
-        ({"max_black_image": float("nan")}, "--max-black-image must be between 0 and 60 s"),
+        ({"max_frozen_image": -0.1}, "limits.frozen_image must be between 0 and 60 s"),
+        ({"max_black_image": float("nan")}, "limits.black_image must be between 0 and 60 s"),
     ],
 )
 def test_settings_that_no_camera_has_are_refused(settings, complaint):

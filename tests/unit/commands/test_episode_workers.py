@@ -7,7 +7,7 @@ import pytest
 
 from helpers.worker_jobs import Job, run
 from mavbridge.commands.episode_workers import fly_jobs
-from mavbridge.config.workers import WorkersConfig
+from mavbridge.config.episodes import WorkersConfig
 from mavbridge.core.errors import PeerError, UserError
 from mavbridge.simulation.referee import EpisodeInterruptedError
 
@@ -37,10 +37,6 @@ def test_where_to_fly() -> None:
     assert WorkersConfig().ray_address is None
     assert WorkersConfig(ray=True).ray_address == "auto"
     assert WorkersConfig(ray="head:6379").ray_address == "head:6379"
-    assert [config.is_parallel for config in (WorkersConfig(), WorkersConfig(workers=2))] == [
-        False,
-        True,
-    ]
     with pytest.raises(UserError, match="--workers must be between"):
         WorkersConfig(workers=0)
 

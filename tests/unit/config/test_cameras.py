@@ -45,7 +45,3 @@ def test_names_that_the_policy_does_not_have_are_refused(
 def test_several_cameras_have_different_names(given: tuple[str, ...]) -> None:
     with pytest.raises(UserError, match="each has a name of its own"):
         CameraConfig(camera=given)
-
-
-def test_a_window_is_a_lone_camera() -> None:
-    assert CameraConfig(window_name="Sim").sources_of(("front",)) == ("screen:Sim",)

@@ -38,10 +38,10 @@ def test_a_slow_single_rate_policy_finds_an_image_that_has_just_come() -> None:
 @pytest.mark.parametrize(
     ("flag", "value", "message"),
     [
-        ("rate", 0.4, "--rate must be between 0.5 and 500 Hz"),
-        ("action_rate", 501.0, "--action-rate must be between 0.5 and 500 Hz"),
-        ("stick_rate", 19.0, "--stick-rate must be between 20 and 400 Hz"),
-        ("stick_rate", 401.0, "--stick-rate must be between 20 and 400 Hz"),
+        ("rate", 0.4, "rates.single must be between 0.5 and 500 Hz"),
+        ("action_rate", 501.0, "rates.action must be between 0.5 and 500 Hz"),
+        ("stick_rate", 19.0, "rates.stick must be between 20 and 400 Hz"),
+        ("stick_rate", 401.0, "rates.stick must be between 20 and 400 Hz"),
     ],
 )
 def test_a_rate_out_of_range_is_refused_by_its_flag(flag: str, value: float, message: str) -> None:

@@ -21,6 +21,7 @@ from helpers.guides import (
     page_name,
 )
 from mavbridge.cli import cli
+from mavbridge.config.settings_files import Settings, given_settings
 from mavbridge.core.errors import MavbridgeError
 from mavbridge.core.vehicle import Output
 from mavbridge.mavlink.profiles.ardupilot import ArduPilot
@@ -67,7 +68,10 @@ def parse_mavbridge(arguments: list[str]) -> None:
     words = list(outer.args)
     if words and not words[0].startswith("-"):
         assert words[0] in cli, f"unknown command {words[0]}"
-    cli.parse_args(words, print_error=False, exit_on_error=False)
+    settings = given_settings(outer.arguments.get("set_config", ()))
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(cli, "config", [Settings(settings, source="test", commands=tuple(cli))])
+        cli.parse_args(words, print_error=False, exit_on_error=False)
 
 
 def parse_make(arguments: list[str]) -> None:
@@ -137,7 +141,7 @@ def test_an_unknown_flag_or_command_would_be_found() -> None:
     for line in (
         "mavbridge --conect udp:127.0.0.1:14550",
         "mavbridge chekc --connect udp:127.0.0.1:14550",
-        "mavbridge --connect udp:127.0.0.1:14550 --arm --max-tilt high",
+        "mavbridge --connect udp:127.0.0.1:14550 --arm --set-config envelope.tilt=high",
         "python -m sitl --conect udpout:127.0.0.1:14550",
         "make flyy",
         "make fly COURS=1",

@@ -44,11 +44,14 @@ def test_flags_tighten_one_by_one() -> None:
 @pytest.mark.parametrize(
     ("limits", "message"),
     [
-        (Limits(max_attitude_age=0.25), "--max-attitude-age 0.25 is looser than the 0.2 s of this"),
-        (Limits(max_velocity_age=0.5), "--max-velocity-age 0.5 is looser than the 0.4 s"),
-        (Limits(max_feature_age=5), "--max-feature-age 5 is looser than the 2 s"),
-        (Limits(max_chunk_age=1.6), "--max-chunk-age 1.6 is looser than the 1.5 s"),
-        (Limits(max_stall=0.6), "--max-stall 0.6 is looser than the 0.5 s"),
+        (
+            Limits(max_attitude_age=0.25),
+            "limits.attitude_age=0.25 is looser than the 0.2 s",
+        ),
+        (Limits(max_velocity_age=0.5), "limits.velocity_age=0.5 is looser than the 0.4 s"),
+        (Limits(max_feature_age=5), "limits.feature_age=5 is looser than the 2 s"),
+        (Limits(max_chunk_age=1.6), "limits.chunk_age=1.6 is looser than the 1.5 s"),
+        (Limits(max_stall=0.6), "limits.stall=0.6 is looser than the 0.5 s"),
     ],
 )
 def test_a_flag_that_would_loosen_is_refused(limits: Limits, message: str) -> None:
@@ -68,5 +71,5 @@ def test_a_measured_flight_may_have_tighter_ages_too() -> None:
 @pytest.mark.parametrize("name", ["attitude", "velocity", "feature", "chunk"])
 @pytest.mark.parametrize("age_s", [0.0, -1.0, 61.0, float("nan")])
 def test_an_age_out_of_range_is_refused_by_its_flag(name: str, age_s: float) -> None:
-    with pytest.raises(UserError, match=f"--max-{name}-age must be between 0.01 and 60 s"):
+    with pytest.raises(UserError, match=f"limits.{name}_age must be between 0.01 and 60 s"):
         Limits(**{f"max_{name}_age": age_s})

@@ -53,7 +53,7 @@ def test_a_policy_that_is_fast_enough_needs_no_words(is_dual: bool) -> None:
         ),
         (300, 4, None, 0, "an image 300 ms.* the image is up to 614 ms old, beyond the 300 ms"),
         (0, 900, None, 0, "Take fewer --num-diffusion-steps"),
-        (0, 20, 5, 0, "attitude is up to 220 ms old.* Ask for a higher --action-rate"),
+        (0, 20, 5, 0, "attitude is up to 220 ms old.* Ask for a higher rates.action"),
         (0, 900, 0.5, 0.8, "attitude is up to 2.9 s old, beyond the 900 ms"),
         (500, 20, 1, 2, "when a chunk is begun, the image is up to 1 s old, beyond the 300 ms"),
     ],
@@ -80,7 +80,7 @@ def test_a_horizon_shorter_than_the_time_between_solves_is_refused_as_that(
     act_ms: float | None, horizon: int, dt_s: float, hz: float | None, least: int
 ) -> None:
     contract = replace(CONTRACT, horizon=horizon, chunk_dt_s=dt_s)
-    with pytest.raises(PolicyError, match=f"between two solves .* --rate {least} or more") as told:
+    with pytest.raises(PolicyError, match=f"solves .* rates.single {least} or more") as told:
         notes_of(0, act_ms, hz=hz, is_dual=False, contract=contract)
     assert "slow" not in str(told.value)
     assert f"{horizon} x {dt_s * 1e3:.0f}" in str(told.value)
@@ -120,8 +120,12 @@ def test_where_nothing_could_be_measured_nothing_is_refused() -> None:
 @pytest.mark.parametrize(
     ("is_dual", "rates", "told"),
     [
-        (True, Rates(rate=2), "warning: --rate 2 is of a single rate: add --single-rate"),
-        (False, Rates(action_rate=50), "warning: --action-rate 50 is of two rates: give --rate"),
+        (True, Rates(rate=2), "warning: rates.single=2 is of a single rate: add --single-rate"),
+        (
+            False,
+            Rates(action_rate=50),
+            "warning: rates.action=50 is of two rates: give rates.single",
+        ),
         (True, Rates(rate=30, action_rate=50), None),
     ],
 )

@@ -105,7 +105,7 @@ def test_the_flag(given_rate: float | str, limits: tuple[float, float]) -> None:
     "given_rate", ["car", "auto:5", "auto:a:b", "auto:30:10", 0.0, "auto:0:30"]
 )
 def test_a_bad_flag(given_rate: float | str) -> None:
-    with pytest.raises(UserError, match="visual-rate"):
+    with pytest.raises(UserError, match=r"rates\.visual"):
         Rates(visual_rate=given_rate)
 
 

@@ -289,7 +289,7 @@ def test_commands_are_echoed_and_confirmed() -> None:
 @pytest.mark.parametrize(
     ("params", "expected"),
     [
-        ({"MAV_GCS_SYSID": 42.0}, "--source-system 42"),
+        ({"MAV_GCS_SYSID": 42.0}, "--set-config link.source_system=42"),
         ({"RC_OPTIONS": 2.0}, "RC_OPTIONS bit 1"),
         ({"RC_OVERRIDE_TIME": 0.0}, "RC_OVERRIDE_TIME is 0"),
     ],

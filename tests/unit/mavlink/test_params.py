@@ -102,7 +102,7 @@ def test_a_calibration_that_the_codec_would_refuse_later_cannot_be_accepted(
     ("values", "source_system", "expected"),
     [
         ({"MAV_GCS_SYSID": 255.0}, 255, None),
-        ({"MAV_GCS_SYSID": 255.0}, 42, "--source-system 255"),
+        ({"MAV_GCS_SYSID": 255.0}, 42, "--set-config link.source_system=255"),
         ({"MAV_GCS_SYSID": 240.0, "MAV_GCS_SYSID_HI": 250.0}, 245, None),
         ({"MAV_GCS_SYSID": 240.0, "MAV_GCS_SYSID_HI": 0.0}, 245, "obeys system 240"),
         ({"SYSID_MYGCS": 252.0}, 255, "obeys system 252"),
@@ -143,7 +143,7 @@ def test_a_risk_is_refused_until_it_is_accepted_or_mended(
     assert problem is not None
     assert (problem.code, dict(problem.data)["risk"]) == (Code.RISK, risk)
     assert cure in str(problem)
-    assert f"--accept-risk {risk}" in str(problem)
+    assert f"--set-config link.accept_risk={risk}" in str(problem)
     for name in change:
         refused.set_by_pilot(name, 1.0)
     assert refused.problem() is None
@@ -218,10 +218,10 @@ def test_many_sticks_fill_a_port_that_carries_few_states() -> None:
 def test_a_slow_serial_port_is_refused_for_both_autopilots(connect: str) -> None:
     vehicle = ParamVehicle(connect=connect)
     vehicle.run(6.0)
-    assert "or --accept-risk slow-serial" in str(vehicle.problem())
+    assert "or --set-config link.accept_risk=slow-serial" in str(vehicle.problem())
     px4 = px4_vehicle(connect=connect)
     px4.run(6.0)
-    assert "or --accept-risk slow-serial" in str(px4.problem())
+    assert "or --set-config link.accept_risk=slow-serial" in str(px4.problem())
     fine = px4_vehicle(connect=connect, accepted_risks=("slow-serial",))
     fine.run(6.0)
     assert fine.problem() is None

@@ -50,12 +50,12 @@ def test_two_vehicles_need_a_choice() -> None:
     discovery = VehicleDiscovery(target_system=0)
     discovery.receive(Endpoint(1, 1), heartbeat(), None, 0)
     discovery.receive(Endpoint(7, 1), heartbeat(), None, S)
-    with pytest.raises(PeerError, match=r"\[1, 7\].*--target-system"):
+    with pytest.raises(PeerError, match=r"\[1, 7\].*link.target_system"):
         discovery.choose(2 * S)
     chosen = VehicleDiscovery(target_system=7)
     chosen.receive(Endpoint(1, 1), heartbeat(), None, 0)
     assert chosen.choose(9 * S) is None
-    assert "--target-system" in chosen.describe(hearing("udp:127.0.0.1:1"))
+    assert "link.target_system" in chosen.describe(hearing("udp:127.0.0.1:1"))
     chosen.receive(Endpoint(7, 1), heartbeat(autopilot=12), None, S)
     peer = chosen.choose(3 * S)
     assert peer is not None

@@ -179,7 +179,7 @@ def test_landed_is_what_the_vehicle_says_and_not_for_ever(
         (SystemStatus(BATTERY_BIT, BATTERY_BIT, 15), None),
         (
             SystemStatus(BATTERY_BIT, BATTERY_BIT, 14),
-            "the battery is at 14 %, below 15 % (--min-battery)",
+            "the battery is at 14 %, below 15 % (envelope.min_battery)",
         ),
     ],
 )

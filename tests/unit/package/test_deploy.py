@@ -28,7 +28,7 @@ def test_the_sample_settings_are_understood(monkeypatch: pytest.MonkeyPatch) -> 
     monkeypatch.setattr(cli, "config", cli.config)  # --config sets it, for all who parse later
     monkeypatch.setattr("mavbridge.flight.app.fly", lambda config: seen.append(config) or 0)
     with pytest.raises(SystemExit) as ended:
-        cli.meta(["--config", str(DEPLOY / "mavbridge.toml"), "--max-height", "20"])
+        cli.meta(["--config", str(DEPLOY / "mavbridge.toml"), "--set-config", "envelope.height=20"])
     assert ended.value.code == 0
     (config,) = seen
     assert config.link.connect == "/dev/ttyACM0,921600"

@@ -12,10 +12,10 @@ import pytest
 from helpers.golden_flights import FLIGHTS, copied
 from mavbridge.__main__ import main
 from mavbridge.cli import cli
-from mavbridge.commands.replay.config import ReplayConfig
+from mavbridge.commands.config import ReplayConfig
 from mavbridge.commands.replay.run import replay
 from mavbridge.config.flight import FlyConfig
-from mavbridge.config.trust import untrusted_settings
+from mavbridge.config.settings_files import untrusted_settings
 from mavbridge.core.errors import UserError
 from mavbridge.recording.folder import SETTINGS
 from mavbridge.recording.meta import FlightError, read_meta
@@ -191,7 +191,7 @@ def test_a_settings_file_reaches_nothing_by_itself(
     path = lure / "mavbridge.toml"
     path.write_text(text)
     with pytest.raises(SystemExit) as ended:
-        main(["--config", str(path), "--connect-timeout", "0.1"])
+        main(["--config", str(path), "--set-config", "link.timeout=0.1"])
     assert ended.value.code == 2
     shown = " ".join(capsys.readouterr().err.split())
     assert f"{flag} '" in shown

@@ -203,10 +203,10 @@ def test_weights_that_learned_from_rates_are_flown_by_them(small_toge, checkpoin
     [
         ({"checkpoint": Path("absent.safetensors")}, "no such file"),
         ({"checkpoint": Path("weights.bin")}, "not a checkpoint"),
-        ({"image_size": 64}, "--image-size 64 contradicts"),
+        ({"image_size": 64}, "network.image_size=64 contradicts"),
         ({"device": "cuda:99"}, "this computer has"),
         ({"spec": "toge:huge"}, "neither a size"),
-        ({"spec": "toge:medium", "checkpoint": None}, "--allow-untrained"),
+        ({"spec": "toge:medium", "checkpoint": None}, "network.allow_untrained"),
     ],
 )
 def test_cheap_checks_refuse_without_loading(checkpoint, changes, message):

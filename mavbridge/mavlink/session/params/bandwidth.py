@@ -50,5 +50,5 @@ def baud_danger(baud: int | None, *, streams: Iterable[StreamGroup], stick_hz: f
     cure = f"a serial port of {enough} baud on both sides" if enough else "a network link"
     return (
         f"{baud} baud cannot carry the sticks and states that are asked for ({needed:.0f} bit/s): "
-        f"use --connect with {cure}, or a lower --action-rate"
+        f"use --connect with {cure}, or a lower rates.action"
     )

@@ -8,7 +8,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from mavbridge.commands.config import DemonstrateConfig
 from mavbridge.commands.demonstrate import (
     DemonstrationSpec,
     TurnSchedule,
@@ -17,7 +16,7 @@ from mavbridge.commands.demonstrate import (
     fly_demonstration,
 )
 from mavbridge.commands.train import fit_to_flights
-from mavbridge.config.courses import RACE_COURSE_SEED, AutopilotKind
+from mavbridge.config.episodes import RACE_COURSE_SEED, AutopilotKind, DemonstrateConfig
 from mavbridge.config.policy import PolicyConfig
 from mavbridge.core.errors import UserError
 from mavbridge.core.vehicle import BodyRates

@@ -2,9 +2,13 @@
 
 import pytest
 
-from mavbridge.commands.evaluate.config import EvaluateConfig
-from mavbridge.commands.evaluate.episodes import EpisodeSpec
-from mavbridge.config.courses import MAX_EPISODES, MAX_EVALUATION_SEED, RACE_COURSE_SEED
+from mavbridge.commands.evaluate.run import EpisodeSpec
+from mavbridge.config.episodes import (
+    MAX_EPISODES,
+    MAX_EVALUATION_SEED,
+    RACE_COURSE_SEED,
+    EvaluateConfig,
+)
 from mavbridge.config.policy import PolicyConfig
 from mavbridge.core.errors import UserError
 

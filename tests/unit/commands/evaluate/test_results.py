@@ -2,19 +2,19 @@ import json
 import math
 from pathlib import Path
 
-import numpy as np
 import pytest
 from rich.console import Console
 
 from helpers.evaluated_flights import FINISHED, crashed, finished
 from helpers.factories import make_released_tick, make_tick, make_trace, make_vision_tick
-from mavbridge.commands.evaluate.config import EvaluateConfig
 from mavbridge.commands.evaluate.results import (
     Evaluation,
+    draw,
     print_evaluation,
     summarise,
     to_json,
 )
+from mavbridge.config.episodes import EvaluateConfig
 from mavbridge.core.clock import NS_PER_MS
 from mavbridge.core.vehicle import NEUTRAL, Sticks
 from mavbridge.simulation.referee import EpisodeResult, StickMeter
@@ -74,20 +74,13 @@ def test_the_table_shows_rate_interval_and_ends() -> None:
     assert "50.0%" in text
     assert "9.5% to 90.5%" in text  # Wilson's of 1 in 2
     assert "2 flights: 1 finished, 1 crashed" in text
-    assert "lockstep, random conditions, images 50 ms later" in text
+    assert "random conditions, images 50 ms later" in text
 
 
-def test_the_picture_plots_gates_outcomes_and_smoothness() -> None:
+def test_the_picture_is_drawn(tmp_path: Path) -> None:
     pytest.importorskip("matplotlib", reason="needs the extra bench")
-    from mavbridge.commands.evaluate.figure import make_figure
-
-    figure = make_figure(evaluation(finished(), crashed(stick_rate_per_s=1.0), crashed()))
-    gates, outcomes, smoothness = figure.axes
-    assert gates.lines[0].get_xydata() == pytest.approx(np.array([[1, 1.0], [2, 1 / 3]]))
-    assert [bar.get_width() for bar in outcomes.patches] == [2, 1]
-    assert [label.get_text() for label in outcomes.get_yticklabels()] == ["crashed", "finished"]
-    dots = {line.get_label(): line.get_xydata().tolist() for line in smoothness.lines}
-    assert dots == {"finished": [[3.0, 0.5]], "not finished": [[6.0, 1.0]]}
+    draw(evaluation(finished(), crashed(stick_rate_per_s=1.0), crashed()), tmp_path / "a.png")
+    assert (tmp_path / "a.png").stat().st_size > 10_000
 
 
 def test_stick_movement_counts_only_what_the_policy_sent_in_a_row() -> None:

@@ -9,11 +9,9 @@ import pytest
 
 from helpers.evaluated_flights import finished
 from mavbridge.commands.evaluate import run
-from mavbridge.commands.evaluate.config import EvaluateConfig
-from mavbridge.commands.evaluate.episodes import EpisodeSpec, FlownEpisode
-from mavbridge.commands.evaluate.run import evaluate, identity
+from mavbridge.commands.evaluate.run import EpisodeSpec, FlownEpisode, evaluate, identity
+from mavbridge.config.episodes import EvaluateConfig, WorkersConfig
 from mavbridge.config.policy import PolicyConfig
-from mavbridge.config.workers import WorkersConfig
 from mavbridge.core.errors import PeerError, UserError
 
 

@@ -12,10 +12,19 @@ import pytest
 from helpers.evaluated_flights import finished
 from mavbridge.__main__ import main
 from mavbridge.commands.evaluate import run
-from mavbridge.commands.evaluate.config import EvaluateConfig
-from mavbridge.commands.evaluate.episodes import EpisodeSpec, FlownEpisode, fly_simulated
-from mavbridge.commands.evaluate.run import INTERRUPTED, evaluate
-from mavbridge.config.courses import HELD_OUT_COURSE_SEED, MAX_EPISODES, ConditionsKind
+from mavbridge.commands.evaluate.run import (
+    INTERRUPTED,
+    EpisodeSpec,
+    FlownEpisode,
+    evaluate,
+    fly_simulated,
+)
+from mavbridge.config.episodes import (
+    HELD_OUT_COURSE_SEED,
+    MAX_EPISODES,
+    ConditionsKind,
+    EvaluateConfig,
+)
 from mavbridge.config.policy import PolicyConfig
 from mavbridge.core.errors import PeerError
 from mavbridge.flight.policies import is_stateless
@@ -52,21 +61,6 @@ def test_only_built_in_nets_are_kept_from_one_episode_to_the_next() -> None:
     assert not is_stateless(PolicyConfig(policy="my.package:Policy"))
 
 
-@pytest.mark.parametrize(
-    ("kind", "flags"),
-    [
-        ("nominal", ()),
-        ("random", ("--conditions", "1000001")),
-        ("held-out", ("--held-out-conditions", "1000001")),
-    ],
-)
-def test_conditions_are_held_out_like_the_courses(
-    kind: ConditionsKind, flags: tuple[str, ...]
-) -> None:
-    spec = EpisodeSpec(config=EvaluateConfig(policy=CIRCLE, conditions=kind), index=1)
-    assert spec.conditions_flags == flags
-
-
 @pytest.fixture(scope="module")
 def write_json(tmp_path_factory: pytest.TempPathFactory) -> Callable[[ConditionsKind], bytes]:
     def write(conditions: ConditionsKind) -> bytes:
@@ -86,7 +80,6 @@ def test_two_runs_write_the_same_and_other_vehicles_fly_otherwise(
     first = write_json("nominal")
     assert write_json("nominal") == first
     nominal, random = json.loads(first), json.loads(write_json("random"))
-    assert nominal["mode"] == "lockstep"
     assert nominal["summary"]["outcomes"] == {"timed out": 2}
     assert (nominal["conditions"], random["conditions"]) == ("nominal", "random")
     for a, b in zip(nominal["episodes"], random["episodes"], strict=True):
@@ -149,36 +142,19 @@ def test_an_error_costs_no_result_that_was_there_before(
     assert "ended after 2 of 5 episodes" in capsys.readouterr().err
 
 
-def test_the_clock_is_told(
-    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    monkeypatch.setattr(run, "fly_simulated", lambda spec, _: flown(spec))
-    monkeypatch.setattr(run, "fly_on_wall_clock", lambda spec, _: flown(spec))
-    for flag, mode in (("--clock=wall", "realtime"), ("--clock=simulated", "lockstep")):
-        status, text = output(capsys, "--policy", "scripted", "--episodes", "1", flag)
-        assert status == 0
-        assert f"scripted (numpy), {mode}" in text
-
-
 @pytest.mark.parametrize(
     ("flags", "message"),
     [
         (["--episodes", "0"], f"--episodes must be between 1 and {MAX_EPISODES}"),
         (["--workers", "0"], "--workers must be between"),
         (["--max-time", "0"], "--max-time must be between"),
-        (["--clock", "wall", "--workers", "2"], "--clock wall flies one episode at a time"),
-        (["--clock", "wall", "--ray"], "--clock wall flies one episode at a time"),
-        (["--clock", "wall", "--gusts", "1"], "--gusts needs --clock simulated"),
         (["--gusts", "-1"], "--gusts must be between 0 and 10 m/s"),
         (["--resume"], "--resume needs the --json FILE"),
-        (["--clock", "wall", "--vision-delay", "50"], "--vision-time and --stalls need"),
-        (["--clock", "wall", "--vision-time", "50"], "--vision-time and --stalls need"),
-        (["--clock", "wall", "--stalls", "100"], "--stalls need --clock simulated"),
         (["--stalls", "-1"], "--stalls must be between 0 and 5000 ms"),
         (["--vision-delay", "-1"], "--vision-delay must be between 0 and 5000 ms"),
         (["--conditions", "stormy"], "--conditions"),
-        (["--action-rate", "0"], "between 0.5 and 500 Hz"),
-        (["--policy", "toge:medium"], "--allow-untrained"),
+        (["--set-config", "rates.action=0"], "between 0.5 and 500 Hz"),
+        (["--policy", "toge:medium"], "network.allow_untrained"),
         (["--policy", "scripted", "--json", "/proc/none/out.json"], "cannot write"),
         (["--policy", "scripted", "--json", "/"], "cannot write --json /"),
         (["--policy", "scripted", "--plot", "/proc/none/out.png"], "cannot write"),
@@ -192,13 +168,3 @@ def test_a_bad_flag_is_one_clear_error(
     status, text = output(capsys, *flags)
     assert status != 0
     assert message in text
-
-
-def test_help_lists_the_flags(capsys: pytest.CaptureFixture[str]) -> None:
-    status, text = output(capsys, "--help")
-    assert status == 0
-    flags = """--clock --episodes --workers --ray --json --plot --seed --policy --conditions
-        --vision-delay --vision-time --courses --checkpoint --engine --dual-rate
-        --max-time --stalls --max-stall"""
-    assert [flag for flag in flags.split() if flag not in text] == []
-    assert "--realtime" not in text

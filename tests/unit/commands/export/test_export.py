@@ -1,12 +1,10 @@
 """Flights to a LeRobot dataset and back, under the rules of lerobot's reader."""
 
 import json
-import shutil
 import signal
 from collections.abc import Callable
 from pathlib import Path
 
-import av
 import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
@@ -87,12 +85,6 @@ def dataset(flights: list[Path], tmp_path_factory: pytest.TempPathFactory) -> Pa
     out = tmp_path_factory.mktemp("exported") / "dataset"
     write(flights, out)
     return out
-
-
-@pytest.fixture
-def copy(dataset: Path, tmp_path: Path) -> Path:
-    """To break."""
-    return Path(shutil.copytree(dataset, tmp_path / "copy"))
 
 
 def test_the_dataset_keeps_the_rules_of_the_reader(dataset: Path) -> None:
@@ -333,85 +325,3 @@ def test_ctrl_c_leaves_nothing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) 
 def test_flags_that_say_nothing_are_refused(tmp_path: Path) -> None:
     with pytest.raises(MavbridgeError, match="--task"):
         ExportConfig(out=tmp_path, task=" ")
-
-
-def _edit_info(root: Path, **changes: object) -> None:
-    path = root / "meta/info.json"
-    path.write_text(json.dumps(json.loads(path.read_text()) | changes))
-
-
-def _edit_rows(root: Path, name: str, values: object) -> None:
-    path = root / "data/chunk-000/file-000.parquet"
-    table = pq.read_table(path)
-    place = table.column_names.index(name)
-    pq.write_table(
-        table.set_column(place, table.schema.field(name), pa.array(values, table[name].type)), path
-    )
-
-
-def _shift_episode(root: Path) -> None:
-    path = root / "meta/episodes/chunk-000/file-000.parquet"
-    table = pq.read_table(path)
-    name = "videos/observation.images.front/from_timestamp"
-    moved = pa.array([at + 0.01 for at in table[name].to_pylist()], pa.float64())
-    pq.write_table(table.set_column(table.column_names.index(name), name, moved), path)
-
-
-def _forget_pandas(root: Path) -> None:
-    path = root / "meta/tasks.parquet"
-    pq.write_table(pq.read_table(path).replace_schema_metadata(None), path)
-
-
-def _slow_video(root: Path) -> None:
-    """A frame less: its rows are not there any more."""
-    path = root / "videos/observation.images.front/chunk-000/file-000.mp4"
-    with av.open(str(path)) as container:
-        images = [f.to_ndarray(format="rgb24") for f in container.decode(video=0)]
-    with av.open(str(path), "w") as container:
-        stream = container.add_stream("libx264", rate=30, options={"bf": "0"})
-        stream.height, stream.width, stream.pix_fmt = SIZE, SIZE, "yuv420p"
-        for image in images[:-1]:
-            container.mux(stream.encode(av.VideoFrame.from_ndarray(image, format="rgb24")))
-        container.mux(stream.encode(None))
-
-
-@pytest.mark.parametrize(
-    ("spoil", "says"),
-    [
-        (lambda root: _edit_info(root, codebase_version="v2.1"), "codebase_version"),
-        (lambda root: _edit_info(root, fps=29.97), "fps"),
-        (lambda root: _edit_info(root, total_frames=1), "totals"),
-        (lambda root: _edit_rows(root, "timestamp", [0.0] * 75), "timestamp"),
-        (lambda root: _edit_rows(root, "index", list(range(1, 76))), "index is not"),
-        (lambda root: _edit_rows(root, "task_index", [1] * 75), "unknown task"),
-        (_shift_episode, "no frame within"),
-        (_forget_pandas, "not the index"),
-        (_slow_video, "ends before"),
-    ],
-)
-def test_the_rules_can_be_broken(spoil: Callable[[Path], None], says: str, copy: Path) -> None:
-    spoil(copy)
-    assert any(says in broken for broken in broken_rules(copy))
-
-
-@pytest.mark.filterwarnings("ignore")
-def test_lerobot_itself_reads_it(dataset: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setenv("HF_HUB_OFFLINE", "1")
-    try:
-        from lerobot.datasets.lerobot_dataset import LeRobotDataset
-    except (ImportError, RuntimeError, AttributeError) as error:
-        pytest.skip(f"lerobot cannot be imported here: {error}")
-    # Episodes that were read back above; here lerobot's own loader says the same.
-    lerobot = LeRobotDataset("local/test", root=dataset, video_backend="pyav")
-    assert (len(lerobot), lerobot.num_episodes, lerobot.fps) == (75, 3, 30)
-    row = 0
-    for episode in read_dataset(dataset):
-        for k, image in enumerate(episode.decode()):
-            item = lerobot[row]
-            np.testing.assert_array_equal(item["observation.state"].numpy(), episode.state[k])
-            np.testing.assert_array_equal(item["action"].numpy(), episode.target[k])
-            assert item["stamp.captured_ns"].item() == episode.captured_ns[k]
-            seen = item["observation.images.front"].numpy().transpose(1, 2, 0) * 255
-            np.testing.assert_allclose(seen, image, atol=1.0)
-            assert item["task"] == "fly the gates"
-            row += 1

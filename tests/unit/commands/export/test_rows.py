@@ -6,7 +6,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from helpers.flight_folders import LEVEL, MS
-from mavbridge.commands.export.rows import (
+from mavbridge.commands.export.files import (
     MAX_HELD_NS,
     Stretch,
     common_fps,

@@ -1,7 +1,6 @@
 """``mavbridge imagine`` from the command line."""
 
 import os
-import re
 import signal
 from collections.abc import Callable
 from dataclasses import replace
@@ -13,17 +12,18 @@ from rerun.chunk import RrdReader
 from helpers.recordings import make_meta
 from helpers.rollouts import TINY, TinyWorld, write_flight
 from mavbridge.__main__ import main
-from mavbridge.commands.imagine import run, sampling
+from mavbridge.commands.imagine import inputs, run
+from mavbridge.commands.imagine.inputs import Sampler
 from mavbridge.commands.imagine.output import read_rows
-from mavbridge.commands.imagine.sampling import Sampler
 from mavbridge.recording.video.file import count_frames
 from policy.checkpoints.world_model_file import save_world_model
 from policy.contract import Contract
 
 Imagine = Callable[..., tuple[int, str]]
 TOGE = (
-    *("--decider", "toge", "--policy", "toge:small:resnet18", "--allow-untrained"),
-    *("--image-size", "32", "--engine", "torch", "--num-diffusion-steps", "2"),
+    *("--decider", "toge", "--policy", "toge:small:resnet18"),
+    *("--set-config", "network.allow_untrained=true", "--set-config", "network.image_size=32"),
+    *("--set-config", "network.engine=torch", "--num-diffusion-steps", "2"),
 )
 
 
@@ -69,40 +69,16 @@ def imagine(
     return run
 
 
-def digest(text: str) -> str:
-    found = re.search(r"sha256 of the frames: ([0-9a-f]{64})", text)
-    assert found is not None, text
-    return found[1]
-
-
-@pytest.mark.parametrize("decider", [(), TOGE], ids=["world-model", "toge"])
-def test_ours_and_serial_print_the_same_digest(
-    imagine: Imagine, tmp_path: Path, decider: tuple[str, ...]
-) -> None:
-    digests = []
-    for name in ("ours", "serial"):
-        out = tmp_path / f"{name}.mp4"
-        more = ("--serial",) if name == "serial" else ()
-        flags = ("--n-iter", "3", "--frames", "16", "--seed", "5", *decider, *more)
-        status, text = imagine("--out", str(out), *flags)
-        assert status == 0, text
-        assert count_frames(out) == read_rows(out).num_rows == 48
-        digests.append(digest(text))
-    assert digests[0] == digests[1]
-
-
-def test_sampling_leaves_a_core_to_decoding_in_either_way(
+def test_sampling_leaves_a_core_to_decoding(
     imagine: Imagine, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     asked: list[int] = []
-    monkeypatch.setattr(sampling.torch, "get_num_threads", lambda: 8)
-    monkeypatch.setattr(sampling.torch, "set_num_threads", asked.append)
-    for way in ((), ("--serial",)):
-        status, text = imagine("--out", str(tmp_path / f"{len(way)}.mp4"), "--n-iter", "1", *way)
-        assert status == 0, text
-        assert asked[0] == 7
-        assert asked[-1] == 8, "what it was before"
-        asked.clear()
+    monkeypatch.setattr(inputs.torch, "get_num_threads", lambda: 8)
+    monkeypatch.setattr(inputs.torch, "set_num_threads", asked.append)
+    status, text = imagine("--out", str(tmp_path / "a.mp4"), "--n-iter", "1")
+    assert status == 0, text
+    assert asked[0] == 7
+    assert asked[-1] == 8, "what it was before"
 
 
 def test_without_a_video_there_are_rows_and_nothing_is_decoded(
@@ -115,29 +91,6 @@ def test_without_a_video_there_are_rows_and_nothing_is_decoded(
     assert "32 rows, no video, 0 decoded" in text
     assert [path.name for path in tmp_path.iterdir()] == ["a.parquet"]
     assert read_rows(out).num_rows == 32
-
-
-@pytest.mark.parametrize(("flags", "decoded"), [((), 2), (("--fast-policy-no-decode",), 0)])
-def test_the_policy_path_decodes_unless_told_otherwise(
-    imagine: Imagine, tmp_path: Path, flags: tuple[str, ...], decoded: int
-) -> None:
-    """Two frames of the first of two segments: the context of the tiny world model."""
-    given = ("--n-iter", "2", "--exe-steps", "5", "--no-decode-video", *flags)
-    status, text = imagine("--out", str(tmp_path / "a.mp4"), *given)
-    assert status == 0, text
-    assert f"10 rows, no video, {decoded} decoded" in text
-
-
-@pytest.mark.parametrize("exe_steps", [1, 5])
-def test_a_segment_holds_the_executed_frames_by_default(
-    imagine: Imagine, tmp_path: Path, exe_steps: int
-) -> None:
-    out = tmp_path / "a.mp4"
-    status, text = imagine("--out", str(out), "--n-iter", "3", "--exe-steps", str(exe_steps))
-    assert status == 0, text
-    rows = read_rows(out)
-    assert count_frames(out) == rows.num_rows == 3 * exe_steps
-    assert all(rows["executed"].to_pylist())
 
 
 def test_rerun_shows_imagined_and_real_frames_states_and_sticks(
@@ -230,18 +183,3 @@ def test_bad_input_is_one_message(
     assert told in text.replace("│ ", ""), text
     assert not (tmp_path / "a.mp4").exists()
     assert (folder / "taken.mp4").read_text() == "precious"
-
-
-def test_no_world_model_is_shipped_yet(
-    imagine: Imagine, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, folder: Path
-) -> None:
-    monkeypatch.setattr(run, "SHIPPED", folder / "nothing.safetensors")
-    with pytest.raises(SystemExit) as stopped:
-        main(["imagine", "--start", "flight", "--out", str(tmp_path / "a.mp4")])
-    assert stopped.value.code == 2
-    monkeypatch.setattr(run, "SHIPPED", folder / "world.safetensors")
-    out = str(tmp_path / "b.mp4")
-    flags = ["--start", "flight", "--out", out, "--n-iter", "1", "--no-decode-video"]
-    with pytest.raises(SystemExit) as stopped:
-        main(["imagine", *flags])
-    assert stopped.value.code == 0

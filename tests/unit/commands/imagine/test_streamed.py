@@ -19,8 +19,12 @@ from torch import Tensor
 from helpers.recordings import send_signal
 from helpers.rollouts import TinyWorld, make_plan, make_sampler
 from mavbridge.commands.imagine.loop import Segment
-from mavbridge.commands.imagine.output import RolloutError, read_rows
-from mavbridge.commands.imagine.streamed import QUEUED_SEGMENTS, StreamedOutput
+from mavbridge.commands.imagine.output import (
+    QUEUED_SEGMENTS,
+    RolloutError,
+    StreamedOutput,
+    read_rows,
+)
 from mavbridge.core.errors import MavbridgeError
 from mavbridge.core.workers import HungError
 from mavbridge.recording.tables import TableWriter
@@ -166,7 +170,7 @@ def test_a_decoder_that_hangs_is_given_up(tmp_path: Path, monkeypatch: pytest.Mo
             go_on.wait(DEADLINE_S)
             return super().decode(latents)
 
-    monkeypatch.setattr("mavbridge.commands.imagine.streamed.STALL_S", 0.0)
+    monkeypatch.setattr("mavbridge.commands.imagine.output.STALL_S", 0.0)
     with output(tmp_path / "a.mp4", Hangs()) as made:
         with pytest.raises(HungError, match="no frame"):
             put_all(made)
@@ -190,7 +194,7 @@ from pathlib import Path
 
 def main():  # the writer process imports this script, too: nothing heavy outside
     from mavbridge.commands.imagine.loop import rollout
-    from mavbridge.commands.imagine.streamed import StreamedOutput
+    from mavbridge.commands.imagine.output import StreamedOutput
     from helpers.rollouts import make_decider, make_plan, make_sampler, make_start
 
     def on_frame(frame, rgb):

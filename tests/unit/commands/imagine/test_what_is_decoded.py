@@ -11,7 +11,7 @@ import torch
 
 from helpers.rollouts import TinyWorld, make_plan, make_sampler, make_start, run
 from mavbridge.commands.imagine.loop import ObservationQueue, rollout
-from mavbridge.commands.imagine.streamed import QUEUED_SEGMENTS
+from mavbridge.commands.imagine.output import QUEUED_SEGMENTS
 from mavbridge.core.records import FloatArray, ImageArray, RolloutFrame
 from policy.contract import Contract
 

@@ -14,8 +14,7 @@ from helpers.recordings import make_frame, make_meta, without_writer_process
 from mavbridge.commands.config import InspectConfig
 from mavbridge.commands.inspect.analysis import FlightAnalysis, analyse
 from mavbridge.commands.inspect.run import _events as events_of
-from mavbridge.commands.inspect.run import inspect
-from mavbridge.commands.inspect.tables import print_comparison, print_flight
+from mavbridge.commands.inspect.run import inspect, print_comparison, print_flight
 from mavbridge.core.clock import NS_PER_MS
 from mavbridge.core.course import CourseGate
 from mavbridge.core.errors import MavbridgeError, UserError

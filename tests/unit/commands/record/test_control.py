@@ -1,6 +1,6 @@
 import pytest
 
-from mavbridge.commands.record.control import EpisodeControl, Orders, Seen
+from mavbridge.commands.record.episodes import EpisodeControl, Orders, Seen
 from mavbridge.core.clock import NS_PER_MS
 
 STEP_NS = 50 * NS_PER_MS

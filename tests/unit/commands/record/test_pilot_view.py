@@ -7,7 +7,7 @@ import pytest
 from helpers.factories import make_guard_tick
 from helpers.fakes import START_NS, ListSink
 from helpers.wire import WireEnd
-from mavbridge.commands.record.pilot_view import STICKS_FRESH_NS, PilotView
+from mavbridge.commands.record.view import STICKS_FRESH_NS, PilotView
 from mavbridge.core.clock import NS_PER_MS
 from mavbridge.core.reasons import Code, because
 from mavbridge.core.records import Tick

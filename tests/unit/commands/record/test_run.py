@@ -6,13 +6,11 @@ from pathlib import Path
 
 import pytest
 
-from helpers.recordings import make_meta
 from mavbridge.__main__ import main
-from mavbridge.commands.record.config import ListenConfig, RecordConfig
+from mavbridge.commands.config import ListenConfig, RecordConfig
 from mavbridge.commands.record.run import CONTRACT, listening_guard, pilot_flight
 from mavbridge.core.clock import NS_PER_S, MonotonicClock
 from mavbridge.flight.plan import plan_flight
-from mavbridge.recording.meta import write_meta
 
 CONNECT = ("--connect", "udp:127.0.0.1:14999")
 
@@ -49,16 +47,6 @@ def test_what_cannot_be_recorded_is_refused_before_anything_is_opened(
     assert stopped.value.code not in (0, None)
     assert says in " ".join(capsys.readouterr().err.split())
     assert not (tmp_path / "out").exists()
-
-
-def test_a_flight_is_no_folder_for_flights(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    write_meta(tmp_path, make_meta())
-    with pytest.raises(SystemExit) as stopped:
-        main(["record", "--out", str(tmp_path), *CONNECT, "--camera", "shm:x"])
-    assert stopped.value.code == 2
-    assert "is a flight itself" in " ".join(capsys.readouterr().err.split())
 
 
 def test_no_network_is_loaded_to_record() -> None:

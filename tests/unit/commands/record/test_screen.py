@@ -6,7 +6,7 @@ import pytest
 from rich.console import Console
 
 from helpers.factories import make_tick, make_vision_tick
-from mavbridge.commands.record.screen import RecordScreen, Shown
+from mavbridge.commands.record.view import RecordScreen, Shown
 from mavbridge.core.clock import NS_PER_S
 from mavbridge.core.vehicle import Sticks
 

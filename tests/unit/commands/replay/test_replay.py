@@ -7,7 +7,7 @@ import pyarrow.parquet as pq
 import pytest
 
 from helpers.golden_flights import FLIGHTS, copied
-from mavbridge.commands.replay.config import ReplayConfig
+from mavbridge.commands.config import ReplayConfig
 from mavbridge.commands.replay.run import (
     ENGINE_TOLERANCE,
     VIDEO_TOLERANCE,

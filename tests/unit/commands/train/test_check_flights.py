@@ -11,7 +11,7 @@ import pytest
 import torch
 
 from mavbridge.commands import train as train_check
-from mavbridge.config.courses import (
+from mavbridge.config.episodes import (
     CHECK_COURSE_SEED,
     HELD_OUT_COURSE_SEED,
     MAX_EPISODES,

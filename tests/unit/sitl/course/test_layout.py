@@ -6,7 +6,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from mavbridge.config.courses import RACE_COURSE_SEED
+from mavbridge.config.episodes import RACE_COURSE_SEED
 from sitl import UsageError
 from sitl.course import EASY, RACE, RACE_SEEDS, Family, Gate, course_to_json, make_course
 

@@ -1,0 +1,175 @@
+"""Settings of the commands that fly simulated episodes, and the seeds of their courses."""
+
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Annotated, Literal
+
+from cyclopts import Parameter
+
+from mavbridge.config.flags import check_range, hidden
+from mavbridge.config.flight import Limits
+from mavbridge.config.policy import PolicyConfig
+from mavbridge.config.rates import Rates
+from mavbridge.core.errors import UserError
+
+AutopilotKind = Literal["ardupilot", "px4"]
+CourseKind = Literal["easy", "race"]
+"""Family of courses; each has seeds of its own, and in them the same ranges."""
+ConditionsKind = Literal["nominal", "random", "held-out"]
+"""Vehicles, wind and light: the same for every course, drawn as demonstrations do, or with looks
+that no demonstration has."""
+
+RACE_COURSE_SEED = 1_000_000_000
+"""Seeds of race courses begin here (`sitl.course.RACE_SEEDS`)."""
+
+CHECK_COURSE_SEED = 900_000
+"""Courses from here on are flown during training, and neither learned from nor evaluated."""
+
+HELD_OUT_COURSE_SEED = 1_000_000
+"""Courses from here on are for evaluation: nothing is ever trained on them."""
+
+MAX_EPISODES = 10_000
+"""Most episodes of one evaluation, so that another seed has other courses."""
+
+MAX_EVALUATION_SEED = (RACE_COURSE_SEED - HELD_OUT_COURSE_SEED) // MAX_EPISODES - 1
+"""From the next on, easy courses of an evaluation would be races, some of them trained on."""
+
+
+def first_seed(courses: CourseKind) -> int:
+    """Seed 0 of a family."""
+    return RACE_COURSE_SEED if courses == "race" else 0
+
+
+@Parameter(name="*")
+@dataclass(frozen=True, kw_only=True)
+class WorkersConfig:
+    """Number of episodes flown at a time, and the machines that fly them."""
+
+    workers: int = 1
+    """Episodes at a time, each in a process of its own."""
+    ray: Annotated[
+        bool | str, Parameter(negative="", show_default=False, metavar="[HOST:PORT]")
+    ] = False
+    """Fly on the Ray cluster that this machine belongs to, or on the one at HOST:PORT. Its machines
+    must share the folders of files that are read and written. Needs the extra "cluster"."""
+
+    def __post_init__(self) -> None:
+        """Refuse numbers of processes that no machine runs."""
+        check_range("workers", self.workers, 1, 10_000, "")
+
+    @property
+    def ray_address(self) -> str | None:
+        """Address as Ray takes it; None = no cluster."""
+        return "auto" if self.ray is True else self.ray or None
+
+
+@Parameter(name="*")
+@dataclass(frozen=True, kw_only=True)
+class EvaluateConfig:
+    """One evaluation: many courses that no policy was trained on."""
+
+    policy: PolicyConfig = field(default_factory=PolicyConfig)
+    limits: Limits = field(default_factory=Limits)
+    visual_rate: Annotated[float | str, hidden("rates.visual")] = 30.0
+    """Most frames a second through the image encoder (dual rate), or auto[:MIN:MAX]."""
+    action_rate: Annotated[float | None, hidden("rates.action")] = None
+    """Most chunks of actions a second (dual rate): by default 100, or 2 for each time that the
+    policy is meant to play a chunk."""
+    rate: Annotated[float | None, hidden("rates.single")] = None
+    """The same in single-rate mode: by default 30, or likewise."""
+    episodes: int = 20
+    """Courses to fly."""
+    max_time: float = 60.0
+    """Seconds that a flight may take, from the policy's first action."""
+    courses: CourseKind = "easy"
+    """easy, or race: longer, with sharper turns, climbs and dives."""
+    conditions: ConditionsKind = "nominal"
+    """random: each flight has another vehicle, firmware settings, wind, light, colours and lens.
+    held-out: the same, and a look that no demonstration has: gates partly hidden, in shadow, at
+    night, against the sun, or beside others that are out of order."""
+    autopilot: AutopilotKind = "ardupilot"
+    """Firmware of the bundled flight controller: its modes, stick curves and airframe."""
+    gains: float = 1.0
+    """Factor on the lean, yaw rate and climb of ArduPilot at full stick."""
+    gusts: float | None = None
+    """Gusts of this many m/s (standard deviation) along each horizontal axis, in place of those of
+    --conditions."""
+    raw_sticks: bool = False
+    """Send the policy's sticks as they are, whatever the vehicle's curves make of them."""
+    vision_delay: float = 0.0
+    """Milliseconds added to the encoding of each image; an image older than
+    limits.feature_age is not flown by. Here such limits may also be looser than the policy's."""
+    vision_time: float | None = None
+    """Milliseconds that an image takes to encode, always; by default as on two shared
+    cores: 11, and 25 at the 99th percentile."""
+    stalls: float = 0.0
+    """Milliseconds for which the flight process stands still, at a random moment every 3 s;
+    limits.stall may be looser than the policy's here, too."""
+    workers: WorkersConfig = field(default_factory=WorkersConfig)
+    json: Path | None = None
+    """Write all results here as JSON."""
+    resume: bool = False
+    """Go on with the flights that --json holds, if they were flown by the same flags, weights and
+    versions; the file is written anew after each flight."""
+    plot: Path | None = None
+    """Draw the results here as PNG; needs matplotlib (the extra "bench")."""
+
+    def __post_init__(self) -> None:
+        """Refuse values out of range, and contradictions."""
+        check_range("episodes", self.episodes, 1, MAX_EPISODES, "")
+        check_range("max-time", self.max_time, 1, 3600, "s")
+        check_range("vision-delay", self.vision_delay, 0, 5000, "ms")
+        check_range("stalls", self.stalls, 0, 5000, "ms")
+        if self.resume and self.json is None:
+            raise UserError("--resume needs the --json FILE to go on with")
+        if self.vision_time is not None:
+            check_range("vision-time", self.vision_time, 0, 5000, "ms")
+        check_range("gains", self.gains, 0.2, 2.5, "")
+        check_range("seed", self.policy.seed, 0, MAX_EVALUATION_SEED, "")
+        if self.gains != 1 and self.autopilot != "ardupilot":
+            raise UserError("--gains needs --autopilot ardupilot")
+        if self.gusts is not None:
+            check_range("gusts", self.gusts, 0, 10, "m/s")
+        _ = self.rates
+
+    @property
+    def rates(self) -> Rates:
+        """Rates of ``mavbridge fly``."""
+        return Rates(visual_rate=self.visual_rate, action_rate=self.action_rate, rate=self.rate)
+
+
+@Parameter(name="*")
+@dataclass(frozen=True, kw_only=True)
+class DemonstrateConfig:
+    """Flights to learn from."""
+
+    out: Path
+    """Folder for the flights, each in a folder of its own; finished ones are kept."""
+    episodes: int = 100
+    """Flights in all."""
+    speed: float = 5.0
+    """Speed of the expert along the course, in m/s; 1.5 to 10 by sticks, to 14 by rates."""
+    action: Literal["sticks", "rates"] = "sticks"
+    """What the expert flies by: sticks in ALT_HOLD, or thrust and body rates."""
+    autopilot: AutopilotKind = "ardupilot"
+    """Firmware of the bundled flight controller: its modes, stick curves and airframe."""
+    courses: CourseKind = "easy"
+    """easy, or race: longer, with sharper turns, climbs and dives."""
+    max_time: float = 40.0
+    """Seconds after which a flight ends, on the course or not; a short one can start a rollout."""
+    policy: PolicyConfig = field(default_factory=PolicyConfig)
+    """With --checkpoint the policy flies most of the time, and the expert's actions are recorded as
+    labels (DAgger)."""
+    workers: WorkersConfig = field(default_factory=WorkersConfig)
+
+    def __post_init__(self) -> None:
+        """Refuse what cannot be flown."""
+        check_range("episodes", self.episodes, 1, MAX_EPISODES, "")
+        check_range("speed", self.speed, 1.5, 14 if self.action == "rates" else 10, "m/s")
+        check_range("max-time", self.max_time, 1, 3600, "s")
+        check_range("seed", self.policy.seed, 0, CHECK_COURSE_SEED // MAX_EPISODES - 1, "")
+
+    @property
+    def first_course_seed(self) -> int:
+        """Course of the first flight; neither training nor evaluation flies any of these."""
+        return first_seed(self.courses) + self.policy.seed * MAX_EPISODES

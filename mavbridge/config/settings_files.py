@@ -1,0 +1,156 @@
+"""Settings files: what they may ask for, and how they are read and written."""
+
+import json
+import re
+import sys
+import textwrap
+from collections.abc import Container, Iterator, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+from cyclopts import App
+from cyclopts.argument import ArgumentCollection, update_argument_collection
+from cyclopts.config import Dict
+
+from mavbridge.core.errors import UserError
+from policy.files import user_path
+
+_DATA_KINDS = ("toge", "toge-rates", "resnet-unet", "scripted", "lerobot", "onnx")
+_ADDRESS_KEYS = ("serve", "rerun", "host", "ray")
+_OUTPUT_KEYS = ("record", "report", "json", "plot", "html", "out", "rerun")
+_LOCAL = re.compile(
+    r"(?:$|off$|spawn$|/|serial:|udp://:|[\w./-]+\.rrd$"
+    r"|(?:connect=)?(?:[\w+]+:)?(?://)?(?:127\.0\.0\.1|localhost|\[?::1\]?)(?::\d+)?(?:[/?]|$))"
+)
+"""Addresses on this computer."""
+
+
+def foreign_policy(spec: str) -> str | None:
+    """What a policy is beside data that we read; None if it is nothing more."""
+    kind = spec.partition(":")[0]
+    if kind in ("ws", "wss"):
+        return None if _LOCAL.match(spec) else "a server, which would get the images"
+    if kind == "torchscript":
+        return "a program in TorchScript"
+    return None if kind in _DATA_KINDS else "a program in Python"
+
+
+def untrusted_settings(
+    document: Mapping[str, Any], given: Sequence[str]
+) -> Iterator[tuple[str, str, str]]:
+    """Flag, value and what it names, of all that a file may not ask for.
+
+    ``given``: words of the command line, whose flags stand in place of the file's.
+    """
+    flags = {word.partition("=")[0] for word in given}
+    for keys, value in _leaves(document, ()):
+        for key in {key.lstrip("-").replace("_", "-").lower() for key in keys}:
+            if f"--{key}" not in flags and (what := _foreign(key, value)) is not None:
+                yield f"--{key}", value, what
+
+
+def _leaves(value: Any, keys: tuple[str, ...]) -> Iterator[tuple[tuple[str, ...], str]]:
+    if isinstance(value, Mapping):
+        for key, each in value.items():
+            yield from _leaves(each, (*keys, key))
+    elif isinstance(value, list):
+        for each in value:
+            yield from _leaves(each, keys)
+    elif isinstance(value, str | int | float):
+        yield keys, str(value)
+
+
+def _foreign(key: str, value: str) -> str | None:
+    if key == "policy":
+        return foreign_policy(value)
+    if key == "camera":
+        source = re.sub(r"^[A-Za-z_]\w*=", "", value)
+        return "a program" if source.startswith("pipe:") else None
+    if key in _ADDRESS_KEYS and not _LOCAL.match(value):
+        return "another computer, or a port that is open to others"
+    if key in _OUTPUT_KEYS and (value.startswith(("/", "~")) or ".." in Path(value).parts):
+        return "a place outside the working directory to write to"
+    return None
+
+
+_HOME = re.compile(r"((?:--[\w.-]+=)?(?:[a-z]+:)?)(~[^/]*(?:/.*)?)")
+"""A path below a home directory, behind a flag's name or a prefix such as ``lerobot:``."""
+
+
+def given_settings(texts: Sequence[str]) -> dict[str, dict[str, str | list[str]]]:
+    """Return the document of ``--set-config``, by section and key; raises UserError."""
+    document: dict[str, dict[str, str | list[str]]] = {}
+    for text in texts:
+        if (match := re.fullmatch(r"([a-z]+)\.([\w-]+)=(.*)", text)) is None:
+            raise UserError(
+                f"--set-config {text} is not understood: use SECTION.KEY=VALUE, such as "
+                "limits.attitude_age=0.2 (see --print-config)"
+            )
+        section, key = document.setdefault(match[1], {}), match[2].replace("-", "_")
+        before = section.get(key, [])
+        several = [*([before] if isinstance(before, str) else before), match[3]]
+        section[key] = match[3] if len(several) == 1 else several
+    return document
+
+
+class Settings(Dict):
+    """A settings file. Its keys are flags, of which some are named as commands: record, serve."""
+
+    def __init__(self, data: dict[str, Any], *, source: str, commands: Container[str]) -> None:
+        super().__init__(with_home(data), source=source)
+        self._commands = commands
+
+    def __call__(self, app: App, commands: tuple[str, ...], arguments: ArgumentCollection) -> None:
+        """See ``Dict``, which leaves such keys out; tables for other commands stay left out."""
+        flags = {
+            k: v for k, v in self.data.items() if not (isinstance(v, dict) and k in self._commands)
+        }
+        update_argument_collection(
+            flags,
+            self.source,
+            arguments,
+            app.app_stack.stack[-1],
+            root_keys=(),
+            allow_unknown=self.allow_unknown,
+        )
+
+
+def with_home(value: Any) -> Any:
+    """Return words or settings with ``~`` expanded in each text that names a path.
+
+    Shells leave it alone behind a colon or an equals sign: ``lerobot:~/act``, ``--out=~/flights``.
+    """
+    if isinstance(value, str) and (found := _HOME.match(value)) is not None:
+        return f"{found[1]}{user_path(found[2])}"
+    if isinstance(value, list):
+        return [with_home(each) for each in value]
+    if isinstance(value, dict):
+        return {name: with_home(each) for name, each in value.items()}
+    return value
+
+
+def print_settings(command: App) -> None:
+    """Print TOML that ``--config`` reads; what has no default is commented out."""
+    sections: dict[str, list[str]] = {"": ["# Flags"]}
+    for argument in command.assemble_argument_collection(parse_docstring=True):
+        if argument.name == "*" or argument.children or not argument.name.startswith("--"):
+            continue
+        section, _, key = argument.name.removeprefix("--").rpartition(".")
+        help_text = " ".join(str(argument.parameter.help or "").split())
+        lines = textwrap.wrap(help_text, 96, initial_indent="# ", subsequent_indent="# ")
+        value = _toml(argument.field_info.default)
+        name = key.replace("-", "_")
+        lines.append(f"# {name} =" if value is None else f"{name} = {value}")
+        sections.setdefault(section, [f"[{section}]"]).extend(lines)
+    sys.stdout.write("\n\n".join("\n".join(lines) for lines in sections.values()) + "\n")
+
+
+def _toml(value: Any) -> str | None:
+    """Return a value as TOML writes it; None where there is no default."""
+    if isinstance(value, bool):
+        return str(value).lower()
+    if isinstance(value, int | float):
+        return str(value)
+    if isinstance(value, tuple) and value:
+        return json.dumps(value)
+    return json.dumps(str(value)) if isinstance(value, str | Path) and value else None

@@ -1,0 +1,324 @@
+"""Recorded doublets of vehicles whose response is known."""
+
+import json
+import math
+from collections.abc import Callable
+from dataclasses import replace
+from io import StringIO
+
+import numpy as np
+import pytest
+from rich.console import Console
+
+from faults.stage import faulty_policy
+from helpers.factories import make_released_tick, make_state, make_tick, make_trace
+from helpers.fakes import FakeClock
+from mavbridge.commands.config import IdentifyConfig
+from mavbridge.commands.identify import (
+    Identification,
+    doublet_flight,
+    doublet_policy,
+    full_stick,
+    identify_pushes,
+    print_identification,
+    to_json,
+    trained_motion,
+)
+from mavbridge.commands.step_response import CHANNELS, MAX_ROWS, ResponseRecording, fit_response
+from mavbridge.config.flight import FlyConfig, LinkConfig
+from mavbridge.config.policy import PolicyConfig
+from mavbridge.core.clock import NS_PER_MS, NS_PER_S
+from mavbridge.core.errors import UserError
+from mavbridge.core.vehicle import ACTION_CLASSES
+from mavbridge.flight.policies import configured_contract
+from policy.contract import ActionKind, Contract
+from policy.scripted.programs import doublet_length_s, doublet_steps
+
+START_S = 100.0
+STEP_S = 0.01
+LAG_S, DEAD_STEPS = 0.15, 8
+MARGIN_S = 1.0
+
+Curve = Callable[[str, float], float]
+"""(axis, action in the unit of its channel) -> motion in the unit of its signal."""
+
+
+def usual_sticks(axis: str, stick: float) -> float:
+    """ArduCopter's defaults, written down once more."""
+    full, dead = {"yaw": (202.5, 0.04), "climb": (2.5, 0.2)}.get(axis, (30.0, 0.04))
+    return math.copysign(full * max(0.0, abs(stick) - dead) / (1 - dead), stick)
+
+
+def recorded(
+    kind: ActionKind = "sticks",
+    curve: Curve = usual_sticks,
+    *,
+    hover: float = 0.0,
+    is_flown: Callable[[float], bool] = lambda _: True,
+) -> ResponseRecording:
+    """A doublet of this kind, flown by a vehicle of first order with a dead time."""
+    recording = ResponseRecording()
+    amounts = {"sticks": 1.0, "attitude": 20.0, "rates": 40.0, "velocity": 2.0}
+    channels = {channel.axis: channel for channel in CHANNELS[kind]}
+    motions = dict.fromkeys(channels, 0.0)
+    waiting: dict[str, list[float]] = {axis: [0.0] * DEAD_STEPS for axis in channels}
+    for index in range(round((doublet_length_s(kind) + 2 * MARGIN_S) / STEP_S)):
+        time_s = index * STEP_S - MARGIN_S
+        at_ns = round((START_S + time_s) * NS_PER_S)
+        state = _state(motions, kind, at_ns)
+        pushes = [push for step in doublet_steps(kind) if (push := step.push_at(time_s))]
+        action = [0.0] * 4
+        if kind in ("attitude", "rates"):
+            action[0] = hover
+        for axis, channel in channels.items():
+            amount = sum(push.share for push in pushes if push.axis == axis) * amounts[kind]
+            action[channel.column] = amount / channel.scale
+            waiting[axis].append(amount)
+            wanted = curve(axis, waiting[axis].pop(0))
+            motions[axis] += (wanted - motions[axis]) * STEP_S / LAG_S
+        trace = make_trace(ACTION_CLASSES[kind](*action))  # type: ignore[arg-type]
+        tick = make_tick(index, trace=trace, sent_ns=at_ns, state=state)
+        recording.emit(tick if is_flown(time_s) else make_released_tick(index))
+    return recording
+
+
+def _state(motions: dict[str, float], kind: str, at_ns: int) -> object:
+    values = np.array([0, 0, 0, 1, 0, 0, 0, 0, 0, 0, 0, 0, -9.81], np.float32)
+    roll, pitch = math.radians(motions["roll"]), -math.radians(motions["pitch"])
+    values[9] = math.radians(motions["yaw"])
+    values[2] = -motions.get("climb", 0.0)
+    if kind == "velocity":
+        values[0], values[1] = motions["pitch"], motions["roll"]
+    elif kind == "rates":
+        values[7], values[8] = roll, pitch
+    else:  # never both at once
+        values[3] = math.cos((abs(roll) + abs(pitch)) / 2)
+        values[4], values[5] = math.sin(roll / 2), math.sin(pitch / 2)
+    return make_state(at_ns, values=values)
+
+
+def identified(
+    recording: ResponseRecording, contract: Contract | None = None
+) -> tuple[Identification, Contract]:
+    contract = contract or Contract()
+    found = identify_pushes(recording, contract=contract, program_start_s=START_S)
+    return found, contract
+
+
+@pytest.fixture(scope="module")
+def usual() -> Identification:
+    return identified(recorded())[0]
+
+
+def test_a_vehicle_as_in_training_has_every_ratio_at_one(usual: Identification) -> None:
+    assert usual.missing == ()
+    assert [push.axis for push in usual.pushes] == [step.axis for step in doublet_steps("sticks")]
+    for push in usual.pushes:
+        assert push.ratio == pytest.approx((1.0, 1.0), abs=0.02), push
+        assert push.dead_time_s == pytest.approx(DEAD_STEPS * STEP_S, abs=0.02), push
+        assert push.time_63_s == pytest.approx(DEAD_STEPS * STEP_S + LAG_S, abs=0.02), push
+    roll = [push for push in usual.pushes if push.axis == "roll"]
+    assert full_stick(roll) == pytest.approx((30.0, -30.0), rel=0.02)
+
+
+def test_other_gains_are_told() -> None:
+    def other(axis: str, stick: float) -> float:
+        """A descent at half of the climb; 35 deg of lean."""
+        factor = 0.5 if axis == "climb" and stick < 0 else 35 / 30
+        return factor * usual_sticks(axis, stick)
+
+    found, _ = identified(recorded(curve=other))
+    ratios = {push.axis: push.ratio for push in found.pushes}
+    assert ratios["roll"] == pytest.approx((35 / 30, 35 / 30), rel=0.03)
+    assert ratios["climb"] == pytest.approx((35 / 30, 0.5), rel=0.03)
+
+
+@pytest.mark.parametrize("kind", ["attitude", "rates", "velocity"])
+def test_setpoints_are_compared_with_what_was_commanded(kind: ActionKind) -> None:
+    recording = recorded(kind, lambda axis, amount: 0.8 * amount, hover=0.45)
+    found, _ = identified(recording, Contract(action=kind, hover_thrust=0.39))
+    assert len(found.pushes) == (8 if kind == "velocity" else 6)
+    for push in found.pushes:
+        assert push.ratio == pytest.approx((0.8, 0.8), abs=0.02), push
+    if kind != "velocity":
+        assert found.hover_thrust == pytest.approx(0.45)
+    else:
+        assert found.hover_thrust is None
+
+
+def test_what_the_policy_did_not_fly_is_missing_with_its_reason() -> None:
+    yaw = next(step for step in doublet_steps("sticks") if step.axis == "yaw")
+    recording = recorded(is_flown=lambda time_s: time_s < yaw.begin_s + 1.0)
+    found, contract = identified(recording)
+    assert {push.axis for push in found.pushes} == {"roll", "pitch"}
+    assert found.missing[0] == "yaw at 50%: the policy did not fly all of it"
+    assert len(found.missing) == 4
+    console = Console(file=StringIO(), width=120)
+    print_identification(found, contract, console)
+    text = console.file.getvalue()  # type: ignore[attr-defined]
+    assert "not measured: climb at 100%" in text
+    assert "+8.1" in text
+
+
+def test_a_vehicle_that_does_not_follow_is_not_measured() -> None:
+    def deaf(axis: str, stick: float) -> float:
+        return 0.0 if axis == "yaw" else usual_sticks(axis, stick)
+
+    found, _ = identified(recorded(curve=deaf))
+    assert "yaw at 100%: the motion does not follow the action" in found.missing
+
+
+def test_json_holds_every_figure(usual: Identification) -> None:
+    document = json.loads(to_json(usual, Contract(), IdentifyConfig()))
+    assert len(document["pushes"]) == 8
+    first = document["pushes"][0]
+    assert first["measured"][0] == pytest.approx(8.1, abs=0.2)
+    assert first["ratio"] == pytest.approx([1.0, 1.0], abs=0.02)
+    assert (document["policy"], document["action"], document["hover_thrust"]) == (
+        *("toge", "sticks"),
+        None,
+    )
+
+
+def test_what_a_policy_expects_follows_from_its_contract() -> None:
+    contract = Contract(full_lean_deg=20.0, full_climb_mps=3.0, full_descent_mps=1.0)
+    assert trained_motion(contract, "roll", 1.0) == 20.0
+    assert trained_motion(contract, "roll", -0.52) == pytest.approx(-10.0)
+    assert trained_motion(contract, "climb", 0.6) == pytest.approx(1.5)
+    assert trained_motion(contract, "climb", -1.0) == -1.0
+    assert trained_motion(contract, "yaw", 0.03) == 0.0
+    assert trained_motion(replace(contract, action="rates", modes=()), "roll", 7.0) == 7.0
+
+
+def test_the_recording_is_bounded_and_keeps_each_state_once() -> None:
+    recording = ResponseRecording()
+    state = make_state()
+    for index in range(MAX_ROWS + 10):
+        recording.emit(make_tick(0, sent_ns=index * NS_PER_MS, state=state))
+    times, _ = recording.inputs(0)
+    assert len(times) == MAX_ROWS
+    assert times[-1] == pytest.approx((MAX_ROWS + 9) / 1000)
+    assert len(recording.outputs(CHANNELS["sticks"][0].motion)[0]) == 1
+
+
+# --- the flight
+
+
+def test_the_flight_is_the_users_with_the_doublet_in_place_of_the_policy() -> None:
+    link = LinkConfig(connect="udp:127.0.0.1:1")
+    asked = FlyConfig(link=link, arm=True, takeoff=10.0, policy=PolicyConfig(policy="toge"))
+    flight = doublet_flight(IdentifyConfig(flight=asked), Contract(action="velocity"))
+    assert flight.policy.policy == "scripted:doublet:velocity"
+    assert flight.camera.sources == ("none",)
+    assert flight.link.raw_sticks
+    assert flight.takeoff == 10.0
+    assert flight.duration is not None
+    assert flight.duration > doublet_length_s("velocity") + 8.0
+    mapped = doublet_flight(IdentifyConfig(flight=asked, mapped_sticks=True), Contract())
+    assert not mapped.link.raw_sticks
+
+
+def test_a_flight_that_sends_nothing_is_refused() -> None:
+    asked = FlyConfig(link=LinkConfig(connect="udp:127.0.0.1:1", readonly=True))
+    with pytest.raises(UserError, match="readonly"):
+        doublet_flight(IdentifyConfig(flight=asked), Contract())
+
+
+def test_the_doublet_means_by_its_sticks_what_the_policy_means() -> None:
+    trained = Contract(full_lean_deg=20.0, yaw_dead_zone=0.1, image_height=96, image_width=96)
+    policy, executable = doublet_policy(trained, FakeClock(), is_in_air=True)
+    assert executable.contract.full_lean_deg == 20.0
+    assert executable.contract.yaw_dead_zone == 0.1
+    assert executable.dual_rate
+    assert policy.program_start_s is None
+
+
+def test_the_contract_is_that_of_the_policy_of_the_flags() -> None:
+    assert configured_contract(PolicyConfig()).action == "sticks"
+    rates = configured_contract(PolicyConfig(policy="scripted:square:rates"))
+    assert rates.action == "rates"
+    own = configured_contract(PolicyConfig(policy=faulty_policy("SingleRate")))
+    assert own.action == "sticks"
+
+
+# --- the fit
+
+
+INPUT_S = np.arange(0.0, 3.0, 0.01)
+OUTPUT_S = np.arange(0.2, 2.9, 0.01) + 0.003
+DOUBLET = np.where((INPUT_S > 0.5) & (INPUT_S < 1.7), 0.6, 0.0) - np.where(INPUT_S >= 1.7, 0.6, 0.0)
+
+
+def respond(
+    inputs: np.ndarray, *, dead_s: float, lag_s: float, up: float, down: float, offset: float = 0.0
+) -> np.ndarray:
+    """A lag of first order behind a dead time, integrated on a grid ten times finer."""
+    step_s = 0.0005
+    fine_s = np.arange(-1.0, 3.0, step_s)
+    newest = np.searchsorted(INPUT_S, fine_s, side="right") - 1
+    held = np.where(newest < 0, 0.0, inputs[np.clip(newest, 0, None)])
+    wanted = np.where(held > 0, up * held, down * held)
+    outputs, value = np.empty(len(fine_s)), 0.0
+    for index, now in enumerate(wanted):
+        outputs[index] = value
+        value += (1 - np.exp(-step_s / lag_s)) * (now - value)
+    return offset + np.interp(OUTPUT_S - dead_s, fine_s, outputs)
+
+
+@pytest.mark.parametrize(
+    ("dead_s", "lag_s", "up", "down", "noise"),
+    [
+        (0.08, 0.08, 30.0, 30.0, 0.0),
+        (0.08, 0.08, 30.0, 30.0, 0.5),
+        (0.02, 0.05, 200.0, 180.0, 3.0),
+        (0.25, 0.40, 2.5, 1.5, 0.05),
+        (0.0, 0.70, 1.0, 1.0, 0.02),
+        (0.15, 0.10, -5.0, -4.0, 0.1),
+    ],
+)
+def test_gains_of_both_sides_dead_time_and_lag_are_found(
+    dead_s: float, lag_s: float, up: float, down: float, noise: float
+) -> None:
+    outputs = respond(DOUBLET, dead_s=dead_s, lag_s=lag_s, up=up, down=down, offset=0.3)
+    outputs += np.random.default_rng(0).normal(0.0, noise, len(outputs))
+    found = fit_response(INPUT_S, DOUBLET, OUTPUT_S, outputs)
+    assert found is not None
+    assert found.gains == pytest.approx((up, down), rel=0.05)
+    assert found.dead_time_s == pytest.approx(dead_s, abs=0.02)
+    assert found.dead_time_s + found.lag_s == pytest.approx(dead_s + lag_s, rel=0.06)
+    assert found.r_squared > 0.97
+
+
+def test_an_input_that_never_rests_will_do() -> None:
+    """As body rates are that a feedback has made."""
+    inputs = 0.5 * np.sin(7 * INPUT_S) + 0.3 * np.sign(np.sin(3 * INPUT_S))
+    outputs = respond(inputs, dead_s=0.03, lag_s=0.06, up=1.0, down=1.0)
+    found = fit_response(INPUT_S, inputs, OUTPUT_S, outputs)
+    assert found is not None
+    assert found.gains == pytest.approx((1.0, 1.0), rel=0.02)
+    assert found.dead_time_s + found.lag_s == pytest.approx(0.09, abs=0.01)
+
+
+def test_a_gust_does_not_move_the_result() -> None:
+    outputs = respond(DOUBLET, dead_s=0.1, lag_s=0.15, up=30.0, down=30.0)
+    clean = fit_response(INPUT_S, DOUBLET, OUTPUT_S, outputs)
+    outputs += np.random.default_rng(1).normal(0.0, 0.2, len(outputs))
+    outputs[130:140] += 25.0
+    found = fit_response(INPUT_S, DOUBLET, OUTPUT_S, outputs)
+    assert clean is not None
+    assert found is not None
+    assert found.gains[0] == pytest.approx(clean.gains[0], rel=0.03)
+    assert found.lag_s == pytest.approx(clean.lag_s, rel=0.2)
+    assert found.r_squared < 0.99  # the gust is counted, though
+
+
+@pytest.mark.parametrize("outputs", [np.zeros(len(OUTPUT_S)), np.ones(5)])
+def test_what_does_not_move_or_is_too_short_has_no_response(outputs: np.ndarray) -> None:
+    assert fit_response(INPUT_S, DOUBLET, OUTPUT_S[: len(outputs)], outputs) is None
+
+
+def test_a_motion_that_has_nothing_to_do_with_the_input_is_not_explained() -> None:
+    outputs = np.random.default_rng(2).normal(0.0, 1.0, len(OUTPUT_S))
+    found = fit_response(INPUT_S, DOUBLET, OUTPUT_S, outputs)
+    assert found is not None
+    assert found.r_squared < 0.3
