@@ -144,8 +144,9 @@ def _import_file(path: Path) -> ModuleType:
 def _import_hint(error: BaseException | None) -> str:
     """Say what to do about a failed import."""
     name = error.name if isinstance(error, ImportError) and error.name else ""
-    if name.partition(".")[0] in OUR_PACKAGES:
-        return f"{name.partition('.')[0]} is a package of mavbridge: yours needs another name"
+    package = name.partition(".")[0]
+    if package in OUR_PACKAGES:
+        return f"{package} is a package of mavbridge: one of yours needs another name"
     if isinstance(error, ImportError) and "relative import" in str(error):
         return "import its neighbours by their plain names, or name it as package.module:Class"
     if isinstance(error, ModuleNotFoundError):

@@ -187,7 +187,7 @@ def test_circles(kind: ActionKind) -> None:
     early, late = (at(flown, policy.program_start_s + s) for s in (5.0, 17.0))
     assert late.yaw_rad - early.yaw_rad == pytest.approx(math.tau, rel=0.25)
     assert 1.0 < late.speed_mps < 2.0
-    assert math.hypot(late.north_m - early.north_m, late.east_m - early.east_m) < 3.0
+    assert math.hypot(late.north_m - early.north_m, late.east_m - early.east_m) < 4.0  # of 6
 
 
 def test_yaw_turns_on_the_spot() -> None:
