@@ -137,7 +137,6 @@ class GuardFlight:
                 min_battery_percent=config.envelope.min_battery,
                 folder=folder,
             ),
-            forward=lambda packet: self.guard.forward(packet),
         )
         self.guard = GuardLoop(self.clock, self.link, self.guard_port)
         self.features = FreshFeatures(self.clock)

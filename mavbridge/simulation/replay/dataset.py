@@ -14,7 +14,7 @@ from mavbridge.core.records import FeatureFrame, VehicleState
 from mavbridge.core.vehicle import Sticks
 from mavbridge.flight.feature_cache import FeatureCache
 from mavbridge.flight.history import SentHistory
-from mavbridge.flight.observation import ObservationSource, StateHistory, observation_ages_ns
+from mavbridge.flight.observation import ObservationSource, observation_ages_ns
 from mavbridge.flight.settings import effective_freshness
 from mavbridge.flight.state import Unavailable
 from mavbridge.simulation.clock import START_NS, SteppedClock
@@ -55,14 +55,13 @@ class EpisodeReplay:
         self._episode, self._executable, self._clock = episode, executable, clock
         span_ns = observation_ages_ns(contract)[0]
         self._cache = FeatureCache(span_ns=span_ns)
-        self._states = StateHistory(span_ns=span_ns) if span_ns else None
         limits = effective_freshness(contract, config.limits)
         self._observations = ObservationSource(
             contract,
             caches=[self._cache],
             join=executable.join,
-            states=self._states,
             max_feature_age_ns=limits.feature_ns,
+            states_span_ns=span_ns,
         )
         self._history = SentHistory(length=contract.history_len, dt_s=contract.history_dt_s)
         self._sent = 0
@@ -92,8 +91,7 @@ class EpisodeReplay:
             velocity_ns=now_ns,
             specific_force_ns=now_ns,
         )
-        if self._states is not None:
-            self._states.push(state)
+        self._observations.remember(state)
         self._observations.push(state)
         seen = self._observations.observe(state, now_ns)
         if isinstance(seen, Unavailable):

@@ -17,7 +17,7 @@ from mavbridge.config.flight import FlyConfig
 from mavbridge.core.clock import NS_PER_MS, NS_PER_S
 from mavbridge.core.errors import UserError
 from mavbridge.core.records import Frame, Solve
-from mavbridge.core.vehicle import ForwardedPacket, Sticks
+from mavbridge.core.vehicle import Sticks
 from mavbridge.flight.bridge import CameraPath, build_bridge
 from mavbridge.flight.feature_cache import FeatureCache
 from mavbridge.flight.observation import observation_ages_ns
@@ -25,7 +25,8 @@ from mavbridge.flight.plan import plan_flight
 from mavbridge.flight.settings import action_meaning
 from mavbridge.guard.chunks import Chunk
 from mavbridge.guard.values import Phase
-from mavbridge.guard.wire import GuardStatus, GuardTick, NoChunk
+from mavbridge.guard.wire import GuardStatus, GuardTick, NoChunk, Samples
+from mavbridge.mavlink.session.telemetry import PacketDecoder
 from mavbridge.simulation.clock import START_NS, SteppedClock
 from mavbridge.simulation.replay.actions import ActionPair
 from mavbridge.simulation.replay.telemetry_log import PilotSticks, TelemetryLog
@@ -152,7 +153,7 @@ class LogReplay:
             UserError: the video begins after the log, or ends before it.
         """
         self._skip_images_before_log()
-        view, policy = self._bridge.view, self._bridge.policy
+        view, policy, decoder = self._bridge.view, self._bridge.policy, PacketDecoder()
         for at_ns, packet in self._log.packets():
             now_ns = START_NS + at_ns
             self._bring_images(now_ns)
@@ -160,7 +161,7 @@ class LogReplay:
             if (sticks := self._sticks.receive(packet)) is not None:
                 self._pilot = (now_ns, sticks)
                 view.receive(self._tick(sticks, now_ns))
-            view.receive((ForwardedPacket(now_ns, now_ns, packet.data),))
+            view.receive(Samples(decoder.decode(packet.data, now_ns, now_ns)))
             if self._video.next_ns is None:
                 return
             if policy.has_news and self._cache.latest() is not None:

@@ -7,8 +7,8 @@ import pytest
 
 from mavbridge.config.flight import LinkConfig
 from mavbridge.core.errors import UserError
+from mavbridge.core.link_settings import LinkSettings
 from mavbridge.flight.settings import link_settings, state_folder
-from mavbridge.mavlink.settings import LinkSettings
 
 
 def test_parameters_and_risks_reach_the_link(tmp_path: Path) -> None:
