@@ -151,6 +151,7 @@ def link_bridge(plan: FlightPlan, guard: GuardProcess, meter: "ClientMeter") -> 
         cameras=[CameraPath(camera=NoCamera(), cache=cache, clock=clock)],
         sinks=(meter,),
         watches_images=False,
+        samples=guard.samples,
     )
 
 

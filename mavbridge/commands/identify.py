@@ -237,7 +237,7 @@ def identify(config: IdentifyConfig) -> int:
     trained = configured_contract(config.flight.policy)
     flight = doublet_flight(config, trained)
     require_writable(config.json, "--json")
-    check_flight(flight, clock)
+    check_flight(flight)
     policy, executable = doublet_policy(trained, clock, is_in_air=flight.takeoff is not None)
     recording = ResponseRecording()
     plan = plan_flight(flight, executable.contract, is_dual=executable.dual_rate)

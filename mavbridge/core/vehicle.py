@@ -152,8 +152,7 @@ class Reading(NamedTuple):
         return self.delay_ns >= 0 and now_ns - self.happened_ns <= limit_ns
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Telemetry:
+class Telemetry(NamedTuple):
     """Newest reading of each quantity, in MAVLink's frames (NED world, FRD body); None = never."""
 
     ned_from_body_wxyz: Reading | None = None
@@ -164,6 +163,14 @@ class Telemetry:
     """From the estimator's origin."""
     height_above_home_m: Reading | None = None
     """One number; comes only where a policy takes it."""
+
+
+class Sample(NamedTuple):
+    """One reading on its way from the guard to the flight process."""
+
+    quantity: str
+    """Field of ``Telemetry``."""
+    reading: Reading
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -235,6 +242,10 @@ class LinkSnapshot:
     """Everything that the link knows at one tick."""
 
     telemetry: Telemetry
+    samples: tuple[Sample, ...] = ()
+    """Readings since the last snapshot, in order of arrival."""
+    packets: tuple["ForwardedPacket", ...] = ()
+    """Packets of the vehicle since the last snapshot, where the link keeps them."""
     status: VehicleStatus | None
     problem: Reason | None
     """Why sticks may not be sent (no heartbeat, handshake, override switch, no echo), or None."""

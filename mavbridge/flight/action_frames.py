@@ -29,7 +29,7 @@ class ActionFrame:
     def to_guard(self, actions: FloatArray) -> tuple[Action, ...]:
         """Actions [horizon, 4] of the policy -> the same in NED and FRD."""
         kind = type(self.neutral)
-        return tuple(kind(*row) for row in self._other_axes(actions).tolist())
+        return tuple(map(kind._make, self._other_axes(actions).tolist()))
 
     def from_guard(self, actions: Sequence[Action]) -> FloatArray:
         """Actions as they were sent -> [len, 4] in the policy's axes.
@@ -42,6 +42,8 @@ class ActionFrame:
         return self._other_axes(np.array(own, dtype=np.float32))
 
     def _other_axes(self, actions: FloatArray) -> FloatArray:
+        if self.order == (0, 1, 2, 3) and self.signs == (1.0, 1.0, 1.0, 1.0):
+            return actions
         return actions[:, self.order] * np.array(self.signs, dtype=np.float32)
 
 

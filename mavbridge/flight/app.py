@@ -89,7 +89,7 @@ def fly(config: FlyConfig) -> int:
         ExitStack() as policy_life,
         ExitStack() as stack,
     ):
-        check_flight(config, clock)
+        check_flight(config)
         guard = start_guard(config, clock, stack)  # finds the vehicle while the weights load
         guard.process.wait_until_open()
         loaded = load_configured_policy(
@@ -224,6 +224,7 @@ class _Flight:
             all_cameras=self._observers.recorders,
             watch_solve=self._observers.watch_solve,
             watch_packets=self._observers.watch_packets,
+            samples=self._guard.samples,
         )
 
     def _close_recorder(self) -> None:

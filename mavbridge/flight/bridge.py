@@ -11,19 +11,19 @@ from mavbridge.config.rates import LoopRates
 from mavbridge.core.clock import NS_PER_MS, NS_PER_S, Clock
 from mavbridge.core.observers import FanOut
 from mavbridge.core.ports import Camera, TickSink
-from mavbridge.core.records import CameraImage, FloatArray, Solve, VehicleState
+from mavbridge.core.records import CameraImage, FloatArray, Solve
 from mavbridge.core.vehicle import ForwardedPacket
 from mavbridge.flight.action_frames import action_frame
 from mavbridge.flight.feature_cache import FeatureCache
 from mavbridge.flight.history import SentHistory
-from mavbridge.flight.observation import ObservationSource, StateHistory, observation_ages_ns
+from mavbridge.flight.observation import ObservationSource, observation_ages_ns
 from mavbridge.flight.plan import FlightPlan
 from mavbridge.flight.policy_loop import PolicyLoop, PolicySettings
-from mavbridge.flight.state import Freshness
-from mavbridge.flight.state_reader import StateReader
+from mavbridge.flight.state import Freshness, StateReader
 from mavbridge.flight.telemetry_cache import TelemetryCache
 from mavbridge.flight.vision_loop import VisionLoop
 from mavbridge.flight.vision_rate import AdaptiveRate
+from mavbridge.guard.channel import SocketPort
 from mavbridge.guard.chunks import Chunk
 from mavbridge.guard.wire import NoChunk
 from policy.contract import Contract
@@ -68,6 +68,7 @@ def build_bridge(
     all_cameras: Sequence[TickSink] = (),
     watch_solve: Callable[[Solve], object] | None = None,
     watch_packets: Callable[[tuple[ForwardedPacket, ...]], object] = lambda packets: None,
+    samples: SocketPort | None = None,
     delay_vision: Callable[[TickSink], TickSink] | None = None,
 ) -> Bridge:
     """Join a policy, its cameras and the guard.
@@ -82,7 +83,9 @@ def build_bridge(
         watches_images: a frozen or a black image is a fault; False where nobody looks at it.
         all_cameras: see the encoded frames of the other cameras, each in the thread of its own.
         watch_solve: is given every solve, in the thread of the policy; must not block.
-        watch_packets: is given every packet of the vehicle that arrives; must not block.
+        watch_packets: is given every packet of the vehicle, where the guard passes them on; must
+            not block.
+        samples: where the vehicle's readings come from, if not with the guard's other messages.
         delay_vision: wraps the sink of each vision loop, where encoding takes simulated time.
     """
     config, contract, limits = plan.config, plan.contract, plan.start_limits
@@ -94,23 +97,19 @@ def build_bridge(
         max_frozen_ns=round(config.limits.max_frozen_state * NS_PER_S),
         period_ns=plan.guard.chunk_period_ns,
     )
-    states = _state_history(contract, settings.period_ns, limits.feature_ns)
+    span_ns = _states_span_ns(contract, settings.period_ns, limits.feature_ns)
     history = SentHistory(
         length=contract.history_len, dt_s=contract.history_dt_s, frame=settings.action_frame
     )
     rates = _visual_rates(contract, plan.loops)
     adaptive = [[rate] if rate.is_adaptive else [] for rate in rates]
-
-    def remember() -> None:
-        if states is not None:
-            _push_state(states, reader, view)
-
     view = TelemetryCache(
         history=history,
         sink=FanOut([*chain(*adaptive), *sinks]),
         state_frame=contract.state_frame,
         freshness=freshness,
-        on_attitude=remember,
+        samples=samples,
+        keeps_past=span_ns > 0,
         watch_packets=watch_packets,
     )
     vision_sinks: list[TickSink] = [
@@ -132,8 +131,8 @@ def build_bridge(
             contract,
             caches=[path.cache for path in cameras],
             join=executable.join,
-            states=states,
             max_feature_age_ns=limits.feature_ns,
+            states_span_ns=span_ns,
         ),
         history=history,
         act=executable.act,
@@ -173,13 +172,10 @@ def _vision_loops(
     )
 
 
-def _state_history(
-    contract: Contract, chunk_period_ns: int, feature_ns: int
-) -> StateHistory | None:
-    """Past states, where the policy takes several or the motion since an exposure needs them."""
+def _states_span_ns(contract: Contract, chunk_period_ns: int, feature_ns: int) -> int:
+    """Span of past states that the policy takes, or the motion since an exposure needs."""
     is_sparse = contract.since_exposure and chunk_period_ns > SPARSE_NS
-    span_ns = observation_ages_ns(contract)[0] + (feature_ns if is_sparse else 0)
-    return StateHistory(span_ns=span_ns) if span_ns else None
+    return observation_ages_ns(contract)[0] + (feature_ns if is_sparse else 0)
 
 
 def _visual_rates(contract: Contract, loops: LoopRates) -> list[AdaptiveRate]:
@@ -188,14 +184,6 @@ def _visual_rates(contract: Contract, loops: LoopRates) -> list[AdaptiveRate]:
         AdaptiveRate(min_hz=min(loops.min_vision_hz, hz), max_hz=min(loops.max_vision_hz, hz))
         for hz in contract.camera_rates_hz or (loops.max_vision_hz,) * len(contract.cameras)
     ]
-
-
-def _push_state(states: StateHistory, reader: StateReader, view: TelemetryCache) -> None:
-    """Remember the state at the attitude that has just come in."""
-    has_position = view.status.has_position
-    state = reader.read(view.telemetry(), view.attitude_ns, has_position=has_position)
-    if isinstance(state, VehicleState):
-        states.push(state)
 
 
 def _encoder(executable: Executable, camera: int) -> Callable[[CameraImage], FloatArray]:

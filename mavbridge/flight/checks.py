@@ -2,13 +2,10 @@
 
 from mavbridge.camera.open import check_camera
 from mavbridge.config.flight import FlyConfig, LinkConfig
-from mavbridge.core.address import is_reachable
-from mavbridge.core.clock import Clock
+from mavbridge.core.address import is_reachable, parse_address
 from mavbridge.core.course import read_gates
 from mavbridge.core.files import require_writable
 from mavbridge.flight.policies import check_configured_policy, require_cameras, require_images
-from mavbridge.mavlink.transport.signing_files import read_key
-from mavbridge.mavlink.transport.sockets import make_transport
 from mavbridge.observe.viewer.server import serve_address
 from mavbridge.observe.viewer.target import check_target
 from mavbridge.recording.folder import prepare_folder
@@ -24,15 +21,13 @@ def signing_note(config: LinkConfig) -> str | None:
     )
 
 
-def check_flight(config: FlyConfig, clock: Clock) -> None:
-    """Refuse what takes no time to check: weights take seconds to load.
+def check_flight(config: FlyConfig) -> None:
+    """Run the cheap checks first; loading weights takes seconds. The guard checks the link itself.
 
     Raises:
         MavbridgeError: a flag names something that cannot be opened, written or loaded.
     """
-    make_transport(config.link.connect, clock)
-    if config.link.signing_key_file is not None:
-        read_key(config.link.signing_key_file)
+    parse_address(config.link.connect)
     for source in config.camera.sources:
         check_camera(source, latency_ms=config.camera.camera_latency)
     check_configured_policy(config.policy)

@@ -60,15 +60,19 @@ class GuardProcess:
     def __init__(self, settings: GuardSettings, clock: Clock) -> None:
         """Start the process; it looks for the vehicle from then on."""
         ours, theirs = channel_pair()
+        samples, their_samples = channel_pair()
         self._clock = clock
         self._port = SocketPort(ours, takes_files=True)
+        self.samples = SocketPort(samples)
+        """Readings of the vehicle, for a ``TelemetryCache``."""
         self._words: LastWords | None = None
         self._outlet: int | None = None
         """The guard's open socket or port, while the vehicle is held."""
         self._newest: GuardTick | None = None
         self._lock = threading.Lock()
-        self._process = _spawn(theirs, settings)
+        self._process = _spawn((theirs, their_samples), settings)
         theirs.close()
+        their_samples.close()
         self._early: list[FromGuard] = []
         """Messages that came before ``listen``."""
         self.summary: GuardSummary | None = None
@@ -203,14 +207,18 @@ class GuardProcess:
     def close(self) -> None:
         """Close the channel: a guard that still runs takes it for our death, and ends by itself."""
         self._port.close()
+        self.samples.close()
         self.wait(CLOSE_S)
         self._close_outlet()
 
 
-def _spawn(end: socket.socket, settings: GuardSettings) -> subprocess.Popen[bytes]:
-    passed = [end.fileno()] + ([] if settings.tlog_fd is None else [settings.tlog_fd])
+def _spawn(
+    ends: tuple[socket.socket, socket.socket], settings: GuardSettings
+) -> subprocess.Popen[bytes]:
+    files = [end.fileno() for end in ends]
+    passed = files + ([] if settings.tlog_fd is None else [settings.tlog_fd])
     return subprocess.Popen(
-        [sys.executable, "-m", "mavbridge.guard", str(end.fileno())],
+        [sys.executable, "-m", "mavbridge.guard", *map(str, files)],
         env=child_environment(),
         stdin=subprocess.DEVNULL,
         stdout=subprocess.DEVNULL,

@@ -1,6 +1,5 @@
 """What the policy sees at one moment: images of all cameras and states, the past ones as well."""
 
-import threading
 from collections import deque
 from collections.abc import Callable, Sequence
 from typing import NamedTuple, TypeAlias
@@ -39,31 +38,6 @@ class Observation(NamedTuple):
     """Images of the features, [T][cameras], oldest first."""
 
 
-class StateHistory:
-    """States as they came, for policies that take several; one thread pushes, another one reads."""
-
-    def __init__(self, *, span_ns: int) -> None:
-        """``span_ns``: time before the newest attitude for which states are kept."""
-        self._span_ns = span_ns
-        self._lock = threading.Lock()
-        self._states: deque[VehicleState] = deque(maxlen=MAX_STATES)
-
-    def push(self, state: VehicleState) -> None:
-        """Remember a state whose attitude is newer than the last one's."""
-        with self._lock:
-            states = self._states
-            if states and state.attitude_ns <= states[-1].attitude_ns:
-                return
-            states.append(state)
-            while len(states) > 1 and states[1].attitude_ns <= state.attitude_ns - self._span_ns:
-                states.popleft()
-
-    def all(self) -> tuple[VehicleState, ...]:
-        """The states of the span, oldest first, and one from before it."""
-        with self._lock:
-            return tuple(self._states)
-
-
 class ObservationSource:
     """Joins the newest and the past images and states of one flight; for the policy's thread.
 
@@ -78,8 +52,8 @@ class ObservationSource:
         *,
         caches: Sequence[FeatureCache],
         join: Join,
-        states: StateHistory | None,
         max_feature_age_ns: int,
+        states_span_ns: int = 0,
     ) -> None:
         """Join nothing yet.
 
@@ -87,13 +61,14 @@ class ObservationSource:
             contract: says how many observations there are, and of what.
             caches: one for each camera of the contract, in its order.
             join: of the executable.
-            states: past states; None where the policy takes only the newest, and takes it often.
             max_feature_age_ns: oldest image to act on.
+            states_span_ns: time before the newest attitude for which states are kept.
         """
         self._cameras = contract.cameras
         self._caches = tuple(caches)
         self._join = join
-        self._history = states
+        self._states: deque[VehicleState] = deque(maxlen=MAX_STATES)
+        self._span_ns = states_span_ns
         self._max_feature_age_ns = max_feature_age_ns
         self._before_ns = observation_ages_ns(contract)
         self._ego_motion: EgoMotion | None = None
@@ -101,13 +76,21 @@ class ObservationSource:
             span_ns = max_feature_age_ns + self._before_ns[0]
             self._ego_motion = EgoMotion(span_ns=span_ns)
 
-    def push(self, state: VehicleState) -> None:
-        """Take a state, also one that no chunk will come from; in order."""
-        if self._ego_motion is None:
+    def remember(self, state: VehicleState) -> None:
+        """Take a state of the past, which has come since the last solve; in order."""
+        states = self._states
+        if states and state.attitude_ns <= states[-1].attitude_ns:
             return
-        for past in self._history.all() if self._history else ():
-            self._ego_motion.push(past)
-        self._ego_motion.push(state)
+        states.append(state)
+        while len(states) > 1 and states[1].attitude_ns <= state.attitude_ns - self._span_ns:
+            states.popleft()
+        if self._ego_motion is not None:
+            self._ego_motion.push(state)
+
+    def push(self, state: VehicleState) -> None:
+        """Take the newest state, also one that no chunk will come from; in order."""
+        if self._ego_motion is not None:
+            self._ego_motion.push(state)
 
     def observe(self, state: VehicleState, now_ns: int) -> Observation | Unavailable:
         """The inputs of a chunk from ``state``, which was pushed; or what is missing for one."""
@@ -133,18 +116,18 @@ class ObservationSource:
         ]
         return Observation(
             encoded=self._join([[feature.value for feature in row] for row in rows]),
-            states=self._states(state, [row[0] for row in rows]),
+            states=self._rows(state, [row[0] for row in rows]),
             state=state,
             feature=newest[0],
             image_ns=min(feature.captured_ns for feature in newest),
             frame_ids=tuple(tuple(feature.frame_id for feature in row) for row in rows),
         )
 
-    def _states(self, state: VehicleState, features: Sequence[FeatureFrame]) -> FloatArray:
+    def _rows(self, state: VehicleState, features: Sequence[FeatureFrame]) -> FloatArray:
         """States at the observations whose images of the first camera are ``features``."""
-        if self._history is None or len(self._before_ns) == 1:
+        if len(self._before_ns) == 1:
             return self._with_motion(state, features[0])
-        known = (*self._history.all(), state)
+        known = (*self._states, state)
         rows = []
         for before_ns, feature in zip(self._before_ns, features, strict=True):
             at_ns = state.attitude_ns - before_ns

@@ -12,8 +12,7 @@ from mavbridge.core.vehicle import Action
 from mavbridge.flight.action_frames import ActionFrame
 from mavbridge.flight.history import SentHistory
 from mavbridge.flight.observation import Observation, ObservationSource
-from mavbridge.flight.state import FrozenStateCheck, Unavailable
-from mavbridge.flight.state_reader import StateReader
+from mavbridge.flight.state import FrozenStateCheck, StateReader, Unavailable
 from mavbridge.flight.telemetry_cache import SolveInputs, TelemetryCache
 from mavbridge.guard.chunks import Chunk
 from mavbridge.guard.wire import NoChunk
@@ -100,7 +99,9 @@ class PolicyLoop:
             self._clock.sleep_until_ns(min(self.start_ns, looks_ns))
             if self.start_ns > looks_ns:
                 pass  # a slow policy: the stop flag is looked at meanwhile
-            elif self._view.wait_for_attitude(newer_than_ns=self.start_ns - 1, timeout_ns=WAIT_NS):
+            elif self._view.wait_for_attitude(
+                self._clock, newer_than_ns=self.start_ns - 1, timeout_ns=WAIT_NS
+            ):
                 self.step()
             else:
                 self._send(NoChunk(because(Code.NO_READING, quantity="attitude")))
@@ -126,7 +127,9 @@ class PolicyLoop:
     def step(self) -> None:
         """One solve from what is newest now, or the reason why there is none."""
         now_ns, is_starting = self._clock.now_ns(), self._is_starting
-        self._seen_ns = self._view.attitude_ns
+        telemetry, has_position = self._view.telemetry, self._view.status.has_position
+        attitude = telemetry.ned_from_body_wxyz
+        self._seen_ns = 0 if attitude is None else attitude.arrived_ns
         period_ns = self._settings.period_ns
         due_ns = now_ns if self._due_ns is None or is_starting else self._due_ns
         # A hundredth of tolerance for the vehicle's clock; after a pause the grid starts anew.
@@ -134,8 +137,10 @@ class PolicyLoop:
         if is_starting:
             self._reset_ns = now_ns
             self._reset()
-        has_position = self._view.status.has_position
-        state = self._reader.read(self._view.telemetry(), now_ns, has_position=has_position)
+        for past in self._view.take_past(self._seen_ns):
+            if (before := self._reader.past(past, has_position=has_position)) is not None:
+                self._observations.remember(before)
+        state = self._reader.read(telemetry, now_ns, has_position=has_position)
         observation = self._observe(state, now_ns) if isinstance(state, VehicleState) else state
         if isinstance(observation, Unavailable):
             self._refuse(observation.reason)

@@ -8,6 +8,7 @@ from pathlib import Path
 from mavbridge.config.flight import EnvelopeConfig, FlyConfig, Limits, LinkConfig
 from mavbridge.core.clock import NS_PER_S
 from mavbridge.core.errors import UserError
+from mavbridge.core.link_settings import LinkSettings, SigningFiles
 from mavbridge.core.vehicle import ActionMeaning, StickGains
 from mavbridge.guard.chunks import FreshnessLimits
 from mavbridge.guard.envelope import EnvelopeLimits
@@ -15,7 +16,6 @@ from mavbridge.guard.limits import LimitSettings
 from mavbridge.guard.memory import EngagementSettings
 from mavbridge.guard.sequences import DisengageSettings, EngageSettings
 from mavbridge.guard.settings import GuardSettings
-from mavbridge.mavlink.settings import LinkSettings, SigningFiles
 from policy.contract import ActionKind, Contract
 
 LEAST = 1e-9
@@ -41,6 +41,7 @@ def guard_settings(
         realtime=config.rates.realtime,
         cpu=config.rates.guard_cpu,
         tlog_fd=tlog_fd,
+        keeps_packets=tlog_fd is not None,
         wall_offset_ns=wall_offset_ns,
     )
 

@@ -1,7 +1,7 @@
-"""Telemetry -> the 13-D state of the contract, or the reason why there is none."""
+"""Telemetry -> the state of the contract, or the reason why there is none."""
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Literal, NamedTuple
 
 import numpy as np
@@ -10,8 +10,11 @@ from mavbridge.core.clock import NS_PER_MS
 from mavbridge.core.reasons import Code, Reason, because
 from mavbridge.core.records import VehicleState
 from mavbridge.core.vehicle import Reading, Telemetry
+from policy.contract import Contract
 
 StateFrame = Literal["ned_frd", "enu_flu"]
+Ned = tuple[float, float, float]
+_READINGS = {"goal": "position", "altitude": "position", "height": "height above home"}
 
 _HALF_SQRT2 = math.sqrt(0.5)
 LEAST_RATE_RADPS = 1e-4
@@ -84,11 +87,72 @@ class FrozenStateCheck:
         if attitude != self._attitude:
             self._attitude, self._changed_ns = attitude, state.attitude_ns
         frozen_ns = state.attitude_ns - self._changed_ns
-        is_turning = bool(np.abs(state.values[7:10]).max() > LEAST_RATE_RADPS)
-        if not self._max_frozen_ns or frozen_ns <= self._max_frozen_ns or not is_turning:
+        if not self._max_frozen_ns or frozen_ns <= self._max_frozen_ns:
+            return None
+        if float(np.abs(state.values[7:10]).max()) <= LEAST_RATE_RADPS:
             return None
         age_ms, limit_ms = frozen_ns / NS_PER_MS, self._max_frozen_ns / NS_PER_MS
         return because(Code.ATTITUDE_FROZEN, age_ms=age_ms, limit_ms=limit_ms)
+
+
+class StateReader:
+    """Builds the states of one flight, with the extra inputs that its contract asks for.
+
+    Freshness of the extra inputs is that of the velocity: a missing or an old one is a refusal.
+    """
+
+    def __init__(
+        self, contract: Contract, *, freshness: Freshness, goal_ned_m: Ned | None = None
+    ) -> None:
+        """``goal_ned_m``: from the estimator's origin, for a contract that asks for it."""
+        self._frame = contract.state_frame
+        self._extras = contract.state_extras
+        self._freshness = freshness
+        self._goal_ned_m = goal_ned_m
+
+    def read(
+        self, telemetry: Telemetry, now_ns: int, *, has_position: bool
+    ) -> VehicleState | Unavailable:
+        """The state of now; ``has_position``: the vehicle's position may be trusted."""
+        state = build_state(telemetry, now_ns, frame=self._frame, freshness=self._freshness)
+        if isinstance(state, Unavailable) or not self._extras:
+            return state
+        position = telemetry.position_ned_m if has_position else None
+        numbers: list[float] = []
+        stamps_ns: list[int] = []
+        for extra in self._extras:
+            reading = telemetry.height_above_home_m if extra == "height" else position
+            if reading is None or not reading.is_fresh(now_ns, self._freshness.velocity_ns):
+                return self._missing(extra, reading, now_ns)
+            stamps_ns.append(reading.happened_ns)
+            if extra == "goal":
+                numbers += self._to_goal(reading.values)
+            else:
+                numbers.append(reading.values[0] if extra == "height" else -reading.values[2])
+        return replace(state, extras=tuple(numbers), extras_ns=min(stamps_ns))
+
+    def past(self, telemetry: Telemetry, *, has_position: bool) -> VehicleState | None:
+        """The state at the arrival of the newest attitude; None if there was none."""
+        attitude = telemetry.ned_from_body_wxyz
+        if attitude is None:
+            return None
+        state = self.read(telemetry, attitude.arrived_ns, has_position=has_position)
+        return state if isinstance(state, VehicleState) else None
+
+    def _missing(self, extra: str, reading: Reading | None, now_ns: int) -> Unavailable:
+        what = _READINGS[extra]
+        if reading is None:
+            return Unavailable(because(Code.NO_TRUSTED_READING, quantity=what))
+        return stale(reading, what, now_ns, self._freshness.velocity_ns)
+
+    def _to_goal(self, position_ned_m: tuple[float, ...]) -> list[float]:
+        """From the vehicle to the goal, in the world's axes of the contract."""
+        if self._goal_ned_m is None:
+            raise ValueError("the contract takes a goal, and the flight has none")
+        north, east, down = (
+            there - here for there, here in zip(self._goal_ned_m, position_ned_m, strict=True)
+        )
+        return [north, east, down] if self._frame == "ned_frd" else [east, north, -down]
 
 
 def stale(reading: Reading | None, quantity: str, now_ns: int, limit_ns: int) -> Unavailable:

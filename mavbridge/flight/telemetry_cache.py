@@ -1,19 +1,21 @@
 """The vehicle and the sticks as the flight process knows them, from the guard's messages."""
 
 import logging
+import select
 import threading
-from collections import OrderedDict
-from collections.abc import Callable
+from collections import OrderedDict, deque
+from collections.abc import Callable, Iterable
 from itertools import groupby
 from typing import NamedTuple
 
-from mavbridge.core.clock import NS_PER_S
+from mavbridge.core.clock import NS_PER_S, Clock
 from mavbridge.core.ports import TickSink
 from mavbridge.core.reasons import Reason
 from mavbridge.core.records import Position, Tick, VehicleState
-from mavbridge.core.vehicle import ForwardedPacket, Telemetry
+from mavbridge.core.vehicle import ForwardedPacket, Sample, Telemetry
 from mavbridge.flight.history import SentHistory
 from mavbridge.flight.state import Freshness, StateFrame, build_state
+from mavbridge.guard.channel import SocketPort
 from mavbridge.guard.values import Phase
 from mavbridge.guard.wire import (
     FromGuard,
@@ -23,14 +25,16 @@ from mavbridge.guard.wire import (
     GuardSummary,
     GuardTick,
     LastWords,
+    Packets,
+    Samples,
+    decode_samples,
 )
-from mavbridge.mavlink.codec.messages import LocalVelocity, Measurement
-from mavbridge.mavlink.codec.packets import Codec
-from mavbridge.mavlink.session.telemetry import TelemetryCollector
 
 _log = logging.getLogger(__name__)
 POSITION_NS = NS_PER_S
 """Oldest position that a tick tells of; nothing is flown by it."""
+MAX_PAST = 4096
+"""Attitudes that wait for a solve: ten seconds of the fastest stream."""
 MAX_SOLVES = 256
 """Chunks whose inputs are remembered until the guard reports that it has flown them."""
 
@@ -49,7 +53,7 @@ class SolveInputs(NamedTuple):
 class TelemetryCache:
     """Telemetry, sent sticks and phase; turns the guard's reports into ticks.
 
-    One thread calls ``receive``, another one reads; simulation does both in one.
+    One thread calls ``receive``, the policy's one waits for attitudes; simulation does both in one.
     """
 
     def __init__(
@@ -59,7 +63,8 @@ class TelemetryCache:
         sink: TickSink,
         state_frame: StateFrame,
         freshness: Freshness,
-        on_attitude: Callable[[], object] = lambda: None,
+        samples: SocketPort | None = None,
+        keeps_past: bool = False,
         watch_packets: Callable[[tuple[ForwardedPacket, ...]], object] = lambda packets: None,
     ) -> None:
         """Start without a vehicle.
@@ -69,24 +74,28 @@ class TelemetryCache:
             sink: takes a tick for every send, and for every slot without one.
             state_frame: frame of the states in ticks in which the policy does not fly.
             freshness: oldest readings that such a state may have.
-            on_attitude: called for each new attitude, in the thread of ``receive``.
-            watch_packets: is given the packets afterwards, in the same thread; must not block.
+            samples: where the vehicle's readings come from, if not by ``receive``: the thread that
+                waits for an attitude reads them itself, so that no other one has to wake it.
+            keeps_past: keep the telemetry at each attitude for ``take_past``.
+            watch_packets: is given packets for a recorder, in the same thread; must not block.
         """
         self._history = history
         self._sink = sink
         self._state_frame = state_frame
         self._freshness = freshness
-        self._on_attitude = on_attitude
         self._watch_packets = watch_packets
-        self._codec = Codec(source_system=0, source_component=0)
-        self._telemetry = TelemetryCollector()
+        self.telemetry = Telemetry()
+        """The newest reading of each quantity."""
+        self._past: deque[Telemetry] | None = deque(maxlen=MAX_PAST) if keeps_past else None
         self._solves: OrderedDict[int, SolveInputs] = OrderedDict()
-        self._news = threading.Condition()
+        self._samples = samples
+        self._lock = threading.Lock()
+        """Held while samples are read."""
+        self._is_awaited = False
+        """The policy's thread waits, and reads the samples."""
         self._serial = 0
         self._texts: list[str] = []
         self.status = GuardStatus("none", None, False, None, (), None)
-        self.height_m: float | None = None
-        """Above the estimator's origin, where it has a position."""
         self._was_flown = False
         """The policy moved the sticks at the last tick."""
         self.phase = Phase.WAITING
@@ -98,9 +107,11 @@ class TelemetryCache:
 
     # --- the reader's side
 
-    def telemetry(self) -> Telemetry:
-        """The newest reading of each quantity."""
-        return self._telemetry.snapshot()
+    @property
+    def height_m(self) -> float | None:
+        """Above the estimator's origin; None without a position."""
+        position = self.telemetry.position_ned_m
+        return None if position is None else -position.values[2]
 
     @property
     def is_airborne(self) -> bool:
@@ -110,14 +121,32 @@ class TelemetryCache:
     @property
     def attitude_ns(self) -> int:
         """Arrival of the newest attitude; 0 before the first."""
-        return self._telemetry.attitude_arrived_ns
+        return _attitude_ns(self.telemetry)
 
-    def wait_for_attitude(self, *, newer_than_ns: int, timeout_ns: int) -> bool:
+    def take_past(self, until_ns: int) -> list[Telemetry]:
+        """Telemetry as it was at each attitude since the last call, up to one that arrived then."""
+        taken: list[Telemetry] = []
+        while self._past and _attitude_ns(self._past[0]) <= until_ns:
+            taken.append(self._past.popleft())
+        return taken
+
+    def wait_for_attitude(self, clock: Clock, *, newer_than_ns: int, timeout_ns: int) -> bool:
         """Wait for an attitude that arrived after ``newer_than_ns``; False: none came in time."""
-        with self._news:
-            return self._news.wait_for(
-                lambda: self.attitude_ns > newer_than_ns, timeout_ns / NS_PER_S
-            )
+        port, until_ns = self._samples, clock.now_ns() + timeout_ns
+        assert port is not None
+        with self._lock:
+            self._is_awaited = True
+        try:
+            while True:
+                for data in port.receive():
+                    self._receive_samples(decode_samples(data))
+                if self.attitude_ns > newer_than_ns:
+                    return True
+                if (left_ns := until_ns - clock.now_ns()) <= 0:
+                    return False
+                select.select([] if port.is_closed else [port], [], [], left_ns / NS_PER_S)
+        finally:
+            self._is_awaited = False
 
     def remember(self, solve: SolveInputs) -> None:
         """Keep the inputs of a chunk for the ticks that will be flown by it."""
@@ -135,6 +164,8 @@ class TelemetryCache:
     def receive(self, message: FromGuard) -> None:
         """Take one message of the guard."""
         match message:
+            case Samples(samples):
+                self._receive_samples(samples)
             case GuardTick():
                 self._receive_tick(message)
             case GuardStatus():
@@ -143,30 +174,23 @@ class TelemetryCache:
                 self.status = message
             case GuardMessage(text):
                 self._texts.append(text)
+            case Packets(packets):
+                self._watch_packets(packets)
             case GuardError() | GuardSummary() | LastWords():
                 pass  # its end is the business of whoever has started it
-            case packets:
-                self._receive_packets(packets)
 
-    def _receive_packets(self, packets: tuple[ForwardedPacket, ...]) -> None:
-        before_ns = self.attitude_ns
-        for _, datagram in groupby(packets, key=lambda packet: packet.arrived_ns):
-            known_ns = self.attitude_ns
-            for arrived_ns, happened_ns, data in datagram:
-                for message in self._codec.decode_datagram(data):
-                    if isinstance(message.body, Measurement):
-                        self._telemetry.receive(message.body, arrived_ns, happened_ns)
-                        if isinstance(message.body, LocalVelocity) and message.body.position_ned_m:
-                            self.height_m = -message.body.position_ned_m[2]
+    def _receive_samples(self, samples: Iterable[Sample]) -> None:
+        for _, datagram in groupby(samples, key=lambda sample: sample.reading.arrived_ns):
+            known_ns, self.telemetry = self.attitude_ns, self.telemetry._replace(**dict(datagram))
             # After each datagram: which of them came in one batch is not in a recording.
-            if self.attitude_ns != known_ns:
-                self._on_attitude()
-        if self.attitude_ns != before_ns:
-            with self._news:
-                self._news.notify_all()
-        self._watch_packets(packets)
+            if self._past is not None and self.attitude_ns != known_ns:
+                self._past.append(self.telemetry)
 
     def _receive_tick(self, tick: GuardTick) -> None:
+        with self._lock:
+            if self._samples is not None and not self._is_awaited:
+                for data in self._samples.receive():  # a slow policy leaves them to us
+                    self._receive_samples(decode_samples(data))
         if tick.phase is Phase.FLYING and self.phase is not Phase.FLYING:
             self.flights += 1
         self.phase, self.reason = tick.phase, tick.reason
@@ -178,7 +202,7 @@ class TelemetryCache:
 
     def _state_at(self, now_ns: int) -> VehicleState | None:
         state = build_state(
-            self.telemetry(), now_ns, frame=self._state_frame, freshness=self._freshness
+            self.telemetry, now_ns, frame=self._state_frame, freshness=self._freshness
         )
         return state if isinstance(state, VehicleState) else None
 
@@ -186,7 +210,7 @@ class TelemetryCache:
         """The guard's report together with the inputs of the chunk that was flown."""
         solve = None if sent.chunk_serial is None else self._solves.get(sent.chunk_serial)
         state = solve.state if solve else self._state_at(sent.sent_ns)
-        position = self._telemetry.snapshot().position_ned_m
+        position = self.telemetry.position_ned_m
         is_placed = position is not None and sent.sent_ns - position.arrived_ns <= POSITION_NS
         texts = self.take_texts()
         is_flown = sent.phase is Phase.FLYING
@@ -217,3 +241,8 @@ class TelemetryCache:
             chunk_computed_ns=solve.computed_ns if solve else None,
             position_ned_m=Position(*position.values) if position and is_placed else None,
         )
+
+
+def _attitude_ns(telemetry: Telemetry) -> int:
+    attitude = telemetry.ned_from_body_wxyz
+    return 0 if attitude is None else attitude.arrived_ns

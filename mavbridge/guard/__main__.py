@@ -1,7 +1,7 @@
-"""The guard process: ``python -m mavbridge.guard FD``, started by the flight process.
+"""The guard process: ``python -m mavbridge.guard FD FD``, started by the flight process.
 
 It prints nothing, since whatever reads its output might not: messages and errors go through the
-channel, file descriptor FD.
+channel, the first file descriptor, and the vehicle's readings through the second.
 """
 
 import select
@@ -45,14 +45,14 @@ def main() -> None:
     """Serve one flight process until the sticks are given back."""
     for name in _SURVIVED:
         signal.signal(getattr(signal, name), signal.SIG_IGN)
-    port = SocketPort(socket.socket(fileno=int(sys.argv[1])))
+    port, samples = (SocketPort(socket.socket(fileno=int(fd))) for fd in sys.argv[1:])
     select.select([port], [], [], SETTINGS_TIMEOUT_S)
     first, *later = port.receive() or [b""]
     settings = decode_to_guard(first) if first else None
     if not isinstance(settings, GuardSettings):
         sys.exit("the flight process sent no settings")
     try:
-        _run(settings, port, later)
+        _run(settings, port, samples, later)
     except MavbridgeError as error:
         is_user = isinstance(error, UserError)
         reason = GuardError("user" if is_user else "peer", str(error))
@@ -63,21 +63,24 @@ def main() -> None:
         sys.exit(2)
 
 
-def _run(settings: GuardSettings, port: SocketPort, received: list[bytes]) -> None:
+def _run(
+    settings: GuardSettings, port: SocketPort, samples: SocketPort, received: list[bytes]
+) -> None:
     clock, files = MonotonicClock(), settings.link.signing
     if files is None:
-        _fly(settings, port, received, clock, None)
+        _fly(settings, port, samples, received, clock, None)
         return
     store = SigningStore(files, clock)
     with store as signing:
         if store.problem is not None:
             port.send(encode_from_guard(GuardMessage(store.problem)))
-        _fly(settings, port, received, clock, signing)
+        _fly(settings, port, samples, received, clock, signing)
 
 
 def _fly(
     settings: GuardSettings,
     port: SocketPort,
+    samples: SocketPort,
     received: list[bytes],
     clock: MonotonicClock,
     signing: Signing | None,
@@ -91,10 +94,10 @@ def _fly(
         clock,
         settings.link,
         packet_log=log,
-        forward=lambda p: loop.forward(p),
+        keeps_packets=settings.keeps_packets,
         signing=signing,
     )
-    loop = GuardLoop(clock, link, port, received=received, lead_ns=LEAD_NS)
+    loop = GuardLoop(clock, link, port, samples=samples, received=received, lead_ns=LEAD_NS)
     told = EndRequest(reason=because(Code.TOLD_TO_END))
     signal.signal(signal.SIGTERM, lambda *_: loop.stop(told))
     refusal = settle_guard(realtime=settings.realtime, cpu=settings.cpu)
@@ -113,7 +116,7 @@ def _fly(
         failure=loop.failure,
         outcome=loop.outcome,
         params=dict(link.known_params),
-        dropped_messages=port.dropped,
+        dropped_messages=port.dropped + samples.dropped,
         dropped_packets=log.dropped if log else 0,
     )
     port.finish(encode_from_guard(summary), LAST_WORDS_S)

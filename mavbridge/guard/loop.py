@@ -3,7 +3,9 @@
 import traceback
 from collections.abc import Callable, Iterable, Sequence
 from contextlib import suppress
+from dataclasses import fields
 from functools import partial
+from operator import attrgetter
 from pathlib import Path
 from typing import Protocol, TypeVar
 
@@ -14,10 +16,10 @@ from mavbridge.core.vehicle import (
     ActionMeaning,
     Command,
     Decision,
-    ForwardedPacket,
     LinkSnapshot,
     Outlet,
     Output,
+    VehicleStatus,
 )
 from mavbridge.guard.channel import Port
 from mavbridge.guard.chunks import Chunk
@@ -33,6 +35,7 @@ from mavbridge.guard.wire import (
     decode_to_guard,
     encode_from_guard,
     encode_packets,
+    encode_samples,
     encode_tick,
 )
 
@@ -47,6 +50,12 @@ change. In modes where the throttle is thrust they repeat the last one, which sh
 _HELD = (Phase.FLYING, Phase.LEAVING, Phase.HOLDING)
 _ENGAGED = (*_HELD, Phase.RELEASING)
 _TAKEN = (*_ENGAGED, Phase.PREPARING)
+_MOTION = ("telemetry", "samples", "packets", "status", "position_ned_m")
+_LINK, _STATUS = (
+    attrgetter(*(each.name for each in fields(kind) if each.name not in _MOTION))
+    for kind in (LinkSnapshot, VehicleStatus)
+)
+"""Everything that a step of the guard may answer to, but for the motion of the vehicle."""
 
 
 class GuardLink(Protocol):
@@ -122,6 +131,7 @@ class GuardLoop:
         link: GuardLink,
         flight: Port,
         *,
+        samples: Port | None = None,
         received: Sequence[bytes] = (),
         lead_ns: int = 0,
     ) -> None:
@@ -131,6 +141,7 @@ class GuardLoop:
             clock: time of everything.
             link: the vehicle.
             flight: the flight process.
+            samples: takes the vehicle's readings; None: they go with the other messages.
             received: messages of it that have come before.
             lead_ns: how long before a slot its work begins; the sticks wait for the slot itself.
         """
@@ -139,9 +150,11 @@ class GuardLoop:
         self._clock = clock
         self._link = link
         self._flight = flight
+        self._samples = samples or flight
         self._guard: Guard | None = None
-        self._packets: list[ForwardedPacket] = []
+        self._vehicle: VehicleStatus | None = None
         self._status: GuardStatus | None = None
+        """As told last, from the vehicle's own one."""
         self._watches_position = False
         self._phase = Phase.WAITING
         self._stop: EndRequest | None = None
@@ -155,6 +168,9 @@ class GuardLoop:
         self._words_due_ns = 0
         self._words_outlet: Outlet | None = None
         """That the flight process has open."""
+        self._known: object = None
+        """The link and the vehicle's status at the last look, motion excepted."""
+        self._stepped_ns = 0
         self.is_done = False
         """The sticks are given back, and nobody wants more flights."""
 
@@ -167,10 +183,6 @@ class GuardLoop:
     def outcome(self) -> Outcome:
         """How the flights went."""
         return Outcome() if self._guard is None else self._guard.outcome
-
-    def forward(self, packet: ForwardedPacket) -> None:
-        """Take a packet of the vehicle for the flight process; the link calls it in ``poll``."""
-        self._packets.append(packet)
 
     def stop(self, ending: EndRequest) -> None:
         """End at the next step, as ``ending`` says."""
@@ -233,6 +245,9 @@ class GuardLoop:
         # A slot that is about to come due is worked for now, so that only the send is left.
         now_ns, slot_ns = self._clock.now_ns(), self._guard.next_ns
         at_ns = slot_ns if 0 < slot_ns - now_ns <= self._lead_ns else now_ns
+        if not self._has_work(snapshot, given, at_ns, slot_ns):
+            self._link.service()
+            return self._guard.next_ns - self._lead_ns
         output = self._guard.step(at_ns, given)
         if isinstance(output.decision, Command):
             self._link.send_before_action()
@@ -254,6 +269,21 @@ class GuardLoop:
             self._finish(woke_ns)
         # A command that failed is answered in a pass that follows at once.
         return woke_ns if self._command_fault else self._guard.next_ns - self._lead_ns
+
+    def _has_work(
+        self, snapshot: LinkSnapshot, given: GuardInput, at_ns: int, slot_ns: int
+    ) -> bool:
+        """True unless the policy flies, nothing but the vehicle's motion is news, and a step was
+        made just now."""
+        status = snapshot.status
+        known = (_LINK(snapshot), status and _STATUS(status), self._link.outlet)
+        before, self._known = self._known, known
+        is_called = given.chunk or given.absence or given.act or given.stop or given.command_fault
+        is_due = at_ns >= min(slot_ns, self._stepped_ns + IDLE_PERIOD_NS)
+        has_work = self._phase is not Phase.FLYING or is_called or is_due or before != known
+        if has_work:
+            self._stepped_ns = at_ns
+        return bool(has_work)
 
     def _attempt(self, send: Callable[[], _Sent]) -> _Sent | None:
         """Send something; an error is a fault of the flight, not the guard's end."""
@@ -290,12 +320,20 @@ class GuardLoop:
         self.is_done = (was_clean and self._is_clean) or now_ns >= self._finish_until_ns
 
     def _report_vehicle(self, snapshot: LinkSnapshot) -> None:
-        """Pass the vehicle's packets on, then its status where that has changed."""
+        """Pass the vehicle's samples on, then its status where that has changed."""
         # Until a policy is loaded nobody reads, and the queue is for what matters then.
-        if self._packets and self._guard is not None:
-            self._flight.send(encode_packets(self._packets))
-        self._packets.clear()
+        if snapshot.samples and self._guard is not None:
+            self._samples.send(encode_samples(snapshot.samples))
+        if snapshot.packets and self._guard is not None:
+            self._flight.send(encode_packets(snapshot.packets))
         vehicle = snapshot.status
+        if vehicle is not self._vehicle or self._status is None or snapshot.texts:
+            self._vehicle = vehicle
+            self._report_status(vehicle)
+        for text in snapshot.texts:
+            self._flight.send(encode_from_guard(GuardMessage(text)))
+
+    def _report_status(self, vehicle: VehicleStatus | None) -> None:
         status = GuardStatus(
             autopilot=self._link.autopilot,
             mode=vehicle.mode if vehicle else None,
@@ -308,8 +346,6 @@ class GuardLoop:
         if status != self._status:
             self._status = status
             self._flight.send(encode_from_guard(status))
-        for text in snapshot.texts:
-            self._flight.send(encode_from_guard(GuardMessage(text)))
 
     def _receive(self, snapshot: LinkSnapshot) -> GuardInput:
         """Take the messages of the flight process, the newest of each kind."""

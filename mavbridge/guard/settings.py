@@ -2,12 +2,12 @@
 
 from dataclasses import dataclass
 
+from mavbridge.core.link_settings import LinkSettings
 from mavbridge.core.vehicle import ActionMeaning, Output
 from mavbridge.guard.chunks import FreshnessLimits
 from mavbridge.guard.envelope import EnvelopeLimits
 from mavbridge.guard.limits import Smoothing
 from mavbridge.guard.memory import EngagementSettings
-from mavbridge.mavlink.settings import LinkSettings
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -21,6 +21,8 @@ class GuardSettings:
     """Run on this CPU alone."""
     tlog_fd: int | None = None
     """Write end of the pipe of the telemetry log."""
+    keeps_packets: bool = False
+    """Pass the vehicle's packets on, for a recorder."""
     wall_offset_ns: int = 0
     """Wall time minus the clock, for the telemetry log."""
 

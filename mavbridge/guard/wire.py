@@ -20,7 +20,10 @@ from mavbridge.core.vehicle import (
     ForwardedPacket,
     LinkStats,
     Percentiles,
+    Reading,
+    Sample,
     Sticks,
+    Telemetry,
 )
 from mavbridge.guard.chunks import Chunk
 from mavbridge.guard.settings import FlightSettings, GuardSettings
@@ -29,6 +32,9 @@ from mavbridge.guard.values import EndRequest, OperatorCommand, Outcome, Phase
 _CHUNK = struct.Struct("<cBqqqqqqqqH")
 _TICK = struct.Struct("<cqqqqqqqB?iBBB20d")
 _PACKET = struct.Struct("<qqH")
+_QUANTITIES = Telemetry._fields
+_SAMPLES = tuple(struct.Struct(f"<Bqq{count}d") for count in (4, 3, 3, 3, 3, 1))
+"""By quantity: its number, arrival, delay, and the values."""
 _PHASES = tuple(Phase)
 _CLASSES = tuple(ACTION_CLASSES.values())
 _IS_SLOT, _IS_COASTING, _HAS_TRACE, _HAS_SENT = 1, 2, 4, 8
@@ -64,6 +70,18 @@ class GuardTick:
     starting_ns: int = 0
     """All has been ready since then: the policy gets the sticks with its first chunk after a reset
     from then on; 0 where it has them, or all is not ready."""
+
+
+class Samples(NamedTuple):
+    """Readings of the vehicle, in order of arrival."""
+
+    samples: tuple[Sample, ...]
+
+
+class Packets(NamedTuple):
+    """Packets of the vehicle, in order of arrival, for a recorder."""
+
+    packets: tuple[ForwardedPacket, ...]
 
 
 class GuardStatus(NamedTuple):
@@ -132,7 +150,8 @@ class GuardSummary:
 
 ToGuard: TypeAlias = GuardSettings | FlightSettings | Chunk | NoChunk | OperatorCommand | EndRequest
 FromGuard: TypeAlias = (
-    tuple[ForwardedPacket, ...]
+    Samples
+    | Packets
     | GuardTick
     | GuardStatus
     | GuardMessage
@@ -262,6 +281,25 @@ def _decode_tick(data: bytes) -> GuardTick:
     )
 
 
+def encode_samples(samples: Iterable[Sample]) -> bytes:
+    """Readings of the vehicle, in order of arrival."""
+    parts = [b"R"]
+    for name, (arrived_ns, values, delay_ns) in samples:
+        number = _QUANTITIES.index(name)
+        parts.append(_SAMPLES[number].pack(number, arrived_ns, delay_ns, *values))
+    return b"".join(parts)
+
+
+def decode_samples(data: bytes) -> Iterator[Sample]:
+    """Inverse of ``encode_samples``, where nothing else can come."""
+    at = 1
+    while at < len(data):
+        layout = _SAMPLES[data[at]]
+        number, arrived_ns, delay_ns, *values = layout.unpack_from(data, at)
+        yield Sample(_QUANTITIES[number], Reading(arrived_ns, tuple(values), delay_ns))
+        at += layout.size
+
+
 def encode_packets(packets: Iterable[ForwardedPacket]) -> bytes:
     """Packets of the vehicle, in order of arrival."""
     parts = [b"P"]
@@ -321,7 +359,9 @@ def _decode_from_guard(data: bytes) -> FromGuard:
         case b"T":
             return _decode_tick(data)
         case b"P":
-            return tuple(_decode_packets(data))
+            return Packets(tuple(_decode_packets(data)))
+        case b"R":
+            return Samples(tuple(decode_samples(data)))
         case b"V":
             autopilot, mode, armed, is_landed, channels_us, sticks, has_position = json.loads(
                 data[1:]

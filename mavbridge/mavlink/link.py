@@ -1,6 +1,6 @@
 """The vehicle as the guard sees it. One thread owns socket and codec."""
 
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Iterable, Mapping
 from contextlib import suppress
 from dataclasses import replace
 
@@ -10,6 +10,7 @@ from mavbridge.core.address import parse_address
 from mavbridge.core.clock import NS_PER_MS, NS_PER_S, Clock, period_ns
 from mavbridge.core.errors import PeerError
 from mavbridge.core.histogram import Histogram
+from mavbridge.core.link_settings import LinkSettings
 from mavbridge.core.reasons import Code, Reason, because
 from mavbridge.core.vehicle import (
     Action,
@@ -21,6 +22,7 @@ from mavbridge.core.vehicle import (
     ModeRoles,
     Outlet,
     Output,
+    Sample,
 )
 from mavbridge.mavlink.codec.messages import (
     Altitude,
@@ -47,7 +49,6 @@ from mavbridge.mavlink.session.stats import LinkCounters
 from mavbridge.mavlink.session.telemetry import TelemetryCollector
 from mavbridge.mavlink.session.timesync import TimesyncFilter
 from mavbridge.mavlink.session.vehicle import VehicleSession
-from mavbridge.mavlink.settings import LinkSettings
 from mavbridge.mavlink.transport.connection import REFUSED_NS, Connection, PacketLog
 from mavbridge.mavlink.transport.sockets import Address, Transport
 
@@ -63,9 +64,8 @@ _HEARTBEAT_HZ = 1.0
 class MavlinkLink:
     """The session with one vehicle over a transport; used by one thread, and never waits.
 
-    ``forward`` gets every packet of the chosen vehicle, in order, while ``poll`` runs; it must
-    neither wait nor raise. Problems of the transport are never raised once it has been opened:
-    they stand in the snapshot, and it is opened again once a second.
+    Problems of the transport are never raised once it has been opened: they stand in the snapshot,
+    and it is opened again once a second.
 
     Raises from ``service`` and ``begin_flight``:
         PeerError: no vehicle within the timeout, two vehicles, or one that cannot be flown.
@@ -78,12 +78,15 @@ class MavlinkLink:
         config: LinkSettings,
         *,
         packet_log: PacketLog | None = None,
-        forward: Callable[[ForwardedPacket], None] | None = None,
+        keeps_packets: bool = False,
         signing: Signing | None = None,
     ) -> None:
+        """``keeps_packets``: each snapshot holds the vehicle's packets, for a recorder."""
         self._clock = clock
         self._config = config
-        self._forward = forward
+        self._keeps_packets = keeps_packets
+        self._packets: list[ForwardedPacket] = []
+        self._samples: list[Sample] = []
         self._codec = Codec(
             source_system=config.source_system,
             source_component=SOURCE_COMPONENT,
@@ -126,9 +129,13 @@ class MavlinkLink:
         status = vehicle.status(now_ns) if vehicle else None
         modes = vehicle.profile.modes.roles if vehicle else ModeRoles()
         problem = self._problem(now_ns)
+        samples, self._samples = tuple(self._samples), []
+        packets, self._packets = tuple(self._packets), []
         if vehicle is None or output is None:
             return LinkSnapshot(
-                telemetry=self._telemetry.snapshot(),
+                telemetry=self._telemetry.telemetry,
+                samples=samples,
+                packets=packets,
                 status=status,
                 problem=problem or because(Code.NO_POLICY_LOADED),
                 interruption=self._interruption,
@@ -140,7 +147,9 @@ class MavlinkLink:
         # A vehicle that gets nothing from us rightly follows somebody else.
         others = None if self._connection.is_refused(now_ns) else output.overruled(now_ns)
         return LinkSnapshot(
-            telemetry=self._telemetry.snapshot(),
+            telemetry=self._telemetry.telemetry,
+            samples=samples,
+            packets=packets,
             status=output.in_policy_terms(status, vehicle, now_ns),
             problem=problem or others or output.unheard(now_ns),
             is_overruled=others is not None,
@@ -217,7 +226,7 @@ class MavlinkLink:
                 return  # the estimator says that it has none: nobody takes it for one
             case Attitude() | LocalVelocity() | SpecificForce() | Altitude() as body:
                 happened_ns = self._timesync.happened_ns(body.boot_us, arrived_ns)
-                self._telemetry.receive(body, arrived_ns, happened_ns)
+                self._samples += self._telemetry.receive(body, arrived_ns, happened_ns)
             case Timesync() as reply:
                 self._timesync.receive(reply, arrived_ns)
                 self._tell_pace()
@@ -232,8 +241,8 @@ class MavlinkLink:
             vehicle.receive(message, arrived_ns)
             if (changed := vehicle.param_interruption) is not None and changed is not before:
                 self._interrupt(changed)
-        if self._forward is not None:
-            self._forward(ForwardedPacket(arrived_ns, happened_ns, message.packet))
+        if self._keeps_packets:
+            self._packets.append(ForwardedPacket(arrived_ns, happened_ns, message.packet))
 
     def _tell_pace(self) -> None:
         slow = None if self._has_told_pace else self._timesync.slow_clock
@@ -386,8 +395,10 @@ class MavlinkLink:
         """Choose what carries the actions of the policy, now or once the vehicle is known; to be
         called before the first action.
 
-        ``output`` None: the usual one of such actions and this vehicle.
+        ``output`` None: the usual one of such actions and this vehicle. Telemetry starts anew, so
+        that a recording, which begins here, holds all that the samples come from.
         """
+        self._telemetry = TelemetryCollector()
         self._sender.begin_flight(meaning, output)
 
     def watch_home_height(self) -> None:

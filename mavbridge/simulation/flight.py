@@ -188,7 +188,6 @@ class SimulatedFlight:
                 stick_hz=config.rates.stick_rate,
                 min_battery_percent=0.0,
             ),
-            forward=lambda packet: guard.forward(packet),
         )
         guard = GuardLoop(world, link, MemoryPort(outgoing=to_flight, incoming=to_guard))
         contract, policy_clock = executable.contract, AheadClock(world)

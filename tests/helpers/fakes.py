@@ -7,7 +7,6 @@ from functools import partial
 from typing import Any
 
 from helpers.guard_facts import COPTER_MODES
-from helpers.wire import WireEnd
 from mavbridge.core.clock import NS_PER_S, Clock
 from mavbridge.core.reasons import Reason
 from mavbridge.core.records import Event, Tick, VisionTick
@@ -17,13 +16,13 @@ from mavbridge.core.vehicle import (
     ActionMeaning,
     Command,
     Decision,
-    ForwardedPacket,
     LinkSnapshot,
     LinkStats,
     Outlet,
     Output,
     Reading,
     Release,
+    Sample,
     Telemetry,
     VehicleStatus,
 )
@@ -97,10 +96,8 @@ class FakeLink:
 
     def __init__(self, clock: Clock, **status: Any) -> None:
         self._clock = clock
-        self._wire = WireEnd()
-        self._arrived: list[ForwardedPacket] = []
+        self._samples: tuple[Sample, ...] = ()
         self._telemetry = Telemetry()
-        self.forward: Callable[[ForwardedPacket], None] = lambda packet: None
         self.status: VehicleStatus | None = replace(AIRBORNE_STATUS, **status)
         self.problem: Reason | None = None
         self.overruled: Reason | None = None
@@ -129,28 +126,17 @@ class FakeLink:
 
     def measure(self, *, age_ns: int = 0, yaw_rad: float = 0.0, down_mps: float = 0.0) -> None:
         """The vehicle sends its state, which arrives now and happened ``age_ns`` ago."""
-        now_ns, mav = self._clock.now_ns(), self._wire.mav
         quaternion = (math.cos(yaw_rad / 2), 0.0, 0.0, math.sin(yaw_rad / 2))
         velocity, force = (0.0, 0.0, down_mps), (0.0, 0.0, -9.80665)
         none = (0.0,) * 3
-        reading = partial(Reading, now_ns, delay_ns=age_ns)
-        sent = {
-            "velocity_ned_mps": mav.local_position_ned_encode(0, *none, *velocity),
-            "specific_force_body_mps2": mav.highres_imu_encode(
-                0, *force, *none, *none, 0, 0, 0, 0, 7
-            ),
-            "ned_from_body_wxyz": mav.attitude_quaternion_encode(0, *quaternion, *none),
-        }
-        for name, message in sent.items():
-            if name != self.lacks:
-                data = self._wire.pack(message)
-                self._arrived.append(ForwardedPacket(now_ns, now_ns - age_ns, data))
+        reading = partial(Reading, self._clock.now_ns(), delay_ns=age_ns)
         self._telemetry = Telemetry(
             ned_from_body_wxyz=reading(quaternion),
             rate_body_radps=reading(none),
             velocity_ned_mps=reading(velocity),
             specific_force_body_mps2=reading(force),
         )
+        self._samples += tuple(s for s in samples_of(self._telemetry) if s.quantity != self.lacks)
 
     def change(self, **status: Any) -> None:
         """Replace fields of the vehicle's status."""
@@ -164,9 +150,7 @@ class FakeLink:
         return [one for k, one in enumerate(sent) if k == 0 or one != sent[k - 1]]
 
     def poll(self) -> LinkSnapshot:
-        arrived, self._arrived = self._arrived, []
-        for packet in arrived:
-            self.forward(packet)
+        samples, self._samples = self._samples, ()
         texts, self.texts = tuple(self.texts), []
         status = self.status
         if status is not None and status.rc_arrived_ns is not None:
@@ -174,6 +158,7 @@ class FakeLink:
         holds = bool(self.decisions) and isinstance(self.decisions[-1][1], Command)
         return LinkSnapshot(
             telemetry=self._telemetry,
+            samples=samples,
             status=status,
             problem=self.problem or self.overruled,
             is_overruled=self.overruled is not None,
@@ -248,4 +233,10 @@ class FakeLink:
 
 def without(telemetry: Telemetry, field_name: str) -> Telemetry:
     """The same telemetry with one quantity never received."""
-    return replace(telemetry, **{field_name: None})
+    return telemetry._replace(**{field_name: None})
+
+
+def samples_of(telemetry: Telemetry) -> tuple[Sample, ...]:
+    """All readings of it, as the guard sends them."""
+    known = telemetry._asdict().items()
+    return tuple(Sample(name, reading) for name, reading in known if reading is not None)

@@ -133,7 +133,6 @@ class GuardFlight:
                 stick_hz=config.rates.stick_rate,
                 min_battery_percent=config.envelope.min_battery,
             ),
-            forward=lambda packet: self.guard.forward(packet),
         )
         self.guard = GuardLoop(self.clock, self.link, self.guard_port)
         self.features = FreshFeatures(self.clock)

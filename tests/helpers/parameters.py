@@ -6,13 +6,13 @@ from typing import Any
 
 from helpers.wire import CALIBRATION
 from mavbridge.core.clock import NS_PER_MS, NS_PER_S
+from mavbridge.core.link_settings import LinkSettings
 from mavbridge.core.reasons import Reason
 from mavbridge.core.vehicle import Output, VehicleStatus
 from mavbridge.mavlink.codec.messages import CommandRequest, ParamRequest, ParamValue, ParamWrite
 from mavbridge.mavlink.profiles.ardupilot import ARDUPILOT
 from mavbridge.mavlink.profiles.profile import Profile
 from mavbridge.mavlink.session.params.vehicle_params import VehicleParams
-from mavbridge.mavlink.settings import LinkSettings
 
 STEP_NS = 10 * NS_PER_MS
 NAMES = ("MIN", "TRIM", "MAX", "REVERSED")

@@ -133,7 +133,6 @@ class VirtualFlight:
         port = MemoryPort(outgoing=to_guard, incoming=to_flight)
         self._send = sender(world, self._policy_clock, port)
         guard = GuardLoop(world, self.link, MemoryPort(outgoing=to_flight, incoming=to_guard))
-        self.link.forward = guard.forward
         plan = plan_flight(self.config, executable.contract, is_dual=executable.dual_rate)
         self._send(plan.guard)
         bridge = build_bridge(

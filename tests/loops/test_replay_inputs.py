@@ -4,14 +4,14 @@ import sys
 from collections.abc import Callable
 from contextlib import ExitStack
 from dataclasses import dataclass, field, replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
-from pymavlink.dialects.v20 import ardupilotmega as mav
 
-from helpers.fakes import ListSink
+from helpers.fakes import ListSink, level_telemetry, samples_of
 from helpers.policy_servers import when_it_listens
 from helpers.recordings import make_meta
 from mavbridge.config.flight import FlyConfig
@@ -22,6 +22,8 @@ from mavbridge.core.vehicle import ForwardedPacket
 from mavbridge.flight.history import SentHistory
 from mavbridge.flight.state import Freshness
 from mavbridge.flight.telemetry_cache import TelemetryCache
+from mavbridge.guard.wire import Samples
+from mavbridge.mavlink.link import MavlinkLink
 from mavbridge.simulation import flight as simulation
 from mavbridge.simulation.clock import SteppedClock
 from mavbridge.simulation.flight import SimulatedFlight, SimulationSettings
@@ -137,6 +139,7 @@ def flown_and_repeated(
         )
 
     monkeypatch.setattr(simulation, "build_bridge", recorded)
+    monkeypatch.setattr(simulation, "MavlinkLink", partial(MavlinkLink, keeps_packets=True))
     settings = SimulationSettings(goal=goal, least_camera_px=32)
     vehicle = make_vehicle(autopilot=autopilot)
     one = SimulatedFlight(course_seed=3, seed=1, settings=settings, vehicle=vehicle)
@@ -258,22 +261,13 @@ def test_the_example_on_a_server_is_repeated_bit_for_bit(
 
 def test_what_reaches_the_policy_in_one_batch_does_not_change_past_states() -> None:
     """Attitudes of one batch are all remembered: a replay does not know what came together."""
-    pushed: list[int] = []
     view = TelemetryCache(
         history=SentHistory(length=4, dt_s=0.05),
         sink=ListSink(),
         state_frame="ned_frd",
         freshness=Freshness(attitude_ns=NS_PER_S, velocity_ns=NS_PER_S),
-        on_attitude=lambda: pushed.append(view.attitude_ns),
+        keeps_past=True,
     )
-    codec = mav.MAVLink(None, srcSystem=1, srcComponent=1)
-    packets = tuple(
-        ForwardedPacket(stamp_ms, stamp_ms, attitude(stamp_ms).pack(codec))
-        for stamp_ms in (10, 20, 30)
-    )
-    view.receive(packets)
-    assert pushed == [10, 20, 30]
-
-
-def attitude(boot_ms: int) -> mav.MAVLink_attitude_message:
-    return mav.MAVLink_attitude_message(boot_ms, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
+    known = [level_telemetry(at_ns) for at_ns in (10, 20, 30)]
+    view.receive(Samples(tuple(sample for each in known for sample in samples_of(each))))
+    assert view.take_past(30) == known

@@ -13,9 +13,9 @@ from faults.processes import Process
 from faults.record import aftermath
 from faults.relay import Override
 from faults.stage import ORDERLY, faulty_policy, staged
+from mavbridge.core.link_settings import LinkSettings
 from mavbridge.flight.guard_process import GuardProcess
 from mavbridge.guard.settings import GuardSettings
-from mavbridge.mavlink.settings import LinkSettings
 from sitl.clock import Clock
 
 pytestmark = pytest.mark.system

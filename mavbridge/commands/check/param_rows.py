@@ -9,6 +9,7 @@ from typing import NamedTuple
 from mavbridge.commands.check.rows import Row, Verdict
 from mavbridge.config.flight import FlyConfig
 from mavbridge.core.address import serial_baud
+from mavbridge.core.link_settings import LinkSettings
 from mavbridge.core.reasons import Code, because
 from mavbridge.core.vehicle import (
     ActionKind,
@@ -23,7 +24,6 @@ from mavbridge.mavlink.profiles.sticks import IDENTITY, Half
 from mavbridge.mavlink.session.params.bandwidth import baud_danger
 from mavbridge.mavlink.session.params.checks import assess
 from mavbridge.mavlink.session.vehicle import VehicleSession
-from mavbridge.mavlink.settings import LinkSettings
 from policy.contract import Contract
 
 _STICK_OUTPUTS = ("rc-override", "manual-control")

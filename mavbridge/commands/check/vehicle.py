@@ -12,6 +12,7 @@ from mavbridge.commands.check.rows import Row
 from mavbridge.config.flight import FlyConfig
 from mavbridge.core.clock import Clock
 from mavbridge.core.errors import MavbridgeError
+from mavbridge.core.link_settings import LinkSettings
 from mavbridge.core.vehicle import (
     ActionMeaning,
     LinkSnapshot,
@@ -22,7 +23,6 @@ from mavbridge.flight.settings import action_meaning, guard_settings
 from mavbridge.guard.sequences import MIDDLE_STICK
 from mavbridge.mavlink.link import MavlinkLink
 from mavbridge.mavlink.session.vehicle import VehicleSession
-from mavbridge.mavlink.settings import LinkSettings
 from mavbridge.mavlink.transport.signing_files import SigningStore
 from mavbridge.mavlink.transport.sockets import Transport, make_transport
 

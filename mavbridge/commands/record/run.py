@@ -113,7 +113,7 @@ def listening_guard(config: RecordConfig, clock: Clock) -> GuardSettings:
         pilot_flight(config), is_dual=True, tlog_fd=None, wall_offset_ns=wall_offset_ns(clock)
     )
     link = replace(settings.link, pilot_hz=config.rate, stick_hz=0.0, min_battery_percent=0.0)
-    return replace(settings, link=link)
+    return replace(settings, link=link, keeps_packets=True)
 
 
 class _Session:
@@ -315,9 +315,9 @@ class _Session:
         """What a demonstration cannot do without, and is not there."""
         if self._view.status.mode is None:
             return "no vehicle yet"
-        if self._view.telemetry().ned_from_body_wxyz is None:
+        if self._view.telemetry.ned_from_body_wxyz is None:
             return "no attitude from the vehicle"
-        if self._view.telemetry().velocity_ned_mps is None:
+        if self._view.telemetry.velocity_ned_mps is None:
             return "no velocity from the vehicle: it has no position estimate"
         is_silent = self._clock.now_ns() - self._view.sticks_ns > STICKS_FRESH_NS
         if is_silent:

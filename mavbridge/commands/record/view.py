@@ -11,11 +11,11 @@ from mavbridge.core.clock import NS_PER_MS, NS_PER_S
 from mavbridge.core.ports import TickSink
 from mavbridge.core.reasons import Code, because
 from mavbridge.core.records import Event, Tick
-from mavbridge.core.vehicle import ForwardedPacket, Packet, Sticks
+from mavbridge.core.vehicle import Packet, Sticks
 from mavbridge.flight.history import SentHistory
 from mavbridge.flight.state import Freshness, StateFrame
 from mavbridge.flight.telemetry_cache import TelemetryCache
-from mavbridge.guard.wire import FromGuard
+from mavbridge.guard.wire import FromGuard, Packets
 from mavbridge.mavlink.codec.frames import split_frames
 from mavbridge.mavlink.session.streams import message_id
 from mavbridge.mavlink.transport.packet_pipe import PacketPipe
@@ -60,13 +60,11 @@ class PilotView(TelemetryCache):
     def receive(self, message: FromGuard) -> None:
         """Take one message of the guard."""
         super().receive(message)
-        if not isinstance(message, tuple):
+        if not isinstance(message, Packets):
             return
         stick_id = STICK_IDS.get(self.status.autopilot.partition(" ")[0])
         with self._log_lock:
-            for packet in message:
-                if not isinstance(packet, ForwardedPacket):
-                    return  # another message of the guard that is a tuple
+            for packet in message.packets:
                 if self._log is not None:
                     self._log.put(Packet(packet.arrived_ns, packet.data))
                 frames, _ = split_frames(packet.data)

@@ -1,7 +1,7 @@
-"""The packets between each state and its sticks, without pymavlink's general parser and packer.
+"""Whole packets of MAVLink 2 without pymavlink's general parser and packer.
 
-The same result in less than half of the time; anything unusual is left to pymavlink. The same way
-are decoded the messages that pymavlink's dialect lacks.
+The same result in less than half of the time; anything unusual is left to pymavlink: MAVLink 1,
+streams, messages with arrays. Messages that pymavlink's dialect lacks are decoded here alone.
 """
 
 import struct
@@ -43,12 +43,16 @@ _LAYOUTS = {
         struct.Struct(message.unpacker.format),
         namedtuple(message.msgname, message.ordered_fieldnames),
     )
-    for message in (
-        dialect.MAVLink_attitude_quaternion_message,
-        dialect.MAVLink_local_position_ned_message,
-        dialect.MAVLink_highres_imu_message,
-    )
+    for message in dialect.mavlink_map.values()
+    if message.msgname == "ATTITUDE_QUATERNION"  # its array is at the end, and not used
+    or (message.msgname in READERS and not any(message.array_lengths))
 }
+_UNREAD: dict[int, str] = {
+    message.id: message.msgname
+    for message in dialect.mavlink_map.values()
+    if message.msgname not in READERS
+}
+"""Messages of which nothing but the sequence number is used."""
 
 _MISSING_LAYOUTS = {
     436: _Layout(
@@ -74,12 +78,19 @@ CRC_EXTRA: dict[int, int] = {
 """Seed of each message's checksum, by the number of the message."""
 
 
-def decode_state_packet(data: bytes) -> ReceivedMessage | None:
-    """Decode one whole, sound and usable packet of a state message; otherwise None.
+def packet_end(data: bytes, at: int) -> int | None:
+    """End of the packet of MAVLink 2 that begins here; None if there is no whole one."""
+    if len(data) - at < _HEADER_BYTES + _CHECKSUM_BYTES or data[at] != _MAVLINK_2:
+        return None
+    end = at + _HEADER_BYTES + data[at + 1] + _CHECKSUM_BYTES
+    end += SIGNATURE_BYTES if data[at + 2] & SIGNED else 0
+    return end if end <= len(data) else None
+
+
+def decode_packet(data: bytes) -> ReceivedMessage | None:
+    """Decode one whole, sound and usable packet; None if it is anything else, or has an array.
 
     A signature is left to the caller.
-
-    Also one of a message that pymavlink's dialect lacks.
     """
     if len(data) < _HEADER_BYTES + _CHECKSUM_BYTES:
         return None
@@ -87,15 +98,21 @@ def decode_state_packet(data: bytes) -> ReceivedMessage | None:
         data
     )
     number = low | high << 16
-    layout = _LAYOUTS.get(number)
-    if layout is None or start != _MAVLINK_2:
+    layout, unread = _LAYOUTS.get(number), _UNREAD.get(number)
+    if start != _MAVLINK_2 or incompatible not in (0, SIGNED):
         return None
-    if incompatible not in (0, SIGNED):
+    crc_extra = CRC_EXTRA.get(number)
+    if crc_extra is None or (layout is None and unread is None):
         return None
     sealed = data[:-SIGNATURE_BYTES] if incompatible else data
-    if len(sealed) != _HEADER_BYTES + length + _CHECKSUM_BYTES or length > layout.payload.size:
+    if len(sealed) != _HEADER_BYTES + length + _CHECKSUM_BYTES:
         return None
-    if _checksum(sealed[1:-_CHECKSUM_BYTES], layout.crc_extra) != sealed[-_CHECKSUM_BYTES:]:
+    if _checksum(sealed[1:-_CHECKSUM_BYTES], crc_extra) != sealed[-_CHECKSUM_BYTES:]:
+        return None
+    source = Endpoint(system, component)
+    if unread is not None:
+        return ReceivedMessage(source, sequence, unread, None, data)
+    if layout is None or length > layout.payload.size:
         return None
     payload = sealed[_HEADER_BYTES:-_CHECKSUM_BYTES].ljust(layout.payload.size, b"\0")
     values = layout.payload.unpack(payload)[: len(layout.fields._fields)]
@@ -103,7 +120,7 @@ def decode_state_packet(data: bytes) -> ReceivedMessage | None:
         body = READERS[layout.name](layout.fields._make(values))
     except UnusableError:
         return None  # counted by the general parser
-    return ReceivedMessage(Endpoint(system, component), sequence, layout.name, body, data)
+    return ReceivedMessage(source, sequence, layout.name, body, data)
 
 
 def pack_override(

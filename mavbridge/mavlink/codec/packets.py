@@ -10,7 +10,7 @@ from mavbridge.core.clock import NS_PER_MS
 from mavbridge.core.rotation import Quaternion, tilt_rad
 from mavbridge.core.vehicle import Sticks, Velocity
 from mavbridge.mavlink.codec.calibration import PWM_LIMITS_US, Pwm, RcCalibration
-from mavbridge.mavlink.codec.fast_path import decode_state_packet, pack_override
+from mavbridge.mavlink.codec.fast_path import decode_packet, pack_override, packet_end
 from mavbridge.mavlink.codec.messages import (
     STICK_END,
     CommandRequest,
@@ -110,7 +110,7 @@ class Codec:
         self._mav.buf_index = 0
 
     def decode_datagram(self, data: bytes) -> Iterator[ReceivedMessage]:
-        """Messages of one datagram, which nearly always is one whole packet.
+        """Messages of one datagram, which nearly always is one whole packet, or several.
 
         What was left of an earlier datagram was then cut off, and must not swallow this one. A
         datagram that starts otherwise may be the next piece of a forwarded serial stream. Of one
@@ -121,20 +121,28 @@ class Codec:
             self.bad_data_count += 1
         if data[:1] in _PACKET_STARTS:
             self.forget_partial()
-            if (state := decode_state_packet(data)) is not None:
-                if self._is_admitted(state.packet):
-                    yield state
-                return
-            try:
-                message = self._mav.decode(bytearray(data))  # in half the time of the parser
-            except dialect.MAVError:
-                yield from self.decode(data)
-            else:
-                yield from self._read(message)
+            at = 0
+            while (end := packet_end(data, at)) is not None:
+                packet = data[at:end]
+                if (whole := decode_packet(packet)) is None:
+                    break
+                at = end
+                if self._is_admitted(packet):
+                    yield whole
+            if rest := data[at:]:
+                yield from self._decode_unusual(rest)
         elif self._mav.buf_len():
             yield from self.decode(data)
         else:
             self.bad_data_count += 1
+
+    def _decode_unusual(self, data: bytes) -> Iterator[ReceivedMessage]:
+        try:
+            message = self._mav.decode(bytearray(data))  # in half the time of the parser
+        except dialect.MAVError:
+            yield from self.decode(data)
+        else:
+            yield from self._read(message)
 
     def decode(self, data: bytes) -> Iterator[ReceivedMessage]:
         """Messages completed by these bytes; corrupt bytes and unusable values are counted."""
@@ -164,7 +172,7 @@ class Codec:
     def _decoded(self, message: dialect.MAVLink_message, packet: bytes) -> ReceivedMessage:
         name = message.get_type()
         if isinstance(message, dialect.MAVLink_unknown):
-            return decode_state_packet(packet) or _unread(name, packet)
+            return decode_packet(packet) or _unread(name, packet)
         reader = READERS.get(name)
         try:
             body = None if reader is None else reader(message)

@@ -2,6 +2,7 @@
 
 import math
 from collections.abc import Callable
+from operator import attrgetter
 
 from pymavlink.dialects.v20 import ardupilotmega as dialect
 
@@ -45,6 +46,7 @@ MOST_NORM_ERROR = 0.1
 """A quaternion within it is normalised; one farther from length 1 is no attitude."""
 UNPRINTABLE = "\N{REPLACEMENT CHARACTER}"
 """Stands for control characters, with which a text could write into the user's terminal."""
+_CHANNELS = attrgetter(*(f"chan{number}_raw" for number in range(1, 19)))
 _HIGHRES_ACCEL_FIELDS = 0b111
 """fields_updated bits of xacc, yacc, zacc."""
 
@@ -101,24 +103,17 @@ def _highres_imu(m: dialect.MAVLink_highres_imu_message) -> Body:
     return SpecificForce("HIGHRES_IMU", m.time_usec, (m.xacc, m.yacc, m.zacc))
 
 
-def _raw_imu(m: dialect.MAVLink_raw_imu_message) -> Body:
-    return _milli_g_imu(m, m.time_usec)
-
-
-def _scaled_imu(m: dialect.MAVLink_scaled_imu_message) -> Body:
-    return _milli_g_imu(m, 1000 * m.time_boot_ms)
-
-
 def _milli_g_imu(
-    m: dialect.MAVLink_raw_imu_message | dialect.MAVLink_scaled_imu_message, boot_us: int
+    name: str,
+    m: dialect.MAVLink_raw_imu_message | dialect.MAVLink_scaled_imu_message,
+    boot_us: int,
 ) -> Body:
     x, y, z = (value * MG_TO_MPS2 for value in (m.xacc, m.yacc, m.zacc))
-    return SpecificForce(m.get_type(), boot_us, (x, y, z))
+    return SpecificForce(name, boot_us, (x, y, z))
 
 
 def _rc_channels(m: dialect.MAVLink_rc_channels_message) -> Body:
-    values = (getattr(m, f"chan{number}_raw") for number in range(1, 19))
-    channels_us = tuple(us if us in RADIO_US else 0 for us in values)
+    channels_us = tuple(us if us in RADIO_US else 0 for us in _CHANNELS(m))
     return RcChannels(channels_us[: m.chancount or 18], 1000 * m.time_boot_ms)
 
 
@@ -183,9 +178,9 @@ READERS: dict[str, Callable[[dialect.MAVLink_message], Body | None]] = {
     "ATTITUDE_QUATERNION": _attitude_quaternion,
     "LOCAL_POSITION_NED": _local_position,
     "HIGHRES_IMU": _highres_imu,
-    "SCALED_IMU": _scaled_imu,
-    "SCALED_IMU2": _scaled_imu,
-    "RAW_IMU": _raw_imu,
+    "SCALED_IMU": lambda m: _milli_g_imu("SCALED_IMU", m, 1000 * m.time_boot_ms),
+    "SCALED_IMU2": lambda m: _milli_g_imu("SCALED_IMU2", m, 1000 * m.time_boot_ms),
+    "RAW_IMU": lambda m: _milli_g_imu("RAW_IMU", m, m.time_usec),
     "RC_CHANNELS": _rc_channels,
     "MANUAL_CONTROL": _manual_control,
     "ATTITUDE_TARGET": _attitude_target,

@@ -31,6 +31,8 @@ class StickOutput(ActionOutput):
         self._curves_due_ns = 0
         self._saturating: tuple[str, ...] = ()
         """Sticks of the last action that ask for more than the vehicle can do."""
+        self._mapped: tuple[VehicleStatus, StickCurves, VehicleStatus] | None = None
+        """A status of the vehicle, the curves, and what both come to in the policy's terms."""
         self._new_notes: list[str] = []
         self._told: set[str] = set()
 
@@ -58,12 +60,15 @@ class StickOutput(ActionOutput):
         curves = self._curves_of(vehicle, status.mode, now_ns)
         if curves.is_identity or (status.rc_sticks is None and status.pilot_sticks is None):
             return status
-        rc, pilot = status.rc_sticks, status.pilot_sticks
-        return replace(
-            status,
-            rc_sticks=None if rc is None else curves.to_policy(rc),
-            pilot_sticks=None if pilot is None else curves.to_policy(pilot),
-        )
+        if self._mapped is None or self._mapped[0] is not status or self._mapped[1] is not curves:
+            rc, pilot = status.rc_sticks, status.pilot_sticks
+            told = replace(
+                status,
+                rc_sticks=None if rc is None else curves.to_policy(rc),
+                pilot_sticks=None if pilot is None else curves.to_policy(pilot),
+            )
+            self._mapped = (status, curves, told)
+        return self._mapped[2]
 
     def _resting(self, action: Action) -> Sticks:
         """The vehicle's sticks for an action, by the curves in use."""

@@ -1,5 +1,6 @@
 """The vehicle's condition beside its motion: mode, radio receiver, estimator, landing, battery."""
 
+import sys
 from typing import TypeAlias
 
 from pymavlink.dialects.v20 import ardupilotmega as dialect
@@ -67,9 +68,13 @@ class VehicleCondition:
         """Sticks of a radio stood in RC_CHANNELS before our first override."""
         self._is_rc_healthy: bool | None = None
         """SYS_STATUS's verdict on the receiver before our first override, if it has one."""
+        self._status: VehicleStatus | None = None
+        self._status_ns = (0, 0)
+        """First and last moment for which that holds, unless a message comes."""
 
     def receive(self, body: ConditionMessage, arrived_ns: int, *, may_be_ours: bool) -> None:
         """Take a message; ``may_be_ours``: an override was sent, and hides the receiver."""
+        self._status = None
         match body:
             case Heartbeat():
                 self._receive_heartbeat(body, arrived_ns)
@@ -137,6 +142,7 @@ class VehicleCondition:
         is_released: bool,
     ) -> None:
         """Take RC_CHANNELS: all of it, its four stick channels, and the sticks that these mean."""
+        self._status = None
         self.rc, self._rc_sticks = (arrived_ns, rc), sticks
         if not may_be_ours and channels_us:
             self._is_rc_plausible = all(value_us in RADIO_US for value_us in channels_us)
@@ -193,6 +199,22 @@ class VehicleCondition:
         """The vehicle's own report; None before its first heartbeat."""
         if self.heartbeat is None:
             return None
+        first_ns, last_ns = self._status_ns
+        if self._status is None or not first_ns <= now_ns <= last_ns:
+            self._status, self._status_ns = self._status_at(now_ns), (now_ns, self._next_ns(now_ns))
+        return self._status
+
+    def _next_ns(self, now_ns: int) -> int:
+        """The moment after which something that was told is too old."""
+        limits = (
+            (self.rc, GAP_NS),
+            (self._position, POSITION_FRESH_NS),
+            *((told, SLOW_FRESH_NS) for told in (self._estimator, self._landed, self._system)),
+        )
+        ends = (told[0] + limit_ns for told, limit_ns in limits if told is not None)
+        return min((end for end in ends if end >= now_ns), default=sys.maxsize)
+
+    def _status_at(self, now_ns: int) -> VehicleStatus:
         rc_ns, rc = self.rc or (None, RcChannels(()))
         is_shown = rc_ns is not None and now_ns - rc_ns <= GAP_NS
         is_valid = self._is_position_valid(now_ns)

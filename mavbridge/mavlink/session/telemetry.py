@@ -1,7 +1,7 @@
 """Newest reading of each quantity, from the best message that carries it."""
 
 from mavbridge.core.clock import NS_PER_MS
-from mavbridge.core.vehicle import Reading, Telemetry
+from mavbridge.core.vehicle import Reading, Sample, Telemetry
 from mavbridge.mavlink.codec.messages import (
     RESTART_STAMPS,
     RESTART_STEP_US,
@@ -11,6 +11,7 @@ from mavbridge.mavlink.codec.messages import (
     Measurement,
     later_by_us,
 )
+from mavbridge.mavlink.codec.packets import Codec
 
 _YIELD_NS = 300 * NS_PER_MS
 """Silence after which a better message gives way to a worse one."""
@@ -61,50 +62,54 @@ class TelemetryCollector:
     def __init__(self) -> None:
         self._attitude_filter, self._velocity_filter = _Filter(), _Filter()
         self._force_filter, self._height_filter = _Filter(), _Filter()
-        self._attitude: Reading | None = None
-        self._rate: Reading | None = None
-        self._velocity: Reading | None = None
-        self._force: Reading | None = None
-        self._position: Reading | None = None
-        self._height: Reading | None = None
+        self.telemetry = Telemetry()
+        """The newest reading of each quantity."""
 
-    def receive(self, body: Measurement, arrived_ns: int, happened_ns: int) -> None:
-        """Take a message, with its arrival and the time that it tells about."""
-        boot_us = body.boot_us
+    def receive(self, body: Measurement, arrived_ns: int, happened_ns: int) -> tuple[Sample, ...]:
+        """Take a message, with its arrival and the time that it tells about; return what of it
+        is news."""
+        rank, values = 0, {}
         if isinstance(body, Attitude):
-            rank = 0 if body.is_quaternion else 1
-            delay_ns = self._attitude_filter.delay_ns(rank, boot_us, arrived_ns, happened_ns)
-            if delay_ns is not None:
-                self._attitude = Reading(arrived_ns, body.ned_from_body_wxyz, delay_ns)
-                self._rate = Reading(arrived_ns, body.rate_body_radps, delay_ns)
+            rank, filtered = 0 if body.is_quaternion else 1, self._attitude_filter
+            values = {
+                "ned_from_body_wxyz": body.ned_from_body_wxyz,
+                "rate_body_radps": body.rate_body_radps,
+            }
         elif isinstance(body, LocalVelocity):
-            delay_ns = self._velocity_filter.delay_ns(0, boot_us, arrived_ns, happened_ns)
-            if delay_ns is not None:
-                self._velocity = Reading(arrived_ns, body.velocity_ned_mps, delay_ns)
-                if body.position_ned_m is not None:
-                    self._position = Reading(arrived_ns, body.position_ned_m, delay_ns)
+            filtered = self._velocity_filter
+            values = {"velocity_ned_mps": body.velocity_ned_mps}
+            if body.position_ned_m is not None:
+                values["position_ned_m"] = body.position_ned_m
         elif isinstance(body, Altitude):
-            delay_ns = self._height_filter.delay_ns(0, boot_us, arrived_ns, happened_ns)
-            if delay_ns is not None:
-                self._height = Reading(arrived_ns, (body.above_home_m,), delay_ns)
+            filtered = self._height_filter
+            values = {"height_above_home_m": (body.above_home_m,)}
         else:
-            rank = _FORCE_RANK[body.message_name]
-            delay_ns = self._force_filter.delay_ns(rank, boot_us, arrived_ns, happened_ns)
-            if delay_ns is not None:
-                self._force = Reading(arrived_ns, body.specific_force_body_mps2, delay_ns)
+            rank, filtered = _FORCE_RANK[body.message_name], self._force_filter
+            values = {"specific_force_body_mps2": body.specific_force_body_mps2}
+        delay_ns = filtered.delay_ns(rank, body.boot_us, arrived_ns, happened_ns)
+        if delay_ns is None:
+            return ()
+        new = {name: Reading(arrived_ns, each, delay_ns) for name, each in values.items()}
+        self.telemetry = self.telemetry._replace(**new)
+        return tuple(map(Sample._make, new.items()))
+
+
+class PacketDecoder:
+    """Samples of recorded packets, as the guard took them from the link."""
+
+    def __init__(self) -> None:
+        self._codec = Codec(source_system=0, source_component=0)
+        self._collector = TelemetryCollector()
 
     @property
-    def attitude_arrived_ns(self) -> int:
-        """Arrival of the newest attitude; 0 before the first."""
-        return 0 if self._attitude is None else self._attitude.arrived_ns
-
-    def snapshot(self) -> Telemetry:
+    def telemetry(self) -> Telemetry:
         """The newest reading of each quantity."""
-        return Telemetry(
-            ned_from_body_wxyz=self._attitude,
-            rate_body_radps=self._rate,
-            velocity_ned_mps=self._velocity,
-            specific_force_body_mps2=self._force,
-            position_ned_m=self._position,
-            height_above_home_m=self._height,
-        )
+        return self._collector.telemetry
+
+    def decode(self, data: bytes, arrived_ns: int, happened_ns: int) -> tuple[Sample, ...]:
+        """Samples of one datagram of the vehicle; empty if it holds nothing that is news."""
+        samples: tuple[Sample, ...] = ()
+        for message in self._codec.decode_datagram(data):
+            if isinstance(message.body, Measurement):
+                samples += self._collector.receive(message.body, arrived_ns, happened_ns)
+        return samples

@@ -10,6 +10,7 @@ from dataclasses import replace
 from pymavlink.dialects.v20 import ardupilotmega as dialect
 
 from mavbridge.core.clock import NS_PER_MS, NS_PER_S
+from mavbridge.core.link_settings import LinkSettings
 from mavbridge.core.reasons import Code, Reason, because
 from mavbridge.core.switch import Switch
 from mavbridge.core.vehicle import Output, VehicleStatus, said_by_vehicle
@@ -37,7 +38,6 @@ from mavbridge.mavlink.session.discovery import VehicleIdentity
 from mavbridge.mavlink.session.params.vehicle_params import VehicleParams
 from mavbridge.mavlink.session.streams import StreamRequester, message_id
 from mavbridge.mavlink.session.texts import TextJoiner
-from mavbridge.mavlink.settings import LinkSettings
 
 RECEIVER_WAIT_NS = 2 * NS_PER_S
 """Longest wait, once streams are granted, for RC_CHANNELS and SYS_STATUS to show a receiver:
@@ -100,6 +100,8 @@ class VehicleSession:
         """Silence before the first stamp that was old."""
         self._old_stamps = 0
         self._upset: tuple[int, Reason] | None = None
+        self._without_receiver: tuple[VehicleStatus, VehicleStatus] | None = None
+        """A status, and the same one without a receiver."""
 
     def use_output(self, output: Output) -> None:
         """Fly with this output from now on: its echo is asked for, its demands are checked."""
@@ -246,9 +248,11 @@ class VehicleSession:
         if status is None or not self._is_receiver_settled(now_ns):
             return status
         is_absent = status.has_receiver is None and not self.profile.has_rc_channels_always
-        if is_absent or (status.has_receiver and self._params.ignores_receiver):
-            return replace(status, has_receiver=False)
-        return status
+        if not (is_absent or (status.has_receiver and self._params.ignores_receiver)):
+            return status
+        if self._without_receiver is None or self._without_receiver[0] is not status:
+            self._without_receiver = (status, replace(status, has_receiver=False))
+        return self._without_receiver[1]
 
     def problem(self, now_ns: int) -> Reason | None:
         """The reason why it cannot be flown now, whatever the output, or None."""

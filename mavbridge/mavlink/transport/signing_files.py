@@ -11,6 +11,7 @@ from pathlib import Path
 from mavbridge.core.clock import NS_PER_S, Clock, wall_offset_ns
 from mavbridge.core.errors import UserError
 from mavbridge.core.files import write_durably
+from mavbridge.core.link_settings import SigningFiles
 from mavbridge.mavlink.codec.signing import (
     KEY_BYTES,
     LATEST_TICKS,
@@ -19,7 +20,6 @@ from mavbridge.mavlink.codec.signing import (
     SigningState,
     Stream,
 )
-from mavbridge.mavlink.settings import SigningFiles
 
 SAVE_S = 10.0
 AHEAD_TICKS = 2 * round(SAVE_S) * NS_PER_S // TICK_NS

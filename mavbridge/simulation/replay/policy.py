@@ -12,30 +12,26 @@ those that are built here. Both are compared.
 
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
-from itertools import groupby
 from typing import Literal
 
 import numpy as np
 
 from mavbridge.core.reasons import Code, Reason, because
 from mavbridge.core.records import FeatureFrame, FloatArray, Frame, Solve, Tick, VehicleState
-from mavbridge.core.vehicle import ForwardedPacket, Telemetry
+from mavbridge.core.vehicle import Sample, Telemetry
 from mavbridge.flight.bridge import CameraPath, build_bridge
 from mavbridge.flight.feature_cache import FeatureCache
 from mavbridge.flight.observation import observation_ages_ns
 from mavbridge.flight.plan import plan_flight
-from mavbridge.flight.state import Freshness
-from mavbridge.flight.state_reader import StateReader
+from mavbridge.flight.state import Freshness, StateReader
 from mavbridge.flight.telemetry_cache import TelemetryCache
 from mavbridge.guard.chunks import Chunk
 from mavbridge.guard.values import Phase
-from mavbridge.guard.wire import GuardStatus, GuardTick, NoChunk
-from mavbridge.mavlink.codec.messages import Measurement
-from mavbridge.mavlink.codec.packets import Codec
-from mavbridge.mavlink.session.telemetry import TelemetryCollector
+from mavbridge.guard.wire import GuardStatus, GuardTick, NoChunk, Samples
+from mavbridge.mavlink.session.telemetry import PacketDecoder
 from mavbridge.simulation.clock import SteppedClock
 from mavbridge.simulation.replay.guard import recorded_plan
-from mavbridge.simulation.replay.recording import RecordedPacket, ReplaySource
+from mavbridge.simulation.replay.recording import ReplaySource
 from policy.protocol import Executable
 
 _SIDES: tuple[Literal["left"], Literal["right"]] = ("left", "right")
@@ -166,15 +162,24 @@ class _Shelf:
 
 
 class _News:
-    """What reached the flight process: packets, ticks of the guard, and features."""
+    """What reached the flight process: samples, ticks of the guard, and features."""
 
     def __init__(
         self, source: ReplaySource, view: TelemetryCache, shelves: Sequence[_Shelf]
     ) -> None:
         self._view = view
         self._shelves = shelves
-        self._packets = [p for p in source.packets if p.happened_ns is not None]
-        self._telemetry = _telemetry(self._packets)
+        decoder = PacketDecoder()
+        self._samples: list[tuple[Sample, ...]] = []
+        """Of each packet that has any."""
+        self._telemetry: list[Telemetry] = []
+        """What was known after each of them."""
+        for packet in source.packets:
+            if packet.happened_ns is None:
+                continue
+            if new := decoder.decode(packet.data, packet.arrived_ns, packet.happened_ns):
+                self._samples.append(new)
+                self._telemetry.append(decoder.telemetry)
         self._stamps = np.array([_stamps_ns(now) for now in self._telemetry]).reshape(-1, 4)
         limits = recorded_plan(source).start_limits
         self._reader = StateReader(
@@ -182,14 +187,14 @@ class _News:
             freshness=Freshness(attitude_ns=limits.state_ns, velocity_ns=limits.velocity_ns),
             goal_ned_m=source.config.goal_ned_m,
         )
-        self._next_packet = 0
+        self._next = 0
         self._ticks = source.ticks
         self._next_tick = 0
 
     def bring(self, solve: Solve) -> str | None:
         """Deliver what this solve had seen; returns what the recording lacks, or None."""
         self._bring_ticks(solve.started_ns)
-        if not self._bring_packets(solve):
+        if not self._bring_samples(solve):
             return "the packets of its state"
         for shelf, frame_id in zip(self._shelves, solve.frame_ids[-1], strict=True):
             if not shelf.bring(frame_id):
@@ -216,7 +221,7 @@ class _News:
             (now.extras, now.extras_ns) == (solve.state.extras, solve.state.extras_ns)
         )
 
-    def _bring_packets(self, solve: Solve) -> bool:
+    def _bring_samples(self, solve: Solve) -> bool:
         state = solve.state
         wanted = (state.attitude_ns, state.rate_ns, state.velocity_ns, state.specific_force_ns)
         first, last = (
@@ -226,26 +231,10 @@ class _News:
         found = next((place for place in places.tolist() if self._has_extras(place, solve)), None)
         if found is None:
             return False
-        end = max(self._next_packet, found + 1)
-        arrived = self._packets[self._next_packet : end]
-        self._next_packet = end
-        for _, group in groupby(arrived, key=lambda packet: packet.arrived_ns):
-            self._view.receive(
-                tuple(ForwardedPacket(p.arrived_ns, p.happened_ns or 0, p.data) for p in group)
-            )
+        end = max(self._next, found + 1)
+        self._view.receive(Samples(sum(self._samples[self._next : end], ())))
+        self._next = end
         return True
-
-
-def _telemetry(packets: Sequence[RecordedPacket]) -> list[Telemetry]:
-    """What was known after each packet."""
-    codec, telemetry = Codec(source_system=0, source_component=0), TelemetryCollector()
-    known = []
-    for packet in packets:
-        for message in codec.decode_datagram(packet.data):
-            if isinstance(message.body, Measurement):
-                telemetry.receive(message.body, packet.arrived_ns, packet.happened_ns or 0)
-        known.append(telemetry.snapshot())
-    return known
 
 
 def _stamps_ns(now: Telemetry) -> list[int]:

@@ -18,13 +18,13 @@ from helpers.fakes import START_NS, FakeClock
 from helpers.network import needs_ipv6
 from mavbridge.core.address import SocketAddress
 from mavbridge.core.clock import NS_PER_MS
+from mavbridge.core.link_settings import LinkSettings
 from mavbridge.flight import guard_process
 from mavbridge.flight.guard_process import LATEST_NS, GuardDiedError, GuardProcess
 from mavbridge.guard.channel import SocketPort
 from mavbridge.guard.settings import GuardSettings
 from mavbridge.guard.values import Phase
 from mavbridge.guard.wire import GuardError, LastWords, encode_from_guard, encode_tick
-from mavbridge.mavlink.settings import LinkSettings
 
 MS = NS_PER_MS
 PACKETS = ((0, b"neutral"), (20 * MS, b"neutral"), (100 * MS, b"mode"))
@@ -82,8 +82,8 @@ class Rig:
 def rig(monkeypatch: pytest.MonkeyPatch) -> Iterator[Rig]:
     made = Rig()
 
-    def spawn(end: socket.socket, _settings: GuardSettings) -> Any:
-        made.port = SocketPort(end.dup())
+    def spawn(ends: tuple[socket.socket, socket.socket], _settings: GuardSettings) -> Any:
+        made.port = SocketPort(ends[0].dup())
         return made.child
 
     monkeypatch.setattr(guard_process, "_spawn", spawn)

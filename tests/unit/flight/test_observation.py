@@ -1,5 +1,6 @@
 """Which images and states one chunk comes from."""
 
+from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -13,7 +14,6 @@ from mavbridge.flight.observation import (
     MAX_STATES,
     Observation,
     ObservationSource,
-    StateHistory,
     observation_ages_ns,
 )
 from mavbridge.flight.state import Unavailable
@@ -52,7 +52,7 @@ def felt(ago_ms: float) -> VehicleState:
 
 
 def source(
-    contract: Contract, *caches: FeatureCache, states: StateHistory | None = None
+    contract: Contract, *caches: FeatureCache, past: Sequence[float] = (), span_ms: int = 200
 ) -> ObservationSource:
     executable = Executable(
         contract=contract,
@@ -62,13 +62,16 @@ def source(
         encode=lambda rgb, camera=0: np.zeros((1, 1), np.float32),
         act=lambda e, s, h: e,
     )
-    return ObservationSource(
+    looks = ObservationSource(
         contract,
         caches=caches,
         join=executable.join,
-        states=states,
         max_feature_age_ns=300 * MS,
+        states_span_ns=span_ms * MS,
     )
+    for ago_ms in past:
+        looks.remember(felt(ago_ms))
+    return looks
 
 
 def cache_of(*ago_ms: float, span_ms: int = 200) -> FeatureCache:
@@ -86,10 +89,8 @@ def observed(found: Observation | Unavailable) -> Observation:
 def test_past_features_are_the_nearest_to_each_step_before_the_newest() -> None:
     # 30 Hz with jitter; the newest is 20 ms old, so 120 and 220 ms are wanted.
     cache = cache_of(254, 221.5, 187, 154, 119, 86, 53, 20)
-    states = StateHistory(span_ns=200 * MS)
-    for ago_ms in (210, 201, 190, 110, 99, 90, 10):
-        states.push(felt(ago_ms))
-    found = observed(source(THREE_STEPS, cache, states=states).observe(felt(0), NOW_NS))
+    past = (210, 201, 190, 110, 99, 90, 10)
+    found = observed(source(THREE_STEPS, cache, past=past).observe(felt(0), NOW_NS))
     assert found.encoded.shape == (1, 3, 1)
     assert found.encoded[0, :, 0].tolist() == [221.5, 119, 20]
     assert found.states.shape == (1, 3, 13)
@@ -98,12 +99,10 @@ def test_past_features_are_the_nearest_to_each_step_before_the_newest() -> None:
 
 
 def test_the_oldest_is_repeated_where_there_is_no_older_one() -> None:
-    states = StateHistory(span_ns=200 * MS)
-    states.push(felt(30))
-    found = observed(source(THREE_STEPS, cache_of(60, 20), states=states).observe(felt(0), NOW_NS))
+    found = observed(source(THREE_STEPS, cache_of(60, 20), past=[30]).observe(felt(0), NOW_NS))
     assert found.encoded[0, :, 0].tolist() == [60, 60, 20]
     assert found.states[0, :, 0].tolist() == [30, 30, 0]
-    alone = source(THREE_STEPS, cache_of(20), states=StateHistory(span_ns=200 * MS))
+    alone = source(THREE_STEPS, cache_of(20))
     found = observed(alone.observe(felt(0), NOW_NS))
     assert found.encoded[0, :, 0].tolist() == [20, 20, 20]
     assert found.states[0, :, 0].tolist() == [0, 0, 0]
@@ -113,17 +112,13 @@ def test_an_image_with_a_fault_is_nobodys_past() -> None:
     cache = cache_of(221, 187)
     cache.publish(seen(120, fault=BLACK))
     cache.publish(seen(20))
-    states = StateHistory(span_ns=200 * MS)
-    found = observed(source(THREE_STEPS, cache, states=states).observe(felt(0), NOW_NS))
+    found = observed(source(THREE_STEPS, cache).observe(felt(0), NOW_NS))
     assert found.encoded[0, :, 0].tolist() == [221, 187, 20]
 
 
 def test_each_past_state_is_told_of_its_own_image() -> None:
     contract = replace(THREE_STEPS, since_exposure=True)
-    states = StateHistory(span_ns=200 * MS)
-    for ago_ms in (250, 200, 150, 100, 50):
-        states.push(felt(ago_ms))
-    looks = source(contract, cache_of(230, 125, 20), states=states)
+    looks = source(contract, cache_of(230, 125, 20), past=(250, 200, 150, 100, 50))
     looks.push(felt(0))
     rows = observed(looks.observe(felt(0), NOW_NS)).states[0]
     np.testing.assert_allclose(rows[:, 13], [0.030, 0.025, 0.020], atol=1e-6)
@@ -177,18 +172,18 @@ def test_the_age_is_that_of_the_oldest_of_the_newest_images() -> None:
 
 
 def test_histories_are_bounded() -> None:
-    cache, states = FeatureCache(span_ns=60_000 * MS), StateHistory(span_ns=60_000 * MS)
-    for ago_ms in range(6000, 0, -1):
+    past = range(6000, 0, -1)
+    contract = replace(THREE_STEPS, observation_steps=16, observation_dt_s=1.0)
+    cache = FeatureCache(span_ns=60_000 * MS)
+    for ago_ms in past:
         cache.publish(seen(ago_ms))
-        states.push(felt(ago_ms))
-    assert len(states.all()) == MAX_STATES
+    looks = source(contract, cache, past=past, span_ms=60_000)
+    rows = observed(looks.observe(felt(0), NOW_NS)).states[0]
+    assert rows[0, 0] == MAX_STATES
     assert cache.nearest(seen(0), before_ns=60_000 * MS).value[0, 0] == MAX_PAST
-    short = StateHistory(span_ns=100 * MS)
-    for ago_ms in range(6000, 0, -1):
-        short.push(felt(ago_ms))
-    assert len(short.all()) == 101
-    short.push(felt(50))  # late
-    assert len(short.all()) == 101
+    short = source(contract, cache, past=(*past, 50), span_ms=100)  # 50 is late
+    rows = observed(short.observe(felt(0), NOW_NS)).states[0]
+    assert rows[0, 0] == 101
 
 
 def test_ages_of_observations() -> None:

@@ -8,23 +8,21 @@ import numpy as np
 import pytest
 
 from helpers.factories import make_guard_tick
-from helpers.fakes import START_NS, FakeClock, ListSink
-from helpers.wire import WireEnd
-from mavbridge.core.clock import NS_PER_MS
+from helpers.fakes import START_NS, FakeClock, ListSink, level_telemetry, samples_of
+from mavbridge.core.clock import NS_PER_MS, Clock
 from mavbridge.core.reasons import Code, Reason, because
 from mavbridge.core.records import FeatureFrame, FloatArray
-from mavbridge.core.vehicle import ForwardedPacket, Velocity
+from mavbridge.core.vehicle import Sample, Velocity
 from mavbridge.flight.action_frames import ActionFrame, action_frame
 from mavbridge.flight.feature_cache import FeatureCache
 from mavbridge.flight.history import SentHistory
 from mavbridge.flight.observation import ObservationSource
 from mavbridge.flight.policy_loop import MAX_HORIZON, RETRY_NS, PolicyLoop, PolicySettings
-from mavbridge.flight.state import Freshness
-from mavbridge.flight.state_reader import StateReader
+from mavbridge.flight.state import Freshness, StateReader
 from mavbridge.flight.telemetry_cache import TelemetryCache
 from mavbridge.guard.chunks import Chunk
 from mavbridge.guard.values import Phase
-from mavbridge.guard.wire import NoChunk
+from mavbridge.guard.wire import NoChunk, Samples
 from policy.contract import Contract
 
 MS = NS_PER_MS
@@ -43,7 +41,7 @@ class Rig:
         frame: ActionFrame = STICKS_FRAME,
         period_ms: int = 10,
     ) -> None:
-        self.clock, self.cache, self.end = FakeClock(), FeatureCache(), WireEnd()
+        self.clock, self.cache = FakeClock(), FeatureCache()
         history = SentHistory(length=2, dt_s=0.05, frame=frame)
         self.view = TelemetryCache(
             history=history, sink=ListSink(), state_frame="ned_frd", freshness=FRESH
@@ -59,7 +57,6 @@ class Rig:
                 Contract(),
                 caches=(self.cache,),
                 join=lambda encoded: encoded[0][0],
-                states=None,
                 max_feature_age_ns=300 * MS,
             ),
             history=history,
@@ -85,17 +82,12 @@ class Rig:
     def measure(
         self, *, attitude_age_ns: int = 0, velocity_age_ns: int = 0, force_age_ns: int = MS
     ) -> "Rig":
-        mav, now_ns = self.end.mav, self.clock.now_ns()
-        self.view.receive(
-            tuple(
-                ForwardedPacket(now_ns, now_ns - age_ns, self.end.pack(message))
-                for age_ns, message in (
-                    (velocity_age_ns, mav.local_position_ned_encode(0, 0, 0, 0, 0, 0, 0)),
-                    (force_age_ns, mav.highres_imu_encode(0, 0, 0, -9.8, *[0.0] * 10, 7)),
-                    (attitude_age_ns, mav.attitude_quaternion_encode(0, 1, 0, 0, 0, 0, 0, 0)),
-                )
-            )
+        ages_ns = {"velocity_ned_mps": velocity_age_ns, "specific_force_body_mps2": force_age_ns}
+        samples = (
+            Sample(name, reading._replace(delay_ns=ages_ns.get(name, attitude_age_ns)))
+            for name, reading in samples_of(level_telemetry(self.clock.now_ns()))
         )
+        self.view.receive(Samples(tuple(samples)))
         return self
 
     def see(self, *, age_ns: int = 30 * MS, fault: Reason | None = None) -> "Rig":
@@ -234,7 +226,7 @@ def test_it_solves_until_it_is_told_to_stop_and_says_when_no_attitude_comes() ->
     rig, stop = Rig().see(), threading.Event()
     waits = iter([True, False, True])
 
-    def wait(*, newer_than_ns: int, timeout_ns: int) -> bool:
+    def wait(_clock: Clock, *, newer_than_ns: int, timeout_ns: int) -> bool:
         has_come = next(waits, None)
         if has_come is None:
             stop.set()
@@ -261,6 +253,7 @@ def test_a_policy_that_fails_is_told_to_the_guard_at_once(failure: type[BaseExce
         raise failure
 
     rig.loop._act = fail
+    rig.view.wait_for_attitude = lambda *_, **__: True  # type: ignore[method-assign]
     with pytest.raises(failure):
         rig.loop.run(threading.Event())
     assert rig.sent == [NoChunk(because(Code.POLICY_FAILED))]

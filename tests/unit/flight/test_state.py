@@ -113,8 +113,8 @@ def test_a_missing_or_old_part_is_a_reason(field: str, what: str) -> None:
 
     limit_ns = LIMITS.attitude_ns if what in ("attitude", "body rate") else LIMITS.velocity_ns
     reading = getattr(good, field)
-    at_limit = replace(good, **{field: Reading(NOW_NS - limit_ns, reading.values)})
-    old = replace(good, **{field: Reading(NOW_NS - limit_ns - 1, reading.values)})
+    at_limit = good._replace(**{field: Reading(NOW_NS - limit_ns, reading.values)})
+    old = good._replace(**{field: Reading(NOW_NS - limit_ns - 1, reading.values)})
     assert isinstance(
         build_state(at_limit, NOW_NS, frame="ned_frd", freshness=LIMITS), VehicleState
     )
@@ -124,7 +124,7 @@ def test_a_missing_or_old_part_is_a_reason(field: str, what: str) -> None:
         because(Code.TOO_OLD, quantity=what, age_ms=age_ms, limit_ms=limit_ms)
     )
 
-    future = replace(good, **{field: Reading(NOW_NS, reading.values, delay_ns=-400 * NS_PER_MS)})
+    future = good._replace(**{field: Reading(NOW_NS, reading.values, delay_ns=-400 * NS_PER_MS)})
     for now_ns in (NOW_NS, NOW_NS + 40 * NS_PER_MS):
         assert build_state(future, now_ns, frame="ned_frd", freshness=LIMITS) == Unavailable(
             because(Code.READING_AHEAD, quantity=what, ahead_ms=400.0)
@@ -133,7 +133,7 @@ def test_a_missing_or_old_part_is_a_reason(field: str, what: str) -> None:
 
 def test_a_reading_that_arrived_just_now_but_happened_long_ago_is_old() -> None:
     late = Reading(NOW_NS, (1.0, 0.0, 0.0, 0.0), delay_ns=LIMITS.attitude_ns)
-    fresh = replace(telemetry(), ned_from_body_wxyz=late)
+    fresh = telemetry()._replace(ned_from_body_wxyz=late)
     state = build_state(fresh, NOW_NS, frame="ned_frd", freshness=LIMITS)
     assert isinstance(state, VehicleState)
     assert (state.attitude_ns, state.rate_ns) == (NOW_NS - LIMITS.attitude_ns, NOW_NS)
@@ -142,7 +142,7 @@ def test_a_reading_that_arrived_just_now_but_happened_long_ago_is_old() -> None:
 
 
 def test_each_part_keeps_its_own_stamp_and_the_array_is_frozen() -> None:
-    source = replace(telemetry(), velocity_ned_mps=Reading(NOW_NS - 7, (0.0, 0.0, 0.0)))
+    source = telemetry()._replace(velocity_ned_mps=Reading(NOW_NS - 7, (0.0, 0.0, 0.0)))
     state = build_state(source, NOW_NS, frame="ned_frd", freshness=LIMITS)
     assert isinstance(state, VehicleState)
     assert (state.velocity_ns, state.attitude_ns) == (NOW_NS - 7, NOW_NS)

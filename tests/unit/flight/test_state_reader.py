@@ -1,7 +1,5 @@
 """Goal, height and altitude behind the state; the 13 numbers before them are test_state's."""
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
 
@@ -12,8 +10,7 @@ from mavbridge.core.reasons import Code, because
 from mavbridge.core.records import VehicleState
 from mavbridge.core.vehicle import Reading, Telemetry
 from mavbridge.flight.plan import plan_flight
-from mavbridge.flight.state import Freshness, Unavailable
-from mavbridge.flight.state_reader import StateReader
+from mavbridge.flight.state import Freshness, StateReader, Unavailable
 from policy.contract import Contract, StateExtra
 from policy.protocol import Executable
 
@@ -74,11 +71,11 @@ def test_extras_follow_in_the_contracts_order_and_axes(frame: str, goal: tuple[f
 def test_what_is_missing_or_old_is_a_reason_and_never_a_zero(extra: StateExtra, field: str) -> None:
     what = "position" if field == "position_ned_m" else "height above home"
     reading = getattr(FLYING, field)
-    missing = read(replace(FLYING, **{field: None}), extra)
+    missing = read(FLYING._replace(**{field: None}), extra)
     assert missing == Unavailable(because(Code.NO_TRUSTED_READING, quantity=what))
-    just = replace(FLYING, **{field: at(250, *reading.values)})
+    just = FLYING._replace(**{field: at(250, *reading.values)})
     assert isinstance(read(just, extra), VehicleState)
-    old = replace(FLYING, **{field: at(252, *reading.values)})
+    old = FLYING._replace(**{field: at(252, *reading.values)})
     assert read(old, extra) == Unavailable(
         because(Code.TOO_OLD, quantity=what, age_ms=252.0, limit_ms=250.0)
     )
@@ -86,7 +83,7 @@ def test_what_is_missing_or_old_is_a_reason_and_never_a_zero(extra: StateExtra, 
 
 
 def test_a_state_that_is_missing_is_a_reason_also_where_extras_are_asked_for() -> None:
-    refused = read(replace(FLYING, ned_from_body_wxyz=None), "height")
+    refused = read(FLYING._replace(ned_from_body_wxyz=None), "height")
     assert refused == Unavailable(because(Code.NO_READING, quantity="attitude"))
 
 

@@ -1,24 +1,32 @@
 """What the flight process knows from the guard's messages."""
 
 import threading
-from collections.abc import Callable
+from collections.abc import Iterator
 from dataclasses import replace
-from typing import Any
+from typing import Any, NamedTuple
 
 import pytest
 from rich.console import Console
 
 from helpers.factories import make_state, make_trace
-from helpers.fakes import START_NS, ListSink
-from helpers.wire import WireEnd
-from mavbridge.core.clock import NS_PER_MS
+from helpers.fakes import START_NS, ListSink, level_telemetry, samples_of, without
+from mavbridge.core.clock import NS_PER_MS, MonotonicClock
 from mavbridge.core.reasons import Code, because
-from mavbridge.core.vehicle import ForwardedPacket, Sticks
+from mavbridge.core.vehicle import ForwardedPacket, Reading, Sticks, Telemetry
 from mavbridge.flight.history import SentHistory
 from mavbridge.flight.state import Freshness
 from mavbridge.flight.telemetry_cache import MAX_SOLVES, SolveInputs, TelemetryCache
+from mavbridge.guard.channel import SocketPort, channel_pair
 from mavbridge.guard.values import Phase
-from mavbridge.guard.wire import GuardError, GuardMessage, GuardStatus, GuardTick
+from mavbridge.guard.wire import (
+    GuardError,
+    GuardMessage,
+    GuardStatus,
+    GuardTick,
+    Packets,
+    Samples,
+    encode_samples,
+)
 from mavbridge.observe.terminal import FlightScreen
 from mavbridge.observe.timing import FlightTiming, ObserverDrops
 
@@ -54,7 +62,7 @@ SOLVE = SolveInputs(
 
 
 class Viewed:
-    """A view, and the vehicle's packets for it."""
+    """A view, and the vehicle's samples for it."""
 
     def __init__(self) -> None:
         self.sink = ListSink()
@@ -65,19 +73,16 @@ class Viewed:
             state_frame="ned_frd",
             freshness=Freshness(attitude_ns=100 * MS, velocity_ns=250 * MS),
         )
-        self.end = WireEnd()
 
-    def packets(
-        self, at_ns: int = START_NS, *, height_m: float = 3.0
-    ) -> tuple[ForwardedPacket, ...]:
-        mav = self.end.mav
-        messages = (
-            mav.local_position_ned_encode(0, 0, 0, -height_m, 1, 0, 0),
-            mav.highres_imu_encode(0, 0, 0, -9.8, 0, 0, 0, 0, 0, 0, 0, 0, 0, 0, 7),
-            mav.attitude_quaternion_encode(0, 1, 0, 0, 0, 0.1, 0, 0),
-            mav.heartbeat_encode(2, 3, 81, 2, 4),
+    def samples(self, at_ns: int = START_NS, *, height_m: float = 3.0) -> Samples:
+        position = Reading(at_ns, (0.0, 0.0, -height_m))
+        known = level_telemetry(at_ns)._replace(position_ned_m=position)
+        return Samples(
+            tuple(
+                one._replace(reading=one.reading._replace(delay_ns=2 * MS))
+                for one in samples_of(known)
+            )
         )
-        return tuple(ForwardedPacket(at_ns, at_ns - 2 * MS, self.end.pack(one)) for one in messages)
 
     def receive(self, *messages: Any) -> "Viewed":
         for message in messages:
@@ -85,25 +90,55 @@ class Viewed:
         return self
 
 
-def test_packets_become_readings_with_the_moment_that_they_tell_about() -> None:
-    viewed = Viewed().receive(Viewed().packets(height_m=7.5))
-    telemetry = viewed.view.telemetry()
-    for name in (
-        *("ned_from_body_wxyz", "rate_body_radps"),
-        *("velocity_ned_mps", "specific_force_body_mps2"),
-    ):
-        reading = getattr(telemetry, name)
-        assert (reading.arrived_ns, reading.happened_ns) == (START_NS, START_NS - 2 * MS)
-    assert telemetry.velocity_ned_mps is not None
-    assert telemetry.velocity_ned_mps.values == (1.0, 0.0, 0.0)
+class Awaited(NamedTuple):
+    """A view with a channel of its own for samples, and the guard's end of it."""
+
+    view: TelemetryCache
+    port: SocketPort
+
+    def send(self, telemetry: Telemetry) -> None:
+        assert self.port.send(encode_samples(samples_of(telemetry)))
+
+
+def test_samples_are_the_newest_telemetry() -> None:
+    viewed = Viewed().receive(Viewed().samples(height_m=7.5))
+    telemetry = viewed.view.telemetry
+    assert samples_of(telemetry) == Viewed().samples(height_m=7.5).samples
+    assert telemetry.ned_from_body_wxyz is not None
+    assert telemetry.ned_from_body_wxyz.happened_ns == START_NS - 2 * MS
     assert viewed.view.attitude_ns == START_NS
     assert viewed.view.height_m == 7.5
 
 
-def test_bytes_that_are_no_packet_change_nothing() -> None:
-    viewed = Viewed().receive((ForwardedPacket(START_NS, START_NS, b"\xfd\x05nonsense"),), ())
-    assert viewed.view.attitude_ns == 0
-    assert viewed.receive(viewed.packets()).view.attitude_ns == START_NS
+def test_the_past_is_kept_by_datagram_until_it_is_taken() -> None:
+    view = TelemetryCache(
+        history=SentHistory(length=2, dt_s=0.01),
+        sink=ListSink(),
+        state_frame="ned_frd",
+        freshness=Freshness(attitude_ns=100 * MS, velocity_ns=250 * MS),
+        keeps_past=True,
+    )
+    first, second, third = (level_telemetry(START_NS + k * MS) for k in range(3))
+    velocity = without(second, "ned_from_body_wxyz")
+    view.receive(Samples(samples_of(first) + samples_of(velocity) + samples_of(third)))
+    assert view.take_past(START_NS + MS) == [first]
+    assert view.take_past(START_NS + 2 * MS) == [third]
+    assert view.take_past(START_NS + 2 * MS) == []
+
+
+def test_packets_go_to_the_recorder_alone() -> None:
+    kept: list[ForwardedPacket] = []
+    view = TelemetryCache(
+        history=SentHistory(length=2, dt_s=0.01),
+        sink=ListSink(),
+        state_frame="ned_frd",
+        freshness=Freshness(attitude_ns=100 * MS, velocity_ns=250 * MS),
+        watch_packets=kept.extend,
+    )
+    packet = ForwardedPacket(START_NS, START_NS, b"\xfd\x05nonsense")
+    view.receive(Packets((packet,)))
+    assert kept == [packet]
+    assert view.attitude_ns == 0
 
 
 def test_a_tick_of_flight_is_told_with_the_inputs_of_its_chunk() -> None:
@@ -138,7 +173,7 @@ def test_while_nobody_flies_ticks_have_the_newest_state_if_it_is_fresh(
     late_ms: int, is_fresh: bool
 ) -> None:
     viewed = Viewed()
-    viewed.receive(viewed.packets(), replace(NOBODY, sent_ns=START_NS + late_ms * MS))
+    viewed.receive(viewed.samples(), replace(NOBODY, sent_ns=START_NS + late_ms * MS))
     (tick,) = viewed.sink.ticks
     assert (tick.state is not None) is is_fresh
     assert tick.release_reason == WAIT
@@ -183,31 +218,55 @@ def test_it_is_airborne_while_the_policy_flies_and_the_vehicle_says_so() -> None
         assert not Viewed().receive(status, TICK).view.is_airborne
 
 
-def test_an_attitude_that_has_come_is_not_waited_for() -> None:
-    viewed = Viewed().receive(Viewed().packets())
-    assert viewed.view.wait_for_attitude(newer_than_ns=START_NS - 1, timeout_ns=0)
-    assert not viewed.view.wait_for_attitude(newer_than_ns=START_NS, timeout_ns=0)
+@pytest.fixture
+def awaited() -> Iterator[Awaited]:
+    guard, flight = map(SocketPort, channel_pair())
+    view = TelemetryCache(
+        history=SentHistory(length=2, dt_s=0.01),
+        sink=ListSink(),
+        state_frame="ned_frd",
+        freshness=Freshness(attitude_ns=100 * MS, velocity_ns=250 * MS),
+        samples=flight,
+    )
+    yield Awaited(view, guard)
+    guard.close()
+    flight.close()
 
 
-def test_an_attitude_wakes_who_waits_for_it() -> None:
-    viewed, woken, waits = Viewed(), threading.Event(), threading.Event()
+def test_an_attitude_that_has_come_is_not_waited_for(awaited: Awaited) -> None:
+    awaited.send(level_telemetry(START_NS))
+    clock = MonotonicClock()
+    assert awaited.view.wait_for_attitude(clock, newer_than_ns=START_NS - 1, timeout_ns=0)
+    assert not awaited.view.wait_for_attitude(clock, newer_than_ns=START_NS, timeout_ns=0)
 
-    class Condition(threading.Condition):
-        def wait(self, timeout: float | None = None) -> bool:
-            waits.set()
-            return super().wait(timeout)
 
-    viewed.view._news = Condition()
-    arguments = (viewed.view, woken.set)
-    threading.Thread(target=_wait_and_tell, args=arguments, name="waits", daemon=True).start()
-    assert waits.wait(10.0)
-    viewed.receive(viewed.packets())
+def test_an_attitude_wakes_who_waits_for_it_and_a_velocity_does_not(awaited: Awaited) -> None:
+    woken = threading.Event()
+
+    def wait() -> None:
+        if awaited.view.wait_for_attitude(
+            MonotonicClock(), newer_than_ns=START_NS, timeout_ns=60_000 * MS
+        ):
+            woken.set()
+
+    threading.Thread(target=wait, name="waits", daemon=True).start()
+    awaited.send(without(level_telemetry(START_NS + MS), "ned_from_body_wxyz"))
+    assert not woken.wait(0.1)
+    awaited.send(level_telemetry(START_NS + 2 * MS))
     assert woken.wait(10.0)
 
 
-def _wait_and_tell(view: TelemetryCache, tell: Callable[[], None]) -> None:
-    if view.wait_for_attitude(newer_than_ns=0, timeout_ns=60_000 * MS):
-        tell()
+def test_a_tick_brings_the_samples_that_a_busy_policy_has_not_read(awaited: Awaited) -> None:
+    awaited.send(level_telemetry(START_NS))
+    awaited.view.receive(NOBODY)
+    assert awaited.view.attitude_ns == START_NS
+
+
+def test_a_guard_that_is_gone_is_waited_for_no_longer_than_asked(awaited: Awaited) -> None:
+    awaited.port.close()
+    clock = MonotonicClock()
+    assert not awaited.view.wait_for_attitude(clock, newer_than_ns=0, timeout_ns=20 * MS)
+    assert not awaited.view.wait_for_attitude(clock, newer_than_ns=0, timeout_ns=20 * MS)
 
 
 def test_status_line_report_and_recording_count_the_missed_slots_of_the_flight_alone() -> None:

@@ -10,6 +10,7 @@ from helpers.fakes import FOREVER_NS, START_NS, FakeClock, FakeLink
 from helpers.guard_facts import codes, engagement_settings, stick_smoothing
 from mavbridge.core.clock import NS_PER_MS, NS_PER_S
 from mavbridge.core.errors import UserError
+from mavbridge.core.link_settings import LinkSettings
 from mavbridge.core.reasons import Code, because
 from mavbridge.core.vehicle import (
     IDLE,
@@ -26,6 +27,7 @@ from mavbridge.core.vehicle import (
 )
 from mavbridge.guard.chunks import Chunk, FreshnessLimits
 from mavbridge.guard.envelope import EnvelopeLimits
+from mavbridge.guard.guard import Guard
 from mavbridge.guard.limits import LimitSettings, Smoothing
 from mavbridge.guard.loop import FINISH_NS, IDLE_PERIOD_NS, GuardLoop
 from mavbridge.guard.sequences import DisengageSettings
@@ -38,12 +40,12 @@ from mavbridge.guard.wire import (
     GuardTick,
     LastWords,
     NoChunk,
+    Samples,
     ToGuard,
     decode_from_guard,
     encode_to_guard,
 )
 from mavbridge.mavlink.codec.packets import CommandRefusedError
-from mavbridge.mavlink.settings import LinkSettings
 
 MS = NS_PER_MS
 WANTED = Sticks(0.4, 0.1, -0.2, 0.3)
@@ -101,7 +103,6 @@ class Rig:
         self.port = FakePort()
         received = [encode_to_guard(message) for message in first or []]
         self.loop = GuardLoop(self.clock, self.link, self.port, received=received, lead_ns=lead_ns)
-        self.link.forward = self.loop.forward
         self.solves = True
         self.wanted: Action = WANTED
         self.serial = 0
@@ -159,7 +160,7 @@ class Rig:
 # --- what the flight process hears
 
 
-def test_packets_are_passed_on_before_anything_else_with_their_stamps() -> None:
+def test_samples_are_passed_on_before_anything_else_with_their_stamps() -> None:
     rig = Rig().flying()
     rig.port.received.clear()
     rig.link.change(mode="LOITER")
@@ -167,10 +168,11 @@ def test_packets_are_passed_on_before_anything_else_with_their_stamps() -> None:
     rig.link.measure(age_ns=3 * MS)
     arrived_ns = rig.clock.now_ns()
     rig.loop.step()
-    packets, *rest = rig.port.received
-    assert isinstance(packets, tuple)
-    assert len(packets) == 3
-    assert {(p.arrived_ns, p.happened_ns) for p in packets} == {(arrived_ns, arrived_ns - 3 * MS)}
+    passed, *rest = rig.port.received
+    assert isinstance(passed, Samples)
+    readings = [sample.reading for sample in passed.samples]
+    assert len(readings) == 4
+    assert {(r.arrived_ns, r.happened_ns) for r in readings} == {(arrived_ns, arrived_ns - 3 * MS)}
     assert [type(message) for message in rest] == [
         *(GuardStatus, GuardMessage, GuardTick, LastWords)
     ]
@@ -218,17 +220,34 @@ def test_a_change_of_phase_is_told_even_where_nothing_is_sent() -> None:
     assert rig.ticks[-1].reason == because(Code.MODE_CHANGED, before="ALT_HOLD", after="LOITER")
 
 
-def test_packets_are_not_passed_on_before_somebody_reads_them() -> None:
+def test_motion_alone_is_passed_on_without_a_step_of_the_guard(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    rig, steps, step = Rig().flying(), [], Guard.step
+    monkeypatch.setattr(Guard, "step", lambda *given: steps.append(1) or step(*given))
+    rig.loop.step()
+    before = len(steps)
+    rig.port.received.clear()
+    rig.link.measure()
+    rig.loop.step()
+    assert [type(message) for message in rig.port.received] == [Samples]
+    assert len(steps) == before
+    rig.link.change(mode="LOITER")
+    rig.loop.step()
+    assert len(steps) == before + 1
+
+
+def test_samples_are_not_passed_on_before_somebody_reads_them() -> None:
     rig = Rig()
     for _ in range(1000):
         rig.link.measure()
         rig.loop.step()
-    assert rig.got(tuple) == rig.got(GuardStatus)
+    assert rig.got(Samples) == []
     rig.tell(FLIGHT)
     rig.loop.step()
     rig.link.measure()
     rig.loop.step()
-    assert [len(one) for one in rig.got(tuple) if not isinstance(one, GuardStatus)] == [3]
+    assert [len(one.samples) for one in rig.got(Samples)] == [4]
 
 
 # --- what it says

@@ -10,6 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from helpers.guard_facts import engagement_settings, stick_smoothing
+from mavbridge.core.link_settings import LinkSettings
 from mavbridge.core.reasons import Code, because
 from mavbridge.core.vehicle import (
     ActionMeaning,
@@ -17,6 +18,8 @@ from mavbridge.core.vehicle import (
     ForwardedPacket,
     LinkStats,
     Percentiles,
+    Reading,
+    Sample,
     Sticks,
 )
 from mavbridge.guard.chunks import Chunk, FreshnessLimits
@@ -32,15 +35,17 @@ from mavbridge.guard.wire import (
     GuardSummary,
     GuardTick,
     NoChunk,
+    Packets,
+    Samples,
     ToGuard,
     decode_from_guard,
     decode_to_guard,
     encode_from_guard,
     encode_packets,
+    encode_samples,
     encode_tick,
     encode_to_guard,
 )
-from mavbridge.mavlink.settings import LinkSettings
 
 STICKS = Sticks(0.1, -0.2, 0.3, -0.4)
 FLIGHT = FlightSettings(
@@ -122,8 +127,22 @@ FROM_GUARD: list[FromGuard] = [
         replace(TICK, phase=phase, reason=because(Code.STILL_ENDING, phase=phase.value))
         for phase in Phase
     ),
-    (),
-    (ForwardedPacket(1, 2, b"\xfd" * 280), ForwardedPacket(3, 3, b""), ForwardedPacket(4, 1, b"P")),
+    Samples(()),
+    Samples(
+        (
+            Sample("velocity_ned_mps", Reading(3, (0.1, -math.inf, 1e300), -5)),
+            Sample("ned_from_body_wxyz", Reading(4, (1.0, 0.2, 0.3, 0.4), 2**40)),
+            Sample("height_above_home_m", Reading(2**60, (7.0,), 0)),
+        )
+    ),
+    Packets(()),
+    Packets(
+        (
+            ForwardedPacket(1, 2, b"\xfd" * 280),
+            ForwardedPacket(3, 3, b""),
+            ForwardedPacket(4, 1, b"P"),
+        )
+    ),
     STATUS,
     GuardStatus("none", None, False, None, (), None),
     GuardMessage("PreArm: Gyros inconsistent"),
@@ -139,7 +158,9 @@ def encoded(message: FromGuard) -> bytes:
             return encode_tick(message)
         case GuardStatus() | GuardMessage() | GuardError() | GuardSummary():
             return encode_from_guard(message)
-        case packets:
+        case Samples(samples):
+            return encode_samples(samples)
+        case Packets(packets):
             return encode_packets(packets)
 
 

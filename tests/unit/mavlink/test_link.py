@@ -11,6 +11,7 @@ from helpers.fakes import FakeClock
 from helpers.wire import CALIBRATION, WireEnd
 from mavbridge.core.clock import NS_PER_MS, NS_PER_S
 from mavbridge.core.errors import PeerError, UserError
+from mavbridge.core.link_settings import LinkSettings
 from mavbridge.core.observers import BoundedQueue
 from mavbridge.core.reasons import Code, because
 from mavbridge.core.vehicle import (
@@ -23,13 +24,11 @@ from mavbridge.core.vehicle import (
     Output,
     Packet,
     Release,
+    Sample,
     Sticks,
 )
-from mavbridge.mavlink.codec.messages import Measurement
-from mavbridge.mavlink.codec.packets import Codec
 from mavbridge.mavlink.link import MavlinkLink
-from mavbridge.mavlink.session.telemetry import TelemetryCollector
-from mavbridge.mavlink.settings import LinkSettings
+from mavbridge.mavlink.session.telemetry import PacketDecoder
 from mavbridge.mavlink.transport.sockets import Address, Received, TransportDownError
 
 MS = NS_PER_MS
@@ -171,13 +170,14 @@ class Rig:
         self.clock = FakeClock()
         self.vehicle = Vehicle(self.clock)
         self.packet_log: BoundedQueue[Packet] = BoundedQueue(20_000)
-        self.forwarded: list[ForwardedPacket] = []
+        self.packets: list[ForwardedPacket] = []
+        self.samples: list[Sample] = []
         self.link = MavlinkLink(
             self.vehicle,
             self.clock,
             LinkSettings(connect="udp:127.0.0.1:14550", **config),
             packet_log=self.packet_log,
-            forward=self.forwarded.append,
+            keeps_packets=True,
         )
         if meaning is not None:
             self.link.begin_flight(meaning, output)
@@ -190,6 +190,8 @@ class Rig:
             self.ticks += 1
             snapshot = self.link.poll()
             self.texts += snapshot.texts
+            self.packets += snapshot.packets
+            self.samples += snapshot.samples
             if decision is not None:
                 self.link.send(decision)
             self.link.service()
@@ -533,14 +535,14 @@ def test_in_flight_another_clock_elsewhere_is_not_followed() -> None:
     rig.run(0.5, Command(action=IDLE))
     rig.vehicle.address = ("127.0.0.1", 2)
     rig.vehicle.boot_ns -= 5 * NS_PER_S
-    count = len(rig.forwarded)
+    count = len(rig.packets)
     snapshot = rig.run(9.0, Command(action=IDLE))
     assert snapshot.interruption is not None
     assert snapshot.interruption.code is Code.REPLACED
     for part in ("127.0.0.1:1 is silent", "heard from 127.0.0.1:2", "engage again"):
         assert part in str(snapshot.interruption)
     assert rig.vehicle.answered_to == ("127.0.0.1", 1)
-    assert len(rig.forwarded) == count
+    assert len(rig.packets) == count
     attitude = snapshot.telemetry.ned_from_body_wxyz
     assert attitude is not None
     assert rig.clock.now_ns() - attitude.happened_ns >= 9 * NS_PER_S
@@ -705,23 +707,36 @@ def test_a_slow_clock_is_told_once_and_explains_a_heartbeat_that_is_late() -> No
     )
 
 
-def test_what_is_forwarded_gives_the_same_readings_elsewhere() -> None:
+def test_packets_and_samples_say_the_same() -> None:
     rig = Rig()
     rig.vehicle.delay_ns = 30 * MS
     snapshot = rig.run(12.0)
-    codec, collector = Codec(source_system=255, source_component=191), TelemetryCollector()
-    names = []
-    for packet in rig.forwarded:
-        for message in codec.decode_datagram(packet.data):
-            names.append(message.name)
-            if isinstance(message.body, Measurement):
-                collector.receive(message.body, packet.arrived_ns, packet.happened_ns)
-            else:
-                assert packet.happened_ns == packet.arrived_ns
-    assert collector.snapshot() == snapshot.telemetry
-    arrivals_ns = [packet.arrived_ns for packet in rig.forwarded]
+    decoder = PacketDecoder()
+    samples = [
+        sample
+        for packet in rig.packets
+        for sample in decoder.decode(packet.data, packet.arrived_ns, packet.happened_ns)
+    ]
+    assert samples == rig.samples
+    assert dict(samples) == {
+        name: reading for name, reading in snapshot.telemetry._asdict().items() if reading
+    }
+    arrivals_ns = [packet.arrived_ns for packet in rig.packets]
     assert arrivals_ns == sorted(arrivals_ns)
+    names = [dialect.mavlink_map[packet.data[7]].msgname for packet in rig.packets]
     assert {"HEARTBEAT", "COMMAND_ACK", "PARAM_VALUE", "RC_CHANNELS", "TIMESYNC"} <= set(names)
+
+
+def test_packets_are_kept_for_a_recorder_alone() -> None:
+    rig = Rig()
+    link = MavlinkLink(rig.vehicle, rig.clock, LinkSettings(connect="udp:127.0.0.1:14550"))
+    for tick in range(300):
+        rig.vehicle.tick(tick)
+        snapshot = link.poll()
+        link.service()
+        assert snapshot.packets == ()
+        rig.clock.advance_ns(10 * MS)
+    assert snapshot.samples
 
 
 def test_it_says_what_to_select_on_unless_the_connection_is_lost() -> None:
@@ -834,11 +849,11 @@ def test_other_sticks_that_px4_follows_are_noticed() -> None:
 
 def test_the_velocity_that_px4_sends_without_an_estimate_is_nobodys_velocity() -> None:
     rig = px4_rig()
-    before, count = rig.run(8.0).telemetry.velocity_ned_mps, len(rig.forwarded)
+    before, count = rig.run(8.0).telemetry.velocity_ned_mps, len(rig.packets)
     assert before is not None
     rig.vehicle.put(rig.vehicle.end.mav.estimator_status_encode(0, 0xE5, *[0.0] * 8))
     assert rig.run(0.2).telemetry.velocity_ned_mps == before
-    assert all(packet.data[7] != 32 for packet in rig.forwarded[count:])
+    assert all(packet.data[7] != 32 for packet in rig.packets[count:])
     rig.vehicle.put(rig.vehicle.end.mav.estimator_status_encode(0, 831, *[0.0] * 8))
     assert rig.run(0.2).telemetry.velocity_ned_mps != before
 
@@ -847,15 +862,15 @@ def test_other_peoples_sticks_that_px4_passes_on_are_not_its_own() -> None:
     """PX4's links pass the packets of other senders on, under their own ids."""
     rig = px4_rig()
     rig.run(8.0)
-    count = len(rig.forwarded)
+    count = len(rig.packets)
     for system, component in ((42, 191), (255, 190), (1, 191)):
         sender = WireEnd(system=system, component=component)
         rig.vehicle.put_bytes(sender.pack(sender.mav.manual_control_encode(1, 900, 0, 500, 0, 0)))
     rig.run(0.1)
-    assert all(packet.data[7] != 69 for packet in rig.forwarded[count:])
+    assert all(packet.data[7] != 69 for packet in rig.packets[count:])
     rig.vehicle.put(rig.vehicle.end.mav.manual_control_encode(1, 900, 0, 500, 0, 0))
     rig.run(0.1)
-    assert [packet.data[5:8] for packet in rig.forwarded if packet.data[7] == 69] == [b"\1\1\x45"]
+    assert [packet.data[5:8] for packet in rig.packets if packet.data[7] == 69] == [b"\1\1\x45"]
 
 
 @pytest.mark.parametrize(

@@ -364,9 +364,9 @@ def test_a_worse_message_never_overwrites_a_better_live_one() -> None:
     force("RAW_IMU", 1.0, 0)
     force("HIGHRES_IMU", 2.0, 1000)
     force("RAW_IMU", 3.0, 2000)
-    assert telemetry.snapshot().specific_force_body_mps2 == (1000, (2.0, 0, 0), 0)
+    assert telemetry.telemetry.specific_force_body_mps2 == (1000, (2.0, 0, 0), 0)
     force("SCALED_IMU2", 4.0, S)
-    assert telemetry.snapshot().specific_force_body_mps2 == (S, (4.0, 0, 0), 0)
+    assert telemetry.telemetry.specific_force_body_mps2 == (S, (4.0, 0, 0), 0)
 
     def attitude(quaternion: bool, at_ns: int) -> None:
         body = Attitude(quaternion, 0, (1, 0, 0, 0), (0, 0, 0))
@@ -374,7 +374,7 @@ def test_a_worse_message_never_overwrites_a_better_live_one() -> None:
 
     attitude(True, 0)
     attitude(False, 1)
-    assert telemetry.snapshot().rate_body_radps == (0, (0, 0, 0), 0)
+    assert telemetry.telemetry.rate_body_radps == (0, (0, 0, 0), 0)
 
 
 def velocities(*received: tuple[int, float, int]) -> list[tuple[float, int]]:
@@ -384,7 +384,7 @@ def velocities(*received: tuple[int, float, int]) -> list[tuple[float, int]]:
         arrived_ns = (1000 + k) * 10 * NS_PER_MS
         body = LocalVelocity(stamp_ms * 1000, (value, 0, 0))
         telemetry.receive(body, arrived_ns, arrived_ns - delay_ms * NS_PER_MS)
-        reading = telemetry.snapshot().velocity_ned_mps
+        reading = telemetry.telemetry.velocity_ned_mps
         assert reading is not None
         assert reading.happened_ns <= reading.arrived_ns <= arrived_ns
         held.append((reading.values[0], (arrived_ns - reading.happened_ns) // NS_PER_MS))

@@ -7,8 +7,8 @@ import pytest
 
 from helpers.fakes import FakeClock
 from mavbridge.core.errors import UserError
+from mavbridge.core.link_settings import SigningFiles
 from mavbridge.mavlink.codec.packets import Codec
-from mavbridge.mavlink.settings import SigningFiles
 from mavbridge.mavlink.transport.signing_files import (
     AHEAD_TICKS,
     MOST_PACKETS,

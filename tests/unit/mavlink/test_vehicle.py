@@ -10,6 +10,7 @@ from pymavlink.dialects.v20 import ardupilotmega as dialect
 from helpers.wire import ARDUPILOT, CALIBRATION
 from mavbridge.core.clock import NS_PER_MS, NS_PER_S
 from mavbridge.core.errors import PeerError
+from mavbridge.core.link_settings import LinkSettings
 from mavbridge.core.reasons import Code, Reason, because
 from mavbridge.core.vehicle import ActionMeaning, Sticks, VehicleStatus
 from mavbridge.mavlink.codec.messages import (
@@ -37,7 +38,6 @@ from mavbridge.mavlink.outputs.choice import choose_output
 from mavbridge.mavlink.session.commands import ModeAndArm
 from mavbridge.mavlink.session.discovery import VehicleIdentity
 from mavbridge.mavlink.session.vehicle import VehicleSession
-from mavbridge.mavlink.settings import LinkSettings
 
 S, MS = NS_PER_S, NS_PER_MS
 RECEIVER = (1500, 1500, 1000, 1500, 1500, 1500, 1500, 1500)

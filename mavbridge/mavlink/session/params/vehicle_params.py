@@ -5,6 +5,7 @@ from collections.abc import Callable, Iterator, Mapping
 
 from mavbridge.core.address import serial_baud
 from mavbridge.core.clock import NS_PER_S
+from mavbridge.core.link_settings import LinkSettings
 from mavbridge.core.reasons import Code, Reason, because
 from mavbridge.core.vehicle import Output, VehicleStatus
 from mavbridge.mavlink.codec.calibration import RcCalibration
@@ -14,7 +15,6 @@ from mavbridge.mavlink.session.params.bandwidth import baud_danger
 from mavbridge.mavlink.session.params.checks import Assessment, assess
 from mavbridge.mavlink.session.params.reader import ParamReader
 from mavbridge.mavlink.session.params.temporary import TemporaryParams
-from mavbridge.mavlink.settings import LinkSettings
 
 _AGAIN_NS = 2 * NS_PER_S
 """Between attempts to read parameters that the vehicle did not send."""

@@ -14,7 +14,7 @@ from mavbridge.core.records import Tick
 from mavbridge.core.vehicle import ForwardedPacket, Sticks
 from mavbridge.flight.history import SentHistory
 from mavbridge.flight.state import Freshness
-from mavbridge.guard.wire import GuardMessage, GuardStatus
+from mavbridge.guard.wire import GuardMessage, GuardStatus, Packets
 from mavbridge.mavlink.transport.packet_pipe import PacketPipe
 
 STICKS = Sticks(0.1, 0.2, 0.3, 0.4)
@@ -26,13 +26,16 @@ class Viewed:
     view: PilotView
     end: WireEnd
 
-    def radio(self, at_ns: int) -> tuple[ForwardedPacket, ...]:
+    def radio(self, at_ns: int) -> Packets:
         mav = self.end.mav
         channels = mav.rc_channels_encode(0, 8, *[1500] * 18, 255)
         manual = mav.manual_control_encode(1, 0, 0, 500, 0, 0)
         other = mav.heartbeat_encode(2, 3, 81, 2, 4)
-        return tuple(
-            ForwardedPacket(at_ns, at_ns, self.end.pack(one)) for one in (channels, manual, other)
+        return Packets(
+            tuple(
+                ForwardedPacket(at_ns, at_ns, self.end.pack(one))
+                for one in (channels, manual, other)
+            )
         )
 
     def tick(self, at_ns: int) -> Tick:
@@ -94,10 +97,10 @@ def test_packets_are_logged_while_there_is_a_log(
     reader, log = pipe
     viewed.view.receive(viewed.radio(START_NS))
     viewed.view.log_to(log)
-    packets = viewed.radio(START_NS)
-    viewed.view.receive(packets)
+    radio = viewed.radio(START_NS)
+    viewed.view.receive(radio)
     viewed.view.log_to(None)
     viewed.view.receive(viewed.radio(START_NS))
     logged = os.read(reader, 1 << 16)
-    assert len(logged) == sum(8 + len(packet.data) for packet in packets)
-    assert logged.endswith(packets[-1].data)
+    assert len(logged) == sum(8 + len(packet.data) for packet in radio.packets)
+    assert logged.endswith(radio.packets[-1].data)
