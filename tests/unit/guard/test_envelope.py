@@ -329,5 +329,5 @@ def test_a_flag_has_the_last_word() -> None:
 @pytest.mark.parametrize("flag", ["max_tilt", "max_height", "max_speed", "max_distance"])
 @pytest.mark.parametrize("value", [-1.0, math.nan])
 def test_flags_that_are_no_limit_are_refused(flag: str, value: float) -> None:
-    with pytest.raises(UserError, match=flag.replace("_", "-")):
+    with pytest.raises(UserError, match=flag.replace("max_", "envelope.")):
         EnvelopeConfig(**{flag: value})
