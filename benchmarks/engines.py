@@ -14,10 +14,10 @@ from mavbridge.core.clock import NS_PER_S, MonotonicClock
 from mavbridge.core.histogram import Histogram
 from mavbridge.flight.policies import load_configured_policy
 from policy.contract import ACTION_DIM
-from policy.engines.executable import encode_all, level_state
+from policy.engines.runner import encode_all, level_state
 from policy.errors import PolicyError
 from policy.preprocess import dummy_images
-from policy.protocol import Executable
+from policy.protocol import PolicyRunner
 
 EAGER: Engine = "torch"
 ENCODE, CHUNK, BOTH = "encode one image", "sample one chunk", "one image to one chunk"
@@ -75,30 +75,30 @@ def _cases(policy: PolicyConfig, lives: ExitStack) -> tuple[list[_Case], list[st
 
 
 def _cases_on(policy: PolicyConfig, lives: ExitStack) -> list[_Case]:
-    executable = _load(policy, lives)
-    contract = executable.contract
+    runner = _load(policy, lives)
+    contract = runner.contract
     images, state = dummy_images(contract), level_state(contract)
     image = images.reshape(-1, *contract.picture_shape)[0]
     history = np.zeros((1, contract.history_len, ACTION_DIM), np.float32)
-    feature = encode_all(executable, images)
-    engine = executable.engine if policy.engine == "auto" else policy.engine
+    feature = encode_all(runner, images)
+    engine = runner.engine if policy.engine == "auto" else policy.engine
 
     def case(work: str, call: Callable[[], object]) -> _Case:
         return _Case(policy=name_of(policy), work=work, engine=engine, call=call)
 
-    if not executable.dual_rate:
-        return [case(BOTH, lambda: executable.act(encode_all(executable, images), state, history))]
+    if not runner.dual_rate:
+        return [case(BOTH, lambda: runner.act(encode_all(runner, images), state, history))]
     return [
-        case(ENCODE, lambda: executable.encode(image)),
-        case(CHUNK, lambda: executable.act(feature, state, history)),
+        case(ENCODE, lambda: runner.encode(image)),
+        case(CHUNK, lambda: runner.act(feature, state, history)),
     ]
 
 
-def _load(policy: PolicyConfig, lives: ExitStack) -> Executable:
+def _load(policy: PolicyConfig, lives: ExitStack) -> PolicyRunner:
     loaded = lives.enter_context(load_configured_policy(policy, MonotonicClock()))
-    if policy.engine != "auto" and not loaded.executable.engine.startswith(policy.engine):
+    if policy.engine != "auto" and not loaded.runner.engine.startswith(policy.engine):
         raise PolicyError("; ".join(loaded.notes))  # says why the engine was passed over
-    return loaded.executable
+    return loaded.runner
 
 
 def _time(case: _Case, block_s: float) -> None:

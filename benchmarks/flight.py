@@ -29,14 +29,14 @@ from mavbridge.core.errors import PeerError, UserError
 from mavbridge.core.processes import end, free_port, running, wait
 from mavbridge.core.reasons import Reason
 from mavbridge.core.records import Event, Tick
-from mavbridge.flight.app import fly_executable, start_guard
+from mavbridge.flight.app import fly_policy, start_guard
 from mavbridge.flight.plan import plan_flight
 from mavbridge.flight.policies import load_configured_policy
 from mavbridge.guard.values import EndRequest
 from mavbridge.observe.output import flight_console
 from mavbridge.observe.timing import FlightTiming, ObserverDrops, TimingReport
 from policy.contract import FloatArray
-from policy.protocol import Executable
+from policy.protocol import PolicyRunner
 
 FLIGHT_PROCESS = "benchmarks.flight"
 STARTING_S = 300.0
@@ -135,18 +135,21 @@ def main(job: FlightJob) -> None:
 
 
 def measure_flight(
-    job: FlightJob, alter: Callable[[Executable], Executable] = lambda executable: executable
+    job: FlightJob, alter: Callable[[PolicyRunner], PolicyRunner] = lambda runner: runner
 ) -> None:
     """Fly the policy, changed by ``alter``, and write the figures."""
     clock = MonotonicClock()
     with load_configured_policy(job.policy, clock) as loaded:
-        _measure(job, clock, loaded.executable, alter)
+        _measure(job, clock, loaded.runner, alter)
 
 
 def _measure(
-    job: FlightJob, clock: Clock, executable: Executable, alter: Callable[[Executable], Executable]
+    job: FlightJob,
+    clock: Clock,
+    runner: PolicyRunner,
+    alter: Callable[[PolicyRunner], PolicyRunner],
 ) -> None:
-    loops = job.rates.loops(is_dual=executable.dual_rate, play_s=executable.contract.play_s)
+    loops = job.rates.loops(is_dual=runner.dual_rate, play_s=runner.contract.play_s)
     meter = FlightMeter(
         stick_hz=job.rates.stick_rate, action_hz=loops.action_hz, vision_hz=loops.max_vision_hz
     )
@@ -161,16 +164,16 @@ def _measure(
         arm=True,
         duration=job.duration,
     )
-    climb = level_climb(alter(executable))
+    climb = level_climb(alter(runner))
     with ExitStack() as stack:
         guard = start_guard(config, clock, stack)
         probe, console = GuardProbe(guard.process.pid, clock), flight_console()
         watch = ReleaseWatch(lambda reason: guard.process.send(EndRequest(reason=reason)))
         sinks = (meter, probe, watch)
         plan = plan_flight(config, climb.contract, is_dual=climb.dual_rate)
-        fly_executable(plan, climb, clock=clock, console=console, sinks=sinks, guard=guard)
+        fly_policy(plan, climb, clock=clock, console=console, sinks=sinks, guard=guard)
         summary = guard.process.summary
-    flight = _flight(job.policy, executable.engine, meter, probe)
+    flight = _flight(job.policy, runner.engine, meter, probe)
     if flight.duration_s < LEAST_SHARE * job.duration:
         lasted = f"the flight lasted {flight.duration_s:g} s instead of {job.duration:g} s"
         raise PeerError(f"{lasted}: {watch.reason}")
@@ -178,22 +181,22 @@ def _measure(
     job.out.write_text(to_json(replace(flight, lost_reports=lost)))
 
 
-def level_climb(executable: Executable) -> Executable:
-    """An executable that does the same work and returns other sticks, however late it is."""
+def level_climb(runner: PolicyRunner) -> PolicyRunner:
+    """A runner that does the same work and returns other sticks, however late it is."""
 
     def act(encoded: FloatArray, state: FloatArray, history: FloatArray) -> FloatArray:
-        chunk = executable.act(encoded, state, history).copy()
+        chunk = runner.act(encoded, state, history).copy()
         chunk[...] = (CLIMB_STICK, 0.0, 0.0, 0.0)
         return chunk
 
     contract = replace(
-        executable.contract,
+        runner.contract,
         max_state_age_s=MAX_AGE_S,
         max_velocity_age_s=MAX_AGE_S,
         max_feature_age_s=MAX_AGE_S,
         max_chunk_age_s=MAX_AGE_S,
     )
-    return replace(executable, contract=contract, act=act)
+    return replace(runner, contract=contract, act=act)
 
 
 class FlightMeter:

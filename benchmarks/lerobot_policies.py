@@ -23,17 +23,17 @@ from mavbridge.core.clock import NS_PER_MS, NS_PER_S, MonotonicClock
 from policy.adapters.lerobot.plan import read_plan
 from policy.adapters.lerobot.policy import LeRobotDiffusion, LeRobotPolicy, load_policy_of
 from policy.contract import FloatArray
-from policy.engines.executable import (
+from policy.engines.openvino_compile import precisions
+from policy.engines.openvino_modules import ModuleConverter, make_module_runner
+from policy.engines.parity import make_parity_samples
+from policy.engines.runner import (
     ExecutionSettings,
     Precision,
     encode_all,
     level_state,
 )
-from policy.engines.openvino_compile import precisions
-from policy.engines.openvino_modules import ModuleConverter, make_module_executable
-from policy.engines.parity import make_parity_samples
-from policy.engines.torch_eager import make_torch_executable
-from policy.protocol import Executable
+from policy.engines.torch_eager import make_torch_runner
+from policy.protocol import PolicyRunner
 
 PEER = Path(__file__).with_name("lerobot_peer.py")
 TRIAL_NS = 4 * NS_PER_S
@@ -61,8 +61,8 @@ def rows(folder: Path, steps: int, peer: str | None) -> list[str]:
         *notes,
         f"{'engine':<16} {'encode best':>12} {'p50 ms':>8} {'chunk best':>12} {'p50 ms':>8}",
     ]
-    for executable in _executables(policy, settings):
-        lines.append(_line(executable.engine, *_times(executable)))
+    for runner in _runners(policy, settings):
+        lines.append(_line(runner.engine, *_times(runner)))
     if peer is not None:
         ms, furthest = _beside_lerobot(policy, folder, steps, peer)
         lines.append(_line("LeRobot, eager", None, ms))
@@ -76,24 +76,22 @@ def _line(name: str, encode: Milliseconds | None, chunk: Milliseconds) -> str:
     return "{:<16} {:>12} {:>8} {:>12} {:>8}".format(name, *cells)
 
 
-def _executables(policy: LeRobotPolicy, settings: ExecutionSettings) -> list[Executable]:
+def _runners(policy: LeRobotPolicy, settings: ExecutionSettings) -> list[PolicyRunner]:
     kinds: set[Precision] = {action for _, action in precisions()}
     converter = ModuleConverter(policy, settings.name)
-    graphs = [
-        make_module_executable(policy, settings, kind, kind, converter) for kind in sorted(kinds)
-    ]
-    return [make_torch_executable(policy, settings), *graphs]
+    graphs = [make_module_runner(policy, settings, kind, kind, converter) for kind in sorted(kinds)]
+    return [make_torch_runner(policy, settings), *graphs]
 
 
-def _times(executable: Executable) -> tuple[Milliseconds, Milliseconds]:
-    contract = executable.contract
+def _times(runner: PolicyRunner) -> tuple[Milliseconds, Milliseconds]:
+    contract = runner.contract
     samples = make_parity_samples(contract)
     rgb, state, history = samples.rgb[0], samples.state[:1], samples.history[:1]
-    encoded = encode_all(executable, rgb)
+    encoded = encode_all(runner, rgb)
     image = rgb.reshape(-1, *rgb.shape[-3:])[0]
     return (
-        _time(lambda: executable.encode(image)),
-        _time(lambda: executable.act(encoded, state, history)),
+        _time(lambda: runner.encode(image)),
+        _time(lambda: runner.act(encoded, state, history)),
     )
 
 

@@ -38,7 +38,7 @@ from mavbridge.flight.plan import FlightPlan, plan_flight
 from mavbridge.flight.settings import guard_settings
 from mavbridge.guard.values import EndRequest
 from policy.contract import ACTION_DIM, ACTION_NAMES, RATE, Contract
-from policy.protocol import Executable
+from policy.protocol import PolicyRunner
 
 LINK_PROCESS = "benchmarks.link"
 LINK_VEHICLE = "benchmarks.link_vehicle"
@@ -183,7 +183,7 @@ def repeat_roll_rate(_feature: FloatArray, state: FloatArray, _history: FloatArr
     return chunk
 
 
-ROLL_RATE = Executable(
+ROLL_RATE = PolicyRunner(
     # Wide ages: a vehicle that is served late is to be measured.
     contract=Contract(max_state_age_s=1.0, max_velocity_age_s=1.0, max_chunk_age_s=1.0),
     name="roll rate",

@@ -19,7 +19,7 @@ from benchmarks.flight import FlightJob, measure_flight
 from mavbridge.core.clock import NS_PER_MS, MonotonicClock
 from mavbridge.core.workers import Worker
 from policy.contract import FloatArray
-from policy.protocol import Executable
+from policy.protocol import PolicyRunner
 
 Load: TypeAlias = Literal["none", "slow", "busy"]
 SLOW_EVERY = 10
@@ -38,7 +38,7 @@ def main(job: FlightJob, *, load: Load = "none") -> None:
         for worker in busy if load == "busy" else ():
             worker.start()
             stack.callback(worker.join, JOIN_S)
-        measure_flight(job, with_slow_solves if load == "slow" else lambda executable: executable)
+        measure_flight(job, with_slow_solves if load == "slow" else lambda runner: runner)
 
 
 @torch.no_grad()
@@ -57,8 +57,8 @@ def hog_interpreter(stop: threading.Event) -> None:
         pass
 
 
-def with_slow_solves(executable: Executable) -> Executable:
-    """An executable whose every tenth solve computes for 30 ms more."""
+def with_slow_solves(runner: PolicyRunner) -> PolicyRunner:
+    """A runner whose every tenth solve computes for 30 ms more."""
     clock, solves = MonotonicClock(), 0
 
     def act(encoded: FloatArray, state: FloatArray, history: FloatArray) -> FloatArray:
@@ -67,9 +67,9 @@ def with_slow_solves(executable: Executable) -> Executable:
         end_ns = clock.now_ns() + (0 if solves % SLOW_EVERY else SLOW_NS)
         while clock.now_ns() < end_ns:
             pass
-        return executable.act(encoded, state, history)
+        return runner.act(encoded, state, history)
 
-    return replace(executable, act=act)
+    return replace(runner, act=act)
 
 
 if __name__ == "__main__":

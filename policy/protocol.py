@@ -52,7 +52,7 @@ class DualRatePolicy(SingleRatePolicy, Protocol):
 
 
 class Encode(Protocol):
-    """``Executable.encode``."""
+    """``PolicyRunner.encode``."""
 
     def __call__(self, image: CameraImage, camera: int = 0, /) -> FloatArray:
         """Image of one of ``contract.cameras`` -> its encoded image."""
@@ -89,7 +89,7 @@ def keep_nothing() -> None:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Executable:
+class PolicyRunner:
     """A policy ready to run on one engine, numpy in and numpy out, as the loops call it.
 
     ``encode`` runs in the threads of the cameras, one image at a time, ``act`` and ``reset`` in the

@@ -24,7 +24,7 @@ from policy.contract import (
     FloatArray,
 )
 from policy.errors import ContractError
-from policy.protocol import Executable
+from policy.protocol import PolicyRunner
 from policy.rotation import Array, Quaternion, Vector, conjugate, matrix_columns, multiply, rotate
 
 GRAVITY_MPS2 = 9.80665
@@ -86,18 +86,18 @@ def rates_contract(contract: Contract) -> Contract:
     )
 
 
-def flown_by_rates(executable: Executable) -> Executable:
-    """An executable whose chunks are sticks, flown by thrust and body rates.
+def flown_by_rates(runner: PolicyRunner) -> PolicyRunner:
+    """A runner whose chunks are sticks, flown by thrust and body rates.
 
     Its network gets a history of centred sticks: what was sent are rates.
     """
-    loop = StickLoop(by_rates(executable.contract))
-    centred = np.zeros((1, executable.contract.history_len, ACTION_DIM), np.float32)
+    loop = StickLoop(by_rates(runner.contract))
+    centred = np.zeros((1, runner.contract.history_len, ACTION_DIM), np.float32)
 
     def act(encoded: FloatArray, state: FloatArray, _history: FloatArray) -> FloatArray:
-        return loop.to_rates(executable.act(encoded, state, centred), state)
+        return loop.to_rates(runner.act(encoded, state, centred), state)
 
-    return replace(executable, contract=loop.contract, act=act)
+    return replace(runner, contract=loop.contract, act=act)
 
 
 @dataclass(frozen=True, slots=True)

@@ -30,7 +30,7 @@ from mavbridge.simulation.delays import Delay, Delays
 from mavbridge.simulation.flight import SimulatedFlight, SimulationSettings
 from mavbridge.simulation.world import Exposure, make_vehicle
 from policy.contract import ACTION_DIM, Contract, FloatArray
-from policy.protocol import Executable
+from policy.protocol import PolicyRunner
 from sitl.course import gate_truth
 from sitl.expert.demonstrator import Expert, RateExpert
 from sitl.expert.disturbance import RATE_STRENGTHS, STICK_STRENGTHS, Disturbance, random_start
@@ -95,7 +95,7 @@ def _random_delays(random: np.random.Generator) -> Delays:
 
 
 class Pilot:
-    """The expert's action at every solve, and an executable that flies."""
+    """The expert's action at every solve, and a runner that flies."""
 
     def __init__(
         self,
@@ -104,7 +104,7 @@ class Pilot:
         *,
         speed_mps: float,
         contract: Contract,
-        student: Executable | None,
+        student: PolicyRunner | None,
     ) -> None:
         self._flight = flight
         self._variation = variation
@@ -124,7 +124,7 @@ class Pilot:
         """By the serial of the chunk that was computed with them."""
         self.begin_ns: int | None = None
         """When the demonstration begins; None before the policy has the vehicle's sticks."""
-        expert = Executable(
+        expert = PolicyRunner(
             contract=contract,
             name=f"expert at {speed_mps:g} m/s",
             engine="numpy",
@@ -132,7 +132,7 @@ class Pilot:
             encode=lambda _rgb, _camera=0: np.zeros((1, 1), np.float32),
             act=self._act,
         )
-        self.executable = replace(student or expert, act=self._act, reset=self._start)
+        self.runner = replace(student or expert, act=self._act, reset=self._start)
 
     def expert_action(self, chunk_serial: int) -> Action | None:
         """The expert's action at the state of a recent chunk; None before its demonstration."""
@@ -146,7 +146,7 @@ class Pilot:
 
     def _act(self, encoded: FloatArray, state: FloatArray, history: FloatArray) -> FloatArray:
         self._solves += 1
-        horizon = self.executable.contract.horizon
+        horizon = self.runner.contract.horizon
         if self._expert is None:  # not engaged yet: the guard wants to see chunks first
             return np.zeros((1, horizon, ACTION_DIM), np.float32)
         now_s, body = self._flight.clock.now_ns() / NS_PER_S, self._flight.vehicle.ap.truth
@@ -236,7 +236,7 @@ def fly_demonstration(spec: DemonstrationSpec, should_stop: Callable[[], bool]) 
 def _fly(spec: DemonstrationSpec, should_stop: Callable[[], bool], stack: ExitStack) -> bool:
     """Fly and record one course; the student is closed with ``stack``."""
     variation, wanted = draw_variation(spec.seed), spec.config.policy
-    student: Executable | None = None
+    student: PolicyRunner | None = None
     size_px = wanted.image_size or SIM_CAMERA_PX
     contract = Contract(
         feature_dim=1,
@@ -248,7 +248,7 @@ def _fly(spec: DemonstrationSpec, should_stop: Callable[[], bool], stack: ExitSt
     )
     if wanted.checkpoint is not None:
         loaded = load_for_episodes(replace(wanted, dual_rate=True), MonotonicClock())
-        student = stack.enter_context(loaded).executable
+        student = stack.enter_context(loaded).runner
         contract = student.contract
         if contract.action != spec.config.action:
             raise UserError(
@@ -266,12 +266,12 @@ def _fly(spec: DemonstrationSpec, should_stop: Callable[[], bool], stack: ExitSt
     pilot = Pilot(
         flight, variation, speed_mps=spec.config.speed, contract=contract, student=student
     )
-    meta = _meta(spec, variation, pilot.executable)
+    meta = _meta(spec, variation, pilot.runner)
     writer = FlightWriter(spec.folder, meta, pressure="offline", with_labels=True)
     recorder = _LabelledRecorder(flight, pilot, writer)
     try:
         result = flight.fly(
-            pilot.executable,
+            pilot.runner,
             max_time_s=spec.config.max_time,
             sinks=(recorder,),
             should_stop=should_stop,
@@ -286,18 +286,18 @@ def _fly(spec: DemonstrationSpec, should_stop: Callable[[], bool], stack: ExitSt
     return success
 
 
-def _meta(spec: DemonstrationSpec, variation: Variation, executable: Executable) -> FlightMeta:
+def _meta(spec: DemonstrationSpec, variation: Variation, runner: PolicyRunner) -> FlightMeta:
     return FlightMeta(
         started_at=datetime.now(UTC).isoformat(),
         start_ns=0,
         mavbridge_version=mavbridge.__version__,
         source="dagger" if spec.config.policy.checkpoint else "demonstration",
-        policy=executable.name,
-        engine=executable.engine,
+        policy=runner.name,
+        engine=runner.engine,
         mode="dual",
         action_hz=Rates().loops(is_dual=True).action_hz,
         visual_hz=Rates().visual_limits_hz[1],
-        contract=executable.contract,
+        contract=runner.contract,
         course_seed=spec.seed,
         seed=spec.seed,
         conditions=variation.conditions.numbers(),

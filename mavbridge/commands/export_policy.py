@@ -59,6 +59,6 @@ def _difference(ours: PolicyRequest, written: PolicyRequest) -> str | None:
     """Why two policies are not the same from image to stick, or None."""
     chunks = []
     for request in (ours, written):
-        executable = load_policy(replace(request, dual_rate=False), now_s=lambda: 0.0).executable
-        chunks.append(chunks_of_samples(executable, make_parity_samples(executable.contract)))
+        runner = load_policy(replace(request, dual_rate=False), now_s=lambda: 0.0).runner
+        chunks.append(chunks_of_samples(runner, make_parity_samples(runner.contract)))
     return parity_failure(chunks[0], chunks[1])

@@ -23,14 +23,14 @@ from mavbridge.config.policy import PolicyConfig
 from mavbridge.core.clock import NS_PER_S, Clock, MonotonicClock
 from mavbridge.core.errors import PeerError, UserError
 from mavbridge.core.files import require_writable
-from mavbridge.flight.app import fly_executable
+from mavbridge.flight.app import fly_policy
 from mavbridge.flight.checks import check_flight
 from mavbridge.flight.plan import plan_flight
 from mavbridge.flight.policies import configured_contract
 from mavbridge.observe.output import flight_console
 from policy.contract import Contract
-from policy.engines.executable import ExecutionSettings, make_numpy_executable
-from policy.protocol import Executable
+from policy.engines.runner import ExecutionSettings, make_numpy_runner
+from policy.protocol import PolicyRunner
 from policy.scripted import ScriptedPolicy
 from policy.scripted.programs import Axis, DoubletStep, doublet_length_s, doublet_steps
 
@@ -238,10 +238,10 @@ def identify(config: IdentifyConfig) -> int:
     flight = doublet_flight(config, trained)
     require_writable(config.json, "--json")
     check_flight(flight)
-    policy, executable = doublet_policy(trained, clock, is_in_air=flight.takeoff is not None)
+    policy, runner = doublet_policy(trained, clock, is_in_air=flight.takeoff is not None)
     recording = ResponseRecording()
-    plan = plan_flight(flight, executable.contract, is_dual=executable.dual_rate)
-    fly_executable(plan, executable, clock=clock, console=flight_console(), sinks=(recording,))
+    plan = plan_flight(flight, runner.contract, is_dual=runner.dual_rate)
+    fly_policy(plan, runner, clock=clock, console=flight_console(), sinks=(recording,))
     if policy.program_start_s is None:
         raise PeerError("the flight ended before the doublet began: there is nothing to measure")
     found = identify_pushes(recording, contract=trained, program_start_s=policy.program_start_s)
@@ -273,7 +273,7 @@ def doublet_flight(config: IdentifyConfig, trained: Contract) -> FlyConfig:
 
 def doublet_policy(
     trained: Contract, clock: Clock, *, is_in_air: bool
-) -> tuple[ScriptedPolicy, Executable]:
+) -> tuple[ScriptedPolicy, PolicyRunner]:
     """Return the doublet in the policy's kind of action, with what that policy means by it."""
     names = (
         *("hover_thrust", "full_lean_deg", "full_yaw_rate_degps", "full_climb_mps"),
@@ -286,6 +286,6 @@ def doublet_policy(
         starts_in_air=is_in_air,
         contract=Contract(**{name: getattr(trained, name) for name in names}),
     )
-    executable = make_numpy_executable(policy, ExecutionSettings(name="scripted:doublet"))
+    runner = make_numpy_runner(policy, ExecutionSettings(name="scripted:doublet"))
     policy.reset()  # of what the trial on a dummy sample left behind
-    return policy, replace(executable, reset=policy.reset)
+    return policy, replace(runner, reset=policy.reset)

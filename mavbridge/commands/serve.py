@@ -39,7 +39,7 @@ from policy.adapters.websocket.observation import RESET_KEY, from_message
 from policy.adapters.websocket.remote_policy import ACTIONS_KEY
 from policy.contract import Contract
 from policy.errors import PolicyError
-from policy.protocol import Executable, keep_nothing
+from policy.protocol import PolicyRunner, keep_nothing
 
 MAX_CLIENTS = 4
 WAIT_S = 0.1
@@ -68,12 +68,12 @@ class Job:
 class AnswerLoop:
     """Answers one request after the other; only its own thread calls the policy."""
 
-    def __init__(self, executable: Executable, *, clock: Clock) -> None:
-        """``executable`` is single-rate."""
-        self._executable = executable
-        self._interface = Interface(contract=executable.contract)
+    def __init__(self, runner: PolicyRunner, *, clock: Clock) -> None:
+        """``runner`` is single-rate."""
+        self._runner = runner
+        self._interface = Interface(contract=runner.contract)
         self._clock = clock
-        self.max_clients = MAX_CLIENTS if executable.reset is keep_nothing else 1
+        self.max_clients = MAX_CLIENTS if runner.reset is keep_nothing else 1
         """One alone where the policy remembers: two flights would share what it keeps."""
         self._jobs: queue.Queue[Job] = queue.Queue(self.max_clients)
 
@@ -82,8 +82,8 @@ class AnswerLoop:
         """The first message to every client."""
         return pack(
             {
-                CONTRACT_KEY: self._executable.contract.to_json(),
-                "policy": self._executable.name,
+                CONTRACT_KEY: self._runner.contract.to_json(),
+                "policy": self._runner.name,
             }
         )
 
@@ -110,8 +110,8 @@ class AnswerLoop:
             message = unpack(request)
             image, state, history = from_message(self._interface, message)
             if message.get(RESET_KEY):
-                self._executable.reset()
-            chunk = self._executable.act(image, state, history)
+                self._runner.reset()
+            chunk = self._runner.act(image, state, history)
         except PolicyError as error:
             return str(error)
         took_ms = (self._clock.now_ns() - begun_ns) / NS_PER_MS
@@ -240,10 +240,10 @@ def serve(config: ServeConfig) -> int:
         loaded = stack.enter_context(load_configured_policy(policy_config, clock))
         for note in loaded.notes:
             console.print(Text(note, style="yellow"))
-        answers = AnswerLoop(loaded.executable, clock=clock)
+        answers = AnswerLoop(loaded.runner, clock=clock)
         server = PolicyServer(
             answers,
-            image_bytes=_image_bytes(loaded.executable.contract),
+            image_bytes=_image_bytes(loaded.runner.contract),
             api_key=os.environ.get(API_KEY_VARIABLE) or None,
             report=lambda line: console.print(Text(line)),
         )

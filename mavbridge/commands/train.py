@@ -84,7 +84,7 @@ def share_of_gates(checkpoint: Path, settings: TrainSettings) -> float:
     with load_configured_policy(wanted, MonotonicClock()) as loaded:
         for index in range(settings.check_flights):
             flight = SimulatedFlight(course_seed=first + index, seed=index)
-            result = flight.fly(loaded.executable)
+            result = flight.fly(loaded.runner)
             passed, total = passed + result.gates_passed, total + result.gates_total
     return passed / total
 

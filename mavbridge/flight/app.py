@@ -51,7 +51,7 @@ from mavbridge.observe.output import flight_console
 from mavbridge.recording.tlog import TlogPipe, open_tlog_pipe
 from policy.contract import Contract
 from policy.preprocess import least_source_px
-from policy.protocol import Executable
+from policy.protocol import PolicyRunner
 
 _log = logging.getLogger(__name__)
 JOIN_S = 2.0
@@ -97,9 +97,9 @@ def fly(config: FlyConfig) -> int:
         )
         policy_life.enter_context(loaded)
         unsigned = signing_note(config.link)
-        executable = loaded.executable
-        plan = plan_flight(config, executable.contract, is_dual=executable.dual_rate)
-        speed = require_speed(plan, executable.name, loaded.times)
+        runner = loaded.runner
+        plan = plan_flight(config, runner.contract, is_dual=runner.dual_rate)
+        speed = require_speed(plan, runner.name, loaded.times)
         notes = (*loaded.notes, *speed, *([unsigned] if unsigned else []))
         for note in notes:
             logging.getLogger(SAID).info("%s", note)
@@ -107,7 +107,7 @@ def fly(config: FlyConfig) -> int:
         if (times := loaded.times) is not None:
             act_ms, encode_ms = times.act_s * 1e3, times.encode_s * 1e3
             _log.debug("a chunk takes %.2f ms here, an image %.2f ms", act_ms, encode_ms)
-        return fly_executable(plan, executable, clock=clock, console=console, guard=guard)
+        return fly_policy(plan, runner, clock=clock, console=console, guard=guard)
 
 
 def start_guard(config: FlyConfig, clock: Clock, stack: ExitStack) -> StartedGuard:
@@ -131,9 +131,9 @@ def start_guard(config: FlyConfig, clock: Clock, stack: ExitStack) -> StartedGua
     return StartedGuard(process, tlog_pipe)
 
 
-def fly_executable(
+def fly_policy(
     plan: FlightPlan,
-    executable: Executable,
+    runner: PolicyRunner,
     *,
     clock: Clock,
     console: Console,
@@ -152,7 +152,7 @@ def fly_executable(
         with ExitStack() as stack:
             guard = guard or start_guard(plan.config, clock, stack)
             prepare_to_die_first()
-            flight = _Flight(plan, clock, console, executable, guard, sinks, stack)
+            flight = _Flight(plan, clock, console, runner, guard, sinks, stack)
             # Only now: until a stick can have been taken, a signal may simply end the process.
             stop = stack.enter_context(stop_on_signals())
             guard.process.send(plan.guard)
@@ -176,7 +176,7 @@ class _Flight:
         plan: FlightPlan,
         clock: Clock,
         console: Console,
-        executable: Executable,
+        runner: PolicyRunner,
         guard: StartedGuard,
         sinks: tuple[TickSink, ...],
         stack: ExitStack,
@@ -196,9 +196,9 @@ class _Flight:
         feature_ns = plan.start_limits.feature_ns
         self._encoder_hang_ns = max(LEAST_HANG_NS, HANG_PERIODS * feature_ns)
         self._looked_ns = self._resumed_ns = clock.now_ns()
-        self._observers = FlightObservers(plan, executable, clock=clock, console=console)
+        self._observers = FlightObservers(plan, runner, clock=clock, console=console)
         stack.callback(self._close_recorder)  # after the guard: it records the release
-        contract = executable.contract
+        contract = runner.contract
         self._cameras = contract.cameras
         past_ns = observation_ages_ns(contract)[0]
         cameras = [
@@ -215,7 +215,7 @@ class _Flight:
         )
         self._bridge: Bridge = build_bridge(
             plan,
-            executable,
+            runner,
             clock=clock,
             send=self._guard.send,
             cameras=cameras,

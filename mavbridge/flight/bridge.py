@@ -27,7 +27,7 @@ from mavbridge.guard.channel import SocketPort
 from mavbridge.guard.chunks import Chunk
 from mavbridge.guard.wire import NoChunk
 from policy.contract import Contract
-from policy.protocol import Executable
+from policy.protocol import PolicyRunner
 
 SPARSE_NS = 50 * NS_PER_MS
 """States of chunks that are farther apart do not tell the motion since an exposure: it takes those
@@ -58,7 +58,7 @@ class CameraPath:
 
 def build_bridge(
     plan: FlightPlan,
-    executable: Executable,
+    runner: PolicyRunner,
     *,
     clock: Clock,
     send: Callable[[Chunk | NoChunk], object],
@@ -75,7 +75,7 @@ def build_bridge(
 
     Args:
         plan: of the flight; its cameras and address are not used.
-        executable: the policy on its engine.
+        runner: the policy on its engine.
         clock: time of the policy loop; in simulation its solves take simulated time.
         send: hands a chunk to the guard, or the reason why there is none.
         cameras: those of the contract, in its order.
@@ -116,7 +116,7 @@ def build_bridge(
         FanOut([*own, *(all_cameras if number else sinks)]) for number, own in enumerate(adaptive)
     ]
     visions = _vision_loops(
-        executable,
+        runner,
         cameras,
         rates=rates,
         sinks=[delay_vision(sink) for sink in vision_sinks] if delay_vision else vision_sinks,
@@ -130,13 +130,13 @@ def build_bridge(
         observations=ObservationSource(
             contract,
             caches=[path.cache for path in cameras],
-            join=executable.join,
+            join=runner.join,
             max_feature_age_ns=limits.feature_ns,
             states_span_ns=span_ns,
         ),
         history=history,
-        act=executable.act,
-        reset=executable.reset,
+        act=runner.act,
+        reset=runner.reset,
         send=send,
         settings=settings,
         watch=watch_solve,
@@ -145,7 +145,7 @@ def build_bridge(
 
 
 def _vision_loops(
-    executable: Executable,
+    runner: PolicyRunner,
     cameras: Sequence[CameraPath],
     *,
     rates: Sequence[AdaptiveRate],
@@ -158,7 +158,7 @@ def _vision_loops(
     return tuple(
         VisionLoop(
             camera=path.camera,
-            encode=_encoder(executable, number),
+            encode=_encoder(runner, number),
             cache=path.cache,
             sink=sink,
             clock=path.clock,
@@ -186,8 +186,8 @@ def _visual_rates(contract: Contract, loops: LoopRates) -> list[AdaptiveRate]:
     ]
 
 
-def _encoder(executable: Executable, camera: int) -> Callable[[CameraImage], FloatArray]:
-    return executable.encode if camera == 0 else lambda rgb: executable.encode(rgb, camera)
+def _encoder(runner: PolicyRunner, camera: int) -> Callable[[CameraImage], FloatArray]:
+    return runner.encode if camera == 0 else lambda rgb: runner.encode(rgb, camera)
 
 
 def _image_watch(config: CameraConfig) -> ImageWatch:

@@ -15,7 +15,7 @@ from mavbridge.flight.state import Unavailable
 from policy.contract import Contract
 
 Join: TypeAlias = Callable[[Sequence[Sequence[FloatArray]]], FloatArray]
-"""``Executable.join``."""
+"""``PolicyRunner.join``."""
 
 MAX_STATES = 4096
 """Most past states that are kept: ten seconds of the fastest attitude stream."""
@@ -25,7 +25,7 @@ class Observation(NamedTuple):
     """Inputs of one chunk, and the moments that they come from."""
 
     encoded: FloatArray
-    """What ``Executable.act`` takes."""
+    """What ``PolicyRunner.act`` takes."""
     states: FloatArray
     """[1, *contract.state_shape]."""
     state: VehicleState
@@ -60,7 +60,7 @@ class ObservationSource:
         Args:
             contract: says how many observations there are, and of what.
             caches: one for each camera of the contract, in its order.
-            join: of the executable.
+            join: of the runner.
             max_feature_age_ns: oldest image to act on.
             states_span_ns: time before the newest attitude for which states are kept.
         """

@@ -36,7 +36,7 @@ from mavbridge.observe.timing import FlightTiming, Mode, ObserverDrops, report_j
 from mavbridge.observe.viewer.flight import RerunView
 from mavbridge.observe.viewer.layout import ViewedFlight
 from mavbridge.recording.tlog import TlogPipe
-from policy.protocol import Executable
+from policy.protocol import PolicyRunner
 
 if TYPE_CHECKING:  # the extra "record" may not be installed
     from mavbridge.recording.meta import FlightMeta
@@ -55,11 +55,11 @@ class FlightObservers:
     """The observers that the flags ask for. None of them can delay a loop."""
 
     def __init__(
-        self, plan: FlightPlan, executable: Executable, *, clock: Clock, console: Console
+        self, plan: FlightPlan, runner: PolicyRunner, *, clock: Clock, console: Console
     ) -> None:
         config = self._config = plan.config
         self._plan = plan
-        self._executable = executable
+        self._runner = runner
         self._clock = clock
         self._mode: Mode = "dual" if plan.is_dual else "single"
         action_hz, vision_hz = plan.loops.action_hz, plan.loops.max_vision_hz
@@ -149,12 +149,12 @@ class FlightObservers:
             start_ns=start_ns,
             mavbridge_version=mavbridge.__version__,
             source="flight",
-            policy=self._executable.name,
-            engine=self._executable.engine,
+            policy=self._runner.name,
+            engine=self._runner.engine,
             mode=self._mode,
             action_hz=self._plan.loops.action_hz,
             visual_hz=self._plan.loops.max_vision_hz,
-            contract=self._executable.contract,
+            contract=self._runner.contract,
             seed=self._config.policy.seed,
             plan=self._plan.figures(),
             command=command_line(),
@@ -198,7 +198,7 @@ class FlightObservers:
             self.screen.show_message(f"--record {folder}: {error.strerror}")
 
     def _camera_sources(self) -> dict[str, str]:
-        names = self._executable.contract.cameras
+        names = self._runner.contract.cameras
         sources = map(without_secrets, self._config.camera.sources_of(names))
         return dict(zip(names, sources, strict=True))
 
@@ -230,8 +230,8 @@ class FlightObservers:
         viewer, recorder = self._viewer, self._recorder
         report = self._timing.report(
             mode=self._mode,
-            engine=self._executable.engine,
-            policy=self._executable.name,
+            engine=self._runner.engine,
+            policy=self._runner.name,
             autopilot=autopilot,
             link=summary.link if summary else None,
             observer_drops=ObserverDrops(

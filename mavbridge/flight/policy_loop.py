@@ -19,7 +19,7 @@ from mavbridge.guard.wire import NoChunk
 from policy.errors import NoChunkError
 
 Act: TypeAlias = Callable[[FloatArray, FloatArray, FloatArray], FloatArray]
-"""``Executable.act``."""
+"""``PolicyRunner.act``."""
 
 WAIT_NS = 100 * NS_PER_MS
 """Longest wait for an attitude before the stop flag is checked, and the guard told why it waits."""

@@ -38,7 +38,7 @@ from mavbridge.simulation.world import (
     needed_params,
 )
 from policy.contract import Contract, FloatArray
-from policy.protocol import Executable
+from policy.protocol import PolicyRunner
 from sitl.camera.fpv import FpvRenderer
 from sitl.course import make_course
 from sitl.rotation import Quat
@@ -73,7 +73,7 @@ class SimulatedFlight:
 
     The same arguments give the same stick bytes. Watchers are added before ``fly``. A scripted
     policy follows ``clock``; ``vehicle.ap.truth`` is the true state at any moment, also from within
-    an executable's ``act``.
+    a runner's ``act``.
     """
 
     def __init__(
@@ -131,7 +131,7 @@ class SimulatedFlight:
 
     def fly(
         self,
-        executable: Executable,
+        runner: PolicyRunner,
         *,
         max_time_s: float = MAX_TIME_S,
         sinks: tuple[TickSink, ...] = (),
@@ -139,7 +139,7 @@ class SimulatedFlight:
     ) -> EpisodeResult:
         """Arm, fly, and give the sticks back; ends with the last gate, a crash, or the time.
 
-        The executable must not remember earlier flights; ``max_time_s`` counts from its first
+        The runner must not remember earlier flights; ``max_time_s`` counts from its first
         action. ``should_stop`` is called after each step of the vehicle.
 
         Raises:
@@ -154,7 +154,7 @@ class SimulatedFlight:
         cv2.setNumThreads(1)  # the same images on any machine, and no pool to wake for them
         referee = Referee(self.clock, self.vehicle, max_time_s=max_time_s, should_stop=should_stop)
         self.watch_steps(referee.watch)
-        guard = self._compose(executable, (referee, *sinks))
+        guard = self._compose(runner, (referee, *sinks))
         while not referee.stop.is_set():
             self.clock.sleep_until_ns(self.clock.now_ns() + STEP_NS)
         guard.stop(EndRequest(reason=because(Code.DURATION)))
@@ -163,7 +163,7 @@ class SimulatedFlight:
             self.clock.sleep_until_ns(self.clock.now_ns() + STEP_NS)
         return referee.result(course_seed=self._course_seed, seed=self._seed)
 
-    def _compose(self, executable: Executable, sinks: tuple[TickSink, ...]) -> GuardLoop:
+    def _compose(self, runner: PolicyRunner, sinks: tuple[TickSink, ...]) -> GuardLoop:
         """Build the bridge on the stepped clock; its parts run as events from now on."""
         world, hop = self.clock, self._settings.delays.hop
         config = FlyConfig(
@@ -173,7 +173,7 @@ class SimulatedFlight:
             goal=self._settings.goal,
             arm=True,
         )
-        plan = plan_flight(config, executable.contract, is_dual=executable.dual_rate)
+        plan = plan_flight(config, runner.contract, is_dual=runner.dual_rate)
         loops = plan.loops
         stalled_ns = self._stalls.end_ns
         to_guard = DelayedChannel(world, hop.samples_ns(self._random(7)), stalled_ns)
@@ -190,7 +190,7 @@ class SimulatedFlight:
             ),
         )
         guard = GuardLoop(world, link, MemoryPort(outgoing=to_flight, incoming=to_guard))
-        contract, policy_clock = executable.contract, AheadClock(world)
+        contract, policy_clock = runner.contract, AheadClock(world)
         for name, value in needed_params(contract, self._vehicle_config.autopilot).items():
             self.vehicle.params.set(name, value)
         vision_clocks = [AheadClock(world) for _ in contract.cameras]
@@ -200,7 +200,7 @@ class SimulatedFlight:
         past_ns = observation_ages_ns(contract)[0]
         bridge = build_bridge(
             plan,
-            self._take_time(executable, vision_clocks, policy_clock),
+            self._take_time(runner, vision_clocks, policy_clock),
             clock=policy_clock,
             send=send,
             cameras=[
@@ -260,9 +260,9 @@ class SimulatedFlight:
         )
 
     def _take_time(
-        self, executable: Executable, vision_clocks: Sequence[AheadClock], policy_clock: AheadClock
-    ) -> Executable:
-        """The same executable, whose calls take simulated time.
+        self, runner: PolicyRunner, vision_clocks: Sequence[AheadClock], policy_clock: AheadClock
+    ) -> PolicyRunner:
+        """The same runner, whose calls take simulated time.
 
         Without a fast path the whole network runs for every action, which then takes both times,
         the one for the image once for each camera.
@@ -272,15 +272,15 @@ class SimulatedFlight:
             vision.samples_ns(self._random(10 * number + 4)) for number in range(len(vision_clocks))
         ]
         action_ns = self._settings.delays.action.samples_ns(self._random(5))
-        is_dual = executable.dual_rate
+        is_dual = runner.dual_rate
 
         def encode(rgb: CameraImage, camera: int = 0, /) -> FloatArray:
             vision_clocks[camera].ahead_ns += next(vision_ns[camera]) if is_dual else 0
-            return executable.encode(rgb, camera)
+            return runner.encode(rgb, camera)
 
         def act(encoded: FloatArray, state: FloatArray, history: FloatArray) -> FloatArray:
             policy_clock.ahead_ns += next(action_ns)
             policy_clock.ahead_ns += 0 if is_dual else sum(next(each_ns) for each_ns in vision_ns)
-            return executable.act(encoded, state, history)
+            return runner.act(encoded, state, history)
 
-        return replace(executable, encode=encode, act=act)
+        return replace(runner, encode=encode, act=act)

@@ -1,4 +1,4 @@
-"""Engines that execute a policy; each makes a ``protocol.Executable``."""
+"""Engines that execute a policy; each makes a ``protocol.PolicyRunner``."""
 
 import sys
 

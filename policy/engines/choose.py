@@ -13,28 +13,28 @@ import numpy as np
 import torch
 
 from policy.contract import FloatArray
-from policy.engines.executable import EngineName, ExecutionSettings, encode_all
 from policy.engines.kept import changes, modules_of, snapshot
 from policy.engines.parity import ParitySamples, make_parity_samples, parity_failure
-from policy.engines.torch_eager import make_torch_executable
+from policy.engines.runner import EngineName, ExecutionSettings, encode_all
+from policy.engines.torch_eager import make_torch_runner
 from policy.errors import Agreed, PolicyError, warned
 from policy.nets.resnet_unet import ResnetUnet
 from policy.nets.toge import Toge
-from policy.protocol import Executable, SingleRatePolicy
+from policy.protocol import PolicyRunner, SingleRatePolicy
 
-Candidate = tuple[str, Callable[[], Executable]]
+Candidate = tuple[str, Callable[[], PolicyRunner]]
 """The name of an engine to try, and what makes it."""
 
 
-def choose_executable(
+def choose_runner(
     policy: SingleRatePolicy, engine: EngineName, settings: ExecutionSettings
-) -> tuple[Executable, tuple[str, ...]]:
-    """The executable and lines for a person: the engine, and why faster ones were passed over."""
+) -> tuple[PolicyRunner, tuple[str, ...]]:
+    """The runner and lines for a person: the engine, and why faster ones were passed over."""
     modules = modules_of(policy)
     for module in modules:
         module.eval()  # before any engine looks: a flight trains nothing
     if engine == "torch" or (engine == "auto" and not modules):
-        return make_torch_executable(policy, settings), ()
+        return make_torch_runner(policy, settings), ()
     if not modules:
         raise PolicyError(
             f"network.engine={engine} takes a torch.nn.Module, or a class that holds one as an "
@@ -42,54 +42,54 @@ def choose_executable(
         )
     if engine == "auto" and not isinstance(policy, Toge | ResnetUnet):
         if settings.vision_device != "cpu" or settings.action_device != "cpu":
-            return make_torch_executable(policy, settings), ()
+            return make_torch_runner(policy, settings), ()
         if hasattr(policy, "reset"):
             note = (
                 "engine torch: the policy has reset, so it keeps something from call to call, "
                 "which a graph cannot; without reset it is converted to the faster openvino"
             )
-            return make_torch_executable(policy, settings), (note,)
+            return make_torch_runner(policy, settings), (note,)
     candidates = _candidates(policy, engine, settings)
     return first_that_agrees(policy, candidates, settings)
 
 
 def first_that_agrees(
     policy: SingleRatePolicy, candidates: list[Candidate], settings: ExecutionSettings
-) -> tuple[Executable, tuple[str, ...]]:
+) -> tuple[PolicyRunner, tuple[str, ...]]:
     """The first candidate that passes the check, or torch, with a line for each one passed over."""
     notes: list[str] = []
     if candidates:
         on_cpu = replace(settings, vision_device="cpu", action_device="cpu")
         samples = make_parity_samples(policy.contract)
-        reference = make_torch_executable(policy, on_cpu)
+        reference = make_torch_runner(policy, on_cpu)
         before = snapshot(policy)
         expected = chunks_of_samples(reference, samples)
         if (reason := _impurity(policy, before, reference, samples, expected)) is not None:
-            return make_torch_executable(policy, settings), (f"engine torch: {reason}",)
+            return make_torch_runner(policy, settings), (f"engine torch: {reason}",)
     for label, make in candidates:
         try:
-            executable = make()
-            reason = parity_failure(expected, chunks_of_samples(executable, samples))
+            runner = make()
+            reason = parity_failure(expected, chunks_of_samples(runner, samples))
         except (PolicyError, RuntimeError, TypeError) as error:
             reason = f"{type(error).__name__}: {str(error).strip().splitlines()[0]}"
         if reason is None:
-            return executable, (*notes, Agreed(f"engine {executable.engine}: agrees with torch"))
+            return runner, (*notes, Agreed(f"engine {runner.engine}: agrees with torch"))
         notes.append(warned(f"engine {label} is passed over: {reason}"))
-    return make_torch_executable(policy, settings), tuple(notes)
+    return make_torch_runner(policy, settings), tuple(notes)
 
 
-def chunks_of_samples(executable: Executable, samples: ParitySamples) -> FloatArray:
+def chunks_of_samples(runner: PolicyRunner, samples: ParitySamples) -> FloatArray:
     """Chunks [samples, horizon, 4] from image to stick."""
     inputs = zip(samples.rgb, samples.state, samples.history, strict=True)
     return np.concatenate(
-        [executable.act(encode_all(executable, rgb), s[None], h[None]) for rgb, s, h in inputs]
+        [runner.act(encode_all(runner, rgb), s[None], h[None]) for rgb, s, h in inputs]
     )
 
 
 def _impurity(
     policy: SingleRatePolicy,
     before: dict[str, object],
-    reference: Executable,
+    reference: PolicyRunner,
     samples: ParitySamples,
     expected: FloatArray,
 ) -> str | None:
@@ -120,7 +120,7 @@ def _candidates(
         )
     if devices == {"cpu"} and find_spec("openvino") is not None:
         from policy.engines.openvino_compile import precisions
-        from policy.engines.openvino_cpu import make_openvino_executable
+        from policy.engines.openvino_cpu import make_openvino_runner
         from policy.engines.openvino_modules import ModuleConverter
 
         is_ours = isinstance(policy, Toge | ResnetUnet)
@@ -128,14 +128,14 @@ def _candidates(
         return [
             (
                 f"openvino (images {vision}, actions {action})",
-                partial(make_openvino_executable, policy, settings, vision, action, converter),
+                partial(make_openvino_runner, policy, settings, vision, action, converter),
             )
             for vision, action in precisions()
         ]
     if engine == "openvino":
         raise PolicyError("network.engine=openvino: the package is missing; pip install openvino")
     if devices == {"cuda"} and torch.cuda.is_available():
-        from policy.engines.cuda_graph import make_cuda_graph_executable
+        from policy.engines.cuda_graph import make_cuda_graph_runner
 
-        return [("cuda-graph", partial(make_cuda_graph_executable, policy, settings))]
+        return [("cuda-graph", partial(make_cuda_graph_runner, policy, settings))]
     return []

@@ -18,9 +18,9 @@ import torch
 from torch import Tensor, nn
 
 from policy.contract import FloatArray
-from policy.engines.executable import ExecutionSettings, Shape, make_executable
+from policy.engines.runner import ExecutionSettings, Shape, make_runner
 from policy.errors import PolicyError
-from policy.protocol import Executable, SingleRatePolicy
+from policy.protocol import PolicyRunner, SingleRatePolicy
 
 NAME = "cuda-graph"
 WARM_UP_CALLS = 3
@@ -28,7 +28,7 @@ WARM_UP_CALLS = 3
 HIGH_PRIORITY, NORMAL_PRIORITY = -1, 0
 
 
-def make_cuda_graph_executable(policy: SingleRatePolicy, settings: ExecutionSettings) -> Executable:
+def make_cuda_graph_runner(policy: SingleRatePolicy, settings: ExecutionSettings) -> PolicyRunner:
     """Capture a copy of the policy for the loops; tried once.
 
     Raises:
@@ -44,7 +44,7 @@ def make_cuda_graph_executable(policy: SingleRatePolicy, settings: ExecutionSett
     vision = action
     if vision_device != action_device:
         vision = copy.deepcopy(action).to(vision_device)
-    return make_executable(
+    return make_runner(
         vision,
         action,
         partial(_Graph, stream=_stream(vision_device, NORMAL_PRIORITY)),

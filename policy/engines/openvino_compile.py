@@ -17,7 +17,7 @@ import openvino as ov
 import torch
 
 from policy.contract import FloatArray
-from policy.engines.executable import Precision
+from policy.engines.runner import Precision
 from policy.engines.signal_stack import signal_stack_kept
 from policy.errors import PolicyError
 from policy.files import whole_file

@@ -5,33 +5,33 @@ from collections.abc import Callable
 
 from torch import nn
 
-from policy.engines.executable import (
+from policy.engines.openvino_compile import GraphCompiler, engine_name
+from policy.engines.openvino_graph import denoise_graph, step_inputs, vision_graph
+from policy.engines.openvino_modules import ModuleConverter, make_module_runner
+from policy.engines.runner import (
     ExecutionSettings,
     Precision,
     assemble,
 )
-from policy.engines.openvino_compile import GraphCompiler, engine_name
-from policy.engines.openvino_graph import denoise_graph, step_inputs, vision_graph
-from policy.engines.openvino_modules import ModuleConverter, make_module_executable
 from policy.engines.signal_stack import signal_stack_kept
 from policy.engines.stepwise import Segment, sample_in_segments, to_numpy
 from policy.nets.resnet_unet import ResnetUnet
 from policy.nets.toge import Toge
 from policy.preprocess import egocentric
-from policy.protocol import Executable, SingleRatePolicy
+from policy.protocol import PolicyRunner, SingleRatePolicy
 
 MAX_UNROLLED = 10
 """Denoising steps in one graph: each takes a third of a second to convert, the first time."""
 
 
 @signal_stack_kept()
-def make_openvino_executable(
+def make_openvino_runner(
     policy: SingleRatePolicy,
     settings: ExecutionSettings,
     vision: Precision,
     action: Precision,
     converter: ModuleConverter | None = None,
-) -> Executable:
+) -> PolicyRunner:
     """Compile a policy for the loops, or take it from the user's cache; tried once.
 
     The initial noise of the policy is taken as it is now; ``vision`` and ``action`` are the
@@ -46,12 +46,12 @@ def make_openvino_executable(
     if isinstance(policy, Toge | ResnetUnet):
         return _make_builtin(policy, settings, vision, action)
     converter = converter or ModuleConverter(policy, settings.name)
-    return make_module_executable(policy, settings, vision, action, converter)
+    return make_module_runner(policy, settings, vision, action, converter)
 
 
 def _make_builtin(
     policy: Toge | ResnetUnet, settings: ExecutionSettings, vision: Precision, action: Precision
-) -> Executable:
+) -> PolicyRunner:
     name, steps = engine_name(vision, action), settings.num_diffusion_steps
     compiler = GraphCompiler(f"{policy.config} {digest_of_weights(policy)}")
     encode = compiler.compile("vision", vision, lambda: vision_graph(policy))

@@ -20,8 +20,8 @@ import torch.nn.functional as F
 from torch import Tensor, nn
 
 from policy.contract import ACTION_DIM, FloatArray
-from policy.engines.executable import Precision, Shape
 from policy.engines.openvino_compile import DEVICE
+from policy.engines.runner import Precision, Shape
 from policy.engines.signal_stack import signal_stack_kept
 from policy.errors import user_code
 from policy.nets.action_head import DiffusionHead, size_dims

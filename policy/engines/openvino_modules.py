@@ -16,22 +16,22 @@ import torch
 from torch import Tensor, nn
 from torch.export import ExportedProgram
 
-from policy.engines.executable import (
+from policy.engines.kept import modules_of
+from policy.engines.openvino_compile import GraphCompiler, engine_name
+from policy.engines.openvino_graph import Traceable, quiet
+from policy.engines.runner import (
     ArrayFunction,
     Compile,
     ExecutionSettings,
     Precision,
     Shape,
-    make_executable,
+    make_runner,
 )
-from policy.engines.kept import modules_of
-from policy.engines.openvino_compile import GraphCompiler, engine_name
-from policy.engines.openvino_graph import Traceable, quiet
 from policy.engines.signal_stack import signal_stack_kept
-from policy.engines.stepwise import make_stepwise_executable
+from policy.engines.stepwise import make_stepwise_runner
 from policy.engines.torch_eager import run_eagerly
 from policy.errors import PolicyError, user_code
-from policy.protocol import Executable, SingleRatePolicy, StepwisePolicy
+from policy.protocol import PolicyRunner, SingleRatePolicy, StepwisePolicy
 
 _MANGLED = re.compile(r"___torch_mangle_\d+\.")
 """In the name of a type: how many others of that name the process has loaded."""
@@ -45,13 +45,13 @@ each use while it is converted. One step of the largest usual diffusion policy i
 
 
 @signal_stack_kept()
-def make_module_executable(
+def make_module_runner(
     policy: SingleRatePolicy,
     settings: ExecutionSettings,
     vision: Precision,
     action: Precision,
     converter: "ModuleConverter",
-) -> Executable:
+) -> PolicyRunner:
     """Compile a policy's methods for the loops; tried once.
 
     Raises:
@@ -67,8 +67,8 @@ def make_module_executable(
     compilers = compile_as(vision), compile_as(action)
     if isinstance(policy, StepwisePolicy):
         end = run_eagerly(settings.name, "cpu")
-        return make_stepwise_executable(policy, *compilers, end, engine=name, settings=settings)
-    return make_executable(policy, policy, *compilers, engine=name, settings=settings)
+        return make_stepwise_runner(policy, *compilers, end, engine=name, settings=settings)
+    return make_runner(policy, policy, *compilers, engine=name, settings=settings)
 
 
 class ModuleConverter:

@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 
 from policy.contract import ACTION_DIM, Contract, FloatArray
-from policy.engines.executable import (
+from policy.engines.runner import (
     Act,
     ArrayFunction,
     Compile,
@@ -15,7 +15,7 @@ from policy.engines.executable import (
     encoders,
 )
 from policy.errors import user_code
-from policy.protocol import Executable, StepwisePolicy
+from policy.protocol import PolicyRunner, StepwisePolicy
 
 Segment = Callable[[FloatArray, FloatArray, FloatArray, FloatArray], FloatArray]
 """(encoded image, state, history, noisy chunk [1, horizon, 4]) -> less noisy chunk."""
@@ -44,7 +44,7 @@ def to_numpy(array: Any) -> FloatArray:
     return np.array(array.cpu().numpy() if hasattr(array, "cpu") else array, np.float32)
 
 
-def make_stepwise_executable(
+def make_stepwise_runner(
     policy: StepwisePolicy,
     compile_vision: Compile,
     compile_action: Compile,
@@ -52,8 +52,8 @@ def make_stepwise_executable(
     *,
     engine: str,
     settings: ExecutionSettings,
-) -> Executable:
-    """``executable.make_executable``; ``compile_end`` is for ``to_chunk``, the end of a solve."""
+) -> PolicyRunner:
+    """``runner.make_runner``; ``compile_end`` is for ``to_chunk``, the end of a solve."""
     contract = policy.contract
     image = ((1, *contract.image_shape[-3:]),)
     encode = [compile_vision(method, image) for method in encoders(policy)]

@@ -9,20 +9,20 @@ import torch
 from torch import Tensor, nn
 
 from policy.contract import FloatArray
-from policy.engines.executable import (
+from policy.engines.runner import (
     ArrayFunction,
     Compile,
     ExecutionSettings,
     Shape,
-    make_executable,
+    make_runner,
 )
 from policy.errors import PolicyError
-from policy.protocol import Executable, SingleRatePolicy
+from policy.protocol import PolicyRunner, SingleRatePolicy
 
 NAME = "torch"
 
 
-def make_torch_executable(policy: SingleRatePolicy, settings: ExecutionSettings) -> Executable:
+def make_torch_runner(policy: SingleRatePolicy, settings: ExecutionSettings) -> PolicyRunner:
     """Wrap a torch policy for the loops: numpy in and out, no gradients, tried once.
 
     A module is moved to the action device, and copied to the vision device where that is another
@@ -35,7 +35,7 @@ def make_torch_executable(policy: SingleRatePolicy, settings: ExecutionSettings)
         policy.to(settings.action_device).eval()
         if settings.vision_device != settings.action_device:
             vision = copy.deepcopy(policy).to(settings.vision_device)
-    return make_executable(
+    return make_runner(
         vision,
         action,
         run_eagerly(settings.name, settings.vision_device),

@@ -1,4 +1,4 @@
-"""From what a user wrote (``--policy``, ``--checkpoint``) to an executable, or a clear refusal.
+"""From what a user wrote (``--policy``, ``--checkpoint``) to a runner, or a clear refusal.
 
     toge[:SIZE][:BACKBONE]   TOGE, e.g. toge, toge:medium, toge:small:resnet18
     resnet-unet[:SIZE]       ResNet-UNet, single-rate
@@ -30,13 +30,13 @@ from policy.checkpoints.detect import detect
 from policy.checkpoints.header import read_contract
 from policy.contract import Contract
 from policy.engines.devices import require_devices
-from policy.engines.executable import ExecutionSettings, make_numpy_executable
+from policy.engines.runner import ExecutionSettings, make_numpy_runner
 from policy.errors import PolicyError, user_code, warned
 from policy.files import user_path
 from policy.loading.builtin import BUILTIN_KINDS, builtin_checkpoint, load_builtin, parse_builtin
 from policy.loading.request import LoadedPolicy, PolicyRequest, default_contract
 from policy.loading.timing import measure_times
-from policy.protocol import DualRatePolicy, Executable, SingleRatePolicy, keep_nothing
+from policy.protocol import DualRatePolicy, PolicyRunner, SingleRatePolicy, keep_nothing
 from policy.scripted.policy import IN_AIR, ScriptedPolicy, make_scripted
 from policy.stick_loop import by_rates, flown_by_rates
 
@@ -116,22 +116,22 @@ def load_policy(request: PolicyRequest, *, now_s: Callable[[], float]) -> Loaded
     policy, notes = _find(request, now_s)
     reset, close = (_life_method(policy, name, request.spec) for name in ("reset", "close"))
     try:
-        executable, engine_notes = _on_engine(policy, request, notes)
-        if executable.reset is keep_nothing:  # an engine that keeps the state has its own
-            executable = replace(executable, reset=reset)
-        times = measure_times(executable, now_s)
-        executable.reset()  # forget the dummy samples
+        runner, engine_notes = _on_engine(policy, request, notes)
+        if runner.reset is keep_nothing:  # an engine that keeps the state has its own
+            runner = replace(runner, reset=reset)
+        times = measure_times(runner, now_s)
+        runner.reset()  # forget the dummy samples
     except BaseException:
         with suppress(PolicyError):
             close()
         raise
-    executable = replace(executable, close=close)
-    return LoadedPolicy(executable=executable, notes=(*notes, *engine_notes), times=times)
+    runner = replace(runner, close=close)
+    return LoadedPolicy(runner=runner, notes=(*notes, *engine_notes), times=times)
 
 
 def _on_engine(
     policy: SingleRatePolicy, request: PolicyRequest, notes: list[str]
-) -> tuple[Executable, tuple[str, ...]]:
+) -> tuple[PolicyRunner, tuple[str, ...]]:
     """The policy on its engine, tried once; adds to ``notes`` what is not as it was asked for."""
     _require_image_size(policy.contract, request.image_size)
     dual_rate = request.dual_rate and isinstance(policy, DualRatePolicy)
@@ -162,13 +162,13 @@ def _on_engine(
                 f"{request.spec} computes in numpy, which network.engine={request.engine} cannot "
                 "run: leave it out"
             )
-        return make_numpy_executable(policy, settings), ()
-    from policy.engines.choose import choose_executable
+        return make_numpy_runner(policy, settings), ()
+    from policy.engines.choose import choose_runner
 
-    executable, engine_notes = choose_executable(policy, request.engine, settings)
+    runner, engine_notes = choose_runner(policy, request.engine, settings)
     if kind in BUILTIN_KINDS and (request.by_rates or policy.contract.action == "rates"):
-        executable = flown_by_rates(executable)
-    return executable, engine_notes
+        runner = flown_by_rates(runner)
+    return runner, engine_notes
 
 
 def _find(request: PolicyRequest, now_s: Callable[[], float]) -> tuple[SingleRatePolicy, list[str]]:

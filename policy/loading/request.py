@@ -4,10 +4,10 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from policy.contract import Contract
-from policy.engines.executable import EngineName
+from policy.engines.runner import EngineName
 from policy.errors import PolicyError
 from policy.loading.timing import SolveTimes
-from policy.protocol import Executable
+from policy.protocol import PolicyRunner
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -52,7 +52,7 @@ class LoadedPolicy:
     loaded it, once. A policy that fails to close never hides why the flight failed.
     """
 
-    executable: Executable
+    runner: PolicyRunner
     notes: tuple[str, ...]
     times: SolveTimes | None = None
     """Measured on a dummy sample; None where it had no chunk for that."""
@@ -64,7 +64,7 @@ class LoadedPolicy:
     def __exit__(self, _kind: object, failure: BaseException | None, _traceback: object) -> None:
         """Close the policy; raises PolicyError if that fails, unless something failed before."""
         try:
-            self.executable.close()
+            self.runner.close()
         except PolicyError as error:
             if failure is None:
                 raise

@@ -7,10 +7,10 @@ from statistics import median
 import numpy as np
 
 from policy.contract import ACTION_DIM
-from policy.engines.executable import encode_all, level_state
+from policy.engines.runner import encode_all, level_state
 from policy.errors import NoChunkError
 from policy.preprocess import dummy_images
-from policy.protocol import Executable
+from policy.protocol import PolicyRunner
 
 REPETITIONS = 5
 MOST_S = 0.5
@@ -27,12 +27,12 @@ class SolveTimes:
     """One chunk."""
 
 
-def measure_times(executable: Executable, now_s: Callable[[], float]) -> SolveTimes | None:
+def measure_times(runner: PolicyRunner, now_s: Callable[[], float]) -> SolveTimes | None:
     """Time a policy that was tried before; None if it had no chunk for the dummy sample.
 
     By a clock that stands still, as in simulations, it is asked only once.
     """
-    contract = executable.contract
+    contract = runner.contract
     images, state = dummy_images(contract), level_state(contract)
     history = np.zeros((1, contract.history_len, ACTION_DIM), np.float32)
     encode_s: list[float] = []
@@ -40,10 +40,10 @@ def measure_times(executable: Executable, now_s: Callable[[], float]) -> SolveTi
     begun_s = now_s()
     while len(act_s) < REPETITIONS and (not act_s or 0 < now_s() - begun_s < MOST_S):
         before_s = now_s()
-        encoded = encode_all(executable, images)
+        encoded = encode_all(runner, images)
         encoded_s = now_s()
         try:
-            executable.act(encoded, state, history)
+            runner.act(encoded, state, history)
         except NoChunkError:
             return None
         encode_s.append((encoded_s - before_s) / contract.observation_steps)

@@ -35,7 +35,7 @@ from mavbridge.simulation.guard import GuardStepper, MemoryPort, PolicyStepper
 from mavbridge.simulation.network import DelayedChannel
 from mavbridge.simulation.world import NOMINAL_VEHICLE
 from policy.contract import Contract, FloatArray
-from policy.protocol import Executable
+from policy.protocol import PolicyRunner
 from sitl.ardupilot.autopilot import ArduCopter
 from sitl.ardupilot.flight_modes import Mode
 from sitl.course import AirborneStart
@@ -137,13 +137,13 @@ class GuardFlight:
         self.guard = GuardLoop(self.clock, self.link, self.guard_port)
         self.features = FreshFeatures(self.clock)
         self.sink = ListSink()
-        executable = self._executable(contract)
+        runner = self._runner(contract)
         self._horizon = contract.horizon
         self._policy_clock = AheadClock(self.clock)
-        plan = plan_flight(config, executable.contract, is_dual=executable.dual_rate)
+        plan = plan_flight(config, runner.contract, is_dual=runner.dual_rate)
         bridge = build_bridge(
             plan,
-            executable,
+            runner,
             clock=self._policy_clock,
             send=self._send,
             cameras=[CameraPath(camera=NoCamera(), cache=self.features, clock=self.clock)],
@@ -163,8 +163,8 @@ class GuardFlight:
 
     # --- the flight process
 
-    def _executable(self, contract: Contract) -> Executable:
-        return Executable(
+    def _runner(self, contract: Contract) -> PolicyRunner:
+        return PolicyRunner(
             contract=contract,
             name="test",
             engine="numpy",

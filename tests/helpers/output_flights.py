@@ -16,7 +16,7 @@ from mavbridge.core.reasons import Code
 from mavbridge.guard.values import Phase
 from mavbridge.simulation.world import NOMINAL_VEHICLE
 from policy.contract import ActionKind, Contract, FloatArray
-from policy.protocol import Executable
+from policy.protocol import PolicyRunner
 from policy.scripted.policy import ScriptedPolicy
 from policy.scripted.programs import LEG_MPS, LEG_S, Motion, Program, Push, make_program
 from sitl.ardupilot.autopilot import ArduCopter
@@ -127,7 +127,7 @@ class OutputFlight(GuardFlight):
 
     # --- the policy
 
-    def _executable(self, contract: Contract) -> Executable:
+    def _runner(self, contract: Contract) -> PolicyRunner:
         self.scripted = ScriptedPolicy(
             "hover",
             lambda: self.clock.now_ns() / NS_PER_S,
@@ -135,7 +135,7 @@ class OutputFlight(GuardFlight):
             starts_in_air=self._in_air,
         )
         self.scripted._program = self._program
-        act = super()._executable(contract)
+        act = super()._runner(contract)
         return replace(act, contract=self.scripted.contract, reset=self.scripted.reset)
 
     def _act(self, encoded: FloatArray, state: FloatArray, history: FloatArray) -> FloatArray:

@@ -1,4 +1,4 @@
-"""Executables for simulated flights: constant sticks, and a pilot that knows the true state."""
+"""PolicyRunners for simulated flights: constant sticks, and a pilot that knows the true state."""
 
 import math
 from collections.abc import Callable
@@ -8,14 +8,14 @@ import numpy as np
 
 from mavbridge.simulation.flight import SimulatedFlight
 from policy.contract import Contract, FloatArray
-from policy.protocol import Executable
+from policy.protocol import PolicyRunner
 from policy.scripted.controllers import LEAN_PER_MPS, LEAN_PER_WANTED_MPS, THROTTLE_DEADZONE
 
 SPEED_MPS = 3.0
 CONTRACT = Contract(feature_dim=1, arrays="numpy", image_height=32, image_width=32)
 
 
-def steady(sticks: Callable[[], tuple[float, float, float, float]]) -> Executable:
+def steady(sticks: Callable[[], tuple[float, float, float, float]]) -> PolicyRunner:
     """Calls ``sticks`` at every action and holds the result for the chunk."""
 
     def act(encoded: FloatArray, state: FloatArray, history: FloatArray) -> FloatArray:
@@ -23,7 +23,7 @@ def steady(sticks: Callable[[], tuple[float, float, float, float]]) -> Executabl
         chunk[:] = sticks()
         return chunk
 
-    return Executable(
+    return PolicyRunner(
         contract=CONTRACT,
         name="test",
         engine="numpy",
@@ -33,11 +33,11 @@ def steady(sticks: Callable[[], tuple[float, float, float, float]]) -> Executabl
     )
 
 
-def single_rate(executable: Executable) -> Executable:
-    return replace(executable, dual_rate=False)
+def single_rate(runner: PolicyRunner) -> PolicyRunner:
+    return replace(runner, dual_rate=False)
 
 
-def pursuit(flight: SimulatedFlight) -> Executable:
+def pursuit(flight: SimulatedFlight) -> PolicyRunner:
     """Flies through the gates by the true state."""
 
     def sticks() -> tuple[float, float, float, float]:

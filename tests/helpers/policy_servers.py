@@ -16,7 +16,7 @@ from mavbridge.core.workers import Worker
 from policy.adapters.websocket.messages import Message, pack, unpack
 from policy.errors import PolicyError
 from policy.loading.request import LoadedPolicy
-from policy.protocol import Executable
+from policy.protocol import PolicyRunner
 
 Reply = bytes | str | tuple[bytes, ...] | None
 """Several: one after the other; None: close the connection."""
@@ -85,10 +85,10 @@ async def _listening(talk: Callable[[ServerConnection], object], port: int) -> S
 
 @contextmanager
 def our_server(
-    executable: Executable, *, api_key: str | None = None, image_bytes: int = 2**20
+    runner: PolicyRunner, *, api_key: str | None = None, image_bytes: int = 2**20
 ) -> Iterator[int]:
     """``mavbridge serve`` without its command line; gives its port."""
-    answers = AnswerLoop(executable, clock=MonotonicClock())
+    answers = AnswerLoop(runner, clock=MonotonicClock())
     server = PolicyServer(
         answers, image_bytes=image_bytes, api_key=api_key, report=lambda _line: None
     )

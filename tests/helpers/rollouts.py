@@ -29,7 +29,7 @@ from mavbridge.recording.flight_folder import RecordedFlight, open_flight
 from mavbridge.recording.flight_writer import FlightWriter
 from mavbridge.recording.meta import FlightMeta
 from policy.contract import Contract
-from policy.protocol import Executable
+from policy.protocol import PolicyRunner
 from policy.world_model.config import WorldModelConfig
 from policy.world_model.model import WorldModel
 
@@ -65,7 +65,7 @@ class TinyWorld(WorldModel):
         return sum(count for _, count in self.decoded)
 
 
-def noise_executable(contract: Contract | None = None) -> Executable:
+def noise_runner(contract: Contract | None = None) -> PolicyRunner:
     """A policy whose sticks depend on every pixel, the state and the history."""
     contract = contract or Contract(feature_dim=1, arrays="numpy")
 
@@ -79,7 +79,7 @@ def noise_executable(contract: Contract | None = None) -> Executable:
         steps = np.arange(contract.horizon)[:, None] + np.arange(4)
         return 0.8 * np.sin(phase + steps)[None].astype(np.float32)
 
-    return Executable(
+    return PolicyRunner(
         contract=contract, name="noise", engine="numpy", dual_rate=True, encode=encode, act=act
     )
 
@@ -105,7 +105,7 @@ DECIDERS = ("world-model", "world-model from pixels", "toge")
 
 def make_decider(name: str, sampler: Sampler) -> Decider:
     if name == "toge":
-        return PolicyDecider(noise_executable(), sampler)
+        return PolicyDecider(noise_runner(), sampler)
     return WorldModelDecider(sampler, from_pixels="pixels" in name)
 
 

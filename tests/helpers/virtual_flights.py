@@ -23,7 +23,7 @@ from mavbridge.simulation.guard import GuardStepper, MemoryPort, PolicyStepper, 
 from mavbridge.simulation.network import DelayedChannel
 from mavbridge.simulation.world import DelayedFeatureCache, DelayedSink, VisionStepper
 from policy.contract import Contract
-from policy.protocol import Executable
+from policy.protocol import PolicyRunner
 
 MS = NS_PER_MS
 FRAME_NS = NS_PER_S // 30
@@ -120,7 +120,7 @@ class VirtualFlight:
 
     def _compose(self, contract: Contract) -> GuardLoop:
         world = self.world
-        executable = Executable(
+        runner = PolicyRunner(
             contract=contract,
             name="test",
             engine="numpy",
@@ -133,11 +133,11 @@ class VirtualFlight:
         port = MemoryPort(outgoing=to_guard, incoming=to_flight)
         self._send = sender(world, self._policy_clock, port)
         guard = GuardLoop(world, self.link, MemoryPort(outgoing=to_flight, incoming=to_guard))
-        plan = plan_flight(self.config, executable.contract, is_dual=executable.dual_rate)
+        plan = plan_flight(self.config, runner.contract, is_dual=runner.dual_rate)
         self._send(plan.guard)
         bridge = build_bridge(
             plan,
-            executable,
+            runner,
             clock=self._policy_clock,
             send=self._send,
             cameras=[

@@ -17,16 +17,16 @@ from mavbridge.core.errors import MavbridgeError
 from mavbridge.simulation import flight as simulated
 from mavbridge.simulation.flight import SimulatedFlight
 from policy.contract import Contract
-from policy.engines.executable import (
+from policy.engines.runner import (
     ExecutionSettings,
     encode_all,
     level_state,
-    make_numpy_executable,
+    make_numpy_runner,
 )
-from policy.engines.torch_eager import make_torch_executable
+from policy.engines.torch_eager import make_torch_runner
 from policy.loading.load import load_policy
 from policy.loading.request import PolicyRequest
-from policy.protocol import Executable
+from policy.protocol import PolicyRunner
 from sitl.camera.fpv import FpvRenderer
 from sitl.rotation import Quat, Vec3
 
@@ -72,17 +72,17 @@ class HoldsDistance:
         return chunk
 
 
-def height_flown_m(executable: Executable, *sinks: ListSink) -> float:
+def height_flown_m(runner: PolicyRunner, *sinks: ListSink) -> float:
     flight = SimulatedFlight(course_seed=3, seed=0)
-    result = flight.fly(executable, max_time_s=8.0, sinks=sinks)
+    result = flight.fly(runner, max_time_s=8.0, sinks=sinks)
     assert result.outcome == "timed out", result
     return -flight.vehicle.ap.truth.position_ned_m[2]
 
 
 def test_a_policy_in_python_flies_by_metres() -> None:
     policy, sink = HoldsDistance(), ListSink()
-    executable = make_numpy_executable(policy, ExecutionSettings(name="deep", dual_rate=False))
-    height_m = height_flown_m(executable, sink)
+    runner = make_numpy_runner(policy, ExecutionSettings(name="deep", dual_rate=False))
+    height_m = height_flown_m(runner, sink)
     assert {image.shape for image in policy.seen} == {(1, 1, SIDE, SIDE)}
     assert {image.dtype for image in policy.seen} == {np.dtype(np.float32)}
     held_m = policy.seen[-1][..., SIDE // 2 :, :].mean()
@@ -118,11 +118,11 @@ class TwoRates(torch.nn.Module):
 @pytest.mark.parametrize("dual_rate", [True, False])
 def test_a_policy_in_torch_gets_metres_of_all_cameras_and_times(dual_rate: bool) -> None:
     settings = ExecutionSettings(name="deep", dual_rate=dual_rate)
-    executable = make_torch_executable(TwoRates(), settings)
+    runner = make_torch_runner(TwoRates(), settings)
     metres = np.array([[1, 2], [3, 4]], np.uint16)
     images = np.broadcast_to(1000 * metres[..., None, None], (2, 2, 40, 50)).astype(np.uint16)
     state, history = level_state(TwoRates.contract), np.zeros((1, 4, 4), np.float32)
-    chunk = executable.act(encode_all(executable, images), state, history)
+    chunk = runner.act(encode_all(runner, images), state, history)
     assert chunk[0, 0] == pytest.approx([1, 2, 3, 4])
 
 
@@ -157,8 +157,8 @@ def request(folder: Path) -> PolicyRequest:
 def test_a_graph_flies_by_metres(tmp_path: Path) -> None:
     actor(tmp_path / "policy.onnx")
     with load_policy(request(tmp_path), now_s=lambda: 0.0) as loaded:
-        assert loaded.executable.contract.is_depth
-        height_m = height_flown_m(loaded.executable)
+        assert loaded.runner.contract.is_depth
+        height_m = height_flown_m(loaded.runner)
     assert 0.5 < height_m < 4
 
 
@@ -172,8 +172,8 @@ def test_a_simulated_camera_of_colour_is_refused(monkeypatch: pytest.MonkeyPatch
     monkeypatch.setattr(simulated, "FpvRenderer", FpvRenderer)
     settings = ExecutionSettings(name="deep", dual_rate=False)
     with pytest.raises(MavbridgeError, match=r"uint16 .* got uint8"):
-        height_flown_m(make_numpy_executable(HoldsDistance(), settings))
+        height_flown_m(make_numpy_runner(HoldsDistance(), settings))
     monkeypatch.setattr(simulated, "FpvRenderer", GroundDepth)
-    colour = make_numpy_executable(HoldsDistance(replace(DEPTH, image_channels="rgb")), settings)
+    colour = make_numpy_runner(HoldsDistance(replace(DEPTH, image_channels="rgb")), settings)
     with pytest.raises(MavbridgeError, match=r"uint8 .* got uint16"):
         height_flown_m(colour)

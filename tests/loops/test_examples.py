@@ -42,7 +42,7 @@ def fly(loaded: LoadedPolicy) -> list[BodyState]:
     flight = SimulatedFlight(course_seed=3, seed=0)
     sink = TruthAtTicks(flight)
     with loaded:
-        result = flight.fly(loaded.executable, max_time_s=FLIGHT_S, sinks=(sink,))
+        result = flight.fly(loaded.runner, max_time_s=FLIGHT_S, sinks=(sink,))
     assert result.outcome == "timed out"  # it passes no gates, and does not crash
     assert len(sink.states) > 2 * STEADY_TICKS
     return sink.states[-STEADY_TICKS:]
@@ -77,8 +77,8 @@ def test_the_numpy_policy_climbs_and_turns() -> None:
 
 def test_the_torch_policy_climbs_and_looks_for_light() -> None:
     loaded = load(f"{EXAMPLES}/torch_policy.py:TowardsLight")
-    assert loaded.executable.dual_rate
-    assert loaded.executable.engine.startswith("openvino")
+    assert loaded.runner.dual_rate
+    assert loaded.runner.engine.startswith("openvino")
     assert_holds_3_m(fly(loaded))
 
 

@@ -30,7 +30,7 @@ from mavbridge.simulation.replay.guard import (
 )
 from mavbridge.simulation.replay.policy import replay_policy
 from mavbridge.simulation.replay.recording import ReplaySource
-from policy.protocol import Executable
+from policy.protocol import PolicyRunner
 
 
 def stepped_clock(source: ReplaySource) -> SteppedClock:
@@ -38,18 +38,18 @@ def stepped_clock(source: ReplaySource) -> SteppedClock:
 
 
 @pytest.fixture
-def numpy_executable() -> Iterator[Executable]:
+def numpy_runner() -> Iterator[PolicyRunner]:
     """The policy as a flight loads it."""
     source = golden("numpy_px4")
     spec = f"{FLIGHTS / 'numpy_policy.py'}:NumpyPolicy"
     wanted = replace(source.config.policy, policy=spec)
     with load_configured_policy(wanted, stepped_clock(source)) as loaded:
-        yield loaded.executable
+        yield loaded.runner
 
 
-def repeated(source: ReplaySource, executable: Executable) -> PolicyComparison:
+def repeated(source: ReplaySource, runner: PolicyRunner) -> PolicyComparison:
     clock = stepped_clock(source)
-    return compare_policy(replay_policy(source, executable, clock, source.features))
+    return compare_policy(replay_policy(source, runner, clock, source.features))
 
 
 @pytest.mark.parametrize("name", NAMES)
@@ -63,9 +63,9 @@ def test_the_guard_reproduces_phases_traces_and_sent_sticks_bit_for_bit(name: st
 
 
 def test_the_policy_loop_reproduces_every_input_and_chunk_bit_for_bit(
-    numpy_executable: Executable,
+    numpy_runner: PolicyRunner,
 ) -> None:
-    compared = repeated(golden("numpy_px4"), numpy_executable)
+    compared = repeated(golden("numpy_px4"), numpy_runner)
 
     assert compared.missing == {}
     assert compared.inputs_differ == {}
@@ -77,7 +77,7 @@ def test_the_shipped_policy_gets_the_same_inputs_and_decides_the_same_on_any_eng
     source = golden("toge_ardupilot")
     clock = stepped_clock(source)
     with load_configured_policy(source.config.policy, clock) as loaded:
-        pairs = list(replay_policy(source, loaded.executable, clock, source.features))
+        pairs = list(replay_policy(source, loaded.runner, clock, source.features))
     compared = compare_policy(pairs)
 
     assert compared.missing == {}
@@ -96,7 +96,7 @@ def test_a_scripted_policy_differs_by_its_look_at_the_clock_alone() -> None:
     source = golden("scripted_velocity_ardupilot")
     clock = stepped_clock(source)
     with load_configured_policy(source.config.policy, clock, starts_in_air=True) as loaded:
-        compared = compare_policy(replay_policy(source, loaded.executable, clock, source.features))
+        compared = compare_policy(replay_policy(source, loaded.runner, clock, source.features))
 
     assert compared.inputs_differ == {}
     assert compared.deviation.most < CLOCK_TOLERANCE
@@ -132,28 +132,28 @@ def with_solve(source: ReplaySource, change: Callable[[Solve], Solve]) -> Replay
 
 
 def test_one_bit_of_one_history_is_noticed(
-    numpy_executable: Executable,
+    numpy_runner: PolicyRunner,
 ) -> None:
     def change(solve: Solve) -> Solve:
         history = solve.history.copy()
         history[0, -1, 0] = np.nextafter(history[0, -1, 0], np.float32(1))
         return replace(solve, history=history)
 
-    compared = repeated(with_solve(golden("numpy_px4"), change), numpy_executable)
+    compared = repeated(with_solve(golden("numpy_px4"), change), numpy_runner)
 
     assert compared.inputs_differ == {"history": 1}
     assert compared.equal_chunks == compared.solves
 
 
 def test_a_feature_that_was_lost_is_told_and_the_rest_repeated(
-    numpy_executable: Executable,
+    numpy_runner: PolicyRunner,
 ) -> None:
     source = golden("numpy_px4")
     (features,) = source.features
     lost = features[len(features) // 2]
     without = tuple(each for each in features if each is not lost)
 
-    compared = repeated(replace(source, features=(without,)), numpy_executable)
+    compared = repeated(replace(source, features=(without,)), numpy_runner)
 
     reason = because(Code.NOT_RECORDED, what=f"the feature of frame {lost.frame_id}")
     assert compared.missing[str(reason)] > 0

@@ -16,8 +16,8 @@ def test_the_parameters_of_a_vehicle_are_found_in_flight() -> None:
     vehicle = make_vehicle(autopilot="ardupilot", gains=0.5)
     flight = SimulatedFlight(course_seed=3, seed=0, settings=settings, vehicle=vehicle)
     contract, recording = Contract(), ResponseRecording()
-    policy, executable = doublet_policy(contract, flight.clock, is_in_air=False)
-    flight.fly(executable, max_time_s=12.0 + doublet_length_s("sticks"), sinks=(recording,))
+    policy, runner = doublet_policy(contract, flight.clock, is_in_air=False)
+    flight.fly(runner, max_time_s=12.0 + doublet_length_s("sticks"), sinks=(recording,))
     assert policy.program_start_s is not None
     found = identify_pushes(recording, contract=contract, program_start_s=policy.program_start_s)
     assert found.missing == ()

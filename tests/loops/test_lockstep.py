@@ -22,7 +22,7 @@ from mavbridge.simulation.referee import EpisodeInterruptedError, EpisodeResult
 from mavbridge.simulation.world import Exposure, make_vehicle
 from policy.contract import FloatArray
 from policy.errors import PolicyError
-from policy.protocol import Executable
+from policy.protocol import PolicyRunner
 from sitl.vehicle.config import STEP_NS, AutopilotName, VehicleConfig
 
 MS = NS_PER_MS
@@ -84,8 +84,8 @@ def watched() -> Watched:
         watched.features.append(float(e[0, 0]))
         return pilot.act(e, s, h)
 
-    executable = replace(pilot, encode=encode, act=act)
-    one.fly(executable, max_time_s=1.0, sinks=(watched.sink,))
+    runner = replace(pilot, encode=encode, act=act)
+    one.fly(runner, max_time_s=1.0, sinks=(watched.sink,))
     return watched
 
 
@@ -246,8 +246,8 @@ def test_single_rate_takes_the_time_of_the_whole_network_for_every_action() -> N
 def test_the_scripted_policies_fly(program: str) -> None:
     one = flight()
     wanted = PolicyConfig(policy=f"scripted:{program}", dual_rate=True)
-    executable: Executable = load_configured_policy(wanted, one.clock).executable
-    result = one.fly(executable, max_time_s=9.0)
+    runner: PolicyRunner = load_configured_policy(wanted, one.clock).runner
+    result = one.fly(runner, max_time_s=9.0)
     assert result.outcome == "timed out"
     body = one.vehicle.ap.truth
     assert -body.position_ned_m[2] == pytest.approx(3.0, abs=1.0)
@@ -341,13 +341,13 @@ def test_a_scripted_square_flies_in_every_setpoint_that_takes_off(
     if autopilot == "ardupilot":
         one.vehicle.params.set("GUID_OPTIONS", 8)  # thrust, not a climb rate
     wanted = PolicyConfig(policy=f"scripted:square:{action}", dual_rate=True)
-    executable: Executable = load_configured_policy(wanted, one.clock).executable
+    runner: PolicyRunner = load_configured_policy(wanted, one.clock).runner
     sink = ListSink()
-    result = one.fly(executable, max_time_s=15.0, sinks=(sink,))
+    result = one.fly(runner, max_time_s=15.0, sinks=(sink,))
     assert result.outcome == "timed out"
     body = one.vehicle.ap.truth
     assert -body.position_ned_m[2] == pytest.approx(3.0, abs=0.5)
     assert result.distance_m > 8.0
     assert {type(tick.trace.smoothed) for tick in flown(sink) if tick.trace} == {
-        ACTION_CLASSES[executable.contract.action]
+        ACTION_CLASSES[runner.contract.action]
     }

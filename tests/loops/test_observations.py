@@ -16,7 +16,7 @@ from mavbridge.core.reasons import Code
 from mavbridge.simulation.flight import SimulatedFlight, SimulationSettings
 from mavbridge.simulation.world import make_vehicle
 from policy.contract import Contract
-from policy.engines.executable import ExecutionSettings, make_numpy_executable
+from policy.engines.runner import ExecutionSettings, make_numpy_runner
 
 MS = NS_PER_MS
 STEP_NS = 100 * MS
@@ -61,11 +61,11 @@ class Watchful:
 def flown() -> tuple[Watchful, ListSink]:
     one, sink = SimulatedFlight(course_seed=3, seed=0), ListSink()
     policy = Watchful(one.clock)
-    executable = make_numpy_executable(policy, ExecutionSettings(name="watchful"))
+    runner = make_numpy_runner(policy, ExecutionSettings(name="watchful"))
     policy.calls.clear()
     for seen in (*policy.encoded_ns, *policy.brightness):
         seen.clear()  # of the trial
-    result = one.fly(executable, max_time_s=2.0, sinks=(sink,))
+    result = one.fly(runner, max_time_s=2.0, sinks=(sink,))
     assert result.outcome == "timed out"
     assert -one.vehicle.ap.truth.position_ned_m[2] > 1.0
     return policy, sink
@@ -121,8 +121,8 @@ def test_the_slowest_camera_decides_whether_an_image_is_too_old() -> None:
         image_width=32,
     )
     one, sink = SimulatedFlight(course_seed=3, seed=0), ListSink()
-    executable = make_numpy_executable(Watchful(one.clock, contract), ExecutionSettings(name="w"))
-    one.fly(executable, max_time_s=4.0, sinks=(sink,))
+    runner = make_numpy_runner(Watchful(one.clock, contract), ExecutionSettings(name="w"))
+    one.fly(runner, max_time_s=4.0, sinks=(sink,))
     reasons = {tick.release_reason for tick in sink.ticks}
     missing = [figures(reason, Code.OF_CAMERA) for reason in reasons]
     assert {found["camera"] for found in missing if found} == {"down"}
@@ -133,9 +133,9 @@ def test_the_slowest_camera_decides_whether_an_image_is_too_old() -> None:
 def test_the_simulator_says_which_cameras_it_has() -> None:
     one = SimulatedFlight(course_seed=3, seed=0, settings=SimulationSettings(draw_images=False))
     contract = Contract(arrays="numpy", feature_dim=2, cameras=("front", "wrist"))
-    executable = make_numpy_executable(Watchful(one.clock, contract), ExecutionSettings(name="w"))
+    runner = make_numpy_runner(Watchful(one.clock, contract), ExecutionSettings(name="w"))
     with pytest.raises(UserError, match=r"no cameras \['wrist'\].*front, down, left, right, back"):
-        one.fly(executable, max_time_s=1.0)
+        one.fly(runner, max_time_s=1.0)
 
 
 class GoalSeeker(Watchful):
@@ -173,9 +173,9 @@ def test_goal_height_and_altitude_are_those_of_the_vehicle(autopilot: Any, actio
         image_width=32,
     )
     policy = GoalSeeker(one.clock, contract)
-    executable = make_numpy_executable(policy, ExecutionSettings(name="seeker"))
+    runner = make_numpy_runner(policy, ExecutionSettings(name="seeker"))
     policy.calls.clear()
-    one.fly(executable, max_time_s=12.0 if action == "velocity" else 3.0)
+    one.fly(runner, max_time_s=12.0 if action == "velocity" else 3.0)
     place_ned_m = np.array(one.vehicle.ap.truth.position_ned_m)
     if action == "velocity":
         assert place_ned_m == pytest.approx(goal, abs=0.4)
@@ -199,13 +199,13 @@ def test_a_slow_policy_gets_the_states_between_its_solves() -> None:
         max_chunk_age_s=1.0,
     )
     policy = Watchful(one.clock, contract)
-    executable = make_numpy_executable(policy, ExecutionSettings(name="slow"))
+    runner = make_numpy_runner(policy, ExecutionSettings(name="slow"))
     policy.calls.clear()
     north_mps: dict[int, float] = {}
     one.watch_steps(
         lambda: north_mps.update({one.clock.now_ns(): one.vehicle.ap.truth.velocity_ned_mps[0]})
     )
-    one.fly(executable, max_time_s=6.0)
+    one.fly(runner, max_time_s=6.0)
 
     def near(at_ns: int) -> float:
         return north_mps[min(north_mps, key=lambda stamp_ns: abs(stamp_ns - at_ns))]

@@ -32,11 +32,11 @@ from mavbridge.simulation.replay.policy import replay_policy
 from mavbridge.simulation.replay.recording import RecordedPacket, ReplaySource
 from mavbridge.simulation.world import make_vehicle
 from policy.contract import Contract
-from policy.engines.executable import ExecutionSettings, make_numpy_executable
+from policy.engines.runner import ExecutionSettings, make_numpy_runner
 from policy.errors import NoChunkError
 from policy.loading.load import load_policy
 from policy.loading.request import PolicyRequest
-from policy.protocol import Executable
+from policy.protocol import PolicyRunner
 from sitl.vehicle.config import AutopilotName
 
 EXAMPLES = Path(__file__).parents[2] / "examples"
@@ -90,8 +90,8 @@ class Flown:
     solves: list[Solve] = field(default_factory=list)
     packets: list[ForwardedPacket] = field(default_factory=list)
 
-    def source(self, executable: Executable, goal: str | None) -> ReplaySource:
-        cameras: list[list[FeatureFrame]] = [[] for _ in executable.contract.cameras]
+    def source(self, runner: PolicyRunner, goal: str | None) -> ReplaySource:
+        cameras: list[list[FeatureFrame]] = [[] for _ in runner.contract.cameras]
         for event in self.sink.events:
             if isinstance(event, VisionTick) and event.feature is not None:
                 frame = FeatureFrame(
@@ -102,11 +102,11 @@ class Flown:
                     fault=event.fault,
                 )
                 cameras[event.camera].append(frame)
-        mode = "dual" if executable.dual_rate else "single"
+        mode = "dual" if runner.dual_rate else "single"
         return ReplaySource(
             folder=Path("in memory"),
-            meta=make_meta(contract=executable.contract, mode=mode, autopilot="ardupilot"),
-            contract=executable.contract,
+            meta=make_meta(contract=runner.contract, mode=mode, autopilot="ardupilot"),
+            contract=runner.contract,
             config=FlyConfig(arm=True, goal=goal),
             ticks=tuple(event for event in self.sink.events if isinstance(event, Tick)),
             solves=tuple(self.solves),
@@ -121,7 +121,7 @@ class Flown:
 
 def flown_and_repeated(
     monkeypatch: pytest.MonkeyPatch,
-    make: Callable[[], Executable],
+    make: Callable[[], PolicyRunner],
     *,
     goal: str | None = None,
     autopilot: AutopilotName = "ardupilot",
@@ -143,17 +143,17 @@ def flown_and_repeated(
     settings = SimulationSettings(goal=goal, least_camera_px=32)
     vehicle = make_vehicle(autopilot=autopilot)
     one = SimulatedFlight(course_seed=3, seed=1, settings=settings, vehicle=vehicle)
-    executable = make()
-    one.fly(executable, max_time_s=FLIGHT_S, sinks=(flown.sink,))
-    source = flown.source(executable, goal)
+    runner = make()
+    one.fly(runner, max_time_s=FLIGHT_S, sinks=(flown.sink,))
+    source = flown.source(runner, goal)
     clock = SteppedClock(source.solves[0].started_ns - NS_PER_S)
     return compare_policy(replay_policy(source, make(), clock, source.features))
 
 
-def attentive(kind: type[Attentive] = Attentive, **changes: Any) -> Callable[[], Executable]:
+def attentive(kind: type[Attentive] = Attentive, **changes: Any) -> Callable[[], PolicyRunner]:
     settings = ExecutionSettings(name="attentive", dual_rate=changes.pop("dual_rate", True))
     contract = replace(BASE, modes=(), **changes)
-    return lambda: make_numpy_executable(kind(contract), settings)
+    return lambda: make_numpy_runner(kind(contract), settings)
 
 
 def assert_equal(compared: PolicyComparison, *, least: int = 50) -> None:
@@ -230,8 +230,8 @@ def test_every_kind_of_action_is_repeated_bit_for_bit(
 def test_the_examples_are_repeated_bit_for_bit(monkeypatch: pytest.MonkeyPatch, name: str) -> None:
     request = PolicyRequest(spec=f"{EXAMPLES}/{name}", dual_rate=True)
 
-    def load() -> Executable:
-        return load_policy(request, now_s=lambda: 0.0).executable
+    def load() -> PolicyRunner:
+        return load_policy(request, now_s=lambda: 0.0).runner
 
     assert_equal(flown_and_repeated(monkeypatch, load))
 
@@ -246,10 +246,10 @@ def test_the_example_on_a_server_is_repeated_bit_for_bit(
         command = (sys.executable, str(EXAMPLES / "server_policy.py"), str(port))
         stack.enter_context(running(*command, log=tmp_path / "server.log"))
 
-        def load() -> Executable:
+        def load() -> PolicyRunner:
             request = PolicyRequest(spec=f"ws://127.0.0.1:{port}")
             loaded = when_it_listens(lambda: load_policy(request, now_s=lambda: 0.0))
-            return stack.enter_context(loaded).executable
+            return stack.enter_context(loaded).runner
 
         compared = flown_and_repeated(monkeypatch, load)
     # The server runs in real time: on a busy machine it is late now and then, in either run.

@@ -26,6 +26,6 @@ def test_gates_are_passed_by_body_rates(
 ) -> None:
     flight = SimulatedFlight(course_seed=course, seed=0, vehicle=make_vehicle(autopilot=autopilot))
     with load_configured_policy(policy, MonotonicClock()) as loaded:
-        assert loaded.executable.contract.action == "rates"
-        result = flight.fly(loaded.executable, max_time_s=15.0)
+        assert loaded.runner.contract.action == "rates"
+        result = flight.fly(loaded.runner, max_time_s=15.0)
     assert result.gates_passed >= gates, result

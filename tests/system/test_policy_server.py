@@ -28,16 +28,16 @@ from policy.adapters.websocket.kind import load_server_policy
 from policy.adapters.websocket.messages import Message, number_array, pack, unpack
 from policy.adapters.websocket.remote_policy import RemotePolicy, answer_deadline_s
 from policy.contract import Contract, FloatArray
-from policy.engines.executable import (
+from policy.engines.runner import (
     ExecutionSettings,
     encode_all,
     level_state,
-    make_numpy_executable,
+    make_numpy_runner,
 )
 from policy.errors import NoChunkError, PolicyError
 from policy.loading.load import load_policy, read_policy_contract
 from policy.loading.request import PolicyRequest
-from policy.protocol import Executable
+from policy.protocol import PolicyRunner
 
 pytestmark = pytest.mark.system
 
@@ -161,8 +161,8 @@ def test_a_server_that_comes_back_is_flown_again(contract_file: Path) -> None:
 
 
 def test_a_server_of_another_policy_is_not_flown() -> None:
-    executable = make_numpy_executable(Echo(), ExecutionSettings(name="echo", dual_rate=False))
-    with our_server(executable) as port:
+    runner = make_numpy_runner(Echo(), ExecutionSettings(name="echo", dual_rate=False))
+    with our_server(runner) as port:
         policy, _ = load_server_policy(f"ws://127.0.0.1:{port}", None)
     with closing(policy), scripted_server(lambda _: chunk_of(0.2), port=port):
         predict_until(policy, lambda found: "serves another policy now" in str(found))
@@ -275,12 +275,12 @@ class Echo:
         self.resets += 1
 
 
-def sample(executable: Executable, seed: int) -> tuple[FloatArray, FloatArray, FloatArray]:
-    rng, contract = np.random.default_rng(seed), executable.contract
+def sample(runner: PolicyRunner, seed: int) -> tuple[FloatArray, FloatArray, FloatArray]:
+    rng, contract = np.random.default_rng(seed), runner.contract
     rgb = rng.integers(0, 256, (48, 64, 3), dtype=np.uint8)
     state = rng.normal(size=(1, *contract.state_shape)).astype(np.float32)
     history = rng.uniform(-1, 1, (1, contract.history_len, 4)).astype(np.float32)
-    return encode_all(executable, rgb), state, history
+    return encode_all(runner, rgb), state, history
 
 
 @pytest.mark.parametrize("name", ["echo", "toge"])
@@ -288,14 +288,14 @@ def test_a_served_policy_flies_the_same_sticks_as_here(name: str) -> None:
     """To the last bit; TOGE by its shipped weights, in float32 on torch."""
     if name == "toge":
         request = PolicyRequest(spec="toge", engine="torch", dual_rate=False, num_diffusion_steps=2)
-        here = load_policy(request, now_s=lambda: 0.0).executable
+        here = load_policy(request, now_s=lambda: 0.0).runner
     else:
-        here = make_numpy_executable(Echo(), ExecutionSettings(name="echo", dual_rate=False))
+        here = make_numpy_runner(Echo(), ExecutionSettings(name="echo", dual_rate=False))
     size = int(np.prod(here.contract.image_shape))
     with our_server(here, image_bytes=size) as port:
         policy, _ = load_server_policy(f"ws://127.0.0.1:{port}", None)
         settings = ExecutionSettings(name="served", dual_rate=False)
-        there = make_numpy_executable(policy, settings)
+        there = make_numpy_runner(policy, settings)
         with closing(policy):
             assert there.contract.image_shape == here.contract.image_shape
             for seed in range(3):
@@ -318,12 +318,12 @@ def test_a_contract_file_says_when_a_served_policy_may_fly(tmp_path: Path) -> No
 
 def test_a_served_policy_is_told_that_a_flight_begins() -> None:
     policy = Echo()
-    executable = make_numpy_executable(policy, ExecutionSettings(name="echo", dual_rate=False))
-    executable = Executable(**{**vars(executable), "reset": policy.reset})
-    with our_server(executable) as port:
+    runner = make_numpy_runner(policy, ExecutionSettings(name="echo", dual_rate=False))
+    runner = PolicyRunner(**{**vars(runner), "reset": policy.reset})
+    with our_server(runner) as port:
         remote, _ = load_server_policy(f"ws://127.0.0.1:{port}", None)
         with closing(remote):
-            inputs = sample(executable, 0)
+            inputs = sample(runner, 0)
             remote.predict(*inputs, 10)
             assert policy.resets == 0
             remote.reset()
@@ -333,8 +333,8 @@ def test_a_served_policy_is_told_that_a_flight_begins() -> None:
             assert policy.resets == 1
 
 
-def served_echo() -> Executable:
-    return make_numpy_executable(Echo(), ExecutionSettings(name="echo", dual_rate=False))
+def served_echo() -> PolicyRunner:
+    return make_numpy_runner(Echo(), ExecutionSettings(name="echo", dual_rate=False))
 
 
 def connect(port: int, **headers: str) -> Any:

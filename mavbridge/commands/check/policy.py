@@ -19,11 +19,11 @@ from mavbridge.flight.plan import plan_flight
 from mavbridge.flight.policies import load_configured_policy
 from mavbridge.flight.speed import require_speed
 from policy.contract import ACTION_DIM, Contract
-from policy.engines.executable import encode_all, level_state
+from policy.engines.runner import encode_all, level_state
 from policy.errors import Agreed, NoChunkError, Warned
 from policy.loading.request import LoadedPolicy
 from policy.preprocess import dummy_images
-from policy.protocol import Executable
+from policy.protocol import PolicyRunner
 
 NO_POLICY = "none"
 _BUSY = 0.8
@@ -58,19 +58,19 @@ def check_policy(config: FlyConfig, clock: Clock, *, timing_s: float) -> PolicyF
             )
             stack.enter_context(loaded)
             rows = [_engine_row(loaded), *_speed_rows(config, loaded, clock, timing_s)]
-            rows += _contract_rows(config, loaded.executable)
-            contract = loaded.executable.contract
-            return PolicyFindings(rows=rows, contract=contract, is_dual=loaded.executable.dual_rate)
+            rows += _contract_rows(config, loaded.runner)
+            contract = loaded.runner.contract
+            return PolicyFindings(rows=rows, contract=contract, is_dual=loaded.runner.dual_rate)
     except MavbridgeError as error:
         return PolicyFindings(rows=[_row("policy", config.policy.policy, "no-go", str(error))])
 
 
 def _engine_row(loaded: LoadedPolicy) -> Row:
     """The engine and its agreement with torch; what is not as it was asked for is a warning."""
-    executable = loaded.executable
+    runner = loaded.runner
     warnings = [note.text for note in loaded.notes if isinstance(note, Warned)]
     agrees = any(isinstance(note, Agreed) for note in loaded.notes)
-    found = f"{executable.name} on {executable.engine}{', agrees with torch' if agrees else ''}"
+    found = f"{runner.name} on {runner.engine}{', agrees with torch' if agrees else ''}"
     return _row(
         "engine",
         found,
@@ -87,13 +87,13 @@ def _speed_rows(
     if loaded.times is None:
         yield _row("speed", "not measured: no chunk on a dummy sample")
     else:
-        for pace in _run_at_rates(config, loaded.executable, clock, timing_s):
+        for pace in _run_at_rates(config, loaded.runner, clock, timing_s):
             yield pace.row()
     expected = "within the ages of its contract"
     try:
-        executable = loaded.executable
-        plan = plan_flight(config, executable.contract, is_dual=executable.dual_rate)
-        notes = require_speed(plan, executable.name, loaded.times)
+        runner = loaded.runner
+        plan = plan_flight(config, runner.contract, is_dual=runner.dual_rate)
+        notes = require_speed(plan, runner.name, loaded.times)
     except MavbridgeError as error:
         yield _row("speed", "too slow", "no-go", str(error), expected=expected)
         return
@@ -158,25 +158,25 @@ class Pace:
 
 
 def _run_at_rates(
-    config: FlyConfig, executable: Executable, clock: Clock, timing_s: float
+    config: FlyConfig, runner: PolicyRunner, clock: Clock, timing_s: float
 ) -> list[Pace]:
     """Chunks and images of a dummy sample, each in a thread, at the rates of the flight."""
-    contract, rates = executable.contract, config.rates
-    loops = rates.loops(is_dual=executable.dual_rate, play_s=contract.play_s)
+    contract, rates = runner.contract, config.rates
+    loops = rates.loops(is_dual=runner.dual_rate, play_s=contract.play_s)
     images, state = dummy_images(contract), level_state(contract)
     history = np.zeros((1, contract.history_len, ACTION_DIM), np.float32)
-    encoded = encode_all(executable, images)
+    encoded = encode_all(runner, images)
     one_of_each = images.reshape(-1, len(contract.cameras), *contract.picture_shape)[0]
 
     def encode() -> None:
         for camera, image in enumerate(one_of_each):
-            executable.encode(image, camera)
+            runner.encode(image, camera)
 
     chunks = Pace(name="chunks", asked_hz=loops.action_hz)
     pictures = Pace(name="images", asked_hz=min((loops.max_vision_hz, *contract.camera_rates_hz)))
     workers = []
     for pace, call, realtime, cpu in (
-        (chunks, lambda: executable.act(encoded, state, history), rates.realtime, rates.action_cpu),
+        (chunks, lambda: runner.act(encoded, state, history), rates.realtime, rates.action_cpu),
         (pictures, encode, False, rates.vision_cpu),
     ):
         settle = partial(settle_thread, realtime=realtime, cpu=cpu)
@@ -192,12 +192,12 @@ def _run_at_rates(
     return [chunks, pictures]
 
 
-def _contract_rows(config: FlyConfig, executable: Executable) -> list[Row]:
-    contract = executable.contract
+def _contract_rows(config: FlyConfig, runner: PolicyRunner) -> list[Row]:
+    contract = runner.contract
     takes = f"{contract.image_width}x{contract.image_height} of {', '.join(contract.cameras)}"
     found = f"{contract.action}, {contract.state_frame}, {takes}"
     try:
-        plan = plan_flight(config, contract, is_dual=executable.dual_rate)
+        plan = plan_flight(config, contract, is_dual=runner.dual_rate)
     except MavbridgeError as error:
         return [_row("flags of the flight", found, "no-go", str(error))]
     figures = ", ".join(f"{name} {value:.4g}" for name, value in plan.figures().items())

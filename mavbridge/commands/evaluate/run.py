@@ -94,10 +94,10 @@ def fly_simulated(spec: EpisodeSpec, should_stop: Callable[[], bool]) -> FlownEp
         vehicle=make_vehicle(autopilot=config.autopilot, gains=config.gains, conditions=conditions),
     )
     with load_for_episodes(config.policy, flight.clock) as loaded:
-        contract = contract_with_ages(loaded.executable.contract, config.limits)
-        executable = replace(loaded.executable, contract=contract)
-        result = flight.fly(executable, max_time_s=config.max_time, should_stop=should_stop)
-    return FlownEpisode(engine=loaded.executable.engine, notes=tuple(loaded.notes), result=result)
+        contract = contract_with_ages(loaded.runner.contract, config.limits)
+        runner = replace(loaded.runner, contract=contract)
+        result = flight.fly(runner, max_time_s=config.max_time, should_stop=should_stop)
+    return FlownEpisode(engine=loaded.runner.engine, notes=tuple(loaded.notes), result=result)
 
 
 def identity(config: EvaluateConfig) -> str:

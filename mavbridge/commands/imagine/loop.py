@@ -17,7 +17,7 @@ from mavbridge.core.records import FloatArray, ImageArray
 from mavbridge.core.vehicle import Sticks
 from mavbridge.flight.history import SentHistory, sample_chunk
 from policy.contract import SINCE_EXPOSURE_DIM, Contract
-from policy.protocol import Executable
+from policy.protocol import PolicyRunner
 
 SAMPLES_PER_STEP = 8
 """An action of the world model is the mean stick of a step: the mean of so many samples."""
@@ -90,31 +90,31 @@ class PolicyDecider:
 
     images = 1
 
-    def __init__(self, executable: Executable, sampler: Sampler) -> None:
+    def __init__(self, runner: PolicyRunner, sampler: Sampler) -> None:
         """Make sure that the two belong together.
 
         Raises:
             UserError: policy and world model have their states in different frames, or the policy
                 takes what nobody imagines.
         """
-        seen = executable.contract
+        seen = runner.contract
         if len(seen.cameras) > 1 or seen.observation_steps > 1 or seen.state_extras:
             raise UserError(
-                f"{executable.name} takes several cameras, past observations or a place in the "
+                f"{runner.name} takes several cameras, past observations or a place in the "
                 "world; flights are imagined for policies that take the newest image and state"
             )
         if seen.action != "sticks":
             raise UserError(
-                f"{executable.name} flies by {seen.action}; flights are imagined from sticks"
+                f"{runner.name} flies by {seen.action}; flights are imagined from sticks"
             )
-        ours, theirs = sampler.config.contract.state_frame, executable.contract.state_frame
+        ours, theirs = sampler.config.contract.state_frame, runner.contract.state_frame
         if ours != theirs:
             raise UserError(
-                f"the world model takes states in {ours}, the policy {executable.name} in "
+                f"the world model takes states in {ours}, the policy {runner.name} in "
                 f"{theirs}: use two that were trained on the same kind of flights"
             )
-        self.contract = executable.contract
-        self._executable = executable
+        self.contract = runner.contract
+        self._runner = runner
         self._frames = sampler.config.frames
         self._frame_dt_s = sampler.config.frame_dt_s
 
@@ -124,8 +124,8 @@ class PolicyDecider:
         if self.contract.since_exposure:
             # The image is as old as the state: nothing has moved since.
             state = np.pad(state, ((0, 0), (0, SINCE_EXPOSURE_DIM)))
-        feature = self._executable.encode(seen.images[-1])
-        chunk = self._executable.act(feature, state, seen.history())[0]
+        feature = self._runner.encode(seen.images[-1])
+        chunk = self._runner.act(feature, state, seen.history())[0]
         sticks = [
             sample_chunk(
                 chunk,

@@ -163,7 +163,7 @@ def _make_decider(
     loaded = stack.enter_context(load_configured_policy(wanted, clock))
     for note in loaded.notes:
         console.print(Text(note, style="yellow" if isinstance(note, Warned) else "dim"))
-    return PolicyDecider(loaded.executable, sampler)
+    return PolicyDecider(loaded.runner, sampler)
 
 
 def _print_summary(config: ImagineConfig, sampler: Sampler, output: StreamedOutput) -> None:

@@ -36,7 +36,7 @@ from mavbridge.simulation.replay.guard import (
 )
 from mavbridge.simulation.replay.policy import SolvePair, replay_policy
 from mavbridge.simulation.replay.recording import ReplaySource, open_source
-from policy.protocol import Executable
+from policy.protocol import PolicyRunner
 
 VIDEO_TOLERANCE = 0.15
 """Largest difference of a smoothed stick from the lossy video, in full deflections: twice what was
@@ -67,12 +67,12 @@ def replay(folder: Path, config: ReplayConfig) -> int:
     if chosen != "chunks":
         clock = SteppedClock(source.solves[0].started_ns - NS_PER_S)
         with load_configured_policy(flown.config.policy, clock) as loaded:
-            executable = loaded.executable
-            engine = executable.engine
-            plan = plan_flight(flown.config, executable.contract, is_dual=executable.dual_rate)
-            pairs = _replayed(flown, executable, clock, chosen)
+            runner = loaded.runner
+            engine = runner.engine
+            plan = plan_flight(flown.config, runner.contract, is_dual=runner.dual_rate)
+            pairs = _replayed(flown, runner, clock, chosen)
         compared = compare_policy(pairs)
-        chunks = _other_chunks(executable, pairs)
+        chunks = _other_chunks(runner, pairs)
     is_same = compared is None or compared.equal_chunks == compared.solves
     if is_same and not config.changes_limits:
         traces = guard_traces(steps)
@@ -192,9 +192,9 @@ def tolerance_of(
 
 
 def _replayed(
-    source: ReplaySource, executable: Executable, clock: SteppedClock, chosen: ReplayFrom
+    source: ReplaySource, runner: PolicyRunner, clock: SteppedClock, chosen: ReplayFrom
 ) -> list[SolvePair]:
-    contract = executable.contract
+    contract = runner.contract
     if contract.history_len != source.contract.history_len or (
         contract.cameras != source.contract.cameras or contract.action != source.contract.action
     ):
@@ -211,16 +211,16 @@ def _replayed(
         features: Sequence[Iterable[FeatureFrame]] = source.features
     else:
         features = [
-            _encoded(source, executable, number, name)
+            _encoded(source, runner, number, name)
             for number, name in enumerate(source.contract.cameras)
         ]
     kind = "features" if chosen == "features" else "images of the video"
-    print_status(f"repeating {len(source.solves)} solves from {kind} on {executable.engine}")
-    return list(replay_policy(source, executable, clock, features))
+    print_status(f"repeating {len(source.solves)} solves from {kind} on {runner.engine}")
+    return list(replay_policy(source, runner, clock, features))
 
 
 def _encoded(
-    source: ReplaySource, executable: Executable, number: int, name: str
+    source: ReplaySource, runner: PolicyRunner, number: int, name: str
 ) -> Iterator[FeatureFrame]:
     """The frames of one camera's video, encoded as they are taken: images are large."""
     cv2.setNumThreads(1)
@@ -233,16 +233,16 @@ def _encoded(
             frame_id=row.frame_id,
             captured_ns=row.captured_ns,
             ready_ns=row.ready_ns,
-            value=executable.encode(rgb, number).copy(),
+            value=runner.encode(rgb, number).copy(),
             fault=faults.get(row.frame_id),
         )
 
 
-def _other_chunks(executable: Executable, pairs: Sequence[SolvePair]) -> dict[int, Chunk]:
+def _other_chunks(runner: PolicyRunner, pairs: Sequence[SolvePair]) -> dict[int, Chunk]:
     """The new chunks, by the serial numbers of the recorded ones."""
     return {
         pair.recorded.serial: chunk_of(
-            replace(pair.replayed, serial=pair.recorded.serial), executable.contract
+            replace(pair.replayed, serial=pair.recorded.serial), runner.contract
         )
         for pair in pairs
         if pair.replayed is not None

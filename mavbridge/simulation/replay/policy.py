@@ -32,7 +32,7 @@ from mavbridge.mavlink.session.telemetry import PacketDecoder
 from mavbridge.simulation.clock import SteppedClock
 from mavbridge.simulation.replay.guard import recorded_plan
 from mavbridge.simulation.replay.recording import ReplaySource
-from policy.protocol import Executable
+from policy.protocol import PolicyRunner
 
 _SIDES: tuple[Literal["left"], Literal["right"]] = ("left", "right")
 
@@ -49,7 +49,7 @@ class SolvePair:
 
 def replay_policy(
     source: ReplaySource,
-    executable: Executable,
+    runner: PolicyRunner,
     clock: SteppedClock,
     features: Sequence[Iterable[FeatureFrame]],
 ) -> Iterator[SolvePair]:
@@ -57,11 +57,11 @@ def replay_policy(
 
     Args:
         source: the flight.
-        executable: the policy, reset; it follows ``clock`` if it follows one at all.
+        runner: the policy, reset; it follows ``clock`` if it follows one at all.
         clock: at a time before the flight.
         features: of each camera of the contract, in order of exposure.
     """
-    loop = _Loop(source, executable, clock)
+    loop = _Loop(source, runner, clock)
     news = _News(
         source, loop.view, [_Shelf(f, c) for f, c in zip(features, loop.caches, strict=True)]
     )
@@ -78,20 +78,20 @@ def replay_policy(
 class _Loop:
     """The policy loop and all around it, stepped for each recorded solve."""
 
-    def __init__(self, source: ReplaySource, executable: Executable, clock: SteppedClock) -> None:
+    def __init__(self, source: ReplaySource, runner: PolicyRunner, clock: SteppedClock) -> None:
         contract = source.contract
         self._clock = clock
         self._now: Solve | None = None
         self._solve: Solve | None = None
         self._refusal: Reason | None = None
-        self._act = executable.act
-        self._takes_recorded = executable.contract == contract
+        self._act = runner.act
+        self._takes_recorded = runner.contract == contract
         span_ns = observation_ages_ns(contract)[0]
         self.caches = [FeatureCache(span_ns=span_ns) for _ in contract.cameras]
-        plan = plan_flight(source.config, executable.contract, is_dual=executable.dual_rate)
+        plan = plan_flight(source.config, runner.contract, is_dual=runner.dual_rate)
         bridge = build_bridge(
             plan,
-            replace(executable, act=self._timed_act),
+            replace(runner, act=self._timed_act),
             clock=clock,
             send=self._sent,
             cameras=[CameraPath(camera=_NoCamera(), cache=c, clock=clock) for c in self.caches],

@@ -13,19 +13,19 @@ from policy.adapters.onnx.files import DENOISER, OnnxFiles
 from policy.adapters.onnx.graphs import GraphFile, Ports, Wanted, require_roles
 from policy.contract import ACTION_DIM, Contract, FloatArray
 from policy.engines.choose import chunks_of_samples
-from policy.engines.executable import (
+from policy.engines.openvino_compile import engine_name, precisions
+from policy.engines.parity import make_parity_samples, parity_failure
+from policy.engines.runner import (
     ExecutionSettings,
     Precision,
     Shape,
-    make_numpy_executable,
+    make_numpy_runner,
 )
-from policy.engines.openvino_compile import engine_name, precisions
-from policy.engines.parity import make_parity_samples, parity_failure
 from policy.engines.stepwise import solver_segment
 from policy.errors import PolicyError, warned
 from policy.nets.diffusion import NoiseSchedule, flight_noise
 from policy.preprocess import input_to_bytes
-from policy.protocol import Executable
+from policy.protocol import PolicyRunner
 
 
 class OnnxGraphs:
@@ -153,30 +153,30 @@ class EncoderPolicy(OnnxPolicy):
 
 def choose_precision(
     policy: OnnxPolicy, settings: ExecutionSettings
-) -> tuple[Executable, tuple[str, ...]]:
-    """The executable at the fastest precision whose sticks are those of float32, and notes.
+) -> tuple[PolicyRunner, tuple[str, ...]]:
+    """The runner at the fastest precision whose sticks are those of float32, and notes.
 
     ``policy`` is in float32. There is nothing else to compare with: that these graphs are the
     policy is taken from the files.
     """
     samples = make_parity_samples(policy.contract)
 
-    def chunks(executable: Executable) -> FloatArray:
-        executable.reset()
-        return chunks_of_samples(executable, samples)
+    def chunks(runner: PolicyRunner) -> FloatArray:
+        runner.reset()
+        return chunks_of_samples(runner, samples)
 
-    def executable_of(policy: OnnxPolicy, vision: Precision, action: Precision) -> Executable:
-        executable = make_numpy_executable(policy, settings)
-        return replace(executable, engine=engine_name(vision, action), reset=policy.reset)
+    def runner_of(policy: OnnxPolicy, vision: Precision, action: Precision) -> PolicyRunner:
+        runner = make_numpy_runner(policy, settings)
+        return replace(runner, engine=engine_name(vision, action), reset=policy.reset)
 
-    reference = executable_of(policy, "f32", "f32")
+    reference = runner_of(policy, "f32", "f32")
     notes: list[str] = []
     expected = chunks(reference)
     for vision, action in precisions():
         if vision == action == "f32":
             break
         try:
-            candidate = executable_of(policy.graphs.at(vision, action), vision, action)
+            candidate = runner_of(policy.graphs.at(vision, action), vision, action)
             reason = parity_failure(expected, chunks(candidate))
         except (PolicyError, RuntimeError) as error:
             reason = f"{type(error).__name__}: {str(error).strip().splitlines()[0]}"

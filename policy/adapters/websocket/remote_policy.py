@@ -16,7 +16,7 @@ from policy.adapters.websocket.messages import (
 )
 from policy.adapters.websocket.observation import RESET_KEY, to_message
 from policy.contract import ACTION_DIM, Contract, FloatArray
-from policy.engines.executable import level_state
+from policy.engines.runner import level_state
 from policy.errors import NoChunkError
 
 ACTIONS_KEY = "actions"

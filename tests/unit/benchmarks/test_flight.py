@@ -10,7 +10,7 @@ from mavbridge.config.policy import PolicyConfig
 from mavbridge.config.rates import Rates
 from mavbridge.core.reasons import Code, Reason, because
 from policy.contract import Contract
-from policy.protocol import Executable
+from policy.protocol import PolicyRunner
 
 
 @pytest.mark.parametrize(
@@ -52,11 +52,11 @@ def test_a_level_climb_does_the_work_and_returns_other_sticks() -> None:
         called.append(len(arguments))
         return np.ones((1, 16, 4), np.float32)
 
-    executable = Executable(
+    runner = PolicyRunner(
         contract=Contract(), name="a", engine="b", dual_rate=True, encode=lambda rgb: rgb, act=act
     )
     history = np.zeros((1, 4, 4), np.float32)
-    climb = level_climb(executable)
+    climb = level_climb(runner)
     assert climb.contract.max_state_age_s == climb.contract.max_chunk_age_s == 5.0
     chunk = climb.act(history, make_state().values[None], history)
     assert called == [3]

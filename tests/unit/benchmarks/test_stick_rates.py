@@ -15,11 +15,11 @@ from mavbridge.config.rates import Rates
 from mavbridge.core.clock import MonotonicClock
 from mavbridge.core.errors import UserError
 from policy.contract import Contract
-from policy.protocol import Executable
+from policy.protocol import PolicyRunner
 
 
 def test_every_tenth_solve_is_slow_and_all_are_the_policys() -> None:
-    executable = Executable(
+    runner = PolicyRunner(
         contract=Contract(),
         name="a",
         engine="b",
@@ -27,7 +27,7 @@ def test_every_tenth_solve_is_slow_and_all_are_the_policys() -> None:
         encode=lambda rgb: rgb,
         act=lambda *arguments: arguments[0],
     )
-    slow, clock, durations_ns = with_slow_solves(executable), MonotonicClock(), []
+    slow, clock, durations_ns = with_slow_solves(runner), MonotonicClock(), []
     for number in range(2 * SLOW_EVERY):
         start_ns = clock.now_ns()
         assert slow.act(number, None, None) == number

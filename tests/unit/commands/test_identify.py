@@ -226,10 +226,10 @@ def test_a_flight_that_sends_nothing_is_refused() -> None:
 
 def test_the_doublet_means_by_its_sticks_what_the_policy_means() -> None:
     trained = Contract(full_lean_deg=20.0, yaw_dead_zone=0.1, image_height=96, image_width=96)
-    policy, executable = doublet_policy(trained, FakeClock(), is_in_air=True)
-    assert executable.contract.full_lean_deg == 20.0
-    assert executable.contract.yaw_dead_zone == 0.1
-    assert executable.dual_rate
+    policy, runner = doublet_policy(trained, FakeClock(), is_in_air=True)
+    assert runner.contract.full_lean_deg == 20.0
+    assert runner.contract.yaw_dead_zone == 0.1
+    assert runner.dual_rate
     assert policy.program_start_s is None
 
 

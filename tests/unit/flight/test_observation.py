@@ -18,7 +18,7 @@ from mavbridge.flight.observation import (
 )
 from mavbridge.flight.state import Unavailable
 from policy.contract import Contract
-from policy.protocol import Executable
+from policy.protocol import PolicyRunner
 
 MS = NS_PER_MS
 NOW_NS = 10_000 * MS
@@ -54,7 +54,7 @@ def felt(ago_ms: float) -> VehicleState:
 def source(
     contract: Contract, *caches: FeatureCache, past: Sequence[float] = (), span_ms: int = 200
 ) -> ObservationSource:
-    executable = Executable(
+    runner = PolicyRunner(
         contract=contract,
         name="",
         engine="",
@@ -65,7 +65,7 @@ def source(
     looks = ObservationSource(
         contract,
         caches=caches,
-        join=executable.join,
+        join=runner.join,
         max_feature_age_ns=300 * MS,
         states_span_ns=span_ms * MS,
     )

@@ -12,7 +12,7 @@ from mavbridge.config.flight import FlyConfig
 from mavbridge.flight.observers import FlightObservers
 from mavbridge.flight.plan import plan_flight
 from policy.contract import Contract
-from policy.engines.executable import ExecutionSettings, make_numpy_executable
+from policy.engines.runner import ExecutionSettings, make_numpy_runner
 
 
 class Hovering:
@@ -25,12 +25,10 @@ class Hovering:
 
 
 def observers(report: Path, said: io.StringIO) -> FlightObservers:
-    executable = make_numpy_executable(
-        Hovering(), ExecutionSettings(name="hovering", dual_rate=False)
-    )
+    runner = make_numpy_runner(Hovering(), ExecutionSettings(name="hovering", dual_rate=False))
     console = Console(file=said, width=200)
-    plan = plan_flight(FlyConfig(report=report), executable.contract, is_dual=False)
-    return FlightObservers(plan, executable, clock=FakeClock(), console=console)
+    plan = plan_flight(FlyConfig(report=report), runner.contract, is_dual=False)
+    return FlightObservers(plan, runner, clock=FakeClock(), console=console)
 
 
 def test_a_report_that_cannot_be_written_is_said(tmp_path: Path) -> None:

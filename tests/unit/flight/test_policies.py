@@ -38,7 +38,7 @@ def test_a_users_class_is_found_in_the_working_directory_by_check_and_loading(
     monkeypatch.setattr(sys, "path", [entry for entry in sys.path if entry])
     wanted = PolicyConfig(policy="still_module:Still")
     check_configured_policy(wanted)
-    assert load_configured_policy(wanted, MonotonicClock()).executable.name == wanted.policy
+    assert load_configured_policy(wanted, MonotonicClock()).runner.name == wanted.policy
 
 
 @pytest.mark.parametrize(

@@ -14,7 +14,7 @@ from mavbridge.guard.memory import EngagementSettings
 from mavbridge.guard.sequences import DisengageSettings, EngageSettings
 from mavbridge.guard.settings import FlightSettings
 from policy.contract import Contract
-from policy.protocol import Executable
+from policy.protocol import PolicyRunner
 
 LINK = LinkConfig(connect="udp:127.0.0.1:14550")
 
@@ -22,7 +22,7 @@ LINK = LinkConfig(connect="udp:127.0.0.1:14550")
 def settings_for(
     config: FlyConfig | None = None, contract: Contract | None = None, *, dual_rate: bool = True
 ) -> FlightSettings:
-    executable = Executable(
+    runner = PolicyRunner(
         contract=contract or Contract(feature_dim=8),
         name="test",
         engine="numpy",
@@ -30,7 +30,7 @@ def settings_for(
         encode=lambda rgb: rgb,
         act=lambda *inputs: inputs[0],
     )
-    contract, is_dual = executable.contract, executable.dual_rate
+    contract, is_dual = runner.contract, runner.dual_rate
     return plan_flight(config or FlyConfig(link=LINK), contract, is_dual=is_dual).guard
 
 

@@ -12,7 +12,7 @@ from mavbridge.core.vehicle import Reading, Telemetry
 from mavbridge.flight.plan import plan_flight
 from mavbridge.flight.state import Freshness, StateReader, Unavailable
 from policy.contract import Contract, StateExtra
-from policy.protocol import Executable
+from policy.protocol import PolicyRunner
 
 MS = NS_PER_MS
 NOW_NS = 5_000 * MS
@@ -111,7 +111,7 @@ def test_a_goal_is_three_numbers(goal: str) -> None:
 
 def test_a_goal_is_given_just_where_the_policy_takes_one() -> None:
     def settings(goal: str | None, *extras: StateExtra) -> object:
-        executable = Executable(
+        runner = PolicyRunner(
             contract=Contract(state_extras=extras),
             name="",
             engine="",
@@ -119,7 +119,7 @@ def test_a_goal_is_given_just_where_the_policy_takes_one() -> None:
             encode=lambda rgb, camera=0: np.zeros((1, 1), np.float32),
             act=lambda e, s, h: e,
         )
-        return plan_flight(config(goal), executable.contract, is_dual=executable.dual_rate).guard
+        return plan_flight(config(goal), runner.contract, is_dual=runner.dual_rate).guard
 
     assert config("-10.5, 2,-3").goal_ned_m == (-10.5, 2.0, -3.0)
     with pytest.raises(UserError, match="this policy flies to a goal: give --goal"):

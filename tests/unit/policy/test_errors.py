@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from policy.contract import Contract
-from policy.engines.executable import ExecutionSettings, make_numpy_executable
+from policy.engines.runner import ExecutionSettings, make_numpy_runner
 from policy.errors import PolicyError, user_code
 
 
@@ -48,13 +48,13 @@ class Careless:
 
 
 def test_a_careless_policy_harms_nobody() -> None:
-    executable = make_numpy_executable(Careless(), ExecutionSettings(name="careless"))
-    first = executable.encode(np.zeros((8, 8, 3), np.uint8))
+    runner = make_numpy_runner(Careless(), ExecutionSettings(name="careless"))
+    first = runner.encode(np.zeros((8, 8, 3), np.uint8))
     first.setflags(write=False)  # as the vision loop publishes it
     before = first.copy()
-    executable.encode(np.zeros((8, 8, 3), np.uint8))
+    runner.encode(np.zeros((8, 8, 3), np.uint8))
     state = np.ones((1, 13), np.float32)
     state.setflags(write=False)
-    executable.act(first, state, np.zeros((1, 4, 4), np.float32))
+    runner.act(first, state, np.zeros((1, 4, 4), np.float32))
     assert (first == before).all()
     assert (state == 1).all()

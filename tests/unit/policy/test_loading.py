@@ -31,8 +31,8 @@ def load(spec: str, **changes: Any) -> LoadedPolicy:
 
 
 def act(loaded: LoadedPolicy) -> np.ndarray:
-    executable = loaded.executable
-    return executable.act(executable.encode(RGB), STATE, HISTORY)
+    runner = loaded.runner
+    return runner.act(runner.encode(RGB), STATE, HISTORY)
 
 
 @pytest.fixture(scope="module")
@@ -54,9 +54,9 @@ def checkpoint(small_toge: Toge, tmp_path_factory: pytest.TempPathFactory) -> Pa
 )
 def test_scripted_flies_dual_rate_without_weights(spec: str, action: str) -> None:
     loaded = load(spec, image_size=64)
-    assert loaded.executable.contract.action == action
-    assert loaded.executable.dual_rate
-    assert loaded.executable.contract.image_height == 64
+    assert loaded.runner.contract.action == action
+    assert loaded.runner.dual_rate
+    assert loaded.runner.contract.image_height == 64
     assert act(loaded).shape == (1, 16, 4)
 
 
@@ -104,7 +104,7 @@ def test_the_fastest_engine_that_agrees_flies_and_is_named(checkpoint: Path) -> 
     fast, reference = (
         load("toge", checkpoint=checkpoint, engine=engine) for engine in ("auto", "torch")
     )
-    assert fast.executable.engine.startswith("openvino")
+    assert fast.runner.engine.startswith("openvino")
     assert any("agrees with torch" in note for note in fast.notes)
     np.testing.assert_allclose(act(fast), act(reference), atol=0.01)
 
@@ -112,8 +112,8 @@ def test_the_fastest_engine_that_agrees_flies_and_is_named(checkpoint: Path) -> 
 @pytest.mark.parametrize("spec", ["toge", "toge:small", "toge:small:resnet18", "toge:resnet18"])
 def test_a_checkpoint_decides_what_is_built(spec: str, checkpoint: Path, small_toge: Toge) -> None:
     loaded = load(spec, checkpoint=checkpoint)
-    assert loaded.executable.contract == small_toge.contract
-    assert loaded.executable.dual_rate
+    assert loaded.runner.contract == small_toge.contract
+    assert loaded.runner.dual_rate
     assert "(small, resnet18)" in loaded.notes[0]
 
 
@@ -130,7 +130,7 @@ def test_a_policy_without_fast_path_becomes_single_rate_with_one_warning(tmp_pat
     asked, not_asked = (
         load("resnet-unet", checkpoint=path, dual_rate=dual_rate) for dual_rate in (True, False)
     )
-    assert not asked.executable.dual_rate
+    assert not asked.runner.dual_rate
     assert [note for note in asked.notes if note.startswith("warning")] == [
         "warning: resnet-unet has no fast path (encode_visual and predict_fast), so it flies in "
         "single-rate mode, the whole network for every action (--single-rate: as intended)"
@@ -177,8 +177,8 @@ def test_refusals_say_what_to_do(spec: str, changes: dict[str, Any], message: st
 def test_sticks_are_flown_by_rates_where_that_is_asked_for(checkpoint: Path) -> None:
     sticks = load("toge", checkpoint=checkpoint)
     rates = load("toge", checkpoint=checkpoint, by_rates=True)
-    contract = rates.executable.contract
-    assert contract == by_rates(sticks.executable.contract)
+    contract = rates.runner.contract
+    assert contract == by_rates(sticks.runner.contract)
     request = PolicyRequest(spec="toge", checkpoint=checkpoint, by_rates=True)
     assert read_policy_contract(request) == contract
     flown = StickLoop(contract).to_rates(act(sticks), STATE)
@@ -192,7 +192,7 @@ def test_weights_that_learned_from_rates_are_flown_by_them(small_toge, checkpoin
     path = tmp_path / "rates.safetensors"
     save_checkpoint(path, network)
     loaded = load("toge", checkpoint=path, num_diffusion_steps=4)
-    assert loaded.executable.contract == network.contract
+    assert loaded.runner.contract == network.contract
     sticks = act(load("toge", checkpoint=checkpoint, num_diffusion_steps=4))
     flown = StickLoop(network.contract).to_rates(sticks, STATE)
     np.testing.assert_allclose(act(loaded), flown, atol=1e-6)
@@ -312,9 +312,9 @@ def test_a_class_of_the_users_flies(user_module: str) -> None:
         load(f"{user_module}:Dual"),
         load(f"{user_module}:Dual", checkpoint=Path("weights.bin")),
     )
-    assert not single.executable.dual_rate
+    assert not single.runner.dual_rate
     assert any(note.startswith("warning") for note in single.notes)
-    assert dual.executable.dual_rate
+    assert dual.runner.dual_rate
     assert [float(act(loaded).max()) for loaded in (single, dual, trained)] == pytest.approx(
         [0.2, 0.0, 0.5]
     )
@@ -326,7 +326,7 @@ def test_a_class_of_the_users_flies(user_module: str) -> None:
 def test_a_policy_that_remembers_is_reset_after_loading(user_module, name, engine, step):
     loaded = load(f"{user_module}:{name}", engine=engine)
     assert [float(act(loaded).max()) for _ in range(2)] == pytest.approx([step, 2 * step])
-    loaded.executable.reset()
+    loaded.runner.reset()
     assert float(act(loaded).max()) == pytest.approx(step)
 
 

@@ -8,7 +8,7 @@ import pytest
 
 from policy.contract import Contract, FloatArray
 from policy.errors import ContractError
-from policy.protocol import Executable
+from policy.protocol import PolicyRunner
 from policy.rotation import matrix_columns, multiply
 from policy.stick_loop import (
     MAX_TILT_RATE_RADPS,
@@ -159,7 +159,7 @@ def test_the_policy_flies_its_own_network_by_rates() -> None:
         given.append(history)
         return np.full((1, 16, 4), 0.5, np.float32)
 
-    sticks = Executable(
+    sticks = PolicyRunner(
         contract=Contract(),
         name="sticks",
         engine="numpy",

@@ -8,7 +8,7 @@ import pytest
 from policy.contract import Contract, FloatArray
 from policy.errors import NoChunkError
 from policy.loading.timing import MOST_S, REPETITIONS, SolveTimes, measure_times
-from policy.protocol import Executable
+from policy.protocol import PolicyRunner
 
 
 class Timed:
@@ -18,7 +18,7 @@ class Timed:
         self.now_s = 0.0
         self._act_s = act_s
         self.acts = 0
-        self.executable = Executable(
+        self.runner = PolicyRunner(
             contract=contract,
             name="test",
             engine="numpy",
@@ -42,20 +42,20 @@ ONE = Contract(feature_dim=1, arrays="numpy")
 
 def test_one_slow_repetition_does_not_make_a_policy_slow() -> None:
     timed = Timed([0.004, 0.2, 0.004, 0.005, 0.006], ONE)
-    times = measure_times(timed.executable, lambda: timed.now_s)
+    times = measure_times(timed.runner, lambda: timed.now_s)
     assert times == SolveTimes(encode_s=pytest.approx(0.01), act_s=pytest.approx(0.005))
     assert timed.acts == REPETITIONS
 
 
 def test_a_slow_policy_is_asked_once() -> None:
     timed = Timed([MOST_S], ONE)
-    measure_times(timed.executable, lambda: timed.now_s)
+    measure_times(timed.runner, lambda: timed.now_s)
     assert timed.acts == 1
 
 
 def test_by_a_clock_that_stands_still_it_is_asked_once_and_takes_no_time() -> None:
     timed = Timed([0.004], ONE)
-    assert measure_times(timed.executable, lambda: 7.0) == SolveTimes(encode_s=0.0, act_s=0.0)
+    assert measure_times(timed.runner, lambda: 7.0) == SolveTimes(encode_s=0.0, act_s=0.0)
     assert timed.acts == 1
 
 
@@ -64,7 +64,7 @@ def test_an_image_is_one_of_each_camera_however_many_observations_there_are() ->
         feature_dim=1, arrays="numpy", cameras=("front", "down"), observation_steps=3
     )
     timed = Timed([0.004], contract)
-    times = measure_times(timed.executable, lambda: timed.now_s)
+    times = measure_times(timed.runner, lambda: timed.now_s)
     assert times is not None
     assert times.encode_s == pytest.approx(0.02)
 
@@ -73,5 +73,5 @@ def test_without_a_chunk_there_is_no_time_of_one() -> None:
     def act(*inputs: object) -> FloatArray:
         raise NoChunkError("the server is not there yet")
 
-    executable = replace(Timed([], ONE).executable, act=act)
-    assert measure_times(executable, lambda: 0.0) is None
+    runner = replace(Timed([], ONE).runner, act=act)
+    assert measure_times(runner, lambda: 0.0) is None

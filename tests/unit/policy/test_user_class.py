@@ -48,7 +48,7 @@ def load(spec: str, checkpoint: Path | None = None) -> LoadedPolicy:
 
 def throttle(loaded: LoadedPolicy) -> float:
     rgb = np.full((48, 64, 3), 90, np.uint8)
-    act, encode = loaded.executable.act, loaded.executable.encode
+    act, encode = loaded.runner.act, loaded.runner.encode
     return float(act(encode(rgb), STATE, HISTORY)[0, 0, 0])
 
 
@@ -57,7 +57,7 @@ def test_a_file_of_the_users_flies_and_finds_its_neighbours(folder: Path, form: 
     spec = form.format(folder)
     loaded = load(spec)
     assert throttle(loaded) == pytest.approx(0.25)
-    assert loaded.executable.name == spec
+    assert loaded.runner.name == spec
     assert throttle(load(spec, folder / "weights.txt")) == pytest.approx(0.5)
     assert "flying" not in sys.modules
 

@@ -13,7 +13,7 @@ from helpers.rollouts import (
     grey,
     make_sampler,
     make_start,
-    noise_executable,
+    noise_runner,
     write_flight,
 )
 from mavbridge.commands.imagine.inputs import RealFrames, read_start
@@ -85,13 +85,13 @@ def test_a_flight_that_starts_nothing_is_refused(
 def test_a_policy_of_another_frame_is_refused() -> None:
     other = Contract(feature_dim=1, arrays="numpy", state_frame="enu_flu")
     with pytest.raises(UserError, match=r"ned_frd.*enu_flu"):
-        PolicyDecider(noise_executable(other), make_sampler())
+        PolicyDecider(noise_runner(other), make_sampler())
 
 
 def test_a_policy_by_body_rates_is_refused() -> None:
     other = Contract(feature_dim=1, arrays="numpy", action="rates")
     with pytest.raises(UserError, match="flies by rates; flights are imagined from sticks"):
-        PolicyDecider(noise_executable(other), make_sampler())
+        PolicyDecider(noise_runner(other), make_sampler())
 
 
 def observe(contract: Contract) -> ObservationQueue:
@@ -101,7 +101,7 @@ def observe(contract: Contract) -> ObservationQueue:
 
 
 def test_an_action_is_the_mean_of_the_chunk_over_its_step() -> None:
-    ramp = noise_executable()
+    ramp = noise_runner()
     chunk = np.repeat(np.linspace(-0.8, 0.8, 16, dtype=np.float32)[None, :, None], 4, axis=2)
 
     def act(*_: object) -> FloatArray:
@@ -118,7 +118,7 @@ def test_an_action_is_the_mean_of_the_chunk_over_its_step() -> None:
 def test_a_policy_that_asks_for_the_image_s_age_is_told_that_nothing_moved() -> None:
     contract = Contract(feature_dim=1, arrays="numpy", since_exposure=True)
     states = []
-    plain = noise_executable(contract)
+    plain = noise_runner(contract)
 
     def act(feature: FloatArray, state: FloatArray, history: FloatArray) -> FloatArray:
         states.append(state)

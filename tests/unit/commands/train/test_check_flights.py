@@ -25,7 +25,7 @@ from policy.checkpoints.policy_file import save_checkpoint
 from policy.contract import Contract, FloatArray
 from policy.loading.request import LoadedPolicy
 from policy.nets.toge import Toge, TogeConfig
-from policy.protocol import Executable
+from policy.protocol import PolicyRunner
 from policy.training.settings import TrainSettings
 
 
@@ -63,10 +63,10 @@ def test_counts_the_gates_of_courses_that_nothing_else_flies_with_the_weights_in
     flown: list[int] = []
     features: list[FloatArray] = []
 
-    def fly(executable: Executable, *, course_seed: int, seed: int) -> EpisodeResult:
-        assert executable.dual_rate
+    def fly(runner: PolicyRunner, *, course_seed: int, seed: int) -> EpisodeResult:
+        assert runner.dual_rate
         flown.append(course_seed)
-        features.append(executable.encode(np.full((32, 32, 3), 128, np.uint8)))
+        features.append(runner.encode(np.full((32, 32, 3), 128, np.uint8)))
         return result(course_seed, seed, gates=2 * seed)
 
     monkeypatch.setattr("mavbridge.simulation.flight.SimulatedFlight", flights_by(fly))
@@ -91,7 +91,7 @@ def test_races_have_courses_of_their_own_to_check_by(
 ) -> None:
     flown: list[int] = []
 
-    def fly(_executable: Executable, *, course_seed: int, seed: int) -> EpisodeResult:
+    def fly(_runner: PolicyRunner, *, course_seed: int, seed: int) -> EpisodeResult:
         flown.append(course_seed)
         return result(course_seed, seed, gates=1)
 

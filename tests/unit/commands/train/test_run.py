@@ -59,12 +59,12 @@ def test_a_checkpoint_is_trained_and_loads_to_fly(
     assert "stick error" in printed.out
     request = PolicyRequest(spec="toge", checkpoint=out, engine="torch", num_diffusion_steps=2)
     loaded = load_policy(request, now_s=lambda: 0.0)
-    executable = loaded.executable
-    assert executable.contract.since_exposure
-    feature = executable.encode(np.zeros((48, 64, 3), np.uint8))
+    runner = loaded.runner
+    assert runner.contract.since_exposure
+    feature = runner.encode(np.zeros((48, 64, 3), np.uint8))
     state, history = np.zeros((1, 20), np.float32), np.zeros((1, 4, 4), np.float32)
     state[0, 3] = 1.0
-    assert executable.act(feature, state, history).shape == (1, 16, 4)
+    assert runner.act(feature, state, history).shape == (1, 16, 4)
 
 
 def test_a_world_model_is_trained(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

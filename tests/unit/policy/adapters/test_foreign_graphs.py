@@ -16,11 +16,11 @@ from onnx import TensorProto, helper
 
 from helpers import foreign_graphs as graphs
 from policy.adapters.drafts import onnx_entries
-from policy.engines.executable import level_state
+from policy.engines.runner import level_state
 from policy.errors import PolicyError
 from policy.loading.load import load_policy
 from policy.loading.request import PolicyRequest
-from policy.protocol import Executable
+from policy.protocol import PolicyRunner
 
 Write = Callable[[Path], None]
 
@@ -30,27 +30,27 @@ def own_cache(tmp_path_factory: pytest.TempPathFactory, monkeypatch: pytest.Monk
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path_factory.mktemp("cache")))
 
 
-def load(spec: str) -> Executable:
+def load(spec: str) -> PolicyRunner:
     request = PolicyRequest(spec=spec, dual_rate=False)
-    return load_policy(request, now_s=lambda: 0.0).executable
+    return load_policy(request, now_s=lambda: 0.0).runner
 
 
-def act(executable: Executable, *, vx_mps: float = 0.0, level: int = 0) -> np.ndarray:
+def act(runner: PolicyRunner, *, vx_mps: float = 0.0, level: int = 0) -> np.ndarray:
     """First action for a velocity and an evenly grey image."""
-    contract = executable.contract
+    contract = runner.contract
     state = level_state(contract)
     state[0, 0] = vx_mps
     rgb = np.full((contract.image_height, contract.image_width, 3), level, np.uint8)
     history = np.zeros((1, contract.history_len, 4), np.float32)
-    return executable.act(executable.join([[executable.encode(rgb)]]), state, history)[0, 0]
+    return runner.act(runner.join([[runner.encode(rgb)]]), state, history)[0, 0]
 
 
 @pytest.mark.parametrize("state", ["obs", "observation", "state", "input", "x.1"])
 def test_one_action_for_one_observation_flies_as_it_is(tmp_path: Path, state: str) -> None:
     graphs.write_contract(tmp_path)
     graphs.actor(tmp_path / "policy.onnx", state=state)
-    executable = load(f"onnx:{tmp_path}")
-    assert act(executable, vx_mps=2.0) == pytest.approx([0.2] * 4, abs=1e-3)
+    runner = load(f"onnx:{tmp_path}")
+    assert act(runner, vx_mps=2.0) == pytest.approx([0.2] * 4, abs=1e-3)
 
 
 def test_the_output_that_is_asked_for_is_flown(tmp_path: Path) -> None:
@@ -68,11 +68,11 @@ def test_a_hidden_state_goes_from_call_to_call_until_reset(tmp_path, hidden):
     graphs.recurrent(tmp_path / "policy.onnx", hidden=hidden)
     if hidden == ("h", "hn"):
         graphs.describe(tmp_path, hidden={"h": "hn"}, outputs={"chunk": "actions"})
-    executable = load(f"onnx:{tmp_path}")
+    runner = load(f"onnx:{tmp_path}")
     for _ in range(2):
-        throttles = [act(executable)[0] for _ in range(3)]
+        throttles = [act(runner)[0] for _ in range(3)]
         assert throttles == pytest.approx([0.1, 0.2, 0.3], abs=1e-3)
-        executable.reset()
+        runner.reset()
 
 
 @pytest.mark.parametrize(
@@ -87,9 +87,9 @@ def test_a_hidden_state_goes_from_call_to_call_until_reset(tmp_path, hidden):
 def test_the_element_type_says_what_a_pixel_is(tmp_path: Path, kind: int, white: float) -> None:
     graphs.write_contract(tmp_path)
     graphs.image_actor(tmp_path / "policy.onnx", kind=kind)
-    executable = load(f"onnx:{tmp_path}")
+    runner = load(f"onnx:{tmp_path}")
     for level in (0, 1, 128, 255):
-        assert act(executable, level=level) == pytest.approx([white * level / 255] * 4, rel=5e-3)
+        assert act(runner, level=level) == pytest.approx([white * level / 255] * 4, rel=5e-3)
 
 
 def external(folder: Path, change: Callable[[Path], object]) -> None:
@@ -214,18 +214,18 @@ def test_a_tuple_of_torchscript_needs_to_be_told_apart(tmp_path: Path) -> None:
 def test_a_torchscript_of_an_observation_alone_flies_as_it_is(tmp_path: Path) -> None:
     graphs.write_contract(tmp_path)
     graphs.save_script(tmp_path / "policy.pt", graphs.StateActor())
-    executable = load(f"torchscript:{tmp_path / 'policy.pt'}")
-    assert act(executable, vx_mps=2.0) == pytest.approx([0.2] * 4, abs=1e-3)
+    runner = load(f"torchscript:{tmp_path / 'policy.pt'}")
+    assert act(runner, vx_mps=2.0) == pytest.approx([0.2] * 4, abs=1e-3)
 
 
 def test_a_recurrent_torchscript_keeps_its_state_until_reset(tmp_path: Path) -> None:
     graphs.write_contract(tmp_path)
     graphs.save_script(tmp_path / "policy.pt", graphs.CountingActor())
-    executable = load(f"torchscript:{tmp_path / 'policy.pt'}")
+    runner = load(f"torchscript:{tmp_path / 'policy.pt'}")
     for _ in range(2):
-        throttles = [act(executable)[0] for _ in range(3)]
+        throttles = [act(runner)[0] for _ in range(3)]
         assert throttles == pytest.approx([0.1, 0.2, 0.3], abs=1e-3)
-        executable.reset()
+        runner.reset()
 
 
 class Deep(nn.Module):

@@ -13,7 +13,7 @@ from helpers.lerobot_checkpoints import SHAPES_FILE, weight
 from policy.adapters.lerobot.config import ENVIRONMENT_KEY
 from policy.adapters.lerobot.plan import read_plan
 from policy.adapters.lerobot.policy import LeRobotDiffusion, build_policy_of
-from policy.engines.executable import level_state
+from policy.engines.runner import level_state
 from policy.loading.load import load_policy
 from policy.loading.request import PolicyRequest
 
@@ -77,15 +77,15 @@ def test_the_condition_is_state_images_environment_as_in_lerobot(folder: Path) -
 
 def test_it_is_loaded_and_steers_by_its_goal(folder: Path) -> None:
     request = PolicyRequest(spec=f"lerobot:{folder}", num_diffusion_steps=4, engine="torch")
-    executable = load_policy(request, now_s=lambda: 0.0).executable
-    contract = executable.contract
+    runner = load_policy(request, now_s=lambda: 0.0).runner
+    contract = runner.contract
     rgb = np.zeros((contract.image_height, contract.image_width, 3), np.uint8)
-    encoded = executable.join([[executable.encode(rgb)]] * contract.observation_steps)
+    encoded = runner.join([[runner.encode(rgb)]] * contract.observation_steps)
     history = np.zeros((1, contract.history_len, 4), np.float32)
     chunks = []
     for goal_x_m in (0.0, 20.0):
         state = level_state(contract)
         state[..., 13] = goal_x_m
-        chunks.append(executable.act(encoded, state, history))
+        chunks.append(runner.act(encoded, state, history))
     assert chunks[0].shape == (1, 7, 4)
     assert not np.allclose(chunks[0], chunks[1])

@@ -13,11 +13,11 @@ from policy.adapters.lerobot.plan import read_plan
 from policy.adapters.lerobot.policy import load_policy_of
 from policy.contract import STATE_NAMES
 from policy.engines.choose import chunks_of_samples
-from policy.engines.executable import ExecutionSettings
-from policy.engines.openvino_modules import ModuleConverter, make_module_executable
+from policy.engines.openvino_modules import ModuleConverter, make_module_runner
 from policy.engines.parity import make_parity_samples
+from policy.engines.runner import ExecutionSettings
 from policy.engines.stepwise import solver_segment
-from policy.engines.torch_eager import make_torch_executable
+from policy.engines.torch_eager import make_torch_runner
 from policy.errors import CheckpointError
 from policy.protocol import StepwisePolicy
 
@@ -154,10 +154,10 @@ def test_the_openvino_engine_computes_the_same(golden):
     _, _, policy, _ = golden
     settings = ExecutionSettings(name="lerobot", num_diffusion_steps=2)
     converter = ModuleConverter(policy, "lerobot")
-    graphs = make_module_executable(policy, settings, "f32", "f32", converter)
+    graphs = make_module_runner(policy, settings, "f32", "f32", converter)
     samples = make_parity_samples(policy.contract)
     samples.state[..., STATE_NAMES.index(STATE[12])] = policy._state.shift[12]  # a constant there
-    expected = chunks_of_samples(make_torch_executable(policy, settings), samples)
+    expected = chunks_of_samples(make_torch_runner(policy, settings), samples)
     found = chunks_of_samples(graphs, samples)
     np.testing.assert_allclose(found, expected, rtol=0, atol=1e-3 * np.abs(expected).max())
 

@@ -13,7 +13,7 @@ from policy.engines.parity import make_parity_samples, parity_failure
 from policy.errors import PolicyError
 from policy.loading.load import check_request, load_policy, read_policy_contract
 from policy.loading.request import PolicyRequest
-from policy.protocol import Executable
+from policy.protocol import PolicyRunner
 
 pytestmark = [
     pytest.mark.filterwarnings("ignore:.*torch.jit:DeprecationWarning"),
@@ -33,12 +33,12 @@ def own_cache(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
 
 
-def loaded(request: PolicyRequest) -> tuple[Executable, str]:
+def loaded(request: PolicyRequest) -> tuple[PolicyRunner, str]:
     policy = load_policy(request, now_s=lambda: 0.0)
-    return policy.executable, "\n".join(policy.notes)
+    return policy.runner, "\n".join(policy.notes)
 
 
-def require_same(a: Executable, b: Executable) -> None:
+def require_same(a: PolicyRunner, b: PolicyRunner) -> None:
     samples = make_parity_samples(a.contract)
     assert parity_failure(chunks_of_samples(a, samples), chunks_of_samples(b, samples)) is None
 
@@ -61,9 +61,9 @@ def test_a_class_that_names_its_modules_flies_converted(name: str, dual_rate: bo
         dual_rate=dual_rate,
         num_diffusion_steps=4,
     )
-    executable, notes = loaded(request)
-    assert executable.engine.startswith("openvino"), notes
-    assert executable.contract.feature_dim == (0 if name == "ForwardOnly" else DUAL.feature_dim)
+    runner, notes = loaded(request)
+    assert runner.engine.startswith("openvino"), notes
+    assert runner.contract.feature_dim == (0 if name == "ForwardOnly" else DUAL.feature_dim)
 
 
 def test_modules_that_make_no_policy_are_refused() -> None:
@@ -106,10 +106,10 @@ def test_an_archive_with_named_modules_says_all_of_itself(tmp_path: Path) -> Non
     path = archive(tmp_path, Container(NamedDenoiser()), described(schedule=schedule))
     request = PolicyRequest(spec=f"torchscript:{path}", num_diffusion_steps=4)
     assert read_policy_contract(request).horizon == SINGLE.horizon
-    executable, notes = loaded(request)
-    assert executable.engine.startswith("openvino"), notes
+    runner, notes = loaded(request)
+    assert runner.engine.startswith("openvino"), notes
     mine = PolicyRequest(spec="helpers.torch_policies:NamedDenoiser", num_diffusion_steps=4)
-    require_same(executable, loaded(mine)[0])
+    require_same(runner, loaded(mine)[0])
 
 
 def test_an_archive_with_forward_flies_by_a_contract_file(tmp_path: Path) -> None:
@@ -118,10 +118,10 @@ def test_an_archive_with_forward_flies_by_a_contract_file(tmp_path: Path) -> Non
     request = PolicyRequest(
         spec=f"torchscript:{path}", contract_file=tmp_path / "mine.toml", dual_rate=False
     )
-    executable, notes = loaded(request)
-    assert executable.engine.startswith("openvino"), notes
+    runner, notes = loaded(request)
+    assert runner.engine.startswith("openvino"), notes
     mine = PolicyRequest(spec="helpers.torch_policies:ForwardOnly", dual_rate=False)
-    require_same(executable, loaded(mine)[0])
+    require_same(runner, loaded(mine)[0])
     with pytest.raises(PolicyError, match=r"give --contract FILE\.toml"):
         check_request(PolicyRequest(spec=f"torchscript:{path}"))
 
@@ -136,12 +136,12 @@ class Branching(nn.Module):
 
 def test_the_decisions_of_a_script_are_kept(tmp_path: Path) -> None:
     path = archive(tmp_path, Branching(), described())
-    executable, _ = loaded(PolicyRequest(spec=f"torchscript:{path}", dual_rate=False))
-    image = executable.encode(make_parity_samples(SINGLE).rgb[0])
+    runner, _ = loaded(PolicyRequest(spec=f"torchscript:{path}", dual_rate=False))
+    image = runner.encode(make_parity_samples(SINGLE).rgb[0])
     history = torch.zeros(1, 4, 4).numpy()
     for vx, throttle in ((1.0, 0.5), (-1.0, 0.0)):
         state = torch.tensor([[vx, 0, 0, 1, *[0] * 9]]).numpy()
-        assert executable.act(image, state, history)[0, 0, 0] == throttle
+        assert runner.act(image, state, history)[0, 0, 0] == throttle
 
 
 @pytest.mark.parametrize(

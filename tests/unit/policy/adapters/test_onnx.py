@@ -16,15 +16,15 @@ from policy.adapters.onnx import policies
 from policy.adapters.onnx.graphs import GraphFile, Ports, Wanted
 from policy.contract import Contract
 from policy.engines.choose import chunks_of_samples
-from policy.engines.executable import ExecutionSettings
 from policy.engines.parity import make_parity_samples, parity_failure
-from policy.engines.torch_eager import make_torch_executable
+from policy.engines.runner import ExecutionSettings
+from policy.engines.torch_eager import make_torch_runner
 from policy.errors import PolicyError
 from policy.loading.load import check_request, load_policy, read_policy_contract
 from policy.loading.request import PolicyRequest
 from policy.nets.resnet_unet import ResnetUnet, ResnetUnetConfig
 from policy.nets.toge import Toge
-from policy.protocol import Executable
+from policy.protocol import PolicyRunner
 
 STEPS = 4
 
@@ -43,18 +43,18 @@ def exported_toge(trained_toge: Toge, tmp_path_factory: pytest.TempPathFactory) 
     return folder
 
 
-def loaded(request: PolicyRequest) -> tuple[Executable, str]:
+def loaded(request: PolicyRequest) -> tuple[PolicyRunner, str]:
     policy = load_policy(request, now_s=lambda: 0.0)
-    return policy.executable, "\n".join(policy.notes)
+    return policy.runner, "\n".join(policy.notes)
 
 
 def reference(
     policy: OurPolicy | TwoRates | ForwardOnly, settings: ExecutionSettings
-) -> Executable:
-    return make_torch_executable(policy, settings)  # type: ignore[arg-type]
+) -> PolicyRunner:
+    return make_torch_runner(policy, settings)  # type: ignore[arg-type]
 
 
-def require_same(a: Executable, b: Executable) -> None:
+def require_same(a: PolicyRunner, b: PolicyRunner) -> None:
     samples = make_parity_samples(a.contract)
     assert parity_failure(chunks_of_samples(a, samples), chunks_of_samples(b, samples)) is None
 
@@ -71,12 +71,12 @@ def test_our_policy_is_the_same_from_image_to_stick(trained_toge, exported_toge,
         dual_rate=dual_rate,
         num_diffusion_steps=STEPS,
     )
-    executable, notes = loaded(request)
-    assert executable.engine.startswith("openvino")
-    assert "agrees with float32" in notes or executable.engine == "openvino-f32"
-    assert executable.contract == replace(trained_toge.contract, arrays="numpy")
+    runner, notes = loaded(request)
+    assert runner.engine.startswith("openvino")
+    assert "agrees with float32" in notes or runner.engine == "openvino-f32"
+    assert runner.contract == replace(trained_toge.contract, arrays="numpy")
     trained_toge.seed_noise(0)
-    require_same(executable, reference(trained_toge, settings))
+    require_same(runner, reference(trained_toge, settings))
 
 
 def test_the_archive_of_our_policy_is_the_same(trained_toge: Toge, tmp_path: Path) -> None:
@@ -84,9 +84,9 @@ def test_the_archive_of_our_policy_is_the_same(trained_toge: Toge, tmp_path: Pat
     request = PolicyRequest(spec=f"torchscript:{tmp_path / 'toge.pt'}", num_diffusion_steps=STEPS)
     trained_toge.seed_noise(0)
     settings = ExecutionSettings(name="toge", num_diffusion_steps=STEPS)
-    executable, notes = loaded(request)
-    assert executable.engine.startswith("openvino"), notes
-    require_same(executable, reference(trained_toge, settings))
+    runner, notes = loaded(request)
+    assert runner.engine.startswith("openvino"), notes
+    require_same(runner, reference(trained_toge, settings))
 
 
 def test_a_single_rate_policy_of_ours_gains_a_fast_path(tmp_path: Path) -> None:
@@ -102,9 +102,9 @@ def test_a_single_rate_policy_of_ours_gains_a_fast_path(tmp_path: Path) -> None:
         request = PolicyRequest(
             spec=f"onnx:{tmp_path}", dual_rate=dual_rate, num_diffusion_steps=STEPS
         )
-        executable, _ = loaded(request)
-        assert executable.dual_rate == dual_rate
-        chunks = chunks_of_samples(executable, samples)
+        runner, _ = loaded(request)
+        assert runner.dual_rate == dual_rate
+        chunks = chunks_of_samples(runner, samples)
         assert parity_failure(chunks_of_samples(expected, samples), chunks) is None
 
 
@@ -132,20 +132,20 @@ def test_one_file_by_the_names_of_a_contract_file(tmp_path: Path) -> None:
         "[contract]\nimage_height = 32\nimage_width = 32\nhorizon = 8\n"
     )
     request = PolicyRequest(spec=f"onnx:{tmp_path / 'mine.onnx'}", dual_rate=False)
-    executable, notes = loaded(request)
+    runner, notes = loaded(request)
     assert "mine.onnx" in notes
     samples = make_parity_samples(SINGLE)
     for rgb, state, chunk in zip(
-        samples.rgb, samples.state, chunks_of_samples(executable, samples), strict=True
+        samples.rgb, samples.state, chunks_of_samples(runner, samples), strict=True
     ):
-        image = torch.from_numpy(loaded_image(executable, rgb))
+        image = torch.from_numpy(loaded_image(runner, rgb))
         with torch.inference_mode():
             wanted = policy(image.reshape(IMAGE), torch.from_numpy(state[None]))[0].numpy()
         np.testing.assert_allclose(chunk, wanted, atol=0.01)
 
 
-def loaded_image(executable: Executable, rgb: np.ndarray) -> np.ndarray:
-    return executable.encode(rgb)
+def loaded_image(runner: PolicyRunner, rgb: np.ndarray) -> np.ndarray:
+    return runner.encode(rgb)
 
 
 def test_an_encoder_and_a_head(tmp_path: Path) -> None:
@@ -157,9 +157,9 @@ def test_an_encoder_and_a_head(tmp_path: Path) -> None:
     (tmp_path / "policy.json").write_text(json.dumps(description))
     request = PolicyRequest(spec=f"onnx:{tmp_path}")
     assert read_policy_contract(request).feature_dim == 0
-    executable, _ = loaded(request)
-    assert executable.contract.feature_dim == DUAL.feature_dim
-    require_same(executable, reference(policy, ExecutionSettings(name="it")))
+    runner, _ = loaded(request)
+    assert runner.contract.feature_dim == DUAL.feature_dim
+    require_same(runner, reference(policy, ExecutionSettings(name="it")))
 
 
 @pytest.mark.parametrize("dual_rate", [True, False])
@@ -171,17 +171,17 @@ def test_several_cameras_and_observations(tmp_path: Path, dual_rate: bool) -> No
     description = {"contract": json.loads(WIDE.to_json()), "schedule": {"prediction": "sample"}}
     (tmp_path / "policy.json").write_text(json.dumps(description))
     flags: dict[str, Any] = {"dual_rate": dual_rate, "num_diffusion_steps": STEPS}
-    executable, _ = loaded(PolicyRequest(spec=f"onnx:{tmp_path}", **flags))
+    runner, _ = loaded(PolicyRequest(spec=f"onnx:{tmp_path}", **flags))
     mine = PolicyRequest(spec="helpers.torch_policies:Wide", engine="torch", **flags)
-    require_same(executable, loaded(mine)[0])
+    require_same(runner, loaded(mine)[0])
 
 
 def test_bf16_is_flown_only_where_it_agrees(exported_toge, monkeypatch):
     failures = iter(["a stick is off", "a stick is off"])
     monkeypatch.setattr(policies, "precisions", lambda: (("bf16", "bf16"), ("f32", "f32")))
     monkeypatch.setattr(policies, "parity_failure", lambda *_: next(failures))
-    executable, notes = loaded(PolicyRequest(spec=f"onnx:{exported_toge}"))
-    assert executable.engine == "openvino-f32"
+    runner, notes = loaded(PolicyRequest(spec=f"onnx:{exported_toge}"))
+    assert runner.engine == "openvino-f32"
     assert "openvino-bf16 is passed over: a stick is off" in notes
 
 

@@ -10,13 +10,13 @@ import pytest
 import torch
 
 from policy.contract import Contract, FloatArray
-from policy.engines.choose import Candidate, choose_executable, first_that_agrees
-from policy.engines.executable import ExecutionSettings
+from policy.engines.choose import Candidate, choose_runner, first_that_agrees
 from policy.engines.parity import MAX_STICK_ERROR
-from policy.engines.torch_eager import make_torch_executable
+from policy.engines.runner import ExecutionSettings
+from policy.engines.torch_eager import make_torch_runner
 from policy.errors import PolicyError
 from policy.nets.toge import Toge
-from policy.protocol import Executable
+from policy.protocol import PolicyRunner
 
 SETTINGS = ExecutionSettings(name="toge", num_diffusion_steps=2)
 
@@ -24,8 +24,8 @@ SETTINGS = ExecutionSettings(name="toge", num_diffusion_steps=2)
 def altered(policy: Toge, alter: Callable[[FloatArray], FloatArray]) -> Candidate:
     """An engine that gets the chunks wrong."""
 
-    def make() -> Executable:
-        right = make_torch_executable(policy, SETTINGS)
+    def make() -> PolicyRunner:
+        right = make_torch_runner(policy, SETTINGS)
 
         def act(*arrays: Any) -> FloatArray:
             return alter(right.act(*arrays))
@@ -36,7 +36,7 @@ def altered(policy: Toge, alter: Callable[[FloatArray], FloatArray]) -> Candidat
 
 
 def failing(error: Exception) -> Candidate:
-    def make() -> Executable:
+    def make() -> PolicyRunner:
         raise error
 
     return ("broken", make)
@@ -63,8 +63,8 @@ def shifted(chunk: FloatArray) -> FloatArray:
     ],
 )
 def test_a_wrong_engine_is_passed_over_with_its_reason(small_toge, alter, reason):
-    executable, notes = first_that_agrees(small_toge, [altered(small_toge, alter)], SETTINGS)
-    assert executable.engine == "torch"
+    runner, notes = first_that_agrees(small_toge, [altered(small_toge, alter)], SETTINGS)
+    assert runner.engine == "torch"
     assert len(notes) == 1
     assert notes[0].startswith("warning: engine wrong is passed over: ")
     assert re.search(reason, notes[0])
@@ -76,8 +76,8 @@ def test_a_wrong_engine_is_passed_over_with_its_reason(small_toge, alter, reason
 )
 def test_an_engine_that_fails_is_passed_over(small_toge: Toge, error: Exception) -> None:
     right = altered(small_toge, lambda chunk: chunk)
-    executable, notes = first_that_agrees(small_toge, [failing(error), right], SETTINGS)
-    assert executable.engine == "wrong"  # by name only
+    runner, notes = first_that_agrees(small_toge, [failing(error), right], SETTINGS)
+    assert runner.engine == "wrong"  # by name only
     assert "engine broken is passed over" in notes[0]
     assert notes[0].endswith("no memory")
     assert "agrees with torch" in notes[1]
@@ -85,10 +85,10 @@ def test_an_engine_that_fails_is_passed_over(small_toge: Toge, error: Exception)
 
 def test_without_openvino_torch_flies(small_toge: Toge, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("policy.engines.choose.find_spec", lambda name: None)
-    executable, _ = choose_executable(small_toge, "auto", SETTINGS)
-    assert executable.engine == "torch"
+    runner, _ = choose_runner(small_toge, "auto", SETTINGS)
+    assert runner.engine == "torch"
     with pytest.raises(PolicyError, match="pip install openvino"):
-        choose_executable(small_toge, "openvino", SETTINGS)
+        choose_runner(small_toge, "openvino", SETTINGS)
 
 
 @pytest.mark.parametrize(
@@ -101,7 +101,7 @@ def test_without_openvino_torch_flies(small_toge: Toge, monkeypatch: pytest.Monk
 def test_an_engine_asked_for_on_the_wrong_device_is_refused(small_toge, engine, device, message):
     settings = replace(SETTINGS, vision_device=device, action_device=device)
     with pytest.raises(PolicyError, match=message):
-        choose_executable(small_toge, engine, settings)
+        choose_runner(small_toge, engine, settings)
 
 
 def test_engines_of_our_networks_do_not_take_others() -> None:
@@ -114,6 +114,6 @@ def test_engines_of_our_networks_do_not_take_others() -> None:
 
     policy = Other(Contract())
     single = replace(SETTINGS, dual_rate=False)
-    assert choose_executable(policy, "auto", single)[0].engine == "torch"
+    assert choose_runner(policy, "auto", single)[0].engine == "torch"
     with pytest.raises(PolicyError, match=r"takes a torch\.nn\.Module"):
-        choose_executable(policy, "openvino", single)
+        choose_runner(policy, "openvino", single)

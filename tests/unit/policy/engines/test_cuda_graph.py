@@ -9,11 +9,11 @@ import torch
 
 from policy.checkpoints.policy_file import BuiltinConfig, build_policy
 from policy.contract import Contract, FloatArray
-from policy.engines.choose import choose_executable, chunks_of_samples
-from policy.engines.cuda_graph import make_cuda_graph_executable
-from policy.engines.executable import ExecutionSettings
+from policy.engines.choose import choose_runner, chunks_of_samples
+from policy.engines.cuda_graph import make_cuda_graph_runner
 from policy.engines.parity import make_parity_samples, parity_failure
-from policy.engines.torch_eager import make_torch_executable
+from policy.engines.runner import ExecutionSettings
+from policy.engines.torch_eager import make_torch_runner
 from policy.nets.names import Size
 from policy.nets.resnet_unet import ResnetUnetConfig
 from policy.nets.toge import Toge, TogeConfig
@@ -36,10 +36,8 @@ def test_toge_computes_what_torch_computes(size: Size, since_exposure: bool) -> 
     contract = replace(SMALL, since_exposure=since_exposure)
     config: BuiltinConfig = TogeConfig(size=size, contract=contract)
     policy, samples = build_policy(config).eval(), make_parity_samples(contract)
-    expected = chunks_of_samples(
-        make_torch_executable(policy, ExecutionSettings(name="t")), samples
-    )
-    chunks = chunks_of_samples(make_cuda_graph_executable(policy, ON_GPU), samples)
+    expected = chunks_of_samples(make_torch_runner(policy, ExecutionSettings(name="t")), samples)
+    chunks = chunks_of_samples(make_cuda_graph_runner(policy, ON_GPU), samples)
     assert parity_failure(expected, chunks) is None
 
 
@@ -50,52 +48,50 @@ def test_single_rate_computes_what_torch_computes() -> None:
         make_parity_samples(SMALL),
     )
     settings = ExecutionSettings(name="r", dual_rate=False)
-    expected = chunks_of_samples(make_torch_executable(policy, settings), samples)
+    expected = chunks_of_samples(make_torch_runner(policy, settings), samples)
     on_gpu = ExecutionSettings(
         name="r", dual_rate=False, vision_device="cuda", action_device="cuda"
     )
     assert (
-        parity_failure(
-            expected, chunks_of_samples(make_cuda_graph_executable(policy, on_gpu), samples)
-        )
+        parity_failure(expected, chunks_of_samples(make_cuda_graph_runner(policy, on_gpu), samples))
         is None
     )
 
 
 def test_the_default_on_a_gpu_is_the_graph(small_toge: Toge) -> None:
-    executable, notes = choose_executable(small_toge, "auto", ON_GPU)
-    assert executable.engine == "cuda-graph", notes
+    runner, notes = choose_runner(small_toge, "auto", ON_GPU)
+    assert runner.engine == "cuda-graph", notes
 
 
 def test_the_same_inputs_give_the_same_sticks(small_toge: Toge) -> None:
-    executable = make_cuda_graph_executable(small_toge, ON_GPU)
+    runner = make_cuda_graph_runner(small_toge, ON_GPU)
     samples = make_parity_samples(small_toge.contract)
-    first, second = (chunks_of_samples(executable, samples) for _ in range(2))
+    first, second = (chunks_of_samples(runner, samples) for _ in range(2))
     np.testing.assert_array_equal(first, second)
 
 
 def test_the_shipped_policy_is_that_of_torch(trained_toge: Toge) -> None:
     samples = make_parity_samples(trained_toge.contract)
     expected = chunks_of_samples(
-        make_torch_executable(trained_toge, ExecutionSettings(name="t")), samples
+        make_torch_runner(trained_toge, ExecutionSettings(name="t")), samples
     )
-    chunks = chunks_of_samples(make_cuda_graph_executable(trained_toge, ON_GPU), samples)
+    chunks = chunks_of_samples(make_cuda_graph_runner(trained_toge, ON_GPU), samples)
     assert parity_failure(expected, chunks) is None
 
 
 def test_both_paths_at_once_do_not_touch_each_other(small_toge: Toge) -> None:
-    executable, samples = make_cuda_graph_executable(small_toge, ON_GPU), make_parity_samples(SMALL)
+    runner, samples = make_cuda_graph_runner(small_toge, ON_GPU), make_parity_samples(SMALL)
     rgb = samples.rgb[:, :32, :32]
-    features = [executable.encode(image) for image in rgb]
+    features = [runner.encode(image) for image in rgb]
     state, history = samples.state[:1], samples.history[:1]
-    chunk = executable.act(features[0], state, history)
+    chunk = runner.act(features[0], state, history)
 
     def encode_all() -> list[FloatArray]:
-        return [executable.encode(rgb[index % len(rgb)]) for index in range(100)]
+        return [runner.encode(rgb[index % len(rgb)]) for index in range(100)]
 
     with ThreadPoolExecutor(1) as vision:
         pending = vision.submit(encode_all)
         for _ in range(100):
-            np.testing.assert_array_equal(executable.act(features[0], state, history), chunk)
+            np.testing.assert_array_equal(runner.act(features[0], state, history), chunk)
         for index, feature in enumerate(pending.result(60)):
             np.testing.assert_array_equal(feature, features[index % len(rgb)])

@@ -7,8 +7,8 @@ import pytest
 import torch
 
 from policy.contract import Contract
-from policy.engines.executable import ExecutionSettings, make_numpy_executable
-from policy.engines.torch_eager import make_torch_executable
+from policy.engines.runner import ExecutionSettings, make_numpy_runner
+from policy.engines.torch_eager import make_torch_runner
 from policy.errors import PolicyError
 from policy.nets.toge import Toge
 from policy.preprocess import image_to_input
@@ -28,12 +28,10 @@ def frozen(array: np.ndarray) -> np.ndarray:
 
 
 def test_dual_rate_torch_matches_the_net_called_directly(small_toge: Toge) -> None:
-    executable = make_torch_executable(
-        small_toge, ExecutionSettings(name="toge", num_diffusion_steps=3)
-    )
-    assert (executable.engine, executable.dual_rate) == ("torch", True)
-    feature = executable.encode(RGB)
-    chunk = executable.act(frozen(feature), frozen(STATE), frozen(HISTORY))
+    runner = make_torch_runner(small_toge, ExecutionSettings(name="toge", num_diffusion_steps=3))
+    assert (runner.engine, runner.dual_rate) == ("torch", True)
+    feature = runner.encode(RGB)
+    chunk = runner.act(frozen(feature), frozen(STATE), frozen(HISTORY))
     image = torch.tensor(image_to_input(RGB, small_toge.contract))
     with torch.inference_mode():
         expected = small_toge.predict(image, torch.tensor(STATE), torch.tensor(HISTORY), 3)
@@ -43,7 +41,7 @@ def test_dual_rate_torch_matches_the_net_called_directly(small_toge: Toge) -> No
 
 def test_single_rate_carries_the_image_to_act(small_toge: Toge) -> None:
     dual, single = (
-        make_torch_executable(
+        make_torch_runner(
             small_toge, ExecutionSettings(name="toge", num_diffusion_steps=2, dual_rate=dual_rate)
         )
         for dual_rate in (True, False)
@@ -58,24 +56,22 @@ def test_single_rate_carries_the_image_to_act(small_toge: Toge) -> None:
 @pytest.mark.parametrize("dual_rate", [True, False])
 def test_numpy_policies_are_called_as_they_are(dual_rate: bool) -> None:
     policy = ScriptedPolicy("hover", lambda: 0.0)
-    executable = make_numpy_executable(
-        policy, ExecutionSettings(name="scripted", dual_rate=dual_rate)
-    )
-    assert executable.engine == "numpy"
-    encoded = executable.encode(RGB)
+    runner = make_numpy_runner(policy, ExecutionSettings(name="scripted", dual_rate=dual_rate))
+    assert runner.engine == "numpy"
+    encoded = runner.encode(RGB)
     assert encoded.shape == ((1, 8) if dual_rate else (1, 3, 224, 224))
-    chunk = executable.act(encoded, STATE, HISTORY)
+    chunk = runner.act(encoded, STATE, HISTORY)
     np.testing.assert_array_equal(
         chunk, policy.predict_fast(np.zeros((1, 8), np.float32), STATE, HISTORY, 10)
     )
 
 
-@pytest.mark.parametrize("make", [make_numpy_executable, make_torch_executable])
+@pytest.mark.parametrize("make", [make_numpy_runner, make_torch_runner])
 def test_a_persons_policy_that_asks_gets_the_motion_since_the_exposure(make):
     seen: list[tuple[int, ...]] = []
     policy = Fake(act=lambda feature, state: seen.append(tuple(state.shape)) or CHUNK)
     policy.contract = replace(policy.contract, since_exposure=True)
-    if make is make_torch_executable:
+    if make is make_torch_runner:
         policy = Fake(
             encode=lambda _: torch.zeros(1, 2),
             act=lambda feature, state: seen.append(tuple(state.shape)) or torch.tensor(CHUNK),
@@ -125,14 +121,14 @@ def raises(error: Exception) -> Callable[..., Any]:
 )
 def test_a_policy_that_breaks_its_contract_never_flies(parts, message):
     with pytest.raises(PolicyError, match=message):
-        make_numpy_executable(Fake(**parts), ExecutionSettings(name="fake"))
+        make_numpy_runner(Fake(**parts), ExecutionSettings(name="fake"))
 
 
 def test_torch_policies_must_return_tensors() -> None:
     policy = Fake()
     policy.contract = replace(policy.contract, arrays="torch")
     with pytest.raises(PolicyError, match="returned ndarray; its contract says torch"):
-        make_torch_executable(policy, ExecutionSettings(name="fake"))
+        make_torch_runner(policy, ExecutionSettings(name="fake"))
 
 
 def test_dual_rate_needs_a_fast_path() -> None:
@@ -142,4 +138,4 @@ def test_dual_rate_needs_a_fast_path() -> None:
 
     policy: SingleRatePolicy = Slow()
     with pytest.raises(PolicyError, match="fly it single-rate"):
-        make_numpy_executable(policy, ExecutionSettings(name="slow"))
+        make_numpy_runner(policy, ExecutionSettings(name="slow"))

@@ -13,10 +13,10 @@ from torch import nn
 from helpers import torch_policies
 from helpers.torch_policies import PlainClass, Stepwise, TwoRates
 from policy.engines import openvino_modules
-from policy.engines.choose import choose_executable, chunks_of_samples
-from policy.engines.executable import ExecutionSettings
+from policy.engines.choose import choose_runner, chunks_of_samples
 from policy.engines.parity import make_parity_samples, parity_failure
-from policy.engines.torch_eager import make_torch_executable
+from policy.engines.runner import ExecutionSettings
+from policy.engines.torch_eager import make_torch_runner
 from policy.protocol import SingleRatePolicy
 
 SETTINGS = ExecutionSettings(name="mine", num_diffusion_steps=4)
@@ -30,11 +30,11 @@ def own_cache(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
 
 
 def require_parity(policy: SingleRatePolicy, settings: ExecutionSettings) -> None:
-    executable, notes = choose_executable(policy, "auto", settings)
-    assert executable.engine.startswith("openvino"), notes
+    runner, notes = choose_runner(policy, "auto", settings)
+    assert runner.engine.startswith("openvino"), notes
     samples = make_parity_samples(policy.contract)
-    expected = chunks_of_samples(make_torch_executable(policy, settings), samples)
-    assert parity_failure(expected, chunks_of_samples(executable, samples)) is None
+    expected = chunks_of_samples(make_torch_runner(policy, settings), samples)
+    assert parity_failure(expected, chunks_of_samples(runner, samples)) is None
 
 
 @pytest.mark.parametrize("make", [TwoRates, PlainClass])
@@ -55,8 +55,8 @@ def test_modules_fly_converted(make: type[SingleRatePolicy], dual_rate: bool) ->
 )
 def test_what_a_graph_cannot_do_runs_in_torch_and_says_why(name: str, reason: str) -> None:
     policy = getattr(torch_policies, name)()
-    executable, notes = choose_executable(policy, "auto", SETTINGS)
-    assert executable.engine == "torch"
+    runner, notes = choose_runner(policy, "auto", SETTINGS)
+    assert runner.engine == "torch"
     assert notes
     assert all(re.search(reason, note) for note in notes)
 
@@ -71,8 +71,8 @@ def test_a_solver_that_is_no_policy_s_own_step_is_not_unrolled_over_its_weights(
     monkeypatch.setattr(openvino_modules, "MAX_WEIGHTS", weights)
     require_parity(Stepwise(), SETTINGS)
     monkeypatch.delattr(Stepwise, "to_chunk")  # so that it is no StepwisePolicy
-    executable, notes = choose_executable(Stepwise(), "auto", SETTINGS)
-    assert executable.engine == "torch"
+    runner, notes = choose_runner(Stepwise(), "auto", SETTINGS)
+    assert runner.engine == "torch"
     assert "weights, each counted as often as it is used" in notes[0]
     assert "protocol.StepwisePolicy" in notes[0]
 

@@ -9,15 +9,15 @@ from torch import Tensor, nn
 
 from policy.contract import Contract
 from policy.engines.choose import chunks_of_samples
-from policy.engines.executable import (
+from policy.engines.parity import make_parity_samples, parity_failure
+from policy.engines.runner import (
     ExecutionSettings,
     encode_all,
     level_state,
-    make_numpy_executable,
+    make_numpy_runner,
 )
-from policy.engines.parity import make_parity_samples, parity_failure
-from policy.engines.torch_eager import make_torch_executable
-from policy.protocol import Executable
+from policy.engines.torch_eager import make_torch_runner
+from policy.protocol import PolicyRunner
 
 SMALL = {"image_height": 16, "image_width": 24, "horizon": 2, "feature_dim": 3}
 GREYS = np.array([[10, 20], [30, 40]], np.uint8)
@@ -54,12 +54,12 @@ class Remembering:
     predict = predict_fast
 
 
-def seen_by(executable: Executable, policy: Remembering) -> tuple[np.ndarray, np.ndarray]:
-    contract = executable.contract
+def seen_by(runner: PolicyRunner, policy: Remembering) -> tuple[np.ndarray, np.ndarray]:
+    contract = runner.contract
     steps, cameras = contract.observation_steps, len(contract.cameras)
     rgb = np.empty((steps, cameras, 30, 40, 3), np.uint8)
     rgb[:] = GREYS[:steps, :cameras, None, None, None]
-    executable.act(encode_all(executable, rgb), level_state(contract), HISTORY)
+    runner.act(encode_all(runner, rgb), level_state(contract), HISTORY)
     encoded, state = policy.given
     assert state.shape == (1, *contract.state_shape)
     return encoded, state
@@ -76,8 +76,8 @@ def seen_by(executable: Executable, policy: Remembering) -> tuple[np.ndarray, np
 )
 def test_features_stand_side_by_side_by_camera_and_oldest_first(steps, cameras, expected):
     policy = Remembering(contract_of(steps, cameras))
-    executable = make_numpy_executable(policy, ExecutionSettings(name="mine"))
-    feature, _ = seen_by(executable, policy)
+    runner = make_numpy_runner(policy, ExecutionSettings(name="mine"))
+    feature, _ = seen_by(runner, policy)
     assert feature.shape == (1, *policy.contract.feature_shape)
     np.testing.assert_allclose(feature[0], expected, atol=1e-4)
 
@@ -89,7 +89,7 @@ def test_features_stand_side_by_side_by_camera_and_oldest_first(steps, cameras, 
 def test_single_rate_images_keep_camera_and_time_apart(steps, cameras, expected):
     policy = Remembering(contract_of(steps, cameras))
     settings = ExecutionSettings(name="mine", dual_rate=False)
-    image, _ = seen_by(make_numpy_executable(policy, settings), policy)
+    image, _ = seen_by(make_numpy_runner(policy, settings), policy)
     assert image.shape == (1, *policy.contract.image_shape)
     np.testing.assert_allclose(image[0].mean(axis=(-3, -2, -1)), expected, atol=1e-4)
 
@@ -124,13 +124,13 @@ def test_openvino_computes_what_torch_computes(steps: int, cameras: int) -> None
         torch.manual_seed(0)
         module = Mixing(contract_of(steps, cameras, "torch")).eval()
     settings, samples = ExecutionSettings(name="mixing"), make_parity_samples(module.contract)
-    expected = chunks_of_samples(make_torch_executable(module, settings), samples)
-    made = openvino_cpu.make_openvino_executable(module, settings, "f32", "f32")
+    expected = chunks_of_samples(make_torch_runner(module, settings), samples)
+    made = openvino_cpu.make_openvino_runner(module, settings, "f32", "f32")
     assert parity_failure(expected, chunks_of_samples(made, samples)) is None
     # The gate sees a camera that takes the other's place, and a state that takes its successor's.
     if cameras > 1:
         module.eyes = nn.ModuleList(reversed(module.eyes))
-        changed = chunks_of_samples(make_torch_executable(module, settings), samples)
+        changed = chunks_of_samples(make_torch_runner(module, settings), samples)
         assert parity_failure(expected, changed) is not None
 
 

@@ -14,20 +14,20 @@ from torch import Tensor, nn
 from policy.checkpoints.policy_file import BuiltinConfig, BuiltinPolicy, build_policy
 from policy.contract import Contract, FloatArray
 from policy.engines import openvino_cpu
-from policy.engines.choose import choose_executable, chunks_of_samples
-from policy.engines.executable import ExecutionSettings, Precision
+from policy.engines.choose import choose_runner, chunks_of_samples
 from policy.engines.openvino_compile import precisions
-from policy.engines.openvino_cpu import make_openvino_executable
+from policy.engines.openvino_cpu import make_openvino_runner
 from policy.engines.openvino_graph import BulkEncoder, denoise_graph
 from policy.engines.parity import make_parity_samples
+from policy.engines.runner import ExecutionSettings, Precision
 from policy.engines.signal_stack import signal_stack_kept
-from policy.engines.torch_eager import make_torch_executable
+from policy.engines.torch_eager import make_torch_runner
 from policy.errors import PolicyError
 from policy.nets.diffusion import NoiseSchedule
 from policy.nets.names import BACKBONE_NAMES, BackboneName
 from policy.nets.resnet_unet import ResnetUnetConfig
 from policy.nets.toge import Toge, TogeConfig
-from policy.protocol import Executable
+from policy.protocol import PolicyRunner
 
 SMALL = Contract(image_height=32, image_width=32)
 SETTINGS = ExecutionSettings(name="toge", num_diffusion_steps=2)
@@ -44,17 +44,17 @@ def seeded(config: BuiltinConfig) -> BuiltinPolicy:
 def both(policy: BuiltinPolicy, settings: ExecutionSettings) -> tuple[FloatArray, FloatArray]:
     """Chunks by plain torch, and by OpenVINO in float32."""
     samples = make_parity_samples(policy.contract)
-    reference = make_torch_executable(policy, settings)
-    executable = make_openvino_executable(policy, settings, "f32", "f32")
-    assert executable.engine == "openvino-f32"
-    return chunks_of_samples(reference, samples), chunks_of_samples(executable, samples)
+    reference = make_torch_runner(policy, settings)
+    runner = make_openvino_runner(policy, settings, "f32", "f32")
+    assert runner.engine == "openvino-f32"
+    return chunks_of_samples(reference, samples), chunks_of_samples(runner, samples)
 
 
 @pytest.fixture(scope="module")
-def shipped(trained_toge: Toge) -> dict[tuple[Precision, Precision], Executable]:
+def shipped(trained_toge: Toge) -> dict[tuple[Precision, Precision], PolicyRunner]:
     """The shipped policy in every precision of this CPU."""
     pairs = {*precisions(), ("f32", "f32")}
-    return {pair: make_openvino_executable(trained_toge, SETTINGS, *pair) for pair in pairs}
+    return {pair: make_openvino_runner(trained_toge, SETTINGS, *pair) for pair in pairs}
 
 
 @pytest.mark.parametrize("backbone", BACKBONE_NAMES)
@@ -99,11 +99,11 @@ def test_segments_compute_what_a_whole_solve_on_torch_does(prediction, monkeypat
 
 def test_every_precision_of_this_cpu_is_near(trained_toge, shipped):
     samples = make_parity_samples(trained_toge.contract)
-    expected = chunks_of_samples(make_torch_executable(trained_toge, SETTINGS), samples)
-    for (vision, _), executable in shipped.items():
-        assert executable.engine.startswith(f"openvino-{vision}")
+    expected = chunks_of_samples(make_torch_runner(trained_toge, SETTINGS), samples)
+    for (vision, _), runner in shipped.items():
+        assert runner.engine.startswith(f"openvino-{vision}")
         # Three significant digits of bfloat16; whether that is near enough the check decides.
-        assert np.abs(chunks_of_samples(executable, samples) - expected).max() < 0.05
+        assert np.abs(chunks_of_samples(runner, samples) - expected).max() < 0.05
 
 
 @pytest.mark.parametrize("action", sorted({action for _, action in precisions()}))
@@ -122,20 +122,20 @@ def test_every_bias_is_added_within_its_convolution(small_toge: Toge, action: st
 
 
 def test_results_belong_to_the_caller(shipped):
-    executable = shipped["f32", "f32"]
-    samples = make_parity_samples(executable.contract)
-    first = executable.encode(samples.rgb[0])
+    runner = shipped["f32", "f32"]
+    samples = make_parity_samples(runner.contract)
+    first = runner.encode(samples.rgb[0])
     kept = first.copy()
-    second = executable.encode(samples.rgb[1])
+    second = runner.encode(samples.rgb[1])
     assert not np.array_equal(first, second)
     np.testing.assert_array_equal(first, kept)
 
 
 def test_refuses_an_array_of_another_shape(shipped):
-    executable = shipped["f32", "f32"]
-    state = np.zeros((1, executable.contract.state_dim), np.float32)
+    runner = shipped["f32", "f32"]
+    state = np.zeros((1, runner.contract.state_dim), np.float32)
     with pytest.raises(PolicyError, match=r"input 0 must be \[1, 256\], got \[1, 1\]"):
-        executable.act(np.zeros((1, 1), np.float32), state, np.zeros((1, 4, 4), np.float32))
+        runner.act(np.zeros((1, 1), np.float32), state, np.zeros((1, 4, 4), np.float32))
 
 
 class UserModule(nn.Module):
@@ -161,8 +161,8 @@ def test_a_users_module_that_cannot_be_traced_flies_on_torch() -> None:
     policy = UserModule()
     policy.encode_visual = lambda image: torch.linalg.qr(image)[0].mean(dim=(2, 3))  # type: ignore[method-assign]
     level = logging.root.level
-    executable, notes = choose_executable(policy, "openvino", ExecutionSettings(name="mine"))
-    assert executable.engine == "torch"
+    runner, notes = choose_runner(policy, "openvino", ExecutionSettings(name="mine"))
+    assert runner.engine == "torch"
     assert all("is passed over" in note for note in notes)
     assert logging.root.level == level  # the converter raises it
 
@@ -179,7 +179,7 @@ def test_compiled_graphs_are_cached_and_damage_does_no_harm(tmp_path, monkeypatc
     def chunks(seed: int = 0, steps: int = 1) -> FloatArray:
         policy.seed_noise(seed)
         settings = ExecutionSettings(name="toge", num_diffusion_steps=steps)
-        return chunks_of_samples(make_openvino_executable(policy, settings, "f32", "f32"), samples)
+        return chunks_of_samples(make_openvino_runner(policy, settings, "f32", "f32"), samples)
 
     first = chunks()
     assert len(cached(tmp_path)) == 2

@@ -1,4 +1,4 @@
-"""Shared by all engines: a policy becomes an ``Executable``, tried once before it flies."""
+"""Shared by all engines: a policy becomes a ``PolicyRunner``, tried once before it flies."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -9,12 +9,12 @@ import numpy as np
 from policy.contract import ACTION_DIM, QUATERNION, CameraImage, Contract, FloatArray
 from policy.errors import PolicyError, user_code
 from policy.preprocess import dummy_images, image_to_input
-from policy.protocol import DualRatePolicy, Executable, SingleRatePolicy
+from policy.protocol import DualRatePolicy, PolicyRunner, SingleRatePolicy
 
 EngineName = Literal["auto", "torch", "openvino", "cuda-graph"]
 Precision = Literal["bf16", "f32"]
 Act = Callable[[FloatArray, FloatArray, FloatArray], FloatArray]
-"""``Executable.act``."""
+"""``PolicyRunner.act``."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -37,7 +37,7 @@ Compile = Callable[[Callable[..., Any], Sequence[Shape]], ArrayFunction]
 """(function of the engine's own kind of arrays, shapes of its float32 inputs) -> compiled."""
 
 
-def make_executable(
+def make_runner(
     vision: SingleRatePolicy,
     action: SingleRatePolicy,
     compile_vision: Compile,
@@ -45,7 +45,7 @@ def make_executable(
     *,
     engine: str,
     settings: ExecutionSettings,
-) -> Executable:
+) -> PolicyRunner:
     """Compile a policy's methods for the loops and try them on a dummy sample.
 
     ``vision`` encodes images and ``action`` samples chunks: one policy, perhaps on two devices.
@@ -78,7 +78,7 @@ def encoders(vision: DualRatePolicy) -> list[Callable[..., Any]]:
     return [lambda image, camera=camera: encode(image, camera) for camera in range(cameras)]
 
 
-def make_numpy_executable(policy: SingleRatePolicy, settings: ExecutionSettings) -> Executable:
+def make_numpy_runner(policy: SingleRatePolicy, settings: ExecutionSettings) -> PolicyRunner:
     """Wrap a numpy policy for the loops; tried once."""
 
     def compile_(method: Callable[..., Any], _shapes: Sequence[Shape]) -> ArrayFunction:
@@ -95,7 +95,7 @@ def make_numpy_executable(policy: SingleRatePolicy, settings: ExecutionSettings)
 
         return run
 
-    return make_executable(policy, policy, compile_, compile_, engine="numpy", settings=settings)
+    return make_runner(policy, policy, compile_, compile_, engine="numpy", settings=settings)
 
 
 def assemble(
@@ -104,11 +104,11 @@ def assemble(
     act: Act,
     engine: str,
     settings: ExecutionSettings,
-) -> Executable:
-    """An executable of an engine's functions, tried on a dummy sample, which warms it up.
+) -> PolicyRunner:
+    """A runner of an engine's functions, tried on a dummy sample, which warms it up.
 
     ``encode`` has a function for each camera, which takes a normalised image [1, 3, H, W]; without
-    a fast path it is empty. ``act`` is that of ``Executable``.
+    a fast path it is empty. ``act`` is that of ``PolicyRunner``.
     """
 
     def encode_image(image: CameraImage, camera: int = 0, /) -> FloatArray:
@@ -120,7 +120,7 @@ def assemble(
         with user_code(f"{settings.name} failed on a state"):
             return act(encoded, state, history)
 
-    executable = Executable(
+    runner = PolicyRunner(
         contract=contract,
         name=settings.name,
         engine=engine,
@@ -128,20 +128,20 @@ def assemble(
         encode=encode_image,
         act=act_on,
     )
-    _try(executable)
-    return executable
+    _try(runner)
+    return runner
 
 
-def encode_all(executable: Executable, images: CameraImage) -> FloatArray:
+def encode_all(runner: PolicyRunner, images: CameraImage) -> FloatArray:
     """One image for each camera at each observation -> what ``act`` takes.
 
     ``images`` has the axes of ``preprocess.dummy_images``, and may be of another size.
     """
-    contract = executable.contract
+    contract = runner.contract
     steps, cameras = contract.observation_steps, len(contract.cameras)
     images = images.reshape(steps, cameras, *images.shape[-len(contract.picture_shape) :])
-    return executable.join(
-        [[executable.encode(image, camera) for camera, image in enumerate(row)] for row in images]
+    return runner.join(
+        [[runner.encode(image, camera) for camera, image in enumerate(row)] for row in images]
     )
 
 
@@ -152,33 +152,32 @@ def level_state(contract: Contract) -> FloatArray:
     return state
 
 
-def _try(executable: Executable) -> None:
-    contract = executable.contract
+def _try(runner: PolicyRunner) -> None:
+    contract = runner.contract
     images, state = dummy_images(contract), level_state(contract)
     history = np.zeros((1, contract.history_len, ACTION_DIM), np.float32)
     try:
-        if executable.dual_rate:
+        if runner.dual_rate:
             for camera in range(len(contract.cameras)):
                 image = images.reshape(-1, *contract.picture_shape)[0]
-                feature = executable.encode(image, camera)
-                _require(executable, "encode_visual", feature, (1, contract.feature_dim))
-        encoded = encode_all(executable, images)
-        chunk = executable.act(encoded, state, history)
+                feature = runner.encode(image, camera)
+                _require(runner, "encode_visual", feature, (1, contract.feature_dim))
+        encoded = encode_all(runner, images)
+        chunk = runner.act(encoded, state, history)
     except PolicyError as error:
-        told = str(error) if executable.name in str(error) else f"{executable.name}: {error}"
+        told = str(error) if runner.name in str(error) else f"{runner.name}: {error}"
         raise PolicyError(
             f"{told}; this was a dummy sample: image {[1, *contract.image_shape]}, state "
             f"{[1, *contract.state_shape]}, action_history [1, {contract.history_len}, "
             f"{ACTION_DIM}], as {contract.arrays} arrays"
         ) from error
-    _require(executable, "the chunk", chunk, (1, contract.horizon, ACTION_DIM))
+    _require(runner, "the chunk", chunk, (1, contract.horizon, ACTION_DIM))
 
 
-def _require(executable: Executable, what: str, array: FloatArray, shape: tuple[int, ...]) -> None:
+def _require(runner: PolicyRunner, what: str, array: FloatArray, shape: tuple[int, ...]) -> None:
     if array.shape != shape:
         raise PolicyError(
-            f"{executable.name}: {what} must be {list(shape)} by its contract, got "
-            f"{list(array.shape)}"
+            f"{runner.name}: {what} must be {list(shape)} by its contract, got {list(array.shape)}"
         )
     if not np.isfinite(array).all():
-        raise PolicyError(f"{executable.name}: {what} holds NaN or infinity on a dummy sample")
+        raise PolicyError(f"{runner.name}: {what} holds NaN or infinity on a dummy sample")
