@@ -36,12 +36,6 @@ def test_a_file_is_tried_and_not_left_behind(tmp_path: Path) -> None:
     assert path.read_text() == "an older flight"
 
 
-def test_a_file_in_a_folder_that_cannot_be_made_is_refused(tmp_path: Path) -> None:
-    (tmp_path / "taken").write_text("")
-    with pytest.raises(UserError, match="--rerun"):
-        prepare_target(str(tmp_path / "taken" / "flight.rrd"))
-
-
 def test_a_folder_called_rrd_is_refused(tmp_path: Path) -> None:
     folder = tmp_path / "flight.rrd"
     folder.mkdir()
