@@ -9,7 +9,7 @@ from helpers.factories import make_released_tick, make_state, make_tick, make_tr
 from mavbridge.core.reasons import Code, because
 from mavbridge.core.records import Tick, VehicleState
 from mavbridge.core.vehicle import ActionTrace, Sticks, Velocity
-from mavbridge.recording.replay_rows import FEATURES, PACKETS, SOLVES
+from mavbridge.recording.replay_tables import FEATURES, PACKETS, SOLVES
 from mavbridge.recording.rows import (
     DEMONSTRATION_FRAMES,
     DEMONSTRATION_TICKS,

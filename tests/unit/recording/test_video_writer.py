@@ -19,7 +19,6 @@ from mavbridge.recording.rows import FRAMES, read_frames
 from mavbridge.recording.tables import read_table
 from mavbridge.recording.video import ring
 from mavbridge.recording.video.file import count_frames, read_video
-from mavbridge.recording.video.frame_files import VideoJob
 from mavbridge.recording.video.ring import MIN_SLOTS
 from mavbridge.recording.video.writer import (
     FrameSender,
@@ -27,7 +26,7 @@ from mavbridge.recording.video.writer import (
     VideoWriter,
     WriterError,
 )
-from mavbridge.recording.video.writer_process import Notice, WriterService
+from mavbridge.recording.video.writer_process import Notice, VideoJob, WriterService
 
 DEADLINE_S = 30.0
 
