@@ -52,16 +52,10 @@ def test_stabilized_leans_in_proportion_as_was_measured() -> None:
 def test_what_the_vehicle_cannot_do_is_said_at_once_and_named_stick_by_stick() -> None:
     values = PX4_DEFAULTS | {"MPC_Z_VEL_MAX_UP": 1.2, "MPC_MAN_TILT_MAX": 20.0}
     curves = px4_curves(values, "ALTCTL", GAINS)
-    assert curves.notes == (
-        "full climb of the policy is 2.5 m/s and this vehicle climbs 1.2 m/s at most "
-        "(MPC_Z_VEL_MAX_UP): beyond 0.58 of the stick it does less",
-        "full descent of the policy is 2.5 m/s and this vehicle descends 1.5 m/s at most "
-        "(MPC_Z_VEL_MAX_DN): beyond 0.68 of the stick it does less",
-        "full yaw rate of the policy is 202 deg/s and this vehicle turns 150 deg/s at most "
-        "(MPC_MAN_Y_MAX): beyond 0.75 of the stick it does less",
-        "full lean of the policy is 30 deg and this vehicle leans 20 deg at most "
-        "(MPC_MAN_TILT_MAX): beyond 0.68 of the stick it does less",
-    )
+    names = ("MPC_Z_VEL_MAX_UP", "MPC_Z_VEL_MAX_DN", "MPC_MAN_Y_MAX", "MPC_MAN_TILT_MAX")
+    shares = ("0.58", "0.68", "0.75", "0.68")
+    for note, name, share in zip(curves.notes, names, shares, strict=True):
+        assert f"({name}): beyond {share} of the stick" in note
     full = Sticks(throttle=1.0, yaw=1.0, pitch=0.0, roll=-1.0)
     assert curves.saturated(full) == ("throttle", "yaw", "roll")
     assert curves.to_vehicle(full) == full
