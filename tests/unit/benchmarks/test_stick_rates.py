@@ -4,11 +4,15 @@ from pathlib import Path
 import pytest
 
 from benchmarks import stick_rates
+from benchmarks.loaded_flight import SLOW_EVERY, SLOW_NS, with_slow_solves
 from benchmarks.results import Flight
 from helpers.bench_results import make_flight
 from mavbridge.config.policy import PolicyConfig
 from mavbridge.config.rates import Rates
+from mavbridge.core.clock import MonotonicClock
 from mavbridge.core.errors import UserError
+from policy.contract import Contract
+from policy.protocol import PolicyRunner
 
 
 class Flights:
@@ -51,3 +55,20 @@ def test_a_flight_that_fails_is_said_and_the_others_are_flown(
     assert stick_rates.main(rates=(250.0,), loads=("slow", "busy")) == 1
     assert len(flights.flown) == 4
     assert "it was released" in capsys.readouterr().out
+
+
+def test_every_tenth_solve_is_slow_and_all_are_the_policys() -> None:
+    runner = PolicyRunner(
+        contract=Contract(),
+        name="a",
+        engine="b",
+        dual_rate=True,
+        encode=lambda rgb: rgb,
+        act=lambda *arguments: arguments[0],
+    )
+    slow, clock, durations_ns = with_slow_solves(runner), MonotonicClock(), []
+    for number in range(2 * SLOW_EVERY):
+        start_ns = clock.now_ns()
+        assert slow.act(number, None, None) == number
+        durations_ns.append(clock.now_ns() - start_ns)
+    assert min(durations_ns[SLOW_EVERY - 1 :: SLOW_EVERY]) >= SLOW_NS

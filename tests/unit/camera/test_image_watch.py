@@ -154,3 +154,9 @@ def test_depth_that_is_nowhere_known_is_a_fault_and_a_wall_is_none(depth, fault)
     found = first_fault(watch, [depth.copy() for _ in range(20)])
     assert (found is not None) is fault
     assert not fault or dict(found[1].data)["what"] == "without any depth"
+
+
+def test_rows_of_a_large_image_that_are_not_sampled_count_as_well(watch):
+    scene = RANDOM.integers(0, 255, (480, 640, 3), dtype=np.uint8)
+    scene[1] = 0
+    assert first_fault(watch, [scene, with_pixel(scene, 1, 5)] * 20) is None

@@ -1,5 +1,6 @@
 """Pictures in chunks over UDP: assembled from any order, repetition and loss; stamped; refused."""
 
+import select
 import socket
 
 import numpy as np
@@ -11,8 +12,10 @@ from helpers.camera_senders import HEADER, UdpSender, chunks, depth_scene, encod
 from helpers.fakes import START_NS, FakeClock
 from mavbridge.camera import jpeg_udp
 from mavbridge.camera.jpeg_udp import (
+    MAX_DRIFT_NS,
     MAX_PARTIAL,
     RESTART_NS,
+    WINDOW_NS,
     FrameAssembler,
     JpegUdpSource,
     SenderClock,
@@ -272,3 +275,32 @@ def test_a_picture_that_says_it_is_huge_is_not_decoded():
     for end in range(40):
         assert decode_picture(jpeg[:end]) is None
         assert decode_picture(png[:end]) is None
+
+
+def test_a_clock_that_is_set_anew_is_learnt_again():
+    clock = SenderClock()
+    for offset_ns in (10**18, 3 * NS_PER_S, 2 * 10**18):
+        ages = ages_ms(
+            clock, speed=1.0, offset_ns=offset_ns, seconds=4, delay_ms=lambda n: 5.0 + n % 2
+        )
+        assert set(ages[:30]) == {0.0}
+        assert set(map(round, ages[-30:])) == {0, 1}
+    assert MAX_DRIFT_NS < WINDOW_NS
+
+
+def test_a_whole_frame_waits_for_nothing(monkeypatch):
+    source, asked_s = JpegUdpSource("127.0.0.1", 17205, clock=MonotonicClock()), []
+    with UdpSender(17205) as sender:
+        sender.send(0, encoded(scene(0)))
+        sender.send_raw(chunks(1, payload(1), part=9)[0])
+        real = select.select
+
+        def ask(reads, writes, errors, timeout_s):
+            asked_s.append(timeout_s)
+            return real(reads, writes, errors, timeout_s)
+
+        monkeypatch.setattr(jpeg_udp.select, "select", ask)
+        source.next_image()
+    source.close()
+    assert 0.0 in asked_s
+    assert set(asked_s[asked_s.index(0.0) :]) == {0.0}

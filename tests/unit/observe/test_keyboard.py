@@ -194,3 +194,13 @@ def test_a_job_in_the_background_is_not_stopped(terminal: tuple[int, int]) -> No
     output, _ = job.communicate("end\n", timeout=60.0)
     assert output == "0\n"
     assert termios.tcgetattr(fd) == before
+
+
+def test_a_release_among_other_keys_counts(terminal: tuple[int, int]) -> None:
+    user, fd = terminal
+    pressed = Pressed()
+    keyboard = started(fd, pressed)
+    os.write(user, b"eq")
+    while pressed.next() != "q":
+        pass
+    keyboard.stop(30.0)

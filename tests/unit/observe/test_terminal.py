@@ -218,3 +218,12 @@ def test_no_line_shows_the_password_of_an_address() -> None:
     assert shown.count("rtsp://me:***@host/1?token=*** is lost") >= 4
     assert "it@" not in shown
     assert "abc" not in shown
+
+
+def test_a_screen_that_never_started_prints_what_it_has_at_the_end() -> None:
+    out = io.StringIO()
+    screen = make_screen(Console(file=out, width=100))
+    screen.show_report(report_of())
+    assert screen.close(60.0)
+    assert "p99" not in out.getvalue()  # nothing was measured: no table
+    assert "never released" in out.getvalue()

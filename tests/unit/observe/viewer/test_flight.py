@@ -421,3 +421,37 @@ def test_a_viewer_that_stalls_cannot_keep_the_process_alive() -> None:
             check=True,
         )
     assert flight.stdout == "did not finish within 0.2 s\n"
+
+
+def test_dropped_frames_start_from_zero(rrd: Path) -> None:
+    first = make_vision_tick(1, dropped_frames=40)
+    second, third = (make_vision_tick(k, dropped_frames=40 + k) for k in (2, 3))
+    seen = show(rrd, [make_tick(0), first], [second, third])
+    assert seen.values("missed/vision", 1) == [0, 3]
+
+
+def test_rc_echo_shows_four_channels_as_they_change(rrd: Path) -> None:
+    moved = (1100, 1200, 1300, 1400, 1500, 1600)
+    later = [make_tick(index, rc_channels_us=moved) for index in (1, 2, 3, 4)]
+    seen = show(rrd, [make_tick(0), *later])
+    assert seen.rows("rc") == [[1500] * 4, [1100, 1200, 1300, 1400], [1100, 1200, 1300, 1400]]
+    assert seen.times_ms("rc") == [0, 10, 40]
+
+
+def test_chunks_that_nobody_flies_are_not_shown(rrd: Path) -> None:
+    seen = show(rrd, [make_released_tick(0), make_solve(0, [[0.0] * 4] * 8)])
+    assert "/sticks/throttle/plan/0" not in seen.columns
+
+
+def test_a_level_chunk_keeps_what_the_air_slows_down(rrd: Path) -> None:
+    tick = make_tick(0, position_ned_m=Position(0.0, 0.0, 0.0))
+    values = np.array((4.0, 0, 0, 1, 0, 0, 0, 0, 0, 0, -2.0, 0, -9.81), dtype=np.float32)
+    solve = make_solve(0, [[0.0] * 4] * 20, state=make_state(START_NS, values=values))
+    seen = show(rrd, [tick, solve])
+    assert strips(seen, "scene/planned")[0][-1] == pytest.approx([3.0, 0, 0], abs=0.06)
+
+
+def test_a_flight_without_an_event_is_still_a_readable_file(rrd: Path) -> None:
+    seen = show(rrd)
+    assert set(seen.columns) == set()
+    assert len(seen.reader.blueprints()) == 1
