@@ -2,29 +2,37 @@
 
 import sys
 from collections.abc import Callable
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 
-from mavbridge.camera.blank import BlankCamera
+import numpy as np
+
 from mavbridge.camera.capture import open_device, open_stream, present_devices
-from mavbridge.camera.deadlines import LiveCamera, wait_for_first_frame
-from mavbridge.camera.grabber import Grabber, Image
+from mavbridge.camera.grabber import (
+    Grabber,
+    Image,
+    LiveCamera,
+    wait_for_first_frame,
+    wait_until_due,
+)
 from mavbridge.camera.jpeg_udp import JpegUdpSource, parse_jpeg_udp
-from mavbridge.camera.latency import LatencyCompensatedCamera
 from mavbridge.camera.pipe import PipeCamera, parse_pipe
 from mavbridge.camera.shared_memory import SharedMemoryCamera
 from mavbridge.camera.video_file import VideoFileCamera
-from mavbridge.core.clock import NS_PER_MS, Clock
+from mavbridge.core.clock import NS_PER_MS, NS_PER_S, Clock
 from mavbridge.core.errors import CameraError, UserError
 from mavbridge.core.extras import require_packages
 from mavbridge.core.ports import Camera
 from mavbridge.core.provenance import without_secrets
-from mavbridge.core.records import Frame
+from mavbridge.core.records import CameraImage, Frame
 
 STREAM_SCHEMES = ("rtsp://", "rtp://", "udp://", "tcp://", "http://", "https://")
 SCREEN_PACKAGES = {"mss": "mss", "Xlib": "python-xlib"}
 """The extra "screen"."""
 NO_CAMERA = "none"
+BLANK_NS = NS_PER_S // 30
+"""Period of the black frames of no camera."""
 FORMS = (
     "a device (0, /dev/video0, /dev/v4l/by-id/NAME), a stream (rtsp://, rtp://, udp://, tcp://, "
     "http://, https://, an .sdp file), "
@@ -168,3 +176,55 @@ def _open(spec: str, *, image_size: int, clock: Clock, is_depth: bool | None) ->
         opener = partial(open_device, device, image_size=image_size, clock=clock)
         return Grabber(opener, clock=clock)
     return VideoFileCamera(Path(spec), clock=clock)
+
+
+class BlankCamera:
+    """Delivers a black frame at each moment of a grid; one that nobody took in time is dropped."""
+
+    def __init__(self, *, image_size: int, clock: Clock, is_depth: bool = False) -> None:
+        self._clock = clock
+        shape = (image_size, image_size, *(() if is_depth else (3,)))
+        self._rgb: CameraImage = np.zeros(shape, np.uint16 if is_depth else np.uint8)
+        self._rgb.flags.writeable = False
+        self._due_ns = clock.now_ns()
+        self._frame_id = 0
+        self.dropped_frames = 0
+
+    def read(self, timeout_ns: int) -> Frame | None:
+        """See `mavbridge.core.ports.Camera`."""
+        if not wait_until_due(self._clock, self._due_ns, timeout_ns):
+            return None
+        late = (self._clock.now_ns() - self._due_ns) // BLANK_NS
+        captured_ns = self._due_ns + late * BLANK_NS
+        self.dropped_frames += late
+        self._frame_id += 1 + late
+        self._due_ns = captured_ns + BLANK_NS
+        return Frame(frame_id=self._frame_id, captured_ns=captured_ns, rgb=self._rgb)
+
+    def close(self) -> None:
+        """There is nothing to free."""
+
+
+class LatencyCompensatedCamera:
+    """Another camera, whose stamps lie earlier by its latency: exposure to arrival here."""
+
+    def __init__(self, camera: Camera, *, latency_ns: int) -> None:
+        """Wrap an open camera; closing this one closes it."""
+        self._camera = camera
+        self._latency_ns = latency_ns
+
+    @property
+    def dropped_frames(self) -> int:
+        """See `mavbridge.core.ports.Camera`."""
+        return self._camera.dropped_frames
+
+    def read(self, timeout_ns: int) -> Frame | None:
+        """See `mavbridge.core.ports.Camera`."""
+        frame = self._camera.read(timeout_ns)
+        if frame is None:
+            return None
+        return replace(frame, captured_ns=frame.captured_ns - self._latency_ns)
+
+    def close(self) -> None:
+        """Close the wrapped camera."""
+        self._camera.close()

@@ -2,7 +2,8 @@
 
 import re
 import struct
-from typing import NamedTuple, Protocol
+from abc import ABC, abstractmethod
+from typing import NamedTuple
 
 import cv2
 import numpy as np
@@ -81,41 +82,46 @@ def _jpeg_sides(data: bytes) -> tuple[int, int]:
     return 0, 0
 
 
-class FrameCutter(Protocol):
+class FrameCutter(ABC):
     """Takes bytes as they come, and gives the newest whole frame."""
+
+    def __init__(self) -> None:
+        self._newest: tuple[bytes, int] | None = None
+        self._first_ns = 0
+        """Arrival of the first byte of the frame that is being read."""
 
     @property
     def has_frame(self) -> bool:
-        """A whole frame is there."""
+        """True if a whole frame is there."""
+        return self._newest is not None
 
+    def take(self) -> tuple[bytes, int] | None:
+        """Return the newest whole frame and when its first byte came, if there is one."""
+        newest, self._newest = self._newest, None
+        return newest
+
+    @abstractmethod
     def put(self, data: bytes, arrived_ns: int) -> None:
         """Take bytes. Raises CameraError for what cannot be frames."""
 
-    def take(self) -> tuple[bytes, int] | None:
-        """The newest whole frame and when its first byte came; None: there is none yet."""
-
+    @abstractmethod
     def decode(self, frame: bytes) -> CameraImage | None:
-        """[H, W, 3] uint8 RGB or [H, W] uint16 depth; None if it is damaged."""
+        """Return [H, W, 3] uint8 RGB or [H, W] uint16 depth; None if it is damaged."""
 
+    @abstractmethod
     def rest(self) -> str:
-        """What was left over at the end of the stream, for a message."""
+        """Describe what was left over at the end of the stream."""
 
 
-class RawCutter:
+class RawCutter(FrameCutter):
     """Pictures of one size, one directly after the other."""
 
     def __init__(self, width: int, height: int, pixels: RawFormat) -> None:
+        super().__init__()
         self._shape = (height, width)
         self._format = pixels
         self._size = width * height * pixels.bits // 8
         self._partial = bytearray()
-        self._first_ns = 0
-        self._newest: tuple[bytes, int] | None = None
-
-    @property
-    def has_frame(self) -> bool:
-        """See `FrameCutter`."""
-        return self._newest is not None
 
     def put(self, data: bytes, arrived_ns: int) -> None:
         """See `FrameCutter`."""
@@ -126,11 +132,6 @@ class RawCutter:
             self._newest = bytes(self._partial[: self._size]), self._first_ns
             del self._partial[: self._size]
             self._first_ns = arrived_ns
-
-    def take(self) -> tuple[bytes, int] | None:
-        """See `FrameCutter`."""
-        newest, self._newest = self._newest, None
-        return newest
 
     def decode(self, frame: bytes) -> CameraImage:
         """See `FrameCutter`; any bytes are a picture."""
@@ -156,21 +157,15 @@ class RawCutter:
         )
 
 
-class PictureCutter:
+class PictureCutter(FrameCutter):
     """JPEG or PNG pictures one after the other, with or without headers of a multipart stream."""
 
     def __init__(self) -> None:
+        super().__init__()
         self._buffer = bytearray()
-        self._first_ns = 0
         self._at = 0
         """Where the search goes on; 0 while the start of a picture is looked for."""
         self._in_scan = self._is_png = False
-        self._newest: tuple[bytes, int] | None = None
-
-    @property
-    def has_frame(self) -> bool:
-        """See `FrameCutter`."""
-        return self._newest is not None
 
     def put(self, data: bytes, arrived_ns: int) -> None:
         """See `FrameCutter`."""
@@ -240,11 +235,6 @@ class PictureCutter:
                 return False
             self._at = end
         return True
-
-    def take(self) -> tuple[bytes, int] | None:
-        """See `FrameCutter`."""
-        newest, self._newest = self._newest, None
-        return newest
 
     def decode(self, frame: bytes) -> CameraImage | None:
         """See `FrameCutter`."""

@@ -10,7 +10,7 @@ from pathlib import Path
 
 import numpy as np
 
-from mavbridge.camera.deadlines import STALL_NS
+from mavbridge.camera.grabber import STALL_NS
 from mavbridge.core.clock import NS_PER_MS, NS_PER_S, Clock
 from mavbridge.core.errors import CameraError, UserError
 from mavbridge.core.records import CameraImage, Frame

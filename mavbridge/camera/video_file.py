@@ -6,8 +6,7 @@ from pathlib import Path
 import cv2
 
 from mavbridge.camera.capture import retrieve_rgb
-from mavbridge.camera.deadlines import wait_until_due
-from mavbridge.camera.grabber import Image
+from mavbridge.camera.grabber import Image, wait_until_due
 from mavbridge.core.clock import NS_PER_MS, NS_PER_S, Clock
 from mavbridge.core.errors import CameraError
 from mavbridge.core.records import Frame

@@ -1,23 +1,210 @@
-"""Writes what a replay needs: solves, features, stamps of packets, and all settings."""
+"""Tables of what a replay needs: solves of the policy, features, and stamps of packets."""
 
+import json
+from collections.abc import Iterator, Sequence
 from pathlib import Path
-from typing import Generic, TypeVar
+from typing import Any, Generic, NamedTuple, TypeVar
 
+import numpy as np
 import pyarrow as pa
 
 from mavbridge.core.observers import BoundedQueue
-from mavbridge.core.records import FeatureFrame, Solve, VisionTick
+from mavbridge.core.reasons import reason_to_json
+from mavbridge.core.records import FeatureFrame, FloatArray, Solve, VehicleState, VisionTick
 from mavbridge.core.vehicle import ForwardedPacket
-from mavbridge.recording import replay_rows
-from mavbridge.recording.folder import PACKETS, SOLVES, features_of
-from mavbridge.recording.replay_rows import (
-    FeatureRow,
-    SolveRow,
-    features_batch,
-    packets_batch,
-    solves_batch,
-)
+from mavbridge.recording.folder import PACKETS as PACKETS_STEM
+from mavbridge.recording.folder import SOLVES as SOLVES_STEM
+from mavbridge.recording.folder import features_of
+from mavbridge.recording.rows import read_reason
 from mavbridge.recording.tables import TableWriter
+from policy.contract import ACTION_DIM, STATE_DIM, Contract
+
+_NUMBERS = pa.list_(pa.float32())
+_STATE_STAMPS = ("attitude_ns", "rate_ns", "velocity_ns", "specific_force_ns")
+_PLAIN = ("serial", "started_ns", "computed_ns", "reset_ns", "image_ns", "first_ns", "step_ns")
+_ARRAYS = ("states", "history", "actions")
+_V1 = 0xFE
+
+
+def _required(kind: pa.DataType, *names: str) -> list[pa.Field]:
+    return [pa.field(name, kind, nullable=False) for name in names]
+
+
+SOLVES = pa.schema(
+    [
+        *_required(pa.int64(), *_PLAIN),
+        *_required(pa.list_(pa.float32(), STATE_DIM), "state"),
+        *_required(pa.int64(), *_STATE_STAMPS),
+        *_required(pa.list_(pa.float64()), "extras"),
+        pa.field("extras_ns", pa.int64()),
+        *_required(_NUMBERS, *_ARRAYS),
+        *_required(pa.list_(pa.list_(pa.int64())), "frame_ids"),
+        *_required(pa.int32(), "dropped_before"),
+    ]
+)
+FEATURES = pa.schema(
+    [
+        *_required(pa.int64(), "frame_id", "captured_ns", "ready_ns"),
+        *_required(_NUMBERS, "value"),
+        pa.field("fault", pa.string()),
+        *_required(pa.int32(), "dropped_before"),
+    ]
+)
+PACKETS = pa.schema(
+    [
+        *_required(pa.int64(), "arrived_ns", "happened_ns"),
+        *_required(pa.int32(), "message_id"),
+        *_required(pa.uint8(), "sequence"),
+        *_required(pa.int32(), "dropped_before"),
+    ]
+)
+
+
+class FeatureRow(NamedTuple):
+    """One feature of one camera."""
+
+    frame: FeatureFrame
+    dropped_before: int
+
+
+class SolveRow(NamedTuple):
+    """One solve, and how many before it are not in the recording."""
+
+    solve: Solve
+    dropped_before: int
+
+
+class PacketStamp(NamedTuple):
+    """When one packet of ``link.tlog`` arrived, and when what it tells of happened."""
+
+    arrived_ns: int
+    happened_ns: int
+    message_id: int
+    sequence: int
+
+
+def packet_key(data: bytes) -> tuple[int, int]:
+    """Message id and sequence number of a whole MAVLink packet."""
+    if data[0] == _V1:
+        return data[5], data[2]
+    return int.from_bytes(data[7:10], "little"), data[4]
+
+
+def solves_batch(rows: Sequence[SolveRow]) -> pa.RecordBatch:
+    """Rows of consecutive solves."""
+    solves = [row.solve for row in rows]
+    states = [solve.state for solve in solves]
+    columns: dict[str, Any] = {name: [getattr(solve, name) for solve in solves] for name in _PLAIN}
+    columns |= {name: [getattr(state, name) for state in states] for name in _STATE_STAMPS}
+    columns |= {name: _lists([getattr(solve, name) for solve in solves]) for name in _ARRAYS}
+    columns["state"] = pa.FixedSizeListArray.from_arrays(
+        _joined([state.values for state in states]), STATE_DIM
+    )
+    columns["extras"] = [list(state.extras) for state in states]
+    columns["extras_ns"] = [state.extras_ns for state in states]
+    columns["frame_ids"] = [[list(ids) for ids in solve.frame_ids] for solve in solves]
+    columns["dropped_before"] = [row.dropped_before for row in rows]
+    return _batch(columns, SOLVES)
+
+
+def features_batch(rows: Sequence[FeatureRow]) -> pa.RecordBatch:
+    """Rows of consecutive features of one camera."""
+    frames = [row.frame for row in rows]
+    names = ("frame_id", "captured_ns", "ready_ns")
+    columns: dict[str, Any] = {name: [getattr(frame, name) for frame in frames] for name in names}
+    columns["fault"] = [
+        None if frame.fault is None else json.dumps(reason_to_json(frame.fault)) for frame in frames
+    ]
+    columns["value"] = _lists([frame.value for frame in frames])
+    columns["dropped_before"] = [row.dropped_before for row in rows]
+    return _batch(columns, FEATURES)
+
+
+def packets_batch(packets: Sequence[ForwardedPacket], dropped: int) -> pa.RecordBatch:
+    """Rows of consecutive packets; ``dropped`` of them were lost before the first."""
+    keys = [packet_key(packet.data) for packet in packets]
+    columns = {
+        "arrived_ns": [packet.arrived_ns for packet in packets],
+        "happened_ns": [packet.happened_ns for packet in packets],
+        "message_id": [key[0] for key in keys],
+        "sequence": [key[1] for key in keys],
+        "dropped_before": [0 if number else dropped for number in range(len(packets))],
+    }
+    return _batch(columns, PACKETS)
+
+
+def _batch(columns: dict[str, Any], schema: pa.Schema) -> pa.RecordBatch:
+    arrays = [
+        column if isinstance(column, pa.Array) else pa.array(column, field.type)
+        for field in schema
+        for column in (columns[field.name],)
+    ]
+    return pa.RecordBatch.from_arrays(arrays, schema=schema)
+
+
+def _joined(arrays: Sequence[FloatArray]) -> FloatArray:
+    """All numbers in one row; Arrow takes an array of numpy without a copy of each number."""
+    return np.concatenate([np.zeros(0, np.float32), *(array.ravel() for array in arrays)])
+
+
+def _lists(arrays: Sequence[FloatArray]) -> pa.Array:
+    ends = np.cumsum([0, *(array.size for array in arrays)], dtype=np.int32)
+    return pa.ListArray.from_arrays(pa.array(ends), pa.array(_joined(arrays)))
+
+
+def read_solves(table: pa.Table, contract: Contract) -> Iterator[SolveRow]:
+    """Records of a table of solves, with arrays in the shapes of the contract. Read-only."""
+    shapes = {
+        "states": (1, *contract.state_shape),
+        "history": (1, -1, ACTION_DIM),
+        "actions": (1, -1, ACTION_DIM),
+    }
+    for batch in table.to_batches():
+        arrays: dict[str, list[Any]] = {
+            name: _arrays(batch.column(name)) for name in (*_ARRAYS, "state")
+        }
+        rows = batch.drop_columns([*_ARRAYS, "state"]).to_pylist()
+        for number, row in enumerate(rows):
+            state = VehicleState(
+                values=arrays["state"][number],
+                extras=tuple(row["extras"]),
+                extras_ns=row["extras_ns"],
+                **{name: row[name] for name in _STATE_STAMPS},
+            )
+            solve = Solve(
+                state=state,
+                frame_ids=tuple(map(tuple, row["frame_ids"])),
+                **{name: row[name] for name in _PLAIN},
+                **{name: arrays[name][number].reshape(shapes[name]) for name in _ARRAYS},
+            )
+            yield SolveRow(solve, row["dropped_before"])
+
+
+def read_features(table: pa.Table) -> Iterator[FeatureFrame]:
+    """Records of a table of features, each with its value [1, F]. Read-only."""
+    for batch in table.to_batches():
+        values = _arrays(batch.column("value"))
+        for value, row in zip(values, batch.drop_columns(["value"]).to_pylist(), strict=True):
+            del row["dropped_before"]
+            fault = row.pop("fault")
+            stored = {"code": None, "data": {}} if fault is None else json.loads(fault)
+            reason = read_reason(stored["code"], json.dumps(stored["data"]))
+            yield FeatureFrame(value=value[None], fault=reason, **row)
+
+
+def read_packets(table: pa.Table) -> Iterator[PacketStamp]:
+    """Records of a table of packets."""
+    for batch in table.to_batches():
+        for row in batch.drop_columns(["dropped_before"]).to_pylist():
+            yield PacketStamp(**row)
+
+
+def _arrays(column: pa.Array) -> list[FloatArray]:
+    found = [np.asarray(each.values, np.float32) for each in column]
+    for array in found:
+        array.setflags(write=False)
+    return found
+
 
 PACKET_CAPACITY = 60_000
 """Packets whose stamps may wait: a minute of the busiest link."""
@@ -58,13 +245,13 @@ class ReplayTables:
             cameras: those of the contract, in its order.
             has_features: the policy has features, not just resized images.
         """
-        self._solves: _Buffered[SolveRow] = _Buffered(folder / SOLVES, replay_rows.SOLVES)
+        self._solves: _Buffered[SolveRow] = _Buffered(folder / SOLVES_STEM, SOLVES)
         self._solves.serial = 0  # that of the first solve is 1
-        self._packets = TableWriter(folder / PACKETS, replay_rows.PACKETS)
+        self._packets = TableWriter(folder / PACKETS_STEM, PACKETS)
         self._packets_lost = 0
         names = (None, *cameras[1:]) if has_features else ()
         self._features: list[_Buffered[FeatureRow]] = [
-            _Buffered(folder / features_of(name), replay_rows.FEATURES) for name in names
+            _Buffered(folder / features_of(name), FEATURES) for name in names
         ]
         self.packets: BoundedQueue[tuple[ForwardedPacket, ...]] = BoundedQueue(PACKET_CAPACITY)
         """Groups of packets, as they came; another thread puts them in."""

@@ -13,11 +13,11 @@ import numpy as np
 
 from helpers.factories import START_NS, make_vision_tick
 from mavbridge.core.records import ImageArray, VisionTick
-from mavbridge.recording import camera_files
+from mavbridge.recording import flight_writer
 from mavbridge.recording.meta import FlightMeta
 from mavbridge.recording.rows import FrameRow
 from mavbridge.recording.tlog import TlogJob
-from mavbridge.recording.video.frame_files import FrameFiles, VideoJob
+from mavbridge.recording.video.writer_process import FrameFiles, VideoJob
 from policy.contract import Contract
 
 _BITS = 12
@@ -114,7 +114,7 @@ class InProcessWriter:
 @contextmanager
 def without_writer_process() -> Iterator[None]:
     """Meanwhile flights are written by the calling thread."""
-    with patch.object(camera_files, "VideoWriter", InProcessWriter):
+    with patch.object(flight_writer, "VideoWriter", InProcessWriter):
         yield
 
 

@@ -52,3 +52,9 @@ class WireEnd:
     ) -> bytes:
         base = 1 | (128 if armed else 0)
         return self.pack(self.mav.heartbeat_encode(vehicle_type, autopilot, base, mode, 3))
+
+
+def sent(data: bytes) -> dialect.MAVLink_message:
+    """The one message in a packet of ours."""
+    (message,) = WireEnd().read(data)
+    return message

@@ -18,8 +18,7 @@ from mavbridge.core.errors import UserError
 from mavbridge.core.processes import child_environment, end, free_port
 from mavbridge.observe.viewer.flight import RerunView
 from mavbridge.observe.viewer.layout import ViewedFlight
-from mavbridge.observe.viewer.process import listens
-from mavbridge.observe.viewer.server import ServeAddress, serve_address
+from mavbridge.observe.viewer.server import ServeAddress, listens, serve_address
 
 pytestmark = pytest.mark.system
 
@@ -121,7 +120,7 @@ def test_the_server_ends_with_the_view(address: ServeAddress) -> None:
 
 LEAVES_ITS_SERVER = """
 import os, sys
-from mavbridge.observe.viewer.process import listens
+from mavbridge.observe.viewer.server import listens
 from mavbridge.observe.viewer.server import WebServer, serve_address
 
 WebServer(serve_address(sys.argv[1]))

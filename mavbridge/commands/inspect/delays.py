@@ -16,9 +16,9 @@ from mavbridge.core.records import Solve, Tick
 from mavbridge.flight.settings import effective_freshness
 from mavbridge.guard.chunks import FreshnessLimits
 from mavbridge.observe.timing import LATE_PERIODS
-from mavbridge.recording import replay_rows
+from mavbridge.recording import replay_tables
 from mavbridge.recording.folder import PACKETS, SOLVES
-from mavbridge.recording.replay_rows import read_solves
+from mavbridge.recording.replay_tables import read_solves
 from mavbridge.recording.settings import read_settings
 from mavbridge.recording.tables import read_table
 from policy.contract import Contract
@@ -200,7 +200,7 @@ def read_arrivals(folder: Path, damage: list[str]) -> Arrivals | None:
     """
     if not _has(folder, PACKETS):
         return None
-    table = read_table(folder / PACKETS, replay_rows.PACKETS, damage=damage)
+    table = read_table(folder / PACKETS, replay_tables.PACKETS, damage=damage)
     columns = {name: table.column(name).to_numpy() for name in table.column_names}
     rows = np.flatnonzero(np.isin(columns["message_id"], ATTITUDES))
     if not len(rows):
@@ -216,7 +216,7 @@ def recorded_solves(folder: Path, contract: Contract | None) -> Iterator[Solve]:
         MavbridgeError: the table is damaged.
     """
     if contract is not None and _has(folder, SOLVES):
-        table = read_table(folder / SOLVES, replay_rows.SOLVES)
+        table = read_table(folder / SOLVES, replay_tables.SOLVES)
         yield from (row.solve for row in read_solves(table, contract))
 
 

@@ -16,11 +16,9 @@ import rerun as rr
 from mavbridge.core.clock import NS_PER_S
 from mavbridge.core.records import Observed, Solve, Tick, VisionTick
 from mavbridge.observe.viewer import layout
-from mavbridge.observe.viewer.columns import Columns
 from mavbridge.observe.viewer.layout import ViewedFlight, flight_blueprint
-from mavbridge.observe.viewer.plan import PlanView
-from mavbridge.observe.viewer.plots import ActionPlots, TimingPlots
-from mavbridge.observe.viewer.scene import SceneView
+from mavbridge.observe.viewer.plots import ActionPlots, Columns, TimingPlots
+from mavbridge.observe.viewer.scene import PlanView, SceneView
 from mavbridge.observe.viewer.target import RerunRecording
 
 EVENT_CHARACTERS = 64

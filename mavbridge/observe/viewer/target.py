@@ -11,8 +11,12 @@ import rerun.blueprint as rrb
 
 from mavbridge.core.errors import MavbridgeError, PeerError, UserError
 from mavbridge.core.files import require_writable
-from mavbridge.observe.viewer.process import listens, start_listening
-from mavbridge.observe.viewer.server import WebServer, serve_address
+from mavbridge.observe.viewer.server import (
+    WebServer,
+    listens,
+    serve_address,
+    start_listening,
+)
 
 VIEWER_HOST = "127.0.0.1"
 VIEWER_PORT = 9876

@@ -15,7 +15,6 @@ from mavbridge.core.errors import MavbridgeError
 from mavbridge.core.records import CameraImage
 from mavbridge.recording.rows import FrameRow
 from mavbridge.recording.tlog import TlogJob
-from mavbridge.recording.video.frame_files import VideoJob
 from mavbridge.recording.video.ring import FrameRing
 from mavbridge.recording.video.writer_process import (
     NICENESS,
@@ -24,6 +23,7 @@ from mavbridge.recording.video.writer_process import (
     Notice,
     Submit,
     ToWriter,
+    VideoJob,
     Written,
     run_writer,
 )

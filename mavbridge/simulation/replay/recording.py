@@ -11,10 +11,10 @@ from mavbridge.core.errors import UserError
 from mavbridge.core.records import FeatureFrame, Solve, Tick
 from mavbridge.mavlink.codec.frames import RawPacket
 from mavbridge.mavlink.codec.tlog import Skipped, read_tlog
-from mavbridge.recording import replay_rows, rows
+from mavbridge.recording import replay_tables, rows
 from mavbridge.recording.folder import PACKETS, SOLVES, TICKS, TLOG, features_of
 from mavbridge.recording.meta import FlightMeta, read_meta
-from mavbridge.recording.replay_rows import (
+from mavbridge.recording.replay_tables import (
     PacketStamp,
     packet_key,
     read_features,
@@ -85,7 +85,7 @@ def open_source(folder: Path) -> ReplaySource:
     damage: list[str] = []
     table = read_table(folder / TICKS, rows.TICKS, later=rows.OPTIONAL, damage=damage)
     ticks = list(rows.read_ticks(table, meta.contract.action))
-    solved = read_table(folder / SOLVES, replay_rows.SOLVES, damage=damage)
+    solved = read_table(folder / SOLVES, replay_tables.SOLVES, damage=damage)
     solve_rows = list(read_solves(solved, meta.contract))
     if ticks and not meta.finished:  # cut off: what was sent before its last solves is not known
         solve_rows = [row for row in solve_rows if row.solve.started_ns <= ticks[-1].tick.sent_ns]
@@ -93,7 +93,7 @@ def open_source(folder: Path) -> ReplaySource:
         raise UserError(
             f"{folder} ended before its policy had computed anything: nothing to replay"
         )
-    stamps = list(read_packets(read_table(folder / PACKETS, replay_rows.PACKETS, damage=damage)))
+    stamps = list(read_packets(read_table(folder / PACKETS, replay_tables.PACKETS, damage=damage)))
     offset_ns, system = settings.wall_offset_ns, config.link.source_system
     skipped = Skipped()
     log = read_tlog(folder / TLOG, skipped)
@@ -132,7 +132,7 @@ def _features(
     return tuple(
         tuple(
             read_features(
-                read_table(folder / features_of(name), replay_rows.FEATURES, damage=damage)
+                read_table(folder / features_of(name), replay_tables.FEATURES, damage=damage)
             )
         )
         for name in (None, *contract.cameras[1:])

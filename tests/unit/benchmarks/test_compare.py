@@ -62,11 +62,3 @@ def test_writes_json_into_a_folder_that_is_made(tmp_path: Path) -> None:
 def test_what_cannot_be_used_is_refused_before_the_run(tmp_path: Path, flag: str) -> None:
     with pytest.raises(UserError):
         compare.main(BenchOutputs(**{flag: tmp_path}))  # a folder
-
-
-def test_ctrl_c_is_no_traceback(monkeypatch: pytest.MonkeyPatch) -> None:
-    def interrupted(*_: object, **__: object) -> BenchResult:
-        raise KeyboardInterrupt
-
-    monkeypatch.setattr(compare, "measure", interrupted)
-    assert compare.main() == compare.INTERRUPTED

@@ -4,7 +4,14 @@ import numpy as np
 import pytest
 from cyclopts import App
 
-from benchmarks.flight import CLIMB_STICK, FlightJob, ReleaseWatch, level_climb, to_flags
+from benchmarks.flight import (
+    CLIMB_STICK,
+    FlightJob,
+    FlightMeter,
+    ReleaseWatch,
+    level_climb,
+    to_flags,
+)
 from helpers.factories import make_released_tick, make_state, make_tick, make_vision_tick
 from mavbridge.config.policy import PolicyConfig
 from mavbridge.config.rates import Rates
@@ -74,3 +81,23 @@ def test_a_flight_ends_once_the_policy_has_lost_the_sticks() -> None:
     for index, reason in enumerate((first, both)):
         watch.emit(make_released_tick(2 + index, reason))
     assert ended == [watch.reason] == [first]
+
+
+def test_a_flight_is_measured_from_its_first_action_on() -> None:
+    meter = FlightMeter(stick_hz=100, action_hz=100, vision_hz=30)
+    for index in range(50):
+        meter.emit(make_released_tick(index))
+        meter.emit(make_vision_tick(index))
+    for index in range(100, 112):
+        meter.emit(make_tick(index, missed_slots=50 if index == 100 else 0))
+    report = meter.report()
+    assert report.sticks.sends == 12
+    assert report.sticks.missed_slots == 0
+    assert report.action.rate_hz == pytest.approx(100)
+    assert report.vision.frames == 0
+    for index in range(112, 115):
+        meter.emit(make_tick(index, missed_slots=2 if index == 113 else 0))
+        meter.emit(make_vision_tick(index))
+    report = meter.report()
+    assert (report.sticks.missed_slots, report.vision.frames) == (2, 3)
+    assert meter.cpu_ns > 0

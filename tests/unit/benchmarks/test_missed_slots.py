@@ -12,7 +12,7 @@ from benchmarks.missed_slots import (
     stolen_ms_since,
     stolen_ns,
 )
-from helpers.factories import make_released_tick, make_tick, make_vision_tick
+from helpers.factories import make_released_tick, make_tick
 from helpers.fakes import FakeClock
 from mavbridge.core.clock import NS_PER_MS
 from mavbridge.core.records import Tick
@@ -76,25 +76,6 @@ def test_missed_slots_are_counted_by_cause(proc: Path) -> None:
     assert probe.cpu_ns == 4 * NS_PER_MS
 
 
-def test_ticks_that_are_read_late_are_explained_by_what_happened_since_before_them(
-    proc: Path,
-) -> None:
-    reader = Reader()
-    reader.take(make_tick(0))
-    write(proc, stolen_ms=0, cpu_ms=2, waited_ms=40)
-    reader.take(make_tick(1), late_ms=60)
-    reader.take(make_tick(6, missed_slots=4))
-    assert reader.probe.missed_by_cause == {"kernel": 4}
-
-
-def test_ticks_on_time_and_frames_count_nothing(proc: Path) -> None:
-    probe = GuardProbe(PID, FakeClock())
-    for index in range(5):
-        probe.emit(make_tick(index))
-        probe.emit(make_vision_tick(index))
-    assert probe.missed_by_cause == {}
-
-
 def test_slots_missed_around_a_release_do_not_count(proc: Path) -> None:
     probe = GuardProbe(PID, FakeClock())
     probe.emit(make_tick(0))
@@ -118,12 +99,3 @@ def test_stolen_time_is_what_the_kernel_counts(proc: Path) -> None:
     before_ns = stolen_ns()
     write(proc, stolen_ms=230, cpu_ms=0, waited_ms=0)
     assert stolen_ms_since(before_ns) == 30.0
-
-
-@pytest.mark.parametrize("text", [None, "cpu  100 0 50\n"])
-def test_stolen_time_is_unknown_where_nobody_counts_it(proc: Path, text: str | None) -> None:
-    (proc / "stat").unlink()
-    if text is not None:
-        (proc / "stat").write_text(text)
-    assert stolen_ns() is None
-    assert stolen_ms_since(5) is None

@@ -1,14 +1,10 @@
-import json
 import re
-from dataclasses import replace
 from io import StringIO
-from pathlib import Path
 
 import pytest
 from rich.console import Console
 
-from benchmarks import rollout
-from benchmarks.rollout import Pair, median_trial, print_pairs, write_json
+from benchmarks.rollout import Pair, print_pairs
 from benchmarks.rollout_process import Trial
 from mavbridge.commands.output import PIPED_WIDTH
 
@@ -55,38 +51,9 @@ def test_speed_up_and_bound_are_ratios_of_wall_and_sampling() -> None:
     assert make_pair().bound == pytest.approx(10 / 6)
 
 
-def test_the_median_run_counts() -> None:
-    trials = [make_trial("serial", wall_s=wall_s) for wall_s in (3.0, 1.0, 2.0)]
-    assert median_trial(trials).wall_s == 2.0
-    assert median_trial(trials[:2]).wall_s == 1.0
-
-
 def test_the_table_shows_both_ways() -> None:
     text = printed(*BY_ITERATIONS, *BY_STEPS)
     assert re.search(r"serial +│ +8 │ +4 │ +256 ", text)
     assert re.search(r"streamed +│ +8 │ +4 │ +128 ", text)
     for part in ("329", "123", "1.25", "1.67", "0 of 4 pairs differ in their frames"):
         assert part in text
-
-
-def test_pairs_with_different_frames_are_counted() -> None:
-    pair = make_pair()
-    other = replace(pair, streamed=replace(pair.streamed, sha256="1" * 64))
-    assert "1 of 2 pairs differ" in printed(pair, other)
-
-
-def test_the_json_holds_what_follows_from_the_figures(tmp_path: Path) -> None:
-    write_json(BY_STEPS, tmp_path / "a.json")
-    first = json.loads((tmp_path / "a.json").read_text())["pairs"][0]
-    assert (first["speed_up"], first["bound"]) == (1.25, pytest.approx(10 / 6))
-    assert first["streamed"]["frames_decoded"] == 128
-
-
-def test_the_figure_shows_speed_up_by_steps_and_memory_by_iterations() -> None:
-    pytest.importorskip("matplotlib", reason="the figure needs the extra 'bench'")
-    left, right = rollout.draw(BY_ITERATIONS, BY_STEPS).axes
-    measured, bound = left.lines
-    assert list(measured.get_xdata()) == [1, 4]
-    assert list(measured.get_ydata()) == [1.25, 1.25]
-    assert list(bound.get_ydata()) == pytest.approx([10 / 6, 10 / 6])
-    assert [list(line.get_ydata()) for line in right.lines] == [[329, 385], [329, 385]]

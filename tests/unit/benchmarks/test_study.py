@@ -1,13 +1,12 @@
 """The study evaluates each setting once, with the right checkpoint."""
 
-import json
 from collections.abc import Sequence
 from pathlib import Path
 
 import pytest
 
 from benchmarks import study
-from benchmarks.study import DELAYED, DELAYED_WITHOUT_AGE, SETTINGS, Setting, SettingScore
+from benchmarks.study import DELAYED_WITHOUT_AGE, SETTINGS, Setting, SettingScore
 
 
 def make_score(
@@ -62,18 +61,6 @@ def checkpoints(tmp_path: Path) -> dict[str, Path]:
     return paths
 
 
-def test_late_images_are_flown_with_both_checkpoints_and_all_else_with_one(
-    tmp_path: Path, checkpoints: dict[str, Path], evaluations: Evaluations
-) -> None:
-    study.main(json=tmp_path / "study.json", **checkpoints)
-    expected = [
-        ("without_age" if one.group == DELAYED_WITHOUT_AGE else "checkpoint", one.name)
-        for one in SETTINGS
-    ]
-    assert evaluations.flown == expected
-    assert len(json.loads((tmp_path / "study.json").read_text())) == len(SETTINGS)
-
-
 def test_an_interrupted_study_resumes_and_other_weights_begin_anew(
     tmp_path: Path, checkpoints: dict[str, Path], evaluations: Evaluations
 ) -> None:
@@ -88,19 +75,3 @@ def test_an_interrupted_study_resumes_and_other_weights_begin_anew(
     checkpoint.write_text("other weights")
     study.main(json=out, checkpoint=checkpoint)
     assert evaluations.names() == 2 * names
-
-
-def test_the_figure_shows_every_success(checkpoints: dict[str, Path]) -> None:
-    figure = pytest.importorskip("matplotlib.figure", reason="the figure needs the extra 'bench'")
-    left, right = figure.Figure().subplots(1, 2)
-    scores = [
-        make_score(one, checkpoints["checkpoint"], 10, success=0.2 + 0.02 * row)
-        for row, one in enumerate(SETTINGS)
-    ]
-    late = [one for one in scores if one.group == DELAYED]
-    others = [one for one in scores if not one.group.startswith(DELAYED)]
-    study.draw_settings(left, others)
-    assert [bar.get_width() for bar in left.patches] == [100 * one.success for one in others[::-1]]
-    study.draw_delays(right, scores)
-    assert list(right.lines[0].get_xdata()) == list(study.DELAYS_MS)
-    assert list(right.lines[0].get_ydata()) == [100 * one.success for one in late]

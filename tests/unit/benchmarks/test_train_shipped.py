@@ -50,12 +50,3 @@ def test_an_unfinished_training_goes_on(commands: list[str], tmp_path: Path) -> 
     (tmp_path / "toge" / "toge.training").mkdir(parents=True)
     train_shipped.main("toge", out=tmp_path)
     assert commands[-1].endswith("--out toge.safetensors --resume")
-
-
-def test_a_clone_without_history_is_told_what_to_do(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(train_shipped, "HERE", tmp_path)
-    with pytest.raises(SystemExit, match="unshallow"):
-        train_shipped.copy_weights_before(tmp_path / "before.safetensors")
-    assert not list(tmp_path.iterdir())

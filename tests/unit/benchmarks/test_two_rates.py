@@ -70,29 +70,6 @@ def test_an_interrupted_map_resumes_and_other_weights_begin_anew(
     assert len(flown) == (len(CONTROLS) + 1) * len(ENCODER_MS) * len(LOOPS)
 
 
-def test_a_part_of_the_map_is_shown_with_what_is_there_already(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    out, shown = tmp_path / "map.json", []
-    weights = tmp_path / "weights"
-    weights.write_text("")
-    monkeypatch.setattr(two_rates, "evaluate", lambda *cell: made(*cell[:5]))
-    monkeypatch.setattr(two_rates, "draw", lambda cells, _path: shown.append(cells))
-    for name in ("races", "sticks"):
-        two_rates.main(
-            json=out,
-            plot=tmp_path / "map.png",
-            controls=(name,),  # type: ignore[arg-type]
-            encoders_ms=(100, 50),
-            loops=("one rate",),
-            sticks=weights,
-            rates=weights,
-        )
-    kinds = [(cell.control, cell.encoder_ms) for cell in shown[-1]]
-    sticks, races = CONTROLS["sticks"].name, CONTROLS["races"].name
-    assert kinds == [(sticks, 50), (sticks, 100), (races, 50), (races, 100)]
-
-
 def test_the_figure_shows_every_cell(tmp_path: Path) -> None:
     pytest.importorskip("matplotlib", reason="the figure needs the extra 'bench'")
     weights = tmp_path / "weights"

@@ -7,8 +7,7 @@ import numpy as np
 import pytest
 
 from helpers.fakes import START_NS, FakeClock
-from mavbridge.camera.deadlines import REOPENED_NS, STALL_NS
-from mavbridge.camera.grabber import Grabber, Image
+from mavbridge.camera.grabber import REOPENED_NS, STALL_NS, Grabber, Image
 from mavbridge.core.clock import NS_PER_S
 from mavbridge.core.errors import CameraError
 
@@ -59,199 +58,135 @@ def source():
     return ScriptedSource()
 
 
-def opening(*sources):
-    """Opens these one after another; an exception fails its attempt, and there are no more."""
-    pending = list(sources)
+@pytest.fixture
+def grab(clock):
+    """Make a grabber that opens these sources in turn; an exception fails its attempt.
 
-    def open_source():
-        item = pending.pop(0) if pending else CameraError("no more sources")
-        if isinstance(item, Exception):
-            raise item
-        return item
+    One that has ``flown`` has delivered a first frame.
+    """
+    made = []
 
-    return open_source
+    def make(*sources, delays_s=(0.0,), flown=True):
+        pending = [*sources]
+
+        def open_source():
+            item = pending.pop(0) if pending else CameraError("no more sources")
+            if isinstance(item, Exception):
+                raise item
+            return item
+
+        grabber = Grabber(open_source, clock=clock, reopen_delays_s=delays_s)
+        made.append((grabber, sources))
+        if flown:
+            sources[0].put(START_NS)
+            assert grabber.read(WAIT_NS).frame_id == 1
+        return grabber
+
+    yield make
+    for grabber, sources in made:
+        for source in sources:
+            if isinstance(source, ScriptedSource):
+                source.fail("end of test")
+        grabber.close()
+        grabber.close()
+    assert "mavbridge-camera" not in [thread.name for thread in threading.enumerate()]
 
 
-def end(grabber, source):
-    source.fail("end of test")
-    grabber.close()
-
-
-def test_a_frame_comes_with_its_stamp_and_cannot_be_written(source, clock):
-    grabber = Grabber(opening(source), clock=clock)
-    source.put(START_NS)
-    frame = grabber.read(WAIT_NS)
-    assert (frame.frame_id, frame.captured_ns) == (1, START_NS)
-    assert not frame.rgb.flags.writeable
-    end(grabber, source)
-
-
-def test_the_newest_frame_wins_and_the_others_are_counted(source, clock):
-    grabber = Grabber(opening(source), clock=clock)
+def test_the_newest_frame_wins_and_the_others_are_counted(source, grab):
+    grabber = grab(source, flown=False)
     source.put(START_NS + 1, START_NS + 2, START_NS + 3)
     frame = grabber.read(WAIT_NS)
     assert (frame.frame_id, frame.captured_ns) == (3, START_NS + 3)
+    assert not frame.rgb.flags.writeable
     assert grabber.dropped_frames == 2
     assert grabber.read(0) is None
     source.put(START_NS + 4)
     assert grabber.read(WAIT_NS).frame_id == 4
     assert grabber.dropped_frames == 2
-    end(grabber, source)
 
 
-def test_before_the_first_frame_it_is_opened_until_that_works(source, clock):
+def test_before_the_first_frame_it_is_opened_until_that_works(source, clock, grab):
     refusals = [CameraError(f"no such device, attempt {k}") for k in range(5)]
-    grabber = Grabber(opening(*refusals, source), clock=clock, reopen_delays_s=(0.0,))
+    grabber = grab(*refusals, source, flown=False)
     clock.advance_ns(3600 * NS_PER_S)
     source.put(START_NS)
     assert grabber.read(WAIT_NS).frame_id == 1
-    end(grabber, source)
 
 
-def test_while_nothing_was_delivered_it_says_why(source, clock):
-    opened = threading.Event()
-
-    def refuse_once():
-        if not opened.is_set():
-            opened.set()
-            raise CameraError("no such device")
-        return source
-
-    grabber = Grabber(refuse_once, clock=clock, reopen_delays_s=(0.05,))
-    assert opened.wait(10)
+def test_while_nothing_was_delivered_it_says_why(source, clock, grab):
+    grabber = grab(CameraError("no such device"), source, delays_s=(0.05,), flown=False)
     assert grabber.waiting_reason in {"it is being opened", "no such device"}
     assert source.idle.wait(10)
     assert grabber.waiting_reason == "it is open, and has delivered no frame yet"
     clock.advance_ns(3600 * NS_PER_S)
     assert grabber.read(0) is None
-    end(grabber, source)
 
 
-def test_a_source_that_falls_silent_is_dead(source, clock):
-    grabber = Grabber(opening(source), clock=clock)
-    source.put(START_NS)
-    grabber.read(WAIT_NS)
-    clock.advance_ns(STALL_NS)
-    assert grabber.read(0) is None
-    clock.advance_ns(1)
-    with pytest.raises(CameraError, match="stopped delivering"):
-        grabber.read(0)
-    end(grabber, source)
-
-
-def test_a_source_that_is_silent_after_it_was_reopened_is_dead(source, clock):
+@pytest.mark.parametrize(("is_reopened", "limit_ns"), [(False, STALL_NS), (True, REOPENED_NS)])
+def test_a_source_that_falls_silent_is_dead(source, clock, grab, is_reopened, limit_ns):
     second = ScriptedSource()
-    grabber = Grabber(opening(source, second), clock=clock, reopen_delays_s=(0.0,))
-    source.put(START_NS)
-    grabber.read(WAIT_NS)
-    source.fail("unplugged")
-    assert second.idle.wait(10)
-    clock.advance_ns(REOPENED_NS)
+    grabber = grab(source, second)
+    if is_reopened:
+        source.fail("unplugged")
+        assert second.idle.wait(10)
+    clock.advance_ns(limit_ns)
     assert grabber.read(0) is None
     clock.advance_ns(1)
     with pytest.raises(CameraError, match="stopped delivering"):
         grabber.read(0)
-    end(grabber, second)
 
 
-@pytest.mark.parametrize("frames", [0, 2])
-def test_any_other_exception_of_a_source_reaches_read_by_name(source, clock, frames):
-    grabber = Grabber(opening(source), clock=clock)
-    for _ in range(frames):
-        source.put(START_NS)
-        grabber.read(WAIT_NS)
-    cause = ValueError("cannot reshape 614400 bytes")
+@pytest.mark.parametrize("flown", [False, True])
+def test_any_other_exception_of_a_source_reaches_read_by_name(source, grab, flown):
+    grabber, cause = grab(source, flown=flown), ValueError("cannot reshape 614400 bytes")
     source.crash(cause)
     for _ in range(2):
         with pytest.raises(CameraError, match=r"ValueError\('cannot reshape 614400") as caught:
             grabber.read(WAIT_NS)
         assert caught.value.__cause__ is cause
-    grabber.close()
     assert source.closed.is_set()
-    assert "mavbridge-camera" not in [thread.name for thread in threading.enumerate()]
 
 
-def test_an_exception_of_the_opener_reaches_read_by_name(clock):
-    grabber = Grabber(opening(OSError("out of file descriptors")), clock=clock)
+def test_an_exception_of_the_opener_reaches_read_by_name(grab):
+    grabber = grab(OSError("out of file descriptors"), flown=False)
     with pytest.raises(CameraError, match=r"OSError.*out of file descriptors"):
         grabber.read(WAIT_NS)
-    grabber.close()
 
 
-def test_a_frame_that_waits_is_given_even_if_nothing_came_since(source, clock):
-    grabber = Grabber(opening(source), clock=clock)
+def test_a_frame_that_waits_is_given_even_if_nothing_came_since(source, clock, grab):
+    grabber = grab(source, flown=False)
     source.put(START_NS)
     clock.advance_ns(STALL_NS + 1)
     assert grabber.read(0) is not None
-    end(grabber, source)
 
 
-def test_a_lost_source_is_opened_again_and_closed_first(source, clock):
-    second = ScriptedSource()
-    grabber = Grabber(opening(source, second), clock=clock, reopen_delays_s=(0.0,))
-    source.put(START_NS)
-    grabber.read(WAIT_NS)
-    source.fail("unplugged")
-    second.put(START_NS + 1)
-    assert source.closed.is_set()
-    assert grabber.read(WAIT_NS).frame_id == 2
-    end(grabber, second)
-    assert second.closed.is_set()
+def test_a_lost_source_is_closed_and_opened_again_and_a_frame_gives_all_attempts_back(source, grab):
+    others = [ScriptedSource() for _ in range(3)]
+    grabber = grab(source, *others)
+    for before, after, frame_id in zip([source, *others], others, (2, 3, 4), strict=False):
+        before.fail("unplugged")
+        after.put(START_NS + frame_id)
+        assert before.closed.is_set()
+        assert grabber.read(WAIT_NS).frame_id == frame_id
 
 
-def test_when_all_attempts_fail_it_is_dead_with_the_last_reason(source, clock):
+@pytest.mark.parametrize("is_opened", [False, True])
+def test_when_all_attempts_fail_it_is_dead_with_the_last_reason(source, grab, is_opened):
+    """Sources that open but deliver nothing use up the attempts."""
     attempts = [CameraError("gone"), CameraError("still gone")]
-    grabber = Grabber(opening(source, *attempts), clock=clock, reopen_delays_s=(0.0, 0.0))
-    source.put(START_NS)
-    grabber.read(WAIT_NS)
+    if is_opened:
+        silent = [ScriptedSource(), ScriptedSource()]
+        for other, attempt in zip(silent, attempts, strict=True):
+            other.crash(attempt)
+    grabber = grab(source, *(silent if is_opened else attempts), delays_s=(0.0, 0.0))
     source.fail("unplugged")
     with pytest.raises(CameraError, match="still gone; 2 attempts to reopen it have failed"):
         grabber.read(WAIT_NS)
-    grabber.close()
 
 
-def test_sources_that_open_but_deliver_nothing_use_up_the_attempts(source, clock):
-    others = [ScriptedSource(), ScriptedSource()]
-    for other in others:
-        other.fail("no picture")
-    grabber = Grabber(opening(source, *others), clock=clock, reopen_delays_s=(0.0, 0.0))
-    source.put(START_NS)
-    grabber.read(WAIT_NS)
-    source.fail("unplugged")
-    with pytest.raises(CameraError, match="no picture"):
-        grabber.read(WAIT_NS)
-    grabber.close()
-    assert all(other.closed.is_set() for other in others)
-
-
-def test_a_frame_gives_all_attempts_back(source, clock):
-    others = [ScriptedSource() for _ in range(3)]
-    grabber = Grabber(opening(source, *others), clock=clock, reopen_delays_s=(0.0,))
-    source.fail("unplugged")
-    for other in others[:-1]:
-        other.put(START_NS)
-        other.fail("unplugged again")
-    others[-1].put(START_NS)
-    assert grabber.read(WAIT_NS) is not None
-    end(grabber, others[-1])
-
-
-def test_while_it_is_being_opened_again_there_is_no_frame_and_no_error(source, clock):
-    grabber = Grabber(opening(source), clock=clock, reopen_delays_s=(3600.0,))
-    source.put(START_NS)
-    grabber.read(WAIT_NS)
+def test_while_it_is_being_opened_again_there_is_no_frame_and_no_error(source, clock, grab):
+    grabber = grab(source, delays_s=(3600.0,))
     source.fail("unplugged")
     assert source.closed.wait(10)
     clock.advance_ns(STALL_NS + REOPENED_NS)
     assert grabber.read(0) is None
-    grabber.close()
-
-
-def test_close_ends_the_thread_and_may_be_called_twice(source, clock):
-    grabber = Grabber(opening(source), clock=clock)
-    names = [thread.name for thread in threading.enumerate()]
-    assert "mavbridge-camera" in names
-    end(grabber, source)
-    grabber.close()
-    assert "mavbridge-camera" not in [thread.name for thread in threading.enumerate()]
-    assert source.closed.is_set()

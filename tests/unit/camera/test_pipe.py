@@ -167,14 +167,12 @@ def test_depth_comes_as_png_of_16_bits_or_raw_and_no_other_picture_is_depth() ->
     shown = PictureCutter().decode(encoded(depth, ".png"))
     raw = RawCutter(SIDE, SIDE, RAW_FORMATS["gray16le"]).decode(depth.astype("<u2").tobytes())
     for found in (shown, raw):
-        assert found is not None
         assert found.dtype == np.uint16
         assert np.array_equal(found, depth)
     for colours in (np.dstack([depth] * 3), (depth >> 8).astype(np.uint8), scene(1)):
         done, data = cv2.imencode(".png", colours)
         assert done
         picture = PictureCutter().decode(data.tobytes())
-        assert picture is not None
         assert (picture.dtype, picture.shape) == (np.uint8, (SIDE, SIDE, 3))
 
 
@@ -198,7 +196,6 @@ def test_frames_come_from_a_program(tmp_path: Path) -> None:
     )
     try:
         frame = camera.read(2_000 * NS_PER_MS)
-        assert frame is not None
         assert frame.rgb.shape == (HEIGHT, WIDTH, 3)
         assert abs(int(frame.rgb[8, 24, 1]) - 40) < 6
         assert frame.captured_ns <= clock.now_ns() - 20 * NS_PER_MS

@@ -64,6 +64,18 @@ class HandWriter:
         self._file.close()
 
 
+class HookedClock(FakeClock):
+    """Calls back in each sleep: what another process would do meanwhile."""
+
+    def __init__(self):
+        super().__init__()
+        self.on_sleep = lambda: None
+
+    def sleep_until_ns(self, deadline_ns):
+        super().sleep_until_ns(deadline_ns)
+        self.on_sleep()
+
+
 @pytest.fixture
 def path():
     path = Path("/dev/shm", f"mb-test-reader-{os.getpid()}")
@@ -80,7 +92,7 @@ def writer(path):
 
 @pytest.fixture
 def clock():
-    return FakeClock()
+    return HookedClock()
 
 
 @pytest.fixture
@@ -90,81 +102,39 @@ def camera(writer, clock):
     camera.close()
 
 
-class HookedClock(FakeClock):
-    """Calls back in each sleep: what another process would do meanwhile."""
-
-    def __init__(self):
-        super().__init__()
-        self.on_sleep = lambda: None
-
-    def sleep_until_ns(self, deadline_ns):
-        super().sleep_until_ns(deadline_ns)
-        self.on_sleep()
-
-
 def test_a_frame_comes_with_its_stamp_and_cannot_be_written(camera, writer):
     writer.publish(1, START_NS - 5 * NS_PER_MS, grey=77)
     frame = camera.read(0)
-    assert frame is not None
     assert (frame.frame_id, frame.captured_ns) == (1, START_NS - 5 * NS_PER_MS)
     assert frame.rgb.shape == (HEIGHT, WIDTH, 3)
     assert frame.rgb.dtype == np.uint8
     assert set(frame.rgb.ravel().tolist()) == {77}
     assert not frame.rgb.flags.writeable
+    assert camera.read(30 * NS_PER_MS) is None  # given once
+    camera.close()
+    assert set(frame.rgb.ravel().tolist()) == {77}
 
 
-def test_a_frame_is_given_once(camera, writer, clock):
-    writer.publish(1, START_NS)
-    assert camera.read(0) is not None
-    assert camera.read(30 * NS_PER_MS) is None
-    assert clock.now_ns() == START_NS + 30 * NS_PER_MS
-
-
-def test_the_newest_frame_wins_and_the_skipped_are_counted(camera, writer):
+def test_the_newest_frame_wins_and_the_skipped_are_counted(camera, writer, clock):
     for frame_id in range(1, 7):
         writer.publish(frame_id, START_NS + frame_id, grey=frame_id)
-    frame = camera.read(0)
-    assert frame is not None
-    assert frame.frame_id == 6
+    assert camera.read(0).frame_id == 6
     assert camera.dropped_frames == 5
+    late = SharedMemoryCamera(writer.path.name, clock=clock)
+    assert (late.read(0).frame_id, late.dropped_frames) == (6, 0)  # from before the opening
+    late.close()
 
 
-def test_frames_from_before_the_opening_are_not_counted(writer, clock):
-    for frame_id in range(1, 101):
-        writer.publish(frame_id, START_NS)
-    camera = SharedMemoryCamera(writer.path.name, clock=clock)
-    frame = camera.read(0)
-    assert frame is not None
-    assert frame.frame_id == 100
-    assert camera.dropped_frames == 0
-    camera.close()
-
-
-def test_a_frame_copy_survives_the_writer_and_the_camera(camera, writer):
-    writer.publish(1, START_NS, grey=9)
-    frame = camera.read(0)
-    assert frame is not None
-    writer.publish(5, START_NS, grey=200)
-    camera.close()
-    assert set(frame.rgb.ravel().tolist()) == {9}
-
-
-def test_a_half_written_frame_is_waited_for(writer):
-    clock = HookedClock()
-    camera = SharedMemoryCamera(writer.path.name, clock=clock)
+def test_a_half_written_frame_is_waited_for(camera, writer, clock):
     writer.begin(1, START_NS, grey=3)
     writer.announce(1)
     assert camera.read(0) is None
     clock.on_sleep = lambda: writer.finish(1)
-    frame = camera.read(10 * NS_PER_MS)
-    assert frame is not None
-    assert frame.frame_id == 1
-    camera.close()
+    assert camera.read(10 * NS_PER_MS).frame_id == 1
 
 
-def test_a_lapped_copy_is_thrown_away_and_the_newer_frame_taken(writer, clock, monkeypatch):
+def test_a_lapped_copy_is_thrown_away_and_the_newer_frame_taken(camera, writer, monkeypatch):
     """The writer comes round to the slot while its pixels are being copied."""
-    camera = SharedMemoryCamera(writer.path.name, clock=clock)
     writer.publish(1, START_NS, grey=1)
     laps = iter([lambda: writer.publish(5, START_NS + 5, grey=5)])
 
@@ -175,9 +145,7 @@ def test_a_lapped_copy_is_thrown_away_and_the_newer_frame_taken(writer, clock, m
     barriers = ["newest", "before copy", "after copy", *["later"] * 3]
     monkeypatch.setattr(shared_memory, "memory_barrier", interrupted)
     frame = camera.read(0)
-    assert frame is not None
     assert (frame.frame_id, frame.captured_ns, frame.rgb[0, 0, 0]) == (5, START_NS + 5, 5)
-    camera.close()
 
 
 def test_a_writer_that_falls_silent_is_dead_after_two_seconds(camera, writer, clock):
@@ -190,12 +158,20 @@ def test_a_writer_that_falls_silent_is_dead_after_two_seconds(camera, writer, cl
         camera.read(0)
 
 
-def test_a_writer_that_closed_is_named_as_the_cause(camera, writer, clock):
+@pytest.mark.parametrize(
+    ("spoil", "told"),
+    [
+        (lambda writer: (writer.set_closed(), writer.path.unlink()), "closed"),
+        (lambda writer: writer.publish(2, START_NS - 100 * NS_PER_S), "CLOCK_MONOTONIC"),
+    ],
+)
+def test_a_writer_that_closed_or_leaves_our_clock_is_named_as_the_cause(
+    camera, writer, clock, spoil, told
+):
     writer.publish(1, START_NS)
     camera.read(0)
-    writer.set_closed()
-    writer.path.unlink()
-    with pytest.raises(CameraError, match="closed"):
+    spoil(writer)
+    with pytest.raises(CameraError, match=told):
         camera.read(3 * NS_PER_S)
     assert clock.now_ns() <= START_NS + 2 * NS_PER_S + NS_PER_MS
 
@@ -214,18 +190,7 @@ def test_stamps_of_another_clock_are_refused(camera, writer, age_s):
     assert "CLOCK_MONOTONIC" in camera.waiting_reason
 
 
-def test_stamps_that_leave_our_clock_are_refused(camera, writer, clock):
-    writer.publish(1, START_NS)
-    assert camera.read(0) is not None
-    writer.publish(2, START_NS - 100 * NS_PER_S)
-    with pytest.raises(CameraError, match="CLOCK_MONOTONIC"):
-        camera.read(3 * NS_PER_S)
-    assert clock.now_ns() <= START_NS + 2 * NS_PER_S + NS_PER_MS
-
-
-def test_a_writer_that_starts_again_is_followed_and_ids_keep_rising(writer):
-    clock = HookedClock()
-    camera = SharedMemoryCamera(writer.path.name, clock=clock)
+def test_a_writer_that_starts_again_is_followed_and_ids_keep_rising(camera, writer, clock):
     for frame_id in (1, 2, 3):
         writer.publish(frame_id, START_NS)
     assert camera.read(0) is not None
@@ -238,15 +203,11 @@ def test_a_writer_that_starts_again_is_followed_and_ids_keep_rising(writer):
 
     clock.on_sleep = restart
     frame = camera.read(NS_PER_S)
-    assert frame is not None
-    assert frame.frame_id == 4
-    assert frame.rgb[0, 0, 0] == 42
+    assert (frame.frame_id, frame.rgb[0, 0, 0]) == (4, 42)
     successors[0].close()
-    camera.close()
 
 
-def test_a_name_that_appears_late_is_waited_for(path):
-    clock = HookedClock()
+def test_a_name_that_appears_late_is_waited_for(path, clock):
     writers = []
 
     def start_after_nine_seconds():
@@ -270,25 +231,13 @@ def test_a_name_that_is_not_there_says_what_to_start_and_what_is_there(writer, c
     camera.close()
 
 
-def test_a_file_in_another_format_that_appears_late_is_refused(path):
-    clock = HookedClock()
-    camera = SharedMemoryCamera(path.name, clock=clock)
-    clock.on_sleep = lambda: path.write_bytes(b"something else")
-    with pytest.raises(CameraError, match="wrong magic"):
-        camera.read(NS_PER_S)
-    camera.close()
-
-
 @pytest.mark.parametrize(
     ("content", "complaint"),
     [
         pytest.param(b"", "wrong magic", id="empty"),
         pytest.param(header(magic=b"MBSHM\0\0\2").ljust(832, b"\0"), "wrong magic", id="version"),
         pytest.param(header(channels=4).ljust(832, b"\0"), "4 channels", id="channels"),
-        pytest.param(header(slots=2).ljust(832, b"\0"), "2 slots", id="slots"),
         pytest.param(header(width=0).ljust(832, b"\0"), "impossible", id="no width"),
-        pytest.param(header(height=1 << 31).ljust(832, b"\0"), "impossible", id="height"),
-        pytest.param(header().ljust(64 + 4 * STRIDE - 1, b"\0"), "take 832 bytes", id="short"),
         pytest.param(header().ljust(64 + 4 * STRIDE + 1, b"\0"), "it has 833", id="long"),
     ],
 )
@@ -296,13 +245,6 @@ def test_a_file_in_another_format_is_refused(path, clock, content, complaint):
     path.write_bytes(content)
     with pytest.raises(CameraError, match=complaint):
         SharedMemoryCamera(path.name, clock=clock)
-
-
-def test_a_folder_is_refused(path, clock):
-    path.mkdir()
-    with pytest.raises(CameraError, match="cannot be opened"):
-        SharedMemoryCamera(path.name, clock=clock)
-    path.rmdir()
 
 
 def free_after(seconds, path, is_over):
@@ -337,19 +279,12 @@ def test_impossible_names_are_refused(name, clock):
         SharedMemoryCamera(name, clock=clock)
 
 
-def test_close_twice_leaves_the_segment_alone(camera, writer):
-    camera.close()
-    camera.close()
-    assert writer.path.exists()
-
-
 def test_the_simulators_writer_is_understood(path, clock):
     publisher = FramePublisher(path.name, WIDTH, HEIGHT)
     camera = SharedMemoryCamera(path.name, clock=clock)
     image = np.arange(HEIGHT * WIDTH * 3, dtype=np.uint8).reshape(HEIGHT, WIDTH, 3)
     publisher.publish(image, captured_ns=START_NS - 1)
     frame = camera.read(0)
-    assert frame is not None
     assert (frame.frame_id, frame.captured_ns) == (1, START_NS - 1)
     np.testing.assert_array_equal(frame.rgb, image)
     publisher.close()
@@ -396,7 +331,6 @@ def read_until(last_id, camera):
     seen = []
     while not seen or seen[-1][0] < last_id:
         frame = camera.read(10 * NS_PER_S)
-        assert frame is not None
         seen.append((frame.frame_id, frame.rgb.min(), frame.rgb.max()))
     return seen
 

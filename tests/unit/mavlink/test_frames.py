@@ -59,5 +59,4 @@ def test_a_packet_without_a_payload_is_one() -> None:
 def test_a_number_of_three_bytes() -> None:
     data = bytes((0xFD, 1, 0, 0, 0, 7, 9, 0x01, 0x02, 0x03)) + b"x" + b"\x12\x34"
     frame = frame_at(data, 0)
-    assert frame is not None
     assert frame.message_id == 0x030201

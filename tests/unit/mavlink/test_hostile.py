@@ -4,7 +4,6 @@ import math
 import time
 
 import pytest
-from pymavlink.dialects.v20 import ardupilotmega as dialect
 
 from helpers.fakes import START_NS
 from helpers.flown_vehicle import Flight, FlownVehicle, codec
@@ -37,29 +36,6 @@ def test_a_huge_datagram_costs_no_more_than_a_large_one(unit: bytes) -> None:
     assert [m.name for m in ours.decode_datagram(WireEnd().heartbeat())] == ["HEARTBEAT"]
 
 
-@pytest.mark.parametrize(
-    "values", [(32767, 0, 500, 0), (0, -32768, 500, 0), (0, 0, 1001, 0), (0, 0, -1, 0)]
-)
-def test_sticks_that_no_stick_has_are_unusable(values: tuple[int, int, int, int]) -> None:
-    """They were taken for the pilot's, and a flight began with them: the codec refused those."""
-    ours, end = codec(), WireEnd()
-    packet = end.pack(end.mav.manual_control_encode(255, *values, 0))
-    (message,) = ours.decode_datagram(packet)
-    assert message.body is None
-    assert ours.bad_data_count == 1
-
-
-@pytest.mark.parametrize("bad", [3.4e38, -3.4e38, math.inf, math.nan])
-@pytest.mark.parametrize("axis", range(3))
-def test_a_speed_beyond_any_vehicle_is_unusable(bad: float, axis: int) -> None:
-    """Its square is infinite in the float32 with which policies compute."""
-    ours, end = codec(), WireEnd()
-    velocity = [bad if k == axis else 1.0 for k in range(3)]
-    packet = end.pack(end.mav.local_position_ned_encode(1000, 0.0, 0.0, 0.0, *velocity))
-    (message,) = ours.decode_datagram(packet)
-    assert message.body is None
-
-
 def test_a_text_cannot_write_into_the_terminal() -> None:
     end = WireEnd()
     (message,) = codec().decode_datagram(end.pack(end.mav.statustext_encode(4, b"\x1b[2J a\tb")))
@@ -73,7 +49,6 @@ def test_a_text_cannot_write_into_the_terminal() -> None:
 def test_a_text_ends_with_its_last_visible_character(data: bytes, text_id: int) -> None:
     end = WireEnd()
     (message,) = codec().decode_datagram(end.pack(end.mav.statustext_encode(6, data, text_id)))
-    assert isinstance(message.body, StatusText)
     assert message.body.text == data.decode().rstrip()
 
 
@@ -81,7 +56,6 @@ def test_a_piece_with_many_bytes_beyond_ascii_is_the_last_one_all_the_same() -> 
     end = WireEnd()
     text = "Höhe überschritten, äöüÄÖÜß".encode()
     (message,) = codec().decode_datagram(end.pack(end.mav.statustext_encode(4, text, 7, 1)))
-    assert isinstance(message.body, StatusText)
     assert not message.body.is_full
 
 
@@ -133,7 +107,3 @@ def test_a_climb_rate_that_cannot_be_turns_no_climb_into_a_descent(limit: float)
     for down_mps in (-2.0, 0.0, 2.0):
         message = flight.message(flight.send(Velocity(0.0, 0.0, down_mps, 0.0)))
         assert math.isclose(message.vz, 0.0, abs_tol=0.01)
-
-
-def test_every_message_of_the_dialect_has_a_name_in_the_counters() -> None:
-    assert len(dialect.mavlink_map) < 500

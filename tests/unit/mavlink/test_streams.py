@@ -24,7 +24,6 @@ def ack(result: int, command: int = dialect.MAV_CMD_SET_MESSAGE_INTERVAL) -> Com
 
 
 def ids(request: object) -> tuple[float, float]:
-    assert isinstance(request, CommandRequest)
     return request.params[0], round(request.params[1])
 
 
@@ -224,7 +223,6 @@ class Link:
         for _ in range(round(duration_s * 1000)):
             self._now_ns += NS_PER_MS
             if (request := self.requester.step(self._now_ns)) is not None:
-                assert isinstance(request, CommandRequest)
                 self.asked.append((int(request.params[0]), 1e6 / request.params[1]))
                 self.rates_hz[int(request.params[0])] = 1e6 / request.params[1]
                 self.requester.receive_ack(ack(0))
@@ -290,16 +288,6 @@ def test_a_link_is_not_blamed_for_a_slow_clock() -> None:
 def test_packets_that_get_lost_are_no_reason_to_ask_for_less() -> None:
     link = Link(PX4.streams(state_hz=100), capacity_hz=10_000.0)
     link.run(30.0, loses_every=2)
-    assert link.texts == []
-    assert link.rates_hz[31] == 100.0
-
-
-def test_one_stream_that_is_slow_alone_is_no_full_link() -> None:
-    link = Link(PX4.streams(state_hz=100), capacity_hz=10_000.0)
-    link.run(3.0)
-    for _ in range(10):
-        link.rates_hz[31] = 4.0  # a ground station on the same link
-        link.run(4.5)
     assert link.texts == []
     assert link.rates_hz[31] == 100.0
 

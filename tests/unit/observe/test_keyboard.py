@@ -7,6 +7,7 @@ import sys
 import termios
 from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -56,8 +57,8 @@ class Pressed:
         return self.keys.get(timeout=30.0)
 
 
-def started(fd: int, pressed: Pressed) -> Keyboard:
-    keyboard = Keyboard(pressed.keys.put, fd=fd)
+def started(fd: int, pressed: Pressed, **keys: Any) -> Keyboard:
+    keyboard = Keyboard(pressed.keys.put, fd=fd, **keys)
     assert keyboard.start()
     for _ in range(600):
         if not local_modes(fd) & termios.ICANON:
@@ -67,9 +68,7 @@ def started(fd: int, pressed: Pressed) -> Keyboard:
 
 
 def local_modes(fd: int) -> int:
-    modes = termios.tcgetattr(fd)[LOCAL_MODES]
-    assert isinstance(modes, int)
-    return modes
+    return termios.tcgetattr(fd)[LOCAL_MODES]
 
 
 def test_keys_come_singly_without_echo_and_control_c_stays_a_signal(
@@ -116,23 +115,10 @@ def test_a_paste_or_a_function_key_engages_nothing(
 def test_other_keys_may_be_listened_to(terminal: tuple[int, int]) -> None:
     user, fd = terminal
     pressed = Pressed()
-    keyboard = Keyboard(pressed.keys.put, keys=("q", " ", "g"), fd=fd)
-    assert keyboard.start()
-    while local_modes(fd) & termios.ICANON:
-        select.select([], [], [], 0.05)
+    keyboard = started(fd, pressed, keys=("q", " ", "g"))
     for key in ("g", " ", "q"):
         os.write(user, key.encode())
         assert pressed.next() == key
-    keyboard.stop(30.0)
-
-
-def test_a_release_among_other_keys_counts(terminal: tuple[int, int]) -> None:
-    user, fd = terminal
-    pressed = Pressed()
-    keyboard = started(fd, pressed)
-    os.write(user, b"eq")
-    while pressed.next() != "q":
-        pass
     keyboard.stop(30.0)
 
 
@@ -208,3 +194,13 @@ def test_a_job_in_the_background_is_not_stopped(terminal: tuple[int, int]) -> No
     output, _ = job.communicate("end\n", timeout=60.0)
     assert output == "0\n"
     assert termios.tcgetattr(fd) == before
+
+
+def test_a_release_among_other_keys_counts(terminal: tuple[int, int]) -> None:
+    user, fd = terminal
+    pressed = Pressed()
+    keyboard = started(fd, pressed)
+    os.write(user, b"eq")
+    while pressed.next() != "q":
+        pass
+    keyboard.stop(30.0)

@@ -1,4 +1,6 @@
 import io
+from dataclasses import replace
+from typing import Any
 
 import pytest
 from rich.console import Console, RenderableType
@@ -48,14 +50,35 @@ def test_the_table_fits_eighty_columns() -> None:
     assert max(len(line) for line in rendered(table).splitlines()) <= 80
 
 
-def test_verdicts_compare_targets_and_results() -> None:
-    link = LinkStats(
-        messages_per_s=(),
-        lost_fraction=0.0,
-        rtt_ms=Percentiles(p50=1, p99=1, p999=1, max=1),
-        sent_overrides=11,
-        echo_confirmed=True,
+def link_of(**changes: Any) -> LinkStats:
+    stats = LinkStats(
+        messages_per_s=(), lost_fraction=0.0, rtt_ms=None, sent_overrides=1, echo_confirmed=True
     )
+    return replace(stats, **changes)
+
+
+@pytest.mark.parametrize(
+    ("link", "expected"),
+    [
+        (
+            link_of(echo_confirmed=False, lost_fraction=0.5),
+            "NO ECHO from the vehicle, 50.00% of the vehicle's messages lost",
+        ),
+        (link_of(echo_confirmed=None, lost_fraction=None), "echo not checked, loss not measured"),
+        (
+            link_of(saturated=(("pitch", 0.123), ("yaw", 0.001))),
+            "echo confirmed, 0.00% of the vehicle's messages lost, pitch beyond what the vehicle "
+            "does in 12.3%, yaw beyond what the vehicle does in 0.1%",
+        ),
+    ],
+)
+def test_the_link_verdict_is_honest(link: LinkStats, expected: str) -> None:
+    (line,) = [line for line in verdict_lines(report_of(make_tick(), link=link)) if "link" in line]
+    assert line == f"link     1 stick message sent, {expected}"
+
+
+def test_verdicts_compare_targets_and_results() -> None:
+    link = link_of(rtt_ms=Percentiles(p50=1, p99=1, p999=1, max=1), sent_overrides=11)
     report = report_of(*(make_tick(index) for index in range(11)), link=link, rerun_drops=0)
     assert verdict_lines(report) == [
         "sticks   100 Hz grid, 0 slots of 11 missed, 0 sends coasting",
@@ -76,42 +99,6 @@ def test_verdicts_name_the_last_releases_and_what_observers_missed() -> None:
         "the flight is over (0.0 s); the flight was ended by a signal (0.0 s)",
         "rerun    missed 1 event",
     ]
-
-
-@pytest.mark.parametrize(
-    ("confirmed", "lost", "expected"),
-    [
-        (False, 0.5, "NO ECHO from the vehicle, 50.00% of the vehicle's messages lost"),
-        (None, None, "echo not checked, loss not measured"),
-    ],
-)
-def test_the_link_verdict_is_honest(
-    confirmed: bool | None, lost: float | None, expected: str
-) -> None:
-    link = LinkStats(
-        messages_per_s=(),
-        lost_fraction=lost,
-        rtt_ms=None,
-        sent_overrides=1,
-        echo_confirmed=confirmed,
-    )
-    assert verdict_lines(report_of(make_tick(), link=link))[3] == (
-        f"link     1 stick message sent, {expected}"
-    )
-
-
-def test_the_link_verdict_tells_which_sticks_asked_for_too_much() -> None:
-    link = LinkStats(
-        messages_per_s=(),
-        lost_fraction=0.0,
-        rtt_ms=None,
-        sent_overrides=1000,
-        echo_confirmed=True,
-        saturated=(("pitch", 0.123), ("yaw", 0.001)),
-    )
-    assert verdict_lines(report_of(make_tick(), link=link))[3].endswith(
-        ", pitch beyond what the vehicle does in 12.3%, yaw beyond what the vehicle does in 0.1%"
-    )
 
 
 @pytest.mark.parametrize(

@@ -1,4 +1,5 @@
 import io
+from typing import Any
 
 import pytest
 from rich.console import Console
@@ -28,6 +29,12 @@ def make_screen(console: Console | None = None, *, readonly: bool = False) -> Fl
     return FlightScreen(console, action_hz=100, vision_hz=30, readonly=readonly)
 
 
+def shown_screen(*, width: int = 80, **terminal: Any) -> tuple[FlightScreen, io.StringIO]:
+    """A screen, and what it prints."""
+    out = io.StringIO()
+    return make_screen(Console(file=out, width=width, **terminal)), out
+
+
 def said(text: str) -> Reason:
     return because(Code.POLICY_REFUSED, said=text)
 
@@ -49,10 +56,6 @@ def test_the_line_of_a_good_flight() -> None:
         "FLYING  ALT_HOLD armed  action 100.0 Hz  vision 25.0 Hz"
         "  feature 40 ms  state 3 ms  missed 0"
     )
-
-
-def test_before_the_first_tick_the_line_says_so() -> None:
-    assert make_screen().status_line().plain == "waiting for the first tick"
 
 
 @pytest.mark.parametrize(
@@ -93,12 +96,6 @@ def test_readonly_is_not_called_flying_and_a_release_stays_a_release() -> None:
     assert line.endswith("  no image feature yet")  # last, since it may be long
 
 
-def test_one_refresh_is_no_rate_yet() -> None:
-    screen = make_screen()
-    screen.emit(make_tick(0))
-    assert "action - Hz  vision - Hz" in screen.status_line().plain
-
-
 def test_a_loop_that_has_stopped_has_no_rate() -> None:
     screen = make_screen()
     assert "action 100.0 Hz" in fly(screen, ticks=201)
@@ -106,21 +103,8 @@ def test_a_loop_that_has_stopped_has_no_rate() -> None:
     assert "action - Hz  vision - Hz" in lines[-1]
 
 
-def test_the_rate_follows_within_the_window() -> None:
-    screen = make_screen()
-    fly(screen, ticks=201)
-    line = ""
-    for number in range(1, 101):  # half the rate from here on
-        screen.emit(make_tick(200 + 2 * number))
-        if number % (REFRESH_TICKS // 2) == 0:
-            line = screen.status_line().plain
-    assert "action 50.0 Hz" in line
-
-
 def test_the_line_is_cut_not_wrapped_on_a_narrow_terminal() -> None:
-    out = io.StringIO()
-    console = Console(file=out, width=60, force_terminal=True, color_system=None)
-    screen = make_screen(console)
+    screen, out = shown_screen(width=60, force_terminal=True, color_system=None)
     with screen.live():
         screen.emit(make_released_tick(0, said("a very long reason " * 10)))
         screen.refresh()
@@ -130,8 +114,7 @@ def test_the_line_is_cut_not_wrapped_on_a_narrow_terminal() -> None:
 
 
 def test_where_there_is_no_terminal_a_line_is_printed_now_and_then() -> None:
-    out = io.StringIO()
-    screen = make_screen(Console(file=out, width=80))
+    screen, out = shown_screen()
     with screen.live():
         screen.emit(make_tick(0))
         for _ in range(2 * round(PLAIN_PERIOD_S * STATUS_HZ)):
@@ -144,8 +127,7 @@ def test_where_there_is_no_terminal_a_line_is_printed_now_and_then() -> None:
 
 
 def test_messages_are_printed_once_in_order() -> None:
-    out = io.StringIO()
-    screen = make_screen(Console(file=out, width=80))
+    screen, out = shown_screen()
     no_state = said("no [bold] state")
     screen.emit(make_released_tick(0, reason=no_state, texts=("vehicle: Arming motors",)))
     screen.emit(make_released_tick(1, reason=no_state))
@@ -166,8 +148,7 @@ def test_messages_are_printed_once_in_order() -> None:
 
 
 def test_a_reason_that_keeps_changing_is_shown_once_a_second() -> None:
-    out = io.StringIO()
-    screen = make_screen(Console(file=out, width=80))
+    screen, out = shown_screen()
     reasons = [because(code) for code in (Code.NO_CHUNK, Code.NO_IMAGE, Code.NOT_ARMED)]
     for index in range(201):
         screen.emit(make_released_tick(index, reasons[index % 3], phase="waiting"))
@@ -177,8 +158,7 @@ def test_a_reason_that_keeps_changing_is_shown_once_a_second() -> None:
 
 
 def test_a_reason_whose_figures_alone_change_is_shown_once() -> None:
-    out = io.StringIO()
-    screen = make_screen(Console(file=out, width=80))
+    screen, out = shown_screen()
     for index in range(201):
         screen.emit(make_released_tick(index, because(Code.IMAGE_FROZEN, age_s=index / 100)))
     screen.refresh()
@@ -186,9 +166,7 @@ def test_a_reason_whose_figures_alone_change_is_shown_once() -> None:
 
 
 def test_on_a_terminal_the_line_is_redrawn_and_leaves_nothing_behind() -> None:
-    out = io.StringIO()
-    console = Console(file=out, width=100, force_terminal=True, color_system=None)
-    screen = make_screen(console)
+    screen, out = shown_screen(width=100, force_terminal=True, color_system=None)
     with screen.live():
         screen.emit(make_tick(0))
         screen.refresh()
@@ -198,9 +176,7 @@ def test_on_a_terminal_the_line_is_redrawn_and_leaves_nothing_behind() -> None:
 
 
 def test_the_keys_are_named_below_the_line() -> None:
-    out = io.StringIO()
-    console = Console(file=out, width=100, force_terminal=True, color_system=None)
-    screen = make_screen(console)
+    screen, out = shown_screen(width=100, force_terminal=True, color_system=None)
     screen.start(hint="e engages")
     screen.refresh()
     assert screen.close(60.0)
@@ -208,8 +184,7 @@ def test_the_keys_are_named_below_the_line() -> None:
 
 
 def test_close_prints_what_is_left_and_may_be_called_again() -> None:
-    out = io.StringIO()
-    screen = make_screen(Console(file=out, width=100))
+    screen, out = shown_screen()
     screen.start(hint="e engages")
     screen.show_message("the last message")
     screen.show_report(report_of(*(make_tick(index) for index in range(11))))
@@ -222,34 +197,16 @@ def test_close_prints_what_is_left_and_may_be_called_again() -> None:
     assert out.getvalue() == shown
 
 
-def test_a_screen_that_never_started_prints_what_it_has_at_the_end() -> None:
-    out = io.StringIO()
-    screen = make_screen(Console(file=out, width=100))
-    screen.show_report(report_of())
-    assert screen.close(60.0)
-    assert "p99" not in out.getvalue()  # nothing was measured: no table
-    assert "never released" in out.getvalue()
-
-
 def test_the_oldest_messages_are_dropped_and_counted() -> None:
-    out = io.StringIO()
-    screen = make_screen(Console(file=out, width=100))
+    screen, out = shown_screen()
     for number in range(MAX_MESSAGES + 3):
         screen.show_message(f"message {number}")
     screen.refresh()
     assert out.getvalue().splitlines()[:2] == ["(3 older messages were dropped)", "message 3"]
 
 
-def test_a_status_of_the_end_replaces_the_line() -> None:
-    screen = make_screen()
-    screen.emit(make_tick(0))
-    screen.show_status("ending the flight")
-    assert screen.status_line().plain == "ending the flight"
-
-
 def test_no_line_shows_the_password_of_an_address() -> None:
-    text = io.StringIO()
-    screen = make_screen(Console(file=text, width=200))
+    screen, text = shown_screen(width=200)
     secret = "camera rtsp://me:it@host/1?token=abc is lost"
     screen.emit(make_released_tick(0, said(secret)))
     line = screen.status_line().plain
@@ -261,3 +218,12 @@ def test_no_line_shows_the_password_of_an_address() -> None:
     assert shown.count("rtsp://me:***@host/1?token=*** is lost") >= 4
     assert "it@" not in shown
     assert "abc" not in shown
+
+
+def test_a_screen_that_never_started_prints_what_it_has_at_the_end() -> None:
+    out = io.StringIO()
+    screen = make_screen(Console(file=out, width=100))
+    screen.show_report(report_of())
+    assert screen.close(60.0)
+    assert "p99" not in out.getvalue()  # nothing was measured: no table
+    assert "never released" in out.getvalue()

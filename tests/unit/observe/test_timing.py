@@ -1,4 +1,6 @@
 import json
+from operator import attrgetter
+from typing import Any
 
 import pytest
 
@@ -63,112 +65,75 @@ def all_equal(value: float) -> Percentiles:
     return Percentiles(p50=value, p99=value, p999=value, max=value)
 
 
-def test_a_perfect_flight() -> None:
-    report = timed(*(make_tick(index) for index in range(101)))
-    assert report.duration_s == 1.0
-    sticks, action = report.sticks, report.action
-    assert (sticks.rate_hz, sticks.flying_s) == (100.0, 1.0)
-    assert (sticks.sends, sticks.slots, sticks.missed_slots) == (101, 101, 0)
-    assert sticks.coasting_sends == 0
-    assert sticks.lateness_ms == all_equal(2.0)
-    assert action.rate_hz == 100.0
-    assert (action.chunks, action.late_chunks) == (101, 0)
-    assert action.period_ms == all_equal(10.0)
-    assert action.predict_ms == all_equal(2.0)
-    assert report.feature_age_ms == all_equal(40.0)
-    assert report.state_age_ms == all_equal(3.0)
-    assert report.state_to_wire_ms == all_equal(3.0)
-    assert report.releases == ()
+def computed(index: int, after_ms: int) -> Tick:
+    """Tick ``index``, with a chunk that was finished so long after that of tick 0."""
+    first_ns = make_tick(0).chunk_computed_ns
+    return make_tick(index, chunk_computed_ns=first_ns + after_ms * NS_PER_MS)
 
 
-def test_a_stall_counts_its_slots_and_makes_its_chunk_late() -> None:
-    last = (make_tick(7, missed_slots=5, chunk_serial=2), make_tick(8, chunk_serial=3))
-    report = timed(make_tick(0), make_tick(1), *last)
-    assert (report.sticks.missed_slots, report.sticks.slots) == (5, 9)
-    assert (report.action.chunks, report.action.late_chunks) == (4, 1)
-    assert report.action.period_ms is not None
-    assert report.action.period_ms.max == 60.0
+def sent(index: int, late_ms: int, **changes: Any) -> Tick:
+    return make_tick(index, sent_ns=START_NS + index * TICK_NS + late_ms * NS_PER_MS, **changes)
 
 
-def test_lateness_is_that_of_slots_and_a_send_between_two_has_none() -> None:
-    late = make_tick(1, sent_ns=START_NS + TICK_NS + 7 * NS_PER_MS)
-    between = make_tick(2, is_slot=False, sent_ns=START_NS + 2 * TICK_NS + 9 * NS_PER_MS)
-    sticks = timed(make_tick(0), late, between, make_tick(3)).sticks
-    assert (sticks.sends, sticks.slots) == (4, 4)
-    assert sticks.lateness_ms is not None
-    assert sticks.lateness_ms.max == 7.0
+OLD = {"chunk_serial": 1, "chunk_computed_ns": make_tick(1).chunk_computed_ns}
+SAME = make_state(START_NS)
+TICKS: dict[str, list[Tick]] = {
+    "perfect": [make_tick(index) for index in range(101)],
+    "stall": [make_tick(0), make_tick(1), make_tick(7, missed_slots=5, chunk_serial=2)],
+    "between slots": [make_tick(0), sent(1, 7), sent(2, 9, is_slot=False), make_tick(3)],
+    "slow inference": [
+        *(make_tick(0), make_tick(1), make_tick(2, **OLD)),
+        *(make_tick(3, is_coasting=True, **OLD), make_tick(4, chunk_serial=2)),
+    ],
+    "one and a half periods": [make_tick(0), computed(1, 15)],
+    "late": [make_tick(0), computed(1, 16)],
+    "overtaken": [make_tick(0), make_tick(2), make_tick(4)],
+    "release": [make_tick(0), make_released_tick(1), make_tick(50), make_tick(51)],
+    "one attitude": [make_tick(index, state=SAME) for index in range(3)],
+    "readonly": [make_tick(0, sent=None), make_tick(1, sent=None)],
+    "not flown": [make_released_tick(index) for index in range(5)],
+    "one tick": [make_tick(0)],
+    "waits fast, flies slowly": [
+        *(make_released_tick(index) for index in range(500)),
+        *(make_tick(500 + 5 * k, missed_slots=4, chunk_serial=k) for k in range(11)),
+        *(make_released_tick(600 + k) for k in range(9)),
+    ],
+    "no reason": [make_released_tick(0, release_reason=None), make_tick(1, sent=None)],
+}
 
 
-def test_a_slow_inference_costs_a_late_chunk_and_no_stick() -> None:
-    """Two sends go on with the chunk before; the second one coasts."""
-    old = {"chunk_serial": 1, "chunk_computed_ns": make_tick(1).chunk_computed_ns}
-    report = timed(
-        make_tick(0),
-        make_tick(1),
-        make_tick(2, **old),
-        make_tick(3, is_coasting=True, **old),
-        make_tick(4, chunk_serial=2),
-    )
-    assert (report.sticks.sends, report.sticks.missed_slots) == (5, 0)
-    assert report.sticks.coasting_sends == 1
-    assert (report.action.chunks, report.action.late_chunks) == (3, 1)
-    assert report.action.period_ms is not None
-    assert report.action.period_ms.max == 30.0
-
-
-@pytest.mark.parametrize(("gap_ms", "late"), [(15, 0), (16, 1)])
-def test_a_chunk_is_late_beyond_one_and_a_half_periods(gap_ms: int, late: int) -> None:
-    first = make_tick(0)
-    assert first.chunk_computed_ns is not None
-    second = make_tick(1, chunk_computed_ns=first.chunk_computed_ns + gap_ms * NS_PER_MS)
-    assert timed(first, second).action.late_chunks == late
-
-
-def test_a_chunk_that_was_overtaken_makes_the_next_one_not_late() -> None:
-    action = timed(make_tick(0), make_tick(2), make_tick(4)).action
-    assert (action.chunks, action.late_chunks, action.rate_hz) == (3, 0, 100.0)
-    assert action.period_ms == all_equal(10.0)
-
-
-def test_the_pause_of_a_release_is_no_late_chunk() -> None:
-    report = timed(make_tick(0), make_released_tick(1), make_tick(50), make_tick(51))
-    assert (report.action.chunks, report.action.late_chunks) == (3, 0)
-
-
-def test_only_the_first_send_of_an_attitude_counts_as_state_to_wire() -> None:
-    state = make_state(START_NS)
-    report = timed(make_tick(0, state=state), make_tick(1, state=state), make_tick(2, state=state))
-    assert report.state_to_wire_ms == all_equal(2.0)
-    assert report.state_age_ms is not None
-    assert report.state_age_ms.max == 22.0
-
-
-def test_ages_of_what_was_not_flown_are_not_counted() -> None:
-    report = timed(*(make_released_tick(index) for index in range(5)))
-    assert report.feature_age_ms is None
-    assert report.state_age_ms is None
-    assert report.state_to_wire_ms is None
-    assert report.action.predict_ms is None
-    assert report.action.period_ms is None
-    assert report.action.rate_hz is None
-    assert report.sticks.rate_hz is None
-
-
-def test_a_loop_that_waits_fast_and_flies_slowly_is_reported_slow() -> None:
-    waiting = [make_released_tick(index) for index in range(500)]
-    flying = [make_tick(500 + 5 * k, missed_slots=4, chunk_serial=k) for k in range(11)]
-    report = timed(*waiting, *flying, *(make_released_tick(600 + k) for k in range(9)))
-    sticks, action = report.sticks, report.action
-    assert (sticks.rate_hz, sticks.flying_s) == (20.0, 0.5)
-    assert (sticks.sends, sticks.missed_slots) == (11, 40)
-    assert (action.rate_hz, action.late_chunks) == (20.0, 10)
-    assert action.period_ms == all_equal(50.0)
-
-
-def test_readonly_has_ages_but_nothing_on_the_wire() -> None:
-    report = timed(make_tick(0, sent=None), make_tick(1, sent=None))
-    assert report.state_to_wire_ms is None
-    assert report.state_age_ms == all_equal(3.0)
+@pytest.mark.parametrize(
+    ("name", "paths", "values"),
+    [
+        ("perfect", "duration_s sticks.rate_hz sticks.flying_s", (1.0, 100.0, 1.0)),
+        ("perfect", "sticks.sends sticks.slots sticks.coasting_sends", (101, 101, 0)),
+        ("perfect", "action.rate_hz action.chunks action.late_chunks", (100.0, 101, 0)),
+        ("perfect", "sticks.lateness_ms action.predict_ms", (all_equal(2.0),) * 2),
+        ("perfect", "state_age_ms state_to_wire_ms", (all_equal(3.0),) * 2),
+        ("perfect", "action.period_ms feature_age_ms", (all_equal(10.0), all_equal(40.0))),
+        ("perfect", "sticks.missed_slots releases", (0, ())),
+        ("stall", "sticks.missed_slots sticks.slots action.chunks", (5, 8, 3)),
+        ("stall", "action.late_chunks action.period_ms.max", (1, 60.0)),
+        ("between slots", "sticks.sends sticks.slots sticks.lateness_ms.max", (4, 4, 7.0)),
+        ("slow inference", "sticks.sends sticks.missed_slots sticks.coasting_sends", (5, 0, 1)),
+        ("slow inference", "action.chunks action.late_chunks action.period_ms.max", (3, 1, 30.0)),
+        ("one and a half periods", "action.late_chunks sticks.sends", (0, 2)),
+        ("late", "action.late_chunks sticks.sends", (1, 2)),
+        ("overtaken", "action.chunks action.late_chunks action.rate_hz", (3, 0, 100.0)),
+        ("release", "action.chunks action.late_chunks", (3, 0)),
+        ("one attitude", "state_to_wire_ms state_age_ms.max", (all_equal(2.0), 22.0)),
+        ("readonly", "state_to_wire_ms state_age_ms", (None, all_equal(3.0))),
+        ("not flown", "feature_age_ms state_age_ms state_to_wire_ms", (None,) * 3),
+        ("not flown", "action.predict_ms action.period_ms sticks.rate_hz", (None,) * 3),
+        ("one tick", "action.rate_hz sticks.rate_hz action.period_ms", (None,) * 3),
+        ("waits fast, flies slowly", "sticks.rate_hz sticks.flying_s", (20.0, 0.5)),
+        ("waits fast, flies slowly", "sticks.sends sticks.missed_slots", (11, 40)),
+        ("waits fast, flies slowly", "action.rate_hz action.late_chunks", (20.0, 10)),
+        ("no reason", "release_count sticks.sends", (0, 1)),
+    ],
+)
+def test_figures(name: str, paths: str, values: tuple[object, ...]) -> None:
+    assert attrgetter(*paths.split())(timed(*TICKS[name])) == values
 
 
 def test_releases_are_transitions_since_the_first_tick() -> None:
@@ -218,23 +183,6 @@ def test_vision_counts_what_was_dropped_since_its_first_frame() -> None:
     assert vision.rate_hz == pytest.approx(30.0, abs=0.01)
     assert vision.dropped_frames == 3
     assert vision.encode_ms == all_equal(20.0)
-
-
-def test_a_flight_without_a_tick_measured_nothing() -> None:
-    report = timed()
-    assert report.duration_s == 0.0
-    assert report.action.rate_hz is None
-    assert report.sticks.rate_hz is None
-    assert report.action.period_ms is None
-    assert report.vision.rate_hz is None
-    assert report.vision.encode_ms is None
-
-
-def test_one_tick_has_no_rate_and_no_period() -> None:
-    report = timed(make_tick(0))
-    assert report.action.rate_hz is None
-    assert report.sticks.rate_hz is None
-    assert report.action.period_ms is None
 
 
 @pytest.mark.parametrize(("action_hz", "late"), [(50.0, 0), (100.0, 0), (250.0, 1)])
@@ -292,9 +240,3 @@ def test_json_says_null_for_what_was_not_measured() -> None:
     for key in ("feature_age_ms", "state_age_ms", "state_to_wire_ms"):
         assert document[key] is None
     assert document["action"]["rate_hz"] is None
-
-
-def test_no_reason_is_no_release() -> None:
-    """A read-only flight has none before the policy has begun."""
-    begin = make_released_tick(0, release_reason=None, phase="released")
-    assert timed(begin, make_tick(1, sent=None)).release_count == 0

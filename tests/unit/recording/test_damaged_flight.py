@@ -61,10 +61,6 @@ def spoil_image(folder: Path, number: int) -> None:
     spoil(folder / "camera.mp4", place.start, place.end)
 
 
-def test_a_whole_flight_has_no_damage(flight: Path) -> None:
-    assert open_flight(flight).damage == read_flight(flight).damage == ()
-
-
 def test_rows_around_damaged_ones_are_read_and_those_are_counted(flight: Path) -> None:
     first = pq.read_metadata(flight / "ticks.parquet").row_group(0).num_rows
     lost = spoil_second_group(flight / "ticks.parquet")

@@ -233,12 +233,6 @@ def test_later_keys_in_meta_are_left_aside(flight: Path) -> None:
     assert open_flight(flight).meta.finished
 
 
-def test_a_new_or_empty_folder_is_prepared(tmp_path: Path) -> None:
-    prepare_folder(tmp_path / "a" / "b")
-    prepare_folder(tmp_path / "a" / "b")
-    assert list((tmp_path / "a" / "b").iterdir()) == []
-
-
 def test_a_folder_that_cannot_take_a_flight_is_refused(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

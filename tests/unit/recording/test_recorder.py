@@ -106,15 +106,6 @@ def test_a_killed_writer_costs_the_images_alone_and_is_told_once(tmp_path: Path)
     assert "not completely: the writer process has died" in stood.recorder.summary()
 
 
-def test_a_writer_killed_after_the_last_frame_is_told_in_the_end(tmp_path: Path) -> None:
-    with stand(tmp_path) as stood:
-        stood.recorder.emit(make_tick(0))
-        until(stood, 1)
-        send_signal(stood.pid, signal.SIGKILL)
-    assert "not completely: the writer process has died" in stood.recorder.summary()
-    assert open_flight(tmp_path).ticks.num_rows == 1
-
-
 def test_a_full_disk_ends_the_recording_with_one_warning(
     tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:

@@ -12,15 +12,15 @@ from mavbridge.config.rates import Rates
 from mavbridge.core.reasons import Code, because, reason_to_json
 from mavbridge.core.records import Solve
 from mavbridge.core.vehicle import ForwardedPacket
-from mavbridge.recording import replay_rows
+from mavbridge.recording import replay_tables
 from mavbridge.recording.folder import SETTINGS
-from mavbridge.recording.replay_rows import (
+from mavbridge.recording.replay_tables import (
+    ReplayTables,
     packet_key,
     read_features,
     read_packets,
     read_solves,
 )
-from mavbridge.recording.replay_tables import ReplayTables
 from mavbridge.recording.settings import (
     ReplaySettings,
     SettingsError,
@@ -87,7 +87,7 @@ def test_solves_come_back_bit_for_bit_also_from_a_flight_that_was_cut_off(
     if is_finished:
         tables.finish()
 
-    rows = list(read_solves(read_table(tmp_path / "solves", replay_rows.SOLVES), CONTRACT))
+    rows = list(read_solves(read_table(tmp_path / "solves", replay_tables.SOLVES), CONTRACT))
 
     assert [row.dropped_before for row in rows] == [0, 0, 2]
     for solve, row in zip(solves, rows, strict=True):
@@ -102,8 +102,8 @@ def test_features_of_each_camera_have_a_table_of_their_own(tmp_path: Path) -> No
     tables.feature(replace(vision, camera=1, serial=2, fault=FROZEN, feature=-value))
     tables.finish()
 
-    (front,) = read_features(read_table(tmp_path / "features", replay_rows.FEATURES))
-    down = read_table(tmp_path / "features_down", replay_rows.FEATURES)
+    (front,) = read_features(read_table(tmp_path / "features", replay_tables.FEATURES))
+    down = read_table(tmp_path / "features_down", replay_tables.FEATURES)
 
     assert front.value.tobytes() == value.tobytes()
     assert front.value.shape == (1, 3)
@@ -125,7 +125,7 @@ def test_stamps_of_packets_name_the_packet_in_the_log(tmp_path: Path) -> None:
     tables.packets.put((ForwardedPacket(7, 5, HEARTBEAT), ForwardedPacket(9, 9, HEARTBEAT)))
     tables.finish()
 
-    first, second = read_packets(read_table(tmp_path / "packets", replay_rows.PACKETS))
+    first, second = read_packets(read_table(tmp_path / "packets", replay_tables.PACKETS))
 
     assert first == (7, 5, 0, 7)
     assert second == (9, 9, 0, 7)

@@ -6,15 +6,13 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from helpers.factories import make_released_tick, make_state, make_tick, make_trace
-from helpers.recordings import make_row
 from mavbridge.core.reasons import Code, because
 from mavbridge.core.records import Tick, VehicleState
 from mavbridge.core.vehicle import ActionTrace, Sticks, Velocity
-from mavbridge.recording.replay_rows import FEATURES, PACKETS, SOLVES
+from mavbridge.recording.replay_tables import FEATURES, PACKETS, SOLVES
 from mavbridge.recording.rows import (
     DEMONSTRATION_FRAMES,
     DEMONSTRATION_TICKS,
-    FRAMES,
     TICKS,
     FrameRow,
     FrameTruth,
@@ -114,14 +112,6 @@ def test_ticks_come_back_as_they_were(rows: list[TickRow]) -> None:
 def test_frames_come_back_as_they_were(rows: list[FrameRow]) -> None:
     table = pa.Table.from_batches([frames_batch(rows, DEMONSTRATION_FRAMES)])
     assert list(read_frames(table)) == rows
-
-
-def test_a_flight_without_labels_has_none() -> None:
-    table = pa.Table.from_batches([ticks_batch([TickRow(make_tick(), 0)], TICKS)])
-    (row,) = read_ticks(table)
-    assert row.labels is None
-    frames = pa.Table.from_batches([frames_batch([make_row(0)], FRAMES)])
-    assert [row.truth for row in read_frames(frames)] == [None]
 
 
 def test_what_was_not_there_is_null_and_not_zero() -> None:

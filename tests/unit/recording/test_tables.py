@@ -38,12 +38,6 @@ def disk_of(limit_bytes: int) -> Iterator[None]:
         resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
 
 
-def test_the_stream_can_be_read_while_it_grows(tmp_path: Path) -> None:
-    writer = write(tmp_path / "frames", [3, 2])
-    assert read_table(tmp_path / "frames", FRAMES)["frame_id"].to_pylist() == [0, 1, 2, 3, 4]
-    writer.abandon()
-
-
 def test_finishing_leaves_parquet_alone(tmp_path: Path) -> None:
     write(tmp_path / "frames", [3, 2]).finish()
     assert [path.name for path in tmp_path.iterdir()] == ["frames.parquet"]
@@ -85,12 +79,6 @@ def test_no_room_for_parquet_leaves_the_stream(tmp_path: Path) -> None:
         writer.finish()
     assert [path.name for path in tmp_path.iterdir()] == ["frames.arrows"]
     assert read_table(tmp_path / "frames", FRAMES).num_rows == 500
-
-
-def test_an_existing_table_is_not_overwritten(tmp_path: Path) -> None:
-    write(tmp_path / "frames", [1]).abandon()
-    with pytest.raises(FileExistsError):
-        TableWriter(tmp_path / "frames", FRAMES)
 
 
 def test_errors_say_what_is_wrong(tmp_path: Path) -> None:

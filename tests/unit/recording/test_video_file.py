@@ -29,16 +29,6 @@ def test_frames_come_back_in_order_with_their_times(tmp_path: Path) -> None:
     assert times == pytest.approx([k / 30 for k in range(70)], abs=2e-5)
 
 
-def test_each_frame_but_the_last_is_on_disk_at_once(tmp_path: Path) -> None:
-    path = tmp_path / "camera.mp4"
-    video = FragmentedMp4(path, height=48, width=64, hz=30)
-    for k in range(5):
-        video.append(picture(k), START_NS + k * FRAME_NS)
-        assert count_frames(path) == k
-    video.close()
-    assert count_frames(path) == 5
-
-
 def test_colours_are_kept(tmp_path: Path) -> None:
     path = tmp_path / "camera.mp4"
     rgb = np.zeros((48, 96, 3), np.uint8)

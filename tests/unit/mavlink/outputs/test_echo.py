@@ -4,6 +4,7 @@ import heapq
 import math
 import random
 from collections.abc import Callable
+from typing import Any
 
 import pytest
 
@@ -135,6 +136,12 @@ class World:
         return self.run(limit_s), (self.now_ns - start_ns) / S
 
 
+def engaged(**conditions: Any) -> World:
+    world = World(**conditions)
+    world.engage()
+    return world
+
+
 # --- no false alarms
 
 BAD_LINKS = [
@@ -155,20 +162,17 @@ BAD_LINKS = [
 def test_a_bad_link_raises_no_alarm(
     link: dict[str, float], send_hz: float, sticks: Callable[[int], Shown]
 ) -> None:
-    world = World(send_hz=send_hz, sticks=sticks, **link)  # type: ignore[arg-type]
-    world.engage()
+    world = engaged(send_hz=send_hz, sticks=sticks, **link)
     assert world.run(20.0) is None
 
 
 def test_sticks_at_the_receivers_own_place_raise_no_alarm() -> None:
-    world = World(sticks=lambda _now_ns: RECEIVER)
-    world.engage()
+    world = engaged(sticks=lambda _now_ns: RECEIVER)
     assert world.run(10.0) is None
 
 
 def test_a_network_that_stalls_towards_us_raises_no_alarm() -> None:
-    world = World()
-    world.engage()
+    world = engaged()
     for _ in range(10):
         world.delay_ms = 300.0  # what is sent now comes at once with what is sent later
         assert world.run(0.3) is None
@@ -177,8 +181,7 @@ def test_a_network_that_stalls_towards_us_raises_no_alarm() -> None:
 
 
 def test_one_stray_release_of_another_station_raises_no_alarm() -> None:
-    world = World(rc_jitter_ms=0.0)
-    world.engage()
+    world = engaged(rc_jitter_ms=0.0)
     for _ in range(10):
         world.override = None
         assert world.run(1.0) is None
@@ -195,8 +198,7 @@ def test_a_joystick_is_noticed_within_half_a_second(
 ) -> None:
     """At 50 Hz beside our 100 Hz it has 0 to 50 % of the vehicle's time, by the phase."""
     for seed in range(20):
-        world = World(seed=seed, send_hz=send_hz, sticks=sticks)
-        world.engage()
+        world = engaged(seed=seed, send_hz=send_hz, sticks=sticks)
         world.start_joystick(joystick_hz, after_ours_ms=seed / 2)
         fault, after_s = world.seconds_to_fault()
         assert fault == "foreign"
@@ -207,8 +209,7 @@ def test_a_slow_joystick_is_noticed_as_soon_as_it_is_shown_once() -> None:
     """At 10 Hz it has 5 % of the vehicle's time on average: one sample in twenty shows it."""
     times_s = []
     for seed in range(40):
-        world = World(seed=seed)
-        world.engage()
+        world = engaged(seed=seed)
         # Clocks that drift apart by 1 %, from any phase on.
         world.start_joystick(10.1, after_ours_ms=10 * seed / 40)
         fault, after_s = world.seconds_to_fault()
@@ -231,8 +232,7 @@ def test_a_joystick_that_was_there_first_is_noticed(joystick_hz: float) -> None:
 
 
 def test_a_joystick_held_where_our_sticks_rest_is_noticed_when_it_holds_the_vehicle() -> None:
-    world = World()
-    world.engage()
+    world = engaged()
     world.joystick, world.joystick_hz = still, 2000.0
     fault, after_s = world.seconds_to_fault()
     assert fault == "silent"
@@ -241,8 +241,7 @@ def test_a_joystick_held_where_our_sticks_rest_is_noticed_when_it_holds_the_vehi
 
 def test_a_joystick_on_a_bad_link_is_noticed() -> None:
     for seed in range(20):
-        world = World(seed=seed, rc_hz=20.0, loss=0.2, sticks=moving)
-        world.engage()
+        world = engaged(seed=seed, rc_hz=20.0, loss=0.2, sticks=moving)
         world.start_joystick(50.0, after_ours_ms=2.0)
         fault, after_s = world.seconds_to_fault()
         assert fault == "foreign"
@@ -250,8 +249,7 @@ def test_a_joystick_on_a_bad_link_is_noticed() -> None:
 
 
 def test_a_fault_stays_known_for_three_seconds_and_only_then_is_forgotten() -> None:
-    world = World()
-    world.engage()
+    world = engaged()
     world.start_joystick(50.0, after_ours_ms=2.0)
     assert world.run(1.0) == "foreign"
     world.joystick_hz = 0.0
@@ -271,8 +269,7 @@ def test_a_vehicle_that_hears_us_no_more_is_noticed_within_half_a_second(
     rc_hz: float, send_hz: float, sticks: Callable[[int], Shown]
 ) -> None:
     for seed in range(10):
-        world = World(seed=seed, send_hz=send_hz, rc_hz=rc_hz, sticks=sticks)
-        world.engage()
+        world = engaged(seed=seed, send_hz=send_hz, rc_hz=rc_hz, sticks=sticks)
         world.is_deaf = True
         fault, after_s = world.seconds_to_fault()
         assert fault == "silent"
@@ -280,8 +277,7 @@ def test_a_vehicle_that_hears_us_no_more_is_noticed_within_half_a_second(
 
 
 def test_an_override_that_expires_is_noticed_as_the_sticks_of_before_us() -> None:
-    world = World()
-    world.engage()
+    world = engaged()
     world.is_deaf = True
     world.run(0.2)
     world.override = None
@@ -289,8 +285,7 @@ def test_an_override_that_expires_is_noticed_as_the_sticks_of_before_us() -> Non
 
 
 def test_a_pause_of_our_own_is_no_silence_of_the_vehicle() -> None:
-    world = World()
-    world.engage()
+    world = engaged()
     world.is_sending = False
     world.run(0.35)
     world.is_sending = True
@@ -298,8 +293,7 @@ def test_a_pause_of_our_own_is_no_silence_of_the_vehicle() -> None:
 
 
 def test_a_vehicle_that_sends_no_rc_channels_any_more_is_noticed() -> None:
-    world = World()
-    world.engage()
+    world = engaged()
     world.rc_hz = 0.0
     fault, after_s = world.seconds_to_fault()
     assert fault == "unseen"
@@ -307,8 +301,7 @@ def test_a_vehicle_that_sends_no_rc_channels_any_more_is_noticed() -> None:
 
 
 def test_after_a_silence_the_sticks_of_before_it_are_nobody_elses() -> None:
-    world = World(sticks=moving)
-    world.engage()
+    world = engaged(sticks=moving)
     world.is_deaf = True
     world.rc_hz = 0.0  # nothing arrives either way
     assert world.run(2.0) == "unseen"
@@ -341,8 +334,7 @@ def test_an_override_that_shows_up_is_confirmed() -> None:
 
 
 def test_late_and_doubled_datagrams_are_left_out() -> None:
-    world = World()
-    world.engage()
+    world = engaged()
     stamp_us, now_ns = world.now_ns // 1000, world.now_ns
     world.echo.received(STICKS, stamp_us + 1000, now_ns)
     for _ in range(5):
@@ -425,8 +417,7 @@ def test_a_receiver_that_rests_close_to_our_last_sticks_confirms_the_release() -
 
 
 def test_a_vehicle_that_has_not_heard_our_last_sticks_does_not_show_them() -> None:
-    world = World()
-    world.engage()
+    world = engaged()
     world.is_deaf = True
     world.sticks = lambda _now_ns: (1500, 1500, 1500, 1500)
     world.run(0.05)

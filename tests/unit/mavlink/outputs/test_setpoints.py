@@ -69,7 +69,6 @@ def test_the_thrust_of_body_rates_is_along_the_body_whatever_the_autopilot_adds(
     encoded = flight.send(BodyRates(0.6, 0.1, 0.2, 0.3))
     message: Any = flight.message(encoded)
     assert message.thrust == pytest.approx(factor * 0.6, abs=1e-4)
-    assert encoded is not None
     assert encoded.action.thrust == pytest.approx(0.6, abs=1e-4)  # what the policy's history holds
 
 
@@ -116,7 +115,6 @@ def test_thrust_that_hovered_in_training_hovers_here(profile: Profile) -> None:
     encoded = flight.send(AttitudeThrust(0.4, 0.0, 0.0, 0.0))
     message: Any = flight.message(encoded)
     assert message.thrust == pytest.approx(0.5, abs=1e-4)
-    assert isinstance(encoded.action, AttitudeThrust)
     assert encoded.action.thrust == pytest.approx(0.4, abs=1e-4)
     message = flight.message(flight.send(AttitudeThrust(1.0, 0.0, 0.0, 0.0)))
     assert 0.999 < message.thrust <= 1.0
@@ -201,7 +199,6 @@ def test_setpoints_of_another_station_are_noticed_but_not_a_change_of_mode(
     flight.send(LEVEL)
     flight.receive(target(0.45))
     why = flight.output.overruled(flight.now_ns)
-    assert why is not None
     assert (why.code, dict(why.data)["quantity"]) == (Code.OVERRULED, "setpoints")
     assert "another station commands it" in str(why)
 
@@ -217,7 +214,6 @@ def test_a_vehicle_that_hears_no_setpoint_any_more_is_noticed() -> None:
         flight.receive(target(message.thrust))
     assert 0.35 * S < flight.now_ns - deaf_ns < 0.5 * S
     why = flight.output.unheard(flight.now_ns)
-    assert why is not None
     assert (why.code, dict(why.data)["quantity"]) == (Code.UNHEARD, "setpoints")
     assert flight.output.overruled(flight.now_ns) is None
 
@@ -279,7 +275,6 @@ def test_a_velocity_and_its_echo(profile: Profile) -> None:
         flight.send(Velocity(1.0, 0.5, -0.25, 0.2))
         flight.receive(VelocityTarget(0, 3079, (0.0, 0.0, 0.0), 0.0))
     why = flight.output.overruled(flight.now_ns)
-    assert why is not None
     assert why.code is Code.OVERRULED
     assert "limits or refuses them" in str(why)
 

@@ -94,7 +94,6 @@ def test_the_pilots_sticks_are_told_as_the_policy_would_mean_them() -> None:
     status = flight.vehicle.status(0)
     theirs = replace(status, rc_sticks=curves.to_vehicle(WANTED), pilot_sticks=NEUTRAL)
     told = flight.output.in_policy_terms(theirs, flight.session, flight.now_ns)
-    assert told is not None
     assert told.rc_sticks == pytest.approx(WANTED, abs=1e-6)
     assert told.pilot_sticks == pytest.approx(NEUTRAL)
     assert px4_flight().output.in_policy_terms(theirs, flight.session, flight.now_ns) is theirs
@@ -173,7 +172,6 @@ def test_what_px4_acts_on_instead_of_our_sticks_is_told(
         flight.send(NEUTRAL)
         if shown is not None:
             flight.receive(shown)
-    assert flight.problem is not None
     assert flight.problem.code is code
     assert expected in str(flight.problem)
     assert flight.now_ns - since_ns < 500 * MS

@@ -128,19 +128,6 @@ def test_old_names_are_read_too_and_mean_the_same() -> None:
     assert set(old) | set(new) <= set(ARDUPILOT.params)
 
 
-@pytest.mark.parametrize(
-    ("output", "message"),
-    [
-        ("rc-override", "RC_CHANNELS"),
-        ("attitude", "ATTITUDE_TARGET"),
-        ("rates", "ATTITUDE_TARGET"),
-        ("velocity", "POSITION_TARGET_LOCAL_NED"),
-    ],
-)
-def test_where_each_output_is_shown(output: Output, message: str) -> None:
-    assert ARDUPILOT.echo(output).messages == (message,)
-
-
 def test_a_takeoff_is_asked_for_by_height_above_home() -> None:
     command = CommandRequest(dialect.MAV_CMD_NAV_TAKEOFF, (0, 0, 0, 0, 0, 0, 8.0))
     assert ARDUPILOT.takeoff(8.0, None) == ARDUPILOT.takeoff(8.0, 489.0) == command

@@ -88,3 +88,17 @@ def test_modes_of_px4_without_a_name_of_their_own() -> None:
     for name in ("AUTO", "AUTO.8", "LOITER", "TERMINATION"):
         with pytest.raises(UserError, match=r"AUTO\.LOITER"):
             modes.command(name)
+
+
+@pytest.mark.parametrize(
+    ("outputs", "message"),
+    [
+        (("attitude", "rates"), "ATTITUDE_TARGET"),
+        (("velocity",), "POSITION_TARGET_LOCAL_NED"),
+    ],
+)
+def test_where_each_output_is_shown(outputs: tuple[Output, ...], message: str) -> None:
+    assert PX4.echo("manual-control").messages == ("MANUAL_CONTROL",)
+    assert ARDUPILOT.echo("rc-override").messages == ("RC_CHANNELS",)
+    for profile in (PX4, ARDUPILOT):
+        assert {profile.echo(output).messages for output in outputs} == {(message,)}
