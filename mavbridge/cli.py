@@ -332,7 +332,7 @@ def with_config(
     if print_config:
         print_settings(cli[tokens[0]] if tokens and tokens[0] in cli else cli)
         return 0
-    cli.config = [Settings(given_settings(set_config), source="--set-config", commands=tuple(cli))]
+    cli.config = [Settings(given_settings(set_config), source="--set-config")]
     if config is not None:
         try:
             document = read_toml(user_path(config))
@@ -340,6 +340,10 @@ def with_config(
             raise UserError(f"--config {config}: {error.strerror}") from error
         except ValueError as error:
             raise UserError(f"--config {config} is not TOML: {error}") from error
+        if "set_config" in document or "set-config" in document:
+            raise UserError(
+                f"--config {config}: set_config is no key of a file: write its sections"
+            )
         for flag, value, what in [] if trust_config else untrusted_settings(document, tokens):
             raise UserError(
                 f"--config {config}: {flag} {value!r} names {what}, which a file may not do by "

@@ -94,9 +94,14 @@ def given_settings(texts: Sequence[str]) -> dict[str, dict[str, str | list[str]]
 
 
 class Settings(Dict):
-    """A settings file. Its keys are flags, of which some are named as commands: record, serve."""
+    """A settings file. Its keys are flags, of which some are named as commands: record, serve.
 
-    def __init__(self, data: dict[str, Any], *, source: str, commands: Container[str]) -> None:
+    ``commands`` have tables of their own there, which are left out.
+    """
+
+    def __init__(
+        self, data: Mapping[str, Any], *, source: str, commands: Container[str] = ()
+    ) -> None:
         super().__init__(with_home(data), source=source)
         self._commands = commands
 

@@ -202,9 +202,11 @@ class MavlinkLink:
 
         It is followed so that neutral sticks, the safe mode and the release reach it.
         """
-        if not self.is_engaged or not isinstance(body, Attitude):
+        heard_ns = self._counters.heard_ns
+        is_beside = self._duplicate_systems.is_beside(sender, heard_ns)
+        if not self.is_engaged or is_beside or not isinstance(body, Attitude):
             return False
-        is_silent = arrived_ns - self._counters.heard_ns > _MOVED_NS
+        is_silent = arrived_ns - heard_ns > _MOVED_NS
         is_same = is_silent and self._timesync.is_same_clock(body.boot_us, arrived_ns)
         self._moved_stamps = self._moved_stamps + 1 if is_same else 0
         if self._moved_stamps < _MOVED_STAMPS:

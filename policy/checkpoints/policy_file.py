@@ -106,6 +106,11 @@ def load_checkpoint_with_notes(
         require_header(path, header)
     else:
         header, tensors = {}, read_torch(path)
+        if "contract" in tensors:
+            raise CheckpointError(
+                f"{path}: holds a contract, which is not read from a torch file: save it as "
+                ".safetensors, or the weights alone"
+            )
     try:
         policy = build_policy(_config_of(header, fallback) if is_ours else fallback)
     except (PolicyError, RecursionError) as error:

@@ -98,6 +98,7 @@ class FakeLink:
         self._clock = clock
         self._samples: tuple[Sample, ...] = ()
         self._telemetry = Telemetry()
+        self._happened_ns = 0
         self.status: VehicleStatus | None = replace(AIRBORNE_STATUS, **status)
         self.problem: Reason | None = None
         self.overruled: Reason | None = None
@@ -125,7 +126,14 @@ class FakeLink:
         """Whether a decision can be sent now; may raise."""
 
     def measure(self, *, age_ns: int = 0, yaw_rad: float = 0.0, down_mps: float = 0.0) -> None:
-        """The vehicle sends its state, which arrives now and happened ``age_ns`` ago."""
+        """The vehicle sends its state, which arrives now and happened ``age_ns`` ago.
+
+        The link takes none that is older than the one before.
+        """
+        happened_ns = self._clock.now_ns() - age_ns
+        if happened_ns < self._happened_ns:
+            return
+        self._happened_ns = happened_ns
         quaternion = (math.cos(yaw_rad / 2), 0.0, 0.0, math.sin(yaw_rad / 2))
         velocity, force = (0.0, 0.0, down_mps), (0.0, 0.0, -9.80665)
         none = (0.0,) * 3

@@ -62,6 +62,7 @@ class ParamVehicle:
         output: Output | None = "rc-override",
         loses: Callable[[int], bool] = lambda _: False,
         values: dict[str, float] | None = None,
+        old_params: dict[str, float] | None = None,
         **settings: Any,
     ) -> None:
         found: dict[str, float | None] = {**SAFE, **(changes or {})}
@@ -73,7 +74,7 @@ class ParamVehicle:
             profile,
             LinkSettings(**settings),
             streams=profile.streams(state_hz=100.0),
-            old_params={},
+            old_params={} if old_params is None else old_params,
             report=self.texts.append,
         )
         if output is not None:

@@ -6,7 +6,7 @@ from typing import Any
 import pytest
 from pymavlink.dialects.v20 import ardupilotmega as dialect
 
-from helpers.guard_facts import figures
+from helpers.guard_facts import codes, figures
 from helpers.guard_flights import MS, GuardFlight, climbing_first, hovering
 from helpers.wire import WireEnd
 from mavbridge.config.flight import FlyConfig
@@ -61,6 +61,16 @@ def test_a_vehicle_whose_clock_goes_on_elsewhere_is_brought_into_safety_there(
     flight.run(6)
     assert flight.ap.mode is Mode.BRAKE
     assert flight.phase is Phase.RELEASED
+
+
+def test_a_second_way_to_the_vehicle_is_not_followed_where_the_first_one_pauses() -> None:
+    flight = GuardFlight(policy=hovering).fly()
+    flight.inject(WireEnd(system=1).heartbeat(mode=2, armed=True), ELSEWHERE)
+    flight.run(0.5)
+    flight.network.address = ELSEWHERE
+    flight.until(lambda: flight.phase is not Phase.FLYING, within_s=1)
+    flight.run(1)
+    assert not any(Code.MOVED in codes(tick.reason) for tick in flight.ticks)
 
 
 def test_a_reboot_in_flight_is_latched_and_still_leaves_a_release() -> None:

@@ -5,7 +5,7 @@ from collections.abc import Callable
 import pytest
 
 from helpers.guard_flights import GuardFlight, hovering, leaning
-from mavbridge.core.clock import NS_PER_MS, NS_PER_S
+from mavbridge.core.clock import NS_PER_MS
 from mavbridge.core.reasons import Code, Reason, because
 from mavbridge.guard.values import Phase
 from sitl.ardupilot.flight_modes import Mode
@@ -161,18 +161,12 @@ def by_parameter(flight: GuardFlight) -> None:
     flight.vehicle.server.links[0].send_param(index)  # ArduPilot tells every link
 
 
-def by_clock(flight: GuardFlight) -> None:
-    """It goes back, which looks like a reboot."""
-    flight.ap.boot_ns += 5 * NS_PER_S
-
-
 @pytest.mark.parametrize(
     ("take", "mode"),
     [
         (by_mode, "LOITER"),
         (lambda flight: flight.pilot_mode(Mode.STABILIZE), "STABILIZE"),
         (by_parameter, "ALT_HOLD"),
-        (by_clock, "ALT_HOLD"),
     ],
 )
 def test_without_a_receiver_no_takeover_leaves_a_lean_behind(

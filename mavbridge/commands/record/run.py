@@ -157,6 +157,7 @@ class _Session:
             freshness=Freshness(
                 attitude_ns=flight.freshness.state_ns, velocity_ns=flight.freshness.velocity_ns
             ),
+            samples=self._guard.samples,
         )
         self._images = FeatureCache()
         self._vision = self._vision_loop(camera, sink)

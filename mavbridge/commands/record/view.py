@@ -15,6 +15,7 @@ from mavbridge.core.vehicle import Packet, Sticks
 from mavbridge.flight.history import SentHistory
 from mavbridge.flight.state import Freshness, StateFrame
 from mavbridge.flight.telemetry_cache import TelemetryCache
+from mavbridge.guard.channel import SocketPort
 from mavbridge.guard.wire import FromGuard, Packets
 from mavbridge.mavlink.codec.frames import split_frames
 from mavbridge.mavlink.session.streams import message_id
@@ -39,12 +40,14 @@ class PilotView(TelemetryCache):
         sink: TickSink,
         state_frame: StateFrame,
         freshness: Freshness,
+        samples: SocketPort,
     ) -> None:
         super().__init__(
             history=history,
             sink=PilotTicks(self, sink),
             state_frame=state_frame,
             freshness=freshness,
+            samples=samples,
         )
         self._log: PacketPipe | None = None
         self._log_lock = threading.Lock()

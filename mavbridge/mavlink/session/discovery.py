@@ -204,8 +204,14 @@ class DuplicateSystems:
     """Other senders that use the system id of the chosen vehicle."""
 
     def __init__(self) -> None:
-        self._reported: set[Address | None] = set()
+        self._reported: dict[Address | None, int] = {}
+        """When each was first heard."""
         self._replaced_ns: int | None = None
+
+    def is_beside(self, sender: Address | None, heard_ns: int) -> bool:
+        """Whether the vehicle, heard last at ``heard_ns``, went on when this sender had come: it is
+        another way to the vehicle, or another vehicle."""
+        return self._reported.get(sender, heard_ns) < heard_ns
 
     def notice(
         self, vehicle: VehicleIdentity, sender: Address | None, now_ns: int, heard_ns: int
@@ -227,7 +233,7 @@ class DuplicateSystems:
             ), True
         if sender in self._reported or len(self._reported) >= _DUPLICATE_SYSTEMS:
             return None, False
-        self._reported.add(sender)
+        self._reported[sender] = now_ns
         return (
             f"system {vehicle.source.system} is also heard from {_place(sender)}, which is "
             f"ignored: the vehicle is at {vehicle.place}; {_DUPLICATE_SYSTEM_ADVICE}"

@@ -166,13 +166,14 @@ class VehicleSession:
     def _watch_boot(self, boot_ms: int, arrived_ns: int) -> None:
         back_us = -later_by_us(1000 * boot_ms, 1000 * self._boot_ms)
         silent_ns, self._stamped_ns = arrived_ns - self._stamped_ns, arrived_ns
-        if self._old_stamps == 0:
-            self._silent_ns = silent_ns
         if back_us <= RESTART_STEP_US:
             self._old_stamps, self._boot_ms = 0, boot_ms
-        elif boot_ms * NS_PER_MS <= _FASTEST_CLOCK * self._silent_ns + _BOOT_SLACK_NS:
-            self._old_stamps += 1
-        else:  # it has run for longer than the silence: the same flight, by a clock that was set
+            return
+        if self._old_stamps == 0:
+            self._silent_ns = silent_ns
+        self._old_stamps += 1  # one alone is a packet that was late
+        has_run_longer = boot_ms * NS_PER_MS > _FASTEST_CLOCK * self._silent_ns + _BOOT_SLACK_NS
+        if self._old_stamps >= RESTART_STAMPS and has_run_longer:  # the same flight, another clock
             self._old_stamps, self._boot_ms = 0, boot_ms
             reason = because(Code.CLOCK_SET_BACK, back_s=back_us / 1_000_000)
             self.end_engagement(reason, arrived_ns)

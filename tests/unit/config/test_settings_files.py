@@ -71,3 +71,15 @@ def test_a_setting_on_the_command_line_wins_over_the_file(
 def test_a_setting_that_cannot_be_is_refused_by_its_name(text: str, told: str) -> None:
     with pytest.raises(UserError, match=told):
         cli.meta([*VEHICLE, "--set-config", text])
+
+
+@pytest.mark.parametrize("text", ["replay.tau=1", "limits.no_such=1", "nothing.attitude_age=1"])
+def test_a_setting_that_no_section_has_is_refused(
+    text: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr(cli, "config", cli.config)
+    with pytest.raises(SystemExit) as ended:
+        cli.meta([*VEHICLE, "--set-config", text])
+    assert ended.value.code != 0
+    printed = capsys.readouterr()
+    assert text.partition(".")[0] in printed.out + printed.err

@@ -41,6 +41,15 @@ def test_a_parameter_is_set_before_the_flight_and_put_back_after_it() -> None:
     assert told(vehicle, "RC_OVERRIDE_TIME put back to 3")
 
 
+def test_what_is_put_back_is_the_value_that_was_there_when_it_was_set() -> None:
+    before = {"RC_OVERRIDE_TIME": 7.0}  # of a session before, on the same system id
+    vehicle = start(time_s=5.0, old_params=before)
+    vehicle.run(6.0)
+    assert told(vehicle, "RC_OVERRIDE_TIME set from 5 to 0.5")
+    end(vehicle)
+    assert vehicle.values["RC_OVERRIDE_TIME"] == 5.0
+
+
 def test_a_refused_risk_is_mended_by_setting_it() -> None:
     vehicle = start(time_s=-1.0)
     vehicle.run(6.0)

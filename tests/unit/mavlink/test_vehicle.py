@@ -591,6 +591,17 @@ def test_a_reboot_is_found_wherever_the_clock_stood(
     assert session.session.has_rebooted is (last_ms - first_ms > 1000)
 
 
+def test_one_late_attitude_ends_nothing_and_a_clock_that_was_set_back_does() -> None:
+    session = Session()
+    for boot_ms, is_upset in ((60_000, False), (58_800, False), (60_010, False), (55_000, False),
+                              (55_010, True)):  # fmt: skip
+        session.put(Attitude(True, 1000 * boot_ms, (1, 0, 0, 0), (0, 0, 0)))
+        problem = session.session.problem(session.now_ns)
+        is_told = problem is not None and problem.code is Code.CLOCK_SET_BACK
+        assert is_told is is_upset
+        session.now_ns += 10 * NS_PER_MS
+
+
 @given(
     last_ms=st.integers(5_000, 2**32 - 2_000),
     back_ms=st.integers(1_001, 2**32),

@@ -92,7 +92,7 @@ class TemporaryParams:
             if (now := values.get(name)) is None:
                 self._failures[name] = because(Code.SET_ABSENT, name=name, value=value)
             elif not is_same(now, value):
-                self._before.setdefault(name, now)
+                self._before[name] = now
                 self._writer.write(name, value)
 
     def _conclude_set(self, outcome: Outcome) -> None:
@@ -117,6 +117,7 @@ class TemporaryParams:
 
     def _begin_restoring(self, values: Mapping[str, float]) -> None:
         self._writer.cancel()
+        self._writer.take_outcomes()  # of what was set, not of what is put back
         self._phase = _Phase.RESTORING
         for name, before in list(self._before.items()):
             now = values.get(name)

@@ -141,6 +141,15 @@ def test_a_malicious_pickle_is_refused_and_not_run(small_toge, tmp_path, protoco
     assert not marker.exists()
 
 
+def test_a_torch_file_with_a_contract_is_refused_and_not_flown_by_another(
+    small_toge: Toge, tmp_path: Path
+) -> None:
+    path = tmp_path / "own.pt"
+    torch.save({"state_dict": small_toge.state_dict(), "contract": "{}"}, path)
+    with pytest.raises(CheckpointError, match="holds a contract"):
+        load_checkpoint(path, fallback=small_toge.config)
+
+
 def test_a_missing_file_names_what_is_there(small_toge: Toge, saved: Path) -> None:
     with pytest.raises(CheckpointError, match=r"no such file.*toge\.safetensors"):
         load_checkpoint(saved.with_name("other.pt"), fallback=small_toge.config)
