@@ -24,7 +24,6 @@ FORMS = (
 DEFAULT_BAUD = 57600
 EVERY_INTERFACE = "0.0.0.0"  # noqa: S104 - only where the user says so
 LOOPBACK = "127.0.0.1"
-_EVERY_HOST = (EVERY_INTERFACE, "::")
 _HOST_PORT = r"(?:\[([0-9A-Fa-f:.]*:[0-9A-Fa-f:.]*(?:%[^\]\s/]+)?)\]|([^:/\s\[\]]*)):(\d{1,5})"
 _KINDS = ("udp", "udpin", "udpout", "tcp", "tcpout")
 _NETWORK = re.compile(rf"(?:({'|'.join(_KINDS)}):)?(//)?{_HOST_PORT}/?", re.ASCII)

@@ -10,8 +10,6 @@ from sitl.course import Course
 from sitl.expert.demonstrator import CENTRED, Expert, StickPositions
 from sitl.simulated_vehicle import SimulatedVehicle
 
-SWITCH_CHANNEL = 7
-"""Channel of the pilot's spare switch, from 1; `mavbridge record --episode-channel 7`."""
 OFF_US = (0,) * 8  # no signal: the receiver has lost the transmitter
 PERIOD_NS = 20 * NS_PER_MS  # between two frames of a receiver
 GESTURE_THROTTLE, GESTURE_YAW = -1.0, 1.0

@@ -22,14 +22,6 @@ from mavbridge.mavlink.profiles.sticks import (
     unusable,
 )
 
-ARDUPILOT_CURVE_NAMES = (
-    *("ANGLE_MAX", "ATC_ANGLE_MAX"),
-    *("PILOT_Y_RATE", "PILOT_Y_EXPO"),
-    *("PILOT_SPEED_UP", "PILOT_SPEED_DN", "PILOT_SPD_UP", "PILOT_SPD_DN"),
-    "THR_DZ",
-)
-"""Parameters to read besides the radio calibration (RCMAP_*, RCn_*); the second name of a pair is
-that of 4.7. A vehicle has one of the two, and before 4.3 no PILOT_Y_EXPO."""
 _LEAN_MODES = ("ALT_HOLD", "STABILIZE")
 """The sticks are a lean and a yaw rate."""
 _CLIMB_MODE = "ALT_HOLD"

@@ -23,14 +23,6 @@ from mavbridge.mavlink.profiles.sticks import (
     unusable,
 )
 
-PX4_CURVE_NAMES = (
-    "MPC_MAN_TILT_MAX",
-    *("MAN_DEADZONE", "MPC_HOLD_DZ"),
-    *("MPC_MAN_Y_MAX", "MPC_YAW_EXPO"),
-    *("MPC_Z_VEL_MAX_UP", "MPC_Z_VEL_MAX_DN", "MPC_Z_MAN_EXPO"),
-)
-"""Parameters to read. MPC_HOLD_DZ is what MAN_DEADZONE was called before 1.17, and only those
-versions have the two expos, which are ``EXPO`` for good since."""
 EXPO = 0.6
 """Cubic share of the yaw and climb sticks; the default of older versions too."""
 _LEAN_MODES = ("ALTCTL", "STABILIZED")
