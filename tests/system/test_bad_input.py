@@ -44,7 +44,7 @@ FLY = ("--connect", "udp:127.0.0.1:1")
     [
         ([], "--connect"),
         (["--connect", "udp:127.0.0.1:1", "--fly-high"], "Unknown option: --fly-high"),
-        (["--connect", "udp:127.0.0.1:1", "--set-config", "rates.action=fast"], "rates.action"),
+        (["--connect", "udp:127.0.0.1:1", "--set-config", "rates.action=fast"], "[rates][action]"),
         (
             ["--connect", "udp:127.0.0.1:1", "--set-config", "rates.action=0"],
             "between 0.5 and 500 Hz",

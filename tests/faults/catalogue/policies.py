@@ -80,7 +80,8 @@ class Leaning(Climbing):
         if self._flown > self.lean_calls:
             chunk[:] = (0.3, 0.25, 0.0, 0.5)
         if self.is_faulty:
-            if self.has_begun and self.marks_fault:
+            has_fault = type(self).misbehave is not Leaning.misbehave
+            if self.has_begun and self.marks_fault and has_fault:
                 mark_fault()
             self.misbehave(chunk)
         return chunk
