@@ -18,6 +18,7 @@ from mavbridge.core.errors import PeerError, UserError
 from mavbridge.core.reasons import Code
 from mavbridge.guard.values import Phase
 from sitl.ardupilot.flight_modes import Mode
+from sitl.vehicle.config import MID_RECEIVER_US
 
 ARM = dialect.MAV_CMD_COMPONENT_ARM_DISARM
 SWITCH = 7
@@ -37,6 +38,25 @@ def test_arm_idles_the_throttle_until_the_policy_takes_over_from_there() -> None
 
     assert sticks[0].throttle == pytest.approx(-1.0, abs=0.05)
     assert max(steps) < 0.09, "8 /s at 100 Hz, and not a jump from idle to the policy"
+
+
+@pytest.mark.parametrize("receiver_us", [None, MID_RECEIVER_US], ids=["no receiver", "receiver"])
+@pytest.mark.parametrize("gap_s", [0.15, 0.5, 1.0, 4.0])
+@pytest.mark.parametrize("lost", ["refused", "to the vehicle", "from the vehicle"])
+def test_a_gap_of_the_link_delays_arming_and_never_prevents_it(
+    lost: str, gap_s: float, receiver_us: tuple[int, ...] | None
+) -> None:
+    """Nothing is sent meanwhile: what the echo shows then must not keep us from trying again."""
+    flight = GuardFlight(climbing_first, receiver_us=receiver_us, arm=True, mode="ALT_HOLD")
+    flight.until(lambda: flight.phase is Phase.PREPARING, within_s=12)
+    if lost == "refused":
+        flight.network.send = lambda data, peer=None: False  # type: ignore[method-assign]
+    flight.up.is_silent, flight.down.is_silent = lost == "to the vehicle", lost.startswith("from")
+    flight.run(gap_s)
+    if lost == "refused":
+        del flight.network.send  # type: ignore[attr-defined]
+    flight.up.is_silent = flight.down.is_silent = False
+    flight.until(lambda: flight.phase is Phase.FLYING, within_s=5)
 
 
 def test_the_switch_engages_by_going_high_while_armed_in_an_allowed_mode() -> None:

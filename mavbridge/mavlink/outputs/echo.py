@@ -37,7 +37,8 @@ _DITHER_LEVELS = 3
 """Three levels of 25 ms, by time and not by packet: no usual rate of commands or of what shows them
 hits the same level each time, and one lost packet never makes two levels look like one."""
 _PAUSE_NS = 100 * NS_PER_MS
-"""After this long without a command of ours, an echo may rightly have been constant."""
+"""After this long without a command of ours nothing is judged: an echo may rightly be constant, and
+what lasted until then must not keep us from ever trying again."""
 _RETRY_NS = 3 * NS_PER_S
 """A fault stays known for this long after it was last seen."""
 
@@ -78,6 +79,8 @@ class EchoCheck:
         """The last of each 0.7 s; after a release, those before it."""
         self._since_ns: int | None = None
         """First command of this check; None while the vehicle is released."""
+        self._tried_ns = 0
+        """Last command, also one that could not be sent."""
         self._baseline: Shown | None = None
         """Last values that were shown before ours."""
         self._matched_ns: int | None = None
@@ -129,6 +132,7 @@ class EchoCheck:
 
     def tried(self, now_ns: int) -> None:
         """Note a command, also one that could not be sent: its echo is awaited from then on."""
+        self._tried_ns = now_ns
         if self._since_ns is None:
             self._since_ns = now_ns
             self._sent.clear()
@@ -137,8 +141,10 @@ class EchoCheck:
         """Note a command that was sent, by the values that will be shown of it."""
         self.tried(now_ns)
         self.has_sent, self.is_released = True, False
-        if self._sent and now_ns - self._sent[-1][0] > _PAUSE_NS:
+        if self._sent and self._is_paused(now_ns):
             self._held = None
+            if now_ns - self._sent[-1][0] > MATCH_NS:
+                self._restart(now_ns)
         self._sent.append((now_ns, values))
         while self._sent[0][0] < now_ns - MATCH_NS:
             self._sent.popleft()
@@ -167,6 +173,9 @@ class EchoCheck:
             apart = self._rules.release_tolerance
             self.is_released |= not any(_is_within(apart, values, past) for _, past in self._sent)
             self.shows_last = bool(self._sent) and self._is_near(values, self._sent[-1][1])
+        elif self._is_paused(now_ns):
+            self._note_pause(values, now_ns)
+            return
         elif not self.confirmed:
             self._seek(values, is_ours, now_ns)
         elif is_ours:
@@ -196,8 +205,20 @@ class EchoCheck:
     def _is_near(self, one: Shown, other: Shown) -> bool:
         return _is_within(self._rules.tolerance, one, other)
 
+    def _is_paused(self, now_ns: int) -> bool:
+        """Nothing of ours has left for so long that what is shown tells nothing about us."""
+        return not self._sent or now_ns - self._sent[-1][0] > _PAUSE_NS
+
+    def _note_pause(self, values: Shown, now_ns: int) -> None:
+        """Judge nothing; after a long pause these are the values of before the next command."""
+        self._held = None
+        self._returned_us.clear()
+        self._foreign_us.clear()
+        if not self._sent or now_ns - self._sent[-1][0] > MATCH_NS:
+            self._baseline = values
+
     def _restart(self, now_ns: int) -> None:
-        """Nothing was shown for so long that the vehicle may rightly show what it likes now."""
+        """Nothing was shown, or sent, for so long that the vehicle may rightly show anything."""
         if self.is_sending:
             self._since_ns, self._matched_ns, self._held = now_ns, None, None
             self._returned_us.clear()
@@ -229,7 +250,7 @@ class EchoCheck:
 
     def fault(self, now_ns: int) -> EchoFault | None:
         """The way in which it does not act on our commands; kept for 3 s after it ends."""
-        if self._since_ns is not None:
+        if self._since_ns is not None and now_ns - self._tried_ns <= _PAUSE_NS:
             since_ns, longest_ns = self._since_ns, CONFIRM_NS
             if self._matched_ns is not None:
                 since_ns, longest_ns = self._matched_ns, self._rules.longest_pause_ns

@@ -284,12 +284,20 @@ def test_an_override_that_expires_is_noticed_as_the_sticks_of_before_us() -> Non
     assert world.seconds_to_fault()[0] == "returned"
 
 
-def test_a_pause_of_our_own_is_no_silence_of_the_vehicle() -> None:
+@pytest.mark.parametrize("keeps", [True, False], ids=["held", "expired"])
+@pytest.mark.parametrize("pause_s", [0.35, 0.5, 0.8, 3.0, 10.0])
+def test_a_pause_of_our_own_says_nothing_about_the_vehicle(pause_s: float, keeps: bool) -> None:
     world = engaged()
     world.is_sending = False
-    world.run(0.35)
+    assert world.run(min(pause_s, 0.2)) is None
+    if not keeps:
+        world.override = None  # the receiver's sticks come back
+    assert world.run(pause_s - min(pause_s, 0.2)) is None
     world.is_sending = True
-    assert world.run(1.0) is None
+    assert world.run(1.0 if keeps else 0.1) is None
+    if keeps:
+        world.is_deaf = True
+        assert world.seconds_to_fault()[0] == "silent"
 
 
 def test_a_vehicle_that_sends_no_rc_channels_any_more_is_noticed() -> None:
