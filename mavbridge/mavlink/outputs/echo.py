@@ -167,7 +167,6 @@ class EchoCheck:
         if self.is_unshown(now_ns) and self._arrived_ns is not None:
             self._restart(now_ns)
         self._shown_us, self._arrived_ns = shown_us, now_ns
-        is_ours = any(self._is_near(values, past) for _, past in reversed(self._sent))
         if self._since_ns is None:
             self._baseline = values
             apart = self._rules.release_tolerance
@@ -175,8 +174,13 @@ class EchoCheck:
             self.shows_last = bool(self._sent) and self._is_near(values, self._sent[-1][1])
         elif self._is_paused(now_ns):
             self._note_pause(values, now_ns)
-            return
-        elif not self.confirmed:
+        else:
+            self._judge(values, shown_us, now_ns)
+
+    def _judge(self, values: Shown, shown_us: int, now_ns: int) -> None:
+        """Compare what is shown while we send."""
+        is_ours = any(self._is_near(values, past) for _, past in reversed(self._sent))
+        if not self.confirmed:
             self._seek(values, is_ours, now_ns)
         elif is_ours:
             self._matched_ns = now_ns

@@ -53,8 +53,6 @@ class SingleRate:
 class Leaning(Climbing):
     """Takes off, then leans, turns and climbs; ``misbehave`` is called once it leans steadily."""
 
-    marks_fault = True
-
     contract = Contract(arrays="numpy", feature_dim=1, image_height=32, image_width=32)
     lean_calls, fault_calls = 120, 260
     """Calls into the flight after which it leans, and after which its fault begins; those on the
@@ -80,8 +78,7 @@ class Leaning(Climbing):
         if self._flown > self.lean_calls:
             chunk[:] = (0.3, 0.25, 0.0, 0.5)
         if self.is_faulty:
-            has_fault = type(self).misbehave is not Leaning.misbehave
-            if self.has_begun and self.marks_fault and has_fault:
+            if self.has_begun and type(self).misbehave != Leaning.misbehave:
                 mark_fault()
             self.misbehave(chunk)
         return chunk
@@ -171,8 +168,6 @@ class HangingInPython(Leaning):
 class HangingEncoder(Leaning):
     """Its encoder stops answering once the flight leans."""
 
-    marks_fault = False
-
     def encode_visual(self, image: Array) -> Array:
         if self.is_faulty:
             mark_fault()
@@ -205,8 +200,6 @@ class TwoEyed(Leaning):
 
 class HangingBelow(TwoEyed):
     """The encoder of the second camera stops answering once the flight leans."""
-
-    marks_fault = False
 
     def encode_visual(self, image: Array, camera: int = 0) -> Array:
         if camera == 1 and self.is_faulty:
@@ -251,6 +244,8 @@ class Misshapen(Leaning):
 
     def predict_fast(self, feature: Array, state: Array, history: Array, steps: int) -> Array:
         chunk = super().predict_fast(feature, state, history, steps)
+        if self.has_begun:
+            mark_fault()
         return chunk[0] if self.is_faulty else chunk
 
 
