@@ -29,7 +29,8 @@ from mavbridge.core.errors import PeerError, UserError
 from mavbridge.core.processes import end, free_port, running, wait
 from mavbridge.core.reasons import Reason
 from mavbridge.core.records import Event, Tick
-from mavbridge.flight.app import fly_policy, start_guard
+from mavbridge.flight.app import fly_policy
+from mavbridge.flight.guard_process import start_guard
 from mavbridge.flight.plan import plan_flight
 from mavbridge.flight.policies import load_configured_policy
 from mavbridge.guard.values import EndRequest

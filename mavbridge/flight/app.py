@@ -6,7 +6,6 @@ from collections.abc import Callable, Sequence
 from contextlib import ExitStack
 from functools import partial
 from pathlib import Path
-from typing import NamedTuple
 
 import cv2
 from rich.console import Console
@@ -15,17 +14,13 @@ from rich.text import Text
 from mavbridge.camera.open import open_camera
 from mavbridge.config.flight import FlyConfig
 from mavbridge.config.rates import STATUS_HZ
-from mavbridge.core.clock import NS_PER_S, Clock, MonotonicClock, wall_offset_ns
+from mavbridge.core.clock import NS_PER_S, Clock, MonotonicClock
 from mavbridge.core.errors import ExitCode, MavbridgeError, PeerError
 from mavbridge.core.files import empty_folders_removed
 from mavbridge.core.log import SAID
 from mavbridge.core.ports import Camera, TickSink
 from mavbridge.core.provenance import without_secrets
-from mavbridge.core.realtime import (
-    prepare_to_die_first,
-    settle_process,
-    settle_thread,
-)
+from mavbridge.core.realtime import prepare_to_die_first, settle_process, settle_thread
 from mavbridge.core.reasons import Code, Reason, because
 from mavbridge.core.records import FlightOutcome
 from mavbridge.core.stopping import StopRequest, stop_on_signals
@@ -34,21 +29,16 @@ from mavbridge.core.workers import HungError, Worker
 from mavbridge.flight.bridge import Bridge, CameraPath, build_bridge
 from mavbridge.flight.checks import check_flight, signing_note
 from mavbridge.flight.feature_cache import FeatureCache
-from mavbridge.flight.guard_process import GuardProcess
+from mavbridge.flight.guard_process import StartedGuard, start_guard
 from mavbridge.flight.observation import observation_ages_ns
 from mavbridge.flight.observers import FlightObservers
 from mavbridge.flight.outcome import flight_verdict, log_link
 from mavbridge.flight.plan import FlightPlan, plan_flight
-from mavbridge.flight.policies import (
-    load_configured_policy,
-    looks_at_images,
-)
-from mavbridge.flight.settings import guard_settings
+from mavbridge.flight.policies import load_configured_policy, looks_at_images
 from mavbridge.flight.speed import require_speed
 from mavbridge.guard.values import EndRequest, Phase
 from mavbridge.observe.keyboard import ENGAGE_KEY, KEYS_HINT, Keyboard
 from mavbridge.observe.output import flight_console
-from mavbridge.recording.tlog import TlogPipe, open_tlog_pipe
 from policy.contract import Contract
 from policy.preprocess import least_source_px
 from policy.protocol import PolicyRunner
@@ -64,13 +54,6 @@ STOPPED_NS = LEAST_HANG_NS // 2
 stopped, which is no hang of the policy."""
 END_S = 10.0
 """Longest wait for a guard that neither holds sticks nor ends."""
-
-
-class StartedGuard(NamedTuple):
-    """A guard that looks for the vehicle already, and the pipe of its telemetry log."""
-
-    process: GuardProcess
-    tlog_pipe: TlogPipe | None
 
 
 def fly(config: FlyConfig) -> int:
@@ -108,27 +91,6 @@ def fly(config: FlyConfig) -> int:
             act_ms, encode_ms = times.act_s * 1e3, times.encode_s * 1e3
             _log.debug("a chunk takes %.2f ms here, an image %.2f ms", act_ms, encode_ms)
         return fly_policy(plan, runner, clock=clock, console=console, guard=guard)
-
-
-def start_guard(config: FlyConfig, clock: Clock, stack: ExitStack) -> StartedGuard:
-    """Start the guard process; with ``stack`` its channel is closed, which ends it."""
-    tlog_pipe: TlogPipe | None = None
-    tlog_fd: int | None = None
-    if config.record is not None:
-        tlog_pipe = open_tlog_pipe()
-        stack.callback(tlog_pipe.close)
-        tlog_fd = tlog_pipe.writer.fileno()
-    settings = guard_settings(
-        config,
-        is_dual=config.policy.may_be_dual,
-        tlog_fd=tlog_fd,
-        wall_offset_ns=wall_offset_ns(clock),
-    )
-    process = GuardProcess(settings, clock)
-    stack.callback(process.close)
-    if tlog_pipe is not None:
-        tlog_pipe.writer.close()
-    return StartedGuard(process, tlog_pipe)
 
 
 def fly_policy(

@@ -6,12 +6,15 @@ import socket
 import subprocess
 import sys
 import threading
-from contextlib import suppress
+from contextlib import ExitStack, suppress
+from typing import NamedTuple
 
+from mavbridge.config.flight import FlyConfig
 from mavbridge.core.address import SocketAddress
-from mavbridge.core.clock import NS_PER_MS, NS_PER_S, Clock
+from mavbridge.core.clock import NS_PER_MS, NS_PER_S, Clock, wall_offset_ns
 from mavbridge.core.errors import ExitCode, MavbridgeError, PeerError, UserError
 from mavbridge.core.processes import child_environment
+from mavbridge.flight.settings import guard_settings
 from mavbridge.flight.telemetry_cache import TelemetryCache
 from mavbridge.guard.channel import SocketPort, channel_pair
 from mavbridge.guard.settings import GuardSettings
@@ -26,6 +29,7 @@ from mavbridge.guard.wire import (
     decode_from_guard,
     encode_to_guard,
 )
+from mavbridge.recording.tlog import TlogPipe, open_tlog_pipe
 
 LISTEN_S = 0.1
 """Longest wait for a message before the stop flag is checked."""
@@ -238,3 +242,31 @@ def _as_exception(error: GuardError) -> MavbridgeError:
             return GuardDiedError(
                 f"the guard process has failed, a bug of mavbridge:\n{error.text}"
             )
+
+
+class StartedGuard(NamedTuple):
+    """A guard that looks for the vehicle already, and the pipe of its telemetry log."""
+
+    process: GuardProcess
+    tlog_pipe: TlogPipe | None
+
+
+def start_guard(config: FlyConfig, clock: Clock, stack: ExitStack) -> StartedGuard:
+    """Start the guard process; with ``stack`` its channel is closed, which ends it."""
+    tlog_pipe: TlogPipe | None = None
+    tlog_fd: int | None = None
+    if config.record is not None:
+        tlog_pipe = open_tlog_pipe()
+        stack.callback(tlog_pipe.close)
+        tlog_fd = tlog_pipe.writer.fileno()
+    settings = guard_settings(
+        config,
+        is_dual=config.policy.may_be_dual,
+        tlog_fd=tlog_fd,
+        wall_offset_ns=wall_offset_ns(clock),
+    )
+    process = GuardProcess(settings, clock)
+    stack.callback(process.close)
+    if tlog_pipe is not None:
+        tlog_pipe.writer.close()
+    return StartedGuard(process, tlog_pipe)
