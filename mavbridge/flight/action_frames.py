@@ -1,8 +1,8 @@
-"""A policy's actions, in the axes of its contract, and the same actions in the guard's.
+"""Convert actions between the axes of the policy's contract and those of the guard.
 
-The guard, the limits and MAVLink have NED world and FRD body axes. A policy with the state in
-``enu_flu`` (ROS, REP 103) puts its actions out in those axes as well, and finds them so in its
-history. Both ways are the same change of axes.
+The guard, its limits and MAVLink use NED world and FRD body axes. A policy with ``state_frame =
+"enu_flu"`` (ROS, REP 103) outputs actions, and reads its action history, in ENU and FLU. The
+conversion is its own inverse.
 """
 
 from collections.abc import Sequence
@@ -17,25 +17,26 @@ from policy.contract import Contract
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ActionFrame:
-    """Kind of a policy's actions, and how its axes lie to NED and FRD."""
+    """Kind of the policy's actions, and the permutation and signs that convert them to NED and
+    FRD."""
 
     neutral: Action = NEUTRAL
-    """Action of the policy's kind that does nothing: zeros, with the thrust that hovers. The same
-    in both axes."""
+    """Neutral action of the policy's kind: zeros, or zeros with hover thrust. Equal in both
+    frames."""
     order: tuple[int, ...] = (0, 1, 2, 3)
     signs: tuple[float, ...] = (1.0, 1.0, 1.0, 1.0)
-    """Number ``i`` in the one axes is ``signs[i]`` times number ``order[i]`` in the other."""
+    """Component ``i`` in one frame is ``signs[i]`` times component ``order[i]`` in the other."""
 
     def to_guard(self, actions: FloatArray) -> tuple[Action, ...]:
-        """Actions [horizon, 4] of the policy -> the same in NED and FRD."""
+        """Convert policy actions [horizon, 4] to NED and FRD actions."""
         kind = type(self.neutral)
         return tuple(map(kind._make, self._other_axes(actions).tolist()))
 
     def from_guard(self, actions: Sequence[Action]) -> FloatArray:
-        """Actions as they were sent -> [len, 4] in the policy's axes.
+        """Convert sent actions to the policy's frame, [len, 4].
 
-        An action of another kind is neutral: the guard has others while it gets the vehicle ready,
-        and levels it by an attitude where a policy puts out body rates.
+        An action of another kind becomes neutral: while it prepares the vehicle, or levels one that
+        is flown by body rates, the guard sends actions that the policy does not know.
         """
         kind = type(self.neutral)
         own = [action if type(action) is kind else self.neutral for action in actions]
@@ -48,7 +49,7 @@ class ActionFrame:
 
 
 def action_frame(contract: Contract) -> ActionFrame:
-    """Axes and kind of the actions under a contract."""
+    """Return the frame conversion and action kind of a contract."""
     kind = contract.action
     cls = ACTION_CLASSES[kind]
     has_thrust = kind in ("rates", "attitude")

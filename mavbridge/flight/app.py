@@ -1,4 +1,5 @@
-"""One real flight: starts the guard, opens what the flags name, stops all in reverse order."""
+"""A real flight: start the guard, open the devices that the flags name, stop all in reverse
+order."""
 
 import logging
 import threading
@@ -46,21 +47,21 @@ from policy.protocol import PolicyRunner
 _log = logging.getLogger(__name__)
 JOIN_S = 2.0
 LEAST_HANG_NS = NS_PER_S
-"""Silence of the policy, or of the encoder, after which the flight ends; the guard has released it
+"""Silence of the policy or the encoder that ends the flight. The guard has released the vehicle
 long before."""
 HANG_PERIODS = 5
 STOPPED_NS = LEAST_HANG_NS // 2
-"""The main thread looks STATUS_HZ times a second; after a longer pause the whole process had been
-stopped, which is no hang of the policy."""
+"""The main thread checks STATUS_HZ times a second. A longer gap means that the whole process was
+stopped, not that the policy hangs."""
 END_S = 10.0
 """Longest wait for a guard that neither holds sticks nor ends."""
 
 
 def fly(config: FlyConfig) -> int:
-    """Run one flight to its end; returns the exit status.
+    """Run one flight to its end; return the exit status.
 
     Raises:
-        MavbridgeError: anything that the user, the vehicle or the policy got wrong.
+        MavbridgeError: the user, the vehicle or the policy made the flight impossible.
     """
     clock = MonotonicClock()
     console = flight_console()
@@ -102,9 +103,10 @@ def fly_policy(
     sinks: tuple[TickSink, ...] = (),
     guard: StartedGuard | None = None,
 ) -> int:
-    """Run one flight of a policy that is loaded already; returns the exit status.
+    """Run one flight of a loaded policy; return the exit status.
 
-    ``sinks`` see every tick. Errors that end a flight of the policy have the status of a fault.
+    ``sinks`` receive every tick. An error that ends a flight of the policy has the exit status of a
+    fault.
     """
     # OpenCV would print its own complaint about a camera before, and instead of, ours.
     cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_SILENT)
@@ -131,7 +133,7 @@ def fly_policy(
 
 
 class _Flight:
-    """One flight; everything that is opened goes on the exit stack at once."""
+    """State of one flight. Every resource is pushed on the exit stack when it is opened."""
 
     def __init__(
         self,
@@ -149,7 +151,8 @@ class _Flight:
         self._guard = guard.process
         self._has_hung = False
         self._ending = EndRequest(reason=because(Code.GUARD_DIED), is_fault=True)
-        """What it was asked to end for; until then only its death ends it without a summary."""
+        """Reason for which the guard was asked to end. Until it is asked, it ends without a summary
+        only if it dies."""
         self._hang_ns = max(
             LEAST_HANG_NS,
             HANG_PERIODS * plan.guard.chunk_period_ns,
@@ -194,7 +197,7 @@ class _Flight:
 
     @property
     def _outcome(self) -> FlightOutcome | None:
-        """How the policy flew; None if it has not, as in a start that failed."""
+        """Outcome of the policy's flight; None if the policy never flew."""
         if not self._observers.referee.has_flown:
             return None
         summary, asked = self._guard.summary, self._ending
@@ -219,7 +222,7 @@ class _Flight:
         return camera
 
     def run(self, stop: StopRequest) -> None:
-        """Fly until the guard ends, a loop ends, or a signal comes."""
+        """Fly until the guard ends, a loop ends, or a signal arrives."""
         rates, bridge, screen = self._config.rates, self._bridge, self._observers.screen
         visions = [
             Worker(
@@ -264,7 +267,7 @@ class _Flight:
     def _scheduled(
         self, run: Callable[[threading.Event], None], *, realtime: bool, cpu: int | None
     ) -> Callable[[threading.Event], None]:
-        """Wrap a loop so that its thread first asks for its scheduling."""
+        """Wrap a loop so that its thread sets its scheduling first."""
 
         def run_settled(stop: threading.Event) -> None:
             refusal = settle_thread(realtime=realtime, cpu=cpu)
@@ -276,11 +279,11 @@ class _Flight:
 
     @property
     def has_flown(self) -> bool:
-        """The policy has had the sticks."""
+        """True if the policy has had control."""
         return bool(self._bridge.view.flights)
 
     def verdict(self, stop: StopRequest) -> int:
-        """Judge the flight, which has ended; tells the user why it is no success."""
+        """Return the exit status of the ended flight, and tell the user why it is not 0."""
         exit_code, text = flight_verdict(
             self._guard.summary,
             stop,
@@ -294,7 +297,7 @@ class _Flight:
         return exit_code
 
     def _fault(self, visions: Sequence[Worker], policy: Worker) -> Reason | None:
-        """Why no more chunks will come, or None."""
+        """Return why no more chunks will come, or None."""
         for vision, camera in zip(visions, self._cameras, strict=True):
             if not vision.is_alive:
                 return because(Code.CAMERA_FAILED, camera=self._named(camera))
@@ -323,11 +326,11 @@ class _Flight:
         return None
 
     def _named(self, camera: str, prefix: str = "") -> str:
-        """The name of one of several cameras, for a message."""
+        """Return the camera's name for a message; empty if it is the only camera."""
         return f" {prefix}{camera}" if len(self._cameras) > 1 else ""
 
     def _end(self, ending: EndRequest, listener: Worker, stop: StopRequest) -> None:
-        """Have the guard give the sticks back, and wait for it while it holds any."""
+        """Ask the guard to end, and wait while it holds the vehicle."""
         self._ending = ending
         self._guard.send(ending)
         screen, view = self._observers.screen, self._bridge.view
@@ -351,7 +354,7 @@ class _Flight:
             raise PeerError(f"{ending.reason}: it is too slow for this machine, or stuck")
 
     def _join(self, worker: Worker) -> None:
-        """Join a loop: one call of the policy may last until it would count as hung."""
+        """Join a loop, for as long as one call of the policy may last before it counts as hung."""
         longest_s = 0.0 if self._has_hung else max(self._hang_ns, self._encoder_hang_ns) / NS_PER_S
         try:
             worker.join(max(JOIN_S, longest_s))
@@ -360,7 +363,7 @@ class _Flight:
                 raise
 
     def finish(self) -> None:
-        """Print the report of a flight with a vehicle, and write it where --report names a file."""
+        """Print the report of a flight with a vehicle, and write it to --report."""
         view, screen, summary = self._bridge.view, self._observers.screen, self._guard.summary
         for text in view.take_texts():  # said after the last tick
             screen.show_message(text)

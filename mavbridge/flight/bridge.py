@@ -1,4 +1,4 @@
-"""The loops of the flight process, composed once for a real vehicle and for the simulation."""
+"""Composition of the flight process's loops, shared by real flights and the simulation."""
 
 import threading
 from collections.abc import Callable, Sequence
@@ -30,30 +30,30 @@ from policy.contract import Contract
 from policy.protocol import PolicyRunner
 
 SPARSE_NS = 50 * NS_PER_MS
-"""States of chunks that are farther apart do not tell the motion since an exposure: it takes those
-in between as well."""
+"""At longer chunk periods the states of the chunks are too sparse for the motion since an exposure:
+the states between two chunks are kept as well."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Bridge:
-    """Camera to feature cache, state and feature to chunks, and what the guard says of both."""
+    """Vision loops, policy loop and telemetry of one flight."""
 
     visions: tuple[VisionLoop, ...]
-    """One for each camera of the contract, in its order."""
+    """One loop per camera, in the contract's order."""
     policy: PolicyLoop
     view: TelemetryCache
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class CameraPath:
-    """What belongs to one camera of the contract."""
+    """Per-camera resources."""
 
     camera: Camera
-    """Read by its vision loop alone."""
+    """Read by the camera's vision loop only."""
     cache: FeatureCache
-    """Holds its features; in simulation they appear in it when their encoding is over."""
+    """Features of this camera. In simulation a feature appears when its simulated encoding ends."""
     clock: Clock
-    """Time of its vision loop."""
+    """Clock of the camera's vision loop."""
 
 
 def build_bridge(
@@ -153,7 +153,7 @@ def _vision_loops(
     watch: CameraConfig | None,
     is_airborne: Callable[[], bool],
 ) -> tuple[VisionLoop, ...]:
-    """The loop of each camera, with its rate and its sink; ``watch`` judges images, if given."""
+    """Build the vision loop of each camera. ``watch``: check images for faults; None: do not."""
     encoder_lock = threading.Lock()
     return tuple(
         VisionLoop(
@@ -173,13 +173,14 @@ def _vision_loops(
 
 
 def _states_span_ns(contract: Contract, chunk_period_ns: int, feature_ns: int) -> int:
-    """Span of past states that the policy takes, or the motion since an exposure needs."""
+    """Return for how long past states are kept: for past observations, and for the motion since an
+    exposure."""
     is_sparse = contract.since_exposure and chunk_period_ns > SPARSE_NS
     return observation_ages_ns(contract)[0] + (feature_ns if is_sparse else 0)
 
 
 def _visual_rates(contract: Contract, loops: LoopRates) -> list[AdaptiveRate]:
-    """Rate of each camera: that of the flight, or of the contract where that is lower."""
+    """Return the rate of each camera: the flight's, or the contract's if that is lower."""
     return [
         AdaptiveRate(min_hz=min(loops.min_vision_hz, hz), max_hz=min(loops.max_vision_hz, hz))
         for hz in contract.camera_rates_hz or (loops.max_vision_hz,) * len(contract.cameras)

@@ -1,4 +1,4 @@
-"""What a flight is refused for before anything slow is loaded."""
+"""Checks that run before anything slow is loaded."""
 
 from mavbridge.camera.open import check_camera
 from mavbridge.config.flight import FlyConfig, LinkConfig
@@ -12,7 +12,8 @@ from mavbridge.recording.folder import prepare_folder
 
 
 def signing_note(config: LinkConfig) -> str | None:
-    """Who else can steer the vehicle, for want of signatures; None: nobody on another computer."""
+    """Return a note if other computers can steer the vehicle because packets are not signed, else
+    None."""
     if config.signing_key_file is not None or not is_reachable(config.connect):
         return None
     return (

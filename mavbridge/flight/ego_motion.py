@@ -1,4 +1,4 @@
-"""Age of the image and motion since its exposure, which a contract may append to the state."""
+"""Image age and motion since exposure, optional inputs appended to the state."""
 
 from collections import deque
 
@@ -19,13 +19,14 @@ from policy.contract import (
 from policy.rotation import motion_since_exposure, slerp
 
 MAX_READINGS = 1024
-"""Readings of each kind: five seconds of the fastest attitude stream that a link carries."""
+"""Attitudes, and velocities, kept: five seconds of the fastest attitude stream that a link
+carries."""
 
 
 class EgoMotion:
-    """Remembers attitude and velocity, each by its own stamp; for one thread.
+    """History of attitude and velocity, each by its own stamp; for one thread.
 
-    All is in the frame of the states that are pushed, so the same code serves NED/FRD and ENU/FLU.
+    Works in the frame of the pushed states, NED/FRD or ENU/FLU.
     """
 
     def __init__(self, *, span_ns: int) -> None:
@@ -34,21 +35,21 @@ class EgoMotion:
         self._velocities: deque[Reading] = deque(maxlen=MAX_READINGS)
 
     def push(self, state: VehicleState) -> None:
-        """Remember a state; a part that is not newer than the last one is known already."""
+        """Add a state. A part that is not newer than the last one is ignored."""
         values = state.values.tolist()
         self._remember(self._attitudes, Reading(state.attitude_ns, tuple(values[QUATERNION])))
         self._remember(self._velocities, Reading(state.velocity_ns, tuple(values[VELOCITY])))
 
     def append_to(self, state: VehicleState, exposed_ns: int) -> FloatArray:
-        """The state [13] and ``contract.SINCE_EXPOSURE_NAMES`` behind it -> [1, 20] float32.
+        """Return the state [13] with ``contract.SINCE_EXPOSURE_NAMES`` appended, [1, 20] float32.
 
         Args:
-            state: the newest of those that were pushed.
-            exposed_ns: exposure of the image. If that was after the attitude, the motion is zero
+            state: newest pushed state.
+            exposed_ns: exposure of the image. If it is after the attitude, the motion is zero
                 and the age negative.
 
         Raises:
-            ValueError: nothing was pushed.
+            ValueError: no state was pushed.
         """
         if not self._attitudes:
             raise ValueError("no state was pushed, so none can have moved")
@@ -77,7 +78,7 @@ class EgoMotion:
 
 
 def _around(readings: deque[Reading], at_ns: int) -> tuple[Reading, Reading, float]:
-    """The readings before and after a time, and how far it is between them, 0 to 1."""
+    """Return the readings before and after a time, and its position between them, 0 to 1."""
     after = readings[-1]
     for before in reversed(readings):  # from the newest: an image is a few readings old
         if before.arrived_ns <= at_ns:

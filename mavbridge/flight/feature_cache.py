@@ -1,4 +1,4 @@
-"""The cache between the two rates, one for each camera: the newest wins, and neither side waits."""
+"""Cache between the two rates, one per camera. The newest feature wins; neither side waits."""
 
 import threading
 from collections import deque
@@ -6,26 +6,27 @@ from collections import deque
 from mavbridge.core.records import FeatureFrame
 
 MAX_PAST = 1024
-"""Most past features that are kept: of a longer span of time the oldest are forgotten."""
+"""Past features kept; beyond this the oldest are dropped."""
 
 
 class FeatureCache:
-    """Holds the newest feature, and past ones where the policy takes several observations.
+    """Newest feature, and past ones for policies that take several observations.
 
-    Written by the thread of the camera, read by the action thread. A frame is immutable and
-    replaced by reference, which CPython does atomically; only the past ones need a lock.
+    Written by the camera's thread, read by the policy's. A feature is immutable and replaced by
+    reference, which CPython does atomically; only the past features need a lock.
     """
 
     def __init__(self, *, span_ns: int = 0) -> None:
-        """``span_ns``: time before the newest exposure for which features are kept; 0 = none."""
+        """Create an empty cache. ``span_ns``: how far before the newest exposure features are kept;
+        0: none."""
         self._frame: FeatureFrame | None = None
         self._span_ns = span_ns
         self._lock = threading.Lock()
         self._past: deque[FeatureFrame] = deque(maxlen=MAX_PAST)
-        """By exposure, oldest first; none of them has a fault."""
+        """Features without a fault, by exposure, oldest first."""
 
     def publish(self, frame: FeatureFrame) -> None:
-        """Replace the held feature."""
+        """Publish a new feature."""
         self._frame = frame
         if not self._span_ns or frame.fault is not None:
             return
@@ -38,14 +39,12 @@ class FeatureCache:
                 self._past.popleft()
 
     def latest(self) -> FeatureFrame | None:
-        """Newest feature, or None before the first."""
+        """Return the newest feature; None before the first."""
         return self._frame
 
     def nearest(self, to: FeatureFrame, *, before_ns: int) -> FeatureFrame:
-        """The feature whose exposure is nearest to ``before_ns`` before that of ``to``.
-
-        ``to`` itself where none was kept.
-        """
+        """Return the feature exposed nearest to ``before_ns`` before ``to``; ``to`` itself if none
+        was kept."""
         at_ns = to.captured_ns - before_ns
         with self._lock:
             past = (*self._past, to)

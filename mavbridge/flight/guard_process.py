@@ -1,4 +1,4 @@
-"""The guard process as its parent sees it: started, fed with chunks, listened to, waited for."""
+"""The guard process as seen by its parent: start it, send chunks, receive reports, wait for it."""
 
 import os
 import select
@@ -32,19 +32,19 @@ from mavbridge.guard.wire import (
 from mavbridge.recording.tlog import TlogPipe, open_tlog_pipe
 
 LISTEN_S = 0.1
-"""Longest wait for a message before the stop flag is checked."""
+"""Longest wait for a message between two checks of the stop flag."""
 OPEN_S = 20.0
-"""Longest wait for a guard to start and to open the link: it imports little, and TCP is given three
-seconds, but the machine may be busy."""
+"""Longest wait for the guard to start and to open the link. TCP alone may take three seconds, and
+the machine may be busy."""
 CLOSE_S = 5.0
 """Longest wait for a guard that holds no sticks to end and free its port."""
 
 
 REAP_S = 0.2
-"""Longest wait for a guard whose channel is closed to be gone: nothing is sent while it lives."""
+"""Longest wait for a guard whose channel is closed to exit. Nothing is sent while it lives."""
 LATEST_NS = 500 * NS_PER_MS
-"""Oldest sign of life of a guard that is spoken for: a vehicle may have left our sticks since, by
-its own timeout or by its pilot."""
+"""Oldest report of a dead guard for which its last words are still sent. Later, the vehicle may
+have left our sticks by its own timeout or by its pilot."""
 _STILL_OURS = (Phase.FLYING, Phase.LEAVING, Phase.HOLDING)
 OWN_TIMEOUT = (
     "the vehicle keeps the last sticks or setpoint until its own timeout (ArduPilot: "
@@ -53,54 +53,55 @@ OWN_TIMEOUT = (
 
 
 class GuardDiedError(MavbridgeError):
-    """The guard process is gone without having ended in order."""
+    """The guard process exited without its summary."""
 
     exit_code = ExitCode.FAULT
 
 
 class GuardProcess:
-    """Starts the guard; ``send`` may be called by any thread, ``listen`` runs in one of its own."""
+    """Handle of the guard process. ``send`` is thread-safe; ``listen`` needs a thread of its
+    own."""
 
     def __init__(self, settings: GuardSettings, clock: Clock) -> None:
-        """Start the process; it looks for the vehicle from then on."""
+        """Start the process, which begins to look for the vehicle."""
         ours, theirs = channel_pair()
         samples, their_samples = channel_pair()
         self._clock = clock
         self._port = SocketPort(ours, takes_files=True)
         self.samples = SocketPort(samples)
-        """Readings of the vehicle, for a ``TelemetryCache``."""
+        """The vehicle's readings, for a ``TelemetryCache``."""
         self._words: LastWords | None = None
         self._outlet: int | None = None
-        """The guard's open socket or port, while the vehicle is held."""
+        """Duplicate of the guard's socket or port while it holds the vehicle."""
         self._newest: GuardTick | None = None
         self._lock = threading.Lock()
         self._process = _spawn((theirs, their_samples), settings)
         theirs.close()
         their_samples.close()
         self._early: list[FromGuard] = []
-        """Messages that came before ``listen``."""
+        """Messages received before ``listen``."""
         self.summary: GuardSummary | None = None
-        """The guard's last words; None until it has ended in order."""
+        """Final summary; None until the guard has ended in order."""
         self.error: MavbridgeError | None = None
-        """Why the guard could not go on."""
+        """Error that ended the guard."""
         self.send(settings)
 
     @property
     def pid(self) -> int:
-        """Process id."""
+        """Process id of the guard."""
         return self._process.pid
 
     def send(self, message: ToGuard) -> bool:
-        """Hand over a message; False: it was dropped. Never waits for the guard."""
+        """Send a message without waiting; return False if it was dropped."""
         with self._lock:
             return self._port.send(encode_to_guard(message))
 
     def wait_until_open(self, timeout_s: float = OPEN_S) -> None:
-        """Wait for its first word, which says that the link is open; called before ``listen``.
+        """Wait for the guard's first message, sent when the link is open. Call before ``listen``.
 
         Raises:
-            PeerError, UserError: the address of the vehicle cannot be used.
-            GuardDiedError: it has ended at once, or says nothing in time.
+            PeerError, UserError: the vehicle's address cannot be used.
+            GuardDiedError: the guard has exited, or sends nothing within ``timeout_s``.
         """
         if not select.select([self._port], [], [], timeout_s)[0]:
             raise GuardDiedError(f"the guard process has said nothing for {timeout_s:g} s")
@@ -115,8 +116,8 @@ class GuardProcess:
         """Pass the guard's messages to ``view`` until it ends or ``stop`` is set.
 
         Raises:
-            GuardDiedError: the guard has ended without its summary.
-            PeerError, UserError: the reason that the guard gave.
+            GuardDiedError: the guard has exited without its summary.
+            PeerError, UserError: the error that the guard reported.
         """
         early, self._early = self._early, []
         for message in early:
@@ -152,7 +153,7 @@ class GuardProcess:
                 view.receive(message)
 
     def _keep(self, words: LastWords) -> None:
-        """Take the guard's last words, and the file through which they leave."""
+        """Store the guard's last words, and the descriptor to send them through."""
         self._words = words
         if words.brings_file or not words.packets:
             self._close_outlet()
@@ -165,7 +166,7 @@ class GuardProcess:
             self._outlet = None
 
     def _speak(self) -> str:
-        """Send the last words of a guard that is gone once; return what was done, for the user."""
+        """Send the last words of a guard that has died; return a description for the user."""
         died_ns, words, newest = self._clock.now_ns(), self._words, self._newest
         if words is None or newest is None or not words.packets:
             return "it held no sticks"
@@ -190,7 +191,7 @@ class GuardProcess:
         )
 
     def _transmit(self, packet: bytes, receiver: SocketAddress | None) -> bool:
-        """Send one packet through the guard's socket or port; never waits."""
+        """Send one packet through the guard's socket or port without waiting."""
         if self._outlet is None:
             return False
         with suppress(OSError):
@@ -201,7 +202,7 @@ class GuardProcess:
         return False
 
     def wait(self, timeout_s: float) -> bool:
-        """Wait for the process to end by itself; returns whether it has."""
+        """Wait for the process to exit; return whether it has."""
         try:
             self._process.wait(timeout_s)
         except subprocess.TimeoutExpired:
@@ -209,7 +210,7 @@ class GuardProcess:
         return True
 
     def close(self) -> None:
-        """Close the channel: a guard that still runs takes it for our death, and ends by itself."""
+        """Close the channel. A running guard takes this for our death, and ends by itself."""
         self._port.close()
         self.samples.close()
         self.wait(CLOSE_S)
@@ -245,14 +246,14 @@ def _as_exception(error: GuardError) -> MavbridgeError:
 
 
 class StartedGuard(NamedTuple):
-    """A guard that looks for the vehicle already, and the pipe of its telemetry log."""
+    """A guard that is looking for the vehicle, and the pipe of its telemetry log."""
 
     process: GuardProcess
     tlog_pipe: TlogPipe | None
 
 
 def start_guard(config: FlyConfig, clock: Clock, stack: ExitStack) -> StartedGuard:
-    """Start the guard process; with ``stack`` its channel is closed, which ends it."""
+    """Start the guard process. Closing ``stack`` closes its channel, which ends it."""
     tlog_pipe: TlogPipe | None = None
     tlog_fd: int | None = None
     if config.record is not None:

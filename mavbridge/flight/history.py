@@ -1,4 +1,4 @@
-"""Chunks and history in seconds: which action acts now, and which ones were sent before."""
+"""Sample chunks and the history of sent actions at given times."""
 
 import threading
 from bisect import bisect_right
@@ -10,12 +10,13 @@ from policy.contract import history_ages_ns
 
 
 def sample_chunk(chunk: FloatArray, *, chunk_dt_s: float, at_s: float) -> Sticks:
-    """Action of a chunk at a time, linear between its points, held at its ends.
+    """Return the action of a chunk at a time: linear between its rows, constant beyond them.
 
     Args:
-        chunk: [horizon, 4]; row k acts ``k * chunk_dt_s`` after the state that it was made from.
-        chunk_dt_s: time between rows, s.
-        at_s: time since that state, s.
+        chunk: [horizon, 4]; row k acts ``k * chunk_dt_s`` after the state that it was computed
+            from.
+        chunk_dt_s: time between rows [s].
+        at_s: time since that state [s].
     """
     last = len(chunk) - 1
     position = min(max(at_s / chunk_dt_s, 0.0), float(last))
@@ -27,23 +28,25 @@ def sample_chunk(chunk: FloatArray, *, chunk_dt_s: float, at_s: float) -> Sticks
 
 
 class SentHistory:
-    """Actions as they were sent, resampled to the policy's history grid in the policy's axes.
+    """Sent actions, resampled on the policy's history grid in the policy's frame.
 
-    One thread appends, another one may resample.
+    One thread may append while another one resamples.
     """
 
     def __init__(self, *, length: int, dt_s: float, frame: ActionFrame | None = None) -> None:
-        """``frame``: kind and axes of the policy's actions; None = sticks."""
+        """Create a neutral history. ``frame``: kind and axes of the policy's actions; None:
+        sticks."""
         self._frame = frame or ActionFrame()
         self._ages_ns = history_ages_ns(length, dt_s)
         self._span_ns = self._ages_ns[0] + self._ages_ns[-1]
         self._lock = threading.Lock()
         self._sent_ns: list[int] = []
         self._sent: list[Action] = [self._frame.neutral]
-        """One more than stamps: what was held before the first of them."""
+        """One action more than stamps: the first is the one before the first stamp."""
 
     def append(self, sent: Action | None, now_ns: int) -> None:
-        """Remember what left at ``now_ns`` (None = released); forget what is too old to matter."""
+        """Add the action sent at ``now_ns``; None: control was released. Old actions are
+        dropped."""
         with self._lock:
             self._sent_ns.append(now_ns)
             self._sent.append(self._frame.neutral if sent is None else sent)
@@ -51,7 +54,7 @@ class SentHistory:
                 del self._sent_ns[: old - 1], self._sent[: old - 1]
 
     def resample(self, now_ns: int) -> FloatArray:
-        """[1, K, 4], see ``policy.contract.history_ages_ns``."""
+        """Return the history [1, K, 4] on the grid of ``policy.contract.history_ages_ns``."""
         with self._lock:
             rows = [self._sent[bisect_right(self._sent_ns, now_ns - age)] for age in self._ages_ns]
         return self._frame.from_guard(rows)[None]

@@ -1,4 +1,4 @@
-"""What the policy sees at one moment: images of all cameras and states, the past ones as well."""
+"""Policy inputs at one moment: images of all cameras and states, past observations included."""
 
 from collections import deque
 from collections.abc import Callable, Sequence
@@ -15,35 +15,34 @@ from mavbridge.flight.state import Unavailable
 from policy.contract import Contract
 
 Join: TypeAlias = Callable[[Sequence[Sequence[FloatArray]]], FloatArray]
-"""``PolicyRunner.join``."""
+"""Signature of ``PolicyRunner.join``."""
 
 MAX_STATES = 4096
-"""Most past states that are kept: ten seconds of the fastest attitude stream."""
+"""Past states kept: ten seconds of the fastest attitude stream."""
 
 
 class Observation(NamedTuple):
-    """Inputs of one chunk, and the moments that they come from."""
+    """Inputs of one chunk, with their stamps."""
 
     encoded: FloatArray
-    """What ``PolicyRunner.act`` takes."""
+    """Encoded images, as ``PolicyRunner.act`` takes them."""
     states: FloatArray
-    """[1, *contract.state_shape]."""
+    """States, shape [1, *contract.state_shape]."""
     state: VehicleState
-    """The newest."""
+    """Newest state."""
     feature: FeatureFrame
-    """The newest of the first camera."""
+    """Newest feature of the first camera."""
     image_ns: int
-    """Exposure of the oldest among the newest images of all cameras."""
+    """Oldest exposure among the newest images of all cameras."""
     frame_ids: tuple[tuple[int, ...], ...]
-    """Images of the features, [T][cameras], oldest first."""
+    """Frame ids of the features, [T][cameras], oldest first."""
 
 
 class ObservationSource:
-    """Joins the newest and the past images and states of one flight; for the policy's thread.
+    """Joins newest and past images and states of one flight; for the policy's thread.
 
-    A past observation is the image, or the state, that is nearest in time to the one wanted: so
-    many steps before the newest of its own kind and camera. Where nothing older exists yet, the
-    oldest is repeated.
+    A past observation is the image, or state, nearest in time to a fixed number of steps before the
+    newest one of its camera. At the start of a flight the oldest one is repeated.
     """
 
     def __init__(
@@ -55,14 +54,14 @@ class ObservationSource:
         max_feature_age_ns: int,
         states_span_ns: int = 0,
     ) -> None:
-        """Join nothing yet.
+        """Create an empty source.
 
         Args:
-            contract: says how many observations there are, and of what.
-            caches: one for each camera of the contract, in its order.
-            join: of the runner.
+            contract: number and kind of observations.
+            caches: one per camera, in the contract's order.
+            join: ``PolicyRunner.join``.
             max_feature_age_ns: oldest image to act on.
-            states_span_ns: time before the newest attitude for which states are kept.
+            states_span_ns: how far before the newest attitude states are kept.
         """
         self._cameras = contract.cameras
         self._caches = tuple(caches)
@@ -77,7 +76,7 @@ class ObservationSource:
             self._ego_motion = EgoMotion(span_ns=span_ns)
 
     def remember(self, state: VehicleState) -> None:
-        """Take a state of the past, which has come since the last solve; in order."""
+        """Add a past state that arrived since the last solve; call in order."""
         states = self._states
         if states and state.attitude_ns <= states[-1].attitude_ns:
             return
@@ -88,12 +87,13 @@ class ObservationSource:
             self._ego_motion.push(state)
 
     def push(self, state: VehicleState) -> None:
-        """Take the newest state, also one that no chunk will come from; in order."""
+        """Add the newest state, also if no chunk is computed from it; call in order."""
         if self._ego_motion is not None:
             self._ego_motion.push(state)
 
     def observe(self, state: VehicleState, now_ns: int) -> Observation | Unavailable:
-        """The inputs of a chunk from ``state``, which was pushed; or what is missing for one."""
+        """Return the inputs of a chunk from ``state``, the newest pushed; ``Unavailable`` if one is
+        missing."""
         newest = []
         for camera, cache in enumerate(self._caches):
             feature = cache.latest()
@@ -124,7 +124,7 @@ class ObservationSource:
         )
 
     def _rows(self, state: VehicleState, features: Sequence[FeatureFrame]) -> FloatArray:
-        """States at the observations whose images of the first camera are ``features``."""
+        """Return the states at the observations; ``features`` are the first camera's."""
         if len(self._before_ns) == 1:
             return self._with_motion(state, features[0])
         known = (*self._states, state)
@@ -136,7 +136,7 @@ class ObservationSource:
         return np.stack(rows)[None]
 
     def _with_motion(self, state: VehicleState, feature: FeatureFrame) -> FloatArray:
-        """[1, state_dim]"""
+        """Return the state with its optional inputs, [1, state_dim]."""
         row = state.values[None]
         if self._ego_motion is not None:
             row = self._ego_motion.append_to(state, feature.captured_ns)
@@ -145,14 +145,15 @@ class ObservationSource:
         return row
 
     def _missing(self, camera: int, why: Reason) -> Unavailable:
-        """``why``, with the camera's name where there are several."""
+        """Return ``Unavailable``; of several cameras, name the one."""
         is_only = len(self._cameras) == 1
         name = self._cameras[camera]
         return Unavailable(why if is_only else because(Code.OF_CAMERA, camera=name, why=why))
 
 
 def observation_ages_ns(contract: Contract) -> tuple[int, ...]:
-    """Time from each observation to the newest one, oldest first; the last is 0."""
+    """Return the age of each observation relative to the newest [ns], oldest first; the last is
+    0."""
     step_ns = round(contract.observation_dt_s * NS_PER_S)
     return tuple(step_ns * steps for steps in reversed(range(contract.observation_steps)))
 

@@ -1,4 +1,4 @@
-"""The observers of one flight: timing, terminal, Rerun viewer and recorder."""
+"""Observers of one flight: timing, terminal, Rerun viewer and recorder."""
 
 import shutil
 from collections.abc import Callable
@@ -43,16 +43,17 @@ if TYPE_CHECKING:  # the extra "record" may not be installed
     from mavbridge.recording.recorder import Recorder
 
 RERUN_CAPACITY = 1000
-"""Ticks that may wait for the viewer: ten seconds at 100 Hz."""
+"""Ticks queued for the viewer: ten seconds at 100 Hz."""
 VIEWER_JOIN_S = 2.0
 SCREEN_CLOSE_S = 2.0
-"""Time for a reader of the terminal to take the report."""
+"""Longest wait for the terminal to take the report."""
 RECORDER_JOIN_S = 60.0
-"""The tables of a long flight become Parquet within seconds; the vehicle is released by then."""
+"""Longest wait for the recorder. A long flight's tables become Parquet within seconds; the vehicle
+is released by then."""
 
 
 class FlightObservers:
-    """The observers that the flags ask for. None of them can delay a loop."""
+    """Observers that the flags ask for. None of them can delay a loop."""
 
     def __init__(
         self, plan: FlightPlan, runner: PolicyRunner, *, clock: Clock, console: Console
@@ -78,7 +79,7 @@ class FlightObservers:
 
     @property
     def sinks(self) -> tuple[TickSink, ...]:
-        """All observers that are open, for the bridge."""
+        """Open observers, for the bridge."""
         optional = (self._recorder, self._viewer)
         return (
             self._timing,
@@ -89,12 +90,12 @@ class FlightObservers:
 
     @property
     def recorders(self) -> tuple[TickSink, ...]:
-        """The observers that take the images of all cameras."""
+        """Observers that take the images of all cameras."""
         return tuple(sink for sink in (self._recorder, self._viewer) if sink is not None)
 
     @property
     def watch_solve(self) -> Callable[[Solve], object] | None:
-        """Where every solve of the policy goes; None where nobody keeps or shows them."""
+        """Callback for every solve; None if no observer takes solves."""
         takers = [taker for taker in (self._recorder, self._viewer) if taker is not None]
         if not takers:
             return None
@@ -106,12 +107,12 @@ class FlightObservers:
         return watch
 
     def watch_packets(self, packets: tuple[ForwardedPacket, ...]) -> None:
-        """Keep when packets of the vehicle came and what they tell of, if there is a recording."""
+        """Pass the vehicle's packets to the recorder, if there is one."""
         if self._recorder is not None:
             self._recorder.watch_packets(packets)
 
     def open_viewer(self, stack: ExitStack) -> None:
-        """Start the viewer or its file, if one is wanted; it is closed with ``stack``."""
+        """Start the viewer, or its file, if the flags ask for it. ``stack`` closes it."""
         if self._config.rerun == "off" and not self._config.serve:
             return
         config, contract, freshness = self._config, self._plan.contract, self._plan.guard.freshness
@@ -136,7 +137,11 @@ class FlightObservers:
     def open_recorder(
         self, tlog_pipe: TlogPipe | None, guard: GuardProcess, autopilot: Callable[[], str]
     ) -> None:
-        """Start the recording, if one is wanted; raises UserError if it cannot be written."""
+        """Start the recorder if --record is given.
+
+        Raises:
+            UserError: the folder cannot be written.
+        """
         if self._config.record is None or tlog_pipe is None:
             return
         from mavbridge.recording.meta import FlightMeta
@@ -178,7 +183,7 @@ class FlightObservers:
             raise UserError(f"--record {self._config.record}: {error}") from error
 
     def close_recorder(self, outcome: FlightOutcome | None) -> None:
-        """Finish the recording; after the guard has ended, so that it holds the release."""
+        """Finish the recording. Call after the guard has ended, so that it holds the release."""
         recorder, summary = self._recorder, self._guard.summary if self._guard else None
         if recorder is None or self._config.record is None:
             return
@@ -189,7 +194,7 @@ class FlightObservers:
             self._write_end(replace(meta, parameters=params), self._config.record)
 
     def _write_end(self, meta: "FlightMeta", folder: Path) -> None:
-        """Add to the meta data what is known only when the guard has ended."""
+        """Add the outcome and the vehicle's parameters to ``meta.json``."""
         from mavbridge.recording.meta import write_meta
 
         try:
@@ -205,10 +210,8 @@ class FlightObservers:
     def finish(
         self, summary: GuardSummary | None, autopilot: str | None, outcome: FlightOutcome | None
     ) -> None:
-        """Show the report, and write it where --report names a file, if a vehicle was found.
-
-        Without one nothing is kept of the flight.
-        """
+        """Show the report and write it to --report; without a vehicle, delete the flight's
+        files."""
         try:
             if autopilot is not None:
                 self._report(summary, autopilot, outcome)
@@ -218,7 +221,7 @@ class FlightObservers:
             self.screen.close(SCREEN_CLOSE_S)
 
     def _discard(self) -> None:
-        """Remove the files of a flight that found no vehicle; both are closed."""
+        """Delete the closed files of a flight that found no vehicle."""
         if self._recorder is not None and self._config.record is not None:
             shutil.rmtree(self._config.record, ignore_errors=True)
         if self._viewer is not None and self._config.rerun.endswith(".rrd"):

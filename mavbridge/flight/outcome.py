@@ -1,4 +1,4 @@
-"""What became of a flight: its outcome, the line that states it, and the exit status."""
+"""Outcome of a flight: the facts, the line that states them, and the exit status."""
 
 import logging
 import math
@@ -20,7 +20,7 @@ from mavbridge.recording.crash import CrashWatch
 
 _log = logging.getLogger(__name__)
 RUN_OUT_NS = NS_PER_S
-"""From the last gate to the end of the flight: a crash just behind it still counts."""
+"""Time from the last gate to the end of the flight, in which a crash still counts."""
 _ENDS: dict[FlightEnd, str] = {
     "course": "the end of the course",
     "duration": "--duration",
@@ -35,16 +35,16 @@ _UNPLANNED = ("takeover", "disarmed", "fault")
 
 
 class FlightReferee:
-    """A ``TickSink`` that follows the policy's flight to its outcome; other threads may ask it."""
+    """``TickSink`` that follows the policy's flight to its outcome; other threads may ask it."""
 
     def __init__(self, gates: Sequence[CourseGate] | None) -> None:
-        """``gates``: of the course, in order; None where no course was named."""
+        """``gates``: the course's gates in order; None if no course was named."""
         self._gates_total = len(gates) if gates else None
         self._course = CourseProgress(gates or ())
         self._crashes = CrashWatch()
         self._began_ns = 0
         self._flown: Tick | None = None
-        """The last one in which the policy had the sticks."""
+        """Last tick in which the policy had control."""
         self._has_position = self._is_flying = self._is_disarmed = False
         self._reason: Reason | None = None
 
@@ -69,24 +69,24 @@ class FlightReferee:
 
     @property
     def has_flown(self) -> bool:
-        """The policy has had the sticks."""
+        """True if the policy has had control."""
         return self._flown is not None
 
     @property
     def crash(self) -> str | None:
-        """How the vehicle was seen to have hit something so far, in words."""
+        """How the vehicle hit something, in words; None if it was not seen to."""
         return self._crashes.reason
 
     def is_course_over(self, now_ns: int) -> bool:
-        """The last gate was passed, and the run-out behind it is over."""
+        """True if the last gate was passed more than the run-out ago."""
         return self._course.is_done and now_ns - self._course.passed_ns[-1] >= RUN_OUT_NS
 
     def outcome(
         self, end: FlightEnd, vehicle: GuardStatus, asked: Reason | None = None
     ) -> FlightOutcome | None:
-        """The outcome of a flight that ended so; None if the policy has not flown.
+        """Return the outcome of a flight that ended by ``end``; None if the policy has not flown.
 
-        ``asked``: the reason, where the guard did not live to tell one.
+        ``asked``: reason for the end, if the guard died before it could tell one.
         """
         if (flown := self._flown) is None:
             return None
@@ -110,7 +110,7 @@ class FlightReferee:
 
 
 def describe(outcome: FlightOutcome) -> str:
-    """State the outcome in one line."""
+    """Return the outcome in one line."""
     course: list[str] = []
     if outcome.gates_total is not None:
         passed = "no position: ?" if outcome.gates_passed is None else outcome.gates_passed
@@ -137,11 +137,11 @@ def describe(outcome: FlightOutcome) -> str:
 
 
 class Verdict(NamedTuple):
-    """How a flight went, for scripts and for the user."""
+    """Exit status of a flight, with its reason."""
 
     exit_code: int
     text: str | None = None
-    """Why it is not 0."""
+    """Why the status is not 0."""
 
 
 def flight_verdict(
@@ -188,7 +188,7 @@ def flight_verdict(
 
 
 def log_link(summary: GuardSummary) -> None:
-    """Log what came over the link, and the parameters that were read."""
+    """Log the received message rates and the parameters that were read."""
     rates = (f"{name} {rate_hz:.1f}" for name, rate_hz in summary.link.messages_per_s)
     _log.debug("received, in Hz: %s", ", ".join(rates))
     params = (f"{name}={value:g}" for name, value in sorted(summary.params.items()))

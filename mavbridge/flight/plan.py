@@ -1,4 +1,4 @@
-"""All that follows from the flags and the contract of a flight, resolved once."""
+"""Everything that follows from a flight's flags and contract, resolved once."""
 
 from dataclasses import dataclass
 
@@ -23,19 +23,19 @@ from policy.contract import Contract
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class FlightPlan:
-    """Made by ``plan_flight`` alone, and handed down."""
+    """Resolved settings of a flight, made by ``plan_flight`` and handed down."""
 
     config: FlyConfig
     contract: Contract
     is_dual: bool
     loops: LoopRates
     start_limits: FreshnessLimits
-    """Oldest inputs from which a chunk may be computed."""
+    """Maximum age of each input from which a chunk may be computed."""
     guard: FlightSettings
-    """Settings of the guard; its ``freshness`` holds while a chunk is played."""
+    """Settings of the guard. Its ``freshness`` applies while a chunk is played."""
 
     def figures(self) -> dict[str, float]:
-        """Rates, periods and limits by their names, for people and for ``meta.json``."""
+        """Return rates, periods and limits by name, for ``check`` and ``meta.json``."""
         limits, smoothing, envelope = (
             self.guard.freshness,
             self.guard.smoothing,
@@ -60,7 +60,7 @@ class FlightPlan:
 
 
 def plan_flight(config: FlyConfig, contract: Contract, *, is_dual: bool) -> FlightPlan:
-    """Resolve the flags of a flight of a policy with this contract.
+    """Resolve the flags of a flight against the policy's contract.
 
     Raises:
         UserError: a flag contradicts the contract.

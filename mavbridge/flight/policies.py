@@ -1,4 +1,4 @@
-"""From the flags of a command to a loaded policy."""
+"""Load the policy that the flags name."""
 
 from dataclasses import replace
 from functools import lru_cache
@@ -19,27 +19,32 @@ NO_IMAGE_ADVICE = "looks at no image: --camera none does without"
 STATELESS = (*BUILTIN_KINDS, "onnx")
 FILE_KINDS = ("lerobot", "onnx", "torchscript")
 POLICY_SUFFIXES = (".safetensors", ".onnx", ".data", ".pt", ".json", ".toml")
-"""Files of a policy's folder that belong to it."""
+"""Suffixes of the files in a policy's folder that belong to it."""
 
 
 def load_configured_policy(
     wanted: PolicyConfig, clock: Clock, *, starts_in_air: bool = False
 ) -> LoadedPolicy:
-    """Load the policy that the flags name, or raise PolicyError.
+    """Load the policy that the flags name.
 
-    A scripted one follows ``clock``, and climbs first unless it ``starts_in_air``.
+    A scripted policy follows ``clock``, and climbs first unless ``starts_in_air``.
+
+    Raises:
+        PolicyError: it cannot be loaded.
     """
     request = replace(_request(wanted), starts_in_air=starts_in_air)
     return load_policy(request, now_s=lambda: clock.now_ns() / NS_PER_S)
 
 
 def check_configured_policy(wanted: PolicyConfig) -> None:
-    """Refuse in milliseconds, by PolicyError, what ``load_configured_policy`` cannot load."""
+    """Raise PolicyError, within milliseconds, if ``load_configured_policy`` could not load the
+    policy."""
     check_request(_request(wanted))
 
 
 def configured_contract(wanted: PolicyConfig) -> Contract:
-    """Contract of the policy that the flags name, its weights left alone; raises PolicyError."""
+    """Return the contract of the named policy without loading its weights; raise PolicyError if it
+    has none."""
     return read_policy_contract(_request(wanted))
 
 
@@ -62,7 +67,7 @@ def _request(wanted: PolicyConfig) -> PolicyRequest:
 
 
 def policy_files(wanted: PolicyConfig) -> list[Path]:
-    """The files that make the policy what it is: weights, contract, graphs, a user's code."""
+    """Return the files that define the policy: weights, contract, graphs, user code."""
     files = [path for path in (wanted.checkpoint, wanted.contract) if path is not None]
     shipped = shipped_weights(wanted.policy)
     if shipped is not None and wanted.checkpoint is None and not wanted.allow_untrained:
@@ -77,21 +82,21 @@ def policy_files(wanted: PolicyConfig) -> list[Path]:
 
 
 def is_scripted(policy: PolicyConfig) -> bool:
-    """Return whether the policy flies by no image."""
+    """Return True if the policy is scripted and uses no image."""
     return policy.kind == "scripted"
 
 
 def looks_at_images(config: FlyConfig) -> bool:
-    """Return whether a frozen or a black image tells of a fault.
+    """Return True if a frozen or black image is a fault for this policy.
 
-    Without a camera a policy of the user's is taken at its user's word; our own nets need images.
+    A user's policy may fly without a camera; our own networks need images.
     """
     is_blind = _has_no_camera(config) and config.policy.kind not in BUILTIN_KINDS
     return not is_blind and not is_scripted(config.policy)
 
 
 def require_images(config: FlyConfig) -> None:
-    """Refuse to fly a net of ours without a camera; raises UserError."""
+    """Raise UserError if a network of ours is flown without a camera."""
     if config.policy.kind in BUILTIN_KINDS and _has_no_camera(config):
         raise UserError(
             f"--camera none: {config.policy.policy} flies by its images, so name its camera; "
@@ -100,7 +105,7 @@ def require_images(config: FlyConfig) -> None:
 
 
 def require_cameras(config: FlyConfig) -> None:
-    """Refuse local cameras that are not plugged in; raises CameraError."""
+    """Raise CameraError if a local camera is not plugged in."""
     for source in config.camera.sources:
         try:
             require_present(source)
@@ -115,7 +120,7 @@ def _has_no_camera(config: FlyConfig) -> bool:
 
 
 def is_stateless(policy: PolicyConfig) -> bool:
-    """Return whether the policy keeps nothing between flights: nets that are loaded by us."""
+    """Return True if the policy keeps no state between flights, as networks that we load."""
     return policy.kind in STATELESS
 
 
@@ -125,7 +130,7 @@ def _loaded_once(policy: PolicyConfig) -> LoadedPolicy:
 
 
 def load_for_episodes(policy: PolicyConfig, clock: Clock) -> LoadedPolicy:
-    """Load a policy for one of many flights; nets, which keep nothing between them, only once."""
+    """Load a policy for one of many flights. Stateless policies are loaded once per process."""
     if is_stateless(policy):
         return _loaded_once(policy)
     return load_configured_policy(policy, clock)

@@ -1,4 +1,4 @@
-"""The fast path: newest attitude + cached feature + sent actions -> chunk -> the guard."""
+"""Fast path: newest attitude, cached feature and sent actions become a chunk for the guard."""
 
 import threading
 from collections.abc import Callable
@@ -19,35 +19,35 @@ from mavbridge.guard.wire import NoChunk
 from policy.errors import NoChunkError
 
 Act: TypeAlias = Callable[[FloatArray, FloatArray, FloatArray], FloatArray]
-"""``PolicyRunner.act``."""
+"""Signature of ``PolicyRunner.act``."""
 
 WAIT_NS = 100 * NS_PER_MS
-"""Longest wait for an attitude before the stop flag is checked, and the guard told why it waits."""
+"""Longest wait for an attitude before the stop flag is checked and the guard is told."""
 
 RETRY_NS = 100 * NS_PER_MS
-"""After a solve that was refused the next one starts at the latest so much later, however slow the
-policy is."""
+"""Longest pause after a solve that was refused, for slow policies too."""
 
 MAX_HORIZON = 1024
-"""Most actions of a chunk, as in a contract: the guard has to read each one between two sticks."""
+"""Most actions in a chunk, as in a contract: the guard reads each one between two sends."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class PolicySettings:
-    """Parts of the contract and of the configuration that the loop needs."""
+    """Settings of the policy loop."""
 
     action_frame: ActionFrame
     chunk_dt_s: float
     max_frozen_ns: int
-    """Longest time for which the attitude may stay exactly the same; 0 = no limit."""
+    """Longest time for which the attitude may stay bit-identical; 0: no limit."""
     period_ns: int
-    """Mean time between two solves, at least; single ones may be closer, as the attitudes come."""
+    """Minimum mean period of solves. Attitudes that arrive close together may shorten a single
+    one."""
 
 
 class PolicyLoop:
-    """Solves on each new attitude, at most at the policy's rate, in a thread of its own.
+    """Solves on each new attitude, at most at the policy's rate, in its own thread.
 
-    It computes before the flight as well: the guard engages only with a fresh chunk.
+    It also solves before the flight: the guard engages only with a fresh chunk.
     """
 
     def __init__(
@@ -80,12 +80,13 @@ class PolicyLoop:
         self._seen_ns = 0
         """Arrival of the newest attitude at the last step."""
         self._due_ns: int | None = None
-        """Slot of the next solve; an attitude up to a quarter of a period before it will do."""
+        """Slot of the next solve. An attitude up to a quarter of a period earlier starts it."""
         self.alive_ns = clock.now_ns()
-        """When the last step ended; read by another thread."""
+        """End of the last step; read by another thread."""
 
     def run(self, stop: threading.Event) -> None:
-        """Solve until told to stop; the guard is told of a failure, which is no stall."""
+        """Solve until ``stop`` is set. On an error, tell the guard that no more chunks will
+        come."""
         try:
             self._run(stop)
         except BaseException:
@@ -109,23 +110,23 @@ class PolicyLoop:
 
     @property
     def start_ns(self) -> int:
-        """An attitude that arrives from then on starts the next solve."""
+        """Earliest arrival of an attitude that starts the next solve."""
         if self._due_ns is None or self._is_starting:
             return self._seen_ns + 1
         return self._due_ns - self._settings.period_ns // 4
 
     @property
     def _is_starting(self) -> bool:
-        """The guard waits for a reset, and the first chunk after it."""
+        """True while the guard waits for a reset and the first chunk after it."""
         return self._view.starting_ns > self._reset_ns
 
     @property
     def has_news(self) -> bool:
-        """An attitude has come that starts the next solve."""
+        """True if an attitude has arrived that starts the next solve."""
         return self._view.attitude_ns >= self.start_ns
 
     def step(self) -> None:
-        """One solve from what is newest now, or the reason why there is none."""
+        """Solve once from the newest inputs, or tell the guard why that is impossible."""
         now_ns, is_starting = self._clock.now_ns(), self._is_starting
         telemetry, has_position = self._view.telemetry, self._view.status.has_position
         attitude = telemetry.ned_from_body_wxyz
@@ -248,7 +249,7 @@ def make_chunk(
 
 
 def _kept(array: FloatArray) -> FloatArray:
-    """A copy that nobody changes: engines may write their next result into the same memory."""
+    """Return a copy: engines may write their next result into the same memory."""
     copy = array.copy()
     copy.setflags(write=False)
     return copy

@@ -1,4 +1,4 @@
-"""From the flags of a command, and the contract of a policy, to the settings of link and guard."""
+"""Derive the settings of link and guard from the flags and the policy's contract."""
 
 import math
 import os
@@ -19,17 +19,18 @@ from mavbridge.guard.settings import GuardSettings
 from policy.contract import ActionKind, Contract
 
 LEAST = 1e-9
-"""A limit that widens nothing."""
+"""Limit that widens nothing."""
 
 TAU_S: dict[ActionKind, float] = {"sticks": 0.05, "rates": 0.01, "attitude": 0.05, "velocity": 0.05}
-"""Usual time constants of the low-pass. Body rates close the loop of the attitude, which has no
-room for 50 ms more."""
+"""Default time constants of the low-pass filter. A policy of body rates closes the attitude loop,
+which tolerates no lag of 50 ms."""
 
 
 def guard_settings(
     config: FlyConfig, *, is_dual: bool, tlog_fd: int | None, wall_offset_ns: int
 ) -> GuardSettings:
-    """Settings of the process, before a policy is loaded; chunks are sent besides the slots."""
+    """Return the process settings known before the policy is loaded. Chunks are sent between slots,
+    too."""
     rates = config.rates
     return GuardSettings(
         link=link_settings(
@@ -47,7 +48,7 @@ def guard_settings(
 
 
 def require_goal(config: FlyConfig, contract: Contract) -> None:
-    """Raise UserError unless the flight has a goal just where the policy takes one."""
+    """Raise UserError unless --goal is given exactly when the policy takes a goal."""
     if "goal" in contract.state_extras and config.goal is None:
         raise UserError(
             "this policy flies to a goal: give --goal NORTH,EAST,DOWN, in metres from the "
@@ -61,7 +62,7 @@ def require_goal(config: FlyConfig, contract: Contract) -> None:
 
 
 def limit_settings(config: FlyConfig) -> LimitSettings:
-    """Bounds of what leaves, for every kind of action."""
+    """Return the limits of sent actions, for every kind."""
     bounds = config.setpoints
     return LimitSettings(
         stick_slew_per_s=config.limits.max_slew,
@@ -76,7 +77,7 @@ def limit_settings(config: FlyConfig) -> LimitSettings:
 
 
 def policy_envelope(contract: Contract) -> EnvelopeLimits:
-    """Envelope that the policy needs; nothing where its contract is silent."""
+    """Return the envelope that the policy needs; limits that its contract omits widen nothing."""
     return EnvelopeLimits(
         tilt_deg=contract.max_tilt_deg or LEAST,
         height_m=contract.max_height_m or LEAST,
@@ -86,7 +87,8 @@ def policy_envelope(contract: Contract) -> EnvelopeLimits:
 
 
 def engagement_settings(config: FlyConfig, contract: Contract) -> EngagementSettings:
-    """Acts and modes that engage; raises UserError for a mode that is not in the contract."""
+    """Return how the policy may engage; raise UserError for a mode that its contract does not
+    name."""
     mode = config.mode.upper() if config.mode else None
     if mode is not None and mode not in contract.modes:
         raise UserError(
@@ -110,7 +112,7 @@ def engagement_settings(config: FlyConfig, contract: Contract) -> EngagementSett
 
 
 def state_folder() -> Path:
-    """Where this user's programs keep what must outlive them, by the XDG rules."""
+    """Return the folder of persistent state, by the XDG base directory specification."""
     root = Path(os.environ.get("XDG_STATE_HOME", ""))
     if not root.is_absolute():  # the specification says to ignore such a value
         root = Path.home() / ".local" / "state"
@@ -124,7 +126,7 @@ def link_settings(
     stick_hz: float,
     min_battery_percent: float,
 ) -> LinkSettings:
-    """Settings of a link that asks for telemetry at ``state_hz``."""
+    """Return the settings of a link that requests telemetry at ``state_hz``."""
     signing = None
     if config.signing_key_file is not None:
         signing = SigningFiles(key_file=config.signing_key_file, state_folder=state_folder())
@@ -144,7 +146,8 @@ def link_settings(
 
 
 def action_meaning(contract: Contract, config: LinkConfig) -> ActionMeaning:
-    """Meaning of the policy's actions; with ``link.raw_sticks`` its sticks have none."""
+    """Return the meaning of the policy's actions; with ``link.raw_sticks``, sticks without
+    gains."""
     gains = StickGains(
         lean_deg=contract.full_lean_deg,
         yaw_rate_degps=contract.full_yaw_rate_degps,
@@ -163,7 +166,7 @@ def action_meaning(contract: Contract, config: LinkConfig) -> ActionMeaning:
 
 
 def envelope_limits(config: EnvelopeConfig, policy: EnvelopeLimits | None) -> EnvelopeLimits:
-    """Defaults, widened to what the policy needs; a flag that was given has the last word."""
+    """Return the defaults widened to the policy's needs, overridden by the flags."""
     limits = EnvelopeLimits() if policy is None else EnvelopeLimits().widened(policy)
     return replace(
         limits,
@@ -175,7 +178,7 @@ def envelope_limits(config: EnvelopeConfig, policy: EnvelopeLimits | None) -> En
 
 
 def effective_freshness(contract: Contract, limits: Limits) -> FreshnessLimits:
-    """Ages at which a chunk may begin: the flag's where given, else the contract's.
+    """Return the maximum input ages: the flag's if given, else the contract's.
 
     Raises:
         UserError: a flag would loosen a limit of the contract.
@@ -201,9 +204,9 @@ def _tightened_ns(allowed_s: float, what: str, asked_s: float | None) -> int:
 
 
 def contract_with_ages(contract: Contract, limits: Limits) -> Contract:
-    """The contract with the ages that the flags give, also looser ones.
+    """Return the contract with the ages of the flags, which may be looser.
 
-    For simulated flights only, which measure what an age does to a policy.
+    For simulated flights only, which measure the effect of an age on a policy.
     """
 
     def either_s(asked_s: float | None, own_s: float) -> float:

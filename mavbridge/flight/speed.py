@@ -1,4 +1,4 @@
-"""Whether this computer is fast enough for a policy, by figures measured before arming."""
+"""Check, by times measured before arming, that this computer is fast enough for the policy."""
 
 import math
 from typing import NamedTuple
@@ -12,9 +12,10 @@ from policy.errors import warned
 from policy.loading.timing import SolveTimes
 
 CLEARLY = 1.5
-"""A limit is out of reach from this factor on: other programs may have slowed the measurement."""
+"""Factor beyond a limit that counts as out of reach: other programs may have slowed the
+measurement."""
 NEARLY = 1.1
-"""A rate is not reached from this factor on."""
+"""Factor beyond a period that counts as too slow for the rate."""
 FASTER = (
     "Take fewer --num-diffusion-steps, a smaller policy, another network.engine or --device, a "
     "faster "
@@ -24,30 +25,30 @@ FASTER = (
 
 
 class _Age(NamedTuple):
-    """The greatest age that something would reach in flight, and what that may be."""
+    """Greatest age that an input would reach in flight, and its limit."""
 
     what: str
     reached_s: float
     allowed_s: float
     by: str = "contract"
-    """What says so."""
+    """Origin of the limit."""
 
     @property
     def share(self) -> float:
-        """1 = the limit."""
+        """Ratio of age to limit; 1 is the limit."""
         return self.reached_s / self.allowed_s
 
 
 def require_speed(plan: FlightPlan, name: str, times: SolveTimes | None) -> tuple[str, ...]:
-    """Notes about the policy's speed and rates, for the user.
+    """Return notes about the policy's speed and rates, for the user.
 
     Args:
-        plan: of the flight.
-        name: that of the policy.
-        times: of its parts on this computer; None: not measured.
+        plan: plan of the flight.
+        name: name of the policy.
+        times: measured times of its parts on this computer; None: not measured.
 
     Raises:
-        PolicyError: it clearly cannot keep the limits of its own contract; with the figures.
+        PolicyError: the policy clearly cannot keep the limits of its own contract.
     """
     contract, is_dual, loops, rates = plan.contract, plan.is_dual, plan.loops, plan.config.rates
     action_hz, image_hz = loops.action_hz, min((loops.max_vision_hz, *contract.camera_rates_hz))
@@ -92,7 +93,7 @@ def require_speed(plan: FlightPlan, name: str, times: SolveTimes | None) -> tupl
 
 
 def _require_horizon(name: str, contract: Contract, action_hz: float, flag: str) -> None:
-    """Raise PolicyError if a chunk ends before the next one is asked for."""
+    """Raise PolicyError if a chunk ends before the next one is due."""
     horizon_s = contract.horizon * contract.chunk_dt_s
     if horizon_s < (1 - PERIOD_TOLERANCE) / action_hz:
         least_hz = math.ceil(1 / horizon_s - 1e-6)
@@ -112,10 +113,9 @@ def _worst(
     action_hz: float,
     image_hz: float,
 ) -> _Age:
-    """The age that comes nearest to its limit, when the last stick of a chunk leaves.
+    """Return the age that comes nearest to its limit, when the last stick of a chunk leaves.
 
-    That is just before the next one comes. An image is older by the time that its camera takes,
-    which is not known here.
+    That is just before the next chunk. The camera's own latency is unknown here and not included.
     """
     played = limits.while_played(round(contract.play_s * NS_PER_S))
     every_s = max(1 / action_hz, times.act_s)

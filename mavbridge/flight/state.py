@@ -1,4 +1,4 @@
-"""Telemetry -> the state of the contract, or the reason why there is none."""
+"""Build the contract's state from telemetry, or say why it is unavailable."""
 
 import math
 from dataclasses import dataclass, replace
@@ -18,19 +18,19 @@ _READINGS = {"goal": "position", "altitude": "position", "height": "height above
 
 _HALF_SQRT2 = math.sqrt(0.5)
 LEAST_RATE_RADPS = 1e-4
-"""A body that turns at this rate cannot keep its attitude: a hundredth of a gyroscope's noise, and
-more than what is left of a turn where a simulator without noise hovers."""
+"""Body rate that excludes a constant attitude: a hundredth of a gyroscope's noise, and above the
+residual rate of a noise-free simulator at hover."""
 
 
 class Unavailable(NamedTuple):
-    """Returned where there is no state or observation now."""
+    """Returned in place of a state or observation that does not exist now."""
 
     reason: Reason
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Freshness:
-    """Oldest acceptable reading of each kind."""
+    """Maximum age of each kind of reading."""
 
     attitude_ns: int
     """Attitude and body rates."""
@@ -41,9 +41,9 @@ class Freshness:
 def build_state(
     telemetry: Telemetry, now_ns: int, *, frame: StateFrame, freshness: Freshness
 ) -> VehicleState | Unavailable:
-    """Join the newest readings; one that is missing or too old is ``Unavailable``, never a zero.
+    """Join the newest readings into a state in ``frame``, the contract's.
 
-    The state is returned in ``frame``, that of the contract.
+    A missing or stale reading makes the state ``Unavailable``, never a zero.
     """
     attitude, rate = telemetry.ned_from_body_wxyz, telemetry.rate_body_radps
     velocity, force = telemetry.velocity_ned_mps, telemetry.specific_force_body_mps2
@@ -70,10 +70,10 @@ def build_state(
 
 
 class FrozenStateCheck:
-    """Notices a state that goes on arriving and stays the same.
+    """Detects a frozen attitude: states keep arriving, but the attitude stays bit-identical.
 
-    Its attitude has not changed in any bit for longer than the limit, although the body rates say
-    that it turns. A limit of 0 turns the check off.
+    It is a fault after ``max_frozen_ns`` if the body rates say that the vehicle turns; 0 disables
+    the check.
     """
 
     def __init__(self, *, max_frozen_ns: int) -> None:
@@ -82,7 +82,7 @@ class FrozenStateCheck:
         self._changed_ns = 0
 
     def problem(self, state: VehicleState) -> Reason | None:
-        """Reason not to fly by this state, or None; call it with each state, in order."""
+        """Return the reason not to fly by this state, or None. Call with each state, in order."""
         attitude = state.values[3:7].tobytes()
         if attitude != self._attitude:
             self._attitude, self._changed_ns = attitude, state.attitude_ns
@@ -96,15 +96,17 @@ class FrozenStateCheck:
 
 
 class StateReader:
-    """Builds the states of one flight, with the extra inputs that its contract asks for.
+    """Builds the states of one flight, with the optional inputs of its contract.
 
-    Freshness of the extra inputs is that of the velocity: a missing or an old one is a refusal.
+    Optional inputs have the freshness limit of the velocity; a missing or stale one makes the state
+    unavailable.
     """
 
     def __init__(
         self, contract: Contract, *, freshness: Freshness, goal_ned_m: Ned | None = None
     ) -> None:
-        """``goal_ned_m``: from the estimator's origin, for a contract that asks for it."""
+        """``goal_ned_m``: goal relative to the estimator's origin, for a contract that asks for
+        one."""
         self._frame = contract.state_frame
         self._extras = contract.state_extras
         self._freshness = freshness
@@ -113,7 +115,8 @@ class StateReader:
     def read(
         self, telemetry: Telemetry, now_ns: int, *, has_position: bool
     ) -> VehicleState | Unavailable:
-        """The state of now; ``has_position``: the vehicle's position may be trusted."""
+        """Return the state at ``now_ns``. ``has_position``: the vehicle's position may be
+        trusted."""
         state = build_state(telemetry, now_ns, frame=self._frame, freshness=self._freshness)
         if isinstance(state, Unavailable) or not self._extras:
             return state
@@ -132,7 +135,7 @@ class StateReader:
         return replace(state, extras=tuple(numbers), extras_ns=min(stamps_ns))
 
     def past(self, telemetry: Telemetry, *, has_position: bool) -> VehicleState | None:
-        """The state at the arrival of the newest attitude; None if there was none."""
+        """Return the state at the arrival of the newest attitude; None if it is unavailable."""
         attitude = telemetry.ned_from_body_wxyz
         if attitude is None:
             return None
@@ -146,7 +149,7 @@ class StateReader:
         return stale(reading, what, now_ns, self._freshness.velocity_ns)
 
     def _to_goal(self, position_ned_m: tuple[float, ...]) -> list[float]:
-        """From the vehicle to the goal, in the world's axes of the contract."""
+        """Return the vector from the vehicle to the goal, in the contract's world frame."""
         if self._goal_ned_m is None:
             raise ValueError("the contract takes a goal, and the flight has none")
         north, east, down = (
@@ -156,7 +159,7 @@ class StateReader:
 
 
 def stale(reading: Reading | None, quantity: str, now_ns: int, limit_ns: int) -> Unavailable:
-    """Say why a reading is none to fly by."""
+    """Return ``Unavailable`` with the reason for a missing, stale or future reading."""
     if reading is None:
         return Unavailable(because(Code.NO_READING, quantity=quantity))
     if reading.delay_ns < 0:
@@ -190,7 +193,8 @@ def _to_enu_flu(
 
 
 def _unit_positive(q: tuple[float, ...]) -> tuple[float, ...]:
-    """Normalise with w >= 0: q and -q are the same attitude, and nets see only one of them."""
+    """Normalise to w >= 0: q and -q are the same attitude, and networks are trained on one of
+    them."""
     w, x, y, z = q
     norm = math.sqrt(w * w + x * x + y * y + z * z)
     scale = (-1.0 if w < 0 else 1.0) / norm

@@ -1,4 +1,4 @@
-"""The vehicle and the sticks as the flight process knows them, from the guard's messages."""
+"""The vehicle and the sent actions as the flight process knows them, from the guard's messages."""
 
 import logging
 import select
@@ -32,15 +32,15 @@ from mavbridge.guard.wire import (
 
 _log = logging.getLogger(__name__)
 POSITION_NS = NS_PER_S
-"""Oldest position that a tick tells of; nothing is flown by it."""
+"""Oldest position that a tick reports. Nothing is flown by it."""
 MAX_PAST = 4096
-"""Attitudes that wait for a solve: ten seconds of the fastest stream."""
+"""Attitudes queued for the next solve: ten seconds of the fastest stream."""
 MAX_SOLVES = 256
-"""Chunks whose inputs are remembered until the guard reports that it has flown them."""
+"""Chunks whose inputs are kept until the guard reports that it has flown them."""
 
 
 class SolveInputs(NamedTuple):
-    """Inputs and duration of one chunk."""
+    """Inputs and duration of one solve."""
 
     serial: int
     state: VehicleState
@@ -51,9 +51,10 @@ class SolveInputs(NamedTuple):
 
 
 class TelemetryCache:
-    """Telemetry, sent sticks and phase; turns the guard's reports into ticks.
+    """Telemetry, sent actions and phase; turns the guard's reports into ticks.
 
-    One thread calls ``receive``, the policy's one waits for attitudes; simulation does both in one.
+    One thread calls ``receive`` while the policy's thread waits for attitudes; the simulation does
+    both in one thread.
     """
 
     def __init__(
@@ -85,37 +86,37 @@ class TelemetryCache:
         self._freshness = freshness
         self._watch_packets = watch_packets
         self.telemetry = Telemetry()
-        """The newest reading of each quantity."""
+        """Newest reading of each quantity."""
         self._past: deque[Telemetry] | None = deque(maxlen=MAX_PAST) if keeps_past else None
         self._solves: OrderedDict[int, SolveInputs] = OrderedDict()
         self._samples = samples
         self._lock = threading.Lock()
         """Held while samples are read."""
         self._is_awaited = False
-        """The policy's thread waits, and reads the samples."""
+        """True while the policy's thread waits and reads the samples itself."""
         self._serial = 0
         self._texts: list[str] = []
         self.status = GuardStatus("none", None, False, None, (), None)
         self._was_flown = False
-        """The policy moved the sticks at the last tick."""
+        """True if the policy moved the sticks at the last tick."""
         self.phase = Phase.WAITING
         self.reason: Reason | None = None
         self.starting_ns = 0
-        """The policy is to be reset for a flight, as of then; 0: it is not."""
+        """Time from which the policy is to be reset for a flight; 0: no reset is due."""
         self.flights = 0
-        """Number of times that the policy took the sticks."""
+        """Number of times that the policy took control."""
 
     # --- the reader's side
 
     @property
     def height_m(self) -> float | None:
-        """Above the estimator's origin; None without a position."""
+        """Height above the estimator's origin [m]; None without a position."""
         position = self.telemetry.position_ned_m
         return None if position is None else -position.values[2]
 
     @property
     def is_airborne(self) -> bool:
-        """The policy flies, and the vehicle says that it is not landed."""
+        """True if the policy flies and the vehicle reports that it is not landed."""
         return self.phase is Phase.FLYING and self.status.is_landed is False
 
     @property
@@ -124,14 +125,14 @@ class TelemetryCache:
         return _attitude_ns(self.telemetry)
 
     def take_past(self, until_ns: int) -> list[Telemetry]:
-        """Telemetry as it was at each attitude since the last call, up to one that arrived then."""
+        """Return the telemetry at each attitude since the last call, up to arrival ``until_ns``."""
         taken: list[Telemetry] = []
         while self._past and _attitude_ns(self._past[0]) <= until_ns:
             taken.append(self._past.popleft())
         return taken
 
     def wait_for_attitude(self, clock: Clock, *, newer_than_ns: int, timeout_ns: int) -> bool:
-        """Wait for an attitude that arrived after ``newer_than_ns``; False: none came in time."""
+        """Wait for an attitude that arrived after ``newer_than_ns``; return False on timeout."""
         port, until_ns = self._samples, clock.now_ns() + timeout_ns
         assert port is not None
         with self._lock:
@@ -157,12 +158,12 @@ class TelemetryCache:
     # --- the guard's side
 
     def take_texts(self) -> tuple[str, ...]:
-        """Lines for the user that no tick has carried yet."""
+        """Return lines for the user that no tick has carried yet."""
         texts, self._texts = tuple(self._texts), []
         return texts
 
     def receive(self, message: FromGuard) -> None:
-        """Take one message of the guard."""
+        """Handle one message of the guard."""
         match message:
             case Samples(samples):
                 self._receive_samples(samples)
@@ -207,7 +208,7 @@ class TelemetryCache:
         return state if isinstance(state, VehicleState) else None
 
     def _join(self, sent: GuardTick) -> Tick:
-        """The guard's report together with the inputs of the chunk that was flown."""
+        """Join the guard's report with the inputs of the chunk that was flown."""
         solve = None if sent.chunk_serial is None else self._solves.get(sent.chunk_serial)
         state = solve.state if solve else self._state_at(sent.sent_ns)
         position = self.telemetry.position_ned_m

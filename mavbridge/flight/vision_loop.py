@@ -1,4 +1,4 @@
-"""The slow path: newest frame -> encoder -> feature cache, in its own thread."""
+"""Slow path: encode the newest frame into the feature cache, in its own thread."""
 
 import threading
 from collections.abc import Callable
@@ -11,17 +11,16 @@ from mavbridge.core.records import CameraImage, FeatureFrame, FloatArray, Vision
 from mavbridge.flight.feature_cache import FeatureCache
 
 READ_TIMEOUT_NS = 100 * NS_PER_MS
-"""Longest wait for a frame before the stop flag is checked."""
+"""Longest wait for a frame between two checks of the stop flag."""
 MAX_AHEAD_NS = 20 * NS_PER_MS
-"""Most by which a stamp may lie in the future: it would hide so much of the image's age."""
+"""Tolerance for exposure stamps in the future, which would hide that much of the image's age."""
 
 
 class VisionLoop:
-    """Encodes frames as they come, at most at the visual rate, and publishes the result.
+    """Encodes frames as they arrive, at most at the visual rate, and publishes the features.
 
-    It is driven by the camera, not by a grid: a frame is used when it arrives. Frames that come
-    faster than the visual rate are skipped, with a quarter of a period of tolerance for the
-    camera's own jitter.
+    The camera drives the loop, not a grid. Frames that arrive faster than the visual rate are
+    skipped; a quarter of a period is tolerated for camera jitter.
     """
 
     def __init__(
@@ -66,22 +65,23 @@ class VisionLoop:
         self._image_watch = image_watch
         self._is_airborne = is_airborne
         self._used_ns: int | None = None
-        """Slot of the last frame that was used."""
+        """Slot of the last used frame."""
         self._frames = 0
         self.alive_ns = clock.now_ns()
-        """When the last step ended; read by another thread."""
+        """End of the last step; read by another thread."""
         self.encoding_since_ns: int | None = None
-        """When the encoding in progress began; None while waiting for the lock. Read by another
+        """Start of the encoding in progress; None while waiting for the lock. Read by another
         thread."""
 
     def run(self, stop: threading.Event) -> None:
-        """Encode until told to stop; raises CameraError if the camera has died."""
+        """Encode until ``stop`` is set; raise CameraError if the camera has died."""
         while not stop.is_set():
             self.step()
             self.alive_ns = self._clock.now_ns()
 
     def step(self) -> None:
-        """Wait up to ``READ_TIMEOUT_NS`` for one frame, encode and publish it, or CameraError."""
+        """Wait up to ``READ_TIMEOUT_NS`` for one frame; encode and publish it. Raise CameraError as
+        ``run``."""
         frame = self._camera.read(READ_TIMEOUT_NS)
         started_ns = self._clock.now_ns()
         if frame is None:

@@ -1,4 +1,4 @@
-"""The adaptive visual rate: as fast as the scene moves, within what the encoder can sustain."""
+"""Adaptive visual rate: as fast as the scene moves, within what the encoder can sustain."""
 
 import math
 
@@ -9,23 +9,24 @@ from mavbridge.core.records import CameraImage, Event, Tick
 from policy.contract import RATE
 
 FULL_TURN_RADPS = 1.5
-"""Body rate that asks for the highest rate; at 10 Hz it is 9 degrees from frame to frame."""
+"""Body rate that demands the highest rate; at 10 Hz the view turns by 9 degrees per frame."""
 FULL_CHANGE_PER_S = 1.0
-"""Mean change of the pixels, in full scales a second, that asks for the highest rate; the full
-scale of depth is the farthest pixel."""
+"""Mean pixel change [full scales/s] that demands the highest rate. For depth the full scale is the
+farthest pixel."""
 BUDGET = 0.8
-"""Share of one core that the encoder may take."""
+"""Share of one core that the encoder may use."""
 CALM_TAU_S = 0.5
-"""Demand rises at once and falls with this time constant, because motion may resume."""
+"""Time constant of a falling demand. It rises at once and falls slowly, because motion may
+resume."""
 _GRID = 16
-"""The image change is measured on about this many pixels a side."""
+"""Image change is measured on about this many pixels per side."""
 
 
 class AdaptiveRate:
-    """A ``TickSink`` that turns motion into the vision loop's next period.
+    """``TickSink`` that turns motion into the vision loop's next period.
 
-    Turn rate comes with the ticks, image change and encoding time with the vision ticks; the two
-    threads that emit write different fields.
+    Body rates come from ticks; image change and encoding time come from vision ticks. The two
+    emitting threads write different fields.
     """
 
     def __init__(self, *, min_hz: float, max_hz: float) -> None:
@@ -38,11 +39,11 @@ class AdaptiveRate:
 
     @property
     def is_adaptive(self) -> bool:
-        """The limits leave room; otherwise nothing needs to be emitted here."""
+        """True if the limits differ; otherwise no event needs to be emitted here."""
         return self._max_hz > self._min_hz
 
     def emit(self, event: Event) -> None:
-        """Measure the motion that the event shows."""
+        """Measure motion from an event."""
         if isinstance(event, Tick):
             if event.state is not None:
                 self._turn_radps = math.hypot(*event.state.values[RATE].tolist())
@@ -64,12 +65,12 @@ class AdaptiveRate:
 
     @property
     def rate_hz(self) -> float:
-        """Frames a second to encode now, always within the limits."""
+        """Current encoding rate [Hz], within the limits."""
         wanted_hz = self._min_hz + self._demand * (self._max_hz - self._min_hz)
         if self._encode_s > 0:
             wanted_hz = min(wanted_hz, BUDGET / self._encode_s)
         return min(max(wanted_hz, self._min_hz), self._max_hz)
 
     def period_ns(self) -> int:
-        """Time to the next frame to encode."""
+        """Return the time to the next frame to encode."""
         return round(NS_PER_S / self.rate_hz)
