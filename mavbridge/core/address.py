@@ -29,24 +29,25 @@ _KINDS = ("udp", "udpin", "udpout", "tcp", "tcpout")
 _NETWORK = re.compile(rf"(?:({'|'.join(_KINDS)}):)?(//)?{_HOST_PORT}/?", re.ASCII)
 _BRACKETS = "an IPv6 address goes into brackets, as in udp:[::1]:14550; "
 _SERIAL = re.compile(r"(?:serial:(?://)?)?(/dev/[^,]+?|COM\d+)(?:,(.*)|:(\d{4,}))?")
-"""A name may hold colons (/dev/serial/by-path/...): only four digits and more are a rate."""
+"""A device name may hold colons (/dev/serial/by-path/...): only four or more digits are a baud
+rate."""
 
 
 SocketAddress: TypeAlias = tuple[str, int, *tuple[int, ...]]
-"""Host and port as numbers, as the ``socket`` module has them: IPv6 adds flow and scope."""
+"""Numeric host and port, as the ``socket`` module has them; IPv6 adds flow and scope."""
 
 
 class UdpAddress(NamedTuple):
-    """Datagrams from ``host``'s side of the port, or to it."""
+    """UDP address to listen on or to send to."""
 
     host: str
     port: int
     listens: bool
-    """The host is ours; else that of the other side."""
+    """True: ``host`` is a local address. False: it is the peer's."""
 
 
 class TcpAddress(NamedTuple):
-    """A server to connect to."""
+    """TCP server to connect to."""
 
     host: str
     port: int
@@ -63,12 +64,12 @@ LinkAddress: TypeAlias = UdpAddress | TcpAddress | SerialAddress
 
 
 def parse_address(spec: str) -> LinkAddress:
-    """Read the address of ``--connect``; no name is looked up.
+    """Parse the address of ``--connect`` without looking up any name.
 
     A bare HOST:PORT listens, as in pymavlink.
 
     Raises:
-        UserError: it is not understood; the message holds the forms.
+        UserError: the address is not understood; the message lists the accepted forms.
     """
     if (serial := _serial(spec)) is not None:
         return serial
@@ -85,7 +86,7 @@ def parse_address(spec: str) -> LinkAddress:
 
 
 def is_reachable(spec: str) -> bool:
-    """Other computers can send to the address of ``--connect``, or to where it connects."""
+    """Return True if the address of ``--connect`` is not confined to this computer."""
     address = parse_address(spec)
     if isinstance(address, SerialAddress):
         return False
@@ -93,7 +94,7 @@ def is_reachable(spec: str) -> bool:
 
 
 def host_port(text: str) -> tuple[str, int] | None:
-    """Read HOST:PORT, an IPv6 address in brackets; None for anything else."""
+    """Parse HOST:PORT, with an IPv6 address in brackets; return None for anything else."""
     match = re.fullmatch(_HOST_PORT, text, re.ASCII)
     if match is None or not 0 < (port := int(match[3])) < 65536:
         return None
@@ -102,16 +103,16 @@ def host_port(text: str) -> tuple[str, int] | None:
 
 
 def spelled(host: str, port: int, *scope: int) -> str:
-    """Return HOST:PORT as ``host_port`` reads it, also of a ``SocketAddress``."""
+    """Format HOST:PORT as ``host_port`` parses it; takes the items of a ``SocketAddress``, too."""
     zone = f"%{scope[-1]}" if scope and scope[-1] and "%" not in host else ""
     return f"[{host}{zone}]:{port}" if ":" in host else f"{host}:{port}"
 
 
 def resolve(host: str, port: int) -> SocketAddress:
-    """Look a host up, IPv4 first where it has both; once, at the start, as a resolver may block.
+    """Resolve a host, preferring IPv4. Call once at the start: a resolver may block.
 
     Raises:
-        UserError: there is no such host, or no such network card.
+        UserError: the host or network interface does not exist.
     """
     try:
         found = [entry[4] for entry in socket.getaddrinfo(host, port, type=socket.SOCK_DGRAM)]
@@ -122,17 +123,17 @@ def resolve(host: str, port: int) -> SocketAddress:
 
 
 def socket_address(host: str | int, port: int | bytes, *scope: int) -> SocketAddress:
-    """Return the address of which a library or a message holds these parts."""
+    """Return a ``SocketAddress`` of these parts."""
     return (str(host), int(port), *scope)
 
 
 def family(address: SocketAddress) -> socket.AddressFamily:
-    """Return the family of a socket for this address."""
+    """Return the socket family of this address."""
     return socket.AF_INET if len(address) == 2 else socket.AF_INET6
 
 
 def serial_baud(spec: str) -> int | None:
-    """Bits per second of the port that an address names; None: it is not serial."""
+    """Return the baud rate of a serial address; None if it is not serial."""
     serial = _serial(spec)
     return None if serial is None else serial.baud
 
@@ -149,7 +150,7 @@ def _serial(spec: str) -> SerialAddress | None:
 
 
 def _network(spec: str) -> tuple[str, str, int] | None:
-    """Kind (empty where none is given), host and port; None for anything else."""
+    """Return kind (empty if not given), host and port; None for anything else."""
     match = _NETWORK.fullmatch(spec)
     if match is None or not 0 < (port := int(match[5])) < 65536:
         return None

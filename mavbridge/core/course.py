@@ -1,4 +1,4 @@
-"""Gates that stand along a flight, where somebody knows them, and which of them were passed."""
+"""Gates of a known course, and a path's progress through them."""
 
 import math
 from collections.abc import Sequence
@@ -13,20 +13,20 @@ from policy.files import read_json
 
 
 class CourseGate(NamedTuple):
-    """One vertical square opening."""
+    """Vertical square opening."""
 
     center_ned_m: Position
     yaw_rad: float
-    """Heading of the passage: 0 = flown through towards north, + = clockwise."""
+    """Heading of the passage: 0 = flown through northwards, + = clockwise."""
     size_m: float
     """Side of the opening."""
 
 
 class CourseProgress:
-    """Gates that a path has passed: in order, forward, inside the opening.
+    """Counts the gates that a path passes in order, forward and inside the opening.
 
-    A gate that was flown around stays the next one. ``sitl.course.GateCounter`` judges the
-    truth of a simulated vehicle by the same rule; a property holds the two equal.
+    A gate that was flown around remains the next one. ``sitl.course.GateCounter`` applies the same
+    rule to the simulated vehicle's true path; a property test holds the two equal.
     """
 
     def __init__(self, gates: Sequence[CourseGate]) -> None:
@@ -36,12 +36,13 @@ class CourseProgress:
 
     @property
     def is_done(self) -> bool:
-        """There were gates, and all were passed."""
+        """True if there are gates and all were passed."""
         return 0 < len(self._gates) == len(self.passed_ns)
 
     @property
     def speed_mps(self) -> float | None:
-        """Along the straight legs from the first gate to the last one passed; None before two."""
+        """Mean speed along the straight legs from the first to the last gate passed; None before
+        two."""
         passed_ns, passed = self.passed_ns, self._gates[: len(self.passed_ns)]
         if len(passed) < 2 or passed_ns[-1] == passed_ns[0]:
             return None
@@ -49,7 +50,7 @@ class CourseProgress:
         return sum(legs_m) * NS_PER_S / (passed_ns[-1] - passed_ns[0])
 
     def update(self, position: Position | None, at_ns: int) -> None:
-        """Append a position, to which the path is straight; None interrupts the path."""
+        """Extend the path by a straight segment to ``position``; None interrupts it."""
         last = self._last
         if last is not None and position == last[0]:
             return  # told once more: it was there from the first time on
@@ -67,7 +68,7 @@ class CourseProgress:
 
 
 def _crossing(gate: CourseGate, start: Position, end: Position) -> float | None:
-    """Fraction of the segment at which it passes forward through the opening, or None."""
+    """Return the fraction of a segment at which it passes forward through the opening, or None."""
     (ahead_m, right_m, down_m), after = (_offset_m(gate, position) for position in (start, end))
     if not ahead_m < 0.0 <= after[0]:
         return None
@@ -79,20 +80,20 @@ def _crossing(gate: CourseGate, start: Position, end: Position) -> float | None:
 
 
 def _offset_m(gate: CourseGate, position: Position) -> tuple[float, float, float]:
-    """Position from the gate's centre: forward through it, right, down."""
+    """Return the position relative to the gate's centre: forward, right, down."""
     north_m, east_m, down_m = (a - b for a, b in zip(position, gate.center_ned_m, strict=True))
     cos_yaw, sin_yaw = math.cos(gate.yaw_rad), math.sin(gate.yaw_rad)
     return north_m * cos_yaw + east_m * sin_yaw, east_m * cos_yaw - north_m * sin_yaw, down_m
 
 
 def read_gates(path: Path) -> tuple[CourseGate, ...]:
-    """Read gates in the order in which they are flown, from JSON.
+    """Read gates, in flight order, from JSON.
 
-    The file is that of ``python -m sitl course --json``: a list ``gates`` of objects that have
+    The format is that of ``python -m sitl course --json``: a list ``gates`` of objects with
     ``center_ned_m`` (north, east, down from the estimator's origin), ``yaw_rad`` and ``size_m``.
 
     Raises:
-        UserError: the file cannot be read, or is another one.
+        UserError: the file cannot be read or has another format.
     """
     try:
         document: Any = read_json(path)

@@ -18,26 +18,26 @@ __all__ = ["CameraError", "ExitCode", "MavbridgeError", "PeerError", "PolicyErro
 
 
 class ExitCode(IntEnum):
-    """Exit status of the process; a signal before the flight gives 128 + its number, as in shells.
+    """Exit status of the process. A signal before the flight gives 128 + its number, as in shells.
 
     docs/commands.md has the table for users.
     """
 
     DONE = 0
-    """What was asked was done; a flight was flown and ended in order."""
+    """Success; a flight was flown and ended in order."""
     BUG = 1
-    """An error of ours, shown with its traceback; the interpreter's own choice."""
+    """Bug of mavbridge, shown with its traceback; the interpreter's own choice."""
     REFUSED = 2
-    """A flag, a file or a policy that cannot be used; also the parser's of the command line."""
+    """A flag, file or policy cannot be used; also the status of the command line's parser."""
     NOT_FLOWN = 3
-    """The vehicle, the camera or the network did not do its part, or the vehicle never left the
-    ground or was disarmed under the policy."""
+    """The vehicle, camera or network was not usable, or the vehicle never left the ground or was
+    disarmed under the policy."""
     FAULT = 4
     """The policy flew, and a fault ended its flight."""
     DIFFERENT = 5
     """A replay differs from its recording by more than the tolerance."""
     CRASHED = 6
-    """The policy flew without a fault, and the vehicle hit something or was seen to crash."""
+    """The policy flew without a fault, and the vehicle crashed or hit something."""
 
 
 class UserError(MavbridgeError):
@@ -45,7 +45,7 @@ class UserError(MavbridgeError):
 
 
 class PeerError(MavbridgeError):
-    """The other side is absent, wrong or silent."""
+    """The vehicle or server is absent, silent or incompatible."""
 
     exit_code = ExitCode.NOT_FLOWN
 

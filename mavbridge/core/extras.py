@@ -1,4 +1,4 @@
-"""Packages that only a part of mavbridge needs."""
+"""Optional packages."""
 
 import importlib.util
 from collections.abc import Mapping
@@ -7,9 +7,9 @@ from mavbridge.core.errors import UserError
 
 
 def require_packages(what: str, modules: Mapping[str, str]) -> None:
-    """Raise UserError if ``what`` needs something that is not installed.
+    """Raise UserError if ``what`` needs a package that is not installed.
 
-    ``modules``: names to import, each with the name to install it by.
+    ``modules``: import name and install name of each package.
     """
     missing = [name for name in modules if importlib.util.find_spec(name) is None]
     if missing:

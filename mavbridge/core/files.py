@@ -1,4 +1,4 @@
-"""Files that are checked before they are needed, or must survive a loss of power."""
+"""File helpers: early checks of output paths, and durable writes."""
 
 import os
 from collections.abc import Iterator
@@ -9,9 +9,9 @@ from mavbridge.core.errors import UserError
 
 
 def require_writable(path: Path | None, flag: str) -> None:
-    """Raise UserError if the file that a flag names cannot be written; creates its folder.
+    """Raise UserError if the file that a flag names cannot be written; create its folder.
 
-    ``flag`` is named in the message, such as ``--json``. An empty file is not left behind.
+    ``flag``, such as ``--json``, is named in the message. No empty file is left behind.
     """
     if path is None:
         return
@@ -30,9 +30,9 @@ def require_writable(path: Path | None, flag: str) -> None:
 
 @contextmanager
 def empty_folders_removed(*folders: Path | None) -> Iterator[None]:
-    """Remove at the end of the block what was made in it of these folders, and of those above them.
+    """Context manager: remove empty folders created inside the block, these and their parents.
 
-    Only where they are empty: a start that failed leaves nothing behind.
+    A start that failed leaves nothing behind.
     """
     wanted = {each for folder in folders if folder for each in (folder, *folder.parents)}
     missing = [folder for folder in wanted if not folder.exists()]
@@ -45,10 +45,10 @@ def empty_folders_removed(*folders: Path | None) -> Iterator[None]:
 
 
 def write_durably(path: Path, text: str) -> None:
-    """Replace a file at once and on the disk itself, so that a loss of power leaves old or new.
+    """Replace a file atomically and durably: a loss of power leaves the old or the new content.
 
     Raises:
-        OSError: it cannot be written.
+        OSError: the file cannot be written.
     """
     path.parent.mkdir(parents=True, exist_ok=True)
     temporary = path.with_suffix(f".{os.getpid()}")

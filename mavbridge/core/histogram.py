@@ -1,21 +1,22 @@
-"""Durations counted into percentiles, in constant memory."""
+"""Histogram of durations in constant memory."""
 
 from mavbridge.core.clock import NS_PER_MS
 from mavbridge.core.vehicle import Percentiles
 
 _SUB_BITS = 7
-"""128 bins an octave: a bin is at most 1/128 = 0.8 % wide."""
+"""128 bins per octave: a bin is at most 1/128 = 0.8 % wide."""
 _SUB_BINS = 1 << _SUB_BITS
 _LARGEST_NS = (1 << 42) - 1
-"""73 minutes; longer values share the last bin."""
+"""73 minutes. Longer durations share the last bin."""
 _BINS = (43 - _SUB_BITS) * _SUB_BINS
 
 
 class Histogram:
     """Distribution of durations in constant memory: percentiles within 0.4 %, exact extremes.
 
-    Bins are linear within an octave and double in width from one to the next, which takes a shift
-    instead of a logarithm (G. Tene, HdrHistogram). One thread adds; another may read at any time.
+    Bins are linear within an octave and double in width from one octave to the next, so that the
+    index needs a shift and no logarithm (G. Tene, HdrHistogram). One thread adds; another may read
+    at any time.
     """
 
     def __init__(self) -> None:
@@ -25,7 +26,7 @@ class Histogram:
         self.max_ns: int | None = None
 
     def add(self, value_ns: int) -> None:
-        """Count one duration; negative ones fall in the first bin."""
+        """Add a duration; negative ones count in the first bin."""
         clamped = 0 if value_ns < 0 else min(value_ns, _LARGEST_NS)
         shift = clamped.bit_length() - (_SUB_BITS + 1)
         if shift < 0:
@@ -40,9 +41,9 @@ class Histogram:
         self.count += 1
 
     def quantile_ns(self, fraction: float) -> float | None:
-        """Nearest-rank quantile, ``fraction`` in (0, 1]; None if empty.
+        """Return the nearest-rank quantile, ``fraction`` in (0, 1]; None if empty.
 
-        It is the middle of its bin, but never beyond the extremes.
+        The value is the middle of its bin, limited to the exact extremes.
         """
         if self.min_ns is None or self.max_ns is None:
             return None
@@ -58,7 +59,7 @@ class Histogram:
         return self.max_ns
 
     def percentiles_ms(self) -> Percentiles | None:
-        """p50, p99, p99.9 and the exact maximum in milliseconds; None if empty."""
+        """Return p50, p99, p99.9 and the exact maximum [ms]; None if empty."""
         quantiles_ns = (*map(self.quantile_ns, (0.5, 0.99, 0.999)), self.max_ns)
         p50, p99, p999, longest = (round((ns or 0) / NS_PER_MS, 3) for ns in quantiles_ns)
         return Percentiles(p50=p50, p99=p99, p999=p999, max=longest) if self.count else None

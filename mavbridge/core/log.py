@@ -1,7 +1,7 @@
-"""The log of a run, for ``--log-file`` and ``--verbose``: written by a thread of its own.
+"""Log of a run, for ``--log-file`` and ``--verbose``, written by its own thread.
 
-Whoever logs never waits: records go through a bounded queue, and are dropped and counted when it is
-full. The logger SAID takes what the terminal has shown already.
+Logging never blocks: records pass through a bounded queue, and are dropped and counted when it is
+full. The logger SAID takes text that the terminal has already shown.
 """
 
 import logging
@@ -21,18 +21,18 @@ from mavbridge.core.workers import HungError, Worker
 SAID = "mavbridge.said"
 THREAD = "mavbridge-log"
 CAPACITY = 2000
-"""Records that may wait."""
+"""Most queued records."""
 POLL_S = 0.1
 CLOSE_S = 2.0
 OURS = ("mavbridge", "policy")
-"""Loggers whose details are taken; of all others warnings."""
+"""Loggers of which all levels are logged; of all others only warnings."""
 _FORMAT = "%(asctime)s %(levelname)-7s %(name)s: %(message)s"
 
 _log = logging.getLogger(__name__)
 
 
 class _Queue(logging.handlers.QueueHandler):
-    """Takes records from any thread; drops and counts what does not fit."""
+    """Queues records of any thread; drops and counts records that do not fit."""
 
     def __init__(self) -> None:
         self.records: queue.Queue[logging.LogRecord] = queue.Queue(CAPACITY)
@@ -40,13 +40,13 @@ class _Queue(logging.handlers.QueueHandler):
         self.dropped = 0
 
     def prepare(self, record: logging.LogRecord) -> logging.LogRecord:
-        """Format it, without the secrets of addresses in it."""
+        """Format the record, and mask the secrets of addresses in it."""
         prepared: logging.LogRecord = super().prepare(record)
         prepared.msg = prepared.message = without_secrets(str(prepared.msg))
         return prepared
 
     def enqueue(self, record: logging.LogRecord) -> None:
-        """Queue it, or drop and count it."""
+        """Queue the record, or drop and count it."""
         try:
             self.records.put_nowait(record)
         except queue.Full:
@@ -54,19 +54,19 @@ class _Queue(logging.handlers.QueueHandler):
 
 
 class _File(logging.FileHandler):
-    """Raises OSError where it cannot write."""
+    """File handler that raises OSError if it cannot write."""
 
     def handleError(self, record: logging.LogRecord) -> None:  # noqa: N802 - of logging
-        """Let the thread decide; called while the error is handled."""
+        """Re-raise: the log's thread handles the error."""
         del record
         raise
 
 
 class _Terminal(logging.Handler):
-    """Standard error as it is now: a flight redirects it to its screen."""
+    """Writes to the current standard error, which a flight redirects to its screen."""
 
     def emit(self, record: logging.LogRecord) -> None:
-        """Print what has not been shown."""
+        """Print the record unless the terminal has already shown it."""
         if record.name != SAID:
             sys.stderr.write(f"{record.getMessage()}\n")
 
@@ -75,7 +75,7 @@ class _Terminal(logging.Handler):
 def run_log(file: Path | None, *, verbose: bool) -> Iterator[None]:
     """Log to ``file``, and with ``verbose`` show details on the terminal, while the block runs.
 
-    With neither of them nothing is changed: Python's logging shows warnings.
+    Without either, Python's default logging shows warnings.
 
     Raises:
         UserError: the file cannot be written.
@@ -113,7 +113,7 @@ def run_log(file: Path | None, *, verbose: bool) -> Iterator[None]:
 
 
 def is_log_thread() -> bool:
-    """Return whether this is the thread that writes the log: what it prints is logged already."""
+    """Return True in the thread that writes the log: its output is already logged."""
     return threading.current_thread().name == THREAD
 
 
@@ -125,7 +125,7 @@ def _begin() -> None:
 
 
 def _write(source: _Queue, sinks: list[logging.Handler], stop: threading.Event) -> None:
-    """Hand each record to the sinks that take it; a file that cannot be written is left out."""
+    """Pass each record to the handlers of its level; drop a file that cannot be written."""
     while not (stop.is_set() and source.records.empty()):
         try:
             record = source.records.get(timeout=POLL_S)

@@ -1,4 +1,4 @@
-"""Observers behind bounded queues: they may drop events and never delay a loop."""
+"""Observers behind bounded queues: they drop events rather than delay a loop."""
 
 import logging
 import threading
@@ -14,28 +14,28 @@ BATCH_PERIOD_S = 0.1
 """Time between batches. The queue is polled: waking a thread from ``emit`` would cost the loop a
 system call and contention for the interpreter lock."""
 BATCH_EVENTS = 256
-"""Most events of a kind in one batch, so that a backlog is not handled in one long stretch."""
+"""Most events of a kind per batch, so that a backlog is handled in short stretches."""
 
 _log = logging.getLogger(__name__)
 _Item = TypeVar("_Item")
 
 
 class Consumer(Protocol):
-    """The work of an observer; called by the observer's thread alone."""
+    """Work of an observer, called by the observer's thread only."""
 
     def consume(self, batch: Sequence[Observed]) -> None:
         """Handle events: all ticks in order, then all solves, then all vision ticks in order.
 
         Raises:
-            MavbridgeError, OSError: it cannot continue; no further batch will come.
+            MavbridgeError, OSError: the consumer cannot continue; it gets no further batch.
         """
 
     def close(self) -> None:
-        """Finish; called once, after the last batch, also when ``consume`` has raised."""
+        """Finish. Called once, after the last batch, also if ``consume`` has raised."""
 
 
 class BoundedQueue(Generic[_Item]):
-    """A queue with one producer and one consumer, which needs no lock; neither ever waits."""
+    """Lock-free queue of one producer and one consumer. Neither ever waits."""
 
     def __init__(self, capacity: int) -> None:
         if capacity < 1:
@@ -48,7 +48,7 @@ class BoundedQueue(Generic[_Item]):
         return len(self._items)
 
     def put(self, item: _Item, /) -> None:
-        """Add the item; drop and count it if the queue is full."""
+        """Add an item, or drop and count it if the queue is full."""
         if len(self._items) < self._capacity:
             self._items.append(item)
         else:
@@ -79,10 +79,10 @@ class ObserverThread:
         image_capacity: int = 16,
         cameras: int = 1,
     ) -> None:
-        """Start the thread, which alone uses the consumer from here on.
+        """Start the thread. The consumer belongs to it from here on.
 
-        ``capacity`` is the most ticks that may wait, and the most solves; ``image_capacity`` the
-        most vision ticks of each of so many ``cameras``.
+        ``capacity``: most queued ticks, and most queued solves. ``image_capacity``: most queued
+        vision ticks per camera.
         """
         self._name = name
         self._consumer = consumer
@@ -101,7 +101,7 @@ class ObserverThread:
         self._thread.start()
 
     def emit(self, event: Observed) -> None:
-        """Queue the event, or drop and count it; never blocks, never raises."""
+        """Queue the event, or drop and count it. Never blocks, never raises."""
         queue = self._queue_of(event)
         if self._open:
             queue.put(event)
@@ -115,7 +115,7 @@ class ObserverThread:
 
     @property
     def dropped(self) -> int:
-        """Events that the consumer never got, or failed on."""
+        """Number of events that the consumer never got, or failed on."""
         queues = (self._ticks, self._solves, *self._visions)
         dropped = sum(queue.dropped for queue in queues)
         if self._thread.is_alive() and not self._out_of_time.is_set():
@@ -169,6 +169,6 @@ class FanOut:
         self._sinks = tuple(sinks)
 
     def emit(self, event: Event) -> None:
-        """Give the event to every sink, in order."""
+        """Pass the event to every sink, in order."""
         for sink in self._sinks:
             sink.emit(event)

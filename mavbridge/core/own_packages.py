@@ -1,6 +1,6 @@
-"""Whether Python finds our own packages, and not a file of the user's that has their name.
+"""Check that a user's module does not shadow our own packages.
 
-Imports nothing of ours: it is asked before anything else is imported.
+Imports nothing of ours: it runs before anything else is imported.
 """
 
 import importlib.util
@@ -11,18 +11,18 @@ from pathlib import Path
 import mavbridge
 
 SAFE_PATH, OUR_SAFE_PATH = "PYTHONSAFEPATH", "mavbridge"
-"""Variable that keeps the working directory out of Python's search path, with any value, and ours:
-programs of the user's do not get it."""
+"""Variable that keeps the working directory off Python's search path, and our value of it. Programs
+of the user do not inherit ours."""
 OURS = ("policy", "sitl")
-"""Packages beside ``mavbridge`` that anybody's module may be called like."""
+"""Packages beside ``mavbridge`` whose names a user's module may have."""
 _ROOT = Path(__file__).parents[2]
 
 
 def hidden_package(root: Path = _ROOT) -> str | None:
-    """Say which of the packages in ``root``, the folder of ``mavbridge``, something else hides.
+    """Return an error message if another module hides a package in ``root``, else None.
 
-    Python looks first in the current folder (``python -m``), then along PYTHONPATH. Nothing is
-    imported. None: both are ours.
+    ``root`` is the folder of ``mavbridge``. Python searches the working directory first (``python
+    -m``), then PYTHONPATH. Nothing is imported.
     """
     for name in OURS:
         spec = _found(name)
@@ -40,7 +40,7 @@ def hidden_package(root: Path = _ROOT) -> str | None:
 
 
 def _found(name: str) -> ModuleSpec | None:
-    """What ``import`` would find if the working directory were not left out."""
+    """Return what ``import`` would find with the working directory on the search path."""
     path, sys.path = sys.path, [*mavbridge.left_out, *sys.path]
     try:
         return importlib.util.find_spec(name)

@@ -1,4 +1,4 @@
-"""Interfaces of what the loops are connected to."""
+"""Protocols that the control loops depend on."""
 
 from typing import Protocol
 
@@ -6,25 +6,25 @@ from mavbridge.core.records import Event, Frame
 
 
 class Camera(Protocol):
-    """A video source; opened by its constructor, used by one thread."""
+    """Video source, opened by its constructor and used by one thread."""
 
     @property
     def dropped_frames(self) -> int:
-        """Frames that the source delivered and nobody read, since it was opened."""
+        """Number of frames that were delivered and not read, since the source was opened."""
 
     def read(self, timeout_ns: int) -> Frame | None:
-        """Newest frame that was not returned before; None if none comes within the timeout.
+        """Return the newest frame not returned before; None if none arrives within the timeout.
 
         Raises:
-            CameraError: the source has died and will not come back by itself.
+            CameraError: the source has died and will not recover by itself.
         """
 
     def close(self) -> None:
-        """Free the source; joins its thread. May be called twice."""
+        """Free the source and join its thread. May be called twice."""
 
 
 class TickSink(Protocol):
-    """A receiver of ticks; must never block and never raise."""
+    """Receiver of events. Must never block and never raise."""
 
     def emit(self, event: Event) -> None:
         """Take the event, or drop and count it."""

@@ -1,4 +1,4 @@
-"""Child processes: started with a log, waited for with a deadline, ended in every case."""
+"""Child processes: logged, waited for with a deadline, always ended."""
 
 import os
 import socket
@@ -12,13 +12,13 @@ from mavbridge.core.errors import UserError
 from mavbridge.core.own_packages import OUR_SAFE_PATH, SAFE_PATH
 
 IMPORT_ROOT = Path(mavbridge.__file__).parents[1]
-"""The folder that holds this mavbridge: the source tree, or site-packages."""
+"""Folder that holds this mavbridge: the source tree, or site-packages."""
 END_TIMEOUT_S = 10.0
 LOG_LINES_QUOTED = 8
 
 
 def free_port(kind: socket.SocketKind = socket.SOCK_DGRAM) -> int:
-    """A UDP (or, with ``SOCK_STREAM``, TCP) port of the loopback that nobody uses now."""
+    """Return a free UDP (or, with ``SOCK_STREAM``, TCP) port of the loopback interface."""
     with socket.socket(socket.AF_INET, kind) as probe:
         probe.bind(("127.0.0.1", 0))
         port: int = probe.getsockname()[1]
@@ -26,7 +26,7 @@ def free_port(kind: socket.SocketKind = socket.SOCK_DGRAM) -> int:
 
 
 def child_environment() -> dict[str, str]:
-    """Our environment, in which a Python child imports this mavbridge wherever it is started."""
+    """Return an environment in which a Python child imports this mavbridge from any folder."""
     import_path = (str(IMPORT_ROOT), os.environ.get("PYTHONPATH", ""))
     return os.environ | {
         "PYTHONPATH": os.pathsep.join(filter(None, import_path)),
@@ -35,16 +35,16 @@ def child_environment() -> dict[str, str]:
 
 
 def user_environment() -> dict[str, str]:
-    """Our environment as the user has set it, for a program of the user's."""
+    """Return the environment as the user has set it, for programs of the user."""
     is_ours = os.environ.get(SAFE_PATH) == OUR_SAFE_PATH
     return {k: v for k, v in os.environ.items() if not (is_ours and k == SAFE_PATH)}
 
 
 @contextmanager
 def running(*command: str, log: Path) -> Iterator[subprocess.Popen[bytes]]:
-    """Run a process beside the block, its output in ``log``; the block's end ends it.
+    """Context manager: run a process with its output in ``log``; end it with the block.
 
-    A Python child imports this mavbridge, whatever modules the working directory holds.
+    A Python child imports this mavbridge, whatever the working directory holds.
     """
     with log.open("wb") as out:
         process = subprocess.Popen(
@@ -57,7 +57,7 @@ def running(*command: str, log: Path) -> Iterator[subprocess.Popen[bytes]]:
 
 
 def end(process: subprocess.Popen[bytes]) -> None:
-    """Terminate a process, and kill it if it has not ended after ``END_TIMEOUT_S``."""
+    """Terminate a process; kill it if it has not ended after ``END_TIMEOUT_S``."""
     if process.poll() is None:
         process.terminate()
     try:
@@ -68,7 +68,7 @@ def end(process: subprocess.Popen[bytes]) -> None:
 
 
 def wait(process: subprocess.Popen[bytes], name: str, log: Path, timeout_s: float) -> None:
-    """Wait for a process to end; raises UserError with the end of its log if it fails to."""
+    """Wait for a process to end; raise UserError with the end of its log if it fails to."""
     try:
         status = process.wait(timeout_s)
     except subprocess.TimeoutExpired as error:
@@ -78,6 +78,6 @@ def wait(process: subprocess.Popen[bytes], name: str, log: Path, timeout_s: floa
 
 
 def log_tail(log: Path) -> str:
-    """The last lines of a log, for an error message."""
+    """Return the last lines of a log, for an error message."""
     lines = log.read_text(errors="replace").strip().splitlines()
     return "\n".join(lines[-LOG_LINES_QUOTED:]) or "it printed nothing"

@@ -1,4 +1,4 @@
-"""What ran, for records and logs: command line, versions, the revision of the source, digests."""
+"""Provenance for records and logs: command line, versions, source revision, file digests."""
 
 import hashlib
 import platform
@@ -16,34 +16,34 @@ PACKAGES = (
     *("torch", "openvino", "numpy", "opencv-python-headless", "pymavlink", "pyserial"),
     *("rerun-sdk", "safetensors", "pyarrow", "av", "websockets"),
 )
-"""Those that have a part in how a flight goes or in what is recorded."""
+"""Packages that influence a flight or its recording."""
 GIT_TIMEOUT_S = 2.0
 _USER_PASSWORD = re.compile(r"(?<=://)([^/@\s:]*):\S*@")
-"""To the last @ of the word: a password may hold any character, a slash or another @ too."""
+"""Matches up to the last @ of the word: a password may hold any character, / and @ included."""
 _NAMED_SECRET = re.compile(
     r"""((?:pass|passwd|password|pwd|pw|token|secret|key|auth|sig|signature)=)"""
     r"""(?:(?!_[a-z]+=)[^&;/?\#\s"'])+""",
     re.IGNORECASE,
 )
-"""In a query, or in a path as some cameras have it: /user=me_password=it_channel=1."""
+"""Matches in a query, and in a path as some cameras have it: /user=me_password=it_channel=1."""
 
 
 def command_line() -> tuple[str, ...]:
-    """The words of this process's command line, without the passwords in addresses."""
+    """Return the words of this process's command line, with the secrets of addresses masked."""
     return tuple(without_secrets(word) for word in ("mavbridge", *sys.argv[1:]))
 
 
 def without_secrets(text: str) -> str:
-    """Return a text with ``***`` for the passwords and keys of the addresses in it.
+    """Mask passwords and keys of the addresses in a text.
 
-    The one door for terminal, log, errors and records: ``rtsp://me:it@host`` becomes
+    Used for terminal, log, errors and records: ``rtsp://me:it@host`` becomes
     ``rtsp://me:***@host``, ``?token=abc`` becomes ``?token=***``.
     """
     return _NAMED_SECRET.sub(r"\1***", _USER_PASSWORD.sub(r"\1:***@", text))
 
 
 def versions() -> dict[str, str]:
-    """Versions by name: ours, Python's, the system's, and those of the packages that are here."""
+    """Return versions by name: mavbridge, Python, the system, and the installed packages."""
     found = {
         "mavbridge": mavbridge.__version__,
         "python": platform.python_version(),
@@ -58,9 +58,9 @@ def versions() -> dict[str, str]:
 
 
 def git_revision(root: Path = IMPORT_ROOT) -> str | None:
-    """Commit of the checkout that this mavbridge runs from, with ``-dirty`` where files differ.
+    """Return the commit of the checkout that runs, with ``-dirty`` if files differ.
 
-    None where ``root`` is no checkout, such as an installed wheel, or git is missing.
+    None if ``root`` is no checkout, such as an installed wheel, or git is missing.
     """
     if not (root / ".git").exists():
         return None
@@ -80,7 +80,7 @@ def git_revision(root: Path = IMPORT_ROOT) -> str | None:
 
 
 def digests(files: Iterable[Path]) -> dict[str, str]:
-    """SHA-256 of each file by its absolute path; one that cannot be read is left out."""
+    """Return the SHA-256 of each file by its absolute path; unreadable files are left out."""
     found = {}
     for path in files:
         try:

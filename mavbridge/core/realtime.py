@@ -1,4 +1,4 @@
-"""Scheduling and memory of this process and its threads, as far as the system permits."""
+"""Scheduling and memory locking of this process and its threads, as far as the system permits."""
 
 import ctypes
 import gc
@@ -11,21 +11,21 @@ from pathlib import Path
 from mavbridge.core.errors import UserError
 
 SWITCH_INTERVAL_S = 0.0005
-"""Longest time that another Python thread may hold the interpreter while the action loop waits.
-Python's default, 5 ms, is half a period at 100 Hz."""
+"""Longest time that another Python thread may hold the interpreter lock while the policy loop
+waits. Python's default, 5 ms, is half a period at 100 Hz."""
 GUARD_FIFO_PRIORITY = 10
-"""Above every ordinary thread, below the kernel's own."""
+"""Above all ordinary threads, below the kernel's own."""
 ACTION_FIFO_PRIORITY = 5
-"""Below the guard: however long an inference takes, the guard sends on time."""
+"""Below the guard: the guard sends on time, however long an inference takes."""
 OOM_SCORE = 500
-"""As if this process held half of the machine's memory more than it does (oom_score_adj in proc(5),
-of 1000): it is killed before the guard, whose own score stays 0."""
+"""oom_score_adj of the flight process (proc(5), at most 1000): the kernel kills it before the
+guard, whose value stays 0. 500 counts as half of the machine's memory."""
 _MCL_CURRENT, _MCL_FUTURE = 1, 2
-"""From <sys/mman.h>, the same on Linux for x86 and ARM, and on macOS."""
+"""From <sys/mman.h>, equal on Linux for x86 and ARM, and on macOS."""
 
 
 def require_supported_system() -> None:
-    """Raise UserError where a guard cannot outlive the flight process; call first."""
+    """Raise UserError on a system where a guard cannot outlive the flight process. Call first."""
     if platform.system() not in ("Linux", "Darwin"):
         raise UserError(
             f"mavbridge does not fly from {platform.system() or 'this system'}: use Linux (with "
@@ -34,10 +34,10 @@ def require_supported_system() -> None:
 
 
 def settle_process() -> None:
-    """Prepare the interpreter for deadlines; call once everything is built, before the flight.
+    """Prepare the interpreter for deadlines. Call after construction, before the flight.
 
-    Collection stays enabled: it no longer walks through what was built, so its cost is bounded by
-    what a flight itself makes, and a cycle that somebody leaves behind does not grow for hours.
+    Garbage collection stays enabled, so that cycles do not accumulate for hours. Existing objects
+    are frozen, so that a collection only walks those of the flight.
     """
     gc.collect()
     gc.freeze()
@@ -45,10 +45,11 @@ def settle_process() -> None:
 
 
 def prepare_to_die_first() -> None:
-    """Have the kernel kill this process before the guard, and quickly: without a core dump.
+    """Let the kernel kill this process before the guard, and without a core dump.
 
     The guard learns of the death when the kernel closes the channel, which is after any dump.
-    Children inherit both settings, so the guard is started before. What is refused stays as it was.
+    Children inherit both settings, so start the guard before. Settings that the system refuses stay
+    unchanged.
     """
     with suppress(OSError):  # no such file on macOS
         Path("/proc/self/oom_score_adj").write_text(str(OOM_SCORE))
@@ -59,10 +60,10 @@ def prepare_to_die_first() -> None:
 
 
 def settle_guard(*, realtime: bool, cpu: int | None) -> str | None:
-    """Prepare the guard process, which has one thread; call once it is built.
+    """Prepare the guard process, which has one thread. Call after construction.
 
-    Its memory stays in RAM, and ``realtime`` puts it before all ordinary threads; what it starts
-    is ordinary again. Collection stays enabled, as in ``settle_process``.
+    Its memory is locked in RAM, and ``realtime`` schedules it before all ordinary threads; its
+    children are ordinary again. Garbage collection stays enabled, as in ``settle_process``.
 
     Returns:
         What the system refused and how to allow it, or None.
@@ -78,7 +79,7 @@ def settle_guard(*, realtime: bool, cpu: int | None) -> str | None:
 
 
 def settle_thread(*, realtime: bool, cpu: int | None) -> str | None:
-    """Schedule the calling thread of the flight process; returns what was refused, or None."""
+    """Schedule the calling thread of the flight process; return what was refused, or None."""
     if (refusal := _pin("a loop", cpu)) is not None:
         return refusal
     # On a single CPU a slow policy would leave nothing to the thread that watches over it.
@@ -120,10 +121,10 @@ def _use_fifo(priority: int, who: str, *, resets_on_fork: bool) -> str | None:
 
 
 def _lock_memory() -> str | None:
-    """Keep all memory, now and later, in RAM.
+    """Lock all present and future memory in RAM.
 
-    Only where no limit holds for this process: under one, an allocation in flight could fail that
-    succeeds unlocked. Without a limit of its own Linux grants it to CAP_IPC_LOCK alone (mlock(2)).
+    Done only without a limit for this process: under a limit, an allocation in flight could fail.
+    Linux grants unlimited locking to CAP_IPC_LOCK alone unless a limit is set (mlock(2)).
     """
     lacking = "the guard's memory is not locked, so it may wait for the disk"
     if platform.system() != "Linux":

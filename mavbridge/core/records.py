@@ -1,7 +1,7 @@
-"""Values that travel between the parts: frozen, with units and frames in their names.
+"""Values that travel between components: frozen, with units and frames in their names.
 
-Stamps are nanoseconds of the injected clock, taken where the thing happened (exposure, datagram
-arrival). Arrays are read-only once they are published here.
+Stamps are nanoseconds of the injected clock, taken at the source (exposure, datagram arrival).
+Arrays are read-only once they are published here.
 """
 
 from dataclasses import asdict, dataclass, replace
@@ -26,14 +26,14 @@ class Frame:
 
     frame_id: int
     captured_ns: int
-    """Exposure, or failing that, arrival."""
+    """Exposure if the source tells it, else arrival."""
     rgb: CameraImage
     """Read-only."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class FeatureFrame:
-    """An encoded image on its way from the vision loop to the action loop."""
+    """Encoded image, passed from the vision loop to the policy loop."""
 
     frame_id: int
     captured_ns: int
@@ -41,12 +41,12 @@ class FeatureFrame:
     value: FloatArray
     """Dual rate: feature [1, F]. Single rate: preprocessed image [1, 3, H, W]. Read-only."""
     fault: Reason | None = None
-    """Why it must not be acted on, such as a frozen image; None where nothing is wrong with it."""
+    """Why the image must not be acted on, such as a frozen image, or None."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class VehicleState:
-    """The 13-D state of the contract, and when each of its parts was measured."""
+    """The contract's 13-D state, with the time at which each part was measured."""
 
     values: FloatArray
     """[13] float32: velocity m/s, attitude quaternion wxyz, body rates rad/s, specific force m/s^2,
@@ -56,13 +56,13 @@ class VehicleState:
     velocity_ns: int
     specific_force_ns: int
     extras: tuple[float, ...] = ()
-    """The contract's ``state_extras``, as it orders them."""
+    """Optional inputs (``state_extras``), in the contract's order."""
     extras_ns: int | None = None
-    """When the oldest of them was measured; None without any."""
+    """When the oldest optional input was measured; None without any."""
 
 
 class Position(NamedTuple):
-    """A place in metres from an origin, in a frame that the name of the value tells."""
+    """Position in metres from an origin; the field's name tells the frame."""
 
     north: float
     east: float
@@ -71,51 +71,52 @@ class Position(NamedTuple):
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Tick:
-    """One pass of the action loop, complete enough to explain it afterwards."""
+    """One step of the guard, with everything that explains it afterwards."""
 
     serial: int
-    """Number among all ticks of the flight, without gaps: what an observer missed is one."""
+    """Number among all ticks of the flight. A gap is a tick that the observer dropped."""
     index: int
     due_ns: int
     woke_ns: int
     missed_slots: int
-    """Of the stick grid, since the last tick, if the policy moved the sticks at both."""
+    """Missed slots of the stick grid since the last tick, if the policy had control at both
+    ticks."""
     predict_ns: int | None
-    """Duration of the policy's part; None when it did not run."""
+    """Duration of the policy's solve; None if no chunk was flown."""
     sent_ns: int
-    """After the datagram was handed to the kernel."""
+    """Time at which the datagram had been handed to the kernel."""
     feature_frame_id: int | None
     feature_captured_ns: int | None
     state: VehicleState | None
     trace: ActionTrace | None
     sent: Action | None
-    """As sent, after rounding by the message; None when released or read-only."""
+    """The action as sent, rounded by the message; None if released or read-only."""
     release_reason: Reason | None
-    """Why the policy does not fly; None while it does, and where the guard has not said why."""
+    """Why the policy does not fly; None while it does, or if the guard has not said why."""
     mode: str | None
     armed: bool
     rc_channels_us: tuple[int, ...]
     rc_sticks: Sticks | None
     texts: tuple[str, ...] = ()
     is_slot: bool = True
-    """A slot of the stick grid; False: sent between two slots, at once for a new chunk."""
+    """True: sent in a slot of the stick grid. False: sent between two slots, for a new chunk."""
     chunk_serial: int | None = None
-    """Number of the chunk that was flown; None when none was."""
+    """Number of the chunk that was flown; None if none was."""
     chunk_computed_ns: int | None = None
-    """When the policy had finished that chunk."""
+    """End of the solve that made the chunk."""
     is_coasting: bool = False
-    """The chunk was too old to be flown as fresh, and was flown for the grace alone."""
+    """True if the chunk was stale and flown only for the grace period."""
     phase: str | None = None
-    """State of the engagement: a value of ``guard.engagement.Phase``; None in old records."""
+    """Value of ``guard.engagement.Phase``; None in old records."""
     position_ned_m: Position | None = None
-    """From the estimator's origin; None where the vehicle tells none, or none that is fresh."""
+    """Position from the estimator's origin; None if the vehicle reports none or a stale one."""
     decided_ns: int | None = None
-    """The moment that the sticks were decided for: the slot, or when a chunk was seen between two
+    """Time for which the action was computed: the slot, or the arrival of a chunk between two
     slots. None in old records."""
 
     @property
     def activity(self) -> str:
-        """Who has the sticks, as a line for the user."""
+        """One line that tells the user who has control."""
         if self.release_reason is not None:
             return f"{self.holder}: {self.release_reason}"
         if self.trace is None:
@@ -126,16 +127,13 @@ class Tick:
 
     @property
     def stage(self) -> tuple[object, ...]:
-        """Equal for ticks whose ``activity`` differs by figures alone."""
+        """Key that is equal for ticks whose ``activity`` differs by figures alone."""
         reason = None if self.release_reason is None else self.release_reason.key
         return self.holder, reason, self.trace is None, self.sent is None
 
     @property
     def holder(self) -> str:
-        """WAITING for an act, PREPARING after one, NEUTRAL sticks of ours, or RELEASED.
-
-        Only where the policy does not fly.
-        """
+        """WAITING, PREPARING, NEUTRAL or RELEASED; for ticks in which the policy does not fly."""
         if self.phase in ("waiting", "preparing"):
             return self.phase.upper()
         return "NEUTRAL" if self.phase in ("leaving", "holding") else "RELEASED"
@@ -143,39 +141,41 @@ class Tick:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class FlightOutcome:
-    """How the policy flew, from its first action to its last one; None = not known."""
+    """How the policy flew, from its first action to its last. None: not known."""
 
     end: FlightEnd
     reason: Reason | None
-    """The end, as the guard told it; None: not told."""
+    """Reason of the end, as the guard reported it; None: not reported."""
     flown_s: float
     height_m: float | None
-    """Above the estimator's origin, at the policy's last action."""
+    """Height above the estimator's origin at the policy's last action."""
     speed_mps: float | None
-    """At the policy's last action."""
+    """Speed at the policy's last action."""
     mode: str | None
-    """Mode, arming and landing are the vehicle's last word in this run."""
+    """Mode, arming and landing: last report of the vehicle in this run."""
     is_armed: bool
     is_landed: bool | None
     gates_total: int | None
     """None: no course was named."""
     gates_passed: int | None
-    """In order, forward, inside the opening; None also where the vehicle tells no position."""
+    """Gates passed in order, forward and inside the opening; None also if the vehicle reports no
+    position."""
     course_s: float | None
-    """From the first action to the last gate that was passed."""
+    """Time from the first action to the last gate passed."""
     course_speed_mps: float | None
-    """Along the straight legs from the first gate to the last one passed; None before two."""
+    """Mean speed along the straight legs from the first to the last gate passed; None before
+    two."""
     crash: str | None
-    """How it was seen to have hit something, in words; None: no contact was seen or told."""
+    """How the vehicle hit something, in words; None: no contact was seen or reported."""
 
     def to_json(self) -> dict[str, object]:
-        """The outcome for JSON: the reason with its code, kind, figures and sentence."""
+        """Return the outcome for JSON, its reason with code, kind, figures and sentence."""
         reason = None if self.reason is None else reason_to_json(self.reason)
         return asdict(replace(self, reason=None)) | {"reason": reason}
 
     @property
     def success(self) -> bool | None:
-        """False for a flight that failed, True for a whole course; else nobody can say."""
+        """False for a flight that failed, True for a whole course, None if unknown."""
         if self.crash is not None or self.end == "fault":
             return False
         return None if self.gates_passed is None else self.gates_passed == self.gates_total
@@ -183,10 +183,10 @@ class FlightOutcome:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class VisionTick:
-    """One frame through the vision loop."""
+    """One frame's way through the vision loop."""
 
     serial: int
-    """Number among all frames through the loop, without gaps."""
+    """Number among all frames of this camera, without gaps."""
     frame_id: int
     captured_ns: int
     started_ns: int
@@ -194,52 +194,53 @@ class VisionTick:
     dropped_frames: int
     """Frames dropped by the source since it was opened."""
     rgb: CameraImage
-    """What the policy saw, before resizing; read-only."""
+    """Image before resizing; read-only."""
     camera: int = 0
-    """Its place among the cameras of the contract; ``serial`` and all others are of this camera."""
+    """Index of the camera in the contract. All other fields belong to this camera."""
     feature: FloatArray | None = None
-    """What the encoder made of it, read-only: dual rate [1, F], single rate the network's image."""
+    """Encoded image, read-only: feature [1, F] (dual rate) or the network's image (single rate)."""
     fault: Reason | None = None
-    """Why it must not be acted on, such as a frozen image."""
+    """Why the image must not be acted on, such as a frozen image."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Solve:
-    """One call of the policy: what it was given, when, and what it returned; it can be repeated."""
+    """One call of the policy, with its inputs and its result, so that it can be repeated."""
 
     serial: int
-    """That of its chunk, which rises by one."""
+    """Number of its chunk; rises by one."""
     started_ns: int
     computed_ns: int
     reset_ns: int
-    """When the policy was last reset before it, for a flight; 0: when it was loaded."""
+    """Last reset of the policy for a flight; 0: it was reset when it was loaded."""
     state: VehicleState
-    """The newest."""
+    """Newest state."""
     states: FloatArray
-    """[1, *contract.state_shape], as the policy got them. Read-only."""
+    """States as passed to the policy, [1, *contract.state_shape]. Read-only."""
     history: FloatArray
-    """Sticks sent before, [1, history_len, 4]. Read-only."""
+    """Actions sent before, [1, history_len, 4]. Read-only."""
     frame_ids: tuple[tuple[int, ...], ...]
-    """Images whose features it was given, [T][cameras], oldest first, in the contract's order."""
+    """Frame ids of the features, [T][cameras], oldest first, in the contract's order."""
     image_ns: int
-    """Exposure of the oldest among the newest images of all cameras."""
+    """Oldest exposure among the newest images of all cameras."""
     first_ns: int
-    """When the first action acts."""
+    """Time at which the first action acts."""
     step_ns: int
-    """Time from one action to the next."""
+    """Time between two actions."""
     actions: FloatArray
-    """[1, horizon, 4] as the policy returned them, in its own frame, not clipped. Read-only."""
+    """Actions [1, horizon, 4] as the policy returned them, in its own frame, not clipped.
+    Read-only."""
 
 
 Event: TypeAlias = Tick | VisionTick
-"""What the loops report to every observer."""
+"""Events that the loops report to every observer."""
 Observed: TypeAlias = Event | Solve
-"""What the recorder and the viewer take as well."""
+"""Events that the recorder and the viewer take in addition."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class RolloutFrame:
-    """One row of an imagined flight: everything about a frame except its pixels."""
+    """One frame of an imagined flight, without its pixels."""
 
     number: int
     """Frame number in the video."""
@@ -247,16 +248,16 @@ class RolloutFrame:
     frame: int
     """Frame number within its iteration."""
     executed: bool
-    """The next decision was made after it; the others were only looked at."""
+    """True if the next decision was made after this frame; False if it was only looked at."""
     step: int
-    """Steps since the newest frame that was really seen; iterations may overlap."""
+    """Steps since the newest real frame. Iterations may overlap."""
     frame_dt_s: float
     state: FloatArray
-    """[13]"""
+    """State [13]."""
     action: FloatArray
-    """[4], the mean stick of the step before it."""
+    """Action [4], the mean stick of the step before this frame."""
 
     @property
     def time_s(self) -> float:
-        """Time since the newest frame that was really seen."""
+        """Time since the newest real frame [s]."""
         return self.step * self.frame_dt_s

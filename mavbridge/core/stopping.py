@@ -1,4 +1,4 @@
-"""Signals that end a flight in order, however often they are sent, and the end of the process."""
+"""Stop signals of a flight, and a bounded end of the process."""
 
 import os
 import queue
@@ -14,12 +14,12 @@ from mavbridge.core.clock import NS_PER_MS, Clock, MonotonicClock
 from mavbridge.core.workers import Worker
 
 INTERRUPTED = 130
-"""What shells report of a program ended by Ctrl-C."""
+"""Exit status that shells report after Ctrl-C."""
 ONE_REQUEST_NS = 250 * NS_PER_MS
-"""Signals closer than this are one request. A closing terminal sends SIGHUP more than once, and a
-program that runs this one passes on a Ctrl-C which the terminal has sent to both."""
+"""Signals closer together are one request. A closing terminal sends SIGHUP more than once, and a
+parent program may pass on a Ctrl-C that the terminal has sent to both."""
 LAST_WORDS_S = 1.0
-"""Time for a reader of the console to take the last words, before the process ends without."""
+"""Longest wait for the console to take the last output before the process exits."""
 
 
 class StopRequest:
@@ -35,12 +35,12 @@ class StopRequest:
         self._wake: queue.SimpleQueue[None] = queue.SimpleQueue()
         self._newest_ns: int | None = None
         self.signal_number: int | None = None
-        """The first signal that requested it."""
+        """First signal that requested the stop."""
         self.requests = 0
-        """Times it was set; signals within ``ONE_REQUEST_NS`` of one another count once."""
+        """Number of requests; signals within ``ONE_REQUEST_NS`` of one another count once."""
 
     def set(self) -> None:
-        """Request the stop, once more if it was requested before."""
+        """Request the stop, or request it once more."""
         now_ns, newest_ns = self._clock.now_ns(), self._newest_ns
         # From here to the count nothing is called: another handler can interrupt only calls.
         self._newest_ns = now_ns
@@ -49,13 +49,13 @@ class StopRequest:
         self._wake.put(None)
 
     def is_set(self) -> bool:
-        """Return whether the stop was requested."""
+        """Return True if a stop was requested."""
         return self.requests > 0
 
     def wait(self, timeout_s: float, *, requests: int = 1) -> bool:
-        """Wait for so many requests; returns whether they have come.
+        """Wait for a number of requests; return whether they have come.
 
-        It may return before ``timeout_s`` without them: once for each earlier signal.
+        It may return early without them, once for each earlier signal.
         """
         if self.requests < requests:
             with suppress(queue.Empty):
@@ -65,7 +65,7 @@ class StopRequest:
 
 @contextmanager
 def stop_on_signals() -> Iterator[StopRequest]:
-    """Let SIGINT, SIGTERM and SIGHUP request the stop; restores the old handlers afterwards."""
+    """Context manager: SIGINT, SIGTERM and SIGHUP request the stop."""
     stop = StopRequest()
 
     def on_signal(number: int, _frame: FrameType | None) -> None:
@@ -84,10 +84,10 @@ def stop_on_signals() -> Iterator[StopRequest]:
 
 
 def interrupt_once(clock: Clock | None = None) -> None:
-    """Let the first Ctrl-C raise KeyboardInterrupt, and a later one end the process at once.
+    """Let the first Ctrl-C raise KeyboardInterrupt, and a later one exit at once.
 
-    A second KeyboardInterrupt would cut the clean-up of the first short with a traceback. The guard
-    notices the end like any other death of this process.
+    A second KeyboardInterrupt would interrupt the clean-up of the first with a traceback. The guard
+    handles the exit like any other death of this process.
     """
     if signal.getsignal(signal.SIGINT) is not signal.default_int_handler:
         return  # ignored, as shells start programs in the background
@@ -107,11 +107,11 @@ def interrupt_once(clock: Clock | None = None) -> None:
 
 
 def end_process(status: int, say: Callable[[], None] | None = None) -> NoReturn:
-    """End the process with ``status``, after ``say`` has printed, whoever reads the console or not.
+    """Exit with ``status`` after calling ``say``, without blocking on the console.
 
-    An ordinary exit flushes standard output and error, and so waits for ever where another thread
-    is asleep in a write to them or their reader has stalled. Whether they can be flushed is tried
-    for ``LAST_WORDS_S``; if not, the process ends at once, and exit handlers do not run.
+    An ordinary exit flushes standard output and error, and blocks for ever if another thread sleeps
+    in a write to them or their reader has stalled. Here the flush is tried for ``LAST_WORDS_S``; if
+    it does not succeed, the process exits at once, without exit handlers.
     """
 
     def finish(_stop: threading.Event) -> None:

@@ -1,32 +1,32 @@
-"""Readings of a receiver's channels, and the switches among them."""
+"""Radio channel readings, and the switches among them."""
 
 from typing import Literal, TypeAlias
 
 from mavbridge.core.clock import NS_PER_MS
 
 RADIO_US = range(800, 2201)
-"""Readings of a radio. Any other number (0, 65535) is a channel that nobody drives: no reading."""
+"""Readings of a radio. Any other number (0, 65535) is an undriven channel."""
 ON_US, OFF_US = 1800, 1200
-"""ArduPilot's thresholds of a high and of a low switch."""
+"""ArduPilot's thresholds of a high and a low switch."""
 DWELL_NS = 200 * NS_PER_MS
-"""Debounce, as in ArduPilot."""
+"""Debounce time, as in ArduPilot."""
 GAP_NS = 500 * NS_PER_MS
-"""Longest pause between two readings: 10 at 20 Hz, the slowest rate that is asked for."""
+"""Longest gap between two readings: ten periods of 20 Hz, the slowest requested rate."""
 
 Position: TypeAlias = Literal["low", "middle", "high"]
 
 
 class Switch:
-    """A switch, debounced by the arrivals of its readings.
+    """Switch, debounced by the arrival times of its readings.
 
-    Going high is an act only after a rest: a receiver that drops out and comes back moves its
-    channels as a hand would.
+    Going high counts as an act only after a rest: a receiver that drops out and comes back moves
+    its channels as a hand would.
     """
 
     def __init__(self, *, rest_ns: int = DWELL_NS, rests: tuple[Position, ...] = ("low",)) -> None:
-        """``rest_ns``: least time in a position of ``rests`` before the act of going high again.
+        """``rest_ns``: least time in a position of ``rests`` before going high counts again.
 
-        The debounce is enough for one that was never high: no dropout is behind it.
+        The debounce time is enough the first time, when no dropout can have happened.
         """
         self._again_ns, self._rests = rest_ns, rests
         self._rest_ns = DWELL_NS
@@ -34,14 +34,15 @@ class Switch:
         self._since_ns = 0
         self._newest_ns: int | None = None
         self.position: Position | None = None
-        """By the newest reading; None before the first and once the receiver is lost."""
+        """Position of the newest reading; None before the first, and after the receiver was
+        lost."""
         self.is_off = False
-        """It was low, and has not been high for the dwell since."""
+        """True if it was low and has not been high for the dwell time since."""
         self.is_on = False
-        """It was high for the dwell, and has not been low since."""
+        """True if it was high for the dwell time and has not been low since."""
 
     def read(self, value_us: int, arrived_ns: int) -> bool:
-        """Take a reading, or the same one again; True at the act of going high."""
+        """Add a reading; return True if this is the act of going high."""
         if value_us not in RADIO_US:
             return False
         before = self.position
@@ -68,5 +69,5 @@ class Switch:
         return False
 
     def forget(self) -> None:
-        """The receiver is lost: no rest from before counts."""
+        """Forget the position and the rest: the receiver is lost."""
         self.position, self._has_rested, self._rest_ns = None, False, self._again_ns
