@@ -1,1 +1,1 @@
-"""Settings, one module a command: a field is a flag, its docstring the help text."""
+"""Settings of the commands. Each field is a flag; its docstring is the help text."""

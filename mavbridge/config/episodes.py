@@ -14,29 +14,29 @@ from mavbridge.core.errors import UserError
 
 AutopilotKind = Literal["ardupilot", "px4"]
 CourseKind = Literal["easy", "race"]
-"""Family of courses; each has seeds of its own, and in them the same ranges."""
+"""Families of courses, each with its own seeds and the same ranges of them."""
 ConditionsKind = Literal["nominal", "random", "held-out"]
-"""Vehicles, wind and light: the same for every course, drawn as demonstrations do, or with looks
-that no demonstration has."""
+"""Vehicles, wind and light: constant, drawn as in demonstrations, or with looks that no
+demonstration has."""
 
 RACE_COURSE_SEED = 1_000_000_000
-"""Seeds of race courses begin here (`sitl.course.RACE_SEEDS`)."""
+"""First seed of race courses (`sitl.course.RACE_SEEDS`)."""
 
 CHECK_COURSE_SEED = 900_000
-"""Courses from here on are flown during training, and neither learned from nor evaluated."""
+"""First seed of the courses flown during training; never learned from or evaluated on."""
 
 HELD_OUT_COURSE_SEED = 1_000_000
-"""Courses from here on are for evaluation: nothing is ever trained on them."""
+"""First seed of the evaluation's courses; nothing is ever trained on them."""
 
 MAX_EPISODES = 10_000
-"""Most episodes of one evaluation, so that another seed has other courses."""
+"""Most episodes per evaluation, so that different seeds never share courses."""
 
 MAX_EVALUATION_SEED = (RACE_COURSE_SEED - HELD_OUT_COURSE_SEED) // MAX_EPISODES - 1
-"""From the next on, easy courses of an evaluation would be races, some of them trained on."""
+"""Beyond this seed, easy courses would be race courses, some of them trained on."""
 
 
 def first_seed(courses: CourseKind) -> int:
-    """Seed 0 of a family."""
+    """Return the first seed of a family."""
     return RACE_COURSE_SEED if courses == "race" else 0
 
 
@@ -54,12 +54,12 @@ class WorkersConfig:
     must share the folders of files that are read and written. Needs the extra "cluster"."""
 
     def __post_init__(self) -> None:
-        """Refuse numbers of processes that no machine runs."""
+        """Raise UserError for a number of processes that no machine runs."""
         check_range("workers", self.workers, 1, 10_000, "")
 
     @property
     def ray_address(self) -> str | None:
-        """Address as Ray takes it; None = no cluster."""
+        """Address as Ray takes it; None: no cluster."""
         return "auto" if self.ray is True else self.ray or None
 
 
@@ -73,10 +73,11 @@ class EvaluateConfig:
     visual_rate: Annotated[float | str, hidden("rates.visual")] = 30.0
     """Most frames a second through the image encoder (dual rate), or auto[:MIN:MAX]."""
     action_rate: Annotated[float | None, hidden("rates.action")] = None
-    """Most chunks of actions a second (dual rate): by default 100, or 2 for each time that the
-    policy is meant to play a chunk."""
+    """Most chunks of actions a second (dual rate); default: 100, or 2 / play_s for slow
+    policies."""
     rate: Annotated[float | None, hidden("rates.single")] = None
-    """The same in single-rate mode: by default 30, or likewise."""
+    """Most chunks of actions a second (single rate); default: 30, or 2 / play_s for slow
+    policies."""
     episodes: int = 20
     """Courses to fly."""
     max_time: float = 60.0
@@ -115,7 +116,7 @@ class EvaluateConfig:
     """Draw the results here as PNG; needs matplotlib (the extra "bench")."""
 
     def __post_init__(self) -> None:
-        """Refuse values out of range, and contradictions."""
+        """Raise UserError for values out of range, and for contradictions."""
         check_range("episodes", self.episodes, 1, MAX_EPISODES, "")
         check_range("max-time", self.max_time, 1, 3600, "s")
         check_range("vision-delay", self.vision_delay, 0, 5000, "ms")
@@ -134,14 +135,14 @@ class EvaluateConfig:
 
     @property
     def rates(self) -> Rates:
-        """Rates of ``mavbridge fly``."""
+        """Rates as in ``mavbridge fly``."""
         return Rates(visual_rate=self.visual_rate, action_rate=self.action_rate, rate=self.rate)
 
 
 @Parameter(name="*")
 @dataclass(frozen=True, kw_only=True)
 class DemonstrateConfig:
-    """Flights to learn from."""
+    """Demonstrations to learn from."""
 
     out: Path
     """Folder for the flights, each in a folder of its own; finished ones are kept."""
@@ -163,7 +164,7 @@ class DemonstrateConfig:
     workers: WorkersConfig = field(default_factory=WorkersConfig)
 
     def __post_init__(self) -> None:
-        """Refuse what cannot be flown."""
+        """Raise UserError if the expert could not fly so."""
         check_range("episodes", self.episodes, 1, MAX_EPISODES, "")
         check_range("speed", self.speed, 1.5, 14 if self.action == "rates" else 10, "m/s")
         check_range("max-time", self.max_time, 1, 3600, "s")
@@ -171,5 +172,5 @@ class DemonstrateConfig:
 
     @property
     def first_course_seed(self) -> int:
-        """Course of the first flight; neither training nor evaluation flies any of these."""
+        """Course of the first flight. Training and evaluation never fly these courses."""
         return first_seed(self.courses) + self.policy.seed * MAX_EPISODES

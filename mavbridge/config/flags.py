@@ -8,7 +8,7 @@ from mavbridge.core.errors import UserError
 
 
 def check_range(name: str, value: float, low: float, high: float, unit: str) -> None:
-    """Refuse a number outside [low, high], or none at all, naming its flag or its setting."""
+    """Raise UserError, naming the flag or setting, if a number is not within [low, high]."""
     if not (math.isfinite(value) and low <= value <= high):
         limits = f"{low:g} and {high:g} {unit}".rstrip()
         flag = name if "." in name else f"--{name}"
@@ -25,7 +25,7 @@ RARE = Group("Rarely needed", sort_key=9)
 
 
 def section(name: str) -> Parameter:
-    """Make a dataclass a section of ``--config``: its fields are no flags of the help."""
+    """Make a dataclass a section of ``--config``: its fields do not appear in the help."""
 
     def key(field: str) -> str:
         return field.removeprefix("max_").removeprefix("setpoint_").replace("_", "-")
@@ -34,5 +34,5 @@ def section(name: str) -> Parameter:
 
 
 def hidden(key: str) -> Parameter:
-    """Make a field a key of a section of ``--config``, and no flag of the help."""
+    """Make a field a key in a section of ``--config``; it does not appear in the help."""
     return Parameter(name=f"--{key}", negative="", show=False)

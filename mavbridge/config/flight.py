@@ -1,4 +1,4 @@
-"""Settings of ``mavbridge fly``: the vehicle, the camera, the limits."""
+"""Settings of ``mavbridge fly``: vehicle, camera, limits."""
 
 import math
 import re
@@ -24,30 +24,33 @@ _FLOAT32_MAX = 3.4e38
 @section("limits")
 @dataclass(frozen=True, kw_only=True)
 class Limits:
-    """Oldest inputs to act on, and the fastest stick movement."""
+    """Maximum input ages and stick speed."""
 
     max_attitude_age: float | None = None
-    """Oldest attitude and body rates to act on, in seconds; this and the next three are judged as a
-    stick leaves, come from the policy's contract, and can only be tightened."""
+    """Oldest attitude and body rates to act on, in seconds, when a command leaves; default: the
+    policy's contract, which this can only tighten."""
     max_velocity_age: float | None = None
-    """Oldest velocity and acceleration to act on, in seconds."""
+    """Oldest velocity and acceleration to act on, in seconds; default and direction as
+    attitude_age."""
     max_feature_age: float | None = None
-    """Oldest image feature to act on, in seconds since exposure."""
+    """Oldest image to act on, in seconds since exposure; default and direction as attitude_age."""
     max_chunk_age: float | None = None
-    """Longest time to act on one chunk of actions, in seconds since it was computed."""
+    """Oldest chunk of actions to act on, in seconds since it was computed; default and direction as
+    attitude_age."""
     max_stall: float | None = None
-    """Longest time in seconds to fly on along one chunk when no newer one comes."""
+    """Longest time in seconds to fly on along one chunk when no newer one comes; default and
+    direction as attitude_age."""
     max_frozen_state: float = 0.5
-    """Longest time in seconds for which the attitude may stay exactly the same while the vehicle
+    """Longest time in seconds for which the attitude may stay bit-identical while the vehicle
     turns; 0 = no limit."""
     tau: float | None = None
-    """Time constant of the low-pass of actions, in seconds; 0 = off. By default 0.05, of body rates
-    0.01."""
+    """Time constant in seconds of the low-pass filter on actions; 0 = off; default: 0.05, for body
+    rates 0.01."""
     max_slew: float = 8.0
     """Fastest stick movement, in full deflections a second; 0 = no limit."""
 
     def __post_init__(self) -> None:
-        """Refuse values that would switch a limit off by accident."""
+        """Raise UserError for values that would disable a limit by accident."""
         for name, unit, least, largest in (
             ("max_attitude_age", "s", 0.01, 60),
             ("max_velocity_age", "s", 0.01, 60),
@@ -65,7 +68,7 @@ class Limits:
 @section("envelope")
 @dataclass(frozen=True, kw_only=True)
 class EnvelopeConfig:
-    """Where the vehicle may fly; without a flag the wider of the default and the policy's own."""
+    """Flight envelope; default: the wider of ours and the policy's."""
 
     max_tilt: float | None = None
     """Largest tilt, in degrees; by default 60 or what the policy needs; 0 = not watched."""
@@ -79,7 +82,7 @@ class EnvelopeConfig:
     """Lowest charge, in percent; 0 = only what the vehicle itself calls low."""
 
     def __post_init__(self) -> None:
-        """Refuse values that mean something else than a limit."""
+        """Raise UserError for values that are no limits."""
         for name, unit, largest in (
             ("max_tilt", "deg", 180),
             ("max_height", "m", 100_000),
@@ -94,7 +97,7 @@ class EnvelopeConfig:
 @section("setpoints")
 @dataclass(frozen=True, kw_only=True)
 class SetpointLimits:
-    """The most that is asked of the vehicle by setpoints; the autopilot limits few of them."""
+    """Limits of setpoints; the autopilot itself limits few of them."""
 
     setpoint_lean: float = 35.0
     """Largest lean of an attitude, in degrees."""
@@ -112,7 +115,7 @@ class SetpointLimits:
     """Fastest change of a velocity, in m/s^2."""
 
     def __post_init__(self) -> None:
-        """Refuse bounds that no multirotor has."""
+        """Raise UserError for limits that no multirotor has."""
         for name, unit, largest in (
             ("setpoint_lean", "deg", 80),
             ("setpoint_rate", "deg/s", 2000),
@@ -129,7 +132,7 @@ class SetpointLimits:
 @Parameter(name="*", group=VEHICLE)
 @dataclass(frozen=True, kw_only=True)
 class ListenConfig:
-    """A vehicle that is listened to."""
+    """A vehicle to listen to."""
 
     connect: Annotated[str, Parameter(show_default=False)] = ""
     """The vehicle: udp:HOST:PORT (listen), udpout:HOST:PORT, tcp:HOST:PORT, /dev/ttyX,BAUD; or as
@@ -143,7 +146,7 @@ class ListenConfig:
     """Seconds to wait for the vehicle's first heartbeat."""
 
     def __post_init__(self) -> None:
-        """Refuse ids and times that no vehicle has."""
+        """Raise UserError for ids and times that no vehicle has."""
         check_range("link.target_system", self.target_system, 0, 254, "")
         check_range("link.timeout", self.connect_timeout, 0.1, 3600, "s")
 
@@ -170,7 +173,7 @@ class LinkConfig(ListenConfig):
     """Fly in spite of a setting that a flight was refused for."""
 
     def __post_init__(self) -> None:
-        """Refuse ids that MAVLink has no room for, and parameters that cannot be set."""
+        """Raise UserError for ids that MAVLink cannot carry, and parameters that cannot be set."""
         super().__post_init__()
         if self.set_params and self.readonly:
             raise UserError("--readonly sets no parameter: leave out --set")
@@ -178,7 +181,7 @@ class LinkConfig(ListenConfig):
 
     @property
     def set_params(self) -> tuple[tuple[str, float], ...]:
-        """Names and values of ``--set``; UserError if one cannot be read or comes twice."""
+        """Names and values of ``--set``; raises UserError for a malformed or repeated one."""
         read: dict[str, float] = {}
         for text in self.set:
             match = re.fullmatch(r"([A-Za-z0-9_]{1,16})=(.+)", text)
@@ -200,7 +203,7 @@ class LinkConfig(ListenConfig):
 @Parameter(name="*", group=CAMERA)
 @dataclass(frozen=True, kw_only=True)
 class CameraConfig:
-    """Where the images come from."""
+    """Camera of the policy."""
 
     camera: Annotated[tuple[str, ...], Parameter(negative="", show_default=" ".join)] = ("0",)
     """Device index or /dev/videoN, rtsp:// udp:// http:// URL, video file, shm:NAME,
@@ -214,12 +217,12 @@ class CameraConfig:
     """Milliseconds from exposure to arrival here; not for shm:, whose frames carry their own
     stamps."""
     max_frozen_image: Annotated[float, hidden("limits.frozen-image")] = 0.5
-    """Longest time in seconds for which the image may stay the same in flight; 0 = no limit."""
+    """Longest time in seconds for which the image may stay identical in flight; 0 = no limit."""
     max_black_image: Annotated[float, hidden("limits.black-image")] = 0.5
     """Longest time in seconds for which the image may be black or of one colour; 0 = no limit."""
 
     def __post_init__(self) -> None:
-        """Refuse times that no camera has."""
+        """Raise UserError for times that no camera has."""
         check_range("link.camera_timeout", self.camera_timeout, 0.1, 3600, "s")
         check_range("camera-latency", self.camera_latency, 0, 2000, "ms")
         check_range("limits.frozen_image", self.max_frozen_image, 0, 60, "s")
@@ -234,17 +237,18 @@ class CameraConfig:
 
     @property
     def _named(self) -> tuple[tuple[str, str], ...]:
-        """Name and source of each; an empty name where none was given."""
+        """Name and source of each camera; the name is empty if not given."""
         matches = [re.fullmatch(r"(?:([A-Za-z_]\w*)=)?(.*)", text) for text in self.camera]
         return tuple((match[1] or "", match[2]) for match in matches if match)
 
     @property
     def sources(self) -> tuple[str, ...]:
-        """Camera specifications that the flags lead to, in the order in which they were given."""
+        """Sources of the cameras, in the order of the flags."""
         return tuple(source for _, source in self._named)
 
     def sources_of(self, cameras: tuple[str, ...]) -> tuple[str, ...]:
-        """The specification of each camera of a contract; UserError if the names do not match."""
+        """Return the source of each camera of a contract; raise UserError if the names do not
+        match."""
         found = dict(self._named)
         if len(cameras) == 1 and "" in found:
             return (found[""],)
@@ -286,11 +290,11 @@ class FlyConfig:
     engage_on_arm: Annotated[bool, Parameter(group=ENGAGING)] = False
     """Engage when the vehicle is armed for the first time."""
     on_fault: Annotated[OnFault, Parameter(group=ENGAGING)] = "auto"
-    """After a fault of ours, first neutral sticks, then: release, hold (BRAKE, AUTO.LOITER), land
-    or rtl. auto: release to a receiver that works and whose throttle is near the middle, else
-    hold. In the air release does so too; setpoints are not released but hold."""
+    """After a fault of ours, neutral sticks, then: release, hold (BRAKE, AUTO.LOITER), land or rtl.
+    auto: release if the receiver works and its throttle is near the middle, else hold. release: in
+    the air, as auto. Setpoints are held, never released."""
     then: Annotated[OnFault, Parameter(group=ENGAGING)] = "auto"
-    """The same at a normal end, where auto and release land instead of holding."""
+    """The same after a normal end, where auto and release land instead of holding."""
     duration: Annotated[float | None, Parameter(group=ENGAGING)] = None
     """Seconds to fly, from the first action of the policy; by default until Ctrl-C."""
     rerun: Annotated[str, Parameter(group=OUTPUT)] = "off"
@@ -308,7 +312,7 @@ class FlyConfig:
     """Write the timing report here as JSON."""
 
     def __post_init__(self) -> None:
-        """Refuse contradictions."""
+        """Raise UserError for contradictions."""
         if self.duration is not None:
             check_range("duration", self.duration, 0.1, 86400, "s")
         if self.takeoff is not None:
@@ -327,7 +331,7 @@ class FlyConfig:
 
     @property
     def goal_ned_m(self) -> tuple[float, float, float] | None:
-        """Value of ``--goal``; UserError if it is not three numbers."""
+        """Goal of ``--goal``; raises UserError unless it is three numbers."""
         if self.goal is None:
             return None
         try:

@@ -1,7 +1,8 @@
-"""Values that describe the vehicle, its sticks and the link to it; no arrays, so no numpy to load.
+"""Values that describe the vehicle, its sticks and its link. No arrays, so importing needs no
+numpy.
 
-Stamps are nanoseconds of the injected clock, taken where the thing happened (datagram arrival,
-handed to the kernel).
+Stamps are nanoseconds of the injected clock, taken at the source (datagram arrival, handed to the
+kernel).
 """
 
 from dataclasses import dataclass
@@ -14,18 +15,18 @@ Output: TypeAlias = Literal["rc-override", "manual-control", "attitude", "rates"
 """RC_CHANNELS_OVERRIDE (ArduPilot), MANUAL_CONTROL (PX4), SET_ATTITUDE_TARGET with an attitude or
 with body rates, SET_POSITION_TARGET_LOCAL_NED with a velocity."""
 ActionKind: TypeAlias = Literal["sticks", "rates", "attitude", "velocity"]
-"""Meaning of the four numbers of an action; ``Action`` has a class for each."""
+"""Meaning of an action's four numbers; ``Action`` has a class for each."""
 OnFault: TypeAlias = Literal["auto", "release", "hold", "land", "rtl"]
-"""Action that follows the neutral sticks when a flight ends by our own doing."""
+"""What follows the neutral sticks when a flight ends by our own doing."""
 FlightEnd: TypeAlias = Literal[
     "course", "duration", "landed", "operator", "signal", "takeover", "disarmed", "fault"
 ]
-"""How a flight of the policy ended: a planned end, the pilot or the vehicle, a fault of ours."""
+"""How the policy's flight ended: planned, by the pilot or the vehicle, or by a fault of ours."""
 
 Risk: TypeAlias = Literal[
     "endless-override", "no-throttle-failsafe", "long-setpoint", "slow-serial"
 ]
-"""A setting of the vehicle or of the link with which a flight is begun only if it is accepted."""
+"""Settings of vehicle or link with which a flight begins only if the user accepts the risk."""
 
 
 class Sticks(NamedTuple):
@@ -82,18 +83,16 @@ ACTION_CLASSES: dict[ActionKind, type[Action]] = {
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class StickGains:
-    """Vehicle motion at full stick, and the stick's travel that does nothing.
-
-    Linear in between. The defaults are ArduCopter's own.
-    """
+    """Vehicle motion at full stick, and dead zones; linear in between. The defaults are
+    ArduCopter's."""
 
     lean_deg: float = 30.0
-    """Roll or pitch."""
+    """Roll and pitch."""
     yaw_rate_degps: float = 202.5
     climb_mps: float = 2.5
     descent_mps: float = 2.5
     lean_dead_zone: float = 0.04
-    """Share of the travel to each side of the centre; also in the next two."""
+    """Dead zone as a share of the travel to each side of the centre."""
     yaw_dead_zone: float = 0.04
     throttle_dead_zone: float = 0.2
 
@@ -104,28 +103,28 @@ class ActionMeaning:
 
     kind: ActionKind = "sticks"
     stick_gains: StickGains | None = None
-    """What full stick was in training; None: sticks go to the vehicle as they are."""
+    """Motion at full stick in training; None: send the sticks unchanged."""
     hover_thrust: float = 0.39
-    """Thrust that hovers, in training: for rates and attitude."""
+    """Hover thrust in training, for rates and attitude."""
     is_heading_frame: bool = False
-    """Velocities are forward, right, down, and not north, east, down."""
+    """True: velocities are forward, right, down. False: north, east, down."""
 
 
 NEUTRAL = Sticks(throttle=0.0, yaw=0.0, pitch=0.0, roll=0.0)
 IDLE = Sticks(throttle=-1.0, yaw=0.0, pitch=0.0, roll=0.0)
-"""Throttle at the bottom, the rest centred: what arming demands."""
+"""Throttle at the bottom, the rest centred, as arming demands."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Command:
-    """Have the vehicle do this until the next command."""
+    """Action to hold until the next command."""
 
     action: Action
 
 
 @dataclass(frozen=True, slots=True)
 class Release:
-    """Do not touch the sticks: they belong to the pilot. ``reason`` is shown to the user."""
+    """Leave the sticks to the pilot. ``reason`` is shown to the user."""
 
     reason: Reason
 
@@ -134,39 +133,40 @@ Decision: TypeAlias = Command | Release
 
 
 class Reading(NamedTuple):
-    """One measurement of the vehicle as it came in."""
+    """One measurement of the vehicle."""
 
     arrived_ns: int
     values: tuple[float, ...]
     delay_ns: int = 0
-    """From the measured moment to the arrival, by the vehicle's own stamp; 0 = not known, negative
-    = stamped in the future, so that the age is not known either."""
+    """Time from measurement to arrival, by the vehicle's stamp; 0: unknown. Negative: stamped in
+    the future, so that the age is unknown, too."""
 
     @property
     def happened_ns(self) -> int:
-        """The measured moment, from which its age counts."""
+        """Time of the measurement, from which its age counts."""
         return self.arrived_ns - self.delay_ns
 
     def is_fresh(self, now_ns: int, limit_ns: int) -> bool:
-        """True if it is known to be at most ``limit_ns`` old."""
+        """True if the reading is known to be at most ``limit_ns`` old."""
         return self.delay_ns >= 0 and now_ns - self.happened_ns <= limit_ns
 
 
 class Telemetry(NamedTuple):
-    """Newest reading of each quantity, in MAVLink's frames (NED world, FRD body); None = never."""
+    """Newest reading of each quantity, in MAVLink's frames (NED world, FRD body); None: none
+    yet."""
 
     ned_from_body_wxyz: Reading | None = None
     rate_body_radps: Reading | None = None
     velocity_ned_mps: Reading | None = None
     specific_force_body_mps2: Reading | None = None
     position_ned_m: Reading | None = None
-    """From the estimator's origin."""
+    """Position from the estimator's origin."""
     height_above_home_m: Reading | None = None
-    """One number; comes only where a policy takes it."""
+    """One number; requested only if the policy takes it."""
 
 
 class Sample(NamedTuple):
-    """One reading on its way from the guard to the flight process."""
+    """One reading, passed from the guard to the flight process."""
 
     quantity: str
     """Field of ``Telemetry``."""
@@ -175,100 +175,101 @@ class Sample(NamedTuple):
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class VehicleStatus:
-    """The vehicle's state as its heartbeat and RC_CHANNELS report it."""
+    """The vehicle's state as HEARTBEAT, RC_CHANNELS and others report it."""
 
     mode: str
     armed: bool
     mode_arrived_ns: int | None = None
-    """Arrival of the newest message that tells the mode."""
+    """Arrival of the newest message that reports the mode."""
     rc_sticks: Sticks | None = None
     """Sticks that the vehicle acts on (RC_CHANNELS through its calibration)."""
     rc_channels_us: tuple[int, ...] = ()
-    """Readings of the receiver's channels, 0 where there is none; empty when they are old."""
+    """Radio channels, 0 if undriven; empty if stale."""
     channels_arrived_ns: int | None = None
-    """Arrival of these."""
+    """Arrival of ``rc_channels_us``."""
     rc_arrived_ns: int | None = None
     is_failsafe: bool = False
-    """HEARTBEAT.system_status is critical or worse: a failsafe of the vehicle is active."""
+    """A failsafe is active: HEARTBEAT.system_status is critical or worse."""
     is_landed: bool | None = None
-    """None = the vehicle does not say."""
+    """None: the vehicle does not report it."""
     has_receiver: bool | None = None
-    """A radio receiver delivers the pilot's sticks, as seen before our first override; None = not
-    known, or we sent sticks before it could be seen."""
+    """True if a radio receiver delivers the pilot's sticks, as seen before our first override;
+    None: not known, or we sent sticks before it could be seen."""
     is_receiver_sick: bool = False
-    """SYS_STATUS says now that the receiver does not work."""
+    """SYS_STATUS reports that the receiver does not work."""
     pilot_sticks: Sticks | None = None
-    """The receiver's sticks as last seen while we sent none."""
+    """The receiver's sticks when we last sent none."""
     position_ned_m: tuple[float, float, float] | None = None
-    """From the estimator's origin; None without a valid, fresh position."""
+    """Position from the estimator's origin; None without a valid, fresh position."""
     is_position_valid: bool | None = None
-    """The estimator's own verdict on its horizontal position; None = it does not say."""
+    """The estimator's own verdict on its horizontal position; None: not reported."""
     battery_problem: str | None = None
-    """The vehicle reports its battery as low or failed, in words for the user."""
+    """Why the vehicle reports its battery as low or failed, in words; None: it does not."""
     stick_override_ns: int | None = None
-    """When it last said that moving sticks have changed its mode."""
+    """When it last reported that moving sticks have changed its mode."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ModeRoles:
-    """Flight modes of one firmware by name, and what each is good for."""
+    """Flight modes of one firmware by name, and their properties."""
 
     names: tuple[str, ...] = ()
-    """All that can be asked for."""
+    """Modes that can be requested."""
     hold: str = ""
-    """Holds the position whatever the sticks say; empty where there is none, also in the next two.
-    """
+    """Mode that holds the position whatever the sticks say; empty: the firmware has none."""
     land: str = ""
     rtl: str = ""
     takeoff: tuple[str, ...] = ()
-    """The mode to arm in for a takeoff by the autopilot's own means, then those it goes through."""
+    """Mode to arm in for an autonomous takeoff, then the modes that the takeoff passes through."""
     thrust: tuple[str, ...] = ()
-    """The throttle stick is thrust in them, or centred sticks do not level."""
+    """Modes in which the throttle stick is thrust, or centred sticks do not level."""
     setpoint: tuple[str, ...] = ()
-    """They follow setpoints, and the sticks do nothing."""
+    """Modes that follow setpoints and ignore the sticks."""
     needs_setpoints_first: bool = False
-    """A mode of ``setpoint`` is entered only while setpoints flow already."""
+    """True if a mode of ``setpoint`` can be entered only while setpoints are already flowing."""
     is_silence_failsafe: bool = False
-    """Sticks that end are a failsafe, even where a receiver has the next ones."""
+    """True if the end of our sticks is a failsafe even with a working receiver."""
     override: str = ""
-    """Entered from a mode that flies by itself when the vehicle takes moving sticks for the pilot's
-    hand; empty: it never does."""
+    """Mode that an autonomous mode gives way to when sticks move as by a pilot's hand; empty:
+    none."""
     needs_sticks_first: bool = False
-    """A mode that sticks fly is refused while the vehicle has none."""
+    """True if modes flown by sticks are refused while the vehicle receives none."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class LinkSnapshot:
-    """Everything that the link knows at one tick."""
+    """Everything that the link knows at one step."""
 
     telemetry: Telemetry
     samples: tuple[Sample, ...] = ()
     """Readings since the last snapshot, in order of arrival."""
     packets: tuple["ForwardedPacket", ...] = ()
-    """Packets of the vehicle since the last snapshot, where the link keeps them."""
+    """Packets of the vehicle since the last snapshot, if the link keeps them."""
     status: VehicleStatus | None
     problem: Reason | None
-    """Why sticks may not be sent (no heartbeat, handshake, override switch, no echo), or None."""
+    """Why actions must not be sent (no heartbeat, handshake, override switch, no echo), or None."""
     is_overruled: bool = False
-    """The vehicle does not act on the sticks that we send: somebody else holds them."""
+    """The vehicle acts on other sticks than ours: another source has control."""
     is_switched_off: bool = False
     """The pilot holds the switch that forbids overrides (RCn_OPTION 46) low."""
     echo_confirmed: bool = False
-    """The vehicle was seen to act on our sticks, or its output has no echo to check."""
+    """The vehicle has shown that it acts on our sticks, or the output has no echo to check."""
     is_released: bool = True
-    """The vehicle was seen to act on other sticks than ours since the release, or none was sent."""
+    """The vehicle has shown other sticks than ours since the release, or none was sent."""
     shows_last: bool = True
-    """Since the release it shows our last sticks, or others that cannot be told from them."""
+    """Since the release the vehicle shows our last sticks, or sticks indistinguishable from
+    them."""
     are_sticks_at_rest: bool = True
-    """Our last sticks have moved so little for so long that they pass for nobody's hand."""
+    """Our last sticks have moved so little, for so long, that they do not count as a pilot's
+    hand."""
     interruption: Reason | None = None
-    """Why every engagement so far is over, or None: the vehicle has rebooted, or now sends from
-    another address. Stays as it is once it has happened."""
+    """Why all engagements so far are over, or None: the vehicle has rebooted or changed its
+    address. Stays set."""
     interruptions: int = 0
     """Number of interruptions so far."""
     modes: ModeRoles = ModeRoles()
     refused_mode: str | None = None
-    """Mode that the vehicle has just refused to enter, or None."""
+    """Mode that the vehicle has just refused, or None."""
     texts: tuple[str, ...] = ()
     """Status texts of the vehicle and warnings of the link since the last snapshot."""
 
@@ -277,13 +278,13 @@ _VEHICLE_SAYS = "vehicle: "
 
 
 class VehicleText(str):
-    """A status text of the vehicle, among those of the link; shown with that word in front."""
+    """Status text of the vehicle; shown with the prefix "vehicle: "."""
 
     __slots__ = ()
 
     @property
     def said(self) -> str:
-        """The text without the word in front."""
+        """The text without its prefix."""
         return self[len(_VEHICLE_SAYS) :]
 
 
@@ -293,24 +294,24 @@ def said_by_vehicle(text: str) -> VehicleText:
 
 
 def recorded_text(text: str) -> str:
-    """Return a text of a recording, or of another process, as what it was in the link."""
+    """Restore a text from a recording or another process."""
     return VehicleText(text) if text.startswith(_VEHICLE_SAYS) else text
 
 
 class Outlet(NamedTuple):
-    """Where packets to the vehicle leave, for a process that may send in place of the guard."""
+    """Where packets to the vehicle leave, for a process that sends in place of the guard."""
 
     opened: int
-    """Number of times that the link was opened: another number is another socket or port."""
+    """Number of times that the link was opened: a new number is a new socket or port."""
     fd: int | None
-    """None while it is closed."""
+    """File descriptor; None while the link is closed."""
     receiver: SocketAddress | None
     """Address for datagrams; None on a stream."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ActionTrace:
-    """One action on its way from the policy to the wire."""
+    """One action's way from the policy to the wire."""
 
     raw: Action
     clipped: Action
@@ -319,25 +320,25 @@ class ActionTrace:
 
 
 class Packet(NamedTuple):
-    """One MAVLink packet as it came or left."""
+    """One received or sent MAVLink packet."""
 
     stamp_ns: int
-    """Arrival, or handed to the kernel."""
+    """Arrival, or time at which it was handed to the kernel."""
     data: bytes
 
 
 class ForwardedPacket(NamedTuple):
-    """One packet of the vehicle, with all that a later reader needs to tell its age."""
+    """One packet of the vehicle, with what a later reader needs to compute its age."""
 
     arrived_ns: int
     happened_ns: int
-    """The moment that it tells about, by the vehicle's own stamp; else its arrival."""
+    """Time that the packet describes, by the vehicle's stamp if it has one, else its arrival."""
     data: bytes
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Percentiles:
-    """Distribution of a measured quantity; the unit is in the name of what holds it."""
+    """Distribution of a measured quantity. The name of the field that holds it tells the unit."""
 
     p50: float
     p99: float
@@ -347,29 +348,29 @@ class Percentiles:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class LinkStats:
-    """Counters of the link over one flight; None = not measured."""
+    """Counters of the link over one flight; None: not measured."""
 
     messages_per_s: tuple[tuple[str, float], ...]
     """Mean arrival rate by MAVLink message name."""
     lost_fraction: float | None
     rtt_ms: Percentiles | None
-    """Round trips of our own TIMESYNC requests."""
+    """Round trips of our TIMESYNC requests."""
     sent_overrides: int
-    """Stick messages handed to the kernel; releases not counted."""
+    """Stick messages handed to the kernel, releases not counted."""
     echo_confirmed: bool | None
-    """The vehicle showed our sticks in RC_CHANNELS; None = no stick was sent."""
+    """The vehicle showed our sticks in RC_CHANNELS; None: no stick was sent."""
     unusable_packets: int = 0
-    """Corrupt, cut off, or holding NaN."""
+    """Packets that were corrupt, truncated or contained NaN."""
     refused_signatures: int = 0
-    """Packets without a signature, with a wrong or a replayed one, where signing is on."""
+    """With signing: packets without a signature, or with a wrong or replayed one."""
     vehicle_clock_offset_ns: int | None = None
-    """Vehicle's clock minus ours, by TIMESYNC: joins our stamps with the vehicle's log."""
+    """Vehicle's clock minus ours, by TIMESYNC: relates our stamps to the vehicle's log."""
     is_timesync_good: bool = False
-    """Ages count from the vehicle's own stamps; False = from arrival, which hides delay."""
+    """True: ages count from the vehicle's stamps. False: from arrival, which hides latency."""
     slow_clock: str | None = None
-    """How far behind real time the vehicle's clock falls; None where it does not."""
+    """By how much the vehicle's clock lags real time, in words; None: it does not."""
     saturated: tuple[tuple[str, float], ...] = ()
-    """Share of the stick messages in which a stick of the policy meant more than the vehicle can
-    do, by stick; those at 0 are left out."""
+    """By stick, share of the messages in which the policy asked for more than the vehicle can do;
+    zeros left out."""
     timesync_error_ms: float | None = None
-    """The most by which the offset of the clocks, and so every age, may be wrong."""
+    """Upper bound of the error of the clocks' offset, and so of every age."""
