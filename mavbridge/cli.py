@@ -7,7 +7,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Annotated
 
-from cyclopts import App, CycloptsError, Parameter, UnusedCliTokensError
+from cyclopts import App, CycloptsError, Group, Parameter, UnusedCliTokensError
 from rich.text import Text
 
 import mavbridge
@@ -41,12 +41,18 @@ from policy.adapters.websocket.kind import require_packages
 from policy.files import read_toml, user_path
 from policy.training.settings import RunSettings, TrainSettings, WorldModelSettings
 
-HELP = """Fly an ArduPilot or PX4 vehicle with a vision policy.
+HELP = """Fly an ArduPilot or PX4 vehicle with a vision policy. How to start:
 
-mavbridge --connect udp:127.0.0.1:14550 --camera 0 --checkpoint my.safetensors
+mavbridge check --connect udp:127.0.0.1:14550 --camera 0 --policy ./my_policy.py:MyPolicy
 
-mavbridge --connect /dev/ttyACM0,921600 --policy my_module:MyPolicy --readonly
+mavbridge --connect udp:127.0.0.1:14550 --camera 0 --policy ./my_policy.py:MyPolicy --arm
+
+`mavbridge fly --help` lists the flags of a flight; `fly` itself may be left out.
 """
+FLYING = Group("Fly", sort_key=1)
+LEARNING = Group("Learn", sort_key=2)
+CONVERTING = Group("Convert and serve policies", sort_key=3)
+REVIEWING = Group("Review flights", sort_key=4)
 
 EXIT_CODES = """Exit status: 0 done, and a flight flown and ended in order; 1 a bug of mavbridge;
 2 a flag, file or policy that cannot be used; 3 no flight: vehicle, camera or network absent, never
@@ -71,15 +77,14 @@ def _as_ours(error: CycloptsError) -> Text:
 cli = App(
     name="mavbridge",
     help=HELP,
-    help_epilogue=EXIT_CODES,
     version=mavbridge.__version__,
     default_parameter=Parameter(show_default=_shown_default),
     error_formatter=_as_ours,
 )
-cli.register_install_completion_command(
-    help="Complete commands and flags in this shell (bash, zsh, fish), from its next start on."
-)
+cli.register_install_completion_command(help="Install completion for this shell (bash, zsh, fish).")
 cli.meta.error_formatter = _as_ours
+for _flag in ("--help", "--version", "--install-completion"):
+    cli[_flag].group = RARE
 
 
 def _require_vehicle(connect: str) -> None:
@@ -88,10 +93,9 @@ def _require_vehicle(connect: str) -> None:
     require_supported_system()
 
 
-@cli.command(name="fly")
-@cli.default
+@cli.command(group=FLYING, help_epilogue=EXIT_CODES)
 def fly(config: FlyConfig | None = None) -> int:
-    """Fly; the default command. The policy gets the sticks by an explicit act, such as --arm."""
+    """Fly. The policy gets control by an explicit act only, such as --arm."""
     config = config or FlyConfig()
     _require_vehicle(config.link.connect)
     from mavbridge.flight.app import fly as run_flight
@@ -99,10 +103,17 @@ def fly(config: FlyConfig | None = None) -> int:
     return run_flight(config)
 
 
-@cli.command
+@cli.default
+def _fly_by_default(config: Annotated[FlyConfig | None, Parameter(show=False)] = None) -> int:
+    return fly(config)
+
+
+@cli.command(group=FLYING)
 def check(config: CheckConfig | None = None) -> int:
-    """Say whether a flight could begin: give it the flags of the flight. --connect none, --policy
-    none and --camera none leave those out. Exit status: 0 go, 3 no-go."""
+    """Check whether a flight could begin, and say why not. Takes the flags of the flight.
+
+    --connect none, --policy none and --camera none leave those out. Exit status: 0 go, 3 no-go.
+    """
     config = config or CheckConfig()
     _require_vehicle(config.flight.link.connect)
     from mavbridge.commands.check.run import check as run_check
@@ -110,9 +121,9 @@ def check(config: CheckConfig | None = None) -> int:
     return run_check(config)
 
 
-@cli.command
+@cli.command(group=FLYING)
 def identify(config: IdentifyConfig | None = None) -> int:
-    """Fly steps on each axis, and compare the vehicle's gains and lags with a policy's training."""
+    """Compare the vehicle's gains and lags with those of a policy's training."""
     config = config or IdentifyConfig()
     _require_vehicle(config.flight.link.connect)
     from mavbridge.commands.identify import identify as run_identification
@@ -120,9 +131,9 @@ def identify(config: IdentifyConfig | None = None) -> int:
     return run_identification(config)
 
 
-@cli.command
+@cli.command(group=LEARNING)
 def record(config: RecordConfig) -> int:
-    """Record a human pilot's flights, to learn from; nothing is sent but requests."""
+    """Record a human pilot's flights to learn from."""
     _require_vehicle(config.vehicle.connect)
     require_extra("record")
     from mavbridge.commands.record.run import record as run_recording
@@ -130,9 +141,11 @@ def record(config: RecordConfig) -> int:
     return run_recording(config)
 
 
-@cli.command
+@cli.command(group=REVIEWING)
 def replay(flight: Path, config: ReplayConfig | None = None) -> int:
-    """Compute a recorded flight once more, and compare the sticks; exit status 5: they differ.
+    """Compute a recorded flight again, and compare the sticks.
+
+    Exit status 5: they differ.
 
     Args:
         flight: folder of a flight, as --record makes it.
@@ -144,9 +157,9 @@ def replay(flight: Path, config: ReplayConfig | None = None) -> int:
     return run_replay(flight, ReplayConfig() if config is None else config)
 
 
-@cli.command
+@cli.command(group=REVIEWING)
 def inspect(*flights: Path, config: InspectConfig | None = None) -> int:
-    """Report on a recorded flight, or compare two: rates, delays and their causes, who flew when.
+    """Report on a recorded flight, or compare two: rates, latency, releases.
 
     Args:
         flights: one or two flight folders, as --record makes them.
@@ -158,18 +171,18 @@ def inspect(*flights: Path, config: InspectConfig | None = None) -> int:
     return run_inspection(flights, config or InspectConfig())
 
 
-@cli.command
+@cli.command(group=CONVERTING)
 def serve(config: ServeConfig | None = None) -> int:
-    """Serve a policy for flights on other computers, which name it --policy ws://HOST:PORT."""
+    """Serve a policy to other computers, for --policy ws://HOST:PORT."""
     require_packages("serve")
     from mavbridge.commands.serve import serve as run_server
 
     return run_server(ServeConfig() if config is None else config)
 
 
-@cli.command
+@cli.command(group=LEARNING)
 def imagine(config: ImagineConfig) -> int:
-    """Let a policy and a world model imagine a flight, from the start of a recorded one."""
+    """Imagine a flight by a policy and a world model."""
     require_extra("imagine")
     from mavbridge.commands.imagine.run import imagine as run_rollout
 
@@ -189,17 +202,17 @@ def _needs_simulator(command: str) -> Iterator[None]:
         ) from error
 
 
-@cli.command
+@cli.command(group=LEARNING)
 def evaluate(config: EvaluateConfig | None = None) -> int:
-    """Fly a policy over many simulated gate courses, and say how well it does."""
+    """Fly a policy over many simulated courses, and count the gates."""
     with _needs_simulator("evaluate"):
         from mavbridge.commands.evaluate.run import evaluate as run_evaluation
     return run_evaluation(EvaluateConfig() if config is None else config)
 
 
-@cli.command
+@cli.command(group=LEARNING)
 def demonstrate(config: DemonstrateConfig) -> int:
-    """Record flights of simulated gate courses by an expert, to learn from."""
+    """Record an expert's flights of simulated courses to learn from."""
     require_extra("demonstrate")
     with _needs_simulator("demonstrate"):
         from mavbridge.commands.demonstrate import demonstrate as run_demonstrations
@@ -232,7 +245,7 @@ def _prepare_training(command: str, flights: Sequence[Path], settings: RunSettin
     os.environ.setdefault("OMP_WAIT_POLICY", "passive")
 
 
-@cli.command
+@cli.command(group=LEARNING)
 def train(*flights: Path, settings: Annotated[TrainSettings, Parameter(name="*")]) -> int:
     """Train a policy from flights.
 
@@ -246,11 +259,11 @@ def train(*flights: Path, settings: Annotated[TrainSettings, Parameter(name="*")
     return run_policy_training(flights, settings)
 
 
-@cli.command
+@cli.command(group=LEARNING)
 def train_world_model(
     *flights: Path, settings: Annotated[WorldModelSettings, Parameter(name="*")]
 ) -> int:
-    """Train the world model of mavbridge imagine from flights.
+    """Train the world model of imagine from flights.
 
     Args:
         flights: flight folders, folders of them, or LeRobot datasets (v3).
@@ -262,9 +275,9 @@ def train_world_model(
     return run_world_model_training(flights, settings)
 
 
-@cli.command
+@cli.command(group=LEARNING)
 def export(*flights: Path, config: ExportConfig) -> int:
-    """Make a LeRobot dataset (v3.0) of flights, without those that failed.
+    """Convert flights to a LeRobot dataset (v3.0), without those that failed.
 
     Args:
         flights: flight folders, or folders of them.
@@ -278,9 +291,9 @@ def export(*flights: Path, config: ExportConfig) -> int:
     return run_export(flights, config)
 
 
-@cli.command
+@cli.command(group=CONVERTING)
 def export_policy(checkpoint: Path | None = None, *, config: ExportPolicyConfig) -> int:
-    """Write a policy of ours as ONNX or TorchScript.
+    """Export a policy as ONNX or TorchScript.
 
     Args:
         checkpoint: its weights, .safetensors; left out, those that TOGE ships with.
@@ -291,9 +304,9 @@ def export_policy(checkpoint: Path | None = None, *, config: ExportPolicyConfig)
     return run_export(checkpoint, config)
 
 
-@cli.command
+@cli.command(group=CONVERTING)
 def contract(source: Path, config: ContractConfig | None = None) -> int:
-    """Draft a contract file: what the files of a policy do not say, such as its rate.
+    """Draft the contract file of a foreign policy.
 
     Args:
         source: folder of a LeRobot policy, of a LeRobot dataset, or of ONNX files; or one of those.
@@ -308,7 +321,9 @@ def contract(source: Path, config: ContractConfig | None = None) -> int:
 def with_config(
     *tokens: Annotated[str, Parameter(show=False, allow_leading_hyphen=True)],
     config: Annotated[Path | None, Parameter(group=RARE)] = None,
-    set_config: Annotated[tuple[str, ...], Parameter(negative="", group=RARE)] = (),
+    set_config: Annotated[
+        tuple[str, ...], Parameter(negative="", group=RARE, show_default=False)
+    ] = (),
     print_config: Annotated[bool, Parameter(negative="", group=RARE)] = False,
     trust_config: Annotated[bool, Parameter(negative="", group=RARE)] = False,
     verbose: Annotated[bool, Parameter(name=("--verbose", "-v"), negative="", group=RARE)] = False,
@@ -318,15 +333,12 @@ def with_config(
 
     Args:
         tokens: the rest of the command line.
-        config: TOML file with flags as keys, and with sections of further settings; flags given on
-            the command line win.
-        set_config: SECTION.KEY=VALUE: one setting of such a file, as in limits.attitude_age=0.2;
-            may be given more than once.
-        print_config: print a settings file with every setting of the command, and end.
-        trust_config: let that file name programs (a policy in Python, pipe: cameras), other
-            computers, and places outside the working directory to write to.
-        verbose: show details: engine, vehicle, streams, parameters.
-        log_file: add what is shown, details and times to this file.
+        config: TOML file of flags and further settings; the command line wins.
+        set_config: SECTION.KEY=VALUE: one setting, as limits.stall=0.2; repeatable.
+        print_config: Print all settings of the command as TOML, and exit.
+        trust_config: Let --config name programs, other computers and outside folders.
+        verbose: Show details: engine, vehicle, streams, parameters.
+        log_file: Append output, details and times to this file.
     """
     _check_command(tokens)
     if print_config:

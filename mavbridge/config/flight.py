@@ -135,11 +135,9 @@ class ListenConfig:
     """A vehicle to listen to."""
 
     connect: Annotated[str, Parameter(show_default=False)] = ""
-    """The vehicle: udp:HOST:PORT (listen), udpout:HOST:PORT, tcp:HOST:PORT, /dev/ttyX,BAUD; or as
-    MAVSDK writes it: udpin://0.0.0.0:14540, serial:///dev/ttyACM0:921600."""
+    """Vehicle: udp:HOST:PORT, udpout:HOST:PORT, tcp:HOST:PORT or /dev/ttyX,BAUD."""
     signing_key_file: Annotated[Path | None, Parameter(show_default=False)] = None
-    """Sign every packet, and take only signed ones (MAVLink 2): a file with the vehicle's key, 32
-    bytes or 64 hexadecimal digits, which only you may read."""
+    """File with the vehicle's MAVLink 2 key: sign, and accept signed packets only."""
     target_system: Annotated[int, hidden("link.target-system")] = 0
     """System id of the vehicle to fly; 0 = the only one on the link."""
     connect_timeout: Annotated[float, hidden("link.timeout")] = 30.0
@@ -157,20 +155,17 @@ class LinkConfig(ListenConfig):
     """The vehicle and how to reach it."""
 
     source_system: Annotated[int, hidden("link.source-system")] = 255
-    """Our MAVLink system id; ArduPilot obeys overrides from its MAV_GCS_SYSID (255) only."""
-    output: OutputChoice = "auto"
-    """Message that carries the actions: rc-override or manual-control (sticks), attitude, rates,
-    velocity. auto: by the policy's actions and the firmware."""
+    """Our MAVLink system id. ArduPilot obeys overrides of its MAV_GCS_SYSID (255) only."""
+    output: Annotated[OutputChoice, Parameter(show_choices=False)] = "auto"
+    """auto, rc-override, manual-control, attitude, rates or velocity."""
     raw_sticks: Annotated[bool, hidden("link.raw-sticks")] = False
-    """Send the policy's sticks as they are. By default they are changed where this vehicle leans,
-    turns or climbs more or less at full stick than the one that the policy was trained for."""
+    """Send the policy's sticks unchanged; default: map them to this vehicle's stick curves."""
     readonly: bool = False
-    """Run everything, send no stick, mode or arm command."""
+    """Run everything, but send no stick, mode or arm command."""
     set: Annotated[tuple[str, ...], Parameter(negative="", show_default=False)] = ()
-    """NAME=VALUE: set a parameter of the vehicle before arming, put the old value back at an
-    orderly end; may be given more than once."""
+    """NAME=VALUE: set a parameter of the vehicle for the flight; repeatable."""
     accept_risk: Annotated[tuple[Risk, ...], hidden("link.accept-risk")] = ()
-    """Fly in spite of a setting that a flight was refused for."""
+    """Fly in spite of a setting for which a flight is refused."""
 
     def __post_init__(self) -> None:
         """Raise UserError for ids that MAVLink cannot carry, and parameters that cannot be set."""
@@ -206,16 +201,11 @@ class CameraConfig:
     """Camera of the policy."""
 
     camera: Annotated[tuple[str, ...], Parameter(negative="", show_default=" ".join)] = ("0",)
-    """Device index or /dev/videoN, rtsp:// udp:// http:// URL, video file, shm:NAME,
-    screen:WINDOW TITLE, pipe:COMMAND (MJPEG or PNG from a program) or pipe:640x480:rgb24:COMMAND
-    (raw; gray16le: depth), jpeg-udp:[HOST:]PORT (a simulator's chunks of JPEG), or none for a
-    policy that looks at no image. For a policy with several cameras give each by its name in the
-    contract: --camera front=0 --camera down=/dev/video2."""
+    """0, /dev/videoN, URL, FILE, shm:NAME, screen:TITLE, pipe:..., none."""
     camera_timeout: Annotated[float, hidden("link.camera-timeout")] = 10.0
     """Seconds to wait for the camera's first frame."""
     camera_latency: float = 0.0
-    """Milliseconds from exposure to arrival here; not for shm:, whose frames carry their own
-    stamps."""
+    """Milliseconds from exposure to arrival, if frames carry no stamps."""
     max_frozen_image: Annotated[float, hidden("limits.frozen-image")] = 0.5
     """Longest time in seconds for which the image may stay identical in flight; 0 = no limit."""
     max_black_image: Annotated[float, hidden("limits.black-image")] = 0.5
@@ -276,40 +266,33 @@ class FlyConfig:
     arm: Annotated[bool, Parameter(group=ENGAGING)] = False
     """Arm and engage once, as soon as everything is ready."""
     mode: Annotated[str | None, Parameter(group=ENGAGING)] = None
-    """Flight mode to ask for when engaging; one of those that the policy flies in."""
+    """Flight mode to request when engaging; default: one that is allowed."""
     takeoff: Annotated[float | None, Parameter(group=ENGAGING)] = None
-    """With --arm: metres to which the autopilot climbs by its own means before the policy flies."""
+    """With --arm: metres to climb by the autopilot's own takeoff first."""
     goal: Annotated[
         str | None, Parameter(group=ENGAGING, allow_leading_hyphen=True, show_default=False)
     ] = None
-    """NORTH,EAST,DOWN in metres from the estimator's origin, where the vehicle was switched on: for
-    a policy that flies to a goal."""
+    """NORTH,EAST,DOWN of the goal, in metres from the estimator's origin."""
     engage_channel: Annotated[int | None, Parameter(group=ENGAGING)] = None
-    """Radio channel, from 5, whose switch engages when it goes high while armed, and releases when
-    it goes low."""
+    """Radio channel, from 5, whose switch engages (high) and releases (low)."""
     engage_on_arm: Annotated[bool, Parameter(group=ENGAGING)] = False
     """Engage when the vehicle is armed for the first time."""
-    on_fault: Annotated[OnFault, Parameter(group=ENGAGING)] = "auto"
-    """After a fault of ours, neutral sticks, then: release, hold (BRAKE, AUTO.LOITER), land or rtl.
-    auto: release if the receiver works and its throttle is near the middle, else hold. release: in
-    the air, as auto. Setpoints are held, never released."""
-    then: Annotated[OnFault, Parameter(group=ENGAGING)] = "auto"
-    """The same after a normal end, where auto and release land instead of holding."""
+    on_fault: Annotated[OnFault, Parameter(group=ENGAGING, show_choices=False)] = "auto"
+    """After a fault of ours: auto, release, hold, land or rtl."""
+    then: Annotated[OnFault, Parameter(group=ENGAGING, show_choices=False)] = "auto"
+    """After a normal end: auto, release, hold, land or rtl."""
     duration: Annotated[float | None, Parameter(group=ENGAGING)] = None
-    """Seconds to fly, from the first action of the policy; by default until Ctrl-C."""
+    """Seconds to fly from the policy's first action; default: until Ctrl-C."""
     rerun: Annotated[str, Parameter(group=OUTPUT)] = "off"
-    """Rerun viewer: spawn, connect[=URL], FILE.rrd, or off."""
+    """Rerun viewer: spawn, connect[=URL], FILE.rrd or off."""
     serve: Annotated[str, Parameter(group=OUTPUT, show_default=False)] = ""
-    """HOST:PORT of a page with the live flight, for a browser: 127.0.0.1:9090 for one on this
-    computer. The next port carries the data."""
+    """HOST:PORT of a web page with the live flight; its data use PORT + 1."""
     gates: Annotated[Path | None, Parameter(group=OUTPUT)] = None
-    """JSON of a course's gates, as ``python -m sitl course --json`` prints it. The viewer shows
-    them, the outcome counts them, and the flight ends a second after the last one."""
+    """JSON of the course's gates: shown, counted, and the last one ends the flight."""
     record: Annotated[Path | None, Parameter(group=OUTPUT)] = None
-    """Record the flight into this folder, new or empty: camera, ticks, raw MAVLink; needs the extra
-    "record"."""
+    """New folder for the recorded flight; needs the extra "record"."""
     report: Annotated[Path | None, Parameter(group=OUTPUT)] = None
-    """Write the timing report here as JSON."""
+    """JSON file for the timing report."""
 
     def __post_init__(self) -> None:
         """Raise UserError for contradictions."""

@@ -20,29 +20,21 @@ class PolicyConfig:
     """The policy, its weights, and what runs it."""
 
     policy: str = "toge"
-    """toge[:small|medium|large[:BACKBONE]], toge-rates, resnet-unet; your own class,
-    ./file.py:Class or package.module:Class; lerobot:DIR, onnx:DIR, torchscript:FILE;
-    ws://HOST:PORT, a server (mavbridge serve, openpi's); or
-    scripted[:hover|square|circle|yaw|doublet][:sticks|attitude|rates|velocity][:air], air: the
-    vehicle flies already, so do not climb first. docs/policies.md has the details."""
+    """toge, toge-rates, FILE.py:Class, lerobot:DIR, onnx:DIR, ws://..."""
     checkpoint: Path | None = None
-    """Weights: .safetensors with the contract in its header, .pt or .ckpt; toge and
-    toge-rates have shipped ones. A class of yours is made as Class(checkpoint=path)."""
+    """Weights: .safetensors, .pt or .ckpt; toge and toge-rates come with theirs."""
     contract: Path | None = None
-    """TOML file that says what the files of a policy trained elsewhere do not: rate, names, units,
-    camera; mavbridge contract writes a first draft."""
+    """TOML file with what a foreign policy's files omit; see mavbridge contract."""
     dual_rate: Annotated[
         bool | None, Parameter(negative=("--no-dual-rate", "--single-rate"), show_default=False)
     ] = None
-    """Encode images in their own thread and sample actions faster from the cached feature; by
-    default wherever the policy can (encode_visual and predict_fast)."""
+    """Encode images at a rate of their own; default: if the policy can."""
     num_diffusion_steps: Annotated[int | None, Parameter(show_default=False)] = None
-    """DDIM steps of the action head: by default 10, and 1 for toge and toge-rates."""
+    """DDIM steps of the action head; default: 10, and 1 for toge and toge-rates."""
     allow_untrained: Annotated[bool, hidden("network.allow-untrained")] = False
     """Fly TOGE with random weights: for timing and bring-up only."""
     by_rates: bool = False
-    """Fly the sticks of toge or resnet-unet by thrust and body rates, attitude and climb closed by
-    the policy from the newest state; in GUIDED_NOGPS, GUIDED or OFFBOARD."""
+    """Fly a stick policy by thrust and body rates, its attitude loop closed here."""
     image_size: Annotated[int | None, hidden("network.image-size")] = None
     """Pixels a side into the encoder; by default what the policy's contract says (224)."""
     engine: Annotated[Engine, hidden("network.engine")] = "auto"
@@ -54,7 +46,7 @@ class PolicyConfig:
     action_device: Annotated[str | None, hidden("network.action-device")] = None
     """Device of the action head, where it differs from --device."""
     seed: Annotated[int, Parameter(group=RARE)] = 0
-    """Seed of random weights, diffusion noise and, in simulation, of courses and delays."""
+    """Seed of random weights, diffusion noise and simulated courses."""
 
     def __post_init__(self) -> None:
         """Refuse what the scheduler and encoders cannot serve."""

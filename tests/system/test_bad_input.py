@@ -26,8 +26,8 @@ def run(capsys: pytest.CaptureFixture[str], *flags: str) -> tuple[int, str]:
     return exit_info.value.code, text
 
 
-def test_help_names_every_flag_of_the_contract(capsys: pytest.CaptureFixture[str]) -> None:
-    status, text = run(capsys, "--help")
+def test_help_of_fly_names_every_flag_of_the_contract(capsys: pytest.CaptureFixture[str]) -> None:
+    status, text = run(capsys, "fly", "--help")
     assert status == 0
     flags = """--connect --policy --checkpoint --dual-rate --num-diffusion-steps --camera --device
         --output --readonly --mode --arm --duration --rerun --report --record --config --set-config
