@@ -62,12 +62,12 @@ crashed; 128 + its number: a signal before the flight.
 
 
 def _shown_default(value: object) -> str | None:
-    """Leave out of the help what says nothing: a flag that is off, an empty text."""
+    """Return a default for the help; None for defaults that say nothing, as a flag that is off."""
     return None if value in (False, "", None) else str(value)
 
 
 def _as_ours(error: CycloptsError) -> Text:
-    """An error of the parser in the form of every other one."""
+    """Format an error of the parser like all other errors."""
     text = str(error)
     if isinstance(error, UnusedCliTokensError):
         text = f"unexpected word {' '.join(error.unused_tokens or ())!r}: flags begin with --"
@@ -191,7 +191,7 @@ def imagine(config: ImagineConfig) -> int:
 
 @contextmanager
 def _needs_simulator(command: str) -> Iterator[None]:
-    """Say what to install where the simulator cannot be imported."""
+    """Context manager: raise UserError with what to install if the simulator cannot be imported."""
     try:
         yield
     except ModuleNotFoundError as error:
@@ -220,7 +220,7 @@ def demonstrate(config: DemonstrateConfig) -> int:
 
 
 def _prepare_training(command: str, flights: Sequence[Path], settings: RunSettings) -> None:
-    """Refuse paths that could not be used, before torch and the flights are loaded.
+    """Check the paths before torch and the flights are loaded.
 
     Raises:
         UserError: an extra, a folder or a file is missing, or --out cannot be written.
@@ -368,7 +368,7 @@ def with_config(
 
 
 def _check_command(tokens: tuple[str, ...]) -> None:
-    """Refuse a first word that is no command; the flight, which needs none, takes flags alone."""
+    """Raise UserError if the first word is neither a command nor a flag."""
     if not tokens or tokens[0].startswith("-") or tokens[0] in cli:
         return
     commands = sorted(name for name in cli if not name.startswith("-"))

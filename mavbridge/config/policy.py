@@ -1,4 +1,4 @@
-"""Settings that choose a policy and what runs it; shared by every command that flies one."""
+"""Settings of a policy, shared by every command that flies one."""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -9,7 +9,7 @@ from cyclopts import Parameter
 from mavbridge.config.flags import POLICY, RARE, check_range, hidden
 
 STEPS, TOGE_STEPS = 10, 1
-"""DDIM steps from noise of most policies, and of toge and toge-rates, which fly as well in one
+"""DDIM steps by default, and those of toge and toge-rates, which fly as well in one
 (docs/study.md)."""
 Engine = Literal["auto", "torch", "openvino", "cuda-graph"]
 
@@ -32,24 +32,24 @@ class PolicyConfig:
     num_diffusion_steps: Annotated[int | None, Parameter(show_default=False)] = None
     """DDIM steps of the action head; default: 10, and 1 for toge and toge-rates."""
     allow_untrained: Annotated[bool, hidden("network.allow-untrained")] = False
-    """Fly TOGE with random weights: for timing and bring-up only."""
+    """Fly TOGE with random weights, for timing and bring-up only."""
     by_rates: bool = False
     """Fly a stick policy by thrust and body rates, its attitude loop closed here."""
     image_size: Annotated[int | None, hidden("network.image-size")] = None
-    """Pixels a side into the encoder; by default what the policy's contract says (224)."""
+    """Side of the encoder's input in pixels; default: the contract's (224)."""
     engine: Annotated[Engine, hidden("network.engine")] = "auto"
-    """What runs the network; auto takes the fastest that agrees with torch."""
+    """Inference engine; auto: the fastest that agrees with torch."""
     device: str = "cpu"
     """torch device: cpu, cuda, cuda:1, mps."""
     vision_device: Annotated[str | None, hidden("network.vision-device")] = None
-    """Device of the image encoder, where it differs from --device."""
+    """Device of the image encoder; default: --device."""
     action_device: Annotated[str | None, hidden("network.action-device")] = None
-    """Device of the action head, where it differs from --device."""
+    """Device of the action head; default: --device."""
     seed: Annotated[int, Parameter(group=RARE)] = 0
     """Seed of random weights, diffusion noise and simulated courses."""
 
     def __post_init__(self) -> None:
-        """Refuse what the scheduler and encoders cannot serve."""
+        """Raise UserError for values that scheduler or encoder do not support."""
         check_range("num-diffusion-steps", self.steps, 1, 100, "steps")
         if self.image_size is not None:
             check_range("network.image_size", self.image_size, 32, 1024, "pixels")
@@ -57,12 +57,12 @@ class PolicyConfig:
 
     @property
     def kind(self) -> str:
-        """The first word of ``policy``: toge, scripted, onnx..."""
+        """First word of ``policy``: toge, scripted, onnx, ..."""
         return self.policy.partition(":")[0]
 
     @property
     def may_be_dual(self) -> bool:
-        """Whether it may fly at two rates, as far as that is known before it is loaded."""
+        """True if the policy may fly at two rates, as far as is known before it is loaded."""
         return self.dual_rate is not False and self.kind != "resnet-unet"
 
     @property

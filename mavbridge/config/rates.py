@@ -1,4 +1,4 @@
-"""Every rate of the flight in Hz, and the only place that holds one."""
+"""Rates of a flight in Hz, all in one place."""
 
 import math
 from dataclasses import dataclass
@@ -11,35 +11,35 @@ from mavbridge.core.errors import UserError
 
 LEAST_HZ = 0.5
 AUTO_VISUAL_HZ = (10.0, 60.0)
-"""Limits of rates.visual = "auto" where none are given."""
+"""Default limits of rates.visual = "auto"."""
 ACTION_HZ, SINGLE_HZ = 100.0, 30.0
-"""Most chunks a second, by dual and by single rate, where neither a flag nor the policy says it."""
+"""Default maximum of chunks per second, at two rates and at one."""
 SOLVES_PER_PLAY = 2.0
-"""Chunks that are computed in the time for which a policy is meant to play one: a new one is there
-before the last one ends, also when a solve is late."""
+"""Chunks computed per play time: a new chunk arrives before the last one ends, even if a solve is
+late."""
 STATE_HZ = 50.0
-"""Lowest rate of telemetry to ask for, however slow the actions: age limits are in seconds."""
+"""Lowest requested telemetry rate, however slow the actions: age limits are in seconds."""
 SIM_CAMERA_HZ = 30.0
-"""Frames a second of the simulated camera, unless the visual rate asks for more."""
+"""Frame rate of the simulated camera, unless the visual rate is higher."""
 SIM_CAMERA_PX = 224
-"""Side of its frames in pixels, as ``python -m sitl`` sends them. The bridge resizes them to what
-the policy takes, as it does with a real camera."""
+"""Side of its frames in pixels, as ``python -m sitl`` sends them. The bridge resizes them like
+those of a real camera."""
 STATUS_HZ = 5.0
-"""Terminal refresh."""
+"""Refresh rate of the terminal."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class LoopRates:
-    """Rates of the two loops of one flight, in Hz."""
+    """Rates of the two loops of a flight."""
 
     action_hz: float
     min_vision_hz: float
     max_vision_hz: float
-    """Equal to the minimum where the visual rate is fixed."""
+    """Equal to the minimum if the visual rate is fixed."""
 
     @property
     def state_hz(self) -> float:
-        """Rate of telemetry to ask the vehicle for."""
+        """Telemetry rate to request from the vehicle."""
         return max(self.action_hz, STATE_HZ)
 
 
@@ -49,28 +49,28 @@ class Rates:
     """Loop rates in Hz."""
 
     visual_rate: Annotated[float | str, hidden("rates.visual")] = 30.0
-    """Most frames a second through the image encoder (dual rate); auto[:MIN:MAX] encodes more often
-    when the vehicle turns or the image changes."""
+    """Most images encoded per second (dual rate); auto[:MIN:MAX] encodes more often when the
+    vehicle turns or the image changes."""
     action_rate: Annotated[float | None, hidden("rates.action")] = None
-    """Most chunks of actions a second, each from the newest attitude (dual rate). By default 100,
-    or 2 for each time that the policy is meant to play a chunk (play_s of its contract)."""
+    """Most chunks of actions per second (dual rate), each from the newest attitude; default: 100,
+    or 2 / play_s for slow policies."""
     rate: Annotated[float | None, hidden("rates.single")] = None
-    """Most chunks a second in single-rate mode, each with the newest image. By default 30, or 2 for
-    each time that the policy is meant to play a chunk."""
+    """Most chunks of actions per second (single rate), each from the newest image; default: 30, or
+    2 / play_s for slow policies."""
     stick_rate: Annotated[float, hidden("rates.stick")] = 100.0
-    """Stick commands a second that leave for the autopilot, whatever the policy's rate."""
+    """Commands sent to the autopilot per second, whatever the policy's rate."""
     realtime: Annotated[bool, hidden("scheduling.realtime")] = True
     """Real-time scheduling (SCHED_FIFO) of the guard and of the policy, where the system permits
     it."""
     guard_cpu: Annotated[int | None, hidden("scheduling.guard-cpu")] = None
-    """Run the guard on this CPU alone."""
+    """Pin the guard to this CPU."""
     action_cpu: Annotated[int | None, hidden("scheduling.action-cpu")] = None
-    """Run the policy on this CPU alone."""
+    """Pin the policy to this CPU."""
     vision_cpu: Annotated[int | None, hidden("scheduling.vision-cpu")] = None
-    """Run the vision loop on this CPU alone."""
+    """Pin the vision loop to this CPU."""
 
     def __post_init__(self) -> None:
-        """Refuse rates that no autopilot serves."""
+        """Raise UserError for rates that no autopilot supports."""
         low_hz, high_hz = self.visual_limits_hz
         check_range("rates.visual", low_hz, 0.5, high_hz, "Hz")
         check_range("rates.visual", high_hz, low_hz, 240, "Hz")
@@ -81,7 +81,7 @@ class Rates:
 
     @property
     def visual_limits_hz(self) -> tuple[float, float]:
-        """Least and most frames a second; equal where the rate is fixed."""
+        """Minimum and maximum frames per second; equal if the rate is fixed."""
         if isinstance(self.visual_rate, float | int):
             return self.visual_rate, self.visual_rate
         kind, *limits = self.visual_rate.split(":")
@@ -96,10 +96,11 @@ class Rates:
         return low_hz, high_hz
 
     def loops(self, *, is_dual: bool, play_s: float = 0.0) -> LoopRates:
-        """Rates of both loops of a policy that plays each chunk for up to ``play_s``.
+        """Return the rates of both loops, for a policy that plays each chunk for up to ``play_s``.
 
-        Without dual rate images are only resized as they come. A chunk takes the newest one, so
-        they come at the visual rate where chunks are slower: it must not be old when it is used.
+        At a single rate, images are only resized when they arrive. A chunk takes the newest image,
+        so that they arrive at the visual rate even if chunks are slower: the image must not be old
+        when it is used.
         """
         action_hz = self.action_rate if is_dual else self.rate
         if action_hz is None:

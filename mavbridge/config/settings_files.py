@@ -1,4 +1,4 @@
-"""Settings files: what they may ask for, and how they are read and written."""
+"""Read, check and write settings files."""
 
 import json
 import re
@@ -22,11 +22,11 @@ _LOCAL = re.compile(
     r"(?:$|off$|spawn$|/|serial:|udp://:|[\w./-]+\.rrd$"
     r"|(?:connect=)?(?:[\w+]+:)?(?://)?(?:127\.0\.0\.1|localhost|\[?::1\]?)(?::\d+)?(?:[/?]|$))"
 )
-"""Addresses on this computer."""
+"""Matches addresses on this computer."""
 
 
 def foreign_policy(spec: str) -> str | None:
-    """What a policy is beside data that we read; None if it is nothing more."""
+    """Return what a policy runs besides reading data, such as Python code; None if nothing."""
     kind = spec.partition(":")[0]
     if kind in ("ws", "wss"):
         return None if _LOCAL.match(spec) else "a server, which would get the images"
@@ -38,9 +38,9 @@ def foreign_policy(spec: str) -> str | None:
 def untrusted_settings(
     document: Mapping[str, Any], given: Sequence[str]
 ) -> Iterator[tuple[str, str, str]]:
-    """Flag, value and what it names, of all that a file may not ask for.
+    """Yield flag, value and description of each setting that a file may not make by itself.
 
-    ``given``: words of the command line, whose flags stand in place of the file's.
+    ``given``: words of the command line; its flags replace those of the file.
     """
     flags = {word.partition("=")[0] for word in given}
     for keys, value in _leaves(document, ()):
@@ -78,7 +78,8 @@ _HOME = re.compile(r"((?:--[\w.-]+=)?(?:[a-z]+:)?)(~[^/]*(?:/.*)?)")
 
 
 def given_settings(texts: Sequence[str]) -> dict[str, dict[str, str | list[str]]]:
-    """Return the document of ``--set-config``, by section and key; raises UserError."""
+    """Return the settings of ``--set-config`` by section and key; raise UserError for a malformed
+    one."""
     document: dict[str, dict[str, str | list[str]]] = {}
     for text in texts:
         if (match := re.fullmatch(r"([a-z]+)\.([\w-]+)=(.*)", text)) is None:
@@ -94,10 +95,8 @@ def given_settings(texts: Sequence[str]) -> dict[str, dict[str, str | list[str]]
 
 
 class Settings(Dict):
-    """A settings file. Its keys are flags, of which some are named as commands: record, serve.
-
-    ``commands`` have tables of their own there, which are left out.
-    """
+    """A settings file, as a cyclopts configuration. Some flags have the name of a command (record,
+    serve), so that the tables of ``commands`` are left out here."""
 
     def __init__(
         self, data: Mapping[str, Any], *, source: str, commands: Container[str] = ()
@@ -121,9 +120,9 @@ class Settings(Dict):
 
 
 def with_home(value: Any) -> Any:
-    """Return words or settings with ``~`` expanded in each text that names a path.
+    """Expand ``~`` in words and settings that name a path.
 
-    Shells leave it alone behind a colon or an equals sign: ``lerobot:~/act``, ``--out=~/flights``.
+    Shells do not expand it after a colon or an equals sign: ``lerobot:~/act``, ``--out=~/flights``.
     """
     if isinstance(value, str) and (found := _HOME.match(value)) is not None:
         return f"{found[1]}{user_path(found[2])}"
@@ -135,7 +134,7 @@ def with_home(value: Any) -> Any:
 
 
 def print_settings(command: App) -> None:
-    """Print TOML that ``--config`` reads; what has no default is commented out."""
+    """Print TOML that ``--config`` reads. Settings without a default are commented out."""
     sections: dict[str, list[str]] = {"": ["# Flags"]}
     for argument in command.assemble_argument_collection(parse_docstring=True):
         if argument.name == "*" or argument.children or not argument.name.startswith("--"):
@@ -151,7 +150,7 @@ def print_settings(command: App) -> None:
 
 
 def _toml(value: Any) -> str | None:
-    """Return a value as TOML writes it; None where there is no default."""
+    """Return a value in TOML; None if there is no default."""
     if isinstance(value, bool):
         return str(value).lower()
     if isinstance(value, int | float):
