@@ -6,6 +6,7 @@ clock and new for each test. docs/guides/contract_suite.md says what the suite d
 
 import os
 from collections.abc import Iterator
+from typing import Any, Literal, TypeVar
 
 import pytest
 from pymavlink.dialects.v20 import ardupilotmega as mav
@@ -22,6 +23,7 @@ COPTER_FIXTURES = ("companion", "armable", "grounded", "flying", "expendable", "
 PX4_FIXTURES = ("px4", "px4_armable", "px4_grounded", "px4_flying", "px4_expendable")
 FIRMWARES = {mav.MAV_AUTOPILOT_ARDUPILOTMEGA: COPTER_FIXTURES, mav.MAV_AUTOPILOT_PX4: PX4_FIXTURES}
 FOUND_WITHIN_S = 30.0
+AnyCompanion = TypeVar("AnyCompanion", CopterCompanion, Px4Companion)
 
 
 class ExternalVehicle:
@@ -91,115 +93,48 @@ def _need(request: pytest.FixtureRequest, permission: str) -> None:
     pytest.skip(f"it would {permission}: {ALLOW}={permission} allows that")
 
 
-def _on_the_ground(companion: Companion) -> None:
-    if companion.is_external and companion.in_the_air:
-        companion.come_down()
+def _heard(companion: AnyCompanion) -> Iterator[AnyCompanion]:
+    """A vehicle that has been heard, as the test before left it; a real one is restored."""
+    companion.peer.advance(0) if companion.is_external else companion.wait("HEARTBEAT")
+    yield companion
+    if companion.is_external:
+        companion.restore()
 
 
 @pytest.fixture
 def copter(request: pytest.FixtureRequest) -> Iterator[CopterCompanion]:
-    """An ArduCopter that has been heard, as the test before has left it."""
+    """An ArduCopter; with a receiver that has idle sticks, unless the test is of none."""
     receiver = "without_receiver" not in request.fixturenames
-    companion = CopterCompanion(_peer(request, "ardupilot", receiver=receiver))
-    companion.peer.advance(0) if companion.is_external else companion.wait("HEARTBEAT")
-    yield companion
-    if companion.is_external:
-        companion.restore()
-
-
-@pytest.fixture
-def companion(copter: CopterCompanion) -> CopterCompanion:
-    """A companion of an ArduCopter on the ground, whose receiver has idle sticks; never arms."""
-    _on_the_ground(copter)
-    return copter
-
-
-@pytest.fixture
-def armable(request: pytest.FixtureRequest, copter: CopterCompanion) -> CopterCompanion:
-    """As ``companion``, for tests that arm and stay on the ground."""
-    _need(request, "arm")
-    _on_the_ground(copter)
-    copter.may_arm = True
-    return copter
-
-
-@pytest.fixture
-def grounded(request: pytest.FixtureRequest, copter: CopterCompanion) -> CopterCompanion:
-    """As ``armable``, for tests that take off."""
-    _need(request, "fly")
-    _on_the_ground(copter)
-    copter.may_arm = True
-    return copter
-
-
-@pytest.fixture
-def flying(request: pytest.FixtureRequest, copter: CopterCompanion) -> CopterCompanion:
-    """An ArduCopter some metres up, still, in ALT_HOLD, under neutral overrides."""
-    _need(request, "fly")
-    copter.may_arm = True
-    copter.fly_up()
-    return copter
-
-
-@pytest.fixture
-def expendable(flying: CopterCompanion) -> CopterCompanion:
-    """As ``flying``, for tests that end the flight."""
-    return flying
-
-
-@pytest.fixture
-def without_receiver(request: pytest.FixtureRequest, copter: CopterCompanion) -> CopterCompanion:
-    """As ``grounded``, but the vehicle never had a receiver."""
-    _need(request, "fly")
-    copter.may_arm = True
-    return copter
+    yield from _heard(CopterCompanion(_peer(request, "ardupilot", receiver=receiver)))
 
 
 @pytest.fixture
 def px4_vehicle(request: pytest.FixtureRequest) -> Iterator[Px4Companion]:
-    """A PX4 without a receiver that has been heard, as the test before has left it."""
-    companion = Px4Companion(_peer(request, "px4", receiver=False))
-    companion.peer.advance(0) if companion.is_external else companion.wait("HEARTBEAT")
-    yield companion
-    if companion.is_external:
-        companion.restore()
+    """A PX4 without a receiver."""
+    yield from _heard(Px4Companion(_peer(request, "px4", receiver=False)))
 
 
-@pytest.fixture
-def px4(px4_vehicle: Px4Companion) -> Px4Companion:
-    """A ground station of a PX4 on the ground; never arms."""
-    _on_the_ground(px4_vehicle)
-    return px4_vehicle
+def _found(vehicle: str, permission: str, place: Literal["down", "up", "anywhere"]) -> Any:
+    """A fixture: that vehicle on the ground, some metres up under neutral sticks, or as it is."""
+
+    @pytest.fixture
+    def found(request: pytest.FixtureRequest) -> Any:
+        companion: Any = request.getfixturevalue(vehicle)
+        _need(request, permission)
+        companion.may_arm = permission != "ground"
+        if place == "up":
+            companion.fly_up()
+        elif place == "down" and companion.is_external and companion.in_the_air:
+            companion.come_down()
+        return companion
+
+    return found
 
 
-@pytest.fixture
-def px4_armable(request: pytest.FixtureRequest, px4_vehicle: Px4Companion) -> Px4Companion:
-    """As ``px4``, for tests that arm and stay on the ground."""
-    _need(request, "arm")
-    _on_the_ground(px4_vehicle)
-    px4_vehicle.may_arm = True
-    return px4_vehicle
-
-
-@pytest.fixture
-def px4_grounded(request: pytest.FixtureRequest, px4_vehicle: Px4Companion) -> Px4Companion:
-    """As ``px4_armable``, for tests that take off."""
-    _need(request, "fly")
-    _on_the_ground(px4_vehicle)
-    px4_vehicle.may_arm = True
-    return px4_vehicle
-
-
-@pytest.fixture
-def px4_flying(request: pytest.FixtureRequest, px4_vehicle: Px4Companion) -> Px4Companion:
-    """A PX4 some metres up, still, in ALTCTL, under centred sticks."""
-    _need(request, "fly")
-    px4_vehicle.may_arm = True
-    px4_vehicle.fly_up()
-    return px4_vehicle
-
-
-@pytest.fixture
-def px4_expendable(px4_flying: Px4Companion) -> Px4Companion:
-    """As ``px4_flying``, for tests that end the flight."""
-    return px4_flying
+companion, px4 = (_found(vehicle, "ground", "down") for vehicle in ("copter", "px4_vehicle"))
+armable, px4_armable = (_found(vehicle, "arm", "down") for vehicle in ("copter", "px4_vehicle"))
+grounded, px4_grounded = (_found(vehicle, "fly", "down") for vehicle in ("copter", "px4_vehicle"))
+flying, px4_flying = (_found(vehicle, "fly", "up") for vehicle in ("copter", "px4_vehicle"))
+expendable, px4_expendable = (_found(vehicle, "fly", "up") for vehicle in ("copter", "px4_vehicle"))
+"""As those that fly, for tests that end the flight."""
+without_receiver = _found("copter", "fly", "anywhere")

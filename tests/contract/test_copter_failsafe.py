@@ -35,10 +35,8 @@ def heartbeat(companion, system_id=GCS):
 
 def test_sticks_that_stop_are_held_until_they_expire_then_the_receivers_count(flying):
     flying.hold(1.0, roll=1700)
-
     held = flying.advance(2.9)
     released = flying.advance(2.6)
-
     assert math.degrees(last(held, "ATTITUDE").roll) == pytest.approx(11.26, abs=0.5)
     assert math.degrees(abs(last(released, "ATTITUDE").roll)) < 1.0
     assert last(released, "LOCAL_POSITION_NED").vz == pytest.approx(IDLE_DESCENT_MPS, abs=0.35)
@@ -49,9 +47,7 @@ def test_sticks_that_stop_are_held_until_they_expire_then_the_receivers_count(fl
 def test_a_short_lifetime_of_overrides_ends_them_sooner(flying):
     flying.set_param("RC_OVERRIDE_TIME", 0.5)
     flying.hold(1.0, roll=1700)
-
     levelled = flying.advance(1.0)
-
     assert math.degrees(abs(last(levelled, "ATTITUDE").roll)) < 2.0
 
 
@@ -69,12 +65,10 @@ def wait_for_text(companion, text):
 def test_overrides_are_contact_with_the_ground_station_and_heartbeats_of_others_are_not(flying):
     watch_the_ground_station(flying)
     assert not [text for text in texts(flying.hold(2.0)) if "GCS" in text]
-
     messages = []
     for _ in range(20):
         heartbeat(flying, system_id=42)
         messages += flying.advance(0.1)
-
     assert "GCS Failsafe - Continuing Pilot Control" in texts(messages)
     assert set(modes(messages)) == {ALT_HOLD}
     heartbeat(flying)
@@ -85,7 +79,6 @@ def test_the_ground_stations_failsafe_drops_overrides_and_stays_when_switched_of
     flying.set_param("RC_OVERRIDE_TIME", 10.0)
     watch_the_ground_station(flying)
     flying.hold(0.3, roll=1600, thr=1500)
-
     wait_for_text(flying, "GCS Failsafe - Continuing Pilot Control")
     assert last(flying.advance(0.2), "RC_CHANNELS").chan1_raw == 1500
     flying.set_param("FS_GCS_ENABLE", 0)
@@ -93,7 +86,6 @@ def test_the_ground_stations_failsafe_drops_overrides_and_stays_when_switched_of
     for _ in range(8):
         heartbeat(flying)
         messages += flying.hold(0.1)
-
     assert last(messages, "HEARTBEAT").system_status == mav.MAV_STATE_CRITICAL
     flying.set_param("FS_GCS_ENABLE", 1)
     heartbeat(flying)
@@ -103,7 +95,6 @@ def test_the_ground_stations_failsafe_drops_overrides_and_stays_when_switched_of
 def test_lost_ground_station_in_guided_returns(flying):
     watch_the_ground_station(flying)
     assert flying.set_mode(GUIDED_NOGPS) == ACCEPTED
-
     wait_for_text(flying, "GCS Failsafe")
     assert flying.wait("HEARTBEAT").custom_mode == RTL
     heartbeat(flying)
@@ -122,10 +113,8 @@ def test_without_receiver_arming_needs_overrides(without_receiver):
         pytest.skip("a real vehicle has had sticks since it booted")
     companion.advance(4.0)
     companion.set_mode(ALT_HOLD)
-
     companion.send(mav.MAVLink_command_long_message(1, 1, ARM, 0, 1, *[0] * 6))
     text = companion.wait("STATUSTEXT", where=lambda m: m.text.startswith("Arm:"))
-
     assert text.text == "Arm: RC not found"
     companion.get_ready(ALT_HOLD)
     assert companion.arm() == ACCEPTED
@@ -136,14 +125,11 @@ def test_without_receiver_silence_is_a_radio_failsafe(without_receiver):
     in_the_air(companion)
     companion.hold(0.5, roll=1600)
     silent_ns = companion.peer.now_ns()
-
     companion.wait("STATUSTEXT", where=lambda m: m.text == "Radio Failsafe")
     fired_s = (companion.peer.now_ns() - silent_ns) / 1e9
-
     assert 0.95 <= fired_s <= 1.1
     assert companion.wait("HEARTBEAT", where=lambda m: m.custom_mode == RTL)
     assert companion.channels()[0] == 1600
-
     messages = companion.hold(1.5)
     assert "Radio Failsafe Cleared" in texts(messages)
     assert modes(messages)[-1] == RTL
@@ -153,9 +139,7 @@ def test_without_receiver_silence_is_a_radio_failsafe(without_receiver):
 def test_without_receiver_short_gaps_are_forgiven(without_receiver, gap_s, fails):
     companion = without_receiver
     in_the_air(companion)
-
     messages = companion.advance(gap_s - 0.02)
-
     assert ("Radio Failsafe" in texts(messages)) == fails
 
 
@@ -163,7 +147,6 @@ def test_manual_throttle_modes_are_refused_in_radio_failsafe(without_receiver):
     companion = without_receiver
     in_the_air(companion)
     companion.advance(2.0)
-
     assert companion.set_mode(ACRO) == FAILED
     assert companion.set_mode(STABILIZE) == FAILED
     companion.hold(0.3)
@@ -175,11 +158,9 @@ def test_a_radio_failsafe_replaces_brake_and_one_set_after_it_stays(without_rece
     in_the_air(companion)
     assert companion.set_mode(BRAKE) == ACCEPTED
     companion.hold(0.2)
-
     companion.wait("STATUSTEXT", where=lambda m: m.text == "Radio Failsafe")
     heartbeat = companion.wait("HEARTBEAT", where=lambda m: m.custom_mode == RTL)
     assert heartbeat.system_status == mav.MAV_STATE_CRITICAL
-
     assert companion.set_mode(BRAKE) == ACCEPTED
     assert modes(companion.advance(5.0))[-1] == BRAKE
 
@@ -188,27 +169,12 @@ def test_zeros_without_a_receiver_keep_the_lean_for_a_second(without_receiver):
     companion = without_receiver
     in_the_air(companion)
     companion.hold(1.0, roll=1700)
-
     companion.override(*[0] * 8)
     held = companion.advance(0.9)
     levelled = companion.advance(1.0)
-
     assert math.degrees(last(held, "ATTITUDE").roll) == pytest.approx(11.26, abs=0.5)
     assert last(levelled, "RC_CHANNELS").chan1_raw == 1700
     assert modes(levelled)[-1] == RTL
-
-
-def test_an_option_lets_a_landing_go_on_without_sticks(without_receiver):
-    companion = without_receiver
-    in_the_air(companion)
-    companion.set_param("FS_OPTIONS", 24)
-    assert companion.set_mode(9) == ACCEPTED
-    companion.hold(0.5)
-
-    messages = companion.advance(2.0)
-
-    assert "Radio Failsafe - Continuing Landing" in texts(messages)
-    assert modes(messages)[-1] == 9
 
 
 def test_without_its_failsafe_the_last_stick_stays_for_good(without_receiver):
@@ -216,8 +182,6 @@ def test_without_its_failsafe_the_last_stick_stays_for_good(without_receiver):
     in_the_air(companion)
     companion.set_param("FS_THR_ENABLE", 0)
     companion.hold(1.0, roll=1700)
-
     messages = companion.advance(5.0)
-
     assert math.degrees(last(messages, "ATTITUDE").roll) == pytest.approx(11.26, abs=0.5)
     assert modes(messages)[-1] == ALT_HOLD

@@ -19,7 +19,6 @@ def arming_refusal(companion):
 def test_arming_is_refused_with_throttle_up(armable):
     armable.get_ready(STABILIZE)
     armable.hold(0.1, thr=1300)
-
     assert arming_refusal(armable) == "Arm: Throttle too high"
 
 
@@ -34,13 +33,11 @@ def test_arming_is_refused_with_throttle_up(armable):
 def test_arming_is_refused_off_neutral(armable, sticks, text):
     armable.get_ready(ALT_HOLD)
     armable.hold(0.1, thr=1000, **sticks)
-
     assert arming_refusal(armable) == text
 
 
 def test_arming_twice_is_accepted(armable):
     armable.get_ready(ALT_HOLD)
-
     assert armable.arm() == ACCEPTED
     armable.hold(0.5, thr=1000)
     assert armable.arm() == ACCEPTED
@@ -53,9 +50,7 @@ def test_who_does_not_take_off_is_disarmed_with_the_throttle_down(armable, throt
     armable.get_ready(ALT_HOLD)
     assert armable.arm() == ACCEPTED
     armable.hold(0.3, thr=throttle_us)
-
     armed = [is_armed(m) for m in named(armable.hold(2.5, thr=throttle_us), "HEARTBEAT")]
-
     assert armed[0]
     assert armed[-1] != disarms
 
@@ -63,7 +58,6 @@ def test_who_does_not_take_off_is_disarmed_with_the_throttle_down(armable, throt
 def test_a_reboot_is_refused_while_armed(armable):
     armable.get_ready(ALT_HOLD)
     assert armable.arm() == ACCEPTED
-
     assert armable.command(REBOOT, 1) == FAILED
 
 
@@ -78,27 +72,23 @@ def test_a_reboot_is_refused_while_armed(armable):
 )
 def test_sticks_lean_and_turn_as_measured(flying, sticks, field, expected_deg):
     attitudes = named(flying.hold(1.5, **sticks), "ATTITUDE")[-10:]
-
     mean_rad = sum(getattr(m, field) for m in attitudes) / len(attitudes)
     assert math.degrees(mean_rad) == pytest.approx(expected_deg, rel=0.04)
 
 
 def test_throttle_is_a_climb_rate_in_alt_hold(flying):
     states = named(flying.hold(2.5, thr=1700), "LOCAL_POSITION_NED")[-10:]
-
     assert -sum(m.vz for m in states) / len(states) == pytest.approx(0.64, abs=0.05)
 
 
 def test_a_forced_reboot_in_flight_leaves_it_disarmed_in_its_boot_mode(expendable):
     before_ms = last(expendable.seen, "ATTITUDE").time_boot_ms
-
     assert expendable.command(REBOOT, 1, 0, 0, 0, 0, REBOOT_FORCE) == ACCEPTED
     expendable.advance(1.0)
     expendable.seen.clear()
     heartbeat = expendable.wait("HEARTBEAT", timeout_s=20.0)
     assert expendable.stream(mav.MAVLINK_MSG_ID_ATTITUDE, 20) == ACCEPTED
     after_ms = expendable.wait("ATTITUDE", timeout_s=10.0).time_boot_ms
-
     assert not is_armed(heartbeat)
     assert heartbeat.custom_mode == STABILIZE
     assert after_ms < before_ms

@@ -4,7 +4,7 @@ import pytest
 from pymavlink.dialects.v20 import ardupilotmega as mav
 
 from helpers.contract_peers import named
-from helpers.copter_companion import ACCEPTED, ALT_HOLD, DENIED, UNSUPPORTED
+from helpers.copter_companion import ACCEPTED, DENIED, UNSUPPORTED
 
 
 def rate_hz(messages):
@@ -17,7 +17,6 @@ def rate_hz(messages):
 
 def test_heartbeat_names_a_quadrotor_with_ardupilot(companion):
     heartbeat = companion.wait("HEARTBEAT")
-
     assert (heartbeat.get_srcSystem(), heartbeat.get_srcComponent()) == (1, 1)
     assert heartbeat.type == mav.MAV_TYPE_QUADROTOR
     assert heartbeat.autopilot == mav.MAV_AUTOPILOT_ARDUPILOTMEGA
@@ -29,7 +28,6 @@ def test_the_version_comes_on_request(companion):
         mav.MAV_CMD_SET_MESSAGE_INTERVAL, mav.MAVLINK_MSG_ID_AUTOPILOT_VERSION, 100_000
     )
     version = companion.wait("AUTOPILOT_VERSION")
-
     assert result == ACCEPTED
     assert version.flight_sw_version >> 16 == 4 << 8 | 7
     assert version.capabilities & mav.MAV_PROTOCOL_CAPABILITY_MAVLINK2
@@ -41,14 +39,12 @@ def test_the_version_comes_on_request(companion):
 )
 def test_intervals_are_cut_to_whole_milliseconds(companion, asked_hz, got_us):
     assert companion.stream(mav.MAVLINK_MSG_ID_ATTITUDE, asked_hz) == ACCEPTED
-
     companion.send(
         mav.MAVLink_command_long_message(
             1, 1, mav.MAV_CMD_GET_MESSAGE_INTERVAL, 0, mav.MAVLINK_MSG_ID_ATTITUDE, *[0] * 6
         )
     )
     interval = companion.wait("MESSAGE_INTERVAL")
-
     assert (interval.message_id, interval.interval_us) == (mav.MAVLINK_MSG_ID_ATTITUDE, got_us)
 
 
@@ -68,30 +64,15 @@ def test_state_comes_at_the_rate_asked_for_by_its_own_stamps(companion, message_
     companion.stream(message_id, 100)
     name = mav.mavlink_map[message_id].msgname
     companion.wait(name)
-
     assert rate_hz(named(companion.advance(0.6), name)) == pytest.approx(100.0, rel=0.02)
 
 
 @pytest.mark.parametrize("asked_hz", [400, 500, 1000])
 def test_rates_above_the_cap_are_denied_and_the_old_one_stays(companion, asked_hz):
     companion.stream(mav.MAVLINK_MSG_ID_ATTITUDE, 50)
-
     assert companion.stream(mav.MAVLINK_MSG_ID_ATTITUDE, asked_hz) == DENIED
     attitudes = named(companion.advance(0.6), "ATTITUDE")
-
     assert rate_hz(attitudes) == pytest.approx(50.0, rel=0.05)
-
-
-def test_a_denied_rate_says_why(companion):
-    companion.send(
-        mav.MAVLink_command_long_message(
-            1, 1, mav.MAV_CMD_SET_MESSAGE_INTERVAL, 0, mav.MAVLINK_MSG_ID_ATTITUDE, 1000, *[0] * 5
-        )
-    )
-
-    text = companion.wait("STATUSTEXT", where=lambda m: "Requested rate" in m.text)
-
-    assert "too fast" in text.text
 
 
 @pytest.mark.parametrize(
@@ -101,34 +82,20 @@ def test_unknown_messages_are_denied(companion, message_id):
     assert companion.stream(message_id, 10) == DENIED
 
 
-def test_interval_with_a_third_parameter_is_denied(companion):
-    command = mav.MAV_CMD_SET_MESSAGE_INTERVAL
-    assert companion.command(command, mav.MAVLINK_MSG_ID_ATTITUDE, 10_000, 1.0) == DENIED
-
-
 def test_interval_minus_one_stops(companion):
     companion.stream(mav.MAVLINK_MSG_ID_ATTITUDE, 100)
     companion.wait("ATTITUDE")
-
     companion.command(mav.MAV_CMD_SET_MESSAGE_INTERVAL, mav.MAVLINK_MSG_ID_ATTITUDE, -1)
-
     assert not [m for m in companion.advance(0.5) if m.get_type() == "ATTITUDE"]
 
 
 def test_data_streams_overrule_intervals(companion):
     companion.stream(mav.MAVLINK_MSG_ID_ATTITUDE, 100)
-
     companion.send(mav.MAVLink_request_data_stream_message(1, 1, mav.MAV_DATA_STREAM_EXTRA1, 25, 1))
     companion.advance(0.1)
     attitudes = named(companion.advance(1.0), "ATTITUDE")
     companion.send(mav.MAVLink_request_data_stream_message(1, 1, mav.MAV_DATA_STREAM_EXTRA1, 0, 0))
-
     assert rate_hz(attitudes) == pytest.approx(25.0, rel=0.05)
-
-
-@pytest.mark.parametrize("number", [410, 510, 511, 512, 520, 60_000])
-def test_every_command_is_acknowledged(companion, number):
-    assert companion.command(number, 0, 0, 0.5) in range(10)
 
 
 def test_unknown_commands_are_unsupported(companion):
@@ -141,25 +108,10 @@ def test_commands_are_taken_from_any_system(companion):
     assert result == ACCEPTED
 
 
-def test_command_int_is_acknowledged_to_its_sender(companion):
-    companion.send(
-        mav.MAVLink_command_int_message(
-            1, 1, 0, mav.MAV_CMD_DO_SET_MODE, 0, 0, 1, ALT_HOLD, 0, 0, 0, 0, 0
-        ),
-        system_id=42,
-    )
-
-    ack = companion.wait("COMMAND_ACK")
-
-    assert (ack.result, ack.target_system, ack.target_component) == (ACCEPTED, 42, 191)
-
-
 @pytest.mark.parametrize("system_id", [255, 42, 1])
 def test_timesync_echoes_the_request_to_anybody(companion, system_id):
     companion.send(mav.MAVLink_timesync_message(0, 123_456_789_012), system_id=system_id)
-
     answer = companion.wait("TIMESYNC", where=lambda m: m.tc1 != 0)
-
     assert answer.ts1 == 123_456_789_012
     assert answer.tc1 > 0
     assert answer.tc1 % 1000 == 0
@@ -169,9 +121,7 @@ def test_timesync_and_telemetry_share_a_clock(companion):
     companion.stream(mav.MAVLINK_MSG_ID_ATTITUDE, 100)
     companion.send(mav.MAVLink_timesync_message(0, 1))
     answer = companion.wait("TIMESYNC", where=lambda m: m.tc1 != 0)
-
     attitude = companion.wait("ATTITUDE")
-
     assert attitude.time_boot_ms - answer.tc1 / 1e6 == pytest.approx(10.0, abs=50.0)
 
 
@@ -190,18 +140,6 @@ def test_all_params_come_with_their_index(companion):
     seen = {m.param_index for m in named(companion.seen, "PARAM_VALUE")}
     missing = set(range(count)) - seen
     assert len(missing) <= count // 20
-
     for index in missing:
         companion.send(mav.MAVLink_param_request_read_message(1, 1, b"", index))
         assert companion.wait("PARAM_VALUE").param_index == index
-
-
-@pytest.mark.parametrize("mission_type", [0, 1, 2])
-def test_there_is_no_mission(companion, mission_type):
-    companion.send(mav.MAVLink_mission_request_list_message(1, 1, mission_type))
-
-    count = companion.wait("MISSION_COUNT")
-
-    # Home is the first item of the mission once it is known: with a position, or after arming.
-    assert count.count <= (1 if mission_type == 0 else 0)
-    assert count.mission_type == mission_type

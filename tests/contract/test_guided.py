@@ -79,13 +79,11 @@ def test_a_lean_is_reached_in_its_time_and_beyond_angle_max(flying, mode):
     in_the_air(flying, mode)
     level = stream(flying, attitude(yaw_deg=yaw_deg(flying.advance(0.1))), 1.0)
     heading = yaw_deg(level)
-
     start_ms = last(level, "ATTITUDE").time_boot_ms
     messages = stream(flying, attitude(10.0, heading), 1.0)
     reached_ms = next(
         m.time_boot_ms for m in named(messages, "ATTITUDE") if math.degrees(m.roll) >= 6.3
     )
-
     assert 120 <= reached_ms - start_ms <= 270
     assert roll_deg(messages) == pytest.approx(10.0, abs=0.5)
     assert roll_deg(stream(flying, attitude(45.0, heading), 0.8)) == pytest.approx(45.0, abs=3.0)
@@ -95,9 +93,7 @@ def test_a_lean_is_reached_in_its_time_and_beyond_angle_max(flying, mode):
 def test_setpoints_of_anybody_are_taken_without_a_word(flying, mode):
     in_the_air(flying, mode)
     heading = yaw_deg(flying.advance(0.1))
-
     messages = stream(flying, attitude(10.0, heading), 1.0, system_id=42)
-
     assert roll_deg(messages) == pytest.approx(10.0, abs=1.5)
     assert not named(messages, "COMMAND_ACK")
     assert not [m for m in named(messages, "STATUSTEXT") if "EKF" not in m.text]
@@ -106,21 +102,17 @@ def test_setpoints_of_anybody_are_taken_without_a_word(flying, mode):
 def test_other_modes_ignore_setpoints(flying):
     in_the_air(flying, ALT_HOLD)
     flying.hold(0.5)
-
     flying.send(attitude(20.0))
     flying.send(velocity(3.0))
     messages = flying.hold(1.5)
-
     assert roll_deg(messages) == pytest.approx(0.0, abs=1.5)
 
 
 def test_rates_turn_and_without_rates_or_attitude_it_keeps_its_attitude(flying):
     in_the_air(flying, GUIDED_NOGPS)
     stream(flying, attitude(), 1.0)
-
     turned = stream(flying, rates(40.0), 0.5)
     assert math.degrees(last(turned, "ATTITUDE").rollspeed) == pytest.approx(40.0, abs=6.0)
-
     start = stream(flying, rates(mask=135), 0.5)
     end = stream(flying, rates(mask=135), 0.5)
     assert roll_deg(end) == pytest.approx(roll_deg(start), abs=1.5)
@@ -143,7 +135,6 @@ def test_an_invalid_setpoint_brakes_in_guided_and_is_forgotten_in_nogps(flying, 
     braked = stream(flying, invalid, 1.0)
     assert roll_deg(braked) < 2.0
     assert named(braked[-20:], "POSITION_TARGET_LOCAL_NED")
-
     assert flying.set_mode(GUIDED_NOGPS) == ACCEPTED
     stream(flying, attitude(10.0), 0.8)
     assert roll_deg(stream(flying, invalid, 0.6)) == pytest.approx(10.0, abs=1.5)
@@ -154,7 +145,6 @@ def test_a_stream_that_stops_is_held_and_resumes_at_once(flying, mode):
     in_the_air(flying, mode)
     flying.set_param("GUID_TIMEOUT", 1.0)
     stream(flying, attitude(10.0), 0.8)
-
     assert roll_deg(flying.advance(0.8)) == pytest.approx(10.0, abs=1.0)
     levelled = flying.advance(1.2)
     assert abs(roll_deg(levelled)) < 2.0
@@ -169,9 +159,7 @@ def test_a_stream_that_stops_is_held_and_resumes_at_once(flying, mode):
 def test_thrust_is_a_climb_rate_unless_an_option_says_otherwise(flying, options, thrust, climb_mps):
     in_the_air(flying, GUIDED_NOGPS)
     flying.set_param("GUID_OPTIONS", options)
-
     messages = stream(flying, attitude(thrust=thrust), 0.6 if options else 2.5)
-
     climb = -speed_ned(messages)[2]
     assert climb > climb_mps if options else climb == pytest.approx(climb_mps, abs=0.15)
 
@@ -179,15 +167,12 @@ def test_thrust_is_a_climb_rate_unless_an_option_says_otherwise(flying, options,
 def test_a_thrust_lifts_off_sticks_do_nothing_and_in_flight_only_a_forced_disarm_works(grounded):
     armed_on_the_ground(grounded, GUIDED_NOGPS)
     start_m = last(grounded.advance(0.2), "LOCAL_POSITION_NED").z
-
     stream(grounded, attitude(thrust=0.8), 5.5)
     grounded.override(1900, 1900, 1900, 1900)
     messages = stream(grounded, attitude(), 1.5)
-
     assert start_m - last(messages, "LOCAL_POSITION_NED").z > 2.0
     assert abs(roll_deg(messages)) < 1.5
     assert abs(speed_ned(messages)[2]) < 0.3
-
     grounded.stream(mav.MAVLINK_MSG_ID_HEARTBEAT, 10)
     assert grounded.command(ARM, 0) == FAILED
     assert is_armed(grounded.wait("HEARTBEAT"))
@@ -208,10 +193,8 @@ def test_the_frame_decides_on_the_axes_of_a_velocity(flying, frame, is_body):
     in_the_air(flying)
     if not 80.0 < yaw_deg(flying.advance(0.1)) < 100.0:  # else the frame before has turned it
         stream(flying, attitude(yaw_deg=90.0), 3.0)
-
     messages = stream(flying, velocity(1.0, frame=frame), 3.0)
     heading = math.radians(yaw_deg(messages))
-
     north, east = (math.cos(heading), math.sin(heading)) if is_body else (1.0, 0.0)
     assert speed_ned(messages)[:2] == pytest.approx((north, east), abs=0.2)
     target = last(messages, "POSITION_TARGET_LOCAL_NED")
@@ -223,9 +206,7 @@ def test_the_frame_decides_on_the_axes_of_a_velocity(flying, frame, is_body):
 def test_a_velocity_in_another_frame_brakes(flying, frame):
     in_the_air(flying)
     assert math.hypot(*speed_ned(stream(flying, velocity(1.5), 2.0))) > 1.2
-
     stopped = stream(flying, velocity(1.5, frame=frame), 2.5)
-
     assert math.hypot(*speed_ned(stopped)) < 0.5
 
 
@@ -233,12 +214,10 @@ def test_velocity_and_yaw_rate_take_their_measured_time(flying):
     in_the_air(flying)
     still = stream(flying, velocity(), 1.0)
     start_ms = last(still, "LOCAL_POSITION_NED").time_boot_ms
-
     messages = stream(flying, velocity(2.0), 3.0)
     reached_ms = next(m.time_boot_ms for m in named(messages, "LOCAL_POSITION_NED") if m.vx >= 1.26)
     assert reached_ms - start_ms == pytest.approx(865, abs=120)
     assert speed_ned(messages)[0] == pytest.approx(2.0, abs=0.1)
-
     turning = stream(flying, velocity(yaw_degps=30.0), 2.0)
     assert math.degrees(last(turning, "ATTITUDE").yawspeed) == pytest.approx(30.0, abs=3.0)
 
@@ -247,7 +226,6 @@ def test_a_velocity_that_stops_is_held_until_the_timeout(flying):
     in_the_air(flying)
     flying.set_param("GUID_TIMEOUT", 1.0)
     stream(flying, velocity(1.0), 2.5)
-
     assert speed_ned(flying.advance(0.8))[0] == pytest.approx(1.0, abs=0.15)
     assert math.hypot(*speed_ned(flying.advance(2.2))) < 0.3
 
@@ -256,11 +234,9 @@ def test_a_velocity_does_not_lift_off_and_ends_a_takeoff(grounded):
     armed_on_the_ground(grounded, GUIDED)
     start_m = last(grounded.advance(0.2), "LOCAL_POSITION_NED").z
     assert start_m - last(stream(grounded, velocity(z=-1.0), 3.0), "LOCAL_POSITION_NED").z < 0.3
-
     assert grounded.command(mav.MAV_CMD_NAV_TAKEOFF, *[0] * 6, 8.0) == ACCEPTED
     grounded.advance(3.2)
     messages = stream(grounded, velocity(), 3.0)
-
     assert 1.0 < start_m - last(messages, "LOCAL_POSITION_NED").z < 7.0
     assert grounded.command(mav.MAV_CMD_NAV_TAKEOFF, *[0] * 6, 12.0) == FAILED
 
@@ -278,12 +254,9 @@ def test_a_takeoff_ends_at_its_height_alt_hold_keeps_it_and_land_disarms_on_the_
     end = last(messages, "LOCAL_POSITION_NED").z
     assert start - end == pytest.approx(5.0, abs=0.7)
     assert last(messages, "EXTENDED_SYS_STATE").landed_state == mav.MAV_LANDED_STATE_IN_AIR
-
     assert grounded.set_mode(ALT_HOLD) == ACCEPTED
     held = last(grounded.hold(3.0), "LOCAL_POSITION_NED").z
-
     assert held == pytest.approx(end, abs=0.4)
-
     grounded.stream(mav.MAVLINK_MSG_ID_HEARTBEAT, 10)
     grounded.set_param("LAND_SPEED", 150.0)
     assert grounded.set_mode(LAND) == ACCEPTED
@@ -300,13 +273,11 @@ def test_attitude_target_is_the_shaped_target_and_tells_the_thrust(flying):
         flying.stream(message_id, 100)
     # After a flight that was ended in the air the firmware keeps its last thrust; the mock has 0.
     assert flying.wait("ATTITUDE_TARGET").type_mask == 0
-
     in_the_air(flying, GUIDED_NOGPS)
     heading = yaw_deg(stream(flying, attitude(), 2.0))
     messages = stream(flying, attitude(10.0, heading), 0.1)
     target = last(messages, "ATTITUDE_TARGET")
     rolled_deg = 2.0 * math.degrees(math.asin(target.q[1]))
-
     assert 0.5 < rolled_deg < 8.0
     assert math.degrees(target.body_roll_rate) > 20.0
     assert 0.2 < target.thrust < 0.6
@@ -316,9 +287,7 @@ def test_without_receiver_setpoints_do_not_stop_the_radio_failsafe(without_recei
     companion = without_receiver
     companion.fly_up(GUIDED_NOGPS)
     companion.override(1500, 1500, 1500, 1500)
-
     messages = stream(companion, attitude(), 1.6)
-
     assert "Radio Failsafe" in [m.text for m in named(messages, "STATUSTEXT")]
     assert last(messages, "HEARTBEAT").custom_mode == RTL
 
@@ -328,9 +297,7 @@ def test_an_option_lets_guided_go_on_without_sticks(without_receiver):
     companion.fly_up(GUIDED_NOGPS)
     companion.override(1500, 1500, 1500, 1500)
     companion.set_param("FS_OPTIONS", 4)
-
     messages = stream(companion, attitude(), 2.6)
-
     texts = [m.text for m in named(messages, "STATUSTEXT")]
     assert texts == ["Radio Failsafe - Continuing Guided Mode"]
     assert last(messages, "HEARTBEAT").custom_mode == GUIDED_NOGPS
@@ -345,9 +312,7 @@ def test_without_receiver_and_its_failsafe_setpoints_alone_arm_and_fly(without_r
     companion.advance(4.0)
     assert companion.set_mode(GUIDED_NOGPS) == ACCEPTED
     assert companion.arm() == FAILED
-
     companion.set_param("FS_THR_ENABLE", 0)
     assert companion.arm() == ACCEPTED
     messages = stream(companion, attitude(thrust=0.8), 6.0)
-
     assert last(messages, "LOCAL_POSITION_NED").z < -1.0

@@ -126,7 +126,6 @@ def test_mavsdk_gets_parameters_telemetry_and_arms():
         with client as mavsdk:
             console = Console(mavsdk)
             assert console.has("}\n", DEADLINE_S), console.seen
-
     found = json.loads(console.seen.partition("RESULT ")[2].splitlines()[0])
     assert found == {
         "param": 0.5,

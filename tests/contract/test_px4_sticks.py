@@ -39,29 +39,15 @@ def echoes(messages):
 )
 def test_a_field_out_of_range_is_centred(px4, sent, used):
     px4.stream(mav.MAVLINK_MSG_ID_MANUAL_CONTROL, 50)
-
     echo = echoes(px4.fly(0.5, sent))[-1]
-
     assert echo == pytest.approx(used, abs=1)
 
 
 @pytest.mark.parametrize("system_id", [255, 254, 42, 1])
 def test_sticks_are_taken_from_any_system(px4, system_id):
     px4.stream(mav.MAVLINK_MSG_ID_MANUAL_CONTROL, 50)
-
     messages = px4.repeat(lambda _: px4.sticks((300, 0, 500, 0), system_id=system_id), 0.5)
-
     assert echoes(messages)[-1][0] == pytest.approx(300, abs=1)
-
-
-def test_sticks_for_another_system_are_ignored(px4):
-    px4.stream(mav.MAVLINK_MSG_ID_MANUAL_CONTROL, 50)
-    px4.advance(1.0)
-
-    other = mav.MAVLink_manual_control_message(2, 300, 0, 500, 0, 0)
-    messages = px4.repeat(lambda _: px4.send(other), 0.5)
-
-    assert not echoes(messages)
 
 
 def test_the_echo_comes_at_the_senders_rate_and_stops_when_the_sticks_are_lost(px4):
@@ -70,7 +56,6 @@ def test_the_echo_comes_at_the_senders_rate_and_stops_when_the_sticks_are_lost(p
     sent = []
     messages = px4.repeat(lambda at_s: sent.append(at_s) or px4.sticks(MID), 2.0)
     messages += px4.advance(1.0)
-
     assert len(echoes(messages)) == pytest.approx(len(sent), abs=6)
     assert not echoes(px4.advance(1.0))
 
@@ -80,7 +65,6 @@ def test_some_input_modes_ignore_mavlinks_sticks(px4, in_mode):
     px4.change("COM_RC_IN_MODE", in_mode)
     px4.stream(mav.MAVLINK_MSG_ID_MANUAL_CONTROL, 50)
     px4.advance(1.0)
-
     assert not echoes(px4.fly(0.5))
 
 
@@ -88,9 +72,7 @@ def test_overrides_are_no_sticks(px4):
     px4.stream(mav.MAVLINK_MSG_ID_MANUAL_CONTROL, 50)
     px4.advance(1.0)
     message = mav.MAVLink_rc_channels_override_message(1, 1, 1600, 1500, 1500, 1500, *[1500] * 4)
-
     messages = px4.repeat(lambda _: px4.send(message), 0.5)
-
     assert not echoes(messages)
 
 
@@ -100,7 +82,6 @@ def test_without_sticks_their_modes_do_not_arm(px4_armable, mode):
     px4_armable.advance(1.0)
     assert px4_armable.set_mode(mode) == ACCEPTED, "disarmed, every mode is taken"
     px4_armable.seen.clear()
-
     assert px4_armable.arm() == REJECTED
     assert px4_armable.hears("Arming denied: Resolve system health failures first")
 
@@ -108,7 +89,6 @@ def test_without_sticks_their_modes_do_not_arm(px4_armable, mode):
 def test_hold_arms_without_sticks_and_return_does_not(px4_armable):
     px4_armable.get_ready(LOITER)
     px4_armable.advance(1.0)
-
     assert px4_armable.arm() == ACCEPTED
     assert px4_armable.command(ARM, 1) == ACCEPTED, "arming twice"
     assert px4_armable.command(ARM, 0) == ACCEPTED
@@ -135,7 +115,6 @@ def test_arming_needs_a_low_throttle(px4_armable, mode, z, result):
     sticks = (500, -500, z, 0)  # the others may be anywhere
     px4_armable.fly(0.3, sticks)
     px4_armable.seen.clear()
-
     assert px4_armable.arm() == result
     denied = px4_armable.hears(
         "Arming denied: throttle not in safe position", 0.7, lambda _: px4_armable.sticks(sticks)
@@ -148,37 +127,24 @@ def test_throttle_down_and_full_yaw_arms_and_disarms(px4_armable):
     px4_armable.seen.clear()
     px4_armable.fly(0.8, (0, 0, 0, 1000))
     assert "Armed by stick gesture" not in px4_armable.texts()
-
     assert px4_armable.hears(
         "Armed by stick gesture", 1.5, lambda _: px4_armable.sticks((0, 0, 0, 1000))
     )
     px4_armable.seen.clear()
-
     assert px4_armable.hears(
         "Disarmed by stick gesture", 2.5, lambda _: px4_armable.sticks((0, 0, 0, -1000))
     )
-
-
-def test_a_lean_is_no_gesture(px4_armable):
-    px4_armable.get_ready(POSCTL)
-    px4_armable.seen.clear()
-
-    px4_armable.fly(1.6, (500, 500, 0, 1000))
-
-    assert "Armed by stick gesture" not in px4_armable.texts()
 
 
 def test_who_does_not_take_off_is_disarmed(px4_armable):
     px4_armable.change("COM_DISARM_PRFLT", 4.0)
     px4_armable.get_ready(ALTCTL)
     assert px4_armable.arm() == ACCEPTED
-
     took_s, _ = px4_armable.until(
         lambda m: any("Disarmed" in x.text for x in named(m, "STATUSTEXT")),
         8.0,
         lambda _: px4_armable.sticks(MID),
     )
-
     assert 3.8 <= took_s <= 5.5
 
 
@@ -186,17 +152,10 @@ def test_a_reboot_is_denied_while_armed_even_by_force(px4_armable):
     px4_armable.get_ready(ALTCTL)
     assert px4_armable.arm() == ACCEPTED
     px4_armable.fly(0.2)
-
     reboot = mav.MAV_CMD_PREFLIGHT_REBOOT_SHUTDOWN
     assert px4_armable.command(reboot, 1) == mav.MAV_RESULT_DENIED
     assert px4_armable.command(reboot, 1, 0, 0, 0, 0, REBOOT_FORCE) == mav.MAV_RESULT_DENIED
     assert px4_armable.command(reboot, 0) == ACCEPTED, "which asks for nothing"
-
-
-def test_an_odd_arm_value_is_not_answered(px4_armable):
-    px4_armable.send(mav.MAVLink_command_long_message(1, 1, ARM, 0, 2, *[0] * 6))
-    acks = named(px4_armable.advance(0.5), "COMMAND_ACK")
-    assert ARM not in [m.command for m in acks]
 
 
 @pytest.mark.parametrize(
@@ -209,28 +168,22 @@ def test_an_odd_arm_value_is_not_answered(px4_armable):
     ],
 )
 def test_altctl_leans_by_the_tangent(px4_flying, sticks, axis, expected_deg):
-
     attitude = named(px4_flying.fly(1.5, sticks), "ATTITUDE")[-1]
-
     assert math.degrees(getattr(attitude, axis)) == pytest.approx(expected_deg, abs=1.0)
 
 
 @pytest.mark.parametrize(("r", "expected_degps"), [(100, 0.0), (500, 34.5), (1000, 145.0)])
 def test_yaw_has_a_dead_zone_and_an_expo(px4_flying, r, expected_degps):
     px4_flying.fly(1.5, (0, 0, 500, r))
-
     attitudes = named(px4_flying.fly(0.5, (0, 0, 500, r)), "ATTITUDE")
     turned = math.remainder(attitudes[-1].yaw - attitudes[0].yaw, 2 * math.pi)
     span_s = (attitudes[-1].time_boot_ms - attitudes[0].time_boot_ms) / 1e3
-
     assert math.degrees(turned) / span_s == pytest.approx(expected_degps, abs=3.0 + 0.005 * r)
 
 
 @pytest.mark.parametrize(("z", "low_mps", "high_mps"), [(550, -0.25, 0.25), (750, 0.45, 0.95)])
 def test_throttle_is_a_climb_rate_with_a_dead_zone(px4_flying, z, low_mps, high_mps):
-
     messages = px4_flying.fly(2.5, (0, 0, z, 0))
-
     positions = named(messages, "LOCAL_POSITION_NED")[-25:]
     climb_mps = -sum(m.vz for m in positions) / len(positions)
     assert low_mps <= climb_mps <= high_mps
@@ -246,12 +199,10 @@ def test_a_lean_comes_an_eighth_of_a_second_after_the_stick(px4_flying):
         lags_ms.append(next(m.time_boot_ms for m in attitudes if m.roll > math.radians(2.0)))
         lags_ms[-1] -= begin_ms
         px4_flying.fly(1.5)
-
     assert sorted(lags_ms)[1] == pytest.approx(143, abs=25)
 
 
 def test_in_flight_only_a_forced_disarm_works(px4_expendable):
-
     assert px4_expendable.command(ARM, 0) == REJECTED
     assert px4_expendable.hears(
         "Disarming denied: not landed", 2.0, lambda _: px4_expendable.sticks(MID)
