@@ -20,7 +20,7 @@ from policy.contract import Contract
 from policy.data.flight_data import DatasetError, FlightData, common_frame, common_terms
 from policy.data.flight_folders import find_flights, leave_out_failed, read_flight
 from policy.data.lerobot import is_lerobot, read_dataset
-from policy.engines.devices import require_devices
+from policy.engines.runner import require_devices
 from policy.loading.builtin import builtin_config
 from policy.stick_loop import rates_contract
 from policy.training.policy_run import Check, Network, train_policy

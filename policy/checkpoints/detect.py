@@ -1,15 +1,11 @@
 """Identify a file or folder that was passed as a policy's weights and is not ours.
 
-Everything is read by hand: no torch, and no pickle is executed.
+Everything is read by hand, without torch. What a pickle holds is said by whoever reads it.
 """
 
-import io
 import json
-import pickletools
 import struct
 import zipfile
-import zlib
-from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -18,14 +14,8 @@ from policy.files import open_regular, read_json, stand_in_of
 HEAD_BYTES = 4096
 MAX_HEADER_BYTES = 100_000_000
 """Longest header of safetensors, as its own reader has it."""
-MAX_PICKLE_BYTES = 16_000_000
-MAX_PICKLES = 4
 LEROBOT_TYPES = ("act", "diffusion")
 """Types of LeRobot policies that fly from their files."""
-_PREFACE = ("PROTO", "FRAME", "MARK", "MEMOIZE", "PUT", "BINPUT", "LONG_BINPUT")
-"""Opcodes that come before, or between, those that say what is pickled."""
-_TENSOR_MODULES = ("torch", "torch._utils", "torch.nn.parameter", "torch.serialization")
-_PLAIN_MODULES = ("collections", "_codecs", "builtins", "__builtin__", "copyreg", "copy_reg")
 _FOLDERS: tuple[tuple[str, str, str], ...] = (
     ("pretrained_model/", "a folder of LeRobot's training", "fly it with --policy lerobot:{0}/{1}"),
     (
@@ -63,8 +53,6 @@ def _file(path: Path) -> tuple[str, str] | None:
         if head[8:9] == b"{":
             (length,) = struct.unpack("<Q", file.read(8))
             return _safetensors(path, file.read(min(length, MAX_HEADER_BYTES)))
-        if head.startswith(b"\x80"):
-            return _pickle(path, file.read(MAX_PICKLE_BYTES))
     if path.suffix == ".onnx":
         return "an ONNX model", f"fly it with --policy onnx:{path}"
     return None
@@ -76,67 +64,10 @@ def _zip(path: Path) -> tuple[str, str] | None:
             names = archive.namelist()
             if any("/code/" in name or name.endswith("/constants.pkl") for name in names):
                 return "a TorchScript archive", f"fly it with --policy torchscript:{path}"
-            if (pickled := next((n for n in names if n.endswith("data.pkl")), None)) is None:
-                return "a zip archive", "unpack it, and name what is in it"
-            with archive.open(pickled) as file:
-                return _pickle(path, file.read(MAX_PICKLE_BYTES))
-    except (zipfile.BadZipFile, zlib.error, RuntimeError, EOFError, ValueError):
+            is_torch = any(name.endswith("data.pkl") for name in names)
+            return None if is_torch else ("a zip archive", "unpack it, and name what is in it")
+    except (zipfile.BadZipFile, ValueError):
         return "cut short, or damaged", "copy or download it again, and compare its size"
-
-
-def _pickle(path: Path, content: bytes) -> tuple[str, str] | None:
-    """Name the classes that a pickle would look up; None where tensors alone will do."""
-    names, is_object = _globals_of(content)
-    classes = [
-        f"{module}.{name}"
-        for module, name in names
-        if module not in (*_TENSOR_MODULES, *_PLAIN_MODULES)
-    ]
-    if not classes:
-        return None
-    if is_object:
-        return (
-            f"a whole pickled object ({classes[0]}), and loading that could run any program",
-            "where it was trained, save model.state_dict() for a network of this project; for "
-            "another one save torch.jit.trace(model, example) (--policy torchscript:FILE) or write "
-            "a class that builds it (--policy ./file.py:Class)",
-        )
-    return (
-        f"weights with other pickled objects beside them ({', '.join(classes[:3])}), and loading "
-        "those could run any program",
-        "where you trust it, save the weights alone: torch.save({'state_dict': "
-        f"torch.load('{path.name}', weights_only=False)['state_dict']}}, 'weights.pt')",
-    )
-
-
-def _globals_of(content: bytes) -> tuple[list[tuple[str, str]], bool]:
-    """(module, name) of everything that pickles would look up, and whether one of them begins so.
-
-    Old files of torch are four pickles in a row. A damaged one gives what comes before the damage.
-    """
-    found: list[tuple[str, str]] = []
-    has_object = False
-    stream = io.BytesIO(content)
-    with suppress(Exception):  # pickletools raises whatever the bytes lead it to
-        for _ in range(MAX_PICKLES):
-            texts: list[str] = []
-            is_first = True
-            for opcode, argument, _ in pickletools.genops(stream):
-                before = len(found)
-                if opcode.name in ("GLOBAL", "INST"):
-                    module, _, name = str(argument).partition(" ")
-                    found.append((module, name))
-                elif opcode.name == "STACK_GLOBAL" and len(texts) >= 2:
-                    found.append((texts[-2], texts[-1]))
-                elif isinstance(argument, str):
-                    texts.append(argument)
-                    continue
-                elif opcode.name in _PREFACE:
-                    continue
-                if is_first and len(found) > before:
-                    has_object = has_object or found[-1][0] not in _PLAIN_MODULES
-                is_first = False
-    return found, has_object
 
 
 def _safetensors(path: Path, text: bytes) -> tuple[str, str] | None:

@@ -9,6 +9,7 @@ read without executing pickles, and what they do not say is taken from the calle
 import copy
 import json
 import pickle
+import re
 import struct
 import warnings
 from dataclasses import asdict
@@ -27,7 +28,7 @@ from policy.checkpoints.header import (
     require_file,
     require_header,
 )
-from policy.checkpoints.state_dicts import FoundWeights, find_weights
+from policy.checkpoints.state_dicts import find_weights
 from policy.checkpoints.tensors import (
     pack,
     read_tensors,
@@ -60,6 +61,8 @@ _DAMAGED = (
     *(AssertionError, ArithmeticError, MemoryError, struct.error),
 )
 """Raised by torch.load on flipped bytes, which its reader interprets before it checks them."""
+_UNSUPPORTED = re.compile(r"GLOBAL (\S+)")
+"""In an error of torch.load's: the class that it refuses to look up."""
 
 
 def build_policy(config: BuiltinConfig) -> BuiltinPolicy:
@@ -122,20 +125,21 @@ def load_checkpoint_with_notes(
         if name.startswith(VECTOR_PREFIX)
     }
     require_finite(path, vector)
+    note: str | None = None
     if is_ours:
-        found = FoundWeights(state=unpack(tensors))
+        state = unpack(tensors)
     else:
-        found = find_weights(path, tensors, shapes_of(policy))
-    require_finite(path, found.state)
+        state, note = find_weights(path, tensors, shapes_of(policy))
+    require_finite(path, state)
     require_fit(
-        *(path, policy, found.state),
+        *(path, policy, state),
         "Name the size and encoder of its training, as in --policy toge:medium:resnet18",
     )
-    policy.load_state_dict(found.state)
+    policy.load_state_dict(state)
     policy.eval()
     if vector:
         _require_reproduced(path, policy, vector)
-    return policy, () if found.note is None else (found.note,)
+    return policy, () if note is None else (note,)
 
 
 def load_checkpoint(path: Path, *, fallback: BuiltinConfig) -> BuiltinPolicy:
@@ -218,9 +222,13 @@ def read_torch(path: Path) -> dict[Any, Any]:
             warnings.simplefilter("ignore")  # of file formats; what matters is refused below
             loaded: object = torch.load(path, map_location="cpu", weights_only=True)
     except pickle.UnpicklingError as error:
+        named = _UNSUPPORTED.search(str(error))
+        held = f"a pickle that holds a {named[1]}" if named else "damaged, or no pickle of tensors"
         raise CheckpointError(
-            f"{path}: refused. It is damaged, or a pickle that holds more than tensors, and "
-            "loading that could run any program. Save only model.state_dict() where it was trained"
+            f"{path} is {held}, and loading that could run any program. Where it was trained save "
+            "model.state_dict() alone, for a network of this project; for another one save "
+            "torch.jit.trace(model, example) (--policy torchscript:FILE), or write a class that "
+            "builds it (--policy ./file.py:Class)"
         ) from error
     except _DAMAGED as error:
         raise CheckpointError(why_unreadable(path, error)) from error

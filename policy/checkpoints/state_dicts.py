@@ -2,7 +2,6 @@
 
 import re
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -18,38 +17,17 @@ Shapes = Mapping[str, tuple[int, ...]]
 """Shape of each weight by its name."""
 
 
-@dataclass(frozen=True, kw_only=True)
-class FoundWeights:
-    """A state dict with the names of the network, and where it was found."""
-
-    state: dict[str, Tensor]
-    where: str = ""
-    """Keys and prefix that were taken away; empty where the file is a state dict."""
-    left: str = ""
-    """Where other weights were that fit as well; averaged ones are taken in place of these."""
-
-    @property
-    def is_averaged(self) -> bool:
-        """An average of weights, by its name."""
-        return _AVERAGED.search(self.where) is not None
-
-    @property
-    def note(self) -> str | None:
-        """A line for a person where there was a choice, or a prefix."""
-        if self.is_averaged:
-            besides = f", not those under {self.left!r}" if self.left else ""
-            return f"the averaged weights under {self.where!r} fly{besides}"
-        return None if self.where in ("", *USUAL_KEYS[:2]) else f"weights under {self.where!r}"
-
-
-def find_weights(path: Path, loaded: Mapping[Any, Any], wanted: Shapes) -> FoundWeights:
+def find_weights(
+    path: Path, loaded: Mapping[Any, Any], wanted: Shapes
+) -> tuple[dict[str, Tensor], str | None]:
     """Return the weights in a file that fit a network, or else those that come nearest.
 
     They may lie under keys (``state_dict``, ``ema``) and behind prefixes (``module.``, ``net.``).
-    Averaged weights are preferred to those that they are the average of.
+    Averaged weights are preferred to those that they are the average of. The second value is a line
+    for a person where there was a choice, or a prefix.
     """
     found = [
-        FoundWeights(state=state, where=f"{key}.{prefix}".strip("."))
+        (f"{key}.{prefix}".strip("."), state)
         for key, table in _tables(loaded)
         for prefix, state in _behind_prefixes(table, wanted)
     ]
@@ -58,14 +36,16 @@ def find_weights(path: Path, loaded: Mapping[Any, Any], wanted: Shapes) -> Found
             f"{path}: no weights found; it must hold 'model_state_dict' or 'state_dict', or be a "
             f"state dict itself, and holds {sorted(map(str, loaded))[:8]}"
         )
-    fitting = [each for each in found if not misfits(each.state, wanted)]
+    fitting = [each for each in found if not misfits(each[1], wanted)]
     if not fitting:
-        return min(found, key=lambda each: len(misfits(each.state, wanted)))
-    averaged = [each for each in fitting if each.is_averaged]
-    plain = [each for each in fitting if not each.is_averaged]
-    if averaged and plain:
-        return replace(averaged[0], left=plain[0].where)
-    return (averaged or plain)[0]
+        return min((state for _, state in found), key=lambda each: len(misfits(each, wanted))), None
+    averaged = [each for each in fitting if _AVERAGED.search(each[0])]
+    where, state = (averaged or fitting)[0]
+    if averaged:
+        plain = next((name for name, _ in fitting if not _AVERAGED.search(name)), None)
+        besides = f", not those under {plain!r}" if plain is not None else ""
+        return state, f"the averaged weights under {where!r} fly{besides}"
+    return state, None if where in ("", *USUAL_KEYS[:2]) else f"weights under {where!r}"
 
 
 def misfits(state: Mapping[str, Tensor], wanted: Shapes) -> list[str]:

@@ -1,4 +1,4 @@
-"""OpenVINO graphs compiled for the CPU, or taken from the user's cache.
+"""OpenVINO graphs converted and compiled for the CPU, or taken from the user's cache.
 
 Each graph infers on the calling thread alone, without the GIL, on arrays that are bound once.
 Threads are not pinned to cores: measured beside a second loop, pinning was slower or made no
@@ -6,20 +6,25 @@ difference.
 """
 
 import contextlib
+import ctypes
 import hashlib
 import io
+import logging
 import os
-from collections.abc import Callable
+import sys
+import warnings
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import openvino as ov
 import torch
+from torch import Tensor, nn
 
 from policy.contract import FloatArray
-from policy.engines.runner import Precision
-from policy.engines.signal_stack import signal_stack_kept
-from policy.errors import PolicyError
+from policy.engines.runner import Precision, Shape
+from policy.errors import PolicyError, user_code
 from policy.files import whole_file
 
 MAX_ENTRIES = 24
@@ -81,6 +86,42 @@ class CompileCache:
 
 NAME = "openvino"
 DEVICE = "CPU"
+_SS_DISABLE = 2
+"""bits/ss_flags.h: no alternate stack."""
+
+
+class _StackT(ctypes.Structure):
+    """stack_t of Linux, see sigaltstack(2)."""
+
+    _fields_ = (
+        ("ss_sp", ctypes.c_void_p),
+        ("ss_flags", ctypes.c_int),
+        ("ss_size", ctypes.c_size_t),
+    )
+
+
+@contextlib.contextmanager
+def signal_stack_kept() -> Iterator[None]:
+    """Give the calling thread its alternate signal stack back, or none if it had none.
+
+    OpenVINO's CPU plugin gives the thread that loads it an alternate signal stack, and frees that
+    memory with the last of its objects. Python's handlers ask for the alternate stack, so the next
+    Ctrl-C would be handled in memory that is gone, and end the process with the sticks still held.
+    (Seen with 2026.4: ``sigaltstack`` after loading, a segmentation fault in ``kill`` later.)
+    """
+    if sys.platform != "linux":
+        yield
+        return
+    sigaltstack = ctypes.CDLL(None, use_errno=True).sigaltstack
+    before = _StackT()
+    sigaltstack(None, ctypes.byref(before))
+    try:
+        yield
+    finally:
+        if sigaltstack(ctypes.byref(before), None) != 0:
+            # Too small for what the CPU must save by now (AMX): none is better than a freed one.
+            none = _StackT(ss_sp=None, ss_flags=_SS_DISABLE, ss_size=0)
+            sigaltstack(ctypes.byref(none), None)
 
 
 @signal_stack_kept()
@@ -161,3 +202,47 @@ class Graph:
     def rest(self) -> list[FloatArray]:
         """Return copies of the further outputs of the last run."""
         return [array.copy() for array in self._outputs[1:]]
+
+
+class Traceable(nn.Module):
+    """A function of tensors as a module, with the modules whose weights it uses."""
+
+    def __init__(self, held: nn.Module, function: Callable[..., Any]) -> None:
+        super().__init__()
+        self.held = held
+        self.function = function
+
+    def forward(self, *arrays: Tensor) -> Any:
+        """Call the function."""
+        return self.function(*arrays)
+
+
+@contextlib.contextmanager
+def quiet() -> Iterator[None]:
+    """Keep tracer and converter from writing to the terminal, and from muting others for good."""
+    level, disabled = logging.root.level, logging.root.manager.disable
+    fast_path = torch.backends.mha.get_fastpath_enabled()
+    try:
+        logging.disable(logging.CRITICAL)
+        # The fused layer of torch's own transformers is an operation that no converter knows.
+        torch.backends.mha.set_fastpath_enabled(False)
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # each shape check of ours is one, rightly constant
+            yield
+    finally:
+        torch.backends.mha.set_fastpath_enabled(fast_path)
+        logging.disable(disabled)
+        logging.root.setLevel(level)
+
+
+def convert(policy: nn.Module, function: Callable[..., Any], shapes: Sequence[Shape]) -> ov.Model:
+    """``function`` of float32 tensors of these shapes, which uses the weights of ``policy``.
+
+    It is traced: what it decides by a tensor's values is decided once, by zeros.
+    """
+    with user_code("converting it for OpenVINO failed"), quiet():
+        return ov.convert_model(
+            Traceable(policy, function).eval(),
+            example_input=tuple(torch.zeros(shape) for shape in shapes),
+            input=[list(shape) for shape in shapes],
+        )

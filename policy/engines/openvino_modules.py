@@ -17,8 +17,13 @@ from torch import Tensor, nn
 from torch.export import ExportedProgram
 
 from policy.engines.kept import modules_of
-from policy.engines.openvino_compile import GraphCompiler, engine_name
-from policy.engines.openvino_graph import Traceable, quiet
+from policy.engines.openvino_compile import (
+    GraphCompiler,
+    Traceable,
+    engine_name,
+    quiet,
+    signal_stack_kept,
+)
 from policy.engines.runner import (
     ArrayFunction,
     Compile,
@@ -27,7 +32,6 @@ from policy.engines.runner import (
     Shape,
     make_runner,
 )
-from policy.engines.signal_stack import signal_stack_kept
 from policy.engines.stepwise import make_stepwise_runner
 from policy.engines.torch_eager import run_eagerly
 from policy.errors import PolicyError, user_code

@@ -29,8 +29,7 @@ from policy.adapters.websocket.kind import SCHEMES, check_server, load_server_po
 from policy.checkpoints.detect import detect
 from policy.checkpoints.header import read_contract
 from policy.contract import Contract
-from policy.engines.devices import require_devices
-from policy.engines.runner import ExecutionSettings, make_numpy_runner
+from policy.engines.runner import ExecutionSettings, make_numpy_runner, require_devices
 from policy.errors import PolicyError, user_code, warned
 from policy.files import user_path
 from policy.loading.builtin import BUILTIN_KINDS, builtin_checkpoint, load_builtin, parse_builtin

@@ -24,7 +24,7 @@ from policy.data.flight_folders import read_ages
 from policy.data.frames import FrameStore
 from policy.data.interpolation import Indices
 from policy.data.samples import Timeline
-from policy.engines.openvino_graph import BulkEncoder
+from policy.engines.openvino_cpu import BulkEncoder
 from policy.errors import PolicyError
 from policy.nets.backbones import load_imagenet_state
 from policy.nets.resnet_unet import ResnetUnetConfig

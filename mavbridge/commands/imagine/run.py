@@ -38,7 +38,7 @@ from mavbridge.core.stopping import INTERRUPTED, stop_on_signals
 from mavbridge.flight.policies import load_configured_policy
 from mavbridge.recording.flight_folder import open_flight
 from policy.checkpoints.world_model_file import load_world_model
-from policy.engines.devices import require_devices
+from policy.engines.runner import require_devices
 from policy.errors import Warned
 from policy.world_model.model import WorldModel
 

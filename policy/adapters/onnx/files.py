@@ -25,13 +25,8 @@ if TYPE_CHECKING:
 ENCODER, DENOISER, HEAD, WHOLE = "encoder.onnx", "denoiser.onnx", "head.onnx", "policy.onnx"
 KINDS = f"{ENCODER} and {DENOISER}, {ENCODER} and {HEAD}, or {WHOLE} alone"
 
-_EXTERNAL = re.compile(rb"\x0a\x08location\x12([\x01-\x7f])(.{0,127})", re.DOTALL)
-_OFFSET, _LENGTH = (
-    re.compile(rb"\x0a\x06" + key + rb"\x12[\x01-\x14](\d+)") for key in (b"offset", b"length")
-)
-"""Entries of ``TensorProto.external_data`` (onnx.proto): a key and its value, both texts."""
-_GRAPH_FIELD = 7
-"""Of ONNX's ModelProto."""
+_EXTERNAL = re.compile(r"externally stored data in file \((.+), offset: ")
+"""In an error of OpenVINO's: the file that lacks the weights."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -88,72 +83,31 @@ def _graphs(spec: str, path: Path) -> tuple[Path | None, Path]:
 
 def read_graph(path: Path) -> "ov.Model":
     """Read an ONNX file and the files of its weights."""
-    from openvino import Core  # not needed to find the files
+    from openvino import frontend  # not needed to find the files
 
-    _require_external_data(path)
-    if not _is_whole(path.read_bytes()):  # else parsers of all formats tell what they think of it
-        error = ValueError("it is something else, or breaks off")
-        raise CheckpointError(why_unreadable(path, error, "ONNX"))
+    # By the frontend of ONNX alone: else parsers of all formats tell what they think of the file.
+    reader = frontend.FrontEndManager().load_by_framework("onnx")
+    failures = (
+        *(RuntimeError, frontend.GeneralFailure, frontend.OpConversionFailure),
+        *(frontend.OpValidationFailure, frontend.NotImplementedFailure),
+    )
     try:
-        return Core().read_model(path)
-    except RuntimeError as error:
+        loaded = reader.load(str(path))
+    except failures as error:
+        if (found := _EXTERNAL.search(str(error))) is None:
+            raise CheckpointError(why_unreadable(path, error, "ONNX")) from error
+        beside = path.parent / found[1]
+        what, advice = stand_in(beside) or ("missing or cut short", "copy both files again")
+        raise CheckpointError(
+            f"{beside}, which holds the weights of {path.name}, is {what}: {advice}"
+        ) from error
+    try:
+        model: ov.Model = reader.convert(loaded)
+    except failures as error:
         raise CheckpointError(
             f"{path} holds what OpenVINO cannot run ({last_line(error)}): export it with operators "
             "of the ONNX standard alone, and without errors of onnx.checker"
         ) from error
-
-
-def _is_whole(content: bytes) -> bool:
-    """Return whether these are fields of a protobuf message, whole, with a graph (7) among them."""
-    at, numbers = 0, set()
-    try:
-        while at < len(content):
-            key, at = _varint(content, at)
-            numbers.add(key >> 3)
-            match key & 7:
-                case 0:
-                    _, at = _varint(content, at)
-                case 2:
-                    size, at = _varint(content, at)
-                    at += size
-                case 1 | 5 as kind:
-                    at += 8 if kind == 1 else 4
-                case _:
-                    return False
-    except IndexError:
-        return False
-    return at == len(content) and _GRAPH_FIELD in numbers
-
-
-def _varint(content: bytes, at: int) -> tuple[int, int]:
-    """Read a number of protobuf; returns it, and where the next field begins."""
-    value = shift = 0
-    while True:
-        byte = content[at]
-        value, at, shift = value | (byte & 0x7F) << shift, at + 1, shift + 7
-        if not byte & 0x80:
-            return value, at
-
-
-def _require_external_data(path: Path) -> None:
-    """Raise CheckpointError if a file with tensors of the graph is missing or too short."""
-    content = path.read_bytes()
-    needed: dict[str, int] = {}
-    for found in _EXTERNAL.finditer(content):
-        name = found[2][: found[1][0]].decode(errors="replace")
-        entry = content[found.end(1) : found.end(1) + found[1][0] + 80]
-        entry = entry.partition(b"\x0a\x08location")[0]  # of the next tensor
-        ends = [int(each[1]) if (each := key.search(entry)) else 0 for key in (_OFFSET, _LENGTH)]
-        needed[name] = max(needed.get(name, 0), sum(ends))
-    for name, size in needed.items():
-        beside = path.parent / name
-        if not beside.is_file():
-            raise CheckpointError(
-                f"{path}: {name} is missing beside it, and holds its weights: copy both files"
-            )
-        has = beside.stat().st_size
-        if has < size:
-            what, advice = stand_in(beside) or ("cut short", "copy it again")
-            raise CheckpointError(
-                f"{beside} is {what} ({has} bytes, {path.name} needs {size}): {advice}"
-            )
+    if not model.outputs:
+        raise CheckpointError(why_unreadable(path, ValueError("there is no graph in it"), "ONNX"))
+    return model

@@ -11,9 +11,8 @@ import openvino as ov
 
 from policy.adapters.onnx.files import read_graph
 from policy.contract import FloatArray
-from policy.engines.openvino_compile import Graph, GraphCompiler
+from policy.engines.openvino_compile import Graph, GraphCompiler, signal_stack_kept
 from policy.engines.runner import Precision, Shape
-from policy.engines.signal_stack import signal_stack_kept
 from policy.errors import CheckpointError, PolicyError
 from policy.files import last_line
 

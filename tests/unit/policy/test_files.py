@@ -43,14 +43,6 @@ def test_a_pipe_is_no_file_and_is_not_waited_for(pipe: Path) -> None:
             open_regular(path)
 
 
-def test_settings_from_a_pipe_are_refused_at_once(pipe, capsys):
-    with pytest.raises(SystemExit):
-        main(["--config", str(pipe)])
-    assert "not a file" in capsys.readouterr().err
-    with pytest.raises(ContractError, match="not a file"):
-        read_interface(pipe)
-
-
 @pytest.mark.parametrize("text", ["[" * 200_000, '{"a":' * 100_000, "[" * 2_000 + "1,"])
 def test_json_that_is_nested_too_deeply_is_a_value_error(text: str) -> None:
     with pytest.raises(ValueError, match=r"nested too deeply|Expecting value"):
@@ -80,13 +72,6 @@ def test_toml_that_would_fill_the_memory_is_refused(content, told, tmp_path, cap
         main(["--config", str(path), "--connect", "udp:127.0.0.1:1"])
     assert ended.value.code == 2
     assert told in capsys.readouterr().err.replace("\n", " ")
-
-
-def test_lines_of_the_longest_length_take_little_memory(tmp_path: Path) -> None:
-    path = tmp_path / "settings.toml"
-    lines = [f"k{number}." + "a." * 990 + "a = 1" for number in range(32)]
-    path.write_text("\n".join(lines))
-    assert len(read_toml(path)) == 32
 
 
 @pytest.mark.parametrize("newline", ["\n", "\r\n"])

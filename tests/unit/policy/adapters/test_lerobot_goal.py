@@ -44,17 +44,9 @@ def folder(request: pytest.FixtureRequest, tmp_path: Path) -> Path:
     save_file({}, tmp_path / "model.safetensors")
     policy = build_policy_of(read_plan(tmp_path, None))
     shapes = json.loads((tmp_path / SHAPES_FILE).read_text())
-    prefix = policy.net.prefix
-    ours = {name: tuple(value.shape) for name, value in policy.net.state_dict().items()}
-    named = {
-        name: shape
-        for name, shape in shapes.items()
-        if policy.net.own_name(name.removeprefix(prefix)) in ours
-    }
-    drawn = {
-        name: weight(name, ours[policy.net.own_name(name.removeprefix(prefix)) or ""])
-        for name in named
-    }
+    prefix, ours = policy.net.prefix, policy.net.state_dict()
+    owns = {name: policy.net.own_name(name.removeprefix(prefix)) or "" for name in shapes}
+    drawn = {n: weight(n, tuple(ours[own].shape)) for n, own in owns.items() if own in ours}
     save_file(drawn, tmp_path / "model.safetensors")
     return tmp_path
 

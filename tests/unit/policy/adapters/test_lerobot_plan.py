@@ -59,15 +59,12 @@ def test_the_contract_of_an_act_is_that_of_its_map(tmp_path):
     ("change", "said"),
     [
         ({"type": "pi0"}, "type must be one of act, diffusion, got 'pi0'"),
-        ({"vision_backbone": "vit"}, "vision_backbone must be one of resnet18"),
         ({"prediction_type": "v_prediction"}, "prediction_type must be one of epsilon, sample"),
         ({"use_group_norm": None}, "no entry 'use_group_norm', and its default differs"),
         ({"down_dims": [16, 32, 64, 128]}, "a horizon of 8 does not suit"),
         ({"crop_shape": [65, 65]}, "cannot crop"),
-        ({"crop_shape": [65]}, "crop_shape must be a height and a width"),
         ({"kernel_size": True}, "kernel_size must be a positive integer"),
         ({"clip_sample": 1}, "clip_sample must be true or false"),
-        ({"beta_start": "0"}, "beta_start must be a number"),
         ({"use_peft": True}, "merge"),
         ({"input_features": {}}, "images must be of one shape"),
         (
@@ -198,12 +195,6 @@ def test_statistics_before_version_0_4_lie_in_the_weights(folder):
         np.testing.assert_array_equal(ours.shift, theirs.shift)
         np.testing.assert_array_equal(ours.divisor, theirs.divisor)
         assert (ours.gain, ours.bias) == (theirs.gain, theirs.bias)
-
-
-def test_a_folder_without_any_statistics_is_refused(folder):
-    (folder / "policy_preprocessor.json").unlink()
-    with pytest.raises(CheckpointError, match="holds no statistics"):
-        read_plan(folder, None)
 
 
 def test_statistics_that_a_mode_needs_are_named(folder):

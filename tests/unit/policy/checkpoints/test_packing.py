@@ -35,7 +35,4 @@ def test_packing_again_keeps_every_step() -> None:
     again = pack(unpack(packed), coarse="backbone.")
     for name, value in packed.items():
         torch.testing.assert_close(again[name], value)
-
-
-def test_what_is_not_packed_is_left_alone() -> None:
     assert all(torch.equal(unpack(STATE)[name], value) for name, value in STATE.items())

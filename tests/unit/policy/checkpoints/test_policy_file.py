@@ -8,6 +8,7 @@ import pytest
 import torch
 from safetensors import safe_open
 from safetensors.torch import save_file
+from torch import nn
 
 from policy.checkpoints.policy_file import (
     build_policy,
@@ -15,7 +16,7 @@ from policy.checkpoints.policy_file import (
     save_checkpoint,
 )
 from policy.contract import Contract
-from policy.errors import CheckpointError, PolicyError
+from policy.errors import CheckpointError
 from policy.nets.diffusion import NoiseSchedule
 from policy.nets.resnet_unet import ResnetUnetConfig
 from policy.nets.toge import Toge, TogeConfig
@@ -80,9 +81,6 @@ def test_a_test_vector_is_carried_and_kept(small_toge: Toge, saved: Path) -> Non
     ("changes", "message"),
     [
         ({"test_vector.chunks": lambda x: x + 0.02}, r"off by 0\.02.*damaged"),
-        ({"test_vector.chunks": lambda x: x[:2]}, "chunks of shape"),
-        ({"test_vector.chunks": lambda x: x * float("nan")}, "NaN"),
-        ({"test_vector.rgb": lambda x: x.flip(0)}, "do not make the sticks"),
         ({"test_vector.rgb": lambda x: x.float()}, "test vector is damaged: an image must be"),
         ({"test_vector.state": lambda x: x[:, :12]}, "test vector is damaged: state must be"),
         ({"test_vector.history": lambda x: None}, "test vector is damaged: it must hold"),
@@ -99,23 +97,6 @@ def test_weights_that_do_not_make_their_vector(small_toge, saved, tmp_path, chan
     save_file(contents, path, metadata=header_of(saved))
     with pytest.raises(CheckpointError, match=message):
         load_checkpoint(path, fallback=small_toge.config)
-
-
-def test_resnet_unet_round_trips(tmp_path: Path) -> None:
-    policy = build_policy(ResnetUnetConfig(contract=SMALL))
-    save_checkpoint(tmp_path / "a.safetensors", policy)
-    loaded = load_checkpoint(tmp_path / "a.safetensors", fallback=ResnetUnetConfig())
-    assert loaded.config == policy.config
-
-
-@pytest.mark.parametrize("key", ["model_state_dict", "state_dict", None])
-@pytest.mark.parametrize("suffix", [".pt", ".pth"])
-def test_torch_files_load_in_their_usual_forms(small_toge, tmp_path, key, suffix):
-    path = tmp_path / f"a{suffix}"
-    state = small_toge.state_dict()
-    torch.save({key: state, "epoch": 3} if key else state, path)
-    loaded = load_checkpoint(path, fallback=small_toge.config)
-    assert torch.equal(loaded.state_dict()["fusion.mlp.0.weight"], state["fusion.mlp.0.weight"])
 
 
 class Malicious:
@@ -139,6 +120,14 @@ def test_a_malicious_pickle_is_refused_and_not_run(small_toge, tmp_path, protoco
     with pytest.raises(CheckpointError, match="could run any program"):
         load_checkpoint(path, fallback=small_toge.config)
     assert not marker.exists()
+
+
+@pytest.mark.parametrize("zipped", [True, False])
+def test_a_pickled_network_is_named_with_its_ways_to_fly(small_toge, tmp_path, zipped):
+    path = tmp_path / "a.pt"
+    torch.save(nn.Linear(2, 2), path, _use_new_zipfile_serialization=zipped)
+    with pytest.raises(CheckpointError, match=r"holds a torch\.nn.*--policy torchscript:FILE"):
+        load_checkpoint(path, fallback=small_toge.config)
 
 
 def test_a_torch_file_with_a_contract_is_refused_and_not_flown_by_another(
@@ -193,11 +182,9 @@ def test_weights_that_do_not_fit_are_named(small_toge, tmp_path, name, tensor, m
         ("contract", {"feature_dim": 384}, "feature_dim 384"),
         ("contract", {"unknown": 1}, "unknown contract keys"),
         ("architecture", {"size": "huge"}, "size 'huge' is unknown"),
-        ("architecture", {"size": ["small"]}, "is unknown"),
         ("architecture", {"backbone": "vgg16"}, "backbone 'vgg16' is unknown"),
         ("architecture", {"policy": "other"}, "policy 'other' is unknown"),
         ("architecture", {"depth": 3}, "malformed architecture"),
-        ("architecture", {"schedule": 3}, "malformed architecture"),
         ("architecture", {"schedule": {"betas": "quadratic"}}, "betas 'quadratic' is unknown"),
     ],
 )
@@ -210,13 +197,8 @@ def test_headers_of_another_build_are_refused(saved, tmp_path, key, changes, mes
     assert str(path) in str(caught.value)
 
 
-NONSENSE = ["[" * 100_000, "null", "[]", "{"]
-
-
-@pytest.mark.parametrize(
-    ("key", "text"),
-    [*(("contract", text) for text in NONSENSE), *(("architecture", t) for t in [*NONSENSE, "{}"])],
-)
+@pytest.mark.parametrize("text", ["[" * 100_000, "null", "[]", "{"])
+@pytest.mark.parametrize("key", ["contract", "architecture"])
 def test_header_text_that_is_nonsense_is_refused(saved, tmp_path, key, text):
     path = with_header(tmp_path / "a.safetensors", {**header_of(saved), key: text})
     with pytest.raises(CheckpointError, match=r"a\.safetensors"):
@@ -235,10 +217,3 @@ def test_a_file_without_header_says_how_to_convert_it(saved, tmp_path, key):
 def test_another_kind_of_policy_is_refused(saved: Path) -> None:
     with pytest.raises(CheckpointError, match="--policy toge"):
         load_checkpoint(saved, fallback=ResnetUnetConfig())
-
-
-def test_a_path_that_cannot_be_written_is_refused(small_toge: Toge, tmp_path: Path) -> None:
-    with pytest.raises(CheckpointError, match="cannot write"):
-        save_checkpoint(tmp_path / "no" / "folder.safetensors", small_toge)
-    with pytest.raises(PolicyError, match="rename"):
-        save_checkpoint(tmp_path / "a.pt", small_toge)

@@ -96,7 +96,6 @@ def test_weights_that_are_not_finite_or_do_not_fit_are_refused(model, tmp_path):
         sick.action_mean[1] = 1e6  # no float16
     with pytest.raises(CheckpointError, match="action_mean"):
         save_world_model(path, sick)
-    assert not path.exists()
     save_world_model(path, model)
     header = read_tensors(path)[0]
     state = load_file(path)
@@ -112,12 +111,9 @@ def test_weights_that_are_not_finite_or_do_not_fit_are_refused(model, tmp_path):
 @pytest.mark.parametrize(
     ("key", "text", "says"),
     [
-        ("world_model", "[", "malformed"),
         ("world_model", "[" * 100_000, "malformed"),
-        ("world_model", "[1]", "must hold"),
         ("world_model", "{}", "must hold"),
         ("world_model", CONFIG.to_json().replace('"frames": 4', '"frames": 0'), "frames"),
-        ("world_model", CONFIG.to_json().replace('"frames": 4', '"frames": "4"'), "frames"),
         ("contract", "{}x", "not JSON"),
         ("contract", '{"version": 99}', "version 99"),
     ],
@@ -132,19 +128,18 @@ def test_headers_of_another_make_are_refused(model, tmp_path, key, text, says):
 
 
 def test_a_path_that_cannot_be_written_leaves_the_old_file(model, tmp_path):
-    with pytest.raises(CheckpointError, match="cannot write"):
-        save_world_model(tmp_path / "missing" / "a.safetensors", model)
-    with pytest.raises(CheckpointError, match="rename"):
-        save_world_model(tmp_path / "a.pt", model)
+    for path, says in (
+        (tmp_path / "missing" / "a.safetensors", "cannot write"),
+        (tmp_path / "a.pt", "rename"),
+    ):
+        with pytest.raises(CheckpointError, match=says):
+            save_world_model(path, model)
     path = tmp_path / "a.safetensors"
     save_world_model(path, model)
     before = path.read_bytes()
-    (tmp_path / "folder.safetensors").mkdir()
-    with pytest.raises(CheckpointError, match="cannot write"):
-        save_world_model(tmp_path / "folder.safetensors", model)
     sick = WorldModel(CONFIG)
     sick.action_mean[0] = float("inf")
     with pytest.raises(CheckpointError, match="action_mean"):
         save_world_model(path, sick)
     assert path.read_bytes() == before
-    assert sorted(p.name for p in tmp_path.iterdir()) == ["a.safetensors", "folder.safetensors"]
+    assert list(tmp_path.iterdir()) == [path]

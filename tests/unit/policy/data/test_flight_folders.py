@@ -1,5 +1,5 @@
-import json
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pyarrow as pa
@@ -15,7 +15,7 @@ from helpers.flight_folders import (
     write_meta,
     write_spot_flight,
 )
-from policy.data.flight_data import DatasetError, common_frame, hold_out
+from policy.data.flight_data import DatasetError, hold_out
 from policy.data.flight_folders import (
     failure_of,
     find_flights,
@@ -104,24 +104,20 @@ def test_failed_flights_are_left_out_and_counted_unless_they_are_asked_for(tmp_p
         leave_out_failed([tmp_path / "b"], include_failed=False)
 
 
-def test_folders_of_flights_are_opened(tmp_path: Path) -> None:
-    for name in ("b", "a"):
-        write_meta(tmp_path / "flights" / name)
-    found = find_flights([tmp_path / "flights", tmp_path / "flights" / "a"])
-    assert [path.name for path in found] == ["a", "b"]
-
-
 @pytest.mark.parametrize(
     ("meta", "says"),
     [
+        ("{", "not JSON"),
+        ("[]", "not a flight of mavbridge"),
         ({"format": "other"}, "not a flight of mavbridge"),
         ({"version": 2}, "version 2"),
-        ({"contract": {}}, "state frame is"),
         ({"contract": None}, "state frame is"),
     ],
 )
-def test_a_foreign_folder_is_refused(tmp_path: Path, meta: dict[str, object], says: str) -> None:
-    write_meta(tmp_path, **meta)
+def test_a_foreign_folder_is_refused(tmp_path: Path, meta: Any, says: str) -> None:
+    write_meta(tmp_path, **(meta if isinstance(meta, dict) else {}))
+    if isinstance(meta, str):
+        (tmp_path / "meta.json").write_text(meta)
     with pytest.raises(DatasetError, match=says):
         read_flight(tmp_path)
 
@@ -136,52 +132,31 @@ def test_no_flights_are_refused(tmp_path: Path) -> None:
     write_meta(tmp_path)
     with pytest.raises(DatasetError, match=r"neither ticks\.parquet nor"):
         read_flight(tmp_path)
-
-
-def test_a_flight_without_frames_is_refused(tmp_path: Path) -> None:
     ticks = ticks_table(woke_ns=WOKE, expert=[STICK] * 3, sent=[STICK] * 3)
     folder = flight(tmp_path / "a", ticks)
+    assert find_flights([tmp_path, folder]) == [tmp_path.resolve(), folder.resolve()]
     (folder / "camera.mp4").unlink()
     with pytest.raises(DatasetError, match="no frames"):
         read_flight(folder)
 
 
-def test_meta_that_is_not_json_is_refused(tmp_path: Path) -> None:
-    (tmp_path / "meta.json").write_text("{")
-    with pytest.raises(DatasetError, match="not JSON"):
-        read_flight(tmp_path)
-    (tmp_path / "meta.json").write_text(json.dumps([]))
-    with pytest.raises(DatasetError, match="not a flight"):
-        read_flight(tmp_path)
-
-
-def test_numbers_that_are_none_are_refused(tmp_path: Path) -> None:
-    bad = (0.0, float("nan"), 0.0, 0.0)
-    ticks = ticks_table(woke_ns=WOKE, expert=[STICK, bad, STICK], sent=[STICK] * 3)
-    with pytest.raises(DatasetError, match="expert holds NaN or infinity in row 1"):
-        read_flight(flight(tmp_path / "a", ticks))
-    fast = (900.0, *LEVEL[1:])
-    ticks = ticks_table(woke_ns=WOKE, expert=[STICK] * 3, sent=[STICK] * 3, state=[fast] * 3)
-    with pytest.raises(DatasetError, match="vx_mps reaches 900"):
-        read_flight(flight(tmp_path / "b", ticks))
-    ticks = ticks_table(woke_ns=WOKE, expert=[(2.0, 0, 0, 0)] * 3, sent=[STICK] * 3)
-    with pytest.raises(DatasetError, match="target must be sticks"):
-        read_flight(flight(tmp_path / "c", ticks))
-    ticks = ticks_table(woke_ns=[0, 20 * MS, 10 * MS], expert=[STICK] * 3, sent=[STICK] * 3)
-    with pytest.raises(DatasetError, match="runs backwards at row 2"):
-        read_flight(flight(tmp_path / "d", ticks))
-    ticks = ticks_table(woke_ns=WOKE, expert=[None] * 3, sent=[STICK] * 3)
-    with pytest.raises(DatasetError, match="nobody to learn from"):
-        read_flight(flight(tmp_path / "e", ticks))
-
-
-def test_two_kinds_of_flights_are_refused(tmp_path: Path) -> None:
-    ticks = ticks_table(woke_ns=WOKE, expert=[STICK] * 3, sent=[STICK] * 3)
-    ned = read_flight(flight(tmp_path / "a", ticks))
-    enu = read_flight(flight(tmp_path / "b", ticks, contract={"state_frame": "enu_flu"}))
-    assert common_frame([enu]) == "enu_flu"
-    with pytest.raises(DatasetError, match="one kind at a time"):
-        common_frame([ned, enu])
+@pytest.mark.parametrize(
+    ("changes", "says"),
+    [
+        (
+            {"expert": [STICK, (0, float("nan"), 0, 0), STICK]},
+            "expert holds NaN or infinity in row 1",
+        ),
+        ({"state": [(900.0, *LEVEL[1:])] * 3}, "vx_mps reaches 900"),
+        ({"expert": [(2.0, 0, 0, 0)] * 3}, "target must be sticks"),
+        ({"woke_ns": [0, 20 * MS, 10 * MS]}, "runs backwards at row 2"),
+        ({"expert": [None] * 3}, "nobody to learn from"),
+    ],
+)
+def test_numbers_that_are_none_are_refused(tmp_path, changes, says):
+    good = {"woke_ns": WOKE, "expert": [STICK] * 3, "sent": [STICK] * 3}
+    with pytest.raises(DatasetError, match=says):
+        read_flight(flight(tmp_path / "a", ticks_table(**{**good, **changes})))
 
 
 def test_ages_are_measured_where_a_policy_looked(tmp_path: Path) -> None:
@@ -215,16 +190,12 @@ def test_some_flights_are_held_out_and_some_are_kept(tmp_path: Path) -> None:
         ({"source": "dagger", "success": False}, None),
         ({"source": "dagger", "success": False, "ticks": 0}, "empty"),
         ({"source": "flight", "success": None}, None),
-        ({"source": "flight", "success": None, "finished": True}, None),
         ({"source": "flight", "success": None, "finished": False}, "cut off"),
         ({"source": "flight", "success": None, "outcome": {"end": "duration"}}, None),
-        ({"source": "flight", "success": None, "outcome": {"end": "takeover"}}, None),
         ({"source": "flight", "success": None, "outcome": {"end": "fault"}}, "ended by a fault"),
         ({"source": "flight", "success": True, "outcome": {"end": "fault"}}, None),
         ({"source": "flight", "outcome": {"end": "course", "crash": "hit gate 7"}}, "crashed"),
-        ({"source": "flight", "success": False, "outcome": {"end": "duration"}}, "off the course"),
         ({"source": "flight", "success": False, "crash": "it lay on its back"}, "crashed"),
-        ({"source": "pilot", "success": None}, None),
         ({"source": "pilot", "success": None, "finished": False}, None),
         ({"source": "pilot", "success": True, "crash": "a hard landing"}, None),
         ({"source": "pilot", "success": False}, "marked as bad"),
@@ -239,10 +210,7 @@ def test_a_failed_flight_is_nothing_to_imitate(tmp_path, meta, failure):
     ("contract", "says"),
     [
         ({"action": "velocity"}, "was flown by velocity: this build learns from sticks and body"),
-        ({"action": "attitude"}, "was flown by attitude"),
-        ({"action": "thrust"}, "was flown by thrust"),
         ({"action": "rates", "state_frame": "enu_flu"}, "learns body rates in ned_frd alone"),
-        ({"action": "rates", "hover_thrust": None}, "None in its contract is no number above 0"),
         ({"action": "rates", "hover_thrust": 0.0}, "0.0 in its contract is no number above 0"),
         ({"action": "rates"}, "without an expert"),
     ],

@@ -80,12 +80,6 @@ def test_a_shift_moves_down_and_right_and_repeats_the_edge() -> None:
     assert moved[3].tolist() == [9, 10, 11, 11]
 
 
-def test_no_image_at_all_is_an_error(episode: FlightData, tmp_path: Path) -> None:
-    with pytest.raises(DatasetError, match="no frame of its video"):
-        store_frames([replace(episode, fingerprint="empty", decode=lambda: iter(()))], tmp_path, 32)
-    assert list(tmp_path.iterdir()) == []
-
-
 def test_a_disk_without_room_is_refused_before_decoding(episode, tmp_path, monkeypatch):
     full = SimpleNamespace(free=1000)
     monkeypatch.setattr(dataset_frames.shutil, "disk_usage", lambda path: full)

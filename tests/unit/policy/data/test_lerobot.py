@@ -127,12 +127,9 @@ def _second_camera(info: dict[str, Any]) -> None:
     ("change", "says"),
     [
         (lambda info: info.update(codebase_version="v2.1"), "convert_dataset_v21_to_v30"),
-        (lambda info: info.pop("codebase_version"), "version None"),
         (lambda info: info.update(fps=0), "fps"),
-        (lambda info: info.update(features=[]), "no features"),
         (lambda info: info["features"].pop("observation.state"), "no feature observation.state"),
         (_state(shape=[14]), r"shape \[14\]"),
-        (_state(names=None), "named None"),
         (_state(names=list(STATE_NAMES[::-1])), "in this order"),
         (_state(info={"state_frame": "body"}), "state frame is 'body'"),
         (lambda info: info["features"].pop(CAMERA), "no camera"),
@@ -192,7 +189,6 @@ def _scalar_state(root: Path) -> None:
     ("spoil", "says"),
     [
         (lambda root: _edit_rows(root, "observation.state", _nan), "NaN or infinity in row 3"),
-        (lambda root: _edit_rows(root, "action", _nan), "action holds NaN"),
         (lambda root: _edit_rows(root, "timestamp", lambda v: v[::-1]), "runs backwards"),
         (lambda root: _edit_rows(root, "timestamp", lambda v: [None, *v[1:]]), "missing in 1"),
         (lambda root: _edit_rows(root, "action", lambda v: [[7.0] * 4] * len(v)), "sticks in"),
@@ -208,7 +204,6 @@ def _scalar_state(root: Path) -> None:
             lambda root: (root / "meta/episodes/chunk-000/file-000.parquet").unlink(),
             "no meta/episodes",
         ),
-        (lambda root: (root / "meta/info.json").write_text("{"), "not JSON"),
     ],
 )
 def test_a_damaged_dataset_is_refused(spoil, says, tmp_path):
@@ -228,13 +223,6 @@ def test_a_video_that_ends_early_is_refused(shown: int, says: str, tmp_path: Pat
     assert len(list(first.decode())) == LENGTHS[0]
     with pytest.raises(DatasetError, match=says):
         list(second.decode())
-
-
-def test_a_file_that_is_no_video_is_refused(tmp_path: Path) -> None:
-    root = write(tmp_path / "a")
-    (root / f"videos/{CAMERA}/chunk-000/file-000.mp4").write_bytes(b"no video")
-    with pytest.raises(DatasetError, match=r"file-000\.mp4 cannot be read"):
-        list(read_dataset(root)[0].decode())
 
 
 @pytest.mark.parametrize(

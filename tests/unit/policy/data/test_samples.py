@@ -113,16 +113,6 @@ def test_chunk_by_hand() -> None:
     np.testing.assert_allclose(chunk[1, :, 1], [0.65, 0.75, 0.75, 0.75], atol=1e-6)  # held
 
 
-def test_sticks_far_apart_are_not_interpolated() -> None:
-    episode = flown()
-    keep = np.r_[0:100, 130:200]  # 300 ms without an expert
-    gappy = replace(episode, target_ns=episode.target_ns[keep], target=episode.target[keep])
-    known = timeline(gappy).chunks(np.arange(200))[1]
-    assert known[60:80].all()
-    assert not known[101:130].any(axis=1).any()
-    assert known[97].tolist() == [True, False, False, False]
-
-
 def test_since_exposure_by_hand() -> None:
     """A quarter turn to the right in 100 ms, gathering 1 m/s northwards, nose east at exposure."""
     tick_ns = np.arange(5) * 100 * MS

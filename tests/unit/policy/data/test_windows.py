@@ -93,16 +93,6 @@ def test_states_are_those_of_the_exposures_and_follow_the_actions() -> None:
     assert YAW_RATE_RADPS > np.abs(samples.states[..., 9]).max() > 0.5
 
 
-def test_among_keeps_what_needs_no_other_frame() -> None:
-    found = windows_of(steered_flight(0))
-    part = found.among(np.arange(20))
-    assert part.frames.max() < 20
-    assert len(part) == 5
-    assert len(found.among(np.arange(3))) == 0
-    assert len(found.spread(10)) == 10
-    assert len(part.spread(10)) == 5
-
-
 def test_flights_without_a_window_are_refused() -> None:
     with pytest.raises(DatasetError, match="33 ms apart"):
         windows_of(steered_flight(0, seconds=0.3))

@@ -15,7 +15,6 @@ from policy.engines.parity import make_parity_samples, parity_failure
 from policy.engines.runner import ExecutionSettings
 from policy.engines.torch_eager import make_torch_runner
 from policy.nets.names import Size
-from policy.nets.resnet_unet import ResnetUnetConfig
 from policy.nets.toge import Toge, TogeConfig
 
 pytestmark = [
@@ -41,33 +40,9 @@ def test_toge_computes_what_torch_computes(size: Size, since_exposure: bool) -> 
     assert parity_failure(expected, chunks) is None
 
 
-def test_single_rate_computes_what_torch_computes() -> None:
-    torch.manual_seed(0)
-    policy, samples = (
-        build_policy(ResnetUnetConfig(contract=SMALL)).eval(),
-        make_parity_samples(SMALL),
-    )
-    settings = ExecutionSettings(name="r", dual_rate=False)
-    expected = chunks_of_samples(make_torch_runner(policy, settings), samples)
-    on_gpu = ExecutionSettings(
-        name="r", dual_rate=False, vision_device="cuda", action_device="cuda"
-    )
-    assert (
-        parity_failure(expected, chunks_of_samples(make_cuda_graph_runner(policy, on_gpu), samples))
-        is None
-    )
-
-
 def test_the_default_on_a_gpu_is_the_graph(small_toge: Toge) -> None:
     runner, notes = choose_runner(small_toge, "auto", ON_GPU)
     assert runner.engine == "cuda-graph", notes
-
-
-def test_the_same_inputs_give_the_same_sticks(small_toge: Toge) -> None:
-    runner = make_cuda_graph_runner(small_toge, ON_GPU)
-    samples = make_parity_samples(small_toge.contract)
-    first, second = (chunks_of_samples(runner, samples) for _ in range(2))
-    np.testing.assert_array_equal(first, second)
 
 
 def test_the_shipped_policy_is_that_of_torch(trained_toge: Toge) -> None:

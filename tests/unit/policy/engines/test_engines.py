@@ -1,5 +1,6 @@
 from collections.abc import Callable
 from dataclasses import replace
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -9,7 +10,7 @@ import torch
 from policy.contract import Contract
 from policy.engines.runner import ExecutionSettings, make_numpy_runner
 from policy.engines.torch_eager import make_torch_runner
-from policy.errors import PolicyError
+from policy.errors import PolicyError, user_code
 from policy.nets.toge import Toge
 from policy.preprocess import image_to_input
 from policy.protocol import SingleRatePolicy
@@ -37,20 +38,6 @@ def test_dual_rate_torch_matches_the_net_called_directly(small_toge: Toge) -> No
         expected = small_toge.predict(image, torch.tensor(STATE), torch.tensor(HISTORY), 3)
     assert feature.dtype == chunk.dtype == np.float32
     np.testing.assert_array_equal(chunk, expected.numpy())
-
-
-def test_single_rate_carries_the_image_to_act(small_toge: Toge) -> None:
-    dual, single = (
-        make_torch_runner(
-            small_toge, ExecutionSettings(name="toge", num_diffusion_steps=2, dual_rate=dual_rate)
-        )
-        for dual_rate in (True, False)
-    )
-    image = single.encode(RGB)
-    assert image.shape == (1, 3, 32, 32)
-    np.testing.assert_array_equal(
-        single.act(image, STATE, HISTORY), dual.act(dual.encode(RGB), STATE, HISTORY)
-    )
 
 
 @pytest.mark.parametrize("dual_rate", [True, False])
@@ -139,3 +126,55 @@ def test_dual_rate_needs_a_fast_path() -> None:
     policy: SingleRatePolicy = Slow()
     with pytest.raises(PolicyError, match="fly it single-rate"):
         make_numpy_runner(policy, ExecutionSettings(name="slow"))
+
+
+@pytest.mark.parametrize("error", [AssertionError("no"), OSError("no"), SystemExit("no")])
+def test_whatever_is_raised_becomes_one_message_with_its_place(error: BaseException) -> None:
+    with (
+        pytest.raises(PolicyError, match=rf"flying: {type(error).__name__}: no \(.*:\d+\)") as info,
+        user_code("flying"),
+    ):
+        raise error
+    assert Path(__file__).name in str(info.value)
+    assert info.value.__cause__ is error
+
+
+def test_what_is_clear_already_passes() -> None:
+    with pytest.raises(PolicyError, match=r"^clear$"), user_code("flying"):
+        raise PolicyError("clear")
+
+
+class Careless:
+    """Writes to what it is given, and returns what it writes to again."""
+
+    contract = Contract(arrays="numpy", feature_dim=2)
+
+    def __init__(self) -> None:
+        self._feature = np.zeros((1, 2), np.float32)
+
+    def encode_visual(self, image: np.ndarray) -> np.ndarray:
+        image *= 0.5
+        self._feature += 1
+        return self._feature
+
+    def predict_fast(
+        self, feature: np.ndarray, state: np.ndarray, history: np.ndarray, steps: int
+    ) -> np.ndarray:
+        feature += 1
+        state[:, :3] /= 5
+        return np.zeros((1, 16, 4), np.float32)
+
+    predict = predict_fast
+
+
+def test_a_careless_policy_harms_nobody() -> None:
+    runner = make_numpy_runner(Careless(), ExecutionSettings(name="careless"))
+    first = runner.encode(np.zeros((8, 8, 3), np.uint8))
+    first.setflags(write=False)  # as the vision loop publishes it
+    before = first.copy()
+    runner.encode(np.zeros((8, 8, 3), np.uint8))
+    state = np.ones((1, 13), np.float32)
+    state.setflags(write=False)
+    runner.act(first, state, np.zeros((1, 4, 4), np.float32))
+    assert (first == before).all()
+    assert (state == 1).all()

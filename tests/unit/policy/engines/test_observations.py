@@ -4,19 +4,15 @@ from typing import Any
 
 import numpy as np
 import pytest
-import torch
-from torch import Tensor, nn
 
 from policy.contract import Contract
-from policy.engines.choose import chunks_of_samples
-from policy.engines.parity import make_parity_samples, parity_failure
+from policy.engines.parity import make_parity_samples
 from policy.engines.runner import (
     ExecutionSettings,
     encode_all,
     level_state,
     make_numpy_runner,
 )
-from policy.engines.torch_eager import make_torch_runner
 from policy.protocol import PolicyRunner
 
 SMALL = {"image_height": 16, "image_width": 24, "horizon": 2, "feature_dim": 3}
@@ -92,46 +88,6 @@ def test_single_rate_images_keep_camera_and_time_apart(steps, cameras, expected)
     image, _ = seen_by(make_numpy_runner(policy, settings), policy)
     assert image.shape == (1, *policy.contract.image_shape)
     np.testing.assert_allclose(image[0].mean(axis=(-3, -2, -1)), expected, atol=1e-4)
-
-
-class Mixing(nn.Module):
-    """Uses every number of every input, and a layer of its own for each camera."""
-
-    def __init__(self, contract: Contract) -> None:
-        super().__init__()
-        self.contract = contract
-        pixels = 3 * contract.image_height * contract.image_width
-        cameras = len(contract.cameras)
-        self.eyes = nn.ModuleList(nn.Linear(pixels, 3) for _ in range(cameras))
-        inputs = contract.observation_steps * (3 * cameras + contract.state_dim) + 16
-        self.hand = nn.Linear(inputs, 8)
-
-    def encode_visual(self, image: Tensor, camera: int = 0) -> Tensor:
-        return torch.tanh(self.eyes[camera](image.flatten(1)))
-
-    def predict_fast(self, feature: Tensor, state: Tensor, history: Tensor, steps: int) -> Tensor:
-        everything = torch.cat([part.flatten(1) for part in (feature, state, history)], dim=1)
-        return torch.tanh(self.hand(everything)).reshape(-1, 2, 4)
-
-    def predict(self, image: Tensor, state: Tensor, history: Tensor, steps: int) -> Tensor:
-        raise NotImplementedError
-
-
-@pytest.mark.parametrize(("steps", "cameras"), [(1, 1), (2, 1), (1, 2), (3, 2)])
-def test_openvino_computes_what_torch_computes(steps: int, cameras: int) -> None:
-    openvino_cpu = pytest.importorskip("policy.engines.openvino_cpu")
-    with torch.random.fork_rng(devices=[]):
-        torch.manual_seed(0)
-        module = Mixing(contract_of(steps, cameras, "torch")).eval()
-    settings, samples = ExecutionSettings(name="mixing"), make_parity_samples(module.contract)
-    expected = chunks_of_samples(make_torch_runner(module, settings), samples)
-    made = openvino_cpu.make_openvino_runner(module, settings, "f32", "f32")
-    assert parity_failure(expected, chunks_of_samples(made, samples)) is None
-    # The gate sees a camera that takes the other's place, and a state that takes its successor's.
-    if cameras > 1:
-        module.eyes = nn.ModuleList(reversed(module.eyes))
-        changed = chunks_of_samples(make_torch_runner(module, settings), samples)
-        assert parity_failure(expected, changed) is not None
 
 
 def test_parity_samples_have_every_extra_input() -> None:

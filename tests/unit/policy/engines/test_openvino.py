@@ -1,6 +1,5 @@
 """The OpenVINO engine against plain torch, on a CPU; every graph is compiled once per test run."""
 
-import logging
 import subprocess
 import sys
 from dataclasses import replace
@@ -9,18 +8,15 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from torch import Tensor, nn
 
 from policy.checkpoints.policy_file import BuiltinConfig, BuiltinPolicy, build_policy
 from policy.contract import Contract, FloatArray
 from policy.engines import openvino_cpu
-from policy.engines.choose import choose_runner, chunks_of_samples
-from policy.engines.openvino_compile import precisions
-from policy.engines.openvino_cpu import make_openvino_runner
-from policy.engines.openvino_graph import BulkEncoder, denoise_graph
+from policy.engines.choose import chunks_of_samples
+from policy.engines.openvino_compile import precisions, signal_stack_kept
+from policy.engines.openvino_cpu import BulkEncoder, denoise_graph, make_openvino_runner
 from policy.engines.parity import make_parity_samples
 from policy.engines.runner import ExecutionSettings, Precision
-from policy.engines.signal_stack import signal_stack_kept
 from policy.engines.torch_eager import make_torch_runner
 from policy.errors import PolicyError
 from policy.nets.diffusion import NoiseSchedule
@@ -136,35 +132,6 @@ def test_refuses_an_array_of_another_shape(shipped):
     state = np.zeros((1, runner.contract.state_dim), np.float32)
     with pytest.raises(PolicyError, match=r"input 0 must be \[1, 256\], got \[1, 1\]"):
         runner.act(np.zeros((1, 1), np.float32), state, np.zeros((1, 4, 4), np.float32))
-
-
-class UserModule(nn.Module):
-    """A module of a user: dual-rate, with parameters of its own."""
-
-    def __init__(self) -> None:
-        super().__init__()
-        self.contract = Contract(image_height=16, image_width=16, feature_dim=3, horizon=4)
-        self.layer = nn.Linear(16, 16)
-
-    def encode_visual(self, image: Tensor) -> Tensor:
-        return image.mean(dim=(2, 3))
-
-    def predict_fast(self, feature: Tensor, state: Tensor, history: Tensor, steps: int) -> Tensor:
-        read = self.layer(torch.cat([feature, state], dim=1)).reshape(1, 4, 4)
-        return (read + history.mean()).tanh()
-
-    def predict(self, image: Tensor, state: Tensor, history: Tensor, steps: int) -> Tensor:
-        return self.predict_fast(self.encode_visual(image), state, history, steps)
-
-
-def test_a_users_module_that_cannot_be_traced_flies_on_torch() -> None:
-    policy = UserModule()
-    policy.encode_visual = lambda image: torch.linalg.qr(image)[0].mean(dim=(2, 3))  # type: ignore[method-assign]
-    level = logging.root.level
-    runner, notes = choose_runner(policy, "openvino", ExecutionSettings(name="mine"))
-    assert runner.engine == "torch"
-    assert all("is passed over" in note for note in notes)
-    assert logging.root.level == level  # the converter raises it
 
 
 def cached(folder: Path) -> list[Path]:

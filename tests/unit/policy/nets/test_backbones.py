@@ -4,6 +4,7 @@ import torch
 from policy.errors import PolicyError
 from policy.nets.backbones import build_backbone, load_imagenet_state
 from policy.nets.names import BACKBONE_NAMES, BackboneName
+from policy.nets.pooling import moments
 
 # Names and shapes of torchvision's published ImageNet state dicts.
 KNOWN_PARAMETERS: list[tuple[BackboneName, str, tuple[int, ...]]] = [
@@ -44,47 +45,36 @@ KNOWN_TOTALS: list[tuple[BackboneName, int, int]] = [
 
 
 @pytest.mark.parametrize(("name", "total", "out_dim"), KNOWN_TOTALS)
-def test_has_torchvisions_parameter_count(name: BackboneName, total: int, out_dim: int) -> None:
+def test_has_torchvisions_parameters(name: BackboneName, total: int, out_dim: int) -> None:
     backbone = build_backbone(name)
     classifier = out_dim * 1000 + 1000
     assert sum(p.numel() for p in backbone.parameters()) + classifier == total
     assert backbone.out_dim == 3 * out_dim
+    state = backbone.state_dict()
+    for known, key, shape in KNOWN_PARAMETERS:
+        assert known != name or tuple(state[key].shape) == shape
 
 
-@pytest.mark.parametrize("name", [name for name, _, _ in KNOWN_TOTALS])
-def test_has_torchvisions_names_and_shapes(name: BackboneName) -> None:
-    state = build_backbone(name).state_dict()
-    for backbone, key, shape in KNOWN_PARAMETERS:
-        if backbone == name:
-            assert tuple(state[key].shape) == shape
-
-
-@pytest.mark.parametrize("size", [32, 64, 97])
 @pytest.mark.parametrize("name", BACKBONE_NAMES)
-def test_pools_any_image_size(name: BackboneName, size: int) -> None:
+@torch.inference_mode()
+def test_an_untrained_feature_says_where_and_any_size_has_one(name: BackboneName) -> None:
     backbone = build_backbone(name).eval()
-    with torch.inference_mode():
-        feature = backbone(torch.randn(2, 3, size, size))
-    assert feature.shape == (2, backbone.out_dim)
-    assert torch.isfinite(feature).all()
-
-
-@pytest.mark.parametrize("name", BACKBONE_NAMES)
-def test_untrained_feature_depends_on_the_image(name: BackboneName) -> None:
-    images = torch.randn(2, 3, 64, 64, generator=torch.Generator().manual_seed(0))
-    with torch.inference_mode():
-        first, second = build_backbone(name).eval()(images)
-    assert (first - second).abs().max() > 1e-3 * first.abs().max()
-    assert first.abs().max() > 1e-6
-
-
-@pytest.mark.parametrize("name", BACKBONE_NAMES)
-def test_feature_says_where(name: BackboneName) -> None:
     images = torch.zeros(2, 3, 96, 96)
     images[0, :, 40:56, 16:32] = images[1, :, 40:56, 64:80] = 3.0  # whole strides apart
-    with torch.inference_mode():
-        left, right = build_backbone(name).eval()(images)
-    assert (left - right).abs().max() > 1e-2 * left.abs().max()
+    left, right = backbone(images)
+    assert (left - right).abs().max() > 1e-2 * left.abs().max() > 1e-8
+    for size in (32, 97):
+        assert backbone(torch.randn(2, 3, size, size)).shape == (2, backbone.out_dim)
+
+
+def test_moments_say_where_a_spot_is_at_every_size() -> None:
+    for size in (4, 8):
+        features = torch.zeros(1, 1, size, size)
+        features[0, 0, 3 * size // 4 :, : size // 4] = 1.0  # low, left
+        average, across, down = moments(features)[0, :, 0]
+        assert average == features.mean()
+        assert float(across / average) == pytest.approx(-(3**0.5) * 0.75)
+        assert float(down / average) == pytest.approx(3**0.5 * 0.75)
 
 
 def test_imagenet_weights_load_without_their_classifier() -> None:

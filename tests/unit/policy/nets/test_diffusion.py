@@ -53,13 +53,6 @@ def test_steps_start_at_pure_noise_and_end_clean(count: int) -> None:
         assert step.signal**2 + step.noise**2 == pytest.approx(1.0)
 
 
-def test_one_step_is_the_nets_estimate_of_the_clean_sample() -> None:
-    estimate = torch.tensor([[-0.5, 0.25, 3.0, -7.0]])
-    schedule = NoiseSchedule(prediction="sample")
-    result = solve(schedule, 1, lambda *_: estimate, torch.randn(1, 4))
-    assert result.tolist() == [[-0.5, 0.25, 1.0, -1.0]]
-
-
 DEVIATION = 0.1
 
 

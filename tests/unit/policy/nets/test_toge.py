@@ -49,17 +49,6 @@ def test_an_observation_is_encoded_as_in_two_parts(small_toge: Toge, past: str) 
 
 
 @torch.inference_mode()
-def test_the_single_rate_network_takes_no_history_either() -> None:
-    image, state, history = sample()
-    contract = Contract(image_height=32, image_width=32)
-    net = ResnetUnet(ResnetUnetConfig(contract=contract)).eval()
-    net.seed_noise(1)
-    centred = net.encode_observation(image, state, history * 0)
-    assert torch.equal(net.encode_observation(image, state), centred)
-    assert torch.equal(net.predict(image, state), net.head.sample(centred, 10))
-
-
-@torch.inference_mode()
 @pytest.mark.parametrize("changed", ["image", "state", "history"])
 def test_every_input_reaches_the_sticks(small_toge: Toge, changed: str) -> None:
     inputs = dict(zip(("image", "state", "history"), sample(), strict=True))
@@ -170,6 +159,8 @@ def test_resnet_unet_flies_single_rate_only() -> None:
     assert chunk.abs().max() <= 1.0
     assert not torch.equal(policy.predict(image, state + 0.5, history, 3), chunk)
     assert not torch.equal(policy.predict(image, state, -history, 3), chunk)
+    centred = policy.encode_observation(image, state, history * 0)
+    assert torch.equal(policy.encode_observation(image, state), centred)
     with pytest.raises(PolicyError, match="action_history"):
         policy.predict(image, state, history[:, :2], 3)
 
