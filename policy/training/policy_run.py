@@ -12,8 +12,6 @@ import torch
 from torch import Tensor, nn
 
 from policy.checkpoints.policy_file import (
-    BuiltinPolicy,
-    build_policy,
     load_checkpoint,
     read_torch,
     save_checkpoint,
@@ -27,8 +25,7 @@ from policy.data.samples import Timeline
 from policy.engines.openvino_cpu import BulkEncoder
 from policy.errors import PolicyError
 from policy.nets.backbones import load_imagenet_state
-from policy.nets.resnet_unet import ResnetUnetConfig
-from policy.nets.toge import TogeConfig
+from policy.nets.toge import Toge, TogeConfig
 from policy.training.batches import Batch, Batches, FeatureStore, normalise_image
 from policy.training.encode import ENCODE_BATCH, Encode, encode_rows, one_way_first
 from policy.training.parallel import StepLoss, computing_in
@@ -39,7 +36,6 @@ from policy.training.settings import MAX_AGE_MS, TrainSettings
 from policy.training.stages import TrainingStage, policy_stages
 from policy.training.trainee import Trainee, refresh_batch_norm, validate
 
-Network: TypeAlias = TogeConfig | ResnetUnetConfig
 Check: TypeAlias = Callable[[Path], float]
 """Flies a checkpoint in closed loop and returns a score: more is better."""
 
@@ -58,7 +54,7 @@ HEAD_RATE = 3
 
 def train_policy(
     flights: Sequence[FlightData],
-    network: Network,
+    network: TogeConfig,
     settings: TrainSettings,
     hooks: Hooks,
     check: Check | None = None,
@@ -77,7 +73,7 @@ class _PolicyRun(TrainingRun[Trainee, Batch]):
     def __init__(
         self,
         flights: Sequence[FlightData],
-        network: Network,
+        network: TogeConfig,
         settings: TrainSettings,
         folder: RunFolder,
         hooks: Hooks,
@@ -237,19 +233,19 @@ def _evenly(range_ms: tuple[float, float]) -> Nanoseconds:
     return np.linspace(low_ms * NS_PER_MS, high_ms * NS_PER_MS, 256).astype(np.int64)
 
 
-def _starting_trainee(network: Network, settings: TrainSettings) -> Trainee:
+def _starting_trainee(network: TogeConfig, settings: TrainSettings) -> Trainee:
     """The policy to start from and a new gate head; torch's global random state is kept."""
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(settings.seed)
         if settings.start_from is not None:
             return Trainee(_checkpoint(network, settings.start_from), settings.gate_weight)
-        policy = build_policy(network)
+        policy = Toge(network)
         if settings.backbone_weights is not None:
             load_imagenet_state(policy.backbone, read_torch(settings.backbone_weights))
         return Trainee(policy, settings.gate_weight)
 
 
-def _checkpoint(network: Network, path: Path) -> BuiltinPolicy:
+def _checkpoint(network: TogeConfig, path: Path) -> Toge:
     policy = load_checkpoint(path, fallback=network)
     if policy.contract.action != network.contract.action:
         raise PolicyError(
@@ -264,7 +260,7 @@ def _checkpoint(network: Network, path: Path) -> BuiltinPolicy:
         for config, contract in ((network, wanted), (policy.config, policy.contract))
     )
     other = [f"{name} {value!r}" for name, value in held.items() if asked.get(name) != value]
-    if other or type(policy.config) is not type(network):
+    if other:
         raise PolicyError(
             f"--start-from {path} holds another policy: {', '.join(other)}; ask for the same one"
         )
