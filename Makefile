@@ -22,8 +22,10 @@ PARALLEL := --numprocesses auto --maxprocesses 8 --dist loadfile
 # Flights in real time have the machine for themselves: they are judged by the millisecond.
 FLIGHTS := --numprocesses auto --maxprocesses 2 --dist worksteal
 
-# Modules whose mutants are tried, as in MODULES=mavbridge/guard/guard.py; none = all of tests/mutation.toml.
+# Modules whose mutants are tried, as in MODULES=mavbridge/guard/guard.py; none = all of
+# tests/mutation/reasons.toml. ONLY=Guard.step: mutants whose name begins so.
 MODULES ?=
+ONLY ?=
 
 .PHONY: fly check test lint bench faults fuzz mutants soak clean
 
@@ -70,10 +72,10 @@ test: .venv-peers/installed check  ## all of lint, then every test
 	$(BIN)/pytest $(FLIGHTS) -m system
 
 bench: $(VENV)/installed .venv-peers/installed  ## engines, loops and link here, beside a baseline and peers
-	$(BIN)/python -m benchmarks.compare --json out/bench.json --plot out/bench.png --check benchmarks/budget.json
+	$(BIN)/python -m benchmarks.compare --json out/bench.json --check benchmarks/budget.json
 
 mutants: $(VENV)/installed  ## small changes of the safety core, each of which a test must notice; not part of test
-	$(BIN)/python -m benchmarks.mutants $(MODULES)
+	PYTHONPATH=.:tests $(BIN)/python -m mutation $(MODULES) $(if $(ONLY),--only $(ONLY))
 
 FAULTS ?=
 JOBS ?= 1

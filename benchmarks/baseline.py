@@ -10,18 +10,18 @@ leaves the rest in the socket, and the next step acts on what is oldest there.
 It arms nothing, so the vehicle stays on the ground; its sticks are sent and counted all the same.
 """
 
+import sys
 import threading
 import time
+from pathlib import Path
 
 import numpy as np
 import torch
-from cyclopts import App
 from pymavlink import mavutil
 from pymavlink.dialects.v20 import ardupilotmega as mav
 
 from benchmarks.engines import EAGER
-from benchmarks.flight import FlightJob
-from benchmarks.missed_slots import stolen_ms_since, stolen_ns
+from benchmarks.flight import FlightJob, read_job
 from benchmarks.results import BASELINE, Flight, solves_of, to_json
 from mavbridge.camera.open import open_camera
 from mavbridge.config.policy import PolicyConfig
@@ -39,12 +39,11 @@ STREAMS = (
     mav.MAVLINK_MSG_ID_RAW_IMU,
 )
 READ_TIMEOUT_NS = 100 * NS_PER_MS
-app = App(help=__doc__)
 
 
-@app.default
-def main(job: FlightJob) -> None:
-    """Fly once and write the figures."""
+def main(path: Path) -> None:
+    """Fly the job in a file once, and write its figures."""
+    job = read_job(path)
     job.out.write_text(to_json(Baseline(job).run()))
 
 
@@ -148,7 +147,6 @@ class Baseline:
     def _action_loop(self) -> Flight:
         end_ns: int | None = None
         heartbeat_ns = cpu_ns = 0
-        start_stolen_ns: int | None = None
         while end_ns is None or self._clock.now_ns() < end_ns:
             started_ns = self._clock.now_ns()
             if started_ns - heartbeat_ns >= NS_PER_S:
@@ -157,10 +155,10 @@ class Baseline:
                     mav.MAV_TYPE_ONBOARD_CONTROLLER, mav.MAV_AUTOPILOT_INVALID, 0, 0, 0
                 )
             if self._step(started_ns) and end_ns is None:
-                end_ns = started_ns + round(self._job.duration * NS_PER_S)
-                cpu_ns, start_stolen_ns = time.process_time_ns(), stolen_ns()
+                end_ns = started_ns + round(self._job.duration_s * NS_PER_S)
+                cpu_ns = time.process_time_ns()
             self._sleep(1 / self._action_hz, started_ns)
-        return self._flight(time.process_time_ns() - cpu_ns, stolen_ms_since(start_stolen_ns))
+        return self._flight(time.process_time_ns() - cpu_ns)
 
     def _step(self, started_ns: int) -> bool:
         attitude = self._connection.recv_match(type="ATTITUDE_QUATERNION", blocking=False)
@@ -224,7 +222,7 @@ class Baseline:
         elapsed_s = (self._clock.now_ns() - started_ns) / NS_PER_S
         time.sleep(max(0.0, period_s - elapsed_s))  # noqa: TID251 - common practice, under test
 
-    def _flight(self, cpu_ns: int, stolen_ms: float | None) -> Flight:
+    def _flight(self, cpu_ns: int) -> Flight:
         duration_s = (self._stamps_ns[-1] - self._stamps_ns[0]) / NS_PER_S
         return Flight(
             runner=BASELINE,
@@ -239,20 +237,13 @@ class Baseline:
             action_hz=_rate_hz(self._stamps_ns),
             vision_hz=_rate_hz(self._frames_ns),
             missed_slots=max(0, round(self._action_hz * duration_s) + 1 - len(self._stamps_ns)),
-            lateness_ms=None,
-            coasting_sends=None,
             chunks=len(self._stamps_ns),
-            late_chunks=None,
             period_ms=self._period.percentiles_ms(),
             predict_ms=self._predict.percentiles_ms(),
             encode_ms=self._encode.percentiles_ms(),
             feature_age_ms=self._feature_age.percentiles_ms(),
-            state_age_ms=None,
             state_to_wire_ms=self._state_to_wire.percentiles_ms(),
             cpu_cores=round(cpu_ns / NS_PER_S / duration_s, 3),
-            guard_cpu_cores=None,
-            stolen_ms=stolen_ms,
-            missed_by_cause=None,
         )
 
 
@@ -263,4 +254,4 @@ def _rate_hz(stamps_ns: list[int]) -> float | None:
 
 
 if __name__ == "__main__":
-    app()
+    main(Path(sys.argv[1]))

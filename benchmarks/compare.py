@@ -1,6 +1,6 @@
 """This machine with mavbridge, beside a roofline, a baseline runner and other MAVLink clients.
 
-python -m benchmarks.compare --json bench.json --plot bench.png --check benchmarks/budget.json
+python -m benchmarks.compare --json bench.json --check benchmarks/budget.json
 
 Engines and flights with the shipped policy (ResNet-8, 96 pixels) and with an untrained one
 (EfficientNet-B3, 224 pixels); MAVSDK where .venv-peers has it.
@@ -10,19 +10,19 @@ is the smaller the better. The file is JSON, ``{"ratios": {name: most}}``; the n
 ``ratios``.
 """
 
-import json
 import math
 import sys
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import replace
+from json import loads
 from pathlib import Path
 
-from cyclopts import App, Parameter
+from cyclopts import App
 from rich.text import Text
 
 from benchmarks.engines import EAGER, time_engines
-from benchmarks.flight import FLIGHT_PROCESS, fly
-from benchmarks.link import OUR_CLIENT, LinkClient, time_link
+from benchmarks.flight import FLIGHT_PROCESS, Load, fly
+from benchmarks.link import BARE_CLIENT, link_clients, time_link
 from benchmarks.results import (
     BASELINE,
     OURS,
@@ -37,11 +37,8 @@ from mavbridge.config.policy import PolicyConfig
 from mavbridge.config.rates import Rates
 from mavbridge.core.errors import UserError
 from mavbridge.core.extras import require_packages
-from mavbridge.core.processes import IMPORT_ROOT
-from mavbridge.core.stopping import INTERRUPTED
 
 BASELINE_PROCESS = "benchmarks.baseline"
-PEERS_PYTHON = IMPORT_ROOT / ".venv-peers" / "bin" / "python"
 SHIPPED = PolicyConfig(engine="openvino")
 LARGE = replace(SHIPPED, policy="toge:small", allow_untrained=True)
 FLIGHTS = (
@@ -51,104 +48,67 @@ FLIGHTS = (
     (replace(LARGE, engine=EAGER), FLIGHT_PROCESS),
     (replace(LARGE, engine=EAGER), BASELINE_PROCESS),
 )
+LOADED_FLIGHTS: tuple[tuple[Rates, Load], ...] = tuple(
+    (Rates(stick_rate=400.0, realtime=realtime), load)
+    for load in ("slow", "busy")
+    for realtime in (True, False)
+)
+"""With the shipped policy: how exact sticks stay beside a slow policy, and a busy interpreter."""
 ROOFLINE = "roofline f32"
-BARE_CLIENT = "bare pymavlink loop"
 MS_PER_S = 1000.0
 
 app = App(help=__doc__)
 
 
-@dataclass(frozen=True, kw_only=True)
-class Effort:
-    """Durations and repeats of all measurements."""
-
-    engine_rounds: int
-    engine_block_s: float
-    flight_s: float
-    attitudes: int
-
-
-FULL = Effort(engine_rounds=5, engine_block_s=1.5, flight_s=60.0, attitudes=1500)
-QUICK = Effort(engine_rounds=2, engine_block_s=0.5, flight_s=5.0, attitudes=200)
-
-
-@Parameter(name="*")
-@dataclass(frozen=True, kw_only=True)
-class BenchOutputs:
-    """Duration of the measurement, and destinations of its results."""
-
-    quick: bool = False
-    """Measure for seconds instead of minutes: figures to look at, not to quote."""
-    json: Path | None = None
-    """Write all figures here as JSON."""
-    plot: Path | None = None
-    """Draw the figures here as PNG; needs matplotlib (the extra "bench")."""
-    check: Path | None = None
-    """Compare with this budget of ratios, and exit with 1 if one is exceeded."""
-
-
 @app.default
-def main(outputs: BenchOutputs | None = None) -> int:
-    """Measure everything, print, write and draw; 1 if the budget is exceeded, 130 if interrupted.
+def main(
+    *,
+    quick: bool = False,
+    json: Path | None = None,
+    check: Path | None = None,
+) -> int:
+    """Measure everything, print and write; 1 if the budget is exceeded.
 
-    Raises:
-        UserError: an output cannot be written, the budget cannot be read, or a package is missing.
+    Args:
+        quick: measure for seconds instead of minutes: figures to look at, not to quote.
+        json: write all figures here.
+        check: compare with this budget of ratios.
     """
-    outputs = outputs or BenchOutputs()
-    budget = None if outputs.check is None else read_budget(outputs.check)
-    require_outputs(outputs.json, outputs.plot)
+    budget = None if check is None else read_budget(check)
+    require_outputs(json, None)
     require_packages("make bench, which flies the simulator,", {"mujoco": "mujoco"})
     console = table_console()
-    try:
-        result = measure(QUICK if outputs.quick else FULL)
-    except KeyboardInterrupt:
-        console.print("interrupted: nothing is written")
-        return INTERRUPTED
+    result = measure(is_quick=quick)
     print_result(result, console)
-    if outputs.json is not None:
-        outputs.json.write_text(to_json(result))
-    if outputs.plot is not None:
-        from benchmarks.figure import make_figure
-
-        make_figure(result).savefig(outputs.plot)
+    if json is not None:
+        json.write_text(to_json(result))
     if budget is None:
         return 0
     exceeded = violations(ratios(result), budget)
     for line in exceeded:
         console.print(Text(f"over budget: {line}", style="bold red"))
     if not exceeded:
-        console.print(Text(f"within the budget of {outputs.check}", style="green"))
+        console.print(Text(f"within the budget of {check}", style="green"))
     return 1 if exceeded else 0
 
 
-def measure(effort: Effort) -> BenchResult:
+def measure(*, is_quick: bool) -> BenchResult:
     """Measure every section, one after the other: they would disturb each other."""
     policies = tuple(replace(policy, engine="auto") for policy in (SHIPPED, LARGE))
-    engines, notes = time_engines(
-        policies, rounds=effort.engine_rounds, block_s=effort.engine_block_s
-    )
-    peers, peer_notes = peer_clients()
+    rounds, block_s, flight_s, attitudes = (2, 0.5, 5.0, 200) if is_quick else (5, 1.5, 60.0, 1500)
+    engines, notes = time_engines(policies, rounds=rounds, block_s=block_s)
+    clients, peer_notes = link_clients()
     return BenchResult(
         machine=this_machine(),
-        quick=effort is QUICK,
+        quick=is_quick,
         engines=(*engines, *time_rooflines(policies)),
-        flights=tuple(
-            fly(policy, Rates(), effort.flight_s, module=module) for policy, module in FLIGHTS
+        flights=(
+            *(fly(policy, Rates(), flight_s, module=module) for policy, module in FLIGHTS),
+            *(fly(SHIPPED, rates, flight_s, load=load) for rates, load in LOADED_FLIGHTS),
         ),
-        links=tuple(time_link(client, effort.attitudes) for client in (OUR_CLIENT, *peers)),
+        links=tuple(time_link(client, attitudes) for client in clients),
         notes=(*notes, *peer_notes),
     )
-
-
-def peer_clients() -> tuple[tuple[LinkClient, ...], tuple[str, ...]]:
-    """Other software's clients of the link test; and why one cannot run here."""
-    module = (sys.executable, "-m", "benchmarks.link_pymavlink")
-    bare = LinkClient(name=BARE_CLIENT, command=module)
-    name = "MAVSDK-Python 4"
-    if not PEERS_PYTHON.is_file():
-        return (bare,), (f"{name}: not measured, there is no {PEERS_PYTHON} (make bench)",)
-    command = (str(PEERS_PYTHON), "-m", "benchmarks.link_mavsdk")
-    return (bare, LinkClient(name=name, command=command)), ()
 
 
 def ratios(result: BenchResult) -> dict[str, float]:
@@ -166,11 +126,11 @@ def ratios(result: BenchResult) -> dict[str, float]:
             least_ms = times.get((policy, work, reference))
             if least_ms and engine != reference and not engine.startswith("roofline"):
                 found[f"{policy}, {work}: {engine} / {reference}"] = time_ms / least_ms
-    bare = next((link for link in result.links if link.client == BARE_CLIENT), None)
-    for link in result.links:
-        if bare is not None and bare.round_trip_ms.p50 > 0 and link is not bare:
-            ratio = link.round_trip_ms.p50 / bare.round_trip_ms.p50
-            found[f"link: {link.client}: round trip / {BARE_CLIENT}"] = ratio
+    trips = {link.client: link.round_trip_ms.p50 for link in result.links if link.round_trip_ms}
+    bare_ms = trips.pop(BARE_CLIENT.name, 0.0)
+    for client, trip_ms in trips.items():
+        if bare_ms > 0:
+            found[f"link: {client}: round trip / {BARE_CLIENT.name}"] = trip_ms / bare_ms
     return found
 
 
@@ -181,13 +141,14 @@ def _flight_ratios(result: BenchResult) -> Iterator[tuple[str, float]]:
             continue
         # Without the precision, which depends on the processor: one budget serves them all.
         engine = flight.engine.partition("-")[0]
-        name = f"flight: {flight.policy}, {flight.solves}, {engine}"
+        parts = (flight.policy, flight.solves, engine, flight.conditions)
+        name = f"flight: {', '.join(filter(None, parts))}"
         yield f"{name}: period / asked period", flight.asked_action_hz / flight.action_hz
         if flight.lateness_ms is not None:
             periods = flight.lateness_ms.p99 * flight.asked_stick_hz / MS_PER_S
             yield f"{name}: stick lateness p99 / period", periods
         baseline = baselines.get(flight.policy)
-        if baseline is None or not baseline.action_hz:
+        if baseline is None or not baseline.action_hz or flight.conditions:
             continue
         yield f"{name}: period / {BASELINE}", baseline.action_hz / flight.action_hz
         least_cpu = baseline.cpu_cores / baseline.action_hz
@@ -205,23 +166,11 @@ def read_budget(path: Path) -> dict[str, float]:
         UserError: no such file, or not a budget.
     """
     try:
-        document = json.loads(path.read_text())
-    except OSError as error:
-        raise UserError(f"cannot read --check {path}: {error.strerror}") from error
-    except ValueError as error:
-        raise UserError(f"--check {path} is not JSON: {error}") from error
-    entries = document.get("ratios") if isinstance(document, dict) else None
-    if not isinstance(entries, dict) or not entries or not all(map(_is_limit, entries.values())):
+        return {str(name): float(most) for name, most in loads(path.read_text())["ratios"].items()}
+    except (OSError, ValueError, TypeError, KeyError, AttributeError) as error:
         raise UserError(
-            f'--check {path} is no budget: it must hold {{"ratios": {{name: positive number}}}}'
-        )
-    return {str(name): float(most) for name, most in entries.items()}
-
-
-def _is_limit(value: object) -> bool:
-    if isinstance(value, bool) or not isinstance(value, int | float):
-        return False
-    return math.isfinite(value) and value > 0
+            f'--check {path} is no budget, {{"ratios": {{name: most}}}}: {error!r}'
+        ) from error
 
 
 def violations(measured: Mapping[str, float], budget: Mapping[str, float]) -> tuple[str, ...]:

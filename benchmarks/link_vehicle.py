@@ -8,17 +8,15 @@ answers by the kernel as they arrive: nothing that this process does is in the f
 """
 
 from collections.abc import Iterator
-from dataclasses import dataclass
 from itertools import count
 from pathlib import Path
 
 from cyclopts import App
 from pymavlink.dialects.v20 import ardupilotmega as mav
 
-from benchmarks.results import to_json
+from benchmarks.results import LinkLatency, to_json
 from mavbridge.core.clock import NS_PER_MS, NS_PER_S, Clock, MonotonicClock
 from mavbridge.core.histogram import Histogram
-from mavbridge.core.vehicle import Percentiles
 from mavbridge.mavlink.transport.sockets import UdpTransport
 
 ATTITUDE_HZ = 97.0
@@ -72,16 +70,6 @@ def main(*, port: int, attitudes: int, out: Path) -> None:
         transport.close()
 
 
-@dataclass(frozen=True, kw_only=True)
-class Answers:
-    """Counts and times of a client's answers."""
-
-    sent: int
-    answered: int
-    round_trip_ms: Percentiles | None
-    """From just before a send to the kernel's stamp of the first answer; None = no answer."""
-
-
 def stick_of(code: int) -> float:
     """The stick that stands for a code, in [-1, 1)."""
     return (code - CODE_SPAN) / CODE_SPAN
@@ -129,9 +117,9 @@ class RoundTrips:
         if self._is_counting:
             self._durations.add(arrived_ns - sent_ns)
 
-    def answers(self) -> Answers:
+    def answers(self) -> LinkLatency:
         """Figures so far."""
-        return Answers(
+        return LinkLatency(
             sent=self._sent,
             answered=self._durations.count,
             round_trip_ms=self._durations.percentiles_ms(),
@@ -150,7 +138,7 @@ class LinkVehicle:
         self._channels_us = [1500] * 8
         self._round_trips = RoundTrips()
 
-    def run(self, attitudes: int) -> Answers:
+    def run(self, attitudes: int) -> LinkLatency:
         """Wait for steady answers, then count those to ``attitudes``.
 
         Raises:

@@ -5,7 +5,7 @@ from collections import deque
 from pathlib import Path
 from typing import Literal, NamedTuple
 
-from mavbridge.core.clock import NS_PER_MS, NS_PER_S, Clock
+from mavbridge.core.clock import NS_PER_S, Clock
 from mavbridge.core.records import Event, Tick
 
 Cause = Literal["host", "kernel", "guard"]
@@ -29,32 +29,15 @@ class Counters(NamedTuple):
     """The guard ran."""
 
 
-def stolen_ns() -> int | None:
-    """Processor time that the hypervisor has taken since boot; None = not known."""
-    try:
-        fields = (PROC / "stat").read_text().split("\n", 1)[0].split()
-    except OSError:
-        return None
-    if len(fields) <= STEAL_FIELD:
-        return None
-    return int(fields[STEAL_FIELD]) * NS_PER_S // os.sysconf("SC_CLK_TCK")
-
-
-def stolen_ms_since(start_ns: int | None) -> float | None:
-    """Milliseconds since an earlier ``stolen_ns``; None = not known."""
-    now_ns = stolen_ns()
-    if start_ns is None or now_ns is None:
-        return None
-    return round((now_ns - start_ns) / NS_PER_MS, 1)
-
-
 def read_counters(pid: int) -> Counters:
     """Counters of a process with one thread; schedstat is documented in sched-stats.rst."""
     try:
         cpu_ns, waited_ns = map(int, (PROC / str(pid) / "schedstat").read_text().split()[:2])
-    except (OSError, ValueError):
-        cpu_ns = waited_ns = 0
-    return Counters(host_ns=stolen_ns() or 0, waited_ns=waited_ns, cpu_ns=cpu_ns)
+        stolen = int((PROC / "stat").read_text().split("\n", 1)[0].split()[STEAL_FIELD])
+    except (OSError, ValueError, IndexError):
+        return Counters(0, 0, 0)
+    host_ns = stolen * NS_PER_S // os.sysconf("SC_CLK_TCK")
+    return Counters(host_ns=host_ns, waited_ns=waited_ns, cpu_ns=cpu_ns)
 
 
 def find_cause(first: Tick, second: Tick, before: Counters, after: Counters) -> Cause:

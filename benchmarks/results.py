@@ -55,6 +55,8 @@ class Flight:
     policy: str
     solves: str
     engine: str
+    conditions: str = ""
+    """What is unusual about this flight, for tables."""
     asked_stick_hz: float
     asked_action_hz: float
     asked_vision_hz: float
@@ -66,37 +68,29 @@ class Flight:
     vision_hz: float | None
     missed_slots: int
     """Slots of the stick grid without a send within one period."""
-    lateness_ms: Percentiles | None
+    missed_by_cause: Mapping[str, int] | None = None
+    lateness_ms: Percentiles | None = None
     """From a slot to its send."""
-    coasting_sends: int | None
-    """Sends of a chunk whose successor was late."""
     chunks: int
-    late_chunks: int | None
+    late_chunks: int | None = None
     """Chunks that came more than 1.5 periods after the one before."""
     period_ms: Percentiles | None
     """Between two chunks."""
     predict_ms: Percentiles | None
     encode_ms: Percentiles | None
     feature_age_ms: Percentiles | None
-    state_age_ms: Percentiles | None
-    """From an attitude's arrival at this computer to each send that is based on it."""
     state_to_wire_ms: Percentiles | None
     """From an attitude's arrival at this computer to the send of the first sticks made from it."""
     cpu_cores: float
     """Processor time of all our processes over elapsed time."""
-    guard_cpu_cores: float | None
+    guard_cpu_cores: float | None = None
     """The guard's share of it."""
-    stolen_ms: float | None
-    missed_by_cause: Mapping[str, int] | None
-    lost_reports: int = 0
-    """Messages of the guard that its reader was too slow for: the figures lack them."""
-    vehicle_gap_ms: Mapping[str, float] | None = None
-    """p50, p99 and max between stick messages, as the vehicle saw them arrive."""
 
     @property
     def label(self) -> str:
-        """Runner, policy, kind of solve and engine."""
-        return f"{self.runner}, {self.policy}, {self.solves}, {self.engine}"
+        """Runner, policy, kind of solve, engine and conditions."""
+        parts = (self.runner, self.policy, self.solves, self.engine, self.conditions)
+        return ", ".join(filter(None, parts))
 
     @property
     def missed_fraction(self) -> float:
@@ -106,25 +100,14 @@ class Flight:
 
 
 @dataclass(frozen=True, kw_only=True)
-class ClientTiming:
-    """Figures that a client of the link test measures itself; None = not measured."""
-
-    state_to_wire_ms: Percentiles | None = None
-    """From the kernel's arrival stamp of an attitude to the send."""
-    chunk_to_wire_ms: Percentiles | None = None
-    """The last part of it: from the end of the policy's computation to the send."""
-
-
-@dataclass(frozen=True, kw_only=True)
 class LinkLatency:
     """The time from an attitude's send by the vehicle to the arrival of its sticks."""
 
-    client: str
+    client: str = ""
     sent: int
     answered: int
-    round_trip_ms: Percentiles
-    """On the vehicle's clock: its send to the arrival that its kernel stamped."""
-    timing: ClientTiming
+    round_trip_ms: Percentiles | None
+    """From just before a send to the kernel's stamp of the first answer; None = no answer."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -238,12 +221,9 @@ _FLIGHT_ROWS: tuple[tuple[str, Callable[[Flight], str]], ...] = (
     ("sample one chunk, ms", lambda f: spread(f.predict_ms)),
     ("encode one image, ms", lambda f: spread(f.encode_ms)),
     ("feature age at send, ms", lambda f: spread(f.feature_age_ms)),
-    ("attitude age at send, ms", lambda f: spread(f.state_age_ms)),
     ("attitude to wire, ms", lambda f: spread(f.state_to_wire_ms)),
-    ("gaps at the vehicle, ms", lambda f: _gaps(f.vehicle_gap_ms)),
     ("processor time, cores", lambda f: number(f.cpu_cores, 2)),
     ("of it the guard", lambda f: number(f.guard_cpu_cores, 2)),
-    ("stolen by the host, ms", lambda f: number(f.stolen_ms, 0)),
 )
 
 
@@ -263,24 +243,11 @@ def causes(slots_by_cause: Mapping[str, int] | None) -> str:
     return ", ".join(f"{cause} {slots}" for cause, slots in slots_by_cause.items()) or "none"
 
 
-def _gaps(gap_ms: Mapping[str, float] | None) -> str:
-    if gap_ms is None:
-        return "-"
-    return " / ".join(number(gap_ms[name], 1) for name in ("p50", "p99", "max"))
-
-
 def link_table(links: Iterable[LinkLatency]) -> Table:
     """A row for each client."""
     rows = [
-        (
-            link.client,
-            f"{link.answered} of {link.sent}",
-            spread(link.round_trip_ms, 2),
-            spread(link.timing.state_to_wire_ms, 2),
-            spread(link.timing.chunk_to_wire_ms, 2),
-        )
+        (link.client, f"{link.answered} of {link.sent}", spread(link.round_trip_ms, 2))
         for link in links
     ]
-    header = ("client", "answered", "round trip", "attitude to wire", "chunk to wire")
     title = "Link alone: attitude out of the vehicle to sticks back in, ms (p50 / p99 / max)"
-    return make_table(title, header, rows)
+    return make_table(title, ("client", "answered", "round trip"), rows)

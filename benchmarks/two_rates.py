@@ -14,16 +14,19 @@ both in gusts as well, and the latter on PX4: a slower loop of body rates, and a
 drag.
 """
 
+import hashlib
 import math
+import subprocess
+import sys
 from dataclasses import asdict, dataclass
 from itertools import product
 from json import dumps, loads
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any, Literal, NamedTuple
 
 from cyclopts import App
 
-from benchmarks.study import fly, sha256
 from mavbridge.commands.output import (
     BLUE,
     FIGURE_DPI,
@@ -38,9 +41,6 @@ from policy.loading.builtin import SHIPPED, SHIPPED_RATES
 
 Loop = Literal["one rate", "100 actions a second", "250 actions a second"]
 LOOPS: tuple[Loop, ...] = ("one rate", "100 actions a second", "250 actions a second")
-ControlName = Literal[
-    "sticks", "by-rates", "races", "sticks-gusts", "by-rates-gusts", "by-rates-px4"
-]
 ENCODER_MS = (5, 20, 50, 100, 200)
 HEAD_MS = 4
 """What the action head takes beside the encoder in a single loop: 3 ms, and some for late ones."""
@@ -67,18 +67,14 @@ class Control(NamedTuple):
 
 GUSTS = "--gusts 2"
 """m/s, along each horizontal axis: more than any demonstration has."""
-CONTROLS: dict[ControlName, Control] = {
-    "sticks": Control("sticks in ALT_HOLD, easy courses", "--courses easy"),
-    "by-rates": Control("the same weights by body rates", "--courses easy --by-rates"),
-    "races": Control("body rates, race courses", "--courses race --policy toge-rates", True),
-    "sticks-gusts": Control("sticks, gusts of 2 m/s", f"--courses easy {GUSTS}"),
-    "by-rates-gusts": Control(
-        "by body rates, gusts of 2 m/s", f"--courses easy --by-rates {GUSTS}"
-    ),
-    "by-rates-px4": Control(
-        "by body rates, PX4 and its airframe", "--courses easy --by-rates --autopilot px4"
-    ),
-}
+CONTROLS = (
+    Control("sticks in ALT_HOLD, easy courses", "--courses easy"),
+    Control("the same weights by body rates", "--courses easy --by-rates"),
+    Control("body rates, race courses", "--courses race --policy toge-rates", is_race=True),
+    Control("sticks, gusts of 2 m/s", f"--courses easy {GUSTS}"),
+    Control("by body rates, gusts of 2 m/s", f"--courses easy --by-rates {GUSTS}"),
+    Control("by body rates, PX4 and its airframe", "--courses easy --by-rates --autopilot px4"),
+)
 """To 63 % of a step the body rates take 53 ms on ArduPilot and 100 ms on PX4."""
 
 
@@ -111,9 +107,6 @@ def main(
     plot: Path | None = None,
     episodes: int = 50,
     workers: int = 2,
-    controls: tuple[ControlName, ...] = tuple(CONTROLS),
-    encoders_ms: tuple[int, ...] = ENCODER_MS,
-    loops: tuple[Loop, ...] = LOOPS,
     sticks: Path = SHIPPED,
     rates: Path = SHIPPED_RATES,
 ) -> None:
@@ -124,17 +117,13 @@ def main(
         plot: where to draw them as PNG.
         episodes: courses for each cell.
         workers: episodes at a time.
-        controls: which controls to fly.
-        encoders_ms: times of an encoder, in ms.
-        loops: which loops to fly.
         sticks: weights by sticks.
         rates: weights that learned from races by body rates.
     """
     require_outputs(json, plot)
     known = [Cell(**one) for one in loads(json.read_text())] if json.exists() else []
     cells = {cell.key: cell for cell in known if cell.episodes == episodes}
-    for name, encoder_ms, loop in product(controls, encoders_ms, loops):
-        control = CONTROLS[name]
+    for control, encoder_ms, loop in product(CONTROLS, ENCODER_MS, LOOPS):
         weights = rates if control.is_race else sticks
         key = (control.name, loop, encoder_ms, sha256(weights))
         if key not in cells:
@@ -149,9 +138,7 @@ def main(
 
 def shown_cells(cells: list[Cell], sticks: Path, rates: Path) -> list[Cell]:
     """All cells of these weights, in the order of the controls, encoders and loops."""
-    weights = {
-        control.name: sha256(rates if control.is_race else sticks) for control in CONTROLS.values()
-    }
+    weights = {control.name: sha256(rates if control.is_race else sticks) for control in CONTROLS}
     names = list(weights)
     return sorted(
         (cell for cell in cells if cell.checkpoint_sha256 == weights.get(cell.control)),
@@ -200,6 +187,48 @@ def evaluate(
         gates=flown.gates,
         speed_mps=0.0 if math.isnan(flown.course_speed_mps) else flown.course_speed_mps,
     )
+
+
+class Flown(NamedTuple):
+    """Figures of one ``mavbridge evaluate``; intervals are 95 %. NaN: no flight has the figure."""
+
+    success: float
+    success_low: float
+    success_high: float
+    gates: float
+    speed_mps: float
+    course_speed_mps: float
+
+
+def fly(flags: str, checkpoint: Path, workers: int) -> Flown:
+    """Run ``mavbridge evaluate`` with these flags.
+
+    Raises:
+        subprocess.CalledProcessError: the evaluation failed, and printed why.
+    """
+    with TemporaryDirectory() as folder:
+        out = Path(folder) / "evaluation.json"
+        files = ("--checkpoint", str(checkpoint), "--workers", str(workers), "--json", str(out))
+        command = [sys.executable, "-m", "mavbridge", "evaluate", *flags.split(), *files]
+        subprocess.run(command, check=True, stdout=subprocess.DEVNULL)
+        summary = loads(out.read_text())["summary"]
+
+    def value(name: str) -> float:
+        return float(summary[name]["value"]) if summary[name] else math.nan
+
+    return Flown(
+        success=value("success_rate"),
+        success_low=summary["success_rate"]["low"],
+        success_high=summary["success_rate"]["high"],
+        gates=value("gates_passed"),
+        speed_mps=value("mean_speed_mps"),
+        course_speed_mps=value("course_speed_mps"),
+    )
+
+
+def sha256(path: Path) -> str:
+    """Hash of a file, in hexadecimal digits."""
+    return hashlib.sha256(path.read_bytes()).hexdigest()
 
 
 def print_cells(cells: list[Cell]) -> None:

@@ -2,7 +2,6 @@ from typing import Any
 
 from benchmarks.results import (
     BenchResult,
-    ClientTiming,
     EngineTiming,
     Flight,
     LinkLatency,
@@ -31,20 +30,16 @@ def make_flight(runner: str, **changes: Any) -> Flight:
         "vision_hz": 15.0,
         "missed_slots": 12,
         "lateness_ms": all_equal(0.25) if runner == "mavbridge" else None,
-        "coasting_sends": 0,
         "chunks": 3000,
         "late_chunks": 7,
         "period_ms": all_equal(10.0),
         "predict_ms": None,
         "encode_ms": all_equal(20.0),
         "feature_age_ms": all_equal(50.0),
-        "state_age_ms": all_equal(25.0),
         "state_to_wire_ms": all_equal(20.0),
         "cpu_cores": 1.0,
         "guard_cpu_cores": 0.125,
-        "stolen_ms": None,
         "missed_by_cause": {"kernel": 9, "host": 3} if runner == "mavbridge" else None,
-        "vehicle_gap_ms": {"p50": 10.0, "p99": 11.0, "max": 12.0},
     }
     return Flight(**(fields | changes))
 
@@ -53,14 +48,9 @@ def make_timing(work: str, engine: str, p50_ms: float) -> EngineTiming:
     return EngineTiming(policy="toge", work=work, engine=engine, p50_ms=p50_ms, p99_ms=p50_ms + 1)
 
 
-def make_link(client: str, *, round_trip_ms: float, chunk_to_wire_ms: float | None) -> LinkLatency:
-    timing = None if chunk_to_wire_ms is None else all_equal(chunk_to_wire_ms)
+def make_link(client: str, *, round_trip_ms: float) -> LinkLatency:
     return LinkLatency(
-        client=client,
-        sent=600,
-        answered=599,
-        round_trip_ms=all_equal(round_trip_ms),
-        timing=ClientTiming(chunk_to_wire_ms=timing),
+        client=client, sent=600, answered=599, round_trip_ms=all_equal(round_trip_ms)
     )
 
 
@@ -80,8 +70,8 @@ RESULT = BenchResult(
         make_flight("baseline", action_hz=25.0, state_to_wire_ms=all_equal(400.0)),
     ),
     links=(
-        make_link("mavbridge", round_trip_ms=0.6, chunk_to_wire_ms=0.2),
-        make_link("bare pymavlink loop", round_trip_ms=0.3, chunk_to_wire_ms=None),
+        make_link("mavbridge", round_trip_ms=0.6),
+        make_link("bare pymavlink loop", round_trip_ms=0.3),
     ),
     notes=("MAVSDK-Python 4: not measured, it is not installed",),
 )

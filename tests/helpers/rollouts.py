@@ -1,7 +1,9 @@
 """A world model that is small and quick, flights to start from, and rollouts of both."""
 
+import queue
 import threading
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
+from contextlib import closing
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -9,7 +11,6 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from benchmarks.serial_rollout import SerialOutput
 from helpers.factories import START_NS, TICK_NS, make_state, make_tick, make_vision_tick
 from helpers.recordings import make_meta, without_writer_process
 from mavbridge.commands.imagine.inputs import RolloutStart, Sampler, read_start
@@ -21,13 +22,23 @@ from mavbridge.commands.imagine.loop import (
     WorldModelDecider,
     rollout,
 )
-from mavbridge.commands.imagine.output import OnFrame, StreamedOutput, ignore_frame
+from mavbridge.commands.imagine.output import (
+    SCHEMA,
+    OnFrame,
+    StreamedOutput,
+    captured_ns,
+    ignore_frame,
+    rows_batch,
+    writing,
+)
 from mavbridge.core.clock import NS_PER_S, MonotonicClock
-from mavbridge.core.records import FloatArray, ImageArray
+from mavbridge.core.records import FloatArray, ImageArray, RolloutFrame
 from mavbridge.core.vehicle import Sticks
 from mavbridge.recording.flight_folder import RecordedFlight, open_flight
 from mavbridge.recording.flight_writer import FlightWriter
 from mavbridge.recording.meta import FlightMeta
+from mavbridge.recording.tables import TableWriter
+from mavbridge.recording.video.file import FragmentedMp4
 from policy.contract import Contract
 from policy.protocol import PolicyRunner
 from policy.world_model.config import WorldModelConfig
@@ -41,6 +52,46 @@ TINY = WorldModelConfig(
     dynamics_width=32,
     dynamics_depth=1,
 )
+
+
+class SerialOutput(StreamedOutput):
+    """The plain form, kept as the reference: all frames in a list, everything written at the end.
+
+    Every frame must have been decoded by the loop.
+    """
+
+    def _open(self) -> None:
+        self._video, self._jobs = None, queue.Queue(1)  # nothing runs beside the loop
+        self._collected: list[tuple[RolloutFrame, ImageArray]] = []
+
+    @property
+    def writer_queue(self) -> int:
+        return len(self._collected)
+
+    def put(self, segment: Segment) -> None:
+        for frame in self._rows(segment):
+            rgb = segment.decoded[frame.frame]
+            self._collected.append((frame, rgb))
+            self._show(frame, rgb if self._decode_video else None)
+
+    def finish(self, on_wait: Callable[[], None] = lambda: None) -> None:
+        with self._sampler.meter.write, writing(self.out):
+            table = TableWriter(self.out, SCHEMA)
+            try:
+                table.append(rows_batch([frame for frame, _ in self._collected]))
+                if self._decode_video:
+                    size, hz = self._sampler.config.image_size, 1 / self._frame_dt_s
+                    with closing(FragmentedMp4(self.out, height=size, width=size, hz=hz)) as video:
+                        for frame, rgb in self._collected:
+                            video.append(rgb, captured_ns(frame))
+                            on_wait()
+            except BaseException:
+                table.abandon()
+                raise
+            table.finish()
+
+    def close(self) -> None:
+        pass
 
 
 class TinyWorld(WorldModel):

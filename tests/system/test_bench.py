@@ -2,10 +2,9 @@
 
 import pytest
 
-from benchmarks.compare import peer_clients
 from benchmarks.engines import time_engines
 from benchmarks.flight import fly
-from benchmarks.link import OUR_CLIENT, time_link
+from benchmarks.link import BARE_CLIENT, OUR_CLIENT, time_link
 from mavbridge.config.policy import PolicyConfig
 from mavbridge.config.rates import Rates
 
@@ -25,11 +24,8 @@ def test_a_flight_is_measured() -> None:
     assert flight.lateness_ms.p50 > 0
     assert flight.guard_cpu_cores is not None
     assert 0 < flight.guard_cpu_cores < flight.cpu_cores
-    assert flight.lost_reports == 0
     assert flight.vision_hz is not None
     assert flight.vision_hz > 0
-    assert flight.vehicle_gap_ms is not None
-    assert flight.vehicle_gap_ms["p50"] > 0
 
 
 def test_an_engine_is_timed() -> None:
@@ -44,14 +40,7 @@ def test_our_client_answers_the_vehicle_of_the_link_test() -> None:
     # An attitude may be overtaken by the next one, and a shared host may stall.
     assert link.answered >= 25
     assert 0 < link.round_trip_ms.p50 <= link.round_trip_ms.p99 <= link.round_trip_ms.max
-    timing = link.timing
-    assert timing.state_to_wire_ms is not None
-    assert timing.state_to_wire_ms.p50 >= 0
-    assert timing.chunk_to_wire_ms is not None
-    assert timing.chunk_to_wire_ms.p50 > 0
 
 
 def test_a_bare_pymavlink_loop_is_a_client_of_the_link_test() -> None:
-    link = time_link(peer_clients()[0][0], attitudes=50)
-    assert link.answered >= 25
-    assert link.timing.chunk_to_wire_ms is None
+    assert time_link(BARE_CLIENT, attitudes=50).answered >= 25

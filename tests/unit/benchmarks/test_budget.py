@@ -45,13 +45,7 @@ def test_reads_what_the_repository_holds() -> None:
     assert all(most > 0 for most in budget.values())
 
 
-@pytest.mark.parametrize(
-    "text",
-    [
-        *("", "[]", "{}", '{"ratios": {}}', '{"ratios": {"a": "1"}}', '{"ratios": {"a": true}}'),
-        *('{"ratios": {"a": 0}}', '{"ratios": {"a": NaN}}', '{"ratios": [1]}'),
-    ],
-)
+@pytest.mark.parametrize("text", ["", "[]", "{}", '{"ratios": {"a": "b"}}', '{"ratios": [1]}'])
 def test_refuses_what_is_no_budget(tmp_path: Path, text: str) -> None:
     path = tmp_path / "budget.json"
     path.write_text(text)

@@ -1,6 +1,6 @@
 import numpy as np
 
-from benchmarks.link import repeat_roll_rate
+from benchmarks.link_client import repeat_roll_rate
 from benchmarks.link_vehicle import (
     CODES,
     PARAMS,

@@ -62,7 +62,7 @@ def test_an_interrupted_map_resumes_and_other_weights_begin_anew(
         two_rates.main(json=out, sticks=weights, rates=races)
     most = 1000
     two_rates.main(json=out, sticks=weights, rates=races)
-    controls = CONTROLS.values()
+    controls = CONTROLS
     assert flown == [(each, loop, ms) for each in controls for ms in ENCODER_MS for loop in LOOPS]
     assert len(json.loads(out.read_text())) == len(flown)
     races.write_text("other weights")
@@ -76,7 +76,7 @@ def test_the_figure_shows_every_cell(tmp_path: Path) -> None:
     weights.write_text("")
     cells = [
         made(control, loop, ms, weights, 50)
-        for control in CONTROLS.values()
+        for control in CONTROLS
         for ms in ENCODER_MS
         for loop in LOOPS
     ]

@@ -1,8 +1,8 @@
-"""Mutation testing of what must never be wrong: ``python -m benchmarks.mutants [MODULE...]``.
+"""Mutation testing of what must never be wrong: ``make mutants``.
 
 Collects the tests of a group once, notes which lines each one runs, and forks for every mutant: the
 child exchanges the code of one function, or one constant, and runs the tests that reach the changed
-lines, the fastest first, until one fails. ``tests/mutation.toml`` has the groups, and the reason of
+lines, the fastest first, until one fails. ``reasons.toml`` has the groups, and the reason of
 each mutant that may survive; one without a reason ends this with status 1.
 """
 
@@ -24,10 +24,10 @@ from typing import Any
 import pytest
 from hypothesis import Phase, settings
 
-from benchmarks.mutation_operators import Mutant, mutants_of
+from mutation.operators import Mutant, mutants_of
 
-ROOT = Path(__file__).parents[1]
-REASONS = ROOT / "tests" / "mutation.toml"
+ROOT = Path(__file__).parents[2]
+REASONS = Path(__file__).with_name("reasons.toml")
 _PYTEST = (
     *("-q", "-s", "-p", "no:cacheprovider", "-p", "no:xdist"),
     *("--hypothesis-seed=0", "--hypothesis-profile=mutants"),
@@ -126,7 +126,7 @@ class Driver:
         with os.fdopen(reading, "rb") as pipe:
             data = pipe.read()
         os.waitpid(pid, 0)
-        return pickle.loads(data) if data else None  # noqa: S301 - our child's
+        return pickle.loads(data) if data else None
 
     def _functions(self) -> dict[str, dict[str, list[FunctionType]]]:
         """The live functions of each file, by qualified name: those of slotted classes twice."""
@@ -196,7 +196,7 @@ def _install(mutant: Mutant, path: str, functions: dict[str, list[FunctionType]]
         if getattr(module, "__file__", None) == path and not name.startswith("tests")
     )
     space: dict[str, Any] = {"__name__": name, "__file__": path}
-    exec(code, space)  # noqa: S102 - our own source, with one change
+    exec(code, space)
     owner, _, constant = mutant.scope.rpartition(".")
     if owner:
         _change_default(getattr(sys.modules[name], owner), space[owner], constant)
@@ -246,7 +246,7 @@ def _report(verdicts: dict[str, Verdicts], reasons: dict[str, dict[str, str]]) -
 def main() -> int:
     """Run the groups that have one of the modules; without any, all."""
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("modules", nargs="*", help="as in tests/mutation.toml")
+    parser.add_argument("modules", nargs="*", help="as in reasons.toml")
     parser.add_argument("--only", action="append", help="mutants whose name begins so")
     parser.add_argument("--jobs", type=int, default=os.cpu_count() or 1)
     wanted = parser.parse_args()
