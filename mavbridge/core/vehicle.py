@@ -288,6 +288,12 @@ class VehicleText(str):
         return self[len(_VEHICLE_SAYS) :]
 
 
+class AdviceText(str):
+    """A text of the link about parameters or sticks, for which a check has rows of its own."""
+
+    __slots__ = ()
+
+
 def said_by_vehicle(text: str) -> VehicleText:
     """Return a text of the vehicle."""
     return VehicleText(_VEHICLE_SAYS + text)

@@ -4,15 +4,15 @@ from collections.abc import Callable, Iterator, Mapping
 from functools import partial
 from typing import Literal, TypeAlias
 
-from mavbridge.commands.check.param_rows import Terms
+from mavbridge.commands.check.param_rows import Terms, cures
 from mavbridge.commands.check.rows import Row, Verdict
 from mavbridge.core.clock import NS_PER_MS, NS_PER_S, Clock
 from mavbridge.core.reasons import Code, Reason, because
 from mavbridge.core.vehicle import NEUTRAL, Command, LinkSnapshot, LinkStats, Release
+from mavbridge.flight.plan import FlightPlan
 from mavbridge.mavlink.link import MavlinkLink
 from mavbridge.mavlink.profiles.profile import StreamGroup
 from mavbridge.mavlink.session.vehicle import VehicleSession
-from policy.contract import Contract
 
 SET_UP_S = 15.0
 """Longest wait for version, parameters, streams and the receiver: on a link that loses nothing it
@@ -134,10 +134,9 @@ def link_rows(
     """All of them but the echo test."""
     yield _vehicle_row(vehicle, unfinished)
     rates_hz = dict(stats.messages_per_s)
-    contract = terms.contract or Contract()
     for group in terms.streams:
         if not group.is_optional:
-            yield _rate_row(group, rates_hz, contract)
+            yield _rate_row(group, rates_hz, terms.plan)
     yield _optional_row(terms, rates_hz)
     yield _loss_row(stats)
     yield from _time_rows(stats)
@@ -154,15 +153,14 @@ def _vehicle_row(vehicle: VehicleSession, unfinished: Reason | None) -> Row:
     )
 
 
-def _rate_row(group: StreamGroup, rates_hz: Mapping[str, float], contract: Contract) -> Row:
+def _rate_row(group: StreamGroup, rates_hz: Mapping[str, float], plan: FlightPlan | None) -> Row:
     name = _QUANTITIES.get(group.messages[0], group.messages[0])
     rate_hz = next((rates_hz[message] for message in group.messages if message in rates_hz), 0.0)
-    least_hz = {
-        "attitude": 1 / contract.max_state_age_s,
-        "velocity": 1 / contract.max_velocity_age_s,
-        "acceleration": 1 / contract.max_velocity_age_s,
-        "sticks (echo)": _ECHO_HZ,
-    }.get(name, 0.0)
+    least_hz = _ECHO_HZ if name == "sticks (echo)" else 0.0
+    if plan is not None:
+        limits = plan.start_limits
+        oldest_ns = limits.state_ns if name == "attitude" else limits.velocity_ns
+        least_hz = max(least_hz, NS_PER_S / oldest_ns)
     verdict, advice = _rate_verdict(name, rate_hz, least_hz, group.rate_hz)
     return _row(name, f"{rate_hz:.1f} Hz", f"{group.rate_hz:.3g} Hz", verdict, advice)
 
@@ -250,13 +248,13 @@ def echo_row(probe: VehicleProbe, terms: Terms) -> Row:
             )
         case "taken":
             return _row(name, "taken, and released", expected)
-    return _row(
-        name,
-        f"not seen in {ECHO_S:g} s",
-        expected,
-        "no-go",
-        str(probe.echo_problem)
-        if probe.echo_problem is not None
-        else "the vehicle does not show our sticks: another station may be overriding them, or it "
-        "obeys another system id",
+    problem = probe.echo_problem
+    is_obstacle = problem is not None and problem.code is Code.OBSTACLE
+    mend = cures(terms.assessment.obstacles) if is_obstacle else ()
+    advice = (
+        "the vehicle does not show our sticks: another station may be overriding them, or it "
+        "obeys another system id"
     )
+    if problem is not None:
+        advice = str(problem)
+    return _row(name, f"not seen in {ECHO_S:g} s", expected, "no-go", advice, mend)

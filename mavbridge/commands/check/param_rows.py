@@ -1,8 +1,7 @@
 """Rows about the parameters, and the terms of the flight by which they are judged."""
 
-import re
-from collections.abc import Iterator, Mapping
-from dataclasses import dataclass, replace
+from collections.abc import Iterable, Iterator, Mapping
+from dataclasses import dataclass
 from functools import partial
 from typing import NamedTuple
 
@@ -11,32 +10,26 @@ from mavbridge.config.flight import FlyConfig
 from mavbridge.core.address import serial_baud
 from mavbridge.core.link_settings import LinkSettings
 from mavbridge.core.reasons import Code, because
-from mavbridge.core.vehicle import (
-    ActionKind,
-    StickGains,
-    Sticks,
-    VehicleStatus,
-)
-from mavbridge.flight.settings import action_meaning
-from mavbridge.mavlink.codec.calibration import RcCalibration, RcChannel
-from mavbridge.mavlink.profiles.profile import Danger, ParamContext, Profile, StreamGroup
+from mavbridge.core.vehicle import ActionKind, StickGains, Sticks, VehicleStatus
+from mavbridge.flight.plan import FlightPlan
+from mavbridge.mavlink.codec.calibration import RcChannel
+from mavbridge.mavlink.profiles.profile import ParamContext, ParamNote, Profile, StreamGroup
 from mavbridge.mavlink.profiles.sticks import IDENTITY, Half
 from mavbridge.mavlink.session.params.bandwidth import baud_danger
-from mavbridge.mavlink.session.params.checks import assess
+from mavbridge.mavlink.session.params.checks import Assessment, assess
 from mavbridge.mavlink.session.vehicle import VehicleSession
 from policy.contract import Contract
 
 _STICK_OUTPUTS = ("rc-override", "manual-control")
 _NOT_SENT = "not sent"
-_PARAMETER = re.compile(r"\b[A-Z][A-Za-z0-9]*_\w+\b")
 _row = partial(Row, "parameters")
 
 
-class Sentence(NamedTuple):
-    """What a flight would say of the parameters."""
+class JudgedNote(NamedTuple):
+    """A note, and whether the flight is refused for it."""
 
     verdict: Verdict
-    text: str
+    note: ParamNote
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -45,7 +38,7 @@ class Terms:
 
     config: FlyConfig
     settings: LinkSettings
-    contract: Contract | None
+    plan: FlightPlan | None
     """None: no policy."""
     profile: Profile
     read: Mapping[str, float]
@@ -57,18 +50,18 @@ class Terms:
         cls,
         config: FlyConfig,
         settings: LinkSettings,
-        contract: Contract | None,
+        plan: FlightPlan | None,
         vehicle: VehicleSession,
         status: VehicleStatus | None,
     ) -> "Terms":
         """Terms by what the vehicle has told so far."""
-        kind: ActionKind = "sticks" if contract is None else contract.action
+        kind: ActionKind = "sticks" if plan is None else plan.contract.action
         output = config.link.output
         usual = vehicle.profile.outputs[kind]
         return cls(
             config=config,
             settings=settings,
-            contract=contract,
+            plan=plan,
             profile=vehicle.profile,
             read=vehicle.known_params,
             context=ParamContext(
@@ -89,12 +82,14 @@ class Terms:
         return self.context.output in _STICK_OUTPUTS
 
     @property
+    def contract(self) -> Contract | None:
+        """The contract of the policy."""
+        return None if self.plan is None else self.plan.contract
+
+    @property
     def gains(self) -> StickGains | None:
-        """What full stick means to the policy; None where there is none of sticks."""
-        if self.contract is None:
-            return None
-        link = replace(self.config.link, raw_sticks=False)
-        return action_meaning(self.contract, link).stick_gains
+        """What full stick means to the policy; None where its sticks are not mapped."""
+        return None if self.plan is None else self.plan.guard.meaning.stick_gains
 
     @property
     def mode(self) -> str | None:
@@ -112,38 +107,37 @@ class Terms:
         return self.profile.streams(state_hz=self.settings.state_hz)
 
     @property
-    def calibration(self) -> RcCalibration | None:
-        """The radio calibration by which sticks would be sent."""
-        return assess(self.profile, self.values, self.context).calibration
+    def assessment(self) -> Assessment:
+        """The parameters, judged for this flight."""
+        return assess(self.profile, self.values, self.context)
 
-    def sentences(self) -> Iterator[Sentence]:
+    def notes(self) -> Iterator[JudgedNote]:
         """Refusals and warnings of the flight, and hints that only a check gives."""
         values, context = self.values, self.context
-        assessment = assess(self.profile, values, context)
-        yield from (Sentence("no-go", text) for text in assessment.obstacles)
+        assessment = self.assessment
+        yield from (JudgedNote("no-go", note) for note in assessment.obstacles)
         if assessment.unusable is not None:
             unusable = because(Code.CALIBRATION_UNUSABLE, cause=assessment.unusable)
-            yield Sentence("no-go", str(unusable))
+            yield JudgedNote("no-go", ParamNote((), str(unusable)))
         serial = baud_danger(
             serial_baud(self.settings.connect),
             streams=self.streams,
             stick_hz=self.settings.stick_hz,
         )
-        dangers = (*([Danger("slow-serial", serial)] if serial else []), *assessment.dangers)
-        for danger in dangers:
+        for danger in (*([serial] if serial else []), *assessment.dangers):
             if danger.risk in self.config.link.accept_risk:
-                yield Sentence("warn", f"risk {danger.risk} is accepted: {danger.text}")
+                yield JudgedNote("warn", danger.accepted)
             else:
-                yield Sentence("no-go", danger.refusal)
-        yield from (Sentence("warn", text) for text in self.profile.advice(values, context))
-        yield from (Sentence("warn", text) for text in self.profile.hints(values, context))
+                yield JudgedNote("no-go", danger.refused)
+        yield from (JudgedNote("warn", note) for note in self.profile.advice(values, context))
+        yield from (JudgedNote("warn", note) for note in self.profile.hints(values, context))
 
 
 def param_rows(terms: Terms) -> Iterator[Row]:
     """Every parameter that matters, then the calibration, then what full stick means here."""
-    left = list(terms.sentences())
+    left = list(terms.notes())
     for name, should_be in terms.profile.wanted_params(terms.values, terms.context):
-        about = [each for each in left if re.search(rf"\b{name}\b", each.text)]
+        about = [each for each in left if name in each.note.names]
         left = [each for each in left if each not in about]
         verdicts = [each.verdict for each in about]
         yield _row(
@@ -151,14 +145,20 @@ def param_rows(terms: Terms) -> Iterator[Row]:
             _found(terms, name),
             should_be,
             "no-go" if "no-go" in verdicts else "warn" if about else "go",
-            "; ".join(each.text for each in about),
+            "; ".join(each.note.text for each in about),
+            cures(each.note for each in about),
         )
-    for verdict, text in left:
-        named = _PARAMETER.search(text)
-        yield _row(named[0] if named else "settings", "see below", "", verdict, text)
+    for verdict, note in left:
+        name = note.names[0] if note.names else "settings"
+        yield _row(name, "see below", "", verdict, note.text, cures([note]))
     yield from _calibration_rows(terms)
     yield from _curve_rows(terms)
     yield from _thrust_rows(terms)
+
+
+def cures(notes: Iterable[ParamNote]) -> tuple[str, ...]:
+    """Flags that mend what these notes are about."""
+    return tuple(note.cure for note in notes if note.cure)
 
 
 def _found(terms: Terms, name: str) -> str:
@@ -171,8 +171,8 @@ def _found(terms: Terms, name: str) -> str:
 
 
 def _calibration_rows(terms: Terms) -> Iterator[Row]:
-    """The four channels of overrides; a calibration that cannot be used is a sentence already."""
-    calibration = terms.calibration
+    """The four channels of overrides; a calibration that cannot be used is a note already."""
+    calibration = terms.assessment.calibration
     if terms.context.output != "rc-override" or calibration is None:
         return
     for stick, channel in zip(Sticks._fields, calibration.channels, strict=True):
@@ -187,14 +187,17 @@ def _channel(channel: RcChannel) -> str:
 
 def _curve_rows(terms: Terms) -> Iterator[Row]:
     """Motion at full stick, beside what it was in the policy's training."""
-    gains, mode = terms.gains, terms.mode
-    if gains is None or mode is None or not terms.is_sticks:
+    mode, gains = terms.mode, terms.gains
+    if terms.plan is None or mode is None or not terms.is_sticks:
+        return
+    if gains is None:
+        text = "link.raw_sticks: full sticks are not what they were in training"
+        yield _row("sticks", "sent as they are", "mapped", "warn", text)
         return
     curves = terms.profile.stick_curves(terms.values, mode, gains)
     shortfalls: dict[str, str] = dict(curves.shortfalls)
-    if (
-        curves is IDENTITY
-    ):  # the very object that stands for a mode whose sticks mean something else
+    # The very object that stands for a mode whose sticks mean something else.
+    if curves is IDENTITY:
         yield _row("sticks", f"sent as they are in {mode}", "a mode in which they are mapped")
         return
     if curves.unmapped is not None:
@@ -213,11 +216,8 @@ def _curve_rows(terms: Terms) -> Iterator[Row]:
         note = shortfalls.get(noun, "")
         found = f"{trained:.3g} {unit}, as in training"
         if half is not None:
-            found = f"{half.full:.3g} {unit} ({half.parameter})"
-            if terms.config.link.raw_sticks:
-                note = note or f"link.raw_sticks: full {noun} is not what it was in training"
-            elif not note:
-                found += ", sticks are mapped"
+            mapped = "" if note else ", sticks are mapped"
+            found = f"{half.full:.3g} {unit} ({half.parameter}){mapped}"
         yield _row(f"full {noun}", found, f"{trained:.3g} {unit}", "warn" if note else "go", note)
 
 

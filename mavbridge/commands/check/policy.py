@@ -11,11 +11,11 @@ import numpy as np
 from mavbridge.commands.check.rows import Row, Verdict
 from mavbridge.config.flight import FlyConfig
 from mavbridge.core.clock import NS_PER_S, Clock, period_ns
-from mavbridge.core.errors import MavbridgeError
+from mavbridge.core.errors import MavbridgeError, UserError
 from mavbridge.core.histogram import Histogram
 from mavbridge.core.realtime import settle_thread
 from mavbridge.core.workers import Worker
-from mavbridge.flight.plan import plan_flight
+from mavbridge.flight.plan import FlightPlan, plan_flight
 from mavbridge.flight.policies import load_configured_policy
 from mavbridge.flight.speed import require_speed
 from policy.contract import ACTION_DIM, Contract
@@ -42,9 +42,8 @@ class PolicyFindings:
     """The policy's rows, and what the rest of the check takes from it."""
 
     rows: list[Row] = field(default_factory=list)
-    contract: Contract | None = None
-    """None: no policy was named, or it cannot be loaded."""
-    is_dual: bool = True
+    plan: FlightPlan | None = None
+    """None: no policy was named, it cannot be loaded, or a flag contradicts it."""
 
 
 def check_policy(config: FlyConfig, clock: Clock, *, timing_s: float) -> PolicyFindings:
@@ -57,10 +56,16 @@ def check_policy(config: FlyConfig, clock: Clock, *, timing_s: float) -> PolicyF
                 config.policy, clock, starts_in_air=config.takeoff is not None
             )
             stack.enter_context(loaded)
-            rows = [_engine_row(loaded), *_speed_rows(config, loaded, clock, timing_s)]
-            rows += _contract_rows(config, loaded.runner)
-            contract = loaded.runner.contract
-            return PolicyFindings(rows=rows, contract=contract, is_dual=loaded.runner.dual_rate)
+            rows = [_engine_row(loaded)]
+            runner = loaded.runner
+            try:
+                plan = plan_flight(config, runner.contract, is_dual=runner.dual_rate)
+            except UserError as error:
+                found = _contract_words(runner.contract)
+                rows.append(_row("flags of the flight", found, "no-go", str(error)))
+                return PolicyFindings(rows=rows)
+            rows += [*_speed_rows(plan, loaded, clock, timing_s), *_plan_rows(plan)]
+            return PolicyFindings(rows=rows, plan=plan)
     except MavbridgeError as error:
         return PolicyFindings(rows=[_row("policy", config.policy.policy, "no-go", str(error))])
 
@@ -81,19 +86,17 @@ def _engine_row(loaded: LoadedPolicy) -> Row:
 
 
 def _speed_rows(
-    config: FlyConfig, loaded: LoadedPolicy, clock: Clock, timing_s: float
+    plan: FlightPlan, loaded: LoadedPolicy, clock: Clock, timing_s: float
 ) -> Iterator[Row]:
     """The rates that were held, and what a flight says of the policy's speed."""
     if loaded.times is None:
         yield _row("speed", "not measured: no chunk on a dummy sample")
     else:
-        for pace in _run_at_rates(config, loaded.runner, clock, timing_s):
+        for pace in _run_at_rates(plan, loaded.runner, clock, timing_s):
             yield pace.row()
     expected = "within the ages of its contract"
     try:
-        runner = loaded.runner
-        plan = plan_flight(config, runner.contract, is_dual=runner.dual_rate)
-        notes = require_speed(plan, runner.name, loaded.times)
+        notes = require_speed(plan, loaded.runner.name, loaded.times)
     except MavbridgeError as error:
         yield _row("speed", "too slow", "no-go", str(error), expected=expected)
         return
@@ -158,11 +161,10 @@ class Pace:
 
 
 def _run_at_rates(
-    config: FlyConfig, runner: PolicyRunner, clock: Clock, timing_s: float
+    plan: FlightPlan, runner: PolicyRunner, clock: Clock, timing_s: float
 ) -> list[Pace]:
     """Chunks and images of a dummy sample, each in a thread, at the rates of the flight."""
-    contract, rates = runner.contract, config.rates
-    loops = rates.loops(is_dual=runner.dual_rate, play_s=contract.play_s)
+    contract, rates, loops = runner.contract, plan.config.rates, plan.loops
     images, state = dummy_images(contract), level_state(contract)
     history = np.zeros((1, contract.history_len, ACTION_DIM), np.float32)
     encoded = encode_all(runner, images)
@@ -192,17 +194,16 @@ def _run_at_rates(
     return [chunks, pictures]
 
 
-def _contract_rows(config: FlyConfig, runner: PolicyRunner) -> list[Row]:
-    contract = runner.contract
+def _contract_words(contract: Contract) -> str:
     takes = f"{contract.image_width}x{contract.image_height} of {', '.join(contract.cameras)}"
-    found = f"{contract.action}, {contract.state_frame}, {takes}"
-    try:
-        plan = plan_flight(config, contract, is_dual=runner.dual_rate)
-    except MavbridgeError as error:
-        return [_row("flags of the flight", found, "no-go", str(error))]
+    return f"{contract.action}, {contract.state_frame}, {takes}"
+
+
+def _plan_rows(plan: FlightPlan) -> list[Row]:
     figures = ", ".join(f"{name} {value:.4g}" for name, value in plan.figures().items())
+    expected = "no flag that contradicts it"
     return [
-        _row("contract", found, expected="no flag that contradicts it"),
+        _row("contract", _contract_words(plan.contract), expected=expected),
         _row("plan", figures),
     ]
 

@@ -1,6 +1,5 @@
 """Rows of the check, the verdict on all of them, their JSON and their table."""
 
-import re
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Literal, TypeAlias
@@ -14,9 +13,6 @@ from mavbridge.core.provenance import without_secrets
 
 Area: TypeAlias = Literal["link", "vehicle", "parameters", "camera", "policy", "computer"]
 Verdict: TypeAlias = Literal["go", "warn", "no-go"]
-_FLAG = re.compile(
-    r"--set [A-Z0-9_]+=-?\d+(?:\.\d+)?|--set-config link\.source_system=\d+|ulimit -\w \w+"
-)
 _STYLES: dict[Verdict, str] = {"go": "green", "warn": "yellow", "no-go": "bold red"}
 _FOOT = (
     "Nothing was set, armed or flown. What a flight asks for was asked for as well: message "
@@ -35,16 +31,13 @@ class Row:
     verdict: Verdict = "go"
     advice: str = ""
     """The reason for a warning or a no-go, and what to do; empty for a go."""
+    commands: tuple[str, ...] = ()
+    """Flags that mend it for one flight."""
 
     def __post_init__(self) -> None:
         """Hide the passwords of addresses, for the table and the JSON."""
         for name in ("found", "expected", "advice"):
             object.__setattr__(self, name, without_secrets(getattr(self, name)))
-
-    @property
-    def commands(self) -> tuple[str, ...]:
-        """Flags and commands in the advice that mend it."""
-        return tuple(_FLAG.findall(self.advice))
 
 
 def overall(rows: Sequence[Row]) -> Verdict:
@@ -94,20 +87,16 @@ def _table(rows: Sequence[Row]) -> Table:
 
 
 def _print_reasons(rows: Sequence[Row], console: Console) -> None:
-    """Each reason once, with its rows' names, its text hanging under itself."""
-    names: dict[str, list[str]] = {}
-    for row in rows:
-        names.setdefault(row.advice, []).append(row.name)
-    if not names:
+    """Each reason with its row's name; those of parameters name them."""
+    if not rows:
         return
     grid = Table.grid(padding=(0, 1))
     grid.add_column(no_wrap=True)
     grid.add_column(overflow="fold")
     mark = Text(rows[0].verdict, style=_STYLES[rows[0].verdict])
-    for advice, whose in names.items():
-        names_itself = advice.startswith(tuple(whose))
-        head = "" if names_itself else f"{', '.join(whose)}: "
-        grid.add_row(mark, Text.assemble((head, "bold"), advice))
+    for row in rows:
+        head = "" if row.area == "parameters" else f"{row.name}: "
+        grid.add_row(mark, Text.assemble((head, "bold"), row.advice))
     console.print()
     console.print(grid)
 
@@ -117,7 +106,6 @@ def _summary(rows: Sequence[Row]) -> Text:
     counts = {each: sum(row.verdict == each for row in rows) for each in _STYLES}
     told = f"{counts['go']} go, {counts['warn']} to be warned of, {counts['no-go']} no-go"
     word = "NO-GO" if verdict == "no-go" else "GO"
-    sets = dict.fromkeys(command for row in rows for command in row.commands)
-    flags = [flag for flag in sets if flag.startswith("--")]
+    flags = dict.fromkeys(command for row in rows for command in row.commands)
     cure = f"\nfor one flight, add: {' '.join(flags)}" if flags else ""
     return Text.assemble((word, _STYLES[verdict]), f": {told}{cure}")

@@ -13,17 +13,18 @@ from rich.console import Console
 
 from mavbridge.camera.open import NO_CAMERA
 from mavbridge.commands.check.camera import CameraNeeds, camera_rows
-from mavbridge.commands.check.policy import NO_POLICY, PolicyFindings, check_policy
+from mavbridge.commands.check.policy import NO_POLICY, check_policy
 from mavbridge.commands.check.rows import Row, as_document, overall, print_check
 from mavbridge.commands.check.vehicle import check_vehicle
 from mavbridge.commands.config import CheckConfig
 from mavbridge.commands.output import print_status
 from mavbridge.config.flight import CameraConfig, FlyConfig
 from mavbridge.config.rates import Rates
-from mavbridge.core.clock import Clock, MonotonicClock
+from mavbridge.core.clock import NS_PER_S, Clock, MonotonicClock
 from mavbridge.core.errors import ExitCode, MavbridgeError
 from mavbridge.core.files import require_writable
 from mavbridge.core.processes import child_environment
+from mavbridge.flight.plan import FlightPlan
 from mavbridge.flight.policies import looks_at_images, require_images
 from policy.contract import Contract
 from policy.preprocess import least_source_px
@@ -129,22 +130,22 @@ def check_all(config: CheckConfig) -> list[Row]:
     if flight.policy.policy != NO_POLICY:
         print_status(f"loading the policy, then running it for {config.timing:g} s")
     policy = check_policy(flight, clock, timing_s=config.timing)
-    cameras = _check_cameras(flight, policy, clock)
+    cameras = _check_cameras(flight, policy.plan, clock)
     if flight.link.connect == NO_VEHICLE:
         vehicle = [Row("link", "vehicle", "none", "none for this check")]
     else:
         print_status(f"listening to the vehicle on {flight.link.connect}")
-        vehicle = check_vehicle(flight, policy, clock, echo_test=config.echo_test)
+        vehicle = check_vehicle(flight, policy.plan, clock, echo_test=config.echo_test)
     return [*vehicle, *cameras, *policy.rows, *computer_rows(flight.rates)]
 
 
-def _check_cameras(config: FlyConfig, policy: PolicyFindings, clock: Clock) -> list[Row]:
+def _check_cameras(config: FlyConfig, plan: FlightPlan | None, clock: Clock) -> list[Row]:
     """Rows of every camera of the flight, or of the flags that do not fit the policy."""
     if config.link.connect == NO_VEHICLE and set(config.camera.sources) == {NO_CAMERA}:
         return []  # only this computer is checked
     try:
         require_images(config)
-        needs = _camera_needs(config, policy)
+        needs = _camera_needs(config, plan)
     except MavbridgeError as error:
         return [_camera_row(" ".join(config.camera.sources), "", "no-go", str(error))]
     if not needs:
@@ -153,33 +154,35 @@ def _check_cameras(config: FlyConfig, policy: PolicyFindings, clock: Clock) -> l
     return camera_rows(needs, config.camera, clock)
 
 
-def _camera_needs(config: FlyConfig, policy: PolicyFindings) -> list[CameraNeeds]:
+def _camera_needs(config: FlyConfig, plan: FlightPlan | None) -> list[CameraNeeds]:
     """What the flight needs of each camera; raises UserError where their names do not fit.
 
     Without a policy only cameras that were named are looked at.
     """
-    contract = policy.contract
     if set(config.camera.sources) == {NO_CAMERA}:
         return []
-    is_depth = None if contract is None else contract.is_depth
-    if contract is None:
+    if plan is None:
         if config.camera == CameraConfig():
             return []
         contract = Contract()
         names, sources = config.camera.sources, config.camera.sources
+        _, most_hz = config.rates.visual_limits_hz
+        max_age_s = contract.max_feature_age_s
     else:
+        contract = plan.contract
         names, sources = contract.cameras, config.camera.sources_of(contract.cameras)
-    loops = config.rates.loops(is_dual=policy.is_dual, play_s=contract.play_s)
-    rates_hz = contract.camera_rates_hz or (loops.max_vision_hz,) * len(sources)
+        most_hz = plan.loops.max_vision_hz
+        max_age_s = plan.start_limits.feature_ns / NS_PER_S
+    rates_hz = contract.camera_rates_hz or (most_hz,) * len(sources)
     return [
         CameraNeeds(
             name=name if len(names) > 1 else "",
             source=source,
-            rate_hz=min(rate_hz, loops.max_vision_hz),
+            rate_hz=min(rate_hz, most_hz),
             side_px=least_source_px(contract),
-            max_age_s=contract.max_feature_age_s,
+            max_age_s=max_age_s,
             is_flown_by=looks_at_images(config),
-            is_depth=is_depth,
+            is_depth=None if plan is None else contract.is_depth,
         )
         for name, source, rate_hz in zip(names, sources, rates_hz, strict=False)
     ]

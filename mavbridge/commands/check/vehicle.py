@@ -7,7 +7,6 @@ from functools import partial
 
 from mavbridge.commands.check.link_rows import VehicleProbe, echo_row, link_rows
 from mavbridge.commands.check.param_rows import Terms, param_rows
-from mavbridge.commands.check.policy import PolicyFindings
 from mavbridge.commands.check.rows import Row
 from mavbridge.config.flight import FlyConfig
 from mavbridge.core.clock import Clock
@@ -15,11 +14,13 @@ from mavbridge.core.errors import MavbridgeError
 from mavbridge.core.link_settings import LinkSettings
 from mavbridge.core.vehicle import (
     ActionMeaning,
+    AdviceText,
     LinkSnapshot,
     VehicleStatus,
     VehicleText,
 )
-from mavbridge.flight.settings import action_meaning, guard_settings
+from mavbridge.flight.plan import FlightPlan
+from mavbridge.flight.settings import guard_settings
 from mavbridge.guard.sequences import MIDDLE_STICK
 from mavbridge.mavlink.link import MavlinkLink
 from mavbridge.mavlink.session.vehicle import VehicleSession
@@ -47,7 +48,7 @@ def vehicle_rows(
         yield _arming_row(is_ready=is_ready)
     if vehicle.switch_problem is not None:
         yield _row("override switch", "off", "on", "warn", str(vehicle.switch_problem))
-    yield from _text_rows(terms, texts, None if status is None else status.mode)
+    yield from _text_rows(texts)
 
 
 def _mode_rows(terms: Terms) -> Iterator[Row]:
@@ -133,12 +134,9 @@ def _arming_row(*, is_ready: bool) -> Row:
     )
 
 
-def _text_rows(terms: Terms, texts: Sequence[str], present_mode: str | None) -> Iterator[Row]:
-    """What was said besides the parameters' sentences, which have rows of their own."""
-    told = {sentence.text for sentence in terms.sentences()}
-    for mode in filter(None, {terms.mode, present_mode}):
-        told |= set(terms.profile.stick_curves(terms.values, mode, terms.gains).notes)
-    for text in [text for text in texts if text not in told][-_TEXTS_SHOWN:]:
+def _text_rows(texts: Sequence[str]) -> Iterator[Row]:
+    """What was said besides advice about parameters and sticks, which has rows of its own."""
+    for text in [text for text in texts if not isinstance(text, AdviceText)][-_TEXTS_SHOWN:]:
         if not isinstance(text, VehicleText):
             yield _row("link", "see below", "", "warn", text)
         elif text.said.startswith(REFUSES_TO_ARM):
@@ -149,7 +147,7 @@ def _text_rows(terms: Terms, texts: Sequence[str], present_mode: str | None) -> 
 
 def check_vehicle(
     config: FlyConfig,
-    policy: PolicyFindings,
+    plan: FlightPlan | None,
     clock: Clock,
     *,
     echo_test: bool,
@@ -157,10 +155,11 @@ def check_vehicle(
 ) -> list[Row]:
     """All rows about the link, the vehicle and its parameters; whatever fails is a row.
 
-    ``transport`` replaces the one that the address of ``config`` names.
+    ``plan`` is None where no policy flies. ``transport`` replaces the one that the address of
+    ``config`` names.
     """
     rows: list[Row] = []
-    settings = checking_settings(config, policy, sends=echo_test)
+    settings = checking_settings(config, is_dual=plan is None or plan.is_dual, sends=echo_test)
     try:
         with ExitStack() as stack:
             transport = transport or make_transport(settings.connect, clock)
@@ -169,9 +168,8 @@ def check_vehicle(
                 signing = stack.enter_context(SigningStore(settings.signing, clock))
             link = MavlinkLink(transport, clock, settings, signing=signing)
             stack.callback(link.close)
-            meaning = ActionMeaning()  # without a policy, sticks as they are
-            if policy.contract is not None:
-                meaning = action_meaning(policy.contract, config.link)
+            # Without a policy, sticks as they are.
+            meaning = ActionMeaning() if plan is None else plan.guard.meaning
             output = None if config.link.output == "auto" else config.link.output
             link.begin_flight(meaning, output)
             probe = VehicleProbe(link, clock)
@@ -179,7 +177,7 @@ def check_vehicle(
             unfinished = probe.set_up()
             stats = probe.measure()
             vehicle, snapshot, texts = probe.find(), probe.snapshot(), list(probe.texts)
-            terms = Terms.of(config, settings, policy.contract, vehicle, snapshot.status)
+            terms = Terms.of(config, settings, plan, vehicle, snapshot.status)
             rows += link_rows(vehicle, stats, terms, unfinished=unfinished)
             if echo_test:
                 rows.append(echo_row(probe, terms))
@@ -191,11 +189,7 @@ def check_vehicle(
     return rows
 
 
-def checking_settings(config: FlyConfig, policy: PolicyFindings, *, sends: bool) -> LinkSettings:
+def checking_settings(config: FlyConfig, *, is_dual: bool, sends: bool) -> LinkSettings:
     """Settings of the flight's link, which sets no parameter and, unless ``sends``, no stick."""
-    guard = guard_settings(config, is_dual=policy.is_dual, tlog_fd=None, wall_offset_ns=0)
-    return replace(
-        guard.link,
-        readonly=not sends,
-        set_params=(),
-    )
+    guard = guard_settings(config, is_dual=is_dual, tlog_fd=None, wall_offset_ns=0)
+    return replace(guard.link, readonly=not sends, set_params=())

@@ -3,7 +3,7 @@
 from dataclasses import replace
 
 from mavbridge.core.clock import NS_PER_MS
-from mavbridge.core.vehicle import IDLE, Action, StickGains, Sticks, VehicleStatus
+from mavbridge.core.vehicle import IDLE, Action, AdviceText, StickGains, Sticks, VehicleStatus
 from mavbridge.mavlink.codec.packets import Codec, CommandRefusedError
 from mavbridge.mavlink.outputs.echo import EchoRules
 from mavbridge.mavlink.outputs.output import ActionOutput, Encoded
@@ -104,5 +104,5 @@ class StickOutput(ActionOutput):
                 is_new = note not in self._told and len(self._told) < _MOST_TOLD
                 if is_new and vehicle.are_params_read:
                     self._told.add(note)
-                    self._new_notes.append(note)
+                    self._new_notes.append(AdviceText(note))
         return self._curves

@@ -17,6 +17,7 @@ from mavbridge.mavlink.profiles.profile import (
     NO_POSITION_WORD,
     Danger,
     ParamContext,
+    ParamNote,
     Profile,
     StreamGroup,
     WantedParam,
@@ -129,7 +130,7 @@ class ArduPilot(Profile):
             return CommandRequest(dialect.MAV_CMD_DO_AUX_FUNCTION, _SIMPLE_MODE_OFF)
         return None
 
-    def obstacles(self, values: Mapping[str, float], context: ParamContext) -> Iterator[str]:
+    def obstacles(self, values: Mapping[str, float], context: ParamContext) -> Iterator[ParamNote]:
         """Overrides that are ignored or turned, and thrust that would be taken for a climb rate."""
         if context.output == "rc-override":
             yield from ardupilot_params.override_obstacles(values, context.source_system)
@@ -143,14 +144,14 @@ class ArduPilot(Profile):
         elif context.output is not None:
             yield from setpoint_danger(values, "GUID_TIMEOUT")
 
-    def advice(self, values: Mapping[str, float], context: ParamContext) -> Iterator[str]:
+    def advice(self, values: Mapping[str, float], context: ParamContext) -> Iterator[ParamNote]:
         """Time-outs that are long, and what keeps it from arming."""
         if context.output == "rc-override":
             yield from ardupilot_params.override_advice(values)
         elif context.output is not None:
             yield from ardupilot_params.setpoint_advice(values, context)
 
-    def hints(self, values: Mapping[str, float], context: ParamContext) -> Iterator[str]:
+    def hints(self, values: Mapping[str, float], context: ParamContext) -> Iterator[ParamNote]:
         """Failsafes and switches that make a flight safer."""
         return ardupilot_params.hints(values, context)
 

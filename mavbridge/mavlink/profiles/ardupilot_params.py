@@ -11,6 +11,7 @@ from mavbridge.mavlink.codec.calibration import (
 from mavbridge.mavlink.profiles.profile import (
     Danger,
     ParamContext,
+    ParamNote,
     StickSetting,
     WantedParam,
     stick_obstacles,
@@ -157,37 +158,44 @@ def is_simple_setting(name: str, value: float) -> bool:
     return is_option or (name in SIMPLE_NAMES and value != 0)
 
 
-def override_obstacles(values: Mapping[str, float], source_system: int) -> Iterator[str]:
+def override_obstacles(values: Mapping[str, float], source_system: int) -> Iterator[ParamNote]:
     """Reasons, as far as parameters show, for which this vehicle would ignore our overrides."""
     low = current_names(values).get("MAV_GCS_SYSID")
     if low is not None:
         high = max(values.get("MAV_GCS_SYSID_HI", 0), low)
         if not low <= source_system <= high:
-            yield (
-                f"it obeys system {low:.0f} and we are system {source_system}: use "
-                f"--set-config link.source_system={low:.0f}, or set MAV_GCS_SYSID (SYSID_MYGCS on "
-                "older firmware)"
+            yield ParamNote(
+                ("MAV_GCS_SYSID", "SYSID_MYGCS"),
+                f"it obeys system {low:.0f} and we are system {source_system}",
+                f"--set-config link.source_system={low:.0f}",
+                ", or set MAV_GCS_SYSID (SYSID_MYGCS on older firmware)",
             )
     options = int(values.get("RC_OPTIONS", 0))
     if options & _IGNORE_OVERRIDES:
-        yield (
-            "RC_OPTIONS bit 1 (ignore overrides) is set: use "
-            f"--set RC_OPTIONS={options & ~_IGNORE_OVERRIDES}"
+        yield ParamNote(
+            ("RC_OPTIONS",),
+            "RC_OPTIONS bit 1 (ignore overrides) is set",
+            f"--set RC_OPTIONS={options & ~_IGNORE_OVERRIDES}",
         )
     if values.get("RC_OVERRIDE_TIME") == 0:
-        yield "RC_OVERRIDE_TIME is 0, which disables overrides: use --set RC_OVERRIDE_TIME=0.5"
+        yield ParamNote(
+            ("RC_OVERRIDE_TIME",),
+            "RC_OVERRIDE_TIME is 0, which disables overrides",
+            "--set RC_OVERRIDE_TIME=0.5",
+        )
     yield from stick_obstacles(stick_settings(values), values)
 
 
-def thrust_obstacles(values: Mapping[str, float]) -> Iterator[str]:
+def thrust_obstacles(values: Mapping[str, float]) -> Iterator[ParamNote]:
     """Reasons for which the thrust of SET_ATTITUDE_TARGET would not be taken as one."""
     options = values.get("GUID_OPTIONS")
     if options is None:
-        yield "it has not sent GUID_OPTIONS, which is asked for again"
+        yield ParamNote(("GUID_OPTIONS",), "it has not sent GUID_OPTIONS, which is asked for again")
     elif not int(options) & _THRUST_AS_THRUST:
-        yield (
-            f"GUID_OPTIONS is {options:g}, with which it takes our thrust for a climb rate: use "
-            f"--set GUID_OPTIONS={int(options) | _THRUST_AS_THRUST}"
+        yield ParamNote(
+            ("GUID_OPTIONS",),
+            f"GUID_OPTIONS is {options:g}, with which it takes our thrust for a climb rate",
+            f"--set GUID_OPTIONS={int(options) | _THRUST_AS_THRUST}",
         )
 
 
@@ -197,71 +205,92 @@ def override_dangers(values: Mapping[str, float], *, has_receiver: bool | None) 
     if time_s is not None and time_s < 0:
         yield Danger(
             "endless-override",
-            "if this computer died, the vehicle would hold its last sticks for ever "
-            f"(RC_OVERRIDE_TIME is {time_s:g}): use --set RC_OVERRIDE_TIME=0.5",
+            ParamNote(
+                ("RC_OVERRIDE_TIME",),
+                "if this computer died, the vehicle would hold its last sticks for ever "
+                f"(RC_OVERRIDE_TIME is {time_s:g})",
+                "--set RC_OVERRIDE_TIME=0.5",
+            ),
         )
     if values.get("FS_THR_ENABLE") == 0 and has_receiver is not True:
         yield Danger(
             "no-throttle-failsafe",
-            "no receiver was seen, and without its throttle failsafe (FS_THR_ENABLE is 0) the "
-            "vehicle would hold its last sticks for ever if this computer died: use "
-            "--set FS_THR_ENABLE=1",
+            ParamNote(
+                ("FS_THR_ENABLE",),
+                "no receiver was seen, and without its throttle failsafe (FS_THR_ENABLE is 0) the "
+                "vehicle would hold its last sticks for ever if this computer died",
+                "--set FS_THR_ENABLE=1",
+            ),
         )
 
 
-def override_advice(values: Mapping[str, float]) -> Iterator[str]:
+def override_advice(values: Mapping[str, float]) -> Iterator[ParamNote]:
     """What should be known before a flight by overrides."""
     missing = [name for name in RISK_NAMES if name not in values]
     if missing:
-        yield (
+        yield ParamNote(
+            tuple(missing),
             f"the vehicle has not sent {', '.join(missing)}: whether it holds its last sticks for "
-            "ever if this computer dies is not known"
+            "ever if this computer dies is not known",
         )
     if missing := [name for name in SIMPLE_NAMES if name not in values]:
-        yield (
+        yield ParamNote(
+            tuple(missing),
             f"the vehicle has not sent {', '.join(missing)}: whether {_TURNED}the heading at "
-            "arming is not known"
+            "arming is not known",
         )
     time_s = values.get("RC_OVERRIDE_TIME", 0.0)
     if time_s > _LONGEST_S:
-        yield (
+        yield ParamNote(
+            ("RC_OVERRIDE_TIME",),
             f"RC_OVERRIDE_TIME is {time_s:g}: if this computer died, the vehicle would hold its "
-            "last sticks for that many seconds: use --set RC_OVERRIDE_TIME=0.5"
+            "last sticks for that many seconds",
+            "--set RC_OVERRIDE_TIME=0.5",
         )
 
 
-def setpoint_advice(values: Mapping[str, float], context: ParamContext) -> Iterator[str]:
+def setpoint_advice(values: Mapping[str, float], context: ParamContext) -> Iterator[ParamNote]:
     """What should be known before a flight by setpoints in GUIDED."""
     timeout_s = values.get("GUID_TIMEOUT", 0.0)
     if timeout_s > _LONGEST_S:
-        yield (
+        yield ParamNote(
+            ("GUID_TIMEOUT",),
             f"GUID_TIMEOUT is {timeout_s:g}: if this computer died, the vehicle would hold its "
-            "last setpoint for that many seconds: use --set GUID_TIMEOUT=0.5"
+            "last setpoint for that many seconds",
+            "--set GUID_TIMEOUT=0.5",
         )
     if context.has_receiver is False and values.get("FS_THR_ENABLE", 0.0) != 0:
-        yield (
+        yield ParamNote(
+            ("FS_THR_ENABLE",),
             "no receiver was seen: the vehicle will not arm without one while its throttle "
-            "failsafe is on; setpoints do not need it: --set FS_THR_ENABLE=0"
+            "failsafe is on; setpoints do not need it",
+            "--set FS_THR_ENABLE=0",
         )
     if context.output == "attitude" and values.get("ATC_ANGLE_BOOST") == 0:
-        yield "ATC_ANGLE_BOOST is 0: thrust is not raised when it leans, the policy has to do it"
+        yield ParamNote(
+            ("ATC_ANGLE_BOOST",),
+            "ATC_ANGLE_BOOST is 0: thrust is not raised when it leans, the policy has to do it",
+        )
 
 
-def hints(values: Mapping[str, float], context: ParamContext) -> Iterator[str]:
+def hints(values: Mapping[str, float], context: ParamContext) -> Iterator[ParamNote]:
     """Failsafes and switches that make a flight safer."""
     if context.output != "rc-override":
         return
     options = values.get("FS_OPTIONS")
     lands_on = options is None or int(options) & _CONTINUE_LANDING
     if context.has_receiver is False and options is not None and not lands_on:
-        yield (
+        yield ParamNote(
+            ("FS_OPTIONS",),
             f"FS_OPTIONS is {options:g}: without a receiver, a landing turns into RTL when the "
-            f"sticks end: --set FS_OPTIONS={int(options) | _CONTINUE_LANDING}"
+            "sticks end",
+            f"--set FS_OPTIONS={int(options) | _CONTINUE_LANDING}",
         )
     if context.has_receiver and override_switch(values) is None:
-        yield (
+        yield ParamNote(
+            ("RCn_OPTION",),
             "no RCn_OPTION is 46: a switch of the radio with it takes the sticks back in the "
-            "autopilot itself, whatever happens here"
+            "autopilot itself, whatever happens here",
         )
 
 

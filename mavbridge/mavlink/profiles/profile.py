@@ -66,16 +66,41 @@ class EventMeaning(NamedTuple):
     """For the user, where no STATUSTEXT says it."""
 
 
+class ParamNote(NamedTuple):
+    """A remark about parameters, and the flag that mends it."""
+
+    names: tuple[str, ...]
+    """Parameters that it is about; empty: none."""
+    said: str
+    cure: str = ""
+    """Empty: no flag mends it."""
+    or_else: str = ""
+    """End of the sentence, after the flag."""
+
+    @property
+    def text(self) -> str:
+        """The sentence for the user."""
+        return f"{self.said}: use {self.cure}{self.or_else}" if self.cure else self.said
+
+
 class Danger(NamedTuple):
     """A setting with which the vehicle flies, but is not safe."""
 
     risk: Risk
-    text: str
+    note: ParamNote
 
     @property
-    def refusal(self) -> str:
-        """The sentence for a flight that is not begun."""
-        return f"{self.text}, or --set-config link.accept_risk={self.risk} to fly all the same"
+    def accepted(self) -> ParamNote:
+        """The note for a flight of which the user has accepted the risk."""
+        return self.note._replace(said=f"risk {self.risk} is accepted: {self.note.said}")
+
+    @property
+    def refused(self) -> ParamNote:
+        """The note for a flight that is not begun."""
+        accept = f", or --set-config link.accept_risk={self.risk} to fly all the same"
+        if not self.note.cure:
+            return self.note._replace(said=self.note.said + accept)
+        return self.note._replace(or_else=self.note.or_else + accept)
 
 
 LONGEST_SETPOINT_S = 3.0
@@ -89,8 +114,12 @@ def setpoint_danger(values: Mapping[str, float], name: str) -> Iterator[Danger]:
     if time_s > LONGEST_SETPOINT_S:
         yield Danger(
             "long-setpoint",
-            "if this computer died, the vehicle would fly on with its last setpoint for "
-            f"{time_s:g} s ({name}): use --set {name}=0.5",
+            ParamNote(
+                (name,),
+                "if this computer died, the vehicle would fly on with its last setpoint for "
+                f"{time_s:g} s ({name})",
+                f"--set {name}=0.5",
+            ),
         )
 
 
@@ -103,12 +132,14 @@ class StickSetting(NamedTuple):
     mended: float
 
 
-def stick_obstacles(settings: Iterable[StickSetting], values: Mapping[str, float]) -> Iterator[str]:
-    """A sentence for each of the settings with which sticks mean something else."""
+def stick_obstacles(
+    settings: Iterable[StickSetting], values: Mapping[str, float]
+) -> Iterator[ParamNote]:
+    """A note for each of the settings with which sticks mean something else."""
     for name, effect, is_harmless, mended in settings:
         value = values.get(name)
         if value is not None and not is_harmless(value):
-            yield f"{name} is {value:g}: {effect}: use --set {name}={mended:g}"
+            yield ParamNote((name,), f"{name} is {value:g}: {effect}", f"--set {name}={mended:g}")
 
 
 class WantedParam(NamedTuple):
@@ -193,7 +224,7 @@ class Profile(ABC):
         return False
 
     @abstractmethod
-    def obstacles(self, values: Mapping[str, float], context: ParamContext) -> Iterator[str]:
+    def obstacles(self, values: Mapping[str, float], context: ParamContext) -> Iterator[ParamNote]:
         """Reasons, as far as parameters show, for which the vehicle would not do as it is told.
 
         Each with the command that mends it; nobody can accept them.
@@ -208,10 +239,10 @@ class Profile(ABC):
         """Settings with which it flies, but not safely; accepted ones included."""
 
     @abstractmethod
-    def advice(self, values: Mapping[str, float], context: ParamContext) -> Iterator[str]:
+    def advice(self, values: Mapping[str, float], context: ParamContext) -> Iterator[ParamNote]:
         """Warnings: they forbid no flight, but should be known before it."""
 
-    def hints(self, values: Mapping[str, float], context: ParamContext) -> Iterator[str]:
+    def hints(self, values: Mapping[str, float], context: ParamContext) -> Iterator[ParamNote]:
         """What could be set better for a flight, with the command; said by ``mavbridge check``
         alone."""
         return iter(())

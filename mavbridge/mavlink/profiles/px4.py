@@ -16,6 +16,7 @@ from mavbridge.mavlink.profiles.profile import (
     Danger,
     EventMeaning,
     ParamContext,
+    ParamNote,
     Profile,
     StickSetting,
     StreamGroup,
@@ -189,16 +190,18 @@ class Px4(Profile):
         """COM_RC_IN_MODE 1 takes sticks from MAVLink alone, 4 from nowhere."""
         return values.get("COM_RC_IN_MODE") in (1.0, 4.0)
 
-    def obstacles(self, values: Mapping[str, float], context: ParamContext) -> Iterator[str]:
+    def obstacles(self, values: Mapping[str, float], context: ParamContext) -> Iterator[ParamNote]:
         """COM_RC_IN_MODE without MAVLink's sticks, and a gesture that a policy might make."""
         if context.output != "manual-control":
             return
         yield from stick_obstacles(_STICK_SETTINGS, values)
         mode = values.get("COM_RC_IN_MODE")
         if mode in _NO_MAVLINK_STICKS:
-            yield (
-                f"COM_RC_IN_MODE is {mode:g} ({_NO_MAVLINK_STICKS[int(mode)]}): use "
-                "--set COM_RC_IN_MODE=1 (MAVLink only), or 6 with a receiver (MAVLink first)"
+            yield ParamNote(
+                ("COM_RC_IN_MODE",),
+                f"COM_RC_IN_MODE is {mode:g} ({_NO_MAVLINK_STICKS[int(mode)]})",
+                "--set COM_RC_IN_MODE=1",
+                " (MAVLink only), or 6 with a receiver (MAVLink first)",
             )
 
     def dangers(self, values: Mapping[str, float], context: ParamContext) -> Iterator[Danger]:
@@ -206,7 +209,7 @@ class Px4(Profile):
         if context.output not in (None, "manual-control"):
             yield from setpoint_danger(values, "COM_OF_LOSS_T")
 
-    def advice(self, values: Mapping[str, float], context: ParamContext) -> Iterator[str]:
+    def advice(self, values: Mapping[str, float], context: ParamContext) -> Iterator[ParamNote]:
         """What the end of our packets would do, where that is not what one expects."""
         if context.output == "manual-control":
             name, action = "COM_RC_LOSS_T", _FATAL_ACTIONS.get(int(values.get("NAV_RCL_ACT", 2)))
@@ -219,34 +222,49 @@ class Px4(Profile):
             return
         time_s = values.get(name, _LONGEST_S)
         if time_s > _LONGEST_S:
-            yield (
+            yield ParamNote(
+                (name,),
                 f"{name} is {time_s:g}: if this computer died, the vehicle would go on with the "
-                f"last it was told for that many seconds: use --set {name}=0.5"
+                "last it was told for that many seconds",
+                f"--set {name}=0.5",
             )
         if time_s < _SHORTEST_S:
-            yield f"{name} is {time_s:g}: a pause of our packets as short as that is a failsafe"
+            yield ParamNote(
+                (name,),
+                f"{name} is {time_s:g}: a pause of our packets as short as that is a failsafe",
+            )
         if action is not None:
-            yield f"{act_name} is {values[act_name]:g}: it would {action} if our packets stopped"
+            yield ParamNote(
+                (act_name,),
+                f"{act_name} is {values[act_name]:g}: it would {action} if our packets stopped",
+            )
 
-    def hints(self, values: Mapping[str, float], context: ParamContext) -> Iterator[str]:
+    def hints(self, values: Mapping[str, float], context: ParamContext) -> Iterator[ParamNote]:
         """Losses of sticks that end other modes, and a gesture that arms."""
         exceptions = values.get("COM_RCL_EXCEPT")
         is_sticks = context.output == "manual-control"
         bit, mode = (_EXCEPT_HOLD, "AUTO") if is_sticks else (_EXCEPT_OFFBOARD, "OFFBOARD")
         if exceptions is not None and not int(exceptions) & bit:
-            yield (
+            yield ParamNote(
+                ("COM_RCL_EXCEPT",),
                 f"COM_RCL_EXCEPT is {exceptions:g}: sticks that were there at arming and end later "
-                f"are a failsafe in {mode} modes too: --set COM_RCL_EXCEPT={int(exceptions) | bit}"
+                f"are a failsafe in {mode} modes too",
+                f"--set COM_RCL_EXCEPT={int(exceptions) | bit}",
             )
         if is_sticks and values.get("MAN_ARM_GESTURE") == 1:
-            yield (
+            yield ParamNote(
+                ("MAN_ARM_GESTURE",),
                 "MAN_ARM_GESTURE is 1: throttle down and full yaw for a second arms, which a "
-                "policy on the ground might do: --set MAN_ARM_GESTURE=0"
+                "policy on the ground might do",
+                "--set MAN_ARM_GESTURE=0",
             )
         if not is_sticks and values.get("COM_OBL_RC_ACT") == 0:
-            yield (
+            yield ParamNote(
+                ("COM_OBL_RC_ACT",),
                 "COM_OBL_RC_ACT is 0: when setpoints end it enters POSCTL if there are sticks, "
-                "else RTL: land with --set COM_OBL_RC_ACT=4, or hold with 5"
+                "else RTL",
+                "--set COM_OBL_RC_ACT=4",
+                " (land), or 5 (hold)",
             )
 
     def wanted_params(
@@ -303,18 +321,22 @@ class Px4(Profile):
         )
 
 
-def _stick_advice(values: Mapping[str, float]) -> Iterator[str]:
+def _stick_advice(values: Mapping[str, float]) -> Iterator[ParamNote]:
     """Settings by which a stick does less, or something else, in one mode."""
     full_deg, limit_deg = values.get("MPC_MAN_TILT_MAX", 0.0), values.get("MPC_TILTMAX_AIR")
     if limit_deg is not None and limit_deg < full_deg:
-        yield (
+        yield ParamNote(
+            ("MPC_TILTMAX_AIR",),
             f"MPC_TILTMAX_AIR is {limit_deg:g}: in ALTCTL it leans no further, and full stick is "
-            f"{full_deg:g} deg (MPC_MAN_TILT_MAX): use --set MPC_TILTMAX_AIR={full_deg:g}"
+            f"{full_deg:g} deg (MPC_MAN_TILT_MAX)",
+            f"--set MPC_TILTMAX_AIR={full_deg:g}",
         )
     if values.get("MPC_THR_CURVE") == _NO_RESCALE:
-        yield (
+        yield ParamNote(
+            ("MPC_THR_CURVE",),
             "MPC_THR_CURVE is 1: in STABILIZED the middle of the throttle is half of full thrust, "
-            "and not hover thrust: use --set MPC_THR_CURVE=0"
+            "and not hover thrust",
+            "--set MPC_THR_CURVE=0",
         )
 
 

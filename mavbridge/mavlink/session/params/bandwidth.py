@@ -4,7 +4,7 @@ from collections.abc import Iterable
 
 from pymavlink.dialects.v20 import ardupilotmega as dialect
 
-from mavbridge.mavlink.profiles.profile import StreamGroup
+from mavbridge.mavlink.profiles.profile import Danger, ParamNote, StreamGroup
 
 _FRAME_BYTES = 12
 """Header and checksum of MAVLink 2."""
@@ -36,8 +36,10 @@ def sent_bytes_per_s(stick_hz: float) -> float:
     return _OTHERS_BYTES_PER_S + stick_hz * _OVERRIDE_BYTES
 
 
-def baud_danger(baud: int | None, *, streams: Iterable[StreamGroup], stick_hz: float) -> str | None:
-    """Why a port of this baud rate is too slow, or None; ``baud`` None: not a serial port.
+def baud_danger(
+    baud: int | None, *, streams: Iterable[StreamGroup], stick_hz: float
+) -> Danger | None:
+    """Danger of a port whose baud rate is too low, or None; ``baud`` None: not a serial port.
 
     A serial port carries both directions at once, so the fuller one decides.
     """
@@ -48,7 +50,8 @@ def baud_danger(baud: int | None, *, streams: Iterable[StreamGroup], stick_hz: f
         return None
     enough = next((rate for rate in _STANDARD_BAUDS if rate >= needed), None)
     cure = f"a serial port of {enough} baud on both sides" if enough else "a network link"
-    return (
+    said = (
         f"{baud} baud cannot carry the sticks and states that are asked for ({needed:.0f} bit/s): "
         f"use --connect with {cure}, or a lower rates.action"
     )
+    return Danger("slow-serial", ParamNote((), said))

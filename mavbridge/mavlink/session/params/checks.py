@@ -5,7 +5,7 @@ from typing import NamedTuple
 
 from mavbridge.core.vehicle import Risk
 from mavbridge.mavlink.codec.calibration import RcCalibration
-from mavbridge.mavlink.profiles.profile import Danger, ParamContext, Profile
+from mavbridge.mavlink.profiles.profile import Danger, ParamContext, ParamNote, Profile
 
 
 class Assessment(NamedTuple):
@@ -16,7 +16,7 @@ class Assessment(NamedTuple):
     """Why there is no calibration, although the output needs one."""
     override_switch: int | None
     """Number of the channel that enables the output."""
-    obstacles: tuple[str, ...]
+    obstacles: tuple[ParamNote, ...]
     """Reasons for which the vehicle would not do as it is told."""
     dangers: tuple[Danger, ...]
     """Accepted ones included."""
@@ -27,7 +27,8 @@ class Assessment(NamedTuple):
         return (
             self.calibration != before.calibration
             or self.override_switch != before.override_switch
-            or not set(self.obstacles) <= set(before.obstacles)
+            or not {each.names for each in self.obstacles}
+            <= {each.names for each in before.obstacles}
             or any(risk not in accepted for risk in new_risks)
         )
 

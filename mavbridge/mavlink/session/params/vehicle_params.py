@@ -7,10 +7,16 @@ from mavbridge.core.address import serial_baud
 from mavbridge.core.clock import NS_PER_S
 from mavbridge.core.link_settings import LinkSettings
 from mavbridge.core.reasons import Code, Reason, because
-from mavbridge.core.vehicle import Output, VehicleStatus
+from mavbridge.core.vehicle import AdviceText, Output, VehicleStatus
 from mavbridge.mavlink.codec.calibration import RcCalibration
 from mavbridge.mavlink.codec.messages import CommandRequest, ParamRequest, ParamValue, ParamWrite
-from mavbridge.mavlink.profiles.profile import Danger, ParamContext, Profile, StreamGroup
+from mavbridge.mavlink.profiles.profile import (
+    Danger,
+    ParamContext,
+    ParamNote,
+    Profile,
+    StreamGroup,
+)
 from mavbridge.mavlink.session.params.bandwidth import baud_danger
 from mavbridge.mavlink.session.params.checks import Assessment, assess
 from mavbridge.mavlink.session.params.reader import ParamReader
@@ -62,9 +68,9 @@ class VehicleParams:
         self._follow_up: CommandRequest | None = None
         self._follow_ups_left = self._follow_up_ns = 0
         self._advised: ParamContext | None = None
-        self._told: set[str] = set()
-        """Advice, each text once: whether there is a receiver is learnt later than the rest."""
         """Output that the user was advised about."""
+        self._told: set[ParamNote] = set()
+        """Advice, each once: whether there is a receiver is learnt later than the rest."""
         self._assessed: tuple[ParamContext, Assessment] | None = None
         """What follows from all values, and for whom."""
         self.is_read = False
@@ -192,18 +198,18 @@ class VehicleParams:
         if context.output is None or context == self._advised or not self._changes.is_settled:
             return
         self._advised = context
-        texts = list(self._profile.advice(self._reader.values, context))
+        notes = list(self._profile.advice(self._reader.values, context))
         for danger in self._dangers(self._current(status)):
             if danger.risk in self._config.accepted_risks:
-                texts.append(f"risk {danger.risk} is accepted: {danger.text}")
-        for text in texts:
-            if text not in self._told and len(self._told) < _MOST_TOLD:
-                self._told.add(text)
-                self._report(text)
+                notes.append(danger.accepted)
+        for note in notes:
+            if note not in self._told and len(self._told) < _MOST_TOLD:
+                self._told.add(note)
+                self._report(AdviceText(note.text))
 
     def _dangers(self, assessment: Assessment) -> Iterator[Danger]:
         if self._serial is not None:
-            yield Danger("slow-serial", self._serial)
+            yield self._serial
         yield from assessment.dangers
 
     def problem(self) -> Reason | None:
@@ -224,14 +230,18 @@ class VehicleParams:
                 if is_sticks
                 else "not fly by our setpoints"
             )
-            return because(Code.OBSTACLE, what=what, causes="; ".join(assessment.obstacles))
+            return because(
+                Code.OBSTACLE,
+                what=what,
+                causes="; ".join(each.text for each in assessment.obstacles),
+            )
         if assessment.unusable is not None:
             return because(Code.CALIBRATION_UNUSABLE, cause=assessment.unusable)
         if self._output == "rc-override" and assessment.calibration != self.calibration:
             return because(Code.CALIBRATION_CHANGED)
         for danger in self._dangers(assessment):
             if danger.risk not in self._config.accepted_risks:
-                return because(Code.RISK, risk=danger.risk, said=danger.refusal)
+                return because(Code.RISK, risk=danger.risk, said=danger.refused.text)
         return None
 
     def _current(self, status: VehicleStatus | None) -> Assessment:

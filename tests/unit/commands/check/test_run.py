@@ -28,6 +28,7 @@ REFUSED = Row(
     expected="0.5",
     verdict="no-go",
     advice="it would hold its last sticks for ever: use --set RC_OVERRIDE_TIME=0.5, or else",
+    commands=("--set RC_OVERRIDE_TIME=0.5",),
 )
 GO = Row(area="link", name="attitude", found="100.0 Hz", expected="100 Hz")
 
@@ -104,17 +105,14 @@ def test_a_policy_tells_its_engine_speed_and_contract() -> None:
     findings = check_policy(flight("scripted:square:velocity"), MonotonicClock(), timing_s=0.5)
     names = [row.name for row in findings.rows]
     assert names == ["engine", "chunks", "images", "contract", "plan"]
-    assert findings.contract is not None
-    assert findings.contract.action == "velocity"
+    assert findings.plan is not None
+    assert findings.plan.contract.action == "velocity"
 
 
 def test_a_flag_that_contradicts_the_policy_is_a_no_go() -> None:
     config = FlyConfig(policy=PolicyConfig(policy="scripted:hover"), mode="LOITER", camera=BLIND)
-    (row,) = [
-        row
-        for row in check_policy(config, MonotonicClock(), timing_s=0.5).rows
-        if row.name == "flags of the flight"
-    ]
+    row = check_policy(config, MonotonicClock(), timing_s=0.5).rows[-1]
+    assert row.name == "flags of the flight"
     assert row.verdict == "no-go"
     assert "--mode LOITER" in row.advice
 

@@ -27,7 +27,7 @@ def context(output: Output | None, *, has_receiver: bool | None = True) -> Param
 def test_thrust_must_be_thrust(options: float | None, expected: str | None) -> None:
     values = {} if options is None else {"GUID_OPTIONS": options}
     for output in ("attitude", "rates"):
-        found = "; ".join(ARDUPILOT.obstacles(values, context(output)))
+        found = "; ".join(note.text for note in ARDUPILOT.obstacles(values, context(output)))
         if expected is None:
             assert found == ""
         else:
@@ -55,11 +55,10 @@ RCMAP = {"RCMAP_ROLL": 1.0, "RCMAP_PITCH": 2.0, "RCMAP_THROTTLE": 3.0, "RCMAP_YA
 )
 def test_what_turns_a_stick_is_refused_with_what_mends_it(name: str, value: float) -> None:
     settings = {each.name: each for each in stick_settings(RCMAP)}
-    (text,) = ARDUPILOT.obstacles(RCMAP | {name: value}, context("rc-override"))
+    (note,) = ARDUPILOT.obstacles(RCMAP | {name: value}, context("rc-override"))
     mended = settings[name].mended
 
-    assert text.startswith(f"{name} is {value:g}: ")
-    assert text.endswith(f"use --set {name}={mended:g}")
+    assert (note.names, note.cure) == ((name,), f"--set {name}={mended:g}")
     assert list(ARDUPILOT.obstacles(RCMAP | {name: mended}, context("rc-override"))) == []
     assert list(ARDUPILOT.obstacles(RCMAP | {name: value}, context("velocity"))) == []
 
@@ -98,10 +97,10 @@ def test_a_receiver_that_is_ignored_holds_no_stick() -> None:
 def test_advice_for_setpoints(
     values: dict[str, float], output: Output | None, has_receiver: bool | None, expected: list[str]
 ) -> None:
-    texts = list(ARDUPILOT.advice(values, context(output, has_receiver=has_receiver)))
-    assert len(texts) == len(expected)
-    for text, part in zip(texts, expected, strict=True):
-        assert part in text
+    notes = list(ARDUPILOT.advice(values, context(output, has_receiver=has_receiver)))
+    assert len(notes) == len(expected)
+    for note, part in zip(notes, expected, strict=True):
+        assert part in note.text
 
 
 def test_setpoints_that_stop_are_never_held_for_ever() -> None:

@@ -19,15 +19,15 @@ def context(output: Output | None) -> ParamContext:
 def test_sticks_of_mavlink_must_be_taken(mode: int) -> None:
     found = list(PX4.obstacles({"COM_RC_IN_MODE": float(mode)}, context("manual-control")))
     assert bool(found) == (mode in (0, 4))
-    assert all("--set COM_RC_IN_MODE=1" in text for text in found)
+    assert all(note.cure == "--set COM_RC_IN_MODE=1" for note in found)
     assert list(PX4.obstacles({"COM_RC_IN_MODE": float(mode)}, context("rates"))) == []
     assert PX4.ignores_receiver({"COM_RC_IN_MODE": float(mode)}) == (mode in (1, 4))
 
 
 @pytest.mark.parametrize("time_s", [-1.0, 0.0, 2.0])
 def test_no_gesture_of_the_policys_may_stop_the_motors(time_s: float) -> None:
-    texts = list(PX4.obstacles({"MAN_KILL_GEST_T": time_s}, context("manual-control")))
-    assert ["--set MAN_KILL_GEST_T=-1" in text for text in texts] == [True] * (time_s >= 0)
+    notes = PX4.obstacles({"MAN_KILL_GEST_T": time_s}, context("manual-control"))
+    assert [note.cure for note in notes] == ["--set MAN_KILL_GEST_T=-1"] * (time_s >= 0)
     assert list(PX4.obstacles({"MAN_KILL_GEST_T": time_s}, context("rates"))) == []
 
 
@@ -55,10 +55,10 @@ def test_no_gesture_of_the_policys_may_stop_the_motors(time_s: float) -> None:
     ],
 )
 def test_advice(values: dict[str, float], output: Output | None, expected: list[str]) -> None:
-    texts = list(PX4.advice(values, context(output)))
-    assert len(texts) == len(expected)
-    for text, part in zip(texts, expected, strict=True):
-        assert part in text
+    notes = list(PX4.advice(values, context(output)))
+    assert len(notes) == len(expected)
+    for note, part in zip(notes, expected, strict=True):
+        assert part in note.text
 
 
 @pytest.mark.parametrize(
@@ -107,5 +107,5 @@ def test_a_last_setpoint_that_stays_for_long_has_to_be_accepted(
     for output in ("attitude", "rates", "velocity"):
         assert list(profile.dangers({name: 3.0}, context(output))) == []
         (danger,) = profile.dangers({name: 3.5}, context(output))
-        assert (danger.risk, f"--set {name}=0.5" in danger.text) == ("long-setpoint", True)
+        assert (danger.risk, f"--set {name}=0.5" in danger.note.cure) == ("long-setpoint", True)
     assert list(profile.dangers({name: 3.5}, context(sticks))) == []
