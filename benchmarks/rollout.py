@@ -1,6 +1,6 @@
 """Imagined flights: the plain serial way beside the streamed one.
 
-python -m benchmarks.rollout --json rollout.json --plot docs/images/rollout.png
+python -m benchmarks.rollout --json rollout.json --plot rollout.png
 """
 
 import json

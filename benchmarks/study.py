@@ -1,6 +1,6 @@
 """A study of what a checkpoint needs: one setting changed at a time, on the same courses.
 
-python -m benchmarks.study --episodes 10 --json docs/study.json --plot docs/images/study.png
+python -m benchmarks.study --episodes 10 --json docs/dev/study.json --plot docs/images/study.png
 --checkpoint fast.safetensors --without-age fast_without_age.safetensors
 
 Each row is a ``mavbridge evaluate`` of its own. Rows that the JSON holds for the same checkpoints
@@ -216,7 +216,7 @@ def fly(flags: str, checkpoint: Path, workers: int) -> Flown:
 
 
 def print_scores(scores: Sequence[SettingScore]) -> None:
-    """Print the table of docs/study.md."""
+    """Print the table of docs/dev/study.md."""
     rows = [
         (
             *(one.name, f"{one.success:.0%}", f"{one.success_low:.0%} to {one.success_high:.0%}"),
