@@ -79,8 +79,8 @@ mutants: $(VENV)/installed  ## small changes of the safety core, each of which a
 
 FAULTS ?=
 JOBS ?= 1
-faults: $(VENV)/installed  ## every fault with every vehicle, and docs/faults.md; FAULTS="kill stop" flies those alone
-	PYTHONPATH=.:tests $(BIN)/python -m faults --jobs $(JOBS) $(or $(FAULTS),--out docs/faults.md)
+faults: $(VENV)/installed  ## every fault with every vehicle, and docs/dev/faults.md; FAULTS="kill stop" flies those alone
+	PYTHONPATH=.:tests $(BIN)/python -m faults --jobs $(JOBS) $(or $(FAULTS),--out docs/dev/faults.md)
 
 soak: $(VENV)/installed  ## SOAK_MINUTES of a flight with a random fault every few seconds
 	PYTHONPATH=.:tests $(BIN)/python -m faults --soak $(SOAK_MINUTES)

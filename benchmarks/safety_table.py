@@ -1,4 +1,4 @@
-"""The state table of docs/SAFETY.md, made of the guard's: ``python -m benchmarks.safety_table``."""
+"""The state table of docs/safety.md, made of the guard's: ``python -m benchmarks.safety_table``."""
 
 import inspect
 from collections.abc import Callable, Iterator
@@ -7,8 +7,7 @@ from pathlib import Path
 from mavbridge.guard.table import PROGRESS, TABLE
 from mavbridge.guard.values import Phase
 
-PAGE = Path(__file__).parents[1] / "docs" / "SAFETY.md"
-_BEGIN, _END = "<!-- made by python -m benchmarks.safety_table -->\n", "<!-- end -->\n"
+PAGE = Path(__file__).parents[1] / "docs" / "safety.md"
 _CONTROLLED_BY = {
     Phase.WAITING: "the pilot; nothing is sent",
     Phase.PREPARING: "the pilot, or idle or neutral sticks: [the way in](#the-way-in)",
@@ -60,9 +59,15 @@ def _words(function: Callable[..., object] | None) -> tuple[str, str]:
 
 def with_table(page: str) -> str:
     """Return the page with the table of now."""
-    before, _, rest = page.partition(_BEGIN)
-    _, _, after = rest.partition(_END)
-    return before + _BEGIN + table() + _END + after
+    return with_generated(page, "benchmarks.safety_table", table())
+
+
+def with_generated(page: str, module: str, text: str) -> str:
+    """Return the page with the text between the marks of the module that generates it."""
+    begin, end = f"<!-- made by python -m {module} -->\n", "<!-- end -->\n"
+    before, _, rest = page.partition(begin)
+    _, _, after = rest.partition(end)
+    return before + begin + text + end + after
 
 
 if __name__ == "__main__":

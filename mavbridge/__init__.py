@@ -12,7 +12,7 @@
 The slow path encodes images in a thread and caches the feature. The fast path joins the newest
 attitude with that feature and computes a chunk of actions, each with the time at which it acts. The
 guard alone sends to the autopilot: it samples the newest chunk while the policy has the sticks, and
-gives them back in order when the pilot takes them or anything fails (docs/SAFETY.md).
+gives them back in order when the pilot takes them or anything fails (docs/safety.md).
 """  # noqa: E501 - the picture is wider than the text
 
 import os

@@ -6,7 +6,7 @@ the autopilot closes the loops that fly them; by rates, this does, from the newe
 image decides where to go, and the attitude never waits for it.
 
 A network that was trained on thrust and rates themselves copied the vehicle's own rates and flew
-into the first gates; see ``docs/LOG.md``.
+into the first gates; see ``docs/dev/log.md``.
 """
 
 import math

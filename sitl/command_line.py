@@ -53,9 +53,7 @@ def _parser() -> argparse.ArgumentParser:
     add("--connect-onboard", action="append", metavar="LINK", help=onboard_help)
     names = ("ardupilot", "px4")
     add("--autopilot", choices=names, default=names[0], help="firmware (default: ardupilot)")
-    add(
-        "--report", type=Path, metavar="FILE", help="write a report (docs/formats/flight_report.md)"
-    )
+    add("--report", type=Path, metavar="FILE", help="write a report (docs/formats.md)")
     add("--duration", type=_POSITIVE, metavar="S", help="stop after S seconds")
     end_help = "stop one second after the last gate, or at a crash"
     add("--end-with-course", action="store_true", help=end_help)

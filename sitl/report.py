@@ -1,4 +1,4 @@
-"""Measures a flight on the vehicle's side of the wire, as docs/formats/flight_report.md says."""
+"""Measures a flight on the vehicle's side of the wire, as docs/formats.md says."""
 
 import json
 import math

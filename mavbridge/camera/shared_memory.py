@@ -1,4 +1,4 @@
-"""Reads frames from shared memory; docs/formats/shm_camera.md describes the format."""
+"""Reads frames from shared memory; docs/formats.md describes the format."""
 
 import mmap
 import os
@@ -227,9 +227,7 @@ def _slot_type(width: int, height: int, channels: int) -> np.dtype[np.void]:
 def _checked_slot(name: str, header: bytes, file_bytes: int) -> np.dtype[np.void]:
     """Layout of a slot by the header, checked against the length of the file."""
     if len(header) < HEADER.size or not header.startswith(MAGIC):
-        raise CameraError(
-            f"shm:{name}: not a frame segment (docs/formats/shm_camera.md): wrong magic"
-        )
+        raise CameraError(f"shm:{name}: not a frame segment (docs/formats.md): wrong magic")
     _, width, height, channels, slots = HEADER.unpack(header)
     if channels not in PIXELS or slots != SLOTS:
         raise CameraError(

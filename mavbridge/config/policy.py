@@ -10,7 +10,7 @@ from mavbridge.config.flags import POLICY, RARE, check_range, hidden
 
 STEPS, TOGE_STEPS = 10, 1
 """DDIM steps by default, and those of toge and toge-rates, which fly as well in one
-(docs/study.md)."""
+(docs/dev/study.md)."""
 Engine = Literal["auto", "torch", "openvino", "cuda-graph"]
 
 

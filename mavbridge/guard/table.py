@@ -15,7 +15,7 @@ Rules that every row keeps:
 In each step the rows of the state are read from the top. The first one whose event happens and
 whose condition holds is taken; one without a next state goes on to those below. ``TABLE`` is read
 with what comes from outside, then the state acts (``Engagement``), then ``PROGRESS`` is read with
-what its sequence has reached. The docstrings are the texts of docs/SAFETY.md.
+what its sequence has reached. The docstrings are the texts of docs/safety.md.
 """
 
 from collections.abc import Callable

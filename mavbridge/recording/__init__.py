@@ -1,4 +1,4 @@
-"""A flight on disk: docs/formats/flight_folder.md is the format.
+"""A flight on disk: docs/formats.md is the format.
 
     vision loop, action loop --emit--> Recorder (its own thread) --> FlightWriter --> ticks
                                                                          |

@@ -24,7 +24,7 @@ class RecordedFlight:
     folder: Path
     meta: FlightMeta
     ticks: Any
-    """``pyarrow.Table`` with the columns of docs/formats/flight_folder.md."""
+    """``pyarrow.Table`` with the columns of docs/formats.md."""
     frames: Any
     """The same, one row an image."""
     video: str = VIDEO

@@ -1,6 +1,6 @@
 """Rows of a flight's two tables: as records, as Arrow schemas, and the conversion both ways.
 
-docs/formats/flight_folder.md is the format. A column is named as the attribute that it holds, and
+docs/formats.md is the format. A column is named as the attribute that it holds, and
 a value that was not there is null.
 """
 

@@ -139,7 +139,7 @@ def read_numbered(
     if missing:
         raise TableError(
             f"{path} lacks the column{'s' * (len(missing) > 1)} {', '.join(missing)} "
-            "of docs/formats/flight_folder.md: another program or version wrote it"
+            "of docs/formats.md: another program or version wrote it"
         )
     return table, numbers
 

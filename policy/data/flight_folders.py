@@ -1,4 +1,4 @@
-"""Reads the project's flight folders (docs/formats/flight_folder.md)."""
+"""Reads the project's flight folders (docs/formats.md)."""
 
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence

@@ -1,4 +1,4 @@
-"""Writer of frames in shared memory: docs/formats/shm_camera.md is the format."""
+"""Writer of frames in shared memory: docs/formats.md is the format."""
 
 import math
 import mmap

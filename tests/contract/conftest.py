@@ -1,7 +1,7 @@
 """Which flight controller the suite runs against, and in which state a test finds it.
 
 ``MAVBRIDGE_TEST_PEER`` names a real one; without it that is the simulator, in process on a stepped
-clock and new for each test. docs/guides/contract_suite.md says what the suite does to a vehicle.
+clock and new for each test. docs/dev/contract_suite.md says what the suite does to a vehicle.
 """
 
 import os

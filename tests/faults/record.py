@@ -1,4 +1,4 @@
-"""Judge a fault at a known time by the vehicle's report (docs/formats/flight_report.md)."""
+"""Judge a fault at a known time by the vehicle's report (docs/formats.md)."""
 
 from collections.abc import Sequence
 from itertools import takewhile

@@ -1,4 +1,4 @@
-"""Writes small flight folders (docs/formats/flight_folder.md) for tests, without the recorder."""
+"""Writes small flight folders (docs/formats.md) for tests, without the recorder."""
 
 import json
 from collections.abc import Sequence

@@ -1,4 +1,4 @@
-"""Who gets the sticks, and how (docs/SAFETY.md): points 1, 3 and 7 of the guard, on the vehicle."""
+"""Who gets the sticks, and how (docs/safety.md): points 1, 3 and 7 of the guard, on the vehicle."""
 
 from dataclasses import replace
 from itertools import pairwise

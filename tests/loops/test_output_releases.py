@@ -1,6 +1,6 @@
 """Every way out of a flight, for each kind of action on each firmware, by the vehicle's record.
 
-Limits are those of docs/SAFETY.md; the vehicle leans 15 degrees or flies 2 m/s when it happens.
+Limits are those of docs/safety.md; the vehicle leans 15 degrees or flies 2 m/s when it happens.
 """
 
 from collections.abc import Callable

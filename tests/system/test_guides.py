@@ -1,8 +1,8 @@
 """Runs the terminals of the guides against the bundled vehicle, on the firmware's own ports.
 
-docs/guides/ardupilot_sitl.md, docs/guides/px4_sitl.md and docs/guides/ground_station.md: what is
-typed there is run as it stands, but for free ports, folders of the test and a shorter flight. How
-well it flies is for other tests: this machine may be busy.
+docs/simulators.md and docs/companion_computers.md: what is typed there is run as it stands, but for
+free ports, folders of the test and a shorter flight. How well it flies is for other tests: this
+machine may be busy.
 """
 
 import re
@@ -33,9 +33,9 @@ def ports() -> dict[str, str]:
     return {name: str(free_port()) for name in ("5762", "5763", "14540", "14550")}
 
 
-def typed(page: str) -> list[list[str]]:
-    """Words of the commands of a page that are marked as run here."""
-    marked = (block for block in blocks(ROOT / page) if block.mark == MARK)
+def typed(page: str, firmware: str) -> list[list[str]]:
+    """Words of the commands of a page that are marked as run here, for one firmware or program."""
+    marked = (block for block in blocks(ROOT / page) if block.mark == f"{MARK}: {firmware}")
     return [words for block in marked for words in command_lines(block.text)]
 
 
@@ -83,12 +83,14 @@ def fly(vehicle: Sequence[str], terminals: Sequence[Sequence[str]]) -> str:
     return flight.stdout + flight.stderr
 
 
-def fly_guide(page: str, vehicle: Sequence[str], ports: dict[str, str], folder: Path) -> Path:
+def fly_guide(
+    page: str, firmware: str, vehicle: Sequence[str], ports: dict[str, str], folder: Path
+) -> Path:
     """Fly until the policy had control once, anew where a busy machine prevented it."""
     output = ""
     for start in range(STARTS):
         recording = folder / str(start)
-        output = fly(vehicle, [here(words, ports, recording) for words in typed(page)])
+        output = fly(vehicle, [here(words, ports, recording) for words in typed(page, firmware)])
         if IN_CONTROL in output:
             return recording
     raise AssertionError(output)
@@ -97,18 +99,18 @@ def fly_guide(page: str, vehicle: Sequence[str], ports: dict[str, str], folder: 
 def test_the_terminals_of_the_guide_to_ardupilot_fly(ports: dict[str, str], tmp_path: Path) -> None:
     links = ["--connect", f"tcpin:127.0.0.1:{ports['5762']}"]
     links += ["--connect", f"tcpin:127.0.0.1:{ports['5763']}"]
-    recording = fly_guide("docs/guides/ardupilot_sitl.md", links, ports, tmp_path)
+    recording = fly_guide("docs/simulators.md", "ArduPilot", links, ports, tmp_path)
     assert any(True for _ in open_flight(recording).frame_rows())
 
 
 def test_the_terminals_of_the_guide_to_px4_fly(ports: dict[str, str], tmp_path: Path) -> None:
     links = ["--autopilot", "px4", "--connect", f"udpout:127.0.0.1:{ports['14550']}"]
     links += ["--connect-onboard", f"udpout:127.0.0.1:{ports['14540']}"]
-    recording = fly_guide("docs/guides/px4_sitl.md", links, ports, tmp_path)
+    recording = fly_guide("docs/simulators.md", "PX4", links, ports, tmp_path)
     assert any(True for _ in open_flight(recording).frame_rows())
 
 
 @pytest.mark.skipif(not (PEERS / "mavproxy.py").exists(), reason="MAVProxy is not installed")
 def test_mavproxy_of_the_guide_shares_the_link(ports: dict[str, str], tmp_path: Path) -> None:
     links = ["--connect", f"tcpin:127.0.0.1:{ports['5762']}"]
-    fly_guide("docs/guides/ground_station.md", links, ports, tmp_path)
+    fly_guide("docs/companion_computers.md", "MAVProxy", links, ports, tmp_path)

@@ -45,7 +45,7 @@ SCHEMA = pa.schema(
         pa.field("action", pa.list_(pa.float32(), ACTION_DIM), nullable=False),
     ]
 )
-"""The columns of docs/formats/rollout_files.md, named as the attributes of ``RolloutFrame``."""
+"""The columns of docs/formats.md, named as the attributes of ``RolloutFrame``."""
 
 OnFrame: TypeAlias = Callable[[RolloutFrame, ImageArray | None], None]
 """Called for every frame [H, W, 3] in the video's order, by one thread; None: not decoded."""

@@ -89,7 +89,7 @@ def _interface(contract_file: Path | None, metadata: "Message") -> Interface:
             return read_interface(contract_file)
         raise PolicyError(
             "the server does not say its rate nor what its state and actions mean: write that in a "
-            "file, and give --contract FILE; docs/policies.md has one to begin with"
+            "file, and give --contract FILE; docs/policy.md has one to begin with"
         )
     try:
         contract = replace(Contract.from_json(served), arrays="numpy", feature_dim=0)

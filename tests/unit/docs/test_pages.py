@@ -10,6 +10,7 @@ from typing import NamedTuple
 import pytest
 from cyclopts.exceptions import CycloptsError, MissingArgumentError
 
+from benchmarks import commands_page
 from helpers.guides import (
     PAGES,
     ROOT,
@@ -30,11 +31,14 @@ from mavbridge.mavlink.profiles.px4 import Px4
 from mavbridge.mavlink.session.params.bandwidth import received_bytes_per_s
 from sitl.command_line import _parser as sitl_parser
 
-MARKED = [page for page in PAGES if page.parent.name == "guides" or page == ROOT / "README.md"]
+_GUIDES = ("simulators", "companion_computers", "real_vehicle", "record_and_train", "timing")
+MARKED = [ROOT / "README.md", *(ROOT / "docs" / f"{name}.md" for name in _GUIDES)]
+"""Pages whose blocks say which test runs them."""
 OUR_OUTPUT = "text"
 """Language of a block that shows what appears, and holds no command."""
 SOME_ADDRESS = "udp:127.0.0.1:14550"
 NOT_RUN = "not run by a test"
+MOST_WORDS = 20_000
 
 
 def parse(words: list[str]) -> None:
@@ -178,10 +182,20 @@ def test_every_block_of_a_guide_says_who_runs_it(page: str) -> None:
         start = block.text.splitlines()[0]
         assert block.mark, f"{page}: no mark above the block that begins with {start!r}"
         if NOT_RUN not in block.mark:
-            ran = re.fullmatch(r"(?:run|read) by (tests/\S+\.py)", block.mark)
+            ran = re.fullmatch(r"(?:run|read) by (tests/\S+\.py)(?:: \w+)?", block.mark)
             assert ran, f"{page}: {block.mark!r} names no test"
             test = (ROOT / ran[1]).read_text()
             assert block.page in test, f"{ran[1]} does not read {block.page}"
+
+
+def test_the_flags_on_the_page_of_commands_are_those_of_the_program() -> None:
+    page = commands_page.PAGE.read_text()
+    assert commands_page.with_flags(page) == page, "run: python -m benchmarks.commands_page"
+
+
+def test_the_pages_for_users_stay_short() -> None:
+    pages = [page for page in PAGES if page.parent == ROOT / "docs"]
+    assert sum(len(page.read_text().split()) for page in pages) <= MOST_WORDS
 
 
 def test_every_page_is_in_the_index() -> None:
@@ -191,7 +205,7 @@ def test_every_page_is_in_the_index() -> None:
     assert not {page_name(page) for page in pages - reached}
 
 
-@pytest.mark.parametrize("page", ["docs/guides/real_vehicle.md"])
+@pytest.mark.parametrize("page", ["docs/real_vehicle.md"])
 @pytest.mark.parametrize(
     ("profile", "output", "name"),
     [(ArduPilot(), "rc-override", "ArduPilot"), (Px4(), "manual-control", "PX4")],

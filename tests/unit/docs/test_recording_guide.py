@@ -1,4 +1,4 @@
-"""Runs the commands of docs/guides/recording.md."""
+"""Runs the commands of docs/record_and_train.md."""
 
 from pathlib import Path
 
@@ -7,7 +7,7 @@ import pytest
 from helpers.guides import ROOT, blocks, command_lines
 from mavbridge.__main__ import main
 
-PAGE = ROOT / "docs/guides/recording.md"
+PAGE = ROOT / "docs/record_and_train.md"
 
 
 def test_its_commands_make_a_dataset(tmp_path: Path) -> None:

@@ -1,4 +1,4 @@
-"""The table of the engagement, row by row: docs/SAFETY.md shows it to pilots."""
+"""The table of the engagement, row by row: docs/safety.md shows it to pilots."""
 
 from collections.abc import Callable
 from dataclasses import replace

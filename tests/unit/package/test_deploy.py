@@ -86,8 +86,8 @@ def test_the_wheel_holds_all_three_packages_and_nothing_else(tmp_path: Path) -> 
     tree.mkdir()
     for name in ("mavbridge", "policy", "sitl"):
         shutil.copytree(ROOT / name, tree / name, ignore=shutil.ignore_patterns("__pycache__"))
-    for name in ("pyproject.toml", "LICENSE", "docs/package.md"):
-        (tree / name).parent.mkdir(exist_ok=True)
+    for name in ("pyproject.toml", "LICENSE", "docs/dev/package.md"):
+        (tree / name).parent.mkdir(parents=True, exist_ok=True)
         shutil.copy(ROOT / name, tree / name)
     command = "from setuptools.build_meta import build_wheel; print(build_wheel('..'))"
     made = subprocess.run(

@@ -1,4 +1,4 @@
-"""The writer against docs/formats/shm_camera.md, read with struct and not with the reader."""
+"""The writer against docs/formats.md, read with struct and not with the reader."""
 
 import os
 import struct
