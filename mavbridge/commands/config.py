@@ -40,7 +40,7 @@ class ExportPolicyConfig:
     """onnx: encoder, one denoising step, contract and schedule. torchscript: the same in one
     archive."""
     policy: str = "toge"
-    """Kind of the policy: toge or toge-rates."""
+    """Kind of the policy: toge or resnet-unet."""
 
 
 @Parameter(name="*")

@@ -21,7 +21,7 @@ def export_policy(checkpoint: Path | None, config: ExportPolicyConfig) -> int:
     console = Console(stderr=True, highlight=False, emoji=False)
     kind = config.policy.partition(":")[0]
     if kind not in BUILTIN_KINDS:
-        raise UserError(f"--policy {config.policy}: weights of toge are exported")
+        raise UserError(f"--policy {config.policy}: policies of toge and resnet-unet are exported")
     ours = PolicyRequest(spec=config.policy, checkpoint=checkpoint, engine="torch")
     _require_room(config)
     policy, notes = load_builtin(ours)

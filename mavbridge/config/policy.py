@@ -63,7 +63,7 @@ class PolicyConfig:
     @property
     def may_be_dual(self) -> bool:
         """True if the policy may fly at two rates, as far as is known before it is loaded."""
-        return self.dual_rate is not False
+        return self.dual_rate is not False and self.kind != "resnet-unet"
 
     @property
     def steps(self) -> int:

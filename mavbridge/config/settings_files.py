@@ -15,7 +15,7 @@ from cyclopts.config import Dict
 from mavbridge.core.errors import UserError
 from policy.files import user_path
 
-_DATA_KINDS = ("toge", "toge-rates", "scripted", "lerobot", "onnx")
+_DATA_KINDS = ("toge", "toge-rates", "resnet-unet", "scripted", "lerobot", "onnx")
 _ADDRESS_KEYS = ("serve", "rerun", "host", "ray")
 _OUTPUT_KEYS = ("record", "report", "json", "plot", "html", "out", "rerun")
 _LOCAL = re.compile(

@@ -8,7 +8,7 @@ import warnings
 from collections.abc import Sequence
 from dataclasses import asdict
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeAlias
 
 import torch
 from torch import Tensor, nn
@@ -16,8 +16,10 @@ from torch import Tensor, nn
 from policy.adapters.description import DESCRIPTION
 from policy.adapters.onnx.files import DENOISER, ENCODER
 from policy.contract import ACTION_DIM
+from policy.nets.resnet_unet import ResnetUnet
 from policy.nets.toge import Toge
 
+OurPolicy: TypeAlias = Toge | ResnetUnet
 OPSET = 18
 """ONNX operator set: of 2022, so that every runtime in use reads it."""
 DENOISER_INPUTS = ("noisy", "timestep", "feature", "state", "action_history")
@@ -26,7 +28,7 @@ DENOISER_INPUTS = ("noisy", "timestep", "feature", "state", "action_history")
 class _Encoder(nn.Module):
     """Normalised image [1, 3, H, W] -> feature [1, F]."""
 
-    def __init__(self, policy: Toge) -> None:
+    def __init__(self, policy: OurPolicy) -> None:
         super().__init__()
         self.backbone, self.projection = policy.backbone, policy.visual_projection
 
@@ -38,7 +40,7 @@ class _Encoder(nn.Module):
 class _Denoiser(nn.Module):
     """One network call of a solve, in the order of ``DENOISER_INPUTS``."""
 
-    def __init__(self, policy: Toge) -> None:
+    def __init__(self, policy: OurPolicy) -> None:
         super().__init__()
         self.policy = policy
 
@@ -63,7 +65,7 @@ class _Archive(nn.Module):
         self.visual_encoder, self.denoiser = encoder, denoiser
 
 
-def export_onnx(policy: Toge, folder: Path) -> None:
+def export_onnx(policy: OurPolicy, folder: Path) -> None:
     """Write encoder.onnx, denoiser.onnx and policy.json into ``folder``, which exists.
 
     It needs the onnx package.
@@ -75,7 +77,7 @@ def export_onnx(policy: Toge, folder: Path) -> None:
     (folder / DESCRIPTION).write_text(_description(policy))
 
 
-def export_torchscript(policy: Toge, path: Path) -> None:
+def export_torchscript(policy: OurPolicy, path: Path) -> None:
     """Write one archive."""
     image, rest = _examples(policy)
     trace: Any = torch.jit.trace  # without types
@@ -113,7 +115,7 @@ def _quiet() -> "warnings.catch_warnings[None]":
     return warnings.catch_warnings(action="ignore")  # each shape check of ours is one
 
 
-def _examples(policy: Toge) -> tuple[tuple[Tensor, ...], tuple[Tensor, ...]]:
+def _examples(policy: OurPolicy) -> tuple[tuple[Tensor, ...], tuple[Tensor, ...]]:
     contract = policy.contract
     dim = policy.visual_projection[0].out_features
     return (torch.zeros(1, 3, contract.image_height, contract.image_width),), (
@@ -125,7 +127,7 @@ def _examples(policy: Toge) -> tuple[tuple[Tensor, ...], tuple[Tensor, ...]]:
     )
 
 
-def _description(policy: Toge) -> str:
+def _description(policy: OurPolicy) -> str:
     contract = json.loads(policy.contract.to_json())
     described = {"contract": contract, "schedule": asdict(policy.config.schedule)}
     return json.dumps(described, indent=2, sort_keys=True) + "\n"

@@ -23,7 +23,7 @@ from policy.files import user_path
 from policy.protocol import DualRatePolicy, SingleRatePolicy
 
 FORMS = (
-    "toge[:SIZE][:BACKBONE], scripted[:PROGRAM][:ACTION][:air], "
+    "toge[:SIZE][:BACKBONE], resnet-unet[:SIZE], scripted[:PROGRAM][:ACTION][:air], "
     "lerobot:DIR, onnx:DIR_OR_FILE, torchscript:FILE, ws://HOST:PORT, package.module:Class or "
     "./file.py:Class"
 )

@@ -14,7 +14,7 @@ import struct
 import warnings
 from dataclasses import asdict
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeAlias
 
 import numpy as np
 import torch
@@ -43,11 +43,13 @@ from policy.engines.parity import ParitySamples, make_parity_samples, parity_fai
 from policy.errors import CheckpointError, PolicyError
 from policy.files import why_unreadable
 from policy.nets.diffusion import NoiseSchedule
+from policy.nets.resnet_unet import ResnetUnet, ResnetUnetConfig
 from policy.nets.toge import Toge, TogeConfig
 from policy.preprocess import image_to_input
 
-KIND = "toge"
-"""Kind of the network in a header."""
+BuiltinPolicy: TypeAlias = Toge | ResnetUnet
+BuiltinConfig: TypeAlias = TogeConfig | ResnetUnetConfig
+
 VECTOR_PREFIX = "test_vector."
 BACKBONE_PREFIX = "backbone."
 VECTOR_NAMES = ("rgb", "state", "history", "chunks")
@@ -63,8 +65,13 @@ _UNSUPPORTED = re.compile(r"GLOBAL (\S+)")
 """In an error of torch.load's: the class that it refuses to look up."""
 
 
+def build_policy(config: BuiltinConfig) -> BuiltinPolicy:
+    """The network of ``config``, with random weights of torch's global generator."""
+    return Toge(config) if isinstance(config, TogeConfig) else ResnetUnet(config)
+
+
 def save_checkpoint(
-    path: Path, policy: Toge, *, training: str | None = None, packed: bool = False
+    path: Path, policy: BuiltinPolicy, *, training: str | None = None, packed: bool = False
 ) -> None:
     """Write weights, contract, architecture and a test vector; replaces ``path`` at once or not.
 
@@ -80,18 +87,20 @@ def save_checkpoint(
     for name, value in _make_vector(policy).items():
         state[VECTOR_PREFIX + name] = value
     config = {name: value for name, value in asdict(policy.config).items() if name != "contract"}
-    architecture = json.dumps({"policy": KIND, **config}, sort_keys=True)
+    architecture = json.dumps({"policy": _kind(policy.config), **config}, sort_keys=True)
     header = {CONTRACT_KEY: policy.contract.to_json(), ARCHITECTURE_KEY: architecture}
     if training is not None:
         header[TRAINING_KEY] = training
     write_tensors(path, state, header)
 
 
-def load_checkpoint_with_notes(path: Path, *, fallback: TogeConfig) -> tuple[Toge, tuple[str, ...]]:
+def load_checkpoint_with_notes(
+    path: Path, *, fallback: BuiltinConfig
+) -> tuple[BuiltinPolicy, tuple[str, ...]]:
     """Read a checkpoint into the network that it was made for, on the CPU, in eval mode.
 
-    ``fallback`` serves for what a ``.pt`` does not say. The notes say where in it the weights were
-    found.
+    ``fallback`` is the policy that was asked for: its kind must be the file's, and its values serve
+    for what a ``.pt`` does not say. The notes say where in a ``.pt`` the weights were found.
     """
     require_file(path, SUFFIXES)
     is_ours = path.suffix == ".safetensors"
@@ -106,7 +115,7 @@ def load_checkpoint_with_notes(path: Path, *, fallback: TogeConfig) -> tuple[Tog
                 ".safetensors, or the weights alone"
             )
     try:
-        policy = Toge(_config_of(header) if is_ours else fallback)
+        policy = build_policy(_config_of(header, fallback) if is_ours else fallback)
     except (PolicyError, RecursionError) as error:
         told = str(error) if isinstance(error, PolicyError) else "its header is nested too deeply"
         raise CheckpointError(f"{path}: {told}") from error
@@ -133,12 +142,12 @@ def load_checkpoint_with_notes(path: Path, *, fallback: TogeConfig) -> tuple[Tog
     return policy, () if note is None else (note,)
 
 
-def load_checkpoint(path: Path, *, fallback: TogeConfig) -> Toge:
+def load_checkpoint(path: Path, *, fallback: BuiltinConfig) -> BuiltinPolicy:
     """Read a checkpoint as ``load_checkpoint_with_notes`` does, without the notes."""
     return load_checkpoint_with_notes(path, fallback=fallback)[0]
 
 
-def _make_vector(policy: Toge) -> dict[str, Tensor]:
+def _make_vector(policy: BuiltinPolicy) -> dict[str, Tensor]:
     """Inputs, and the chunks that plain torch in float32 on a CPU computes from them."""
     reference = copy.deepcopy(policy).cpu().eval()
     samples = make_parity_samples(policy.contract)
@@ -150,7 +159,7 @@ def _make_vector(policy: Toge) -> dict[str, Tensor]:
 
 
 @torch.inference_mode()
-def _chunks(policy: Toge, samples: ParitySamples) -> FloatArray:
+def _chunks(policy: BuiltinPolicy, samples: ParitySamples) -> FloatArray:
     policy.seed_noise(0)
     images = np.concatenate([image_to_input(rgb, policy.contract) for rgb in samples.rgb])
     steps = min(VECTOR_STEPS, policy.config.schedule.num_train_timesteps)
@@ -159,7 +168,7 @@ def _chunks(policy: Toge, samples: ParitySamples) -> FloatArray:
     return chunks
 
 
-def _require_reproduced(path: Path, policy: Toge, vector: dict[str, Tensor]) -> None:
+def _require_reproduced(path: Path, policy: BuiltinPolicy, vector: dict[str, Tensor]) -> None:
     damaged = f"{path}: its test vector is damaged"
     if set(vector) != set(VECTOR_NAMES):
         raise CheckpointError(f"{damaged}: it must hold {list(VECTOR_NAMES)}, not {sorted(vector)}")
@@ -175,18 +184,35 @@ def _require_reproduced(path: Path, policy: Toge, vector: dict[str, Tensor]) -> 
         )
 
 
-def _config_of(header: dict[str, str]) -> TogeConfig:
-    contract, text = Contract.from_json(header[CONTRACT_KEY]), header[ARCHITECTURE_KEY]
+def _config_of(header: dict[str, str], fallback: BuiltinConfig) -> BuiltinConfig:
+    contract = Contract.from_json(header[CONTRACT_KEY])
+    config = _architecture_from_json(header[ARCHITECTURE_KEY], contract)
+    if type(config) is not type(fallback):
+        raise CheckpointError(
+            f"it holds a {_kind(config)!r} policy, not a {_kind(fallback)!r} one: "
+            f"ask for it with --policy {_kind(config)}"
+        )
+    return config
+
+
+def _kind(config: BuiltinConfig) -> str:
+    return "toge" if isinstance(config, TogeConfig) else "resnet-unet"
+
+
+def _architecture_from_json(text: str, contract: Contract) -> BuiltinConfig:
     try:
         data: Any = json.loads(text)
-        if (kind := data.pop("policy")) != KIND:
-            raise CheckpointError(f"policy {kind!r} is unknown; this build knows {KIND!r}")
+        kind = data.pop("policy")
         schedule = NoiseSchedule(**data.pop("schedule"))
-        return TogeConfig(contract=contract, schedule=schedule, **data)
+        if kind == "toge":
+            return TogeConfig(contract=contract, schedule=schedule, **data)
+        if kind == "resnet-unet":
+            return ResnetUnetConfig(contract=contract, schedule=schedule, **data)
     except (json.JSONDecodeError, KeyError, TypeError, AttributeError) as error:
         raise CheckpointError(
             f"malformed architecture {text[:200]!r} ({error}): export the checkpoint again"
         ) from error
+    raise CheckpointError(f"policy {kind!r} is unknown; this build knows 'toge', 'resnet-unet'")
 
 
 def read_torch(path: Path) -> dict[Any, Any]:

@@ -18,6 +18,7 @@ from policy.engines.parity import ParitySamples, make_parity_samples, parity_fai
 from policy.engines.runner import EngineName, ExecutionSettings, encode_all
 from policy.engines.torch_eager import make_torch_runner
 from policy.errors import Agreed, PolicyError, warned
+from policy.nets.resnet_unet import ResnetUnet
 from policy.nets.toge import Toge
 from policy.protocol import PolicyRunner, SingleRatePolicy
 
@@ -39,7 +40,7 @@ def choose_runner(
             f"network.engine={engine} takes a torch.nn.Module, or a class that holds one as an "
             f"attribute: leave it out, and {settings.name} runs on torch"
         )
-    if engine == "auto" and not isinstance(policy, Toge):
+    if engine == "auto" and not isinstance(policy, Toge | ResnetUnet):
         if settings.vision_device != "cpu" or settings.action_device != "cpu":
             return make_torch_runner(policy, settings), ()
         if hasattr(policy, "reset"):
@@ -93,7 +94,7 @@ def _impurity(
     expected: FloatArray,
 ) -> str | None:
     """Why no graph computes what this policy does; None where one may."""
-    if isinstance(policy, Toge):
+    if isinstance(policy, Toge | ResnetUnet):
         return None
     if changed := changes(before, snapshot(policy)):
         return f"it keeps {', '.join(changed)} from call to call, which a graph cannot"
@@ -122,7 +123,7 @@ def _candidates(
         from policy.engines.openvino_cpu import make_openvino_runner
         from policy.engines.openvino_modules import ModuleConverter
 
-        is_ours = isinstance(policy, Toge)
+        is_ours = isinstance(policy, Toge | ResnetUnet)
         converter = None if is_ours else ModuleConverter(policy, settings.name)
         return [
             (

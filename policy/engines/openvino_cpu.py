@@ -28,6 +28,7 @@ from policy.engines.openvino_modules import ModuleConverter, make_module_runner
 from policy.engines.runner import Act, ExecutionSettings, Precision, assemble
 from policy.engines.stepwise import to_numpy
 from policy.nets.action_head import DiffusionHead, size_dims
+from policy.nets.resnet_unet import ResnetUnet
 from policy.nets.toge import Toge
 from policy.nets.unet1d import Conv, ResidualBlock, UNet1d, norm_of_groups
 from policy.preprocess import egocentric, egocentric_scale
@@ -56,14 +57,14 @@ def make_openvino_runner(
             asked for, or failed on a dummy sample.
         RuntimeError: OpenVINO cannot compile it.
     """
-    if isinstance(policy, Toge):
+    if isinstance(policy, Toge | ResnetUnet):
         return _make_builtin(policy, settings, vision, action)
     converter = converter or ModuleConverter(policy, settings.name)
     return make_module_runner(policy, settings, vision, action, converter)
 
 
 def _make_builtin(
-    policy: Toge, settings: ExecutionSettings, vision: Precision, action: Precision
+    policy: Toge | ResnetUnet, settings: ExecutionSettings, vision: Precision, action: Precision
 ) -> PolicyRunner:
     name = engine_name(vision, action)
     compiler = GraphCompiler(f"{policy.config} {digest_of_weights(policy)}")
@@ -76,7 +77,9 @@ def _make_builtin(
     )
 
 
-def _solver(compiler: GraphCompiler, policy: Toge, precision: Precision, steps: int) -> Act:
+def _solver(
+    compiler: GraphCompiler, policy: Toge | ResnetUnet, precision: Precision, steps: int
+) -> Act:
     """(encoded image, state, history) -> chunk, by ``steps`` from the policy's noise on.
 
     One graph, and so one copy of the weights, runs them all, at most ``MAX_UNROLLED`` at a time:
@@ -110,13 +113,13 @@ def digest_of_weights(module: nn.Module) -> str:
     return digest.hexdigest()
 
 
-def vision_graph(policy: Toge) -> ov.Model:
+def vision_graph(policy: Toge | ResnetUnet) -> ov.Model:
     """Normalised image [1, 3, H, W] -> feature [1, F]."""
     image = (1, 3, policy.contract.image_height, policy.contract.image_width)
     return convert(policy, lambda i: policy.visual_projection(policy.backbone(i)), [image])
 
 
-def denoise_graph(policy: Toge, count: int) -> ov.Model:
+def denoise_graph(policy: Toge | ResnetUnet, count: int) -> ov.Model:
     """``count`` steps of a solve, unrolled; ``step_inputs`` says which ones.
 
     (feature, egocentric, history, noisy [1, horizon, 4], films, updates) -> less noisy.
@@ -227,7 +230,7 @@ class BulkEncoder:
     images a second as torch in batches.
     """
 
-    def __init__(self, policy: Toge, precision: Precision) -> None:
+    def __init__(self, policy: Toge | ResnetUnet, precision: Precision) -> None:
         properties = {
             "PERFORMANCE_HINT": "THROUGHPUT",
             "INFERENCE_PRECISION_HINT": precision,

@@ -1,4 +1,4 @@
-"""TOGE, the network of this project, trained or with random weights."""
+"""The networks of this project: TOGE and ResNet-UNet, trained or with random weights."""
 
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -9,27 +9,27 @@ from policy.loading.request import PolicyRequest, default_contract
 from policy.nets.names import BACKBONE_NAMES, SIZE_NAMES, BackboneName, Size
 
 if TYPE_CHECKING:
-    from policy.nets.toge import Toge, TogeConfig
+    from policy.checkpoints.policy_file import BuiltinConfig, BuiltinPolicy
 
 SHIPPED = Path(__file__).parents[1] / "weights" / "toge.safetensors"
 """Flown by ``toge`` where no other weights are named; its card is beside it."""
 SHIPPED_RATES = SHIPPED.with_name("toge-rates.safetensors")
 """The same of ``toge-rates``, by thrust and body rates."""
-BUILTIN_KINDS = ("toge", "toge-rates")
+BUILTIN_KINDS = ("toge", "toge-rates", "resnet-unet")
 
 
-def builtin_config(spec: str, *, image_size: int) -> "TogeConfig":
+def builtin_config(spec: str, *, image_size: int) -> "BuiltinConfig":
     """The built-in network that ``spec`` names, with the default contract at that image size."""
     kind, *options = spec.split(":")
     if kind not in BUILTIN_KINDS:
         raise PolicyError(
-            f"--policy {spec} cannot be trained here: use toge[:SIZE][:BACKBONE]; a world model "
-            "has a command of its own, train-world-model"
+            f"--policy {spec} cannot be trained here: use toge[:SIZE][:BACKBONE], "
+            "resnet-unet[:SIZE]; a world model has a command of its own, train-world-model"
         )
     return _config(kind, options, image_size)
 
 
-def load_builtin(request: PolicyRequest) -> tuple["Toge", list[str]]:
+def load_builtin(request: PolicyRequest) -> tuple["BuiltinPolicy", list[str]]:
     """Build a network and load its weights, or seeded random ones; with notes for the user."""
     kind, *options = request.spec.split(":")
     config, checkpoint = _config(kind, options, request.image_size), builtin_checkpoint(request)
@@ -61,7 +61,7 @@ def parse_builtin(kind: str, options: list[str]) -> tuple[Size, BackboneName | N
     """Size and backbone that a spec asks for; a checkpoint that says more overrules them."""
     rest: list[Any] = list(options)
     size: Size = rest.pop(0) if rest and rest[0] in SIZE_NAMES else "small"
-    if len(rest) > 1:
+    if len(rest) > (0 if kind == "resnet-unet" else 1):
         raise PolicyError(f"--policy {kind} does not take {':'.join(rest)!r}: write {FORMS}")
     if rest and rest[0] not in BACKBONE_NAMES:
         raise PolicyError(
@@ -71,21 +71,24 @@ def parse_builtin(kind: str, options: list[str]) -> tuple[Size, BackboneName | N
     return size, rest[0] if rest else None
 
 
-def _config(kind: str, options: list[str], image_size: int | None) -> "TogeConfig":
+def _config(kind: str, options: list[str], image_size: int | None) -> "BuiltinConfig":
+    from policy.nets.resnet_unet import ResnetUnetConfig
     from policy.nets.toge import TogeConfig
 
     size, backbone = parse_builtin(kind, options)
     contract = default_contract(image_size)
-    return TogeConfig(size=size, backbone=backbone or TogeConfig.backbone, contract=contract)
+    if kind != "resnet-unet":
+        return TogeConfig(size=size, backbone=backbone or TogeConfig.backbone, contract=contract)
+    return ResnetUnetConfig(size=size, contract=contract)
 
 
 def _trained(
-    config: "TogeConfig", options: list[str], checkpoint: Path, seed: int
-) -> tuple["Toge", list[str]]:
+    config: "BuiltinConfig", options: list[str], checkpoint: Path, seed: int
+) -> tuple["BuiltinPolicy", list[str]]:
     from policy.checkpoints.policy_file import load_checkpoint_with_notes
 
     policy, found = load_checkpoint_with_notes(checkpoint, fallback=config)
-    parts = (policy.config.size, policy.config.backbone)
+    parts = (policy.config.size, getattr(policy.config, "backbone", "resnet18"))
     if contradicted := [option for option in options if option not in parts]:
         raise PolicyError(
             f"{checkpoint} holds {':'.join(parts)}, not {':'.join(contradicted)}: leave that out"
@@ -106,14 +109,14 @@ def _trained(
     return policy, notes
 
 
-def _untrained(config: "TogeConfig", seed: int) -> tuple["Toge", list[str]]:
+def _untrained(config: "BuiltinConfig", seed: int) -> tuple["BuiltinPolicy", list[str]]:
     import torch
 
-    from policy.nets.toge import Toge
+    from policy.checkpoints.policy_file import build_policy
 
     with torch.random.fork_rng(devices=[]):  # the process's own random stream stays as it was
         torch.manual_seed(seed)
-        policy = Toge(config).eval()
+        policy = build_policy(config).eval()
     policy.seed_noise(seed)
     note = f"untrained: seeded random weights (seed {seed}, noise too); for bring-up only"
     return policy, [note]

@@ -1,6 +1,7 @@
 """From what a user wrote (``--policy``, ``--checkpoint``) to a runner, or a clear refusal.
 
     toge[:SIZE][:BACKBONE]   TOGE, e.g. toge, toge:medium, toge:small:resnet18
+    resnet-unet[:SIZE]       ResNet-UNet, single-rate
     scripted[:PROGRAM][:ACTION][:air]
                              a fixed program in any kind of action, e.g. scripted:square:velocity;
                              air: begin in the air, without the climb

@@ -12,6 +12,8 @@ import torch
 from torch import Tensor, nn
 
 from policy.checkpoints.policy_file import (
+    BuiltinPolicy,
+    build_policy,
     load_checkpoint,
     read_torch,
     save_checkpoint,
@@ -25,7 +27,8 @@ from policy.data.samples import Timeline
 from policy.engines.openvino_cpu import BulkEncoder
 from policy.errors import PolicyError
 from policy.nets.backbones import load_imagenet_state
-from policy.nets.toge import Toge, TogeConfig
+from policy.nets.resnet_unet import ResnetUnetConfig
+from policy.nets.toge import TogeConfig
 from policy.training.batches import Batch, Batches, FeatureStore, normalise_image
 from policy.training.encode import ENCODE_BATCH, Encode, encode_rows, one_way_first
 from policy.training.parallel import StepLoss, computing_in
@@ -36,6 +39,7 @@ from policy.training.settings import MAX_AGE_MS, TrainSettings
 from policy.training.stages import TrainingStage, policy_stages
 from policy.training.trainee import Trainee, refresh_batch_norm, validate
 
+Network: TypeAlias = TogeConfig | ResnetUnetConfig
 Check: TypeAlias = Callable[[Path], float]
 """Flies a checkpoint in closed loop and returns a score: more is better."""
 
@@ -54,7 +58,7 @@ HEAD_RATE = 3
 
 def train_policy(
     flights: Sequence[FlightData],
-    network: TogeConfig,
+    network: Network,
     settings: TrainSettings,
     hooks: Hooks,
     check: Check | None = None,
@@ -73,7 +77,7 @@ class _PolicyRun(TrainingRun[Trainee, Batch]):
     def __init__(
         self,
         flights: Sequence[FlightData],
-        network: TogeConfig,
+        network: Network,
         settings: TrainSettings,
         folder: RunFolder,
         hooks: Hooks,
@@ -233,19 +237,19 @@ def _evenly(range_ms: tuple[float, float]) -> Nanoseconds:
     return np.linspace(low_ms * NS_PER_MS, high_ms * NS_PER_MS, 256).astype(np.int64)
 
 
-def _starting_trainee(network: TogeConfig, settings: TrainSettings) -> Trainee:
+def _starting_trainee(network: Network, settings: TrainSettings) -> Trainee:
     """The policy to start from and a new gate head; torch's global random state is kept."""
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(settings.seed)
         if settings.start_from is not None:
             return Trainee(_checkpoint(network, settings.start_from), settings.gate_weight)
-        policy = Toge(network)
+        policy = build_policy(network)
         if settings.backbone_weights is not None:
             load_imagenet_state(policy.backbone, read_torch(settings.backbone_weights))
         return Trainee(policy, settings.gate_weight)
 
 
-def _checkpoint(network: TogeConfig, path: Path) -> Toge:
+def _checkpoint(network: Network, path: Path) -> BuiltinPolicy:
     policy = load_checkpoint(path, fallback=network)
     if policy.contract.action != network.contract.action:
         raise PolicyError(
@@ -260,7 +264,7 @@ def _checkpoint(network: TogeConfig, path: Path) -> Toge:
         for config, contract in ((network, wanted), (policy.config, policy.contract))
     )
     other = [f"{name} {value!r}" for name, value in held.items() if asked.get(name) != value]
-    if other:
+    if other or type(policy.config) is not type(network):
         raise PolicyError(
             f"--start-from {path} holds another policy: {', '.join(other)}; ask for the same one"
         )

@@ -7,9 +7,9 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
+from policy.checkpoints.policy_file import BuiltinPolicy
 from policy.contract import ACTION_DIM, FloatArray
 from policy.nets.action_head import size_dims
-from policy.nets.toge import Toge
 from policy.training.batches import Batch, normalised
 from policy.training.parallel import StepLoss, computing_in
 from policy.training.report import PolicyValidation
@@ -32,7 +32,7 @@ VALIDATION_STEPS = 10
 class Trainee(nn.Module):
     """A policy with its gate head, and the mean and spread of the sticks to imitate."""
 
-    def __init__(self, policy: Toge, gate_weight: float) -> None:
+    def __init__(self, policy: BuiltinPolicy, gate_weight: float) -> None:
         super().__init__()
         self.policy = policy
         self.gate_head = nn.Linear(size_dims(policy.config.size).base_dim, GATE_LABELS)

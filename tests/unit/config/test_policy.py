@@ -14,6 +14,7 @@ from mavbridge.config.policy import PolicyConfig
         ({}, True, 1),
         ({"policy": "toge:medium"}, True, 1),
         ({"dual_rate": False}, False, 1),
+        ({"policy": "resnet-unet"}, False, 10),
         ({"policy": "toge-rates"}, True, 1),
         ({"policy": "toge-rates", "num_diffusion_steps": 4}, True, 4),
         ({"policy": "./mine.py:Mine"}, True, 10),

@@ -3,7 +3,7 @@ from collections.abc import Iterator
 import pytest
 import torch
 
-from policy.checkpoints.policy_file import load_checkpoint
+from policy.checkpoints.policy_file import BuiltinPolicy, load_checkpoint
 from policy.contract import Contract
 from policy.loading.builtin import SHIPPED
 from policy.nets.toge import Toge, TogeConfig
@@ -28,6 +28,6 @@ def small_toge() -> Toge:
 
 
 @pytest.fixture(scope="session")
-def trained_toge() -> Toge:
+def trained_toge() -> BuiltinPolicy:
     """The shipped policy."""
     return load_checkpoint(SHIPPED, fallback=TogeConfig())

@@ -9,10 +9,12 @@ import numpy as np
 import pytest
 import torch
 
-from policy.checkpoints.policy_file import save_checkpoint
+from policy.checkpoints.policy_file import build_policy, save_checkpoint
+from policy.contract import Contract
 from policy.errors import PolicyError
 from policy.loading.load import check_request, load_policy, read_policy_contract
 from policy.loading.request import LoadedPolicy, PolicyRequest
+from policy.nets.resnet_unet import ResnetUnetConfig
 from policy.nets.toge import Toge
 from policy.stick_loop import StickLoop, by_rates, rates_contract
 
@@ -121,6 +123,22 @@ def test_a_spec_that_contradicts_the_checkpoint_is_refused(spec: str, checkpoint
         load(spec, checkpoint=checkpoint)
 
 
+def test_a_policy_without_fast_path_becomes_single_rate_with_one_warning(tmp_path: Path) -> None:
+    contract = Contract(image_height=32, image_width=32)
+    path = tmp_path / "a.safetensors"
+    save_checkpoint(path, build_policy(ResnetUnetConfig(contract=contract)))
+    asked, not_asked = (
+        load("resnet-unet", checkpoint=path, dual_rate=dual_rate) for dual_rate in (True, False)
+    )
+    assert not asked.runner.dual_rate
+    assert [note for note in asked.notes if note.startswith("warning")] == [
+        "warning: resnet-unet has no fast path (encode_visual and predict_fast), so it flies in "
+        "single-rate mode, the whole network for every action (--single-rate: as intended)"
+    ]
+    assert not any(note.startswith("warning") for note in not_asked.notes)
+    assert act(asked).shape == (1, 16, 4)
+
+
 @pytest.mark.parametrize(
     ("spec", "changes", "message"),
     [
@@ -132,13 +150,13 @@ def test_a_spec_that_contradicts_the_checkpoint_is_refused(spec: str, checkpoint
         ("scripted", {"checkpoint": Path("a.pt")}, "no weights"),
         ("toge:huge", {"allow_untrained": True}, "neither a size"),
         ("toge:small:vgg16", {"allow_untrained": True}, "efficientnet_b3"),
-        ("toge:small:resnet18:x", {"allow_untrained": True}, "does not take 'resnet18:x'"),
+        ("resnet-unet:resnet50", {"allow_untrained": True}, "does not take 'resnet50'"),
         ("toge", {"checkpoint": Path("absent.safetensors")}, "no such file"),
         ("toge:resnet18", {"allow_untrained": True, "image_size": 1}, "image_height"),
-        ("toge:resnet8", {"allow_untrained": True, "device": "tpu"}, "this computer has"),
-        ("toge:resnet8", {"allow_untrained": True, "action_device": "cuda:9"}, "this computer has"),
+        ("resnet-unet", {"allow_untrained": True, "device": "tpu"}, "this computer has"),
+        ("resnet-unet", {"allow_untrained": True, "action_device": "cuda:9"}, "this computer has"),
         ("scripted:yaw", {"engine": "openvino"}, "computes in numpy"),
-        ("toge:resnet8", {"allow_untrained": True, "num_diffusion_steps": 101}, r"1\.\.100"),
+        ("resnet-unet", {"allow_untrained": True, "num_diffusion_steps": 101}, r"1\.\.100"),
         ("json.decoder:Nothing", {}, "no class Nothing"),
         ("policy:Mine", {}, "a file of that name flies by its path: --policy ./policy.py:Mine"),
         ("scripted:yaw", {"by_rates": True}, "--by-rates is for toge"),
@@ -267,17 +285,6 @@ def user_module(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> str:
     monkeypatch.syspath_prepend(tmp_path)
     monkeypatch.delitem(sys.modules, "my_user_policies", raising=False)
     return "my_user_policies"
-
-
-def test_a_policy_without_fast_path_becomes_single_rate_with_one_warning(user_module: str) -> None:
-    asked, not_asked = (load(f"{user_module}:Single", dual_rate=dual) for dual in (True, False))
-    assert not asked.runner.dual_rate
-    assert [note for note in asked.notes if note.startswith("warning")] == [
-        f"warning: {user_module}:Single has no fast path (encode_visual and predict_fast), so it "
-        "flies in single-rate mode, the whole network for every action (--single-rate: as intended)"
-    ]
-    assert not any(note.startswith("warning") for note in not_asked.notes)
-    assert float(act(asked).max()) == pytest.approx(0.2)
 
 
 @pytest.mark.parametrize(

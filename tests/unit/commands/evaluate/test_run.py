@@ -56,6 +56,7 @@ def test_seeds_follow_from_the_evaluations_seed_and_the_index_alone() -> None:
 
 def test_only_built_in_nets_are_kept_from_one_episode_to_the_next() -> None:
     assert is_stateless(PolicyConfig(policy="toge:small"))
+    assert is_stateless(PolicyConfig(policy="resnet-unet"))
     assert not is_stateless(CIRCLE)
     assert not is_stateless(PolicyConfig(policy="my.package:Policy"))
 

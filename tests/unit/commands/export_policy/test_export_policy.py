@@ -56,11 +56,11 @@ def test_files_that_are_another_policy_are_not_praised(
 @pytest.mark.parametrize(
     ("config", "message"),
     [
-        ({"out": "here", "policy": "scripted"}, "weights of toge are exported"),
+        ({"out": "here", "policy": "scripted"}, "policies of toge and resnet-unet are exported"),
         ({"out": "taken", "format": "torchscript"}, "name a new file in a folder that exists"),
         ({"out": "no/mine.pt", "format": "torchscript"}, "name a new file in a folder that exists"),
         ({"out": "taken"}, "is taken"),
-        ({"out": "here", "policy": "toge:large"}, "needs trained weights"),
+        ({"out": "here", "policy": "resnet-unet"}, "needs trained weights"),
     ],
 )
 def test_what_cannot_be_written_is_refused(

@@ -11,9 +11,10 @@ import pytest
 import torch
 
 from helpers.torch_policies import DUAL, SINGLE, WIDE, ForwardOnly, TwoRates, Wide
-from policy.adapters.export import export_onnx, export_torchscript
+from policy.adapters.export import OurPolicy, export_onnx, export_torchscript
 from policy.adapters.onnx import policies
 from policy.adapters.onnx.graphs import GraphFile, Ports, Wanted
+from policy.contract import Contract
 from policy.engines.choose import chunks_of_samples
 from policy.engines.parity import make_parity_samples, parity_failure
 from policy.engines.runner import ExecutionSettings
@@ -21,6 +22,7 @@ from policy.engines.torch_eager import make_torch_runner
 from policy.errors import PolicyError
 from policy.loading.load import check_request, load_policy, read_policy_contract
 from policy.loading.request import PolicyRequest
+from policy.nets.resnet_unet import ResnetUnet, ResnetUnetConfig
 from policy.nets.toge import Toge
 from policy.protocol import PolicyRunner
 
@@ -46,7 +48,9 @@ def loaded(request: PolicyRequest) -> tuple[PolicyRunner, str]:
     return policy.runner, "\n".join(policy.notes)
 
 
-def reference(policy: Toge | TwoRates | ForwardOnly, settings: ExecutionSettings) -> PolicyRunner:
+def reference(
+    policy: OurPolicy | TwoRates | ForwardOnly, settings: ExecutionSettings
+) -> PolicyRunner:
     return make_torch_runner(policy, settings)  # type: ignore[arg-type]
 
 
@@ -83,6 +87,25 @@ def test_the_archive_of_our_policy_is_the_same(trained_toge: Toge, tmp_path: Pat
     runner, notes = loaded(request)
     assert runner.engine.startswith("openvino"), notes
     require_same(runner, reference(trained_toge, settings))
+
+
+def test_a_single_rate_policy_of_ours_gains_a_fast_path(tmp_path: Path) -> None:
+    with torch.random.fork_rng(devices=[]):
+        torch.manual_seed(0)
+        contract = Contract(image_height=32, image_width=32)
+        policy = ResnetUnet(ResnetUnetConfig(contract=contract)).eval()
+    export_onnx(policy, tmp_path)
+    settings = ExecutionSettings(name="it", dual_rate=False, num_diffusion_steps=STEPS)
+    expected = reference(policy, settings)
+    samples = make_parity_samples(policy.contract)
+    for dual_rate in (False, True):
+        request = PolicyRequest(
+            spec=f"onnx:{tmp_path}", dual_rate=dual_rate, num_diffusion_steps=STEPS
+        )
+        runner, _ = loaded(request)
+        assert runner.dual_rate == dual_rate
+        chunks = chunks_of_samples(runner, samples)
+        assert parity_failure(chunks_of_samples(expected, samples), chunks) is None
 
 
 def write(module: torch.nn.Module, path: Path, shapes: dict[str, tuple[int, ...]]) -> None:

@@ -11,12 +11,14 @@ from safetensors.torch import save_file
 from torch import nn
 
 from policy.checkpoints.policy_file import (
+    build_policy,
     load_checkpoint,
     save_checkpoint,
 )
 from policy.contract import Contract
 from policy.errors import CheckpointError
 from policy.nets.diffusion import NoiseSchedule
+from policy.nets.resnet_unet import ResnetUnetConfig
 from policy.nets.toge import Toge, TogeConfig
 
 SMALL = Contract(image_height=32, image_width=32)
@@ -50,7 +52,7 @@ def test_the_file_alone_says_what_it_is(tmp_path: Path) -> None:
         ),
         schedule=NoiseSchedule(prediction="epsilon", betas="linear", num_train_timesteps=50),
     )
-    policy = Toge(config).eval()
+    policy = build_policy(config).eval()
     path = tmp_path / "a.safetensors"
     save_checkpoint(path, policy)
     loaded = load_checkpoint(path, fallback=TogeConfig())
@@ -150,7 +152,7 @@ def test_nan_weights_are_refused_on_both_ways(small_toge, saved, tmp_path):
     save_file(poisoned, path, metadata=header_of(saved))
     with pytest.raises(CheckpointError, match=r"NaN.*fusion\.mlp\.0\.weight"):
         load_checkpoint(path, fallback=small_toge.config)
-    policy = Toge(small_toge.config)
+    policy = build_policy(small_toge.config)
     with torch.no_grad():
         policy.head.unet.out.weight[0, 0] = float("inf")
     with pytest.raises(CheckpointError, match=r"head\.unet\.out\.weight"):
@@ -210,3 +212,8 @@ def test_a_file_without_header_says_how_to_convert_it(saved, tmp_path, key):
     path = with_header(tmp_path / "a.safetensors", header)
     with pytest.raises(CheckpointError, match="save_checkpoint"):
         load_checkpoint(path, fallback=TogeConfig())
+
+
+def test_another_kind_of_policy_is_refused(saved: Path) -> None:
+    with pytest.raises(CheckpointError, match="--policy toge"):
+        load_checkpoint(saved, fallback=ResnetUnetConfig())

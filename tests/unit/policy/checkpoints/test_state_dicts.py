@@ -9,7 +9,7 @@ import torch
 from torch import Tensor, nn
 from torch.optim.swa_utils import AveragedModel
 
-from policy.checkpoints.policy_file import load_checkpoint_with_notes
+from policy.checkpoints.policy_file import build_policy, load_checkpoint_with_notes
 from policy.errors import CheckpointError
 from policy.nets.toge import Toge, TogeConfig
 
@@ -92,7 +92,7 @@ def test_torchs_own_wrappers_load(small_toge: Toge, tmp_path: Path) -> None:
         (lambda s: {"shadow_params": list(s.values())}, "no weights found"),
         (lambda s: nn.Linear(3, 3).state_dict(), r"does not fit .*size and encoder"),
         (
-            lambda s: Toge(TogeConfig(backbone="resnet8")).state_dict(),
+            lambda s: build_policy(TogeConfig(backbone="resnet8")).state_dict(),
             r"does not fit this policy in \d+ places: missing",
         ),
     ],

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 import torch
 
+from policy.checkpoints.policy_file import BuiltinConfig, build_policy
 from policy.contract import Contract, FloatArray
 from policy.engines.choose import choose_runner, chunks_of_samples
 from policy.engines.cuda_graph import make_cuda_graph_runner
@@ -32,8 +33,8 @@ ON_GPU = ExecutionSettings(name="toge", vision_device="cuda", action_device="cud
 def test_toge_computes_what_torch_computes(size: Size, since_exposure: bool) -> None:
     torch.manual_seed(0)
     contract = replace(SMALL, since_exposure=since_exposure)
-    config = TogeConfig(size=size, contract=contract)
-    policy, samples = Toge(config).eval(), make_parity_samples(contract)
+    config: BuiltinConfig = TogeConfig(size=size, contract=contract)
+    policy, samples = build_policy(config).eval(), make_parity_samples(contract)
     expected = chunks_of_samples(make_torch_runner(policy, ExecutionSettings(name="t")), samples)
     chunks = chunks_of_samples(make_cuda_graph_runner(policy, ON_GPU), samples)
     assert parity_failure(expected, chunks) is None

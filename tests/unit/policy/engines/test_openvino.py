@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 import torch
 
+from policy.checkpoints.policy_file import BuiltinConfig, BuiltinPolicy, build_policy
 from policy.contract import Contract, FloatArray
 from policy.engines import openvino_cpu
 from policy.engines.choose import chunks_of_samples
@@ -20,6 +21,7 @@ from policy.engines.torch_eager import make_torch_runner
 from policy.errors import PolicyError
 from policy.nets.diffusion import NoiseSchedule
 from policy.nets.names import BACKBONE_NAMES, BackboneName
+from policy.nets.resnet_unet import ResnetUnetConfig
 from policy.nets.toge import Toge, TogeConfig
 from policy.protocol import PolicyRunner
 
@@ -27,15 +29,15 @@ SMALL = Contract(image_height=32, image_width=32)
 SETTINGS = ExecutionSettings(name="toge", num_diffusion_steps=2)
 
 
-def seeded(config: TogeConfig) -> Toge:
+def seeded(config: BuiltinConfig) -> BuiltinPolicy:
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(0)
-        policy = Toge(config).eval()
+        policy = build_policy(config).eval()
     policy.seed_noise(3)
     return policy
 
 
-def both(policy: Toge, settings: ExecutionSettings) -> tuple[FloatArray, FloatArray]:
+def both(policy: BuiltinPolicy, settings: ExecutionSettings) -> tuple[FloatArray, FloatArray]:
     """Chunks by plain torch, and by OpenVINO in float32."""
     samples = make_parity_samples(policy.contract)
     reference = make_torch_runner(policy, settings)
@@ -64,16 +66,17 @@ def test_every_backbone_computes_what_torch_computes(backbone: BackboneName) -> 
 @pytest.mark.parametrize(
     "config",
     [
-        TogeConfig(size="large", backbone="resnet8", contract=replace(SMALL, since_exposure=True)),
+        TogeConfig(size="large", backbone="resnet8", contract=SMALL),
+        ResnetUnetConfig(contract=replace(SMALL, since_exposure=True)),
         TogeConfig(
             backbone="resnet18",
             contract=Contract(image_height=32, image_width=48, horizon=8, history_len=2),
             schedule=NoiseSchedule(prediction="epsilon", betas="linear", num_train_timesteps=50),
         ),
     ],
-    ids=["large", "other-contract"],
+    ids=["large", "resnet-unet", "other-contract"],
 )
-def test_single_rate_computes_what_torch_computes(config: TogeConfig) -> None:
+def test_single_rate_computes_what_torch_computes(config: BuiltinConfig) -> None:
     settings = ExecutionSettings(name="toge", num_diffusion_steps=1, dual_rate=False)
     expected, chunks = both(seeded(config), settings)
     assert np.abs(expected).max() > 0.1

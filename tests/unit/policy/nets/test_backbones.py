@@ -18,6 +18,15 @@ KNOWN_PARAMETERS: list[tuple[BackboneName, str, tuple[int, ...]]] = [
     ("efficientnet_b3", "features.3.0.block.1.0.weight", (192, 1, 5, 5)),
     ("efficientnet_b3", "features.7.1.block.3.0.weight", (384, 2304, 1, 1)),
     ("efficientnet_b3", "features.8.0.weight", (1536, 384, 1, 1)),
+    ("convnext_tiny", "features.0.0.bias", (96,)),
+    ("convnext_tiny", "features.0.1.weight", (96,)),
+    ("convnext_tiny", "features.1.0.layer_scale", (96, 1, 1)),
+    ("convnext_tiny", "features.1.0.block.0.weight", (96, 1, 7, 7)),
+    ("convnext_tiny", "features.1.0.block.2.weight", (96,)),
+    ("convnext_tiny", "features.2.1.weight", (192, 96, 2, 2)),
+    ("convnext_tiny", "features.5.8.block.3.weight", (1536, 384)),
+    ("convnext_tiny", "features.7.2.block.5.weight", (768, 3072)),
+    ("convnext_tiny", "classifier.0.weight", (768,)),
     ("resnet18", "conv1.weight", (64, 3, 7, 7)),
     ("resnet18", "layer2.0.downsample.0.weight", (128, 64, 1, 1)),
     ("resnet18", "layer4.1.bn2.running_mean", (512,)),
@@ -29,6 +38,7 @@ KNOWN_PARAMETERS: list[tuple[BackboneName, str, tuple[int, ...]]] = [
 # Parameters that torchvision's documentation gives, classifier of 1000 classes included.
 KNOWN_TOTALS: list[tuple[BackboneName, int, int]] = [
     ("efficientnet_b3", 12_233_232, 1536),
+    ("convnext_tiny", 28_589_128, 768),
     ("resnet18", 11_689_512, 512),
     ("resnet50", 25_557_032, 2048),
 ]

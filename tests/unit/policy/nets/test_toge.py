@@ -2,11 +2,14 @@ import pytest
 import torch
 from torch import Tensor
 
+from policy.checkpoints.policy_file import BuiltinPolicy
 from policy.contract import Contract
 from policy.errors import ContractError, PolicyError
 from policy.nets.action_head import DiffusionHead
 from policy.nets.diffusion import NoiseSchedule
+from policy.nets.resnet_unet import ResnetUnet, ResnetUnetConfig
 from policy.nets.toge import Toge, TogeConfig
+from policy.protocol import DualRatePolicy, SingleRatePolicy
 
 
 def sample(batch: int = 1) -> tuple[Tensor, Tensor, Tensor]:
@@ -106,10 +109,14 @@ def test_refuses_wrong_shapes_and_names_them(small_toge: Toge) -> None:
 
 
 @torch.inference_mode()
-def test_every_number_since_the_exposure_reaches_the_sticks() -> None:
+@pytest.mark.parametrize("kind", [TogeConfig, ResnetUnetConfig])
+def test_every_number_since_the_exposure_reaches_the_sticks(kind):
     image, state, history = sample()
     contract = Contract(image_height=32, image_width=32, since_exposure=True)
-    policy = Toge(TogeConfig(backbone="resnet18", contract=contract)).eval()
+    if kind is TogeConfig:
+        policy: BuiltinPolicy = Toge(TogeConfig(backbone="resnet18", contract=contract)).eval()
+    else:
+        policy = ResnetUnet(ResnetUnetConfig(contract=contract)).eval()
     with pytest.raises(PolicyError, match=r"state must be \[B, 20\], got \[1, 13\]"):
         policy.predict(image, state, history, 2)
     wide = torch.cat([state, torch.zeros(1, 7)], dim=1)
@@ -130,11 +137,32 @@ def test_every_number_since_the_exposure_reaches_the_sticks() -> None:
         (lambda: TogeConfig(backbone="vgg16"), "efficientnet_b3"),  # type: ignore[arg-type]
         (lambda: TogeConfig(contract=Contract(feature_dim=99)), "feature_dim 99"),
         (lambda: TogeConfig(contract=Contract(arrays="numpy")), "torch"),
+        (lambda: ResnetUnetConfig(contract=Contract(feature_dim=256)), "feature_dim 0"),
+        (lambda: ResnetUnetConfig(size="huge"), "small"),  # type: ignore[arg-type]
     ],
 )
 def test_refuses_configs_of_another_network(build: object, message: str) -> None:
     with pytest.raises((PolicyError, ContractError), match=message):
         build()  # type: ignore[operator]
+
+
+@torch.inference_mode()
+def test_resnet_unet_flies_single_rate_only() -> None:
+    torch.manual_seed(0)
+    contract = Contract(image_height=32, image_width=32)
+    policy = ResnetUnet(ResnetUnetConfig(contract=contract)).eval()
+    assert isinstance(policy, SingleRatePolicy)
+    assert not isinstance(policy, DualRatePolicy)
+    image, state, history = sample(batch=2)
+    chunk = policy.predict(image, state, history, 3)
+    assert chunk.shape == (2, 16, 4)
+    assert chunk.abs().max() <= 1.0
+    assert not torch.equal(policy.predict(image, state + 0.5, history, 3), chunk)
+    assert not torch.equal(policy.predict(image, state, -history, 3), chunk)
+    centred = policy.encode_observation(image, state, history * 0)
+    assert torch.equal(policy.encode_observation(image, state), centred)
+    with pytest.raises(PolicyError, match="action_history"):
+        policy.predict(image, state, history[:, :2], 3)
 
 
 @pytest.mark.parametrize("prediction", ["sample", "epsilon"])

@@ -21,10 +21,11 @@ from policy.data.flight_folders import read_flight
 from policy.data.frames import store_frames
 from policy.data.samples import Timeline
 from policy.errors import PolicyError
+from policy.nets.resnet_unet import ResnetUnetConfig
 from policy.nets.toge import Toge, TogeConfig
 from policy.training import batches as batches_module
 from policy.training.batches import Batches
-from policy.training.policy_run import train_policy
+from policy.training.policy_run import Network, train_policy
 from policy.training.report import Hooks, TrainingProgress, TrainResult
 from policy.training.run_folder import Position, RunFolder, TrainingError
 from policy.training.settings import TrainSettings
@@ -65,7 +66,7 @@ def run(
     settings: TrainSettings,
     report: Callable[[TrainingProgress], None] = lambda _: None,
     check: Callable[[Path], float] | None = None,
-    network: TogeConfig = NETWORK,
+    network: Network = NETWORK,
 ) -> TrainResult:
     return train_policy(flights, network, settings, make_hooks(report), check)
 
@@ -112,6 +113,13 @@ def test_a_run_that_was_killed_resumes_as_if_it_had_not_been(flights, whole, tmp
 
 def test_a_run_that_was_stopped_resumes_as_if_it_had_not_been(flights, whole, tmp_path):
     check_stopping(partial(train_shortly, folder=tmp_path), flights, whole, validated_at=4)
+
+
+def test_resnet_unet_trains_too_and_an_ablation_is_a_weight_of_zero(flights, tmp_path):
+    network = ResnetUnetConfig(contract=CONTRACT)
+    made = settings(tmp_path, gate_weight=0.0, mirror=False, validations=1)
+    result = run(flights[:2], made, network=network)
+    assert load_checkpoint(result.checkpoint, fallback=network).contract == CONTRACT
 
 
 def test_a_closed_loop_check_decides_and_a_checkpoint_is_gone_on_from(flights, tmp_path):
