@@ -32,7 +32,7 @@ from policy.contract import Contract
 from policy.engines.runner import ExecutionSettings, make_numpy_runner
 from policy.protocol import PolicyRunner
 from policy.scripted import ScriptedPolicy
-from policy.scripted.programs import Axis, DoubletStep, doublet_length_s, doublet_steps
+from policy.scripted.controllers import Axis, DoubletStep, doublet_length_s, doublet_steps
 
 LEAST_R_SQUARED = 0.7
 EARLY_S, BEFORE_S, STILL_S, LONGEST_GAP_S, CLIMB_S = 0.12, 0.1, 1.0, 0.25, 20.0

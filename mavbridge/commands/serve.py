@@ -34,8 +34,7 @@ from mavbridge.core.workers import Worker
 from mavbridge.flight.policies import check_configured_policy, load_configured_policy
 from policy.adapters.interface import Interface
 from policy.adapters.websocket.link import API_KEY_VARIABLE
-from policy.adapters.websocket.messages import CONTRACT_KEY, pack, unpack
-from policy.adapters.websocket.observation import RESET_KEY, from_message
+from policy.adapters.websocket.messages import CONTRACT_KEY, RESET_KEY, from_message, pack, unpack
 from policy.adapters.websocket.remote_policy import ACTIONS_KEY
 from policy.contract import Contract
 from policy.errors import PolicyError

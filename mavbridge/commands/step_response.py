@@ -12,8 +12,7 @@ from mavbridge.core.clock import NS_PER_S
 from mavbridge.core.records import Event, Tick, VehicleState
 from mavbridge.core.vehicle import Action
 from policy.contract import RATE, ActionKind
-from policy.scripted.controllers import measure
-from policy.scripted.programs import Axis
+from policy.scripted.controllers import Axis, measure
 
 Array = NDArray[np.float64]
 Sides = tuple[float, float]

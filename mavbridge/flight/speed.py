@@ -9,7 +9,7 @@ from mavbridge.flight.plan import FlightPlan
 from mavbridge.guard.chunks import PERIOD_TOLERANCE, FreshnessLimits
 from policy.contract import Contract
 from policy.errors import warned
-from policy.loading.timing import SolveTimes
+from policy.loading.request import SolveTimes
 
 CLEARLY = 1.5
 """Factor beyond a limit that counts as out of reach: other programs may have slowed the

@@ -12,10 +12,9 @@ from pathlib import Path
 from typing import Any, Literal, NamedTuple
 
 from policy import files
-from policy.adapters.interface import ACTION_FIELDS, UNANSWERED
+from policy.adapters.interface import ACTION_FIELDS, DERIVED_NAMES, UNANSWERED
 from policy.adapters.lerobot.config import CONFIG_FILE, read_json
 from policy.adapters.onnx.files import read_graph
-from policy.adapters.state import DERIVED_NAMES
 from policy.contract import (
     ACTION_DIM,
     ENVELOPE_TERMS,

@@ -21,22 +21,65 @@
     [task]
     prompt = "fly through the gates"
 
-All of it is optional but what the kind of policy asks for. State names are those of the contract
-and of ``adapters.state``. A draft has the text "?" where only the user knows the answer, and is not
-flown before each has one: ``adapters.drafts`` writes them.
+All of it is optional but what the kind of policy asks for. State names are those of the contract,
+and numbers made of them:
+
+    vx_body_mps, vy_body_mps, vz_body_mps    velocity in the axes of the body
+    vertical_x, vertical_y, vertical_z       the world's third axis in the axes of the body
+    roll_rad, pitch_rad, yaw_rad             Euler angles of the attitude, turned in the order
+                                             yaw, pitch, roll; signs by the contract's frame
+
+The first six are the same on every heading, so a network that takes them has no rotations to learn.
+A draft has the text "?" where only the user knows the answer, and is not flown before each has one:
+``adapters.drafts`` writes them.
 """
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Any, TypeVar, cast
 
 import numpy as np
 
-from policy.adapters.state import DERIVED_NAMES, state_values
-from policy.contract import ACTION_DIM, ACTION_NAMES, Contract
+from policy.contract import ACTION_DIM, ACTION_NAMES, QUATERNION, STATE_NAMES, Contract
 from policy.errors import ContractError, PolicyError
 from policy.files import read_toml
+from policy.preprocess import egocentric_columns
+from policy.rotation import matrix_columns
+
+EGOCENTRIC_NAMES = (
+    *("vx_body_mps", "vy_body_mps", "vz_body_mps"),
+    *("vertical_x", "vertical_y", "vertical_z"),
+)
+EULER_NAMES = ("roll_rad", "pitch_rad", "yaw_rad")
+DERIVED_NAMES = (*EGOCENTRIC_NAMES, *EULER_NAMES)
+BODY_STATE_NAMES = (*EGOCENTRIC_NAMES, *STATE_NAMES[QUATERNION.stop :])
+"""A state without a heading: velocity, vertical axis, rates and specific force of the body."""
+
+
+def state_values(
+    columns: Sequence[Any],
+    names: Sequence[str],
+    wanted: Sequence[str],
+    arctan2: Callable[[Any, Any], Any] = np.arctan2,
+) -> list[Any]:
+    """The ``wanted`` numbers of a state whose ``columns`` are called ``names``.
+
+    ``names`` begin with ``STATE_NAMES``; columns are floats or arrays of any kind, torch's too, and
+    ``arctan2`` is that of their library.
+    """
+    known = dict(zip(names, columns, strict=True))
+    base = [known[name] for name in STATE_NAMES]
+    if set(wanted) & set(EGOCENTRIC_NAMES):
+        known |= dict(zip(EGOCENTRIC_NAMES, egocentric_columns(base), strict=False))
+    if set(wanted) & set(EULER_NAMES):
+        forward, side, up = matrix_columns(*base[QUATERNION])
+        level = (forward[0] * forward[0] + forward[1] * forward[1]) ** 0.5
+        known["roll_rad"] = arctan2(side[2], up[2])
+        known["pitch_rad"] = arctan2(-forward[2], level)
+        known["yaw_rad"] = arctan2(forward[1], forward[0])
+    return [known[name] for name in wanted]
+
 
 ArrayOrTensor = TypeVar("ArrayOrTensor")
 CONTRACT_FILE = "mavbridge.toml"
@@ -59,7 +102,7 @@ class Interface:
 
     contract: Contract
     state_names: tuple[str, ...] = ()
-    """Its state vector, as names of ``contract.state_names`` and ``state.DERIVED_NAMES``; empty:
+    """Its state vector, as names of ``contract.state_names`` and ``DERIVED_NAMES``; empty:
     the same as the contract's."""
     state_scale: tuple[float, ...] = ()
     """Factor from the contract's unit to the policy's of each of them; empty: ones."""

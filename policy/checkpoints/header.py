@@ -1,15 +1,128 @@
-"""The header of a checkpoint, read without torch and without the weights.
+"""What a file of weights is, and the header of ours: read without torch and without the weights.
 
 What is wrong with a file is raised as a ``CheckpointError``.
 """
 
+import json
+import struct
+import zipfile
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
-from policy.checkpoints.detect import detect
 from policy.contract import Contract
 from policy.errors import CheckpointError
-from policy.files import open_safetensors
+from policy.files import open_regular, open_safetensors, read_json, stand_in_of
+
+HEAD_BYTES = 4096
+MAX_HEADER_BYTES = 100_000_000
+"""Longest header of safetensors, as its own reader has it."""
+LEROBOT_TYPES = ("act", "diffusion")
+"""Types of LeRobot policies that fly from their files."""
+_FOLDERS: tuple[tuple[str, str, str], ...] = (
+    ("pretrained_model/", "a folder of LeRobot's training", "fly it with --policy lerobot:{0}/{1}"),
+    (
+        "checkpoints/last/pretrained_model/",
+        "a folder of LeRobot's training",
+        "fly it with --policy lerobot:{0}/{1}",
+    ),
+    ("meta/info.json", "a LeRobot data set, not a policy", "train one: mavbridge train {0}"),
+    ("ticks.parquet", "a recorded flight, not a policy", "train one: mavbridge train {0}"),
+    ("*.onnx", "a folder of ONNX models", "fly it with --policy onnx:{0}"),
+)
+"""Entry of a folder, what the folder is, what to do."""
+
+
+def detect(path: Path) -> str | None:
+    """Return what a file or folder is and how it flies; None if it is unknown, or may be ours."""
+    try:
+        found = _folder(path) if path.is_dir() else _file(path)
+    except OSError:
+        return None  # whoever opens it says why it cannot be read
+    if found is None:
+        return None
+    what, advice = found
+    return f"{path} is {what}: {advice}"
+
+
+def _file(path: Path) -> tuple[str, str] | None:
+    with open_regular(path) as file:
+        head = file.read(HEAD_BYTES)
+        file.seek(0)
+        if (found := stand_in_of(head)) is not None:
+            return found
+        if head.startswith(b"PK\x03\x04"):
+            return _zip(path)
+        if head[8:9] == b"{":
+            (length,) = struct.unpack("<Q", file.read(8))
+            return _safetensors(path, file.read(min(length, MAX_HEADER_BYTES)))
+    if path.suffix == ".onnx":
+        return "an ONNX model", f"fly it with --policy onnx:{path}"
+    return None
+
+
+def _zip(path: Path) -> tuple[str, str] | None:
+    try:
+        with zipfile.ZipFile(path) as archive:
+            names = archive.namelist()
+            if any("/code/" in name or name.endswith("/constants.pkl") for name in names):
+                return "a TorchScript archive", f"fly it with --policy torchscript:{path}"
+            is_torch = any(name.endswith("data.pkl") for name in names)
+            return None if is_torch else ("a zip archive", "unpack it, and name what is in it")
+    except (zipfile.BadZipFile, ValueError):
+        return "cut short, or damaged", "copy or download it again, and compare its size"
+
+
+def _safetensors(path: Path, text: bytes) -> tuple[str, str] | None:
+    try:
+        header: Any = json.loads(text)
+        metadata = header.pop("__metadata__", {}) or {}
+        if "contract" in metadata:
+            return None
+        names = [str(name) for name in header]
+    except (ValueError, TypeError, AttributeError, RecursionError):
+        return None  # its reader says what is wrong with it
+    if (beside := _lerobot(path.parent)) is not None:
+        what, advice = beside
+        return f"the weights of {what}", advice
+    theirs = ("diffusion.unet.", "model.action_head.", "normalize_inputs.")
+    if any(name.startswith(theirs) for name in names):
+        return (
+            "the weights of a LeRobot policy, without the config.json that belongs beside them",
+            "name the whole folder: --policy lerobot:DIR",
+        )
+    return None
+
+
+def _folder(path: Path) -> tuple[str, str]:
+    if (kind := _lerobot(path)) is not None:
+        return kind
+    for sign, what, advice in _FOLDERS:
+        if any(path.glob(sign)):
+            return what, advice.format(path, sign.rstrip("/"))
+    there = sorted(each.name for each in path.iterdir())[:8]
+    return "a folder", f"name a file; it holds {there}"
+
+
+def _lerobot(folder: Path) -> tuple[str, str] | None:
+    """Name the LeRobot policy in a folder and what to do with it; None if there is none."""
+    try:
+        config: Any = read_json(folder / "config.json")
+    except (OSError, ValueError):
+        return None
+    if not isinstance(config, dict) or "type" not in config:
+        return None
+    kind = config["type"]
+    if kind in LEROBOT_TYPES:
+        return f"a LeRobot policy ({kind})", f"fly its folder with --policy lerobot:{folder}"
+    if "input_features" not in config:
+        return None
+    return (
+        f"a LeRobot policy of type {kind!r}",
+        f"of its types {' and '.join(LEROBOT_TYPES)} fly from their files; run this one in "
+        "LeRobot's own environment behind --policy ws://HOST:PORT",
+    )
+
 
 CONTRACT_KEY = "contract"
 ARCHITECTURE_KEY = "architecture"

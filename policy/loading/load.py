@@ -26,15 +26,13 @@ from policy.adapters.lerobot.plan import Plan, read_plan
 from policy.adapters.onnx.files import OnnxFiles, find_onnx_files
 from policy.adapters.user_class import check_user_class, load_user_class
 from policy.adapters.websocket.kind import SCHEMES, check_server, load_server_policy
-from policy.checkpoints.detect import detect
-from policy.checkpoints.header import read_contract
+from policy.checkpoints.header import detect, read_contract
 from policy.contract import Contract
 from policy.engines.runner import ExecutionSettings, make_numpy_runner, require_devices
 from policy.errors import PolicyError, user_code, warned
 from policy.files import user_path
 from policy.loading.builtin import BUILTIN_KINDS, builtin_checkpoint, load_builtin, parse_builtin
-from policy.loading.request import LoadedPolicy, PolicyRequest, default_contract
-from policy.loading.timing import measure_times
+from policy.loading.request import LoadedPolicy, PolicyRequest, default_contract, measure_times
 from policy.protocol import DualRatePolicy, PolicyRunner, SingleRatePolicy, keep_nothing
 from policy.scripted.policy import IN_AIR, ScriptedPolicy, make_scripted
 from policy.stick_loop import by_rates, flown_by_rates

@@ -12,8 +12,7 @@ from torch import Tensor, nn
 
 from policy.errors import PolicyError
 from policy.nets.names import BackboneName
-from policy.nets.pooling import MOMENTS, moments
-from policy.nets.resnet import ResNet, ResNet8
+from policy.nets.resnet import MOMENTS, ResNet, ResNet8, moments
 
 STEM_CHANNELS = 40
 # expand ratio, kernel, stride, channels out, depth: B0's table at width 1.2 and depth 1.4
@@ -89,7 +88,7 @@ class EfficientNetB3(nn.Module):
         self.out_dim = MOMENTS * OUT_CHANNELS
 
     def forward(self, image: Tensor) -> Tensor:
-        """``pooling.moments`` of the last map, flat."""
+        """``resnet.moments`` of the last map, flat."""
         pooled: Tensor = moments(self.features(image)).flatten(1)
         return pooled
 

@@ -3,12 +3,45 @@
 ResNet-50 strides in the 3x3 convolution ("v1.5"), as torchvision's weights do.
 """
 
+import math
 from itertools import pairwise
 
+import numpy as np
+import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-from policy.nets.pooling import MOMENTS, moments
+from policy.contract import FloatArray
+
+MOMENTS = 3
+"""The average, and the averages weighted by the place to the right and by the place below."""
+
+
+def moments(features: Tensor) -> Tensor:
+    """Map [B, C, H, W] -> [B, 3, C], a vector that still says where things are.
+
+    The usual average answers what is in the image and forgets where; steering needs both. Diffusion
+    policies therefore pool by spatial softmax (Chi et al. 2023). First moments do the same without
+    a parameter, at any image size, beside the average that ImageNet's weights were trained with.
+    """
+    height, width = (int(size) for size in features.shape[2:])  # plain numbers also in a trace
+    weights = torch.from_numpy(moment_weights(height, width)).to(features)
+    return torch.matmul(features.flatten(2), weights).transpose(1, 2)
+
+
+def moment_weights(height: int, width: int) -> FloatArray:
+    """[H * W, 3]: what each cell counts; places have mean 0 and variance of about 1."""
+    across = np.broadcast_to(_places(width), (height, width))
+    down = np.broadcast_to(_places(height)[:, None], (height, width))
+    weights = np.stack([np.ones_like(across), across, down], axis=-1).reshape(-1, MOMENTS)
+    return (weights / (height * width)).astype(np.float32)
+
+
+def _places(count: int) -> FloatArray:
+    """Centres of ``count`` cells from one border to the other, at -sqrt(3) and sqrt(3)."""
+    centres = (np.arange(count, dtype=np.float32) + 0.5) * (2.0 / count) - 1.0
+    return (math.sqrt(3.0) * centres).astype(np.float32)
+
 
 RESNET8_CHANNELS = (24, 48, 96, 128)
 """Channels out of the first convolution and of the three blocks."""
@@ -109,7 +142,7 @@ class ResNet(LastMap):
         self.out_dim = MOMENTS * self.channels
 
     def forward(self, image: Tensor) -> Tensor:
-        """``pooling.moments`` of the last map, flat."""
+        """``moments`` of the last map, flat."""
         pooled: Tensor = moments(super().forward(image)).flatten(1)
         return pooled
 

@@ -4,7 +4,7 @@ They speak the whole dual-rate protocol and put out any kind of action, so both 
 the vehicle can be tried before anything is trained.
 """
 
+from policy.scripted.controllers import PROGRAM_NAMES
 from policy.scripted.policy import ScriptedPolicy
-from policy.scripted.programs import PROGRAM_NAMES
 
 __all__ = ["PROGRAM_NAMES", "ScriptedPolicy"]

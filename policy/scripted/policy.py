@@ -8,8 +8,16 @@ import numpy as np
 
 from policy.contract import ACTION_DIM, STATE_DIM, ActionKind, Contract, FloatArray
 from policy.errors import PolicyError
-from policy.scripted.controllers import CONTROLS, Climb, Measured, ThrustLoop, clip, measure
-from policy.scripted.programs import Motion, make_program
+from policy.scripted.controllers import (
+    CONTROLS,
+    Climb,
+    Measured,
+    Motion,
+    ThrustLoop,
+    clip,
+    make_program,
+    measure,
+)
 
 FEATURE_DIM = 8
 DEFAULT_CONTRACT = Contract()

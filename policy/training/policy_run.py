@@ -29,14 +29,21 @@ from policy.errors import PolicyError
 from policy.nets.backbones import load_imagenet_state
 from policy.nets.resnet_unet import ResnetUnetConfig
 from policy.nets.toge import TogeConfig
-from policy.training.batches import Batch, Batches, FeatureStore, normalise_image
-from policy.training.encode import ENCODE_BATCH, Encode, encode_rows, one_way_first
+from policy.training.batches import (
+    ENCODE_BATCH,
+    Batch,
+    Batches,
+    Encode,
+    FeatureStore,
+    encode_rows,
+    normalise_image,
+    one_way_first,
+)
 from policy.training.parallel import StepLoss, computing_in
 from policy.training.report import Hooks, PolicyValidation, TrainResult, Validation
 from policy.training.run import TrainingRun, open_run
 from policy.training.run_folder import Position, RunFolder
-from policy.training.settings import MAX_AGE_MS, TrainSettings
-from policy.training.stages import TrainingStage, policy_stages
+from policy.training.settings import MAX_AGE_MS, TrainingStage, TrainSettings, policy_stages
 from policy.training.trainee import Trainee, refresh_batch_norm, validate
 
 Network: TypeAlias = TogeConfig | ResnetUnetConfig

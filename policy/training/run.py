@@ -32,8 +32,7 @@ from policy.training.run_folder import (
     TrainingStoppedError,
     identity_of,
 )
-from policy.training.settings import Precision, RunSettings
-from policy.training.stages import TrainingStage, learning_rate_factor
+from policy.training.settings import Precision, RunSettings, TrainingStage, learning_rate_factor
 from policy.world_model.config import WorldModelConfig
 
 LOG_STEPS = 20

@@ -103,23 +103,6 @@ def test_moving_the_sticks_takes_the_return_over_in_posctl(px4_flying):
     assert TOOK_OVER_IN_FAILSAFE in events, "an event, but no text"
 
 
-@pytest.mark.parametrize("refills", [False, True])
-def test_the_delay_is_a_budget_that_a_changed_parameter_fills(px4_flying, refills):
-    px4_flying.refill_delay(2.0)
-    px4_flying.fly(0.1)
-    goes_to(px4_flying, LOITER, 2.0)
-    goes_to(px4_flying, RTL, 5.0)
-    px4_flying.fly(0.5)
-    assert px4_flying.set_mode(ALTCTL) == ACCEPTED
-    px4_flying.fly(0.5)
-    if refills:
-        px4_flying.change("MPC_LAND_SPEED", 0.8)
-    px4_flying.fly(0.5)
-    goes_to(px4_flying, LOITER, 2.0)
-    took_s = goes_to(px4_flying, RTL, 5.0)
-    assert 1.7 <= took_s <= 2.4 if refills else took_s <= 1.2
-
-
 def test_the_loss_time_is_a_parameter(px4_flying):
     px4_flying.refill_delay()
     px4_flying.fly(0.1)
@@ -216,17 +199,3 @@ def test_offboard_needs_more_than_one_setpoint_a_second(px4_flying, hz, stays):
     messages = px4_flying.repeat(send, 4.0)
     modes = {m.custom_mode for m in modes_in(messages)}
     assert (modes == {custom(OFFBOARD)}) == stays
-
-
-@pytest.mark.parametrize(("ramp_s", "takes_over"), [(0.6, True), (1.5, False), (0.0, False)])
-def test_a_fast_ramp_of_the_sticks_takes_over_and_a_jump_does_not(px4_flying, ramp_s, takes_over):
-    assert px4_flying.set_mode(LOITER) == ACCEPTED
-    px4_flying.fly(0.5)
-
-    def ramp(elapsed_s: float) -> None:
-        share = 1.0 if elapsed_s >= ramp_s else elapsed_s / ramp_s
-        px4_flying.sticks((0, int(1000 * share), 500, 0))
-
-    px4_flying.repeat(ramp, 1.8)
-    assert px4_flying.hears("Pilot took over using sticks", 0.5) == takes_over
-    assert px4_flying.mode() == custom(POSCTL if takes_over else LOITER)

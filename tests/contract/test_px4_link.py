@@ -104,13 +104,6 @@ def test_minus_one_stops_a_stream(px4):
     assert not named(px4.advance(0.5), "ATTITUDE")
 
 
-def test_data_streams_are_ignored(px4):
-    px4.command(SET_INTERVAL, mav.MAVLINK_MSG_ID_ATTITUDE, -1)
-    px4.send(mav.MAVLink_request_data_stream_message(1, 1, mav.MAV_DATA_STREAM_EXTRA1, 25, 1))
-    px4.advance(0.1)
-    assert not named(px4.advance(0.5), "ATTITUDE")
-
-
 def test_the_interval_is_told(px4):
     px4.stream(mav.MAVLINK_MSG_ID_ATTITUDE, 50)
     px4.send(
@@ -174,16 +167,6 @@ def test_refused_modes_say_so(px4):
     assert px4.command(mav.MAV_CMD_DO_SET_MODE, 1, 9, 0) == REJECTED
     assert px4.command(mav.MAV_CMD_DO_SET_MODE, 1, 4, 99) == REJECTED
     assert px4.command(mav.MAV_CMD_DO_SET_MODE, 0, *ALTCTL) == REJECTED
-
-
-def test_the_old_set_mode_message_is_acknowledged_as_the_command(px4):
-    px4.set_mode(LOITER)
-    px4.advance(0.5)
-    px4.send(mav.MAVLink_set_mode_message(1, 1, custom(ALTCTL)))
-    messages = px4.advance(0.5)
-    acks = [(m.command, m.result) for m in named(messages, "COMMAND_ACK")]
-    assert acks == [(mav.MAV_CMD_DO_SET_MODE, ACCEPTED)]
-    assert px4.mode() == custom(ALTCTL)
 
 
 def test_texts_need_a_ground_station(px4_armable):

@@ -89,21 +89,6 @@ def test_a_body_velocity_turns_with_the_heading(offboard):
     )
 
 
-def test_an_unknown_frame_is_refused_with_a_text(offboard):
-    offboard.seen.clear()
-    offboard.repeat(
-        lambda _: [
-            offboard.send(velocity_target(vx=1.0, frame=9)),
-            offboard.send(velocity_target()),
-        ],
-        0.5,
-        hz=5,
-    )
-    offboard.stream_setpoint(velocity_target(), 0.5)
-    texts = [m for m in named(offboard.seen, "STATUSTEXT") if "coordinate frame 9" in m.text]
-    assert texts
-
-
 def test_the_attitude_target_echoes_the_setpoint(offboard):
     yaw = heading(offboard)
     assert offboard.stream(mav.MAVLINK_MSG_ID_ATTITUDE_TARGET, 50) == ACCEPTED

@@ -68,14 +68,6 @@ def test_some_input_modes_ignore_mavlinks_sticks(px4, in_mode):
     assert not echoes(px4.fly(0.5))
 
 
-def test_overrides_are_no_sticks(px4):
-    px4.stream(mav.MAVLINK_MSG_ID_MANUAL_CONTROL, 50)
-    px4.advance(1.0)
-    message = mav.MAVLink_rc_channels_override_message(1, 1, 1600, 1500, 1500, 1500, *[1500] * 4)
-    messages = px4.repeat(lambda _: px4.send(message), 0.5)
-    assert not echoes(messages)
-
-
 @pytest.mark.parametrize("mode", [STAB, ACRO, ALTCTL, POSCTL])
 def test_without_sticks_their_modes_do_not_arm(px4_armable, mode):
     px4_armable.get_ready(LOITER)

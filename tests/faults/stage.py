@@ -22,8 +22,6 @@ from mavbridge.core.reasons import reason_from_json
 from sitl.clock import NS_PER_MS, Clock
 
 TIMEOUT_S = 90.0
-REPORT_S = 360.0
-"""For a vehicle that flies on at the lowest priority, beside whatever else runs."""
 STARTS = 3
 LEANING = 100
 """Steering messages that lean, in a row: the policy holds its lean."""
@@ -282,10 +280,7 @@ class Stage:
 
     def end_vehicle(self) -> None:
         self._vehicle.terminate()
-        try:
-            self._vehicle.wait(REPORT_S)
-        finally:
-            self._vehicle.kill()
+        self._vehicle.wait(TIMEOUT_S)
 
     def report(self) -> Any:
         return json.loads((self.folder / "report.json").read_text())

@@ -17,8 +17,8 @@ from mavbridge.guard.values import Phase
 from mavbridge.simulation.world import NOMINAL_VEHICLE
 from policy.contract import ActionKind, Contract, FloatArray
 from policy.protocol import PolicyRunner
+from policy.scripted.controllers import LEG_MPS, LEG_S, Motion, Program, Push, make_program
 from policy.scripted.policy import ScriptedPolicy
-from policy.scripted.programs import LEG_MPS, LEG_S, Motion, Program, Push, make_program
 from sitl.ardupilot.autopilot import ArduCopter
 from sitl.ardupilot.flight_modes import Mode as ArduMode
 from sitl.ardupilot.guided import Submode

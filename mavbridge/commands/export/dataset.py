@@ -23,7 +23,7 @@ from mavbridge.commands.export.files import (
 )
 from mavbridge.core.records import ImageArray
 from mavbridge.recording.video.file import VideoError
-from policy.adapters.state import state_values
+from policy.adapters.interface import state_values
 from policy.contract import ACTION_NAMES, STATE_NAMES
 from policy.data import lerobot_format as names
 from policy.files import library_name

@@ -178,7 +178,7 @@ class DatasetSpec:
     state_frame: StateFrame
     task: str
     state_names: tuple[str, ...] = STATE_NAMES
-    """Numbers of ``observation.state``: the contract's, or made of them by ``adapters.state``."""
+    """Numbers of ``observation.state``: by the contract or ``adapters.interface``."""
     data_file_bytes: int = DATA_FILE_MB * MB
     video_file_bytes: int = VIDEO_FILE_MB * MB
     """Size of a file; one episode alone may be larger."""

@@ -29,8 +29,7 @@ from mavbridge.core.errors import UserError
 from mavbridge.core.records import ImageArray
 from mavbridge.core.stopping import stop_on_signals
 from policy.adapters.drafts import Entry, dataset_entries, draft_text, recorded_entries
-from policy.adapters.interface import CONTRACT_FILE
-from policy.adapters.state import BODY_STATE_NAMES
+from policy.adapters.interface import BODY_STATE_NAMES, CONTRACT_FILE
 from policy.contract import STATE_NAMES
 from policy.data.flight_data import FlightData, common_frame, common_terms
 from policy.data.flight_folders import find_flights, leave_out_failed, read_flight

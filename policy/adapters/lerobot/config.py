@@ -50,7 +50,7 @@ class Features:
     takes_goal: bool
     """observation.environment_state is the vector to the goal, ``policy.contract.EXTRA_NAMES``."""
     modes: Mapping[str, str]
-    """Normalisation of STATE, VISUAL and ACTION, ``statistics.MODES``."""
+    """Normalisation of STATE, VISUAL and ACTION, ``plan.MODES``."""
 
 
 @dataclass(frozen=True, kw_only=True)

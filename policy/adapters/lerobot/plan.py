@@ -1,17 +1,206 @@
-"""All that is known of a LeRobot policy before its weights are read: its networks and its contract.
+"""All that is known of a LeRobot policy before its weights are read: contract and statistics.
 
 config.json says shapes; what it does not say (rate, names, units, frame, autopilot modes) comes
-from a contract file: ``adapters.interface``.
+from a contract file: ``adapters.interface``. Its preprocessor and postprocessor normalise. Their
+statistics lie in a state file beside policy_preprocessor.json; before 0.4, in the weights, as
+``normalize_inputs.buffer_observation_state.mean``. All modes are of one affine form.
 """
 
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 
+import numpy as np
+
 from policy.adapters.interface import CONTRACT_FILE, Interface, read_interface
-from policy.adapters.lerobot.config import STATE_KEY, Config, Features, read_config
-from policy.adapters.lerobot.statistics import WEIGHTS_FILE, Normalisation, read_normalisation
-from policy.contract import EXTRA_NAMES, Contract
-from policy.errors import CheckpointError, ContractError
+from policy.adapters.lerobot.config import (
+    ACTION_KEY,
+    ENVIRONMENT_KEY,
+    STATE_KEY,
+    Config,
+    Features,
+    read_config,
+    read_json,
+)
+from policy.contract import EXTRA_NAMES, Contract, FloatArray
+from policy.errors import CheckpointError, ContractError, warned
+from policy.files import open_safetensors
+
+PREPROCESSOR, POSTPROCESSOR = "policy_preprocessor.json", "policy_postprocessor.json"
+WEIGHTS_FILE = "model.safetensors"
+MODES: dict[str, tuple[str, ...]] = {
+    "IDENTITY": (),
+    "MEAN_STD": ("mean", "std"),
+    "MIN_MAX": ("min", "max"),
+    "QUANTILES": ("q01", "q99"),
+    "QUANTILE10": ("q10", "q90"),
+}
+"""Statistics that each mode of normalisation needs."""
+_HARMLESS = ("to_batch_processor", "device_processor")
+_EPSILON = 1e-8
+_CONSTANT = 1e-6
+"""A number of the state that varied by less did not vary."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Affine:
+    """``normalised = gain * (value - shift) / divisor - bias``, as LeRobot's own code rounds it.
+
+    Back it goes by ``(normalised + bias) / gain * span + shift``.
+    """
+
+    shift: FloatArray
+    divisor: FloatArray
+    span: FloatArray
+    gain: float
+    bias: float
+
+
+@dataclass(frozen=True, kw_only=True)
+class Normalisation:
+    """Statistics of each input, by its name in config.json, and of the action; None: as it is."""
+
+    images: Mapping[str, Affine | None]
+    state: Affine | None
+    goal: Affine | None
+    """Of observation.environment_state."""
+    action: Affine | None
+    renamed: Mapping[str, str]
+    """Name of an input in the data -> its name in config.json."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class _Statistics:
+    """Statistics by feature and name, and by which of them each kind of feature is normalised."""
+
+    path: Path
+    modes: Mapping[str, str]
+    epsilon: float
+    arrays: Mapping[str, Mapping[str, FloatArray]]
+
+    def affine(self, key: str, kind: str) -> Affine | None:
+        """Return the transformation of one feature; None where it stays as it is."""
+        mode, own = self.modes.get(kind, "IDENTITY"), self.arrays.get(key, {})
+        if mode not in MODES:
+            raise CheckpointError(
+                f"{self.path}: normalises {key} by {mode!r}; supported are {', '.join(MODES)}"
+            )
+        if mode == "IDENTITY" or not own:
+            return None
+        if missing := [name for name in MODES[mode] if name not in own]:
+            raise CheckpointError(
+                f"{self.path}: {key} is normalised by {mode}, but its statistics lack {missing}; "
+                f"there are {sorted(own)}"
+            )
+        shape = (3, 1, 1) if kind == "VISUAL" else (-1,)
+        low, high = (own[name].astype(np.float32).reshape(shape) for name in MODES[mode])
+        if not (np.isfinite(low).all() and np.isfinite(high).all()):
+            raise CheckpointError(f"{self.path}: the statistics of {key} hold NaN or infinity")
+        epsilon = np.float32(self.epsilon)
+        if mode == "MEAN_STD":
+            return Affine(shift=low, divisor=high + epsilon, span=high, gain=1.0, bias=0.0)
+        span = np.where(high == low, epsilon, high - low)
+        return Affine(shift=low, divisor=span, span=span, gain=2.0, bias=1.0)
+
+
+def read_normalisation(folder: Path, features: Features) -> tuple[Normalisation, list[str]]:
+    """Read how a policy normalises; with notes for the user."""
+    renamed: dict[str, str] = {}
+    if (folder / PREPROCESSOR).is_file():
+        inputs, renamed = _processor(folder / PREPROCESSOR, "normalizer_processor")
+        outputs, _ = _processor(folder / POSTPROCESSOR, "unnormalizer_processor")
+    else:
+        inputs = outputs = _in_weights(folder, features)
+    normalisation = Normalisation(
+        images={key: inputs.affine(key, "VISUAL") for key in features.image_keys},
+        state=inputs.affine(STATE_KEY, "STATE") if features.state_dim else None,
+        goal=inputs.affine(ENVIRONMENT_KEY, "ENV") if features.takes_goal else None,
+        action=outputs.affine(ACTION_KEY, "ACTION"),
+        renamed=renamed,
+    )
+    return normalisation, _notes(folder, features, normalisation)
+
+
+def _notes(folder: Path, features: Features, normalisation: Normalisation) -> list[str]:
+    """Warn of what LeRobot computes without a word, and what is seldom meant."""
+    found = [(key, "VISUAL", affine) for key, affine in normalisation.images.items()]
+    found += [(ACTION_KEY, "ACTION", normalisation.action)]
+    found += [(ENVIRONMENT_KEY, "ENV", normalisation.goal)] if features.takes_goal else []
+    found += [(STATE_KEY, "STATE", normalisation.state)] if features.state_dim else []
+    notes: list[str] = [
+        warned(f"{folder} holds no statistics of {key}: it flies as it is, not normalised")
+        for key, kind, affine in found
+        if affine is None and features.modes.get(kind, "IDENTITY") != "IDENTITY"
+    ]
+    state = normalisation.state
+    if state is not None and (constant := np.flatnonzero(state.divisor < _CONSTANT).tolist()):
+        notes.append(
+            warned(
+                f"numbers {constant} (from 0) of {STATE_KEY} never changed in the training "
+                "data: any other value is divided by almost nothing, as in LeRobot, and rules the "
+                "chunk"
+            )
+        )
+    return notes
+
+
+def _processor(path: Path, normaliser: str) -> tuple[_Statistics, dict[str, str]]:
+    """Read the steps of a processor: at most one normalisation, and renamings."""
+    renamed: dict[str, str] = {}
+    found = _Statistics(path=path, modes={}, epsilon=0.0, arrays={})
+    steps = read_json(path).get("steps")
+    if not isinstance(steps, list) or not all(isinstance(step, dict) for step in steps):
+        raise CheckpointError(f"{path}: no list of steps")
+    for step in steps:
+        name, config = step.get("registry_name", step.get("class")), step.get("config", {})
+        if name == "rename_observations_processor":
+            renamed |= config.get("rename_map", {})
+        elif name == normaliser:
+            file, only = step.get("state_file"), config.get("normalize_observation_keys")
+            arrays = _by_feature(_read_arrays(path.parent / file)) if file else {}
+            kept = {k: v for k, v in arrays.items() if only is None or k in (*only, ACTION_KEY)}
+            modes, epsilon = config.get("norm_map", {}), float(config.get("eps", _EPSILON))
+            found = _Statistics(path=path, modes=modes, epsilon=epsilon, arrays=kept)
+        elif name not in _HARMLESS:
+            raise CheckpointError(
+                f"{path}: the step {name!r} is not supported: serve the policy from its own "
+                "environment, and fly --policy ws://HOST:PORT"
+            )
+    return found, renamed
+
+
+def _in_weights(folder: Path, features: Features) -> _Statistics:
+    """Statistics as LeRobot kept them before 0.4, in the weights."""
+    path = folder / WEIGHTS_FILE
+    sides = ("normalize_inputs.buffer_", "unnormalize_outputs.buffer_")
+    found = _by_feature(_read_arrays(path, sides))
+    if not found:
+        raise CheckpointError(
+            f"{folder}: there is no {PREPROCESSOR}, and {WEIGHTS_FILE} holds no statistics "
+            "(normalize_inputs.buffer_*): copy the whole folder that LeRobot wrote"
+        )
+    names = (*features.image_keys, STATE_KEY, ENVIRONMENT_KEY)
+    keys = {key: sides[0] + key.replace(".", "_") for key in names}
+    keys[ACTION_KEY] = sides[1] + ACTION_KEY
+    arrays = {key: found[name] for key, name in keys.items() if name in found}
+    return _Statistics(path=path, modes=features.modes, epsilon=_EPSILON, arrays=arrays)
+
+
+def _by_feature(arrays: Mapping[str, FloatArray]) -> dict[str, dict[str, FloatArray]]:
+    """Group ``observation.state.mean`` and the like by feature, then by statistic."""
+    found: dict[str, dict[str, FloatArray]] = {}
+    for name, array in arrays.items():
+        key, _, statistic = name.rpartition(".")
+        found.setdefault(key, {})[statistic] = array
+    return found
+
+
+def _read_arrays(path: Path, starts: tuple[str, ...] = ("",)) -> dict[str, FloatArray]:
+    if not path.is_file():
+        raise CheckpointError(f"{path} is missing: copy the whole folder that LeRobot wrote")
+    with open_safetensors(path, "numpy") as file:
+        names = [name for name in file.keys() if name.startswith(starts)]  # noqa: SIM118
+        return {name: file.get_tensor(name) for name in names}
 
 
 @dataclass(frozen=True, kw_only=True)

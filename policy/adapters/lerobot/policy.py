@@ -8,8 +8,7 @@ from torch import Tensor, nn
 from policy.adapters.lerobot.act import Act
 from policy.adapters.lerobot.config import ActConfig, DiffusionConfig
 from policy.adapters.lerobot.diffusion import DdimSchedule, Diffusion
-from policy.adapters.lerobot.plan import Plan
-from policy.adapters.lerobot.statistics import WEIGHTS_FILE, Affine
+from policy.adapters.lerobot.plan import WEIGHTS_FILE, Affine, Plan
 from policy.contract import EXTRA_NAMES, Contract
 from policy.errors import CheckpointError
 from policy.files import open_safetensors

@@ -7,14 +7,15 @@ import numpy as np
 from policy.adapters.interface import Interface
 from policy.adapters.websocket.link import ServerLink
 from policy.adapters.websocket.messages import (
+    RESET_KEY,
     Message,
     MessageError,
     last_line,
     number_array,
     pack,
+    to_message,
     unpack,
 )
-from policy.adapters.websocket.observation import RESET_KEY, to_message
 from policy.contract import ACTION_DIM, Contract, FloatArray
 from policy.engines.runner import level_state
 from policy.errors import NoChunkError

@@ -12,14 +12,12 @@ from policy.data.flight_data import DatasetError, FlightData
 from policy.data.interpolation import Indices
 from policy.data.windows import find_windows
 from policy.errors import PolicyError
-from policy.training.batches import FeatureStore
-from policy.training.encode import both_ways, encode_rows
+from policy.training.batches import FeatureStore, both_ways, encode_rows
 from policy.training.parallel import StepLoss, computing_in
 from policy.training.report import Hooks, TrainResult, Validation, WorldModelValidation
 from policy.training.run import TrainingRun, open_run
 from policy.training.run_folder import RunFolder
-from policy.training.settings import WorldModelSettings
-from policy.training.stages import TrainingStage, world_model_stages
+from policy.training.settings import TrainingStage, WorldModelSettings, world_model_stages
 from policy.training.world_model.batches import FrameBatch, WindowBatch, WindowBatches, frame_batch
 from policy.training.world_model.losses import (
     autoencoder_loss,

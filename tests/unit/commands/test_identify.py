@@ -32,7 +32,7 @@ from mavbridge.core.errors import UserError
 from mavbridge.core.vehicle import ACTION_CLASSES
 from mavbridge.flight.policies import configured_contract
 from policy.contract import ActionKind, Contract
-from policy.scripted.programs import doublet_length_s, doublet_steps
+from policy.scripted.controllers import doublet_length_s, doublet_steps
 
 START_S = 100.0
 STEP_S = 0.01

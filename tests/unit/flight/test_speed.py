@@ -10,7 +10,7 @@ from mavbridge.core.errors import PolicyError
 from mavbridge.flight.plan import plan_flight
 from mavbridge.flight.speed import require_speed
 from policy.contract import Contract
-from policy.loading.timing import SolveTimes
+from policy.loading.request import SolveTimes
 
 CONTRACT = Contract(feature_dim=1, arrays="numpy", horizon=100)
 

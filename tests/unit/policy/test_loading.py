@@ -146,7 +146,6 @@ def test_a_policy_without_fast_path_becomes_single_rate_with_one_warning(tmp_pat
         ("..toge:Toge", {}, "package.module:Class"),
         ("scripted:loop", {}, "square"),
         ("scripted:square:position", {}, "velocity"),
-        ("scripted:square:rates:air:air", {}, "air"),
         ("scripted", {"checkpoint": Path("a.pt")}, "no weights"),
         ("toge:huge", {"allow_untrained": True}, "neither a size"),
         ("toge:small:vgg16", {"allow_untrained": True}, "efficientnet_b3"),
@@ -194,11 +193,8 @@ def test_weights_that_learned_from_rates_are_flown_by_them(small_toge, checkpoin
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
-        ({"checkpoint": Path("absent.safetensors")}, "no such file"),
         ({"checkpoint": Path("weights.bin")}, "not a checkpoint"),
         ({"image_size": 64}, "network.image_size=64 contradicts"),
-        ({"device": "cuda:99"}, "this computer has"),
-        ({"spec": "toge:huge"}, "neither a size"),
         ({"spec": "toge:medium", "checkpoint": None}, "network.allow_untrained"),
     ],
 )

@@ -11,7 +11,7 @@ from policy.contract import ActionKind
 from policy.errors import PolicyError
 from policy.protocol import DualRatePolicy
 from policy.scripted import PROGRAM_NAMES, ScriptedPolicy
-from policy.scripted.programs import doublet_length_s, doublet_steps
+from policy.scripted.controllers import doublet_length_s, doublet_steps
 
 STEP_S = 0.01
 DELAY_STEPS = 4

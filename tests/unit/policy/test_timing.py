@@ -7,7 +7,7 @@ import pytest
 
 from policy.contract import Contract, FloatArray
 from policy.errors import NoChunkError
-from policy.loading.timing import MOST_S, REPETITIONS, SolveTimes, measure_times
+from policy.loading.request import MOST_S, REPETITIONS, SolveTimes, measure_times
 from policy.protocol import PolicyRunner
 
 
@@ -57,16 +57,6 @@ def test_by_a_clock_that_stands_still_it_is_asked_once_and_takes_no_time() -> No
     timed = Timed([0.004], ONE)
     assert measure_times(timed.runner, lambda: 7.0) == SolveTimes(encode_s=0.0, act_s=0.0)
     assert timed.acts == 1
-
-
-def test_an_image_is_one_of_each_camera_however_many_observations_there_are() -> None:
-    contract = Contract(
-        feature_dim=1, arrays="numpy", cameras=("front", "down"), observation_steps=3
-    )
-    timed = Timed([0.004], contract)
-    times = measure_times(timed.runner, lambda: timed.now_s)
-    assert times is not None
-    assert times.encode_s == pytest.approx(0.02)
 
 
 def test_without_a_chunk_there_is_no_time_of_one() -> None:

@@ -14,8 +14,7 @@ from mavbridge.commands.config import ExportConfig
 from mavbridge.commands.export.files import stretches
 from mavbridge.commands.export.run import export
 from mavbridge.core.errors import UserError
-from policy.adapters.interface import Interface, read_interface
-from policy.adapters.state import BODY_STATE_NAMES
+from policy.adapters.interface import BODY_STATE_NAMES, Interface, read_interface
 from policy.contract import Contract
 from policy.data.flight_data import DatasetError
 from policy.data.flight_folders import read_flight

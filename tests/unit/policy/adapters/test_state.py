@@ -7,8 +7,7 @@ import numpy as np
 import pytest
 import torch
 
-from policy.adapters.interface import Interface
-from policy.adapters.state import BODY_STATE_NAMES, DERIVED_NAMES
+from policy.adapters.interface import BODY_STATE_NAMES, DERIVED_NAMES, Interface
 from policy.contract import STATE_NAMES, Contract
 from policy.errors import ContractError
 from policy.rotation import multiply, rotate

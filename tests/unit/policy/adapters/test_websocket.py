@@ -18,18 +18,16 @@ from policy.adapters.interface import Interface
 from policy.adapters.websocket import kind
 from policy.adapters.websocket.kind import check_server
 from policy.adapters.websocket.messages import (
+    HISTORY_KEY,
     MessageError,
+    from_message,
+    from_uint8,
     last_line,
     number_array,
     pack,
-    unpack,
-)
-from policy.adapters.websocket.observation import (
-    HISTORY_KEY,
-    from_message,
-    from_uint8,
     to_message,
     to_uint8,
+    unpack,
 )
 from policy.contract import Contract
 from policy.errors import MavbridgeError, PolicyError

@@ -12,8 +12,7 @@ import pytest
 import torch
 from safetensors.torch import save_file
 
-from policy.checkpoints.detect import detect
-from policy.checkpoints.header import read_contract
+from policy.checkpoints.header import detect, read_contract
 from policy.errors import CheckpointError, PolicyError
 from policy.loading.load import check_request
 from policy.loading.request import PolicyRequest

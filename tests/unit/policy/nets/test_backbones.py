@@ -4,7 +4,7 @@ import torch
 from policy.errors import PolicyError
 from policy.nets.backbones import build_backbone, load_imagenet_state
 from policy.nets.names import BACKBONE_NAMES, BackboneName
-from policy.nets.pooling import moments
+from policy.nets.resnet import moments
 
 # Names and shapes of torchvision's published ImageNet state dicts.
 KNOWN_PARAMETERS: list[tuple[BackboneName, str, tuple[int, ...]]] = [

@@ -5,8 +5,14 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from policy.training.batches import FeatureStore
-from policy.training.encode import ENCODE_BATCH, Job, both_ways, encode_rows, one_way_first
+from policy.training.batches import (
+    ENCODE_BATCH,
+    FeatureStore,
+    Job,
+    both_ways,
+    encode_rows,
+    one_way_first,
+)
 
 FRAMES = 2 * ENCODE_BATCH + 10
 

@@ -39,16 +39,6 @@ def test_a_motion_leads_back_to_the_state() -> None:
     torch.testing.assert_close(again, then, atol=2e-5, rtol=0)
 
 
-def test_a_half_turn_about_each_axis_is_told_and_undone() -> None:
-    now = random_states(1).expand(3, -1)
-    half_turns = np.eye(4)[1:]
-    then = now.clone()
-    attitude = rotation.multiply(now[:, QUATERNION].numpy().astype(np.float64), half_turns)
-    then[:, QUATERNION] = torch.from_numpy(attitude.astype(np.float32))
-    again = state_after(now, motion_since(now, then))
-    assert (again[:, QUATERNION] * then[:, QUATERNION]).sum(1).abs().min() > 1 - 1e-5
-
-
 def test_a_motion_is_the_rotation_that_the_quaternions_tell() -> None:
     now, then = random_states(20), random_states(20, seed=1)
     motion = motion_since(now, then).numpy()
