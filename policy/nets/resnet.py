@@ -4,6 +4,7 @@ ResNet-50 strides in the 3x3 convolution ("v1.5"), as torchvision's weights do.
 """
 
 import math
+from functools import lru_cache
 from itertools import pairwise
 
 import numpy as np
@@ -25,8 +26,18 @@ def moments(features: Tensor) -> Tensor:
     a parameter, at any image size, beside the average that ImageNet's weights were trained with.
     """
     height, width = (int(size) for size in features.shape[2:])  # plain numbers also in a trace
-    weights = torch.from_numpy(moment_weights(height, width)).to(features)
+    if features.is_cuda:
+        weights = _weights_on_gpu(features.device, features.dtype, height, width)
+    else:
+        weights = torch.from_numpy(moment_weights(height, width)).to(features)
     return torch.matmul(features.flatten(2), weights).transpose(1, 2)
+
+
+@lru_cache(maxsize=64)
+def _weights_on_gpu(device: torch.device, dtype: torch.dtype, height: int, width: int) -> Tensor:
+    """Return ``moment_weights``, kept there: while a CUDA graph is captured nothing is copied."""
+    with torch.inference_mode(False):
+        return torch.from_numpy(moment_weights(height, width)).to(device, dtype)
 
 
 def moment_weights(height: int, width: int) -> FloatArray:
