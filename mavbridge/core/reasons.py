@@ -55,6 +55,7 @@ class Code(StrEnum):
     REBOOTED = auto()
     CLOCK_SET_BACK = auto()
     MOVED = auto()
+    MOVED_AT_REST = auto()
     REPLACED = auto()
     PARAMETER_CHANGED = auto()
     # Planned ends
@@ -98,6 +99,10 @@ class Code(StrEnum):
     OBSTACLE = auto()
     CALIBRATION_CHANGED = auto()
     RISK = auto()
+    ENDLESS_OVERRIDE = auto()
+    NO_THROTTLE_FAILSAFE = auto()
+    LONG_SETPOINT = auto()
+    SLOW_SERIAL = auto()
     OVERRIDE_SWITCH_NOT_ON = auto()
     WITH_HINT = auto()
     SLOW_CLOCK = auto()
@@ -105,6 +110,7 @@ class Code(StrEnum):
     BEYOND = auto()
     ESTIMATOR_LOST = auto()
     BATTERY = auto()
+    BATTERY_BELOW = auto()
     # The policy, its inputs and this computer
     LATE = auto()
     PAST_HORIZON = auto()
@@ -182,7 +188,16 @@ _REASONS: dict[Code, tuple[Kind, str]] = {
     Code.CLOCK_SET_BACK: (_VEHICLE, "the vehicle's clock went back by {back_s:.1f} s"),
     Code.MOVED: (_VEHICLE, "the vehicle went on from {now} instead of {before}"),
     Code.REBOOTED: (_VEHICLE, "the vehicle has rebooted: its session starts over"),
-    Code.REPLACED: (_VEHICLE, "{said}"),
+    Code.MOVED_AT_REST: (
+        _VEHICLE,
+        "the vehicle now sends from {now} instead of {before}: its session starts over",
+    ),
+    Code.REPLACED: (
+        _VEHICLE,
+        "the vehicle at {before} is silent, and system {system} is now heard from {now}, which is "
+        "not followed in flight: if it is another vehicle, give it another system id, or keep it "
+        "off this port; if this one has moved, engage again",
+    ),
     Code.PARAMETER_CHANGED: (
         _PILOT,
         "{name} was changed from {before:g} to {after:g} in flight",
@@ -253,7 +268,31 @@ _REASONS: dict[Code, tuple[Kind, str]] = {
         _PILOT,
         "the vehicle's radio calibration was changed in flight: disarm to take it in",
     ),
-    Code.RISK: (_VEHICLE, "{said}"),
+    Code.RISK: (
+        _VEHICLE,
+        "{why}, or --set-config link.accept_risk={risk} to fly all the same",
+    ),
+    Code.ENDLESS_OVERRIDE: (
+        _VEHICLE,
+        "if this computer died, the vehicle would hold its last sticks for ever (RC_OVERRIDE_TIME "
+        "is {time_s:g}): use --set RC_OVERRIDE_TIME=0.5",
+    ),
+    Code.NO_THROTTLE_FAILSAFE: (
+        _VEHICLE,
+        "no receiver was seen, and without its throttle failsafe (FS_THR_ENABLE is 0) the vehicle "
+        "would hold its last sticks for ever if this computer died: use --set FS_THR_ENABLE=1",
+    ),
+    Code.LONG_SETPOINT: (
+        _VEHICLE,
+        "if this computer died, the vehicle would fly on with its last setpoint for {time_s:g} s "
+        "({name}): use --set {name}=0.5",
+    ),
+    Code.SLOW_SERIAL: (
+        _VEHICLE,
+        "{baud} baud cannot carry the sticks and states that are asked for ({needed:.0f} bit/s): "
+        "use --connect with a serial port of {enough:.0f} baud or more on both sides or with a "
+        "network link, or a lower rates.action",
+    ),
     Code.OVERRIDE_SWITCH_NOT_ON: (
         _WAITING,
         "the override switch (RC{channel}) is off: switch it on to fly",
@@ -265,7 +304,11 @@ _REASONS: dict[Code, tuple[Kind, str]] = {
         "{quantity} {value:.1f} {unit} is beyond {limit:g} {unit} (envelope.{quantity})",
     ),
     Code.ESTIMATOR_LOST: (_VEHICLE, "the vehicle's estimator has lost its position"),
-    Code.BATTERY: (_VEHICLE, "{said}"),
+    Code.BATTERY: (_VEHICLE, "the vehicle reports its battery as low or failed"),
+    Code.BATTERY_BELOW: (
+        _VEHICLE,
+        "the battery is at {percent} %, below {limit:g} % (envelope.min_battery)",
+    ),
     Code.LATE: (_FAULT, "{quantity} {age_ms:.0f} ms old (limit {limit_ms:.0f} ms)"),
     Code.PAST_HORIZON: (
         _FAULT,

@@ -203,8 +203,8 @@ class VehicleStatus:
     """Position from the estimator's origin; None without a valid, fresh position."""
     is_position_valid: bool | None = None
     """The estimator's own verdict on its horizontal position; None: not reported."""
-    battery_problem: str | None = None
-    """Why the vehicle reports its battery as low or failed, in words; None: it does not."""
+    battery_problem: Reason | None = None
+    """Why the battery counts as low or failed; None: it does not."""
     stick_override_ns: int | None = None
     """When it last reported that moving sticks have changed its mode."""
 

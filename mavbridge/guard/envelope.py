@@ -169,9 +169,7 @@ class Envelope:
             problem = because(Code.ESTIMATOR_LOST) if lost else None
             yield _Finding("estimator", problem, now_ns, FLAG_PERSIST_NS)
         if limits.battery:
-            said = status.battery_problem
-            problem = None if said is None else because(Code.BATTERY, said=said)
-            yield _Finding("battery", problem, now_ns, FLAG_PERSIST_NS)
+            yield _Finding("battery", status.battery_problem, now_ns, FLAG_PERSIST_NS)
         if limits.landing:
             if status.is_landed is None:
                 self._ignore("landing", "the vehicle does not say whether it is in the air")

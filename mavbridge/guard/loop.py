@@ -1,24 +1,21 @@
 """The guard with its two edges, the link to the vehicle and the channel to the flight process."""
 
 import traceback
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Sequence
 from contextlib import suppress
 from dataclasses import fields
 from functools import partial
 from operator import attrgetter
 from pathlib import Path
-from typing import Protocol, TypeVar
+from typing import TypeVar
 
 from mavbridge.core.clock import NS_PER_MS, NS_PER_S, Clock
 from mavbridge.core.reasons import Code, Reason, because
 from mavbridge.core.vehicle import (
     Action,
-    ActionMeaning,
     Command,
-    Decision,
     LinkSnapshot,
     Outlet,
-    Output,
     VehicleStatus,
 )
 from mavbridge.guard.channel import Port
@@ -32,12 +29,12 @@ from mavbridge.guard.wire import (
     GuardTick,
     LastWords,
     NoChunk,
+    Packets,
     decode_to_guard,
     encode_from_guard,
-    encode_packets,
     encode_samples,
-    encode_tick,
 )
+from mavbridge.mavlink.link import MavlinkLink
 
 IDLE_PERIOD_NS = 10 * NS_PER_MS
 """Between two looks at the link before a policy is loaded."""
@@ -58,77 +55,13 @@ _LINK, _STATUS = (
 """Everything that a step of the guard may answer to, but for the motion of the vehicle."""
 
 
-class GuardLink(Protocol):
-    """The part of ``mavlink.link.MavlinkLink`` that the loop uses."""
-
-    is_engaged: bool
-
-    @property
-    def autopilot(self) -> str:
-        """Autopilot and version."""
-
-    @property
-    def is_release_owed(self) -> bool:
-        """A release could not be sent yet."""
-
-    @property
-    def is_restored(self) -> bool:
-        """Every parameter that was set for the flight has its old value."""
-
-    def begin_restore(self) -> None:
-        """Put parameters back; ``service`` does it."""
-
-    def poll(self) -> LinkSnapshot:
-        """Receive everything that has arrived; never blocks."""
-
-    def service(self) -> None:
-        """Send what is due besides sticks; called after them."""
-
-    def send_before_action(self) -> None:
-        """Send what should reach the vehicle before the next action."""
-
-    def begin_flight(self, meaning: ActionMeaning, output: Output | None) -> None:
-        """Choose the message that carries such actions; raises PeerError where none can."""
-
-    def watch_home_height(self) -> None:
-        """Keep the height above home coming."""
-
-    def send(self, decision: Decision, decided_ns: int) -> Action | None:
-        """Send what was decided for that moment; returns the action as rounded and sent, or None
-        when it released."""
-
-    def set_mode(self, mode: str) -> None:
-        """Ask for a flight mode."""
-
-    def arm(self) -> None:
-        """Ask to arm."""
-
-    def takeoff(self, height_m: float) -> None:
-        """Ask the autopilot to climb to this height above the ground by its own means."""
-
-    def announce(self, text: str) -> None:
-        """Tell every ground station."""
-
-    @property
-    def outlet(self) -> Outlet:
-        """Where packets to the vehicle leave now."""
-
-    def rehearse(
-        self, plan: Iterable[tuple[int, Decision | None, str | None]]
-    ) -> tuple[tuple[int, bytes], ...]:
-        """Encode decisions and requests for a mode, for another process to send."""
-
-    def transmit(self, packet: bytes) -> bool:
-        """Send a packet of ``rehearse`` now."""
-
-
 class GuardLoop:
     """One pass at every wake: receive, decide, send, report. Used by one thread."""
 
     def __init__(
         self,
         clock: Clock,
-        link: GuardLink,
+        link: MavlinkLink,
         flight: Port,
         *,
         samples: Port | None = None,
@@ -142,7 +75,7 @@ class GuardLoop:
             link: the vehicle.
             flight: the flight process.
             samples: takes the vehicle's readings; None: they go with the other messages.
-            received: messages of it that have come before.
+            received: messages of the flight process that have come before.
             lead_ns: how long before a slot its work begins; the sticks wait for the slot itself.
         """
         self._received = list(received)
@@ -300,22 +233,22 @@ class GuardLoop:
 
     def _follow(self, output: GuardOutput) -> None:
         """Send the requests, and show the messages."""
+        commands = self._link.commands
         if output.mode is not None:
-            self._attempt(partial(self._link.set_mode, output.mode))
+            self._attempt(partial(commands.set_mode, output.mode))
         if output.arm:
-            self._link.arm()
+            commands.arm()
         if output.takeoff_m is not None:
-            self._attempt(partial(self._link.takeoff, output.takeoff_m))
+            self._attempt(partial(commands.takeoff, output.takeoff_m))
         for text in output.messages:
             self._flight.send(encode_from_guard(GuardMessage(text)))
 
     def _finish(self, now_ns: int) -> None:
         """Put the vehicle's parameters back, and send what is owed, for a bounded time."""
-        self._link.begin_restore()
         if self._finish_until_ns is None:
             self._finish_until_ns = now_ns + FINISH_NS
         was_clean = self._is_clean
-        self._is_clean = self._link.is_restored and not self._link.is_release_owed
+        self._is_clean = self._link.restore() and not self._link.is_release_owed
         # One pass more: it passes on what the link says about the parameters.
         self.is_done = (was_clean and self._is_clean) or now_ns >= self._finish_until_ns
 
@@ -325,7 +258,7 @@ class GuardLoop:
         if snapshot.samples and self._guard is not None:
             self._samples.send(encode_samples(snapshot.samples))
         if snapshot.packets and self._guard is not None:
-            self._flight.send(encode_packets(snapshot.packets))
+            self._flight.send(encode_from_guard(Packets(snapshot.packets)))
         vehicle = snapshot.status
         if vehicle is not self._vehicle or self._status is None or snapshot.texts:
             self._vehicle = vehicle
@@ -361,10 +294,12 @@ class GuardLoop:
                     pass
                 case FlightSettings() as settings if self._guard is None:
                     self._guard = Guard(settings, self._clock.now_ns())
-                    self._link.begin_flight(settings.meaning, settings.output)
                     self._watches_position = settings.watches_position
-                    if settings.watches_home_height:
-                        self._link.watch_home_height()
+                    self._link.begin_flight(
+                        settings.meaning,
+                        settings.output,
+                        watches_home_height=settings.watches_home_height,
+                    )
                 case EndRequest() as ending:
                     self.stop(ending)
                 case "engage" | "release" as new:
@@ -402,7 +337,7 @@ class GuardLoop:
             reason=output.reason,
             starting_ns=output.starting_ns,
         )
-        self._flight.send(encode_tick(tick))
+        self._flight.send(encode_from_guard(tick))
 
     def _change_phase(self, output: GuardOutput) -> None:
         """Tell everybody who holds the sticks now."""

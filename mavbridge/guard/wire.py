@@ -1,25 +1,23 @@
 """Messages between the flight process and the guard, as bytes.
 
-Little-endian structures where they come at the rates of the loops, JSON where they come seldom, and
-one pickle: the settings, from the parent process that has started the guard.
+Little-endian structures where they come at the rates of the loops, else pickles: one process has
+started the other, and nobody else has an end of the channel.
 """
 
-import json
 import pickle
 import struct
 from collections.abc import Iterable, Iterator
-from dataclasses import asdict, dataclass, replace
-from typing import Literal, NamedTuple, TypeAlias
+from dataclasses import dataclass
+from typing import Any, Literal, NamedTuple, TypeAlias, get_args
 
-from mavbridge.core.address import SocketAddress, socket_address
-from mavbridge.core.reasons import Reason, reason_from_json, reason_to_json
+from mavbridge.core.address import SocketAddress
+from mavbridge.core.reasons import Reason
 from mavbridge.core.vehicle import (
     ACTION_CLASSES,
     Action,
     ActionTrace,
     ForwardedPacket,
     LinkStats,
-    Percentiles,
     Reading,
     Sample,
     Sticks,
@@ -31,7 +29,6 @@ from mavbridge.guard.values import EndRequest, OperatorCommand, Outcome, Phase
 
 _CHUNK = struct.Struct("<cBqqqqqqqqH")
 _TICK = struct.Struct("<cqqqqqqqB?iBBB20d")
-_PACKET = struct.Struct("<qqH")
 _QUANTITIES = Telemetry._fields
 _SAMPLES = tuple(struct.Struct(f"<Bqq{count}d") for count in (4, 3, 3, 3, 3, 1))
 """By quantity: its number, arrival, delay, and the values."""
@@ -39,6 +36,7 @@ _PHASES = tuple(Phase)
 _CLASSES = tuple(ACTION_CLASSES.values())
 _IS_SLOT, _IS_COASTING, _HAS_TRACE, _HAS_SENT = 1, 2, 4, 8
 _NOTHING = (0.0,) * 4
+_PICKLE = b"S"
 _MALFORMED = (
     *(struct.error, pickle.UnpicklingError, EOFError),
     *(ValueError, TypeError, LookupError, AttributeError),
@@ -160,57 +158,58 @@ FromGuard: TypeAlias = (
     | GuardSummary
 )
 
+_TO_GUARD = (GuardSettings, FlightSettings, NoChunk, str, EndRequest)
+
 
 def encode_to_guard(message: ToGuard) -> bytes:
     """One message of the flight process."""
-    match message:
-        case Chunk():
-            stamps = (*message[:7], message.reset_ns)
-            count = len(message.actions)
-            values = [value for action in message.actions for value in action]
-            kind = _class_index(message.actions[0]) if count else 0
-            return _CHUNK.pack(b"C", kind, *stamps, count) + struct.pack(f"<{4 * count}d", *values)
-        case NoChunk(reason):
-            return b"N" + _encode_reason(reason)
-        case GuardSettings() | FlightSettings():
-            return b"S" + pickle.dumps(message)
-        case EndRequest(reason=reason, is_fault=is_fault, end=end):
-            return b"E" + json.dumps([is_fault, end]).encode() + b"\n" + _encode_reason(reason)
-        case "engage" | "release":
-            return b"A" + message.encode()
+    if not isinstance(message, Chunk):
+        return _PICKLE + pickle.dumps(message)
+    stamps = (*message[:7], message.reset_ns)
+    count = len(message.actions)
+    values = [value for action in message.actions for value in action]
+    kind = _CLASSES.index(type(message.actions[0])) if count else 0
+    return _CHUNK.pack(b"C", kind, *stamps, count) + struct.pack(f"<{4 * count}d", *values)
 
 
 def decode_to_guard(data: bytes) -> ToGuard:
     """Inverse of ``encode_to_guard``; raises ValueError for anything else."""
     try:
-        return _decode_to_guard(data)
+        message: ToGuard = _decode_chunk(data) if data[:1] == b"C" else _unpickled(data, _TO_GUARD)
     except _MALFORMED as error:
         raise ValueError(f"not a message to the guard: {data[:16]!r}") from error
+    return message
 
 
-def _decode_to_guard(data: bytes) -> ToGuard:
-    kind, rest = data[:1], data[1:]
-    match kind:
-        case b"C":
-            return _decode_chunk(data)
-        case b"N":
-            return NoChunk(_decode_reason(rest))
-        case b"S":
-            settings: GuardSettings | FlightSettings = pickle.loads(rest)  # noqa: S301 - our parent's
-            return settings
-        case b"E":
-            head, _, reason = rest.partition(b"\n")
-            is_fault, end = json.loads(head)
-            return EndRequest(reason=_decode_reason(reason), is_fault=is_fault, end=end)
-        case b"A" if rest == b"engage":
-            return "engage"
-        case b"A" if rest == b"release":
-            return "release"
-    raise ValueError("unknown kind")
+def encode_from_guard(message: FromGuard) -> bytes:
+    """One message of the guard."""
+    match message:
+        case GuardTick():
+            return _encode_tick(message)
+        case Samples(samples):
+            return encode_samples(samples)
+    return _PICKLE + pickle.dumps(message)
 
 
-def _class_index(action: Action) -> int:
-    return _CLASSES.index(type(action))
+def decode_from_guard(data: bytes) -> FromGuard:
+    """Any message of the guard; raises ValueError for anything else."""
+    try:
+        match data[:1]:
+            case b"T":
+                return _decode_tick(data)
+            case b"R":
+                return Samples(tuple(decode_samples(data)))
+        message: FromGuard = _unpickled(data, get_args(FromGuard))
+    except _MALFORMED as error:
+        raise ValueError(f"not a message of the guard: {data[:16]!r}") from error
+    return message
+
+
+def _unpickled(data: bytes, classes: tuple[type, ...]) -> Any:
+    message = pickle.loads(data[1:]) if data[:1] == _PICKLE else None  # noqa: S301 - see above
+    if not isinstance(message, classes):
+        raise ValueError("unknown kind")  # noqa: TRY004 - as everything else that is no message
+    return message
 
 
 def _decode_chunk(data: bytes) -> Chunk:
@@ -231,8 +230,7 @@ def _decode_chunk(data: bytes) -> Chunk:
     )
 
 
-def encode_tick(tick: GuardTick) -> bytes:
-    """One tick."""
+def _encode_tick(tick: GuardTick) -> bytes:
     flags = (
         _IS_SLOT * tick.is_slot
         | _IS_COASTING * tick.is_coasting
@@ -248,12 +246,12 @@ def encode_tick(tick: GuardTick) -> bytes:
         *(tick.index, tick.due_ns, tick.woke_ns, tick.decided_ns, tick.sent_ns, tick.starting_ns),
         *(0 if serial is None else serial, flags, serial is not None, tick.missed_slots),
         _PHASES.index(tick.phase),
-        0 if trace is None else _class_index(trace.raw),
-        0 if tick.sent is None else _class_index(tick.sent),
+        0 if trace is None else _CLASSES.index(type(trace.raw)),
+        0 if tick.sent is None else _CLASSES.index(type(tick.sent)),
         *stages,
         *(tick.sent or _NOTHING),
     )
-    return packed if tick.reason is None else packed + _encode_reason(tick.reason)
+    return packed if tick.reason is None else packed + pickle.dumps(tick.reason)
 
 
 def _decode_tick(data: bytes) -> GuardTick:
@@ -263,6 +261,9 @@ def _decode_tick(data: bytes) -> GuardTick:
     raw, clipped, slewed, smoothed = (_CLASSES[traced](*four) for four in fours[:4])
     trace = ActionTrace(raw=raw, clipped=clipped, slewed=slewed, smoothed=smoothed)
     sent = _CLASSES[sent_kind](*fours[4])
+    reason: Reason | None = None
+    if len(data) > _TICK.size:
+        reason = pickle.loads(data[_TICK.size :])  # noqa: S301 - see above
     return GuardTick(
         index=index,
         due_ns=due_ns,
@@ -277,7 +278,7 @@ def _decode_tick(data: bytes) -> GuardTick:
         trace=trace if flags & _HAS_TRACE else None,
         sent=sent if flags & _HAS_SENT else None,
         phase=_PHASES[phase],
-        reason=_decode_reason(data[_TICK.size :]) if len(data) > _TICK.size else None,
+        reason=reason,
     )
 
 
@@ -298,113 +299,3 @@ def decode_samples(data: bytes) -> Iterator[Sample]:
         number, arrived_ns, delay_ns, *values = layout.unpack_from(data, at)
         yield Sample(_QUANTITIES[number], Reading(arrived_ns, tuple(values), delay_ns))
         at += layout.size
-
-
-def encode_packets(packets: Iterable[ForwardedPacket]) -> bytes:
-    """Packets of the vehicle, in order of arrival."""
-    parts = [b"P"]
-    for packet in packets:
-        parts += (
-            _PACKET.pack(packet.arrived_ns, packet.happened_ns, len(packet.data)),
-            packet.data,
-        )
-    return b"".join(parts)
-
-
-def _decode_packets(data: bytes) -> Iterator[ForwardedPacket]:
-    at = 1
-    while at < len(data):
-        arrived_ns, happened_ns, length = _PACKET.unpack_from(data, at)
-        at += _PACKET.size
-        if at + length > len(data):
-            raise ValueError(f"a packet of {length} bytes is cut off")
-        yield ForwardedPacket(arrived_ns, happened_ns, data[at : at + length])
-        at += length
-
-
-def encode_from_guard(
-    message: GuardStatus | GuardMessage | LastWords | GuardError | GuardSummary,
-) -> bytes:
-    """One message of the guard that comes seldom."""
-    match message:
-        case GuardStatus():
-            return b"V" + json.dumps(message).encode()
-        case GuardMessage():
-            return b"M" + json.dumps(message).encode()
-        case LastWords(phase, _, _, _, packets):
-            texts = [(after_ns, packet.hex()) for after_ns, packet in packets]
-            words = message._replace(phase=phase.value, packets=texts)  # type: ignore[arg-type]
-            return b"W" + json.dumps(words).encode()
-        case GuardError():
-            return b"X" + json.dumps(message).encode()
-        case GuardSummary():
-            fault = message.outcome.fault
-            document = asdict(replace(message, failure=None)) | {
-                "outcome": message.outcome._replace(fault=None),
-                "reasons": [each and reason_to_json(each) for each in (message.failure, fault)],
-            }
-            return b"Z" + json.dumps(document).encode()
-
-
-def decode_from_guard(data: bytes) -> FromGuard:
-    """Any message of the guard; raises ValueError for anything else."""
-    try:
-        return _decode_from_guard(data)
-    except _MALFORMED as error:
-        raise ValueError(f"not a message of the guard: {data[:16]!r}") from error
-
-
-def _decode_from_guard(data: bytes) -> FromGuard:
-    match data[:1]:
-        case b"T":
-            return _decode_tick(data)
-        case b"P":
-            return Packets(tuple(_decode_packets(data)))
-        case b"R":
-            return Samples(tuple(decode_samples(data)))
-        case b"V":
-            autopilot, mode, armed, is_landed, channels_us, sticks, has_position = json.loads(
-                data[1:]
-            )
-            rc_sticks = None if sticks is None else Sticks(*sticks)
-            channels = tuple(channels_us)
-            return GuardStatus(autopilot, mode, armed, is_landed, channels, rc_sticks, has_position)
-        case b"M":
-            return GuardMessage(*json.loads(data[1:]))
-        case b"W":
-            phase, mode, receiver, brings_file, texts = json.loads(data[1:])
-            packets = tuple((int(after_ns), bytes.fromhex(text)) for after_ns, text in texts)
-            address = None if receiver is None else socket_address(*receiver)
-            return LastWords(Phase(phase), mode, address, bool(brings_file), packets)
-        case b"X":
-            return GuardError(*json.loads(data[1:]))
-        case b"Z":
-            return _summary(json.loads(data[1:]))
-    raise ValueError("unknown kind")
-
-
-def _summary(document: dict[str, object]) -> GuardSummary:
-    link = dict(document.pop("link"))  # type: ignore[call-overload]
-    rtt = link.pop("rtt_ms")
-    rates, saturated = (
-        tuple((name, number) for name, number in link.pop(key))
-        for key in ("messages_per_s", "saturated")
-    )
-    stats = LinkStats(
-        **link,
-        messages_per_s=rates,
-        saturated=saturated,
-        rtt_ms=None if rtt is None else Percentiles(**rtt),
-    )
-    failure, fault = (each and reason_from_json(each) for each in document.pop("reasons"))  # type: ignore[attr-defined]
-    outcome = Outcome(*document.pop("outcome"))._replace(fault=fault)  # type: ignore[misc]
-    document["failure"] = failure
-    return GuardSummary(**document, link=stats, outcome=outcome)  # type: ignore[arg-type]
-
-
-def _encode_reason(reason: Reason) -> bytes:
-    return json.dumps(reason_to_json(reason, has_words=False)).encode()
-
-
-def _decode_reason(data: bytes) -> Reason:
-    return reason_from_json(json.loads(data))

@@ -1,7 +1,6 @@
 """The vehicle as the guard sees it. One thread owns socket and codec."""
 
 from collections.abc import Iterable, Mapping
-from contextlib import suppress
 from dataclasses import replace
 
 from pymavlink.dialects.v20 import ardupilotmega as dialect
@@ -25,20 +24,19 @@ from mavbridge.core.vehicle import (
     Sample,
 )
 from mavbridge.mavlink.codec.messages import (
-    Altitude,
     Attitude,
     CommandAck,
     CommandRequest,
     Heartbeat,
     LocalVelocity,
+    Measurement,
     ReceivedMessage,
-    SpecificForce,
     Timesync,
 )
-from mavbridge.mavlink.codec.packets import Codec, CommandRefusedError
+from mavbridge.mavlink.codec.packets import Codec
 from mavbridge.mavlink.codec.signing import Signing
 from mavbridge.mavlink.outputs.sender import ActionSender
-from mavbridge.mavlink.session.commands import ModeAndArm, mode_request
+from mavbridge.mavlink.session.commands import VehicleCommands
 from mavbridge.mavlink.session.discovery import (
     DuplicateSystems,
     Hearing,
@@ -55,10 +53,7 @@ from mavbridge.mavlink.transport.sockets import Address, Transport
 SOURCE_COMPONENT = dialect.MAV_COMP_ID_ONBOARD_COMPUTER
 _EARLY_REQUEST_NS = 20 * NS_PER_MS
 """Two periods of the usual sticks: a request leaves before one of them, never after."""
-_MOVED_NS, _MOVED_STAMPS = 250 * NS_PER_MS, 3
-"""Silence of the engaged vehicle, and stamps of its clock in a row that come from elsewhere."""
 _HEARTBEAT_HZ = 1.0
-"""MAVLink heartbeat protocol; autopilots time a peer out after several seconds."""
 
 
 class MavlinkLink:
@@ -67,8 +62,8 @@ class MavlinkLink:
     Problems of the transport are never raised once it has been opened: they stand in the snapshot,
     and it is opened again once a second.
 
-    Raises from ``service`` and ``begin_flight``:
-        PeerError: no vehicle within the timeout, two vehicles, or one that cannot be flown.
+    ``service`` and ``begin_flight`` raise PeerError: no vehicle within the timeout, two of them, or
+    one that cannot be flown.
     """
 
     def __init__(
@@ -82,9 +77,7 @@ class MavlinkLink:
         signing: Signing | None = None,
     ) -> None:
         """``keeps_packets``: each snapshot holds the vehicle's packets, for a recorder."""
-        self._clock = clock
-        self._config = config
-        self._keeps_packets = keeps_packets
+        self._clock, self._config, self._keeps_packets = clock, config, keeps_packets
         self._packets: list[ForwardedPacket] = []
         self._samples: list[Sample] = []
         self._codec = Codec(
@@ -93,39 +86,37 @@ class MavlinkLink:
             signing=signing,
         )
         self._connection = Connection(transport, self._codec, clock, packet_log)
+        self._report = self._connection.texts.append
+        self.fileno, self.close = self._connection.fileno, self._connection.close
+        """To wake up on arrivals, and to free the socket or port."""
+        self.transmit = self._connection.send
+        """For the packets of ``rehearse``."""
         self._discovery = VehicleDiscovery(target_system=config.target_system)
         self._counters = LinkCounters()
-        self._timesync = TimesyncFilter()
-        self._has_told_pace = False
+        self._timesync = TimesyncFilter(self._report)
         self._telemetry = TelemetryCollector()
-        self._commands = ModeAndArm()
+        self.commands = VehicleCommands(self._command, self._report, clock)
         self._sender = ActionSender(self._connection, self._codec, clock)
         self.is_engaged = False
         """We hold the vehicle's sticks, or are giving them back: no other address is followed."""
         self._started_ns = self._heartbeat_due_ns = clock.now_ns()
-        self._vehicle: VehicleSession | None = None
+        self.vehicle: VehicleSession | None = None
+        """The present session, to look at; None before the vehicle is found."""
         self._old_params: dict[str, float] = {}
         self._watches_home_height = False
         self._interruption: Reason | None = None
         self._interruptions = 0
-        self._moved_stamps = 0
         self._duplicate_systems = DuplicateSystems()
-
-    def fileno(self) -> int | None:
-        """Descriptor for ``select`` to wake up on arrivals; None while the transport is closed."""
-        return self._connection.fileno()
-
-    # --- receiving
 
     def poll(self) -> LinkSnapshot:
         """Receive everything that has arrived; never blocks. All other work is in ``service``."""
         self._receive_all()
-        if self._vehicle is not None and self._vehicle.has_rebooted:
+        if self.vehicle is not None and self.vehicle.has_rebooted:
             self._interrupt(because(Code.REBOOTED))
-            self._adopt(self._vehicle.identity)
+            self._adopt(self.vehicle.identity)
         now_ns = self._clock.now_ns()
         texts = self._connection.take_texts()
-        vehicle, output = self._vehicle, self._sender.output
+        vehicle, output = self.vehicle, self._sender.output
         status = vehicle.status(now_ns) if vehicle else None
         modes = vehicle.profile.modes.roles if vehicle else ModeRoles()
         problem = self._problem(now_ns)
@@ -141,7 +132,6 @@ class MavlinkLink:
                 interruption=self._interruption,
                 interruptions=self._interruptions,
                 modes=modes,
-                refused_mode=self._commands.refused_mode,
                 texts=texts,
             )
         # A vehicle that gets nothing from us rightly follows somebody else.
@@ -161,7 +151,7 @@ class MavlinkLink:
             interruption=self._interruption,
             interruptions=self._interruptions,
             modes=modes if output.is_sticks else replace(modes, is_silence_failsafe=False),
-            refused_mode=self._commands.refused_mode,
+            refused_mode=self.commands.refused_mode,
             texts=(*texts, *output.take_notes()),
         )
 
@@ -169,7 +159,7 @@ class MavlinkLink:
         """Why this vehicle cannot be flown now, whatever its echo shows, or None."""
         if self._connection.is_down:
             return because(Code.CONNECTION_LOST)
-        if (vehicle := self._vehicle) is None:
+        if (vehicle := self.vehicle) is None:
             return because(Code.NO_HEARTBEAT)
         if (problem := vehicle.problem(now_ns)) is not None:
             if (slow := self._timesync.slow_clock) is not None:
@@ -181,37 +171,32 @@ class MavlinkLink:
         return vehicle.output_problem(now_ns) or self._timesync.late_sending
 
     def _receive_all(self) -> None:
-        vehicle = self._vehicle
+        vehicle = self.vehicle
         for message, arrived_ns, sender in self._connection.receive():
-            if isinstance(message.body, Heartbeat):
-                self._discovery.receive(message.source, message.body, sender, arrived_ns)
+            body = message.body
+            if isinstance(body, Heartbeat):
+                self._discovery.receive(message.source, body, sender, arrived_ns)
             if vehicle is None or message.source != vehicle.identity.source:
                 continue
-            if sender != vehicle.identity.address and not self._is_moved(
-                vehicle, message.body, sender, arrived_ns
+            if sender == vehicle.identity.address or (
+                isinstance(body, Attitude) and self._is_moved(vehicle, body, sender, arrived_ns)
             ):
-                if isinstance(message.body, Heartbeat):
-                    self._notice_other(vehicle.identity, sender, arrived_ns)
-                continue
-            self._receive(vehicle, message, arrived_ns)
+                self._receive(vehicle, message, arrived_ns)
+            elif isinstance(body, Heartbeat):
+                self._notice_other(vehicle.identity, sender, arrived_ns)
 
     def _is_moved(
-        self, vehicle: VehicleSession, body: object, sender: Address | None, arrived_ns: int
+        self, vehicle: VehicleSession, body: Attitude, sender: Address | None, arrived_ns: int
     ) -> bool:
         """Whether the engaged vehicle now sends from here: silent elsewhere, its clock goes on.
 
         It is followed so that neutral sticks, the safe mode and the release reach it.
         """
-        heard_ns = self._counters.heard_ns
-        is_beside = self._duplicate_systems.is_beside(sender, heard_ns)
-        if not self.is_engaged or is_beside or not isinstance(body, Attitude):
+        is_same_clock = self._timesync.is_same_clock(body.boot_us, arrived_ns)
+        if not self.is_engaged or not self._duplicate_systems.has_moved(
+            sender, arrived_ns, self._counters.heard_ns, is_same_clock=is_same_clock
+        ):
             return False
-        is_silent = arrived_ns - heard_ns > _MOVED_NS
-        is_same = is_silent and self._timesync.is_same_clock(body.boot_us, arrived_ns)
-        self._moved_stamps = self._moved_stamps + 1 if is_same else 0
-        if self._moved_stamps < _MOVED_STAMPS:
-            return False
-        self._moved_stamps = 0
         before, vehicle.identity = vehicle.identity, replace(vehicle.identity, address=sender)
         self._connection.peer = sender
         reason = because(Code.MOVED, before=before.place, now=vehicle.identity.place)
@@ -226,45 +211,37 @@ class MavlinkLink:
             case LocalVelocity() if not vehicle.condition.is_velocity_usable(arrived_ns):
                 vehicle.receive(message, arrived_ns)
                 return  # the estimator says that it has none: nobody takes it for one
-            case Attitude() | LocalVelocity() | SpecificForce() | Altitude() as body:
+            case body if isinstance(body, Measurement):
                 happened_ns = self._timesync.happened_ns(body.boot_us, arrived_ns)
                 self._samples += self._telemetry.receive(body, arrived_ns, happened_ns)
             case Timesync() as reply:
                 self._timesync.receive(reply, arrived_ns)
-                self._tell_pace()
             case CommandAck() as ack:
                 is_for_us = ack.target in ((0, 0), self._codec.source)
-                if is_for_us and (refusal := self._commands.receive(ack)) is not None:
-                    self._report(refusal)
+                if is_for_us:
+                    self.commands.receive(ack)
         if is_for_us:
-            before = vehicle.param_interruption
+            before = vehicle.params.interruption
             if (output := self._sender.output) is not None:
                 output.receive(message.body, vehicle, arrived_ns)
             vehicle.receive(message, arrived_ns)
-            if (changed := vehicle.param_interruption) is not None and changed is not before:
+            if (changed := vehicle.params.interruption) is not None and changed is not before:
                 self._interrupt(changed)
         if self._keeps_packets:
             self._packets.append(ForwardedPacket(arrived_ns, happened_ns, message.packet))
 
-    def _tell_pace(self) -> None:
-        slow = None if self._has_told_pace else self._timesync.slow_clock
-        if slow is not None:
-            self._has_told_pace = True
-            self._report(slow)
-
     def _notice_other(self, identity: VehicleIdentity, sender: Address | None, now_ns: int) -> None:
         """Another address uses the vehicle's system id: its packets are ignored while we fly."""
         heard_ns = self._counters.heard_ns if self.is_engaged else now_ns
-        text, has_replaced = self._duplicate_systems.notice(identity, sender, now_ns, heard_ns)
-        if text is not None and has_replaced:
-            self._interrupt(because(Code.REPLACED, said=text))
-        elif text is not None:
-            self._report(text)
+        told = self._duplicate_systems.notice(identity, sender, now_ns, heard_ns)
+        if isinstance(told, str):
+            self._report(told)
+        elif told is not None:
+            self._interrupt(told)
 
     def _interrupt(self, reason: Reason) -> None:
         """Note why every engagement so far is over."""
-        self._interruptions += 1
-        self._interruption = reason
+        self._interruption, self._interruptions = reason, self._interruptions + 1
         self._report(str(reason))
 
     def stats(self) -> LinkStats:
@@ -281,9 +258,8 @@ class MavlinkLink:
     @property
     def autopilot(self) -> str:
         """Autopilot and version, for the report."""
-        if self._vehicle is None:
-            return "none"
-        return f"{self._vehicle.profile.name} {self._vehicle.version or ''}".strip()
+        vehicle = self.vehicle
+        return f"{vehicle.profile.name} {vehicle.version or ''}".strip() if vehicle else "none"
 
     @property
     def is_release_owed(self) -> bool:
@@ -296,56 +272,41 @@ class MavlinkLink:
         self._timesync.round_trips = Histogram()
 
     @property
-    def vehicle(self) -> VehicleSession | None:
-        """The present session, to look at; None before the vehicle is found."""
-        return self._vehicle
-
-    # --- the vehicle's parameters
-
-    @property
     def known_params(self) -> Mapping[str, float]:
         """The vehicle's parameters that matter for a flight, by name, for the report."""
-        return {} if self._vehicle is None else self._vehicle.known_params
+        return {} if self.vehicle is None else self.vehicle.params.values
 
-    def begin_restore(self) -> None:
-        """Let ``service`` put back what was set for the flight; may be called at every tick."""
-        if self._vehicle is not None:
-            self._vehicle.begin_restore()
-
-    @property
-    def is_restored(self) -> bool:
-        """Nothing is left to put back, or no more can be done; true some 3 s later at the latest,
-        if the vehicle is still heard."""
-        return self._vehicle is None or self._vehicle.is_restored
-
-    # --- finding and keeping the vehicle
+    def restore(self) -> bool:
+        """Let ``service`` put back what was set for the flight; called at every tick until True:
+        nothing is left to put back, or no more can be done, which takes some 3 s at most."""
+        return self.vehicle is None or self.vehicle.params.restore()
 
     def service(self) -> None:
         """Find or follow the vehicle and send due requests; called after the sticks are sent."""
         now_ns = self._clock.now_ns()
-        if self._vehicle is None:
+        if self.vehicle is None:
             self._find_vehicle(now_ns)
         elif not self.is_engaged:
-            self._follow_vehicle(self._vehicle.identity, now_ns)
+            here = self.vehicle.identity
+            if (moved := self._discovery.moved(here, now_ns)) is not None:
+                self._interrupt(because(Code.MOVED_AT_REST, before=here.place, now=moved.place))
+                self._adopt(moved)
         if self._sender.is_release_owed and not self._sender.try_release():
             return
         if now_ns >= self._heartbeat_due_ns:
             self._heartbeat_due_ns = now_ns + period_ns(_HEARTBEAT_HZ)
-            kind = self._vehicle.profile.heartbeat_type if self._vehicle else None
+            kind = self.vehicle.profile.heartbeat_type if self.vehicle else None
             self._connection.send(self._codec.encode_heartbeat(kind))
-        if (vehicle := self._vehicle) is None:
+        if (vehicle := self.vehicle) is None:
             return
         for request in vehicle.step(now_ns):
             self._connection.send(self._codec.encode_request(vehicle.identity.source, request))
         self._request_time(now_ns)
 
     def send_before_action(self) -> None:
-        """Send a TIMESYNC request that is due soon; called just before an action is sent.
-
-        Where actions fill a queue that drops what does not fit, the place that has become free
-        since the last action goes to the packet that comes first.
-        """
-        if self._vehicle is not None and not self._sender.is_release_owed:
+        """Send a TIMESYNC request that is due soon; called just before an action is sent, so that
+        actions which fill a queue do not take its place as well."""
+        if self.vehicle is not None and not self._sender.is_release_owed:
             self._request_time(self._clock.now_ns(), _EARLY_REQUEST_NS)
 
     def _request_time(self, now_ns: int, early_ns: int = 0) -> None:
@@ -356,27 +317,18 @@ class MavlinkLink:
         if (identity := self._discovery.choose(now_ns)) is not None:
             self._adopt(identity)
             return
-        timeout_s, waited_ns = self._config.connect_timeout_s, now_ns - self._started_ns
-        if not self._discovery.is_settling and waited_ns > timeout_s * NS_PER_S:
-            waited = f"no vehicle on {self._config.connect} after {timeout_s:g} s"
+        place, timeout_s = self._config.connect, self._config.connect_timeout_s
+        waited_s, heard = (now_ns - self._started_ns) / NS_PER_S, self._connection
+        if waited_s > timeout_s and not self._discovery.is_settling:
             hearing = Hearing(
-                address=parse_address(self._config.connect),
-                waited_s=waited_ns / NS_PER_S,
-                received_bytes=self._connection.received_bytes,
-                received_packets=self._connection.received_packets,
+                parse_address(place), waited_s, heard.received_bytes, heard.received_packets
             )
-            raise PeerError(f"{waited}: {self._discovery.describe(hearing)}")
-
-    def _follow_vehicle(self, identity: VehicleIdentity, now_ns: int) -> None:
-        if (moved := self._discovery.moved(identity, now_ns)) is not None:
-            places = f"{moved.place} instead of {identity.place}"
-            said = f"the vehicle now sends from {places}: its session starts over"
-            self._interrupt(because(Code.REPLACED, said=said))
-            self._adopt(moved)
+            why = self._discovery.describe(hearing)
+            raise PeerError(f"no vehicle on {place} after {timeout_s:g} s: {why}")
 
     def _adopt(self, identity: VehicleIdentity) -> None:
         """Start a new session: at first sight, after a reboot and after a change of address."""
-        self._vehicle = VehicleSession(
+        self.vehicle = VehicleSession(
             identity,
             self._config,
             old_params=self._old_params,
@@ -384,16 +336,18 @@ class MavlinkLink:
             has_slow_clock=lambda: self._timesync.slow_pace is not None,
         )
         if self._watches_home_height:
-            self._vehicle.watch_home_height()
-        self._sender.equip(self._vehicle)
+            self.vehicle.watch_home_height()
+        self._sender.equip(self.vehicle)
         self._telemetry = TelemetryCollector()
         self._timesync.restart()
-        self._commands = ModeAndArm()
+        self.commands.adopt(self.vehicle)
         self._counters.new_sequence()
         self._duplicate_systems = DuplicateSystems()
         self._connection.peer = identity.address
 
-    def begin_flight(self, meaning: ActionMeaning, output: Output | None) -> None:
+    def begin_flight(
+        self, meaning: ActionMeaning, output: Output | None, *, watches_home_height: bool = False
+    ) -> None:
         """Choose what carries the actions of the policy, now or once the vehicle is known; to be
         called before the first action.
 
@@ -402,83 +356,32 @@ class MavlinkLink:
         """
         self._telemetry = TelemetryCollector()
         self._sender.begin_flight(meaning, output)
-
-    def watch_home_height(self) -> None:
-        """Keep the height above home coming, now and from any vehicle that follows."""
-        self._watches_home_height = True
-        if self._vehicle is not None:
-            self._vehicle.watch_home_height()
-
-    def _report(self, text: str) -> None:
-        self._connection.texts.append(text)
-
-    def set_mode(self, mode: str) -> None:
-        """Request a flight mode, the same one at most every 50 ms.
-
-        Raises UserError if the vehicle has no mode of this name.
-        """
-        if (vehicle := self._vehicle) is not None:
-            numbers = vehicle.profile.modes.command(mode)
-            self._command(self._commands.set_mode(mode, numbers, self._clock.now_ns()))
-
-    def arm(self) -> None:
-        """Request arming, at most once a second."""
-        self._command(self._commands.arm(self._clock.now_ns()))
-
-    def takeoff(self, height_m: float) -> None:
-        """Ask the autopilot to climb to this height above the ground by its own means, at most once
-        a second."""
-        if (vehicle := self._vehicle) is None:
-            return
-        now_ns = self._clock.now_ns()
-        request = vehicle.profile.takeoff(height_m, vehicle.condition.amsl_m(now_ns))
-        if request is not None:
-            self._command(self._commands.takeoff(request, now_ns))
-        elif self._commands.is_time_to_explain(now_ns):
-            self._report("no takeoff yet: the vehicle does not tell its height above the sea")
+        self._watches_home_height = watches_home_height
+        if watches_home_height and self.vehicle is not None:
+            self.vehicle.watch_home_height()
 
     def rehearse(
         self, plan: Iterable[tuple[int, Decision | None, str | None]]
     ) -> tuple[tuple[int, bytes], ...]:
         """Encode decisions and requests for a mode, with their delays, for another process to send
-        if this one dies; nothing is sent or noted. One that the codec refuses is left out."""
-        if (vehicle := self._vehicle) is None or self._config.readonly:
-            return ()
-        packets: list[tuple[int, bytes | None]] = []
-        with self._codec.rehearsing():
-            for after_ns, decision, mode in plan:
-                with suppress(CommandRefusedError):
-                    if decision is not None:
-                        packets.append((after_ns, self._sender.rehearse(decision)))
-                if mode is not None:
-                    request = mode_request(vehicle.profile.modes.command(mode))
-                    packet = self._codec.encode_request(vehicle.identity.source, request)
-                    packets.append((after_ns, packet))
-        return tuple((after_ns, packet) for after_ns, packet in packets if packet is not None)
+        if this one dies; nothing is sent or noted."""
+        return () if self._config.readonly else tuple(self._sender.rehearse(plan))
 
     @property
     def outlet(self) -> Outlet:
         """Where packets to the vehicle leave now."""
         return self._connection.outlet
 
-    def transmit(self, packet: bytes) -> bool:
-        """Send a packet of ``rehearse`` now; False: it was not sent."""
-        return self._connection.send(packet)
+    def _command(self, request: CommandRequest) -> None:
+        if (vehicle := self.vehicle) is not None and not self._config.readonly:
+            self._sender.transmit(self._codec.encode_request(vehicle.identity.source, request))
 
-    def _command(self, request: CommandRequest | None) -> None:
-        if request is None or self._vehicle is None or self._config.readonly:
-            return
-        self._sender.transmit(self._codec.encode_request(self._vehicle.identity.source, request))
-
-    def announce(self, text: str, *, is_warning: bool = False) -> None:
+    def announce(self, text: str) -> None:
         """Send a STATUSTEXT, for a pilot who sees only a ground station; read-only, say nothing."""
         if self._config.readonly:
             return
-        severity = dialect.MAV_SEVERITY_WARNING if is_warning else dialect.MAV_SEVERITY_NOTICE
-        for packet in self._codec.encode_statustext(severity, text):
+        for packet in self._codec.encode_statustext(dialect.MAV_SEVERITY_NOTICE, text):
             self._sender.transmit(packet)
-
-    # --- actions
 
     def send(self, decision: Decision, decided_ns: int | None = None) -> Action | None:
         """Send an action or a release; returns the action as it was really sent, or None.
@@ -486,16 +389,10 @@ class MavlinkLink:
         ``decided_ns``: the moment that the action was decided for, by which it is made; None: now.
 
         Releases leave every 50 ms for as long as they are asked for and the output has any. One
-        that cannot be sent now is sent before anything else that can.
-
-        Raises:
-            CommandRefusedError: an action that this output must not send.
+        that cannot be sent now is sent before anything else that can. Raises CommandRefusedError
+        for an action that this output must not send.
         """
         action = None if self._config.readonly else self._sender.send(decision, decided_ns)
         if action is not None:
             self._counters.sent += 1
         return action
-
-    def close(self) -> None:
-        """Free the socket or port."""
-        self._connection.close()

@@ -3,7 +3,7 @@
 from collections import deque
 from collections.abc import Callable, Iterator
 
-from mavbridge.mavlink.transport.sockets import Address, Received
+from mavbridge.mavlink.transport.sockets import Address, Received, Transport
 from mavbridge.simulation.clock import SteppedClock
 
 VEHICLE: Address = ("sitl", 1)
@@ -47,8 +47,8 @@ class DelayedChannel:
         return self._in_flight[0][0] if self._in_flight else None
 
 
-class MemoryTransport:
-    """The bridge's end: a ``mavlink.transport.Transport`` whose arrival stamps are exact."""
+class MemoryTransport(Transport):
+    """The bridge's end, whose arrival stamps are exact."""
 
     def __init__(
         self, clock: SteppedClock, *, to_vehicle: DelayedChannel, from_vehicle: DelayedChannel
@@ -57,17 +57,10 @@ class MemoryTransport:
         self._to_vehicle = to_vehicle
         self._from_vehicle = from_vehicle
 
-    def open(self) -> None:
-        """Nothing to acquire."""
-
     def drain(self) -> Iterator[Received]:
         """Every datagram that has arrived."""
         for arrived_ns, data in self._from_vehicle.receive():
             yield Received(data, arrived_ns, VEHICLE)
-
-    def fileno(self) -> int | None:
-        """Nothing that ``select`` could wait for."""
-        return None
 
     def receiver(self, peer: Address | None) -> Address | None:
         """See ``Transport``."""
@@ -89,6 +82,3 @@ class MemoryTransport:
         """Send one packet; always succeeds."""
         self._to_vehicle.send(data)
         return True
-
-    def close(self) -> None:
-        """Nothing to free."""

@@ -112,6 +112,7 @@ class FakeLink:
         self.texts: list[str] = []
         self.is_engaged = False
         self.is_restored = True
+        self.commands = self
         self.autopilot = "fake 1.0"
         self.decisions: list[tuple[int, Decision]] = []
         self.requests: list[str] = []
@@ -181,7 +182,9 @@ class FakeLink:
     def send_before_action(self) -> None:
         pass
 
-    def begin_flight(self, meaning: ActionMeaning, output: Output | None) -> None:
+    def begin_flight(
+        self, meaning: ActionMeaning, output: Output | None, *, watches_home_height: bool = False
+    ) -> None:
         self.meaning = meaning
 
     def takeoff(self, height_m: float) -> None:
@@ -226,8 +229,9 @@ class FakeLink:
         self.transmitted.append((self._clock.now_ns(), packet.decode()))
         return True
 
-    def begin_restore(self) -> None:
+    def restore(self) -> bool:
         self.restores += 1
+        return self.is_restored
 
     def stats(self) -> LinkStats:
         return LinkStats(

@@ -15,8 +15,7 @@ from mavbridge.flight.plan import FlightPlan
 from mavbridge.mavlink.codec.calibration import RcChannel
 from mavbridge.mavlink.profiles.profile import ParamContext, ParamNote, Profile, StreamGroup
 from mavbridge.mavlink.profiles.sticks import IDENTITY, Half
-from mavbridge.mavlink.session.params.bandwidth import baud_danger
-from mavbridge.mavlink.session.params.checks import Assessment, assess
+from mavbridge.mavlink.session.params.checks import Assessment, assess, serial_dangers
 from mavbridge.mavlink.session.vehicle import VehicleSession
 from policy.contract import Contract
 
@@ -119,12 +118,12 @@ class Terms:
         if assessment.unusable is not None:
             unusable = because(Code.CALIBRATION_UNUSABLE, cause=assessment.unusable)
             yield JudgedNote("no-go", ParamNote((), str(unusable)))
-        serial = baud_danger(
+        serial = serial_dangers(
             serial_baud(self.settings.connect),
             streams=self.streams,
             stick_hz=self.settings.stick_hz,
         )
-        for danger in (*([serial] if serial else []), *assessment.dangers):
+        for danger in (*serial, *assessment.dangers):
             if danger.risk in self.config.link.accept_risk:
                 yield JudgedNote("warn", danger.accepted)
             else:

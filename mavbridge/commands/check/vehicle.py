@@ -43,7 +43,7 @@ def vehicle_rows(
         yield _receiver_row(status)
         yield _position_row(status)
         if status.battery_problem is not None:
-            yield _row("battery", "low", "charged", "no-go", status.battery_problem)
+            yield _row("battery", "low", "charged", "no-go", str(status.battery_problem))
     if (is_ready := vehicle.condition.is_ready_to_arm) is not None:
         yield _arming_row(is_ready=is_ready)
     if vehicle.switch_problem is not None:

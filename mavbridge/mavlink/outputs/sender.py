@@ -1,13 +1,67 @@
-"""Sends actions and releases through the output of the flight."""
+"""Chooses the output of the flight, and sends actions and releases through it."""
 
-from mavbridge.core.clock import Clock
-from mavbridge.core.vehicle import Action, ActionMeaning, Decision, Output, Release
-from mavbridge.mavlink.codec.packets import Codec
-from mavbridge.mavlink.outputs.choice import choose_output
+from collections.abc import Iterable, Iterator
+from contextlib import suppress
+
+from mavbridge.core.clock import NS_PER_MS, Clock
+from mavbridge.core.errors import PeerError
+from mavbridge.core.vehicle import (
+    Action,
+    ActionKind,
+    ActionMeaning,
+    Command,
+    Decision,
+    Output,
+    Release,
+)
+from mavbridge.mavlink.codec.packets import Codec, CommandRefusedError
+from mavbridge.mavlink.outputs.attitude import AttitudeOutput
+from mavbridge.mavlink.outputs.manual_control import ManualControlOutput
 from mavbridge.mavlink.outputs.output import ActionOutput
-from mavbridge.mavlink.outputs.release import ReleasePlan
+from mavbridge.mavlink.outputs.override import OverrideOutput
+from mavbridge.mavlink.outputs.velocity import VelocityOutput
+from mavbridge.mavlink.profiles.profile import Profile
+from mavbridge.mavlink.session.commands import mode_request
 from mavbridge.mavlink.session.vehicle import VehicleSession
 from mavbridge.mavlink.transport.connection import Connection
+
+RELEASE_SPACING_NS = 50 * NS_PER_MS
+CARRIED: dict[Output, ActionKind] = {
+    "rc-override": "sticks",
+    "manual-control": "sticks",
+    "attitude": "attitude",
+    "rates": "rates",
+    "velocity": "velocity",
+}
+"""Kind of action that each output carries."""
+
+
+def choose_output(
+    meaning: ActionMeaning, wanted: Output | None, profile: Profile, codec: Codec
+) -> ActionOutput:
+    """The output that was asked for, or the usual one of such actions and this vehicle.
+
+    Raises:
+        PeerError: this vehicle, or such actions, cannot be flown with it.
+    """
+    usual = profile.outputs[meaning.kind]
+    name = wanted or usual
+    if CARRIED[name] != meaning.kind:
+        raise PeerError(
+            f"--output {name} carries {CARRIED[name]}, and the actions of this policy are "
+            f"{meaning.kind}: use --output auto, which is {usual} here"
+        )
+    if (refusal := profile.refusals.get(name)) is not None:
+        raise PeerError(refusal)
+    match name:
+        case "rc-override":
+            return OverrideOutput(codec, meaning.stick_gains)
+        case "manual-control":
+            return ManualControlOutput(codec, meaning.stick_gains)
+        case "velocity":
+            return VelocityOutput(codec, meaning)
+        case "attitude" | "rates":
+            return AttitudeOutput(codec, meaning, profile, name)
 
 
 class ActionSender:
@@ -21,7 +75,10 @@ class ActionSender:
         self._flight: tuple[ActionMeaning, Output | None] | None = None
         """The policy's actions, and the output that was asked for; None = no policy is loaded."""
         self._vehicle: VehicleSession | None = None
-        self._release = ReleasePlan()
+        self._releases_left = self._release_due_ns = 0
+        """Those that may follow the last action, and when the next one is due."""
+        self.is_release_owed = False
+        """A release could not be sent: ``try_release`` before everything else."""
         self.output: ActionOutput | None = None
         """None until both are known."""
 
@@ -46,11 +103,6 @@ class ActionSender:
         if self.output is not None:
             vehicle.use_output(self.output.name)
 
-    @property
-    def is_release_owed(self) -> bool:
-        """A release could not be sent: ``try_release`` before everything else."""
-        return self._release.is_owed
-
     def send(self, decision: Decision, decided_ns: int | None = None) -> Action | None:
         """Send an action or a release; returns the action as it was really sent, or None.
 
@@ -65,14 +117,15 @@ class ActionSender:
         if isinstance(decision, Release):
             self._level(output, vehicle)
             output.released()
-            if self._release.is_due(self._clock.now_ns()):
+            if self._releases_left > 0 and self._clock.now_ns() >= self._release_due_ns:
                 self.try_release()
             return None
         made_ns = self._clock.now_ns() if decided_ns is None else decided_ns
         encoded = output.encode(decision.action, vehicle, made_ns)
-        if encoded is None or (self._release.is_owed and not self.try_release()):
+        if encoded is None or (self.is_release_owed and not self.try_release()):
             return None
-        self._release.acted(output.releases)
+        # Before the send, which may leave whatever it says.
+        self._releases_left, self._release_due_ns = output.releases, 0
         if not self._connection.send(encoded.packet):
             if not self._connection.is_down:  # which is told as that
                 output.refused(encoded, vehicle, self._clock.now_ns())
@@ -80,24 +133,37 @@ class ActionSender:
         output.sent(encoded, vehicle, self._clock.now_ns())
         return encoded.action
 
-    def rehearse(self, decision: Decision) -> bytes | None:
-        """The packet of an action at rest or of a release, for later: nothing is noted."""
+    def rehearse(
+        self, plan: Iterable[tuple[int, Decision | None, str | None]]
+    ) -> Iterator[tuple[int, bytes]]:
+        """Yield the packets of decisions at rest and of requests for a mode, with their delays, for
+        later: nothing is noted. One that the codec refuses is left out."""
         vehicle, output, now_ns = self._vehicle, self.output, self._clock.now_ns()
-        if vehicle is None or output is None:
-            return None
-        if isinstance(decision, Release):
-            return output.release_packet(vehicle, now_ns)
-        return output.encode_resting(decision.action, vehicle, now_ns)
+        if vehicle is None:
+            return
+        with self._codec.rehearsing():
+            for after_ns, decision, mode in plan:
+                packet = None
+                with suppress(CommandRefusedError):
+                    if isinstance(decision, Release) and output is not None:
+                        packet = output.release_packet(vehicle, now_ns)
+                    elif isinstance(decision, Command) and output is not None:
+                        packet = output.encode_resting(decision.action, vehicle, now_ns)
+                if packet is not None:
+                    yield after_ns, packet
+                if mode is not None:
+                    request = mode_request(vehicle.profile.modes.command(mode))
+                    yield after_ns, self._codec.encode_request(vehicle.identity.source, request)
 
     def _level(self, output: ActionOutput, vehicle: VehicleSession) -> None:
         """Send what goes ahead of the first release, where the output has it."""
-        if self._release.left < output.releases:
+        if self._releases_left < output.releases:
             return  # not the first
         now_ns = self._clock.now_ns()
         encoded = output.last_sticks(vehicle, now_ns)
         if encoded is not None and self._connection.send(encoded.packet):
             output.sent(encoded, vehicle, now_ns)
-            self._release.tried(now_ns, is_sent=True)
+            self._note_release(is_sent=True)
 
     def try_release(self) -> bool:
         """Send a release; False: it was not sent, and goes before all other packets."""
@@ -106,11 +172,17 @@ class ActionSender:
             return True
         packet = output.release_packet(vehicle, self._clock.now_ns())
         is_sent = packet is None or self._connection.send(packet)
-        self._release.tried(self._clock.now_ns(), is_sent=is_sent)
+        self._note_release(is_sent=is_sent)
         return is_sent
+
+    def _note_release(self, *, is_sent: bool) -> None:
+        self.is_release_owed = not is_sent
+        if is_sent:
+            self._releases_left -= 1
+            self._release_due_ns = self._clock.now_ns() + RELEASE_SPACING_NS
 
     def transmit(self, data: bytes) -> bool:
         """Send another packet, after a release that is owed; False: it was not sent."""
-        if self._release.is_owed and not self.try_release():
+        if self.is_release_owed and not self.try_release():
             return False
         return self._connection.send(data)

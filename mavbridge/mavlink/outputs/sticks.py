@@ -102,7 +102,7 @@ class StickOutput(ActionOutput):
             self._curves = vehicle.profile.stick_curves(vehicle.known_params, mode, self._gains)
             for note in self._curves.notes:
                 is_new = note not in self._told and len(self._told) < _MOST_TOLD
-                if is_new and vehicle.are_params_read:
+                if is_new and vehicle.params.is_read:
                     self._told.add(note)
                     self._new_notes.append(AdviceText(note))
         return self._curves

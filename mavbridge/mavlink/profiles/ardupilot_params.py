@@ -2,6 +2,7 @@
 
 from collections.abc import Iterator, Mapping
 
+from mavbridge.core.reasons import Code, because
 from mavbridge.mavlink.codec.calibration import (
     DEAD_ZONE_US,
     FS_THR_MARGIN_US,
@@ -203,25 +204,11 @@ def override_dangers(values: Mapping[str, float], *, has_receiver: bool | None) 
     """Settings with which the last sticks would stay for good if this computer died."""
     time_s = values.get("RC_OVERRIDE_TIME")
     if time_s is not None and time_s < 0:
-        yield Danger(
-            "endless-override",
-            ParamNote(
-                ("RC_OVERRIDE_TIME",),
-                "if this computer died, the vehicle would hold its last sticks for ever "
-                f"(RC_OVERRIDE_TIME is {time_s:g})",
-                "--set RC_OVERRIDE_TIME=0.5",
-            ),
-        )
+        why = because(Code.ENDLESS_OVERRIDE, time_s=time_s)
+        yield Danger("endless-override", why, "RC_OVERRIDE_TIME", "--set RC_OVERRIDE_TIME=0.5")
     if values.get("FS_THR_ENABLE") == 0 and has_receiver is not True:
-        yield Danger(
-            "no-throttle-failsafe",
-            ParamNote(
-                ("FS_THR_ENABLE",),
-                "no receiver was seen, and without its throttle failsafe (FS_THR_ENABLE is 0) the "
-                "vehicle would hold its last sticks for ever if this computer died",
-                "--set FS_THR_ENABLE=1",
-            ),
-        )
+        why = because(Code.NO_THROTTLE_FAILSAFE)
+        yield Danger("no-throttle-failsafe", why, "FS_THR_ENABLE", "--set FS_THR_ENABLE=1")
 
 
 def override_advice(values: Mapping[str, float]) -> Iterator[ParamNote]:

@@ -7,6 +7,7 @@ from typing import ClassVar, NamedTuple
 
 from pymavlink.dialects.v20 import ardupilotmega as dialect
 
+from mavbridge.core.reasons import Code, Reason, because
 from mavbridge.core.vehicle import ActionKind, Output, Risk, StickGains
 from mavbridge.mavlink.codec.calibration import RcCalibration
 from mavbridge.mavlink.codec.messages import CommandRequest
@@ -79,28 +80,38 @@ class ParamNote(NamedTuple):
 
     @property
     def text(self) -> str:
-        """The sentence for the user."""
-        return f"{self.said}: use {self.cure}{self.or_else}" if self.cure else self.said
+        """The sentence for the user, with the flag."""
+        is_told = not self.cure or self.cure in self.said
+        return self.said if is_told else f"{self.said}: use {self.cure}{self.or_else}"
 
 
 class Danger(NamedTuple):
     """A setting with which the vehicle flies, but is not safe."""
 
     risk: Risk
-    note: ParamNote
+    why: Reason
+    name: str | None = None
+    """Parameter that it is about."""
+    cure: str = ""
+    """As in ``ParamNote``; ``why`` names it."""
 
     @property
     def accepted(self) -> ParamNote:
         """The note for a flight of which the user has accepted the risk."""
-        return self.note._replace(said=f"risk {self.risk} is accepted: {self.note.said}")
+        return self._note(f"risk {self.risk} is accepted: {self.why}")
 
     @property
     def refused(self) -> ParamNote:
         """The note for a flight that is not begun."""
-        accept = f", or --set-config link.accept_risk={self.risk} to fly all the same"
-        if not self.note.cure:
-            return self.note._replace(said=self.note.said + accept)
-        return self.note._replace(or_else=self.note.or_else + accept)
+        return self._note(str(self.refusal))
+
+    @property
+    def refusal(self) -> Reason:
+        """Why a flight is not begun."""
+        return because(Code.RISK, risk=self.risk, why=self.why)
+
+    def _note(self, said: str) -> ParamNote:
+        return ParamNote(() if self.name is None else (self.name,), said, self.cure)
 
 
 LONGEST_SETPOINT_S = 3.0
@@ -112,15 +123,8 @@ def setpoint_danger(values: Mapping[str, float], name: str) -> Iterator[Danger]:
     """The danger of a vehicle whose timeout of setpoints, parameter ``name`` in s, is long."""
     time_s = values.get(name, 0.0)
     if time_s > LONGEST_SETPOINT_S:
-        yield Danger(
-            "long-setpoint",
-            ParamNote(
-                (name,),
-                "if this computer died, the vehicle would fly on with its last setpoint for "
-                f"{time_s:g} s ({name})",
-                f"--set {name}=0.5",
-            ),
-        )
+        why = because(Code.LONG_SETPOINT, name=name, time_s=time_s)
+        yield Danger("long-setpoint", why, name, f"--set {name}=0.5")
 
 
 class StickSetting(NamedTuple):

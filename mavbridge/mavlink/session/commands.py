@@ -1,19 +1,23 @@
-"""Commands for mode and arming: not too often, and what the vehicle answers to them."""
+"""Commands for mode, arming and takeoff: not too often, and what the vehicle answers to them."""
+
+from collections.abc import Callable
 
 from pymavlink.dialects.v20 import ardupilotmega as dialect
 
-from mavbridge.core.clock import NS_PER_MS, NS_PER_S
+from mavbridge.core.clock import NS_PER_MS, NS_PER_S, Clock
 from mavbridge.mavlink.codec.messages import CommandAck, CommandRequest
+from mavbridge.mavlink.session.vehicle import VehicleSession
 
-_ARM_SPACING_NS = NS_PER_S
-"""Each refused request to arm prints the vehicle's reason."""
+_SPACING_NS = NS_PER_S
+"""Between two requests to arm or take off: each refused one prints the vehicle's reason."""
 _MODE_SPACING_NS = 50 * NS_PER_MS
 """A guard: who asks decides how often, and on the way out of a flight a lost request must cost no
 second."""
 _SET_MODE = dialect.MAV_CMD_DO_SET_MODE
 _ARM = dialect.MAV_CMD_COMPONENT_ARM_DISARM
 _FORGET_NS = 3 * NS_PER_S
-"""A refusal counts no longer once the mode was not asked for during this time."""
+"""A refusal counts no longer once the mode was not asked for during this time; and why there is no
+takeoff is said again after it."""
 
 
 def mode_request(numbers: tuple[int, int]) -> CommandRequest:
@@ -21,61 +25,81 @@ def mode_request(numbers: tuple[int, int]) -> CommandRequest:
     return CommandRequest(_SET_MODE, (dialect.MAV_MODE_FLAG_CUSTOM_MODE_ENABLED, *numbers))
 
 
-class ModeAndArm:
-    """Requests of a mode or of arming, each not too soon after the same one before."""
+class VehicleCommands:
+    """Requests to the present vehicle, each not too soon after the same one before."""
 
-    def __init__(self) -> None:
+    def __init__(
+        self,
+        send: Callable[[CommandRequest], None],
+        report: Callable[[str], None],
+        clock: Clock,
+    ) -> None:
+        self._send, self._report, self._clock = send, report, clock
+        self._vehicle: VehicleSession | None = None
         self._sent: dict[int, tuple[int, CommandRequest]] = {}
         self._mode: str | None = None
         self._explained_ns: int | None = None
         self.refused_mode: str | None = None
         """Mode that was asked for last and that the vehicle has refused, or None."""
 
-    def set_mode(self, mode: str, numbers: tuple[int, int], now_ns: int) -> CommandRequest | None:
-        """The request for a mode, unless it was sent just now."""
-        last_ns = self._sent[_SET_MODE][0] if _SET_MODE in self._sent else now_ns
+    def adopt(self, vehicle: VehicleSession) -> None:
+        """Ask this session of the vehicle from now on; nothing was asked of it before."""
+        self._vehicle, self._mode, self.refused_mode, self._explained_ns = vehicle, None, None, None
+        self._sent.clear()
+
+    def set_mode(self, mode: str) -> None:
+        """Request a flight mode, the same one at most every 50 ms.
+
+        Raises:
+            UserError: the vehicle has no mode of this name.
+        """
+        if self._vehicle is None:
+            return
+        request = mode_request(self._vehicle.profile.modes.command(mode))
+        now_ns = self._clock.now_ns()
+        last_ns, last = self._sent.get(_SET_MODE, (now_ns, None))
         if mode != self._mode or now_ns - last_ns > _FORGET_NS:
             self._mode, self.refused_mode = mode, None
-        return self._request(mode_request(numbers), now_ns, _MODE_SPACING_NS)
+        if request != last or now_ns - last_ns >= _MODE_SPACING_NS:
+            self._put(request, now_ns)
 
-    def arm(self, now_ns: int) -> CommandRequest | None:
-        """The request to arm, unless it was sent just now."""
-        return self._request(CommandRequest(_ARM, (1,)), now_ns, _ARM_SPACING_NS)
+    def arm(self) -> None:
+        """Request arming, at most once a second."""
+        self._request(CommandRequest(_ARM, (1,)))
 
-    def takeoff(self, request: CommandRequest, now_ns: int) -> CommandRequest | None:
-        """The request to take off, unless one was sent just now, to whatever height."""
-        last_ns, _ = self._sent.get(request.command, (None, None))
-        if last_ns is not None and now_ns - last_ns < _ARM_SPACING_NS:
-            return None
+    def takeoff(self, height_m: float) -> None:
+        """Ask the autopilot to climb to this height above the ground by its own means, at most once
+        a second, whatever the height."""
+        if self._vehicle is None:
+            return
+        now_ns = self._clock.now_ns()
+        request = self._vehicle.profile.takeoff(height_m, self._vehicle.condition.amsl_m(now_ns))
+        if request is not None:
+            self._request(request)
+        elif self._explained_ns is None or now_ns - self._explained_ns >= _FORGET_NS:
+            self._explained_ns = now_ns
+            self._report("no takeoff yet: the vehicle does not tell its height above the sea")
+
+    def _request(self, request: CommandRequest) -> None:
+        now_ns = self._clock.now_ns()
+        last = self._sent.get(request.command)
+        if last is None or now_ns - last[0] >= _SPACING_NS:
+            self._put(request, now_ns)
+
+    def _put(self, request: CommandRequest, now_ns: int) -> None:
         self._sent[request.command] = now_ns, request
-        return request
+        self._send(request)
 
-    def is_time_to_explain(self, now_ns: int) -> bool:
-        """Why nothing can be asked for is said again, every three seconds."""
-        if self._explained_ns is not None and now_ns - self._explained_ns < _FORGET_NS:
-            return False
-        self._explained_ns = now_ns
-        return True
-
-    def _request(
-        self, request: CommandRequest, now_ns: int, spacing_ns: int
-    ) -> CommandRequest | None:
-        last_ns, last = self._sent.get(request.command, (0, None))
-        if request == last and now_ns - last_ns < spacing_ns:
-            return None
-        self._sent[request.command] = now_ns, request
-        return request
-
-    def receive(self, ack: CommandAck) -> str | None:
-        """Take an ack; returns a refusal in words for the user."""
+    def receive(self, ack: CommandAck) -> None:
+        """Take an ack; a refusal is told the user."""
         if ack.command not in self._sent or ack.result == dialect.MAV_RESULT_IN_PROGRESS:
-            return None
+            return
         is_accepted = ack.result == dialect.MAV_RESULT_ACCEPTED
         if ack.command == _SET_MODE:
             self.refused_mode = None if is_accepted else self._mode
         if is_accepted:
-            return None
+            return
         command = dialect.enums["MAV_CMD"][ack.command].name.removeprefix("MAV_CMD_")
         result = dialect.enums["MAV_RESULT"].get(ack.result)
         reason = result.name.removeprefix("MAV_RESULT_") if result else ack.result
-        return f"the vehicle answered {command} with {reason}"
+        self._report(f"the vehicle answered {command} with {reason}")

@@ -6,6 +6,7 @@ from typing import TypeAlias
 from pymavlink.dialects.v20 import ardupilotmega as dialect
 
 from mavbridge.core.clock import NS_PER_MS, NS_PER_S
+from mavbridge.core.reasons import Code, Reason, because
 from mavbridge.core.switch import GAP_NS, RADIO_US
 from mavbridge.core.vehicle import Sticks, VehicleStatus
 from mavbridge.mavlink.codec.messages import (
@@ -264,13 +265,13 @@ class VehicleCondition:
             return None
         return bool(state == dialect.MAV_LANDED_STATE_ON_GROUND)
 
-    def _battery_problem(self, now_ns: int) -> str | None:
+    def _battery_problem(self, now_ns: int) -> Reason | None:
         if self._system is None or now_ns - self._system[0] > SLOW_FRESH_NS:
             return None
         system, bit = self._system[1], dialect.MAV_SYS_STATUS_SENSOR_BATTERY
         if system.present & bit and not system.healthy & bit:
-            return "the vehicle reports its battery as low or failed"
+            return because(Code.BATTERY)
         if 0 <= system.battery_percent < self._min_battery_percent:
-            least = f"{self._min_battery_percent:g} % (envelope.min_battery)"
-            return f"the battery is at {system.battery_percent} %, below {least}"
+            percent, limit = system.battery_percent, self._min_battery_percent
+            return because(Code.BATTERY_BELOW, percent=percent, limit=limit)
         return None

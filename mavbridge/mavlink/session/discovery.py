@@ -14,6 +14,7 @@ from mavbridge.core.address import (
 )
 from mavbridge.core.clock import NS_PER_MS, NS_PER_S
 from mavbridge.core.errors import PeerError
+from mavbridge.core.reasons import Code, Reason, because
 from mavbridge.mavlink.codec.messages import Endpoint, Heartbeat
 from mavbridge.mavlink.transport.sockets import Address
 
@@ -28,10 +29,11 @@ _NOT_VEHICLES = (
     *(dialect.MAV_TYPE_ADSB, dialect.MAV_TYPE_CAMERA, dialect.MAV_TYPE_ANTENNA_TRACKER),
 )
 _CAPACITY = 64
+_MOVED_NS, _MOVED_STAMPS = 250 * NS_PER_MS, 3
+"""Silence of the engaged vehicle, and stamps of its clock in a row that come from elsewhere."""
 _SILENT_NS = 500 * NS_PER_MS
 """Silence after which a vehicle that is heard elsewhere is taken to have moved there."""
 _DUPLICATE_SYSTEMS = 16
-_DUPLICATE_SYSTEM_ADVICE = "give it another system id, or keep it off this port"
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -207,37 +209,47 @@ class DuplicateSystems:
         self._reported: dict[Address | None, int] = {}
         """When each was first heard."""
         self._replaced_ns: int | None = None
+        self._moved_stamps = 0
 
-    def is_beside(self, sender: Address | None, heard_ns: int) -> bool:
-        """Whether the vehicle, heard last at ``heard_ns``, went on when this sender had come: it is
-        another way to the vehicle, or another vehicle."""
-        return self._reported.get(sender, heard_ns) < heard_ns
+    def has_moved(
+        self, sender: Address | None, now_ns: int, heard_ns: int, *, is_same_clock: bool
+    ) -> bool:
+        """Take an attitude of another sender; True: it is the vehicle's own, at a new address.
+
+        It is not where the vehicle, heard last at ``heard_ns``, went on when this sender had come:
+        that is another way to the vehicle, or another vehicle.
+        """
+        if self._reported.get(sender, heard_ns) < heard_ns:
+            return False
+        is_own = is_same_clock and now_ns - heard_ns > _MOVED_NS
+        self._moved_stamps = self._moved_stamps + 1 if is_own else 0
+        if self._moved_stamps < _MOVED_STAMPS:
+            return False
+        self._moved_stamps = 0
+        return True
 
     def notice(
         self, vehicle: VehicleIdentity, sender: Address | None, now_ns: int, heard_ns: int
-    ) -> tuple[str | None, bool]:
+    ) -> Reason | str | None:
         """Take a heartbeat of another sender; ``heard_ns`` is when the vehicle was heard last.
 
         Returns:
-            What to tell, or None; and whether the vehicle is silent meanwhile, so that the flight
-            is over. The first is told once a sender, the second once a second.
+            Why the flight is over, since the vehicle is silent meanwhile, once a second; else what
+            to tell the user, once a sender; else None.
         """
+        system = vehicle.source.system
         if now_ns - heard_ns >= _SILENT_NS:
             if self._replaced_ns is not None and now_ns - self._replaced_ns <= NS_PER_S:
-                return None, True
+                return None
             self._replaced_ns = now_ns
-            return (
-                f"the vehicle at {vehicle.place} is silent, and system {vehicle.source.system} is "
-                f"now heard from {_place(sender)}, which is not followed in flight: if it is "
-                f"another vehicle, {_DUPLICATE_SYSTEM_ADVICE}; if this one has moved, engage again"
-            ), True
+            return because(Code.REPLACED, before=vehicle.place, system=system, now=_place(sender))
         if sender in self._reported or len(self._reported) >= _DUPLICATE_SYSTEMS:
-            return None, False
+            return None
         self._reported[sender] = now_ns
         return (
-            f"system {vehicle.source.system} is also heard from {_place(sender)}, which is "
-            f"ignored: the vehicle is at {vehicle.place}; {_DUPLICATE_SYSTEM_ADVICE}"
-        ), False
+            f"system {system} is also heard from {_place(sender)}, which is ignored: the vehicle "
+            f"is at {vehicle.place}; give it another system id, or keep it off this port"
+        )
 
 
 def _place(address: Address | None) -> str:

@@ -1,6 +1,7 @@
 """Offset between the vehicle's clock and ours, by TIMESYNC, and when things happened by it."""
 
 from collections import deque
+from collections.abc import Callable
 from typing import NamedTuple
 
 from mavbridge.core.clock import NS_PER_MS, NS_PER_S, period_ns
@@ -63,7 +64,9 @@ class TimesyncFilter:
     station would look like absurd round trips.
     """
 
-    def __init__(self) -> None:
+    def __init__(self, report: Callable[[str], None] = lambda _: None) -> None:
+        """``report`` shows the user once that the vehicle's clock is slow."""
+        self._report = report
         self._outstanding: deque[int] = deque(maxlen=_OUTSTANDING)
         self._best: _Exchange | None = None
         self._agreeing = 0
@@ -72,6 +75,7 @@ class TimesyncFilter:
         self._clocks: deque[tuple[int, int]] = deque()
         """Arrivals and the vehicle's clock of the newest answers."""
         self.round_trips = Histogram()
+        self._has_told_pace = False
 
     def restart(self) -> None:
         """Forget the offset: the vehicle has rebooted, or is another one."""
@@ -113,6 +117,9 @@ class TimesyncFilter:
         self._agreeing += 1
         sending_ns = reply.tc1 - best.offset_ns - reply.ts1
         self._sending_ns.append(sending_ns - self._error_ns(best, arrived_ns))
+        if not self._has_told_pace and (slow := self.slow_clock) is not None:
+            self._has_told_pace = True
+            self._report(slow)
 
     @property
     def slow_pace(self) -> float | None:

@@ -87,7 +87,7 @@ class VehicleSession:
         self._version_due_ns = 0
         streams = self.profile.streams(state_hz=config.state_hz, pilot_hz=config.pilot_hz)
         self._streams = StreamRequester(streams, report=report, has_slow_clock=has_slow_clock)
-        self._params = VehicleParams(
+        self.params = VehicleParams(
             self.profile, config, streams=streams, old_params=old_params, report=report
         )
         self._receiver_due_ns: int | None = None
@@ -105,7 +105,7 @@ class VehicleSession:
 
     def use_output(self, output: Output) -> None:
         """Fly with this output from now on: its echo is asked for, its demands are checked."""
-        self._params.use_output(output)
+        self.params.use_output(output)
         self._streams.add(self.profile.echo(output))
 
     def watch_home_height(self) -> None:
@@ -131,9 +131,9 @@ class VehicleSession:
             case CommandAck():
                 self._streams.receive_ack(body)
             case ParamValue():
-                self._params.receive(body, self.status(arrived_ns))
+                self.params.receive(body, self.status(arrived_ns))
             case ParamAbsent(name):
-                self._params.absent(name)
+                self.params.absent(name)
             case AutopilotVersion(version):
                 self.version = version
             case StatusText():
@@ -159,7 +159,7 @@ class VehicleSession:
             may_be_ours=self.is_receiver_hidden,
             is_released=self.is_released,
         )
-        if (switch := self._params.override_switch) is not None:
+        if (switch := self.params.override_switch) is not None:
             in_range = switch <= len(rc.channels_us)
             self._switch.read(rc.channels_us[switch - 1] if in_range else 0, arrived_ns)
 
@@ -188,8 +188,8 @@ class VehicleSession:
             number = float(message_id("AUTOPILOT_VERSION"))
             yield CommandRequest(dialect.MAV_CMD_REQUEST_MESSAGE, (number,))
         # Streams come after parameters: a vehicle slows its streams down while it sends those.
-        yield from self._params.step(now_ns, self.status(now_ns))
-        if not self._params.is_read:
+        yield from self.params.step(now_ns, self.status(now_ns))
+        if not self.params.is_read:
             return
         if (request := self._streams.step(now_ns)) is not None:
             yield request
@@ -202,35 +202,16 @@ class VehicleSession:
     @property
     def calibration(self) -> RcCalibration | None:
         """The radio calibration to fly with; None before it is read, or if it cannot be used."""
-        return self._params.calibration
-
-    @property
-    def are_params_read(self) -> bool:
-        """Every parameter has come or was given up."""
-        return self._params.is_read
+        return self.params.calibration
 
     @property
     def known_params(self) -> Mapping[str, float]:
         """All parameters that matter and that the vehicle has sent, by name."""
-        return self._params.values
-
-    @property
-    def param_interruption(self) -> Reason | None:
-        """A change of a parameter in flight that ends every engagement so far; stays once set."""
-        return self._params.interruption
-
-    def begin_restore(self) -> None:
-        """Begin to put back the parameters that were set for the flight; ``step`` does it."""
-        self._params.begin_restore()
-
-    @property
-    def is_restored(self) -> bool:
-        """Nothing is left to put back, or no more can be done about it now."""
-        return self._params.is_restored
+        return self.params.values
 
     def unfinished(self, now_ns: int) -> Reason | None:
         """The step of the set-up that is not finished, or None."""
-        if not self._params.is_read:
+        if not self.params.is_read:
             return because(Code.READING_PARAMETERS)
         if not self._streams.is_settled and self._streams.renewals == 0:
             return because(Code.REQUESTING_TELEMETRY)
@@ -249,7 +230,7 @@ class VehicleSession:
         if status is None or not self._is_receiver_settled(now_ns):
             return status
         is_absent = status.has_receiver is None and not self.profile.has_rc_channels_always
-        if not (is_absent or (status.has_receiver and self._params.ignores_receiver)):
+        if not (is_absent or (status.has_receiver and self.params.ignores_receiver)):
             return status
         if self._without_receiver is None or self._without_receiver[0] is not status:
             self._without_receiver = (status, replace(status, has_receiver=False))
@@ -265,7 +246,7 @@ class VehicleSession:
             return self._upset[1]
         if (unfinished := self.unfinished(now_ns)) is not None:
             return unfinished
-        return self._params.problem()
+        return self.params.problem()
 
     def end_engagement(self, reason: Reason, now_ns: int) -> None:
         """Have ``problem`` give this reason for long enough to end an engagement in order."""
@@ -273,14 +254,14 @@ class VehicleSession:
 
     def output_problem(self, now_ns: int) -> Reason | None:
         """The reason why it cannot be flown with the output now, or None."""
-        if (forbidden := self._params.output_problem(self.status(now_ns))) is not None:
+        if (forbidden := self.params.output_problem(self.status(now_ns))) is not None:
             return forbidden
         return self.switch_problem
 
     @property
     def switch_problem(self) -> Reason | None:
         """The override switch that keeps our sticks out, or None."""
-        switch = self._params.override_switch
+        switch = self.params.override_switch
         if switch is not None and not self._switch.is_on:
             return because(Code.OVERRIDE_SWITCH_NOT_ON, channel=switch)
         return None
@@ -288,4 +269,4 @@ class VehicleSession:
     @property
     def is_switched_off(self) -> bool:
         """The pilot's override switch is low: the vehicle ignores our sticks."""
-        return self._params.override_switch is not None and self._switch.is_off
+        return self.params.override_switch is not None and self._switch.is_off

@@ -1,10 +1,41 @@
-"""Says which process holds a port or a device, to help a user who cannot have it (Linux)."""
+"""Says why a port or a device cannot be had, and on Linux which process holds it."""
 
+import errno
 from collections.abc import Iterator
 from pathlib import Path
 
+from serial.tools import list_ports
+
+from mavbridge.core.address import SocketAddress, spelled
+
 _PROC = Path("/proc")
 _GUARD = ("mavbridge.guard", "mavbridge/guard/")
+
+
+def udp_obstacle(address: SocketAddress, error: OSError) -> str:
+    """What to do about an address on which we cannot listen."""
+    if error.errno == errno.EADDRINUSE:
+        return f"{udp_holder(address[1])}, or choose another port"
+    if error.errno == errno.EADDRNOTAVAIL:
+        return f"this computer has no such address; udpout:{spelled(*address)} sends there"
+    return "check the address"
+
+
+def serial_obstacle(device: str, error: OSError | ValueError) -> str:
+    """What keeps a serial port from us, and what to do about it."""
+    if isinstance(error, FileNotFoundError) or not Path(device).exists():
+        names = ", ".join(sorted(info.device for info in list_ports.comports()))
+        here = f"present: {names}" if names else "this computer has none: is it plugged in?"
+        return f"there is no such port; {here}"
+    code = getattr(error, "errno", None)
+    if code == errno.EACCES:
+        return "no permission: join its group (sudo usermod -aG dialout $USER, then log in anew)"
+    if code == errno.ENOTTY or "ioctl" in str(error):  # pyserial may keep the number to itself
+        return "it is no serial port"
+    holder = device_holder(device)
+    if holder or code in (errno.EBUSY, errno.EAGAIN):
+        return f"it is in use{holder or '; stop the program that has it'}"
+    return f"{error}"
 
 
 def udp_holder(port: int, proc: Path = _PROC) -> str:

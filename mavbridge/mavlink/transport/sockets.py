@@ -12,11 +12,9 @@ import termios
 import time
 from collections import deque
 from collections.abc import Callable, Iterator
-from pathlib import Path
 from typing import Generic, NamedTuple, Protocol, TypeAlias, TypeVar
 
 import serial
-from serial.tools import list_ports
 
 from mavbridge.core.address import (
     SerialAddress,
@@ -30,7 +28,7 @@ from mavbridge.core.address import (
 )
 from mavbridge.core.clock import NS_PER_MS, NS_PER_S, Clock
 from mavbridge.core.errors import PeerError, UserError
-from mavbridge.mavlink.transport.holders import device_holder, udp_holder
+from mavbridge.mavlink.transport.holders import serial_obstacle, udp_obstacle
 
 Address: TypeAlias = SocketAddress
 
@@ -74,21 +72,20 @@ class Transport(Protocol):
     """A non-blocking connection to a vehicle; used by one thread."""
 
     def open(self) -> None:
-        """Acquire the socket or port.
-
-        Raises:
-            UserError: it cannot be opened as configured, and trying again will not help.
-            TransportDownError: it cannot be opened now.
-        """
+        """Acquire the socket or port; raises UserError if trying again will not help, and
+        TransportDownError if it may."""
+        return
 
     def drain(self) -> Iterator[Received]:
         """Everything that has arrived. Raises TransportDownError when the connection is lost."""
 
     def fileno(self) -> int | None:
         """Descriptor that turns readable when ``drain`` has something to yield; None if closed."""
+        return None
 
     def receiver(self, peer: Address | None) -> Address | None:
         """Address to which ``send`` sends; None on a stream, or if there is none yet."""
+        return None
 
     def send(self, data: bytes, peer: Address | None = None) -> bool:
         """Hand one whole packet to the kernel; False: dropped, because it cannot be sent now.
@@ -99,25 +96,24 @@ class Transport(Protocol):
 
     def close(self) -> None:
         """Free the socket or port; may be called twice."""
+        return
 
 
 _Handle = TypeVar("_Handle", socket.socket, serial.Serial)
 
 
-class _Base(Generic[_Handle]):
-    """The parts that all transports have in common."""
+class _FileTransport(Transport, Generic[_Handle]):
+    """A socket or port. A stream may take a part of a packet: the rest goes before the next one."""
 
     def __init__(self, clock: Clock) -> None:
         self._clock = clock
         self._handle: _Handle | None = None
+        self._unsent = b""
+        self._was_open = False
 
     def fileno(self) -> int | None:
         """See `Transport`."""
         return None if self._handle is None else self._handle.fileno()
-
-    def receiver(self, peer: Address | None) -> Address | None:
-        """See `Transport`."""
-        return None
 
     def close(self) -> None:
         """See `Transport`. The flight process may have the file open, too: it is ended first."""
@@ -126,19 +122,30 @@ class _Base(Generic[_Handle]):
                 self._end(self._handle)
             with contextlib.suppress(OSError):
                 self._handle.close()
-            self._handle = None
+            self._handle, self._unsent = None, b""
 
     def _end(self, handle: _Handle) -> None:
         """End what would outlive ``close`` for as long as another process has the file open."""
 
+    def _put(self, data: bytes, write: Callable[[bytes], int]) -> bool:
+        """Write the packet, or drop it whole; raises OSError as ``write`` does."""
+        try:
+            if self._unsent:
+                self._unsent = self._unsent[write(self._unsent) :]
+                if self._unsent:
+                    return False
+            self._unsent = data[write(data) :]
+        except BlockingIOError:
+            return False
+        return True
 
-class UdpTransport(_Base[socket.socket]):
+
+class UdpTransport(_FileTransport[socket.socket]):
     """UDP, listening (``udp:``, ``udpin:``) or calling (``udpout:``)."""
 
     def __init__(self, address: Address, clock: Clock, *, listen: bool) -> None:
         super().__init__(clock)
-        self._address = address
-        self._listen = listen
+        self._address, self._listen = address, listen
 
     def open(self) -> None:
         """See `Transport`."""
@@ -150,11 +157,8 @@ class UdpTransport(_Base[socket.socket]):
                 udp.bind(self._address)
         except OSError as error:
             udp.close()
-            place, hint = spelled(*self._address), "check the address"
-            if error.errno == errno.EADDRINUSE:
-                hint = f"{udp_holder(self._address[1])}, or choose another port"
-            elif error.errno == errno.EADDRNOTAVAIL:
-                hint = f"this computer has no such address; udpout:{place} sends there"
+            hint = udp_obstacle(self._address, error)
+            place = spelled(*self._address)
             raise UserError(f"cannot use udp {place}: {error.strerror}; {hint}") from error
         self._handle = udp
 
@@ -189,42 +193,20 @@ class UdpTransport(_Base[socket.socket]):
     def send(self, data: bytes, peer: Address | None = None) -> bool:
         """Send one datagram to the peer, if there is one and it can be reached now."""
         receiver = self.receiver(peer)
-        if self._handle is None or receiver is None:
-            return False
-        try:
-            self._handle.sendto(data, receiver)
-        except OSError:
-            return False  # full buffer, no route, nobody listens: this datagram is lost, no more
-        return True
+        if self._handle is not None and receiver is not None:
+            with contextlib.suppress(OSError):  # full buffer, no route, nobody listens
+                self._handle.sendto(data, receiver)
+                return True
+        return False
 
 
-class _StreamTransport(_Base[_Handle]):
-    """A stream that may take a part of a packet: the rest goes out before the next packet."""
-
-    _unsent = b""
-
-    def _put(self, data: bytes, write: Callable[[bytes], int]) -> bool:
-        """Write the packet, or drop it whole; raises OSError as ``write`` does."""
-        try:
-            if self._unsent:
-                self._unsent = self._unsent[write(self._unsent) :]
-                if self._unsent:
-                    return False
-            self._unsent = data[write(data) :]
-        except BlockingIOError:
-            return False
-        return True
-
-
-class TcpTransport(_StreamTransport[socket.socket]):
+class TcpTransport(_FileTransport[socket.socket]):
     """TCP client (``tcp:``)."""
 
     def __init__(self, address: Address, clock: Clock) -> None:
         super().__init__(clock)
         self._address = address
-        self._was_open = False
-        self._is_connected = False
-        self._heard_ns = 0
+        self._is_connected, self._heard_ns = False, 0
 
     def open(self) -> None:
         """Connect: the first time wait for the answer, later ``drain`` finds out.
@@ -233,31 +215,26 @@ class TcpTransport(_StreamTransport[socket.socket]):
         """
         tcp = new_socket(self._address, socket.SOCK_STREAM)
         tcp.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+        tcp.settimeout(0.0 if self._was_open else TCP_FIRST_S)
         try:
-            code = tcp.connect_ex(self._address)
+            tcp.connect(self._address)
+        except BlockingIOError:
+            pass
         except OSError as error:
-            code = error.errno or errno.EIO
-        if not self._was_open and code in (errno.EINPROGRESS, errno.EWOULDBLOCK):
-            _, is_done, _ = select.select([], [tcp], [], TCP_FIRST_S)
-            code = (
-                tcp.getsockopt(socket.SOL_SOCKET, socket.SO_ERROR) if is_done else errno.ETIMEDOUT
-            )
-        if code not in (0, errno.EINPROGRESS, errno.EWOULDBLOCK):
             tcp.close()
-            raise self._down(code) if self._was_open else self._unreachable(code)
-        self._handle, self._is_connected, self._unsent = tcp, False, b""
-        self._was_open = True
+            code = error.errno or errno.ETIMEDOUT
+            if self._was_open:
+                raise self._down(code) from error
+            reason = f"{os.strerror(code)}: check the address and the network"
+            if code == errno.ECONNREFUSED:
+                reason = "nobody listens there: start the vehicle's end first, or check the port"
+            raise PeerError(f"cannot connect to tcp {spelled(*self._address)}: {reason}") from error
+        tcp.setblocking(False)
+        self._handle, self._is_connected, self._was_open = tcp, False, True
         self._heard_ns = self._clock.now_ns()
 
     def _end(self, handle: socket.socket) -> None:
         handle.shutdown(socket.SHUT_RDWR)
-
-    def _unreachable(self, code: int) -> PeerError:
-        if code == errno.ECONNREFUSED:
-            reason = "nobody listens there: start the vehicle's end first, or check the port"
-        else:
-            reason = f"{os.strerror(code)}: check the address and the network"
-        return PeerError(f"cannot connect to tcp {spelled(*self._address)}: {reason}")
 
     def _down(self, code: int | None) -> TransportDownError:
         reason = errno.errorcode.get(code or 0, code)
@@ -297,14 +274,12 @@ class TcpTransport(_StreamTransport[socket.socket]):
             raise self._down(error.errno) from error
 
 
-class SerialTransport(_StreamTransport[serial.Serial]):
+class SerialTransport(_FileTransport[serial.Serial]):
     """A serial port (``/dev/ttyX,BAUD``)."""
 
     def __init__(self, device: str, baud: int, clock: Clock) -> None:
         super().__init__(clock)
-        self._device = device
-        self._baud = baud
-        self._was_open = False
+        self._device, self._baud = device, baud
         self._backlog: deque[Received] = deque()
         """Read, but not drained yet."""
         self._emptied_ns = 0
@@ -320,33 +295,16 @@ class SerialTransport(_StreamTransport[serial.Serial]):
             if self._was_open:
                 raise self._down(error) from error
             raise UserError(
-                f"cannot open {self._device} at {self._baud} baud: {self._obstacle(error)}"
+                f"cannot open {self._device} at {self._baud} baud: "
+                f"{serial_obstacle(self._device, error)}"
             ) from error
         self._was_open = True
-        self._unsent = b""
         self._backlog.clear()
         self._written.clear()
         self._emptied_ns = self._clock.now_ns()
 
     def _end(self, handle: serial.Serial) -> None:
         fcntl.flock(handle.fileno(), fcntl.LOCK_UN)  # that of ``exclusive``
-
-    def _obstacle(self, error: OSError | ValueError) -> str:
-        """What keeps the port from us, and what to do about it."""
-        device = Path(self._device)
-        if isinstance(error, FileNotFoundError) or not device.exists():
-            return f"there is no such port; {_ports_here()}"
-        code = getattr(error, "errno", None)
-        if code == errno.EACCES:
-            return (
-                "no permission: join its group (sudo usermod -aG dialout $USER, then log in anew)"
-            )
-        if code == errno.ENOTTY or "ioctl" in str(error):  # pyserial may keep the number to itself
-            return "it is no serial port"
-        holder = device_holder(self._device)
-        if holder or code in (errno.EBUSY, errno.EAGAIN):
-            return f"it is in use{holder or '; stop the program that has it'}"
-        return f"{error}"
 
     def _down(self, error: Exception | str) -> TransportDownError:
         return TransportDownError(f"serial {self._device}: {error}")
@@ -415,12 +373,6 @@ class SerialTransport(_StreamTransport[serial.Serial]):
             port.reset_output_buffer()
             self._written.clear()
             self._unsent = b""
-
-
-def _ports_here() -> str:
-    """The serial ports of this computer, for a message."""
-    names = sorted(info.device for info in list_ports.comports())
-    return f"present: {', '.join(names)}" if names else "this computer has none: is it plugged in?"
 
 
 def make_transport(spec: str, clock: Clock) -> Transport:

@@ -27,7 +27,7 @@ from mavbridge.guard.settings import FlightSettings
 from mavbridge.guard.values import EndRequest, OperatorCommand, Phase
 from mavbridge.guard.wire import GuardTick, decode_from_guard, encode_to_guard
 from mavbridge.mavlink.link import MavlinkLink
-from mavbridge.mavlink.transport.sockets import Address, Received
+from mavbridge.mavlink.transport.sockets import Address, Received, Transport
 from mavbridge.simulation.clock import SteppedClock
 from mavbridge.simulation.network import VEHICLE
 from mavbridge.simulation.replay.recording import RecordedPacket, ReplaySource
@@ -254,8 +254,8 @@ def _link(
     return _WatchedLink(transport, clock, replace(settings, known_params=source.known_params))
 
 
-class _RecordedTransport:
-    """A ``Transport`` from which the recorded packets come; what is sent goes nowhere."""
+class _RecordedTransport(Transport):
+    """A transport from which the recorded packets come; what is sent goes nowhere."""
 
     def __init__(self, clock: SteppedClock, packets: Sequence[RecordedPacket]) -> None:
         self._clock = clock
@@ -269,9 +269,6 @@ class _RecordedTransport:
         """When the next packet comes; None after the last."""
         return None if self._next is None else self._next.arrived_ns
 
-    def open(self) -> None:
-        """Nothing to acquire."""
-
     def drain(self) -> Iterator[Received]:
         """Everything that had arrived."""
         now_ns = self._clock.now_ns()
@@ -279,23 +276,12 @@ class _RecordedTransport:
             packet, self._next = self._next, next(self._packets, None)
             yield Received(packet.data, packet.arrived_ns, VEHICLE)
 
-    def fileno(self) -> int | None:
-        """Nothing that ``select`` could wait for."""
-        return None
-
-    def receiver(self, peer: Address | None) -> Address | None:
-        """Nobody."""
-        return None
-
     def send(self, data: bytes, peer: Address | None = None) -> bool:
         """Let the time of sending pass."""
         if self.sent_ns is not None:
             self._clock.sleep_until_ns(self.sent_ns)
             self.sent_ns = None
         return True
-
-    def close(self) -> None:
-        """Nothing to free."""
 
 
 class _RecordedPort:

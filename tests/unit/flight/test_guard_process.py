@@ -24,7 +24,7 @@ from mavbridge.flight.guard_process import LATEST_NS, GuardDiedError, GuardProce
 from mavbridge.guard.channel import SocketPort
 from mavbridge.guard.settings import GuardSettings
 from mavbridge.guard.values import Phase
-from mavbridge.guard.wire import GuardError, LastWords, encode_from_guard, encode_tick
+from mavbridge.guard.wire import GuardError, LastWords, encode_from_guard
 
 MS = NS_PER_MS
 PACKETS = ((0, b"neutral"), (20 * MS, b"neutral"), (100 * MS, b"mode"))
@@ -67,7 +67,7 @@ class Rig:
         assert self.port.send(encode_from_guard(words), fd)
 
     def tick(self, phase: Phase = Phase.FLYING) -> None:
-        self.port.send(encode_tick(make_guard_tick(self.clock.now_ns(), phase=phase)))
+        self.port.send(encode_from_guard(make_guard_tick(self.clock.now_ns(), phase=phase)))
 
     def die(self, returncode: int | None = -9) -> str:
         """Returns what the user is told."""

@@ -368,9 +368,9 @@ def test_the_engage_switch_of_the_receiver_engages() -> None:
 def test_the_envelope_ends_a_flight_as_a_fault() -> None:
     guard = Stepped().engaged()
     for at_ms in range(40, 740, 10):
-        guard.step(at_ms, guard.chunk(at_ms), battery_problem="the battery is at 8 %")
+        guard.step(at_ms, guard.chunk(at_ms), battery_problem=because(Code.BATTERY))
     assert guard.guard.outcome.faults == 1
-    assert because(Code.BATTERY, said="the battery is at 8 %") in [o.reason for o in guard.outputs]
+    assert because(Code.BATTERY) in [o.reason for o in guard.outputs]
 
 
 def test_a_policy_that_is_too_slow_is_not_armed_for() -> None:

@@ -517,14 +517,14 @@ def test_what_the_link_says_about_putting_back_is_still_passed_on() -> None:
     rig = Rig(first=[FLIGHT])
     rig.run(0.1)
     rig.tell(EndRequest(reason=because(Code.SIGNAL)))
-    restore = rig.link.begin_restore
+    restore = rig.link.restore
 
-    def begin_restore() -> None:
-        restore()
+    def putting_back() -> bool:
         if not rig.loop.is_done:
             rig.link.texts = ["RC_OVERRIDE_TIME put back to 3"]
+        return restore()
 
-    rig.link.begin_restore = begin_restore  # type: ignore[method-assign]
+    rig.link.restore = putting_back  # type: ignore[method-assign]
     rig.run(0.1)
     assert rig.loop.is_done
     assert "RC_OVERRIDE_TIME put back to 3" in rig.texts

@@ -41,9 +41,6 @@ from mavbridge.guard.wire import (
     decode_from_guard,
     decode_to_guard,
     encode_from_guard,
-    encode_packets,
-    encode_samples,
-    encode_tick,
     encode_to_guard,
 )
 
@@ -152,18 +149,6 @@ FROM_GUARD: list[FromGuard] = [
 ]
 
 
-def encoded(message: FromGuard) -> bytes:
-    match message:
-        case GuardTick():
-            return encode_tick(message)
-        case GuardStatus() | GuardMessage() | GuardError() | GuardSummary():
-            return encode_from_guard(message)
-        case Samples(samples):
-            return encode_samples(samples)
-        case Packets(packets):
-            return encode_packets(packets)
-
-
 @pytest.mark.parametrize("message", TO_GUARD, ids=lambda m: type(m).__name__)
 def test_what_is_sent_to_the_guard_arrives_as_it_was(message: ToGuard) -> None:
     received = decode_to_guard(encode_to_guard(message))
@@ -173,7 +158,7 @@ def test_what_is_sent_to_the_guard_arrives_as_it_was(message: ToGuard) -> None:
 
 @pytest.mark.parametrize("message", FROM_GUARD, ids=lambda m: type(m).__name__)
 def test_what_the_guard_sends_arrives_as_it_was(message: FromGuard) -> None:
-    received = decode_from_guard(encoded(message))
+    received = decode_from_guard(encode_from_guard(message))
     assert received == message
     assert type(received) is type(message)
 
@@ -222,7 +207,7 @@ def test_any_chunk_arrives_bit_by_bit(seven: tuple[int, ...], actions: list[Stic
     )
 )
 def test_any_tick_arrives_bit_by_bit(tick: GuardTick) -> None:
-    received = decode_from_guard(encode_tick(tick))
+    received = decode_from_guard(encode_from_guard(tick))
     assert isinstance(received, GuardTick)
     plain = {"trace": None, "sent": None}
     assert replace(received, **plain) == replace(tick, **plain)  # type: ignore[arg-type]
@@ -237,40 +222,26 @@ def test_any_tick_arrives_bit_by_bit(tick: GuardTick) -> None:
             assert bits(getattr(received.trace, stage)) == bits(getattr(tick.trace, stage))
 
 
-GARBAGE = [b"", b"\0", b"Q", b"A", b"Afly", b"E{}", b"E[]", b"E\xff", b"S", b"Snonsense"]
-
-
-@pytest.mark.parametrize("data", GARBAGE)
-def test_the_guard_refuses_what_is_no_message(data: bytes) -> None:
+@pytest.mark.parametrize("data", [b"", b"\0", b"Q", b"S", b"Snonsense", b"C", b"T", b"R\0"])
+def test_what_is_no_message_is_refused(data: bytes) -> None:
     with pytest.raises(ValueError, match="not a message"):
         decode_to_guard(data)
-
-
-@pytest.mark.parametrize(
-    "data", [b"", b"Q", b"V{}", b"Vnull", b"V[1]", b"M", b"X[]", b"Z{}", b"Z[]"]
-)
-def test_the_flight_process_refuses_what_is_no_message(data: bytes) -> None:
     with pytest.raises(ValueError, match="not a message"):
         decode_from_guard(data)
 
 
-@pytest.mark.parametrize("message", TO_GUARD[:1] + TO_GUARD[5:], ids=lambda m: type(m).__name__)
-def test_a_message_to_the_guard_that_is_cut_off_is_refused(message: ToGuard) -> None:
-    whole = encode_to_guard(message)
+@pytest.mark.parametrize("whole", [encode_to_guard(CHUNK), encode_to_guard(FLIGHT)])
+def test_a_message_to_the_guard_that_is_cut_off_or_too_long_is_refused(whole: bytes) -> None:
     for length in range(len(whole)):
         with pytest.raises(ValueError, match="not a message"):
             decode_to_guard(whole[:length])
-
-
-@pytest.mark.parametrize("message", [TICK, FROM_GUARD[-7], STATUS, SUMMARY])
-def test_a_message_of_the_guard_that_is_cut_off_is_refused(message: FromGuard) -> None:
-    whole = encoded(message)
-    at_whole_packets = {1, 1 + 18 + 280, 1 + 18 + 280 + 18} if isinstance(message, tuple) else set()
-    for length in set(range(len(whole))) - at_whole_packets:
-        with pytest.raises(ValueError, match="not a message"):
-            decode_from_guard(whole[:length])
-
-
-def test_a_chunk_with_more_bytes_than_it_says_is_refused() -> None:
     with pytest.raises(ValueError, match="not a message"):
         decode_to_guard(encode_to_guard(CHUNK) + b"\0")
+
+
+@pytest.mark.parametrize("message", [TICK, STATUS, SUMMARY])
+def test_a_message_of_the_guard_that_is_cut_off_is_refused(message: FromGuard) -> None:
+    whole = encode_from_guard(message)
+    for length in range(len(whole)):
+        with pytest.raises(ValueError, match="not a message"):
+            decode_from_guard(whole[:length])

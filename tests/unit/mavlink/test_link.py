@@ -325,10 +325,9 @@ def test_a_parameter_is_set_over_the_wire_also_after_a_reboot() -> None:
     assert "RC_OVERRIDE_TIME set from 3 to 0.5 for this flight" in rig.texts
     rig.vehicle.boot_ns = rig.clock.now_ns()
     assert rig.run(8.0).problem is None
-    assert not rig.link.is_restored
-    rig.link.begin_restore()
+    assert not rig.link.restore()
     rig.run(1.0)
-    assert rig.link.is_restored
+    assert rig.link.restore()
     assert rig.vehicle.params["RC_OVERRIDE_TIME"] == rig.link.known_params["RC_OVERRIDE_TIME"] == 3
 
 
@@ -506,7 +505,7 @@ def test_on_the_ground_a_vehicle_that_moves_is_followed_and_said_to_have_moved()
         told.append(snapshot.interruption)
         assert rig.vehicle.answered_to == ("127.0.0.1", port)
         assert rig.run(0.1).problem is None
-    assert all(why is not None and why.code is Code.REPLACED for why in told)
+    assert all(why is not None and why.code is Code.MOVED_AT_REST for why in told)
     assert all(str(why) in rig.texts for why in told)
     assert "now sends from 127.0.0.1:2 instead of 127.0.0.1:1" in str(told[0])
     assert told[0] != told[1]
@@ -613,8 +612,8 @@ def test_mode_and_arm_are_not_requested_too_often_and_refusals_are_reported() ->
     rig = Rig()
     rig.run(8.0)
     for _ in range(150):
-        rig.link.set_mode("ACRO")
-        rig.link.arm()
+        rig.link.commands.set_mode("ACRO")
+        rig.link.commands.arm()
         rig.run(0.01)
     commands = [
         (message.command, message.param1, message.param2)
@@ -635,18 +634,18 @@ def test_a_refused_mode_is_named_until_another_is_asked_for() -> None:
     rig = Rig()
     rig.run(8.0)
     rig.vehicle.results[176, 17.0] = dialect.MAV_RESULT_FAILED
-    rig.link.set_mode("BRAKE")
+    rig.link.commands.set_mode("BRAKE")
     assert rig.run(0.02).refused_mode == "BRAKE"
-    rig.link.set_mode("BRAKE")
+    rig.link.commands.set_mode("BRAKE")
     assert rig.run(0.02).refused_mode == "BRAKE"
-    rig.link.set_mode("LAND")  # at once, though a mode was asked for just now
+    rig.link.commands.set_mode("LAND")  # at once, though a mode was asked for just now
     assert rig.run(0.02).refused_mode is None
     modes = [m.param2 for m in rig.vehicle.received if getattr(m, "command", 0) == 176]
     assert modes == [17, 9]
-    rig.link.set_mode("BRAKE")
+    rig.link.commands.set_mode("BRAKE")
     assert rig.run(4.0).refused_mode == "BRAKE"
     rig.vehicle.is_deaf = True
-    rig.link.set_mode("BRAKE")  # long after the refusal, and not answered yet
+    rig.link.commands.set_mode("BRAKE")  # long after the refusal, and not answered yet
     assert rig.link.poll().refused_mode is None
 
 
@@ -654,12 +653,12 @@ def test_announcements_reach_the_vehicles_link() -> None:
     rig = Rig()
     rig.run(8.0)
     rig.link.announce("mavbridge flies")
-    rig.link.announce("mavbridge released: " + "x" * 60, is_warning=True)
+    rig.link.announce("mavbridge released: " + "x" * 60)
     texts = [m for m in rig.vehicle.received if m.get_type() == "STATUSTEXT"]
     assert [(m.severity, m.text) for m in texts] == [
         (dialect.MAV_SEVERITY_NOTICE, "mavbridge flies"),
-        (dialect.MAV_SEVERITY_WARNING, "mavbridge released: " + "x" * 30),
-        (dialect.MAV_SEVERITY_WARNING, "x" * 30),
+        (dialect.MAV_SEVERITY_NOTICE, "mavbridge released: " + "x" * 30),
+        (dialect.MAV_SEVERITY_NOTICE, "x" * 30),
     ]
 
 
@@ -913,7 +912,7 @@ def test_a_takeoff_is_asked_for_once_a_second_and_its_refusal_is_told() -> None:
         mav = rig.vehicle.end.mav
         for tick in range(150):
             rig.vehicle.put(mav.global_position_int_encode(0, 0, 0, 584_000 + tick, 0, 0, 0, 0, 0))
-            rig.link.takeoff(5.0)
+            rig.link.commands.takeoff(5.0)
             rig.run(0.01)
         asked = [m for m in rig.vehicle.received if getattr(m, "command", 0) == 22]
         assert len(asked) == 2
@@ -932,15 +931,15 @@ def test_a_takeoff_is_asked_for_as_the_firmware_wants_it() -> None:
 
     copter = Rig()
     copter.run(8.0)
-    copter.link.takeoff(5.0)
+    copter.link.commands.takeoff(5.0)
     assert heights(copter) == [5.0]
     px4 = px4_rig()
     px4.run(8.0)
-    px4.link.takeoff(5.0)  # its height is not known yet
+    px4.link.commands.takeoff(5.0)  # its height is not known yet
     assert heights(px4) == []
     px4.vehicle.put(px4.vehicle.end.mav.global_position_int_encode(7, 0, 0, 489400, *[0] * 5))
     px4.run(0.1)
-    px4.link.takeoff(5.0)
+    px4.link.commands.takeoff(5.0)
     assert heights(px4) == [494.4]
 
 

@@ -17,9 +17,9 @@ def start(*, time_s: float = 3.0, **more: Any) -> ParamVehicle:
 
 
 def end(vehicle: ParamVehicle, *, within_s: float = 5.0) -> None:
-    vehicle.params.begin_restore()
+    vehicle.params.restore()
     vehicle.run(within_s)
-    assert vehicle.params.is_restored
+    assert vehicle.params.restore()
 
 
 def told(vehicle: ParamVehicle, text: str) -> bool:
@@ -35,7 +35,6 @@ def test_a_parameter_is_set_before_the_flight_and_put_back_after_it() -> None:
     assert vehicle.writes == SET
     assert told(vehicle, "RC_OVERRIDE_TIME set from 3 to 0.5 for this flight")
     assert not told(vehicle, "last sticks for that many seconds")  # it is mended
-    assert not vehicle.params.is_restored
     end(vehicle, within_s=0.1)
     assert vehicle.values["RC_OVERRIDE_TIME"] == 3.0
     assert told(vehicle, "RC_OVERRIDE_TIME put back to 3")
@@ -117,12 +116,12 @@ def test_arming_while_something_is_put_back_stops_that() -> None:
     vehicle = start()
     vehicle.run(6.0)
     vehicle.refuses.add("RC_OVERRIDE_TIME")
-    vehicle.params.begin_restore()
+    vehicle.params.restore()
     vehicle.run(0.7)
     vehicle.armed = True
     count = len(vehicle.writes)
     vehicle.run(5.0)
-    assert vehicle.params.is_restored
+    assert vehicle.params.restore()
     assert len(vehicle.writes) == count
     assert told(vehicle, "still armed")
 

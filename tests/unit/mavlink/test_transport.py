@@ -158,7 +158,7 @@ def test_a_port_in_use_is_the_users_error_and_says_whose_it_is() -> None:
     with pytest.raises(UserError, match=f"{port}.*stop it, or choose another port") as caught:
         make_transport(f"udpin:127.0.0.1:{port}", FakeClock()).open()
     if sys.platform == "linux":
-        assert f"process {os.getpid()} ({Path(sys.executable)}" in str(caught.value)
+        assert f"process {os.getpid()} (" in str(caught.value)
     first.close()
 
 

@@ -7,6 +7,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from pymavlink.dialects.v20 import ardupilotmega as dialect
 
+from helpers.fakes import FakeClock
 from helpers.wire import ARDUPILOT, CALIBRATION
 from mavbridge.core.clock import NS_PER_MS, NS_PER_S
 from mavbridge.core.errors import PeerError
@@ -34,8 +35,8 @@ from mavbridge.mavlink.codec.messages import (
     SystemStatus,
 )
 from mavbridge.mavlink.codec.packets import Codec
-from mavbridge.mavlink.outputs.choice import choose_output
-from mavbridge.mavlink.session.commands import ModeAndArm
+from mavbridge.mavlink.outputs.sender import choose_output
+from mavbridge.mavlink.session.commands import VehicleCommands
 from mavbridge.mavlink.session.discovery import VehicleIdentity
 from mavbridge.mavlink.session.vehicle import VehicleSession
 
@@ -173,17 +174,17 @@ def test_landed_is_what_the_vehicle_says_and_not_for_ever(
     ("system", "expected"),
     [
         (SystemStatus(BATTERY_BIT, BATTERY_BIT, 80), None),
-        (SystemStatus(BATTERY_BIT, 0, 80), "the vehicle reports its battery as low or failed"),
+        (SystemStatus(BATTERY_BIT, 0, 80), because(Code.BATTERY)),
         (SystemStatus(0, 0, 80), None),  # no battery monitor
         (SystemStatus(0, 0, -1), None),
         (SystemStatus(BATTERY_BIT, BATTERY_BIT, 15), None),
         (
             SystemStatus(BATTERY_BIT, BATTERY_BIT, 14),
-            "the battery is at 14 %, below 15 % (envelope.min_battery)",
+            because(Code.BATTERY_BELOW, percent=14, limit=15),
         ),
     ],
 )
-def test_the_battery(system: SystemStatus, expected: str | None) -> None:
+def test_the_battery(system: SystemStatus, expected: Reason | None) -> None:
     session = Session(min_battery_percent=15.0)
     session.put(system)
     assert session.status.battery_problem == expected
@@ -451,24 +452,28 @@ def test_the_pilots_sticks_are_those_without_ours() -> None:
 
 
 def test_a_refused_mode_is_known_until_another_is_asked_for_or_it_is_granted() -> None:
-    commands = ModeAndArm()
+    session, sent = Session(), []
+    commands = VehicleCommands(sent.append, session.texts.append, clock := FakeClock())
+    commands.adopt(session.session)
 
     def answer(result: int, command: int = dialect.MAV_CMD_DO_SET_MODE) -> str | None:
         commands.receive(CommandAck(command, result, Endpoint(0, 0)))
         return commands.refused_mode
 
     assert answer(dialect.MAV_RESULT_FAILED) is None  # nothing was asked for
-    assert commands.set_mode("BRAKE", (17, 0), 0) == CommandRequest(176, (1, 17, 0))
+    commands.set_mode("BRAKE")
     assert answer(dialect.MAV_RESULT_IN_PROGRESS) is None
     assert answer(dialect.MAV_RESULT_FAILED, dialect.MAV_CMD_COMPONENT_ARM_DISARM) is None
     for refusal in (dialect.MAV_RESULT_FAILED, dialect.MAV_RESULT_TEMPORARILY_REJECTED):
         assert answer(refusal) == "BRAKE"
-    assert commands.set_mode("BRAKE", (17, 0), 20 * MS) is None  # too soon
+    clock.advance_ns(20 * MS)
+    commands.set_mode("BRAKE")  # too soon
+    assert sent == [CommandRequest(176, (1, 17, 0))]
     assert commands.refused_mode == "BRAKE"
     assert answer(dialect.MAV_RESULT_ACCEPTED) is None
     assert answer(dialect.MAV_RESULT_DENIED) == "BRAKE"
-    assert commands.set_mode("LAND", (9, 0), S // 2) is not None
-    assert commands.refused_mode is None
+    commands.set_mode("LAND")
+    assert (len(sent), commands.refused_mode) == (2, None)
 
 
 @pytest.mark.parametrize(

@@ -33,7 +33,7 @@ vectors = st.tuples(floats, floats, floats)
 simple = st.sampled_from([because(Code.NO_CHUNK), because(Code.OVERRIDE_SWITCH_OFF)])
 reasons = (
     simple
-    | st.builds(because, st.just(Code.RISK), risk=st.text(), said=st.text())
+    | st.builds(because, st.just(Code.RISK), risk=st.text(), why=simple)
     | st.builds(because, st.just(Code.NO_CHUNK_SINCE_RESET), why=simple)
 )
 

@@ -1,11 +1,30 @@
-"""A set of parameters, judged for a flight with one output."""
+"""Parameters, and the capacity of a serial port, judged for a flight with one output."""
 
-from collections.abc import Container, Mapping
+from collections.abc import Container, Iterable, Mapping
 from typing import NamedTuple
 
+from pymavlink.dialects.v20 import ardupilotmega as dialect
+
+from mavbridge.core.reasons import Code, because
 from mavbridge.core.vehicle import Risk
 from mavbridge.mavlink.codec.calibration import RcCalibration
-from mavbridge.mavlink.profiles.profile import Danger, ParamContext, ParamNote, Profile
+from mavbridge.mavlink.profiles.profile import (
+    Danger,
+    ParamContext,
+    ParamNote,
+    Profile,
+    StreamGroup,
+)
+
+_FRAME_BYTES = 12
+"""Header and checksum of MAVLink 2."""
+_OVERRIDE_BYTES = 30
+"""RC_CHANNELS_OVERRIDE of eight channels; MANUAL_CONTROL is shorter."""
+_OTHERS_BYTES_PER_S = 500
+"""Heartbeats, TIMESYNC and requests, in either direction."""
+_BITS_PER_BYTE = 10
+"""One start bit, eight data bits, one stop bit."""
+_STANDARD_BAUDS = (57600, 115200, 230400, 460800, 921600, 1500000, 3000000)
 
 
 class Assessment(NamedTuple):
@@ -49,3 +68,37 @@ def assess(profile: Profile, values: Mapping[str, float], context: ParamContext)
         tuple(profile.obstacles(values, context)),
         tuple(profile.dangers(values, context)),
     )
+
+
+def received_bytes_per_s(streams: Iterable[StreamGroup]) -> float:
+    """Need of these streams, in their longest form, without those that seldom come."""
+    return _OTHERS_BYTES_PER_S + sum(
+        stream.rate_hz * (_FRAME_BYTES + _payload_bytes(stream.messages[0]))
+        for stream in streams
+        if stream.least_hz is None
+    )
+
+
+def _payload_bytes(name: str) -> int:
+    size: int = getattr(dialect, f"MAVLink_{name.lower()}_message").unpacker.size
+    return size
+
+
+def sent_bytes_per_s(stick_hz: float) -> float:
+    """Need of our sticks."""
+    return _OTHERS_BYTES_PER_S + stick_hz * _OVERRIDE_BYTES
+
+
+def serial_dangers(
+    baud: int | None, *, streams: Iterable[StreamGroup], stick_hz: float
+) -> tuple[Danger, ...]:
+    """The danger of a port whose baud rate is too low; ``baud`` None: not a serial port.
+
+    A serial port carries both directions at once, so the fuller one decides.
+    """
+    needed = max(received_bytes_per_s(streams), sent_bytes_per_s(stick_hz)) * _BITS_PER_BYTE
+    if baud is None or baud >= needed:
+        return ()
+    enough = next((rate for rate in _STANDARD_BAUDS if rate >= needed), needed)
+    why = because(Code.SLOW_SERIAL, baud=baud, needed=needed, enough=enough)
+    return (Danger("slow-serial", why),)

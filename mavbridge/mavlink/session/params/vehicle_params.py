@@ -10,15 +10,8 @@ from mavbridge.core.reasons import Code, Reason, because
 from mavbridge.core.vehicle import AdviceText, Output, VehicleStatus
 from mavbridge.mavlink.codec.calibration import RcCalibration
 from mavbridge.mavlink.codec.messages import CommandRequest, ParamRequest, ParamValue, ParamWrite
-from mavbridge.mavlink.profiles.profile import (
-    Danger,
-    ParamContext,
-    ParamNote,
-    Profile,
-    StreamGroup,
-)
-from mavbridge.mavlink.session.params.bandwidth import baud_danger
-from mavbridge.mavlink.session.params.checks import Assessment, assess
+from mavbridge.mavlink.profiles.profile import ParamContext, ParamNote, Profile, StreamGroup
+from mavbridge.mavlink.session.params.checks import Assessment, assess, serial_dangers
 from mavbridge.mavlink.session.params.reader import ParamReader
 from mavbridge.mavlink.session.params.temporary import TemporaryParams
 
@@ -51,7 +44,7 @@ class VehicleParams:
         self._config = config
         self._report = report
         self._output: Output | None = None
-        self._serial = baud_danger(
+        self._serial = serial_dangers(
             serial_baud(config.connect), streams=streams, stick_hz=config.stick_hz
         )
         self._reader = ParamReader(profile.params, known=config.known_params)
@@ -199,18 +192,13 @@ class VehicleParams:
             return
         self._advised = context
         notes = list(self._profile.advice(self._reader.values, context))
-        for danger in self._dangers(self._current(status)):
+        for danger in (*self._serial, *self._current(status).dangers):
             if danger.risk in self._config.accepted_risks:
                 notes.append(danger.accepted)
         for note in notes:
             if note not in self._told and len(self._told) < _MOST_TOLD:
                 self._told.add(note)
                 self._report(AdviceText(note.text))
-
-    def _dangers(self, assessment: Assessment) -> Iterator[Danger]:
-        if self._serial is not None:
-            yield self._serial
-        yield from assessment.dangers
 
     def problem(self) -> Reason | None:
         """Why nothing may begin yet, whatever the output, or None."""
@@ -239,9 +227,9 @@ class VehicleParams:
             return because(Code.CALIBRATION_UNUSABLE, cause=assessment.unusable)
         if self._output == "rc-override" and assessment.calibration != self.calibration:
             return because(Code.CALIBRATION_CHANGED)
-        for danger in self._dangers(assessment):
+        for danger in (*self._serial, *assessment.dangers):
             if danger.risk not in self._config.accepted_risks:
-                return because(Code.RISK, risk=danger.risk, said=danger.refused.text)
+                return danger.refusal
         return None
 
     def _current(self, status: VehicleStatus | None) -> Assessment:
@@ -250,11 +238,6 @@ class VehicleParams:
             return self._assess(status)
         return self._assessed[1]
 
-    def begin_restore(self) -> None:
-        """Put back what was set for the flight; ``is_restored`` tells when that is done."""
-        self._changes.begin_restore()
-
-    @property
-    def is_restored(self) -> bool:
-        """The end has been begun and nothing more can be done now."""
-        return self._changes.is_restored
+    def restore(self) -> bool:
+        """Put back what was set for the flight; True: nothing more can be done now."""
+        return self._changes.restore()

@@ -107,5 +107,5 @@ def test_a_last_setpoint_that_stays_for_long_has_to_be_accepted(
     for output in ("attitude", "rates", "velocity"):
         assert list(profile.dangers({name: 3.0}, context(output))) == []
         (danger,) = profile.dangers({name: 3.5}, context(output))
-        assert (danger.risk, f"--set {name}=0.5" in danger.note.cure) == ("long-setpoint", True)
+        assert (danger.risk, f"--set {name}=0.5" in danger.cure) == ("long-setpoint", True)
     assert list(profile.dangers({name: 3.5}, context(sticks))) == []
