@@ -1,8 +1,8 @@
 """Comparisons and studies for developers; run one with ``python -m benchmarks.NAME``.
 
-compare         our engines, flights and link beside a roofline, a baseline runner and other clients
-rollout         imagined flights, serial and streamed
-links           our client of the link and the others, turn by turn
-stick_rates     exactness of the sticks, with an idle and a busy flight process
-study           what makes a checkpoint fly well, one setting at a time
+compare             our engines, flights and link beside a roofline, a baseline runner and others
+link                our client of the link and the others, turn by turn
+lerobot_policies    LeRobot's policies on our engines, beside its own code
+two_rates           one loop and two, by the time that an image takes to encode
+train_shipped       training of what ships
 """

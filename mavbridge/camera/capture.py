@@ -48,8 +48,9 @@ class CaptureSource:
             raise CameraError(f"{self.name} {self.failure}")
         captured_ns = self.clock.now_ns()
         if self.has_driver_stamps:
-            driver_ms, arrived_ns = self.capture.get(cv2.CAP_PROP_POS_MSEC), captured_ns
-            captured_ns = exposure_ns(driver_ms, arrived_ns, is_our_clock=self.is_our_clock)
+            stamp_ns = round(self.capture.get(cv2.CAP_PROP_POS_MSEC) * NS_PER_MS)
+            arrived_ns = captured_ns
+            captured_ns = exposure_ns(stamp_ns, arrived_ns, is_our_clock=self.is_our_clock)
             self.is_our_clock = self.is_our_clock or captured_ns != arrived_ns
         return Image(captured_ns=captured_ns, rgb=retrieve_rgb(self.capture, self.name))
 
@@ -133,13 +134,12 @@ def retrieve_rgb(capture: cv2.VideoCapture, name: str) -> CameraImage:
     return np.asarray(cv2.cvtColor(bgr, cv2.COLOR_BGR2RGB), dtype=np.uint8)
 
 
-def exposure_ns(driver_ms: float, arrived_ns: int, *, is_our_clock: bool = False) -> int:
-    """Return the driver's stamp if it is plausible or known to be of our clock, else the arrival.
+def exposure_ns(stamp_ns: int, arrived_ns: int, *, is_our_clock: bool = False) -> int:
+    """Return the source's stamp if it is plausible or known to be of our clock, else the arrival.
 
     Video4Linux stamps buffers on CLOCK_MONOTONIC, which OpenCV returns as CAP_PROP_POS_MSEC
     (modules/videoio/src/cap_v4l.cpp); other systems return something else, or nothing.
     """
-    stamp_ns = round(driver_ms * NS_PER_MS)
     is_plausible = 0 <= arrived_ns - stamp_ns <= MAX_DRIVER_AGE_NS
     return stamp_ns if is_plausible or (is_our_clock and stamp_ns > 0) else arrived_ns
 

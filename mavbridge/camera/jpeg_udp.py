@@ -6,13 +6,11 @@ A datagram is ``HEADER`` and a part of a JPEG or PNG. Chunks may be lost, repeat
 import logging
 import select
 import socket
-from collections import deque
 from dataclasses import dataclass, field
-from itertools import pairwise
 from struct import Struct
 from typing import NamedTuple
 
-from mavbridge.camera.capture import MAX_DRIVER_AGE_NS
+from mavbridge.camera.capture import exposure_ns
 from mavbridge.camera.grabber import Image
 from mavbridge.camera.pipe_frames import MAX_BAD_FRAMES, MAX_JPEG_BYTES, decode_picture
 from mavbridge.core.address import LOOPBACK, host_port, spelled
@@ -28,11 +26,6 @@ RESTART_NS = NS_PER_S
 """Time without a whole frame after which a lower frame id is a sender that has started again."""
 SILENT_NS = 2 * NS_PER_S
 """Longest wait for a whole frame."""
-WINDOW_NS = NS_PER_S
-WINDOWS = 5
-"""Windows over which the least delay is taken."""
-MAX_DRIFT_NS = WINDOW_NS // 100
-"""Most by which the least delay changes from window to window, of a clock as fast as ours."""
 _POLL_S = 0.1
 _RECEIVE_BUFFER_BYTES = 4 << 20
 _MOST_QUEUED = 4096
@@ -139,43 +132,6 @@ class FrameAssembler:
         return key != last and now_ns - self._whole_ns >= RESTART_NS
 
 
-class SenderClock:
-    """Maps the stamps of a sender to our clock, if they can be mapped.
-
-    A stamp that is plausible as one of our clock is one. A foreign clock as fast as ours is mapped
-    by the least delay of the last seconds, so that a frame that was slower on its way shows as
-    older; the least delay itself is unknown, and counts as none. Until that is established, and
-    for a clock that stands still or has another speed (a slow simulator), the arrival counts.
-    """
-
-    def __init__(self) -> None:
-        self._leasts_ns: deque[int] = deque(maxlen=WINDOWS)
-        """Least delay of each window, by two clocks."""
-        self._least_ns = self._window_ns = self._result_ns = 0
-
-    def exposure_ns(self, stamp_ns: int, arrived_ns: int) -> int:
-        """The stamp by our clock, or the arrival; not before the last result, nor in the future."""
-        delay_ns = arrived_ns - stamp_ns
-        age_ns = (
-            delay_ns if 0 <= delay_ns <= MAX_DRIVER_AGE_NS else self._age_ns(delay_ns, arrived_ns)
-        )
-        self._result_ns = min(max(arrived_ns - age_ns, self._result_ns + 1), arrived_ns)
-        return self._result_ns
-
-    def _age_ns(self, delay_ns: int, arrived_ns: int) -> int:
-        """Return the delay beyond the least one; 0 if the clocks differ in speed."""
-        if abs(delay_ns - self._least_ns) > MAX_DRIVER_AGE_NS:
-            self._leasts_ns.clear()
-            self._least_ns, self._window_ns = delay_ns, arrived_ns
-        self._least_ns = min(self._least_ns, delay_ns)
-        age_ns = delay_ns - min(*self._leasts_ns, self._least_ns, delay_ns)
-        if arrived_ns - self._window_ns >= WINDOW_NS:
-            self._leasts_ns.append(self._least_ns)
-            self._least_ns, self._window_ns = delay_ns, arrived_ns
-        drifts_ns = [abs(after - before) for before, after in pairwise(self._leasts_ns)]
-        return age_ns if min(drifts_ns, default=WINDOW_NS) <= MAX_DRIFT_NS else 0
-
-
 class JpegUdpSource:
     """Implements `ImageSource` over a UDP port; the newest whole frame wins."""
 
@@ -184,7 +140,6 @@ class JpegUdpSource:
         self._name = f"jpeg-udp:{spelled(host, port)}"
         self._clock = clock
         self._frames = FrameAssembler()
-        self._stamps = SenderClock()
         self._datagrams = 0
         family = socket.AF_INET6 if ":" in host else socket.AF_INET
         self._socket = socket.socket(family, socket.SOCK_DGRAM)
@@ -202,8 +157,8 @@ class JpegUdpSource:
         for _ in range(MAX_BAD_FRAMES + 1):
             frame = self._newest_frame(silent_after_ns)
             if (pixels := decode_picture(frame.picture)) is not None:
-                stamp_ns = self._stamps.exposure_ns(frame.key.stamp_ns, frame.arrived_ns)
-                return Image(captured_ns=stamp_ns, rgb=pixels)
+                captured_ns = exposure_ns(frame.key.stamp_ns, frame.arrived_ns)
+                return Image(captured_ns=captured_ns, rgb=pixels)
         raise CameraError(f"{self._name}: {MAX_BAD_FRAMES + 1} pictures in a row are damaged")
 
     def _newest_frame(self, silent_after_ns: int) -> Assembly:

@@ -33,7 +33,7 @@ NOW_NS = 1_000 * NS_PER_S
     ],
 )
 def test_the_drivers_stamp_is_taken_if_it_can_be_one(driver_ms, captured_ns):
-    assert exposure_ns(driver_ms, NOW_NS) == captured_ns
+    assert exposure_ns(round(driver_ms * NS_PER_MS), NOW_NS) == captured_ns
 
 
 @pytest.mark.parametrize(
@@ -45,7 +45,8 @@ def test_the_drivers_stamp_is_taken_if_it_can_be_one(driver_ms, captured_ns):
     ],
 )
 def test_a_driver_on_our_clock_is_believed_however_old_its_frame(driver_ms, captured_ns):
-    assert exposure_ns(driver_ms, NOW_NS, is_our_clock=True) == captured_ns
+    stamp_ns = round(driver_ms * NS_PER_MS)
+    assert exposure_ns(stamp_ns, NOW_NS, is_our_clock=True) == captured_ns
 
 
 @pytest.mark.parametrize(
@@ -237,8 +238,3 @@ def level_scene(number):
 
 def level_of(rgb):
     return round((float(rgb.mean()) - 16) / 30)
-
-
-def test_a_stream_that_nobody_sends_is_refused():
-    with pytest.raises(CameraError, match="cannot be opened within 5 s"):
-        open_stream("tcp://127.0.0.1:9", clock=FakeClock())

@@ -47,12 +47,6 @@ def wait(camera, clock, timeout_s=10.0):
     return lines
 
 
-def test_a_camera_that_delivers_at_once_is_not_spoken_of():
-    clock = FakeClock()
-    assert wait(LateCamera(clock, after_s=0.9), clock) == []
-    assert clock.now_ns() == START_NS + round(0.9 * NS_PER_S)
-
-
 def test_every_second_of_the_wait_is_a_line_and_a_new_reason_is_told_once():
     clock = FakeClock()
     reasons = {2: "no such device", 3: "no such device"}

@@ -147,19 +147,6 @@ def test_any_other_exception_of_a_source_reaches_read_by_name(source, grab, flow
     assert source.closed.is_set()
 
 
-def test_an_exception_of_the_opener_reaches_read_by_name(grab):
-    grabber = grab(OSError("out of file descriptors"), flown=False)
-    with pytest.raises(CameraError, match=r"OSError.*out of file descriptors"):
-        grabber.read(WAIT_NS)
-
-
-def test_a_frame_that_waits_is_given_even_if_nothing_came_since(source, clock, grab):
-    grabber = grab(source, flown=False)
-    source.put(START_NS)
-    clock.advance_ns(STALL_NS + 1)
-    assert grabber.read(0) is not None
-
-
 def test_a_lost_source_is_closed_and_opened_again_and_a_frame_gives_all_attempts_back(source, grab):
     others = [ScriptedSource() for _ in range(3)]
     grabber = grab(source, *others)
@@ -182,11 +169,3 @@ def test_when_all_attempts_fail_it_is_dead_with_the_last_reason(source, grab, is
     source.fail("unplugged")
     with pytest.raises(CameraError, match="still gone; 2 attempts to reopen it have failed"):
         grabber.read(WAIT_NS)
-
-
-def test_while_it_is_being_opened_again_there_is_no_frame_and_no_error(source, clock, grab):
-    grabber = grab(source, delays_s=(3600.0,))
-    source.fail("unplugged")
-    assert source.closed.wait(10)
-    clock.advance_ns(STALL_NS + REOPENED_NS)
-    assert grabber.read(0) is None

@@ -62,15 +62,6 @@ def test_live_sources(spec, asked):
     assert caught.value.__cause__.args == asked
 
 
-@pytest.mark.usefixtures("openers")
-def test_a_session_description_is_a_stream(tmp_path):
-    path = tmp_path / "camera.sdp"
-    path.write_text("v=0\n")
-    with pytest.raises(CameraError) as caught:
-        open_camera(str(path), image_size=224, clock=MonotonicClock())
-    assert caught.value.__cause__.args == ("stream", str(path), {})
-
-
 @pytest.fixture(params=["a.avi", "10:30.avi"])  # FFmpeg would take the second for a protocol
 def video(tmp_path, monkeypatch, request):
     monkeypatch.chdir(tmp_path)

@@ -135,17 +135,6 @@ def test_a_window_is_captured_in_rgb_at_a_pace(clock):
 
 @needs_x
 @pytest.mark.system
-def test_a_window_is_followed_and_clipped_to_the_screen(window, clock):
-    camera = ScreenCamera("red", clock=clock)
-    window.do("window.geometry('60x30+280+-10')")
-    frame = camera.read(NS_PER_S)
-    assert frame.rgb.shape == (20, 40, 3)
-    assert frame.rgb[0, 0].tolist() == [0xFF, 0x20, 0x10]
-    camera.close()
-
-
-@needs_x
-@pytest.mark.system
 @pytest.mark.parametrize("command", ["window.withdraw()", "window.geometry('+1000+0')", GONE])
 def test_a_window_that_goes_away_is_dead(window, clock, command):
     camera = ScreenCamera("red", clock=clock)

@@ -2,7 +2,6 @@
 
 import json
 import os
-import signal
 import socket
 import subprocess
 import sys
@@ -17,7 +16,7 @@ from sitl.__main__ import main
 from sitl.app import filming, fly, fly_on
 from sitl.ardupilot.flight_modes import Mode
 from sitl.camera.fpv import CameraOptions
-from sitl.clock import NS_PER_MS, NS_PER_S, Clock, StopRequest, stop_on_signal
+from sitl.clock import NS_PER_MS, NS_PER_S, Clock, StopRequest
 from sitl.course import AirborneStart, Crash, make_course
 from sitl.link.transport import Received
 from sitl.simulated_vehicle import SimulatedVehicle
@@ -109,17 +108,6 @@ def test_the_loop_takes_in_bytes_and_says_who_came(capsys):
     fly(vehicle, [FakeTransport(clock, arrivals)], clock, StopRequest(), end_ns=NS_PER_S)
 
     assert capsys.readouterr().err == "sitl: link 0 connected\nsitl: mode ALT_HOLD\n"
-
-
-@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
-def test_a_signal_ends_the_loop_and_handlers_come_back(number):
-    before = signal.getsignal(number)
-    with stop_on_signal() as stop:
-        os.kill(os.getpid(), number)
-        assert stop.is_set()
-        fly(SimulatedVehicle(links=0, boot_ns=0), [], FakeClock(), stop, end_ns=None)
-
-    assert signal.getsignal(number) is before
 
 
 class ScriptedTransmitter:

@@ -8,7 +8,6 @@ from pymavlink.dialects.v20 import ardupilotmega as mav
 
 from sitl.ardupilot.params import ArduPilotParams
 from sitl.px4.params import Px4Params
-from sitl.vehicle.conditions import random_conditions
 
 BOTH = pytest.mark.parametrize(
     ("make", "seconds"), [(ArduPilotParams, "RC_OVERRIDE_TIME"), (Px4Params, "COM_OF_LOSS_T")]
@@ -53,14 +52,6 @@ def test_unknown_names_are_refused(make, seconds):
 
 
 @pytest.mark.parametrize(
-    ("name", "default"),
-    [("RC_OVERRIDE_TIME", 3.0), ("RC_FS_TIMEOUT", 1.0), ("MAV_GCS_SYSID", 255.0), ("RC3_DZ", 30.0)],
-)
-def test_defaults_are_the_firmware_s(name, default):
-    assert ArduPilotParams()[name] == default
-
-
-@pytest.mark.parametrize(
     ("release", "present", "absent"),
     [
         ("4.6", ("SYSID_THISMAV", "SYSID_MYGCS", "SYSID_ENFORCE", "ANGLE_MAX"), "MAV_GCS_SYSID_HI"),
@@ -97,17 +88,3 @@ def test_an_integer_of_px4_travels_as_its_bytes():
     assert params.set_on_wire("NAV_RCL_ACT", as_float(3))
     assert params.integer("NAV_RCL_ACT") == 3
     assert not params.set("NAV_RCL_ACT", 2.0**31)
-
-
-def test_a_receiver_is_mapped():
-    assert Px4Params()["RC_MAP_THROTTLE"] == 0
-    assert Px4Params(receiver=True)["RC_MAP_THROTTLE"] == 3
-
-
-def test_other_vehicles_have_other_settings():
-    nominal, drawn = Px4Params(), Px4Params(random_conditions(8))
-    varied = {name for name in nominal.names if drawn[name] != nominal[name]}
-
-    assert varied >= {"MPC_MAN_TILT_MAX", "MPC_MAN_Y_MAX", "MPC_Z_VEL_MAX_DN", "MC_ROLLRATE_P"}
-    assert 35.0 <= drawn["MPC_MAN_TILT_MAX"] <= 52.5
-    assert 1.07 <= drawn["MPC_Z_VEL_MAX_DN"] <= 2.1

@@ -7,28 +7,6 @@ import pytest
 from sitl.ardupilot.flight_modes import Mode
 
 
-def test_alt_hold_keeps_its_height_while_leaning(pilot):
-    pilot.take_off()
-    start_m = pilot.height_m
-
-    pilot.hold(3.0, pitch=1000)
-
-    assert pilot.angles_deg()[1] == pytest.approx(-30.0, abs=0.5)
-    assert pilot.height_m == pytest.approx(start_m, abs=0.3)
-    assert pilot.ap.truth.velocity_ned_mps[0] > 5.0
-
-
-def test_a_roll_step_acts_within_the_measured_time(pilot):
-    pilot.take_off()
-    samples = []
-
-    pilot.hold(0.5, roll=1700, watch=lambda ap: samples.append((ap.now_ns, pilot.angles_deg()[0])))
-
-    first_ns = samples[0][0]
-    reached = next(stamp_ns for stamp_ns, roll_deg in samples if roll_deg >= 2.0)
-    assert 0.06 <= (reached - first_ns) / 1e9 <= 0.126
-
-
 def test_stabilize_hovers_at_mid_stick_and_climbs_above(pilot):
     pilot.take_off(mode=Mode.STABILIZE)
     pilot.hold(1.0)
@@ -37,19 +15,6 @@ def test_stabilize_hovers_at_mid_stick_and_climbs_above(pilot):
 
     assert abs(drift_mps) < 0.1
     assert 2.5 < -pilot.ap.truth.velocity_ned_mps[2] < 4.5
-
-
-def test_acro_turns_at_about_12_degrees_a_second_for_a_small_stick(pilot):
-    pilot.take_off(height_m=10.0, mode=Mode.ACRO)
-    rates_degps = []
-
-    pilot.hold(
-        1.0,
-        roll=1550,
-        watch=lambda ap: rates_degps.append(math.degrees(ap.truth.rate_body_radps[0])),
-    )
-
-    assert sum(rates_degps) / len(rates_degps) == pytest.approx(12.0, abs=3.0)
 
 
 def test_acro_trainer_limits_the_lean_and_without_it_there_is_none(pilot):
@@ -152,23 +117,6 @@ def test_fs_thr_enable_chooses_the_action(pilot_without_receiver, choice, mode):
     assert pilot.ap.mode is mode
 
 
-FLOWN = (Mode.STABILIZE, Mode.ALT_HOLD, Mode.LOITER, Mode.POSHOLD, Mode.BRAKE, Mode.LAND)
-
-
-@pytest.mark.parametrize("mode", FLOWN)
-def test_without_a_receiver_silence_becomes_rtl_out_of_every_mode(pilot_without_receiver, mode):
-    pilot = pilot_without_receiver
-    pilot.take_off(height_m=8.0, mode=mode)
-    pilot.hold(0.5)
-
-    pilot.silence(0.95)
-    assert pilot.ap.mode is mode
-    pilot.silence(0.1)
-
-    assert pilot.ap.mode is Mode.RTL
-    assert pilot.texts() == ["Radio Failsafe"]
-
-
 def test_the_transmitter_switched_off_is_a_radio_failsafe(pilot):
     pilot.take_off()
     pilot.ap.rc.override([0] * 8, pilot.ap.now_ns)
@@ -199,15 +147,6 @@ def test_the_mode_switch_acts_after_its_debounce_and_only_when_it_moves(pilot):
     pilot.hold(0.5)
 
     assert pilot.ap.mode is Mode.ALT_HOLD
-
-
-def test_a_position_of_the_mode_switch_without_a_mode_changes_nothing(pilot):
-    pilot.ap.params.set("FLTMODE6", 99.0)
-    pilot.hold(0.5)
-    pilot.ap.rc.set_receiver([1500, 1500, 1000, 1500, 1900])
-    pilot.hold(0.5)
-
-    assert pilot.ap.mode is Mode.STABILIZE
 
 
 def test_radio_failsafe_on_the_ground_disarms(pilot_without_receiver):

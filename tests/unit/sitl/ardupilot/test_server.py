@@ -8,7 +8,6 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from pymavlink.dialects.v20 import ardupilotmega as mav
 
-from faults.link import FaultyLink, LinkFaults
 from sitl.ardupilot.endpoint import BUILDERS, ArduPilotStreams
 from sitl.ardupilot.flight_modes import Mode
 from sitl.clock import NS_PER_MS, NS_PER_S
@@ -151,56 +150,11 @@ def test_command_results(station, number, params, result):
     assert station.command(number, *params) == result
 
 
-def test_message_interval_on_request_message(station):
-    station.interval(mav.MAVLINK_MSG_ID_ATTITUDE, 100)
-    station.send(
-        mav.MAVLink_command_long_message(
-            1, 1, mav.MAV_CMD_REQUEST_MESSAGE, 0, mav.MAVLINK_MSG_ID_MESSAGE_INTERVAL, 30, *[0] * 5
-        )
-    )
-
-    (interval,) = named(station.run(0.01), "MESSAGE_INTERVAL")
-    assert (interval.message_id, interval.interval_us) == (30, 10_000)
-
-
-def test_set_mode_message_and_its_ack(station):
-    station.send(mav.MAVLink_set_mode_message(1, 1, 2))
-
-    (ack,) = named(station.run(0.01), "COMMAND_ACK")
-    assert (ack.command, ack.result) == (mav.MAVLINK_MSG_ID_SET_MODE, mav.MAV_RESULT_ACCEPTED)
-
-
-def test_uploads_of_missions_are_unsupported(station):
-    station.send(mav.MAVLink_mission_count_message(1, 1, 3))
-    station.send(mav.MAVLink_mission_clear_all_message(1, 1))
-
-    acks = named(station.run(0.01), "MISSION_ACK")
-    assert [ack.type for ack in acks] == [mav.MAV_MISSION_UNSUPPORTED] * 2
-
-
-def test_ping_is_answered_to_its_sender(station):
-    station.send(mav.MAVLink_ping_message(123, 7, 0, 0))
-
-    (ping,) = named(station.run(0.01), "PING")
-    assert (ping.time_usec, ping.seq, ping.target_system) == (123, 7, 255)
-
-
 def test_the_gcs_only_option_silences_everybody_else(station):
     station.vehicle.params.set("MAV_OPTIONS", 1.0)
     for system_id, answers in ((42, 0), (255, 1), (1, 1)):
         station.send(mav.MAVLink_timesync_message(0, 5), system_id=system_id)
         assert len(named(station.run(0.01), "TIMESYNC")) == answers
-
-
-def test_overrides_of_a_gcs_range_are_let_in(station):
-    station.vehicle.params.set("MAV_GCS_SYSID", 240.0)
-    station.vehicle.params.set("MAV_GCS_SYSID_HI", 250.0)
-    for system_id, roll_us in ((239, 1601), (245, 1602), (251, 1603)):
-        override = mav.MAVLink_rc_channels_override_message(1, 1, roll_us, *[65535] * 7)
-        station.send(override, system_id=system_id)
-    station.run(0.05)
-
-    assert station.vehicle.ap.rc.channels_us[0] == 1602
 
 
 def test_mavlink_1_framing_is_understood(station):
@@ -240,20 +194,6 @@ def test_garbage_never_raises_and_a_good_frame_still_gets_through(chunks):
     assert any(m.get_type() == "TIMESYNC" and m.ts1 == 77 for m in answers)
 
 
-@settings(max_examples=100, deadline=None)
-@given(st.sampled_from(sorted(mav.mavlink_map)), st.binary(min_size=0, max_size=255))
-def test_any_payload_of_any_known_message_is_survived(station_of, message_id, payload):
-    station = station_of()
-    message = mav.MAVLink_message(message_id, mav.mavlink_map[message_id].msgname)
-    message._crc_extra = mav.mavlink_map[message_id].crc_extra
-    frame = message._pack(
-        mav.MAVLink(None, srcSystem=255), mav.mavlink_map[message_id].crc_extra, payload
-    )
-
-    station.vehicle.receive(0, bytes(frame), 0)
-    station.run(0.01)
-
-
 def test_a_host_stall_advances_physics_but_sends_no_burst(station):
     station.interval(mav.MAVLINK_MSG_ID_ATTITUDE, 100)
     station.run(0.1)
@@ -274,43 +214,6 @@ def test_an_eleventh_interval_joins_the_nearest_of_ten():
 
     assert streams.interval_us(50) == 18_000
     assert streams.interval_us(10) == 10_000
-
-
-@pytest.mark.parametrize(
-    ("loop_hz", "shortest_us"), [(400, 3000), (300, 4000), (200, 6000), (100, 12000), (50, 25000)]
-)
-def test_the_cap_follows_the_loop_rate(loop_hz, shortest_us):
-    streams = ArduPilotStreams([30], 0)
-
-    assert streams.set_interval(30, shortest_us, loop_hz=loop_hz, now_ns=0) is None
-    assert "too fast" in streams.set_interval(30, shortest_us - 1000, loop_hz=loop_hz, now_ns=0)
-
-
-@given(st.lists(st.integers(1, 40), min_size=1, max_size=200), st.integers(3, 50))
-def test_streams_never_send_faster_than_asked(gaps_ms, interval_ms):
-    streams = ArduPilotStreams([30], 0)
-    streams.set_interval(30, interval_ms * 1000, loop_hz=400.0, now_ns=0)
-    now_ms, sent = 0, 0
-    for gap_ms in gaps_ms:
-        now_ms += gap_ms
-        sent += len(streams.due(now_ms * NS_PER_MS, 1))
-
-    assert sent <= now_ms // interval_ms
-
-
-def test_corrupted_frames_are_counted_and_the_rest_gets_through(station):
-    link = FaultyLink(LinkFaults(corrupt=0.3), seed=5)
-    for index in range(100):
-        override = mav.MAVLink_rc_channels_override_message(1, 1, 1600, *[65535] * 7)
-        link.send(station.pack(override), index * 10 * NS_PER_MS)
-    for packet in link.receive(2 * NS_PER_S):
-        station.vehicle.receive(0, packet, station.now_ns)
-    station.run(0.01)
-
-    summary = station.vehicle.log.summary(station.vehicle.ap, station.vehicle.bad_frames)
-    assert summary["bad_frames"] >= 10
-    assert 50 <= summary["overrides"]["count"] <= 90
-    assert station.vehicle.ap.rc.channels_us[0] == 1600
 
 
 def test_the_report_counts_the_setpoints_that_were_followed(station):

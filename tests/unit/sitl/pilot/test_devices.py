@@ -4,17 +4,15 @@ import pygame
 import pytest
 
 from sitl import UsageError
-from sitl.clock import NS_PER_MS, NS_PER_S
+from sitl.clock import NS_PER_S
 from sitl.pilot import devices
 from sitl.pilot.devices import GamepadPilot, KeyboardPilot, PygamePad
 from sitl.pilot.transmitter import (
-    DEAD_ZONE,
     DEFAULT_AXES,
     OFF_US,
     PERIOD_NS,
     Axis,
     parse_axes,
-    past_dead_zone,
 )
 
 MIDDLE = (1500, 1500, 1500, 1500)
@@ -47,12 +45,6 @@ def test_the_usual_pad_flies_by_mode_2_and_an_axis_that_it_lacks_is_centred():
 def test_other_axes_are_refused_with_an_example(rest):
     with pytest.raises(UsageError, match=DEFAULT_AXES):
         parse_axes(f"throttle=1,yaw=0,pitch=4{rest}")
-
-
-def test_the_dead_zone_is_left_without_a_jump_and_full_stays_full():
-    assert past_dead_zone(DEAD_ZONE) == past_dead_zone(-DEAD_ZONE) == 0.0
-    assert past_dead_zone(DEAD_ZONE + 0.01) == pytest.approx(0.01 / (1 - DEAD_ZONE))
-    assert (past_dead_zone(-1.0), past_dead_zone(1.5)) == (-1.0, 1.0)
 
 
 class FakePad:
@@ -115,15 +107,6 @@ def keys(monkeypatch):
     made.pilot.close()
 
 
-@pytest.mark.parametrize("device", ["pad", "keys"])
-def test_frames_come_at_the_rate_of_a_receiver(request, device):
-    device = request.getfixturevalue(device)
-    assert device.frame() is not None
-    device.clock.now += 2 * NS_PER_MS
-    assert device.pilot.latest() is None
-    assert device.frame() is not None
-
-
 def test_sticks_are_channels_as_the_autopilots_have_them(pad):
     pad.values = [1.0, -1.0, 0.0, -1.0, -1.0, 0.0]
     assert pad.frame()[:4] == (1000, 1000, 2000, 2000)  # left, nose down, up, right
@@ -153,12 +136,6 @@ def test_buttons_move_the_switch_once_each_time(pad):
     assert positions == [1000, 2000, 2000, 2000, 1500, 2000, 2000, 1000]
 
 
-def test_the_mode_switch_is_moved_once_after_the_start(pad):
-    assert pad.frame()[4] == 1100
-    pad.clock.now += NS_PER_S
-    assert pad.frame()[4] == 1500
-
-
 def test_a_computer_without_a_gamepad(monkeypatch):
     monkeypatch.setenv("SDL_VIDEODRIVER", "dummy")
     monkeypatch.setenv("SDL_JOYSTICK_DISABLE_UDEV", "1")
@@ -184,23 +161,6 @@ def test_keys_move_the_sticks_as_fast_as_a_thumb(keys):
     assert keys.frame(1.0)[:4] == (1500, 1500, 1850, 1150)
     keys.press(pygame.K_s)
     assert keys.frame(1.0)[2] == 1500, "both ways are none"
-
-
-def test_keys_hold_the_gestures_and_move_the_switch(keys):
-    for key, yaw_us in ((pygame.K_RETURN, 2000), (pygame.K_BACKSPACE, 1000)):
-        keys.press(key)
-        assert keys.frame()[:4] == (1500, 1500, 1000, yaw_us)
-        keys.release(key)
-    for key, us in zip("x  ", (1500, 2000, 1000), strict=True):
-        keys.press(ord(key))
-        assert keys.frame()[6] == us
-
-
-def test_keys_that_go_to_another_window_are_released(keys):
-    keys.press(pygame.K_w)
-    assert keys.frame(1.0)[2] == 1850
-    pygame.event.post(pygame.event.Event(pygame.WINDOWFOCUSLOST))
-    assert keys.frame(1.0)[2] == 1500
 
 
 def test_a_closed_window_is_a_lost_signal(keys):

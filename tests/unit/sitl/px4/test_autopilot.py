@@ -7,7 +7,7 @@ import pytest
 from pymavlink.dialects.v20 import ardupilotmega as mav
 
 from sitl.course import AirborneStart
-from sitl.px4.modes import Mode, mode_of
+from sitl.px4.modes import Mode
 from sitl.rotation import from_euler
 
 MID = (0, 0, 500, 0)
@@ -24,11 +24,6 @@ def airborne(ends):
     ends.run(0.1)
     ends.vehicle.launch(START)
     return ends
-
-
-def lean_deg(ends):
-    _, x, y, _ = ends.ap.truth.ned_from_body_wxyz
-    return math.degrees(math.acos(1.0 - 2.0 * (x * x + y * y)))
 
 
 def test_a_launched_vehicle_hovers_in_altctl_until_sticks_come(airborne):
@@ -57,27 +52,6 @@ def test_a_launch_under_sticks_leaves_them(ends):
     assert ends.ap.stick_input.sticks.right == pytest.approx(0.3)
     ends.run(0.6)
     assert not ends.ap.stick_input.valid
-
-
-def test_its_speed_ends_where_drag_holds_the_lean(airborne):
-    airborne.run(6.0, {0: (0, 1000, 500, 0)})
-
-    assert lean_deg(airborne) == pytest.approx(35.0, abs=0.5)
-    assert math.hypot(*airborne.ap.truth.velocity_ned_mps) == pytest.approx(6.8, abs=0.3)
-
-
-def test_the_delay_of_a_failsafe_comes_back_at_a_quarter(airborne):
-    airborne.run(0.5, {0: MID})
-    airborne.run(5.0)
-    lost = airborne.ap.commander.lost_sticks
-    spent_s = 5.0 - lost.delay_s
-    airborne.command(mav.MAV_CMD_DO_SET_MODE, 1, 4, 3)
-    before_s = lost.delay_s
-
-    airborne.run(8.0)
-
-    assert spent_s == pytest.approx(4.4, abs=0.1)
-    assert lost.delay_s - before_s == pytest.approx(2.0, abs=0.05)
 
 
 def test_a_lost_position_leaves_posctl_for_altctl_and_gives_it_back(airborne):
@@ -111,32 +85,3 @@ def test_a_return_climbs_flies_home_lands_and_disarms(ends):
     assert highest_m == pytest.approx(30.0, abs=1.5)
     assert math.hypot(north, east) < 1.5
     assert not ends.ap.armed
-
-
-@pytest.mark.parametrize(
-    ("numbers", "mode"),
-    [
-        ((2, 0), Mode.ALTCTL),
-        ((3, 1), Mode.POSCTL),
-        ((4, 0), Mode.AUTO_MISSION),
-        ((4, 99), None),
-        ((9, 0), None),
-    ],
-)
-def test_modes_by_number(numbers, mode):
-    assert mode_of(*numbers) is mode
-
-
-@pytest.mark.parametrize(
-    ("mode", "flags"),
-    [
-        (Mode.ALTCTL, 81),
-        (Mode.STAB, 81),
-        (Mode.MANUAL, 81),
-        (Mode.ACRO, 65),
-        (Mode.AUTO_LOITER, 29),
-        (Mode.OFFBOARD, 1),
-    ],
-)
-def test_base_mode_of_the_heartbeat(mode, flags):
-    assert mode.base_flags == flags

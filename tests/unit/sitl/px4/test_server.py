@@ -4,12 +4,10 @@ import struct
 
 import pytest
 from pymavlink.dialects.v20 import ardupilotmega as mav
-from pymavlink.dialects.v20 import development
 
 from sitl.clock import NS_PER_S
 from sitl.px4.commander import Event
-from sitl.px4.messages import CURRENT_MODE, event_message
-from sitl.px4.modes import Mode
+from sitl.px4.messages import event_message
 
 MID = (0, 0, 500, 0)
 ACCEPTED = mav.MAV_RESULT_ACCEPTED
@@ -61,20 +59,6 @@ def test_heartbeats_of_ground_stations_are_passed_on(ends_of, kind, arrives):
     assert bool(heard) == arrives
 
 
-@pytest.mark.parametrize("link", [0, 1])
-def test_texts_come_on_the_links_that_have_a_ground_station(ends_of, link):
-    ends = ends_of(links=2)
-    ends.gcs_heartbeat(link=1)
-    ends.run(0.1)
-    ends.command(mav.MAV_CMD_DO_SET_MODE, 1, 2)
-    ends.send(mav.MAVLink_command_long_message(1, 1, 400, 0, 1, *[0] * 6))
-
-    messages = ends.run(0.1, link=link)
-
-    assert bool(named(messages, "STATUSTEXT")) == (link == 1)
-    assert named(messages, "UNKNOWN_410")
-
-
 def test_a_long_text_comes_in_numbered_chunks(ends):
     ends.gcs_heartbeat()
     ends.run(0.1)
@@ -88,16 +72,6 @@ def test_a_long_text_comes_in_numbered_chunks(ends):
     assert "".join(m.text for m in chunks) == (
         "Arming denied: Resolve system health failures first\t"
     )
-
-
-def test_current_mode_is_what_the_development_dialect_reads(ends):
-    ends.interval(CURRENT_MODE, 50)
-    (raw,) = named(ends.run(0.03), "UNKNOWN_436")[:1]
-
-    (message,) = development.MAVLink(None).parse_buffer(raw.get_msgbuf())
-
-    assert message.get_type() == "CURRENT_MODE"
-    assert message.custom_mode == message.intended_custom_mode == Mode.AUTO_LOITER.custom_mode
 
 
 def test_an_event_has_the_number_and_layout_of_the_firmware():
@@ -140,17 +114,6 @@ def test_without_a_position_its_message_goes_on(ends):
     assert named(messages, "LOCAL_POSITION_NED")
     assert not named(messages, "GLOBAL_POSITION_INT")
     assert named(messages, "ESTIMATOR_STATUS")[-1].flags == 0xE5
-
-
-def test_overrides_are_a_receiver_and_no_sticks(ends):
-    values = [1600, *[1500] * 7]
-    ends.send(mav.MAVLink_rc_channels_override_message(1, 1, *values))
-
-    messages = ends.run(0.5)
-
-    assert named(messages, "RC_CHANNELS")[-1].chan1_raw == 1600
-    assert named(messages, "RC_CHANNELS")[-1].rssi == 100
-    assert not ends.ap.stick_input.valid
 
 
 def test_mapped_channels_of_a_receiver_are_sticks_where_the_mode_allows(ends_of):

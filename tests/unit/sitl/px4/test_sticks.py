@@ -59,27 +59,6 @@ def test_a_receiver_counts_where_the_mode_says_so(in_mode, source):
     assert Senders(in_mode).send(0.2, RC_SOURCE, GCS) == source
 
 
-@pytest.mark.parametrize(("ramp_s", "is_fast"), [(0.9, True), (1.2, False)])
-def test_the_pilots_will_is_a_ramp_faster_than_full_stick_a_second(ramp_s, is_fast):
-    senders = Senders()
-    senders.send(0.2, GCS)
-    seen = False
-    for step in range(1, round(ramp_s / 0.02)):
-        senders.send(0.02, GCS, sticks=Sticks(right=step * 0.02 / ramp_s))
-        seen = seen or senders.input.moved_fast
-
-    assert seen == is_fast
-
-
-def test_override_speed_minus_one_switches_it_off():
-    senders = Senders()
-    senders.params.set("MAN_OVERRIDE_SPD", -1.0)
-    for step in range(10):
-        senders.send(0.02, GCS, sticks=Sticks(right=step * 0.1))
-
-    assert not senders.input.moved_fast
-
-
 def test_pretended_sticks_stay_until_real_ones_come():
     senders = Senders()
     senders.input.pretend_centred(0)

@@ -50,29 +50,6 @@ def test_motor_order_and_signs(commands, axis, sign):
     assert all(abs(rate) < 1e-3 for other, rate in enumerate(rates) if other != axis)
 
 
-def test_a_roll_to_the_right_drifts_east_when_heading_north():
-    quad = Quadrotor()
-    state = fly((0.5,) * 4, 1.0, quad=quad)
-    state = fly((0.45, 0.55, 0.55, 0.45), 0.1, state=state, quad=quad)
-    state = fly((0.5,) * 4, 0.3, state=state, quad=quad)
-
-    roll, _, _ = rotation.to_euler(state.body.ned_from_body_wxyz)
-    assert roll > 0.05
-    assert state.body.velocity_ned_mps[1] > 0.1
-    assert state.body.velocity_ned_mps[0] == pytest.approx(0.0, abs=1e-3)
-
-
-def test_a_step_depends_on_its_arguments_alone():
-    quad = Quadrotor()
-    start = fly((0.5, 0.6, 0.5, 0.6), 0.7, quad=quad)
-
-    first = quad.step(start, (0.4, 0.5, 0.6, 0.5), 80)
-    quad.step(quad.at_rest(), (1.0,) * 4, 400)
-    again = quad.step(start, (0.4, 0.5, 0.6, 0.5), 80)
-
-    assert first.body == again.body
-
-
 angle = st.floats(-3.1, 3.1)
 pitch = st.floats(-1.5, 1.5)
 

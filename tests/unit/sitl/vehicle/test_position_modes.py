@@ -31,22 +31,6 @@ def test_it_stops_and_stays_there_in_the_wind(pilot, mode):
     assert pilot.height_m == pytest.approx(start_m, abs=0.3)
 
 
-@pytest.mark.parametrize("mode", PILOTED)
-def test_sticks_lean_turn_and_climb_as_in_alt_hold(pilot, mode):
-    in_alt_hold = type(pilot)(pilot.ap.config)
-    for one in (pilot, in_alt_hold):
-        one.take_off()
-    assert pilot.ap.set_mode(mode)
-    for one in (pilot, in_alt_hold):
-        one.hold(2.5, roll=1700, thr=1700, yaw=1700)
-
-    flown, wanted = pilot.ap.truth, in_alt_hold.ap.truth
-    assert abs(pilot.angles_deg()[0]) > 9.0
-    assert pilot.angles_deg() == pytest.approx(in_alt_hold.angles_deg(), abs=0.3)
-    assert flown.velocity_ned_mps == pytest.approx(wanted.velocity_ned_mps, abs=0.05)
-    assert flown.rate_body_radps == pytest.approx(wanted.rate_body_radps, abs=0.02)
-
-
 def test_without_a_position_it_is_refused_in_the_air(pilot):
     pilot = type(pilot)(VehicleConfig(position_ready_s=math.inf))
     pilot.take_off()
