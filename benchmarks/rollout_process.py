@@ -89,7 +89,7 @@ def measure(job: RolloutJob, video: Path) -> Trial:
     start, decider = still_start(sampler.config), WorldModelDecider(sampler, from_pixels=False)
     writer_rss_mb: float | None = None
 
-    def on_frame(frame: RolloutFrame, rgb: ImageArray | None) -> None:
+    def on_frame(frame: RolloutFrame, rgb: ImageArray) -> None:
         nonlocal writer_rss_mb
         if frame.number + 1 == plan.iterations * plan.frames and output.writer_pid is not None:
             writer_rss_mb = peak_rss_mb(output.writer_pid)  # the writer still runs

@@ -24,7 +24,7 @@ class SerialOutput(StreamedOutput):
     """
 
     def _open(self) -> None:
-        self._video, self._jobs = None, queue.Queue(1)  # nothing runs beside the loop
+        self._jobs = queue.Queue(1)  # nothing runs beside the loop
         self._collected: list[tuple[RolloutFrame, ImageArray]] = []
         self._written = 0
 
@@ -38,7 +38,7 @@ class SerialOutput(StreamedOutput):
         for frame in self._rows(segment):
             rgb = segment.decoded[frame.frame]
             self._collected.append((frame, rgb))
-            self._show(frame, rgb if self._decode_video else None)
+            self._show(frame, rgb)
 
     def finish(self, on_wait: Callable[[], None] = lambda: None) -> None:
         """Write everything."""
@@ -46,15 +46,14 @@ class SerialOutput(StreamedOutput):
             table = TableWriter(self.out, SCHEMA)
             try:
                 table.append(rows_batch([frame for frame, _ in self._collected]))
-                if self._decode_video:
-                    size = self._sampler.config.image_size
-                    with closing(
-                        FragmentedMp4(self.out, height=size, width=size, hz=1 / self._frame_dt_s)
-                    ) as video:
-                        for frame, rgb in self._collected:
-                            video.append(rgb, captured_ns(frame))
-                            self._written += 1
-                            on_wait()
+                size = self._sampler.config.image_size
+                with closing(
+                    FragmentedMp4(self.out, height=size, width=size, hz=1 / self._frame_dt_s)
+                ) as video:
+                    for frame, rgb in self._collected:
+                        video.append(rgb, captured_ns(frame))
+                        self._written += 1
+                        on_wait()
             except BaseException:
                 table.abandon()
                 raise
