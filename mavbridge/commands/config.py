@@ -147,8 +147,11 @@ class ImagineConfig:
     """Imagined frames that a segment of the video holds; by default the executed ones."""
     ddim_steps: int = 4
     """DDIM steps of the world model."""
+    decode_video: bool = True
+    """Write a video; without it only the rows are written."""
     fast_policy_no_decode: bool = False
     """Let the world model decide from its latents, without decoding and encoding them again."""
+    rerun: Annotated[str, Parameter(help="spawn, connect[=URL], FILE.rrd, or off.")] = "off"
 
     def __post_init__(self) -> None:
         """Refuse values out of range."""

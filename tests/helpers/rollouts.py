@@ -184,13 +184,14 @@ def run(
     *,
     decider: str = "world-model",
     serial: bool = False,
+    decode_video: bool = True,
     model: TinyWorld | None = None,
     on_frame: OnFrame = ignore_frame,
 ) -> Finished:
     model = model or TinyWorld()
     sampler = make_sampler(model, serial=serial, steps=plan.ddim_steps)
     kind = SerialOutput if serial else StreamedOutput
-    output = kind(out, sampler, plan, on_frame=on_frame)
+    output = kind(out, sampler, plan, decode_video=decode_video, on_frame=on_frame)
     try:
         for segment in segments(sampler, plan, decider):
             output.put(segment)

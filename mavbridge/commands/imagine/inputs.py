@@ -1,5 +1,6 @@
 """The world model as the loop calls it, and the observed past at which a rollout starts."""
 
+from collections import deque
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -247,3 +248,42 @@ def _start_images(flight: RecordedFlight, frames: list[int], size: int) -> NDArr
 
 def _nearest(stamps_ns: NDArray[np.int64], at_ns: int) -> int:
     return int(np.abs(stamps_ns - at_ns).argmin())
+
+
+class RealFrames:
+    """Images of the flight's camera after the start, at the world model's times and size.
+
+    Decodes forward only; keeps as many frames as one segment has, since segments overlap.
+    """
+
+    def __init__(self, flight: RecordedFlight, config: WorldModelConfig, newest_ns: int) -> None:
+        self._captured_ns: NDArray[np.int64] = flight.frames["captured_ns"].to_numpy()
+        self._images: Iterator[ImageArray] = flight.rgb_images()
+        self._config = config
+        self._newest_ns = newest_ns
+        self._decoded = 0
+        self._newest_step = 0
+        self._window: deque[ImageArray] = deque(maxlen=config.frames)
+
+    def at(self, step: int) -> ImageArray | None:
+        """The frame ``step`` times ``frame_dt_s`` after the start; None once the flight is over.
+
+        Raises:
+            ValueError: it has left the window: steps may go back by one segment at most.
+            VideoError: the video is damaged.
+        """
+        while self._newest_step < step:
+            dt_s, size = self._config.frame_dt_s, self._config.image_size
+            at_ns = self._newest_ns + round((self._newest_step + 1) * dt_s * NS_PER_S)
+            if at_ns > self._captured_ns[-1]:
+                return None
+            rgb = None
+            while self._decoded <= _nearest(self._captured_ns, at_ns):
+                rgb = next(self._images)
+                self._decoded += 1
+            self._newest_step += 1
+            # Two steps share a frame only where the camera is slower than the world model.
+            self._window.append(self._window[-1] if rgb is None else resize(rgb, size, size))
+        if self._newest_step - step >= len(self._window):
+            raise ValueError(f"step {step} has left the window")
+        return self._window[step - self._newest_step - 1]

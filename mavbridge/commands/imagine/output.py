@@ -47,11 +47,11 @@ SCHEMA = pa.schema(
 )
 """The columns of docs/formats.md, named as the attributes of ``RolloutFrame``."""
 
-OnFrame: TypeAlias = Callable[[RolloutFrame, ImageArray], None]
-"""Called for every frame [H, W, 3] in the video's order, by one thread."""
+OnFrame: TypeAlias = Callable[[RolloutFrame, ImageArray | None], None]
+"""Called for every frame [H, W, 3] in the video's order, by one thread; None: not decoded."""
 
 
-def ignore_frame(frame: RolloutFrame, rgb: ImageArray) -> None:
+def ignore_frame(frame: RolloutFrame, rgb: ImageArray | None) -> None:
     """An ``OnFrame`` that does nothing."""
 
 
@@ -77,10 +77,13 @@ def prepare_out(out: Path) -> None:
 def read_rows(out: Path) -> Any:
     """The rows of a rollout's frames, finished or cut off: a ``pyarrow.Table`` of ``SCHEMA``.
 
+    A rollout without a video has its rows alone.
+
     Raises:
         MavbridgeError: there is none, or it is damaged.
     """
-    return read_table(out, SCHEMA).slice(0, count_frames(out))
+    table = read_table(out, SCHEMA)
+    return table.slice(0, count_frames(out)) if out.exists() else table
 
 
 @contextmanager
@@ -172,8 +175,8 @@ class FrameDecoder:
 class _DecodeJob:
     frames: list[RolloutFrame]
     decoded: dict[int, ImageArray]
-    missing: Tensor
-    """Latents of the frames that are not decoded yet, in order."""
+    missing: Tensor | None
+    """Latents of the frames that are not decoded yet, in order; None: no video is wanted."""
     ready: torch.cuda.Event | None
     """Event of the GPU after which they may be read."""
 
@@ -190,11 +193,13 @@ class StreamedOutput:
         sampler: Sampler,
         plan: RolloutPlan,
         *,
+        decode_video: bool = True,
         on_frame: OnFrame = ignore_frame,
     ) -> None:
-        """Open the output at ``out``."""
+        """Open the output at ``out``; without ``decode_video`` it is the rows alone."""
         self.out = out
         self._plan = plan
+        self._decode_video = decode_video
         self._clock = sampler.clock
         self._sampler = sampler
         self._frame_dt_s = sampler.config.frame_dt_s
@@ -209,13 +214,15 @@ class StreamedOutput:
         self._decoder = FrameDecoder(self._sampler.model)
         self._jobs: queue.Queue[_DecodeJob | None] = queue.Queue(QUEUED_SEGMENTS)
         self._table_path = self.out.with_suffix(".arrows")
+        self._video: VideoWriter | None = None
         with writing(self._table_path):
             self._table = TableWriter(self.out, SCHEMA)
-        try:
-            self._video = VideoWriter(self.out, pressure="offline", hz=1 / self._frame_dt_s)
-        except BaseException:
-            self._table.abandon()
-            raise
+        if self._decode_video:
+            try:
+                self._video = VideoWriter(self.out, pressure="offline", hz=1 / self._frame_dt_s)
+            except BaseException:
+                self._table.abandon()
+                raise
         self._worker = Worker("mavbridge-rollout-decode", self._serve)
         self._worker.start()
 
@@ -232,20 +239,21 @@ class StreamedOutput:
     @property
     def writer_queue(self) -> int:
         """Frames that wait to be written."""
-        return self._video.lost
+        return 0 if self._video is None else self._video.lost
 
     @property
     def writer_pid(self) -> int | None:
-        """Process id of the writer."""
-        return self._video.pid
+        """Process id of the writer; None where there is none."""
+        return None if self._video is None else self._video.pid
 
     def put(self, segment: Segment) -> None:
         """Queue a segment; waits while the queue is full."""
         frames = self._rows(segment)
-        ready = None
-        missing = segment.latents[[k for k in range(len(frames)) if k not in segment.decoded]]
-        if missing.is_cuda:
-            ready = torch.cuda.current_stream(missing.device).record_event()
+        missing = ready = None
+        if self._video is not None:
+            missing = segment.latents[[k for k in range(len(frames)) if k not in segment.decoded]]
+            if missing.is_cuda:
+                ready = torch.cuda.current_stream(missing.device).record_event()
         job = _DecodeJob(frames=frames, decoded=segment.decoded, missing=missing, ready=ready)
         with self._sampler.meter.decode:
             self._enqueue(job)
@@ -280,11 +288,12 @@ class StreamedOutput:
             self._wait_until(lambda: self._worker.ends_within(_POLL_S), on_wait)
             self._worker.join(END_S)
         with self._sampler.meter.write:
-            self._video.finish()
-            if self._video.written != self._table.rows:
-                raise RolloutError(
-                    f"{self._video.written} frames were written for {self._table.rows} rows"
-                )
+            if self._video is not None:
+                self._video.finish()
+                if self._video.written != self._table.rows:
+                    raise RolloutError(
+                        f"{self._video.written} frames were written for {self._table.rows} rows"
+                    )
             with writing(self._table_path):
                 self._table.finish()
 
@@ -292,7 +301,8 @@ class StreamedOutput:
         """Stop the thread and the writer; what is written stays readable."""
         with suppress(BaseException):  # it is what led here
             self._worker.join(END_S)
-        self._video.close()
+        if self._video is not None:
+            self._video.close()
         self._table.abandon()
 
     def _serve(self, stop: Event) -> None:
@@ -310,20 +320,24 @@ class StreamedOutput:
         # Rows first: after a crash there may be rows without a frame, but no frame without a row.
         with writing(self._table_path):
             self._table.append(rows_batch(job.frames))
-        images = self._decoder.frames(job.missing, job.ready)
+        images: Iterator[ImageArray] = iter(())
+        if job.missing is not None:
+            images = self._decoder.frames(job.missing, job.ready)
         for frame in job.frames:
             if stop.is_set():
                 return
-            rgb = job.decoded.get(frame.frame)
-            if rgb is None:
-                rgb = next(images)
-                self.frames_decoded += 1
-            row = FrameRow(
-                frame_id=frame.number,
-                captured_ns=captured_ns(frame),
-                ready_ns=self._clock.now_ns(),
-            )
-            self._video.submit(rgb, row)
+            rgb = None
+            if self._video is not None:
+                rgb = job.decoded.get(frame.frame)
+                if rgb is None:
+                    rgb = next(images)
+                    self.frames_decoded += 1
+                row = FrameRow(
+                    frame_id=frame.number,
+                    captured_ns=captured_ns(frame),
+                    ready_ns=self._clock.now_ns(),
+                )
+                self._video.submit(rgb, row)
             self._show(frame, rgb)
 
     def _rows(self, segment: Segment) -> list[RolloutFrame]:
@@ -342,8 +356,9 @@ class StreamedOutput:
             for row in range(plan.frames)
         ]
 
-    def _show(self, frame: RolloutFrame, rgb: ImageArray) -> None:
+    def _show(self, frame: RolloutFrame, rgb: ImageArray | None) -> None:
         """Count a frame that has left the decoder, and let the observer see it."""
-        self._digest.update(np.ascontiguousarray(rgb).data)
+        if rgb is not None:
+            self._digest.update(np.ascontiguousarray(rgb).data)
         self._on_frame(frame, rgb)
         self.frames += 1

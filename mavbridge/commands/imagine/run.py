@@ -1,6 +1,6 @@
 """``mavbridge imagine``: from a recorded flight and the settings to the files of a rollout."""
 
-from contextlib import ExitStack
+from contextlib import ExitStack, closing
 from dataclasses import replace
 from pathlib import Path
 
@@ -11,6 +11,7 @@ from rich.text import Text
 import policy
 from mavbridge.commands.config import ImagineConfig
 from mavbridge.commands.imagine.inputs import (
+    RealFrames,
     RolloutStart,
     Sampler,
     read_start,
@@ -24,8 +25,10 @@ from mavbridge.commands.imagine.loop import (
     rollout,
 )
 from mavbridge.commands.imagine.output import (
+    OnFrame,
     RolloutError,
     StreamedOutput,
+    ignore_frame,
     prepare_out,
 )
 from mavbridge.commands.output import progress_bar
@@ -72,7 +75,16 @@ def imagine(config: ImagineConfig) -> int:
     with ExitStack() as stack:
         decider = _make_decider(config, sampler, clock, console, stack)
         stack.enter_context(torch_threads(free))
-        output = StreamedOutput(config.out, sampler, plan)
+        on_frame: OnFrame = ignore_frame
+        if config.rerun != "off":
+            from mavbridge.observe.viewer.rollout import RolloutView
+
+            real = RealFrames(flight, model.config, start.newest_ns)
+            view = stack.enter_context(closing(RolloutView(config.rerun, real=real.at)))
+            on_frame = view.show
+        output = StreamedOutput(
+            config.out, sampler, plan, decode_video=config.decode_video, on_frame=on_frame
+        )
         was_stopped = run_rollout(sampler, decider, start, plan, output, console)
     _print_summary(config, sampler, output)
     if was_stopped:
@@ -158,10 +170,13 @@ def _print_summary(config: ImagineConfig, sampler: Sampler, output: StreamedOutp
     console = Console(highlight=False)
     meter = sampler.meter
     decoded = meter.frames_decoded + output.frames_decoded
+    what = f"{config.out}: {output.frames} frames"
+    if not config.decode_video:
+        what = f"{config.out.with_suffix('.parquet')}: {output.frames} rows, no video"
     console.print(
-        f"{config.out}: {output.frames} frames, {decoded} decoded; sampling "
-        f"{meter.sample.seconds:.2f} s, waiting for pixels {meter.decode.seconds:.2f} s, for the "
-        f"files {meter.write.seconds:.2f} s",
+        f"{what}, {decoded} decoded; sampling {meter.sample.seconds:.2f} s, waiting for pixels "
+        f"{meter.decode.seconds:.2f} s, for the files {meter.write.seconds:.2f} s",
         soft_wrap=True,
     )
-    console.print(f"sha256 of the frames: {output.sha256}", soft_wrap=True)
+    if config.decode_video:
+        console.print(f"sha256 of the frames: {output.sha256}", soft_wrap=True)

@@ -1,1 +1,1 @@
-"""The Rerun viewer: a live flight, or a recorded one."""
+"""The Rerun viewer: a live flight, a recorded one, an imagined one."""

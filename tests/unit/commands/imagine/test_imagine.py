@@ -7,6 +7,7 @@ from dataclasses import replace
 from pathlib import Path
 
 import pytest
+from rerun.chunk import RrdReader
 
 from helpers.recordings import make_meta
 from helpers.rollouts import TINY, TinyWorld, write_flight
@@ -80,6 +81,34 @@ def test_sampling_leaves_a_core_to_decoding(
     assert asked[-1] == 8, "what it was before"
 
 
+def test_without_a_video_there_are_rows_and_nothing_is_decoded(
+    imagine: Imagine, tmp_path: Path
+) -> None:
+    out = tmp_path / "a.mp4"
+    flags = ("--n-iter", "2", "--exe-steps", "16", "--no-decode-video")
+    status, text = imagine("--out", str(out), *flags, "--fast-policy-no-decode")
+    assert status == 0, text
+    assert "32 rows, no video, 0 decoded" in text
+    assert [path.name for path in tmp_path.iterdir()] == ["a.parquet"]
+    assert read_rows(out).num_rows == 32
+
+
+def test_rerun_shows_imagined_and_real_frames_states_and_sticks(
+    imagine: Imagine, tmp_path: Path
+) -> None:
+    out, rrd = tmp_path / "a.mp4", tmp_path / "a.rrd"
+    flags = ("--n-iter", "3", "--frames", "6", "--exe-steps", "6", "--rerun", str(rrd))
+    status, text = imagine("--out", str(out), *flags)
+    assert status == 0, text
+    shown: dict[str, int] = {}
+    for chunk in RrdReader(rrd).stream():
+        if not chunk.is_static and not chunk.entity_path.startswith("/__"):
+            rows = chunk.to_record_batch().num_rows
+            shown[chunk.entity_path] = shown.get(chunk.entity_path, 0) + rows
+    states = ("/state/velocity", "/state/attitude", "/state/rate", "/state/force")
+    assert shown == dict.fromkeys(("/imagined", "/real", "/sticks", *states), 18)
+
+
 def test_ctrl_c_finishes_what_is_there(
     imagine: Imagine, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -139,6 +168,7 @@ def test_a_writer_that_dies_is_one_message_that_says_what_is_left(
         (["--decider", "pilot"], "pilot"),
         (["--start", "enu", "--world-model", "enu.safetensors", *TOGE], "enu_flu"),
         (["--device", "cuda:9"], "cuda:9 is not available"),
+        (["--rerun", "a.txt"], ".rrd"),
         (["--out", "taken.mp4"], "taken.mp4 is there already"),
         (["--out", "a.avi"], "must end in .mp4"),
         (["--out", "taken.mp4/a.mp4"], "cannot write --out"),

@@ -16,7 +16,7 @@ from helpers.rollouts import (
     noise_runner,
     write_flight,
 )
-from mavbridge.commands.imagine.inputs import read_start
+from mavbridge.commands.imagine.inputs import RealFrames, read_start
 from mavbridge.commands.imagine.loop import ObservationQueue, PolicyDecider
 from mavbridge.core.clock import NS_PER_MS, NS_PER_S
 from mavbridge.core.errors import UserError
@@ -41,6 +41,17 @@ def test_context_is_a_frame_each_frame_dt_with_the_state_at_its_exposure(flight:
     assert START_NS + 490 * NS_PER_MS <= at_ns < start.newest_ns
     assert sticks is not None
     assert sticks.yaw == pytest.approx(0.049)
+
+
+def test_real_frames_follow_at_the_same_spacing_until_the_flight_ends(flight: Path) -> None:
+    opened = open_flight(flight)
+    real = RealFrames(opened, TINY, read_start(opened, TINY, 0.0).newest_ns)
+    for step in (1, 2, 3, 4, 2, 3, 4, 5):  # segments overlap
+        rgb = real.at(step)
+        assert rgb is not None
+        assert rgb.mean() == pytest.approx(grey(3 + 3 * step), abs=3)
+    assert real.at(8) is not None
+    assert real.at(9) is None
 
 
 @pytest.mark.parametrize(

@@ -184,7 +184,7 @@ def test_files_that_are_there_are_not_overwritten(tmp_path: Path) -> None:
         put_all(made)
     assert out.read_text() == "precious"
     with pytest.raises(RolloutError, match="exists"):
-        StreamedOutput(out, make_sampler(), PLAN)  # the rows are there already
+        StreamedOutput(out, make_sampler(), PLAN, decode_video=False)  # the rows are there already
 
 
 KILLED = """

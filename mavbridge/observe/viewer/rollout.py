@@ -1,0 +1,90 @@
+"""A rollout in the Rerun viewer: imagined and real frames side by side, states and sticks.
+
+Unlike a flight's view: a viewer that does not keep up slows the rollout down, and its errors end
+it.
+"""
+
+from collections.abc import Callable
+
+import cv2
+import numpy as np
+import rerun as rr
+import rerun.blueprint as rrb
+
+from mavbridge.core.records import ImageArray, RolloutFrame
+from mavbridge.observe.viewer.target import RerunRecording
+from policy.contract import ACTION_NAMES, QUATERNION, RATE, SPECIFIC_FORCE, STATE_NAMES, VELOCITY
+
+IMAGINED, REAL, STICKS = "imagined", "real", "sticks"
+STATES = {
+    "state/velocity": ("World velocity [m/s]", VELOCITY),
+    "state/attitude": ("Attitude, world from body", QUATERNION),
+    "state/rate": ("Body rates [rad/s]", RATE),
+    "state/force": ("Specific force [m/s^2]", SPECIFIC_FORCE),
+}
+
+
+def rollout_blueprint() -> rrb.Blueprint:
+    """Layout of the viewer when it opens."""
+    plots = [
+        rrb.TimeSeriesView(origin=path, name=name, plot_legend=rrb.PlotLegend(corner="LeftTop"))
+        for path, name in [(STICKS, "Sticks"), *((path, STATES[path][0]) for path in STATES)]
+    ]
+    return rrb.Blueprint(
+        rrb.Horizontal(
+            rrb.Vertical(
+                rrb.Horizontal(
+                    rrb.Spatial2DView(origin=IMAGINED, name="Imagined"),
+                    rrb.Spatial2DView(origin=REAL, name="Real, at the same time"),
+                ),
+                plots[0],
+                row_shares=[2, 1],
+            ),
+            rrb.Vertical(*plots[1:]),
+        ),
+        rrb.TimePanel(state="collapsed", timeline="frame"),
+        collapse_panels=True,
+    )
+
+
+class RolloutView:
+    """Shows frames as they come, on the timelines ``frame`` (in the video) and ``time``.
+
+    Where iterations overlap, ``time`` goes back with each, and the viewer shows the last one.
+    """
+
+    def __init__(self, target: str, *, real: Callable[[int], ImageArray | None]) -> None:
+        """Open the file or viewer; raises as ``prepare_target``.
+
+        ``real`` returns the camera's real image at a step, [H, W, 3], or None.
+        """
+        self._real = real
+        self._recording = RerunRecording("mavbridge-rollout", target)
+        self._recording.open(rollout_blueprint())
+        names = {path: list(STATE_NAMES[columns]) for path, (_, columns) in STATES.items()}
+        for path, lines in {STICKS: list(ACTION_NAMES), **names}.items():
+            self._recording.stream.log(path, rr.SeriesLines(names=lines), static=True, strict=True)
+
+    def show(self, frame: RolloutFrame, rgb: ImageArray | None) -> None:
+        """Send one frame; blocks while the viewer does not keep up. For one thread."""
+        recording = self._recording.stream
+        recording.set_time("frame", sequence=frame.number)
+        recording.set_time("time", duration=frame.time_s)
+        if rgb is not None:
+            recording.log(IMAGINED, _png(rgb), strict=True)
+        real = self._real(frame.step)
+        # Past the flight's end there is nothing to compare with: the last image must not stay.
+        recording.log(REAL, rr.Clear(recursive=False) if real is None else _png(real), strict=True)
+        recording.log(STICKS, rr.Scalars(frame.action), strict=True)
+        for path, (_, columns) in STATES.items():
+            recording.log(path, rr.Scalars(frame.state[columns]), strict=True)
+
+    def close(self) -> None:
+        """Deliver the rest; blocks until it is taken. Raises MavbridgeError: the viewer is gone."""
+        self._recording.close()
+
+
+def _png(rgb: ImageArray) -> rr.EncodedImage:
+    """Encode without loss: these images are small, and a person judges their quality."""
+    _, encoded = cv2.imencode(".png", cv2.cvtColor(np.ascontiguousarray(rgb), cv2.COLOR_RGB2BGR))
+    return rr.EncodedImage(contents=encoded.tobytes(), media_type="image/png")
