@@ -27,7 +27,7 @@ FLIGHTS := --numprocesses auto --maxprocesses 2 --dist worksteal
 MODULES ?=
 ONLY ?=
 
-.PHONY: fly check test lint bench faults fuzz mutants soak clean
+.PHONY: fly check test lint docs bench faults fuzz mutants soak clean
 
 # What flies, records and trains; `installed` adds what tests, plots and computes on many machines.
 $(VENV)/flies: pyproject.toml constraints.txt
@@ -44,6 +44,10 @@ $(VENV)/installed: $(VENV)/flies
 	$(PYTHON) -m venv .venv-peers
 	.venv-peers/bin/pip install --quiet --disable-pip-version-check --constraint constraints.txt \
 		MAVProxy mavsdk
+	touch $@
+
+$(VENV)/documents: $(VENV)/installed
+	$(PIP) --editable '.[docs]'
 	touch $@
 
 fly: $(VENV)/flies  ## a simulated vehicle in its own process, and a policy flying its course over UDP
@@ -68,8 +72,11 @@ lint: $(VENV)/installed  ## format, lint, types, import direction
 check: lint  ## all of lint, then every test that needs no second process
 	$(BIN)/pytest $(PARALLEL) -m 'not system'
 
-test: .venv-peers/installed check  ## all of lint, then every test
+test: .venv-peers/installed check docs  ## all of lint, then every test, and the site
 	$(BIN)/pytest $(FLIGHTS) -m system
+
+docs: $(VENV)/documents  ## the documentation as a site in out/site; warnings are errors
+	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --quiet --strict
 
 bench: $(VENV)/installed .venv-peers/installed  ## engines, loops and link here, beside a baseline and peers
 	$(BIN)/python -m benchmarks.compare --json out/bench.json --check benchmarks/budget.json

@@ -198,6 +198,17 @@ def test_the_pages_for_users_stay_short() -> None:
     assert sum(len(page.read_text().split()) for page in pages) <= MOST_WORDS
 
 
+def test_the_way_of_an_attitude_names_functions_that_exist() -> None:
+    page = (ROOT / "docs/dev/architecture.md").read_text()
+    table = page.split("## From an attitude datagram")[1].split("## ")[0]
+    rows = re.findall(r"^\| \d+ \| `(\S+\.py)` \| (.*) \|$", table, re.M)
+    assert len(rows) > 15
+    for name, text in rows:
+        source = (ROOT / "mavbridge" / name).read_text()
+        for function in re.findall(r"`(?:\w+\.)?(\w+)`", text):
+            assert re.search(rf"\b(?:def|class) {function}\b", source), f"{function} in {name}"
+
+
 def test_every_page_is_in_the_index() -> None:
     index = ROOT / "docs" / "README.md"
     reached = {target for target, _ in links(index)} | {index}
