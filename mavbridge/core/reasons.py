@@ -3,7 +3,7 @@
 Code decides, records and tests by ``Reason.code``. Only people read the sentence, ``str(reason)``.
 """
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from enum import Enum, StrEnum, auto
 from typing import TypeAlias
@@ -451,8 +451,13 @@ class Reason:
 
 
 def because(code: Code, **data: Value) -> Reason:
-    """Make a reason."""
-    return Reason(code, tuple(data.items()))
+    """Make a reason. Numbers of numpy become plain ones: the guard, which gets it, has no numpy."""
+    return Reason(code, tuple((name, _plain(value)) for name, value in data.items()))
+
+
+def _plain(value: Value) -> Value:
+    to_plain: Callable[[], Value] | None = getattr(value, "item", None)
+    return value if to_plain is None else to_plain()
 
 
 def reason_to_json(reason: Reason, *, has_words: bool = True) -> dict[str, object]:

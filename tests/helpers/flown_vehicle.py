@@ -1,5 +1,6 @@
 """The session of a vehicle as an output sees it, set by hand."""
 
+from types import SimpleNamespace
 from typing import cast
 
 from helpers.wire import WireEnd
@@ -25,7 +26,7 @@ class FlownVehicle:
             source=Endpoint(1, 1), address=None, vehicle_type=2, autopilot=3
         )
         self.known_params: dict[str, float] = {}
-        self.are_params_read = True
+        self.params = SimpleNamespace(is_read=True)
         self.is_receiver_hidden = False
         self.is_released = True
         self.mode = profile.modes.roles.setpoint[0]

@@ -5,13 +5,14 @@ import struct
 from dataclasses import replace
 from typing import Any
 
+import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
 from helpers.guard_facts import engagement_settings, stick_smoothing
 from mavbridge.core.link_settings import LinkSettings
-from mavbridge.core.reasons import Code, because
+from mavbridge.core.reasons import Code, Reason, because
 from mavbridge.core.vehicle import (
     ActionMeaning,
     ActionTrace,
@@ -245,3 +246,13 @@ def test_a_message_of_the_guard_that_is_cut_off_is_refused(message: FromGuard) -
     for length in range(len(whole)):
         with pytest.raises(ValueError, match="not a message"):
             decode_from_guard(whole[:length])
+
+
+@pytest.mark.parametrize("number", [np.float64(1.5), np.float32(1.5), np.int64(7), np.bool_(True)])
+def test_a_number_of_numpy_crosses_as_a_plain_one(number: Any) -> None:
+    reason = because(Code.TOO_OLD, age_ms=number)
+    assert type(dict(reason.data)["age_ms"]) in (float, int, bool)
+    assert decode_to_guard(encode_to_guard(NoChunk(reason))) == NoChunk(reason)
+    foreign = NoChunk(Reason(Code.TOO_OLD, (("age_ms", number),)))
+    with pytest.raises(ValueError, match="not a message"):  # its reader imports no numpy
+        decode_to_guard(encode_to_guard(foreign))
