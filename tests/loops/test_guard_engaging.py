@@ -14,7 +14,7 @@ from helpers.guard_flights import (
     climbing_first,
     leaning,
 )
-from mavbridge.core.errors import PeerError, UserError
+from mavbridge.core.errors import UserError
 from mavbridge.core.reasons import Code
 from mavbridge.guard.values import Phase
 from sitl.ardupilot.flight_modes import Mode
@@ -24,11 +24,6 @@ ARM = dialect.MAV_CMD_COMPONENT_ARM_DISARM
 SWITCH = 7
 TWO_MODES = replace(CONTRACT, modes=("ALT_HOLD", "LOITER"))
 LOW, HIGH = 1000, 2000
-
-
-def arm_by_pilot(flight: GuardFlight) -> None:
-    flight.ap.set_mode(Mode.ALT_HOLD)
-    assert flight.ap.arm(force=False), flight.describe()
 
 
 def test_arm_idles_the_throttle_until_the_policy_takes_over_from_there() -> None:
@@ -57,30 +52,6 @@ def test_a_gap_of_the_link_delays_arming_and_never_prevents_it(
         del flight.network.send  # type: ignore[attr-defined]
     flight.up.is_silent = flight.down.is_silent = False
     flight.until(lambda: flight.phase is Phase.FLYING, within_s=5)
-
-
-def test_the_switch_engages_by_going_high_while_armed_in_an_allowed_mode() -> None:
-    flight = GuardFlight(engage_channel=SWITCH)
-    flight.receiver(ch7=HIGH)
-    flight.launch()
-    flight.run(1)
-    assert flight.phase is Phase.WAITING, "it was high when it was first seen"
-
-    flight.receiver(ch7=LOW)
-    flight.run(2)
-    assert flight.phase is Phase.WAITING
-    flight.receiver(ch7=HIGH)
-    took_s = flight.until(lambda: flight.phase is Phase.FLYING, within_s=0.3)
-    assert took_s > 0.2, "the debounce"
-    flight.run(1)
-
-    flight.receiver(ch7=LOW)
-    took_s = flight.until(lambda: flight.phase is Phase.RELEASED, within_s=0.3)
-    assert took_s < 0.2
-    assert flight.codes == (Code.ENGAGE_SWITCH_OFF,)
-    flight.run(2)
-    flight.receiver(ch7=HIGH)
-    flight.until(lambda: flight.phase is Phase.FLYING, within_s=0.3)
 
 
 @pytest.mark.parametrize("dropout", [{"ch7": 988}, {"ch7": 988, "ch3": 950}, {"ch7": 65535}])
@@ -126,24 +97,6 @@ def test_a_mode_in_the_air_is_asked_for_while_the_pilot_keeps_the_sticks() -> No
     assert flight.phases() == [Phase.WAITING, Phase.PREPARING, Phase.FLYING]
 
 
-@pytest.mark.parametrize("act", ["release", "stop"])
-def test_ending_before_the_policy_had_the_sticks_does_not_touch_the_pilots(act: str) -> None:
-    flight = GuardFlight(contract=TWO_MODES, mode="LOITER").launch()
-    flight.up.is_silent = True
-    flight.act("engage")
-    flight.run(0.3)
-    assert flight.phase is Phase.PREPARING
-    flight.up.is_silent = False
-    if act == "release":
-        flight.act("release")
-    else:
-        flight.stop()
-    flight.run(0.5)
-
-    assert flight.phase is (Phase.RELEASED if act == "release" else Phase.ENDED)
-    assert not flight.overrides(), "the pilot was flying all the time"
-
-
 @pytest.mark.parametrize(
     ("changes", "told"),
     [
@@ -157,14 +110,6 @@ def test_a_mode_that_the_contract_does_not_name_is_refused(
 ) -> None:
     with pytest.raises(UserError, match=told):
         GuardFlight(**changes)
-
-
-@pytest.mark.parametrize("vehicle_type", [dialect.MAV_TYPE_FIXED_WING, dialect.MAV_TYPE_HELICOPTER])
-def test_anything_but_a_multirotor_is_refused_with_one_sentence(vehicle_type: int) -> None:
-    flight = GuardFlight(vehicle_type=vehicle_type)
-    with pytest.raises(PeerError, match="only multirotors are flown"):
-        flight.run(5)
-    assert not flight.overrides()
 
 
 def test_from_pilot_to_policy_without_a_jump_and_back_without_a_blend() -> None:

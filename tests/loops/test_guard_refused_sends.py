@@ -38,22 +38,6 @@ def test_in_flight_they_are_a_fault_of_the_link_after_100_ms(
     assert flight.guard.outcome.faults == 1
 
 
-@pytest.mark.parametrize(
-    ("autopilot", "kind"), [("ardupilot", "sticks"), ("ardupilot", "attitude"), ("px4", "sticks")]
-)
-def test_from_the_act_on_they_end_the_flight_and_the_summary_stands(
-    autopilot: AutopilotName, kind: ActionKind
-) -> None:
-    flight = OutputFlight(autopilot, kind).launch()
-    refuse(flight)
-    flight.act("engage")
-    flight.until(lambda: flight.phase is Phase.FLYING, within_s=0.05)
-    flight.until(lambda: flight.phase is not Phase.FLYING, within_s=REFUSED_NS / 1e9 + 2 * SLOT_S)
-    assert all(tick.sent is None for tick in flight.ticks)
-    stats = flight.link.stats()
-    assert (stats.sent_overrides, stats.saturated) == (0, ())
-
-
 def test_before_an_act_they_refuse_it() -> None:
     flight = GuardFlight().launch()
     refuse(flight)

@@ -63,16 +63,6 @@ def test_with_an_idle_receiver_hold_keeps_the_height() -> None:
     assert flight.height_m == pytest.approx(height_m, abs=0.5)
 
 
-@pytest.mark.parametrize("loss", [0.2, 0.5])
-def test_mode_and_release_are_sent_until_they_are_confirmed(loss: float) -> None:
-    flight = GuardFlight(on_fault="hold").fly()
-    flight.up.loss = loss
-    fault(flight)
-
-    assert flight.ap.mode is Mode.BRAKE
-    assert flight.record()[-1]["us"] == MID_RECEIVER_US[:4]
-
-
 def test_a_lost_request_for_the_mode_is_repeated_at_once() -> None:
     flight = GuardFlight(on_fault="hold").fly()
     flight.up.is_silent = True
@@ -104,30 +94,7 @@ def test_without_a_receiver_neutral_goes_on_until_disarming_and_no_failsafe_come
     )
 
 
-def test_without_a_receiver_a_fault_holds_the_place_for_as_long_as_it_takes() -> None:
-    flight = GuardFlight(climbing_first, receiver_us=None, arm=True).take_off()
-    flight.die()
-    flight.run(1)
-    position = flight.ap.truth.position_ned_m
-    flight.run(10)
-
-    assert flight.phase is Phase.HOLDING
-    assert flight.ap.mode is Mode.BRAKE
-    assert not any(entry["failsafe"] for entry in flight.record())
-    assert flight.ap.truth.position_ned_m == pytest.approx(position, abs=2.0)
-    assert not flight.guard.is_done
-
-
 # --- normal ends
-
-
-def test_the_duration_may_end_while_coasting() -> None:
-    flight = GuardFlight(duration=2.0, on_fault="hold").fly(1.93)
-    flight.is_flight_process_stopped = True
-    flight.until(lambda: flight.guard.is_done, within_s=3)
-
-    assert flight.codes == (Code.DURATION,)
-    assert flight.ap.mode is Mode.ALT_HOLD, "a normal end, with a receiver"
 
 
 # --- modes whose throttle is thrust

@@ -77,19 +77,6 @@ def test_a_takeover_releases_and_no_mode_command_ever_leaves(
     assert {us for _, us in releases} == {(0, 0, 0, 0)}, "after the takeover nothing but releases"
 
 
-def test_the_release_leaves_in_the_step_that_hears_of_the_takeover() -> None:
-    flight = GuardFlight().fly()
-    flight.pilot_mode(Mode.LOITER)
-    flight.until(lambda: flight.ap.mode is Mode.LOITER, within_s=0.01)
-    changed_ns = flight.clock.now_ns()
-    flight.run(0.2)
-
-    override_ns = [at_ns for at_ns, us in flight.overrides() if any(us)]
-    release_ns = next(at_ns for at_ns, us in flight.overrides() if not any(us))
-    assert release_ns - changed_ns < 5 * MS, "the vehicle's step, and the way here"
-    assert override_ns[-1] < release_ns
-
-
 def test_the_pilot_has_his_sticks_within_60_ms_by_the_vehicles_record() -> None:
     flight = GuardFlight(receiver_us=(1450, 1550, 1520, 1500, 1500, 1500, 1500, 1500)).fly()
     taken_s = flight.t_s
@@ -103,19 +90,7 @@ def test_the_pilot_has_his_sticks_within_60_ms_by_the_vehicles_record() -> None:
     assert flight.modes == ["ALT_HOLD", "LOITER"], "the bridge never changes the pilot's mode back"
 
 
-def test_a_mode_change_whose_heartbeat_is_lost_is_seen_within_a_tenth_of_a_second() -> None:
-    flight = GuardFlight().fly()
-    flight.down.is_silent = True
-    flight.pilot_mode(Mode.LOITER)
-    flight.run(0.02)
-    flight.down.is_silent = False
-    took_s = flight.until(lambda: flight.phase is not Phase.FLYING, within_s=0.2)
-
-    assert took_s < 0.11
-    assert not flight.modes_asked()
-
-
-@pytest.mark.parametrize("rate_hz", [10, 20, 25, 50, 100, 200])
+@pytest.mark.parametrize("rate_hz", [10, 50, 200])
 @pytest.mark.parametrize("policy", [hovering, leaning])
 def test_a_joystick_on_our_system_id_is_noticed_within_half_a_second(
     rate_hz: float, policy: Callable[[float], tuple[float, float, float, float]]

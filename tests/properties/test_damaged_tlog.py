@@ -4,7 +4,6 @@ from collections.abc import Sequence
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
-import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from pymavlink.dialects.v20 import ardupilotmega as dialect
@@ -91,50 +90,6 @@ def test_a_log_that_is_cut_at_either_end_says_so(head: int, tail: int) -> None:
     assert is_part(found, records)
     assert len(found) >= 20 - 5 - 3
     assert skipped.packets >= 1 or not skipped.bytes
-
-
-@given(
-    st.lists(st.integers(0, 3), min_size=3, max_size=40),
-    st.integers(0, 20),
-    st.sampled_from([b"\0", b"\xff", b"\xfe", b"\xfd\x09"]),
-    st.booleans(),
-)
-def test_records_padded_to_one_size_are_no_damage(
-    kinds: list[int], spare: int, padding: bytes, v1: bool
-) -> None:
-    records = make_records(kinds, v1=v1)
-    size = max(len(encoded(record)) for record in records) + 1 + spare
-    data = b"".join(
-        piece + (padding * size)[: size - len(piece)] for piece in map(encoded, records)
-    )
-    assert read(data) == (records, Skipped())
-
-
-def test_a_damaged_packet_of_a_padded_log_is_counted_without_its_padding() -> None:
-    records = make_records([0] * 20)
-    data = bytearray(b"".join(encoded(record).ljust(300, b"\0") for record in records))
-    data[300 * 7 + 20] ^= 1
-    found, skipped = read(bytes(data))
-    assert found == records[:7] + records[8:]
-    assert skipped == Skipped(bytes=300, packets=1)
-
-
-@pytest.mark.parametrize("stamp", [0, START_US + 90_000_000, START_US - 5_000_000, 2**63])
-def test_a_damaged_stamp_is_damage(stamp: int) -> None:
-    records = make_records([0] * 20)
-    wrong = [*records[:7], (stamp, records[7][1]), *records[8:]]
-    found, skipped = read(b"".join(map(encoded, wrong)))
-    assert found == records[:7] + records[8:]
-    assert skipped == Skipped(bytes=len(encoded(records[7])), packets=1)
-
-
-def test_a_clock_that_is_set_and_a_link_that_is_silent_are_no_damage() -> None:
-    records = [
-        (us + (number > 5) * 10**15 - (number > 9) * 5 * 10**6 + (number > 14) * 4 * 10**9, packet)
-        for number, (us, packet) in enumerate(make_records([0] * 20))
-    ]
-    records[0] = (0, records[0][1])
-    assert read(b"".join(map(encoded, records))) == (records, Skipped())
 
 
 def test_packets_of_unknown_messages_are_read() -> None:

@@ -23,7 +23,6 @@ from mavbridge.core.vehicle import (
     Decision,
     Release,
     Sticks,
-    Velocity,
 )
 from mavbridge.guard.chunks import Chunk, FreshnessLimits
 from mavbridge.guard.envelope import EnvelopeLimits
@@ -264,12 +263,6 @@ def test_before_a_policy_is_loaded_the_link_is_served_all_the_same() -> None:
     assert rig.link.decisions == []
 
 
-def test_settings_may_come_with_the_first_messages() -> None:
-    rig = Rig(first=[FLIGHT])
-    assert rig.loop.step() == START_NS + 10 * MS
-    assert rig.ticks[0].phase is Phase.WAITING
-
-
 def test_the_first_settings_of_a_flight_count() -> None:
     rig = Rig(first=[FLIGHT]).flying()
     rig.tell(replace(FLIGHT, stick_period_ns=50 * MS), GuardSettings(link=LinkSettings()))
@@ -297,26 +290,6 @@ def test_why_there_is_no_chunk_is_passed_on_to_the_user() -> None:
     rig.tell(FLIGHT, NoChunk(because(Code.IMAGE_BLANK, what="black", age_s=0.6)))
     rig.run(0.1)
     assert rig.ticks[-1].reason == because(Code.IMAGE_BLANK, what="black", age_s=0.6)
-
-
-def test_a_chunk_is_the_end_of_the_reason_for_there_being_none() -> None:
-    rig = Rig().flying()
-    rig.solves = False
-    rig.tell(NoChunk(because(Code.IMAGE_BLANK, what="black", age_s=0.6)), rig.chunk())
-    rig.run(0.2)
-    assert rig.ticks[-1].phase is not Phase.FLYING
-    reason = rig.ticks[-1].reason
-    assert reason is not None
-    assert reason.codes == (Code.LATE,)
-    assert dict(reason.data)["age_ms"] == 110
-    assert dict(reason.data)["limit_ms"] == 100
-
-
-def test_a_message_that_is_none_is_an_error() -> None:
-    rig = Rig()
-    rig.port.inbox.append(b"?")
-    with pytest.raises(ValueError, match="not a message"):
-        rig.loop.step()
 
 
 # --- the vehicle
@@ -362,16 +335,6 @@ def test_every_ground_station_is_told_who_holds_the_sticks() -> None:
         "mavbridge: control given back: the policy has failed; then mode changed from BRAKE to "
         "LOITER",
     ]
-
-
-def test_an_oversleep_delays_slots_and_loses_none() -> None:
-    rig = Rig(oversleep_ns=MS)
-    rig.solves = False
-    rig.tell(FLIGHT)
-    rig.run(5.0)
-    assert sum(tick.missed_slots for tick in rig.ticks) == 0
-    assert [tick.index for tick in rig.ticks] == list(range(len(rig.ticks)))
-    assert {tick.sent_ns - tick.due_ns for tick in rig.ticks[2:]} == {MS}
 
 
 def test_work_that_begins_before_the_slot_sends_at_the_slot() -> None:
@@ -479,15 +442,6 @@ def test_a_chunk_that_has_come_with_the_end_of_the_channel_does_not_fly() -> Non
     rig.port.is_closed = True
     rig.loop.step()
     assert rig.link.decisions[-1][1] == Command(action=NEUTRAL)
-
-
-def test_the_first_reason_to_end_is_the_one_that_counts() -> None:
-    rig = Rig().flying()
-    rig.loop.stop(EndRequest(reason=because(Code.TOLD_TO_END)))
-    rig.tell(EndRequest(reason=because(Code.POLICY_FAILED), is_fault=True))
-    rig.run(1.0)
-    assert rig.link.hands[-1] == Release(because(Code.TOLD_TO_END))
-    assert rig.loop.is_done
 
 
 @pytest.mark.parametrize("has_policy", [True, False], ids=["flight", "weights still loading"])
@@ -661,40 +615,3 @@ def test_a_guard_that_fails_leaves_no_body_rates_behind() -> None:
     rig.loop.abandon()
     level = str(Command(action=AttitudeThrust(0.4, 0.0, 0.0, 0.0)))
     assert rig.link.transmitted[0][1] == level
-
-
-def test_a_guard_that_fails_in_a_flight_by_setpoints_asks_the_vehicle_to_hold() -> None:
-    rig = Rig(mode="GUIDED")
-    rig.wanted = Velocity(1.0, 0.0, 0.0, 0.0)
-    setpoints = engagement_settings(modes=("GUIDED",), is_setpoint=True)
-    rig.tell(replace(FLIGHT, meaning=ActionMeaning(kind="velocity"), engagement=setpoints))
-    rig.run(0.3)
-    rig.tell("engage")
-    rig.run(0.1)
-    assert rig.link.announced == ["mavbridge: the policy has control"]
-    rig.loop.abandon()
-    assert [text for _, text in rig.link.transmitted].count("BRAKE") == 3
-
-
-def test_a_guard_that_fails_after_a_takeover_leaves_the_pilots_mode_alone() -> None:
-    rig = Rig(mode="GUIDED")
-    rig.wanted = Velocity(1.0, 0.0, 0.0, 0.0)
-    setpoints = engagement_settings(modes=("GUIDED",), is_setpoint=True)
-    rig.flying(replace(FLIGHT, meaning=ActionMeaning(kind="velocity"), engagement=setpoints))
-    rig.link.status = replace(rig.link.status, mode="LOITER")
-    rig.run(0.1)
-    rig.loop.abandon()
-    assert "BRAKE" not in [text for _, text in rig.link.transmitted]
-
-
-def test_the_reason_for_no_flight_is_known_at_the_end() -> None:
-    rig = Rig(armed=False, is_landed=True)
-    assert rig.loop.failure is None
-    rig.link.obeys = rig.solves = False
-    engagement = replace(FLIGHT.engagement, arm=True)
-    rig.tell(replace(FLIGHT, engagement=engagement))
-    rig.run(100.0)
-    assert rig.loop.is_done
-    assert codes(rig.loop.failure) == (Code.NOT_READY, Code.NO_CHUNK)
-    assert rig.loop.failure is not None
-    assert dict(rig.loop.failure.data)["after_s"] == 90

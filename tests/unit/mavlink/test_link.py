@@ -288,36 +288,6 @@ def test_commands_are_echoed_and_confirmed() -> None:
     assert rig.link.stats().echo_confirmed is True
 
 
-@pytest.mark.parametrize(
-    ("params", "expected"),
-    [
-        ({"MAV_GCS_SYSID": 42.0}, "--set-config link.source_system=42"),
-        ({"RC_OPTIONS": 2.0}, "RC_OPTIONS bit 1"),
-        ({"RC_OVERRIDE_TIME": 0.0}, "RC_OVERRIDE_TIME is 0"),
-    ],
-)
-def test_a_vehicle_that_would_ignore_us_is_reported_before_a_stick_is_sent(
-    params: dict[str, float], expected: str
-) -> None:
-    rig = Rig()
-    rig.vehicle.params |= params
-    problem = rig.run(8.0).problem
-    assert problem is not None
-    assert problem.code is Code.OBSTACLE
-    assert "would ignore our sticks" in str(problem)
-    assert expected in str(problem)
-
-
-def test_a_radio_calibration_that_would_fail_in_flight_is_a_problem_and_not_an_error() -> None:
-    rig = Rig()
-    rig.vehicle.params["RC1_MAX"] = 2250.0
-    problem = rig.run(8.0).problem
-    assert problem is not None
-    assert problem.code is Code.CALIBRATION_UNUSABLE
-    assert "--set RC1_MAX=2200" in str(problem)
-    assert rig.link.send(Command(action=Sticks(0.0, 0.0, 0.0, 1.0))) is None
-
-
 def test_a_parameter_is_set_over_the_wire_also_after_a_reboot() -> None:
     rig = Rig(set_params=(("RC_OVERRIDE_TIME", 0.5),))
     assert rig.run(8.0).problem is None
@@ -359,15 +329,6 @@ def test_a_vehicle_that_ignores_us_is_noticed(resting_throttle_us: int) -> None:
     assert snapshot.is_overruled
     assert not snapshot.echo_confirmed
     assert rig.link.stats().echo_confirmed is False
-
-
-def test_without_rc_channels_there_is_nothing_to_check_against() -> None:
-    rig = Rig()
-    rig.run(8.0)
-    rig.vehicle.shows_rc = False
-    rig.vehicle.follows_overrides = False
-    unshown = because(Code.NO_ECHO, message="RC_CHANNELS", quantity="sticks")
-    assert rig.run(1.3, Command(action=IDLE)).problem == unshown
 
 
 def test_releases_leave_every_50_ms_while_they_are_asked_for_and_not_for_ever() -> None:
@@ -452,15 +413,6 @@ def test_readonly_sends_no_stick() -> None:
     rig.link.announce("mavbridge: the policy has control")
     rig.run(0.1)
     assert "STATUSTEXT" not in {message.get_type() for message in rig.vehicle.received}
-
-
-def test_the_override_switch_decides() -> None:
-    rig = Rig()
-    rig.vehicle.params["RC7_OPTION"] = 46.0
-    rig.vehicle.channels[6] = 1000
-    assert rig.run(9.0).problem == because(Code.OVERRIDE_SWITCH_NOT_ON, channel=7)
-    rig.vehicle.channels[6] = 2000
-    assert rig.run(0.3).problem is None
 
 
 def test_a_silent_vehicle_is_lost_after_three_beats_and_found_again() -> None:
@@ -571,16 +523,6 @@ def test_a_second_sender_with_the_vehicles_id_is_ignored_and_ends_no_flight(
     assert "is ignored: the vehicle is at 127.0.0.1:1" in told[0]
 
 
-def test_one_old_stamp_is_no_reboot_and_costs_no_release() -> None:
-    rig = Rig()
-    rig.run(8.0)
-    rig.run(0.2, Command(action=IDLE))
-    mav = rig.vehicle.end.mav
-    rig.vehicle.put(mav.attitude_quaternion_encode(3, 1, 0, 0, 0, 0, 0, 0))
-    assert rig.run(0.2, Command(action=IDLE)).problem is None
-    assert not any("rebooted" in text for text in rig.texts)
-
-
 def test_a_reboot_ends_the_engagement_and_still_leaves_a_release() -> None:
     rig = Rig()
     rig.run(8.0)
@@ -595,17 +537,6 @@ def test_a_reboot_ends_the_engagement_and_still_leaves_a_release() -> None:
         rig.run(0.2, PILOTS)
         assert rig.overrides()[count:] == [RELEASE_US] * 4
         assert rig.run(8.0).problem is None
-
-
-def test_a_reboot_starts_the_handshake_again() -> None:
-    rig = Rig()
-    rig.run(8.0)
-    reads = rig.vehicle.names().count("PARAM_REQUEST_READ")
-    rig.vehicle.boot_ns = rig.clock.now_ns()
-    assert rig.run(0.05).problem is not None
-    assert rig.run(8.0).problem is None
-    assert rig.vehicle.names().count("PARAM_REQUEST_READ") == 2 * reads
-    assert any("rebooted" in text for text in rig.texts)
 
 
 def test_mode_and_arm_are_not_requested_too_often_and_refusals_are_reported() -> None:
@@ -628,25 +559,6 @@ def test_mode_and_arm_are_not_requested_too_often_and_refusals_are_reported() ->
     rig.run(0.01)
     assert "the vehicle answered COMPONENT_ARM_DISARM with FAILED" in rig.texts
     assert "vehicle: Arm: Throttle too high" in rig.texts
-
-
-def test_a_refused_mode_is_named_until_another_is_asked_for() -> None:
-    rig = Rig()
-    rig.run(8.0)
-    rig.vehicle.results[176, 17.0] = dialect.MAV_RESULT_FAILED
-    rig.link.commands.set_mode("BRAKE")
-    assert rig.run(0.02).refused_mode == "BRAKE"
-    rig.link.commands.set_mode("BRAKE")
-    assert rig.run(0.02).refused_mode == "BRAKE"
-    rig.link.commands.set_mode("LAND")  # at once, though a mode was asked for just now
-    assert rig.run(0.02).refused_mode is None
-    modes = [m.param2 for m in rig.vehicle.received if getattr(m, "command", 0) == 176]
-    assert modes == [17, 9]
-    rig.link.commands.set_mode("BRAKE")
-    assert rig.run(4.0).refused_mode == "BRAKE"
-    rig.vehicle.is_deaf = True
-    rig.link.commands.set_mode("BRAKE")  # long after the refusal, and not answered yet
-    assert rig.link.poll().refused_mode is None
 
 
 def test_announcements_reach_the_vehicles_link() -> None:
@@ -833,19 +745,6 @@ def test_px4_that_does_not_hear_our_sticks_is_noticed() -> None:
     assert not snapshot.is_overruled
 
 
-def test_other_sticks_that_px4_follows_are_noticed() -> None:
-    rig = px4_rig()
-    rig.run(8.0)
-    rig.run(0.5, Command(action=IDLE))
-    rig.vehicle.put(rig.vehicle.end.mav.manual_control_encode(1, 300, -200, 700, 0, 0))
-    rig.vehicle.follows_overrides = False
-    snapshot = rig.run(0.02, Command(action=IDLE))
-    assert snapshot.problem is not None
-    assert snapshot.problem.code is Code.OVERRULED
-    assert "another station sends sticks" in str(snapshot.problem)
-    assert snapshot.is_overruled
-
-
 def test_the_velocity_that_px4_sends_without_an_estimate_is_nobodys_velocity() -> None:
     rig = px4_rig()
     before, count = rig.run(8.0).telemetry.velocity_ned_mps, len(rig.packets)
@@ -943,11 +842,6 @@ def test_a_takeoff_is_asked_for_as_the_firmware_wants_it() -> None:
     assert heights(px4) == [494.4]
 
 
-def test_ardupilot_with_manual_control_is_refused() -> None:
-    with pytest.raises(PeerError, match="--output rc-override"):
-        Rig(output="manual-control").run(3.0)
-
-
 def test_an_output_that_makes_no_sense_is_refused_at_once_where_the_vehicle_is_known() -> None:
     rig = Rig(meaning=None)
     rig.run(8.0)
@@ -979,11 +873,6 @@ def test_acks_for_other_stations_are_ignored() -> None:
     ]
     assert intervals[:8] == [31, 32, 105, 65, 1, 245, 193, 0]
     assert set(intervals[8:]) == {1, 245, 193, 0}  # which this vehicle grants and never sends
-
-
-def test_px4_with_rc_override_is_refused() -> None:
-    with pytest.raises(PeerError, match="--output manual-control"):
-        px4_rig(output="rc-override").run(3.0)
 
 
 def test_noise_that_looks_like_packets_of_unknown_messages_is_no_mavlink() -> None:

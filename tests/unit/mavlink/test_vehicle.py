@@ -474,6 +474,10 @@ def test_a_refused_mode_is_known_until_another_is_asked_for_or_it_is_granted() -
     assert answer(dialect.MAV_RESULT_DENIED) == "BRAKE"
     commands.set_mode("LAND")
     assert (len(sent), commands.refused_mode) == (2, None)
+    assert answer(dialect.MAV_RESULT_FAILED) == "LAND"
+    clock.advance_ns(3 * S + 1)
+    commands.set_mode("LAND")  # long after the refusal, and not answered yet
+    assert commands.refused_mode is None
 
 
 @pytest.mark.parametrize(
@@ -518,12 +522,6 @@ def test_the_override_switch_is_on_after_the_debounce_and_off_at_once() -> None:
     session.now_ns += 20 * MS
     session.rc((*RECEIVER[:6], 1000, 1500))
     assert session.session.is_switched_off
-
-
-def test_without_a_switch_nothing_is_switched_off() -> None:
-    session = Session()
-    session.rc((*RECEIVER[:6], 1000, 1000))
-    assert not session.session.is_switched_off
 
 
 # --- the echo, in words
