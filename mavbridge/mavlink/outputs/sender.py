@@ -16,10 +16,9 @@ from mavbridge.core.vehicle import (
 )
 from mavbridge.mavlink.codec.packets import Codec, CommandRefusedError
 from mavbridge.mavlink.outputs.attitude import AttitudeOutput
-from mavbridge.mavlink.outputs.manual_control import ManualControlOutput
 from mavbridge.mavlink.outputs.output import ActionOutput
-from mavbridge.mavlink.outputs.override import OverrideOutput
-from mavbridge.mavlink.outputs.velocity import VelocityOutput
+from mavbridge.mavlink.outputs.setpoints import VelocityOutput
+from mavbridge.mavlink.outputs.sticks import ManualControlOutput, OverrideOutput
 from mavbridge.mavlink.profiles.profile import Profile
 from mavbridge.mavlink.session.commands import mode_request
 from mavbridge.mavlink.session.vehicle import VehicleSession

@@ -1,11 +1,30 @@
-"""Common part of both outputs for sticks: the policy's sticks and the vehicle's."""
+"""Outputs for sticks: RC_CHANNELS_OVERRIDE (ArduPilot) and MANUAL_CONTROL (PX4), with echoes."""
 
+from collections.abc import Mapping
 from dataclasses import replace
+from typing import ClassVar
 
-from mavbridge.core.clock import NS_PER_MS
-from mavbridge.core.vehicle import IDLE, Action, AdviceText, StickGains, Sticks, VehicleStatus
-from mavbridge.mavlink.codec.packets import Codec, CommandRefusedError
-from mavbridge.mavlink.outputs.echo import EchoRules
+from mavbridge.core.clock import NS_PER_MS, NS_PER_S
+from mavbridge.core.vehicle import (
+    IDLE,
+    NEUTRAL,
+    Action,
+    AdviceText,
+    Output,
+    StickGains,
+    Sticks,
+    VehicleStatus,
+)
+from mavbridge.mavlink.codec.calibration import RcCalibration
+from mavbridge.mavlink.codec.messages import STICK_END, Body, ManualControl, RcChannels
+from mavbridge.mavlink.codec.packets import (
+    Codec,
+    CommandRefusedError,
+    manual_control_of,
+    manual_control_sticks,
+    pwm_of,
+)
+from mavbridge.mavlink.outputs.echo import EchoFault, EchoRules, Shown
 from mavbridge.mavlink.outputs.output import ActionOutput, Encoded
 from mavbridge.mavlink.profiles.sticks import IDENTITY, StickCurves
 from mavbridge.mavlink.session.vehicle import VehicleSession
@@ -106,3 +125,254 @@ class StickOutput(ActionOutput):
                     self._told.add(note)
                     self._new_notes.append(AdviceText(note))
         return self._curves
+
+
+OVERRIDE_ECHO = EchoRules(tolerance=2, dithered=3, dither=1, seek_dither=4, centre=1500)
+"""In us. A receiver at rest moves by 2; the vehicle itself shows overrides to the microsecond.
+
+Roll is dithered: 1500, 1501 and 1502 us were seen to move nothing, inside the dead zone of 20 us;
+beyond it, 2 us are 0.2 degrees of lean at the usual calibration. Two of the larger steps are well
+inside the dead zone.
+"""
+
+
+class OverrideOutput(StickOutput):
+    """RC_CHANNELS_OVERRIDE; a release gives the channels back to the receiver.
+
+    Without a receiver ArduPilot keeps the last sticks after a release, until its radio failsafe a
+    second later, or for ever with FS_THR_ENABLE 0: level ones go ahead of it there.
+    """
+
+    name: Output = "rc-override"
+    hides_receiver = True
+    releases = 80
+    """Over the four seconds for which they are asked for at most; then silence, so that another
+    station may override."""
+    _echo_message = "RC_CHANNELS"
+    _causes: ClassVar[Mapping[EchoFault, str]] = {
+        "unseen": "another station may be overriding them, or the receiver has priority",
+        "foreign": "another station is overriding them (a joystick on our system id?)",
+        "returned": "it also acts on the sticks that it had before us: another station is "
+        "overriding or releasing them, or the override switch is off",
+        "silent": "its sticks have stood still for 0.4 s while ours moved",
+    }
+
+    def __init__(self, codec: Codec, gains: StickGains | None) -> None:
+        super().__init__(codec, OVERRIDE_ECHO, gains)
+        self._calibration: RcCalibration | None = None
+        """Calibration of the last override, for its release even after a reboot of the vehicle."""
+        self._last: Shown = (0, 0, 0, 0)
+        """The last override in us: throttle, yaw, pitch, roll."""
+        self._status: VehicleStatus | None = None
+        """The vehicle's last one, also after its session has started over."""
+
+    def encode(self, action: Action, vehicle: VehicleSession, now_ns: int) -> Encoded | None:
+        """The override of the four sticks; None without a calibration."""
+        sticks, curves = self._wanted(action, vehicle, now_ns)
+        calibration = vehicle.calibration
+        if calibration is None:
+            return None
+        shown = self.echo.with_dither(pwm_of(sticks, calibration), now_ns)
+        throttle, yaw, pitch, roll = shown
+        pwm_us = (throttle, yaw, pitch, roll)
+        packet = self._codec.encode_override(vehicle.identity.source, pwm_us, calibration)
+        self._calibration, self._last = calibration, pwm_us
+        return Encoded(packet, curves.to_policy(calibration.to_sticks(pwm_us)), shown)
+
+    def encode_resting(self, action: Action, vehicle: VehicleSession, now_ns: int) -> bytes | None:
+        """See `ActionOutput`."""
+        if (calibration := vehicle.calibration) is None:
+            return None
+        pwm_us = pwm_of(self._resting(action), calibration)
+        return self._codec.encode_override(vehicle.identity.source, pwm_us, calibration)
+
+    def _compare(self, body: Body | None, vehicle: VehicleSession, arrived_ns: int) -> None:
+        """Compare RC_CHANNELS with what was sent."""
+        if isinstance(body, RcChannels) and vehicle.calibration is not None:
+            pwm_us = vehicle.calibration.stick_channels_us(body.channels_us)
+            if pwm_us is not None:
+                self.echo.received(pwm_us, body.boot_us, arrived_ns)
+
+    def in_policy_terms(
+        self, status: VehicleStatus | None, vehicle: VehicleSession, now_ns: int
+    ) -> VehicleStatus | None:
+        """The status with its sticks as the policy would mean them."""
+        self._status = status or self._status
+        return super().in_policy_terms(status, vehicle, now_ns)
+
+    def last_sticks(self, vehicle: VehicleSession, now_ns: int) -> Encoded | None:
+        """Level ones for an armed vehicle without a receiver; where the throttle is thrust, with
+        the last one.
+
+        None once a failsafe has chosen its mode: sticks clear a radio failsafe, and it would fire
+        again a second later, whatever mode the pilot has set by then.
+        """
+        status, calibration = vehicle.status(now_ns) or self._status, self._calibration
+        if status is None or calibration is None or not status.armed:
+            return None
+        roles = vehicle.profile.modes.roles
+        is_brought_down = status.is_failsafe and status.mode in (roles.hold, roles.land, roles.rtl)
+        if status.has_receiver or is_brought_down:
+            return None
+        throttle, yaw, pitch, roll = pwm_of(NEUTRAL, calibration)
+        if status.mode in roles.thrust:
+            throttle = self._last[0]
+        pwm_us = (throttle, yaw, pitch, roll)
+        packet = self._codec.encode_override(vehicle.identity.source, pwm_us, calibration)
+        return Encoded(packet, calibration.to_sticks(pwm_us), pwm_us)
+
+    def release_packet(self, vehicle: VehicleSession, now_ns: int) -> bytes | None:
+        """Give the four channels back."""
+        if self._calibration is None:
+            return None
+        return self._codec.encode_release(vehicle.identity.source, self._calibration)
+
+
+MANUAL_ECHO = EchoRules(
+    tolerance=1,
+    release_tolerance=1,
+    dithered=3,
+    dither=2,
+    seek_dither=4,
+    centre=0,
+    longest_pause_ns=450 * NS_PER_MS,
+)
+"""x, y, z, r. PX4 shows the sticks as they came, or one less (rounded down), at the rate at which
+they came: it shows nothing when it hears nothing.
+
+The dither is on r, whose dead zone is a tenth; outside it 4 are half a degree a second.
+"""
+_MODES = ("ALTCTL", "POSCTL", "MANUAL", "STABILIZED", "ACRO")
+"""In all others the last sticks do nothing, but one that jumps may be taken for the pilot's hand,
+which ends the mode."""
+_HELD_NS = 700 * NS_PER_MS
+"""PX4 holds the last sticks for 0.5 s and a poll of 0.2 s (COM_RC_LOSS_T); echoes end with them."""
+
+
+_SPEED_TAU_S = 0.1
+"""Of PX4's low-pass of a stick's speed (``MovingDiff``); that of 1.18 is faster."""
+_REST_SHARE = 0.5
+"""Of a hand's speed. A jump that PX4 sees 70 ms later, since packets were lost, is below it too."""
+
+
+class StickSpeeds:
+    """Speed of the sticks that were sent, as PX4's detector of a pilot's hand computes it."""
+
+    def __init__(self) -> None:
+        self._last: ManualControl | None = None
+        self._at_ns = 0
+        self._per_s: tuple[float, ...] = (0.0,) * 4
+
+    @property
+    def fastest_per_s(self) -> float:
+        """Full sticks a second."""
+        return max(map(abs, self._per_s))
+
+    def sent(self, values: ManualControl, now_ns: int) -> None:
+        """Take sticks that have left."""
+        last, dt_s = self._last, (now_ns - self._at_ns) / NS_PER_S
+        self._last, self._at_ns = values, now_ns
+        if last is None or dt_s <= 0.0:
+            return
+        x, y, z, r = (value - before for value, before in zip(values, last, strict=True))
+        weight = dt_s / (_SPEED_TAU_S + dt_s)
+        moves = (x, y, 2 * z, r)  # z runs over half the range
+        self._per_s = tuple(
+            speed + weight * (move / STICK_END / dt_s - speed)
+            for speed, move in zip(self._per_s, moves, strict=True)
+        )
+
+
+class ManualControlOutput(StickOutput):
+    """MANUAL_CONTROL. There is no release: one neutral packet where nobody else has sticks, then
+    silence, which PX4 takes for lost sticks where it had only ours."""
+
+    name: Output = "manual-control"
+    releases = 1
+    _echo_message = "MANUAL_CONTROL"
+    _causes: ClassVar[Mapping[EchoFault, str]] = {
+        "unseen": "it has other sticks (a receiver, or a joystick on another link) and keeps them "
+        "(COM_RC_IN_MODE)",
+        "foreign": "another station sends sticks, or the receiver's have priority (COM_RC_IN_MODE)",
+        "returned": "it also acts on the sticks that it had before us (COM_RC_IN_MODE)",
+        "silent": "its sticks have stood still for 0.4 s while ours moved",
+    }
+
+    def __init__(self, codec: Codec, gains: StickGains | None) -> None:
+        super().__init__(codec, MANUAL_ECHO, gains)
+        self._last = ManualControl(0, 0, STICK_END // 2, 0)
+        self._sent_ns = 0
+        self._speeds = StickSpeeds()
+        self._shown: tuple[int, Sticks] | None = None
+        """Arrival of the sticks that it acts on, and these."""
+        self._pilot: Sticks | None = None
+        """The same while it acted on none of ours."""
+        self._status: VehicleStatus | None = None
+        """The vehicle's last one, also after its session has started over."""
+
+    def sent(self, encoded: Encoded, vehicle: VehicleSession, now_ns: int) -> None:
+        """Note what has left."""
+        super().sent(encoded, vehicle, now_ns)
+        self._sent_ns = now_ns
+        self._speeds.sent(self._last, now_ns)
+
+    def are_sticks_at_rest(self, vehicle: VehicleSession) -> bool:
+        """Slower than a hand, by the parameter that this version has."""
+        hand_per_s = vehicle.profile.hand_per_s(vehicle.known_params)
+        return self._speeds.fastest_per_s < _REST_SHARE * hand_per_s
+
+    def encode(self, action: Action, vehicle: VehicleSession, now_ns: int) -> Encoded | None:
+        """The four sticks, rounded."""
+        sticks, curves = self._wanted(action, vehicle, now_ns)
+        shown = self.echo.with_dither(manual_control_of(sticks), now_ns)
+        x, y, z, r = shown
+        values = ManualControl(x, y, z, r)
+        packet = self._codec.encode_manual_control(vehicle.identity.source.system, values)
+        self._last = values
+        return Encoded(packet, curves.to_policy(manual_control_sticks(values)), shown)
+
+    def encode_resting(self, action: Action, vehicle: VehicleSession, now_ns: int) -> bytes | None:
+        """See `ActionOutput`."""
+        values = manual_control_of(self._resting(action))
+        return self._codec.encode_manual_control(vehicle.identity.source.system, values)
+
+    def _compare(self, body: Body | None, vehicle: VehicleSession, arrived_ns: int) -> None:
+        """Compare the sticks that the vehicle acts on; they carry no stamp of its own."""
+        if not isinstance(body, ManualControl):
+            return
+        self.echo.received(tuple(body), arrived_ns // 1000, arrived_ns)
+        self._shown = (arrived_ns, manual_control_sticks(body))
+        if self.echo.is_released and not self.echo.is_sending:
+            self._pilot = self._shown[1]
+
+    def in_policy_terms(
+        self, status: VehicleStatus | None, vehicle: VehicleSession, now_ns: int
+    ) -> VehicleStatus | None:
+        """The status with the sticks that are shown by MANUAL_CONTROL, and never by RC_CHANNELS."""
+        self._status = status or self._status
+        if status is not None and self._shown is not None:
+            arrived_ns, sticks = self._shown
+            status = replace(
+                status, rc_sticks=sticks, pilot_sticks=self._pilot, rc_arrived_ns=arrived_ns
+            )
+        return super().in_policy_terms(status, vehicle, now_ns)
+
+    def release_packet(self, vehicle: VehicleSession, now_ns: int) -> bytes | None:
+        """Level once more in a mode that follows sticks, unless a receiver has some of its own;
+        where the throttle is thrust, with the last one.
+
+        A vehicle whose session starts over has no status yet. Its reboot may be but a wrong stamp,
+        and without this packet it would fly on with the policy's last sticks for COM_RC_LOSS_T.
+        """
+        status = vehicle.status(now_ns) or self._status
+        if status is None or status.has_receiver or status.mode not in _MODES:
+            return None
+        z = self._last.z if status.mode in vehicle.profile.modes.roles.thrust else STICK_END // 2
+        return self._codec.encode_manual_control(
+            vehicle.identity.source.system, ManualControl(0, 0, z, 0)
+        )
+
+    def is_released(self, vehicle: VehicleSession, now_ns: int) -> bool:
+        """It shows other sticks, or none any more."""
+        is_over = now_ns - self._sent_ns > _HELD_NS and self.echo.is_unshown(now_ns)
+        return self.echo.is_released or (is_over and not self.echo.is_sending)

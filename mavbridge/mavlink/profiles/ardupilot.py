@@ -10,12 +10,12 @@ from mavbridge.mavlink.codec.calibration import RcCalibration
 from mavbridge.mavlink.codec.messages import CommandRequest
 from mavbridge.mavlink.profiles import ardupilot_params
 from mavbridge.mavlink.profiles.ardupilot_sticks import ardupilot_curves
-from mavbridge.mavlink.profiles.modes import ModeTable
 from mavbridge.mavlink.profiles.profile import (
     NO_HEALTH,
     NO_LANDING,
     NO_POSITION_WORD,
     Danger,
+    ModeTable,
     ParamContext,
     ParamNote,
     Profile,

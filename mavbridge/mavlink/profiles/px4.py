@@ -8,13 +8,13 @@ from pymavlink.dialects.v20 import ardupilotmega as dialect
 
 from mavbridge.core.vehicle import ActionKind, ModeRoles, Output, StickGains
 from mavbridge.mavlink.codec.messages import CommandRequest
-from mavbridge.mavlink.profiles.modes import ModeTable
 from mavbridge.mavlink.profiles.profile import (
     NO_HEALTH,
     NO_LANDING,
     NO_POSITION_WORD,
     Danger,
     EventMeaning,
+    ModeTable,
     ParamContext,
     ParamNote,
     Profile,

@@ -14,8 +14,8 @@ from mavbridge.core.vehicle import ActionMeaning, Velocity
 from mavbridge.mavlink.codec.messages import ParamValue, StatusText
 from mavbridge.mavlink.codec.packets import MOST_DATAGRAM_BYTES
 from mavbridge.mavlink.outputs.echo import EchoCheck
-from mavbridge.mavlink.outputs.override import OVERRIDE_ECHO
-from mavbridge.mavlink.outputs.velocity import VelocityOutput
+from mavbridge.mavlink.outputs.setpoints import VelocityOutput
+from mavbridge.mavlink.outputs.sticks import OVERRIDE_ECHO
 from mavbridge.mavlink.profiles.px4 import PX4
 from mavbridge.mavlink.session.stats import LinkCounters
 from mavbridge.mavlink.session.timesync import TimesyncFilter

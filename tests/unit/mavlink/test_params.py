@@ -15,7 +15,7 @@ from mavbridge.mavlink.profiles import ardupilot_params
 from mavbridge.mavlink.profiles.ardupilot import ARDUPILOT
 from mavbridge.mavlink.profiles.px4 import PX4
 from mavbridge.mavlink.session.params.checks import serial_dangers
-from mavbridge.mavlink.session.params.reader import ParamReader
+from mavbridge.mavlink.session.params.vehicle_params import ParamReader
 
 S = NS_PER_S
 

@@ -6,7 +6,7 @@ import pytest
 
 from mavbridge.core.clock import NS_PER_MS, NS_PER_S
 from mavbridge.mavlink.codec.messages import StatusText
-from mavbridge.mavlink.session.texts import TextJoiner
+from mavbridge.mavlink.session.vehicle import TextJoiner
 
 PIECES = [
     StatusText("one, ", 7, 0, is_full=True),

@@ -10,7 +10,7 @@ import pytest
 
 from mavbridge.core.clock import NS_PER_MS, NS_PER_S
 from mavbridge.mavlink.outputs.echo import CONFIRM_NS, EchoCheck, EchoFault, Shown
-from mavbridge.mavlink.outputs.override import OVERRIDE_ECHO
+from mavbridge.mavlink.outputs.sticks import OVERRIDE_ECHO
 from mavbridge.mavlink.profiles.ardupilot import RC_CHANNELS_HZ
 
 S, MS = NS_PER_S, NS_PER_MS

@@ -18,8 +18,7 @@ from mavbridge.mavlink.codec.messages import (
 )
 from mavbridge.mavlink.codec.packets import CommandRefusedError
 from mavbridge.mavlink.outputs.attitude import MOST_LEAD_RAD, AttitudeOutput, HeadingTarget
-from mavbridge.mavlink.outputs.setpoints import HELD_NS
-from mavbridge.mavlink.outputs.velocity import VelocityOutput
+from mavbridge.mavlink.outputs.setpoints import HELD_NS, VelocityOutput
 from mavbridge.mavlink.profiles.ardupilot import ARDUPILOT
 from mavbridge.mavlink.profiles.profile import Profile
 from mavbridge.mavlink.profiles.px4 import PX4

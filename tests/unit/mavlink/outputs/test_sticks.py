@@ -22,9 +22,8 @@ from mavbridge.core.vehicle import (
 )
 from mavbridge.mavlink.codec.messages import ManualControl, RcChannels
 from mavbridge.mavlink.codec.packets import CommandRefusedError
-from mavbridge.mavlink.outputs.manual_control import ManualControlOutput
-from mavbridge.mavlink.outputs.override import OverrideOutput
 from mavbridge.mavlink.outputs.sender import choose_output
+from mavbridge.mavlink.outputs.sticks import ManualControlOutput, OverrideOutput
 from mavbridge.mavlink.profiles.ardupilot import ARDUPILOT
 from mavbridge.mavlink.profiles.profile import Profile
 from mavbridge.mavlink.profiles.px4 import PX4
