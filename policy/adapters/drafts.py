@@ -7,12 +7,11 @@ its value comes from. An entry that nobody but the user can answer holds ``inter
 import json
 import textwrap
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal, NamedTuple
 
 from policy import files
-from policy.adapters.interface import ACTION_FIELDS, DERIVED_NAMES, UNANSWERED
+from policy.adapters.interface import ACTION_FIELDS, DERIVED_NAMES, UNANSWERED, is_unanswered
 from policy.adapters.lerobot.config import CONFIG_FILE, read_json
 from policy.adapters.onnx.files import read_graph
 from policy.contract import (
@@ -27,7 +26,6 @@ from policy.data.lerobot_format import ACTION_KEY, INFO, STATE_FRAME, STATE_KEY,
 from policy.errors import CheckpointError
 
 Table = Literal["contract", "state", "action", "images", "task"]
-Origin = Literal["read", "guessed", "to answer", "optional"]
 TRAIN_CONFIG_FILE = "train_config.json"
 _WIDTH = 96
 _SPELLINGS: Mapping[str, Sequence[str]] = {
@@ -61,17 +59,32 @@ _LIMITS = (
 """Terms that are written where the flights had others than the usual ones."""
 
 
-@dataclass(frozen=True, kw_only=True)
-class Entry:
+class Entry(NamedTuple):
     """A line of a draft."""
 
     table: Table
     name: str
-    value: str | float | Sequence[str] | Sequence[float]
-    origin: Origin
-    """Optional entries are written as comments."""
+    value: Any
+    """Text, a number, or a list of either."""
     why: str
     """Where the value comes from, or the question to the user."""
+    found: Literal["read", "guessed", "optional"] = "read"
+    """Optional entries are written as comments."""
+
+    @property
+    def origin(self) -> str:
+        """What the user has to do: answer, check, or nothing."""
+        return "to answer" if is_unanswered(self.value) else self.found
+
+
+_ASKED_RATE = Entry(
+    *("contract", "chunk_dt_s", UNANSWERED),
+    "seconds from one action of a chunk to the next: 1 / frames a second of its dataset",
+)
+_ASKED_FRAME = Entry(
+    *("contract", "state_frame", UNANSWERED),
+    "axes of its state and action: ned_frd (z down, as MAVLink) or enu_flu (z up, as ROS)",
+)
 
 
 def draft_text(title: str, entries: Sequence[Entry]) -> str:
@@ -94,11 +107,6 @@ def draft_text(title: str, entries: Sequence[Entry]) -> str:
 
 def _comment(text: str) -> list[str]:
     return textwrap.wrap(text, _WIDTH, initial_indent="# ", subsequent_indent="# ")
-
-
-def _entry(table: Table, name: str, value: Any, origin: Origin, why: str) -> Entry:
-    origin = "to answer" if value == UNANSWERED else origin
-    return Entry(table=table, name=name, value=value, origin=origin, why=why)
 
 
 # --- LeRobot's folders: datasets, and policies trained on them
@@ -145,16 +153,18 @@ def _lerobot_entries(
             "multirotor: sticks, or thrust and rates, or thrust and attitude, or a velocity"
         )
     names: dict[str, list[str] | None] = {STATE_KEY: None, ACTION_KEY: None}
-    rate_hz, where, frame = None, path.name, _frame_entry(UNANSWERED, "to answer", "")
+    rate, frame, where = _ASKED_RATE, _ASKED_FRAME, path.name
     if dataset is not None:
         info, where = read_json(dataset / INFO), f"the dataset's {INFO}"
         features = _features(dataset / INFO, info, "features")
         names = {key: _names(features.get(key)) for key in names}
         fps = info.get("fps")
-        rate_hz = float(fps) if isinstance(fps, int | float) else None
+        if isinstance(fps, int | float) and fps >= 1:
+            why = f"{where}: {fps:g} a second"
+            rate = Entry("contract", "chunk_dt_s", round(1 / fps, 6), why)
         frame = _frame(dataset, features, names[STATE_KEY])
     return [
-        _rate_entry(rate_hz, where),
+        rate,
         frame,
         *_action_entries(names[ACTION_KEY], where),
         *_state_entries(names[STATE_KEY], state_dim, where),
@@ -166,14 +176,15 @@ def _frame(dataset: Path, features: Mapping[str, Any], names: Sequence[str] | No
     """As our export notes it; else by gravity: in level flight -z is up in FRD, +z in FLU."""
     about = features.get(STATE_KEY, {}).get("info")
     if isinstance(about, dict) and STATE_FRAME in about:
-        return _frame_entry(str(about[STATE_FRAME]), "read", f"the dataset's {INFO}")
+        return Entry("contract", "state_frame", str(about[STATE_FRAME]), f"the dataset's {INFO}")
     try:
         stats = files.read_json(dataset / STATS)
         mean = float(stats[STATE_KEY]["mean"][list(names or ()).index("az_mps2")])
     except (OSError, ValueError, KeyError, IndexError, TypeError):
-        return _frame_entry(UNANSWERED, "to answer", "")
+        return _ASKED_FRAME
+    why = f"the mean of az_mps2 is {mean:.1f}, by {STATS}"
     frame = "ned_frd" if mean < 0 else "enu_flu"
-    return _frame_entry(frame, "guessed", f"the mean of az_mps2 is {mean:.1f}, by {STATS}")
+    return Entry("contract", "state_frame", frame, why, "guessed")
 
 
 def _names(feature: object) -> list[str] | None:
@@ -228,11 +239,7 @@ def onnx_entries(graphs: Sequence[Path]) -> list[Entry]:
     ]
     states = [port for port in others if "state" in port.name] or others
     chunks = [port for port in outputs if port.shape[-1:] == (ACTION_DIM,) and len(port.shape) > 1]
-    entries = [
-        _rate_entry(None, ""),
-        _frame_entry(UNANSWERED, "to answer", ""),
-        *_action_entries(None, ""),
-    ]
+    entries = [_ASKED_RATE, _ASKED_FRAME, *_action_entries(None, "")]
     for name, ports, axis in (
         ("image_height", images, -2),
         ("image_width", images, -1),
@@ -240,17 +247,14 @@ def onnx_entries(graphs: Sequence[Path]) -> list[Entry]:
         ("horizon", chunks, -2),
     ):
         for port in ports[:1]:
-            size, why = port.shape[axis], f"{port.where} leaves its size open"
-            entries.append(
-                _entry("contract", name, UNANSWERED, "to answer", why)
-                if size is None
-                else _entry("contract", name, size, "read", port.where)
-            )
+            size = port.shape[axis]
+            why = port.where if size else f"{port.where} leaves its size open"
+            entries.append(Entry("contract", name, size or UNANSWERED, why))
     for port in images[:1]:
         entries += _pixel_entries(port.shape[-3] == 1)
         entries += _camera_entries([port.name], port.where)
     for port in states[:1]:
-        entries.append(_entry("state", "key", port.name, "read", port.where))
+        entries.append(Entry("state", "key", port.name, port.where))
         entries += _state_entries(None, port.shape[-1] or 0, port.where)
     return entries
 
@@ -258,10 +262,10 @@ def onnx_entries(graphs: Sequence[Path]) -> list[Entry]:
 def _pixel_entries(is_depth: bool) -> list[Entry]:
     if is_depth:
         why = "it takes one channel: depth in metres, 0 where it is not known"
-        return [_entry("contract", "image_channels", "depth", "guessed", why)]
+        return [Entry("contract", "image_channels", "depth", why, "guessed")]
     why = "it takes (rgb / 255 - mean) / std; zeros and ones for images in [0, 1]"
     scaling = (("image_mean_rgb", IMAGENET_MEAN_RGB), ("image_std_rgb", IMAGENET_STD_RGB))
-    return [_entry("contract", name, list(value), "guessed", why) for name, value in scaling]
+    return [Entry("contract", name, list(value), why, "guessed") for name, value in scaling]
 
 
 def _ports(graphs: Sequence[Path]) -> tuple[list[_Port], list[_Port]]:
@@ -293,9 +297,9 @@ def recorded_entries(contracts: Sequence[Mapping[str, Any]]) -> list[Entry]:
         value = json.loads(found[0]) if found else usual[name]
         if len(found) > 1:
             why = f"the flights were flown with different ones: {', '.join(found)}"
-            entries.append(_entry("contract", name, UNANSWERED, "to answer", why))
+            entries.append(Entry("contract", name, UNANSWERED, why))
         elif name in _STICKS or value != usual[name]:
-            entries.append(_entry("contract", name, value, "read", "as the flights were flown"))
+            entries.append(Entry("contract", name, value, "as the flights were flown"))
     return entries
 
 
@@ -313,16 +317,13 @@ def _state_entries(names: Sequence[str] | None, dim: int, where: str) -> list[En
     called = f"{where} calls them {', '.join(given)}"
     if UNANSWERED in found:
         why = f"names of its {dim} numbers in their order, of {', '.join(known)}"
-        origin: Origin = "to answer"
         why += f"; {called}" if any(given) else ""
-    elif found == given:
-        origin, why = "read", where
     else:
-        origin, why = "guessed", f"{called}; are these its units, and its axes?"
+        why = where if found == given else f"{called}; are these its units, and its axes?"
     factor = "factor from the units above to the policy's, e.g. 57.29578 for degrees"
     return [
-        _entry("state", "names", found, origin, why),
-        _entry("state", "scale", [1.0] * dim, "optional", factor),
+        Entry("state", "names", found, why, "read" if found == given else "guessed"),
+        Entry("state", "scale", [1.0] * dim, factor, "optional"),
     ]
 
 
@@ -331,41 +332,21 @@ def _action_entries(names: Sequence[str] | None, where: str) -> list[Entry]:
     kinds = [kind for kind, own in ACTION_FIELDS.items() if sorted(own) == sorted(names or ())]
     if kinds and names:
         return [
-            _entry("contract", "action", kinds[0], "read", where),
-            _entry("action", "names", list(names), "read", where),
+            Entry("contract", "action", kinds[0], where),
+            Entry("action", "names", list(names), where),
         ]
     choices = "; ".join(f"{kind}: {', '.join(own)}" for kind, own in ACTION_FIELDS.items())
     called = f"; {where} calls them {', '.join(names)}" if names else ""
     asked = f"what its four actions are. {choices}{called}"
-    order, units = (
-        "the four names of that kind, in the policy's order",
-        "from the policy's units to those of the names",
-    )
+    order = "the four names of that kind, in the policy's order"
+    units = "from the policy's units to those of the names"
+    factor = f"{units}: a factor, e.g. -1.0 for another sign"
     return [
-        _entry("contract", "action", UNANSWERED, "to answer", asked),
-        _entry("action", "names", [UNANSWERED] * 4, "to answer", order),
-        _entry(
-            *("action", "scale", [1.0] * 4, "optional"),
-            f"{units}: a factor, e.g. -1.0 for another sign",
-        ),
-        _entry("action", "offset", [0.0] * 4, "optional", f"{units}: added after the factor"),
+        Entry("contract", "action", UNANSWERED, asked),
+        Entry("action", "names", [UNANSWERED] * 4, order),
+        Entry("action", "scale", [1.0] * 4, factor, "optional"),
+        Entry("action", "offset", [0.0] * 4, f"{units}: added after the factor", "optional"),
     ]
-
-
-def _rate_entry(rate_hz: float | None, where: str) -> Entry:
-    """The time between actions."""
-    if rate_hz is not None and rate_hz >= 1.0:
-        why = f"{where}: {rate_hz:g} a second"
-        return _entry("contract", "chunk_dt_s", round(1.0 / rate_hz, 6), "read", why)
-    why = "seconds from one action of a chunk to the next: 1 / frames a second of its dataset"
-    return _entry("contract", "chunk_dt_s", UNANSWERED, "to answer", why)
-
-
-def _frame_entry(state_frame: str, origin: Origin, why: str) -> Entry:
-    """The axes of state and action."""
-    if state_frame == UNANSWERED:
-        why = "axes of its state and action: ned_frd (z down, as MAVLink) or enu_flu (z up, as ROS)"
-    return _entry("contract", "state_frame", state_frame, origin, why)
 
 
 def _camera_entries(keys: Sequence[str], where: str) -> list[Entry]:
@@ -375,7 +356,6 @@ def _camera_entries(keys: Sequence[str], where: str) -> list[Entry]:
         cameras = [f"camera_{number}" for number in range(len(keys))]
     why = "names of the vehicle's cameras; with several, those that --camera gives them"
     images = [
-        _entry("images", camera, key, "read", where)
-        for camera, key in zip(cameras, keys, strict=True)
+        Entry("images", camera, key, where) for camera, key in zip(cameras, keys, strict=True)
     ]
-    return [_entry("contract", "cameras", cameras, "guessed", why), *images] if images else []
+    return [Entry("contract", "cameras", cameras, why, "guessed"), *images] if images else []

@@ -47,6 +47,18 @@ from policy.files import read_toml
 from policy.preprocess import egocentric_columns
 from policy.rotation import matrix_columns
 
+CONTRACT_FILE = "mavbridge.toml"
+"""Its name beside a policy or dataset, where flights find it without --contract."""
+UNANSWERED = "?"
+"""In a contract file: the user has to say."""
+
+ACTION_FIELDS: dict[str, tuple[str, ...]] = {
+    "sticks": ACTION_NAMES,
+    "rates": ("thrust", "roll_rate_radps", "pitch_rate_radps", "yaw_rate_radps"),
+    "attitude": ("thrust", "roll_rad", "pitch_rad", "yaw_rate_radps"),
+    "velocity": ("vx_mps", "vy_mps", "vz_mps", "yaw_rate_radps"),
+}
+"""Names of the four numbers of each kind of action, in the contract's order."""
 EGOCENTRIC_NAMES = (
     *("vx_body_mps", "vy_body_mps", "vz_body_mps"),
     *("vertical_x", "vertical_y", "vertical_z"),
@@ -55,6 +67,7 @@ EULER_NAMES = ("roll_rad", "pitch_rad", "yaw_rad")
 DERIVED_NAMES = (*EGOCENTRIC_NAMES, *EULER_NAMES)
 BODY_STATE_NAMES = (*EGOCENTRIC_NAMES, *STATE_NAMES[QUATERNION.stop :])
 """A state without a heading: velocity, vertical axis, rates and specific force of the body."""
+ArrayOrTensor = TypeVar("ArrayOrTensor")
 
 
 def state_values(
@@ -79,21 +92,6 @@ def state_values(
         known["pitch_rad"] = arctan2(-forward[2], level)
         known["yaw_rad"] = arctan2(forward[1], forward[0])
     return [known[name] for name in wanted]
-
-
-ArrayOrTensor = TypeVar("ArrayOrTensor")
-CONTRACT_FILE = "mavbridge.toml"
-"""Its name beside a policy or dataset, where flights find it without --contract."""
-UNANSWERED = "?"
-"""In a contract file: the user has to say."""
-
-ACTION_FIELDS: dict[str, tuple[str, ...]] = {
-    "sticks": ACTION_NAMES,
-    "rates": ("thrust", "roll_rate_radps", "pitch_rate_radps", "yaw_rate_radps"),
-    "attitude": ("thrust", "roll_rad", "pitch_rad", "yaw_rate_radps"),
-    "velocity": ("vx_mps", "vy_mps", "vz_mps", "yaw_rate_radps"),
-}
-"""Names of the four numbers of each kind of action, in the contract's order."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -264,14 +262,19 @@ def _interface(data: dict[str, Any], derived: Mapping[str, object]) -> Interface
 
 
 def _unanswered(data: Mapping[str, Any]) -> list[str]:
-    """Entries that are, or hold, ``UNANSWERED``."""
+    """Entries that the user has to answer."""
     return [
         f"[{table}] {name}"
         for table, entries in data.items()
         if isinstance(entries, dict)
         for name, value in entries.items()
-        if value == UNANSWERED or (isinstance(value, list) and UNANSWERED in value)
+        if is_unanswered(value)
     ]
+
+
+def is_unanswered(value: object) -> bool:
+    """Return True for an entry that is ``UNANSWERED``, or a list that holds it."""
+    return UNANSWERED in (value if isinstance(value, list) else [value])
 
 
 def _columns(values: Any, columns: list[int]) -> Any:

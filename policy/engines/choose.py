@@ -4,7 +4,7 @@ An engine that cannot be made, or fails the parity check, is passed over with a 
 Torch, the reference, is last.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from functools import partial
 from importlib.util import find_spec
@@ -57,7 +57,7 @@ def first_that_agrees(
     policy: SingleRatePolicy, candidates: list[Candidate], settings: ExecutionSettings
 ) -> tuple[PolicyRunner, tuple[str, ...]]:
     """The first candidate that passes the check, or torch, with a line for each one passed over."""
-    notes: list[str] = []
+    notes: tuple[str, ...] = ()
     if candidates:
         on_cpu = replace(settings, vision_device="cpu", action_device="cpu")
         samples = make_parity_samples(policy.contract)
@@ -66,6 +66,17 @@ def first_that_agrees(
         expected = chunks_of_samples(reference, samples)
         if (reason := _impurity(policy, before, reference, samples, expected)) is not None:
             return make_torch_runner(policy, settings), (f"engine torch: {reason}",)
+        runner, notes = first_with_chunks(expected, samples, candidates)
+        if runner is not None:
+            return runner, (*notes, Agreed(f"engine {runner.engine}: agrees with torch"))
+    return make_torch_runner(policy, settings), notes
+
+
+def first_with_chunks(
+    expected: FloatArray, samples: ParitySamples, candidates: Sequence[Candidate]
+) -> tuple[PolicyRunner | None, tuple[str, ...]]:
+    """The first candidate that makes the expected chunks, or None; a line for each other one."""
+    notes: list[str] = []
     for label, make in candidates:
         try:
             runner = make()
@@ -73,13 +84,14 @@ def first_that_agrees(
         except (PolicyError, RuntimeError, TypeError) as error:
             reason = f"{type(error).__name__}: {str(error).strip().splitlines()[0]}"
         if reason is None:
-            return runner, (*notes, Agreed(f"engine {runner.engine}: agrees with torch"))
+            return runner, tuple(notes)
         notes.append(warned(f"engine {label} is passed over: {reason}"))
-    return make_torch_runner(policy, settings), tuple(notes)
+    return None, tuple(notes)
 
 
 def chunks_of_samples(runner: PolicyRunner, samples: ParitySamples) -> FloatArray:
-    """Chunks [samples, horizon, 4] from image to stick."""
+    """Chunks [samples, horizon, 4] from image to stick, from a reset on."""
+    runner.reset()
     inputs = zip(samples.rgb, samples.state, samples.history, strict=True)
     return np.concatenate(
         [runner.act(encode_all(runner, rgb), s[None], h[None]) for rgb, s, h in inputs]

@@ -202,14 +202,6 @@ def test_the_frame_decides_on_the_axes_of_a_velocity(flying, frame, is_body):
     assert (target.vx, target.vy) == pytest.approx((north, east), abs=0.05)
 
 
-@pytest.mark.parametrize("frame", [mav.MAV_FRAME_MISSION, mav.MAV_FRAME_GLOBAL_RELATIVE_ALT])
-def test_a_velocity_in_another_frame_brakes(flying, frame):
-    in_the_air(flying)
-    assert math.hypot(*speed_ned(stream(flying, velocity(1.5), 2.0))) > 1.2
-    stopped = stream(flying, velocity(1.5, frame=frame), 2.5)
-    assert math.hypot(*speed_ned(stopped)) < 0.5
-
-
 def test_velocity_and_yaw_rate_take_their_measured_time(flying):
     in_the_air(flying)
     still = stream(flying, velocity(), 1.0)

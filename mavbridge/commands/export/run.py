@@ -144,7 +144,7 @@ def write_contract(dataset: Path, flights: Sequence[Path], config: ExportConfig)
     entries = [
         *(entry for entry in dataset_entries(dataset) if entry.name != "cameras"),
         *recorded_entries([each for each in contracts if isinstance(each, dict)]),
-        Entry(table="task", name="prompt", value=config.task, origin="read", why="--task"),
+        Entry("task", "prompt", config.task, "--task"),
     ]
     title = (
         "Contract of the policies that are trained on this dataset, written by mavbridge export: "

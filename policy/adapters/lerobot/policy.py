@@ -9,9 +9,8 @@ from policy.adapters.lerobot.act import Act
 from policy.adapters.lerobot.config import ActConfig, DiffusionConfig
 from policy.adapters.lerobot.diffusion import DdimSchedule, Diffusion
 from policy.adapters.lerobot.plan import WEIGHTS_FILE, Affine, Plan
+from policy.checkpoints.tensors import read_tensors, require_finite, require_fit
 from policy.contract import EXTRA_NAMES, Contract
-from policy.errors import CheckpointError
-from policy.files import open_safetensors
 
 _STATISTICS = ("normalize_inputs.", "normalize_targets.", "unnormalize_outputs.")
 """Prefixes of the statistics in checkpoints before 0.4, which are read apart."""
@@ -204,28 +203,14 @@ def load_policy_of(
 
 
 def _read(path: Path, net: Act | Diffusion) -> dict[str, Tensor]:
-    wanted = net.state_dict()
-    with open_safetensors(path, "pt") as file:
-        tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
-    state = {name: value for name, value in wanted.items() if name.endswith("num_batches_tracked")}
-    problems, seen = [], set(state)
-    for name, value in tensors.items():
-        own = net.own_name(name.removeprefix(net.prefix)) if name.startswith(net.prefix) else name
-        if own is None or name.startswith(_STATISTICS):
-            continue
-        seen.add(own)
-        if own not in wanted:
-            problems.append(f"unexpected {name!r}")
-        elif value.shape != wanted[own].shape:
-            problems.append(f"{name!r} is {list(value.shape)}, not {list(wanted[own].shape)}")
-        elif not torch.isfinite(value).all():
-            problems.append(f"{name!r} holds NaN or infinity")
-        else:
-            state[own] = value.to(wanted[own].dtype)
-    problems += [f"missing {name!r}" for name in wanted if name not in seen]
-    if problems:
-        raise CheckpointError(
-            f"{path}: does not fit the policy of its config.json in {len(problems)} places: "
-            f"{'; '.join(problems[:4])}. Copy both files again, from one folder"
-        )
+    """Weights of LeRobot's file by our names."""
+    # Counts of batches may be missing: they matter to training alone.
+    own = net.state_dict().items()
+    state = {name: value for name, value in own if name.endswith("num_batches_tracked")}
+    for name, value in read_tensors(path)[1].items():
+        ours = net.own_name(name.removeprefix(net.prefix)) if name.startswith(net.prefix) else name
+        if ours is not None and not name.startswith(_STATISTICS):
+            state[ours] = value
+    require_finite(path, state)
+    require_fit(path, net, state, "Copy both files again, from one folder")
     return state

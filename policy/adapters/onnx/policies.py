@@ -12,9 +12,9 @@ from policy.adapters.modules import make_schedule
 from policy.adapters.onnx.files import DENOISER, OnnxFiles
 from policy.adapters.onnx.graphs import GraphFile, Ports, Wanted, require_roles
 from policy.contract import ACTION_DIM, Contract, FloatArray
-from policy.engines.choose import chunks_of_samples
+from policy.engines.choose import chunks_of_samples, first_with_chunks
 from policy.engines.openvino_compile import engine_name, precisions
-from policy.engines.parity import make_parity_samples, parity_failure
+from policy.engines.parity import make_parity_samples
 from policy.engines.runner import (
     ExecutionSettings,
     Precision,
@@ -22,7 +22,7 @@ from policy.engines.runner import (
     make_numpy_runner,
 )
 from policy.engines.stepwise import solver_segment
-from policy.errors import PolicyError, warned
+from policy.errors import PolicyError
 from policy.nets.diffusion import NoiseSchedule, flight_noise
 from policy.preprocess import input_to_bytes
 from policy.protocol import PolicyRunner
@@ -159,30 +159,23 @@ def choose_precision(
     ``policy`` is in float32. There is nothing else to compare with: that these graphs are the
     policy is taken from the files.
     """
-    samples = make_parity_samples(policy.contract)
 
-    def chunks(runner: PolicyRunner) -> FloatArray:
-        runner.reset()
-        return chunks_of_samples(runner, samples)
+    def runner_of(vision: Precision, action: Precision) -> PolicyRunner:
+        is_given = vision == action == "f32"
+        own = policy if is_given else policy.graphs.at(vision, action)
+        runner = make_numpy_runner(own, settings)
+        return replace(runner, engine=engine_name(vision, action), reset=own.reset)
 
-    def runner_of(policy: OnnxPolicy, vision: Precision, action: Precision) -> PolicyRunner:
-        runner = make_numpy_runner(policy, settings)
-        return replace(runner, engine=engine_name(vision, action), reset=policy.reset)
-
-    reference = runner_of(policy, "f32", "f32")
-    notes: list[str] = []
-    expected = chunks(reference)
-    for vision, action in precisions():
-        if vision == action == "f32":
-            break
-        try:
-            candidate = runner_of(policy.graphs.at(vision, action), vision, action)
-            reason = parity_failure(expected, chunks(candidate))
-        except (PolicyError, RuntimeError) as error:
-            reason = f"{type(error).__name__}: {str(error).strip().splitlines()[0]}"
-        if reason is None:
-            return candidate, (*notes, f"engine {candidate.engine}: agrees with float32")
-        notes.append(warned(f"{engine_name(vision, action)} is passed over: {reason}"))
+    reference, samples = runner_of("f32", "f32"), make_parity_samples(policy.contract)
+    faster = [
+        (engine_name(*pair), partial(runner_of, *pair))
+        for pair in precisions()
+        if pair != ("f32", "f32")
+    ]
+    expected = chunks_of_samples(reference, samples)
+    runner, notes = first_with_chunks(expected, samples, faster)
+    if runner is not None:
+        return runner, (*notes, f"engine {runner.engine}: agrees with float32")
     return reference, (*notes, f"engine {reference.engine}")
 
 

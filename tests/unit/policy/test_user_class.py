@@ -180,12 +180,6 @@ def test_a_policy_is_closed_once_at_the_end(life: str, name: str) -> None:
     assert closed(name) == 1
 
 
-def test_a_policy_is_closed_when_the_flight_has_failed(life: str) -> None:
-    with pytest.raises(ZeroDivisionError), load(f"{life}:Life"):
-        raise ZeroDivisionError
-    assert closed("Life") == 1
-
-
 @pytest.mark.parametrize("name", ["Fails", "FailsTwice"])
 def test_a_policy_that_fails_its_trial_is_closed(life: str, name: str) -> None:
     with pytest.raises(PolicyError, match="no weights"):

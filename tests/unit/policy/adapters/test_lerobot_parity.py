@@ -165,13 +165,16 @@ def test_the_openvino_engine_computes_the_same(golden):
 def test_weights_of_another_network_are_refused(tmp_path):
     shutil.copytree(GOLDENS / "act", tmp_path, dirs_exist_ok=True)
     weights = formula.weights(tmp_path, dict(np.load(tmp_path / "expected.npz")))
+    contract_file(tmp_path, "act", 13)
+    sick = {**weights, "model.decoder_pos_embed.weight": np.full((10, 32), np.nan, np.float32)}
     del weights["model.action_head.bias"]
     weights["model.action_head.weight"] = np.zeros((4, 31), np.float32)
-    weights["model.decoder_pos_embed.weight"][0] = np.nan
     weights["model.nose.weight"] = np.zeros(1, np.float32)
-    save_file(weights, tmp_path / "model.safetensors")
-    contract_file(tmp_path, "act", 13)
-    with pytest.raises(CheckpointError) as caught:
-        load_policy_of(read_plan(tmp_path, None), seed=0, num_diffusion_steps=4)
-    for said in ("4 places", "[4, 31], not [4, 32]", "NaN", "unexpected 'model.nose"):
-        assert said in str(caught.value)
+    for wrong, told in (
+        (sick, ("NaN", "decoder_pos_embed")),
+        (weights, ("3 places", "missing 'action_head.bias'", "is [4, 31], must be", "nose.weight")),
+    ):
+        save_file(wrong, tmp_path / "model.safetensors")
+        with pytest.raises(CheckpointError) as caught:
+            load_policy_of(read_plan(tmp_path, None), seed=0, num_diffusion_steps=4)
+        assert all(each in str(caught.value) for each in told)

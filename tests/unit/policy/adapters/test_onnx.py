@@ -15,6 +15,7 @@ from policy.adapters.export import OurPolicy, export_onnx, export_torchscript
 from policy.adapters.onnx import policies
 from policy.adapters.onnx.graphs import GraphFile, Ports, Wanted
 from policy.contract import Contract
+from policy.engines import choose
 from policy.engines.choose import chunks_of_samples
 from policy.engines.parity import make_parity_samples, parity_failure
 from policy.engines.runner import ExecutionSettings
@@ -179,7 +180,7 @@ def test_several_cameras_and_observations(tmp_path: Path, dual_rate: bool) -> No
 def test_bf16_is_flown_only_where_it_agrees(exported_toge, monkeypatch):
     failures = iter(["a stick is off", "a stick is off"])
     monkeypatch.setattr(policies, "precisions", lambda: (("bf16", "bf16"), ("f32", "f32")))
-    monkeypatch.setattr(policies, "parity_failure", lambda *_: next(failures))
+    monkeypatch.setattr(choose, "parity_failure", lambda *_: next(failures))
     runner, notes = loaded(PolicyRequest(spec=f"onnx:{exported_toge}"))
     assert runner.engine == "openvino-f32"
     assert "openvino-bf16 is passed over: a stick is off" in notes

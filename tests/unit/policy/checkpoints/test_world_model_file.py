@@ -88,15 +88,14 @@ def test_a_policy_and_a_foreign_file_are_refused(small_toge, model, tmp_path):
 
 def test_weights_that_are_not_finite_or_do_not_fit_are_refused(model, tmp_path):
     path = tmp_path / "world.safetensors"
-    sick = WorldModel(CONFIG)
-    sick.action_mean[1] = float("nan")
-    with pytest.raises(CheckpointError, match="action_mean"):
-        save_world_model(path, sick)
-    with torch.no_grad():
-        sick.action_mean[1] = 1e6  # no float16
-    with pytest.raises(CheckpointError, match="action_mean"):
-        save_world_model(path, sick)
     save_world_model(path, model)
+    before, sick = path.read_bytes(), WorldModel(CONFIG)
+    for value in (float("nan"), 1e6):  # the second is no float16
+        sick.action_mean[1] = value
+        with pytest.raises(CheckpointError, match="action_mean"):
+            save_world_model(path, sick)
+    assert path.read_bytes() == before
+    assert list(tmp_path.iterdir()) == [path]
     header = read_tensors(path)[0]
     state = load_file(path)
     save_file({**state, "action_std": torch.full((4,), float("inf"))}, path, metadata=header)
@@ -127,19 +126,7 @@ def test_headers_of_another_make_are_refused(model, tmp_path, key, text, says):
         load_world_model(path)
 
 
-def test_a_path_that_cannot_be_written_leaves_the_old_file(model, tmp_path):
-    for path, says in (
-        (tmp_path / "missing" / "a.safetensors", "cannot write"),
-        (tmp_path / "a.pt", "rename"),
-    ):
+def test_a_path_that_cannot_be_written_is_told(model, tmp_path):
+    for name, says in (("missing/a.safetensors", "cannot write"), ("a.pt", "rename")):
         with pytest.raises(CheckpointError, match=says):
-            save_world_model(path, model)
-    path = tmp_path / "a.safetensors"
-    save_world_model(path, model)
-    before = path.read_bytes()
-    sick = WorldModel(CONFIG)
-    sick.action_mean[0] = float("inf")
-    with pytest.raises(CheckpointError, match="action_mean"):
-        save_world_model(path, sick)
-    assert path.read_bytes() == before
-    assert list(tmp_path.iterdir()) == [path]
+            save_world_model(tmp_path / name, model)

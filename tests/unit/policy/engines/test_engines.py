@@ -8,7 +8,13 @@ import pytest
 import torch
 
 from policy.contract import Contract
-from policy.engines.runner import ExecutionSettings, make_numpy_runner
+from policy.engines.parity import make_parity_samples
+from policy.engines.runner import (
+    ExecutionSettings,
+    encode_all,
+    level_state,
+    make_numpy_runner,
+)
 from policy.engines.torch_eager import make_torch_runner
 from policy.errors import PolicyError, user_code
 from policy.nets.toge import Toge
@@ -178,3 +184,43 @@ def test_a_careless_policy_harms_nobody() -> None:
     runner.act(first, state, np.zeros((1, 4, 4), np.float32))
     assert (first == before).all()
     assert (state == 1).all()
+
+
+class Remembering(Fake):
+    """Keeps the images that it was given."""
+
+    def predict(self, image: Any, state: Any, action_history: Any, steps: int) -> Any:
+        self.image = image
+        return np.zeros((1, 4, 4), np.float32)
+
+
+@pytest.mark.parametrize(
+    ("steps", "cameras", "expected"),
+    [(1, 1, 10), (1, 2, [10, 20]), (2, 1, [10, 30]), (2, 2, [[10, 20], [30, 40]])],
+)
+def test_single_rate_images_keep_camera_and_time_apart(steps, cameras, expected):
+    policy = Remembering()
+    contract = policy.contract = replace(
+        policy.contract,
+        observation_steps=steps,
+        cameras=("front", "down")[:cameras],
+        image_mean_rgb=(0.0, 0.0, 0.0),
+        image_std_rgb=(1 / 255, 1 / 255, 1 / 255),
+    )
+    runner = make_numpy_runner(policy, ExecutionSettings(name="mine", dual_rate=False))
+    greys = np.array([[10, 20], [30, 40]], np.uint8)[:steps, :cameras, None, None, None]
+    images = np.broadcast_to(greys, (steps, cameras, 30, 40, 3))
+    runner.act(encode_all(runner, images), level_state(contract), HISTORY)
+    assert policy.image.shape == (1, *contract.image_shape)
+    np.testing.assert_allclose(policy.image[0].mean(axis=(-3, -2, -1)), expected, atol=1e-4)
+
+
+def test_parity_samples_have_every_extra_input() -> None:
+    contract = Contract(
+        observation_steps=2, since_exposure=True, state_extras=("goal", "height", "altitude")
+    )
+    samples = make_parity_samples(contract)
+    assert samples.state.shape == (4, 2, 25)
+    assert samples.rgb.shape == (4, 2, 224, 224, 3)
+    assert np.abs(samples.state).min(axis=(0, 1)).min() > 0
+    np.testing.assert_allclose(np.linalg.norm(samples.state[..., 3:7], axis=-1), 1, atol=1e-6)

@@ -218,30 +218,17 @@ def test_a_net_that_says_nothing_shows_the_last_frame_turned_as_was_warped() -> 
 
 def test_inputs_that_do_not_fit_are_refused(model: WorldModel) -> None:
     latents, states = context(1)
-    given = actions(1)
-
-    def sample(
-        latents: Tensor = latents,
-        states: Tensor = states,
-        given: Tensor | None = given,
-        *,
-        steps: int = 2,
-        sim_mode: bool = True,
-    ) -> None:
-        model.sample(latents, states, given, ddim_steps=steps, noise_seed=0, sim_mode=sim_mode)
-
-    with pytest.raises(PolicyError, match="latents must be"):
-        sample(latents=latents[:, :1])
-    with pytest.raises(PolicyError, match="states must be"):
-        sample(states=states[..., :12])
-    with pytest.raises(PolicyError, match="actions must be"):
-        sample(given=given[:, :2])
-    with pytest.raises(PolicyError, match="missing"):
-        sample(given=None)
-    with pytest.raises(PolicyError, match="not to be given"):
-        sample(sim_mode=False)
-    with pytest.raises(PolicyError, match="num_diffusion_steps"):
-        sample(steps=0)
+    good = {"latents": latents, "states": states, "actions": actions(1), "ddim_steps": 2}
+    for changes, says in (
+        ({"latents": latents[:, :1]}, "latents must be"),
+        ({"states": states[..., :12]}, "states must be"),
+        ({"actions": actions(1)[:, :2]}, "actions must be"),
+        ({"actions": None}, "missing"),
+        ({"sim_mode": False}, "not to be given"),
+        ({"ddim_steps": 0}, "num_diffusion_steps"),
+    ):
+        with pytest.raises(PolicyError, match=says):
+            model.sample(**{"noise_seed": 0, "sim_mode": True, **good, **changes})  # type: ignore[arg-type]
     with pytest.raises(PolicyError, match="uint8"):
         model.encode(images(1).float())
     with pytest.raises(PolicyError, match="resize"):
