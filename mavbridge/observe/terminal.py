@@ -76,7 +76,6 @@ class FlightScreen:
         self._target_hz = (action_hz, vision_hz)
         self._readonly = readonly
         self._hint: str | None = None
-        self._final_status: str | None = None
         self._action, self._vision = RateMeter(), RateMeter()
         self._tick: Tick | None = None
         self._missed_slots = 0
@@ -163,10 +162,6 @@ class FlightScreen:
             _said.info("%s", text)
         self._show(Text(without_secrets(text), style="dim"), soft_wrap=True)
 
-    def show_status(self, text: str) -> None:
-        """Show this as the status line from now on: the flight is over, and something goes on."""
-        self._final_status = without_secrets(text)
-
     def show_report(self, report: TimingReport) -> None:
         """Show the table of what was measured, and the verdicts, with the next refresh."""
         if (table := timing_table(report)) is not None:
@@ -184,8 +179,6 @@ class FlightScreen:
         """The status now; to be called at ``STATUS_HZ``, since rates are averages over calls."""
         rates_hz = (self._action.sample_hz(), self._vision.sample_hz())
         tick = self._tick
-        if self._final_status is not None:
-            return Text(self._final_status)
         if tick is None:
             return Text("waiting for the first tick", style="dim")
         line = Text(no_wrap=True, overflow="ellipsis")

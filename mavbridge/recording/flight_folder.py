@@ -66,7 +66,7 @@ def open_flight(folder: Path, camera: str | None = None) -> RecordedFlight:
     """
     meta = read_meta(folder)
     damage: list[str] = []
-    ticks = read_table(folder / TICKS, rows.TICKS, later=rows.OPTIONAL, damage=damage)
+    ticks = read_table(folder / TICKS, rows.TICKS, damage=damage)
     known = ("front",) if meta.contract is None else meta.contract.cameras
     if camera is not None and camera not in known:
         raise FlightError(f"{folder} has no camera {camera}: it has {', '.join(known)}")

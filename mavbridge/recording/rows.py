@@ -98,16 +98,6 @@ TICKS = pa.schema(
         pa.field("decided_ns", pa.int64()),
     ]
 )
-LATER = frozenset(
-    {
-        *("is_slot", "is_coasting", "chunk_serial", "chunk_computed_ns", "phase"),
-        *("position_ned_m", "decided_ns"),
-    }
-)
-"""Columns of ticks that older flights lack: in the first ones, every tick was a slot with a new
-chunk."""
-OPTIONAL = LATER | {"release_code", "release_data"}
-"""Columns that a table may lack."""
 DEMONSTRATION_TICKS = TICKS.append(pa.field("expert", _STICKS))
 
 _FRAME_STAMPS = _fields(pa.int64(), "frame_id", "captured_ns", "ready_ns", nullable=False)
@@ -208,8 +198,7 @@ def _rows(table: pa.Table) -> Iterator[dict[str, Any]]:
 
 
 def _tick(row: dict[str, Any], serial: int, make: type[Action]) -> Tick:
-    values = {name: row[name] for name in _TICK if name not in LATER}
-    values |= {name: row[name] for name in LATER if row[name] is not None}
+    values = {name: row[name] for name in _TICK}
     values |= {name: tuple(row[name]) for name in ("rc_channels_us", "texts")}
     values |= {"release_reason": read_reason(row["release_code"], row["release_data"])}
     values |= {"sent": row["sent"] and make(*row["sent"]), "rc_sticks": _sticks(row["rc_sticks"])}

@@ -1,6 +1,6 @@
 """Tables that survive a crash: an Arrow IPC stream while they grow, Parquet once they are whole."""
 
-from collections.abc import Collection, Iterator
+from collections.abc import Iterator
 from pathlib import Path
 from typing import IO, Any
 
@@ -88,30 +88,19 @@ def _groups(schema: pa.Schema, batches: Iterator[pa.RecordBatch]) -> Iterator[pa
         yield pa.Table.from_batches(group, schema).combine_chunks()
 
 
-def read_table(
-    stem: Path,
-    schema: pa.Schema,
-    *,
-    later: Collection[str] = (),
-    damage: list[str] | None = None,
-) -> pa.Table:
+def read_table(stem: Path, schema: pa.Schema, *, damage: list[str] | None = None) -> pa.Table:
     """The table under this stem, whichever form it has; of a cut-off stream the whole batches.
 
-    What is lost is told in a sentence that is added to ``damage``. Columns named in ``later`` may
-    be missing, since the first files lack them: they are null then.
+    What is lost is told in a sentence that is added to ``damage``.
 
     Raises:
         TableError: there is none, it is damaged, or it lacks a column of ``schema``.
     """
-    return read_numbered(stem, schema, later=later, damage=damage)[0]
+    return read_numbered(stem, schema, damage=damage)[0]
 
 
 def read_numbered(
-    stem: Path,
-    schema: pa.Schema,
-    *,
-    later: Collection[str] = (),
-    damage: list[str] | None = None,
+    stem: Path, schema: pa.Schema, *, damage: list[str] | None = None
 ) -> tuple[pa.Table, NDArray[np.int64]]:
     """As ``read_table``, with the numbers that the rows had before some were lost."""
     parquet, stream = stem.with_suffix(".parquet"), stem.with_suffix(".arrows")
@@ -128,9 +117,6 @@ def read_numbered(
         raise TableError(f"{path} is damaged: {error}") from error
     if not table.column_names:
         table = schema.empty_table()
-    for field in schema:
-        if field.name in later and field.name not in table.column_names:
-            table = table.append_column(field, pa.nulls(table.num_rows, field.type))
     missing = [
         field.name
         for field in schema

@@ -2,6 +2,7 @@
 
 import json
 from collections.abc import Iterable
+from contextlib import closing
 from itertools import chain, islice
 from pathlib import Path
 from typing import TypeAlias
@@ -12,14 +13,12 @@ import pyarrow.parquet as pq
 from numpy.typing import NDArray
 
 from mavbridge.commands.export.files import (
-    DATA_FILE_MB,
     FILES_A_CHUNK,
     MIN_ROWS,
-    VIDEO_FILE_MB,
     DatasetSpec,
+    EpisodeVideo,
     Stretch,
-    TableFiles,
-    VideoFiles,
+    episode_file,
 )
 from mavbridge.core.records import ImageArray
 from mavbridge.recording.video.file import VideoError
@@ -33,6 +32,8 @@ QUANTILES = {"q01": 0.01, "q10": 0.10, "q50": 0.50, "q90": 0.90, "q99": 0.99}
 Stats: TypeAlias = dict[str, NDArray[np.float64] | NDArray[np.int64]]
 """By name; "count" is [1] int64, the others are as wide as the feature."""
 
+DATA_FILE_MB, VIDEO_FILE_MB = 100, 200
+"""LeRobot's defaults (``datasets/utils.py``), for recordings that are appended to the dataset."""
 _PIXEL_STEP = 2
 """Every second pixel in each direction represents an image's colours."""
 _LEVELS = 256
@@ -95,7 +96,10 @@ class ImageStats:
 
 
 class DatasetWriter:
-    """A dataset that grows by an episode at a time; whole only after ``finish``."""
+    """A dataset that grows by an episode at a time; whole only after ``finish``.
+
+    Each episode has a video and a table of its own.
+    """
 
     def __init__(self, folder: Path, spec: DatasetSpec, image_size: int | None = None) -> None:
         """Prepare; nothing is written yet into the folder, which is there and empty.
@@ -103,7 +107,7 @@ class DatasetWriter:
         ``image_size``: as in ``fit_size``.
         """
         self._folder, self._spec, self._image_size = folder, spec, image_size
-        self._video, self._data = VideoFiles(folder, spec), TableFiles(folder, spec)
+        self._tables: list[Path] = []
         self._episodes: list[dict[str, Json]] = []
         self._colours = ImageStats()
         self.rows = 0
@@ -126,24 +130,27 @@ class DatasetWriter:
         first = list(islice(images, MIN_ROWS))
         if len(first) < MIN_ROWS:
             return 0
-        self._video.begin(len(part))
         colours = ImageStats()
         count = 0
-        for rgb in chain(first, images):
-            image = np.ascontiguousarray(fit_size(rgb, self._image_size))
-            self._require_size(part, image)
-            self._video.append(image)
-            colours.add(image)
-            count += 1
+        path = episode_file(self._folder, names.VIDEO, self.episodes)
+        with closing(EpisodeVideo(path, self._spec)) as video:
+            for rgb in chain(first, images):
+                image = np.ascontiguousarray(fit_size(rgb, self._image_size))
+                self._require_size(part, image)
+                video.append(image)
+                colours.add(image)
+                count += 1
         columns = self._columns(part.part(0, count))
         if len(columns["index"]) != count:
             raise ValueError(f"{count} frames, {len(columns['index'])} rows")
         table = pa.table({name: _arrow(values) for name, values in columns.items()})
+        self._tables.append(episode_file(self._folder, names.DATA, self.episodes))
+        pq.write_table(table, library_name(self._tables[-1]))
         stats = {name: vector_stats(values) for name, values in columns.items()}
         stats[names.CAMERA_KEY] = colours.stats()
         self._colours.merge(colours)
         self._episodes.append(
-            self._episode_row(count, table)
+            self._episode_row(count)
             | {
                 f"stats/{feature}/{name}": values.tolist()
                 for feature, found in stats.items()
@@ -176,10 +183,9 @@ class DatasetWriter:
             "task_index": np.zeros(count, np.int64),
         }
 
-    def _episode_row(self, count: int, table: pa.Table) -> dict[str, Json]:
-        """Write the rows; returns those columns of ``meta/episodes`` that are no statistics."""
-        span = self._video.end()
-        chunk, file = self._data.append(table)
+    def _episode_row(self, count: int) -> dict[str, Json]:
+        """Columns of ``meta/episodes`` that are no statistics."""
+        chunk, file = divmod(self.episodes, FILES_A_CHUNK)
         video = f"videos/{names.CAMERA_KEY}/"
         return {
             "episode_index": self.episodes,
@@ -189,22 +195,21 @@ class DatasetWriter:
             "data/file_index": file,
             "dataset_from_index": self.rows,
             "dataset_to_index": self.rows + count,
-            f"{video}chunk_index": span.chunk_index,
-            f"{video}file_index": span.file_index,
-            f"{video}from_timestamp": span.from_s,
-            f"{video}to_timestamp": span.to_s,
+            f"{video}chunk_index": chunk,
+            f"{video}file_index": file,
+            f"{video}from_timestamp": 0.0,
+            f"{video}to_timestamp": count / self._spec.fps,
             "meta/episodes/chunk_index": 0,
             "meta/episodes/file_index": 0,
         }
 
     def finish(self) -> None:
-        """Close the files and write what describes the whole.
+        """Write what describes the whole.
 
         Raises:
             VideoError: not one episode had images.
             OSError, FFmpegError: it cannot be written.
         """
-        self.close()
         if self.rows == 0:
             raise VideoError("nothing to export: not one image of these flights can be decoded")
         episodes = self._folder / names.EPISODES.format(chunk_index=0, file_index=0)
@@ -213,7 +218,7 @@ class DatasetWriter:
         pq.write_table(pa.Table.from_pylist(self._episodes), library_name(episodes))
         # One feature after the other, so that memory holds one.
         columns = (name for name in _features(self._spec) if name != names.CAMERA_KEY)
-        stats = {name: vector_stats(self._data.column(name)) for name in columns}
+        stats = {name: vector_stats(self._column(name)) for name in columns}
         stats[names.CAMERA_KEY] = self._colours.stats()
         lists: Json = {
             feature: {name: values.tolist() for name, values in found.items()}
@@ -222,12 +227,13 @@ class DatasetWriter:
         self._write_json(names.STATS, lists)
         self._write_json(names.INFO, self._info())
 
-    def close(self) -> None:
-        """Close the files, after an error as well."""
-        try:
-            self._video.close()
-        finally:
-            self._data.close()
+    def _column(self, name: str) -> NDArray[np.generic]:
+        """[rows, D] of all episodes."""
+        files = map(library_name, self._tables)
+        parts = [pq.read_table(file, columns=[name], partitioning=None) for file in files]
+        column = pa.concat_tables(parts)[name].combine_chunks()
+        values = column.flatten() if pa.types.is_fixed_size_list(column.type) else column
+        return np.asarray(values.to_numpy()).reshape(len(column), -1)
 
     def _info(self) -> dict[str, Json]:
         spec = self._spec

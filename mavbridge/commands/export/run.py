@@ -1,7 +1,7 @@
 """``mavbridge export``: flights in, a LeRobot dataset out, whole or not at all."""
 
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import closing, contextmanager
+from contextlib import contextmanager
 from dataclasses import dataclass
 from itertools import chain, islice
 from pathlib import Path
@@ -14,9 +14,6 @@ from rich.progress import TaskID
 from mavbridge.commands.config import ExportConfig
 from mavbridge.commands.export.dataset import DatasetWriter, fit_size
 from mavbridge.commands.export.files import (
-    DATA_FILE_MB,
-    MB,
-    VIDEO_FILE_MB,
     DatasetSpec,
     Stretch,
     common_fps,
@@ -86,9 +83,6 @@ def write_dataset(
     folder: Path,
     config: ExportConfig,
     on_frame: Callable[[], None] = lambda: None,
-    *,
-    data_file_bytes: int = DATA_FILE_MB * MB,
-    video_file_bytes: int = VIDEO_FILE_MB * MB,
 ) -> ExportSummary:
     """Write flights into an empty folder; ``on_frame`` is called for every decoded frame.
 
@@ -116,13 +110,11 @@ def write_dataset(
         state_frame=common_frame(list(episodes)),
         task=config.task,
         state_names=BODY_STATE_NAMES if config.state == "body" else STATE_NAMES,
-        data_file_bytes=data_file_bytes,
-        video_file_bytes=video_file_bytes,
     )
-    with closing(DatasetWriter(folder, spec, config.image_size)) as writer:
-        for episode, of_flight in zip(episodes, parts, strict=True):
-            _write_flight(writer, episode, of_flight, on_frame)
-        writer.finish()
+    writer = DatasetWriter(folder, spec, config.image_size)
+    for episode, of_flight in zip(episodes, parts, strict=True):
+        _write_flight(writer, episode, of_flight, on_frame)
+    writer.finish()
     return ExportSummary(
         episodes=writer.episodes,
         rows=writer.rows,

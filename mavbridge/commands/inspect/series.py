@@ -1,8 +1,7 @@
 """A recorded flight's ticks and path as arrays, and the gates along it, for figures and plots."""
 
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
-from datetime import datetime
 from typing import Literal, TypeAlias
 
 import numpy as np
@@ -12,11 +11,7 @@ from mavbridge.commands.inspect.delays import is_gap
 from mavbridge.core.clock import NS_PER_MS, NS_PER_S
 from mavbridge.core.course import CourseGate
 from mavbridge.core.records import Position, Tick
-from mavbridge.mavlink.codec.messages import LocalVelocity
-from mavbridge.mavlink.codec.packets import Codec
-from mavbridge.mavlink.codec.tlog import Skipped, read_tlog
 from mavbridge.recording.flight_folder import RecordedFlight
-from mavbridge.recording.folder import TLOG
 from mavbridge.recording.rows import FrameRow
 from policy.contract import STATE_DIM
 from policy.rotation import conjugate, multiply
@@ -175,20 +170,16 @@ def course_gates(seed: int | None) -> tuple[CourseGate, ...]:
     )
 
 
-def read_track(
-    flight: RecordedFlight, series: Series, frames: Sequence[FrameRow], damage: list[str]
-) -> Track | None:
-    """The simulator's truth, else the positions in the ticks, else those in the telemetry log.
-
-    A sentence on what of the log is lost is added to ``damage``.
-    """
+def read_track(series: Series, frames: Sequence[FrameRow]) -> Track | None:
+    """The simulator's truth, else the positions in the ticks."""
     rows = [
         ((frame.captured_ns - series.start_ns) / NS_PER_S, frame.truth.position_ned_m)
         for frame in frames
         if frame.truth is not None
     ]
     if rows:
-        return _track(rows, "simulator")
+        times, positions = zip(*rows, strict=True)
+        return Track(t_s=np.array(times), position_ned_m=np.array(positions), source="simulator")
     known = np.isfinite(series.position_ned_m[:, 0])
     if known.any():
         return Track(
@@ -196,33 +187,4 @@ def read_track(
             position_ned_m=series.position_ned_m[known],
             source="estimator",
         )
-    rows = list(_logged_positions(flight, series.start_ns, damage))
-    return _track(rows, "estimator") if rows else None
-
-
-def _track(
-    rows: Sequence[tuple[float, tuple[float, float, float]]],
-    source: Literal["estimator", "simulator"],
-) -> Track:
-    times, positions = zip(*rows, strict=True)
-    return Track(t_s=np.array(times), position_ned_m=np.array(positions), source=source)
-
-
-def _logged_positions(
-    flight: RecordedFlight, start_ns: int, damage: list[str]
-) -> Iterator[tuple[float, tuple[float, float, float]]]:
-    """Positions in ``link.tlog``; none where there is no such file."""
-    codec = Codec(source_system=0, source_component=0)
-    unix_start_ns = round(datetime.fromisoformat(flight.meta.started_at).timestamp() * NS_PER_S)
-    offset_ns = flight.meta.start_ns - unix_start_ns
-    if not (flight.folder / TLOG).is_file():
-        return
-    path, skipped = flight.folder / TLOG, Skipped()
-    for stamp_us, packet in read_tlog(path, skipped):
-        for message in codec.decode_datagram(packet.data):
-            body = message.body
-            if isinstance(body, LocalVelocity) and body.position_ned_m is not None:
-                at_ns = stamp_us * 1000 + offset_ns
-                if at_ns >= start_ns:
-                    yield (at_ns - start_ns) / NS_PER_S, body.position_ned_m
-    damage += filter(None, [skipped.describe(path)])
+    return None

@@ -83,7 +83,7 @@ def open_source(folder: Path) -> ReplaySource:
         record=None,
     )
     damage: list[str] = []
-    table = read_table(folder / TICKS, rows.TICKS, later=rows.OPTIONAL, damage=damage)
+    table = read_table(folder / TICKS, rows.TICKS, damage=damage)
     ticks = list(rows.read_ticks(table, meta.contract.action))
     solved = read_table(folder / SOLVES, replay_tables.SOLVES, damage=damage)
     solve_rows = list(read_solves(solved, meta.contract))

@@ -3,7 +3,6 @@ import shutil
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
-import pyarrow.parquet as pq
 import pytest
 
 from helpers.factories import make_tick
@@ -15,7 +14,7 @@ from mavbridge.recording.flight_folder import open_flight
 from mavbridge.recording.flight_writer import FlightWriter
 from mavbridge.recording.folder import prepare_folder
 from mavbridge.recording.meta import FlightError, read_meta, write_meta
-from mavbridge.recording.rows import LATER, TICKS, FrameTruth, TickLabels
+from mavbridge.recording.rows import FrameTruth, TickLabels
 from mavbridge.recording.tlog import open_tlog_pipe
 from policy.contract import (
     Contract,
@@ -149,18 +148,6 @@ def test_a_flight_that_was_cut_off_is_read_as_far_as_it_goes(tmp_path: Path) -> 
     back = open_flight(folder)
     assert 0 < back.frames.num_rows < 40
     assert [number_of(rgb) for rgb in back.images()] == list(range(back.frames.num_rows))
-
-
-def test_a_flight_from_before_the_columns_of_chunks_is_read(flight: Path) -> None:
-    path = flight / "ticks.parquet"
-    pq.write_table(pq.read_table(path).drop_columns(sorted(LATER)), path)
-    back = open_flight(flight)
-    assert set(TICKS.names) == set(back.ticks.column_names)
-    ticks = [row.tick for row in back.tick_rows()]
-    assert [tick.index for tick in ticks] == list(range(30))
-    assert {(tick.is_slot, tick.is_coasting, tick.chunk_serial) for tick in ticks} == {
-        (True, False, None)
-    }
 
 
 def test_a_flight_without_a_frame_is_a_flight(tmp_path: Path) -> None:

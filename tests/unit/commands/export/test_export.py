@@ -60,16 +60,12 @@ def fly(
     )
 
 
-def write(
-    flights: list[Path], out: Path, video_file_bytes: int = 10**9, data_file_bytes: int = 10**9
-) -> ExportSummary:
+def write(flights: list[Path], out: Path) -> ExportSummary:
     out.mkdir()
     return write_dataset(
         [read_flight(flight) for flight in flights],
         out,
         ExportConfig(out=out, task="fly the gates"),
-        video_file_bytes=video_file_bytes,
-        data_file_bytes=data_file_bytes,
     )
 
 
@@ -81,7 +77,7 @@ def flights(tmp_path_factory: pytest.TempPathFactory) -> list[Path]:
 
 @pytest.fixture(scope="module")
 def dataset(flights: list[Path], tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Three episodes, all in one file."""
+    """Three episodes."""
     out = tmp_path_factory.mktemp("exported") / "dataset"
     write(flights, out)
     return out
@@ -91,12 +87,12 @@ def test_the_dataset_keeps_the_rules_of_the_reader(dataset: Path) -> None:
     assert broken_rules(dataset) == []
     files = [str(path.relative_to(dataset)) for path in dataset.rglob("*") if path.is_file()]
     assert sorted(files) == [
-        "data/chunk-000/file-000.parquet",
+        *(f"data/chunk-000/file-00{k}.parquet" for k in range(3)),
         "meta/episodes/chunk-000/file-000.parquet",
         "meta/info.json",
         "meta/stats.json",
         "meta/tasks.parquet",
-        "videos/observation.images.front/chunk-000/file-000.mp4",
+        *(f"videos/observation.images.front/chunk-000/file-00{k}.mp4" for k in range(3)),
     ]
 
 
@@ -145,15 +141,15 @@ def test_what_was_sent_is_imitated_where_there_is_no_expert(tmp_path: Path) -> N
     assert (back.target_ns <= back.captured_ns).all()
 
 
-def test_small_files_hold_an_episode_each(flights: list[Path], tmp_path: Path) -> None:
-    done = write(flights, tmp_path / "out", video_file_bytes=1, data_file_bytes=1)
-    assert done.episodes == 3
+def test_files_are_grouped_in_chunks(
+    flights: list[Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    for module in ("files", "dataset"):
+        monkeypatch.setattr(f"mavbridge.commands.export.{module}.FILES_A_CHUNK", 2)
+    write(flights, tmp_path / "out")
     assert broken_rules(tmp_path / "out") == []
-    assert len(list(tmp_path.glob("out/videos/*/chunk-000/*.mp4"))) == 3
-    assert len(list(tmp_path.glob("out/data/chunk-000/*.parquet"))) == 3
-    back = read_dataset(tmp_path / "out")
-    assert [len(list(episode.decode())) for episode in back] == [20, 25, 30]
-    assert [episode.state[0, 1] for episode in back] == [0, 1, 2]
+    assert len(list(tmp_path.glob("out/videos/*/chunk-001/file-000.mp4"))) == 1
+    assert [len(list(each.decode())) for each in read_dataset(tmp_path / "out")] == [20, 25, 30]
 
 
 def test_a_pause_makes_two_episodes(tmp_path: Path) -> None:

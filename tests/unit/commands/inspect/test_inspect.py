@@ -1,7 +1,6 @@
 import io
 import json
 import shutil
-import struct
 from dataclasses import replace
 from pathlib import Path
 
@@ -20,7 +19,6 @@ from mavbridge.core.course import CourseGate
 from mavbridge.core.errors import MavbridgeError, UserError
 from mavbridge.core.reasons import Code, Kind, because, reason_to_json
 from mavbridge.core.records import Position, Tick, VisionTick
-from mavbridge.mavlink.codec.packets import Codec
 from mavbridge.recording.flight_folder import open_flight
 from mavbridge.recording.flight_writer import FlightWriter
 from mavbridge.recording.meta import FlightMeta
@@ -37,8 +35,6 @@ PLANNED_ENDS = {
     Code.FINISHED,
     Code.OPERATOR,
 }
-UNIX_START_S = 1_767_323_045
-"""2026-01-02T03:04:05 UTC, the start of ``make_meta``."""
 
 
 def write(
@@ -120,23 +116,6 @@ def test_axes_of_ros_become_ned_axes(tmp_path: Path) -> None:
     assert series.velocity_ned_mps[0].tolist() == pytest.approx([0, 3, -1])
     assert series.roll_pitch_yaw_deg[0].tolist() == pytest.approx([0, 0, 90], abs=1e-4)
     assert series.rate_frd_dps[0].tolist() == pytest.approx([0, 0, -28.6479], abs=1e-3)
-
-
-def test_the_path_comes_from_the_telemetry_log_where_ticks_lack_it(tmp_path: Path) -> None:
-    folder = write(tmp_path / "flight", [make_tick(index) for index in range(100)])
-    codec = Codec(source_system=1, source_component=1)
-    dialect = codec._mav
-    with (folder / "link.tlog").open("wb") as log:
-        for step in range(10):
-            message = dialect.local_position_ned_encode(1000 + 100 * step, step, 0, -2, 1, 0, 0)
-            stamp_us = UNIX_START_S * 1_000_000 + 100_000 * step
-            log.write(struct.pack(">Q", stamp_us) + message.pack(dialect))
-        log.write(b"\0\0\0")  # cut off
-    track = analyse(folder).track
-    assert track is not None
-    assert track.source == "estimator"
-    assert track.t_s.tolist() == pytest.approx([0.1 * step for step in range(10)])
-    assert track.position_ned_m[:, 0].tolist() == list(range(10))
 
 
 def test_two_flights_side_by_side_mark_what_differs(tmp_path: Path) -> None:
