@@ -15,7 +15,8 @@ from sitl.ardupilot.autopilot import ArduCopter
 from sitl.ardupilot.endpoint import ArduPilotEndpoint
 from sitl.ardupilot.flight_modes import Mode
 from sitl.ardupilot.guided import VelocitySetpoint
-from sitl.ardupilot.sticks import IGNORE, PRIMARY_CHANNELS, RELEASE, Axes
+from sitl.ardupilot.rc import IGNORE, PRIMARY_CHANNELS, RELEASE
+from sitl.ardupilot.sticks import Axes
 from sitl.firmware import AttitudeSetpoint
 from sitl.link.server import (
     ACCEPTED,

@@ -10,17 +10,12 @@ from benchmarks.results import (
     print_result,
     to_json,
 )
-from helpers.bench_results import RESULT, make_flight
+from helpers.bench_results import RESULT
 
 
 @pytest.mark.parametrize("flight", RESULT.flights)
 def test_a_flight_survives_the_way_between_processes(flight: Flight) -> None:
     assert from_json(Flight, to_json(flight)) == flight
-
-
-def test_missed_fraction_is_of_the_asked_slots() -> None:
-    assert RESULT.flights[0].missed_fraction == pytest.approx(12 / 12_000)
-    assert make_flight("mavbridge", duration_s=0.0).missed_fraction == 1.0
 
 
 def printed(result: BenchResult) -> str:
