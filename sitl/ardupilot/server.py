@@ -125,7 +125,7 @@ class ArduPilotServer(MavlinkServer[ArduCopter, ArduPilotEndpoint]):
         if primary - {RELEASE, IGNORE}:
             self._log.overrides.add(arrived_ns)
         elif RELEASE in primary:
-            self._log.on_release(arrived_ns)
+            self._log.releases += 1
         self._ap.rc.override(raw_us, arrived_ns)
 
     def _manual_control(self, _link: ArduPilotEndpoint, message: Message, arrived_ns: int) -> None:

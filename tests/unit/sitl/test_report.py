@@ -12,31 +12,6 @@ from sitl.simulated_vehicle import SimulatedVehicle
 from sitl.vehicle.config import STEP_NS
 
 
-def logged(arrivals_ms, releases_ms=()):
-    log = FlightLog(0, None)
-    events = [(ms, log.overrides.add) for ms in arrivals_ms]
-    events += [(ms, log.on_release) for ms in releases_ms]
-    for ms, happens in sorted(events, key=lambda event: event[0]):
-        happens(ms * NS_PER_MS)
-    return log.summary(SimulatedVehicle(links=1, boot_ns=0).ap, 0)
-
-
-def test_override_rate_and_gaps():
-    overrides = logged([*range(1000, 2000, 10), 2020])["overrides"]
-
-    assert overrides["count"] == 101
-    assert (overrides["first_t_s"], overrides["last_t_s"]) == (1.0, 2.02)
-    assert overrides["rate_hz"] == pytest.approx(100 / 1.02)
-    assert overrides["gap_ms"] == {"p50": 10.0, "p99": pytest.approx(10.2), "max": 30.0}
-
-
-def test_a_release_is_no_gap():
-    summary = logged([0, 10, 20, 5000, 5010], releases_ms=[30, 40])
-
-    assert summary["overrides"]["gap_ms"]["max"] == 10.0
-    assert summary["releases"] == {"count": 2, "t_s": [0.03, 0.04]}
-
-
 def test_releases_and_foreign_overrides_on_the_link_are_distinguished():
     vehicle = SimulatedVehicle(links=1, boot_ns=0)
     sender = mav.MAVLink(None, srcSystem=255)
@@ -48,7 +23,7 @@ def test_releases_and_foreign_overrides_on_the_link_are_distinguished():
 
     summary = vehicle.log.summary(vehicle.ap, 0)
     assert summary["overrides"]["count"] == 2
-    assert summary["releases"]["count"] == 2
+    assert summary["releases"] == 2
 
 
 def test_sticks_are_recorded_when_they_change_with_how_the_vehicle_moved(pilot):
