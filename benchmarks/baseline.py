@@ -10,6 +10,7 @@ leaves the rest in the socket, and the next step acts on what is oldest there.
 It arms nothing, so the vehicle stays on the ground; its sticks are sent and counted all the same.
 """
 
+import pickle
 import sys
 import threading
 import time
@@ -22,7 +23,7 @@ from pymavlink.dialects.v20 import ardupilotmega as mav
 
 from benchmarks.engines import EAGER
 from benchmarks.flight import FlightJob, read_job
-from benchmarks.results import BASELINE, Flight, solves_of, to_json
+from benchmarks.results import BASELINE, Flight, solves_of
 from mavbridge.camera.open import open_camera
 from mavbridge.config.policy import PolicyConfig
 from mavbridge.core.clock import NS_PER_MS, NS_PER_S, MonotonicClock
@@ -44,7 +45,7 @@ READ_TIMEOUT_NS = 100 * NS_PER_MS
 def main(path: Path) -> None:
     """Fly the job in a file once, and write its figures."""
     job = read_job(path)
-    job.out.write_text(to_json(Baseline(job).run()))
+    job.out.write_bytes(pickle.dumps(Baseline(job).run()))
 
 
 def eager_toge(policy: PolicyConfig) -> Toge:

@@ -10,6 +10,7 @@ replaced by a slow level climb. Only for a simulated vehicle. A load keeps the f
     busy   beside the flight a thread runs eager torch, and another one never leaves the interpreter
 """
 
+import os
 import pickle
 import sys
 import threading
@@ -18,12 +19,11 @@ from contextlib import ExitStack
 from dataclasses import dataclass, replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import Literal, TypeAlias
+from typing import Literal, NamedTuple, TypeAlias
 
 import torch
 
-from benchmarks.missed_slots import GuardProbe
-from benchmarks.results import OURS, Flight, from_json, name_of, solves_of, to_json
+from benchmarks.results import OURS, Flight, name_of, solves_of
 from mavbridge.commands.output import print_status
 from mavbridge.config.flight import CameraConfig, EnvelopeConfig, FlyConfig, LinkConfig
 from mavbridge.config.policy import PolicyConfig
@@ -50,6 +50,9 @@ SLOW_NS = 30 * NS_PER_MS
 TORCH_CHANNELS, TORCH_SIDE = 32, 48
 """A small convolution of some 1 ms: many calls a second, each of which takes the interpreter."""
 JOIN_S = 5.0
+PROC = Path("/proc")
+STEAL_FIELD = 8
+"""The line "cpu" is: cpu user nice system idle iowait irq softirq steal."""
 STARTING_S = 300.0
 """Most that a process may take beside its flight: imports, compiling an engine, arming. A network
 of 263 M parameters compiles for one or two minutes."""
@@ -96,7 +99,7 @@ def fly(
     camera = f"shm:mavbridge-bench-{port}"
     with TemporaryDirectory(prefix="mavbridge-bench-") as name:
         folder = Path(name)
-        out, path = folder / "flight.json", folder / "job"
+        out, path = folder / "flight", folder / "job"
         log, vehicle_log = folder / "flight.log", folder / "vehicle.log"
         job = FlightJob(
             port=port,
@@ -122,7 +125,8 @@ def fly(
                 raise
             end(vehicle)
             wait(vehicle, "python -m sitl", vehicle_log, STARTING_S)
-        return from_json(Flight, out.read_text())
+        flight: Flight = pickle.loads(out.read_bytes())  # noqa: S301 - our child's
+        return flight
 
 
 def main(path: Path) -> None:
@@ -178,9 +182,6 @@ def with_slow_solves(runner: PolicyRunner) -> PolicyRunner:
 def measure(job: FlightJob, clock: Clock, runner: PolicyRunner) -> None:
     """Fly the runner's work, and write the figures."""
     loops = job.rates.loops(is_dual=runner.dual_rate, play_s=runner.contract.play_s)
-    meter = FlightMeter(
-        stick_hz=job.rates.stick_rate, action_hz=loops.action_hz, vision_hz=loops.max_vision_hz
-    )
     config = FlyConfig(
         link=LinkConfig(connect=f"udp:127.0.0.1:{job.port}"),
         policy=job.policy,
@@ -195,16 +196,21 @@ def measure(job: FlightJob, clock: Clock, runner: PolicyRunner) -> None:
     climb = level_climb(runner)
     with ExitStack() as stack:
         guard = start_guard(config, clock, stack)
-        probe, console = GuardProbe(guard.process.pid, clock), flight_console()
+        meter = FlightMeter(
+            guard.process.pid,
+            stick_hz=job.rates.stick_rate,
+            action_hz=loops.action_hz,
+            vision_hz=loops.max_vision_hz,
+        )
         plan = plan_flight(config, climb.contract, is_dual=climb.dual_rate)
-        fly_policy(plan, climb, clock=clock, console=console, sinks=(meter, probe), guard=guard)
-    flight = _flight(job, runner.engine, meter, probe)
+        fly_policy(plan, climb, clock=clock, console=flight_console(), sinks=(meter,), guard=guard)
+    flight = _flight(job, runner.engine, meter)
     if meter.release_reason is not None:
         raise PeerError(f"the policy lost the sticks: {meter.release_reason}")
     if flight.duration_s < LEAST_SHARE * job.duration_s:
         lasted = f"the flight lasted {flight.duration_s:g} s instead of {job.duration_s:g} s"
         raise PeerError(lasted)
-    job.out.write_text(to_json(flight))
+    job.out.write_bytes(pickle.dumps(flight))
 
 
 def level_climb(runner: PolicyRunner) -> PolicyRunner:
@@ -225,26 +231,54 @@ def level_climb(runner: PolicyRunner) -> PolicyRunner:
     return replace(runner, contract=contract, act=act)
 
 
+class Counters(NamedTuple):
+    """Processor times since some moment [ns]; each only ever grows."""
+
+    ours: int
+    """This process ran."""
+    guard: int
+    """The guard ran."""
+    waited: int
+    """The guard could run and was not put on a processor."""
+    host: int
+    """The hypervisor gave processors of this machine to others."""
+
+
+def read_counters(guard_pid: int) -> Counters:
+    """Counters of the system (proc_stat(5), sched-stats.rst); 0 where it does not tell them."""
+    try:
+        schedstat = (PROC / str(guard_pid) / "schedstat").read_text().split()
+        stolen = int((PROC / "stat").read_text().split("\n", 1)[0].split()[STEAL_FIELD])
+    except (OSError, ValueError, IndexError):
+        return Counters(time.process_time_ns(), 0, 0, 0)
+    host_ns = stolen * NS_PER_S // os.sysconf("SC_CLK_TCK")
+    return Counters(time.process_time_ns(), int(schedstat[0]), int(schedstat[1]), host_ns)
+
+
 class FlightMeter:
     """A ``TickSink`` that measures from the policy's first action on.
 
     Waiting, handshake and arming are cheap ticks on time: they would flatter a slow engine.
     """
 
-    def __init__(self, *, stick_hz: float, action_hz: float, vision_hz: float) -> None:
+    def __init__(
+        self, guard_pid: int, *, stick_hz: float, action_hz: float, vision_hz: float
+    ) -> None:
+        self._guard_pid = guard_pid
         self._timing = FlightTiming(stick_hz=stick_hz, action_hz=action_hz, vision_hz=vision_hz)
-        self._cpu_start_ns: int | None = None
-        self.cpu_ns = 0
+        self._first: Counters | None = None
+        self.spent = Counters(0, 0, 0, 0)
+        """From the first action to the last."""
         self.release_reason: Reason | None = None
         """Why the policy lost the sticks before its end; None if it kept them."""
 
     def emit(self, event: Event) -> None:
         """Count the event."""
         if isinstance(event, Tick) and event.trace is not None:
-            if self._cpu_start_ns is None:
-                self._cpu_start_ns = time.process_time_ns()
-            self.cpu_ns = time.process_time_ns() - self._cpu_start_ns
-        if self._cpu_start_ns is not None:
+            now = read_counters(self._guard_pid)
+            self._first = self._first or now
+            self.spent = Counters(*(b - a for a, b in zip(self._first, now, strict=True)))
+        if self._first is not None:
             self._timing.emit(event)
             reason = event.release_reason if isinstance(event, Tick) else None
             if reason is not None and reason.kind is not Kind.END:
@@ -258,8 +292,8 @@ class FlightMeter:
         )
 
 
-def _flight(job: FlightJob, engine: str, meter: FlightMeter, probe: GuardProbe) -> Flight:
-    report = meter.report()
+def _flight(job: FlightJob, engine: str, meter: FlightMeter) -> Flight:
+    report, spent = meter.report(), meter.spent
     sticks, action, vision = report.sticks, report.action, report.vision
     elapsed_ns = report.duration_s * NS_PER_S
     return Flight(
@@ -284,9 +318,10 @@ def _flight(job: FlightJob, engine: str, meter: FlightMeter, probe: GuardProbe) 
         encode_ms=vision.encode_ms,
         feature_age_ms=report.feature_age_ms,
         state_to_wire_ms=report.state_to_wire_ms,
-        cpu_cores=round((meter.cpu_ns + probe.cpu_ns) / elapsed_ns, 3),
-        guard_cpu_cores=round(probe.cpu_ns / elapsed_ns, 3),
-        missed_by_cause=probe.missed_by_cause,
+        cpu_cores=round((spent.ours + spent.guard) / elapsed_ns, 3),
+        guard_cpu_cores=round(spent.guard / elapsed_ns, 3),
+        guard_waited_ms=round(spent.waited / NS_PER_MS, 1),
+        host_took_ms=round(spent.host / NS_PER_MS, 1),
     )
 
 

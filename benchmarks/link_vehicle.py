@@ -7,6 +7,7 @@ from the attitude, so that it is never in its way. Sends are stamped just before
 answers by the kernel as they arrive: nothing that this process does is in the figures.
 """
 
+import pickle
 from collections.abc import Iterator
 from itertools import count
 from pathlib import Path
@@ -14,7 +15,7 @@ from pathlib import Path
 from cyclopts import App
 from pymavlink.dialects.v20 import ardupilotmega as mav
 
-from benchmarks.results import LinkLatency, to_json
+from benchmarks.results import LinkLatency
 from mavbridge.core.clock import NS_PER_MS, NS_PER_S, Clock, MonotonicClock
 from mavbridge.core.histogram import Histogram
 from mavbridge.mavlink.transport.sockets import UdpTransport
@@ -65,7 +66,7 @@ def main(*, port: int, attitudes: int, out: Path) -> None:
     transport = UdpTransport(("127.0.0.1", port), clock, listen=False)
     transport.open()
     try:
-        out.write_text(to_json(LinkVehicle(transport, clock).run(attitudes)))
+        out.write_bytes(pickle.dumps(LinkVehicle(transport, clock).run(attitudes)))
     finally:
         transport.close()
 

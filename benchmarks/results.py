@@ -4,11 +4,10 @@ import json
 import os
 import platform
 import sys
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable
 from dataclasses import asdict, dataclass, is_dataclass
 from importlib.metadata import version
 from pathlib import Path
-from typing import Any, TypeVar, get_args, get_type_hints
 
 from rich.console import Console
 from rich.table import Table
@@ -19,7 +18,6 @@ from mavbridge.config.policy import PolicyConfig
 from mavbridge.core.vehicle import Percentiles
 
 OURS, BASELINE = "mavbridge", "baseline"
-T = TypeVar("T")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -68,7 +66,6 @@ class Flight:
     vision_hz: float | None
     missed_slots: int
     """Slots of the stick grid without a send within one period."""
-    missed_by_cause: Mapping[str, int] | None = None
     lateness_ms: Percentiles | None = None
     """From a slot to its send."""
     chunks: int
@@ -85,6 +82,10 @@ class Flight:
     """Processor time of all our processes over elapsed time."""
     guard_cpu_cores: float | None = None
     """The guard's share of it."""
+    guard_waited_ms: float | None = None
+    """The guard could run, and the kernel ran others."""
+    host_took_ms: float | None = None
+    """The hypervisor gave processors of this machine to others."""
 
     @property
     def label(self) -> str:
@@ -155,22 +156,6 @@ def to_json(result: object) -> str:
     return json.dumps(asdict(result), indent=2, allow_nan=False) + "\n"
 
 
-def from_json(kind: type[T], text: str) -> T:
-    """Inverse of ``to_json`` for a dataclass whose nested fields are dataclasses or None."""
-    return _build(kind, json.loads(text))
-
-
-def _build(kind: type[T], document: Mapping[str, Any]) -> T:
-    hints = get_type_hints(kind)
-
-    def value_of(name: str, value: Any) -> Any:
-        kinds = get_args(hints[name]) or (hints[name],)
-        nested: Any = next((one for one in kinds if is_dataclass(one)), None)
-        return _build(nested, value) if nested and isinstance(value, dict) else value
-
-    return kind(**{name: value_of(name, value) for name, value in document.items()})
-
-
 def print_result(result: BenchResult, console: Console) -> None:
     """Print the machine, all tables, and what was left out."""
     here = result.machine
@@ -212,7 +197,6 @@ def engine_table(timings: Iterable[EngineTiming]) -> Table:
 _FLIGHT_ROWS: tuple[tuple[str, Callable[[Flight], str]], ...] = (
     ("sticks, Hz", lambda f: f"{number(f.stick_hz, 1)} of {f.asked_stick_hz:g}"),
     ("missed slots", lambda f: f"{f.missed_slots} ({f.missed_fraction:.3%})"),
-    ("by cause", lambda f: causes(f.missed_by_cause)),
     ("stick lateness, ms", lambda f: spread(f.lateness_ms, 3)),
     ("chunks, Hz", lambda f: f"{number(f.action_hz, 1)} of {f.asked_action_hz:g}"),
     ("late chunks", lambda f: f"{number(f.late_chunks, 0)} of {f.chunks}"),
@@ -224,6 +208,8 @@ _FLIGHT_ROWS: tuple[tuple[str, Callable[[Flight], str]], ...] = (
     ("attitude to wire, ms", lambda f: spread(f.state_to_wire_ms)),
     ("processor time, cores", lambda f: number(f.cpu_cores, 2)),
     ("of it the guard", lambda f: number(f.guard_cpu_cores, 2)),
+    ("guard waited for a core, ms", lambda f: number(f.guard_waited_ms, 0)),
+    ("taken by the host, ms", lambda f: number(f.host_took_ms, 0)),
 )
 
 
@@ -234,13 +220,6 @@ def flight_table(flights: Iterable[Flight]) -> Table:
     rows = [(name, *(cell(one) for one in flights)) for name, cell in _FLIGHT_ROWS]
     title = "Both loops against the simulated vehicle (p50 / p99 / max)"
     return make_table(title, header, rows)
-
-
-def causes(slots_by_cause: Mapping[str, int] | None) -> str:
-    """Missed slots by cause, in words."""
-    if slots_by_cause is None:
-        return "-"
-    return ", ".join(f"{cause} {slots}" for cause, slots in slots_by_cause.items()) or "none"
 
 
 def link_table(links: Iterable[LinkLatency]) -> Table:

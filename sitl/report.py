@@ -2,22 +2,18 @@
 
 import json
 import math
-from array import array
 from collections import deque
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any, Literal, NamedTuple, TypeAlias
 
-import numpy as np
-
-from sitl.clock import NS_PER_MS, NS_PER_S
+from sitl.clock import NS_PER_S
 from sitl.course import Course, Crash, GateCounter, GatePass, struck_gate
 from sitl.firmware import Autopilot
 from sitl.rotation import Vec3, cos_tilt, to_euler
 
 CRASH_SPEED_MPS = 3.5  # ALT_HOLD descends at up to 2.5 m/s: a hard landing, not a crash
 CRASH_TILT_COS = math.cos(math.radians(45.0))
-MAX_RELEASE_TIMES = 100
 MAX_TEXTS = 200
 END_AFTER_NS = NS_PER_S
 """From the last gate to the end of a flown course: a crash just behind the gate still counts."""
@@ -43,11 +39,10 @@ class FlightLog:
         self._course = course or Course(seed=0, gates=())
         self._has_course = course is not None
         self._gates = GateCounter(self._course)
-        self.overrides = _ArrivalStats()  # RC_CHANNELS_OVERRIDE that drives at least one stick
-        self.manual_controls = _ArrivalStats()  # of senders that the vehicle listens to
-        self.setpoints = _ArrivalStats()  # attitudes, rates and velocities that it follows
-        self._release_times_s: list[float] = []
-        self._releases = 0
+        self.overrides = _Arrivals()  # RC_CHANNELS_OVERRIDE that drives at least one stick
+        self.manual_controls = _Arrivals()  # of senders that the vehicle listens to
+        self.setpoints = _Arrivals()  # attitudes, rates and velocities that it follows
+        self.releases = 0  # RC_CHANNELS_OVERRIDE that only release sticks
         self._sticks = _StickRecord()
         self._arrived_ns = start_ns
         self._modes: list[LogEntry] = []
@@ -104,13 +99,6 @@ class FlightLog:
         """
         self._arrived_ns = max(self._arrived_ns, arrived_ns)
 
-    def on_release(self, arrived_ns: int) -> None:
-        """Count an RC_CHANNELS_OVERRIDE that only releases sticks."""
-        self.overrides.interrupt(arrived_ns)
-        self._releases += 1
-        if len(self._release_times_s) < MAX_RELEASE_TIMES:
-            self._release_times_s.append(self._t_s(arrived_ns))
-
     def on_text(self, now_ns: int, text: str) -> None:
         if len(self.texts) < MAX_TEXTS:
             self.texts.append({"t_s": self._t_s(now_ns), "text": text})
@@ -158,10 +146,10 @@ class FlightLog:
         return {
             "start_ns": self._start_ns,
             "duration_s": self._t_s(ap.now_ns),
-            "overrides": self.overrides.summary(self._start_ns),
-            "releases": {"count": self._releases, "t_s": self._release_times_s},
-            "manual_control": self.manual_controls.summary(self._start_ns),
-            "setpoints": self.setpoints.summary(self._start_ns),
+            "overrides": self.overrides.summary(),
+            "releases": self.releases,
+            "manual_control": self.manual_controls.summary(),
+            "setpoints": self.setpoints.summary(),
             "refused_messages": self.refused_messages,
             "bad_frames": bad_frames,
             "armed_s": self._armed_ns / NS_PER_S,
@@ -233,42 +221,22 @@ class _StickRecord:
         return rows
 
 
-class _ArrivalStats:
-    """Arrival times of overrides; gaps are kept as float32, so an hour at 100 Hz is 1.4 MB."""
+class _Arrivals:
+    """Messages of one kind, and the times of the first and the last."""
 
     def __init__(self) -> None:
         self._count = 0
         self._first_ns = self._last_ns = 0
-        self._engaged = False
-        self._gaps_ms = array("f")
 
     def add(self, arrived_ns: int) -> None:
-        if self._count == 0:
-            self._first_ns = arrived_ns
-        self.interrupt(arrived_ns)
-        self._count += 1
+        self._first_ns = self._first_ns if self._count else arrived_ns
         self._last_ns = arrived_ns
-        self._engaged = True
+        self._count += 1
 
-    def interrupt(self, arrived_ns: int) -> None:
-        """End the current gap at a release: sticks were held until then, and are free after it."""
-        if self._engaged:
-            self._gaps_ms.append((arrived_ns - self._last_ns) / NS_PER_MS)
-        self._engaged = False
-
-    def summary(self, start_ns: int) -> dict[str, Any]:
+    def summary(self) -> dict[str, Any]:
         span_s = (self._last_ns - self._first_ns) / NS_PER_S
-        gap_ms = None
-        if self._gaps_ms:
-            p50, p99, most = np.percentile(np.asarray(self._gaps_ms), (50, 99, 100)).tolist()
-            gap_ms = {"p50": p50, "p99": p99, "max": most}
-        return {
-            "count": self._count,
-            "first_t_s": (self._first_ns - start_ns) / NS_PER_S if self._count else None,
-            "last_t_s": (self._last_ns - start_ns) / NS_PER_S if self._count else None,
-            "rate_hz": (self._count - 1) / span_s if span_s > 0.0 else None,
-            "gap_ms": gap_ms,
-        }
+        rate_hz = (self._count - 1) / span_s if span_s > 0.0 else None
+        return {"count": self._count, "rate_hz": rate_hz}
 
 
 def write_report(path: Path, summary: dict[str, Any]) -> None:

@@ -11,15 +11,8 @@ from contextlib import suppress
 from sitl.ardupilot.flight_modes import CopterControl, Mode
 from sitl.ardupilot.guided import GuidedControl
 from sitl.ardupilot.params import ArduPilotParams
-from sitl.ardupilot.sticks import (
-    ModeSwitch,
-    RcEngine,
-    RudderGesture,
-    SimpleMode,
-    Sticks,
-    climb_rate_mps,
-    read_sticks,
-)
+from sitl.ardupilot.rc import ModeSwitch, RcEngine
+from sitl.ardupilot.sticks import RudderGesture, SimpleMode, Sticks, climb_rate_mps, read_sticks
 from sitl.clock import NS_PER_S
 from sitl.firmware import STOPPED, Autopilot
 from sitl.rotation import cos_tilt

@@ -15,7 +15,8 @@ from sitl.ardupilot.autopilot import ArduCopter
 from sitl.ardupilot.endpoint import ArduPilotEndpoint
 from sitl.ardupilot.flight_modes import Mode
 from sitl.ardupilot.guided import VelocitySetpoint
-from sitl.ardupilot.sticks import IGNORE, PRIMARY_CHANNELS, RELEASE, Axes
+from sitl.ardupilot.rc import IGNORE, PRIMARY_CHANNELS, RELEASE
+from sitl.ardupilot.sticks import Axes
 from sitl.firmware import AttitudeSetpoint
 from sitl.link.server import (
     ACCEPTED,
@@ -124,7 +125,7 @@ class ArduPilotServer(MavlinkServer[ArduCopter, ArduPilotEndpoint]):
         if primary - {RELEASE, IGNORE}:
             self._log.overrides.add(arrived_ns)
         elif RELEASE in primary:
-            self._log.on_release(arrived_ns)
+            self._log.releases += 1
         self._ap.rc.override(raw_us, arrived_ns)
 
     def _manual_control(self, _link: ArduPilotEndpoint, message: Message, arrived_ns: int) -> None:

@@ -18,7 +18,7 @@ from faults.processes import Process, StageError, child_of, mapped_memory, proce
 from faults.props import FrameFeed, Transmitter, Viewer
 from faults.record import VehicleReport
 from faults.relay import Relay
-from mavbridge.core.reasons import reason_from_json
+from mavbridge.core.reasons import Reason, reason_from_json
 from sitl.clock import NS_PER_MS, Clock
 
 TIMEOUT_S = 90.0
@@ -27,7 +27,8 @@ LEANING = 100
 """Steering messages that lean, in a row: the policy holds its lean."""
 STICKS_OVER_NS = 200 * NS_PER_MS
 """Time without a stick of the policy after which its flight is over."""
-STALLED = ("delivered no attitude", "stood still")
+STALLS = frozenset(("computer", "guard", "flight process", "link"))
+"""Places in which a busy machine loses time, of the reasons that name one."""
 ORDERLY = (0, 4)
 """Exit statuses of a flight that ended in order; 4: a busy machine made the guard end it before."""
 MARK = "FAULT_MARK"
@@ -167,8 +168,7 @@ class Stage:
         self.start(*flags)
         for _ in range(STARTS - 1):
             status, output = self.end()
-            is_stalled = any(text in output for text in STALLED) and "error:" not in output
-            if not (status == ORDERLY[1] and is_stalled):
+            if status != ORDERLY[1] or not was_stalled(self.folder / "report.json"):
                 return status, output
             self._lines.clear()
             self._start_over()
@@ -287,12 +287,32 @@ class Stage:
 
     def release_codes(self) -> set[str]:
         """Codes of all reasons for which the policy lost the sticks, those inside others too."""
-        reasons = [reason_from_json(release["reason"]) for release in self.report()["releases"]]
+        reasons = release_reasons(self.folder / "report.json")
         return {code.value for reason in reasons for code in reason.codes}
 
     def vehicle_report(self) -> VehicleReport:
         """Only after the ``staged`` block, which ends the vehicle."""
         return json.loads((self.folder / "fc.json").read_text())
+
+
+def release_reasons(report: Path) -> list[Reason]:
+    """All reasons for which the policy lost the sticks, by the bridge's report."""
+    releases = json.loads(report.read_text())["releases"] if report.exists() else []
+    return [reason_from_json(release["reason"]) for release in releases]
+
+
+def was_stalled(report: Path) -> bool:
+    """True if a busy machine made the guard end the flight."""
+    return any(STALLS & {*places(reason)} for reason in release_reasons(report))
+
+
+def places(reason: Reason) -> Iterator[object]:
+    """Where the time was spent, in a reason and in those inside it."""
+    for name, value in reason.data:
+        if name == "place":
+            yield value
+        elif isinstance(value, Reason):
+            yield from places(value)
 
 
 @contextmanager

@@ -39,7 +39,8 @@ def make_flight(runner: str, **changes: Any) -> Flight:
         "state_to_wire_ms": all_equal(20.0),
         "cpu_cores": 1.0,
         "guard_cpu_cores": 0.125,
-        "missed_by_cause": {"kernel": 9, "host": 3} if runner == "mavbridge" else None,
+        "guard_waited_ms": 90.0,
+        "host_took_ms": 33.0,
     }
     return Flight(**(fields | changes))
 

@@ -13,6 +13,7 @@ from faults.processes import child_of
 from faults.relay import Override
 from faults.stage import ORDERLY, faulty_policy, staged
 from helpers.flight_logs import logged_overrides
+from mavbridge.core.reasons import Code, because
 from mavbridge.core.vehicle import Sticks
 from mavbridge.recording.flight_folder import RecordedFlight, open_flight
 
@@ -139,7 +140,7 @@ def test_an_exception_in_the_policy_gives_the_sticks_back(tmp_path: Path) -> Non
 def test_somebody_elses_arming_is_not_engaging(tmp_path: Path) -> None:
     with staged(tmp_path) as flying:
         flying.start("--dual-rate", "--policy", "scripted:hover")
-        assert flying.wait_for("not engaged: press e, use the engage switch, or --arm")
+        assert flying.wait_for(str(because(Code.NOT_ENGAGED)))
         flying.relay.set_mode("ALT_HOLD")
         flying.relay.arm()
         flying.observe(3.0)

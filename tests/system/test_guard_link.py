@@ -11,6 +11,7 @@ from faults.props import Transmitter
 from faults.record import DITHER_US, aftermath
 from faults.relay import Relay
 from faults.stage import ORDERLY, Stage, faulty_policy, free_port, staged
+from mavbridge.core.reasons import Code, because
 
 pytestmark = pytest.mark.system
 
@@ -97,7 +98,7 @@ def test_only_the_engage_switch_engages_where_the_pilot_arms(tmp_path: Path) -> 
         policy = ("--policy", faulty_policy("Leaning"))
         flying.start("--dual-rate", "--engage-channel", "7", *policy)
         relay = flying.relay
-        assert flying.wait_for("not engaged: press e, use the engage switch")
+        assert flying.wait_for(str(because(Code.NOT_ENGAGED)))
         transmitter.move(7, 1000)
         relay.set_mode("ALT_HOLD")
         armed_ns = relay.arm()

@@ -1,5 +1,4 @@
 import json
-from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -27,15 +26,6 @@ from mavbridge.core.errors import UserError
 def test_ratios_compare_two_figures_of_one_run(name: str, value: float) -> None:
     assert ratios(RESULT)[name] == pytest.approx(value)
     assert len(ratios(RESULT)) == 10
-
-
-def test_a_run_without_the_other_side_has_no_ratio_with_it() -> None:
-    alone = replace(RESULT, engines=(), flights=RESULT.flights[:1], links=RESULT.links[:1])
-    name = "flight: toge:small, 1 step, torch"
-    assert ratios(alone) == {
-        f"{name}: period / asked period": pytest.approx(2.0),
-        f"{name}: stick lateness p99 / period": pytest.approx(0.05),
-    }
 
 
 def test_reads_what_the_repository_holds() -> None:

@@ -1,16 +1,22 @@
+import os
+from pathlib import Path
+
 import numpy as np
 import pytest
 
+from benchmarks import flight
 from benchmarks.flight import (
     CLIMB_STICK,
     SLOW_EVERY,
     SLOW_NS,
+    Counters,
     FlightMeter,
     level_climb,
+    read_counters,
     with_slow_solves,
 )
 from helpers.factories import make_released_tick, make_state, make_tick, make_vision_tick
-from mavbridge.core.clock import MonotonicClock
+from mavbridge.core.clock import NS_PER_MS, MonotonicClock
 from mavbridge.core.reasons import Code, because
 from policy.contract import Contract
 from policy.protocol import PolicyRunner
@@ -35,7 +41,7 @@ def test_a_level_climb_does_the_work_and_returns_other_sticks() -> None:
 
 
 def test_a_flight_is_measured_from_its_first_action_on() -> None:
-    meter = FlightMeter(stick_hz=100, action_hz=100, vision_hz=30)
+    meter = FlightMeter(os.getpid(), stick_hz=100, action_hz=100, vision_hz=30)
     for index in range(50):
         meter.emit(make_released_tick(index))
         meter.emit(make_vision_tick(index))
@@ -51,7 +57,7 @@ def test_a_flight_is_measured_from_its_first_action_on() -> None:
         meter.emit(make_vision_tick(index))
     report = meter.report()
     assert (report.sticks.missed_slots, report.vision.frames) == (2, 3)
-    assert meter.cpu_ns > 0
+    assert meter.spent.ours > 0
     assert meter.release_reason is None
     for index, code in enumerate((Code.NO_CHUNK, Code.DISARMED)):
         meter.emit(make_released_tick(200 + index, because(code)))
@@ -73,3 +79,16 @@ def test_every_tenth_solve_is_slow_and_all_are_the_policys() -> None:
         assert slow.act(number, None, None) == number
         durations_ns.append(clock.now_ns() - start_ns)
     assert min(durations_ns[SLOW_EVERY - 1 :: SLOW_EVERY]) >= SLOW_NS
+
+
+def test_counters_are_the_kernels(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(flight, "PROC", tmp_path)
+    monkeypatch.setattr(flight.os, "sysconf", lambda _: 100)
+    assert read_counters(7)[1:] == (0, 0, 0)
+    (tmp_path / "7").mkdir()
+    (tmp_path / "7" / "schedstat").write_text("5000000 3000000 12\n")
+    (tmp_path / "stat").write_text(
+        "cpu  100 0 50 9000 3 0 7 4 0 0\ncpu0 50 0 25 4500 1 0 3 1 0 0\n"
+    )
+    expected = Counters(ours=0, guard=5 * NS_PER_MS, waited=3 * NS_PER_MS, host=40 * NS_PER_MS)
+    assert read_counters(7)[1:] == expected[1:]

@@ -5,22 +5,9 @@ from rich.console import Console
 
 from benchmarks.results import (
     BenchResult,
-    Flight,
-    from_json,
     print_result,
-    to_json,
 )
-from helpers.bench_results import RESULT, make_flight
-
-
-@pytest.mark.parametrize("flight", RESULT.flights)
-def test_a_flight_survives_the_way_between_processes(flight: Flight) -> None:
-    assert from_json(Flight, to_json(flight)) == flight
-
-
-def test_missed_fraction_is_of_the_asked_slots() -> None:
-    assert RESULT.flights[0].missed_fraction == pytest.approx(12 / 12_000)
-    assert make_flight("mavbridge", duration_s=0.0).missed_fraction == 1.0
+from helpers.bench_results import RESULT
 
 
 def printed(result: BenchResult) -> str:
@@ -33,7 +20,7 @@ def printed(result: BenchResult) -> str:
     "words",
     [
         *("some cpu", "60.00 / 61.00", "roofline bf16", "599 of 600", "0.60 / 0.60 / 0.60"),
-        *("50.0 of 100", "25.0 of 100", "12 (0.100%)", "kernel 9, host 3"),
+        *("50.0 of 100", "25.0 of 100", "12 (0.100%)", "33"),
         *("201.0 of 200", "0.250 / 0.250 / 0.250", "7 of 3000"),
         *("400.0 / 400.0 / 400.0", "MAVSDK-Python 4: not measured"),
     ],

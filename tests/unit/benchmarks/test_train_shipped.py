@@ -44,9 +44,3 @@ def test_weights_that_are_there_are_not_trained_again(commands: list[str], tmp_p
     (tmp_path / "toge" / "toge.safetensors").touch()
     train_shipped.main("toge", out=tmp_path)
     assert not [command for command in commands if command.startswith("train")]
-
-
-def test_an_unfinished_training_goes_on(commands: list[str], tmp_path: Path) -> None:
-    (tmp_path / "toge" / "toge.training").mkdir(parents=True)
-    train_shipped.main("toge", out=tmp_path)
-    assert commands[-1].endswith("--out toge.safetensors --resume")

@@ -10,7 +10,7 @@ import pytest
 from helpers.camera_senders import SIDE, RtpSender, repeating
 from helpers.fakes import START_NS, FakeClock
 from mavbridge.camera import capture
-from mavbridge.camera.capture import device_mode, exposure_ns, open_device, open_stream
+from mavbridge.camera.capture import exposure_ns, open_device, open_stream
 from mavbridge.camera.grabber import Grabber
 from mavbridge.camera.open import open_camera
 from mavbridge.core.clock import NS_PER_MS, NS_PER_S, MonotonicClock
@@ -47,14 +47,6 @@ def test_the_drivers_stamp_is_taken_if_it_can_be_one(driver_ms, captured_ns):
 def test_a_driver_on_our_clock_is_believed_however_old_its_frame(driver_ms, captured_ns):
     stamp_ns = round(driver_ms * NS_PER_MS)
     assert exposure_ns(stamp_ns, NOW_NS, is_our_clock=True) == captured_ns
-
-
-@pytest.mark.parametrize(
-    ("image_size", "mode"),
-    [(224, (640, 480)), (480, (640, 480)), (481, (1280, 720)), (4000, (1920, 1080))],
-)
-def test_the_smallest_mode_that_covers_the_image(image_size, mode):
-    assert device_mode(image_size) == mode
 
 
 class FakeDevice:

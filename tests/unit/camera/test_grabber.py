@@ -113,15 +113,6 @@ def test_before_the_first_frame_it_is_opened_until_that_works(source, clock, gra
     assert grabber.read(WAIT_NS).frame_id == 1
 
 
-def test_while_nothing_was_delivered_it_says_why(source, clock, grab):
-    grabber = grab(CameraError("no such device"), source, delays_s=(0.05,), flown=False)
-    assert grabber.waiting_reason in {"it is being opened", "no such device"}
-    assert source.idle.wait(10)
-    assert grabber.waiting_reason == "it is open, and has delivered no frame yet"
-    clock.advance_ns(3600 * NS_PER_S)
-    assert grabber.read(0) is None
-
-
 @pytest.mark.parametrize(("is_reopened", "limit_ns"), [(False, STALL_NS), (True, REOPENED_NS)])
 def test_a_source_that_falls_silent_is_dead(source, clock, grab, is_reopened, limit_ns):
     second = ScriptedSource()

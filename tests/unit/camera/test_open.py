@@ -172,16 +172,6 @@ def test_the_video_of_a_depth_flight_plays_as_depth(tmp_path):
     camera.close()
 
 
-def test_a_video_file_is_no_depth_and_no_camera_is_of_either_kind(video):
-    with pytest.raises(UserError, match=r"delivers RGB images of 32x32, .* takes depth"):
-        open_camera(video, image_size=32, clock=FakeClock(), is_depth=True)
-    shapes = []
-    for is_depth in (False, True):
-        camera = open_camera("none", image_size=32, clock=FakeClock(), is_depth=is_depth)
-        shapes.append((camera.read(NS_PER_MS).rgb.dtype, camera.read(NS_PER_S).rgb.shape))
-    assert shapes == [(np.uint8, (32, 32, 3)), (np.uint16, (32, 32))]
-
-
 def test_black_frames_come_on_a_grid_and_late_ones_are_dropped() -> None:
     clock = FakeClock()
     camera = open_camera("none", image_size=32, clock=clock)

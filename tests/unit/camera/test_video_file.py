@@ -50,13 +50,6 @@ def test_it_is_paced_by_its_stamps(camera, clock):
     assert camera.dropped_frames == 0
 
 
-def test_a_frame_that_is_not_due_yet_is_waited_for_up_to_the_timeout(camera, clock):
-    camera.read(0)
-    assert camera.read(20 * NS_PER_MS) is None
-    assert clock.now_ns() == START_NS + 20 * NS_PER_MS
-    assert camera.read(40 * NS_PER_MS).frame_id == 2
-
-
 def test_a_slow_reader_gets_the_newest_and_the_others_are_counted(camera, clock):
     camera.read(0)
     clock.advance_ns(4 * PERIOD_NS + NS_PER_MS)

@@ -14,11 +14,9 @@ from pymavlink.dialects.v20 import ardupilotmega as mav
 
 from sitl.__main__ import main
 from sitl.app import filming, fly, fly_on
-from sitl.ardupilot.flight_modes import Mode
 from sitl.camera.fpv import CameraOptions
 from sitl.clock import NS_PER_MS, NS_PER_S, Clock, StopRequest
 from sitl.course import AirborneStart, Crash, make_course
-from sitl.link.transport import Received
 from sitl.simulated_vehicle import SimulatedVehicle
 from sitl.vehicle.config import STEP_NS, VehicleConfig
 
@@ -97,46 +95,6 @@ def test_after_a_stall_it_catches_up_without_a_burst():
     assert after_ns[0] == pytest.approx(1.3 * NS_PER_S, abs=10)
     assert after_ns[1] - after_ns[0] <= 10 * NS_PER_MS
     assert vehicle.ap.now_ns == 2 * NS_PER_S - STEP_NS
-
-
-def test_the_loop_takes_in_bytes_and_says_who_came(capsys):
-    clock = FakeClock()
-    vehicle = SimulatedVehicle(links=1, boot_ns=0)
-    frame = mav.MAVLink_command_long_message(1, 1, 176, 0, 1, int(Mode.ALT_HOLD), *[0] * 5)
-    arrivals = [Received(frame.pack(mav.MAVLink(None, srcSystem=255)), 50 * NS_PER_MS)]
-
-    fly(vehicle, [FakeTransport(clock, arrivals)], clock, StopRequest(), end_ns=NS_PER_S)
-
-    assert capsys.readouterr().err == "sitl: link 0 connected\nsitl: mode ALT_HOLD\n"
-
-
-class ScriptedTransmitter:
-    """Receiver values that come at a time."""
-
-    def __init__(self, clock, values_us, at_ns):
-        self._clock, self._values_us, self._at_ns = clock, values_us, at_ns
-
-    def latest(self):
-        if self._at_ns is None or self._clock.now_ns() < self._at_ns:
-            return None
-        self._at_ns = None
-        return self._values_us
-
-
-def test_the_rc_input_moves_the_receiver_while_the_vehicle_flies():
-    clock = FakeClock()
-    vehicle = SimulatedVehicle(links=0, boot_ns=0)
-    rc_input = ScriptedTransmitter(
-        clock, (1700, 1500, 1000, 1500, 1400, 1500, 1500, 1900), NS_PER_S
-    )
-
-    fly(vehicle, [], clock, StopRequest(), end_ns=2 * NS_PER_S, rc_input=rc_input)
-
-    (before, after, switched) = vehicle.log.summary(vehicle.ap, 0)["sticks"]
-    assert before["us"] == (1500, 1500, 1000, 1500)
-    assert after["us"] == (1700, 1500, 1000, 1500)
-    assert after["t_s"] == pytest.approx(1.0, abs=0.025)
-    assert switched["mode"] == "RTL"
 
 
 @pytest.mark.parametrize(("flags", "least_s"), [([], 0.0), (["--fly-on", "20"], 20.0)])
@@ -235,12 +193,3 @@ def test_the_camera_publishes_while_its_context_lasts():
     assert frame_id >= 3
     assert not path.exists()
     assert not any(thread.name == "sitl-camera" for thread in threading.enumerate())
-
-
-def test_the_course_is_printed_both_ways(capsys):
-    assert main(["course", "--course", "7", "--json"]) == 0
-    as_json = json.loads(capsys.readouterr().out)
-    assert main(["course", "--course", "7"]) == 0
-    as_table = capsys.readouterr().out
-
-    assert len(as_json["gates"]) == len(as_table.splitlines()) - 1

@@ -1,7 +1,5 @@
 """The flight log: what is counted, what is a crash, and the report as JSON."""
 
-import json
-import math
 from itertools import pairwise
 
 import pytest
@@ -9,35 +7,9 @@ from pymavlink.dialects.v20 import ardupilotmega as mav
 
 from sitl.ardupilot.flight_modes import Mode
 from sitl.clock import NS_PER_MS, NS_PER_S
-from sitl.course import Course, make_course
-from sitl.report import FlightLog, write_report
+from sitl.report import FlightLog
 from sitl.simulated_vehicle import SimulatedVehicle
 from sitl.vehicle.config import STEP_NS
-
-
-def logged(arrivals_ms, releases_ms=()):
-    log = FlightLog(0, None)
-    events = [(ms, log.overrides.add) for ms in arrivals_ms]
-    events += [(ms, log.on_release) for ms in releases_ms]
-    for ms, happens in sorted(events, key=lambda event: event[0]):
-        happens(ms * NS_PER_MS)
-    return log.summary(SimulatedVehicle(links=1, boot_ns=0).ap, 0)
-
-
-def test_override_rate_and_gaps():
-    overrides = logged([*range(1000, 2000, 10), 2020])["overrides"]
-
-    assert overrides["count"] == 101
-    assert (overrides["first_t_s"], overrides["last_t_s"]) == (1.0, 2.02)
-    assert overrides["rate_hz"] == pytest.approx(100 / 1.02)
-    assert overrides["gap_ms"] == {"p50": 10.0, "p99": pytest.approx(10.2), "max": 30.0}
-
-
-def test_a_release_is_no_gap():
-    summary = logged([0, 10, 20, 5000, 5010], releases_ms=[30, 40])
-
-    assert summary["overrides"]["gap_ms"]["max"] == 10.0
-    assert summary["releases"] == {"count": 2, "t_s": [0.03, 0.04]}
 
 
 def test_releases_and_foreign_overrides_on_the_link_are_distinguished():
@@ -51,7 +23,7 @@ def test_releases_and_foreign_overrides_on_the_link_are_distinguished():
 
     summary = vehicle.log.summary(vehicle.ap, 0)
     assert summary["overrides"]["count"] == 2
-    assert summary["releases"]["count"] == 2
+    assert summary["releases"] == 2
 
 
 def test_sticks_are_recorded_when_they_change_with_how_the_vehicle_moved(pilot):
@@ -106,22 +78,6 @@ def flown(pilot, course=None):
     return log, lambda ap: log.on_step(ap)
 
 
-def test_a_soft_flight_is_no_crash_and_is_measured(pilot):
-    log, watch = flown(pilot)
-    pilot.take_off(height_m=3.0)
-    pilot.hold(1.0, pitch=1400, watch=watch)
-    pilot.hold(1.0, pitch=1600, watch=watch)
-    pilot.hold(6.0, thr=1000, watch=watch)
-
-    summary = log.summary(pilot.ap, 0)
-    north, east, _ = summary["final"]["position_ned_m"]
-    assert not summary["crashed"]
-    assert 1.5 < summary["impact_speed_mps"] < 3.5
-    assert summary["distance_m"] > math.hypot(north, east) > 0.5
-    assert summary["max_altitude_m"] > 3.0
-    assert not summary["final"]["armed"] or summary["armed_s"] > 8.0
-
-
 def test_falling_out_of_the_sky_is_a_crash(pilot):
     log, watch = flown(pilot)
     pilot.take_off(height_m=5.0)
@@ -131,33 +87,3 @@ def test_falling_out_of_the_sky_is_a_crash(pilot):
     summary = log.summary(pilot.ap, 0)
     assert summary["crashed"]
     assert summary["impact_speed_mps"] > 5.0
-
-
-def test_a_course_without_gates_is_never_finished():
-    assert FlightLog(0, None).verdict(10 * NS_PER_S) is None
-    assert FlightLog(0, Course(seed=0, gates=())).verdict(10 * NS_PER_S) is None
-
-
-def test_modes_and_gates_are_logged(pilot):
-    log, watch = flown(pilot, make_course(7))
-    pilot.hold(1.0, thr=1000, watch=watch)
-    pilot.ap.set_mode(Mode.ALT_HOLD)
-    pilot.hold(1.0, thr=1000, watch=watch)
-
-    summary = log.summary(pilot.ap, 0)
-    assert [entry["mode"] for entry in summary["modes"]] == ["STABILIZE", "ALT_HOLD"]
-    assert summary["modes"][1]["t_s"] == pytest.approx(1.0, abs=0.01)
-    assert summary["gates"] == {"total": len(make_course(7).gates), "passed": []}
-
-
-def test_the_report_is_json(tmp_path, pilot):
-    path = tmp_path / "fc.json"
-    log = FlightLog(0, make_course(1))
-    log.on_text(5, "hello")
-
-    write_report(path, log.summary(pilot.ap, 3))
-
-    written = json.loads(path.read_text())
-    assert written["bad_frames"] == 3
-    assert written["sticks"] == []
-    assert written["statustexts"] == [{"t_s": 5e-9, "text": "hello"}]

@@ -43,28 +43,6 @@ def test_rtl_comes_home_and_lands(pilot):
     assert not pilot.ap.armed
 
 
-@pytest.mark.parametrize("mode", [Mode.LAND, Mode.RTL])
-def test_a_fast_drift_is_braked_with_the_firmwares_lean(pilot, mode):
-    """From 14 degrees: level after 0.36 s, then 14.8 (LAND) and 10 (RTL) the other way."""
-    pilot.take_off(height_m=4.0)
-    pilot.hold(1.5, roll=1750)
-    assert pilot.ap.set_mode(mode)
-    rolls_deg = []
-    pilot.hold(3.0, watch=lambda ap: rolls_deg.append(pilot.angles_deg()[0]))
-    assert 9.0 < -min(rolls_deg) < 16.0
-
-
-def test_full_throttle_down_in_alt_hold_lands_and_disarms_after_the_delay(pilot):
-    pilot.take_off(height_m=3.0)
-    pilot.hold(5.0, thr=1000)
-    assert pilot.ap.armed
-    assert pilot.ap.landed
-
-    pilot.hold(10.0, thr=1000)
-
-    assert not pilot.ap.armed
-
-
 def test_a_tipped_vehicle_stops_its_motors(pilot):
     pilot.ap.params.set("ACRO_TRAINER", 0.0)
     pilot.take_off(height_m=3.0, mode=Mode.ACRO)

@@ -90,13 +90,3 @@ def test_the_battery_is_reported_as_set(station, is_low):
     assert bool(status.onboard_control_sensors_health & BATTERY) != is_low
     assert (battery.charge_state == mav.MAV_BATTERY_CHARGE_STATE_LOW) == is_low
     assert (heartbeat.system_status == mav.MAV_STATE_CRITICAL) == is_low
-
-
-def test_a_reboot_leaves_the_transmitter_as_it_was(station):
-    station.vehicle.set_receiver([1500, 1500, 1500, 1500, 1500, 1900, 1500, 1500])
-    station.run(0.1)
-
-    station.vehicle.reboot()
-    station.run(0.1)
-
-    assert station.vehicle.ap.rc.channels_us[5] == 1900

@@ -96,11 +96,3 @@ def test_a_launched_vehicle_flies_on_from_there():
     assert [entry["index"] for entry in summary["gates"]["passed"]] == [1]
     assert vehicle.log.next_gate is None
     assert vehicle.ap.truth.position_ned_m[2] == pytest.approx(-2.0, abs=0.3)
-
-
-def test_a_reboot_takes_the_vehicle_home_through_no_gate():
-    vehicle = launched((14.0, 2.0, -2.0), north_mps=0.0, next_gate=0)
-    glide(vehicle, 0.2)
-    vehicle.reboot()
-    glide(vehicle, 0.2)
-    assert vehicle.log.summary(vehicle.ap, 0)["crash"] is None

@@ -59,21 +59,6 @@ def test_heartbeats_of_ground_stations_are_passed_on(ends_of, kind, arrives):
     assert bool(heard) == arrives
 
 
-def test_a_long_text_comes_in_numbered_chunks(ends):
-    ends.gcs_heartbeat()
-    ends.run(0.1)
-    ends.command(mav.MAV_CMD_DO_SET_MODE, 1, 2)
-    ends.send(mav.MAVLink_command_long_message(1, 1, 400, 0, 1, *[0] * 6))
-
-    chunks = named(ends.run(0.1), "STATUSTEXT")
-
-    assert [m.chunk_seq for m in chunks] == [0, 1]
-    assert chunks[0].id == chunks[1].id != 0
-    assert "".join(m.text for m in chunks) == (
-        "Arming denied: Resolve system health failures first\t"
-    )
-
-
 def test_an_event_has_the_number_and_layout_of_the_firmware():
     event = Event("commander_armed_by", 0x66, b"\x04", 79_300)
     sender = mav.MAVLink(None, srcSystem=1, srcComponent=1)
@@ -95,16 +80,6 @@ def test_a_ground_stations_link_gets_no_imu_and_a_companions_does(ends_of):
     messages = ends.run(1.0, link=1)  # and those of the second before
     assert len(named(messages, "HIGHRES_IMU")) == pytest.approx(100, abs=2)
     assert len([m for m in named(messages, "TIMESYNC") if m.tc1 == 0]) == pytest.approx(20, abs=1)
-
-
-def test_a_narrow_link_is_slowed_in_silence(ends_of):
-    ends = ends_of(link_bytes_ps=4000.0, onboard_links=frozenset({0}))
-    assert ends.interval(mav.MAVLINK_MSG_ID_ATTITUDE, 100) == ACCEPTED
-
-    messages = ends.run(5.0)
-
-    assert len(named(messages, "ATTITUDE")) / 5.0 == pytest.approx(11.8, abs=1.0)
-    assert len(named(messages, "HEARTBEAT")) == 5
 
 
 def test_without_a_position_its_message_goes_on(ends):

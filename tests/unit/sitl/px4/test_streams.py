@@ -29,18 +29,6 @@ def test_nothing_is_sent_while_the_topic_is_old():
     assert len(times) == 11
 
 
-def test_a_stream_that_waited_starts_a_new_grid():
-    streams = Px4Streams({}, PLENTY, 0)
-    streams.set_interval(ATTITUDE, 20_000, 0)
-    version = {"now": 1}
-    sent_ms(streams, 0.1, version_of=lambda _: version["now"])
-    version["now"] = 2
-
-    times = sent_ms(streams, 0.1, version_of=lambda ms: ms, begin_ms=1004)
-
-    assert times[:2] == [1008, 1028]
-
-
 def test_zero_restores_the_links_default_and_minus_one_stops():
     streams = Px4Streams({ATTITUDE: 50.0}, PLENTY, 0)
     streams.set_interval(ATTITUDE, -1, 0)

@@ -68,10 +68,3 @@ def test_rotating_there_and_back_changes_nothing(roll, pitch, yaw):
     back = rotation.rotate(rotation.conjugate(q), rotation.rotate(q, (1.0, -2.0, 3.0)))
 
     assert back == pytest.approx((1.0, -2.0, 3.0), abs=1e-9)
-
-
-def test_integrating_a_rate_turns_by_rate_times_time():
-    q = rotation.integrate(rotation.IDENTITY, (0.0, 0.0, 0.5), 1.0)
-
-    assert rotation.to_euler(q) == pytest.approx((0.0, 0.0, 0.5))
-    assert rotation.rotation_vector(q) == pytest.approx((0.0, 0.0, 0.5))

@@ -1,0 +1,205 @@
+"""Receiver and overrides, merged channel by channel, and the switches among the channels."""
+
+from bisect import bisect_left
+from collections.abc import Sequence
+from itertools import zip_longest
+
+from sitl.ardupilot.params import RC_CHANNELS_WITH_PARAMS, ArduPilotParams
+from sitl.clock import NS_PER_S
+
+CHANNELS = 16
+PRIMARY_CHANNELS = 8  # channels 1-8 and 9-16 differ in what 0 and the highest values mean
+IGNORE = 65535
+RELEASE_ON_AUX = 65534  # releases channels 9-16; on 1-8 it is a value like any other
+RELEASE = 0  # releases channels 1-8; on 9-16 it means "ignore"
+AXIS_ABSENT = 32767  # MANUAL_CONTROL axis that the sender does not drive
+
+_RECEIVER_PERIOD_NS = NS_PER_S // 50
+_OPTION_OVERRIDE_SWITCH = 46
+_OPTIONS_IGNORE_RECEIVER = 1
+_OPTIONS_IGNORE_OVERRIDES = 2
+
+
+class RcEngine:
+    """Merges receiver and overrides, channel by channel; stamps are nanoseconds of one clock.
+
+    Rules as measured on ArduCopter 4.7: each channel expires after RC_OVERRIDE_TIME, nothing is
+    checked for its range, and sticks stay latched where there is no receiver.
+    """
+
+    def __init__(self, params: ArduPilotParams, receiver_us: Sequence[int] | None) -> None:
+        self._params = params
+        self._receiver_us = receiver_us
+        self._has_frames = receiver_us is not None
+        self._override_us = [RELEASE] * CHANNELS
+        self._override_ns = [0] * CHANNELS
+        self._fresh_override = False
+        self._next_receiver_ns = 0
+        self._switch = _OverrideSwitch()
+        self.channels_us = [0] * CHANNELS
+        """Channels that RC_CHANNELS reports and the modes use; 0 = never had a value."""
+        self.found = receiver_us is not None  # true with a receiver, or once an override has come
+
+    @property
+    def has_receiver(self) -> bool:
+        return self._receiver_us is not None
+
+    @property
+    def channel_count(self) -> int:
+        return max(PRIMARY_CHANNELS, len(self._receiver_us or ()))
+
+    def set_receiver(self, values_us: Sequence[int]) -> None:
+        """Move sticks and switches of the transmitter, in microseconds; the next frame has them.
+
+        Up to 16 channels at 50 Hz; a 0 leaves its channel as it is. All zeros switch it off: no
+        more frames come, and the last values stay. A vehicle without a receiver has one from its
+        first values on.
+        """
+        self._has_frames = any(values_us)
+        if self._has_frames:
+            pairs = zip_longest(values_us[:CHANNELS], self._receiver_us or (), fillvalue=0)
+            self._receiver_us = tuple(new or old for new, old in pairs)
+            self.found = True
+
+    def override(self, raw_us: Sequence[int], now_ns: int) -> None:
+        """Apply the 18 fields of one RC_CHANNELS_OVERRIDE."""
+        for index, value in enumerate(raw_us[:CHANNELS]):
+            if index < PRIMARY_CHANNELS:
+                if value != IGNORE:
+                    self._set(index, value, now_ns)
+            elif value == RELEASE_ON_AUX:
+                self._set(index, RELEASE, now_ns)
+            elif value not in (RELEASE, IGNORE):
+                self._set(index, value, now_ns)
+
+    def manual_control(self, *, x: int, y: int, z: int, r: int, now_ns: int) -> None:
+        """Apply a MANUAL_CONTROL: -1000..1000 (z 0..1000); +x is forward, hence a lower PWM."""
+        if z < 0:
+            return
+        axes = (
+            ("ROLL", y, y + 1000, 2000),
+            ("PITCH", x, 1000 - x, 2000),
+            ("YAW", r, r + 1000, 2000),
+            ("THROTTLE", z, z, 1000),
+        )
+        for axis, value, travel, full in axes:
+            index = self.index_of(axis)
+            low = self._params.integer(f"RC{index + 1}_MIN")
+            high = self._params.integer(f"RC{index + 1}_MAX")
+            pwm = low + (high - low) * travel // full
+            self._set(index, RELEASE if value == AXIS_ABSENT else pwm, now_ns)
+
+    def clear_overrides(self) -> None:
+        self._override_us = [RELEASE] * CHANNELS
+
+    def index_of(self, axis: str) -> int:
+        """Zero-based channel of ROLL, PITCH, THROTTLE or YAW by RCMAP_*."""
+        mapped = self._params.integer(f"RCMAP_{axis}")
+        return min(max(mapped, 1), RC_CHANNELS_WITH_PARAMS) - 1
+
+    def sticks_us(self) -> tuple[int, int, int, int]:
+        """Roll, pitch, throttle and yaw that the modes use, in microseconds by RCMAP_*."""
+        roll, pitch, throttle, yaw = map(self.index_of, ("ROLL", "PITCH", "THROTTLE", "YAW"))
+        channels_us = self.channels_us
+        return channels_us[roll], channels_us[pitch], channels_us[throttle], channels_us[yaw]
+
+    def update(self, now_ns: int) -> bool:
+        """Refresh ``channels_us``; True if receiver or overrides supplied a value."""
+        frame = self._has_frames and now_ns >= self._next_receiver_ns
+        if not (frame or self._fresh_override):
+            self._watch_switch(now_ns)
+            return False
+        self._fresh_override = False
+        if frame:
+            self._next_receiver_ns = now_ns + _RECEIVER_PERIOD_NS
+        values = [self._source(index, now_ns) for index in range(CHANNELS)]
+        for index, value in enumerate(values):
+            if value is not None:
+                self.channels_us[index] = value
+        self._watch_switch(now_ns)
+        return any(value is not None for value in values)
+
+    def _source(self, index: int, now_ns: int) -> int | None:
+        options = self._params.integer("RC_OPTIONS")
+        lifetime_s = self._params["RC_OVERRIDE_TIME"]
+        age_ns = now_ns - self._override_ns[index]
+        is_alive = lifetime_s < 0.0 or age_ns < lifetime_s * NS_PER_S
+        is_allowed = is_alive and not options & _OPTIONS_IGNORE_OVERRIDES
+        if self._override_us[index] != RELEASE and is_allowed:
+            return self._override_us[index]
+        if self._receiver_us is None or options & _OPTIONS_IGNORE_RECEIVER:
+            return None
+        return self._receiver_us[index] if index < len(self._receiver_us) else 0
+
+    def _set(self, index: int, value_us: int, now_ns: int) -> None:
+        if not self._switch.enabled:
+            return
+        self._override_us[index] = value_us
+        self._override_ns[index] = now_ns
+        self._fresh_override = True
+        self.found = True
+
+    def _watch_switch(self, now_ns: int) -> None:
+        for channel in range(1, RC_CHANNELS_WITH_PARAMS + 1):
+            if self._params.integer(f"RC{channel}_OPTION") == _OPTION_OVERRIDE_SWITCH:
+                if self._switch.update(self.channels_us[channel - 1], now_ns):
+                    self.clear_overrides()
+                return
+
+
+class ModeSwitch:
+    """FLTMODE_CH: acts when its position has changed and has stayed for 0.2 s."""
+
+    _HIGHEST_US = (1230, 1360, 1490, 1620, 1749)  # of the first five positions
+    _DEBOUNCE_NS = NS_PER_S // 5
+
+    def __init__(self) -> None:
+        self.position: int | None = None
+        self._candidate: int | None = None
+        self._since_ns = 0
+
+    def update(self, pwm_us: int, now_ns: int) -> int | None:
+        """The new position, 1..6, at the moment it is taken; None otherwise and for the first."""
+        if not 900 < pwm_us < 2200:
+            return None
+        position = 1 + bisect_left(self._HIGHEST_US, pwm_us)
+        if position != self._candidate:
+            self._candidate, self._since_ns = position, now_ns
+        if position == self.position or now_ns - self._since_ns < self._DEBOUNCE_NS:
+            return None
+        before, self.position = self.position, position
+        return None if before is None else position
+
+
+class _OverrideSwitch:
+    """RCn_OPTION 46: high allows overrides, low forbids them, the middle changes nothing.
+
+    Read at 10 Hz and debounced for 0.2 s, so a flip acts after 0.2 to 0.3 s (0.38 s was measured).
+    """
+
+    _PERIOD_NS = NS_PER_S // 10
+    _DEBOUNCE_NS = NS_PER_S // 5
+
+    def __init__(self) -> None:
+        self.enabled = True
+        self._due_ns = 0
+        self._candidate = "unknown"
+        self._since_ns = 0
+
+    def update(self, pwm_us: int, now_ns: int) -> bool:
+        """True when overrides have just been forbidden."""
+        if now_ns < self._due_ns:
+            return False
+        self._due_ns = now_ns + self._PERIOD_NS
+        position = "neither"
+        if 900 < pwm_us < 1200:
+            position = "low"
+        elif 1800 < pwm_us < 2200:
+            position = "high"
+        if position != self._candidate:
+            self._candidate, self._since_ns = position, now_ns
+            return False
+        if position == "neither" or now_ns - self._since_ns < self._DEBOUNCE_NS:
+            return False
+        was_enabled, self.enabled = self.enabled, position == "high"
+        return was_enabled and not self.enabled
