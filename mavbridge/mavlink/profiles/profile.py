@@ -74,9 +74,6 @@ class StreamGroup(NamedTuple):
     """One quantity: the messages that carry it, best first."""
 
     messages: tuple[str, ...]
-    stream: int | None
-    """MAV_DATA_STREAM of REQUEST_DATA_STREAM; None where the firmware has none, or it would also
-    set other messages."""
     rate_hz: float
     is_optional: bool = False
     """Nothing waits for it: a vehicle that does not grant it is flown without."""
@@ -98,7 +95,7 @@ def optional_stream(
     stand_in: str | None = None,
 ) -> StreamGroup:
     """Group of one message that no flight waits for."""
-    return StreamGroup((message,), None, rate_hz, True, least_hz, without, stand_in)
+    return StreamGroup((message,), rate_hz, True, least_hz, without, stand_in)
 
 
 NO_LANDING = "a landing does not end the flight"

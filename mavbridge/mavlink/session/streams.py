@@ -6,7 +6,7 @@ from pymavlink.dialects.v20 import ardupilotmega as dialect
 
 from mavbridge.core.clock import NS_PER_MS, NS_PER_S
 from mavbridge.mavlink.codec.fast_path import MISSING_IDS
-from mavbridge.mavlink.codec.messages import CommandAck, CommandRequest, Request, StreamRequest
+from mavbridge.mavlink.codec.messages import CommandAck, CommandRequest
 from mavbridge.mavlink.profiles.profile import StreamGroup
 
 _ACK_TIMEOUT_NS = 500 * NS_PER_MS
@@ -28,7 +28,7 @@ _LOSSY = 0.1
 
 
 class _Stream:
-    """Negotiation of one group: the message, its rate, and the kind of request."""
+    """Negotiation of one group: the message and its rate."""
 
     def __init__(self, group: StreamGroup) -> None:
         self.group = group
@@ -46,11 +46,9 @@ class _Stream:
         self.is_absence_told = False
         self._choice = 0
 
-    def request(self) -> Request:
-        """The next request to send: REQUEST_DATA_STREAM once no message interval was accepted."""
+    def request(self) -> CommandRequest:
+        """The next request to send, of one message after the other."""
         self.attempts += 1
-        if self._choice >= len(self.group.messages) and self.group.stream is not None:
-            return StreamRequest(self.group.stream, max(round(self.rate_hz), 1))
         number = message_id(self.group.messages[self._choice % len(self.group.messages)])
         return CommandRequest(dialect.MAV_CMD_SET_MESSAGE_INTERVAL, (number, 1e6 / self.rate_hz))
 
@@ -74,10 +72,9 @@ class _Stream:
         self.rate_hz = self.group.rate_hz
         self._choice += 1
 
-    def give_up_intervals(self) -> None:
-        """The vehicle does not answer SET_MESSAGE_INTERVAL."""
-        self.attempts = 0
-        self._choice = len(self.group.messages)
+    def miss(self) -> None:
+        """The vehicle does not answer: begin with the first message again."""
+        self.attempts = self._choice = 0
         if self.group.is_optional:
             self._give_up()
 
@@ -174,25 +171,21 @@ class StreamRequester:
             self._pending.refuse()
         self._pending = None
 
-    def step(self, now_ns: int) -> Request | None:
+    def step(self, now_ns: int) -> CommandRequest | None:
         """The request that is due, if any."""
         self._check_rates(now_ns)
         if self._pending is not None:
             if now_ns - self._requested_ns < _ACK_TIMEOUT_NS:
                 return None
             if self._pending.attempts >= _ATTEMPTS:
-                self._pending.give_up_intervals()
+                self._pending.miss()
         self._pending = next((s for s in self._streams if not s.is_settled), None)
         if self._pending is None:
             return None
         self._requested_ns = now_ns
-        request = self._pending.request()
-        if isinstance(request, StreamRequest):  # never acknowledged
-            self._pending.accept()
-            self._pending = None
-        return request
+        return self._pending.request()
 
-    def stand_ins(self, now_ns: int) -> Iterator[Request]:
+    def stand_ins(self, now_ns: int) -> Iterator[CommandRequest]:
         """Yield requests for what stands in for streams that stay away."""
         for stream in self._streams:
             name = stream.group.stand_in

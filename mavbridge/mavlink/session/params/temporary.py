@@ -3,7 +3,6 @@
 import math
 from collections.abc import Callable, Iterator, Mapping
 from enum import Enum, auto
-from typing import NamedTuple
 
 from mavbridge.core.clock import NS_PER_MS
 from mavbridge.core.reasons import Code, Reason, because
@@ -19,81 +18,19 @@ def is_same(one: float, other: float) -> bool:
     return math.isclose(one, other, rel_tol=1e-6, abs_tol=1e-9)
 
 
-class Outcome(NamedTuple):
-    """The end of one write."""
-
-    name: str
-    asked: float
-    answer: float | None
-    """Value that the vehicle named last; None: it did not answer."""
-
-    @property
-    def is_confirmed(self) -> bool:
-        """The vehicle has the value."""
-        return self.answer is not None and is_same(self.answer, self.asked)
-
-
 class _Write:
+    """One parameter until the vehicle confirms it, six requests at most."""
+
     def __init__(self, value: float) -> None:
         self.value = value
         self.answer: float | None = None
+        """Value that the vehicle named last; perhaps in answer to an older request."""
         self.requested_ns = 0
         self.attempts = 0
 
-
-class ParamWriter:
-    """Writes parameters until PARAM_VALUE confirms each, six times at most."""
-
-    def __init__(self) -> None:
-        self._open: dict[str, _Write] = {}
-        self._outcomes: list[Outcome] = []
-
     @property
-    def is_done(self) -> bool:
-        """Every write is confirmed or was given up."""
-        return not self._open
-
-    def write(self, name: str, value: float) -> None:
-        """Set this parameter; replaces an unfinished write of the same one."""
-        self._open[name] = _Write(value)
-
-    def cancel(self) -> None:
-        """Forget what is unfinished; the vehicle may have taken it."""
-        self._open.clear()
-
-    def take_outcomes(self) -> list[Outcome]:
-        """Results of the writes that ended since the last call."""
-        outcomes, self._outcomes = self._outcomes, []
-        return outcomes
-
-    def receive(self, param: ParamValue) -> None:
-        """Take a PARAM_VALUE. Another value than ours may be the answer to an older request."""
-        write = self._open.get(param.name)
-        if write is None or write.attempts == 0:
-            return
-        write.answer = param.value
-        if is_same(param.value, write.value):
-            self._close(param.name, write)
-
-    def step(self, now_ns: int) -> Iterator[ParamWrite | ParamRequest]:
-        """Requests that are due.
-
-        A repetition also reads the value: a vehicle that has it already may not answer a write.
-        """
-        for name, write in list(self._open.items()):
-            if write.attempts and now_ns - write.requested_ns < _TIMEOUT_NS:
-                continue
-            if write.attempts >= _ATTEMPTS:
-                self._close(name, write)
-                continue
-            write.requested_ns, write.attempts = now_ns, write.attempts + 1
-            yield ParamWrite(name, write.value)
-            if write.attempts > 1:
-                yield ParamRequest(name)
-
-    def _close(self, name: str, write: _Write) -> None:
-        del self._open[name]
-        self._outcomes.append(Outcome(name, write.value, write.answer))
+    def is_confirmed(self) -> bool:
+        return self.answer is not None and is_same(self.answer, self.value)
 
 
 class _Phase(Enum):
@@ -126,7 +63,7 @@ class TemporaryParams:
         self._failures: dict[str, Reason] = {}
         self._is_disarmed = False
         self._is_ending = False
-        self._writer = ParamWriter()
+        self._open: dict[str, _Write] = {}
 
     def problem(self) -> Reason | None:
         """Why a flight may not begin yet, or None."""
@@ -143,7 +80,9 @@ class TemporaryParams:
 
     def receive(self, param: ParamValue) -> None:
         """Take a PARAM_VALUE: a confirmation, or a value that the pilot has mended meanwhile."""
-        self._writer.receive(param)
+        write = self._open.get(param.name)
+        if write is not None and write.attempts and not write.is_confirmed:
+            write.answer = param.value
         if param.name in self._failures and is_same(param.value, self._wanted[param.name]):
             del self._failures[param.name]
 
@@ -161,18 +100,31 @@ class TemporaryParams:
             self._begin_writing(values)
         if self._phase not in (_Phase.WRITING, _Phase.RESTORING):
             return
+        for name in [name for name, write in self._open.items() if write.is_confirmed]:
+            self._conclude(name)
         if is_disarmed:
-            yield from self._writer.step(now_ns)
-        elif self._phase is _Phase.RESTORING and not self._writer.is_done:
-            self._writer.cancel()
+            yield from self._write(now_ns)
+        elif self._phase is _Phase.RESTORING and self._open:
+            self._open.clear()
             self._report_what_stays()
-        for outcome in self._writer.take_outcomes():
-            if self._phase is _Phase.WRITING:
-                self._conclude_set(outcome)
-            else:
-                self._conclude_restore(outcome)
-        if self._writer.is_done:
+        if not self._open:
             self._phase = _Phase.READY if self._phase is _Phase.WRITING else _Phase.ENDED
+
+    def _write(self, now_ns: int) -> Iterator[ParamWrite | ParamRequest]:
+        """Requests that are due.
+
+        A repetition also reads the value: a vehicle that has it already may not answer a write.
+        """
+        for name, write in list(self._open.items()):
+            if write.attempts and now_ns - write.requested_ns < _TIMEOUT_NS:
+                continue
+            if write.attempts >= _ATTEMPTS:
+                self._conclude(name)
+                continue
+            write.requested_ns, write.attempts = now_ns, write.attempts + 1
+            yield ParamWrite(name, write.value)
+            if write.attempts > 1:
+                yield ParamRequest(name)
 
     def _begin_writing(self, values: Mapping[str, float]) -> None:
         self._phase = _Phase.WRITING
@@ -181,11 +133,22 @@ class TemporaryParams:
                 self._failures[name] = because(Code.SET_ABSENT, name=name, value=value)
             elif not is_same(now, value):
                 self._before[name] = now
-                self._writer.write(name, value)
+                self._open[name] = _Write(value)
 
-    def _conclude_set(self, outcome: Outcome) -> None:
-        name, asked, answer = outcome
-        if outcome.is_confirmed:
+    def _conclude(self, name: str) -> None:
+        """Tell how the write of this parameter has ended."""
+        write = self._open.pop(name)
+        asked, answer = write.value, write.answer
+        if self._phase is _Phase.RESTORING:
+            if write.is_confirmed:
+                self._report(f"{name} put back to {asked:g}")
+                self._before.pop(name, None)
+            else:
+                self._report(
+                    f"{name} could not be put back to {asked:g}, as the vehicle did not confirm "
+                    "it: set it with your ground station"
+                )
+        elif write.is_confirmed:
             self._report(f"{name} set from {self._before[name]:g} to {asked:g} for this flight")
         elif answer is None:
             self._failures[name] = because(Code.SET_UNANSWERED, name=name, value=asked)
@@ -203,8 +166,7 @@ class TemporaryParams:
         return self._phase is _Phase.ENDED or not self._wanted
 
     def _begin_restoring(self, values: Mapping[str, float]) -> None:
-        self._writer.cancel()
-        self._writer.take_outcomes()  # of what was set, not of what is put back
+        self._open.clear()
         self._phase = _Phase.RESTORING
         for name, before in list(self._before.items()):
             now = values.get(name)
@@ -213,7 +175,7 @@ class TemporaryParams:
                 del self._before[name]
             elif self._is_disarmed:
                 # Also if it seems to have its old value: a write may be on its way.
-                self._writer.write(name, before)
+                self._open[name] = _Write(before)
         if not self._is_disarmed:
             self._report_what_stays()
 
@@ -223,15 +185,4 @@ class TemporaryParams:
             self._report(
                 "the vehicle is still armed, so what was set for the flight stays: "
                 f"{', '.join(texts)}"
-            )
-
-    def _conclude_restore(self, outcome: Outcome) -> None:
-        name, value, _ = outcome
-        if outcome.is_confirmed:
-            self._report(f"{name} put back to {value:g}")
-            self._before.pop(name, None)
-        else:
-            self._report(
-                f"{name} could not be put back to {value:g}, as the vehicle did not confirm it: "
-                "set it with your ground station"
             )
