@@ -70,8 +70,7 @@ def _run(
     if files is None:
         _fly(settings, port, samples, received, clock, None)
         return
-    store = SigningStore(files, clock)
-    with store as signing:
+    with (store := SigningStore(files, clock)) as signing:
         if store.problem is not None:
             port.send(encode_from_guard(GuardMessage(store.problem)))
         _fly(settings, port, samples, received, clock, signing)

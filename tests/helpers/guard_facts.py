@@ -5,11 +5,14 @@ from typing import Any
 
 from mavbridge.core.clock import NS_PER_MS
 from mavbridge.core.reasons import Code, Reason, Value
-from mavbridge.core.vehicle import NEUTRAL, ModeRoles
+from mavbridge.core.vehicle import NEUTRAL, ActionMeaning, ModeRoles
+from mavbridge.guard.chunks import FreshnessLimits
 from mavbridge.guard.engagement import Engagement
+from mavbridge.guard.envelope import EnvelopeLimits
 from mavbridge.guard.limits import LimitSettings, Smoothing
 from mavbridge.guard.memory import EngagementSettings
 from mavbridge.guard.sequences import DisengageSettings, EngageSettings
+from mavbridge.guard.settings import FlightSettings
 from mavbridge.guard.values import Actions, EndRequest, EngagementInputs, OperatorCommand, Phase
 
 MODES = ("ALT_HOLD", "ALTCTL")
@@ -83,6 +86,23 @@ def engagement_settings(**settings: Any) -> EngagementSettings:
         disengage=disengage,
         **settings,
     )
+
+
+def flight_settings(**changes: Any) -> FlightSettings:
+    """Sticks at 100 Hz without a filter, in ALT_HOLD; ages up to 300 ms."""
+    ages = dict.fromkeys(("state_ns", "velocity_ns", "feature_ns", "chunk_ns"), 300 * NS_PER_MS)
+    settings: dict[str, Any] = {
+        "meaning": ActionMeaning(),
+        "stick_period_ns": 10 * NS_PER_MS,
+        "chunk_period_ns": 10 * NS_PER_MS,
+        "freshness": FreshnessLimits(**ages),
+        "smoothing": stick_smoothing(),
+        "envelope": EnvelopeLimits(),
+        "watches_home_height": False,
+        "watches_position": False,
+        "engagement": engagement_settings(modes=("ALT_HOLD",)),
+    }
+    return FlightSettings(**(settings | changes))
 
 
 def codes(reason: Reason | None) -> tuple[Code, ...]:

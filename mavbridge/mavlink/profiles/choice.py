@@ -18,33 +18,24 @@ _MULTIROTORS = (
 )
 
 
-def profile_of(autopilot: int) -> Profile | None:
-    """The profile of a MAV_AUTOPILOT; None: it cannot be flown."""
-    return _PROFILES.get(autopilot)
-
-
 def require_profile(autopilot: int, vehicle_type: int) -> Profile:
     """The profile of a multirotor's firmware.
 
     Raises:
         PeerError: the firmware is another one, or the vehicle is no multirotor.
     """
-    profile = profile_of(autopilot)
-    if profile is None:
-        name = _name("MAV_AUTOPILOT", autopilot)
+    if autopilot not in _PROFILES:
         raise PeerError(
-            f"the vehicle's firmware is {name} (MAV_AUTOPILOT {autopilot}), and only ArduPilot and "
-            "PX4 are flown"
+            f"the vehicle's firmware is {_name('MAV_AUTOPILOT', autopilot)}, and only ArduPilot "
+            "and PX4 are flown"
         )
     if vehicle_type not in _MULTIROTORS:
         name = _name("MAV_TYPE", vehicle_type)
-        raise PeerError(
-            f"the vehicle is a {name} (MAV_TYPE {vehicle_type}), and only multirotors are flown"
-        )
-    return profile
+        raise PeerError(f"the vehicle is a {name}, and only multirotors are flown")
+    return _PROFILES[autopilot]
 
 
 def _name(enum: str, number: int) -> str:
     entry = dialect.enums[enum].get(number)
-    name: str = entry.name.removeprefix(f"{enum}_") if entry else "unknown"
-    return name
+    name = entry.name.removeprefix(f"{enum}_") if entry else "unknown"
+    return f"{name} ({enum} {number})"

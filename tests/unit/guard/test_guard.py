@@ -7,7 +7,14 @@ from typing import Any
 import pytest
 
 from helpers.fakes import AIRBORNE_STATUS, FOREVER_NS, START_NS
-from helpers.guard_facts import COPTER_MODES, PX4_MODES, codes, engagement_settings, stick_smoothing
+from helpers.guard_facts import (
+    COPTER_MODES,
+    PX4_MODES,
+    codes,
+    engagement_settings,
+    flight_settings,
+    stick_smoothing,
+)
 from mavbridge.core.clock import NS_PER_MS
 from mavbridge.core.reasons import Code, Reason, because
 from mavbridge.core.vehicle import (
@@ -28,11 +35,9 @@ from mavbridge.core.vehicle import (
     Velocity,
 )
 from mavbridge.guard.chunks import Chunk, FreshnessLimits
-from mavbridge.guard.envelope import EnvelopeLimits
 from mavbridge.guard.guard import Guard, GuardInput, GuardOutput
 from mavbridge.guard.limits import LimitSettings, Smoothing
 from mavbridge.guard.sequences import DisengageSettings
-from mavbridge.guard.settings import FlightSettings
 from mavbridge.guard.values import EndRequest, OperatorCommand, Phase
 
 MS = NS_PER_MS
@@ -64,15 +69,10 @@ class Stepped:
         engagement = engagement_settings(
             **({"modes": ("ALT_HOLD",), "disengage": DisengageSettings()} | rules)
         )
-        settings = FlightSettings(
+        settings = flight_settings(
             meaning=meaning or ActionMeaning(),
-            stick_period_ns=10 * MS,
-            chunk_period_ns=10 * MS,
             freshness=freshness,
             smoothing=smoothing or stick_smoothing(),
-            envelope=EnvelopeLimits(),
-            watches_home_height=False,
-            watches_position=False,
             engagement=engagement,
         )
         self.guard = Guard(settings, START_NS)

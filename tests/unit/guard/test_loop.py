@@ -7,7 +7,7 @@ from typing import Any
 import pytest
 
 from helpers.fakes import FOREVER_NS, START_NS, FakeClock, FakeLink
-from helpers.guard_facts import codes, engagement_settings, stick_smoothing
+from helpers.guard_facts import codes, engagement_settings, flight_settings
 from mavbridge.core.clock import NS_PER_MS, NS_PER_S
 from mavbridge.core.errors import UserError
 from mavbridge.core.link_settings import LinkSettings
@@ -24,8 +24,7 @@ from mavbridge.core.vehicle import (
     Release,
     Sticks,
 )
-from mavbridge.guard.chunks import Chunk, FreshnessLimits
-from mavbridge.guard.envelope import EnvelopeLimits
+from mavbridge.guard.chunks import Chunk
 from mavbridge.guard.guard import Guard
 from mavbridge.guard.limits import LimitSettings, Smoothing
 from mavbridge.guard.loop import FINISH_NS, IDLE_PERIOD_NS, GuardLoop
@@ -48,19 +47,7 @@ from mavbridge.mavlink.codec.packets import CommandRefusedError
 
 MS = NS_PER_MS
 WANTED = Sticks(0.4, 0.1, -0.2, 0.3)
-FLIGHT = FlightSettings(
-    meaning=ActionMeaning(),
-    stick_period_ns=10 * MS,
-    chunk_period_ns=10 * MS,
-    freshness=FreshnessLimits(
-        state_ns=300 * MS, velocity_ns=300 * MS, feature_ns=300 * MS, chunk_ns=300 * MS
-    ),
-    smoothing=stick_smoothing(),
-    envelope=EnvelopeLimits(),
-    watches_home_height=False,
-    watches_position=False,
-    engagement=engagement_settings(modes=("ALT_HOLD",), disengage=DisengageSettings()),
-)
+FLIGHT = flight_settings()
 
 
 class FakePort:

@@ -10,11 +10,10 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from helpers.guard_facts import engagement_settings, stick_smoothing
+from helpers.guard_facts import engagement_settings, flight_settings, stick_smoothing
 from mavbridge.core.link_settings import LinkSettings
 from mavbridge.core.reasons import Code, Reason, because
 from mavbridge.core.vehicle import (
-    ActionMeaning,
     ActionTrace,
     ForwardedPacket,
     LinkStats,
@@ -23,10 +22,10 @@ from mavbridge.core.vehicle import (
     Sample,
     Sticks,
 )
-from mavbridge.guard.chunks import Chunk, FreshnessLimits
+from mavbridge.guard.chunks import Chunk
 from mavbridge.guard.envelope import EnvelopeLimits
 from mavbridge.guard.sequences import DisengageSettings
-from mavbridge.guard.settings import FlightSettings, GuardSettings
+from mavbridge.guard.settings import GuardSettings
 from mavbridge.guard.values import EndRequest, Outcome, Phase
 from mavbridge.guard.wire import (
     FromGuard,
@@ -46,16 +45,10 @@ from mavbridge.guard.wire import (
 )
 
 STICKS = Sticks(0.1, -0.2, 0.3, -0.4)
-FLIGHT = FlightSettings(
-    meaning=ActionMeaning(),
-    stick_period_ns=10_000_000,
-    chunk_period_ns=33_333_333,
-    freshness=FreshnessLimits(state_ns=1, velocity_ns=2, feature_ns=3, chunk_ns=4),
+FLIGHT = flight_settings(
     smoothing=stick_smoothing(max_slew_per_s=8.0, tau_s=0.05),
     envelope=EnvelopeLimits(height_m=math.inf),
-    watches_home_height=False,
-    watches_position=False,
-    engagement=engagement_settings(modes=("ALT_HOLD",), disengage=DisengageSettings(then="rtl")),
+    engagement=engagement_settings(disengage=DisengageSettings(then="rtl")),
 )
 CHUNK = Chunk(
     serial=7,
