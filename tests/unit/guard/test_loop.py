@@ -186,14 +186,6 @@ def test_every_stick_is_told_with_its_chunk_as_it_was_sent() -> None:
     assert [tick.chunk_serial for tick in sent] == sorted(tick.chunk_serial for tick in sent)
 
 
-def test_slots_in_which_nothing_is_sent_are_told_too() -> None:
-    rig = Rig()
-    rig.tell(FLIGHT)
-    rig.run(0.1)
-    assert [tick.index for tick in rig.ticks] == list(range(10))
-    assert {(tick.is_slot, tick.sent) for tick in rig.ticks} == {(True, None)}
-
-
 def test_a_change_of_phase_is_told_even_where_nothing_is_sent() -> None:
     rig = Rig().flying()
     rig.solves = False
@@ -269,14 +261,6 @@ def test_the_newest_of_several_chunks_is_flown() -> None:
     rig.loop.step()
     assert rig.link.decisions[-1] == (rig.clock.now_ns(), Command(action=NEUTRAL))
     assert rig.ticks[-1].chunk_serial == new.serial
-
-
-def test_why_there_is_no_chunk_is_passed_on_to_the_user() -> None:
-    rig = Rig()
-    rig.solves = False
-    rig.tell(FLIGHT, NoChunk(because(Code.IMAGE_BLANK, what="black", age_s=0.6)))
-    rig.run(0.1)
-    assert rig.ticks[-1].reason == because(Code.IMAGE_BLANK, what="black", age_s=0.6)
 
 
 # --- the vehicle

@@ -463,22 +463,6 @@ def test_on_the_ground_a_vehicle_that_moves_is_followed_and_said_to_have_moved()
     assert told[0] != told[1]
 
 
-def test_in_flight_a_vehicle_whose_clock_goes_on_elsewhere_is_followed() -> None:
-    rig = Rig()
-    rig.run(8.0)
-    rig.link.is_engaged = True
-    rig.run(0.5, Command(action=IDLE))
-    rig.vehicle.address = ("127.0.0.1", 2)
-    rig.run(0.25, Command(action=IDLE))
-    assert rig.vehicle.answered_to == ("127.0.0.1", 1)
-    snapshot = rig.run(0.1, Command(action=IDLE))
-    assert rig.vehicle.answered_to == ("127.0.0.1", 2)
-    assert snapshot.interruption is None
-    assert snapshot.problem is not None
-    assert snapshot.problem.code is Code.MOVED
-    assert rig.run(1.0, Command(action=IDLE)).problem is None
-
-
 def test_in_flight_another_clock_elsewhere_is_not_followed() -> None:
     rig = Rig()
     rig.run(8.0)
@@ -732,17 +716,6 @@ def test_where_nobody_else_has_sticks_px4_gets_neutral_ones_before_the_silence()
     rig.run(0.5, PILOTS)
     sticks = [m for m in rig.vehicle.received if m.get_type() == "MANUAL_CONTROL"]
     assert [(m.x, m.y, m.z, m.r) for m in sticks[10:]] == [(0, 0, 500, 0)]
-
-
-def test_px4_that_does_not_hear_our_sticks_is_noticed() -> None:
-    rig = px4_rig()
-    rig.run(8.0)
-    rig.run(0.5, Command(action=IDLE))
-    rig.vehicle.follows_overrides = False
-    assert rig.run(0.4, Command(action=IDLE)).problem is None
-    snapshot = rig.run(0.1, Command(action=IDLE))
-    assert snapshot.problem == because(Code.NO_ECHO, message="MANUAL_CONTROL", quantity="sticks")
-    assert not snapshot.is_overruled
 
 
 def test_the_velocity_that_px4_sends_without_an_estimate_is_nobodys_velocity() -> None:

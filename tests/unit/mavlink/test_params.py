@@ -38,14 +38,6 @@ def test_parameters_are_requested_a_few_at_a_time_and_again_when_lost() -> None:
     assert reader.values["P0"] == 2.0
 
 
-def test_a_parameter_that_does_not_exist_is_given_up() -> None:
-    reader = ParamReader(("NONE",))
-    requested = sum(len(list(reader.step(k * S))) for k in range(20))
-    assert requested == 4
-    assert reader.is_done
-    assert reader.values == {}
-
-
 # --- the radio calibration
 
 
@@ -162,15 +154,6 @@ def test_advice_is_given_once_and_waits_for_what_it_needs_to_know() -> None:
     assert "no receiver was seen" in vehicle.texts[1]
 
 
-@pytest.mark.parametrize(("time_s", "is_advised"), [(3.0, True), (1.0, False)])
-def test_a_long_override_time_is_a_warning(time_s: float, is_advised: bool) -> None:
-    vehicle = ParamVehicle({"RC_OVERRIDE_TIME": time_s})
-    vehicle.run(6.0)
-    assert vehicle.problem() is None
-    warned = [text for text in vehicle.texts if "--set RC_OVERRIDE_TIME=0.5" in text]
-    assert len(warned) == is_advised
-
-
 @pytest.mark.parametrize(
     ("baud", "rate_hz", "enough"),
     [
@@ -212,17 +195,7 @@ def px4_vehicle(changes: dict[str, float | None] | None = None, **settings: Any)
     return ParamVehicle(profile=PX4, output=output, values=values, **settings)
 
 
-def test_what_is_known_can_be_listed() -> None:
-    vehicle = ParamVehicle({"RC1_DZ": 25.0, "THR_DZ": 100.0})
-    vehicle.run(6.0)
-    known = vehicle.params.values
-    assert list(known) == sorted(known)
-    assert known["RC1_DZ"] == 25.0
-    assert known["THR_DZ"] == 100.0
-    assert {"RC_FS_TIMEOUT", "FS_OPTIONS", "FS_THR_ENABLE", "RCMAP_YAW"} <= set(known)
-
-
-@pytest.mark.parametrize("seed", range(5))
+@pytest.mark.parametrize("seed", range(2))
 def test_reading_goes_on_through_losses(seed: int) -> None:
     vehicle = ParamVehicle({"RC_OVERRIDE_TIME": -1.0}, loses=lossy(0.5, seed))
     vehicle.run(60.0)

@@ -49,14 +49,6 @@ def test_what_is_put_back_is_the_value_that_was_there_when_it_was_set() -> None:
     assert vehicle.values["RC_OVERRIDE_TIME"] == 5.0
 
 
-def test_a_refused_risk_is_mended_by_setting_it() -> None:
-    vehicle = start(time_s=-1.0)
-    vehicle.run(6.0)
-    assert vehicle.problem() is None
-    end(vehicle)
-    assert vehicle.values["RC_OVERRIDE_TIME"] == -1.0
-
-
 @pytest.mark.parametrize("seed", range(5))
 def test_setting_and_putting_back_survive_losses(seed: int) -> None:
     vehicle = start(loses=lossy(0.3, seed))

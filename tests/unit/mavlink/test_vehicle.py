@@ -379,15 +379,6 @@ def test_a_receiver_is_learnt_before_the_first_override(
     assert session.status.has_receiver is expected
 
 
-def test_a_receiver_that_comes_before_the_first_override_counts() -> None:
-    session = Session()
-    session.rc(NOTHING)
-    assert session.status.has_receiver is False
-    session.now_ns += S
-    session.rc(RECEIVER)
-    assert session.status.has_receiver is True
-
-
 def test_px4_without_rc_channels_has_no_receiver() -> None:
     session = Session("px4", is_ready=False)
     assert session.status.has_receiver is None

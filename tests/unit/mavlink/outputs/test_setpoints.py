@@ -234,16 +234,6 @@ def test_where_no_echo_is_to_be_expected_none_is_missed(state: str) -> None:
         assert message.thrust == 0.0  # not dithered: the motors stay idle
 
 
-def test_the_receiver_is_seen_beside_our_setpoints() -> None:
-    flight = attitude_flight(ARDUPILOT)
-    for _ in range(20):
-        message: Any = flight.message(flight.send(LEVEL))
-        flight.receive(target(message.thrust))
-    assert flight.output.echo_confirmed
-    assert flight.vehicle.is_released
-    assert not flight.vehicle.is_receiver_hidden
-
-
 # --- velocity
 
 
