@@ -38,13 +38,13 @@ _CONTINUE_LANDING = 8
 _LONGEST_S = 1.0
 """A longer time-out leaves the vehicle without a pilot for longer than necessary."""
 
-_OLD_NAMES: dict[str, tuple[str, float]] = {
-    "MAV_GCS_SYSID": ("SYSID_MYGCS", 1.0),
-    "ATC_ANGLE_MAX": ("ANGLE_MAX", 0.01),
-    "PILOT_SPD_UP": ("PILOT_SPEED_UP", 0.01),
-    "PILOT_SPD_DN": ("PILOT_SPEED_DN", 0.01),
+_OLD_NAMES = {
+    "MAV_GCS_SYSID": "SYSID_MYGCS",
+    "ATC_ANGLE_MAX": "ANGLE_MAX",
+    "PILOT_SPD_UP": "PILOT_SPEED_UP",
+    "PILOT_SPD_DN": "PILOT_SPEED_DN",
 }
-"""Names of 4.7 (degrees, m/s), with those up to 4.6 (centidegrees, cm/s) and the factor between."""
+"""Names of 4.7, with those up to 4.6."""
 
 RISK_NAMES = ("RC_OVERRIDE_TIME", "RC_OPTIONS", "FS_THR_ENABLE")
 """Those that decide how safe a flight is: asked for again if the first requests get lost."""
@@ -57,18 +57,10 @@ FIRST_NAMES = (
     *("GUID_OPTIONS", "GUID_TIMEOUT", "ATC_ANGLE_BOOST", "MOT_THST_HOVER"),
     *("PILOT_Y_RATE", "PILOT_Y_EXPO"),
     *_OLD_NAMES,
-    *(old for old, _ in _OLD_NAMES.values()),
+    *_OLD_NAMES.values(),
     *(f"RC{number}_OPTION" for number in _OPTION_CHANNELS),
 )
 """Read first; RCMAP_* then tells which RCn_MIN ... to read."""
-
-
-def current_names(values: Mapping[str, float]) -> dict[str, float]:
-    """The same values, with those of older versions also under 4.7's names and in its units."""
-    renamed = {
-        new: values[old] * factor for new, (old, factor) in _OLD_NAMES.items() if old in values
-    }
-    return renamed | dict(values)
 
 
 def calibration_names(values: Mapping[str, float]) -> tuple[str, ...]:
@@ -161,7 +153,7 @@ def is_simple_setting(name: str, value: float) -> bool:
 
 def override_obstacles(values: Mapping[str, float], source_system: int) -> Iterator[ParamNote]:
     """Reasons, as far as parameters show, for which this vehicle would ignore our overrides."""
-    low = current_names(values).get("MAV_GCS_SYSID")
+    low = values.get("MAV_GCS_SYSID", values.get("SYSID_MYGCS"))
     if low is not None:
         high = max(values.get("MAV_GCS_SYSID_HI", 0), low)
         if not low <= source_system <= high:

@@ -6,7 +6,7 @@ from pymavlink.dialects.v20 import ardupilotmega as dialect
 from mavbridge.core.vehicle import Output
 from mavbridge.mavlink.codec.messages import CommandRequest
 from mavbridge.mavlink.profiles.ardupilot import ARDUPILOT
-from mavbridge.mavlink.profiles.ardupilot_params import current_names, stick_settings
+from mavbridge.mavlink.profiles.ardupilot_params import stick_settings
 from mavbridge.mavlink.profiles.profile import ParamContext
 
 
@@ -107,24 +107,6 @@ def test_setpoints_that_stop_are_never_held_for_ever() -> None:
     values = {"RC_OVERRIDE_TIME": -1.0, "FS_THR_ENABLE": 0.0}
     assert list(ARDUPILOT.dangers(values, context("velocity", has_receiver=False))) == []
     assert len(list(ARDUPILOT.dangers(values, context("rc-override", has_receiver=False)))) == 2
-
-
-def test_old_names_are_read_too_and_mean_the_same() -> None:
-    old = {
-        "SYSID_MYGCS": 255.0,
-        "ANGLE_MAX": 3000.0,
-        "PILOT_SPEED_UP": 250.0,
-        "PILOT_SPEED_DN": 150.0,
-    }
-    new = {
-        "MAV_GCS_SYSID": 255.0,
-        "ATC_ANGLE_MAX": 30.0,
-        "PILOT_SPD_UP": 2.5,
-        "PILOT_SPD_DN": 1.5,
-    }
-    assert current_names(old) == old | new
-    assert current_names(new) == new
-    assert set(old) | set(new) <= set(ARDUPILOT.params)
 
 
 def test_a_takeoff_is_asked_for_by_height_above_home() -> None:
