@@ -9,6 +9,7 @@ from pymavlink.dialects.v20 import ardupilotmega as mav
 
 from helpers.contract_peers import ARM, GCS, TICK_NS, Companion, Peer, named
 from sitl.clock import NS_PER_S
+from sitl.rotation import from_euler
 
 ACCEPTED, REJECTED = mav.MAV_RESULT_ACCEPTED, mav.MAV_RESULT_TEMPORARILY_REJECTED
 ALTCTL, POSCTL, ACRO, OFFBOARD, STAB = (2, 0), (3, 0), (5, 0), (6, 0), (7, 0)
@@ -51,15 +52,7 @@ def event_id(message: Any) -> int:
 def attitude_target(
     roll_deg: float = 0.0, thrust: float = HOVER_THRUST, pitch_deg: float = 0.0, yaw: float = 0.0
 ) -> Any:
-    cr, sr = math.cos(math.radians(roll_deg) / 2), math.sin(math.radians(roll_deg) / 2)
-    cp, sp = math.cos(math.radians(pitch_deg) / 2), math.sin(math.radians(pitch_deg) / 2)
-    cy, sy = math.cos(yaw / 2), math.sin(yaw / 2)
-    q = [
-        cr * cp * cy + sr * sp * sy,
-        sr * cp * cy - cr * sp * sy,
-        cr * sp * cy + sr * cp * sy,
-        cr * cp * sy - sr * sp * cy,
-    ]
+    q = from_euler(math.radians(roll_deg), math.radians(pitch_deg), yaw)
     return mav.MAVLink_set_attitude_target_message(0, 1, 1, 7, q, 0, 0, 0, thrust)
 
 

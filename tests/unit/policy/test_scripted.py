@@ -12,6 +12,7 @@ from policy.errors import PolicyError
 from policy.protocol import DualRatePolicy
 from policy.scripted import PROGRAM_NAMES, ScriptedPolicy
 from policy.scripted.controllers import doublet_length_s, doublet_steps
+from sitl.rotation import from_euler
 
 STEP_S = 0.01
 DELAY_STEPS = 4
@@ -47,15 +48,7 @@ class Vehicle:
     thrust: float = 0.0
 
     def state(self) -> np.ndarray:
-        cr, sr = math.cos(self.roll_rad / 2), math.sin(self.roll_rad / 2)
-        cp, sp = math.cos(self.pitch_rad / 2), math.sin(self.pitch_rad / 2)
-        cy, sy = math.cos(self.yaw_rad / 2), math.sin(self.yaw_rad / 2)
-        quaternion = (
-            cr * cp * cy + sr * sp * sy,
-            sr * cp * cy - cr * sp * sy,
-            cr * sp * cy + sr * cp * sy,
-            cr * cp * sy - sr * sp * cy,
-        )
+        quaternion = from_euler(self.roll_rad, self.pitch_rad, self.yaw_rad)
         velocity = (self.north_mps, self.east_mps, -self.climb_mps)
         return np.array([[*velocity, *quaternion, *self.rates, 0.0, 0.0, -9.81]], np.float32)
 

@@ -94,7 +94,7 @@ def test_a_world_model_is_trained(tmp_path: Path, capsys: pytest.CaptureFixture[
         (["train", "flights", "--out", "no/a.safetensors"], "no folder no"),
         (["train", *OUT, "--start-from", "b.safetensors"], "no such file"),
         (["train", *OUT, "--backbone-weights", "b.pth"], "no such file"),
-        (["train", *OUT, "--backbone-weights", "torn.pth"], "torn.pth: refused"),
+        (["train", *OUT, "--backbone-weights", "torn.pth"], "torn.pth is damaged"),
         (["train", *OUT, "--freeze-encoder"], "--start-from"),
         (["train", *OUT, "--camera-key", "front"], "flights have one camera"),
         (["train-world-model", *OUT, "--ages", "40:90"], "Unknown option"),
