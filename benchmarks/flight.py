@@ -68,7 +68,7 @@ MAX_AGE_S = 5.0
 
 @dataclass(frozen=True, kw_only=True)
 class FlightJob:
-    """What a program that flies once and is measured gets."""
+    """Job of a program that flies once and is measured."""
 
     port: int
     camera: str

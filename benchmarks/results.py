@@ -54,7 +54,7 @@ class Flight:
     solves: str
     engine: str
     conditions: str = ""
-    """What is unusual about this flight, for tables."""
+    """Unusual rate, load or scheduling of this flight, for tables."""
     asked_stick_hz: float
     asked_action_hz: float
     asked_vision_hz: float

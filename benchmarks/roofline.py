@@ -30,7 +30,7 @@ TRIALS, TRIAL_NS = 5, 20 * NS_PER_MS
 
 @dataclass(frozen=True, kw_only=True)
 class Work:
-    """Arithmetic and reads of one call, whatever the engine."""
+    """Arithmetic and reads of one call, on any engine."""
 
     flop: int
     weight_uses: int

@@ -50,7 +50,7 @@ def flights(makes: str, flags: str, student: str | None = None) -> Step:
 
 
 def training(makes: str, data: str, flags: str, start: str | None = None) -> Step:
-    """A training of so many minutes on these folders, from the weights of an earlier one."""
+    """A training on these folders, from the weights of an earlier one."""
     start_from = "" if start is None else f" --start-from {start}.safetensors"
     return Step(f"{makes}.safetensors", f"train {data} {NET} {flags}{start_from}")
 

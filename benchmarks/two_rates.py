@@ -43,7 +43,7 @@ Loop = Literal["one rate", "100 actions a second", "250 actions a second"]
 LOOPS: tuple[Loop, ...] = ("one rate", "100 actions a second", "250 actions a second")
 ENCODER_MS = (5, 20, 50, 100, 200)
 HEAD_MS = 4
-"""What the action head takes beside the encoder in a single loop: 3 ms, and some for late ones."""
+"""Time of the action head beside the encoder in a single loop: 3 ms, and a margin for late ones."""
 MOST_HZ = 100.0
 """Most that a single loop is asked for: the rate of the vehicle's state."""
 CAMERA_HZ = 30.0
@@ -57,7 +57,7 @@ app = App(help=__doc__)
 
 
 class Control(NamedTuple):
-    """What is controlled, of which vehicle, and over which courses."""
+    """Controlled quantity, vehicle and courses of a group."""
 
     name: str
     flags: str
@@ -96,7 +96,7 @@ class Cell:
 
     @property
     def key(self) -> tuple[str, str, int, str]:
-        """What makes it another cell."""
+        """Identity of the cell."""
         return self.control, self.loop, self.encoder_ms, self.checkpoint_sha256
 
 

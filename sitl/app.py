@@ -46,10 +46,9 @@ def run_vehicle(
     pilot: PilotOptions | None = None,
     report: Path | None,
     duration_s: float | None,
-    end_with_course: bool,
     fly_on_s: float = 0.0,
 ) -> None:
-    """Fly until the duration is over (None: endless), the course ends, or a signal comes.
+    """Fly until the duration is over (None: endless), or a signal comes.
 
     Then the vehicle flies on for ``fly_on_s`` by itself before the report is written.
 
@@ -86,7 +85,6 @@ def run_vehicle(
                 stop,
                 end_ns,
                 rc_input=rc_input,
-                end_with_course=end_with_course,
             )
         if fly_on_s:
             os.nice(LEAST_PRIORITY)
@@ -151,12 +149,10 @@ def fly(
     end_ns: int | None,
     *,
     rc_input: Pilot | None = None,
-    end_with_course: bool = False,
 ) -> None:
     """Run the loop on a 2.5 ms grid: receive, advance the vehicle to now, send what is due.
 
     After a stall the vehicle catches up with the clock, and missed grid points are skipped.
-    ``end_with_course`` ends it a second after the last gate, or at a crash.
     """
     status = _Status(vehicle)
     due_ns = clock.now_ns()
@@ -171,8 +167,6 @@ def fly(
         for link_id, transport in enumerate(transports):
             transport.send(vehicle.take_outgoing(link_id))
         status.print_changes()
-        if end_with_course and vehicle.log.verdict(vehicle.ap.now_ns) is not None:
-            return
         missed = max(0, (clock.now_ns() - due_ns) // STEP_NS)
         due_ns += (missed + 1) * STEP_NS
         clock.sleep_until_ns(due_ns)

@@ -55,8 +55,6 @@ def _parser() -> argparse.ArgumentParser:
     add("--autopilot", choices=names, default=names[0], help="firmware (default: ardupilot)")
     add("--report", type=Path, metavar="FILE", help="write a report (docs/formats.md)")
     add("--duration", type=_POSITIVE, metavar="S", help="stop after S seconds")
-    end_help = "stop one second after the last gate, or at a crash"
-    add("--end-with-course", action="store_true", help=end_help)
     fly_on_help = "before the report, fly S seconds more without links, faster than real time"
     add("--fly-on", type=_POSITIVE, default=0.0, metavar="S", help=fly_on_help)
     receiver_help = "RC receiver: throttle down, every stick centred, or none (default: mid; "
@@ -127,7 +125,6 @@ def _fly(args: argparse.Namespace) -> None:
         pilot=PilotOptions(args.pilot, args.pilot_axes, args.pilot_speed) if args.pilot else None,
         report=args.report,
         duration_s=args.duration,
-        end_with_course=args.end_with_course,
         fly_on_s=args.fly_on,
     )
 

@@ -21,7 +21,7 @@ RACE_SEEDS = 1_000_000_000  # seeds from here on are race courses, those below a
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Family:
-    """What the courses of one kind have in common; pairs are least and most."""
+    """Limits of the courses of one kind; pairs are least and most."""
 
     gate_count: int
     first_leg_m: float

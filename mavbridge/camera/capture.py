@@ -26,7 +26,7 @@ default, which is the first of these."""
 SDP_OPTIONS = "|protocol_whitelist;file,udp,rtp"
 """FFmpeg opens what an .sdp file names only where that is allowed."""
 DEVICE_MODES = ((640, 480), (1280, 720), (1920, 1080))
-"""Offered by practically every camera; the smallest that covers the policy's image is used."""
+"""Practically every camera offers them; the smallest that covers the policy's image is used."""
 MAX_DRIVER_AGE_NS = NS_PER_S
 
 

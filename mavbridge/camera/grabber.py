@@ -1,4 +1,4 @@
-"""What live sources share: waiting times, and the thread that keeps a blocking one drained."""
+"""Waiting times of live sources, and the thread that keeps a blocking one drained."""
 
 import threading
 from collections.abc import Callable, Sequence

@@ -197,7 +197,7 @@ class PipeSource:
         return f"{self._name} {how}{self._cutter.rest()}{self._last_error()}"
 
     def close(self) -> None:
-        """End the program and whatever it has started, and wait for it."""
+        """End the program and its children, and wait for it."""
         for number in (signal.SIGTERM, signal.SIGKILL):
             with suppress(ProcessLookupError, PermissionError):
                 os.killpg(self._process.pid, number)

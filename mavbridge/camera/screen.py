@@ -97,7 +97,7 @@ class X11Screen:
 
 
 class ScreenCamera:
-    """Captures the area of the screen that a window covers, including whatever overlaps it.
+    """Captures the area of the screen that a window covers, overlapping windows included.
 
     Captures in ``read``, so a frame is as old as the capture takes, and none is ever dropped. The
     window may be moved and resized.

@@ -59,7 +59,7 @@ class SimulationSettings:
     limits: Limits = field(default_factory=Limits)
     delays: Delays = field(default_factory=Delays)
     raw_sticks: bool = False
-    """Sticks leave as the policy has put them out, whatever the vehicle's curves make of them."""
+    """Send the policy's sticks without mapping them through the vehicle's curves."""
     goal: str | None = None
     """--goal of the flight."""
     draw_images: bool = True
@@ -222,7 +222,7 @@ class SimulatedFlight:
         return guard
 
     def _make_cameras(self, contract: Contract, *, camera_hz: float) -> list[SimulatedCamera]:
-        """The cameras of a policy; a lone one looks ahead, whatever its name.
+        """The cameras of a policy; a single one looks ahead, under any name.
 
         Raises:
             UserError: there is no camera of that name.

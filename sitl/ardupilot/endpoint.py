@@ -136,7 +136,7 @@ def _autopilot_version(ap: ArduCopter) -> Message:
 
 
 def _attitude_target(ap: ArduCopter) -> Message:
-    """The controller's shaped target, whatever was sent; thrust before the boost for a lean."""
+    """The controller's shaped target, not the received setpoint; thrust before the lean boost."""
     attitude, rate_radps = ap.control.target
     return mav.MAVLink_attitude_target_message(
         boot_ms(ap), 0, attitude, *rate_radps, ap.control.thrust

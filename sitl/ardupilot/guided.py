@@ -41,7 +41,7 @@ class VelocitySetpoint(NamedTuple):
 
 
 class Submode(Enum):
-    """What GUIDED follows; GUIDED_NOGPS knows ATTITUDE alone."""
+    """Kind of setpoint that GUIDED follows; GUIDED_NOGPS knows ATTITUDE alone."""
 
     VELOCITY = auto()
     ATTITUDE = auto()

@@ -1,4 +1,4 @@
-"""What the sticks mean: dead zones, curves, the arming gesture, Simple mode.
+"""Meaning of the sticks: dead zones, curves, the arming gesture, Simple mode.
 
 Formulas: ArduPilot ``RC_Channel`` (calibration), Copter ``get_pilot_desired_throttle`` and
 ``get_pilot_desired_climb_rate``; pinned by leans and rates measured on the firmware.

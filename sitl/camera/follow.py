@@ -8,7 +8,7 @@ messages.
 import math
 import sys
 from collections import Counter
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from contextlib import closing
 from typing import TypeAlias
 
@@ -20,7 +20,7 @@ from sitl.clock import NS_PER_S, Clock
 from sitl.course import Course
 from sitl.link.server import Message
 from sitl.link.transport import FOLLOWER_KINDS, open_transport
-from sitl.rotation import Quat, Vec3, from_euler, integrate
+from sitl.rotation import Quat, Vec3, integrate
 
 ReportedPose: TypeAlias = tuple[Vec3, Quat]  # position_ned_m, ned_from_body_wxyz
 
@@ -29,11 +29,8 @@ SYSTEM_ID = 246
 the pilot's ground station has gone."""
 POSE_MAX_AGE_NS = NS_PER_S
 REQUEST_PERIOD_NS = NS_PER_S
-ROUNDS_BEFORE_EULER = 3
-"""Requests for the quaternion that go unanswered before Euler angles are requested as well."""
 QUATERNION = mav.MAVLINK_MSG_ID_ATTITUDE_QUATERNION
 POSITION = mav.MAVLINK_MSG_ID_LOCAL_POSITION_NED
-FRAME_STARTS = (mav.PROTOCOL_MARKER_V1, mav.PROTOCOL_MARKER_V2)
 MESSAGES_PER_FRAME = 2
 MAX_MESSAGE_HZ = 200.0  # within what ArduPilot can send at its default loop rate
 NO_POSE = "no pose from the vehicle in the last second, so no frames"
@@ -56,12 +53,11 @@ class PoseListener:
         self._attitude: tuple[int, Quat, Vec3] | None = None
         self._position: tuple[int, Vec3, Vec3] | None = None
         self._received = Counter[int]()
-        self._rounds_without_quaternion = 0
         self._due_ns: int | None = None
 
     def receive(self, data: bytes, arrived_ns: int) -> None:
         """Parse received bytes; garbage and other senders are ignored."""
-        for message in self._messages(data):
+        for message in self._mav.parse_buffer(data) or ():
             if message.get_srcComponent() != mav.MAV_COMP_ID_AUTOPILOT1:
                 continue
             is_heartbeat = message.get_type() == "HEARTBEAT"
@@ -105,50 +101,26 @@ class PoseListener:
         self._received.clear()
         return [message.pack(self._mav) for message in messages]
 
-    def _messages(self, data: bytes) -> Iterator[Message]:
-        """Parse; where garbage looked like a frame, the bytes that it swallowed are read again."""
-        parser = self._mav
-        message = parser.parse_char(data)
-        while message is not None:
-            if message.get_type() != "BAD_DATA":
-                yield message
-            elif message.data[0] in FRAME_STARTS:
-                parser.buf = bytearray(message.data[1:]) + parser.buf[parser.buf_index :]
-                parser.buf_index = 0
-            message = parser.parse_char(b"")
-
     def _update(self, message: Message, arrived_ns: int) -> None:
         match message.get_type():
             case "ATTITUDE_QUATERNION":
+                rate_radps = (message.rollspeed, message.pitchspeed, message.yawspeed)
                 wxyz = (message.q1, message.q2, message.q3, message.q4)
-                self._update_attitude(wxyz, message, arrived_ns)
-            case "ATTITUDE":
-                angles_rad = (message.roll, message.pitch, message.yaw)
-                if all(map(math.isfinite, angles_rad)):
-                    self._update_attitude(from_euler(*angles_rad), message, arrived_ns)
+                norm = math.hypot(*wxyz)
+                if 0.9 < norm < 1.1 and all(map(math.isfinite, rate_radps)):
+                    w, x, y, z = (part / norm for part in wxyz)
+                    self._attitude = (arrived_ns, (w, x, y, z), rate_radps)
             case "LOCAL_POSITION_NED":
                 position_m = (message.x, message.y, message.z)
                 velocity_mps = (message.vx, message.vy, message.vz)
                 if all(map(math.isfinite, position_m + velocity_mps)):
                     self._position = (arrived_ns, position_m, velocity_mps)
 
-    def _update_attitude(self, wxyz: Quat, message: Message, arrived_ns: int) -> None:
-        rate_radps = (message.rollspeed, message.pitchspeed, message.yawspeed)
-        norm = math.hypot(*wxyz)
-        if 0.9 < norm < 1.1 and all(map(math.isfinite, rate_radps)):
-            w, x, y, z = (part / norm for part in wxyz)
-            self._attitude = (arrived_ns, (w, x, y, z), rate_radps)
-
     def _missing(self) -> list[int]:
         if self._vehicle is None:
             return []
-        wanted = [QUATERNION, POSITION]
-        self._rounds_without_quaternion += 1
-        if self._received[QUATERNION]:
-            self._rounds_without_quaternion = 0
-        if self._rounds_without_quaternion > ROUNDS_BEFORE_EULER:
-            wanted.append(mav.MAVLINK_MSG_ID_ATTITUDE)
-        return [kind for kind in wanted if self._received[kind] < self._rate_hz / 2]
+        enough = self._rate_hz / 2
+        return [kind for kind in (QUATERNION, POSITION) if self._received[kind] < enough]
 
 
 def film_vehicle(

@@ -70,7 +70,7 @@ class Agility:
     planned_braking_mps2: float
     planned_accel_mps2: float
     climb_accel_mps2: float  # vertical; what it counts on to get into the opening of a gate
-    climb_lead_s: float  # the climb rate that is demanded is the planned one so much later
+    climb_lead_s: float  # the demanded climb rate is the planned one this much later
     takeoff_climb_mps: float
     braking_distance_m: float  # beyond the last gate, until it brakes in full
 

@@ -209,7 +209,7 @@ class RateExpert:
 
 
 def _drag_ned_mps2(body: BodyState) -> Vec3:
-    """Drag over mass, whatever the airframe and the wind; 0 on the ground.
+    """Drag over mass of any airframe in any wind; 0 on the ground.
 
     The thrust is along the body's third axis: what an accelerometer feels along the others is drag.
     """

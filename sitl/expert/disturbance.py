@@ -24,7 +24,7 @@ PULSE_S = (0.15, 0.5)
 NOISE_TIME_S = 0.25  # correlation time of the noise: about as fast as a thumb
 START_AWAY_M = (3.0, 5.5)
 """Distance before a gate of an easy course: past the previous one, whose leg is at least 7 m."""
-RACE_START_AWAY_M = (4.0, 8.5)  # likewise with legs of at least 10 m
+RACE_START_AWAY_M = (4.0, 8.5)  # the same for a race, whose legs are at least 10 m
 LATE_CHANCE = 0.3
 LATE_S = (0.2, 2.0)
 

@@ -24,7 +24,7 @@ Gesture = Literal["arm", "disarm"]
 
 
 class Hand(NamedTuple):
-    """What the pilot does with the transmitter."""
+    """Sticks, gesture and switch of the pilot."""
 
     sticks: StickPositions = CENTRED
     gesture: Gesture | None = None
@@ -33,7 +33,7 @@ class Hand(NamedTuple):
 
 
 class Pilot(Protocol):
-    """Whoever moves the receiver; polled by the loop of the vehicle, never waits."""
+    """Source of receiver values; polled by the loop of the vehicle, never waits."""
 
     def latest(self) -> Sequence[int] | None:
         """Channels in microseconds, as ``Autopilot.set_receiver`` takes them; None = as before."""

@@ -61,7 +61,7 @@ LOW_THROTTLE, MIDDLE_THROTTLE = -0.8, 0.2
 """Most that arming allows where the stick is thrust, and where it is a climb rate."""
 
 _BOOT_MODES = {1: Mode.ALTCTL, 2: Mode.POSCTL}
-"""COM_FLTMODE_BOOT; 4, and whatever this vehicle does not have, is Hold."""
+"""COM_FLTMODE_BOOT; 4 and all modes that this vehicle lacks are Hold."""
 
 
 class Commander:
@@ -97,7 +97,7 @@ class Commander:
         return self.armed and (self.lost_sticks.active or self._fallback)
 
     def can_fly(self, mode: Mode) -> bool:
-        """What the mode needs is there: sticks, a position, a stream of setpoints."""
+        """True if the mode has its sticks, position or stream of setpoints."""
         if mode.piloted and not self._sticks.valid:
             return False
         if mode.needs_position and not self.position_ready:

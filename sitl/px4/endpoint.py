@@ -21,7 +21,7 @@ NS_PER_US = 1000
 LOWEST_SCALE = 0.05
 FRAME_BYTES = 12
 OTHER_STREAMS_BYTES_PS = 9000
-"""What PX4 sends besides the streams that this vehicle has; it counts for the bandwidth."""
+"""Bandwidth of the PX4 streams that this vehicle lacks."""
 
 _BOTH = by_message(SYSTEM_TIME=1.0, BATTERY_STATUS=0.5, HOME_POSITION=0.5, ESTIMATOR_STATUS=1.0)
 _BOTH[CURRENT_MODE] = 0.5

@@ -36,7 +36,7 @@ class PositionSetpoint(NamedTuple):
 
 
 Setpoint: TypeAlias = AttitudeSetpoint | PositionSetpoint
-"""What a companion computer asks for in OFFBOARD."""
+"""Setpoint of a companion computer in OFFBOARD."""
 
 
 class Px4Control:

@@ -176,7 +176,7 @@ def _vfr_hud(ap: Px4) -> Message:
 
 
 def _attitude_target(ap: Px4) -> Message:
-    """What the rate and attitude loops are asked for, in any mode."""
+    """Setpoints of the rate and attitude loops, in any mode."""
     flight = ap.flight
     return mav.MAVLink_attitude_target_message(
         boot_ms(ap), 0, list(flight.attitude), *flight.rates_radps, flight.thrust

@@ -70,7 +70,7 @@ _FLOATS: Mapping[str, float] = MappingProxyType(
 _OLD_NAMES: Mapping[str, float] = MappingProxyType(
     {"MPC_HOLD_DZ": 0.1, "MPC_YAW_EXPO": 0.6, "MPC_Z_MAN_EXPO": 0.6}
 )
-"""What releases before 1.17 have in place of DEAD_ZONE (upstream commit 2bf9fce577)."""
+"""Releases before 1.17 have these in place of DEAD_ZONE (upstream commit 2bf9fce577)."""
 _OLD_OVERRIDE, _NEW_OVERRIDE = ("COM_RC_OVERRIDE", "COM_RC_STICK_OV"), ("MAN_OVERRIDE_SPD",)
 _ABSENT: Mapping[Px4Release, tuple[str, ...]] = MappingProxyType(
     {
@@ -85,7 +85,7 @@ DEFAULT_RATE_P = float32(_FLOATS["MC_ROLLRATE_P"])
 
 
 def _varied(conditions: Conditions) -> dict[str, float]:
-    """What other vehicles set otherwise: the defaults, scaled by as much as ArduPilot's are."""
+    """Settings that vary: the defaults, scaled by the same factors as ArduPilot's."""
     lean = conditions.angle_max_cdeg / NOMINAL.angle_max_cdeg
     yaw_rate = conditions.pilot_yaw_rate_degps / NOMINAL.pilot_yaw_rate_degps
     climb = conditions.pilot_speed_up_cmps / NOMINAL.pilot_speed_up_cmps

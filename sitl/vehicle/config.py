@@ -1,4 +1,4 @@
-"""What makes one simulated vehicle differ from another, whatever its firmware."""
+"""Configuration of a simulated vehicle of either firmware."""
 
 from dataclasses import dataclass
 from typing import Literal, NamedTuple, TypeAlias
@@ -52,7 +52,7 @@ class VehicleConfig:
     receiver_us: tuple[int, ...] = IDLE_RECEIVER_US
     """The receiver's channels at boot, in microseconds."""
     vehicle_type: int = 2
-    """HEARTBEAT.type, a MAV_TYPE: 2 is a quadrotor, and flies as one whatever it says."""
+    """HEARTBEAT.type, a MAV_TYPE: 2 is a quadrotor; the vehicle flies as one with any value."""
     estimator_ready_s: float = 3.0
     """From boot until arming is possible (about 23 s on the real firmware)."""
     position_ready_s: float = 5.0

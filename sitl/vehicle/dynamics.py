@@ -29,7 +29,7 @@ VERTICAL_GUST_SHARE = 0.5
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Airframe:
-    """What differs from one quadrotor to another; the defaults are the nominal one's."""
+    """Physical constants of a quadrotor; the defaults are nominal."""
 
     mass_kg: float = 1.2
     max_motor_thrust_n: float = 7.54

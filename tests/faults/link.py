@@ -120,7 +120,7 @@ class Carrier(ABC):
     """The vehicle's end of the bridge's link; `fail` may be called by any thread."""
 
     is_stream = True
-    """What is received may end anywhere in a packet."""
+    """True if a read may end inside a packet."""
     wait_s = 0.2
     """Longest time until the next look at it."""
 
@@ -140,7 +140,7 @@ class Carrier(ABC):
 
     @abstractmethod
     def receive(self) -> list[bytes]:
-        """What has come from the bridge; never waits."""
+        """Data from the bridge; never waits."""
 
     @abstractmethod
     def send(self, packet: bytes) -> None:

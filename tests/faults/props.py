@@ -1,4 +1,4 @@
-"""What stands around the bridge: a camera without a renderer, a transmitter, a viewer, a watch."""
+"""Surroundings of the bridge: a camera without a renderer, a transmitter, a viewer, a watch."""
 
 import os
 import socket

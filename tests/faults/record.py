@@ -46,7 +46,7 @@ class VehicleReport(TypedDict):
 
 
 class Aftermath(NamedTuple):
-    """What happened to the vehicle after a fault."""
+    """Reaction of the vehicle to a fault."""
 
     safe_ms: float
     """Until the first entry with safe sticks or another mode."""
@@ -65,7 +65,7 @@ class Aftermath(NamedTuple):
 
 
 class Ending(NamedTuple):
-    """What the vehicle did after the policy had lost the sticks, until a pilot took over."""
+    """Flight after the policy had lost the sticks, until a pilot took over."""
 
     mode: str
     """The last."""

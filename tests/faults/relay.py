@@ -87,7 +87,7 @@ class Sent(NamedTuple):
 
     @property
     def steers(self) -> bool:
-        """A message of sticks, whatever they say."""
+        """True for any message of sticks."""
         return self.name in ("RC_CHANNELS_OVERRIDE", "MANUAL_CONTROL")
 
     @property
@@ -120,7 +120,7 @@ class Sent(NamedTuple):
 
 
 class _Way:
-    """One direction; a packet that is under way arrives whatever happens to later ones."""
+    """One direction; later faults do not affect packets that are under way."""
 
     def __init__(self) -> None:
         self._seeds = count()

@@ -97,7 +97,7 @@ FAULTS = {
 
 @dataclass(kw_only=True)
 class SoakResult:
-    """What the flight has shown."""
+    """Counts and failures of a soak."""
 
     minutes: float
     faults: dict[str, int] = field(default_factory=dict)
@@ -197,7 +197,7 @@ def _engage(stage: Stage, transmitter: Transmitter) -> None:
 
 
 def _lost(recording: Path, result: SoakResult) -> list[str]:
-    """What the recording lacks."""
+    """Gaps in the recording, in words."""
     meta = json.loads((recording / "meta.json").read_text())
     failures = [
         f"{key} is {meta[key]}"

@@ -1,4 +1,4 @@
-"""What a scenario does to a flight, one step after the other.
+"""Steps of a scenario.
 
 A step is a function of the stage and the keys of its table; it returns the moment of its fault in
 ns of CLOCK_MONOTONIC, or None if it is none. ``do`` is its name, with spaces.

@@ -17,7 +17,7 @@ MOST_LOST_M = 2.0
 
 @dataclass(kw_only=True)
 class Verdict:
-    """What a run has shown."""
+    """Measurements and failures of a run."""
 
     scenario: str
     variant: Variant
@@ -55,7 +55,7 @@ class Verdict:
 def judge(
     verdict: Verdict, scenario: Scenario, stage: Stage, at_ns: int, leans: bool, slack_ms: float
 ) -> None:
-    """Fill in the measurements of a verdict, and whatever was not as it must be.
+    """Fill in the measurements and the failures of a verdict.
 
     ``stage`` has ended, and the vehicle has written its report; ``at_ns`` is the moment of the
     fault, CLOCK_MONOTONIC; ``leans``: the newest sticks were the policy's when the steps were over.

@@ -31,7 +31,7 @@ def failure(problem: object, datagrams: Iterable[bytes]) -> FuzzError:
 
 
 def fuzz_codec(seed: int, count: int) -> None:
-    """Feed so many datagrams.
+    """Feed ``count`` datagrams.
 
     Raises:
         FuzzError: an invariant does not hold.

@@ -75,7 +75,7 @@ class Datagrams:
     def focus_on_some(self) -> None:
         """Forge one to three kinds of messages from now on, or all again.
 
-        Else what forges a reboot, for one, would wipe out whatever the others have done.
+        Else a forged reboot, for example, would undo the effect of the others.
         """
         few = self._draw.choice((1, 1, 2, 3))
         is_all = self._draw.random() < 0.3
@@ -99,7 +99,7 @@ class Datagrams:
     # --- whole messages
 
     def _valid(self, source: Endpoint) -> bytes:
-        """A sound packet, whatever its numbers say; of MAVLink 1 at times."""
+        """A sound packet with arbitrary numbers; of MAVLink 1 at times."""
         is_read = self._draw.random() < 0.6
         number = self._draw.choice(self._numbers or (_READ if is_read else _ALL))
         payload = bytearray(dialect.mavlink_map[number].unpacker.size)

@@ -33,7 +33,7 @@ STRANGER: Address = ("stranger", 9)
 BATCH, BATCH_NS = 10, 5 * NS_PER_MS
 """2,000 datagrams a second."""
 MOST_ENTRIES = 1000
-"""In any table or queue of link and guard, whatever was received."""
+"""Entries of any table or queue of link and guard."""
 MOST_BYTES = 3_000_000
 ROUNDS = 8
 """Flights with one program."""
@@ -69,7 +69,7 @@ class HostileFlight:
     # --- the flight
 
     def run(self, count: int) -> None:
-        """Feed so many datagrams, in rounds; raises FuzzError."""
+        """Feed ``count`` datagrams in rounds; raises FuzzError."""
         try:
             while self.fed < count:
                 self._connect(min(500, count // 8))
@@ -122,7 +122,7 @@ class HostileFlight:
         self._advance(self._draw.choice((0, 20, 300)))
 
     def _make_flyable(self) -> None:
-        """Only the vehicle talks: whatever was pretended must be forgotten."""
+        """Let only the vehicle talk until forged state is forgotten."""
         if not self._is_flyable():
             self.reboots += 1
             self.flight.vehicle.reboot()

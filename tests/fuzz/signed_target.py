@@ -17,7 +17,7 @@ _SEAL_BYTES, _HASH_BYTES = 13, 6
 
 
 def fuzz_signing(seed: int, count: int) -> None:
-    """Feed so many datagrams, and some packets that are signed as they should be.
+    """Feed ``count`` datagrams, some of them packets with valid signatures.
 
     Raises:
         FuzzError: an invariant does not hold.
@@ -64,7 +64,7 @@ def _signing_end(key: bytes) -> WireEnd:
 
 
 def _hostile(source: Datagrams, forger: WireEnd, draw: Random) -> bytes:
-    """What somebody without the key can make of what they hear, and of nothing."""
+    """A forgery of somebody without the key, from heard packets or from nothing."""
     kind = draw.random()
     if kind < 0.3 or not source.heard:
         return source.own() if draw.random() < 0.7 else source.foreign()

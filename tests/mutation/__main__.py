@@ -37,7 +37,7 @@ _PYTEST = (
 
 @dataclass
 class Reach:
-    """What the tests of a group run: lines of the mutated files, and CPU time."""
+    """Lines of the mutated files that each test of a group runs, and its CPU time."""
 
     lines: list[dict[str, set[int]]] = field(default_factory=list)
     cost_s: list[float] = field(default_factory=list)

@@ -1,4 +1,4 @@
-"""What a replay came to, beside what was recorded. Values are compared bit for bit."""
+"""Comparison of a replay with the recording, bit for bit."""
 
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass

@@ -50,7 +50,7 @@ class GuardStep:
     replayed: GuardTick | None
     """None: this time nothing was to be sent or told."""
     snapshot: LinkSnapshot
-    """What the link knew."""
+    """The link's snapshot of that pass."""
     chunk_serial: int | None
     """Chunk that the guard got in this pass."""
     act: OperatorCommand | None
@@ -166,7 +166,7 @@ class _Arrivals:
 
 
 def _arrivals(source: ReplaySource) -> Iterator[_Arrivals]:
-    """What each tick shows of them.
+    """Derive the arrivals from each tick.
 
     A tick that flies a chunk names it. Before a flight a chunk counts from the end of its solve.
     """
@@ -205,7 +205,7 @@ def _act(before: Tick | None, tick: Tick, *, is_called: bool) -> OperatorCommand
 
 
 def _stop(before: Tick | None, tick: Tick) -> EndRequest | None:
-    """What the flight process asked for at its own end."""
+    """Request of the flight process at its own end."""
     was = None if before is None else before.phase
     reason = tick.release_reason
     if reason is not None and reason.code is Code.THEN:
@@ -309,7 +309,7 @@ class _RecordedPort:
         return tick
 
     def receive(self) -> list[bytes]:
-        """What was put in."""
+        """Return the injected messages."""
         until_ns, self.begin_ns = self.begin_ns or self.decided_ns, None
         if until_ns is not None:
             self._clock.sleep_until_ns(until_ns)

@@ -162,7 +162,7 @@ class _Shelf:
 
 
 class _News:
-    """What reached the flight process: samples, ticks of the guard, and features."""
+    """Input of the flight process: samples, ticks of the guard, and features."""
 
     def __init__(
         self, source: ReplaySource, view: TelemetryCache, shelves: Sequence[_Shelf]
@@ -173,7 +173,7 @@ class _News:
         self._samples: list[tuple[Sample, ...]] = []
         """Of each packet that has any."""
         self._telemetry: list[Telemetry] = []
-        """What was known after each of them."""
+        """Telemetry after each of them."""
         for packet in source.packets:
             if packet.happened_ns is None:
                 continue

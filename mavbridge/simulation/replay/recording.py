@@ -62,7 +62,7 @@ class ReplaySource:
     known_params: frozenset[str]
     """Parameters that the flight had asked for: a later version asks for more."""
     gaps: tuple[str, ...]
-    """What the recording has lost, in words: a replay may differ there."""
+    """Losses of the recording, in words: a replay may differ there."""
 
 
 def open_source(folder: Path) -> ReplaySource:

@@ -16,7 +16,7 @@ from sitl.__main__ import main
 from sitl.app import filming, fly, fly_on
 from sitl.camera.fpv import CameraOptions
 from sitl.clock import NS_PER_MS, NS_PER_S, Clock, StopRequest
-from sitl.course import AirborneStart, Crash, make_course
+from sitl.course import AirborneStart, make_course
 from sitl.simulated_vehicle import SimulatedVehicle
 from sitl.vehicle.config import STEP_NS, VehicleConfig
 
@@ -68,17 +68,6 @@ def test_the_loop_keeps_an_absolute_grid_and_flies_in_real_time():
 
     assert clock.sleeps_ns == [STEP_NS * n for n in range(1, 401)]
     assert vehicle.ap.now_ns == NS_PER_S - STEP_NS
-
-
-@pytest.mark.parametrize(("wanted", "ends_ns"), [(True, 0), (False, NS_PER_S // 2)])
-def test_a_crash_ends_the_loop_if_the_course_is_to_end_it(wanted, ends_ns):
-    clock = FakeClock()
-    vehicle = SimulatedVehicle(links=0, boot_ns=0, course=make_course(1))
-    vehicle.log.crash = Crash(t_s=0.0, hit="ground", speed_mps=5.0)
-
-    fly(vehicle, [], clock, StopRequest(), end_ns=NS_PER_S // 2, end_with_course=wanted)
-
-    assert clock.now_ns() == ends_ns
 
 
 def test_after_a_stall_it_catches_up_without_a_burst():

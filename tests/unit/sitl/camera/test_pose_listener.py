@@ -6,13 +6,13 @@ from itertools import pairwise
 import pytest
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
-from sitl.camera.follow import ROUNDS_BEFORE_EULER, SYSTEM_ID, PoseListener
+from sitl.camera.follow import SYSTEM_ID, PoseListener
 from sitl.clock import NS_PER_S
 from sitl.rotation import IDENTITY, from_euler
 
 T0_NS = 100 * NS_PER_S
 RATE_HZ = 60.0
-QUATERNION, EULER, POSITION = 31, 30, 32
+QUATERNION, POSITION = 31, 32
 
 
 class Vehicle:
@@ -27,9 +27,6 @@ class Vehicle:
 
     def quaternion(self, wxyz=IDENTITY, rate_radps=(0.0, 0.0, 0.0)):
         return self._mav.attitude_quaternion_encode(0, *wxyz, *rate_radps).pack(self._mav)
-
-    def euler(self, roll=0.0, pitch=0.0, yaw=0.0):
-        return self._mav.attitude_encode(0, roll, pitch, yaw, 0, 0, 0).pack(self._mav)
 
     def position(self, position_m=(1.0, 2.0, -3.0), velocity_mps=(0.0, 0.0, 0.0)):
         return self._mav.local_position_ned_encode(0, *position_m, *velocity_mps).pack(self._mav)
@@ -81,7 +78,6 @@ def test_the_pose_is_carried_on_at_constant_velocity_and_rate(listener, vehicle)
         pytest.param(lambda v: v.quaternion((0.0, 0.0, 0.0, 0.0)), id="zero quaternion"),
         pytest.param(lambda v: v.quaternion((math.nan, 0.0, 0.0, 0.0)), id="quaternion NaN"),
         pytest.param(lambda v: v.quaternion(rate_radps=(math.nan, 0, 0)), id="rate NaN"),
-        pytest.param(lambda v: v.euler(roll=math.inf), id="roll inf"),
     ],
 )
 def test_values_that_cannot_be_are_ignored(listener, vehicle, bad):
@@ -133,10 +129,3 @@ def test_a_message_is_asked_for_until_it_flows_and_again_when_its_rate_drops(lis
         POSITION
     ]
     assert run_second(listener, 4, flows) == []
-
-
-def test_euler_angles_are_asked_for_when_there_is_no_quaternion(listener, vehicle):
-    for second in range(ROUNDS_BEFORE_EULER):
-        assert EULER not in run_second(listener, second, [vehicle.position()] * 60)
-    assert run_second(listener, ROUNDS_BEFORE_EULER, []) == [QUATERNION, POSITION, EULER]
-    assert EULER not in run_second(listener, ROUNDS_BEFORE_EULER + 1, [vehicle.quaternion()])
