@@ -18,6 +18,7 @@ import hashlib
 import math
 import subprocess
 import sys
+from collections import Counter
 from dataclasses import asdict, dataclass
 from itertools import product
 from json import dumps, loads
@@ -246,18 +247,23 @@ def print_cells(cells: list[Cell]) -> None:
 
 
 def draw(cells: list[Cell], path: Path) -> None:
-    """Write a PNG: success by the encoder's time; loops are lines, controls are panels."""
+    """Write a PNG: success by the encoder's time; loops are lines, controls are panels.
+
+    A control that was flown beside one encoder alone has no panel.
+    """
     from matplotlib import rc_context
     from matplotlib.figure import Figure
 
-    names = list(dict.fromkeys(cell.control for cell in cells))
+    times = {(cell.control, cell.encoder_ms): None for cell in cells}
+    flown = Counter(control for control, _ in times)
+    names = [name for name, count in flown.items() if count > 1] or list(flown)
     encoders_ms = sorted({cell.encoder_ms for cell in cells})
     with rc_context(FIGURE_STYLE):
         rows = math.ceil(len(names) / PANELS_A_ROW)
         columns = min(len(names), PANELS_A_ROW)
         size = (6.0 * columns, 4.6 * rows)
         figure = Figure(figsize=size, dpi=FIGURE_DPI, facecolor="white")
-        panels = figure.subplots(rows, columns, squeeze=False).ravel()
+        panels = figure.subplots(rows, columns, squeeze=False, sharey=True).ravel()
         for axes in panels[len(names) :]:
             axes.set_visible(False)
         for axes, name in zip(panels, names, strict=False):
@@ -268,9 +274,10 @@ def draw(cells: list[Cell], path: Path) -> None:
             axes.minorticks_off()
             axes.set_xlim(0.85 * encoders_ms[0], 1.18 * encoders_ms[-1])
             axes.set_ylim(-3, 103)
-            axes.set_xlabel("ms to encode an image")
-            axes.set_title(f"{name}: courses flown, %, 95 %")
+            axes.set_xlabel("encoder [ms an image]")
+            axes.set_title(name)
             axes.legend(loc="lower left")
+        panels[0].set_ylabel("courses flown [%], 95 % interval")
         figure.tight_layout(w_pad=3)
         figure.savefig(path)
 
@@ -282,7 +289,8 @@ def draw_loop(axes: Any, cells: list[Cell], colour: str) -> None:
     at = [cell.encoder_ms for cell in cells]
     low, high = ([100 * getattr(c, f"success_{end}") for c in cells] for end in ("low", "high"))
     axes.fill_between(at, low, high, color=colour, alpha=0.12, linewidth=0)
-    axes.plot(at, [100 * cell.success for cell in cells], "o-", color=colour, label=cells[0].loop)
+    label = cells[0].loop if cells[0].loop == "one rate" else f"two rates, {cells[0].loop}"
+    axes.plot(at, [100 * cell.success for cell in cells], "o-", color=colour, label=label)
 
 
 if __name__ == "__main__":

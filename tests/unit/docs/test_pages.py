@@ -193,6 +193,12 @@ def test_the_flags_on_the_page_of_commands_are_those_of_the_program() -> None:
     assert commands_page.with_flags(page) == page, "run: python -m benchmarks.commands_page"
 
 
+def test_the_policy_of_the_quickstart_is_the_example() -> None:
+    page = ROOT / "docs/quickstart.md"
+    (code,) = (block.text for block in blocks(page) if block.kind == "python")
+    assert code in (ROOT / "examples/numpy_policy.py").read_text()
+
+
 def test_the_pages_for_users_stay_short() -> None:
     pages = [page for page in PAGES if page.parent == ROOT / "docs"]
     words = [word for page in pages for word in page.read_text().split()]
