@@ -5,7 +5,7 @@ from typing import Any
 
 import pytest
 
-from helpers.guard_facts import AIRBORNE, ON_GROUND, Stepped, codes, flying
+from helpers.guard_facts import AIRBORNE, ON_GROUND, Stepped, flying
 from mavbridge.core.clock import NS_PER_S
 from mavbridge.core.reasons import Code, Reason, because
 from mavbridge.guard.sequences import DisengageSettings
@@ -148,22 +148,6 @@ def test_a_switch_on_a_channel_that_does_not_arrive_is_not_off() -> None:
     assert stepped.step("engage") == FLIES
 
 
-def test_an_act_while_disarmed_does_not_engage_later() -> None:
-    stepped = Stepped(replace(ON_GROUND, rc_channels_us=LOW), engage_channel=8)
-    stepped.run(0.3)
-    stepped.run(0.3, rc_channels_us=HIGH)
-    assert codes(stepped.engagement.refusal) == (Code.NOT_ENGAGED_SINCE, Code.NOT_ARMED)
-    assert set(stepped.run(2, armed=True)) == {NOTHING}
-
-
-def test_the_key_that_releases_wins_over_the_switch_in_the_same_step() -> None:
-    stepped = switched()
-    stepped.run(0.3)
-    stepped.run(0.2, rc_channels_us=HIGH)
-    assert stepped.step("release") == NOTHING
-    assert set(stepped.run(1)) == {NOTHING}
-
-
 def test_engage_on_arm_counts_the_first_arming_alone() -> None:
     stepped = Stepped(ON_GROUND, engage_on_arm=True)
     stepped.run(0.1)
@@ -224,14 +208,6 @@ def test_the_first_stop_is_the_one_that_counts() -> None:
     stepped.engagement.stop(EndRequest(because(Code.DURATION)))
     assert stepped.step(stop=DEATH).mode == "LAND"
     assert stepped.codes == (Code.DURATION,)
-
-
-def test_the_key_ends_the_flight_and_the_guard_stays() -> None:
-    stepped = flying()
-    stepped.step("release")
-    stepped.run(1, is_released=True)
-    assert stepped.phase is Phase.RELEASED
-    assert stepped.step("engage") == FLIES
 
 
 @pytest.mark.parametrize("stop_at", ["flying", "leaving"])
