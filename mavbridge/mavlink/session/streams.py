@@ -44,11 +44,14 @@ class _Stream:
         self.newest_ns = 0
         self.stand_in_due_ns = 0
         self.is_absence_told = False
+        self.is_denied = False
+        """Each message was denied at each rate: asked again after a pause."""
         self._choice = 0
 
     def request(self) -> CommandRequest:
         """The next request to send, of one message after the other."""
         self.attempts += 1
+        self.is_denied = False
         number = message_id(self.group.messages[self._choice % len(self.group.messages)])
         return CommandRequest(dialect.MAV_CMD_SET_MESSAGE_INTERVAL, (number, 1e6 / self.rate_hz))
 
@@ -71,6 +74,7 @@ class _Stream:
             return
         self.rate_hz = self.group.rate_hz
         self._choice += 1
+        self.is_denied = self._choice % len(self.group.messages) == 0
 
     def miss(self) -> None:
         """The vehicle does not answer: begin with the first message again."""
@@ -179,7 +183,9 @@ class StreamRequester:
                 return None
             if self._pending.attempts >= _ATTEMPTS:
                 self._pending.miss()
-        self._pending = next((s for s in self._streams if not s.is_settled), None)
+        may_repeat = now_ns - self._requested_ns >= _ACK_TIMEOUT_NS
+        open_streams = (s for s in self._streams if not s.is_settled)
+        self._pending = next((s for s in open_streams if may_repeat or not s.is_denied), None)
         if self._pending is None:
             return None
         self._requested_ns = now_ns

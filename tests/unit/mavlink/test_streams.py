@@ -126,6 +126,15 @@ def test_denied_means_slower_then_another_message() -> None:
     assert requested == [(id_, us) for id_ in (31, 30) for us in (10000, 20000, 40000)]
 
 
+def test_a_vehicle_that_denies_everything_is_not_flooded_with_requests() -> None:
+    requester = StreamRequester(ARDUPILOT.streams(state_hz=100))
+    requests = 0
+    for now_ns in range(S, 6 * S, 2 * NS_PER_MS):  # each denial is answered within a step
+        requests += requester.step(now_ns) is not None
+        requester.receive_ack(ack(dialect.MAV_RESULT_DENIED))
+    assert 20 < requests < 200  # each cycle of messages and rates half a second after the last
+
+
 def test_a_request_that_is_undecided_is_repeated_without_haste() -> None:
     requester, requested_s = one_group(), []
     for tick in range(300):
