@@ -112,8 +112,6 @@ class EvaluateConfig:
     resume: bool = False
     """Go on with the flights that --json holds, if they were flown by the same flags, weights and
     versions; the file is written anew after each flight."""
-    plot: Path | None = None
-    """Draw the results here as PNG; needs matplotlib (the extra "bench")."""
 
     def __post_init__(self) -> None:
         """Raise UserError for values out of range, and for contradictions."""

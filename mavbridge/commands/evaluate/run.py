@@ -1,4 +1,4 @@
-"""``mavbridge evaluate``: fly or go on, print, write, draw."""
+"""``mavbridge evaluate``: fly or go on, print, write."""
 
 import hashlib
 from collections.abc import Callable, Generator, Mapping
@@ -9,8 +9,8 @@ from rich.console import Console
 from rich.text import Text
 
 from mavbridge.commands.episode_workers import fly_jobs
-from mavbridge.commands.evaluate.results import Evaluation, draw, print_evaluation, to_json
-from mavbridge.commands.output import progress_bar, require_outputs
+from mavbridge.commands.evaluate.results import Evaluation, print_evaluation, to_json
+from mavbridge.commands.output import progress_bar
 from mavbridge.config.episodes import (
     HELD_OUT_COURSE_SEED,
     MAX_EPISODES,
@@ -20,7 +20,7 @@ from mavbridge.config.episodes import (
 )
 from mavbridge.core.clock import NS_PER_MS
 from mavbridge.core.errors import MavbridgeError, UserError
-from mavbridge.core.files import write_durably
+from mavbridge.core.files import require_writable, write_durably
 from mavbridge.core.provenance import digests, git_revision, versions
 from mavbridge.core.stopping import INTERRUPTED, stop_on_signals
 from mavbridge.flight.policies import is_scripted, load_for_episodes, policy_files
@@ -113,7 +113,6 @@ def identity(config: EvaluateConfig) -> str:
         workers=WorkersConfig(),
         resume=False,
         json=None,
-        plot=None,
     )
     files = policy_files(config.policy)
     known = digests(files)
@@ -179,7 +178,7 @@ def evaluate(config: EvaluateConfig) -> int:
     Raises:
         MavbridgeError: an episode cannot be flown, or the results cannot be written.
     """
-    require_outputs(config.json, config.plot)
+    require_writable(config.json, "--json")
     console = Console(stderr=True, emoji=False)
     flown_by = "" if config.json is None else identity(config)
     flown = flown_before(config, flown_by) if config.resume else {}
@@ -198,8 +197,6 @@ def evaluate(config: EvaluateConfig) -> int:
     evaluation = _evaluation(config, flown)
     if flown:
         print_evaluation(evaluation, Console())
-        if config.plot is not None:
-            draw(evaluation, config.plot)
     if config.json is not None and (flown or failure is None):
         config.json.write_text(to_json(evaluation, flown_by))
     if failure is not None or was_stopped:

@@ -54,13 +54,6 @@ def test_seeds_follow_from_the_evaluations_seed_and_the_index_alone() -> None:
     assert all(spec.course_seed >= HELD_OUT_COURSE_SEED for spec in (*first, *other))
 
 
-def test_only_built_in_nets_are_kept_from_one_episode_to_the_next() -> None:
-    assert is_stateless(PolicyConfig(policy="toge:small"))
-    assert is_stateless(PolicyConfig(policy="resnet-unet"))
-    assert not is_stateless(CIRCLE)
-    assert not is_stateless(PolicyConfig(policy="my.package:Policy"))
-
-
 @pytest.fixture(scope="module")
 def write_json(tmp_path_factory: pytest.TempPathFactory) -> Callable[[ConditionsKind], bytes]:
     def write(conditions: ConditionsKind) -> bytes:
@@ -157,7 +150,6 @@ def test_an_error_costs_no_result_that_was_there_before(
         (["--policy", "toge:medium"], "network.allow_untrained"),
         (["--policy", "scripted", "--json", "/proc/none/out.json"], "cannot write"),
         (["--policy", "scripted", "--json", "/"], "cannot write --json /"),
-        (["--policy", "scripted", "--plot", "/proc/none/out.png"], "cannot write"),
         (["--policy", "scripted", "--ray", "cluster"], "--ray cluster: nothing answers there"),
         (["--fast"], "Unknown option: --fast"),
     ],
@@ -168,3 +160,10 @@ def test_a_bad_flag_is_one_clear_error(
     status, text = output(capsys, *flags)
     assert status != 0
     assert message in text
+
+
+def test_only_built_in_nets_are_kept_from_one_episode_to_the_next() -> None:
+    assert is_stateless(PolicyConfig(policy="toge:small"))
+    assert is_stateless(PolicyConfig(policy="resnet-unet"))
+    assert not is_stateless(CIRCLE)
+    assert not is_stateless(PolicyConfig(policy="my.package:Policy"))
