@@ -17,22 +17,11 @@ def test_a_folder_is_made_for_the_output_and_the_output_is_not(tmp_path: Path) -
     assert not path.exists()
 
 
-def test_an_output_that_is_there_keeps_its_content(tmp_path: Path) -> None:
-    path = tmp_path / "a.json"
-    path.write_text("old")
-    require_writable(path, "--json")
-    assert path.read_text() == "old"
-
-
 @pytest.mark.parametrize("name", ["", "file/a.json"])
 def test_what_cannot_be_written_is_refused_with_its_flag(tmp_path: Path, name: str) -> None:
     (tmp_path / "file").touch()
     with pytest.raises(UserError, match=r"cannot write --json .*: "):
         require_writable(tmp_path / name, "--json")
-
-
-def test_a_flag_that_was_not_given_is_no_error() -> None:
-    require_writable(None, "--json")
 
 
 def test_a_figure_without_matplotlib_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:

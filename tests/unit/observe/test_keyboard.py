@@ -112,16 +112,6 @@ def test_a_paste_or_a_function_key_engages_nothing(
     assert got in ([*expected, "q"], ["q"])
 
 
-def test_other_keys_may_be_listened_to(terminal: tuple[int, int]) -> None:
-    user, fd = terminal
-    pressed = Pressed()
-    keyboard = started(fd, pressed, keys=("q", " ", "g"))
-    for key in ("g", " ", "q"):
-        os.write(user, key.encode())
-        assert pressed.next() == key
-    keyboard.stop(30.0)
-
-
 def test_what_was_typed_before_the_flight_does_not_engage(terminal: tuple[int, int]) -> None:
     user, fd = terminal
     os.write(user, b"e\n")
@@ -130,18 +120,6 @@ def test_what_was_typed_before_the_flight_does_not_engage(terminal: tuple[int, i
     os.write(user, b"q")
     assert pressed.next() == "q"
     keyboard.stop(30.0)
-
-
-def test_a_terminal_whose_output_is_stopped_is_no_obstacle(terminal: tuple[int, int]) -> None:
-    user, fd = terminal
-    termios.tcflow(fd, termios.TCOOFF)
-    before = termios.tcgetattr(fd)
-    pressed = Pressed()
-    keyboard = started(fd, pressed)
-    os.write(user, b"q")
-    assert pressed.next() == "q"
-    keyboard.stop(30.0)
-    assert termios.tcgetattr(fd) == before
 
 
 def test_a_failing_receiver_leaves_the_terminal_as_it_was(terminal: tuple[int, int]) -> None:

@@ -103,16 +103,6 @@ def test_a_loop_that_has_stopped_has_no_rate() -> None:
     assert "action - Hz  vision - Hz" in lines[-1]
 
 
-def test_the_line_is_cut_not_wrapped_on_a_narrow_terminal() -> None:
-    screen, out = shown_screen(width=60, force_terminal=True, color_system=None)
-    with screen.live():
-        screen.emit(make_released_tick(0, said("a very long reason " * 10)))
-        screen.refresh()
-        shown = out.getvalue().split("RELEASED")[-1]
-    assert shown.rstrip().endswith("\N{HORIZONTAL ELLIPSIS}")
-    assert "\n" not in shown
-
-
 def test_where_there_is_no_terminal_a_line_is_printed_now_and_then() -> None:
     screen, out = shown_screen()
     with screen.live():
@@ -157,14 +147,6 @@ def test_a_reason_that_keeps_changing_is_shown_once_a_second() -> None:
     assert lines == [f"WAITING: {reasons[index % 3]}" for index in (0, 100, 200)]
 
 
-def test_a_reason_whose_figures_alone_change_is_shown_once() -> None:
-    screen, out = shown_screen()
-    for index in range(201):
-        screen.emit(make_released_tick(index, because(Code.IMAGE_FROZEN, age_s=index / 100)))
-    screen.refresh()
-    assert out.getvalue() == "RELEASED: the image has been frozen for 0.0 s\n"
-
-
 def test_on_a_terminal_the_line_is_redrawn_and_leaves_nothing_behind() -> None:
     screen, out = shown_screen(width=100, force_terminal=True, color_system=None)
     with screen.live():
@@ -173,14 +155,6 @@ def test_on_a_terminal_the_line_is_redrawn_and_leaves_nothing_behind() -> None:
         screen.refresh()
     assert out.getvalue().count("FLYING") >= 2
     assert out.getvalue().endswith(ONE_UP_AND_ERASE)
-
-
-def test_the_keys_are_named_below_the_line() -> None:
-    screen, out = shown_screen(width=100, force_terminal=True, color_system=None)
-    screen.start(hint="e engages")
-    screen.refresh()
-    assert screen.close(60.0)
-    assert "waiting for the first tick\ne engages" in out.getvalue().replace("\r", "")
 
 
 def test_close_prints_what_is_left_and_may_be_called_again() -> None:
@@ -216,12 +190,3 @@ def test_no_line_shows_the_password_of_an_address() -> None:
     assert shown.count("rtsp://me:***@host/1?token=*** is lost") >= 3
     assert "it@" not in shown
     assert "abc" not in shown
-
-
-def test_a_screen_that_never_started_prints_what_it_has_at_the_end() -> None:
-    out = io.StringIO()
-    screen = make_screen(Console(file=out, width=100))
-    screen.show_report(report_of())
-    assert screen.close(60.0)
-    assert "p99" not in out.getvalue()  # nothing was measured: no table
-    assert "never released" in out.getvalue()

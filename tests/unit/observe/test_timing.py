@@ -168,12 +168,6 @@ def test_the_release_list_is_bounded_and_the_count_is_not() -> None:
     assert report.release_count == MAX_RELEASES + 7
 
 
-def test_a_reason_whose_figures_alone_change_is_one_release() -> None:
-    report = timed(*(make_released_tick(index, frozen(index / 100)) for index in range(9)))
-    assert report.releases == (ReleaseEvent(t_s=0.0, reason=frozen(0.0)),)
-    assert report.release_count == 1
-
-
 def test_vision_counts_what_was_dropped_since_its_first_frame() -> None:
     timing = FlightTiming(stick_hz=100, action_hz=100, vision_hz=30)
     for number in range(1, 32):
@@ -183,16 +177,6 @@ def test_vision_counts_what_was_dropped_since_its_first_frame() -> None:
     assert vision.rate_hz == pytest.approx(30.0, abs=0.01)
     assert vision.dropped_frames == 3
     assert vision.encode_ms == all_equal(20.0)
-
-
-@pytest.mark.parametrize(("action_hz", "late"), [(50.0, 0), (100.0, 0), (250.0, 1)])
-def test_lateness_is_against_the_rate_that_was_asked_for(action_hz: float, late: int) -> None:
-    timing = FlightTiming(stick_hz=400, action_hz=action_hz, vision_hz=30)
-    timing.emit(make_tick(0))
-    timing.emit(make_tick(1))
-    report = report_of(timing)
-    assert report.action.late_chunks == late
-    assert (report.sticks.target_hz, report.action.target_hz) == (400, action_hz)
 
 
 def test_json_has_the_keys_of_the_report_in_order() -> None:
@@ -232,11 +216,3 @@ def test_json_has_the_keys_of_the_report_in_order() -> None:
     }
     assert document["releases"] == [{"t_s": 0.0, "reason": reason_to_json(NO_IMAGE)}]
     assert document["observer_drops"] == {"rerun": None, "recorder": None}
-
-
-def test_json_says_null_for_what_was_not_measured() -> None:
-    document = json.loads(report_json(timed()))
-    assert document["link"] is None
-    for key in ("feature_age_ms", "state_age_ms", "state_to_wire_ms"):
-        assert document[key] is None
-    assert document["action"]["rate_hz"] is None

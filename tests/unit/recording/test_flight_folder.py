@@ -215,11 +215,6 @@ def test_what_is_no_flight_says_what_is_wanted(flight: Path) -> None:
         assert told in str(error.value)
 
 
-def test_later_keys_in_meta_are_left_aside(flight: Path) -> None:
-    _meta(weather="fine")(flight)
-    assert open_flight(flight).meta.finished
-
-
 def test_a_folder_that_cannot_take_a_flight_is_refused(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -112,14 +112,6 @@ def test_features_of_each_camera_have_a_table_of_their_own(tmp_path: Path) -> No
     assert down["dropped_before"].to_pylist() == [2]
 
 
-def test_a_single_rate_flight_keeps_no_images_as_features(tmp_path: Path) -> None:
-    tables = ReplayTables(tmp_path, ("front",), has_features=False)
-    tables.feature(replace(make_vision_tick(1), feature=np.zeros((1, 3, 8, 8), np.float32)))
-    tables.finish()
-
-    assert sorted(path.name for path in tmp_path.iterdir()) == ["packets.parquet", "solves.parquet"]
-
-
 def test_stamps_of_packets_name_the_packet_in_the_log(tmp_path: Path) -> None:
     tables = ReplayTables(tmp_path, ("front",), has_features=True)
     tables.packets.put((ForwardedPacket(7, 5, HEARTBEAT), ForwardedPacket(9, 9, HEARTBEAT)))
@@ -160,3 +152,11 @@ def test_a_flag_of_a_later_version_is_left_out_and_damage_is_named(tmp_path: Pat
     (tmp_path / SETTINGS).unlink()
     with pytest.raises(SettingsError, match="older mavbridge"):
         read_settings(tmp_path)
+
+
+def test_a_single_rate_flight_keeps_no_images_as_features(tmp_path: Path) -> None:
+    tables = ReplayTables(tmp_path, ("front",), has_features=False)
+    tables.feature(replace(make_vision_tick(1), feature=np.zeros((1, 3, 8, 8), np.float32)))
+    tables.finish()
+
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["packets.parquet", "solves.parquet"]

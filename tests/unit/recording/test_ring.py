@@ -7,10 +7,6 @@ import pytest
 from mavbridge.recording.video.ring import MAX_BYTES, MAX_SLOTS, MIN_SLOTS, FrameRing
 
 
-def shm_file(ring: FrameRing) -> Path:
-    return Path("/dev/shm") / ring.shape.name
-
-
 def test_both_ends_see_the_same_slots() -> None:
     ring = FrameRing.create(6, 4)
     other = FrameRing.attach(ring.shape)

@@ -5,7 +5,7 @@ import pyarrow as pa
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from helpers.factories import make_released_tick, make_state, make_tick, make_trace
+from helpers.factories import make_state, make_tick, make_trace
 from mavbridge.core.reasons import Code, because
 from mavbridge.core.records import Tick, VehicleState
 from mavbridge.core.vehicle import ActionTrace, Sticks, Velocity
@@ -112,13 +112,6 @@ def test_ticks_come_back_as_they_were(rows: list[TickRow]) -> None:
 def test_frames_come_back_as_they_were(rows: list[FrameRow]) -> None:
     table = pa.Table.from_batches([frames_batch(rows, DEMONSTRATION_FRAMES)])
     assert list(read_frames(table)) == rows
-
-
-def test_what_was_not_there_is_null_and_not_zero() -> None:
-    tick = replace(make_released_tick(), state=None, rc_sticks=None, mode=None)
-    table = pa.Table.from_batches([ticks_batch([TickRow(tick, 0)], TICKS)])
-    absent = ("predict_ns", "state", "attitude_ns", "raw", "smoothed", "sent", "rc_sticks", "mode")
-    assert [table.column(name).null_count for name in absent] == [1] * len(absent)
 
 
 def test_the_columns_are_those_of_the_document() -> None:

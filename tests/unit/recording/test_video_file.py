@@ -41,15 +41,6 @@ def test_colours_are_kept(tmp_path: Path) -> None:
     assert np.abs(centres - rgb[24, [16, 48, 80]]).max() < 12
 
 
-def test_stamps_that_stand_still_or_go_back_still_give_frames(tmp_path: Path) -> None:
-    path = tmp_path / "camera.mp4"
-    video = FragmentedMp4(path, height=48, width=64, hz=30)
-    for k, at_ns in enumerate((0, 0, -5 * FRAME_NS, FRAME_NS, 0)):
-        video.append(picture(k), START_NS + at_ns)
-    video.close()
-    assert [number_of(rgb) for rgb in read_video(path)] == [0, 1, 2, 3, 4]
-
-
 def test_a_video_cut_off_anywhere_has_its_whole_frames(tmp_path: Path) -> None:
     path = tmp_path / "camera.mp4"
     write(path, 4).close()
@@ -136,15 +127,10 @@ def test_depth_comes_back_to_the_last_bit(tmp_path: Path) -> None:
         next(decode_video(path, np.arange(4)))
 
 
-def test_a_damaged_number_of_an_image_moves_no_other_one(tmp_path: Path) -> None:
+def test_stamps_that_stand_still_or_go_back_still_give_frames(tmp_path: Path) -> None:
     path = tmp_path / "camera.mp4"
-    write(path, 100).close()
-    whole = path.read_bytes()
-    key = video_parts(path).fragments[60]
-    assert key.is_key
-    at = key.start + 20  # the sequence number in its moof box
-    for wrong in (5, 75, 105):
-        path.write_bytes(whole[:at] + (wrong + 1).to_bytes(4, "big") + whole[at + 4 :])
-        numbers = [fragment.number for fragment in video_parts(path).fragments]
-        assert numbers == [*range(60), *range(90, 100)]
-        assert [number_of(rgb) for rgb in read_video(path)] == numbers
+    video = FragmentedMp4(path, height=48, width=64, hz=30)
+    for k, at_ns in enumerate((0, 0, -5 * FRAME_NS, FRAME_NS, 0)):
+        video.append(picture(k), START_NS + at_ns)
+    video.close()
+    assert [number_of(rgb) for rgb in read_video(path)] == [0, 1, 2, 3, 4]

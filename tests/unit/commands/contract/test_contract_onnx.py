@@ -55,11 +55,3 @@ def test_a_file_that_is_no_graph_is_refused(tmp_path: Path) -> None:
     with pytest.raises(CheckpointError, match=r"policy\.onnx cannot be read as ONNX"):
         contract(path, ContractConfig())
     assert [each.name for each in tmp_path.iterdir()] == ["policy.onnx"]
-
-
-def test_one_channel_is_guessed_to_be_depth(tmp_path: Path) -> None:
-    path = graph(tmp_path / "policy.onnx", channels=1)
-    assert contract(path, ContractConfig()) == 0
-    drafted = tomllib.loads((tmp_path / "mavbridge.toml").read_text())["contract"]
-    assert drafted["image_channels"] == "depth"
-    assert not {"image_mean_rgb", "image_std_rgb"} & set(drafted)

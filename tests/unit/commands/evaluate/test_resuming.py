@@ -9,7 +9,7 @@ import pytest
 
 from helpers.evaluated_flights import finished
 from mavbridge.commands.evaluate import run
-from mavbridge.commands.evaluate.run import EpisodeSpec, FlownEpisode, evaluate, identity
+from mavbridge.commands.evaluate.run import EpisodeSpec, FlownEpisode, evaluate
 from mavbridge.config.episodes import EvaluateConfig, WorkersConfig
 from mavbridge.config.policy import PolicyConfig
 from mavbridge.core.errors import PeerError, UserError
@@ -90,12 +90,6 @@ def test_more_episodes_and_workers_go_on_and_fewer_lose_none(
     assert config.json.read_text() == text
 
 
-def test_without_the_flag_all_are_flown(flights: Flights, config: EvaluateConfig) -> None:
-    evaluate(config)
-    evaluate(replace(config, resume=False))
-    assert flights.flown == [0, 1, 2, 3, 4] * 2
-
-
 def test_flights_by_other_flags_or_weights_are_not_mixed(
     flights: Flights, config: EvaluateConfig, tmp_path: Path
 ) -> None:
@@ -108,23 +102,6 @@ def test_flights_by_other_flags_or_weights_are_not_mixed(
     weights.write_text("another")
     with pytest.raises(UserError, match="other flags, weights or versions"):
         evaluate(config)
-
-
-def test_a_contract_and_a_program_are_known_by_what_they_say(
-    config: EvaluateConfig, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    one, other = tmp_path / "one.toml", tmp_path / "other.toml"
-    one.write_text("a = 1")
-    other.write_text("a = 1")
-    by_one, by_other = (
-        replace(config, policy=replace(config.policy, contract=path)) for path in (one, other)
-    )
-    assert identity(by_one) == identity(by_other) != identity(config)
-    other.write_text("a = 2")
-    assert identity(by_one) != identity(by_other)
-    before = identity(config)
-    monkeypatch.setattr(run, "git_revision", lambda: "another")
-    assert identity(config) != before
 
 
 def test_flights_of_another_engine_are_not_mixed(

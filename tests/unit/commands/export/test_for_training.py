@@ -78,13 +78,6 @@ def test_terms_in_which_flights_differ_are_asked_of_the_user(tmp_path: Path) -> 
     assert "different ones: 30.0, 45.0" in out.read_text()
 
 
-def test_an_older_flight_without_terms_has_the_usual_ones(tmp_path: Path) -> None:
-    old = flight(tmp_path / "a")
-    write_meta(old, contract={"state_frame": "enu_flu"})
-    read = read_interface(exported([old], tmp_path / "out") / "mavbridge.toml").contract
-    assert read == Contract(state_frame="enu_flu", chunk_dt_s=0.033333)
-
-
 def test_a_state_in_body_axes_is_what_the_policy_gets_in_flight(tmp_path: Path) -> None:
     folder = flight(tmp_path / "a")
     out = exported([folder], tmp_path / "out", state="body")

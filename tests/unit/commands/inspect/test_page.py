@@ -99,14 +99,6 @@ def test_a_long_flight_is_thinned_and_keeps_every_spike(
     assert len(unpacked(late["values"])) == len(times)
 
 
-def test_a_large_video_stays_beside_the_page(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(page, "MAX_VIDEO_BYTES", 100)
-    (shown,) = json.loads(page_data([flight(tmp_path / "flight")]))
-    assert "camera.mp4 has 0 MB, too much for a page" in shown["video"]["note"]
-
-
 @pytest.mark.skipif(CHROMIUM is None, reason="no Chromium is installed here")
 def test_a_browser_draws_it_to_the_end(tmp_path: Path) -> None:
     flights = [

@@ -57,14 +57,6 @@ def test_a_key_begins_and_ends_and_marks() -> None:
     assert session.step(keys="q") == ["end", "quit"]
 
 
-def test_a_key_that_could_not_begin_is_not_remembered() -> None:
-    session = Session()
-    session.may_begin = False
-    assert session.step(keys="r") == []
-    session.may_begin = True
-    assert session.step(times=5) == []
-
-
 def test_a_switch_records_while_it_is_high() -> None:
     session = Session(has_switch=True)
     assert session.step(switch_us=LOW) == []

@@ -130,11 +130,6 @@ def test_a_later_session_goes_on_counting(stand: Stand) -> None:
     assert stand.flight(2).meta.ticks == 3
 
 
-def test_a_mark_without_an_episode_says_so(stand: Stand) -> None:
-    stand.episodes.mark("good")
-    assert stand.told == ["there is no episode yet to mark"]
-
-
 def test_a_flight_is_no_folder_for_flights(stand: Stand) -> None:
     stand.record(0)
     with pytest.raises(UserError, match="is a flight itself"):

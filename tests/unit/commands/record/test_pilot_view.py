@@ -11,11 +11,11 @@ from mavbridge.commands.record.view import STICKS_FRESH_NS, PilotView
 from mavbridge.core.clock import NS_PER_MS
 from mavbridge.core.reasons import Code, because
 from mavbridge.core.records import Tick
-from mavbridge.core.vehicle import ForwardedPacket, Reading, Sample, Sticks
+from mavbridge.core.vehicle import ForwardedPacket, Sticks
 from mavbridge.flight.history import SentHistory
 from mavbridge.flight.state import Freshness
 from mavbridge.guard.channel import SocketPort, channel_pair
-from mavbridge.guard.wire import GuardMessage, GuardStatus, Packets, encode_samples
+from mavbridge.guard.wire import GuardMessage, GuardStatus, Packets
 from mavbridge.mavlink.transport.packet_pipe import PacketPipe
 
 STICKS = Sticks(0.1, 0.2, 0.3, 0.4)
@@ -86,14 +86,6 @@ def test_the_message_with_the_sticks_is_counted_by_firmware(viewed: Viewed, auto
         viewed.view.receive(viewed.radio(START_NS + k))
     viewed.view.receive(GuardMessage("a line"))
     assert (viewed.view.stick_packets, viewed.view.sticks_ns) == (3, START_NS + 3)
-
-
-def test_the_vehicles_readings_are_taken_with_each_tick(viewed: Viewed) -> None:
-    for count in range(3):
-        reading = Reading(START_NS + count, (1.0, 0.0, 0.0, 0.0))
-        viewed.guard.send(encode_samples([Sample("ned_from_body_wxyz", reading)]))
-        viewed.tick(START_NS + count)
-        assert viewed.view.telemetry.ned_from_body_wxyz == reading
 
 
 def test_ticks_are_the_pilots_and_old_sticks_are_none(viewed: Viewed) -> None:

@@ -5,7 +5,7 @@ from dataclasses import replace
 import pytest
 from rich.console import Console
 
-from helpers.factories import make_tick, make_vision_tick
+from helpers.factories import make_tick
 from mavbridge.commands.record.view import RecordScreen, Shown
 from mavbridge.core.clock import NS_PER_S
 from mavbridge.core.vehicle import Sticks
@@ -45,17 +45,3 @@ def test_the_line_tells_state_number_marks_sticks_and_disk(screen: RecordScreen)
     assert "RECORDING episode 3  12.0 s" in line
     assert "no sticks  " in line
     assert line.endswith("no sticks of a pilot")
-
-
-def test_rates_are_those_of_the_vehicle_and_the_camera(screen: RecordScreen) -> None:
-    for k in range(10):
-        at_ns = k * NS_PER_S // 20
-        tick = make_tick(k, woke_ns=at_ns)
-        assert tick.state is not None
-        state = replace(tick.state, attitude_ns=at_ns // 2 * 2)
-        screen.emit(replace(tick, state=state))
-        screen.emit(replace(tick, state=state))  # a row with no news
-        screen.emit(make_vision_tick(k + 1, ready_ns=at_ns))
-        screen.shown = replace(SHOWN, stick_packets=5 * k, sticks_ns=at_ns)
-        line = screen.status_line().plain
-    assert "sticks 100.0 Hz  state 20.0 Hz  camera 20.0 Hz" in line

@@ -12,7 +12,6 @@ from typing import Any, get_args
 import cv2
 import numpy as np
 import pytest
-import rerun as rr
 from rerun.chunk import RrdReader
 
 from helpers.factories import (
@@ -30,13 +29,10 @@ from mavbridge.core.vehicle import ActionKind, ActionTrace, Sticks
 from mavbridge.flight.action_frames import action_frame
 from mavbridge.observe.viewer.flight import EVENT_CHARACTERS, RerunView
 from mavbridge.observe.viewer.layout import (
-    PLOTS,
     ViewedFlight,
-    action_plots,
     flight_blueprint,
     styles,
 )
-from mavbridge.observe.viewer.scene import MAX_IMAGE_WIDTH
 from policy.contract import Contract
 
 CAMERA = "/scene/chase/vehicle/front"
@@ -218,14 +214,6 @@ def image(columns: dict[str, list[Any]]) -> np.ndarray[Any, Any]:
     return bgr
 
 
-def test_large_images_are_scaled_down_in_proportion(rrd: Path) -> None:
-    frame = make_vision_tick(1, rgb=np.zeros((720, 1280, 3), dtype=np.uint8))
-    seen = show(rrd, [frame])
-    assert image(seen.columns[CAMERA]).shape == (360, MAX_IMAGE_WIDTH, 3)
-    resolution = seen.static[CAMERA]["Pinhole:resolution"][0][0]
-    assert list(resolution) == [MAX_IMAGE_WIDTH, 360]
-
-
 def test_each_camera_hangs_below_the_vehicle_and_the_first_is_timed(rrd: Path) -> None:
     contract = Contract(cameras=("front", "down"))
     frames = [make_vision_tick(1), make_vision_tick(2, camera=1)]
@@ -344,40 +332,6 @@ def test_some_chunks_are_shown_over_the_time_that_they_are_for(rrd: Path) -> Non
         assert math.isnan(values[8])
 
 
-def test_a_chunk_of_velocities_is_a_path_from_the_vehicle(rrd: Path) -> None:
-    contract = Contract(action="velocity")
-    tick = make_tick(0, position_ned_m=Position(1.0, 2.0, -3.0))
-    solve = make_solve(0, [[2.0, 0.0, -1.0, 0.0]] * 2)
-    seen = show(rrd, [tick, solve], flight=viewed(contract))
-    assert np.allclose(
-        strips(seen, "scene/planned"), [[[1, 2, -3], [1.1, 2, -3.05], [1.2, 2, -3.1]]]
-    )
-
-
-def test_sticks_become_the_path_of_the_leans_that_they_mean(rrd: Path) -> None:
-    contract = Contract(lean_dead_zone=0.0, throttle_dead_zone=0.0, full_lean_deg=45.0)
-    tick = make_tick(0, position_ned_m=Position(0.0, 0.0, 0.0))
-    forward = [[1.0, 0.0, 1.0, 0.0]] * 20  # full climb, 45 degrees nose down, for a second
-    seen = show(rrd, [tick, make_solve(0, forward)], flight=viewed(contract))
-    end = strips(seen, "scene/planned")[0][-1]
-    assert end == pytest.approx([9.81 / 2, 0, -contract.full_climb_mps], rel=0.06, abs=1e-6)
-
-
-def test_every_plot_names_and_colours_its_series(rrd: Path) -> None:
-    seen = show(rrd, [make_tick(0)])
-    for plot in (*PLOTS, *action_plots("sticks")):
-        style = seen.static[f"/{plot.path}"]
-        assert len(style["SeriesLines:names"][0]) == len(plot.series)
-        assert len(style["SeriesLines:colors"][0]) == len(plot.series)
-
-
-def test_the_file_opens_on_the_blueprint_and_no_recording_is_global(rrd: Path) -> None:
-    seen = show(rrd, [make_tick(0)])
-    assert len(seen.reader.blueprints()) == 1
-    assert len(seen.reader.recordings()) == 1
-    assert rr.get_global_data_recording() is None
-
-
 @pytest.mark.parametrize("action", get_args(ActionKind))
 def test_every_plot_is_in_the_blueprint(action: ActionKind) -> None:
     def contents(node: Any) -> Iterator[str]:
@@ -423,13 +377,6 @@ def test_a_viewer_that_stalls_cannot_keep_the_process_alive() -> None:
     assert flight.stdout == "did not finish within 0.2 s\n"
 
 
-def test_dropped_frames_start_from_zero(rrd: Path) -> None:
-    first = make_vision_tick(1, dropped_frames=40)
-    second, third = (make_vision_tick(k, dropped_frames=40 + k) for k in (2, 3))
-    seen = show(rrd, [make_tick(0), first], [second, third])
-    assert seen.values("missed/vision", 1) == [0, 3]
-
-
 def test_rc_echo_shows_four_channels_as_they_change(rrd: Path) -> None:
     moved = (1100, 1200, 1300, 1400, 1500, 1600)
     later = [make_tick(index, rc_channels_us=moved) for index in (1, 2, 3, 4)]
@@ -443,15 +390,20 @@ def test_chunks_that_nobody_flies_are_not_shown(rrd: Path) -> None:
     assert "/sticks/throttle/plan/0" not in seen.columns
 
 
-def test_a_level_chunk_keeps_what_the_air_slows_down(rrd: Path) -> None:
+def test_a_chunk_of_velocities_is_a_path_from_the_vehicle(rrd: Path) -> None:
+    contract = Contract(action="velocity")
+    tick = make_tick(0, position_ned_m=Position(1.0, 2.0, -3.0))
+    solve = make_solve(0, [[2.0, 0.0, -1.0, 0.0]] * 2)
+    seen = show(rrd, [tick, solve], flight=viewed(contract))
+    assert np.allclose(
+        strips(seen, "scene/planned"), [[[1, 2, -3], [1.1, 2, -3.05], [1.2, 2, -3.1]]]
+    )
+
+
+def test_sticks_become_the_path_of_the_leans_that_they_mean(rrd: Path) -> None:
+    contract = Contract(lean_dead_zone=0.0, throttle_dead_zone=0.0, full_lean_deg=45.0)
     tick = make_tick(0, position_ned_m=Position(0.0, 0.0, 0.0))
-    values = np.array((4.0, 0, 0, 1, 0, 0, 0, 0, 0, 0, -2.0, 0, -9.81), dtype=np.float32)
-    solve = make_solve(0, [[0.0] * 4] * 20, state=make_state(START_NS, values=values))
-    seen = show(rrd, [tick, solve])
-    assert strips(seen, "scene/planned")[0][-1] == pytest.approx([3.0, 0, 0], abs=0.06)
-
-
-def test_a_flight_without_an_event_is_still_a_readable_file(rrd: Path) -> None:
-    seen = show(rrd)
-    assert set(seen.columns) == set()
-    assert len(seen.reader.blueprints()) == 1
+    forward = [[1.0, 0.0, 1.0, 0.0]] * 20  # full climb, 45 degrees nose down, for a second
+    seen = show(rrd, [tick, make_solve(0, forward)], flight=viewed(contract))
+    end = strips(seen, "scene/planned")[0][-1]
+    assert end == pytest.approx([9.81 / 2, 0, -contract.full_climb_mps], rel=0.06, abs=1e-6)
