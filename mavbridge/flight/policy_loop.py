@@ -2,6 +2,7 @@
 
 import threading
 from collections.abc import Callable
+from contextlib import suppress
 from dataclasses import dataclass
 from typing import TypeAlias
 
@@ -90,7 +91,8 @@ class PolicyLoop:
         try:
             self._run(stop)
         except BaseException:
-            self._send(NoChunk(because(Code.POLICY_FAILED)))
+            with suppress(Exception):  # no memory: the first error is the one to raise
+                self._send(NoChunk(because(Code.POLICY_FAILED)))
             raise
 
     def _run(self, stop: threading.Event) -> None:
