@@ -1,6 +1,7 @@
-"""A flight controller to test against: its own process, reached over MAVLink and shared memory.
+"""Simulated flight controller to test against: a separate process, reached over MAVLink and shared
+memory.
 
-Nothing here comes from the bridge, so an agreement between the two is an agreement over the wire.
+It shares no code with the bridge, so an agreement between the two is an agreement over the wire.
 """
 
 
