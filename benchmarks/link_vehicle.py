@@ -30,7 +30,7 @@ off by 2 us."""
 WARM_ANSWERS = 100
 CONNECT_S = 30.0
 PENDING_LIMIT = 150
-"""Pending answers before the oldest counts as lost, after 1.5 s; less than the number of codes."""
+"""Largest number of pending answers (1.5 s); older ones count as lost. Smaller than CODES."""
 SENT_MESSAGES = (
     mav.MAVLINK_MSG_ID_ATTITUDE_QUATERNION,
     mav.MAVLINK_MSG_ID_LOCAL_POSITION_NED,

@@ -6,4 +6,4 @@ It shares no code with the bridge, so an agreement between the two is an agreeme
 
 
 class UsageError(Exception):
-    """A flag, address or port that cannot be used; the message says why and what would work."""
+    """Unusable flag, address or port; the message says the reason and gives an alternative."""

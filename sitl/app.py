@@ -26,7 +26,7 @@ their timing."""
 PilotName = Literal["gamepad", "keyboard", "expert"]
 PILOTS: tuple[PilotName, ...] = ("gamepad", "keyboard", "expert")
 _PX4_PARAMS = {"COM_RC_IN_MODE": 0.0, "COM_FLTMODE_BOOT": 1.0}
-"""Take sticks from the receiver alone; boot into Altitude mode."""
+"""Parameters for a pilot: sticks from the receiver only, Altitude mode after boot."""
 
 
 class PilotOptions(NamedTuple):

@@ -267,7 +267,7 @@ def struck_gate(course: Course, start_ned_m: Vec3, end_ned_m: Vec3) -> int | Non
 
 
 def _is_near(gate: Gate, start_ned_m: Vec3, end_ned_m: Vec3) -> bool:
-    """Cheap pre-check: True for every gate that can be struck, and for some that cannot."""
+    """True if the gate may be struck; a cheap check without false negatives."""
     reach_m = 1.5 * (gate.size_m / 2 + BAR_M + DEPTH_M + VEHICLE_RADIUS_M)
     for start, end, center in zip(start_ned_m, end_ned_m, gate.center_ned_m, strict=True):
         if min(start, end) - center > reach_m or center - max(start, end) > reach_m:

@@ -58,7 +58,7 @@ class Params:
         self._integers = integers
         self.names: tuple[str, ...] = tuple(self._values)
         """Names on the wire, in PARAM_VALUE's order."""
-        self.changes = 0  # number of changed values: PX4 tells its modules that, not which
+        self.changes = 0  # count of changes: PX4's modules do not learn which value changed
 
     def __getitem__(self, name: str) -> float:
         return self._values[name]
@@ -229,7 +229,7 @@ class Autopilot(ABC):
     def launch(
         self, position_ned_m: Vec3, velocity_ned_mps: Vec3, ned_from_body_wxyz: Quat
     ) -> None:
-        """Put the armed vehicle into the air in this state, in a mode with lean and climb sticks.
+        """Put the armed vehicle into the air in this state, in a mode whose sticks lean and climb.
 
         A mode flown by setpoints is kept.
         """

@@ -102,8 +102,8 @@ class SimulatedVehicle:
         return outgoing
 
     def launch(self, start: AirborneStart) -> None:
-        """Put the armed vehicle into the air in this state, in a mode with lean and climb
-        sticks."""
+        """Put the armed vehicle into the air in this state, in a mode whose sticks lean and
+        climb."""
         self.ap.launch(start.position_ned_m, start.velocity_ned_mps, start.ned_from_body_wxyz)
         self.log.start_over(start.next_gate)
         self.pose = Pose(stamp_ns=self.ap.now_ns, body=self.ap.truth)

@@ -21,8 +21,8 @@ READ_TIMEOUT_MS = 2000
 FFMPEG_OPTIONS_VARIABLE = "OPENCV_FFMPEG_CAPTURE_OPTIONS"
 FFMPEG_LOG_VARIABLE = "OPENCV_FFMPEG_LOGLEVEL"
 LOW_LATENCY_OPTIONS = "rtsp_flags;prefer_tcp|fflags;nobuffer|flags;low_delay"
-"""No buffering in the demuxer, no reordering delay in the decoder. The first option is OpenCV's
-default, which setting any options drops."""
+"""No buffering in the demuxer, no reordering delay in the decoder. Setting any option drops
+OpenCV's default, which is repeated as the first one."""
 SDP_OPTIONS = "|protocol_whitelist;file,udp,rtp"
 """Protocols that FFmpeg must be allowed to use for the sources in an .sdp file."""
 DEVICE_MODES = ((640, 480), (1280, 720), (1920, 1080))

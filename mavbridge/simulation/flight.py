@@ -98,8 +98,7 @@ class SimulatedFlight:
         self._course_seed = course_seed
         self._seed = seed
         self.clock = SteppedClock()
-        # Real vehicles and bridges are not in phase, and their phase stays constant during a
-        # flight.
+        # A real vehicle and bridge are not in phase; the phase stays constant during a flight.
         boot_ns = self.clock.now_ns() + int(self._random(6).integers(STEP_NS))
         self.course = make_course(course_seed)
         self._vehicle_config = vehicle

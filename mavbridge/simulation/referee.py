@@ -17,7 +17,7 @@ from sitl.course import make_course
 from sitl.simulated_vehicle import SimulatedVehicle
 
 READY_NS = 30 * NS_PER_S
-"""Limit from the start to the policy's first action, which normally comes after 4 s."""
+"""Limit from the start to the policy's first action, which comes after some 4 s."""
 
 
 Outcome = Literal["finished", "crashed", "disarmed", "timed out"]

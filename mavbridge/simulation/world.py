@@ -1,7 +1,6 @@
 """World around the bridge in a simulated flight: the vehicle, its cameras and the vision loop.
 
-The vision loop runs as an event when a frame arrives, and publishes its result at the result's
-stamps.
+The vision loop runs as an event when a frame arrives; its results are published at their stamps.
 """
 
 import math
@@ -46,8 +45,9 @@ half a second."""
 
 
 def draw_conditions(kind: ConditionsKind, seed: int) -> Conditions:
-    """Return the conditions of an evaluated flight. ``seed`` is its course's, so that no
-    demonstration had the same conditions.
+    """Return the conditions of an evaluated flight.
+
+    ``seed`` is the seed of its course, so that no demonstration had the same conditions.
 
     Raises:
         UsageError: the seed is negative.

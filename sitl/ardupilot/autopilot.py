@@ -360,7 +360,7 @@ class ArduCopter(Autopilot):
             self._fail_over("GCS", "FS_GCS_ENABLE")
 
     def _fail_over(self, who: str, parameter: str) -> None:
-        """Land or return; the mode stays after the cause has gone."""
+        """Land, brake or return as the parameters say; the mode stays after the cause has gone."""
         if self.armed and self.landed:
             self._send_text(SEVERITY_WARNING, f"{who} Failsafe - Disarming")
             self.disarm(force=True)

@@ -205,7 +205,8 @@ def boosted(thrust: float, body: BodyState, params: ArduPilotParams) -> float:
 
 
 def lean_for(accel_ne_mps2: tuple[float, float], body: BodyState) -> tuple[float, float]:
-    """Return the roll and pitch [rad] that accelerate a hovering vehicle by this north and east."""
+    """Return the roll and pitch [rad] that give a hovering vehicle this acceleration north and
+    east."""
     north, east = accel_ne_mps2
     forward, right = to_heading(north, east, yaw_of(body.ned_from_body_wxyz))
     return math.atan2(right, GRAVITY_MPS2), -math.atan2(forward, GRAVITY_MPS2)

@@ -101,7 +101,7 @@ class GuidedControl:
         self._takeoff_height_m = height_m
 
     def is_taking_off(self, body: BodyState) -> bool:
-        """True during `take_off`: more than a tenth of its height is left, or the climb is still
+        """True while `take_off` has more than a tenth of its height left or the climb is still
         fast.
 
         Formula: ArduCopter's ``auto_takeoff``; fast is at least half of WPNAV_SPEED_UP.
@@ -114,7 +114,7 @@ class GuidedControl:
     def lifts_off(self, now_ns: int, armed_ns: int) -> bool:
         """True once a landed vehicle has spun its motors up for a takeoff.
 
-        A thrust or climb rate above zero lifts it off, or `take_off`; a velocity never does.
+        A thrust or climb rate above zero lifts it off, as does `take_off`; a velocity never does.
         """
         wanted = self.submode is Submode.TAKEOFF
         by_thrust = self.submode is Submode.ATTITUDE and self._has_thrust
@@ -198,8 +198,7 @@ class GuidedControl:
         return max(0.0, min(1.0, self._setpoint.thrust)) if self._setpoint else 0.0
 
     def _climb_mps(self) -> float:
-        """Return the climb rate of a thrust: 0.5 holds the height; 0 and 1 are WPNAV's descent and
-        climb."""
+        """Return the climb rate of a thrust: 0 is WPNAV_SPEED_DN, 0.5 zero, 1 WPNAV_SPEED_UP."""
         above_half = 2.0 * self._thrust() - 1.0
         limit = "WPNAV_SPEED_UP" if above_half > 0.0 else "WPNAV_SPEED_DN"
         return above_half * self._params[limit] / 100.0

@@ -166,8 +166,8 @@ class SimpleMode:
     """Simple and Super Simple mode, which interpret pitch and roll in other axes than the
     vehicle's.
 
-    Copter up to 4.6 and from 4.8 on works like this; 4.7.0 switches the modes and turns nothing.
-    They change only by a switch or a command: a parameter alone does nothing.
+    As in Copter up to 4.6 and from 4.8 on; 4.7.0 accepts the switch but rotates nothing. Only a
+    switch or a command changes the axes; a changed parameter has no effect until then.
     """
 
     def __init__(self, params: ArduPilotParams) -> None:

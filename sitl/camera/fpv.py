@@ -232,11 +232,11 @@ class Shutter:
         return np.asarray(np.mean(moved, axis=0).round(), dtype=np.uint8)
 
     def flow_pxps(self, rate_camera_radps: FloatArray) -> tuple[Pixels, Pixels]:
-        """Return the pixel flow right and down, per second after the stamp, to the pixel's place at
-        the stamp.
+        """Return the flow [pixels/s], right and down, for rows exposed at other times than the
+        stamp.
 
-        At the stamp, the ray r = (x, y, 1) of a camera that has since turned for t was r + t *
-        cross(rate, r).
+        A pixel exposed t after the stamp shows the stamp's image at pixel + t * flow: the ray r =
+        (x, y, 1) of a camera that has turned for t was r + t * cross(rate, r) at the stamp.
         """
         right_radps, down_radps, ahead_radps = rate_camera_radps.astype(np.float32)
         deeper = right_radps * self._y - down_radps * self._x

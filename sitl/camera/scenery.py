@@ -23,8 +23,8 @@ INSIDE_BRIGHTNESS = 0.7
 SHADE_BRIGHTNESS = 0.4
 PANEL_AHEAD_M = (2.0, 4.5)  # distance of a panel before the gate that it partly hides
 PANEL_ASIDE_M = (1.3, 1.9)
-"""Distance of the panel's middle from the passage's axis, to either side: beyond any flight path,
-so it has no collision."""
+"""Distance of the panel's middle from the passage's axis, to either side. No path passes through a
+panel, and panels have no collision."""
 PANEL_WIDTH_M = 1.2
 STRAY_AHEAD_M = (-3.0, 3.0)
 """Distance of a stray gate beyond the gate that it stands beside."""

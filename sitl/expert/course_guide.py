@@ -37,8 +37,8 @@ TAKEOFF_HEIGHT_M = (0.4, 1.4)
 BACKING_SPEED_MPS = 2.5
 CLEAR_OF_FRAME_M = 2.4  # sideways from a gate's axis, the vehicle's size included
 MISS_M = (0.7, 1.2)
-"""Predicted miss distance in the plane of a gate, despite full lean: at the first it begins to back
-off, at the second it does nothing else."""
+"""Predicted miss distance in the plane of a gate, despite full lean: from the first value on it
+starts to back off, from the second on it only backs off."""
 BRAKING_GAIN_PER_S = 1.2
 BEYOND_LEG_M = 8.0
 

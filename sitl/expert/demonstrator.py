@@ -101,8 +101,8 @@ class StickResponse:
         self._throttle_dead = 2.0 * params["THR_DZ"] * (half / 500.0) / 1000.0
 
     def sticks(self, demand: Demand, drag_mps2: complex, yaw_rad: float) -> StickPositions:
-        """Convert a demand to sticks: leans from accelerations in heading axes against this drag,
-        and rates."""
+        """Convert a demand to sticks: leans that give its acceleration against this drag, and rates
+        as shares of full scale."""
         accel_mps2 = demand.accel_mps2 - drag_mps2
         forward_right = accel_mps2 * cmath.rect(1.0, -yaw_rad) / GRAVITY_MPS2
         nose_down_rad = math.atan(forward_right.real)

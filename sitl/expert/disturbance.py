@@ -25,12 +25,12 @@ PULSE_S = (0.15, 0.5)
 NOISE_TIME_S = 0.25  # correlation time of the noise: about that of a thumb
 START_AWAY_M = (3.0, 5.5)
 """Distance before a gate of an easy course: past the previous gate, as legs are at least 7 m."""
-RACE_START_AWAY_M = (4.0, 8.5)  # for a race course, whose legs are at least 10 m
+RACE_START_AWAY_M = (4.0, 8.5)  # before a gate of a race course, whose legs are at least 10 m
 LATE_CHANCE = 0.3
 LATE_S = (0.2, 2.0)
 
 
-ZEROS: Numbers = (0.0,) * 4  # no offset; as an action, sticks or rates, a no-op on the ground
+ZEROS: Numbers = (0.0,) * 4  # no offset; as an action, by sticks or rates, a no-op on the ground
 
 
 class Strengths(NamedTuple):

@@ -47,7 +47,7 @@ REACTION_S = 0.85  # time for which AUTO keeps a moving vehicle's lean before it
 
 
 class RateController:
-    """Tracks body rates, and attitudes on top of them."""
+    """Tracks body rates, and attitudes through them."""
 
     def __init__(self, params: Px4Params) -> None:
         self._params = params
@@ -145,8 +145,8 @@ class Horizontal:
     """Horizontal motion of the modes that need a position: paths, tracked by the velocity
     controller.
 
-    POSCTL's sticks push a velocity that drag holds back. AUTO modes follow a path of limited jerk
-    to a position. OFFBOARD tracks the demanded velocity directly.
+    In POSCTL the sticks accelerate the target velocity against drag. AUTO modes follow a path of
+    limited jerk to a position. OFFBOARD tracks the demanded velocity directly.
     """
 
     def __init__(self, params: Px4Params) -> None:

@@ -191,7 +191,7 @@ class Px4Control:
         return self._hold_yaw(self._yaw_rate_radps, body)
 
     def _hold_yaw(self, yaw_rate_radps: float, body: BodyState) -> float:
-        """Return the yaw rate; at zero rate, hold the heading at which it became zero."""
+        """Return the yaw rate; near zero, return 0 and hold the present heading."""
         if abs(yaw_rate_radps) > STILL_YAW_RADPS:
             self._yaw_hold_rad = None
             return yaw_rate_radps

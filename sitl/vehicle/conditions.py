@@ -55,7 +55,7 @@ class Conditions:
     stream_jitter_ms: float = 0.0  # largest random delay of a message
     stream_phase_spread: float = 0.0  # largest early start of a stream, as a share of its interval
 
-    velocity_noise_mps: float = 0.0  # noise: standard deviation per sample and axis
+    velocity_noise_mps: float = 0.0  # noise values: standard deviation per sample and axis
     rate_noise_radps: float = 0.0
     specific_force_noise_mps2: float = 0.0
 
@@ -67,7 +67,7 @@ class Conditions:
 
     gate_rgb: tuple[Rgb, Rgb] = ((255, 126, 22), (222, 34, 48))  # even gates, odd gates
     ground_tint: Vec3 = (1.0, 1.0, 1.0)  # factors on red, green and blue
-    sky_tint: Vec3 = (1.0, 1.0, 1.0)  # also tints haze and far ground
+    sky_tint: Vec3 = (1.0, 1.0, 1.0)  # factors on red, green, blue; also tints haze and far ground
     ground_seed: int = 0  # seed of the pattern of grass and soil
     sun_ned: Vec3 = (-0.45, 0.35, -0.82)  # direction to the sun, unit length
     ambient: float = 0.78  # brightness of a surface turned away from the sun

@@ -24,7 +24,7 @@ MOTOR_ARM_M = 0.12  # motors sit at (+-arm, +-arm): a 0.34 m diagonal wheelbase
 YAW_TORQUE_PER_THRUST_M = 0.016
 REST_HEIGHT_M = 0.06
 VERTICAL_GUST_SHARE = 0.5
-"""Vertical over horizontal gust strength; near the ground the air moves along it."""
+"""Vertical over horizontal gust strength; near the ground, air moves along the ground."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -33,7 +33,7 @@ class Airframe:
 
     mass_kg: float = 1.2
     max_motor_thrust_n: float = 7.54
-    """Hover at 0.39 of full thrust, ArduCopter's order of magnitude for a learned hover."""
+    """Thrust for hover at 0.39 of full, ArduCopter's order of magnitude for a learned hover."""
     motor_lag_s: float = 0.028
     rotor_drag_nspm: float = 0.15
     """Linear drag of spinning rotors, about 0.1 1/s of mass at this size. Body drag is MuJoCo's

@@ -34,7 +34,7 @@ from mavbridge.simulation.replay.recording import RecordedPacket, ReplaySource
 from policy.contract import Contract
 
 PREPARE_NS = 10 * NS_PER_MS
-"""Longest time between two polls of the link, as before a policy is loaded."""
+"""Longest time between two polls of the link, as while no policy is loaded."""
 _OWN_ENDINGS = (
     *(Code.SIGNAL, Code.COURSE_DONE, Code.POLICY_FAILED, Code.CAMERA_FAILED, Code.HANGS),
     *(Code.TOLD_TO_END, Code.FLIGHT_PROCESS_DIED),
@@ -116,7 +116,7 @@ def _keep_link(
     soon.
 
     It also services the link just before each arrival, since the packet may be the answer to a
-    request: a vehicle selected a moment later would not be listened to yet.
+    request: a vehicle selected a moment later would still be ignored.
     """
     while clock.now_ns() < until_ns:
         arrival_ns = transport.next_arrival_ns or until_ns
