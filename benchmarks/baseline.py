@@ -189,8 +189,7 @@ class Baseline:
     def _state(self) -> np.ndarray | None:
         """Return [1, state_dim] of the newest parsed message of each kind, or None.
 
-        A policy that takes the age of its image gets zeros, since this runner does not know the
-        age.
+        A policy that takes the age of its image gets zeros, since this runner does not know it.
         """
         messages = self._connection.messages
         try:

@@ -18,8 +18,7 @@ _UNNAMED = ("Arguments", "Parameters", "Flags")
 
 
 def flags() -> str:
-    """Return every command with its flags, then the settings. A flag is listed under its first
-    command.
+    """Return every command with its flags, each under its first command, then the settings.
 
     Long help texts are shortened; ``--help`` has the rest.
     """
@@ -34,8 +33,7 @@ def flags() -> str:
 
 
 def _flags_of(app: App, seen: dict[tuple[str, str], str]) -> Iterator[str]:
-    """Yield the flags not listed under an earlier command, by group, then the names of the other
-    groups."""
+    """Yield the flags not listed before, by group, then the names of the other groups."""
     new: dict[str, list[Argument]] = {}
     shared: dict[str, None] = {}
     for argument in _arguments(app):
@@ -90,8 +88,7 @@ def _default(argument: Argument) -> str:
 
 
 def _text(text: object) -> str:
-    """Return a help text on one line; shorten a long one to its first sentence or clause before a
-    semicolon."""
+    """Return a help text on one line, or the first sentence or clause of a long one."""
     words = str(text or "").split("Args:")[0].split()
     line = " ".join(words)
     return line if len(words) <= MOST_WORDS else re.split(r"[.;] ", line)[0].rstrip(".") + "."

@@ -1,5 +1,4 @@
-"""Measure mavbridge on this machine, beside a roofline, a baseline runner and other MAVLink
-clients.
+"""Measure mavbridge on this machine, beside a roofline, a baseline and other MAVLink clients.
 
 python -m benchmarks.compare --json bench.json --check benchmarks/budget.json
 
@@ -53,8 +52,7 @@ LOADED_FLIGHTS: tuple[tuple[Rates, Load], ...] = tuple(
     for load in ("slow", "busy")
     for realtime in (True, False)
 )
-"""Conditions for the shipped policy: stick timing beside a slow policy, and beside a busy
-interpreter."""
+"""Flights of the shipped policy for stick timing: with slow solves, and with a busy interpreter."""
 ROOFLINE = "roofline f32"
 MS_PER_S = 1000.0
 

@@ -1,4 +1,4 @@
-"""Timing of one encoded image and one sampled chunk on each engine, in one thread, with no other
+"""Timing of one encoded image and one sampled chunk per engine, in one thread, without other
 load."""
 
 from collections.abc import Callable, Sequence

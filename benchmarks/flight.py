@@ -54,7 +54,7 @@ PROC = Path("/proc")
 STEAL_FIELD = 8
 """Index of "steal" in the line "cpu": cpu user nice system idle iowait irq softirq steal."""
 STARTING_S = 300.0
-"""Limit of a process' time beside its flight: imports, compiling an engine, arming. A network of
+"""Time limit of a process apart from its flight: imports, compiling an engine, arming. A network of
 263 M parameters compiles for one or two minutes."""
 CLIMB_STICK = 0.3
 """Stick for 0.3 m/s up in ALT_HOLD: beyond the dead zone, some 20 m per minute."""
@@ -159,8 +159,7 @@ def run_torch(stop: threading.Event) -> None:
 
 
 def hog_interpreter(stop: threading.Event) -> None:
-    """Run only bytecode, so that other threads run only when the interpreter takes its lock
-    away."""
+    """Run only bytecode: others run only when the interpreter takes its lock away."""
     while not stop.is_set():
         pass
 
@@ -259,8 +258,7 @@ def read_counters(guard_pid: int) -> Counters:
 class FlightMeter:
     """``TickSink`` that measures from the policy's first action on.
 
-    Waiting, handshake and arming consist of cheap, punctual ticks, which would flatter a slow
-    engine.
+    Waiting, handshake and arming consist of cheap, punctual ticks that would flatter a slow engine.
     """
 
     def __init__(

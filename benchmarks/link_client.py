@@ -1,9 +1,7 @@
-"""mavbridge's client of the link test: guard and policy loop, with a policy that repeats the roll
-rate.
+"""mavbridge's client of the link test: guard and policy loop; the policy repeats the roll rate.
 
 No torch is loaded and no camera runs, but every attitude takes the path of a flight: from the
-socket through the guard to the flight process, through the policy loop, and as a chunk back to the
-guard.
+socket through the guard to the flight process, through the policy loop, and back as a chunk.
 """
 
 import signal
@@ -67,8 +65,7 @@ def main(*, port: int) -> None:
 
 
 def link_bridge(plan: FlightPlan, guard: GuardProcess) -> Bridge:
-    """Build the policy loop and its view of the vehicle; the vision loop is built but never
-    runs."""
+    """Build the policy loop and its view of the vehicle; the vision loop exists but never runs."""
     clock, cache = MonotonicClock(), FeatureCache()
     now_ns = clock.now_ns()
     feature = np.zeros((1, 1), np.float32)

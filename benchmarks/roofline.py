@@ -25,8 +25,7 @@ MATRIX_SIDE = 1024
 """Side large enough that a product is bound by arithmetic: 2 GFLOP over 12 MB."""
 LEAST_BUFFER_BYTES = 1 << 20
 TRIALS, TRIAL_NS = 5, 20 * NS_PER_MS
-"""Trials and their minimum length. The best counts: a peak is the machine's ability, without other
-load."""
+"""Trials and their minimum length. The best counts: a peak excludes other load."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -59,7 +58,7 @@ def time_rooflines(policies: Sequence[PolicyConfig]) -> tuple[EngineTiming, ...]
 
 
 def works_of(policy: PolicyConfig) -> Iterator[tuple[str, Work]]:
-    """Return the work of encoding an image and of a full solve: the condition once, the U-Net per
+    """Return the work of encoding an image, and of a full solve: one condition, the U-Net per
     step."""
     net, steps = eager_toge(policy), policy.steps
     contract = net.contract
@@ -100,8 +99,7 @@ def floor_ms(work: Work, dtype: torch.dtype) -> float:
 
 
 def best_s(call: Callable[[], object]) -> float:
-    """Return the shortest mean time of a call over a few trials, each at least ``TRIAL_NS``
-    long."""
+    """Return the shortest mean time of a call over a few trials of at least ``TRIAL_NS`` each."""
     clock, best_s = MonotonicClock(), float("inf")
     call()
     for _ in range(TRIALS):

@@ -22,8 +22,7 @@ _CONTROLLED_BY = {
 
 
 def table() -> str:
-    """Return every state with its controller and its rows in reading order, then the explained
-    words.
+    """Return all states with their controllers and rows in reading order, then the explained words.
 
     A row is repeated in each of its states.
     """

@@ -1,5 +1,4 @@
-"""Simulated flight controller to test against: a separate process, reached over MAVLink and shared
-memory.
+"""Simulated flight controller, a separate process reached over MAVLink and shared memory.
 
 It shares no code with the bridge, so an agreement between the two is an agreement over the wire.
 """

@@ -21,8 +21,7 @@ from sitl.vehicle.config import STEP_NS, AutopilotName, VehicleConfig
 
 JOIN_TIMEOUT_S = 5.0
 LEAST_PRIORITY = 19
-"""Niceness while flying on faster than real time, so that flights running on the same computer keep
-their timing."""
+"""Niceness while flying on faster than real time, to protect the timing of other flights."""
 PilotName = Literal["gamepad", "keyboard", "expert"]
 PILOTS: tuple[PilotName, ...] = ("gamepad", "keyboard", "expert")
 _PX4_PARAMS = {"COM_RC_IN_MODE": 0.0, "COM_FLTMODE_BOOT": 1.0}
@@ -54,8 +53,7 @@ def run_vehicle(
     Before the report the vehicle flies on for ``fly_on_s`` without links or pilot.
 
     Raises:
-        UsageError: a link, the RC input, the pilot, the camera's name or the report's folder
-            cannot be used.
+        UsageError: a link, RC input, pilot, camera name or report folder cannot be used.
     """
     if report is not None and not report.parent.is_dir():
         raise UsageError(f"--report {report}: there is no folder {report.parent}")
@@ -114,8 +112,7 @@ def make_pilot(
     """Return the pilot and a line about it for the user.
 
     Raises:
-        UsageError: the pilot's package, display or vehicle is missing, or its axes cannot be
-            read.
+        UsageError: the pilot lacks its package, display or vehicle, or its axes cannot be read.
     """
     name, axes, speed_mps = options
     if name == "expert":

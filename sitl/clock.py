@@ -10,8 +10,7 @@ NS_PER_MS = 1_000_000
 
 
 class Clock:
-    """CLOCK_MONOTONIC: never set back, one origin for all processes. Tests inject a stepped
-    clock."""
+    """CLOCK_MONOTONIC: never set back, one origin for all processes. Tests inject another one."""
 
     def now_ns(self) -> int:
         return time.monotonic_ns()
@@ -35,8 +34,7 @@ def monotonic_from_wall_ns(wall_ns: int) -> int:
 class StopRequest:
     """Stop flag that a signal handler may set.
 
-    Not a ``threading.Event``: a second signal would wait for the lock that the first one's handler
-    holds.
+    Not a ``threading.Event``: a second signal's handler would wait for the first one's lock.
     """
 
     def __init__(self) -> None:
@@ -51,8 +49,7 @@ class StopRequest:
 
 @contextmanager
 def stop_on_signal() -> Iterator[StopRequest]:
-    """Context manager: SIGINT and SIGTERM set the flag; the previous handlers are restored at the
-    end."""
+    """Context manager: SIGINT and SIGTERM set the flag; the old handlers return at the end."""
     stop = StopRequest()
     signals = (signal.SIGINT, signal.SIGTERM)
     previous = [signal.signal(number, lambda *_: stop.set()) for number in signals]

@@ -1,5 +1,4 @@
-"""Command line: ``python -m sitl`` flies, ``camera`` films another vehicle, ``course`` prints a
-course."""
+"""Commands: ``python -m sitl`` flies, ``camera`` films a vehicle, ``course`` prints a course."""
 
 import argparse
 import math

@@ -66,8 +66,7 @@ class Gate:
     index: int  # position on the course, from 0
 
     def to_axes(self, vector_ned: Vec3) -> Vec3:
-        """Rotate a NED direction, velocity or offset into gate axes: forward through the gate,
-        right, down."""
+        """Rotate a NED direction, velocity or offset into gate axes: forward, right, down."""
         north, east, down = vector_ned
         cos_yaw, sin_yaw = math.cos(self.yaw_rad), math.sin(self.yaw_rad)
         return (north * cos_yaw + east * sin_yaw, east * cos_yaw - north * sin_yaw, down)
@@ -205,9 +204,8 @@ class Crash:
 class GateCounter:
     """Counts the gates that a trajectory passes in order, forward and inside the opening.
 
-    ``first`` is the gate to begin with, for a flight that starts in the middle of the course. A
-    point on the very edge of the opening is inside. A gate that was flown around stays next until
-    it is passed.
+    ``first`` is the gate to begin with, for a flight that starts in the middle of the course. The
+    edge of the opening is inside. A gate that was flown around stays next until it is passed.
     """
 
     def __init__(self, course: Course, *, first: int = 0) -> None:
@@ -241,8 +239,7 @@ class GateCounter:
 
 
 def crossing(gate: Gate, start_ned_m: Vec3, end_ned_m: Vec3) -> float | None:
-    """Return the fraction of the segment at which it passes forward through the opening, or
-    None."""
+    """Return the fraction of the segment at which it passes forward through the opening, if any."""
     start_forward_m, start_right_m, start_down_m = gate.offset_m(start_ned_m)
     end_forward_m, end_right_m, end_down_m = gate.offset_m(end_ned_m)
     if not start_forward_m < 0.0 <= end_forward_m:

@@ -75,8 +75,7 @@ class Params:
         return int(self._values[name])
 
     def set(self, name: str, value: float) -> bool:
-        """Store the value. Return False for an unknown name or a value that its type cannot
-        hold."""
+        """Store the value. Return False for an unknown name or a value outside its type."""
         if name not in self._values or not math.isfinite(value):
             return False
         if name in self._integers:
@@ -105,8 +104,7 @@ class Params:
         return float(packed)
 
     def set_on_wire(self, name: str, packed: float) -> bool:
-        """Store the float field of PARAM_SET. Return False for an unknown name or a value that its
-        type cannot hold."""
+        """Store the float field of PARAM_SET. Return False if refused, like `set`."""
         if name not in self._integers:
             return self.set(name, packed)
         (value,) = struct.unpack("<i", struct.pack("<f", packed))
@@ -114,8 +112,7 @@ class Params:
 
 
 class Autopilot(ABC):
-    """One boot of the flight controller, without its links. Stamps are those of the caller's
-    clock."""
+    """One boot of the flight controller, without its links. Stamps use the caller's clock."""
 
     step_ns: ClassVar[int]  # control period, by which `step` advances
     airframe: ClassVar[Airframe]
@@ -177,8 +174,7 @@ class Autopilot(ABC):
 
     @abstractmethod
     def set_receiver(self, values_us: Sequence[int]) -> None:
-        """Move the pilot's sticks and switches [us, by channel]; all zeros switch the transmitter
-        off."""
+        """Move the pilot's sticks and switches [us, by channel]; all zeros: transmitter off."""
 
     @property
     def step_s(self) -> float:
@@ -229,7 +225,7 @@ class Autopilot(ABC):
     def launch(
         self, position_ned_m: Vec3, velocity_ned_mps: Vec3, ned_from_body_wxyz: Quat
     ) -> None:
-        """Put the armed vehicle into the air in this state, in a mode whose sticks lean and climb.
+        """Put the vehicle into the air in this state, armed, in a mode with lean and climb sticks.
 
         A mode flown by setpoints is kept.
         """

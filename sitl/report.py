@@ -16,8 +16,7 @@ CRASH_SPEED_MPS = 3.5  # ALT_HOLD descends at up to 2.5 m/s, a hard landing but 
 CRASH_TILT_COS = math.cos(math.radians(45.0))
 MAX_TEXTS = 200
 END_AFTER_NS = NS_PER_S
-"""Time from the last gate to the end of a flown course, so that a crash just behind the gate
-counts."""
+"""Time from the last gate to the end of the course: a crash just behind the gate counts."""
 PATH_PERIOD_NS = NS_PER_S // 20
 """Path length is summed at 20 Hz: fine enough for turns, coarse enough to leave out vibration."""
 
@@ -72,8 +71,7 @@ class FlightLog:
         return tuple(self._gates.passed)
 
     def start_over(self, next_gate: int) -> None:
-        """Begin again after the vehicle was placed elsewhere in the air: count from
-        ``next_gate``."""
+        """Restart the count at ``next_gate`` after the vehicle was placed elsewhere in the air."""
         self._gates = GateCounter(self._course, first=next_gate)
         self._position_ned_m = None
         self._was_touching = False
@@ -86,8 +84,7 @@ class FlightLog:
         self._was_touching = True
 
     def verdict(self, now_ns: int) -> Literal["crashed", "finished"] | None:
-        """Return the end of the course: a crash, or one second after the last gate; None before
-        that."""
+        """Return the end of the course: a crash, or 1 s after the last gate; None before that."""
         if self.crashed:
             return "crashed"
         if not self._gates.passed or self.next_gate is not None:
@@ -193,8 +190,7 @@ class _StickEntry(NamedTuple):
 
 
 class _StickRecord:
-    """Sticks that the vehicle acted on and its motion, at every change and periodically while
-    armed."""
+    """Sticks that the vehicle acted on and its motion, at changes and periodically while armed."""
 
     def __init__(self) -> None:
         self._entries: deque[_StickEntry] = deque(maxlen=MAX_STICK_ENTRIES)

@@ -32,8 +32,7 @@ class Pose:
 
 
 class SimulatedVehicle:
-    """Autopilot, physics and MAVLink of one vehicle. Stamps are those of the caller's monotonic
-    clock."""
+    """Autopilot, physics and MAVLink of one vehicle. Stamps use the caller's monotonic clock."""
 
     def __init__(
         self,
@@ -102,8 +101,8 @@ class SimulatedVehicle:
         return outgoing
 
     def launch(self, start: AirborneStart) -> None:
-        """Put the armed vehicle into the air in this state, in a mode whose sticks lean and
-        climb."""
+        """Put the vehicle into the air in this state, armed, in a mode with lean and climb
+        sticks."""
         self.ap.launch(start.position_ned_m, start.velocity_ned_mps, start.ned_from_body_wxyz)
         self.log.start_over(start.next_gate)
         self.pose = Pose(stamp_ns=self.ap.now_ns, body=self.ap.truth)

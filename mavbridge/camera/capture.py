@@ -26,8 +26,7 @@ OpenCV's default, which is repeated as the first one."""
 SDP_OPTIONS = "|protocol_whitelist;file,udp,rtp"
 """Protocols that FFmpeg must be allowed to use for the sources in an .sdp file."""
 DEVICE_MODES = ((640, 480), (1280, 720), (1920, 1080))
-"""Modes that practically every camera offers; the smallest that covers the policy's image is
-used."""
+"""Modes of practically every camera; the smallest that covers the policy's image is used."""
 MAX_DRIVER_AGE_NS = NS_PER_S
 
 

@@ -47,7 +47,7 @@ class ImageWatch:
     def check(self, rgb: CameraImage, captured_ns: int, *, is_airborne: bool) -> Reason | None:
         """Return the reason not to fly by this image, or None. Call it with each image, in order.
 
-        ``rgb`` is kept for the next call and must not be changed. ``is_airborne`` is also False if
+        ``rgb`` is kept for the next call and must not be changed. ``is_airborne`` is False if
         unknown.
         """
         blank = self._blank(rgb, captured_ns) if self._max_black_s > 0 else None

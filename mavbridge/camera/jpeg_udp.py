@@ -19,8 +19,7 @@ from mavbridge.core.errors import CameraError, UserError
 
 FORM = "jpeg-udp:[HOST:]PORT, such as jpeg-udp:5600 or jpeg-udp:[::1]:5600"
 HEADER = Struct("<IHHIIQ")
-"""Frame id, chunk number, number of chunks, picture size [bytes], chunk size [bytes], stamp
-[ns]."""
+"""Frame id, chunk number, number of chunks, bytes of the picture and of the chunk, stamp [ns]."""
 MAX_PARTIAL = 4
 """Largest number of incomplete frames; bounds the memory together with MAX_JPEG_BYTES."""
 RESTART_NS = NS_PER_S

@@ -141,8 +141,7 @@ def open_camera(
 
 
 def _require_kind(spec: str, first: Image | Frame | None, is_depth: bool | None) -> None:
-    """Raise UserError for depth images if the policy takes RGB, and the reverse. A source without
-    ``first`` is RGB."""
+    """Raise UserError for depth instead of RGB, or the reverse; without ``first``, assume RGB."""
     shape = (0, 0, 3) if first is None else first.rgb.shape
     if is_depth is None or is_depth == (len(shape) == 2):
         return

@@ -54,8 +54,7 @@ class X11Screen:
         self._title_atoms = [*map(self._display.intern_atom, ("_NET_WM_NAME", "WM_NAME"))]
 
     def windows(self) -> list[Window]:
-        """Return the visible windows with a title, bottom to top, each before the windows inside
-        it."""
+        """Return visible windows with a title, bottom to top, each before the windows inside it."""
         return list(self._titled(self._root))
 
     def _titled(self, parent: XlibWindow) -> Iterator[Window]:

@@ -175,8 +175,7 @@ class _Segment:
         return newest_id
 
     def copy(self, frame_id: int) -> tuple[int, CameraImage] | None:
-        """Return captured_ns and pixels of a frame; None if the writer used its slot in the
-        meantime."""
+        """Return captured_ns and pixels of a frame; None if the writer has reused its slot."""
         slot = self._slots[frame_id % SLOTS : frame_id % SLOTS + 1]
         seq = int(slot["seq"][0])
         memory_barrier()

@@ -30,8 +30,7 @@ class Delay:
     offset_ns: int = 0
 
     def __post_init__(self) -> None:
-        """Raise UserError for negative times or percentiles impossible for a log-normal
-        distribution."""
+        """Raise UserError for negative times or percentiles that no log-normal distribution has."""
         if min(self.p50_ns, self.offset_ns) < 0:
             raise UserError(f"a delay cannot be negative, got {self}")
         if self.p99_ns is not None and not 0 < self.p50_ns <= self.p99_ns:
@@ -63,8 +62,7 @@ class Delays:
     uplink: Delay = Delay(p50_ns=NS_PER_MS * 3 // 10)
     downlink: Delay = Delay(p50_ns=NS_PER_MS * 3 // 10)
     stall_ns: int = 0
-    """Duration of random stalls of the flight process, which begin 3 s after the last one's end on
-    average; 0 = none."""
+    """Duration of the flight process' stalls, at random, on average 3 s apart; 0 = none."""
 
 
 class Stalls:

@@ -72,8 +72,7 @@ class SimulatedFlight:
     """One flight of a vehicle over a course, flown by the bridge.
 
     The same arguments give the same stick bytes. Add watchers before ``fly``. A scripted policy
-    follows ``clock``; ``vehicle.ap.truth`` is the true state at any time, including from within a
-    runner's ``act``.
+    follows ``clock``; ``vehicle.ap.truth`` is the true state at any time, even within ``act``.
     """
 
     def __init__(
@@ -118,8 +117,7 @@ class SimulatedFlight:
         self._has_flown = False
 
     def _random(self, purpose: int) -> np.random.Generator:
-        """Return random numbers for one purpose, so that changing one delay leaves the others
-        alone."""
+        """Return random numbers for one purpose: changing one delay leaves the others alone."""
         return np.random.Generator(np.random.PCG64((self._seed, purpose)))
 
     def watch_exposures(self, watch: Callable[[Exposure], None]) -> None:

@@ -21,8 +21,7 @@ READY_NS = 30 * NS_PER_S
 
 
 Outcome = Literal["finished", "crashed", "disarmed", "timed out"]
-"""All gates passed; ground or gate hit; motors stopped in flight; none of these before the
-limit."""
+"""All gates passed; ground or gate hit; motors stopped in flight; none of these in time."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -58,8 +57,7 @@ class EpisodeResult:
 
     @property
     def course_speed_mps(self) -> float | None:
-        """Mean speed along the straight legs from the first to the last passed gate; None for fewer
-        than two gates."""
+        """Mean speed along the straight legs between the passed gates; None for fewer than two."""
         if self.gates_passed < 2:
             return None
         gates = make_course(self.course_seed).gates[: self.gates_passed]

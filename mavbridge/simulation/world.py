@@ -40,8 +40,7 @@ MOUNTS: dict[str, Quat] = {
 """Camera directions by name for policies with several cameras: body_from_mount. Each camera has the
 tilt of the front one; in the image of ``down``, the upper edge is ahead."""
 NOMINAL_VEHICLE = VehicleConfig(estimator_ready_s=0.5, position_ready_s=0.5)
-"""Vehicle without random conditions. It is ready at once: the handshake alone takes longer than
-half a second."""
+"""Nominal vehicle, ready at once: the handshake alone takes longer than half a second."""
 
 
 def draw_conditions(kind: ConditionsKind, seed: int) -> Conditions:
@@ -82,8 +81,7 @@ def make_vehicle(
 
 
 def needed_params(contract: Contract, autopilot: AutopilotName) -> dict[str, float]:
-    """Return the parameters without which a simulated vehicle misinterprets the contract's
-    actions."""
+    """Return parameters without which a simulated vehicle misinterprets the contract's actions."""
     has_thrust = contract.action in ("rates", "attitude")
     return {"GUID_OPTIONS": OPTION_THRUST} if has_thrust and autopilot == "ardupilot" else {}
 
@@ -232,7 +230,7 @@ class DelayedFeatureCache(FeatureCache):
 
 
 class DelayedSink:
-    """Passes vision ticks on when their features are ready, so that events come in order of
+    """Passes vision ticks on when their features are ready, so that events stay in order of
     time."""
 
     def __init__(self, clock: SteppedClock, sink: TickSink) -> None:

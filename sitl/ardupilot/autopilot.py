@@ -183,8 +183,7 @@ class ArduCopter(Autopilot):
         return None
 
     def arm(self, *, force: bool, by_rudder: bool = False) -> bool:
-        """Start the motors, or send the refusal as a status text. Return True if armed
-        afterwards."""
+        """Start the motors, or send the refusal as a text. Return True if armed afterwards."""
         if self.armed:
             return True
         refusal = self.prearm_refusal() or self._stick_refusal(by_rudder=by_rudder)
@@ -221,11 +220,10 @@ class ArduCopter(Autopilot):
         return True
 
     def set_mode(self, mode: Mode) -> bool:
-        """Change the flight mode, or send the refusal as a status text. Return True if in the mode
+        """Change the flight mode, or send the refusal as a text. Return True if in the mode
         afterwards.
 
-        A mode that needs a position is refused only to an armed vehicle; a disarmed one is refused
-        arming instead.
+        A mode that needs a position is refused only while armed; otherwise arming is refused.
         """
         if mode is self.mode:
             return True
@@ -251,7 +249,7 @@ class ArduCopter(Autopilot):
             self._on_gcs_change()
 
     def _start_in_air(self) -> None:
-        """Fly on in ALT_HOLD, or in the mode that setpoints fly. An idle receiver commands a
+        """Fly on in ALT_HOLD, or in a mode flown by setpoints. An idle receiver commands a
         descent."""
         self._armed = True
         self._set_landed(landed=False)
@@ -290,8 +288,7 @@ class ArduCopter(Autopilot):
         return self.control.wants_takeoff(self.mode, sticks)
 
     def _is_idle(self, sticks: Sticks) -> bool:
-        """True after DISARM_DELAY on the ground with the throttle at the bottom; centred is not
-        idle."""
+        """True after DISARM_DELAY on the ground with the throttle at the bottom, not centred."""
         if not (self.rc.found and sticks.throttle == 0.0):
             self._idle_since_ns = self.now_ns
         delay_s = self.params["DISARM_DELAY"]

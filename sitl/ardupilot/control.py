@@ -20,8 +20,7 @@ from sitl.rotation import (
 from sitl.vehicle.dynamics import GRAVITY_MPS2, BodyState, clamp
 
 RATE_GAIN_PER_S: Vec3 = (18.0, 18.0, 6.0)
-"""Rate loop at the default gains. With a motor lag of 28 ms, 18/s gives a damping ratio of about
-0.7."""
+"""At the default gains. With 28 ms of motor lag, 18/s gives a damping ratio of about 0.7."""
 MIN_INPUT_TIME_S = 0.01
 MAX_TARGET_LEAD_RAD = math.radians(30.0)
 """In rate mode, the target's largest lead over the vehicle before it is reset to the vehicle."""
@@ -58,8 +57,7 @@ class AttitudeController:
     def lean(
         self, body: BodyState, roll: float, pitch: float, yaw_rate_radps: float, dt_s: float
     ) -> Vec3:
-        """Return the body angular acceleration [rad/s^2] towards a roll and pitch with a yaw
-        rate."""
+        """Return body angular acceleration [rad/s^2] towards a roll and pitch, with a yaw rate."""
         self._roll_rate = self._shape("R", roll - self._roll, self._roll_rate, dt_s)
         self._pitch_rate = self._shape("P", pitch - self._pitch, self._pitch_rate, dt_s)
         self._roll += self._roll_rate * dt_s
@@ -76,8 +74,7 @@ class AttitudeController:
         return self._track(body, self._target, feedforward)
 
     def rates(self, body: BodyState, rate_radps: Vec3, dt_s: float) -> Vec3:
-        """Return the body angular acceleration [rad/s^2] towards a body rate; zero holds the
-        attitude."""
+        """Return body angular acceleration [rad/s^2] towards a body rate; zero holds attitude."""
         self._target = integrate(self._target, rate_radps, dt_s)
         error = rotation_vector(multiply(conjugate(body.ned_from_body_wxyz), self._target))
         if math.hypot(*error) > MAX_TARGET_LEAD_RAD:
@@ -87,8 +84,7 @@ class AttitudeController:
     def approach(
         self, body: BodyState, ned_from_body_wxyz: Quat, rate_body_radps: Vec3, dt_s: float
     ) -> Vec3:
-        """Return the body angular acceleration [rad/s^2] towards an attitude that turns at a body
-        rate."""
+        """Return body angular acceleration [rad/s^2] towards an attitude turning at a body rate."""
         error = rotation_vector(multiply(conjugate(self._target), ned_from_body_wxyz))
         rate = [
             self._shape(axis, error[k], self._target_rate_radps[k], dt_s, rate_body_radps[k])
@@ -97,7 +93,7 @@ class AttitudeController:
         return self._advance(body, (rate[0], rate[1], rate[2]), dt_s)
 
     def turn(self, body: BodyState, rate_body_radps: Vec3, dt_s: float) -> Vec3:
-        """Return the body angular acceleration [rad/s^2] towards a body rate, without target jumps.
+        """Return body angular acceleration [rad/s^2] towards a body rate, without target jumps.
 
         As in the firmware, the target does not wait for the vehicle. The vehicle later makes up for
         the angle that it lost at the start, so a weak axis overshoots its rate.
@@ -147,8 +143,7 @@ class AttitudeController:
         return self.slew(axis, wanted, rate_radps, dt_s)
 
     def slew(self, axis: str, wanted_radps: float, rate_radps: float, dt_s: float) -> float:
-        """Return the next rate of axis R, P or Y towards the wanted one, within the axis'
-        acceleration limit."""
+        """Return the next rate of axis R, P or Y, within the axis' acceleration limit."""
         max_accel_radps2 = math.radians(self._limit(f"ATC_ACCEL_{axis}_MAX") / 100.0)
         return rate_radps + clamp(wanted_radps - rate_radps, max_accel_radps2 * dt_s)
 
@@ -205,8 +200,7 @@ def boosted(thrust: float, body: BodyState, params: ArduPilotParams) -> float:
 
 
 def lean_for(accel_ne_mps2: tuple[float, float], body: BodyState) -> tuple[float, float]:
-    """Return the roll and pitch [rad] that give a hovering vehicle this acceleration north and
-    east."""
+    """Return roll and pitch [rad] that give a hovering vehicle this acceleration north and east."""
     north, east = accel_ne_mps2
     forward, right = to_heading(north, east, yaw_of(body.ned_from_body_wxyz))
     return math.atan2(right, GRAVITY_MPS2), -math.atan2(forward, GRAVITY_MPS2)

@@ -1,6 +1,6 @@
 """One link of an ArduPilot vehicle: its messages and their intervals.
 
-Intervals are rounded and capped, and limited to ten distinct values, as in the firmware. Units and
+As in the firmware, intervals are rounded and capped, with at most ten distinct values. Units and
 oddities are those measured on ArduCopter 4.7: scaled integers in RAW_IMU, a HIGHRES_IMU whose gyro
 keeps its bias and whose magnetometer is a million times too large, positions withheld until the
 estimator has one.
@@ -146,8 +146,7 @@ def _attitude_target(ap: ArduCopter) -> Message:
 
 
 def _position_target(ap: ArduCopter) -> Message | None:
-    """Build the setpoint that GUIDED follows, in NED axes; None for attitudes and in other
-    modes."""
+    """Build the setpoint that GUIDED follows, in NED axes; None for attitudes or other modes."""
     guided = ap.guided if ap.mode is Mode.GUIDED else None
     if guided is None or guided.submode is Submode.ATTITUDE:
         return None
@@ -202,8 +201,7 @@ BUILDERS: dict[int, Callable[[ArduCopter], Message | None]] = {
     mav.MAVLINK_MSG_ID_POSITION_TARGET_LOCAL_NED: _position_target,
     mav.MAVLINK_MSG_ID_EXTENDED_SYS_STATE: _extended_sys_state,
 }
-"""Builders of all messages that can be streamed or requested; they return None while there is
-nothing to report."""
+"""Builders of all messages to stream or request; they return None with nothing to report."""
 
 
 HEARTBEAT_INTERVAL_MS = 1000
@@ -286,8 +284,7 @@ class ArduPilotStreams:
         return stream.interval_ms * 1000 if stream else -1
 
     def due(self, now_ns: int, slowdown: int) -> list[int]:
-        """Return the ids of the messages to send now. Missed slots are dropped: a late message is
-        sent once."""
+        """Return the ids of the messages to send now; after missed slots, each is sent once."""
         ready = [
             key for key, stream in self._streams.items() if now_ns >= stream.due_ns + stream.late_ns
         ]
@@ -304,8 +301,7 @@ class ArduPilotStreams:
     def _start(self, message_id: int, interval_ms: int, now_ns: int) -> None:
         self._streams.pop(message_id, None)
         if interval_ms > 0:
-            # The firmware keeps ten distinct intervals per link; an eleventh is replaced by the
-            # nearest.
+            # The firmware keeps ten distinct intervals per link; the nearest replaces an eleventh.
             taken = {stream.interval_ms for stream in self._streams.values()}
             if interval_ms not in taken and len(taken) >= MAX_DISTINCT_INTERVALS:
                 interval_ms = min(taken, key=lambda other: abs(other - interval_ms))
@@ -320,8 +316,7 @@ def shortest_ms(loop_hz: float) -> int:
 
 
 class ArduPilotEndpoint(Endpoint[ArduCopter]):
-    """One link and its intervals. Senders on one link, such as two ground stations, share the
-    intervals."""
+    """Link with intervals that all its senders, such as two ground stations, share."""
 
     def __init__(self, ap: ArduCopter) -> None:
         super().__init__(ap, BUILDERS)

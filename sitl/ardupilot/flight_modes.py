@@ -61,8 +61,7 @@ class Mode(IntEnum):
 
     @property
     def holds_position(self) -> bool:
-        """True if the mode stops and holds its position: LOITER and POSHOLD at centred sticks,
-        BRAKE always."""
+        """True for modes that stop and hold: LOITER and POSHOLD at centred sticks, BRAKE always."""
         return self in (Mode.LOITER, Mode.POSHOLD, Mode.BRAKE)
 
     @property
@@ -174,8 +173,7 @@ class CopterControl:
         return -self._params["LAND_SPEED"] / 100.0
 
     def _lean_home(self, mode: Mode, body: BodyState) -> tuple[float, float]:
-        """Return the lean that stops the drift, or that flies home in RTL once the return height is
-        reached."""
+        """Return the lean that stops the drift, or in RTL flies home from the return height on."""
         north, east, down = body.position_ned_m
         wanted_n = wanted_e = 0.0
         if mode is Mode.RTL and not self._home_reached:
@@ -222,8 +220,7 @@ def _stay_within(angle: float, limit: float, rate: float) -> float:
 def _lean_towards(
     wanted_n_mps: float, wanted_e_mps: float, body: BodyState, limit_mps2: float
 ) -> tuple[float, float]:
-    """Return the roll and pitch [rad] that bring the velocity to the wanted one, within the
-    limit."""
+    """Return roll and pitch [rad] that bring the velocity to the wanted one, within the limit."""
     accel_n_mps2 = VELOCITY_GAIN_PER_S * (wanted_n_mps - body.velocity_ned_mps[0])
     accel_e_mps2 = VELOCITY_GAIN_PER_S * (wanted_e_mps - body.velocity_ned_mps[1])
     scale = limit_mps2 / max(limit_mps2, math.hypot(accel_n_mps2, accel_e_mps2))

@@ -16,8 +16,7 @@ from sitl.rotation import Vec3, from_euler, integrate, to_euler
 from sitl.vehicle.dynamics import BodyState, HeightController, clamp, thrust_for
 
 OPTION_THRUST = 8
-"""Bit of GUID_OPTIONS. Set: SET_ATTITUDE_TARGET.thrust is a collective; clear: it is a climb
-rate."""
+"""Bit of GUID_OPTIONS: SET_ATTITUDE_TARGET.thrust is a collective instead of a climb rate."""
 ARMING_DELAY_NS = 2 * NS_PER_S
 SPOOL_UP_NS = 500 * NS_PER_MS
 CLIMB_WINDUP_NS = 500 * NS_PER_MS
@@ -101,8 +100,7 @@ class GuidedControl:
         self._takeoff_height_m = height_m
 
     def is_taking_off(self, body: BodyState) -> bool:
-        """True while `take_off` has more than a tenth of its height left or the climb is still
-        fast.
+        """True while `take_off` has over a tenth of its height left or the climb is still fast.
 
         Formula: ArduCopter's ``auto_takeoff``; fast is at least half of WPNAV_SPEED_UP.
         """
@@ -132,8 +130,7 @@ class GuidedControl:
     def fly(
         self, body: BodyState, now_ns: int, *, has_position: bool, dt_s: float
     ) -> tuple[Vec3, float]:
-        """Return the body angular acceleration [rad/s^2] and the thrust, 0..1, of a level
-        vehicle."""
+        """Return body angular acceleration [rad/s^2] and thrust (0..1, of a level vehicle)."""
         if self.submode is Submode.ATTITUDE:
             return self._fly_attitude(body, now_ns, dt_s)
         return self._fly_velocity(body, now_ns, has_position=has_position, dt_s=dt_s)
@@ -210,8 +207,7 @@ class GuidedControl:
 
 
 class _Track:
-    """Horizontal target whose velocity changes without jumps, and the vehicle's controller towards
-    it."""
+    """Horizontal target whose velocity changes without jumps, and the controller towards it."""
 
     def __init__(self) -> None:
         self._position_m = [0.0, 0.0]

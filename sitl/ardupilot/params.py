@@ -134,8 +134,7 @@ class ArduPilotParams(Params):
         return value / HUNDREDTHS if name in _SI_NAMES else value
 
     def set_on_wire(self, name: str, packed: float) -> bool:
-        """Store a value under its wire name, in its wire unit. Return False if refused, as `set`
-        does."""
+        """Store a value by its wire name, in its wire unit. Return False if refused, like `set`."""
         scale = HUNDREDTHS if name in _SI_NAMES else 1.0
         return name in self._by_wire_name and self.set(self._by_wire_name[name], scale * packed)
 

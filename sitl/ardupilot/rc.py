@@ -52,7 +52,7 @@ class RcEngine:
         """Move sticks and switches of the transmitter [us] from the next frame on.
 
         Up to 16 channels at 50 Hz; a 0 leaves its channel unchanged. All zeros switch the
-        transmitter off: frames stop and the last values stay. A vehicle without a receiver gets one
+        transmitter off: frames stop, the last values stay. A vehicle without a receiver gets one
         with its first values.
         """
         self._has_frames = any(values_us)
@@ -159,8 +159,7 @@ class ModeSwitch:
         self._since_ns = 0
 
     def update(self, pwm_us: int, now_ns: int) -> int | None:
-        """Return the position, 1..6, when it has just changed; None otherwise and for the first
-        one."""
+        """Return the position, 1..6, when it has just changed; None otherwise and for the first."""
         if not 900 < pwm_us < 2200:
             return None
         position = 1 + bisect_left(self._HIGHEST_US, pwm_us)
@@ -173,8 +172,7 @@ class ModeSwitch:
 
 
 class _OverrideSwitch:
-    """Switch with RCn_OPTION 46: high allows overrides, low forbids them, the middle changes
-    nothing.
+    """RCn_OPTION 46: high allows overrides, low forbids them, the middle changes nothing.
 
     Read at 10 Hz and debounced for 0.2 s, so a flip acts after 0.2 to 0.3 s (measured: 0.38 s).
     """

@@ -262,8 +262,7 @@ def _attitude_setpoint(message: Message) -> AttitudeSetpoint | None:
 
 
 def _velocity_setpoint(message: Message, heading_rad: float) -> VelocitySetpoint | None:
-    """Return the velocity in NED axes; accelerations and a heading in the message have no
-    effect."""
+    """Return the velocity in NED axes; ignore accelerations and a heading in the message."""
     mask = message.type_mask
     if mask & _VELOCITY_IGNORED or mask & _POSITION_IGNORED != _POSITION_IGNORED:
         return None

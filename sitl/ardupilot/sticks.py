@@ -80,8 +80,7 @@ def _throttle(rc: RcEngine, params: ArduPilotParams) -> tuple[float, float]:
 
 
 def lean_angles(sticks: Sticks, params: ArduPilotParams) -> tuple[float, float]:
-    """Return roll and pitch [rad] (+ right, + nose up), with their joint length limited to
-    ANGLE_MAX."""
+    """Return roll and pitch [rad] (+ right, + nose up), their joint length limited to ANGLE_MAX."""
     limit = math.radians(params["ANGLE_MAX"] / 100.0)
     scale = limit / max(1.0, math.hypot(sticks.roll, sticks.pitch))
     return sticks.roll * scale, sticks.pitch * scale
@@ -123,8 +122,7 @@ def climb_rate_mps(sticks: Sticks, params: ArduPilotParams) -> float:
 
 
 def manual_thrust(sticks: Sticks, params: ArduPilotParams) -> float:
-    """Return the collective in [0, 1] of STABILIZE and ACRO: expo through hover thrust at
-    mid-stick."""
+    """Return the collective in [0, 1] of STABILIZE and ACRO, with hover thrust at mid-stick."""
     mid = min(max(sticks.throttle_mid, 1.0), THROTTLE_FULL - 1.0)
     if sticks.throttle < mid:
         position = 0.5 * sticks.throttle / mid
@@ -163,8 +161,7 @@ class Axes(IntEnum):
 
 
 class SimpleMode:
-    """Simple and Super Simple mode, which interpret pitch and roll in other axes than the
-    vehicle's.
+    """Simple and Super Simple mode: pitch and roll in other axes than the vehicle's.
 
     As in Copter up to 4.6 and from 4.8 on; 4.7.0 accepts the switch but rotates nothing. Only a
     switch or a command changes the axes; a changed parameter has no effect until then.

@@ -184,8 +184,7 @@ class FpvRenderer:
         return np.rint(points_px * (1 << SUBPIXEL_BITS)).astype(np.int32)
 
     def _in_view(self, corners_m: FloatArray) -> NDArray[np.bool_]:
-        """Return the mask [N] of faces [N, 4, 3] not completely outside one side of the view
-        frustum."""
+        """Return the mask [N] of faces [N, 4, 3] not fully outside one side of the view frustum."""
         x, y, z = np.moveaxis(corners_m, -1, 0)
         half_width, half_height = (self._center_px + 1) / self._focal_px
         is_left, is_right = x < -half_width * z, x > half_width * z
@@ -232,8 +231,7 @@ class Shutter:
         return np.asarray(np.mean(moved, axis=0).round(), dtype=np.uint8)
 
     def flow_pxps(self, rate_camera_radps: FloatArray) -> tuple[Pixels, Pixels]:
-        """Return the flow [pixels/s], right and down, for rows exposed at other times than the
-        stamp.
+        """Return the flow [pixels/s], right and down, for rows exposed before or after the stamp.
 
         A pixel exposed t after the stamp shows the stamp's image at pixel + t * flow: the ray r =
         (x, y, 1) of a camera that has turned for t was r + t * cross(rate, r) at the stamp.
@@ -259,8 +257,7 @@ class Shutter:
 
 
 class _ImageSensor:
-    """Exposure, colour cast, blur and noise of a sensor; the noise of the n-th frame is
-    reproducible."""
+    """Exposure, colour cast, blur and noise of a sensor; the n-th frame's noise is reproducible."""
 
     def __init__(self, conditions: Conditions, width: int, height: int) -> None:
         self._random = np.random.Generator(np.random.PCG64((conditions.seed, 3)))
@@ -315,6 +312,5 @@ def clip_near(corners_m: FloatArray) -> FloatArray:
 
 
 def rotation_matrix(wxyz: Quat) -> FloatArray:
-    """Return the rotation matrix [3, 3] of a quaternion; its columns are the rotated unit
-    vectors."""
+    """Return the rotation matrix [3, 3] of a quaternion; columns are the rotated unit vectors."""
     return np.array([rotate(wxyz, axis) for axis in ((1, 0, 0), (0, 1, 0), (0, 0, 1))]).T

@@ -32,8 +32,7 @@ STRAY_ASIDE_M = (5.0, 8.0)  # from that gate's middle, to either side; it has no
 STRAY_TURN_RAD = math.radians(120.0)
 """Largest turn of a stray gate's passage relative to that gate's, to either side."""
 STRAY_CLEARANCE_M = 4.5
-"""Smallest distance of a stray gate from the middle of every gate of the course; with less it is
-left out."""
+"""Smallest distance of a stray gate from all gates of the course, or it is left out."""
 BOTH_SIDES: Vec3 = (0.0, 0.0, 0.0)
 
 RIDGE_SEGMENTS = 120
@@ -219,8 +218,7 @@ def _ring(outer_m: float, inner_m: float, forward_m: float, normal: Vec3, rgb: R
 
 
 def _quarter_turns(top: _Face) -> list[_Face]:
-    """Return the face and its copies turned about the passage by one, two and three quarter
-    turns."""
+    """Return the face and its copies, turned about the passage by one to three quarter turns."""
     faces = [top]
     for _ in range(3):
         corners_m, normal, rgb = faces[-1]
@@ -234,7 +232,7 @@ def _quarter_turn(vector: Vec3) -> Vec3:
 
 
 def ridge_directions(seed: int) -> FloatArray:
-    """Return hills on the horizon, which show rotation: quadrilaterals of NED directions, [N, 4,
+    """Return hills on the horizon, to show rotation: quadrilaterals of NED directions, [N, 4,
     3]."""
     random = np.random.Generator(np.random.PCG64(seed))
     azimuth_rad = np.linspace(-math.pi, math.pi, RIDGE_SEGMENTS + 1)
@@ -268,8 +266,7 @@ def backdrop_colours(conditions: Conditions = NOMINAL) -> Image:
 def ground_tile(conditions: Conditions = NOMINAL) -> Image:
     """Return a square of ground that repeats seamlessly, [GROUND_TILE_PX, GROUND_TILE_PX, 3] RGB.
 
-    Mottled grass and soil under a 2 m grid: texture for optic flow, lines for scale. Axis 0 is
-    east, axis 1 is north.
+    Mottled grass and soil (for optic flow) under a 2 m grid (for scale). Axis 0 is east, 1 north.
     """
     random = np.random.Generator(np.random.PCG64(conditions.ground_seed))
     patches = _periodic_noise(random, smooth_m=1.2)[..., None]

@@ -92,8 +92,7 @@ class FramePublisher:
     def _memory_barrier(self) -> None:
         """Order earlier stores before later ones, for readers on other cores.
 
-        Python has no explicit barrier; taking and freeing a lock is one on every platform (POSIX
-        4.12).
+        Python has no barrier; taking and freeing a lock is one on every platform (POSIX 4.12).
         """
         with self._lock:
             pass

@@ -64,8 +64,7 @@ class Agility:
     max_speed_mps: float
     max_accel_mps2: float
     corner_accel_mps2: float
-    """Acceleration of the planned path above which it slows down; the rest is for gusts and
-    mistakes."""
+    """Limit of the planned path before it slows down; the rest is for gusts and mistakes."""
     along_accel_mps2: tuple[float, float]  # (braking, negative; speeding up)
     planned_braking_mps2: float
     planned_accel_mps2: float
@@ -109,8 +108,7 @@ class CourseGuide:
         return self._referee.next_gate
 
     def demand(self, position_ned_m: Vec3, t_s: float, state: "Predicted") -> Demand:
-        """Return the demand for a vehicle that is here now, and in ``state`` when its action takes
-        effect.
+        """Return the demand for a vehicle here now, and in ``state`` when its action takes effect.
 
         The positions of successive calls are the flown trajectory.
         """
@@ -131,8 +129,7 @@ class CourseGuide:
         return _blend(climb_away, demand, flying)
 
     def _gates_ahead(self, position_ned_m: Vec3, state: "Predicted") -> tuple[Gate, ...]:
-        """Return the gates still to fly, without one that will be passed before the action takes
-        effect."""
+        """Return the gates ahead, without one that is passed before the action takes effect."""
         next_gate = self.next_gate
         if next_gate is None:
             return self._beyond
@@ -319,8 +316,7 @@ def _back_off_share(state: Predicted, gate: Gate, agility: Agility) -> float:
 
 
 def _back_off(state: Predicted, gate: Gate, agility: Agility) -> Demand:
-    """Return the demand to fly backwards beside the gate, nose along its passage, until it is ahead
-    again."""
+    """Return the demand to fly backwards beside the gate, nose along its passage, to its front."""
     forward_m, right_m, down_m = gate.offset_m(state.position_ned_m)
     is_beside = forward_m > -1.0 and abs(right_m) < CLEAR_OF_FRAME_M
     side_m = math.copysign(CLEAR_OF_FRAME_M, right_m) if is_beside else right_m

@@ -179,7 +179,7 @@ class Expert:
         return self._guide.next_gate
 
     def sticks(self, body: BodyState, t_s: float) -> StickPositions:
-        """Return the sticks for this state. The positions of successive calls are the flown
+        """Return the sticks for this state. Positions of successive calls are the flown
         trajectory."""
         north_mps2, east_mps2, _ = drag_ned_mps2 = _drag_ned_mps2(body)
         state = _predict(body, _level_accel_mps2(body, drag_ned_mps2), self._lag_s)

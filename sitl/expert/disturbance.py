@@ -1,5 +1,4 @@
-"""Perturbation of demonstrations, so that they contain recoveries: disturbed actions and starts in
-the air.
+"""Perturbed demonstrations, which contain recoveries: disturbed actions and airborne starts.
 
 The disturbed actions are flown while the expert's remain the label, so that the data show the way
 back from a mistake (Laskey et al., "DART: Noise Injection for Robust Imitation Learning", 2017).
@@ -93,8 +92,7 @@ class Disturbance:
         return self._strength > 0.0 and self._stretch.kind != "quiet"
 
     def flown(self, wanted: Commanded, t_s: float) -> Commanded:
-        """Return the action to fly at ``t_s`` in place of the expert's ``wanted``, within the
-        bounds."""
+        """Return the action to fly at ``t_s`` for the expert's ``wanted``, within the bounds."""
         if self._start_s is None:
             self._start_s = t_s
         t_s -= self._start_s

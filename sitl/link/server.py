@@ -36,8 +36,7 @@ def flags(prefix: str, names: str) -> int:
 
 
 class Endpoint(ABC, Generic[Ap]):
-    """Framing, messages by number and the parameter list of one link; each firmware adds its
-    streams.
+    """Framing, messages by number and parameter list of one link; each firmware adds its streams.
 
     Framing and sequence numbers survive a restart of the vehicle.
     """
@@ -168,8 +167,7 @@ class MavlinkServer(ABC, Generic[Ap, Link]):
         self._commands: dict[int, Callable[[Params7, Link], int | None]] = {
             mav.MAV_CMD_GET_MESSAGE_INTERVAL: self._get_interval
         }
-        """Handlers by command number; they return the MAV_RESULT for the ack, or None for no
-        ack."""
+        """Handlers by command number; they return the MAV_RESULT of the ack, or None for no ack."""
 
     def restart(self, ap: Ap) -> None:
         self._ap = ap

@@ -160,8 +160,7 @@ def sys_status(ap: Autopilot, *, present: int, enabled: int, healthy: int) -> Me
 
 
 def battery_status(ap: Autopilot, *, energy_hj: int) -> Message:
-    """Build BATTERY_STATUS: one pack, whose voltage is reported as one cell; -1 hJ used: not
-    known."""
+    """Build BATTERY_STATUS: one pack, reported as one cell; ``energy_hj`` -1: not known."""
     charge = mav.MAV_BATTERY_CHARGE_STATE_OK
     if ap.battery.is_low:
         charge = mav.MAV_BATTERY_CHARGE_STATE_LOW

@@ -202,8 +202,7 @@ Transport: TypeAlias = UdpLink | TcpLink
 
 
 def split_frames(data: bytes, limit: int) -> Iterator[bytes]:
-    """Cut MAVLink data into pieces of whole frames, at most ``limit`` bytes each (or one longer
-    frame)."""
+    """Cut MAVLink data into pieces of whole frames, of at most ``limit`` bytes or one frame."""
     start = end = 0
     while end < len(data):
         length = data[end + 1]  # payload length

@@ -69,8 +69,7 @@ class Transmitter:
 
 
 def _us(position: float) -> int:
-    """Convert a position to microseconds; less is left, nose down and descent, as in ArduCopter and
-    PX4."""
+    """Convert a position to microseconds; less is left, nose down and descent."""
     return round(1500 + 500 * max(-1.0, min(1.0, position)))
 
 

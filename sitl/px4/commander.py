@@ -249,8 +249,7 @@ class Commander:
             self._say_failsafe(ACTION_RTL)
 
     def _yield_to_pilot(self) -> None:
-        """Let fast sticks take over an autonomous flight, except in the Hold before a failsafe
-        action."""
+        """Let fast sticks take over an autonomous flight, except in a failsafe's Hold."""
         is_held = self.lost_sticks.phase is Phase.HOLDING
         bits = int(self._params.get("COM_RC_OVERRIDE", 0b11))  # 1.18 has no parameter and does both
         is_autonomous = bool(bits & 1) and self.mode.is_auto

@@ -62,8 +62,7 @@ class RateController:
         self.rates_radps = (0.0, 0.0, 0.0)
 
     def attitude(self, body: BodyState, target: Quat, yaw_rate_radps: float, dt_s: float) -> Vec3:
-        """Return the angular acceleration towards an attitude that turns about the vertical at a
-        rate."""
+        """Return the angular acceleration towards an attitude that turns about the vertical."""
         self._targets.append((target, yaw_rate_radps))
         target, yaw_rate_radps = self._targets[0]
         turned_rad = yaw_rate_radps * dt_s * (len(self._targets) - 1)  # turn since the demand
@@ -142,8 +141,7 @@ class VelocityController:
 
 
 class Horizontal:
-    """Horizontal motion of the modes that need a position: paths, tracked by the velocity
-    controller.
+    """Horizontal motion of the modes that need a position: paths and their velocity controller.
 
     In POSCTL the sticks accelerate the target velocity against drag. AUTO modes follow a path of
     limited jerk to a position. OFFBOARD tracks the demanded velocity directly.
@@ -173,8 +171,7 @@ class Horizontal:
         return self._follow(self.speed_mps, STILL, body, dt_s)
 
     def steer(self, wanted_mps: NorthEast, body: BodyState, dt_s: float) -> NorthEast:
-        """Approach the velocity of POSCTL's sticks; with centred sticks, stop and hold the
-        position."""
+        """Approach the velocity of POSCTL's sticks; with centred sticks, stop and hold."""
         params = self._params
         full = 2.0 * params["MPC_ACC_HOR"]  # at full stick, before drag
         per_s = full / params["MPC_VEL_MANUAL"]
@@ -220,8 +217,7 @@ class Horizontal:
         return self._follow(velocity, self._path_accel, body, dt_s)
 
     def _approach(self, wanted: NorthEast, limit: float, jerk: float, dt_s: float) -> None:
-        """Move the path's acceleration towards the wanted one, and integrate the path's
-        velocity."""
+        """Move the path's acceleration towards the wanted one, and integrate its velocity."""
         wanted = shorten(wanted, limit)
         step = jerk * dt_s
         now_n, now_e = self._path_accel

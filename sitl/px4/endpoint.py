@@ -2,8 +2,7 @@
 
 Each control step, a stream is sent if its interval has passed and its topic is new. A stream that
 is late by less than half an interval keeps its grid; a later one starts a new grid. So 200 Hz of a
-250 Hz topic become 125 Hz, as measured. If the bandwidth is too small, all rates are scaled down
-silently.
+250 Hz topic become 125 Hz, as measured. A small bandwidth silently scales all rates down.
 """
 
 from collections.abc import Callable, Hashable, Mapping
@@ -42,8 +41,7 @@ GCS_HZ: Mapping[int, float] = MappingProxyType(
     | by_message(RC_CHANNELS=20.0, VFR_HUD=4.0, POSITION_TARGET_LOCAL_NED=1.5, GPS_RAW_INT=1.0)
     | by_message(EXTENDED_SYS_STATE=1.0, SYS_STATUS=1.0)
 )
-"""Message rates on a link to a ground station (mode Normal plus the additions of PX4's SITL
-script)."""
+"""Message rates on a link to a ground station (mode Normal with the SITL script's additions)."""
 
 _UNSCALED = (mav.MAVLINK_MSG_ID_HEARTBEAT,)
 
@@ -89,8 +87,7 @@ class Px4Streams:
         return -1 if stream is None else stream.interval_us
 
     def due(self, now_ns: int, version_of: Callable[[int], Hashable]) -> list[int]:
-        """Return the ids of the messages to send now; ``version_of`` changes with each new
-        topic."""
+        """Return the ids of the messages to send now; ``version_of`` changes with each topic."""
         now_us, scale = now_ns // NS_PER_US, self.scale
         ready = []
         for message_id, stream in self._streams.items():
@@ -154,8 +151,7 @@ class Px4Endpoint(Endpoint[Px4]):
         return self._streams.interval_us(message_id)
 
     def send_text(self, severity: int, text: str) -> None:
-        """Send STATUSTEXT once a ground station is known; split a long text into numbered
-        chunks."""
+        """Send STATUSTEXT once a ground station is known; number the chunks of a long text."""
         if not self.has_gcs:
             return
         data = text.encode("ascii", "replace")

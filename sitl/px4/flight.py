@@ -208,8 +208,7 @@ class Px4Control:
         return max(self._params["MPC_THR_MIN"], min(self._params["MPC_THR_MAX"], thrust))
 
     def _climb_mps(self, mode: Mode, sticks: Sticks, body: BodyState) -> float:
-        """Return the climb rate demanded by mode and sticks, slower near the ground in both
-        directions."""
+        """Return the climb rate demanded by mode and sticks; near the ground it is slower."""
         params, height = self._params, -body.position_ned_m[2]
         low, high = params["MPC_LAND_ALT2"], params["MPC_LAND_ALT1"]
         share = max(0.0, min(1.0, (height - low) / max(0.1, high - low)))

@@ -83,8 +83,7 @@ def _current_mode(ap: Px4) -> Message:
 
 
 def _heartbeat(ap: Px4) -> Message:
-    """Build HEARTBEAT. It is sent once a second, so changes in between, arming included, may never
-    show."""
+    """Build HEARTBEAT; once a second, so a short change, even an arming, may never show."""
     flags = ap.mode.base_flags
     if ap.mode is Mode.OFFBOARD and isinstance(ap.setpoint, PositionSetpoint):
         flags |= mav.MAV_MODE_FLAG_STABILIZE_ENABLED
@@ -104,8 +103,7 @@ def _heartbeat(ap: Px4) -> Message:
 
 
 def _sys_status(ap: Px4) -> Message:
-    """Build SYS_STATUS; PREARM_CHECK, never present, is healthy if the vehicle's health allows
-    arming."""
+    """Build SYS_STATUS; PREARM_CHECK, never present, is healthy if health allows arming."""
     sticks = mav.MAV_SYS_STATUS_SENSOR_RC_RECEIVER if ap.stick_input.valid else 0
     healthy = _SENSORS_HEALTHY | sticks
     if ap.armed or ap.commander.can_arm():
@@ -127,8 +125,7 @@ def _highres_imu(ap: Px4) -> Message:
 
 
 def _local_position_ned(ap: Px4) -> Message:
-    """Build LOCAL_POSITION_NED; without a position it contains zeros that nothing marks as
-    invalid."""
+    """Build LOCAL_POSITION_NED; without a position, zeros that nothing marks as invalid."""
     (north, east, down), (vn, ve, vd) = ap.sensed.position_ned_m, ap.sensed.velocity_ned_mps
     if not ap.position_ready:
         north = east = vn = ve = 0.0
@@ -163,8 +160,7 @@ def _rc_channels(ap: Px4) -> Message | None:
 
 
 def _manual_control(ap: Px4) -> Message | None:
-    """Build MANUAL_CONTROL: the chosen sticks, scaled in single precision and truncated to
-    integers."""
+    """Build MANUAL_CONTROL: the chosen sticks, scaled in single precision and truncated."""
     if not ap.stick_input.valid:
         return None
     forward, right, throttle, yaw = (np.float32(value) for value in ap.stick_input.sticks)
@@ -196,8 +192,7 @@ def _position_target(ap: Px4) -> Message:
 
 
 def _estimator_status(ap: Px4) -> Message:
-    """Build ESTIMATOR_STATUS, the only message that reports the validity of the horizontal
-    position."""
+    """Build ESTIMATOR_STATUS, the only message with the validity of the horizontal position."""
     flags = _ESTIMATOR_ON_GROUND if ap.landed else _ESTIMATOR_WITH_POSITION
     if not ap.position_ready:
         flags = _ESTIMATOR_WITHOUT_POSITION
@@ -243,8 +238,7 @@ BUILDERS: dict[int, Callable[[Px4], Message | None]] = {
     mav.MAVLINK_MSG_ID_ODOMETRY: _odometry,
     CURRENT_MODE: _current_mode,
 }
-"""Builders of all messages that can be streamed or requested; they return None while there is
-nothing to report."""
+"""Builders of all messages to stream or request; they return None with nothing to report."""
 BUILDERS_1_14 = {key: build for key, build in BUILDERS.items() if key != CURRENT_MODE}
 """Builders without CURRENT_MODE, which came with 1.15 (upstream commit bb900264e0)."""
 
@@ -257,8 +251,7 @@ _SLOW_TOPICS = (
 
 
 def topic_version(message_id: int, ap: Px4) -> Hashable:
-    """Return a value that changes with every new sample of the message's topic; it bounds a
-    stream's rate."""
+    """Return a value that changes with each new sample of the topic; it bounds a stream's rate."""
     if message_id in _SLOW_TOPICS:
         return _at_rate(ap, 8)
     if message_id == mav.MAVLINK_MSG_ID_ATTITUDE_TARGET:

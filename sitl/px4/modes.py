@@ -48,8 +48,7 @@ class Mode(Enum):
         if (self.piloted and main != 5) or self.is_auto:
             flags |= mav.MAV_MODE_FLAG_STABILIZE_ENABLED
         self.base_flags = int(flags)
-        """MAV_MODE_FLAG bits of the heartbeat, without the armed bit and OFFBOARD's bit for its
-        setpoint."""
+        """MAV_MODE_FLAG bits of the heartbeat, without the armed and OFFBOARD's setpoint bit."""
 
     @property
     def label(self) -> str:
@@ -146,7 +145,6 @@ class LostSticks:
 
 
 def mode_without_stream(params: Px4Params, *, has_sticks: bool) -> Mode:
-    """Return the mode that replaces OFFBOARD without setpoints: RTL if the selected one lacks
-    sticks."""
+    """Return the mode that replaces OFFBOARD without setpoints; RTL if that one lacks sticks."""
     mode = _STREAM_LOST_MODES.get(params.integer("COM_OBL_RC_ACT"), Mode.AUTO_RTL)
     return Mode.AUTO_RTL if mode.piloted and not has_sticks else mode

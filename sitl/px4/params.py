@@ -125,8 +125,7 @@ class Px4Params(Params):
         receiver: bool = False,
         release: Px4Release = "1.18",
     ) -> None:
-        """Set the release's defaults. ``receiver``: map its first four channels in the usual
-        order."""
+        """Set the release's defaults. ``receiver``: map four channels in the usual order."""
         values: dict[str, float] = {**_INTEGERS, **_FLOATS, **_varied(conditions)}
         for name in _ABSENT[release]:
             del values[name]

@@ -121,8 +121,7 @@ class StickInput:
     def gesture(self, now_ns: int) -> int:
         """Return 1 for the arming gesture, -1 for the disarming one, else 0. Each is reported once.
 
-        Arming: throttle down with full right yaw and no lean for a second; disarming: full left
-        yaw.
+        Arming: throttle down with full right yaw and no lean for 1 s; disarming: full left yaw.
         """
         if not self._gesture or self._gesture_done or now_ns - self._gesture_since_ns < GESTURE_NS:
             return 0
@@ -199,8 +198,7 @@ def yaw_rate_radps(sticks: Sticks, params: Px4Params) -> float:
 
 
 def lean_accel_mps2(sticks: Sticks, params: Px4Params) -> tuple[float, float]:
-    """Return the forward and right acceleration of ALTCTL's lean; both sticks share
-    MPC_MAN_TILT_MAX."""
+    """Return ALTCTL's acceleration forward and right; both sticks share MPC_MAN_TILT_MAX."""
     scale = GRAVITY_MPS2 * math.tan(math.radians(params["MPC_MAN_TILT_MAX"]))
     scale /= max(1.0, math.hypot(sticks.forward, sticks.right))
     return sticks.forward * scale, sticks.right * scale
@@ -231,8 +229,7 @@ def speed_mps(sticks: Sticks, params: Px4Params) -> tuple[float, float]:
 
 
 def manual_thrust(sticks: Sticks, params: Px4Params, hover: float) -> float:
-    """Return the collective of STAB and ACRO: two straight lines that meet at hover thrust,
-    mid-stick."""
+    """Return the collective of STAB and ACRO: two lines that meet at hover thrust, mid-stick."""
     if sticks.throttle < 0.0:
         least = params["MPC_MANTHR_MIN"]
         return least + (1.0 + sticks.throttle) * (hover - least)

@@ -123,8 +123,7 @@ def random_conditions(seed: int, strength: float = 1.0) -> Conditions:
 
 
 def held_out_conditions(seed: int) -> Conditions:
-    """Return vehicle, wind and lens of ``random_conditions`` with a look absent from all
-    demonstrations.
+    """Return vehicle, wind and lens of ``random_conditions`` with a look that no demonstration has.
 
     One seed in five each: gates partly hidden by panels; gates in shadow over high-contrast ground;
     night with shining gates; a low sun in the lens; stray gates beside the path.

@@ -58,8 +58,7 @@ class VehicleConfig:
     position_ready_s: float = 5.0
     """Time from boot until the estimator has a position (about 40 s on the real firmware)."""
     onboard_links: frozenset[int] = frozenset()
-    """Indices of the links to companion computers, on which PX4 sends other streams than to a
-    ground station."""
+    """Indices of the links to companion computers, which get other streams from PX4."""
     link_bytes_ps: float = 4_000_000.0
     """Bandwidth that PX4 assumes for each link; too little slows its streams silently."""
     signing: SigningKey | None = None

@@ -256,8 +256,7 @@ def clamp(value: float, limit: float) -> float:
 
 
 class HeightController:
-    """Controller from climb rate demand to vertical acceleration; holds the height at zero
-    demand."""
+    """Controller from climb rate demand to vertical acceleration; zero demand holds the height."""
 
     HEIGHT_GAIN_PER_S = 1.0
     CLIMB_GAIN_PER_S = 5.0
@@ -277,8 +276,7 @@ class HeightController:
     def update(
         self, body: BodyState, climb_mps: float, max_accel_mps2: float, dt_s: float
     ) -> float:
-        """Return the upward acceleration [m/s^2]; ``max_accel_mps2`` limits the change of the
-        demand."""
+        """Return the upward acceleration [m/s^2]; ``max_accel_mps2`` limits the demand's change."""
         height, climb = -body.position_ned_m[2], -body.velocity_ned_mps[2]
         self._climb_mps += clamp(climb_mps - self._climb_mps, max_accel_mps2 * dt_s)
         self._height_m += self._climb_mps * dt_s
@@ -293,7 +291,7 @@ class HeightController:
 
 
 def thrust_for(accel_up_mps2: float, cos_tilt: float, hover: float) -> float:
-    """Return the collective in [0, 1] for a vertical acceleration; the tilt boost ends at 60
+    """Return the collective in [0, 1] for a vertical acceleration; tilt boost ends at 60
     degrees."""
     return max(0.0, min(1.0, hover * (1.0 + accel_up_mps2 / GRAVITY_MPS2) / max(cos_tilt, 0.5)))
 

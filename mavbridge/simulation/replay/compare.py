@@ -66,8 +66,7 @@ class GuardComparison:
 
 @dataclass(frozen=True, kw_only=True)
 class StickTraces:
-    """Smoothed sticks over the flight, recorded and replayed, [N, 4]; NaN while the policy did not
-    fly."""
+    """Smoothed sticks, recorded and replayed, [N, 4]; NaN while the policy did not fly."""
 
     times_s: Array
     """Time since the first tick."""
@@ -150,7 +149,10 @@ def _other_inputs(pair: SolvePair) -> list[str]:
 
 
 def compare_guard(steps: Sequence[GuardStep]) -> GuardComparison:
-    """Compare phases, chunks, the whole trace and the sent sticks of all passes."""
+    """Compare phases, chunks, the whole trace and the sent sticks of all passes.
+
+    The first pass only reads the settings, and decides nothing.
+    """
     differ: dict[str, int] = {}
     first: str | None = None
     for number, step in enumerate(steps):

@@ -112,8 +112,7 @@ def replay_guard(source: ReplaySource) -> list[GuardStep]:
 def _keep_link(
     link: MavlinkLink, clock: SteppedClock, transport: "_RecordedTransport", until_ns: int
 ) -> None:
-    """Let the link receive and request between two ticks as in the flight: at each arrival, or
-    soon.
+    """Let the link receive and request between two ticks: at each arrival, or soon.
 
     It also services the link just before each arrival, since the packet may be the answer to a
     request: a vehicle selected a moment later would still be ignored.
@@ -286,7 +285,7 @@ class _RecordedTransport(Transport):
 
 
 class _RecordedPort:
-    """``Port`` without a flight process; receiving advances the clock to the moment of the
+    """``Port`` without a flight process; receiving advances the clock to the time of the
     decision."""
 
     def __init__(self, clock: SteppedClock) -> None:

@@ -192,8 +192,7 @@ class _News:
         self._next_tick = 0
 
     def bring(self, solve: Solve) -> str | None:
-        """Deliver the inputs that this solve had seen. Return the name of a missing one, or
-        None."""
+        """Deliver the inputs that this solve had seen. Return a missing one's name, or None."""
         self._bring_ticks(solve.started_ns)
         if not self._bring_samples(solve):
             return "the packets of its state"

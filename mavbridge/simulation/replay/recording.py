@@ -52,7 +52,7 @@ class ReplaySource:
     meta: FlightMeta
     contract: Contract
     config: FlyConfig
-    """Flags of the flight, without those with effects outside it, such as ``--set`` and
+    """Flags of the flight, without those that act outside it, such as ``--set`` and
     ``--record``."""
     ticks: tuple[Tick, ...]
     solves: tuple[Solve, ...]
