@@ -1,8 +1,7 @@
 """Time LeRobot's code in LeRobot's environment.
 
     python benchmarks/lerobot_peer.py make DIR KIND   # a checkpoint with random weights
-    python benchmarks/lerobot_peer.py time DIR STEPS  # a line of JSON: ms of a chunk, p50 and
-        p99
+    python benchmarks/lerobot_peer.py time DIR STEPS  # a line of JSON: ms of a chunk, p50 and p99
 
 It imports nothing of this project. KIND is one of ``KINDS``.
 """

@@ -78,7 +78,7 @@ class FlightLog:
         self.crash = None
 
     def on_reboot(self) -> None:
-        """Start a new trajectory at the origin."""
+        """Start a new trajectory at the origin, which the vehicle did not fly to."""
         self._gates.interrupt()
         self._position_ned_m = None
         self._was_touching = True

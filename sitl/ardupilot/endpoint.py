@@ -316,7 +316,7 @@ def shortest_ms(loop_hz: float) -> int:
 
 
 class ArduPilotEndpoint(Endpoint[ArduCopter]):
-    """Link with intervals that all its senders, such as two ground stations, share."""
+    """Link whose intervals all senders share, for example two ground stations."""
 
     def __init__(self, ap: ArduCopter) -> None:
         super().__init__(ap, BUILDERS)

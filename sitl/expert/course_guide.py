@@ -64,7 +64,7 @@ class Agility:
     max_speed_mps: float
     max_accel_mps2: float
     corner_accel_mps2: float
-    """Limit of the planned path before it slows down; the rest is for gusts and mistakes."""
+    """Acceleration at which the planned path slows down; the rest is for gusts and mistakes."""
     along_accel_mps2: tuple[float, float]  # (braking, negative; speeding up)
     planned_braking_mps2: float
     planned_accel_mps2: float
@@ -140,7 +140,7 @@ class CourseGuide:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Predicted:
-    """Predicted state at the time when an action sent now takes effect."""
+    """Predicted state when an action sent now takes effect, if nothing changes until then."""
 
     position_ned_m: Vec3
     velocity_ned_mps: Vec3
