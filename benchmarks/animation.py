@@ -1,4 +1,4 @@
-"""Animate a recorded flight: camera, chase view and the actions that were sent, side by side.
+"""Animate a recorded flight: camera, chase view and sent actions, side by side.
 
 python -m benchmarks.animation FLIGHT --gates gates.json --out docs/images/flight.webp
 """
@@ -22,14 +22,14 @@ HEIGHT, CAMERA, SCENE = 400, 400, 500
 PLOT = 130
 """Pixels: of the picture, the camera's square, the scene's width and the plot's height."""
 TRACE_S = 3.0
-"""Seconds of actions in the plot."""
+"""Length of the plot [s]."""
 BACK_M, UP_M, FOCAL = 5.0, 2.2, 330.0
-"""Chase camera: distance behind and above the vehicle, and focal length in pixels."""
+"""Chase camera: distance behind and above the vehicle [m], and focal length [pixels]."""
 NEAR_M, FAR_M = 0.5, 60.0
 SKY, GROUND, GRID = (48, 38, 32), (58, 52, 46), (84, 76, 68)
 GATE, PATH, BODY = (0, 159, 230), (233, 180, 86), (245, 245, 245)
 COLOURS = ((0, 159, 230), (233, 180, 86), (115, 158, 0), (167, 121, 204))
-"""BGR of the four actions: told apart by colour-blind readers (Okabe and Ito)."""
+"""BGR of the four actions, distinguishable for colour-blind readers (Okabe and Ito)."""
 NAMES = {
     "sticks": ("throttle", "yaw", "pitch", "roll"),
     "rates": ("thrust", "roll rate", "pitch rate", "yaw rate"),
@@ -58,12 +58,12 @@ class Flight:
         self.names = NAMES[contract.action if contract else "sticks"]
 
     def at(self, time_s: float) -> int:
-        """Index of the newest row at a time."""
+        """Return the index of the newest row at a time."""
         return max(0, int(np.searchsorted(self.time_s, time_s, "right")) - 1)
 
 
 class View:
-    """A pinhole camera behind the vehicle, looking along its heading."""
+    """Pinhole camera behind the vehicle, looking along its heading."""
 
     def __init__(self, position: Array, heading: float) -> None:
         forward = np.array([np.cos(heading), np.sin(heading), 0.12])
@@ -73,7 +73,7 @@ class View:
         self._origin = position - BACK_M * np.array([*forward[:2], 0.0]) - [0.0, 0.0, UP_M]
 
     def line(self, picture: Array, ends: Array, colour: tuple[int, ...], width: int) -> None:
-        """Draw a line between two points of the world, cut at the near plane."""
+        """Draw a line between two points of the world, clipped at the near plane."""
         points = (ends - self._origin) @ np.stack([self._right, self._down, self._forward]).T
         if (points[:, 2] < NEAR_M).all():
             return
@@ -89,7 +89,7 @@ class View:
 
 
 def _scene(flight: Flight, index: int, gates: list[Array]) -> Array:
-    """Chase view with ground, gates, flown path and vehicle."""
+    """Draw the chase view with ground, gates, flown path and vehicle."""
     height = HEIGHT - PLOT
     picture = np.full((height, SCENE, 3), SKY, np.uint8)
     position = flight.position[index]
@@ -116,7 +116,7 @@ def _scene(flight: Flight, index: int, gates: list[Array]) -> Array:
 
 
 def _plot(flight: Flight, index: int) -> Array:
-    """The last seconds of the four actions, each in a band of its own."""
+    """Draw the last seconds of the four actions, one band each."""
     picture = np.full((PLOT, SCENE, 3), (28, 24, 20), np.uint8)
     now = flight.time_s[index]
     shown = flight.time_s[: index + 1] > now - TRACE_S
@@ -139,7 +139,7 @@ def _write(
 
 
 def _gates(path: Path) -> list[Array]:
-    """Corners of each gate, in metres, from the JSON of ``python -m sitl course --json``."""
+    """Return the corners of each gate [m] from the JSON of ``python -m sitl course --json``."""
     corners = []
     for gate in json.loads(path.read_text())["gates"]:
         side = gate["size_m"] / 2

@@ -1,13 +1,13 @@
-"""The baseline: how a learned policy is commonly run, written honestly; mavbridge is beside it.
+"""Baseline runner: a careful version of the common way to run a learned policy, for comparison.
 
-Eager torch as it comes, the whole sampler at every step, one thread for images and one for actions
-with a lock around what they share, ``time.sleep(period - elapsed)``, and pymavlink's own connection
-read once a step. The weights, the camera and the vehicle are those of the measured flight.
+Plain eager torch with the whole sampler at every step, one thread for images and one for actions
+with a lock around shared data, ``time.sleep(period - elapsed)``, and pymavlink's connection read
+once per step. The weights, the camera and the vehicle are those of the measured flight.
 
-Reading one attitude a step is what makes it fall behind: a step that is slower than the stream
-leaves the rest in the socket, and the next step acts on what is oldest there.
+It falls behind because it reads one attitude per step: a step slower than the stream leaves
+messages in the socket, and the next step acts on the oldest one there.
 
-It arms nothing, so the vehicle stays on the ground; its sticks are sent and counted all the same.
+It does not arm, so the vehicle stays on the ground; its sticks are sent and counted.
 """
 
 import pickle
@@ -49,7 +49,8 @@ def main(path: Path) -> None:
 
 
 def eager_toge(policy: PolicyConfig) -> Toge:
-    """The network alone: the shipped TOGE, or seeded weights by ``network.allow_untrained``."""
+    """Return the network without a runner: the shipped TOGE, or seeded weights by
+    ``network.allow_untrained``."""
     torch.manual_seed(policy.seed)
     if policy.allow_untrained:
         net = build_policy(TogeConfig(size="small"))
@@ -63,7 +64,7 @@ def eager_toge(policy: PolicyConfig) -> Toge:
 
 
 class Baseline:
-    """Two threads and a lock; counts what mavbridge counts."""
+    """Two threads and a lock; counts the same quantities as a flight of mavbridge."""
 
     def __init__(self, job: FlightJob) -> None:
         self._job = job
@@ -89,9 +90,9 @@ class Baseline:
         self._feature_age, self._state_to_wire = Histogram(), Histogram()
 
     def run(self) -> Flight:
-        """Fly for the duration, from the first chunk on."""
+        """Fly for the job's duration, counted from the first chunk."""
         contract = self._net.contract
-        # The first inference of a process allocates, which belongs to the start.
+        # The first inference of a process allocates memory, which belongs to the start.
         self._encode_image(np.zeros((contract.image_height, contract.image_width, 3), np.uint8))
         self._sample(
             torch.zeros(1, contract.feature_dim), np.zeros((1, contract.state_dim), np.float32)
@@ -178,17 +179,17 @@ class Baseline:
         self._stamps_ns.append(started_ns)
         self._feature_age.add(now_ns - captured_ns)
         if attitude is not None:
-            # mavutil stamps a message when it is parsed, however long it has waited in the socket.
-            # The vehicle's own stamp does not wait: the least difference stands for no delay.
+            # mavutil stamps a message when it is parsed, after its wait in the socket. The
+            # vehicle's stamp excludes the wait; the smallest difference counts as zero delay.
             offset_ns = now_ns - attitude.time_boot_ms * NS_PER_MS
             self._least_offset_ns = min(offset_ns, self._least_offset_ns or offset_ns)
             self._state_to_wire.add(offset_ns - self._least_offset_ns)
         return True
 
     def _state(self) -> np.ndarray | None:
-        """[1, state_dim] of the newest message of each kind that the connection has parsed.
+        """Return [1, state_dim] of the newest parsed message of each kind, or None.
 
-        A policy that takes the age of its image is given zeros: this runner does not know it.
+        A policy that takes the age of its image gets zeros, since this runner does not know it.
         """
         messages = self._connection.messages
         try:
@@ -197,7 +198,7 @@ class Baseline:
             )
         except KeyError:
             return None
-        g = 9.80665e-3  # m/s^2 for each mg
+        g = 9.80665e-3  # m/s^2 per mg
         values = (
             *(p.vx, p.vy, p.vz, q.q1, q.q2, q.q3, q.q4),
             *(q.rollspeed, q.pitchspeed, q.yawspeed, i.xacc * g, i.yacc * g, i.zacc * g),

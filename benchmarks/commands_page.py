@@ -14,13 +14,13 @@ from mavbridge.cli import cli
 PAGE = Path(__file__).parents[1] / "docs" / "commands.md"
 MOST_WORDS = 15
 _UNNAMED = ("Arguments", "Parameters", "Flags")
-"""Groups that say nothing to a reader: their flags are named one by one."""
+"""Groups with a meaningless name: their flags are named one by one."""
 
 
 def flags() -> str:
-    """Every command with its flags, those that several share under the first one, then settings.
+    """Return every command with its flags, each under its first command, then the settings.
 
-    ``--help`` has the rest of long help texts.
+    Long help texts are shortened; ``--help`` has the rest.
     """
     seen: dict[tuple[str, str], str] = {}
     lines: list[str] = []
@@ -33,7 +33,7 @@ def flags() -> str:
 
 
 def _flags_of(app: App, seen: dict[tuple[str, str], str]) -> Iterator[str]:
-    """Flags that no command before has, by group; the others by the names of their groups."""
+    """Yield the flags not listed before, by group, then the names of the other groups."""
     new: dict[str, list[Argument]] = {}
     shared: dict[str, None] = {}
     for argument in _arguments(app):
@@ -52,7 +52,7 @@ def _flags_of(app: App, seen: dict[tuple[str, str], str]) -> Iterator[str]:
 
 
 def _arguments(app: App) -> list[Argument]:
-    """Flags that the help shows."""
+    """Return the flags that the help shows."""
     arguments = app.assemble_argument_collection(parse_docstring=True)
     return [each for each in arguments if each.show and not each.children and each.name != "*"]
 
@@ -69,7 +69,7 @@ def _list(arguments: list[Argument]) -> Iterator[str]:
 
 
 def _settings(app: App) -> Iterator[str]:
-    """Keys of each section of a settings file, with their defaults."""
+    """Yield the keys of each section of a settings file, with their defaults."""
     sections: dict[str, list[str]] = {}
     for argument in app.assemble_argument_collection(parse_docstring=True):
         section, found, key = argument.name.removeprefix("--").partition(".")
@@ -81,21 +81,21 @@ def _settings(app: App) -> Iterator[str]:
 
 
 def _default(argument: Argument) -> str:
-    """Return the default in brackets, or nothing where it says nothing."""
+    """Return the default in brackets, or nothing if it is not informative."""
     default = argument.field_info.default
     shown = isinstance(default, str | int | float) and not isinstance(default, bool)
     return f" ({default})" if shown and default != "" else ""
 
 
 def _text(text: object) -> str:
-    """Return a help text on one line; of a long one its first sentence, up to a semicolon."""
+    """Return a help text on one line, or the first sentence or clause of a long one."""
     words = str(text or "").split("Args:")[0].split()
     line = " ".join(words)
     return line if len(words) <= MOST_WORDS else re.split(r"[.;] ", line)[0].rstrip(".") + "."
 
 
 def with_flags(page: str) -> str:
-    """Return the page with the flags of now."""
+    """Return the page with the current flags."""
     return with_generated(page, "benchmarks.commands_page", flags())
 
 

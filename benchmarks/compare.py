@@ -1,13 +1,12 @@
-"""This machine with mavbridge, beside a roofline, a baseline runner and other MAVLink clients.
+"""Measure mavbridge on this machine, beside a roofline, a baseline and other MAVLink clients.
 
 python -m benchmarks.compare --json bench.json --check benchmarks/budget.json
 
-Engines and flights with the shipped policy (ResNet-8, 96 pixels) and with an untrained one
-(EfficientNet-B3, 224 pixels); MAVSDK where .venv-peers has it.
+Engines and flights use the shipped policy (ResNet-8, 96 pixels) and an untrained one
+(EfficientNet-B3, 224 pixels). MAVSDK is included if .venv-peers has it.
 
-Each ratio of the budget compares two figures of one run, so that no machine is too slow for it, and
-is the smaller the better. The file is JSON, ``{"ratios": {name: most}}``; the names are those of
-``ratios``.
+Each ratio of the budget compares two figures of one run, so that no machine is too slow for it.
+Smaller is better. The file is JSON, ``{"ratios": {name: most}}``, with the names of ``ratios``.
 """
 
 import math
@@ -53,7 +52,7 @@ LOADED_FLIGHTS: tuple[tuple[Rates, Load], ...] = tuple(
     for load in ("slow", "busy")
     for realtime in (True, False)
 )
-"""With the shipped policy: how exact sticks stay beside a slow policy, and a busy interpreter."""
+"""Flights of the shipped policy for stick timing: with slow solves, and with a busy interpreter."""
 ROOFLINE = "roofline f32"
 MS_PER_S = 1000.0
 
@@ -67,7 +66,7 @@ def main(
     json: Path | None = None,
     check: Path | None = None,
 ) -> int:
-    """Measure everything, print and write; 1 if the budget is exceeded.
+    """Measure everything, print and write; exit with 1 if the budget is exceeded.
 
     Args:
         quick: measure for seconds instead of minutes: figures to look at, not to quote.
@@ -93,7 +92,7 @@ def main(
 
 
 def measure(*, is_quick: bool) -> BenchResult:
-    """Measure every section, one after the other: they would disturb each other."""
+    """Measure the sections one after the other, since they would disturb each other."""
     policies = tuple(replace(policy, engine="auto") for policy in (SHIPPED, LARGE))
     rounds, block_s, flight_s, attitudes = (2, 0.5, 5.0, 200) if is_quick else (5, 1.5, 60.0, 1500)
     engines, notes = time_engines(policies, rounds=rounds, block_s=block_s)
@@ -112,12 +111,12 @@ def measure(*, is_quick: bool) -> BenchResult:
 
 
 def ratios(result: BenchResult) -> dict[str, float]:
-    """Every ratio that the run allows, by name.
+    """Return all ratios that the run allows, by name.
 
-    Engines: median time over that of eager torch and over the roofline. Flights: period over the
-    asked one; and period, processor time an action and latency over the baseline's with the same
-    policy; and the lateness of sticks at the 99th percentile over their period. Link: round trip
-    over the bare loop's.
+    Engines: median time over eager torch's and over the roofline. Flights: period over the
+    requested one; period, processor time per action and latency over the baseline's with the same
+    policy; 99th percentile of the stick lateness over the stick period. Link: round trip over the
+    bare loop's.
     """
     found = dict(_flight_ratios(result))
     times = {(one.policy, one.work, one.engine): one.p50_ms for one in result.engines}
@@ -139,7 +138,7 @@ def _flight_ratios(result: BenchResult) -> Iterator[tuple[str, float]]:
     for flight in result.flights:
         if flight.runner != OURS or not flight.action_hz:
             continue
-        # Without the precision, which depends on the processor: one budget serves them all.
+        # Omit the precision, which depends on the processor, so that one budget serves all.
         engine = flight.engine.partition("-")[0]
         parts = (flight.policy, flight.solves, engine, flight.conditions)
         name = f"flight: {', '.join(filter(None, parts))}"
@@ -160,7 +159,7 @@ def _flight_ratios(result: BenchResult) -> Iterator[tuple[str, float]]:
 
 
 def read_budget(path: Path) -> dict[str, float]:
-    """The largest allowed ratios, by name.
+    """Return the largest allowed ratios, by name.
 
     Raises:
         UserError: no such file, or not a budget.
@@ -174,7 +173,7 @@ def read_budget(path: Path) -> dict[str, float]:
 
 
 def violations(measured: Mapping[str, float], budget: Mapping[str, float]) -> tuple[str, ...]:
-    """A line for each ratio that is over the budget or was not measured."""
+    """Return a line for each ratio that is over the budget or was not measured."""
     lines = []
     for name, most in budget.items():
         if name not in measured:

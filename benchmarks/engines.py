@@ -1,4 +1,5 @@
-"""Encoding one image and sampling one chunk on each engine, one thread, with nothing beside it."""
+"""Timing of one encoded image and one sampled chunk per engine, in one thread, without other
+load."""
 
 from collections.abc import Callable, Sequence
 from contextlib import ExitStack
@@ -35,9 +36,10 @@ class _Case:
 def time_engines(
     policies: Sequence[PolicyConfig], *, rounds: int, block_s: float
 ) -> tuple[tuple[EngineTiming, ...], tuple[str, ...]]:
-    """Time each policy on its engine, or with ``auto`` on all of this device; notes on failures.
+    """Time each policy on its engine, or with ``auto`` on all engines of this device.
 
-    Each round times every case for ``block_s``: a slow minute of the host is shared by all engines.
+    Return the timings, and notes on failures. Each round times every case for ``block_s``, so that
+    a slow minute of the host affects all engines.
 
     Raises:
         PolicyError: a policy cannot be loaded on any engine.
@@ -71,7 +73,7 @@ def _cases(policy: PolicyConfig, lives: ExitStack) -> tuple[list[_Case], list[st
         return cases, notes
     return _cases_on(
         policy, lives
-    ), []  # a policy in numpy runs on "auto" alone; others are refused
+    ), []  # numpy policies run on "auto" only and are refused elsewhere
 
 
 def _cases_on(policy: PolicyConfig, lives: ExitStack) -> list[_Case]:
@@ -97,13 +99,13 @@ def _cases_on(policy: PolicyConfig, lives: ExitStack) -> list[_Case]:
 def _load(policy: PolicyConfig, lives: ExitStack) -> PolicyRunner:
     loaded = lives.enter_context(load_configured_policy(policy, MonotonicClock()))
     if policy.engine != "auto" and not loaded.runner.engine.startswith(policy.engine):
-        raise PolicyError("; ".join(loaded.notes))  # says why the engine was passed over
+        raise PolicyError("; ".join(loaded.notes))  # reason why the engine was not used
     return loaded.runner
 
 
 def _time(case: _Case, block_s: float) -> None:
     clock = MonotonicClock()
-    case.call()  # warms the caches that the other cases have emptied
+    case.call()  # warms the caches that other cases have evicted
     end_ns = clock.now_ns() + round(block_s * NS_PER_S)
     while True:
         start_ns = clock.now_ns()

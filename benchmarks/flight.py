@@ -1,13 +1,13 @@
-"""One flight of both loops against the simulated vehicle, each in a process of its own.
+"""Measured flight of both loops against the simulated vehicle, in separate processes.
 
-``fly`` starts the vehicle and ``python -m benchmarks.flight JOB``, which is composed and sends as
-``mavbridge fly``. A policy without training would fly the vehicle into the ground, and a
-vehicle that has crashed takes no sticks: so each chunk is computed in full, and then its values are
-replaced by a slow level climb. Only for a simulated vehicle. A load keeps the flight process busy:
+``fly`` starts the vehicle and ``python -m benchmarks.flight JOB``, which is composed and sends like
+``mavbridge fly``. An untrained policy would fly the vehicle into the ground, and a crashed vehicle
+takes no sticks. Therefore each chunk is computed in full, and then its values are replaced by a
+slow level climb. For simulated vehicles only. A load keeps the flight process busy:
 
-    none   nothing beside the flight
+    none   no load
     slow   every tenth solve takes 30 ms longer
-    busy   beside the flight a thread runs eager torch, and another one never leaves the interpreter
+    busy   one thread runs eager torch, and another one never leaves the interpreter
 """
 
 import os
@@ -48,22 +48,22 @@ Load: TypeAlias = Literal["none", "slow", "busy"]
 SLOW_EVERY = 10
 SLOW_NS = 30 * NS_PER_MS
 TORCH_CHANNELS, TORCH_SIDE = 32, 48
-"""A small convolution of some 1 ms: many calls a second, each of which takes the interpreter."""
+"""Small convolution of some 1 ms: many calls per second, each of which takes the interpreter."""
 JOIN_S = 5.0
 PROC = Path("/proc")
 STEAL_FIELD = 8
-"""The line "cpu" is: cpu user nice system idle iowait irq softirq steal."""
+"""Index of "steal" in the line "cpu": cpu user nice system idle iowait irq softirq steal."""
 STARTING_S = 300.0
-"""Most that a process may take beside its flight: imports, compiling an engine, arming. A network
-of 263 M parameters compiles for one or two minutes."""
+"""Time limit of a process apart from its flight: imports, compiling an engine, arming. A network of
+263 M parameters compiles for one or two minutes."""
 CLIMB_STICK = 0.3
-"""0.3 m/s up in ALT_HOLD: beyond its dead zone, some 20 m in a minute."""
+"""Stick for 0.3 m/s up in ALT_HOLD: beyond the dead zone, some 20 m per minute."""
 NO_CEILING = EnvelopeConfig(max_height=0.0)
-"""Ten minutes of that are beyond the usual 120 m."""
+"""Ten minutes of that climb exceed the usual 120 m."""
 LEAST_SHARE = 0.95
-"""Share of the asked duration; a flight that ended earlier is no measurement."""
+"""Minimum share of the requested duration; a flight that ended earlier is no measurement."""
 MAX_AGE_S = 5.0
-"""A slow engine is to be measured, not released: far from what any of them needs."""
+"""Age limit far above any engine's need, so that a slow engine is measured, not released."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -73,7 +73,7 @@ class FlightJob:
     port: int
     camera: str
     duration_s: float
-    """From the policy's first action."""
+    """Duration from the policy's first action."""
     out: Path
     policy: PolicyConfig
     rates: Rates
@@ -120,7 +120,7 @@ def fly(
                 with running(sys.executable, "-m", module, str(path), log=log) as process:
                     wait(process, f"python -m {module}", log, duration_s + STARTING_S)
             except UserError:
-                if vehicle.poll() is not None:  # then the flight's log is not the reason
+                if vehicle.poll() is not None:  # it ended early: its log has the reason
                     wait(vehicle, "python -m sitl", vehicle_log, STARTING_S)
                 raise
             end(vehicle)
@@ -150,7 +150,7 @@ def read_job(path: Path) -> FlightJob:
 
 @torch.no_grad()
 def run_torch(stop: threading.Event) -> None:
-    """Eager convolutions, one after the other."""
+    """Run eager convolutions, one after the other."""
     torch.set_num_threads(1)
     layer = torch.nn.Conv2d(TORCH_CHANNELS, TORCH_CHANNELS, 3)
     values = torch.zeros(1, TORCH_CHANNELS, TORCH_SIDE, TORCH_SIDE)
@@ -159,13 +159,13 @@ def run_torch(stop: threading.Event) -> None:
 
 
 def hog_interpreter(stop: threading.Event) -> None:
-    """Bytecode alone: others run when the interpreter takes its lock away."""
+    """Run only bytecode: others run only when the interpreter takes its lock away."""
     while not stop.is_set():
         pass
 
 
 def with_slow_solves(runner: PolicyRunner) -> PolicyRunner:
-    """A runner whose every tenth solve computes for 30 ms more."""
+    """Return a runner whose every tenth solve computes for 30 ms more."""
     clock, solves = MonotonicClock(), 0
 
     def act(encoded: FloatArray, state: FloatArray, history: FloatArray) -> FloatArray:
@@ -185,7 +185,7 @@ def measure(job: FlightJob, clock: Clock, runner: PolicyRunner) -> None:
     config = FlyConfig(
         link=LinkConfig(connect=f"udp:127.0.0.1:{job.port}"),
         policy=job.policy,
-        # High above the course the simulator's view, which has no noise, hardly changes.
+        # High above the course, the simulator's noiseless view hardly changes.
         camera=CameraConfig(camera=(job.camera,), max_frozen_image=0.0),
         rates=job.rates,
         envelope=NO_CEILING,
@@ -214,7 +214,7 @@ def measure(job: FlightJob, clock: Clock, runner: PolicyRunner) -> None:
 
 
 def level_climb(runner: PolicyRunner) -> PolicyRunner:
-    """A runner that does the same work and returns other sticks, however late it is."""
+    """Return a runner that does the same work and returns climb sticks, however late it is."""
 
     def act(encoded: FloatArray, state: FloatArray, history: FloatArray) -> FloatArray:
         chunk = runner.act(encoded, state, history).copy()
@@ -232,20 +232,20 @@ def level_climb(runner: PolicyRunner) -> PolicyRunner:
 
 
 class Counters(NamedTuple):
-    """Processor times since some moment [ns]; each only ever grows."""
+    """Processor times since an arbitrary start [ns]; they never decrease."""
 
     ours: int
-    """This process ran."""
+    """Time in which this process ran."""
     guard: int
-    """The guard ran."""
+    """Time in which the guard ran."""
     waited: int
-    """The guard could run and was not put on a processor."""
+    """Time in which the guard was runnable but not on a processor."""
     host: int
-    """The hypervisor gave processors of this machine to others."""
+    """Time in which the hypervisor gave this machine's processors to others."""
 
 
 def read_counters(guard_pid: int) -> Counters:
-    """Counters of the system (proc_stat(5), sched-stats.rst); 0 where it does not tell them."""
+    """Read the system's counters (proc_stat(5), sched-stats.rst); 0 if unavailable."""
     try:
         schedstat = (PROC / str(guard_pid) / "schedstat").read_text().split()
         stolen = int((PROC / "stat").read_text().split("\n", 1)[0].split()[STEAL_FIELD])
@@ -256,9 +256,9 @@ def read_counters(guard_pid: int) -> Counters:
 
 
 class FlightMeter:
-    """A ``TickSink`` that measures from the policy's first action on.
+    """``TickSink`` that measures from the policy's first action on.
 
-    Waiting, handshake and arming are cheap ticks on time: they would flatter a slow engine.
+    Waiting, handshake and arming consist of cheap, punctual ticks that would flatter a slow engine.
     """
 
     def __init__(
@@ -268,9 +268,9 @@ class FlightMeter:
         self._timing = FlightTiming(stick_hz=stick_hz, action_hz=action_hz, vision_hz=vision_hz)
         self._first: Counters | None = None
         self.spent = Counters(0, 0, 0, 0)
-        """From the first action to the last."""
+        """Counters from the first action to the last."""
         self.release_reason: Reason | None = None
-        """Why the policy lost the sticks before its end; None if it kept them."""
+        """Reason why the policy lost the sticks early; None if it kept them."""
 
     def emit(self, event: Event) -> None:
         """Count the event."""
@@ -285,7 +285,7 @@ class FlightMeter:
                 self.release_reason = self.release_reason or reason
 
     def report(self) -> TimingReport:
-        """Figures of the flight so far; names and link are left empty."""
+        """Return the figures of the flight so far; names and link are left empty."""
         drops = ObserverDrops(rerun=None, recorder=None)
         return self._timing.report(
             mode="dual", engine="", policy="", autopilot=None, link=None, observer_drops=drops
@@ -326,7 +326,7 @@ def _flight(job: FlightJob, engine: str, meter: FlightMeter) -> Flight:
 
 
 def conditions_of(job: FlightJob) -> str:
-    """Return what of rate, load and scheduling is not usual."""
+    """Return the unusual rate, load and scheduling of a job."""
     usual = Rates()
     parts = []
     if job.rates.stick_rate != usual.stick_rate:

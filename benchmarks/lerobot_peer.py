@@ -1,4 +1,4 @@
-"""LeRobot's own code, timed; runs in LeRobot's environment.
+"""Time LeRobot's code in LeRobot's environment.
 
     python benchmarks/lerobot_peer.py make DIR KIND   # a checkpoint with random weights
     python benchmarks/lerobot_peer.py time DIR STEPS  # a line of JSON: ms of a chunk, p50 and p99
@@ -38,7 +38,7 @@ PIXELS = 96
 
 
 def make(folder: Path, kind: str) -> None:
-    """Write a policy with seeded random weights, as LeRobot saves one."""
+    """Write a policy with seeded random weights in LeRobot's format."""
     torch.manual_seed(0)
     config_class, options = KINDS[kind]
     inputs = {
@@ -59,7 +59,7 @@ def make(folder: Path, kind: str) -> None:
 
 
 def time_chunks(folder: Path, steps: int) -> list[float]:
-    """Median and 99th percentile of a chunk's milliseconds, on a still scene."""
+    """Return the median and 99th percentile of a chunk's time [ms], on a still scene."""
     torch.set_num_threads(1)
     config = PreTrainedConfig.from_pretrained(folder)
     if isinstance(config, DiffusionConfig):

@@ -1,10 +1,10 @@
-"""LeRobot policies on our engines, and beside LeRobot's own code on the same weights.
+"""Time LeRobot policies on our engines, and with LeRobot's code on the same weights.
 
     python -m benchmarks.lerobot_policies DIR... [--steps 4] [--peer PYTHON_OF_LEROBOT]
 
 DIR holds a checkpoint and its mavbridge.toml; ``benchmarks/lerobot_peer.py make`` makes one with
-random weights. Milliseconds of one thread. LeRobot's are of a whole chunk: it encodes the images of
-all observations each time, where we encode one.
+random weights. Times are milliseconds in one thread. LeRobot's are per whole chunk: it encodes the
+images of all observations each time, mavbridge only one.
 """
 
 import json
@@ -52,7 +52,7 @@ def main(*folders: Path, steps: int = 4, peer: Path | None = None) -> None:
 
 
 def time_peer(python: Path, folder: Path, steps: int) -> EngineTiming:
-    """LeRobot's time of a chunk.
+    """Return LeRobot's time per chunk.
 
     Raises:
         UserError: LeRobot did not compute it; quotes its last line.

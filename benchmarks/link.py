@@ -1,4 +1,4 @@
-"""The latency of the link: mavbridge and its peers, turn by turn against one timing vehicle.
+"""Measure the latency of the link: mavbridge and other clients in turn, against one timing vehicle.
 
 python -m benchmarks.link --rounds 3
 """
@@ -21,13 +21,13 @@ from mavbridge.core.processes import IMPORT_ROOT, end, free_port, log_tail, runn
 LINK_VEHICLE = "benchmarks.link_vehicle"
 PEERS_PYTHON = IMPORT_ROOT / ".venv-peers" / "bin" / "python"
 STARTING_S = 15.0
-"""For imports, beside what the vehicle gives a client to connect."""
+"""Time for imports [s], in addition to the vehicle's time for a client to connect."""
 app = App(help=__doc__)
 
 
 @dataclass(frozen=True, kw_only=True)
 class LinkClient:
-    """A program that answers each attitude with sticks."""
+    """Program that answers each attitude with sticks."""
 
     name: str
     module: str
@@ -46,8 +46,8 @@ def main(*, attitudes: int = 1500, rounds: int = 1) -> None:
     """Time every client ``rounds`` times.
 
     Args:
-        attitudes: number of attitudes, of which 97 come a second.
-        rounds: turns of each client: a slow minute of the host is shared by all.
+        attitudes: number of attitudes, sent at 97 per second.
+        rounds: turns of each client, so that a slow minute of the host affects all.
     """
     clients, notes = link_clients()
     results = [time_link(client, attitudes) for _ in range(rounds) for client in clients]
@@ -58,7 +58,7 @@ def main(*, attitudes: int = 1500, rounds: int = 1) -> None:
 
 
 def link_clients() -> tuple[tuple[LinkClient, ...], tuple[str, ...]]:
-    """Our client and its peers; and why one of them cannot run here."""
+    """Return our client and its peers, and the reason why one of them cannot run here."""
     if PEERS_PYTHON.is_file():
         return (OUR_CLIENT, BARE_CLIENT, MAVSDK_CLIENT), ()
     note = f"{MAVSDK_CLIENT.name}: not measured, there is no {PEERS_PYTHON} (make bench)"

@@ -1,8 +1,7 @@
-"""Our client of the link test: guard and policy loop, with a policy that repeats the roll rate.
+"""mavbridge's client of the link test: guard and policy loop; the policy repeats the roll rate.
 
-No torch is loaded and no camera runs, but every attitude goes the way of a flight's: from the
-socket through the guard to the flight process, through the policy loop, and as a chunk back to the
-guard.
+No torch is loaded and no camera runs, but every attitude takes the path of a flight: from the
+socket through the guard to the flight process, through the policy loop, and back as a chunk.
 """
 
 import signal
@@ -33,11 +32,11 @@ from policy.protocol import PolicyRunner
 
 ROLL = ACTION_NAMES.index("roll")
 MOST_CHUNKS_HZ = 200.0
-"""Twice the vehicle's rate: an attitude that follows a late one closely is answered at once."""
+"""Twice the vehicle's rate, so that an attitude closely after a late one is answered at once."""
 DAY_NS = 24 * 3600 * NS_PER_S
 WATCH_S = 0.1
 END_S = 5.0
-"""For the release of a vehicle that may be gone already, and for threads to end."""
+"""Limit for the release of a vehicle that may have left, and for threads to end."""
 
 
 def main(*, port: int) -> None:
@@ -46,7 +45,7 @@ def main(*, port: int) -> None:
     signal.signal(signal.SIGTERM, lambda *_: stop.set())
     config = FlyConfig(
         link=LinkConfig(connect=f"udp:127.0.0.1:{port}"),
-        # No smoothing: the vehicle must find its number unchanged. Its attitude never changes.
+        # No smoothing, so that the vehicle finds its code unchanged. Its attitude never changes.
         limits=Limits(tau=0.0, max_slew=0.0, max_frozen_state=0.0),
         rates=Rates(action_rate=MOST_CHUNKS_HZ),
         arm=True,
@@ -66,7 +65,7 @@ def main(*, port: int) -> None:
 
 
 def link_bridge(plan: FlightPlan, guard: GuardProcess) -> Bridge:
-    """The policy loop and its view of the vehicle; the vision loop is built and never runs."""
+    """Build the policy loop and its view of the vehicle; the vision loop exists but never runs."""
     clock, cache = MonotonicClock(), FeatureCache()
     now_ns = clock.now_ns()
     feature = np.zeros((1, 1), np.float32)
@@ -86,10 +85,10 @@ def link_bridge(plan: FlightPlan, guard: GuardProcess) -> Bridge:
 
 
 def _serve(bridge: Bridge, guard: GuardProcess, stop: threading.Event) -> None:
-    """Run until told to stop or until the guard ends, and raise what a thread has raised."""
+    """Run until told to stop or until the guard ends; raise any exception of a thread."""
 
     def run_settled(ended: threading.Event, *, run: Callable[[threading.Event], None]) -> None:
-        settle_thread(realtime=True, cpu=None)  # as a flight does
+        settle_thread(realtime=True, cpu=None)  # as in a flight
         run(ended)
 
     settle_process()
@@ -107,14 +106,14 @@ def _serve(bridge: Bridge, guard: GuardProcess, stop: threading.Event) -> None:
 
 
 def repeat_roll_rate(_feature: FloatArray, state: FloatArray, _history: FloatArray) -> FloatArray:
-    """State [1, 13] -> chunk [1, 16, 4] whose roll stick is the roll rate, in rad/s."""
+    """Return a chunk [1, 16, 4] whose roll stick is the roll rate [rad/s] of the state [1, 13]."""
     chunk = np.zeros((1, Contract.horizon, ACTION_DIM), np.float32)
     chunk[0, :, ROLL] = state[0, RATE][0]
     return chunk
 
 
 ROLL_RATE = PolicyRunner(
-    # Wide ages: a vehicle that is served late is to be measured.
+    # Wide age limits, so that a vehicle served late is measured.
     contract=Contract(max_state_age_s=1.0, max_velocity_age_s=1.0, max_chunk_age_s=1.0),
     name="roll rate",
     engine="none",
@@ -125,12 +124,12 @@ ROLL_RATE = PolicyRunner(
 
 
 class NoCamera:
-    """A camera that never delivers."""
+    """Camera that never delivers."""
 
     dropped_frames = 0
 
     def read(self, timeout_ns: int) -> Frame | None:
-        """Nothing; ``timeout_ns`` is not waited for."""
+        """Return None without waiting."""
 
     def close(self) -> None:
         """No-op."""

@@ -1,6 +1,6 @@
-"""Client of the link test: MAVSDK-Python 4, run by the interpreter that has it.
+"""MAVSDK-Python 4 client of the link test; runs in the interpreter that has MAVSDK.
 
-A subscription's callback answers with manual control, which is MAVSDK's way to move sticks.
+A subscription's callback answers with manual control, MAVSDK's way to move sticks.
 """
 
 import sys

@@ -1,4 +1,4 @@
-"""Client of the link test: the shortest loop that pymavlink allows, blocking receive and send."""
+"""Shortest pymavlink client of the link test: blocking receive, then send."""
 
 from cyclopts import run
 from pymavlink import mavutil

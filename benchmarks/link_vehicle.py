@@ -1,10 +1,10 @@
-"""The vehicle of the link test: always armed, and it times the answers to its attitudes.
+"""Vehicle of the link test: always armed; times the answers to its attitudes.
 
-It sends ATTITUDE_QUATERNION on a grid, each with a code in its roll rate, and waits for sticks that
-carry the same code: RC_CHANNELS_OVERRIDE (channel 1) or MANUAL_CONTROL (y). What else a client
-needs (heartbeat, parameters, acknowledgements, the other state messages) is sent half a period away
-from the attitude, so that it is never in its way. Sends are stamped just before the system call,
-answers by the kernel as they arrive: nothing that this process does is in the figures.
+It sends ATTITUDE_QUATERNION on a grid, each with a code in its roll rate, and waits for sticks with
+the same code: RC_CHANNELS_OVERRIDE (channel 1) or MANUAL_CONTROL (y). A client's other needs
+(heartbeat, parameters, acknowledgements, other state messages) are sent half a period away from the
+attitude, so that they never delay it. Sends are stamped just before the system call, answers on
+arrival by the kernel, so that this process adds nothing to the figures.
 """
 
 import pickle
@@ -21,23 +21,23 @@ from mavbridge.core.histogram import Histogram
 from mavbridge.mavlink.transport.sockets import UdpTransport
 
 ATTITUDE_HZ = 97.0
-"""Not 100: the phase against a client with a 100 Hz clock of its own then takes every value."""
+"""Not 100, so that the phase relative to a client with a 100 Hz clock takes every value."""
 CODES = 200
 CODE_SPAN = 100
 CODE_US = 5
-"""A code k stands for a stick of (k - 100) / 100, which is 1000 + 5 k us of PWM: a client may move
-the channel by 2 us beside its answer."""
+"""PWM step per code: code k is a stick of (k - 100) / 100, which is 1000 + 5 k us. An answer may be
+off by 2 us."""
 WARM_ANSWERS = 100
 CONNECT_S = 30.0
 PENDING_LIMIT = 150
-"""Answers later than 1.5 seconds count as lost; fewer than there are codes."""
+"""Largest number of pending answers (1.5 s); older ones count as lost. Smaller than CODES."""
 SENT_MESSAGES = (
     mav.MAVLINK_MSG_ID_ATTITUDE_QUATERNION,
     mav.MAVLINK_MSG_ID_LOCAL_POSITION_NED,
     mav.MAVLINK_MSG_ID_RAW_IMU,
     mav.MAVLINK_MSG_ID_RC_CHANNELS,
 )
-"""Intervals of others are denied."""
+"""Messages whose interval may be set; others are denied."""
 PARAMS = {
     "RCMAP_ROLL": 1.0,
     "RCMAP_PITCH": 2.0,
@@ -55,7 +55,7 @@ PARAMS = {
     for channel in range(1, 5)
     for part, value in (("MIN", 1000.0), ("TRIM", 1500.0), ("MAX", 2000.0), ("REVERSED", 0.0))
 }
-"""All that a client may request; RCn_OPTION stays unanswered."""
+"""All parameters that a client may request; RCn_OPTION stays unanswered."""
 app = App(help=__doc__)
 
 
@@ -72,7 +72,7 @@ def main(*, port: int, attitudes: int, out: Path) -> None:
 
 
 def stick_of(code: int) -> float:
-    """The stick that stands for a code, in [-1, 1)."""
+    """Return the stick for a code, in [-1, 1)."""
     return (code - CODE_SPAN) / CODE_SPAN
 
 
@@ -82,12 +82,12 @@ def code_of(stick: float) -> int:
 
 
 def code_of_pwm(pwm_us: int) -> int:
-    """The code that RC_CHANNELS_OVERRIDE carries."""
+    """Return the code in a channel of RC_CHANNELS_OVERRIDE."""
     return round((pwm_us - 1000) / CODE_US)
 
 
 class RoundTrips:
-    """Matches answers with the codes that were sent; counts none before ``start``."""
+    """Matches answers with sent codes; counts none before ``start``."""
 
     def __init__(self) -> None:
         self._pending: dict[int, int] = {}
@@ -97,12 +97,12 @@ class RoundTrips:
         self.answered_in_a_row = 0
 
     def start(self) -> None:
-        """Count from here on."""
+        """Start counting."""
         self._is_counting = True
         self._pending.clear()
 
     def send(self, code: int, at_ns: int) -> None:
-        """Note a code as sent; the oldest of too many pending ones is lost."""
+        """Note a code as sent; drop the oldest pending codes over the limit as lost."""
         while len(self._pending) >= PENDING_LIMIT:
             self._pending.pop(next(iter(self._pending)))
             self.answered_in_a_row = 0
@@ -110,7 +110,7 @@ class RoundTrips:
         self._sent += self._is_counting
 
     def answer(self, code: int, arrived_ns: int) -> None:
-        """Note an answer; only the first to each code counts."""
+        """Note an answer; only the first one to each code counts."""
         sent_ns = self._pending.pop(code, None)
         if sent_ns is None:
             return
@@ -119,7 +119,7 @@ class RoundTrips:
             self._durations.add(arrived_ns - sent_ns)
 
     def answers(self) -> LinkLatency:
-        """Figures so far."""
+        """Return the figures so far."""
         return LinkLatency(
             sent=self._sent,
             answered=self._durations.count,
@@ -128,7 +128,7 @@ class RoundTrips:
 
 
 class LinkVehicle:
-    """One vehicle for one client."""
+    """Timing vehicle for one client."""
 
     def __init__(self, transport: UdpTransport, clock: Clock) -> None:
         self._clock = clock
@@ -158,7 +158,10 @@ class LinkVehicle:
         return self._round_trips.answers()
 
     def _exchange(self, number: int, due_ns: int) -> int:
-        """One attitude; half a period later its answers and all other messages; the next due."""
+        """Send one attitude; half a period later read answers and send all other messages.
+
+        Return the time of the next attitude.
+        """
         half_ns = round(NS_PER_S / ATTITUDE_HZ / 2)
         self._clock.sleep_until_ns(due_ns)
         code = number % CODES

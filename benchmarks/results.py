@@ -1,4 +1,4 @@
-"""Results of a benchmark as frozen values, their JSON, and tables of them."""
+"""Results of a benchmark as frozen values, their JSON, and their tables."""
 
 import json
 import os
@@ -22,7 +22,7 @@ OURS, BASELINE = "mavbridge", "baseline"
 
 @dataclass(frozen=True, kw_only=True)
 class Machine:
-    """The computer of a run."""
+    """Computer of a run."""
 
     cpu: str
     cores: int
@@ -32,22 +32,20 @@ class Machine:
 
 @dataclass(frozen=True, kw_only=True)
 class EngineTiming:
-    """One piece of inference on one engine and one thread."""
+    """Time of one piece of inference on one engine and one thread."""
 
     policy: str
     work: str
     engine: str
-    """Or a bound, such as a roofline."""
+    """Engine, or the name of a bound such as a roofline."""
     p50_ms: float
     p99_ms: float
 
 
 @dataclass(frozen=True, kw_only=True)
 class Flight:
-    """Both loops against the simulated vehicle, from the policy's first action to its last.
-
-    None = not measured.
-    """
+    """Figures of both loops against the simulated vehicle, from the policy's first to its last
+    action. None = not measured."""
 
     runner: str
     policy: str
@@ -60,32 +58,33 @@ class Flight:
     asked_vision_hz: float
     duration_s: float
     stick_hz: float | None
-    """All sends, those between two slots as well."""
+    """All sends per second, including those between two slots."""
     action_hz: float | None
-    """Chunks computed."""
+    """Computed chunks per second."""
     vision_hz: float | None
     missed_slots: int
     """Slots of the stick grid without a send within one period."""
     lateness_ms: Percentiles | None = None
-    """From a slot to its send."""
+    """Time from a slot to its send."""
     chunks: int
     late_chunks: int | None = None
-    """Chunks that came more than 1.5 periods after the one before."""
+    """Chunks that came more than 1.5 periods after the previous one."""
     period_ms: Percentiles | None
-    """Between two chunks."""
+    """Time between two chunks."""
     predict_ms: Percentiles | None
     encode_ms: Percentiles | None
     feature_age_ms: Percentiles | None
     state_to_wire_ms: Percentiles | None
-    """From an attitude's arrival at this computer to the send of the first sticks made from it."""
+    """Time from an attitude's arrival at this computer to the send of the first sticks made from
+    it."""
     cpu_cores: float
     """Processor time of all our processes over elapsed time."""
     guard_cpu_cores: float | None = None
-    """The guard's share of it."""
+    """The guard's part of ``cpu_cores``."""
     guard_waited_ms: float | None = None
-    """The guard could run, and the kernel ran others."""
+    """Time in which the guard was runnable, but the kernel ran others."""
     host_took_ms: float | None = None
-    """The hypervisor gave processors of this machine to others."""
+    """Time in which the hypervisor gave this machine's processors to others."""
 
     @property
     def label(self) -> str:
@@ -95,14 +94,14 @@ class Flight:
 
     @property
     def missed_fraction(self) -> float:
-        """Missed over asked slots."""
+        """Share of the requested slots that were missed."""
         asked = self.asked_stick_hz * self.duration_s
         return self.missed_slots / asked if asked > 0 else 1.0
 
 
 @dataclass(frozen=True, kw_only=True)
 class LinkLatency:
-    """The time from an attitude's send by the vehicle to the arrival of its sticks."""
+    """Time from the vehicle's send of an attitude to the arrival of its sticks."""
 
     client: str = ""
     sent: int
@@ -113,7 +112,7 @@ class LinkLatency:
 
 @dataclass(frozen=True, kw_only=True)
 class BenchResult:
-    """One run."""
+    """Results of one run."""
 
     machine: Machine
     quick: bool
@@ -124,18 +123,18 @@ class BenchResult:
 
 
 def name_of(policy: PolicyConfig) -> str:
-    """The checkpoint's name, or that of the policy."""
+    """Return the name of the checkpoint, or else of the policy."""
     return policy.policy if policy.checkpoint is None else policy.checkpoint.stem
 
 
 def solves_of(policy: PolicyConfig) -> str:
-    """The kind of solve that makes a policy's chunks, for tables."""
+    """Return the kind of solve that makes a policy's chunks, for tables."""
     steps = f"{policy.steps} step" + "s" * (policy.steps > 1)
     return steps if policy.may_be_dual else f"single rate, {steps}"
 
 
 def this_machine() -> Machine:
-    """Describe the computer that runs this."""
+    """Describe this computer."""
     try:
         lines = Path("/proc/cpuinfo").read_text().splitlines()
     except OSError:
@@ -150,14 +149,14 @@ def this_machine() -> Machine:
 
 
 def to_json(result: object) -> str:
-    """A dataclass as JSON, keys in the order of its fields; null = not measured."""
+    """Return a dataclass as JSON, keys in the order of its fields; null = not measured."""
     if not is_dataclass(result) or isinstance(result, type):
         raise TypeError(f"not a dataclass instance: {result!r}")
     return json.dumps(asdict(result), indent=2, allow_nan=False) + "\n"
 
 
 def print_result(result: BenchResult, console: Console) -> None:
-    """Print the machine, all tables, and what was left out."""
+    """Print the machine, all tables and the notes."""
     here = result.machine
     console.print(Text(f"{here.cpu}, {here.cores} cores, Python {here.python}, torch {here.torch}"))
     for table in (
@@ -171,7 +170,7 @@ def print_result(result: BenchResult, console: Console) -> None:
 
 
 def spread(percentiles: Percentiles | None, digits: int = 1) -> str:
-    """p50 / p99 / max, or a dash."""
+    """Return p50 / p99 / max, or a dash."""
     if percentiles is None:
         return "-"
     values = (percentiles.p50, percentiles.p99, percentiles.max)
@@ -179,7 +178,7 @@ def spread(percentiles: Percentiles | None, digits: int = 1) -> str:
 
 
 def engine_table(timings: Iterable[EngineTiming]) -> Table:
-    """A row for each piece of work, a column for each engine."""
+    """Return a table with a row for each piece of work and a column for each engine."""
     cells = {
         (one.policy, one.work, one.engine): f"{one.p50_ms:.2f} / {one.p99_ms:.2f}"
         for one in timings
@@ -214,7 +213,7 @@ _FLIGHT_ROWS: tuple[tuple[str, Callable[[Flight], str]], ...] = (
 
 
 def flight_table(flights: Iterable[Flight]) -> Table:
-    """A column for each flight, a row for each figure."""
+    """Return a table with a column for each flight and a row for each figure."""
     flights = tuple(flights)
     header = ("", *(f"{one.label}, {one.duration_s:.0f} s".replace(", ", "\n") for one in flights))
     rows = [(name, *(cell(one) for one in flights)) for name, cell in _FLIGHT_ROWS]
@@ -223,7 +222,7 @@ def flight_table(flights: Iterable[Flight]) -> Table:
 
 
 def link_table(links: Iterable[LinkLatency]) -> Table:
-    """A row for each client."""
+    """Return a table with a row for each client."""
     rows = [
         (link.client, f"{link.answered} of {link.sent}", spread(link.round_trip_ms, 2))
         for link in links

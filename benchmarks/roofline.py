@@ -1,8 +1,8 @@
-"""The least time that inference can take on one thread: its arithmetic, its weights, this machine.
+"""Lower bound of inference time on one thread, from arithmetic, weights and this machine.
 
 S. Williams, A. Waterman, D. Patterson, "Roofline", CACM 52(4), 2009: attainable time is the larger
-of work over peak arithmetic and traffic over bandwidth. Both peaks are measured here, in the same
-run as what is compared with them.
+of work over peak arithmetic and traffic over bandwidth. Both peaks are measured in the same run as
+the figures compared with them.
 """
 
 from collections.abc import Callable, Iterator, Sequence
@@ -22,10 +22,10 @@ from policy.engines.openvino_compile import precisions
 
 DTYPES = {"f32": torch.float32, "bf16": torch.bfloat16}
 MATRIX_SIDE = 1024
-"""Large enough that a product is bound by arithmetic: 2 GFLOP over 12 MB."""
+"""Side large enough that a product is bound by arithmetic: 2 GFLOP over 12 MB."""
 LEAST_BUFFER_BYTES = 1 << 20
 TRIALS, TRIAL_NS = 5, 20 * NS_PER_MS
-"""The best counts: a peak is what the machine can do, not what it did beside others."""
+"""Trials and their minimum length. The best counts: a peak excludes other load."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -34,12 +34,12 @@ class Work:
 
     flop: int
     weight_uses: int
-    """Weights read, each as often as it is used; as numbers, not bytes."""
+    """Number of weights read, counted once per use; not bytes."""
     distinct_weights: int
 
 
 def time_rooflines(policies: Sequence[PolicyConfig]) -> tuple[EngineTiming, ...]:
-    """The bound of every TOGE's work, in every precision that this processor computes in."""
+    """Return the bound of every TOGE's work, in each precision of this processor."""
     torch.set_num_threads(1)
     usable = {precision for pair in precisions() for precision in pair}
     return tuple(
@@ -58,7 +58,8 @@ def time_rooflines(policies: Sequence[PolicyConfig]) -> tuple[EngineTiming, ...]
 
 
 def works_of(policy: PolicyConfig) -> Iterator[tuple[str, Work]]:
-    """Encoding an image; and a full solve: the condition once, the U-Net once a step."""
+    """Return the work of encoding an image, and of a full solve: one condition, the U-Net per
+    step."""
     net, steps = eager_toge(policy), policy.steps
     contract = net.contract
     image = torch.zeros(1, 3, contract.image_height, contract.image_width)
@@ -74,7 +75,7 @@ def works_of(policy: PolicyConfig) -> Iterator[tuple[str, Work]]:
 
 
 def count_work(call: Callable[[], object], uses: dict[nn.Module, int]) -> Work:
-    """Count one eager call; ``uses`` says how often it runs each of its networks."""
+    """Count one eager call; ``uses`` is the number of runs of each of its networks."""
     with FlopCounterMode(display=False) as counter, torch.no_grad():
         call()
     weights = {module: sum(p.numel() for p in module.parameters()) for module in uses}
@@ -86,11 +87,11 @@ def count_work(call: Callable[[], object], uses: dict[nn.Module, int]) -> Work:
 
 
 def floor_ms(work: Work, dtype: torch.dtype) -> float:
-    """The roofline of ``work``, by peaks that are measured now."""
+    """Return the roofline of ``work``, by peaks measured now."""
     a, b = (torch.ones(MATRIX_SIDE, MATRIX_SIDE, dtype=dtype) for _ in range(2))
     product = torch.empty_like(a)
     flop_per_s = 2 * MATRIX_SIDE**3 / best_s(lambda: torch.mm(a, b, out=product))
-    # One buffer over and over: what fits a cache is read as fast as that cache allows.
+    # One buffer, read again and again: data that fits a cache is read at that cache's speed.
     num_bytes = max(work.distinct_weights * dtype.itemsize, LEAST_BUFFER_BYTES)
     buffer = torch.zeros(num_bytes // 4, dtype=torch.float32)
     bytes_per_s = buffer.nbytes / best_s(lambda: torch.sum(buffer))
@@ -98,7 +99,7 @@ def floor_ms(work: Work, dtype: torch.dtype) -> float:
 
 
 def best_s(call: Callable[[], object]) -> float:
-    """Shortest mean time of a call over a few trials, each at least ``TRIAL_NS`` long."""
+    """Return the shortest mean time of a call over a few trials of at least ``TRIAL_NS`` each."""
     clock, best_s = MonotonicClock(), float("inf")
     call()
     for _ in range(TRIALS):

@@ -1,4 +1,5 @@
-"""The state table of docs/safety.md, made of the guard's: ``python -m benchmarks.safety_table``."""
+"""Write the state table of docs/safety.md from the guard's table: ``python -m
+benchmarks.safety_table``."""
 
 import inspect
 from collections.abc import Callable, Iterator
@@ -21,7 +22,7 @@ _CONTROLLED_BY = {
 
 
 def table() -> str:
-    """Every state with who controls the vehicle, its rows in the order of their reading, the words.
+    """Return all states with their controllers and rows in reading order, then the explained words.
 
     A row is repeated in each of its states.
     """
@@ -52,18 +53,18 @@ def _lines(phase: Phase) -> Iterator[str]:
 
 
 def _words(function: Callable[..., object] | None) -> tuple[str, str]:
-    """First line of a docstring, and the rest of it as one line."""
+    """Return the first line of a docstring, and the rest of it as one line."""
     name, _, meaning = (inspect.getdoc(function) or "").partition("\n") if function else ("",) * 3
     return name, " ".join(meaning.split())
 
 
 def with_table(page: str) -> str:
-    """Return the page with the table of now."""
+    """Return the page with the current table."""
     return with_generated(page, "benchmarks.safety_table", table())
 
 
 def with_generated(page: str, module: str, text: str) -> str:
-    """Return the page with the text between the marks of the module that generates it."""
+    """Return the page with the text between the marks of its generating module."""
     begin, end = f"<!-- made by python -m {module} -->\n", "<!-- end -->\n"
     before, _, rest = page.partition(begin)
     _, _, after = rest.partition(end)

@@ -1,4 +1,4 @@
-"""Draw what a command prints as SVG.
+"""Draw the output of a command as SVG.
 
 python -m benchmarks.terminal_picture docs/images/check.svg mavbridge check --connect none
 """

@@ -2,15 +2,14 @@
 
 python -m benchmarks.train_shipped toge --out training
 
-toge begins with the weights that shipped before, which come from this repository's history: they
-fly, the expert corrects them, and they learn from that. toge-rates begins with nothing: flights of
-the expert, training, the student's own flights, training, three times over; what ships began
-otherwise (policy/weights/README.md), and this has not been run whole.
+toge starts from the weights shipped before, taken from this repository's history: they fly, the
+expert corrects them, and they learn from that. toge-rates starts from nothing: flights of the
+expert, training, the student's flights, training, three times over. The shipped toge-rates started
+differently (policy/weights/README.md), and this recipe has not been run as a whole.
 
-Run the same command again to go on after an interruption: flights that are recorded are kept,
-weights that are written are not trained again, and an unfinished training is resumed. Seeds decide
-the flights; budgets of training are minutes, so that another machine makes similar weights, not the
-same.
+Run the same command again to resume after an interruption: recorded flights and written weights are
+kept, and an unfinished training is resumed. Seeds determine the flights. Training budgets are
+minutes, so another machine makes similar weights, not the same.
 """
 
 import subprocess
@@ -27,13 +26,13 @@ app = App(help=__doc__)
 HERE = Path(__file__).parent
 
 SIZE = "--set-config network.image_size=96"
-"""Of the recorded images."""
+"""Side of the recorded images."""
 NET = "--policy toge:small:resnet8 --image-size 96 --batch-size 64"
 RACES, PX4 = "--action rates --courses race", "--autopilot px4"
 STICK_AGES, RATE_AGES = "--ages 10:220", "--ages 10:140"
 
 BEFORE = "6ec5125d549ce680a1948114cb9b9f5180260677"
-"""Commit of 2026-11-24 that holds the weights to start from."""
+"""Commit of 2026-11-24 with the weights to start from."""
 
 
 class Step(NamedTuple):
@@ -44,13 +43,13 @@ class Step(NamedTuple):
 
 
 def flights(makes: str, flags: str, student: str | None = None) -> Step:
-    """Flights of the expert, or of a student that it corrects."""
+    """Return a step that records flights of the expert, or of a student that it corrects."""
     own = "" if student is None else f" --checkpoint {student}.safetensors"
     return Step(makes, f"demonstrate {flags}{own}")
 
 
 def training(makes: str, data: str, flags: str, start: str | None = None) -> Step:
-    """A training on these folders, from the weights of an earlier one."""
+    """Return a step that trains on these folders, from the weights of an earlier training."""
     start_from = "" if start is None else f" --start-from {start}.safetensors"
     return Step(f"{makes}.safetensors", f"train {data} {NET} {flags}{start_from}")
 
@@ -95,11 +94,11 @@ STEPS: dict[str, tuple[Step, ...]] = {
 
 @app.default
 def main(policy: Literal["toge", "toge-rates"], *, out: Path, workers: int = 2) -> None:
-    """Run every step that has not been done yet.
+    """Run all steps that are not done yet.
 
     Args:
-        policy: what to train.
-        out: folder for flights and weights; one for each policy is made in it.
+        policy: the policy to train.
+        out: folder for flights and weights; one per policy is made in it.
         workers: flights at a time.
     """
     folder = out / policy
@@ -116,7 +115,7 @@ def main(policy: Literal["toge", "toge-rates"], *, out: Path, workers: int = 2) 
 
 
 def copy_weights_before(path: Path) -> None:
-    """Write the toge that shipped before; end with a message where git does not have it."""
+    """Write the toge that shipped before; exit with a message if git lacks it."""
     if path.exists():
         return
     name = f"{BEFORE}:policy/weights/toge.safetensors"
@@ -131,7 +130,7 @@ def copy_weights_before(path: Path) -> None:
 
 
 def run(folder: Path, command: str) -> None:
-    """Run one mavbridge command in the folder; end with its status if it fails."""
+    """Run one mavbridge command in the folder; exit with its status if it fails."""
     table_console().print(f"mavbridge {command}", soft_wrap=True)
     done = subprocess.run([sys.executable, "-m", "mavbridge", *command.split()], cwd=folder)
     if done.returncode:

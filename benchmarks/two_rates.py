@@ -1,17 +1,16 @@
-"""Where two rates pay: one loop that waits for the encoder, beside a fast loop that does not.
+"""Compare two rates with one: a fast loop beside the encoder, and a loop that waits for it.
 
 python -m benchmarks.two_rates --episodes 50 --json map.json --plot map.png
 
-For each time that an image takes to encode, the same courses are flown by a single loop, which runs
-as often as the encoder and the action head let it, and at two rates: as many images a second as the
-encoder makes, and 100 or 250 actions a second from the newest state. Each cell is a ``mavbridge
-evaluate`` of its own. Cells that the JSON holds for the same weights and as many episodes are not
-flown again: an interrupted map resumes.
+For each encoding time of an image, the same courses are flown by a single loop, as fast as the
+encoder and the action head allow, and at two rates: as many images per second as the encoder can
+make, and 100 or 250 actions per second from the newest state. Each cell is a separate ``mavbridge
+evaluate``. Cells that the JSON holds for the same weights and number of episodes are not flown
+again, so an interrupted map resumes.
 
-The weights by sticks fly the same courses where the autopilot closes attitude and climb, and by
-body rates, where the policy does. So what differs is who closes them, and nothing else. They do
-both in gusts as well, and the latter on PX4: a slower loop of body rates, and an airframe with more
-drag.
+The stick weights fly the same courses in two ways that differ only in who closes attitude and
+climb: by sticks the autopilot, by body rates the policy. They fly both ways in gusts, and by body
+rates on PX4, which has a slower rate loop and an airframe with more drag.
 """
 
 import hashlib
@@ -46,14 +45,14 @@ ENCODER_MS = (5, 20, 50, 100, 200)
 HEAD_MS = 4
 """Time of the action head beside the encoder in a single loop: 3 ms, and a margin for late ones."""
 MOST_HZ = 100.0
-"""Most that a single loop is asked for: the rate of the vehicle's state."""
+"""Highest rate requested of a single loop: the rate of the vehicle's state."""
 CAMERA_HZ = 30.0
 PANELS_A_ROW = 3
 LOOSE = " ".join(
     f"--set-config limits.{age}=2"
     for age in ("attitude_age", "velocity_age", "feature_age", "chunk_age")
 )
-"""Nothing is refused for its age: what age costs is what is measured."""
+"""Age limits so wide that nothing is refused: the cost of age is being measured."""
 app = App(help=__doc__)
 
 
@@ -63,11 +62,11 @@ class Control(NamedTuple):
     name: str
     flags: str
     is_race: bool = False
-    """Flown by the weights that learned from races."""
+    """True: flown by the weights that learned from races."""
 
 
 GUSTS = "--gusts 2"
-"""m/s, along each horizontal axis: more than any demonstration has."""
+"""RMS of the gusts along each horizontal axis [m/s], more than in any demonstration."""
 CONTROLS = (
     Control("sticks in ALT_HOLD, easy courses", "--courses easy"),
     Control("the same weights by body rates", "--courses easy --by-rates"),
@@ -76,7 +75,7 @@ CONTROLS = (
     Control("by body rates, gusts of 2 m/s", f"--courses easy --by-rates {GUSTS}"),
     Control("by body rates, PX4 and its airframe", "--courses easy --by-rates --autopilot px4"),
 )
-"""To 63 % of a step the body rates take 53 ms on ArduPilot and 100 ms on PX4."""
+"""Groups of the map. Body rates reach 63 % of a step after 53 ms on ArduPilot, 100 ms on PX4."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -111,11 +110,11 @@ def main(
     sticks: Path = SHIPPED,
     rates: Path = SHIPPED_RATES,
 ) -> None:
-    """Evaluate what has not been evaluated yet, then print and draw.
+    """Evaluate the missing cells, then print and draw all.
 
     Args:
-        json: where the cells are kept.
-        plot: where to draw them as PNG.
+        json: file of the cells.
+        plot: PNG to draw them in.
         episodes: courses for each cell.
         workers: episodes at a time.
         sticks: weights by sticks.
@@ -138,7 +137,7 @@ def main(
 
 
 def shown_cells(cells: list[Cell], sticks: Path, rates: Path) -> list[Cell]:
-    """All cells of these weights, in the order of the controls, encoders and loops."""
+    """Return all cells of these weights, in the order of controls, encoders and loops."""
     weights = {control.name: sha256(rates if control.is_race else sticks) for control in CONTROLS}
     names = list(weights)
     return sorted(
@@ -148,7 +147,7 @@ def shown_cells(cells: list[Cell], sticks: Path, rates: Path) -> list[Cell]:
 
 
 def flags_of(loop: Loop, encoder_ms: int) -> str:
-    """Flags of ``mavbridge evaluate`` for a loop beside such an encoder."""
+    """Return the flags of ``mavbridge evaluate`` for a loop beside an encoder of this speed."""
     images_hz = min(CAMERA_HZ, 1000 / encoder_ms)
     if loop == "one rate":
         rate_hz = min(MOST_HZ, 1000 / (encoder_ms + HEAD_MS))
@@ -228,7 +227,7 @@ def fly(flags: str, checkpoint: Path, workers: int) -> Flown:
 
 
 def sha256(path: Path) -> str:
-    """Hash of a file, in hexadecimal digits."""
+    """Return the hash of a file in hexadecimal digits."""
     return hashlib.sha256(path.read_bytes()).hexdigest()
 
 
@@ -247,9 +246,9 @@ def print_cells(cells: list[Cell]) -> None:
 
 
 def draw(cells: list[Cell], path: Path) -> None:
-    """Write a PNG: success by the encoder's time; loops are lines, controls are panels.
+    """Write a PNG of success over encoding time: one panel per control, one line per loop.
 
-    A control that was flown beside one encoder alone has no panel.
+    A control flown with a single encoder has no panel.
     """
     from matplotlib import rc_context
     from matplotlib.figure import Figure
@@ -283,7 +282,7 @@ def draw(cells: list[Cell], path: Path) -> None:
 
 
 def draw_loop(axes: Any, cells: list[Cell], colour: str) -> None:
-    """Success in percent by the encoder's time, with its interval."""
+    """Draw success [%] over encoding time, with its interval."""
     if not cells:
         return
     at = [cell.encoder_ms for cell in cells]

@@ -1,14 +1,14 @@
-"""Entry point of ``python -m sitl``: what is not installed is one message."""
+"""Entry point of ``python -m sitl``; reports a missing package in one line."""
 
 import sys
 from collections.abc import Sequence
 
 PACKAGES = {"mujoco": "mujoco", "cv2": "opencv-python-headless", "pymavlink": "pymavlink"}
-"""Names to import, each with the name to install it by."""
+"""Required packages: import name to pip name."""
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """Run the command; returns the exit code, 2 for a usage error or a missing package."""
+    """Run the command. Return the exit code: 2 for a usage error or a missing package."""
     try:
         from sitl.command_line import run
     except ModuleNotFoundError as error:

@@ -1,4 +1,4 @@
-"""Flies the vehicle in real time: sockets, the 400 Hz loop, the camera thread, the final report."""
+"""Real-time flight: sockets, the 400 Hz loop, the camera thread and the final report."""
 
 import os
 import sys
@@ -21,18 +21,18 @@ from sitl.vehicle.config import STEP_NS, AutopilotName, VehicleConfig
 
 JOIN_TIMEOUT_S = 5.0
 LEAST_PRIORITY = 19
-"""Of a vehicle that flies on faster than real time: flights beside it are judged by the ms."""
+"""Niceness while flying on faster than real time, to protect the timing of other flights."""
 PilotName = Literal["gamepad", "keyboard", "expert"]
 PILOTS: tuple[PilotName, ...] = ("gamepad", "keyboard", "expert")
 _PX4_PARAMS = {"COM_RC_IN_MODE": 0.0, "COM_FLTMODE_BOOT": 1.0}
-"""Sticks from the receiver alone; the mode after boot is Altitude."""
+"""Parameters for a pilot: sticks from the receiver only, Altitude mode after boot."""
 
 
 class PilotOptions(NamedTuple):
-    """Who moves the receiver."""
+    """Pilot that moves the receiver."""
 
     name: PilotName
-    axes: str  # axes of a gamepad, as ``sitl.pilot.transmitter`` reads them
+    axes: str  # gamepad axes, in the format of ``sitl.pilot.transmitter``
     speed_mps: float  # speed of the expert
 
 
@@ -48,13 +48,12 @@ def run_vehicle(
     duration_s: float | None,
     fly_on_s: float = 0.0,
 ) -> None:
-    """Fly until the duration is over (None: endless), or a signal comes.
+    """Fly for ``duration_s`` (None: endless) or until a signal, then write the report.
 
-    Then the vehicle flies on for ``fly_on_s`` by itself before the report is written.
+    Before the report the vehicle flies on for ``fly_on_s`` without links or pilot.
 
     Raises:
-        UsageError: a link, the RC input, the pilot, the camera's name or the report's folder cannot
-            be used.
+        UsageError: a link, RC input, pilot, camera name or report folder cannot be used.
     """
     if report is not None and not report.parent.is_dir():
         raise UsageError(f"--report {report}: there is no folder {report.parent}")
@@ -95,7 +94,7 @@ def run_vehicle(
 
 
 def prepare_vehicle(vehicle: SimulatedVehicle, autopilot: AutopilotName) -> None:
-    """Have the vehicle fly by its receiver in ALT_HOLD or ALTCTL; to be called before it flies."""
+    """Make the vehicle fly by its receiver in ALT_HOLD or ALTCTL. Call before the flight."""
     if autopilot == "px4":
         for name, value in _PX4_PARAMS.items():
             vehicle.params.set(name, value)
@@ -110,10 +109,10 @@ def make_pilot(
     course: Course,
     clock: Clock,
 ) -> tuple[Pilot, str]:
-    """The pilot, and a line for the user about it.
+    """Return the pilot and a line about it for the user.
 
     Raises:
-        UsageError: its package, display or vehicle is missing, or its axes cannot be read.
+        UsageError: the pilot lacks its package, display or vehicle, or its axes cannot be read.
     """
     name, axes, speed_mps = options
     if name == "expert":
@@ -122,7 +121,7 @@ def make_pilot(
         expert = ExpertPilot(vehicle, course, speed_mps=speed_mps)
         return expert, f"the expert flies at {speed_mps:g} m/s"
     wanted = parse_axes(axes)
-    os.environ.setdefault("PYGAME_HIDE_SUPPORT_PROMPT", "1")  # a line of its own on every import
+    os.environ.setdefault("PYGAME_HIDE_SUPPORT_PROMPT", "1")  # no banner on import
     try:
         import pygame
 
@@ -150,9 +149,9 @@ def fly(
     *,
     rc_input: Pilot | None = None,
 ) -> None:
-    """Run the loop on a 2.5 ms grid: receive, advance the vehicle to now, send what is due.
+    """Run the loop on a 2.5 ms grid: receive, advance the vehicle to now, send due messages.
 
-    After a stall the vehicle catches up with the clock, and missed grid points are skipped.
+    After a stall the vehicle catches up with the clock; missed grid points are skipped.
     """
     status = _Status(vehicle)
     due_ns = clock.now_ns()
@@ -173,7 +172,7 @@ def fly(
 
 
 def fly_on(vehicle: SimulatedVehicle, duration_s: float) -> None:
-    """Advance the vehicle as fast as the computer can; it receives and sends nothing."""
+    """Advance the vehicle as fast as the computer can, without receiving or sending."""
     start_ns = vehicle.ap.now_ns
     for now_ns in range(start_ns, start_ns + round(duration_s * NS_PER_S), STEP_NS):
         vehicle.step(now_ns)
@@ -187,7 +186,7 @@ def print_status(line: str) -> None:
 
 
 class _Status:
-    """Prints what changes: connections, mode, arming and the vehicle's texts."""
+    """Prints changes: connections, mode, arming and the vehicle's texts."""
 
     def __init__(self, vehicle: SimulatedVehicle) -> None:
         self._vehicle = vehicle
@@ -217,7 +216,7 @@ class _Status:
 def filming(
     vehicle: SimulatedVehicle, course: Course, camera: CameraOptions, clock: Clock
 ) -> Iterator[None]:
-    """Publish the vehicle's FPV view from a thread of its own while the context lasts."""
+    """Context manager: publish the vehicle's FPV view from a separate thread."""
     stop = threading.Event()
     size = (camera.image_size, camera.image_size)
     renderer = FpvRenderer(course, *size, vehicle.ap.config.conditions)

@@ -1,4 +1,4 @@
-"""The host's clock, as integer nanoseconds shared by all processes, and its signals to stop."""
+"""Host clock in integer nanoseconds, shared by all processes, and stop signals."""
 
 import signal
 import time
@@ -10,32 +10,31 @@ NS_PER_MS = 1_000_000
 
 
 class Clock:
-    """CLOCK_MONOTONIC: never set back, one origin for all processes; tests inject a stepped one."""
+    """CLOCK_MONOTONIC: never set back, one origin for all processes. Tests inject another one."""
 
     def now_ns(self) -> int:
         return time.monotonic_ns()
 
     def sleep_until_ns(self, deadline_ns: int) -> None:
-        """Return at or after ``deadline_ns``; at once if it has passed."""
+        """Sleep until ``deadline_ns``; return at once if it has passed."""
         while (left_ns := deadline_ns - time.monotonic_ns()) > 0:
             time.sleep(left_ns / NS_PER_S)
 
 
 def wall_ns() -> int:
-    """Unix time, for what a protocol wants it for."""
+    """Return Unix time, for protocols that need it."""
     return time.time_ns()
 
 
 def monotonic_from_wall_ns(wall_ns: int) -> int:
-    """Convert a recent CLOCK_REALTIME stamp, such as the kernel's of a datagram."""
+    """Convert a recent CLOCK_REALTIME stamp, for example the kernel's stamp of a datagram."""
     return time.monotonic_ns() - (time.time_ns() - wall_ns)
 
 
 class StopRequest:
-    """A flag that a signal handler may set.
+    """Stop flag that a signal handler may set.
 
-    Not a ``threading.Event``: a second signal would wait for the lock that the first one's handler
-    holds.
+    Not a ``threading.Event``: a second signal's handler would wait for the first one's lock.
     """
 
     def __init__(self) -> None:
@@ -50,7 +49,7 @@ class StopRequest:
 
 @contextmanager
 def stop_on_signal() -> Iterator[StopRequest]:
-    """Let SIGINT and SIGTERM request the stop; the old handlers come back afterwards."""
+    """Context manager: SIGINT and SIGTERM set the flag; the old handlers return at the end."""
     stop = StopRequest()
     signals = (signal.SIGINT, signal.SIGTERM)
     previous = [signal.signal(number, lambda *_: stop.set()) for number in signals]

@@ -1,4 +1,4 @@
-"""Commands: ``python -m sitl`` flies; ``camera`` films, ``course`` prints a course."""
+"""Commands: ``python -m sitl`` flies, ``camera`` films a vehicle, ``course`` prints a course."""
 
 import argparse
 import math
@@ -24,7 +24,7 @@ from sitl.vehicle.config import (
 
 KEY_BYTES = 32
 EPOCH_2015_NS = 1_420_070_400 * NS_PER_S
-"""Unix time from which timestamps of MAVLink 2 signing count."""
+"""Unix time of the epoch of MAVLink 2 signing timestamps."""
 SIGNING_TICK_NS = 10_000
 
 
@@ -171,7 +171,7 @@ def _print_course(args: argparse.Namespace) -> None:
 def _number(
     parse: type[int] | type[float], low: float, high: float, wanted: str
 ) -> Callable[[str], float]:
-    """A flag's type: a number within [low, high]."""
+    """Return a flag's type: a number within [low, high]."""
 
     def convert(text: str) -> float:
         with suppress(ValueError):

@@ -1,4 +1,4 @@
-"""Gate courses: where the gates stand, generated from a seed, and as seen from the vehicle.
+"""Gate courses generated from a seed, passage and crash detection, and ground truth.
 
 Frame: local NED in metres, origin at the start, the vehicle heads north. A gate is a vertical
 square opening; ``yaw_rad`` is the heading in which it must be flown through (0 = north).
@@ -16,24 +16,24 @@ from sitl.rotation import Quat, Vec3, conjugate, rotate, to_euler, wrap_pi
 OPENING_M = 2.4  # side of the opening: five times the width of a 0.5 m quadrotor
 BAR_M = 0.32  # width of the bars around an opening
 DEPTH_M = 0.24  # depth of the frame along the passage; the gate's centre is halfway in
-RACE_SEEDS = 1_000_000_000  # seeds from here on are race courses, those below are easy ones
+RACE_SEEDS = 1_000_000_000  # seeds from here on give race courses, smaller ones easy courses
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Family:
-    """Limits of the courses of one kind; pairs are least and most."""
+    """Limits of one kind of course; pairs are (least, most)."""
 
     gate_count: int
     first_leg_m: float
     leg_m: tuple[float, float]
-    turn_rad: float  # largest turn from one leg to the next, to either side
-    climb_m: float  # largest change of height from gate to gate, up or down
+    turn_rad: float  # largest turn between legs, to either side
+    climb_m: float  # largest height change between gates, up or down
     first_altitude_m: tuple[float, float]
     altitude_m: tuple[float, float]
 
 
-# At 8 m/s the sharpest turn over the shortest leg, 35 degrees in 7 m, asks for v^2 * angle / leg =
-# 5.6 m/s^2 = g * tan(30 deg), ArduCopter's default lean limit. The climb limit asks for 1.1 m/s.
+# At 8 m/s the sharpest turn over the shortest leg, 35 degrees in 7 m, needs v^2 * angle / leg = 5.6
+# m/s^2 = g * tan(30 deg), ArduCopter's default lean limit. The climb limit needs 1.1 m/s.
 EASY = Family(
     gate_count=8,
     first_leg_m=8.0,
@@ -43,8 +43,8 @@ EASY = Family(
     first_altitude_m=(2.0, 3.0),
     altitude_m=(2.0, 4.0),
 )
-# At 10 m/s the sharpest turn, 50 degrees in 10 m, asks for 8.7 m/s^2: a lean of 42 degrees, and
-# with the steepest climb or dive, 3 m in 10 m, for changes of 3 m/s in a second.
+# At 10 m/s the sharpest turn, 50 degrees in 10 m, needs 8.7 m/s^2: a lean of 42 degrees. The
+# steepest climb or dive, 3 m in 10 m, adds velocity changes of 3 m/s within a second.
 RACE = Family(
     gate_count=12,
     first_leg_m=12.0,
@@ -62,17 +62,17 @@ class Gate:
 
     center_ned_m: Vec3
     yaw_rad: float  # heading of the passage, in [-pi, pi]
-    size_m: float  # side of the square opening; the frame around it is not part of it
+    size_m: float  # side of the square opening, without the frame
     index: int  # position on the course, from 0
 
     def to_axes(self, vector_ned: Vec3) -> Vec3:
-        """Turn a direction, velocity or offset into gate axes: forward through it, right, down."""
+        """Rotate a NED direction, velocity or offset into gate axes: forward, right, down."""
         north, east, down = vector_ned
         cos_yaw, sin_yaw = math.cos(self.yaw_rad), math.sin(self.yaw_rad)
         return (north * cos_yaw + east * sin_yaw, east * cos_yaw - north * sin_yaw, down)
 
     def offset_m(self, position_ned_m: Vec3) -> Vec3:
-        """Position relative to the gate's centre in gate axes: forward through it, right, down."""
+        """Return the position relative to the gate's centre in gate axes: forward, right, down."""
         north_m, east_m, down_m = position_ned_m
         center_n, center_e, center_d = self.center_ned_m
         return self.to_axes((north_m - center_n, east_m - center_e, down_m - center_d))
@@ -88,7 +88,7 @@ class Course:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class AirborneStart:
-    """State of a flight that begins in the air."""
+    """Initial state of a flight that begins in the air."""
 
     position_ned_m: Vec3
     velocity_ned_mps: Vec3
@@ -97,10 +97,10 @@ class AirborneStart:
 
 
 def make_course(seed: int) -> Course:
-    """Generate the course of this seed: the same on every machine.
+    """Generate the course of this seed; it is the same on every machine.
 
-    Below ``RACE_SEEDS`` legs turn by up to 35 degrees and rise or fall by up to 1 m, from there on
-    by up to 50 degrees and 3 m. A gate faces the mean of the legs before and after it.
+    Below ``RACE_SEEDS``, legs turn by up to 35 degrees and rise or fall by up to 1 m; from there
+    on, by up to 50 degrees and 3 m. A gate faces the mean of the legs before and after it.
 
     Raises:
         UsageError: the seed is negative.
@@ -136,7 +136,7 @@ def make_course(seed: int) -> Course:
 
 
 def course_to_json(course: Course) -> str:
-    """The course as JSON: frame, seed and gates in order."""
+    """Return the course as JSON: seed, frame and gates in order."""
     return json.dumps(
         {
             "seed": course.seed,
@@ -150,7 +150,7 @@ def course_to_json(course: Course) -> str:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class GateTruth:
-    """The next two gates relative to one pose; None where the course has no more gates."""
+    """The next two gates relative to one pose; None past the end of the course."""
 
     next_gate: int | None = None  # index of the next gate
     gate_body_m: Vec3 | None = None  # centre of the next gate in FRD body axes
@@ -161,7 +161,7 @@ class GateTruth:
 def gate_truth(
     course: Course, next_gate: int | None, position_ned_m: Vec3, ned_from_body_wxyz: Quat
 ) -> GateTruth:
-    """Ground truth at a pose for ``next_gate`` and the gate after it."""
+    """Return the ground truth at a pose for ``next_gate`` and the gate after it."""
     if next_gate is None:
         return GateTruth()
     body_from_ned = conjugate(ned_from_body_wxyz)
@@ -181,12 +181,12 @@ def gate_truth(
 
 
 VEHICLE_RADIUS_M = 0.25
-"""Distance to the rotor tips; the vehicle is treated as a cube of twice this side."""
+"""Distance from the centre to the rotor tips; the vehicle counts as a cube of twice this side."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class GatePass:
-    """A gate that was flown through, and when."""
+    """Passage of one gate and its time."""
 
     index: int
     t_s: float
@@ -202,11 +202,10 @@ class Crash:
 
 
 class GateCounter:
-    """Counts the gates that a trajectory passes: in order, forward, inside the opening.
+    """Counts the gates that a trajectory passes in order, forward and inside the opening.
 
-    ``first`` is the gate to begin with, for a flight that starts in the middle of the course.
-    A point on the very edge of the opening is inside. A gate that was flown around stays the next
-    one until it has been passed.
+    ``first`` is the gate to begin with, for a flight that starts in the middle of the course. The
+    edge of the opening is inside. A gate that was flown around stays next until it is passed.
     """
 
     def __init__(self, course: Course, *, first: int = 0) -> None:
@@ -221,11 +220,11 @@ class GateCounter:
         return index if index < len(self._gates) else None
 
     def interrupt(self) -> None:
-        """Start a new trajectory: the next position was not reached by flying, after a reboot."""
+        """Start a new trajectory after a jump in position, for example a reboot."""
         self._previous = None
 
     def update(self, position_ned_m: Vec3, t_s: float) -> None:
-        """Append a position to the trajectory, which is straight since the previous one."""
+        """Append a position; the path from the previous one counts as a straight line."""
         previous, self._previous = self._previous, (position_ned_m, t_s)
         if previous is None:
             return
@@ -240,7 +239,7 @@ class GateCounter:
 
 
 def crossing(gate: Gate, start_ned_m: Vec3, end_ned_m: Vec3) -> float | None:
-    """Fraction of the segment at which it passes forward through the opening, or None."""
+    """Return the fraction of the segment at which it passes forward through the opening, if any."""
     start_forward_m, start_right_m, start_down_m = gate.offset_m(start_ned_m)
     end_forward_m, end_right_m, end_down_m = gate.offset_m(end_ned_m)
     if not start_forward_m < 0.0 <= end_forward_m:
@@ -253,10 +252,10 @@ def crossing(gate: Gate, start_ned_m: Vec3, end_ned_m: Vec3) -> float | None:
 
 
 def struck_gate(course: Course, start_ned_m: Vec3, end_ned_m: Vec3) -> int | None:
-    """Index of the first gate whose frame the straight segment touches; None if it touches none.
+    """Return the index of the first gate whose frame the straight segment touches, or None.
 
     The frame is the square ring between the opening and its outer edge, ``DEPTH_M`` deep, without
-    the posts below it; nothing stops the vehicle there, since the physics has no gates.
+    the posts below it. Nothing stops the vehicle there, since the physics has no gates.
     """
     for gate in course.gates:
         if _is_near(gate, start_ned_m, end_ned_m) and _strikes(gate, start_ned_m, end_ned_m):
@@ -265,7 +264,7 @@ def struck_gate(course: Course, start_ned_m: Vec3, end_ned_m: Vec3) -> int | Non
 
 
 def _is_near(gate: Gate, start_ned_m: Vec3, end_ned_m: Vec3) -> bool:
-    """Cheap test that never misses a gate that is struck."""
+    """True if the gate may be struck; a cheap check without false negatives."""
     reach_m = 1.5 * (gate.size_m / 2 + BAR_M + DEPTH_M + VEHICLE_RADIUS_M)
     for start, end, center in zip(start_ned_m, end_ned_m, gate.center_ned_m, strict=True):
         if min(start, end) - center > reach_m or center - max(start, end) > reach_m:
@@ -288,7 +287,7 @@ def _strikes(gate: Gate, start_ned_m: Vec3, end_ned_m: Vec3) -> bool:
 
 
 def _meets_box(start: Vec3, end: Vec3, low: Vec3, high: Vec3) -> bool:
-    """Segment against a closed axis-aligned box (slab method of Kay and Kajiya, 1986)."""
+    """True if a segment meets a closed axis-aligned box (slab method of Kay and Kajiya, 1986)."""
     enter, leave = 0.0, 1.0
     for a, b, lowest, highest in zip(start, end, low, high, strict=True):
         if a == b:

@@ -1,7 +1,7 @@
-"""The base of both firmwares below MAVLink: parameters, sensing, readiness, landing, launch.
+"""Base of both simulated firmwares below MAVLink: parameters, sensors, readiness, landing, launch.
 
-`sitl.ardupilot.autopilot` and `sitl.px4.autopilot` have what differs; nothing else asks which of
-the two a vehicle runs.
+`sitl.ardupilot.autopilot` and `sitl.px4.autopilot` hold the differences. No other module asks which
+firmware a vehicle runs.
 """
 
 import math
@@ -34,31 +34,31 @@ class StatusText(NamedTuple):
 class AttitudeSetpoint(NamedTuple):
     """A valid SET_ATTITUDE_TARGET; body axes are FRD."""
 
-    ned_from_body_wxyz: Quat | None  # None: the rates alone count
+    ned_from_body_wxyz: Quat | None  # None: rates only
     rate_body_radps: Vec3
-    thrust: float  # PX4: a collective, 0..1; ArduPilot: what GUID_OPTIONS says
+    thrust: float  # PX4: collective, 0..1; ArduPilot: as GUID_OPTIONS says
 
 
 def float32(value: float) -> float:
-    """Round as the wire does; raises OverflowError beyond its range."""
+    """Round to float32, as on the wire. Raises OverflowError beyond its range."""
     (rounded,) = struct.unpack("<f", struct.pack("<f", value))
     return float(rounded)
 
 
 class Params:
-    """Named numbers in a fixed, sorted order, which is the index in PARAM_VALUE.
+    """Named numbers in sorted order; the position is the index in PARAM_VALUE.
 
     An integer travels as its four bytes in the float field of PARAM_VALUE and PARAM_SET, so a peer
     that reads it as a number sees a denormal.
     """
 
     def __init__(self, values: Mapping[str, float], integers: Collection[str] = ()) -> None:
-        """``integers`` are the names of those that are stored as INT32; the others are float32."""
+        """Store the values as INT32 where the name is in ``integers``, else as float32."""
         self._values = {name: float32(values[name]) for name in sorted(values)}
         self._integers = integers
         self.names: tuple[str, ...] = tuple(self._values)
         """Names on the wire, in PARAM_VALUE's order."""
-        self.changes = 0  # number of changed values: PX4 tells its modules, not which one
+        self.changes = 0  # count of changes: PX4's modules do not learn which value changed
 
     def __getitem__(self, name: str) -> float:
         return self._values[name]
@@ -67,15 +67,15 @@ class Params:
         return name in self._values
 
     def get(self, name: str, default: float) -> float:
-        """The value, or ``default`` where the release lacks the parameter."""
+        """Return the value, or ``default`` if the release lacks the parameter."""
         return self._values.get(name, default)
 
     def integer(self, name: str) -> int:
-        """The value of an integer, an enumeration or a bit mask."""
+        """Return the value of an integer, an enumeration or a bit mask."""
         return int(self._values[name])
 
     def set(self, name: str, value: float) -> bool:
-        """Store the value; False for an unknown name or a value that its type cannot hold."""
+        """Store the value. Return False for an unknown name or a value outside its type."""
         if name not in self._values or not math.isfinite(value):
             return False
         if name in self._integers:
@@ -92,19 +92,19 @@ class Params:
         return True
 
     def kind(self, name: str) -> int:
-        """MAV_PARAM_TYPE of PARAM_VALUE."""
+        """Return the MAV_PARAM_TYPE of PARAM_VALUE."""
         is_integer = name in self._integers
         return int(mav.MAV_PARAM_TYPE_INT32 if is_integer else mav.MAV_PARAM_TYPE_REAL32)
 
     def on_wire(self, name: str) -> float:
-        """The value as the float field of PARAM_VALUE carries it."""
+        """Return the value as the float field of PARAM_VALUE carries it."""
         if name not in self._integers:
             return self._values[name]
         (packed,) = struct.unpack("<f", struct.pack("<i", self.integer(name)))
         return float(packed)
 
     def set_on_wire(self, name: str, packed: float) -> bool:
-        """Store what the float field of PARAM_SET carries; False as in `set`."""
+        """Store the float field of PARAM_SET. Return False if refused, like `set`."""
         if name not in self._integers:
             return self.set(name, packed)
         (value,) = struct.unpack("<i", struct.pack("<f", packed))
@@ -112,28 +112,28 @@ class Params:
 
 
 class Autopilot(ABC):
-    """One boot of the flight controller without its links; stamps are the caller's clock."""
+    """One boot of the flight controller, without its links. Stamps use the caller's clock."""
 
-    step_ns: ClassVar[int]  # control period: what `step` advances by
+    step_ns: ClassVar[int]  # control period, by which `step` advances
     airframe: ClassVar[Airframe]
     gps_period_ns: ClassVar[int]
     gyro_noise_radps: ClassVar[float] = 0.0
-    """Noise of the body rates on each axis, on top of the conditions'."""
-    id_param: ClassVar[str]  # parameter of the vehicle's system id
+    """Noise of the body rates on each axis, in addition to the conditions'."""
+    id_param: ClassVar[str]  # name of the system id's parameter
 
     def __init__(self, params: Params, config: VehicleConfig, boot_ns: int) -> None:
-        self.params = params  # a reboot leaves them
+        self.params = params  # survives a reboot
         self.config = config
         self.boot_ns = boot_ns
         self.now_ns = boot_ns  # time of the last control step
         self.landed = True
-        self.battery = Battery()  # replaced as a whole by whoever wants another one
+        self.battery = Battery()  # to change it, replace the whole object
         self.sensors_frozen = False
-        """Fault: telemetry and control keep the last state, the physics goes on."""
+        """Injected fault: telemetry and control keep the last state while the physics goes on."""
         self.position_lost = False
-        """Fault: the estimator has no horizontal position any more, as long as this is set."""
+        """Injected fault: the estimator has no horizontal position while this is set."""
         self.texts: list[StatusText] = []
-        """Status texts that every link is to send next; the reader empties the list."""
+        """Status texts to send on every link; the reader empties the list."""
         self.motor_commands: tuple[float, ...] = STOPPED
         conditions = config.conditions
         rate_noise_radps = math.hypot(conditions.rate_noise_radps, self.gyro_noise_radps)
@@ -147,7 +147,7 @@ class Autopilot(ABC):
         self._still_since_ns: int | None = boot_ns
 
     def rebooted(self) -> Self:
-        """The flight controller after a restart on the ground at the origin."""
+        """Return the flight controller after a restart on the ground at the origin."""
         return type(self)(self.params, self.config, self.now_ns)
 
     @property
@@ -157,24 +157,24 @@ class Autopilot(ABC):
     @property
     @abstractmethod
     def mode_name(self) -> str:
-        """The firmware's own name of the flight mode."""
+        """The firmware's name of the flight mode."""
 
     @property
     @abstractmethod
     def in_failsafe(self) -> bool:
-        """The pilot's sticks are lost, and the firmware acts on it."""
+        """True if the pilot's sticks are lost and the firmware acts on it."""
 
     @property
     @abstractmethod
     def sticks_us(self) -> tuple[int, int, int, int]:
-        """Roll, pitch, throttle and yaw that the modes use; 0: never had a value.
+        """Roll, pitch, throttle and yaw that the modes use [us]; 0: never had a value.
 
-        Microseconds, 1500 centred, as ArduCopter has them: less is left, nose down and descent.
+        1500 is centred. Smaller is left, nose down and descent, as in ArduCopter.
         """
 
     @abstractmethod
     def set_receiver(self, values_us: Sequence[int]) -> None:
-        """Move the pilot's sticks and switches, in microseconds by channel; all zeros: off."""
+        """Move the pilot's sticks and switches [us, by channel]; all zeros: transmitter off."""
 
     @property
     def step_s(self) -> float:
@@ -195,12 +195,12 @@ class Autopilot(ABC):
 
     @property
     def uptime_ns(self) -> int:
-        """Time since boot: the clock of all telemetry."""
+        """Time since boot, the clock of all telemetry."""
         return self.now_ns - self.boot_ns
 
     @property
     def estimator_ready(self) -> bool:
-        """True once the attitude is aligned: arming is possible."""
+        """True once the attitude is aligned, which arming requires."""
         return self.uptime_ns >= self.config.estimator_ready_s * NS_PER_S
 
     @property
@@ -225,9 +225,9 @@ class Autopilot(ABC):
     def launch(
         self, position_ned_m: Vec3, velocity_ned_mps: Vec3, ned_from_body_wxyz: Quat
     ) -> None:
-        """Put the vehicle in the air in this state, armed, where the sticks lean and climb.
+        """Put the vehicle into the air in this state, armed, in a mode with lean and climb sticks.
 
-        It stays in a mode that setpoints fly.
+        A mode flown by setpoints is kept.
         """
         self._physics = self._quad.airborne(position_ned_m, velocity_ned_mps, ned_from_body_wxyz)
         self.sensed = self.gps = self._physics.body
@@ -235,11 +235,11 @@ class Autopilot(ABC):
 
     @abstractmethod
     def _read_inputs(self) -> None:
-        """Take sticks and setpoints, and decide on mode and arming."""
+        """Read sticks and setpoints, and decide on mode and arming."""
 
     @abstractmethod
     def _motors(self) -> tuple[float, ...]:
-        """Motor commands of this step, each in [0, 1]."""
+        """Return the motor commands of this step, each in [0, 1]."""
 
     @abstractmethod
     def _start_in_air(self) -> None:
@@ -248,7 +248,7 @@ class Autopilot(ABC):
     @property
     @abstractmethod
     def _is_pushing(self) -> bool:
-        """Thrust is above half of hovering: the vehicle is no landed one."""
+        """True if thrust is above half of hover thrust, so that the vehicle is not landed."""
 
     def _set_landed(self, *, landed: bool) -> None:
         self.landed = landed

@@ -1,4 +1,4 @@
-"""Measures a flight on the vehicle's side of the wire, as docs/formats.md says."""
+"""Measurement of a flight on the vehicle's side of the wire; format: docs/formats.md."""
 
 import json
 import math
@@ -12,23 +12,23 @@ from sitl.course import Course, Crash, GateCounter, GatePass, struck_gate
 from sitl.firmware import Autopilot
 from sitl.rotation import Vec3, cos_tilt, to_euler
 
-CRASH_SPEED_MPS = 3.5  # ALT_HOLD descends at up to 2.5 m/s: a hard landing, not a crash
+CRASH_SPEED_MPS = 3.5  # ALT_HOLD descends at up to 2.5 m/s, a hard landing but no crash
 CRASH_TILT_COS = math.cos(math.radians(45.0))
 MAX_TEXTS = 200
 END_AFTER_NS = NS_PER_S
-"""From the last gate to the end of a flown course: a crash just behind the gate still counts."""
+"""Time from the last gate to the end of the course: a crash just behind the gate counts."""
 PATH_PERIOD_NS = NS_PER_S // 20
-"""Path length is summed at 20 Hz: fine enough for turns, coarse enough not to add up vibration."""
+"""Path length is summed at 20 Hz: fine enough for turns, coarse enough to leave out vibration."""
 
 MAX_STICK_ENTRIES = 20_000
 STICK_PERIOD_NS = NS_PER_S // 20
-"""While armed an entry is made at least this often, so that the motion under held sticks shows."""
+"""Longest time between two entries while armed, so that the motion under held sticks shows."""
 
-LogEntry: TypeAlias = dict[str, float | str]  # a time ``t_s`` and what happened then
+LogEntry: TypeAlias = dict[str, float | str]  # a time ``t_s`` and an event
 
 
 class FlightLog:
-    """Collects the measurements of one run; ``start_ns``, the first boot, is its time zero."""
+    """Collects the measurements of one run. Times count from ``start_ns``, the first boot."""
 
     def __init__(self, start_ns: int, course: Course | None) -> None:
         self.refused_messages = 0
@@ -40,9 +40,9 @@ class FlightLog:
         self._has_course = course is not None
         self._gates = GateCounter(self._course)
         self.overrides = _Arrivals()  # RC_CHANNELS_OVERRIDE that drives at least one stick
-        self.manual_controls = _Arrivals()  # of senders that the vehicle listens to
-        self.setpoints = _Arrivals()  # attitudes, rates and velocities that it follows
-        self.releases = 0  # RC_CHANNELS_OVERRIDE that only release sticks
+        self.manual_controls = _Arrivals()  # only of senders that the vehicle listens to
+        self.setpoints = _Arrivals()  # accepted attitudes, rates and velocities
+        self.releases = 0  # RC_CHANNELS_OVERRIDE that only releases sticks
         self._sticks = _StickRecord()
         self._arrived_ns = start_ns
         self._modes: list[LogEntry] = []
@@ -59,7 +59,7 @@ class FlightLog:
 
     @property
     def next_gate(self) -> int | None:
-        """Index of the gate to be passed next; None after the last, or without a course."""
+        """Index of the next gate to pass; None after the last gate or without a course."""
         return self._gates.next_gate
 
     @property
@@ -71,20 +71,20 @@ class FlightLog:
         return tuple(self._gates.passed)
 
     def start_over(self, next_gate: int) -> None:
-        """Note that the vehicle was placed elsewhere in the air: count gates from this one."""
+        """Restart the count at ``next_gate`` after the vehicle was placed elsewhere in the air."""
         self._gates = GateCounter(self._course, first=next_gate)
         self._position_ned_m = None
         self._was_touching = False
         self.crash = None
 
     def on_reboot(self) -> None:
-        """Note that the vehicle is back at the origin, without having flown there."""
+        """Start a new trajectory at the origin, which the vehicle did not fly to."""
         self._gates.interrupt()
         self._position_ned_m = None
         self._was_touching = True
 
     def verdict(self, now_ns: int) -> Literal["crashed", "finished"] | None:
-        """End of the course: by a crash, or a second after its last gate; None while it goes on."""
+        """Return the end of the course: a crash, or 1 s after the last gate; None before that."""
         if self.crashed:
             return "crashed"
         if not self._gates.passed or self.next_gate is not None:
@@ -93,9 +93,10 @@ class FlightLog:
         return "finished" if self._gates.passed[-1].t_s * NS_PER_S <= over_ns else None
 
     def on_received(self, arrived_ns: int) -> None:
-        """Note that bytes came: after a stall the steps that act on them lie before their arrival.
+        """Note the arrival of bytes.
 
-        What they change in ``sticks`` is stamped with the arrival then, never with less.
+        After a stall the vehicle acts on them in steps dated before their arrival. Stick changes of
+        such steps are stamped with the arrival instead.
         """
         self._arrived_ns = max(self._arrived_ns, arrived_ns)
 
@@ -183,20 +184,20 @@ class _StickEntry(NamedTuple):
     mode: str
     armed: bool
     failsafe: bool
-    lean_deg: float  # between the vehicle's axis and the vertical
+    lean_deg: float  # angle between the vehicle's vertical axis and the vertical
     climb_mps: float
     height_m: float
 
 
 class _StickRecord:
-    """The sticks that the vehicle acted on and its motion, at every change and between them."""
+    """Sticks that the vehicle acted on and its motion, at changes and periodically while armed."""
 
     def __init__(self) -> None:
         self._entries: deque[_StickEntry] = deque(maxlen=MAX_STICK_ENTRIES)
         self._due_ns = 0
 
     def update(self, ap: Autopilot, stamp_ns: int) -> None:
-        """Look at the vehicle after a control step; ``stamp_ns`` is the time of an entry."""
+        """Add an entry, stamped ``stamp_ns``, if one is due after this control step."""
         last = self._entries[-1] if self._entries else None
         us, state = ap.sticks_us, (ap.mode_name, ap.armed, ap.in_failsafe)
         is_same = last is not None and state == last[2:5]
@@ -222,7 +223,7 @@ class _StickRecord:
 
 
 class _Arrivals:
-    """Messages of one kind, and the times of the first and the last."""
+    """Count of one kind of message, and the times of the first and the last."""
 
     def __init__(self) -> None:
         self._count = 0
@@ -240,7 +241,7 @@ class _Arrivals:
 
 
 def write_report(path: Path, summary: dict[str, Any]) -> None:
-    """Write the report as JSON, each entry of ``sticks`` on a line of its own."""
+    """Write the report as JSON, with one line per entry of ``sticks``."""
     sticks = ",\n    ".join(json.dumps(entry) for entry in summary["sticks"])
     rest = {key: value for key, value in summary.items() if key != "sticks"}
     head = json.dumps(rest, indent=2).removesuffix("\n}")

@@ -1,4 +1,4 @@
-"""Attitude arithmetic on plain floats: at these sizes several times cheaper than arrays.
+"""Attitude arithmetic on plain floats, several times cheaper than arrays at these sizes.
 
 Quaternions are unit, w first, and named by the frames that they join: ``ned_from_body`` rotates
 body (FRD) vectors into NED. Euler angles are yaw, then pitch, then roll (aerospace order).
@@ -30,7 +30,7 @@ def conjugate(q: Quat) -> Quat:
 
 
 def rotate(q: Quat, v: Vec3) -> Vec3:
-    """The vector in the frame on the left of the quaternion's name."""
+    """Rotate a vector into the frame on the left of the quaternion's name."""
     w, x, y, z = q
     vx, vy, vz = v
     tx = 2.0 * (y * vz - z * vy)
@@ -56,7 +56,7 @@ def from_euler(roll: float, pitch: float, yaw: float) -> Quat:
 
 
 def to_euler(q: Quat) -> Vec3:
-    """Roll, pitch, yaw in radians; pitch within +-pi/2."""
+    """Return roll, pitch and yaw [rad]; pitch is within +-pi/2."""
     w, x, y, z = q
     roll = math.atan2(2.0 * (w * x + y * z), 1.0 - 2.0 * (x * x + y * y))
     pitch = math.asin(max(-1.0, min(1.0, 2.0 * (w * y - z * x))))
@@ -65,7 +65,7 @@ def to_euler(q: Quat) -> Vec3:
 
 
 def rotation_vector(q: Quat) -> Vec3:
-    """Axis times angle of the shorter way round, radians."""
+    """Return axis times angle [rad] of the shorter way round."""
     w, x, y, z = q
     if w < 0.0:
         w, x, y, z = -w, -x, -y, -z
@@ -75,7 +75,7 @@ def rotation_vector(q: Quat) -> Vec3:
 
 
 def integrate(q: Quat, rate_body_radps: Vec3, dt_s: float) -> Quat:
-    """The attitude after turning at a constant body rate; renormalised."""
+    """Return the attitude after ``dt_s`` at a constant body rate, renormalised."""
     wx, wy, wz = rate_body_radps
     rate = math.sqrt(wx * wx + wy * wy + wz * wz)
     half = 0.5 * rate * dt_s
@@ -86,7 +86,7 @@ def integrate(q: Quat, rate_body_radps: Vec3, dt_s: float) -> Quat:
 
 
 def cos_tilt(q: Quat) -> float:
-    """Cosine of the angle between body down and NED down: 1 level, 0 on its side."""
+    """Return the cosine of the angle between body down and NED down: 1 level, 0 on its side."""
     _, x, y, _ = q
     return 1.0 - 2.0 * (x * x + y * y)
 
@@ -100,12 +100,12 @@ def yaw_of(q: Quat) -> float:
 
 
 def from_heading(forward: float, right: float, yaw: float) -> tuple[float, float]:
-    """North and east parts of a horizontal vector in the axes of a heading."""
+    """Rotate a horizontal vector from heading axes into north and east."""
     cy, sy = math.cos(yaw), math.sin(yaw)
     return forward * cy - right * sy, forward * sy + right * cy
 
 
 def to_heading(north: float, east: float, yaw: float) -> tuple[float, float]:
-    """Forward and right parts of a horizontal vector in the axes of a heading."""
+    """Rotate a horizontal vector from north and east into heading axes: forward, right."""
     cy, sy = math.cos(yaw), math.sin(yaw)
     return north * cy + east * sy, east * cy - north * sy

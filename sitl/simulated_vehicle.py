@@ -1,4 +1,4 @@
-"""A whole vehicle without I/O: bytes in and out per link, and a clock that the caller steps."""
+"""A complete vehicle without I/O: bytes in and out per link, and a clock that the caller steps."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -20,19 +20,19 @@ from sitl.vehicle.dynamics import BodyState
 
 SEVERITY_CRITICAL = 2
 MAX_CATCH_UP_NS = NS_PER_S
-"""Simulated in one call; after a longer stall the rest follows in later calls."""
+"""Longest time simulated in one call; after a longer stall the rest follows in later calls."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Pose:
-    """State of the vehicle for the camera; replaced as a whole, so any thread may read it."""
+    """Vehicle state for the camera. Replaced as a whole, so any thread may read it."""
 
     stamp_ns: int
     body: BodyState
 
 
 class SimulatedVehicle:
-    """Autopilot, physics and MAVLink of one vehicle; stamps are the caller's monotonic clock."""
+    """Autopilot, physics and MAVLink of one vehicle. Stamps use the caller's monotonic clock."""
 
     def __init__(
         self,
@@ -61,7 +61,7 @@ class SimulatedVehicle:
 
     @property
     def params(self) -> Params:
-        """The firmware's parameters, which a reboot leaves."""
+        """The firmware's parameters; they survive a reboot."""
         return self.ap.params
 
     @property
@@ -73,14 +73,14 @@ class SimulatedVehicle:
         self.server.receive(link_id, data, now_ns)
 
     def set_receiver(self, values_us: Sequence[int]) -> None:
-        """Move the pilot's sticks and switches ; a reboot leaves them."""
+        """Move the pilot's sticks and switches [us]; they survive a reboot."""
         self._transmitter_us = values_us
         self.ap.set_receiver(values_us)
 
     def step(self, now_ns: int) -> None:
-        """Advance the simulation to ``now_ns`` in whole control steps, then queue what is due.
+        """Advance the simulation to ``now_ns`` in whole control steps, then queue due messages.
 
-        Missed control steps are all run; missed message slots are dropped.
+        All missed control steps are run; missed message slots are dropped.
         """
         ap = self.ap
         behind_ns = min(now_ns - ap.now_ns, MAX_CATCH_UP_NS)
@@ -101,7 +101,8 @@ class SimulatedVehicle:
         return outgoing
 
     def launch(self, start: AirborneStart) -> None:
-        """Put the vehicle in the air in this state, armed, where the sticks lean and climb."""
+        """Put the vehicle into the air in this state, armed, in a mode with lean and climb
+        sticks."""
         self.ap.launch(start.position_ned_m, start.velocity_ned_mps, start.ned_from_body_wxyz)
         self.log.start_over(start.next_gate)
         self.pose = Pose(stamp_ns=self.ap.now_ns, body=self.ap.truth)

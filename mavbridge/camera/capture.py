@@ -1,4 +1,4 @@
-"""Devices and network streams through OpenCV; their reads block, so they run behind a `Grabber`."""
+"""Devices and network streams through OpenCV. Their reads block, so they run behind a `Grabber`."""
 
 import os
 from collections.abc import Iterator
@@ -21,18 +21,18 @@ READ_TIMEOUT_MS = 2000
 FFMPEG_OPTIONS_VARIABLE = "OPENCV_FFMPEG_CAPTURE_OPTIONS"
 FFMPEG_LOG_VARIABLE = "OPENCV_FFMPEG_LOGLEVEL"
 LOW_LATENCY_OPTIONS = "rtsp_flags;prefer_tcp|fflags;nobuffer|flags;low_delay"
-"""No buffering in the demuxer, no reordering delay in the decoder. Setting options drops OpenCV's
-default, which is the first of these."""
+"""No buffering in the demuxer, no reordering delay in the decoder. Setting any option drops
+OpenCV's default, which is repeated as the first one."""
 SDP_OPTIONS = "|protocol_whitelist;file,udp,rtp"
-"""FFmpeg opens what an .sdp file names only where that is allowed."""
+"""Protocols that FFmpeg must be allowed to use for the sources in an .sdp file."""
 DEVICE_MODES = ((640, 480), (1280, 720), (1920, 1080))
-"""Practically every camera offers them; the smallest that covers the policy's image is used."""
+"""Modes of practically every camera; the smallest that covers the policy's image is used."""
 MAX_DRIVER_AGE_NS = NS_PER_S
 
 
 @dataclass(slots=True)
 class CaptureSource:
-    """Implements `ImageSource` over an open OpenCV capture; ``failure`` says why it may end."""
+    """`ImageSource` over an open OpenCV capture; ``failure`` is the likely reason for its end."""
 
     capture: cv2.VideoCapture
     name: str
@@ -40,7 +40,7 @@ class CaptureSource:
     clock: Clock
     has_driver_stamps: bool = False
     is_our_clock: bool = False
-    """A stamp of the driver has been plausible: later ones tell the age, however great it is."""
+    """True once a driver's stamp was plausible; later stamps are then trusted at any age."""
 
     def next_image(self) -> Image:
         """See `ImageSource`."""
@@ -73,7 +73,7 @@ def open_device(device: int | Path, *, image_size: int, clock: Clock) -> Capture
 
 
 def present_devices() -> str:
-    """The local cameras of this computer, for a message."""
+    """Describe the local cameras of this computer for a message."""
     found = [*Path("/dev").glob("video*"), *Path("/dev").glob("v4l/by-id/*")]
     names = ", ".join(sorted(map(str, found)))
     if not names:
@@ -82,14 +82,14 @@ def present_devices() -> str:
 
 
 def open_stream(url: str, *, clock: Clock) -> CaptureSource:
-    """Open a network stream or an .sdp file; frames are stamped on arrival.
+    """Open a network stream or an .sdp file. Frames are stamped on arrival.
 
     Raises CameraError if no video arrives within OPEN_TIMEOUT_MS.
     """
     timeouts = [
         *(cv2.CAP_PROP_OPEN_TIMEOUT_MSEC, OPEN_TIMEOUT_MS),
         *(cv2.CAP_PROP_READ_TIMEOUT_MSEC, READ_TIMEOUT_MS),
-        *(cv2.CAP_PROP_N_THREADS, 1),  # each further one holds a frame back
+        *(cv2.CAP_PROP_N_THREADS, 1),  # each additional thread delays by one frame
     ]
     name, source, options = without_secrets(url), url, LOW_LATENCY_OPTIONS
     if "://" not in url:
@@ -108,11 +108,11 @@ def open_stream(url: str, *, clock: Clock) -> CaptureSource:
 
 @contextmanager
 def _ffmpeg_options(options: str) -> Iterator[None]:
-    """FFmpeg options for the captures opened inside, unless the user has set some.
+    """Context manager: set FFmpeg options for captures opened inside, unless the user has set some.
 
-    OpenCV reads them from the environment alone. They must not stay there: a file that is opened
-    with ``nobuffer`` loses its first frames. FFmpeg is silenced as well: it would complain of each
-    frame of a stream that is joined between two key frames.
+    OpenCV reads them only from the environment. They must not stay there: a file opened with
+    ``nobuffer`` loses its first frames. FFmpeg is also silenced: it would complain about each frame
+    of a stream joined between two key frames.
     """
     wanted = {FFMPEG_OPTIONS_VARIABLE: options, FFMPEG_LOG_VARIABLE: "-8"}
     added = {name: value for name, value in wanted.items() if name not in os.environ}
@@ -125,7 +125,7 @@ def _ffmpeg_options(options: str) -> Iterator[None]:
 
 
 def retrieve_rgb(capture: cv2.VideoCapture, name: str) -> CameraImage:
-    """The grabbed frame in RGB, or of depth; raises CameraError if it cannot be decoded."""
+    """Return the grabbed frame in RGB or as depth. Raises CameraError if it cannot be decoded."""
     decoded, bgr = capture.retrieve()
     if not decoded:
         raise CameraError(f"{name}: a frame cannot be decoded")
@@ -145,6 +145,6 @@ def exposure_ns(stamp_ns: int, arrived_ns: int, *, is_our_clock: bool = False) -
 
 
 def device_mode(image_size: int) -> tuple[int, int]:
-    """Width and height to request from a camera, so that its short side covers ``image_size``."""
+    """Return the width and height to request, so that the short side covers ``image_size``."""
     covering = (mode for mode in DEVICE_MODES if mode[1] >= image_size)
     return next(covering, DEVICE_MODES[-1])

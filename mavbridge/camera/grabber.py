@@ -1,4 +1,4 @@
-"""Waiting times of live sources, and the thread that keeps a blocking one drained."""
+"""Timeouts of live sources, and the thread that keeps a blocking source drained."""
 
 import threading
 from collections.abc import Callable, Sequence
@@ -10,31 +10,31 @@ from mavbridge.core.ports import Camera
 from mavbridge.core.records import CameraImage, Frame
 
 REOPENED_NS = 10 * NS_PER_S
-"""Limit for the first frame of a source that was opened again: exposure control, negotiation."""
+"""Limit for the first frame of a reopened source: exposure control, negotiation."""
 STALL_NS = 2 * NS_PER_S
-"""Limit for every other frame."""
+"""Limit for all other frames."""
 REOPEN_DELAYS_S = (0.5, 1.0, 2.0, 4.0)
 JOIN_S = 3.0
 
 
 class LiveCamera(Camera, Protocol):
-    """A camera that may begin to deliver long after it was opened.
+    """Camera that may deliver its first frame long after it was opened.
 
-    Before its first frame ``read`` only raises CameraError for what waiting cannot mend.
+    Before its first frame ``read`` raises CameraError only for errors that waiting cannot fix.
     """
 
     @property
     def waiting_reason(self) -> str:
-        """Why there is no frame yet, as far as it is known."""
+        """Known reason why there is no frame yet."""
 
 
 def wait_for_first_frame(
     camera: LiveCamera, *, clock: Clock, timeout_s: float, report: Callable[[str], None]
 ) -> Frame:
-    """Return the first frame; every second until then ``report`` gets a line of a countdown.
+    """Return the first frame. Every second until then, ``report`` gets a line of a countdown.
 
-    The reason for the wait is reported when it changes. Raises CameraError if none comes in time,
-    or as ``read`` does.
+    The line contains the reason for the wait when it changes. Raises CameraError if no frame comes
+    in time, or as ``read`` does.
     """
     deadline_ns = clock.now_ns() + round(timeout_s * NS_PER_S)
     told: str | None = None
@@ -55,14 +55,14 @@ def wait_for_first_frame(
 
 
 def wait_until_due(clock: Clock, due_ns: int, timeout_ns: int) -> bool:
-    """Sleep until ``due_ns``, but no longer than the timeout; True if that time has come."""
+    """Sleep until ``due_ns``, at most for the timeout. Return True if ``due_ns`` was reached."""
     deadline_ns = clock.now_ns() + timeout_ns
     clock.sleep_until_ns(min(due_ns, deadline_ns))
     return due_ns <= deadline_ns
 
 
 class Image(NamedTuple):
-    """A frame as its source delivers it."""
+    """Image of one frame, with its stamp."""
 
     captured_ns: int
     rgb: CameraImage
@@ -70,10 +70,10 @@ class Image(NamedTuple):
 
 
 class ImageSource(Protocol):
-    """A blocking source, opened already; used by the grabber's thread alone."""
+    """Open blocking source, used only by the grabber's thread."""
 
     def next_image(self) -> Image:
-        """Block until the next frame; raises CameraError if there will be none."""
+        """Block until the next frame. Raises CameraError if there will be none."""
 
     def close(self) -> None:
         """Free the device or connection."""
@@ -82,11 +82,11 @@ class ImageSource(Protocol):
 class Grabber:
     """`LiveCamera` over a blocking source, which its thread opens, reads and closes.
 
-    Before the first frame the source is opened again and again until ``close``. Later a source that
-    fails is reopened, up to ``len(reopen_delays_s)`` times in a row; meanwhile ``read`` returns
-    None. ``read`` raises once all these attempts have delivered no frame, when the source is open
-    but silent for STALL_NS (REOPENED_NS after it was reopened), or when the thread has failed by
-    anything but a CameraError.
+    Before the first frame, opening is retried until ``close``. A source that fails later is
+    reopened, up to ``len(reopen_delays_s)`` times in a row; meanwhile ``read`` returns None.
+    ``read`` raises if all these attempts delivered no frame, if the source is open but silent for
+    STALL_NS (REOPENED_NS after it was reopened), or if the thread failed by anything but a
+    CameraError.
     """
 
     def __init__(
@@ -113,7 +113,7 @@ class Grabber:
 
     @property
     def dropped_frames(self) -> int:
-        """Frames that were replaced by a newer one before they were read."""
+        """Number of frames replaced by a newer one before they were read."""
         with self._changed:
             return self._dropped_frames
 
@@ -139,14 +139,14 @@ class Grabber:
             return None
 
     def close(self) -> None:
-        """Stop the thread; a source that blocks longer than JOIN_S is left to the daemon thread."""
+        """Stop the thread. A source that blocks longer than JOIN_S is left to the daemon thread."""
         self._stopping.set()
         self._thread.join(JOIN_S)
 
     def _run(self) -> None:
         try:
             failure = self._serve()
-        except Exception as error:  # noqa: BLE001 - a driver's or ours: raised again by read
+        except Exception as error:  # noqa: BLE001 - ours or a driver's: raised again by read
             failure = CameraError(f"the camera's thread has failed: {error!r}")
             failure.__cause__ = error
         with self._changed:
@@ -154,7 +154,7 @@ class Grabber:
             self._changed.notify_all()
 
     def _serve(self) -> CameraError:
-        """Open and drain until told to stop, or until the attempts are used up."""
+        """Open and drain the source until told to stop or until all attempts have failed."""
         delays_s = iter(self._reopen_delays_s)
         while True:
             frames_before = self._frame_count
@@ -182,7 +182,7 @@ class Grabber:
         return source
 
     def _drain(self, source: ImageSource) -> str:
-        """Take frame after frame; returns the reason for the end."""
+        """Receive frames until the source ends. Return the reason for the end."""
         try:
             while not self._stopping.is_set():
                 captured_ns, rgb = source.next_image()

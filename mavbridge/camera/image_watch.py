@@ -1,4 +1,4 @@
-"""Notices a camera that goes on delivering, but shows nothing: a frozen or a blank image."""
+"""Detection of a camera that keeps delivering but shows nothing: a frozen or blank image."""
 
 import numpy as np
 
@@ -7,33 +7,33 @@ from mavbridge.core.reasons import Code, Reason, because
 from mavbridge.core.records import CameraImage
 
 TAKEOFF_NS = 2 * NS_PER_S
-"""Time from the last word that the vehicle is landed in which its image may still be at rest: the
+"""Time for which the image may stay at rest after the vehicle was last reported as landed: the
 motors spin up and the thrust rises before it leaves the ground (0.5 s in the simulator)."""
 SAMPLED_ROWS = 32
-"""Rows compared first: enough to tell two images of a real sensor apart, by their noise."""
+"""Rows compared first: enough to tell two images of a real sensor apart by their noise."""
 GRID = 32
-"""Pixels a side of the grid that decides whether an image shows anything."""
+"""Side of the sampling grid for the blank test [pixels]."""
 DARK = 24
 """Brightest value of a dark pixel: video black is 16, and a covered sensor adds a little noise."""
 PLAIN_SPREAD = 3
-"""Most that a pixel of a plain image differs from its mean. One value in twenty lies beyond that
-in an overcast sky with a noise of 1.5 levels; none does in a decoder's grey."""
+"""Largest deviation of a pixel of a plain image from its mean. An overcast sky with a noise of 1.5
+levels exceeds it in one value of twenty, a decoder's grey in none."""
 SHOWING_SHARE = 0.01
 """Share of the grid's values that must be neither dark nor plain; hot pixels are fewer."""
 
 
 class ImageWatch:
-    """Says why an image should not be flown by; a limit of 0 turns its part off.
+    """Detects frozen and blank images; a limit of 0 disables its check.
 
     Frozen: no value of any pixel has changed for longer than the limit. In flight that is a fault
     of every source: a sensor's noise differs in every frame, and in the simulator's noiseless view
-    from a vehicle that hovers no image stays the same for 0.07 s. At rest on the ground a simulator
+    from a hovering vehicle no image stays the same for 0.07 s. At rest on the ground a simulator
     draws the same image for ever, so the time counts only while the vehicle is airborne, and
     TAKEOFF_NS later than that.
 
-    Blank: for longer than the limit nearly all pixels have been dark (a cap on the lens, no
-    exposure) or of one colour (a lost video signal, a decoder without a key frame, dense fog), or
-    of a depth image unknown. That counts on the ground as well.
+    Blank: for longer than the limit, nearly all pixels have been dark (a lens cap, no exposure), of
+    one colour (a lost video signal, a decoder without a key frame, dense fog), or unknown in a
+    depth image. Blank images count on the ground as well.
     """
 
     def __init__(self, *, max_frozen_s: float, max_black_s: float) -> None:
@@ -45,10 +45,10 @@ class ImageWatch:
         self._blank_since_ns: int | None = None
 
     def check(self, rgb: CameraImage, captured_ns: int, *, is_airborne: bool) -> Reason | None:
-        """Reason not to fly by this image, or None; call it with each image, in order.
+        """Return the reason not to fly by this image, or None. Call it with each image, in order.
 
-        ``rgb`` is kept for the next call and must not be changed.
-        ``is_airborne`` is False also where that is not known.
+        ``rgb`` is kept for the next call and must not be changed. ``is_airborne`` is False if
+        unknown.
         """
         blank = self._blank(rgb, captured_ns) if self._max_black_s > 0 else None
         frozen = self._frozen(rgb, captured_ns, is_airborne) if self._max_frozen_s > 0 else None
@@ -81,15 +81,15 @@ class ImageWatch:
 
 
 def _is_same(one: CameraImage, other: CameraImage) -> bool:
-    """Compare all pixels, but only where some rows do not differ already."""
+    """True if all pixels are equal; a few rows are compared first to save time."""
     step = max(1, len(one) // SAMPLED_ROWS)
     return np.array_equal(one[::step], other[::step]) and np.array_equal(one, other)
 
 
 def is_blank(rgb: CameraImage) -> bool:
-    """Return whether nearly all pixels are dark, or all of one colour, or of unknown depth.
+    """True if nearly all pixels are dark, or all of one colour, or of unknown depth.
 
-    Equal depths are no fault: so shows a wall.
+    Equal depths are no fault: a wall looks like that.
     """
     height, width = rgb.shape[:2]
     grid = rgb[:: max(1, height // GRID), :: max(1, width // GRID)].reshape(-1, *rgb.shape[2:])

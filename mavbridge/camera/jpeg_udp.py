@@ -1,4 +1,4 @@
-"""``jpeg-udp:[HOST:]PORT``: pictures in chunks over UDP, as racing simulators send them.
+"""``jpeg-udp:[HOST:]PORT``: pictures in chunks over UDP, as sent by racing simulators.
 
 A datagram is ``HEADER`` and a part of a JPEG or PNG. Chunks may be lost, repeated or out of order.
 """
@@ -19,22 +19,22 @@ from mavbridge.core.errors import CameraError, UserError
 
 FORM = "jpeg-udp:[HOST:]PORT, such as jpeg-udp:5600 or jpeg-udp:[::1]:5600"
 HEADER = Struct("<IHHIIQ")
-"""Frame id, chunk, chunks, bytes of the picture, bytes of this chunk, stamp in nanoseconds."""
+"""Frame id, chunk number, number of chunks, bytes of the picture and of the chunk, stamp [ns]."""
 MAX_PARTIAL = 4
-"""Frames that may be incomplete at a time: with MAX_JPEG_BYTES each, the bound of the memory."""
+"""Largest number of incomplete frames; bounds the memory together with MAX_JPEG_BYTES."""
 RESTART_NS = NS_PER_S
-"""Time without a whole frame after which a lower frame id is a sender that has started again."""
+"""Time without a whole frame after which a lower frame id means that the sender has restarted."""
 SILENT_NS = 2 * NS_PER_S
 """Longest wait for a whole frame."""
 _POLL_S = 0.1
 _RECEIVE_BUFFER_BYTES = 4 << 20
 _MOST_QUEUED = 4096
-"""Datagrams read behind a whole frame: a sender faster than this computer is not followed on."""
+"""Limit of datagrams read after a whole frame, in case the sender is faster than this computer."""
 _log = logging.getLogger(__name__)
 
 
 def parse_jpeg_udp(text: str) -> tuple[str, int]:
-    """Host and port of what follows ``jpeg-udp:``; this computer alone without a host.
+    """Return the host and port after ``jpeg-udp:``; without a host, the loopback address.
 
     Raises:
         UserError: it is malformed.
@@ -46,52 +46,52 @@ def parse_jpeg_udp(text: str) -> tuple[str, int]:
 
 
 class FrameKey(NamedTuple):
-    """Header fields that all chunks of one frame share."""
+    """Header fields common to all chunks of one frame."""
 
     frame_id: int
     chunks: int
     size_bytes: int
     stamp_ns: int
-    """By the sender's clock."""
+    """Stamp of the sender's clock."""
 
 
 @dataclass(slots=True)
 class Assembly:
-    """The chunks of a frame that have come so far."""
+    """Received chunks of one frame."""
 
     key: FrameKey
     arrived_ns: int
-    """Arrival of the first one."""
+    """Arrival of the first chunk."""
     parts: dict[int, bytes] = field(default_factory=dict)
     size_bytes: int = 0
 
     @property
     def picture(self) -> bytes:
-        """All chunks in their order."""
+        """All chunks, joined in order."""
         return b"".join(self.parts[chunk] for chunk in range(self.key.chunks))
 
 
 class FrameAssembler:
-    """Puts frames together from datagrams in any order; each is newer than the one before."""
+    """Assembles frames from datagrams in any order; each returned frame is newer than the last."""
 
     def __init__(self) -> None:
         self.malformed = 0
-        """Datagrams ignored, and frames whose chunks do not add up to their size."""
+        """Ignored datagrams, and frames whose chunks do not add up to their size."""
         self.incomplete = 0
         """Frames given up with chunks missing."""
         self._partial: dict[FrameKey, Assembly] = {}
-        """Least recently continued first."""
+        """Incomplete frames, least recently continued first."""
         self._last: FrameKey | None = None
         self._whole_ns = 0
 
     def put(self, datagram: bytes, arrived_ns: int) -> Assembly | None:
-        """Take in a datagram; return the frame that it completes.
+        """Process a datagram. Return the frame that it completes, or None.
 
-        A malformed datagram is counted and ignored, one of a frame that is not news is ignored.
+        A malformed datagram is counted and ignored; one of an old frame is ignored.
         """
         header = HEADER.unpack_from(datagram.ljust(HEADER.size, b"\0"))
         frame_id, chunk, chunks, size_bytes, length, stamp_ns = header
-        payload = datagram[HEADER.size : HEADER.size + length]  # a sender may pad its datagrams
+        payload = datagram[HEADER.size : HEADER.size + length]  # padding is allowed
         is_chunk = chunk < chunks and 0 < length == len(payload)
         if not is_chunk or not max(chunks, length) <= size_bytes <= MAX_JPEG_BYTES:
             self.malformed += 1
@@ -106,7 +106,7 @@ class FrameAssembler:
         return self._kept(frame, arrived_ns)
 
     def _kept(self, frame: Assembly, now_ns: int) -> Assembly | None:
-        """Return a whole frame, and give older ones up; keep one that lacks chunks."""
+        """Return a whole frame and drop older ones, or keep an incomplete frame."""
         key, is_whole = frame.key, len(frame.parts) == frame.key.chunks
         if frame.size_bytes > key.size_bytes or (is_whole and frame.size_bytes < key.size_bytes):
             self.malformed += 1
@@ -125,7 +125,7 @@ class FrameAssembler:
         return frame if is_whole else None
 
     def _is_news(self, key: FrameKey, now_ns: int) -> bool:
-        """Return whether the frame is newer than the last whole one; ids wrap around."""
+        """True if the frame is newer than the last whole one; ids wrap around."""
         last = self._last
         if last is None or 0 < (key.frame_id - last.frame_id) % (1 << 32) < 1 << 31:
             return True
@@ -133,10 +133,10 @@ class FrameAssembler:
 
 
 class JpegUdpSource:
-    """Implements `ImageSource` over a UDP port; the newest whole frame wins."""
+    """`ImageSource` over a UDP port; returns the newest whole frame."""
 
     def __init__(self, host: str, port: int, *, clock: Clock) -> None:
-        """Bind the port; raises CameraError if it cannot be."""
+        """Bind the port. Raises CameraError on failure."""
         self._name = f"jpeg-udp:{spelled(host, port)}"
         self._clock = clock
         self._frames = FrameAssembler()
@@ -162,7 +162,7 @@ class JpegUdpSource:
         raise CameraError(f"{self._name}: {MAX_BAD_FRAMES + 1} pictures in a row are damaged")
 
     def _newest_frame(self, silent_after_ns: int) -> Assembly:
-        """Receive until a frame is whole, then what is there already: it may hold a newer one."""
+        """Receive until a frame is whole, then drain the socket, which may hold a newer frame."""
         newest: Assembly | None = None
         more = _MOST_QUEUED
         while newest is None or more > 0:
@@ -184,7 +184,7 @@ class JpegUdpSource:
         try:
             ready, _, _ = select.select([self._socket], [], [], _POLL_S if is_waiting else 0.0)
             return self._socket.recv(1 << 16) if ready else None
-        except BlockingIOError:  # its checksum was wrong
+        except BlockingIOError:  # a datagram with a wrong checksum
             return None
         except OSError as error:
             raise CameraError(f"{self._name}: {error.strerror}") from error

@@ -1,4 +1,4 @@
-"""Opens the camera that ``--camera`` describes."""
+"""Opening of the camera named by ``--camera``."""
 
 import sys
 from collections.abc import Callable
@@ -29,10 +29,10 @@ from mavbridge.core.records import CameraImage, Frame
 
 STREAM_SCHEMES = ("rtsp://", "rtp://", "udp://", "tcp://", "http://", "https://")
 SCREEN_PACKAGES = {"mss": "mss", "Xlib": "python-xlib"}
-"""The extra "screen"."""
+"""Packages of the extra "screen": import name to pip name."""
 NO_CAMERA = "none"
 BLANK_NS = NS_PER_S // 30
-"""Period of the black frames of no camera."""
+"""Period of the black frames for ``none``."""
 FORMS = (
     "a device (0, /dev/video0, /dev/v4l/by-id/NAME), a stream (rtsp://, rtp://, udp://, tcp://, "
     "http://, https://, an .sdp file), "
@@ -43,11 +43,11 @@ FORMS = (
 
 
 def check_camera(spec: str, *, latency_ms: float = 0.0) -> None:
-    """Refuse a source that cannot be opened, as far as that can be told without opening it.
+    """Raise UserError if a source cannot be opened, as far as known without opening it.
 
     Raises:
-        UserError: ``spec`` has no known form, names no file, needs a package that is missing, or
-            stamps its frames itself and ``latency_ms`` is not 0.
+        UserError: ``spec`` has no known form, names no file, needs a package that is missing,
+            or stamps its frames itself and ``latency_ms`` is not 0.
     """
     kind = spec.partition(":")[0]
     if kind == "shm" and latency_ms != 0.0:
@@ -70,7 +70,7 @@ def check_camera(spec: str, *, latency_ms: float = 0.0) -> None:
 
 
 def require_present(spec: str) -> None:
-    """Refuse a local camera that is not plugged in, before anything slow is loaded.
+    """Raise CameraError if a local camera is not plugged in; cheap, for use before slow loading.
 
     Raises:
         CameraError: there is no such device.
@@ -81,8 +81,10 @@ def require_present(spec: str) -> None:
 
 
 def _is_device(spec: str) -> bool:
-    """Return True for a number, and for anything under /dev but regular files: names by udev are
-    links to devices, and a link that leads nowhere is a camera that is not plugged in."""
+    """True for a number, and for anything under /dev but regular files.
+
+    udev's names are links to devices; a dangling link is an unplugged camera.
+    """
     return spec.isdecimal() or (spec.startswith("/dev/") and not Path(spec).is_file())
 
 
@@ -102,23 +104,23 @@ def open_camera(
     report: Callable[[str], None] = lambda _: None,
     is_depth: bool | None = None,
 ) -> Camera:
-    """Open the source that ``spec`` names, and wait for its first frame, which is dropped.
+    """Open the source named by ``spec``, and wait for its first frame, which is dropped.
 
-    A file has no wait: it plays from the first ``read`` on. Nor has a screen.
+    Files and screens need no wait: a file plays from the first ``read`` on.
 
     Args:
         spec: one of FORMS.
-        image_size: side of the policy's square image in pixels: a device is asked for a mode that
-            covers it. All other sources deliver their own size.
+        image_size: side of the policy's square image [pixels]. A device is asked for a mode
+            that covers it; all other sources deliver their own size.
         clock: time of the waits, and of the stamps made here.
         timeout_s: longest wait for the first frame; meanwhile a device or stream that cannot be
-            opened is tried again, and shared memory may appear.
+            opened is retried, and shared memory may appear.
         latency_ms: time from exposure to arrival, subtracted from the stamps.
         report: gets a line of a countdown for every second of the wait.
-        is_depth: whether the policy takes depth or RGB; None: either.
+        is_depth: True: the policy takes depth; False: RGB; None: either.
 
     Raises:
-        UserError: as ``check_camera``, or its images are of the other kind.
+        UserError: as ``check_camera``, or the images are of the other kind.
         CameraError: no frame came in time, or the source cannot be used.
     """
     check_camera(spec, latency_ms=latency_ms)
@@ -139,7 +141,7 @@ def open_camera(
 
 
 def _require_kind(spec: str, first: Image | Frame | None, is_depth: bool | None) -> None:
-    """Refuse depth for a policy of RGB, and the reverse; a source without ``first`` is RGB."""
+    """Raise UserError for depth instead of RGB, or the reverse; without ``first``, assume RGB."""
     shape = (0, 0, 3) if first is None else first.rgb.shape
     if is_depth is None or is_depth == (len(shape) == 2):
         return
@@ -179,7 +181,7 @@ def _open(spec: str, *, image_size: int, clock: Clock, is_depth: bool | None) ->
 
 
 class BlankCamera:
-    """Delivers a black frame at each moment of a grid; one that nobody took in time is dropped."""
+    """Camera that delivers a black frame at each point of a time grid, and drops unread ones."""
 
     def __init__(self, *, image_size: int, clock: Clock, is_depth: bool = False) -> None:
         self._clock = clock
@@ -202,14 +204,14 @@ class BlankCamera:
         return Frame(frame_id=self._frame_id, captured_ns=captured_ns, rgb=self._rgb)
 
     def close(self) -> None:
-        """There is nothing to free."""
+        """No-op."""
 
 
 class LatencyCompensatedCamera:
-    """Another camera, whose stamps lie earlier by its latency: exposure to arrival here."""
+    """Wrapper that moves a camera's stamps back by its latency from exposure to arrival."""
 
     def __init__(self, camera: Camera, *, latency_ns: int) -> None:
-        """Wrap an open camera; closing this one closes it."""
+        """Wrap an open camera; closing the wrapper closes it."""
         self._camera = camera
         self._latency_ns = latency_ns
 

@@ -1,11 +1,11 @@
-"""``pipe:COMMAND``: frames from the standard output of any program, such as a CSI camera's own.
+"""``pipe:COMMAND``: frames from the standard output of a program, such as a CSI camera tool.
 
     pipe:COMMAND                         MJPEG or PNG
     pipe:WIDTHxHEIGHT:FORMAT:COMMAND     raw pictures; FORMAT by FFmpeg's name, such as rgb24
 
 A grey PNG of 16 bits and the raw format gray16le are depth images.
 
-The command is split as a shell would split it, and run without one.
+The command is split by shell rules, and run without a shell.
 """
 
 import os
@@ -34,27 +34,27 @@ from mavbridge.core.processes import user_environment
 
 FORM = "pipe:COMMAND (MJPEG or PNG) or pipe:WIDTHxHEIGHT:FORMAT:COMMAND (raw pictures)"
 FIRST_NS, SILENT_NS = 10 * NS_PER_S, 2 * NS_PER_S
-"""Longest wait for the first byte, and for each one after it."""
+"""Longest wait for the first byte, and for each later one."""
 END_S = 1.0
-"""Time for the program to end by itself before it is killed, and for that."""
+"""Time for the program to end by itself before it is killed, and then to end after the kill."""
 _POLL_S = 0.1
 _READ_BYTES = 1 << 16
-"""A pipe holds as much: a program that nobody reads is held up, so no frame in it is old."""
+"""Capacity of a pipe. A full pipe blocks the program, so no frame in it is old."""
 _MORE_READS = 64
-"""After a whole frame; a program that is faster than this computer is not followed for ever."""
+"""Limit of reads after a whole frame, in case the program is faster than this computer."""
 _MAX_ERROR_BYTES = 2000
 _RAW = re.compile(r"(\d{1,5})x(\d{1,5}):([a-z0-9]+):(.*)", re.DOTALL)
 
 
 class PipeCommand(NamedTuple):
-    """A program and what comes out of it."""
+    """Program and the format of its output."""
 
     words: tuple[str, ...]
     raw: tuple[int, int, str] | None
     """Width, height and format; None: MJPEG or PNG."""
 
     def cutter(self) -> FrameCutter:
-        """A new cutter for its output."""
+        """Return a new cutter for its output."""
         if self.raw is None:
             return PictureCutter()
         width, height, name = self.raw
@@ -62,7 +62,7 @@ class PipeCommand(NamedTuple):
 
 
 def parse_pipe(text: str) -> PipeCommand:
-    """Read what follows ``pipe:``.
+    """Parse the text after ``pipe:``.
 
     Raises:
         UserError: it is malformed, or there is no such program.
@@ -91,7 +91,7 @@ def parse_pipe(text: str) -> PipeCommand:
 
 
 class PipeCamera(Grabber):
-    """A `LiveCamera` over a program, which is started, ended and waited for by the thread."""
+    """`LiveCamera` over a program; its thread starts the program, ends it and waits for it."""
 
     def __init__(self, command: PipeCommand, *, clock: Clock) -> None:
         self._ending = threading.Event()
@@ -104,13 +104,13 @@ class PipeCamera(Grabber):
 
 
 class PipeSource:
-    """Implements `ImageSource`; the newest whole frame wins.
+    """`ImageSource` over a program; returns the newest whole frame.
 
-    The program has a session of its own, so that Ctrl-C ends the flight and not its camera.
+    The program runs in a separate session, so that Ctrl-C ends the flight but not the camera.
     """
 
     def __init__(self, command: PipeCommand, clock: Clock, ending: threading.Event) -> None:
-        """Start the program; raises CameraError if it cannot be."""
+        """Start the program. Raises CameraError on failure."""
         self._name = f"program {command.words[0]}"
         self._clock = clock
         self._ending = ending
@@ -148,7 +148,7 @@ class PipeSource:
                 raise CameraError(f"{self._name}: {self._bad_frames} pictures in a row are damaged")
 
     def _newest_frame(self) -> tuple[bytes, int]:
-        """Read until a frame is whole, then what is there already, which may hold a newer one."""
+        """Read until a frame is whole, then drain the pipe, which may hold a newer frame."""
         more = _MORE_READS
         while True:
             ready, _, _ = select.select(

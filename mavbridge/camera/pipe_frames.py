@@ -1,4 +1,4 @@
-"""Cuts the output of a camera program into frames: JPEG or PNG, or raw pictures of one size."""
+"""Frames from the output of a camera program: JPEG or PNG, or raw pictures of one size."""
 
 import re
 import struct
@@ -13,31 +13,31 @@ from mavbridge.core.records import CameraImage
 
 MAX_JPEG_BYTES = 16 << 20
 MAX_BETWEEN_BYTES = 4096
-"""Most bytes between two pictures: multipart headers."""
+"""Limit for the multipart headers between two pictures [bytes]."""
 MAX_SIDE_PX = 8192
 MAX_BAD_FRAMES = 10
-"""Frames in a row that cannot be decoded."""
+"""Limit of consecutive frames that cannot be decoded."""
 _SOI, _EOI, _SOS, _FILL = b"\xff\xd8", 0xD9, 0xDA, 0xFF
 _SOF = {*range(0xC0, 0xD0)} - {0xC4, 0xC8, 0xCC}
-"""Markers of the segment that says a JPEG's size."""
+"""Markers of the segment that contains a JPEG's size."""
 _SIDES = struct.Struct(">HH")
 _PNG = b"\x89PNG\r\n\x1a\n"
 _IHDR = struct.Struct(">16xIIBB")
-"""Width, height, bits of a sample and kind of colour (0: grey) of a PNG."""
+"""Width, height, bits per sample and colour type (0: grey) of a PNG."""
 _START = re.compile(re.escape(_SOI) + b"|" + re.escape(_PNG))
 _MARKER = re.compile(rb"\xff[^\x00\xff\xd0-\xd7]")
-"""In the coded data of a scan, where 00 and the restart markers D0 to D7 are data."""
+"""Marker in a scan's coded data, where 00 and the restart markers D0 to D7 are data."""
 
 
 class RawFormat(NamedTuple):
-    """How a raw picture lies in memory."""
+    """Memory layout of a raw picture."""
 
     bits: int
-    """For each pixel."""
+    """Bits per pixel."""
     conversion: int | None
-    """OpenCV's code of the conversion to RGB; None: it is RGB, or the depth of ``is_depth``."""
+    """OpenCV's code of the conversion to RGB; None: already RGB, or depth (``is_depth``)."""
     is_depth: bool = False
-    """One little-endian number for each pixel."""
+    """True: one little-endian number per pixel."""
 
 
 RAW_FORMATS = {
@@ -49,13 +49,13 @@ RAW_FORMATS = {
     "yuyv422": RawFormat(16, cv2.COLOR_YUV2RGB_YUY2),
     "gray16le": RawFormat(16, None, is_depth=True),
 }
-"""By FFmpeg's names."""
+"""Raw formats by FFmpeg's names."""
 
 
 def decode_picture(data: bytes) -> CameraImage | None:
-    """A JPEG or PNG as [H, W, 3] uint8 RGB, or [H, W] uint16 if it is a grey PNG of 16 bits.
+    """Decode a JPEG or PNG to [H, W, 3] uint8 RGB, or a 16-bit grey PNG to [H, W] uint16.
 
-    None if it is damaged, or larger than MAX_SIDE_PX a side, which is seen before it is decoded.
+    Return None if it is damaged or larger than MAX_SIDE_PX per side, which is checked first.
     """
     is_png = data.startswith(_PNG) and len(data) > _IHDR.size
     sides = _IHDR.unpack_from(data)[:2] if is_png else _jpeg_sides(data)
@@ -72,7 +72,7 @@ def decode_picture(data: bytes) -> CameraImage | None:
 
 
 def _jpeg_sides(data: bytes) -> tuple[int, int]:
-    """Height and width from the first segment that says them; zeros: there is none."""
+    """Return height and width from the first segment that contains them, or zeros."""
     at = len(_SOI)
     while data.startswith(_SOI) and at + 9 <= len(data) and data[at] == _FILL:
         if data[at + 1] in _SOF:
@@ -83,38 +83,38 @@ def _jpeg_sides(data: bytes) -> tuple[int, int]:
 
 
 class FrameCutter(ABC):
-    """Takes bytes as they come, and gives the newest whole frame."""
+    """Consumes a byte stream, and provides the newest whole frame."""
 
     def __init__(self) -> None:
         self._newest: tuple[bytes, int] | None = None
         self._first_ns = 0
-        """Arrival of the first byte of the frame that is being read."""
+        """Arrival of the first byte of the incomplete frame."""
 
     @property
     def has_frame(self) -> bool:
-        """True if a whole frame is there."""
+        """True if a whole frame is available."""
         return self._newest is not None
 
     def take(self) -> tuple[bytes, int] | None:
-        """Return the newest whole frame and when its first byte came, if there is one."""
+        """Return the newest whole frame and the arrival of its first byte, or None."""
         newest, self._newest = self._newest, None
         return newest
 
     @abstractmethod
     def put(self, data: bytes, arrived_ns: int) -> None:
-        """Take bytes. Raises CameraError for what cannot be frames."""
+        """Take bytes. Raises CameraError if they cannot be frames."""
 
     @abstractmethod
     def decode(self, frame: bytes) -> CameraImage | None:
-        """Return [H, W, 3] uint8 RGB or [H, W] uint16 depth; None if it is damaged."""
+        """Return [H, W, 3] uint8 RGB or [H, W] uint16 depth; None if the frame is damaged."""
 
     @abstractmethod
     def rest(self) -> str:
-        """Describe what was left over at the end of the stream."""
+        """Describe the unused bytes at the end of the stream."""
 
 
 class RawCutter(FrameCutter):
-    """Pictures of one size, one directly after the other."""
+    """Cutter for consecutive raw pictures of one size."""
 
     def __init__(self, width: int, height: int, pixels: RawFormat) -> None:
         super().__init__()
@@ -134,7 +134,7 @@ class RawCutter(FrameCutter):
             self._first_ns = arrived_ns
 
     def decode(self, frame: bytes) -> CameraImage:
-        """See `FrameCutter`; any bytes are a picture."""
+        """See `FrameCutter`. Raw pictures are never damaged: any bytes are valid."""
         height, width = self._shape
         if self._format.is_depth:
             return np.frombuffer(frame, "<u2").reshape(height, width).astype(np.uint16)
@@ -158,13 +158,13 @@ class RawCutter(FrameCutter):
 
 
 class PictureCutter(FrameCutter):
-    """JPEG or PNG pictures one after the other, with or without headers of a multipart stream."""
+    """Cutter for consecutive JPEG or PNG pictures, with or without multipart headers."""
 
     def __init__(self) -> None:
         super().__init__()
         self._buffer = bytearray()
         self._at = 0
-        """Where the search goes on; 0 while the start of a picture is looked for."""
+        """Position at which the search continues; 0 until a picture's start is found."""
         self._in_scan = self._is_png = False
 
     def put(self, data: bytes, arrived_ns: int) -> None:
@@ -197,7 +197,7 @@ class PictureCutter(FrameCutter):
         return True
 
     def _find_end(self) -> bool:
-        """Walk over the segments of the picture; True: it ends at ``_at``."""
+        """Walk over the segments of the picture. Return True if it ends at ``_at``."""
         buffer = self._buffer
         while True:
             if self._in_scan:
@@ -226,7 +226,7 @@ class PictureCutter(FrameCutter):
             self._in_scan = marker == _SOS
 
     def _find_png_end(self) -> bool:
-        """Walk over the chunks of the picture; True: it ends at ``_at``."""
+        """Walk over the chunks of the picture. Return True if it ends at ``_at``."""
         buffer, kind = self._buffer, b""
         while kind != b"IEND":
             kind = bytes(buffer[self._at + 4 : self._at + 8])

@@ -1,4 +1,4 @@
-"""A window, or the whole screen, as a camera: for simulators that offer no other video."""
+"""Window or whole screen as a camera, for simulators without another video output."""
 
 from collections.abc import Iterator, Sequence
 from contextlib import suppress
@@ -19,11 +19,11 @@ from mavbridge.core.errors import CameraError, MavbridgeError, UserError
 from mavbridge.core.records import Frame
 
 INTERVAL_NS = NS_PER_S // 60
-"""Screens change no faster, and a capture takes milliseconds."""
+"""Shortest capture interval: screens change no faster, and a capture takes milliseconds."""
 
 
 class Region(NamedTuple):
-    """A rectangle of the screen in pixels."""
+    """Rectangle of the screen [pixels]."""
 
     left: int
     top: int
@@ -32,17 +32,17 @@ class Region(NamedTuple):
 
 
 class Window(NamedTuple):
-    """A visible window with a title."""
+    """Visible window with a title."""
 
     id: int
     title: str
 
 
 class X11Screen:
-    """A connection to the display that DISPLAY names; used by one thread at a time."""
+    """Connection to the display named by DISPLAY; used by one thread at a time."""
 
     def __init__(self) -> None:
-        """Connect; raises CameraError if there is no X server."""
+        """Connect. Raises CameraError if there is no X server."""
         try:
             self._display = Display()
         except (DisplayError, OSError) as error:
@@ -54,14 +54,14 @@ class X11Screen:
         self._title_atoms = [*map(self._display.intern_atom, ("_NET_WM_NAME", "WM_NAME"))]
 
     def windows(self) -> list[Window]:
-        """Visible windows with a title, bottom to top, a window before those inside it."""
+        """Return visible windows with a title, bottom to top, each before the windows inside it."""
         return list(self._titled(self._root))
 
     def _titled(self, parent: XlibWindow) -> Iterator[Window]:
         try:
             children = parent.query_tree().children
         except XError:
-            return  # closed meanwhile
+            return  # closed in the meantime
         for child in children:
             try:
                 titles = (child.get_full_text_property(atom) for atom in self._title_atoms)
@@ -73,7 +73,7 @@ class X11Screen:
             yield from self._titled(child)
 
     def region(self, window_id: int) -> Region | None:
-        """The part of the window that is on the screen; None if it is closed or hidden."""
+        """Return the on-screen part of the window; None if it is closed or hidden."""
         window = self._display.create_resource_object("window", window_id)
         try:
             size = window.get_geometry()
@@ -97,16 +97,16 @@ class X11Screen:
 
 
 class ScreenCamera:
-    """Captures the area of the screen that a window covers, overlapping windows included.
+    """Camera that captures the screen area of a window, overlapping windows included.
 
-    Captures in ``read``, so a frame is as old as the capture takes, and none is ever dropped. The
-    window may be moved and resized.
+    It captures in ``read``: a frame is as old as the capture takes, and no frame is ever dropped.
+    The window may be moved and resized.
     """
 
     dropped_frames = 0
 
     def __init__(self, title: str, *, clock: Clock) -> None:
-        """Find the window; an empty title stands for the whole screen.
+        """Find the window; an empty title selects the whole screen.
 
         Raises:
             UserError: no window has this title, or several do.
@@ -130,7 +130,7 @@ class ScreenCamera:
         self._due_ns = clock.now_ns()
 
     def read(self, timeout_ns: int) -> Frame | None:
-        """See `mavbridge.core.ports.Camera`; at most 60 frames a second."""
+        """See `mavbridge.core.ports.Camera`; at most 60 frames per second."""
         if not wait_until_due(self._clock, self._due_ns, timeout_ns):
             return None
         captured_ns = self._clock.now_ns()
@@ -161,10 +161,10 @@ class ScreenCamera:
 
 
 def choose_window(windows: Sequence[Window], title: str) -> Window:
-    """The window with this title, or else the only one whose title contains it in any case.
+    """Return the window with this title, else the only one whose title contains it in any case.
 
-    Window managers may give a frame the title of the window inside it, so of equal titles the last
-    is chosen: the innermost, topmost one. Raises UserError if there is none, or are several.
+    Window managers may give a frame the title of the window inside it. Among equal titles the last
+    window is chosen: the innermost, topmost one. Raises UserError for no or several matches.
     """
     exact = [window for window in windows if window.title == title]
     similar = [window for window in windows if title.casefold() in window.title.casefold()]

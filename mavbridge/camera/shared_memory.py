@@ -1,4 +1,4 @@
-"""Reads frames from shared memory; docs/formats.md describes the format."""
+"""Reader of frames in shared memory; format: docs/formats.md."""
 
 import mmap
 import os
@@ -27,28 +27,27 @@ SLOTS = 4
 MAX_SIDE_PX = 16384
 CLOSED = 2
 NEWEST, STATE = 3, 4
-"""Index of the header's fields in units of 8 bytes."""
+"""Indices of header fields, in units of 8 bytes."""
 
 POLL_NS = NS_PER_MS
 REOPEN_NS = 200 * NS_PER_MS
-"""Interval at which a starving reader checks whether another file has taken the name."""
+"""Interval at which a reader without frames checks for a new file under the name."""
 MAX_RETRIES = 8
-"""Copies in a row that the writer may overtake before the reader waits for the next poll."""
+"""Consecutive copies that the writer may overtake before the reader waits for the next poll."""
 
 
 class SharedMemoryCamera:
-    """Newest frame of a segment. It polls, because the writer has no way to wake a reader.
+    """Camera on a shared memory segment. It polls, because the writer cannot wake a reader.
 
-    The segment may appear later. When another writer takes over the name, the reader follows; once
-    there was a frame, ``read`` raises when none has come for STALL_NS.
+    The segment may appear later. When another writer takes over the name, the reader follows. After
+    the first frame, ``read`` raises CameraError if none has come for STALL_NS.
 
     The file is mapped directly and read-only: `multiprocessing.shared_memory` would map it
-    writable, and before Python 3.13 it has a resource tracker that removes the file when the reader
-    ends.
+    writable, and before Python 3.13 its resource tracker removes the file when the reader ends.
     """
 
     def __init__(self, name: str, *, clock: Clock) -> None:
-        """Map the segment, if it is there already.
+        """Map the segment if it exists already.
 
         Raises:
             UserError: not a valid name.
@@ -65,7 +64,7 @@ class SharedMemoryCamera:
         self._stamp_age_ns = 0
         self._reopen_ns = clock.now_ns() + REOPEN_NS
         self._dead_ns: int | None = None
-        """When to give the writer up; None before the first frame."""
+        """Time at which the writer counts as dead; None before the first frame."""
         self._segment: _Segment | None = None
         self._follow_name()
 
@@ -97,7 +96,7 @@ class SharedMemoryCamera:
             self._segment.close()
 
     def _take(self) -> Frame | None:
-        """The newest frame, if it is new, complete and recent."""
+        """Return the newest frame if it is new, complete and recent, else None."""
         segment = self._segment
         if segment is None:
             return None
@@ -113,8 +112,7 @@ class SharedMemoryCamera:
         skipped = newest_id - self._seen_id - 1
         self._seen_id = newest_id
         self._stamp_age_ns = self._clock.now_ns() - captured_ns
-        # A stamp from the future is no sign of a dead writer: in flight it is for the vision loop,
-        # which names it.
+        # A stamp from the future does not mean a dead writer; in flight the vision loop reports it.
         is_ahead = self._stamp_age_ns < -STALL_NS and self._dead_ns is None
         if is_ahead or self._stamp_age_ns > STALL_NS:
             return None
@@ -122,7 +120,7 @@ class SharedMemoryCamera:
         return Frame(frame_id=self._first_id + newest_id, captured_ns=captured_ns, rgb=rgb)
 
     def _follow_name(self) -> None:
-        """Map the file that has the name now, if it is another one. Frame ids keep increasing."""
+        """Map the file under the name if it has changed. Frame ids keep increasing."""
         try:
             status = self._path.stat()
         except FileNotFoundError:
@@ -168,16 +166,16 @@ class _Segment:
         self._slots = np.frombuffer(self._map, slot, SLOTS, HEADER_BYTES)
 
     def newest_id(self) -> int:
-        """Newest frame; 0 = none yet. Raises CameraError where the file has shrunk."""
+        """Return the newest frame's id; 0 = none yet. Raises CameraError if the file has shrunk."""
         if self._map.size() < len(self._map):
-            # To read what is no longer there would end the process (SIGBUS).
+            # Reading beyond the end of the file would end the process (SIGBUS).
             raise CameraError(f"shm:{self._name}: its file has shrunk: start its writer again")
         newest_id = int(self._header[NEWEST])
         memory_barrier()
         return newest_id
 
     def copy(self, frame_id: int) -> tuple[int, CameraImage] | None:
-        """captured_ns and pixels of a frame; None if the writer used its slot meanwhile."""
+        """Return captured_ns and pixels of a frame; None if the writer has reused its slot."""
         slot = self._slots[frame_id % SLOTS : frame_id % SLOTS + 1]
         seq = int(slot["seq"][0])
         memory_barrier()
@@ -192,18 +190,18 @@ class _Segment:
         return captured_ns, rgb
 
     def is_closed(self) -> bool:
-        """The writer has ended."""
+        """True if the writer has ended."""
         return bool(self._header[STATE] == CLOSED)
 
     def close(self) -> None:
-        """Unmap; the views have to go first."""
+        """Unmap the file, after the views of it."""
         self._slots = self._slots[:0].copy()
         self._header = np.array([0, 0, 0, 0, CLOSED], np.int64)
         self._map.close()
 
 
 def memory_barrier() -> None:
-    """Keep the loads before it in front of those after it.
+    """Order earlier loads before later ones.
 
     Python has no memory barrier; taking and releasing a lock is one on every platform (POSIX 4.12).
     """
@@ -225,7 +223,7 @@ def _slot_type(width: int, height: int, channels: int) -> np.dtype[np.void]:
 
 
 def _checked_slot(name: str, header: bytes, file_bytes: int) -> np.dtype[np.void]:
-    """Layout of a slot by the header, checked against the length of the file."""
+    """Return the layout of a slot from the header, checked against the length of the file."""
     if len(header) < HEADER.size or not header.startswith(MAGIC):
         raise CameraError(f"shm:{name}: not a frame segment (docs/formats.md): wrong magic")
     _, width, height, channels, slots = HEADER.unpack(header)

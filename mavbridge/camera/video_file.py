@@ -1,4 +1,4 @@
-"""A recorded video as a camera."""
+"""Recorded video as a camera."""
 
 import math
 from pathlib import Path
@@ -13,21 +13,21 @@ from mavbridge.core.records import Frame
 from policy.files import library_name
 
 DEFAULT_FPS = 30.0
-"""For files with neither stamps nor a rate."""
+"""Frame rate for files with neither stamps nor a rate."""
 DEPTH_FORMAT = int.from_bytes(b"Y1\0\x10", "little")
-"""FFmpeg's gray16le, as in the camera.mp4 of a flight by depth."""
+"""FFmpeg's gray16le, as in the camera.mp4 of a flight with depth images."""
 
 
 class VideoFileCamera:
     """Plays a file in real time on the injected clock, from the first ``read`` on.
 
-    Frames become due at their own stamps; if several are due, the newest is returned and the
-    others count as dropped. After the last frame ``read`` raises CameraError. Frames are decoded in
+    Frames become due at their stamps. If several are due, the newest is returned and the others
+    count as dropped. After the last frame ``read`` raises CameraError. Frames are decoded in
     ``read``; there is no thread.
     """
 
     def __init__(self, path: Path, *, clock: Clock) -> None:
-        """Open the file; raises CameraError if OpenCV cannot decode its first frame."""
+        """Open the file. Raises CameraError if OpenCV cannot decode its first frame."""
         self._path = path
         self._clock = clock
         self._capture = cv2.VideoCapture(library_name(path))
@@ -40,7 +40,7 @@ class VideoFileCamera:
         self._frame_count = 0
         self.dropped_frames = 0
         self.upcoming = self._decode(previous_ns=None)
-        """The next image, stamped with its time in the file; None at the end."""
+        """Next image, stamped with its time in the file; None at the end."""
         if self.upcoming is None:
             self._capture.release()
             raise CameraError(f"{path} contains no video that can be decoded")
@@ -69,7 +69,7 @@ class VideoFileCamera:
         self._capture.release()
 
     def _decode(self, *, previous_ns: int | None) -> Image | None:
-        """The next frame, stamped with its time in the file; None at the end.
+        """Return the next image, stamped with its time in the file; None at the end.
 
         A stamp that does not increase, as in files without stamps, is replaced by the nominal one.
         """

@@ -1,6 +1,5 @@
-"""The bridge and its simulator in one thread on one stepped clock, over real MAVLink bytes.
+"""Lockstep: the bridge and its simulator in one thread on one stepped clock, over MAVLink bytes.
 
-The loops, the link and everything that they call are those of a real flight; replaced are time,
-the network and the camera. No wall clock is read, so a flight depends on its arguments alone.
-Users know this as lockstep.
+The loops and the link are those of a real flight; time, network and camera are replaced. No wall
+clock is read, so a flight depends only on its arguments.
 """

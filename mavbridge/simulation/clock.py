@@ -1,4 +1,4 @@
-"""Simulated time: it passes when a loop waits, and events run as it passes them."""
+"""Simulated time, which advances when a loop waits and runs the events on its way."""
 
 import heapq
 from collections.abc import Callable
@@ -7,14 +7,14 @@ from itertools import count
 from mavbridge.core.clock import NS_PER_S
 
 START_NS = 1_000 * NS_PER_S
-"""Away from zero, which some stamps use for "never"."""
+"""Start of simulated time; not zero, which some stamps use for "never"."""
 
 
 class SteppedClock:
-    """A ``Clock`` with a queue of events, for one thread.
+    """``Clock`` with a queue of events, for one thread.
 
-    Whoever flies waits; all of the simulated world is events: each runs at its time, takes no time
-    itself, and events of equal time run in the order of scheduling.
+    Only the caller waits; the rest of the simulated world consists of events. Each event runs at
+    its time and takes no time. Events of equal time run in the order of scheduling.
     """
 
     def __init__(self, start_ns: int = START_NS) -> None:
@@ -24,20 +24,20 @@ class SteppedClock:
         self._is_in_event = False
 
     def now_ns(self) -> int:
-        """Simulated time."""
+        """Return the simulated time."""
         return self._now_ns
 
     @property
     def next_event_ns(self) -> int | None:
-        """When the next event is due; None = no event is scheduled."""
+        """Time of the next event; None = no event is scheduled."""
         return self._events[0][0] if self._events else None
 
     def schedule(self, at_ns: int, event: Callable[[], object]) -> None:
-        """Run ``event`` at ``at_ns``, or as soon as time passes if that is already over."""
+        """Run ``event`` at ``at_ns``; if that has passed, as soon as time advances."""
         heapq.heappush(self._events, (at_ns, next(self._order), event))
 
     def sleep_until_ns(self, deadline_ns: int) -> None:
-        """Let time pass to ``deadline_ns``, and run the events due by then.
+        """Advance time to ``deadline_ns``, and run the events due by then.
 
         Raises:
             RuntimeError: called from within an event, with a deadline that has not passed.
@@ -58,10 +58,10 @@ class SteppedClock:
 
 
 class AheadClock:
-    """The ``Clock`` of a loop that runs as an event: simulated time plus the time it has worked.
+    """``Clock`` of a loop that runs as an event: simulated time plus the loop's working time.
 
-    The vision loop encodes an image within one event, yet the result must exist only later: its
-    stamps come from this clock, and what it publishes is scheduled for them.
+    The vision loop encodes an image within one event, but the result must exist only later: its
+    stamps come from this clock, and its publication is scheduled for them.
     """
 
     def __init__(self, world: SteppedClock) -> None:
@@ -69,9 +69,9 @@ class AheadClock:
         self.ahead_ns = 0
 
     def now_ns(self) -> int:
-        """Simulated time plus the time worked."""
+        """Return the simulated time plus the working time."""
         return self._world.now_ns() + self.ahead_ns
 
     def sleep_until_ns(self, deadline_ns: int) -> None:
-        """Count the time until ``deadline_ns`` as worked."""
+        """Count the time until ``deadline_ns`` as working time."""
         self.ahead_ns = max(self.ahead_ns, deadline_ns - self._world.now_ns())

@@ -12,17 +12,17 @@ from mavbridge.core.clock import NS_PER_MS, NS_PER_S
 from mavbridge.core.errors import UserError
 
 _Z99 = 2.3263478740408408
-"""99 % of a normal distribution lie below this many standard deviations."""
+"""Standard deviations below which 99 % of a normal distribution lie."""
 _BLOCK = 1024
-"""Samples drawn at once: in numpy a single one costs as much as a hundred."""
+"""Samples per draw: in numpy one sample costs as much as a hundred."""
 
 STALLS_APART_S = (1.5, 4.5)
-"""From the end of one stall to the next one, evenly distributed."""
+"""Time from the end of one stall to the next one, uniformly distributed."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Delay:
-    """A log-normal duration, as work on shared processors takes, or a fixed one."""
+    """Log-normal duration, typical of work on shared processors, or a fixed one."""
 
     p50_ns: int
     p99_ns: int | None = None
@@ -30,14 +30,14 @@ class Delay:
     offset_ns: int = 0
 
     def __post_init__(self) -> None:
-        """Refuse negative times and percentiles that no log-normal distribution has."""
+        """Raise UserError for negative times or percentiles that no log-normal distribution has."""
         if min(self.p50_ns, self.offset_ns) < 0:
             raise UserError(f"a delay cannot be negative, got {self}")
         if self.p99_ns is not None and not 0 < self.p50_ns <= self.p99_ns:
             raise UserError(f"a log-normal delay needs 0 < p50 <= p99, got {self}")
 
     def samples_ns(self, random: np.random.Generator) -> Iterator[int]:
-        """Independent samples without end."""
+        """Yield independent samples without end."""
         if self.p99_ns is None:
             yield from repeat(self.p50_ns + self.offset_ns)
             return
@@ -49,24 +49,24 @@ class Delay:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Delays:
-    """The delays of one flight; by default those of TOGE small on two shared cores."""
+    """Delays of one flight; the defaults are those of TOGE small on two shared cores."""
 
     camera: Delay = Delay(p50_ns=3 * NS_PER_MS)
-    """End of the exposure to arrival of the frame."""
+    """From the end of the exposure to the frame's arrival."""
     vision: Delay = Delay(p50_ns=11 * NS_PER_MS, p99_ns=25 * NS_PER_MS)
-    """Image to feature."""
+    """From image to feature."""
     action: Delay = Delay(p50_ns=3 * NS_PER_MS, p99_ns=6 * NS_PER_MS)
-    """State to chunk; in single-rate mode the time for the image comes on top."""
+    """From state to chunk; a single-rate policy adds the time for the image."""
     hop: Delay = Delay(p50_ns=NS_PER_MS // 10, p99_ns=NS_PER_MS // 2)
-    """Message between the flight process and the guard, either way."""
+    """Message between the flight process and the guard, in either direction."""
     uplink: Delay = Delay(p50_ns=NS_PER_MS * 3 // 10)
     downlink: Delay = Delay(p50_ns=NS_PER_MS * 3 // 10)
     stall_ns: int = 0
-    """Length of the stalls of the flight process, every 3 s at random; 0 = none."""
+    """Duration of the flight process' stalls, at random, on average 3 s apart; 0 = none."""
 
 
 class Stalls:
-    """Stalls of the flight process: what would reach it, or leave it, does so when they end."""
+    """Stalls of the flight process; its messages, in and out, are held back until a stall ends."""
 
     def __init__(self, stall_ns: int, start_ns: int, random: np.random.Generator) -> None:
         self._stall_ns = stall_ns
@@ -74,7 +74,7 @@ class Stalls:
         self._random = random
 
     def end_ns(self, at_ns: int) -> int:
-        """End of the stall that lasts at a time; the time itself between stalls."""
+        """Return the end of the stall at ``at_ns``; between stalls, ``at_ns`` itself."""
         starts_ns = self._starts_ns
         while self._stall_ns and starts_ns[-1] <= at_ns:
             apart_ns = round(self._random.uniform(*STALLS_APART_S) * NS_PER_S)

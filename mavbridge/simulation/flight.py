@@ -1,4 +1,4 @@
-"""One simulated flight of one course: the real bridge, its world on a stepped clock."""
+"""One simulated flight of one course: the real bridge and its world on a stepped clock."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
@@ -46,9 +46,9 @@ from sitl.simulated_vehicle import SimulatedVehicle
 from sitl.vehicle.config import STEP_NS, VehicleConfig
 
 MAX_TIME_S = 60.0
-"""Default limit: courses are some 80 m long, so a policy slower than 1.5 m/s fails."""
+"""Default limit [s]: courses are some 80 m long, so a policy slower than 1.5 m/s fails."""
 END_NS = 3 * NS_PER_S
-"""Longest that the guard may take to give the sticks back."""
+"""Longest time for the guard to return the sticks."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -61,19 +61,18 @@ class SimulationSettings:
     raw_sticks: bool = False
     """Send the policy's sticks without mapping them through the vehicle's curves."""
     goal: str | None = None
-    """--goal of the flight."""
+    """Value of ``--goal``."""
     draw_images: bool = True
-    """False: images stay black, where neither the policy nor a sink looks at them."""
+    """False: images stay black, for policies and sinks that use none."""
     least_camera_px: int = SIM_CAMERA_PX
-    """Least side of the frames that are drawn, however small the policy wants them."""
+    """Minimum side of the drawn frames [pixels], even if the policy wants smaller ones."""
 
 
 class SimulatedFlight:
-    """A vehicle on a course, and the bridge that flies it, once.
+    """One flight of a vehicle over a course, flown by the bridge.
 
-    The same arguments give the same stick bytes. Watchers are added before ``fly``. A scripted
-    policy follows ``clock``; ``vehicle.ap.truth`` is the true state at any moment, also from within
-    a runner's ``act``.
+    The same arguments give the same stick bytes. Add watchers before ``fly``. A scripted policy
+    follows ``clock``; ``vehicle.ap.truth`` is the true state at any time, even within ``act``.
     """
 
     def __init__(
@@ -86,8 +85,8 @@ class SimulatedFlight:
     ) -> None:
         """Put the vehicle on the course of ``sitl.course.make_course``.
 
-        ``seed`` decides the delays and the phases of vehicle and camera; the vehicle's conditions
-        also decide how the course looks.
+        ``seed`` determines the delays and the phases of vehicle and camera; the vehicle's
+        conditions also determine the look of the course.
 
         Raises:
             UserError: ``seed`` is negative.
@@ -98,7 +97,7 @@ class SimulatedFlight:
         self._course_seed = course_seed
         self._seed = seed
         self.clock = SteppedClock()
-        # Vehicle and bridge are never in phase, and their phase stays for a whole flight.
+        # A real vehicle and bridge are not in phase; the phase stays constant during a flight.
         boot_ns = self.clock.now_ns() + int(self._random(6).integers(STEP_NS))
         self.course = make_course(course_seed)
         self._vehicle_config = vehicle
@@ -118,11 +117,11 @@ class SimulatedFlight:
         self._has_flown = False
 
     def _random(self, purpose: int) -> np.random.Generator:
-        """Random numbers of one purpose: changing one delay leaves the others alone."""
+        """Return random numbers for one purpose: changing one delay leaves the others alone."""
         return np.random.Generator(np.random.PCG64((self._seed, purpose)))
 
     def watch_exposures(self, watch: Callable[[Exposure], None]) -> None:
-        """Call ``watch`` at each exposure, also of frames that are never read."""
+        """Call ``watch`` at each exposure, including frames that are never read."""
         self._exposure_watchers.append(watch)
 
     def watch_steps(self, watch: Callable[[], None]) -> None:
@@ -137,10 +136,10 @@ class SimulatedFlight:
         sinks: tuple[TickSink, ...] = (),
         should_stop: Callable[[], bool] | None = None,
     ) -> EpisodeResult:
-        """Arm, fly, and give the sticks back; ends with the last gate, a crash, or the time.
+        """Arm, fly and return the sticks; ends after the last gate, a crash or ``max_time_s``.
 
-        The runner must not remember earlier flights; ``max_time_s`` counts from its first
-        action. ``should_stop`` is called after each step of the vehicle.
+        The runner must not remember earlier flights; ``max_time_s`` counts from its first action.
+        ``should_stop`` is called after each step of the vehicle.
 
         Raises:
             EpisodeInterruptedError: ``should_stop`` ended the flight.
@@ -151,7 +150,7 @@ class SimulatedFlight:
         if self._has_flown:
             raise UserError("a simulated flight is flown once: make another one")
         self._has_flown = True
-        cv2.setNumThreads(1)  # the same images on any machine, and no pool to wake for them
+        cv2.setNumThreads(1)  # same images on any machine, and no thread pool to wake
         referee = Referee(self.clock, self.vehicle, max_time_s=max_time_s, should_stop=should_stop)
         self.watch_steps(referee.watch)
         guard = self._compose(runner, (referee, *sinks))
@@ -222,7 +221,7 @@ class SimulatedFlight:
         return guard
 
     def _make_cameras(self, contract: Contract, *, camera_hz: float) -> list[SimulatedCamera]:
-        """The cameras of a policy; a single one looks ahead, under any name.
+        """Return the cameras of a policy; a single one looks ahead under any name.
 
         Raises:
             UserError: there is no camera of that name.
@@ -262,10 +261,10 @@ class SimulatedFlight:
     def _take_time(
         self, runner: PolicyRunner, vision_clocks: Sequence[AheadClock], policy_clock: AheadClock
     ) -> PolicyRunner:
-        """The same runner, whose calls take simulated time.
+        """Return the runner with calls that take simulated time.
 
-        Without a fast path the whole network runs for every action, which then takes both times,
-        the one for the image once for each camera.
+        A single-rate policy runs its whole network for every action: each action takes the action's
+        delay plus one image delay per camera.
         """
         vision = self._settings.delays.vision
         vision_ns = [

@@ -1,4 +1,4 @@
-"""The guard and the policy loop in simulated time: the classes of a real flight, run as events."""
+"""Guard and policy loop in simulated time: the classes of a real flight, run as events."""
 
 from collections.abc import Callable
 from functools import partial
@@ -12,7 +12,7 @@ from mavbridge.simulation.network import DelayedChannel
 
 
 class MemoryPort:
-    """A ``guard.channel.Port`` over two channels whose messages arrive after their delay."""
+    """``guard.channel.Port`` over two delayed channels."""
 
     def __init__(self, *, outgoing: DelayedChannel, incoming: DelayedChannel) -> None:
         self._outgoing = outgoing
@@ -25,12 +25,12 @@ class MemoryPort:
         return True
 
     def receive(self) -> list[bytes]:
-        """Messages that have arrived."""
+        """Return the messages that have arrived."""
         return [data for _, data in self._incoming.receive()]
 
 
 class GuardStepper:
-    """Steps the guard whenever something arrives, and at its own grid."""
+    """Steps the guard at each arrival and at each point of its grid."""
 
     def __init__(self, clock: SteppedClock, loop: GuardLoop) -> None:
         self._clock = clock
@@ -39,7 +39,7 @@ class GuardStepper:
         clock.schedule(clock.now_ns(), self.step)
 
     def step(self) -> None:
-        """One pass of the guard, now."""
+        """Run one pass of the guard now."""
         if self._loop.is_done:
             return
         due_ns = self._loop.step()
@@ -48,13 +48,13 @@ class GuardStepper:
             self._clock.schedule(due_ns, self._step_if_due)
 
     def _step_if_due(self) -> None:
-        """Woken by the grid; an earlier step may have moved the next one."""
+        """Run a pass at a grid point, unless an earlier step has moved the next point."""
         if self._clock.now_ns() >= self._due_ns:
             self.step()
 
 
 class PolicyStepper:
-    """Runs the policy loop whenever it is idle and an attitude has arrived that it has not used."""
+    """Runs the policy loop whenever it is idle and a new attitude has arrived."""
 
     def __init__(
         self,
@@ -72,7 +72,7 @@ class PolicyStepper:
         self._is_busy = False
 
     def receive(self) -> None:
-        """Take the guard's messages that have arrived, and solve if there is something new."""
+        """Take the guard's messages that have arrived; solve if there is a new attitude."""
         for data in self._port.receive():
             self._view.receive(decode_from_guard(data))
         self._solve()
@@ -91,7 +91,7 @@ class PolicyStepper:
 
 
 def sender(world: SteppedClock, clock: AheadClock, port: MemoryPort) -> Callable[[ToGuard], object]:
-    """Hands messages to the guard at the time at which ``clock`` says that they were made."""
+    """Return a function that sends messages to the guard at the time on ``clock``."""
 
     def send(message: ToGuard) -> None:
         data = encode_to_guard(message)

@@ -1,4 +1,4 @@
-"""A network in memory between two ends: datagrams arrive whole and in order, after their delay."""
+"""In-memory network between two ends: datagrams arrive whole and in order, after a delay."""
 
 from collections import deque
 from collections.abc import Callable, Iterator
@@ -18,7 +18,8 @@ class DelayedChannel:
         delays_ns: Iterator[int],
         stalled_until_ns: Callable[[int], int] = int,
     ) -> None:
-        """``stalled_until_ns``: arrival of what would arrive at a time; by default that time."""
+        """Create an empty channel. ``stalled_until_ns`` maps an arrival to the end of a stall at
+        that time; by default there are no stalls."""
         self._clock = clock
         self._delays_ns = delays_ns
         self._stalled_until_ns = stalled_until_ns
@@ -28,7 +29,7 @@ class DelayedChannel:
         """Called at each arrival."""
 
     def send(self, data: bytes) -> None:
-        """Send a datagram; it arrives after its delay, and never before an earlier one."""
+        """Send a datagram; it arrives after its delay and never before an earlier one."""
         arrival_ns = self._stalled_until_ns(self._clock.now_ns() + next(self._delays_ns))
         self._last_arrival_ns = max(self._last_arrival_ns, arrival_ns)
         self._in_flight.append((self._last_arrival_ns, data))
@@ -36,19 +37,19 @@ class DelayedChannel:
             self._clock.schedule(self._last_arrival_ns, self.on_arrival)
 
     def receive(self) -> Iterator[tuple[int, bytes]]:
-        """Arrival stamp in ns and bytes of every datagram that has arrived."""
+        """Yield the arrival stamp [ns] and bytes of every datagram that has arrived."""
         now_ns = self._clock.now_ns()
         while self._in_flight and self._in_flight[0][0] <= now_ns:
             yield self._in_flight.popleft()
 
     @property
     def next_arrival_ns(self) -> int | None:
-        """Arrival of the oldest datagram that was not received; None = there is none."""
+        """Arrival of the oldest datagram not yet received; None = there is none."""
         return self._in_flight[0][0] if self._in_flight else None
 
 
 class MemoryTransport(Transport):
-    """The bridge's end, whose arrival stamps are exact."""
+    """The bridge's end of the network, with exact arrival stamps."""
 
     def __init__(
         self, clock: SteppedClock, *, to_vehicle: DelayedChannel, from_vehicle: DelayedChannel
@@ -58,7 +59,7 @@ class MemoryTransport(Transport):
         self._from_vehicle = from_vehicle
 
     def drain(self) -> Iterator[Received]:
-        """Every datagram that has arrived."""
+        """Yield every datagram that has arrived."""
         for arrived_ns, data in self._from_vehicle.receive():
             yield Received(data, arrived_ns, VEHICLE)
 
@@ -67,9 +68,9 @@ class MemoryTransport(Transport):
         return peer
 
     def wait(self, until_ns: int) -> None:
-        """Let time pass until a datagram has arrived, or until ``until_ns``.
+        """Advance time until a datagram has arrived, or to ``until_ns``.
 
-        Time passes from event to event, since an event may send a datagram that arrives in time.
+        Time advances from event to event, since an event may send a datagram that arrives in time.
         """
         while (now_ns := self._clock.now_ns()) < until_ns:
             arrival_ns, event_ns = self._from_vehicle.next_arrival_ns, self._clock.next_event_ns

@@ -1,4 +1,4 @@
-"""The end of an episode and its result: one flight of one course."""
+"""End and result of an episode, one flight of one course."""
 
 import math
 import threading
@@ -21,12 +21,12 @@ READY_NS = 30 * NS_PER_S
 
 
 Outcome = Literal["finished", "crashed", "disarmed", "timed out"]
-"""All gates passed; hit the ground or a gate; motors stopped in flight; none of these in time."""
+"""All gates passed; ground or gate hit; motors stopped in flight; none of these in time."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class EpisodeResult:
-    """One flight of one course; times count from the policy's first action."""
+    """Result of one flight of one course. Times count from the policy's first action."""
 
     course_seed: int
     seed: int
@@ -34,7 +34,7 @@ class EpisodeResult:
     gates_total: int
     gate_times_s: tuple[float, ...]
     flown_s: float
-    """Until the end of the episode: one second after the last gate, the crash, or the limit."""
+    """Time to the end of the episode: one second after the last gate, the crash, or the limit."""
     distance_m: float
     stick_rate_per_s: float | None
     """Mean over the four sticks of |change| per second, as sent; full deflection is 1. None = the
@@ -42,7 +42,7 @@ class EpisodeResult:
 
     @property
     def has_finished(self) -> bool:
-        """All gates were passed in order, without a crash."""
+        """True if all gates were passed in order, without a crash."""
         return self.outcome == "finished"
 
     @property
@@ -52,13 +52,12 @@ class EpisodeResult:
 
     @property
     def mean_speed_mps(self) -> float:
-        """Over the whole flight, take-off included."""
+        """Mean speed over the whole flight, takeoff included."""
         return self.distance_m / self.flown_s if self.flown_s > 0 else 0.0
 
     @property
     def course_speed_mps(self) -> float | None:
-        """Along the straight legs from the first gate to the last one passed; None for fewer than
-        two."""
+        """Mean speed along the straight legs between the passed gates; None for fewer than two."""
         if self.gates_passed < 2:
             return None
         gates = make_course(self.course_seed).gates[: self.gates_passed]
@@ -67,12 +66,12 @@ class EpisodeResult:
 
     @property
     def course_s(self) -> float | None:
-        """First action to last gate; None unless finished."""
+        """Time from first action to last gate; None unless finished."""
         return self.gate_times_s[-1] if self.has_finished and self.gate_times_s else None
 
 
 class StickMeter:
-    """A ``TickSink`` that measures how much the policy moves the sticks."""
+    """``TickSink`` that measures the policy's stick activity."""
 
     def __init__(self) -> None:
         self.engaged_ns: int | None = None
@@ -81,7 +80,7 @@ class StickMeter:
         self._moved_ns = 0
 
     def emit(self, event: Event) -> None:
-        """Add the change since the tick before."""
+        """Add the stick change since the previous tick."""
         if not isinstance(event, Tick):
             return
         if event.trace is None or event.sent is None:
@@ -105,11 +104,11 @@ class StickMeter:
 
 
 class EpisodeInterruptedError(MavbridgeError):
-    """An episode was stopped before its end, so it has no result."""
+    """Episode stopped before its end, so that it has no result."""
 
 
 class Referee:
-    """A ``TickSink`` that also watches the true vehicle, and sets ``stop`` at the end."""
+    """``TickSink`` that also watches the true vehicle, and sets ``stop`` at the end."""
 
     def __init__(
         self,
@@ -165,7 +164,7 @@ class Referee:
         return "timed out" if is_late else None
 
     def result(self, *, course_seed: int, seed: int) -> EpisodeResult:
-        """The result of a flight that has ended.
+        """Return the result of a flight that has ended.
 
         Raises:
             EpisodeInterruptedError: the flight was stopped before its end.

@@ -1,6 +1,6 @@
-"""The world around the bridge in a simulated flight: the vehicle, its camera, and the vision loop.
+"""World around the bridge in a simulated flight: the vehicle, its cameras and the vision loop.
 
-The vision loop runs as an event when a frame arrives, and publishes at its stamps.
+The vision loop runs as an event when a frame arrives; its results are published at their stamps.
 """
 
 import math
@@ -37,14 +37,16 @@ MOUNTS: dict[str, Quat] = {
     "right": from_euler(0.0, 0.0, math.pi / 2),
     "back": from_euler(0.0, 0.0, math.pi),
 }
-"""Where the cameras of a policy that has several look, by name: body_from_mount. Each is tilted as
-the front one; the upper edge of the image of ``down`` lies ahead."""
+"""Camera directions by name for policies with several cameras: body_from_mount. Each camera has the
+tilt of the front one; in the image of ``down``, the upper edge is ahead."""
 NOMINAL_VEHICLE = VehicleConfig(estimator_ready_s=0.5, position_ready_s=0.5)
-"""Nothing is random; ready at once, since the handshake alone takes longer than half a second."""
+"""Nominal vehicle, ready at once: the handshake alone takes longer than half a second."""
 
 
 def draw_conditions(kind: ConditionsKind, seed: int) -> Conditions:
-    """Conditions of an evaluated flight; the seed of its course, so that no demonstration had them.
+    """Return the conditions of an evaluated flight.
+
+    ``seed`` is the seed of its course, so that no demonstration had the same conditions.
 
     Raises:
         UsageError: the seed is negative.
@@ -61,7 +63,7 @@ def draw_conditions(kind: ConditionsKind, seed: int) -> Conditions:
 def make_vehicle(
     *, autopilot: AutopilotName, gains: float = 1.0, conditions: Conditions = NOMINAL
 ) -> VehicleConfig:
-    """A vehicle to evaluate a policy with.
+    """Return the configuration of a vehicle for evaluating a policy.
 
     Args:
         autopilot: its firmware.
@@ -79,13 +81,13 @@ def make_vehicle(
 
 
 def needed_params(contract: Contract, autopilot: AutopilotName) -> dict[str, float]:
-    """Parameters without which a simulated vehicle takes the actions for something else."""
+    """Return parameters without which a simulated vehicle misinterprets the contract's actions."""
     has_thrust = contract.action in ("rates", "attitude")
     return {"GUID_OPTIONS": OPTION_THRUST} if has_thrust and autopilot == "ardupilot" else {}
 
 
 class BlankRenderer:
-    """Stands in for ``FpvRenderer`` where no image is looked at: black, at no cost."""
+    """Replacement of ``FpvRenderer`` for flights without images: black, at no cost."""
 
     def __init__(self, width: int, height: int) -> None:
         self._black = np.zeros((height, width, 3), np.uint8)
@@ -93,13 +95,13 @@ class BlankRenderer:
     def render(
         self, position_ned_m: Vec3, ned_from_body_wxyz: Quat, rate_body_radps: Vec3
     ) -> ImageArray:
-        """Black [H, W, 3] uint8; always the same array."""
+        """Return black [H, W, 3] uint8, always the same array."""
         return self._black
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Exposure:
-    """The vehicle's true state at the exposure of a frame."""
+    """True state of the vehicle at the exposure of a frame."""
 
     frame_id: int
     captured_ns: int
@@ -139,10 +141,10 @@ class VehicleStepper:
 
 
 class SimulatedCamera:
-    """A ``ports.Camera`` on the vehicle; a frame is drawn when read, from the pose at exposure.
+    """``ports.Camera`` on the vehicle; a frame is drawn when read, from the pose at exposure.
 
     As in ``sitl``, a frame shows the vehicle's last step and carries that step's stamp, which is
-    the middle of the frame: it ends ``to_end_ns`` later, and arrives after that.
+    the middle of the frame. The frame ends ``to_end_ns`` later, and arrives after that.
     """
 
     def __init__(
@@ -175,7 +177,7 @@ class SimulatedCamera:
 
     @property
     def has_frame(self) -> bool:
-        """A frame has arrived that was not read."""
+        """True if an unread frame has arrived."""
         return self._arrived is not None
 
     def _expose(self) -> None:
@@ -197,7 +199,7 @@ class SimulatedCamera:
             watch()
 
     def read(self, timeout_ns: int) -> Frame | None:
-        """Newest frame that was not returned before; never waits."""
+        """Return the newest unread frame, or None; never waits."""
         exposure, self._arrived = self._arrived, None
         if exposure is None:
             return None
@@ -211,11 +213,11 @@ class SimulatedCamera:
         return Frame(frame_id=exposure.frame_id, captured_ns=exposure.captured_ns, rgb=rgb)
 
     def close(self) -> None:
-        """Nothing to free."""
+        """No-op."""
 
 
 class DelayedFeatureCache(FeatureCache):
-    """Publishes each feature at its ``ready_ns``."""
+    """Feature cache that publishes each feature at its ``ready_ns``."""
 
     def __init__(self, clock: SteppedClock, *, span_ns: int = 0) -> None:
         super().__init__(span_ns=span_ns)
@@ -228,7 +230,8 @@ class DelayedFeatureCache(FeatureCache):
 
 
 class DelayedSink:
-    """Passes vision ticks on when their features are ready, so that events come in time order."""
+    """Passes vision ticks on when their features are ready, so that events stay in order of
+    time."""
 
     def __init__(self, clock: SteppedClock, sink: TickSink) -> None:
         self._clock = clock

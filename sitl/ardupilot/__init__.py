@@ -1,1 +1,1 @@
-"""ArduCopter as a peer sees it: modes, radio, parameters, failsafes, and its side of MAVLink."""
+"""ArduCopter as a peer sees it: modes, radio, parameters, failsafes and MAVLink."""

@@ -1,7 +1,7 @@
-"""The flight controller without its link: sticks in, physics out, one step of 2.5 ms at a time.
+"""ArduCopter without its link: sticks in, physics out, in steps of 2.5 ms.
 
-It behaves as a pilot and a companion computer see ArduCopter: modes, arming, failsafes, and their
-status texts, word for word. Nothing here knows about MAVLink, sockets or the host's time.
+Modes, arming, failsafes and their status texts, word for word, as a pilot and a companion computer
+see them. This module knows nothing about MAVLink, sockets or the host's time.
 """
 
 import math
@@ -20,11 +20,11 @@ from sitl.vehicle.config import STEP_NS, VehicleConfig
 from sitl.vehicle.dynamics import QUAD
 
 LOW_READS_TO_FAIL = 3
-GCS_CHECK_PERIOD_NS = NS_PER_S // 3  # ArduCopter looks at the ground station in its 3 Hz loop
+GCS_CHECK_PERIOD_NS = NS_PER_S // 3  # ArduCopter checks the ground station at 3 Hz
 
 
 class RadioFailsafe:
-    """No sticks for RC_FS_TIMEOUT, or a throttle below FS_THR_VALUE."""
+    """Failsafe for sticks absent for RC_FS_TIMEOUT, or a throttle below FS_THR_VALUE."""
 
     def __init__(self, params: ArduPilotParams, now_ns: int) -> None:
         self._params = params
@@ -33,7 +33,7 @@ class RadioFailsafe:
         self.active = False
 
     def update(self, *, new_input: bool, throttle_us: int, can_fail: bool, now_ns: int) -> bool:
-        """Check after one RC update; True if ``active`` has changed."""
+        """Check after one RC update. Return True if ``active`` has changed."""
         was_active = self.active
         if not self._params["FS_THR_ENABLE"]:
             self._last_input_ns, self._low_reads, self.active = now_ns, 0, False
@@ -55,7 +55,7 @@ class RadioFailsafe:
 
 
 class GcsFailsafe:
-    """No heartbeat and no override of the ground station for FS_GCS_TIMEOUT."""
+    """Failsafe for a ground station that sends no heartbeat and no override for FS_GCS_TIMEOUT."""
 
     def __init__(self, params: ArduPilotParams) -> None:
         self._params = params
@@ -67,10 +67,10 @@ class GcsFailsafe:
         self._last_contact_ns = now_ns
 
     def update(self, now_ns: int) -> bool:
-        """Check the timer where it is due; True if ``active`` has changed.
+        """Check the timer if it is due. Return True if ``active`` has changed.
 
-        Switched off while it is active it stays so, and arming is refused until the next boot or
-        until it is switched on again and hears the ground station.
+        Disabled while active, the failsafe stays active and arming is refused until the next boot,
+        or until it is enabled again and hears the ground station.
         """
         if now_ns < self._due_ns or not self._params["FS_GCS_ENABLE"]:
             return False
@@ -91,15 +91,15 @@ FAILSAFE_MODES = {
     "FS_THR_ENABLE": {3: Mode.LAND, 7: Mode.BRAKE},
     "FS_GCS_ENABLE": {5: Mode.LAND, 7: Mode.BRAKE},
 }
-"""The mode that each value of the parameter selects; any other value but 0 means RTL."""
-FS_OPTION_GUIDED = 4  # goes on without the pilot's sticks
+"""Mode that each value of the parameter selects; all other values but 0 mean RTL."""
+FS_OPTION_GUIDED = 4  # GUIDED continues without the pilot's sticks
 FS_OPTION_LANDING_CONTINUES = 8
 FS_OPTION_PILOT_CONTINUES = 16
 RC_OPTION_SKIP_NEUTRAL_CHECK = 64
 
 
 class ArduCopter(Autopilot):
-    """One boot of the vehicle; the control period is that of 400 Hz."""
+    """One boot of ArduCopter, stepped at 400 Hz."""
 
     step_ns = STEP_NS
     airframe = QUAD
@@ -114,7 +114,7 @@ class ArduCopter(Autopilot):
         self.radio_failsafe = RadioFailsafe(params, boot_ns)
         self.gcs_failsafe = GcsFailsafe(params)
         self.control = CopterControl(params)
-        """Targets and thrust, for telemetry; only this autopilot commands it."""
+        """Targets and thrust, for telemetry to read; only this class commands it."""
         self.simple = SimpleMode(params)
         self._armed = False
         self._mode_switch = ModeSwitch()
@@ -147,11 +147,11 @@ class ArduCopter(Autopilot):
 
     @property
     def guided(self) -> GuidedControl | None:
-        """Takes setpoints in GUIDED and GUIDED_NOGPS; None in other modes."""
+        """Setpoint control in GUIDED and GUIDED_NOGPS; None in other modes."""
         return self.control.guided if self.mode.is_guided else None
 
     def prearm_refusal(self) -> str | None:
-        """ArduCopter's reason why the vehicle is not ready to arm in any mode (PREARM_CHECK)."""
+        """Return ArduCopter's reason to refuse arming in any mode (PREARM_CHECK), or None."""
         if not self.estimator_ready:
             return "AHRS: EKF3 not started"
         if not self.rc.found and self.params["FS_THR_ENABLE"]:
@@ -166,7 +166,7 @@ class ArduCopter(Autopilot):
         return None
 
     def _stick_refusal(self, *, by_rudder: bool) -> str | None:
-        """ArduCopter's reason why mode or sticks forbid arming, or None."""
+        """Return ArduCopter's reason why mode or sticks forbid arming, or None."""
         if not self.mode.can_arm:
             return f"{self.mode.name} mode not armable"
         if self.mode.needs_position and not self.position_ready:
@@ -183,7 +183,7 @@ class ArduCopter(Autopilot):
         return None
 
     def arm(self, *, force: bool, by_rudder: bool = False) -> bool:
-        """Start the motors; a refusal becomes a status text. True if armed afterwards."""
+        """Start the motors, or send the refusal as a text. Return True if armed afterwards."""
         if self.armed:
             return True
         refusal = self.prearm_refusal() or self._stick_refusal(by_rudder=by_rudder)
@@ -198,7 +198,7 @@ class ArduCopter(Autopilot):
         return True
 
     def disarm(self, *, force: bool) -> bool:
-        """Stop the motors; refused in flight unless forced. True if disarmed afterwards."""
+        """Stop the motors; refused in flight unless forced. Return True if disarmed afterwards."""
         if self.armed and not (self.landed or force):
             return False
         if self.armed:
@@ -207,10 +207,10 @@ class ArduCopter(Autopilot):
         return True
 
     def take_off(self, height_m: float) -> bool:
-        """Climb to a height above home (NAV_TAKEOFF). True if that has begun.
+        """Climb to a height above home (NAV_TAKEOFF). Return True if accepted.
 
-        Only GUIDED climbs here; the firmware does it in ALT_HOLD and LOITER, too. GUIDED_NOGPS says
-        yes and stays on the ground, as the firmware does.
+        Only GUIDED climbs here; the firmware also climbs in ALT_HOLD and LOITER. GUIDED_NOGPS
+        accepts and stays on the ground, as the firmware does.
         """
         is_climb = height_m > -self.sensed.position_ned_m[2]
         if not (self.armed and self.landed and self.mode.is_guided and is_climb):
@@ -220,9 +220,10 @@ class ArduCopter(Autopilot):
         return True
 
     def set_mode(self, mode: Mode) -> bool:
-        """Change the flight mode; a refusal becomes a status text. True if in that mode then.
+        """Change the flight mode, or send the refusal as a text. Return True if in the mode
+        afterwards.
 
-        A mode that needs a position is refused in the air only: on the ground arming is.
+        A mode that needs a position is refused only while armed; otherwise arming is refused.
         """
         if mode is self.mode:
             return True
@@ -248,7 +249,8 @@ class ArduCopter(Autopilot):
             self._on_gcs_change()
 
     def _start_in_air(self) -> None:
-        """Fly on in ALT_HOLD, unless setpoints fly it; an idle receiver commands a descent."""
+        """Fly on in ALT_HOLD, or in a mode flown by setpoints. An idle receiver commands a
+        descent."""
         self._armed = True
         self._set_landed(landed=False)
         if not self.mode.is_guided:
@@ -286,7 +288,7 @@ class ArduCopter(Autopilot):
         return self.control.wants_takeoff(self.mode, sticks)
 
     def _is_idle(self, sticks: Sticks) -> bool:
-        """On the ground for DISARM_DELAY with the throttle at its end; centred is not idle."""
+        """True after DISARM_DELAY on the ground with the throttle at the bottom, not centred."""
         if not (self.rc.found and sticks.throttle == 0.0):
             self._idle_since_ns = self.now_ns
         delay_s = self.params["DISARM_DELAY"]
@@ -340,7 +342,7 @@ class ArduCopter(Autopilot):
         if self._mode_switch.position not in (None, before):
             self.simple.read_mode_switch(self._mode_switch.position)
         if position is not None:
-            with suppress(ValueError):  # a mode that this vehicle does not have
+            with suppress(ValueError):  # ignore a mode that this vehicle lacks
                 self.set_mode(Mode(self.params.integer(f"FLTMODE{position}")))
 
     def _on_gcs_change(self) -> None:
@@ -355,7 +357,7 @@ class ArduCopter(Autopilot):
             self._fail_over("GCS", "FS_GCS_ENABLE")
 
     def _fail_over(self, who: str, parameter: str) -> None:
-        """Bring the vehicle down or home; the mode stays when the cause has gone."""
+        """Land, brake or return as the parameters say; the mode stays after the cause has gone."""
         if self.armed and self.landed:
             self._send_text(SEVERITY_WARNING, f"{who} Failsafe - Disarming")
             self.disarm(force=True)

@@ -1,4 +1,4 @@
-"""Inner loop: leans, attitudes or body rates to angular acceleration; accelerations to leans."""
+"""Inner loops: lean, attitude or body rate to angular acceleration; acceleration to lean."""
 
 import math
 
@@ -20,11 +20,10 @@ from sitl.rotation import (
 from sitl.vehicle.dynamics import GRAVITY_MPS2, BodyState, clamp
 
 RATE_GAIN_PER_S: Vec3 = (18.0, 18.0, 6.0)
-"""At the default gains. With a 28 ms motor lag 18/s keeps the rate loop at a damping ratio of about
-0.7."""
+"""At the default gains. With 28 ms of motor lag, 18/s gives a damping ratio of about 0.7."""
 MIN_INPUT_TIME_S = 0.01
 MAX_TARGET_LEAD_RAD = math.radians(30.0)
-"""In rate mode the target may run ahead of the vehicle by this much before it is pulled back."""
+"""In rate mode, the target's largest lead over the vehicle before it is reset to the vehicle."""
 MOTOR_LAG_S = 0.028
 CATCH_UP_PER_S = 1.0
 YAW_GAIN_PER_S = 6.0
@@ -34,7 +33,7 @@ _ANGLE_GAINS = ("ATC_ANG_RLL_P", "ATC_ANG_PIT_P", "ATC_ANG_YAW_P")
 
 
 class AttitudeController:
-    """Tracks leans, attitudes or body rates; the target lives here between steps."""
+    """Tracks leans, attitudes or body rates, and keeps their target between steps."""
 
     def __init__(self, params: ArduPilotParams) -> None:
         self._params = params
@@ -46,7 +45,7 @@ class AttitudeController:
 
     @property
     def target(self) -> tuple[Quat, Vec3]:
-        """Shaped target of the last step: attitude (NED from body) and body rates in rad/s."""
+        """Shaped target of the last step: attitude (NED from body) and body rates [rad/s]."""
         return self._target, self._target_rate_radps
 
     def reset(self, body: BodyState) -> None:
@@ -58,7 +57,7 @@ class AttitudeController:
     def lean(
         self, body: BodyState, roll: float, pitch: float, yaw_rate_radps: float, dt_s: float
     ) -> Vec3:
-        """Body angular acceleration (rad/s^2) towards a roll and pitch, turning at a yaw rate."""
+        """Return body angular acceleration [rad/s^2] towards a roll and pitch, with a yaw rate."""
         self._roll_rate = self._shape("R", roll - self._roll, self._roll_rate, dt_s)
         self._pitch_rate = self._shape("P", pitch - self._pitch, self._pitch_rate, dt_s)
         self._roll += self._roll_rate * dt_s
@@ -75,7 +74,7 @@ class AttitudeController:
         return self._track(body, self._target, feedforward)
 
     def rates(self, body: BodyState, rate_radps: Vec3, dt_s: float) -> Vec3:
-        """Body angular acceleration (rad/s^2) towards a body rate; zero holds the attitude."""
+        """Return body angular acceleration [rad/s^2] towards a body rate; zero holds attitude."""
         self._target = integrate(self._target, rate_radps, dt_s)
         error = rotation_vector(multiply(conjugate(body.ned_from_body_wxyz), self._target))
         if math.hypot(*error) > MAX_TARGET_LEAD_RAD:
@@ -85,7 +84,7 @@ class AttitudeController:
     def approach(
         self, body: BodyState, ned_from_body_wxyz: Quat, rate_body_radps: Vec3, dt_s: float
     ) -> Vec3:
-        """Body angular acceleration (rad/s^2) towards an attitude that turns at a body rate."""
+        """Return body angular acceleration [rad/s^2] towards an attitude turning at a body rate."""
         error = rotation_vector(multiply(conjugate(self._target), ned_from_body_wxyz))
         rate = [
             self._shape(axis, error[k], self._target_rate_radps[k], dt_s, rate_body_radps[k])
@@ -94,10 +93,10 @@ class AttitudeController:
         return self._advance(body, (rate[0], rate[1], rate[2]), dt_s)
 
     def turn(self, body: BodyState, rate_body_radps: Vec3, dt_s: float) -> Vec3:
-        """Body angular acceleration (rad/s^2) towards a body rate, without a jump in the target.
+        """Return body angular acceleration [rad/s^2] towards a body rate, without target jumps.
 
-        As in the firmware the target does not wait for the vehicle: what it turned too slowly in
-        the beginning it makes up for, so a weak axis overshoots its rate.
+        As in the firmware, the target does not wait for the vehicle. The vehicle later makes up for
+        the angle that it lost at the start, so a weak axis overshoots its rate.
         """
         rate = [
             self.slew(axis, rate_body_radps[k], self._target_rate_radps[k], dt_s)
@@ -134,7 +133,7 @@ class AttitudeController:
     def _shape(
         self, axis: str, error_rad: float, rate_radps: float, dt_s: float, wanted_radps: float = 0.0
     ) -> float:
-        """Next rate of a target angle that closes its error without a jump in rate.
+        """Return the next rate of a target angle that closes its error without a jump in rate.
 
         ``wanted_radps`` is the rate at which the wanted angle itself turns.
         """
@@ -144,7 +143,7 @@ class AttitudeController:
         return self.slew(axis, wanted, rate_radps, dt_s)
 
     def slew(self, axis: str, wanted_radps: float, rate_radps: float, dt_s: float) -> float:
-        """Next rate of R, P or Y on the way to the wanted one, by the axis' acceleration limit."""
+        """Return the next rate of axis R, P or Y, within the axis' acceleration limit."""
         max_accel_radps2 = math.radians(self._limit(f"ATC_ACCEL_{axis}_MAX") / 100.0)
         return rate_radps + clamp(wanted_radps - rate_radps, max_accel_radps2 * dt_s)
 
@@ -154,7 +153,7 @@ class AttitudeController:
 
 
 class _Response:
-    """How the firmware's vehicle follows a shaped target: with its motors' lag, and weak in yaw.
+    """Response of the firmware's vehicle to a shaped target: motor lag, and a weak yaw axis.
 
     The constants fit steps measured on the firmware (roll 40 deg/s: 33, 48, 53, 70-100 ms to 10,
     50, 63 and 90 %; yaw 40 deg/s: 145, 272, 307, 392 ms and a peak of 1.22).
@@ -190,7 +189,7 @@ class _Response:
 
 
 def boosted(thrust: float, body: BodyState, params: ArduPilotParams) -> float:
-    """Collective in [0, 1] that keeps the vertical thrust of a leaning vehicle, to 84 degrees.
+    """Return the collective in [0, 1] that keeps the vertical thrust in a lean of up to 84 degrees.
 
     ATC_ANGLE_BOOST turns it off. Formula: ArduPilot's ``get_throttle_boosted``.
     """
@@ -201,7 +200,7 @@ def boosted(thrust: float, body: BodyState, params: ArduPilotParams) -> float:
 
 
 def lean_for(accel_ne_mps2: tuple[float, float], body: BodyState) -> tuple[float, float]:
-    """Roll and pitch (rad) that give a hovering vehicle this acceleration north and east."""
+    """Return roll and pitch [rad] that give a hovering vehicle this acceleration north and east."""
     north, east = accel_ne_mps2
     forward, right = to_heading(north, east, yaw_of(body.ned_from_body_wxyz))
     return math.atan2(right, GRAVITY_MPS2), -math.atan2(forward, GRAVITY_MPS2)

@@ -1,8 +1,9 @@
-"""One link of an ArduPilot vehicle: messages, and their intervals with rounding, caps and buckets.
+"""One link of an ArduPilot vehicle: its messages and their intervals.
 
-Units and oddities are those measured on ArduCopter 4.7: scaled integers in RAW_IMU, a HIGHRES_IMU
-whose gyro keeps its bias and whose magnetometer is a million times too large, positions that are
-withheld until the estimator has one.
+As in the firmware, intervals are rounded and capped, with at most ten distinct values. Units and
+oddities are those measured on ArduCopter 4.7: scaled integers in RAW_IMU, a HIGHRES_IMU whose gyro
+keeps its bias and whose magnetometer is a million times too large, positions withheld until the
+estimator has one.
 """
 
 from collections.abc import Callable, Collection
@@ -31,9 +32,9 @@ from sitl.vehicle.conditions import NOMINAL, Conditions
 from sitl.vehicle.config import ArduPilotRelease
 
 HOME = Home(-35.3632621, 149.1652374, 584.0, (0.2322, 0.0520, -0.5280), 945.0, 35.0)
-"""ArduPilot SITL's default home."""
+"""Default home of ArduPilot's SITL."""
 GYRO_BIAS_RADPS: Vec3 = (0.003, -0.002, 0.001)
-"""Subtracted by the estimator; raw IMU messages still carry it."""
+"""Gyro bias. The estimator subtracts it; raw IMU messages contain it."""
 
 _SENSORS = flags(
     "MAV_SYS_STATUS_",
@@ -45,7 +46,7 @@ _CAPABILITIES = flags(
     "PARAM_FLOAT MISSION_INT COMMAND_INT MAVLINK2 SET_ATTITUDE_TARGET "
     "SET_POSITION_TARGET_LOCAL_NED",
 )
-"""No FTP: clients then fetch parameters with PARAM_REQUEST_LIST."""
+"""Without FTP, so that clients fetch parameters with PARAM_REQUEST_LIST."""
 _FIRMWARE_VERSIONS: dict[ArduPilotRelease, int] = {
     "4.6": 4 << 24 | 6 << 16 | 3 << 8 | mav.FIRMWARE_VERSION_TYPE_OFFICIAL,
     "4.7-dev": 4 << 24 | 7 << 16 | mav.FIRMWARE_VERSION_TYPE_DEV,
@@ -55,8 +56,8 @@ _EKF_VERTICAL = mav.EKF_ATTITUDE | mav.EKF_VELOCITY_VERT | mav.EKF_POS_VERT_ABS
 _EKF_HORIZONTAL = flags(
     "EKF_", "VELOCITY_HORIZ POS_HORIZ_REL POS_HORIZ_ABS PRED_POS_HORIZ_REL PRED_POS_HORIZ_ABS"
 )
-_VELOCITY_ONLY = 3079  # POSITION_TARGET_LOCAL_NED.type_mask: all but velocity and acceleration
-_POSITION_ONLY = 3576  # all but the position
+_VELOCITY_ONLY = 3079  # POSITION_TARGET_LOCAL_NED.type_mask: velocity and acceleration only
+_POSITION_ONLY = 3576  # type_mask: position only
 
 
 def _raw_gyro(ap: ArduCopter) -> tuple[float, ...]:
@@ -66,7 +67,7 @@ def _raw_gyro(ap: ArduCopter) -> tuple[float, ...]:
 
 
 def _heartbeat(ap: ArduCopter) -> Message:
-    """CRITICAL while a failsafe is active."""
+    """Build HEARTBEAT; its state is CRITICAL while a failsafe is active."""
     base_mode = (
         mav.MAV_MODE_FLAG_CUSTOM_MODE_ENABLED
         | mav.MAV_MODE_FLAG_STABILIZE_ENABLED
@@ -89,7 +90,7 @@ def _scaled_imu(ap: ArduCopter) -> tuple[int, ...]:
 
 
 def _highres_imu(ap: ArduCopter) -> Message:
-    """Rates with bias; the field is in micro-gauss, as the firmware has it."""
+    """Build HIGHRES_IMU: rates with bias, field in micro-gauss, as in the firmware."""
     field = (1e6 * b for b in HOME.mag_gauss(ap))
     return HOME.highres_imu(ap, _raw_gyro(ap), field, has_difference=True)
 
@@ -101,7 +102,7 @@ def _vfr_hud(ap: ArduCopter) -> Message:
 
 
 def _sys_status(ap: ArduCopter) -> Message:
-    """PREARM_CHECK is healthy when mode and sticks alone decide on arming."""
+    """Build SYS_STATUS; PREARM_CHECK is healthy if only mode and sticks can still refuse arming."""
     present = _SENSORS | mav.MAV_SYS_STATUS_PREARM_CHECK
     present |= mav.MAV_SYS_STATUS_SENSOR_RC_RECEIVER if ap.rc.found else 0
     faults = 0
@@ -115,7 +116,7 @@ def _sys_status(ap: ArduCopter) -> Message:
 
 
 def _ekf_status_report(ap: ArduCopter) -> Message:
-    """Attitude from the start, the rest with a position."""
+    """Build EKF_STATUS_REPORT: the attitude flags from the start, the others with a position."""
     flags = mav.EKF_UNINITIALIZED
     if ap.estimator_ready:
         flags = _EKF_VERTICAL | (0 if ap.position_ready else mav.EKF_CONST_POS_MODE)
@@ -136,7 +137,8 @@ def _autopilot_version(ap: ArduCopter) -> Message:
 
 
 def _attitude_target(ap: ArduCopter) -> Message:
-    """The controller's shaped target, not the received setpoint; thrust before the lean boost."""
+    """Build ATTITUDE_TARGET: the controller's shaped target, not the received setpoint, and the
+    thrust before the lean boost."""
     attitude, rate_radps = ap.control.target
     return mav.MAVLink_attitude_target_message(
         boot_ms(ap), 0, attitude, *rate_radps, ap.control.thrust
@@ -144,7 +146,7 @@ def _attitude_target(ap: ArduCopter) -> Message:
 
 
 def _position_target(ap: ArduCopter) -> Message | None:
-    """The setpoint that GUIDED follows, in NED axes; nothing in other modes or for attitudes."""
+    """Build the setpoint that GUIDED follows, in NED axes; None for attitudes or other modes."""
     guided = ap.guided if ap.mode is Mode.GUIDED else None
     if guided is None or guided.submode is Submode.ATTITUDE:
         return None
@@ -153,7 +155,7 @@ def _position_target(ap: ArduCopter) -> Message | None:
         boot_ms(ap),
         mav.MAV_FRAME_LOCAL_NED,
         _POSITION_ONLY if is_takeoff else _VELOCITY_ONLY,
-        *(0.0, 0.0, 0.0),  # also during a takeoff, as the firmware has it
+        *(0.0, 0.0, 0.0),  # zero even during a takeoff, as in the firmware
         *guided.velocity.velocity_ned_mps,
         *(0.0, 0.0, 0.0, 0.0, 0.0),
     )
@@ -169,7 +171,7 @@ BUILDERS: dict[int, Callable[[ArduCopter], Message | None]] = {
     mav.MAVLINK_MSG_ID_SCALED_IMU: lambda ap: mav.MAVLink_scaled_imu_message(
         boot_ms(ap), *_scaled_imu(ap), HOME.temperature_cdeg
     ),
-    # Scaled integers in spite of its name.
+    # Scaled integers in spite of the name.
     mav.MAVLINK_MSG_ID_RAW_IMU: lambda ap: mav.MAVLink_raw_imu_message(
         boot_us(ap), *_scaled_imu(ap), 0, HOME.temperature_cdeg
     ),
@@ -181,7 +183,7 @@ BUILDERS: dict[int, Callable[[ArduCopter], Message | None]] = {
         else None
     ),
     mav.MAVLINK_MSG_ID_RC_CHANNELS_RAW: lambda _: None,  # accepted by the firmware, never sent
-    # The values after overrides.
+    # Channel values after overrides.
     mav.MAVLINK_MSG_ID_RC_CHANNELS: lambda ap: mav.MAVLink_rc_channels_message(
         boot_ms(ap), ap.rc.channel_count, *ap.rc.channels_us, 0, 0, 255
     ),
@@ -199,7 +201,7 @@ BUILDERS: dict[int, Callable[[ArduCopter], Message | None]] = {
     mav.MAVLINK_MSG_ID_POSITION_TARGET_LOCAL_NED: _position_target,
     mav.MAVLINK_MSG_ID_EXTENDED_SYS_STATE: _extended_sys_state,
 }
-"""Every message that can be streamed or requested; None where there is nothing to report yet."""
+"""Builders of all messages to stream or request; they return None with nothing to report."""
 
 
 HEARTBEAT_INTERVAL_MS = 1000
@@ -232,10 +234,10 @@ class _Stream:
 
 
 class ArduPilotStreams:
-    """The message intervals of one link; stamps are the vehicle's clock, intervals whole ms.
+    """Message intervals of one link, in whole ms. Stamps are those of the vehicle's clock.
 
-    MESSAGE_INTERVAL does not report what the conditions add to them (a slow link, jitter, phases),
-    as on the firmware.
+    MESSAGE_INTERVAL reports the interval without the conditions' delays (slow link, jitter,
+    phases), as the firmware does.
     """
 
     def __init__(
@@ -268,21 +270,21 @@ class ArduPilotStreams:
         return None
 
     def set_group(self, group: int, rate_hz: int, *, loop_hz: float, now_ns: int) -> None:
-        """Apply REQUEST_DATA_STREAM; it overrules earlier intervals. Rate 0 stops the group."""
+        """Apply REQUEST_DATA_STREAM, which replaces earlier intervals. Rate 0 stops the group."""
         interval_ms = max(1000 // rate_hz, shortest_ms(loop_hz)) if rate_hz > 0 else 0
         for one in STREAM_GROUPS if group == mav.MAV_DATA_STREAM_ALL else (group,):
             for message_id in STREAM_GROUPS.get(one, ()):
                 self._start(message_id, interval_ms, now_ns)
 
     def interval_us(self, message_id: int) -> int:
-        """The interval that MESSAGE_INTERVAL reports: 0 = unknown message, -1 = not streamed."""
+        """Return the interval for MESSAGE_INTERVAL: 0 = unknown message, -1 = not streamed."""
         if message_id not in self._known:
             return 0
         stream = self._streams.get(message_id)
         return stream.interval_ms * 1000 if stream else -1
 
     def due(self, now_ns: int, slowdown: int) -> list[int]:
-        """Ids of the messages to send now; missed slots are dropped, so a late one is sent once."""
+        """Return the ids of the messages to send now; after missed slots, each is sent once."""
         ready = [
             key for key, stream in self._streams.items() if now_ns >= stream.due_ns + stream.late_ns
         ]
@@ -299,7 +301,7 @@ class ArduPilotStreams:
     def _start(self, message_id: int, interval_ms: int, now_ns: int) -> None:
         self._streams.pop(message_id, None)
         if interval_ms > 0:
-            # The firmware keeps ten distinct intervals per link; an eleventh joins the nearest.
+            # The firmware keeps ten distinct intervals per link; the nearest replaces an eleventh.
             taken = {stream.interval_ms for stream in self._streams.values()}
             if interval_ms not in taken and len(taken) >= MAX_DISTINCT_INTERVALS:
                 interval_ms = min(taken, key=lambda other: abs(other - interval_ms))
@@ -309,13 +311,12 @@ class ArduPilotStreams:
 
 
 def shortest_ms(loop_hz: float) -> int:
-    """Shortest interval: 0.8 of the main loop's rate, in whole milliseconds; 3 ms at 400 Hz."""
+    """Return the shortest interval, 1 / (0.8 * loop rate) in whole milliseconds: 3 ms at 400 Hz."""
     return int(1000.0 / (0.8 * max(50.0, loop_hz)))
 
 
 class ArduPilotEndpoint(Endpoint[ArduCopter]):
-    """Intervals belong to the link, not to the sender that requested them; two ground stations on
-    one link share them."""
+    """Link whose intervals all senders share, for example two ground stations."""
 
     def __init__(self, ap: ArduCopter) -> None:
         super().__init__(ap, BUILDERS)

@@ -1,4 +1,4 @@
-"""Flight modes: ArduCopter's numbers, and how each turns sticks and state into motor commands."""
+"""Flight modes: ArduCopter's mode numbers and the control laws from sticks to motor commands."""
 
 import math
 from enum import IntEnum
@@ -13,14 +13,14 @@ from sitl.vehicle.dynamics import BodyState, HeightController, mix, thrust_for
 
 IDLE = (0.03, 0.03, 0.03, 0.03)  # armed on the ground, throttle down
 
-SLOW_DESCENT_HEIGHT_M = 10.0  # LAND descends by WPNAV_SPEED_DN above it, by LAND_SPEED below
+SLOW_DESCENT_HEIGHT_M = 10.0  # LAND descends at WPNAV_SPEED_DN above this, at LAND_SPEED below
 RTL_SPEED_MPS = 5.0
 RTL_ARRIVED_M = 1.0
 POSITION_GAIN_PER_S = 0.8
 VELOCITY_GAIN_PER_S = 2.0
 TRAINER_GAIN_PER_S = 5.0
-HOLD_ACCEL_MPS2 = 2.5  # braking and holding lean by at most 14 degrees, as LOITER and LAND did
-HOLD_BELOW_MPS = 0.3  # braking ends at this speed, and the position of that moment is held
+HOLD_ACCEL_MPS2 = 2.5  # limit of braking and holding: 14 degrees of lean, as in LOITER and LAND
+HOLD_BELOW_MPS = 0.3  # braking ends at this speed, and the present position is held
 
 
 class Mode(IntEnum):
@@ -39,7 +39,7 @@ class Mode(IntEnum):
 
     @property
     def manual_throttle(self) -> bool:
-        """The throttle stick is thrust; refused in RC failsafe, and for arming it must be down."""
+        """True if the throttle stick is thrust: refused in RC failsafe, and down for arming."""
         return self in (Mode.STABILIZE, Mode.ACRO)
 
     @property
@@ -56,27 +56,27 @@ class Mode(IntEnum):
 
     @property
     def throttle_is_climb_rate(self) -> bool:
-        """The throttle stick is a climb rate; the height is held where it is centred."""
+        """True if the throttle stick is a climb rate, and holds the height when centred."""
         return self in (Mode.ALT_HOLD, Mode.LOITER, Mode.POSHOLD)
 
     @property
     def holds_position(self) -> bool:
-        """It stops and stays at its place: LOITER and POSHOLD at centred sticks, BRAKE always."""
+        """True for modes that stop and hold: LOITER and POSHOLD at centred sticks, BRAKE always."""
         return self in (Mode.LOITER, Mode.POSHOLD, Mode.BRAKE)
 
     @property
     def needs_position(self) -> bool:
-        """Refused to a vehicle that is armed and has no position."""
+        """True if the mode is refused to an armed vehicle without a position."""
         return self in (Mode.RTL, Mode.GUIDED) or self.holds_position
 
     @property
     def lands(self) -> bool:
-        """It ends on the ground: touching down stops the motors at once."""
+        """True if the mode ends on the ground; touching down stops the motors at once."""
         return self in (Mode.RTL, Mode.LAND)
 
 
 class CopterControl:
-    """Control laws of all modes, and the controllers that they share."""
+    """Control laws of all modes, with their shared controllers."""
 
     def __init__(self, params: ArduPilotParams) -> None:
         self._params = params
@@ -86,7 +86,7 @@ class CopterControl:
         self._hold_ned_m: Vec3 | None = None
         self.guided = GuidedControl(params, self._attitude, self._height)
         self.thrust = self.collective = 0.0
-        """Commanded mean thrust, as a fraction of full: before and after the boost for a lean."""
+        """Commanded mean thrust, as a fraction of full, before and after the boost for a lean."""
 
     @property
     def target(self) -> tuple[Quat, Vec3]:
@@ -97,7 +97,7 @@ class CopterControl:
         self.guided.enter(body, with_position=mode is Mode.GUIDED)
 
     def reset(self, body: BodyState) -> None:
-        """Forget the targets; setpoints of a companion computer stay."""
+        """Clear the targets; keep the setpoints of a companion computer."""
         self._attitude.reset(body)
         self._height.reset(body)
         self._home_reached = False
@@ -137,7 +137,7 @@ class CopterControl:
     def _lean(
         self, mode: Mode, sticks: Sticks, body: BodyState, *, has_position: bool, dt_s: float
     ) -> Vec3:
-        """One step of the modes that lean; the body angular acceleration in rad/s^2."""
+        """Run one step of a leaning mode. Return the body angular acceleration [rad/s^2]."""
         roll, pitch = pilot.lean_angles(sticks, self._params) if mode.piloted else (0.0, 0.0)
         if roll or pitch or not has_position:
             self._hold_ned_m = None
@@ -173,7 +173,7 @@ class CopterControl:
         return -self._params["LAND_SPEED"] / 100.0
 
     def _lean_home(self, mode: Mode, body: BodyState) -> tuple[float, float]:
-        """Lean that stops the drift, or in RTL flies home once the return height is reached."""
+        """Return the lean that stops the drift, or in RTL flies home from the return height on."""
         north, east, down = body.position_ned_m
         wanted_n = wanted_e = 0.0
         if mode is Mode.RTL and not self._home_reached:
@@ -186,7 +186,7 @@ class CopterControl:
         return _lean_towards(wanted_n, wanted_e, body, HOLD_ACCEL_MPS2)
 
     def _lean_to_hold(self, body: BodyState) -> tuple[float, float]:
-        """Lean that stops the vehicle, and then keeps it where it came to rest."""
+        """Return the lean that stops the vehicle and then holds its resting position."""
         wanted_n = wanted_e = 0.0
         if self._hold_ned_m is not None:
             north, east, _ = self._hold_ned_m
@@ -212,7 +212,7 @@ class CopterControl:
 
 
 def _stay_within(angle: float, limit: float, rate: float) -> float:
-    """The rate, braked so that the angle comes to rest at the limit."""
+    """Return the rate, limited so that the angle comes to rest at the limit."""
     lowest, highest = -limit - angle, limit - angle
     return max(TRAINER_GAIN_PER_S * lowest, min(TRAINER_GAIN_PER_S * highest, rate))
 
@@ -220,7 +220,7 @@ def _stay_within(angle: float, limit: float, rate: float) -> float:
 def _lean_towards(
     wanted_n_mps: float, wanted_e_mps: float, body: BodyState, limit_mps2: float
 ) -> tuple[float, float]:
-    """Roll and pitch (rad) that change the velocity to this one, at no more than the limit."""
+    """Return roll and pitch [rad] that bring the velocity to the wanted one, within the limit."""
     accel_n_mps2 = VELOCITY_GAIN_PER_S * (wanted_n_mps - body.velocity_ned_mps[0])
     accel_e_mps2 = VELOCITY_GAIN_PER_S * (wanted_e_mps - body.velocity_ned_mps[1])
     scale = limit_mps2 / max(limit_mps2, math.hypot(accel_n_mps2, accel_e_mps2))

@@ -1,7 +1,7 @@
 """GUIDED and GUIDED_NOGPS: setpoints of a companion computer instead of the pilot's sticks.
 
-Which message is taken, what an invalid one does, the timeout and the response times are those
-measured on the firmware. Positions as setpoints are not simulated; they are dropped.
+Accepted messages, the effect of invalid ones, the timeout and the response times are those measured
+on the firmware. Position setpoints are not simulated; they are dropped.
 """
 
 import math
@@ -16,16 +16,17 @@ from sitl.rotation import Vec3, from_euler, integrate, to_euler
 from sitl.vehicle.dynamics import BodyState, HeightController, clamp, thrust_for
 
 OPTION_THRUST = 8
-"""GUID_OPTIONS: SET_ATTITUDE_TARGET.thrust is a collective; else it is a climb rate."""
+"""Bit of GUID_OPTIONS: SET_ATTITUDE_TARGET.thrust is a collective instead of a climb rate."""
 ARMING_DELAY_NS = 2 * NS_PER_S
 SPOOL_UP_NS = 500 * NS_PER_MS
 CLIMB_WINDUP_NS = 500 * NS_PER_MS
-"""On top where the height controller lifts it off; a takeoff to 8 m passed 2 m after 3.0 s."""
+"""Added to SPOOL_UP_NS if the height controller does the lift-off. On the firmware a takeoff to 8 m
+passed 2 m after 3.0 s."""
 TAKEOFF_DECEL_MPS2 = 0.7
 TAKEOFF_GAIN_PER_S = 1.0
 ACCEL_MPS2 = 2.5  # WPNAV_ACCEL
 JERK_MPS3 = 5.0  # PSC_JERK_XY
-SPEED_GAIN_PER_S = 1.8  # of the target's own speed: 2 m/s to 90 % in 1.34 s was measured
+SPEED_GAIN_PER_S = 1.8  # towards the target's speed; on the firmware 2 m/s took 1.34 s to 90 %
 VELOCITY_GAIN_PER_S = 2.0
 POSITION_GAIN_PER_S = 1.0
 MAX_POSITION_ERROR_M = 2.0
@@ -34,14 +35,14 @@ MIN_CLIMB_ACCEL_MPS2 = 0.5
 
 
 class VelocitySetpoint(NamedTuple):
-    """A valid SET_POSITION_TARGET_LOCAL_NED."""
+    """Velocity and yaw rate of a valid SET_POSITION_TARGET_LOCAL_NED."""
 
     velocity_ned_mps: Vec3
     yaw_rate_radps: float
 
 
 class Submode(Enum):
-    """Kind of setpoint that GUIDED follows; GUIDED_NOGPS knows ATTITUDE alone."""
+    """Kind of setpoint that GUIDED follows; GUIDED_NOGPS supports ATTITUDE only."""
 
     VELOCITY = auto()
     ATTITUDE = auto()
@@ -49,7 +50,7 @@ class Submode(Enum):
 
 
 class GuidedControl:
-    """Control law of both modes, on the attitude and height controllers of all modes."""
+    """Control law of both modes, on the attitude and height controllers shared by all modes."""
 
     def __init__(
         self, params: ArduPilotParams, attitude: AttitudeController, height: HeightController
@@ -68,7 +69,7 @@ class GuidedControl:
         self._yaw = self._yaw_rate_radps = 0.0
 
     def enter(self, body: BodyState, *, with_position: bool) -> None:
-        """Forget all setpoints: GUIDED brakes then, GUIDED_NOGPS levels and holds its height."""
+        """Clear all setpoints: GUIDED then brakes, GUIDED_NOGPS levels and holds its height."""
         self._setpoint = None
         self._has_thrust = False
         self.submode = Submode.ATTITUDE
@@ -76,7 +77,7 @@ class GuidedControl:
             self.brake(body)
 
     def brake(self, body: BodyState) -> None:
-        """Stop and stay: what an invalid setpoint does in GUIDED, too."""
+        """Stop and hold. An invalid setpoint in GUIDED does the same."""
         self._start(Submode.VELOCITY, body)
 
     def follow_attitude(self, setpoint: AttitudeSetpoint, body: BodyState, now_ns: int) -> None:
@@ -99,9 +100,9 @@ class GuidedControl:
         self._takeoff_height_m = height_m
 
     def is_taking_off(self, body: BodyState) -> bool:
-        """`take_off` is under way: a tenth of its height missing, or still climbing fast.
+        """True while `take_off` has over a tenth of its height left or the climb is still fast.
 
-        Formula: ArduCopter's ``auto_takeoff``, less than half of WPNAV_SPEED_UP at the end.
+        Formula: ArduCopter's ``auto_takeoff``; fast is at least half of WPNAV_SPEED_UP.
         """
         if self.submode is not Submode.TAKEOFF:
             return False
@@ -111,7 +112,7 @@ class GuidedControl:
     def lifts_off(self, now_ns: int, armed_ns: int) -> bool:
         """True once a landed vehicle has spun its motors up for a takeoff.
 
-        A velocity never lifts it off; a thrust or climb rate above zero does, or `take_off`.
+        A thrust or climb rate above zero lifts it off, as does `take_off`; a velocity never does.
         """
         wanted = self.submode is Submode.TAKEOFF
         by_thrust = self.submode is Submode.ATTITUDE and self._has_thrust
@@ -129,7 +130,7 @@ class GuidedControl:
     def fly(
         self, body: BodyState, now_ns: int, *, has_position: bool, dt_s: float
     ) -> tuple[Vec3, float]:
-        """Body angular acceleration (rad/s^2) and thrust (0..1, of a level vehicle)."""
+        """Return body angular acceleration [rad/s^2] and thrust (0..1, of a level vehicle)."""
         if self.submode is Submode.ATTITUDE:
             return self._fly_attitude(body, now_ns, dt_s)
         return self._fly_velocity(body, now_ns, has_position=has_position, dt_s=dt_s)
@@ -177,7 +178,7 @@ class GuidedControl:
         return turn, self._hold_climb(body, -down, dt_s)
 
     def _start(self, submode: Submode, body: BodyState) -> None:
-        """Begin with a velocity of zero, unless it flies in this way already."""
+        """Set the velocity to zero, and reset the controllers if the submode changes."""
         self.velocity = VelocitySetpoint((0.0, 0.0, 0.0), 0.0)
         if self.submode is not submode:
             self.submode = submode
@@ -194,7 +195,7 @@ class GuidedControl:
         return max(0.0, min(1.0, self._setpoint.thrust)) if self._setpoint else 0.0
 
     def _climb_mps(self) -> float:
-        """Climb rate of a thrust: 0.5 holds the height, 0 and 1 are WPNAV's descent and climb."""
+        """Return the climb rate of a thrust: 0 is WPNAV_SPEED_DN, 0.5 zero, 1 WPNAV_SPEED_UP."""
         above_half = 2.0 * self._thrust() - 1.0
         limit = "WPNAV_SPEED_UP" if above_half > 0.0 else "WPNAV_SPEED_DN"
         return above_half * self._params[limit] / 100.0
@@ -206,7 +207,7 @@ class GuidedControl:
 
 
 class _Track:
-    """A horizontal target that changes its velocity without jumps, and the vehicle's way to it."""
+    """Horizontal target whose velocity changes without jumps, and the controller towards it."""
 
     def __init__(self) -> None:
         self._position_m = [0.0, 0.0]
@@ -221,7 +222,7 @@ class _Track:
     def step(
         self, wanted_mps: tuple[float, float], body: BodyState, dt_s: float
     ) -> tuple[float, float]:
-        """North and east acceleration (m/s^2) of the vehicle."""
+        """Return the vehicle's acceleration north and east [m/s^2]."""
         error = [w - v for w, v in zip(wanted_mps, self._velocity_mps, strict=True)]
         scale = min(SPEED_GAIN_PER_S, ACCEL_MPS2 / max(1e-6, math.hypot(*error)))
         accel = [0.0, 0.0]

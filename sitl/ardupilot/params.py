@@ -1,11 +1,10 @@
 """Parameters that the simulated firmware reads, with ArduCopter's names and SITL defaults.
 
-The names in this code are those of the measured firmware, a 4.7 in development: it has the system
-ids of 4.7 and the units of 4.6. On the wire they are those of `VehicleConfig.ardupilot_release`.
-
-Values are float32, as on the wire (PARAM_VALUE carries REAL32). Those that differ from one vehicle
-to the next come from its conditions; their nominal attitude gains and rate limits are this
-vehicle's own tuning, not the firmware's defaults.
+The code uses the names of the measured firmware, a development version of 4.7, which has the system
+ids of 4.7 and the units of 4.6. On the wire the names are those of
+`VehicleConfig.ardupilot_release`. Values are float32, as on the wire (PARAM_VALUE carries REAL32).
+Values that vary between vehicles come from the conditions; their nominal attitude gains and rate
+limits are this vehicle's tuning, not the firmware's defaults.
 """
 
 from sitl.firmware import Params, float32
@@ -13,7 +12,7 @@ from sitl.vehicle.conditions import NOMINAL, Conditions
 from sitl.vehicle.config import ArduPilotRelease
 
 RC_CHANNELS_WITH_PARAMS = 8
-DEFAULT_RATE_P = float32(0.135)  # gain of the loop from body rates to torque, roll and pitch
+DEFAULT_RATE_P = float32(0.135)  # gain from body rates to torque, roll and pitch
 _FIXED = {
     "ACRO_BAL_PITCH": 1.0,
     "ACRO_BAL_ROLL": 1.0,
@@ -21,11 +20,11 @@ _FIXED = {
     "ACRO_RP_RATE": 360.0,  # deg/s
     "ACRO_TRAINER": 2.0,  # 0 none, 1 levels itself, 2 also limits the lean
     "ACRO_Y_RATE": 202.5,  # deg/s
-    "ATC_ACCEL_Y_MAX": 27000.0,  # cdeg/s^2, of GUIDED alone; 0: no limit
+    "ATC_ACCEL_Y_MAX": 27000.0,  # cdeg/s^2, in GUIDED only; 0: no limit
     "ATC_ANGLE_BOOST": 1.0,  # more thrust in a lean
-    "ATC_RATE_Y_MAX": 0.0,  # deg/s, of GUIDED alone; 0: no limit
+    "ATC_RATE_Y_MAX": 0.0,  # deg/s, in GUIDED only; 0: no limit
     "DISARM_DELAY": 10.0,  # s
-    "FLTMODE1": 0.0,  # STABILIZE; the modes of the switch's six positions, this vehicle's own
+    "FLTMODE1": 0.0,  # STABILIZE; FLTMODE1 to 6, the switch's positions, are this vehicle's choice
     "FLTMODE2": 9.0,  # LAND
     "FLTMODE3": 6.0,  # RTL
     "FLTMODE4": 2.0,  # ALT_HOLD, at 1500 us
@@ -34,15 +33,15 @@ _FIXED = {
     "FLTMODE_CH": 5.0,  # channel of the switch; 0: none
     "FS_GCS_ENABLE": 0.0,  # 0 off, 1 RTL, 5 LAND, 7 BRAKE
     "FS_GCS_TIMEOUT": 5.0,  # s
-    "FS_OPTIONS": 16.0,  # bit 2: GUIDED goes on; 3: a landing; 4: the pilot when the GCS is lost
+    "FS_OPTIONS": 16.0,  # bit 2: GUIDED continues; 3: a landing; 4: the pilot after GCS loss
     "FS_THR_ENABLE": 1.0,  # 0 off, 1 RTL, 3 LAND, 7 BRAKE
     "FS_THR_VALUE": 975.0,  # us
     "GUID_OPTIONS": 0.0,  # bit 3: SET_ATTITUDE_TARGET.thrust is thrust, not a climb rate
-    "GUID_TIMEOUT": 3.0,  # s; how long a setpoint counts
+    "GUID_TIMEOUT": 3.0,  # s until a setpoint is stale
     "LAND_SPEED": 50.0,  # cm/s
     "MAV_GCS_SYSID": 255.0,
     "MAV_GCS_SYSID_HI": 0.0,
-    "MAV_OPTIONS": 0.0,  # bit 0: listen to the GCS alone
+    "MAV_OPTIONS": 0.0,  # bit 0: listen to the GCS only
     "MAV_SYSID": 1.0,
     "MOT_THST_HOVER": 0.39,
     "RCMAP_PITCH": 2.0,
@@ -54,7 +53,7 @@ _FIXED = {
     "RC_OVERRIDE_TIME": 3.0,  # s; 0 refuses overrides, < 0 never expires
     "RTL_ALT": 1500.0,  # cm
     "SCHED_LOOP_RATE": 400.0,  # Hz; bounds the message rates
-    "SIMPLE": 0.0,  # a bit for each position of the mode switch
+    "SIMPLE": 0.0,  # one bit for each position of the mode switch
     "SUPER_SIMPLE": 0.0,
     "WPNAV_ACCEL_Z": 100.0,  # cm/s^2
     "WPNAV_SPEED_DN": 150.0,  # cm/s
@@ -64,7 +63,7 @@ _RC_CHANNEL = {"MAX": 2000.0, "MIN": 1000.0, "OPTION": 0.0, "REVERSED": 0.0, "TR
 
 _NAMES_4_6 = {
     "MAV_GCS_SYSID": "SYSID_MYGCS",
-    "MAV_OPTIONS": "SYSID_ENFORCE",  # its bit 0
+    "MAV_OPTIONS": "SYSID_ENFORCE",  # corresponds to bit 0
     "MAV_SYSID": "SYSID_THISMAV",
 }
 _ABSENT_IN_4_6 = ("MAV_GCS_SYSID_HI",)
@@ -82,7 +81,7 @@ _NAMES_4_7 = {
     "WPNAV_SPEED_DN": "WP_SPD_DN",
     "WPNAV_SPEED_UP": "WP_SPD_UP",
 }
-"""All of them in metres or degrees, where the names before were in hundredths of those."""
+"""Renamed parameters, all in metres or degrees; under the old names they were in hundredths."""
 _SI_NAMES = frozenset(_NAMES_4_7.values())
 HUNDREDTHS = 100.0
 
@@ -102,7 +101,7 @@ def _varied(conditions: Conditions) -> dict[str, float]:
         "ATC_RATE_P_MAX": conditions.lean_rate_max_degps,  # deg/s; 0: no limit
         "ATC_RATE_R_MAX": conditions.lean_rate_max_degps,
         "PILOT_ACCEL_Z": conditions.pilot_accel_z_cmps2,
-        "PILOT_SPEED_DN": conditions.pilot_speed_down_cmps,  # 0: as up
+        "PILOT_SPEED_DN": conditions.pilot_speed_down_cmps,  # 0: equal to up
         "PILOT_SPEED_UP": conditions.pilot_speed_up_cmps,
         "PILOT_Y_EXPO": conditions.pilot_yaw_expo,
         "PILOT_Y_RATE": conditions.pilot_yaw_rate_degps,
@@ -111,7 +110,7 @@ def _varied(conditions: Conditions) -> dict[str, float]:
 
 
 class ArduPilotParams(Params):
-    """Named numbers; `on_wire` and `set_on_wire` know them by the names of the release."""
+    """ArduPilot's parameters; `on_wire` and `set_on_wire` use the names of the release."""
 
     def __init__(
         self, conditions: Conditions = NOMINAL, release: ArduPilotRelease = "4.7-dev"
@@ -130,15 +129,15 @@ class ArduPilotParams(Params):
         self.names = tuple(self._by_wire_name)
 
     def on_wire(self, name: str) -> float:
-        """The value in the unit that this name, one of ``names``, has on the wire."""
+        """Return the value in the wire unit of this name, one of ``names``."""
         value = self._values[self._by_wire_name[name]]
         return value / HUNDREDTHS if name in _SI_NAMES else value
 
     def set_on_wire(self, name: str, packed: float) -> bool:
-        """As `set`, by a name and in the unit of the wire."""
+        """Store a value by its wire name, in its wire unit. Return False if refused, like `set`."""
         scale = HUNDREDTHS if name in _SI_NAMES else 1.0
         return name in self._by_wire_name and self.set(self._by_wire_name[name], scale * packed)
 
     def decimal(self, name: str) -> float:
-        """The value rounded to the seven digits that float32 carries: 0.15, not 0.1500000059."""
+        """Return the value rounded to the seven digits of a float32: 0.15, not 0.1500000059."""
         return float(f"{self._values[name]:.7g}")

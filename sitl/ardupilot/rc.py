@@ -8,10 +8,10 @@ from sitl.ardupilot.params import RC_CHANNELS_WITH_PARAMS, ArduPilotParams
 from sitl.clock import NS_PER_S
 
 CHANNELS = 16
-PRIMARY_CHANNELS = 8  # channels 1-8 and 9-16 differ in what 0 and the highest values mean
+PRIMARY_CHANNELS = 8  # 0 and the highest values mean something else on channels 9-16
 IGNORE = 65535
-RELEASE_ON_AUX = 65534  # releases channels 9-16; on 1-8 it is a value like any other
-RELEASE = 0  # releases channels 1-8; on 9-16 it means "ignore"
+RELEASE_ON_AUX = 65534  # releases channels 9-16; an ordinary value on 1-8
+RELEASE = 0  # releases channels 1-8; means "ignore" on 9-16
 AXIS_ABSENT = 32767  # MANUAL_CONTROL axis that the sender does not drive
 
 _RECEIVER_PERIOD_NS = NS_PER_S // 50
@@ -21,10 +21,10 @@ _OPTIONS_IGNORE_OVERRIDES = 2
 
 
 class RcEngine:
-    """Merges receiver and overrides, channel by channel; stamps are nanoseconds of one clock.
+    """Merges receiver and overrides, channel by channel. Stamps are nanoseconds of one clock.
 
-    Rules as measured on ArduCopter 4.7: each channel expires after RC_OVERRIDE_TIME, nothing is
-    checked for its range, and sticks stay latched where there is no receiver.
+    Rules as measured on ArduCopter 4.7: each channel expires after RC_OVERRIDE_TIME, ranges are not
+    checked, and without a receiver the sticks stay latched.
     """
 
     def __init__(self, params: ArduPilotParams, receiver_us: Sequence[int] | None) -> None:
@@ -38,7 +38,7 @@ class RcEngine:
         self._switch = _OverrideSwitch()
         self.channels_us = [0] * CHANNELS
         """Channels that RC_CHANNELS reports and the modes use; 0 = never had a value."""
-        self.found = receiver_us is not None  # true with a receiver, or once an override has come
+        self.found = receiver_us is not None  # has a receiver, or an override has come
 
     @property
     def has_receiver(self) -> bool:
@@ -49,11 +49,11 @@ class RcEngine:
         return max(PRIMARY_CHANNELS, len(self._receiver_us or ()))
 
     def set_receiver(self, values_us: Sequence[int]) -> None:
-        """Move sticks and switches of the transmitter, in microseconds; the next frame has them.
+        """Move sticks and switches of the transmitter [us] from the next frame on.
 
-        Up to 16 channels at 50 Hz; a 0 leaves its channel as it is. All zeros switch it off: no
-        more frames come, and the last values stay. A vehicle without a receiver has one from its
-        first values on.
+        Up to 16 channels at 50 Hz; a 0 leaves its channel unchanged. All zeros switch the
+        transmitter off: frames stop, the last values stay. A vehicle without a receiver gets one
+        with its first values.
         """
         self._has_frames = any(values_us)
         if self._has_frames:
@@ -73,7 +73,7 @@ class RcEngine:
                 self._set(index, value, now_ns)
 
     def manual_control(self, *, x: int, y: int, z: int, r: int, now_ns: int) -> None:
-        """Apply a MANUAL_CONTROL: -1000..1000 (z 0..1000); +x is forward, hence a lower PWM."""
+        """Apply a MANUAL_CONTROL: -1000..1000 (z 0..1000); +x is forward and so a lower PWM."""
         if z < 0:
             return
         axes = (
@@ -93,18 +93,18 @@ class RcEngine:
         self._override_us = [RELEASE] * CHANNELS
 
     def index_of(self, axis: str) -> int:
-        """Zero-based channel of ROLL, PITCH, THROTTLE or YAW by RCMAP_*."""
+        """Return the zero-based channel of ROLL, PITCH, THROTTLE or YAW by RCMAP_*."""
         mapped = self._params.integer(f"RCMAP_{axis}")
         return min(max(mapped, 1), RC_CHANNELS_WITH_PARAMS) - 1
 
     def sticks_us(self) -> tuple[int, int, int, int]:
-        """Roll, pitch, throttle and yaw that the modes use, in microseconds by RCMAP_*."""
+        """Return the roll, pitch, throttle and yaw that the modes use [us], by RCMAP_*."""
         roll, pitch, throttle, yaw = map(self.index_of, ("ROLL", "PITCH", "THROTTLE", "YAW"))
         channels_us = self.channels_us
         return channels_us[roll], channels_us[pitch], channels_us[throttle], channels_us[yaw]
 
     def update(self, now_ns: int) -> bool:
-        """Refresh ``channels_us``; True if receiver or overrides supplied a value."""
+        """Refresh ``channels_us``. Return True if receiver or overrides supplied a value."""
         frame = self._has_frames and now_ns >= self._next_receiver_ns
         if not (frame or self._fresh_override):
             self._watch_switch(now_ns)
@@ -148,7 +148,7 @@ class RcEngine:
 
 
 class ModeSwitch:
-    """FLTMODE_CH: acts when its position has changed and has stayed for 0.2 s."""
+    """Switch on FLTMODE_CH, debounced: a new position acts after 0.2 s."""
 
     _HIGHEST_US = (1230, 1360, 1490, 1620, 1749)  # of the first five positions
     _DEBOUNCE_NS = NS_PER_S // 5
@@ -159,7 +159,7 @@ class ModeSwitch:
         self._since_ns = 0
 
     def update(self, pwm_us: int, now_ns: int) -> int | None:
-        """The new position, 1..6, at the moment it is taken; None otherwise and for the first."""
+        """Return the position, 1..6, when it has just changed; None otherwise and for the first."""
         if not 900 < pwm_us < 2200:
             return None
         position = 1 + bisect_left(self._HIGHEST_US, pwm_us)
@@ -174,7 +174,7 @@ class ModeSwitch:
 class _OverrideSwitch:
     """RCn_OPTION 46: high allows overrides, low forbids them, the middle changes nothing.
 
-    Read at 10 Hz and debounced for 0.2 s, so a flip acts after 0.2 to 0.3 s (0.38 s was measured).
+    Read at 10 Hz and debounced for 0.2 s, so a flip acts after 0.2 to 0.3 s (measured: 0.38 s).
     """
 
     _PERIOD_NS = NS_PER_S // 10
@@ -187,7 +187,7 @@ class _OverrideSwitch:
         self._since_ns = 0
 
     def update(self, pwm_us: int, now_ns: int) -> bool:
-        """True when overrides have just been forbidden."""
+        """Return True if overrides have just been forbidden."""
         if now_ns < self._due_ns:
             return False
         self._due_ns = now_ns + self._PERIOD_NS

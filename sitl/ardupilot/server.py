@@ -1,10 +1,9 @@
-"""Receives MAVLink on all links of an ArduPilot vehicle: who is obeyed, what a message does.
+"""Message handling of the simulated ArduPilot, without I/O.
 
 Filters are ArduCopter's as measured: overrides only from MAV_GCS_SYSID (or up to MAV_GCS_SYSID_HI),
-commands from anybody, everything only for target system 0 or the vehicle's own.
-
-Setpoints are never answered, and ignored outside GUIDED and GUIDED_NOGPS. An invalid one makes
-GUIDED brake and leaves GUIDED_NOGPS with its last setpoint, as measured on the firmware.
+commands from any sender, and only messages for target system 0 or the vehicle. Setpoints are never
+answered, and ignored outside GUIDED and GUIDED_NOGPS. An invalid one makes GUIDED brake and leaves
+GUIDED_NOGPS with its last setpoint, as measured on the firmware.
 """
 
 import math
@@ -35,13 +34,13 @@ from sitl.link.server import (
 from sitl.report import FlightLog
 from sitl.rotation import from_euler, rotate
 
-FORCE_REBOOT = 20190226.0  # param 6 of PREFLIGHT_REBOOT_SHUTDOWN: also while armed (ArduPilot)
+FORCE_REBOOT = 20190226.0  # param 6 of PREFLIGHT_REBOOT_SHUTDOWN: even while armed (ArduPilot)
 SIMPLE_MODE, SWITCH_LOW = 3.0, 0.0  # params of DO_AUX_FUNCTION
 _OPTION_GCS_ONLY = 1
-MAX_NORM_ERROR = 1e-3  # of the squared length of a quaternion
+MAX_NORM_ERROR = 1e-3  # tolerance for the squared length of a quaternion
 
-_RATES_IGNORED = 0b111  # of ATTITUDE_TARGET_TYPEMASK
-_POSITION_IGNORED, _VELOCITY_IGNORED = 0b111, 0b111 << 3  # of POSITION_TARGET_TYPEMASK
+_RATES_IGNORED = 0b111  # bits of ATTITUDE_TARGET_TYPEMASK
+_POSITION_IGNORED, _VELOCITY_IGNORED = 0b111, 0b111 << 3  # bits of POSITION_TARGET_TYPEMASK
 _NED_AXES = (mav.MAV_FRAME_LOCAL_NED, mav.MAV_FRAME_LOCAL_OFFSET_NED)
 _BODY_AXES = (mav.MAV_FRAME_BODY_NED, mav.MAV_FRAME_BODY_OFFSET_NED)
 
@@ -86,7 +85,7 @@ class ArduPilotServer(MavlinkServer[ArduCopter, ArduPilotEndpoint]):
     def _pass_on(self, link: ArduPilotEndpoint, message: Message) -> None: ...
 
     def _announce(self) -> None:
-        """A change of mode sends a heartbeat at once."""
+        """Send a heartbeat at once after a mode change."""
         if self._ap.mode is not self._mode:
             self._mode = self._ap.mode
             for link in self.links:
@@ -99,7 +98,7 @@ class ArduPilotServer(MavlinkServer[ArduCopter, ArduPilotEndpoint]):
             return False
         if getattr(message, "target_system", 0) not in (0, own):
             return False
-        # Commands mark unused parameters with NaN; each checks those that it reads.
+        # Commands mark unused parameters with NaN; each handler checks those that it reads.
         values = [getattr(message, name) for name in message.fieldnames]
         numbers = [value for value in values if isinstance(value, float)]
         if message.get_type() not in COMMAND_FIELDS and not all(map(math.isfinite, numbers)):
@@ -150,7 +149,7 @@ class ArduPilotServer(MavlinkServer[ArduCopter, ArduPilotEndpoint]):
             ap.guided.brake(ap.sensed)
 
     def _position_target(self, _link: ArduPilotEndpoint, message: Message, arrived_ns: int) -> None:
-        """GUIDED_NOGPS ignores it."""
+        """Follow a velocity in GUIDED; GUIDED_NOGPS ignores it."""
         ap = self._ap
         if ap.guided is None or ap.mode is not Mode.GUIDED:
             return
@@ -224,7 +223,7 @@ class ArduPilotServer(MavlinkServer[ArduCopter, ArduPilotEndpoint]):
         return ACCEPTED if math.isfinite(height_m) and self._ap.take_off(height_m) else FAILED
 
     def _aux_function(self, params: Params7, _link: ArduPilotEndpoint) -> int:
-        """Simple mode off is the one function that this vehicle takes from a command."""
+        """Turn Simple mode off, the only function supported by command."""
         if params[:2] != (SIMPLE_MODE, SWITCH_LOW):
             return FAILED
         self._ap.simple.axes = Axes.VEHICLE
@@ -254,7 +253,7 @@ def _attitude_setpoint(message: Message) -> AttitudeSetpoint | None:
     if not mask & mav.ATTITUDE_TARGET_TYPEMASK_ATTITUDE_IGNORE:
         w, x, y, z = message.q
         norm = w * w + x * x + y * y + z * z
-        if not abs(norm - 1.0) <= MAX_NORM_ERROR:  # also not a number
+        if not abs(norm - 1.0) <= MAX_NORM_ERROR:  # negated, so that NaN is refused
             return None
         length = math.sqrt(norm)
         attitude = (w / length, x / length, y / length, z / length)
@@ -263,7 +262,7 @@ def _attitude_setpoint(message: Message) -> AttitudeSetpoint | None:
 
 
 def _velocity_setpoint(message: Message, heading_rad: float) -> VelocitySetpoint | None:
-    """The velocity in NED axes; accelerations and a heading in the message have no effect."""
+    """Return the velocity in NED axes; ignore accelerations and a heading in the message."""
     mask = message.type_mask
     if mask & _VELOCITY_IGNORED or mask & _POSITION_IGNORED != _POSITION_IGNORED:
         return None

@@ -1,7 +1,7 @@
-"""Meaning of the sticks: dead zones, curves, the arming gesture, Simple mode.
+"""Stick processing: dead zones, curves, the arming gesture, Simple mode.
 
 Formulas: ArduPilot ``RC_Channel`` (calibration), Copter ``get_pilot_desired_throttle`` and
-``get_pilot_desired_climb_rate``; pinned by leans and rates measured on the firmware.
+``get_pilot_desired_climb_rate``; checked against leans and rates measured on the firmware.
 """
 
 import math
@@ -15,7 +15,7 @@ from sitl.clock import NS_PER_S
 from sitl.rotation import Vec3, from_heading
 
 THROTTLE_FULL = 1000.0
-GESTURE_NS = 2 * NS_PER_S  # ArduCopter's ARM_DELAY and DISARM_DELAY of the sticks
+GESTURE_NS = 2 * NS_PER_S  # hold time: ArduCopter's ARM_DELAY and DISARM_DELAY of the sticks
 FULL_YAW = 4000 / 4500
 _OPTION_SIMPLE, _OPTION_SUPER_SIMPLE = 3, 13
 _LOW_US, _HIGH_US = 1200, 1800
@@ -33,7 +33,7 @@ class Sticks(NamedTuple):
 
 
 def read_sticks(rc: RcEngine, params: ArduPilotParams) -> Sticks:
-    """Read the four flight sticks by RCMAP_*; a channel that never had a value is centred."""
+    """Return the four flight sticks by RCMAP_*; a channel that never had a value is centred."""
     throttle, mid = _throttle(rc, params)
     return Sticks(
         roll=_centred(rc, params, "ROLL"),
@@ -62,7 +62,7 @@ def _centred(rc: RcEngine, params: ArduPilotParams, axis: str) -> float:
 
 
 def _throttle(rc: RcEngine, params: ArduPilotParams) -> tuple[float, float]:
-    """Throttle and its middle, in 0..THROTTLE_FULL."""
+    """Return the throttle and its middle, in 0..THROTTLE_FULL."""
     index = rc.index_of("THROTTLE")
     name = f"RC{index + 1}_"
     low, high = params[name + "MIN"], params[name + "MAX"]
@@ -80,7 +80,7 @@ def _throttle(rc: RcEngine, params: ArduPilotParams) -> tuple[float, float]:
 
 
 def lean_angles(sticks: Sticks, params: ArduPilotParams) -> tuple[float, float]:
-    """Roll and pitch in radians (+ right, + nose up), their length limited to ANGLE_MAX."""
+    """Return roll and pitch [rad] (+ right, + nose up), their joint length limited to ANGLE_MAX."""
     limit = math.radians(params["ANGLE_MAX"] / 100.0)
     scale = limit / max(1.0, math.hypot(sticks.roll, sticks.pitch))
     return sticks.roll * scale, sticks.pitch * scale
@@ -91,7 +91,7 @@ def yaw_rate_radps(sticks: Sticks, params: ArduPilotParams) -> float:
 
 
 def acro_rates_radps(sticks: Sticks, params: ArduPilotParams) -> tuple[float, float, float]:
-    """Body roll, pitch and yaw rates of ACRO, before the trainer; roll and pitch share a circle."""
+    """Return ACRO's body rates before the trainer; roll and pitch share a circle."""
     length = max(1.0, math.hypot(sticks.roll, sticks.pitch))
     full = math.radians(params["ACRO_RP_RATE"])
     expo = params["ACRO_RP_EXPO"]
@@ -103,13 +103,13 @@ def acro_rates_radps(sticks: Sticks, params: ArduPilotParams) -> tuple[float, fl
 
 
 def _expo(value: float, expo: float) -> float:
-    """ArduPilot's ``input_expo``: softer around the middle, unchanged at the ends."""
+    """Apply ArduPilot's ``input_expo``: softer around the middle, unchanged at the ends."""
     expo = max(0.0, min(0.95, expo))
     return (1.0 - expo) * value / (1.0 - expo * abs(value))
 
 
 def climb_rate_mps(sticks: Sticks, params: ArduPilotParams) -> float:
-    """Climb rate of ALT_HOLD, + up; 0 within THR_DZ of the middle."""
+    """Return the climb rate of ALT_HOLD, + up; 0 within THR_DZ of the middle."""
     dead_zone = max(0.0, min(400.0, params["THR_DZ"]))
     top = sticks.throttle_mid + dead_zone
     bottom = sticks.throttle_mid - dead_zone
@@ -122,7 +122,7 @@ def climb_rate_mps(sticks: Sticks, params: ArduPilotParams) -> float:
 
 
 def manual_thrust(sticks: Sticks, params: ArduPilotParams) -> float:
-    """Collective in [0, 1] of STABILIZE and ACRO: an expo through hover thrust at mid-stick."""
+    """Return the collective in [0, 1] of STABILIZE and ACRO, with hover thrust at mid-stick."""
     mid = min(max(sticks.throttle_mid, 1.0), THROTTLE_FULL - 1.0)
     if sticks.throttle < mid:
         position = 0.5 * sticks.throttle / mid
@@ -133,14 +133,14 @@ def manual_thrust(sticks: Sticks, params: ArduPilotParams) -> float:
 
 
 class RudderGesture:
-    """Throttle at its end with full yaw: to the right arms, to the left disarms."""
+    """Arming gesture: throttle at the bottom with full yaw, right to arm, left to disarm."""
 
     def __init__(self) -> None:
         self._side = 0
         self._since_ns: int | None = None
 
     def update(self, sticks: Sticks, now_ns: int) -> Literal["arm", "disarm"] | None:
-        """The gesture, once, when it has been held for long enough."""
+        """Return the gesture, once, when it has been held for GESTURE_NS."""
         side = 0
         if sticks.throttle == 0.0 and abs(sticks.yaw) > FULL_YAW:
             side = 1 if sticks.yaw > 0.0 else -1
@@ -153,7 +153,7 @@ class RudderGesture:
 
 
 class Axes(IntEnum):
-    """Axes in which the sticks count."""
+    """Axes in which pitch and roll sticks are interpreted."""
 
     VEHICLE = 0
     ARMING = 1
@@ -161,10 +161,10 @@ class Axes(IntEnum):
 
 
 class SimpleMode:
-    """Simple and Super Simple mode: pitch and roll sticks count in other axes than the vehicle's.
+    """Simple and Super Simple mode: pitch and roll in other axes than the vehicle's.
 
-    As Copter up to 4.6 and from 4.8 on has them; 4.7.0 switches them and turns nothing. They stay
-    as they are until a switch or a command changes them: a parameter alone does nothing.
+    As in Copter up to 4.6 and from 4.8 on; 4.7.0 accepts the switch but rotates nothing. Only a
+    switch or a command changes the axes; a changed parameter has no effect until then.
     """
 
     def __init__(self, params: ArduPilotParams) -> None:
@@ -177,7 +177,7 @@ class SimpleMode:
         self._arming_rad = self._home_rad = yaw_rad
 
     def read_mode_switch(self, position: int) -> None:
-        """The mode switch has moved to this position, 1 to 6, or was read for the first time."""
+        """Apply a mode switch position, 1 to 6, that is new or was read for the first time."""
         if self._aux is None:
             bit = 1 << (position - 1)
             is_super = self._params.integer("SUPER_SIMPLE") & bit
@@ -197,7 +197,7 @@ class SimpleMode:
             self.axes = self._aux
 
     def turned(self, sticks: Sticks, yaw_rad: float, position_ned_m: Vec3) -> Sticks:
-        """The same sticks in the vehicle's own axes."""
+        """Return the sticks rotated into the vehicle's axes."""
         if self.axes is Axes.VEHICLE:
             return sticks
         north_m, east_m, _ = position_ned_m

@@ -1,1 +1,1 @@
-"""The simulated camera: the gate course as the vehicle sees it."""
+"""Simulated camera: the gate course seen from the vehicle."""

@@ -1,8 +1,7 @@
-"""Films the course from any other vehicle: its reported pose in, camera frames out.
+"""Camera on another vehicle: its reported pose in, frames of the course out.
 
-The vehicle's local NED is taken for the frame of the course, so it must start at the origin,
-heading north. Nothing is sent that could steer the vehicle: only heartbeats and requests for
-messages.
+The vehicle's local NED is used as the frame of the course, so the vehicle must start at the origin,
+heading north. Only heartbeats and message requests are sent, nothing that could steer the vehicle.
 """
 
 import math
@@ -25,22 +24,22 @@ from sitl.rotation import Quat, Vec3, integrate
 ReportedPose: TypeAlias = tuple[Vec3, Quat]  # position_ned_m, ned_from_body_wxyz
 
 SYSTEM_ID = 246
-"""Not 255: ArduPilot would count our heartbeats as its ground station's, and so not notice that
-the pilot's ground station has gone."""
+"""Not 255: ArduPilot would count our heartbeats as its ground station's and miss the loss of the
+pilot's ground station."""
 POSE_MAX_AGE_NS = NS_PER_S
 REQUEST_PERIOD_NS = NS_PER_S
 QUATERNION = mav.MAVLINK_MSG_ID_ATTITUDE_QUATERNION
 POSITION = mav.MAVLINK_MSG_ID_LOCAL_POSITION_NED
 MESSAGES_PER_FRAME = 2
-MAX_MESSAGE_HZ = 200.0  # within what ArduPilot can send at its default loop rate
+MAX_MESSAGE_HZ = 200.0  # within ArduPilot's limit at its default loop rate
 NO_POSE = "no pose from the vehicle in the last second, so no frames"
 
 
 class PoseListener:
-    """Tracks the pose of the first autopilot that is heard, without I/O: bytes in, bytes out.
+    """Tracks the pose of the first autopilot heard, without I/O: bytes in, bytes out.
 
-    Once a second it requests each message that comes at less than half of the wanted rate. A
-    reading with a value that is not finite, or a quaternion that is far from unit, is ignored.
+    Once a second it requests each message that arrives at less than half of the wanted rate. It
+    ignores a reading with a non-finite value or a quaternion far from unit length.
     """
 
     def __init__(self, *, rate_hz: float) -> None:
@@ -56,7 +55,7 @@ class PoseListener:
         self._due_ns: int | None = None
 
     def receive(self, data: bytes, arrived_ns: int) -> None:
-        """Parse received bytes; garbage and other senders are ignored."""
+        """Parse received bytes; ignore garbage and other senders."""
         for message in self._mav.parse_buffer(data) or ():
             if message.get_srcComponent() != mav.MAV_COMP_ID_AUTOPILOT1:
                 continue
@@ -69,7 +68,7 @@ class PoseListener:
                 self._update(message, arrived_ns)
 
     def pose_at(self, now_ns: int) -> ReportedPose | None:
-        """The pose extrapolated to ``now_ns`` at constant velocity and body rate.
+        """Return the pose extrapolated to ``now_ns`` at constant velocity and body rate.
 
         None if position or attitude is missing or older than POSE_MAX_AGE_NS.
         """
@@ -85,7 +84,7 @@ class PoseListener:
         return now_m, integrate(wxyz, rate_radps, (now_ns - attitude_ns) / NS_PER_S)
 
     def outgoing(self, now_ns: int) -> list[bytes]:
-        """Packets to send now: a heartbeat and requests once a second, else nothing."""
+        """Return the packets to send now: a heartbeat and requests once a second, else none."""
         if self._due_ns is not None and now_ns < self._due_ns:
             return []
         self._due_ns = now_ns + REQUEST_PERIOD_NS
@@ -128,8 +127,8 @@ def film_vehicle(
 ) -> None:
     """Publish the view from the vehicle on ``url`` until ``should_stop``.
 
-    ``url``: ``udp:HOST:PORT`` or ``udpin:`` listens, ``udpout:`` and ``tcp:`` connect to it. While
-    the pose is unknown or older than 1 s no frames are published; changes are printed on stderr.
+    ``url``: ``udp:HOST:PORT`` and ``udpin:`` listen, ``udpout:`` and ``tcp:`` connect. No frames
+    are published while the pose is unknown or older than 1 s; changes are printed on stderr.
 
     Raises:
         UsageError: the address cannot be parsed or bound, or the name cannot be used.

@@ -1,4 +1,4 @@
-"""Draws the view of a camera on the vehicle over a gate course, with OpenCV.
+"""Rendering of the view from a camera on the vehicle over a gate course, with OpenCV.
 
 Frames: NED world; FRD body; camera x right, y down, z along the optical axis. The camera sits at
 the body's origin and looks forward, tilted up, unless the conditions shift it. Pinhole, square
@@ -19,20 +19,20 @@ from sitl.course import Course
 from sitl.rotation import Quat, Vec3, from_euler, rotate
 from sitl.vehicle.conditions import NOMINAL, Conditions
 
-NEAR_M = 0.05  # what is nearer than this, or behind, is cut off before it is projected
+NEAR_M = 0.05  # anything nearer or behind is clipped before projection
 LOWEST_EYE_M = 0.12
-"""The eye is drawn at least this high, so that a vehicle on the ground sees ground."""
+"""Minimum height of the eye in the rendering, so that a vehicle on the ground sees ground."""
 GATE_HAZE_M = 90.0  # distance at which a gate has lost 63 % of its contrast
 GROUND_FADE_M = 14.0
-"""Distance at which the ground has lost 3/4 of its contrast; farther out it would alias."""
+"""Distance at which the ground has lost 3/4 of its contrast; farther texture would alias."""
 GLOW_SHARE = 0.18  # share of the image's width at which the sun's glow has lost 63 %
 SUBPIXEL_BITS = 4  # corners are rounded to 1/16 pixel
-REFERENCE_WIDTH_PX = 224  # image width for which the conditions give the blur
+REFERENCE_WIDTH_PX = 224  # image width that the conditions' blur refers to
 NOISE_MARGIN_PX = 61
-"""Noise is drawn once, this much larger than the image, and cropped anew for every frame."""
+"""Margin of the noise image, which is drawn once and cropped anew for every frame."""
 SMEAR_STEP_PX = 1.5
-"""Motion on the optical axis between two of the images that a smeared one is the mean of."""
-MOST_SMEARED = 8  # most images in that mean
+"""Motion on the optical axis between two of the images averaged for motion blur."""
+MOST_SMEARED = 8  # most images averaged for motion blur
 STILL: Vec3 = (0.0, 0.0, 0.0)  # the rate of a camera that does not turn
 
 Pixels = NDArray[np.float32]
@@ -40,17 +40,17 @@ Pixels = NDArray[np.float32]
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class CameraOptions:
-    """Name, size and rate of the frames that a camera publishes."""
+    """Name, size and rate of published frames."""
 
     shm_name: str
-    image_size: int  # side of the square image, in pixels
+    image_size: int  # side of the square image [pixels]
     fps: float
 
 
 class FpvRenderer:
     """Draws the view from any pose on a course.
 
-    Only image noise, where the conditions have it, depends on how many frames came before.
+    A frame is independent of earlier frames, except for image noise.
     """
 
     def __init__(
@@ -84,7 +84,7 @@ class FpvRenderer:
     ) -> Image:
         """Draw the view as [H, W, 3] uint8 RGB, a new array.
 
-        The body rates matter where the conditions have an exposure or a read-out that takes time.
+        The body rates have an effect if the conditions have an exposure or read-out time.
         """
         eye_ned_m = np.array(position_ned_m, dtype=np.float64)
         if any(self._offset_body_m):
@@ -121,12 +121,12 @@ class FpvRenderer:
         eye_ned_m: FloatArray,
         ned_ray_from_pixel: FloatArray,
     ) -> None:
-        """Blend the ground's texture in, less with distance."""
+        """Blend in the ground's texture, less with distance."""
         height_m = -eye_ned_m[2]
         weight = np.maximum(falls, 0)
         weight /= weight + np.float32(height_m / GROUND_FADE_M)
         weight *= weight
-        # Where a ray meets the ground is a homography of the pixel; modulo the tile keeps it small.
+        # The ground point of a ray is a homography of the pixel; modulo the tile keeps it small.
         north_east_m = np.mod(eye_ned_m[:2], scenery.GROUND_TILE_M)
         tile_from_pixel = ned_ray_from_pixel.copy()
         tile_from_pixel[:2] *= height_m
@@ -142,7 +142,7 @@ class FpvRenderer:
         image[:] = cv2.blendLinear(ground, image, weight, 1 - weight)
 
     def _draw_faces(self, image: Image, eye_ned_m: FloatArray, ned_from_camera: FloatArray) -> None:
-        """Paint far gates and panels first, and the faces of a gate in their order."""
+        """Paint gates and panels from far to near, and the faces of each in their order."""
         faces = self._faces
         from_eye_m = faces.corners_ned_m - eye_ned_m
         facing = np.einsum("nk,nk->n", faces.normals_ned, from_eye_m[:, 0]) <= 0
@@ -154,8 +154,10 @@ class FpvRenderer:
         self._fill(image, from_eye_m[order] @ ned_from_camera, rgb, cv2.LINE_AA)
 
     def _add_glare(self, image: Image, sun: FloatArray) -> Image:
-        """A glow around the sun, which is in this direction, and a veil the nearer it is to the
-        optical axis; gates do not hide it."""
+        """Add a glow around the sun, and a veil that grows as the sun nears the optical axis.
+
+        ``sun`` is its direction in camera axes. Gates do not hide it.
+        """
         x, y, z = sun.tolist()
         if z <= 0.0:
             return image
@@ -166,7 +168,7 @@ class FpvRenderer:
         return np.asarray(cv2.add(image, cv2.merge([light] * 3), dtype=cv2.CV_8U), dtype=np.uint8)
 
     def _fill(self, image: Image, corners_m: FloatArray, rgb: FloatArray, line_type: int) -> None:
-        """Paint quadrilaterals [N, 4, 3] in camera axes, in this order, with colours [N, 3]."""
+        """Paint quadrilaterals [N, 4, 3], given in camera axes, in order, with colours [N, 3]."""
         seen = self._in_view(corners_m)
         corners_m = corners_m[seen]
         cut = corners_m[:, :, 2].min(axis=1) < NEAR_M
@@ -177,12 +179,12 @@ class FpvRenderer:
             cv2.fillConvexPoly(image, fixed, colour, line_type, SUBPIXEL_BITS)
 
     def _project(self, points_m: FloatArray) -> NDArray[np.int32]:
-        """Pixel coordinates [..., 2] in units of 1/16 pixel."""
+        """Project points to pixel coordinates [..., 2] in units of 1/16 pixel."""
         points_px = self._center_px + self._focal_px * points_m[..., :2] / points_m[..., 2:]
         return np.rint(points_px * (1 << SUBPIXEL_BITS)).astype(np.int32)
 
     def _in_view(self, corners_m: FloatArray) -> NDArray[np.bool_]:
-        """Mask [N] of faces [N, 4, 3] that are not wholly behind a side of the view frustum."""
+        """Return the mask [N] of faces [N, 4, 3] not fully outside one side of the view frustum."""
         x, y, z = np.moveaxis(corners_m, -1, 0)
         half_width, half_height = (self._center_px + 1) / self._focal_px
         is_left, is_right = x < -half_width * z, x > half_width * z
@@ -192,13 +194,12 @@ class FpvRenderer:
 
 
 class Shutter:
-    """Motion blur and a rolling shutter: exposes row after row, from top to bottom; a frame's stamp
-    is the middle of both.
+    """Motion blur and a rolling shutter that exposes rows from top to bottom.
 
-    Only rotation counts: the pixels of a view move by the camera's body rate alone, whatever is in
-    it (Longuet-Higgins and Prazdny, "The Interpretation of a Moving Retinal Image", 1980). Motion
-    by the vehicle's speed is left out: at 8 m/s, 5 m before a gate, it is 1.1 rad/s at 45 degrees
-    from ahead.
+    A frame's stamp is the middle of exposure and read-out. Only rotation counts: the camera's body
+    rate alone moves the pixels of a view, independent of its content (Longuet-Higgins and Prazdny,
+    "The Interpretation of a Moving Retinal Image", 1980). Motion by the vehicle's speed is left
+    out: at 8 m/s, 5 m before a gate, it is 1.1 rad/s at 45 degrees from ahead.
     """
 
     def __init__(self, conditions: Conditions, *, u_px: Pixels, v_px: Pixels, focal_px: float):
@@ -212,10 +213,10 @@ class Shutter:
         self._is_instant = conditions.frame_time_s == 0.0
 
     def expose(self, image: Image, rate_camera_radps: FloatArray) -> Image:
-        """The image [H, W, 3] of a camera that turns; may be the argument itself.
+        """Return the image [H, W, 3] of a camera that turns; may be the argument itself.
 
-        ``rate_camera_radps`` [3] is about the camera's axes: right, down, forward. Where the view
-        moves in from beyond the image, its edge is repeated.
+        ``rate_camera_radps`` [3] is about the camera's axes: right, down, forward. Beyond the
+        image, its edge is repeated.
         """
         turn_radps = float(np.linalg.norm(rate_camera_radps))
         if self._is_instant or turn_radps == 0.0:
@@ -230,9 +231,10 @@ class Shutter:
         return np.asarray(np.mean(moved, axis=0).round(), dtype=np.uint8)
 
     def flow_pxps(self, rate_camera_radps: FloatArray) -> tuple[Pixels, Pixels]:
-        """Where the ray of a pixel was at the stamp, right and down, for each second since then.
+        """Return the flow [pixels/s], right and down, for rows exposed before or after the stamp.
 
-        The ray r = (x, y, 1) of a camera that has turned for t was r + t * cross(rate, r) then.
+        A pixel exposed t after the stamp shows the stamp's image at pixel + t * flow: the ray r =
+        (x, y, 1) of a camera that has turned for t was r + t * cross(rate, r) at the stamp.
         """
         right_radps, down_radps, ahead_radps = rate_camera_radps.astype(np.float32)
         deeper = right_radps * self._y - down_radps * self._x
@@ -242,7 +244,7 @@ class Shutter:
         return focal_px * flow_right, focal_px * flow_down
 
     def _moved(self, image: Image, flow_pxps: tuple[Pixels, Pixels], at_s: Pixels) -> Image:
-        """The view at times [H, 1] after the stamp."""
+        """Return the view at times [H, 1] after the stamp."""
         flow_right, flow_down = flow_pxps
         moved = cv2.remap(
             image,
@@ -255,7 +257,7 @@ class Shutter:
 
 
 class _ImageSensor:
-    """Exposure, colour cast, blur and noise of a sensor; noise is the same in each n-th frame."""
+    """Exposure, colour cast, blur and noise of a sensor; the n-th frame's noise is reproducible."""
 
     def __init__(self, conditions: Conditions, width: int, height: int) -> None:
         self._random = np.random.Generator(np.random.PCG64((conditions.seed, 3)))
@@ -272,7 +274,7 @@ class _ImageSensor:
             self._noise = noise.round().astype(np.int16)
 
     def expose(self, image: Image) -> Image:
-        """Image [H, W, 3] RGB as the sensor would record it; may be the argument itself."""
+        """Return the image [H, W, 3] RGB as recorded by the sensor; may be the argument itself."""
         if self._lut is not None:
             image = np.asarray(cv2.LUT(image, self._lut), dtype=np.uint8)
         if self._blur_px > 0.0:
@@ -286,7 +288,7 @@ class _ImageSensor:
 
 
 def body_from_camera(conditions: Conditions = NOMINAL) -> FloatArray:
-    """Rotation matrix [3, 3] from camera axes (x right, y down, z forward) to FRD body axes."""
+    """Return the rotation [3, 3] from camera axes (x right, y down, z forward) to FRD body axes."""
     sine, cosine = math.sin(conditions.camera_tilt_rad), math.cos(conditions.camera_tilt_rad)
     tilted = np.array([[0.0, sine, cosine], [1.0, 0.0, 0.0], [0.0, cosine, -sine]])
     roll_rad, yaw_rad = conditions.camera_roll_rad, conditions.camera_yaw_rad
@@ -298,7 +300,7 @@ def body_from_camera(conditions: Conditions = NOMINAL) -> FloatArray:
 
 
 def clip_near(corners_m: FloatArray) -> FloatArray:
-    """Cut a convex polygon [N, 3] to z >= NEAR_M (Sutherland and Hodgman, 1974)."""
+    """Clip a convex polygon [N, 3] to z >= NEAR_M (Sutherland and Hodgman, 1974)."""
     kept = []
     for start, end in zip(corners_m, np.roll(corners_m, -1, axis=0), strict=True):
         if start[2] >= NEAR_M:
@@ -310,5 +312,5 @@ def clip_near(corners_m: FloatArray) -> FloatArray:
 
 
 def rotation_matrix(wxyz: Quat) -> FloatArray:
-    """Rotation matrix [3, 3] of a quaternion: its columns are the rotated unit vectors."""
+    """Return the rotation matrix [3, 3] of a quaternion; columns are the rotated unit vectors."""
     return np.array([rotate(wxyz, axis) for axis in ((1, 0, 0), (0, 1, 0), (0, 0, 1))]).T

@@ -18,20 +18,21 @@ Image: TypeAlias = NDArray[np.uint8]
 
 LEG_M = 0.09  # width of the two posts that reach down to the ground
 PIP_M = 0.16
-PIP_PITCH_M = 0.32  # white squares on the front of the top bar: the gate's number, counted from one
+PIP_PITCH_M = 0.32  # white squares on the front of the top bar count the gate's number from one
 INSIDE_BRIGHTNESS = 0.7
 SHADE_BRIGHTNESS = 0.4
-PANEL_AHEAD_M = (2.0, 4.5)  # distance before the gate of a panel that hides a part of it
+PANEL_AHEAD_M = (2.0, 4.5)  # distance of a panel before the gate that it partly hides
 PANEL_ASIDE_M = (1.3, 1.9)
-"""From the way to its middle, to either side. Nothing flies through one, and nothing can hit it."""
+"""Distance of the panel's middle from the passage's axis, to either side. No path passes through a
+panel, and panels have no collision."""
 PANEL_WIDTH_M = 1.2
 STRAY_AHEAD_M = (-3.0, 3.0)
-"""Distance of a gate that is out of order beyond the one that it stands beside."""
-STRAY_ASIDE_M = (5.0, 8.0)  # from the middle of that gate, to either side. It cannot be hit.
+"""Distance of a stray gate beyond the gate that it stands beside."""
+STRAY_ASIDE_M = (5.0, 8.0)  # from that gate's middle, to either side; it has no collision
 STRAY_TURN_RAD = math.radians(120.0)
-"""Largest turn of its passage against the other's, to either side."""
+"""Largest turn of a stray gate's passage relative to that gate's, to either side."""
 STRAY_CLEARANCE_M = 4.5
-"""From the middle of every gate of the course; where there is less, none stands."""
+"""Smallest distance of a stray gate from all gates of the course, or it is left out."""
 BOTH_SIDES: Vec3 = (0.0, 0.0, 0.0)
 
 RIDGE_SEGMENTS = 120
@@ -49,7 +50,7 @@ GRID_RGB = (196, 200, 160)
 LEG_RGB = (58, 60, 68)
 PANEL_RGB = (74, 72, 66)
 PIP_RGB = (255, 248, 232)
-BACK_RGB = (96, 98, 112)  # a gate is grey from behind: it must not be passed from there
+BACK_RGB = (96, 98, 112)  # a gate is grey from behind, the side that must not be entered
 BACKDROP_RGB = (
     (-1.0, (78, 98, 66)),
     (-0.30, (92, 108, 76)),
@@ -59,14 +60,14 @@ BACKDROP_RGB = (
     (0.40, (126, 172, 222)),
     (1.0, (52, 100, 182)),
 )
-"""Rise of a viewing ray of unit depth, and its colour; interpolated between."""
+"""Rise of a viewing ray of unit depth and its colour, with interpolation in between."""
 
 
 class _Face(NamedTuple):
     """One quadrilateral in gate axes: forward through the gate, right, down."""
 
     corners_m: tuple[Vec3, ...]
-    normal: Vec3  # towards the side from which it is seen; zero = it is seen from both
+    normal: Vec3  # towards the visible side; zero = visible from both sides
     rgb: Rgb
 
 
@@ -76,19 +77,19 @@ class Faces:
 
     corners_ned_m: FloatArray  # [N, 4, 3]
     normals_ned: FloatArray
-    """[N, 3] unit, towards the side from which a face is seen; zero = it is seen from both."""
+    """[N, 3] unit vectors towards the visible side; zero = visible from both sides."""
     rgb: FloatArray  # [N, 3], lit by the sun
     owner: NDArray[np.intp]
-    """[N] row in ``centers_ned_m`` of what a face belongs to. Of the faces of one that are seen
-    from a point, a later one is never hidden by an earlier one."""
+    """[N] row in ``centers_ned_m`` of the object that a face belongs to. Of one object's visible
+    faces, a later one is never hidden by an earlier one."""
     centers_ned_m: FloatArray
-    """[M, 3] of the course's gates, of those out of order, then of the panels."""
+    """[M, 3] of the course's gates, the stray gates, then the panels."""
 
 
 def course_faces(course: Course, conditions: Conditions = NOMINAL) -> Faces:
-    """Build all surfaces of all gates, in order or not, and of the panels that hide some.
+    """Build all surfaces of the course's gates, stray gates and panels.
 
-    A gate out of order is shaded as the one whose number it has.
+    A stray gate has the shading of the course's gate with the same number.
     """
     sun_ned, ambient = np.array(conditions.sun_ned), conditions.ambient
     random = np.random.Generator(np.random.PCG64((conditions.seed, 6)))
@@ -128,7 +129,7 @@ def course_faces(course: Course, conditions: Conditions = NOMINAL) -> Faces:
 
 
 def _stray_gates(course: Course, conditions: Conditions) -> list[Gate]:
-    """Gates that do not belong to the course, with numbers and colours of some that do."""
+    """Return gates outside the course, with numbers and colours of gates on it."""
     random = np.random.Generator(np.random.PCG64((conditions.seed, 8)))
     strays = []
     for gate in course.gates:
@@ -151,10 +152,10 @@ def _stray_gates(course: Course, conditions: Conditions) -> list[Gate]:
 
 
 def _faces_of(gate: Gate, front_rgb: tuple[Rgb, Rgb]) -> list[_Face]:
-    """Faces in drawing order: posts, walls inside the opening, outer walls, back, front, number.
+    """Return the faces in drawing order: posts, inner walls, outer walls, back, front, number.
 
-    Walls inside the opening are hidden by any other part of the frame that is in the way, so they
-    come first; an outer wall and a ring that are both seen never hide each other.
+    The walls inside the opening come first, since any other part of the frame may hide them. Two
+    visible faces among the outer walls and rings never hide each other.
     """
     inner_m = gate.size_m / 2
     outer_m = inner_m + BAR_M
@@ -182,7 +183,7 @@ def _faces_of(gate: Gate, front_rgb: tuple[Rgb, Rgb]) -> list[_Face]:
 def _upright(
     forward_m: float, middle_m: float, width_m: float, down_m: tuple[float, float]
 ) -> tuple[Vec3, ...]:
-    """Corners of a rectangle across the passage."""
+    """Return the corners of a rectangle across the passage."""
     left_m, right_m = middle_m - width_m / 2, middle_m + width_m / 2
     top_m, bottom_m = down_m
     return (
@@ -194,7 +195,7 @@ def _upright(
 
 
 def _tube(half_m: float, top_normal: Vec3, rgb: Rgb) -> list[_Face]:
-    """Walls of a square tube along the passage; its top wall has this normal."""
+    """Return the walls of a square tube along the passage, given the normal of its top wall."""
     depth_m = DEPTH_M / 2
     top = (
         (-depth_m, -half_m, -half_m),
@@ -206,7 +207,7 @@ def _tube(half_m: float, top_normal: Vec3, rgb: Rgb) -> list[_Face]:
 
 
 def _ring(outer_m: float, inner_m: float, forward_m: float, normal: Vec3, rgb: Rgb) -> list[_Face]:
-    """Front or back of the frame around the opening, in four parts."""
+    """Return the front or back of the frame around the opening, in four parts."""
     top = (
         (forward_m, -outer_m, -outer_m),
         (forward_m, outer_m, -outer_m),
@@ -217,7 +218,7 @@ def _ring(outer_m: float, inner_m: float, forward_m: float, normal: Vec3, rgb: R
 
 
 def _quarter_turns(top: _Face) -> list[_Face]:
-    """The face, then turned about the passage by one, two and three quarters of a turn."""
+    """Return the face and its copies, turned about the passage by one to three quarter turns."""
     faces = [top]
     for _ in range(3):
         corners_m, normal, rgb = faces[-1]
@@ -231,7 +232,8 @@ def _quarter_turn(vector: Vec3) -> Vec3:
 
 
 def ridge_directions(seed: int) -> FloatArray:
-    """Hills on the horizon, which show rotation: quadrilaterals of NED directions, [N, 4, 3]."""
+    """Return hills on the horizon, to show rotation: quadrilaterals of NED directions, [N, 4,
+    3]."""
     random = np.random.Generator(np.random.PCG64(seed))
     azimuth_rad = np.linspace(-math.pi, math.pi, RIDGE_SEGMENTS + 1)
     waves = np.arange(2, 16)
@@ -250,7 +252,7 @@ def tinted(rgb: Rgb, tint: Vec3) -> FloatArray:
 
 
 def backdrop_colours(conditions: Conditions = NOMINAL) -> Image:
-    """Colour table of sky and far ground, [256, 1, 3] uint8 RGB.
+    """Return the colour table of sky and far ground, [256, 1, 3] uint8 RGB.
 
     Entry k is for a ray of unit depth that rises by k / 127.5 - 1.
     """
@@ -262,10 +264,9 @@ def backdrop_colours(conditions: Conditions = NOMINAL) -> Image:
 
 
 def ground_tile(conditions: Conditions = NOMINAL) -> Image:
-    """A square of ground that repeats seamlessly, [GROUND_TILE_PX, GROUND_TILE_PX, 3] RGB.
+    """Return a square of ground that repeats seamlessly, [GROUND_TILE_PX, GROUND_TILE_PX, 3] RGB.
 
-    Mottled grass and soil under a 2 m grid: texture for optic flow, lines for scale. Axis 0 is
-    east, axis 1 is north.
+    Mottled grass and soil (for optic flow) under a 2 m grid (for scale). Axis 0 is east, 1 north.
     """
     random = np.random.Generator(np.random.PCG64(conditions.ground_seed))
     patches = _periodic_noise(random, smooth_m=1.2)[..., None]
@@ -284,7 +285,8 @@ def ground_tile(conditions: Conditions = NOMINAL) -> Image:
 
 
 def _periodic_noise(random: np.random.Generator, *, smooth_m: float) -> FloatArray:
-    """Zero mean, unit variance, Gaussian-smoothed in the frequency domain, hence without a seam."""
+    """Return noise of zero mean and unit variance, smoothed by a Gaussian in the frequency domain
+    so that it has no seam."""
     frequency_per_m = np.fft.fftfreq(GROUND_TILE_PX, GROUND_TILE_M / GROUND_TILE_PX)
     low_pass = np.exp(-2 * (math.pi * smooth_m * frequency_per_m) ** 2)
     white = random.standard_normal((GROUND_TILE_PX, GROUND_TILE_PX))

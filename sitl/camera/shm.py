@@ -1,4 +1,4 @@
-"""Writer of frames in shared memory: docs/formats.md is the format."""
+"""Writer of frames in shared memory; format: docs/formats.md."""
 
 import math
 import mmap
@@ -24,7 +24,7 @@ SEQ, FRAME_ID, CAPTURED_NS = 0, 1, 2  # fields of a slot, in units of 8 bytes
 
 
 class FramePublisher:
-    """Publishes frames of one size under a name, in RGB or of depth; used by one thread."""
+    """Publishes RGB or depth frames of one size under a name, from one thread."""
 
     def __init__(self, name: str, width: int, height: int, *, is_depth: bool = False) -> None:
         if min(width, height) < 1:
@@ -56,12 +56,12 @@ class FramePublisher:
     def publish(
         self, rgb: NDArray[np.uint8 | np.uint16], captured_ns: int, *, is_whole: bool = True
     ) -> None:
-        """Copy a frame [height, width, 3] uint8, or [height, width] uint16, and make it the newest.
+        """Publish a frame, [height, width, 3] uint8 or [height, width] uint16, as the newest.
 
-        One that is not whole stays marked as being written, as by a writer that stops meanwhile.
+        ``is_whole=False`` leaves it marked as being written, like a writer that stopped halfway.
 
         Raises:
-            ValueError: another shape or type than announced, or closed before.
+            ValueError: the shape or type is not the announced one, or the publisher is closed.
         """
         if rgb.shape != self._shape or rgb.dtype != self._type:
             raise ValueError(f"want {self._type} {self._shape}, got {rgb.dtype} {rgb.shape}")
@@ -80,7 +80,7 @@ class FramePublisher:
         self._header[NEWEST] = self._frame_id
 
     def close(self) -> None:
-        """Mark the stream closed, and remove the name unless another writer has taken it over."""
+        """Mark the stream as closed. Remove the name unless another writer has taken it over."""
         if not self._fields:
             return
         self._header[STATE] = CLOSED
@@ -90,16 +90,16 @@ class FramePublisher:
         self._map.close()
 
     def _memory_barrier(self) -> None:
-        """Order the stores before it before those after it, for readers on other cores.
+        """Order earlier stores before later ones, for readers on other cores.
 
-        Python has none by name; taking and freeing a lock is one on every platform (POSIX 4.12).
+        Python has no barrier; taking and freeing a lock is one on every platform (POSIX 4.12).
         """
         with self._lock:
             pass
 
 
 def _create(path: Path, header: bytes, size: int) -> tuple[mmap.mmap, int]:
-    """Lay the file out under another name, then rename it: no reader sees half a header."""
+    """Create the file under a temporary name, then rename it: no reader sees half a header."""
     draft = path.with_name(f".{path.name}.{os.getpid()}")
     with draft.open("w+b") as file:
         file.truncate(size)

@@ -1,1 +1,1 @@
-"""A demonstrator that flies gate courses from the true pose."""
+"""Demonstrators that fly gate courses from the true pose."""

@@ -1,12 +1,12 @@
-"""Guides a flight over a gate course: from a predicted state to the motion that is wanted.
+"""Guidance over a gate course: from a predicted state to the wanted motion.
 
-The demand follows from position, velocity, the next gate and the two after it, which a policy could
-see or have as input; its one memory is which gate comes next. It plans the path of least
-acceleration through the gates ahead, and slows down where the path would need more than the vehicle
-is to be asked for. After a miss it backs off, nose towards the gate, and flies at it again. After
+The demand follows from position, velocity, the next gate and the two after it, all of which a
+policy could see or have as input; the only memory is the index of the next gate. The guide plans
+the path of least acceleration through the gates ahead, and slows down where the path would exceed
+the vehicle's ``Agility``. After a miss it backs off, nose towards the gate, and tries again. After
 the last gate it brakes and hovers.
 
-Horizontal vectors are complex numbers, north + 1j * east: a product with the conjugate of a unit
+Horizontal vectors are complex numbers, north + 1j * east. A product with the conjugate of a unit
 vector has the component along it as its real part and the one to its right as its imaginary part.
 """
 
@@ -29,16 +29,16 @@ FloatArray = NDArray[np.float64]
 GATES_AHEAD = 3
 SPEED_GAIN_PER_S = 1.5
 MIN_SPEED_MPS = 1.5
-LOOK_M = 5.0  # the nose points at the next gate, and nearer than this along the leg after it
+LOOK_M = 5.0  # the nose points at the next gate; once nearer, along the leg after it
 YAW_GAIN_PER_S = 2.5
 MAX_YAW_RATE_RADPS = math.radians(110.0)
 TAKEOFF_HEIGHT_M = (0.4, 1.4)
-"""Below the first it only climbs, above the second it flies at full speed."""
+"""Below the first height it only climbs, above the second it flies at full speed."""
 BACKING_SPEED_MPS = 2.5
-CLEAR_OF_FRAME_M = 2.4  # sideways from the axis of a gate, with the vehicle's own size
+CLEAR_OF_FRAME_M = 2.4  # sideways from a gate's axis, the vehicle's size included
 MISS_M = (0.7, 1.2)
-"""Predicted distance from the axis in the plane of a gate, with full lean: from the first on it
-begins to back off, at the second it does nothing else."""
+"""Predicted miss distance in the plane of a gate, despite full lean: from the first value on it
+starts to back off, from the second on it only backs off."""
 BRAKING_GAIN_PER_S = 1.2
 BEYOND_LEG_M = 8.0
 
@@ -50,7 +50,7 @@ MIN_LEG_S = 0.03
 
 
 class Demand(NamedTuple):
-    """Motion that the actions are to bring about."""
+    """Motion that the actions must produce."""
 
     accel_mps2: complex  # horizontal, north + 1j * east
     climb_mps: float
@@ -59,20 +59,19 @@ class Demand(NamedTuple):
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Agility:
-    """The most that is asked of the vehicle; accelerations are horizontal but where they say."""
+    """Limits of the demanded motion; accelerations are horizontal unless noted."""
 
     max_speed_mps: float
     max_accel_mps2: float
     corner_accel_mps2: float
-    """Most that the planned path may need before it slows down; the rest is for gusts and
-    mistakes."""
-    along_accel_mps2: tuple[float, float]  # braking, negative, and speeding up
+    """Acceleration at which the planned path slows down; the rest is for gusts and mistakes."""
+    along_accel_mps2: tuple[float, float]  # (braking, negative; speeding up)
     planned_braking_mps2: float
     planned_accel_mps2: float
-    climb_accel_mps2: float  # vertical; what it counts on to get into the opening of a gate
-    climb_lead_s: float  # the demanded climb rate is the planned one this much later
+    climb_accel_mps2: float  # vertical; assumed available for reaching a gate's opening
+    climb_lead_s: float  # lead of the demanded climb rate over the planned one
     takeoff_climb_mps: float
-    braking_distance_m: float  # beyond the last gate, until it brakes in full
+    braking_distance_m: float  # beyond the last gate, until full braking
 
 
 class CourseGuide:
@@ -91,7 +90,7 @@ class CourseGuide:
                 f"got {speed_mps}"
             )
         self._last = course.gates[-1]
-        # Points straight on from the last gate, so that it is flown like any other.
+        # Points straight ahead of the last gate, so that it is flown like any other.
         north_m, east_m, down_m = self._last.center_ned_m
         step_m = cmath.rect(BEYOND_LEG_M, self._last.yaw_rad)
         beyond_ned_m = [
@@ -109,7 +108,7 @@ class CourseGuide:
         return self._referee.next_gate
 
     def demand(self, position_ned_m: Vec3, t_s: float, state: "Predicted") -> Demand:
-        """Motion for a vehicle that is here now, and in ``state`` when its action takes effect.
+        """Return the demand for a vehicle here now, and in ``state`` when its action takes effect.
 
         The positions of successive calls are the flown trajectory.
         """
@@ -130,7 +129,7 @@ class CourseGuide:
         return _blend(climb_away, demand, flying)
 
     def _gates_ahead(self, position_ned_m: Vec3, state: "Predicted") -> tuple[Gate, ...]:
-        """Gates still to fly, without one that will be behind by the time that the sticks act."""
+        """Return the gates ahead, without one that is passed before the action takes effect."""
         next_gate = self.next_gate
         if next_gate is None:
             return self._beyond
@@ -141,7 +140,7 @@ class CourseGuide:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Predicted:
-    """The vehicle when an action that is sent now takes effect, if nothing changes until then."""
+    """Predicted state when an action sent now takes effect, if nothing changes until then."""
 
     position_ned_m: Vec3
     velocity_ned_mps: Vec3
@@ -173,11 +172,11 @@ class Plan:
 def least_acceleration(position_m: Vec3, velocity_mps: Vec3, waypoints: Sequence[Waypoint]) -> Plan:
     """Plan from a position and velocity through the waypoints, in any inertial frame.
 
-    Between waypoints a path of least integrated squared acceleration is a cubic in time (Bryson and
-    Ho, Applied Optimal Control, 1975). A waypoint is soft: missing its point or its velocity has a
-    cost. So the path, and with it the acceleration at its start, changes smoothly as one waypoint
-    is passed and another is added at the far end; with hard waypoints the gain would grow as
-    1 / time^2.
+    Between waypoints, a path of least integrated squared acceleration is a cubic in time (Bryson
+    and Ho, Applied Optimal Control, 1975). Waypoints are soft: missing a point or its velocity has
+    a cost. The path, and so the acceleration at its start, therefore changes smoothly when one
+    waypoint is passed and another is added at the far end. With hard waypoints the gain would grow
+    as 1 / time^2.
     """
     count = len(waypoints)
     hessian = np.zeros((2 * count + 2, 2 * count + 2))
@@ -189,7 +188,7 @@ def least_acceleration(position_m: Vec3, velocity_mps: Vec3, waypoints: Sequence
         ahead_s += leg_s
         hessian[first : first + 4, first : first + 4] += _leg_cost(leg_s)
         hessian[first + 2, first + 2] += POINT_WEIGHT_PER_S3
-        # A velocity wanted at one instant is a step in acceleration there: fade it in.
+        # A velocity demanded at one instant is a step in acceleration there: fade it in.
         weight = VELOCITY_WEIGHT_PER_S * min(1.0, ahead_s / FADE_S)
         hessian[first + 3, first + 3] += weight
         target[first + 2] += POINT_WEIGHT_PER_S3 * np.array(waypoint.point_m)
@@ -207,7 +206,7 @@ def least_acceleration(position_m: Vec3, velocity_mps: Vec3, waypoints: Sequence
 
 
 def _leg_cost(leg_s: float) -> FloatArray:
-    """Integral of the squared acceleration of a cubic, over (p0, v0, p1, v1)."""
+    """Return the integral of the squared acceleration of a cubic, over (p0, v0, p1, v1)."""
     a, b, c = 12 / leg_s**3, 6 / leg_s**2, 2 / leg_s
     return np.array([[a, b, -a, b], [b, 2 * c, -b, c], [-a, -b, a, -b], [b, c, -b, 2 * c]])
 
@@ -215,7 +214,7 @@ def _leg_cost(leg_s: float) -> FloatArray:
 def _approach(
     state: Predicted, ahead: tuple[Gate, ...], agility: Agility, speed_mps: float
 ) -> Demand:
-    """Fly along the path through the gates ahead, at the speed that it allows."""
+    """Return the demand along the path through the gates ahead, at the speed that it allows."""
     velocity = state.velocity_mps
     to_aim_m = _aim_point(state, ahead) - complex(*state.position_ned_m[:2])
     distance_m = max(_length(to_aim_m), 1e-3)
@@ -224,7 +223,7 @@ def _approach(
     waypoints = _waypoints(state, ahead, closing_mps, agility, speed_mps)
     plan = least_acceleration(state.position_ned_m, state.velocity_ned_mps, waypoints)
     accel_n, accel_e, accel_d = plan.accel_mps2[0].tolist()
-    # Along the path speed is controlled; the plan's own speed is only what it was timed by.
+    # Speed along the path is controlled; the plan's speed only serves its timing.
     along = velocity + MIN_SPEED_MPS * sight
     along /= max(_length(along), 1e-3)
     right_mps2 = clamp((complex(accel_n, accel_e) * along.conjugate()).imag, agility.max_accel_mps2)
@@ -246,7 +245,7 @@ def _approach(
 
 
 def _aim_point(state: Predicted, ahead: tuple[Gate, ...]) -> complex:
-    """The next gate; from nearer than ``LOOK_M`` a point that slides along the leg after it."""
+    """Return the next gate; nearer than ``LOOK_M``, a point that slides along the leg after it."""
     gate = ahead[0]
     forward_m, _, _ = gate.offset_m(state.position_ned_m)
     center, leg, leg_m = complex(*gate.center_ned_m[:2]), cmath.rect(1.0, gate.yaw_rad), 1.0
@@ -263,11 +262,11 @@ def _waypoints(
     agility: Agility,
     speed_mps: float,
 ) -> list[Waypoint]:
-    """The gates, each leg timed by the speed that can be reached half-way along it."""
+    """Return the gates as waypoints; each leg is timed by the speed reachable half-way along it."""
     waypoints = []
     before, covered_m = state.position_ned_m, 0.0
     for gate in ahead:
-        # Off the axis the distance does not shrink to nothing in the plane of the gate; time must.
+        # Off the axis, the distance does not vanish in the plane of the gate; the time must.
         forward_m, right_m, _ = gate.offset_m(before)
         leg_m = math.hypot(min(0.0, forward_m), max(0.0, abs(right_m) - gate.size_m / 2))
         gained = 2 * agility.planned_accel_mps2 * (covered_m + leg_m / 2)
@@ -285,7 +284,7 @@ def _waypoints(
 
 
 def _corner_speed(plan: Plan, waypoints: list[Waypoint], agility: Agility) -> float:
-    """The speed from which it can still slow down for the corners at the gates ahead."""
+    """Return the speed from which the vehicle can still slow down for the corners ahead."""
     allowed_mps, distance_m = math.inf, 0.0
     for waypoint, accel in zip(waypoints, plan.accel_mps2[1:].tolist(), strict=True):
         timed_mps = math.hypot(*waypoint.velocity_mps)
@@ -297,13 +296,13 @@ def _corner_speed(plan: Plan, waypoints: list[Waypoint], agility: Agility) -> fl
 
 
 def _corner_ratio(accel_mps2: float, agility: Agility) -> float:
-    """Factor by which a corner can be flown faster than at this lateral acceleration."""
+    """Return the factor by which a corner with this lateral acceleration can be flown faster."""
     return math.sqrt(agility.corner_accel_mps2 / max(abs(accel_mps2), 1e-3))
 
 
 def _back_off_share(state: Predicted, gate: Gate, agility: Agility) -> float:
-    """0 where the gate can be flown at from here; 1 where it cannot, since the vehicle is beside or
-    behind it, or too fast and too far off to get into the opening."""
+    """Return 0 if the gate can be flown from here; up to 1 if the vehicle is beside or behind it,
+    or too fast and too far off to reach the opening."""
     forward_m, right_m, down_m = gate.offset_m(state.position_ned_m)
     if forward_m >= 0.0:
         return 1.0
@@ -317,7 +316,7 @@ def _back_off_share(state: Predicted, gate: Gate, agility: Agility) -> float:
 
 
 def _back_off(state: Predicted, gate: Gate, agility: Agility) -> Demand:
-    """Fly backwards beside the gate, nose along its passage, until it is in front again."""
+    """Return the demand to fly backwards beside the gate, nose along its passage, to its front."""
     forward_m, right_m, down_m = gate.offset_m(state.position_ned_m)
     is_beside = forward_m > -1.0 and abs(right_m) < CLEAR_OF_FRAME_M
     side_m = math.copysign(CLEAR_OF_FRAME_M, right_m) if is_beside else right_m
@@ -351,7 +350,7 @@ def _blend(a: Demand, b: Demand, share: float) -> Demand:
 
 
 def _length(vector: complex) -> float:
-    """More exact than ``abs``, which may differ from one platform's C library to another."""
+    """Return the length; unlike ``abs``, it is the same with every platform's C library."""
     return math.hypot(vector.real, vector.imag)
 
 

@@ -32,18 +32,17 @@ class RateCommand(NamedTuple):
 def rate_command(
     demand: Demand, state: Predicted, ned_from_body: Quat, drag_ned_mps2: Vec3
 ) -> RateCommand:
-    """Thrust and rates for a demand, in a predicted state and attitude, against this drag.
+    """Return thrust and rates for a demand, in a predicted state and attitude, against this drag.
 
-    The thrust points where the demand needs it, turned there the shorter way round. The tilt has a
-    loop of its own, and the heading follows by its rate alone: the thrust's direction matters more
-    than where the nose points (Brescianini and D'Andrea, "Tilt-Prioritized Quadrocopter Attitude
-    Control", 2018).
+    The thrust vector turns the shorter way round to the direction that the demand needs. Tilt has
+    its own loop; heading follows only by its rate, because the thrust's direction matters more than
+    the nose's (Brescianini and D'Andrea, "Tilt-Prioritized Quadrocopter Attitude Control", 2018).
     """
     force_ned = _specific_force(demand, state, drag_ned_mps2)
     size = math.hypot(*force_ned)
     body_from_ned = conjugate(ned_from_body)
     x, y, z = (part / size for part in rotate(body_from_ned, force_ned))
-    # The rotation vector that takes the thrust, along -z of the body, to the force.
+    # Rotation vector that takes the thrust, along -z of the body, to the force.
     sine = math.hypot(x, y)
     angle_rad = math.atan2(sine, -z)
     per_sine = TILT_GAIN_PER_S * angle_rad / sine if sine > 1e-6 else TILT_GAIN_PER_S
@@ -57,7 +56,7 @@ def rate_command(
 
 
 def _specific_force(demand: Demand, state: Predicted, drag_ned_mps2: Vec3) -> Vec3:
-    """Specific force of the thrust in NED, with a bounded tilt and size."""
+    """Return the specific force of the thrust in NED, limited in tilt and size."""
     drag_n, drag_e, drag_d = drag_ned_mps2
     north = demand.accel_mps2.real - drag_n
     east = demand.accel_mps2.imag - drag_e
@@ -71,7 +70,7 @@ def _specific_force(demand: Demand, state: Predicted, drag_ned_mps2: Vec3) -> Ve
 
 
 DEAD_ZONE_SLOPE = 0.08
-"""A dead zone is crossed within about this share of full scale: by a slope, not by a jump."""
+"""Share of full scale over which a dead zone is crossed, by a slope instead of a jump."""
 
 
 class StickPositions(NamedTuple):
@@ -102,7 +101,8 @@ class StickResponse:
         self._throttle_dead = 2.0 * params["THR_DZ"] * (half / 500.0) / 1000.0
 
     def sticks(self, demand: Demand, drag_mps2: complex, yaw_rad: float) -> StickPositions:
-        """Leans by the ratio to gravity in heading axes, against this drag, rates by full scale."""
+        """Convert a demand to sticks: leans that give its acceleration against this drag, and rates
+        as shares of full scale."""
         accel_mps2 = demand.accel_mps2 - drag_mps2
         forward_right = accel_mps2 * cmath.rect(1.0, -yaw_rad) / GRAVITY_MPS2
         nose_down_rad = math.atan(forward_right.real)
@@ -119,14 +119,14 @@ class StickResponse:
 
 
 def _past_dead_zone(value: float, dead: float) -> float:
-    """The stick whose effect is ``value`` of full scale."""
+    """Return the stick whose effect is ``value`` of full scale."""
     return clamp((1.0 - dead) * value + dead * math.tanh(value / DEAD_ZONE_SLOPE), 1.0)
 
 
 STICK_LAG_S = 0.17  # from stick to lean, of the nominal vehicle
 STICK_AGILITY = Agility(
     max_speed_mps=10.0,
-    max_accel_mps2=5.3,  # a lean of 28 degrees of the 30 that there are
+    max_accel_mps2=5.3,  # a lean of 28 of at most 30 degrees
     corner_accel_mps2=4.2,
     along_accel_mps2=(-4.0, 3.0),
     planned_braking_mps2=2.5,
@@ -136,7 +136,7 @@ STICK_AGILITY = Agility(
     takeoff_climb_mps=1.6,
     braking_distance_m=4.0,
 )
-RATE_LAG_S = 0.06  # from rate command to rate: motors, and the loop before them
+RATE_LAG_S = 0.06  # from rate command to rate: motors and the rate loop
 RATE_AGILITY = Agility(
     max_speed_mps=14.0,
     max_accel_mps2=13.0,  # a lean of 53 degrees
@@ -154,8 +154,8 @@ RATE_AGILITY = Agility(
 class Expert:
     """Demonstrator of one flight by sticks; call `sticks` at 50 Hz or more.
 
-    ``speed_mps`` is its speed where the course allows it: at 8 m/s it slows down for corners.
-    ``params`` are the vehicle's: what a stick means, and how fast the vehicle responds.
+    ``speed_mps`` is its speed where the course allows it; at 8 m/s it slows down for corners.
+    ``params`` are the vehicle's, which determine stick curves and response times.
 
     Raises:
         UsageError: a speed that it cannot fly at.
@@ -179,7 +179,8 @@ class Expert:
         return self._guide.next_gate
 
     def sticks(self, body: BodyState, t_s: float) -> StickPositions:
-        """Sticks for this state; the positions of successive calls are the flown trajectory."""
+        """Return the sticks for this state. Positions of successive calls are the flown
+        trajectory."""
         north_mps2, east_mps2, _ = drag_ned_mps2 = _drag_ned_mps2(body)
         state = _predict(body, _level_accel_mps2(body, drag_ned_mps2), self._lag_s)
         demand = self._guide.demand(body.position_ned_m, t_s, state)
@@ -209,9 +210,9 @@ class RateExpert:
 
 
 def _drag_ned_mps2(body: BodyState) -> Vec3:
-    """Drag over mass of any airframe in any wind; 0 on the ground.
+    """Return drag over mass, for any airframe in any wind; 0 on the ground.
 
-    The thrust is along the body's third axis: what an accelerometer feels along the others is drag.
+    Thrust acts along the body's third axis, so an accelerometer measures drag on the other two.
     """
     if body.touching:
         return (0.0, 0.0, 0.0)
@@ -220,7 +221,7 @@ def _drag_ned_mps2(body: BodyState) -> Vec3:
 
 
 def _level_accel_mps2(body: BodyState, drag_ned_mps2: Vec3) -> Vec3:
-    """Acceleration of the present lean in level flight."""
+    """Return the acceleration of the present lean in level flight."""
     thrust_n, thrust_e, thrust_d = rotate(body.ned_from_body_wxyz, (0.0, 0.0, -1.0))
     per_g = GRAVITY_MPS2 / max(0.5, -thrust_d)
     return thrust_n * per_g + drag_ned_mps2[0], thrust_e * per_g + drag_ned_mps2[1], 0.0

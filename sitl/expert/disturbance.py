@@ -1,8 +1,8 @@
-"""Perturbs demonstrations, so that they hold mistakes to learn from: actions and starts in the air.
+"""Perturbed demonstrations, which contain recoveries: disturbed actions and airborne starts.
 
-The disturbed actions are flown while the expert's stay the label, so that the way back from a
-mistake is in the data (Laskey et al., "DART: Noise Injection for Robust Imitation Learning", 2017).
-Everything follows from a seed.
+The disturbed actions are flown while the expert's remain the label, so that the data show the way
+back from a mistake (Laskey et al., "DART: Noise Injection for Robust Imitation Learning", 2017).
+All randomness follows from a seed.
 """
 
 import math
@@ -21,19 +21,19 @@ Commanded = TypeVar("Commanded", StickPositions, RateCommand)
 QUIET_S = (1.0, 5.0)
 NOISY_S = (0.5, 2.0)
 PULSE_S = (0.15, 0.5)
-NOISE_TIME_S = 0.25  # correlation time of the noise: about as fast as a thumb
+NOISE_TIME_S = 0.25  # correlation time of the noise: about that of a thumb
 START_AWAY_M = (3.0, 5.5)
-"""Distance before a gate of an easy course: past the previous one, whose leg is at least 7 m."""
-RACE_START_AWAY_M = (4.0, 8.5)  # the same for a race, whose legs are at least 10 m
+"""Distance before a gate of an easy course: past the previous gate, as legs are at least 7 m."""
+RACE_START_AWAY_M = (4.0, 8.5)  # before a gate of a race course, whose legs are at least 10 m
 LATE_CHANCE = 0.3
 LATE_S = (0.2, 2.0)
 
 
-ZEROS: Numbers = (0.0,) * 4  # no offset; as an action it does nothing on the ground, in either kind
+ZEROS: Numbers = (0.0,) * 4  # no offset; as an action, by sticks or rates, a no-op on the ground
 
 
 class Strengths(NamedTuple):
-    """Disturbances of one kind of actions, number by number."""
+    """Disturbance of one kind of action, by action number."""
 
     noise_rms: Numbers
     pulse_max: Numbers
@@ -64,8 +64,8 @@ class _Stretch(NamedTuple):
 class Disturbance:
     """Stretches of correlated noise and held pulses on the actions, with quiet ones in between.
 
-    ``strength`` scales amplitudes; 0 never disturbs. Use one per flight and call `flown` at every
-    tick, in order of time. Some flights from the ground start late.
+    ``strength`` scales amplitudes; 0 never disturbs. Use one instance per flight and call `flown`
+    at every tick, in order of time. Some flights from the ground start late.
     """
 
     def __init__(
@@ -92,14 +92,14 @@ class Disturbance:
         return self._strength > 0.0 and self._stretch.kind != "quiet"
 
     def flown(self, wanted: Commanded, t_s: float) -> Commanded:
-        """Action to fly at ``t_s`` where the expert wants ``wanted``; within the bounds."""
+        """Return the action to fly at ``t_s`` for the expert's ``wanted``, within the bounds."""
         if self._start_s is None:
             self._start_s = t_s
         t_s -= self._start_s
         dt_s, self._last_s = t_s - self._last_s, t_s
         while t_s >= self._stretch.end_s:
             self._stretch = self._next(self._stretch)
-        # An Ornstein-Uhlenbeck process, exact for any step.
+        # Ornstein-Uhlenbeck process, exact for any step.
         kept = math.exp(-max(dt_s, 0.0) / NOISE_TIME_S)
         fresh = math.sqrt(1.0 - kept * kept) * self._random.standard_normal(4)
         self._noise = kept * self._noise + fresh * np.array(self._strengths.noise_rms)
@@ -121,7 +121,7 @@ class Disturbance:
         if self._random.random() < 0.5:
             self._noise[:] = 0.0
             return _Stretch("noise", ended.end_s + float(self._random.uniform(*NOISY_S)), ZEROS)
-        # A pulse is on one or two numbers, as a slip of the thumb is.
+        # A pulse acts on one or two numbers, like a slip of the thumb.
         held = self._random.uniform(-1.0, 1.0, 4) * np.array(self._strengths.pulse_max)
         held *= self._random.permutation([1.0, 1.0, 0.0, 0.0])
         length_s = float(self._random.uniform(*PULSE_S))

@@ -1,1 +1,1 @@
-"""The simulated vehicle's side of MAVLink."""
+"""MAVLink link of the simulated vehicle: sockets, framing and shared messages."""

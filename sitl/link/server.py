@@ -1,8 +1,7 @@
-"""Receives MAVLink on all links of a vehicle, without I/O, and acts on it: the part of both
-firmwares.
+"""Message handling of a vehicle's links, without I/O: the part that both firmwares share.
 
-Parameters, time, pings, missions and the dispatch of commands; a firmware adds its own messages and
-commands, and decides whom it obeys.
+Parameters, time, pings, missions and the dispatch of commands. A firmware adds its messages and
+commands, and decides which senders it obeys.
 """
 
 import math
@@ -27,24 +26,24 @@ MAX_STATUSTEXT = 50
 
 
 def by_message(**values: Value) -> dict[int, Value]:
-    """Values of messages by their number in the dialect, given by name."""
+    """Map message numbers of the dialect to values given by message name."""
     return {getattr(mav, f"MAVLINK_MSG_ID_{name}"): value for name, value in values.items()}
 
 
 def flags(prefix: str, names: str) -> int:
-    """The sum of the dialect's constants with this prefix."""
+    """Return the sum of the dialect's constants with this prefix."""
     return sum(int(getattr(mav, prefix + name)) for name in names.split())
 
 
 class Endpoint(ABC, Generic[Ap]):
-    """Framing, messages by number, and the list of parameters; each firmware adds its streams.
+    """Framing, messages by number and parameter list of one link; each firmware adds its streams.
 
-    A restart of the vehicle leaves framing and sequence numbers alone.
+    Framing and sequence numbers survive a restart of the vehicle.
     """
 
     def __init__(self, ap: Ap, builders: Builders[Ap]) -> None:
-        """``builders`` make every message that can be streamed or requested; they return None
-        where there is nothing to report yet."""
+        """Join a vehicle. ``builders`` make all messages that can be streamed or requested; they
+        return None while there is nothing to report."""
         self.bad_frames = 0
         """Garbage, truncated frames and wrong checksums; with a key also wrong signatures."""
         self._mav = mav.MAVLink(None, srcSystem=1, srcComponent=mav.MAV_COMP_ID_AUTOPILOT1)
@@ -64,7 +63,7 @@ class Endpoint(ABC, Generic[Ap]):
 
     @abstractmethod
     def step(self, now_ns: int) -> None:
-        """Queue what is due; ``now_ns`` is at most one control step ahead of the vehicle."""
+        """Queue due messages; ``now_ns`` is at most one control step ahead of the vehicle."""
 
     @abstractmethod
     def interval_us(self, message_id: int) -> int: ...
@@ -73,7 +72,7 @@ class Endpoint(ABC, Generic[Ap]):
     def send_text(self, severity: int, text: str) -> None: ...
 
     def parse(self, data: bytes) -> Iterator[Message]:
-        """Complete messages in these bytes; unreadable frames are counted and skipped."""
+        """Yield the complete messages in these bytes; unreadable frames are counted and skipped."""
         for message in self._mav.parse_buffer(data) or ():
             if message.get_type() == "BAD_DATA":
                 self.bad_frames += 1
@@ -89,13 +88,13 @@ class Endpoint(ABC, Generic[Ap]):
         self._outgoing += frame
 
     def take_outgoing(self) -> bytes:
-        """Everything queued since the last call: whole frames, in order."""
+        """Return everything queued since the last call: whole frames, in order."""
         taken = bytes(self._outgoing)
         self._outgoing.clear()
         return taken
 
     def send_now(self, message_id: int) -> bool:
-        """Send one message, unless it has nothing to report yet; False if it is unknown."""
+        """Send one message if it has anything to report. Return False if it is unknown."""
         build = self._builders.get(message_id)
         message = build(self._ap) if build else None
         if message is not None:
@@ -107,7 +106,7 @@ class Endpoint(ABC, Generic[Ap]):
         self.send(mav.MAVLink_message_interval_message(message_id, interval_us))
 
     def send_all_params(self) -> None:
-        """Send every parameter from the first, a few hundred a second."""
+        """Send every parameter from the first, at most 250 per second."""
         self._queued_params = deque(range(len(self._ap.params.names)))
 
     def send_param(self, index: int) -> None:
@@ -119,7 +118,7 @@ class Endpoint(ABC, Generic[Ap]):
         self.send(mav.MAVLink_param_value_message(name.encode(), *value, count, index))
 
     def _send_next_param(self, now_ns: int) -> None:
-        """Send one of the list, if it is due."""
+        """Send the next parameter of the list if it is due."""
         if self._queued_params and now_ns >= self._param_due_ns:
             self._param_due_ns = now_ns + PARAM_PERIOD_NS
             self.send_param(self._queued_params.popleft())
@@ -130,7 +129,7 @@ REJECTED: int = mav.MAV_RESULT_TEMPORARILY_REJECTED
 DENIED: int = mav.MAV_RESULT_DENIED
 UNSUPPORTED: int = mav.MAV_RESULT_UNSUPPORTED
 FAILED: int = mav.MAV_RESULT_FAILED
-FORCE = 21196.0  # param 2 of ARM_DISARM that overrules a refusal (MAVLink common.xml)
+FORCE = 21196.0  # param 2 of ARM_DISARM that overrides a refusal (MAVLink common.xml)
 UINT16_MAX = 65535
 MAX_RC_FIELDS = 18
 COMMAND_FIELDS = {
@@ -144,10 +143,10 @@ Params7: TypeAlias = tuple[float, ...]
 
 
 class MavlinkServer(ABC, Generic[Ap, Link]):
-    """Receives on all links of one vehicle, and acts on it."""
+    """Receives on all links of one vehicle, and acts on the messages."""
 
     bad_interval: ClassVar[int]
-    """MAV_RESULT of a request for the interval of a message whose number is none."""
+    """MAV_RESULT for GET_MESSAGE_INTERVAL with an invalid message number."""
 
     def __init__(self, ap: Ap, links: Sequence[Link], log: FlightLog) -> None:
         self.links = tuple(links)
@@ -164,11 +163,11 @@ class MavlinkServer(ABC, Generic[Ap, Link]):
             "TIMESYNC": self._timesync,
             "PING": self._ping,
         }
-        """By message: the link, the message, its arrival."""
+        """Handlers by message name, called with the link, the message and its arrival."""
         self._commands: dict[int, Callable[[Params7, Link], int | None]] = {
             mav.MAV_CMD_GET_MESSAGE_INTERVAL: self._get_interval
         }
-        """By number: MAV_RESULT for the ack, None for no ack."""
+        """Handlers by command number; they return the MAV_RESULT of the ack, or None for no ack."""
 
     def restart(self, ap: Ap) -> None:
         self._ap = ap
@@ -186,8 +185,8 @@ class MavlinkServer(ABC, Generic[Ap, Link]):
                 handler(link, message, arrived_ns)
 
     def step(self, now_ns: int) -> None:
-        """Queue on every link what is due and what the vehicle has to say; ``now_ns`` is at most
-        one control step ahead of it."""
+        """Queue due messages and the vehicle's texts on every link. ``now_ns`` is at most one
+        control step ahead of the vehicle."""
         self._announce()
         for text in self._ap.texts:
             self._log.on_text(self._ap.now_ns, text.text)
@@ -203,14 +202,14 @@ class MavlinkServer(ABC, Generic[Ap, Link]):
 
     @abstractmethod
     def _pass_on(self, link: Link, message: Message) -> None:
-        """Take note of a message that came on the link, whoever it is for."""
+        """Process every message of the link before dispatch, including those for other systems."""
 
     @abstractmethod
     def _announce(self) -> None:
-        """Queue what goes out before the texts."""
+        """Queue messages that precede the texts."""
 
     def _execute(self, message: Message, params: Params7, link: Link) -> int | None:
-        """Execute a command; returns the MAV_RESULT for its ack, or None for no ack."""
+        """Execute a command. Return the MAV_RESULT for its ack, or None for no ack."""
         handler = self._commands.get(message.command)
         return UNSUPPORTED if handler is None else handler(params, link)
 
@@ -242,7 +241,7 @@ class MavlinkServer(ABC, Generic[Ap, Link]):
         link.send(mav.MAVLink_mission_count_message(*sender_of(message), 0, message.mission_type))
 
     def _timesync(self, link: Link, message: Message, arrived_ns: int) -> None:
-        """Answer a request; answers (tc1 set) to our own requests need no action."""
+        """Answer a request; answers (tc1 set) to our requests need no action."""
         if message.tc1 == 0:
             uptime_us = (arrived_ns - self._ap.boot_ns) // 1000
             link.send(mav.MAVLink_timesync_message(uptime_us * 1000, message.ts1))
@@ -254,7 +253,7 @@ class MavlinkServer(ABC, Generic[Ap, Link]):
 
 
 def sender_of(message: Message) -> tuple[int, int]:
-    """System and component that a message came from."""
+    """Return the system and component that sent a message."""
     return message.get_srcSystem(), message.get_srcComponent()
 
 

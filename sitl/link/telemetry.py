@@ -1,4 +1,4 @@
-"""Units and messages that both firmwares send alike, from the state of the vehicle."""
+"""Units and messages common to both firmwares, from the state of the vehicle."""
 
 import math
 from collections.abc import Callable, Iterable
@@ -17,27 +17,27 @@ _IMU_FIELDS_UPDATED = 0x1FFF
 
 
 class Home(NamedTuple):
-    """The place of the simulator's origin, and the messages that depend on it."""
+    """Location of the simulator's origin, and the messages that depend on it."""
 
     lat_deg: float
     lon_deg: float
     alt_m: float  # above mean sea level
     field_ned_gauss: Vec3  # magnetic field of the earth
-    pressure_hpa: float  # of the air at this altitude
+    pressure_hpa: float  # air pressure at this altitude
     temperature_c: float
 
     def lat_lon_e7(self, north_m: float, east_m: float) -> tuple[int, int]:
-        """Latitude and longitude in 1e-7 degrees."""
+        """Return latitude and longitude in 1e-7 degrees."""
         lat = self.lat_deg + north_m / METRES_PER_DEGREE
         lon = self.lon_deg + east_m / (METRES_PER_DEGREE * math.cos(math.radians(self.lat_deg)))
         return round(lat * 1e7), round(lon * 1e7)
 
     def mag_gauss(self, ap: Autopilot) -> Vec3:
-        """The field in body axes."""
+        """Return the magnetic field in body axes."""
         return rotate(conjugate(ap.sensed.ned_from_body_wxyz), self.field_ned_gauss)
 
     def global_position_int(self, ap: Autopilot) -> Message | None:
-        """GLOBAL_POSITION_INT; None without a position."""
+        """Build GLOBAL_POSITION_INT; None without a position."""
         if not ap.position_ready:
             return None
         north, east, down = ap.sensed.position_ned_m
@@ -51,7 +51,7 @@ class Home(NamedTuple):
         )
 
     def home_position(self, ap: Autopilot) -> Message | None:
-        """HOME_POSITION; None without a position."""
+        """Build HOME_POSITION; None without a position."""
         if not ap.position_ready:
             return None
         altitude_mm, level = round(self.alt_m * 1000.0), [1.0, 0.0, 0.0, 0.0]
@@ -60,7 +60,7 @@ class Home(NamedTuple):
         )
 
     def gps_raw_int(self, ap: Autopilot, *, fix: int, eph: int, epv: int) -> Message:
-        """GPS_RAW_INT: the last fix, repeated; accuracies and satellites are constant."""
+        """Build GPS_RAW_INT: the last fix, repeated; accuracies and satellites are constant."""
         north, east, down = ap.gps.position_ned_m
         vn, ve, _ = ap.gps.velocity_ned_mps
         place = (*self.lat_lon_e7(north, east), round(1000.0 * (self.alt_m - down)))
@@ -75,9 +75,9 @@ class Home(NamedTuple):
         *,
         has_difference: bool,
     ) -> Message:
-        """HIGHRES_IMU in m/s^2 and rad/s; the field in the firmware's own unit.
+        """Build HIGHRES_IMU in m/s^2 and rad/s; the field is in the firmware's unit.
 
-        With ``has_difference`` its differential pressure is against that of the origin; else 0.
+        The differential pressure is relative to the origin with ``has_difference``, else 0.
         """
         height_m = -ap.sensed.position_ned_m[2]
         pressure = self.pressure_hpa * math.exp(-height_m / 8434.0)
@@ -87,7 +87,7 @@ class Home(NamedTuple):
         return mav.MAVLink_highres_imu_message(boot_us(ap), *imu, *air, _IMU_FIELDS_UPDATED, 0)
 
     def scaled_imu(self, ap: Autopilot, gyro_radps: Iterable[float]) -> tuple[int, ...]:
-        """Acceleration in milli-g, gyro in mrad/s, field in mGauss."""
+        """Return acceleration in milli-g, gyro in mrad/s, field in mGauss."""
         accel = [1000.0 * force / GRAVITY_MPS2 for force in ap.sensed.specific_force_body_mps2]
         field = int16(self.mag_gauss(ap), 1000.0)
         return (*int16(accel, 1.0), *int16(gyro_radps, 1000.0), *field)
@@ -97,7 +97,7 @@ class Home(NamedTuple):
         return round(100.0 * self.temperature_c)
 
     def builders(self) -> dict[int, Callable[[Autopilot], Message | None]]:
-        """The messages that are the same in both firmwares, by number."""
+        """Return the builders of messages identical in both firmwares, by message number."""
         return {
             # No date: the vehicle has no wall clock.
             mav.MAVLINK_MSG_ID_SYSTEM_TIME: lambda ap: mav.MAVLink_system_time_message(
@@ -118,7 +118,7 @@ class Home(NamedTuple):
 
 
 def boot_ms(ap: Autopilot) -> int:
-    """Time since boot in whole milliseconds, a uint32 that wraps after 49.7 days."""
+    """Return the time since boot in whole milliseconds, a uint32 that wraps after 49.7 days."""
     return ap.uptime_ns // 1_000_000 % 2**32
 
 
@@ -127,24 +127,24 @@ def boot_us(ap: Autopilot) -> int:
 
 
 def int16(values: Iterable[float], scale: float) -> list[int]:
-    """Scaled, rounded and kept within a field of 16 bits."""
+    """Scale, round and clamp values to a field of 16 bits."""
     return [max(-INT16, min(INT16, round(scale * value))) for value in values]
 
 
 def heading(angle_rad: float, units_per_degree: float = 1.0) -> int:
-    """From 0 to below a full turn."""
+    """Convert an angle to whole units from 0 to below a full turn."""
     full_turn = round(360 * units_per_degree)
     return round(math.degrees(angle_rad) % 360.0 * units_per_degree) % full_turn
 
 
 def servo_output_raw(ap: Autopilot) -> Message:
-    """SERVO_OUTPUT_RAW: motors at 1000..2000 us."""
+    """Build SERVO_OUTPUT_RAW: motors at 1000..2000 us."""
     motors = (round(1000.0 + 1000.0 * m) for m in ap.motor_commands)
     return mav.MAVLink_servo_output_raw_message(boot_us(ap) & 0xFFFFFFFF, 0, *motors, 0, 0, 0, 0)
 
 
 def vfr_hud(ap: Autopilot, *, altitude_m: float, throttle: float) -> Message:
-    """VFR_HUD; the throttle is a share of full."""
+    """Build VFR_HUD; ``throttle`` is a share of full."""
     north, east, down = ap.sensed.velocity_ned_mps
     speed, percent = math.hypot(north, east), round(100.0 * throttle)
     nose = heading(ap.yaw_rad)
@@ -152,7 +152,7 @@ def vfr_hud(ap: Autopilot, *, altitude_m: float, throttle: float) -> Message:
 
 
 def sys_status(ap: Autopilot, *, present: int, enabled: int, healthy: int) -> Message:
-    """SYS_STATUS with these sensors and the battery."""
+    """Build SYS_STATUS with these sensors and the battery."""
     battery = (*_battery_mv_ca(ap), ap.battery.remaining_percent)
     return mav.MAVLink_sys_status_message(
         present, enabled, healthy, 100, *battery, 0, 0, 0, 0, 0, 0
@@ -160,7 +160,7 @@ def sys_status(ap: Autopilot, *, present: int, enabled: int, healthy: int) -> Me
 
 
 def battery_status(ap: Autopilot, *, energy_hj: int) -> Message:
-    """BATTERY_STATUS: one pack, its voltage as that of a single cell; -1 hJ used: not known."""
+    """Build BATTERY_STATUS: one pack, reported as one cell; ``energy_hj`` -1: not known."""
     charge = mav.MAV_BATTERY_CHARGE_STATE_OK
     if ap.battery.is_low:
         charge = mav.MAV_BATTERY_CHARGE_STATE_LOW
@@ -177,7 +177,7 @@ def _battery_mv_ca(ap: Autopilot) -> tuple[int, int]:
 
 
 def autopilot_version(ap: Autopilot, *, capabilities: int, version: int) -> Message:
-    """AUTOPILOT_VERSION; the unique number is the system id."""
+    """Build AUTOPILOT_VERSION; the unique number is the system id."""
     no_hash = [0] * 8
     return mav.MAVLink_autopilot_version_message(
         capabilities, version, 0, 0, 0, no_hash, no_hash, no_hash, 0, 0, ap.system_id

@@ -11,18 +11,18 @@ from sitl import UsageError
 from sitl.clock import NS_PER_S, Clock, monotonic_from_wall_ns
 
 Address: TypeAlias = tuple[str, int, *tuple[int, ...]]
-"""Host and port as numbers, as the ``socket`` module has them: IPv6 adds flow and scope."""
+"""Numeric host and port of the ``socket`` module; IPv6 adds flow and scope."""
 
 VEHICLE_KINDS = ("udpout", "udpin", "tcpin")  # links of a vehicle
 FOLLOWER_KINDS = ("udp", "udpin", "udpout", "tcp")  # links to another vehicle; ``udp`` is ``udpin``
 MAX_DATAGRAM = 65535
 MAX_PACKED = 1200  # frames of one step share a datagram up to this size: below any usual MTU
-MAX_PEERS = 8  # addresses that a listening link answers; the one that was silent longest makes room
+MAX_PEERS = 8  # addresses that a listening link answers; a new one replaces the longest silent
 MAX_READS = 1000
-"""Per drain, so that a flood cannot stop the loop: the rest waits for the next step."""
+"""Reads per drain, so that a flood cannot stop the loop; the rest waits for the next step."""
 CONNECT_TIMEOUT_S = 1.0
 
-_SO_TIMESTAMPNS = 35  # Linux (asm-generic/socket.h); Python does not name it
+_SO_TIMESTAMPNS = 35  # Linux (asm-generic/socket.h); not in Python
 _TIMESPEC = struct.Struct("@qq")
 _ANCILLARY_BYTES = 64
 _UNREACHABLE = (errno.ENETUNREACH, errno.EHOSTUNREACH, errno.ENOBUFS)
@@ -31,19 +31,18 @@ _V2_OVERHEAD, _SIGNATURE, _SIGNED_FLAG = 12, 13, 0x01
 
 
 class Received(NamedTuple):
-    """One datagram, or one read of a stream, and when it arrived."""
+    """One datagram, or one read of a stream, with its arrival."""
 
     data: bytes
     arrived_ns: int
 
 
 def open_transport(url: str, clock: Clock, kinds: tuple[str, ...] = VEHICLE_KINDS) -> "Transport":
-    """Open a link by its name, KIND:HOST:PORT, or KIND://HOST:PORT as MAVSDK writes it; an IPv6
-    host in brackets.
+    """Open a link by its name, KIND:HOST:PORT or, as in MAVSDK, KIND://HOST:PORT; IPv6 in brackets.
 
-    ``udpout`` sends there first; ``udpin`` listens and answers everybody it has heard; ``tcpin``
-    serves clients, together or one after another; ``tcp`` connects whenever there is something to
-    send, so a lost connection is made again.
+    ``udpout`` sends first; ``udpin`` listens and answers all senders it has heard; ``tcpin`` serves
+    clients, together or one after another; ``tcp`` connects at each send without a connection, so
+    it recovers a lost one.
 
     Raises:
         UsageError: the name is malformed, the host is unknown or the port is taken.
@@ -70,7 +69,7 @@ def open_transport(url: str, clock: Clock, kinds: tuple[str, ...] = VEHICLE_KIND
 
 
 def _resolve(host: str, port: int) -> Address:
-    """Look a host up, IPv4 first where it has both."""
+    """Resolve a host; prefer IPv4."""
     found = [entry[4] for entry in socket.getaddrinfo(host, port, type=socket.SOCK_DGRAM)]
     number, port_number, *scope = min(found, key=len)
     return (str(number), int(port_number), *tuple(int(part) for part in scope))
@@ -95,11 +94,11 @@ class UdpLink:
         except OSError:
             self._socket.close()
             raise
-        with suppress(OSError):  # where the kernel cannot stamp datagrams, we do
+        with suppress(OSError):  # without kernel stamps, stamp on reading
             self._socket.setsockopt(socket.SOL_SOCKET, _SO_TIMESTAMPNS, 1)
 
     def drain(self) -> Iterator[Received]:
-        """All datagrams in the socket's buffer, with the kernel's arrival stamps."""
+        """Yield all datagrams in the socket's buffer, with the kernel's arrival stamps."""
         for _ in range(MAX_READS):
             try:
                 data, ancillary, _, sender = self._socket.recvmsg(MAX_DATAGRAM, _ANCILLARY_BYTES)
@@ -113,7 +112,7 @@ class UdpLink:
             yield Received(data, self._arrival_ns(ancillary))
 
     def send(self, data: bytes) -> None:
-        """Send whole frames to every peer; what cannot be sent now is dropped."""
+        """Send whole frames to every peer; drop those that cannot be sent now."""
         for datagram in split_frames(data, MAX_PACKED):
             for peer in self._peers:
                 try:
@@ -148,11 +147,11 @@ class TcpLink:
             self._server.setblocking(False)
 
     def drain(self) -> Iterator[Received]:
-        """Accept waiting clients, then read every connection; one that was closed is dropped."""
+        """Accept waiting clients, then read every connection; drop closed ones."""
         while self._server is not None and len(self._connections) < MAX_PEERS:
             try:
                 self._add(self._server.accept()[0])
-            except OSError:  # no client waits, or it has gone
+            except OSError:  # no client waits, or it has left
                 break
         for connection in tuple(self._connections):
             try:
@@ -167,7 +166,7 @@ class TcpLink:
                 self._drop(connection)
 
     def send(self, data: bytes) -> None:
-        """Send on every connection; one whose peer does not read is dropped, not waited for."""
+        """Send on every connection; drop a peer that does not read, instead of waiting for it."""
         if not data:
             return
         if self._server is None and not self._connections:
@@ -203,10 +202,10 @@ Transport: TypeAlias = UdpLink | TcpLink
 
 
 def split_frames(data: bytes, limit: int) -> Iterator[bytes]:
-    """Cut whole MAVLink frames into pieces of at most ``limit`` bytes (or one frame, if longer)."""
+    """Cut MAVLink data into pieces of whole frames, of at most ``limit`` bytes or one frame."""
     start = end = 0
     while end < len(data):
-        length = data[end + 1]  # of the payload
+        length = data[end + 1]  # payload length
         if data[end] == _V1_MAGIC:
             length += _V1_OVERHEAD
         else:
@@ -221,16 +220,15 @@ def split_frames(data: bytes, limit: int) -> Iterator[bytes]:
 
 
 HOST = "127.0.0.1"
-MAX_RC_READS = 100  # per call, so that a flood cannot stop the loop
+MAX_RC_READS = 100  # reads per call, so that a flood cannot stop the loop
 _LAYOUTS = {layout.size: layout for layout in (struct.Struct("<8H"), struct.Struct("<16H"))}
 
 
 class RcInput:
-    """A UDP port of this computer that takes receiver values, as ArduPilot's SITL does; never
-    blocks.
+    """Local UDP port that takes receiver values, as ArduPilot's SITL does; never blocks.
 
-    A datagram is 8 or 16 little-endian uint16, one PWM value in microseconds a channel. A 0 leaves
-    its channel as it is; all zeros switch the transmitter off.
+    A datagram is 8 or 16 little-endian uint16, one PWM value in microseconds per channel. A 0
+    leaves its channel unchanged; all zeros switch the transmitter off.
 
     Raises:
         UsageError: the port is taken.
@@ -247,7 +245,7 @@ class RcInput:
         self._socket.setblocking(False)
 
     def latest(self) -> tuple[int, ...] | None:
-        """The newest values since the last call, in microseconds; None where nothing came.
+        """Return the newest values since the last call [us]; None if none came.
 
         Datagrams of any other size are ignored.
         """

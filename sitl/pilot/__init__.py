@@ -1,1 +1,1 @@
-"""The pilot of the simulated vehicle, who moves its receiver: a person, or the expert."""
+"""Pilot of the simulated vehicle, who moves its receiver: a person or the expert."""

@@ -1,4 +1,4 @@
-"""The pilot at a gamepad (or a transmitter on USB) or at the keys of a window."""
+"""Pilots at a gamepad (or a USB transmitter) or at the keyboard."""
 
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
@@ -11,7 +11,7 @@ from sitl.expert.demonstrator import StickPositions
 from sitl.pilot.transmitter import OFF_US, Axes, Gesture, Hand, Switch, Transmitter
 
 RECORD_BUTTON, BAD_BUTTON, DISARM_BUTTON, ARM_BUTTON = 0, 1, 6, 7
-"""A, B, back and start of the usual pad."""
+"""A, B, back and start on a common pad."""
 PAD_HELP = (
     "hold button 7 (start) to arm, 6 (back) to disarm; button 0 (A) moves the switch of channel 7 "
     "up and down, 1 (B) to its middle"
@@ -19,22 +19,22 @@ PAD_HELP = (
 
 
 class Pad(Protocol):
-    """A gamepad as far as it is used here."""
+    """Gamepad, as far as `GamepadPilot` uses it."""
 
     def poll(self) -> bool: ...
 
     def axes(self) -> Sequence[float]:
-        """Positions in [-1, 1], by number."""
+        """Return the positions in [-1, 1], by number."""
 
     def buttons(self) -> Sequence[bool]:
-        """Those that are pressed, by number."""
+        """Return the buttons' states, by number: True if pressed."""
 
 
 class _DevicePilot(ABC):
-    """A `Pilot` at a device: its transmitter, gestures and switch."""
+    """`Pilot` at a device: its transmitter, gestures and switch."""
 
     def __init__(self, clock: Clock, *, arm: int, disarm: int, up: int, middle: int) -> None:
-        """The keys or buttons of the gestures, and of the switch: up and down, to its middle."""
+        """Bind keys or buttons: the gestures, the switch up and down, the switch to its middle."""
         self._clock = clock
         self._transmitter = Transmitter(clock.now_ns())
         self._switch: Switch = "low"
@@ -54,7 +54,7 @@ class _DevicePilot(ABC):
 
     @abstractmethod
     def _poll(self, now_ns: int) -> StickPositions | None:
-        """Take what has happened; the sticks, or None while the receiver has no signal."""
+        """Process events. Return the sticks, or None while the receiver has no signal."""
 
     def _press(self, number: int) -> None:
         self._down.add(number)
@@ -68,7 +68,7 @@ class _DevicePilot(ABC):
 
 
 class GamepadPilot(_DevicePilot):
-    """Without the pad the receiver has no signal."""
+    """Pilot at a gamepad; without the pad the receiver has no signal."""
 
     def __init__(self, pad: Pad, axes: Axes, clock: Clock) -> None:
         super().__init__(
@@ -90,16 +90,16 @@ class GamepadPilot(_DevicePilot):
 
 
 class PygamePad:
-    """The first gamepad of this computer; another one may be plugged in in its place."""
+    """First gamepad of this computer; it may be unplugged and replaced."""
 
     def __init__(self) -> None:
-        pygame.display.init()  # events come through it
+        pygame.display.init()  # needed for events
         pygame.joystick.init()
         self._pad: pygame.joystick.JoystickType | None = None
 
     @property
     def description(self) -> str | None:
-        """Its name, and how many axes and buttons it has; None while there is none."""
+        """Name and numbers of axes and buttons; None without a pad."""
         if not self.poll() or self._pad is None:
             return None
         pad = self._pad
@@ -129,9 +129,9 @@ KEYS_HELP = (
     "W S climb, A D turn, arrows lean; hold Enter to arm, Backspace to disarm; Space moves the "
     "switch of channel 7 up and down, X to its middle"
 )
-DEFLECTION = 0.7  # share of full travel; with Shift all of it
+DEFLECTION = 0.7  # share of full travel; full travel with Shift
 TRAVEL_PER_S = 4.0
-"""Sticks move towards where the keys want them at this speed: a thumb's, and not a jump."""
+"""Speed at which sticks move towards the keys' demand, like a thumb's."""
 _SIZE_PX = (460, 120)
 _AXES = (
     (pygame.K_w, pygame.K_s),
@@ -139,14 +139,14 @@ _AXES = (
     (pygame.K_UP, pygame.K_DOWN),
     (pygame.K_RIGHT, pygame.K_LEFT),
 )
-"""Keys up and down each stick: throttle, yaw, pitch, roll."""
+"""Keys that move each stick up and down: throttle, yaw, pitch, roll."""
 
 
 class KeyboardPilot(_DevicePilot):
-    """With its window closed the receiver has no signal."""
+    """Pilot at the keyboard; once its window is closed the receiver has no signal."""
 
     def __init__(self, clock: Clock) -> None:
-        """Open the window; raises pygame.error without a display."""
+        """Open the window. Raises pygame.error without a display."""
         pygame.display.init()
         pygame.display.set_caption(f"pilot: {KEYS_HELP}")
         pygame.display.set_mode(_SIZE_PX)
@@ -166,7 +166,7 @@ class KeyboardPilot(_DevicePilot):
             if event.type == pygame.QUIT:
                 self._is_open = False
             elif event.type == pygame.WINDOWFOCUSLOST:
-                self._down.clear()  # their releases go to another window
+                self._down.clear()  # another window gets the key releases
             elif event.type == pygame.KEYUP:
                 self._down.discard(event.key)
             elif event.type == pygame.KEYDOWN:

@@ -1,4 +1,4 @@
-"""From a hand on the sticks to the channels of a receiver."""
+"""Simulated transmitter: from a pilot's hand to receiver channels."""
 
 import re
 from collections.abc import Sequence
@@ -10,13 +10,13 @@ from sitl.course import Course
 from sitl.expert.demonstrator import CENTRED, Expert, StickPositions
 from sitl.simulated_vehicle import SimulatedVehicle
 
-OFF_US = (0,) * 8  # no signal: the receiver has lost the transmitter
+OFF_US = (0,) * 8  # no signal from the transmitter
 PERIOD_NS = 20 * NS_PER_MS  # between two frames of a receiver
 GESTURE_THROTTLE, GESTURE_YAW = -1.0, 1.0
 _SWITCH_US = {"low": 1000, "middle": 1500, "high": 2000}
 _FIRST_MODE_US, _MODE_US = 1100, 1500
-"""The mode switch is moved once after the start: ArduPilot takes no notice of where it stands
-before. At 1500 us the simulated vehicle is in ALT_HOLD."""
+"""The mode switch moves once after the start, because ArduPilot ignores its position until it
+moves. At 1500 us the simulated vehicle is in ALT_HOLD."""
 _MODE_AFTER_NS = NS_PER_S
 
 Switch = Literal["low", "middle", "high"]
@@ -28,28 +28,28 @@ class Hand(NamedTuple):
 
     sticks: StickPositions = CENTRED
     gesture: Gesture | None = None
-    """Throttle down and yaw full right arms, full left disarms, in place of ``sticks``."""
+    """Replaces ``sticks``: throttle down with full right yaw to arm, full left yaw to disarm."""
     switch: Switch = "low"
 
 
 class Pilot(Protocol):
-    """Source of receiver values; polled by the loop of the vehicle, never waits."""
+    """Source of receiver values. The vehicle's loop polls it; it never waits."""
 
     def latest(self) -> Sequence[int] | None:
-        """Channels in microseconds, as ``Autopilot.set_receiver`` takes them; None = as before."""
+        """Return the channels [us] for ``Autopilot.set_receiver``; None: unchanged."""
 
     def close(self) -> None: ...
 
 
 class Transmitter:
-    """Channels of a hand, at the rate of a receiver; the mode switch moves by itself."""
+    """Converts a hand to channels at a receiver's frame rate, and moves the mode switch."""
 
     def __init__(self, start_ns: int) -> None:
         self._start_ns = start_ns
         self._due_ns = start_ns
 
     def begins_frame(self, now_ns: int) -> bool:
-        """It is time for another frame; true once for each."""
+        """Return True once for each frame, when it is due."""
         if now_ns < self._due_ns:
             return False
         is_on_time = now_ns - self._due_ns < PERIOD_NS
@@ -57,7 +57,7 @@ class Transmitter:
         return True
 
     def channels_us(self, hand: Hand, now_ns: int) -> tuple[int, ...]:
-        """Roll, pitch, throttle, yaw, mode, nothing, the switch, nothing."""
+        """Return the channels: roll, pitch, throttle, yaw, mode, unused, switch, unused."""
         throttle, yaw, pitch, roll = hand.sticks
         if hand.gesture is not None:
             side = GESTURE_YAW if hand.gesture == "arm" else -GESTURE_YAW
@@ -69,23 +69,23 @@ class Transmitter:
 
 
 def _us(position: float) -> int:
-    """Less is left, nose down and descent, as ArduCopter and PX4 have them."""
+    """Convert a position to microseconds; less is left, nose down and descent."""
     return round(1500 + 500 * max(-1.0, min(1.0, position)))
 
 
 DEAD_ZONE = 0.08
-"""Share of the travel to each side that counts as centred; springs come back to within 0.05."""
+"""Share of the travel to each side that counts as centred; springs return to within 0.05."""
 
 
 class Axis(NamedTuple):
-    """One axis, from 0, as the system numbers them; a pad's vertical ones are negative upwards."""
+    """One axis by the system's number, from 0. A pad's vertical axes are negative upwards."""
 
     number: int
     is_reversed: bool
 
 
 class Axes(NamedTuple):
-    """The axis of each stick."""
+    """Axis of each stick."""
 
     throttle: Axis
     yaw: Axis
@@ -93,7 +93,7 @@ class Axes(NamedTuple):
     roll: Axis
 
     def sticks(self, values: Sequence[float]) -> StickPositions:
-        """Positions of the sticks where the pad's axes have these values; an absent one is 0."""
+        """Convert the pad's axis values to stick positions; an absent axis is 0."""
         positions = []
         for axis in self:
             value = values[axis.number] if axis.number < len(values) else 0.0
@@ -102,14 +102,14 @@ class Axes(NamedTuple):
 
 
 DEFAULT_AXES = "throttle=-1,yaw=0,pitch=-4,roll=3"
-"""Mode 2 on the usual pad: the left stick climbs and turns, the right one leans."""
+"""Mode 2 on a common pad: the left stick climbs and turns, the right one leans."""
 
 
 def parse_axes(text: str) -> Axes:
-    """Read ``throttle=-1,yaw=0,pitch=-4,roll=3``; a minus reverses the axis.
+    """Parse ``throttle=-1,yaw=0,pitch=-4,roll=3``; a minus reverses the axis.
 
     Raises:
-        UsageError: not the four sticks, each once, with the number of an axis.
+        UsageError: not exactly one axis number for each of the four sticks.
     """
     found: dict[str, Axis] = {}
     for part in text.split(","):
@@ -126,21 +126,21 @@ def parse_axes(text: str) -> Axes:
 
 
 def past_dead_zone(value: float) -> float:
-    """A position in [-1, 1] without its dead zone; full deflection stays full."""
+    """Remove the dead zone from a position in [-1, 1]; full deflection stays full."""
     beyond = max(0.0, min(1.0, abs(value)) - DEAD_ZONE) / (1.0 - DEAD_ZONE)
     return beyond if value > 0.0 else -beyond
 
 
 WAIT_NS = 8 * NS_PER_S
-"""From boot to the arming gesture: the estimator needs 3 s for the attitude and 5 s for the
-position, and whoever records asks for parameters and streams."""
+"""Time from boot to the arming gesture: the estimator needs 3 s for the attitude and 5 s for the
+position, and a recorder requests parameters and streams."""
 HOVER_NS = 2 * NS_PER_S  # after the last gate, before the landing
 IDLE = CENTRED._replace(throttle=-1.0)
 DESCENT = CENTRED._replace(throttle=-0.8)
 
 
 class ExpertPilot:
-    """A `Pilot` for one flight over the course."""
+    """`Pilot` for one flight of the expert over the course."""
 
     def __init__(self, vehicle: SimulatedVehicle, course: Course, *, speed_mps: float) -> None:
         self._vehicle = vehicle

@@ -1,1 +1,1 @@
-"""PX4 as a peer sees it: modes, stick input, parameters, failsafes, and its side of MAVLink."""
+"""PX4 as a peer sees it: modes, stick input, parameters, failsafes and MAVLink."""

@@ -1,7 +1,7 @@
-"""The flight controller without its link: sticks and setpoints in, physics out, 4 ms at a time.
+"""PX4 without its link: sticks and setpoints in, physics out, in steps of 4 ms.
 
-It behaves as a pilot and a companion computer see PX4. Nothing here knows about MAVLink's links,
-sockets or the host's time.
+It behaves as a pilot and a companion computer see PX4. This module knows nothing about MAVLink's
+links, sockets or the host's time.
 """
 
 import math
@@ -18,12 +18,12 @@ from sitl.px4.sticks import RC_SOURCE, StickInput, Sticks
 from sitl.vehicle.config import Battery, VehicleConfig
 
 RECEIVER_PERIOD_NS = NS_PER_S // 50
-RAMP_FROM_MPS = -2.4  # as long on the ground as measured
-TAKEOFF_MARGIN_M = 0.2  # below its height AUTO.TAKEOFF has arrived
+RAMP_FROM_MPS = -2.4  # chosen to match the measured time on the ground
+TAKEOFF_MARGIN_M = 0.2  # AUTO.TAKEOFF has arrived this far below its height
 
 
 class Px4(Autopilot):
-    """One boot of the vehicle, with the control period, airframe and noise of PX4's SIH.
+    """One boot of PX4, with the control period, airframe and noise of PX4's SIH.
 
     Every stamp is a multiple of the control period.
     """
@@ -48,7 +48,7 @@ class Px4(Autopilot):
         self._setpoint_ns = boot_ns
         self._has_transmitter = config.receiver
         self._receiver_due_ns = boot_ns
-        self._ramp_ns: int | None = None  # since when the vehicle leaves the ground
+        self._ramp_ns: int | None = None  # start of the takeoff ramp; None: no ramp
         self._flown_mode = self.mode
 
     @property
@@ -69,7 +69,7 @@ class Px4(Autopilot):
 
     @property
     def sticks_us(self) -> tuple[int, int, int, int]:
-        """The chosen sticks as ArduCopter would have them: less is left, nose down, descent."""
+        """The chosen sticks with ArduCopter's signs: less is left, nose down and descent."""
         if not self.stick_input.count:
             return (0, 0, 0, 0)
         sticks = self.stick_input.sticks
@@ -78,13 +78,13 @@ class Px4(Autopilot):
         return roll, pitch, throttle, yaw
 
     def set_receiver(self, values_us: Sequence[int]) -> None:
-        """Move the transmitter's sticks, in microseconds by channel; all zeros switch it off."""
+        """Move the transmitter's sticks [us, by channel]; all zeros switch it off."""
         self._has_transmitter = any(values_us)
         if self._has_transmitter:
             self.receiver_us = tuple(values_us)
 
     def set_setpoint(self, setpoint: Setpoint, now_ns: int) -> None:
-        """Take a setpoint for OFFBOARD; which modes fly by it is the commander's."""
+        """Take a setpoint for OFFBOARD; the commander decides which modes use it."""
         self.setpoint, self._setpoint_ns = setpoint, now_ns
         self.setpoint_count += 1
         self.commander.setpoint_fresh = True
@@ -101,8 +101,8 @@ class Px4(Autopilot):
     def _start_in_air(self) -> None:
         """Fly on in ALTCTL, unless setpoints fly it.
 
-        Sticks that are valid go on, as do setpoints; else they count as valid and centred until the
-        first ones come.
+        Valid sticks and setpoints stay in effect. Without valid sticks, centred ones are assumed
+        until the first real ones come.
         """
         commander = self.commander
         if commander.mode is not Mode.OFFBOARD:
@@ -116,7 +116,7 @@ class Px4(Autopilot):
         self.flight.reset(self.sensed)
 
     def _read_receiver(self) -> None:
-        """The receiver's four mapped channels are a source of sticks like any link."""
+        """Feed the receiver's four mapped channels to the stick input as one more source."""
         if self.receiver_us is None or not self._has_transmitter:
             return
         if self.now_ns < self._receiver_due_ns:
@@ -162,10 +162,10 @@ class Px4(Autopilot):
         return commands
 
     def _leaves_ground(self) -> bool:
-        """True in flight, and once a landed vehicle is to lift off.
+        """True in flight, and once a landed vehicle lifts off.
 
-        Where it climbs at a rate, the most that it may climb at grows over MPC_TKO_RAMP_T, from a
-        value below zero: the motors spin up before the vehicle moves.
+        In modes with a climb rate its limit ramps up over MPC_TKO_RAMP_T from a negative value, so
+        that the motors spin up before the vehicle moves.
         """
         if self._ramp_ns is not None:
             share = (

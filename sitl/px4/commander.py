@@ -1,7 +1,7 @@
-"""Arming, modes and failsafes: what PX4's commander decides, and what it says about it.
+"""Arming, modes and failsafes, with their texts and events, as PX4's commander decides them.
 
-The intended mode is what the pilot or a command asked for last; the mode is what flies, which a
-failsafe may change without touching the intended one.
+The intended mode is the last one that the pilot or a command requested. The flown mode is ``mode``;
+a failsafe may change it and leaves the intended one alone.
 """
 
 import struct
@@ -15,7 +15,7 @@ from sitl.px4.sticks import StickInput
 
 SEVERITY_CRITICAL, SEVERITY_INFO = 2, 6
 LEVELS_INFO, LEVELS_DENIED, LEVELS_FAILSAFE = 0x66, 0x62, 0x42
-"""Levels for the outside and, in the upper half, for the vehicle's own log: 2 critical, 6 info."""
+"""Event levels: low half for peers, high half for the vehicle's own log; 2 critical, 6 info."""
 _AUTOPILOT_COMPONENT = 1 << 24
 _FNV1A_32_OFFSET, _FNV1A_32_PRIME = 0x811C9DC5, 0x01000193
 
@@ -35,7 +35,8 @@ CAUSE_STICKS_LOST = 1
 class Event(NamedTuple):
     """One EVENT(410); ``uptime_ms`` is its time since boot.
 
-    Its number is the autopilot's component above a hash of its name (MAVLink's events interface).
+    Its number is the autopilot's component in the upper bits and a hash of its name below
+    (MAVLink's events interface).
     """
 
     name: str
@@ -52,20 +53,20 @@ class Event(NamedTuple):
 
 
 def pack(layout: str, *values: float) -> bytes:
-    """Arguments of an event: `struct` letters without padding."""
+    """Pack the arguments of an event: `struct` letters without padding."""
     return struct.pack("<" + layout, *values)
 
 
 CHECK_PERIOD_NS = 20 * NS_PER_MS
 LOW_THROTTLE, MIDDLE_THROTTLE = -0.8, 0.2
-"""Most that arming allows where the stick is thrust, and where it is a climb rate."""
+"""Highest throttle for arming in modes where the stick is thrust, and where it is a climb rate."""
 
 _BOOT_MODES = {1: Mode.ALTCTL, 2: Mode.POSCTL}
-"""COM_FLTMODE_BOOT; 4 and all modes that this vehicle lacks are Hold."""
+"""Modes of COM_FLTMODE_BOOT; 4, and any mode that this vehicle lacks, means Hold."""
 
 
 class Commander:
-    """Decides on mode and arming of one boot; texts and events wait in lists for the links."""
+    """Decides on mode and arming during one boot; texts and events wait in lists for the links."""
 
     def __init__(
         self, params: Px4Params, sticks: StickInput, boot_ns: int, texts: list[StatusText]
@@ -77,16 +78,16 @@ class Commander:
         self.mode = self.intended = self._last_armable = boot_mode
         self.armed = False
         self.terminated = False
-        self.landed = True  # told by the autopilot, as the next three
+        self.landed = True  # set by the autopilot, as are readiness and setpoint_fresh
         self.estimator_ready = self.position_ready = False
         self.setpoint_fresh = False
         self.lost_sticks = LostSticks(params)
         self.events: list[Event] = []  # events to send; the reader empties the list
         self._texts = texts
         self._fallback = False
-        self._sticks_missed = True  # lost, and that is known
+        self._sticks_missed = True  # the loss of sticks has been noticed
         self._lost_ns: int | None = None
-        self._ignores_sticks = False  # they were absent at arming
+        self._ignores_sticks = False  # no failsafe: sticks were absent at arming
         self.armed_ns = boot_ns
         self._landed_ns = boot_ns
         self._has_flown = False
@@ -97,7 +98,7 @@ class Commander:
         return self.armed and (self.lost_sticks.active or self._fallback)
 
     def can_fly(self, mode: Mode) -> bool:
-        """True if the mode has its sticks, position or stream of setpoints."""
+        """True if the mode has the sticks, position or stream of setpoints that it needs."""
         if mode.piloted and not self._sticks.valid:
             return False
         if mode.needs_position and not self.position_ready:
@@ -105,11 +106,11 @@ class Commander:
         return self.setpoint_fresh if mode is Mode.OFFBOARD else mode is not Mode.AUTO_MISSION
 
     def can_arm(self) -> bool:
-        """Arming would not be refused for the vehicle's health; sticks may still be too high."""
+        """True if the vehicle's health allows arming; sticks may still be too high."""
         return self.estimator_ready and self.intended.armable and self.can_fly(self.intended)
 
     def arm(self, reason: int = ARM_REASON_COMMAND) -> bool:
-        """Start the motors; a refusal becomes a text. True if armed afterwards."""
+        """Start the motors, or send the refusal as a text. Return True if armed afterwards."""
         if self.armed:
             return True
         if self.terminated or not self.can_arm():
@@ -141,7 +142,7 @@ class Commander:
         self._sticks_missed = not self._sticks.valid
 
     def disarm(self, *, force: bool, reason: int = ARM_REASON_COMMAND) -> bool:
-        """Stop the motors; refused in flight unless forced. True if disarmed afterwards."""
+        """Stop the motors; refused in flight unless forced. Return True if disarmed afterwards."""
         if not self.armed:
             return True
         if not (self.landed or force) or (self.terminated and not force):
@@ -157,7 +158,10 @@ class Commander:
         return True
 
     def set_mode(self, mode: Mode, *, says_why: bool = True) -> bool:
-        """Take a commanded mode; a refusal may become a text. True if it is intended then."""
+        """Take a commanded mode. Return True if it is the intended one afterwards.
+
+        A refusal becomes a text if ``says_why``.
+        """
         if self.terminated:
             return False
         if self.armed and mode is not Mode.AUTO_LAND and not self.can_fly(mode):
@@ -179,7 +183,7 @@ class Commander:
         self._emit("commander_failsafe_enter_generic", LEVELS_FAILSAFE, arguments)
 
     def refuse_frame(self, frame: int) -> None:
-        """A velocity setpoint came in axes that PX4 does not take."""
+        """Report a velocity setpoint in axes that PX4 does not support."""
         name = "SET_POSITION_TARGET_LOCAL_NED"
         self._deny(
             f"{name} coordinate frame {frame} unsupported",
@@ -222,7 +226,7 @@ class Commander:
             self.disarm(force=False, reason=ARM_REASON_GESTURE)
 
     def _watch_sticks(self) -> None:
-        """Start the failsafe when sticks are lost in flight; absence at arming is ignored."""
+        """Start the failsafe if sticks are lost in flight; sticks absent at arming are ignored."""
         if self._sticks.valid:
             if self._sticks_missed and self._lost_ns is not None:
                 gap_s = (self.now_ns - self._lost_ns) / NS_PER_S
@@ -245,9 +249,9 @@ class Commander:
             self._say_failsafe(ACTION_RTL)
 
     def _yield_to_pilot(self) -> None:
-        """Fast sticks take an autonomous flight over; not in the Hold before the action."""
+        """Let fast sticks take over an autonomous flight, except in a failsafe's Hold."""
         is_held = self.lost_sticks.phase is Phase.HOLDING
-        bits = int(self._params.get("COM_RC_OVERRIDE", 0b11))  # 1.18: both, without a parameter
+        bits = int(self._params.get("COM_RC_OVERRIDE", 0b11))  # 1.18 has no parameter and does both
         is_autonomous = bool(bits & 1) and self.mode.is_auto
         is_autonomous = is_autonomous or (bool(bits & 2) and self.mode is Mode.OFFBOARD)
         if self._sticks.moved_fast and is_autonomous and not is_held and not self.landed:
@@ -316,7 +320,7 @@ class Commander:
         self._emit(event, LEVELS_DENIED, arguments)
 
     def _say(self, severity: int, text: str) -> None:
-        # The tab marks a text that exists as an event as well; ground stations hide it.
+        # The tab marks a text that is also sent as an event; ground stations hide it.
         self._texts.append(StatusText(severity, text + "\t"))
 
     def _emit(self, name: str, levels: int, arguments: bytes = b"") -> None:

@@ -1,8 +1,8 @@
-"""Inner loops: attitude or body rates to angular acceleration; velocity to a lean and thrust.
+"""Inner loops: attitude or body rate to angular acceleration; velocity to lean and thrust.
 
-The gains of the attitude and velocity loops are PX4's parameters. Those of the rate loop are this
-vehicle's own, chosen so that a step of rate or attitude takes as long as measured on PX4's SIH;
-PX4's parameters of it only scale them.
+The gains of the attitude and velocity loops are PX4's parameters. Those of the rate loop were
+chosen so that a step of rate or attitude takes as long as measured on PX4's SIH; PX4's rate
+parameters only scale them.
 """
 
 import math
@@ -24,7 +24,7 @@ from sitl.vehicle.dynamics import GRAVITY_MPS2, Airframe, BodyState, clamp
 
 SIH_QUAD = Airframe(
     mass_kg=1.0,
-    max_motor_thrust_n=GRAVITY_MPS2 / 4.0 / 0.484,  # hovers at 0.484
+    max_motor_thrust_n=GRAVITY_MPS2 / 4.0 / 0.484,  # hovers at 0.484 of full thrust
     motor_lag_s=0.05,
     rotor_drag_nspm=1.0,  # 6.8 m/s at a lean of 35 degrees
     air_density_kgpm3=0.0,
@@ -37,17 +37,17 @@ STILL: NorthEast = (0.0, 0.0)
 
 RATE_GAIN_PER_S = 14.0  # roll and pitch, at the default MC_ROLLRATE_P and MC_PITCHRATE_P
 YAW_GAIN_PER_S = 2.6
-TARGET_DELAY_STEPS = 9  # control steps until an attitude that is asked for is flown: 36 ms
+TARGET_DELAY_STEPS = 9  # control steps from an attitude demand to its effect: 36 ms
 YAW_TORQUE_LAG_S = 0.08  # MC_YAW_TQ_CUTOFF 2 Hz
 MAX_VELOCITY_INTEGRAL_MPS2 = 4.0
-HOLD_BELOW_MPS = 0.3  # braking ends at this speed, and the place of that moment is held
-BRAKING_PER_S = 1.0  # of POSCTL with centred sticks
+HOLD_BELOW_MPS = 0.3  # braking ends at this speed, and the present position is held
+BRAKING_PER_S = 1.0  # in POSCTL with centred sticks
 MOVING_MPS = 0.5
-REACTION_S = 0.85  # how long AUTO keeps the lean of a moving vehicle before it brakes, as measured
+REACTION_S = 0.85  # time for which AUTO keeps a moving vehicle's lean before it brakes, as measured
 
 
 class RateController:
-    """Tracks body rates, and through them attitudes."""
+    """Tracks body rates, and attitudes through them."""
 
     def __init__(self, params: Px4Params) -> None:
         self._params = params
@@ -62,10 +62,10 @@ class RateController:
         self.rates_radps = (0.0, 0.0, 0.0)
 
     def attitude(self, body: BodyState, target: Quat, yaw_rate_radps: float, dt_s: float) -> Vec3:
-        """Angular acceleration towards an attitude that turns about the vertical at a rate."""
+        """Return the angular acceleration towards an attitude that turns about the vertical."""
         self._targets.append((target, yaw_rate_radps))
         target, yaw_rate_radps = self._targets[0]
-        turned_rad = yaw_rate_radps * dt_s * (len(self._targets) - 1)  # since it was asked for
+        turned_rad = yaw_rate_radps * dt_s * (len(self._targets) - 1)  # turn since the demand
         target = multiply(from_euler(0.0, 0.0, turned_rad), target)
         error = rotation_vector(multiply(conjugate(body.ned_from_body_wxyz), target))
         gains = [self._params[f"MC_{axis}_P"] for axis in ("ROLL", "PITCH", "YAW")]
@@ -77,7 +77,7 @@ class RateController:
         return self.rates(body, (roll, pitch, yaw), dt_s)
 
     def rates(self, body: BodyState, wanted_radps: Vec3, dt_s: float) -> Vec3:
-        """Angular acceleration towards body rates, each within its MC_*RATE_MAX."""
+        """Return the angular acceleration towards body rates, each limited to its MC_*RATE_MAX."""
         limits = [self._params[f"MC_{axis}RATE_MAX"] for axis in ("ROLL", "PITCH", "YAW")]
         roll, pitch, yaw = (
             clamp(rate, math.radians(limit))
@@ -98,7 +98,7 @@ class RateController:
 
 
 class VelocityController:
-    """Tracks a horizontal velocity by leaning: proportional, integral and damping terms."""
+    """Tracks a horizontal velocity by leaning, with proportional, integral and damping terms."""
 
     def __init__(self, params: Px4Params) -> None:
         self._params = params
@@ -107,7 +107,7 @@ class VelocityController:
         self._accel = [0.0, 0.0]
 
     def reset(self, accel_ne_mps2: NorthEast) -> None:
-        """Begin with this acceleration, as if it were what wind and drag need."""
+        """Start with this acceleration in the integral, as if wind and drag required it."""
         self._integral = list(accel_ne_mps2)
         self._last_mps = None
         self._accel = [0.0, 0.0]
@@ -119,7 +119,7 @@ class VelocityController:
         dt_s: float,
         feedforward_ne_mps2: NorthEast = (0.0, 0.0),
     ) -> NorthEast:
-        """Acceleration north and east in m/s^2, within MPC_TILTMAX_AIR."""
+        """Return the acceleration north and east [m/s^2], limited by MPC_TILTMAX_AIR."""
         params = self._params
         actual = body.velocity_ned_mps[:2]
         last = actual if self._last_mps is None else self._last_mps
@@ -141,19 +141,19 @@ class VelocityController:
 
 
 class Horizontal:
-    """Motion of the modes that know where they are: paths, and the velocity controller behind them.
+    """Horizontal motion of the modes that need a position: paths and their velocity controller.
 
-    POSCTL's sticks push a velocity that drag holds back; AUTO modes follow a path of limited jerk
-    to a place; OFFBOARD tracks the velocity that is asked for as it is.
+    In POSCTL the sticks accelerate the target velocity against drag. AUTO modes follow a path of
+    limited jerk to a position. OFFBOARD tracks the demanded velocity directly.
     """
 
     def __init__(self, params: Px4Params) -> None:
         self._params = params
         self._velocity = VelocityController(params)
-        self.accel_mps2 = STILL  # acceleration that was asked for last
-        self.speed_mps = STILL  # velocity that was asked for last
+        self.accel_mps2 = STILL  # last demanded acceleration
+        self.speed_mps = STILL  # last demanded velocity
         self._path_accel = STILL
-        self._place_m: NorthEast | None = None  # on the path, or the place that POSCTL holds
+        self._place_m: NorthEast | None = None  # on the path, or held by POSCTL
         self._stop_m = STILL
         self._reaction_s = 0.0
 
@@ -166,12 +166,12 @@ class Horizontal:
         self._reaction_s = REACTION_S if math.hypot(*self.speed_mps) > MOVING_MPS else 0.0
 
     def track(self, velocity_mps: NorthEast, body: BodyState, dt_s: float) -> NorthEast:
-        """OFFBOARD: a velocity, at most MPC_XY_VEL_MAX."""
+        """Track an OFFBOARD velocity, limited to MPC_XY_VEL_MAX."""
         self.speed_mps = shorten(velocity_mps, self._params["MPC_XY_VEL_MAX"])
         return self._follow(self.speed_mps, STILL, body, dt_s)
 
     def steer(self, wanted_mps: NorthEast, body: BodyState, dt_s: float) -> NorthEast:
-        """POSCTL: a velocity that the sticks end up at; held in place once it has come to rest."""
+        """Approach the velocity of POSCTL's sticks; with centred sticks, stop and hold."""
         params = self._params
         full = 2.0 * params["MPC_ACC_HOR"]  # at full stick, before drag
         per_s = full / params["MPC_VEL_MANUAL"]
@@ -189,7 +189,7 @@ class Horizontal:
         return self._follow(self._towards(self._place_m, body), STILL, body, dt_s)
 
     def fly_to(self, target_m: NorthEast | None, body: BodyState, dt_s: float) -> NorthEast:
-        """AUTO: a place north and east of home; None: where braking ends."""
+        """Fly to a position north and east of home, in AUTO modes; None: brake to a stop."""
         params = self._params
         if self._reaction_s > 0.0:
             self._reaction_s -= dt_s
@@ -217,7 +217,7 @@ class Horizontal:
         return self._follow(velocity, self._path_accel, body, dt_s)
 
     def _approach(self, wanted: NorthEast, limit: float, jerk: float, dt_s: float) -> None:
-        """Turn the path's acceleration towards the wanted one, and its velocity with it."""
+        """Move the path's acceleration towards the wanted one, and integrate its velocity."""
         wanted = shorten(wanted, limit)
         step = jerk * dt_s
         now_n, now_e = self._path_accel
@@ -240,7 +240,7 @@ class Horizontal:
 
 
 def shorten(vector: NorthEast, limit: float) -> NorthEast:
-    """The vector, or one in its direction of this length where it is longer."""
+    """Limit a vector's length and keep its direction."""
     scale = limit / max(limit, math.hypot(*vector))
     return vector[0] * scale, vector[1] * scale
 
@@ -250,7 +250,7 @@ def _place(body: BodyState) -> NorthEast:
 
 
 def attitude_for(accel_ne_mps2: NorthEast, yaw_rad: float) -> Quat:
-    """The attitude whose thrust gives this horizontal acceleration in level flight."""
+    """Return the attitude whose thrust gives this horizontal acceleration in level flight."""
     north, east = accel_ne_mps2
     forward, right = to_heading(north, east, yaw_rad)
     roll = math.asin(right / math.sqrt(forward**2 + right**2 + GRAVITY_MPS2**2))

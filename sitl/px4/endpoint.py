@@ -1,8 +1,8 @@
-"""One link of a PX4 vehicle: texts, events, and streams by topic in a bandwidth, scaled silently.
+"""One link of a PX4 vehicle: texts, events and streams within a bandwidth.
 
-A stream is looked at once a control step. It is sent when its interval has passed and its topic is
-new; a stream that is late by less than half an interval keeps its grid, a later one begins anew.
-So 200 Hz of a 250 Hz topic become 125 Hz, as measured.
+Each control step, a stream is sent if its interval has passed and its topic is new. A stream that
+is late by less than half an interval keeps its grid; a later one starts a new grid. So 200 Hz of a
+250 Hz topic become 125 Hz, as measured. A small bandwidth silently scales all rates down.
 """
 
 from collections.abc import Callable, Hashable, Mapping
@@ -41,7 +41,7 @@ GCS_HZ: Mapping[int, float] = MappingProxyType(
     | by_message(RC_CHANNELS=20.0, VFR_HUD=4.0, POSITION_TARGET_LOCAL_NED=1.5, GPS_RAW_INT=1.0)
     | by_message(EXTENDED_SYS_STATE=1.0, SYS_STATUS=1.0)
 )
-"""Rates on a link to a ground station (mode Normal, with what PX4's SITL script adds)."""
+"""Message rates on a link to a ground station (mode Normal with the SITL script's additions)."""
 
 _UNSCALED = (mav.MAVLINK_MSG_ID_HEARTBEAT,)
 
@@ -50,11 +50,11 @@ _UNSCALED = (mav.MAVLINK_MSG_ID_HEARTBEAT,)
 class _Stream:
     interval_us: int
     sent_us: int
-    version: Hashable = None  # of the topic, when it was sent
+    version: Hashable = None  # topic version when last sent
 
 
 class Px4Streams:
-    """The message intervals of one link; stamps are the vehicle's clock."""
+    """Message intervals of one link. Stamps are those of the vehicle's clock."""
 
     def __init__(
         self, default_hz: Mapping[int, float], bandwidth_bytes_ps: float, now_ns: int
@@ -63,7 +63,7 @@ class Px4Streams:
         self._bandwidth = bandwidth_bytes_ps
         self._streams: dict[int, _Stream] = {}
         self.scale = 1.0
-        """Factor on all rates that fits them into the link's bandwidth; nobody is told."""
+        """Factor that fits all rates into the link's bandwidth; never reported to the peer."""
         for message_id, interval_us in self._default_us.items():
             self.set_interval(message_id, interval_us, now_ns)
 
@@ -82,12 +82,12 @@ class Px4Streams:
         self.scale = max(LOWEST_SCALE, min(1.0, self._bandwidth / wanted))
 
     def interval_us(self, message_id: int) -> int:
-        """The interval that MESSAGE_INTERVAL reports; -1: not streamed."""
+        """Return the interval for MESSAGE_INTERVAL; -1: not streamed."""
         stream = self._streams.get(message_id)
         return -1 if stream is None else stream.interval_us
 
     def due(self, now_ns: int, version_of: Callable[[int], Hashable]) -> list[int]:
-        """Ids of the messages to send now; ``version_of`` tells a new topic from an old one."""
+        """Return the ids of the messages to send now; ``version_of`` changes with each topic."""
         now_us, scale = now_ns // NS_PER_US, self.scale
         ready = []
         for message_id, stream in self._streams.items():
@@ -104,7 +104,7 @@ class Px4Streams:
 
 
 def payload_bytes(message_id: int) -> int:
-    """Most bytes of the message on the wire, signature aside."""
+    """Return the largest size of the message on the wire, without a signature."""
     if message_id == CURRENT_MODE:
         return 9 + FRAME_BYTES
     fields = mav.mavlink_map[message_id]
@@ -112,24 +112,24 @@ def payload_bytes(message_id: int) -> int:
 
 
 class Px4Endpoint(Endpoint[Px4]):
-    """A link to a ground station, or to a companion computer, which gets other streams."""
+    """Link to a ground station, or to a companion computer, which gets other streams."""
 
     def __init__(self, ap: Px4, *, is_onboard: bool) -> None:
         self.heard: set[tuple[int, int]] = set()
-        """Systems and components that have sent on this link."""
+        """Systems and components heard on this link."""
         self._default_hz = ONBOARD_HZ if is_onboard else GCS_HZ
         self._text_id = self._event_sequence = 0
         super().__init__(ap, BUILDERS_1_14 if ap.config.px4_release == "1.14" else BUILDERS)
 
     def restart(self, ap: Px4) -> None:
         super().restart(ap)
-        self.has_gcs = False  # a ground station's heartbeat has come; without one no text is sent
+        self.has_gcs = False  # heard a ground station's heartbeat; no text is sent before
         self._streams = Px4Streams(self._default_hz, ap.config.link_bytes_ps, ap.now_ns)
         self._heartbeat_due_ns = ap.now_ns
         self._looked_ns = ap.now_ns
 
     def step(self, now_ns: int) -> None:
-        """Queue what is due: streams once a control step, parameters at every call."""
+        """Queue due messages: streams once per control step, parameters at every call."""
         ap = self._ap
         self._send_next_param(now_ns)
         if ap.now_ns >= self._heartbeat_due_ns:
@@ -141,7 +141,7 @@ class Px4Endpoint(Endpoint[Px4]):
                 self.send_now(message_id)
 
     def set_interval(self, message_id: int, interval_us: int) -> bool:
-        """Change a stream; False for a message that cannot be streamed."""
+        """Change a stream. Return False for a message that cannot be streamed."""
         if message_id not in self._builders or message_id == mav.MAVLINK_MSG_ID_HEARTBEAT:
             return False
         self._streams.set_interval(message_id, interval_us, self._ap.now_ns)
@@ -151,7 +151,7 @@ class Px4Endpoint(Endpoint[Px4]):
         return self._streams.interval_us(message_id)
 
     def send_text(self, severity: int, text: str) -> None:
-        """Send STATUSTEXT once a ground station is known, a long one in numbered chunks."""
+        """Send STATUSTEXT once a ground station is known; number the chunks of a long text."""
         if not self.has_gcs:
             return
         data = text.encode("ascii", "replace")

@@ -1,4 +1,4 @@
-"""From mode, sticks, setpoint and state to motors: the control laws of all modes."""
+"""Control laws of all modes: from mode, sticks, setpoint and state to motor commands."""
 
 import math
 from typing import NamedTuple, TypeAlias
@@ -21,8 +21,8 @@ from sitl.rotation import IDENTITY, Quat, Vec3, cos_tilt, from_euler, from_headi
 from sitl.vehicle.dynamics import BodyState, HeightController, mix, thrust_for
 
 IDLE = (0.05, 0.05, 0.05, 0.05)  # armed on the ground
-STILL_YAW_RADPS = 0.01  # a slower yaw stick holds the heading
-TAKEOFF_CLIMB_MPS = 0.3  # a climb stick beyond this lifts a landed vehicle off
+STILL_YAW_RADPS = 0.01  # a slower yaw command holds the heading
+TAKEOFF_CLIMB_MPS = 0.3  # a faster climb demand lifts a landed vehicle off
 ARRIVED_M = 1.0
 
 
@@ -40,7 +40,7 @@ Setpoint: TypeAlias = AttitudeSetpoint | PositionSetpoint
 
 
 class Px4Control:
-    """Control laws of all modes, and the controllers that they share."""
+    """Control laws of all modes, with their shared controllers."""
 
     def __init__(self, params: Px4Params) -> None:
         self._params = params
@@ -49,18 +49,18 @@ class Px4Control:
         self._height = HeightController()
         self._yaw_rate_radps = 0.0
         self._yaw_hold_rad: float | None = None
-        self._accel_mps2 = STILL  # north and east, asked for last
+        self._accel_mps2 = STILL  # last demanded, north and east
         self._target_m: NorthEast | None = None
         self._home_reached = False
         self._returns_to_m: float | None = None
         self.takeoff_to_m = 0.0  # height at which AUTO.TAKEOFF ends
         self.most_climb_mps = math.inf
-        """Bound on the climb rate while the vehicle leaves the ground."""
+        """Limit of the climb rate while the vehicle leaves the ground."""
         self.thrust = 0.0  # commanded collective, 0..1
         self.attitude: Quat = IDENTITY  # demanded attitude, as ATTITUDE_TARGET reports it
         self.velocity_ned_mps: Vec3 = (0.0, 0.0, 0.0)
         """Demanded velocity, as POSITION_TARGET_LOCAL_NED reports it."""
-        self.yaw_rate_radps = 0.0  # demanded yaw rate, in the same message
+        self.yaw_rate_radps = 0.0  # demanded yaw rate, reported by the same message
 
     @property
     def rates_radps(self) -> Vec3:
@@ -191,7 +191,7 @@ class Px4Control:
         return self._hold_yaw(self._yaw_rate_radps, body)
 
     def _hold_yaw(self, yaw_rate_radps: float, body: BodyState) -> float:
-        """The rate; where there is none, the heading of that moment is held."""
+        """Return the yaw rate; near zero, return 0 and hold the present heading."""
         if abs(yaw_rate_radps) > STILL_YAW_RADPS:
             self._yaw_hold_rad = None
             return yaw_rate_radps
@@ -208,7 +208,7 @@ class Px4Control:
         return max(self._params["MPC_THR_MIN"], min(self._params["MPC_THR_MAX"], thrust))
 
     def _climb_mps(self, mode: Mode, sticks: Sticks, body: BodyState) -> float:
-        """Climb rate that mode and sticks ask for: slower near the ground, both ways."""
+        """Return the climb rate demanded by mode and sticks; near the ground it is slower."""
         params, height = self._params, -body.position_ned_m[2]
         low, high = params["MPC_LAND_ALT2"], params["MPC_LAND_ALT1"]
         share = max(0.0, min(1.0, (height - low) / max(0.1, high - low)))
@@ -228,7 +228,7 @@ class Px4Control:
         return -(slow + share * (fast - slow))
 
     def _destination(self, mode: Mode, body: BodyState) -> NorthEast | None:
-        """Where an AUTO mode flies to; None: it stays where it comes to rest."""
+        """Return the target of an AUTO mode, north and east; None: stay at the resting position."""
         if mode is not Mode.AUTO_RTL or self._home_reached:
             return self._target_m
         north, east, down = body.position_ned_m
@@ -238,7 +238,7 @@ class Px4Control:
         return self._target_m
 
     def _return_height_m(self, body: BodyState) -> float:
-        """RTL_RETURN_ALT, or near home the height at which RTL began."""
+        """Return RTL_RETURN_ALT, or near home the height at which RTL began."""
         if self._returns_to_m is None:
             north, east, down = body.position_ned_m
             is_near = math.hypot(north, east) < self._params["RTL_MIN_DIST"]

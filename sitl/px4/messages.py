@@ -1,7 +1,7 @@
-"""Telemetry: from the autopilot's state to MAVLink messages and their units, as PX4 sends them.
+"""Telemetry: MAVLink messages from the autopilot's state, in the units that PX4 uses.
 
-EVENT(410) and CURRENT_MODE(436) are missing from pymavlink's ardupilotmega dialect and are packed
-here by their definitions in MAVLink's common and development sets.
+pymavlink's ardupilotmega dialect lacks EVENT(410) and CURRENT_MODE(436). They are packed here by
+their definitions in MAVLink's common and development sets.
 """
 
 import math
@@ -38,7 +38,7 @@ _CURRENT_MODE = struct.Struct("<IIB")
 EVENT_ARGUMENT_BYTES = 40
 
 HOME = Home(47.397743, 8.545594, 489.4, (0.215, 0.0118, 0.4307), 955.6, 25.0)
-"""PX4 SIH's default home."""
+"""Default home of PX4's SIH."""
 
 _FIRMWARE_VERSIONS: dict[Px4Release, int] = {
     "1.14": 0x010E04FF,
@@ -58,7 +58,7 @@ _ODOMETRY_COVARIANCE = [math.nan, *[0.0] * 20]
 
 
 class HandPacked(mav.MAVLink_message):  # type: ignore[misc]  # the library has no types
-    """A message that the dialect lacks: its number, payload and CRC seed."""
+    """Message that the dialect lacks, given by number, payload and CRC seed."""
 
     def __init__(self, number: int, name: str, payload: bytes, crc_extra: int) -> None:
         super().__init__(number, name)
@@ -83,7 +83,7 @@ def _current_mode(ap: Px4) -> Message:
 
 
 def _heartbeat(ap: Px4) -> Message:
-    """Once a second; what is between two of them, arming included, it never shows."""
+    """Build HEARTBEAT; once a second, so a short change, even an arming, may never show."""
     flags = ap.mode.base_flags
     if ap.mode is Mode.OFFBOARD and isinstance(ap.setpoint, PositionSetpoint):
         flags |= mav.MAV_MODE_FLAG_STABILIZE_ENABLED
@@ -103,7 +103,7 @@ def _heartbeat(ap: Px4) -> Message:
 
 
 def _sys_status(ap: Px4) -> Message:
-    """PREARM_CHECK, never present, is healthy where arming would not be refused for health."""
+    """Build SYS_STATUS; PREARM_CHECK, never present, is healthy if health allows arming."""
     sticks = mav.MAV_SYS_STATUS_SENSOR_RC_RECEIVER if ap.stick_input.valid else 0
     healthy = _SENSORS_HEALTHY | sticks
     if ap.armed or ap.commander.can_arm():
@@ -125,7 +125,7 @@ def _highres_imu(ap: Px4) -> Message:
 
 
 def _local_position_ned(ap: Px4) -> Message:
-    """Without a position it still comes: zeros that nothing marks as such."""
+    """Build LOCAL_POSITION_NED; without a position, zeros that nothing marks as invalid."""
     (north, east, down), (vn, ve, vd) = ap.sensed.position_ned_m, ap.sensed.velocity_ned_mps
     if not ap.position_ready:
         north = east = vn = ve = 0.0
@@ -152,7 +152,7 @@ def _odometry(ap: Px4) -> Message:
 
 
 def _rc_channels(ap: Px4) -> Message | None:
-    """A receiver's channels; MANUAL_CONTROL never shows here."""
+    """Build RC_CHANNELS from a receiver's channels; MANUAL_CONTROL never shows here."""
     if ap.receiver_us is None:
         return None
     channels = (*ap.receiver_us, *[65535] * 18)[:18]
@@ -160,7 +160,7 @@ def _rc_channels(ap: Px4) -> Message | None:
 
 
 def _manual_control(ap: Px4) -> Message | None:
-    """The chosen sticks, as single-precision shares of full stick and cut to whole numbers."""
+    """Build MANUAL_CONTROL: the chosen sticks, scaled in single precision and truncated."""
     if not ap.stick_input.valid:
         return None
     forward, right, throttle, yaw = (np.float32(value) for value in ap.stick_input.sticks)
@@ -176,7 +176,7 @@ def _vfr_hud(ap: Px4) -> Message:
 
 
 def _attitude_target(ap: Px4) -> Message:
-    """Setpoints of the rate and attitude loops, in any mode."""
+    """Build ATTITUDE_TARGET: setpoints of the rate and attitude loops, in any mode."""
     flight = ap.flight
     return mav.MAVLink_attitude_target_message(
         boot_ms(ap), 0, list(flight.attitude), *flight.rates_radps, flight.thrust
@@ -192,7 +192,7 @@ def _position_target(ap: Px4) -> Message:
 
 
 def _estimator_status(ap: Px4) -> Message:
-    """The one message that says whether there is a horizontal position."""
+    """Build ESTIMATOR_STATUS, the only message with the validity of the horizontal position."""
     flags = _ESTIMATOR_ON_GROUND if ap.landed else _ESTIMATOR_WITH_POSITION
     if not ap.position_ready:
         flags = _ESTIMATOR_WITHOUT_POSITION
@@ -229,7 +229,7 @@ BUILDERS: dict[int, Callable[[Px4], Message | None]] = {
     mav.MAVLINK_MSG_ID_ATTITUDE_TARGET: _attitude_target,
     mav.MAVLINK_MSG_ID_POSITION_TARGET_LOCAL_NED: _position_target,
     mav.MAVLINK_MSG_ID_HIGHRES_IMU: _highres_imu,
-    # The vehicle's own request; the peer's answer needs no action.
+    # The vehicle's request; the peer's answer needs no action.
     mav.MAVLINK_MSG_ID_TIMESYNC: lambda ap: mav.MAVLink_timesync_message(0, ap.uptime_ns),
     mav.MAVLINK_MSG_ID_BATTERY_STATUS: lambda ap: battery_status(ap, energy_hj=-1),
     mav.MAVLINK_MSG_ID_AUTOPILOT_VERSION: _autopilot_version,
@@ -238,9 +238,9 @@ BUILDERS: dict[int, Callable[[Px4], Message | None]] = {
     mav.MAVLINK_MSG_ID_ODOMETRY: _odometry,
     CURRENT_MODE: _current_mode,
 }
-"""Every message that can be streamed or requested; None where there is nothing to report yet."""
+"""Builders of all messages to stream or request; they return None with nothing to report."""
 BUILDERS_1_14 = {key: build for key, build in BUILDERS.items() if key != CURRENT_MODE}
-"""CURRENT_MODE came with 1.15 (upstream commit bb900264e0)."""
+"""Builders without CURRENT_MODE, which came with 1.15 (upstream commit bb900264e0)."""
 
 _SLOW_TOPICS = (
     mav.MAVLINK_MSG_ID_LOCAL_POSITION_NED,
@@ -251,7 +251,7 @@ _SLOW_TOPICS = (
 
 
 def topic_version(message_id: int, ap: Px4) -> Hashable:
-    """Changes whenever there is something new to send: it bounds the rate of a stream."""
+    """Return a value that changes with each new sample of the topic; it bounds a stream's rate."""
     if message_id in _SLOW_TOPICS:
         return _at_rate(ap, 8)
     if message_id == mav.MAVLINK_MSG_ID_ATTITUDE_TARGET:
@@ -267,5 +267,5 @@ def topic_version(message_id: int, ap: Px4) -> Hashable:
 
 
 def _at_rate(ap: Px4, period_ms: int) -> int:
-    """Version of a topic that is published this often."""
+    """Return the version of a topic that is published with this period."""
     return ap.uptime_ns // (period_ms * NS_PER_MS)

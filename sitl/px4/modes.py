@@ -1,4 +1,4 @@
-"""PX4's flight modes, and those that a failsafe changes to."""
+"""PX4's flight modes, and the modes that a failsafe selects."""
 
 from enum import Enum
 
@@ -8,12 +8,15 @@ from sitl.clock import NS_PER_S
 from sitl.px4.params import Px4Params
 
 MAIN_AUTO = 4
-_SUB_ANY = (1, 2)  # POSCTL's orbit and slow flight; both are flown as POSCTL here
+_SUB_ANY = (1, 2)  # POSCTL's orbit and slow flight, flown here as POSCTL
 
 
 class Mode(Enum):
-    """Flight mode: main and sub mode of HEARTBEAT.custom_mode, its name in status texts, its number
-    as the argument of an event, and its MAV_STANDARD_MODE."""
+    """Flight mode.
+
+    Values: main and sub mode of HEARTBEAT.custom_mode, name in status texts, number as the argument
+    of an event, and MAV_STANDARD_MODE.
+    """
 
     MANUAL = (1, 0, "Manual", 0, 0)
     ALTCTL = (2, 0, "Altitude", 1, 4)
@@ -34,7 +37,7 @@ class Mode(Enum):
         self.custom_mode = main << 16 | sub << 24
         self.is_auto = main == MAIN_AUTO
         self.manual_throttle = main in (1, 5, 7)  # the stick is thrust: down for arming
-        self.piloted = main in (1, 2, 3, 5, 7)  # the sticks fly it: refused without them
+        self.piloted = main in (1, 2, 3, 5, 7)  # flown by sticks: refused without them
         self.needs_position = main == 3 or (self.is_auto and sub != 6)
         self.armable = main != 10 and (main, sub) not in ((4, 4), (4, 5), (4, 6))
         flags = mav.MAV_MODE_FLAG_CUSTOM_MODE_ENABLED
@@ -45,7 +48,7 @@ class Mode(Enum):
         if (self.piloted and main != 5) or self.is_auto:
             flags |= mav.MAV_MODE_FLAG_STABILIZE_ENABLED
         self.base_flags = int(flags)
-        """MAV_MODE_FLAG of the heartbeat, without the armed bit; OFFBOARD's is the plain one."""
+        """MAV_MODE_FLAG bits of the heartbeat, without the armed and OFFBOARD's setpoint bit."""
 
     @property
     def label(self) -> str:
@@ -53,7 +56,7 @@ class Mode(Enum):
 
 
 def mode_of(main: int, sub: int) -> Mode | None:
-    """The mode of these numbers, or None; AUTO without a sub mode is a mission."""
+    """Return the mode with these numbers, or None; AUTO without a sub mode is a mission."""
     if (main, sub) == (MAIN_AUTO, 0):
         return Mode.AUTO_MISSION
     if main == Mode.POSCTL.main and sub in _SUB_ANY:
@@ -76,7 +79,7 @@ _EXCEPT_MISSION, _EXCEPT_AUTO, _EXCEPT_OFFBOARD = 1, 2, 4
 
 
 class Phase(Enum):
-    """Where a failsafe of lost sticks stands."""
+    """Phase of the failsafe for lost sticks."""
 
     NONE = 0
     HOLDING = 1
@@ -84,11 +87,10 @@ class Phase(Enum):
 
 
 class LostSticks:
-    """The latched failsafe of lost sticks: a Hold of COM_FAIL_ACT_T, then the act of NAV_RCL_ACT,
-    whatever the sticks do meanwhile.
+    """Latched failsafe for lost sticks: Hold for COM_FAIL_ACT_T, then the action of NAV_RCL_ACT.
 
-    The delay is a budget that shrinks in such a Hold, and comes back at a quarter of that speed, or
-    at once when any parameter changes.
+    It continues even if the sticks come back. The delay is a budget: a Hold consumes it, and it
+    recovers at a quarter of that speed, or at once when any parameter changes.
     """
 
     def __init__(self, params: Px4Params) -> None:
@@ -103,7 +105,7 @@ class LostSticks:
 
     @property
     def delay_s(self) -> float:
-        """How long the next Hold would be, or how much is left of this one."""
+        """Duration of the next Hold, or the rest of the present one."""
         return max(0.0, self._params["COM_FAIL_ACT_T"] - self._spent_s)
 
     def is_excepted(self, mode: Mode) -> bool:
@@ -120,11 +122,11 @@ class LostSticks:
         self.phase = Phase.HOLDING if self.delay_s > 0.0 else Phase.ACTING
 
     def clear(self) -> None:
-        """A command, or the pilot, has ended it; the budget is what it is."""
+        """End the failsafe by a command or the pilot; the budget stays."""
         self.phase = Phase.NONE
 
     def update(self, dt_ns: int) -> bool:
-        """Count the time; True when the Hold is over and the action begins."""
+        """Advance the time. Return True when the Hold ends and the action begins."""
         if self._params.changes != self._param_changes:
             self._param_changes, self._spent_s = self._params.changes, 0.0
         if self.phase is not Phase.HOLDING:
@@ -143,6 +145,6 @@ class LostSticks:
 
 
 def mode_without_stream(params: Px4Params, *, has_sticks: bool) -> Mode:
-    """The mode that takes over from OFFBOARD without setpoints; RTL where it needs sticks."""
+    """Return the mode that replaces OFFBOARD without setpoints; RTL if that one lacks sticks."""
     mode = _STREAM_LOST_MODES.get(params.integer("COM_OBL_RC_ACT"), Mode.AUTO_RTL)
     return Mode.AUTO_RTL if mode.piloted and not has_sticks else mode

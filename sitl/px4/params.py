@@ -1,4 +1,4 @@
-"""Parameters that the simulated firmware reads or a bridge asks for, with PX4's SIH defaults.
+"""Parameters that the simulated firmware reads or a bridge requests, with PX4's SIH defaults.
 
 PX4 stores INT32 and float.
 """
@@ -13,9 +13,9 @@ from sitl.vehicle.config import Px4Release
 DEAD_ZONE = "MAN_DEADZONE"
 _INTEGERS: Mapping[str, int] = MappingProxyType(
     {
-        "COM_RC_OVERRIDE": 1,  # bit 0: sticks take AUTO modes over, bit 1: OFFBOARD
+        "COM_RC_OVERRIDE": 1,  # bit 0: sticks take over in AUTO modes, bit 1: in OFFBOARD
         "COM_OBL_RC_ACT": 0,  # 0 position, 1 altitude, 2 stabilized, 3 RTL, 4 land, 5 hold
-        "COM_RCL_EXCEPT": 0,  # bit 0 mission, 1 hold, 2 offboard: no failsafe when sticks are lost
+        "COM_RCL_EXCEPT": 0,  # bit 0 mission, 1 hold, 2 offboard: lost sticks are no failsafe
         "COM_RC_IN_MODE": 1,  # source of sticks: see `sitl.px4.sticks`
         "NAV_DLL_ACT": 0,  # a lost ground station does nothing
         "NAV_RCL_ACT": 2,  # lost sticks: 1 hold, 2 RTL, 3 land, 5 terminate, 6 disarm
@@ -33,10 +33,10 @@ _FLOATS: Mapping[str, float] = MappingProxyType(
         "COM_FAIL_ACT_T": 5.0,  # s
         "COM_OF_LOSS_T": 1.0,  # s
         "COM_RC_LOSS_T": 0.5,  # s
-        "COM_RC_STICK_OV": 30.0,  # % of the stick a second
+        "COM_RC_STICK_OV": 30.0,  # % of stick travel per second
         "COM_SPOOLUP_TIME": 1.0,  # s
-        DEAD_ZONE: 0.1,  # of the stick, on each side of the middle
-        "MAN_OVERRIDE_SPD": 1.0,  # full sticks a second; -1: off
+        DEAD_ZONE: 0.1,  # of the stick, to each side of the middle
+        "MAN_OVERRIDE_SPD": 1.0,  # full sticks per second; -1: off
         "MC_ACRO_P_MAX": 100.0,  # deg/s
         "MC_MAN_TILT_TAU": 0.0,  # s
         "MC_PITCHRATE_MAX": 220.0,  # deg/s
@@ -44,8 +44,8 @@ _FLOATS: Mapping[str, float] = MappingProxyType(
         "MIS_TAKEOFF_ALT": 2.5,  # m
         "MPC_ACC_DOWN_MAX": 3.0,  # m/s^2
         "MPC_JERK_AUTO": 4.0,  # m/s^3
-        "MPC_LAND_ALT1": 10.0,  # m: from here on descend more slowly
-        "MPC_LAND_ALT2": 5.0,  # m: from here on with MPC_LAND_SPEED
+        "MPC_LAND_ALT1": 10.0,  # m: slower descent below
+        "MPC_LAND_ALT2": 5.0,  # m: descent at MPC_LAND_SPEED below
         "MPC_LAND_SPEED": 0.7,  # m/s
         "MPC_MAN_TILT_MAX": 35.0,  # deg
         "MPC_MAN_Y_MAX": 150.0,  # deg/s
@@ -70,7 +70,7 @@ _FLOATS: Mapping[str, float] = MappingProxyType(
 _OLD_NAMES: Mapping[str, float] = MappingProxyType(
     {"MPC_HOLD_DZ": 0.1, "MPC_YAW_EXPO": 0.6, "MPC_Z_MAN_EXPO": 0.6}
 )
-"""Releases before 1.17 have these in place of DEAD_ZONE (upstream commit 2bf9fce577)."""
+"""Parameters of releases before 1.17 in place of DEAD_ZONE (upstream commit 2bf9fce577)."""
 _OLD_OVERRIDE, _NEW_OVERRIDE = ("COM_RC_OVERRIDE", "COM_RC_STICK_OV"), ("MAN_OVERRIDE_SPD",)
 _ABSENT: Mapping[Px4Release, tuple[str, ...]] = MappingProxyType(
     {
@@ -85,7 +85,7 @@ DEFAULT_RATE_P = float32(_FLOATS["MC_ROLLRATE_P"])
 
 
 def _varied(conditions: Conditions) -> dict[str, float]:
-    """Settings that vary: the defaults, scaled by the same factors as ArduPilot's."""
+    """Return the varying settings: PX4's defaults, scaled by the same factors as ArduPilot's."""
     lean = conditions.angle_max_cdeg / NOMINAL.angle_max_cdeg
     yaw_rate = conditions.pilot_yaw_rate_degps / NOMINAL.pilot_yaw_rate_degps
     climb = conditions.pilot_speed_up_cmps / NOMINAL.pilot_speed_up_cmps
@@ -125,7 +125,7 @@ class Px4Params(Params):
         receiver: bool = False,
         release: Px4Release = "1.18",
     ) -> None:
-        """With ``receiver`` its first four channels are mapped, in the order that is usual."""
+        """Set the release's defaults. ``receiver``: map four channels in the usual order."""
         values: dict[str, float] = {**_INTEGERS, **_FLOATS, **_varied(conditions)}
         for name in _ABSENT[release]:
             del values[name]

@@ -1,7 +1,7 @@
-"""Receives MAVLink on all links of a PX4 vehicle, and forwards between them.
+"""Message handling of the simulated PX4, without I/O, and forwarding between its links.
 
-Nobody is filtered: sticks, setpoints and commands of any system are taken if they are addressed to
-the vehicle or to everybody.
+Senders are not filtered: sticks, setpoints and commands of any system are accepted if they are
+addressed to the vehicle or broadcast.
 """
 
 import math
@@ -40,7 +40,7 @@ _IGNORE_YAW, _IGNORE_YAW_SPEED = 1 << 10, 1 << 11
 
 
 class Px4Server(MavlinkServer[Px4, Px4Endpoint]):
-    """PX4's messages and commands; it denies a reboot in simulation."""
+    """PX4's messages and commands; in simulation PX4 denies a reboot."""
 
     bad_interval = FAILED
 
@@ -68,7 +68,7 @@ class Px4Server(MavlinkServer[Px4, Px4Endpoint]):
         }
 
     def _announce(self) -> None:
-        """Events go out before the texts."""
+        """Send events before the texts."""
         events = self._ap.commander.events
         for event in events:
             for link in self.links:
@@ -82,10 +82,10 @@ class Px4Server(MavlinkServer[Px4, Px4Endpoint]):
         return system in (0, self._ap.system_id) and is_ours
 
     def _pass_on(self, link: Px4Endpoint, message: Message) -> None:
-        """Forward a frame to the other links, as it is.
+        """Forward a frame unchanged to the other links.
 
-        What is addressed to everybody goes everywhere; MANUAL_CONTROL counts as such, since its
-        target is no ordinary target field. The rest goes where its addressee was heard.
+        Broadcasts go to all links; MANUAL_CONTROL counts as a broadcast, since its target is no
+        ordinary target field. Other messages go to the links where their addressee was heard.
         """
         link.heard.add(sender_of(message))
         system = getattr(message, "target_system", 0)
@@ -115,7 +115,7 @@ class Px4Server(MavlinkServer[Px4, Px4Endpoint]):
         self._ap.stick_input.on_sticks(self.links.index(link), sticks, arrived_ns)
 
     def _override(self, _link: Px4Endpoint, message: Message, arrived_ns: int) -> None:
-        """No override: the values become those of a receiver."""
+        """Treat the values as those of a receiver; PX4 has no override."""
         self._log.overrides.add(arrived_ns)
         values = [getattr(message, f"chan{n}_raw") for n in range(1, MAX_RC_FIELDS + 1)]
         self._ap.set_receiver([0 if value == _RC_IGNORE else value for value in values])
@@ -167,7 +167,7 @@ class Px4Server(MavlinkServer[Px4, Px4Endpoint]):
             self._log.setpoints.add(arrived_ns)
 
     def _set_mode(self, link: Px4Endpoint, message: Message, _arrived_ns: int) -> None:
-        """The old message: acknowledged as the command that replaced it."""
+        """Change the mode by SET_MODE, acknowledged as DO_SET_MODE, which replaced it."""
         main, sub = message.custom_mode >> 16 & 0xFF, message.custom_mode >> 24 & 0xFF
         result = self._change_mode(message, message.base_mode, main, sub)
         send_ack(link, message, mav.MAV_CMD_DO_SET_MODE, result)
@@ -178,7 +178,7 @@ class Px4Server(MavlinkServer[Px4, Px4Endpoint]):
         return super()._execute(message, params, link)
 
     def _change_mode(self, message: Message, base_mode: float, main: float, sub: float) -> int:
-        """Change to a custom mode; a refusal becomes a text only for ground stations."""
+        """Change to a custom mode; send the refusal as a text to ground stations only."""
         if not all(map(math.isfinite, (base_mode, main, sub))):
             return REJECTED
         mode = mode_of(int(main), int(sub))
@@ -200,7 +200,7 @@ class Px4Server(MavlinkServer[Px4, Px4Endpoint]):
         return ACCEPTED if done else REJECTED
 
     def _takeoff(self, params: Params7, _link: Px4Endpoint) -> int:
-        """Param 7 is an altitude above sea level; NaN: MIS_TAKEOFF_ALT above here."""
+        """Take off to param 7, an altitude above sea level; NaN: climb by MIS_TAKEOFF_ALT."""
         height_m = params[6] - HOME.alt_m
         self._ap.prepare_takeoff(height_m if math.isfinite(height_m) else None)
         return ACCEPTED if self._ap.commander.set_mode(Mode.AUTO_TAKEOFF) else REJECTED
@@ -221,7 +221,7 @@ class Px4Server(MavlinkServer[Px4, Px4Endpoint]):
         return ACCEPTED
 
     def _reboot(self, params: Params7, _link: Px4Endpoint) -> int:
-        """Zero asks for nothing; a reboot is refused while armed, and always in SITL."""
+        """Accept 0, a no-op. PX4 refuses a reboot while armed, and always in SITL."""
         return ACCEPTED if math.isfinite(params[0]) and int(params[0]) == 0 else DENIED
 
 

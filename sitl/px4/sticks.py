@@ -1,10 +1,9 @@
-"""Chooses between the senders of sticks, notices their loss, reads gestures from them, and turns
-them into what the modes ask for.
+"""Stick input: choice between senders, loss, gestures, a pilot's takeover, and stick curves.
 
-MAVLink has no notion of an override here: each link, and the receiver, is a source, COM_RC_IN_MODE
-says which may win, and the last values of the winner hold until it is declared lost. Timers and
-limits are those measured on PX4 1.18, and the detectors of a pilot's hand those of
-``src/modules/manual_control`` there and in 1.14 to 1.17 (upstream commit cf50ecf41b).
+PX4 has no overrides: each link, and the receiver, is a source. COM_RC_IN_MODE selects which source
+may win, and the winner's last values hold until it is declared lost. Timers and limits are those
+measured on PX4 1.18. Detectors of a pilot's movement are those of ``src/modules/manual_control`` in
+1.18 and in 1.14 to 1.17 (upstream commit cf50ecf41b).
 """
 
 import math
@@ -17,23 +16,24 @@ from sitl.vehicle.dynamics import GRAVITY_MPS2
 
 RC_SOURCE = -1  # the receiver; links are numbered from 0
 POLL_NS = NS_PER_S // 5
-"""Sticks are looked at when they come, and this long after that, again and again."""
+"""Sticks are checked at each arrival and, without one, at this period."""
 GESTURE_NS = NS_PER_S
 GESTURE_LOW_THROTTLE, GESTURE_FULL_YAW, GESTURE_MOST_LEAN = -0.9, 0.9, 0.3
 FAST_SAMPLES = 3
-"""1.18: so many movements in a row the same way are a hand's (MIN_SIGN_CONSECUTIVE); samples at
-rest between them do not count, so that a stick which has come to rest keeps them."""
-OLD_TAU_S, TAU_S = 0.1, 0.05  # of the low-pass of a stick's speed, before 1.18 and there
+"""1.18: consecutive movements in one direction that count as a pilot's (MIN_SIGN_CONSECUTIVE).
+Samples at rest in between do not count, so a stick that has come to rest keeps its count."""
+OLD_TAU_S, TAU_S = 0.1, 0.05  # low-pass of a stick's speed, before 1.18 and in 1.18
 
 _ANY_SOURCE_MODES = (2, 3, 5, 6, 7, 8)
 _KEEP_FIRST = 3
 _PRIORITIES = {5: (RC_SOURCE, "low"), 6: (None, "low"), 7: (RC_SOURCE, "high"), 8: (None, "high")}
-"""COM_RC_IN_MODE: whether the receiver comes first (else last), and which link wins."""
+"""By COM_RC_IN_MODE: RC_SOURCE if the receiver precedes the links (None: it comes last), and the
+winning link, lowest or highest."""
 
 
 EXPO = 0.6
-"""Of climb, yaw and POSCTL's speed: 0.4 x + 0.6 x^3 behind a dead zone, as measured. Leans have no
-dead zone; in ALTCTL they go by the tangent, in STAB by the angle."""
+"""Expo of climb, yaw and POSCTL's speed: 0.4 x + 0.6 x^3 beyond a dead zone, as measured. Leans
+have no dead zone; they are linear in the tangent in ALTCTL, in the angle in STAB."""
 
 
 class Sticks(NamedTuple):
@@ -46,17 +46,17 @@ class Sticks(NamedTuple):
 
 
 def from_manual_control(x: int, y: int, z: int, r: int) -> Sticks:
-    """Sticks of a MANUAL_CONTROL; a field beyond its range counts as centred."""
+    """Convert a MANUAL_CONTROL; a field beyond its range counts as centred."""
     forward, right, yaw = (v / 1000.0 if -1000 <= v <= 1000 else 0.0 for v in (x, y, r))
     return Sticks(forward, right, z / 500.0 - 1.0 if 0 <= z <= 1000 else 0.0, yaw)
 
 
 class StickSpeed:
-    """Low-passed speed of one stick: ``MovingDiff`` with its ``AlphaFilter``."""
+    """Low-passed speed of one stick: PX4's ``MovingDiff`` with its ``AlphaFilter``."""
 
     def __init__(self) -> None:
         self.per_s = 0.0
-        self.moves_one_way = 0  # movements in a row in one direction
+        self.moves_one_way = 0  # consecutive movements in one direction
         self._last: float | None = None
         self._is_up = False
 
@@ -73,16 +73,16 @@ class StickSpeed:
 
 
 class StickInput:
-    """The sticks that PX4 acts on; stamps are nanoseconds of one clock."""
+    """Sticks that PX4 acts on. Stamps are nanoseconds of one clock."""
 
     def __init__(self, params: Px4Params) -> None:
         self._params = params
         self.sticks = Sticks()
-        self.valid = False  # the winner still sends
-        self.count = 0  # samples chosen so far: a reader sees by it that there is a new one
+        self.valid = False  # the winner is still sending
+        self.count = 0  # samples chosen so far; a change tells a reader of a new one
         self.sampled_ns = 0
         self.moved_fast = False
-        """A stick moves faster than COM_RC_STICK_OV, or MAN_OVERRIDE_SPD, allows."""
+        """A stick moves faster than COM_RC_STICK_OV or MAN_OVERRIDE_SPD."""
         self._source: int | None = None
         self._first_source: int | None = None
         self._never_ages = False
@@ -97,7 +97,7 @@ class StickInput:
         return self._source if self.valid else None
 
     def pretend_centred(self, now_ns: int) -> None:
-        """Take the sticks for valid and centred until the first real ones come."""
+        """Treat the sticks as valid and centred until the first real ones come."""
         self._choose(Sticks(), now_ns)
         self._never_ages = True
 
@@ -109,7 +109,7 @@ class StickInput:
             self._choose(sticks, now_ns)
 
     def update(self, now_ns: int) -> None:
-        """Look at sticks that do not come, and notice the loss of the winner."""
+        """Check sticks between arrivals, and detect the loss of the winner."""
         if self.valid and now_ns - self._looked_ns >= POLL_NS:
             self._look(now_ns)
         if self.valid and not self._never_ages and now_ns - self.sampled_ns >= self._lost_after_ns:
@@ -119,9 +119,9 @@ class StickInput:
             self._speeds = tuple(StickSpeed() for _ in Sticks())
 
     def gesture(self, now_ns: int) -> int:
-        """1: throttle down with full right yaw and no lean for a second, -1: full left; else 0.
+        """Return 1 for the arming gesture, -1 for the disarming one, else 0. Each is reported once.
 
-        Each is reported once.
+        Arming: throttle down with full right yaw and no lean for 1 s; disarming: full left yaw.
         """
         if not self._gesture or self._gesture_done or now_ns - self._gesture_since_ns < GESTURE_NS:
             return 0
@@ -153,7 +153,7 @@ class StickInput:
         return source if links == "low" else -source
 
     def _look(self, now_ns: int) -> None:
-        """Judge the movement since the last look, by the detector of the release."""
+        """Detect movement since the last check, by the detector of the release."""
         is_old = "COM_RC_STICK_OV" in self._params
         dt_s, self._looked_ns = (now_ns - self._looked_ns) / NS_PER_S, now_ns
         limit = self._params["COM_RC_STICK_OV" if is_old else "MAN_OVERRIDE_SPD"]
@@ -181,13 +181,13 @@ class StickInput:
 
 
 def curve(value: float, dead_zone: float, expo: float = EXPO) -> float:
-    """A stick in [-1, 1] behind dead zone and expo."""
+    """Apply dead zone and expo to a stick in [-1, 1]."""
     beyond = max(0.0, abs(value) - dead_zone) / (1.0 - dead_zone)
     return math.copysign((1.0 - expo) * beyond + expo * beyond**3, value)
 
 
 def climb_mps(sticks: Sticks, params: Px4Params) -> float:
-    """Climb rate of ALTCTL and POSCTL, + up."""
+    """Return the climb rate of ALTCTL and POSCTL, + up."""
     share = curve(sticks.throttle, params.dead_zone, params.get("MPC_Z_MAN_EXPO", EXPO))
     return share * params["MPC_Z_VEL_MAX_UP" if share > 0.0 else "MPC_Z_VEL_MAX_DN"]
 
@@ -198,14 +198,14 @@ def yaw_rate_radps(sticks: Sticks, params: Px4Params) -> float:
 
 
 def lean_accel_mps2(sticks: Sticks, params: Px4Params) -> tuple[float, float]:
-    """Forward and right acceleration of ALTCTL's lean; both sticks share MPC_MAN_TILT_MAX."""
+    """Return ALTCTL's acceleration forward and right; both sticks share MPC_MAN_TILT_MAX."""
     scale = GRAVITY_MPS2 * math.tan(math.radians(params["MPC_MAN_TILT_MAX"]))
     scale /= max(1.0, math.hypot(sticks.forward, sticks.right))
     return sticks.forward * scale, sticks.right * scale
 
 
 def lean_rad(sticks: Sticks, params: Px4Params) -> tuple[float, float]:
-    """Roll and pitch (+ nose up) of STAB; both sticks share MPC_MAN_TILT_MAX."""
+    """Return roll and pitch (+ nose up) of STAB; both sticks share MPC_MAN_TILT_MAX."""
     scale = math.radians(params["MPC_MAN_TILT_MAX"])
     scale /= max(1.0, math.hypot(sticks.forward, sticks.right))
     return sticks.right * scale, -sticks.forward * scale
@@ -220,7 +220,7 @@ def acro_rates_radps(sticks: Sticks, params: Px4Params) -> Vec3:
 
 
 def speed_mps(sticks: Sticks, params: Px4Params) -> tuple[float, float]:
-    """Forward and right speed that POSCTL ends up at; both sticks share MPC_VEL_MANUAL."""
+    """Return POSCTL's final forward and right speed; both sticks share MPC_VEL_MANUAL."""
     length = math.hypot(sticks.forward, sticks.right)
     if length == 0.0:
         return 0.0, 0.0
@@ -229,7 +229,7 @@ def speed_mps(sticks: Sticks, params: Px4Params) -> tuple[float, float]:
 
 
 def manual_thrust(sticks: Sticks, params: Px4Params, hover: float) -> float:
-    """Collective of STAB and ACRO: straight lines through hover thrust at mid-stick."""
+    """Return the collective of STAB and ACRO: two lines that meet at hover thrust, mid-stick."""
     if sticks.throttle < 0.0:
         least = params["MPC_MANTHR_MIN"]
         return least + (1.0 + sticks.throttle) * (hover - least)

@@ -1,1 +1,1 @@
-"""The simulated quadrotor without its firmware: physics, air, sensors."""
+"""Simulated quadrotor without its firmware: physics, air, sensors."""

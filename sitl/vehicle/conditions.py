@@ -1,7 +1,7 @@
-"""Everything that differs between flights: airframe, firmware settings, wind, noise, light, lens.
+"""Differences between flights: airframe, firmware settings, wind, noise, light, lens.
 
-The defaults are the nominal vehicle and view, to the bit. `random_conditions` draws others, so that
-a policy learns to fly a vehicle rather than this one (Tobin et al., "Domain Randomization", 2017).
+The defaults are exactly the nominal vehicle and view. `random_conditions` draws others, so that a
+policy generalises beyond this vehicle (Tobin et al., "Domain Randomization", 2017).
 """
 
 import colorsys
@@ -21,9 +21,9 @@ Rgb: TypeAlias = tuple[int, int, int]
 class Conditions:
     """Conditions of one flight; factors of 1 and offsets of 0 change nothing.
 
-    The fields from ``angle_max_cdeg`` to ``rate_gain_factor`` become firmware parameters, by name
-    and unit those of ArduPilot (`sitl.ardupilot.params`). PX4 scales its own by as much
-    (`sitl.px4.params`), and has no dead zones and expo that vary.
+    The fields from ``angle_max_cdeg`` to ``rate_gain_factor`` become firmware parameters, with
+    ArduPilot's names and units (`sitl.ardupilot.params`). PX4 scales its parameters by the same
+    factors (`sitl.px4.params`); its dead zones and expo do not vary.
     """
 
     seed: int = 0  # of gusts, sensor noise and image noise
@@ -31,7 +31,7 @@ class Conditions:
     mass_factor: float = 1.0  # scales mass and inertia
     thrust_factor: float = 1.0  # scales full thrust: battery, propellers, air
     drag_factor: float = 1.0  # scales rotor and body drag
-    min_rotor_drag_nspm: float = 0.0  # linear; an airframe that has more keeps its own
+    min_rotor_drag_nspm: float = 0.0  # linear; an airframe with more keeps its own
     motor_lag_factor: float = 1.0
     wind_ned_mps: Vec3 = (0.0, 0.0, 0.0)  # mean velocity of the air
     gust_rms_mps: float = 0.0  # per horizontal axis; the vertical gust is half as strong
@@ -41,21 +41,21 @@ class Conditions:
     pilot_yaw_rate_degps: float = 202.5
     pilot_yaw_expo: float = 0.0
     pilot_speed_up_cmps: float = 250.0
-    pilot_speed_down_cmps: float = 0.0  # 0: as up
+    pilot_speed_down_cmps: float = 0.0  # 0: equal to up
     pilot_accel_z_cmps2: float = 250.0
-    throttle_dead_zone_permille: float = 100.0  # of the stick, on each side of the middle
+    throttle_dead_zone_permille: float = 100.0  # of the stick, to each side of the middle
     rc_dead_zones_us: tuple[float, ...] = (20.0, 20.0, 30.0, 20.0)  # roll, pitch, throttle, yaw
     input_time_s: float = 0.15  # time constant of the target lean behind the stick
     angle_gains_per_s: Vec3 = (6.0, 6.0, 3.0)  # roll, pitch, yaw
     lean_rate_max_degps: float = 220.0  # 0: no limit
     lean_accel_max_cdegps2: float = 110_000.0  # 0: no limit
-    rate_gain_factor: float = 1.0  # of the loop from body rates to torque, roll and pitch
+    rate_gain_factor: float = 1.0  # gain from body rates to torque, roll and pitch
 
-    stream_slowdown_ms: int = 0  # added to every interval, as for a full radio buffer
+    stream_slowdown_ms: int = 0  # added to every interval, as with a full radio buffer
     stream_jitter_ms: float = 0.0  # largest random delay of a message
-    stream_phase_spread: float = 0.0  # largest share of its interval that a stream begins early
+    stream_phase_spread: float = 0.0  # largest early start of a stream, as a share of its interval
 
-    velocity_noise_mps: float = 0.0  # standard deviation per sample and axis, as the next two
+    velocity_noise_mps: float = 0.0  # noise values: standard deviation per sample and axis
     rate_noise_radps: float = 0.0
     specific_force_noise_mps2: float = 0.0
 
@@ -66,32 +66,32 @@ class Conditions:
     horizontal_fov_rad: float = math.radians(90.0)
 
     gate_rgb: tuple[Rgb, Rgb] = ((255, 126, 22), (222, 34, 48))  # even gates, odd gates
-    ground_tint: Vec3 = (1.0, 1.0, 1.0)  # factors on red, green and blue, as the next
-    sky_tint: Vec3 = (1.0, 1.0, 1.0)  # also tints haze and far ground
+    ground_tint: Vec3 = (1.0, 1.0, 1.0)  # factors on red, green and blue
+    sky_tint: Vec3 = (1.0, 1.0, 1.0)  # factors on red, green, blue; also tints haze and far ground
     ground_seed: int = 0  # seed of the pattern of grass and soil
     sun_ned: Vec3 = (-0.45, 0.35, -0.82)  # direction to the sun, unit length
     ambient: float = 0.78  # brightness of a surface turned away from the sun
 
-    hidden_gates: float = 0.0  # share of the gates with a panel before them, beside the way
-    shaded_gates: float = 0.0  # share of the gates that stand in shadow
-    stray_gates: float = 0.0  # share of the gates beside which another one stands, out of order
-    ground_contrast: float = 1.0  # factor on the pattern of the ground
+    hidden_gates: float = 0.0  # share of gates with a panel before them, beside the path
+    shaded_gates: float = 0.0  # share of gates in shadow
+    stray_gates: float = 0.0  # share of gates with a stray gate beside them
+    ground_contrast: float = 1.0  # factor on the ground's pattern
     glare: float = 0.0  # of the sun in the lens, as a share of white
 
-    exposure_time_s: float = 0.0  # of a row; a camera that turns meanwhile smears it
-    readout_time_s: float = 0.0  # from the first row to the last; 0: a global shutter
-    exposure: float = 1.0  # factor on all colours, before they saturate
+    exposure_time_s: float = 0.0  # per row; turning smears the image
+    readout_time_s: float = 0.0  # from first to last row; 0: a global shutter
+    exposure: float = 1.0  # factor on all colours before saturation
     white_balance: Vec3 = (1.0, 1.0, 1.0)
-    blur_px: float = 0.0  # standard deviation, in pixels of a 224 pixel wide image
+    blur_px: float = 0.0  # standard deviation, in pixels of an image 224 pixels wide
     image_noise: float = 0.0  # standard deviation per channel, in levels of 0..255
 
     @property
     def frame_time_s(self) -> float:
-        """From the first light of a frame to its last; its stamp is the middle."""
+        """Time from the first light of a frame to its last; the stamp is the middle."""
         return self.exposure_time_s + self.readout_time_s
 
     def numbers(self) -> dict[str, float]:
-        """Every number by name, for ``meta.json``; ``name_k`` is entry k of a vector."""
+        """Return all numbers by name, for ``meta.json``; ``name_k`` is entry k of a vector."""
         flat: dict[str, float] = {}
         for name, value in asdict(self).items():
             for index, number in np.ndenumerate(value):
@@ -103,7 +103,7 @@ NOMINAL = Conditions()
 
 
 def random_conditions(seed: int, strength: float = 1.0) -> Conditions:
-    """Draw the conditions of this seed: the same on every machine.
+    """Draw the conditions of this seed; they are the same on every machine.
 
     A ``strength`` of 0 gives the nominal conditions with this seed, 1 the usual spread.
 
@@ -123,10 +123,10 @@ def random_conditions(seed: int, strength: float = 1.0) -> Conditions:
 
 
 def held_out_conditions(seed: int) -> Conditions:
-    """Vehicle, wind and lens of ``random_conditions``, and a look that no demonstration has.
+    """Return vehicle, wind and lens of ``random_conditions`` with a look that no demonstration has.
 
-    One seed in five each: gates partly hidden by panels; gates in shadow over ground of high
-    contrast; night, with gates that shine; a low sun in the lens; other gates beside the way.
+    One seed in five each: gates partly hidden by panels; gates in shadow over high-contrast ground;
+    night with shining gates; a low sun in the lens; stray gates beside the path.
 
     Raises:
         UsageError: a negative seed.
@@ -156,14 +156,14 @@ class _Draw:
         return self.strength * float(self.random.uniform(-half, half))
 
     def factor(self, most: float) -> float:
-        """Within 1 / most .. most, as likely above 1 as below."""
+        """Return a factor within 1 / most .. most, as likely above 1 as below."""
         return math.exp(self.offset(math.log(most)))
 
     def amount(self, most: float) -> float:
         return self.strength * float(self.random.uniform(0.0, most))
 
     def tint(self, most: float) -> Vec3:
-        """A factor for each of red, green and blue."""
+        """Return one factor each for red, green and blue."""
         return (self.factor(most), self.factor(most), self.factor(most))
 
     def light(self, most_tint: float, most_brightness: float) -> Vec3:
@@ -172,11 +172,11 @@ class _Draw:
         return (brightness * red, brightness * green, brightness * blue)
 
     def angle_rad(self) -> float:
-        """Any direction; the strength does not matter."""
+        """Return any direction, independent of the strength."""
         return float(self.random.uniform(-math.pi, math.pi))
 
     def shade(self, rgb: Rgb) -> Rgb:
-        """A similar colour: hue within 20 degrees, paler or darker."""
+        """Return a similar colour: hue within 20 degrees, paler or darker."""
         hue, saturation, value = colorsys.rgb_to_hsv(*(part / 255 for part in rgb))
         red, green, blue = colorsys.hsv_to_rgb(
             (hue + self.offset(20.0) / 360.0) % 1.0,
@@ -245,7 +245,7 @@ def _vary_scene(nominal: Conditions, draw: _Draw) -> Conditions:
 
 
 def _vary_firmware(nominal: Conditions, draw: _Draw) -> Conditions:
-    """Whole numbers where the firmware stores integers, three decimals where it stores floats."""
+    """Draw firmware settings: whole numbers for integer parameters, three decimals for floats."""
     lean_gain_factor = draw.factor(1.35)
     roll_gain, pitch_gain, yaw_gain = nominal.angle_gains_per_s
     return replace(
@@ -257,7 +257,7 @@ def _vary_firmware(nominal: Conditions, draw: _Draw) -> Conditions:
         pilot_speed_down_cmps=round(nominal.pilot_speed_up_cmps * draw.factor(1.4)),
         pilot_accel_z_cmps2=round(nominal.pilot_accel_z_cmps2 * draw.factor(1.4)),
         throttle_dead_zone_permille=round(nominal.throttle_dead_zone_permille * draw.factor(1.4)),
-        # 0..30 us covers what is usual for RCn_DZ.
+        # 0..30 us covers common values of RCn_DZ.
         rc_dead_zones_us=tuple(float(round(draw.amount(30.0))) for _ in nominal.rc_dead_zones_us),
         input_time_s=round(nominal.input_time_s * draw.factor(1.6), 3),
         angle_gains_per_s=(
@@ -271,7 +271,7 @@ def _vary_firmware(nominal: Conditions, draw: _Draw) -> Conditions:
 
 
 def _vary_streams(nominal: Conditions, draw: _Draw) -> Conditions:
-    """Half of the links are fast enough to send every message at the requested rate."""
+    """Draw stream timing; half of the links send every message at the requested rate."""
     is_slow = draw.random.random() < 0.5
     slowdown_ms = round(draw.amount(23.0))
     return replace(
@@ -283,8 +283,8 @@ def _vary_streams(nominal: Conditions, draw: _Draw) -> Conditions:
 
 
 def _vary_airframe_and_shutter(nominal: Conditions, draw: _Draw) -> Conditions:
-    """Drag from a racing frame's to that of PX4's SIH, 1 N per m/s; half of them have little.
-    Exposure and read-out up to those of the rolling shutter of a usual 30 Hz camera."""
+    """Draw drag from a racing frame's to that of PX4's SIH, 1 N per m/s; half of the frames keep
+    the lower drag. Exposure and read-out reach those of a common 30 Hz rolling shutter camera."""
     is_heavy = draw.random.random() < 0.5
     heavy_nspm = 0.15 * math.exp(draw.amount(math.log(1.0 / 0.15)))
     return replace(
@@ -306,7 +306,7 @@ _VARIATIONS = (
     _vary_streams,
     _vary_airframe_and_shutter,
 )
-"""In the order in which they draw, which is part of the seed's meaning."""
+"""Order of the draws, which is part of the seed's meaning."""
 
 
 def _make_night(usual: Conditions, draw: _Draw) -> Conditions:
@@ -321,7 +321,7 @@ def _make_night(usual: Conditions, draw: _Draw) -> Conditions:
 
 
 def _make_glare(usual: Conditions, draw: _Draw) -> Conditions:
-    """The sun stands ahead on the first leg, to 60 degrees to either side."""
+    """Put the sun ahead on the first leg, up to 60 degrees to either side."""
     azimuth_rad, elevation_rad = draw.offset(math.pi / 3), math.radians(4.0 + draw.amount(14.0))
     return replace(
         usual, glare=0.5 + draw.amount(0.5), sun_ned=_direction_ned(azimuth_rad, elevation_rad)

@@ -5,25 +5,25 @@ from typing import Literal, NamedTuple, TypeAlias
 
 from sitl.vehicle.conditions import NOMINAL, Conditions
 
-STEP_NS = 2_500_000  # grid on which a vehicle is served: receive, advance to now, send
+STEP_NS = 2_500_000  # grid of receiving, advancing and sending
 
 IDLE_RECEIVER_US = (1500, 1500, 1000, 1500, 1500, 1500, 1500, 1500)
-"""An untouched transmitter: throttle down, the rest centred."""
+"""Untouched transmitter: throttle down, the rest centred."""
 MID_RECEIVER_US = (1500,) * 8
-"""Every stick centred, the throttle too: what a pilot holds who stands by."""
+"""Every stick centred, throttle included: the sticks of a pilot on standby."""
 
 AutopilotName: TypeAlias = Literal["ardupilot", "px4"]
 
 ArduPilotRelease: TypeAlias = Literal["4.6", "4.7-dev", "4.7"]
-"""Whose names and units of parameters an ArduPilot has; 4.5 has those of 4.6. The measured one, in
-development between the two, has the new names of the system ids and the old ones of the rest."""
+"""ArduPilot release for names and units of parameters; 4.5 has those of 4.6. The measured firmware,
+4.7-dev, has the new names of the system ids and the old names of the rest."""
 
 Px4Release: TypeAlias = Literal["1.14", "1.15", "1.16", "1.17", "1.18"]
-"""Whose parameters, stick override and messages a PX4 has; 1.18 is the one that was measured."""
+"""PX4 release for parameters, stick override and messages; 1.18 was measured."""
 
 
 class Battery(NamedTuple):
-    """The vehicle's word about its battery; it never empties by itself."""
+    """Reported state of the battery; it never empties by itself."""
 
     voltage_v: float = 12.6
     current_a: float = 0.0
@@ -41,28 +41,27 @@ class SigningKey(NamedTuple):
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class VehicleConfig:
-    """Differences between one simulated vehicle and another."""
+    """Configuration of one simulated vehicle."""
 
     autopilot: AutopilotName = "ardupilot"
     ardupilot_release: ArduPilotRelease = "4.7-dev"
     px4_release: Px4Release = "1.18"
     receiver: bool = True
-    """An RC receiver is there. Without one ArduCopter's sticks latch and its radio fails; PX4 looks
-    at it only if COM_RC_IN_MODE tells it to."""
+    """True: an RC receiver is present. Without one, ArduCopter's sticks latch and its radio fails;
+    PX4 uses it only if COM_RC_IN_MODE says so."""
     receiver_us: tuple[int, ...] = IDLE_RECEIVER_US
-    """The receiver's channels at boot, in microseconds."""
+    """Receiver channels at boot [us]."""
     vehicle_type: int = 2
-    """HEARTBEAT.type, a MAV_TYPE: 2 is a quadrotor; the vehicle flies as one with any value."""
+    """HEARTBEAT.type, a MAV_TYPE: 2 is a quadrotor. The vehicle flies as one with any value."""
     estimator_ready_s: float = 3.0
-    """From boot until arming is possible (about 23 s on the real firmware)."""
+    """Time from boot until arming is possible (about 23 s on the real firmware)."""
     position_ready_s: float = 5.0
-    """From boot until the estimator has a position (about 40 s on the real firmware)."""
+    """Time from boot until the estimator has a position (about 40 s on the real firmware)."""
     onboard_links: frozenset[int] = frozenset()
-    """Indices of the links to companion computers, which PX4 gives other streams than a ground
-    station's."""
+    """Indices of the links to companion computers, which get other streams from PX4."""
     link_bytes_ps: float = 4_000_000.0
-    """Bandwidth that PX4 believes each link to have; too little slows its streams silently."""
+    """Bandwidth that PX4 assumes for each link; too little slows its streams silently."""
     signing: SigningKey | None = None
-    """Sign everything, and refuse what is not signed with this key."""
+    """Sign all messages, and refuse those not signed with this key."""
     conditions: Conditions = NOMINAL
-    """Airframe, air and sensors; `sitl.camera.fpv.FpvRenderer` takes those of the camera."""
+    """Airframe, air and sensors; `sitl.camera.fpv.FpvRenderer` uses those of the camera."""

@@ -1,5 +1,5 @@
-"""A quadrotor as a MuJoCo free body: motors with lag, rotor drag, air drag, a ground to hit; the
-wind around it, and the noise of its sensors.
+"""Quadrotor physics: a MuJoCo free body with motor lag, drag and ground contact, wind, sensor
+noise, and the controllers common to both firmwares.
 
 MuJoCo works in north-west-up with a forward-left-up body; everything outside this module is NED and
 FRD. Both differ by a half turn about x, so vectors and the vector part of quaternions flip y and z:
@@ -24,7 +24,7 @@ MOTOR_ARM_M = 0.12  # motors sit at (+-arm, +-arm): a 0.34 m diagonal wheelbase
 YAW_TORQUE_PER_THRUST_M = 0.016
 REST_HEIGHT_M = 0.06
 VERTICAL_GUST_SHARE = 0.5
-"""Vertical over horizontal gust strength: near the ground the air moves along it."""
+"""Vertical over horizontal gust strength; near the ground, air moves along the ground."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -33,14 +33,14 @@ class Airframe:
 
     mass_kg: float = 1.2
     max_motor_thrust_n: float = 7.54
-    """Hover at 0.39 of full thrust, which is ArduCopter's learned-hover order of magnitude."""
+    """Thrust for hover at 0.39 of full, ArduCopter's order of magnitude for a learned hover."""
     motor_lag_s: float = 0.028
     rotor_drag_nspm: float = 0.15
-    """Linear drag of spinning rotors, about 0.1 1/s of mass at this size; body drag is MuJoCo's own
+    """Linear drag of spinning rotors, about 0.1 1/s of mass at this size. Body drag is MuJoCo's
     quadratic model on the equivalent inertia box."""
-    air_density_kgpm3: float = 1.225  # 0 leaves the rotors' drag alone
+    air_density_kgpm3: float = 1.225  # 0: rotor drag only
     step_ns: int = 1_250_000
-    """Step of the physics; a firmware's control period is a whole number of them."""
+    """Physics step; a firmware's control period is a whole number of them."""
 
 
 QUAD = Airframe()
@@ -50,7 +50,7 @@ _FULL_STATE = int(mujoco.mjtState.mjSTATE_INTEGRATION)
 
 
 def _model_xml(airframe: Airframe, conditions: Conditions) -> str:
-    """MuJoCo model to compile, which derives hidden values from the masses.
+    """Return the XML of the MuJoCo model; compiling it derives hidden values from the masses.
 
     Motor order and directions are ArduCopter's quad X: front right and rear left turn anticlockwise
     seen from above, so they push the nose to the right.
@@ -103,9 +103,9 @@ class BodyState(NamedTuple):
     ned_from_body_wxyz: Quat
     velocity_ned_mps: Vec3
     rate_body_radps: Vec3
-    specific_force_body_mps2: Vec3  # what an accelerometer reads: (0, 0, -9.8) at rest
+    specific_force_body_mps2: Vec3  # accelerometer reading: (0, 0, -9.8) at rest
     motors: tuple[float, ...]  # thrust over full thrust, in ArduCopter's quad X order
-    touching: bool  # some part of the frame is on the ground
+    touching: bool  # a part of the frame is on the ground
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -122,7 +122,7 @@ def _flip(v: Sequence[float]) -> Vec3:
 
 
 class Quadrotor:
-    """The physical model, without state: MuJoCo's data is only scratch space."""
+    """Stateless physical model; MuJoCo's data is only scratch space."""
 
     def __init__(self, conditions: Conditions = NOMINAL, airframe: Airframe = QUAD) -> None:
         self._model = mujoco.MjModel.from_xml_string(_model_xml(airframe, conditions))
@@ -135,7 +135,7 @@ class Quadrotor:
         self._state_size = mujoco.mj_stateSize(self._model, _FULL_STATE)
 
     def at_rest(self) -> PhysicsState:
-        """State on the ground at the origin, heading north, motors stopped."""
+        """Return the state on the ground at the origin, heading north, motors stopped."""
         mujoco.mj_resetData(self._model, self._data)
         mujoco.mj_forward(self._model, self._data)
         return self._capture()
@@ -143,7 +143,7 @@ class Quadrotor:
     def airborne(
         self, position_ned_m: Vec3, velocity_ned_mps: Vec3, ned_from_body_wxyz: Quat
     ) -> PhysicsState:
-        """State in the air, not rotating, with motors at hover thrust."""
+        """Return a state in the air, not rotating, with motors at hover thrust."""
         mujoco.mj_resetData(self._model, self._data)
         w, *vector = ned_from_body_wxyz
         self._data.qpos[:] = (*_flip(position_ned_m), w, *_flip(vector))
@@ -161,10 +161,10 @@ class Quadrotor:
         substeps: int,
         wind_ned_mps: Vec3 = (0.0, 0.0, 0.0),
     ) -> PhysicsState:
-        """The state ``substeps`` physics steps later, with the four commands (0..1) and wind held.
+        """Return the state after ``substeps`` physics steps with constant commands (0..1) and wind.
 
-        MuJoCo's body drag knows the wind; its damping, the rotors' drag, is against the ground, so
-        the effect of moving air is added as a force.
+        MuJoCo's body drag includes the wind. Its damping, used as rotor drag, is relative to the
+        ground, so the effect of moving air is added as a force.
         """
         mujoco.mj_setState(self._model, self._data, state.integration, _FULL_STATE)
         self._data.ctrl[:] = motor_commands
@@ -197,8 +197,8 @@ class Quadrotor:
 class Wind:
     """Steady wind and gusts, one value per control step.
 
-    Gusts are a first-order Gauss-Markov process per axis: the longitudinal Dryden spectrum as seen
-    by a vehicle whose passage through the turbulence takes ``gust_time_s`` (MIL-F-8785C).
+    Gusts are a first-order Gauss-Markov process per axis: the longitudinal Dryden spectrum seen by
+    a vehicle that passes through the turbulence in ``gust_time_s`` (MIL-F-8785C).
     """
 
     def __init__(self, conditions: Conditions, step_s: float) -> None:
@@ -211,7 +211,7 @@ class Wind:
         self._gust = self._rms * self._random.standard_normal(3)
 
     def step(self) -> Vec3:
-        """Velocity of the air in NED, m/s, for the next step."""
+        """Return the velocity of the air in NED [m/s] for the next step."""
         if self._is_calm:
             return (0.0, 0.0, 0.0)
         noise = self._innovation * self._rms * self._random.standard_normal(3)
@@ -256,7 +256,7 @@ def clamp(value: float, limit: float) -> float:
 
 
 class HeightController:
-    """Climb rate demand to vertical acceleration; holds the height where the demand is zero."""
+    """Controller from climb rate demand to vertical acceleration; zero demand holds the height."""
 
     HEIGHT_GAIN_PER_S = 1.0
     CLIMB_GAIN_PER_S = 5.0
@@ -276,7 +276,7 @@ class HeightController:
     def update(
         self, body: BodyState, climb_mps: float, max_accel_mps2: float, dt_s: float
     ) -> float:
-        """Upward acceleration in m/s^2; the demand itself changes by no more than the limit."""
+        """Return the upward acceleration [m/s^2]; ``max_accel_mps2`` limits the demand's change."""
         height, climb = -body.position_ned_m[2], -body.velocity_ned_mps[2]
         self._climb_mps += clamp(climb_mps - self._climb_mps, max_accel_mps2 * dt_s)
         self._height_m += self._climb_mps * dt_s
@@ -291,7 +291,8 @@ class HeightController:
 
 
 def thrust_for(accel_up_mps2: float, cos_tilt: float, hover: float) -> float:
-    """Collective in [0, 1] for a vertical acceleration; the tilt boost ends at 60 degrees."""
+    """Return the collective in [0, 1] for a vertical acceleration; tilt boost ends at 60
+    degrees."""
     return max(0.0, min(1.0, hover * (1.0 + accel_up_mps2 / GRAVITY_MPS2) / max(cos_tilt, 0.5)))
 
 
@@ -303,7 +304,7 @@ _YAW_SIGN = (1.0, 1.0, -1.0, -1.0)
 def mix(
     collective: float, angular_accel_radps2: Vec3, airframe: Airframe = QUAD
 ) -> tuple[float, ...]:
-    """Four motor commands in [SPIN_MIN, 1]: attitude first, then thrust, yaw with what is left."""
+    """Return four motor commands in [SPIN_MIN, 1]; priority: roll and pitch, yaw, then thrust."""
     ix, iy, iz = INERTIA_KGM2
     ax, ay, az = angular_accel_radps2
     per_arm = 4.0 * MOTOR_ARM_M * airframe.max_motor_thrust_n

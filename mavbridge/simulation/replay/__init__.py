@@ -1,1 +1,1 @@
-"""A recorded flight through the flight's own code once more, on stepped time."""
+"""Replay of a recorded flight through the flight's code, on a stepped clock."""

@@ -17,65 +17,65 @@ Array: TypeAlias = NDArray[np.float64]
 STAGES = ("raw", "clipped", "slewed", "smoothed")
 INPUTS = ("state", "stamps", "states", "history", "images")
 PAST_INPUTS = ("states", "history")
-"""Given to a policy of the same contract as they were recorded. Those that are built again may be
-others where a solve without a chunk, or a tick on its way, is not in the recording."""
+"""Inputs that a policy with the recorded contract gets from the recording. Rebuilt ones may differ
+if the recording lacks a solve without a chunk, or a tick in transit."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Deviation:
-    """Largest and typical difference of each of the four numbers of an action."""
+    """Largest and RMS difference of each of an action's four numbers."""
 
     largest: tuple[float, ...]
     rms: tuple[float, ...]
 
     @property
     def most(self) -> float:
-        """The largest of all four; infinite where a row has nothing to compare with."""
+        """Largest of all four; infinite if a row has no counterpart."""
         return max(self.largest)
 
 
 @dataclass(frozen=True, kw_only=True)
 class PolicyComparison:
-    """Every solve once more."""
+    """Comparison of all solves with their repetition."""
 
     solves: int
     missing: Mapping[str, int]
-    """Why solves were not repeated, or refused this time, and how many."""
+    """Number of solves not repeated, or refused in the replay, by reason."""
     inputs_differ: Mapping[str, int]
-    """Solves that were given something else, by input; those without any difference left out."""
+    """Number of solves with a different input, by input; equal inputs left out."""
     equal_chunks: int
-    """Solves with the same chunk, bit for bit."""
+    """Solves with a bit-identical chunk."""
     deviation: Deviation
     """Deviation of all actions of all chunks."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class GuardComparison:
-    """Every pass of the guard once more, with the recorded chunks."""
+    """Comparison of all passes of the guard with their repetition on the recorded chunks."""
 
     steps: int
     flown: int
     """Passes in which the policy moved the sticks."""
     differ: Mapping[str, int]
-    """Passes that came out differently: by phase, chunk, stage of the trace, and sent sticks."""
+    """Number of passes with a difference, by phase, chunk, stage of the trace, and sent sticks."""
     first: str | None
-    """The first difference, in words."""
+    """Description of the first difference."""
     deviation: Deviation
     """Deviation of the smoothed sticks."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class StickTraces:
-    """Smoothed sticks over the flight, recorded and replayed, [N, 4]; NaN where nobody flew."""
+    """Smoothed sticks, recorded and replayed, [N, 4]; NaN while the policy did not fly."""
 
     times_s: Array
-    """Since the first tick."""
+    """Time since the first tick."""
     recorded: Array
     replayed: Array
 
     @property
     def deviation(self) -> Deviation:
-        """Where either of them was flown; infinite where only one was."""
+        """Deviation while either policy flew; infinite while only one did."""
         difference = np.abs(self.replayed - self.recorded)
         both_idle = np.isnan(self.recorded) & np.isnan(self.replayed)
         difference = np.where(np.isnan(difference) & ~both_idle, np.inf, difference)
@@ -83,7 +83,7 @@ class StickTraces:
 
 
 def deviation_of(difference: Array) -> Deviation:
-    """Largest and root mean square of absolute differences [N, 4]."""
+    """Return largest and root mean square of absolute differences [N, 4]."""
     if not len(difference):
         return Deviation(largest=(0.0,) * 4, rms=(0.0,) * 4)
     return Deviation(
@@ -93,11 +93,11 @@ def deviation_of(difference: Array) -> Deviation:
 
 
 def compare_policy(pairs: Iterable[SolvePair]) -> PolicyComparison:
-    """Inputs and results of all solves."""
+    """Compare inputs and results of all solves."""
     missing: dict[str, int] = {}
     inputs: dict[str, int] = {}
     sentences: dict[object, str] = {}
-    """The first of each reason: the others differ by their figures."""
+    """First sentence of each reason; later ones differ only by their figures."""
     differences: list[Array] = []
     solves = equal = 0
     for pair in pairs:
@@ -128,7 +128,7 @@ def _count(counts: dict[str, int], name: str) -> None:
 
 
 def _other_inputs(pair: SolvePair) -> list[str]:
-    """Inputs that are not what they were."""
+    """Return the names of the inputs that differ from the recording."""
     one, other = pair.recorded, pair.replayed
     if other is None:
         return []
@@ -149,9 +149,9 @@ def _other_inputs(pair: SolvePair) -> list[str]:
 
 
 def compare_guard(steps: Sequence[GuardStep]) -> GuardComparison:
-    """Phases, chunks, the whole trace and the sent sticks of all passes.
+    """Compare phases, chunks, the whole trace and the sent sticks of all passes.
 
-    The very first pass reads the settings, and decides nothing.
+    The first pass only reads the settings, and decides nothing.
     """
     differ: dict[str, int] = {}
     first: str | None = None
@@ -191,12 +191,12 @@ def _stage(trace: ActionTrace | None, stage: str) -> Action | None:
 
 
 def guard_traces(steps: Sequence[GuardStep]) -> StickTraces:
-    """The recorded chunks through the guard."""
+    """Return the sticks from the recorded chunks."""
     return _traces(steps, [step.replayed.trace if step.replayed else None for step in steps])
 
 
 def other_traces(steps: Sequence[GuardStep], outputs: Iterable[GuardOutput]) -> StickTraces:
-    """Other chunks, or other settings, through the guard."""
+    """Return the sticks from other chunks or other settings."""
     return _traces(steps, [output.trace for output in outputs])
 
 

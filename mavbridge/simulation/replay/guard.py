@@ -1,9 +1,9 @@
-"""The guard and the link of a recorded flight once more: its bytes, its chunks, its moments.
+"""Replay of a flight's guard and link with the recorded bytes, chunks and times.
 
-``GuardLoop`` and ``MavlinkLink`` run as in the flight; replaced are the socket, the channel to the
-flight process and the clock. Taken from the recording: when the guard woke, for which moment it
-decided and when its sticks had left; which bytes came; which chunk it had seen by then; and what
-the operator or the flight process asked for, as far as the phases show it.
+``GuardLoop`` and ``MavlinkLink`` run as in the flight; the socket, the channel to the flight
+process and the clock are replaced. The recording supplies the times at which the guard woke,
+decided and had sent its sticks, the received bytes, and the newest chunk at each pass. Requests of
+the operator or the flight process are derived from the phases.
 """
 
 from collections.abc import Iterator, Mapping, Sequence
@@ -34,7 +34,7 @@ from mavbridge.simulation.replay.recording import RecordedPacket, ReplaySource
 from policy.contract import Contract
 
 PREPARE_NS = 10 * NS_PER_MS
-"""Longest time between two looks at the link, as while no policy is loaded."""
+"""Longest time between two polls of the link, as while no policy is loaded."""
 _OWN_ENDINGS = (
     *(Code.SIGNAL, Code.COURSE_DONE, Code.POLICY_FAILED, Code.CAMERA_FAILED, Code.HANGS),
     *(Code.TOLD_TO_END, Code.FLIGHT_PROCESS_DIED),
@@ -44,11 +44,11 @@ _OWN_ENDINGS = (
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class GuardStep:
-    """One recorded pass of the guard, and what it came to this time."""
+    """One recorded pass of the guard and its repetition."""
 
     recorded: Tick
     replayed: GuardTick | None
-    """None: this time nothing was to be sent or told."""
+    """None: the replayed pass neither sent nor reported."""
     snapshot: LinkSnapshot
     """The link's snapshot of that pass."""
     chunk_serial: int | None
@@ -58,7 +58,7 @@ class GuardStep:
 
 
 def chunk_of(solve: Solve, contract: Contract) -> Chunk:
-    """The chunk that the policy loop makes of a solve."""
+    """Return the chunk that the policy loop makes of a solve."""
     return make_chunk(
         solve.serial,
         solve.state,
@@ -71,12 +71,12 @@ def chunk_of(solve: Solve, contract: Contract) -> Chunk:
 
 
 def recorded_plan(source: ReplaySource) -> FlightPlan:
-    """Plan of the recorded flight."""
+    """Return the plan of the recorded flight."""
     return plan_flight(source.config, source.contract, is_dual=source.meta.mode == "dual")
 
 
 def replay_guard(source: ReplaySource) -> list[GuardStep]:
-    """The recorded chunks through the guard, one step for each recorded tick."""
+    """Replay the recorded chunks through the guard. Return one step for each recorded tick."""
     ticks = source.ticks
     clock = SteppedClock(
         min(source.packets[0].arrived_ns if source.packets else ticks[0].woke_ns, ticks[0].woke_ns)
@@ -87,7 +87,7 @@ def replay_guard(source: ReplaySource) -> list[GuardStep]:
     loop = GuardLoop(clock, link, port)
     settings = recorded_plan(source).guard
     port.inbox.append(encode_to_guard(settings))
-    # The grid begins where the guard gets its settings.
+    # The grid begins when the guard gets its settings.
     port.begin_ns = ticks[0].due_ns - ticks[0].index * settings.stick_period_ns
     steps = []
     for arrivals in _arrivals(source):
@@ -112,10 +112,10 @@ def replay_guard(source: ReplaySource) -> list[GuardStep]:
 def _keep_link(
     link: MavlinkLink, clock: SteppedClock, transport: "_RecordedTransport", until_ns: int
 ) -> None:
-    """Let the link receive and ask between two ticks, as it did: at each arrival, or soon.
+    """Let the link receive and request between two ticks: at each arrival, or soon.
 
-    It asks just before each arrival as well, since that may be the answer: a vehicle that is chosen
-    a moment later than then would not be listened to yet.
+    It also services the link just before each arrival, since the packet may be the answer to a
+    request: a vehicle selected a moment later would still be ignored.
     """
     while clock.now_ns() < until_ns:
         arrival_ns = transport.next_arrival_ns or until_ns
@@ -134,10 +134,10 @@ def replay_other(
     settings: FlightSettings,
     chunks: Mapping[int, Chunk],
 ) -> Iterator[GuardOutput]:
-    """Other chunks, or other settings, through the guard, one output for each of ``steps``.
+    """Replay other chunks or settings through the guard. Yield one output for each of ``steps``.
 
-    The vehicle's answers are those to the recorded sticks, so that the link is not asked: its
-    snapshots are taken as they were. Sticks are those of the policy's trace, before the message.
+    The vehicle's answers are those to the recorded sticks, so the link is not run; its recorded
+    snapshots are used. The resulting sticks are those of the policy's trace, before the message.
     """
     first = steps[0].recorded
     origin_ns = first.due_ns - first.index * settings.stick_period_ns
@@ -168,7 +168,7 @@ class _Arrivals:
 def _arrivals(source: ReplaySource) -> Iterator[_Arrivals]:
     """Derive the arrivals from each tick.
 
-    A tick that flies a chunk names it. Before a flight a chunk counts from the end of its solve.
+    A tick that flies a chunk names it. Before a flight, a chunk counts from the end of its solve.
     """
     config = source.config
     is_called = not (config.arm or config.engage_channel or config.engage_on_arm)
@@ -195,7 +195,7 @@ def _is_seen(solve: Solve, tick: Tick) -> bool:
 
 
 def _act(before: Tick | None, tick: Tick, *, is_called: bool) -> OperatorCommand | None:
-    """The operator's keys, as the phases show them."""
+    """Return the operator's key, derived from a change of phase."""
     was = None if before is None else before.phase
     if is_called and was in ("waiting", "released") and tick.phase in ("preparing", "flying"):
         return "engage"
@@ -205,14 +205,14 @@ def _act(before: Tick | None, tick: Tick, *, is_called: bool) -> OperatorCommand
 
 
 def _stop(before: Tick | None, tick: Tick) -> EndRequest | None:
-    """Request of the flight process at its own end."""
+    """Return the flight process' request to end, derived from a change of phase."""
     was = None if before is None else before.phase
     reason = tick.release_reason
     if reason is not None and reason.code is Code.THEN:
         reason = dict(reason.data)["first"]  # type: ignore[assignment]
     if tick.phase != was and isinstance(reason, Reason) and reason.code in _OWN_ENDINGS:
         return EndRequest(reason=reason, is_fault=reason.kind is Kind.FAULT)
-    if tick.phase == Phase.ENDED.value != was:  # the second of two stops counts for nothing
+    if tick.phase == Phase.ENDED.value != was:  # the second of two stops has no effect
         return EndRequest(reason=because(Code.SIGNAL))
     return None
 
@@ -222,7 +222,7 @@ def _code(tick: Tick) -> Code | None:
 
 
 class _WatchedLink(MavlinkLink):
-    """Keeps what it told the guard last."""
+    """Link that keeps its last snapshot for the guard."""
 
     newest: LinkSnapshot
 
@@ -233,7 +233,7 @@ class _WatchedLink(MavlinkLink):
 
 
 def same_action(one: Action | None, other: Action | None) -> bool:
-    """Equal in single precision, in which a recording holds them."""
+    """True if equal in single precision, the precision of a recording."""
     if one is None or other is None:
         return one is other
     return np.array_equal(np.array(one, np.float32), np.array(other, np.float32))
@@ -243,7 +243,7 @@ def _link(
     source: ReplaySource, clock: SteppedClock, transport: "_RecordedTransport"
 ) -> _WatchedLink:
     config: FlyConfig = source.config
-    # As the guard was started, before a policy was loaded.
+    # Use the settings from before a policy was loaded, as when the guard started.
     loops = config.rates.loops(is_dual=source.meta.mode == "dual")
     settings = link_settings(
         config.link,
@@ -255,29 +255,29 @@ def _link(
 
 
 class _RecordedTransport(Transport):
-    """A transport from which the recorded packets come; what is sent goes nowhere."""
+    """Transport that delivers recorded packets and discards sent ones."""
 
     def __init__(self, clock: SteppedClock, packets: Sequence[RecordedPacket]) -> None:
         self._clock = clock
         self._packets = iter(packets)
         self._next = next(self._packets, None)
         self.sent_ns: int | None = None
-        """When the sticks of this pass had left."""
+        """Time at which the sticks of this pass had left."""
 
     @property
     def next_arrival_ns(self) -> int | None:
-        """When the next packet comes; None after the last."""
+        """Arrival of the next packet; None after the last."""
         return None if self._next is None else self._next.arrived_ns
 
     def drain(self) -> Iterator[Received]:
-        """Everything that had arrived."""
+        """Yield every packet that has arrived."""
         now_ns = self._clock.now_ns()
         while self._next is not None and self._next.arrived_ns <= now_ns:
             packet, self._next = self._next, next(self._packets, None)
             yield Received(packet.data, packet.arrived_ns, VEHICLE)
 
     def send(self, data: bytes, peer: Address | None = None) -> bool:
-        """Let the time of sending pass."""
+        """Advance the clock to the recorded end of sending."""
         if self.sent_ns is not None:
             self._clock.sleep_until_ns(self.sent_ns)
             self.sent_ns = None
@@ -285,26 +285,27 @@ class _RecordedTransport(Transport):
 
 
 class _RecordedPort:
-    """A ``Port`` to no flight process; the clock goes on to the moment of the decision."""
+    """``Port`` without a flight process; receiving advances the clock to the time of the
+    decision."""
 
     def __init__(self, clock: SteppedClock) -> None:
         self._clock = clock
         self.inbox: list[bytes] = []
         self.begin_ns: int | None = None
-        """When the guard had read the settings of the flight, in the next pass."""
+        """Time at which the guard had read the flight's settings, in the next pass."""
         self.decided_ns: int | None = None
         self.is_closed = False
         self._tick: GuardTick | None = None
 
     def send(self, message: bytes, fd: int | None = None) -> bool:
-        """Keep a tick; everything else has no reader."""
+        """Keep a tick; discard other messages, which have no reader."""
         decoded = decode_from_guard(message)
         if isinstance(decoded, GuardTick):
             self._tick = decoded
         return True
 
     def take_tick(self) -> GuardTick | None:
-        """The tick since the last call."""
+        """Return the tick since the last call, or None."""
         tick, self._tick = self._tick, None
         return tick
 

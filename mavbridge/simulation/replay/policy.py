@@ -1,13 +1,13 @@
-"""The policy loop of a recorded flight once more: its bytes, its features, its sent sticks.
+"""Replay of a flight's policy loop with the recorded bytes, features and sent sticks.
 
 ``TelemetryCache``, ``StateReader``, ``ObservationSource``, ``SentHistory`` and ``PolicyLoop`` run
-as in the flight, composed by ``build_bridge``. Taken from the recording: when each solve began and
-ended; what had reached the flight process by then (the state, its stamps and the newest image tell
-it); when packets arrived and what moment they tell about; and which sticks had been sent. Solves
-that returned no chunk are not in a recording, and are not repeated.
+as in the flight, composed by ``build_bridge``. The recording supplies the start and end of each
+solve, the arrival and measurement times of packets, and the sent sticks. A solve's state, stamps
+and newest image show which messages had reached the flight process. Solves that returned no chunk
+are not recorded and not repeated.
 
-A policy of the recorded contract computes from the recorded states and history, another one from
-those that are built here. Both are compared.
+A policy with the recorded contract gets the recorded states and history, any other policy those
+rebuilt here. Both are compared.
 """
 
 from collections.abc import Iterable, Iterator, Sequence
@@ -39,12 +39,12 @@ _SIDES: tuple[Literal["left"], Literal["right"]] = ("left", "right")
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class SolvePair:
-    """A recorded solve, and the same one now."""
+    """Recorded solve and its repetition."""
 
     recorded: Solve
     replayed: Solve | None
     refusal: Reason | None = None
-    """Why there is none this time."""
+    """Reason why there is no repetition."""
 
 
 def replay_policy(
@@ -53,11 +53,11 @@ def replay_policy(
     clock: SteppedClock,
     features: Sequence[Iterable[FeatureFrame]],
 ) -> Iterator[SolvePair]:
-    """Every recorded solve once more.
+    """Repeat every recorded solve.
 
     Args:
         source: the flight.
-        runner: the policy, reset; it follows ``clock`` if it follows one at all.
+        runner: the policy, reset; if it follows a clock, it follows ``clock``.
         clock: at a time before the flight.
         features: of each camera of the contract, in order of exposure.
     """
@@ -76,7 +76,7 @@ def replay_policy(
 
 
 class _Loop:
-    """The policy loop and all around it, stepped for each recorded solve."""
+    """Policy loop and its surroundings, stepped for each recorded solve."""
 
     def __init__(self, source: ReplaySource, runner: PolicyRunner, clock: SteppedClock) -> None:
         contract = source.contract
@@ -105,7 +105,7 @@ class _Loop:
         self.view.receive(GuardStatus(autopilot, None, True, None, (), None, has_position=True))
 
     def repeat(self, recorded: Solve) -> SolvePair:
-        """One step of the loop at the moment of a recorded one."""
+        """Run one step of the loop at the time of a recorded solve."""
         self._now, self._solve, self._refusal = recorded, None, None
         self._clock.sleep_until_ns(recorded.started_ns)
         self._policy.step()
@@ -114,7 +114,7 @@ class _Loop:
     def _timed_act(
         self, encoded: FloatArray, states: FloatArray, history: FloatArray
     ) -> FloatArray:
-        """Compute, and let the time pass that it took then."""
+        """Compute a chunk, and advance the clock to the recorded end."""
         recorded = self._now
         if recorded is not None and self._takes_recorded:
             states, history = recorded.states.copy(), recorded.history.copy()
@@ -132,20 +132,20 @@ class _Loop:
 
 
 class _NoCamera:
-    """A ``Camera`` that is never read: the features are recorded."""
+    """``Camera`` that is never read: the features are recorded."""
 
     dropped_frames = 0
 
     def read(self, timeout_ns: int) -> Frame | None:
-        """No frame."""
+        """Return None."""
         return None
 
     def close(self) -> None:
-        """Nothing to free."""
+        """No-op."""
 
 
 class _Shelf:
-    """Features of one camera on their way into its cache; taken one by one, as they are needed."""
+    """Features of one camera that enter its cache one by one, on demand."""
 
     def __init__(self, features: Iterable[FeatureFrame], cache: FeatureCache) -> None:
         self._features, self._cache = iter(features), cache
@@ -153,7 +153,7 @@ class _Shelf:
         self._newest_id: int | None = None
 
     def bring(self, frame_id: int) -> bool:
-        """Publish all up to this one; False: it is not there."""
+        """Publish all features up to this frame. Return False if the frame's feature is missing."""
         while self._next is not None and self._next.frame_id <= frame_id:
             self._cache.publish(self._next)
             self._newest_id = self._next.frame_id
@@ -171,9 +171,9 @@ class _News:
         self._shelves = shelves
         decoder = PacketDecoder()
         self._samples: list[tuple[Sample, ...]] = []
-        """Of each packet that has any."""
+        """Samples of each packet that contains any."""
         self._telemetry: list[Telemetry] = []
-        """Telemetry after each of them."""
+        """Telemetry after each entry of ``_samples``."""
         for packet in source.packets:
             if packet.happened_ns is None:
                 continue
@@ -192,7 +192,7 @@ class _News:
         self._next_tick = 0
 
     def bring(self, solve: Solve) -> str | None:
-        """Deliver what this solve had seen; returns what the recording lacks, or None."""
+        """Deliver the inputs that this solve had seen. Return a missing one's name, or None."""
         self._bring_ticks(solve.started_ns)
         if not self._bring_samples(solve):
             return "the packets of its state"
@@ -210,9 +210,10 @@ class _News:
             self._view.receive(_guard_tick(tick))
 
     def _has_extras(self, place: int, solve: Solve) -> bool:
-        """After this packet the extra inputs, which come in messages of their own, are the solve's.
+        """True if, after this packet, the extra inputs equal the solve's.
 
-        Their one recorded stamp is that of the oldest, so that the values have to agree as well.
+        Extra inputs come in separate messages, and only the oldest one's stamp is recorded, so that
+        the values must agree as well.
         """
         if not solve.state.extras:
             return True
@@ -238,7 +239,7 @@ class _News:
 
 
 def _stamps_ns(now: Telemetry) -> list[int]:
-    """Stamps of attitude, rate, velocity and specific force; 0 where there is none."""
+    """Return the stamps of attitude, rate, velocity and specific force; 0 if missing."""
     readings = (
         *(now.ned_from_body_wxyz, now.rate_body_radps),
         *(now.velocity_ned_mps, now.specific_force_body_mps2),
@@ -247,7 +248,7 @@ def _stamps_ns(now: Telemetry) -> list[int]:
 
 
 def _guard_tick(tick: Tick) -> GuardTick:
-    """The guard's report that became this tick."""
+    """Rebuild the guard's report that became this tick."""
     return GuardTick(
         index=tick.index,
         due_ns=tick.due_ns,

@@ -1,4 +1,4 @@
-"""All that a recorded flight holds for its replay."""
+"""Contents of a recorded flight that a replay needs."""
 
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
@@ -26,21 +26,21 @@ from mavbridge.recording.tables import read_table
 from policy.contract import Contract
 
 STAMP_NS = 10 * NS_PER_MS
-"""Most by which a packet's two stamps may differ: the log's are rounded to 4 us, and the clocks of
-user and system drift apart by less in an hour."""
+"""Largest difference between a packet's two stamps: the log's are rounded to 4 us, and wall clock
+and monotonic clock drift apart by less in an hour."""
 _PARAM_REQUEST_READ, _PARAM_ID = 20, slice(4, 20)
-"""Message, and place of the name in its payload."""
+"""Message id, and position of the parameter's name in its payload."""
 LOOK_AHEAD = 64
-"""Rows of the table among which a packet of the log is looked for: the log may have lost some."""
+"""Table rows searched for a packet of the log, since the log may have lost some."""
 
 
 class RecordedPacket(NamedTuple):
-    """A packet that came from the vehicle's side."""
+    """Packet received from the vehicle's side."""
 
     arrived_ns: int
-    """Exact where the flight process got it, else rounded to 4 us."""
+    """Exact if the flight process got the packet, else rounded to 4 us."""
     happened_ns: int | None
-    """None: the flight process did not get it."""
+    """None: the flight process did not get the packet."""
     data: bytes
 
 
@@ -52,24 +52,25 @@ class ReplaySource:
     meta: FlightMeta
     contract: Contract
     config: FlyConfig
-    """Its flags, without those that reach outside of the flight: ``--set``."""
+    """Flags of the flight, without those that act outside it, such as ``--set`` and
+    ``--record``."""
     ticks: tuple[Tick, ...]
     solves: tuple[Solve, ...]
     features: tuple[tuple[FeatureFrame, ...], ...]
     """Features of each camera of the contract; empty for a single-rate policy."""
     packets: tuple[RecordedPacket, ...]
-    """In order of arrival."""
+    """Packets in order of arrival."""
     known_params: frozenset[str]
-    """Parameters that the flight had asked for: a later version asks for more."""
+    """Parameters that the flight had requested; a later version requests more."""
     gaps: tuple[str, ...]
-    """Losses of the recording, in words: a replay may differ there."""
+    """Losses of the recording, in words; the replay may differ there."""
 
 
 def open_source(folder: Path) -> ReplaySource:
     """Read a flight, finished or cut off.
 
     Raises:
-        MavbridgeError: it is no recorded flight, or one that cannot be replayed.
+        MavbridgeError: not a recorded flight, or one that cannot be replayed.
     """
     meta = read_meta(folder)
     settings = read_settings(folder)
@@ -87,7 +88,7 @@ def open_source(folder: Path) -> ReplaySource:
     ticks = list(rows.read_ticks(table, meta.contract.action))
     solved = read_table(folder / SOLVES, replay_tables.SOLVES, damage=damage)
     solve_rows = list(read_solves(solved, meta.contract))
-    if ticks and not meta.finished:  # cut off: what was sent before its last solves is not known
+    if ticks and not meta.finished:  # cut off: sticks sent before its last solves are unknown
         solve_rows = [row for row in solve_rows if row.solve.started_ns <= ticks[-1].tick.sent_ns]
     if not ticks or not solve_rows:
         raise UserError(
@@ -153,9 +154,9 @@ def _received(
     offset_ns: int,
     own_system: int,
 ) -> Iterator[RecordedPacket]:
-    """Packets of others than ourselves, with the exact stamps of those that are in the table.
+    """Yield the packets of other senders, with exact stamps for those in the table.
 
-    Both have the same order, so that each is looked for behind the last one that was found.
+    Log and table have the same order, so each packet is searched after the previous match.
     """
     waiting = 0
     latest_ns = 0
@@ -166,7 +167,7 @@ def _received(
         key = packet_key(packet.data)
         found = None
         while waiting < len(stamps) and stamps[waiting].arrived_ns < rough_ns - STAMP_NS:
-            waiting += 1  # the log has lost it
+            waiting += 1  # the log has lost this packet
         for place in range(waiting, min(waiting + LOOK_AHEAD, len(stamps))):
             stamp = stamps[place]
             if stamp.arrived_ns - rough_ns >= STAMP_NS:
