@@ -72,8 +72,7 @@ class Chunk(NamedTuple):
     step_ns: int
     """Time from one action to the next."""
     actions: tuple[Action, ...]
-    """Raw output of the policy in time order, all of one kind, in NED and FRD axes. Not clipped,
-    possibly not finite."""
+    """Raw actions in time order, of one kind, NED and FRD axes; unclipped, perhaps not finite."""
     reset_ns: int = 0
     """Last reset of the policy before the solve; 0: none since loading."""
 
@@ -298,8 +297,7 @@ class ChunkBuffer:
         Args:
             now_ns: current time.
             stood_ns: duration of the guard's stall until now.
-            heard_ns: arrival of the vehicle's newest readings, under the keys "attitude" and
-                "velocity".
+            heard_ns: arrival of the vehicle's newest "attitude" and "velocity", by these names.
         """
         if not self.is_over(now_ns):
             return None
@@ -354,8 +352,7 @@ class ChunkBuffer:
         )
 
     def action_at(self, now_ns: int, lead_ns: int = 0) -> Action | None:
-        """Return the action for ``now_ns + lead_ns``, or the last one if the horizon ends before
-        that.
+        """Return the action at ``now_ns + lead_ns``, or the last one if the horizon ends first.
 
         Return None if ``now_ns`` is beyond the horizon of the newest chunk.
         """
