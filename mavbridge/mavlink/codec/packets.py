@@ -202,8 +202,7 @@ class Codec:
         """Encode RC_CHANNELS_OVERRIDE of the four stick channels; the others are left unchanged.
 
         Raises:
-            CommandRefusedError: a value outside a radio's range, or a throttle in the failsafe
-                range.
+            CommandRefusedError: a value that no radio sends, or a throttle that is a failsafe.
         """
         for channel, value_us in zip(calibration.channels, pwm_us, strict=True):
             if not PWM_LIMITS_US[0] <= value_us <= PWM_LIMITS_US[1]:
@@ -245,8 +244,7 @@ class Codec:
         """Encode SET_ATTITUDE_TARGET with an attitude and a collective thrust in [0, 1].
 
         Raises:
-            CommandRefusedError: no unit quaternion, a lean above ``MOST_LEAN_RAD``, or a bad
-                thrust.
+            CommandRefusedError: no unit quaternion, too large a lean, or a bad thrust.
         """
         _refuse_bad_thrust(thrust)
         if not abs(math.hypot(*ned_from_body_wxyz) - 1) <= MOST_NORM_ERROR:
@@ -268,7 +266,7 @@ class Codec:
         """Encode SET_ATTITUDE_TARGET with body rates and a collective thrust in [0, 1].
 
         Raises:
-            CommandRefusedError: a rate above ``MOST_RATE_RADPS``, or a bad thrust.
+            CommandRefusedError: a rate above the hard limit, or a bad thrust.
         """
         _refuse_bad_thrust(thrust)
         if not all(abs(rate) <= MOST_RATE_RADPS for rate in rate_body_radps):
@@ -298,8 +296,7 @@ class Codec:
         """Encode SET_POSITION_TARGET_LOCAL_NED with only a velocity and a yaw rate.
 
         Raises:
-            CommandRefusedError: a speed above ``MOST_SPEED_MPS``, or a yaw rate above
-                ``MOST_RATE_RADPS``.
+            CommandRefusedError: a speed or a yaw rate above the hard limit.
         """
         x, y, z, yaw_rate = velocity
         if not (math.hypot(x, y, z) <= MOST_SPEED_MPS and abs(yaw_rate) <= MOST_RATE_RADPS):

@@ -16,9 +16,8 @@ SAME_GAIN = 0.01
 """A stick is not mapped if the vehicle's motion at full stick is within this fraction of the
 policy's, and the dead zones differ by at most this fraction of the travel (see also SAME_END)."""
 SAME_END = 0.1
-"""Largest difference, as a fraction of the travel, between the points of full motion of two curves
-that need no mapping. ArduPilot's throttle is full before the bottom (RC3_DZ, 0.06 by default), for
-policies trained on it too."""
+"""Largest difference in the travel of full motion at which a stick is not mapped. ArduPilot's
+throttle is full before the bottom (RC3_DZ, 0.06 by default), for policies trained on it too."""
 MAX_DEAD_ZONE = 0.9
 _ROUNDING = 1e-9
 """Tolerance for rounding of a motion at the limit."""
@@ -252,8 +251,7 @@ class StickCurves:
         )
 
     def saturated(self, sticks: Sticks) -> tuple[str, ...]:
-        """Return the policy's sticks that demand more than the vehicle can do, in the order of
-        ``Sticks``."""
+        """Return the names of sticks that demand more than the vehicle can do, in Sticks' order."""
         names: tuple[str, ...] = ()
         if self.throttle is not None and self.throttle.saturates(sticks.throttle):
             names += ("throttle",)
@@ -332,8 +330,7 @@ def _note(
 def unusable(
     values: Mapping[str, float], *, needed: tuple[str, ...], positive: tuple[str, ...]
 ) -> StickCurves | None:
-    """Return an empty map with a sentence that says why, if parameters are missing or invalid; else
-    None."""
+    """Return an empty map that says why, if parameters are missing or invalid; else None."""
     as_they_are = "the policy's sticks go to the vehicle as they are, whatever they mean to it"
     if missing := [name for name in needed if name not in values]:
         return StickCurves(unmapped=f"{as_they_are}: it did not send {', '.join(missing)}")
