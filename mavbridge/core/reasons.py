@@ -403,8 +403,7 @@ _SPENT = {
 
 @dataclass(frozen=True, slots=True)
 class Reason:
-    """A code and its data: plain values, and figures with the unit in their name, such as
-    ``age_ms``."""
+    """A code and its data: plain values, and figures named with their unit, such as ``age_ms``."""
 
     code: Code
     data: tuple[tuple[str, Value], ...] = ()
@@ -478,8 +477,7 @@ def reason_from_json(document: Mapping[str, object]) -> Reason:
     """Return the reason of a document of ``reason_to_json``.
 
     Raises:
-        KeyError, TypeError, ValueError: the document is malformed, or this version lacks its
-            code.
+        KeyError, TypeError, ValueError: it is malformed, or this version lacks its code.
     """
     data = document["data"]
     if not isinstance(data, dict):

@@ -122,8 +122,7 @@ class SocketPort:
         return data
 
     def finish(self, message: bytes, timeout_s: float) -> None:
-        """Send the last message and close the socket; wait at most ``timeout_s`` for a slow
-        reader."""
+        """Send the last message within ``timeout_s``, then close the socket."""
         self._socket.settimeout(timeout_s)
         with suppress(OSError):
             self._socket.sendall(self._unsent + _LENGTH.pack(len(message)) + message)

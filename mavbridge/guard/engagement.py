@@ -22,8 +22,7 @@ _REHEARSED_MS = (0, 20, 40, *range(100, 2000, 50))
 """Times after the guard's death at which its last words are sent [ms]. The first are close
 together, since a packet that the guard sent in part swallows the next one."""
 _ASKED_NS = 250 * NS_PER_MS
-"""Time for which the last words request a mode. Longer requests could undo the pilot's mode
-change."""
+"""Time for which the last words request a mode; longer could undo the pilot's mode change."""
 _RELEASES = 5
 SILENCE_NS = 250 * NS_PER_MS
 """Silence of the vehicle, or stall of the guard, after which the vehicle's mode is unknown until
@@ -36,8 +35,7 @@ class Engagement(Memory):
     """Decides who controls the vehicle; ``step`` runs whenever the guard wakes up."""
 
     def __init__(self, settings: EngagementSettings, *, chunk_period_ns: int = 0) -> None:
-        """``chunk_period_ns``: time between chunks; the first chunk after a reset may take two
-        periods."""
+        """``chunk_period_ns``: time between chunks; the first after a reset may take two."""
         super().__init__(
             settings=settings,
             first_chunk_ns=ACT_TIMEOUT_NS + 2 * chunk_period_ns,
@@ -161,8 +159,7 @@ class Engagement(Memory):
             self.own_mode = now.mode
 
     def _note_act(self, now: EngagementInputs, act: OperatorCommand | None) -> None:
-        """Note the act of this step: the operator's command, the engage switch, or the first
-        arming."""
+        """Note this step's act: the operator's command, the engage switch or the first arming."""
         is_first_arming = now.armed and self.is_arming_awaited is True
         if now.is_connected and self.is_arming_awaited is not False:
             self.is_arming_awaited = not now.armed
@@ -195,8 +192,7 @@ class Engagement(Memory):
     def rehearse(self, now: EngagementInputs) -> Iterator[tuple[int, Actions]]:
         """Yield the actions that end the flight if the guard dies now, with their delays [ns].
 
-        A copy of this state machine treats the death as a fault, and receives nothing more from the
-        vehicle.
+        A copy of this state machine treats the death as a fault; it hears nothing of the vehicle.
         """
         twin = deepcopy(self, {id(self.settings): self.settings})
         twin.disengage.ask_at_once(now.now_ns)

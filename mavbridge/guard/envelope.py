@@ -18,8 +18,7 @@ POSITION_PERSIST_NS = 300 * NS_PER_MS
 FLAG_PERSIST_NS = 600 * NS_PER_MS
 """Debounce time of estimator, battery and landing: more than one message at 2 Hz."""
 FRESH_NS = 500 * NS_PER_MS
-"""Oldest attitude and velocity that are checked; the guard has stricter age limits for its
-inputs."""
+"""Oldest attitude and velocity that are checked; the policy's inputs have stricter age limits."""
 
 _Kind: TypeAlias = Literal["fault", "landed"]
 
@@ -77,8 +76,7 @@ class _Finding(NamedTuple):
 
 
 class Envelope:
-    """Detects when the vehicle leaves its envelope, and lists the quantities that cannot be
-    watched.
+    """Detects when the vehicle leaves its envelope, and which quantities cannot be watched.
 
     Call ``reset`` at every engagement: a lost position counts only after the position was valid, a
     landing only after the vehicle was in the air.

@@ -183,7 +183,7 @@ class Guard:
             yield after_ns, self._at_rest(actions.control), actions.mode
 
     def unsent(self) -> None:
-        """Continue from the decision before the last one, which was not sent."""
+        """Discard the last decision: it was not sent."""
         if not self._engagement.settings.readonly:
             self._smoother.undo()
 
@@ -230,7 +230,7 @@ class Guard:
         )
 
     def _silence(self, now_ns: int, stood_ns: int, attitude: Reading | None) -> Reason | None:
-        """Return why a silent vehicle ends the flight: only our own stall is bridged."""
+        """Return why a silent link ends the flight, or None; a plan bridges only our own stall."""
         if stood_ns > STOOD_STILL_NS:
             self._heard_ns = now_ns
         limit_ns = self._chunks.grace_ns
@@ -314,7 +314,7 @@ class Guard:
     def _change_control(
         self, control: ControlSource | None, now_ns: int, link: LinkSnapshot
     ) -> None:
-        """At a takeover by policy or neutral, start the filter from the current command."""
+        """When policy or neutral takes control, start the filter from the current command."""
         before, self._control = self._control, control
         if control is ControlSource.NEUTRAL and before not in (control, ControlSource.POLICY):
             on_ground = before is ControlSource.IDLE

@@ -36,8 +36,7 @@ class ActionLimits:
     change_per_s: Four
     """Maximum rate of change of each; infinite: no limit."""
     pair: tuple[int, int] | None = None
-    """Indices of two numbers that form a vector: its length is limited to ``high``, its direction
-    is kept."""
+    """Indices of a vector's two numbers; limits its length to ``high`` and keeps its direction."""
 
     def clip(self, action: Action) -> Action:
         """Return the nearest action within the bounds."""
@@ -48,8 +47,7 @@ class ActionLimits:
         return type(action)(*values)
 
     def approach(self, now: Action, goal: Action, dt_s: float) -> Action:
-        """Return ``goal``, or the nearest action to it that the rate limits allow after
-        ``dt_s``."""
+        """Return the action nearest to ``goal`` that the rate limits allow after ``dt_s``."""
         reach = [rate * dt_s if rate < math.inf else rate for rate in self.change_per_s]
         moves = [min(max(b - a, -most), most) for a, b, most in zip(now, goal, reach, strict=True)]
         if self.pair is not None:
@@ -146,7 +144,7 @@ def idle_action(meaning: ActionMeaning) -> Action:
 
 
 def first_action(meaning: ActionMeaning, telemetry: Telemetry, pilot: Sticks | None) -> Action:
-    """Return the action that continues the vehicle's motion at takeover, without a jump.
+    """Return the policy's first action: it continues the vehicle's motion without a jump.
 
     ``pilot``: sticks that the vehicle follows now; None: unknown.
     """

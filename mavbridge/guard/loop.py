@@ -77,8 +77,7 @@ class GuardLoop:
             flight: channel to the flight process.
             samples: port for the vehicle's readings; None: send them through ``flight``.
             received: messages already received from the flight process.
-            lead_ns: time before a slot at which its computation begins; the send waits for the
-                slot.
+            lead_ns: time from the start of a computation to its slot; the send waits for the slot.
         """
         self._received = list(received)
         self._lead_ns = lead_ns
@@ -98,8 +97,7 @@ class GuardLoop:
         self._finish_until_ns: int | None = None
         self._is_clean = False
         self._words: tuple[tuple[int, bytes], ...] = ()
-        """Last words: delays [ns] and packets that bring the vehicle to safety if this process
-        dies."""
+        """Last words: delays [ns] and packets that make the vehicle safe if this process dies."""
         self._words_basis: object = None
         self._words_due_ns = 0
         self._words_outlet: Outlet | None = None
@@ -248,8 +246,7 @@ class GuardLoop:
             self._flight.send(encode_from_guard(GuardMessage(text)))
 
     def _finish(self, now_ns: int) -> None:
-        """Restore the vehicle's parameters and send an outstanding release, for at most
-        FINISH_NS."""
+        """For at most FINISH_NS, restore parameters and send an outstanding release."""
         if self._finish_until_ns is None:
             self._finish_until_ns = now_ns + FINISH_NS
         was_clean = self._is_clean

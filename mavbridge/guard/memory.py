@@ -54,8 +54,7 @@ class Memory:
     reason: Reason | None = field(default_factory=lambda: because(Code.NOT_ENGAGED))
     """Why the policy does not fly; None while it does."""
     refusal: Reason | None = None
-    """Why the last act had no effect, or what the vehicle has not confirmed. The reader resets
-    it."""
+    """Failure of the last act, or missing confirmation by the vehicle; the reader resets it."""
     failure: Reason | None = None
     """Why there was no flight: the vehicle did not take the mode or arm in time."""
     outcome: Outcome = field(default_factory=Outcome)
@@ -75,8 +74,7 @@ class Memory:
     was_armed: bool = False
     """True if the vehicle was armed at the last step of PREPARING."""
     starting_ns: int | None = None
-    """Time at which everything but the policy was ready and the policy's reset was requested; None
-    before and after."""
+    """Start of the policy's reset, when all else was ready; None before and after."""
     allowed_ns: int = 0
     """Time allowed for PREPARING."""
     until_ns: int = 0

@@ -8,8 +8,7 @@ from mavbridge.core.vehicle import OnFault
 from mavbridge.guard.values import Actions, ControlSource, EngagementInputs
 
 REQUEST_SPACING_NS = NS_PER_S
-"""Time between two requests to arm or to change the mode: each refusal prints the vehicle's
-reason."""
+"""Time between requests to arm or change the mode: each refusal prints the vehicle's reason."""
 ARRIVED = 0.9
 """Fraction of the takeoff height at which the policy's mode is requested."""
 FLOW_NS = 100 * NS_PER_MS
@@ -20,7 +19,7 @@ NEUTRAL_NS = 50 * NS_PER_MS
 MODE_SPACING_NS = 100 * NS_PER_MS
 """Time between two requests for the safe mode; ArduPilot answers within 10 ms."""
 SLOW_SPACING_NS = NS_PER_S
-"""Time between two such requests after MODE_TIMEOUT_NS without confirmation over a good link."""
+"""Time between requests for a mode not confirmed within MODE_TIMEOUT_NS over a good link."""
 MODE_TIMEOUT_NS = 3 * NS_PER_S
 """Longest wait for the safe mode while the vehicle is heard; HEARTBEAT, which confirms it, may come
 at 1 Hz."""
@@ -28,8 +27,8 @@ BLIND_NS = 3 * NS_PER_S
 """Longest time to request a mode from a vehicle that is not heard, if its receiver takes over when
 our sticks end: the failsafe for a lost ground station comes after 5 s."""
 FAILSAFE_BLIND_NS = 500 * NS_PER_MS
-"""Same limit if the vehicle's failsafe follows, which must not be undone: it comes after 0.5 s
-(COM_RC_LOSS_T) or 1 s (RC_FS_TIMEOUT, COM_OF_LOSS_T)."""
+"""Longest time to request a mode from a vehicle that is not heard, if its failsafe follows and must
+not be undone: after 0.5 s (COM_RC_LOSS_T) or 1 s (RC_FS_TIMEOUT, COM_OF_LOSS_T)."""
 SETPOINT_NS = 500 * NS_PER_MS
 """Longest stream of neutral setpoints while waiting for the mode on PX4. A vehicle that has not
 answered by then does not hear us. It would return to OFFBOARD within 30 ms of hearing a setpoint
@@ -39,8 +38,7 @@ STICK_REST_NS = NS_PER_S
 a jump over the full range, PX4 sees less than 0.05 per second, the slowest motion that counts as a
 hand."""
 UNDONE_NS = NS_PER_S
-"""Time after entering the safe mode within which PX4 may leave it because of our jump to
-neutral."""
+"""Time in a safe mode within which PX4 may leave it because of our jump to neutral."""
 WORD_NS = 100 * NS_PER_MS
 """Wait for the EVENT that reports moved sticks; another station's mode change causes none."""
 MIDDLE_STICK = 0.2
@@ -79,15 +77,13 @@ class DisengageSettings:
 
 @dataclass(slots=True)
 class EngageSequence:
-    """Mode, arming, takeoff: ``begin`` starts the sequence, ``step`` continues until nothing is
-    missing."""
+    """Mode, arming, takeoff: ``begin`` starts, ``step`` continues until nothing is missing."""
 
     settings: EngageSettings
     waits_for: Reason | None = None
     """Missing condition; None: ready to fly."""
     arms: bool = False
-    """True if the vehicle was disarmed at the beginning: we keep it idle on the ground, and arm
-    it."""
+    """True if the vehicle was disarmed at the beginning: we keep it idle, and arm it."""
     asked_mode: str | None = None
     request_due_ns: int = 0
     is_up: bool = False
@@ -116,8 +112,7 @@ class EngageSequence:
         return now.mode == self.asked_mode or (has_takeoff and now.mode in now.modes.takeoff)
 
     def may_change_mode(self, now: EngagementInputs) -> bool:
-        """True if an act requests another mode: the flag's, or one that needs our setpoints to be
-        entered."""
+        """True if an act requests another mode: the flag's, or one entered only by setpoints."""
         if self.settings.mode is not None:
             return now.mode != self.settings.mode
         needs_flow = self.settings.is_setpoint and now.modes.needs_setpoints_first
@@ -167,8 +162,7 @@ class EngageSequence:
         return Actions(control=control, mode=wanted, arm=arm, takeoff_m=climb_m)
 
     def _lend_sticks(self, now: EngagementInputs, wanted: str | None) -> None:
-        """Start neutral sticks after PX4 has refused a mode that it enters only while it receives
-        sticks.
+        """Start neutral sticks if PX4 has refused a mode that it enters only with sticks.
 
         From then on silence would be a failsafe.
         """
@@ -222,16 +216,14 @@ class EngageSequence:
 
 @dataclass(slots=True)
 class DisengageSequence:
-    """Neutral, a safe mode, then the release: ``begin`` starts the sequence, ``step`` continues
-    it."""
+    """Neutral, a safe mode, then the release: ``begin`` starts, ``step`` continues."""
 
     settings: DisengageSettings
     mode: str | None = None
     """Requested safe mode; a change to it is no takeover."""
     is_done: bool = False
     must_hold: bool = False
-    """True if neutral must continue: silence is a failsafe, or the receiver would drop the
-    vehicle."""
+    """True if neutral must go on: silence is a failsafe, or the receiver would drop it."""
     is_silence_failsafe: bool = False
     """True if the end of our sticks triggers the vehicle's failsafe."""
     may_release: bool = False
@@ -255,8 +247,7 @@ class DisengageSequence:
         self.request_due_ns, self.asks_until_ns = now_ns, now_ns + MODE_TIMEOUT_NS
 
     def begin(self, now: EngagementInputs, *, is_fault: bool) -> Reason | None:
-        """Choose the safe mode. Return why the sticks are not released although the flag demands
-        it, or None."""
+        """Choose the safe mode. Return why a release that the flag demands is refused, or None."""
         self.ask_at_once(now.now_ns)
         self.began_ns = now.now_ns
         self.asked_ns = self.undone_ns = None
@@ -307,7 +298,7 @@ class DisengageSequence:
     def is_undone(self, now: EngagementInputs) -> bool:
         """True if our own sticks made the vehicle leave the safe mode, or may have.
 
-        It shows our sticks and no others, and its EVENT reports moved sticks.
+        The vehicle shows our sticks and no others, and its EVENT reports moved sticks.
         """
         if self.mode is None or self.asked_ns is None or now.mode != now.modes.override:
             return False
@@ -350,8 +341,7 @@ class DisengageSequence:
     def step(self, now: EngagementInputs, unheard_ns: int | None) -> Actions:
         """Send neutral, and request the mode until it is confirmed or refused.
 
-        ``unheard_ns``: last message of a vehicle whose mode is unknown since; None: its mode is
-        known.
+        ``unheard_ns``: last message of a vehicle whose mode is unknown since; None: known.
         """
         is_confirmed = self.mode is None or now.mode == self.mode
         is_safe = self.may_release or (self.mode is not None and is_confirmed)

@@ -28,14 +28,12 @@ class ControlSource(Enum):
     """Source of the actions that the guard sends."""
 
     IDLE = "idle"
-    """Throttle at the bottom, the rest centred, as arming demands; or a setpoint that stays
-    down."""
+    """Throttle down, the rest centred, as arming demands; or a setpoint that stays down."""
     POLICY = "policy"
     NEUTRAL = "neutral"
     """All centred: level, at constant height if the mode holds height; or a setpoint at rest."""
     LEVEL = "level"
-    """All but the throttle centred; the throttle keeps its last value, for modes in which it is
-    thrust."""
+    """Throttle at its last value, the rest centred; for modes in which the throttle is thrust."""
     RELEASE = "release"
     """No source: the sticks are given back."""
 
@@ -116,11 +114,9 @@ class EngagementInputs:
     echo_confirmed: bool
     is_released: bool
     shows_last: bool = True
-    """True if the vehicle shows our last sticks, or a receiver's sticks indistinguishable from
-    them."""
+    """True if the vehicle shows our last sticks, or a receiver's that look the same."""
     are_sticks_at_rest: bool = True
-    """True if our last sticks do not look like a hand, for which the vehicle would leave an
-    autonomous mode."""
+    """True if our last sticks do not look like a hand, which would end an autonomous mode."""
     stick_override_ns: int | None = None
     """Vehicle's last report that moving sticks have changed its mode."""
     refused_mode: str | None

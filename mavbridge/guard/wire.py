@@ -103,8 +103,7 @@ class GuardMessage(NamedTuple):
 
 
 class LastWords(NamedTuple):
-    """Packets that the flight process sends the vehicle if the guard dies; replaces the previous
-    ones."""
+    """Packets for the flight process to send if the guard dies; replaces the previous ones."""
 
     phase: Phase
     """Phase of the guard when it prepared the packets."""
@@ -208,8 +207,7 @@ def decode_from_guard(data: bytes) -> FromGuard:
 
 
 class _Unpickler(pickle.Unpickler):
-    """Unpickler for our own classes. Importing anything else, such as numpy, would stall the
-    guard."""
+    """Unpickler for our own classes: importing others, such as numpy, would stall the guard."""
 
     def find_class(self, module: str, name: str) -> Any:
         """Return a class of our own, or raise UnpicklingError."""

@@ -52,8 +52,7 @@ from mavbridge.mavlink.transport.sockets import Address, Transport
 
 SOURCE_COMPONENT = dialect.MAV_COMP_ID_ONBOARD_COMPUTER
 _EARLY_REQUEST_NS = 20 * NS_PER_MS
-"""Two stick periods at the usual rate: a due request leaves before a stick message, never after
-it."""
+"""Two usual stick periods: a due request leaves before a stick message, never after it."""
 _HEARTBEAT_HZ = 1.0
 
 
@@ -110,8 +109,7 @@ class MavlinkLink:
         self._duplicate_systems = DuplicateSystems()
 
     def poll(self) -> LinkSnapshot:
-        """Receive everything that has arrived, without blocking. ``service`` does all other
-        work."""
+        """Receive everything that has arrived; never block. ``service`` does the rest."""
         self._receive_all()
         if self.vehicle is not None and self.vehicle.has_rebooted:
             self._interrupt(because(Code.REBOOTED))
@@ -233,8 +231,7 @@ class MavlinkLink:
             self._packets.append(ForwardedPacket(arrived_ns, happened_ns, message.packet))
 
     def _notice_other(self, identity: VehicleIdentity, sender: Address | None, now_ns: int) -> None:
-        """Handle another address with the vehicle's system id; its packets are ignored while
-        engaged."""
+        """Handle another sender with the vehicle's system id, ignored while engaged."""
         heard_ns = self._counters.heard_ns if self.is_engaged else now_ns
         told = self._duplicate_systems.notice(identity, sender, now_ns, heard_ns)
         if isinstance(told, str):

@@ -1,5 +1,4 @@
-"""Conversion between sticks and PWM by the vehicle's radio calibration; the only table of signs and
-channels."""
+"""Sticks to PWM and back by the vehicle's radio calibration; the only table of their signs."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
@@ -84,8 +83,7 @@ class RcCalibration:
     """Channel, sign and centre [us] of each stick, in the order of ``Sticks``."""
 
     def __post_init__(self) -> None:
-        """Raise ValueError if two sticks share a channel, or a trim or the failsafe is out of
-        range."""
+        """Raise ValueError for a shared channel, or a trim or failsafe out of range."""
         numbers = [channel.number for channel in self.channels]
         if len(set(numbers)) != 4:
             raise ValueError(
@@ -116,8 +114,7 @@ class RcCalibration:
         return self.throttle, self.yaw, self.pitch, self.roll
 
     def stick_channels_us(self, channels_us: Sequence[int]) -> Pwm | None:
-        """Return the PWM of the four sticks among a vehicle's channels; None if it has fewer than
-        eight."""
+        """Return the PWM of the four sticks; None for a vehicle with fewer than eight channels."""
         if len(channels_us) < 8:
             return None
         t, y, p, r = (channels_us[channel.number - 1] for channel in self.channels)

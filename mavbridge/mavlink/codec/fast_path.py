@@ -17,8 +17,7 @@ from mavbridge.mavlink.codec.signing import SIGNATURE_BYTES, SIGNED
 
 _MAVLINK_2 = 0xFD
 _HEADER = struct.Struct("<BBBBBBBHB")
-"""Marker, payload length, incompatibility and compatibility flags, sequence, system, component,
-id."""
+"""Marker, payload length, incompatible and compatible flags, sequence, system, component, id."""
 _HEADER_BYTES, _CHECKSUM_BYTES = 10, 2
 _OVERRIDE = dialect.MAVLink_rc_channels_override_message
 _OVERRIDE_PAYLOAD = struct.Struct("<8H2B")
@@ -80,8 +79,7 @@ CRC_EXTRA: dict[int, int] = {
 
 
 def packet_end(data: bytes, at: int) -> int | None:
-    """Return the end of the MAVLink 2 packet that begins at ``at``; None if there is no whole
-    one."""
+    """Return the end of the MAVLink 2 packet at ``at``; None if there is no whole one."""
     if len(data) - at < _HEADER_BYTES + _CHECKSUM_BYTES or data[at] != _MAVLINK_2:
         return None
     end = at + _HEADER_BYTES + data[at + 1] + _CHECKSUM_BYTES
@@ -128,8 +126,7 @@ def decode_packet(data: bytes) -> ReceivedMessage | None:
 def pack_override(
     source: Endpoint, sequence: int, target: Endpoint, channels_us: Sequence[int]
 ) -> bytes:
-    """Encode RC_CHANNELS_OVERRIDE of channels 1 to 8. MAVLink 2 truncates trailing zeros of a
-    payload."""
+    """Encode RC_CHANNELS_OVERRIDE of channels 1 to 8, without trailing zeros (MAVLink 2)."""
     payload = _OVERRIDE_PAYLOAD.pack(*channels_us, *target).rstrip(b"\0") or b"\0"
     header = _HEADER.pack(_MAVLINK_2, len(payload), 0, 0, sequence, *source, _OVERRIDE.id, 0)
     packet = header + payload

@@ -87,8 +87,7 @@ WRAP_US = 2**32 * 1000
 def later_by_us(stamp_us: int, other_us: int) -> int:
     """Return the time from one timestamp of the vehicle's clock to another; negative: earlier.
 
-    A difference of less than ``RESTART_STEP_US`` across the wrap is a wrap: no vehicle reboots that
-    fast.
+    Less than ``RESTART_STEP_US`` across the wrap is a wrap: no vehicle reboots that fast.
     """
     across_us = (stamp_us - other_us + RESTART_STEP_US) % WRAP_US - RESTART_STEP_US
     return across_us if across_us <= RESTART_STEP_US else stamp_us - other_us
@@ -181,8 +180,7 @@ class ParamValue(NamedTuple):
     """MAV_PARAM_TYPE."""
 
     def from_bytes(self) -> "ParamValue":
-        """Return the value of a vehicle that stores integers in the bytes of the float, such as
-        PX4."""
+        """Return the value of a vehicle that stores integers in the float's bytes (PX4)."""
         if self.kind != dialect.MAV_PARAM_TYPE_INT32:
             return self
         (number,) = _INTEGER.unpack(_REAL.pack(self.value))
@@ -281,8 +279,7 @@ class ParamWrite(NamedTuple):
     """MAV_PARAM_TYPE."""
 
     def as_bytes(self) -> "ParamWrite":
-        """Return the write for a vehicle that reads integers from the bytes of the float, such as
-        PX4."""
+        """Return the write for a vehicle that reads integers from the float's bytes (PX4)."""
         if self.kind != dialect.MAV_PARAM_TYPE_INT32:
             return self
         number = round(min(max(self.value, _LEAST), _MOST))

@@ -24,8 +24,7 @@ LATEST_TICKS = 2**48 - 2**40
 MOST_LAG_TICKS = 60 * 10**9 // TICK_NS
 """Largest lag behind our clock at which an unknown stream is accepted: one minute."""
 _RADIO_STATUS = 109
-"""Sent by the telemetry radio itself, which has no key; accepted unsigned, as nothing depends on
-it."""
+"""From the telemetry radio, which has no key: accepted unsigned, as nothing depends on it."""
 LINK_ID, LAST_WORDS_LINK_ID = 0, 1
 """Link ids of the guard's packets, and of the last words. Those are signed in advance as a separate
 stream, within ``MOST_LAG_TICKS`` of the guard's."""

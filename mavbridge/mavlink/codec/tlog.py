@@ -26,8 +26,7 @@ class Skipped:
     bytes: int = 0
     """Number of bytes outside any packet."""
     packets: int = 0
-    """Number of lost packets, from gaps in the senders' sequence numbers around the damage; at
-    least one."""
+    """Lost packets, by gaps in the senders' sequence numbers around the damage; at least one."""
 
     def describe(self, path: Path) -> str | None:
         """Return a sentence for the user; None if nothing was skipped."""
@@ -81,8 +80,7 @@ def _records(data: mmap.mmap, skipped: Skipped) -> Iterator[tuple[int, RawPacket
 def _packet_at(data: mmap.mmap, at: int) -> RawPacket | None:
     """Return the packet of the record at ``at`` if its checksum is valid.
 
-    If the checksum cannot be tested, another record must follow the packet, and none begin inside
-    it.
+    If it cannot be tested, another record must follow the packet, and none begin inside it.
     """
     packet = frame_at(data, at + _STAMP_BYTES)
     if packet is None or (is_sound := _is_sound(packet)) is False:

@@ -164,8 +164,7 @@ class AttitudeOutput(SetpointOutput):
         self._scale = None
 
     def encode(self, action: Action, vehicle: VehicleSession, now_ns: int) -> Encoded | None:
-        """Encode the setpoint; return None for an attitude before the vehicle's heading is
-        known."""
+        """Encode the setpoint; None for an attitude before the vehicle's heading is known."""
         if not isinstance(action, AttitudeThrust | BodyRates):
             raise CommandRefusedError(f"{type(action).__name__} has neither attitude nor rates")
         if not (all(map(math.isfinite, action)) and 0.0 <= action.thrust <= 1.0):
@@ -232,8 +231,7 @@ class AttitudeOutput(SetpointOutput):
         return hover / self._trained_hover
 
     def _compare(self, body: Body | None, vehicle: VehicleSession, arrived_ns: int) -> None:
-        """Process the vehicle's attitude, force and echo, by arrival: PX4's echo has an old
-        timestamp."""
+        """Process attitude, force and echo, by their arrival: PX4's echo has an old timestamp."""
         match body:
             case Attitude():
                 self._measured_rad = heading_rad(body.ned_from_body_wxyz)

@@ -24,8 +24,7 @@ SILENT_US = 400_000
 """Longest time that the echo may be constant, by the vehicle's clock. The command changes every 25
 ms, so that 20 % of loss in both directions leaves a dozen changes in this time."""
 SILENT_SAMPLES = 8
-"""Fewest echo messages in that time, the number at 20 Hz: after losses, a few may agree by
-chance."""
+"""Fewest echo messages in SILENT_US, as at 20 Hz: after losses a few may agree by chance."""
 OFTEN_US = 500_000
 RETURNED_SAMPLES = 2
 """Samples within OFTEN_US at the values before our first command that count as a fault. One is a
@@ -50,15 +49,13 @@ class EchoRules:
     tolerance: int
     """Largest difference from the sent value, and largest movement of another source at rest."""
     release_tolerance: int = 0
-    """Tolerance after the release, to tell our last values from another source that rests beside
-    them."""
+    """Tolerance after the release, to tell our last values from a source at rest beside them."""
     dithered: int
     """Index of the number that is dithered, so that its echo changes."""
     dither: int
     """Dither step after the echo is confirmed."""
     seek_dither: int
-    """Dither step before that: above ``tolerance``, so that an idle source is not mistaken for our
-    echo."""
+    """Dither step before: above ``tolerance``, so that no idle source is mistaken for our echo."""
     centre: int
     """Value towards which the dither goes."""
     foreign_samples: int = 1
@@ -101,8 +98,7 @@ class EchoCheck:
         self.is_released = True
         """True if values other than ours were shown since the release, or none was ever sent."""
         self.shows_last = False
-        """True if the vehicle still echoes our last command, or values indistinguishable from
-        it."""
+        """True if the vehicle still echoes our last command, or values like it."""
         self.has_sent = False
         """True if a command was sent in this session."""
 
@@ -124,8 +120,7 @@ class EchoCheck:
     def with_dither(self, wanted: Shown, now_ns: int) -> Shown:
         """Return the values to send, one of them dithered by up to two steps towards the centre.
 
-        The echo of a vehicle that receives us then keeps changing, and differs from another source
-        at rest.
+        The echo of a vehicle that hears us then keeps changing, unlike another source at rest.
         """
         rules, at = self._rules, self._rules.dithered
         step = rules.dither if self.confirmed else rules.seek_dither

@@ -47,8 +47,7 @@ class ActionOutput(ABC):
         self._rules = rules
         self.echo = EchoCheck(rules)
         self.saturated: Counter[str] = Counter()
-        """Number of messages, by stick, in which the policy asked for more than the vehicle can
-        do."""
+        """Number of messages, by stick, that demanded more than the vehicle can do."""
         self._was_confirmed = False
 
     def restart(self) -> None:

@@ -1,5 +1,4 @@
-"""Outputs for sticks: RC_CHANNELS_OVERRIDE (ArduPilot) and MANUAL_CONTROL (PX4), with echo
-checks."""
+"""Outputs for sticks: RC_CHANNELS_OVERRIDE (ArduPilot), MANUAL_CONTROL (PX4), with echoes."""
 
 from collections.abc import Mapping
 from dataclasses import replace
@@ -161,8 +160,7 @@ class OverrideOutput(StickOutput):
     def __init__(self, codec: Codec, gains: StickGains | None) -> None:
         super().__init__(codec, OVERRIDE_ECHO, gains)
         self._calibration: RcCalibration | None = None
-        """Calibration of the last override, kept for the release even after a reboot of the
-        vehicle."""
+        """Calibration of the last override, for its release even after a reboot."""
         self._last: Shown = (0, 0, 0, 0)
         """Last override [us]: throttle, yaw, pitch, roll."""
         self._status: VehicleStatus | None = None
@@ -203,8 +201,7 @@ class OverrideOutput(StickOutput):
         return super().in_policy_terms(status, vehicle, now_ns)
 
     def last_sticks(self, vehicle: VehicleSession, now_ns: int) -> Encoded | None:
-        """Return level sticks for an armed vehicle without a receiver, with the last throttle in
-        thrust modes.
+        """Level an armed vehicle without a receiver, with the last throttle in thrust modes.
 
         Return None once a failsafe has chosen its mode: sticks would clear a radio failsafe, which
         would fire again a second later in any mode that the pilot has set by then.
@@ -248,15 +245,13 @@ _MODES = ("ALTCTL", "POSCTL", "MANUAL", "STABILIZED", "ACRO")
 """Modes flown by sticks. In other modes the last sticks do nothing, but a jump may be taken for the
 pilot's hand, which ends the mode."""
 _HELD_NS = 700 * NS_PER_MS
-"""Time for which PX4 holds and echoes the last sticks: 0.5 s (COM_RC_LOSS_T) plus a poll of 0.2
-s."""
+"""Time for which PX4 holds and echoes the last sticks: 0.5 s (COM_RC_LOSS_T) + 0.2 s of polling."""
 
 
 _SPEED_TAU_S = 0.1
 """Time constant of PX4's low-pass of the stick speed (``MovingDiff``); 1.18 is faster."""
 _REST_SHARE = 0.5
-"""Fraction of a hand's speed that counts as rest; covers a jump that packet loss delays by 70
-ms."""
+"""Fraction of a hand's speed that counts as rest, even if lost packets delay a jump by 70 ms."""
 
 
 class StickSpeeds:
@@ -321,8 +316,7 @@ class ManualControlOutput(StickOutput):
         self._speeds.sent(self._last, now_ns)
 
     def are_sticks_at_rest(self, vehicle: VehicleSession) -> bool:
-        """True if our sticks move more slowly than a hand, by the parameter of this firmware
-        version."""
+        """True if our sticks are slower than a hand, by this firmware version's parameter."""
         hand_per_s = vehicle.profile.hand_per_s(vehicle.known_params)
         return self._speeds.fastest_per_s < _REST_SHARE * hand_per_s
 

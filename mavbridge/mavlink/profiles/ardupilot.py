@@ -95,8 +95,7 @@ class ArduPilot(Profile):
         return StreamGroup(("RC_CHANNELS",), RC_CHANNELS_HZ)
 
     def more_params(self, values: Mapping[str, float]) -> tuple[str, ...]:
-        """Return calibration and dead zones of RCMAP_*'s channels, and settings that turn
-        sticks."""
+        """Return calibration, dead zones and stick settings of RCMAP_*'s channels."""
         names = ardupilot_params.calibration_names(values)
         settings = ardupilot_params.stick_setting_names(values)
         return names + ardupilot_params.dead_zone_names(values) + settings

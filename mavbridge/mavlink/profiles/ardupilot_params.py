@@ -77,8 +77,7 @@ def dead_zone_names(values: Mapping[str, float]) -> tuple[str, ...]:
 
 
 def stick_setting_names(values: Mapping[str, float]) -> tuple[str, ...]:
-    """Return the names in ``stick_settings`` that are not read first, as far as RCMAP_* is
-    known."""
+    """Return the names in ``stick_settings`` not read first, as far as RCMAP_* is known."""
     names = (each.name for each in stick_settings(values))
     return tuple(name for name in names if name not in FIRST_NAMES)
 

@@ -26,8 +26,7 @@ _LEAN_MODES = ("ALT_HOLD", "STABILIZE")
 """Modes in which sticks are a lean and a yaw rate."""
 _CLIMB_MODE = "ALT_HOLD"
 _MAX_LEAN_DEG = 85.0
-"""``_MAX_LEAN_DEG``, ``_MAX_THR_DZ``, ``_MIN_EXPO`` and ``_MAX_EXPO`` are limits of the
-firmware."""
+"""Firmware limits: ``_MAX_LEAN_DEG``, ``_MAX_THR_DZ``, ``_MIN_EXPO`` and ``_MAX_EXPO``."""
 _MAX_THR_DZ = 400.0
 _MIN_EXPO, _MAX_EXPO = -0.5, 0.95
 
@@ -116,8 +115,7 @@ def _centred(values: Mapping[str, float], stick: str, half: Half, sign: float) -
 
 
 def _throttle(values: Mapping[str, float], up: str, down: str) -> Axis:
-    """Return the climb-rate axis: dead zone THR_DZ [permille] around the middle, RC3_DZ [us] lost
-    at the bottom."""
+    """Return the climb-rate axis: dead zones THR_DZ [permille] (middle), RC3_DZ [us] (bottom)."""
     name = f"RC{int(values['RCMAP_THROTTLE'])}_"
     range_us = values[name + "MAX"] - values[name + "MIN"]
     lost = min(max(values[name + "DZ"] / range_us, 0.0), 0.4) if range_us > 0.0 else 0.0

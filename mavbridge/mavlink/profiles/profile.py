@@ -104,8 +104,7 @@ NO_HEALTH = "a low battery and a receiver that fails are not seen"
 
 
 HOME_HEIGHT = optional_stream("GLOBAL_POSITION_INT", 20.0, least_hz=5.0)
-"""Height above home, for policies that take it; somewhat faster than the age limit of a
-velocity."""
+"""Height above home, for policies that take it; fresher than the age limit of a velocity."""
 
 
 class EventMeaning(NamedTuple):
@@ -168,8 +167,7 @@ class Danger(NamedTuple):
 
 
 LONGEST_SETPOINT_S = 3.0
-"""Longest time for which a vehicle may follow the last setpoint of a dead guard; ArduPilot's
-default."""
+"""Longest time to follow the last setpoint of a dead guard; ArduPilot's default."""
 
 
 def setpoint_danger(values: Mapping[str, float], name: str) -> Iterator[Danger]:
@@ -232,8 +230,7 @@ class Profile(ABC):
     is_bytewise: ClassVar[bool] = False
     """True if PARAM_VALUE and PARAM_SET carry an integer in the bytes of their float."""
     sends_invalid_estimates: ClassVar[bool] = False
-    """True if LOCAL_POSITION_NED also comes without a valid estimate: the estimator's flags
-    decide."""
+    """True if LOCAL_POSITION_NED also comes without a valid estimate: see the estimator's flags."""
     shows_rates: ClassVar[bool] = False
     """True if ATTITUDE_TARGET shows body rates as sent, but not their thrust."""
     has_rc_channels_always: ClassVar[bool] = True
@@ -332,8 +329,7 @@ class Profile(ABC):
         return math.inf
 
     def climb_limits(self, values: Mapping[str, float]) -> tuple[float, float]:
-        """Return the climb and descent [m/s] to which it clips velocity setpoints, also in its
-        echo."""
+        """Return climb and descent [m/s] to which it clips velocity setpoints and their echo."""
         return math.inf, math.inf
 
     @abstractmethod

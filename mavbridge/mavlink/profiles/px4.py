@@ -305,8 +305,7 @@ class Px4(Profile):
         return hand_per_s if hand_per_s > 0.0 else math.inf
 
     def climb_limits(self, values: Mapping[str, float]) -> tuple[float, float]:
-        """Return MPC_Z_VEL_MAX_UP and _DN, at least 0: a negative limit would reverse the
-        motion."""
+        """Return MPC_Z_VEL_MAX_UP and _DN; below 0 they would reverse the motion."""
         climb_mps = values.get("MPC_Z_VEL_MAX_UP", 3.0)
         return max(climb_mps, 0.0), max(values.get("MPC_Z_VEL_MAX_DN", 1.5), 0.0)
 

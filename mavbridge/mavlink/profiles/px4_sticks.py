@@ -45,8 +45,7 @@ class CubicExpo(NamedTuple):
         return share * (1.0 - self.expo + self.expo * share * share)
 
     def straightened(self, share: float) -> float:
-        """Return the fraction of the stick: the real root, by the hyperbolic form of Cardano's
-        formula."""
+        """Return the fraction of the stick: the real root, by Cardano's hyperbolic formula."""
         linear = 1.0 - self.expo
         if linear < _LEAST_LINEAR:
             return math.cbrt(share)
@@ -91,8 +90,7 @@ def _expo(values: Mapping[str, float], name: str) -> Bend | None:
 
 
 def _lean(tilt_deg: float, *, is_tangent: bool) -> VehicleLean:
-    """Return the lean, without a dead zone. Sticks are an acceleration in ALTCTL, a tilt in
-    STABILIZED."""
+    """Return the lean: no dead zone; an acceleration in ALTCTL, a tilt in STABILIZED."""
     tilt_deg = min(tilt_deg, _MAX_TILT_DEG)
     full = math.tan(math.radians(tilt_deg)) if is_tangent else tilt_deg
     axis = Axis.even(Half(full))

@@ -142,8 +142,7 @@ class VehicleCondition:
         may_be_ours: bool,
         is_released: bool,
     ) -> None:
-        """Process RC_CHANNELS: the message, its four stick channels, and the sticks that they
-        mean."""
+        """Process RC_CHANNELS with its four stick channels and the sticks that they mean."""
         self._status = None
         self.rc, self._rc_sticks = (arrived_ns, rc), sticks
         if not may_be_ours and channels_us:
@@ -250,8 +249,7 @@ class VehicleCondition:
     def _position_ned_m(
         self, now_ns: int, is_valid: bool | None
     ) -> tuple[float, float, float] | None:
-        """Return the position if it is valid: some firmware also sends it without a valid
-        estimate."""
+        """Return the position if valid: some firmware also sends one without an estimate."""
         is_trusted = is_valid is None and not self._profile.sends_invalid_estimates
         is_good = is_valid is True or is_trusted
         if self._position is None or not is_good:

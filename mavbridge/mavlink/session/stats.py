@@ -25,8 +25,7 @@ class LinkCounters:
         self.sent = 0
 
     def receive(self, name: str, sequence: int, arrived_ns: int) -> None:
-        """Count one message; a gap in its 8-bit sequence number counts as lost messages (modulo
-        256)."""
+        """Count one message, and a gap in its 8-bit sequence number as losses (modulo 256)."""
         is_known = name in self._by_name or len(self._by_name) < _MOST_NAMES
         self._by_name[name if is_known else _REST] += 1
         if self._last_sequence is not None:

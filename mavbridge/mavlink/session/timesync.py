@@ -10,16 +10,14 @@ from mavbridge.core.reasons import Code, Reason, because
 from mavbridge.mavlink.codec.messages import WRAP_US, Timesync
 
 TIMESYNC_HZ = 5.0
-"""Rate of requests: the offset is good one second after the first, and a step is seen within 0.2
-s."""
+"""Request rate: the offset is good one second after the first, a step is seen within 0.2 s."""
 GOOD_EXCHANGES = 5
 """Number of agreeing exchanges after which the vehicle's stamps are trusted."""
 LONGEST_ROUND_TRIP_NS = 2 * NS_PER_S
 """Longest useful round trip: slower ones say too little about the offset, and a link this slow
 loses its heartbeats."""
 UNIX_US = 10**15
-"""Stamps from here on are Unix time, by MAVLink's rule for ``time_usec``; no vehicle runs that
-long."""
+"""Stamps from here on are Unix time (MAVLink's rule for ``time_usec``), too late for an uptime."""
 MAX_AHEAD_NS = 20 * NS_PER_MS
 """Largest lead of a stamp over our time, beyond the offset's error: simulator clocks are uneven."""
 SAME_CLOCK_NS = 100 * NS_PER_MS
@@ -36,8 +34,7 @@ clock step or a paused simulator is no slow clock."""
 SLOW_PACE = 0.9
 """Pace, relative to our clock, below which the vehicle is a slow simulator."""
 _DRIFT_PER = 10_000
-"""Clocks may drift apart by 1 in 10,000; crystals of autopilots and computers drift by half of
-that."""
+"""Clocks may drift apart by 1 in 10,000; crystals of autopilots and computers drift by half."""
 _UNSTEADY_PER = 200
 """A clock that is off by more than 1 in 200 has stepped, or runs unevenly."""
 _UNEVEN_NS = 10 * NS_PER_MS

@@ -72,8 +72,7 @@ class Transport(Protocol):
     """Non-blocking connection to a vehicle; not thread-safe."""
 
     def open(self) -> None:
-        """Open the socket or port. Raise UserError if a retry will not help, TransportDownError if
-        it may."""
+        """Open the socket or port; raise UserError, or TransportDownError if a retry may help."""
         return
 
     def drain(self) -> Iterator[Received]:

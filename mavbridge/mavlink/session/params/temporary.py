@@ -55,8 +55,7 @@ class TemporaryParams:
         before: dict[str, float],
         report: Callable[[str], None],
     ) -> None:
-        """``before``: old values of the changed parameters, by name; outlives a reboot of the
-        vehicle."""
+        """``before``: old values of changed parameters, by name; outlives a vehicle's reboot."""
         self._wanted = dict(wanted)
         self._before = before
         self._report = report

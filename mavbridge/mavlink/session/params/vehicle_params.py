@@ -301,6 +301,5 @@ class VehicleParams:
         return self._assessed[1]
 
     def restore(self) -> bool:
-        """Restore the parameters set for the flight; return True if nothing more can be done
-        now."""
+        """Restore what was set for the flight; return True if nothing more can be done now."""
         return self._changes.restore()
