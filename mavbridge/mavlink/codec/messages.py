@@ -85,7 +85,7 @@ WRAP_US = 2**32 * 1000
 
 
 def later_by_us(stamp_us: int, other_us: int) -> int:
-    """Return the time from one timestamp of the vehicle's clock to another; negative: earlier.
+    """Return the time by which one stamp of the vehicle's clock is later than another.
 
     Less than ``RESTART_STEP_US`` across the wrap is a wrap: no vehicle reboots that fast.
     """

@@ -43,8 +43,8 @@ _PACKET_STARTS = (b"\xfd", b"\xfe")
 GESTURE_Z, MOST_LOW_R = 150, 800
 """PX4 arms and disarms if z < 100 and |r| > 900 for one second; both bounds include a margin."""
 MOST_LEAN_RAD = math.radians(85.0)
-"""``MOST_...``: hard limits of the encoder, wider than any setting of a flight; beyond them lies a
-bug upstream. Neither autopilot limits the lean of a setpoint by itself."""
+"""Hard limits of lean, rates, speed and norm, wider than any setting of a flight: excess is a bug
+upstream. Neither autopilot limits the lean of a setpoint by itself."""
 MOST_RATE_RADPS = 40.0
 MOST_SPEED_MPS = 150.0
 MOST_NORM_ERROR = 1e-4

@@ -117,8 +117,8 @@ class AttitudeOutput(SetpointOutput):
     """SET_ATTITUDE_TARGET, with an attitude or with body rates.
 
     Thrust is scaled so that the hover thrust of training hovers here. With body rates, thrust acts
-    along the body axis on every firmware: a boost that the autopilot adds in a lean is divided out.
-    With an attitude, that boost stays.
+    along the body axis on every firmware: a boost that the autopilot adds in a lean is cancelled.
+    With an attitude, the boost stays.
     """
 
     _echo_message = "ATTITUDE_TARGET"
@@ -134,7 +134,7 @@ class AttitudeOutput(SetpointOutput):
         self._scale: float | None = None
         """Ratio of the vehicle's thrust to the policy's; constant during a stream."""
         self._has_guessed = self._has_told = False
-        """True if no source tells the vehicle's hover thrust; True if the user was told so."""
+        """The vehicle's hover thrust is unknown; the user was told so."""
         self._heading = HeadingTarget()
         self._measured_rad: float | None = None
         self._is_level = False

@@ -27,8 +27,8 @@ SILENT_SAMPLES = 8
 """Fewest echo messages in SILENT_US, as at 20 Hz: after losses a few may agree by chance."""
 OFTEN_US = 500_000
 RETURNED_SAMPLES = 2
-"""Samples within OFTEN_US at the values before our first command that count as a fault. One is a
-stray release of another station; a joystick at 50 Hz causes a quarter to a half of 29 RC_CHANNELS.
+"""Samples within OFTEN_US that show the values from before us and count as a fault. One is a stray
+release of another station; a joystick at 50 Hz causes a quarter to a half of 29 RC_CHANNELS.
 Values that only another overrider can have sent are a fault at the first sample: at 10 Hz they are
 shown only once or twice."""
 DITHER_STEP_NS = 25 * NS_PER_MS
@@ -98,7 +98,7 @@ class EchoCheck:
         self.is_released = True
         """True if values other than ours were shown since the release, or none was ever sent."""
         self.shows_last = False
-        """True if the vehicle still echoes our last command, or values like it."""
+        """True if the vehicle shows our last command since the release, or values like it."""
         self.has_sent = False
         """True if a command was sent in this session."""
 

@@ -131,7 +131,7 @@ class ActionOutput(ABC):
 
     @property
     def shows_last(self) -> bool:
-        """True if the vehicle still shows our last command since the release, or values like it."""
+        """True if the vehicle shows our last command since the release, or values like it."""
         return self.echo.shows_last
 
     def are_sticks_at_rest(self, vehicle: VehicleSession) -> bool:

@@ -23,8 +23,8 @@ within 30 ms; five samples take 50 to 100 ms, so that a mode change is reported 
 
 
 class SetpointOutput(ActionOutput):
-    """Setpoints. The vehicle leaves the last one only by a mode change or a timeout, so the release
-    is silence, and the output repeats nothing by itself.
+    """Setpoints. Only a mode change takes the vehicle away from the last one, so the release is
+    silence, and the output repeats nothing by itself.
 
     The echo is checked while the vehicle is armed, in the air and in a mode that follows setpoints;
     in other states a different target is normal.

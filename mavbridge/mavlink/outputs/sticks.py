@@ -303,7 +303,7 @@ class ManualControlOutput(StickOutput):
         self._sent_ns = 0
         self._speeds = StickSpeeds()
         self._shown: tuple[int, Sticks] | None = None
-        """Sticks that the vehicle acts on, after their arrival."""
+        """Arrival of the sticks that the vehicle acts on, and those sticks."""
         self._pilot: Sticks | None = None
         """Sticks that the vehicle acted on when they were not ours."""
         self._status: VehicleStatus | None = None

@@ -27,9 +27,9 @@ from mavbridge.mavlink.profiles.profile import (
 from mavbridge.mavlink.profiles.sticks import StickCurves
 
 RC_CHANNELS_HZ = 1000 / 17
-"""Rate of RC_CHANNELS for the echo check, which needs at least 20 Hz. Every 17 ms (ArduPilot counts
-in whole ms): no usual joystick rate (10, 20, 25, 50 Hz) is in step with it and stays unseen between
-two samples. Costs 3.2 kB/s."""
+"""Rate of RC_CHANNELS for the echo check, which needs at least 20 Hz: every 17 ms (ArduPilot counts
+in whole ms), so that no joystick at a usual rate (10, 20, 25, 50 Hz) is in step with it and hides
+between two samples. Costs 3.2 kB/s."""
 HEARTBEAT_HZ = 10.0
 """Shows arming within 100 ms despite one lost packet (at 1 Hz within 1 s); a mode change is sent at
 once at any rate."""

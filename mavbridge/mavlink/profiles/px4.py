@@ -192,7 +192,7 @@ class Px4(Profile):
         return values.get("COM_RC_IN_MODE") in (1.0, 4.0)
 
     def obstacles(self, values: Mapping[str, float], context: ParamContext) -> Iterator[ParamNote]:
-        """Yield COM_RC_IN_MODE without MAVLink's sticks, and a gesture that a policy might make."""
+        """Yield a COM_RC_IN_MODE without MAVLink's sticks, and a gesture a policy might make."""
         if context.output != "manual-control":
             return
         yield from stick_obstacles(_STICK_SETTINGS, values)
@@ -241,7 +241,7 @@ class Px4(Profile):
             )
 
     def hints(self, values: Mapping[str, float], context: ParamContext) -> Iterator[ParamNote]:
-        """Yield stick losses that end other modes, and the gesture that arms."""
+        """Yield settings by which lost sticks end other modes, and the gesture that arms."""
         exceptions = values.get("COM_RCL_EXCEPT")
         is_sticks = context.output == "manual-control"
         bit, mode = (_EXCEPT_HOLD, "AUTO") if is_sticks else (_EXCEPT_OFFBOARD, "OFFBOARD")

@@ -16,8 +16,8 @@ SAME_GAIN = 0.01
 """A stick is not mapped if the vehicle's motion at full stick is within this fraction of the
 policy's, and the dead zones differ by at most this fraction of the travel (see also SAME_END)."""
 SAME_END = 0.1
-"""Largest difference in the travel of full motion at which a stick is not mapped. ArduPilot's
-throttle is full before the bottom (RC3_DZ, 0.06 by default), for policies trained on it too."""
+"""Largest gap in travel between full motion and the stop of a stick that is not mapped. ArduPilot's
+throttle has one at the bottom (RC3_DZ, 0.06 by default), also for the policies trained on it."""
 MAX_DEAD_ZONE = 0.9
 _ROUNDING = 1e-9
 """Tolerance for rounding of a motion at the limit."""

@@ -147,8 +147,8 @@ class TimesyncFilter:
     def late_sending(self) -> Reason | None:
         """Why our packets reach the vehicle too late, or None.
 
-        The way is known to within the error of the offset. A link that was equally slow from the
-        beginning, in both directions, is therefore not detected.
+        The time on the way is known to within the error of the offset. A link that was equally slow
+        from the beginning, in both directions, is therefore not detected.
         """
         if not self.is_good or not self._sending_ns:
             return None

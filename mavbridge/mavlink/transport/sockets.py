@@ -40,7 +40,7 @@ STALE_NS = 100 * NS_PER_MS
 """Longest time for a byte in a serial port's queue: the usual age limit of a state."""
 _TCP_STALE_MS = 500
 """Longest time for which sent bytes may stay unacknowledged on TCP. Then the connection closes, and
-discards the sticks queued in the kernel. As long as the detection of sticks that are not heard."""
+discards the sticks queued in the kernel. Equal to the detection time of unheard sticks."""
 _CHUNK_BYTES = 65536
 _STREAM_BYTES = 2048
 """Bytes read from a TCP stream at once: some fifty packets, after which a reader may stop."""

@@ -88,9 +88,9 @@ _FOLLOW_UPS = 3
 class VehicleParams:
     """Reads the parameters, sets some for the flight, and tells why they forbid one.
 
-    All relevant parameters are read at once, for any output. Values received later, changed by
-    anyone, count at once as problems. The calibration follows while the vehicle is disarmed; a
-    relevant change in flight is an interruption.
+    All relevant parameters are read at once, for any output. Later values, set by anyone, affect
+    the problems at once. The calibration follows while the vehicle is disarmed; a change in flight
+    that matters is an interruption.
     """
 
     def __init__(
