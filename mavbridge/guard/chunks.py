@@ -306,7 +306,7 @@ class ChunkBuffer:
         if self._seen is None:
             return Lateness("chunk", silent_ns, self.grace_ns, "flight process", silent_ns, said)
         name, happened_ns, limit_ns = min(self._ages(self._seen), key=lambda age: age[1] + age[2])
-        is_stall = self._until_ns > self._grace_until_ns  # the ages may exceed their limits
+        is_stall = self._until_ns > self._grace_until_ns  # ages may exceed their limits then
         if is_stall or now_ns <= happened_ns + limit_ns:
             is_over = now_ns > self._end_ns
             name, happened_ns = "horizon" if is_over else "chunk", self._taken_ns

@@ -208,8 +208,10 @@ class GuardLoop:
     def _has_work(
         self, snapshot: LinkSnapshot, given: GuardInput, at_ns: int, slot_ns: int
     ) -> bool:
-        """True if the guard must step. False in flight between two slots, if the last step is under
-        10 ms old and only the vehicle's motion has changed."""
+        """True if the guard must step.
+
+        False in flight, between slots, within 10 ms of a step, if only motion has changed.
+        """
         status = snapshot.status
         known = (_LINK(snapshot), status and _STATUS(status), self._link.outlet)
         before, self._known = self._known, known
@@ -224,7 +226,7 @@ class GuardLoop:
         """Call ``send``. An error becomes a fault of the flight instead of ending the guard."""
         try:
             return send()
-        except Exception as error:  # noqa: BLE001 - the vehicle is held: end the flight normally
+        except Exception as error:  # noqa: BLE001 - the vehicle is held: an orderly end
             at = traceback.extract_tb(error.__traceback__)[-1]
             self._command_fault = because(
                 Code.COMMAND_FAILED,

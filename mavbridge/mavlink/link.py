@@ -277,9 +277,10 @@ class MavlinkLink:
         return {} if self.vehicle is None else self.vehicle.params.values
 
     def restore(self) -> bool:
-        """Let ``service`` restore the parameters set for the flight. Call at every tick until it
-        returns True: everything is restored, or nothing more can be done, after some 3 s at
-        most."""
+        """Let ``service`` restore the parameters set for the flight; call at every tick until True.
+
+        True: everything is restored, or nothing more can be done; after some 3 s at most.
+        """
         return self.vehicle is None or self.vehicle.params.restore()
 
     def service(self) -> None:
@@ -362,8 +363,7 @@ class MavlinkLink:
     def rehearse(
         self, plan: Iterable[tuple[int, Decision | None, str | None]]
     ) -> tuple[tuple[int, bytes], ...]:
-        """Encode decisions and mode requests, with their delays [ns], for another process to send
-        if this one dies; no state changes."""
+        """Encode decisions and mode requests, with delays [ns], as last words; no side effects."""
         return () if self._config.readonly else tuple(self._sender.rehearse(plan))
 
     @property

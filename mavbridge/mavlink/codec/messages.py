@@ -69,8 +69,7 @@ class SpecificForce(NamedTuple):
 
 
 class RcChannels(NamedTuple):
-    """RC_CHANNELS (65): channels that the vehicle acts on [us]; 0: not a radio's value (unused,
-    65535, out of range)."""
+    """RC_CHANNELS (65): channels that the vehicle acts on [us]; 0: unused, 65535, out of range."""
 
     channels_us: tuple[int, ...]
     boot_us: int = 0

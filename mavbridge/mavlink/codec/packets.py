@@ -191,8 +191,7 @@ class Codec:
         return packet if self.signing is None else self.signing.sign(packet, crc_extra)
 
     def encode_heartbeat(self, kind: int | None = None) -> bytes:
-        """Encode HEARTBEAT with a MAV_TYPE; None: an onboard controller, which no vehicle takes for
-        a ground station."""
+        """Encode HEARTBEAT of a MAV_TYPE; None: an onboard controller, no ground station."""
         kind = dialect.MAV_TYPE_ONBOARD_CONTROLLER if kind is None else kind
         autopilot = dialect.MAV_AUTOPILOT_INVALID
         state = dialect.MAV_STATE_ACTIVE

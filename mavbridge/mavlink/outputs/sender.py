@@ -135,8 +135,10 @@ class ActionSender:
     def rehearse(
         self, plan: Iterable[tuple[int, Decision | None, str | None]]
     ) -> Iterator[tuple[int, bytes]]:
-        """Yield delays [ns] and packets of resting decisions and mode requests, without side
-        effects; skip those that the codec refuses."""
+        """Yield delays [ns] and packets of resting decisions and mode requests, for later.
+
+        No side effects. A packet that the codec refuses is skipped.
+        """
         vehicle, output, now_ns = self._vehicle, self.output, self._clock.now_ns()
         if vehicle is None:
             return

@@ -23,8 +23,9 @@ within 30 ms; five samples take 50 to 100 ms, so that a mode change is reported 
 
 
 class SetpointOutput(ActionOutput):
-    """Setpoints. Only a mode change takes the vehicle away from the last one, so the release is
-    silence, and the output repeats nothing by itself.
+    """Setpoints, whose release is silence: only a mode change takes the vehicle from the last one.
+
+    The output repeats nothing by itself.
 
     The echo is checked while the vehicle is armed, in the air and in a mode that follows setpoints;
     in other states a different target is normal.

@@ -251,7 +251,7 @@ _HELD_NS = 700 * NS_PER_MS
 _SPEED_TAU_S = 0.1
 """Time constant of PX4's low-pass of the stick speed (``MovingDiff``); 1.18 is faster."""
 _REST_SHARE = 0.5
-"""Fraction of a hand's speed that counts as rest, even if lost packets delay a jump by 70 ms."""
+"""Fraction of a hand's speed that counts as rest; also covers a jump that PX4 sees 70 ms late."""
 
 
 class StickSpeeds:
@@ -283,8 +283,10 @@ class StickSpeeds:
 
 
 class ManualControlOutput(StickOutput):
-    """MANUAL_CONTROL, which has no release: one neutral packet if no other source has sticks, then
-    silence. PX4 treats the silence as lost sticks if it received only ours."""
+    """MANUAL_CONTROL, whose release is silence, after one neutral packet if no other has sticks.
+
+    PX4 takes the silence for lost sticks if it received only ours.
+    """
 
     name: Output = "manual-control"
     releases = 1

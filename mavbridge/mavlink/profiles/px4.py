@@ -93,8 +93,10 @@ _MODES = ModeTable(
 
 
 def event_id(name: str) -> int:
-    """Return the number of an EVENT of the autopilot: 1 in the highest byte, then the low 24 bits
-    of the 32-bit FNV-1a hash of its name (PX4's guide to its events interface)."""
+    """Return the number of an EVENT of the autopilot (PX4's guide to its events interface).
+
+    Highest byte: 1. Lower 24 bits: those of the 32-bit FNV-1a hash of its name.
+    """
     number = 0x811C9DC5
     for byte in name.encode():
         number = (number ^ byte) * 0x01000193 & 0xFFFFFFFF
@@ -296,8 +298,10 @@ class Px4(Profile):
         return values.get("MPC_THR_HOVER")
 
     def hand_per_s(self, values: Mapping[str, float]) -> float:
-        """Return 1.18's MAN_OVERRIDE_SPD (negative: off), or before it COM_RC_STICK_OV, a
-        percentage, which applies if bit 0 of COM_RC_OVERRIDE is on."""
+        """See `Profile`. 1.18 has MAN_OVERRIDE_SPD (negative: off).
+
+        Before, COM_RC_STICK_OV is a percentage, on by bit 0 of COM_RC_OVERRIDE.
+        """
         if (hand_per_s := values.get("MAN_OVERRIDE_SPD")) is None:
             is_on = int(values.get("COM_RC_OVERRIDE", 1)) & 1
             hand_per_s = values.get("COM_RC_STICK_OV", 100.0 * _SLOWEST_HAND_PER_S) / 100.0

@@ -218,8 +218,7 @@ class StickCurves:
         return self.throttle is None and self.yaw is None and self.lean is None
 
     def to_vehicle(self, sticks: Sticks) -> Sticks:
-        """Return the vehicle's sticks for the motion that the policy's sticks mean; centred within
-        the policy's dead zone."""
+        """Return the vehicle's sticks for the policy's; centred within the policy's dead zone."""
         if self.is_identity:
             return sticks
         throttle, yaw, pitch, roll = sticks

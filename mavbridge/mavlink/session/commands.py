@@ -68,8 +68,7 @@ class VehicleCommands:
         self._request(CommandRequest(_ARM, (1,)))
 
     def takeoff(self, height_m: float) -> None:
-        """Request an autonomous takeoff to this height above ground, at most once a second, even if
-        the height differs."""
+        """Request an autonomous takeoff to a height above ground, once a second at any height."""
         if self._vehicle is None:
             return
         now_ns = self._clock.now_ns()

@@ -193,8 +193,10 @@ class TimesyncFilter:
         return delay_ns is not None and abs(delay_ns) <= SAME_CLOCK_NS
 
     def _delay_ns(self, boot_us: int, arrived_ns: int) -> int | None:
-        """Return the time from a stamp to its arrival; None if the stamp is missing (0) or Unix
-        time, or the offset is not good yet."""
+        """Return the time from a stamp to its arrival, or None if the stamp tells nothing.
+
+        The stamp may be missing (0) or Unix time, or the offset not good yet.
+        """
         if self._best is None or not self.is_good or not 0 < boot_us < UNIX_US:
             return None
         wrap_ns = 1000 * WRAP_US

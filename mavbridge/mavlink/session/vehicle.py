@@ -293,7 +293,7 @@ class VehicleSession:
         return self.params.problem()
 
     def end_engagement(self, reason: Reason, now_ns: int) -> None:
-        """Make ``problem`` return this reason, for long enough to end an engagement normally."""
+        """Make ``problem`` return this reason, for long enough to end an engagement in order."""
         self._upset = now_ns, reason
 
     def output_problem(self, now_ns: int) -> Reason | None:

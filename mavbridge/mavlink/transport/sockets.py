@@ -359,8 +359,10 @@ class SerialTransport(_FileTransport[serial.Serial]):
         return size
 
     def _drop_stale(self, port: serial.Serial) -> None:
-        """Empty the port's queue if its oldest byte is stale: no one reads it now, and sticks that
-        old must not act later. A packet may be cut; its checksum shows it.
+        """Empty the port's queue if its oldest byte is stale.
+
+        No one reads it now, and sticks that old must not act later. A packet may be cut; its
+        checksum shows it.
 
         Drivers that do not report their queue, such as pseudo-terminals, keep it.
         """
