@@ -183,7 +183,7 @@ class Guard:
             yield after_ns, self._at_rest(actions.control), actions.mode
 
     def unsent(self) -> None:
-        """Discard the last decision: it was not sent."""
+        """Discard the last decision, which was not sent; continue from the one before."""
         if not self._engagement.settings.readonly:
             self._smoother.undo()
 

@@ -68,7 +68,7 @@ class VehicleCommands:
         self._request(CommandRequest(_ARM, (1,)))
 
     def takeoff(self, height_m: float) -> None:
-        """Request an autonomous takeoff to a height above ground, once a second at any height."""
+        """Request an autonomous takeoff to a height above ground, at most once a second in all."""
         if self._vehicle is None:
             return
         now_ns = self._clock.now_ns()
