@@ -1,6 +1,7 @@
-"""Reasons as values: why the policy does not fly, lost the sticks, or a flight ended.
+"""Reasons as values: why the policy does not fly or has lost control, or why a flight ended.
 
-Code decides, records and tests by ``Reason.code``. Only people read the sentence, ``str(reason)``.
+Code branches on ``Reason.code``, recordings store it and tests compare it. The sentence,
+``str(reason)``, is for people only.
 """
 
 from collections.abc import Callable, Iterator, Mapping
@@ -12,22 +13,22 @@ Value: TypeAlias = "str | int | float | bool | Reason"
 
 
 class Kind(Enum):
-    """Whose doing it is."""
+    """Party responsible for a reason."""
 
     WAITING = "waiting"
-    """Nobody's: something has not come yet, or was not asked for."""
+    """None: something has not arrived yet, or was not requested."""
     PILOT = "pilot"
-    """The pilot's, or an operator's: an explicit act."""
+    """The pilot or an operator, by an explicit act."""
     VEHICLE = "vehicle"
-    """The autopilot's, or its link's."""
+    """The autopilot or its link."""
     FAULT = "fault"
-    """Ours: the policy, its inputs, this computer."""
+    """mavbridge itself: the policy, its inputs, this computer."""
     END = "end"
     """A planned end."""
 
 
 class Code(StrEnum):
-    """One for each reason; ``_REASONS`` has its kind and its sentence."""
+    """Identifier of a reason; ``_REASONS`` holds its kind and its sentence."""
 
     # Before a flight
     NOT_ENGAGED = auto()
@@ -44,7 +45,7 @@ class Code(StrEnum):
     NO_SUCH_MODE = auto()
     NO_CHUNK_SINCE_RESET = auto()
     NOT_READY = auto()
-    # Somebody else has the sticks
+    # Takeovers
     OPERATOR = auto()
     ENGAGE_SWITCH_OFF = auto()
     OVERRIDE_SWITCH_OFF = auto()
@@ -66,7 +67,7 @@ class Code(StrEnum):
     TOLD_TO_END = auto()
     FINISHED = auto()
     PILOT_FLIES = auto()
-    # The way out of a flight
+    # Safe mode and release
     THEN = auto()
     VEHICLE_LOST = auto()
     MODE_NOT_CONFIRMED = auto()
@@ -397,19 +398,19 @@ _SPENT = {
     "link": "the link delivered no {quantity} for",
     "camera": "the camera delivered nothing for",
 }
-"""Where the time of a late input was spent, by ``place`` of ``LATE`` and ``PAST_HORIZON``."""
+"""Phrases for the place that delayed an input, by ``place`` of ``LATE`` and ``PAST_HORIZON``."""
 
 
 @dataclass(frozen=True, slots=True)
 class Reason:
-    """A code with its figures: names with their unit, such as ``age_ms``, and plain values."""
+    """A code and its data: plain values, and figures named with their unit, such as ``age_ms``."""
 
     code: Code
     data: tuple[tuple[str, Value], ...] = ()
 
     @property
     def kind(self) -> Kind:
-        """Whose doing it is; of a reason that only adds words to another one, the other's."""
+        """Party responsible; that of the inner reason if this one only adds words."""
         inner = dict(self.data).get("first") or dict(self.data).get("why")
         if self.code in _WRAPPERS and isinstance(inner, Reason):
             return inner.kind
@@ -417,12 +418,12 @@ class Reason:
 
     @property
     def codes(self) -> tuple[Code, ...]:
-        """Its own code and those inside it."""
+        """Code of this reason and of those inside it."""
         return tuple(self._codes())
 
     @property
     def key(self) -> tuple[object, ...]:
-        """Equal for reasons that differ by numbers alone."""
+        """Key that is equal for reasons that differ only in numbers."""
         words = [
             value.key if isinstance(value, Reason) else value
             for _, value in self.data
@@ -437,13 +438,13 @@ class Reason:
                 yield from value.codes
 
     def __str__(self) -> str:
-        """The sentence for the user."""
+        """Return the sentence for the user."""
         words = dict(self.data)
         text = _REASONS[self.code][1].format(**words)
         if self.code not in (Code.LATE, Code.PAST_HORIZON):
             return text
         said, place = words.get("said"), words["place"]
-        if said is not None and place == "flight process":  # it speaks
+        if said is not None and place == "flight process":  # it answers, so it does not stall
             return f"{said}; {text}"
         spent = _SPENT[str(place)].format(**words)
         text = f"{text}: {spent} {words['spent_ms']:.0f} ms"
@@ -451,7 +452,7 @@ class Reason:
 
 
 def because(code: Code, **data: Value) -> Reason:
-    """Make a reason. Numbers of numpy become plain ones: the guard, which gets it, has no numpy."""
+    """Return a reason. numpy scalars become Python values, since the guard has no numpy."""
     return Reason(code, tuple((name, _plain(value)) for name, value in data.items()))
 
 
@@ -461,7 +462,7 @@ def _plain(value: Value) -> Value:
 
 
 def reason_to_json(reason: Reason, *, has_words: bool = True) -> dict[str, object]:
-    """Code and figures for JSON; with ``has_words`` the kind and the sentence for readers, too."""
+    """Return code and data for JSON; with ``has_words`` also the kind and the sentence."""
     data = {
         name: reason_to_json(value, has_words=has_words) if isinstance(value, Reason) else value
         for name, value in reason.data
@@ -473,10 +474,10 @@ def reason_to_json(reason: Reason, *, has_words: bool = True) -> dict[str, objec
 
 
 def reason_from_json(document: Mapping[str, object]) -> Reason:
-    """Inverse of ``reason_to_json``.
+    """Return the reason of a document of ``reason_to_json``.
 
     Raises:
-        KeyError, TypeError, ValueError: it is none, or of a code that this version does not know.
+        KeyError, TypeError, ValueError: it is malformed, or this version lacks its code.
     """
     data = document["data"]
     if not isinstance(data, dict):

@@ -1,1 +1,1 @@
-"""The last step before the link: who holds the sticks, and how fast they move."""
+"""Last stage before the link: decides who controls the vehicle, and limits every action."""

@@ -1,7 +1,7 @@
-"""The guard process: ``python -m mavbridge.guard FD FD``, started by the flight process.
+"""Guard process: ``python -m mavbridge.guard FD FD``, started by the flight process.
 
-It prints nothing, since whatever reads its output might not: messages and errors go through the
-channel, the first file descriptor, and the vehicle's readings through the second.
+It prints nothing, since a reader of its output might block it. Messages and errors go through the
+channel (the first file descriptor), the vehicle's readings through the second.
 """
 
 import select
@@ -33,16 +33,16 @@ from mavbridge.mavlink.transport.sockets import make_transport
 
 SETTINGS_TIMEOUT_S = 5.0
 LAST_WORDS_S = 2.0
-"""Time for a busy flight process to take the guard's last message; the sticks are given back."""
+"""Longest wait [s] for a busy flight process to read the last message; control is given back."""
 LEAD_NS = 250 * NS_PER_MS // 1000
-"""Sticks are decided this long before their slot: the work before a send takes 0.15 ms or more. A
-chunk that comes meanwhile waits for the slot."""
+"""Time from the decision to its slot [ns]: the work before a send takes at least 0.15 ms. A chunk
+that arrives in between waits for the slot."""
 _SURVIVED = ("SIGINT", "SIGHUP", "SIGTSTP", "SIGTTIN", "SIGTTOU")
-"""Signals of the terminal, which end or stop the flight process: the guard outlives it."""
+"""Terminal signals that end or stop the flight process, and that the guard ignores."""
 
 
 def main() -> None:
-    """Serve one flight process until the sticks are given back."""
+    """Serve one flight process until control has been given back."""
     for name in _SURVIVED:
         signal.signal(getattr(signal, name), signal.SIG_IGN)
     port, samples = (SocketPort(socket.socket(fileno=int(fd))) for fd in sys.argv[1:])
@@ -58,7 +58,7 @@ def main() -> None:
         reason = GuardError("user" if is_user else "peer", str(error))
         port.finish(encode_from_guard(reason), LAST_WORDS_S)
         sys.exit(1)
-    except Exception:  # noqa: BLE001 - told to the flight process, which shows it
+    except Exception:  # noqa: BLE001 - the flight process shows it
         port.finish(encode_from_guard(GuardError("bug", traceback.format_exc())), LAST_WORDS_S)
         sys.exit(2)
 
@@ -122,7 +122,7 @@ def _fly(
 
 
 def _serve(loop: GuardLoop, clock: MonotonicClock, port: SocketPort, link: MavlinkLink) -> None:
-    """Step at every arrival and whenever something is due, until the loop is done."""
+    """Step at every arrival and at every deadline until the loop is done."""
     while not loop.is_done:
         due_ns = loop.step()
         ends = (None if port.is_closed else port.fileno(), link.fileno())

@@ -1,4 +1,4 @@
-"""Messages between two processes over a socket pair; neither side ever waits for the other."""
+"""Non-blocking messages between two processes over a socket pair."""
 
 import socket
 import struct
@@ -10,44 +10,45 @@ from typing import Protocol
 _LENGTH = struct.Struct("<I")
 _RECEIVE_BYTES = 1 << 16
 _RECEIVES = 16
-"""Most reads at once, so that a flood does not keep the reader from its next slot."""
+"""Most reads per call, so that a flood does not delay the reader's next slot."""
 _CLOSED_ON_EXEC: int = getattr(socket, "MSG_CMSG_CLOEXEC", 0)
-"""Linux: no child inherits a file that comes."""
+"""Linux: received files are closed on exec, so that no child inherits them."""
 _BUFFER_BYTES = 1 << 20
-"""Asked of the kernel for each direction: seconds of telemetry, should the other side be busy."""
+"""Send buffer requested from the kernel, for each direction [bytes]: holds seconds of telemetry
+while the other side is busy."""
 
 
 class Port(Protocol):
     """One end of a channel of messages."""
 
     is_closed: bool
-    """The other end is gone; what it sent before was received."""
+    """True if the other end is closed and everything that it sent has been received."""
 
     def send(self, message: bytes, fd: int | None = None) -> bool:
-        """Hand over a message; False: it was dropped, since the other side does not read.
+        """Send a message. Return False if it was dropped because the other side does not read.
 
         With ``fd`` the other side gets a duplicate of that open file.
         """
 
     def receive(self) -> Sequence[bytes]:
-        """Messages that have arrived, in order; never waits."""
+        """Return the messages that have arrived, in order; never block."""
 
 
 def channel_pair() -> tuple[socket.socket, socket.socket]:
-    """Two connected sockets; neither is inherited by a child unless it is passed on explicitly."""
+    """Return two connected sockets; a child inherits one only if it is passed explicitly."""
     return socket.socketpair(socket.AF_UNIX, socket.SOCK_STREAM)
 
 
 class SocketPort:
-    """A ``Port`` over one end of ``channel_pair``; used by one thread.
+    """``Port`` over one end of ``channel_pair``; not thread-safe.
 
-    A stream and not SOCK_SEQPACKET, which macOS lacks: each message follows its length, and the
-    rest of one that the kernel took in part goes out before the next. End of file is the news of
-    the other process's death.
+    It uses a stream, since macOS lacks SOCK_SEQPACKET: a length precedes each message, and the
+    unsent rest of a message leaves before the next one. End of file means that the other process
+    has died.
     """
 
     def __init__(self, end: socket.socket, *, takes_files: bool = False) -> None:
-        """Use this end; open files that come are closed unless ``takes_files``."""
+        """Use this end. Received open files are closed unless ``takes_files``."""
         end.setblocking(False)
         end.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, _BUFFER_BYTES)
         self._socket = end
@@ -55,13 +56,13 @@ class SocketPort:
         self._partial = b""
         self._takes_files = takes_files
         self.files: deque[int] = deque()
-        """Open files that have come with messages, in order; the reader takes and closes them."""
+        """Open files received with messages, in order; the reader takes and closes them."""
         self.is_closed = False
         self.dropped = 0
-        """Messages that the other side had no room for."""
+        """Number of messages dropped because the other side had no room."""
 
     def fileno(self) -> int:
-        """The socket, to ``select`` on."""
+        """Return the socket's descriptor, for ``select``."""
         return self._socket.fileno()
 
     def send(self, message: bytes, fd: int | None = None) -> bool:
@@ -80,13 +81,13 @@ class SocketPort:
         return True
 
     def _put(self, data: bytes, fd: int | None = None) -> bytes:
-        """Write what the kernel takes now; returns the rest."""
+        """Write as much as the kernel accepts now; return the rest."""
         try:
             if fd is not None:
                 return data[socket.send_fds(self._socket, [data], [fd]) :]
             return data[self._socket.send(data) :]
         except OSError:
-            return data  # no room, or the other side is gone, which the next receive finds out
+            return data  # no room, or the other side is gone: the next receive tells
 
     def receive(self) -> list[bytes]:
         """See `Port`."""
@@ -121,12 +122,12 @@ class SocketPort:
         return data
 
     def finish(self, message: bytes, timeout_s: float) -> None:
-        """Send the last message and free the socket; waits, for so long, for a reader that lags."""
+        """Send the last message within ``timeout_s``, then close the socket."""
         self._socket.settimeout(timeout_s)
         with suppress(OSError):
             self._socket.sendall(self._unsent + _LENGTH.pack(len(message)) + message)
         self._socket.close()
 
     def close(self) -> None:
-        """Free the socket: the other side sees the end of file."""
+        """Close the socket: the other side reads end of file."""
         self._socket.close()

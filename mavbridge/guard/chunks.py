@@ -1,4 +1,4 @@
-"""Chunks of actions: whether one may be flown, for how long, and which action acts now."""
+"""Action chunks: their checks, their lifetime and the action for each moment."""
 
 import math
 from collections import deque
@@ -12,39 +12,39 @@ from mavbridge.core.vehicle import ACTION_CLASSES, Action, ActionKind
 
 LEAST_GRACE_NS = 100 * NS_PER_MS
 GRACE_PERIODS = 3
-"""A late chunk is bridged for 100 ms or three chunk periods, whichever is longer, but never for
-more than 100 ms beyond the limits and the horizon of the one that is flown."""
+"""The grace, the time for which a late chunk is bridged: 100 ms or three chunk periods, whichever
+is longer, but at most 100 ms beyond the age limits and the horizon of the current chunk."""
 MAX_REFUSED = 5
-"""Malformed chunks within the window below that end the flight, even if good ones lie between."""
+"""Malformed chunks in the refusal window that end the flight, even with good ones in between."""
 REFUSED_WINDOW_NS = NS_PER_S
 REFUSED_WINDOW_PERIODS = 10
 RECENT_GAPS = 8
 PERIOD_TOLERANCE = 0.01
-"""Share by which a horizon may be shorter than the chunk period: of one given as 0.033 s."""
+"""Fraction by which a horizon may be shorter than the chunk period: 0.033 s for 30 Hz."""
 LEAST_GAPS = 2
-"""Chunks must have come in time for so long before a flight may begin."""
+"""Gaps between chunks that must have been seen before a flight may begin."""
 SLOW_CHUNKS = 5
-"""So many solves in a row that outlast the limit of the attitude: this computer is too slow for the
-policy. The first ones after loading may be slow."""
+"""Consecutive solves that take longer than the attitude's age limit and show that this computer is
+too slow for the policy. More than one, since the first solves after loading may be slow."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class FreshnessLimits:
-    """Greatest ages of what a stick is computed from."""
+    """Maximum age of each input to a stick command [ns]."""
 
     state_ns: int
     """Attitude and body rates."""
     velocity_ns: int
     """Velocity and acceleration."""
     feature_ns: int
-    """Image, since its exposure."""
+    """Image, from its exposure."""
     chunk_ns: int
-    """Since the chunk was computed."""
+    """Chunk, from the end of its solve."""
     stall_ns: int = LEAST_GRACE_NS
-    """Longest time to fly on along a chunk when no newer one comes."""
+    """Longest time to keep flying a chunk while no newer one arrives."""
 
     def while_played(self, play_ns: int) -> "FreshnessLimits":
-        """Limits at the moment of sending, where a chunk is meant to be played for so long."""
+        """Return the limits at the time of sending, for chunks played for ``play_ns``."""
         return FreshnessLimits(
             state_ns=self.state_ns + play_ns,
             velocity_ns=self.velocity_ns + play_ns,
@@ -55,31 +55,30 @@ class FreshnessLimits:
 
 
 class Chunk(NamedTuple):
-    """Actions of one solve of the policy, with the stamps of everything that it came from."""
+    """Actions of one solve of the policy, with the timestamps of its inputs."""
 
     serial: int
-    """Rises by one from chunk to chunk."""
+    """Increases by one with each chunk."""
     attitude_ns: int
-    """When the attitude and the body rates happened, the older of the two."""
+    """Measurement time of the attitude or the body rates, whichever is older."""
     velocity_ns: int
-    """When velocity and acceleration happened, the older of the two."""
+    """Measurement time of velocity or acceleration, whichever is older."""
     image_ns: int
-    """Exposure of the image."""
+    """Exposure time of the image."""
     computed_ns: int
-    """When the solve was done."""
+    """End of the solve."""
     first_ns: int
-    """When the first action acts."""
+    """Time of the first action."""
     step_ns: int
     """Time from one action to the next."""
     actions: tuple[Action, ...]
-    """All of one kind, in NED and FRD axes, in time order, as the policy put them out: not clipped,
-    perhaps not finite."""
+    """Raw actions in time order, of one kind, NED and FRD axes; unclipped, perhaps not finite."""
     reset_ns: int = 0
-    """When the policy was last reset before the solve; 0: not since it was loaded."""
+    """Last reset of the policy before the solve; 0: none since loading."""
 
     @property
     def horizon_ns(self) -> int:
-        """Time for which its actions act, one step each."""
+        """Duration of the actions, one step each."""
         return len(self.actions) * self.step_ns
 
     @property
@@ -88,7 +87,7 @@ class Chunk(NamedTuple):
         return self.first_ns + self.horizon_ns
 
     def action_at(self, at_ns: int) -> Action:
-        """Action at a time, linear between the actions, held at both ends."""
+        """Return the action at a time: linear between actions, constant beyond both ends."""
         last = len(self.actions) - 1
         position = min(max((at_ns - self.first_ns) / self.step_ns, 0.0), float(last))
         low = int(position)
@@ -103,21 +102,21 @@ Place: TypeAlias = Literal["computer", "guard", "flight process", "solve", "link
 
 
 class Lateness(NamedTuple):
-    """The input that became too old to fly by, and where its time went."""
+    """Input that became too old to fly on, and the place where the time was lost."""
 
     name: _Input
-    """chunk: none came for the grace. horizon: the last one ended before."""
+    """chunk: none arrived within the grace. horizon: the last chunk ended first."""
     age_ns: int
     limit_ns: int
     place: Place
     stall_ns: int
-    """Time that was spent there."""
+    """Time lost at ``place``."""
     said: Reason | None = None
-    """Why the flight process computed no chunk."""
+    """Why the flight process computed no chunk; None: it gave no reason."""
 
     @property
     def reason(self) -> Reason:
-        """The same as a reason to end a flight."""
+        """The lateness as a reason to end a flight."""
         code, quantity = Code.LATE, str(self.name)
         if self.name == "horizon":
             code, quantity = Code.PAST_HORIZON, "chunk"
@@ -134,20 +133,20 @@ class Lateness(NamedTuple):
 
 
 class ChunkBuffer:
-    """Holds the newest chunk that may be flown, and judges it at every send.
+    """Newest chunk that may be flown, checked again at every send.
 
-    A chunk is taken if it is well formed and within its limits when it arrives. From then on it is
-    flown until the next one is taken: as fresh while it keeps its limits and the next one is not
-    overdue, else coasting. ``fault`` says when even that must end.
+    A chunk is taken if it is well formed and within its limits on arrival. It is then flown until
+    the next one is taken: fresh while it is within its limits and the next one is not overdue,
+    coasting after that. ``fault`` tells when coasting must end.
     """
 
     def __init__(self, limits: FreshnessLimits, *, period_ns: int, kind: ActionKind) -> None:
-        """Hold nothing yet.
+        """Create an empty buffer.
 
         Args:
-            limits: those at the moment of sending.
+            limits: maximum ages at the moment of sending.
             period_ns: time between the policy's chunks.
-            kind: that of their actions.
+            kind: kind of their actions.
         """
         self._class = ACTION_CLASSES[kind]
         self._limits = limits
@@ -155,34 +154,34 @@ class ChunkBuffer:
         self.grace_ns = max(LEAST_GRACE_NS, GRACE_PERIODS * period_ns)
         self._refused_ns: deque[int] = deque(maxlen=MAX_REFUSED)
         self._malformation: Reason | None = None
-        """What was wrong with the last malformed chunk."""
+        """Defect of the last malformed chunk."""
         self._refusal: Reason | None = None
         """Why the newest chunk was not taken; None if it was."""
         self._is_stale = False
-        """It was refused for its age."""
+        """True if the newest chunk was refused for its age."""
         self.newest: Chunk | None = None
         self._seen: Chunk | None = None
         """The newest well-formed chunk, taken or not."""
         self._word_ns = 0
-        """When the flight process last sent anything."""
+        """Time of the flight process's last message about chunks."""
         self._taken_ns = 0
         self._end_ns = 0
         """End of the horizon of the newest chunk."""
         self._uncovered_ns = 0
-        """Time beyond the horizons of the last chunks in a row that ended before the next came."""
+        """Total gap after the horizons of the last chunks in a row that ended too early."""
         self._grace_until_ns = 0
         """End of the grace of the newest chunk."""
         self._until_ns = 0
-        """When the flight ends without a newer one: after the grace, or a stall."""
+        """End of the grace or of the allowed stall, whichever is later: ends the flight."""
         self._gaps_ns: deque[int] = deque(maxlen=RECENT_GAPS)
-        """Times between the last chunks that were taken."""
+        """Times between the last accepted chunks."""
         self._slow = 0
-        """Chunks in a row whose attitude was too old as soon as they were computed."""
+        """Consecutive chunks whose attitude was too old by the end of the solve."""
         self._solve_ns = 0
-        """From the newest chunk's attitude to the end of its solve."""
+        """Time from the newest chunk's attitude to the end of its solve."""
 
     def offer(self, chunk: Chunk, now_ns: int) -> bool:
-        """Take a chunk if it may be flown; returns whether it was taken."""
+        """Take a chunk if it may be flown. Return True if it was taken."""
         if self.newest is not None and chunk.serial <= self.newest.serial:
             return False
         self._word_ns, self._is_stale = now_ns, False
@@ -212,30 +211,30 @@ class ChunkBuffer:
         limited_ns = max(now_ns, min(self._stale_ns(chunk), end_ns)) + LEAST_GRACE_NS
         self._grace_until_ns = min(now_ns + self.grace_ns, limited_ns - self._uncovered_ns)
         self._until_ns = self._grace_until_ns
-        if max(self._gaps_ns, default=0) <= self.grace_ns:  # no stall so soon after another one
+        if max(self._gaps_ns, default=0) <= self.grace_ns:  # no second stall soon after one
             planned_ns = min(now_ns + self._limits.stall_ns, end_ns)
             self._until_ns = max(self._grace_until_ns, planned_ns)
         return True
 
     def _horizon_end_ns(self, chunk: Chunk, taken_ns: int) -> int:
-        """Moment until which a chunk that came at ``taken_ns`` has an action.
+        """Return the end of the actions of a chunk that arrived at ``taken_ns``.
 
-        A single action is no plan in time: it is held for its step from when it came, and for half
-        a chunk period more, since solves wait for the next attitude.
+        A single action has no time course. It is held from its arrival for its step plus half a
+        chunk period, since solves wait for the next attitude.
         """
         if len(chunk.actions) == 1:
             return taken_ns + chunk.step_ns + self._period_ns // 2
         return chunk.end_ns
 
     def explain_absence(self, reason: Reason, now_ns: int) -> None:
-        """Note why there is no chunk; whoever says so does not stall, and has the grace alone."""
+        """Note why there is no chunk; the flight process answers, so no stall is bridged."""
         self._refusal, self._is_stale, self._word_ns = reason, False, now_ns
         graced_ns = max(self._grace_until_ns, now_ns - self._period_ns + self.grace_ns)
         self._until_ns = min(self._until_ns, graced_ns)
 
     @property
     def impossibility(self) -> Reason | None:
-        """Why the policy can never fly on this computer at this rate, or None."""
+        """Why the policy can never fly on this computer at this rate; None: it can."""
         if self._is_short and (short := self._shortness()) is not None:
             return short
         if self._slow < SLOW_CHUNKS:
@@ -248,13 +247,13 @@ class ChunkBuffer:
         )
 
     def is_coasting(self, now_ns: int) -> bool:
-        """The chunk is beyond its limits or its horizon, or the next is overdue by a period."""
+        """True if the chunk exceeds its limits or horizon, or the next is overdue by a period."""
         chunk = self.newest
         is_overdue = now_ns - self._taken_ns > 2 * self._period_ns or now_ns > self._end_ns
         return chunk is not None and (is_overdue or self._stale(chunk, now_ns) is not None)
 
     def problem(self, now_ns: int) -> Reason | None:
-        """Why no flight may begin now, or None: a chunk must be fresh, by all limits."""
+        """Return why no flight may begin now, or None if the chunk is fresh by all limits."""
         chunk = self.newest
         if (flood := self._malformed_lately(now_ns)) is not None:
             return flood
@@ -280,25 +279,25 @@ class ChunkBuffer:
         return self._stale(chunk, now_ns)
 
     def fault(self, now_ns: int) -> Reason | None:
-        """Why the flight must end now, or None: the grace is over, or too much was malformed."""
+        """Return why the flight must end now, or None: grace over, or malformed chunks."""
         if (flood := self._malformed_lately(now_ns)) is not None:
             return flood
         late = self.lateness(now_ns)
         return None if late is None else late.reason
 
     def is_over(self, now_ns: int) -> bool:
-        """True if the grace has ended."""
+        """True if the grace, or the allowed stall, has ended."""
         return self.newest is None or now_ns > self._until_ns
 
     def lateness(
         self, now_ns: int, *, stood_ns: int = 0, heard_ns: Mapping[str, int] | None = None
     ) -> Lateness | None:
-        """The input that ended the grace, or None while it lasts.
+        """Return the input whose age ended the grace, or None during the grace.
 
         Args:
-            now_ns: the moment.
-            stood_ns: time for which the guard had not looked at anything until now.
-            heard_ns: arrival of the vehicle's newest attitude and velocity, by these names.
+            now_ns: current time.
+            stood_ns: duration of the guard's stall until now.
+            heard_ns: arrival of the vehicle's newest "attitude" and "velocity", by these names.
         """
         if not self.is_over(now_ns):
             return None
@@ -307,7 +306,7 @@ class ChunkBuffer:
         if self._seen is None:
             return Lateness("chunk", silent_ns, self.grace_ns, "flight process", silent_ns, said)
         name, happened_ns, limit_ns = min(self._ages(self._seen), key=lambda age: age[1] + age[2])
-        is_stall = self._until_ns > self._grace_until_ns  # which the ages may outgrow
+        is_stall = self._until_ns > self._grace_until_ns  # ages may exceed their limits then
         if is_stall or now_ns <= happened_ns + limit_ns:
             is_over = now_ns > self._end_ns
             name, happened_ns = "horizon" if is_over else "chunk", self._taken_ns
@@ -333,12 +332,12 @@ class ChunkBuffer:
 
     @property
     def _is_short(self) -> bool:
-        """The newest chunk's horizon is shorter than the period of solves."""
+        """True if the newest chunk's horizon is shorter than the chunk period."""
         chunk, least_ns = self.newest, self._period_ns * (1 - PERIOD_TOLERANCE)
         return chunk is not None and chunk.horizon_ns < least_ns
 
     def _shortness(self) -> Reason | None:
-        """Figures of a policy whose chunks end before the next one comes, or None."""
+        """Return the figures of a policy whose chunks end before the next one arrives, or None."""
         chunk, gaps_ns = self.newest, sorted(self._gaps_ns)
         if chunk is None or not gaps_ns:
             return None
@@ -353,16 +352,16 @@ class ChunkBuffer:
         )
 
     def action_at(self, now_ns: int, lead_ns: int = 0) -> Action | None:
-        """The action that acts ``lead_ns`` from now, or the last one where the horizon ends before.
+        """Return the action at ``now_ns + lead_ns``, or the last one if the horizon ends first.
 
-        None beyond the horizon of the newest chunk.
+        Return None if ``now_ns`` is beyond the horizon of the newest chunk.
         """
         if self.newest is None or now_ns > self._end_ns:
             return None
         return self.newest.action_at(now_ns + lead_ns)
 
     def _ages(self, chunk: Chunk) -> tuple[tuple[_Input, int, int], ...]:
-        """What a chunk came from, when that happened, and how old it may be."""
+        """Return name, timestamp and age limit of each input of a chunk."""
         limits = self._limits
         return (
             ("attitude", chunk.attitude_ns, limits.state_ns),
@@ -372,7 +371,7 @@ class ChunkBuffer:
         )
 
     def _stale_ns(self, chunk: Chunk) -> int:
-        """The last moment at which a chunk keeps its limits."""
+        """Return the last moment at which a chunk is within its age limits."""
         return min(happened_ns + limit_ns for _, happened_ns, limit_ns in self._ages(chunk))
 
     def _stale(self, chunk: Chunk, now_ns: int) -> Reason | None:

@@ -1,4 +1,4 @@
-"""The engagement: steps through the table, and runs the sequences of its states."""
+"""State machine of the engagement: reads the table, and runs the sequences of its states."""
 
 from collections.abc import Iterator, Sequence
 from copy import deepcopy
@@ -19,23 +19,23 @@ from mavbridge.guard.values import (
 )
 
 _REHEARSED_MS = (0, 20, 40, *range(100, 2000, 50))
-"""Moments after the guard's death at which its last words are said; the first of them close
+"""Times after the guard's death at which its last words are sent [ms]. The first are close
 together, since a packet that the guard sent in part swallows the next one."""
 _ASKED_NS = 250 * NS_PER_MS
-"""How long they ask for a mode: any longer, and they could undo a mode that the pilot chose."""
+"""Time for which the last words request a mode; longer could undo the pilot's mode change."""
 _RELEASES = 5
 SILENCE_NS = 250 * NS_PER_MS
-"""After a silence of the vehicle, or a standstill of our own, of this length its mode is not known
-until it is told anew: its own failsafe may have acted, after 0.5 s at the earliest."""
+"""Silence of the vehicle, or stall of the guard, after which the vehicle's mode is unknown until
+the next report: its failsafe may have acted, after 0.5 s at the earliest."""
 BACKLOG_NS = 50 * NS_PER_MS
-"""After a standstill, time for what was under way to come out of pipes and sockets."""
+"""Time after a stall in which old data still comes out of pipes and sockets."""
 
 
 class Engagement(Memory):
-    """Decides who controls the vehicle; ``step`` is called at every wake of the guard."""
+    """Decides who controls the vehicle; ``step`` runs whenever the guard wakes up."""
 
     def __init__(self, settings: EngagementSettings, *, chunk_period_ns: int = 0) -> None:
-        """``chunk_period_ns``: between chunks; the first one after a reset may take two."""
+        """``chunk_period_ns``: time between chunks; the first after a reset may take two."""
         super().__init__(
             settings=settings,
             first_chunk_ns=ACT_TIMEOUT_NS + 2 * chunk_period_ns,
@@ -45,12 +45,12 @@ class Engagement(Memory):
         )
 
     def stop(self, request: EndRequest) -> None:
-        """End: give the sticks back as the request says, and then be ``ENDED``."""
+        """Give the sticks back as the request demands, then enter ``ENDED``."""
         if self.end_request is None:
             self.end_request, self.must_stop = request, True
 
     def step(self, now: EngagementInputs, act: OperatorCommand | None) -> Actions:
-        """Advance to this moment."""
+        """Advance to ``now`` with the operator's command, if any; return the actions to take."""
         if self.settings.readonly:
             return self._watch(now)
         self._listen(now)
@@ -63,13 +63,13 @@ class Engagement(Memory):
                 self._note_own_mode(now)
             begun = self._read(TABLE, now)
             if begun not in (Phase.PREPARING, Phase.LEAVING, Phase.RELEASING):
-                break  # those act in the step in which they begin
+                break  # the others act in the step in which they begin
         actions = self._control(now)
         begun = self._read(PROGRESS, now)
         return self._control(now) if begun in (Phase.FLYING, Phase.RELEASING) else actions
 
     def _read(self, rows: Sequence[Row], now: EngagementInputs) -> Phase | None:
-        """Take a row; returns the state that begins, if any."""
+        """Execute the first matching row; return the state that begins, or None."""
         for row in rows:
             if self.phase not in row.states or not (cause := row.event(self, now)):
                 continue
@@ -82,7 +82,7 @@ class Engagement(Memory):
         return None
 
     def _control(self, now: EngagementInputs) -> Actions:
-        """Act as the state does."""
+        """Return the actions of the current state."""
         match self.phase:
             case Phase.PREPARING:
                 return self._prepare(now)
@@ -101,7 +101,7 @@ class Engagement(Memory):
 
     def _prepare(self, now: EngagementInputs) -> Actions:
         self.was_armed = now.armed
-        # Once the policy is being reset, its silence is no reason to begin that anew.
+        # During the policy's reset, its silence must not restart the reset.
         chunk_problem = now.chunk_problem if self.starting_ns is None else None
         actions = self.engage.step(now, objection(self, now) or chunk_problem)
         self.reason = self.engage.waits_for or because(Code.FIRST_CHUNK)
@@ -109,7 +109,7 @@ class Engagement(Memory):
         return actions
 
     def _start(self, now: EngagementInputs, *, is_ready: bool) -> None:
-        """Have the policy reset once all else is ready."""
+        """Request a reset of the policy once everything else is ready."""
         if not is_ready:
             self.starting_ns = None
         elif self.starting_ns is None:
@@ -117,7 +117,7 @@ class Engagement(Memory):
             self.until_ns = max(self.until_ns, now.now_ns + self.first_chunk_ns)
 
     def _watch(self, now: EngagementInputs) -> Actions:
-        """Read-only: the policy runs whenever it could fly, and the link sends nothing."""
+        """Read-only: run the policy whenever it could fly; the link sends nothing."""
         if ended(self, now):
             self.phase = Phase.ENDED
             return Actions()
@@ -134,10 +134,10 @@ class Engagement(Memory):
             self.phase, self.starting_ns = Phase.FLYING, None
         return Actions(control=ControlSource.POLICY)
 
-    # --- what is noted before the table is read
+    # --- inputs noted before the table is read
 
     def _listen(self, now: EngagementInputs) -> None:
-        """Find out whether the mode is that of now."""
+        """Update whether the reported mode is current."""
         now_ns, stepped_ns = now.now_ns, self.stepped_ns
         heard_ns = now_ns if now.heard_ns is None else now.heard_ns
         mode_ns = now_ns if now.mode_ns is None else now.mode_ns
@@ -153,13 +153,13 @@ class Engagement(Memory):
             self.heard_ns = now_ns
 
     def _note_own_mode(self, now: EngagementInputs) -> None:
-        """Take the present mode for ours if we wait for no other, or have asked for it."""
+        """Treat the present mode as ours if we wait for no other, or requested it."""
         is_first = self.own_mode is None and self.engage.wanted_mode(now) is None
         if is_first or self.engage.is_own_mode(now):
             self.own_mode = now.mode
 
     def _note_act(self, now: EngagementInputs, act: OperatorCommand | None) -> None:
-        """Note the operator's command, or that of the switch, or of the first arming."""
+        """Note this step's act: the operator's command, the engage switch or the first arming."""
         is_first_arming = now.armed and self.is_arming_awaited is True
         if now.is_connected and self.is_arming_awaited is not False:
             self.is_arming_awaited = not now.armed
@@ -167,9 +167,10 @@ class Engagement(Memory):
         self.act = act or ("engage" if is_act else None)
 
     def _is_switched_on(self, now: EngagementInputs) -> bool:
-        """Return whether a hand has put the engage switch high.
+        """True if a hand has put the engage switch high.
 
-        Low takes the sticks back at once, whoever says it; for an act the receiver has to be well.
+        Low takes the sticks back at once, even if a sick receiver reports it; an act needs a
+        healthy receiver.
         """
         channel = self.settings.engage_channel
         if channel is None or len(now.rc_channels_us) < channel:
@@ -186,18 +187,18 @@ class Engagement(Memory):
             self.refusal = not_engaged(why)
         return is_act
 
-    # --- for the death of the guard
+    # --- last words
 
     def rehearse(self, now: EngagementInputs) -> Iterator[tuple[int, Actions]]:
-        """Yield the actions, with their delays in ns, that end the flight if the guard dies now.
+        """Yield the actions that end the flight if the guard dies now, with their delays [ns].
 
-        A copy of this machine takes the death for a fault, and hears nothing more of the vehicle.
+        A copy of this state machine treats the death as a fault; it hears nothing of the vehicle.
         """
         twin = deepcopy(self, {id(self.settings): self.settings})
         twin.disengage.ask_at_once(now.now_ns)
         if self.phase in (Phase.PREPARING, Phase.FLYING):
             twin.stop(EndRequest(because(Code.GUARD_DIED), is_fault=True))
-        # Sticks jump to neutral, unseen by us; the flight process says the words at once, or never.
+        # Sticks jump to neutral unseen; the flight process sends the words at once, or never.
         now = replace(now, are_sticks_at_rest=False, heard_ns=None, mode_ns=None)
         rest_ns = STICK_REST_NS if now.modes.override else 0
         until_ns = rest_ns + _ASKED_NS
@@ -209,7 +210,7 @@ class Engagement(Memory):
                 until_ns = after_ns
                 break
             yield after_ns, actions
-        # The mode was asked for three times: it passes for confirmed.
+        # The mode has been requested three times by now: treat it as confirmed.
         must_release = twin.phase is Phase.LEAVING and not twin.disengage.is_silence_failsafe
         if twin.phase is Phase.RELEASING or must_release:
             for k in range(_RELEASES):

@@ -1,4 +1,4 @@
-"""The envelope of a flight: tilt, height, speed, distance, estimator, battery, landing."""
+"""Flight envelope: tilt, height, speed, distance, estimator, battery, landing."""
 
 import math
 from collections.abc import Iterator
@@ -11,38 +11,38 @@ from mavbridge.core.rotation import tilt_rad
 from mavbridge.core.vehicle import Reading, Telemetry, VehicleStatus
 
 READING_PERSIST_NS = 50 * NS_PER_MS
-"""Tilt and speed must be out for so long, by their own stamps: six readings at 100 Hz, two at 20 Hz
-or less, so that one bad reading ends no flight."""
+"""Debounce time of tilt and speed, by the readings' timestamps: six readings at 100 Hz, two at 20
+Hz or less, so that one bad reading does not end a flight."""
 POSITION_PERSIST_NS = 300 * NS_PER_MS
-"""Height and distance; 6 m at the fastest default speed."""
+"""Debounce time of height and distance; 6 m at the default speed limit."""
 FLAG_PERSIST_NS = 600 * NS_PER_MS
-"""Estimator, battery, landing: more than one message at 2 Hz."""
+"""Debounce time of estimator, battery and landing: more than one message at 2 Hz."""
 FRESH_NS = 500 * NS_PER_MS
-"""An older attitude or velocity is not watched; the guard has its own, stricter limits of age."""
+"""Oldest attitude and velocity that are checked; the policy's inputs have stricter age limits."""
 
 _Kind: TypeAlias = Literal["fault", "landed"]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class EnvelopeLimits:
-    """Limits that a flight must stay inside of; 0 or infinity = not watched."""
+    """Limits of the flight envelope; 0 or infinity: not watched."""
 
     tilt_deg: float = 60.0
-    """Between the vehicle's down and the world's; normal flight stays below 35."""
+    """Angle between the vehicle's down axis and the world's; below 35 in normal flight."""
     height_m: float = 120.0
     """Above the estimator's origin; 120 m is the legal limit in most countries."""
     speed_mps: float = 20.0
-    """In all three directions."""
+    """Speed in three dimensions."""
     distance_m: float = 300.0
-    """Horizontal, from the estimator's origin; about as far as a small vehicle can be seen."""
+    """Horizontal, from the estimator's origin; about as far as a small vehicle is visible."""
     estimator: bool = True
-    """The estimator must not lose a position that it had."""
+    """Fault if the estimator loses a position that it had."""
     battery: bool = True
     landing: bool = True
     """A landing ends the flight."""
 
     def widened(self, by: "EnvelopeLimits") -> "EnvelopeLimits":
-        """The wider limit of each pair; a quantity that either does not watch is not watched."""
+        """Return the wider limit of each pair; a quantity unwatched in either is unwatched."""
         wider: dict[str, float | bool] = {}
         for field in fields(self):
             one, other = getattr(self, field.name), getattr(by, field.name)
@@ -51,7 +51,7 @@ class EnvelopeLimits:
 
 
 class EnvelopeInput(NamedTuple):
-    """The vehicle at one tick, as the link's snapshot has it."""
+    """State of the vehicle at one tick, from the link's snapshot."""
 
     now_ns: int
     telemetry: Telemetry
@@ -59,15 +59,15 @@ class EnvelopeInput(NamedTuple):
 
 
 class EnvelopeExit(NamedTuple):
-    """The end of a flight by its envelope."""
+    """End of a flight by its envelope."""
 
     kind: _Kind
-    """fault, or landed: the flight is over, and nothing is wrong."""
+    """fault: a limit was exceeded. landed: a normal end."""
     reason: Reason
 
 
 class _Finding(NamedTuple):
-    """One quantity at one tick."""
+    """Check of one quantity at one tick."""
 
     name: str
     problem: Reason | None
@@ -76,22 +76,22 @@ class _Finding(NamedTuple):
 
 
 class Envelope:
-    """Tells when the vehicle leaves its envelope, and which quantities it cannot watch.
+    """Detects when the vehicle leaves its envelope, and which quantities cannot be watched.
 
-    ``reset`` at every engagement: a lost position and a landing count only after the position was
-    valid and the vehicle in the air.
+    Call ``reset`` at every engagement: a lost position counts only after the position was valid, a
+    landing only after the vehicle was in the air.
     """
 
     def __init__(self, limits: EnvelopeLimits) -> None:
         self._limits = limits
         self._since_ns: dict[str, int] = {}
-        """Stamp of the first of an unbroken row of problems, by quantity; at most seven."""
+        """Timestamp at which a problem began that has lasted since, by quantity; at most seven."""
         self._had_position = False
         self._was_in_air = False
         self._unwatched: list[str] = []
 
     def reset(self) -> None:
-        """Begin a flight."""
+        """Start the checks of a new flight."""
         self._since_ns.clear()
         self._had_position = self._was_in_air = False
 
@@ -101,7 +101,7 @@ class Envelope:
         return tuple(self._unwatched)
 
     def check(self, vehicle: EnvelopeInput) -> EnvelopeExit | None:
-        """The first limit that was exceeded for long enough, or None."""
+        """Return the first limit that has been exceeded for its debounce time, or None."""
         self._unwatched.clear()
         found: EnvelopeExit | None = None
         for finding in self._findings(vehicle):
@@ -130,7 +130,7 @@ class Envelope:
     def _fresh(
         self, name: str, limit: float, reading: Reading | None, now_ns: int
     ) -> Reading | None:
-        """The reading if it is to be watched and can be."""
+        """Return the reading if its limit is set and the reading is fresh, else None."""
         if not _is_limit(limit):
             return None
         if reading is None or now_ns - reading.arrived_ns > FRESH_NS:
@@ -139,7 +139,7 @@ class Envelope:
         return reading
 
     def _ignore(self, name: str, reason: str) -> None:
-        """Note a quantity that has no data; what was out before has to be seen anew."""
+        """Note a quantity without data, and restart its debounce."""
         self._since_ns.pop(name, None)
         self._unwatched.append(f"{name} is not watched: {reason}")
 

@@ -1,7 +1,7 @@
-"""The guard without I/O: what the link and the policy say goes in, what the sticks do comes out.
+"""Guard without I/O: maps the state of the link and the policy to stick commands.
 
-One class for the guard process, the simulation and the tests. It never waits: every wait is a
-state, and the caller steps it whenever something has arrived and at ``next_ns``.
+The guard process, the simulation and the tests share this class. It never blocks: every wait is a
+state, and the caller steps it at every arrival and at ``next_ns``.
 """
 
 from collections.abc import Iterator
@@ -34,26 +34,26 @@ from mavbridge.guard.values import (
 )
 
 PILOT_FRESH_NS = 500 * NS_PER_MS
-"""Oldest RC_CHANNELS that still tells where the pilot's sticks are."""
+"""Oldest RC_CHANNELS that still tells the position of the pilot's sticks."""
 STOOD_STILL_NS = 60 * NS_PER_MS
-"""A step this late, beyond the slowest grid, says that the guard stood still, and heard nobody."""
+"""Time between two steps that means a stall of the guard; longer than the slowest stick period."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Slot:
-    """One point of the stick grid that has come due."""
+    """One slot of the stick grid that has come due."""
 
     index: int
     due_ns: int
     missed: int
-    """Slots before it for which no stick left within one period."""
+    """Number of earlier slots for which no stick left within one period."""
 
 
 class StickGrid:
-    """Slots at ``origin + index * period``, whatever happens between them.
+    """Fixed grid of slots at ``origin + index * period``.
 
-    A slot is served by the first send from half a period before it to one period after it, so one
-    that was served early is left out, and one that nobody served in time is missed, never made up
+    A slot is served by the first send from half a period before it to one period after it. A slot
+    that was served early is skipped. A slot without a send in time is missed, and never made up
     for.
     """
 
@@ -62,15 +62,15 @@ class StickGrid:
         self._origin_ns = origin_ns
         self._index = -1
         self._served_ns = origin_ns - period_ns
-        """Last send, or the last slot in which nothing was to be sent."""
+        """Last send, or last slot with nothing to send."""
 
     @property
     def next_ns(self) -> int:
-        """When the next slot is due."""
+        """Time of the next slot."""
         return self._origin_ns + (self._index + 1) * self._period_ns
 
     def take(self, now_ns: int) -> Slot | None:
-        """The newest slot that has come due since the last call; None if there is none to serve."""
+        """Return the newest slot that has come due since the last call; None: nothing to serve."""
         index = (now_ns - self._origin_ns) // self._period_ns
         if index <= self._index:
             return None
@@ -85,13 +85,13 @@ class StickGrid:
         return Slot(index=index, due_ns=due_ns, missed=missed)
 
     def serve(self, sent_ns: int) -> None:
-        """Note that sticks have left, or that none were to be sent."""
+        """Note that sticks were sent, or that there was nothing to send."""
         self._served_ns = sent_ns
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class GuardInput:
-    """Everything that has arrived since the last step."""
+    """News since the last step."""
 
     link: LinkSnapshot
     chunk: Chunk | None = None
@@ -100,7 +100,7 @@ class GuardInput:
     act: OperatorCommand | None = None
     stop: EndRequest | None = None
     command_fault: Reason | None = None
-    """Error while the last command was made or sent."""
+    """Error while the last command was encoded or sent."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -110,9 +110,9 @@ class GuardOutput:
     decision: Decision | None
     """None: send nothing now."""
     slot: Slot | None
-    """The slot of the stick grid that this step serves; None between slots."""
+    """Slot of the stick grid that this step serves; None between slots."""
     trace: ActionTrace | None
-    """The policy's action on its way to ``decision``; None where the policy does not move them."""
+    """Stages from the policy's action to ``decision``; None while the policy does not control."""
     chunk_serial: int | None
     is_coasting: bool
     phase: Phase
@@ -122,15 +122,16 @@ class GuardOutput:
     """Flight mode to request."""
     arm: bool
     takeoff_m: float | None
-    """Height to which the autopilot is to climb by its own means, to request."""
+    """Height for an autonomous takeoff, to request."""
     messages: tuple[str, ...]
-    """For the user."""
+    """Texts for the user."""
     starting_ns: int
-    """The policy gets the sticks with its first chunk after a reset from then on; 0: not now."""
+    """Time since which only the policy's first chunk is missing: it gets control with the first
+    chunk that follows a reset at or after this time; 0: not starting."""
 
 
 class Guard:
-    """Decides at each moment whether sticks leave, and which."""
+    """Decides which sticks are sent, and when."""
 
     def __init__(self, settings: FlightSettings, now_ns: int) -> None:
         self._chunks = ChunkBuffer(
@@ -140,23 +141,23 @@ class Guard:
         self._neutral, self._idle = neutral_action(self._meaning), idle_action(self._meaning)
         self._smoother = ActionSmoother(settings.smoothing, self._neutral)
         self._lead_ns = round(settings.smoothing.tau_s * NS_PER_S)
-        """A chunk is sampled this far ahead of the send, but not beyond its end: the lag of our own
-        low-pass."""
+        """Lead for sampling a chunk, at most to its end; compensates the low-pass lag."""
         self._envelope = Envelope(settings.envelope)
         self._engagement = Engagement(settings.engagement, chunk_period_ns=settings.chunk_period_ns)
         self._grid = StickGrid(settings.stick_period_ns, now_ns)
         self._stepped_ns = self._heard_ns = now_ns
-        """The last step; the last one after which the guard can tell silence of the vehicle."""
+        """``_stepped_ns``: last step. ``_heard_ns``: end of the last stall, from which silence of
+        the vehicle counts."""
         self._control: ControlSource | None = None
         self._seen: EngagementInputs | None = None
-        """Those of the last step."""
+        """Inputs of the last step."""
         self._last = self._neutral
-        """As last sent."""
+        """Last action sent."""
         self._messages: list[str] = []
 
     @property
     def next_ns(self) -> int:
-        """When to step again at the latest: the next slot."""
+        """Latest time of the next step: the next slot."""
         return self._grid.next_ns
 
     @property
@@ -166,30 +167,29 @@ class Guard:
 
     @property
     def failure(self) -> Reason | None:
-        """Why there was no flight, or None."""
+        """Why there was no flight; None: there was one, or it may still begin."""
         return self._engagement.failure
 
     @property
     def outcome(self) -> Outcome:
-        """How the flights went so far."""
+        """Outcome of the flights so far."""
         return self._engagement.outcome
 
     def rehearse(self) -> Iterator[tuple[int, Decision | None, str | None]]:
-        """Yield the decisions and the modes to ask for, with their delays in ns, that end the
-        flight if the guard dies now."""
+        """Yield delay [ns], decision and requested mode of each last word, if the guard dies."""
         if self._seen is None:
             return
         for after_ns, actions in self._engagement.rehearse(self._seen):
             yield after_ns, self._at_rest(actions.control), actions.mode
 
     def unsent(self) -> None:
-        """The last decision did not leave: the next one starts from what left before it."""
+        """Discard the last decision, which was not sent; continue from the one before."""
         if not self._engagement.settings.readonly:
             self._smoother.undo()
 
     def step(self, now_ns: int, given: GuardInput) -> GuardOutput:
-        """Advance to this moment."""
-        # Judged before the news: a guard that stood still itself has let the grace run out.
+        """Advance to ``now_ns`` with the given news; return the actions to take."""
+        # Before the new chunk is taken: a stall of the guard itself may have ended the grace.
         stood_ns, self._stepped_ns = now_ns - self._stepped_ns, now_ns
         overdue = self._overdue(now_ns, stood_ns, given)
         has_news = given.chunk is not None and self._chunks.offer(given.chunk, now_ns)
@@ -203,7 +203,7 @@ class Guard:
         actions = self._engagement.step(inputs, given.act)
         self._change_control(actions.control, now_ns, given.link)
         phase = self._engagement.phase
-        # A slot that was just served is left out; a new chunk and a change of hands leave at once.
+        # Skip a slot that was just served; send a new chunk and a change of phase at once.
         slot = self._grid.take(now_ns)
         is_urgent = phase is not phase_before or (
             has_news and actions.control is ControlSource.POLICY
@@ -230,7 +230,7 @@ class Guard:
         )
 
     def _silence(self, now_ns: int, stood_ns: int, attitude: Reading | None) -> Reason | None:
-        """Why the flight must end now, or None: a plan bridges a stall of ours, not a dead link."""
+        """Return why a silent link ends the flight, or None; a plan bridges only our own stall."""
         if stood_ns > STOOD_STILL_NS:
             self._heard_ns = now_ns
         limit_ns = self._chunks.grace_ns
@@ -240,7 +240,7 @@ class Guard:
         return Lateness("attitude", age_ns, limit_ns, "link", age_ns).reason
 
     def _overdue(self, now_ns: int, stood_ns: int, given: GuardInput) -> Reason | None:
-        """Which input of the policy's flight is too late, or None."""
+        """Return the reason if an input of the policy's flight is too late, or None."""
         if self._engagement.phase is not Phase.FLYING or not self._chunks.is_over(now_ns):
             return None
         seen = given.link.telemetry
@@ -259,7 +259,7 @@ class Guard:
         )
         if late is None:
             return None
-        # A chunk from the middle of the time shows that the rest of the computer ran.
+        # A chunk computed in the second half of the stall shows that only the guard stalled.
         middle_ns, chunk = now_ns - stood_ns // 2, given.chunk
         if late.place == "computer" and chunk is not None and chunk.computed_ns > middle_ns:
             late = late._replace(place="guard")
@@ -314,12 +314,12 @@ class Guard:
     def _change_control(
         self, control: ControlSource | None, now_ns: int, link: LinkSnapshot
     ) -> None:
-        """When the policy or neutral takes the sticks, start from where they are."""
+        """When policy or neutral takes control, start the filter from the current command."""
         before, self._control = self._control, control
         if control is ControlSource.NEUTRAL and before not in (control, ControlSource.POLICY):
             on_ground = before is ControlSource.IDLE
             start = self._idle if on_ground else self._first(link, None)
-            self._smoother.reset(start)  # what an earlier flight left in it counts no longer
+            self._smoother.reset(start)  # discard the state of an earlier flight
         if control is not ControlSource.POLICY or before is ControlSource.POLICY:
             return
         self._envelope.reset()
@@ -335,9 +335,9 @@ class Guard:
         self._smoother.reset(self._first(link, pilot))
 
     def _first(self, link: LinkSnapshot, pilot: Sticks | None) -> Action:
-        """Where the sticks are now; a velocity only as far as one may be asked for.
+        """Return the vehicle's current command, a velocity clipped to its limits.
 
-        One that is wrong would go on for long: at 5 m/s^2 the way back from 100 m/s takes 20 s.
+        A wrong velocity would last long: at 5 m/s^2 the way back from 100 m/s takes 20 s.
         """
         first = first_action(self._meaning, link.telemetry, pilot)
         is_velocity = self._meaning.kind == "velocity"
@@ -346,22 +346,22 @@ class Guard:
     def _decide(
         self, control: ControlSource | None, now_ns: int, *, is_thrust: bool
     ) -> tuple[Decision | None, ActionTrace | None]:
-        """The sticks to send now; those of the policy with their trace.
+        """Return the decision to send now; for an action of the policy also its trace.
 
-        ``is_thrust`` says that the throttle stick is thrust in the present mode.
+        ``is_thrust``: the throttle stick is thrust in the present mode.
         """
         if control is not ControlSource.POLICY:
             decision = self._at_rest(control)
             if isinstance(decision, Command):
                 is_neutral = control is ControlSource.NEUTRAL
-                if is_neutral and self._meaning.kind == "velocity":  # braked within the limits
+                if is_neutral and self._meaning.kind == "velocity":  # brake within the limits
                     decision = Command(action=self._smoother.step(self._neutral, now_ns).smoothed)
                 self._last = decision.action
             return decision, None
         raw = self._chunks.action_at(now_ns, self._lead_ns)
-        # Beyond the horizon level sticks bridge the rest of the grace.
+        # Beyond the horizon, level sticks bridge the rest of the grace.
         level = self._level(is_thrust=is_thrust)
-        if raw is None and self._meaning.kind == "rates":  # an attitude: not filtered
+        if raw is None and self._meaning.kind == "rates":  # level is an attitude then: no filter
             trace = ActionTrace(raw=level, clipped=level, slewed=level, smoothed=level)
         else:
             trace = self._smoother.step(raw or level, now_ns)
@@ -369,7 +369,7 @@ class Guard:
         return Command(action=trace.smoothed), trace
 
     def _at_rest(self, control: ControlSource | None) -> Decision | None:
-        """What a source other than the policy's would send now; nothing is noted."""
+        """Return the decision of a source other than the policy, without side effects."""
         if control is None:
             return None
         if control is ControlSource.RELEASE:
@@ -378,7 +378,7 @@ class Guard:
         return Command(action=resting.get(control) or self._level(is_thrust=True))
 
     def _level(self, *, is_thrust: bool) -> Action:
-        """Neutral, with the last throttle where that is thrust."""
+        """Return neutral, with the last throttle if the throttle stick is thrust."""
         neutral, last = self._neutral, self._last
         if isinstance(neutral, Sticks) and isinstance(last, Sticks) and is_thrust:
             return neutral._replace(throttle=last.throttle)
@@ -393,7 +393,7 @@ class Guard:
 
 
 def _newest(link: LinkSnapshot) -> int | None:
-    """Arrival of the newest of what comes all the time."""
+    """Return the newest arrival of a mode, RC_CHANNELS or an attitude; None before the first."""
     status, attitude = link.status, link.telemetry.ned_from_body_wxyz
     stamps = (status.mode_arrived_ns, status.channels_arrived_ns) if status else ()
     arrivals = [stamp for stamp in (*stamps, attitude and attitude.arrived_ns) if stamp is not None]

@@ -1,4 +1,4 @@
-"""Bounds and filter of the actions that leave, and the actions that are safe in themselves."""
+"""Bounds and filter of the actions to send; neutral, idle and first actions."""
 
 import math
 from dataclasses import dataclass
@@ -23,23 +23,23 @@ from mavbridge.core.vehicle import (
 Four: TypeAlias = tuple[float, float, float, float]
 
 MOST_FIRST_LEAN_RAD = math.radians(80.0)
-"""Largest lean that a flight begins with, roll and pitch together: as far as limits go, and within
-what the codec sends (85 degrees)."""
+"""Largest lean at the start of a flight, roll and pitch combined: the widest settable limit, and
+below the codec's limit of 85 degrees."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ActionLimits:
-    """Bounds of the four numbers of an action, and of their change."""
+    """Bounds of the four numbers of an action, and of their rates of change."""
 
     low: Four
     high: Four
     change_per_s: Four
-    """Fastest change of each; infinite = no limit."""
+    """Maximum rate of change of each; infinite: no limit."""
     pair: tuple[int, int] | None = None
-    """Two numbers that are one vector: its length is kept within ``high``, its direction stays."""
+    """Indices of a vector's two numbers; limits its length to ``high`` and keeps its direction."""
 
     def clip(self, action: Action) -> Action:
-        """The nearest action within the bounds."""
+        """Return the nearest action within the bounds."""
         bounds = zip(action, self.low, self.high, strict=True)
         values = [min(max(value, low), high) for value, low, high in bounds]
         if self.pair is not None:
@@ -47,13 +47,13 @@ class ActionLimits:
         return type(action)(*values)
 
     def approach(self, now: Action, goal: Action, dt_s: float) -> Action:
-        """``goal``, or as far towards it as the limits of change allow in this time."""
+        """Return the action nearest to ``goal`` that the rate limits allow after ``dt_s``."""
         reach = [rate * dt_s if rate < math.inf else rate for rate in self.change_per_s]
         moves = [min(max(b - a, -most), most) for a, b, most in zip(now, goal, reach, strict=True)]
         if self.pair is not None:
             wanted = [b - a for a, b in zip(now, goal, strict=True)]
             self._shorten(moves, wanted, reach[self.pair[0]])
-        return type(goal)(  # the idle action of body rates is an attitude
+        return type(goal)(  # ``now`` may be an attitude: the idle action of body rates
             *[
                 b if most == math.inf else a + move
                 for a, b, move, most in zip(now, goal, moves, reach, strict=True)
@@ -61,7 +61,7 @@ class ActionLimits:
         )
 
     def _shorten(self, values: list[float], vector: list[float], longest: float) -> None:
-        """Put the pair of ``vector`` into ``values``, no longer than ``longest``."""
+        """Copy the pair of ``vector`` into ``values``, shortened to at most ``longest``."""
         assert self.pair is not None
         one, other = self.pair
         length = math.hypot(vector[one], vector[other])
@@ -71,14 +71,14 @@ class ActionLimits:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class LimitSettings:
-    """Bounds in the units of each kind; those of other kinds are not used."""
+    """Bounds in the units of each action kind; a flight uses those of its own kind."""
 
     stick_slew_per_s: float = 8.0
-    """Fastest stick, in full deflections a second; 0 = no limit."""
+    """Maximum stick speed, in full deflections per second; 0: no limit."""
     lean_rad: float = math.radians(35.0)
-    """Largest lean of an attitude, roll and pitch together."""
+    """Largest lean of an attitude, roll and pitch combined."""
     rate_radps: float = math.radians(220.0)
-    """Fastest roll and pitch rate."""
+    """Maximum roll and pitch rate."""
     yaw_rate_radps: float = math.radians(120.0)
     thrust: float = 0.9
     speed_mps: float = 8.0
@@ -86,10 +86,10 @@ class LimitSettings:
     climb_mps: float = 3.0
     """Up or down."""
     accel_mps2: float = 5.0
-    """Most change of a velocity, in any horizontal direction, and up and down."""
+    """Maximum change of a velocity, in any horizontal direction and vertically."""
 
     def of(self, kind: ActionKind) -> ActionLimits:
-        """Limits of one kind of action."""
+        """Return the limits of one kind of action."""
         free, lean, rate, yaw = math.inf, self.lean_rad, self.rate_radps, self.yaw_rate_radps
         match kind:
             case "sticks":
@@ -119,7 +119,10 @@ class LimitSettings:
 
 
 def neutral_action(meaning: ActionMeaning) -> Action:
-    """Level, or at rest: body rates alone would keep a lean, so theirs is an attitude."""
+    """Return the action for level flight or standstill.
+
+    For body rates it is an attitude, since zero rates would keep a lean.
+    """
     match meaning.kind:
         case "sticks":
             return NEUTRAL
@@ -130,7 +133,7 @@ def neutral_action(meaning: ActionMeaning) -> Action:
 
 
 def idle_action(meaning: ActionMeaning) -> Action:
-    """Keeps the vehicle on the ground while it is armed."""
+    """Return the action that keeps an armed vehicle on the ground."""
     match meaning.kind:
         case "sticks":
             return IDLE
@@ -141,9 +144,9 @@ def idle_action(meaning: ActionMeaning) -> Action:
 
 
 def first_action(meaning: ActionMeaning, telemetry: Telemetry, pilot: Sticks | None) -> Action:
-    """Action that continues what the vehicle does as the policy takes over, so that nothing jumps.
+    """Return the policy's first action: it continues the vehicle's motion without a jump.
 
-    ``pilot`` are the sticks that the vehicle follows now; None = not known.
+    ``pilot``: sticks that the vehicle follows now; None: unknown.
     """
     attitude, velocity = telemetry.ned_from_body_wxyz, telemetry.velocity_ned_mps
     ned_from_body_wxyz = attitude.values if attitude else (1.0, 0.0, 0.0, 0.0)
@@ -171,21 +174,21 @@ class Smoothing:
 
     limits: ActionLimits
     tau_s: float
-    """Time constant of the first-order low-pass; 0 = off."""
+    """Time constant of the first-order low-pass; 0: off."""
     max_dt_s: float = 0.15
-    """Longest step to integrate over, s, so that nothing jumps after a stall; longer than any
-    period."""
+    """Longest integration step [s], longer than any period; prevents a jump after a stall."""
 
 
 class ActionSmoother:
-    """Clip -> limit of change -> low-pass, with the measured time between calls.
+    """Filter: clip, then rate limit, then low-pass, over the measured time between calls.
 
-    - Change: the output moves towards the input by ``change_per_s * dt`` at most.
+    - Rate limit: the output moves towards the input by at most ``change_per_s * dt``.
     - Low-pass: ``tau dy/dt = u - y``, solved (not stepped) for an input linear over the step:
-      ``y1 = u1 - m tau + (y0 - u0 + m tau) exp(-dt/tau)`` with ``m = (u1 - u0) / dt``. That makes
-      the output at the tick times independent of where the ticks fall.
+      ``y1 = u1 - m tau + (y0 - u0 + m tau) exp(-dt/tau)`` with ``m = (u1 - u0) / dt``. The output
+          at a
+      tick is therefore independent of where the earlier ticks fall.
 
-    The limit comes first, so that the low-pass, an average of limited values, keeps the bound.
+    The rate limit comes first: the low-pass averages limited values, so it keeps the bound.
     """
 
     def __init__(self, settings: Smoothing, start: Action) -> None:
@@ -196,17 +199,17 @@ class ActionSmoother:
         self._smoothed = self._before = start
 
     def reset(self, start: Action) -> None:
-        """Restart from what the vehicle does at present."""
+        """Reset the filter to the vehicle's current command."""
         self._last_ns = None
         self._slewed = start
         self._smoothed = self._before = start
 
     def undo(self) -> None:
-        """Restart from before the last step, whose output did not leave."""
+        """Reset the filter to the output before the last step, which was not sent."""
         self.reset(self._before)
 
     def step(self, raw: Action, now_ns: int) -> ActionTrace:
-        """Filter one action, which must be finite; the first after a reset spans no time."""
+        """Filter one finite action; the first step after a reset has zero duration."""
         dt_s = 0.0
         if self._last_ns is not None:
             dt_s = min(max(now_ns - self._last_ns, 0) / NS_PER_S, self._settings.max_dt_s)
@@ -231,5 +234,5 @@ class ActionSmoother:
             (a, b, y, b - (b - a) * lag + (y - a + (b - a) * lag) * decay)
             for a, b, y in zip(u0, u1, self._smoothed, strict=True)
         )
-        # An average of the three: rounding must not carry it beyond a limit that they keep.
+        # An average of the three: rounding must not carry it beyond their bounds.
         return type(u1)(*[min(max(z, min(a, b, y)), max(a, b, y)) for a, b, y, z in filtered])

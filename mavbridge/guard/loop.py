@@ -1,4 +1,4 @@
-"""The guard with its two edges, the link to the vehicle and the channel to the flight process."""
+"""The guard's loop: connects the guard to the vehicle's link and to the flight process."""
 
 import traceback
 from collections.abc import Callable, Sequence
@@ -37,13 +37,14 @@ from mavbridge.guard.wire import (
 from mavbridge.mavlink.link import MavlinkLink
 
 IDLE_PERIOD_NS = 10 * NS_PER_MS
-"""Between two looks at the link before a policy is loaded."""
+"""Polling period of the link before a policy is loaded."""
 FINISH_NS = 4 * NS_PER_S
-"""Longest that putting parameters back may take, or sending a release that was held up."""
+"""Longest time to restore parameters, and to send a delayed release, at the end."""
 _Sent = TypeVar("_Sent")
 WORDS_NS, THRUST_WORDS_NS = NS_PER_S, 100 * NS_PER_MS
-"""Oldest last words: signatures must be no older than a minute, and what tells the safe mode may
-change. In modes where the throttle is thrust they repeat the last one, which should be near."""
+"""Renewal periods of the last words: their signatures must be less than a minute old, and the
+choice of the safe mode may change. In thrust modes they repeat the last throttle, which should be
+recent."""
 _HELD = (Phase.FLYING, Phase.LEAVING, Phase.HOLDING)
 _ENGAGED = (*_HELD, Phase.RELEASING)
 _TAKEN = (*_ENGAGED, Phase.PREPARING)
@@ -52,11 +53,11 @@ _LINK, _STATUS = (
     attrgetter(*(each.name for each in fields(kind) if each.name not in _MOTION))
     for kind in (LinkSnapshot, VehicleStatus)
 )
-"""Everything that a step of the guard may answer to, but for the motion of the vehicle."""
+"""Getters of all fields that can cause a step of the guard, the vehicle's motion excluded."""
 
 
 class GuardLoop:
-    """One pass at every wake: receive, decide, send, report. Used by one thread."""
+    """Receives, decides, sends and reports in one pass per wakeup. Not thread-safe."""
 
     def __init__(
         self,
@@ -68,15 +69,15 @@ class GuardLoop:
         received: Sequence[bytes] = (),
         lead_ns: int = 0,
     ) -> None:
-        """Join link and channel.
+        """Connect the link and the flight process.
 
         Args:
-            clock: time of everything.
-            link: the vehicle.
-            flight: the flight process.
-            samples: takes the vehicle's readings; None: they go with the other messages.
-            received: messages of the flight process that have come before.
-            lead_ns: how long before a slot its work begins; the sticks wait for the slot itself.
+            clock: source of all timestamps.
+            link: link to the vehicle.
+            flight: channel to the flight process.
+            samples: port for the vehicle's readings; None: send them through ``flight``.
+            received: messages already received from the flight process.
+            lead_ns: time from the start of a computation to its slot; the send waits for the slot.
         """
         self._received = list(received)
         self._lead_ns = lead_ns
@@ -87,42 +88,42 @@ class GuardLoop:
         self._guard: Guard | None = None
         self._vehicle: VehicleStatus | None = None
         self._status: GuardStatus | None = None
-        """As told last, from the vehicle's own one."""
+        """Last status sent to the flight process."""
         self._watches_position = False
         self._phase = Phase.WAITING
         self._stop: EndRequest | None = None
         self._command_fault: Reason | None = None
-        """Error of the last pass while a command was made or sent."""
+        """Error of the last pass while a command was encoded or sent."""
         self._finish_until_ns: int | None = None
         self._is_clean = False
         self._words: tuple[tuple[int, bytes], ...] = ()
-        """Packets with their delays that bring the vehicle into safety if this process dies."""
+        """Last words: delays [ns] and packets that make the vehicle safe if this process dies."""
         self._words_basis: object = None
         self._words_due_ns = 0
         self._words_outlet: Outlet | None = None
-        """That the flight process has open."""
+        """Outlet that the flight process holds open."""
         self._known: object = None
-        """The link and the vehicle's status at the last look, motion excepted."""
+        """State of the link and the vehicle at the last pass, motion excluded."""
         self._stepped_ns = 0
         self.is_done = False
-        """The sticks are given back, and nobody wants more flights."""
+        """True once control has been given back and no further flight will follow."""
 
     @property
     def failure(self) -> Reason | None:
-        """Why there was no flight, or None."""
+        """Why there was no flight; None: there was one, or it may still begin."""
         return None if self._guard is None else self._guard.failure
 
     @property
     def outcome(self) -> Outcome:
-        """How the flights went."""
+        """Outcome of the flights so far."""
         return Outcome() if self._guard is None else self._guard.outcome
 
     def stop(self, ending: EndRequest) -> None:
-        """End at the next step, as ``ending`` says."""
+        """End at the next step, as ``ending`` demands; the first request counts."""
         self._stop = self._stop or ending
 
     def abandon(self) -> None:
-        """Say the last words without any state machine: the guard ends by a bug of its own."""
+        """Send the last words without the state machine, after a bug in the guard."""
         with suppress(Exception):
             self._prepare_words(self._link.outlet)
         died_ns = self._clock.now_ns()
@@ -132,7 +133,7 @@ class GuardLoop:
                 self._link.transmit(packet)
 
     def _renew_words(self, snapshot: LinkSnapshot, output: GuardOutput) -> None:
-        """Prepare the last words where what they rest on has changed, and from time to time."""
+        """Prepare the last words when their inputs have changed, and periodically."""
         now_ns, status, outlet = self._clock.now_ns(), snapshot.status, self._link.outlet
         basis: tuple[object, ...] = (output.phase, outlet)
         if status is not None:
@@ -146,7 +147,7 @@ class GuardLoop:
             self._prepare_words(outlet)
 
     def _prepare_words(self, outlet: Outlet) -> None:
-        """Leave with the flight process what it shall send if this process dies."""
+        """Give the flight process the packets to send if this process dies."""
         if self._guard is None:
             return
         is_held = self._guard.phase in _TAKEN and outlet.fd is not None
@@ -161,10 +162,11 @@ class GuardLoop:
         self._words_outlet = outlet if is_told and self._words else None
 
     def step(self) -> int:
-        """One pass; returns when the next one is due at the latest.
+        """Run one pass. Return the latest time of the next one.
 
         Raises:
-            PeerError, UserError: the vehicle cannot be found, or cannot be flown.
+            PeerError: the vehicle cannot be found.
+            UserError: the vehicle cannot be flown.
         """
         woke_ns = self._clock.now_ns()
         snapshot = self._link.poll()
@@ -175,7 +177,7 @@ class GuardLoop:
             if given.stop is not None:
                 self._finish(woke_ns)
             return woke_ns + IDLE_PERIOD_NS
-        # A slot that is about to come due is worked for now, so that only the send is left.
+        # Compute for a slot that is about to come due, so that only the send is left.
         now_ns, slot_ns = self._clock.now_ns(), self._guard.next_ns
         at_ns = slot_ns if 0 < slot_ns - now_ns <= self._lead_ns else now_ns
         if not self._has_work(snapshot, given, at_ns, slot_ns):
@@ -200,14 +202,16 @@ class GuardLoop:
         self._renew_words(snapshot, output)
         if output.phase is Phase.ENDED:
             self._finish(woke_ns)
-        # A command that failed is answered in a pass that follows at once.
+        # After a failed command the next pass follows at once.
         return woke_ns if self._command_fault else self._guard.next_ns - self._lead_ns
 
     def _has_work(
         self, snapshot: LinkSnapshot, given: GuardInput, at_ns: int, slot_ns: int
     ) -> bool:
-        """True unless the policy flies, nothing but the vehicle's motion is news, and a step was
-        made just now."""
+        """True if the guard must step.
+
+        False in flight, between slots, within 10 ms of a step, if only motion has changed.
+        """
         status = snapshot.status
         known = (_LINK(snapshot), status and _STATUS(status), self._link.outlet)
         before, self._known = self._known, known
@@ -219,10 +223,10 @@ class GuardLoop:
         return bool(has_work)
 
     def _attempt(self, send: Callable[[], _Sent]) -> _Sent | None:
-        """Send something; an error is a fault of the flight, not the guard's end."""
+        """Call ``send``. An error becomes a fault of the flight instead of ending the guard."""
         try:
             return send()
-        except Exception as error:  # noqa: BLE001 - the vehicle is held: end the flight in order
+        except Exception as error:  # noqa: BLE001 - the vehicle is held: an orderly end
             at = traceback.extract_tb(error.__traceback__)[-1]
             self._command_fault = because(
                 Code.COMMAND_FAILED,
@@ -232,7 +236,7 @@ class GuardLoop:
             return None
 
     def _follow(self, output: GuardOutput) -> None:
-        """Send the requests, and show the messages."""
+        """Send the requests to the vehicle, and the messages to the flight process."""
         commands = self._link.commands
         if output.mode is not None:
             self._attempt(partial(commands.set_mode, output.mode))
@@ -244,17 +248,17 @@ class GuardLoop:
             self._flight.send(encode_from_guard(GuardMessage(text)))
 
     def _finish(self, now_ns: int) -> None:
-        """Put the vehicle's parameters back, and send what is owed, for a bounded time."""
+        """For at most FINISH_NS, restore parameters and send an outstanding release."""
         if self._finish_until_ns is None:
             self._finish_until_ns = now_ns + FINISH_NS
         was_clean = self._is_clean
         self._is_clean = self._link.restore() and not self._link.is_release_owed
-        # One pass more: it passes on what the link says about the parameters.
+        # One more pass forwards the link's messages about the parameters.
         self.is_done = (was_clean and self._is_clean) or now_ns >= self._finish_until_ns
 
     def _report_vehicle(self, snapshot: LinkSnapshot) -> None:
-        """Pass the vehicle's samples on, then its status where that has changed."""
-        # Until a policy is loaded nobody reads, and the queue is for what matters then.
+        """Forward the vehicle's samples, then its status if it has changed."""
+        # The flight process does not read samples before a policy is loaded; keep the queue free.
         if snapshot.samples and self._guard is not None:
             self._samples.send(encode_samples(snapshot.samples))
         if snapshot.packets and self._guard is not None:
@@ -281,7 +285,7 @@ class GuardLoop:
             self._flight.send(encode_from_guard(status))
 
     def _receive(self, snapshot: LinkSnapshot) -> GuardInput:
-        """Take the messages of the flight process, the newest of each kind."""
+        """Read the messages of the flight process; keep the newest of each kind."""
         chunk: Chunk | None = None
         absence: Reason | None = None
         act: OperatorCommand | None = None
@@ -303,9 +307,9 @@ class GuardLoop:
                 case EndRequest() as ending:
                     self.stop(ending)
                 case "engage" | "release" as new:
-                    act = "release" if act == "release" else new  # whatever came after it
+                    act = "release" if act == "release" else new  # release wins over a later engage
                 case _:
-                    pass  # settings that count already
+                    pass  # settings are taken only once
         if self._flight.is_closed:
             self.stop(EndRequest(reason=because(Code.FLIGHT_PROCESS_DIED), is_fault=True))
         return GuardInput(
@@ -340,7 +344,7 @@ class GuardLoop:
         self._flight.send(encode_from_guard(tick))
 
     def _change_phase(self, output: GuardOutput) -> None:
-        """Tell everybody who holds the sticks now."""
+        """Announce on the link who has control."""
         before, self._phase = self._phase, output.phase
         self._link.is_engaged = self._phase in _ENGAGED
         text: str | None = None

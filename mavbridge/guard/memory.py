@@ -1,4 +1,4 @@
-"""What the engagement remembers, and what the rows of its table do to that."""
+"""State of the engagement, and the actions of its table's rows."""
 
 from dataclasses import dataclass, field
 
@@ -15,88 +15,87 @@ from mavbridge.guard.sequences import (
 from mavbridge.guard.values import EndRequest, EngagementInputs, OperatorCommand, Outcome, Phase
 
 PREPARE_TIMEOUT_NS = 90 * NS_PER_S
-"""For mode change and arming, without the climb; a cold estimator needs some 40 s."""
+"""Time limit for mode change and arming, without the climb; a cold estimator needs some 40 s."""
 ACT_TIMEOUT_NS = 3 * NS_PER_S
-"""For the change of mode that an act asks for while armed: no act comes true much later."""
+"""Time limit for the mode change after an act while armed: the act expires then."""
 REST_NS = 1_800 * NS_PER_MS
-"""Least rest of the engage switch, low, before going high is an act: receivers that dropped out for
-0.6 to 1.5 s, with a preset that puts the switch low, have looked like a hand."""
+"""Least time that the engage switch must rest low before going high is an act. Receivers that
+dropped out for 0.6 to 1.5 s, with a preset that puts the switch low, have looked like a hand."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class EngagementSettings:
-    """The acts that may engage, and the ways in and out."""
+    """Permitted ways to engage and disengage."""
 
     engage: EngageSettings
     disengage: DisengageSettings
     arm: bool = False
     """Arm once and engage once, as soon as everything is ready."""
     engage_channel: int | None = None
-    """Receiver channel, from 1, that engages when it goes high after a rest low."""
+    """Receiver channel, counted from 1, that engages when it goes high after a rest in low."""
     engage_on_arm: bool = False
     """Engage when the vehicle is armed for the first time."""
     readonly: bool = False
-    """Fly without sending anything."""
+    """Run the policy without sending anything."""
     duration_ns: int | None = None
-    """Flight time from the first engagement on; None = until told otherwise."""
+    """Flight time from the first engagement; None: no limit."""
 
 
 @dataclass(slots=True, kw_only=True)
 class Memory:
-    """Everything that the states remember."""
+    """State that persists between steps."""
 
     settings: EngagementSettings
     first_chunk_ns: int
-    """Time for the policy's first chunk after its reset."""
+    """Time limit for the policy's first chunk after its reset."""
     engage: EngageSequence
     disengage: DisengageSequence
     phase: Phase = Phase.WAITING
     reason: Reason | None = field(default_factory=lambda: because(Code.NOT_ENGAGED))
     """Why the policy does not fly; None while it does."""
     refusal: Reason | None = None
-    """Why the last act had no effect, or what the vehicle has not confirmed; its reader resets it.
-    """
+    """Failure of the last act, or missing confirmation by the vehicle; the reader resets it."""
     failure: Reason | None = None
     """Why there was no flight: the vehicle did not take the mode or arm in time."""
     outcome: Outcome = field(default_factory=Outcome)
     act: OperatorCommand | None = None
-    """Act of this step, whoever's, until a row follows it."""
+    """Act of this step, from any source, until a row handles it."""
     end_request: EndRequest | None = None
-    """The first one: after this flight the guard ends."""
+    """First request to end: the guard ends after this flight."""
     must_stop: bool = False
-    """It has not been acted upon."""
+    """True until ``end_request`` has been acted upon."""
     wants_arm: bool
-    """``--arm`` has not been followed yet."""
+    """True until ``--arm`` has been acted upon."""
     engaged_ns: int | None = None
-    """First moment of flight."""
+    """Start of the first flight."""
     own_mode: str | None = None
-    """The mode that we fly in, or asked for and got; any change of it is a takeover."""
+    """Mode of our flight, present or requested and entered; any change of it is a takeover."""
     seen_interruptions: int = 0
     was_armed: bool = False
-    """The vehicle was armed at the last step of preparing."""
+    """True if the vehicle was armed at the last step of PREPARING."""
     starting_ns: int | None = None
-    """When all was ready but the policy, which is reset then; None before and after."""
+    """Start of the policy's reset, when all else was ready; None before and after."""
     allowed_ns: int = 0
-    """Time to get ready."""
+    """Time allowed for PREPARING."""
     until_ns: int = 0
-    """End of it."""
+    """Deadline of PREPARING."""
     released_ns: int = 0
     owes_release: bool = False
-    """No release was sent yet: one is, also where nothing seems to be held."""
+    """True until a release has been sent; one is sent even if no sticks seem to be held."""
     stepped_ns: int | None = None
     unheard_ns: int | None = None
-    """The vehicle's last word before a silence or a standstill; None: its mode is known."""
+    """Last message of the vehicle before its silence or our stall; None: its mode is known."""
     news_from_ns: int = 0
-    """What has arrived before tells of the time before the silence."""
+    """Messages that arrived before this time date from before the silence."""
     heard_ns: int = 0
-    """The mode was last known; when we began to leave, at the earliest."""
+    """Last time at which the mode was known; reset when LEAVING begins."""
     is_arming_awaited: bool | None = None
-    """The vehicle has not been armed yet; None before it was found."""
+    """True until the vehicle is armed for the first time; None before it is found."""
     switch: Switch = field(default_factory=lambda: Switch(rest_ns=REST_NS))
 
     @property
     def is_act(self) -> bool:
-        """The way in follows an act, and not ``--arm``."""
+        """True if PREPARING follows an act, not ``--arm``."""
         return self.allowed_ns == ACT_TIMEOUT_NS
 
     def nothing(self, _now: EngagementInputs, _cause: object) -> None:
@@ -112,7 +111,7 @@ class Memory:
         self.engage.begin(now)
         self.allowed_ns = ACT_TIMEOUT_NS
         if self.wants_arm:
-            climb_s = self.settings.engage.takeoff_m or 0.0  # at 1 m/s; 1.5 m/s are usual
+            climb_s = self.settings.engage.takeoff_m or 0.0  # at 1 m/s; usual is 1.5 m/s
             self.allowed_ns = PREPARE_TIMEOUT_NS + round(climb_s * NS_PER_S)
         self.wants_arm = self.was_armed = False
         self.until_ns = now.now_ns + self.allowed_ns
@@ -170,12 +169,12 @@ class Memory:
 
     def forget(self, now: EngagementInputs, _cause: bool) -> None:
         """nothing"""
-        self.disengage.mode = None  # from now on every mode change is somebody else's
+        self.disengage.mode = None  # every later mode change comes from someone else
         if not now.is_released:
             self.refusal = because(Code.RELEASE_NOT_SEEN)
 
     def _note_end(self, cause: EndRequest) -> None:
-        """Note how a flight has ended, and whether by a fault of ours."""
+        """Note how a flight has ended, and count it if a fault of ours ended it."""
         if self.phase is not Phase.FLYING:
             return
         is_fault = cause.is_fault and cause.end not in ("takeover", "disarmed")
@@ -186,5 +185,5 @@ class Memory:
 
 
 def not_engaged(why: Reason) -> Reason:
-    """Reason for an act that has no effect."""
+    """Return the reason for an act without effect."""
     return because(Code.NOT_ENGAGED_SINCE, why=why)

@@ -1,4 +1,4 @@
-"""The two sequences of steps that are more than a state: into a flight, and out of one."""
+"""The two multi-step sequences of the engagement: into a flight, and out of it."""
 
 from dataclasses import dataclass
 
@@ -8,55 +8,58 @@ from mavbridge.core.vehicle import OnFault
 from mavbridge.guard.values import Actions, ControlSource, EngagementInputs
 
 REQUEST_SPACING_NS = NS_PER_S
-"""Between two requests to arm or for a mode: each refused one prints the vehicle's reason."""
+"""Time between requests to arm or change the mode: each refusal prints the vehicle's reason."""
 ARRIVED = 0.9
-"""Share of the takeoff height at which the policy's mode is asked for."""
+"""Fraction of the takeoff height at which the policy's mode is requested."""
 FLOW_NS = 100 * NS_PER_MS
-"""Setpoints flow for so long before a mode is asked for that needs them: PX4 took OFFBOARD 20 ms
-after the first, and refused it when asked together with it."""
+"""Time for which setpoints flow before a mode that needs them is requested. PX4 accepted OFFBOARD
+20 ms after the first setpoint, and refused it when requested together with it."""
 NEUTRAL_NS = 50 * NS_PER_MS
-"""Least time of neutral sticks before they are given back."""
+"""Least time of neutral sticks before the release."""
 MODE_SPACING_NS = 100 * NS_PER_MS
-"""Between two requests for the safe mode; ArduPilot answers within 10 ms."""
+"""Time between two requests for the safe mode; ArduPilot answers within 10 ms."""
 SLOW_SPACING_NS = NS_PER_S
-"""The same once a vehicle with a good link has not confirmed it for the timeout."""
+"""Time between requests for a mode not confirmed within MODE_TIMEOUT_NS over a good link."""
 MODE_TIMEOUT_NS = 3 * NS_PER_S
-"""Longest wait for the safe mode of a vehicle that is heard; HEARTBEAT, which confirms it, may come
+"""Longest wait for the safe mode while the vehicle is heard; HEARTBEAT, which confirms it, may come
 at 1 Hz."""
 BLIND_NS = 3 * NS_PER_S
-"""Longest that a vehicle which is not heard is asked for a mode, where a receiver takes over from
-sticks that stay away: a failsafe for want of a ground station comes after 5 s."""
+"""Longest time to request a mode from a vehicle that is not heard, if its receiver takes over when
+our sticks end: the failsafe for a lost ground station comes after 5 s."""
 FAILSAFE_BLIND_NS = 500 * NS_PER_MS
-"""The same where its own failsafe follows, which must not be undone: after 0.5 s (COM_RC_LOSS_T) or
-1 s (RC_FS_TIMEOUT, COM_OF_LOSS_T)."""
+"""Longest time to request a mode from a vehicle that is not heard, if its failsafe follows and must
+not be undone: after 0.5 s (COM_RC_LOSS_T) or 1 s (RC_FS_TIMEOUT, COM_OF_LOSS_T)."""
 SETPOINT_NS = 500 * NS_PER_MS
-"""Longest stream of neutral setpoints that waits for the mode on PX4. A vehicle that has not
-answered by then does not hear us, and it goes back to OFFBOARD within 30 ms when it hears a
-setpoint after its own failsafe (COM_OF_LOSS_T, 1 s)."""
+"""Longest stream of neutral setpoints while waiting for the mode on PX4. A vehicle that has not
+answered by then does not hear us. It would return to OFFBOARD within 30 ms of hearing a setpoint
+after its failsafe (COM_OF_LOSS_T, 1 s)."""
 STICK_REST_NS = NS_PER_S
-"""Longest wait for our sticks to be at rest before the safe mode is asked for all the same: a jump
-over the whole range is slower than PX4's least hand, 0.05 a second, after 0.6 s."""
+"""Longest wait for our sticks to come to rest before the safe mode is requested anyway: 0.6 s after
+a jump over the full range, PX4 sees less than 0.05 per second, the slowest motion that counts as a
+hand."""
 UNDONE_NS = NS_PER_S
-"""A safe mode that PX4 leaves this soon for moving sticks was left for our jump to neutral."""
+"""Time in a safe mode within which PX4 may leave it because of our jump to neutral."""
 WORD_NS = 100 * NS_PER_MS
-"""Wait for the EVENT that tells it from another station's change of mode, which has none."""
+"""Wait for the EVENT that reports moved sticks; another station's mode change causes none."""
 MIDDLE_STICK = 0.2
-"""A receiver's throttle this near to the middle holds height or nearly so (ArduPilot's THR_DZ is
-0.2 of the stick's travel to each side)."""
+"""Largest distance of a receiver's throttle from the middle that roughly holds height (ArduPilot's
+THR_DZ is 0.2 of the stick's travel to each side)."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class EngageSettings:
-    """State that the vehicle has to be in before the policy flies."""
+    """Vehicle state required before the policy flies."""
 
     modes: tuple[str, ...]
     """Modes in which the policy may fly."""
     mode: str | None = None
-    """The one of them to ask for; None = the present one, or when we arm it the first of modes."""
+    """Mode to request, one of ``modes``; None: the present one, or the first of ``modes`` if we arm
+    the vehicle."""
     takeoff_m: float | None = None
-    """Height above the place of arming to which the autopilot climbs by itself, when we arm it."""
+    """Height above the arming place to which the autopilot climbs autonomously, if we arm the
+    vehicle."""
     is_setpoint: bool = False
-    """The policy's actions are setpoints, and not sticks."""
+    """True if the policy's actions are setpoints, not sticks."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -64,35 +67,35 @@ class DisengageSettings:
     """Actions after a fault, and at a normal end."""
 
     on_fault: OnFault = "auto"
-    """auto: release to a hand that would hold the vehicle, else hold."""
+    """auto: release if a hand would hold the vehicle, else hold."""
     then: OnFault = "auto"
-    """auto: release to a hand that would hold the vehicle, else land."""
+    """auto: release if a hand would hold the vehicle, else land."""
     is_setpoint: bool = False
-    """The policy's actions are setpoints: there is nothing to release to, so that a mode which
-    holds stands for release, and silence follows it."""
+    """True if the policy's actions are setpoints: no sticks can take over, so a mode that holds
+    replaces the release, followed by silence."""
 
 
 @dataclass(slots=True)
 class EngageSequence:
-    """Mode, arming, takeoff: ``begin`` starts it, ``step`` goes on until it waits for nothing."""
+    """Mode, arming, takeoff: ``begin`` starts, ``step`` continues until nothing is missing."""
 
     settings: EngageSettings
     waits_for: Reason | None = None
-    """What is missing; None: ready to fly."""
+    """Missing condition; None: ready to fly."""
     arms: bool = False
-    """It was disarmed at the beginning: we keep it idle on the ground, and arm it."""
+    """True if the vehicle was disarmed at the beginning: we keep it idle, and arm it."""
     asked_mode: str | None = None
     request_due_ns: int = 0
     is_up: bool = False
-    """No takeoff is wanted, or the height is reached."""
+    """True if no takeoff is wanted, or its height has been reached."""
     ground_m: float | None = None
     flows_from_ns: int | None = None
-    """First setpoint of those that a mode needs before it is entered."""
+    """Start of the stream of setpoints or sticks that a mode needs before it is entered."""
     lends_sticks: bool = False
-    """The mode was refused to a vehicle in the air that has no sticks: neutral ones flow."""
+    """True if a vehicle in the air without sticks has refused the mode: neutral sticks flow."""
 
     def begin(self, now: EngagementInputs) -> None:
-        """Start with the vehicle as it is now."""
+        """Start from the vehicle's present state."""
         self.arms = not now.armed
         self.is_up = self.settings.takeoff_m is None or not self.arms
         self.asked_mode = self.ground_m = self.flows_from_ns = None
@@ -100,23 +103,23 @@ class EngageSequence:
 
     @property
     def has_sticks(self) -> bool:
-        """Ours are the vehicle's while this goes on."""
+        """True if the vehicle gets our sticks during the sequence."""
         return self.arms or self.lends_sticks
 
     def is_own_mode(self, now: EngagementInputs) -> bool:
-        """The present mode was asked for, or is one that the autopilot's takeoff goes through."""
+        """True if the present mode was requested, or belongs to the autopilot's takeoff."""
         has_takeoff = self.settings.takeoff_m is not None and self.arms
         return now.mode == self.asked_mode or (has_takeoff and now.mode in now.modes.takeoff)
 
     def may_change_mode(self, now: EngagementInputs) -> bool:
-        """An act asks for another mode: the flag's, or one that only our setpoints can enter."""
+        """True if an act requests another mode: the flag's, or one entered only by setpoints."""
         if self.settings.mode is not None:
             return now.mode != self.settings.mode
         needs_flow = self.settings.is_setpoint and now.modes.needs_setpoints_first
         return needs_flow and now.mode not in self.settings.modes
 
     def wanted_mode(self, now: EngagementInputs) -> str | None:
-        """Mode to ask for; None if the present one will do."""
+        """Return the mode to request, or None if the present one is right."""
         wanted = self.settings.mode
         if not self.is_up:
             wanted = now.mode if now.armed else next(iter(now.modes.takeoff), None)
@@ -126,14 +129,14 @@ class EngageSequence:
         return None if wanted == now.mode else wanted
 
     def impossibility(self, now: EngagementInputs) -> Reason | None:
-        """Why waiting will not help, or None."""
+        """Return why waiting will not help, or None."""
         names, wanted = now.modes.names, self.wanted_mode(now)
         if wanted is None or not names or wanted in names:
             return now.slowness
         return because(Code.NO_SUCH_MODE, mode=wanted, modes=", ".join(names))
 
     def step(self, now: EngagementInputs, objection: Reason | None) -> Actions:
-        """Advance; with an ``objection`` nothing new is asked for."""
+        """Advance; with an ``objection``, keep the sticks going but request nothing."""
         self._watch_climb(now)
         wanted = self.wanted_mode(now)
         climb_m = self.settings.takeoff_m if not self.is_up and now.armed else None
@@ -159,7 +162,7 @@ class EngageSequence:
         return Actions(control=control, mode=wanted, arm=arm, takeoff_m=climb_m)
 
     def _lend_sticks(self, now: EngagementInputs, wanted: str | None) -> None:
-        """Send neutral sticks once a mode was refused that PX4 enters only with some.
+        """Start neutral sticks if PX4 has refused a mode that it enters only with sticks.
 
         From then on silence would be a failsafe.
         """
@@ -187,14 +190,14 @@ class EngageSequence:
         return because(Code.WAITING_FOR_ARMING)
 
     def _control(self, now: EngagementInputs, wanted: str | None) -> ControlSource | None:
-        """What to send meanwhile.
+        """Return the source to send during the sequence.
 
-        Somebody who has armed it keeps the sticks until the policy takes them. Setpoints end a
-        takeoff, but some modes are only entered while they flow.
+        A person who armed the vehicle keeps the sticks until the policy takes over. Setpoints would
+        end a takeoff, but some modes can be entered only while setpoints flow.
         """
         is_climbing = self.arms and now.armed and self.settings.takeoff_m is not None
         if now.link_problem is not None:
-            # Sticks that end are a failsafe where there is no receiver, also if we hear nothing.
+            # Without a receiver the end of sticks is a failsafe, even if we hear nothing.
             is_held = is_climbing and not self.settings.is_setpoint
             return ControlSource.NEUTRAL if is_held else None
         if self.settings.is_setpoint:
@@ -202,7 +205,7 @@ class EngageSequence:
                 return None
             if self.arms and self.settings.takeoff_m is None:
                 return ControlSource.IDLE
-            mode = wanted or now.mode  # and once entered, it is kept only by them
+            mode = wanted or now.mode  # setpoints also keep the mode once entered
             needs_flow = now.modes.needs_setpoints_first and mode in now.modes.setpoint
             return ControlSource.NEUTRAL if needs_flow else None
         if not self.has_sticks:
@@ -213,38 +216,38 @@ class EngageSequence:
 
 @dataclass(slots=True)
 class DisengageSequence:
-    """Neutral, a safe mode, then the release: ``begin`` starts it, ``step`` goes on."""
+    """Neutral, a safe mode, then the release: ``begin`` starts, ``step`` continues."""
 
     settings: DisengageSettings
     mode: str | None = None
-    """The safe mode that is asked for; a change to it is no takeover."""
+    """Requested safe mode; a change to it is no takeover."""
     is_done: bool = False
     must_hold: bool = False
-    """Neutral must go on: silence is a failsafe, or the receiver would drop the vehicle."""
+    """True if neutral must go on: silence is a failsafe, or the receiver would drop it."""
     is_silence_failsafe: bool = False
-    """The vehicle takes the end of our sticks for a failsafe."""
+    """True if the end of our sticks triggers the vehicle's failsafe."""
     may_release: bool = False
-    """The receiver's sticks would hold the vehicle in the mode of the flight."""
+    """True if the receiver's sticks would hold the vehicle in the flight's mode."""
     is_thrust_mode: bool = False
     began_ns: int = 0
     request_due_ns: int = 0
     asks_until_ns: int = 0
-    """End of the quick requests: a vehicle that is heard has had its time to confirm."""
+    """End of the frequent requests: a vehicle that is heard has had time to confirm."""
     asked_ns: int | None = None
-    """The safe mode was last asked for."""
+    """Last request for the safe mode."""
     entered_ns: int = 0
-    """It was asked for, or seen for the first time after that."""
+    """Last request for the safe mode, or the first time after it that the mode was seen."""
     undone_ns: int | None = None
-    """The vehicle was first seen in the mode that it enters for a moving stick."""
+    """First time that the vehicle was seen in the mode that it enters when sticks move."""
     has_failed: bool = False
-    """A command could not be made on this way out."""
+    """True if a command has failed since ``begin``."""
 
     def ask_at_once(self, now_ns: int) -> None:
-        """Let the next request for the mode wait for no spacing."""
+        """Request the mode at the next step, without waiting for the spacing."""
         self.request_due_ns, self.asks_until_ns = now_ns, now_ns + MODE_TIMEOUT_NS
 
     def begin(self, now: EngagementInputs, *, is_fault: bool) -> Reason | None:
-        """Choose the safe mode; returns why it is not released although the flag says so."""
+        """Choose the safe mode. Return why a release that the flag demands is refused, or None."""
         self.ask_at_once(now.now_ns)
         self.began_ns = now.now_ns
         self.asked_ns = self.undone_ns = None
@@ -261,7 +264,7 @@ class DisengageSequence:
             if objection is not None and choice == "release":
                 note = because(Code.NOT_RELEASED, instead=instead, why=objection)
             choice = "release" if objection is None else instead
-        # In a mode of setpoints or of the autopilot's takeoff a pilot's sticks would do nothing.
+        # A pilot's sticks would do nothing in a setpoint mode or during the autopilot's takeoff.
         is_deaf = now.mode in (*now.modes.setpoint, *now.modes.takeoff)
         if choice == "release" and (self.settings.is_setpoint or is_deaf):
             choice = "hold"
@@ -273,7 +276,7 @@ class DisengageSequence:
         return note
 
     def _hand_objection(self, now: EngagementInputs) -> Reason | None:
-        """Why the pilot's sticks would not hold the vehicle in its present mode, or None."""
+        """Return why the pilot's sticks would not hold the vehicle in its present mode, or None."""
         if now.has_receiver is not True:
             return because(Code.NO_RECEIVER)
         if now.is_landed:
@@ -293,9 +296,9 @@ class DisengageSequence:
         return None
 
     def is_undone(self, now: EngagementInputs) -> bool:
-        """True if the vehicle has left our mode for a hand that nobody moved, or may have.
+        """True if our own sticks made the vehicle leave the safe mode, or may have.
 
-        It shows our sticks, and no others; its EVENT says that sticks were moved.
+        The vehicle shows our sticks and no others, and its EVENT reports moved sticks.
         """
         if self.mode is None or self.asked_ns is None or now.mode != now.modes.override:
             return False
@@ -316,36 +319,36 @@ class DisengageSequence:
             return
         if now.mode == now.modes.override:
             self.undone_ns = now.now_ns if self.undone_ns is None else self.undone_ns
-        elif self.undone_ns is not None:  # back in our mode: another hand needs another word
+        elif self.undone_ns is not None:  # back in our mode: the next exit needs its own EVENT
             self.asked_ns, self.undone_ns = now.now_ns, None
 
     def _are_at_rest(self, now: EngagementInputs) -> bool:
-        """Neutral sticks have left, and pass for nobody's hand."""
+        """True if neutral sticks were sent and no longer look like a hand."""
         if self.settings.is_setpoint or not now.modes.override:
             return True
         is_bounded = now.now_ns - self.began_ns >= STICK_REST_NS
         self.has_failed = self.has_failed or now.command_failed
         if self.has_failed:
-            return is_bounded  # when neutral left is not known
+            return is_bounded  # the time at which neutral was sent is unknown
         return is_bounded or (now.are_sticks_at_rest and now.now_ns > self.began_ns)
 
     def _may_ask(self, now: EngagementInputs, unheard_ns: int | None) -> bool:
-        """The mode is known, or the vehicle's own failsafe cannot have acted yet."""
+        """True if the mode is known, or the vehicle's failsafe cannot have acted yet."""
         has_failsafe = self.is_silence_failsafe or now.modes.needs_setpoints_first
         blind_ns = FAILSAFE_BLIND_NS if has_failsafe else BLIND_NS
         return unheard_ns is None or now.now_ns - unheard_ns <= blind_ns
 
     def step(self, now: EngagementInputs, unheard_ns: int | None) -> Actions:
-        """Neutral, and the mode until it is confirmed or refused.
+        """Send neutral, and request the mode until it is confirmed or refused.
 
-        ``unheard_ns``: last word of a vehicle that has not told its mode since; None: it is known.
+        ``unheard_ns``: last message of a vehicle whose mode is unknown since; None: known.
         """
         is_confirmed = self.mode is None or now.mode == self.mode
         is_safe = self.may_release or (self.mode is not None and is_confirmed)
         self.must_hold = not self.settings.is_setpoint and (self.is_silence_failsafe or not is_safe)
-        if unheard_ns is not None:  # its time to answer begins when it is heard
+        if unheard_ns is not None:  # the timeout starts when the vehicle is heard
             self.asks_until_ns = now.now_ns + MODE_TIMEOUT_NS
-        # No vehicle refuses to land: an answer that says so is a late one, to the mode before.
+        # No vehicle refuses to land: such an answer is a late one to the previous request.
         if not is_confirmed and now.refused_mode == self.mode:
             self.mode = now.modes.land or None
         elapsed_ns = now.now_ns - self.began_ns
@@ -356,14 +359,14 @@ class DisengageSequence:
         is_late = now.now_ns >= self.asks_until_ns
         is_over = elapsed_ns >= NEUTRAL_NS if is_confirmed else is_late
         self.is_done = not is_undone and (self.is_done or is_over)
-        # Where the throttle is thrust, neutral would climb or fall: the mode goes first. Then it
-        # may still be a hand's to the vehicle.
+        # In thrust modes neutral would climb or fall, so the mode change comes first. Even after
+        # it, the vehicle may take our jump to neutral for a hand.
         is_entered = bool(self.mode) and is_confirmed and not now.modes.override
         is_level_only = self.is_thrust_mode and not is_entered
         control: ControlSource | None
         control = ControlSource.LEVEL if is_level_only else ControlSource.NEUTRAL
         if self.settings.is_setpoint and now.is_landed:
-            control = ControlSource.IDLE  # the thrust that hovers would lift it
+            control = ControlSource.IDLE  # hover thrust would lift it
         may_pull_back = self.settings.is_setpoint and now.modes.needs_setpoints_first
         if may_pull_back and elapsed_ns > SETPOINT_NS:
             control = None

@@ -1,4 +1,4 @@
-"""Settings of the guard: of its process, and of a flight."""
+"""Settings of the guard process, and of a flight."""
 
 from dataclasses import dataclass
 
@@ -12,19 +12,19 @@ from mavbridge.guard.memory import EngagementSettings
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class GuardSettings:
-    """The vehicle, and how the process runs; known before any policy is loaded."""
+    """Settings of the link and of the process, known before a policy is loaded."""
 
     link: LinkSettings
     realtime: bool = True
-    """Real-time scheduling, where the system permits it."""
+    """Use real-time scheduling if the system permits it."""
     cpu: int | None = None
-    """Run on this CPU alone."""
+    """The only CPU to run on; None: any."""
     tlog_fd: int | None = None
-    """Write end of the pipe of the telemetry log."""
+    """Write end of the telemetry log's pipe."""
     keeps_packets: bool = False
-    """Pass the vehicle's packets on, for a recorder."""
+    """Forward the vehicle's packets to a recorder."""
     wall_offset_ns: int = 0
-    """Wall time minus the clock, for the telemetry log."""
+    """Wall time minus the monotonic clock, for the telemetry log."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -33,15 +33,15 @@ class FlightSettings:
 
     meaning: ActionMeaning
     output: Output | None = None
-    """Message that carries the actions; None = the usual one of their kind and the vehicle."""
+    """Message that carries the actions; None: the default of their kind and the vehicle."""
     stick_period_ns: int
     chunk_period_ns: int
-    """Between the policy's chunks."""
+    """Time between the policy's chunks."""
     freshness: FreshnessLimits
     smoothing: Smoothing
     envelope: EnvelopeLimits
     engagement: EngagementSettings
     watches_home_height: bool
-    """The policy takes the height above home, which the vehicle is asked for then."""
+    """True if the policy takes the height above home: it is requested from the vehicle."""
     watches_position: bool
-    """It takes a position: the flight process is told whether there is one to be trusted."""
+    """True if the policy takes a position: the flight process is told while a valid one exists."""

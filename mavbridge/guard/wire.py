@@ -1,7 +1,7 @@
-"""Messages between the flight process and the guard, as bytes.
+"""Encoding of the messages between the flight process and the guard.
 
-Little-endian structures where they come at the rates of the loops, else pickles: one process has
-started the other, and nobody else has an end of the channel.
+Messages at loop rate are little-endian structures, the others pickles. Pickles are safe here: one
+process has started the other, and no third one has an end of the channel.
 """
 
 import io
@@ -32,7 +32,7 @@ _CHUNK = struct.Struct("<cBqqqqqqqqH")
 _TICK = struct.Struct("<cqqqqqqqB?iBBB20d")
 _QUANTITIES = Telemetry._fields
 _SAMPLES = tuple(struct.Struct(f"<Bqq{count}d") for count in (4, 3, 3, 3, 3, 1))
-"""By quantity: its number, arrival, delay, and the values."""
+"""Layout of a sample by quantity: index, arrival, delay, values."""
 _PHASES = tuple(Phase)
 _CLASSES = tuple(ACTION_CLASSES.values())
 _IS_SLOT, _IS_COASTING, _HAS_TRACE, _HAS_SENT = 1, 2, 4, 8
@@ -42,33 +42,33 @@ _MALFORMED = (
     *(struct.error, pickle.UnpicklingError, EOFError),
     *(ValueError, TypeError, LookupError, AttributeError),
 )
-"""Errors of the decoders for bytes that no encoder has made."""
+"""Errors of the decoders on malformed bytes."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class GuardTick:
-    """One send of the guard, or one slot in which it had nothing to send."""
+    """One send of the guard, or one slot without anything to send."""
 
     index: int
     due_ns: int
     woke_ns: int
     decided_ns: int
-    """The moment that the sticks were decided for: the slot, or when a chunk was seen."""
+    """Time for which the sticks were computed: the slot, or the step between slots."""
     sent_ns: int
-    """After the sticks were handed to the kernel."""
+    """Time after the sticks were handed to the kernel."""
     missed_slots: int
     is_slot: bool
     is_coasting: bool
     chunk_serial: int | None
     trace: ActionTrace | None
     sent: Action | None
-    """As sent; None when released, or when nothing was sent."""
+    """Action as sent; None for a release, or if nothing was sent."""
     phase: Phase
     reason: Reason | None
     """Why the policy does not fly; None while it does."""
     starting_ns: int = 0
-    """All has been ready since then: the policy gets the sticks with its first chunk after a reset
-    from then on; 0 where it has them, or all is not ready."""
+    """Time since which only the policy's first chunk is missing: it gets control with the first
+    chunk that follows a reset at or after this time; 0: not starting."""
 
 
 class Samples(NamedTuple):
@@ -84,7 +84,7 @@ class Packets(NamedTuple):
 
 
 class GuardStatus(NamedTuple):
-    """The vehicle's word about itself; sent when it changes."""
+    """Vehicle status; sent when it changes."""
 
     autopilot: str
     mode: str | None
@@ -93,46 +93,46 @@ class GuardStatus(NamedTuple):
     rc_channels_us: tuple[int, ...]
     rc_sticks: Sticks | None
     has_position: bool = False
-    """The estimator has a position that may be trusted, and the policy takes one."""
+    """True if the policy takes a position and the estimator has a valid one."""
 
 
 class GuardMessage(NamedTuple):
-    """A line for the user."""
+    """One line of text for the user."""
 
     text: str
 
 
 class LastWords(NamedTuple):
-    """What the flight process sends the vehicle if the guard dies; replaces the words before."""
+    """Packets for the flight process to send if the guard dies; replaces the previous ones."""
 
     phase: Phase
-    """That of the guard when it prepared them."""
+    """Phase of the guard when it prepared the packets."""
     mode: str | None
-    """The safe mode that they ask for."""
+    """Safe mode that the packets request."""
     receiver: SocketAddress | None
     """Address for the datagrams; None on a stream."""
     brings_file: bool
-    """The open socket or port of the link comes with this message."""
+    """True if the link's open socket or port comes with this message."""
     packets: tuple[tuple[int, bytes], ...]
-    """Each with its delay in ns from the death; none: nothing is held, nothing is to be said."""
+    """Delay after the death [ns] and bytes of each packet; empty: nothing is held, send nothing."""
 
 
 class GuardError(NamedTuple):
-    """The guard ends because of this."""
+    """Error that ends the guard."""
 
     kind: Literal["user", "peer", "bug"]
     text: str
 
 
 class NoChunk(NamedTuple):
-    """Why the flight process cannot compute a chunk now."""
+    """Reason why the flight process cannot compute a chunk now."""
 
     reason: Reason
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class GuardSummary:
-    """Last message of a guard that ends in order."""
+    """Last message of a guard that ends normally."""
 
     autopilot: str
     link: LinkStats
@@ -140,11 +140,11 @@ class GuardSummary:
     """Why there was no flight, or None."""
     outcome: Outcome
     params: dict[str, float]
-    """The vehicle's parameters that matter for a flight, by name, as far as they were read."""
+    """The vehicle's flight-relevant parameters that have been read, by name."""
     dropped_messages: int
-    """Messages to the flight process that did not fit into its queue."""
+    """Messages dropped because the flight process's queue was full."""
     dropped_packets: int
-    """Packets that did not fit into the pipe of the telemetry log."""
+    """Packets dropped because the telemetry log's pipe was full."""
 
 
 ToGuard: TypeAlias = GuardSettings | FlightSettings | Chunk | NoChunk | OperatorCommand | EndRequest
@@ -163,7 +163,7 @@ _TO_GUARD = (GuardSettings, FlightSettings, NoChunk, str, EndRequest)
 
 
 def encode_to_guard(message: ToGuard) -> bytes:
-    """One message of the flight process."""
+    """Encode a message of the flight process."""
     if not isinstance(message, Chunk):
         return _PICKLE + pickle.dumps(message)
     stamps = (*message[:7], message.reset_ns)
@@ -174,7 +174,7 @@ def encode_to_guard(message: ToGuard) -> bytes:
 
 
 def decode_to_guard(data: bytes) -> ToGuard:
-    """Inverse of ``encode_to_guard``; raises ValueError for anything else."""
+    """Decode a message of the flight process; raise ValueError if it is malformed."""
     try:
         message: ToGuard = _decode_chunk(data) if data[:1] == b"C" else _unpickled(data, _TO_GUARD)
     except _MALFORMED as error:
@@ -183,7 +183,7 @@ def decode_to_guard(data: bytes) -> ToGuard:
 
 
 def encode_from_guard(message: FromGuard) -> bytes:
-    """One message of the guard."""
+    """Encode a message of the guard."""
     match message:
         case GuardTick():
             return _encode_tick(message)
@@ -193,7 +193,7 @@ def encode_from_guard(message: FromGuard) -> bytes:
 
 
 def decode_from_guard(data: bytes) -> FromGuard:
-    """Any message of the guard; raises ValueError for anything else."""
+    """Decode a message of the guard; raise ValueError if it is malformed."""
     try:
         match data[:1]:
             case b"T":
@@ -207,10 +207,10 @@ def decode_from_guard(data: bytes) -> FromGuard:
 
 
 class _Unpickler(pickle.Unpickler):
-    """Imports nothing that the guard does not have: numpy, say, would stop it for long."""
+    """Unpickler for our own classes: importing others, such as numpy, would stall the guard."""
 
     def find_class(self, module: str, name: str) -> Any:
-        """Return a class of ours, or raise UnpicklingError."""
+        """Return a class of our own, or raise UnpicklingError."""
         if module.split(".")[0] not in ("mavbridge", "pathlib"):
             raise pickle.UnpicklingError(f"{module}.{name} is no part of a message")
         return super().find_class(module, name)
@@ -219,7 +219,7 @@ class _Unpickler(pickle.Unpickler):
 def _unpickled(data: bytes, classes: tuple[type, ...]) -> Any:
     message = _Unpickler(io.BytesIO(data[1:])).load() if data[:1] == _PICKLE else None
     if not isinstance(message, classes):
-        raise ValueError("unknown kind")  # noqa: TRY004 - as everything else that is no message
+        raise ValueError("unknown kind")  # noqa: TRY004 - same error as for other malformed messages
     return message
 
 
@@ -294,7 +294,7 @@ def _decode_tick(data: bytes) -> GuardTick:
 
 
 def encode_samples(samples: Iterable[Sample]) -> bytes:
-    """Readings of the vehicle, in order of arrival."""
+    """Encode readings of the vehicle, in order of arrival."""
     parts = [b"R"]
     for name, (arrived_ns, values, delay_ns) in samples:
         number = _QUANTITIES.index(name)
@@ -303,7 +303,7 @@ def encode_samples(samples: Iterable[Sample]) -> bytes:
 
 
 def decode_samples(data: bytes) -> Iterator[Sample]:
-    """Inverse of ``encode_samples``, where nothing else can come."""
+    """Decode readings; the data must come from ``encode_samples``."""
     at = 1
     while at < len(data):
         layout = _SAMPLES[data[at]]

@@ -1,1 +1,1 @@
-"""The edge: the only package that knows MAVLink."""
+"""MAVLink; all code that knows the protocol."""

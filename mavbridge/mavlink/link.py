@@ -1,4 +1,4 @@
-"""The vehicle as the guard sees it. One thread owns socket and codec."""
+"""Link to the vehicle for the guard; one thread owns socket and codec."""
 
 from collections.abc import Iterable, Mapping
 from dataclasses import replace
@@ -52,15 +52,15 @@ from mavbridge.mavlink.transport.sockets import Address, Transport
 
 SOURCE_COMPONENT = dialect.MAV_COMP_ID_ONBOARD_COMPUTER
 _EARLY_REQUEST_NS = 20 * NS_PER_MS
-"""Two periods of the usual sticks: a request leaves before one of them, never after."""
+"""Two usual stick periods: a due request leaves before a stick message, never after it."""
 _HEARTBEAT_HZ = 1.0
 
 
 class MavlinkLink:
-    """The session with one vehicle over a transport; used by one thread, and never waits.
+    """Non-blocking session with one vehicle over a transport; not thread-safe.
 
-    Problems of the transport are never raised once it has been opened: they stand in the snapshot,
-    and it is opened again once a second.
+    Once the transport has been opened, its problems appear in the snapshot instead of being raised,
+    and it is reopened once a second.
 
     ``service`` and ``begin_flight`` raise PeerError: no vehicle within the timeout, two of them, or
     one that cannot be flown.
@@ -76,7 +76,7 @@ class MavlinkLink:
         keeps_packets: bool = False,
         signing: Signing | None = None,
     ) -> None:
-        """``keeps_packets``: each snapshot holds the vehicle's packets, for a recorder."""
+        """``keeps_packets``: include the vehicle's packets in each snapshot, for a recorder."""
         self._clock, self._config, self._keeps_packets = clock, config, keeps_packets
         self._packets: list[ForwardedPacket] = []
         self._samples: list[Sample] = []
@@ -88,9 +88,9 @@ class MavlinkLink:
         self._connection = Connection(transport, self._codec, clock, packet_log)
         self._report = self._connection.texts.append
         self.fileno, self.close = self._connection.fileno, self._connection.close
-        """To wake up on arrivals, and to free the socket or port."""
+        """Descriptor to wait on for arrivals; release of the socket or port."""
         self.transmit = self._connection.send
-        """For the packets of ``rehearse``."""
+        """Sends the packets of ``rehearse``."""
         self._discovery = VehicleDiscovery(target_system=config.target_system)
         self._counters = LinkCounters()
         self._timesync = TimesyncFilter(self._report)
@@ -98,10 +98,10 @@ class MavlinkLink:
         self.commands = VehicleCommands(self._command, self._report, clock)
         self._sender = ActionSender(self._connection, self._codec, clock)
         self.is_engaged = False
-        """We hold the vehicle's sticks, or are giving them back: no other address is followed."""
+        """True while we hold or release the vehicle's sticks: no other address is followed."""
         self._started_ns = self._heartbeat_due_ns = clock.now_ns()
         self.vehicle: VehicleSession | None = None
-        """The present session, to look at; None before the vehicle is found."""
+        """Present session, for reading; None before the vehicle is found."""
         self._old_params: dict[str, float] = {}
         self._watches_home_height = False
         self._interruption: Reason | None = None
@@ -109,7 +109,7 @@ class MavlinkLink:
         self._duplicate_systems = DuplicateSystems()
 
     def poll(self) -> LinkSnapshot:
-        """Receive everything that has arrived; never blocks. All other work is in ``service``."""
+        """Receive everything that has arrived; never block. ``service`` does the rest."""
         self._receive_all()
         if self.vehicle is not None and self.vehicle.has_rebooted:
             self._interrupt(because(Code.REBOOTED))
@@ -134,7 +134,7 @@ class MavlinkLink:
                 modes=modes,
                 texts=texts,
             )
-        # A vehicle that gets nothing from us rightly follows somebody else.
+        # A vehicle that receives nothing from us may follow another source.
         others = None if self._connection.is_refused(now_ns) else output.overruled(now_ns)
         return LinkSnapshot(
             telemetry=self._telemetry.telemetry,
@@ -156,7 +156,7 @@ class MavlinkLink:
         )
 
     def _problem(self, now_ns: int) -> Reason | None:
-        """Why this vehicle cannot be flown now, whatever its echo shows, or None."""
+        """Return why this vehicle cannot be flown now, its echo aside, or None."""
         if self._connection.is_down:
             return because(Code.CONNECTION_LOST)
         if (vehicle := self.vehicle) is None:
@@ -188,7 +188,7 @@ class MavlinkLink:
     def _is_moved(
         self, vehicle: VehicleSession, body: Attitude, sender: Address | None, arrived_ns: int
     ) -> bool:
-        """Whether the engaged vehicle now sends from here: silent elsewhere, its clock goes on.
+        """True if the engaged vehicle now sends from ``sender``, with its clock running on.
 
         It is followed so that neutral sticks, the safe mode and the release reach it.
         """
@@ -204,13 +204,13 @@ class MavlinkLink:
         return True
 
     def _receive(self, vehicle: VehicleSession, message: ReceivedMessage, arrived_ns: int) -> None:
-        """Take one message of the chosen vehicle."""
+        """Process one message of the chosen vehicle."""
         self._counters.receive(message.name, message.sequence, arrived_ns)
         happened_ns, is_for_us = arrived_ns, True
         match message.body:
             case LocalVelocity() if not vehicle.condition.is_velocity_usable(arrived_ns):
                 vehicle.receive(message, arrived_ns)
-                return  # the estimator says that it has none: nobody takes it for one
+                return  # the estimator reports no valid velocity
             case body if isinstance(body, Measurement):
                 happened_ns = self._timesync.happened_ns(body.boot_us, arrived_ns)
                 self._samples += self._telemetry.receive(body, arrived_ns, happened_ns)
@@ -231,7 +231,7 @@ class MavlinkLink:
             self._packets.append(ForwardedPacket(arrived_ns, happened_ns, message.packet))
 
     def _notice_other(self, identity: VehicleIdentity, sender: Address | None, now_ns: int) -> None:
-        """Another address uses the vehicle's system id: its packets are ignored while we fly."""
+        """Handle another sender with the vehicle's system id, ignored while engaged."""
         heard_ns = self._counters.heard_ns if self.is_engaged else now_ns
         told = self._duplicate_systems.notice(identity, sender, now_ns, heard_ns)
         if isinstance(told, str):
@@ -240,12 +240,12 @@ class MavlinkLink:
             self._interrupt(told)
 
     def _interrupt(self, reason: Reason) -> None:
-        """Note why every engagement so far is over."""
+        """Note why all engagements so far are over."""
         self._interruption, self._interruptions = reason, self._interruptions + 1
         self._report(str(reason))
 
     def stats(self) -> LinkStats:
-        """Counters for the report."""
+        """Return the counters for the report."""
         output = self._sender.output
         return self._counters.stats(
             self._timesync,
@@ -263,26 +263,28 @@ class MavlinkLink:
 
     @property
     def is_release_owed(self) -> bool:
-        """A release could not be sent: ``service`` sends it before everything else."""
+        """True if a release could not be sent: ``service`` sends it before everything else."""
         return self._sender.is_release_owed
 
     def restart_counters(self) -> None:
-        """Count messages, losses and round trips from now on."""
+        """Restart the counts of messages, losses and round trips."""
         self._counters = LinkCounters()
         self._timesync.round_trips = Histogram()
 
     @property
     def known_params(self) -> Mapping[str, float]:
-        """The vehicle's parameters that matter for a flight, by name, for the report."""
+        """The vehicle's flight-relevant parameters by name, for the report."""
         return {} if self.vehicle is None else self.vehicle.params.values
 
     def restore(self) -> bool:
-        """Let ``service`` put back what was set for the flight; called at every tick until True:
-        nothing is left to put back, or no more can be done, which takes some 3 s at most."""
+        """Let ``service`` restore the parameters set for the flight; call at every tick until True.
+
+        True: everything is restored, or nothing more can be done; after some 3 s at most.
+        """
         return self.vehicle is None or self.vehicle.params.restore()
 
     def service(self) -> None:
-        """Find or follow the vehicle and send due requests; called after the sticks are sent."""
+        """Find or follow the vehicle and send due requests. Call after the sticks are sent."""
         now_ns = self._clock.now_ns()
         if self.vehicle is None:
             self._find_vehicle(now_ns)
@@ -304,8 +306,7 @@ class MavlinkLink:
         self._request_time(now_ns)
 
     def send_before_action(self) -> None:
-        """Send a TIMESYNC request that is due soon; called just before an action is sent, so that
-        actions which fill a queue do not take its place as well."""
+        """Send a TIMESYNC request that is due soon, before the next action can fill the queue."""
         if self.vehicle is not None and not self._sender.is_release_owed:
             self._request_time(self._clock.now_ns(), _EARLY_REQUEST_NS)
 
@@ -327,7 +328,7 @@ class MavlinkLink:
             raise PeerError(f"no vehicle on {place} after {timeout_s:g} s: {why}")
 
     def _adopt(self, identity: VehicleIdentity) -> None:
-        """Start a new session: at first sight, after a reboot and after a change of address."""
+        """Start a new session: for a new vehicle, after a reboot or after a change of address."""
         self.vehicle = VehicleSession(
             identity,
             self._config,
@@ -348,11 +349,10 @@ class MavlinkLink:
     def begin_flight(
         self, meaning: ActionMeaning, output: Output | None, *, watches_home_height: bool = False
     ) -> None:
-        """Choose what carries the actions of the policy, now or once the vehicle is known; to be
-        called before the first action.
+        """Choose the output, now or once the vehicle is known; call before the first action.
 
-        ``output`` None: the usual one of such actions and this vehicle. Telemetry starts anew, so
-        that a recording, which begins here, holds all that the samples come from.
+        ``output`` None: the default of these actions and this vehicle. Telemetry starts anew, so
+        that a recording, which begins here, holds the source of every sample.
         """
         self._telemetry = TelemetryCollector()
         self._sender.begin_flight(meaning, output)
@@ -363,13 +363,12 @@ class MavlinkLink:
     def rehearse(
         self, plan: Iterable[tuple[int, Decision | None, str | None]]
     ) -> tuple[tuple[int, bytes], ...]:
-        """Encode decisions and requests for a mode, with their delays, for another process to send
-        if this one dies; nothing is sent or noted."""
+        """Encode decisions and mode requests, with delays [ns], as last words; no side effects."""
         return () if self._config.readonly else tuple(self._sender.rehearse(plan))
 
     @property
     def outlet(self) -> Outlet:
-        """Where packets to the vehicle leave now."""
+        """Present outlet of packets to the vehicle."""
         return self._connection.outlet
 
     def _command(self, request: CommandRequest) -> None:
@@ -377,20 +376,20 @@ class MavlinkLink:
             self._sender.transmit(self._codec.encode_request(vehicle.identity.source, request))
 
     def announce(self, text: str) -> None:
-        """Send a STATUSTEXT, for a pilot who sees only a ground station; read-only, say nothing."""
+        """Send a STATUSTEXT for pilots who see only a ground station; no-op if read-only."""
         if self._config.readonly:
             return
         for packet in self._codec.encode_statustext(dialect.MAV_SEVERITY_NOTICE, text):
             self._sender.transmit(packet)
 
     def send(self, decision: Decision, decided_ns: int | None = None) -> Action | None:
-        """Send an action or a release; returns the action as it was really sent, or None.
+        """Send an action or a release. Return the action as sent, or None.
 
-        ``decided_ns``: the moment that the action was decided for, by which it is made; None: now.
+        ``decided_ns``: time for which the action was computed; None: now.
 
-        Releases leave every 50 ms for as long as they are asked for and the output has any. One
-        that cannot be sent now is sent before anything else that can. Raises CommandRefusedError
-        for an action that this output must not send.
+        Releases leave every 50 ms while they are requested, up to the output's number. A failed
+        release is sent before anything else. Raises CommandRefusedError for an action that this
+        output must not send.
         """
         action = None if self._config.readonly else self._sender.send(decision, decided_ns)
         if action is not None:

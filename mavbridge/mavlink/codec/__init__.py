@@ -1,1 +1,1 @@
-"""Bytes of MAVLink to values and back, without I/O."""
+"""Conversion between MAVLink bytes and values, without I/O."""

@@ -1,4 +1,4 @@
-"""Sticks <-> PWM with the vehicle's own radio calibration: the one table of signs and channels."""
+"""Sticks to PWM and back by the vehicle's radio calibration; the only table of their signs."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
@@ -7,24 +7,24 @@ from typing import TypeAlias
 from mavbridge.core.vehicle import Sticks
 
 Pwm: TypeAlias = tuple[int, int, int, int]
-"""Throttle, yaw, pitch, roll in us."""
+"""Throttle, yaw, pitch, roll [us]."""
 
 PWM_SIGN = Sticks(throttle=1.0, yaw=1.0, pitch=-1.0, roll=1.0)
-"""ArduPilot: stick forward (+pitch, nose down) is PWM below trim; the others rise with it."""
+"""ArduPilot: stick forward (+pitch, nose down) is PWM below trim; the others increase PWM."""
 
 PWM_LIMITS_US = (800, 2200)
-"""Range of a radio. No other value is sent, even if the vehicle's calibration asks for it."""
+"""PWM range of a radio. No other value is sent, even if the vehicle's calibration demands it."""
 
 DEAD_ZONE_US = 20
-"""RCn_DZ that ArduPilot gives to roll and pitch by default."""
+"""ArduPilot's default RCn_DZ of roll and pitch."""
 
 FS_THR_MARGIN_US = 10
-"""ArduPilot's own arming check wants RC3_MIN this far above FS_THR_VALUE."""
+"""Margin of RC3_MIN above FS_THR_VALUE that ArduPilot's arming check demands."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class RcChannel:
-    """One channel as RCn_* and RCMAP_* describe it; PWM in microseconds."""
+    """One channel, as described by RCn_* and RCMAP_*; PWM in microseconds."""
 
     number: int
     """1 to 8."""
@@ -33,10 +33,10 @@ class RcChannel:
     max_us: int
     is_reversed: bool = False
     dead_zone_us: int = DEAD_ZONE_US
-    """Movement about the centre that the vehicle takes for none."""
+    """Deadband around the centre, to each side."""
 
     def __post_init__(self) -> None:
-        """Refuse a calibration that sticks cannot be mapped with."""
+        """Raise ValueError if the calibration cannot map sticks."""
         if not 1 <= self.number <= 8:
             raise ValueError(f"channel {self.number} is not one of 1..8")
         low_us, high_us = PWM_LIMITS_US
@@ -54,7 +54,7 @@ class RcChannel:
             )
 
     def to_us(self, stick: float, *, centre_us: float) -> int:
-        """Piecewise linear: -1 -> one end, 0 -> centre, +1 -> the other end."""
+        """Map a stick piecewise linearly: -1 to one end, 0 to the centre, +1 to the other end."""
         signed = -stick if self.is_reversed else stick
         span_us = self.max_us - centre_us if signed >= 0 else centre_us - self.min_us
         return min(max(round(centre_us + signed * span_us), self.min_us), self.max_us)
@@ -76,14 +76,14 @@ class RcCalibration:
     pitch: RcChannel
     roll: RcChannel
     throttle_floor_us: int = 0
-    """Lowest throttle that is not a radio failsafe (FS_THR_VALUE and a margin)."""
+    """Lowest throttle that is not a radio failsafe: FS_THR_VALUE plus a margin."""
     _mapping: tuple[tuple[RcChannel, float, float], ...] = field(
         init=False, repr=False, compare=False
     )
-    """Channel, sign and centre in us of each stick, in the order of ``Sticks``."""
+    """Channel, sign and centre [us] of each stick, in the order of ``Sticks``."""
 
     def __post_init__(self) -> None:
-        """Refuse two sticks on one channel."""
+        """Raise ValueError for a shared channel, or a trim or failsafe out of range."""
         numbers = [channel.number for channel in self.channels]
         if len(set(numbers)) != 4:
             raise ValueError(
@@ -97,7 +97,7 @@ class RcCalibration:
                     f"{name} {channel.trim_us} is not in {channel.min_us}..{channel.max_us} us, "
                     f"its MIN and MAX: calibrate the radio, or use --set {name}={middle_us}"
                 )
-        # Throttle is a range channel: its centre is the middle, not RCn_TRIM.
+        # Throttle is a range channel: its centre is the middle of MIN and MAX, not RCn_TRIM.
         throttle_us = (self.throttle.min_us + self.throttle.max_us) / 2
         if self.throttle_floor_us >= throttle_us:
             raise ValueError(
@@ -106,7 +106,7 @@ class RcCalibration:
             )
         centres_us = (throttle_us, *(channel.trim_us for channel in self.channels[1:]))
         mapping = tuple(zip(self.channels, PWM_SIGN, centres_us, strict=True))
-        object.__setattr__(self, "_mapping", mapping)  # once, since each stick needs it
+        object.__setattr__(self, "_mapping", mapping)  # computed once: every stick command needs it
 
     @property
     def channels(self) -> tuple[RcChannel, RcChannel, RcChannel, RcChannel]:
@@ -114,14 +114,14 @@ class RcCalibration:
         return self.throttle, self.yaw, self.pitch, self.roll
 
     def stick_channels_us(self, channels_us: Sequence[int]) -> Pwm | None:
-        """PWM of the four sticks among a vehicle's channels; None if it has fewer than eight."""
+        """Return the PWM of the four sticks; None for a vehicle with fewer than eight channels."""
         if len(channels_us) < 8:
             return None
         t, y, p, r = (channels_us[channel.number - 1] for channel in self.channels)
         return t, y, p, r
 
     def to_pwm_us(self, sticks: Sticks) -> Pwm:
-        """PWM of throttle, yaw, pitch, roll, inside the calibrated range."""
+        """Return the PWM of throttle, yaw, pitch, roll, within the calibrated range."""
         throttle, yaw, pitch, roll = (
             channel.to_us(stick * sign, centre_us=centre_us)
             for stick, (channel, sign, centre_us) in zip(sticks, self._mapping, strict=True)
@@ -129,6 +129,6 @@ class RcCalibration:
         return max(throttle, self.throttle_floor_us), yaw, pitch, roll
 
     def to_sticks(self, pwm_us: Pwm) -> Sticks:
-        """Sticks that correspond to these PWM values."""
+        """Return the sticks for these PWM values."""
         pairs = zip(pwm_us, self._mapping, strict=True)
         return Sticks(*(c.to_stick(us, centre_us=centre) * sign for us, (c, sign, centre) in pairs))

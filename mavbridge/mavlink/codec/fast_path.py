@@ -1,7 +1,7 @@
-"""Whole packets of MAVLink 2 without pymavlink's general parser and packer.
+"""Fast decoder and encoder of whole MAVLink 2 packets, in place of pymavlink's general ones.
 
-The same result in less than half of the time; anything unusual is left to pymavlink: MAVLink 1,
-streams, messages with arrays. Messages that pymavlink's dialect lacks are decoded here alone.
+The result is the same in less than half the time. Unusual input is left to pymavlink: MAVLink 1,
+streams, messages with arrays. Messages that pymavlink's dialect lacks are decoded only here.
 """
 
 import struct
@@ -21,13 +21,13 @@ _HEADER = struct.Struct("<BBBBBBBHB")
 _HEADER_BYTES, _CHECKSUM_BYTES = 10, 2
 _OVERRIDE = dialect.MAVLink_rc_channels_override_message
 _OVERRIDE_PAYLOAD = struct.Struct("<8H2B")
-"""Channels 1 to 8, target system and component; channels 9 to 18 are zeros, which are cut off."""
+"""Channels 1 to 8, target system and component. Channels 9 to 18 are zeros, which are truncated."""
 
 
 class _Layout(NamedTuple):
-    """Wire layout of a message; ``fields`` has pymavlink's names, so its reader serves here.
+    """Wire layout of a message; ``fields`` has pymavlink's names, so that one reader serves both.
 
-    Of an array, which only stands at the end, ``fields`` has the first element.
+    An array is always the last field; ``fields`` holds its first element.
     """
 
     name: str
@@ -44,7 +44,7 @@ _LAYOUTS = {
         namedtuple(message.msgname, message.ordered_fieldnames),
     )
     for message in dialect.mavlink_map.values()
-    if message.msgname == "ATTITUDE_QUATERNION"  # its array is at the end, and not used
+    if message.msgname == "ATTITUDE_QUATERNION"  # its array comes last, and is not used
     or (message.msgname in READERS and not any(message.array_lengths))
 }
 _UNREAD: dict[int, str] = {
@@ -52,7 +52,7 @@ _UNREAD: dict[int, str] = {
     for message in dialect.mavlink_map.values()
     if message.msgname not in READERS
 }
-"""Messages of which nothing but the sequence number is used."""
+"""Messages of which only the sequence number is used."""
 
 _MISSING_LAYOUTS = {
     436: _Layout(
@@ -68,18 +68,18 @@ _MISSING_LAYOUTS = {
         namedtuple("EVENT", "id time_boot_ms sequence component system log_levels arguments"),
     ),
 }
-"""Messages of MAVLink's common dialect that pymavlink's one for ArduPilot does not have, by number;
-layouts as in common.xml, whose fields go by falling size on the wire."""
+"""Messages of MAVLink's common dialect that pymavlink's ardupilotmega lacks, by id. Layouts from
+common.xml; on the wire, fields are sorted by decreasing size."""
 MISSING_IDS = {layout.name: number for number, layout in _MISSING_LAYOUTS.items()}
 _LAYOUTS |= _MISSING_LAYOUTS
 CRC_EXTRA: dict[int, int] = {
     number: message.crc_extra for number, message in dialect.mavlink_map.items()
 } | {number: layout.crc_extra for number, layout in _LAYOUTS.items()}
-"""Seed of each message's checksum, by the number of the message."""
+"""Checksum seed (crc_extra) by message id."""
 
 
 def packet_end(data: bytes, at: int) -> int | None:
-    """End of the packet of MAVLink 2 that begins here; None if there is no whole one."""
+    """Return the end of the MAVLink 2 packet at ``at``; None if there is no whole one."""
     if len(data) - at < _HEADER_BYTES + _CHECKSUM_BYTES or data[at] != _MAVLINK_2:
         return None
     end = at + _HEADER_BYTES + data[at + 1] + _CHECKSUM_BYTES
@@ -88,9 +88,9 @@ def packet_end(data: bytes, at: int) -> int | None:
 
 
 def decode_packet(data: bytes) -> ReceivedMessage | None:
-    """Decode one whole, sound and usable packet; None if it is anything else, or has an array.
+    """Decode one whole, valid and usable packet without arrays; return None for anything else.
 
-    A signature is left to the caller.
+    The caller checks the signature.
     """
     if len(data) < _HEADER_BYTES + _CHECKSUM_BYTES:
         return None
@@ -119,14 +119,14 @@ def decode_packet(data: bytes) -> ReceivedMessage | None:
     try:
         body = READERS[layout.name](layout.fields._make(values))
     except UnusableError:
-        return None  # counted by the general parser
+        return None  # the general parser counts it
     return ReceivedMessage(source, sequence, layout.name, body, data)
 
 
 def pack_override(
     source: Endpoint, sequence: int, target: Endpoint, channels_us: Sequence[int]
 ) -> bytes:
-    """RC_CHANNELS_OVERRIDE of channels 1 to 8. MAVLink 2 cuts trailing zeros off a payload."""
+    """Encode RC_CHANNELS_OVERRIDE of channels 1 to 8, without trailing zeros (MAVLink 2)."""
     payload = _OVERRIDE_PAYLOAD.pack(*channels_us, *target).rstrip(b"\0") or b"\0"
     header = _HEADER.pack(_MAVLINK_2, len(payload), 0, 0, sequence, *source, _OVERRIDE.id, 0)
     packet = header + payload
@@ -134,6 +134,6 @@ def pack_override(
 
 
 def _checksum(data: bytes, crc_extra: int) -> bytes:
-    """CRC-16/MCRF4XX over a packet without its marker, followed by the message's crc_extra."""
+    """Return the CRC-16/MCRF4XX of a packet without its marker, followed by crc_extra."""
     crc: int = dialect.x25crc(data + bytes((crc_extra,))).crc
     return crc.to_bytes(_CHECKSUM_BYTES, "little")

@@ -1,4 +1,4 @@
-"""Cuts datagrams into MAVLink packets without decoding them."""
+"""Splitting of datagrams into MAVLink packets, without decoding."""
 
 from mmap import mmap
 from typing import NamedTuple
@@ -11,28 +11,28 @@ _V1_HEADER, _V2_HEADER, _CHECKSUM = 6, 10, 2
 
 
 class RawPacket(NamedTuple):
-    """One packet; its checksum and signature are left to whoever receives it."""
+    """One packet, with checksum and signature unchecked."""
 
     data: bytes
     source: Endpoint
     message_id: int
     payload: bytes
-    """Without the zeros that MAVLink 2 cuts off its end."""
+    """Payload without the trailing zeros that MAVLink 2 truncates."""
 
     @property
     def sequence(self) -> int:
-        """The sender's number of the packet, 0 to 255."""
+        """Sender's sequence number, 0 to 255."""
         return self.data[2 if self.data[0] == _V1 else 4]
 
     @property
     def sealed(self) -> tuple[bytes, bytes]:
-        """The bytes that the checksum is about, and the checksum as it came."""
+        """Bytes covered by the checksum, and the received checksum."""
         end = (_V1_HEADER if self.data[0] == _V1 else _V2_HEADER) + len(self.payload)
         return self.data[1:end], self.data[end : end + _CHECKSUM]
 
 
 def split_frames(data: bytes) -> tuple[list[RawPacket], bool]:
-    """The packets of a datagram, and whether bytes were left over that are none."""
+    """Return the packets of a datagram, and True if other bytes were left over."""
     frames: list[RawPacket] = []
     at = 0
     while at < len(data):
@@ -45,7 +45,7 @@ def split_frames(data: bytes) -> tuple[list[RawPacket], bool]:
 
 
 def frame_at(data: bytes | mmap, at: int) -> RawPacket | None:
-    """The packet that begins at this place; None if there is none, or not a whole one."""
+    """Return the packet that begins at ``at``; None if there is no complete one."""
     if at >= len(data):
         return None
     marker = data[at]

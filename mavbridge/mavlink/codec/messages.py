@@ -1,4 +1,4 @@
-"""The part of MAVLink that the bridge uses: one frozen record per message, in SI units, checked."""
+"""Records of the MAVLink messages that the bridge uses: frozen, in SI units, checked."""
 
 import struct
 from typing import NamedTuple, TypeAlias
@@ -31,12 +31,12 @@ class CurrentMode(NamedTuple):
 
     custom_mode: int
     intended_custom_mode: int
-    """Mode that was asked for last; 0 = the vehicle does not say. Another one than the present: it
-    has left it by itself, for a failsafe."""
+    """Mode requested last; 0: not reported. If it differs from the present mode, the vehicle has
+    left it by itself, in a failsafe."""
 
 
 class Event(NamedTuple):
-    """EVENT (410): something that happened once; what the number means is the firmware's own."""
+    """EVENT (410): one-time event; each firmware numbers its own."""
 
     event_id: int
 
@@ -46,7 +46,7 @@ class Attitude(NamedTuple):
 
     is_quaternion: bool
     boot_us: int
-    """Vehicle's clock since it started; 0 = the vehicle does not say. Also in the next three."""
+    """Vehicle's clock since boot, as in all measurements; 0: not reported."""
     ned_from_body_wxyz: tuple[float, float, float, float]
     rate_body_radps: tuple[float, float, float]
 
@@ -57,7 +57,7 @@ class LocalVelocity(NamedTuple):
     boot_us: int
     velocity_ned_mps: tuple[float, float, float]
     position_ned_m: tuple[float, float, float] | None = None
-    """From the estimator's origin; None where it is no number."""
+    """Position from the estimator's origin; None if it is not finite."""
 
 
 class SpecificForce(NamedTuple):
@@ -69,38 +69,39 @@ class SpecificForce(NamedTuple):
 
 
 class RcChannels(NamedTuple):
-    """RC_CHANNELS (65): the channels that the vehicle acts on, in microseconds; 0 = no reading of a
-    radio (unused, 65535, out of range)."""
+    """RC_CHANNELS (65): channels that the vehicle acts on [us]; 0: unused, 65535, out of range."""
 
     channels_us: tuple[int, ...]
     boot_us: int = 0
-    """Vehicle's clock since it started."""
+    """Vehicle's clock since boot."""
 
 
 RESTART_STEP_US, RESTART_STAMPS = 1_000_000, 2
-"""A stamp this far back may be a late datagram; so many in a row are a clock that has restarted."""
+"""Step back of a timestamp that may mean a late datagram or a clock restart, and the number of
+consecutive ones that mean a restart."""
 WRAP_US = 2**32 * 1000
 """Period of ``time_boot_ms``: 49.7 days."""
 
 
 def later_by_us(stamp_us: int, other_us: int) -> int:
-    """Return how much later a stamp of the vehicle's clock is than another one; negative: earlier.
+    """Return the time by which one stamp of the vehicle's clock is later than another.
 
-    A wrap is known by a difference of less than ``RESTART_STEP_US``: no vehicle reboots so soon.
+    Less than ``RESTART_STEP_US`` across the wrap is a wrap: no vehicle reboots that fast.
     """
     across_us = (stamp_us - other_us + RESTART_STEP_US) % WRAP_US - RESTART_STEP_US
     return across_us if across_us <= RESTART_STEP_US else stamp_us - other_us
 
 
 STICK_END = 1000
-"""MANUAL_CONTROL: x forward, y right and r, nose right, in -1000..1000, z up in 0..1000."""
+"""Full scale of MAVLink MANUAL_CONTROL: x forward, y right and r nose right in -1000..1000, z up in
+0..1000."""
 
 
 class ManualControl(NamedTuple):
-    """MANUAL_CONTROL (69) from a vehicle: the sticks that it acts on, as they stand in it."""
+    """MANUAL_CONTROL (69) from a vehicle: the raw sticks that it acts on."""
 
     x: int
-    """Forward, -1000 to 1000; so are y, right, and r, nose right."""
+    """Forward, -1000 to 1000. The same range holds for y (right) and r (nose right)."""
     y: int
     z: int
     """Up, 0 to 1000."""
@@ -127,10 +128,10 @@ class VelocityTarget(NamedTuple):
 
 
 class Altitude(NamedTuple):
-    """GLOBAL_POSITION_INT (33), of which only the heights are used."""
+    """GLOBAL_POSITION_INT (33); only the heights are used."""
 
     amsl_m: float
-    """Above mean sea level."""
+    """Height above mean sea level."""
     above_home_m: float = 0.0
     boot_us: int = 0
 
@@ -139,10 +140,10 @@ class SystemStatus(NamedTuple):
     """SYS_STATUS (1)."""
 
     present: int
-    """MAV_SYS_STATUS_SENSOR bits of the sensors that it has and uses."""
+    """MAV_SYS_STATUS_SENSOR bits of the sensors that are present and enabled."""
     healthy: int
     battery_percent: int
-    """-1 = not known."""
+    """-1: unknown."""
 
 
 class LandedState(NamedTuple):
@@ -156,7 +157,7 @@ class EstimatorFlags(NamedTuple):
     """EKF_STATUS_REPORT (193, ArduPilot) or ESTIMATOR_STATUS (230, PX4)."""
 
     flags: int
-    """ESTIMATOR_STATUS_FLAGS; the lowest ten bits mean the same in both."""
+    """ESTIMATOR_STATUS_FLAGS; the lowest ten bits agree in both messages."""
 
 
 class CommandAck(NamedTuple):
@@ -165,7 +166,7 @@ class CommandAck(NamedTuple):
     command: int
     result: int
     target: Endpoint
-    """Sender of the command; zeros where the vehicle does not fill it in."""
+    """Sender of the command; zeros if the vehicle does not fill it in."""
 
 
 class ParamValue(NamedTuple):
@@ -173,12 +174,12 @@ class ParamValue(NamedTuple):
 
     name: str
     value: float
-    """The number itself, whatever its type."""
+    """Numeric value, whatever the parameter's type."""
     kind: int = dialect.MAV_PARAM_TYPE_REAL32
     """MAV_PARAM_TYPE."""
 
     def from_bytes(self) -> "ParamValue":
-        """The same of a vehicle that writes integers into the bytes of the float, as PX4 does."""
+        """Return the value of a vehicle that stores integers in the float's bytes (PX4)."""
         if self.kind != dialect.MAV_PARAM_TYPE_INT32:
             return self
         (number,) = _INTEGER.unpack(_REAL.pack(self.value))
@@ -196,15 +197,15 @@ class StatusText(NamedTuple):
 
     text: str
     text_id: int = 0
-    """Number of a text in several pieces; 0 = all of it is here."""
+    """Number of a text sent in several pieces; 0: the text is complete."""
     sequence: int = 0
-    """Place of this piece among those."""
+    """Index of this piece."""
     is_full: bool = False
-    """It has no end, so that another piece follows."""
+    """True if another piece follows: this one fills its message."""
 
 
 class Timesync(NamedTuple):
-    """TIMESYNC (111), in nanoseconds."""
+    """TIMESYNC (111) [ns]."""
 
     tc1: int
     ts1: int
@@ -241,22 +242,22 @@ Body: TypeAlias = (
 
 
 Measurement: TypeAlias = Attitude | LocalVelocity | SpecificForce | Altitude
-"""Parts of the vehicle's state, each with the vehicle's own stamp."""
+"""Parts of the vehicle's state, each with a timestamp of the vehicle."""
 
 
 class ReceivedMessage(NamedTuple):
-    """One packet that passed its checksum."""
+    """One packet with a valid checksum."""
 
     source: Endpoint
     sequence: int
     name: str
     body: Body | None
-    """None: a message that the bridge does not use, or one with unusable values."""
+    """None: the bridge does not use the message, or its values are unusable."""
     packet: bytes
 
 
 class CommandRequest(NamedTuple):
-    """COMMAND_LONG (76); parameters that are not given are zero."""
+    """COMMAND_LONG (76); omitted parameters are zero."""
 
     command: int
     params: tuple[float, ...]
@@ -277,7 +278,7 @@ class ParamWrite(NamedTuple):
     """MAV_PARAM_TYPE."""
 
     def as_bytes(self) -> "ParamWrite":
-        """The same for a vehicle that reads integers from the bytes of the float, as PX4 does."""
+        """Return the write for a vehicle that reads integers from the float's bytes (PX4)."""
         if self.kind != dialect.MAV_PARAM_TYPE_INT32:
             return self
         number = round(min(max(self.value, _LEAST), _MOST))

@@ -1,4 +1,4 @@
-"""Bytes <-> records, without socket or clock; the wire's sentinels and the last range checks."""
+"""Encoding and decoding of MAVLink packets, with range checks; no socket, no clock."""
 
 import math
 from collections.abc import Iterator, Sequence
@@ -25,54 +25,54 @@ from mavbridge.mavlink.codec.readers import READERS, UnusableError
 from mavbridge.mavlink.codec.signing import LAST_WORDS_LINK_ID, LINK_ID, Signing, is_signed
 
 RELEASE_US = 0
-"""RC_CHANNELS_OVERRIDE ch 1-8: give the channel back to the receiver."""
+"""RC_CHANNELS_OVERRIDE, channels 1-8: release the channel to the receiver."""
 IGNORE_US = 65535
-"""RC_CHANNELS_OVERRIDE ch 1-8: leave the channel as it is. Not a release."""
+"""RC_CHANNELS_OVERRIDE, channels 1-8: leave the channel unchanged. Not a release."""
 
 _TEXT_BYTES = 50
-"""Text of one STATUSTEXT; a longer one is sent as several with one id."""
+"""Text length of one STATUSTEXT; a longer text is sent in pieces with a common id."""
 _TEXT_CHUNKS = 4
 
 MOST_DATAGRAM_BYTES = 4096
-"""Read of one datagram: more than any autopilot or router puts into one, and 2 ms of work if all of
-it is made to keep the parser busy; the largest that UDP takes would be 35 ms."""
+"""Bytes that are decoded of one datagram: more than any autopilot or router sends in one. The worst
+case for the parser takes 2 ms; the largest UDP datagram would take 35 ms."""
 _PACKET_STARTS = (b"\xfd", b"\xfe")
-"""MAVLink 2 and 1."""
+"""Start bytes of MAVLink 2 and 1."""
 
 
 GESTURE_Z, MOST_LOW_R = 150, 800
-"""PX4 arms and disarms by z < 100 with |r| > 900 for a second: both bounds with a margin."""
+"""PX4 arms and disarms if z < 100 and |r| > 900 for one second; both bounds include a margin."""
 MOST_LEAN_RAD = math.radians(85.0)
-"""Hard limits of the wire, beyond what a flight may be configured to: a bug upstream, if exceeded.
-Neither autopilot limits the lean of a setpoint by itself. Also the next three."""
+"""Hard limits of lean, rates, speed and norm, wider than any setting of a flight: excess is a bug
+upstream. Neither autopilot limits the lean of a setpoint by itself."""
 MOST_RATE_RADPS = 40.0
 MOST_SPEED_MPS = 150.0
 MOST_NORM_ERROR = 1e-4
-"""ArduPilot drops quaternions that are off by 5e-4, and brakes."""
+"""ArduPilot drops quaternions whose norm is off by 5e-4, and brakes."""
 _ATTITUDE_MASK = (
     dialect.ATTITUDE_TARGET_TYPEMASK_BODY_ROLL_RATE_IGNORE
     | dialect.ATTITUDE_TARGET_TYPEMASK_BODY_PITCH_RATE_IGNORE
     | dialect.ATTITUDE_TARGET_TYPEMASK_BODY_YAW_RATE_IGNORE
 )
-"""7; a mask that ignores only some rates is dropped by ArduPilot."""
+"""Type mask 7; ArduPilot drops a mask that ignores only some of the rates."""
 _RATES_MASK = dialect.ATTITUDE_TARGET_TYPEMASK_ATTITUDE_IGNORE
 _VELOCITY_MASK = 0x5C7
-"""Position, acceleration and yaw are ignored."""
+"""Ignore position, acceleration and yaw."""
 
 
 class CommandRefusedError(Exception):
-    """A stick command that must not be sent. Always a bug upstream of the codec."""
+    """Stick command that must not be sent; always a bug upstream of the codec."""
 
 
 def _unread(name: str, packet: bytes) -> ReceivedMessage:
-    """A packet that the dialect has no name for: its sequence number counts all the same."""
+    """Return a message unknown to the dialect; its sequence number is counted."""
     at = 4 if packet[0] == dialect.PROTOCOL_MARKER_V2 else 2
     sequence, system, component = packet[at : at + 3]
     return ReceivedMessage(Endpoint(system, component), sequence, name, None, packet)
 
 
 class Codec:
-    """One MAVLink 2 endpoint without I/O: owns the parser state and the sending sequence."""
+    """One MAVLink 2 endpoint without I/O; owns the parser state and the sending sequence."""
 
     def __init__(
         self, *, source_system: int, source_component: int, signing: Signing | None = None
@@ -82,16 +82,16 @@ class Codec:
         self._mav.robust_parsing = True
         self.bad_data_count = 0
         self.signing = signing
-        """Signs what is sent and judges what comes; None: neither."""
+        """Signs sent packets and checks received ones; None: neither."""
         self.hears_signed = False
-        """A packet came with a signature that nobody here can judge, for want of a key."""
+        """True if a signed packet arrived and no key is present to check it."""
         self._text_id = 0
 
     @contextmanager
     def rehearsing(self) -> Iterator[None]:
         """Context manager: encode packets that another process may send later.
 
-        They use up no sequence number, and are signed as a stream of their own.
+        They use up no sequence numbers, and are signed as a separate stream.
         """
         sequence = self._mav.seq
         if self.signing is not None:
@@ -104,16 +104,16 @@ class Codec:
                 self.signing.link_id = LINK_ID
 
     def forget_partial(self) -> None:
-        """Drop an unfinished packet: the next bytes do not continue it."""
+        """Drop an unfinished packet, which the next bytes do not continue."""
         self._mav.buf = bytearray()
         self._mav.buf_index = 0
 
     def decode_datagram(self, data: bytes) -> Iterator[ReceivedMessage]:
-        """Messages of one datagram, which nearly always is one whole packet, or several.
+        """Yield the messages of one datagram, which usually holds one or several whole packets.
 
-        What was left of an earlier datagram was then cut off, and must not swallow this one. A
-        datagram that starts otherwise may be the next piece of a forwarded serial stream. Of one
-        beyond ``MOST_DATAGRAM_BYTES`` the rest is not read.
+        A whole packet at its start means that an unfinished earlier one was cut off and is dropped.
+        A datagram that starts otherwise may continue a forwarded serial stream. Bytes beyond
+        ``MOST_DATAGRAM_BYTES`` are ignored.
         """
         if len(data) > MOST_DATAGRAM_BYTES:
             data = data[:MOST_DATAGRAM_BYTES]
@@ -137,14 +137,14 @@ class Codec:
 
     def _decode_unusual(self, data: bytes) -> Iterator[ReceivedMessage]:
         try:
-            message = self._mav.decode(bytearray(data))  # in half the time of the parser
+            message = self._mav.decode(bytearray(data))  # twice as fast as the parser
         except dialect.MAVError:
             yield from self.decode(data)
         else:
             yield from self._read(message)
 
     def decode(self, data: bytes) -> Iterator[ReceivedMessage]:
-        """Messages completed by these bytes; corrupt bytes and unusable values are counted."""
+        """Yield the messages completed by these bytes; count corrupt bytes and unusable values."""
         for message in self._mav.parse_buffer(data) or ():
             if message.get_type() == "BAD_DATA":
                 self.bad_data_count += 1
@@ -153,7 +153,7 @@ class Codec:
 
     @property
     def refused_signatures(self) -> int:
-        """Packets that were not taken for what their signature was, or was not."""
+        """Number of packets rejected by the signature check."""
         return sum(self.signing.refused.values()) if self.signing is not None else 0
 
     def _is_admitted(self, packet: bytes) -> bool:
@@ -163,7 +163,7 @@ class Codec:
         return True
 
     def _read(self, message: dialect.MAVLink_message) -> Iterator[ReceivedMessage]:
-        """The message, if its signature admits it."""
+        """Yield the message if its signature is accepted."""
         packet = bytes(message.get_msgbuf())
         if self._is_admitted(packet):
             yield self._decoded(message, packet)
@@ -186,20 +186,19 @@ class Codec:
         return self._sealed(data, message.crc_extra)
 
     def _sealed(self, packet: bytes, crc_extra: int) -> bytes:
-        """The packet as it leaves, with the sequence number used up."""
+        """Sign the packet if there is a key, and advance the sequence number."""
         self._mav.seq = (self._mav.seq + 1) % 256
         return packet if self.signing is None else self.signing.sign(packet, crc_extra)
 
     def encode_heartbeat(self, kind: int | None = None) -> bytes:
-        """HEARTBEAT of a MAV_TYPE; None: an onboard controller, which no vehicle mistakes for a
-        ground station."""
+        """Encode HEARTBEAT of a MAV_TYPE; None: an onboard controller, no ground station."""
         kind = dialect.MAV_TYPE_ONBOARD_CONTROLLER if kind is None else kind
         autopilot = dialect.MAV_AUTOPILOT_INVALID
         state = dialect.MAV_STATE_ACTIVE
         return self._pack(self._mav.heartbeat_encode(kind, autopilot, 0, 0, state))
 
     def encode_override(self, target: Endpoint, pwm_us: Pwm, calibration: RcCalibration) -> bytes:
-        """RC_CHANNELS_OVERRIDE of the four stick channels; the others are left alone.
+        """Encode RC_CHANNELS_OVERRIDE of the four stick channels; the others are left unchanged.
 
         Raises:
             CommandRefusedError: a value that no radio sends, or a throttle that is a failsafe.
@@ -212,7 +211,7 @@ class Codec:
         return self._encode_channels(target, pwm_us, calibration)
 
     def encode_release(self, target: Endpoint, calibration: RcCalibration) -> bytes:
-        """RC_CHANNELS_OVERRIDE that gives the four stick channels back."""
+        """Encode RC_CHANNELS_OVERRIDE that releases the four stick channels."""
         return self._encode_channels(target, (RELEASE_US,) * 4, calibration)
 
     def _encode_channels(
@@ -225,11 +224,11 @@ class Codec:
         return self._sealed(packet, dialect.MAVLink_rc_channels_override_message.crc_extra)
 
     def encode_manual_control(self, target_system: int, sticks: ManualControl) -> bytes:
-        """MANUAL_CONTROL.
+        """Encode MANUAL_CONTROL.
 
         Raises:
-            CommandRefusedError: a value out of range, which PX4 takes for the centre, or sticks
-                that arm or disarm if they are held for a second.
+            CommandRefusedError: a value out of range, which PX4 would replace by the centre, or
+                sticks that arm or disarm if held for one second.
         """
         x, y, z, r = sticks
         if not (all(abs(value) <= STICK_END for value in (x, y, r)) and 0 <= z <= STICK_END):
@@ -241,10 +240,10 @@ class Codec:
     def encode_attitude(
         self, target: Endpoint, ned_from_body_wxyz: Quaternion, thrust: float, *, now_ns: int
     ) -> bytes:
-        """SET_ATTITUDE_TARGET with an attitude and a collective thrust in 0..1.
+        """Encode SET_ATTITUDE_TARGET with an attitude and a collective thrust in [0, 1].
 
         Raises:
-            CommandRefusedError: no unit quaternion, a lean that no policy flies, or a bad thrust.
+            CommandRefusedError: no unit quaternion, too large a lean, or a bad thrust.
         """
         _refuse_bad_thrust(thrust)
         if not abs(math.hypot(*ned_from_body_wxyz) - 1) <= MOST_NORM_ERROR:
@@ -263,10 +262,10 @@ class Codec:
         *,
         now_ns: int,
     ) -> bytes:
-        """SET_ATTITUDE_TARGET with body rates and a collective thrust in 0..1.
+        """Encode SET_ATTITUDE_TARGET with body rates and a collective thrust in [0, 1].
 
         Raises:
-            CommandRefusedError: a rate that no multirotor has, or a bad thrust.
+            CommandRefusedError: a rate above the hard limit, or a bad thrust.
         """
         _refuse_bad_thrust(thrust)
         if not all(abs(rate) <= MOST_RATE_RADPS for rate in rate_body_radps):
@@ -293,10 +292,10 @@ class Codec:
     def encode_velocity(
         self, target: Endpoint, velocity: Velocity, *, is_heading_frame: bool, now_ns: int
     ) -> bytes:
-        """SET_POSITION_TARGET_LOCAL_NED with a velocity and a yaw rate alone.
+        """Encode SET_POSITION_TARGET_LOCAL_NED with only a velocity and a yaw rate.
 
         Raises:
-            CommandRefusedError: a speed or a yaw rate that no multirotor has.
+            CommandRefusedError: a speed or a yaw rate above the hard limit.
         """
         x, y, z, yaw_rate = velocity
         if not (math.hypot(x, y, z) <= MOST_SPEED_MPS and abs(yaw_rate) <= MOST_RATE_RADPS):
@@ -312,7 +311,7 @@ class Codec:
         return self._pack(message)
 
     def encode_request(self, target: Endpoint, request: Request) -> bytes:
-        """COMMAND_LONG, PARAM_REQUEST_READ or PARAM_SET."""
+        """Encode COMMAND_LONG, PARAM_REQUEST_READ or PARAM_SET."""
         match request:
             case CommandRequest(command, params):
                 padded = (*params, *(0.0,) * (7 - len(params)))
@@ -324,19 +323,19 @@ class Codec:
         return self._pack(message)
 
     def encode_timesync(self, ts1: int) -> bytes:
-        """TIMESYNC request."""
+        """Encode a TIMESYNC request."""
         return self._pack(self._mav.timesync_encode(0, ts1))
 
     def encode_statustext(self, severity: int, text: str) -> list[bytes]:
-        """STATUSTEXT, in as many packets as the text needs; cut off after 200 bytes.
+        """Encode STATUSTEXT in one or more packets, truncated after 200 bytes.
 
-        Characters beyond ASCII become question marks, since ground stations differ about them.
+        Non-ASCII characters become question marks, since ground stations decode them differently.
         """
         data = text.encode("ascii", "replace")[: _TEXT_BYTES * _TEXT_CHUNKS]
         if len(data) <= _TEXT_BYTES:
             return [self._pack(self._mav.statustext_encode(severity, data))]
         self._text_id = self._text_id % 65535 + 1
-        # The last chunk is told by a zero byte, so that a full one needs an empty one behind it.
+        # A zero byte marks the last chunk, so an empty chunk must follow a full one.
         chunks = [data[at : at + _TEXT_BYTES] for at in range(0, len(data) + 1, _TEXT_BYTES)]
         return [
             self._pack(self._mav.statustext_encode(severity, chunk, self._text_id, sequence))
@@ -345,19 +344,22 @@ class Codec:
 
 
 def pwm_of(sticks: Sticks, calibration: RcCalibration) -> Pwm:
-    """PWM of throttle, yaw, pitch, roll in us.
+    """Return the PWM of throttle, yaw, pitch, roll [us].
 
     Raises:
-        CommandRefusedError: a stick that is not finite or not in [-1, 1].
+        CommandRefusedError: a stick is not finite or not in [-1, 1].
     """
     _refuse_bad_sticks(sticks)
     return calibration.to_pwm_us(sticks)
 
 
 def manual_control_of(sticks: Sticks) -> ManualControl:
-    """Sticks as MANUAL_CONTROL's integers; refuses them as ``pwm_of`` does.
+    """Return sticks as MANUAL_CONTROL's integers.
 
-    With the throttle at the bottom, yaw stays short of what arms or disarms.
+    With the throttle at the bottom, yaw stays short of PX4's arming and disarming gesture.
+
+    Raises:
+        CommandRefusedError: a stick is not finite or not in [-1, 1].
     """
     _refuse_bad_sticks(sticks)
     x, y, r = (round(STICK_END * value) for value in (sticks.pitch, sticks.roll, sticks.yaw))
@@ -368,7 +370,7 @@ def manual_control_of(sticks: Sticks) -> ManualControl:
 
 
 def manual_control_sticks(values: ManualControl) -> Sticks:
-    """Inverse of ``manual_control_of``."""
+    """Return MANUAL_CONTROL's integers as sticks."""
     x, y, z, r = values
     return Sticks(2 * z / STICK_END - 1, r / STICK_END, x / STICK_END, y / STICK_END)
 

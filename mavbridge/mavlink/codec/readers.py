@@ -1,4 +1,4 @@
-"""Received MAVLink messages as our records, checked and in SI units."""
+"""Readers of received MAVLink messages: checked records in SI units."""
 
 import math
 from collections.abc import Callable
@@ -35,24 +35,24 @@ from mavbridge.mavlink.codec.messages import (
 )
 
 MG_TO_MPS2 = 9.80665e-3
-"""Milli-g to m/s^2, standard gravity."""
+"""Milli-g to m/s^2, by standard gravity."""
 
 _TEXT_BYTES = 50
 """Text of one STATUSTEXT."""
 MOST_VALUE = 1e9
 """Largest angle, rate, speed, position or force in SI units: far beyond any vehicle, and its square
-is still a number in the float32 with which policies compute."""
+is finite in the float32 of policies."""
 MOST_NORM_ERROR = 0.1
-"""A quaternion within it is normalised; one farther from length 1 is no attitude."""
+"""Largest norm error of a quaternion that is normalised; one farther from length 1 is unusable."""
 UNPRINTABLE = "\N{REPLACEMENT CHARACTER}"
-"""Stands for control characters, with which a text could write into the user's terminal."""
+"""Replaces control characters, which could write into the user's terminal."""
 _CHANNELS = attrgetter(*(f"chan{number}_raw" for number in range(1, 19)))
 _HIGHRES_ACCEL_FIELDS = 0b111
 """fields_updated bits of xacc, yacc, zacc."""
 
 
 class UnusableError(Exception):
-    """A well-formed message with values that cannot be used."""
+    """Well-formed message with unusable values."""
 
 
 def _require_finite(value: float) -> None:
@@ -91,7 +91,7 @@ def _attitude(m: dialect.MAVLink_attitude_message) -> Body:
 def _local_position(m: dialect.MAVLink_local_position_ned_message) -> Body:
     _require_usable(m.vx, m.vy, m.vz)
     position = (m.x, m.y, m.z)
-    is_position = all(abs(metres) <= MOST_VALUE for metres in position)  # false for NaN too
+    is_position = all(abs(metres) <= MOST_VALUE for metres in position)  # also false for NaN
     velocity = (m.vx, m.vy, m.vz)
     return LocalVelocity(1000 * m.time_boot_ms, velocity, position if is_position else None)
 
@@ -119,7 +119,7 @@ def _rc_channels(m: dialect.MAVLink_rc_channels_message) -> Body:
 
 def _manual_control(m: dialect.MAVLink_manual_control_message) -> Body:
     if not (all(abs(value) <= STICK_END for value in (m.x, m.y, m.r)) and 0 <= m.z <= STICK_END):
-        raise UnusableError  # 32767 is an axis that does not exist
+        raise UnusableError  # 32767: the axis does not exist
     return ManualControl(m.x, m.y, m.z, m.r)
 
 
@@ -145,10 +145,10 @@ def _param_error(m: dialect.MAVLink_param_error_message) -> Body | None:
 
 
 def _status_text(m: dialect.MAVLink_statustext_message) -> Body:
-    # pymavlink has cut the zero bytes off, and made one character of each other byte.
+    # pymavlink has stripped zero bytes, and decoded each other byte to one character.
     is_full = m.id != 0 and len(m.text) >= _TEXT_BYTES
     ended = m.text.rstrip("\t") if is_full else m.text.rstrip()  # PX4 ends its texts with a tab
-    # The codes of a terminal are made visible.
+    # Make terminal control codes visible.
     text = "".join(c if c.isprintable() else UNPRINTABLE for c in ended)
     return StatusText(text, m.id, m.chunk_seq, is_full)
 

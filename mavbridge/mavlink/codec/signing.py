@@ -1,4 +1,4 @@
-"""MAVLink 2 signatures, made and checked; https://mavlink.io/en/guide/message_signing.html."""
+"""MAVLink 2 signatures: https://mavlink.io/en/guide/message_signing.html."""
 
 import hashlib
 import hmac
@@ -10,40 +10,40 @@ from pymavlink.dialects.v20 import ardupilotmega as dialect
 
 KEY_BYTES = 32
 SIGNED = 0x01
-"""Incompatible flag of a signed packet."""
+"""Incompatibility flag of a signed packet."""
 SIGNATURE_BYTES = 13
-"""Link id, timestamp of six bytes, and the first six bytes of the hash."""
+"""Link id, timestamp (6 bytes) and the first 6 bytes of the hash."""
 _TIMESTAMP_BYTES, _HASH_BYTES = 6, 6
 _FLAGS_AT, _SYSTEM_AT, _ID_AT, _HEADER_BYTES, _CHECKSUM_BYTES = 2, 5, 7, 10, 2
 TICK_NS = 10_000
 """Unit of a timestamp, 10 us."""
 EPOCH_NS = 1_420_070_400 * 10**9
-"""Unix time of 2015-01-01 UTC, from which timestamps count."""
+"""Unix time of the timestamps' epoch, 2015-01-01 UTC."""
 LATEST_TICKS = 2**48 - 2**40
-"""No later timestamp is followed: it has 48 bits, and those after it need room."""
+"""Latest received timestamp to follow: the 48-bit range must leave room for later ones."""
 MOST_LAG_TICKS = 60 * 10**9 // TICK_NS
-"""A stream that was never heard may begin a minute behind our own clock."""
+"""Largest lag behind our clock at which an unknown stream is accepted: one minute."""
 _RADIO_STATUS = 109
-"""Made by the telemetry radio itself, which knows no key; nothing is decided by it."""
+"""From the telemetry radio, which has no key: accepted unsigned, as nothing depends on it."""
 LINK_ID, LAST_WORDS_LINK_ID = 0, 1
-"""Of the packets that the guard sends, and of those that the flight process sends if it dies, which
-are signed before: a stream of their own, within ``MOST_LAG_TICKS`` of the other."""
+"""Link ids of the guard's packets, and of the last words. Those are signed in advance as a separate
+stream, within ``MOST_LAG_TICKS`` of the guard's."""
 Stream: TypeAlias = tuple[int, int, int]
-"""Link id, system and component: timestamps grow within each."""
+"""Link id, system and component; timestamps increase within each stream."""
 Refusal: TypeAlias = Literal["unsigned", "wrong key", "replayed", "clock behind"]
 
 
 class SigningState(NamedTuple):
-    """What must survive a restart, so that no packet of the past counts as a new one."""
+    """State to keep across restarts, so that no old packet is accepted as new."""
 
     sent_ticks: int = 0
-    """Newest timestamp that we may have used."""
+    """Upper bound of the timestamps that we have used."""
     heard_ticks: Mapping[Stream, int] = MappingProxyType({})
     """Newest accepted timestamp of each stream."""
 
 
 class Signing:
-    """Signs packets of MAVLink 2, and judges those that come in; used by one thread."""
+    """Signs MAVLink 2 packets and checks received ones; not thread-safe."""
 
     def __init__(
         self,
@@ -52,31 +52,31 @@ class Signing:
         unix_ns: Callable[[], int],
         state: SigningState = SigningState(),  # noqa: B008 - immutable
     ) -> None:
-        """Begin with a key of 32 bytes.
+        """Start with a key and a saved state.
 
         Args:
-            key: shared with the vehicle.
-            unix_ns: the time of day; may be wrong, or step back at a restart.
-            state: of an earlier process with this key.
+            key: 32 bytes, shared with the vehicle.
+            unix_ns: wall time; may be wrong, or step back at a restart.
+            state: state of an earlier process with this key.
         """
         self._key = key
         self.link_id = LINK_ID
-        """Of the packets that are signed."""
+        """Link id of the packets that are signed."""
         self._unix_ns = unix_ns
         self._sent_ticks = state.sent_ticks
         self._remembered = dict(state.heard_ticks)
         self._heard: dict[Stream, int] = {}
         self.refused: dict[Refusal, int] = {}
-        """Packets that were refused, by the reason."""
+        """Number of refused packets by reason."""
         self.accepted = 0
 
     @property
     def state(self) -> SigningState:
-        """What a later process needs."""
+        """State for a later process."""
         return SigningState(self._sent_ticks, self._remembered | self._heard)
 
     def sign(self, packet: bytes, crc_extra: int) -> bytes:
-        """The same packet, signed; its checksum changes with it."""
+        """Return the packet with a signature and the checksum that this requires."""
         body = bytearray(packet[1:-_CHECKSUM_BYTES])
         body[_FLAGS_AT - 1] |= SIGNED
         crc: int = dialect.x25crc(bytes(body) + bytes((crc_extra,))).crc
@@ -91,7 +91,7 @@ class Signing:
         return unsealed + self._hash(unsealed)
 
     def accepts(self, packet: bytes) -> bool:
-        """Judge one whole packet with a right checksum; counts those that are refused."""
+        """True if a whole packet with a valid checksum is accepted; count refusals."""
         refusal = self._refusal(packet)
         if refusal is None:
             self.accepted += 1
@@ -117,14 +117,14 @@ class Signing:
         elif not remembered and ticks < self.now_ticks - MOST_LAG_TICKS:
             return "clock behind"
         self._heard[stream] = ticks
-        # Ours follow, as MAVLink says: a vehicle refuses a sender that is a minute behind it.
+        # Our timestamps follow, as MAVLink demands: a vehicle refuses a sender a minute behind it.
         if ticks <= LATEST_TICKS:
             self._sent_ticks = max(self._sent_ticks, ticks)
         return None
 
     @property
     def now_ticks(self) -> int:
-        """The time of day as a timestamp."""
+        """Wall time as a timestamp."""
         return max((self._unix_ns() - EPOCH_NS) // TICK_NS, 0)
 
     def _hash(self, signed: bytes) -> bytes:
@@ -132,12 +132,12 @@ class Signing:
 
 
 def message_id(packet: bytes) -> int:
-    """Number of the message in a whole packet of MAVLink 1 or 2."""
+    """Return the message id of a whole packet of MAVLink 1 or 2."""
     if packet[0] != dialect.PROTOCOL_MARKER_V2:
-        return packet[_SYSTEM_AT]  # where MAVLink 1 has it
+        return packet[_SYSTEM_AT]  # MAVLink 1 has the message id here
     return int.from_bytes(packet[_ID_AT:_HEADER_BYTES], "little")
 
 
 def is_signed(packet: bytes) -> bool:
-    """The packet has a signature, whatever it is worth."""
+    """True if the packet has a signature, valid or not."""
     return packet[0] == dialect.PROTOCOL_MARKER_V2 and bool(packet[_FLAGS_AT] & SIGNED)

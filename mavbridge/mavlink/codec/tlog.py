@@ -1,4 +1,4 @@
-"""Reads telemetry logs: 8 bytes of Unix time in us before each packet."""
+"""Reader of telemetry logs: 8 bytes of Unix time [us] before each packet."""
 
 import mmap
 import os
@@ -14,19 +14,19 @@ from mavbridge.mavlink.codec.frames import RawPacket, frame_at
 from mavbridge.mavlink.codec.messages import Endpoint
 
 _STAMP_BYTES = 8
-"""Big-endian, unsigned."""
+"""Timestamp size; big-endian, unsigned."""
 _MARKER = re.compile(rb"[\xfd\xfe]")
 _MIRRORED = bytes(int(f"{byte:08b}"[::-1], 2) for byte in range(256))
 
 
 @dataclass
 class Skipped:
-    """Damage that ``read_tlog`` has passed over."""
+    """Damage that ``read_tlog`` has skipped."""
 
     bytes: int = 0
-    """Those that belong to no packet."""
+    """Number of bytes outside any packet."""
     packets: int = 0
-    """By the gaps in the senders' sequence numbers around the damage; at least one."""
+    """Lost packets, by gaps in the senders' sequence numbers around the damage; at least one."""
 
     def describe(self, path: Path) -> str | None:
         """Return a sentence for the user; None if nothing was skipped."""
@@ -39,10 +39,10 @@ class Skipped:
 
 
 def read_tlog(path: Path, skipped: Skipped | None = None) -> Iterator[tuple[int, RawPacket]]:
-    """Unix time in microseconds and packet of each record of a log as ``PacketPipe`` writes it.
+    """Yield Unix time [us] and packet of each record of a log written by ``PacketPipe``.
 
-    Reads on behind damage, which it counts in ``skipped``, where a checksum fits again. A packet of
-    an unknown message, whose checksum cannot be tried, counts where another one follows.
+    After damage, which is counted in ``skipped``, reading resumes at the next valid checksum. The
+    checksum of an unknown message cannot be tested; its packet counts if another one follows.
 
     Raises:
         UserError: the log cannot be read.
@@ -67,7 +67,7 @@ def _records(data: mmap.mmap, skipped: Skipped) -> Iterator[tuple[int, RawPacket
             skipped.packets += behind is None or not newest
             if behind is None:
                 return
-            at, unsure = behind, set(newest)  # senders that were not heard since the damage
+            at, unsure = behind, set(newest)  # senders not heard since the damage
             continue
         if packet.source in unsure:
             unsure.remove(packet.source)
@@ -78,9 +78,9 @@ def _records(data: mmap.mmap, skipped: Skipped) -> Iterator[tuple[int, RawPacket
 
 
 def _packet_at(data: mmap.mmap, at: int) -> RawPacket | None:
-    """The packet of the record here, if its checksum fits.
+    """Return the packet of the record at ``at`` if its checksum is valid.
 
-    If that cannot be tried, another record must follow it, and none begin inside it.
+    If it cannot be tested, another record must follow the packet, and none begin inside it.
     """
     packet = frame_at(data, at + _STAMP_BYTES)
     if packet is None or (is_sound := _is_sound(packet)) is False:
@@ -92,7 +92,7 @@ def _packet_at(data: mmap.mmap, at: int) -> RawPacket | None:
 
 
 def _is_sound(packet: RawPacket) -> bool | None:
-    """True if its checksum fits; None if it is of a message that the dialect lacks."""
+    """True if the checksum is valid; None if the dialect lacks the message."""
     if (extra := CRC_EXTRA.get(packet.message_id)) is None:
         return None
     body, checksum = packet.sealed
@@ -101,7 +101,7 @@ def _is_sound(packet: RawPacket) -> bool | None:
 
 
 def _next_sound(data: mmap.mmap, at: int, end: int) -> int | None:
-    """Begin of the first record between these places whose checksum fits."""
+    """Return the start of the first record in this range with a valid checksum."""
     for marker in _MARKER.finditer(data, at + _STAMP_BYTES, end + _STAMP_BYTES):
         packet = frame_at(data, marker.start())
         if packet is not None and _is_sound(packet):

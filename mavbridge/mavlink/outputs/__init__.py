@@ -1,1 +1,1 @@
-"""The messages that carry a policy's actions to the vehicle, one module each, and their echo."""
+"""Messages that carry a policy's actions to the vehicle, and their echo check."""

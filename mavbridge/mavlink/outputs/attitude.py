@@ -20,30 +20,30 @@ _GAP_NS = 200 * NS_PER_MS
 _CALM_MPS2 = (7.0, 13.0)
 """Specific force along the body's up axis in calm flight."""
 PLAUSIBLE_THRUST = (0.05, 0.9)
-"""Thrust at which a multirotor may hover."""
+"""Plausible range of hover thrust of a multirotor."""
 
 
 class HoverThrust:
-    """Thrust that the vehicle asks of itself, by the specific force that comes of it.
+    """Estimate of the hover thrust, from the vehicle's own thrust demand and the specific force.
 
-    So it may climb or sink meanwhile. Parameters tell it too (MOT_THST_HOVER, MPC_THR_HOVER) but
-    less well: ArduPilot's SITL hovers at 0.364 with 0.39 in the parameter, which is a climb of
-    0.9 m/s after a second.
+    The estimate also holds in a climb or descent. Parameters (MOT_THST_HOVER, MPC_THR_HOVER) are
+    less accurate: ArduPilot's SITL hovers at 0.364 with 0.39 in the parameter, an error of 0.9 m/s
+    of climb after one second.
     """
 
     def __init__(self) -> None:
         self.value: float | None = None
-        """None before a second of calm flight."""
+        """None before one second of calm flight."""
         self._thrust = self._force_mps2 = 0.0
         self._since_ns = self._last_ns = 0
         self._force: tuple[int, float] | None = None
 
     def receive_force(self, up_mps2: float, now_ns: int) -> None:
-        """Take the specific force along the body's up axis."""
+        """Add the specific force along the body's up axis [m/s^2]."""
         self._force = (now_ns, up_mps2)
 
     def receive_thrust(self, thrust: float, now_ns: int) -> None:
-        """Take the thrust that the vehicle's own controller asks for, in the air, nearly level."""
+        """Add the thrust demand of the vehicle's own controller, in the air and nearly level."""
         if self._force is None or now_ns - self._force[0] > _GAP_NS:
             return
         force_mps2 = self._force[1]
@@ -69,28 +69,28 @@ THRUST_ECHO = EchoRules(
     centre=THRUST_UNITS // 2,
     foreign_samples=FOREIGN_SAMPLES,
 )
-"""Thrust in millionths; both autopilots show it as it was sent. Its dither of two times 20 is a
-climb of a millimetre per second after a second."""
+"""Echo of the thrust in millionths, which both autopilots show as sent. A dither of two steps of 20
+is a climb of 1 mm/s after one second."""
 RATE_UNITS = 10_000
 RATE_ECHO = EchoRules(
     tolerance=1, dithered=2, dither=10, seek_dither=10, centre=0, foreign_samples=FOREIGN_SAMPLES
 )
-"""Body rates in 1e-4 rad/s: what PX4 shows of a rate setpoint, from half a second after the last
-attitude setpoint on. The dither is 0.06 degrees/s of yaw rate."""
+"""Echo of body rates in 1e-4 rad/s, which PX4 shows from half a second after the last attitude
+setpoint. The dither is 0.06 degrees/s of yaw rate."""
 MOST_LEAD_RAD = math.radians(45.0)
-"""Largest angle between the heading that is asked for and the vehicle's own. It follows with a lag
-of 0.3 to 0.4 s, so that yaw rates up to 110 degrees/s are followed in full."""
+"""Largest lead of the commanded heading over the vehicle's. The vehicle lags by 0.3 to 0.4 s, so
+that yaw rates up to 110 degrees/s are followed in full."""
 LEAST_COS_TILT = 0.1
-"""ArduPilot boosts the thrust of a lean by the inverse of this at most (get_throttle_boosted)."""
+"""Inverse of ArduPilot's largest thrust boost in a lean (get_throttle_boosted)."""
 _PAUSE_NS = 500 * NS_PER_MS
-"""After this long without a setpoint, heading and thrust start afresh."""
+"""Pause in setpoints after which heading and thrust restart."""
 _LEVEL_RAD = math.radians(15.0)
 
 
 class HeadingTarget:
-    """Heading to ask for, since an attitude setpoint has no usable yaw rate.
+    """Heading to command, since an attitude setpoint has no usable yaw rate.
 
-    It starts at the vehicle's own, is integrated from the yaw rate, and never runs far ahead.
+    It starts at the vehicle's heading, integrates the yaw rate, and has a limited lead.
     """
 
     def __init__(self) -> None:
@@ -98,11 +98,11 @@ class HeadingTarget:
         self._at_ns = 0
 
     def restart(self) -> None:
-        """Start from the vehicle's own heading."""
+        """Restart from the vehicle's own heading."""
         self._asked_rad = None
 
     def step(self, measured_rad: float, yaw_rate_radps: float, now_ns: int) -> float:
-        """Heading to ask for now, in [-pi, pi]."""
+        """Return the heading to command now, in [-pi, pi]."""
         lead_rad, elapsed_ns = 0.0, now_ns - self._at_ns
         if self._asked_rad is not None and elapsed_ns <= _PAUSE_NS:
             lead_rad = self._asked_rad - measured_rad + yaw_rate_radps * elapsed_ns / NS_PER_S
@@ -114,11 +114,11 @@ class HeadingTarget:
 
 
 class AttitudeOutput(SetpointOutput):
-    """SET_ATTITUDE_TARGET; either kind of action is sent as what it is.
+    """SET_ATTITUDE_TARGET, with an attitude or with body rates.
 
-    Thrust is scaled so that the thrust that hovered in training hovers here. That of body rates is
-    along the body's axis on every firmware: where the autopilot raises it in a lean, it is lowered
-    by as much. That of an attitude is what the autopilot makes of it.
+    Thrust is scaled so that the hover thrust of training hovers here. With body rates, thrust acts
+    along the body axis on every firmware: a boost that the autopilot adds in a lean is cancelled.
+    With an attitude, the boost stays.
     """
 
     _echo_message = "ATTITUDE_TARGET"
@@ -132,23 +132,23 @@ class AttitudeOutput(SetpointOutput):
         self._trained_hover = meaning.hover_thrust
         self._hover = HoverThrust()
         self._scale: float | None = None
-        """The vehicle's thrust for the policy's; constant during a stream."""
+        """Ratio of the vehicle's thrust to the policy's; constant during a stream."""
         self._has_guessed = self._has_told = False
-        """Nothing tells the thrust at which the vehicle hovers; the user knows."""
+        """The vehicle's hover thrust is unknown; the user was told so."""
         self._heading = HeadingTarget()
         self._measured_rad: float | None = None
         self._is_level = False
         self._cos_tilt = 1.0
 
     def restart(self) -> None:
-        """A new session: another battery, perhaps another vehicle."""
+        """Start a new session: the battery or the vehicle may be another one."""
         super().restart()
         self._hover, self._scale, self._measured_rad = HoverThrust(), None, None
         self._cos_tilt = 1.0
         self._heading.restart()
 
     def take_notes(self) -> tuple[str, ...]:
-        """A thrust that is not matched to the vehicle."""
+        """Return a note if the thrust is not matched to the vehicle, once."""
         if not self._has_guessed or self._has_told:
             return ()
         self._has_told = True
@@ -158,13 +158,13 @@ class AttitudeOutput(SetpointOutput):
         )
 
     def released(self) -> None:
-        """Silence; the next stream starts afresh."""
+        """Note the end of sending; the next stream starts afresh."""
         super().released()
         self._heading.restart()
         self._scale = None
 
     def encode(self, action: Action, vehicle: VehicleSession, now_ns: int) -> Encoded | None:
-        """The setpoint; None for an attitude before the vehicle's own heading is known."""
+        """Encode the setpoint; None for an attitude before the vehicle's heading is known."""
         if not isinstance(action, AttitudeThrust | BodyRates):
             raise CommandRefusedError(f"{type(action).__name__} has neither attitude nor rates")
         if not (all(map(math.isfinite, action)) and 0.0 <= action.thrust <= 1.0):
@@ -177,7 +177,7 @@ class AttitudeOutput(SetpointOutput):
         boost = self._cos_tilt if is_boosted else 1.0
         scale = self._scale * boost
         shown: Shown = (round(min(self._scale * action.thrust, 1.0) * boost * THRUST_UNITS),)
-        is_checked = shown[0] > 0  # idle motors are left idle
+        is_checked = shown[0] > 0  # leave idle motors idle
         if is_checked and not self._shows_rates:
             shown = self.echo.with_dither(shown, now_ns)
         thrust = shown[0] / THRUST_UNITS
@@ -198,7 +198,7 @@ class AttitudeOutput(SetpointOutput):
         return Encoded(packet, action._replace(thrust=policy_thrust), shown if is_checked else None)
 
     def encode_resting(self, action: Action, vehicle: VehicleSession, now_ns: int) -> bytes | None:
-        """See `ActionOutput`; level, with the vehicle's own heading."""
+        """See `ActionOutput`; level, at the vehicle's own heading."""
         if not isinstance(action, AttitudeThrust) or self._measured_rad is None:
             return None
         level = quaternion_from_euler(0.0, 0.0, self._measured_rad)
@@ -231,7 +231,7 @@ class AttitudeOutput(SetpointOutput):
         return hover / self._trained_hover
 
     def _compare(self, body: Body | None, vehicle: VehicleSession, arrived_ns: int) -> None:
-        """Take the vehicle's own attitude and thrust, and the echo; PX4's carries an old stamp."""
+        """Process attitude, force and echo, by their arrival: PX4's echo has an old timestamp."""
         match body:
             case Attitude():
                 self._measured_rad = heading_rad(body.ned_from_body_wxyz)

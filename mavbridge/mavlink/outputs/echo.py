@@ -1,4 +1,4 @@
-"""Echo check: compares what we send with what the vehicle shows of it."""
+"""Echo check: compares sent commands with those that the vehicle shows."""
 
 from collections import deque
 from dataclasses import dataclass
@@ -8,86 +8,85 @@ from mavbridge.core.clock import NS_PER_MS, NS_PER_S
 from mavbridge.mavlink.codec.messages import RESTART_STAMPS, RESTART_STEP_US
 
 Shown: TypeAlias = tuple[int, ...]
-"""Numbers of a message, in its own units: PWM of the four sticks in RC_CHANNELS, for one."""
+"""Numbers of a message in its own units, for example the PWM of the four sticks in RC_CHANNELS."""
 EchoFault: TypeAlias = Literal["unseen", "foreign", "returned", "silent"]
-"""unseen: no echo since the first command, or no message that shows any. foreign: values that
-neither we nor the pilot's receiver sent. returned: those that it showed before us. silent: ours,
-but always the same ones, although we keep changing them."""
+"""unseen: no echo since the first command, or no message that shows one. foreign: values that
+neither we nor the pilot's receiver sent. returned: the values shown before our first command.
+silent: our values, but constant although we keep changing them."""
 
 CONFIRM_NS = NS_PER_S
-"""Longest wait for the first echo, and longest pause of the message that shows it: an override is
-shown after about 14 ms; 200 ms of delay each way and a few lost packets still leave half of this.
-"""
+"""Longest wait for the first echo, and longest gap between echo messages. An override is echoed
+after about 14 ms; 200 ms of delay each way and a few lost packets still leave half of this."""
 MATCH_NS = 700 * NS_PER_MS
-"""Oldest of our commands that may still be shown: 200 ms of delay each way, a value that is held
-through five lost packets at 30 Hz, an interval of the message that shows it, and a reserve."""
+"""Maximum age of a command that may still be echoed: 200 ms of delay each way, a value held through
+five lost packets at 30 Hz, one interval of the echo message, and a margin."""
 SILENT_US = 400_000
-"""Longest time that the echo may be constant, by the vehicle's clock. We send another value every
-25 ms, so that 20 % of loss in both directions leaves a dozen changes in this time."""
+"""Longest time that the echo may be constant, by the vehicle's clock. The command changes every 25
+ms, so that 20 % of loss in both directions leaves a dozen changes in this time."""
 SILENT_SAMPLES = 8
-"""Fewest messages in that time, as many as come at 20 Hz: where some are lost, a few of them may be
-equal by chance."""
+"""Fewest echo messages in SILENT_US, as at 20 Hz: after losses a few may agree by chance."""
 OFTEN_US = 500_000
 RETURNED_SAMPLES = 2
-"""So many messages within this time with the values of before us: one is a stray release of
-another station; a joystick at 50 Hz has a quarter to a half of 29 RC_CHANNELS. Sticks that nobody
-but another overrider can have sent need no second one: at 10 Hz it is shown but once or twice."""
+"""Samples within OFTEN_US that show the values from before us and count as a fault. One is a stray
+release of another station; a joystick at 50 Hz causes a quarter to a half of 29 RC_CHANNELS.
+Values that only another overrider can have sent are a fault at the first sample: at 10 Hz they are
+shown only once or twice."""
 DITHER_STEP_NS = 25 * NS_PER_MS
 _DITHER_LEVELS = 3
-"""Three levels of 25 ms, by time and not by packet: no usual rate of commands or of what shows them
-hits the same level each time, and one lost packet never makes two levels look like one."""
+"""Number of dither levels, 25 ms each, by time and not by packet: no usual rate of commands or
+echoes hits the same level each time, and one lost packet never makes two levels look like one."""
 _PAUSE_NS = 100 * NS_PER_MS
-"""After this long without a command of ours nothing is judged: an echo may rightly be constant, and
-what lasted until then must not keep us from ever trying again."""
+"""Pause in our commands after which nothing is judged: a constant echo is normal then, and an old
+fault must not prevent every new attempt."""
 _RETRY_NS = 3 * NS_PER_S
-"""A fault stays known for this long after it was last seen."""
+"""Time for which a fault is reported after it was last seen."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class EchoRules:
-    """Rules by which one message shows what was sent."""
+    """Rules of the echo check for one message."""
 
     tolerance: int
-    """Largest difference from what was sent, and movement of another source at rest."""
+    """Largest difference from the sent value, and largest movement of another source at rest."""
     release_tolerance: int = 0
-    """The same where our last values are told from another source that rests beside them."""
+    """Tolerance after the release, to tell our last values from a source at rest beside them."""
     dithered: int
-    """Index of the number that we keep changing, so that its echo changes too."""
+    """Index of the number that is dithered, so that its echo changes."""
     dither: int
-    """Its step once the echo is confirmed."""
+    """Dither step after the echo is confirmed."""
     seek_dither: int
-    """Its step until then: more than ``tolerance``, lest a source at rest is taken for us."""
+    """Dither step before: above ``tolerance``, so that no idle source is mistaken for our echo."""
     centre: int
-    """The dither goes towards this value, never away from it."""
+    """Value towards which the dither goes."""
     foreign_samples: int = 1
-    """So many values of nobody's within half a second are a fault. More than one where the vehicle
-    shows others for a moment as soon as its mode changes, which is told a little later."""
+    """Unrecognised samples per 0.5 s that count as a fault. More than one if a mode change shows
+    foreign values for a moment before the new mode is reported."""
     longest_pause_ns: int = NS_PER_S
-    """After so long without a message that shows them, our commands are taken for lost."""
+    """Gap in the echo messages after which our commands count as lost."""
 
 
 class EchoCheck:
-    """Tells whether the vehicle acts on our commands, on ours alone, and on fresh ones.
+    """Checks that the vehicle acts on our commands, on no others, and on fresh ones.
 
-    Confirmed when it shows values that we sent and that it did not show before. From then on each
-    message must match something that we sent recently, and must change as the dither does.
+    The echo is confirmed when the vehicle shows sent values that it did not show before. From then
+    on each message must match a recent command and must change as the dither does.
     """
 
     def __init__(self, rules: EchoRules) -> None:
         self._rules = rules
         self._sent: deque[tuple[int, Shown]] = deque()
-        """The last of each 0.7 s; after a release, those before it."""
+        """Commands of the last 0.7 s; after a release, of the 0.7 s before it."""
         self._since_ns: int | None = None
-        """First command of this check; None while the vehicle is released."""
+        """First command of this check; None while released."""
         self._tried_ns = 0
-        """Last command, also one that could not be sent."""
+        """Last command, including failed sends."""
         self._baseline: Shown | None = None
-        """Last values that were shown before ours."""
+        """Last values shown before ours."""
         self._matched_ns: int | None = None
-        """Arrival of the last echo; None = not confirmed."""
+        """Arrival of the last echo; None: not confirmed."""
         self._shown_us: int | None = None
         self._arrived_ns: int | None = None
-        """Arrival of the last message that shows them."""
+        """Arrival of the last echo message."""
         self._old_stamps = 0
         self._held: Shown | None = None
         self._held_since_us = 0
@@ -97,32 +96,31 @@ class EchoCheck:
         self._fault: EchoFault | None = None
         self._fault_ns = 0
         self.is_released = True
-        """Other values than ours were shown since the release, or none was ever sent."""
+        """True if values other than ours were shown since the release, or none was ever sent."""
         self.shows_last = False
-        """The values that were shown since the release are, or cannot be told from, our last."""
+        """True if the vehicle shows our last command since the release, or values like it."""
         self.has_sent = False
-        """At least one command was sent in this session."""
+        """True if a command was sent in this session."""
 
     @property
     def confirmed(self) -> bool:
-        """The vehicle acts on our commands."""
+        """True if the vehicle acts on our commands."""
         return self._matched_ns is not None
 
     @property
     def is_sending(self) -> bool:
-        """Something was sent and not released since."""
+        """True if a command was sent and not released since."""
         return self._since_ns is not None
 
     def is_unshown(self, now_ns: int) -> bool:
-        """No message that could show an echo has come for too long."""
+        """True if no echo message has arrived for too long."""
         pause_ns = self._rules.longest_pause_ns
         return self._arrived_ns is None or now_ns - self._arrived_ns > pause_ns
 
     def with_dither(self, wanted: Shown, now_ns: int) -> Shown:
-        """The values to send: one walks by up to two steps towards its centre, never outwards.
+        """Return the values to send, one of them dithered by up to two steps towards the centre.
 
-        So the echo of a vehicle that takes our packets changes all the time, and differs from
-        another source that rests where we do.
+        The echo of a vehicle that hears us then keeps changing, unlike another source at rest.
         """
         rules, at = self._rules, self._rules.dithered
         step = rules.dither if self.confirmed else rules.seek_dither
@@ -131,14 +129,14 @@ class EchoCheck:
         return (*wanted[:at], value, *wanted[at + 1 :])
 
     def tried(self, now_ns: int) -> None:
-        """Note a command, also one that could not be sent: its echo is awaited from then on."""
+        """Note a command, sent or not: its echo is expected from now on."""
         self._tried_ns = now_ns
         if self._since_ns is None:
             self._since_ns = now_ns
             self._sent.clear()
 
     def sent(self, values: Shown, now_ns: int) -> None:
-        """Note a command that was sent, by the values that will be shown of it."""
+        """Note a sent command by the values that its echo will show."""
         self.tried(now_ns)
         self.has_sent, self.is_released = True, False
         if self._sent and self._is_paused(now_ns):
@@ -150,17 +148,17 @@ class EchoCheck:
             self._sent.popleft()
 
     def released(self) -> None:
-        """Sending has ended: the next command starts a new check."""
+        """Note the end of sending; the next command starts a new check."""
         self.shows_last &= not self.is_sending
         self._since_ns = self._matched_ns = self._held = None
         self._returned_us.clear()
         self._foreign_us.clear()
 
     def received(self, values: Shown, shown_us: int, now_ns: int) -> None:
-        """Compare the values of one message, stamped ``shown_us`` by the vehicle.
+        """Compare the values of one message with the vehicle's timestamp ``shown_us``.
 
-        Late and doubled datagrams are left out; two in a row from long ago are a clock that has
-        restarted, or the end of one stamp that was wrong.
+        Late and duplicate datagrams are skipped. Two old timestamps in a row mean that the clock
+        has restarted, or that one wrong timestamp has ended.
         """
         if self._is_late(shown_us):
             return
@@ -178,7 +176,7 @@ class EchoCheck:
             self._judge(values, shown_us, now_ns)
 
     def _judge(self, values: Shown, shown_us: int, now_ns: int) -> None:
-        """Compare what is shown while we send."""
+        """Compare the shown values while we send."""
         is_ours = any(self._is_near(values, past) for _, past in reversed(self._sent))
         if not self.confirmed:
             self._seek(values, is_ours, now_ns)
@@ -193,7 +191,7 @@ class EchoCheck:
             self._watch_change(values, shown_us, now_ns)
 
     def _is_late(self, shown_us: int) -> bool:
-        """Older than the last one, and not of a clock that has restarted."""
+        """True if the timestamp is not newer than the last one and the clock has not restarted."""
         if self._shown_us is None or shown_us > self._shown_us:
             self._old_stamps = 0
             return False
@@ -201,7 +199,7 @@ class EchoCheck:
         self._old_stamps = self._old_stamps + 1 if is_far_back else 0
         if self._old_stamps < RESTART_STAMPS:
             return True
-        self._old_stamps, self._held = 0, None  # no stamp from before it is compared with new ones
+        self._old_stamps, self._held = 0, None  # do not compare old stamps with new ones
         self._returned_us.clear()
         self._foreign_us.clear()
         return False
@@ -210,11 +208,11 @@ class EchoCheck:
         return _is_within(self._rules.tolerance, one, other)
 
     def _is_paused(self, now_ns: int) -> bool:
-        """Nothing of ours has left for so long that what is shown tells nothing about us."""
+        """True if our last command is too old for the echo to tell anything about us."""
         return not self._sent or now_ns - self._sent[-1][0] > _PAUSE_NS
 
     def _note_pause(self, values: Shown, now_ns: int) -> None:
-        """Judge nothing; after a long pause these are the values of before the next command."""
+        """Judge nothing; after a long pause, store the values as the new baseline."""
         self._held = None
         self._returned_us.clear()
         self._foreign_us.clear()
@@ -222,7 +220,7 @@ class EchoCheck:
             self._baseline = values
 
     def _restart(self, now_ns: int) -> None:
-        """Nothing was shown, or sent, for so long that the vehicle may rightly show anything."""
+        """Restart echo tracking after a gap in echoes or commands, when any value is legitimate."""
         if self.is_sending:
             self._since_ns, self._matched_ns, self._held = now_ns, None, None
             self._returned_us.clear()
@@ -253,7 +251,7 @@ class EchoCheck:
         self._fault_ns = now_ns
 
     def fault(self, now_ns: int) -> EchoFault | None:
-        """The way in which it does not act on our commands; kept for 3 s after it ends."""
+        """Return the fault of the echo, up to 3 s after its end, or None."""
         if self._since_ns is not None and now_ns - self._tried_ns <= _PAUSE_NS:
             since_ns, longest_ns = self._since_ns, CONFIRM_NS
             if self._matched_ns is not None:
@@ -264,7 +262,7 @@ class EchoCheck:
 
 
 def _is_often(times_us: deque[int], shown_us: int) -> bool:
-    """Note a value that should not be shown; True once there are too many."""
+    """Note an unexpected value; return True once there are too many."""
     times_us.append(shown_us)
     return len(times_us) == times_us.maxlen and shown_us - times_us[0] <= OFTEN_US
 

@@ -1,4 +1,4 @@
-"""Shape of an output: an action becomes a packet, and the vehicle shows that it took it."""
+"""Interface of an output: encodes actions, and checks their echo."""
 
 from abc import ABC, abstractmethod
 from collections import Counter
@@ -14,58 +14,58 @@ from mavbridge.mavlink.session.vehicle import VehicleSession
 
 
 class Encoded(NamedTuple):
-    """One action, ready to be sent."""
+    """One encoded action."""
 
     packet: bytes
     action: Action
-    """The action as the packet expresses it, in the policy's own terms."""
+    """Action as the packet expresses it, in the policy's terms."""
     shown: Shown | None
-    """What the vehicle will show of it; None: nothing that could be checked."""
+    """Expected echo; None: nothing to check."""
 
 
 class ActionOutput(ABC):
-    """One message that carries actions, from the first packet to the release.
+    """One kind of message that carries actions, from the first packet to the release.
 
-    Made when a policy is loaded. It outlives the sessions of the vehicle, so its methods are given
+    Created when a policy is loaded. It outlives the sessions of the vehicle, so its methods take
     the present one.
     """
 
     name: Output
     is_sticks: ClassVar[bool]
-    """Its actions are stick positions, and not setpoints."""
+    """True if the actions are sticks, False if they are setpoints."""
     hides_receiver: ClassVar[bool] = False
-    """RC_CHANNELS shows our sticks in place of the receiver's."""
+    """True if RC_CHANNELS shows our sticks in place of the receiver's."""
     releases: ClassVar[int]
-    """Packets that take the last action back; 0: silence alone does."""
+    """Number of packets that release the last action; 0: silence is the release."""
     _echo_message: ClassVar[str]
-    """Message in which the vehicle shows what it acts on."""
+    """Message that shows the input that the vehicle acts on."""
     _causes: ClassVar[Mapping[EchoFault, str]]
-    """Likely reason of each fault, for the user."""
+    """Likely cause of each fault, for the user."""
 
     def __init__(self, codec: Codec, rules: EchoRules) -> None:
         self._codec = codec
         self._rules = rules
         self.echo = EchoCheck(rules)
         self.saturated: Counter[str] = Counter()
-        """How often each stick, by name, asked for more than the vehicle can do."""
+        """Number of messages, by stick, that demanded more than the vehicle can do."""
         self._was_confirmed = False
 
     def restart(self) -> None:
-        """A new session of the vehicle begins: nothing was sent in it, or seen."""
+        """Start a new session of the vehicle, in which nothing was sent or seen."""
         self._was_confirmed |= self.echo.confirmed
         self.echo = EchoCheck(self._rules)
 
     @property
     def was_confirmed(self) -> bool:
-        """The vehicle was seen to act on our packets at some time."""
+        """True if the vehicle has ever been seen to act on our packets."""
         return self._was_confirmed or self.echo.confirmed
 
     @abstractmethod
     def encode(self, action: Action, vehicle: VehicleSession, now_ns: int) -> Encoded | None:
-        """The packet of an action; None where the vehicle is not ready for it.
+        """Encode an action; return None if the vehicle is not ready for it.
 
         Raises:
-            CommandRefusedError: an action that must not be sent.
+            CommandRefusedError: the action must not be sent.
         """
 
     def refused(self, encoded: Encoded, vehicle: VehicleSession, now_ns: int) -> None:
@@ -75,19 +75,19 @@ class ActionOutput(ABC):
 
     @abstractmethod
     def encode_resting(self, action: Action, vehicle: VehicleSession, now_ns: int) -> bytes | None:
-        """The packet of an action at rest, for later: nothing is noted, and no dither is in it.
+        """Encode an action at rest for later, without dither and without side effects.
 
         Raises:
-            CommandRefusedError: as ``encode``.
+            CommandRefusedError: the action must not be sent.
         """
 
     def sent(self, encoded: Encoded, vehicle: VehicleSession, now_ns: int) -> None:
-        """Note what has left."""
+        """Note an action that was sent."""
         if encoded.shown is not None:
             self.echo.sent(encoded.shown, now_ns)
 
     def receive(self, body: Body | None, vehicle: VehicleSession, arrived_ns: int) -> None:
-        """Take a message of the vehicle, which may show an echo, before the session does."""
+        """Process a message of the vehicle, possibly an echo, before the session does."""
         self._compare(body, vehicle, arrived_ns)
         if self.hides_receiver:
             vehicle.is_receiver_hidden = self.echo.has_sent
@@ -95,58 +95,58 @@ class ActionOutput(ABC):
 
     @abstractmethod
     def _compare(self, body: Body | None, vehicle: VehicleSession, arrived_ns: int) -> None:
-        """Take an echo, if this is one."""
+        """Process the message if it is an echo."""
 
     def last_sticks(self, vehicle: VehicleSession, now_ns: int) -> Encoded | None:
-        """What goes ahead of the releases, by their spacing; None: nothing has to."""
+        """Return sticks to send before the first release, or None."""
         return None
 
     @abstractmethod
     def release_packet(self, vehicle: VehicleSession, now_ns: int) -> bytes | None:
-        """One of ``releases``; None: there is nothing to take back."""
+        """Encode one of the ``releases``; return None if there is nothing to release."""
 
     def released(self) -> None:
-        """Nothing more is sent until the next action."""
+        """Note that nothing more is sent until the next action."""
         self._was_confirmed |= self.echo.confirmed
         self.echo.released()
 
     @property
     def echo_confirmed(self) -> bool:
-        """The vehicle was seen to act on our packets, or shows nothing of them now."""
+        """True if the vehicle was seen to act on our packets, or shows no echo now."""
         return self.echo.confirmed
 
     def take_notes(self) -> tuple[str, ...]:
-        """What the user should know, each once."""
+        """Return notes for the user, each once."""
         return ()
 
     def in_policy_terms(
         self, status: VehicleStatus | None, vehicle: VehicleSession, now_ns: int
     ) -> VehicleStatus | None:
-        """The status with its sticks as the policy would mean them."""
+        """Return the status with its sticks converted to the policy's."""
         return status
 
     def is_released(self, vehicle: VehicleSession, now_ns: int) -> bool:
-        """It acts on something else than our last packets, or was sent none."""
+        """True if the vehicle acts on something other than our last packets, or none were sent."""
         return self.echo.is_released
 
     @property
     def shows_last(self) -> bool:
-        """What it shows since the release is, or cannot be told from, our last."""
+        """True if the vehicle shows our last command since the release, or values like it."""
         return self.echo.shows_last
 
     def are_sticks_at_rest(self, vehicle: VehicleSession) -> bool:
-        """The vehicle takes what we last sent for nobody's hand."""
+        """True if the vehicle does not take our last sticks for a pilot's hand."""
         return True
 
     def overruled(self, now_ns: int) -> Reason | None:
-        """The likely reason why it acts on something else than what we send, or None."""
+        """Return the likely reason why the vehicle acts on another source than us, or None."""
         fault = self.echo.fault(now_ns)
         if fault is None or fault == "silent" or self.echo.is_unshown(now_ns):
             return None
         return because(Code.OVERRULED, quantity=self._noun, cause=self._causes[fault])
 
     def unheard(self, now_ns: int) -> Reason | None:
-        """The reason why our packets do not reach it, as far as can be told, or None."""
+        """Return the likely reason why our packets do not reach the vehicle, or None."""
         fault = self.echo.fault(now_ns)
         if fault is not None and self.echo.is_unshown(now_ns):
             return because(Code.NO_ECHO, message=self._echo_message, quantity=self._noun)

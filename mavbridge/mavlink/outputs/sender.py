@@ -1,4 +1,4 @@
-"""Chooses the output of the flight, and sends actions and releases through it."""
+"""Choice of the flight's output, and sending of actions and releases through it."""
 
 from collections.abc import Iterable, Iterator
 from contextlib import suppress
@@ -38,10 +38,10 @@ CARRIED: dict[Output, ActionKind] = {
 def choose_output(
     meaning: ActionMeaning, wanted: Output | None, profile: Profile, codec: Codec
 ) -> ActionOutput:
-    """The output that was asked for, or the usual one of such actions and this vehicle.
+    """Return the requested output, or the default of these actions and this vehicle.
 
     Raises:
-        PeerError: this vehicle, or such actions, cannot be flown with it.
+        PeerError: the output does not fit the vehicle or the actions.
     """
     usual = profile.outputs[meaning.kind]
     name = wanted or usual
@@ -64,7 +64,7 @@ def choose_output(
 
 
 class ActionSender:
-    """The output of the flight, once both the vehicle and the policy are known.
+    """Sends actions through the flight's output, once vehicle and policy are known.
 
     A release that could not be sent goes before every other packet.
     """
@@ -72,17 +72,17 @@ class ActionSender:
     def __init__(self, connection: Connection, codec: Codec, clock: Clock) -> None:
         self._connection, self._codec, self._clock = connection, codec, clock
         self._flight: tuple[ActionMeaning, Output | None] | None = None
-        """The policy's actions, and the output that was asked for; None = no policy is loaded."""
+        """Meaning of the policy's actions, and the requested output; None: no policy is loaded."""
         self._vehicle: VehicleSession | None = None
         self._releases_left = self._release_due_ns = 0
-        """Those that may follow the last action, and when the next one is due."""
+        """Number of releases that may still follow the last action, and time of the next one."""
         self.is_release_owed = False
-        """A release could not be sent: ``try_release`` before everything else."""
+        """True if a release could not be sent: call ``try_release`` before everything else."""
         self.output: ActionOutput | None = None
-        """None until both are known."""
+        """None until vehicle and policy are known."""
 
     def begin_flight(self, meaning: ActionMeaning, wanted: Output | None) -> None:
-        """Choose the output for such actions, now or once the vehicle is known.
+        """Choose the output for these actions, now or once the vehicle is known.
 
         Raises:
             PeerError: the vehicle cannot be flown with it.
@@ -92,7 +92,7 @@ class ActionSender:
             self.equip(self._vehicle)
 
     def equip(self, vehicle: VehicleSession) -> None:
-        """Fly this session of the vehicle from now on; raises as ``begin_flight``."""
+        """Fly this session of the vehicle from now on; raises as ``begin_flight`` does."""
         self._vehicle = vehicle
         if self.output is not None:
             self.output.restart()
@@ -103,12 +103,12 @@ class ActionSender:
             vehicle.use_output(self.output.name)
 
     def send(self, decision: Decision, decided_ns: int | None = None) -> Action | None:
-        """Send an action or a release; returns the action as it was really sent, or None.
+        """Send an action or a release. Return the action as sent, or None.
 
-        ``decided_ns``: the moment that the action was decided for, by which it is made; None: now.
+        ``decided_ns``: time for which the action was computed; None: now.
 
         Raises:
-            CommandRefusedError: an action that this output must not send.
+            CommandRefusedError: this output must not send the action.
         """
         vehicle, output = self._vehicle, self.output
         if vehicle is None or output is None:
@@ -123,10 +123,10 @@ class ActionSender:
         encoded = output.encode(decision.action, vehicle, made_ns)
         if encoded is None or (self.is_release_owed and not self.try_release()):
             return None
-        # Before the send, which may leave whatever it says.
+        # Before the send: a failed send may still go out.
         self._releases_left, self._release_due_ns = output.releases, 0
         if not self._connection.send(encoded.packet):
-            if not self._connection.is_down:  # which is told as that
+            if not self._connection.is_down:  # a lost connection is reported as such
                 output.refused(encoded, vehicle, self._clock.now_ns())
             return None
         output.sent(encoded, vehicle, self._clock.now_ns())
@@ -135,8 +135,10 @@ class ActionSender:
     def rehearse(
         self, plan: Iterable[tuple[int, Decision | None, str | None]]
     ) -> Iterator[tuple[int, bytes]]:
-        """Yield the packets of decisions at rest and of requests for a mode, with their delays, for
-        later: nothing is noted. One that the codec refuses is left out."""
+        """Yield delays [ns] and packets of resting decisions and mode requests, for later.
+
+        No side effects. A packet that the codec refuses is skipped.
+        """
         vehicle, output, now_ns = self._vehicle, self.output, self._clock.now_ns()
         if vehicle is None:
             return
@@ -155,9 +157,9 @@ class ActionSender:
                     yield after_ns, self._codec.encode_request(vehicle.identity.source, request)
 
     def _level(self, output: ActionOutput, vehicle: VehicleSession) -> None:
-        """Send what goes ahead of the first release, where the output has it."""
+        """Before the first release, send the output's ``last_sticks``, if any."""
         if self._releases_left < output.releases:
-            return  # not the first
+            return  # not the first release
         now_ns = self._clock.now_ns()
         encoded = output.last_sticks(vehicle, now_ns)
         if encoded is not None and self._connection.send(encoded.packet):
@@ -165,7 +167,7 @@ class ActionSender:
             self._note_release(is_sent=True)
 
     def try_release(self) -> bool:
-        """Send a release; False: it was not sent, and goes before all other packets."""
+        """Send a release. Return False if it failed and must precede all other packets."""
         vehicle, output = self._vehicle, self.output
         if vehicle is None or output is None:
             return True
@@ -181,7 +183,7 @@ class ActionSender:
             self._release_due_ns = self._clock.now_ns() + RELEASE_SPACING_NS
 
     def transmit(self, data: bytes) -> bool:
-        """Send another packet, after a release that is owed; False: it was not sent."""
+        """Send another packet, after an outstanding release. Return False if it was not sent."""
         if self.is_release_owed and not self.try_release():
             return False
         return self._connection.send(data)

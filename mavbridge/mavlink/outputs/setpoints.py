@@ -1,4 +1,4 @@
-"""Outputs for setpoints: their common part, and velocities by SET_POSITION_TARGET_LOCAL_NED."""
+"""Outputs for setpoints: common base, and velocities by SET_POSITION_TARGET_LOCAL_NED."""
 
 import math
 from collections.abc import Mapping
@@ -15,25 +15,26 @@ from mavbridge.mavlink.outputs.output import ActionOutput, Encoded
 from mavbridge.mavlink.session.vehicle import VehicleSession
 
 HELD_NS = 3 * NS_PER_S
-"""Longest that a vehicle goes on with the last setpoint: ArduPilot's GUID_TIMEOUT by default;
+"""Longest time for which a vehicle follows the last setpoint: ArduPilot's default GUID_TIMEOUT;
 PX4's COM_OF_LOSS_T is 1 s."""
 FOREIGN_SAMPLES = 5
-"""A mode that takes over shows its own targets at once and its name within 30 ms, and five samples
-come in 50 to 100 ms: a change of mode is told as what it is."""
+"""Foreign samples that count as a fault. A new mode shows its own targets at once and its name
+within 30 ms; five samples take 50 to 100 ms, so that a mode change is reported as one."""
 
 
 class SetpointOutput(ActionOutput):
-    """Setpoints. Nothing but a mode takes the vehicle away from the last one, so the release is
-    silence; nothing is ever repeated by itself.
+    """Setpoints, whose release is silence: only a mode change takes the vehicle from the last one.
+
+    The output repeats nothing by itself.
 
     The echo is checked while the vehicle is armed, in the air and in a mode that follows setpoints;
-    in every other state it rightly shows something else.
+    in other states a different target is normal.
     """
 
     is_sticks = False
     releases = 0
     takeoff_ns: ClassVar[int] = 0
-    """So long after the ground it may rightly show something else."""
+    """Time after leaving the ground for which another target is normal."""
     _causes: ClassVar[Mapping[EchoFault, str]] = {
         "unseen": "another station may be commanding it",
         "foreign": "another station commands it as well, or it limits or refuses them",
@@ -45,22 +46,22 @@ class SetpointOutput(ActionOutput):
         super().__init__(codec, rules)
         self._sent_ns: int | None = None
         self._ground_ns: int | None = None
-        """When it last stood on the ground, as far as we have sent anything there."""
+        """Last time on the ground that was seen while sending."""
         self._is_checked = False
 
     def restart(self) -> None:
-        """A new session: nothing was sent in it."""
+        """Start a new session, in which nothing was sent."""
         super().restart()
         self._sent_ns, self._ground_ns, self._is_checked = None, None, False
 
     def _follows(self, vehicle: VehicleSession, now_ns: int) -> bool:
-        """The vehicle is armed and in a mode that follows setpoints."""
+        """True if the vehicle is armed and in a mode that follows setpoints."""
         status = vehicle.status(now_ns)
         roles = vehicle.profile.modes.roles
         return status is not None and status.armed and status.mode in roles.setpoint
 
     def _is_taking_off(self, vehicle: VehicleSession, now_ns: int) -> bool:
-        """The vehicle is on the ground, or has only just left it."""
+        """True if the vehicle is on the ground, or has only just left it."""
         status = vehicle.status(now_ns)
         if status is not None and status.is_landed is True:
             self._ground_ns = now_ns
@@ -76,7 +77,7 @@ class SetpointOutput(ActionOutput):
             super().refused(encoded, vehicle, now_ns)
 
     def sent(self, encoded: Encoded, vehicle: VehicleSession, now_ns: int) -> None:
-        """Note what has left, for the echo where there is one to expect."""
+        """Note an action that was sent, and expect its echo if it has one."""
         self._sent_ns = now_ns
         self._is_checked = self._has_echo(encoded, vehicle, now_ns)
         if self._is_checked and encoded.shown is not None:
@@ -85,17 +86,17 @@ class SetpointOutput(ActionOutput):
             super().released()
 
     def released(self) -> None:
-        """Silence."""
+        """Note the end of sending."""
         super().released()
         self._is_checked = False
 
     @property
     def echo_confirmed(self) -> bool:
-        """Its target was ours, or it follows no setpoints now."""
+        """True if the vehicle has shown our target, or shows no echo now."""
         return self.echo.confirmed or not self._is_checked
 
     def is_released(self, vehicle: VehicleSession, now_ns: int) -> bool:
-        """Another mode has taken over, or it holds by itself after its own timeout."""
+        """True if another mode has taken over, or the vehicle's own setpoint timeout has passed."""
         if self._sent_ns is None:
             return True
         is_over = now_ns - self._sent_ns > HELD_NS
@@ -103,11 +104,11 @@ class SetpointOutput(ActionOutput):
 
     @property
     def shows_last(self) -> bool:
-        """Never: what it shows tells nothing about a release."""
+        """Always False: the echo tells nothing about a release."""
         return False
 
     def release_packet(self, vehicle: VehicleSession, now_ns: int) -> bytes | None:
-        """Silence is the release."""
+        """Return None: silence is the release."""
         return None
 
 
@@ -115,8 +116,8 @@ MM_PER_M = 1000
 VELOCITY_ECHO = EchoRules(
     tolerance=0, dithered=0, dither=1, seek_dither=1, centre=0, foreign_samples=FOREIGN_SAMPLES
 )
-"""Velocity down, in mm/s, which both autopilots show as it was sent; the horizontal ones are turned
-into NED axes first."""
+"""Velocity down [mm/s], which both autopilots echo as sent; they rotate horizontal velocities into
+NED axes first."""
 
 
 class VelocityOutput(SetpointOutput):
@@ -124,8 +125,8 @@ class VelocityOutput(SetpointOutput):
 
     name: Output = "velocity"
     takeoff_ns = 3 * NS_PER_S
-    """PX4 brings the climb in over MPC_TKO_RAMP_T, 3 s by default, and shows that: the speed down
-    went from +2.2 to the -1.5 m/s that were sent in 2.0 s, of which 0.8 on the ground."""
+    """PX4 ramps the climb over MPC_TKO_RAMP_T, 3 s by default, and echoes the ramp: the down speed
+    went from +2.2 to the commanded -1.5 m/s in 2.0 s, 0.8 s of that on the ground."""
     _echo_message = "POSITION_TARGET_LOCAL_NED"
 
     def __init__(self, codec: Codec, meaning: ActionMeaning) -> None:
@@ -133,7 +134,7 @@ class VelocityOutput(SetpointOutput):
         self._is_heading_frame = meaning.is_heading_frame
 
     def encode(self, action: Action, vehicle: VehicleSession, now_ns: int) -> Encoded | None:
-        """The setpoint, within the climb rates that the vehicle would itself limit it to."""
+        """Encode the setpoint, clipped to the vehicle's own climb and descent limits."""
         if not isinstance(action, Velocity):
             raise CommandRefusedError(f"{type(action).__name__} is no velocity")
         if not all(map(math.isfinite, action)):
@@ -156,7 +157,7 @@ class VelocityOutput(SetpointOutput):
         )
 
     def _compare(self, body: Body | None, vehicle: VehicleSession, arrived_ns: int) -> None:
-        """Compare the velocity down, if the target has one (a takeoff has a position)."""
+        """Compare the down velocity, if the target has one (a takeoff has a position)."""
         if not isinstance(body, VelocityTarget):
             return
         if not body.type_mask & dialect.POSITION_TARGET_TYPEMASK_VZ_IGNORE:

@@ -1,4 +1,4 @@
-"""Outputs for sticks: RC_CHANNELS_OVERRIDE (ArduPilot) and MANUAL_CONTROL (PX4), with echoes."""
+"""Outputs for sticks: RC_CHANNELS_OVERRIDE (ArduPilot), MANUAL_CONTROL (PX4), with echoes."""
 
 from collections.abc import Mapping
 from dataclasses import replace
@@ -30,50 +30,50 @@ from mavbridge.mavlink.profiles.sticks import IDENTITY, StickCurves
 from mavbridge.mavlink.session.vehicle import VehicleSession
 
 _CURVES_NS = 500 * NS_PER_MS
-"""Parameters that the curves depend on count after this time at the latest; a mode at once."""
+"""Longest delay until a parameter change reaches the stick curves; a mode change does at once."""
 
 _MOST_TOLD = 100
-"""Notes: they name values of parameters, which may change any number of times."""
+"""Largest number of notes: they quote parameter values, which may change without end."""
 
 
 class StickOutput(ActionOutput):
-    """Sticks, mapped so that they mean to the vehicle what they meant in the policy's training."""
+    """Sticks, mapped so that the vehicle moves as it did in the policy's training."""
 
     is_sticks = True
 
     def __init__(self, codec: Codec, rules: EchoRules, gains: StickGains | None) -> None:
         super().__init__(codec, rules)
         self._gains = gains
-        """None: sticks go to the vehicle as they are."""
+        """None: send the sticks unchanged."""
         self._curves = IDENTITY
         self._curves_mode = ""
         self._curves_due_ns = 0
         self._saturating: tuple[str, ...] = ()
-        """Sticks of the last action that ask for more than the vehicle can do."""
+        """Sticks of the last action that demand more than the vehicle can do."""
         self._mapped: tuple[VehicleStatus, StickCurves, VehicleStatus] | None = None
-        """A status of the vehicle, the curves, and what both come to in the policy's terms."""
+        """Cached conversion: status of the vehicle, curves, status in the policy's terms."""
         self._new_notes: list[str] = []
         self._told: set[str] = set()
 
     def restart(self) -> None:
-        """A new session: its parameters and its mode count."""
+        """Start a new session, with its own parameters and mode."""
         super().restart()
         self._curves_mode, self._curves_due_ns = "", 0
 
     def sent(self, encoded: Encoded, vehicle: VehicleSession, now_ns: int) -> None:
-        """Note what has left."""
+        """Note sticks that were sent."""
         super().sent(encoded, vehicle, now_ns)
         self.saturated.update(self._saturating)
 
     def take_notes(self) -> tuple[str, ...]:
-        """What this vehicle cannot do that the policy may ask for, for the user; each once."""
+        """Return the policy's demands that this vehicle cannot meet, for the user; each once."""
         notes, self._new_notes = tuple(self._new_notes), []
         return notes
 
     def in_policy_terms(
         self, status: VehicleStatus | None, vehicle: VehicleSession, now_ns: int
     ) -> VehicleStatus | None:
-        """The status with its sticks as the policy would mean them."""
+        """Return the status with its sticks converted to the policy's."""
         if self._gains is None or status is None:
             return status
         curves = self._curves_of(vehicle, status.mode, now_ns)
@@ -90,7 +90,7 @@ class StickOutput(ActionOutput):
         return self._mapped[2]
 
     def _resting(self, action: Action) -> Sticks:
-        """The vehicle's sticks for an action, by the curves in use."""
+        """Return the vehicle's sticks for an action, by the curves in use."""
         if not isinstance(action, Sticks):
             raise CommandRefusedError(f"{type(action).__name__} are not sticks")
         is_same = action is IDLE or self._curves.is_identity
@@ -99,9 +99,9 @@ class StickOutput(ActionOutput):
     def _wanted(
         self, action: Action, vehicle: VehicleSession, now_ns: int
     ) -> tuple[Sticks, StickCurves]:
-        """The vehicle's sticks for an action, and the curves that lead back.
+        """Return the vehicle's sticks for an action, and the curves for the inverse.
 
-        ``IDLE`` is no motion that the policy means, but the stop at the bottom, for arming.
+        ``IDLE`` is not mapped: it means the stop at the bottom, for arming.
         """
         self._saturating = ()
         if not isinstance(action, Sticks):
@@ -128,26 +128,26 @@ class StickOutput(ActionOutput):
 
 
 OVERRIDE_ECHO = EchoRules(tolerance=2, dithered=3, dither=1, seek_dither=4, centre=1500)
-"""In us. A receiver at rest moves by 2; the vehicle itself shows overrides to the microsecond.
+"""Echo of PWM [us]. A receiver at rest moves by 2 us; the vehicle echoes overrides exactly.
 
-Roll is dithered: 1500, 1501 and 1502 us were seen to move nothing, inside the dead zone of 20 us;
-beyond it, 2 us are 0.2 degrees of lean at the usual calibration. Two of the larger steps are well
-inside the dead zone.
+Roll is dithered: 1500, 1501 and 1502 us moved nothing, inside the dead zone of 20 us. Outside it, 2
+us are 0.2 degrees of lean at the usual calibration. Two of the larger steps also stay well inside
+the dead zone.
 """
 
 
 class OverrideOutput(StickOutput):
     """RC_CHANNELS_OVERRIDE; a release gives the channels back to the receiver.
 
-    Without a receiver ArduPilot keeps the last sticks after a release, until its radio failsafe a
-    second later, or for ever with FS_THR_ENABLE 0: level ones go ahead of it there.
+    Without a receiver ArduPilot keeps the last sticks after a release, until its radio failsafe one
+    second later, or for ever with FS_THR_ENABLE 0. Level sticks therefore precede that release.
     """
 
     name: Output = "rc-override"
     hides_receiver = True
     releases = 80
-    """Over the four seconds for which they are asked for at most; then silence, so that another
-    station may override."""
+    """Sent over the four seconds of a release at most; the silence that follows lets another
+    station override."""
     _echo_message = "RC_CHANNELS"
     _causes: ClassVar[Mapping[EchoFault, str]] = {
         "unseen": "another station may be overriding them, or the receiver has priority",
@@ -160,14 +160,14 @@ class OverrideOutput(StickOutput):
     def __init__(self, codec: Codec, gains: StickGains | None) -> None:
         super().__init__(codec, OVERRIDE_ECHO, gains)
         self._calibration: RcCalibration | None = None
-        """Calibration of the last override, for its release even after a reboot of the vehicle."""
+        """Calibration of the last override, for its release even after a reboot."""
         self._last: Shown = (0, 0, 0, 0)
-        """The last override in us: throttle, yaw, pitch, roll."""
+        """Last override [us]: throttle, yaw, pitch, roll."""
         self._status: VehicleStatus | None = None
-        """The vehicle's last one, also after its session has started over."""
+        """Last status of the vehicle, kept when its session restarts."""
 
     def encode(self, action: Action, vehicle: VehicleSession, now_ns: int) -> Encoded | None:
-        """The override of the four sticks; None without a calibration."""
+        """Encode the override of the four sticks; return None without a calibration."""
         sticks, curves = self._wanted(action, vehicle, now_ns)
         calibration = vehicle.calibration
         if calibration is None:
@@ -187,7 +187,7 @@ class OverrideOutput(StickOutput):
         return self._codec.encode_override(vehicle.identity.source, pwm_us, calibration)
 
     def _compare(self, body: Body | None, vehicle: VehicleSession, arrived_ns: int) -> None:
-        """Compare RC_CHANNELS with what was sent."""
+        """Compare RC_CHANNELS with the sent override."""
         if isinstance(body, RcChannels) and vehicle.calibration is not None:
             pwm_us = vehicle.calibration.stick_channels_us(body.channels_us)
             if pwm_us is not None:
@@ -196,16 +196,15 @@ class OverrideOutput(StickOutput):
     def in_policy_terms(
         self, status: VehicleStatus | None, vehicle: VehicleSession, now_ns: int
     ) -> VehicleStatus | None:
-        """The status with its sticks as the policy would mean them."""
+        """Return the status with its sticks converted to the policy's."""
         self._status = status or self._status
         return super().in_policy_terms(status, vehicle, now_ns)
 
     def last_sticks(self, vehicle: VehicleSession, now_ns: int) -> Encoded | None:
-        """Level ones for an armed vehicle without a receiver; where the throttle is thrust, with
-        the last one.
+        """Level an armed vehicle without a receiver, with the last throttle in thrust modes.
 
-        None once a failsafe has chosen its mode: sticks clear a radio failsafe, and it would fire
-        again a second later, whatever mode the pilot has set by then.
+        Return None once a failsafe has chosen its mode: sticks would clear a radio failsafe, which
+        would fire again a second later in any mode that the pilot has set by then.
         """
         status, calibration = vehicle.status(now_ns) or self._status, self._calibration
         if status is None or calibration is None or not status.armed:
@@ -222,7 +221,7 @@ class OverrideOutput(StickOutput):
         return Encoded(packet, calibration.to_sticks(pwm_us), pwm_us)
 
     def release_packet(self, vehicle: VehicleSession, now_ns: int) -> bytes | None:
-        """Give the four channels back."""
+        """Encode the release of the four channels."""
         if self._calibration is None:
             return None
         return self._codec.encode_release(vehicle.identity.source, self._calibration)
@@ -237,26 +236,26 @@ MANUAL_ECHO = EchoRules(
     centre=0,
     longest_pause_ns=450 * NS_PER_MS,
 )
-"""x, y, z, r. PX4 shows the sticks as they came, or one less (rounded down), at the rate at which
-they came: it shows nothing when it hears nothing.
+"""Echo of x, y, z, r. PX4 shows received sticks, or one less (rounded down), at the rate of
+reception, and nothing if it receives nothing.
 
-The dither is on r, whose dead zone is a tenth; outside it 4 are half a degree a second.
+The dither is on r, which has a dead zone of a tenth; outside it, 4 units are 0.5 degrees/s.
 """
 _MODES = ("ALTCTL", "POSCTL", "MANUAL", "STABILIZED", "ACRO")
-"""In all others the last sticks do nothing, but one that jumps may be taken for the pilot's hand,
-which ends the mode."""
+"""Modes flown by sticks. In other modes the last sticks do nothing, but a jump may be taken for the
+pilot's hand, which ends the mode."""
 _HELD_NS = 700 * NS_PER_MS
-"""PX4 holds the last sticks for 0.5 s and a poll of 0.2 s (COM_RC_LOSS_T); echoes end with them."""
+"""Time for which PX4 holds and echoes the last sticks: 0.5 s (COM_RC_LOSS_T) + 0.2 s of polling."""
 
 
 _SPEED_TAU_S = 0.1
-"""Of PX4's low-pass of a stick's speed (``MovingDiff``); that of 1.18 is faster."""
+"""Time constant of PX4's low-pass of the stick speed (``MovingDiff``); 1.18 is faster."""
 _REST_SHARE = 0.5
-"""Of a hand's speed. A jump that PX4 sees 70 ms later, since packets were lost, is below it too."""
+"""Fraction of a hand's speed that counts as rest; also covers a jump that PX4 sees 70 ms late."""
 
 
 class StickSpeeds:
-    """Speed of the sticks that were sent, as PX4's detector of a pilot's hand computes it."""
+    """Speed of the sent sticks, computed as in PX4's detector of a pilot's hand."""
 
     def __init__(self) -> None:
         self._last: ManualControl | None = None
@@ -265,18 +264,18 @@ class StickSpeeds:
 
     @property
     def fastest_per_s(self) -> float:
-        """Full sticks a second."""
+        """Speed of the fastest stick [full sticks/s]."""
         return max(map(abs, self._per_s))
 
     def sent(self, values: ManualControl, now_ns: int) -> None:
-        """Take sticks that have left."""
+        """Add sticks that were sent."""
         last, dt_s = self._last, (now_ns - self._at_ns) / NS_PER_S
         self._last, self._at_ns = values, now_ns
         if last is None or dt_s <= 0.0:
             return
         x, y, z, r = (value - before for value, before in zip(values, last, strict=True))
         weight = dt_s / (_SPEED_TAU_S + dt_s)
-        moves = (x, y, 2 * z, r)  # z runs over half the range
+        moves = (x, y, 2 * z, r)  # z has half the range
         self._per_s = tuple(
             speed + weight * (move / STICK_END / dt_s - speed)
             for speed, move in zip(self._per_s, moves, strict=True)
@@ -284,8 +283,10 @@ class StickSpeeds:
 
 
 class ManualControlOutput(StickOutput):
-    """MANUAL_CONTROL. There is no release: one neutral packet where nobody else has sticks, then
-    silence, which PX4 takes for lost sticks where it had only ours."""
+    """MANUAL_CONTROL, whose release is silence, after one neutral packet if no other has sticks.
+
+    PX4 takes the silence for lost sticks if it received only ours.
+    """
 
     name: Output = "manual-control"
     releases = 1
@@ -304,25 +305,25 @@ class ManualControlOutput(StickOutput):
         self._sent_ns = 0
         self._speeds = StickSpeeds()
         self._shown: tuple[int, Sticks] | None = None
-        """Arrival of the sticks that it acts on, and these."""
+        """Arrival of the sticks that the vehicle acts on, and those sticks."""
         self._pilot: Sticks | None = None
-        """The same while it acted on none of ours."""
+        """Sticks that the vehicle acted on when they were not ours."""
         self._status: VehicleStatus | None = None
-        """The vehicle's last one, also after its session has started over."""
+        """Last status of the vehicle, kept when its session restarts."""
 
     def sent(self, encoded: Encoded, vehicle: VehicleSession, now_ns: int) -> None:
-        """Note what has left."""
+        """Note sticks that were sent."""
         super().sent(encoded, vehicle, now_ns)
         self._sent_ns = now_ns
         self._speeds.sent(self._last, now_ns)
 
     def are_sticks_at_rest(self, vehicle: VehicleSession) -> bool:
-        """Slower than a hand, by the parameter that this version has."""
+        """True if our sticks are slower than a hand, by this firmware version's parameter."""
         hand_per_s = vehicle.profile.hand_per_s(vehicle.known_params)
         return self._speeds.fastest_per_s < _REST_SHARE * hand_per_s
 
     def encode(self, action: Action, vehicle: VehicleSession, now_ns: int) -> Encoded | None:
-        """The four sticks, rounded."""
+        """Encode the four sticks, rounded."""
         sticks, curves = self._wanted(action, vehicle, now_ns)
         shown = self.echo.with_dither(manual_control_of(sticks), now_ns)
         x, y, z, r = shown
@@ -337,7 +338,7 @@ class ManualControlOutput(StickOutput):
         return self._codec.encode_manual_control(vehicle.identity.source.system, values)
 
     def _compare(self, body: Body | None, vehicle: VehicleSession, arrived_ns: int) -> None:
-        """Compare the sticks that the vehicle acts on; they carry no stamp of its own."""
+        """Compare the sticks that the vehicle acts on; they have no timestamp of the vehicle."""
         if not isinstance(body, ManualControl):
             return
         self.echo.received(tuple(body), arrived_ns // 1000, arrived_ns)
@@ -348,7 +349,7 @@ class ManualControlOutput(StickOutput):
     def in_policy_terms(
         self, status: VehicleStatus | None, vehicle: VehicleSession, now_ns: int
     ) -> VehicleStatus | None:
-        """The status with the sticks that are shown by MANUAL_CONTROL, and never by RC_CHANNELS."""
+        """Return the status with the sticks of MANUAL_CONTROL, never those of RC_CHANNELS."""
         self._status = status or self._status
         if status is not None and self._shown is not None:
             arrived_ns, sticks = self._shown
@@ -358,11 +359,11 @@ class ManualControlOutput(StickOutput):
         return super().in_policy_terms(status, vehicle, now_ns)
 
     def release_packet(self, vehicle: VehicleSession, now_ns: int) -> bytes | None:
-        """Level once more in a mode that follows sticks, unless a receiver has some of its own;
-        where the throttle is thrust, with the last one.
+        """Encode one level packet in modes flown by sticks, with the last throttle in thrust modes.
 
-        A vehicle whose session starts over has no status yet. Its reboot may be but a wrong stamp,
-        and without this packet it would fly on with the policy's last sticks for COM_RC_LOSS_T.
+        Return None if a receiver has sticks. After a session restart the last known status counts:
+        a reboot may be only a wrong timestamp, and without this packet the vehicle would fly on
+        with the policy's last sticks for COM_RC_LOSS_T.
         """
         status = vehicle.status(now_ns) or self._status
         if status is None or status.has_receiver or status.mode not in _MODES:
@@ -373,6 +374,6 @@ class ManualControlOutput(StickOutput):
         )
 
     def is_released(self, vehicle: VehicleSession, now_ns: int) -> bool:
-        """It shows other sticks, or none any more."""
+        """True if the vehicle shows other sticks, or none any more."""
         is_over = now_ns - self._sent_ns > _HELD_NS and self.echo.is_unshown(now_ns)
         return self.echo.is_released or (is_over and not self.echo.is_sending)

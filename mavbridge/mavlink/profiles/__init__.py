@@ -1,1 +1,1 @@
-"""One profile a firmware: nothing else in the tree asks which one it is."""
+"""Firmware profiles, the only firmware-specific code."""

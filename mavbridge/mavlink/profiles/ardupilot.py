@@ -1,4 +1,4 @@
-"""ArduCopter, 4.5 to 4.7."""
+"""Profile of ArduCopter 4.5 to 4.7."""
 
 from collections.abc import Iterator, Mapping
 from typing import ClassVar
@@ -27,17 +27,17 @@ from mavbridge.mavlink.profiles.profile import (
 from mavbridge.mavlink.profiles.sticks import StickCurves
 
 RC_CHANNELS_HZ = 1000 / 17
-"""RC_CHANNELS for the echo check, which needs 20 Hz or more: every 17 ms (ArduPilot counts in whole
-ms), so that no usual rate of a joystick (10, 20, 25, 50 Hz) is in step with it and stays unseen
+"""Rate of RC_CHANNELS for the echo check, which needs at least 20 Hz: every 17 ms (ArduPilot counts
+in whole ms), so that no joystick at a usual rate (10, 20, 25, 50 Hz) is in step with it and hides
 between two samples. Costs 3.2 kB/s."""
 HEARTBEAT_HZ = 10.0
-"""Shows arming within 100 ms where one packet is lost (at 1 Hz within 1 s); a change of mode is
-sent at once at any rate."""
+"""Shows arming within 100 ms despite one lost packet (at 1 Hz within 1 s); a mode change is sent at
+once at any rate."""
 _TARGET_HZ = 50.0
-"""ATTITUDE_TARGET and POSITION_TARGET_LOCAL_NED, for the echo check."""
+"""Rate of ATTITUDE_TARGET and POSITION_TARGET_LOCAL_NED for the echo check."""
 
 _SIMPLE_MODE_OFF = (3.0, 0.0)
-"""Function and position of its switch: low."""
+"""Auxiliary function and switch position (low)."""
 
 _MODES = ModeTable(
     {
@@ -57,7 +57,7 @@ _MODES = ModeTable(
 
 
 class ArduPilot(Profile):
-    """ArduCopter as measured: sticks as PWM through its radio calibration, setpoints in GUIDED."""
+    """ArduCopter, as measured: sticks as PWM through its radio calibration, setpoints in GUIDED."""
 
     name = "ardupilot"
     modes = _MODES
@@ -73,7 +73,7 @@ class ArduPilot(Profile):
     params = ardupilot_params.FIRST_NAMES
 
     def streams(self, *, state_hz: float, pilot_hz: float | None = None) -> tuple[StreamGroup, ...]:
-        """The IMU is asked for in floats first."""
+        """See `Profile`. The IMU is requested in floats first."""
         imu = ("HIGHRES_IMU", "RAW_IMU", "SCALED_IMU2")
         return (
             StreamGroup(("ATTITUDE_QUATERNION", "ATTITUDE"), state_hz),
@@ -87,7 +87,7 @@ class ArduPilot(Profile):
         )
 
     def echo(self, output: Output) -> StreamGroup:
-        """RC_CHANNELS shows overrides to the microsecond; the targets are shaped ones."""
+        """See `Profile`. RC_CHANNELS shows overrides exactly; targets are shown after shaping."""
         if output in ("attitude", "rates"):
             return optional_stream("ATTITUDE_TARGET", _TARGET_HZ)
         if output == "velocity":
@@ -95,83 +95,83 @@ class ArduPilot(Profile):
         return StreamGroup(("RC_CHANNELS",), RC_CHANNELS_HZ)
 
     def more_params(self, values: Mapping[str, float]) -> tuple[str, ...]:
-        """Calibration and dead zones of the channels that RCMAP_* names, and what turns sticks."""
+        """Return calibration, dead zones and stick settings of RCMAP_*'s channels."""
         names = ardupilot_params.calibration_names(values)
         settings = ardupilot_params.stick_setting_names(values)
         return names + ardupilot_params.dead_zone_names(values) + settings
 
     def needed_params(self, values: Mapping[str, float]) -> tuple[str, ...]:
-        """Calibration, and what decides how safe a flight is."""
+        """Return the calibration's parameters, and those that decide a flight's safety."""
         names = ardupilot_params.calibration_names(values)
         thrust_names = ("GUID_OPTIONS", "ATC_ANGLE_BOOST", "MOT_THST_HOVER")
         return (*names, *ardupilot_params.RISK_NAMES, *thrust_names)
 
     def calibration(self, values: Mapping[str, float]) -> RcCalibration:
-        """RCMAP_* and RCn_*."""
+        """Return the calibration from RCMAP_* and RCn_*."""
         return ardupilot_params.calibration(values)
 
     def override_switch(self, values: Mapping[str, float]) -> int | None:
-        """RCn_OPTION 46."""
+        """Return the channel with RCn_OPTION 46, or None."""
         return ardupilot_params.override_switch(values)
 
     def ignores_receiver(self, values: Mapping[str, float]) -> bool:
-        """RC_OPTIONS bit 0."""
+        """True if bit 0 of RC_OPTIONS is set."""
         return bool(int(values.get("RC_OPTIONS", 0)) & ardupilot_params.IGNORE_RECEIVER)
 
     def follow_up(self, name: str, before: float, now: float) -> CommandRequest | None:
-        """Simple mode off, which lasts until the mode switch moves, whatever the parameters are."""
+        """Return "Simple mode off": without it the mode stays on until the mode switch moves."""
         is_simple = ardupilot_params.is_simple_setting
         if is_simple(name, before) and not is_simple(name, now):
             return CommandRequest(dialect.MAV_CMD_DO_AUX_FUNCTION, _SIMPLE_MODE_OFF)
         return None
 
     def obstacles(self, values: Mapping[str, float], context: ParamContext) -> Iterator[ParamNote]:
-        """Overrides that are ignored or turned, and thrust that would be taken for a climb rate."""
+        """Yield settings that ignore or turn overrides, or take thrust for a climb rate."""
         if context.output == "rc-override":
             yield from ardupilot_params.override_obstacles(values, context.source_system)
         elif context.output in ("attitude", "rates"):
             yield from ardupilot_params.thrust_obstacles(values)
 
     def dangers(self, values: Mapping[str, float], context: ParamContext) -> Iterator[Danger]:
-        """Sticks that would stay for good, setpoints that would stay for long."""
+        """Yield settings under which sticks would stay for ever, or setpoints for long."""
         if context.output == "rc-override":
             yield from ardupilot_params.override_dangers(values, has_receiver=context.has_receiver)
         elif context.output is not None:
             yield from setpoint_danger(values, "GUID_TIMEOUT")
 
     def advice(self, values: Mapping[str, float], context: ParamContext) -> Iterator[ParamNote]:
-        """Time-outs that are long, and what keeps it from arming."""
+        """Yield long timeouts, and obstacles to arming."""
         if context.output == "rc-override":
             yield from ardupilot_params.override_advice(values)
         elif context.output is not None:
             yield from ardupilot_params.setpoint_advice(values, context)
 
     def hints(self, values: Mapping[str, float], context: ParamContext) -> Iterator[ParamNote]:
-        """Failsafes and switches that make a flight safer."""
+        """Yield failsafes and switches that make a flight safer."""
         return ardupilot_params.hints(values, context)
 
     def wanted_params(
         self, values: Mapping[str, float], context: ParamContext
     ) -> Iterator[WantedParam]:
-        """Those of overrides, or of setpoints."""
+        """Yield the parameters for overrides, or for setpoints."""
         return ardupilot_params.wanted_params(values, context)
 
     def stick_curves(
         self, values: Mapping[str, float], mode: str, gains: StickGains | None
     ) -> StickCurves:
-        """Leans, yaw rates and climb rates of ALT_HOLD and STABILIZE."""
+        """Return the curves of lean, yaw rate and climb rate in ALT_HOLD and STABILIZE."""
         return ardupilot_curves(values, mode, gains)
 
     def hover_thrust(self, values: Mapping[str, float]) -> float | None:
-        """MOT_THST_HOVER, which it learns in flight."""
+        """Return MOT_THST_HOVER, which the vehicle learns in flight."""
         return values.get("MOT_THST_HOVER")
 
     def boosts_thrust(self, values: Mapping[str, float]) -> bool:
-        """Unless ATC_ANGLE_BOOST is 0."""
+        """True unless ATC_ANGLE_BOOST is 0."""
         return values.get("ATC_ANGLE_BOOST", 1.0) != 0
 
     def takeoff(self, height_m: float, amsl_m: float | None) -> CommandRequest:
-        """NAV_TAKEOFF in GUIDED, whose height counts from home, where it was armed."""
+        """Return NAV_TAKEOFF for GUIDED; its height counts from home, the arming place."""
         return CommandRequest(dialect.MAV_CMD_NAV_TAKEOFF, (0, 0, 0, 0, 0, 0, height_m))
 
 

@@ -1,4 +1,4 @@
-"""The meaning of an ArduCopter's parameters for a flight: calibration, obstacles and risks."""
+"""Parameters of ArduCopter that matter for a flight: calibration, obstacles and risks."""
 
 from collections.abc import Iterator, Mapping
 
@@ -21,10 +21,10 @@ from mavbridge.mavlink.profiles.profile import (
 STICKS = ("THROTTLE", "YAW", "PITCH", "ROLL")
 """RCMAP_* suffixes in the order of ``Sticks``."""
 _OPTION_CHANNELS = range(5, 17)
-"""Channels of a radio's switches; the first four are those of the sticks by default."""
+"""Channels of a radio's switches; by default the first four carry the sticks."""
 _CALIBRATION_PARTS = ("MIN", "TRIM", "MAX", "REVERSED")
 _OVERRIDE_SWITCH_OPTION = 46
-"""RCn_OPTION "RC Override Enable": while the switch is low, all overrides are refused."""
+"""RCn_OPTION "RC Override Enable": overrides are refused while the switch is low."""
 IGNORE_RECEIVER, _IGNORE_OVERRIDES = 1, 2
 """Bits 0 and 1 of RC_OPTIONS."""
 SIMPLE_NAMES = ("SIMPLE", "SUPER_SIMPLE")
@@ -32,11 +32,11 @@ _SIMPLE_OPTIONS = (3.0, 13.0)
 """RCn_OPTION "Simple Mode" and "Super Simple Mode"."""
 _TURNED = "pitch and roll sticks count in the axes of "
 _THRUST_AS_THRUST = 8
-"""Bit 3 of GUID_OPTIONS; without it the thrust of SET_ATTITUDE_TARGET is a climb rate."""
+"""Bit 3 of GUID_OPTIONS; without it, thrust in SET_ATTITUDE_TARGET is a climb rate."""
 _CONTINUE_LANDING = 8
 """Bit 3 of FS_OPTIONS."""
 _LONGEST_S = 1.0
-"""A longer time-out leaves the vehicle without a pilot for longer than necessary."""
+"""Longest useful timeout; a longer one leaves the vehicle uncontrolled longer than necessary."""
 
 _OLD_NAMES = {
     "MAV_GCS_SYSID": "SYSID_MYGCS",
@@ -44,10 +44,10 @@ _OLD_NAMES = {
     "PILOT_SPD_UP": "PILOT_SPEED_UP",
     "PILOT_SPD_DN": "PILOT_SPEED_DN",
 }
-"""Names of 4.7, with those up to 4.6."""
+"""Names since 4.7, with those up to 4.6."""
 
 RISK_NAMES = ("RC_OVERRIDE_TIME", "RC_OPTIONS", "FS_THR_ENABLE")
-"""Those that decide how safe a flight is: asked for again if the first requests get lost."""
+"""Parameters that decide a flight's safety: requested again if the first requests get lost."""
 
 FIRST_NAMES = (
     *(f"RCMAP_{stick}" for stick in STICKS),
@@ -60,30 +60,30 @@ FIRST_NAMES = (
     *_OLD_NAMES.values(),
     *(f"RC{number}_OPTION" for number in _OPTION_CHANNELS),
 )
-"""Read first; RCMAP_* then tells which RCn_MIN ... to read."""
+"""Parameters to read first; RCMAP_* then selects the RCn_MIN etc. to read."""
 
 
 def calibration_names(values: Mapping[str, float]) -> tuple[str, ...]:
-    """Parameters without which sticks cannot be mapped to channels, as far as RCMAP_* is known."""
+    """Return the parameters needed to map sticks to channels, as far as RCMAP_* is known."""
     names = tuple(f"RCMAP_{stick}" for stick in STICKS)
     numbers = sorted({int(values[name]) for name in names if name in values})
     return names + tuple(f"RC{number}_{part}" for number in numbers for part in _CALIBRATION_PARTS)
 
 
 def dead_zone_names(values: Mapping[str, float]) -> tuple[str, ...]:
-    """RCn_DZ of the stick channels, as far as RCMAP_* is known."""
+    """Return RCn_DZ of the stick channels, as far as RCMAP_* is known."""
     known = (values.get(f"RCMAP_{stick}") for stick in STICKS)
     return tuple(f"RC{int(number)}_DZ" for number in known if number is not None)
 
 
 def stick_setting_names(values: Mapping[str, float]) -> tuple[str, ...]:
-    """Names in ``stick_settings`` that are not read first, as far as RCMAP_* is known."""
+    """Return the names in ``stick_settings`` not read first, as far as RCMAP_* is known."""
     names = (each.name for each in stick_settings(values))
     return tuple(name for name in names if name not in FIRST_NAMES)
 
 
 def calibration(values: Mapping[str, float]) -> RcCalibration:
-    """The radio calibration; ValueError if a parameter is missing or contradicts another."""
+    """Return the radio calibration. Raise ValueError if parameters are missing or contradictory."""
     throttle, yaw, pitch, roll = (
         _channel(values, int(_require(values, f"RCMAP_{stick}"))) for stick in STICKS
     )
@@ -114,16 +114,16 @@ def _require(values: Mapping[str, float], name: str) -> float:
 
 
 def override_switch(values: Mapping[str, float]) -> int | None:
-    """Number of the channel that enables overrides, or None."""
+    """Return the number of the channel that enables overrides, or None."""
     options = {number: values.get(f"RC{number}_OPTION") for number in _OPTION_CHANNELS}
     return next((n for n, option in options.items() if option == _OVERRIDE_SWITCH_OPTION), None)
 
 
 def stick_settings(values: Mapping[str, float]) -> Iterator[StickSetting]:
-    """Parameters that can turn our sticks, or let them work a switch as well.
+    """Yield parameters that can turn our sticks, or let them operate a switch.
 
     The bits of SIMPLE_NAMES belong to positions of the pilot's mode switch, which may move at any
-    time. Simple mode's angle is the heading at arming, which is not told: it cannot be mapped.
+    time. Simple mode turns by the heading at arming, which is not reported and so cannot be mapped.
     """
     yield StickSetting("SIMPLE", f"{_TURNED}the heading at arming", lambda bits: bits == 0, 0)
     yield StickSetting("SUPER_SIMPLE", f"{_TURNED}the way home", lambda bits: bits == 0, 0)
@@ -146,13 +146,13 @@ def stick_settings(values: Mapping[str, float]) -> Iterator[StickSetting]:
 
 
 def is_simple_setting(name: str, value: float) -> bool:
-    """True if the vehicle may be in Simple mode by this parameter."""
+    """True if this parameter can put the vehicle into Simple mode."""
     is_option = name.endswith("_OPTION") and value in _SIMPLE_OPTIONS
     return is_option or (name in SIMPLE_NAMES and value != 0)
 
 
 def override_obstacles(values: Mapping[str, float], source_system: int) -> Iterator[ParamNote]:
-    """Reasons, as far as parameters show, for which this vehicle would ignore our overrides."""
+    """Yield settings under which this vehicle would ignore our overrides."""
     low = values.get("MAV_GCS_SYSID", values.get("SYSID_MYGCS"))
     if low is not None:
         high = max(values.get("MAV_GCS_SYSID_HI", 0), low)
@@ -180,7 +180,7 @@ def override_obstacles(values: Mapping[str, float], source_system: int) -> Itera
 
 
 def thrust_obstacles(values: Mapping[str, float]) -> Iterator[ParamNote]:
-    """Reasons for which the thrust of SET_ATTITUDE_TARGET would not be taken as one."""
+    """Yield settings under which the thrust of SET_ATTITUDE_TARGET would not act as thrust."""
     options = values.get("GUID_OPTIONS")
     if options is None:
         yield ParamNote(("GUID_OPTIONS",), "it has not sent GUID_OPTIONS, which is asked for again")
@@ -193,7 +193,7 @@ def thrust_obstacles(values: Mapping[str, float]) -> Iterator[ParamNote]:
 
 
 def override_dangers(values: Mapping[str, float], *, has_receiver: bool | None) -> Iterator[Danger]:
-    """Settings with which the last sticks would stay for good if this computer died."""
+    """Yield settings under which the last sticks would stay for ever if this computer died."""
     time_s = values.get("RC_OVERRIDE_TIME")
     if time_s is not None and time_s < 0:
         why = because(Code.ENDLESS_OVERRIDE, time_s=time_s)
@@ -204,7 +204,7 @@ def override_dangers(values: Mapping[str, float], *, has_receiver: bool | None) 
 
 
 def override_advice(values: Mapping[str, float]) -> Iterator[ParamNote]:
-    """What should be known before a flight by overrides."""
+    """Yield warnings before a flight by overrides."""
     missing = [name for name in RISK_NAMES if name not in values]
     if missing:
         yield ParamNote(
@@ -229,7 +229,7 @@ def override_advice(values: Mapping[str, float]) -> Iterator[ParamNote]:
 
 
 def setpoint_advice(values: Mapping[str, float], context: ParamContext) -> Iterator[ParamNote]:
-    """What should be known before a flight by setpoints in GUIDED."""
+    """Yield warnings before a flight by setpoints in GUIDED."""
     timeout_s = values.get("GUID_TIMEOUT", 0.0)
     if timeout_s > _LONGEST_S:
         yield ParamNote(
@@ -253,7 +253,7 @@ def setpoint_advice(values: Mapping[str, float], context: ParamContext) -> Itera
 
 
 def hints(values: Mapping[str, float], context: ParamContext) -> Iterator[ParamNote]:
-    """Failsafes and switches that make a flight safer."""
+    """Yield failsafes and switches that make a flight safer."""
     if context.output != "rc-override":
         return
     options = values.get("FS_OPTIONS")
@@ -274,7 +274,7 @@ def hints(values: Mapping[str, float], context: ParamContext) -> Iterator[ParamN
 
 
 def wanted_params(values: Mapping[str, float], context: ParamContext) -> Iterator[WantedParam]:
-    """The parameters of overrides, or of setpoints, under the names that this firmware has."""
+    """Yield the parameters for overrides, or for setpoints, under this firmware's names."""
     if context.output == "rc-override":
         name = "SYSID_MYGCS" if "SYSID_MYGCS" in values else "MAV_GCS_SYSID"
         yield WantedParam(name, f"{context.source_system}, our system id")

@@ -1,8 +1,8 @@
-"""Motion that ArduCopter makes of its sticks, by its own parameters.
+"""Motion of ArduCopter for given sticks, by its parameters.
 
 Formulas: ArduPilot's ``RC_Channel::norm_input_dz``, ``rc_input_to_roll_pitch``, ``input_expo`` and
-Copter's ``get_pilot_desired_yaw_rate`` and ``get_pilot_desired_climb_rate``; the tests hold them
-against leans and rates measured on the firmware.
+Copter's ``get_pilot_desired_yaw_rate`` and ``get_pilot_desired_climb_rate``. The tests compare them
+with leans and rates measured on the firmware.
 """
 
 from collections.abc import Mapping
@@ -23,37 +23,36 @@ from mavbridge.mavlink.profiles.sticks import (
 )
 
 _LEAN_MODES = ("ALT_HOLD", "STABILIZE")
-"""The sticks are a lean and a yaw rate."""
+"""Modes in which sticks are a lean and a yaw rate."""
 _CLIMB_MODE = "ALT_HOLD"
 _MAX_LEAN_DEG = 85.0
-"""The firmware's own limit; also the next three."""
+"""Firmware limits: ``_MAX_LEAN_DEG``, ``_MAX_THR_DZ``, ``_MIN_EXPO`` and ``_MAX_EXPO``."""
 _MAX_THR_DZ = 400.0
 _MIN_EXPO, _MAX_EXPO = -0.5, 0.95
 
 
 class YawExpo(NamedTuple):
-    """ArduPilot's ``input_expo``: softer around the middle for a positive ``expo``."""
+    """ArduPilot's ``input_expo``; a positive ``expo`` is softer around the middle."""
 
     expo: float
 
     def bent(self, share: float) -> float:
-        """Share of the yaw rate."""
+        """Return the fraction of the yaw rate at this fraction of the stick."""
         return (1.0 - self.expo) * share / (1.0 - self.expo * share)
 
     def straightened(self, share: float) -> float:
-        """Share of the stick."""
+        """Return the fraction of the stick for this fraction of the yaw rate."""
         return share / (1.0 - self.expo + self.expo * share)
 
 
 def ardupilot_curves(
     values: Mapping[str, float], mode: str, gains: StickGains | None
 ) -> StickCurves:
-    """The map from the policy's sticks to those of an ArduCopter with these parameters.
+    """Return the map from the policy's sticks to those of an ArduCopter with these parameters.
 
-    In ALT_HOLD all sticks are mapped, in STABILIZE all but the throttle, which is thrust there. In
-    every other mode a stick is something that ``gains`` does not tell of (a speed in LOITER and
-    POSHOLD, a body rate in ACRO and SPORT, both in DRIFT) and goes through as it is; so do all if
-    ``gains`` is None.
+    ALT_HOLD maps all sticks, STABILIZE all but the throttle, which is thrust there. In other modes
+    sticks have meanings that ``gains`` does not cover (a speed in LOITER and POSHOLD, a body rate
+    in ACRO and SPORT, both in DRIFT) and stay unchanged; all stay unchanged if ``gains`` is None.
     """
     if gains is None or mode not in _LEAN_MODES:
         return IDENTITY
@@ -86,12 +85,12 @@ def ardupilot_curves(
 
 
 def _present(values: Mapping[str, float], new: str, old: str) -> str:
-    """The name that this firmware knows; the older one if it knows neither."""
+    """Return the name that this firmware has sent; the old one if it has sent neither."""
     return new if new in values else old
 
 
 def _calibration_names(values: Mapping[str, float]) -> tuple[str, ...]:
-    """Parameters that place the dead zones, as far as RCMAP_* is known."""
+    """Return the parameters that define the dead zones, as far as RCMAP_* is known."""
     names: tuple[str, ...] = ()
     for stick in ("THROTTLE", "YAW", "PITCH", "ROLL"):
         names += (f"RCMAP_{stick}",)
@@ -102,7 +101,7 @@ def _calibration_names(values: Mapping[str, float]) -> tuple[str, ...]:
 
 
 def _centred(values: Mapping[str, float], stick: str, half: Half, sign: float) -> Axis:
-    """A stick around RCn_TRIM, with RCn_DZ microseconds of dead zone on each side."""
+    """Return the axis of a stick around RCn_TRIM, with a dead zone of RCn_DZ [us] to each side."""
     name = f"RC{int(values[f'RCMAP_{stick}'])}_"
     trim_us, dead_us = values[name + "TRIM"], values[name + "DZ"]
 
@@ -116,12 +115,12 @@ def _centred(values: Mapping[str, float], stick: str, half: Half, sign: float) -
 
 
 def _throttle(values: Mapping[str, float], up: str, down: str) -> Axis:
-    """Climb rate: none within THR_DZ (permille) of the middle; RC3_DZ us at the bottom are lost."""
+    """Return the climb-rate axis: dead zones THR_DZ [permille] (middle), RC3_DZ [us] (bottom)."""
     name = f"RC{int(values['RCMAP_THROTTLE'])}_"
     range_us = values[name + "MAX"] - values[name + "MIN"]
     lost = min(max(values[name + "DZ"] / range_us, 0.0), 0.4) if range_us > 0.0 else 0.0
     dead_zone = min(max(values["THR_DZ"], 0.0), _MAX_THR_DZ) / 1000.0
-    # The firmware counts from the end of the lost part to the top; the stick from the middle.
+    # The firmware counts from the end of the lost part to the top, the stick from the middle.
     start, end = 2.0 * (1.0 - lost) * dead_zone, 1.0 - 2.0 * lost
     start = min(start, MAX_DEAD_ZONE * end)
     climb_mps = values[up] * (0.01 if up == "PILOT_SPEED_UP" else 1.0)

@@ -1,4 +1,4 @@
-"""Firmware and vehicles that can be flown."""
+"""Supported firmware and vehicle types."""
 
 from pymavlink.dialects.v20 import ardupilotmega as dialect
 
@@ -19,10 +19,10 @@ _MULTIROTORS = (
 
 
 def require_profile(autopilot: int, vehicle_type: int) -> Profile:
-    """The profile of a multirotor's firmware.
+    """Return the profile of a multirotor's firmware.
 
     Raises:
-        PeerError: the firmware is another one, or the vehicle is no multirotor.
+        PeerError: the firmware is not supported, or the vehicle is no multirotor.
     """
     if autopilot not in _PROFILES:
         raise PeerError(

@@ -1,4 +1,4 @@
-"""The shape of a profile: all that the bridge has to know of one firmware."""
+"""Interface of a firmware profile."""
 
 import math
 from abc import ABC, abstractmethod
@@ -19,8 +19,8 @@ from mavbridge.mavlink.profiles.sticks import StickCurves
 class ModeTable:
     """Names and numbers of flight modes; a main mode with sub-modes has one name for each.
 
-    ``shift`` and ``sub_shift`` say where main mode and sub-mode stand in HEARTBEAT.custom_mode, as
-    numbers of eight bits; None = all of it is the mode, and there are no sub-modes. Modes that are
+    ``shift`` and ``sub_shift`` give the position of the 8-bit numbers of main mode and sub-mode in
+    HEARTBEAT.custom_mode; None: the whole number is the mode, without sub-modes. Modes in
     ``never_commanded`` have only a name.
     """
 
@@ -45,10 +45,10 @@ class ModeTable:
             elif name not in never_commanded:
                 self._commands[name] = (number, 0)
         self.roles = replace(roles, names=tuple(self._commands))
-        """All modes that can be asked for, and what each is good for."""
+        """Roles of the modes, and the names of all that can be requested."""
 
     def name(self, custom_mode: int) -> str:
-        """Name of HEARTBEAT.custom_mode, or its number if it has no name."""
+        """Return the name of HEARTBEAT.custom_mode, or its number if it has none."""
         number = custom_mode if self._shift is None else custom_mode >> self._shift & 0xFF
         name = self._names.get(number, str(number))
         if name in self._sub_modes:
@@ -57,7 +57,7 @@ class ModeTable:
         return name
 
     def command(self, name: str) -> tuple[int, int]:
-        """Parameters 2 and 3 of MAV_CMD_DO_SET_MODE.
+        """Return parameters 2 and 3 of MAV_CMD_DO_SET_MODE.
 
         Raises:
             UserError: the vehicle has no such mode.
@@ -71,19 +71,19 @@ class ModeTable:
 
 
 class StreamGroup(NamedTuple):
-    """One quantity: the messages that carry it, best first."""
+    """One quantity, and the messages that carry it, best first."""
 
     messages: tuple[str, ...]
     rate_hz: float
     is_optional: bool = False
-    """Nothing waits for it: a vehicle that does not grant it is flown without."""
+    """True if nothing waits for it: a vehicle that does not grant it is flown without."""
     least_hz: float | None = None
-    """It comes only when something is new, and at least so often; below this it is asked for again.
-    None: it comes all the time, and a share of ``rate_hz`` decides."""
+    """Lowest rate of a message that is sent only on change; below it, it is requested again. None:
+    the message is periodic, and a fraction of ``rate_hz`` decides."""
     without: str = ""
-    """What does not hold, or what is done, while it stays away; the user is told once."""
+    """Effect of its absence, for the user; told once."""
     stand_in: str | None = None
-    """Message that is asked for one by one while it stays away."""
+    """Message to request one at a time during its absence."""
 
 
 def optional_stream(
@@ -94,7 +94,7 @@ def optional_stream(
     without: str = "",
     stand_in: str | None = None,
 ) -> StreamGroup:
-    """Group of one message that no flight waits for."""
+    """Return the group of one message that no flight waits for."""
     return StreamGroup((message,), rate_hz, True, least_hz, without, stand_in)
 
 
@@ -104,62 +104,62 @@ NO_HEALTH = "a low battery and a receiver that fails are not seen"
 
 
 HOME_HEIGHT = optional_stream("GLOBAL_POSITION_INT", 20.0, least_hz=5.0)
-"""Height above home, for a policy that takes it: as often as a velocity may be old, and some."""
+"""Height above home, for policies that take it; fresher than the age limit of a velocity."""
 
 
 class EventMeaning(NamedTuple):
-    """What an EVENT says about the vehicle."""
+    """Meaning of an EVENT."""
 
     is_armed: bool | None = None
-    """None: it does not say."""
+    """None: the EVENT does not tell."""
     is_failsafe: bool = False
     is_stick_override: bool = False
-    """Moving sticks have changed the mode."""
+    """True if moving sticks have changed the mode."""
     text: str | None = None
-    """For the user, where no STATUSTEXT says it."""
+    """Text for the user, if no STATUSTEXT reports it."""
 
 
 class ParamNote(NamedTuple):
-    """A remark about parameters, and the flag that mends it."""
+    """Remark about parameters, and the flag that fixes it."""
 
     names: tuple[str, ...]
-    """Parameters that it is about; empty: none."""
+    """Parameters concerned; may be empty."""
     said: str
     cure: str = ""
-    """Empty: no flag mends it."""
+    """Flag that fixes it; empty: none."""
     or_else: str = ""
     """End of the sentence, after the flag."""
 
     @property
     def text(self) -> str:
-        """The sentence for the user, with the flag."""
+        """Sentence for the user, with the flag."""
         is_told = not self.cure or self.cure in self.said
         return self.said if is_told else f"{self.said}: use {self.cure}{self.or_else}"
 
 
 class Danger(NamedTuple):
-    """A setting with which the vehicle flies, but is not safe."""
+    """Setting with which the vehicle flies, but not safely."""
 
     risk: Risk
     why: Reason
     name: str | None = None
-    """Parameter that it is about."""
+    """Parameter concerned."""
     cure: str = ""
-    """As in ``ParamNote``; ``why`` names it."""
+    """Flag that fixes it, named in ``why``."""
 
     @property
     def accepted(self) -> ParamNote:
-        """The note for a flight of which the user has accepted the risk."""
+        """Note for a flight whose risk the user has accepted."""
         return self._note(f"risk {self.risk} is accepted: {self.why}")
 
     @property
     def refused(self) -> ParamNote:
-        """The note for a flight that is not begun."""
+        """Note for a refused flight."""
         return self._note(str(self.refusal))
 
     @property
     def refusal(self) -> Reason:
-        """Why a flight is not begun."""
+        """Reason to refuse a flight."""
         return because(Code.RISK, risk=self.risk, why=self.why)
 
     def _note(self, said: str) -> ParamNote:
@@ -167,12 +167,11 @@ class Danger(NamedTuple):
 
 
 LONGEST_SETPOINT_S = 3.0
-"""Longest time for which a vehicle may go on with the last setpoint of a guard that has died;
-ArduPilot's default."""
+"""Longest time to follow the last setpoint of a dead guard; ArduPilot's default."""
 
 
 def setpoint_danger(values: Mapping[str, float], name: str) -> Iterator[Danger]:
-    """The danger of a vehicle whose timeout of setpoints, parameter ``name`` in s, is long."""
+    """Yield a danger if the vehicle's setpoint timeout, parameter ``name`` [s], is long."""
     time_s = values.get(name, 0.0)
     if time_s > LONGEST_SETPOINT_S:
         why = because(Code.LONG_SETPOINT, name=name, time_s=time_s)
@@ -180,7 +179,7 @@ def setpoint_danger(values: Mapping[str, float], name: str) -> Iterator[Danger]:
 
 
 class StickSetting(NamedTuple):
-    """A parameter that can give a stick another meaning than the policy's."""
+    """Parameter that can change the meaning of a stick."""
 
     name: str
     effect: str
@@ -191,7 +190,7 @@ class StickSetting(NamedTuple):
 def stick_obstacles(
     settings: Iterable[StickSetting], values: Mapping[str, float]
 ) -> Iterator[ParamNote]:
-    """A note for each of the settings with which sticks mean something else."""
+    """Yield a note for each setting that changes the meaning of a stick."""
     for name, effect, is_harmless, mended in settings:
         value = values.get(name)
         if value is not None and not is_harmless(value):
@@ -199,17 +198,17 @@ def stick_obstacles(
 
 
 class WantedParam(NamedTuple):
-    """A parameter that a flight depends on, and its value in words, for the user."""
+    """Parameter that a flight depends on, and its required value in words, for the user."""
 
     name: str
     should_be: str
 
 
 class ParamContext(NamedTuple):
-    """Circumstances in which parameters are judged."""
+    """Conditions for judging parameters."""
 
     output: Output | None
-    """None: not chosen yet, so that only what holds for every output is judged."""
+    """None: not chosen yet; only rules for all outputs apply."""
     source_system: int
     """Our MAVLink system id."""
     has_receiver: bool | None
@@ -217,54 +216,54 @@ class ParamContext(NamedTuple):
 
 
 class Profile(ABC):
-    """One firmware. Constant: one instance serves all vehicles."""
+    """Properties of one firmware; immutable, one instance serves all vehicles."""
 
     name: ClassVar[str]
-    """As a user writes it, and in reports."""
+    """Name in settings and reports."""
     modes: ClassVar[ModeTable]
     outputs: ClassVar[Mapping[ActionKind, Output]]
-    """The usual output of each kind of action."""
+    """Default output of each action kind."""
     refusals: ClassVar[Mapping[Output, str]]
-    """Outputs that make no sense here, and why, in a sentence that names another one."""
+    """Unsupported outputs, each with a sentence that says why and names an alternative."""
     heartbeat_type: ClassVar[int] = dialect.MAV_TYPE_ONBOARD_CONTROLLER
-    """MAV_TYPE of our own HEARTBEAT, once this is the vehicle's firmware."""
+    """MAV_TYPE of our HEARTBEAT to a vehicle of this firmware."""
     is_bytewise: ClassVar[bool] = False
-    """An integer parameter stands byte for byte in the float of PARAM_VALUE and PARAM_SET."""
+    """True if PARAM_VALUE and PARAM_SET carry an integer in the bytes of their float."""
     sends_invalid_estimates: ClassVar[bool] = False
-    """LOCAL_POSITION_NED comes without a valid estimate too: the estimator's flags decide."""
+    """True if LOCAL_POSITION_NED also comes without a valid estimate: see the estimator's flags."""
     shows_rates: ClassVar[bool] = False
-    """ATTITUDE_TARGET shows the body rates of a setpoint as they were sent, but not its thrust."""
+    """True if ATTITUDE_TARGET shows body rates as sent, but not their thrust."""
     has_rc_channels_always: ClassVar[bool] = True
-    """RC_CHANNELS comes without a receiver too."""
+    """True if RC_CHANNELS also comes without a receiver."""
     events: ClassVar[Mapping[int, EventMeaning]] = {}
-    """Meaning of those EVENTs that matter."""
+    """Meaning of the relevant EVENTs."""
     params: ClassVar[tuple[str, ...]]
-    """Parameters to read first, those of other versions of the firmware included."""
+    """Parameters to read first, including those of other firmware versions."""
 
     @abstractmethod
     def streams(self, *, state_hz: float, pilot_hz: float | None = None) -> tuple[StreamGroup, ...]:
-        """Telemetry that every flight needs, then what is also watched; without the echo.
+        """Return the streams that every flight needs, then optional ones; without the echo.
 
-        ``pilot_hz`` is the rate of RC_CHANNELS, None: the usual one.
+        ``pilot_hz``: rate of RC_CHANNELS; None: the default.
         """
 
     @abstractmethod
     def echo(self, output: Output) -> StreamGroup:
-        """Message that shows what the vehicle does with this output.
+        """Return the message that shows the echo of this output.
 
-        It may be one of ``streams``, which then carries the same rate.
+        It may be one of ``streams``, with the same rate.
         """
 
     def more_params(self, values: Mapping[str, float]) -> tuple[str, ...]:
-        """Parameters that are read because of the values of others."""
+        """Return parameters to read because of the values of others."""
         return ()
 
     def needed_params(self, values: Mapping[str, float]) -> tuple[str, ...]:
-        """Parameters that are asked for again on the ground for as long as they are missing."""
+        """Return parameters that are requested on the ground until they arrive."""
         return ()
 
     def calibration(self, values: Mapping[str, float]) -> RcCalibration | None:
-        """The radio calibration; None where sticks do not go through one.
+        """Return the radio calibration; None if sticks do not pass through one.
 
         Raises:
             ValueError: a parameter is missing or contradicts another.
@@ -272,72 +271,71 @@ class Profile(ABC):
         return None
 
     def override_switch(self, values: Mapping[str, float]) -> int | None:
-        """Number of the radio channel that enables overrides, or None."""
+        """Return the number of the radio channel that enables overrides, or None."""
         return None
 
     def ignores_receiver(self, values: Mapping[str, float]) -> bool:
-        """The sticks of a receiver move nothing, even if there is one."""
+        """True if the vehicle ignores the sticks of a receiver, even if there is one."""
         return False
 
     @abstractmethod
     def obstacles(self, values: Mapping[str, float], context: ParamContext) -> Iterator[ParamNote]:
-        """Reasons, as far as parameters show, for which the vehicle would not do as it is told.
+        """Yield settings under which the vehicle would not follow our commands.
 
-        Each with the command that mends it; nobody can accept them.
+        Each comes with the command that fixes it; the user cannot accept them.
         """
 
     def follow_up(self, name: str, before: float, now: float) -> CommandRequest | None:
-        """The command without which a parameter that was set for a flight has no effect."""
+        """Return the command that a parameter change for a flight needs to take effect, or None."""
         return None
 
     @abstractmethod
     def dangers(self, values: Mapping[str, float], context: ParamContext) -> Iterator[Danger]:
-        """Settings with which it flies, but not safely; accepted ones included."""
+        """Yield settings with which it flies, but not safely, including accepted ones."""
 
     @abstractmethod
     def advice(self, values: Mapping[str, float], context: ParamContext) -> Iterator[ParamNote]:
-        """Warnings: they forbid no flight, but should be known before it."""
+        """Yield warnings that do not forbid a flight."""
 
     def hints(self, values: Mapping[str, float], context: ParamContext) -> Iterator[ParamNote]:
-        """What could be set better for a flight, with the command; said by ``mavbridge check``
-        alone."""
+        """Yield possible improvements with their commands; shown only by ``mavbridge check``."""
         return iter(())
 
     @abstractmethod
     def wanted_params(
         self, values: Mapping[str, float], context: ParamContext
     ) -> Iterator[WantedParam]:
-        """Parameters to show before a flight; whether a value will do, the methods above decide."""
+        """Yield the parameters to show before a flight; the methods above judge the values."""
 
     @abstractmethod
     def stick_curves(
         self, values: Mapping[str, float], mode: str, gains: StickGains | None
     ) -> StickCurves:
-        """The map from a policy's sticks, which mean ``gains``, to this vehicle's in a mode.
+        """Return the map from a policy's sticks, which mean ``gains``, to this vehicle's in a mode.
 
-        To be asked for again when parameters or the mode change. None: sticks stay as they are.
+        Request it again when parameters or the mode change. ``gains`` None: sticks stay unchanged.
         """
 
     @abstractmethod
     def hover_thrust(self, values: Mapping[str, float]) -> float | None:
-        """Collective thrust in 0..1 that hovers, by the vehicle's own estimate; None: not known."""
+        """Return the hover thrust in [0, 1] by the vehicle's own estimate; None: unknown."""
 
     def boosts_thrust(self, values: Mapping[str, float]) -> bool:
-        """The vehicle divides the thrust of a setpoint by the cosine of its tilt."""
+        """True if the vehicle divides a setpoint's thrust by the cosine of its tilt."""
         return False
 
     def hand_per_s(self, values: Mapping[str, float]) -> float:
-        """Speed, in full sticks a second, at which sticks leave a mode that flies by itself."""
+        """Return the stick speed that ends an autonomous mode [full sticks/s]."""
         return math.inf
 
     def climb_limits(self, values: Mapping[str, float]) -> tuple[float, float]:
-        """Climb and descent in m/s to which it cuts velocity setpoints, as its echo shows them."""
+        """Return climb and descent [m/s] to which it clips velocity setpoints and their echo."""
         return math.inf, math.inf
 
     @abstractmethod
     def takeoff(self, height_m: float, amsl_m: float | None) -> CommandRequest | None:
-        """The command that lets the autopilot climb to a height above the ground by itself.
+        """Return the command for an autonomous takeoff to a height above ground.
 
-        ``amsl_m`` is the vehicle's present height above mean sea level, if it is known. None: it
-        cannot be given without that.
+        ``amsl_m``: the vehicle's present height above mean sea level, if known. Return None if the
+        command needs it and it is unknown.
         """

@@ -1,4 +1,4 @@
-"""PX4's multicopters, measured on 1.18."""
+"""Profile of PX4's multicopters, measured on 1.18."""
 
 import math
 from collections.abc import Iterator, Mapping
@@ -29,19 +29,19 @@ from mavbridge.mavlink.profiles.px4_sticks import px4_curves
 from mavbridge.mavlink.profiles.sticks import StickCurves
 
 CURRENT_MODE_HZ = 50.0
-"""It shows a change of mode within 30 ms; without one it comes at 2 Hz."""
+"""Shows a mode change within 30 ms; the unrequested rate is 2 Hz."""
 RC_CHANNELS_HZ = 20.0
-"""Shows the switches of a radio."""
+"""Rate for the switches of a radio."""
 POSITION_CEILING_HZ = 125.0
-"""Rate of the estimator's position, and of targets: asked for more, they come at this rate."""
+"""Highest rate of the estimator's position and of targets, also if more is requested."""
 FAST_HZ = 250.0
-"""Rate of the attitude and of the IMU. Streams are sent every so many steps of the link's own
-clock: 200 Hz asked for come as 125, 250 as 205 to 250."""
+"""Rate of attitude and IMU. A stream is sent at a whole number of steps of the link's clock: 200 Hz
+requested become 125 Hz, 250 Hz become 205 to 250 Hz."""
 _UNEVEN_HZ = 150.0
-"""Above this, asking for the rate itself gives less than asking for ``FAST_HZ``."""
+"""Rate above which a request for the rate itself yields less than one for ``FAST_HZ``."""
 _TARGET_HZ = 100.0
 _NO_MAVLINK_STICKS = {0: "RC only", 4: "sticks disabled"}
-"""COM_RC_IN_MODE."""
+"""Values of COM_RC_IN_MODE that exclude MAVLink's sticks."""
 _STICK_SETTINGS = (
     StickSetting(
         "MAN_KILL_GEST_T",
@@ -51,18 +51,19 @@ _STICK_SETTINGS = (
     ),
 )
 _NO_RESCALE = 1
-"""MPC_THR_CURVE."""
+"""Value of MPC_THR_CURVE."""
 _FATAL_ACTIONS = {5: "terminate the flight", 6: "disarm"}
-"""NAV_RCL_ACT."""
+"""Values of NAV_RCL_ACT."""
 _FATAL_OFFBOARD_ACTIONS = {6: "terminate the flight", 7: "disarm"}
-"""COM_OBL_RC_ACT."""
+"""Values of COM_OBL_RC_ACT."""
 _EXCEPT_HOLD, _EXCEPT_OFFBOARD = 2, 4
-"""Values in COM_RCL_EXCEPT of modes in which the loss of sticks is no failsafe."""
+"""Bits of COM_RCL_EXCEPT: modes in which the loss of sticks is no failsafe."""
 _LONGEST_S = 1.0
 _SHORTEST_S = 0.3
-"""A guard on a busy computer may be late by a tenth of it; a link loses a few packets in a row."""
+"""Shortest safe timeout: a guard on a busy computer may be late by a tenth of it, and a link may
+lose a few packets in a row."""
 _SLOWEST_HAND_PER_S = 0.05
-"""Where neither parameter was read: the least that COM_RC_STICK_OV takes, 5 %."""
+"""Default if neither parameter was read: the minimum of COM_RC_STICK_OV, 5 %."""
 
 _FIRST_MODES = ("MANUAL", "ALTCTL", "POSCTL", "AUTO", "ACRO", "OFFBOARD", "STABILIZED")
 _AUTO_MODES = ("TAKEOFF", "LOITER", "MISSION", "RTL", "LAND")
@@ -92,8 +93,10 @@ _MODES = ModeTable(
 
 
 def event_id(name: str) -> int:
-    """Number of an EVENT of the autopilot: 1 in the highest byte, then the low 24 bits of the
-    32-bit FNV-1a hash of its name (PX4's guide to its events interface)."""
+    """Return the number of an EVENT of the autopilot (PX4's guide to its events interface).
+
+    Highest byte: 1. Lower 24 bits: those of the 32-bit FNV-1a hash of its name.
+    """
     number = 0x811C9DC5
     for byte in name.encode():
         number = (number ^ byte) * 0x01000193 & 0xFFFFFFFF
@@ -115,7 +118,7 @@ _EVENTS = {
 
 
 class Px4(Profile):
-    """PX4 as measured: sticks as MANUAL_CONTROL, setpoints in OFFBOARD."""
+    """PX4, as measured: sticks as MANUAL_CONTROL, setpoints in OFFBOARD."""
 
     name = "px4"
     modes = _MODES
@@ -129,7 +132,7 @@ class Px4(Profile):
         "rc-override": "PX4 cannot release an RC_CHANNELS_OVERRIDE: use --output manual-control"
     }
     heartbeat_type = dialect.MAV_TYPE_GCS
-    """It sends STATUSTEXT only on links on which it hears a ground station."""
+    """PX4 sends STATUSTEXT only on links with a ground station."""
     is_bytewise = True
     has_rc_channels_always = False
     events: ClassVar[Mapping[int, EventMeaning]] = {
@@ -149,9 +152,9 @@ class Px4(Profile):
     )
 
     def streams(self, *, state_hz: float, pilot_hz: float | None = None) -> tuple[StreamGroup, ...]:
-        """RC_CHANNELS comes only where a receiver is, GLOBAL_POSITION_INT only with a position.
+        """See `Profile`. RC_CHANNELS needs a receiver, GLOBAL_POSITION_INT a position.
 
-        The pilot's sticks come in MANUAL_CONTROL, which ``echo`` asks for at their own rate.
+        The pilot's sticks come in MANUAL_CONTROL, requested by ``echo`` at their own rate.
         """
         fast_hz = state_hz if state_hz <= _UNEVEN_HZ else FAST_HZ
         slow_hz = min(state_hz, POSITION_CEILING_HZ)
@@ -175,7 +178,7 @@ class Px4(Profile):
         )
 
     def echo(self, output: Output) -> StreamGroup:
-        """MANUAL_CONTROL shows the chosen sticks at the sender's rate, targets the setpoints."""
+        """See `Profile`. MANUAL_CONTROL shows the selected sticks at the sender's rate."""
         if output in ("attitude", "rates"):
             return optional_stream("ATTITUDE_TARGET", _TARGET_HZ)
         if output == "velocity":
@@ -183,15 +186,15 @@ class Px4(Profile):
         return optional_stream("MANUAL_CONTROL", FAST_HZ, least_hz=0.0)
 
     def needed_params(self, values: Mapping[str, float]) -> tuple[str, ...]:
-        """The source of its sticks, and the thrust at which it hovers."""
+        """Return the parameters for the source of sticks and for hover thrust."""
         return ("COM_RC_IN_MODE", "MPC_THR_HOVER")
 
     def ignores_receiver(self, values: Mapping[str, float]) -> bool:
-        """COM_RC_IN_MODE 1 takes sticks from MAVLink alone, 4 from nowhere."""
+        """True if COM_RC_IN_MODE is 1 (sticks only from MAVLink) or 4 (no sticks)."""
         return values.get("COM_RC_IN_MODE") in (1.0, 4.0)
 
     def obstacles(self, values: Mapping[str, float], context: ParamContext) -> Iterator[ParamNote]:
-        """COM_RC_IN_MODE without MAVLink's sticks, and a gesture that a policy might make."""
+        """Yield a COM_RC_IN_MODE without MAVLink's sticks, and a gesture a policy might make."""
         if context.output != "manual-control":
             return
         yield from stick_obstacles(_STICK_SETTINGS, values)
@@ -205,12 +208,12 @@ class Px4(Profile):
             )
 
     def dangers(self, values: Mapping[str, float], context: ParamContext) -> Iterator[Danger]:
-        """Setpoints that would stay for long; sticks that end are always a failsafe."""
+        """Yield long setpoint timeouts; the end of sticks is always a failsafe."""
         if context.output not in (None, "manual-control"):
             yield from setpoint_danger(values, "COM_OF_LOSS_T")
 
     def advice(self, values: Mapping[str, float], context: ParamContext) -> Iterator[ParamNote]:
-        """What the end of our packets would do, where that is not what one expects."""
+        """Yield unexpected effects of the end of our packets."""
         if context.output == "manual-control":
             name, action = "COM_RC_LOSS_T", _FATAL_ACTIONS.get(int(values.get("NAV_RCL_ACT", 2)))
             act_name = "NAV_RCL_ACT"
@@ -240,7 +243,7 @@ class Px4(Profile):
             )
 
     def hints(self, values: Mapping[str, float], context: ParamContext) -> Iterator[ParamNote]:
-        """Losses of sticks that end other modes, and a gesture that arms."""
+        """Yield settings by which lost sticks end other modes, and the gesture that arms."""
         exceptions = values.get("COM_RCL_EXCEPT")
         is_sticks = context.output == "manual-control"
         bit, mode = (_EXCEPT_HOLD, "AUTO") if is_sticks else (_EXCEPT_OFFBOARD, "OFFBOARD")
@@ -270,7 +273,7 @@ class Px4(Profile):
     def wanted_params(
         self, values: Mapping[str, float], context: ParamContext
     ) -> Iterator[WantedParam]:
-        """Those of sticks, or of setpoints."""
+        """Yield the parameters for sticks, or for setpoints."""
         time = f"0.5; {_SHORTEST_S:g} to {_LONGEST_S:g} s"
         if context.output == "manual-control":
             yield WantedParam("COM_RC_IN_MODE", "1, or 6 with a receiver")
@@ -287,16 +290,18 @@ class Px4(Profile):
     def stick_curves(
         self, values: Mapping[str, float], mode: str, gains: StickGains | None
     ) -> StickCurves:
-        """Leans, yaw rates and climb rates of ALTCTL and STABILIZED."""
+        """Return the curves of lean, yaw rate and climb rate in ALTCTL and STABILIZED."""
         return px4_curves(values, mode, gains)
 
     def hover_thrust(self, values: Mapping[str, float]) -> float | None:
-        """MPC_THR_HOVER."""
+        """Return MPC_THR_HOVER."""
         return values.get("MPC_THR_HOVER")
 
     def hand_per_s(self, values: Mapping[str, float]) -> float:
-        """MAN_OVERRIDE_SPD of 1.18, negative: off; before it COM_RC_STICK_OV, a percentage, unless
-        bit 0 of COM_RC_OVERRIDE is off."""
+        """See `Profile`. 1.18 has MAN_OVERRIDE_SPD (negative: off).
+
+        Before, COM_RC_STICK_OV is a percentage, on by bit 0 of COM_RC_OVERRIDE.
+        """
         if (hand_per_s := values.get("MAN_OVERRIDE_SPD")) is None:
             is_on = int(values.get("COM_RC_OVERRIDE", 1)) & 1
             hand_per_s = values.get("COM_RC_STICK_OV", 100.0 * _SLOWEST_HAND_PER_S) / 100.0
@@ -304,14 +309,14 @@ class Px4(Profile):
         return hand_per_s if hand_per_s > 0.0 else math.inf
 
     def climb_limits(self, values: Mapping[str, float]) -> tuple[float, float]:
-        """MPC_Z_VEL_MAX_UP and _DN; never below 0, which would turn one into the other."""
+        """Return MPC_Z_VEL_MAX_UP and _DN; below 0 they would reverse the motion."""
         climb_mps = values.get("MPC_Z_VEL_MAX_UP", 3.0)
         return max(climb_mps, 0.0), max(values.get("MPC_Z_VEL_MAX_DN", 1.5), 0.0)
 
     def takeoff(self, height_m: float, amsl_m: float | None) -> CommandRequest | None:
-        """NAV_TAKEOFF, which is AUTO.TAKEOFF with a height above mean sea level.
+        """Return NAV_TAKEOFF, which enters AUTO.TAKEOFF, with a height above mean sea level.
 
-        Where it stands and the way it looks are not numbers, and so stay.
+        Position and heading are NaN: the vehicle keeps its own.
         """
         if amsl_m is None:
             return None
@@ -322,7 +327,7 @@ class Px4(Profile):
 
 
 def _stick_advice(values: Mapping[str, float]) -> Iterator[ParamNote]:
-    """Settings by which a stick does less, or something else, in one mode."""
+    """Yield settings that weaken or change a stick in one mode."""
     full_deg, limit_deg = values.get("MPC_MAN_TILT_MAX", 0.0), values.get("MPC_TILTMAX_AIR")
     if limit_deg is not None and limit_deg < full_deg:
         yield ParamNote(

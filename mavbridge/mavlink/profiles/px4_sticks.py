@@ -1,7 +1,7 @@
-"""Motion that PX4's multicopters make of their sticks, by their own parameters.
+"""Motion of PX4's multicopters for given sticks, by their parameters.
 
 Formulas: PX4's ``Sticks``, ``StickTiltXY``, ``StickYaw``, ``FlightTaskManualAltitude`` and, for
-STABILIZED, ``mc_att_control``; the tests hold them against leans and rates measured on the
+STABILIZED, ``mc_att_control``. The tests compare them with leans and rates measured on the
 firmware.
 """
 
@@ -24,28 +24,28 @@ from mavbridge.mavlink.profiles.sticks import (
 )
 
 EXPO = 0.6
-"""Cubic share of the yaw and climb sticks; the default of older versions too."""
+"""Expo of the yaw and climb sticks: cubic fraction; the default of older versions too."""
 _LEAN_MODES = ("ALTCTL", "STABILIZED")
-"""The sticks are a lean and a yaw rate."""
+"""Modes in which sticks are a lean and a yaw rate."""
 _CLIMB_MODE = "ALTCTL"
 _MAX_TILT_DEG = 89.0
 _LEAST_EXPO = 1e-3
-"""Below it the curve is taken for a straight line."""
+"""Expo below which the curve counts as a straight line."""
 _LEAST_LINEAR = 1e-9
-"""Below it the curve is taken for a cube."""
+"""Linear fraction below which the curve counts as a cube."""
 
 
 class CubicExpo(NamedTuple):
-    """(1 - e) x + e x^3."""
+    """Expo curve (1 - e) x + e x^3."""
 
     expo: float
 
     def bent(self, share: float) -> float:
-        """Share of the motion."""
+        """Return the fraction of the motion at this fraction of the stick."""
         return share * (1.0 - self.expo + self.expo * share * share)
 
     def straightened(self, share: float) -> float:
-        """Share of the stick: the one real root, by the hyperbolic form of Cardano's formula."""
+        """Return the fraction of the stick: the real root, by Cardano's hyperbolic formula."""
         linear = 1.0 - self.expo
         if linear < _LEAST_LINEAR:
             return math.cbrt(share)
@@ -54,11 +54,11 @@ class CubicExpo(NamedTuple):
 
 
 def px4_curves(values: Mapping[str, float], mode: str, gains: StickGains | None) -> StickCurves:
-    """The map from the policy's sticks to those of a PX4 multicopter with these parameters.
+    """Return the map from the policy's sticks to those of a PX4 multicopter with these parameters.
 
-    In ALTCTL all sticks are mapped, in STABILIZED all but the throttle, which is thrust there. In
-    every other mode a stick is something that ``gains`` does not tell of (a speed in POSCTL, a body
-    rate in ACRO) and goes through as it is; so do all if ``gains`` is None.
+    ALTCTL maps all sticks, STABILIZED all but the throttle, which is thrust there. In other modes
+    sticks have meanings that ``gains`` does not cover (a speed in POSCTL, a body rate in ACRO) and
+    stay unchanged; all stay unchanged if ``gains`` is None.
     """
     if gains is None or mode not in _LEAN_MODES:
         return IDENTITY
@@ -90,7 +90,7 @@ def _expo(values: Mapping[str, float], name: str) -> Bend | None:
 
 
 def _lean(tilt_deg: float, *, is_tangent: bool) -> VehicleLean:
-    """No dead zone. ALTCTL makes an acceleration of the sticks, STABILIZED a tilt."""
+    """Return the lean: no dead zone; an acceleration in ALTCTL, a tilt in STABILIZED."""
     tilt_deg = min(tilt_deg, _MAX_TILT_DEG)
     full = math.tan(math.radians(tilt_deg)) if is_tangent else tilt_deg
     axis = Axis.even(Half(full))

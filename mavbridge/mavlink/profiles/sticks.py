@@ -1,8 +1,8 @@
-"""Sticks that make one vehicle do what a policy means by its own: curves, and the map between them.
+"""Stick curves, and the map from a policy's sticks to a vehicle's that cause the same motion.
 
-A curve says how much motion a stick asks for. The policy's come from its contract (``StickGains``),
-the vehicle's from its parameters (`ardupilot_sticks`, `px4_sticks`). A stick is mapped by the
-policy's curve to a motion, and by the inverse of the vehicle's to the stick that asks for it there.
+A curve gives the motion that a stick commands. The policy's curves come from its contract
+(``StickGains``), the vehicle's from its parameters (`ardupilot_sticks`, `px4_sticks`). A stick is
+mapped to a motion by the policy's curve, and back to a stick by the inverse of the vehicle's curve.
 """
 
 import math
@@ -13,52 +13,52 @@ from typing import Literal, NamedTuple, Protocol
 from mavbridge.core.vehicle import StickGains, Sticks
 
 SAME_GAIN = 0.01
-"""A stick is not mapped where the vehicle's motion at full stick is within this share of the
-policy's, and its dead zone within this share of the travel."""
+"""A stick is not mapped if the vehicle's motion at full stick is within this fraction of the
+policy's, and the dead zones differ by at most this fraction of the travel (see also SAME_END)."""
 SAME_END = 0.1
-"""And where the full motion is reached within this share of the travel before the stop: ArduPilot's
-throttle has its bottom there (RC3_DZ, 0.06 by default), also for the policies trained on it."""
+"""Largest gap in travel between full motion and the stop of a stick that is not mapped. ArduPilot's
+throttle has one at the bottom (RC3_DZ, 0.06 by default), also for the policies trained on it."""
 MAX_DEAD_ZONE = 0.9
 _ROUNDING = 1e-9
-"""What float arithmetic may add to a motion that is just within reach."""
+"""Tolerance for rounding of a motion at the limit."""
 
 
 class Bend(Protocol):
-    """A curve from [0, 1] to [0, 1], rising, with its ends where they are."""
+    """Increasing curve from [0, 1] to [0, 1], with fixed ends."""
 
     def bent(self, share: float) -> float:
-        """Share of the motion at this share of the stick."""
+        """Return the fraction of the motion at this fraction of the stick."""
 
     def straightened(self, share: float) -> float:
-        """Inverse of ``bent``."""
+        """Return the fraction of the stick for this fraction of the motion."""
 
 
 class Half(NamedTuple):
-    """Motion over one half of a stick's travel; the travel is 0 at the centre and 1 at the stop."""
+    """Motion over one half of a stick's travel, which is 0 at the centre and 1 at the stop."""
 
     full: float
     """Largest motion."""
     start: float = 0.0
-    """Travel where motion begins."""
+    """Travel at which motion begins."""
     end: float = 1.0
-    """Travel from which it is full."""
+    """Travel from which the motion is full."""
     bend: Bend | None = None
     """None: linear from ``start`` to ``end``."""
     parameter: str = ""
-    """The vehicle's parameter that ``full`` comes from."""
+    """The vehicle's parameter behind ``full``."""
 
     def motion(self, travel: float) -> float:
-        """Motion that this travel asks for."""
+        """Return the motion at this travel."""
         if travel <= self.start:
             return 0.0
         if travel >= self.end:
             return self.full
         share = (travel - self.start) / (self.end - self.start)
-        # Rounding may carry a share beyond 1; also in the inverse.
+        # Rounding may push the fraction beyond 1, here and in the inverse.
         return self.full * min(share if self.bend is None else self.bend.bent(share), 1.0)
 
     def travel(self, motion: float) -> float:
-        """Travel that asks for this motion: 0 for none, ``end`` for more than can be had."""
+        """Return the travel for this motion: 0 for none, ``end`` for full motion or more."""
         if motion <= 0.0:
             return 0.0
         if motion >= self.full:
@@ -69,7 +69,7 @@ class Half(NamedTuple):
         return min(self.start + share * (self.end - self.start), self.end)
 
     def is_like(self, policy: "Half") -> bool:
-        """So close to the policy's that its sticks need no mapping."""
+        """True if this half is so close to the policy's that its sticks need no mapping."""
         return (
             self.bend is None
             and abs(self.full - policy.full) <= SAME_GAIN * policy.full
@@ -86,53 +86,53 @@ class Axis(NamedTuple):
     below: Half
 
     def motion(self, stick: float) -> float:
-        """Motion, with the stick's sign."""
+        """Return the motion, with the stick's sign."""
         return self.above.motion(stick) if stick >= 0.0 else -self.below.motion(-stick)
 
     def stick(self, motion: float) -> float:
-        """Inverse of ``motion``."""
+        """Return the stick for a motion."""
         return self.above.travel(motion) if motion >= 0.0 else -self.below.travel(-motion)
 
     def is_like(self, policy: "Axis") -> bool:
-        """Both halves are."""
+        """True if both halves are close to the policy's."""
         return self.above.is_like(policy.above) and self.below.is_like(policy.below)
 
     @classmethod
     def even(cls, half: Half) -> "Axis":
-        """The same in both directions."""
+        """Return an axis with this half in both directions."""
         return cls(half, half)
 
 
 class AxisMap(NamedTuple):
-    """Throttle (m/s, + up) or yaw (degrees/s, + nose right)."""
+    """Map of the throttle (m/s, + up) or the yaw (degrees/s, + nose right)."""
 
     policy: Axis
     vehicle: Axis
 
     def to_vehicle(self, stick: float) -> float:
-        """The vehicle's stick for the policy's."""
+        """Return the vehicle's stick for the policy's."""
         return self.vehicle.stick(self.policy.motion(stick))
 
     def to_policy(self, stick: float) -> float:
-        """The policy's stick for the vehicle's."""
+        """Return the policy's stick for the vehicle's."""
         return self.policy.stick(self.vehicle.motion(stick))
 
     def saturates(self, stick: float) -> bool:
-        """The policy's stick asks for more than the vehicle has."""
+        """True if the policy's stick demands more than the vehicle can do."""
         motion = self.policy.motion(stick)
         half = self.vehicle.above if motion >= 0.0 else self.vehicle.below
         return abs(motion) > half.full * (1.0 + _ROUNDING)
 
 
 class VehicleLean(NamedTuple):
-    """Pitch and roll of the vehicle, whose lean is limited as a whole: both axes to one circle."""
+    """Pitch and roll of the vehicle; their combined lean is limited to a circle."""
 
     pitch: Axis
-    """In degrees, or in the tangent of the lean; also in the next two."""
+    """Unit of ``pitch``, ``roll`` and ``full``: degrees, or the tangent of the lean."""
     roll: Axis
     full: float
     is_tangent: bool
-    """The sticks ask for an acceleration, and so for the tangent of a lean."""
+    """True if sticks command an acceleration, and so the tangent of a lean."""
     parameter: str
 
     @property
@@ -141,25 +141,25 @@ class VehicleLean(NamedTuple):
         return math.degrees(math.atan(self.full)) if self.is_tangent else self.full
 
     def is_like(self, policy: Axis) -> bool:
-        """So close to the policy's that its sticks need no mapping."""
+        """True if the lean is so close to the policy's that its sticks need no mapping."""
         return not self.is_tangent and self.pitch.is_like(policy) and self.roll.is_like(policy)
 
 
 class LeanMap(NamedTuple):
-    """Pitch and roll."""
+    """Map of pitch and roll."""
 
     policy: Axis
-    """Lean in degrees, of either stick; both together no further than its full one."""
+    """Lean of each stick [degrees]; the combined lean is limited to its full value."""
     vehicle: VehicleLean
 
     def to_vehicle(self, pitch: float, roll: float) -> tuple[float, float]:
-        """The vehicle's pitch and roll sticks for the policy's."""
+        """Return the vehicle's pitch and roll sticks for the policy's."""
         vehicle = self.vehicle
         pitch, roll = _within(vehicle.full, *self._asked(pitch, roll))
         return vehicle.pitch.stick(pitch), vehicle.roll.stick(roll)
 
     def to_policy(self, pitch: float, roll: float) -> tuple[float, float]:
-        """The policy's pitch and roll sticks for the vehicle's."""
+        """Return the policy's pitch and roll sticks for the vehicle's."""
         vehicle, policy = self.vehicle, self.policy
         pitch, roll = _within(vehicle.full, vehicle.pitch.motion(pitch), vehicle.roll.motion(roll))
         if vehicle.is_tangent:
@@ -168,11 +168,11 @@ class LeanMap(NamedTuple):
         return policy.stick(pitch), policy.stick(roll)
 
     def saturates(self, pitch: float, roll: float) -> bool:
-        """The policy's sticks ask for more lean than the vehicle has."""
+        """True if the policy's sticks demand more lean than the vehicle has."""
         return math.hypot(*self._asked(pitch, roll)) > self.vehicle.full * (1.0 + _ROUNDING)
 
     def _asked(self, pitch: float, roll: float) -> tuple[float, float]:
-        """What the policy's sticks mean, in the vehicle's unit."""
+        """Return the lean that the policy's sticks demand, in the vehicle's unit."""
         policy = self.policy
         pitch, roll = _within(policy.above.full, policy.motion(pitch), policy.motion(roll))
         if self.vehicle.is_tangent:
@@ -181,7 +181,7 @@ class LeanMap(NamedTuple):
 
 
 def _within(full: float, pitch: float, roll: float) -> tuple[float, float]:
-    """The same direction, no longer than ``full``."""
+    """Shorten a vector to at most ``full``, keeping its direction."""
     length = math.hypot(pitch, roll)
     if length <= full:
         return pitch, roll
@@ -193,33 +193,32 @@ Quantity = Literal["climb", "descent", "yaw rate", "lean"]
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class StickCurves:
-    """The map of one policy's sticks to one vehicle's, in one flight mode.
+    """Map of one policy's sticks to one vehicle's, in one flight mode.
 
-    A stick without a map (None) means the same to both, or has no meaning that a policy was trained
-    for, and goes through unchanged to the last bit.
+    A stick without a map (None) passes unchanged, bit for bit: it means the same to both, or has no
+    meaning from the policy's training.
     """
 
     throttle: AxisMap | None = None
     yaw: AxisMap | None = None
     lean: LeanMap | None = None
     shortfalls: tuple[tuple[Quantity, str], ...] = ()
-    """What this vehicle cannot do, each with a sentence."""
+    """Quantities in which the vehicle falls short of the policy, each with a sentence."""
     unmapped: str | None = None
-    """Why nothing is mapped although it should be."""
+    """Why nothing is mapped although it should be, or None."""
 
     @property
     def notes(self) -> tuple[str, ...]:
-        """For the user, at the start."""
+        """Notes for the user at the start."""
         return (*filter(None, [self.unmapped]), *(text for _, text in self.shortfalls))
 
     @property
     def is_identity(self) -> bool:
-        """No stick is changed."""
+        """True if no stick is changed."""
         return self.throttle is None and self.yaw is None and self.lean is None
 
     def to_vehicle(self, sticks: Sticks) -> Sticks:
-        """Sticks that make the vehicle do what the policy means by these; the centre within the
-        policy's dead zone."""
+        """Return the vehicle's sticks for the policy's; centred within the policy's dead zone."""
         if self.is_identity:
             return sticks
         throttle, yaw, pitch, roll = sticks
@@ -233,10 +232,10 @@ class StickCurves:
         )
 
     def to_policy(self, sticks: Sticks) -> Sticks:
-        """Sticks by which the policy would mean what the vehicle does with these.
+        """Return the policy's sticks for the motion that the vehicle's sticks cause.
 
-        The inverse of ``to_vehicle``, for sticks that were really sent and for the pilot's. Motion
-        beyond what the policy's sticks can mean becomes its full stick.
+        The inverse of ``to_vehicle``, for sticks as sent and for the pilot's. Motion beyond the
+        policy's range becomes its full stick.
         """
         if self.is_identity:
             return sticks
@@ -251,7 +250,7 @@ class StickCurves:
         )
 
     def saturated(self, sticks: Sticks) -> tuple[str, ...]:
-        """Names of the policy's sticks that mean more than the vehicle can do, in Sticks' order."""
+        """Return the names of sticks that demand more than the vehicle can do, in Sticks' order."""
         names: tuple[str, ...] = ()
         if self.throttle is not None and self.throttle.saturates(sticks.throttle):
             names += ("throttle",)
@@ -268,17 +267,17 @@ IDENTITY = StickCurves()
 
 
 class VehicleCurves(NamedTuple):
-    """Motion that one vehicle makes of its sticks in one flight mode."""
+    """Motion of one vehicle for its sticks in one flight mode."""
 
     throttle: Axis | None
-    """Climb rate in m/s, + up; None where the stick means something else."""
+    """Climb rate [m/s], + up; None if the stick has another meaning."""
     yaw: Axis
-    """Yaw rate in degrees/s, + nose right."""
+    """Yaw rate [degrees/s], + nose right."""
     lean: VehicleLean
 
 
 def curves_between(gains: StickGains, vehicle: VehicleCurves) -> StickCurves:
-    """The map from a policy's sticks to a vehicle's, without the sticks that need none."""
+    """Return the map from a policy's sticks to a vehicle's; sticks that need none stay unmapped."""
     yaw = AxisMap(Axis.even(Half(gains.yaw_rate_degps, gains.yaw_dead_zone)), vehicle.yaw)
     lean = LeanMap(Axis.even(Half(gains.lean_deg, gains.lean_dead_zone)), vehicle.lean)
     throttle = None
@@ -317,7 +316,7 @@ def _lean_notes(lean: LeanMap) -> Iterator[tuple[Quantity, str]]:
 def _note(
     noun: Quantity, verb: str, unit: str, policy: Half, most: float, parameter: str
 ) -> Iterator[tuple[Quantity, str]]:
-    """A sentence if the vehicle cannot do all that the policy's stick means."""
+    """Yield a sentence if the vehicle falls short of the policy's full stick."""
     if most < policy.full * (1.0 - SAME_GAIN):
         yield (
             noun,
@@ -330,7 +329,7 @@ def _note(
 def unusable(
     values: Mapping[str, float], *, needed: tuple[str, ...], positive: tuple[str, ...]
 ) -> StickCurves | None:
-    """No map, and the sentence that says why, if parameters are missing or cannot be; else None."""
+    """Return an empty map that says why, if parameters are missing or invalid; else None."""
     as_they_are = "the policy's sticks go to the vehicle as they are, whatever they mean to it"
     if missing := [name for name in needed if name not in values]:
         return StickCurves(unmapped=f"{as_they_are}: it did not send {', '.join(missing)}")

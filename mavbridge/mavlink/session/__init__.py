@@ -1,1 +1,1 @@
-"""The session with one vehicle, without I/O: discovery, parameters, streams, condition."""
+"""Session with one vehicle, without I/O: discovery, parameters, streams, condition."""

@@ -1,4 +1,4 @@
-"""Commands for mode, arming and takeoff: not too often, and what the vehicle answers to them."""
+"""Commands for mode, arming and takeoff, with rate limits and the vehicle's answers."""
 
 from collections.abc import Callable
 
@@ -9,24 +9,24 @@ from mavbridge.mavlink.codec.messages import CommandAck, CommandRequest
 from mavbridge.mavlink.session.vehicle import VehicleSession
 
 _SPACING_NS = NS_PER_S
-"""Between two requests to arm or take off: each refused one prints the vehicle's reason."""
+"""Time between two requests to arm or take off: each refusal prints the vehicle's reason."""
 _MODE_SPACING_NS = 50 * NS_PER_MS
-"""A guard: who asks decides how often, and on the way out of a flight a lost request must cost no
-second."""
+"""Lower bound only: the caller sets the rate, and a lost request at the end of a flight must not
+cost a second."""
 _SET_MODE = dialect.MAV_CMD_DO_SET_MODE
 _ARM = dialect.MAV_CMD_COMPONENT_ARM_DISARM
 _FORGET_NS = 3 * NS_PER_S
-"""A refusal counts no longer once the mode was not asked for during this time; and why there is no
-takeoff is said again after it."""
+"""Time without requests for a mode after which its refusal is forgotten; time between two
+explanations of a missing takeoff."""
 
 
 def mode_request(numbers: tuple[int, int]) -> CommandRequest:
-    """The request for a mode by its two numbers."""
+    """Return the request for a mode by its two numbers."""
     return CommandRequest(_SET_MODE, (dialect.MAV_MODE_FLAG_CUSTOM_MODE_ENABLED, *numbers))
 
 
 class VehicleCommands:
-    """Requests to the present vehicle, each not too soon after the same one before."""
+    """Rate-limited requests to the present vehicle."""
 
     def __init__(
         self,
@@ -40,10 +40,10 @@ class VehicleCommands:
         self._mode: str | None = None
         self._explained_ns: int | None = None
         self.refused_mode: str | None = None
-        """Mode that was asked for last and that the vehicle has refused, or None."""
+        """Mode of the last request if the vehicle has refused it, else None."""
 
     def adopt(self, vehicle: VehicleSession) -> None:
-        """Ask this session of the vehicle from now on; nothing was asked of it before."""
+        """Switch to a new session of the vehicle, to which nothing was sent yet."""
         self._vehicle, self._mode, self.refused_mode, self._explained_ns = vehicle, None, None, None
         self._sent.clear()
 
@@ -68,8 +68,7 @@ class VehicleCommands:
         self._request(CommandRequest(_ARM, (1,)))
 
     def takeoff(self, height_m: float) -> None:
-        """Ask the autopilot to climb to this height above the ground by its own means, at most once
-        a second, whatever the height."""
+        """Request an autonomous takeoff to a height above ground, at most once a second in all."""
         if self._vehicle is None:
             return
         now_ns = self._clock.now_ns()
@@ -91,7 +90,7 @@ class VehicleCommands:
         self._send(request)
 
     def receive(self, ack: CommandAck) -> None:
-        """Take an ack; a refusal is told the user."""
+        """Process an ack; report a refusal to the user."""
         if ack.command not in self._sent or ack.result == dialect.MAV_RESULT_IN_PROGRESS:
             return
         is_accepted = ack.result == dialect.MAV_RESULT_ACCEPTED

@@ -1,4 +1,4 @@
-"""The vehicle's condition beside its motion: mode, radio receiver, estimator, landing, battery."""
+"""Condition of the vehicle apart from its motion: mode, receiver, estimator, landing, battery."""
 
 import sys
 from typing import TypeAlias
@@ -34,17 +34,17 @@ ConditionMessage: TypeAlias = (
 )
 
 SETTLE_NS = 100 * NS_PER_MS
-"""A HEARTBEAT this soon after a change that CURRENT_MODE or an EVENT has told may be older than the
-change: the autopilot tells it before its heartbeats know, and a network may swap packets."""
+"""Time after a change reported by CURRENT_MODE or an EVENT in which a HEARTBEAT may predate it: the
+autopilot reports the change before its heartbeats show it, and a network may swap packets."""
 
 POSITION_FRESH_NS = 500 * NS_PER_MS
 SLOW_FRESH_NS = 2 * NS_PER_S
-"""Landed state, estimator and battery come at 5 and 2 Hz: silent for longer, they are not known."""
+"""Maximum age of landed state, estimator and battery, which arrive at 5 and 2 Hz."""
 _HORIZONTAL_POSITION = dialect.ESTIMATOR_POS_HORIZ_REL | dialect.ESTIMATOR_POS_HORIZ_ABS
 
 
 class VehicleCondition:
-    """Joins the slow messages of one vehicle into one ``VehicleStatus``."""
+    """Combines the slow messages of one vehicle into one ``VehicleStatus``."""
 
     def __init__(self, profile: Profile, *, min_battery_percent: float) -> None:
         self._profile = profile
@@ -55,7 +55,7 @@ class VehicleCondition:
         self._is_armed = False
         self._is_failsafe = False
         self._changed_ns: int | None = None
-        """When CURRENT_MODE or an EVENT has last told a change."""
+        """Last change that CURRENT_MODE or an EVENT reported."""
         self._stick_override_ns: int | None = None
         self._altitude: tuple[int, float] | None = None
         self.rc: tuple[int, RcChannels] | None = None
@@ -66,15 +66,15 @@ class VehicleCondition:
         self._landed: tuple[int, LandedState] | None = None
         self._estimator: tuple[int, EstimatorFlags] | None = None
         self._is_rc_plausible: bool | None = None
-        """Sticks of a radio stood in RC_CHANNELS before our first override."""
+        """True if RC_CHANNELS held a radio's sticks before our first override."""
         self._is_rc_healthy: bool | None = None
-        """SYS_STATUS's verdict on the receiver before our first override, if it has one."""
+        """Receiver health by SYS_STATUS before our first override; None: not reported."""
         self._status: VehicleStatus | None = None
         self._status_ns = (0, 0)
-        """First and last moment for which that holds, unless a message comes."""
+        """First and last moment for which ``_status`` is valid, unless a message arrives."""
 
     def receive(self, body: ConditionMessage, arrived_ns: int, *, may_be_ours: bool) -> None:
-        """Take a message; ``may_be_ours``: an override was sent, and hides the receiver."""
+        """Process a message; ``may_be_ours``: an override was sent, and hides the receiver."""
         self._status = None
         match body:
             case Heartbeat():
@@ -107,7 +107,7 @@ class VehicleCondition:
         self._is_failsafe = body.system_status >= dialect.MAV_STATE_CRITICAL
 
     def _receive_mode(self, body: CurrentMode, arrived_ns: int) -> None:
-        """Take CURRENT_MODE, which also tells that the vehicle has left the mode by itself."""
+        """Process CURRENT_MODE, which also shows that the vehicle has left a mode by itself."""
         if self.heartbeat is None:
             return
         self._mode_ns = arrived_ns
@@ -142,7 +142,7 @@ class VehicleCondition:
         may_be_ours: bool,
         is_released: bool,
     ) -> None:
-        """Take RC_CHANNELS: all of it, its four stick channels, and the sticks that these mean."""
+        """Process RC_CHANNELS with its four stick channels and the sticks that they mean."""
         self._status = None
         self.rc, self._rc_sticks = (arrived_ns, rc), sticks
         if not may_be_ours and channels_us:
@@ -152,10 +152,10 @@ class VehicleCondition:
 
     @property
     def has_receiver(self) -> bool | None:
-        """A receiver was seen before our first override; None = not known.
+        """True if a receiver was seen before our first override; None: unknown.
 
-        A vehicle whose receiver is gone goes on showing the last sticks that it had, but marks the
-        receiver as unhealthy.
+        A vehicle that has lost its receiver keeps showing the last sticks, but marks the receiver
+        as unhealthy.
         """
         return self._is_rc_plausible if self._is_rc_healthy is not False else False
 
@@ -168,7 +168,7 @@ class VehicleCondition:
 
     @property
     def is_ready_to_arm(self) -> bool | None:
-        """The autopilot's own checks before arming are passed; None = it does not say."""
+        """True if the autopilot's arming checks have passed; None: not reported."""
         if self._system is None:
             return None
         system, bit = self._system[1], dialect.MAV_SYS_STATUS_PREARM_CHECK
@@ -176,17 +176,17 @@ class VehicleCondition:
 
     @property
     def has_seen_radio(self) -> bool:
-        """Both messages that tell of a receiver have come."""
+        """True if both messages that show a receiver have arrived."""
         return self.rc is not None and self._system is not None
 
     def is_velocity_usable(self, now_ns: int) -> bool:
-        """False for a velocity that the firmware goes on sending without a valid estimate."""
+        """False for a velocity that the firmware sends without a valid estimate."""
         flags = self._flags(now_ns)
         is_valid = flags is None or bool(flags & dialect.ESTIMATOR_VELOCITY_HORIZ)
         return is_valid or not self._profile.sends_invalid_estimates
 
     def amsl_m(self, now_ns: int) -> float | None:
-        """Height above mean sea level; None without a fresh one."""
+        """Return the height above mean sea level; None without a fresh one."""
         if self._altitude is None or now_ns - self._altitude[0] > SLOW_FRESH_NS:
             return None
         return self._altitude[1]
@@ -197,7 +197,7 @@ class VehicleCondition:
         return self._estimator[1].flags
 
     def status(self, now_ns: int) -> VehicleStatus | None:
-        """The vehicle's own report; None before its first heartbeat."""
+        """Return the vehicle's status; None before its first heartbeat."""
         if self.heartbeat is None:
             return None
         first_ns, last_ns = self._status_ns
@@ -206,7 +206,7 @@ class VehicleCondition:
         return self._status
 
     def _next_ns(self, now_ns: int) -> int:
-        """The moment after which something that was told is too old."""
+        """Return the moment at which the next piece of information becomes stale."""
         limits = (
             (self.rc, GAP_NS),
             (self._position, POSITION_FRESH_NS),
@@ -242,14 +242,14 @@ class VehicleCondition:
         flags = self._flags(now_ns)
         if flags is None:
             return None
-        # The bit for a constant position says nothing: PX4 sets it too while it stands still on
-        # the ground with a good position, and without one neither autopilot sets these.
+        # Ignore the bit for a constant position: PX4 also sets it at rest on the ground with a
+        # good position. Without a position neither autopilot sets these bits.
         return bool(flags & _HORIZONTAL_POSITION)
 
     def _position_ned_m(
         self, now_ns: int, is_valid: bool | None
     ) -> tuple[float, float, float] | None:
-        """The position, if it is one: some firmware sends it without a valid estimate too."""
+        """Return the position if valid: some firmware also sends one without an estimate."""
         is_trusted = is_valid is None and not self._profile.sends_invalid_estimates
         is_good = is_valid is True or is_trusted
         if self._position is None or not is_good:

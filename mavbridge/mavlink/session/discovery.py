@@ -1,4 +1,4 @@
-"""Finds the vehicle to fly among all senders on the link."""
+"""Discovery of the vehicle to fly among all senders on the link."""
 
 from dataclasses import dataclass
 from typing import NamedTuple
@@ -20,9 +20,9 @@ from mavbridge.mavlink.transport.sockets import Address
 
 AUTOPILOT_COMPONENT = 1
 SETTLE_NS = 3 * NS_PER_S // 2
-"""Every vehicle sends a heartbeat at 1 Hz: after this long, a second vehicle has been heard."""
+"""Time by which a second vehicle has been heard: every vehicle sends a heartbeat at 1 Hz."""
 MOVED_NS = 3 * NS_PER_S
-"""Silence after which a vehicle that sends from a new address has moved there."""
+"""Silence after which a vehicle that is heard at a new address has moved there."""
 
 _NOT_VEHICLES = (
     *(dialect.MAV_TYPE_GCS, dialect.MAV_TYPE_ONBOARD_CONTROLLER, dialect.MAV_TYPE_GIMBAL),
@@ -30,15 +30,15 @@ _NOT_VEHICLES = (
 )
 _CAPACITY = 64
 _MOVED_NS, _MOVED_STAMPS = 250 * NS_PER_MS, 3
-"""Silence of the engaged vehicle, and stamps of its clock in a row that come from elsewhere."""
+"""Silence, and consecutive stamps of its clock from elsewhere, that mean a move in flight."""
 _SILENT_NS = 500 * NS_PER_MS
-"""Silence after which a vehicle that is heard elsewhere is taken to have moved there."""
+"""Silence of the vehicle after which another sender with its system id ends the flight."""
 _DUPLICATE_SYSTEMS = 16
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class VehicleIdentity:
-    """One system id at one address, and the kind of vehicle."""
+    """System id, address and type of one vehicle."""
 
     source: Endpoint
     address: Address | None
@@ -48,19 +48,19 @@ class VehicleIdentity:
 
     @property
     def place(self) -> str:
-        """Where it sends from, for a message."""
+        """The vehicle's address as text."""
         return _place(self.address)
 
 
 class VehicleDiscovery:
-    """Chooses component 1 of one vehicle, and explains itself when it cannot."""
+    """Chooses component 1 of one vehicle, or explains why it cannot."""
 
     def __init__(self, *, target_system: int) -> None:
         self._target_system = target_system
         self._heard_ns: dict[VehicleIdentity, int] = {}
         self._others: set[str] = set()
         self._odd_components: set[int] = set()
-        """Components other than 1 that say that they are the autopilot of a vehicle."""
+        """Components other than 1 that claim to be an autopilot."""
         self._first_ns: int | None = None
 
     def receive(
@@ -97,11 +97,11 @@ class VehicleDiscovery:
 
     @property
     def is_settling(self) -> bool:
-        """A vehicle was heard, but a second one may still show up."""
+        """True if a vehicle was heard, but a second one may still appear."""
         return self._first_ns is not None
 
     def choose(self, now_ns: int) -> VehicleIdentity | None:
-        """The vehicle to fly, or None while it is not certain.
+        """Return the vehicle to fly, or None until it is certain.
 
         Raises:
             PeerError: several vehicles are possible, or two cannot be told apart.
@@ -124,7 +124,7 @@ class VehicleDiscovery:
         return wanted[0]
 
     def moved(self, vehicle: VehicleIdentity, now_ns: int) -> VehicleIdentity | None:
-        """The same vehicle at the address that it now sends from, if that has changed."""
+        """Return the same vehicle at its new address, or None if it has not moved."""
         if now_ns - self._heard_ns.get(vehicle, 0) < MOVED_NS:
             return None
         for other, heard_ns in self._heard_ns.items():
@@ -133,7 +133,7 @@ class VehicleDiscovery:
         return None
 
     def describe(self, hearing: "Hearing") -> str:
-        """Say what was heard instead of the vehicle, with advice for this kind of link."""
+        """Describe the senders heard instead of the vehicle, with advice for this kind of link."""
         if self._heard_ns:
             heard = ", ".join(str(s) for s in sorted({v.source.system for v in self._heard_ns}))
             silent = f"system {self._target_system} is silent"
@@ -154,16 +154,16 @@ class VehicleDiscovery:
 
 
 class Hearing(NamedTuple):
-    """What has come over a link on which no vehicle was found."""
+    """Data received over a link on which no vehicle was found."""
 
     address: LinkAddress
     waited_s: float
     received_bytes: int
     received_packets: int
-    """MAVLink packets among them."""
+    """Number of MAVLink packets in the received bytes."""
 
     def without_heartbeat(self) -> str:
-        """Say why no heartbeat was heard, as far as can be told, and what to do."""
+        """Explain why no heartbeat was heard, as far as known, and what to do."""
         amount = f"{self.received_bytes / 1000 / max(self.waited_s, 0.1):.1f} kB/s came"
         if self.received_packets:
             return (
@@ -203,21 +203,21 @@ class Hearing(NamedTuple):
 
 
 class DuplicateSystems:
-    """Other senders that use the system id of the chosen vehicle."""
+    """Other senders with the chosen vehicle's system id."""
 
     def __init__(self) -> None:
         self._reported: dict[Address | None, int] = {}
-        """When each was first heard."""
+        """Time at which each was first heard."""
         self._replaced_ns: int | None = None
         self._moved_stamps = 0
 
     def has_moved(
         self, sender: Address | None, now_ns: int, heard_ns: int, *, is_same_clock: bool
     ) -> bool:
-        """Take an attitude of another sender; True: it is the vehicle's own, at a new address.
+        """Process another sender's attitude; return True if it is the vehicle's own.
 
-        It is not where the vehicle, heard last at ``heard_ns``, went on when this sender had come:
-        that is another way to the vehicle, or another vehicle.
+        If the vehicle, last heard at ``heard_ns``, was heard at its old address after this sender
+        appeared, the sender is another route to the vehicle, or another vehicle.
         """
         if self._reported.get(sender, heard_ns) < heard_ns:
             return False
@@ -231,11 +231,11 @@ class DuplicateSystems:
     def notice(
         self, vehicle: VehicleIdentity, sender: Address | None, now_ns: int, heard_ns: int
     ) -> Reason | str | None:
-        """Take a heartbeat of another sender; ``heard_ns`` is when the vehicle was heard last.
+        """Process another sender's heartbeat; ``heard_ns``: the vehicle's last message.
 
         Returns:
-            Why the flight is over, since the vehicle is silent meanwhile, once a second; else what
-            to tell the user, once a sender; else None.
+            A reason to end the flight if the vehicle is silent, once a second; else a text for
+                the user, once per sender; else None.
         """
         system = vehicle.source.system
         if now_ns - heard_ns >= _SILENT_NS:
@@ -253,5 +253,5 @@ class DuplicateSystems:
 
 
 def _place(address: Address | None) -> str:
-    """A stream has no address."""
+    """Return the address as text; a stream has none."""
     return "this connection" if address is None else spelled(*address)

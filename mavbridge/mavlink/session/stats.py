@@ -8,12 +8,13 @@ from mavbridge.core.vehicle import LinkStats
 from mavbridge.mavlink.session.timesync import TimesyncFilter
 
 _MOST_NAMES = 500
-"""More than the dialect has; messages that it lacks are named by their numbers, 16 million."""
+"""Limit for message names: more than the dialect has. Messages that it lacks have numbers as names,
+16 million of them."""
 _REST = "others"
 
 
 class LinkCounters:
-    """Messages and losses of the chosen vehicle."""
+    """Counters of messages and losses of the chosen vehicle."""
 
     def __init__(self) -> None:
         self._by_name: Counter[str] = Counter()
@@ -24,7 +25,7 @@ class LinkCounters:
         self.sent = 0
 
     def receive(self, name: str, sequence: int, arrived_ns: int) -> None:
-        """Count one message; a gap in its 8-bit sequence is that many lost (modulo 256)."""
+        """Count one message, and a gap in its 8-bit sequence number as losses (modulo 256)."""
         is_known = name in self._by_name or len(self._by_name) < _MOST_NAMES
         self._by_name[name if is_known else _REST] += 1
         if self._last_sequence is not None:
@@ -39,7 +40,7 @@ class LinkCounters:
         return self._last_ns
 
     def new_sequence(self) -> None:
-        """Expect any sequence number next: the sender has restarted."""
+        """Accept any sequence number next: the sender has restarted."""
         self._last_sequence = None
 
     def stats(
@@ -51,7 +52,7 @@ class LinkCounters:
         refused_signatures: int = 0,
         saturated: Mapping[str, int],
     ) -> LinkStats:
-        """The totals so far; ``saturated`` is how often each stick asked for too much."""
+        """Return the totals; ``saturated``: messages in which each stick demanded too much."""
         received = self._by_name.total()
         span_ns = self._last_ns - (self._first_ns or 0)
         error_ns = timesync.error_ns(self._last_ns)

@@ -1,4 +1,4 @@
-"""Requests telemetry at the rate of the action loop, and again whenever it slows down."""
+"""Telemetry requests at the rate of the action loop, repeated whenever a stream slows down."""
 
 from collections.abc import Callable, Iterator
 
@@ -15,20 +15,20 @@ _LOWEST_HZ = 25.0
 _WATCH_NS = 2 * NS_PER_S
 _UNDECIDED = (dialect.MAV_RESULT_TEMPORARILY_REJECTED, dialect.MAV_RESULT_IN_PROGRESS)
 _ENOUGH = 0.7
-"""Share of the granted rate below which another station is assumed to have changed it."""
+"""Fraction of the granted rate below which another station is assumed to have changed it."""
 _ALIKE = 0.2
-"""Streams whose shares differ by less than this part of their mean have one cause."""
+"""Relative spread of the streams' rate fractions below which they have one cause."""
 _AWAY_NS = 250 * NS_PER_MS
 _STAND_IN_NS = 50 * NS_PER_MS
-"""Between two requests for a message that stands in for one that has been away for so long."""
+"""Time between two requests for a stand-in, once its stream has been away for ``_AWAY_NS``."""
 _SCALED_WINDOWS = 2
-"""So many windows in a row at one share are a link that is full; one may be a hiccup."""
+"""Consecutive windows at one rate fraction that mean a full link; a single one may be a hiccup."""
 _LOSSY = 0.1
-"""Share of lost packets above which loss explains low rates."""
+"""Fraction of lost packets above which loss explains low rates."""
 
 
 class _Stream:
-    """Negotiation of one group: the message and its rate."""
+    """Negotiation of message and rate for one group."""
 
     def __init__(self, group: StreamGroup) -> None:
         self.group = group
@@ -36,27 +36,27 @@ class _Stream:
         self.attempts = 0
         self.is_settled = False
         self.is_given_up = False
-        """An optional group that the vehicle does not grant."""
+        """True for an optional group that the vehicle does not grant."""
         self.received: dict[str, int] = {}
-        """By message: a vehicle may send a second one of the group unasked."""
+        """Messages by name: a vehicle may also send another one of the group unrequested."""
         self.has_settled = False
-        """It was granted or given up once."""
+        """True if it has been granted or given up once."""
         self.newest_ns = 0
         self.stand_in_due_ns = 0
         self.is_absence_told = False
         self.is_denied = False
-        """Each message was denied at each rate: asked again after a pause."""
+        """True if each message was denied at each rate: request again after a pause."""
         self._choice = 0
 
     def request(self) -> CommandRequest:
-        """The next request to send, of one message after the other."""
+        """Return the next request, trying one message after the other."""
         self.attempts += 1
         self.is_denied = False
         number = message_id(self.group.messages[self._choice % len(self.group.messages)])
         return CommandRequest(dialect.MAV_CMD_SET_MESSAGE_INTERVAL, (number, 1e6 / self.rate_hz))
 
     def want(self, group: StreamGroup) -> None:
-        """Ask anew, for this group of the same messages."""
+        """Restart the negotiation for this group of the same messages."""
         self.group, self.rate_hz, self.attempts = group, group.rate_hz, 0
         self.is_settled = self.is_given_up = False
 
@@ -64,7 +64,7 @@ class _Stream:
         self.is_settled, self.has_settled, self.attempts = True, True, 0
 
     def refuse(self) -> None:
-        """Half the rate, then the next message: "denied" may mean too fast or unknown."""
+        """Try half the rate, then the next message: "denied" may mean too fast or unknown."""
         self.attempts = 0
         if self.group.is_optional:
             self._give_up()
@@ -77,7 +77,7 @@ class _Stream:
         self.is_denied = self._choice % len(self.group.messages) == 0
 
     def miss(self) -> None:
-        """The vehicle does not answer: begin with the first message again."""
+        """Restart with the first message: the vehicle does not answer."""
         self.attempts = self._choice = 0
         if self.group.is_optional:
             self._give_up()
@@ -86,7 +86,7 @@ class _Stream:
         self.is_settled = self.has_settled = self.is_given_up = True
 
     def share(self, span_s: float) -> float:
-        """Part of the granted rate at which it came."""
+        """Return the arrival rate as a fraction of the granted rate."""
         return self._count / (self.rate_hz * span_s)
 
     @property
@@ -100,18 +100,18 @@ class _Stream:
 
 
 def message_id(name: str) -> int:
-    """Number of a MAVLink message."""
+    """Return the number of a MAVLink message."""
     number: int = MISSING_IDS.get(name) or getattr(dialect, f"MAVLINK_MSG_ID_{name}")
     return number
 
 
 class StreamRequester:
-    """Keeps all groups coming; one request is open at a time, since acks carry no message id.
+    """Keeps all groups coming, with one open request at a time, since acks carry no message id.
 
-    A vehicle slows all streams of a link that is too slow for them down alike, and says nothing:
-    ``report`` then gets a text for the user, once, and what comes has to do. To ask for less would
-    not help: PX4 gives what we give up to the streams that it sends unasked (on a link of 4 kB/s,
-    7.5 Hz of 100 became 1.6 Hz when 6.7 were asked for).
+    A vehicle slows down all streams of an overloaded link alike, without notice. ``report`` then
+    gets one text for the user, and the flight uses the messages that arrive. Lower requests would
+    not help: PX4 gives the freed bandwidth to its unrequested streams (on a link of 4 kB/s, 7.5 Hz
+    of 100 became 1.6 Hz when 6.7 were requested).
     """
 
     def __init__(
@@ -128,7 +128,7 @@ class StreamRequester:
         self._pending: _Stream | None = None
         self._requested_ns = 0
         self._window_ns: int | None = None
-        """Start of the window in which messages are counted; None while requests are open."""
+        """Start of the counting window; None while requests are open."""
         self._sequence: int | None = None
         self._received = self._lost = 0
         """Packets of any kind in this window."""
@@ -139,7 +139,7 @@ class StreamRequester:
             self.add(group)
 
     def add(self, group: StreamGroup) -> None:
-        """Keep this group coming too, unless its message is kept coming already at that rate."""
+        """Add a group, unless its message already comes at that rate."""
         known = self._by_message.get(group.messages[0])
         if known is not None and known.group.rate_hz < group.rate_hz:
             known.want(group)
@@ -150,7 +150,7 @@ class StreamRequester:
 
     @property
     def is_settled(self) -> bool:
-        """Every group that is needed is granted."""
+        """True if every required group is granted."""
         return all(stream.is_settled or stream.group.is_optional for stream in self._streams)
 
     def receive(self, name: str, sequence: int, arrived_ns: int) -> None:
@@ -164,11 +164,11 @@ class StreamRequester:
             stream.newest_ns = arrived_ns
 
     def receive_ack(self, ack: CommandAck) -> None:
-        """Take the vehicle's answer to the open request."""
+        """Process the vehicle's answer to the open request."""
         if self._pending is None or ack.command != dialect.MAV_CMD_SET_MESSAGE_INTERVAL:
             return
         if ack.result in _UNDECIDED:
-            return  # asked again as if there were no answer
+            return  # repeated as if there were no answer
         if ack.result == dialect.MAV_RESULT_ACCEPTED:
             self._pending.accept()
         else:
@@ -176,7 +176,7 @@ class StreamRequester:
         self._pending = None
 
     def step(self, now_ns: int) -> CommandRequest | None:
-        """The request that is due, if any."""
+        """Return the request that is due, or None."""
         self._check_rates(now_ns)
         if self._pending is not None:
             if now_ns - self._requested_ns < _ACK_TIMEOUT_NS:
@@ -192,7 +192,7 @@ class StreamRequester:
         return self._pending.request()
 
     def stand_ins(self, now_ns: int) -> Iterator[CommandRequest]:
-        """Yield requests for what stands in for streams that stay away."""
+        """Yield requests for the stand-ins of missing streams."""
         for stream in self._streams:
             name = stream.group.stand_in
             if name is None or not stream.has_settled or now_ns < stream.stand_in_due_ns:
@@ -215,7 +215,7 @@ class StreamRequester:
             stream.received.clear()
 
     def _judge(self, span_s: float) -> None:
-        """Ask again for what came too slowly in a window, and tell what has not come at all."""
+        """Request slow streams again after a window, and report those that did not come at all."""
         share = self._common_share(span_s)
         self._scaled_windows = self._scaled_windows + 1 if share is not None else 0
         if share is not None and self._scaled_windows >= _SCALED_WINDOWS:
@@ -234,9 +234,9 @@ class StreamRequester:
             self._report(f"{stream.group.messages[0]} does not come: {stream.group.without}")
 
     def _common_share(self, span_s: float) -> float | None:
-        """The part of their rates at which all needed streams came, if a full link explains it."""
+        """Return the common rate fraction of all required streams, if a full link explains it."""
         needed = [stream.share(span_s) for stream in self._streams if not stream.group.is_optional]
-        shares = [share for share in needed if share > 0]  # one without an estimate stays silent
+        shares = [share for share in needed if share > 0]  # no estimate, no messages
         if len(shares) < 2 or self._lost > _LOSSY * (self._lost + self._received):
             return None
         mean = sum(shares) / len(shares)

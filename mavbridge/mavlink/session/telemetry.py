@@ -14,17 +14,17 @@ from mavbridge.mavlink.codec.messages import (
 from mavbridge.mavlink.codec.packets import Codec
 
 _YIELD_NS = 300 * NS_PER_MS
-"""Silence after which a better message gives way to a worse one."""
+"""Silence after which a worse message replaces a better one."""
 
 _FORCE_RANK = {"HIGHRES_IMU": 0, "RAW_IMU": 1, "SCALED_IMU": 1, "SCALED_IMU2": 2}
-"""Float m/s^2 first, then the first IMU in milli-g, then the second."""
+"""Preference: floats in m/s^2, then the first IMU in milli-g, then the second."""
 
 
 class _Filter:
-    """Decides which messages of one quantity are taken.
+    """Selects the messages of one quantity.
 
-    A worse message never replaces a better one that still comes, nor a datagram that is late or
-    doubled the one that overtook it: the vehicle's own stamps decide.
+    A worse message never replaces a better one that still comes. By the vehicle's stamps, a late or
+    duplicate datagram never replaces a newer one.
     """
 
     def __init__(self) -> None:
@@ -35,9 +35,9 @@ class _Filter:
         self._old_stamps = 0
 
     def delay_ns(self, rank: int, boot_us: int, arrived_ns: int, happened_ns: int) -> int | None:
-        """Delay of a message that is taken, or None; a lower rank is better.
+        """Return the delay of a message that is used, or None; a lower rank is better.
 
-        It is negative where the message is stamped in the future.
+        A negative delay means a timestamp in the future.
         """
         if self._arrived_ns is not None:
             if rank > self._rank and arrived_ns - self._arrived_ns <= _YIELD_NS:
@@ -48,7 +48,7 @@ class _Filter:
                 if self._old_stamps < RESTART_STAMPS:
                     return None
             if happened_ns < self._happened_ns:
-                # By a better offset of the clocks; but what is newer happened later.
+                # The offset of the clocks has improved; a newer message still happened later.
                 happened_ns = self._happened_ns
         self._rank, self._boot_us, self._old_stamps = rank, boot_us, 0
         self._arrived_ns = arrived_ns
@@ -57,17 +57,16 @@ class _Filter:
 
 
 class TelemetryCollector:
-    """Joins messages into one ``Telemetry``."""
+    """Combines messages into one ``Telemetry``."""
 
     def __init__(self) -> None:
         self._attitude_filter, self._velocity_filter = _Filter(), _Filter()
         self._force_filter, self._height_filter = _Filter(), _Filter()
         self.telemetry = Telemetry()
-        """The newest reading of each quantity."""
+        """Newest reading of each quantity."""
 
     def receive(self, body: Measurement, arrived_ns: int, happened_ns: int) -> tuple[Sample, ...]:
-        """Take a message, with its arrival and the time that it tells about; return what of it
-        is news."""
+        """Process a message with its arrival and measurement time; return its new samples."""
         rank, values = 0, {}
         if isinstance(body, Attitude):
             rank, filtered = 0 if body.is_quaternion else 1, self._attitude_filter
@@ -95,7 +94,7 @@ class TelemetryCollector:
 
 
 class PacketDecoder:
-    """Samples of recorded packets, as the guard took them from the link."""
+    """Converts recorded packets to the samples that the guard took from the link."""
 
     def __init__(self) -> None:
         self._codec = Codec(source_system=0, source_component=0)
@@ -103,11 +102,11 @@ class PacketDecoder:
 
     @property
     def telemetry(self) -> Telemetry:
-        """The newest reading of each quantity."""
+        """Newest reading of each quantity."""
         return self._collector.telemetry
 
     def decode(self, data: bytes, arrived_ns: int, happened_ns: int) -> tuple[Sample, ...]:
-        """Samples of one datagram of the vehicle; empty if it holds nothing that is news."""
+        """Return the new samples of one datagram of the vehicle."""
         samples: tuple[Sample, ...] = ()
         for message in self._codec.decode_datagram(data):
             if isinstance(message.body, Measurement):

@@ -1,4 +1,4 @@
-"""Offset between the vehicle's clock and ours, by TIMESYNC, and when things happened by it."""
+"""Offset between the vehicle's clock and ours by TIMESYNC, and measurement times from it."""
 
 from collections import deque
 from collections.abc import Callable
@@ -10,62 +10,61 @@ from mavbridge.core.reasons import Code, Reason, because
 from mavbridge.mavlink.codec.messages import WRAP_US, Timesync
 
 TIMESYNC_HZ = 5.0
-"""TIMESYNC requests: the offset is good a second after the first, and a step is seen in 0.2 s."""
+"""Request rate: the offset is good one second after the first, a step is seen within 0.2 s."""
 GOOD_EXCHANGES = 5
-"""Exchanges that must agree before the vehicle's stamps are trusted."""
+"""Number of agreeing exchanges after which the vehicle's stamps are trusted."""
 LONGEST_ROUND_TRIP_NS = 2 * NS_PER_S
-"""Slower exchanges say too little about the offset; a link this slow loses its heartbeats."""
+"""Longest useful round trip: slower ones say too little about the offset, and a link this slow
+loses its heartbeats."""
 UNIX_US = 10**15
-"""Stamps from here on are Unix time, by MAVLink's rule for ``time_usec``; no vehicle runs for so
-many years."""
+"""Stamps from here on are Unix time (MAVLink's rule for ``time_usec``), too late for an uptime."""
 MAX_AHEAD_NS = 20 * NS_PER_MS
-"""Most by which a stamp may lie in the future, beyond the error of the offset: clocks of simulators
-are uneven."""
+"""Largest lead of a stamp over our time, beyond the offset's error: simulator clocks are uneven."""
 SAME_CLOCK_NS = 100 * NS_PER_MS
-"""Two vehicles do not boot within this of each other by chance."""
+"""Largest difference between stamps of one clock; two vehicles do not boot that close by chance."""
 LONGEST_SENDING_NS = 150 * NS_PER_MS
-"""The way to the vehicle: sticks that act so late steer by what was seen too long ago."""
+"""Longest way to the vehicle; later sticks would act on measurements that are too old."""
 _LATE_IN_A_ROW = 2
-"""Requests that must have come late: one may have waited for a vehicle that was busy; but not for
-twice as long, where a link that loses most packets lets few of them through."""
+"""Consecutive late requests that count as late: a single one may have waited for a busy vehicle.
+One that took twice the limit counts alone, since a lossy link lets few through."""
 _OUTSTANDING = 16
 _PACE_NS = 4 * NS_PER_S
 """Time over which the pace of the vehicle's clock is measured, in two halves that must agree: a
-clock that has stepped, or a simulator that stood still, is not slow."""
+clock step or a paused simulator is no slow clock."""
 SLOW_PACE = 0.9
-"""A clock slower than this, against ours, is that of a slow simulator."""
+"""Pace, relative to our clock, below which the vehicle is a slow simulator."""
 _DRIFT_PER = 10_000
-"""Clocks may drift apart by 1 in 10,000: crystals of autopilots and computers are within half."""
+"""Clocks may drift apart by 1 in 10,000; crystals of autopilots and computers drift by half."""
 _UNSTEADY_PER = 200
-"""A clock that is off by more than 1 in 200 has stepped, or does not run evenly."""
+"""A clock that is off by more than 1 in 200 has stepped, or runs unevenly."""
 _UNEVEN_NS = 10 * NS_PER_MS
-"""Unevenness that does no harm: the clock of ArduPilot's SITL runs in lumps of 6 ms, and against
-the wall clock was seen to waver by as much."""
+"""Harmless unevenness: the clock of ArduPilot's SITL advances in steps of 6 ms, and was seen to
+waver by as much against the wall clock."""
 
 
 class _Exchange(NamedTuple):
     at_ns: int
     offset_ns: int
-    """Vehicle's clock minus ours, if both ways took equally long."""
+    """Vehicle's clock minus ours, if both directions took equally long."""
     error_ns: int
-    """Half of the round trip: the most by which the offset may be wrong."""
+    """Half the round trip, the maximum error of the offset."""
 
 
 class TimesyncFilter:
-    """Keeps the exchange that tells most about the offset.
+    """Estimates the offset from the most accurate exchange.
 
-    A request and its answer that together take t give the offset within t / 2, whichever way was
-    the slower one. So the fastest exchange is kept, however long ago it was, until the drift that
-    clocks may have makes a newer one as good: a delay that begins in flight does not move the
-    offset, and shows as age. An exchange that contradicts the kept one shows that the vehicle's
-    clock has stepped or drifts, and takes its place.
+    A request and its answer that together take t give the offset within t / 2, whatever the delay
+    of each direction. So the fastest exchange is kept, however old, until possible clock drift
+    makes a newer one as accurate: a delay that begins in flight does not move the offset, and shows
+    as age. An exchange that contradicts the kept one shows that the vehicle's clock has stepped or
+    drifts, and replaces it.
 
     Only answers to our own outstanding requests count: replies are broadcast, and those to another
     station would look like absurd round trips.
     """
 
     def __init__(self, report: Callable[[str], None] = lambda _: None) -> None:
-        """``report`` shows the user once that the vehicle's clock is slow."""
+        """``report`` tells the user once that the vehicle's clock is slow."""
         self._report = report
         self._outstanding: deque[int] = deque(maxlen=_OUTSTANDING)
         self._best: _Exchange | None = None
@@ -73,12 +72,12 @@ class TimesyncFilter:
         self._sending_ns: deque[int] = deque(maxlen=_LATE_IN_A_ROW)
         self._next_ns = 0
         self._clocks: deque[tuple[int, int]] = deque()
-        """Arrivals and the vehicle's clock of the newest answers."""
+        """Arrival and vehicle time of the newest answers."""
         self.round_trips = Histogram()
         self._has_told_pace = False
 
     def restart(self) -> None:
-        """Forget the offset: the vehicle has rebooted, or is another one."""
+        """Forget the offset after a reboot or a change of vehicle."""
         self._outstanding.clear()
         self._sending_ns.clear()
         self._clocks.clear()
@@ -93,7 +92,7 @@ class TimesyncFilter:
         return now_ns
 
     def receive(self, reply: Timesync, arrived_ns: int) -> None:
-        """Take a TIMESYNC; requests and replies to other stations are ignored."""
+        """Process a TIMESYNC; ignore requests, and replies to other stations."""
         if reply.tc1 == 0 or reply.ts1 not in self._outstanding:
             return
         self._outstanding.remove(reply.ts1)
@@ -123,7 +122,7 @@ class TimesyncFilter:
 
     @property
     def slow_pace(self) -> float | None:
-        """Seconds of the vehicle's clock in one of ours, below SLOW_PACE; else None."""
+        """Pace of the vehicle's clock relative to ours if below SLOW_PACE, else None."""
         if not self._clocks or self._clocks[-1][0] - self._clocks[0][0] < _PACE_NS * 3 // 4:
             return None
         first, middle, last = (self._clocks[at] for at in (0, len(self._clocks) // 2, -1))
@@ -136,7 +135,7 @@ class TimesyncFilter:
 
     @property
     def slow_clock(self) -> str | None:
-        """What a slow clock means, for the user, or None."""
+        """Text for the user about a slow clock, or None."""
         if (pace := self.slow_pace) is None:
             return None
         return (
@@ -146,10 +145,10 @@ class TimesyncFilter:
 
     @property
     def late_sending(self) -> Reason | None:
-        """Why the vehicle gets our packets too late, or None.
+        """Why our packets reach the vehicle too late, or None.
 
-        The time on the way is known less the error of the offset, so that a link that was as slow
-        from the beginning, both ways, is not found.
+        The time on the way is known to within the error of the offset. A link that was equally slow
+        from the beginning, in both directions, is therefore not detected.
         """
         if not self.is_good or not self._sending_ns:
             return None
@@ -164,23 +163,23 @@ class TimesyncFilter:
 
     @property
     def offset_ns(self) -> int | None:
-        """Vehicle clock minus ours; None before the first exchange."""
+        """Vehicle's clock minus ours; None before the first exchange."""
         return None if self._best is None else self._best.offset_ns
 
     def error_ns(self, now_ns: int) -> int | None:
-        """The most by which the offset may be wrong; None before the first exchange."""
+        """Return the maximum error of the offset; None before the first exchange."""
         return None if self._best is None else self._error_ns(self._best, now_ns)
 
     @property
     def is_good(self) -> bool:
-        """Enough exchanges agree: the vehicle's stamps are trusted."""
+        """True if enough exchanges agree to trust the vehicle's stamps."""
         return self._agreeing >= GOOD_EXCHANGES
 
     def happened_ns(self, boot_us: int, arrived_ns: int) -> int:
-        """Our time of something that the vehicle stamped ``boot_us`` after its start.
+        """Return our time of an event that the vehicle stamped ``boot_us`` after boot.
 
-        The arrival where the vehicle's stamp says nothing. Later than the arrival only by more than
-        ``MAX_AHEAD_NS``: a reading of which the age is not known.
+        Return the arrival if the stamp says nothing. A time more than ``MAX_AHEAD_NS`` after the
+        arrival means that the age is unknown.
         """
         delay_ns = self._delay_ns(boot_us, arrived_ns)
         if self._best is None or delay_ns is None:
@@ -189,13 +188,15 @@ class TimesyncFilter:
         return arrived_ns - delay_ns if delay_ns > 0 or is_ahead else arrived_ns
 
     def is_same_clock(self, boot_us: int, arrived_ns: int) -> bool:
-        """Whether a stamp comes from the clock that answered, since it is as young as its own."""
+        """True if a stamp fits the clock that answered TIMESYNC, to within ``SAME_CLOCK_NS``."""
         delay_ns = self._delay_ns(boot_us, arrived_ns)
         return delay_ns is not None and abs(delay_ns) <= SAME_CLOCK_NS
 
     def _delay_ns(self, boot_us: int, arrived_ns: int) -> int | None:
-        """Time from a stamp to its arrival; None where the stamp says nothing: it is missing (0),
-        Unix time, or the offset is not good yet."""
+        """Return the time from a stamp to its arrival, or None if the stamp tells nothing.
+
+        The stamp may be missing (0) or Unix time, or the offset not good yet.
+        """
         if self._best is None or not self.is_good or not 0 < boot_us < UNIX_US:
             return None
         wrap_ns = 1000 * WRAP_US

@@ -1,7 +1,7 @@
-"""The session with one vehicle: its set-up, its state, and whether it can be flown.
+"""Session with one vehicle: its set-up, its state, and reasons why it cannot be flown.
 
-A state machine without I/O. The link steps it at every tick, so connecting, reconnecting and a
-rebooted vehicle are all handled alike, and the action loop never waits for any of them.
+A state machine without I/O. The link steps it at every tick, so that connecting, reconnecting and a
+reboot of the vehicle are handled alike, and none of them blocks the action loop.
 """
 
 from collections.abc import Callable, Iterator, Mapping
@@ -39,22 +39,22 @@ from mavbridge.mavlink.session.params.vehicle_params import VehicleParams
 from mavbridge.mavlink.session.streams import StreamRequester, message_id
 
 _WAIT_NS = NS_PER_S
-"""Longest wait for a lost piece."""
+"""Longest wait for a missing piece of a text."""
 _GAP = "..."
 
 
 class TextJoiner:
-    """Puts the pieces of one text together, in any order; a lost one shows as dots."""
+    """Joins the pieces of one text, in any order; a missing piece becomes dots."""
 
     def __init__(self) -> None:
         self._text_id = 0
         self._pieces: dict[int, str] = {}
         self._last: int | None = None
-        """Place of the piece with the end, once it has come."""
+        """Index of the last piece, once it has arrived."""
         self._since_ns = 0
 
     def receive(self, body: StatusText, now_ns: int) -> list[str]:
-        """Take a piece; returns the texts that are complete, or will not become so."""
+        """Add a piece; return the texts that are complete, or will not become so."""
         if body.text_id == 0:
             return [body.text.rstrip()]
         texts = [] if body.text_id == self._text_id else self._end()
@@ -68,7 +68,7 @@ class TextJoiner:
         return texts
 
     def step(self, now_ns: int) -> list[str]:
-        """The text whose missing pieces were waited for, if any."""
+        """Return the text whose missing pieces are overdue, if any."""
         return self._end() if now_ns - self._since_ns > _WAIT_NS else []
 
     def _end(self) -> list[str]:
@@ -83,13 +83,14 @@ class TextJoiner:
 
 
 RECEIVER_WAIT_NS = 2 * NS_PER_S
-"""Longest wait, once streams are granted, for RC_CHANNELS and SYS_STATUS to show a receiver:
-SYS_STATUS comes at 2 Hz, and some firmware sends RC_CHANNELS only if it has one."""
+"""Longest wait, after the streams are granted, for RC_CHANNELS and SYS_STATUS to show a receiver.
+SYS_STATUS comes at 2 Hz, and some firmware sends RC_CHANNELS only with a receiver."""
 HEARTBEAT_TIMEOUT_NS = 3 * NS_PER_S
-"""Heartbeats come at 1 Hz: a vehicle that loses three in a row is lost."""
+"""Three missed heartbeats at 1 Hz mean that the vehicle is lost."""
 _UPSET_NS = NS_PER_S
 _FASTEST_CLOCK, _BOOT_SLACK_NS = 10, NS_PER_S
-"""A vehicle that has rebooted runs for no longer than it was silent, by a simulator's clock too."""
+"""Bounds for a reboot: the new uptime must not exceed the silence, times the pace of the fastest
+simulator clock, plus a margin."""
 _VERSION_TIMEOUT_NS = 400 * NS_PER_MS
 _VERSION_ATTEMPTS = 8
 
@@ -97,7 +98,7 @@ _VERSION_ATTEMPTS = 8
 class VehicleSession:
     """One vehicle from its first heartbeat to its next reboot.
 
-    Reads its version, then its parameters, then requests its streams and keeps them coming.
+    Reads its version and its parameters, then requests its streams and keeps them coming.
     ``report`` shows a text to the user.
 
     Raises:
@@ -113,7 +114,7 @@ class VehicleSession:
         report: Callable[[str], None],
         has_slow_clock: Callable[[], bool] = lambda: False,
     ) -> None:
-        """``old_params``: filled with the values from before ``--set``, by name."""
+        """``old_params``: receives the values from before ``--set``, by name."""
         self.profile = require_profile(identity.autopilot, identity.vehicle_type)
         self.identity = identity
         self._report = report
@@ -122,9 +123,9 @@ class VehicleSession:
         )
         self._texts = TextJoiner()
         self.is_receiver_hidden = False
-        """Our sticks may stand in RC_CHANNELS in place of the receiver's."""
+        """True if RC_CHANNELS may show our sticks in place of the receiver's."""
         self.is_released = True
-        """Other sticks than ours were seen since, or none of ours was sent."""
+        """True if other sticks than ours were seen since the release, or none of ours was sent."""
         self.version: str | None = None
         self._version_attempts = 0
         self._version_due_ns = 0
@@ -134,34 +135,34 @@ class VehicleSession:
             self.profile, config, streams=streams, old_params=old_params, report=report
         )
         self._receiver_due_ns: int | None = None
-        """End of the wait for a receiver to show; None until the streams are granted."""
+        """Deadline for a receiver to appear; None until the streams are granted."""
         self._switch = Switch()
-        """Override switch; between high and low it stays as it was, as in the vehicle."""
+        """Override switch; between high and low it keeps its state, as in the vehicle."""
         self._boot_ms = 0
         self._stamped_ns = 0
         self._silent_ns = 0
-        """Silence before the first stamp that was old."""
+        """Silence before the first old timestamp."""
         self._old_stamps = 0
         self._upset: tuple[int, Reason] | None = None
         self._without_receiver: tuple[VehicleStatus, VehicleStatus] | None = None
-        """A status, and the same one without a receiver."""
+        """Cache of a status and its copy without a receiver."""
 
     def use_output(self, output: Output) -> None:
-        """Fly with this output from now on: its echo is asked for, its demands are checked."""
+        """Fly with this output from now on: request its echo, check its demands."""
         self.params.use_output(output)
         self._streams.add(self.profile.echo(output))
 
     def watch_home_height(self) -> None:
-        """Keep the height above home coming, often enough to fly by."""
+        """Request the height above home, often enough to fly by."""
         self._streams.add(HOME_HEIGHT)
 
     @property
     def has_rebooted(self) -> bool:
-        """Its clock has started again, no earlier than it was last heard."""
+        """True if the vehicle's clock has restarted since it was last heard."""
         return self._old_stamps >= RESTART_STAMPS
 
     def receive(self, message: ReceivedMessage, arrived_ns: int) -> None:
-        """Take one message from this vehicle."""
+        """Process one message from this vehicle."""
         self._streams.receive(message.name, message.sequence, arrived_ns)
         body = message.body
         if isinstance(body, ConditionMessage):
@@ -194,7 +195,7 @@ class VehicleSession:
         self.condition.receive_rc(
             rc,
             arrived_ns,
-            # Without a calibration the sticks are among the first four by custom.
+            # Without a calibration, the sticks are by convention the first four channels.
             channels_us=rc.channels_us[:4] if pwm_us is None else pwm_us,
             sticks=calibration.to_sticks(pwm_us)
             if calibration and pwm_us and all(pwm_us)
@@ -214,15 +215,15 @@ class VehicleSession:
             return
         if self._old_stamps == 0:
             self._silent_ns = silent_ns
-        self._old_stamps += 1  # one alone is a packet that was late
+        self._old_stamps += 1  # a single one is a late packet
         has_run_longer = boot_ms * NS_PER_MS > _FASTEST_CLOCK * self._silent_ns + _BOOT_SLACK_NS
-        if self._old_stamps >= RESTART_STAMPS and has_run_longer:  # the same flight, another clock
+        if self._old_stamps >= RESTART_STAMPS and has_run_longer:  # same flight, clock set back
             self._old_stamps, self._boot_ms = 0, boot_ms
             reason = because(Code.CLOCK_SET_BACK, back_s=back_us / 1_000_000)
             self.end_engagement(reason, arrived_ns)
 
     def step(self, now_ns: int) -> Iterator[Request]:
-        """Requests that are due."""
+        """Yield the requests that are due."""
         self._show(*self._texts.step(now_ns))
         is_version_open = self.version is None and self._version_attempts < _VERSION_ATTEMPTS
         if is_version_open and now_ns >= self._version_due_ns:
@@ -230,7 +231,7 @@ class VehicleSession:
             self._version_attempts += 1
             number = float(message_id("AUTOPILOT_VERSION"))
             yield CommandRequest(dialect.MAV_CMD_REQUEST_MESSAGE, (number,))
-        # Streams come after parameters: a vehicle slows its streams down while it sends those.
+        # Parameters first: a vehicle slows its streams down while it sends parameters.
         yield from self.params.step(now_ns, self.status(now_ns))
         if not self.params.is_read:
             return
@@ -244,16 +245,16 @@ class VehicleSession:
 
     @property
     def calibration(self) -> RcCalibration | None:
-        """The radio calibration to fly with; None before it is read, or if it cannot be used."""
+        """Radio calibration of the flight; None until it is read, or if it is unusable."""
         return self.params.calibration
 
     @property
     def known_params(self) -> Mapping[str, float]:
-        """All parameters that matter and that the vehicle has sent, by name."""
+        """Relevant parameters received from the vehicle, by name."""
         return self.params.values
 
     def unfinished(self, now_ns: int) -> Reason | None:
-        """The step of the set-up that is not finished, or None."""
+        """Return the unfinished step of the set-up, or None."""
         if not self.params.is_read:
             return because(Code.READING_PARAMETERS)
         if not self._streams.is_settled and self._streams.renewals == 0:
@@ -263,12 +264,12 @@ class VehicleSession:
         return None
 
     def _is_receiver_settled(self, now_ns: int) -> bool:
-        """Everything that tells of a receiver has come, or was waited for."""
+        """True if all messages that show a receiver have arrived, or the wait for them is over."""
         due_ns = self._receiver_due_ns
         return self.condition.has_seen_radio or (due_ns is not None and now_ns >= due_ns)
 
     def status(self, now_ns: int) -> VehicleStatus | None:
-        """The vehicle's own report; None before its first heartbeat."""
+        """Return the vehicle's status; None before its first heartbeat."""
         status = self.condition.status(now_ns)
         if status is None or not self._is_receiver_settled(now_ns):
             return status
@@ -280,7 +281,7 @@ class VehicleSession:
         return self._without_receiver[1]
 
     def problem(self, now_ns: int) -> Reason | None:
-        """The reason why it cannot be flown now, whatever the output, or None."""
+        """Return why the vehicle cannot be flown now with any output, or None."""
         if self.condition.heartbeat is None:
             return because(Code.NO_HEARTBEAT)
         if now_ns - self.condition.heartbeat[0] > HEARTBEAT_TIMEOUT_NS:
@@ -292,18 +293,18 @@ class VehicleSession:
         return self.params.problem()
 
     def end_engagement(self, reason: Reason, now_ns: int) -> None:
-        """Have ``problem`` give this reason for long enough to end an engagement in order."""
+        """Make ``problem`` return this reason, for long enough to end an engagement in order."""
         self._upset = now_ns, reason
 
     def output_problem(self, now_ns: int) -> Reason | None:
-        """The reason why it cannot be flown with the output now, or None."""
+        """Return why the vehicle cannot be flown now with the chosen output, or None."""
         if (forbidden := self.params.output_problem(self.status(now_ns))) is not None:
             return forbidden
         return self.switch_problem
 
     @property
     def switch_problem(self) -> Reason | None:
-        """The override switch that keeps our sticks out, or None."""
+        """Why the override switch blocks our sticks, or None."""
         switch = self.params.override_switch
         if switch is not None and not self._switch.is_on:
             return because(Code.OVERRIDE_SWITCH_NOT_ON, channel=switch)
@@ -311,5 +312,5 @@ class VehicleSession:
 
     @property
     def is_switched_off(self) -> bool:
-        """The pilot's override switch is low: the vehicle ignores our sticks."""
+        """True if the pilot's override switch is low, so that the vehicle ignores our sticks."""
         return self.params.override_switch is not None and self._switch.is_off

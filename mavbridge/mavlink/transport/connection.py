@@ -1,4 +1,4 @@
-"""Transport and codec together: messages in, packets out, reconnecting by itself."""
+"""Transport combined with the codec: receives messages, sends packets, reconnects by itself."""
 
 from collections.abc import Iterator
 from typing import Protocol, TypeAlias
@@ -13,12 +13,12 @@ from mavbridge.mavlink.transport.sockets import Address, Transport, TransportDow
 
 REOPEN_NS = NS_PER_S
 DRAIN_BUDGET_NS = 2 * NS_PER_MS
-"""Longest stretch of reading: a flood must not keep the guard from its next slot. What is
-left stays with the kernel, which drops what it cannot hold."""
+"""Time limit of one read pass, so that a flood does not delay the guard's next slot. The rest stays
+with the kernel, which drops packets that it cannot hold."""
 _UNCHECKED = "UNKNOWN"
-"""Begin of pymavlink's names for messages that the dialect lacks."""
+"""Prefix of pymavlink's names for messages that the dialect lacks."""
 REFUSED_NS = 100 * NS_PER_MS
-"""Time for which every packet is refused before that counts as a problem."""
+"""Time of refused sends after which they count as a problem."""
 
 
 SIGNED_VEHICLE = (
@@ -37,18 +37,18 @@ REFUSALS: dict[Refusal, str] = {
 
 
 class PacketLog(Protocol):
-    """Takes every packet that is received or sent; must neither wait nor raise."""
+    """Receives every packet that is received or sent; must neither block nor raise."""
 
     def put(self, packet: Packet, /) -> None:
-        """Take the packet, or drop and count it."""
+        """Record the packet, or drop and count it."""
 
 
 Arrival: TypeAlias = tuple[ReceivedMessage, int, Address | None]
-"""A message with its arrival in ns and the address that it came from; plain, as it is hot."""
+"""Message, arrival [ns] and source address; a plain tuple for speed."""
 
 
 class Connection:
-    """Packets in and out; used by one thread, and never waits."""
+    """Non-blocking packet input and output; not thread-safe."""
 
     def __init__(
         self,
@@ -63,21 +63,22 @@ class Connection:
         self._log = log
         self._reopen_ns: int | None = None
         self._refused_ns: int | None = None
-        """First of the packets that were refused since the last one that was taken."""
+        """First refused send since the last successful one."""
         self.peer: Address | None = None
         """The vehicle's address, to which packets are sent; None until it is found."""
         self.texts: list[str] = []
         """Messages for the user, until `take_texts`."""
         self.received_bytes = 0
         self.received_packets = 0
-        """Those whose checksum could be tried: noise looks like packets of unknown messages."""
+        """Number of packets with a valid checksum; noise looks like packets of unknown messages,
+        which have none to test."""
         self._told: list[str] = []
         self._opened = 0
         self._open(clock.now_ns())
 
     @property
     def is_down(self) -> bool:
-        """The transport is lost and not open again yet."""
+        """True if the transport is lost and not reopened yet."""
         return self._reopen_ns is not None
 
     def _open(self, now_ns: int) -> None:
@@ -94,18 +95,18 @@ class Connection:
         self._codec.forget_partial()
 
     def take_texts(self) -> tuple[str, ...]:
-        """Messages for the user since the last call."""
+        """Return the messages for the user since the last call."""
         texts = tuple(self.texts)
         self.texts.clear()
         return texts
 
     def fileno(self) -> int | None:
-        """Descriptor to wait for with ``select``; None while there is none."""
+        """Return the descriptor for ``select``; None while there is none."""
         return None if self.is_down else self._transport.fileno()
 
     @property
     def outlet(self) -> Outlet:
-        """Where packets leave now."""
+        """Present outlet of packets."""
         fd = self.fileno()
         return Outlet(self._opened, fd, None if fd is None else self._transport.receiver(self.peer))
 
@@ -115,7 +116,7 @@ class Connection:
         self.texts.append(f"connection lost ({error}); reconnecting")
 
     def receive(self) -> Iterator[Arrival]:
-        """Messages that have arrived; opens the transport again when that is due."""
+        """Yield the messages that have arrived; reopen the transport when that is due."""
         now_ns = self._clock.now_ns()
         if self._reopen_ns is not None:
             if now_ns < self._reopen_ns:
@@ -138,7 +139,7 @@ class Connection:
             self._lose(error, self._clock.now_ns())
 
     def _notice_signatures(self) -> None:
-        """Tell the user, once each, of packets whose signatures do not fit."""
+        """Report rejected signatures to the user, each kind once."""
         signing = self._codec.signing
         if signing is None:
             reasons = [self.hint] if self.hint else []
@@ -150,15 +151,15 @@ class Connection:
 
     @property
     def hint(self) -> str | None:
-        """What may be the reason if the vehicle does not answer, or None."""
+        """Possible reason why the vehicle does not answer, or None."""
         return SIGNED_VEHICLE if self._codec.hears_signed else None
 
     def is_refused(self, now_ns: int) -> bool:
-        """True if the system has taken none of our packets for ``REFUSED_NS``."""
+        """True if the system has refused all our packets for ``REFUSED_NS``."""
         return self._refused_ns is not None and now_ns - self._refused_ns >= REFUSED_NS
 
     def send(self, data: bytes) -> bool:
-        """Send one packet; False: it was not sent."""
+        """Send one packet; return False if it was not sent."""
         if self.is_down:
             return False
         try:
@@ -172,5 +173,5 @@ class Connection:
         return is_sent
 
     def close(self) -> None:
-        """Free the socket or port."""
+        """Close the socket or port."""
         self._transport.close()

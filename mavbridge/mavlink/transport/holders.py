@@ -1,4 +1,4 @@
-"""Says why a port or a device cannot be had, and on Linux which process holds it."""
+"""Reasons why a port or device cannot be opened and, on Linux, the process that holds it."""
 
 import errno
 from collections.abc import Iterator
@@ -13,7 +13,7 @@ _GUARD = ("mavbridge.guard", "mavbridge/guard/")
 
 
 def udp_obstacle(address: SocketAddress, error: OSError) -> str:
-    """What to do about an address on which we cannot listen."""
+    """Return advice about an address on which we cannot listen."""
     if error.errno == errno.EADDRINUSE:
         return f"{udp_holder(address[1])}, or choose another port"
     if error.errno == errno.EADDRNOTAVAIL:
@@ -22,7 +22,7 @@ def udp_obstacle(address: SocketAddress, error: OSError) -> str:
 
 
 def serial_obstacle(device: str, error: OSError | ValueError) -> str:
-    """What keeps a serial port from us, and what to do about it."""
+    """Return the obstacle to opening a serial port, with advice."""
     if isinstance(error, FileNotFoundError) or not Path(device).exists():
         names = ", ".join(sorted(info.device for info in list_ports.comports()))
         here = f"present: {names}" if names else "this computer has none: is it plugged in?"
@@ -30,7 +30,7 @@ def serial_obstacle(device: str, error: OSError | ValueError) -> str:
     code = getattr(error, "errno", None)
     if code == errno.EACCES:
         return "no permission: join its group (sudo usermod -aG dialout $USER, then log in anew)"
-    if code == errno.ENOTTY or "ioctl" in str(error):  # pyserial may keep the number to itself
+    if code == errno.ENOTTY or "ioctl" in str(error):  # pyserial may hide the number
         return "it is no serial port"
     holder = device_holder(device)
     if holder or code in (errno.EBUSY, errno.EAGAIN):
@@ -39,13 +39,13 @@ def serial_obstacle(device: str, error: OSError | ValueError) -> str:
 
 
 def udp_holder(port: int, proc: Path = _PROC) -> str:
-    """Who is bound to a local UDP port, as far as can be found out, and what to do about it."""
+    """Return the process bound to a local UDP port, as far as known, with advice."""
     holder = _holder({f"socket:[{inode}]" for inode in _udp_inodes(port, proc)}, proc)
     return holder or "another program listens there: stop it"
 
 
 def device_holder(device: str, proc: Path = _PROC) -> str:
-    """Who has a device open and what to do about it, after a semicolon; empty if not found."""
+    """Return "; ", the process that has a device open, and advice; empty if not found."""
     holder = _holder({str(Path(device).resolve())}, proc)
     return f"; {holder}" if holder else ""
 
@@ -68,7 +68,7 @@ def _holder(targets: set[str], proc: Path) -> str | None:
             if targets.isdisjoint(str(fd.readlink()) for fd in (process / "fd").iterdir()):
                 continue
             words = (process / "cmdline").read_bytes().decode(errors="replace").split("\0")
-        except OSError:  # it has ended, or belongs to another user
+        except OSError:  # the process has ended, or belongs to another user
             continue
         line = " ".join(words).strip()
         if any(word.startswith(_GUARD[0]) or _GUARD[1] in word for word in words):

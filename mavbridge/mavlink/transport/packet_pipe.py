@@ -1,4 +1,4 @@
-"""Packets into the pipe of a recording, from the process that must not wait for anything."""
+"""Non-blocking pipe from the guard to the recording of packets."""
 
 import fcntl
 import os
@@ -15,27 +15,27 @@ _LINK_MASK = 0b11
 
 
 class PacketPipe:
-    """A ``PacketLog`` that writes a telemetry log, as MAVProxy and the ground stations read it.
+    """``PacketLog`` that writes a telemetry log in the format of MAVProxy and ground stations.
 
-    Eight bytes precede every packet: Unix time in microseconds, big-endian. Its lowest two bits are
-    the number of the link (pymavlink's mavlogfile reads them so), here always 0. A record goes into
-    the pipe whole or not at all, without waiting (pipe(7): writes up to PIPE_BUF bytes are atomic).
+    Eight bytes precede every packet: Unix time in microseconds, big-endian. The lowest two bits are
+    the link number (as in pymavlink's mavlogfile), here always 0. A record is written to the pipe
+    whole or not at all, without blocking (pipe(7): writes up to PIPE_BUF bytes are atomic).
     """
 
     def __init__(self, fd: int, *, wall_offset_ns: int) -> None:
-        """Take over the write end of a pipe; the offset leads from stamps to Unix time."""
+        """Take over the write end of a pipe; ``wall_offset_ns`` converts stamps to Unix time."""
         os.set_blocking(fd, False)
         if hasattr(fcntl, "F_SETPIPE_SZ"):
-            with suppress(OSError):  # the user has many pipes: the usual 64 KiB must do
+            with suppress(OSError):  # the user's pipe quota is used up: keep the default of 64 KiB
                 fcntl.fcntl(fd, fcntl.F_SETPIPE_SZ, PIPE_BYTES)
         self._fd: int | None = fd
         self._offset_ns = wall_offset_ns
         self._has_reader = True
         self.dropped = 0
-        """Packets that are not in the log: the pipe was full, or its reader is gone."""
+        """Number of packets missing from the log because the pipe was full or its reader gone."""
 
     def put(self, packet: Packet, /) -> None:
-        """Write the packet, or drop and count it; neither waits nor raises."""
+        """Write the packet, or drop and count it; neither block nor raise."""
         stamp_us = (packet.stamp_ns + self._offset_ns) // 1000 & ~_LINK_MASK
         record = _STAMP.pack(stamp_us) + packet.data
         if self._fd is None or not self._has_reader or len(record) > select.PIPE_BUF:
@@ -45,12 +45,12 @@ class PacketPipe:
             os.write(self._fd, record)
         except BlockingIOError:
             self.dropped += 1
-        except OSError:  # Python ignores SIGPIPE, so a reader that is gone is an error like others
+        except OSError:  # reader gone: an error, since Python ignores SIGPIPE
             self.dropped += 1
             self._has_reader = False
 
     def close(self) -> None:
-        """Let the reader see the end of the log. May be called twice."""
+        """Close the pipe: the reader sees the end of the log. Safe to call twice."""
         fd, self._fd = self._fd, None
         if fd is not None:
             os.close(fd)

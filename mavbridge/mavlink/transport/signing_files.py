@@ -1,4 +1,4 @@
-"""The key of MAVLink 2 signing, and what of it must survive a restart, in files."""
+"""Files of MAVLink 2 signing: the key, and the state that must survive a restart."""
 
 import hashlib
 import json
@@ -23,25 +23,26 @@ from mavbridge.mavlink.codec.signing import (
 
 SAVE_S = 10.0
 AHEAD_TICKS = 2 * round(SAVE_S) * NS_PER_S // TICK_NS
-"""Saved beyond the time of day while packets are sent: used until the next save, and once more."""
+"""Reserve of timestamps beyond the wall time, saved while packets are sent: lasts until the next
+save, and for one save more."""
 MOST_PACKETS = 2 * round(SAVE_S) * 2000
-"""Saved beyond the newest timestamp where that is ahead of the time of day and rises by one tick a
-packet, of which 2,000 a second are more than any link carries."""
+"""Reserve beyond the newest timestamp if that is ahead of the wall time and rises by one tick per
+packet; no link carries 2,000 packets per second."""
 JOIN_S = 2.0
 MOST_BYTES = 1024
 _MADE = "make one with: (umask 077; openssl rand -hex 32 > FILE)"
 
 
 def read_key(path: Path) -> bytes:
-    """The 32 bytes of a key file, which holds them as they are, or as 64 hexadecimal digits.
+    """Return the 32 bytes of a key file, which holds them raw or as 64 hexadecimal digits.
 
-    No message tells any of them.
+    No error text contains any of them.
 
     Raises:
-        UserError: it cannot be read, others may read it, or it is no key.
+        UserError: the file cannot be read, others may read it, or it holds no key.
     """
     try:
-        # A pipe without a writer must not hold us up.
+        # A pipe without a writer must not block.
         with os.fdopen(os.open(path, os.O_RDONLY | os.O_NONBLOCK), "rb") as file:
             mode, data = os.fstat(file.fileno()).st_mode, file.read(MOST_BYTES)
     except OSError as error:
@@ -75,16 +76,16 @@ def _key(data: bytes) -> bytes | None:
 
 
 class SigningStore:
-    """A ``Signing`` whose timestamps go on where an earlier process with this key has ended.
+    """``Signing`` with timestamps that continue those of an earlier process with this key.
 
-    A thread of its own saves them, since a disk may take its time.
+    A separate thread saves them, since a disk may be slow.
     """
 
     def __init__(self, files: SigningFiles, clock: Clock) -> None:
-        """Read the key and the state; nothing is written before the context begins.
+        """Read the key and the state; nothing is written before the context is entered.
 
         Raises:
-            UserError: as ``read_key``; or the state is damaged.
+            UserError: as ``read_key``, or the state is damaged.
         """
         key = read_key(files.key_file)
         name = hashlib.sha256(b"name of the state of " + key).hexdigest()[:16]
@@ -94,7 +95,7 @@ class SigningStore:
             key, unix_ns=lambda: clock.now_ns() + offset_ns, state=_read_state(self.path)
         )
         self.problem: str | None = None
-        """Why the timestamps cannot be kept."""
+        """Why the timestamps cannot be saved, or None."""
         self._stop = threading.Event()
         self._thread = threading.Thread(target=self._run, name="mavbridge-signing", daemon=True)
 
@@ -105,7 +106,7 @@ class SigningStore:
         return self.signing
 
     def __exit__(self, *_: object) -> None:
-        """Save the newest timestamp itself: what was reserved beyond it was not used."""
+        """Save the newest used timestamp, without the unused reserve."""
         self._stop.set()
         self._thread.join(JOIN_S)
 
@@ -116,7 +117,7 @@ class SigningStore:
 
     def _save(self, *, is_over: bool) -> None:
         sent_ticks, heard = self.signing.state
-        if not is_over:  # not from what an earlier start has reserved: each would gain 20 s
+        if not is_over:  # not from an earlier reserve: each start would gain 20 s
             now_ticks = self.signing.now_ticks
             sent_ticks = max(sent_ticks + MOST_PACKETS, now_ticks + AHEAD_TICKS)
         streams = {"/".join(map(str, stream)): ticks for stream, ticks in heard.items()}

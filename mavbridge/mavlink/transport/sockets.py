@@ -1,4 +1,4 @@
-"""Bytes in and out of a socket or serial port, never blocking, with the kernel's arrival stamps."""
+"""Non-blocking sockets and serial ports, with the kernel's arrival stamps."""
 
 import contextlib
 import errno
@@ -33,30 +33,30 @@ from mavbridge.mavlink.transport.holders import serial_obstacle, udp_obstacle
 Address: TypeAlias = SocketAddress
 
 TCP_SILENCE_NS = 5 * NS_PER_S
-"""Heartbeats come at 1 Hz: a connection this quiet is dead, even if the kernel has not noticed."""
+"""Silence that means a dead connection, known to the kernel or not: heartbeats come at 1 Hz."""
 TCP_FIRST_S = 3.0
-"""Longest wait for the answer to the first attempt to connect; nothing else waits for it then."""
+"""Longest wait for the answer to the first connection attempt, during which nothing else waits."""
 STALE_NS = 100 * NS_PER_MS
-"""Oldest byte that may wait in a serial port's queue: the usual limit of a state's age."""
+"""Longest time for a byte in a serial port's queue: the usual age limit of a state."""
 _TCP_STALE_MS = 500
-"""Longest time for which a TCP connection may leave sent bytes unanswered; then it is closed, and
-the sticks that wait in the kernel with it. As long as until sticks that nobody hears are known."""
+"""Longest time for which sent bytes may stay unacknowledged on TCP. Then the connection closes, and
+discards the sticks queued in the kernel. Equal to the detection time of unheard sticks."""
 _CHUNK_BYTES = 65536
 _STREAM_BYTES = 2048
-"""A piece of a TCP stream: some fifty packets, after which a reader may leave the rest."""
+"""Bytes read from a TCP stream at once: some fifty packets, after which a reader may stop."""
 _ERRORS_A_DRAIN = 16
-"""Answers of the network to earlier sends that one drain skips."""
+"""Errors of earlier sends that one drain skips."""
 _SERIAL_BITS = 10
-"""Bits on the wire of one byte: 8, and a start and a stop bit."""
+"""Bits per byte on the wire: 8 data bits, a start and a stop bit."""
 _STAMP_STEP_NS = 2 * NS_PER_MS
-"""A backlog of a serial port that took longer than this to arrive gets several stamps."""
+"""A serial backlog that took longer than this to arrive gets several stamps."""
 _SO_TIMESTAMPNS = 35
-"""asm-generic/socket.h; Python's socket module does not name it."""
+"""From asm-generic/socket.h; Python's socket module lacks it."""
 _TIMESPEC = struct.Struct("@qq")
 
 
 class Received(NamedTuple):
-    """Bytes as they arrived."""
+    """Received bytes and their arrival."""
 
     data: bytes
     arrived_ns: int
@@ -65,37 +65,36 @@ class Received(NamedTuple):
 
 
 class TransportDownError(Exception):
-    """The peer or the port is gone; closing and opening again may help."""
+    """The peer or the port is gone; reopening may help."""
 
 
 class Transport(Protocol):
-    """A non-blocking connection to a vehicle; used by one thread."""
+    """Non-blocking connection to a vehicle; not thread-safe."""
 
     def open(self) -> None:
-        """Acquire the socket or port; raises UserError if trying again will not help, and
-        TransportDownError if it may."""
+        """Open the socket or port; raise UserError, or TransportDownError if a retry may help."""
         return
 
     def drain(self) -> Iterator[Received]:
-        """Everything that has arrived. Raises TransportDownError when the connection is lost."""
+        """Yield everything that has arrived. Raise TransportDownError if the connection is lost."""
 
     def fileno(self) -> int | None:
-        """Descriptor that turns readable when ``drain`` has something to yield; None if closed."""
+        """Return the descriptor that is readable when ``drain`` has data; None if closed."""
         return None
 
     def receiver(self, peer: Address | None) -> Address | None:
-        """Address to which ``send`` sends; None on a stream, or if there is none yet."""
+        """Return the destination of ``send``; None on a stream, or if there is none yet."""
         return None
 
     def send(self, data: bytes, peer: Address | None = None) -> bool:
-        """Hand one whole packet to the kernel; False: dropped, because it cannot be sent now.
+        """Hand one whole packet to the kernel; return False if it had to be dropped.
 
-        ``peer`` is the receiver of a datagram where we listen; nothing else heeds it. Raises
-        TransportDownError when the connection is lost.
+        ``peer``: destination of a datagram if we listen, else ignored. Raise TransportDownError if
+        the connection is lost.
         """
 
     def close(self) -> None:
-        """Free the socket or port; may be called twice."""
+        """Close the socket or port; safe to call twice."""
         return
 
 
@@ -103,7 +102,7 @@ _Handle = TypeVar("_Handle", socket.socket, serial.Serial)
 
 
 class _FileTransport(Transport, Generic[_Handle]):
-    """A socket or port. A stream may take a part of a packet: the rest goes before the next one."""
+    """Socket or port. A stream may accept part of a packet: the rest precedes the next one."""
 
     def __init__(self, clock: Clock) -> None:
         self._clock = clock
@@ -116,7 +115,7 @@ class _FileTransport(Transport, Generic[_Handle]):
         return None if self._handle is None else self._handle.fileno()
 
     def close(self) -> None:
-        """See `Transport`. The flight process may have the file open, too: it is ended first."""
+        """See `Transport`. Ends the connection first: the flight process may have it open too."""
         if self._handle is not None:
             with contextlib.suppress(OSError):  # the port may be gone already
                 self._end(self._handle)
@@ -125,10 +124,10 @@ class _FileTransport(Transport, Generic[_Handle]):
             self._handle, self._unsent = None, b""
 
     def _end(self, handle: _Handle) -> None:
-        """End what would outlive ``close`` for as long as another process has the file open."""
+        """End whatever would outlive ``close`` while another process has the file open."""
 
     def _put(self, data: bytes, write: Callable[[bytes], int]) -> bool:
-        """Write the packet, or drop it whole; raises OSError as ``write`` does."""
+        """Write the packet, or drop it whole; raise OSError as ``write`` does."""
         try:
             if self._unsent:
                 self._unsent = self._unsent[write(self._unsent) :]
@@ -163,7 +162,7 @@ class UdpTransport(_FileTransport[socket.socket]):
         self._handle = udp
 
     def drain(self) -> Iterator[Received]:
-        """Datagrams, with the kernel's arrival stamp where there is one."""
+        """Yield datagrams, with the kernel's arrival stamp if there is one."""
         errors = 0
         while self._handle is not None and errors < _ERRORS_A_DRAIN:
             try:
@@ -171,7 +170,7 @@ class UdpTransport(_FileTransport[socket.socket]):
             except BlockingIOError:
                 return
             except OSError:
-                errors += 1  # the network's answer to an earlier send: nobody listens there yet
+                errors += 1  # answer to an earlier send: nothing listens there yet
                 continue
             yield Received(data, self._arrival_ns(control), sender)
 
@@ -180,7 +179,7 @@ class UdpTransport(_FileTransport[socket.socket]):
         for level, kind, payload in control:
             if level == socket.SOL_SOCKET and kind == _SO_TIMESTAMPNS:
                 seconds, nanoseconds = _TIMESPEC.unpack(payload[: _TIMESPEC.size])
-                # The stamp is wall time: only its distance from now is used.
+                # The stamp is wall time: use only its distance from now.
                 stamp_ns: int = seconds * NS_PER_S + nanoseconds
                 queued_ns = time.clock_gettime_ns(time.CLOCK_REALTIME) - stamp_ns
                 return now_ns - min(max(queued_ns, 0), NS_PER_S)
@@ -191,10 +190,10 @@ class UdpTransport(_FileTransport[socket.socket]):
         return peer if self._listen else self._address
 
     def send(self, data: bytes, peer: Address | None = None) -> bool:
-        """Send one datagram to the peer, if there is one and it can be reached now."""
+        """Send one datagram to the peer, if there is one and it is reachable now."""
         receiver = self.receiver(peer)
         if self._handle is not None and receiver is not None:
-            with contextlib.suppress(OSError):  # full buffer, no route, nobody listens
+            with contextlib.suppress(OSError):  # full buffer, no route, no listener
                 self._handle.sendto(data, receiver)
                 return True
         return False
@@ -209,9 +208,9 @@ class TcpTransport(_FileTransport[socket.socket]):
         self._is_connected, self._heard_ns = False, 0
 
     def open(self) -> None:
-        """Connect: the first time wait for the answer, later ``drain`` finds out.
+        """Connect. The first time, wait for the answer; later, ``drain`` detects it.
 
-        Raises PeerError if nobody answers the first time.
+        Raise PeerError if the first attempt gets no answer.
         """
         tcp = new_socket(self._address, socket.SOCK_STREAM)
         tcp.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
@@ -241,7 +240,7 @@ class TcpTransport(_FileTransport[socket.socket]):
         return TransportDownError(f"tcp {spelled(*self._address)}: {reason}")
 
     def drain(self) -> Iterator[Received]:
-        """Bytes received so far."""
+        """Yield the bytes received so far."""
         while self._handle is not None:
             try:
                 data = self._handle.recv(_STREAM_BYTES)
@@ -281,11 +280,11 @@ class SerialTransport(_FileTransport[serial.Serial]):
         super().__init__(clock)
         self._device, self._baud = device, baud
         self._backlog: deque[Received] = deque()
-        """Read, but not drained yet."""
+        """Bytes read but not yet drained."""
         self._emptied_ns = 0
-        """When the port was last seen empty: what comes later arrived later."""
+        """Last time at which the port was seen empty: later bytes arrived later."""
         self._written: deque[tuple[int, int]] = deque()
-        """Size and moment of what may still wait in the port's queue."""
+        """Size and time of the writes that may still wait in the port's queue."""
 
     def open(self) -> None:
         """Open the port, non-blocking and exclusive."""
@@ -304,20 +303,20 @@ class SerialTransport(_FileTransport[serial.Serial]):
         self._emptied_ns = self._clock.now_ns()
 
     def _end(self, handle: serial.Serial) -> None:
-        fcntl.flock(handle.fileno(), fcntl.LOCK_UN)  # that of ``exclusive``
+        fcntl.flock(handle.fileno(), fcntl.LOCK_UN)  # the lock of ``exclusive``
 
     def _down(self, error: Exception | str) -> TransportDownError:
         return TransportDownError(f"serial {self._device}: {error}")
 
     def drain(self) -> Iterator[Received]:
-        """Bytes received so far, in pieces whose stamps tell when they came over the wire."""
+        """Yield the bytes received so far, in pieces stamped with their time on the wire."""
         if not self._backlog:
             self._read()
         while self._backlog:
             yield self._backlog.popleft()
 
     def _read(self) -> None:
-        """Read all there is. The last byte came just now, each one before it a byte time earlier.
+        """Read everything. The last byte arrived now, each earlier one a byte time before the next.
 
         Bypasses pyserial, which reads no more than the kernel's line buffer of 4,095 bytes.
         """
@@ -360,10 +359,12 @@ class SerialTransport(_FileTransport[serial.Serial]):
         return size
 
     def _drop_stale(self, port: serial.Serial) -> None:
-        """Empty the port's queue when its oldest byte waits for too long: nobody takes them now,
-        and sticks that old must not be taken later. A packet may be cut; its checksum shows it.
+        """Empty the port's queue if its oldest byte is stale.
 
-        A driver that does not tell its queue, such as a pseudo-terminal, keeps it.
+        No one reads it now, and sticks that old must not act later. A packet may be cut; its
+        checksum shows it.
+
+        Drivers that do not report their queue, such as pseudo-terminals, keep it.
         """
         waiting = port.out_waiting
         extra = sum(size for size, _ in self._written) - waiting
@@ -376,9 +377,9 @@ class SerialTransport(_FileTransport[serial.Serial]):
 
 
 def make_transport(spec: str, clock: Clock) -> Transport:
-    """The transport for an address as ``address.parse_address`` reads it, not opened yet.
+    """Return an unopened transport for an address in the syntax of ``address.parse_address``.
 
-    Raises UserError if it is not understood, or its host does not exist.
+    Raise UserError if the address is malformed, or its host does not exist.
     """
     match parse_address(spec):
         case UdpAddress(host, port, listens):
@@ -390,7 +391,7 @@ def make_transport(spec: str, clock: Clock) -> Transport:
 
 
 def new_socket(address: Address, kind: socket.SocketKind) -> socket.socket:
-    """Make a socket that never blocks, for this address; raises UserError without IPv6."""
+    """Create a non-blocking socket for this address; raise UserError without IPv6."""
     try:
         made = socket.socket(family(address), kind)
     except OSError as error:

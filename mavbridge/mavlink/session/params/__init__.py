@@ -1,1 +1,1 @@
-"""One vehicle's parameters: read, checked before a flight, set for it and put back after it."""
+"""Parameters of one vehicle: read, checked before a flight, set for it and restored after it."""

@@ -1,4 +1,4 @@
-"""Parameters, and the capacity of a serial port, judged for a flight with one output."""
+"""Checks of the parameters and of a serial port's capacity, for a flight with one output."""
 
 from collections.abc import Container, Iterable, Mapping
 from typing import NamedTuple
@@ -21,27 +21,27 @@ _FRAME_BYTES = 12
 _OVERRIDE_BYTES = 30
 """RC_CHANNELS_OVERRIDE of eight channels; MANUAL_CONTROL is shorter."""
 _OTHERS_BYTES_PER_S = 500
-"""Heartbeats, TIMESYNC and requests, in either direction."""
+"""Heartbeats, TIMESYNC and requests, per direction."""
 _BITS_PER_BYTE = 10
 """One start bit, eight data bits, one stop bit."""
 _STANDARD_BAUDS = (57600, 115200, 230400, 460800, 921600, 1500000, 3000000)
 
 
 class Assessment(NamedTuple):
-    """One set of parameters, judged."""
+    """Result of checking one set of parameters."""
 
     calibration: RcCalibration | None
     unusable: str | None
-    """Why there is no calibration, although the output needs one."""
+    """Why a calibration that the output needs is missing; None: it is not."""
     override_switch: int | None
     """Number of the channel that enables the output."""
     obstacles: tuple[ParamNote, ...]
-    """Reasons for which the vehicle would not do as it is told."""
+    """Reasons why the vehicle would not follow our commands."""
     dangers: tuple[Danger, ...]
-    """Accepted ones included."""
+    """All dangers, including accepted ones."""
 
     def endangers(self, before: "Assessment", *, accepted: Container[Risk]) -> bool:
-        """True if this set of parameters must end a flight that was begun with the other."""
+        """True if these parameters must end a flight that began with ``before``."""
         new_risks = {danger.risk for danger in self.dangers} - {d.risk for d in before.dangers}
         return (
             self.calibration != before.calibration
@@ -53,7 +53,7 @@ class Assessment(NamedTuple):
 
 
 def assess(profile: Profile, values: Mapping[str, float], context: ParamContext) -> Assessment:
-    """Judge the parameters of a vehicle of this firmware."""
+    """Check the parameters of a vehicle of this firmware."""
     is_override = context.output == "rc-override"
     ours: RcCalibration | None = None
     unusable: str | None = None
@@ -71,7 +71,7 @@ def assess(profile: Profile, values: Mapping[str, float], context: ParamContext)
 
 
 def received_bytes_per_s(streams: Iterable[StreamGroup]) -> float:
-    """Need of these streams, in their longest form, without those that seldom come."""
+    """Return the bandwidth of these streams with full-length messages, rare ones excluded."""
     return _OTHERS_BYTES_PER_S + sum(
         stream.rate_hz * (_FRAME_BYTES + _payload_bytes(stream.messages[0]))
         for stream in streams
@@ -85,14 +85,14 @@ def _payload_bytes(name: str) -> int:
 
 
 def sent_bytes_per_s(stick_hz: float) -> float:
-    """Need of our sticks."""
+    """Return the bandwidth of our sticks."""
     return _OTHERS_BYTES_PER_S + stick_hz * _OVERRIDE_BYTES
 
 
 def serial_dangers(
     baud: int | None, *, streams: Iterable[StreamGroup], stick_hz: float
 ) -> tuple[Danger, ...]:
-    """The danger of a port whose baud rate is too low; ``baud`` None: not a serial port.
+    """Return the danger of a baud rate that is too low; ``baud`` None: not a serial port.
 
     A serial port carries both directions at once, so the fuller one decides.
     """

@@ -1,4 +1,4 @@
-"""Parameters that are set for one flight and put back at its orderly end."""
+"""Parameters that are set for one flight and restored at its normal end."""
 
 import math
 from collections.abc import Callable, Iterator, Mapping
@@ -9,22 +9,22 @@ from mavbridge.core.reasons import Code, Reason, because
 from mavbridge.mavlink.codec.messages import ParamRequest, ParamValue, ParamWrite
 
 _TIMEOUT_NS = 500 * NS_PER_MS
-"""Longer than a read: the vehicle stores the value, and a telemetry radio is slow."""
+"""Longer than for a read: the vehicle stores the value, and a telemetry radio is slow."""
 _ATTEMPTS = 6
 
 
 def is_same(one: float, other: float) -> bool:
-    """Equal as far as PARAM_VALUE's float32 can tell."""
+    """True if the values are equal in PARAM_VALUE's float32."""
     return math.isclose(one, other, rel_tol=1e-6, abs_tol=1e-9)
 
 
 class _Write:
-    """One parameter until the vehicle confirms it, six requests at most."""
+    """Write of one parameter until the vehicle confirms it, with at most six requests."""
 
     def __init__(self, value: float) -> None:
         self.value = value
         self.answer: float | None = None
-        """Value that the vehicle named last; perhaps in answer to an older request."""
+        """Value that the vehicle reported last, perhaps in answer to an older request."""
         self.requested_ns = 0
         self.attempts = 0
 
@@ -35,7 +35,7 @@ class _Write:
 
 class _Phase(Enum):
     WAITING = auto()
-    """Values are on their way, or the vehicle is armed or its state not known."""
+    """Values are still arriving, or the vehicle is armed, or its state is unknown."""
     WRITING = auto()
     READY = auto()
     RESTORING = auto()
@@ -43,9 +43,9 @@ class _Phase(Enum):
 
 
 class TemporaryParams:
-    """Set the wanted parameters of a disarmed vehicle, and put the old values back.
+    """Sets the wanted parameters of a disarmed vehicle, and restores the old values.
 
-    A flight that is killed leaves them set: the log has the old values.
+    A killed flight leaves them set; the log has the old values.
     """
 
     def __init__(
@@ -55,7 +55,7 @@ class TemporaryParams:
         before: dict[str, float],
         report: Callable[[str], None],
     ) -> None:
-        """``before``: old values of what is set, by name; outlives a reboot of the vehicle."""
+        """``before``: old values of changed parameters, by name; outlives a vehicle's reboot."""
         self._wanted = dict(wanted)
         self._before = before
         self._report = report
@@ -66,7 +66,7 @@ class TemporaryParams:
         self._open: dict[str, _Write] = {}
 
     def problem(self) -> Reason | None:
-        """Why a flight may not begin yet, or None."""
+        """Return why a flight may not begin yet, or None."""
         if self._failures:
             return next(iter(self._failures.values()))
         if self._phase not in (_Phase.WAITING, _Phase.WRITING):
@@ -75,11 +75,11 @@ class TemporaryParams:
 
     @property
     def is_settled(self) -> bool:
-        """Nothing is being set any more."""
+        """True if no write is outstanding."""
         return self._phase in (_Phase.READY, _Phase.ENDED)
 
     def receive(self, param: ParamValue) -> None:
-        """Take a PARAM_VALUE: a confirmation, or a value that the pilot has mended meanwhile."""
+        """Process a PARAM_VALUE: a confirmation, or a value that the pilot has corrected."""
         write = self._open.get(param.name)
         if write is not None and write.attempts and not write.is_confirmed:
             write.answer = param.value
@@ -89,9 +89,9 @@ class TemporaryParams:
     def step(
         self, now_ns: int, values: Mapping[str, float], *, is_complete: bool, is_disarmed: bool
     ) -> Iterator[ParamWrite | ParamRequest]:
-        """Return the requests that are due.
+        """Yield the requests that are due.
 
-        ``values`` are all that the vehicle has sent; ``is_complete``: no more is on its way.
+        ``values``: all values received from the vehicle; ``is_complete``: no more will arrive.
         """
         self._is_disarmed = is_disarmed
         if self._is_ending and self._phase not in (_Phase.RESTORING, _Phase.ENDED):
@@ -111,7 +111,7 @@ class TemporaryParams:
             self._phase = _Phase.READY if self._phase is _Phase.WRITING else _Phase.ENDED
 
     def _write(self, now_ns: int) -> Iterator[ParamWrite | ParamRequest]:
-        """Requests that are due.
+        """Yield the write requests that are due.
 
         A repetition also reads the value: a vehicle that has it already may not answer a write.
         """
@@ -136,7 +136,7 @@ class TemporaryParams:
                 self._open[name] = _Write(value)
 
     def _conclude(self, name: str) -> None:
-        """Tell how the write of this parameter has ended."""
+        """Report the outcome of this parameter's write."""
         write = self._open.pop(name)
         asked, answer = write.value, write.answer
         if self._phase is _Phase.RESTORING:
@@ -158,9 +158,9 @@ class TemporaryParams:
                 del self._before[name]
 
     def restore(self) -> bool:
-        """Put everything back that was set, in the next steps.
+        """Restore all changed parameters in the next steps.
 
-        True: nothing is left to put back, or no more can be done about it now.
+        Return True if everything is restored, or nothing more can be done now.
         """
         self._is_ending = True
         return self._phase is _Phase.ENDED or not self._wanted
@@ -174,7 +174,7 @@ class TemporaryParams:
                 self._report(f"{name} was set to {now:g} by another station: it is left so")
                 del self._before[name]
             elif self._is_disarmed:
-                # Also if it seems to have its old value: a write may be on its way.
+                # Also if it shows the old value: a write may be under way.
                 self._open[name] = _Write(before)
         if not self._is_disarmed:
             self._report_what_stays()

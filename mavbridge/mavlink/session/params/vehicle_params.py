@@ -1,4 +1,4 @@
-"""Everything that the bridge knows, demands and changes of one vehicle's parameters."""
+"""Parameters of one vehicle: known values, demands of the flight, and changes for it."""
 
 import math
 from collections.abc import Callable, Iterator, Mapping
@@ -21,20 +21,20 @@ _ATTEMPTS = 4
 
 
 class ParamReader:
-    """Reads a list of parameters by name, a few at a time, and repeats requests that get lost."""
+    """Reads a list of parameters by name, a few at a time, and repeats lost requests."""
 
     def __init__(self, names: tuple[str, ...], *, known: frozenset[str] | None = None) -> None:
         self._known = known
-        """All that may be asked for; None: anything."""
+        """Names that may be requested; None: any."""
         self._open: dict[str, tuple[int, int]] = {}
-        """Time of the last request and number of requests."""
+        """Time of the last request and number of requests, by name."""
         self._names: set[str] = set()
         self.values: dict[str, float] = {}
-        """In the order of their names."""
+        """Received values, sorted by name."""
         self.request(names)
 
     def request(self, names: tuple[str, ...]) -> None:
-        """Read these parameters as well, those that were given up before included."""
+        """Add these parameters, including ones that were given up before."""
         if self._known is not None:
             names = tuple(name for name in names if name in self._known)
         missing = [name for name in names if name not in self.values]
@@ -43,16 +43,16 @@ class ParamReader:
 
     @property
     def is_done(self) -> bool:
-        """Every parameter has arrived or was given up."""
+        """True if every parameter has arrived or was given up."""
         return not self._open
 
     def receive(self, param: ParamValue) -> None:
-        """Take a PARAM_VALUE, whoever asked for it; of a parameter in the list, it is kept."""
+        """Process a PARAM_VALUE, requested by anyone; store it if it is in the list."""
         self._open.pop(param.name, None)
         if param.name in self._names:
             is_new = param.name not in self.values
             self.values[param.name] = param.value
-            if is_new:  # sorted here, once a name, and not at every look at them
+            if is_new:  # sort once per new name, not at every read
                 self.values = dict(sorted(self.values.items()))
 
     def absent(self, name: str) -> None:
@@ -60,7 +60,7 @@ class ParamReader:
         self._open.pop(name, None)
 
     def step(self, now_ns: int) -> Iterator[ParamRequest]:
-        """Requests that are due: repeated ones first, then new ones up to the window."""
+        """Yield the requests that are due: repetitions first, then new ones up to the window."""
         in_flight = sum(attempts > 0 for _, attempts in self._open.values())
         for name, (requested_ns, attempts) in list(self._open.items()):
             if attempts == 0:
@@ -78,19 +78,19 @@ class ParamReader:
 
 
 _AGAIN_NS = 2 * NS_PER_S
-"""Between attempts to read parameters that the vehicle did not send."""
+"""Time between attempts to read parameters that the vehicle did not send."""
 _MOST_TOLD = 100
-"""Texts of advice in a session: they name values, which may change any number of times."""
+"""Largest number of advice texts per session: they quote values, which may change without end."""
 _FOLLOW_UPS = 3
-"""Times that a command is sent, a second apart, since one may get lost."""
+"""Number of times that a command is sent, one second apart, since one may get lost."""
 
 
 class VehicleParams:
-    """Reads the parameters, sets some for the flight, and says why they forbid one.
+    """Reads the parameters, sets some for the flight, and tells why they forbid one.
 
-    All that may matter are read at once, whatever the output will be. Values heard later, whoever
-    has changed them, count at once for the problems. The calibration follows while the vehicle is
-    disarmed; a change in flight that matters is an interruption.
+    All relevant parameters are read at once, for any output. Later values, set by anyone, affect
+    the problems at once. The calibration follows while the vehicle is disarmed; a change in flight
+    that matters is an interruption.
     """
 
     def __init__(
@@ -111,7 +111,7 @@ class VehicleParams:
         )
         self._reader = ParamReader(profile.params, known=config.known_params)
         self._kinds: dict[str, int] = {}
-        """MAV_PARAM_TYPE of each parameter that matters and was heard."""
+        """MAV_PARAM_TYPE of each relevant parameter that was received."""
         self._has_asked_more = False
         self._again_ns = 0
         self._reader.request(tuple(name for name, _ in config.set_params))
@@ -123,21 +123,21 @@ class VehicleParams:
         self._follow_up: CommandRequest | None = None
         self._follow_ups_left = self._follow_up_ns = 0
         self._advised: ParamContext | None = None
-        """Output that the user was advised about."""
+        """Context of the last advice to the user."""
         self._told: set[ParamNote] = set()
-        """Advice, each once: whether there is a receiver is learnt later than the rest."""
+        """Advice already given; the receiver is known later than the rest."""
         self._assessed: tuple[ParamContext, Assessment] | None = None
-        """What follows from all values, and for whom."""
+        """Assessment of all values, and its context."""
         self.is_read = False
-        """Every parameter has come or was given up."""
+        """True if every parameter has arrived or was given up."""
         self.calibration: RcCalibration | None = None
-        """The calibration to fly with; None before it is read, or if it cannot be used."""
+        """Radio calibration of the flight; None until it is read, or if it is unusable."""
         self.interruption: Reason | None = None
-        """A change in flight that ends every engagement so far, or None; stays once set."""
+        """Change in flight that ends all engagements so far, or None; stays set."""
 
     @property
     def values(self) -> Mapping[str, float]:
-        """All parameters that matter and that the vehicle has sent, by name."""
+        """Relevant parameters received from the vehicle, by name."""
         return self._reader.values
 
     @property
@@ -147,22 +147,22 @@ class VehicleParams:
 
     @property
     def ignores_receiver(self) -> bool:
-        """The sticks of a receiver move nothing."""
+        """True if the vehicle ignores a receiver's sticks."""
         return self._profile.ignores_receiver(self._reader.values)
 
     def use_output(self, output: Output) -> None:
-        """Judge the parameters for this output from now on."""
+        """Check the parameters for this output from now on."""
         self._output = output
 
     def receive(self, param: ParamValue, status: VehicleStatus | None) -> None:
-        """Take a PARAM_VALUE, requested or not."""
+        """Process a PARAM_VALUE, requested or not."""
         if self._profile.is_bytewise:
             param = param.from_bytes()
         if not math.isfinite(param.value):
             return
         old = self._reader.values.get(param.name)
         self._reader.receive(param)
-        if param.name in self._reader.values:  # of no other name, as there may be any number
+        if param.name in self._reader.values:  # other names are unlimited
             self._kinds[param.name] = param.kind
         self._changes.receive(param)
         if not self.is_read or old == self._reader.values.get(param.name):
@@ -180,7 +180,7 @@ class VehicleParams:
             )
 
     def absent(self, name: str) -> None:
-        """The vehicle says that it has no parameter of this name."""
+        """Note that the vehicle has no parameter of this name."""
         self._reader.absent(name)
 
     def _context(self, status: VehicleStatus | None) -> ParamContext:
@@ -196,7 +196,7 @@ class VehicleParams:
     def step(
         self, now_ns: int, status: VehicleStatus | None
     ) -> Iterator[ParamRequest | ParamWrite | CommandRequest]:
-        """Requests that are due."""
+        """Yield the requests that are due."""
         yield from self._reader.step(now_ns)
         if self._reader.is_done:
             self._ask_for_missing(now_ns, status)
@@ -216,13 +216,13 @@ class VehicleParams:
             yield self._follow_up
 
     def _as_written(self, request: ParamRequest | ParamWrite) -> ParamRequest | ParamWrite:
-        """A write with the type that the firmware demands, if it does."""
+        """Return a write with the type that the firmware demands, if any."""
         if isinstance(request, ParamRequest) or not self._profile.is_bytewise:
             return request
         return request._replace(kind=self._kinds.get(request.name, request.kind)).as_bytes()
 
     def _ask_for_missing(self, now_ns: int, status: VehicleStatus | None) -> None:
-        """Ask for what depends on other values, and on the ground for what got lost."""
+        """Request parameters that depend on other values and, on the ground, missing ones."""
         is_usable = self._assessed is not None and self._assessed[1].unusable is None
         is_flying = self.is_read and is_usable and status is not None and status.armed
         if now_ns < self._again_ns or is_flying:
@@ -235,7 +235,7 @@ class VehicleParams:
             self._reader.request((*needed, *self._profile.more_params(values)))
 
     def _take_in(self, status: VehicleStatus | None) -> None:
-        """Fly with what was read, from the beginning or from the next time on the ground."""
+        """Adopt the calibration that was read, at the start or when next disarmed."""
         self.is_read = True
         assessment = self._assessed[1] if self._assessed else self._assess(status)
         if assessment.calibration == self.calibration:
@@ -249,7 +249,7 @@ class VehicleParams:
     def _advise(self, status: VehicleStatus | None) -> None:
         context = self._context(status)
         if self._config.pilot_hz is not None:
-            return  # no stick of ours will leave
+            return  # we will send no sticks
         if context.output is None or context == self._advised or not self._changes.is_settled:
             return
         self._advised = context
@@ -263,13 +263,13 @@ class VehicleParams:
                 self._report(AdviceText(note.text))
 
     def problem(self) -> Reason | None:
-        """Why nothing may begin yet, whatever the output, or None."""
+        """Return why no flight may begin yet with any output, or None."""
         if not self.is_read:
             return because(Code.READING_PARAMETERS)
         return self._changes.problem()
 
     def output_problem(self, status: VehicleStatus | None) -> Reason | None:
-        """Why a flight with the output may not begin or go on with these parameters, or None."""
+        """Return why the parameters forbid a flight with the chosen output, or None."""
         if not self.is_read or self._output is None:
             return None
         assessment = self._current(status)
@@ -295,11 +295,11 @@ class VehicleParams:
         return None
 
     def _current(self, status: VehicleStatus | None) -> Assessment:
-        """The assessment for the present output and receiver."""
+        """Return the assessment for the present output and receiver."""
         if self._assessed is None or self._assessed[0] != self._context(status):
             return self._assess(status)
         return self._assessed[1]
 
     def restore(self) -> bool:
-        """Put back what was set for the flight; True: nothing more can be done now."""
+        """Restore what was set for the flight; return True if nothing more can be done now."""
         return self._changes.restore()
