@@ -80,7 +80,7 @@ def test_takes_off_and_holds_its_altitude(flown: Flown) -> None:
 
 def test_gives_the_sticks_back_at_the_end(flown: Flown) -> None:
     assert_released(flown.overrides)
-    assert flown.vehicle["releases"]["count"] >= 1
+    assert flown.vehicle["releases"] >= 1
 
 
 def test_reports_what_it_did(flown: Flown) -> None:

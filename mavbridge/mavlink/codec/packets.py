@@ -20,6 +20,7 @@ from mavbridge.mavlink.codec.messages import (
     ParamWrite,
     ReceivedMessage,
     Request,
+    StreamRequest,
 )
 from mavbridge.mavlink.codec.readers import READERS, UnusableError
 from mavbridge.mavlink.codec.signing import LAST_WORDS_LINK_ID, LINK_ID, Signing, is_signed
@@ -311,7 +312,7 @@ class Codec:
         return self._pack(message)
 
     def encode_request(self, target: Endpoint, request: Request) -> bytes:
-        """Encode COMMAND_LONG, PARAM_REQUEST_READ or PARAM_SET."""
+        """Encode COMMAND_LONG, PARAM_REQUEST_READ, PARAM_SET or REQUEST_DATA_STREAM."""
         match request:
             case CommandRequest(command, params):
                 padded = (*params, *(0.0,) * (7 - len(params)))
@@ -320,6 +321,8 @@ class Codec:
                 message = self._mav.param_request_read_encode(*target, name.encode(), -1)
             case ParamWrite(name, value, kind):
                 message = self._mav.param_set_encode(*target, name.encode(), value, kind)
+            case StreamRequest(stream, rate_hz):
+                message = self._mav.request_data_stream_encode(*target, stream, rate_hz, 1)
         return self._pack(message)
 
     def encode_timesync(self, ts1: int) -> bytes:

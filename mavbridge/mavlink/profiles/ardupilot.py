@@ -73,13 +73,20 @@ class ArduPilot(Profile):
     params = ardupilot_params.FIRST_NAMES
 
     def streams(self, *, state_hz: float, pilot_hz: float | None = None) -> tuple[StreamGroup, ...]:
-        """See `Profile`. The IMU is requested in floats first."""
-        imu = ("HIGHRES_IMU", "RAW_IMU", "SCALED_IMU2")
+        """See `Profile`. Legacy streams serve links on which no command is acknowledged.
+
+        The IMU is requested in floats first.
+        """
+        attitude, imu, radio = (
+            ("ATTITUDE_QUATERNION", "ATTITUDE"),
+            ("HIGHRES_IMU", "RAW_IMU", "SCALED_IMU2"),
+            ("RC_CHANNELS",),
+        )
         return (
-            StreamGroup(("ATTITUDE_QUATERNION", "ATTITUDE"), state_hz),
-            StreamGroup(("LOCAL_POSITION_NED",), state_hz),
-            StreamGroup(imu, state_hz),
-            StreamGroup(("RC_CHANNELS",), pilot_hz or RC_CHANNELS_HZ),
+            StreamGroup(attitude, dialect.MAV_DATA_STREAM_EXTRA1, state_hz),
+            StreamGroup(("LOCAL_POSITION_NED",), dialect.MAV_DATA_STREAM_POSITION, state_hz),
+            StreamGroup(imu, dialect.MAV_DATA_STREAM_RAW_SENSORS, state_hz),
+            StreamGroup(radio, dialect.MAV_DATA_STREAM_RC_CHANNELS, pilot_hz or RC_CHANNELS_HZ),
             optional_stream("SYS_STATUS", 2.0, without=NO_HEALTH),
             optional_stream("EXTENDED_SYS_STATE", 5.0, without=NO_LANDING),
             optional_stream("EKF_STATUS_REPORT", 5.0, without=NO_POSITION_WORD),
@@ -92,7 +99,8 @@ class ArduPilot(Profile):
             return optional_stream("ATTITUDE_TARGET", _TARGET_HZ)
         if output == "velocity":
             return optional_stream("POSITION_TARGET_LOCAL_NED", _TARGET_HZ, least_hz=0.0)
-        return StreamGroup(("RC_CHANNELS",), RC_CHANNELS_HZ)
+        legacy = dialect.MAV_DATA_STREAM_RC_CHANNELS
+        return StreamGroup(("RC_CHANNELS",), legacy, RC_CHANNELS_HZ)
 
     def more_params(self, values: Mapping[str, float]) -> tuple[str, ...]:
         """Return calibration, dead zones and stick settings of RCMAP_*'s channels."""

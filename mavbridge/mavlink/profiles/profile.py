@@ -74,6 +74,9 @@ class StreamGroup(NamedTuple):
     """One quantity, and the messages that carry it, best first."""
 
     messages: tuple[str, ...]
+    stream: int | None
+    """MAV_DATA_STREAM of REQUEST_DATA_STREAM; None where the firmware has none, or it would also
+    set other messages."""
     rate_hz: float
     is_optional: bool = False
     """True if nothing waits for it: a vehicle that does not grant it is flown without."""
@@ -95,7 +98,7 @@ def optional_stream(
     stand_in: str | None = None,
 ) -> StreamGroup:
     """Return the group of one message that no flight waits for."""
-    return StreamGroup((message,), rate_hz, True, least_hz, without, stand_in)
+    return StreamGroup((message,), None, rate_hz, True, least_hz, without, stand_in)
 
 
 NO_LANDING = "a landing does not end the flight"

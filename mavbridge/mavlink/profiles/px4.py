@@ -159,9 +159,9 @@ class Px4(Profile):
         fast_hz = state_hz if state_hz <= _UNEVEN_HZ else FAST_HZ
         slow_hz = min(state_hz, POSITION_CEILING_HZ)
         return (
-            StreamGroup(("ATTITUDE_QUATERNION", "ATTITUDE"), fast_hz),
-            StreamGroup(("LOCAL_POSITION_NED",), slow_hz),
-            StreamGroup(("HIGHRES_IMU", "SCALED_IMU"), fast_hz),
+            StreamGroup(("ATTITUDE_QUATERNION", "ATTITUDE"), None, fast_hz),
+            StreamGroup(("LOCAL_POSITION_NED",), None, slow_hz),
+            StreamGroup(("HIGHRES_IMU", "SCALED_IMU"), None, fast_hz),
             optional_stream(
                 "CURRENT_MODE",
                 CURRENT_MODE_HZ,

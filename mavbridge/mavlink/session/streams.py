@@ -6,7 +6,7 @@ from pymavlink.dialects.v20 import ardupilotmega as dialect
 
 from mavbridge.core.clock import NS_PER_MS, NS_PER_S
 from mavbridge.mavlink.codec.fast_path import MISSING_IDS
-from mavbridge.mavlink.codec.messages import CommandAck, CommandRequest
+from mavbridge.mavlink.codec.messages import CommandAck, CommandRequest, Request, StreamRequest
 from mavbridge.mavlink.profiles.profile import StreamGroup
 
 _ACK_TIMEOUT_NS = 500 * NS_PER_MS
@@ -28,7 +28,7 @@ _LOSSY = 0.1
 
 
 class _Stream:
-    """Negotiation of message and rate for one group."""
+    """Negotiation of message, rate and kind of request for one group."""
 
     def __init__(self, group: StreamGroup) -> None:
         self.group = group
@@ -48,10 +48,12 @@ class _Stream:
         """True if each message was denied at each rate: request again after a pause."""
         self._choice = 0
 
-    def request(self) -> CommandRequest:
-        """Return the next request, trying one message after the other."""
+    def request(self) -> Request:
+        """Return the next request: REQUEST_DATA_STREAM if no message interval was granted."""
         self.attempts += 1
         self.is_denied = False
+        if self._choice >= len(self.group.messages) and self.group.stream is not None:
+            return StreamRequest(self.group.stream, max(round(self.rate_hz), 1))
         number = message_id(self.group.messages[self._choice % len(self.group.messages)])
         return CommandRequest(dialect.MAV_CMD_SET_MESSAGE_INTERVAL, (number, 1e6 / self.rate_hz))
 
@@ -74,11 +76,13 @@ class _Stream:
             return
         self.rate_hz = self.group.rate_hz
         self._choice += 1
-        self.is_denied = self._choice % len(self.group.messages) == 0
+        has_more = self._choice % len(self.group.messages) or self.group.stream is not None
+        self.is_denied = not has_more
 
-    def miss(self) -> None:
-        """Restart with the first message: the vehicle does not answer."""
-        self.attempts = self._choice = 0
+    def give_up_intervals(self) -> None:
+        """Go on to REQUEST_DATA_STREAM: no SET_MESSAGE_INTERVAL is answered."""
+        self.attempts = 0
+        self._choice = len(self.group.messages)
         if self.group.is_optional:
             self._give_up()
 
@@ -175,23 +179,27 @@ class StreamRequester:
             self._pending.refuse()
         self._pending = None
 
-    def step(self, now_ns: int) -> CommandRequest | None:
+    def step(self, now_ns: int) -> Request | None:
         """Return the request that is due, or None."""
         self._check_rates(now_ns)
         if self._pending is not None:
             if now_ns - self._requested_ns < _ACK_TIMEOUT_NS:
                 return None
             if self._pending.attempts >= _ATTEMPTS:
-                self._pending.miss()
+                self._pending.give_up_intervals()
         may_repeat = now_ns - self._requested_ns >= _ACK_TIMEOUT_NS
         open_streams = (s for s in self._streams if not s.is_settled)
         self._pending = next((s for s in open_streams if may_repeat or not s.is_denied), None)
         if self._pending is None:
             return None
         self._requested_ns = now_ns
-        return self._pending.request()
+        request = self._pending.request()
+        if isinstance(request, StreamRequest):  # never acknowledged
+            self._pending.accept()
+            self._pending = None
+        return request
 
-    def stand_ins(self, now_ns: int) -> Iterator[CommandRequest]:
+    def stand_ins(self, now_ns: int) -> Iterator[Request]:
         """Yield requests for the stand-ins of missing streams."""
         for stream in self._streams:
             name = stream.group.stand_in

@@ -19,6 +19,7 @@ from mavbridge.mavlink.codec.messages import (
     ParamRequest,
     RcChannels,
     StatusText,
+    StreamRequest,
 )
 from mavbridge.mavlink.codec.packets import (
     MOST_DATAGRAM_BYTES,
@@ -96,6 +97,9 @@ def test_requests() -> None:
     param = sent(ours.encode_request(TARGET, ParamRequest("RC1_MIN")))
     assert (param.target_system, param.target_component) == target
     assert (param.param_id, param.param_index) == ("RC1_MIN", -1)
+    stream = sent(ours.encode_request(TARGET, StreamRequest(10, 50)))
+    assert (stream.target_system, stream.target_component) == target
+    assert (stream.req_stream_id, stream.req_message_rate, stream.start_stop) == (10, 50, 1)
 
 
 def test_texts_beyond_the_last_number_begin_again() -> None:

@@ -6,8 +6,10 @@ from pymavlink.dialects.v20 import ardupilotmega as dialect
 from mavbridge.core.clock import NS_PER_MS, NS_PER_S
 from mavbridge.mavlink.codec.messages import (
     CommandAck,
+    CommandRequest,
     Endpoint,
     Request,
+    StreamRequest,
 )
 from mavbridge.mavlink.profiles.ardupilot import ARDUPILOT
 from mavbridge.mavlink.profiles.profile import HOME_HEIGHT, Profile, StreamGroup
@@ -97,6 +99,7 @@ def test_what_is_only_watched_holds_nothing_up(answer: int | None) -> None:
         elif answer is not None:
             requester.receive_ack(ack(answer))
         assert requester.is_settled == (len(requested) >= 4)
+    # never the legacy request, which would change the rates of other messages as well
     attempts = 4 if answer is None else 1
     assert [ids(request)[0] for request in requested[4:]] == [
         number for number in (1, 245, 193, 0) for _ in range(attempts)
@@ -118,16 +121,18 @@ def test_a_watched_stream_that_stops_is_asked_for_again_and_not_lost() -> None:
     assert requester.is_settled
 
 
-def test_denied_means_slower_then_another_message() -> None:
+def test_denied_means_slower_then_another_message_then_the_legacy_stream() -> None:
     requester, requested = one_group(), []
     for k in range(6):
         requested.append(ids(requester.step(k)))
         requester.receive_ack(ack(dialect.MAV_RESULT_DENIED))
     assert requested == [(id_, us) for id_ in (31, 30) for us in (10000, 20000, 40000)]
+    assert requester.step(9) == StreamRequest(dialect.MAV_DATA_STREAM_EXTRA1, 100)
+    assert requester.is_settled
 
 
 def test_a_vehicle_that_denies_everything_is_not_flooded_with_requests() -> None:
-    requester = StreamRequester(ARDUPILOT.streams(state_hz=100))
+    requester = StreamRequester(PX4.streams(state_hz=100))
     requests = 0
     for now_ns in range(S, 6 * S, 2 * NS_PER_MS):  # each denial is answered within a step
         requests += requester.step(now_ns) is not None
@@ -141,7 +146,13 @@ def test_a_request_that_is_undecided_is_repeated_without_haste() -> None:
         if requester.step(tick * 10 * NS_PER_MS) is not None:
             requested_s.append(tick / 100)
             requester.receive_ack(ack(dialect.MAV_RESULT_TEMPORARILY_REJECTED))
-    assert requested_s == [0.0, 0.5, 1.0, 1.5, 2.0, 2.5]
+    assert requested_s == [0.0, 0.5, 1.0, 1.5, 2.0]  # the last is the legacy stream
+
+
+def test_an_unanswered_request_is_repeated_and_then_the_legacy_stream_used() -> None:
+    requester = one_group()
+    requests = [requester.step(k * S) for k in range(5)]
+    assert [type(request) for request in requests] == [CommandRequest] * 4 + [StreamRequest]
 
 
 def test_a_stream_that_slows_down_is_requested_again() -> None:
@@ -161,7 +172,7 @@ def test_a_stream_that_slows_down_is_requested_again() -> None:
     assert requester.renewals == 3
 
 
-def test_a_request_without_an_answer_is_repeated_for_ever() -> None:
+def test_where_there_is_no_legacy_stream_the_interval_is_asked_for_for_ever() -> None:
     requester = StreamRequester(PX4.streams(state_hz=100)[:1])
     requests = [requester.step(k * S) for k in range(12)]
     assert {ids(request)[0] for request in requests} == {31}
