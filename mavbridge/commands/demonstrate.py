@@ -51,7 +51,7 @@ the air and off the course; and of flights without disturbed actions, as example
 flight."""
 RATE_TILT_DEG = 80.0
 """Largest tilt of a policy that learns from an expert by body rates; that expert leans by up to
-62."""
+62 degrees."""
 
 
 @dataclass(frozen=True, kw_only=True)
