@@ -82,8 +82,8 @@ def _since_s(at_ns: int, start_ns: int) -> float:
 
 
 def _crash(flight: RecordedFlight, ticks: Sequence[Tick]) -> Iterator[Moment]:
-    """Yield the first crash in the ticks. A recording that was cut off is searched, too, because its
-    meta does not tell yet."""
+    """Yield the first crash in the ticks. The meta of a recording that was cut off cannot report
+    one, so its ticks are searched, too."""
     if flight.meta.finished and flight.meta.crash is None:
         return
     watch = CrashWatch()
