@@ -1,7 +1,7 @@
 """Steps wall time by an hour in every Python process that has this folder in PYTHONPATH.
 
-Only root could step the computer's own clock, and would do it to everybody. Python imports this
-module at its start; the step is there while the file of STEPPED_CLOCK is.
+Only root could step the computer's own clock, and that would affect all programs. Python imports
+this module at its start; the step is in effect while the file of STEPPED_CLOCK exists.
 """
 
 import os
