@@ -55,8 +55,8 @@ class Leaning(Climbing):
 
     contract = Contract(arrays="numpy", feature_dim=1, image_height=32, image_width=32)
     lean_calls, fault_calls = 120, 260
-    """Calls in flight after which it leans, and after which its fault begins. The count stops at the
-    first while the vehicle is on the ground."""
+    """Calls in flight after which it leans, and after which its fault begins. On the ground the
+    count stays below the first."""
     least_climb_mps = 0.3
     """Climb rate that shows that it has left the ground; PX4 takes 2.4 s to get there."""
 
