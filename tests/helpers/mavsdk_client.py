@@ -1,4 +1,5 @@
-"""Prints as JSON what a MAVSDK program reads from the vehicle; needs MAVSDK's interpreter."""
+"""Prints the data that a MAVSDK program reads from the vehicle, as JSON; needs MAVSDK's
+interpreter."""
 
 import json
 import sys
