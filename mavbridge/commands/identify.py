@@ -255,7 +255,7 @@ def identify(config: IdentifyConfig) -> int:
 
 
 def doublet_flight(config: IdentifyConfig, trained: Contract) -> FlyConfig:
-    """Return the flags' flight with the doublet in place of the policy.
+    """Return the flight of the flags, with the doublet in place of the policy.
 
     Raises:
         UserError: ``--readonly`` was given.

@@ -100,7 +100,6 @@ def print_status(line: str) -> None:
 
 class _StatusColumn(ProgressColumn):
     def render(self, task: Task) -> Text:
-        """Show it."""
         return Text(str(task.fields.get("status", "")))
 
 

@@ -127,5 +127,5 @@ def _is_foreground(fd: int) -> bool:
     terminal."""
     try:
         return os.tcgetpgrp(fd) == os.getpgrp()
-    except OSError:  # not our controlling terminal, so that no other jobs compete for it
+    except OSError:  # not our controlling terminal, so no other jobs compete for it
         return True

@@ -20,7 +20,7 @@ FlightSource = Literal["flight", "demonstration", "dagger", "imagined", "pilot"]
 
 
 class FlightError(MavbridgeError):
-    """Error in reading a recorded flight."""
+    """A recorded flight cannot be read."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -30,7 +30,7 @@ class FlightMeta:
     started_at: str
     """ISO 8601, UTC."""
     start_ns: int
-    """The start of the flight on the clock of all stamps."""
+    """Start of the flight on the clock of all stamps."""
     mavbridge_version: str
     source: FlightSource
     policy: str | None

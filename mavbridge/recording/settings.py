@@ -16,7 +16,7 @@ _T = TypeVar("_T")
 
 
 class SettingsError(MavbridgeError):
-    """Error in reading the settings of a recorded flight."""
+    """The settings of a recorded flight cannot be read."""
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -21,7 +21,7 @@ _GROUP_ROWS = 2_048
 
 
 class TableError(MavbridgeError):
-    """Error in reading a table."""
+    """A table cannot be read."""
 
 
 class TableWriter:

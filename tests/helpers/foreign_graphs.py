@@ -66,7 +66,7 @@ def actor(
 ) -> None:
     """Write a reinforcement learning policy: state [1, S] -> actions [1, 4], more if requested.
 
-    The action is four times the first number of the state, roll velocity times 0.1.
+    Each of the four numbers is 0.1 times the first number of the state, a velocity.
     """
     weight = np.zeros((state_dim, 4), np.float32)
     weight[0] = 0.1

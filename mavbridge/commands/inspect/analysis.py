@@ -50,7 +50,7 @@ class HolderSpan:
     end_s: float
     holder: Holder
     reason: Reason | None
-    """The longest reason why the policy did not fly; None while it did."""
+    """Why the policy did not fly, for most of the span; None while it flew."""
 
 
 def holder_of(tick: Tick) -> Holder:
@@ -63,8 +63,8 @@ def holder_of(tick: Tick) -> Holder:
 
 
 def holder_spans(ticks: Sequence[Tick], start_ns: int) -> tuple[HolderSpan, ...]:
-    """Return the stretches in the order of time. A new reason starts no new stretch; the longest
-    one is reported."""
+    """Return the stretches in the order of time, each with its longest-lasting reason. A new reason
+    does not start a new stretch."""
     spans: list[HolderSpan] = []
     at = 0
     for holder, group in groupby(ticks, holder_of):

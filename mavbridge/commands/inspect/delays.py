@@ -32,7 +32,7 @@ Cause = Literal[
     "the policy loop began late",
     "the attitude or the policy loop was late",
 ]
-"""The last one if the recording lacks the arrivals, which are needed to tell the two apart."""
+"""The last cause covers recordings without arrivals, which would tell its two cases apart."""
 ATTITUDES = (30, 31)
 """Message ids of ATTITUDE and ATTITUDE_QUATERNION (MAVLink, common.xml)."""
 
@@ -78,7 +78,7 @@ def find_delays(
 ) -> tuple[Delay, ...]:
     """Return missed slots and late chunks while the policy flew, in the order of time.
 
-    The time between two ticks with a loss of the recorder in between is left out.
+    Gaps in which the recorder lost ticks are left out.
     """
     slot_ns, chunk_ns = NS_PER_S / stick_hz, NS_PER_S / action_hz
     found = [*_missed_slots(ticks, slot_ns), *_late_chunks(ticks, chunk_ns, arrivals)]

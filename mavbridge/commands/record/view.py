@@ -56,8 +56,8 @@ class PilotView(TelemetryCache):
         self.stick_packets = 0
 
     def log_to(self, log: PacketPipe | None) -> None:
-        """Write every packet of the vehicle to this log from now on; the previous log is then
-        unused."""
+        """Write the vehicle's packets to this log from now on; None: to no log. The previous log is
+        then unused."""
         with self._log_lock:
             self._log = log
 

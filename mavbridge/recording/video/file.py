@@ -40,7 +40,7 @@ _BUFFER_BYTES = 1 << 20
 
 
 class VideoError(MavbridgeError):
-    """Error in reading a video."""
+    """A video cannot be read."""
 
 
 class FragmentedMp4:

@@ -82,8 +82,8 @@ class FrameSender:
     def submit(self, rgb: CameraImage, row: FrameRow) -> bool:
         """Hand a frame over; the caller can overwrite it afterwards.
 
-        A frame that differs in size or kind from the first is dropped and counted online, and a bug
-        offline.
+        A frame that differs in size or kind from the first is a bug offline; online, it is dropped
+        and counted.
 
         Args:
             rgb: the image. An odd last row or column is cut off, which H.264 cannot have.

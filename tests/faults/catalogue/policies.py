@@ -322,4 +322,4 @@ class HoggingNatively(Hogging):
         libc = ctypes.PyDLL(None)
         for _ in range(HANG_S * 2):
             libc.usleep(400_000)
-            time.sleep(0.1)  # noqa: TID251 - somebody else's turn
+            time.sleep(0.1)  # noqa: TID251 - let the other threads run

@@ -9,7 +9,7 @@ import time
 
 STEP_S = 3600
 _path = os.environ["STEPPED_CLOCK"]
-_time, _time_ns = time.time, time.time_ns  # noqa: TID251 - they are what is replaced
+_time, _time_ns = time.time, time.time_ns  # noqa: TID251 - these are replaced
 
 
 def _step_s() -> int:
