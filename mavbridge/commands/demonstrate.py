@@ -46,12 +46,10 @@ a student that crashes at the first gate would learn nothing about later ones (D
 SOLVES_KEPT = TRUTHS_KEPT = 64
 """Solves and exposures kept until their ticks and frames are recorded."""
 NOMINAL_SHARE, AIRBORNE_SHARE, UNDISTURBED_SHARE = 0.25, 0.35, 0.3
-"""Shares of flights without random conditions, as most users fly first; of flights that start in
-the air and off the course; and of flights without disturbed actions, as examples of a good
-flight."""
+"""Shares of flights without random conditions, as most users fly first; that start in the air and
+off the course; and without disturbed actions, as examples of a good flight."""
 RATE_TILT_DEG = 80.0
-"""Largest tilt of a policy that learns from an expert by body rates; that expert leans by up to
-62 degrees."""
+"""Tilt limit of a policy that learns from a body-rate expert, which leans by up to 62 degrees."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -137,13 +135,11 @@ class Pilot:
         self.runner = replace(student or expert, act=self._act, reset=self._start)
 
     def expert_action(self, chunk_serial: int) -> Action | None:
-        """Return the expert's action at the state of a recent chunk; None before the
-        demonstration."""
+        """Return the expert's action at a recent chunk's state; None before the demonstration."""
         return self._expert_actions.get(chunk_serial)
 
     def _start(self) -> None:
-        """Begin the flight. The policy has the sticks now, so a vehicle placed in the air is under
-        control."""
+        """Begin, now that the policy has the sticks: a vehicle placed in the air is controlled."""
         if self._student is not None:
             self._student.reset()
         self._expert = self._begin(self._flight.clock.now_ns())
@@ -228,8 +224,7 @@ def fly_demonstration(spec: DemonstrationSpec, should_stop: Callable[[], bool]) 
     """Fly and record one course; return True if it was finished.
 
     Raises:
-        EpisodeInterruptedError: ``should_stop`` ended it; the folder holds an unfinished
-            flight.
+        EpisodeInterruptedError: ``should_stop`` ended it; the folder holds an unfinished flight.
         MavbridgeError: it cannot be flown or recorded.
     """
     rmtree(spec.folder, ignore_errors=True)

@@ -26,12 +26,10 @@ Job = TypeVar("Job")
 Result = TypeVar("Result")
 ShouldStop: TypeAlias = Callable[[], bool]
 FlyJob: TypeAlias = Callable[[Job, ShouldStop], Result]
-"""Importable in another process; raises ``EpisodeInterruptedError`` if ``ShouldStop`` returns
-True."""
+"""Importable in another process; raises ``EpisodeInterruptedError`` if ``ShouldStop`` is True."""
 
 MAX_RETRIES = 3
-"""Ray flies the episode of a lost worker again. After this many losses the episode counts as the
-cause."""
+"""Lost workers of one episode, which Ray flies again, before it counts as the cause."""
 CONNECT_TIMEOUT_S = 5.0
 END_TIMEOUT_S = 10.0
 """Time for a worker to end its flight in order once it is told to stop."""

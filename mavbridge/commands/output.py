@@ -68,8 +68,7 @@ def require_outputs(json: Path | None, plot: Path | None) -> None:
 
 
 def table_console() -> Console:
-    """Return a console for tables on standard output: as wide as the terminal, or
-    ``PIPED_WIDTH``."""
+    """Return a console for standard output, as wide as the terminal or ``PIPED_WIDTH``."""
     console = Console(highlight=False)
     if not console.is_terminal:
         console.width = PIPED_WIDTH
@@ -104,8 +103,7 @@ class _StatusColumn(ProgressColumn):
 
 
 def progress_bar(console: Console, *, as_percentage: bool = False) -> Progress:
-    """Return a bar with description, count (or percentage), the field ``status``, and the time
-    left."""
+    """Return a bar with description, count (or percentage), field ``status``, and time left."""
     return Progress(
         TextColumn("{task.description}"),
         BarColumn(),

@@ -104,8 +104,7 @@ class AnswerLoop:
                 job.answer.set_result(self.answer(job.request))
 
     def answer(self, request: bytes | str) -> bytes | str:
-        """Return a chunk as msgpack, or a text that describes an error of the request or the
-        policy."""
+        """Return a chunk as msgpack, or a text that describes the request's or policy's error."""
         begun_ns = self._clock.now_ns()
         try:
             message = unpack(request)

@@ -72,8 +72,7 @@ def run_world_model_training(paths: Sequence[Path], settings: WorldModelSettings
 
 
 def share_of_gates(checkpoint: Path, settings: TrainSettings) -> float:
-    """Fly a checkpoint at two rates over ``check_flights`` courses; return the share of gates
-    passed.
+    """Return the share of gates that a checkpoint passes at two rates on ``check_flights`` courses.
 
     Raises:
         MavbridgeError, PolicyError: it cannot be flown.
@@ -93,8 +92,7 @@ def share_of_gates(checkpoint: Path, settings: TrainSettings) -> float:
 def fit_to_flights(
     network: Network, flights: Sequence[FlightData], settings: TrainSettings
 ) -> Network:
-    """Return the network with the flights' state frame and actions, and the inputs of the
-    settings."""
+    """Return the network with the flights' frame and actions, and the settings' inputs."""
     terms = common_terms(flights)
     contract = replace(
         network.contract,

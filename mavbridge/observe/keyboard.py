@@ -86,8 +86,7 @@ class Keyboard:
             self._restore(fd)
 
     def _take(self, fd: int) -> None:
-        """Make the terminal deliver single keys without echo: at the start, and after Ctrl-Z and
-        fg."""
+        """Have keys delivered singly, without echo: at the start, and after Ctrl-Z and fg."""
         modes = termios.tcgetattr(fd)
         if not modes[_LOCAL_MODES] & (termios.ICANON | termios.ECHO):
             return
@@ -123,8 +122,7 @@ def _standard_input() -> int | None:
 
 
 def _is_foreground(fd: int) -> bool:
-    """True if the terminal's input goes to this process, or if it is not our controlling
-    terminal."""
+    """True if the terminal's input is ours, or if it is not our controlling terminal."""
     try:
         return os.tcgetpgrp(fd) == os.getpgrp()
     except OSError:  # not our controlling terminal, so no other jobs compete for it

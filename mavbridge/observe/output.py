@@ -13,8 +13,7 @@ from rich.console import Console
 POLL_S = 0.05
 """Interval at which a stalled write checks whether it was given up."""
 WRITE_BYTES = 512
-"""Bytes handed to the kernel per write: a pipe that is ready takes them all (POSIX:
-_POSIX_PIPE_BUF)."""
+"""Bytes handed to the kernel per write: a ready pipe takes them all (POSIX: _POSIX_PIPE_BUF)."""
 MAX_LINE = 2000
 """Kept characters of an unfinished line; longer text counts as a line."""
 
@@ -60,8 +59,7 @@ class PatientOutput(io.TextIOBase):
         return len(text)
 
     def flush(self) -> None:
-        """Write all text at the reader's pace, unless the stream is given up or the reader is
-        gone."""
+        """Write all text at the reader's pace, unless it is given up or the reader is gone."""
         while self._waiting and not self._is_given_up:
             try:
                 if select.select([], [self._fd], [], POLL_S)[1]:

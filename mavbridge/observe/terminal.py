@@ -106,8 +106,7 @@ class FlightScreen:
         self._worker.start()
 
     def close(self, timeout_s: float) -> bool:
-        """Print pending messages and the report, and stop. Can be called twice, or without
-        ``start``.
+        """Print pending messages and the report, and stop. Works twice, and without ``start``.
 
         Return False if the reader did not take the text within the timeout. The rest is then
         dropped; do not use standard error afterwards, which would block, too (``end_process``).
@@ -177,8 +176,7 @@ class FlightScreen:
         self._messages.append(_Message(what, soft_wrap))
 
     def status_line(self) -> Text:
-        """Return the current status. Call at ``STATUS_HZ``, because rates are averages over
-        calls."""
+        """Return the current status. Call at ``STATUS_HZ``: rates are averages over calls."""
         rates_hz = (self._action.sample_hz(), self._vision.sample_hz())
         tick = self._tick
         if tick is None:

@@ -248,8 +248,7 @@ class _Sticks:
 
 
 class _Chunks:
-    """Statistics of chunks, by the tick that flew them first. Periods never span two stretches of
-    flight."""
+    """Statistics of chunks by the tick that flew them first, within each stretch of flight."""
 
     def __init__(self, target_hz: float) -> None:
         self._target_hz = target_hz

@@ -11,8 +11,7 @@ OVERTURNED_NS = 500 * NS_PER_MS
 FALL_NS = NS_PER_S
 """Window after a disarming in which a fall must show: after 1 s of free fall, speed is 9.8 m/s."""
 FALL_MPS = 1.5
-"""Speed while disarmed that counts as a fall: above any report of a vehicle at rest, below any
-fall."""
+"""Speed while disarmed that counts as a fall; a vehicle at rest reports less, any fall more."""
 _WORDS = ("crash", "flight termination", "lockdown")
 """Words in the crash messages of ArduPilot ("Crash: Disarming") and PX4 ("Flight termination
 active", "Lockdown")."""
@@ -28,8 +27,7 @@ class CrashWatch:
         self._disarmed_ns: int | None = None
 
     def see(self, tick: Tick, *, counts_falls: bool = True) -> None:
-        """Process one tick. ``counts_falls=False`` ignores falls after a disarming that somebody
-        intended."""
+        """Process one tick. ``counts_falls=False`` ignores falls after an intended disarming."""
         fallen = self._fallen(tick)
         if self.reason is None:
             self.reason = self._said(tick) or self._overturned(tick)

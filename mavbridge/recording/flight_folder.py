@@ -62,8 +62,7 @@ def open_flight(folder: Path, camera: str | None = None) -> RecordedFlight:
     rows. Frames without a row and rows without a frame are left out.
 
     Raises:
-        MavbridgeError: not a recorded flight, or a damaged one; the message gives the next
-            step.
+        MavbridgeError: not a recorded flight, or a damaged one; the message gives the next step.
     """
     meta = read_meta(folder)
     damage: list[str] = []

@@ -14,8 +14,7 @@ from mavbridge.recording.video.writer import Pressure, VideoWriter, WriterDiedEr
 
 
 class CameraFiles:
-    """Frames of one camera, written by a separate process. If it dies, only these frames are
-    lost."""
+    """Frames of one camera, written by a separate process, whose death loses only these."""
 
     def __init__(
         self,

@@ -1,5 +1,4 @@
-"""Names in a flight's folder, and the check that a flight can be written there. Imports no
-extra."""
+"""Names in a flight's folder, and the check that it can be written. Imports no extra."""
 
 from pathlib import Path
 

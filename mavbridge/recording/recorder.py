@@ -43,15 +43,13 @@ class Recorder:
             folder: from ``prepare_folder``.
             meta: the facts known at the start.
             tlog_pipe: filled by the link's process; its reader is closed here.
-            packets_dropped: returns how many packets that process has dropped; exact at the
-                end.
+            packets_dropped: returns how many packets that process has dropped; exact at the end.
             autopilot: returns the autopilot's name at the end.
             report: shows a line to the user; called from the recorder's thread.
             settings: the flight's settings, for a replay; None: the flight cannot be replayed.
 
         Raises:
-            OSError, WriterError: the folder cannot be written, or the writer process does not
-                start.
+            OSError, WriterError: the folder is not writable, or the writer process fails.
         """
         self._folder = folder
         writer = FlightWriter(folder, meta, pressure="online", tlog_pipe=tlog_pipe)
@@ -78,8 +76,7 @@ class Recorder:
         self._observer.emit(event)
 
     def watch_packets(self, packets: tuple[ForwardedPacket, ...]) -> None:
-        """Queue the stamps of received packets, or drop and count them. Call from one thread
-        only."""
+        """Queue the stamps of received packets, or drop and count them. For one thread only."""
         self._tables.packets.put(packets)
 
     def close(self, timeout_s: float) -> None:
@@ -97,8 +94,7 @@ class Recorder:
 
     @property
     def crash(self) -> str | None:
-        """How the vehicle has crashed so far, in words; None if it has not. Any thread can read
-        this."""
+        """How the vehicle has crashed so far, in words, or None; readable by any thread."""
         return self._consumer.crash_watch.reason
 
     @property

@@ -75,8 +75,7 @@ class SolveRow(NamedTuple):
 
 
 class PacketStamp(NamedTuple):
-    """Stamps of one packet of ``link.tlog``: its arrival, and the time that its contents
-    describe."""
+    """Arrival of one packet of ``link.tlog``, and the time that its contents describe."""
 
     arrived_ns: int
     happened_ns: int

@@ -126,8 +126,7 @@ _ROWS_AT_ONCE = 4096
 
 
 def ticks_batch(rows: Sequence[TickRow], schema: pa.Schema) -> pa.RecordBatch:
-    """Convert consecutive ticks to rows; with the schema ``DEMONSTRATION_TICKS``, labels
-    included."""
+    """Convert consecutive ticks to rows; with ``DEMONSTRATION_TICKS``, labels included."""
     columns = [
         {
             **_attributes(row.tick, _TICK),
@@ -216,8 +215,7 @@ def _tick(row: dict[str, Any], serial: int, make: type[Action]) -> Tick:
 
 
 def read_reason(code: str | None, data: str) -> Reason | None:
-    """Restore the reason with this code and the figures of a JSON object; raise FlightError if
-    invalid."""
+    """Restore a reason from its code and its figures in JSON; raise FlightError if invalid."""
     if code is None:
         return None
     try:

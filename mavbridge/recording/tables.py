@@ -1,5 +1,4 @@
-"""Tables that survive a crash: an Arrow IPC stream while they grow, Parquet once they are
-complete."""
+"""Tables that survive a crash: Arrow IPC streams while they grow, Parquet when complete."""
 
 from collections.abc import Iterator
 from pathlib import Path
@@ -90,8 +89,7 @@ def _groups(schema: pa.Schema, batches: Iterator[pa.RecordBatch]) -> Iterator[pa
 
 
 def read_table(stem: Path, schema: pa.Schema, *, damage: list[str] | None = None) -> pa.Table:
-    """Read the table with this stem in either format; of a cut-off stream, read the complete
-    batches.
+    """Read the table with this stem in either format; of a cut-off stream, the complete batches.
 
     A sentence about any loss is appended to ``damage``.
 

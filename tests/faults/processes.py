@@ -54,8 +54,7 @@ def status_of(pid: int) -> dict[str, str]:
 
 
 def processes_with(variable: str) -> list[tuple[int, str]]:
-    """Return id and command of each running process that started with ``NAME=value`` in its
-    environment."""
+    """Return id and command of each running process started with ``NAME=value`` set."""
     found = []
     for entry in Path("/proc").glob("[0-9]*"):
         with suppress(OSError):

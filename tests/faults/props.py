@@ -108,8 +108,7 @@ class FrameFeed(Worker):
 
 
 class StallWatch(Worker):
-    """Wakes every 5 ms and keeps its worst lateness, which measures this computer, not the
-    bridge."""
+    """Wakes every 5 ms and keeps its worst lateness, which is that of this computer."""
 
     def __init__(self) -> None:
         super().__init__("stall-watch")

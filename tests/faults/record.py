@@ -10,8 +10,7 @@ NEUTRAL_US: Four = (1500, 1500, 1500, 1500)
 RECEIVER_US: dict[Receiver, Four] = {"idle": (1500, 1500, 1000, 1500), "mid": NEUTRAL_US}
 """Sticks of a receiver by its flag; a receiver ``none`` has no sticks."""
 DITHER_US = 8
-"""Largest movement of a channel by which the bridge checks that the vehicle hears it: two steps of
-4."""
+"""Largest movement of a channel by the bridge's echo check: two steps of 4 us."""
 LANDINGS = ("LAND", "RTL", "AUTO.LAND", "AUTO.RTL")
 """Modes in which a vehicle descends autonomously."""
 
@@ -133,8 +132,7 @@ def ending(report: VehicleReport, since_s: float, until_s: float) -> Ending:
 def is_safe(
     entry: StickEntry, receiver: Receiver, mode: str, others_us: tuple[int, ...] = ()
 ) -> bool:
-    """True for neutral sticks, the receiver's or another source's, outside the flight's mode, or
-    disarmed."""
+    """True for neutral sticks, the receiver's or another's, another mode, or disarmed."""
     allowed = {NEUTRAL_US, RECEIVER_US.get(receiver, NEUTRAL_US), others_us or NEUTRAL_US}
     is_stick = any(
         all(abs(a - b) <= DITHER_US for a, b in zip(entry["us"], us, strict=True)) for us in allowed

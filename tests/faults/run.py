@@ -112,8 +112,7 @@ def _perform(scenario: Scenario, stage: Stage) -> int:
 
 
 def _end(scenario: Scenario, stage: Stage, verdict: Verdict) -> None:
-    """End everything, and take over from a guard that holds the vehicle because no receiver
-    exists."""
+    """End everything; take over from a guard that holds the vehicle for lack of a receiver."""
     guard = stage.guard
     stage.kill_group(signal.SIGCONT)
     verdict.ended_ns = stage.kill_group(signal.SIGINT)

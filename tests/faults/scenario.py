@@ -37,26 +37,22 @@ class Scenario:
     """Limit from the fault until the vehicle is safe by its own record; only for ``loses``. It
     includes the time until the fault can be detected."""
     stick_limit_ms: float = 0.0
-    """Limit from the fault until the last stick of the policy leaves the bridge; 0:
-    ``limit_ms``."""
+    """Limit from the fault until the policy's last stick leaves the bridge; 0: ``limit_ms``."""
     exit: list[int] = field(default_factory=list)
     """Allowed exit statuses of the flight process; a signal is negative. Empty: by the outcome."""
     code: str = ""
     """``Code`` of a reason, in the bridge's report, for which the policy lost the sticks."""
     says: str = ""
-    """Text that the bridge prints if no reason reports the fault: a warning, refusal or foreign
-    error."""
+    """Text that the bridge prints if no reason tells: a warning, refusal or foreign error."""
     modes: list[str] = field(default_factory=list)
     """Allowed first mode after the fault; empty: any or none."""
     receivers: list[Receiver] = field(default_factory=list)
-    """Empty: mid and none, and also idle if the policy loses the sticks and the bridge ends the
-    flight."""
+    """Empty: mid and none, and also idle if the policy loses the sticks and the bridge ends it."""
     autopilots: list[AutopilotName] = field(default_factory=lambda: ["ardupilot", "px4"])
     others_us: list[int] = field(default_factory=list)
     """Four sticks of another source that can share the vehicle with the policy until the limit."""
     is_silent: bool = False
-    """True for a takeover: no mode request can follow, and no stick of any kind beyond the
-    limit."""
+    """True for a takeover: then no mode request, and beyond the limit no stick of any kind."""
     judges_end: bool = True
     """True if the vehicle must hold its height or land after the end, unless it was a takeover."""
     releases: bool = True
@@ -118,8 +114,7 @@ class Variant:
 
 
 def load_catalogue(folder: Path = CATALOGUE) -> dict[str, Scenario]:
-    """Return every scenario by name, in the order of the files; raise UsageError if one is
-    invalid."""
+    """Return all scenarios by name, in the order of the files; raise UsageError if invalid."""
     files = sorted(folder.glob("*.toml"))
     return {scenario.name: scenario for path in files for scenario in _read(path)}
 

@@ -21,8 +21,7 @@ POLICY = "Wandering"
 SWITCH, LOW_US, HIGH_US = 7, 1000, 2000
 """Channel of the engage switch, and its end positions."""
 REST_S = 2.5
-"""Time for which the switch stays low: it must rest for 1.8 s before going high counts as an
-act."""
+"""Time for which the switch stays low: going high counts as an act only after 1.8 s of rest."""
 SETTLE_S = 1.5
 """Time from the end of a fault until the policy must have lost the sticks."""
 QUIET_NS = NS_PER_S // 2

@@ -90,8 +90,7 @@ class Stage:
         return subprocess.Popen([*command, *self._vehicle_flags], stderr=subprocess.DEVNULL)
 
     def start(self, *flags: str, is_read: bool = True) -> None:
-        """Start the bridge in its own process group; without ``is_read`` its output is never
-        read."""
+        """Start the bridge in its own process group; without ``is_read``, never read its output."""
         self._flags, self._is_read = flags, is_read
         if self.prepare is not None:
             if not self.relay.has_heard.wait(TIMEOUT_S):
@@ -117,8 +116,7 @@ class Stage:
         return [*command, *cameras, "--report", str(report)]
 
     def environment(self) -> dict[str, str]:
-        """Return our environment, with a terminal of 200 columns and a file for the mark of a
-        policy's fault."""
+        """Return our environment, with 200 columns and a file for the mark of a policy's fault."""
         ours = {"COLUMNS": "200", MARK: str(self._mark), "TMPDIR": str(self.temporary)}
         return os.environ | ours | self.variables
 
@@ -139,8 +137,7 @@ class Stage:
             )
 
     def wait_for_lean(self) -> None:
-        """Wait until the policy holds its lean. Keep the guard's id for the time after its parent's
-        death.
+        """Wait until the policy holds its lean; keep the guard's id for after its parent's death.
 
         If a busy machine made the guard end the flight early, restart vehicle and bridge.
         """
@@ -289,8 +286,7 @@ class Stage:
         return json.loads((self.folder / "report.json").read_text())
 
     def release_codes(self) -> set[str]:
-        """Return codes of all reasons for which the policy lost the sticks, inner reasons
-        included."""
+        """Return codes of all reasons for which the policy lost the sticks, inner ones included."""
         reasons = release_reasons(self.folder / "report.json")
         return {code.value for reason in reasons for code in reason.codes}
 

@@ -49,8 +49,7 @@ def ended(stage: Stage) -> int:
 
 
 def signal(stage: Stage, *, name: str, to: str = "flight") -> int:
-    """Send a signal to a process; ``group`` is the flight process and its children, as with a
-    terminal."""
+    """Send a signal; ``group``: the flight process and its children, as a terminal sends it."""
     number = signals.Signals[name]
     if to == "recorder":
         return Process(stage.pid_of("recorder"), stage.clock).kill(number)
@@ -161,8 +160,7 @@ def pilot(stage: Stage, *, act: str, mode: str = "") -> int:
 
 
 def joystick(stage: Stage, *, hz: float, s: float, roll_us: int = 1400) -> int:
-    """Send sticks of another program with the bridge's own system id; return the time of the
-    first."""
+    """Send sticks of another program with the bridge's system id; return the first's time."""
     sticks = Override(roll=roll_us, pitch=1500, throttle=1500, yaw=1500)
     began_ns = stage.relay.move_joystick(sticks, is_manual=stage.is_px4)
     for _ in range(round(s * hz)):
@@ -263,8 +261,7 @@ def duplicate_system(stage: Stage, *, s: float, hz: float = 10.0) -> int:
 
 
 def rates(stage: Stage, *, hz: float, names: Sequence[str]) -> int:
-    """Request low message rates as a ground station: by interval and, on ArduPilot, by data
-    streams."""
+    """Request few messages as a ground station, by interval and ArduPilot's data streams."""
     relay, began_ns = stage.relay, stage.clock.now_ns()
     for name in names:
         number = getattr(dialect, f"MAVLINK_MSG_ID_{name}")
@@ -293,8 +290,7 @@ class Step(NamedTuple):
 
 
 def make_step(table: Mapping[str, Any], where: str) -> Step:
-    """Make a step from a table; raise UsageError for an unknown kind, or an unknown or missing
-    key."""
+    """Make a step from a table; raise UsageError for an unknown kind or key, or a missing key."""
     keys = dict(table)
     name = str(keys.pop("do", None))
     if name not in KINDS:

@@ -24,8 +24,7 @@ class Verdict:
     aftermath: Aftermath | None = None
     """Only of a flight that lost its sticks."""
     last_stick_ms: float | None = None
-    """Time from the fault to the policy's last steering message at the relay; negative: before the
-    fault."""
+    """Time from the fault to the policy's last steering message that left; negative: before it."""
     ended_ns: int = 0
     """Time at which everything was told to end, CLOCK_MONOTONIC; 0: before it flew."""
     taken_over_ns: int | None = None

@@ -46,8 +46,7 @@ def scene(number: int) -> np.ndarray:
 
 
 def depth_scene(number: int) -> np.ndarray:
-    """Return a depth image [mm]: a slope from 2 m on that differs for each number, with an unknown
-    corner."""
+    """Return a depth image [mm]: a slope from 2 m on, shifted by number; a corner is unknown."""
     rows, columns = np.mgrid[:SIDE, :SIDE]
     depth = (2000 + 50 * rows + columns + number).astype(np.uint16)
     depth[:8, :8] = 0

@@ -91,8 +91,7 @@ class Companion:
     def __init__(self, peer: Peer) -> None:
         self.peer = peer
         self.may_arm = False
-        """Set by the fixtures of tests that declare that they arm. Otherwise arming commands are
-        not sent."""
+        """Set by fixtures of tests that declare that they arm; otherwise arming is refused."""
         self.seen: list[Any] = []
         """All messages since it was last cleared."""
         self._unread: list[Any] = []
@@ -179,8 +178,7 @@ class Companion:
         return bool(state != mav.MAV_LANDED_STATE_ON_GROUND)
 
     def come_down(self) -> None:
-        """Get to the ground, disarmed, by falling if in the air. Only a simulated vehicle may
-        fly."""
+        """Get to the ground and disarm, by falling if in the air. Only a simulated one may fly."""
         self.command(ARM, 0, FORCE)
         for _ in range(50):
             if not self.in_the_air:

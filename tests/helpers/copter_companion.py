@@ -1,5 +1,4 @@
-"""Ground station or companion computer of an ArduCopter: overrides, modes, the climb to a
-height."""
+"""Ground station or companion computer of an ArduCopter: overrides, modes, how to fly up."""
 
 import math
 from typing import Any
@@ -72,8 +71,7 @@ class CopterCompanion(Companion):
         raise AssertionError(f"the vehicle does not get ready to arm: {self.texts()}")
 
     def fly_up(self, mode: int = ALT_HOLD, height_m: float = HEIGHT_M) -> None:
-        """Reach a height, level and still, in this mode. The last message sent is neutral
-        sticks."""
+        """Reach a height, level and still, in this mode; neutral sticks have just been sent."""
         for message_id in (
             mav.MAVLINK_MSG_ID_ATTITUDE,
             mav.MAVLINK_MSG_ID_LOCAL_POSITION_NED,
@@ -116,8 +114,7 @@ class CopterCompanion(Companion):
         raise AssertionError("the vehicle does not come to rest")
 
     def come_down(self) -> None:
-        """Get to the ground, disarmed, and wait until the height estimate has recovered from the
-        impact."""
+        """Get to the ground and disarm; wait until the height estimate recovers from the impact."""
         super().come_down()
         self.stream(mav.MAVLINK_MSG_ID_LOCAL_POSITION_NED, 20)
         for _ in range(15):

@@ -50,8 +50,7 @@ class CourseFlight:
         return distance_m / (passed[-1]["t_s"] - passed[0]["t_s"]) if len(passed) > 1 else math.nan
 
     def misses_m(self) -> list[float]:
-        """Return the distance from the centre, the larger of sideways and vertical, at each passed
-        gate."""
+        """Return the larger of sideways and vertical distance to the centre at each passed gate."""
         misses = []
         for before, after in pairwise(self.ticks):
             if after.next_gate != before.next_gate:

@@ -28,8 +28,7 @@ class Ends:
         self.vehicle.receive(link, self.pack(message, system_id, component_id), self.now_ns)
 
     def run(self, seconds, sticks=None, link=0):
-        """Step on, sending ``sticks`` (link to x, y, z, r) at 50 Hz; return the messages on
-        ``link``."""
+        """Step on, sending ``sticks`` (link: x, y, z, r) at 50 Hz; return messages on ``link``."""
         received = []
         for step in range(round(seconds * NS_PER_S / STEP_NS)):
             if step % 8 == 0:

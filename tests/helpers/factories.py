@@ -44,8 +44,7 @@ def make_trace(sticks: Sticks = NEUTRAL) -> ActionTrace:
 
 
 def make_tick(index: int = 0, **changes: Any) -> Tick:
-    """Return tick ``index``: flying, on time, 2 ms of prediction, 3 ms old attitude, 40 ms old
-    feature.
+    """Return tick ``index``: flying, on time, 2 ms solve; attitude 3 ms and feature 40 ms old.
 
     Each tick flies a new chunk.
     """
@@ -88,8 +87,7 @@ def make_released_tick(index: int = 0, reason: Reason = _NO_IMAGE, **changes: An
 
 
 def make_vision_tick(frame_id: int = 1, **changes: Any) -> VisionTick:
-    """Return frame ``frame_id``: taken up 2 ms after exposure, encoded in 20 ms, no frame
-    dropped."""
+    """Return frame ``frame_id``: taken up after 2 ms, encoded in 20 ms, no frame dropped."""
     captured_ns = START_NS + (frame_id - 1) * FRAME_NS
     rgb = np.zeros((24, 32, 3), dtype=np.uint8)
     rgb.flags.writeable = False

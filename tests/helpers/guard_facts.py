@@ -111,8 +111,7 @@ def codes(reason: Reason | None) -> tuple[Code, ...]:
 
 
 def figures(reason: Reason | None, code: Code) -> dict[str, Value]:
-    """Return the figures of the reason with this code, inner reasons included; empty if there is
-    none."""
+    """Return the figures of the reason with this code, inner reasons included, or none."""
     if reason is None:
         return {}
     if reason.code is code:

@@ -57,8 +57,7 @@ def hovering(_: float) -> tuple[float, float, float, float]:
 
 
 def leaning(_: float) -> tuple[float, float, float, float]:
-    """Return sticks far enough from neutral, and from any receiver, to be identified in every
-    record."""
+    """Return sticks far enough from neutral, and any receiver, to be told apart in records."""
     return (0.0, 0.1, 0.2, 0.3)
 
 

@@ -1,5 +1,4 @@
-"""A guard with its real output and sender, and a vehicle, a pilot and a flight process set by
-hand."""
+"""A guard with its real output and sender; vehicle, pilot and flight process are set by hand."""
 
 from collections import deque
 from collections.abc import Iterator

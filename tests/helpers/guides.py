@@ -34,8 +34,7 @@ class Block:
     kind: str
     """Language of the block; empty if it names none."""
     mark: str
-    """Test that runs it, as in ``run by tests/system/test_guides.py``; empty without such a
-    comment."""
+    """Test that runs it, as in ``run by tests/system/test_guides.py``; empty if none is named."""
     text: str
 
 

@@ -46,8 +46,7 @@ def weights(folder: Path, constants):
 
 
 def statistics(features):
-    """Return statistics of each feature {key: shape}: neither zero nor one, and one constant
-    number."""
+    """Return statistics of each feature {key: shape}: neither 0 nor 1, and one constant."""
     found = {}
     for key, shape in features.items():
         one = (3, 1, 1) if len(shape) == 3 else tuple(shape)

@@ -1,5 +1,4 @@
-"""Prints the data that a MAVSDK program reads from the vehicle, as JSON; needs MAVSDK's
-interpreter."""
+"""Prints as JSON the data that MAVSDK reads from the vehicle; needs MAVSDK's interpreter."""
 
 import json
 import sys

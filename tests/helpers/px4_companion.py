@@ -102,8 +102,7 @@ class Px4Companion(Companion):
     def repeat(
         self, send: Callable[[float], None], seconds: float, hz: float = STICK_HZ
     ) -> list[Any]:
-        """Call ``send`` with the elapsed time at this rate; return the messages received
-        meanwhile."""
+        """Call ``send`` with the elapsed time at this rate; return the received messages."""
         start_ns = self.peer.now_ns()
         messages: list[Any] = []
         count = 0
@@ -126,8 +125,7 @@ class Px4Companion(Companion):
         within_s: float,
         send: Callable[[float], None] = lambda _: None,
     ) -> tuple[float, list[Any]]:
-        """Continue until the messages since the call satisfy a condition; return the time that it
-        took."""
+        """Continue until the new messages satisfy a condition; return the time and the messages."""
         start_ns, messages = self.peer.now_ns(), list[Any]()
         while self.peer.now_ns() - start_ns < within_s * NS_PER_S:
             send((self.peer.now_ns() - start_ns) / NS_PER_S)

@@ -17,8 +17,7 @@ FIELD_OF_VIEW_RAD = 2.0
 
 
 def steered_flight(seed: int, *, seconds: float = 3.0, size: int = 32) -> FlightData:
-    """Write a flight: yaw turns the view past a distant bright spot; pitch accelerates along the
-    view.
+    """Write a flight: yaw turns the view past a far bright spot; pitch accelerates along it.
 
     Ticks at 100 Hz, frames at 30 Hz. The expert's labels differ from the sent sticks.
     """

@@ -9,8 +9,7 @@ from sitl.simulated_vehicle import SimulatedVehicle
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class SensorFreeze:
-    """Telemetry and control keep the last state for a while; the vehicle flies on without
-    feedback."""
+    """Telemetry and control keep the last state for a while; the vehicle flies on blindly."""
 
     start_s: float
     end_s: float

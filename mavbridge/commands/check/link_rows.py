@@ -84,8 +84,7 @@ class VehicleProbe:
         return self._snapshot or self._pass()
 
     def echo(self) -> EchoResult:
-        """Send neutral sticks while the vehicle is disarmed, watch for their echo, and release
-        them."""
+        """Send neutral sticks while the vehicle is disarmed, watch their echo, and release them."""
         result: EchoResult = "not taken"
         due_ns = 0
 

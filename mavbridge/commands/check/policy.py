@@ -31,8 +31,7 @@ _BUSY = 0.8
 _HELD = 0.98
 """Share of the requested rate that counts as held."""
 _LATE_PERIODS = 1.5
-"""A chunk is late if it comes more than this many periods after the one before, as in a flight's
-report."""
+"""A chunk is late if it comes more than this many periods after the last, as in a report."""
 _JOIN_S = 60.0
 """Longest wait for the last call of a slow policy."""
 
@@ -71,8 +70,7 @@ def check_policy(config: FlyConfig, clock: Clock, *, timing_s: float) -> PolicyF
 
 
 def _engine_row(loaded: LoadedPolicy) -> Row:
-    """Return a row on the engine and its agreement with torch; a deviation from the request is a
-    warning."""
+    """Return a row on the engine and its agreement with torch; any deviation is a warning."""
     runner = loaded.runner
     warnings = [note.text for note in loaded.notes if isinstance(note, Warned)]
     agrees = any(isinstance(note, Agreed) for note in loaded.notes)

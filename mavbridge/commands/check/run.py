@@ -31,8 +31,7 @@ from policy.preprocess import least_source_px
 
 _CLOCK_SOURCE = Path("/sys/devices/system/clocksource/clocksource0/current_clocksource")
 _SLOW_CLOCKS = ("hpet", "acpi_pm", "jiffies", "refined-jiffies", "pit")
-"""Clock sources that are read from a device, which takes a microsecond or more, or that only
-tick."""
+"""Clock sources read from a device, which takes a microsecond or more, or that only tick."""
 _CORES = 2
 """One core for the guard and one for the policy, so that neither delays the other."""
 _RIGHTS_TIMEOUT_S = 10.0

@@ -135,8 +135,7 @@ def _arming_row(*, is_ready: bool) -> Row:
 
 
 def _text_rows(texts: Sequence[str]) -> Iterator[Row]:
-    """Yield rows for texts other than advice about parameters and sticks, which has its own
-    rows."""
+    """Yield rows for texts, except advice about parameters and sticks, which has its own rows."""
     for text in [text for text in texts if not isinstance(text, AdviceText)][-_TEXTS_SHOWN:]:
         if not isinstance(text, VehicleText):
             yield _row("link", "see below", "", "warn", text)
@@ -190,7 +189,6 @@ def check_vehicle(
 
 
 def checking_settings(config: FlyConfig, *, is_dual: bool, sends: bool) -> LinkSettings:
-    """Return the flight's link settings without parameter changes and, unless ``sends``, without
-    sticks."""
+    """Return the flight's link settings without parameters to set; sticks only if ``sends``."""
     guard = guard_settings(config, is_dual=is_dual, tlog_fd=None, wall_offset_ns=0)
     return replace(guard.link, readonly=not sends, set_params=())

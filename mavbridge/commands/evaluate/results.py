@@ -34,8 +34,7 @@ class Estimate:
 
 
 def rate(successes: int, count: int) -> Estimate:
-    """Return the share of successes with Wilson's score interval (E. B. Wilson 1927, JASA 22,
-    209-212).
+    """Return the success rate with Wilson's score interval (E. B. Wilson 1927, JASA 22, 209-212).
 
     Raises:
         ValueError: no trials, or more successes than trials.

@@ -101,8 +101,7 @@ def fly_simulated(spec: EpisodeSpec, should_stop: Callable[[], bool]) -> FlownEp
 
 
 def identity(config: EvaluateConfig) -> str:
-    """Return a digest of everything that determines a flight: flags, contents of policy files,
-    versions.
+    """Return a digest of what determines a flight: flags, contents of policy files, versions.
 
     The number of flights, their machines and the output are left out. The weights of a policy
     server, and other files that a user's code reads, are unknown here.
@@ -126,8 +125,8 @@ def flown_before(config: EvaluateConfig, flown_by: str) -> dict[int, FlownEpisod
     """Return the flights in ``config.json`` by index; none if the file is missing.
 
     Raises:
-        UserError: it holds other data, more flights than requested, or flights of an identity
-            other than ``flown_by``.
+        UserError: it holds other data, more flights than requested, or flights of an identity other
+            than ``flown_by``.
     """
     path = config.json
     if path is None or not path.exists():

@@ -275,8 +275,7 @@ def _arrow(values: NDArray[np.generic]) -> pa.Array:
 
 
 def _tasks(task: str) -> pa.Table:
-    """Return ``task_index`` under the index ``task``: the reader takes the words from pandas'
-    index."""
+    """Return ``task_index`` by ``task``: the reader takes the words from pandas' index."""
     columns: list[Json] = [
         {"name": name, "field_name": name, "pandas_type": kind, "numpy_type": dtype}
         | {"metadata": None}

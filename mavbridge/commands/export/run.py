@@ -87,8 +87,7 @@ def write_dataset(
     """Write flights into an empty folder; ``on_frame`` is called for every decoded frame.
 
     Raises:
-        UserError, VideoError, DatasetError: damaged flights, or flights that do not fit in one
-            dataset.
+        UserError, VideoError, DatasetError: damaged flights, or they do not fit in one dataset.
     """
     if (action := common_terms(list(episodes)).action) != "sticks":
         raise UserError(f"these flights were flown by {action}: this command exports sticks")
@@ -165,8 +164,7 @@ def _write_flight(
 
 @contextmanager
 def _whole_or_nothing(out: Path) -> Iterator[Path]:
-    """Context manager: a folder beside ``out`` that is renamed to ``out`` once its dataset is
-    complete.
+    """Context manager: a folder beside ``out`` that is renamed to ``out`` when complete.
 
     Raises:
         UserError: ``out`` is not empty, or cannot be written.

@@ -266,8 +266,7 @@ class RealFrames:
         self._window: deque[ImageArray] = deque(maxlen=config.frames)
 
     def at(self, step: int) -> ImageArray | None:
-        """Return the frame ``step`` times ``frame_dt_s`` after the start; None once the flight is
-        over.
+        """Return the frame ``step`` times ``frame_dt_s`` after the start; None after the flight.
 
         Raises:
             ValueError: it has left the window: steps can go back by one segment at most.

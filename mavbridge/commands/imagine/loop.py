@@ -69,8 +69,7 @@ class ObservationQueue:
         return np.stack(self._states)[None]
 
     def history(self) -> FloatArray:
-        """Return the executed sticks up to now as the decider's contract defines them, [1, K,
-        4]."""
+        """Return the executed sticks up to now by the decider's contract, [1, K, 4]."""
         return self._history.resample(self._now_ns)
 
 
@@ -82,8 +81,7 @@ class Decider(Protocol):
     contract: Contract
 
     def decide(self, seen: ObservationQueue, seed: int) -> FloatArray:
-        """Return sticks [frames, 4] in [-1, 1]: the mean of each step of ``frame_dt_s`` from now
-        on."""
+        """Return sticks [frames, 4] in [-1, 1]: the mean of each ``frame_dt_s`` from now on."""
         ...
 
 
@@ -121,8 +119,7 @@ class PolicyDecider:
         self._frame_dt_s = sampler.config.frame_dt_s
 
     def decide(self, seen: ObservationQueue, seed: int) -> FloatArray:
-        """Return the mean of one chunk over each step. Its noise was fixed when the policy was
-        loaded."""
+        """Return a chunk's mean over each step. Its noise was fixed when the policy was loaded."""
         state = seen.states()[:, -1]
         if self.contract.since_exposure:
             # Image and state have the same age: no motion since the exposure.
@@ -146,8 +143,7 @@ class WorldModelDecider:
     """The world model as its own decider, by the sampled actions."""
 
     def __init__(self, sampler: Sampler, *, from_pixels: bool) -> None:
-        """Decide from latents; with ``from_pixels``, from its own frames, decoded and encoded
-        again."""
+        """Decide from latents, or with ``from_pixels`` from its own frames, encoded again."""
         self.images = sampler.config.context_frames if from_pixels else 0
         self.contract = sampler.config.contract
         self._sampler = sampler
@@ -199,8 +195,7 @@ class RolloutPlan:
             )
 
     def stage_seed(self, iteration: int, stage: NoiseStage) -> int:
-        """Return the seed of one stage of one iteration of this rollout, independent of all
-        others."""
+        """Return the seed of one stage of one iteration, independent of all others."""
         return noise_seed(self.seed, iteration, int(stage))
 
 

@@ -63,8 +63,7 @@ def prepare_out(out: Path) -> None:
     """Check that a rollout can be written here.
 
     Raises:
-        UserError: the extra is not installed, the name is taken or not .mp4, or writing is not
-            permitted.
+        UserError: the extra is not installed, the name is taken or not .mp4, or is not writable.
     """
     require_extra("imagine")
     if out.suffix != ".mp4":
@@ -76,8 +75,7 @@ def prepare_out(out: Path) -> None:
 
 
 def read_rows(out: Path) -> Any:
-    """Return the rows of a rollout's frames, finished or cut off: a ``pyarrow.Table`` of
-    ``SCHEMA``.
+    """Return the rows of a rollout, finished or cut off: a ``pyarrow.Table`` of ``SCHEMA``.
 
     A rollout without a video has only its rows.
 
@@ -275,8 +273,7 @@ class StreamedOutput:
         self._wait_until(was_put, on_wait)
 
     def _wait_until(self, condition: Callable[[], bool], on_wait: Callable[[], None]) -> None:
-        """Wait for the condition as long as frames are finished. The condition itself waits
-        briefly."""
+        """Wait for the condition, which itself waits briefly, as long as frames are finished."""
         seen, since_ns = self.frames, self._clock.now_ns()
         while not condition():
             on_wait()

@@ -142,8 +142,7 @@ class FlightAnalysis:
 
 
 def analyse(folder: Path, *, gates: Path | None = None) -> FlightAnalysis:
-    """Read a recorded flight; ``gates`` is a file of ``read_gates`` for a flight of an unknown
-    course.
+    """Read a recorded flight; ``gates`` is a file of ``read_gates``, for an unknown course.
 
     Raises:
         MavbridgeError: not a recorded flight, or a damaged one.
@@ -191,8 +190,7 @@ def _require_sound(flight: RecordedFlight) -> None:
 
 
 def _stick_hz(ticks: Iterable[Tick], meta: FlightMeta) -> float:
-    """Return the rate of the grid by the median time between slots; without slots, that of the
-    actions."""
+    """Return the stick rate by the median time between slots; without slots, the action rate."""
     due_ns = np.array([tick.due_ns for tick in ticks if tick.is_slot and tick.due_ns > 0], np.int64)
     periods_ns = due_ns[1:] - due_ns[:-1]
     periods_ns = periods_ns[periods_ns > 0]
@@ -222,8 +220,7 @@ def _report(
 
 
 def _with_gaps(ticks: Sequence[Tick]) -> Iterator[Tick]:
-    """Yield the ticks, and one without sticks wherever the recorder lost some, so that nothing is
-    measured across such a gap."""
+    """Yield the ticks, and one without sticks in each gap, across which nothing is measured."""
     yield from ticks[:1]
     for last, tick in pairwise(ticks):
         if is_gap(last, tick):

@@ -142,8 +142,7 @@ def _solve_of(tick: Tick) -> _Solve | None:
 def _cause(last: _Solve, solve: _Solve, chunk_ns: float, arrivals: Arrivals | None) -> Cause:
     """Return the stage that caused most of the delay.
 
-    A solve can start one period after the last one, once that has ended and a new attitude is
-    there.
+    A solve can start one period after the last one, once that has ended and an attitude is new.
     """
     due_ns = last.started_ns + (solve.serial - last.serial) * chunk_ns
     free_ns = max(due_ns, last.computed_ns)
@@ -182,8 +181,7 @@ def _arrival_ns(
 
 
 def flown_limits(folder: Path, contract: Contract | None) -> FreshnessLimits | None:
-    """Return the age limits of the flown chunks: the flags' if they are recorded, else the
-    contract's."""
+    """Return the age limits of the flown chunks: the recorded flags', else the contract's."""
     if contract is None:
         return None
     try:
@@ -193,8 +191,7 @@ def flown_limits(folder: Path, contract: Contract | None) -> FreshnessLimits | N
 
 
 def read_arrivals(folder: Path, damage: list[str]) -> Arrivals | None:
-    """Return the attitudes that reached the flight process; None if the recording has no such
-    table.
+    """Return the attitudes that reached the flight process; None if there is no such table.
 
     A sentence about any loss is appended to ``damage``.
 

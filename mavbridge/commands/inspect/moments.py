@@ -201,8 +201,7 @@ def _old_images(ticks: Sequence[Tick], start_ns: int) -> Iterator[Moment]:
 def _image_gaps(
     flight: RecordedFlight, frames: Sequence[FrameRow], ticks: Sequence[Tick]
 ) -> Iterator[Moment]:
-    """Yield gaps between exposures from the first tick to the last, without losses of the
-    recorder."""
+    """Yield gaps between exposures from the first tick to the last, except the recorder's."""
     period_ms = 1000 / flight.meta.visual_hz
     for last, frame in pairwise(frames):
         gap_ms = (frame.captured_ns - last.captured_ns) / NS_PER_MS

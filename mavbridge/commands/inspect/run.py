@@ -170,8 +170,7 @@ def _moments_table(flight: FlightAnalysis) -> Table | Text:
 
 
 def print_comparison(flights: Sequence[FlightAnalysis], console: Console) -> None:
-    """Print two flights side by side; differences of a tenth or more are marked as better or
-    worse."""
+    """Print two flights side by side; differences from a tenth on are marked better or worse."""
     first, second = flights
     table = Table(title="Two flights", title_justify="left")
     table.add_column("", no_wrap=True)

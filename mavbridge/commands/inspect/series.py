@@ -24,8 +24,7 @@ _ENU_FROM_NED, _FRD_FROM_FLU = (0.0, _HALF, _HALF, 0.0), (0.0, 1.0, 0.0, 0.0)
 
 @dataclass(frozen=True, kw_only=True)
 class Series:
-    """Values of all N ticks in NED and FRD, independent of the policy's axes; NaN for missing
-    ones."""
+    """Values of all N ticks, in NED and FRD for any policy; NaN for missing ones."""
 
     start_ns: int
     """Wake-up of the first tick, on the clock of all stamps."""
@@ -120,8 +119,7 @@ def _feature_age_ns(tick: Tick) -> int | None:
 
 
 def _periods_ms(ticks: Sequence[Tick]) -> FloatColumn:
-    """Return times between the sends of consecutive slots, both flown by the policy, without lost
-    ticks."""
+    """Return times between the sends of consecutive flown slots without lost ticks."""
     periods_ns: list[int | None] = []
     last_ns: int | None = None
     before: Tick | None = None

@@ -86,8 +86,7 @@ class EpisodeControl:
         )
 
     def _keep_wanting(self, seen: Seen, begin: str | None) -> None:
-        """Repeat the request while the switch is high or the vehicle armed, because the missing
-        requirement can still be met."""
+        """Repeat the request while switch or arming asks: the obstacle can still disappear."""
         is_on = self._position == "high" if self._has_switch else seen.armed
         if begin is not None:
             self._wanted = begin
@@ -140,8 +139,7 @@ class EpisodeControl:
 
 
 FIRST_BYTES_PS = 600_000.0
-"""Assumed until measured, in bytes per second: twice that of 224 x 224 at 30 Hz and 100 rows a
-second."""
+"""Assumed before a measurement: twice the rate of 224 x 224 at 30 Hz and 100 rows a second."""
 LEAST_S = 60.0
 """Recording time for which the disk must have room when an episode begins [s]."""
 MEASURED_NS = 5 * NS_PER_S
@@ -165,15 +163,13 @@ class DiskWatch:
         self._bytes_ps = FIRST_BYTES_PS
 
     def measure(self, episode: Path, duration_ns: int) -> None:
-        """Measure the data rate of an episode that is long enough; raise OSError if it cannot be
-        read."""
+        """Measure the data rate of an episode if it is long enough; raise OSError if unreadable."""
         if duration_ns >= MEASURED_NS:
             size = sum(entry.stat().st_size for entry in episode.iterdir())
             self._bytes_ps = max(1.0, size * NS_PER_S / duration_ns)
 
     def left_s(self) -> float:
-        """Return the recording time until only the reserve is left, at least 0; raise OSError if
-        unknown."""
+        """Return the recording time until only the reserve is left; raise OSError if unknown."""
         return max(0.0, (self._free(self._folder) - self._reserve_bytes) / self._bytes_ps)
 
     @property
@@ -301,8 +297,7 @@ class Episodes:
 
     @property
     def counts(self) -> Counter[bool | None]:
-        """Number of episodes of this session that are good (True), bad (False) and unmarked
-        (None)."""
+        """Number of episodes of this session: good (True), bad (False) and unmarked (None)."""
         return Counter(self._marks.values())
 
     def begin(self) -> None:

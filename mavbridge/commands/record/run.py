@@ -1,5 +1,4 @@
-"""One recording session: open everything, follow the orders of ``EpisodeControl``, close
-everything."""
+"""One recording session: opens everything, follows the orders of ``EpisodeControl``, and closes."""
 
 import threading
 from collections import deque
@@ -223,8 +222,7 @@ class _Session:
         )
 
     def run(self, stop: StopRequest) -> None:
-        """Follow orders until one of them, a signal, a worker's death or the disk ends the
-        session."""
+        """Follow orders until one of them, a signal, a worker's death or the disk ends it."""
         vision = Worker("mavbridge-vision", self._vision.run)
         listener = Worker("mavbridge-guard", self._listen)
         for worker in (vision, listener):

@@ -56,8 +56,7 @@ class PilotView(TelemetryCache):
         self.stick_packets = 0
 
     def log_to(self, log: PacketPipe | None) -> None:
-        """Write the vehicle's packets to this log from now on; None: to no log. The previous log is
-        then unused."""
+        """Log the vehicle's packets here from now on; None: nowhere. The last log is then free."""
         with self._log_lock:
             self._log = log
 
@@ -142,8 +141,7 @@ class RecordScreen(FlightScreen):
         self._newest = event
 
     def status_line(self) -> Text:
-        """Return the current status. Call at ``STATUS_HZ``, because rates are averages over
-        calls."""
+        """Return the current status. Call at ``STATUS_HZ``: rates are averages over calls."""
         shown, tick = self.shown, self._newest
         line = Text(no_wrap=True, overflow="ellipsis")
         if shown is None or tick is None:

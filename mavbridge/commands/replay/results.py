@@ -133,8 +133,7 @@ def to_json(result: ReplayResult) -> str:
 
 
 def _finite(value: object) -> object:
-    """Replace infinity by null, because JSON has no infinity. It means that only one of the two was
-    flown."""
+    """Replace infinity, which JSON lacks, by null: only one of the two was flown."""
     if isinstance(value, dict):
         return {name: _finite(each) for name, each in value.items()}
     if isinstance(value, list | tuple):

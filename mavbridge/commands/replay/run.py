@@ -111,8 +111,7 @@ def _trusted(source: ReplaySource, asked: ReplayConfig) -> ReplayConfig:
     """Return the request, without the flight's own policy if that was named again.
 
     Raises:
-        UserError: the recording names a policy that contains code, or weights that are not a
-            file.
+        UserError: the recording names a policy that contains code, or weights that are not a file.
     """
     flown = source.config.policy
     if (asked.policy, asked.checkpoint, asked.contract) == (

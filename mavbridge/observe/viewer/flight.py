@@ -29,8 +29,7 @@ BATCHES_OF_ROWS = 3
 
 
 class RerunView:
-    """Shows ticks, solves and vision ticks on the timeline ``time``, which starts at the first
-    event.
+    """Shows ticks, solves and vision ticks on the timeline ``time``, from the first one on.
 
     Values of a tick are stamped with its wake-up, values of a frame with the end of its encoding,
     images with their exposure. An unmeasured value is a gap in its line.
@@ -89,8 +88,7 @@ class RerunView:
             self._columns.flush()
 
     def close(self) -> None:
-        """Deliver the rest; blocks until it is taken. Raise MavbridgeError if the viewer is
-        gone."""
+        """Deliver the rest and block until taken; raise MavbridgeError if the viewer is gone."""
         self._open()
         self._timing.close()
         self._columns.flush()
@@ -112,8 +110,7 @@ class RerunView:
             self._columns.plot(plot, [start_ns], [(math.nan,) * len(plot.series)])
 
     def _show_plans(self, solves: Sequence[Solve], ticks: Sequence[Tick]) -> None:
-        """Show the policy's plans while it flies, each starting at the vehicle's position at that
-        time."""
+        """Show the policy's plans while it flies, each from the vehicle's position at its time."""
         known = [tick for tick in (self._last_tick, *ticks) if tick is not None]
         stamps_ns = [tick.woke_ns for tick in known]
         for solve in solves:

@@ -26,8 +26,7 @@ VEHICLE = f"{CHASE}/vehicle"
 PATH = f"{SCENE}/path"
 PLANNED_PATH = f"{SCENE}/planned"
 PLAN_LANES = 2
-"""Planned actions overlap in time. Neighbours are in different entities, or a line would join
-them."""
+"""Planned actions overlap in time: a line would join neighbours in one entity."""
 PLAN_TAIL_S = 3.0
 """Time before the cursor for which the scene shows planned paths."""
 ORIGIN = Position(0.0, 0.0, 0.0)
@@ -151,8 +150,7 @@ def plan_plots(action: ActionKind) -> tuple[tuple[Plot, ...], ...]:
 
 
 def camera_paths(cameras: tuple[str, ...]) -> tuple[str, ...]:
-    """Return the entity of each camera. It is below the vehicle, so that its images hang in the
-    scene."""
+    """Return each camera's entity, below the vehicle so that its images hang in the scene."""
     return tuple(f"{VEHICLE}/{name}" for name in cameras)
 
 
@@ -209,8 +207,7 @@ def flight_blueprint(flight: ViewedFlight) -> rrb.Blueprint:
 
 
 def _scenes(gates: Sequence[CourseGate]) -> rrb.Horizontal:
-    """Return two scenes: the path, as a whole if its gates are known, else from afar; and the
-    vehicle from near."""
+    """Return two scenes: the path (whole with known gates, else from afar), the near vehicle."""
     until_now = rrb.VisibleTimeRange(
         "time", start=rrb.TimeRangeBoundary.infinite(), end=rrb.TimeRangeBoundary.cursor_relative()
     )
@@ -269,8 +266,7 @@ def _timing() -> rrb.Horizontal:
 
 
 def _event_columns() -> rrb.TextLogColumns:
-    """Show only the text, which begins with the time: the viewer's own time column is too
-    narrow."""
+    """Show only the text, which begins with the time; the viewer's own column is too narrow."""
     time = TimelineColumn("time", visible=False)
     return rrb.TextLogColumns(timeline_columns=[time], text_log_columns=["Body"])
 

@@ -94,8 +94,7 @@ class Spread:
 
 
 ALLOWED_SHARE = 0.001
-"""Share of slots and of images that one minute at full rate is allowed to lose; our own
-criterion."""
+"""Our criterion: share of slots and of images that a minute at full rate is allowed to lose."""
 _GAP = Sticks(math.nan, math.nan, math.nan, math.nan)
 
 

@@ -79,8 +79,7 @@ class RolloutView:
             recording.log(path, rr.Scalars(frame.state[columns]), strict=True)
 
     def close(self) -> None:
-        """Deliver the rest; blocks until it is taken. Raise MavbridgeError if the viewer is
-        gone."""
+        """Deliver the rest and block until taken; raise MavbridgeError if the viewer is gone."""
         self._recording.close()
 
 

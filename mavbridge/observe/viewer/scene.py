@@ -216,8 +216,7 @@ def _gates(gates: Sequence[CourseGate]) -> rr.LineStrips3D:
 
 
 def _fitting(image: CameraImage) -> ImageArray:
-    """Return the image in RGB at its shown width. Depth is darker the farther it is; unknown depth
-    is black."""
+    """Return the image in RGB at its shown width; farther depth is darker, unknown is black."""
     rgb = np.asarray(image, np.uint8) if image.ndim == 3 else _shaded(image)
     height, width = rgb.shape[:2]
     if width <= MAX_IMAGE_WIDTH:
@@ -306,8 +305,7 @@ def planned_path(
 
 
 def _lean_mps2(roll_rad: float, pitch_rad: float, yaw_rad: float) -> NDArray[np.float64]:
-    """Return acceleration towards north and east [m/s^2] of a vehicle with this lean at constant
-    height."""
+    """Return acceleration to north and east [m/s^2] of a vehicle that leans at constant height."""
     roll_rad, pitch_rad = (
         max(-_STEEPEST_RAD, min(lean, _STEEPEST_RAD)) for lean in (roll_rad, pitch_rad)
     )

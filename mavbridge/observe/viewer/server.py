@@ -1,9 +1,8 @@
 """Rerun's web viewer and the server that feeds it (``--serve``), in a separate process.
 
 The server keeps received data for browsers that connect late, so memory is bounded there, outside
-the flight. A slow browser blocks the server, never the flight's loops. The server shows data that
-any program sends to its data port; pages of other origins cannot send, and no data returns to the
-flight.
+the flight. A slow browser blocks the server, never the flight's loops. The server shows data from
+any program that sends to its data port. Pages of other origins cannot; the flight gets none of it.
 """
 
 import socket

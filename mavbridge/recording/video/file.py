@@ -96,14 +96,12 @@ class FragmentedMp4:
 
 
 def count_frames(path: Path) -> int:
-    """Count the complete frames of a ``FragmentedMp4`` file; raise VideoError if it is
-    unreadable."""
+    """Count the complete frames of a ``FragmentedMp4`` file; raise VideoError on failure."""
     return len(find_images(path).fragments)
 
 
 def find_images(path: Path) -> VideoParts:
-    """Find the decodable parts of a ``FragmentedMp4`` file; raise VideoError if it is
-    unreadable."""
+    """Find the decodable parts of a ``FragmentedMp4`` file; raise VideoError on failure."""
     try:
         return video_parts(path)
     except OSError as error:

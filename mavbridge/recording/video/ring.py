@@ -79,8 +79,7 @@ class FrameRing:
         return frame
 
     def unlink(self) -> None:
-        """Remove the name, in the producer: the memory is then freed even if both processes are
-        killed."""
+        """Remove the name, in the producer: the memory is freed even if both are killed."""
         if self._is_linked:
             self._is_linked = False
             self._memory.unlink()

@@ -29,8 +29,7 @@ from mavbridge.recording.video.writer_process import (
 )
 
 Pressure = Literal["online", "offline"]
-"""Behaviour with a full ring: online drops and counts the frame; offline makes the producer
-wait."""
+"""With a full ring, online drops and counts the frame; offline makes the producer wait."""
 
 START_S = 30.0
 STALL_S = 30.0
@@ -132,8 +131,7 @@ class FrameSender:
         self._wait_until(lambda: Notice.DONE in self._notices)
 
     def _send(self, message: ToWriter) -> None:
-        """Send a message. Never blocks, because there are at most as many messages in flight as
-        slots."""
+        """Send a message. Never blocks: no more messages are in flight than there are slots."""
         try:
             self._pipe.send(message)
         except OSError:  # it has ended; its last message or exit status gives the reason
@@ -203,8 +201,7 @@ class VideoWriter(FrameSender):
 
         Args:
             video: MP4 file to make; must not exist.
-            pressure: behaviour with a full ring. Online, the process yields the CPU to all
-                others.
+            pressure: behaviour with a full ring. Online, the process yields the CPU to all others.
             hz: nominal frame rate.
             rows: path and stem of a table of frames to write, or None.
             with_truth: the table has the columns of ``FrameTruth``.
