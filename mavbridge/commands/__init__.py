@@ -1,1 +1,1 @@
-"""The programs beside the flight, one package a command."""
+"""Commands beside the flight itself."""

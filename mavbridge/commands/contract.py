@@ -1,4 +1,4 @@
-"""``mavbridge contract``: what a policy's files say, and questions for what they do not say."""
+"""``mavbridge contract``: facts from a policy's files, and questions about the missing ones."""
 
 from pathlib import Path
 
@@ -36,7 +36,7 @@ def contract(source: Path, config: ContractConfig) -> int:
 
 
 def _draft(source: Path, dataset: Path | None) -> tuple[str, str]:
-    """Its text, and what the user should know of it."""
+    """Return the text of the contract file, and notes for the user."""
     if dataset is not None and not is_lerobot(dataset):
         raise UserError(f"--dataset {dataset}: not a LeRobot dataset, it has no meta/info.json")
     if is_lerobot(source):

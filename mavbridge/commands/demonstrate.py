@@ -38,23 +38,23 @@ from sitl.vehicle.conditions import NOMINAL, Conditions, random_conditions
 from sitl.vehicle.dynamics import BodyState
 
 SETTLE_NS = 300 * NS_PER_MS
-"""After a start in the air: until the last frame and state from the ground are gone."""
+"""Wait after a start in the air, until the last frame and state from the ground are gone."""
 STUDENT_TURN_S, EXPERT_TURN_S = (1.5, 6.0), (0.4, 1.6)
-"""Least and most length of a turn. Where a student flies, the expert takes over now and then: a
-student that crashes at the first gate would otherwise learn nothing about the later ones (DAgger,
-Ross et al. 2011, mixes the two at random)."""
+"""Range of the length of a turn. If a student flies, the expert takes over now and then: otherwise
+a student that crashes at the first gate would learn nothing about later ones (DAgger, Ross et al.
+2011, mixes the two at random)."""
 SOLVES_KEPT = TRUTHS_KEPT = 64
-"""Solves and exposures that are kept until their ticks and frames are recorded."""
+"""Solves and exposures kept until their ticks and frames are recorded."""
 NOMINAL_SHARE, AIRBORNE_SHARE, UNDISTURBED_SHARE = 0.25, 0.35, 0.3
-"""Flights without random conditions, as most users fly first; flights that start in the air and off
-the course; flights without disturbed actions: examples of a good flight."""
+"""Shares of flights without random conditions, as most users fly first; that start in the air and
+off the course; and without disturbed actions, as examples of a good flight."""
 RATE_TILT_DEG = 80.0
-"""Largest tilt of a policy that learns from an expert by body rates, which leans by up to 62."""
+"""Tilt limit of a policy that learns from a body-rate expert, which leans by up to 62 degrees."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Variation:
-    """The random part of one demonstration; everything follows from ``seed``."""
+    """Random part of one demonstration, derived from ``seed`` alone."""
 
     seed: int
     conditions: Conditions
@@ -64,7 +64,7 @@ class Variation:
 
 
 def draw_variation(seed: int) -> Variation:
-    """The variation of a seed."""
+    """Draw the variation of a seed."""
     random = np.random.Generator(np.random.PCG64((seed, 4)))
     shares = (NOMINAL_SHARE, AIRBORNE_SHARE, UNDISTURBED_SHARE)
     is_nominal, is_airborne, is_undisturbed = random.random(3) < shares
@@ -78,7 +78,7 @@ def draw_variation(seed: int) -> Variation:
 
 
 def _random_delays(random: np.random.Generator) -> Delays:
-    """Delays between those of a fast computer and a busy one, with log-uniform medians."""
+    """Draw delays between those of a fast computer and of a busy one, with log-uniform medians."""
 
     def median_ns(low_ms: float, high_ms: float) -> int:
         return round(NS_PER_MS * float(np.exp(random.uniform(np.log(low_ms), np.log(high_ms)))))
@@ -95,7 +95,7 @@ def _random_delays(random: np.random.Generator) -> Delays:
 
 
 class Pilot:
-    """The expert's action at every solve, and a runner that flies."""
+    """Computes the expert's action at every solve; its runner flies."""
 
     def __init__(
         self,
@@ -121,9 +121,9 @@ class Pilot:
         self._expert: Expert | RateExpert | None = None
         self._solves = 0
         self._expert_actions: dict[int, Action] = {}
-        """By the serial of the chunk that was computed with them."""
+        """Expert actions by the serial of the chunk that was computed with them."""
         self.begin_ns: int | None = None
-        """When the demonstration begins; None before the policy has the vehicle's sticks."""
+        """Start of the demonstration; None before the policy has the sticks."""
         expert = PolicyRunner(
             contract=contract,
             name=f"expert at {speed_mps:g} m/s",
@@ -135,11 +135,11 @@ class Pilot:
         self.runner = replace(student or expert, act=self._act, reset=self._start)
 
     def expert_action(self, chunk_serial: int) -> Action | None:
-        """The expert's action at the state of a recent chunk; None before its demonstration."""
+        """Return the expert's action at a recent chunk's state; None before the demonstration."""
         return self._expert_actions.get(chunk_serial)
 
     def _start(self) -> None:
-        """The policy has the sticks now: a vehicle that is put in the air is under control."""
+        """Begin, now that the policy has the sticks: a vehicle placed in the air is controlled."""
         if self._student is not None:
             self._student.reset()
         self._expert = self._begin(self._flight.clock.now_ns())
@@ -147,7 +147,7 @@ class Pilot:
     def _act(self, encoded: FloatArray, state: FloatArray, history: FloatArray) -> FloatArray:
         self._solves += 1
         horizon = self.runner.contract.horizon
-        if self._expert is None:  # not engaged yet: the guard wants to see chunks first
+        if self._expert is None:  # not engaged yet: the guard has to see chunks first
             return np.zeros((1, horizon, ACTION_DIM), np.float32)
         now_s, body = self._flight.clock.now_ns() / NS_PER_S, self._flight.vehicle.ap.truth
         self._expert_actions[self._solves], disturbed = self._demonstrate(self._expert, body, now_s)
@@ -155,14 +155,14 @@ class Pilot:
         chunk = np.tile(np.array(disturbed, np.float32), (1, horizon, 1))
         if self._student is None:
             return chunk
-        # Called at every tick, also in the expert's turns: the student may hold state of its own.
+        # Called at every tick, also in the expert's turns: the student can have internal state.
         students = self._student.act(encoded, state, history)
         return students if self._turns.is_students(now_s) else chunk
 
     def _demonstrate(
         self, expert: Expert | RateExpert, body: BodyState, now_s: float
     ) -> tuple[Action, Sequence[float]]:
-        """The expert's action, and what is flown of it."""
+        """Return the expert's action, and the disturbed action to fly."""
         if isinstance(expert, RateExpert):
             command = expert.command(body, now_s)
             return BodyRates(*command), self._disturbance.flown(command, now_s)
@@ -170,10 +170,10 @@ class Pilot:
         return Sticks(*sticks), self._disturbance.flown(sticks, now_s)
 
     def _begin(self, now_ns: int) -> Expert | RateExpert:
-        """Put the vehicle where the demonstration starts, and make the expert that flies it.
+        """Move the vehicle to the start of the demonstration, and create the expert.
 
-        The expert does not know the vehicle's parameters, which no learner could see: it flies as
-        many courses without them (37 of 40, and 37 of 40 with).
+        The expert does not know the vehicle's parameters, because no learner could see them. It
+        finishes as many courses without them (37 of 40) as with them (37 of 40).
         """
         self.begin_ns, next_gate = now_ns, 0
         if self._variation.starts_airborne:
@@ -186,7 +186,7 @@ class Pilot:
 
 
 class TurnSchedule:
-    """Student and expert fly in turns of random length, which follow from ``seed``."""
+    """Turns of student and expert, of random length, derived from ``seed``."""
 
     def __init__(self, seed: int) -> None:
         self._random = np.random.Generator(np.random.PCG64((seed, 5)))
@@ -194,7 +194,7 @@ class TurnSchedule:
         self._end_s: float | None = None
 
     def is_students(self, t_s: float) -> bool:
-        """The student flies at ``t_s``; call in order of time."""
+        """True if the student flies at ``t_s``. Call in order of time."""
         if self._end_s is None:
             self._end_s = t_s + self._length_s()
         while t_s >= self._end_s:
@@ -221,7 +221,7 @@ class DemonstrationSpec:
 
 
 def fly_demonstration(spec: DemonstrationSpec, should_stop: Callable[[], bool]) -> bool:
-    """Fly and record one course; returns whether it was finished.
+    """Fly and record one course; return True if it was finished.
 
     Raises:
         EpisodeInterruptedError: ``should_stop`` ended it; the folder holds an unfinished flight.
@@ -234,7 +234,7 @@ def fly_demonstration(spec: DemonstrationSpec, should_stop: Callable[[], bool]) 
 
 
 def _fly(spec: DemonstrationSpec, should_stop: Callable[[], bool], stack: ExitStack) -> bool:
-    """Fly and record one course; the student is closed with ``stack``."""
+    """Fly and record one course; ``stack`` closes the student."""
     variation, wanted = draw_variation(spec.seed), spec.config.policy
     student: PolicyRunner | None = None
     size_px = wanted.image_size or SIM_CAMERA_PX
@@ -257,7 +257,7 @@ def _fly(spec: DemonstrationSpec, should_stop: Callable[[], bool], stack: ExitSt
     flight = SimulatedFlight(
         course_seed=spec.seed,
         seed=spec.seed,
-        # The expert looks at no image: frames are drawn in the size to be recorded.
+        # The expert uses no image: frames are drawn in the size of the recording.
         settings=SimulationSettings(
             delays=variation.delays, least_camera_px=SIM_CAMERA_PX if student else 1
         ),
@@ -305,7 +305,7 @@ def _meta(spec: DemonstrationSpec, variation: Variation, runner: PolicyRunner) -
 
 
 class _LabelledRecorder:
-    """A ``TickSink`` that records, with labels, what happens once the demonstration has begun."""
+    """``TickSink`` that records the flight with labels, from the start of the demonstration."""
 
     def __init__(self, flight: SimulatedFlight, pilot: Pilot, writer: FlightWriter) -> None:
         self._flight = flight
@@ -331,7 +331,7 @@ class _LabelledRecorder:
             self._truths.pop(next(iter(self._truths)))
 
     def emit(self, event: Event) -> None:
-        """Record the event, numbered from the first that is recorded."""
+        """Record the event. Numbers count from the first recorded one."""
         from_ns = self._pilot.begin_ns
         if from_ns is None:
             return
@@ -343,7 +343,7 @@ class _LabelledRecorder:
             self._frames += 1
 
     def _record(self, tick: Tick, from_ns: int) -> None:
-        """Record the first send of each chunk: one row for each decision of the policy."""
+        """Record the first send of each chunk: one row per decision of the policy."""
         serial = tick.chunk_serial
         if tick.woke_ns < from_ns or serial is None or serial == self._chunk_serial:
             return
@@ -354,7 +354,7 @@ class _LabelledRecorder:
 
 
 def demonstrate(config: DemonstrateConfig) -> int:
-    """Fly every episode that is not recorded yet; 130 if interrupted, to be resumed later.
+    """Fly every episode that is not recorded yet; return 130 if interrupted, to be resumed later.
 
     Raises:
         MavbridgeError: a flight cannot be flown or recorded.
@@ -379,10 +379,10 @@ def demonstrate(config: DemonstrateConfig) -> int:
 
 
 def _missing(config: DemonstrateConfig) -> list[DemonstrationSpec]:
-    """The episodes without a finished recording.
+    """Return the episodes without a finished recording.
 
     Raises:
-        UserError: the folder of an episode holds something that is no flight.
+        UserError: the folder of an episode holds something other than a flight.
     """
     specs = []
     for index in range(config.episodes):
@@ -394,7 +394,7 @@ def _missing(config: DemonstrateConfig) -> list[DemonstrationSpec]:
                 if read_meta(folder).finished:
                     continue
             except FlightError:
-                pass  # cut off while it was written
+                pass  # cut off while being written
         seed = config.first_course_seed + index
         specs.append(DemonstrationSpec(folder=folder, seed=seed, config=config))
     return specs

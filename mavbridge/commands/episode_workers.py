@@ -1,6 +1,6 @@
-"""Episodes one after the other, on processes of this machine, or on a Ray cluster.
+"""Runs episodes one after the other, in processes of this machine, or on a Ray cluster.
 
-The results are the same from all three: an episode depends on its job alone.
+Results are equal in all three cases, because an episode depends only on its job.
 """
 
 import logging
@@ -26,16 +26,16 @@ Job = TypeVar("Job")
 Result = TypeVar("Result")
 ShouldStop: TypeAlias = Callable[[], bool]
 FlyJob: TypeAlias = Callable[[Job, ShouldStop], Result]
-"""Importable in another process; raises ``EpisodeInterruptedError`` when ``ShouldStop`` says so."""
+"""Importable in another process; raises ``EpisodeInterruptedError`` if ``ShouldStop`` is True."""
 
 MAX_RETRIES = 3
-"""Lost workers of one episode on Ray, which flies it again, before it is held to be the cause."""
+"""Lost workers of one episode, which Ray flies again, before it counts as the cause."""
 CONNECT_TIMEOUT_S = 5.0
 END_TIMEOUT_S = 10.0
-"""Time for the flight of a worker to end in order, once it is told to stop."""
+"""Time for a worker to end its flight in order once it is told to stop."""
 _POLL_S = 0.1
 _stop = threading.Event()
-"""In a worker process: set when it is to end."""
+"""In a worker process: set when the worker has to end."""
 
 
 def fly_jobs(
@@ -44,7 +44,7 @@ def fly_jobs(
     config: WorkersConfig,
     should_stop: ShouldStop,
 ) -> Iterator[tuple[int, Result]]:
-    """Fly every job, and yield its index and result when ready; ends early on ``should_stop``.
+    """Fly every job, and yield its index and result when ready; end early on ``should_stop``.
 
     Raises:
         UserError: Ray is missing, or its cluster cannot be reached.
@@ -68,10 +68,10 @@ def _fly_on_processes(
 ) -> Iterator[tuple[int, Result]]:
     context = multiprocessing.get_context("spawn")
     with ExitStack() as stack:
-        # Ends for the workers when it is closed here, and also when this process dies.
+        # The pipe ends for the workers when it is closed here or this process dies.
         theirs, ours = context.Pipe(duplex=False)
         stack.callback(theirs.close)
-        # One worker each: a pool of many may not notice that one has died (CPython 3.11).
+        # One worker per pool: a pool of many can miss the death of one (CPython 3.11).
         executors = [
             stack.enter_context(ProcessPoolExecutor(1, context, _begin_worker, (theirs,)))
             for _ in range(count)
@@ -88,7 +88,7 @@ def _begin_worker(parent: Connection) -> None:
         parent.poll(None)
         _stop.set()
         threading.Event().wait(END_TIMEOUT_S)
-        os._exit(1)  # it hangs, or its parent is dead
+        os._exit(1)  # it hangs, or its parent has died
 
     threading.Thread(target=end_with_parent, name="mavbridge-worker-end", daemon=True).start()
 
@@ -105,7 +105,7 @@ def _collect(
 ) -> Iterator[tuple[int, Result]]:
     """Keep one job with each worker until all are flown or ``should_stop``.
 
-    An outcome of the type ``lost`` is the death of a worker.
+    An outcome of the type ``lost`` means that its worker died.
     """
     waiting, idle = list(reversed(range(len(jobs)))), list(workers)
     busy: dict[Future[Result], tuple[int, Callable[[Job], Future[Result]]]] = {}
@@ -118,7 +118,7 @@ def _collect(
             try:
                 result = future.result()
             except lost as error:
-                if should_stop():  # Ctrl-C reaches a worker that has only just been started
+                if should_stop():  # Ctrl-C can reach a worker that has only just been started
                     return
                 raise PeerError(
                     f"the worker that flew {jobs[index]} died (out of memory?): use fewer "
@@ -164,18 +164,18 @@ def _fly_on_ray(
     except errors.RayTaskError as error:
         if isinstance(error.cause, MavbridgeError):
             raise error.cause from error
-        raise  # a bug: its traceback helps
+        raise  # a bug: keep its traceback
     finally:
         ray.shutdown()
 
 
 def _never() -> bool:
-    """Ray cancels a task by itself when the connection ends."""
+    """Never stop: Ray cancels a task itself when the connection ends."""
     return False
 
 
 def _require_reachable(address: str) -> None:
-    """Refuse an address where nothing answers: Ray would keep trying for long."""
+    """Raise UserError if nothing answers at the address: Ray would retry for long."""
     if address in ("auto", "local"):
         return
     try:

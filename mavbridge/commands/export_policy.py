@@ -1,4 +1,4 @@
-"""A policy of ours in, files that other programs read out, and proof that they are the same."""
+"""Export of one of our policies to files for other programs, with proof that both are equal."""
 
 from dataclasses import replace
 from pathlib import Path
@@ -17,7 +17,7 @@ from policy.loading.request import PolicyRequest
 
 
 def export_policy(checkpoint: Path | None, config: ExportPolicyConfig) -> int:
-    """Write a policy, and compare what was written with it."""
+    """Write a policy, and compare the written files with it."""
     console = Console(stderr=True, highlight=False, emoji=False)
     kind = config.policy.partition(":")[0]
     if kind not in BUILTIN_KINDS:
@@ -46,7 +46,7 @@ def export_policy(checkpoint: Path | None, config: ExportPolicyConfig) -> int:
 
 
 def _require_room(config: ExportPolicyConfig) -> None:
-    """Refuse an output that would hurt something, or that nothing here can write."""
+    """Refuse an output that would overwrite something, or that this installation cannot write."""
     if config.format == "onnx":
         require_packages("--format onnx", {"onnx": "onnx"})
         if config.out.is_file() or (config.out.is_dir() and any(config.out.iterdir())):
@@ -56,7 +56,7 @@ def _require_room(config: ExportPolicyConfig) -> None:
 
 
 def _difference(ours: PolicyRequest, written: PolicyRequest) -> str | None:
-    """Why two policies are not the same from image to stick, or None."""
+    """Return how two policies differ from image to stick, or None."""
     chunks = []
     for request in (ours, written):
         runner = load_policy(replace(request, dual_rate=False), now_s=lambda: 0.0).runner

@@ -36,8 +36,9 @@ from policy.scripted.controllers import Axis, DoubletStep, doublet_length_s, dou
 
 LEAST_R_SQUARED = 0.7
 EARLY_S, BEFORE_S, STILL_S, LONGEST_GAP_S, CLIMB_S = 0.12, 0.1, 1.0, 0.25, 20.0
-"""A push ends early by the smoothing's lag; time looked at before it, and at the end of a pause;
-longest gap of a policy that flies; the climb before the doublet."""
+"""Time by which a push ends early because of the smoothing's lag; time used before a push, and at
+the end of a pause; longest gap in sends of a flying policy; time for the climb before the
+doublet."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -48,26 +49,26 @@ class PushResult:
     motion: str
     unit: str
     action: Sides
-    """Of full stick, or in the unit of the motion."""
+    """In shares of full stick, or in the unit of the motion."""
     measured: Sides
-    """Motion that the vehicle settles at."""
+    """Settled motion of the vehicle."""
     trained: Sides
-    """Motion that the policy was trained to expect."""
+    """Motion expected by the policy's training."""
     dead_time_s: float
     time_63_s: float
-    """From a step of the action to 63 % of its effect."""
+    """Time from a step of the action to 63 % of its effect."""
     r_squared: float
 
     @property
     def ratio(self) -> tuple[float | None, float | None]:
-        """Measured over trained; None where nothing was to move."""
+        """Measured over trained; None if no motion was expected."""
         up, down = (m / t if t else None for m, t in zip(self.measured, self.trained, strict=True))
         return up, down
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Identification:
-    """All that was measured, what could not be and why, and the thrust that hovers."""
+    """All results, the missing ones with their reasons, and the hover thrust."""
 
     pushes: tuple[PushResult, ...]
     missing: tuple[str, ...]
@@ -77,7 +78,7 @@ class Identification:
 def trained_motion(contract: Contract, axis: Axis, amount: float) -> float:
     """Return the motion that a policy expects of an action held at ``amount``.
 
-    ``amount`` is of full stick where the actions are sticks, else the motion commanded.
+    ``amount`` is in shares of full stick if the actions are sticks, else the commanded motion.
     """
     if contract.action != "sticks":
         return amount
@@ -97,12 +98,12 @@ def trained_motion(contract: Contract, axis: Axis, amount: float) -> float:
 def identify_pushes(
     recording: ResponseRecording, *, contract: Contract, program_start_s: float
 ) -> Identification:
-    """Fit every push of the doublet that was flown.
+    """Fit every push of the flown doublet.
 
     Args:
         recording: of the flight.
-        contract: of the policy to compare with; the doublet was of its kind of action.
-        program_start_s: when the doublet began, by the clock of the stamps.
+        contract: of the policy to compare with; the doublet used its kind of action.
+        program_start_s: start of the doublet on the clock of the stamps.
     """
     pushes: list[PushResult] = []
     missing: list[str] = []
@@ -131,7 +132,7 @@ def _fit_push(
     contract: Contract,
     program_start_s: float,
 ) -> PushResult | str:
-    """Return the result of one push, or why there is none."""
+    """Return the result of one push, or the reason why there is none."""
     begin_s, end_s = program_start_s + step.begin_s, program_start_s + step.end_s
     input_s, inputs = recording.inputs(channel.column)
     inputs = inputs * channel.scale
@@ -147,7 +148,7 @@ def _fit_push(
         settled_gain(*data, at_s - EARLY_S, step.half_s) for at_s in (begin_s + step.half_s, end_s)
     )
     known = None if up_gain is None or down_gain is None else (up_gain, down_gain)
-    # Once the gains are known the first step says how fast it was: it began at rest.
+    # With known gains the first step gives the speed, because it began at rest.
     last_s = (end_s if known is None else begin_s + step.half_s) - EARLY_S
     shown = (output_s >= begin_s - BEFORE_S) & (output_s <= last_s)
     response = fit_response(input_s, inputs, output_s[shown], outputs[shown], known)
@@ -184,7 +185,7 @@ def full_stick(pushes: list[PushResult]) -> Sides | None:
 
 
 def print_identification(found: Identification, contract: Contract, console: Console) -> None:
-    """Print every push, the thrust that hovers, and what could not be measured."""
+    """Print every push, the hover thrust, and the missing results."""
     is_sticks = contract.action == "sticks"
     header = (
         *("axis", "stick" if is_sticks else "commanded", "motion", "measured"),
@@ -214,7 +215,7 @@ def print_identification(found: Identification, contract: Contract, console: Con
 
 
 def to_json(found: Identification, contract: Contract, config: IdentifyConfig) -> str:
-    """Return everything as JSON; a ratio is null where the policy expected no motion."""
+    """Return all results as JSON; a ratio is null if the policy expected no motion."""
     document = {
         "policy": config.flight.policy.policy,
         "action": contract.action,
@@ -231,7 +232,7 @@ def identify(config: IdentifyConfig) -> int:
     """Fly the doublet, and print how the vehicle's gains and lags compare with the policy's.
 
     Raises:
-        MavbridgeError: as for a flight; or it ended before anything could be measured.
+        MavbridgeError: as for a flight, or the flight ended before any result.
     """
     clock = MonotonicClock()
     trained = configured_contract(config.flight.policy)
@@ -274,7 +275,7 @@ def doublet_flight(config: IdentifyConfig, trained: Contract) -> FlyConfig:
 def doublet_policy(
     trained: Contract, clock: Clock, *, is_in_air: bool
 ) -> tuple[ScriptedPolicy, PolicyRunner]:
-    """Return the doublet in the policy's kind of action, with what that policy means by it."""
+    """Return the doublet in the policy's kind of action, with that policy's gains."""
     names = (
         *("hover_thrust", "full_lean_deg", "full_yaw_rate_degps", "full_climb_mps"),
         *("full_descent_mps", "lean_dead_zone", "yaw_dead_zone", "throttle_dead_zone"),
@@ -287,5 +288,5 @@ def doublet_policy(
         contract=Contract(**{name: getattr(trained, name) for name in names}),
     )
     runner = make_numpy_runner(policy, ExecutionSettings(name="scripted:doublet"))
-    policy.reset()  # of what the trial on a dummy sample left behind
+    policy.reset()  # discard the state left by the trial on a dummy sample
     return policy, replace(runner, reset=policy.reset)

@@ -1,4 +1,4 @@
-"""Output that the commands share: tables, progress bars and figures."""
+"""Output shared by the commands: tables, progress bars and figures."""
 
 from collections.abc import Iterable
 from pathlib import Path
@@ -23,7 +23,7 @@ from mavbridge.core.files import require_writable
 from mavbridge.core.provenance import without_secrets
 
 PIPED_WIDTH = 120
-"""Columns of the tables where there is no terminal."""
+"""Columns of the tables if there is no terminal."""
 INK, MUTED, GRID, GREY = "#1f2933", "#6b7885", "#dfe4ea", "#a9b4bf"
 BLUE, PALE_BLUE, RED = "#2b6cb0", "#9cc5e8", "#d1495b"
 FIGURE_DPI = 150
@@ -47,7 +47,7 @@ FIGURE_STYLE: dict[Any, Any] = {
 
 
 def require_matplotlib(flag: str = "--plot") -> None:
-    """Refuse a figure that cannot be drawn, before a long run.
+    """Raise UserError before a long run if no figure can be drawn.
 
     Raises:
         UserError: matplotlib is not installed.
@@ -68,7 +68,7 @@ def require_outputs(json: Path | None, plot: Path | None) -> None:
 
 
 def table_console() -> Console:
-    """A console for tables on standard output: as wide as the terminal, or ``PIPED_WIDTH``."""
+    """Return a console for standard output, as wide as the terminal or ``PIPED_WIDTH``."""
     console = Console(highlight=False)
     if not console.is_terminal:
         console.width = PIPED_WIDTH
@@ -78,7 +78,7 @@ def table_console() -> Console:
 def make_table(
     title: str, header: Iterable[str], rows: Iterable[Iterable[str]], *, left_columns: int = 1
 ) -> Table:
-    """A table whose first columns are text and whose others are right-aligned figures."""
+    """Return a table whose first columns are text and whose others are right-aligned figures."""
     table = Table(title=title, title_justify="left")
     for index, name in enumerate(header):
         table.add_column(name, justify="left" if index < left_columns else "right")
@@ -88,23 +88,22 @@ def make_table(
 
 
 def number(value: float | None, digits: int) -> str:
-    """A figure, or a dash for what was not measured."""
+    """Format a figure; a dash if it was not measured."""
     return "-" if value is None else f"{value:.{digits}f}"
 
 
 def print_status(line: str) -> None:
-    """Print what is being done to standard error, apart from the results."""
+    """Print the current activity to standard error, apart from the results."""
     Console(stderr=True).print(Text(without_secrets(line), style="dim"), soft_wrap=True)
 
 
 class _StatusColumn(ProgressColumn):
     def render(self, task: Task) -> Text:
-        """Show it."""
         return Text(str(task.fields.get("status", "")))
 
 
 def progress_bar(console: Console, *, as_percentage: bool = False) -> Progress:
-    """A bar with description, count (or percentage), the field ``status``, and the time left."""
+    """Return a bar with description, count (or percentage), field ``status``, and time left."""
     return Progress(
         TextColumn("{task.description}"),
         BarColumn(),

@@ -1,6 +1,7 @@
 """``mavbridge serve``: a policy on this computer for flights and robots elsewhere.
 
-The thread that answers, the network side (the websocket protocol of openpi), and the command.
+Consists of the answering thread, the network side (the websocket protocol of openpi), and the
+command.
 """
 
 import asyncio
@@ -44,28 +45,28 @@ MAX_CLIENTS = 4
 WAIT_S = 0.1
 """Longest wait for a request before the stop flag is checked."""
 SPARE_BYTES = 2**20
-"""Most bytes of a request beside its images."""
+"""Size limit of a request without its images [bytes]."""
 PING_S = 5.0
-"""A client that has not been heard of for two or three of these is gone, and its place is free."""
+"""Ping period. A client that is silent for two or three periods is gone, and its slot is free."""
 CLOSE_S = 1.0
 UNASKED_S = 5.0
-"""After this a client that has asked for nothing gives its place to another one."""
+"""A client without a request after this time gives up its slot if another client comes."""
 HEALTH_PATH = "/healthz"
 LOOK_S = 0.5
-"""Between two looks whether the policy's thread is alive."""
+"""Interval between two checks that the policy's thread is alive."""
 JOIN_S = 2.0
 
 
 @dataclass(frozen=True, slots=True)
 class Job:
-    """A request, and where its answer goes: bytes, or the text of an error."""
+    """A request, and a future for its answer: bytes, or the text of an error."""
 
     request: bytes | str
     answer: Future[bytes | str]
 
 
 class AnswerLoop:
-    """Answers one request after the other; only its own thread calls the policy."""
+    """Answers one request after the other. Only its own thread calls the policy."""
 
     def __init__(self, runner: PolicyRunner, *, clock: Clock) -> None:
         """``runner`` is single-rate."""
@@ -73,12 +74,12 @@ class AnswerLoop:
         self._interface = Interface(contract=runner.contract)
         self._clock = clock
         self.max_clients = MAX_CLIENTS if runner.reset is keep_nothing else 1
-        """One alone where the policy remembers: two flights would share what it keeps."""
+        """One client only if the policy has state: two flights would share it."""
         self._jobs: queue.Queue[Job] = queue.Queue(self.max_clients)
 
     @property
     def metadata(self) -> bytes:
-        """The first message to every client."""
+        """First message to every client."""
         return pack(
             {
                 CONTRACT_KEY: self._runner.contract.to_json(),
@@ -87,7 +88,7 @@ class AnswerLoop:
         )
 
     def submit(self, request: bytes | str) -> Future[bytes | str]:
-        """Queue a request; raises queue.Full."""
+        """Queue a request; raise queue.Full if the queue is full."""
         job = Job(request, Future())
         self._jobs.put_nowait(job)
         return job.answer
@@ -103,7 +104,7 @@ class AnswerLoop:
                 job.answer.set_result(self.answer(job.request))
 
     def answer(self, request: bytes | str) -> bytes | str:
-        """A chunk as msgpack, or a text that says what is wrong with the request or the policy."""
+        """Return a chunk as msgpack, or a text that describes the request's or policy's error."""
         begun_ns = self._clock.now_ns()
         try:
             message = unpack(request)
@@ -132,9 +133,9 @@ class PolicyServer:
 
         Args:
             answers: its thread runs while clients are served.
-            image_bytes: images of one request; larger requests are refused.
-            api_key: what clients must know; None lets in all that reach this computer.
-            report: gets a line for each client that comes or goes.
+            image_bytes: size of the images of one request; larger requests are refused.
+            api_key: key required of clients; None admits all that reach this computer.
+            report: gets a line for each client that connects or leaves.
         """
         self._answers = answers
         self._max_bytes = image_bytes + SPARE_BYTES
@@ -142,15 +143,15 @@ class PolicyServer:
         self._report = report
         self._clients = 0
         self._unasked: dict[ServerConnection, float] = {}
-        """Clients that have asked for nothing yet, with the time at which each came."""
+        """Clients without a request so far, with the time of their connection."""
 
     async def listen(self, host: str, port: int) -> Server:
-        """Listen from now on.
+        """Start listening.
 
         Raises:
-            UserError: it cannot listen there.
+            UserError: listening at this address fails.
         """
-        # It would print a traceback for every stranger that knocks at the port.
+        # It would print a traceback for every unknown client that probes the port.
         logging.getLogger("websockets.server").setLevel(logging.CRITICAL)
         try:
             return await serve_websockets(
@@ -171,9 +172,9 @@ class PolicyServer:
             ) from error
 
     def _admit(self, connection: ServerConnection, request: Request) -> Response | None:
-        """Refuse pages of a browser, which alone name an origin, and clients without the key.
+        """Refuse clients without the key, and web pages, the only clients that send an origin.
 
-        Whoever only asks whether a server is here gets an answer.
+        A request that only asks for the health of the server is answered.
         """
         if origins := request.headers.get_all("Origin"):
             self._report(f"{_name(connection)} was refused: a web page of {origins[0][:60]!r}")
@@ -203,7 +204,7 @@ class PolicyServer:
                 await connection.send(self._answers.metadata)
                 async for request in connection:
                     self._unasked.pop(connection, None)
-                    # One at a time from each client: the queue has room for all.
+                    # One at a time from each client, so that the queue has room for all.
                     answer = self._answers.submit(request)
                     reply: bytes | str = await asyncio.wrap_future(answer)
                     await connection.send(reply)
@@ -213,12 +214,12 @@ class PolicyServer:
             self._report(f"{_name(connection)} has gone")
 
     async def _make_room(self) -> None:
-        """End the clients that only hold a place."""
+        """Disconnect clients that hold a slot without requests."""
         latest = asyncio.get_running_loop().time() - UNASKED_S
         idle = [each for each, came in self._unasked.items() if came < latest]
         for each in idle:
             await each.close(CloseCode.TRY_AGAIN_LATER, "it has asked for nothing, and others wait")
-        await asyncio.sleep(0)  # for their own tasks to leave
+        await asyncio.sleep(0)  # let their tasks end
 
 
 def _name(connection: ServerConnection) -> str:
@@ -267,12 +268,12 @@ async def _serve(
         with suppress(TimeoutError):
             await asyncio.wait_for(stop.wait(), LOOK_S)
     listener.close()
-    with suppress(TimeoutError):  # a solve that hangs is the policy thread's to report
+    with suppress(TimeoutError):  # a hung solve is for the policy thread to report
         await asyncio.wait_for(listener.wait_closed(), JOIN_S)
 
 
 def _warnings(config: ServeConfig) -> list[str]:
-    """What the user should know who listens to other computers."""
+    """Return warnings for a user who listens to other computers."""
     try:
         is_local = config.host == "localhost" or ip_address(config.host).is_loopback
     except ValueError:

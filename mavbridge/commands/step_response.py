@@ -1,4 +1,4 @@
-"""Step response of one axis: what was sent and how the vehicle moved, and a fit to both."""
+"""Step response of one axis: actions sent, motion of the vehicle, and a fit to both."""
 
 import math
 from collections import deque
@@ -16,35 +16,35 @@ from policy.scripted.controllers import Axis, measure
 
 Array = NDArray[np.float64]
 Sides = tuple[float, float]
-"""To the positive side, to the negative one."""
+"""Value for the positive side, value for the negative side."""
 MAX_ROWS = 100_000
-"""Most actions, and most states: four minutes at 400 Hz. Beyond it the oldest are forgotten."""
+"""Most actions, and most states: four minutes at 400 Hz. The oldest are dropped first."""
 STEP_S, LEAD_S = 0.005, 1.1
-"""Grid of the fit, and the time of the input before the first output that it remembers."""
+"""Grid of the fit, and the span of input used before the first output."""
 DEAD_TIMES_S, LAGS_S = np.arange(0.0, 0.601, 0.02), np.geomspace(0.01, 1.5, 36)
 FINE_DEAD_S, FINE_LAG = np.arange(-0.02, 0.0201, 0.004), np.geomspace(0.85, 1.18, 21)
 OUTLIER_MADS, LEAST_SAMPLES = 6.0, 20
 SETTLED = 0.1
-"""Most change between the last two eighths of a push, of the whole, at which it has settled."""
+"""A push has settled if its last two eighths differ by at most this share of the whole."""
 
 
 class Motion(NamedTuple):
-    """Something that a state measures. + is right, forward, nose right, up."""
+    """Motion quantity of a state. + is right, forward, nose right, up."""
 
     name: str
     unit: str
     stamp: str
-    """Field of a state with the time of the measurement in ns."""
+    """Field of a state with the measurement time in ns."""
     read: Callable[[VehicleState], float]
 
 
 class Channel(NamedTuple):
-    """One axis: a number of the action, and the motion that answers it."""
+    """One axis: a number of the action, and the resulting motion."""
 
     axis: Axis
     column: int
     scale: float
-    """From the number of the action to the motion's unit, or to shares of full stick."""
+    """Factor from the number of the action to the motion's unit, or to shares of full stick."""
     motion: Motion
 
 
@@ -82,11 +82,11 @@ CHANNELS: dict[ActionKind, tuple[Channel, ...]] = {
         *(Channel("yaw", 3, _DEG, _rate(2)), Channel("climb", 2, -1.0, _CLIMB)),
     ),
 }
-"""The axes that the doublet of each kind of action pushes."""
+"""Axes pushed by the doublet of each kind of action."""
 
 
 class ResponseRecording:
-    """A sink of ticks that keeps the policy's actions and the states that they came from."""
+    """``TickSink`` that keeps the policy's actions and the states that they are based on."""
 
     def __init__(self) -> None:
         self._sent: deque[tuple[int, Action]] = deque(maxlen=MAX_ROWS)
@@ -96,7 +96,7 @@ class ResponseRecording:
         """Keep a tick in which the policy flew; see ``mavbridge.core.ports.TickSink``."""
         if not isinstance(event, Tick) or event.trace is None:
             return
-        # As the policy's after its limits, before any mapping to this vehicle's own curves.
+        # The policy's action after its limits, before any mapping to this vehicle's curves.
         self._sent.append((event.sent_ns, event.trace.smoothed))
         state = event.state
         if state is not None and (not self._states or state is not self._states[-1]):
@@ -108,7 +108,7 @@ class ResponseRecording:
         return times, np.array([action[column] for _, action in self._sent], np.float64)
 
     def outputs(self, motion: Motion) -> tuple[Array, Array]:
-        """Return times in s and values of a motion; each moment once."""
+        """Return times in s and values of a motion, without repeated times."""
         times = np.array([getattr(state, motion.stamp) for state in self._states], np.int64)
         values = np.array([motion.read(state) for state in self._states], np.float64)
         _, first = np.unique(times, return_index=True)
@@ -116,7 +116,7 @@ class ResponseRecording:
 
 
 class Response(NamedTuple):
-    """Dead time, then a lag of first order; gains are output for each unit of input."""
+    """Dead time, then a first-order lag. Gains are output per unit of input."""
 
     gains: Sides
     dead_time_s: float
@@ -130,8 +130,8 @@ def fit_response(
 ) -> Response | None:
     """Fit ``output = offset + gain * lag(input, dead_time earlier)``, with a gain for each sign.
 
-    Times rise and are in s; an input holds until the next. Samples that the first fit misses by
-    far, such as those of a gust, are left out of a second. None where there is too little to fit.
+    Times rise and are in s; an input holds until the next. Samples far off the first fit, such as
+    those of a gust, are left out of a second one. Return None if there is too little data.
     """
     if len(input_s) < 2 or len(output_s) < LEAST_SAMPLES or np.ptp(outputs) == 0.0:
         return None
@@ -144,7 +144,7 @@ def fit_response(
     ) -> tuple[float, Response, Array]:
         share = (1.0 - np.exp(-STEP_S / lags_s))[:, None]
         lagged = np.zeros((len(signs), len(lags_s), 2))
-        for index, now in enumerate(signs[:-1]):  # a sample acts from its own moment on
+        for index, now in enumerate(signs[:-1]):  # a sample takes effect from its own time on
             lagged[index + 1] = lagged[index] + share * (now - lagged[index])
         found = []
         for dead_s in dead_times_s.tolist():
@@ -174,7 +174,7 @@ def fit_response(
 def settled_gain(
     input_s: Array, inputs: Array, output_s: Array, outputs: Array, end_s: float, half_s: float
 ) -> float | None:
-    """Return the motion for each unit of a push, from its last eighth; None if it still moves."""
+    """Return the motion per unit of a push, from its last eighth; None if it has not settled."""
     begin_s, middle_s = end_s - 0.25 * half_s, end_s - 0.125 * half_s
     pushed = inputs[(input_s >= begin_s) & (input_s < end_s)]
     first = outputs[(output_s >= begin_s) & (output_s < middle_s)]

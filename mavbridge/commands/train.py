@@ -32,7 +32,7 @@ from policy.world_model.config import WorldModelConfig
 
 
 def run_policy_training(paths: Sequence[Path], settings: TrainSettings) -> int:
-    """Train a policy; 0 when the checkpoint is written, 130 if interrupted.
+    """Train a policy; return 0 when the checkpoint is written, 130 if interrupted.
 
     Paths are flight folders, folders of them, or LeRobot datasets.
 
@@ -72,7 +72,7 @@ def run_world_model_training(paths: Sequence[Path], settings: WorldModelSettings
 
 
 def share_of_gates(checkpoint: Path, settings: TrainSettings) -> float:
-    """Fly a checkpoint at two rates over ``check_flights`` courses; the share of gates passed.
+    """Return the share of gates that a checkpoint passes at two rates on ``check_flights`` courses.
 
     Raises:
         MavbridgeError, PolicyError: it cannot be flown.
@@ -92,7 +92,7 @@ def share_of_gates(checkpoint: Path, settings: TrainSettings) -> float:
 def fit_to_flights(
     network: Network, flights: Sequence[FlightData], settings: TrainSettings
 ) -> Network:
-    """The network with state frame and actions of the flights, and the inputs of the settings."""
+    """Return the network with the flights' frame and actions, and the settings' inputs."""
     terms = common_terms(flights)
     contract = replace(
         network.contract,
@@ -107,7 +107,7 @@ def fit_to_flights(
 
 
 class Display:
-    """A progress bar, whose last words are the losses, and lines for what the run reports."""
+    """Progress bar that ends with the losses, and lines of text for the run's reports."""
 
     def __init__(self) -> None:
         self._bar = progress_bar(Console(stderr=True, highlight=False), as_percentage=True)
@@ -121,7 +121,7 @@ class Display:
         self._bar.stop()
 
     def show(self, progress: TrainingProgress) -> None:
-        """Show whatever the run reports."""
+        """Show one report of the run."""
         if progress.note is not None:
             self._bar.print(f"note: {progress.note}")
             return

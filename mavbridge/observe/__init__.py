@@ -1,1 +1,1 @@
-"""Observers of a flight (timing, terminal, Rerun), none of which can delay it."""
+"""Observers of a flight (timing, terminal, Rerun). None of them can delay it."""

@@ -1,4 +1,4 @@
-"""Single keys from the terminal during a flight."""
+"""Single-key input from the terminal during a flight."""
 
 import os
 import select
@@ -15,23 +15,23 @@ FLIGHT_KEYS = (RELEASE_KEY, ENGAGE_KEY)
 KEYS_HINT = "e engages, q releases"
 POLL_S = 0.1
 _LOCAL_MODES = 3
-"""Index of the local modes in what ``termios.tcgetattr`` returns."""
+"""Index of the local modes in the list that ``termios.tcgetattr`` returns."""
 
 
 def ignore_job_control() -> None:
-    """Keep the calling thread's use of the terminal from stopping the process.
+    """Prevent terminal access by the calling thread from stopping the process.
 
-    A process in the background that reads the terminal is stopped by SIGTTIN, one that changes or
-    (after ``stty tostop``) writes it by SIGTTOU, unless the thread at it blocks the signal.
+    A background process is stopped by SIGTTIN when it reads the terminal, and by SIGTTOU when it
+    changes it or (after ``stty tostop``) writes it, unless the calling thread blocks the signal.
     """
     signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGTTIN, signal.SIGTTOU})
 
 
 class Keyboard:
-    """Passes each key of ``keys`` to ``on_key``, in lower case, from a thread of its own.
+    """Passes each key of ``keys`` to ``on_key``, in lower case, from a separate thread.
 
-    The terminal gives keys at once and without echo while this process is in its foreground;
-    Ctrl-C stays a signal. Without a terminal nothing happens. ``on_key`` must not block.
+    While this process is in the foreground, the terminal delivers keys at once and without echo;
+    Ctrl-C remains a signal. Without a terminal this is a no-op. ``on_key`` must not block.
     """
 
     def __init__(
@@ -41,9 +41,9 @@ class Keyboard:
         keys: Sequence[str] = FLIGHT_KEYS,
         fd: int | None = None,
     ) -> None:
-        """Read ``fd``, by default standard input.
+        """Read ``fd``; default: standard input.
 
-        The first of ``keys`` is heard among others that are typed at once; the others only alone.
+        The first of ``keys`` also counts among several keys typed at once; the others only alone.
         """
         self._on_key = on_key
         self._urgent_key, *self._keys = keys
@@ -52,7 +52,7 @@ class Keyboard:
         self._worker: Worker | None = None
 
     def start(self) -> bool:
-        """Start to listen; returns whether there is a terminal to listen to."""
+        """Start listening; return True if there is a terminal."""
         if self._fd is None or not os.isatty(self._fd):
             return False
         fd = self._fd
@@ -61,7 +61,7 @@ class Keyboard:
         return True
 
     def stop(self, timeout_s: float) -> None:
-        """Stop and leave the terminal as it was; may be called at any time, also twice.
+        """Stop, and restore the terminal. Can be called at any time and more than once.
 
         Raises:
             HungError: ``on_key`` has not returned within the timeout.
@@ -75,7 +75,7 @@ class Keyboard:
         try:
             while not stop.is_set():
                 if not _is_foreground(fd):
-                    stop.wait(POLL_S)  # the shell has given the terminal its own modes
+                    stop.wait(POLL_S)  # the shell has restored the terminal's own modes
                     continue
                 self._take(fd)
                 if select.select([fd], [], [], POLL_S)[0] and not self._read(fd):
@@ -86,14 +86,14 @@ class Keyboard:
             self._restore(fd)
 
     def _take(self, fd: int) -> None:
-        """Have keys delivered singly and without echo: at the start, and after Ctrl-Z and fg."""
+        """Have keys delivered singly, without echo: at the start, and after Ctrl-Z and fg."""
         modes = termios.tcgetattr(fd)
         if not modes[_LOCAL_MODES] & (termios.ICANON | termios.ECHO):
             return
         self._old_modes = termios.tcgetattr(fd)
         modes[_LOCAL_MODES] &= ~(termios.ICANON | termios.ECHO)
-        termios.tcflush(fd, termios.TCIFLUSH)  # nothing typed before the flight engages in it
-        # TCSANOW: the other ways wait until a stopped terminal has shown all output.
+        termios.tcflush(fd, termios.TCIFLUSH)  # keys typed before the flight must not engage it
+        # TCSANOW: the other modes wait until a stopped terminal has shown all output.
         termios.tcsetattr(fd, termios.TCSANOW, modes)
 
     def _restore(self, fd: int) -> None:
@@ -104,9 +104,9 @@ class Keyboard:
             pass  # the terminal is gone
 
     def _read(self, fd: int) -> bool:
-        """Pass on what was typed; returns False at the end of the input."""
+        """Pass on the typed keys; return False at the end of the input."""
         typed = os.read(fd, 1024).decode(errors="replace").lower()
-        # Several at once are a paste, or the sequence of a function key: that engages nothing.
+        # Several keys at once are a paste or a function key's sequence, and must not engage.
         if self._urgent_key in typed and not typed.startswith("\x1b"):
             self._on_key(self._urgent_key)
         elif len(set(typed)) == 1 and typed[0] in self._keys:
@@ -122,8 +122,8 @@ def _standard_input() -> int | None:
 
 
 def _is_foreground(fd: int) -> bool:
-    """Return whether the terminal's input is this process's; so too where it has no shell."""
+    """True if the terminal's input is ours, or if it is not our controlling terminal."""
     try:
         return os.tcgetpgrp(fd) == os.getpgrp()
-    except OSError:  # not our controlling terminal: nobody else's jobs contend for it
+    except OSError:  # not our controlling terminal, so no other jobs compete for it
         return True

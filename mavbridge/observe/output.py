@@ -1,4 +1,4 @@
-"""Console output that a reader who does not read cannot hold up."""
+"""Console output that a stalled reader cannot block."""
 
 import io
 import os
@@ -11,26 +11,26 @@ from typing import TextIO, cast
 from rich.console import Console
 
 POLL_S = 0.05
-"""Interval at which a stalled write looks whether it was given up."""
+"""Interval at which a stalled write checks whether it was given up."""
 WRITE_BYTES = 512
-"""Handed to the kernel at once: a pipe that is ready takes it whole (POSIX: _POSIX_PIPE_BUF)."""
+"""Bytes handed to the kernel per write: a ready pipe takes them all (POSIX: _POSIX_PIPE_BUF)."""
 MAX_LINE = 2000
-"""Characters of text without a line end that are kept; more counts as a line."""
+"""Kept characters of an unfinished line; longer text counts as a line."""
 
 
 class PatientOutput(io.TextIOBase):
-    """A text stream that writes only where the kernel takes it at once, and that can be given up.
+    """Text stream that writes only if the kernel takes the data at once, and that can be given up.
 
-    ``sys.stderr`` will not do for a thread whose reader may stall: the thread would sleep in
-    ``write`` with the stream's lock held, and at its end the interpreter waits for that lock
-    (measured on CPython 3.11, with a full pipe and with a terminal stopped by Ctrl-S).
-    For one thread; ``give_up`` is for any.
+    ``sys.stderr`` does not suit a thread whose reader can stall: the thread would sleep in
+    ``write`` holding the stream's lock, and the interpreter waits for that lock when it exits
+    (measured on CPython 3.11, with a full pipe and with a terminal stopped by Ctrl-S). For one
+    thread; ``give_up`` can be called from any.
     """
 
     encoding = "utf-8"
 
     def __init__(self, stream: TextIO) -> None:
-        """Write to the file behind ``stream``; raises OSError if there is none."""
+        """Write to the file behind ``stream``; raise OSError if there is none."""
         super().__init__()
         self._fd = stream.fileno()
         self._waiting = b""
@@ -42,15 +42,15 @@ class PatientOutput(io.TextIOBase):
         return self._fd
 
     def isatty(self) -> bool:
-        """Return whether this is a terminal."""
+        """True if the file is a terminal."""
         return os.isatty(self._fd)
 
     def writable(self) -> bool:
-        """Return True."""
+        """True."""
         return True
 
     def give_up(self) -> None:
-        """Drop what is waiting and all that comes; ends a ``flush`` in another thread."""
+        """Drop all pending and future text; ends a ``flush`` in another thread."""
         self._is_given_up = True
 
     def write(self, text: str) -> int:
@@ -59,7 +59,7 @@ class PatientOutput(io.TextIOBase):
         return len(text)
 
     def flush(self) -> None:
-        """Write all, however long the reader takes, unless it is given up or the reader is gone."""
+        """Write all text at the reader's pace, unless it is given up or the reader is gone."""
         while self._waiting and not self._is_given_up:
             try:
                 if select.select([], [self._fd], [], POLL_S)[1]:
@@ -73,7 +73,7 @@ class PatientOutput(io.TextIOBase):
 
 
 def flight_console() -> Console:
-    """A console on standard error for ``FlightScreen``, which alone uses it during a flight."""
+    """Return a console on standard error for ``FlightScreen``, its only user during a flight."""
     try:
         return Console(file=cast(TextIO, PatientOutput(sys.stderr)), emoji=False)
     except (OSError, AttributeError):  # standard error is closed, or replaced by a mere buffer
@@ -81,7 +81,7 @@ def flight_console() -> Console:
 
 
 class _Lines(io.TextIOBase):
-    """A text stream that passes on whole lines instead of writing them."""
+    """Text stream that passes on complete lines instead of writing them."""
 
     def __init__(self, show: Callable[[str], None], replaced: TextIO) -> None:
         super().__init__()
@@ -107,10 +107,10 @@ class _Lines(io.TextIOBase):
 
 @contextmanager
 def stray_lines_shown(show: Callable[[str], None]) -> Iterator[None]:
-    """Give ``show`` each line that anybody prints, so that no thread waits for the console.
+    """Redirect every printed line to ``show``, so that no thread waits for the console.
 
-    Standard error (logging, warnings, tracebacks of threads), and standard output if it is a
-    terminal, and so the same console.
+    This covers standard error (logging, warnings, tracebacks of threads), and standard output if it
+    is a terminal and thus the same console.
     """
     old_out, old_err = sys.stdout, sys.stderr
     is_console = old_out is not None and not old_out.closed and old_out.isatty()

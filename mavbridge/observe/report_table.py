@@ -1,4 +1,4 @@
-"""The table and the verdicts that end a flight on the terminal."""
+"""Table and verdicts shown on the terminal after a flight."""
 
 from rich.table import Table
 from rich.text import Text
@@ -17,7 +17,7 @@ _LEGEND = (
 
 
 def timing_table(report: TimingReport) -> Table | None:
-    """Percentiles in milliseconds of what was measured in a flight; None if nothing was."""
+    """Return the measured percentiles of a flight in milliseconds; None if nothing was measured."""
     rows = {
         "stick lateness": report.sticks.lateness_ms,
         "chunk period": report.action.period_ms,
@@ -49,7 +49,7 @@ def timing_table(report: TimingReport) -> Table | None:
 
 
 def verdicts(report: TimingReport) -> list[Text]:
-    """One line for each part of a flight: its target and its result."""
+    """Return one line for each part of a flight, with its target and its result."""
     sticks, action, vision = report.sticks, report.action, report.vision
     missed = f"{_counted(sticks.missed_slots, 'slot')} of {sticks.slots} missed"
     style = _STYLE_GOOD if not sticks.missed_slots else _STYLE_POOR
@@ -107,12 +107,12 @@ def _counted(count: int, noun: str) -> str:
 
 
 def shown_rate(rate_hz: float | None) -> str:
-    """A rate with one decimal, or a dash."""
+    """Format a rate with one decimal; a dash for None."""
     return _NOT_MEASURED if rate_hz is None else f"{rate_hz:.1f}"
 
 
 def rate_style(rate_hz: float | None, target_hz: float) -> str:
-    """The colour of a rate: green from 99 % of its target, yellow from 90 %."""
+    """Return the colour of a rate: green from 99 % of its target, yellow from 90 %."""
     if rate_hz is None or rate_hz < 0.9 * target_hz:
         return _STYLE_BAD
     return _STYLE_GOOD if rate_hz >= 0.99 * target_hz else _STYLE_POOR

@@ -1,4 +1,4 @@
-"""The terminal during a flight: one status line while flying, a table afterwards."""
+"""Terminal output of a flight: one status line while flying, a table afterwards."""
 
 import logging
 import threading
@@ -27,7 +27,7 @@ ACTIVITY_SPACING_NS = NS_PER_S
 PLAIN_PERIOD_S = 5.0
 """Interval between lines if the output is not a terminal."""
 MAX_MESSAGES = 100
-"""Messages that may wait for the reader; the oldest are dropped first, and counted."""
+"""Capacity of the message queue. When it is full, the oldest messages are dropped and counted."""
 
 
 class RateMeter:
@@ -38,15 +38,15 @@ class RateMeter:
         self._newest = (0, 0)
 
     def count(self, stamp_ns: int) -> None:
-        """Count an event; count and stamp change in one step, since another thread reads them."""
+        """Count an event. Count and stamp change in one step because another thread reads them."""
         self._newest = (self._newest[0] + 1, stamp_ns)
 
     def set(self, count: int, stamp_ns: int) -> None:
-        """Take a count that somebody else keeps, with the stamp of the newest event."""
+        """Set an externally kept count, with the stamp of the newest event."""
         self._newest = (count, stamp_ns)
 
     def sample_hz(self) -> float | None:
-        """Events per second, to be called once a refresh; None while no events come."""
+        """Return events per second, or None while no events come. Call once per refresh."""
         if self._newest[0] == 0:
             return None
         self._samples.append(self._newest)
@@ -60,18 +60,18 @@ class _Message(NamedTuple):
 
 
 class FlightScreen:
-    """Status line and final table on one console; a ``TickSink``.
+    """``TickSink`` that shows a status line and a final table on one console.
 
-    Between ``start`` and ``close`` its own thread alone writes to the console. A reader that stalls
-    (Ctrl-S, a pipe that nobody empties) holds up that thread and nothing else: everything here
-    returns at once, but ``close``, which has a deadline. All of it is for any thread, except that
-    ticks, like vision ticks, come from one thread.
+    Between ``start`` and ``close`` only the screen's own thread writes to the console. A stalled
+    reader (Ctrl-S, a pipe that nothing empties) blocks only that thread. All methods return at
+    once, except for ``close``, which has a deadline. They can be called by any thread, but all
+    ticks must come from one thread, and all vision ticks from one thread.
     """
 
     def __init__(
         self, console: Console, *, action_hz: float, vision_hz: float, readonly: bool
     ) -> None:
-        """Show a flight on ``console``, which comes from ``flight_console`` in a real one."""
+        """Show a flight on ``console``; a real flight uses that of ``flight_console``."""
         self._console = console
         self._target_hz = (action_hz, vision_hz)
         self._readonly = readonly
@@ -84,7 +84,7 @@ class FlightScreen:
         self._messages: deque[_Message] = deque(maxlen=MAX_MESSAGES)
         self._dropped_messages = 0
         self._refreshes = 0
-        # Not Live's own redirection: whoever prints would wait for the console's lock.
+        # Not Live's own redirection: any printing thread would wait for the console's lock.
         self._live = Live(
             console=console,
             auto_refresh=False,
@@ -96,7 +96,7 @@ class FlightScreen:
         self._redirection = ExitStack()
 
     def start(self, *, hint: str | None = None) -> None:
-        """Start to show; ``hint`` says which keys do what, if any do."""
+        """Start the display. ``hint`` names the keys and their actions; None: no keys."""
         self._hint = hint
         if hint is not None and not self._console.is_terminal:
             self.show_message(hint)
@@ -106,10 +106,10 @@ class FlightScreen:
         self._worker.start()
 
     def close(self, timeout_s: float) -> bool:
-        """Print what is waiting, report included, and end; may be called twice, or never started.
+        """Print pending messages and the report, and stop. Works twice, and without ``start``.
 
-        Returns False if the reader did not take it within the timeout: the rest is dropped, and
-        standard error, which would not take more either, is best left alone (``end_process``).
+        Return False if the reader did not take the text within the timeout. The rest is then
+        dropped; do not use standard error afterwards, which would block, too (``end_process``).
         """
         worker, self._worker = self._worker, None
         self._redirection.close()
@@ -128,7 +128,7 @@ class FlightScreen:
         return True
 
     def emit(self, event: Event) -> None:
-        """Remember the event and the messages in it."""
+        """Store the event and its messages."""
         if not isinstance(event, Tick):
             self._vision.count(event.ready_ns)
             return
@@ -141,7 +141,7 @@ class FlightScreen:
         self._tick = event
 
     def _show_activity(self, tick: Tick) -> None:
-        """Show who has the sticks when that changes; a reason that keeps changing once a second."""
+        """Show a change of control. A reason that keeps changing is shown at most once a second."""
         before = self._tick
         if before is not None:
             is_other = before.phase != tick.phase or before.holder != tick.holder
@@ -152,18 +152,18 @@ class FlightScreen:
         self.show_message(tick.activity)
 
     def show_message(self, text: str) -> None:
-        """Show a message with the next refresh, and log it now."""
+        """Log a message now, and show it with the next refresh."""
         _said.info("%s", text)
         self._show(Text(without_secrets(text)), soft_wrap=True)
 
     def _show_stray(self, text: str) -> None:
-        """Show a line that somebody has printed; those of the log are in it already."""
+        """Show a line printed elsewhere in the process; lines of the log are already logged."""
         if not is_log_thread():
             _said.info("%s", text)
         self._show(Text(without_secrets(text), style="dim"), soft_wrap=True)
 
     def show_report(self, report: TimingReport) -> None:
-        """Show the table of what was measured, and the verdicts, with the next refresh."""
+        """Show the table of measurements and the verdicts with the next refresh."""
         if (table := timing_table(report)) is not None:
             self._show(table, soft_wrap=False)
         for verdict in verdicts(report):
@@ -172,11 +172,11 @@ class FlightScreen:
 
     def _show(self, what: RenderableType, *, soft_wrap: bool) -> None:
         if len(self._messages) == MAX_MESSAGES:
-            self._dropped_messages += 1  # by two threads at once it may count one too few
+            self._dropped_messages += 1  # two threads at once can lose one count
         self._messages.append(_Message(what, soft_wrap))
 
     def status_line(self) -> Text:
-        """The status now; to be called at ``STATUS_HZ``, since rates are averages over calls."""
+        """Return the current status. Call at ``STATUS_HZ``: rates are averages over calls."""
         rates_hz = (self._action.sample_hz(), self._vision.sample_hz())
         tick = self._tick
         if tick is None:
@@ -188,14 +188,14 @@ class FlightScreen:
             ("action", "vision"), rates_hz, self._target_hz, strict=True
         ):
             if name == "action" and tick.chunk_serial is None:
-                continue  # the policy may well compute, but nobody flies by it
+                continue  # the policy may still compute, but does not fly
             line.append(f"  {name} ")
             line.append(f"{shown_rate(rate_hz)} Hz", style=rate_style(rate_hz, target_hz))
         attitude_ns = None if tick.state is None else tick.state.attitude_ns
         line.append(f"  feature {_age(tick.sent_ns, tick.feature_captured_ns)}")
         line.append(f"  state {_age(tick.sent_ns, attitude_ns)}")
         line.append(f"  missed {self._missed_slots}")
-        if tick.release_reason is not None:  # last: it may be long, and is cut first
+        if tick.release_reason is not None:  # last: it can be long, and is cut first
             line.append(f"  {without_secrets(str(tick.release_reason))}", style="yellow")
         return line
 
@@ -216,13 +216,13 @@ class FlightScreen:
         self._print_messages()
 
     def live(self) -> AbstractContextManager[object]:
-        """Show the status line, if there is a terminal, until the end of the block."""
+        """Context manager: show the status line if there is a terminal."""
         return self._live if self._console.is_terminal else nullcontext()
 
     def refresh(self) -> None:
-        """Print new messages and the line; without a terminal, the line less often.
+        """Print new messages and the status line; without a terminal, the line less often.
 
-        The screen's own thread calls it at ``STATUS_HZ``; nobody else does during a flight.
+        During a flight only the screen's own thread calls this, at ``STATUS_HZ``.
         """
         self._print_messages()
         line = self.status_line()

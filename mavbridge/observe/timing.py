@@ -1,4 +1,4 @@
-"""Ticks in, percentiles out: the timing report of a flight. Pure, constant memory."""
+"""Timing report of a flight: ticks in, percentiles out. Pure; constant memory."""
 
 import json
 from dataclasses import asdict, dataclass
@@ -11,30 +11,30 @@ from mavbridge.core.records import Event, FlightOutcome, Tick
 from mavbridge.core.vehicle import LinkStats, Percentiles
 
 MAX_RELEASES = 1000
-"""Releases listed in a report; the rest are only counted."""
+"""Releases listed in a report; further ones are only counted."""
 LATE_PERIODS = 1.5
-"""A chunk is late beyond this many periods of the policy."""
+"""A chunk is late if it comes more than this many policy periods after the one before."""
 
 Mode = Literal["dual", "single"]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class SticksReport:
-    """Sends of sticks while the policy flew; None = not measured.
+    """Stick sends while the policy flew; None: not measured.
 
-    A slot is one period of a fixed time grid; it is missed when nothing was sent within one period.
+    A slot is one period of a fixed time grid. It is missed if nothing was sent within one period.
     """
 
     target_hz: float
     rate_hz: float | None
-    """All sends, those between two slots as well."""
+    """Rate of all sends, including those between two slots."""
     flying_s: float
-    """Duration of this part; the rest of the flight is waiting, preparing and releases."""
+    """Time under the policy, without waiting, preparing and releases."""
     sends: int
     coasting_sends: int
-    """Sends of a chunk that was too old, within the grace."""
+    """Sends from an outdated chunk, within the grace period."""
     slots: int
-    """Slots of the grid in that time, also those that a chunk's own send has served."""
+    """Slots of the grid in that time, including those served by a chunk's own send."""
     missed_slots: int
     lateness_ms: Percentiles | None
     """Time from a slot to its send."""
@@ -42,13 +42,13 @@ class SticksReport:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ActionReport:
-    """Chunks of actions that were flown; None = not measured."""
+    """Flown chunks of actions; None: not measured."""
 
     target_hz: float
     rate_hz: float | None
     chunks: int
     late_chunks: int
-    """Chunks that were finished more than ``LATE_PERIODS`` after the one before them."""
+    """Chunks that were finished more than ``LATE_PERIODS`` after the one before."""
     period_ms: Percentiles | None
     """Time between the ends of two computations."""
     predict_ms: Percentiles | None
@@ -56,19 +56,19 @@ class ActionReport:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class VisionReport:
-    """The vision loop over one flight; None = not measured."""
+    """Vision loop over one flight; None: not measured."""
 
     target_hz: float
     rate_hz: float | None
     frames: int
     dropped_frames: int | None
-    """Dropped by the source since the first frame of the flight."""
+    """Frames dropped by the source since the first frame of the flight."""
     encode_ms: Percentiles | None
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ReleaseEvent:
-    """A release of the sticks, or a new reason for it, ``t_s`` after the first tick."""
+    """Release of the sticks, or a new reason for it, ``t_s`` after the first tick."""
 
     t_s: float
     reason: Reason
@@ -76,7 +76,7 @@ class ReleaseEvent:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ObserverDrops:
-    """Events that observers missed; None = no such observer."""
+    """Events that observers missed; None: no such observer."""
 
     rerun: int | None
     recorder: int | None
@@ -84,7 +84,7 @@ class ObserverDrops:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class TimingReport:
-    """Timing of one flight; None = not measured."""
+    """Timing of one flight; None: not measured."""
 
     duration_s: float
     mode: Mode
@@ -92,17 +92,16 @@ class TimingReport:
     policy: str
     autopilot: str | None
     outcome: FlightOutcome | None
-    """None where no policy has flown."""
+    """None if no policy has flown."""
     sticks: SticksReport
     action: ActionReport
     vision: VisionReport
     feature_age_ms: Percentiles | None
-    """Time from the exposure of an image to the sending of each action that is based on it."""
+    """Time from the exposure of an image to the send of each action based on it."""
     state_age_ms: Percentiles | None
-    """Time from the arrival of an attitude to the sending of each action that is based on it."""
+    """Time from the arrival of an attitude to the send of each action based on it."""
     state_to_wire_ms: Percentiles | None
-    """State to wire: time from the arrival of a new attitude to the sending of the first sticks
-    that are based on it."""
+    """State to wire: time from the arrival of a new attitude to the first send based on it."""
     link: LinkStats | None
     releases: tuple[ReleaseEvent, ...]
     """The first ``MAX_RELEASES``."""
@@ -111,10 +110,10 @@ class TimingReport:
 
 
 class FlightTiming:
-    """A ``TickSink`` that counts a flight.
+    """``TickSink`` that measures the timing of a flight.
 
-    Cheap enough for the loops' own threads: one thread emits ticks, another may emit vision ticks,
-    and they share nothing.
+    Cheap enough for the loops' own threads: one thread emits ticks and another can emit vision
+    ticks; the two share no state.
     """
 
     def __init__(self, *, stick_hz: float, action_hz: float, vision_hz: float) -> None:
@@ -181,7 +180,7 @@ class FlightTiming:
         observer_drops: ObserverDrops,
         outcome: FlightOutcome | None = None,
     ) -> TimingReport:
-        """The figures so far; exact once the loops have stopped."""
+        """Return the figures so far; exact once the loops have stopped."""
         return TimingReport(
             duration_s=round(self._ticks.duration_s, 3),
             mode=mode,
@@ -209,7 +208,7 @@ class FlightTiming:
 
 
 class _Sticks:
-    """Sends between two ticks of flight: a released loop has nothing to send."""
+    """Statistics of sends during ticks of flight; a released loop has nothing to send."""
 
     def __init__(self, target_hz: float) -> None:
         self._target_hz = target_hz
@@ -249,7 +248,7 @@ class _Sticks:
 
 
 class _Chunks:
-    """Chunks by the tick that flew them first; the time between two is of one stretch of flight."""
+    """Statistics of chunks by the tick that flew them first, within each stretch of flight."""
 
     def __init__(self, target_hz: float) -> None:
         self._target_hz = target_hz
@@ -271,7 +270,7 @@ class _Chunks:
             self._predict.add(tick.predict_ns)
         if last is None or newest[0] < last[0]:
             return
-        # A chunk that a newer one overtook before any send was computed in time all the same.
+        # A chunk overtaken by a newer one before any send was computed in time nevertheless.
         count, span_ns = newest[0] - last[0], newest[1] - last[1]
         self._intervals += count
         self._span_ns += span_ns
@@ -294,7 +293,7 @@ def _rate_hz(count: int, span_ns: int) -> float | None:
 
 
 class _Span:
-    """First and last of a series of stamps, and their number."""
+    """First and last stamp of a series, and the number of its stamps."""
 
     def __init__(self) -> None:
         self.first_ns = self.last_ns = self.count = 0
@@ -315,12 +314,12 @@ class _Span:
 
 
 def report_json(report: TimingReport) -> str:
-    """The report as JSON, keys in the order of the dataclasses; null = not measured."""
+    """Return the report as JSON, with keys in the order of the dataclasses; null: not measured."""
     return json.dumps(report_document(report), indent=2, allow_nan=False) + "\n"
 
 
 def report_document(report: TimingReport) -> dict[str, object]:
-    """The same for a document that holds more."""
+    """Return the report as a JSON object for use in a larger document."""
     document = asdict(report)
     document["releases"] = [
         {"t_s": release.t_s, "reason": reason_to_json(release.reason)}

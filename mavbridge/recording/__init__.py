@@ -1,4 +1,4 @@
-"""A flight on disk: docs/formats.md is the format.
+"""Recorded flights on disk, in the format of docs/formats.md.
 
     vision loop, action loop --emit--> Recorder (its own thread) --> FlightWriter --> ticks
                                                                          |
@@ -7,7 +7,7 @@
                                    writer process: FrameFiles --> camera.mp4, frames
     process of the link --open_tlog_pipe--> writer process: TlogThread --> link.tlog
 
-``FlightWriter`` alone, in the offline mode, records what need not fly in real time
-(demonstrations); ``VideoWriter`` alone makes one video of frames from anywhere (rollouts).
-``open_flight`` reads it all back, after a crash as well. The loops do not import this package.
+``FlightWriter`` alone, in the offline mode, records flights that need not run in real time
+(demonstrations). ``VideoWriter`` alone makes one video of frames from any source (rollouts).
+``open_flight`` reads a recording back, also after a crash. The loops do not import this package.
 """

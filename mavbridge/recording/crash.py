@@ -1,4 +1,4 @@
-"""Notices from the ticks of a flight that the vehicle has crashed."""
+"""Detection of crashes from the ticks of a flight."""
 
 import math
 
@@ -7,17 +7,18 @@ from mavbridge.core.records import FloatArray, Tick
 from mavbridge.core.vehicle import VehicleText, recorded_text
 
 OVERTURNED_NS = 500 * NS_PER_MS
-"""Time beyond 90 degrees of tilt, armed, that is a crash: a flip takes less."""
+"""Shortest time armed beyond 90 degrees of tilt that counts as a crash; a flip takes less."""
 FALL_NS = NS_PER_S
-"""Motors that stop in the air make a fall of 9.8 m/s within this time."""
+"""Window after a disarming in which a fall must show: after 1 s of free fall, speed is 9.8 m/s."""
 FALL_MPS = 1.5
-"""Speed while disarmed that no vehicle at rest reports, and less than that of any fall."""
+"""Speed while disarmed that counts as a fall; a vehicle at rest reports less, any fall more."""
 _WORDS = ("crash", "flight termination", "lockdown")
-"""What ArduPilot ("Crash: Disarming") and PX4 ("Flight termination active", "Lockdown") say."""
+"""Words in the crash messages of ArduPilot ("Crash: Disarming") and PX4 ("Flight termination
+active", "Lockdown")."""
 
 
 class CrashWatch:
-    """Takes each tick of a flight in order; ``reason`` is the first crash that it saw."""
+    """Crash detector. It takes the ticks of a flight in order; ``reason`` is the first crash."""
 
     def __init__(self) -> None:
         self.reason: str | None = None
@@ -26,7 +27,7 @@ class CrashWatch:
         self._disarmed_ns: int | None = None
 
     def see(self, tick: Tick, *, counts_falls: bool = True) -> None:
-        """Take one tick; without ``counts_falls`` a fall after a disarming is somebody's will."""
+        """Process one tick. ``counts_falls=False`` ignores falls after an intended disarming."""
         fallen = self._fallen(tick)
         if self.reason is None:
             self.reason = self._said(tick) or self._overturned(tick)
@@ -62,6 +63,6 @@ class CrashWatch:
 
 
 def _is_overturned(wxyz: FloatArray) -> bool:
-    """More than 90 degrees between the body's down and the world's, in NED/FRD as in ENU/FLU: the
+    """True beyond 90 degrees between the body's down and the world's. In NED/FRD and in ENU/FLU the
     cosine is 1 - 2 (x^2 + y^2)."""
     return bool(wxyz[1] ** 2 + wxyz[2] ** 2 > 0.5)

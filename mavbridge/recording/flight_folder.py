@@ -1,4 +1,4 @@
-"""Reads a recorded flight, finished or cut off."""
+"""Reader of recorded flights, finished or cut off."""
 
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -19,36 +19,36 @@ from policy.data.flight_video import with_images
 
 @dataclass(frozen=True, kw_only=True)
 class RecordedFlight:
-    """One flight. Row k of ``frames`` belongs to the k-th of ``images``, always."""
+    """One recorded flight. Row k of ``frames`` always belongs to the k-th of ``images``."""
 
     folder: Path
     meta: FlightMeta
     ticks: Any
     """``pyarrow.Table`` with the columns of docs/formats.md."""
     frames: Any
-    """The same, one row an image."""
+    """``pyarrow.Table`` with one row per image."""
     video: str = VIDEO
-    """Name of the file of the images."""
+    """File name of the video."""
     numbers: tuple[int, ...] = ()
-    """Number of each row's image in the video; some are left out where files are damaged."""
+    """Number of each row's image in the video. Numbers are missing where files are damaged."""
     damage: tuple[str, ...] = ()
-    """What of the flight was skipped, in sentences for the user."""
+    """Skipped parts of the flight, in sentences for the user."""
 
     def tick_rows(self) -> Iterator[TickRow]:
-        """The ticks as records, with their labels where the flight is a demonstration."""
+        """Return the ticks as records, with their labels if the flight is a demonstration."""
         contract = self.meta.contract
         return read_ticks(self.ticks, "sticks" if contract is None else contract.action)
 
     def frame_rows(self) -> Iterator[FrameRow]:
-        """The row of each image."""
+        """Return the row of each image."""
         return read_frames(self.frames)
 
     def images(self) -> Iterator[CameraImage]:
-        """The images one by one; raises VideoError if the video is damaged."""
+        """Iterate over the images; raise VideoError if the video is damaged."""
         return read_video(self.folder / self.video, self.numbers)
 
     def rgb_images(self) -> Iterator[ImageArray]:
-        """As ``images``; raises FlightError if they are depth images."""
+        """Iterate over the images; raise FlightError if they are depth images."""
         for image in self.images():
             if image.ndim == 2:
                 raise FlightError(f"{self.folder / self.video} holds depth: this takes RGB images")
@@ -56,13 +56,13 @@ class RecordedFlight:
 
 
 def open_flight(folder: Path, camera: str | None = None) -> RecordedFlight:
-    """Read the tables of a flight, with the frames of its first camera or of the one named.
+    """Read the tables of a flight, with the frames of its first camera or of the named one.
 
-    A flight that was cut off (``meta.finished`` is false) is read up to its last whole batch of
-    rows; frames without a row, and rows without a frame, are left out.
+    A flight that was cut off (``meta.finished`` is false) is read up to its last complete batch of
+    rows. Frames without a row and rows without a frame are left out.
 
     Raises:
-        MavbridgeError: it is no recorded flight, or a damaged one; the message says what to do.
+        MavbridgeError: not a recorded flight, or a damaged one; the message gives the next step.
     """
     meta = read_meta(folder)
     damage: list[str] = []

@@ -1,4 +1,4 @@
-"""One flight into its folder, by one thread: ticks, frames, and meta around them."""
+"""Single-threaded writer of a flight's folder: ticks, frames and meta."""
 
 from dataclasses import replace
 from pathlib import Path
@@ -14,7 +14,7 @@ from mavbridge.recording.video.writer import Pressure, VideoWriter, WriterDiedEr
 
 
 class CameraFiles:
-    """Written by a process of their own; one that died costs these frames alone."""
+    """Frames of one camera, written by a separate process, whose death loses only these."""
 
     def __init__(
         self,
@@ -26,11 +26,11 @@ class CameraFiles:
         with_truth: bool = False,
         tlog: TlogJob | None = None,
     ) -> None:
-        """Start the process; ``camera`` is the name of another camera than the first."""
+        """Start the process. ``camera`` is the camera's name, or None for the first one."""
         self.failure: WriterDiedError | None = None
         """Why no more frames are recorded."""
         self.source_size: tuple[int, int] | None = None
-        """Height and width of the frames as they come; None before the first."""
+        """Height and width of the incoming frames; None before the first."""
         self._serial = -1
         self._video = VideoWriter(
             folder / video_of(camera),
@@ -42,7 +42,7 @@ class CameraFiles:
         )
 
     def write(self, vision: VisionTick, truth: FrameTruth | None) -> None:
-        """Record a frame; serial numbers that were left out count as dropped."""
+        """Record a frame. Skipped serial numbers count as dropped."""
         dropped = vision.serial - self._serial - 1
         self._serial = vision.serial
         if self.failure is not None:
@@ -68,7 +68,7 @@ class CameraFiles:
 
     @property
     def dropped(self) -> int:
-        """Frames up to the last one that are not in it."""
+        """Number of frames missing from the video, up to the newest one."""
         return self._serial + 1 - self._video.written
 
     @property
@@ -77,7 +77,7 @@ class CameraFiles:
         return self._video.size
 
     def finish(self) -> None:
-        """Close the files in order, as far as the process lives."""
+        """Close the files in order if the process is alive."""
         if self.failure is not None:
             return
         try:
@@ -86,20 +86,20 @@ class CameraFiles:
             self.failure = error
 
     def close(self) -> None:
-        """Leave the files as they are; may be called twice."""
+        """Leave the files as they are. Can be called twice."""
         self._video.close()
 
 
 FLUSH_NS = 500_000_000
-"""Longest span of events that a crash may take with it."""
+"""Longest span of events that a crash can lose."""
 FLUSH_ROWS = 256
 
 
 class FlightWriter:
-    """Writes during the flight; ``finish`` closes it in order.
+    """Writer used during the flight; ``finish`` closes the files in order.
 
-    Methods raise OSError or WriterError where it cannot be written. After that only ``finish`` and
-    ``close`` may follow; what was written before stays readable.
+    Methods raise OSError or WriterError if a file cannot be written. Afterwards only ``finish`` and
+    ``close`` are allowed; everything written before stays readable.
     """
 
     def __init__(
@@ -116,9 +116,9 @@ class FlightWriter:
         Args:
             folder: the flight's folder.
             meta: the facts known at the start.
-            pressure: "offline" drops nothing, and waits; see ``VideoWriter``.
+            pressure: "offline" waits and drops nothing; see ``VideoWriter``.
             with_labels: the tables have the columns of ``TickLabels`` and ``FrameTruth``.
-            tlog_pipe: its reader becomes ``link.tlog``, and is closed here; None = no such file.
+            tlog_pipe: its reader becomes ``link.tlog`` and is closed here; None: no such file.
         """
         self._folder = folder
         self.meta = meta
@@ -130,7 +130,7 @@ class FlightWriter:
         names = (None,) if meta.contract is None else (None, *meta.contract.cameras[1:])
         job = None if tlog_pipe is None else TlogJob(folder / TLOG, tlog_pipe.reader)
         self.cameras: list[CameraFiles] = []
-        """Those of the contract, in its order."""
+        """Cameras in the contract's order."""
         try:
             for camera in names:
                 self.cameras.append(
@@ -145,14 +145,14 @@ class FlightWriter:
                 )
             write_meta(folder, meta)
             self._table = TableWriter(folder / TICKS, self._schema)
-            # The first conversion imports modules: now, and not in flight.
+            # Import the modules of the first conversion now, not in flight.
             self._table.append(ticks_batch([], self._schema))
         except (OSError, WriterError):
             self._close_cameras()
             raise
 
     def tick(self, tick: Tick, labels: TickLabels | None = None) -> None:
-        """Record a tick; serial numbers that were left out count as dropped."""
+        """Record a tick. Skipped serial numbers count as dropped."""
         dropped = tick.serial - self._tick_serial - 1
         self._tick_serial = tick.serial
         self._ticks_dropped += dropped
@@ -162,16 +162,16 @@ class FlightWriter:
         self._flush_if_due(tick.woke_ns)
 
     def frame(self, vision: VisionTick, truth: FrameTruth | None = None) -> None:
-        """Record a frame of any camera; serial numbers that were left out count as dropped.
+        """Record a frame of any camera. Skipped serial numbers count as dropped.
 
-        A writer process that died costs the frames alone: see ``video_failure``.
+        If a writer process dies, only its frames are lost: see ``video_failure``.
         """
         self._flush_if_due(vision.ready_ns)
         self.cameras[vision.camera].write(vision, truth)
 
     @property
     def video_failure(self) -> WriterDiedError | None:
-        """Reason why no more frames of a camera are recorded, while the rest is."""
+        """Return why frames of a camera are no longer recorded while the rest is, or None."""
         failures = (files.failure for files in self.cameras)
         return next((failure for failure in failures if failure is not None), None)
 
@@ -182,24 +182,24 @@ class FlightWriter:
 
     def _flush(self) -> None:
         if self._rows:
-            # Cleared first: rows that could not be written are not tried again.
+            # Clear first, so that rows that could not be written are not retried.
             waiting, self._rows = self._rows, []
             self._table.append(ticks_batch(waiting, self._schema))
 
     @property
     def frames_written(self) -> int:
-        """Frames known to be in the videos."""
+        """Number of frames known to be in the videos."""
         return sum(files.written for files in self.cameras)
 
     @property
     def ticks(self) -> int:
-        """Rows so far."""
+        """Number of rows so far."""
         return self._table.rows + len(self._rows)
 
     def finish(self, meta: FlightMeta) -> None:
-        """Close everything in order; ``meta`` is completed with what was counted here.
+        """Close everything in order, and complete ``meta`` with the counts kept here.
 
-        A writer that died leaves its table as it was, and ``finished`` false.
+        If a writer has died, its table stays as it was and ``finished`` stays false.
         """
         try:
             self._flush()
@@ -228,7 +228,7 @@ class FlightWriter:
         write_meta(self._folder, self.meta)
 
     def close(self) -> None:
-        """Leave everything as it is, after an error; may be called twice."""
+        """Leave everything as it is, after an error. Can be called twice."""
         self._close_cameras()
         self._table.abandon()
 

@@ -1,4 +1,4 @@
-"""The folder of one flight: names, and whether a flight may be written there. Imports no extra."""
+"""Names in a flight's folder, and the check that it can be written. Imports no extra."""
 
 from pathlib import Path
 
@@ -8,7 +8,7 @@ from mavbridge.core.extras import require_packages
 META = "meta.json"
 TICKS = "ticks"
 FRAMES = "frames"
-"""Stems of the tables: .arrows while they grow, .parquet once they are whole."""
+"""Stems of the tables: .arrows while they grow, .parquet once they are complete."""
 VIDEO = "camera.mp4"
 TLOG = "link.tlog"
 SOLVES, PACKETS, FEATURES = "solves", "packets", "features"
@@ -17,34 +17,34 @@ SETTINGS = "settings.json"
 
 
 EXTRA = ("av", "pyarrow")
-"""Packages of the extra ``record``, by the names that they are imported and installed by."""
+"""Packages of the ``record`` extra; each has the same name for import and installation."""
 
 
 def video_of(camera: str | None) -> str:
-    """Video of the first camera, or of another one by its name."""
+    """Return the video's file name for the first camera, or for the named one."""
     return VIDEO if camera is None else f"camera_{camera}.mp4"
 
 
 def frames_of(camera: str | None) -> str:
-    """Stem of the table of its frames."""
+    """Return the stem of a camera's table of frames."""
     return FRAMES if camera is None else f"{FRAMES}_{camera}"
 
 
 def features_of(camera: str | None) -> str:
-    """Stem of the table of its features."""
+    """Return the stem of a camera's table of features."""
     return FEATURES if camera is None else f"{FEATURES}_{camera}"
 
 
 def require_extra(what: str) -> None:
-    """Raise UserError if the extra is not installed; ``what`` needs it."""
+    """Raise UserError if the extra is not installed. ``what`` is the feature that needs it."""
     require_packages(what, {name: name for name in EXTRA})
 
 
 def prepare_folder(folder: Path) -> None:
-    """Make sure that a flight can be recorded into this folder; makes it.
+    """Create the folder and check that a flight can be recorded into it.
 
     Raises:
-        UserError: the extra is not installed, or the folder holds something, or cannot be written.
+        UserError: the extra is not installed, or the folder is not empty or cannot be written.
     """
     require_extra("--record")
     try:

@@ -1,4 +1,4 @@
-"""``meta.json``: who flew what, with which contract."""
+"""``meta.json``: facts about a flight, its policy and its contract."""
 
 import json
 import math
@@ -20,17 +20,17 @@ FlightSource = Literal["flight", "demonstration", "dagger", "imagined", "pilot"]
 
 
 class FlightError(MavbridgeError):
-    """A recorded flight that cannot be read."""
+    """A recorded flight cannot be read."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class FlightMeta:
-    """Facts about a flight as a whole; None = not known, or not known yet."""
+    """Facts about a whole flight; None: unknown, or not known yet."""
 
     started_at: str
     """ISO 8601, UTC."""
     start_ns: int
-    """The same moment, on the clock of all stamps."""
+    """Start of the flight on the clock of all stamps."""
     mavbridge_version: str
     source: FlightSource
     policy: str | None
@@ -40,39 +40,39 @@ class FlightMeta:
     action_hz: float
     visual_hz: float
     image_height: int | None = None
-    """Height of the recorded frames; the four sizes are written at the end."""
+    """Height of the recorded frames. The four sizes are written at the end."""
     image_width: int | None = None
     source_height: int | None = None
-    """Height of the frames as they came: H.264 cannot have an odd last row, which is cut off."""
+    """Height of the incoming frames. An odd last row is cut off, which H.264 cannot have."""
     source_width: int | None = None
     contract: Contract | None
     course_seed: int | None = None
     seed: int | None = None
     finished: bool = False
-    """The recording was closed in order."""
+    """True if the recording was closed in order."""
     ticks: int | None = None
     frames: int | None = None
-    """Number of rows, of ticks and of frames; known at the end."""
+    """Number of rows in the tables of ticks and of frames; known at the end."""
     ticks_dropped: int | None = None
     frames_dropped: int | None = None
     packets_dropped: int | None = None
-    """Each of the three counts what was lost before the last row of its file."""
+    """Each ``*_dropped`` counts the losses before the last row of its file."""
     success: bool | None = None
-    """Whether it is an example to follow: by its pilot's mark, else by the course and the outcome;
+    """True if the flight is an example to follow: by the pilot's mark, else by course and outcome.
     False after a crash or a fault."""
     crash: str | None = None
-    """How it was seen to have crashed, in words."""
+    """How the vehicle crashed, in words."""
     gates_passed: int | None = None
     outcome: FlightOutcome | None = None
-    """How the policy's flight ended; None where none flew, and in older flights."""
+    """How the policy's flight ended; None if no policy flew, and in older flights."""
     conditions: dict[str, float] = field(default_factory=dict)
-    """Physical quantities that were randomised, by name."""
+    """Randomised physical quantities, by name."""
     command: tuple[str, ...] = ()
-    """Command line, word by word, without passwords."""
+    """Command line, one word per item, without passwords."""
     versions: dict[str, str] = field(default_factory=dict)
-    """Versions of mavbridge, Python, the system and packages that matter, by name."""
+    """Versions of mavbridge, Python, the system and relevant packages, by name."""
     git_revision: str | None = None
-    """Commit of the checkout that ran, with ``-dirty`` where files of it differed."""
+    """Commit of the checkout that ran, with ``-dirty`` if files differed from it."""
     policy_files: dict[str, str] = field(default_factory=dict)
     """SHA-256 of the policy's files (weights, contract, code), by absolute path."""
     cameras: dict[str, str] = field(default_factory=dict)
@@ -80,16 +80,16 @@ class FlightMeta:
     plan: dict[str, float] = field(default_factory=dict)
     """Rates, periods and limits of the flight, as resolved from flags and contract."""
     parameters: dict[str, float] = field(default_factory=dict)
-    """Parameters of the autopilot that matter to the flight, by name, as read from it."""
+    """Flight-relevant parameters read from the autopilot, by name."""
 
     def with_outcome(self, outcome: FlightOutcome) -> "FlightMeta":
-        """Add the outcome, and judge by it whether the flight is an example, if nobody has."""
+        """Add the outcome; derive ``success`` from it if it is not set yet."""
         success = outcome.success if self.success is None else self.success
         return replace(self, outcome=outcome, success=success)
 
 
 def write_meta(folder: Path, meta: FlightMeta) -> None:
-    """Write or replace ``meta.json``, whole or not at all; raises OSError."""
+    """Write or replace ``meta.json`` atomically; raise OSError if that fails."""
     document = {"format": FORMAT, "version": VERSION} | asdict(meta)
     if meta.outcome is not None:
         document["outcome"] = meta.outcome.to_json()
@@ -104,7 +104,7 @@ def write_meta(folder: Path, meta: FlightMeta) -> None:
 
 
 def read_meta(folder: Path) -> FlightMeta:
-    """Read ``meta.json``; raises FlightError if there is none, or it is not one of ours."""
+    """Read ``meta.json``; raise FlightError if it is missing or not ours."""
     try:
         if odd := [each.name for each in folder.iterdir() if not (each.is_file() or each.is_dir())]:
             raise FlightError(f"{folder / odd[0]} is neither a file nor a folder: leave it out")
@@ -141,14 +141,15 @@ def _unreadable(folder: Path) -> str:
 
 
 def _meta(folder: Path, document: dict[str, Any]) -> FlightMeta:
-    """Keys of later versions are left aside; those of this one must be there and be sound."""
+    """Read the document. Keys of later versions are ignored; keys of this version must be present
+    and valid."""
     known = {f.name: document[f.name] for f in fields(FlightMeta) if f.name in document}
     try:
         if known.get("contract") is not None:
             known["contract"] = Contract.from_json(json.dumps(known["contract"]))
         if known.get("outcome") is not None:
             reason = known["outcome"]["reason"]
-            # A sentence without a code is not read back: nothing may be decided by it.
+            # A sentence without a code is not read back, because no decision can be based on it.
             reason = reason_from_json(reason) if isinstance(reason, dict) else None
             known["outcome"] = FlightOutcome(**known["outcome"] | {"reason": reason})
         known["command"] = tuple(known.get("command", ()))

@@ -1,7 +1,7 @@
-"""Records a flight while it flies: a ``TickSink`` that does its work on a thread of its own.
+"""Recorder of a live flight: a ``TickSink`` that works on its own thread.
 
-Cannot hurt the flight: events wait in bounded queues, are dropped and counted when these are full,
-and an error ends the recording alone, with one warning.
+It cannot hurt the flight. Events wait in bounded queues; when these are full, events are dropped
+and counted. An error ends only the recording, with one warning.
 """
 
 from collections.abc import Callable, Sequence
@@ -19,12 +19,12 @@ from mavbridge.recording.settings import ReplaySettings, write_settings
 from mavbridge.recording.tlog import TlogPipe
 
 CAPACITY = 6000
-"""Ticks that may wait: a minute at 100 Hz."""
+"""Capacity of the tick queue: one minute at 100 Hz."""
 IMAGE_CAPACITY = 32
 
 
 class Recorder:
-    """One recorded flight; see the module."""
+    """Recording of one flight while it flies."""
 
     def __init__(
         self,
@@ -42,14 +42,14 @@ class Recorder:
         Args:
             folder: from ``prepare_folder``.
             meta: the facts known at the start.
-            tlog_pipe: fed by the process of the link; its reader is closed here.
+            tlog_pipe: filled by the link's process; its reader is closed here.
             packets_dropped: returns how many packets that process has dropped; exact at the end.
             autopilot: returns the autopilot's name at the end.
             report: shows a line to the user; called from the recorder's thread.
-            settings: those of the flight, for a replay; None: it cannot be replayed.
+            settings: the flight's settings, for a replay; None: the flight cannot be replayed.
 
         Raises:
-            OSError, WriterError: the folder cannot be written, the writer process does not start.
+            OSError, WriterError: the folder is not writable, or the writer process fails.
         """
         self._folder = folder
         writer = FlightWriter(folder, meta, pressure="online", tlog_pipe=tlog_pipe)
@@ -76,34 +76,34 @@ class Recorder:
         self._observer.emit(event)
 
     def watch_packets(self, packets: tuple[ForwardedPacket, ...]) -> None:
-        """Queue the stamps of packets that have arrived, or drop and count them; one thread."""
+        """Queue the stamps of received packets, or drop and count them. For one thread only."""
         self._tables.packets.put(packets)
 
     def close(self, timeout_s: float) -> None:
-        """Finish the recording within ``timeout_s``; call it once the link is closed.
+        """Finish the recording within ``timeout_s``. Call once the link is closed.
 
-        If the process of the link still runs then, the writer process keeps its log to the end.
+        If the link's process is still running, the writer process keeps its log to the end.
         """
         self._observer.close(timeout_s)
 
     @property
     def dropped(self) -> int:
-        """Ticks, frames and packets that are not in the recording; exact after ``close``."""
+        """Number of ticks, frames and packets missing from the recording; exact after ``close``."""
         lost = self._consumer.frames_lost + self._packets_dropped() + self._tables.packets.dropped
         return self._observer.dropped + lost
 
     @property
     def crash(self) -> str | None:
-        """How the vehicle has crashed so far, in words; read by any thread."""
+        """How the vehicle has crashed so far, in words, or None; readable by any thread."""
         return self._consumer.crash_watch.reason
 
     @property
     def meta(self) -> FlightMeta:
-        """What ``meta.json`` holds; complete after ``close``."""
+        """Contents of ``meta.json``; complete after ``close``."""
         return self._consumer.writer.meta
 
     def summary(self) -> str:
-        """One line for a person: the folder, what it holds and what it lacks."""
+        """Return one line for the user: the folder, its contents and the losses."""
         writer = self._consumer.writer
         failure = self._observer.failure or writer.video_failure
         if failure is None and not self.dropped:
@@ -115,7 +115,7 @@ class Recorder:
 
 @dataclass
 class _FlightConsumer:
-    """Runs on the recorder's thread; may raise OSError and WriterError."""
+    """Consumer on the recorder's thread; can raise OSError and WriterError."""
 
     writer: FlightWriter
     tables: ReplayTables
@@ -129,7 +129,7 @@ class _FlightConsumer:
 
     @property
     def frames_lost(self) -> int:
-        """Frames that were taken from the queue and are not in the video."""
+        """Number of frames taken from the queue but missing from the video."""
         return max(0, self._seen_frames - self.writer.frames_written)
 
     def consume(self, batch: Sequence[Observed]) -> None:
@@ -148,7 +148,7 @@ class _FlightConsumer:
             self._flush_if_due(batch[-1])
         except BaseException:
             self._has_failed = True
-            self._seen_frames = seen_frames  # the observer counts this whole batch as lost
+            self._seen_frames = seen_frames  # the observer counts the whole batch as lost
             raise
 
     def _flush_if_due(self, newest: Observed) -> None:
@@ -166,7 +166,7 @@ class _FlightConsumer:
             self.report(f"recording no more images: {failure}; the rest is still recorded")
 
     def close(self) -> None:
-        """Finish in order, or after an error leave things as they are."""
+        """Finish in order; after an error, leave the files as they are."""
         if self._has_failed:
             self.writer.close()
             self.tables.abandon()

@@ -1,4 +1,4 @@
-"""Tables of what a replay needs: solves of the policy, features, and stamps of packets."""
+"""Tables for a replay: solves of the policy, features, and packet stamps."""
 
 import json
 from collections.abc import Iterator, Sequence
@@ -68,14 +68,14 @@ class FeatureRow(NamedTuple):
 
 
 class SolveRow(NamedTuple):
-    """One solve, and how many before it are not in the recording."""
+    """One solve, and the number of unrecorded solves before it."""
 
     solve: Solve
     dropped_before: int
 
 
 class PacketStamp(NamedTuple):
-    """When one packet of ``link.tlog`` arrived, and when what it tells of happened."""
+    """Arrival of one packet of ``link.tlog``, and the time that its contents describe."""
 
     arrived_ns: int
     happened_ns: int
@@ -84,14 +84,14 @@ class PacketStamp(NamedTuple):
 
 
 def packet_key(data: bytes) -> tuple[int, int]:
-    """Message id and sequence number of a whole MAVLink packet."""
+    """Return message id and sequence number of a complete MAVLink packet."""
     if data[0] == _V1:
         return data[5], data[2]
     return int.from_bytes(data[7:10], "little"), data[4]
 
 
 def solves_batch(rows: Sequence[SolveRow]) -> pa.RecordBatch:
-    """Rows of consecutive solves."""
+    """Convert consecutive solves to rows."""
     solves = [row.solve for row in rows]
     states = [solve.state for solve in solves]
     columns: dict[str, Any] = {name: [getattr(solve, name) for solve in solves] for name in _PLAIN}
@@ -108,7 +108,7 @@ def solves_batch(rows: Sequence[SolveRow]) -> pa.RecordBatch:
 
 
 def features_batch(rows: Sequence[FeatureRow]) -> pa.RecordBatch:
-    """Rows of consecutive features of one camera."""
+    """Convert consecutive features of one camera to rows."""
     frames = [row.frame for row in rows]
     names = ("frame_id", "captured_ns", "ready_ns")
     columns: dict[str, Any] = {name: [getattr(frame, name) for frame in frames] for name in names}
@@ -121,7 +121,7 @@ def features_batch(rows: Sequence[FeatureRow]) -> pa.RecordBatch:
 
 
 def packets_batch(packets: Sequence[ForwardedPacket], dropped: int) -> pa.RecordBatch:
-    """Rows of consecutive packets; ``dropped`` of them were lost before the first."""
+    """Convert consecutive packets to rows. ``dropped`` packets were lost before the first."""
     keys = [packet_key(packet.data) for packet in packets]
     columns = {
         "arrived_ns": [packet.arrived_ns for packet in packets],
@@ -143,7 +143,7 @@ def _batch(columns: dict[str, Any], schema: pa.Schema) -> pa.RecordBatch:
 
 
 def _joined(arrays: Sequence[FloatArray]) -> FloatArray:
-    """All numbers in one row; Arrow takes an array of numpy without a copy of each number."""
+    """Join all numbers in one array. Arrow takes a numpy array without copying each number."""
     return np.concatenate([np.zeros(0, np.float32), *(array.ravel() for array in arrays)])
 
 
@@ -153,7 +153,7 @@ def _lists(arrays: Sequence[FloatArray]) -> pa.Array:
 
 
 def read_solves(table: pa.Table, contract: Contract) -> Iterator[SolveRow]:
-    """Records of a table of solves, with arrays in the shapes of the contract. Read-only."""
+    """Return the records of a table of solves, with read-only arrays in the contract's shapes."""
     shapes = {
         "states": (1, *contract.state_shape),
         "history": (1, -1, ACTION_DIM),
@@ -181,7 +181,7 @@ def read_solves(table: pa.Table, contract: Contract) -> Iterator[SolveRow]:
 
 
 def read_features(table: pa.Table) -> Iterator[FeatureFrame]:
-    """Records of a table of features, each with its value [1, F]. Read-only."""
+    """Return the records of a table of features, each with its value [1, F]. Read-only."""
     for batch in table.to_batches():
         values = _arrays(batch.column("value"))
         for value, row in zip(values, batch.drop_columns(["value"]).to_pylist(), strict=True):
@@ -193,7 +193,7 @@ def read_features(table: pa.Table) -> Iterator[FeatureFrame]:
 
 
 def read_packets(table: pa.Table) -> Iterator[PacketStamp]:
-    """Records of a table of packets."""
+    """Return the records of a table of packets."""
     for batch in table.to_batches():
         for row in batch.drop_columns(["dropped_before"]).to_pylist():
             yield PacketStamp(**row)
@@ -207,12 +207,12 @@ def _arrays(column: pa.Array) -> list[FloatArray]:
 
 
 PACKET_CAPACITY = 60_000
-"""Packets whose stamps may wait: a minute of the busiest link."""
+"""Capacity of the queue of packet stamps: one minute of the busiest link."""
 _Row = TypeVar("_Row")
 
 
 class _Buffered(Generic[_Row]):
-    """A table and the rows that are not in it yet."""
+    """A table, and the rows that have not been written to it yet."""
 
     def __init__(self, stem: Path, schema: pa.Schema) -> None:
         self.table = TableWriter(stem, schema)
@@ -221,32 +221,32 @@ class _Buffered(Generic[_Row]):
         self.serial = -1
 
     def dropped_before(self, serial: int) -> int:
-        """Rows between the last serial number and this one."""
+        """Return the number of rows between the last serial number and this one."""
         dropped, self.serial = serial - self.serial - 1, serial
         return dropped
 
     def take(self) -> list[_Row]:
-        """The rows; what cannot be written is not tried again."""
+        """Remove and return the rows, so that a failed write is not retried."""
         rows, self.rows = self.rows, []
         return rows
 
 
 class ReplayTables:
-    """Used by the recorder's thread, ``packets.put`` excepted.
+    """Tables for a replay. Used by the recorder's thread, except for ``packets.put``.
 
-    Methods raise OSError where a file cannot be written; what was written before stays readable.
+    Methods raise OSError if a file cannot be written; everything written before stays readable.
     """
 
     def __init__(self, folder: Path, cameras: tuple[str, ...], *, has_features: bool) -> None:
         """Create the tables in the folder of a flight.
 
         Args:
-            folder: the flight's.
-            cameras: those of the contract, in its order.
-            has_features: the policy has features, not just resized images.
+            folder: of the flight.
+            cameras: in the contract's order.
+            has_features: the policy has features, not only resized images.
         """
         self._solves: _Buffered[SolveRow] = _Buffered(folder / SOLVES_STEM, SOLVES)
-        self._solves.serial = 0  # that of the first solve is 1
+        self._solves.serial = 0  # the first solve has serial 1
         self._packets = TableWriter(folder / PACKETS_STEM, PACKETS)
         self._packets_lost = 0
         names = (None, *cameras[1:]) if has_features else ()
@@ -254,15 +254,15 @@ class ReplayTables:
             _Buffered(folder / features_of(name), FEATURES) for name in names
         ]
         self.packets: BoundedQueue[tuple[ForwardedPacket, ...]] = BoundedQueue(PACKET_CAPACITY)
-        """Groups of packets, as they came; another thread puts them in."""
+        """Groups of packets in order of arrival; filled by another thread."""
 
     def solve(self, solve: Solve) -> None:
-        """Record a solve; serial numbers that were left out count as dropped."""
+        """Record a solve. Skipped serial numbers count as dropped."""
         dropped = self._solves.dropped_before(solve.serial)
         self._solves.rows.append(SolveRow(solve, dropped))
 
     def feature(self, vision: VisionTick) -> None:
-        """Record a feature of any camera, if the policy has features."""
+        """Record a feature of any camera if the policy has features."""
         if not self._features or vision.feature is None:
             return
         table = self._features[vision.camera]
@@ -290,7 +290,7 @@ class ReplayTables:
             self._packets.append(packets_batch(packets, lost))
 
     def finish(self) -> None:
-        """Write the rest, and make Parquet of the tables."""
+        """Write the remaining rows, and convert the tables to Parquet."""
         self.flush()
         for table in self._tables:
             table.finish()

@@ -1,7 +1,7 @@
-"""Rows of a flight's two tables: as records, as Arrow schemas, and the conversion both ways.
+"""Rows of a flight's two tables: records, Arrow schemas, and the conversion in both directions.
 
-docs/formats.md is the format. A column is named as the attribute that it holds, and
-a value that was not there is null.
+docs/formats.md describes the format. A column is named after the attribute that it holds; a missing
+value is null.
 """
 
 import json
@@ -30,24 +30,24 @@ class FrameTruth:
     ned_from_body_wxyz: Quaternion
     velocity_ned_mps: Vector
     next_gate: int | None
-    """Index in the course; None after the last."""
+    """Index of the next gate in the course; None after the last."""
     gate_body_m: Vector | None
     """Centre of the next gate in FRD body axes."""
     gate_yaw_rad: float | None
-    """Heading of the passage relative to the body's."""
+    """Heading of the passage relative to the body's heading."""
     gate_after_body_m: Vector | None
-    """Centre of the gate after that."""
+    """Centre of the gate after the next, in FRD body axes."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class FrameRow:
-    """Facts about a frame besides its pixels."""
+    """Facts about a frame, without its pixels."""
 
     frame_id: int
     captured_ns: int
     ready_ns: int
     dropped_before: int = 0
-    """Frames lost on the way to the recording, just before this one."""
+    """Frames lost just before this one, on the way to the recording."""
     truth: FrameTruth | None = None
 
 
@@ -56,11 +56,11 @@ class TickLabels:
     """Labels of a tick in a demonstration."""
 
     expert: Action | None
-    """The expert's action here, without the disturbance that was flown."""
+    """The expert's action for this tick, without the disturbance that was flown."""
 
 
 class TickRow(NamedTuple):
-    """One row of the ticks table."""
+    """One row of the table of ticks."""
 
     tick: Tick
     dropped_before: int
@@ -114,19 +114,19 @@ DEMONSTRATION_FRAMES = pa.schema(
         pa.field("gate_after_body_m", _VECTOR),
     ]
 )
-"""All columns of the truth are null where it was not given; its position alone never is."""
+"""Columns with the truth: all null if it was not given; otherwise its position is never null."""
 
 _TICK = tuple(
     field.name
     for field in fields(Tick)
     if field.name in TICKS.names and field.name != "release_reason"
 )
-"""Columns that hold an attribute of ``Tick`` as it is."""
+"""Columns that hold a ``Tick`` attribute unchanged."""
 _ROWS_AT_ONCE = 4096
 
 
 def ticks_batch(rows: Sequence[TickRow], schema: pa.Schema) -> pa.RecordBatch:
-    """Rows of consecutive ticks; with the schema ``DEMONSTRATION_TICKS``, their labels as well."""
+    """Convert consecutive ticks to rows; with ``DEMONSTRATION_TICKS``, labels included."""
     columns = [
         {
             **_attributes(row.tick, _TICK),
@@ -143,7 +143,7 @@ def ticks_batch(rows: Sequence[TickRow], schema: pa.Schema) -> pa.RecordBatch:
 
 
 def _reason_columns(reason: Reason | None) -> dict[str, object]:
-    """The sentence for people, the code and the figures for programs."""
+    """Return a reason's columns: the sentence for people, the code and the figures for programs."""
     if reason is None:
         return {}
     document = reason_to_json(reason)
@@ -155,7 +155,7 @@ def _reason_columns(reason: Reason | None) -> dict[str, object]:
 
 
 def frames_batch(rows: Sequence[FrameRow], schema: pa.Schema) -> pa.RecordBatch:
-    """Rows of consecutive frames; with ``DEMONSTRATION_FRAMES``, the truth as well."""
+    """Convert consecutive frames to rows; with ``DEMONSTRATION_FRAMES``, the truth included."""
     return pa.RecordBatch.from_pylist(
         [_attributes(row, tuple(FRAMES.names)) | _attributes(row.truth, _TRUTH) for row in rows],
         schema=schema,
@@ -167,9 +167,9 @@ def _attributes(source: object | None, names: Iterable[str]) -> dict[str, object
 
 
 def read_ticks(table: pa.Table, action: ActionKind = "sticks") -> Iterator[TickRow]:
-    """Records of a ticks table, whose actions are of this kind.
+    """Return the records of a table of ticks whose actions are of this kind.
 
-    Whole columns are never turned into Python objects at once.
+    Whole columns are never converted to Python objects at once.
     """
     serial = -1
     has_labels = "expert" in table.column_names
@@ -182,7 +182,7 @@ def read_ticks(table: pa.Table, action: ActionKind = "sticks") -> Iterator[TickR
 
 
 def read_frames(table: pa.Table) -> Iterator[FrameRow]:
-    """Records of a frames table."""
+    """Return the records of a table of frames."""
     for row in _rows(table):
         truth = None
         if row.get("position_ned_m") is not None:
@@ -215,7 +215,7 @@ def _tick(row: dict[str, Any], serial: int, make: type[Action]) -> Tick:
 
 
 def read_reason(code: str | None, data: str) -> Reason | None:
-    """The reason of this code with the figures of a JSON object; raises FlightError."""
+    """Restore a reason from its code and its figures in JSON; raise FlightError if invalid."""
     if code is None:
         return None
     try:

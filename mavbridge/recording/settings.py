@@ -16,26 +16,26 @@ _T = TypeVar("_T")
 
 
 class SettingsError(MavbridgeError):
-    """Settings that cannot be read."""
+    """The settings of a recorded flight cannot be read."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class ReplaySettings:
-    """Flags of a flight, with the defaults of those that were not given."""
+    """Flags of a flight, including the defaults of flags that were not given."""
 
     config: FlyConfig
     wall_offset_ns: int
-    """From the clock of all stamps to Unix time, as in ``link.tlog``."""
+    """Offset from the clock of all stamps to Unix time, as used in ``link.tlog``."""
 
 
 def write_settings(folder: Path, settings: ReplaySettings) -> None:
-    """Write the file; raises OSError."""
+    """Write the file; raise OSError if that fails."""
     text = json.dumps(asdict(settings), indent=2, default=str) + "\n"
     (folder / SETTINGS).write_text(without_secrets(text))
 
 
 def read_settings(folder: Path) -> ReplaySettings:
-    """Read the file; raises SettingsError if there is none, or it is not one of this version."""
+    """Read the file; raise SettingsError if it is missing or not of this version."""
     try:
         return _made(ReplaySettings, read_json(folder / SETTINGS))
     except FileNotFoundError as error:
@@ -50,7 +50,7 @@ def read_settings(folder: Path) -> ReplaySettings:
 
 
 def _made(cls: type[_T], document: dict[str, Any]) -> _T:
-    """A dataclass from what ``asdict`` and JSON made of it; flags of later versions are left."""
+    """Rebuild a dataclass from its ``asdict`` JSON; flags of later versions are ignored."""
     hints = get_type_hints(cls)
     names = [field.name for field in fields(cls) if field.name in document]  # type: ignore[arg-type]
     return cls(**{name: _value(hints[name], document[name]) for name in names})

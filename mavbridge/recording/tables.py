@@ -1,4 +1,4 @@
-"""Tables that survive a crash: an Arrow IPC stream while they grow, Parquet once they are whole."""
+"""Tables that survive a crash: Arrow IPC streams while they grow, Parquet when complete."""
 
 from collections.abc import Iterator
 from pathlib import Path
@@ -16,25 +16,25 @@ from policy.files import library_name
 
 READ_ERRORS = (pa.ArrowException, OSError)
 _GROUP_ROWS = 2_048
-"""Rows of a Parquet row group: twenty seconds of ticks. Encoding 16,384 at once took 27 MB."""
+"""Rows per Parquet row group: twenty seconds of ticks. Encoding 16,384 rows at once took 27 MB."""
 
 
 class TableError(MavbridgeError):
-    """A table that cannot be read."""
+    """A table cannot be read."""
 
 
 class TableWriter:
-    """Appends batches to ``STEM.arrows``; ``finish`` makes ``STEM.parquet`` of it.
+    """Appends batches to ``STEM.arrows``; ``finish`` converts it to ``STEM.parquet``.
 
-    Methods raise OSError where a file cannot be written; what was written before stays readable.
+    Methods raise OSError if a file cannot be written; everything written before stays readable.
     """
 
     def __init__(self, stem: Path, schema: pa.Schema) -> None:
-        """Create the stream; ``stem`` is a path without a suffix, where no stream may exist."""
+        """Create the stream. ``stem`` is a path without a suffix; no stream may exist there."""
         self._stream = stem.with_suffix(".arrows")
         self._parquet = stem.with_suffix(".parquet")
         self._stream.open("xb").close()
-        self._sink = pa.OSFile(str(self._stream), "wb")  # no buffer of its own
+        self._sink = pa.OSFile(str(self._stream), "wb")  # unbuffered
         self._writer = pa.ipc.new_stream(self._sink, schema)
         self.rows = 0
 
@@ -44,7 +44,7 @@ class TableWriter:
         self.rows += batch.num_rows
 
     def finish(self) -> None:
-        """Close the stream and replace it by Parquet; without room for that, the stream stays."""
+        """Close the stream and replace it by Parquet; if the disk is full, keep the stream."""
         self._writer.close()
         self._sink.close()
         to_parquet(self._stream, self._parquet)
@@ -55,9 +55,9 @@ class TableWriter:
 
 
 def to_parquet(stream: Path, parquet: Path) -> None:
-    """Replace an Arrow stream by the Parquet file of its whole batches, in constant memory.
+    """Replace an Arrow stream by a Parquet file of its complete batches, in constant memory.
 
-    If it cannot be written, OSError is raised, and the stream stays.
+    If that cannot be written, raise OSError and keep the stream.
     """
     part = parquet.with_suffix(".parquet.part")
     try:
@@ -75,7 +75,7 @@ def to_parquet(stream: Path, parquet: Path) -> None:
 
 
 def _groups(schema: pa.Schema, batches: Iterator[pa.RecordBatch]) -> Iterator[pa.Table]:
-    """Small batches joined: a row group for each would be larger than the stream."""
+    """Join small batches: one row group per batch would make the file larger than the stream."""
     group: list[pa.RecordBatch] = []
     rows = 0
     for batch in batches:
@@ -89,12 +89,12 @@ def _groups(schema: pa.Schema, batches: Iterator[pa.RecordBatch]) -> Iterator[pa
 
 
 def read_table(stem: Path, schema: pa.Schema, *, damage: list[str] | None = None) -> pa.Table:
-    """The table under this stem, whichever form it has; of a cut-off stream the whole batches.
+    """Read the table with this stem in either format; of a cut-off stream, the complete batches.
 
-    What is lost is told in a sentence that is added to ``damage``.
+    A sentence about any loss is appended to ``damage``.
 
     Raises:
-        TableError: there is none, it is damaged, or it lacks a column of ``schema``.
+        TableError: the table is missing or damaged, or lacks a column of ``schema``.
     """
     return read_numbered(stem, schema, damage=damage)[0]
 
@@ -102,7 +102,7 @@ def read_table(stem: Path, schema: pa.Schema, *, damage: list[str] | None = None
 def read_numbered(
     stem: Path, schema: pa.Schema, *, damage: list[str] | None = None
 ) -> tuple[pa.Table, NDArray[np.int64]]:
-    """As ``read_table``, with the numbers that the rows had before some were lost."""
+    """Read the table as ``read_table`` does, with the row numbers from before any loss."""
     parquet, stream = stem.with_suffix(".parquet"), stem.with_suffix(".arrows")
     path = parquet if parquet.exists() else stream
     try:
@@ -138,7 +138,7 @@ def _whole_batches(file: IO[bytes]) -> tuple[pa.Schema, Iterator[pa.RecordBatch]
             try:
                 batch = reader.read_next_batch()
             except (StopIteration, pa.ArrowInvalid, OSError):
-                return  # the end, or where the writer was killed
+                return  # end of file, or the point at which the writer was killed
             yield batch
 
     return reader.schema, batches()

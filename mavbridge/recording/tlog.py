@@ -1,6 +1,6 @@
-"""``link.tlog``: from the process that owns the link to the one that writes the recording.
+"""``link.tlog``: the packet log, from the link's process to the recording's writer process.
 
-The records come through a pipe of their own, so that the log goes on after the flight process has
+The records come through a separate pipe, so that the log continues after the flight process has
 died. ``mavbridge.mavlink.transport.packet_pipe`` makes them.
 """
 
@@ -12,22 +12,22 @@ from pathlib import Path
 from typing import NamedTuple, Never
 
 PERIOD_S = 0.05
-"""Time between two reads: waking the reader for each record would cost the link's process time."""
+"""Time between two reads. Waking the reader for each record would cost the link's process time."""
 READ_BYTES = 1 << 16
 STOP_S = 1.0
 
 
 class TlogPipe(NamedTuple):
-    """Both ends of the pipe, in the process that starts the other two; no child inherits them."""
+    """Both ends of the pipe, in the process that starts the other two. No child inherits them."""
 
     reader: "Connection[Never, Never]"
-    """For ``Recorder``, which closes it here once the writer process has it."""
+    """For ``Recorder``, which closes it here as soon as the writer process has it."""
     writer: "Connection[Never, Never]"
-    """Its ``fileno()`` is for the process of the link (``pass_fds``). To be closed here as soon as
-    that process has it, or else the log would never end."""
+    """Its ``fileno()`` is passed to the link's process (``pass_fds``). Close it here as soon as
+    that process has it, or the log never ends."""
 
     def close(self) -> None:
-        """Close what is still open here. May be called twice."""
+        """Close the ends still open here. Can be called twice."""
         self.reader.close()
         self.writer.close()
 
@@ -36,24 +36,24 @@ class TlogJob(NamedTuple):
     """A log to write."""
 
     path: Path
-    """Must not exist."""
+    """Must not exist yet."""
     records: "Connection[Never, Never]"
 
 
 def open_tlog_pipe() -> TlogPipe:
-    """Make the pipe; raises OSError if there are no descriptors left."""
+    """Create the pipe; raise OSError if no descriptors are left."""
     return TlogPipe(*Pipe(duplex=False))
 
 
 class TlogThread:
-    """Appends what comes through the pipe to the file, until its end."""
+    """Thread that copies the pipe to the file until the pipe ends."""
 
     def __init__(self, job: TlogJob) -> None:
-        """Start the thread, which alone uses the pipe from here on."""
+        """Start the thread. From here on only the thread uses the pipe."""
         self._job = job
         self._stop = threading.Event()
         self.failure: OSError | None = None
-        """Why the log is not written any more; the pipe is closed then."""
+        """Why the log is no longer written; the pipe is then closed."""
         self._thread = threading.Thread(target=self._run, name="mavbridge-tlog", daemon=True)
         self._thread.start()
 
@@ -66,7 +66,7 @@ class TlogThread:
             self.failure = error
 
     def _copy(self, file: FileIO) -> bool:
-        """Append what waits in the pipe; False at its end."""
+        """Append the pending data of the pipe; return False at its end."""
         if not wait([self._job.records], PERIOD_S):
             return True
         data = os.read(self._job.records.fileno(), READ_BYTES)
@@ -76,7 +76,7 @@ class TlogThread:
         return bool(data)
 
     def finish(self, timeout_s: float) -> None:
-        """Wait for the end of the pipe, for at most ``timeout_s``, and end the thread."""
+        """Wait at most ``timeout_s`` for the end of the pipe, and end the thread."""
         self._thread.join(timeout_s)
         self._stop.set()
-        self._thread.join(STOP_S)  # a disk that hangs must not keep the process alive
+        self._thread.join(STOP_S)  # a hung disk must not keep the process alive

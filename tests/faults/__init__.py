@@ -1,1 +1,1 @@
-"""A catalogue of faults, flown by real processes and judged by the vehicle's own record."""
+"""Catalogue of faults, flown by real processes and judged by the vehicle's own record."""

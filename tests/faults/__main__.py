@@ -52,7 +52,7 @@ MUST = {
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """Exit status 0: all as it must be, 1: not, 2: a usage error."""
+    """Fly or soak. Exit status 0: all passed, 1: failures, 2: a usage error."""
     parser = argparse.ArgumentParser(prog="python -m faults", description=__doc__)
     add = parser.add_argument
     add("names", nargs="*", metavar="NAME", help="scenarios or groups (default: all)")
@@ -65,7 +65,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     add("--soak", type=float, metavar="N", help=soak_help)
     add("--seed", type=int, default=0, metavar="N", help="of the order of a soak's faults")
     args = parser.parse_args(argv)
-    # An exit by this signal ends the processes of the present flight too.
+    # An exit by this signal also ends the processes of the current flight.
     signal.signal(signal.SIGTERM, lambda number, _: sys.exit(128 + number))
     try:
         return _soak(args.soak, args.seed) if args.soak else _fly_catalogue(args)
@@ -127,7 +127,7 @@ def _machine() -> str:
 def make_page(
     verdicts: Sequence[Verdict], catalogue: Mapping[str, Scenario], *, date: str, machine: str
 ) -> str:
-    """Markdown of the page: one row a run."""
+    """Return the page in Markdown: one row per run."""
     limits = {"lost": MOST_LOST_M, "impact": MOST_IMPACT_MPS}
     parts = [HEAD.format(date=date, machine=machine, **limits)]
     for group, title in TITLES.items():
@@ -141,7 +141,7 @@ def make_page(
 
 
 def make_line(verdict: Verdict) -> str:
-    """A line for the terminal."""
+    """Return a line for the terminal."""
     measured = verdict.aftermath
     parts = [f"{verdict.scenario:24s}", f"{verdict.variant.text:24s}"]
     if measured is not None:

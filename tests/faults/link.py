@@ -1,4 +1,4 @@
-"""The link from the relay to the bridge: its faults by seed, and UDP, TCP or a serial port."""
+"""Link from the relay to the bridge: seeded faults, over UDP, TCP or a serial port."""
 
 import heapq
 import os
@@ -17,9 +17,9 @@ QUEUE_NS = 500 * NS_PER_MS
 """Longest wait for bandwidth; a packet that would wait longer is dropped."""
 LOOPBACK = "127.0.0.1"
 MOST_BYTES = 65536
-BITS_PER_BYTE = 10  # 8, a start and a stop bit
+BITS_PER_BYTE = 10  # 8 data bits, a start bit and a stop bit
 LINE_BUFFER = 4096
-"""Bytes in the ring of a serial driver."""
+"""Buffer size of a serial driver."""
 SERIAL_PACE_S = 0.002
 
 
@@ -30,28 +30,28 @@ class LinkFaults:
     loss: float = 0.0
     duplicate: float = 0.0
     corrupt: float = 0.0  # one byte is changed
-    reorder: float = 0.0  # the packet is held back by ``reorder_ms``, so later ones overtake it
+    reorder: float = 0.0  # held back by ``reorder_ms``, so that later packets overtake it
     reorder_ms: float = 20.0
     delay_ms: float = 0.0
     jitter_ms: float = 0.0
-    """Largest random delay on top, evenly distributed; packets overtake each other."""
+    """Largest additional random delay, uniformly distributed; packets can overtake each other."""
     hole_ms: float = 0.0
     """Length of each gap in which every packet is lost."""
     hole_every_ms: float = 0.0
-    """Mean time between two gaps: 0.5 to 1.5 times this."""
+    """Mean time between two gaps; each is 0.5 to 1.5 times this."""
     bytes_per_s: float = 0.0
     """Bandwidth; 0: unlimited."""
 
 
 class FaultyLink:
-    """One direction of a link: packets in, the surviving ones out when they are due."""
+    """One direction of a link: packets in, surviving packets out when they are due."""
 
     def __init__(self, faults: LinkFaults, seed: int) -> None:
         self._faults = faults
         self._random = np.random.Generator(np.random.PCG64(seed))
         self._in_flight: list[tuple[int, int, bytes]] = []
         self._sent = 0
-        self._hole_ns: int | None = None  # start of the present or next hole
+        self._hole_ns: int | None = None  # start of the current or next hole
         self._free_ns = 0  # when the last packet has passed a link of limited bandwidth
 
     def send(self, packet: bytes, now_ns: int) -> None:
@@ -72,11 +72,11 @@ class FaultyLink:
 
     @property
     def due_ns(self) -> int | None:
-        """When the next packet arrives; None while none is on its way."""
+        """Arrival of the next packet; None while none is in flight."""
         return self._in_flight[0][0] if self._in_flight else None
 
     def receive(self, now_ns: int) -> list[bytes]:
-        """Packets that have arrived by now, in order of arrival."""
+        """Return the packets that have arrived by now, in order of arrival."""
         arrived = []
         while self._in_flight and self._in_flight[0][0] <= now_ns:
             arrived.append(heapq.heappop(self._in_flight)[2])
@@ -96,7 +96,7 @@ class FaultyLink:
         return round((0.5 + self._random.random()) * self._faults.hole_every_ms * NS_PER_MS)
 
     def _passed_ns(self, packet: bytes, now_ns: int) -> int | None:
-        """When the packet has passed the link's bandwidth; None: it finds the queue full."""
+        """Return when the packet has passed the limited bandwidth; None: the queue is full."""
         if self._faults.bytes_per_s <= 0:
             return now_ns
         if self._free_ns - now_ns > QUEUE_NS:
@@ -117,41 +117,41 @@ class FaultyLink:
 
 
 class Carrier(ABC):
-    """The vehicle's end of the bridge's link; `fail` may be called by any thread."""
+    """The vehicle's end of the bridge's link. `fail` can be called by any thread."""
 
     is_stream = True
-    """True if a read may end inside a packet."""
+    """True if a read can end inside a packet."""
     wait_s = 0.2
-    """Longest time until the next look at it."""
+    """Longest time until the next poll."""
 
     def __init__(self, address: str) -> None:
         self.address = address
-        """For the bridge's ``--connect``."""
+        """Value for the bridge's ``--connect``."""
         self.has_failed = False
 
     def fail(self) -> None:
-        """Break at the next look: UDP comes from another port from then on, TCP closes and takes a
-        new connection, a serial port is unplugged."""
+        """Break at the next poll: UDP continues from another port, TCP closes and accepts a new
+        connection, a serial port is unplugged."""
         self.has_failed = True
 
     def descriptors(self) -> list[int]:
-        """Those that turn readable when there is something to receive."""
+        """Return the descriptors that become readable when there is something to receive."""
         return []
 
     @abstractmethod
     def receive(self) -> list[bytes]:
-        """Data from the bridge; never waits."""
+        """Return data from the bridge without waiting."""
 
     @abstractmethod
     def send(self, packet: bytes) -> None:
-        """Send to the bridge; dropped where that cannot be now."""
+        """Send to the bridge; drop the packet if that is not possible now."""
 
     @abstractmethod
     def close(self) -> None: ...
 
 
 class UdpCarrier(Carrier):
-    """The bridge listens; its packets go back to whom it has heard."""
+    """UDP link: the bridge listens, and answers the address that it has received from."""
 
     is_stream = False
 
@@ -188,7 +188,7 @@ class UdpCarrier(Carrier):
 
 
 class TcpCarrier(Carrier):
-    """The bridge connects; the newest connection counts."""
+    """TCP link: the bridge connects; the newest connection counts."""
 
     def __init__(self) -> None:
         self._server = socket.create_server((LOOPBACK, 0))
@@ -238,9 +238,9 @@ class TcpCarrier(Carrier):
 
 
 class SerialCarrier(Carrier):
-    """A pseudo-terminal, both ways at the pace of a serial port.
+    """A pseudo-terminal that carries both directions at the pace of a serial port.
 
-    The kernel keeps 4,095 bytes for the reader and some 16 kB behind them; a real port has a ring
+    The kernel buffers 4,095 bytes for the reader and some 16 kB behind them; a real port has a ring
     of 4,096.
     """
 
@@ -254,13 +254,13 @@ class SerialCarrier(Carrier):
         os.set_blocking(self._ours, False)
         super().__init__(f"{os.ttyname(self._theirs)},{baud}")
         self.is_read = True
-        """The vehicle's end reads; may be changed by any thread."""
+        """True while the vehicle's end reads; can be changed by any thread."""
         self._unsent = bytearray()
         self._looked_ns = clock.now_ns()
         self._is_gone = False
 
     def receive(self) -> list[bytes]:
-        """As many bytes as have come over the wire since the last look."""
+        """Return as many bytes as the wire has carried since the last call."""
         if self.has_failed:
             self.close()
         now_ns = self._clock.now_ns()

@@ -1,4 +1,4 @@
-"""Processes of a flight, found and watched from outside, and what they leave behind."""
+"""Processes of a flight, found and watched from outside, and their leftovers."""
 
 import os
 import select
@@ -12,15 +12,15 @@ from sitl.clock import Clock
 
 MEMORY = Path("/dev/shm")
 LEFT_WAIT_S, LEFT_POLL_S = 10.0, 0.1
-"""A recorder's writer ends after the processes that fed it."""
+"""A recorder's writer ends after the processes that feed it."""
 
 
 class StageError(Exception):
-    """A flight did not get as far as its fault, or did not end."""
+    """A flight did not reach its fault, or did not end."""
 
 
 class Process:
-    """A process of which nobody here is the parent, such as the guard of a killed bridge."""
+    """Process that is not a child of this one, such as the guard of a killed bridge."""
 
     def __init__(self, pid: int, clock: Clock) -> None:
         self.pid = pid
@@ -28,11 +28,11 @@ class Process:
         self._fd = os.pidfd_open(pid)
 
     def has_ended(self, timeout_s: float) -> bool:
-        """Wait for its end; a zombie has ended."""
+        """Wait for its end; return True if it has ended. A zombie has ended."""
         return bool(select.select([self._fd], [], [], timeout_s)[0])
 
     def kill(self, number: signal.Signals) -> int:
-        """Send a signal; returns the moment."""
+        """Send a signal; return the time."""
         at_ns = self._clock.now_ns()
         with suppress(ProcessLookupError):
             signal.pidfd_send_signal(self._fd, number)
@@ -42,19 +42,19 @@ class Process:
         return int(status_of(self.pid)["VmHWM"].split()[0]) / 1024
 
     def close(self) -> None:
-        """End it if it still runs."""
+        """Kill it if it still runs."""
         self.kill(signal.SIGKILL)
         os.close(self._fd)
 
 
 def status_of(pid: int) -> dict[str, str]:
-    """/proc/PID/status by its keys."""
+    """Parse /proc/PID/status."""
     lines = Path(f"/proc/{pid}/status").read_text().splitlines()
     return dict(line.split(":", 1) for line in lines if ":" in line)
 
 
 def processes_with(variable: str) -> list[tuple[int, str]]:
-    """Id and command of each running process that began with this ``NAME=value`` around it."""
+    """Return id and command of each running process started with ``NAME=value`` set."""
     found = []
     for entry in Path("/proc").glob("[0-9]*"):
         with suppress(OSError):
@@ -65,14 +65,14 @@ def processes_with(variable: str) -> list[tuple[int, str]]:
 
 
 def mapped_memory(pid: int) -> set[str]:
-    """Names in ``MEMORY`` that a process has mapped, also those that are removed already."""
+    """Return the names in ``MEMORY`` that a process has mapped, including names already removed."""
     maps = Path(f"/proc/{pid}/maps").read_text().splitlines()
     paths = [Path(line.split()[5]) for line in maps if f" {MEMORY}/" in line]
     return {path.name for path in paths}
 
 
 def child_of(parent_pid: int, text: bytes) -> int:
-    """The child process whose command line contains a text."""
+    """Return the child process whose command line contains a text."""
     for entry in Path("/proc").glob("[0-9]*"):
         try:
             parent = int((entry / "stat").read_text().rpartition(")")[2].split()[1])
@@ -85,7 +85,7 @@ def child_of(parent_pid: int, text: bytes) -> int:
 
 
 def thread_names() -> frozenset[str]:
-    """Threads of this process now."""
+    """Return the names of this process's threads."""
     return frozenset(thread.name for thread in threading.enumerate())
 
 
@@ -95,9 +95,9 @@ def leaks(
     temporary: Path,
     threads_before: Set[str],
 ) -> list[str]:
-    """Name the processes, shared memory, files and threads that a flight has left behind.
+    """Return the processes, shared memory, files and threads that a flight has left behind.
 
-    Waits up to ``LEFT_WAIT_S`` for what is still ending.
+    Waits up to ``LEFT_WAIT_S`` for those that are still ending.
     """
     pause, left = threading.Event(), [""]
     for _ in range(1 + round(LEFT_WAIT_S / LEFT_POLL_S)):

@@ -1,4 +1,4 @@
-"""Surroundings of the bridge: a camera without a renderer, a transmitter, a viewer, a watch."""
+"""Environment of the bridge: a camera without a renderer, a transmitter, a viewer, a watch."""
 
 import os
 import socket
@@ -17,7 +17,7 @@ from sitl.camera.shm import FramePublisher
 from sitl.clock import NS_PER_MS, Clock
 
 SIDE = 32
-"""Pixels of a side, as the policies of the catalogue take them."""
+"""Side of the square images [px], as required by the policies of the catalogue."""
 OTHER_SIDE = 48
 FRAME_PERIOD_S, WATCH_PERIOD_S = 1 / 30, 0.005
 JOIN_S = 5.0
@@ -28,12 +28,12 @@ SILENT = ("gone", "closed", "garbage", "cut")
 LATE_NS = 500 * NS_PER_MS
 CHANNELS = 8
 SWITCH_ON_US = 2000
-"""Channels above the mode switch (5), at the start."""
+"""Initial value of the channels above the mode switch (5)."""
 VIEWER_START_S, VIEWER_POLL_S = 15.0, 0.1
 
 
 class Worker:
-    """A thread that runs ``_run`` while the context lasts."""
+    """Thread that runs ``_run`` while the context lasts."""
 
     def __init__(self, name: str) -> None:
         self._stop = threading.Event()
@@ -52,7 +52,7 @@ class Worker:
 
 
 class FrameFeed(Worker):
-    """Publishes noise at 30 Hz, or something that is wrong."""
+    """Publishes noise at 30 Hz, or faulty images."""
 
     def __init__(self, name: str, clock: Clock) -> None:
         super().__init__("frame-feed")
@@ -61,13 +61,13 @@ class FrameFeed(Worker):
         self._fault: ImageFault = "none"
 
     def show(self, fault: ImageFault) -> int:
-        """Show something else from the next frame on; returns the moment.
+        """Publish this fault from the next frame on; return the time.
 
         ``gone``: nothing, as after the death of the writer; ``frozen``, ``black``: the same image
-        again and again; ``late``: stamps half a second old; ``torn``: frames that never become
-        whole; ``resized``: another writer with larger images takes the name over; ``closed``: the
-        writer ends in order; ``garbage``: a file that holds no images takes the name over; ``cut``:
-        the file is cut to nothing under its readers.
+        repeatedly; ``late``: stamps half a second old; ``torn``: frames that never become complete;
+        ``resized``: another writer with larger images takes the name over; ``closed``: the writer
+        ends in order; ``garbage``: a file without images takes the name over; ``cut``: the file is
+        truncated to zero under its readers.
         """
         self._fault = fault
         return self._clock.now_ns()
@@ -102,13 +102,13 @@ class FrameFeed(Worker):
             stamp_ns = self._clock.now_ns() - (LATE_NS if fault == "late" else 0)
             publisher.publish(image, stamp_ns, is_whole=fault != "torn")
         if done == "cut":
-            os.truncate(path, size_bytes)  # to be written once more, by ``close``
+            os.truncate(path, size_bytes)  # ``close`` writes it again
         publisher.close()
         path.unlink(missing_ok=True)
 
 
 class StallWatch(Worker):
-    """Wakes every 5 ms and keeps its worst lateness: that of this computer, not of the bridge."""
+    """Wakes every 5 ms and keeps its worst lateness, which is that of this computer."""
 
     def __init__(self) -> None:
         super().__init__("stall-watch")
@@ -125,10 +125,10 @@ class StallWatch(Worker):
 
 
 class Transmitter:
-    """The pilot's eight channels, sent to ``--rc-in``; they stay until they are moved."""
+    """The pilot's eight channels, sent to ``--rc-in``; each keeps its value until it is moved."""
 
     def __init__(self, port: int, receiver: Receiver) -> None:
-        """``receiver`` says where its throttle rests."""
+        """``receiver`` gives the rest position of the throttle."""
         self.flags = ("--rc-in", str(port))
         """Flags of the simulated vehicle."""
         self._address = ("127.0.0.1", port)
@@ -144,7 +144,7 @@ class Transmitter:
         self._send(self._channels_us)
 
     def switch_off(self) -> None:
-        """The receiver hears nothing any more."""
+        """Stop the signal: the receiver hears nothing any more."""
         self._send([0] * CHANNELS)
 
     def _send(self, values_us: list[int]) -> None:
@@ -153,7 +153,7 @@ class Transmitter:
 
 
 class Viewer:
-    """Rerun's own program without a window, on loopback while the context lasts."""
+    """Rerun's own program without a window, on loopback, while the context lasts."""
 
     def __init__(self) -> None:
         spec = find_spec("rerun_cli")
@@ -169,7 +169,7 @@ class Viewer:
             stderr=subprocess.DEVNULL,
         )
         self.target = f"connect=rerun+http://127.0.0.1:{self._port}/proxy"
-        """For ``--rerun``."""
+        """Value for ``--rerun``."""
 
     def __enter__(self) -> "Viewer":
         pause = threading.Event()

@@ -1,4 +1,4 @@
-"""Judge a fault at a known time by the vehicle's report (docs/formats.md)."""
+"""Judges a fault at a known time by the vehicle's report (docs/formats.md)."""
 
 from collections.abc import Sequence
 from itertools import takewhile
@@ -8,11 +8,11 @@ Receiver = Literal["idle", "mid", "none"]
 Four = tuple[int, int, int, int]
 NEUTRAL_US: Four = (1500, 1500, 1500, 1500)
 RECEIVER_US: dict[Receiver, Four] = {"idle": (1500, 1500, 1000, 1500), "mid": NEUTRAL_US}
-"""Sticks of a receiver by its flag; ``none`` has no sticks."""
+"""Sticks of a receiver by its flag; a receiver ``none`` has no sticks."""
 DITHER_US = 8
-"""Most by which the bridge moves a channel to see whether the vehicle hears it: two steps of 4."""
+"""Largest movement of a channel by the bridge's echo check: two steps of 4 us."""
 LANDINGS = ("LAND", "RTL", "AUTO.LAND", "AUTO.RTL")
-"""Modes in which a vehicle goes down by its own will."""
+"""Modes in which a vehicle descends autonomously."""
 
 
 class StickEntry(TypedDict):
@@ -33,7 +33,7 @@ class FinalState(TypedDict):
 
 
 class VehicleReport(TypedDict):
-    """The keys of the report that judge a fault."""
+    """Keys of the report that are used to judge a fault."""
 
     start_ns: int
     sticks: Sequence[StickEntry]
@@ -49,34 +49,34 @@ class Aftermath(NamedTuple):
     """Reaction of the vehicle to a fault."""
 
     safe_ms: float
-    """Until the first entry with safe sticks or another mode."""
+    """Time until the first entry with safe sticks or another mode."""
     final_safe_ms: float
-    """The same, but from then on all entries are safe."""
+    """Time from which all entries are safe."""
     mode: str | None
-    """The first other mode than that of the flight; None: it stayed."""
+    """First mode that differs from that of the flight; None: the mode did not change."""
     mode_s: float | None
-    """When it came."""
+    """Time of that mode change."""
     most_lean_deg: float
 
     @property
     def flew_again(self) -> bool:
-        """The policy's sticks came back."""
+        """True if the policy's sticks came back."""
         return self.final_safe_ms > self.safe_ms
 
 
 class Ending(NamedTuple):
-    """Flight after the policy had lost the sticks, until a pilot took over."""
+    """Flight from the policy's loss of the sticks to a pilot's takeover."""
 
     mode: str
-    """The last."""
+    """Last mode."""
     lost_m: float
-    """Height, from where the policy lost the sticks to the lowest point before a landing."""
+    """Height lost, from the policy's loss of the sticks to the lowest point before a landing."""
     impact_mps: float
     """Speed of the hardest touchdown of the flight; 0.0: it never touched the ground again."""
 
 
 class NoVerdictError(Exception):
-    """The vehicle's record does not show what a verdict needs."""
+    """The vehicle's record lacks data that a verdict needs."""
 
 
 def aftermath(
@@ -88,10 +88,10 @@ def aftermath(
 ) -> Aftermath:
     """Read the sticks of a vehicle that flew in ``mode`` under the policy at ``at_ns``.
 
-    ``others_us`` are four sticks of somebody else, which are safe as well.
+    ``others_us`` are four sticks of another source, which count as safe, too.
 
     Raises:
-        NoVerdictError: it did not fly then, or was never safe after it.
+        NoVerdictError: it did not fly then, or was never safe afterwards.
     """
     how = (receiver, mode, others_us)
     fault_s = (at_ns - report["start_ns"]) / 1e9
@@ -118,7 +118,7 @@ def aftermath(
 
 
 def ending(report: VehicleReport, since_s: float, until_s: float) -> Ending:
-    """Read the end of a flight between two moments on the report's clock."""
+    """Read the end of a flight between two times on the report's clock."""
     entries = [entry for entry in report["sticks"] if since_s <= entry["t_s"] < until_s]
     held = list(takewhile(lambda entry: entry["mode"] not in LANDINGS, entries))
     heights_m = [entry["height_m"] for entry in held] or [0.0]
@@ -132,7 +132,7 @@ def ending(report: VehicleReport, since_s: float, until_s: float) -> Ending:
 def is_safe(
     entry: StickEntry, receiver: Receiver, mode: str, others_us: tuple[int, ...] = ()
 ) -> bool:
-    """Neutral sticks, the receiver's, somebody else's, out of the flight's mode, or disarmed."""
+    """True for neutral sticks, the receiver's or another's, another mode, or disarmed."""
     allowed = {NEUTRAL_US, RECEIVER_US.get(receiver, NEUTRAL_US), others_us or NEUTRAL_US}
     is_stick = any(
         all(abs(a - b) <= DITHER_US for a, b in zip(entry["us"], us, strict=True)) for us in allowed

@@ -1,4 +1,4 @@
-"""A relay on loopback between the vehicle and the bridge: it records, and it breaks the link."""
+"""Relay on loopback between the vehicle and the bridge, which records and breaks the link."""
 
 import math
 import select
@@ -18,7 +18,7 @@ from sitl.clock import NS_PER_S, Clock
 Message = Any  # a pymavlink message (the library has no types)
 FOREVER_NS = 1 << 62
 PILOTS_STATION = 42
-"""System id of another ground station than the bridge's 255."""
+"""System id of a ground station other than the bridge, which has 255."""
 BRIDGE = 255
 VEHICLE = (1, 1)
 COPTER_MODES = {"STABILIZE": 0, "ALT_HOLD": 2, "LOITER": 5, "RTL": 6, "LAND": 9, "BRAKE": 17}
@@ -32,10 +32,10 @@ PX4_MODES = {
 }
 """Main mode and sub-mode of PX4's ``custom_mode``, as MAV_CMD_DO_SET_MODE takes them."""
 FORCE = 21196
-"""MAV_CMD_COMPONENT_ARM_DISARM disarms in the air with this."""
+"""Parameter with which MAV_CMD_COMPONENT_ARM_DISARM disarms in the air."""
 JOIN_S = 5.0
 UNREADABLE = ("BAD_DATA", "UNKNOWN")
-"""Types of what pymavlink's dialect does not have, such as PX4's CURRENT_MODE and EVENT."""
+"""Types of messages that pymavlink's dialect lacks, such as PX4's CURRENT_MODE and EVENT."""
 IGNORED_US = 65535
 NEUTRAL_Z = 500
 Rewrite = Callable[[Message], bool]
@@ -43,7 +43,7 @@ Rewrite = Callable[[Message], bool]
 
 
 class Override(NamedTuple):
-    """The first four channels of one RC_CHANNELS_OVERRIDE, in us."""
+    """The first four channels of one RC_CHANNELS_OVERRIDE [us]."""
 
     roll: int
     pitch: int
@@ -52,7 +52,7 @@ class Override(NamedTuple):
 
 
 class Sent(NamedTuple):
-    """A message of the bridge as it came to the relay, before any fault."""
+    """A message of the bridge on arrival at the relay, before any fault."""
 
     at_ns: int
     message: Message
@@ -63,7 +63,7 @@ class Sent(NamedTuple):
 
     @property
     def is_command(self) -> bool:
-        """Sticks of the policy, or neutral; no release."""
+        """True for sticks of the policy or neutral ones; False for a release."""
         return self.override is not None and any(self.override)
 
     @property
@@ -75,12 +75,12 @@ class Sent(NamedTuple):
 
     @property
     def holds(self) -> bool:
-        """Sticks of anything, also neutral ones; no release."""
+        """True for sticks in any message, also neutral ones; False for a release."""
         return self.is_command or self.name == "MANUAL_CONTROL"
 
     @property
     def override(self) -> Override | None:
-        """The sticks of an RC_CHANNELS_OVERRIDE."""
+        """Sticks of an RC_CHANNELS_OVERRIDE, or None."""
         if self.name != "RC_CHANNELS_OVERRIDE":
             return None
         return Override(*(getattr(self.message, f"chan{k}_raw") for k in range(1, 5)))
@@ -92,14 +92,14 @@ class Sent(NamedTuple):
 
     @property
     def climbs(self) -> bool:
-        """The throttle is above the middle, as only a policy's is."""
+        """True if the throttle is above the middle, as only a policy's is."""
         if (sticks := self.override) is not None:
             return NEUTRAL_US[2] < sticks.throttle < IGNORED_US
         return self.name == "MANUAL_CONTROL" and self.message.z > NEUTRAL_Z
 
     @property
     def leans(self) -> bool:
-        """Steers to a side, ahead or around, as only a policy does."""
+        """True if it steers sideways, forward or around, as only a policy does."""
         if (sticks := self.override) is not None:
             turned = (sticks.roll, sticks.pitch, sticks.yaw)
             return any(us not in (0, IGNORED_US) and abs(us - 1500) > DITHER_US for us in turned)
@@ -107,7 +107,7 @@ class Sent(NamedTuple):
 
     @property
     def is_within_limits(self) -> bool:
-        """No stick beyond what the message's definition, or a transmitter, has."""
+        """True if no stick exceeds the limits of its message or of a transmitter."""
         if (sticks := self.override) is not None:
             return all(us in (0, IGNORED_US) or 1000 <= us <= 2000 for us in sticks)
         if self.name == "MANUAL_CONTROL":
@@ -120,7 +120,7 @@ class Sent(NamedTuple):
 
 
 class _Way:
-    """One direction; later faults do not affect packets that are under way."""
+    """One direction of the link. New faults do not affect packets in flight."""
 
     def __init__(self) -> None:
         self._seeds = count()
@@ -141,7 +141,7 @@ class _Way:
 
 
 class Relay:
-    """Passes packets between the vehicle and the bridge, and keeps what the bridge sends."""
+    """Passes packets between the vehicle and the bridge, and keeps the bridge's messages."""
 
     def __init__(self, carrier: Carrier, clock: Clock) -> None:
         """``carrier`` leads to the bridge; the relay closes it."""
@@ -164,7 +164,7 @@ class Relay:
         self.overrides: list[Override] = []
         self.has_flown = threading.Event()
         self.has_heard = threading.Event()
-        """The vehicle has sent something: it can be sent to."""
+        """Set once the vehicle has sent something, so that its address is known."""
         self.port: int = self._socket.getsockname()[1]
 
     def __enter__(self) -> "Relay":
@@ -178,7 +178,7 @@ class Relay:
         self.carrier.close()
 
     def forget(self) -> int:
-        """Forget the flight so far: another one begins. Returns how many overrides it had."""
+        """Forget the flight so far, because another begins. Return the number of its overrides."""
         with self._news:
             count = len(self.overrides)
             self.sent.clear()
@@ -187,19 +187,19 @@ class Relay:
             return count
 
     def newest_steering(self, rows: int) -> list[Sent]:
-        """The newest messages of sticks, at most so many, newest last."""
+        """Return up to ``rows`` of the newest messages of sticks, newest last."""
         newest = islice((sent for sent in reversed(self.sent) if sent.steers), rows)
         return list(newest)[::-1]
 
     def is_leaning(self, rows: int) -> bool:
-        """As many messages of sticks lean, in a row, up to now."""
+        """True if the newest ``rows`` messages of sticks all lean."""
         steering = self.newest_steering(rows)
         return len(steering) == rows and all(sent.leans for sent in steering)
 
     def impair(
         self, *, to_vehicle: LinkFaults | None = None, to_bridge: LinkFaults | None = None
     ) -> int:
-        """Change the link from now on; returns the moment. None leaves a direction as it is."""
+        """Change the link from now on; return the time. None leaves a direction unchanged."""
         at_ns = self._clock.now_ns()
         if to_vehicle is not None:
             self._to_vehicle.impair(to_vehicle)
@@ -208,17 +208,17 @@ class Relay:
         return at_ns
 
     def rewrite(self, change: Rewrite) -> int:
-        """Let every message of the vehicle pass through ``change`` too; returns the moment."""
+        """Also pass every message of the vehicle through ``change``; return the time."""
         self._rewrites = (*self._rewrites, change)
         return self._clock.now_ns()
 
     def rewrite_nothing(self) -> int:
-        """Let the vehicle's messages pass as they are again; returns the moment."""
+        """Pass the vehicle's messages unchanged again; return the time."""
         self._rewrites = ()
         return self._clock.now_ns()
 
     def inject(self, message: Message, station: Message = None) -> int:
-        """Send a message to the vehicle as another ground station; returns the moment."""
+        """Send a message to the vehicle as another ground station; return the time."""
         if self._vehicle is None:
             raise ValueError("the vehicle has not been heard yet")
         at_ns = self._clock.now_ns()
@@ -226,7 +226,7 @@ class Relay:
         return at_ns
 
     def move_joystick(self, sticks: Override, *, is_manual: bool = False) -> int:
-        """Another program sends sticks with the bridge's own system id; returns the moment.
+        """Send sticks of another program with the bridge's own system id; return the time.
 
         ``is_manual``: as MANUAL_CONTROL, which PX4 takes, instead of overrides.
         """
@@ -240,7 +240,7 @@ class Relay:
         return self.inject(message, self._joystick)
 
     def command(self, number: int, *params: float) -> int:
-        """Send a command to the vehicle as another ground station; returns the moment."""
+        """Send a command to the vehicle as another ground station; return the time."""
         padded = (*params, *[0.0] * (7 - len(params)))
         return self.inject(dialect.MAVLink_command_long_message(*VEHICLE, number, 0, *padded))
 
@@ -252,7 +252,7 @@ class Relay:
         return self.command(dialect.MAV_CMD_COMPONENT_ARM_DISARM, 1)
 
     def disarm(self) -> int:
-        """The pilot stops the motors at another station, in the air too."""
+        """Stop the motors as a pilot at another station, even in the air."""
         return self.command(dialect.MAV_CMD_COMPONENT_ARM_DISARM, 0, FORCE)
 
     def wait_until(self, condition: Callable[[], bool], timeout_s: float = 60.0) -> bool:
@@ -276,7 +276,7 @@ class Relay:
                 self._record(messages, now_ns)
 
     def _take_bridges(self, now_ns: int) -> list[Message]:
-        """Put what the bridge has sent on the way to the vehicle; a stream's as whole packets."""
+        """Pass the bridge's data on to the vehicle; those of a stream as complete packets."""
         taken: list[Message] = []
         for data in self.carrier.receive():
             messages = self._mav.parse_buffer(data) or []
@@ -336,6 +336,6 @@ def _parser(system: int) -> Message:
 
 
 def set_fields(message: Message, **values: float) -> None:
-    """Change fields of a received message, so that packing it again sends them."""
+    """Change fields of a received message, so that packing it again sends the new values."""
     for name, value in values.items():
         setattr(message, name, value if math.isnan(value) else type(getattr(message, name))(value))

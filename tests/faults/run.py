@@ -1,4 +1,4 @@
-"""Fly a scenario by real processes, and judge it by the vehicle's own record."""
+"""Flies a scenario with real processes, and judges it by the vehicle's own record."""
 
 import os
 import signal
@@ -17,19 +17,19 @@ from sitl.clock import Clock
 
 FLY = ("--dual-rate", "--arm")
 SETTLE_S = 1.0
-"""After the last step: what must not come back has time to."""
+"""Time after the last step in which nothing must come back."""
 END_S = 20.0
 FLY_ON_S = 10.0
-"""The vehicle's own flight after the end, by which the end is judged."""
+"""Time of the vehicle's own flight after the end, by which the end is judged."""
 MOST_STALL_MS = 30.0
-"""A computer that stood still for longer during a run proves nothing about its times."""
+"""A longer stall of the computer during a run invalidates the run's times."""
 RUNS = 3
 
 
 def fly_scenario(scenario: Scenario, variant: Variant, *, slack_ms: float = 0.0) -> Verdict:
-    """Fly a scenario, and judge it; on a computer that stood still meanwhile, up to ``RUNS`` times.
+    """Fly and judge a scenario; up to ``RUNS`` times if the computer stalls meanwhile.
 
-    ``slack_ms`` is added to the limits, for a computer that others use.
+    ``slack_ms`` is added to the limits, for a computer shared with others.
     """
     for run in range(1, RUNS + 1):
         verdict = Verdict(scenario=scenario.name, variant=variant, runs=run)
@@ -82,7 +82,7 @@ def _carrier(scenario: Scenario) -> Carrier | None:
 
 
 def _equip(stage: Stage, scenario: Scenario, stack: ExitStack) -> tuple[str, ...]:
-    """Give a flight the variables and the viewer that it names; returns its flags."""
+    """Give a flight the variables and the viewer that it requires; return its flags."""
     path = os.environ.get("PYTHONPATH", "")
     stage.variables = {
         name: value.format(folder=stage.folder, catalogue=CATALOGUE, path=path)
@@ -95,7 +95,7 @@ def _equip(stage: Stage, scenario: Scenario, stack: ExitStack) -> tuple[str, ...
 
 
 def _prepare(scenario: Scenario, stage: Stage) -> None:
-    """Bring the vehicle into the state in which the bridge shall find it."""
+    """Bring the vehicle into its state before the start of the bridge."""
     if stage.transmitter is not None:
         stage.transmitter.switch_on()
     for step in scenario.before:
@@ -112,7 +112,7 @@ def _perform(scenario: Scenario, stage: Stage) -> int:
 
 
 def _end(scenario: Scenario, stage: Stage, verdict: Verdict) -> None:
-    """Let everything end; take a guard over that holds the vehicle for want of a receiver."""
+    """End everything; take over from a guard that holds the vehicle for lack of a receiver."""
     guard = stage.guard
     stage.kill_group(signal.SIGCONT)
     verdict.ended_ns = stage.kill_group(signal.SIGINT)

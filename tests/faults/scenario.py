@@ -1,4 +1,4 @@
-"""The catalogue: scenarios in TOML, each a fault with what must come of it."""
+"""The catalogue: scenarios in TOML, each a fault and its required outcome."""
 
 import tomllib
 from collections.abc import Iterator
@@ -14,62 +14,62 @@ from sitl import UsageError
 from sitl.vehicle.config import AutopilotName
 
 Outcome = Literal["loses", "keeps", "either", "refused"]
-"""The policy loses the sticks until the next explicit act, keeps them, either of these as chance
-has it, or never gets them."""
+"""The policy loses the sticks until the next explicit act, keeps them, does either by chance, or
+never gets them."""
 EXITS: dict[Outcome, list[int]] = {"loses": [4], "keeps": [0], "either": [0, 4], "refused": [2]}
 
 
 @dataclass(frozen=True, kw_only=True)
 class Scenario:
-    """A fault, how to bring it about, and what must come of it."""
+    """A fault, the steps to cause it, and its required outcome."""
 
     name: str
     group: str
-    """Its file: link, vehicle, host, images or policy."""
+    """Name of its file: link, vehicle, host, images or policy."""
     what: str
-    """One line for a reader."""
+    """Description in one line."""
     steps: tuple[Step, ...]
-    """The first that returns a moment is the fault."""
+    """The first step that returns a time is the fault."""
     before: tuple[Step, ...] = ()
-    """Carried out on the vehicle before the bridge starts."""
+    """Steps performed on the vehicle before the bridge starts."""
     outcome: Outcome
     limit_ms: float = 0.0
-    """From the fault until the vehicle is safe by its own record; only for ``loses``. A fault that
-    can be known only after a while has that while in it."""
+    """Limit from the fault until the vehicle is safe by its own record; only for ``loses``. It
+    includes the time until the fault can be detected."""
     stick_limit_ms: float = 0.0
-    """From the fault until the last stick of the policy leaves the bridge; 0: ``limit_ms``."""
+    """Limit from the fault until the policy's last stick leaves the bridge; 0: ``limit_ms``."""
     exit: list[int] = field(default_factory=list)
     """Allowed exit statuses of the flight process; a signal is negative. Empty: by the outcome."""
     code: str = ""
     """``Code`` of a reason, in the bridge's report, for which the policy lost the sticks."""
     says: str = ""
-    """The bridge prints this, where no reason tells it: a warning, refusal or foreign error."""
+    """Text that the bridge prints if no reason tells: a warning, refusal or foreign error."""
     modes: list[str] = field(default_factory=list)
-    """Allowed first mode after the fault; empty: any, also none."""
+    """Allowed first mode after the fault; empty: any or none."""
     receivers: list[Receiver] = field(default_factory=list)
-    """Empty: mid and none, and idle where the policy loses the sticks and the bridge ends it."""
+    """Empty: mid and none, and also idle if the policy loses the sticks and the bridge ends it."""
     autopilots: list[AutopilotName] = field(default_factory=lambda: ["ardupilot", "px4"])
     others_us: list[int] = field(default_factory=list)
-    """Four sticks of somebody else, who may share the vehicle with the policy until the limit."""
+    """Four sticks of another source that can share the vehicle with the policy until the limit."""
     is_silent: bool = False
-    """A takeover: no request for a mode may follow, and beyond the limit no stick of any kind."""
+    """True for a takeover: then no mode request, and beyond the limit no stick of any kind."""
     judges_end: bool = True
-    """The vehicle must hold its height or land after the end, unless it was a takeover."""
+    """True if the vehicle must hold its height or land after the end, unless it was a takeover."""
     releases: bool = True
-    """The bridge can still give an ArduPilot with a receiver its sticks back."""
+    """True if the bridge can still give an ArduPilot with a receiver its sticks back."""
     transmitter: bool = False
-    """The pilot has one, which steps can move; its switches are on at the start."""
+    """True if the pilot has a transmitter that steps can move; its switches are initially on."""
     carrier: Literal["udp", "tcp", "serial"] = "udp"
-    """The bridge's link."""
+    """Link of the bridge."""
     baud: int = 115_200
     policy: str = "Leaning"
-    """Class in ``catalogue/policies.py``."""
+    """Name of a class in ``catalogue/policies.py``."""
     flags: list[str] = field(default_factory=list)
-    """More flags of the bridge; ``{folder}`` is a folder for the files of this run, ``{viewer}`` a
-    viewer's address for ``--rerun``."""
+    """Additional flags of the bridge. ``{folder}`` is a folder for the files of this run,
+    ``{viewer}`` a viewer's address for ``--rerun``."""
     environment: dict[str, str] = field(default_factory=dict)
-    """More variables for the bridge; ``{folder}`` as above, ``{catalogue}`` that of the scenarios,
-    ``{path}`` the PYTHONPATH so far."""
+    """Additional variables for the bridge. ``{folder}`` is a folder for the files of this run,
+    ``{catalogue}`` that of the scenarios, ``{path}`` the PYTHONPATH so far."""
     untested: str = ""
     """Why the tests leave it out; empty: they fly it."""
 
@@ -83,7 +83,7 @@ class Scenario:
 
     @property
     def variants(self) -> "list[Variant]":
-        """Vehicles that it is flown with; PX4 has a receiver only where one is wanted alone."""
+        """Vehicles of this scenario; PX4 has a receiver only if ``none`` is not requested."""
         receivers: list[Receiver] = self.receivers or ["mid", "none"]
         if not self.receivers and self.outcome == "loses" and not self.is_silent:
             receivers = ["mid", "idle", "none"]
@@ -97,7 +97,7 @@ class Scenario:
 
 @dataclass(frozen=True, kw_only=True)
 class Variant:
-    """The vehicle of one run."""
+    """Vehicle of one run."""
 
     autopilot: AutopilotName
     receiver: Receiver
@@ -109,12 +109,12 @@ class Variant:
 
     @property
     def mode(self) -> str:
-        """The mode in which the policy's sticks fly."""
+        """Mode in which the policy's sticks fly."""
         return "ALT_HOLD" if self.autopilot == "ardupilot" else "ALTCTL"
 
 
 def load_catalogue(folder: Path = CATALOGUE) -> dict[str, Scenario]:
-    """Every scenario by its name, in the order of the files; raises UsageError if one is wrong."""
+    """Return all scenarios by name, in the order of the files; raise UsageError if invalid."""
     files = sorted(folder.glob("*.toml"))
     return {scenario.name: scenario for path in files for scenario in _read(path)}
 

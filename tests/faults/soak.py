@@ -1,4 +1,4 @@
-"""One long flight with a fault every few seconds: what grows, and what is lost."""
+"""One long flight with a fault every few seconds, to find growth and losses."""
 
 import json
 import random
@@ -19,17 +19,17 @@ from sitl.clock import NS_PER_S
 
 POLICY = "Wandering"
 SWITCH, LOW_US, HIGH_US = 7, 1000, 2000
-"""Channel of the engage switch, and its ends."""
+"""Channel of the engage switch, and its end positions."""
 REST_S = 2.5
-"""The switch stays low for so long: it must rest for 1.8 s before going high is an act."""
+"""Time for which the switch stays low: going high counts as an act only after 1.8 s of rest."""
 SETTLE_S = 1.5
-"""From the end of a fault until the policy must have lost the sticks."""
+"""Time from the end of a fault until the policy must have lost the sticks."""
 QUIET_NS = NS_PER_S // 2
-"""Until the end of that nothing that leans may have left the bridge."""
+"""Last part of ``SETTLE_S``, in which no leaning stick is allowed to leave the bridge."""
 LEANING_ROWS = 50
-"""Messages of sticks that lean, in a row: the policy has the sticks."""
+"""Consecutive messages of leaning sticks that show that the policy has the sticks."""
 SETTLED = 0.3
-"""Part of a soak after which everything that is needed has been loaded and allocated."""
+"""Share of a soak after which everything needed has been loaded and allocated."""
 
 
 class Usage(NamedTuple):
@@ -44,18 +44,18 @@ MOST_GROWTH = {
     "flight": Usage(rss_mb=40.0, descriptors=2, threads=0),
     "guard": Usage(rss_mb=4.0, descriptors=1, threads=0),
 }
-"""Growth of a process that is no leak yet: allocators keep what they once had."""
+"""Growth of a process that is not yet a leak: allocators keep freed memory."""
 REPORT_EVERY = 20
 ENGAGE_S = 10.0
 ENGAGE_TRIES = 6
 
 
 class Fault(NamedTuple):
-    """A fault from which the pilot's switch gets the policy back."""
+    """A fault after which the pilot's switch can engage the policy again."""
 
     steps: tuple[dict[str, object], ...]
     loses: bool = True
-    """The policy must lose the sticks; else it must keep them."""
+    """True if the policy must lose the sticks, False if it must keep them."""
 
 
 def _wait(s: float) -> dict[str, object]:
@@ -101,7 +101,7 @@ class SoakResult:
 
     minutes: float
     faults: dict[str, int] = field(default_factory=dict)
-    """How often each came."""
+    """Number of faults by name."""
     sent: int = 0
     """Overrides and releases that left the bridge."""
     growth: dict[str, Usage] = field(default_factory=dict)
@@ -114,7 +114,7 @@ class SoakResult:
 def soak(minutes: float, seed: int, folder: Path, report: Callable[[str], None]) -> SoakResult:
     """Fly for some minutes, with a random fault every few seconds, in an order given by the seed.
 
-    ``folder`` is empty and gets the recording; ``report`` is given a line now and then.
+    ``folder`` is empty and gets the recording; ``report`` is called with a line now and then.
     """
     result = SoakResult(minutes=minutes)
     transmitter = Transmitter(free_port(), "mid")
@@ -155,7 +155,7 @@ def _fly(
     chance: random.Random,
     report: Callable[[str], None],
 ) -> dict[str, list[Usage]]:
-    """Break the flight again and again; what the two processes held after each time."""
+    """Break the flight repeatedly; return the usage of both processes after each fault."""
     pids = {"flight": stage.bridge_pid, "guard": stage.guard.pid}
     usages: dict[str, list[Usage]] = {name: [] for name in pids}
     end_ns = stage.clock.now_ns() + round(minutes * 60 * NS_PER_S)
@@ -171,7 +171,7 @@ def _fly(
         if fault.loses and not has_lost:
             result.failures.append(f"{name}: the policy kept the sticks")
         if has_lost and not fault.loses:
-            result.stalls += 1  # a busy machine, or a loss that lasted: the flight ended in order
+            result.stalls += 1  # a busy machine, or a lasting loss: the flight ended in order
         result.sent += stage.relay.forget()
         if has_lost:
             _engage(stage, transmitter)
@@ -184,7 +184,7 @@ def _fly(
 
 
 def _engage(stage: Stage, transmitter: Transmitter) -> None:
-    """The pilot arms, and turns the switch off and on, as often as a busy machine needs."""
+    """Arm, and turn the switch off and on, repeatedly if the machine is busy."""
     for _ in range(ENGAGE_TRIES):
         transmitter.move(SWITCH, LOW_US)
         stage.relay.set_mode("ALT_HOLD")
@@ -197,7 +197,7 @@ def _engage(stage: Stage, transmitter: Transmitter) -> None:
 
 
 def _lost(recording: Path, result: SoakResult) -> list[str]:
-    """Gaps in the recording, in words."""
+    """Return the gaps in the recording, in words."""
     meta = json.loads((recording / "meta.json").read_text())
     failures = [
         f"{key} is {meta[key]}"
@@ -219,9 +219,9 @@ def read_usage(pid: int) -> Usage:
 
 
 def growth(samples: Sequence[Usage]) -> Usage:
-    """From the first settled sample to the last: the medians of the first and last third after it.
+    """Return the growth between the medians of the first and last third of the settled samples.
 
-    Medians, because a sample may fall into a moment in which a file or a thread is in use.
+    Medians, because a sample can fall into a moment in which a file or a thread is in use.
     """
     settled = samples[round(len(samples) * SETTLED) :]
     third = max(len(settled) // 3, 1)
@@ -231,7 +231,7 @@ def growth(samples: Sequence[Usage]) -> Usage:
 
 
 def make_summary(result: SoakResult) -> str:
-    """The result for a person, a few lines."""
+    """Return the result for a person, in a few lines."""
     lines = [f"{result.minutes:g} minutes, {result.sent} overrides and releases"]
     lines += [f"{count:5d} times {name}" for name, count in sorted(result.faults.items())]
     lines += [

@@ -1,4 +1,4 @@
-"""A flight in real processes: sitl, a recording relay, mavbridge; everything on loopback."""
+"""Flight in real processes on loopback: sitl, a recording relay, mavbridge."""
 
 import json
 import os
@@ -24,16 +24,16 @@ from sitl.clock import NS_PER_MS, Clock
 TIMEOUT_S = 90.0
 STARTS = 3
 LEANING = 100
-"""Steering messages that lean, in a row: the policy holds its lean."""
+"""Consecutive leaning messages of sticks that show that the policy holds its lean."""
 STICKS_OVER_NS = 200 * NS_PER_MS
 """Time without a stick of the policy after which its flight is over."""
 STALLS = frozenset(("computer", "guard", "flight process", "link"))
-"""Places in which a busy machine loses time, of the reasons that name one."""
+"""Places named in reasons at which a busy machine loses time."""
 ORDERLY = (0, 4)
-"""Exit statuses of a flight that ended in order; 4: a busy machine made the guard end it before."""
+"""Exit statuses of a flight that ended in order; 4: a busy machine made the guard end it early."""
 MARK = "FAULT_MARK"
-"""Environment variable: the file into which a policy of the catalogue writes the moment, in ns of
-CLOCK_MONOTONIC, when its fault begins."""
+"""Environment variable with the file into which a policy of the catalogue writes the start of its
+fault, in ns of CLOCK_MONOTONIC."""
 PIPE_BLOCK = 4096
 CATALOGUE = Path(__file__).parent / "catalogue"
 ProcessName = Literal["flight", "guard", "recorder"]
@@ -41,12 +41,12 @@ ProcessName = Literal["flight", "guard", "recorder"]
 
 
 def faulty_policy(name: str) -> str:
-    """A class of ``catalogue/policies.py`` as the bridge takes it, by ``--policy``."""
+    """Return a class of ``catalogue/policies.py`` as a value of ``--policy``."""
     return f"{CATALOGUE / 'policies.py'}:{name}"
 
 
 class Stage:
-    """One bridge against one simulated vehicle."""
+    """One bridge and one simulated vehicle."""
 
     def __init__(self, folder: Path, relay: Relay, shm: str, vehicle: tuple[str, ...]) -> None:
         """``vehicle`` are the flags of the simulated vehicle, which starts at once."""
@@ -56,7 +56,7 @@ class Stage:
         self._shm = shm
         self._vehicle_flags = vehicle
         self.cameras: tuple[str, ...] = ()
-        """Names of the policy's cameras, where it has several: all see the vehicle's."""
+        """Names of the policy's cameras if it has several: all show the vehicle's camera."""
         self._vehicle = self._start_vehicle()
         self._flags: tuple[str, ...] = ()
         self._is_read = True
@@ -66,19 +66,19 @@ class Stage:
         self._reader: threading.Thread | None = None
         self._guard: Process | None = None
         self.camera: FrameFeed | None = None
-        """The camera, where the vehicle has none of its own."""
+        """The camera, if the vehicle has none of its own."""
         self.viewer: Viewer | None = None
         self.variables: dict[str, str] = {}
-        """More of the bridge's environment."""
+        """Additional environment variables of the bridge."""
         self.memory: set[str] = set()
-        """Shared memory that it has had, by name; see ``wait_for_lean``."""
+        """Names of shared memory that the bridge has had; see ``wait_for_lean``."""
         self.temporary = folder / "temporary"
-        """Where it makes temporary files."""
+        """Folder for the bridge's temporary files."""
         self.temporary.mkdir()
         self.transmitter: Transmitter | None = None
-        """The pilot's, where it can be moved."""
+        """The pilot's transmitter, if it can be moved."""
         self.prepare: Callable[[], object] | None = None
-        """Called before each start of the bridge, when the vehicle has been heard."""
+        """Called before each start of the bridge, once the vehicle has been heard."""
 
     @property
     def is_px4(self) -> bool:
@@ -90,7 +90,7 @@ class Stage:
         return subprocess.Popen([*command, *self._vehicle_flags], stderr=subprocess.DEVNULL)
 
     def start(self, *flags: str, is_read: bool = True) -> None:
-        """Start the bridge in a process group of its own; its output is read, or never."""
+        """Start the bridge in its own process group; without ``is_read``, never read its output."""
         self._flags, self._is_read = flags, is_read
         if self.prepare is not None:
             if not self.relay.has_heard.wait(TIMEOUT_S):
@@ -116,7 +116,7 @@ class Stage:
         return [*command, *cameras, "--report", str(report)]
 
     def environment(self) -> dict[str, str]:
-        """Ours, with a terminal of 200 columns and a place for the mark of a policy's fault."""
+        """Return our environment, with 200 columns and a file for the mark of a policy's fault."""
         ours = {"COLUMNS": "200", MARK: str(self._mark), "TMPDIR": str(self.temporary)}
         return os.environ | ours | self.variables
 
@@ -137,9 +137,9 @@ class Stage:
             )
 
     def wait_for_lean(self) -> None:
-        """The policy holds its lean; remembers the guard, for after the death of its parent.
+        """Wait until the policy holds its lean; keep the guard's id for after its parent's death.
 
-        Where a busy machine made the guard end the flight before, both start anew.
+        If a busy machine made the guard end the flight early, restart vehicle and bridge.
         """
         sent = self.relay.sent
 
@@ -161,9 +161,9 @@ class Stage:
         raise StageError(f"the flight ended {STARTS} times before its fault:\n{self.output}")
 
     def fly(self, *flags: str) -> tuple[int, str]:
-        """Start a bridge that ends by itself; its exit status and everything that it printed.
+        """Start a bridge that ends by itself; return its exit status and all of its output.
 
-        It flies anew where a busy machine kept the attitude from it, which no test here is about.
+        The flight is repeated if a busy machine delayed its attitude, which no test here is about.
         """
         self.start(*flags)
         for _ in range(STARTS - 1):
@@ -191,7 +191,7 @@ class Stage:
         return "".join(self._lines)
 
     def fill_output(self) -> None:
-        """Fill the pipe that nobody reads, so that the bridge's next write to it would wait."""
+        """Fill the unread pipe, so that the bridge's next write to it would block."""
         fd = os.open(f"/proc/{self.bridge_pid}/fd/1", os.O_WRONLY | os.O_NONBLOCK)
         for block in (PIPE_BLOCK, 1):
             with suppress(BlockingIOError):
@@ -203,7 +203,7 @@ class Stage:
         threading.Event().wait(seconds)
 
     def fault_ns(self) -> int:
-        """When the policy's own fault began; waits for it."""
+        """Wait for the policy's own fault; return its start."""
         if not self.relay.wait_until(self._mark.exists, TIMEOUT_S):
             raise StageError(f"the policy's fault has not begun:\n{self.output}")
         return int(self._mark.read_text())
@@ -214,7 +214,7 @@ class Stage:
 
     @property
     def guard(self) -> Process:
-        """The guard process; the first call must come while the bridge lives."""
+        """The guard process; first use it while the bridge lives."""
         if self._guard is None:
             self._guard = Process(child_of(self.bridge_pid, b"mavbridge.guard"), self.clock)
         return self._guard
@@ -225,11 +225,11 @@ class Stage:
         return self.guard.pid if name == "guard" else self.bridge_pid
 
     def processes(self) -> list[tuple[int, str]]:
-        """Id and command of every process of the bridge that still runs."""
+        """Return id and command of every running process of the bridge."""
         return processes_with(f"{MARK}={self._mark}")
 
     def last_lean_ns(self) -> int:
-        """When the policy's last stick left, once none has followed it; waits for that."""
+        """Wait until the policy's sticks have ceased; return the time of the last one."""
         sent = self.relay.sent
 
         def is_over() -> bool:
@@ -241,13 +241,13 @@ class Stage:
         return [row.at_ns for row in sent if row.leans][-1]
 
     def kill(self, number: signal.Signals) -> int:
-        """Send a signal to the bridge alone; returns the moment."""
+        """Send a signal to the bridge alone; return the time."""
         at_ns = self.clock.now_ns()
         self._bridge.send_signal(number)
         return at_ns
 
     def kill_group(self, number: signal.Signals) -> int:
-        """Send a signal as a terminal does, to the whole process group; returns the moment."""
+        """Send a signal to the whole process group, as a terminal does; return the time."""
         at_ns = self.clock.now_ns()
         with suppress(ProcessLookupError):
             os.killpg(self.bridge_pid, number)
@@ -286,17 +286,17 @@ class Stage:
         return json.loads((self.folder / "report.json").read_text())
 
     def release_codes(self) -> set[str]:
-        """Codes of all reasons for which the policy lost the sticks, those inside others too."""
+        """Return codes of all reasons for which the policy lost the sticks, inner ones included."""
         reasons = release_reasons(self.folder / "report.json")
         return {code.value for reason in reasons for code in reason.codes}
 
     def vehicle_report(self) -> VehicleReport:
-        """Only after the ``staged`` block, which ends the vehicle."""
+        """Return the vehicle's report. Call after the ``staged`` block, which ends the vehicle."""
         return json.loads((self.folder / "fc.json").read_text())
 
 
 def release_reasons(report: Path) -> list[Reason]:
-    """All reasons for which the policy lost the sticks, by the bridge's report."""
+    """Return all reasons for which the policy lost the sticks, from the bridge's report."""
     releases = json.loads(report.read_text())["releases"] if report.exists() else []
     return [reason_from_json(release["reason"]) for release in releases]
 
@@ -307,7 +307,7 @@ def was_stalled(report: Path) -> bool:
 
 
 def places(reason: Reason) -> Iterator[object]:
-    """Where the time was spent, in a reason and in those inside it."""
+    """Yield the places at which time was spent, from a reason and its inner reasons."""
     for name, value in reason.data:
         if name == "place":
             yield value
@@ -319,10 +319,10 @@ def places(reason: Reason) -> Iterator[object]:
 def staged(
     folder: Path, *vehicle_flags: str, renders: bool = True, carrier: Carrier | None = None
 ) -> Iterator[Stage]:
-    """A vehicle and a relay, ready for ``Stage.start``; both end with the block.
+    """Context manager: a vehicle and a relay, ready for ``Stage.start``; both end with the block.
 
-    Without ``renders`` the camera shows noise, costs nothing and can be spoilt. ``carrier`` leads
-    from the relay to the bridge; None: UDP.
+    Without ``renders`` the camera shows noise, costs nothing and can be made faulty. ``carrier``
+    leads from the relay to the bridge; None: UDP.
     """
     port = free_port()
     shm = f"test-{port}-{os.getpid()}"
@@ -339,7 +339,7 @@ def staged(
 
 
 def free_port() -> int:
-    """A UDP port of the loopback that nobody uses now."""
+    """Return a UDP port that is free on loopback."""
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
         probe.bind(("127.0.0.1", 0))
         port: int = probe.getsockname()[1]

@@ -1,7 +1,7 @@
 """Steps of a scenario.
 
-A step is a function of the stage and the keys of its table; it returns the moment of its fault in
-ns of CLOCK_MONOTONIC, or None if it is none. ``do`` is its name, with spaces.
+A step is a function of the stage and the keys of its table. It returns the time of its fault in ns
+of CLOCK_MONOTONIC, or None if it is none. ``do`` is its name, with spaces.
 """
 
 import inspect
@@ -31,7 +31,7 @@ from sitl.vehicle.config import VehicleConfig
 REBOOT_IN_FLIGHT = 20190226
 """Sixth parameter of MAV_CMD_PREFLIGHT_REBOOT_SHUTDOWN with which ArduPilot reboots while armed."""
 STAMPS = {"time_boot_ms": NS_PER_S // NS_PER_MS, "time_usec": 1_000_000, "tc1": NS_PER_S}
-"""Fields with the vehicle's time, and their units in a second."""
+"""Fields with the vehicle's time, and their units per second."""
 
 
 def wait(stage: Stage, *, s: float) -> None:
@@ -39,18 +39,17 @@ def wait(stage: Stage, *, s: float) -> None:
 
 
 def policy(stage: Stage) -> int:
-    """Wait until the policy says that its own fault has begun."""
+    """Wait until the policy reports the start of its own fault."""
     return stage.fault_ns()
 
 
 def ended(stage: Stage) -> int:
-    """Wait until the policy has put the sticks down by itself."""
+    """Wait until the policy has released the sticks by itself."""
     return stage.last_lean_ns()
 
 
 def signal(stage: Stage, *, name: str, to: str = "flight") -> int:
-    """Send a signal to a process; ``group`` is the flight process with its children, as a terminal
-    sends it."""
+    """Send a signal; ``group``: the flight process and its children, as a terminal sends it."""
     number = signals.Signals[name]
     if to == "recorder":
         return Process(stage.pid_of("recorder"), stage.clock).kill(number)
@@ -59,26 +58,26 @@ def signal(stage: Stage, *, name: str, to: str = "flight") -> int:
 
 
 def terminal(stage: Stage) -> None:
-    """Nobody reads the terminal any more, and it is full."""
+    """Fill the terminal's pipe, which nothing reads any more."""
     stage.fill_output()
 
 
 def limit(stage: Stage, *, of: str, at: int, to: str = "flight") -> int:
-    """The kernel gives a process no more of something (``prlimit(2)``): NOFILE open files, FSIZE
-    bytes of a file (as on a full disk), AS address space."""
+    """Limit a resource of a process (``prlimit(2)``): NOFILE open files, FSIZE bytes of a file (as
+    on a full disk), AS address space."""
     at_ns, number, pid = stage.clock.now_ns(), getattr(resource, f"RLIMIT_{of}"), stage.pid_of(to)
     resource.prlimit(pid, number, (at, resource.prlimit(pid, number)[1]))
     return at_ns
 
 
 def wall_clock(stage: Stage) -> int:
-    """Wall time jumps by an hour, for a bridge that runs with ``catalogue/stepped_clock``."""
+    """Step wall time by an hour, for a bridge that runs with ``catalogue/stepped_clock``."""
     (stage.folder / "stepped").touch()
     return stage.clock.now_ns()
 
 
 def load(stage: Stage, *, s: float) -> int:
-    """Other programs want every core for a while."""
+    """Load every core with other programs for a while."""
     at_ns, busy = stage.clock.now_ns(), [sys.executable, "-c", "while True: pass"]
     hogs = [subprocess.Popen(busy) for _ in range(os.cpu_count() or 1)]
     stage.observe(s)
@@ -89,7 +88,7 @@ def load(stage: Stage, *, s: float) -> int:
 
 
 def viewer(stage: Stage, *, signal: str) -> int:
-    """The viewer stops reading, or is gone."""
+    """Send a signal to the viewer, which stops reading or dies."""
     if stage.viewer is None:
         raise UsageError("this flight has no viewer: --rerun {viewer} among its flags")
     at_ns = stage.clock.now_ns()
@@ -98,7 +97,7 @@ def viewer(stage: Stage, *, signal: str) -> int:
 
 
 def images(stage: Stage, *, show: str) -> int:
-    """The camera shows something else from now on (``FrameFeed.show``)."""
+    """Change the camera's images from now on (``FrameFeed.show``)."""
     if stage.camera is None:
         raise UsageError("this flight has no camera that can be spoilt")
     return stage.camera.show(show)
@@ -107,7 +106,7 @@ def images(stage: Stage, *, show: str) -> int:
 def messages(
     stage: Stage, *, names: Sequence[str], do_with: str = "drop", field: str = "", value: float = 0
 ) -> int:
-    """Drop, freeze, set or add to a field of (or all measurements in) messages of the vehicle."""
+    """Drop, freeze, set or offset a field (or all measurements) of the vehicle's messages."""
     frozen: dict[str, float] = {}
 
     def change(message: Message) -> bool:
@@ -127,18 +126,18 @@ def messages(
 
 
 def _measured(message: Message) -> list[str]:
-    """Numbers of a message that are measurements, not its time."""
+    """Return the names of numeric fields other than times."""
     names = [n for n in message.get_fieldnames() if isinstance(getattr(message, n), int | float)]
     return [name for name in names if not name.startswith("time")]
 
 
 def whole_messages(stage: Stage) -> int:
-    """Every message of the vehicle passes as it is again."""
+    """Pass every message of the vehicle unchanged again."""
     return stage.relay.rewrite_nothing()
 
 
 def clock(stage: Stage, *, s: float) -> int:
-    """The vehicle's clock jumps, in every message that carries it."""
+    """Step the vehicle's clock in every message that carries it."""
 
     def change(message: Message) -> bool:
         for name, units in STAMPS.items():
@@ -150,7 +149,7 @@ def clock(stage: Stage, *, s: float) -> int:
 
 
 def pilot(stage: Stage, *, act: str, mode: str = "") -> int:
-    """Another station changes the mode, arms, disarms or reboots the vehicle."""
+    """Change the mode, arm, disarm or reboot the vehicle from another station."""
     relay = stage.relay
     if act == "mode":
         return relay.set_mode(mode)
@@ -161,7 +160,7 @@ def pilot(stage: Stage, *, act: str, mode: str = "") -> int:
 
 
 def joystick(stage: Stage, *, hz: float, s: float, roll_us: int = 1400) -> int:
-    """Another program sends sticks with the bridge's own system id; the moment of the first."""
+    """Send sticks of another program with the bridge's system id; return the first's time."""
     sticks = Override(roll=roll_us, pitch=1500, throttle=1500, yaw=1500)
     began_ns = stage.relay.move_joystick(sticks, is_manual=stage.is_px4)
     for _ in range(round(s * hz)):
@@ -171,7 +170,7 @@ def joystick(stage: Stage, *, hz: float, s: float, roll_us: int = 1400) -> int:
 
 
 def param(stage: Stage, *, name: str, value: float) -> int:
-    """Another station sets a parameter of the vehicle."""
+    """Set a parameter of the vehicle from another station."""
     config = VehicleConfig(autopilot="px4" if stage.is_px4 else "ardupilot")
     kind = SimulatedVehicle(links=0, boot_ns=0, config=config).params.kind(name)
     if kind == dialect.MAV_PARAM_TYPE_INT32:
@@ -181,14 +180,14 @@ def param(stage: Stage, *, name: str, value: float) -> int:
 
 
 def switch(stage: Stage, *, channel: int, us: int) -> int:
-    """The pilot moves a stick or a switch of the transmitter, which the scenario has to have."""
+    """Move a stick or a switch of the transmitter, which the scenario must have."""
     at_ns = stage.clock.now_ns()
     stage.transmitter.move(channel, us)
     return at_ns
 
 
 def radio(stage: Stage, *, lost: bool = True) -> int:
-    """The receiver hears the transmitter no more, or again."""
+    """Cut the transmitter's signal to the receiver, or restore it."""
     at_ns = stage.clock.now_ns()
     stage.transmitter.switch_off() if lost else stage.transmitter.switch_on()
     return at_ns
@@ -197,7 +196,7 @@ def radio(stage: Stage, *, lost: bool = True) -> int:
 def link(
     stage: Stage, *, way: str = "both", ramp_s: float = 0, ramp_steps: int = 1, **faults: float
 ) -> int:
-    """Break the link from now on by ``LinkFaults``; without faults it is whole again.
+    """Impair the link from now on by ``LinkFaults``; without faults, restore it.
 
     With ``ramp_s`` the delay grows in ``ramp_steps`` equal steps, so that no packet is much later
     than the one before.
@@ -213,7 +212,7 @@ def link(
 
 
 def silence(stage: Stage, *, s: float, way: str = "both") -> int:
-    """Nothing passes for a while; then the link is whole again."""
+    """Lose every packet for a while; then restore the link."""
     began_ns = link(stage, way=way, loss=1.0)
     stage.observe(s)
     link(stage, way=way)
@@ -221,7 +220,7 @@ def silence(stage: Stage, *, s: float, way: str = "both") -> int:
 
 
 def broken(stage: Stage, *, s: float = 0.0) -> int:
-    """The link breaks as its kind does (``Carrier.fail``), after a silence of ``s``."""
+    """Break the link in the way of its kind (``Carrier.fail``), after a silence of ``s``."""
     began_ns = link(stage, loss=1.0) if s else stage.clock.now_ns()
     stage.observe(s)
     stage.relay.carrier.fail()
@@ -231,7 +230,7 @@ def broken(stage: Stage, *, s: float = 0.0) -> int:
 
 
 def unread(stage: Stage, *, s: float) -> int:
-    """The vehicle's end of a serial port reads nothing for a while, and then on."""
+    """Stop reading at the vehicle's end of a serial port for a while."""
     carrier = stage.relay.carrier
     if not isinstance(carrier, SerialCarrier):
         raise UsageError('this flight has no serial port: carrier = "serial" gives it one')
@@ -243,7 +242,7 @@ def unread(stage: Stage, *, s: float) -> int:
 
 
 def duplicate_system(stage: Stage, *, s: float, hz: float = 10.0) -> int:
-    """Another vehicle of the same system id, disarmed, sends to the bridge from its own port."""
+    """Send to the bridge as another, disarmed vehicle of the same system id, from its own port."""
     carrier = stage.relay.carrier
     if not isinstance(carrier, UdpCarrier):
         raise UsageError("only with UDP can a second vehicle send to the bridge")
@@ -262,8 +261,7 @@ def duplicate_system(stage: Stage, *, s: float, hz: float = 10.0) -> int:
 
 
 def rates(stage: Stage, *, hz: float, names: Sequence[str]) -> int:
-    """A ground station asks the vehicle for few messages: by their interval and, on ArduPilot, by
-    data streams."""
+    """Request few messages as a ground station, by interval and ArduPilot's data streams."""
     relay, began_ns = stage.relay, stage.clock.now_ns()
     for name in names:
         number = getattr(dialect, f"MAVLINK_MSG_ID_{name}")
@@ -292,7 +290,7 @@ class Step(NamedTuple):
 
 
 def make_step(table: Mapping[str, Any], where: str) -> Step:
-    """Make a step of a table; raises UsageError for an unknown kind or key, or a missing one."""
+    """Make a step from a table; raise UsageError for an unknown kind or key, or a missing key."""
     keys = dict(table)
     name = str(keys.pop("do", None))
     if name not in KINDS:

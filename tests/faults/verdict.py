@@ -1,4 +1,4 @@
-"""Judge a flown scenario by the vehicle's own record and by what left the bridge."""
+"""Judges a flown scenario by the vehicle's own record and the bridge's messages."""
 
 import sys
 from collections.abc import Iterator
@@ -24,23 +24,22 @@ class Verdict:
     aftermath: Aftermath | None = None
     """Only of a flight that lost its sticks."""
     last_stick_ms: float | None = None
-    """From the fault to the last steering message of the policy that left the bridge; negative:
-    before it."""
+    """Time from the fault to the policy's last steering message that left; negative: before it."""
     ended_ns: int = 0
-    """When everything was told to end, CLOCK_MONOTONIC; 0: before it flew."""
+    """Time at which everything was told to end, CLOCK_MONOTONIC; 0: before it flew."""
     taken_over_ns: int | None = None
-    """When a pilot ended the bridge's holding of the vehicle."""
+    """Time at which a pilot ended the bridge's hold of the vehicle."""
     ending: Ending | None = None
-    """Only of a flight whose end is the bridge's doing."""
+    """Only of a flight that the bridge ended."""
     exit: int | None = None
     runs: int = 1
-    """Flights until this one."""
+    """Number of flights up to this one."""
     stall_ms: float = 0.0
-    """Longest time for which this computer stood still."""
+    """Longest stall of this computer."""
     late: list[str] = field(default_factory=list)
-    """Failures that a busy computer may cause."""
+    """Failures that a busy computer can cause."""
     wrong: list[str] = field(default_factory=list)
-    """Failures that it may not."""
+    """Failures that a busy computer cannot cause."""
     output: str = ""
 
     @property
@@ -57,9 +56,9 @@ def judge(
 ) -> None:
     """Fill in the measurements and the failures of a verdict.
 
-    ``stage`` has ended, and the vehicle has written its report; ``at_ns`` is the moment of the
-    fault, CLOCK_MONOTONIC; ``leans``: the newest sticks were the policy's when the steps were over.
-    Raises NoVerdictError if the vehicle did not fly at the fault, or was never safe after it.
+    ``stage`` has ended, and the vehicle has written its report. ``at_ns`` is the time of the fault,
+    CLOCK_MONOTONIC. ``leans``: the newest sticks were the policy's when the steps were over. Raise
+    NoVerdictError if the vehicle did not fly at the fault, or was never safe after it.
     """
     report, sent = stage.vehicle_report(), stage.relay.sent
     verdict.wrong += _wrong(verdict, report, sent)
@@ -112,7 +111,7 @@ def _judge_loss(
     at_ns: int,
     slack_ms: float,
 ) -> float:
-    """Judge how the policy lost the sticks; returns when the vehicle was safe [ms]."""
+    """Judge how the policy lost the sticks; return when the vehicle was safe [ms]."""
     variant, sent, late = verdict.variant, stage.relay.sent, verdict.late
     others = tuple(scenario.others_us)
     measured = aftermath(report, at_ns, variant.receiver, variant.mode, others)

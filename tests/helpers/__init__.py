@@ -1,1 +1,1 @@
-"""What several tests share: builders of values, fakes, and flights in real processes."""
+"""Shared test code: builders of values, fakes, and flights in real processes."""

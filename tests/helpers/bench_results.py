@@ -15,7 +15,7 @@ def all_equal(value: float) -> Percentiles:
 
 
 def make_flight(runner: str, **changes: Any) -> Flight:
-    """60 s with eager torch, asked for 100 and 30 Hz."""
+    """Make a flight of 60 s with eager torch, requested at 100 and 30 Hz."""
     fields: dict[str, Any] = {
         "runner": runner,
         "policy": "toge:small",

@@ -1,4 +1,4 @@
-"""Senders of camera images on loopback: chunks of JPEG over UDP, and H.264 over RTP."""
+"""Senders of camera images on loopback: chunked JPEG over UDP, and H.264 over RTP."""
 
 import socket
 import threading
@@ -17,13 +17,13 @@ import numpy as np
 from mavbridge.core.clock import NS_PER_S, MonotonicClock
 
 HEADER = Struct("<IHHIIQ")
-"""As the format's description has it: not taken from the code that is tested."""
+"""From the description of the format, independent of the tested code."""
 SIDE = 64
 HZ = 30
 
 
 def chunks(frame_id: int, data: bytes, *, part: int = 1400, stamp_ns: int = 0) -> list[bytes]:
-    """The datagrams of one picture."""
+    """Return the datagrams of one picture."""
     parts = [data[at : at + part] for at in range(0, len(data), part)]
     return [
         HEADER.pack(frame_id % (1 << 32), place, len(parts), len(data), len(each), stamp_ns) + each
@@ -32,21 +32,21 @@ def chunks(frame_id: int, data: bytes, *, part: int = 1400, stamp_ns: int = 0) -
 
 
 def encoded(image: np.ndarray, suffix: str = ".jpg") -> bytes:
-    """An RGB image as JPEG or PNG, or a depth image as PNG."""
+    """Encode an RGB image as JPEG or PNG, or a depth image as PNG."""
     bgr = image if image.ndim == 2 else cv2.cvtColor(image, cv2.COLOR_RGB2BGR)
     _, data = cv2.imencode(suffix, bgr)
     return data.tobytes()
 
 
 def scene(number: int) -> np.ndarray:
-    """An RGB image that shows something, and another thing for each number."""
+    """Return an RGB image with a pattern that differs for each number."""
     rows, columns = np.mgrid[:SIDE, :SIDE]
     planes = [rows * 3 + number * 16, columns * 3, (rows + columns) * 2 - number * 16]
     return np.stack([plane % 256 for plane in planes], axis=-1).astype(np.uint8)
 
 
 def depth_scene(number: int) -> np.ndarray:
-    """A slope from 2 m on in millimetres, another one for each number; a corner is unknown."""
+    """Return a depth image [mm]: a slope from 2 m on, shifted by number; a corner is unknown."""
     rows, columns = np.mgrid[:SIDE, :SIDE]
     depth = (2000 + 50 * rows + columns + number).astype(np.uint16)
     depth[:8, :8] = 0
@@ -55,7 +55,7 @@ def depth_scene(number: int) -> np.ndarray:
 
 @contextmanager
 def repeating(act: Callable[[int], None], *, hz: float = HZ) -> Iterator[None]:
-    """Call ``act`` with 0, 1, 2 ... at this rate from a thread, while the context lasts."""
+    """Context manager: call ``act`` with 0, 1, 2 ... at this rate from a thread."""
     stop, clock = threading.Event(), MonotonicClock()
 
     def run() -> None:
@@ -75,7 +75,7 @@ def repeating(act: Callable[[int], None], *, hz: float = HZ) -> Iterator[None]:
 
 
 class UdpSender:
-    """Sends pictures as a racing simulator does: in reverse order of chunks, each one twice."""
+    """Sends pictures as a racing simulator does: chunks in reverse order, each one twice."""
 
     def __init__(self, port: int, host: str = "127.0.0.1") -> None:
         self._address = (host, port)
@@ -101,7 +101,7 @@ class UdpSender:
 
 
 class RtpSender:
-    """H.264 over RTP; the session description that a receiver needs comes from ``describe``."""
+    """Sends H.264 over RTP; ``describe`` writes the session description that a receiver needs."""
 
     def __init__(self, port: int) -> None:
         self._port = port

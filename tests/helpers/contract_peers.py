@@ -1,4 +1,4 @@
-"""Flight controllers of the contract suite, and who talks to them."""
+"""Flight controllers of the contract suite, and a companion that talks to them."""
 
 from collections.abc import Callable
 from typing import Any, Protocol
@@ -26,12 +26,12 @@ class Peer(Protocol):
     def send(self, data: bytes) -> None: ...
 
     def advance(self, duration_ns: int) -> bytes:
-        """Let time pass; the bytes that came meanwhile."""
+        """Let time pass; return the bytes received meanwhile."""
         ...
 
 
 class MockPeer:
-    """The vehicle of ``sitl`` in this process; time passes only here."""
+    """The vehicle of ``sitl`` in this process. Only ``advance`` moves its time."""
 
     def __init__(self, config: VehicleConfig) -> None:
         self._now_ns = 0
@@ -54,7 +54,7 @@ class MockPeer:
 
 
 class ExternalPeer:
-    """A flight controller at an address of pymavlink: ``udp:127.0.0.1:14550``, ``/dev/ttyACM0``."""
+    """A flight controller at a pymavlink address: ``udp:127.0.0.1:14550``, ``/dev/ttyACM0``."""
 
     def __init__(self, address: str, baud: int = 115_200) -> None:
         self._clock = Clock()
@@ -67,7 +67,7 @@ class ExternalPeer:
         self._link.write(data)
 
     def advance(self, duration_ns: int) -> bytes:
-        """Reads every few milliseconds: a second of telemetry is more than a socket holds."""
+        """Read every few milliseconds: a second of telemetry is more than a socket holds."""
         end_ns = self._clock.now_ns() + duration_ns
         taken = self._read()
         while (now_ns := self._clock.now_ns()) < end_ns:
@@ -91,9 +91,9 @@ class Companion:
     def __init__(self, peer: Peer) -> None:
         self.peer = peer
         self.may_arm = False
-        """Set by the fixtures of tests that say that they arm; without it arming is not sent."""
+        """Set by fixtures of tests that declare that they arm; otherwise arming is refused."""
         self.seen: list[Any] = []
-        """Everything that came since it was last cleared."""
+        """All messages since it was last cleared."""
         self._unread: list[Any] = []
         self._mav = mav.MAVLink(None, srcComponent=mav.MAV_COMP_ID_ONBOARD_COMPUTER)
         self._mav.robust_parsing = True
@@ -107,9 +107,9 @@ class Companion:
         self.peer.send(message.pack(self._mav))
 
     def advance(self, seconds: float) -> list[Any]:
-        """Let time pass; what came meanwhile, and what `wait` has left."""
+        """Let time pass; return the new messages, and those that `wait` has left."""
         data = self.peer.advance(round(seconds * NS_PER_S))
-        # Component 0 stands for what pymavlink's dialect does not know: those come as raw bytes.
+        # Messages unknown to pymavlink's dialect arrive as raw bytes, with component 0.
         new = [m for m in self._mav.parse_buffer(data) or [] if m.get_srcComponent() in (0, 1)]
         self.seen += new
         messages, self._unread = self._unread + new, []
@@ -118,7 +118,7 @@ class Companion:
     def find(
         self, name: str, timeout_s: float = 3.0, where: Callable[[Any], bool] = lambda _: True
     ) -> Any | None:
-        """The next message of that name; None without one."""
+        """Return the next message of that name; None if there is none."""
         end_ns = self.peer.now_ns() + round(timeout_s * NS_PER_S)
         while self.peer.now_ns() < end_ns:
             messages = self.advance(TICK_NS / NS_PER_S)
@@ -131,12 +131,12 @@ class Companion:
     def wait(
         self, name: str, timeout_s: float = 3.0, where: Callable[[Any], bool] = lambda _: True
     ) -> Any:
-        """The next message of that name; the test fails without one."""
+        """Return the next message of that name; fail the test if there is none."""
         message = self.find(name, timeout_s, where)
         return message or pytest.fail(f"no such {name} within {timeout_s} s")
 
     def command(self, number: int, *params: float, system_id: int = GCS) -> int:
-        """Send a command, again where its ack is lost; the result in the ack."""
+        """Send a command, and repeat it if its ack is lost; return the result in the ack."""
         padded = (*params, *[0.0] * (7 - len(params)))
         for attempt in range(3):
             message = mav.MAVLink_command_long_message(1, 1, number, attempt, *padded)
@@ -147,7 +147,7 @@ class Companion:
         return pytest.fail(f"command {number} is not acknowledged")
 
     def request(self, message_id: int, name: str) -> Any:
-        """A message by MAV_CMD_REQUEST_MESSAGE."""
+        """Request a message by MAV_CMD_REQUEST_MESSAGE, and return it."""
         for _ in range(3):
             params = (message_id, *[0.0] * 6)
             number = mav.MAV_CMD_REQUEST_MESSAGE
@@ -158,7 +158,7 @@ class Companion:
         return pytest.fail(f"no {name} on request")
 
     def stream(self, message_id: int, rate_hz: float) -> int:
-        """Ask for a rate; the end of the test takes it back."""
+        """Request a rate; it is reset at the end of the test."""
         self._streams.add(message_id)
         return self.command(mav.MAV_CMD_SET_MESSAGE_INTERVAL, message_id, int(1e6 / rate_hz))
 
@@ -167,18 +167,18 @@ class Companion:
 
     @property
     def is_external(self) -> bool:
-        """The vehicle is not the one of ``sitl``."""
+        """True unless the vehicle is the one of ``sitl``."""
         return isinstance(self.peer, ExternalPeer)
 
     @property
     def in_the_air(self) -> bool:
-        """The vehicle is not on the ground, by its own word."""
+        """True if the vehicle does not report that it is on the ground."""
         message_id = mav.MAVLINK_MSG_ID_EXTENDED_SYS_STATE
         state = self.request(message_id, "EXTENDED_SYS_STATE").landed_state
         return bool(state != mav.MAV_LANDED_STATE_ON_GROUND)
 
     def come_down(self) -> None:
-        """Be on the ground and disarmed: in the air, by falling. Only a simulated one may fly."""
+        """Get to the ground and disarm, by falling if in the air. Only a simulated one may fly."""
         self.command(ARM, 0, FORCE)
         for _ in range(50):
             if not self.in_the_air:
@@ -189,7 +189,7 @@ class Companion:
         return float(self.read_param(name).param_value)
 
     def read_param(self, name: str) -> Any:
-        """PARAM_VALUE as it came."""
+        """Return PARAM_VALUE as received."""
         for _ in range(3):
             self.send(mav.MAVLink_param_request_read_message(1, 1, name.encode(), -1))
             message = self.find("PARAM_VALUE", 1.0, lambda m: m.param_id == name)
@@ -198,18 +198,18 @@ class Companion:
         return pytest.fail(f"no parameter {name}")
 
     def set_param(self, name: str, value: float) -> float:
-        """Set a parameter until the end of the test; the value that it has then."""
+        """Set a parameter until the end of the test; return its value afterwards."""
         old = self.read_param(name)
         self._changed_params.setdefault(name, (old.param_type, old.param_value))
         return self.write_param(name, old.param_type, value)
 
     def write_param(self, name: str, kind: int, value: float) -> float:
-        """PARAM_SET with a value as it goes on the wire."""
+        """Send PARAM_SET with a value in its wire encoding."""
         self.send(mav.MAVLink_param_set_message(1, 1, name.encode(), value, kind))
         return float(self.wait("PARAM_VALUE", where=lambda m: m.param_id == name).param_value)
 
     def restore(self) -> None:
-        """Give parameters and streams of the vehicle back as they were."""
+        """Restore parameters and streams of the vehicle."""
         for name, (kind, value) in self._changed_params.items():
             self.write_param(name, kind, value)
         for message_id in self._streams:
@@ -217,15 +217,15 @@ class Companion:
 
 
 def named(messages: list[Any], name: str) -> list[Any]:
-    """Those of that name, in their order."""
+    """Return the messages of that name, in order."""
     return [message for message in messages if message.get_type() == name]
 
 
 def last(messages: list[Any], name: str) -> Any:
-    """The newest of that name."""
+    """Return the newest message of that name."""
     return named(messages, name)[-1]
 
 
 def is_armed(heartbeat: Any) -> bool:
-    """The motors may turn."""
+    """True if the vehicle is armed."""
     return bool(heartbeat.base_mode & mav.MAV_MODE_FLAG_SAFETY_ARMED)

@@ -1,4 +1,4 @@
-"""A ground station or companion computer of an ArduCopter: overrides, modes, how to fly up."""
+"""Ground station or companion computer of an ArduCopter: overrides, modes, how to fly up."""
 
 import math
 from typing import Any
@@ -17,18 +17,18 @@ ACCEPTED, DENIED, UNSUPPORTED, FAILED = (
 )
 VELOCITY_MASK = 1479
 HEIGHT_M = 8.0
-TOO_LOW_M, TOO_HIGH_M = 2.0, 15.0  # against the wanted height; a descent takes its time
+TOO_LOW_M, TOO_HIGH_M = 2.0, 15.0  # relative to the wanted height; a descent takes long
 STILL_MPS = 0.25
 
 
 class CopterCompanion(Companion):
-    """As `Companion`, for ArduCopter."""
+    """`Companion` for ArduCopter."""
 
     def set_mode(self, number: int) -> int:
         return self.command(mav.MAV_CMD_DO_SET_MODE, 1, number)
 
     def override(self, *channels_us: int, system_id: int = GCS, target: int = 1) -> None:
-        """RC_CHANNELS_OVERRIDE; channels 1-8 that are not given are ignored."""
+        """Send RC_CHANNELS_OVERRIDE. Channels 1 to 8 that are not given are ignored."""
         primary = (*channels_us, *[65535] * (8 - len(channels_us)))[:8]
         aux = (*channels_us[8:], *[0] * (10 - len(channels_us[8:])))
         message = mav.MAVLink_rc_channels_override_message(target, 0, *primary, *aux)
@@ -43,7 +43,7 @@ class CopterCompanion(Companion):
         thr: int = 1500,
         yaw: int = 1500,
     ) -> list[Any]:
-        """Hold the sticks by overrides at 50 Hz; what came in meanwhile."""
+        """Hold the sticks by overrides at 50 Hz; return the messages received meanwhile."""
         messages = []
         for _ in range(round(seconds * 50.0)):
             self.override(roll, pitch, thr, yaw)
@@ -51,7 +51,7 @@ class CopterCompanion(Companion):
         return messages
 
     def channels(self) -> tuple[int, ...]:
-        """Channels that the vehicle uses; needs RC_CHANNELS to be streamed."""
+        """Return the channels that the vehicle uses; RC_CHANNELS must be streaming."""
         message = self.wait("RC_CHANNELS")
         return tuple(getattr(message, f"chan{n}_raw") for n in range(1, 17))
 
@@ -71,7 +71,7 @@ class CopterCompanion(Companion):
         raise AssertionError(f"the vehicle does not get ready to arm: {self.texts()}")
 
     def fly_up(self, mode: int = ALT_HOLD, height_m: float = HEIGHT_M) -> None:
-        """Be at a height, level and still, in this mode; neutral sticks have just been sent."""
+        """Reach a height, level and still, in this mode; neutral sticks have just been sent."""
         for message_id in (
             mav.MAVLINK_MSG_ID_ATTITUDE,
             mav.MAVLINK_MSG_ID_LOCAL_POSITION_NED,
@@ -88,7 +88,7 @@ class CopterCompanion(Companion):
         assert self.set_mode(mode) == ACCEPTED
 
     def texts(self) -> list[str]:
-        """Status texts since ``seen`` was cleared."""
+        """Return the status texts since ``seen`` was cleared."""
         return [m.text for m in named(self.seen, "STATUSTEXT")]
 
     def _take_off(self, height_m: float) -> None:
@@ -114,7 +114,7 @@ class CopterCompanion(Companion):
         raise AssertionError("the vehicle does not come to rest")
 
     def come_down(self) -> None:
-        """As before, and the estimate of the height has got over the impact."""
+        """Get to the ground and disarm; wait until the height estimate recovers from the impact."""
         super().come_down()
         self.stream(mav.MAVLINK_MSG_ID_LOCAL_POSITION_NED, 20)
         for _ in range(15):
@@ -141,7 +141,7 @@ def velocity(
     yaw_degps: float = 0.0,
     frame: int = mav.MAV_FRAME_LOCAL_NED,
 ) -> Any:
-    """SET_POSITION_TARGET_LOCAL_NED with a velocity in m/s and a yaw rate in deg/s alone."""
+    """Return SET_POSITION_TARGET_LOCAL_NED with only a velocity in m/s and a yaw rate in deg/s."""
     return mav.MAVLink_set_position_target_local_ned_message(
         0,
         1,

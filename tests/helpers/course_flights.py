@@ -17,7 +17,7 @@ from sitl.vehicle.config import STEP_NS, VehicleConfig
 
 TICK_NS = NS_PER_S // 100
 REST_S = 3.0
-"""Flown on after the last gate."""
+"""Flight time after the last gate."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -43,14 +43,14 @@ class CourseFlight:
         return np.array([tick.label for tick in self.ticks])
 
     def mean_speed_mps(self) -> float:
-        """Along the straight legs between the first gate passed and the last."""
+        """Return the speed along the straight legs between the first and the last passed gate."""
         passed = self.vehicle.log.summary(self.vehicle.ap, 0)["gates"]["passed"]
         centers = [self.course.gates[entry["index"]].center_ned_m for entry in passed]
         distance_m = sum(math.dist(a, b) for a, b in pairwise(centers))
         return distance_m / (passed[-1]["t_s"] - passed[0]["t_s"]) if len(passed) > 1 else math.nan
 
     def misses_m(self) -> list[float]:
-        """Distance from the centre, sideways or up, at which each gate was passed."""
+        """Return the larger of sideways and vertical distance to the centre at each passed gate."""
         misses = []
         for before, after in pairwise(self.ticks):
             if after.next_gate != before.next_gate:
@@ -61,7 +61,7 @@ class CourseFlight:
 
 
 def pwm_us(sticks: StickPositions) -> list[int]:
-    """RC_CHANNELS_OVERRIDE of the default calibration; pitch is reversed."""
+    """Return RC_CHANNELS_OVERRIDE of the default calibration; pitch is reversed."""
     throttle, yaw, pitch, roll = sticks
     axes = (roll, -pitch, throttle, yaw)
     return [round(1500 + 500 * axis) for axis in axes] + [65535] * 4

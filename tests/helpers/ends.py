@@ -1,4 +1,4 @@
-"""The far ends of a simulated vehicle's links."""
+"""Far ends of a simulated vehicle's links."""
 
 from pymavlink.dialects.v20 import ardupilotmega as mav
 
@@ -8,7 +8,7 @@ from sitl.vehicle.config import STEP_NS
 
 
 class Ends:
-    """What sits at the other ends of a vehicle's links, on a clock that the test steps."""
+    """Far ends of a vehicle's links, on a clock that the test steps."""
 
     def __init__(self, links=1, config=None):
         self.vehicle = SimulatedVehicle(links=links, boot_ns=0, config=config)
@@ -28,7 +28,7 @@ class Ends:
         self.vehicle.receive(link, self.pack(message, system_id, component_id), self.now_ns)
 
     def run(self, seconds, sticks=None, link=0):
-        """Step on; ``sticks`` maps links to x, y, z, r at 50 Hz. What has come on ``link``."""
+        """Step on, sending ``sticks`` (link: x, y, z, r) at 50 Hz; return messages on ``link``."""
         received = []
         for step in range(round(seconds * NS_PER_S / STEP_NS)):
             if step % 8 == 0:

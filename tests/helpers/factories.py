@@ -1,7 +1,7 @@
 """Records with sensible defaults: a vehicle that flies well at 100 Hz with 30 Hz vision.
 
-Stamps follow from the index alone, so a series of ticks is a plausible flight; any field can be
-replaced by keyword.
+Stamps follow from the index alone, so that a series of ticks is a plausible flight. Keywords
+replace any field.
 """
 
 from dataclasses import replace
@@ -25,7 +25,7 @@ HOVER = (0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, -9.81)
 
 
 def make_state(at_ns: int = START_NS, **changes: Any) -> VehicleState:
-    """Level hover; every part arrived at ``at_ns``."""
+    """Return a level hover whose parts all arrived at ``at_ns``."""
     values = np.array(HOVER, dtype=np.float32)
     values.flags.writeable = False
     state = VehicleState(
@@ -39,12 +39,12 @@ def make_state(at_ns: int = START_NS, **changes: Any) -> VehicleState:
 
 
 def make_trace(sticks: Sticks = NEUTRAL) -> ActionTrace:
-    """An action that no stage changes."""
+    """Return the trace of an action that no stage changes."""
     return ActionTrace(raw=sticks, clipped=sticks, slewed=sticks, smoothed=sticks)
 
 
 def make_tick(index: int = 0, **changes: Any) -> Tick:
-    """Tick ``index``: on time, 2 ms of prediction, 3 ms old attitude, 40 ms old feature, flying.
+    """Return tick ``index``: flying, on time, 2 ms solve; attitude 3 ms and feature 40 ms old.
 
     Each tick flies a new chunk.
     """
@@ -74,7 +74,7 @@ def make_tick(index: int = 0, **changes: Any) -> Tick:
 
 
 def make_released_tick(index: int = 0, reason: Reason = _NO_IMAGE, **changes: Any) -> Tick:
-    """Tick ``index`` of a vehicle that the pilot flies."""
+    """Return tick ``index`` of a vehicle that the pilot flies."""
     released: dict[str, Any] = {
         "predict_ns": None,
         "trace": None,
@@ -87,7 +87,7 @@ def make_released_tick(index: int = 0, reason: Reason = _NO_IMAGE, **changes: An
 
 
 def make_vision_tick(frame_id: int = 1, **changes: Any) -> VisionTick:
-    """Frame ``frame_id``: taken up 2 ms after exposure, encoded in 20 ms, no frame dropped."""
+    """Return frame ``frame_id``: taken up after 2 ms, encoded in 20 ms, no frame dropped."""
     captured_ns = START_NS + (frame_id - 1) * FRAME_NS
     rgb = np.zeros((24, 32, 3), dtype=np.uint8)
     rgb.flags.writeable = False
@@ -104,13 +104,13 @@ def make_vision_tick(frame_id: int = 1, **changes: Any) -> VisionTick:
 
 
 def about_z(angle_rad: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Rotations [B, 4] by angles [B] about the third axis."""
+    """Return rotations [B, 4] by angles [B] about the third axis."""
     zero = np.zeros_like(angle_rad)
     return np.stack([np.cos(angle_rad / 2), zero, zero, np.sin(angle_rad / 2)], axis=-1)
 
 
 def make_guard_tick(at_ns: int, **changes: Any) -> GuardTick:
-    """A slot that the guard served in time, with nothing to send."""
+    """Return a slot that the guard served in time, with nothing to send."""
     tick = GuardTick(
         index=0,
         due_ns=at_ns,

@@ -29,11 +29,11 @@ from mavbridge.core.vehicle import (
 
 START_NS = 1_000 * NS_PER_S
 FOREVER_NS = 2**62
-"""``reset_ns`` of chunks for a guard that is to engage at once."""
+"""``reset_ns`` of chunks for a guard that has to engage at once."""
 
 
 class FakeClock:
-    """Moves only when told to, or when somebody sleeps; sleeps may overshoot."""
+    """Clock that moves only when told to, or when code sleeps; sleeps can overshoot."""
 
     def __init__(self, start_ns: int = START_NS, oversleep_ns: int = 0) -> None:
         self._now_ns = start_ns
@@ -51,7 +51,7 @@ class FakeClock:
 
 
 class ListSink:
-    """Keeps every event."""
+    """Sink that keeps every event."""
 
     def __init__(self) -> None:
         self.events: list[Event] = []
@@ -78,11 +78,11 @@ AIRBORNE_STATUS = VehicleStatus(
     is_position_valid=True,
     position_ned_m=(0.0, 0.0, -3.0),
 )
-"""Armed in ALT_HOLD, 3 m up, with a receiver whose sticks are in the middle."""
+"""Armed in ALT_HOLD, 3 m up, with a receiver whose sticks are centred."""
 
 
 def level_telemetry(arrived_ns: int) -> Telemetry:
-    """Level hover facing north."""
+    """Return a level hover facing north."""
     return Telemetry(
         ned_from_body_wxyz=Reading(arrived_ns, (1.0, 0.0, 0.0, 0.0)),
         rate_body_radps=Reading(arrived_ns, (0.0, 0.0, 0.0)),
@@ -92,7 +92,7 @@ def level_telemetry(arrived_ns: int) -> Telemetry:
 
 
 class FakeLink:
-    """The guard's link to a vehicle in memory, which obeys at once; ``vehicle`` may be replaced."""
+    """The guard's link to a vehicle in memory, which obeys at once. ``vehicle`` can be replaced."""
 
     def __init__(self, clock: Clock, **status: Any) -> None:
         self._clock = clock
@@ -106,7 +106,7 @@ class FakeLink:
         self.is_release_owed = False
         self.echo_confirmed = True
         self.obeys = True
-        """Follows requests for a mode and to arm."""
+        """True if it follows requests for a mode and to arm."""
         self.lacks: str | None = None
         """Field of ``Telemetry`` that the vehicle no longer sends."""
         self.texts: list[str] = []
@@ -118,18 +118,18 @@ class FakeLink:
         self.requests: list[str] = []
         self.announced: list[str] = []
         self.transmitted: list[tuple[int, str]] = []
-        """Last words that were said, as text."""
+        """Last words that were sent, as text."""
         self.outlet = Outlet(1, 7, ("127.0.0.1", 1))
         self.services = 0
         self.restores = 0
         self.on_send: Callable[[], None] = lambda: None
         self.takes: Callable[[Decision], bool] = lambda decision: True
-        """Whether a decision can be sent now; may raise."""
+        """Returns True if a decision can be sent now; can raise."""
 
     def measure(self, *, age_ns: int = 0, yaw_rad: float = 0.0, down_mps: float = 0.0) -> None:
-        """The vehicle sends its state, which arrives now and happened ``age_ns`` ago.
+        """Send the vehicle's state, which arrives now and happened ``age_ns`` ago.
 
-        The link takes none that is older than the one before.
+        The link ignores a state older than the one before.
         """
         happened_ns = self._clock.now_ns() - age_ns
         if happened_ns < self._happened_ns:
@@ -154,7 +154,7 @@ class FakeLink:
 
     @property
     def hands(self) -> list[Decision]:
-        """What was sent, without repeats."""
+        """Sent decisions, without repeats."""
         sent = [decision for _, decision in self.decisions]
         return [one for k, one in enumerate(sent) if k == 0 or one != sent[k - 1]]
 
@@ -216,7 +216,7 @@ class FakeLink:
     def rehearse(
         self, plan: Iterable[tuple[int, Decision | None, str | None]]
     ) -> tuple[tuple[int, bytes], ...]:
-        """Each decision and each mode as text."""
+        """Return each decision and each mode as text."""
         return tuple(
             (after_ns, str(part).encode())
             for after_ns, *parts in plan
@@ -244,11 +244,11 @@ class FakeLink:
 
 
 def without(telemetry: Telemetry, field_name: str) -> Telemetry:
-    """The same telemetry with one quantity never received."""
+    """Return the telemetry as if one quantity had never been received."""
     return telemetry._replace(**{field_name: None})
 
 
 def samples_of(telemetry: Telemetry) -> tuple[Sample, ...]:
-    """All readings of it, as the guard sends them."""
+    """Return all readings of it, as the guard sends them."""
     known = telemetry._asdict().items()
     return tuple(Sample(name, reading) for name, reading in known if reading is not None)

@@ -1,4 +1,4 @@
-"""Writes small flight folders (docs/formats.md) for tests, without the recorder."""
+"""Writer of small flight folders (docs/formats.md) for tests, without the recorder."""
 
 import json
 from collections.abc import Sequence
@@ -94,7 +94,7 @@ def write_flight(
 
 
 def spot(size: int, across: float) -> NDArray[np.uint8]:
-    """A bright spot on grey, ``across`` -1 (left edge) to 1."""
+    """Return a bright spot on grey, ``across`` from -1 (left edge) to 1."""
     image = np.full((size, size, 3), 90, np.uint8)
     centre = round((across + 1) / 2 * (size - 1))
     image[size // 3 : 2 * size // 3, max(0, centre - 3) : centre + 4] = (250, 220, 40)
@@ -102,7 +102,7 @@ def spot(size: int, across: float) -> NDArray[np.uint8]:
 
 
 def write_spot_flight(folder: Path, seed: int, *, seconds: float = 3.0, size: int = 32) -> Path:
-    """A flight in which the image alone tells the expert's yaw; what was sent is noise."""
+    """Write a flight whose image alone determines the expert's yaw; the sent sticks are noise."""
     random = np.random.default_rng(seed)
     phase, pace = random.uniform(0, 2 * np.pi), random.uniform(0.8, 1.6)
 

@@ -9,7 +9,7 @@ from faults.relay import Override
 
 
 def logged_overrides(path: Path) -> Iterator[Override]:
-    """The first four channels of every RC_CHANNELS_OVERRIDE."""
+    """Return the first four channels of every RC_CHANNELS_OVERRIDE."""
     log = mavutil.mavlogfile(str(path))
     while (message := log.recv_match(type="RC_CHANNELS_OVERRIDE")) is not None:
         yield Override(*(getattr(message, f"chan{k}_raw") for k in range(1, 5)))

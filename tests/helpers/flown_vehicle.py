@@ -1,4 +1,4 @@
-"""The session of a vehicle as an output sees it, set by hand."""
+"""Vehicle session as an output sees it, set by hand."""
 
 from types import SimpleNamespace
 from typing import cast
@@ -17,7 +17,7 @@ from mavbridge.mavlink.session.vehicle import VehicleSession
 
 
 class FlownVehicle:
-    """Whatever an output asks of a ``VehicleSession``; in the air and in a mode for setpoints."""
+    """The part of a ``VehicleSession`` that outputs use; in the air and in a mode for setpoints."""
 
     def __init__(self, profile: Profile, calibration: RcCalibration | None = None) -> None:
         self.profile = profile
@@ -35,10 +35,9 @@ class FlownVehicle:
         self.has_receiver: bool | None = False
         self.is_failsafe = False
         self.is_known = True
-        """It has sent a heartbeat since its session began."""
+        """True if it has sent a heartbeat since its session began."""
 
     def status(self, _now_ns: int) -> VehicleStatus | None:
-        """The status that was set."""
         if not self.is_known:
             return None
         return VehicleStatus(
@@ -61,7 +60,7 @@ class Flight:
         self.end = WireEnd()
 
     def send(self, action: Action) -> Encoded:
-        """Encode an action and note it as sent, 10 ms after the last."""
+        """Encode an action and record it as sent, 10 ms after the last."""
         self.now_ns += 10 * NS_PER_MS
         encoded = self.output.encode(action, self.session, self.now_ns)
         assert encoded is not None
@@ -69,18 +68,18 @@ class Flight:
         return encoded
 
     def receive(self, body: Body) -> None:
-        """A message of the vehicle arrives a millisecond later."""
+        """Receive a message of the vehicle a millisecond later."""
         self.now_ns += NS_PER_MS
         self.output.receive(body, self.session, self.now_ns)
 
     def message(self, encoded: Encoded) -> object:
-        """The packet as pymavlink reads it."""
+        """Parse the packet by pymavlink."""
         (message,) = self.end.read(encoded.packet)
         return message
 
     @property
     def status(self) -> VehicleStatus:
-        """The vehicle's status as the guard gets it."""
+        """Status of the vehicle as the guard gets it."""
         status = self.output.in_policy_terms(
             self.vehicle.status(self.now_ns), self.session, self.now_ns
         )
@@ -89,15 +88,15 @@ class Flight:
 
     @property
     def problem(self) -> Reason | None:
-        """What the echo tells now."""
+        """Why the output counts as overruled or unheard; None: it does not."""
         return self.output.overruled(self.now_ns) or self.output.unheard(self.now_ns)
 
     @property
     def is_released(self) -> bool:
-        """It acts on something else than our last packets."""
+        """True if the vehicle acts on something other than our last packets."""
         return self.output.is_released(self.session, self.now_ns)
 
 
 def codec() -> Codec:
-    """Our own end of the wire."""
+    """Return our own end of the wire."""
     return Codec(source_system=255, source_component=191)

@@ -1,4 +1,4 @@
-"""ONNX and TorchScript files as other tools export them: sound ones and broken ones, tiny."""
+"""ONNX and TorchScript files as exported by other tools, valid and broken, all tiny."""
 
 import json
 import warnings
@@ -64,9 +64,9 @@ def actor(
     action_type: int = FLOAT,
     external: bool = False,
 ) -> None:
-    """A policy of reinforcement learning: state [1, S] -> actions [1, 4] and perhaps others.
+    """Write a reinforcement learning policy: state [1, S] -> actions [1, 4], more if requested.
 
-    The action is four times the first number of the state, roll velocity times 0.1.
+    Each of the four numbers is 0.1 times the first number of the state, a velocity.
     """
     weight = np.zeros((state_dim, 4), np.float32)
     weight[0] = 0.1
@@ -82,9 +82,9 @@ def actor(
 
 
 def recurrent(path: Path, *, hidden: Sequence[str] = ("h_in", "h_out"), size: int = 3) -> None:
-    """obs [1, 13] and a hidden state [1, 1, size] that counts the calls -> actions [1, 4].
+    """Write a policy: obs [1, 13], hidden call counter [1, 1, size] -> actions [1, 4].
 
-    Names as Isaac Lab's exporter has them. Throttle is a tenth of the number of calls so far.
+    Names are those of Isaac Lab's exporter. Throttle is a tenth of the number of calls so far.
     """
     taken, given = hidden
     nodes = [
@@ -112,7 +112,7 @@ def recurrent(path: Path, *, hidden: Sequence[str] = ("h_in", "h_out"), size: in
 
 
 def image_actor(path: Path, *, kind: int = FLOAT) -> None:
-    """Image [1, 3, 32, 32] of any element type -> actions [1, 4]: its mean, in image units."""
+    """Write a policy: image [1, 3, 32, 32] of any type -> actions [1, 4], the mean pixel value."""
     nodes = [
         helper.make_node("Cast", ["image"], ["pixels"], to=FLOAT),
         helper.make_node("ReduceMean", ["pixels"], ["mean"], keepdims=0),
@@ -148,14 +148,14 @@ class TupleActor(nn.Module):
 
 
 class CountingActor(nn.Module):
-    """A recurrent policy as rsl_rl exports it: the hidden state is a buffer, with ``reset``."""
+    """Recurrent policy as rsl_rl exports it: the hidden state is a buffer, with ``reset``."""
 
     def __init__(self) -> None:
         super().__init__()
         self.register_buffer("hidden_state", torch.zeros(1))
 
     def forward(self, image: Tensor, state: Tensor) -> Tensor:
-        """Throttle is a tenth of the number of calls so far."""
+        """Return a throttle of a tenth of the number of calls so far."""
         self.hidden_state += 1.0
         return torch.cat([0.1 * self.hidden_state[None], torch.zeros(1, 3)], 1) + 0.0 * state[:, :1]
 

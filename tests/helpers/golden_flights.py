@@ -13,16 +13,16 @@ NAMES = ("toge_ardupilot", "numpy_px4", "scripted_velocity_ardupilot")
 
 @cache
 def golden(name: str) -> ReplaySource:
-    """One of ``NAMES``."""
+    """Open one of ``NAMES``."""
     return open_source(FLIGHTS / name)
 
 
 @cache
 def through_gate(name: str) -> tuple[GuardStep, ...]:
-    """Its recorded chunks through the guard."""
+    """Return the guard's steps with the flight's recorded chunks."""
     return tuple(replay_guard(golden(name)))
 
 
 def copied(name: str, folder: Path) -> Path:
-    """A copy to spoil."""
+    """Return a copy that a test can damage."""
     return Path(shutil.copytree(FLIGHTS / name, folder / name))

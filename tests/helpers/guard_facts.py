@@ -1,4 +1,4 @@
-"""Facts of a vehicle that flies well, and an engagement that is stepped through them."""
+"""Facts of a vehicle that flies well, and an engagement stepped through them."""
 
 from dataclasses import replace
 from typing import Any
@@ -64,20 +64,20 @@ AIRBORNE = EngagementInputs(
     chunk_fault=None,
     envelope_problem=None,
 )
-"""Armed in ALT_HOLD, in the air, with a receiver in the middle and a policy within its limits."""
+"""Armed in ALT_HOLD, in the air, with a centred receiver and a policy within its limits."""
 ON_GROUND = replace(AIRBORNE, armed=False, echo_confirmed=False, height_m=0.0, is_landed=True)
 
 
 def stick_smoothing(
     *, max_slew_per_s: float = 0.0, tau_s: float = 0.0, max_dt_s: float = 0.15
 ) -> Smoothing:
-    """Filter of sticks; without arguments it changes nothing."""
+    """Return a filter of sticks; without arguments it changes nothing."""
     limits = LimitSettings(stick_slew_per_s=max_slew_per_s).of("sticks")
     return Smoothing(limits=limits, tau_s=tau_s, max_dt_s=max_dt_s)
 
 
 def engagement_settings(**settings: Any) -> EngagementSettings:
-    """Settings of the engagement, those of the way in among them; modes are ``MODES``."""
+    """Return settings of the engagement and its ways in; modes are ``MODES``."""
     ways_in = ("modes", "mode", "takeoff_m", "is_setpoint")
     engage = {name: settings.pop(name) for name in ways_in if name in settings}
     disengage = settings.pop("disengage", DisengageSettings())
@@ -89,7 +89,7 @@ def engagement_settings(**settings: Any) -> EngagementSettings:
 
 
 def flight_settings(**changes: Any) -> FlightSettings:
-    """Sticks at 100 Hz without a filter, in ALT_HOLD; ages up to 300 ms."""
+    """Return settings for sticks at 100 Hz without a filter, in ALT_HOLD; ages up to 300 ms."""
     ages = dict.fromkeys(("state_ns", "velocity_ns", "feature_ns", "chunk_ns"), 300 * NS_PER_MS)
     settings: dict[str, Any] = {
         "meaning": ActionMeaning(),
@@ -106,12 +106,12 @@ def flight_settings(**changes: Any) -> FlightSettings:
 
 
 def codes(reason: Reason | None) -> tuple[Code, ...]:
-    """Those of a reason; none while the policy flies."""
+    """Return the codes of a reason; none while the policy flies."""
     return () if reason is None else reason.codes
 
 
 def figures(reason: Reason | None, code: Code) -> dict[str, Value]:
-    """Those of the reason with this code, which may be inside another one; else none."""
+    """Return the figures of the reason with this code, inner reasons included, or none."""
     if reason is None:
         return {}
     if reason.code is code:
@@ -121,7 +121,7 @@ def figures(reason: Reason | None, code: Code) -> dict[str, Value]:
 
 
 class Stepped:
-    """An engagement, its facts, and everything that it decided."""
+    """An engagement, its facts, and all of its decisions."""
 
     def __init__(self, facts: EngagementInputs = AIRBORNE, **settings: Any) -> None:
         self.engagement = Engagement(engagement_settings(**settings))
@@ -131,7 +131,7 @@ class Stepped:
     def step(
         self, act: OperatorCommand | None = None, *, stop: EndRequest | None = None, **changes: Any
     ) -> Actions:
-        """One step, 10 ms after the last; changes of the facts stay."""
+        """Step once, 10 ms after the last; changes of the facts persist."""
         if stop is not None:
             self.engagement.stop(stop)
         if changes.get("interruption") is not None:
@@ -141,7 +141,7 @@ class Stepped:
         return self.moves[-1]
 
     def run(self, seconds: float, **changes: Any) -> list[Actions]:
-        """Steps for a while; returns their moves."""
+        """Step for a while; return the decisions."""
         start = len(self.moves)
         for _ in range(round(seconds * 100)):
             self.step(**changes)
@@ -157,7 +157,7 @@ class Stepped:
 
 
 def flying(facts: EngagementInputs = AIRBORNE, **settings: Any) -> Stepped:
-    """Engaged by the operator's key."""
+    """Return an engagement engaged by the operator's key."""
     stepped = Stepped(facts, **settings)
     stepped.step()
     stepped.step("engage")

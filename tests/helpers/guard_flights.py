@@ -1,8 +1,8 @@
 """The guard, the policy loop and the simulated vehicle in memory, on a stepped clock.
 
-Everything between the policy and the vehicle's motors is the real thing; the camera is not: each
-solve finds a fresh feature. A test moves the pilot's sticks, breaks the link, and reads the
-vehicle's own record and the bytes that left.
+Everything between the policy and the vehicle's motors is real; the camera is not: each solve finds
+a fresh feature. A test moves the pilot's sticks, breaks the link, and reads the vehicle's own
+record and the sent bytes.
 """
 
 import math
@@ -57,17 +57,17 @@ def hovering(_: float) -> tuple[float, float, float, float]:
 
 
 def leaning(_: float) -> tuple[float, float, float, float]:
-    """Far enough from neutral, and from any receiver, to be told apart in every record."""
+    """Return sticks far enough from neutral, and any receiver, to be told apart in records."""
     return (0.0, 0.1, 0.2, 0.3)
 
 
 def climbing_first(t_s: float) -> tuple[float, float, float, float]:
-    """Off the ground to some 4 m, then hovering with a lean."""
+    """Climb from the ground to some 4 m, then hover with a lean."""
     return (0.9, 0.0, 0.0, 0.0) if t_s < 2.5 else (0.0, 0.0, 0.0, 0.25)
 
 
 class StoppableStepper(GuardStepper):
-    """A guard that may stand still, as under SIGSTOP."""
+    """Guard that can stand still, as under SIGSTOP."""
 
     is_stopped = False
 
@@ -77,7 +77,7 @@ class StoppableStepper(GuardStepper):
 
 
 class GuardFlight:
-    """One flight of one vehicle; nothing happens until ``run`` or ``until`` is called."""
+    """One flight of one vehicle. Nothing happens until ``run`` or ``until`` is called."""
 
     def __init__(
         self,
@@ -97,7 +97,7 @@ class GuardFlight:
         self.solve_ns = 3 * MS
         self._engaged_ns: int | None = None
         self.is_flight_process_stopped = False
-        """It neither receives nor sends, as under SIGSTOP."""
+        """True if it neither receives nor sends, as under SIGSTOP."""
         self.vehicle = SimulatedVehicle(
             links=2,
             boot_ns=self.clock.now_ns(),
@@ -191,21 +191,21 @@ class GuardFlight:
         self._port.send(encode_to_guard(message))
 
     def act(self, act: OperatorCommand) -> None:
-        """An explicit act at the terminal."""
+        """Perform an explicit act at the terminal."""
         self.tell(act)
 
     def stop(self, reason: Reason = SIGNAL, *, is_fault: bool = False) -> None:
-        """Ctrl-C, or a fault of the flight process that it could still report."""
+        """Request the end: Ctrl-C, or a fault that the flight process can still report."""
         self.tell(EndRequest(reason=reason, is_fault=is_fault))
 
     def die(self) -> None:
-        """The flight process is killed: the guard reads the end of file."""
+        """Kill the flight process: the guard reads the end of file."""
         self.is_flight_process_stopped = True
         self.guard_port.is_closed = True
         self._wake()
 
     def kill_guard(self) -> None:
-        """The guard is killed, and the flight process sends its last words after 2 ms."""
+        """Kill the guard; the flight process sends its last words after 2 ms."""
         self.guard.is_done = True
         words = [r for r in self.guard_port.reports if isinstance(r, LastWords)][-1]
         for after_ns, packet in words.packets:
@@ -213,7 +213,7 @@ class GuardFlight:
             self.clock.schedule(at_ns, partial(self.up.send, packet))
 
     def stand_still(self, seconds: float) -> None:
-        """Both processes stand still, as the machine does in a long stall; then they go on."""
+        """Stop both processes, as in a long stall of the machine, and continue."""
         self.is_flight_process_stopped = self.guard_stepper.is_stopped = True
         self.run(seconds)
         self.is_flight_process_stopped = self.guard_stepper.is_stopped = False
@@ -236,7 +236,7 @@ class GuardFlight:
         self.clock.sleep_until_ns(self.clock.now_ns() + round(seconds * NS_PER_S))
 
     def until(self, condition: Callable[[], object], *, within_s: float) -> float:
-        """Let time pass until the condition holds; returns the seconds that it took."""
+        """Let time pass until the condition holds; return the seconds that it took."""
         start_ns = self.clock.now_ns()
         end_ns = start_ns + round(within_s * NS_PER_S)
         while not condition():
@@ -245,7 +245,7 @@ class GuardFlight:
         return (self.clock.now_ns() - start_ns) / NS_PER_S
 
     def describe(self) -> str:
-        """The state of both ends, for a failed test."""
+        """Return the state of both ends, for a failed test."""
         ap = self.vehicle.ap
         return (
             f"{self.phase} ({self.reason}); {ap.mode.name}, armed {ap.armed}, "
@@ -284,7 +284,7 @@ class GuardFlight:
         return self
 
     def fly(self, seconds: float = 1.5) -> "GuardFlight":
-        """Launch, engage by the key, and let the policy fly; long enough for the echo."""
+        """Launch, engage by the key, and let the policy fly long enough for the echo."""
         self.launch()
         self.act("engage")
         self.until(lambda: self.phase is Phase.FLYING, within_s=3.0)
@@ -293,7 +293,7 @@ class GuardFlight:
         return self
 
     def take_off(self, seconds: float = 4.0) -> "GuardFlight":
-        """Engage with --arm on the ground, and climb; for a vehicle without a receiver too."""
+        """Engage with --arm on the ground, and climb; also for a vehicle without a receiver."""
         self.until(lambda: self.phase is Phase.FLYING, within_s=12)
         self.run(seconds)
         assert self.phase is Phase.FLYING, self.describe()
@@ -340,7 +340,7 @@ class GuardFlight:
         return [r.text for r in self.guard_port.reports if isinstance(r, GuardMessage)]
 
     def phases(self, since_ns: int = 0) -> list[Phase]:
-        """Phases in order, each once in a row."""
+        """Phases in order, without repeats."""
         found: list[Phase] = []
         for tick in self.ticks:
             if tick.sent_ns >= since_ns and (not found or found[-1] is not tick.phase):
@@ -348,13 +348,13 @@ class GuardFlight:
         return found
 
     def left(self, since_ns: int = 0) -> list[tuple[int, Any]]:
-        """MAVLink messages that left the guard, with their times, also those that got lost."""
+        """MAVLink messages that left the guard, with their times, including lost ones."""
         end = WireEnd()
         found = [(at_ns, m) for at_ns, data in self.up.sent for m in end.read(data)]
         return [(at_ns, m) for at_ns, m in found if at_ns >= since_ns]
 
     def commands(self, number: int, since_ns: int = 0) -> list[tuple[float, ...]]:
-        """Parameters 1 and 2 of the COMMAND_LONG of this number that left."""
+        """Return parameters 1 and 2 of every sent COMMAND_LONG of this number."""
         return [
             (m.param1, m.param2)
             for _, m in self.left(since_ns)
@@ -362,17 +362,17 @@ class GuardFlight:
         ]
 
     def modes_asked(self, since_ns: int = 0) -> list[int]:
-        """Numbers of the modes that were requested."""
+        """Numbers of the requested modes."""
         return [int(mode) for _, mode in self.commands(dialect.MAV_CMD_DO_SET_MODE, since_ns)]
 
     def sticks_sent(self, since_ns: int = 0) -> list[tuple[int, Sticks]]:
-        """Overrides that left, as sticks; releases left out."""
+        """Sent overrides as sticks, without releases."""
         return [
             (t.sent_ns, t.sent) for t in self.ticks if t.sent is not None and t.sent_ns >= since_ns
         ]
 
     def overrides(self, since_ns: int = 0) -> list[tuple[int, tuple[int, ...]]]:
-        """The first four channels of each RC_CHANNELS_OVERRIDE that left, in microseconds."""
+        """First four channels of each sent RC_CHANNELS_OVERRIDE [us]."""
         return [
             (at_ns, (m.chan1_raw, m.chan2_raw, m.chan3_raw, m.chan4_raw))
             for at_ns, m in self.left(since_ns)
@@ -392,7 +392,7 @@ class GuardFlight:
     # --- others
 
     def pilot_mode(self, number: int) -> None:
-        """The pilot changes the mode by a ground station."""
+        """Change the mode as a pilot at a ground station."""
         self.station(
             lambda mav: mav.command_long_encode(
                 1, 1, dialect.MAV_CMD_DO_SET_MODE, 0, 1, number, 0, 0, 0, 0, 0
@@ -403,18 +403,18 @@ class GuardFlight:
     def station(
         self, encode: Callable[[dialect.MAVLink], dialect.MAVLink_message], *, system: int = 255
     ) -> None:
-        """Another station sends a message on a link of its own."""
+        """Send a message of another station over a separate link."""
         end = WireEnd(system=system, component=190)
         self.vehicle.receive(1, end.pack(encode(end.mav)), self.clock.now_ns())
 
     def joystick(self, rate_hz: float, us: tuple[int, int, int, int]) -> None:
-        """A joystick on our system id overrides the same channels from now on."""
+        """Override the same channels from now on with a joystick that uses our system id."""
 
         def send() -> None:
             self.station(lambda mav: mav.rc_channels_override_encode(1, 1, *us, 0, 0, 0, 0))
             self.clock.schedule(self.clock.now_ns() + round(NS_PER_S / rate_hz), send)
 
-        # In the middle between two sends of ours: just before one it would never be shown.
+        # Halfway between two of our sends: just before one it would never be shown.
         self.clock.schedule(self.clock.now_ns() + 13 * MS // 2, send)
 
     def receiver(self, **channels_us: int) -> None:
@@ -425,6 +425,6 @@ class GuardFlight:
         self.vehicle.set_receiver(values)
 
     def inject(self, data: bytes, sender: Address) -> None:
-        """Bytes reach the guard from another address."""
+        """Send bytes to the guard from another address."""
         self.network.strangers.append(Received(data, self.clock.now_ns(), sender))
         self._wake()

@@ -1,4 +1,4 @@
-"""A guard with its real output and sender, and a vehicle, a pilot and a flight process by hand."""
+"""A guard with its real output and sender; vehicle, pilot and flight process are set by hand."""
 
 from collections import deque
 from collections.abc import Iterator
@@ -49,12 +49,12 @@ FLIGHT_MODES = {
     ("px4", "velocity"): "OFFBOARD",
 }
 CODES = 200
-"""Chunks that are told apart by what the wire shows of them."""
+"""Number of chunks that can be told apart on the wire."""
 JOYSTICK = Sticks(0.3, -0.4, -0.6, -0.5)
 
 
 class Wire:
-    """A transport that keeps what is sent; it may be down."""
+    """Transport that keeps the sent data."""
 
     def __init__(self) -> None:
         self.sent: list[bytes] = []
@@ -80,11 +80,11 @@ class Wire:
 
 
 class Copter(FlownVehicle):
-    """The vehicle's word about itself, set by hand."""
+    """The vehicle's report about itself, set by hand."""
 
     is_failsafe = False
     switch_us = 1500
-    """Channel 7."""
+    """Pulse width of channel 7."""
 
     def use_output(self, output: Output) -> None:
         pass
@@ -110,15 +110,15 @@ class Shown:
 
     at_ns: int
     kind: str
-    """policy, neutral, release."""
+    """policy, neutral or release."""
     code: int | None
-    """Which chunk a policy's packet is made of."""
+    """Code of the chunk that a policy's packet comes from."""
     phase: Phase
 
 
 @dataclass
 class GuardWorld:
-    """Everything around one guard; ``step`` is one wake of it."""
+    """Everything around one guard; ``step`` is one wake-up of it."""
 
     autopilot: str
     kind: Any
@@ -135,13 +135,13 @@ class GuardWorld:
     refused_mode: str | None = None
     is_switched_off: bool = False
     has_chunks: bool = True
-    """The flight process computes a chunk every 10 ms."""
+    """True if the flight process computes a chunk every 10 ms."""
     hears: bool = True
-    """What we send reaches the vehicle."""
+    """True if our messages reach the vehicle."""
     shows: bool = True
-    """The vehicle's messages that show our sticks reach us."""
+    """True if the vehicle's messages that show our sticks reach us."""
     joystick_ns: int = 0
-    """Period of another source that sends to the vehicle; 0: there is none."""
+    """Period of another source that sends to the vehicle; 0: none."""
     odd_chunk: Chunk | None = None
     wire: Wire = field(default_factory=Wire)
     packets: list[Shown] = field(default_factory=list)
@@ -160,9 +160,9 @@ class GuardWorld:
         self.guard = Guard(self._settings(meaning), self.clock.now_ns())
         self.end = WireEnd()
         self.chunks: dict[int, Chunk] = {}
-        """Those that may be flown, by code."""
+        """Chunks available to the guard, by code."""
         self.acts_on: tuple[int, ...] | None = None
-        """What the vehicle was told last, as it would show it."""
+        """The last command that reached the vehicle, as the vehicle would show it."""
         self.others_due_ns = self.shown_ns = 0
 
     def _settings(self, meaning: ActionMeaning) -> FlightSettings:
@@ -202,7 +202,7 @@ class GuardWorld:
     # --- the flight process
 
     def chunk(self, **changes: Any) -> Chunk:
-        """A fresh chunk, or one with other stamps or actions."""
+        """Return a fresh chunk, or one with other stamps or actions."""
         self.serial += 1
         now_ns = self.now_ns
         action: Action = Sticks(0.1, 0.0, 0.2 + 0.0025 * (self.serial % CODES), 0.0)
@@ -232,7 +232,7 @@ class GuardWorld:
             self.step()
 
     def stall(self, ms: int) -> None:
-        """The guard does not run for so long; the vehicle does."""
+        """Let time pass for the vehicle only."""
         for _ in range(0, ms, 10):
             self.clock.advance_ns(STEP_NS)
             self._show()
@@ -250,7 +250,7 @@ class GuardWorld:
         return done
 
     def _snapshot(self) -> LinkSnapshot:
-        """As the link makes it of the output and the session."""
+        """Return the snapshot that the link would make from output and session."""
         output, now_ns = self.output, self.now_ns
         vehicle: Any = self.vehicle
         others = output.overruled(now_ns)
@@ -273,7 +273,7 @@ class GuardWorld:
     # --- the vehicle
 
     def _show(self) -> None:
-        """The vehicle's message that shows what it acts on, every 20 ms."""
+        """Send the vehicle's message with the command that it acts on, every 20 ms."""
         if self.joystick_ns and self.now_ns >= self.others_due_ns:
             self.others_due_ns = self.now_ns + self.joystick_ns
             self.acts_on = self._as_shown(JOYSTICK)
@@ -305,7 +305,7 @@ class GuardWorld:
         return RcChannels(channels_us, boot_us)
 
     def _take(self) -> None:
-        """Read what has left, by pymavlink; the vehicle acts on it if it hears it."""
+        """Read the sent packets by pymavlink; the vehicle acts on them if it hears them."""
         sent, self.wire.sent[:] = list(self.wire.sent), []
         for data in sent:
             (message,) = self.end.read(data)
@@ -316,7 +316,7 @@ class GuardWorld:
 
 
 def _meaning(m: Any) -> tuple[str, int | None, tuple[int, ...] | None]:
-    """Kind and code of a packet, and what the vehicle will show of it."""
+    """Return kind and code of a packet, and the vehicle's echo of it."""
     match m.get_type():
         case "RC_CHANNELS_OVERRIDE":
             acts_on = (m.chan3_raw, m.chan4_raw, m.chan2_raw, m.chan1_raw)

@@ -1,4 +1,4 @@
-"""The edges of a flight in memory: a link with faults, a channel that is read, no camera."""
+"""Surroundings of a flight in memory: a link with faults, a readable channel, no camera."""
 
 import random
 from collections import deque
@@ -20,17 +20,17 @@ MS = NS_PER_MS
 
 
 class Direction(DelayedChannel):
-    """One direction of the link, whose faults may be changed in flight."""
+    """One direction of the link, whose faults can be changed in flight."""
 
     def __init__(self, clock: SteppedClock) -> None:
         self.delay_ns = NS_PER_MS * 3 // 10
         self.loss = 0.0
         self.is_silent = False
         self.bytes_per_s = 0.0
-        """Bandwidth; what finds half a second of packets before it is dropped. 0: unlimited."""
+        """Bandwidth; packets behind half a second of others are dropped. 0: unlimited."""
         self._free_ns = 0
         self.sent: list[tuple[int, bytes]] = []
-        """Every datagram, also those that got lost, with its time."""
+        """Every datagram with its time, including lost ones."""
         self._draw = random.Random(1)
         self._world = clock
         super().__init__(clock, self._delays_ns())
@@ -53,30 +53,30 @@ class Direction(DelayedChannel):
 
 
 class Network(MemoryTransport):
-    """The guard's end of the link, which other addresses may write to as well."""
+    """The guard's end of the link, which other addresses can write to, too."""
 
     def __init__(self, clock: SteppedClock, to_vehicle: Direction, from_vehicle: Direction) -> None:
         super().__init__(clock, to_vehicle=to_vehicle, from_vehicle=from_vehicle)
         self._to_vehicle: Direction = to_vehicle
         self.address: Address = VEHICLE
-        """Where the vehicle sends from."""
+        """Address that the vehicle sends from."""
         self.strangers: deque[Received] = deque()
         self.is_down = False
-        """The port is gone."""
+        """True if the port is gone."""
 
     def open(self) -> None:
         if self.is_down:
             raise TransportDownError("no such port")
 
     def fileno(self) -> int | None:
-        """So that the guard prepares its last words."""
+        """Return a number, so that the guard prepares its last words."""
         return 7
 
     def send(self, data: bytes, peer: Address | None = None) -> bool:
         self.open()
         if peer is None or peer == self.address:
             return super().send(data, peer)
-        self._to_vehicle.sent.append((self._clock.now_ns(), data))  # to where it was
+        self._to_vehicle.sent.append((self._clock.now_ns(), data))  # to its former address
         return True
 
     def drain(self) -> Iterator[Received]:
@@ -88,7 +88,7 @@ class Network(MemoryTransport):
 
 
 class FlightPort(MemoryPort):
-    """The guard's end of the channel to the flight process; keeps everything that was reported."""
+    """The guard's end of the channel to the flight process; keeps every report."""
 
     def __init__(self, **channels: DelayedChannel) -> None:
         super().__init__(**channels)
@@ -100,14 +100,14 @@ class FlightPort(MemoryPort):
 
 
 class FreshFeatures(FeatureCache):
-    """A camera that never fails, unless told to."""
+    """Camera without faults, except for those that a test sets."""
 
     def __init__(self, clock: SteppedClock) -> None:
         super().__init__()
         self._clock = clock
         self.fault: Reason | None = None
         self.stopped_ns: int | None = None
-        """When the last image was exposed; None: just now."""
+        """Exposure of the last image; None: just now."""
 
     def latest(self) -> FeatureFrame:
         captured_ns = self.stopped_ns or self._clock.now_ns() - 20 * MS
@@ -121,7 +121,7 @@ class FreshFeatures(FeatureCache):
 
 
 class NoCamera:
-    """Never read: the features come from ``FreshFeatures``."""
+    """Never read, because the features come from ``FreshFeatures``."""
 
     dropped_frames = 0
 

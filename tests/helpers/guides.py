@@ -1,4 +1,4 @@
-"""Reads the project's Markdown: fenced blocks, the commands in them, links and pictures."""
+"""Reader of the project's Markdown: fenced blocks and their commands, links and pictures."""
 
 import re
 import shlex
@@ -30,21 +30,21 @@ class Block:
     """A fenced block, with the HTML comment above it."""
 
     page: str
-    """Relative to the project's folder."""
+    """Path relative to the project's folder."""
     kind: str
-    """Language of the block; empty where it names none."""
+    """Language of the block; empty if it names none."""
     mark: str
-    """Who runs it, as in ``run by tests/system/test_guides.py``; empty without such a comment."""
+    """Test that runs it, as in ``run by tests/system/test_guides.py``; empty if none is named."""
     text: str
 
 
 def page_name(page: Path) -> str:
-    """Path of a page from the project's folder."""
+    """Return the path of a page from the project's folder."""
     return str(page.relative_to(ROOT))
 
 
 def blocks(page: Path) -> Iterator[Block]:
-    """All fenced blocks of a page."""
+    """Return all fenced blocks of a page."""
     for match in _BLOCK.finditer(page.read_text()):
         yield Block(
             page=page_name(page),
@@ -55,7 +55,7 @@ def blocks(page: Path) -> Iterator[Block]:
 
 
 def command_lines(text: str) -> Iterator[list[str]]:
-    """Words of each command of a shell block, without environment, redirection and comments."""
+    """Yield the words of each shell command, without environment, redirection and comments."""
     for line in text.replace("\\\n", " ").splitlines():
         try:
             words = shlex.split(line.removeprefix("$ "), comments=True)
@@ -70,14 +70,14 @@ def command_lines(text: str) -> Iterator[list[str]]:
 
 
 def inline_codes(page: Path) -> Iterator[tuple[str, bool]]:
-    """Each text between backticks outside fenced blocks; true in the first cell of a table."""
+    """Yield each text in backticks outside fenced blocks, and True for a table's first cell."""
     for line in _BLOCK.sub("", page.read_text()).splitlines():
         for match in _INLINE.finditer(line):
             yield match[1], line.startswith("|") and "|" not in line[1 : match.start()]
 
 
 def links(page: Path) -> Iterator[tuple[Path, str]]:
-    """File and anchor of each link and picture of a page that leads into the project."""
+    """Return file and anchor of each link and picture of a page that points into the project."""
     for target in _LINK.findall(_BLOCK.sub("", page.read_text())):
         if "://" in target or target.startswith("mailto:"):
             continue
@@ -86,7 +86,7 @@ def links(page: Path) -> Iterator[tuple[Path, str]]:
 
 
 def anchors(page: Path) -> set[str]:
-    """Anchors of a page's headings, as GitHub makes them."""
+    """Return the anchors of a page's headings, as GitHub makes them."""
     headings = re.findall(r"^#+ (.+)$", _BLOCK.sub("", page.read_text()), re.M)
     texts = (re.sub(r"[^\w\- ]", "", heading.lower()) for heading in headings)
     return {text.replace(" ", "-") for text in texts}

@@ -1,7 +1,7 @@
 """Checkpoints and inputs of the parity tests of LeRobot policies, by formula.
 
-The files of a ResNet have 45 MB, so the weights are not kept: LeRobot's code and ours are given the
-same ones, drawn by name. This module is used in both environments and needs numpy alone.
+The files of a ResNet have 45 MB, so the weights are not kept: LeRobot's code and ours get equal
+weights, drawn by name. This module is used in both environments and needs only numpy.
 """
 
 import json
@@ -17,13 +17,13 @@ CONSTANTS = ("pos_grid", "vae_encoder_pos_enc")
 
 
 def drawn(name, shape, seed=0):
-    """Standard normal numbers, the same for the same name; numpy guarantees this stream."""
+    """Return standard normal numbers that depend only on the name; numpy guarantees this stream."""
     random = np.random.RandomState(zlib.crc32(f"{seed} {name}".encode()))
     return random.standard_normal(shape).astype(np.float32)
 
 
 def weight(name, shape):
-    """A value for a parameter that keeps signals at about their size."""
+    """Return a value for a parameter that roughly preserves the size of signals."""
     if name.endswith("num_batches_tracked"):
         return np.array(7, np.int64)
     values = drawn(name, shape)
@@ -37,7 +37,7 @@ def weight(name, shape):
 
 
 def weights(folder: Path, constants):
-    """All tensors of a kept checkpoint."""
+    """Return all tensors of a kept checkpoint."""
     shapes = json.loads((folder / SHAPES_FILE).read_text())
     return {
         name: constants[name] if name in constants else weight(name, tuple(shape))
@@ -46,7 +46,7 @@ def weights(folder: Path, constants):
 
 
 def statistics(features):
-    """Statistics of each feature {key: shape}: neither zero nor one, and one constant number."""
+    """Return statistics of each feature {key: shape}: neither 0 nor 1, and one constant."""
     found = {}
     for key, shape in features.items():
         one = (3, 1, 1) if len(shape) == 3 else tuple(shape)
@@ -61,7 +61,7 @@ def statistics(features):
 
 
 def images(shape, seed):
-    """Soft images in [0, 1], float32, of the shape [..., 3, H, W]."""
+    """Return smooth images in [0, 1], float32, of the shape [..., 3, H, W]."""
     coarse = drawn("image", (*shape[:-2], 4, 4), seed)
     rows, columns = (np.arange(size) * 4 // size for size in shape[-2:])
     smooth = coarse[..., rows, :][..., columns] + np.float32(0.2) * drawn("grain", shape, seed)

@@ -1,4 +1,4 @@
-"""What lerobot 0.6.1 takes for granted of a dataset of format v3.0, written down.
+"""Assumptions of lerobot 0.6.1 about a dataset of format v3.0.
 
 Each rule names the file and line of ``src/lerobot`` that breaks without it. lerobot itself cannot
 be imported beside this project's torch (it needs torchvision, and torch < 2.12).
@@ -23,7 +23,7 @@ DEFAULT_FEATURES = {  # utils/constants.py:81-87
 
 
 def broken_rules(root: Path) -> list[str]:
-    """The rules that a dataset breaks; every one of them, in words."""
+    """Return all rules that a dataset breaks, in words."""
     info = json.loads((root / "meta/info.json").read_text())
     episodes = _concatenated(root / "meta/episodes")
     rows = _concatenated(root / "data")
@@ -41,7 +41,7 @@ def broken_rules(root: Path) -> list[str]:
 
 
 def _concatenated(folder: Path) -> pa.Table:
-    """In the order of datasets/io_utils.py:75: that of the names."""
+    """Join in the order of datasets/io_utils.py:75, which is that of the names."""
     return pa.concat_tables([pq.read_table(path) for path in sorted(folder.glob("*/*.parquet"))])
 
 
@@ -79,7 +79,7 @@ def _rows(info: dict[str, Any], episodes: pa.Table, rows: pa.Table) -> Iterator[
     for number, episode in enumerate(episodes.to_pylist()):
         end = start + episode["length"]
         if (episode["episode_index"], episode["dataset_from_index"]) != (number, start):
-            yield f"episode {number} is not the next"  # dataset_reader.py:218: by place
+            yield f"episode {number} is not the next"  # dataset_reader.py:218: by position
         if episode["dataset_to_index"] != end:  # dataset_reader.py:220-228
             yield f"dataset_to_index of episode {number}"
         part = rows.slice(start, episode["length"])
@@ -111,7 +111,7 @@ def _files(root: Path, info: dict[str, Any], episodes: pa.Table) -> Iterator[str
 def _tasks(root: Path, info: dict[str, Any], rows: pa.Table) -> Iterator[str]:
     table = pq.read_table(root / "meta/tasks.parquet")
     pandas = json.loads((table.schema.metadata or {}).get(b"pandas", b"{}"))
-    # io_utils.py:184, dataset_reader.py:352: the words are pandas' index, by place
+    # io_utils.py:184, dataset_reader.py:352: the texts are pandas' index, selected by position
     if pandas.get("index_columns") != ["task"] or not pa.types.is_string(table["task"].type):
         yield "tasks are not the index"
     if table["task_index"].to_pylist() != list(range(info["total_tasks"])):
@@ -156,7 +156,7 @@ def _pts(path: Path) -> tuple[np.ndarray, float]:
 
 
 def _found(path: Path, asked: np.ndarray, pts_s: np.ndarray, average_fps: float) -> Iterator[str]:
-    """Both decoders of lerobot find frame k where row k asks for it."""
+    """Check that both decoders of lerobot find frame k where row k asks for it."""
     wanted = asked.astype(np.float32)
     nearest = np.abs(pts_s.astype(np.float32)[:, None] - wanted).min(axis=0)
     if not (nearest < TOLERANCE_S).all():  # PyAV: video_utils.py:158-193
@@ -191,7 +191,7 @@ def _of_episode(episode: dict[str, Any], name: str) -> dict[str, Any]:
 
 
 def _policy_features(info: dict[str, Any]) -> Iterator[str]:
-    """utils/feature_utils.py:168-172: these names become inputs and outputs of a policy."""
+    """Check utils/feature_utils.py:168-172: these names become inputs and outputs of a policy."""
     taken = {n for n in info["features"] if n.startswith(("observation", "action"))}
     if taken != {"observation.images.front", "observation.state", "action"}:
         yield f"a policy would take {sorted(taken)}"

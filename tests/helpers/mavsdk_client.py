@@ -1,4 +1,4 @@
-"""Prints as JSON what a MAVSDK program reads from the vehicle; needs MAVSDK's interpreter."""
+"""Prints as JSON the data that MAVSDK reads from the vehicle; needs MAVSDK's interpreter."""
 
 import json
 import sys

@@ -1,4 +1,4 @@
-"""Whether this computer has the networks that a test exchanges packets on."""
+"""Checks for the networks on which tests exchange packets."""
 
 import socket
 

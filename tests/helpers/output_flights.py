@@ -1,6 +1,6 @@
 """Flights in simulated time with any kind of action on any firmware, and the vehicle's own record.
 
-The policy is a scripted one, so that every kind of action flies the same programs.
+The policy is a scripted one, so that every kind of action flies equal programs.
 """
 
 import math
@@ -30,7 +30,7 @@ from sitl.rotation import Quat, cos_tilt
 from sitl.vehicle.config import MID_RECEIVER_US, AutopilotName, Px4Release
 
 LEANING = Program(motion=lambda _: Motion(push=Push("roll", 0.5)))
-"""Lean 15 degrees to the right, or 2 m/s to the right: far from neutral in every record."""
+"""Lean 15 degrees to the right, or fly 2 m/s to the right: far from neutral in every record."""
 HOVERING = make_program("hover", "sticks")
 SQUARE = make_program("square", "sticks")
 SQUARE_S = 4 * LEG_S
@@ -46,47 +46,47 @@ FLIGHT_MODES: dict[tuple[AutopilotName, ActionKind], str] = {
     ("px4", "rates"): "OFFBOARD",
     ("px4", "velocity"): "OFFBOARD",
 }
-"""The mode that each kind of action is flown in by default."""
+"""Default mode for each kind of action."""
 COMBINATIONS = tuple(FLIGHT_MODES)
 CENTRED_US = 12
-"""Sticks this near to the middle are neutral: the walk of the echo check is less."""
+"""Sticks this close to the middle count as neutral: the dither of the echo check is smaller."""
 NEUTRAL_TILT_RAD, NEUTRAL_RATE_RADPS = math.radians(1.0), math.radians(1.5)
 NEUTRAL_MPS = 0.1
 
 
 class Sample(NamedTuple):
-    """The vehicle after one of its own control steps."""
+    """State of the vehicle after one of its own control steps."""
 
     t_s: float
-    """Since boot."""
+    """Time since boot."""
     mode: str
     armed: bool
     failsafe: bool
     is_neutral: bool
-    """What it was last told is level or at rest."""
+    """True if the last command is level or at rest."""
     lean_deg: float
     speed_mps: float
-    """Horizontal."""
+    """Horizontal speed."""
     position_ned_m: tuple[float, float, float]
 
 
 @dataclass(frozen=True, kw_only=True)
 class Aftermath:
-    """What the vehicle did after a moment, in ms from then; None: never."""
+    """Reaction of the vehicle after a given time, in ms from then; None: never."""
 
     neutral_ms: float | None
-    """Until it was told to be level or at rest, or another mode took over, or it was disarmed."""
+    """Time until a command was level or at rest, another mode took over, or it was disarmed."""
     mode_ms: float | None
     mode: str | None
-    """The first other mode than that of the flight."""
+    """First mode that differs from that of the flight."""
     lean_held_ms: float
-    """Longest that it kept nine tenths of the lean that it had then."""
+    """Time for which it kept nine tenths of its initial lean."""
     level_ms: float | None
-    """Until it leaned by less than 2 degrees."""
+    """Time until it leaned by less than 2 degrees."""
     rest_ms: float | None
-    """Until it was slower than 0.3 m/s, and stayed so."""
+    """Time until it was slower than 0.3 m/s, and stayed so."""
     flew_again: bool
-    """After it was neutral, it was told otherwise in the mode of the flight."""
+    """True if, after it was neutral, it got other commands in the mode of the flight."""
     final_mode: str
     final_armed: bool
 
@@ -106,7 +106,7 @@ class OutputFlight(GuardFlight):
         px4_release: Px4Release = "1.18",
         **config: Any,
     ) -> None:
-        """``config`` as in ``GuardFlight``; ``receiver_us`` None is MID for ArduPilot."""
+        """``config`` as in ``GuardFlight``. ``receiver_us=None`` is MID for ArduPilot."""
         self.autopilot, self.kind, self.is_px4 = autopilot, kind, autopilot == "px4"
         self.mode = FLIGHT_MODES[autopilot, kind]
         self.samples: list[Sample] = []
@@ -146,7 +146,7 @@ class OutputFlight(GuardFlight):
         return chunk
 
     def return_nan(self) -> None:
-        """The policy computes nonsense from now on."""
+        """Return NaN from the policy from now on."""
         self._nan_from_ns = self.clock.now_ns()
 
     # --- into the air
@@ -158,7 +158,7 @@ class OutputFlight(GuardFlight):
         return self
 
     def put_in_air(self) -> None:
-        """Hover armed under the pilot, wherever the vehicle has been."""
+        """Hover armed under the pilot, from any state of the vehicle."""
         self.vehicle.launch(
             AirborneStart(
                 position_ned_m=(0.0, 0.0, -HEIGHT_M),
@@ -167,20 +167,20 @@ class OutputFlight(GuardFlight):
                 next_gate=0,
             )
         )
-        self.run(0.6)  # its estimator has a position then
+        self.run(0.6)  # its estimator has a position by then
         if not self.is_px4:
             assert self.ardupilot.set_mode(ArduMode[self.mode])
         elif self.kind != "sticks":
             self._forget_sticks()
 
     def _forget_sticks(self) -> None:
-        """As if the vehicle had been armed without sticks: nobody has ever moved any."""
+        """Reset PX4 to a vehicle that was armed without sticks, none of which has ever moved."""
         self.px4.commander.set_mode(Px4Mode.AUTO_LOITER)
         self.px4.stick_input.valid = self.px4.stick_input._never_ages = False
         self.px4.commander.start(ignores_sticks=True)
 
     def fly(self, seconds: float = 1.5) -> "OutputFlight":
-        """Launch, engage by the key, and let the policy fly its program, at once."""
+        """Launch, engage by the key, and let the policy start its program at once."""
         self.launch()
         self.act("engage")
         self.until(lambda: self.phase is Phase.FLYING, within_s=1.5)
@@ -224,18 +224,18 @@ class OutputFlight(GuardFlight):
         )
 
     def command(self, number: int, *params: float, system: int = 42) -> None:
-        """Another station's COMMAND_LONG."""
+        """Send a COMMAND_LONG of another station."""
         values = [*params, *[0.0] * (7 - len(params))]
         self.station(lambda mav: mav.command_long_encode(1, 1, number, 0, *values), system=system)
 
     def pilot_changes_mode(self) -> str:
-        """The pilot takes over by a ground station, with a mode that holds; its name."""
+        """Take over as a pilot at a ground station, in a mode that holds; return its name."""
         main, sub = (4, 3) if self.is_px4 else (ArduMode.LOITER.value, 0)
         self.command(dialect.MAV_CMD_DO_SET_MODE, 1, main, sub)
         return "AUTO.LOITER" if self.is_px4 else "LOITER"
 
     def lose_position(self) -> None:
-        """The estimator has no horizontal position any more."""
+        """Make the estimator lose its horizontal position."""
         (self.px4 if self.is_px4 else self.ardupilot).position_lost = True
 
     # --- the record
@@ -292,7 +292,7 @@ class OutputFlight(GuardFlight):
         )
 
     def aftermath(self, since_s: float) -> Aftermath:
-        """Read the record from a moment on, at which the policy flew."""
+        """Read the record from a time on at which the policy flew."""
         before = [s for s in self.samples if s.t_s <= since_s][-1]
         after = [s for s in self.samples if s.t_s > since_s]
         assert before.mode == self.mode, before

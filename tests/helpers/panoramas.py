@@ -1,4 +1,4 @@
-"""A world painted on the sky, and a camera that turns in it: a check of the model's frame warp."""
+"""A world painted on the sky, and a camera that turns in it, to check the model's frame warp."""
 
 import math
 from dataclasses import dataclass
@@ -16,13 +16,13 @@ from sitl.rotation import from_euler
 Array = NDArray[np.float64]
 FRD_FROM_FLU = np.diag([1.0, -1.0, -1.0])
 NEAREST = 1e-3
-"""Depth of a unit ray: what is beside or behind the camera ends far outside of the image."""
+"""Depth limit of a unit ray: points beside or behind the camera project far outside the image."""
 FOV_RAD, TILT_RAD = math.radians(90.0), math.radians(10.0)
 
 
 @dataclass(frozen=True)
 class PinholeCamera:
-    """Fixed to the body; its images are squares, and its pixel centres are integers.
+    """Camera fixed to the body; its images are squares, and its pixel centres are integers.
 
     Camera axes: x right, y down, z along the optical axis.
     """
@@ -39,13 +39,13 @@ class PinholeCamera:
         return np.array([[0.0, sine, cosine], [1.0, 0.0, 0.0], [0.0, cosine, -sine]])
 
     def rays(self) -> Array:
-        """[size, size, 3] in camera axes, of unit depth."""
+        """Return rays [size, size, 3] in camera axes, of unit depth."""
         across = (np.arange(self.size) - (self.size - 1) / 2) / self.focal_px
         x, y = np.meshgrid(across, across)
         return np.stack([x, y, np.ones_like(x)], axis=-1)
 
     def look_up(self, image: ImageArray, rays: Array) -> tuple[ImageArray, NDArray[np.bool_]]:
-        """What an image shows in directions [H, W, 3], and which of them lie inside of it."""
+        """Return an image's colours in directions [H, W, 3], and the mask of those inside it."""
         depth = np.maximum(rays[..., 2], NEAREST)
         last = self.size - 1
         u, v = (self.focal_px * rays[..., axis] / depth + last / 2 for axis in (0, 1))
@@ -62,7 +62,7 @@ class PinholeCamera:
     def turned(
         self, image: ImageArray, ned_from_before: Array, ned_from_after: Array
     ) -> ImageArray:
-        """The image after a turn of the body [3, 3] each, were all things far away."""
+        """Return the image after the turn between two attitudes [3, 3], if all things are far."""
         axes = self.frd_from_camera
         before_from_after = axes.T @ ned_from_before.T @ ned_from_after @ axes
         return self.look_up(image, self.rays() @ before_from_after.T)[0]
@@ -73,7 +73,7 @@ def nominal_lens(size: int) -> PinholeCamera:
 
 
 def state_of(roll_rad: float, pitch_rad: float, yaw_rad: float) -> NDArray[np.float32]:
-    """A state [13] with this attitude."""
+    """Return a state [13] with this attitude."""
     state = make_state().values.copy()
     quaternion = np.array(from_euler(roll_rad, pitch_rad, yaw_rad))
     state[QUATERNION] = quaternion if quaternion[0] >= 0 else -quaternion
@@ -81,13 +81,13 @@ def state_of(roll_rad: float, pitch_rad: float, yaw_rad: float) -> NDArray[np.fl
 
 
 def attitude(roll_rad: float = 0.0, pitch_rad: float = 0.0, yaw_rad: float = 0.0) -> Array:
-    """[3, 3] NED from FRD."""
+    """Return the rotation [3, 3] from FRD to NED."""
     quaternion = state_of(roll_rad, pitch_rad, yaw_rad)[QUATERNION].astype(np.float64)
     return rotation.rotate(quaternion, np.eye(3)).T
 
 
 def panorama(lens: PinholeCamera, ned_from_frd: Array) -> ImageArray:
-    """The view: smooth colours of all directions, all of them far away."""
+    """Return the view: smooth colours of all directions, infinitely far away."""
     ned = lens.rays() @ (ned_from_frd @ lens.frd_from_camera).T
     ned /= np.linalg.norm(ned, axis=-1, keepdims=True)
     waves = np.random.default_rng(0).normal(size=(3, 12, 3))

@@ -1,4 +1,4 @@
-"""A vehicle that has parameters and nothing else, in front of the part that deals with them."""
+"""A vehicle that has only parameters, in front of the code that reads and writes them."""
 
 import random
 from collections.abc import Callable, Iterator
@@ -35,11 +35,11 @@ SAFE: dict[str, float] = {
     "SIMPLE": 0.0,
     "SUPER_SIMPLE": 0.0,
 }
-"""Parameters with which a flight may begin."""
+"""Parameters with which a flight can begin."""
 
 
 def lossy(share: float, seed: int) -> Callable[[int], bool]:
-    """Lose this share of the packets, at random."""
+    """Lose this share of the packets at random."""
     draw = random.Random(seed)
     return lambda _: draw.random() < share
 
@@ -49,9 +49,9 @@ def status(armed: bool, has_receiver: bool | None) -> VehicleStatus:
 
 
 class ParamVehicle:
-    """Answers one step later; each request or answer for which ``loses(number)`` is lost.
+    """Answers one step later; a request or answer for which ``loses(number)`` is True is lost.
 
-    ``changes`` are made to ``SAFE``; None takes a parameter away.
+    ``changes`` are made to ``SAFE``; None removes a parameter.
     """
 
     def __init__(
@@ -84,9 +84,9 @@ class ParamVehicle:
         self.has_receiver: bool | None = None
         self.requests: list[ParamRequest | ParamWrite | CommandRequest] = []
         self.integers: set[str] = set()
-        """Parameters that stand byte for byte in the float."""
+        """Parameters whose bytes are those of an integer in the float."""
         self.refuses: set[str] = set()
-        """Parameters that keep their value."""
+        """Parameters that keep their value when set."""
         self._loses = loses
         self._packets = 0
         self._answers: list[ParamValue] = []
@@ -100,7 +100,7 @@ class ParamVehicle:
         return self.params.problem() or self.params.output_problem(report)
 
     def set_by_pilot(self, name: str, value: float) -> None:
-        """A ground station sets a parameter; everybody hears of it."""
+        """Set a parameter as a ground station; the vehicle announces it to all."""
         self.values[name] = value
         self.params.receive(ParamValue(name, value), status(self.armed, self.has_receiver))
 

@@ -16,7 +16,7 @@ CONTRACT = Contract(feature_dim=1, arrays="numpy", image_height=32, image_width=
 
 
 def steady(sticks: Callable[[], tuple[float, float, float, float]]) -> PolicyRunner:
-    """Calls ``sticks`` at every action and holds the result for the chunk."""
+    """Return a runner that calls ``sticks`` at every action and holds the result for the chunk."""
 
     def act(encoded: FloatArray, state: FloatArray, history: FloatArray) -> FloatArray:
         chunk = np.empty((1, CONTRACT.horizon, 4), np.float32)
@@ -38,7 +38,7 @@ def single_rate(runner: PolicyRunner) -> PolicyRunner:
 
 
 def pursuit(flight: SimulatedFlight) -> PolicyRunner:
-    """Flies through the gates by the true state."""
+    """Return a runner that flies through the gates by the true state."""
 
     def sticks() -> tuple[float, float, float, float]:
         body = flight.vehicle.ap.truth
@@ -48,7 +48,7 @@ def pursuit(flight: SimulatedFlight) -> PolicyRunner:
         cos, sin = math.cos(gate.yaw_rad), math.sin(gate.yaw_rad)
         gate_n, gate_e, gate_d = gate.center_ned_m
         ahead_m = (north - gate_n) * cos + (east - gate_e) * sin
-        lead_m = 4.0 if ahead_m > -4.0 else -2.0  # first in front of the gate, then through it
+        lead_m = 4.0 if ahead_m > -4.0 else -2.0  # first before the gate, then through it
         to_n, to_e = gate_n + lead_m * cos - north, gate_e + lead_m * sin - east
         scale = SPEED_MPS / max(math.hypot(to_n, to_e), 1e-3)
         w, x, y, z = body.ned_from_body_wxyz

@@ -1,4 +1,4 @@
-"""Policy servers on loopback: one that a test scripts, and our own around any policy."""
+"""Policy servers on loopback: one scripted by a test, and our own around any policy."""
 
 import asyncio
 import threading
@@ -19,13 +19,13 @@ from policy.loading.request import LoadedPolicy
 from policy.protocol import PolicyRunner
 
 Reply = bytes | str | tuple[bytes, ...] | None
-"""Several: one after the other; None: close the connection."""
+"""Several: sent one after the other; None: close the connection."""
 START_S = 10.0
 
 
 @contextmanager
 def _in_thread(listen: Callable[[], "asyncio.Future[Server]"]) -> Iterator[int]:
-    """Run a server on a loop of its own; gives its port."""
+    """Context manager: a server on its own event loop; yields its port."""
     port: Future[int] = Future()
     end: list[Callable[[], None]] = []
 
@@ -56,9 +56,10 @@ def scripted_server(
     port: int = 0,
     on_close: Callable[[int | None], None] = lambda _code: None,
 ) -> Iterator[int]:
-    """A server that answers by ``reply``, which runs in a thread and may wait; gives its port.
+    """Context manager: a server that answers by ``reply``; yields its port.
 
-    ``on_close`` gets the code by which a client has closed its connection.
+    ``reply`` runs in a thread and can wait. ``on_close`` gets the code with which a client has
+    closed its connection.
     """
 
     async def talk(connection: ServerConnection) -> None:
@@ -87,7 +88,7 @@ async def _listening(talk: Callable[[ServerConnection], object], port: int) -> S
 def our_server(
     runner: PolicyRunner, *, api_key: str | None = None, image_bytes: int = 2**20
 ) -> Iterator[int]:
-    """``mavbridge serve`` without its command line; gives its port."""
+    """Context manager: ``mavbridge serve`` without its command line; yields its port."""
     answers = AnswerLoop(runner, clock=MonotonicClock())
     server = PolicyServer(
         answers, image_bytes=image_bytes, api_key=api_key, report=lambda _line: None
@@ -102,7 +103,7 @@ def our_server(
 
 
 def chunk_of(value: float, horizon: int = 16) -> bytes:
-    """An answer whose actions all have one value."""
+    """Return an answer whose actions all have one value."""
     return pack(
         {
             "actions": np.full((horizon, 4), value, np.float64),
@@ -120,7 +121,7 @@ class Guard:
         self.requests = 0
 
     def reply(self, _message: Message) -> bytes:
-        """The number of the request, once the guard is open."""
+        """Return the number of the request once the guard is open."""
         self.requests += 1
         number = self.requests
         assert self.is_open.wait(START_S)
@@ -128,7 +129,7 @@ class Guard:
 
 
 def when_it_listens(connect: Callable[[], LoadedPolicy]) -> LoadedPolicy:
-    """Connect to a server that is starting; it refuses connections until it listens."""
+    """Connect to a starting server, which refuses connections until it listens."""
     clock = MonotonicClock()
     until_ns = clock.now_ns() + 30 * NS_PER_S
     while clock.now_ns() < until_ns:

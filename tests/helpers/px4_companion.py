@@ -1,4 +1,4 @@
-"""A ground station or companion computer of a PX4 vehicle: sticks, setpoints, modes, its events."""
+"""Ground station or companion computer of a PX4 vehicle: sticks, setpoints, modes, its events."""
 
 import math
 import struct
@@ -23,7 +23,7 @@ LOWEST_M, HIGHEST_M, STILL_MPS = 5.0, 40.0, 0.3
 
 
 class Modes(NamedTuple):
-    """CURRENT_MODE, decoded by hand: pymavlink's dialect lacks it."""
+    """CURRENT_MODE, decoded by hand because pymavlink's dialect lacks it."""
 
     custom_mode: int
     intended_custom_mode: int
@@ -59,7 +59,7 @@ def attitude_target(
 def rate_target(
     roll: float = 0.0, pitch: float = 0.0, yaw: float = 0.0, thrust: float = HOVER_THRUST
 ) -> Any:
-    """Rates in deg/s."""
+    """Return a setpoint of body rates in deg/s."""
     rates = [math.radians(v) for v in (roll, pitch, yaw)]
     return mav.MAVLink_set_attitude_target_message(0, 1, 1, 128, [1, 0, 0, 0], *rates, thrust)
 
@@ -74,7 +74,7 @@ def velocity_target(
 
 
 class Px4Companion(Companion):
-    """As `Companion`, for PX4; sends a ground station's heartbeat once a second."""
+    """`Companion` for PX4; sends a ground station's heartbeat once a second."""
 
     def __init__(self, peer: Peer, *, is_gcs: bool = True) -> None:
         super().__init__(peer)
@@ -96,13 +96,13 @@ class Px4Companion(Companion):
         return result
 
     def sticks(self, sticks: tuple[int, int, int, int], *, system_id: int = GCS) -> None:
-        """MANUAL_CONTROL: x, y, z, r."""
+        """Send MANUAL_CONTROL: x, y, z, r."""
         self.send(mav.MAVLink_manual_control_message(1, *sticks, 0), system_id=system_id)
 
     def repeat(
         self, send: Callable[[float], None], seconds: float, hz: float = STICK_HZ
     ) -> list[Any]:
-        """Call ``send`` with the time since now at this rate; what came meanwhile."""
+        """Call ``send`` with the elapsed time at this rate; return the received messages."""
         start_ns = self.peer.now_ns()
         messages: list[Any] = []
         count = 0
@@ -125,7 +125,7 @@ class Px4Companion(Companion):
         within_s: float,
         send: Callable[[float], None] = lambda _: None,
     ) -> tuple[float, list[Any]]:
-        """Go on until the messages since now satisfy a condition: how long that took."""
+        """Continue until the new messages satisfy a condition; return the time and the messages."""
         start_ns, messages = self.peer.now_ns(), list[Any]()
         while self.peer.now_ns() - start_ns < within_s * NS_PER_S:
             send((self.peer.now_ns() - start_ns) / NS_PER_S)
@@ -135,12 +135,12 @@ class Px4Companion(Companion):
         raise AssertionError(f"not within {within_s} s")
 
     def mode(self) -> int:
-        """The mode that flies, by CURRENT_MODE."""
+        """Return the active mode, by CURRENT_MODE."""
         name = f"UNKNOWN_{CURRENT_MODE}"
         return decode_current_mode(self.request(CURRENT_MODE, name)).custom_mode
 
     def track(self, hz: float = 50) -> None:
-        """Stream modes, attitude, position and landed state fast."""
+        """Stream modes, attitude, position and landed state at high rates."""
         for message_id in (
             mav.MAVLINK_MSG_ID_ATTITUDE,
             mav.MAVLINK_MSG_ID_LOCAL_POSITION_NED,
@@ -150,7 +150,7 @@ class Px4Companion(Companion):
             assert self.stream(message_id, hz) == ACCEPTED
 
     def get_ready(self, mode: tuple[int, int]) -> None:
-        """Wait until the vehicle may be armed in a mode, with sticks centred; do not arm."""
+        """Wait until the vehicle can be armed in a mode, with sticks centred; do not arm."""
         self.fly(0.2)
         assert self.set_mode(mode) == ACCEPTED
         for _ in range(600):
@@ -163,7 +163,7 @@ class Px4Companion(Companion):
         raise AssertionError("the vehicle does not get ready to arm")
 
     def fly_up(self, mode: tuple[int, int] = ALTCTL) -> None:
-        """Some metres up, level and still, with sticks centred; then the mode."""
+        """Climb some metres, level and still, with sticks centred; then enter the mode."""
         self.sticks(MID)
         self.track()
         if not self.in_the_air:
@@ -177,9 +177,9 @@ class Px4Companion(Companion):
         self.seen.clear()
 
     def _settle(self) -> None:
-        """In POSCTL: brake, and come to a height of 5 to 40 m."""
+        """In POSCTL, brake and reach a height of 5 to 40 m."""
         for count in range(600):
-            if count % 100 == 0:  # again, if a starved computer has lost the sticks meanwhile
+            if count % 100 == 0:  # again, if a busy computer has lost the sticks meanwhile
                 self._take(POSCTL)
             states = named(self.fly(0.1, (0, 0, self._climb_stick(), 0)), "LOCAL_POSITION_NED")
             speed_mps = max(abs(v) for m in states[-1:] for v in (m.vx, m.vy, m.vz))
@@ -188,7 +188,7 @@ class Px4Companion(Companion):
         raise AssertionError("the vehicle does not come to rest")
 
     def _take(self, mode: tuple[int, int]) -> None:
-        """A mode with sticks, which is refused until they have come for a while."""
+        """Enter a mode with sticks, which is refused until they have arrived for a while."""
         for _ in range(20):
             self.fly(0.1)
             if self.set_mode(mode) == ACCEPTED:
@@ -204,7 +204,7 @@ class Px4Companion(Companion):
     def hears(
         self, text: str, within_s: float = 2.0, send: Callable[[float], None] = lambda _: None
     ) -> bool:
-        """True once a status text that begins so has come, since ``seen`` was cleared."""
+        """True once a status text with this beginning has arrived since ``seen`` was cleared."""
         end_ns = self.peer.now_ns() + round(within_s * NS_PER_S)
         while self.peer.now_ns() < end_ns:
             if any(m.text.startswith(text[:50]) for m in named(self.seen, "STATUSTEXT")):
@@ -214,7 +214,7 @@ class Px4Companion(Companion):
         return False
 
     def texts(self) -> list[str]:
-        """Status texts since the last call, without the tab at their end."""
+        """Return the status texts since the last call, without the tab at their end."""
         texts: list[str] = []
         for message in named(self.seen, "STATUSTEXT"):
             if message.chunk_seq:
@@ -239,9 +239,9 @@ class Px4Companion(Companion):
         self.set_param(name, packed)
 
     def refill_delay(self, seconds: float = 5.001) -> None:
-        """Give the failsafe its full delay again, of which earlier ones have spent some.
+        """Give the failsafe its full delay again, part of which earlier failsafes have used up.
 
-        PX4 does so when any parameter changes; so it is not exactly the default of 5 s.
+        PX4 does so when any parameter changes, so ``seconds`` is not exactly the default of 5 s.
         """
         self.change("COM_FAIL_ACT_T", seconds)
 

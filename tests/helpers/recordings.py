@@ -25,7 +25,7 @@ _BLOCK = 16
 
 
 def picture(number: int, *, height: int = 48, width: int = 64) -> ImageArray:
-    """An image that still shows its number after H.264: one block a bit."""
+    """Return an image that still shows its number after H.264: one block per bit."""
     rgb = np.full((height, width, 3), 128, np.uint8)
     for bit in range(_BITS):
         y, x = _BLOCK * (bit // 4), _BLOCK * (bit % 4)
@@ -34,7 +34,7 @@ def picture(number: int, *, height: int = 48, width: int = 64) -> ImageArray:
 
 
 def number_of(rgb: ImageArray) -> int:
-    """What ``picture`` was given."""
+    """Return the number that was given to ``picture``."""
     half = _BLOCK // 2
     return sum(
         int(rgb[_BLOCK * (bit // 4) + half, _BLOCK * (bit % 4) + half, 1] > 127) << bit
@@ -43,12 +43,12 @@ def number_of(rgb: ImageArray) -> int:
 
 
 def make_frame(number: int, **changes: Any) -> VisionTick:
-    """Frame ``number``, from 0, with its picture."""
+    """Return frame ``number``, from 0, with its picture."""
     return replace(make_vision_tick(number + 1, rgb=picture(number)), **changes)
 
 
 def make_row(number: int, **changes: Any) -> FrameRow:
-    """The row of frame ``number``."""
+    """Return the row of frame ``number``."""
     vision = make_vision_tick(number + 1)
     row = FrameRow(
         frame_id=number, captured_ns=vision.captured_ns, ready_ns=vision.ready_ns, dropped_before=0
@@ -57,7 +57,7 @@ def make_row(number: int, **changes: Any) -> FrameRow:
 
 
 def make_meta(**changes: Any) -> FlightMeta:
-    """A flight of 100 and 30 Hz."""
+    """Return the meta of a flight at 100 and 30 Hz."""
     meta = FlightMeta(
         started_at="2026-01-02T03:04:05+00:00",
         start_ns=START_NS,
@@ -74,7 +74,7 @@ def make_meta(**changes: Any) -> FlightMeta:
 
 
 class InProcessWriter:
-    """Stands in for ``VideoWriter`` where its process is not what is tested: it takes a second."""
+    """Replaces ``VideoWriter`` where its process is not under test: starting it takes a second."""
 
     pid = None
     lost = 0
@@ -113,14 +113,14 @@ class InProcessWriter:
 
 @contextmanager
 def without_writer_process() -> Iterator[None]:
-    """Meanwhile flights are written by the calling thread."""
+    """Context manager: write flights in the calling thread."""
     with patch.object(flight_writer, "VideoWriter", InProcessWriter):
         yield
 
 
 def send_signal(pid: int, number: signal.Signals) -> None:
-    """Stop, kill or continue a child, and see it done: ``os.kill`` returns before that."""
+    """Stop, kill or continue a child, and wait until it is done: ``os.kill`` returns earlier."""
     os.kill(pid, number)
     if number != signal.SIGCONT:
-        with suppress(ChildProcessError):  # its parent's other thread has seen to it
+        with suppress(ChildProcessError):  # another thread of its parent has waited for it
             os.waitid(os.P_PID, pid, os.WEXITED | os.WSTOPPED | os.WNOWAIT)

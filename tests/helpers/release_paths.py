@@ -1,4 +1,4 @@
-"""Ways in which a flight ends, each done to a flight that leans under its policy."""
+"""Ways to end a flight that leans under its policy."""
 
 from collections.abc import Callable
 
@@ -15,7 +15,7 @@ RAMP_S = 0.3
 
 
 def later(flight: OutputFlight, seconds: float, act: Callable[[], object]) -> None:
-    """Do something so many seconds from now."""
+    """Call ``act`` after this time."""
     flight.clock.schedule(flight.clock.now_ns() + round(seconds * NS_PER_S), act)
 
 
@@ -24,7 +24,7 @@ def death(flight: OutputFlight) -> None:
 
 
 def hang(flight: OutputFlight) -> None:
-    """The flight process stops for a second, and then goes on as if nothing had been."""
+    """Stop the flight process for a second, and let it continue."""
     flight.is_flight_process_stopped = True
 
     def go_on() -> None:
@@ -42,7 +42,7 @@ def pilots_mode(flight: OutputFlight) -> None:
 
 
 def stick_ramp(flight: OutputFlight) -> None:
-    """A pilot moves a joystick of his own: centred for half a second, then a fast ramp."""
+    """Move another station's joystick: centred for half a second, then a fast ramp."""
     period_s = 0.02
     for step in range(200):
         share = min(max(step * period_s - 0.5, 0.0) / RAMP_S, 1.0)
@@ -51,7 +51,7 @@ def stick_ramp(flight: OutputFlight) -> None:
 
 
 def joystick(flight: OutputFlight, x: int) -> None:
-    """One MANUAL_CONTROL of another station, on a link of its own."""
+    """Send one MANUAL_CONTROL of another station over a separate link."""
     flight.station(lambda mav: mav.manual_control_encode(1, x, 0, 500, 0, 0), system=42)
 
 
@@ -60,22 +60,22 @@ def disarming(flight: OutputFlight) -> None:
 
 
 def deaf_guard(flight: OutputFlight) -> None:
-    """For two seconds nothing of the vehicle reaches us."""
+    """Lose all messages of the vehicle for two seconds."""
     _silence(flight, up_s=0.0, down_s=2.0)
 
 
 def deaf_vehicle_short(flight: OutputFlight) -> None:
-    """For 0.3 s nothing of ours reaches the vehicle."""
+    """Lose all messages to the vehicle for 0.3 s."""
     _silence(flight, up_s=0.3, down_s=0.0)
 
 
 def deaf_vehicle(flight: OutputFlight) -> None:
-    """For 1.5 s nothing of ours reaches the vehicle."""
+    """Lose all messages to the vehicle for 1.5 s."""
     _silence(flight, up_s=1.5, down_s=0.0)
 
 
 def cut_link(flight: OutputFlight) -> None:
-    """For 1.5 s nothing passes either way."""
+    """Lose all messages in both directions for 1.5 s."""
     _silence(flight, up_s=1.5, down_s=1.5)
 
 
@@ -90,17 +90,17 @@ def _silence(flight: OutputFlight, *, up_s: float, down_s: float) -> None:
 
 
 def end(flight: OutputFlight) -> None:
-    """SIGTERM or Ctrl-C."""
+    """End the flight process as by SIGTERM or Ctrl-C."""
     flight.stop()
 
 
 def key(flight: OutputFlight) -> None:
-    """q at the terminal."""
+    """Press q at the terminal."""
     flight.act("release")
 
 
 def failsafe(flight: OutputFlight) -> None:
-    """A failsafe of the vehicle's own changes its mode."""
+    """Change the mode by a failsafe of the vehicle itself."""
     if flight.is_px4:
         flight.px4.commander.lost_sticks.phase = LostPhase.ACTING
     else:
@@ -109,7 +109,7 @@ def failsafe(flight: OutputFlight) -> None:
 
 
 def death_without_position(flight: OutputFlight) -> None:
-    """The flight process dies while the modes that hold a place are refused."""
+    """Kill the flight process while modes that hold a position are refused."""
     flight.lose_position()
     later(flight, 0.05, flight.die)
 

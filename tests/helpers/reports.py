@@ -1,4 +1,4 @@
-"""Reports of flights that never were."""
+"""Reports of invented flights."""
 
 from mavbridge.core.records import Tick
 from mavbridge.core.vehicle import LinkStats
@@ -8,7 +8,7 @@ from mavbridge.observe.timing import FlightTiming, ObserverDrops, TimingReport
 def report_of(
     *ticks: Tick, link: LinkStats | None = None, rerun_drops: int | None = None
 ) -> TimingReport:
-    """The report of a flight of these ticks, at 100 and 30 Hz."""
+    """Return the report of a flight with these ticks, at 100 and 30 Hz."""
     timing = FlightTiming(stick_hz=100, action_hz=100, vision_hz=30)
     for tick in ticks:
         timing.emit(tick)

@@ -1,4 +1,4 @@
-"""A world model that is small and quick, flights to start from, and rollouts of both."""
+"""A small and fast world model, flights to start from, and rollouts of both."""
 
 import queue
 import threading
@@ -55,9 +55,9 @@ TINY = WorldModelConfig(
 
 
 class SerialOutput(StreamedOutput):
-    """The plain form, kept as the reference: all frames in a list, everything written at the end.
+    """Simple reference: all frames in a list, everything written at the end.
 
-    Every frame must have been decoded by the loop.
+    The loop must have decoded every frame.
     """
 
     def _open(self) -> None:
@@ -95,13 +95,13 @@ class SerialOutput(StreamedOutput):
 
 
 class TinyWorld(WorldModel):
-    """A real world model with random weights, that says which frames it decoded, and where."""
+    """Real world model with random weights that records the decoded frames and their threads."""
 
     def __init__(self, config: WorldModelConfig = TINY) -> None:
         with torch.random.fork_rng(devices=[]):
             torch.manual_seed(0)
             super().__init__(config)
-            for weights in self.parameters():  # a new net is near zero: let it say something
+            for weights in self.parameters():  # a new net outputs almost zero
                 weights.data += 0.1 * torch.randn(weights.shape)
         self.eval()
         self.decoded: list[tuple[str, int]] = []
@@ -117,7 +117,7 @@ class TinyWorld(WorldModel):
 
 
 def noise_runner(contract: Contract | None = None) -> PolicyRunner:
-    """A policy whose sticks depend on every pixel, the state and the history."""
+    """Return a policy whose sticks depend on every pixel, the state and the history."""
     contract = contract or Contract(feature_dim=1, arrays="numpy")
 
     def encode(rgb: ImageArray, camera: int = 0) -> FloatArray:
@@ -170,7 +170,7 @@ def make_sampler(
 
 @dataclass(frozen=True)
 class Finished:
-    """What a rollout left."""
+    """Output of a rollout."""
 
     sha256: str
     model: TinyWorld
@@ -214,7 +214,7 @@ def write_flight(
     ticks: bool = True,
     meta: FlightMeta | None = None,
 ) -> Path:
-    """A recorded flight: frame k is of ``grey(k)``, tick j has velocity x = j / 100."""
+    """Write a recorded flight: frame k is ``grey(k)``, tick j has velocity x = j / 100."""
     folder.mkdir(parents=True, exist_ok=True)
     with without_writer_process():
         writer = FlightWriter(folder, meta or make_meta(), pressure="offline")

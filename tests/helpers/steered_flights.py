@@ -1,4 +1,4 @@
-"""Made-up flights whose sticks steer what the camera sees and how the vehicle moves."""
+"""Invented flights whose sticks steer the camera's view and the vehicle's motion."""
 
 from collections.abc import Iterator
 
@@ -17,9 +17,9 @@ FIELD_OF_VIEW_RAD = 2.0
 
 
 def steered_flight(seed: int, *, seconds: float = 3.0, size: int = 32) -> FlightData:
-    """Yaw turns the view past a bright spot far away; pitch accelerates to where the camera looks.
+    """Write a flight: yaw turns the view past a far bright spot; pitch accelerates along it.
 
-    Ticks at 100 Hz, frames at 30 Hz; the expert's labels are another thing than what was sent.
+    Ticks at 100 Hz, frames at 30 Hz. The expert's labels differ from the sent sticks.
     """
     random = np.random.default_rng(seed)
     start_ns, ticks = 10**9 * (seed + 1), round(100 * seconds)

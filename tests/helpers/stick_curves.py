@@ -1,4 +1,4 @@
-"""Vehicles whose sticks are mapped in tests, and what they do by formulas of their own."""
+"""Vehicles whose sticks are mapped in tests, and their motion by independent formulas."""
 
 import math
 from dataclasses import dataclass
@@ -17,7 +17,7 @@ PX4_DEFAULTS = {
     "MPC_Z_VEL_MAX_UP": 3.0,
     "MPC_Z_VEL_MAX_DN": 1.5,
 }
-"""Those of the PX4 whose curves were measured."""
+"""Parameters of the PX4 whose curves were measured."""
 
 
 @dataclass(frozen=True)
@@ -34,7 +34,7 @@ class Motion:
 
 
 def policy_motion(sticks: Sticks, gains: StickGains) -> Motion:
-    """What the contract says, one stick at a time."""
+    """Return the motion by the contract, one stick at a time."""
 
     def linear(stick: float, dead_zone: float) -> float:
         beyond = max(0.0, abs(stick) - dead_zone) / (1.0 - dead_zone)
@@ -59,7 +59,7 @@ def copter_values(**changed: float) -> dict[str, float]:
 
 
 def copter_motion(sticks: Sticks, conditions: Conditions) -> Motion:
-    """What the simulated copter's own code makes of these sticks, as PWM on the wire."""
+    """Return the motion of the simulated copter's own code for these sticks, as PWM on the wire."""
     params = ArduPilotParams(conditions)
     channels = calibration({name: params[name] for name in params.names})
     rc = RcEngine(params, None)
@@ -76,7 +76,7 @@ def copter_motion(sticks: Sticks, conditions: Conditions) -> Motion:
 
 
 def px4_motion(sticks: Sticks, values: dict[str, float], *, stabilized: bool = False) -> Motion:
-    """What PX4 makes of these sticks, by its formulas."""
+    """Return PX4's motion for these sticks, by its formulas."""
 
     def shaped(stick: float, name: str) -> float:
         dead_zone, expo = values["MAN_DEADZONE"], values.get(name, 0.6)

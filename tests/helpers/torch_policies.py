@@ -63,7 +63,7 @@ class TwoRates(nn.Module):
 
 
 class PlainClass:
-    """The same on a class that is no module, but holds two."""
+    """The whole protocol on a class that is not a module, but holds two."""
 
     contract = DUAL
 
@@ -103,7 +103,7 @@ class Drawing(TwoRates):
 
 class Resetting(TwoRates):
     def reset(self) -> None:
-        """A flight begins."""
+        """Called when a flight begins."""
 
 
 class Looping(TwoRates):
@@ -115,7 +115,7 @@ class Looping(TwoRates):
 
 
 class Stepwise(TwoRates):
-    """A diffusion policy that says how one step of it is computed."""
+    """Diffusion policy that defines how one of its steps is computed."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -144,7 +144,7 @@ class Stepwise(TwoRates):
 
 
 class ForwardOnly(nn.Module):
-    """A single-rate policy: a contract, and forward of two arguments out of three."""
+    """Single-rate policy: a contract, and ``forward`` with two of the three arguments."""
 
     contract = SINGLE
 
@@ -161,7 +161,7 @@ class ForwardOnly(nn.Module):
 
 
 class NamedHead:
-    """No module and no methods: two modules by name."""
+    """Neither module nor methods: two modules by name."""
 
     contract = SINGLE
 
@@ -171,7 +171,7 @@ class NamedHead:
 
 
 class NoisyHead(Head):
-    """A head as one step of a diffusion policy, in the order that a denoiser has."""
+    """Head that is one step of a diffusion policy, with arguments in a denoiser's order."""
 
     def __init__(self) -> None:
         super().__init__(extra=DUAL.horizon * 4 + 1)
@@ -183,7 +183,7 @@ class NoisyHead(Head):
 
 
 class NamedDenoiser:
-    """The same with a denoiser."""
+    """Neither module nor methods: two modules by name, one of them a denoiser."""
 
     contract = SINGLE
     noise_schedule = NoiseSchedule(prediction="epsilon", betas="linear")
@@ -207,7 +207,7 @@ WIDE = Contract(
 
 
 class WideDenoiser(nn.Module):
-    """A step on two observations of two cameras."""
+    """Denoising step on two observations of two cameras."""
 
     def __init__(self) -> None:
         super().__init__()

@@ -1,4 +1,4 @@
-"""A killed training that is resumed must end where one that was not killed ends."""
+"""Checks that a killed and resumed training ends like an uninterrupted one."""
 
 from collections.abc import Callable
 from dataclasses import replace
@@ -15,7 +15,7 @@ from policy.training.run_folder import TrainingError, TrainingStoppedError
 
 
 class Training(Protocol):
-    """One run over flights, always in the same folder."""
+    """One run over flights, always in one folder."""
 
     def __call__(
         self, flights: list[FlightData], hooks: Hooks, *, resume: bool = False
@@ -28,7 +28,7 @@ def make_hooks(
     report: Callable[[TrainingProgress], None] = lambda _: None,
     should_stop: Callable[[], bool] = lambda: False,
 ) -> Hooks:
-    """Every look at the clock takes a tenth of a second."""
+    """Make hooks with a clock that advances by a tenth of a second at every reading."""
     ticking = count()
     return Hooks(now_s=lambda: next(ticking) * 0.1, report=report, should_stop=should_stop)
 
@@ -36,7 +36,7 @@ def make_hooks(
 def check_resuming(
     train: Training, flights: list[FlightData], whole: TrainResult, *, killed_at: int
 ) -> None:
-    """Kill it after the validation of a step; refuse to begin anew or with others; resume."""
+    """Kill it after a validation; check that it refuses a fresh start and other flights; resume."""
 
     def kill(progress: TrainingProgress) -> None:
         if progress.validation is not None and progress.step == killed_at:
@@ -73,12 +73,12 @@ def check_stopping(
 
 
 def check_same(result: TrainResult, whole: TrainResult) -> None:
-    """All but the name of the checkpoint."""
+    """Compare everything except for the names of the checkpoints."""
     assert result == replace(whole, checkpoint=result.checkpoint)
     assert weights_of(result.checkpoint) == weights_of(whole.checkpoint)
 
 
 def weights_of(path: Path) -> dict[str, bytes]:
-    """Every tensor of a checkpoint, as it lies in the file."""
+    """Return every tensor of a checkpoint, as stored in the file."""
     with safe_open(path, framework="pt") as file:
         return {name: file.get_tensor(name).numpy().tobytes() for name in file.keys()}  # noqa: SIM118

@@ -17,13 +17,13 @@ class SensorFreeze:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Reboot:
-    """The autopilot restarts: time_boot_ms falls back to 0."""
+    """Restart of the autopilot: time_boot_ms falls back to 0."""
 
     at_s: float
 
 
 class VehicleFaults:
-    """A script of vehicle faults; times are seconds since ``start_ns``."""
+    """Script of vehicle faults; times are seconds since ``start_ns``."""
 
     def __init__(self, script: Iterable[SensorFreeze | Reboot], start_ns: int) -> None:
         script = tuple(script)
@@ -32,7 +32,7 @@ class VehicleFaults:
         self._reboots_s = sorted(fault.at_s for fault in script if isinstance(fault, Reboot))
 
     def apply(self, vehicle: SimulatedVehicle, now_ns: int) -> None:
-        """Apply the faults of this moment; call it before each step."""
+        """Apply the faults that are due. Call before each step."""
         t_s = (now_ns - self._start_ns) / NS_PER_S
         while self._reboots_s and t_s >= self._reboots_s[0]:
             self._reboots_s.pop(0)

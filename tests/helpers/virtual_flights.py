@@ -1,4 +1,4 @@
-"""The loops of a flight and its guard on virtual time, with a vehicle and a policy of fakes."""
+"""Loops of a flight and its guard on virtual time, with a fake vehicle and policy."""
 
 from collections.abc import Callable
 from itertools import repeat
@@ -28,22 +28,22 @@ from policy.protocol import PolicyRunner
 MS = NS_PER_MS
 FRAME_NS = NS_PER_S // 30
 HOP_NS = MS // 10
+"""Latency of a message between the processes."""
 SIGNAL = because(Code.SIGNAL)
-"""A message between the processes."""
 STEADY = np.full((1, 16, 4), 0.25, np.float32)
 SHARP = Limits(tau=0.0, max_slew=0.0)
 """No smoothing."""
 
 
 def nan_chunk() -> FloatArray:
-    """One action is not finite."""
+    """Return a chunk with one action that is not finite."""
     chunk = STEADY.copy()
     chunk[0, 9, 1] = np.nan
     return chunk
 
 
 class EventCamera:
-    """Frames at given times; the newest wins, and what was passed over is counted."""
+    """Camera with frames at given times; the newest wins, and skipped ones are counted."""
 
     def __init__(self, world: SteppedClock, captured_ns: list[int]) -> None:
         self._arrived: Frame | None = None
@@ -178,7 +178,7 @@ class VirtualFlight:
     # --- events
 
     def at(self, seconds: float, event: Callable[[], object]) -> "VirtualFlight":
-        """Do something after so much time."""
+        """Call a function after this time."""
         self.world.schedule(START_NS + round(seconds * NS_PER_S), event)
         return self
 
@@ -215,7 +215,7 @@ class VirtualFlight:
 
     @property
     def sent(self) -> list[tuple[float, Sticks | None]]:
-        """Seconds since the start and sticks of everything sent; None = a release."""
+        """Seconds since the start and sticks of every send; None: a release."""
         return [
             (
                 (at_ns - START_NS) / NS_PER_S,

@@ -1,4 +1,4 @@
-"""A MAVLink peer for tests, built on the dialect alone: packs messages and reads ours."""
+"""MAVLink peer for tests, built on the dialect alone: packs messages and reads ours."""
 
 from pymavlink.dialects.v20 import ardupilotmega as dialect
 
@@ -55,6 +55,6 @@ class WireEnd:
 
 
 def sent(data: bytes) -> dialect.MAVLink_message:
-    """The one message in a packet of ours."""
+    """Return the one message in a packet of ours."""
     (message,) = WireEnd().read(data)
     return message

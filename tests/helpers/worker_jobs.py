@@ -1,4 +1,4 @@
-"""Jobs for worker processes, which import them from here."""
+"""Jobs for worker processes, which import this module."""
 
 import os
 import signal
@@ -13,7 +13,7 @@ from mavbridge.simulation.referee import EpisodeInterruptedError
 
 @dataclass(frozen=True, kw_only=True)
 class Job:
-    """Returns ``number``, after what it has to do first."""
+    """Job that returns ``number``, after its side effects."""
 
     number: int
     deaths: int = 0
@@ -22,7 +22,7 @@ class Job:
     error: Exception | None = None
     waits_for_stop: bool = False
     gets_ctrl_c: bool = False
-    """As every process of a terminal does."""
+    """True if it gets Ctrl-C, as every process of a terminal does."""
     kills_parent: bool = False
 
     def __str__(self) -> str:

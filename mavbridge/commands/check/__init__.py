@@ -1,1 +1,1 @@
-"""``mavbridge check``: whether a flight could begin, without flying."""
+"""``mavbridge check``: checks whether a flight can begin, without flying."""

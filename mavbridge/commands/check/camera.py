@@ -1,4 +1,4 @@
-"""Rows about the cameras: all of them are read at the same time, for two seconds."""
+"""Rows about the cameras, all of which are read at the same time for two seconds."""
 
 import threading
 from collections.abc import Sequence
@@ -21,36 +21,36 @@ MEASURE_S = 2.0
 _READ_NS = NS_PER_S // 2
 _JOIN_S = 5.0
 _ENOUGH = 0.9
-"""Share of the wanted rate."""
+"""Least acceptable share of the wanted rate."""
 _ON_ARRIVAL_MS = 1.0
-"""Frames younger than this when they are read were stamped as they came, not at their exposure."""
+"""A frame younger than this when it is read was stamped on arrival, not at its exposure."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class CameraNeeds:
-    """What the flight takes of one camera."""
+    """Requirements of the flight on one camera."""
 
     name: str
-    """In the contract; empty for the only one."""
+    """Name in the contract; empty for the only camera."""
     source: str
     rate_hz: float
     side_px: int
-    """Least side of its image."""
+    """Least side of the image."""
     max_age_s: float
     """Oldest image to act on."""
     is_flown_by: bool = True
-    """A black image is a fault."""
+    """True if a black image is a fault."""
     is_depth: bool | None = None
-    """It takes depth, or RGB; None: no policy says."""
+    """True for depth, False for RGB; None: no policy tells."""
 
 
 @dataclass(kw_only=True)
 class Seen:
-    """Frames of one camera in two seconds."""
+    """Frames received from one camera in two seconds."""
 
     captured_ns: list[int] = field(default_factory=list)
     ages_ns: list[int] = field(default_factory=list)
-    """From the stamp to the read."""
+    """Time from the stamp to the read of each frame."""
     height_px: int = 0
     width_px: int = 0
     is_depth: bool = False
@@ -60,7 +60,7 @@ class Seen:
 
     @property
     def rate_hz(self) -> float:
-        """By the stamps, of the frames that were not read as well."""
+        """Frame rate from timestamps, unread frames included."""
         if len(self.captured_ns) < 2:
             return 0.0
         span_ns = self.captured_ns[-1] - self.captured_ns[0]
@@ -68,7 +68,7 @@ class Seen:
 
 
 def camera_rows(needs: Sequence[CameraNeeds], config: CameraConfig, clock: Clock) -> list[Row]:
-    """Open, read and close every camera; one that fails is a row."""
+    """Open, read and close every camera; a failure becomes a row."""
     rows: list[Row] = []
     with ExitStack() as stack:
         opened: list[tuple[CameraNeeds, Camera]] = []
@@ -135,7 +135,7 @@ def _watch(camera: Camera, seen: Seen, clock: Clock, stop: threading.Event) -> N
 
 
 def judge(need: CameraNeeds, seen: Seen, *, latency_ms: float) -> list[Row]:
-    """Rows of one camera, by its frames; ``latency_ms`` is that of --camera-latency."""
+    """Return the rows of one camera from its frames; ``latency_ms`` is that of --camera-latency."""
     if seen.failure is not None or not seen.captured_ns:
         why = seen.failure or f"no frame came in {MEASURE_S:g} s"
         return [_row(need, "stopped", verdict="no-go", advice=why)]

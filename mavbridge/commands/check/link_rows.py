@@ -1,4 +1,4 @@
-"""Rows about the link: the vehicle, the rates that come, losses, round trips and clocks."""
+"""Rows about the link: vehicle, received rates, losses, round trips and clocks."""
 
 from collections.abc import Callable, Iterator, Mapping
 from functools import partial
@@ -15,27 +15,27 @@ from mavbridge.mavlink.profiles.profile import StreamGroup
 from mavbridge.mavlink.session.vehicle import VehicleSession
 
 SET_UP_S = 15.0
-"""Longest wait for version, parameters, streams and the receiver: on a link that loses nothing it
-takes one to three seconds."""
+"""Longest wait for version, parameters, streams and the receiver. A link without losses takes one
+to three seconds."""
 SETTLE_S = 1.0
-"""From the grant of the streams until their rates are counted."""
+"""Time from the grant of the streams until their rates are counted."""
 MEASURE_S = 3.0
 ECHO_S = 3.0
 RELEASE_S = 4.0
-"""The releases of an override are spread over so much time at most."""
+"""Longest time over which the releases of an override are spread."""
 _POLL_NS = NS_PER_MS
-"""Between two looks at the link; the kernel stamps what arrives meanwhile."""
+"""Time between two polls of the link; the kernel stamps messages that arrive meanwhile."""
 _STICK_NS = 20 * NS_PER_MS
 
 EchoResult: TypeAlias = Literal["taken", "not taken", "armed"]
-"""``armed``: the vehicle is, or was, armed, so nothing was sent, or no more."""
+"""``armed``: the vehicle is or became armed, so that sticks were not sent, or no longer."""
 _ENOUGH = 0.9
-"""Share of the rate that was asked for."""
+"""Least acceptable share of the requested rate."""
 _ECHO_HZ = 20.0
-"""The check of our sticks needs as many RC_CHANNELS a second."""
+"""Rate of RC_CHANNELS that the echo check needs."""
 _LOSSY, _TOO_LOSSY = 0.01, 0.1
 _SLOW_MS = 50.0
-"""Round trip from which the sticks are noticeably late."""
+"""Round trip above which the sticks are noticeably late."""
 _QUANTITIES = {
     "ATTITUDE_QUATERNION": "attitude",
     "LOCAL_POSITION_NED": "velocity",
@@ -46,25 +46,25 @@ _row = partial(Row, "link")
 
 
 class VehicleProbe:
-    """Runs a ``MavlinkLink`` that has no guard; its methods are called in their order."""
+    """Runs a ``MavlinkLink`` without a guard. Call its methods in the order of their definition."""
 
     def __init__(self, link: MavlinkLink, clock: Clock) -> None:
         self._link = link
         self._clock = clock
         self._snapshot: LinkSnapshot | None = None
         self.texts: list[str] = []
-        """What the vehicle and the link have said."""
+        """Texts of the vehicle and the link."""
         self.echo_problem: Reason | None = None
-        """Why the sticks of the echo test were not taken, as the link says it."""
+        """The link's reason why the sticks of the echo test were not taken."""
 
     def find(self) -> VehicleSession:
-        """Wait for the vehicle; raises PeerError as the link does if there is none in time."""
+        """Wait for the vehicle; raise the link's PeerError if there is none in time."""
         while (vehicle := self._link.vehicle) is None:
             self._pass()
         return vehicle
 
     def set_up(self) -> Reason | None:
-        """Read parameters and request streams; returns the step that was not finished in time."""
+        """Read parameters and request streams; return the step that did not finish in time."""
         self._until(SET_UP_S, lambda: self._unfinished is None)
         return self._unfinished
 
@@ -80,11 +80,11 @@ class VehicleProbe:
         return self._link.stats()
 
     def snapshot(self) -> LinkSnapshot:
-        """Everything that the link knows now."""
+        """Return everything that the link knows now."""
         return self._snapshot or self._pass()
 
     def echo(self) -> EchoResult:
-        """Send neutral sticks while the vehicle is disarmed, look for them, and release them."""
+        """Send neutral sticks while the vehicle is disarmed, watch their echo, and release them."""
         result: EchoResult = "not taken"
         due_ns = 0
 
@@ -111,7 +111,7 @@ class VehicleProbe:
         return result
 
     def _release(self) -> bool:
-        """Give the sticks back; True once the vehicle shows that it has them."""
+        """Release the sticks; return True once the vehicle confirms it."""
         self._link.send(Release(because(Code.FINISHED, what="echo test")))
         return self.snapshot().is_released and not self._link.is_release_owed
 
@@ -131,7 +131,7 @@ class VehicleProbe:
 def link_rows(
     vehicle: VehicleSession, stats: LinkStats, terms: Terms, *, unfinished: Reason | None
 ) -> Iterator[Row]:
-    """All of them but the echo test."""
+    """Return all rows about the link except for the echo test."""
     yield _vehicle_row(vehicle, unfinished)
     rates_hz = dict(stats.messages_per_s)
     for group in terms.streams:
@@ -236,7 +236,7 @@ def _time_rows(stats: LinkStats) -> Iterator[Row]:
 
 
 def echo_row(probe: VehicleProbe, terms: Terms) -> Row:
-    """Send neutral sticks, unless the vehicle is armed, and say whether it took them."""
+    """Send neutral sticks unless the vehicle is armed; return a row with the vehicle's response."""
     name, expected = "echo test", f"our sticks from system {terms.context.source_system}"
     if not terms.is_sticks:
         text = "not sent: the vehicle shows setpoints only in their mode"

@@ -1,4 +1,4 @@
-"""Rows about the parameters, and the terms of the flight by which they are judged."""
+"""Rows about the parameters, and the conditions of the flight by which they are judged."""
 
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
@@ -25,7 +25,7 @@ _row = partial(Row, "parameters")
 
 
 class JudgedNote(NamedTuple):
-    """A note, and whether the flight is refused for it."""
+    """A note, and its verdict on the flight."""
 
     verdict: Verdict
     note: ParamNote
@@ -33,7 +33,7 @@ class JudgedNote(NamedTuple):
 
 @dataclass(frozen=True, kw_only=True)
 class Terms:
-    """One vehicle, and the flight that is meant for it."""
+    """Conditions of one vehicle and its planned flight."""
 
     config: FlyConfig
     settings: LinkSettings
@@ -41,7 +41,7 @@ class Terms:
     """None: no policy."""
     profile: Profile
     read: Mapping[str, float]
-    """Parameters of the vehicle."""
+    """Parameters read from the vehicle."""
     context: ParamContext
 
     @classmethod
@@ -53,7 +53,7 @@ class Terms:
         vehicle: VehicleSession,
         status: VehicleStatus | None,
     ) -> "Terms":
-        """Terms by what the vehicle has told so far."""
+        """Create the terms from the vehicle's answers so far."""
         kind: ActionKind = "sticks" if plan is None else plan.contract.action
         output = config.link.output
         usual = vehicle.profile.outputs[kind]
@@ -72,27 +72,27 @@ class Terms:
 
     @property
     def values(self) -> dict[str, float]:
-        """Parameters as the flight would have them: with those of --set."""
+        """Parameters of the flight, including those of --set."""
         return dict(self.read) | dict(self.config.link.set_params)
 
     @property
     def is_sticks(self) -> bool:
-        """The actions are sticks, and not setpoints."""
+        """True if the actions are sticks rather than setpoints."""
         return self.context.output in _STICK_OUTPUTS
 
     @property
     def contract(self) -> Contract | None:
-        """The contract of the policy."""
+        """Contract of the policy."""
         return None if self.plan is None else self.plan.contract
 
     @property
     def gains(self) -> StickGains | None:
-        """What full stick means to the policy; None where its sticks are not mapped."""
+        """The policy's meaning of full stick; None if its sticks are not mapped."""
         return None if self.plan is None else self.plan.guard.meaning.stick_gains
 
     @property
     def mode(self) -> str | None:
-        """The mode of the flight; None if it is not known, or the vehicle lacks it."""
+        """Mode of the flight; None if it is unknown or the vehicle lacks it."""
         if self.config.mode is not None:
             wanted: tuple[str, ...] = (self.config.mode.upper(),)
         else:
@@ -102,16 +102,16 @@ class Terms:
 
     @property
     def streams(self) -> tuple[StreamGroup, ...]:
-        """Telemetry that the flight asks for."""
+        """Telemetry requested by the flight."""
         return self.profile.streams(state_hz=self.settings.state_hz)
 
     @property
     def assessment(self) -> Assessment:
-        """The parameters, judged for this flight."""
+        """Judgement of the parameters for this flight."""
         return assess(self.profile, self.values, self.context)
 
     def notes(self) -> Iterator[JudgedNote]:
-        """Refusals and warnings of the flight, and hints that only a check gives."""
+        """Return the flight's refusals and warnings, and hints that only a check gives."""
         values, context = self.values, self.context
         assessment = self.assessment
         yield from (JudgedNote("no-go", note) for note in assessment.obstacles)
@@ -133,7 +133,7 @@ class Terms:
 
 
 def param_rows(terms: Terms) -> Iterator[Row]:
-    """Every parameter that matters, then the calibration, then what full stick means here."""
+    """Yield every relevant parameter, then the calibration, then the motion at full stick."""
     left = list(terms.notes())
     for name, should_be in terms.profile.wanted_params(terms.values, terms.context):
         about = [each for each in left if name in each.note.names]
@@ -156,7 +156,7 @@ def param_rows(terms: Terms) -> Iterator[Row]:
 
 
 def cures(notes: Iterable[ParamNote]) -> tuple[str, ...]:
-    """Flags that mend what these notes are about."""
+    """Return the flags that fix the problems in these notes."""
     return tuple(note.cure for note in notes if note.cure)
 
 
@@ -170,7 +170,7 @@ def _found(terms: Terms, name: str) -> str:
 
 
 def _calibration_rows(terms: Terms) -> Iterator[Row]:
-    """The four channels of overrides; a calibration that cannot be used is a note already."""
+    """Yield the four override channels; an unusable calibration is already a note."""
     calibration = terms.assessment.calibration
     if terms.context.output != "rc-override" or calibration is None:
         return
@@ -185,7 +185,7 @@ def _channel(channel: RcChannel) -> str:
 
 
 def _curve_rows(terms: Terms) -> Iterator[Row]:
-    """Motion at full stick, beside what it was in the policy's training."""
+    """Yield the motion at full stick, beside that of the policy's training."""
     mode, gains = terms.mode, terms.gains
     if terms.plan is None or mode is None or not terms.is_sticks:
         return
@@ -195,7 +195,7 @@ def _curve_rows(terms: Terms) -> Iterator[Row]:
         return
     curves = terms.profile.stick_curves(terms.values, mode, gains)
     shortfalls: dict[str, str] = dict(curves.shortfalls)
-    # The very object that stands for a mode whose sticks mean something else.
+    # The object that stands for modes in which sticks have another meaning.
     if curves is IDENTITY:
         yield _row("sticks", f"sent as they are in {mode}", "a mode in which they are mapped")
         return

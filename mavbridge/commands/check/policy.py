@@ -1,4 +1,4 @@
-"""Rows about the policy: whether it loads, its engine, its rates here, and what it expects."""
+"""Rows about the policy: its loading, its engine, its rates on this computer, and its contract."""
 
 import threading
 from collections.abc import Callable, Iterator
@@ -27,19 +27,18 @@ from policy.protocol import PolicyRunner
 
 NO_POLICY = "none"
 _BUSY = 0.8
-"""Share of a slot from which other work on this computer makes chunks late."""
+"""Share of a slot above which other work on this computer makes chunks late."""
 _HELD = 0.98
-"""Share of the asked rate from which it counts as held."""
+"""Share of the requested rate that counts as held."""
 _LATE_PERIODS = 1.5
-"""A chunk that comes more than so many periods after the one before is late, as in the report of a
-flight."""
+"""A chunk is late if it comes more than this many periods after the last, as in a report."""
 _JOIN_S = 60.0
 """Longest wait for the last call of a slow policy."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class PolicyFindings:
-    """The policy's rows, and what the rest of the check takes from it."""
+    """Rows about the policy, and its plan for the other checks."""
 
     rows: list[Row] = field(default_factory=list)
     plan: FlightPlan | None = None
@@ -47,7 +46,7 @@ class PolicyFindings:
 
 
 def check_policy(config: FlyConfig, clock: Clock, *, timing_s: float) -> PolicyFindings:
-    """Load the policy as a flight does, run it for ``timing_s``; a failure is a row."""
+    """Load the policy as a flight does, and run it for ``timing_s``; a failure becomes a row."""
     if config.policy.policy == NO_POLICY:
         return PolicyFindings()
     try:
@@ -71,7 +70,7 @@ def check_policy(config: FlyConfig, clock: Clock, *, timing_s: float) -> PolicyF
 
 
 def _engine_row(loaded: LoadedPolicy) -> Row:
-    """The engine and its agreement with torch; what is not as it was asked for is a warning."""
+    """Return a row on the engine and its agreement with torch; any deviation is a warning."""
     runner = loaded.runner
     warnings = [note.text for note in loaded.notes if isinstance(note, Warned)]
     agrees = any(isinstance(note, Agreed) for note in loaded.notes)
@@ -88,7 +87,7 @@ def _engine_row(loaded: LoadedPolicy) -> Row:
 def _speed_rows(
     plan: FlightPlan, loaded: LoadedPolicy, clock: Clock, timing_s: float
 ) -> Iterator[Row]:
-    """The rates that were held, and what a flight says of the policy's speed."""
+    """Yield rows on the held rates, and the flight's warnings about the policy's speed."""
     if loaded.times is None:
         yield _row("speed", "not measured: no chunk on a dummy sample")
     else:
@@ -107,7 +106,7 @@ def _speed_rows(
 
 @dataclass(kw_only=True)
 class Pace:
-    """One half of the policy, called on a grid as the loops of a flight call it."""
+    """One half of the policy, called on a grid like that of a flight's loops."""
 
     name: str
     asked_hz: float
@@ -124,14 +123,14 @@ class Pace:
         duration_s: float,
         settle: Callable[[], object],
     ) -> None:
-        """Call for ``duration_s``, and count; a call that is late moves those behind it."""
+        """Call and count for ``duration_s``. A late call delays the following ones."""
         settle()
         begun_ns = ended_ns = due_ns = clock.now_ns()
         every_ns = period_ns(self.asked_hz)
         while due_ns < begun_ns + duration_s * NS_PER_S and not stop.is_set():
             clock.sleep_until_ns(due_ns)
             called_ns = clock.now_ns()
-            with suppress(NoChunkError):  # as in a flight, which goes on along the last one
+            with suppress(NoChunkError):  # as in a flight, which continues along the last chunk
                 call()
             now_ns = clock.now_ns()
             self.late += self.took.count > 0 and now_ns - ended_ns > _LATE_PERIODS * every_ns
@@ -140,7 +139,7 @@ class Pace:
         self.rate_hz = self.took.count * NS_PER_S / max(due_ns - begun_ns, 1)
 
     def row(self) -> Row:
-        """The rate and the times; a warning if it was not held, or only just."""
+        """Return a row with rate and times; a warning if the rate was not held, or only just."""
         took_ms = self.took.percentiles_ms()
         if took_ms is None:
             return _row(self.name, "not one in time", "warn", "far too slow for this computer")
@@ -163,7 +162,7 @@ class Pace:
 def _run_at_rates(
     plan: FlightPlan, runner: PolicyRunner, clock: Clock, timing_s: float
 ) -> list[Pace]:
-    """Chunks and images of a dummy sample, each in a thread, at the rates of the flight."""
+    """Compute chunks and images of a dummy sample, each in a thread, at the rates of the flight."""
     contract, rates, loops = runner.contract, plan.config.rates, plan.loops
     images, state = dummy_images(contract), level_state(contract)
     history = np.zeros((1, contract.history_len, ACTION_DIM), np.float32)
@@ -186,7 +185,7 @@ def _run_at_rates(
         workers.append(Worker(f"mavbridge-check-{pace.name}", run))
     for worker in workers:
         worker.start()
-    with ExitStack() as stack:  # also on Ctrl-C: the policy is closed once nothing calls it
+    with ExitStack() as stack:  # also on Ctrl-C: the policy is closed only when nothing calls it
         for worker in workers:
             stack.callback(worker.join, _JOIN_S)
         for worker in workers:

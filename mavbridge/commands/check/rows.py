@@ -1,4 +1,4 @@
-"""Rows of the check, the verdict on all of them, their JSON and their table."""
+"""Rows of the check, their overall verdict, their JSON and their table."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -22,7 +22,7 @@ _FOOT = (
 
 @dataclass(frozen=True, slots=True)
 class Row:
-    """One thing that was looked at."""
+    """One checked item."""
 
     area: Area
     name: str
@@ -30,24 +30,24 @@ class Row:
     expected: str = ""
     verdict: Verdict = "go"
     advice: str = ""
-    """The reason for a warning or a no-go, and what to do; empty for a go."""
+    """Reason for a warning or a no-go, and the next step; empty for a go."""
     commands: tuple[str, ...] = ()
-    """Flags that mend it for one flight."""
+    """Flags that fix the problem for one flight."""
 
     def __post_init__(self) -> None:
-        """Hide the passwords of addresses, for the table and the JSON."""
+        """Hide passwords in addresses, for the table and the JSON."""
         for name in ("found", "expected", "advice"):
             object.__setattr__(self, name, without_secrets(getattr(self, name)))
 
 
 def overall(rows: Sequence[Row]) -> Verdict:
-    """The worst verdict of all."""
+    """Return the worst verdict of all rows."""
     verdicts = {row.verdict for row in rows}
     return "no-go" if "no-go" in verdicts else "warn" if "warn" in verdicts else "go"
 
 
 def as_document(rows: Sequence[Row]) -> dict[str, object]:
-    """All rows in the order of the table, for JSON."""
+    """Return all rows in the order of the table, for JSON."""
     names = ("area", "name", "verdict", "found", "expected", "advice")
     return {
         "verdict": overall(rows),
@@ -59,7 +59,7 @@ def as_document(rows: Sequence[Row]) -> dict[str, object]:
 
 
 def print_check(rows: Sequence[Row], console: Console) -> None:
-    """Print all rows, then the reasons and cures of those that are not go, then the verdict."""
+    """Print all rows, then reasons and fixes of those that are not go, then the verdict."""
     if not console.is_terminal:
         console.width = PIPED_WIDTH
     console.print(_table(rows))
@@ -87,7 +87,7 @@ def _table(rows: Sequence[Row]) -> Table:
 
 
 def _print_reasons(rows: Sequence[Row], console: Console) -> None:
-    """Each reason with its row's name; those of parameters name them."""
+    """Print each reason with its row's name; reasons about parameters name those themselves."""
     if not rows:
         return
     grid = Table.grid(padding=(0, 1))

@@ -1,4 +1,4 @@
-"""``mavbridge check``: its rows, its table, and those about this computer."""
+"""``mavbridge check``: all rows, the table, and the rows about this computer."""
 
 import json
 import os
@@ -31,9 +31,9 @@ from policy.preprocess import least_source_px
 
 _CLOCK_SOURCE = Path("/sys/devices/system/clocksource/clocksource0/current_clocksource")
 _SLOW_CLOCKS = ("hpet", "acpi_pm", "jiffies", "refined-jiffies", "pit")
-"""Clock sources that are read from a device, in a microsecond or more, or only tick."""
+"""Clock sources read from a device, which takes a microsecond or more, or that only tick."""
 _CORES = 2
-"""The guard beside the policy, so that neither delays the other."""
+"""One core for the guard and one for the policy, so that neither delays the other."""
 _RIGHTS_TIMEOUT_S = 10.0
 _TRY_RIGHTS = """
 import sys
@@ -45,7 +45,7 @@ refusals = [settle_guard(realtime=realtime, cpu=cpus[0])]
 refusals += [settle_thread(realtime=False, cpu=cpu) for cpu in cpus[1:]]
 print("; ".join(filter(None, refusals)))
 """
-"""A process of its own asks as the guard does, and ends: nothing of it stays with this one."""
+"""Requests the guard's rights in a separate process, so that this one is not affected."""
 STDOUT = Path("-")
 NO_VEHICLE = "none"
 _row = partial(Row, "computer")
@@ -86,7 +86,7 @@ def computer_rows(rates: Rates) -> list[Row]:
 
 
 def _refused_rights(rates: Rates) -> str:
-    """Return what this system does not permit the guard, empty if all is granted."""
+    """Return the rights that this system refuses to the guard; empty if all are granted."""
     words = ["yes" if rates.realtime else "no"]
     cpus = (rates.guard_cpu, rates.action_cpu, rates.vision_cpu)
     words += ["" if cpu is None else str(cpu) for cpu in cpus]
@@ -105,7 +105,7 @@ def _refused_rights(rates: Rates) -> str:
 
 
 def check(config: CheckConfig) -> int:
-    """Look at everything that a flight needs, print the table; returns the exit status.
+    """Check everything that a flight needs, print the table; return the exit status.
 
     Raises:
         UserError: --json names a file that cannot be written.
@@ -125,7 +125,7 @@ def check(config: CheckConfig) -> int:
 
 
 def check_all(config: CheckConfig) -> list[Row]:
-    """All rows, in the order of the table."""
+    """Return all rows in the order of the table."""
     flight, clock = config.flight, MonotonicClock()
     if flight.policy.policy != NO_POLICY:
         print_status(f"loading the policy, then running it for {config.timing:g} s")
@@ -140,7 +140,7 @@ def check_all(config: CheckConfig) -> list[Row]:
 
 
 def _check_cameras(config: FlyConfig, plan: FlightPlan | None, clock: Clock) -> list[Row]:
-    """Rows of every camera of the flight, or of the flags that do not fit the policy."""
+    """Return rows on every camera of the flight, or on the flags that do not fit the policy."""
     if config.link.connect == NO_VEHICLE and set(config.camera.sources) == {NO_CAMERA}:
         return []  # only this computer is checked
     try:
@@ -155,9 +155,9 @@ def _check_cameras(config: FlyConfig, plan: FlightPlan | None, clock: Clock) -> 
 
 
 def _camera_needs(config: FlyConfig, plan: FlightPlan | None) -> list[CameraNeeds]:
-    """What the flight needs of each camera; raises UserError where their names do not fit.
+    """Return the flight's needs of each camera; raise UserError if their names do not fit.
 
-    Without a policy only cameras that were named are looked at.
+    Without a policy only cameras named by flags are checked.
     """
     if set(config.camera.sources) == {NO_CAMERA}:
         return []

@@ -1,4 +1,4 @@
-"""From the address of a vehicle to its rows: found, set up, measured, and perhaps tried."""
+"""From the address of a vehicle to its rows: find it, set it up, measure it, run the echo test."""
 
 from collections.abc import Iterator, Sequence
 from contextlib import ExitStack
@@ -29,14 +29,14 @@ from mavbridge.mavlink.transport.sockets import Transport, make_transport
 
 _TEXTS_SHOWN = 4
 REFUSES_TO_ARM = "PreArm"
-"""ArduPilot begins so the texts of its checks before arming."""
+"""Prefix of ArduPilot's texts about its pre-arm checks."""
 _row = partial(Row, "vehicle")
 
 
 def vehicle_rows(
     vehicle: VehicleSession, snapshot: LinkSnapshot, terms: Terms, *, texts: Sequence[str]
 ) -> Iterator[Row]:
-    """All of them; ``texts`` is what the vehicle and the link have said."""
+    """Return all rows about the vehicle; ``texts`` are those of the vehicle and the link."""
     yield from _mode_rows(terms)
     if (status := snapshot.status) is not None:
         yield _state_row(status)
@@ -135,7 +135,7 @@ def _arming_row(*, is_ready: bool) -> Row:
 
 
 def _text_rows(texts: Sequence[str]) -> Iterator[Row]:
-    """What was said besides advice about parameters and sticks, which has rows of its own."""
+    """Yield rows for texts, except advice about parameters and sticks, which has its own rows."""
     for text in [text for text in texts if not isinstance(text, AdviceText)][-_TEXTS_SHOWN:]:
         if not isinstance(text, VehicleText):
             yield _row("link", "see below", "", "warn", text)
@@ -153,10 +153,9 @@ def check_vehicle(
     echo_test: bool,
     transport: Transport | None = None,
 ) -> list[Row]:
-    """All rows about the link, the vehicle and its parameters; whatever fails is a row.
+    """Return all rows about the link, the vehicle and its parameters; a failure becomes a row.
 
-    ``plan`` is None where no policy flies. ``transport`` replaces the one that the address of
-    ``config`` names.
+    ``plan`` is None if no policy flies. ``transport`` replaces that of the address in ``config``.
     """
     rows: list[Row] = []
     settings = checking_settings(config, is_dual=plan is None or plan.is_dual, sends=echo_test)
@@ -168,7 +167,7 @@ def check_vehicle(
                 signing = stack.enter_context(SigningStore(settings.signing, clock))
             link = MavlinkLink(transport, clock, settings, signing=signing)
             stack.callback(link.close)
-            # Without a policy, sticks as they are.
+            # Without a policy, sticks are sent unchanged.
             meaning = ActionMeaning() if plan is None else plan.guard.meaning
             output = None if config.link.output == "auto" else config.link.output
             link.begin_flight(meaning, output)
@@ -190,6 +189,6 @@ def check_vehicle(
 
 
 def checking_settings(config: FlyConfig, *, is_dual: bool, sends: bool) -> LinkSettings:
-    """Settings of the flight's link, which sets no parameter and, unless ``sends``, no stick."""
+    """Return the flight's link settings without parameters to set; sticks only if ``sends``."""
     guard = guard_settings(config, is_dual=is_dual, tlog_fd=None, wall_offset_ns=0)
     return replace(guard.link, readonly=not sends, set_params=())

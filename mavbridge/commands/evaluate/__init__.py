@@ -1,1 +1,1 @@
-"""``mavbridge evaluate``: how well a policy flies courses that it was never trained on."""
+"""``mavbridge evaluate``: performance of a policy on courses that it was not trained on."""

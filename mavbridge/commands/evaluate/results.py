@@ -1,4 +1,4 @@
-"""The results of an evaluation: estimates with 95 % intervals, summary, table and JSON."""
+"""Results of an evaluation: estimates with 95 % intervals, summary, table and JSON."""
 
 import json
 import math
@@ -16,16 +16,16 @@ from mavbridge.config.episodes import EvaluateConfig
 from mavbridge.simulation.referee import EpisodeResult, Outcome
 
 Z95 = 1.959963984540054
-"""95 % of a normal distribution lie within this many standard deviations."""
+"""95 % of a normal distribution are within this many standard deviations."""
 _BLOCKS, _BLOCK = 100, 100
-"""10,000 resamples, a block at a time."""
+"""10,000 resamples, one block at a time."""
 _SEED = 0
-"""Seed of the resampling: the same flights have the same interval."""
+"""Seed of the resampling, so that equal flights have equal intervals."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Estimate:
-    """A mean or a rate; the interval is None where a single flight has none."""
+    """Mean or rate; the interval is None if a single flight gives none."""
 
     value: float
     low: float | None
@@ -34,7 +34,7 @@ class Estimate:
 
 
 def rate(successes: int, count: int) -> Estimate:
-    """Share of successes with Wilson's score interval (E. B. Wilson 1927, JASA 22, 209-212).
+    """Return the success rate with Wilson's score interval (E. B. Wilson 1927, JASA 22, 209-212).
 
     Raises:
         ValueError: no trials, or more successes than trials.
@@ -51,7 +51,7 @@ def rate(successes: int, count: int) -> Estimate:
 
 
 def mean(values: Sequence[float]) -> Estimate | None:
-    """Mean with a percentile bootstrap interval (B. Efron 1979); None without values."""
+    """Return the mean with a percentile bootstrap interval (B. Efron 1979); None without values."""
     if not values:
         return None
     sample = np.asarray(values, dtype=np.float64)
@@ -68,25 +68,25 @@ def mean(values: Sequence[float]) -> Estimate | None:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Summary:
-    """Figures over all episodes unless said otherwise; None = no episode has the figure."""
+    """Figures over all episodes unless stated otherwise; None: no episode has the figure."""
 
     success_rate: Estimate
-    """All gates in order, no crash."""
+    """Success: all gates in order, no crash."""
     gates_passed: Estimate | None
     mean_speed_mps: Estimate | None
-    """Path over time, take-off included."""
+    """Path length over time, take-off included."""
     course_speed_mps: Estimate | None
-    """Straight legs over time, from the first gate to the last one passed."""
+    """Length of the straight legs over time, from the first gate to the last one passed."""
     stick_rate_per_s: Estimate | None
-    """Mean |change| of a number of the action per second: lower is smoother."""
+    """Mean |change| of a number of the action per second; lower is smoother."""
     flown_s: Estimate | None
     course_s: Estimate | None
-    """First action to last gate, of the successful flights."""
+    """Time from the first action to the last gate, of the successful flights."""
     outcomes: tuple[tuple[Outcome, int], ...]
 
 
 def summarise(episodes: Sequence[EpisodeResult]) -> Summary:
-    """The figures of one or more episodes.
+    """Compute the figures of one or more episodes.
 
     Raises:
         ValueError: there are none.
@@ -107,22 +107,22 @@ def summarise(episodes: Sequence[EpisodeResult]) -> Summary:
 
 @dataclass(frozen=True, kw_only=True)
 class Evaluation:
-    """The results of one run of ``mavbridge evaluate``."""
+    """Results of one run of ``mavbridge evaluate``."""
 
     config: EvaluateConfig
     engine: str
-    """Empty where no episode was flown."""
+    """Empty if no episode was flown."""
     episodes: tuple[EpisodeResult, ...]
     """In the order of their seeds; fewer than configured if the run was interrupted."""
 
     @cached_property
     def summary(self) -> Summary:
-        """Figures of the episodes, of which there must be at least one."""
+        """Figures of the episodes, of which at least one must exist."""
         return summarise(self.episodes)
 
     @property
     def title(self) -> str:
-        """Policy, engine, and how it was flown."""
+        """Policy, engine, and the conditions that differ from the default."""
         config = self.config
         parts = [f"{config.policy.policy} ({self.engine})"]
         if config.conditions != "nominal":
@@ -135,9 +135,9 @@ class Evaluation:
 
 
 def to_json(evaluation: Evaluation, flown_by: str) -> str:
-    """Everything as JSON, the summary before the episodes; without episodes it is null.
+    """Return all results as JSON, the summary before the episodes; without episodes it is null.
 
-    ``flown_by`` says by what the flights were flown (``resuming.identity``).
+    ``flown_by`` identifies the setup of the flights (``evaluate.run.identity``).
     """
     config, summary = evaluation.config, None
     if evaluation.episodes:

@@ -1,4 +1,4 @@
-"""``mavbridge evaluate``: fly or go on, print, write."""
+"""``mavbridge evaluate``: fly or resume the episodes, print and write the results."""
 
 import hashlib
 from collections.abc import Callable, Generator, Mapping
@@ -37,19 +37,19 @@ from policy.files import read_json
 
 @dataclass(frozen=True, kw_only=True)
 class EpisodeSpec:
-    """An episode to fly; its seeds follow from the evaluation's seed and its index alone."""
+    """Episode to fly; its seeds depend only on the evaluation's seed and the episode's index."""
 
     config: EvaluateConfig
     index: int
 
     @property
     def seed(self) -> int:
-        """Seed of delays and phases; seed S of the evaluation has S * MAX_EPISODES and on."""
+        """Seed of delays and phases; those of evaluation seed S start at S * MAX_EPISODES."""
         return self.config.policy.seed * MAX_EPISODES + self.index
 
     @property
     def course_seed(self) -> int:
-        """A held-out course."""
+        """Seed of a held-out course."""
         return first_seed(self.config.courses) + HELD_OUT_COURSE_SEED + self.seed
 
     def __str__(self) -> str:
@@ -58,7 +58,7 @@ class EpisodeSpec:
 
 @dataclass(frozen=True, kw_only=True)
 class FlownEpisode:
-    """An episode's result, and what flew it."""
+    """Result of an episode, and the engine that flew it."""
 
     engine: str
     notes: tuple[str, ...] = ()
@@ -101,10 +101,10 @@ def fly_simulated(spec: EpisodeSpec, should_stop: Callable[[], bool]) -> FlownEp
 
 
 def identity(config: EvaluateConfig) -> str:
-    """Digest of what decides how a flight goes: flags, contents of the policy's files, versions.
+    """Return a digest of what determines a flight: flags, contents of policy files, versions.
 
-    How many are flown, where, and what is written does not matter. What a server flies by, and what
-    a user's code reads besides, is not known.
+    The number of flights, their machines and the output are left out. The weights of a policy
+    server, and other files that a user's code reads, are unknown here.
     """
     flags = replace(
         config,
@@ -122,11 +122,11 @@ def identity(config: EvaluateConfig) -> str:
 
 
 def flown_before(config: EvaluateConfig, flown_by: str) -> dict[int, FlownEpisode]:
-    """The flights that ``config.json`` holds, by index; none if it is missing.
+    """Return the flights in ``config.json`` by index; none if the file is missing.
 
     Raises:
-        UserError: it holds something else, more than is asked for, or other flights than those
-            of the identity ``flown_by``.
+        UserError: it holds other data, more flights than requested, or flights of an identity other
+            than ``flown_by``.
     """
     path = config.json
     if path is None or not path.exists():
@@ -160,10 +160,10 @@ def flown_before(config: EvaluateConfig, flown_by: str) -> dict[int, FlownEpisod
 
 
 def require_same_engine(flown: Mapping[int, FlownEpisode], engine: str) -> None:
-    """Refuse a flight by another engine than those before.
+    """Refuse a flight by an engine other than that of earlier flights.
 
     Raises:
-        UserError: it is another one, as on another computer.
+        UserError: the engine differs, as on another computer.
     """
     if others := {episode.engine for episode in flown.values()} - {engine}:
         raise UserError(
@@ -173,7 +173,7 @@ def require_same_engine(flown: Mapping[int, FlownEpisode], engine: str) -> None:
 
 
 def evaluate(config: EvaluateConfig) -> int:
-    """Fly every episode of the config; 130 if interrupted, with the results so far.
+    """Fly every episode of the config; return 130 if interrupted, with the results so far.
 
     Raises:
         MavbridgeError: an episode cannot be flown, or the results cannot be written.
@@ -192,7 +192,7 @@ def evaluate(config: EvaluateConfig) -> int:
                     flown[index] = episode
                     _keep(config, flown, flown_by)
         except MavbridgeError as error:
-            failure = error  # the episodes flown before still count
+            failure = error  # the episodes flown before that still count
         was_stopped = stop.is_set()
     evaluation = _evaluation(config, flown)
     if flown:
@@ -208,7 +208,7 @@ def evaluate(config: EvaluateConfig) -> int:
 
 
 def _keep(config: EvaluateConfig, flown: dict[int, FlownEpisode], flown_by: str) -> None:
-    """Write what was flown so far, where that is to be gone on with."""
+    """Write the results so far if the evaluation can be resumed."""
     if config.resume and config.json is not None:
         try:
             write_durably(config.json, to_json(_evaluation(config, flown), flown_by))
@@ -232,7 +232,7 @@ def _fly(
     before: Mapping[int, FlownEpisode],
     should_stop: Callable[[], bool],
 ) -> Generator[tuple[int, FlownEpisode]]:
-    """Fly what was not flown before, until all are flown or ``should_stop``: index and episode."""
+    """Fly the missing episodes until ``should_stop``; yield index and episode."""
     indices = [index for index in range(config.episodes) if index not in before]
     specs = [EpisodeSpec(config=config, index=index) for index in indices]
     done, finished = len(before), sum(one.result.has_finished for one in before.values())

@@ -1,4 +1,4 @@
-"""Writes a LeRobot dataset of format v3.0, episode by episode, with its statistics."""
+"""Writer of LeRobot datasets of format v3.0, episode by episode, with their statistics."""
 
 import json
 from collections.abc import Iterable
@@ -33,7 +33,7 @@ Stats: TypeAlias = dict[str, NDArray[np.float64] | NDArray[np.int64]]
 """By name; "count" is [1] int64, the others are as wide as the feature."""
 
 DATA_FILE_MB, VIDEO_FILE_MB = 100, 200
-"""LeRobot's defaults (``datasets/utils.py``), for recordings that are appended to the dataset."""
+"""LeRobot's defaults (``datasets/utils.py``) for recordings appended to the dataset."""
 _PIXEL_STEP = 2
 """Every second pixel in each direction represents an image's colours."""
 _LEVELS = 256
@@ -43,7 +43,7 @@ _ROW_NUMBERS = ("frame_index", "episode_index", "index", "task_index")
 
 
 def vector_stats(values: NDArray[np.generic]) -> Stats:
-    """Statistics of each column of values [N, D] or [N], N >= 1."""
+    """Return statistics of each column of values [N, D] or [N], N >= 1."""
     numbers = values.reshape(len(values), -1).astype(np.float64)
     return {
         "min": numbers.min(axis=0),
@@ -56,7 +56,7 @@ def vector_stats(values: NDArray[np.generic]) -> Stats:
 
 
 class ImageStats:
-    """Colours of many images, counted."""
+    """Histogram of the colours of many images."""
 
     def __init__(self) -> None:
         self._counts = np.zeros((3, _LEVELS), np.int64)
@@ -70,7 +70,7 @@ class ImageStats:
         self._images += 1
 
     def merge(self, other: "ImageStats") -> None:
-        """Add the images that another has counted."""
+        """Add the images counted by another ``ImageStats``."""
         self._counts += other._counts
         self._images += other._images
 
@@ -96,13 +96,13 @@ class ImageStats:
 
 
 class DatasetWriter:
-    """A dataset that grows by an episode at a time; whole only after ``finish``.
+    """Dataset that grows episode by episode; complete only after ``finish``.
 
-    Each episode has a video and a table of its own.
+    Each episode has its own video and table.
     """
 
     def __init__(self, folder: Path, spec: DatasetSpec, image_size: int | None = None) -> None:
-        """Prepare; nothing is written yet into the folder, which is there and empty.
+        """Prepare; nothing is written yet. The folder must exist and be empty.
 
         ``image_size``: as in ``fit_size``.
         """
@@ -118,9 +118,9 @@ class DatasetWriter:
         return len(self._episodes)
 
     def add(self, part: Stretch, images: Iterable[ImageArray]) -> int:
-        """Append an episode; returns the number of its rows.
+        """Append an episode; return the number of its rows.
 
-        It ends with its images where they end early, and is left out with fewer than ``MIN_ROWS``.
+        It ends early if its images do, and is left out if it has fewer than ``MIN_ROWS`` rows.
 
         Raises:
             VideoError: images of another size.
@@ -184,7 +184,7 @@ class DatasetWriter:
         }
 
     def _episode_row(self, count: int) -> dict[str, Json]:
-        """Columns of ``meta/episodes`` that are no statistics."""
+        """Return the columns of ``meta/episodes`` other than statistics."""
         chunk, file = divmod(self.episodes, FILES_A_CHUNK)
         video = f"videos/{names.CAMERA_KEY}/"
         return {
@@ -204,10 +204,10 @@ class DatasetWriter:
         }
 
     def finish(self) -> None:
-        """Write what describes the whole.
+        """Write the files that describe the whole dataset.
 
         Raises:
-            VideoError: not one episode had images.
+            VideoError: no episode had images.
             OSError, FFmpegError: it cannot be written.
         """
         if self.rows == 0:
@@ -216,7 +216,7 @@ class DatasetWriter:
         episodes.parent.mkdir(parents=True)
         pq.write_table(_tasks(self._spec.task), library_name(self._folder / names.TASKS))
         pq.write_table(pa.Table.from_pylist(self._episodes), library_name(episodes))
-        # One feature after the other, so that memory holds one.
+        # One feature at a time, so that memory holds only one.
         columns = (name for name in _features(self._spec) if name != names.CAMERA_KEY)
         stats = {name: vector_stats(self._column(name)) for name in columns}
         stats[names.CAMERA_KEY] = self._colours.stats()
@@ -228,7 +228,7 @@ class DatasetWriter:
         self._write_json(names.INFO, self._info())
 
     def _column(self, name: str) -> NDArray[np.generic]:
-        """[rows, D] of all episodes."""
+        """Return one column of all episodes, [rows, D]."""
         files = map(library_name, self._tables)
         parts = [pq.read_table(file, columns=[name], partitioning=None) for file in files]
         column = pa.concat_tables(parts)[name].combine_chunks()
@@ -258,7 +258,7 @@ class DatasetWriter:
 
 
 def fit_size(rgb: ImageArray, image_size: int | None) -> ImageArray:
-    """The image at the size of the dataset: ``image_size`` in height and width, or its own.
+    """Scale the image to the dataset's size: ``image_size`` in height and width, or its own.
 
     An odd last row or column is cut off, which 4:2:0 cannot have.
     """
@@ -275,7 +275,7 @@ def _arrow(values: NDArray[np.generic]) -> pa.Array:
 
 
 def _tasks(task: str) -> pa.Table:
-    """``task_index`` under the index ``task``: the reader takes the words from pandas' index."""
+    """Return ``task_index`` by ``task``: the reader takes the words from pandas' index."""
     columns: list[Json] = [
         {"name": name, "field_name": name, "pandas_type": kind, "numpy_type": dtype}
         | {"metadata": None}

@@ -1,12 +1,12 @@
-"""Rows of the frames of flights, and the video of each episode.
+"""Rows for the frames of flights, and the video of each episode.
 
-A row holds what was known at the exposure of its image: the state of the newest tick all of whose
-messages had arrived by then, and the newest sticks to imitate of then or before. Nothing is
-interpolated; the stamps say how old each of them was.
+A row holds the data known at the exposure of its image: the state of the newest tick whose messages
+had all arrived by then, and the newest sticks to imitate up to then. Nothing is interpolated; the
+stamps give the age of each.
 
-LeRobot's reader wants frame k of an episode at ``from_timestamp + k / fps``, within 0.1 ms
+LeRobot's reader expects frame k of an episode at ``from_timestamp + k / fps``, within 0.1 ms
 (lerobot 0.6.1, ``datasets/lerobot_dataset.py`` ``tolerance_s``, ``datasets/video_utils.py``), so a
-video has one frame every 1/fps exactly, from 0 on.
+video has one frame every 1/fps exactly, starting at 0.
 """
 
 from collections.abc import Sequence
@@ -29,42 +29,42 @@ from policy.data.interpolation import MAX_GAP_NS
 from policy.files import library_name
 
 MAX_HELD_NS = MAX_GAP_NS
-"""A state or sticks older than this do not belong to a frame any more."""
+"""A state or sticks older than this no longer belong to a frame."""
 MAX_MISSING_FRAMES = 1
-"""Consecutive frames that may be missing; after more a new episode begins, for LeRobot takes rows
-to be even in time."""
+"""Longest run of missing frames. After a longer one a new episode begins, because LeRobot assumes
+rows at equal intervals."""
 MIN_ROWS = 2
 """Fewer rows show no motion."""
 MAX_RATE_OFF = 0.2
-"""Largest share by which the rate of a flight may differ from the common one."""
+"""Largest relative difference between the rate of a flight and the common rate."""
 
 
 @dataclass(frozen=True)
 class Stretch:
-    """Consecutive frames of a flight in each of which it was flown: one episode of LeRobot."""
+    """Consecutive frames of a flight during which it was flown: one LeRobot episode."""
 
     episode: FlightData
     first_frame: int
     columns: dict[str, NDArray[np.generic]]
     """State [N, 13], action and sent sticks [N, 4], then the stamps [N], under their names in the
-    dataset. Sent sticks are zeros where they were released or nothing had been sent yet."""
+    dataset. Sent sticks are zeros if they were released or none had been sent yet."""
 
     def __len__(self) -> int:
         return len(self.captured_ns)
 
     @property
     def captured_ns(self) -> Nanoseconds:
-        """[N] exposures."""
+        """Exposures, [N]."""
         return self.columns[names.CAPTURED].astype(np.int64, copy=False)
 
     def part(self, start: int, stop: int) -> "Stretch":
-        """The rows from ``start`` up to ``stop``."""
+        """Return the rows from ``start`` up to ``stop``."""
         columns = {name: values[start:stop] for name, values in self.columns.items()}
         return Stretch(self.episode, self.first_frame + start, columns)
 
 
 def stretches(episode: FlightData) -> list[Stretch]:
-    """Align a flight to its frames, and leave out those without a state or sticks."""
+    """Align a flight to its frames, and leave out frames without a state or sticks."""
     captured_ns = episode.captured_ns
     arrived_ns = np.maximum.accumulate(np.maximum(episode.attitude_ns, episode.velocity_ns))
     tick = _newest(arrived_ns, captured_ns)
@@ -74,7 +74,7 @@ def stretches(episode: FlightData) -> list[Stretch]:
     is_known &= captured_ns - arrived_ns[tick] <= MAX_HELD_NS
     is_known &= captured_ns - episode.target_ns[target] <= MAX_HELD_NS
     is_known &= np.isfinite(episode.state[tick]).all(axis=1)
-    # Where nothing had been sent yet, index -1 is the row that is appended.
+    # If nothing had been sent yet, index -1 selects the appended row.
     sent_sticks = np.concatenate([episode.sent, np.zeros((1, ACTION_DIM), np.float32)])[sent]
     sent_ns = np.where(sent < 0, captured_ns, np.append(episode.sent_ns, 0)[sent])
     stamps = (
@@ -92,12 +92,12 @@ def stretches(episode: FlightData) -> list[Stretch]:
 
 
 def _newest(stamps_ns: Nanoseconds, at_ns: Nanoseconds) -> NDArray[np.intp]:
-    """[N] index of the newest stamp at or before each time; -1 where there is none."""
+    """Return [N], the index of the newest stamp at or before each time; -1 if there is none."""
     return np.searchsorted(stamps_ns, at_ns, side="right") - 1
 
 
 def _runs(captured_ns: Nanoseconds, is_known: NDArray[np.bool_]) -> list[tuple[int, int]]:
-    """Consecutive frames that are known and have no hole between them: from and up to."""
+    """Return the runs of known frames without a hole: start and stop index of each."""
     if len(captured_ns) < MIN_ROWS:
         return []
     periods = np.diff(captured_ns)
@@ -108,13 +108,13 @@ def _runs(captured_ns: Nanoseconds, is_known: NDArray[np.bool_]) -> list[tuple[i
 
 
 def common_fps(parts: Sequence[Stretch]) -> int:
-    """The whole number of frames a second that LeRobot takes all of them to have.
+    """Return the integer frame rate that LeRobot assumes for all frames.
 
     Raises:
         UserError: flights of several rates.
     """
     fps = max(1, round(_rate_hz(np.concatenate([np.diff(p.captured_ns) for p in parts]))))
-    # By flight, since a stretch of a few frames has no rate of its own.
+    # Per flight, because a stretch of a few frames has no rate of its own.
     for _, of_flight in groupby(parts, key=lambda part: id(part.episode)):
         whole = list(of_flight)
         own = _rate_hz(np.concatenate([np.diff(part.captured_ns) for part in whole]))
@@ -132,7 +132,7 @@ def _rate_hz(periods_ns: Nanoseconds) -> float:
 
 
 def worst_shift_ns(part: Stretch, fps: int) -> int:
-    """Largest distance of a frame from its place on LeRobot's even grid."""
+    """Return the largest distance of a frame from its place on LeRobot's even grid."""
     even_ns = np.round(np.arange(len(part)) * (NS_PER_S / fps)).astype(np.int64)
     return int(np.abs(part.captured_ns - part.captured_ns[0] - even_ns).max())
 
@@ -142,7 +142,7 @@ FILES_A_CHUNK = 1000
 _OPTIONS: dict[str, object] = {
     "preset": "veryfast",
     "crf": "20",  # as the recorder's
-    "g": "2",  # LeRobot's own: any frame is had by decoding two
+    "g": "2",  # LeRobot's own: any frame is available after decoding two
     "tune": "zerolatency",  # a frame in, a packet out; none is before time 0
     "threads": "1",
 }
@@ -150,22 +150,22 @@ _OPTIONS: dict[str, object] = {
 
 @dataclass(frozen=True, kw_only=True)
 class DatasetSpec:
-    """Properties that all episodes share."""
+    """Properties shared by all episodes."""
 
     fps: int
     height: int
-    """Size of the images, even, as ``width``."""
+    """Image height, even like ``width``."""
     width: int
     state_frame: StateFrame
     task: str
     state_names: tuple[str, ...] = STATE_NAMES
-    """Numbers of ``observation.state``: by the contract or ``adapters.interface``."""
+    """Names of the numbers in ``observation.state``: by the contract or ``adapters.interface``."""
 
 
 class EpisodeVideo:
-    """The video of one episode, H.264, yuv420p, from time 0 on.
+    """Video of one episode, H.264, yuv420p, starting at time 0.
 
-    Methods raise OSError or FFmpegError where it cannot be written.
+    Methods raise OSError or FFmpegError if it cannot be written.
     """
 
     def __init__(self, path: Path, spec: DatasetSpec) -> None:
@@ -193,7 +193,7 @@ class EpisodeVideo:
 
 
 def episode_file(folder: Path, pattern: str, number: int) -> Path:
-    """The file of one episode, below a folder that is there."""
+    """Return the path of one episode's file in an existing folder."""
     chunk, file = divmod(number, FILES_A_CHUNK)
     path = folder / pattern.format(video_key=names.CAMERA_KEY, chunk_index=chunk, file_index=file)
     path.parent.mkdir(parents=True, exist_ok=True)

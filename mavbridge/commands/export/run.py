@@ -1,4 +1,4 @@
-"""``mavbridge export``: flights in, a LeRobot dataset out, whole or not at all."""
+"""``mavbridge export``: flights in, a LeRobot dataset out, complete or not at all."""
 
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
@@ -35,7 +35,7 @@ from policy.data.tables import read_json
 
 @dataclass(frozen=True, kw_only=True)
 class ExportSummary:
-    """Counts of what was written."""
+    """Counts of the written data."""
 
     episodes: int
     rows: int
@@ -87,7 +87,7 @@ def write_dataset(
     """Write flights into an empty folder; ``on_frame`` is called for every decoded frame.
 
     Raises:
-        UserError, VideoError, DatasetError: flights that cannot be in one dataset, or damaged.
+        UserError, VideoError, DatasetError: damaged flights, or they do not fit in one dataset.
     """
     if (action := common_terms(list(episodes)).action) != "sticks":
         raise UserError(f"these flights were flown by {action}: this command exports sticks")
@@ -125,14 +125,14 @@ def write_dataset(
 
 
 def write_contract(dataset: Path, flights: Sequence[Path], config: ExportConfig) -> None:
-    """Write the contract file of a policy that is trained on a dataset made of these flights.
+    """Write the contract file of a policy trained on a dataset of these flights.
 
     Raises:
         DatasetError: a flight's meta.json cannot be read.
     """
     metas = [read_json(flight / "meta.json", "flight folder") for flight in flights]
     contracts = [meta.get("contract") for meta in metas]
-    # The one camera is the vehicle's own, whatever its name: the contract's default.
+    # The only camera is the vehicle's own, whatever its name: the contract's default.
     entries = [
         *(entry for entry in dataset_entries(dataset) if entry.name != "cameras"),
         *recorded_entries([each for each in contracts if isinstance(each, dict)]),
@@ -148,7 +148,7 @@ def write_contract(dataset: Path, flights: Sequence[Path], config: ExportConfig)
 def _write_flight(
     writer: DatasetWriter, episode: FlightData, parts: list[Stretch], on_frame: Callable[[], None]
 ) -> None:
-    """Decode the video once, from its beginning, and write its stretches."""
+    """Decode the video once from its beginning, and write its stretches."""
 
     def decoded() -> Iterator[ImageArray]:
         for image in episode.decode():
@@ -164,10 +164,10 @@ def _write_flight(
 
 @contextmanager
 def _whole_or_nothing(out: Path) -> Iterator[Path]:
-    """A folder beside ``out`` that takes its name once the dataset in it is whole.
+    """Context manager: a folder beside ``out`` that is renamed to ``out`` when complete.
 
     Raises:
-        UserError: ``out`` holds something, or cannot be written.
+        UserError: ``out`` is not empty, or cannot be written.
     """
     part = out.with_name(f"{out.name}.unfinished")
     try:

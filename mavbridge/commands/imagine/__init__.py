@@ -7,7 +7,7 @@
                            rollout.mp4 <-- writer process <-- decode thread (or CUDA side stream)
                            rollout.parquet
 
-``loop.rollout`` is the loop and knows no files. ``StreamedOutput`` writes its segments as they
-come; the benchmarks' ``SerialOutput`` writes the same frames, bit for bit, at the end.
-Nothing grows with the number of iterations but the files.
+``loop.rollout`` is the loop and does not use files. ``StreamedOutput`` writes its segments as they
+come; the tests' ``SerialOutput`` writes bit-identical frames at the end. Only the files grow with
+the number of iterations.
 """

@@ -1,4 +1,4 @@
-"""The world model as the loop calls it, and the observed past at which a rollout starts."""
+"""The world model as the loop calls it, and the observed past from which a rollout starts."""
 
 from collections import deque
 from collections.abc import Iterator
@@ -21,12 +21,12 @@ from policy.world_model.model import WorldModel
 
 
 class ImaginationError(MavbridgeError):
-    """A world model that imagines NaN or infinity."""
+    """The world model imagined NaN or infinity."""
 
 
 @contextmanager
 def torch_threads(count: int) -> Iterator[None]:
-    """Let torch use so many threads, at least one, within the ``with`` block."""
+    """Context manager: let torch use ``count`` threads, at least one."""
     before = torch.get_num_threads()
     torch.set_num_threads(max(1, count))
     try:
@@ -36,7 +36,7 @@ def torch_threads(count: int) -> Iterator[None]:
 
 
 class Stopwatch:
-    """Adds up the time of its ``with`` blocks; not to be nested."""
+    """Adds up the time of its ``with`` blocks, which cannot be nested."""
 
     def __init__(self, clock: Clock) -> None:
         self._clock = clock
@@ -48,19 +48,19 @@ class Stopwatch:
         self._started_ns = self._clock.now_ns()
 
     def __exit__(self, *_: object) -> None:
-        """Add what has passed."""
+        """Add the elapsed time."""
         self.seconds += (self._clock.now_ns() - self._started_ns) / NS_PER_S
 
 
 class Meter:
-    """Time that the loop's own thread spends in each part; written by that thread alone."""
+    """Time that the loop's own thread spends in each part. Only that thread writes it."""
 
     def __init__(self, clock: Clock) -> None:
         self.sample = Stopwatch(clock)
         self.decode = Stopwatch(clock)
-        """Time for pixels: its own decodes, and waits for room in the decode queue."""
+        """Time for pixels: decoding in this thread, and waits for room in the decode queue."""
         self.write = Stopwatch(clock)
-        """Time for the files: its own writing, or waits for the end of the writer's."""
+        """Time for the files: writing in this thread, or waits for the writer to finish."""
         self.frames_decoded = 0
 
 
@@ -75,16 +75,16 @@ class ImaginedSteps:
     actions: FloatArray
     """[frames, 4]"""
     pixels: NDArray[np.uint8] | None
-    """[frames, H, W, 3] where everything is decoded at once, or None."""
+    """[frames, H, W, 3] if everything is decoded at once, or None."""
 
 
 class Sampler:
-    """One world model in both of its roles; used by the loop's thread."""
+    """One world model in both roles, simulation and decision. Used by the loop's thread."""
 
     def __init__(
         self, model: WorldModel, *, ddim_steps: int, clock: Clock, decode_all: bool = False
     ) -> None:
-        """Adapt a model, which is on its device already.
+        """Wrap a model that is already on its device.
 
         ``decode_all`` decodes every sample's frames at once.
         """
@@ -97,14 +97,14 @@ class Sampler:
         self._device = next(model.parameters()).device
 
     def encode(self, images: NDArray[np.uint8]) -> Tensor:
-        """Images [N, H, W, 3] -> latents [N, C, h, w]."""
+        """Encode images [N, H, W, 3] to latents [N, C, h, w]."""
         with torch.inference_mode():
             return self.model.encode(torch.from_numpy(images).to(self._device))
 
     def decode(self, latents: Tensor) -> NDArray[np.uint8]:
-        """Latents [N, C, h, w] -> images [N, H, W, 3].
+        """Decode latents [N, C, h, w] to images [N, H, W, 3].
 
-        On one thread, as ``FrameDecoder``: how a sum is split up decides how it is rounded.
+        On one thread, like ``FrameDecoder``, because splitting a sum changes its rounding.
         """
         with torch.inference_mode(), torch_threads(1), self.meter.decode:
             pixels: NDArray[np.uint8] = self.model.decode(latents).cpu().numpy()
@@ -114,13 +114,13 @@ class Sampler:
     def sample(
         self, latents: Tensor, states: FloatArray, actions: FloatArray | None, *, seed: int
     ) -> ImaginedSteps:
-        """Simulate the actions [frames, 4], or decide on some where they are None.
+        """Simulate the actions [frames, 4], or sample actions if they are None.
 
         Latents are [1, context_frames, C, h, w], states [1, context_frames, 13]; ``seed`` is that
         of the noise.
 
         Raises:
-            ImaginationError: what came out is not finite.
+            ImaginationError: the result is not finite.
         """
         with torch.inference_mode(), self.meter.sample:
             imagined = self.model.sample(
@@ -152,12 +152,12 @@ class Sampler:
 MAX_STATE_AGE_NS = 100_000_000
 """Oldest state, at the exposure of a frame, that still belongs to it."""
 MAX_HISTORY_S = 10.0
-"""No policy's history reaches further back than this."""
+"""Longest history that any policy uses."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class RolloutStart:
-    """The observed past of a rollout, oldest first; the newest frame is its time zero."""
+    """Observed past of a rollout, oldest first; the newest frame is its time zero."""
 
     images: NDArray[np.uint8]
     """[context_frames, H, W, 3] at the world model's size."""
@@ -166,14 +166,14 @@ class RolloutStart:
     newest_ns: int
     """Exposure of the newest frame, on the flight's clock."""
     sent: tuple[tuple[int, Sticks | None], ...]
-    """Sticks sent before it, each with its time; None = released."""
+    """Sticks sent before ``newest_ns``, each with its time; None: released."""
 
 
 def read_start(flight: RecordedFlight, config: WorldModelConfig, start_s: float) -> RolloutStart:
     """Read the context, from ``start_s`` after the first frame that has a state.
 
     Raises:
-        UserError: the flight is too short, has no states, or they are in another frame.
+        UserError: the flight is too short, has no states, or has them in another frame.
         VideoError: its video is damaged.
     """
     _require_state_frame(flight, config)
@@ -196,7 +196,7 @@ def read_start(flight: RecordedFlight, config: WorldModelConfig, start_s: float)
         )
     frames = [_nearest(captured_ns, at_ns) for at_ns in wanted_ns]
     newest_ns = int(captured_ns[frames[-1]])
-    # The last state that was known at each exposure.
+    # The newest state known at each exposure.
     known = np.searchsorted(state_ns, captured_ns[frames], side="right") - 1
     for row, at_ns in zip(known, captured_ns[frames], strict=True):
         if row < 0 or at_ns - state_ns[row] > MAX_STATE_AGE_NS:
@@ -253,7 +253,7 @@ def _nearest(stamps_ns: NDArray[np.int64], at_ns: int) -> int:
 class RealFrames:
     """Images of the flight's camera after the start, at the world model's times and size.
 
-    Decodes forward only; keeps as many frames as one segment has, since segments overlap.
+    Decodes forward only. Keeps as many frames as one segment has, because segments overlap.
     """
 
     def __init__(self, flight: RecordedFlight, config: WorldModelConfig, newest_ns: int) -> None:
@@ -266,10 +266,10 @@ class RealFrames:
         self._window: deque[ImageArray] = deque(maxlen=config.frames)
 
     def at(self, step: int) -> ImageArray | None:
-        """The frame ``step`` times ``frame_dt_s`` after the start; None once the flight is over.
+        """Return the frame ``step`` times ``frame_dt_s`` after the start; None after the flight.
 
         Raises:
-            ValueError: it has left the window: steps may go back by one segment at most.
+            ValueError: it has left the window: steps can go back by one segment at most.
             VideoError: the video is damaged.
         """
         while self._newest_step < step:
@@ -282,7 +282,7 @@ class RealFrames:
                 rgb = next(self._images)
                 self._decoded += 1
             self._newest_step += 1
-            # Two steps share a frame only where the camera is slower than the world model.
+            # Two steps share a frame only if the camera is slower than the world model.
             self._window.append(self._window[-1] if rgb is None else resize(rgb, size, size))
         if self._newest_step - step >= len(self._window):
             raise ValueError(f"step {step} has left the window")

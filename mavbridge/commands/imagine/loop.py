@@ -1,4 +1,4 @@
-"""Deciders of the sticks of an imagined flight, and the loop that asks them."""
+"""Deciders of the sticks in an imagined flight, and the loop that calls them."""
 
 from collections import deque
 from collections.abc import Iterator
@@ -20,15 +20,15 @@ from policy.contract import SINCE_EXPOSURE_DIM, Contract
 from policy.protocol import PolicyRunner
 
 SAMPLES_PER_STEP = 8
-"""An action of the world model is the mean stick of a step: the mean of so many samples."""
+"""Samples whose mean is one action of the world model, the mean stick of a step."""
 MAX_SEED = 2**63 - 1
 """Largest seed that torch's generators accept."""
 
 
 class ObservationQueue:
-    """The newest latents, states and images, oldest first, and the sticks that were executed.
+    """Newest latents, states and images, oldest first, and the executed sticks.
 
-    Images are appended by the loop once they are decoded: there may be fewer than steps.
+    The loop appends images once they are decoded: there can be fewer images than steps.
     """
 
     def __init__(
@@ -42,7 +42,7 @@ class ObservationQueue:
     ) -> None:
         """Begin with the observed past, whose images have ``latents`` [context_frames, C, h, w].
 
-        ``images`` and ``contract`` are the decider's.
+        ``images`` and ``contract`` are those of the decider.
         """
         self._latents = deque(latents, maxlen=len(latents))
         self._states = deque(start.states, maxlen=len(start.states))
@@ -54,22 +54,22 @@ class ObservationQueue:
             self._history.append(sticks, at_ns)
 
     def push(self, latent: Tensor, state: FloatArray, action: FloatArray) -> None:
-        """Add a step: latent [C, h, w] and state [13] that followed from holding ``action`` [4]."""
+        """Add a step: latent [C, h, w] and state [13] that result from holding ``action`` [4]."""
         self._history.append(Sticks(*action.tolist()), self._now_ns)
         self._now_ns += self._step_ns
         self._latents.append(latent)
         self._states.append(state)
 
     def latents(self) -> Tensor:
-        """[1, context_frames, C, h, w]"""
+        """Return the newest latents, [1, context_frames, C, h, w]."""
         return torch.stack(tuple(self._latents))[None]
 
     def states(self) -> FloatArray:
-        """[1, context_frames, 13]"""
+        """Return the newest states, [1, context_frames, 13]."""
         return np.stack(self._states)[None]
 
     def history(self) -> FloatArray:
-        """[1, K, 4] as the decider's contract has it, up to now."""
+        """Return the executed sticks up to now by the decider's contract, [1, K, 4]."""
         return self._history.resample(self._now_ns)
 
 
@@ -77,25 +77,25 @@ class Decider(Protocol):
     """Chooses the sticks."""
 
     images: int
-    """Number of the newest frames that it uses; with 0, none are decoded for it."""
+    """Number of newest frames that it uses; with 0, none are decoded for it."""
     contract: Contract
 
     def decide(self, seen: ObservationQueue, seed: int) -> FloatArray:
-        """Sticks [frames, 4] in [-1, 1]: the mean of each step of ``frame_dt_s`` from now on."""
+        """Return sticks [frames, 4] in [-1, 1]: the mean of each ``frame_dt_s`` from now on."""
         ...
 
 
 class PolicyDecider:
-    """A policy as it flies: newest image, newest state, sticks that were sent."""
+    """A policy as in flight: newest image, newest state, sent sticks."""
 
     images = 1
 
     def __init__(self, runner: PolicyRunner, sampler: Sampler) -> None:
-        """Make sure that the two belong together.
+        """Check that policy and world model fit together.
 
         Raises:
-            UserError: policy and world model have their states in different frames, or the policy
-                takes what nobody imagines.
+            UserError: their states are in different frames, or the policy takes inputs that are
+                not imagined.
         """
         seen = runner.contract
         if len(seen.cameras) > 1 or seen.observation_steps > 1 or seen.state_extras:
@@ -119,10 +119,10 @@ class PolicyDecider:
         self._frame_dt_s = sampler.config.frame_dt_s
 
     def decide(self, seen: ObservationQueue, seed: int) -> FloatArray:
-        """The mean of one chunk over each step; its noise was fixed when the policy was loaded."""
+        """Return a chunk's mean over each step. Its noise was fixed when the policy was loaded."""
         state = seen.states()[:, -1]
         if self.contract.since_exposure:
-            # The image is as old as the state: nothing has moved since.
+            # Image and state have the same age: no motion since the exposure.
             state = np.pad(state, ((0, 0), (0, SINCE_EXPOSURE_DIM)))
         feature = self._runner.encode(seen.images[-1])
         chunk = self._runner.act(feature, state, seen.history())[0]
@@ -140,16 +140,16 @@ class PolicyDecider:
 
 
 class WorldModelDecider:
-    """The world model itself, with the actions part of what it samples."""
+    """The world model as its own decider, by the sampled actions."""
 
     def __init__(self, sampler: Sampler, *, from_pixels: bool) -> None:
-        """``from_pixels``: it looks at its own frames, decoded and encoded again."""
+        """Decide from latents, or with ``from_pixels`` from its own frames, encoded again."""
         self.images = sampler.config.context_frames if from_pixels else 0
         self.contract = sampler.config.contract
         self._sampler = sampler
 
     def decide(self, seen: ObservationQueue, seed: int) -> FloatArray:
-        """The actions of one sample, whose latents are not used."""
+        """Return the actions of one sample; its latents are not used."""
         if self.images:
             latents = self._sampler.encode(np.stack(seen.images))[None]
         else:
@@ -158,36 +158,36 @@ class WorldModelDecider:
 
 
 class NoiseStage(IntEnum):
-    """Step of an iteration that draws noise. The number is part of every seed: never renumber."""
+    """Stage of an iteration that draws noise. The number is part of every seed: never renumber."""
 
     DECIDE = 0
     SIMULATE = 1
 
 
 def noise_seed(*numbers: int) -> int:
-    """Seed of one sample, independent of those of all other numbers."""
+    """Return the seed of one sample, independent of those of all other numbers."""
     sequence = np.random.SeedSequence(numbers)
     return int(sequence.generate_state(1, np.uint64)[0]) & MAX_SEED
 
 
 @dataclass(frozen=True, kw_only=True)
 class RolloutPlan:
-    """One rollout.
+    """Settings of one rollout.
 
     Raises:
-        UserError: more steps are to be executed than are imagined.
+        UserError: more steps are executed than are imagined.
     """
 
     iterations: int
     frames: int
-    """Number of each iteration's imagined frames that are shown, from the first on."""
+    """Number of imagined frames that are shown in each iteration, from the first on."""
     exe_steps: int
-    """Number of its actions that are executed before the next decision."""
+    """Number of actions executed before the next decision."""
     ddim_steps: int
     seed: int
 
     def __post_init__(self) -> None:
-        """Refuse a plan that no iteration can keep."""
+        """Raise UserError if no iteration can satisfy the plan."""
         if self.exe_steps > self.frames:
             raise UserError(
                 f"--exe-steps {self.exe_steps} is more than --frames {self.frames}: only frames "
@@ -195,13 +195,13 @@ class RolloutPlan:
             )
 
     def stage_seed(self, iteration: int, stage: NoiseStage) -> int:
-        """Seed of one stage of one iteration of this rollout: independent of all others."""
+        """Return the seed of one stage of one iteration, independent of all others."""
         return noise_seed(self.seed, iteration, int(stage))
 
 
 @dataclass(frozen=True, kw_only=True)
 class Segment:
-    """ImaginedSteps steps of one iteration that are shown: ``F`` = ``plan.frames`` of them."""
+    """Imagined steps of one iteration that are shown: ``F`` = ``plan.frames`` of them."""
 
     iteration: int
     latents: Tensor
@@ -211,16 +211,16 @@ class Segment:
     actions: FloatArray
     """[F, 4], each held until the frame of its row."""
     decoded: dict[int, ImageArray]
-    """Frames [H, W, 3] that have been decoded already, by row."""
+    """Frames [H, W, 3] that are already decoded, by row."""
 
 
 def rollout(
     sampler: Sampler, decider: Decider, start: RolloutStart, plan: RolloutPlan
 ) -> Iterator[Segment]:
-    """Imagine, an iteration a step; nothing is kept from one iteration but the observation.
+    """Imagine one iteration per step. Only the observation carries over between iterations.
 
-    Only frames that the decider will look at are decoded here: those of the executed steps that
-    will still be in its queue, and none after the last iteration.
+    Only frames that the decider uses are decoded here: those of the executed steps that will still
+    be in its queue, and none after the last iteration.
 
     Raises:
         ImaginationError: the world model imagines NaN or infinity.
@@ -259,7 +259,7 @@ def rollout(
 def _decode_needed(
     sampler: Sampler, imagined: ImaginedSteps, images: int, exe_steps: int
 ) -> dict[int, ImageArray]:
-    """The newest executed frames that fit into the decider's queue, by row, in one call."""
+    """Decode, in one call, the newest executed frames that fit into the decider's queue; by row."""
     if images == 0 or imagined.pixels is not None:
         return {}
     rows = range(exe_steps)[-images:]

@@ -1,4 +1,4 @@
-"""Writes a rollout's segments: ``NAME.mp4``, and ``NAME.parquet`` with a row for each frame.
+"""Writer of a rollout's segments: ``NAME.mp4``, and ``NAME.parquet`` with a row per frame.
 
 While it grows, and after a crash, the table is ``NAME.arrows``, as with recorded flights. A thread
 decodes, the writer process writes.
@@ -45,7 +45,7 @@ SCHEMA = pa.schema(
         pa.field("action", pa.list_(pa.float32(), ACTION_DIM), nullable=False),
     ]
 )
-"""The columns of docs/formats.md, named as the attributes of ``RolloutFrame``."""
+"""Columns described in docs/formats.md, named after the attributes of ``RolloutFrame``."""
 
 OnFrame: TypeAlias = Callable[[RolloutFrame, ImageArray | None], None]
 """Called for every frame [H, W, 3] in the video's order, by one thread; None: not decoded."""
@@ -56,14 +56,14 @@ def ignore_frame(frame: RolloutFrame, rgb: ImageArray | None) -> None:
 
 
 class RolloutError(MavbridgeError):
-    """A rollout that could not be written to its end; what was written is readable."""
+    """The rollout could not be written to its end; the part written so far is readable."""
 
 
 def prepare_out(out: Path) -> None:
-    """Make sure that a rollout can be written here.
+    """Check that a rollout can be written here.
 
     Raises:
-        UserError: the extra is not installed, the name is taken or no .mp4, or may not be written.
+        UserError: the extra is not installed, the name is taken or not .mp4, or is not writable.
     """
     require_extra("imagine")
     if out.suffix != ".mp4":
@@ -75,12 +75,12 @@ def prepare_out(out: Path) -> None:
 
 
 def read_rows(out: Path) -> Any:
-    """The rows of a rollout's frames, finished or cut off: a ``pyarrow.Table`` of ``SCHEMA``.
+    """Return the rows of a rollout, finished or cut off: a ``pyarrow.Table`` of ``SCHEMA``.
 
-    A rollout without a video has its rows alone.
+    A rollout without a video has only its rows.
 
     Raises:
-        MavbridgeError: there is none, or it is damaged.
+        MavbridgeError: the table is missing or damaged.
     """
     table = read_table(out, SCHEMA)
     return table.slice(0, count_frames(out)) if out.exists() else table
@@ -88,7 +88,7 @@ def read_rows(out: Path) -> Any:
 
 @contextmanager
 def writing(path: Path) -> Iterator[None]:
-    """Turn the errors of writing a file into ``RolloutError``."""
+    """Context manager: convert errors of writing a file to ``RolloutError``."""
     try:
         yield
     except WRITE_ERRORS as error:
@@ -97,32 +97,33 @@ def writing(path: Path) -> Iterator[None]:
 
 
 def rows_batch(frames: Sequence[RolloutFrame]) -> pa.RecordBatch:
-    """Rows of the table."""
+    """Convert frames to rows of the table."""
     rows = [{name: getattr(frame, name) for name in SCHEMA.names} for frame in frames]
     return pa.RecordBatch.from_pylist(rows, schema=SCHEMA)
 
 
 def captured_ns(frame: RolloutFrame) -> int:
-    """Time of a frame in the video, where the frames follow each other evenly."""
+    """Return the time of a frame in the video, where frames are evenly spaced."""
     return round(frame.number * frame.frame_dt_s * NS_PER_S)
 
 
 QUEUED_SEGMENTS = 2
-"""Segments that may wait for the decoder; then the loop waits. The slowest part sets the pace."""
+"""Capacity of the decoder's queue in segments; when it is full, the loop waits, so that the slowest
+part sets the pace."""
 STALL_S = 120.0
-"""Longest time in which not one frame gets through."""
+"""Longest time without a finished frame."""
 END_S = 45.0
-"""Longer than a writer process that hangs is waited for."""
+"""Longer than the timeout for a hung writer process."""
 PINNED_FRAMES = 4
-"""Frames that may be on their way from the GPU at a time."""
+"""Frames in transit from the GPU at a time."""
 _POLL_S = 0.1
 
 
 class FrameDecoder:
-    """Latents to images, one frame at a time, since the loop wants the processor, too.
+    """Converts latents to images, one frame at a time, because the loop needs the processor, too.
 
-    On a GPU, on a stream beside the sampler's: frames come back through a ring of pinned memory.
-    Used by one thread.
+    On a GPU it uses a stream beside the sampler's, and frames return through a ring of pinned
+    memory. Used by one thread.
     """
 
     def __init__(self, model: WorldModel) -> None:
@@ -136,9 +137,9 @@ class FrameDecoder:
             self._views: NDArray[np.uint8] = self._ring.numpy()
 
     def frames(self, latents: Tensor, ready: torch.cuda.Event | None) -> Iterator[ImageArray]:
-        """Images [H, W, 3] of latents [N, C, h, w], each to be used before the next is taken.
+        """Return images [H, W, 3] of latents [N, C, h, w]; use each before taking the next.
 
-        On a GPU the latents may be read after the event ``ready``.
+        On a GPU the latents can be read after the event ``ready``.
         """
         if self._stream is None:
             for latent in latents:
@@ -149,10 +150,10 @@ class FrameDecoder:
         under_way: deque[tuple[int, torch.cuda.Event]] = deque()
         if ready is not None:
             self._stream.wait_event(ready)
-        # Freed by the loop's stream, the memory must not be given away before this one is done.
+        # Once the loop's stream frees the memory, it must not be reused before this stream is done.
         latents.record_stream(self._stream)
         for row, latent in enumerate(latents):
-            if len(under_way) == PINNED_FRAMES:  # a slot is free once its frame was used
+            if len(under_way) == PINNED_FRAMES:  # a slot is free once its frame has been used
                 yield self._arrived(*under_way.popleft())
             slot = row % PINNED_FRAMES
             under_way.append((slot, self._launch(latent, slot, self._stream)))
@@ -176,15 +177,15 @@ class _DecodeJob:
     frames: list[RolloutFrame]
     decoded: dict[int, ImageArray]
     missing: Tensor | None
-    """Latents of the frames that are not decoded yet, in order; None: no video is wanted."""
+    """Latents of the frames not decoded yet, in order; None: no video."""
     ready: torch.cuda.Event | None
-    """Event of the GPU after which they may be read."""
+    """GPU event after which the latents can be read."""
 
 
 class StreamedOutput:
-    """Writes frames and rows of segments to the disk as they come; used by the loop's thread.
+    """Writes frames and rows of segments to disk as they come. Used by the loop's thread.
 
-    Methods raise ``MavbridgeError`` if something, now or before, could not be written.
+    Methods raise ``MavbridgeError`` if writing fails or has failed before.
     """
 
     def __init__(
@@ -196,7 +197,7 @@ class StreamedOutput:
         decode_video: bool = True,
         on_frame: OnFrame = ignore_frame,
     ) -> None:
-        """Open the output at ``out``; without ``decode_video`` it is the rows alone."""
+        """Open the output at ``out``; without ``decode_video``, only the rows."""
         self.out = out
         self._plan = plan
         self._decode_video = decode_video
@@ -207,7 +208,7 @@ class StreamedOutput:
         self._digest = hashlib.sha256()
         self.frames = 0
         self.frames_decoded = 0
-        """Frames decoded beside the loop's thread, whose own are in its meter."""
+        """Frames decoded outside the loop's thread, whose own frames are in its meter."""
         self._open()
 
     def _open(self) -> None:
@@ -228,26 +229,26 @@ class StreamedOutput:
 
     @property
     def sha256(self) -> str:
-        """SHA-256 of all frames so far, raw, in their order."""
+        """SHA-256 of all raw frames so far, in order."""
         return self._digest.hexdigest()
 
     @property
     def decode_queue(self) -> int:
-        """Segments that wait to be decoded."""
+        """Number of segments waiting to be decoded."""
         return self._jobs.qsize()
 
     @property
     def writer_queue(self) -> int:
-        """Frames that wait to be written."""
+        """Number of frames waiting to be written."""
         return 0 if self._video is None else self._video.lost
 
     @property
     def writer_pid(self) -> int | None:
-        """Process id of the writer; None where there is none."""
+        """Process id of the writer; None if there is none."""
         return None if self._video is None else self._video.pid
 
     def put(self, segment: Segment) -> None:
-        """Queue a segment; waits while the queue is full."""
+        """Queue a segment; wait while the queue is full."""
         frames = self._rows(segment)
         missing = ready = None
         if self._video is not None:
@@ -261,7 +262,7 @@ class StreamedOutput:
     def _enqueue(self, job: _DecodeJob | None, on_wait: Callable[[], None] = lambda: None) -> None:
         def was_put() -> bool:
             if not self._worker.is_alive:
-                self._worker.join(END_S)  # raises what the thread has raised
+                self._worker.join(END_S)  # raises the thread's exception
                 raise RuntimeError("the thread ended before its work did")
             try:
                 self._jobs.put(job, timeout=_POLL_S)
@@ -272,7 +273,7 @@ class StreamedOutput:
         self._wait_until(was_put, on_wait)
 
     def _wait_until(self, condition: Callable[[], bool], on_wait: Callable[[], None]) -> None:
-        """Wait as long as frames get through; the condition itself waits a little."""
+        """Wait for the condition, which itself waits briefly, as long as frames are finished."""
         seen, since_ns = self.frames, self._clock.now_ns()
         while not condition():
             on_wait()
@@ -282,7 +283,7 @@ class StreamedOutput:
                 raise HungError(f"no frame has been decoded and written for {STALL_S:g} s")
 
     def finish(self, on_wait: Callable[[], None] = lambda: None) -> None:
-        """Work off the queue, close the files, and compare their lengths."""
+        """Process the queue, close the files, and compare their lengths."""
         with self._sampler.meter.decode:
             self._enqueue(None, on_wait)
             self._wait_until(lambda: self._worker.ends_within(_POLL_S), on_wait)
@@ -298,8 +299,8 @@ class StreamedOutput:
                 self._table.finish()
 
     def close(self) -> None:
-        """Stop the thread and the writer; what is written stays readable."""
-        with suppress(BaseException):  # it is what led here
+        """Stop the thread and the writer; the data written so far stays readable."""
+        with suppress(BaseException):  # its exception led here
             self._worker.join(END_S)
         if self._video is not None:
             self._video.close()
@@ -317,7 +318,7 @@ class StreamedOutput:
                 self._write(job, stop)
 
     def _write(self, job: _DecodeJob, stop: Event) -> None:
-        # Rows first: after a crash there may be rows without a frame, but no frame without a row.
+        # Rows first: after a crash, rows without a frame are possible, but no frame without a row.
         with writing(self._table_path):
             self._table.append(rows_batch(job.frames))
         images: Iterator[ImageArray] = iter(())
@@ -357,7 +358,7 @@ class StreamedOutput:
         ]
 
     def _show(self, frame: RolloutFrame, rgb: ImageArray | None) -> None:
-        """Count a frame that has left the decoder, and let the observer see it."""
+        """Count a decoded frame, and pass it to the observer."""
         if rgb is not None:
             self._digest.update(np.ascontiguousarray(rgb).data)
         self._on_frame(frame, rgb)

@@ -46,7 +46,7 @@ SHIPPED = Path(policy.__file__).parent / "weights" / "world_model.safetensors"
 
 
 def imagine(config: ImagineConfig) -> int:
-    """Imagine a flight; the exit status is 130 if interrupted, with what there was by then."""
+    """Imagine a flight; if interrupted, return 130 and keep the output so far."""
     console = Console(stderr=True, highlight=False, emoji=False)
     clock = MonotonicClock()
     plan = RolloutPlan(
@@ -69,8 +69,8 @@ def imagine(config: ImagineConfig) -> int:
         )
     start = read_start(flight, model.config, config.start_at)
     sampler = Sampler(model, ddim_steps=plan.ddim_steps, clock=clock)
-    # One core is left for the decoder: torch's threads spin at the end of every operation until the
-    # last is done.
+    # Leave one core for the decoder: torch's threads spin at the end of every operation until the
+    # last of them is done.
     free = torch.get_num_threads() - 1
     with ExitStack() as stack:
         decider = _make_decider(config, sampler, clock, console, stack)
@@ -100,10 +100,10 @@ def run_rollout(
     output: StreamedOutput,
     console: Console,
 ) -> bool:
-    """Run the iterations; returns whether a signal ended them early.
+    """Run the iterations; return True if a signal ended them early.
 
     Raises:
-        RolloutError: it had to end; the message names what is left.
+        RolloutError: the rollout had to end; the message names the remaining files.
     """
     done = 0
     try:
@@ -138,14 +138,14 @@ def run_rollout(
 
 
 def load_model(world_model: Path | None, *, ddim_steps: int, device: str) -> WorldModel:
-    """Load a world model, by default the one that comes with mavbridge, onto a torch device.
+    """Load a world model onto a torch device; default: the one shipped with mavbridge.
 
     Raises:
-        PolicyError: there is no such device, the weights cannot be used, or not with so many steps.
+        PolicyError: no such device, or the weights cannot be used, or not with so many steps.
     """
     require_devices(device)
     model = load_world_model(world_model or SHIPPED)
-    model.config.schedule.ddim_steps(ddim_steps)  # refuses what it cannot do
+    model.config.schedule.ddim_steps(ddim_steps)  # raises if that number is not possible
     return model.to(torch.device(device)).eval()
 
 

@@ -1,1 +1,1 @@
-"""The report of a recorded flight: on the terminal and in the viewer."""
+"""Report of a recorded flight, on the terminal and in the viewer."""

@@ -1,4 +1,4 @@
-"""What a recorded flight tells: figures, who held the sticks, and the moments that went worst."""
+"""Analysis of a recorded flight: figures, who held the sticks, and the worst moments."""
 
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
@@ -37,23 +37,24 @@ from mavbridge.recording.rows import FrameRow
 
 Holder = Literal["policy", "read-only", "idle", "neutral", "release", "pilot"]
 """idle: ours, before the policy flies; neutral: ours, on the way out; release: given back, not yet
-confirmed; pilot: whoever has them while we send nothing, a receiver, or the autopilot alone."""
+confirmed; pilot: another holder while we send nothing, such as a receiver or the autopilot
+alone."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class HolderSpan:
-    """A stretch of time with one holder."""
+    """Stretch of time with one holder."""
 
     start_s: float
-    """Since the first tick."""
+    """Time since the first tick."""
     end_s: float
     holder: Holder
     reason: Reason | None
-    """Why the policy did not fly, for most of the time; None while it did."""
+    """Why the policy did not fly, for most of the span; None while it flew."""
 
 
 def holder_of(tick: Tick) -> Holder:
-    """Who held the sticks after this tick."""
+    """Return the holder of the sticks after this tick."""
     if tick.trace is not None:
         return "read-only" if tick.sent is None else "policy"
     if tick.sent is not None:
@@ -62,7 +63,8 @@ def holder_of(tick: Tick) -> Holder:
 
 
 def holder_spans(ticks: Sequence[Tick], start_ns: int) -> tuple[HolderSpan, ...]:
-    """Stretches in the order of time; a new reason does not begin one, the longest one is told."""
+    """Return the stretches in the order of time, each with its longest-lasting reason. A new reason
+    does not start a new stretch."""
     spans: list[HolderSpan] = []
     at = 0
     for holder, group in groupby(ticks, holder_of):
@@ -89,15 +91,15 @@ def holder_spans(ticks: Sequence[Tick], start_ns: int) -> tuple[HolderSpan, ...]
 
 @dataclass(frozen=True, kw_only=True)
 class Images:
-    """When the images of one camera were exposed; row k is image k of its video."""
+    """Exposures of one camera's images. Row k is image k of its video."""
 
     camera: str
-    """Its name in the contract."""
+    """Name in the contract."""
     video: Path
     exposed_s: FloatColumn
-    """[M] seconds since the first tick."""
+    """[M] exposures in seconds since the first tick."""
     latency_ms: Percentiles | None
-    """From the exposure to the finished feature; None without images."""
+    """Time from the exposure to the finished feature; None without images."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -107,32 +109,32 @@ class FlightAnalysis:
     folder: Path
     meta: FlightMeta
     stick_hz: float
-    """Rate of the stick grid, by the slots themselves."""
+    """Rate of the stick grid, derived from the slots themselves."""
     report: TimingReport
-    """The figures of the table that ended the flight, but for those of the link."""
+    """Figures of the table that ended the flight, except for those of the link."""
     series: Series
     cameras: tuple[Images, ...]
-    """Those of the contract, in its order; ``report`` speaks of the first one."""
+    """Cameras in the contract's order; ``report`` describes the first one."""
     track: Track | None
-    """None where no position is known."""
+    """None if no position is known."""
     gates: tuple[CourseGate, ...]
-    """Empty where the course is not known."""
+    """Empty if the course is unknown."""
     holders: tuple[HolderSpan, ...]
     delays: tuple[Delay, ...]
-    """Missed slots and late chunks, each with its cause, in the order of time."""
+    """Missed slots and late chunks in the order of time, each with its cause."""
     moments: tuple[Moment, ...]
-    """The ten worst, the worst one first."""
+    """The ten worst, starting with the worst."""
     damage: tuple[str, ...]
-    """What of the recording was skipped, in sentences for the user."""
+    """Skipped parts of the recording, in sentences for the user."""
 
     @property
     def images(self) -> Images:
-        """Those of the first camera."""
+        """Images of the first camera."""
         return self.cameras[0]
 
     @property
     def causes(self) -> tuple[tuple[str, int], ...]:
-        """How often each cause made a chunk late or missed slots, the most frequent first."""
+        """Number of late chunks and missed slots by cause, the most frequent first."""
         counts: dict[str, int] = {}
         for delay in self.delays:
             counts[delay.cause] = counts.get(delay.cause, 0) + delay.count
@@ -140,10 +142,10 @@ class FlightAnalysis:
 
 
 def analyse(folder: Path, *, gates: Path | None = None) -> FlightAnalysis:
-    """Read a recorded flight; ``gates`` is a file of ``read_gates``, for one that knows no course.
+    """Read a recorded flight; ``gates`` is a file of ``read_gates``, for an unknown course.
 
     Raises:
-        MavbridgeError: it is no recorded flight, or a damaged one.
+        MavbridgeError: not a recorded flight, or a damaged one.
     """
     flight = open_flight(folder)
     _require_sound(flight)
@@ -176,7 +178,7 @@ def analyse(folder: Path, *, gates: Path | None = None) -> FlightAnalysis:
 
 
 def _require_sound(flight: RecordedFlight) -> None:
-    """Refuse facts with which nothing can be counted; raises FlightError."""
+    """Raise FlightError if the facts contain values that cannot be used for counting."""
     meta = flight.meta
     for name in ("action_hz", "visual_hz"):
         if getattr(meta, name) <= 0:
@@ -188,7 +190,7 @@ def _require_sound(flight: RecordedFlight) -> None:
 
 
 def _stick_hz(ticks: Iterable[Tick], meta: FlightMeta) -> float:
-    """Rate of the grid, by the median time from one slot to the next; else that of the actions."""
+    """Return the stick rate by the median time between slots; without slots, the action rate."""
     due_ns = np.array([tick.due_ns for tick in ticks if tick.is_slot and tick.due_ns > 0], np.int64)
     periods_ns = due_ns[1:] - due_ns[:-1]
     periods_ns = periods_ns[periods_ns > 0]
@@ -200,7 +202,7 @@ def _stick_hz(ticks: Iterable[Tick], meta: FlightMeta) -> float:
 def _report(
     flight: RecordedFlight, ticks: list[Tick], frames: list[FrameRow], stick_hz: float
 ) -> TimingReport:
-    """Count the rows as they were counted in flight, but for what only a flight knows."""
+    """Count the rows as in flight, except for figures that only a live flight has."""
     meta = flight.meta
     timing = FlightTiming(stick_hz=stick_hz, action_hz=meta.action_hz, vision_hz=meta.visual_hz)
     for tick in _with_gaps(ticks):
@@ -218,8 +220,7 @@ def _report(
 
 
 def _with_gaps(ticks: Sequence[Tick]) -> Iterator[Tick]:
-    """The ticks, and one without sticks wherever the recorder has lost some: nothing is measured
-    across such a gap."""
+    """Yield the ticks, and one without sticks in each gap, across which nothing is measured."""
     yield from ticks[:1]
     for last, tick in pairwise(ticks):
         if is_gap(last, tick):
@@ -228,7 +229,7 @@ def _with_gaps(ticks: Sequence[Tick]) -> Iterator[Tick]:
 
 
 def _losses(flight: RecordedFlight) -> int:
-    """What the recorder has lost; of a recording that was cut off, up to its last row."""
+    """Return the recorder's losses; of a recording that was cut off, up to its last row."""
     meta = flight.meta
     counts = (meta.ticks_dropped, meta.frames_dropped, meta.packets_dropped)
     if any(count is not None for count in counts):
@@ -238,9 +239,9 @@ def _losses(flight: RecordedFlight) -> int:
 
 
 def _vision(frames: Sequence[FrameRow], visual_hz: float) -> VisionReport:
-    """Images by their exposures, with those that only the recorder has lost.
+    """Count the images by their exposures, including those that only the recorder has lost.
 
-    A recording knows neither what the camera dropped nor when an encoding began.
+    A recording contains neither the camera's drops nor the start of an encoding.
     """
     count = sum(1 + frame.dropped_before for frame in frames)
     rate_hz: float | None = None

@@ -32,35 +32,35 @@ Cause = Literal[
     "the policy loop began late",
     "the attitude or the policy loop was late",
 ]
-"""The last one where the recording lacks the arrivals, without which nobody can tell."""
+"""The last cause covers recordings without arrivals, which would tell its two cases apart."""
 ATTITUDES = (30, 31)
 """Message ids of ATTITUDE and ATTITUDE_QUATERNION (MAVLink, common.xml)."""
 
 
 class Arrivals(NamedTuple):
-    """Attitudes of the vehicle, in the order in which they were measured."""
+    """Attitudes of the vehicle in the order of measurement."""
 
     happened_ns: Stamps
-    """[K] as in ``VehicleState.attitude_ns``."""
+    """[K] measurement times, as in ``VehicleState.attitude_ns``."""
     arrived_ns: Stamps
-    """[K] at this computer."""
+    """[K] arrivals at this computer."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Delay:
-    """A late chunk, or missed slots in a row."""
+    """A late chunk, or consecutive missed slots."""
 
     at_ns: int
     what: Literal["late chunk", "missed slots"]
     count: int
-    """Slots that were missed; 1 for a chunk."""
+    """Number of missed slots; 1 for a chunk."""
     delay_ms: float
     """Time beyond the period."""
     cause: Cause
 
 
 class _Solve(NamedTuple):
-    """The computation of the chunk that a tick flew."""
+    """Computation of the chunk that a tick flew."""
 
     serial: int
     started_ns: int
@@ -69,16 +69,16 @@ class _Solve(NamedTuple):
 
 
 def is_gap(last: Tick, tick: Tick) -> bool:
-    """The recording lacks ticks between these two neighbours."""
+    """True if the recording lacks ticks between these two neighbours."""
     return tick.serial != last.serial + 1
 
 
 def find_delays(
     ticks: Sequence[Tick], *, stick_hz: float, action_hz: float, arrivals: Arrivals | None = None
 ) -> tuple[Delay, ...]:
-    """Missed slots and late chunks while the policy flew, in the order of time.
+    """Return missed slots and late chunks while the policy flew, in the order of time.
 
-    Nothing is said about the time between two ticks that the recorder has lost.
+    Gaps in which the recorder lost ticks are left out.
     """
     slot_ns, chunk_ns = NS_PER_S / stick_hz, NS_PER_S / action_hz
     found = [*_missed_slots(ticks, slot_ns), *_late_chunks(ticks, chunk_ns, arrivals)]
@@ -103,7 +103,7 @@ def _missed_slots(ticks: Sequence[Tick], slot_ns: float) -> Iterator[Delay]:
 def _late_chunks(
     ticks: Sequence[Tick], chunk_ns: float, arrivals: Arrivals | None
 ) -> Iterator[Delay]:
-    """Chunks beyond ``LATE_PERIODS`` after the one before."""
+    """Yield chunks that came more than ``LATE_PERIODS`` after the one before."""
     before: Tick | None = None
     last: _Solve | None = None
     for tick in ticks:
@@ -114,7 +114,7 @@ def _late_chunks(
             if solve is None or last is None or solve.serial < last.serial:
                 last = solve
             continue
-        # Chunks in between, which newer ones overtook before any send, were not late.
+        # Chunks in between, overtaken by newer ones before any send, were not late.
         count = solve.serial - last.serial
         period_ns = (solve.computed_ns - last.computed_ns) / count
         if period_ns > LATE_PERIODS * chunk_ns:
@@ -140,9 +140,9 @@ def _solve_of(tick: Tick) -> _Solve | None:
 
 
 def _cause(last: _Solve, solve: _Solve, chunk_ns: float, arrivals: Arrivals | None) -> Cause:
-    """The stage that cost most of the delay.
+    """Return the stage that caused most of the delay.
 
-    A solve may start a period after the last one, when that has ended and a new attitude is there.
+    A solve can start one period after the last one, once that has ended and an attitude is new.
     """
     due_ns = last.started_ns + (solve.serial - last.serial) * chunk_ns
     free_ns = max(due_ns, last.computed_ns)
@@ -164,10 +164,10 @@ def _cause(last: _Solve, solve: _Solve, chunk_ns: float, arrivals: Arrivals | No
 def _arrival_ns(
     arrivals: Arrivals | None, last: _Solve, solve: _Solve, chunk_ns: float
 ) -> int | None:
-    """When the first attitude came that could have started a solve; None: not recorded.
+    """Return the arrival of the first attitude that could have started a solve; None: not recorded.
 
-    It is newer than the last solve's by half a period: the loop takes one that comes a quarter
-    before its time, and its time may follow a late solve by half a period.
+    It is newer than the last solve's attitude by half a period: the loop takes one that comes a
+    quarter of a period early, and its due time can follow a late solve by half a period.
     """
     if arrivals is None or last.attitude_ns is None or solve.attitude_ns is None:
         return None
@@ -176,12 +176,12 @@ def _arrival_ns(
     if number == len(arrivals.happened_ns):
         return None
     if int(arrivals.happened_ns[number]) > solve.attitude_ns:
-        return None  # the one that was used is not in the table: its row was lost
+        return None  # the attitude used is not in the table: its row was lost
     return int(arrivals.arrived_ns[number])
 
 
 def flown_limits(folder: Path, contract: Contract | None) -> FreshnessLimits | None:
-    """Ages at which chunks were flown: the flags' where they are recorded, else the contract's."""
+    """Return the age limits of the flown chunks: the recorded flags', else the contract's."""
     if contract is None:
         return None
     try:
@@ -191,9 +191,9 @@ def flown_limits(folder: Path, contract: Contract | None) -> FreshnessLimits | N
 
 
 def read_arrivals(folder: Path, damage: list[str]) -> Arrivals | None:
-    """Attitudes that reached the flight process; None where the recording has no such table.
+    """Return the attitudes that reached the flight process; None if there is no such table.
 
-    A sentence on what is lost is added to ``damage``.
+    A sentence about any loss is appended to ``damage``.
 
     Raises:
         MavbridgeError: the table is damaged.
@@ -210,7 +210,7 @@ def read_arrivals(folder: Path, damage: list[str]) -> Arrivals | None:
 
 
 def recorded_solves(folder: Path, contract: Contract | None) -> Iterator[Solve]:
-    """What the policy computed, in the order of time; nothing where it was not recorded.
+    """Return the policy's solves in the order of time; nothing if they were not recorded.
 
     Raises:
         MavbridgeError: the table is damaged.

@@ -1,4 +1,4 @@
-"""The moments of a recorded flight that went worst, and what happened in them."""
+"""Worst moments of a recorded flight, and their descriptions."""
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
@@ -15,24 +15,24 @@ from mavbridge.recording.rows import FrameRow
 
 MOMENTS = 10
 APART_S = 0.25
-"""Moments that are closer together are told as one."""
+"""Moments closer together than this are merged into one."""
 CRASH_MS, END_MS = 20_000.0, 10_000.0
-"""Weights of a crash, and of an end that nobody had planned: worse than any delay."""
+"""Weights of a crash and of an unplanned end: worse than any delay."""
 IMAGE_PERIODS = 2.0
-"""A gap between two exposures beyond this many periods is worth telling."""
+"""Gap between two exposures, in periods, above which it is reported."""
 LEAST_MS = 1.0
-"""Coasting that ends sooner, by a chunk between two slots, is not told."""
+"""Coasting that ends sooner, with a chunk between two slots, is not reported."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Moment:
-    """Something that a person wants to look at."""
+    """Moment worth a user's attention."""
 
     t_s: float
-    """Since the first tick."""
+    """Time since the first tick."""
     what: str
     severity_ms: float
-    """Length of the delay, age or gap, by which moments are put in order."""
+    """Length of the delay, age or gap; sort key of the moments."""
     detail: str
     """Figures and cause, as a phrase."""
 
@@ -44,9 +44,9 @@ def worst_moments(
     delays: Sequence[Delay],
     limits: FreshnessLimits | None = None,
 ) -> tuple[Moment, ...]:
-    """The ``MOMENTS`` worst, at least ``APART_S`` apart, the worst one first.
+    """Return the ``MOMENTS`` worst, at least ``APART_S`` apart, starting with the worst.
 
-    ``limits`` are the ages at which chunks were flown; None: not known.
+    ``limits`` are the age limits of the flown chunks; None: unknown.
     """
     if not ticks:
         return ()
@@ -71,7 +71,7 @@ def worst_moments(
 
 
 def _told_together(group: Sequence[Moment]) -> Moment:
-    """The worst of close moments, with the worst one of each other kind in its detail."""
+    """Merge close moments: the worst one, with the worst of each other kind in its detail."""
     worst, *others = group
     phrases = [worst.detail, *(f"{other.what}: {other.detail}" for other in others)]
     return replace(worst, detail="; ".join(phrases))
@@ -82,7 +82,8 @@ def _since_s(at_ns: int, start_ns: int) -> float:
 
 
 def _crash(flight: RecordedFlight, ticks: Sequence[Tick]) -> Iterator[Moment]:
-    """When the ticks show a crash; of a recording that was cut off nobody has said so yet."""
+    """Yield the first crash in the ticks. The meta of a recording that was cut off cannot report
+    one, so its ticks are searched, too."""
     if flight.meta.finished and flight.meta.crash is None:
         return
     watch = CrashWatch()
@@ -114,7 +115,7 @@ def _ends(ticks: Sequence[Tick], start_ns: int) -> Iterator[Moment]:
 
 
 def _ages(tick: Tick) -> str:
-    """What the sticks of a tick came from, as the end of a phrase."""
+    """Return the ages of the data behind a tick's sticks, as the end of a phrase."""
     parts = []
     if tick.state is not None:
         age_ms = (tick.sent_ns - tick.state.attitude_ns) / NS_PER_MS
@@ -139,7 +140,7 @@ def _delay_moments(delays: Sequence[Delay], start_ns: int) -> Iterator[Moment]:
 
 
 def _coasting(ticks: Sequence[Tick], limits: FreshnessLimits | None) -> Iterator[Moment]:
-    """Sends along a chunk that was too old, up to the first send that was not."""
+    """Yield sends of an outdated chunk, up to the first send of a fresh one."""
     at = 0
     for is_coasting, group in groupby(ticks, lambda tick: tick.is_coasting and bool(tick.trace)):
         run = list(group)
@@ -159,7 +160,7 @@ def _coasting(ticks: Sequence[Tick], limits: FreshnessLimits | None) -> Iterator
 
 
 def _staleness(tick: Tick, limits: FreshnessLimits | None) -> str:
-    """Why the chunk of a tick was too old; the order is that of the guard's own check."""
+    """Return why the chunk of a tick was outdated; in the order of the guard's own check."""
     state = tick.state
     if limits is not None and state is not None:
         ages = (
@@ -177,7 +178,7 @@ def _staleness(tick: Tick, limits: FreshnessLimits | None) -> str:
 
 
 def _old_images(ticks: Sequence[Tick], start_ns: int) -> Iterator[Moment]:
-    """In each stretch of sticks by images twice as old as usual, those by the oldest one."""
+    """Yield the oldest image of each stretch of sticks based on images twice as old as usual."""
     aged = [
         (tick.sent_ns - tick.feature_captured_ns, tick)
         for tick in ticks
@@ -200,7 +201,7 @@ def _old_images(ticks: Sequence[Tick], start_ns: int) -> Iterator[Moment]:
 def _image_gaps(
     flight: RecordedFlight, frames: Sequence[FrameRow], ticks: Sequence[Tick]
 ) -> Iterator[Moment]:
-    """Gaps between exposures from the first tick to the last, without those of the recorder."""
+    """Yield gaps between exposures from the first tick to the last, except the recorder's."""
     period_ms = 1000 / flight.meta.visual_hz
     for last, frame in pairwise(frames):
         gap_ms = (frame.captured_ns - last.captured_ns) / NS_PER_MS

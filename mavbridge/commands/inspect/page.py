@@ -1,4 +1,4 @@
-"""The page of ``mavbridge inspect --html``: one file with the figures, the plots and the video."""
+"""Page of ``mavbridge inspect --html``: one file with the figures, the plots and the video."""
 
 import html
 import json
@@ -20,19 +20,19 @@ from mavbridge.flight.outcome import describe
 MAX_POINTS = 20_000
 """Points of a line: four times the pixels of a wide screen. Longer flights keep both extremes."""
 MAX_VIDEO_BYTES = 40_000_000
-"""A larger video stays beside the page: browsers become slow with much more in one address."""
+"""A larger video stays beside the page: larger data URLs make browsers slow."""
 BINS = 40
 ECHO = "vehicle's echo"
 ECHO_WIDTH, LINE_WIDTH = 5.0, 1.4
-"""Pixels. The echo lies under the sticks, and shows on both sides of them where they agree."""
+"""In pixels. The echo is drawn under the sticks, and is visible on both sides if they agree."""
 _HERE = files("mavbridge.commands.inspect")
 
 
 def write_page(path: Path, flights: Sequence[FlightAnalysis]) -> None:
-    """Write one page that needs no other file and no network, with the flights side by side.
+    """Write one page with the flights side by side, which needs no other file and no network.
 
     Raises:
-        UserError: the page cannot be written, or a video not be read.
+        UserError: the page cannot be written, or a video cannot be read.
     """
     title = "mavbridge: " + " and ".join(flight.folder.name for flight in flights)
     try:
@@ -50,7 +50,7 @@ def write_page(path: Path, flights: Sequence[FlightAnalysis]) -> None:
 
 
 def page_data(flights: Sequence[FlightAnalysis]) -> str:
-    """The JSON in the page; no ``<`` is in it, so no name can end its element."""
+    """Return the JSON in the page. It contains no ``<``, so that no name can end its element."""
     return json.dumps([_flight(flight) for flight in flights], allow_nan=False).replace(
         "<", "\\u003c"
     )
@@ -74,7 +74,7 @@ def _flight(flight: FlightAnalysis) -> dict[str, Any]:
 
 
 def _facts(flight: FlightAnalysis) -> Iterator[tuple[str, str, bool]]:
-    """Label, text, and whether it is bad news."""
+    """Yield label, text, and True if the fact is bad news."""
     report, meta = flight.report, flight.meta
     sticks, action, vision = report.sticks, report.action, report.vision
     yield "policy", f"{report.policy} on {report.engine}, {report.mode} rate", False
@@ -145,7 +145,7 @@ def _plots(flight: FlightAnalysis) -> Iterator[dict[str, Any]]:
 
 
 def _plot(title: str, unit: str, columns: dict[str, FloatColumn]) -> dict[str, Any]:
-    """A plot of those columns that have any value."""
+    """Return a plot of the columns that have any value."""
     known = {name: values for name, values in columns.items() if np.isfinite(values).any()}
     return {
         "title": title,
@@ -166,7 +166,7 @@ def _bin_size(count: int) -> int:
 
 
 def _thinned_times(t_s: FloatColumn) -> FloatColumn:
-    """Times of ``_thinned`` values: two for each bin."""
+    """Return the times of ``_thinned`` values: two for each bin."""
     size = _bin_size(len(t_s))
     if size == 1:
         return t_s
@@ -178,7 +178,7 @@ def _thinned_times(t_s: FloatColumn) -> FloatColumn:
 
 
 def _thinned(values: FloatColumn) -> FloatColumn:
-    """The least and the greatest value of each bin, so that no spike is lost."""
+    """Return the minimum and maximum of each bin, so that no spike is lost."""
     size = _bin_size(len(values))
     if size == 1:
         return values
@@ -190,7 +190,7 @@ def _thinned(values: FloatColumn) -> FloatColumn:
 
 
 def _packed(values: FloatColumn) -> str:
-    """Little-endian float32 in base64, which a script reads without rounding text."""
+    """Encode as little-endian float32 in base64, which a script reads without rounding."""
     return b64encode(values.astype("<f4").tobytes()).decode()
 
 
@@ -204,7 +204,7 @@ def _histograms(series: Series) -> Iterator[dict[str, Any]]:
         known = values_ms[np.isfinite(values_ms)]
         if not len(known):
             continue
-        # To the 99.5th percentile and half as far again: the last bin takes what lies beyond.
+        # Range: 1.5 times the 99.5th percentile. The last bin takes all larger values.
         edges = np.linspace(0, max(1.0, 1.5 * float(np.percentile(known, 99.5))), BINS + 1)
         counts, _ = np.histogram(np.minimum(known, edges[-1]), bins=edges)
         yield {
@@ -228,7 +228,7 @@ def _track(flight: FlightAnalysis) -> dict[str, str] | None:
 
 
 def _video(flight: FlightAnalysis) -> dict[str, Any] | None:
-    """The video itself, or a word on why it is not in the page; None without images."""
+    """Return the video, or a note why it is not in the page; None without images."""
     images = flight.images
     if not len(images.exposed_s):
         return None

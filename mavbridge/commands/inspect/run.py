@@ -37,7 +37,7 @@ from policy.contract import Contract
 
 HOLDERS_SHOWN = 12
 NOTABLE = 0.1
-"""Relative difference of two flights' figures that is marked."""
+"""Relative difference between two flights' figures that is marked."""
 _SOURCES = {
     "flight": "a policy's flight",
     "demonstration": "a demonstration by the expert",
@@ -59,7 +59,7 @@ class Figure(NamedTuple):
 
 
 def print_flight(flight: FlightAnalysis, console: Console) -> None:
-    """Everything about one flight."""
+    """Print everything about one flight."""
     for line in _facts(flight):
         console.print(line)
     print_damage(flight, console)
@@ -80,7 +80,7 @@ def print_flight(flight: FlightAnalysis, console: Console) -> None:
 
 
 def print_damage(flight: FlightAnalysis, console: Console) -> None:
-    """Say what of the recording was skipped."""
+    """Print the skipped parts of the recording."""
     for text in flight.damage:
         console.print(Text.assemble(("damage   ", "bold"), (text, "red")))
 
@@ -105,7 +105,7 @@ def _facts(flight: FlightAnalysis) -> Iterator[Text]:
 
 
 def _pilot_lines(flight: FlightAnalysis) -> Iterator[Text]:
-    """What takes the place of the loops' verdicts where no policy flew."""
+    """Yield the lines that replace the loops' verdicts if no policy flew."""
     t_s, vision = flight.series.t_s, flight.report.vision
     rows_hz = (len(t_s) - 1) / t_s[-1] if len(t_s) > 1 and t_s[-1] > 0 else None
     known = np.isfinite(flight.series.echo[:, 0])
@@ -122,7 +122,7 @@ def _pilot_lines(flight: FlightAnalysis) -> Iterator[Text]:
 
 
 def path_length_m(flight: FlightAnalysis) -> float:
-    """Length of the flown path; 0 where no position is known."""
+    """Return the length of the flown path; 0 if no position is known."""
     if flight.track is None:
         return 0.0
     position = flight.track.position_ned_m
@@ -170,7 +170,7 @@ def _moments_table(flight: FlightAnalysis) -> Table | Text:
 
 
 def print_comparison(flights: Sequence[FlightAnalysis], console: Console) -> None:
-    """Two flights side by side; a tenth and more is marked as better or worse."""
+    """Print two flights side by side; differences from a tenth on are marked better or worse."""
     first, second = flights
     table = Table(title="Two flights", title_justify="left")
     table.add_column("", no_wrap=True)
@@ -269,12 +269,12 @@ FIGURES = (
     Figure("path", "m", path_length_m, more_is_better=None),
     Figure("gates passed", "", lambda f: f.meta.gates_passed, 0, more_is_better=True),
 )
-"""What is compared, in the order of the rows."""
+"""Compared figures, in the order of the rows."""
 
 
 MAX_FLIGHTS = 2
 BATCH_EVENTS = 25
-"""A fifth of a second: the path in the viewer grows by batches."""
+"""One fifth of a second: the path in the viewer grows by batches."""
 
 
 def inspect(flights: Sequence[Path], config: InspectConfig) -> int:
@@ -307,7 +307,7 @@ def inspect(flights: Sequence[Path], config: InspectConfig) -> int:
 
 
 def to_json(analyses: Sequence[FlightAnalysis]) -> str:
-    """The figures, one object a flight; null = not measured."""
+    """Return the figures, one object per flight; null: not measured."""
     documents = [
         {
             "folder": str(flight.folder),
@@ -331,7 +331,7 @@ def to_json(analyses: Sequence[FlightAnalysis]) -> str:
 
 
 def show_in_viewer(flight: FlightAnalysis, target: str) -> None:
-    """Send the whole recording to the viewer of live flights."""
+    """Send the whole recording to the viewer for live flights."""
     meta, contract = flight.meta, flight.meta.contract or Contract()
     limits = flown_limits(flight.folder, meta.contract)
     view = RerunView(
@@ -354,7 +354,7 @@ def show_in_viewer(flight: FlightAnalysis, target: str) -> None:
 
 
 def _events(folder: Path, contract: Contract | None) -> Iterator[Observed]:
-    """Ticks, solves, and the images of all cameras, in the order of time."""
+    """Yield ticks, solves, and the images of all cameras, in the order of time."""
     first = open_flight(folder)
     others = () if contract is None else contract.cameras[1:]
     cameras = [first, *(open_flight(folder, name) for name in others)]

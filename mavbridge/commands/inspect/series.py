@@ -1,4 +1,4 @@
-"""A recorded flight's ticks and path as arrays, and the gates along it, for figures and plots."""
+"""Ticks and path of a recorded flight as arrays, and the gates along it, for figures and plots."""
 
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
@@ -24,29 +24,29 @@ _ENU_FROM_NED, _FRD_FROM_FLU = (0.0, _HALF, _HALF, 0.0), (0.0, 1.0, 0.0, 0.0)
 
 @dataclass(frozen=True, kw_only=True)
 class Series:
-    """Values of all N ticks, whatever the axes of the policy; NaN where there was none."""
+    """Values of all N ticks, in NED and FRD for any policy; NaN for missing ones."""
 
     start_ns: int
     """Wake-up of the first tick, on the clock of all stamps."""
     t_s: FloatColumn
     """[N] wake-ups, in seconds since the first one."""
     action_names: tuple[str, ...]
-    """The four numbers of an action: those of ``raw``, ``smoothed``, ``sent`` and ``echo``."""
+    """Names of the four numbers of an action, for ``raw``, ``smoothed``, ``sent`` and ``echo``."""
     raw: FloatColumn
-    """[N, 4] as the policy put them out."""
+    """[N, 4] as output by the policy."""
     smoothed: FloatColumn
     sent: FloatColumn
     """[N, 4] as the message held them."""
     echo: FloatColumn
-    """[N, 4] sticks as the vehicle reported them: ours, or the pilot's."""
+    """[N, 4] sticks reported by the vehicle: ours or the pilot's."""
     feature_age_ms: FloatColumn
-    """[N] from the exposure to the send."""
+    """[N] time from the exposure to the send."""
     state_age_ms: FloatColumn
-    """[N] from the arrival of the attitude to the send."""
+    """[N] time from the arrival of the attitude to the send."""
     lateness_ms: FloatColumn
-    """[N] from the slot to its send."""
+    """[N] time from the slot to its send."""
     period_ms: FloatColumn
-    """[N] from the send of the slot before, of slots in a row."""
+    """[N] time from the send of the slot before, for consecutive slots."""
     velocity_ned_mps: FloatColumn
     """[N, 3]"""
     roll_pitch_yaw_deg: FloatColumn
@@ -58,7 +58,7 @@ class Series:
 
 
 def make_series(flight: RecordedFlight, ticks: Sequence[Tick]) -> Series:
-    """Arrays of the ticks of a flight."""
+    """Convert the ticks of a flight to arrays."""
     start_ns = ticks[0].woke_ns if ticks else flight.meta.start_ns
     woke_ns = np.array([tick.woke_ns for tick in ticks], np.int64)
     contract = flight.meta.contract
@@ -119,7 +119,7 @@ def _feature_age_ns(tick: Tick) -> int | None:
 
 
 def _periods_ms(ticks: Sequence[Tick]) -> FloatColumn:
-    """Time between the sends of two slots of which the policy flew both, and no tick was lost."""
+    """Return times between the sends of consecutive flown slots without lost ticks."""
     periods_ns: list[int | None] = []
     last_ns: int | None = None
     before: Tick | None = None
@@ -138,7 +138,7 @@ def _periods_ms(ticks: Sequence[Tick]) -> FloatColumn:
 
 
 def _euler_deg(ned_from_frd_wxyz: FloatColumn) -> FloatColumn:
-    """Roll, pitch and yaw of the aerospace sequence (yaw, then pitch, then roll)."""
+    """Return roll, pitch and yaw of the aerospace sequence (yaw, then pitch, then roll)."""
     w, x, y, z = np.moveaxis(ned_from_frd_wxyz, -1, 0)
     roll = np.arctan2(2 * (w * x + y * z), 1 - 2 * (x * x + y * y))
     pitch = np.arcsin(np.clip(2 * (w * y - z * x), -1, 1))
@@ -159,7 +159,7 @@ class Track:
 
 
 def course_gates(seed: int | None) -> tuple[CourseGate, ...]:
-    """The gates of a simulated course; none without a seed."""
+    """Return the gates of a simulated course; none without a seed."""
     if seed is None:
         return ()
     from sitl.course import make_course
@@ -171,7 +171,7 @@ def course_gates(seed: int | None) -> tuple[CourseGate, ...]:
 
 
 def read_track(series: Series, frames: Sequence[FrameRow]) -> Track | None:
-    """The simulator's truth, else the positions in the ticks."""
+    """Return the simulator's true positions, else the positions in the ticks."""
     rows = [
         ((frame.captured_ns - series.start_ns) / NS_PER_S, frame.truth.position_ned_m)
         for frame in frames

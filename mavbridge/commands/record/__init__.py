@@ -1,4 +1,4 @@
-"""``mavbridge record``: flights of a human pilot, to learn from; nothing is sent but requests.
+"""``mavbridge record``: flights of a human pilot as training data; only requests are sent.
 
 guard process, read-only --ticks, packets--> PilotView --+
 camera --> vision loop, which encodes nothing ----------+--> EpisodeSink --> Recorder, one each

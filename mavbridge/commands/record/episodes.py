@@ -1,4 +1,4 @@
-"""When episodes begin and end, their folders, recorders and marks, and the room on the disk."""
+"""Start and end of episodes, their folders, recorders and marks, and the room on the disk."""
 
 import os
 from collections import Counter
@@ -22,57 +22,57 @@ QUIT_KEY, TOGGLE_KEY, GOOD_KEY, BAD_KEY = "q", "r", "g", "b"
 KEYS = (QUIT_KEY, TOGGLE_KEY, " ", GOOD_KEY, BAD_KEY)
 KEYS_HINT = "r or space begins and ends an episode, g marks it as good, b as bad, q ends"
 AFTER_DISARM_NS = NS_PER_S
-"""Recorded after disarming: time for a fall to show that it was in the air."""
+"""Recording time after disarming, in which a fall shows if the vehicle was in the air."""
 MIDDLE_NS = 300 * NS_PER_MS
-"""A switch that is on its way from high to low passes the middle within this time."""
+"""A switch on its way from high to low passes the middle within this time."""
 
 Mark: TypeAlias = Literal["good", "bad"]
 _MARKS: dict[str, Mark] = {GOOD_KEY: "good", BAD_KEY: "bad"}
 
 
 class Seen(NamedTuple):
-    """What decides about episodes, at one moment."""
+    """Inputs of the episode control at one time."""
 
     now_ns: int
     armed: bool
     switch_us: int
-    """The channel of the switch; 0 = no reading."""
+    """Pulse width of the switch's channel; 0: no reading."""
     is_recording: bool
     keys: str = ""
-    """Typed since the last moment, in order."""
+    """Keys typed since the last step, in order."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Orders:
-    """Do this, in this order."""
+    """Actions for the recorder, in the order of execution."""
 
     mark_before: Mark | None = None
-    """Mark of the episode that is being recorded, or else of the last one."""
+    """Mark for the current episode, or else for the last one."""
     end: str | None = None
-    """End the episode that is being recorded, for this reason."""
+    """End the current episode for this reason."""
     begin: str | None = None
-    """Begin one, for this reason."""
+    """Begin an episode for this reason."""
     quit: bool = False
 
 
 class EpisodeControl:
-    """Call ``step`` some twenty times a second."""
+    """Decides when episodes begin and end. Call ``step`` about twenty times a second."""
 
     def __init__(self, *, has_switch: bool, on_arm: bool) -> None:
         self._has_switch = has_switch
         self._on_arm = on_arm
         self._switch = Switch(rests=("low", "middle"))
         self._position: Position | None = None
-        """As last read, whatever came between."""
+        """Last known position, kept through readings without one."""
         self._middle_since_ns: int | None = None
-        """When the switch came from high to the middle."""
+        """Time at which the switch moved from high to the middle."""
         self._was_armed = False
         self._disarmed_ns: int | None = None
         self._wanted: str | None = None
-        """Why the switch or the arming wants an episode that could not begin yet."""
+        """Why the switch or the arming asks for an episode that could not begin yet."""
 
     def step(self, seen: Seen) -> Orders:
-        """Advance to this moment."""
+        """Advance to this time; return the resulting orders."""
         keyed = self._by_keys(seen)
         switched = self._by_switch(seen) if self._has_switch else Orders()
         armed = self._by_arming(seen) if self._on_arm else Orders()
@@ -86,8 +86,7 @@ class EpisodeControl:
         )
 
     def _keep_wanting(self, seen: Seen, begin: str | None) -> None:
-        """Ask again for as long as the switch is high, or the vehicle armed: what was missing for
-        an episode may come."""
+        """Repeat the request while switch or arming asks: the obstacle can still disappear."""
         is_on = self._position == "high" if self._has_switch else seen.armed
         if begin is not None:
             self._wanted = begin
@@ -140,20 +139,20 @@ class EpisodeControl:
 
 
 FIRST_BYTES_PS = 600_000.0
-"""Assumed before anything was measured: 224 x 224 at 30 Hz and 100 rows a second take half."""
+"""Assumed before a measurement: twice the rate of 224 x 224 at 30 Hz and 100 rows a second."""
 LEAST_S = 60.0
-"""Room for so long is needed to begin an episode."""
+"""Recording time for which the disk must have room when an episode begins [s]."""
 MEASURED_NS = 5 * NS_PER_S
-"""Length of the part of an episode by which its bytes a second are measured."""
+"""Shortest episode from which the bytes per second are measured."""
 
 
 def free_bytes(folder: Path) -> int:
-    """What an ordinary user may still write there; raises OSError."""
+    """Return the bytes that an ordinary user can still write there; raise OSError if unknown."""
     return disk_usage(folder).free
 
 
 class DiskWatch:
-    """Room on the disk, at the bytes a second of the newest episode."""
+    """Room on the disk, in recording time at the data rate of the newest episode."""
 
     def __init__(
         self, folder: Path, *, reserve_bytes: float, free: Callable[[Path], int] = free_bytes
@@ -164,33 +163,33 @@ class DiskWatch:
         self._bytes_ps = FIRST_BYTES_PS
 
     def measure(self, episode: Path, duration_ns: int) -> None:
-        """Learn the rate from an episode that has lasted so long; raises OSError."""
+        """Measure the data rate of an episode if it is long enough; raise OSError if unreadable."""
         if duration_ns >= MEASURED_NS:
             size = sum(entry.stat().st_size for entry in episode.iterdir())
             self._bytes_ps = max(1.0, size * NS_PER_S / duration_ns)
 
     def left_s(self) -> float:
-        """Time until only the reserve is left, 0 at the least; raises OSError."""
+        """Return the recording time until only the reserve is left; raise OSError if unknown."""
         return max(0.0, (self._free(self._folder) - self._reserve_bytes) / self._bytes_ps)
 
     @property
     def may_begin(self) -> bool:
-        """There is room for another episode; raises OSError."""
+        """True if there is room for another episode; raise OSError if unknown."""
         return self.left_s() >= LEAST_S
 
     @property
     def is_full(self) -> bool:
-        """Only the reserve is left; raises OSError."""
+        """True if only the reserve is left; raise OSError if unknown."""
         return self.left_s() == 0.0
 
 
 PREFIX = "episode-"
 CLOSE_S = 60.0
-"""The tables of a long episode become Parquet within seconds."""
+"""Timeout for closing an episode; converting the tables of a long one to Parquet takes seconds."""
 
 
 class _Recording:
-    """The episode that is being recorded; ticks come from one thread, frames from another."""
+    """The current episode. Ticks come from one thread, frames from another."""
 
     def __init__(
         self, folder: Path, number: int, begin_ns: int, log: PacketPipe, recorder: Recorder
@@ -205,7 +204,7 @@ class _Recording:
         self._first_frame: int | None = None
 
     def emit(self, event: Event) -> None:
-        """Record what happened since the begin, numbered from there."""
+        """Record events since the start of the episode, numbered from there."""
         if isinstance(event, Tick):
             if event.woke_ns >= self.begin_ns:
                 self._first_tick = event.serial if self._first_tick is None else self._first_tick
@@ -216,7 +215,7 @@ class _Recording:
 
 
 class Finished(NamedTuple):
-    """An episode on disk."""
+    """Episode on disk."""
 
     folder: Path
     number: int
@@ -224,7 +223,7 @@ class Finished(NamedTuple):
 
 
 class Episodes:
-    """Begins, ends and marks episodes; all but ``emit`` is for one thread."""
+    """Begins, ends and marks episodes. Everything except ``emit`` is for one thread."""
 
     def __init__(
         self,
@@ -237,13 +236,13 @@ class Episodes:
         wall_offset_ns: int,
         report: Callable[[str], None],
     ) -> None:
-        """Record below ``out``, where earlier episodes stay.
+        """Record below ``out``, where earlier episodes are kept.
 
         Args:
             out: from ``prepare_out``.
-            clock: time of the begin of each episode.
-            make_meta: the facts known at the begin, given its stamp.
-            log_to: sends the vehicle's packets to a log from then on, or nowhere.
+            clock: time of the start of each episode.
+            make_meta: returns the facts known at the start, given its stamp.
+            log_to: sends the vehicle's packets to a log from then on; None stops that.
             autopilot: its name and version.
             wall_offset_ns: wall time minus the clock, for the logs.
             report: shows a line to the user; called by any thread.
@@ -261,51 +260,51 @@ class Episodes:
         self._next = 1 + max(map(_number, out.glob(f"{PREFIX}*")), default=0)
 
     def emit(self, event: Event) -> None:
-        """Record the event if an episode is being recorded; a ``TickSink``."""
+        """Record the event if an episode is in progress; a ``TickSink``."""
         current = self._current
         if current is not None:
             current.emit(event)
 
     @property
     def is_recording(self) -> bool:
-        """An episode is being recorded."""
+        """True if an episode is in progress."""
         return self._current is not None
 
     @property
     def number(self) -> int:
-        """Number of this episode, or of the next one."""
+        """Number of the current episode, or of the next one."""
         return self._next if self._current is None else self._current.number
 
     @property
     def folder(self) -> Path | None:
-        """Folder of the episode that is being recorded."""
+        """Folder of the current episode."""
         return None if self._current is None else self._current.folder
 
     @property
     def duration_ns(self) -> int:
-        """Length of the episode that is being recorded."""
+        """Length of the current episode."""
         return 0 if self._current is None else self._clock.now_ns() - self._current.begin_ns
 
     @property
     def crash(self) -> str | None:
-        """How the vehicle has crashed in this episode, or None."""
+        """How the vehicle has crashed in the current episode, or None."""
         return None if self._current is None else self._current.recorder.crash
 
     @property
     def finished(self) -> int:
-        """Episodes recorded in this session."""
+        """Number of episodes recorded in this session."""
         return len(self._marks)
 
     @property
     def counts(self) -> Counter[bool | None]:
-        """Episodes of this session that are good (True), bad (False) and unmarked (None)."""
+        """Number of episodes of this session: good (True), bad (False) and unmarked (None)."""
         return Counter(self._marks.values())
 
     def begin(self) -> None:
         """Begin an episode.
 
         Raises:
-            UserError, WriterError: its folder cannot be written, or its writer not started.
+            UserError, WriterError: its folder cannot be written, or its writer does not start.
         """
         folder = self._out / f"{PREFIX}{self._next:04}"
         prepare_folder(folder)
@@ -329,7 +328,7 @@ class Episodes:
         self._next += 1
 
     def end(self, reason: str) -> None:
-        """End the episode that is being recorded, mark it, and say what is in it."""
+        """End the current episode, mark it, and report its contents."""
         current, self._current = self._current, None
         if current is None:
             return
@@ -347,7 +346,7 @@ class Episodes:
         )
 
     def mark(self, mark: Mark) -> None:
-        """Mark the episode that is being recorded, or else the last one."""
+        """Mark the current episode, or else the last one."""
         if self._current is not None:
             self._current.mark = mark
             self._report(f"episode {self._current.number} will be marked as {mark}")
@@ -377,7 +376,7 @@ class Episodes:
 
 
 def prepare_out(out: Path) -> None:
-    """Make the folder of the episodes; raises UserError if none can be recorded there."""
+    """Create the folder of the episodes; raise UserError if none can be recorded there."""
     if (out / META).exists():
         raise UserError(f"--out {out} is a flight itself: name a folder for several of them")
     try:

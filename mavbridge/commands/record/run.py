@@ -1,4 +1,4 @@
-"""One recording session: opens everything, follows the orders of ``EpisodeControl``, ends it."""
+"""One recording session: opens everything, follows the orders of ``EpisodeControl``, and closes."""
 
 import threading
 from collections import deque
@@ -56,25 +56,25 @@ from policy.contract import Contract
 
 STEP_S = 0.05
 MAX_KEYS = 64
-"""Keys that may wait for a step; the oldest are forgotten."""
+"""Capacity of the queue of keys for the next step; the oldest are dropped first."""
 DISK_NS = NS_PER_S
-"""Between two looks at the disk."""
+"""Time between two checks of the disk."""
 JOIN_S = 2.0
 RERUN_CAPACITY = 1000
 GUARD_END_S = 5.0
 MAX_FROZEN_S = MAX_BLACK_S = 0.5
-"""Time for which an image may stand still, or be black, before it is shown as a problem."""
+"""Time for which an image can be frozen or black before it is reported as a problem."""
 NOTHING = np.zeros((1, 1), np.float32)
 CONTRACT = Contract(feature_dim=1, arrays="numpy")
-"""What the recorded sticks mean: those of a policy with the usual contract, into whose terms the
-vehicle's own are mapped."""
+"""Meaning of the recorded sticks: those of a policy with the default contract, to which the
+vehicle's own sticks are mapped."""
 
 
 def record(config: RecordConfig) -> int:
-    """Record until the user, a signal or a full disk ends it; returns the exit status.
+    """Record until the user, a signal or a full disk ends it; return the exit status.
 
     Raises:
-        MavbridgeError: anything that the user, the vehicle or the camera got wrong.
+        MavbridgeError: a problem with the flags, the vehicle or the camera.
     """
     clock = MonotonicClock()
     make_transport(config.vehicle.connect, clock)
@@ -97,7 +97,7 @@ def record(config: RecordConfig) -> int:
 
 
 def pilot_flight(config: RecordConfig) -> FlyConfig:
-    """The flight of nobody's policy that only listens, at the rates of the recording."""
+    """Return a flight without a policy that only listens, at the rates of the recording."""
     rates = Rates(
         action_rate=config.rate,
         stick_rate=config.rate,
@@ -108,7 +108,7 @@ def pilot_flight(config: RecordConfig) -> FlyConfig:
 
 
 def listening_guard(config: RecordConfig, clock: Clock) -> GuardSettings:
-    """Settings of a guard that asks for the pilot's sticks at the rate of the recording."""
+    """Return settings of a guard that requests the pilot's sticks at the rate of the recording."""
     settings = guard_settings(
         pilot_flight(config), is_dual=True, tlog_fd=None, wall_offset_ns=wall_offset_ns(clock)
     )
@@ -117,7 +117,7 @@ def listening_guard(config: RecordConfig, clock: Clock) -> GuardSettings:
 
 
 class _Session:
-    """Everything that is opened goes on the exit stack at once."""
+    """One recording session. Every resource is pushed on the exit stack when it is opened."""
 
     def __init__(
         self, config: RecordConfig, clock: Clock, console: Console, stack: ExitStack
@@ -132,7 +132,7 @@ class _Session:
         self._disk = DiskWatch(config.out, reserve_bytes=config.disk_reserve * 1e9)
         self._disk_s, self._disk_due_ns = 0.0, 0
         self._told_missing: str | None = None
-        """Why the last begin was refused."""
+        """Why the last request for an episode was refused."""
         self.screen = RecordScreen(console, rate_hz=config.rate, vision_hz=config.film.visual_rate)
         viewer = self._open_viewer()
         self._guard = GuardProcess(listening_guard(config, clock), clock)
@@ -178,7 +178,7 @@ class _Session:
         return camera
 
     def _vision_loop(self, camera: Camera, sink: TickSink) -> VisionLoop:
-        """A loop that encodes nothing, but paces, stamps and judges the images."""
+        """Return a loop that encodes nothing, but paces, stamps and judges the images."""
         frame_ns = period_ns(self._config.film.visual_rate)
         return VisionLoop(
             camera=camera,
@@ -257,7 +257,7 @@ class _Session:
         self._guard.listen(stop, self._view)
 
     def _step(self) -> bool:
-        """Look at everything that decides about episodes; False: the session is over."""
+        """Update the episodes and the status line; return False when the session is over."""
         orders = self._control.step(self._seen())
         if orders.mark_before is not None:
             self._episodes.mark(orders.mark_before)
@@ -313,7 +313,7 @@ class _Session:
         self.screen.show_message(begun if doubt is None else f"{begun}; {doubt}")
 
     def _missing(self) -> str | None:
-        """What a demonstration cannot do without, and is not there."""
+        """Return the requirement of a demonstration that is missing, or None."""
         if self._view.status.mode is None:
             return "no vehicle yet"
         if self._view.telemetry.ned_from_body_wxyz is None:
@@ -328,7 +328,7 @@ class _Session:
         return None
 
     def _doubt(self) -> str | None:
-        """Why what is recorded now may be worth little, or None."""
+        """Return why the current recording is of doubtful value, or None."""
         image, mode = self._images.latest(), self._view.status.mode
         if image is not None and image.fault is not None:
             return str(image.fault)

@@ -1,4 +1,4 @@
-"""The vehicle as a recording sees it, and the status line of the terminal."""
+"""The vehicle during a recording, and the status line of the terminal."""
 
 import threading
 from collections import Counter
@@ -24,14 +24,14 @@ from mavbridge.observe.report_table import rate_style, shown_rate
 from mavbridge.observe.terminal import FlightScreen, RateMeter
 
 STICK_IDS = {"ardupilot": message_id("RC_CHANNELS"), "px4": message_id("MANUAL_CONTROL")}
-"""Message that carries the pilot's sticks, by the first word of the autopilot's name."""
+"""Message with the pilot's sticks, by the first word of the autopilot's name."""
 STICKS_FRESH_NS = 500 * NS_PER_MS
-"""Older sticks are not the pilot's any more: PX4 goes silent where its receiver does."""
+"""Older sticks do not count as the pilot's: PX4 goes silent when its receiver does."""
 PILOTS = because(Code.PILOT_FLIES)
 
 
 class PilotView(TelemetryCache):
-    """Adds to a ``TelemetryCache`` a log of the vehicle's packets, and counts those with sticks."""
+    """``TelemetryCache`` that also logs the vehicle's packets and counts those with sticks."""
 
     def __init__(
         self,
@@ -56,12 +56,12 @@ class PilotView(TelemetryCache):
         self.stick_packets = 0
 
     def log_to(self, log: PacketPipe | None) -> None:
-        """Write every packet of the vehicle there from now on; the one before is free then."""
+        """Log the vehicle's packets here from now on; None: nowhere. The last log is then free."""
         with self._log_lock:
             self._log = log
 
     def receive(self, message: FromGuard) -> None:
-        """Take one message of the guard."""
+        """Handle one message of the guard."""
         super().receive(message)
         if not isinstance(message, Packets):
             return
@@ -77,14 +77,14 @@ class PilotView(TelemetryCache):
 
 
 class PilotTicks:
-    """A ``TickSink`` that tells the pilot's flight from that of a policy which is not there."""
+    """``TickSink`` that marks the ticks as flown by the pilot, since no policy flies."""
 
     def __init__(self, view: PilotView, sink: TickSink) -> None:
         self._view = view
         self._sink = sink
 
     def emit(self, event: Event) -> None:
-        """Pass it on; sticks that are old are none."""
+        """Pass the event on, without stale sticks."""
         if isinstance(event, Tick):
             is_fresh = event.woke_ns - self._view.sticks_ns <= STICKS_FRESH_NS
             event = replace(
@@ -97,28 +97,28 @@ class PilotTicks:
 
 
 LOW_MINUTES = 10.0
-"""Room on the disk that is shown as a warning."""
+"""Room on the disk below which it is shown as a warning."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Shown:
-    """What the status line tells besides the newest tick."""
+    """Contents of the status line besides the newest tick."""
 
     number: int
     duration_ns: int | None
-    """Length of this episode; None while none is recorded."""
+    """Length of the current episode; None while none is recorded."""
     counts: Counter[bool | None]
-    """Episodes that are good, bad and unmarked."""
+    """Number of good, bad and unmarked episodes."""
     disk_s: float
     stick_packets: int
     sticks_ns: int
-    """Packets with the pilot's sticks so far, and the arrival of the newest."""
+    """Number of packets with the pilot's sticks so far, and the arrival of the newest."""
     problem: str | None
-    """What is missing, or cannot be learnt from."""
+    """A missing requirement, or a doubt about the value of the recording."""
 
 
 class RecordScreen(FlightScreen):
-    """A ``FlightScreen`` whose line is about the pilot; any thread may replace ``shown``."""
+    """``FlightScreen`` with a status line for the pilot. Any thread can replace ``shown``."""
 
     def __init__(self, console: Console, *, rate_hz: float, vision_hz: float) -> None:
         super().__init__(console, action_hz=rate_hz, vision_hz=vision_hz, readonly=True)
@@ -129,7 +129,7 @@ class RecordScreen(FlightScreen):
         self._state_ns = 0
 
     def emit(self, event: Event) -> None:
-        """Remember the event and the messages in it."""
+        """Store the event and its messages."""
         if not isinstance(event, Tick):
             self._images.count(event.ready_ns)
             return
@@ -141,7 +141,7 @@ class RecordScreen(FlightScreen):
         self._newest = event
 
     def status_line(self) -> Text:
-        """The status now; to be called at ``STATUS_HZ``, since rates are averages over calls."""
+        """Return the current status. Call at ``STATUS_HZ``: rates are averages over calls."""
         shown, tick = self.shown, self._newest
         line = Text(no_wrap=True, overflow="ellipsis")
         if shown is None or tick is None:

@@ -1,1 +1,1 @@
-"""``mavbridge replay``: a recorded flight through the flight's own code once more."""
+"""``mavbridge replay``: computes a recorded flight again with the flight's own code."""

@@ -1,4 +1,4 @@
-"""What a replay came to, for a person and for a program."""
+"""Results of a replay, for people and for programs."""
 
 import json
 from dataclasses import asdict, dataclass
@@ -22,23 +22,23 @@ from mavbridge.simulation.replay.recording import ReplaySource
 
 @dataclass(frozen=True, kw_only=True)
 class ReplayResult:
-    """One replay."""
+    """Results of one replay."""
 
     source: ReplaySource
     chosen: ReplayFrom
     engine: str | None
-    """On which the policy ran; None: it was not asked."""
+    """Engine of the policy; None: the policy was not used."""
     policy: PolicyComparison | None
     guard: GuardComparison
-    """With the recorded chunks and settings."""
+    """Comparison with the recorded chunks and settings."""
     sticks: StickTraces
-    """With the new chunks and settings."""
+    """Sticks from the new chunks and settings."""
     tolerance: float | None
-    """None: something else was asked for, and no result is expected."""
+    """None: the policy or the limits were changed, so that no agreement is expected."""
 
     @property
     def problems(self) -> tuple[str, ...]:
-        """Why it is not equal, in words."""
+        """Reasons why the replay is not equal, in words."""
         found = []
         if self.guard.first is not None:
             found.append(f"the guard came out differently, first in the {self.guard.first}")
@@ -61,12 +61,12 @@ class ReplayResult:
 
     @property
     def is_equal(self) -> bool:
-        """Equal within the tolerance, or nothing was expected."""
+        """True if it is equal within the tolerance, or no agreement was expected."""
         return not self.problems
 
 
 def print_replay(result: ReplayResult, console: Console) -> None:
-    """Tables, and a verdict in words."""
+    """Print tables, and a verdict in words."""
     names = ACTION_CLASSES[result.source.contract.action]._fields
     rows = []
     if (policy := result.policy) is not None:
@@ -115,7 +115,7 @@ def _figure(value: float) -> str:
 
 
 def to_json(result: ReplayResult) -> str:
-    """All figures."""
+    """Return all figures as JSON."""
     document = {
         "flight": str(result.source.folder),
         "from": result.chosen,
@@ -133,7 +133,7 @@ def to_json(result: ReplayResult) -> str:
 
 
 def _finite(value: object) -> object:
-    """JSON has no infinity: null says that only one of the two was flown."""
+    """Replace infinity, which JSON lacks, by null: only one of the two was flown."""
     if isinstance(value, dict):
         return {name: _finite(each) for name, each in value.items()}
     if isinstance(value, list | tuple):
@@ -142,7 +142,7 @@ def _finite(value: object) -> object:
 
 
 def draw(result: ReplayResult, path: Path) -> None:
-    """Draw the smoothed sticks, recorded and replayed: one row each, over the time."""
+    """Draw the smoothed sticks, recorded and replayed, over time: one row per stick."""
     from matplotlib import rc_context
     from matplotlib.figure import Figure
 

@@ -1,4 +1,4 @@
-"""The command: read the flight, compute it once more, say what differs."""
+"""Replay command: read the flight, compute it again, report the differences."""
 
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import fields, replace
@@ -39,19 +39,21 @@ from mavbridge.simulation.replay.recording import ReplaySource, open_source
 from policy.protocol import PolicyRunner
 
 VIDEO_TOLERANCE = 0.15
-"""Largest difference of a smoothed stick from the lossy video, in full deflections: twice what was
-measured, see docs/commands.md."""
+"""Tolerance of a smoothed stick for the lossy video, in full deflections: twice the measured
+difference, see docs/commands.md."""
 ENGINE_TOLERANCE = 0.05
-"""The same on another engine. A chunk alone may differ by ``parity.MAX_ACTION_ERROR``."""
+"""Tolerance of a smoothed stick on another engine, in full deflections. A single chunk can differ
+by ``parity.MAX_ACTION_ERROR``."""
 CLOCK_TOLERANCE = 0.01
-"""The same of a scripted policy, which reads the clock while it computes: some 0.1 ms apart."""
+"""Tolerance for a scripted policy, in full deflections: it reads the clock while it computes, with
+differences of some 0.1 ms."""
 
 
 def replay(folder: Path, config: ReplayConfig) -> int:
-    """Compute a recorded flight once more; returns an ``ExitCode``.
+    """Compute a recorded flight again; return an ``ExitCode``.
 
     Raises:
-        MavbridgeError: the flight cannot be read or replayed, or the policy not be loaded.
+        MavbridgeError: the flight cannot be read or replayed, or the policy cannot be loaded.
     """
     require_extra("replay")
     require_outputs(config.json, config.plot)
@@ -106,10 +108,10 @@ def replay(folder: Path, config: ReplayConfig) -> int:
 
 
 def _trusted(source: ReplaySource, asked: ReplayConfig) -> ReplayConfig:
-    """What is asked for, without the flight's own policy where that was named once more.
+    """Return the request, without the flight's own policy if that was named again.
 
     Raises:
-        UserError: the recording names a policy that is more than data, or weights that are no file.
+        UserError: the recording names a policy that contains code, or weights that are not a file.
     """
     flown = source.config.policy
     if (asked.policy, asked.checkpoint, asked.contract) == (
@@ -136,7 +138,7 @@ def _trusted(source: ReplaySource, asked: ReplayConfig) -> ReplayConfig:
 
 
 def _source_of(source: ReplaySource, config: ReplayConfig) -> ReplayFrom:
-    """Where the policy's images come from; UserError where that is not in the recording."""
+    """Return the source of the policy's images; raise UserError if the recording lacks it."""
     has_features = bool(source.features)
     if config.source == "features" and not has_features:
         raise UserError(
@@ -148,7 +150,7 @@ def _source_of(source: ReplaySource, config: ReplayConfig) -> ReplayFrom:
 
 
 def other_config(flown: FlyConfig, asked: ReplayConfig) -> FlyConfig:
-    """The flags of the flight, with those of the replay in their place."""
+    """Return the flags of the flight, overridden by those of the replay."""
     limits = {
         field.name: getattr(asked, field.name)
         for field in fields(flown.limits)
@@ -160,7 +162,7 @@ def other_config(flown: FlyConfig, asked: ReplayConfig) -> FlyConfig:
         for name in (*names, "engine", "device")
         if getattr(asked, name) is not None
     }
-    if asked.policy is not None:  # weights and files of the flight are of another policy
+    if asked.policy is not None:  # weights and files of the flight belong to another policy
         policy = {"checkpoint": None, "contract": None} | policy
     return replace(
         flown,
@@ -177,7 +179,7 @@ def tolerance_of(
     engine: str,
     is_scripted: bool,
 ) -> float | None:
-    """Largest difference of a stick that counts as equal; None: nothing is expected."""
+    """Return the largest stick difference that counts as equal; None: no agreement is expected."""
     if config.tolerance is not None:
         return config.tolerance
     if config.is_other_policy or config.changes_limits:
@@ -222,7 +224,7 @@ def _replayed(
 def _encoded(
     source: ReplaySource, runner: PolicyRunner, number: int, name: str
 ) -> Iterator[FeatureFrame]:
-    """The frames of one camera's video, encoded as they are taken: images are large."""
+    """Yield the frames of one camera's video, encoded one by one, because images are large."""
     cv2.setNumThreads(1)
     flight = open_flight(source.folder, name if number else None)
     faults = {
@@ -239,7 +241,7 @@ def _encoded(
 
 
 def _other_chunks(runner: PolicyRunner, pairs: Sequence[SolvePair]) -> dict[int, Chunk]:
-    """The new chunks, by the serial numbers of the recorded ones."""
+    """Return the new chunks by the serial numbers of the recorded ones."""
     return {
         pair.recorded.serial: chunk_of(
             replace(pair.replayed, serial=pair.recorded.serial), runner.contract

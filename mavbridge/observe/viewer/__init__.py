@@ -1,1 +1,1 @@
-"""The Rerun viewer: a live flight, a recorded one, an imagined one."""
+"""Rerun viewer for live, recorded and imagined flights."""

@@ -1,8 +1,8 @@
 """A flight in the Rerun viewer.
 
 The view is the consumer of an ``ObserverThread``: the SDK blocks its caller while a viewer does not
-keep up, even at the end of the flight, so the caller is that thread, whose queue drops and counts
-events and whose ``close`` has a deadline.
+keep up, even at the end of the flight. The caller is therefore that thread, whose queue drops and
+counts events and whose ``close`` has a deadline.
 """
 
 import math
@@ -22,25 +22,25 @@ from mavbridge.observe.viewer.scene import PlanView, SceneView
 from mavbridge.observe.viewer.target import RerunRecording
 
 EVENT_CHARACTERS = 64
-"""Longer texts go on in the next line: the viewer cuts them off at the edge of its panel."""
+"""Longer texts continue in the next line; the viewer cuts them off at the edge of its panel."""
 
 BATCHES_OF_ROWS = 3
-"""Plots advance in steps of so many batches, the scene and the images with each."""
+"""Plots, the scene and the images advance in steps of this many batches."""
 
 
 class RerunView:
-    """Shows ticks, solves and vision ticks on the timeline ``time``, which starts at the first one.
+    """Shows ticks, solves and vision ticks on the timeline ``time``, from the first one on.
 
     Values of a tick are stamped with its wake-up, values of a frame with the end of its encoding,
-    images with their exposure. A value that was not measured is a gap in its line.
+    images with their exposure. An unmeasured value is a gap in its line.
     """
 
     def __init__(self, target: str, flight: ViewedFlight, *, serve: str = "") -> None:
-        """Check the target; calls that may block are left to ``consume`` and ``close``.
+        """Check the target; calls that can block are left to ``consume`` and ``close``.
 
         Args:
-            target: that of ``prepare_target``, or ``off`` where only a browser looks.
-            flight: what is known of it beforehand.
+            target: that of ``prepare_target``, or ``off`` if only a browser looks.
+            flight: facts known before the flight.
             serve: HOST:PORT of a web viewer that is hosted until ``close``; empty: none.
         """
         self._flight = flight
@@ -58,7 +58,7 @@ class RerunView:
 
     @property
     def url(self) -> str | None:
-        """Address for a browser; None where none is served."""
+        """Address for a browser; None if no page is served."""
         return self._recording.url
 
     def consume(self, batch: Sequence[Observed]) -> None:
@@ -88,7 +88,7 @@ class RerunView:
             self._columns.flush()
 
     def close(self) -> None:
-        """Deliver the rest; blocks until it is taken. Raises MavbridgeError: the viewer is gone."""
+        """Deliver the rest and block until taken; raise MavbridgeError if the viewer is gone."""
         self._open()
         self._timing.close()
         self._columns.flush()
@@ -104,13 +104,13 @@ class RerunView:
         self._scene.open()
 
     def _begin(self, start_ns: int) -> None:
-        """Begin the timeline; a gap at its start gives all plots the same axis."""
+        """Start the timeline. A gap at its start gives all plots the same axis."""
         self._columns.start_ns = start_ns
         for plot in (*layout.PLOTS, *layout.action_plots(self._flight.contract.action)):
             self._columns.plot(plot, [start_ns], [(math.nan,) * len(plot.series)])
 
     def _show_plans(self, solves: Sequence[Solve], ticks: Sequence[Tick]) -> None:
-        """Show plans of the policy while it flies, each from where the vehicle was."""
+        """Show the policy's plans while it flies, each from the vehicle's position at its time."""
         known = [tick for tick in (self._last_tick, *ticks) if tick is not None]
         stamps_ns = [tick.woke_ns for tick in known]
         for solve in solves:
@@ -142,7 +142,7 @@ def _happened_ns(event: Observed) -> int:
 
 
 def _changes(before: Tick | None, now: Tick) -> Iterator[tuple[str, str, layout.Rgb]]:
-    """Text, level and colour of everything in this tick that is new to the user."""
+    """Return text, level and colour of everything in this tick that is new to the user."""
     if before is None or before.stage != now.stage:
         if now.release_reason is None:
             yield now.activity, "INFO", layout.GREEN if now.trace else layout.GREY

@@ -1,6 +1,6 @@
-"""The viewer's plots and their places on its two pages, ``Flight`` and ``Timing``.
+"""Plots of the viewer and their places on its two pages, ``Flight`` and ``Timing``.
 
-No plot has a legend, which would lie on its data: the title names each line and its colour.
+No plot has a legend, which would cover its data: the title names each line and its colour.
 """
 
 from collections.abc import Callable, Sequence
@@ -20,24 +20,23 @@ from policy.contract import Contract
 EVENTS = "events"
 SCENE = "scene"
 CHASE = f"{SCENE}/chase"
-"""Moves and turns with the vehicle, and stays level: the axes of an eye that follows it."""
+"""Level axes that move and turn with the vehicle, for an eye that follows it."""
 VEHICLE = f"{CHASE}/vehicle"
-"""Leans in them."""
+"""Axes within ``CHASE`` that also lean with the vehicle."""
 PATH = f"{SCENE}/path"
 PLANNED_PATH = f"{SCENE}/planned"
 PLAN_LANES = 2
-"""Planned actions overlap in time: neighbours lie in different entities, or a line would join
-them."""
+"""Planned actions overlap in time: a line would join neighbours in one entity."""
 PLAN_TAIL_S = 3.0
-"""The scene shows the planned paths of so long before the cursor."""
+"""Time before the cursor for which the scene shows planned paths."""
 ORIGIN = Position(0.0, 0.0, 0.0)
-"""Where a vehicle is shown that does not tell its position."""
+"""Drawn position of a vehicle that reports none."""
 UP = (0.0, 0.0, -1.0)
 NEAR_EYE_M, FAR_EYE_M = (-3.0, 0.8, -1.3), (-16.0, 5.0, -11.0)
-"""Places of eyes that follow: behind, to the right of and above the vehicle."""
+"""Positions of following eyes: behind, to the right of and above the vehicle."""
 
 Rgb: TypeAlias = tuple[int, int, int]
-# All of them can be read on the dark and on the light ground that a browser asks for.
+# All of them are readable on the dark and the light background that a browser can ask for.
 BLUE, ORANGE, GREEN, RED = (86, 180, 233), (240, 160, 40), (60, 200, 140), (235, 80, 70)
 PINK, GREY = (225, 120, 180), (145, 145, 145)
 DARK_BLUE = (45, 95, 135)
@@ -45,7 +44,7 @@ DARK_BLUE = (45, 95, 135)
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ViewedFlight:
-    """What the viewer is told of a flight before it begins."""
+    """Facts that the viewer gets before a flight begins."""
 
     vision_hz: float
     chunk_hz: float
@@ -53,10 +52,10 @@ class ViewedFlight:
     contract: Contract = field(default_factory=Contract)
     """Kind of the actions, frame of the states, names of the cameras."""
     max_state_age_s: float | None = None
-    """Limits of the ages when a stick is sent; None: nothing is flown by them."""
+    """Age limits when a stick is sent; None: nothing is flown by them."""
     max_feature_age_s: float | None = None
     to_ned: Callable[[FloatArray], tuple[Action, ...]] | None = None
-    """Actions [horizon, 4] of a solve -> the same in NED and FRD; None: no plan is shown."""
+    """Converts actions [horizon, 4] of a solve to NED and FRD; None: no plan is shown."""
     gates: tuple[CourseGate, ...] = ()
 
 
@@ -77,7 +76,7 @@ class Plot(NamedTuple):
 
 
 def _band(path: str, title: str, bound: str) -> Plot:
-    """Plot of a quantity that jumps from value to value: its spread over short windows."""
+    """Return a plot of a quantity that jumps between values: its spread over short windows."""
     series = (
         Series("least", DARK_BLUE),
         Series("most", DARK_BLUE),
@@ -107,7 +106,7 @@ _RC_SERIES = tuple(
     for number, color in enumerate((BLUE, ORANGE, GREEN, PINK), start=1)
 )
 RC = Plot("rc", "RC channels [us]: 1 blue, 2 orange, 3 green, 4 pink", _RC_SERIES)
-"""As the vehicle echoes them. Channels 1 to 4 hold the sticks, unless RCMAP_* says otherwise."""
+"""Channels as the vehicle echoes them. Channels 1 to 4 hold the sticks, unless RCMAP_* differs."""
 SPEED = Plot(
     "motion/speed",
     "Speed [m/s]: blue horizontal, green climb",
@@ -117,7 +116,7 @@ HEIGHT = Plot("motion/height", "Height above the origin [m]", (Series("height", 
 PLOTS = (*BANDS, MISSED, DROPPED, RC, SPEED, HEIGHT)
 
 ACTION_SERIES = (
-    Series("vehicle's echo", GREEN, width=4),  # first: drawn under the others
+    Series("vehicle's echo", GREEN, width=4),  # first, so that the others are drawn on top
     Series("policy", PINK),
     Series("sent", BLUE),
 )
@@ -126,7 +125,7 @@ _PLAN_SERIES = (Series("planned", ORANGE, width=1),)
 
 
 def action_plots(action: ActionKind) -> tuple[Plot, ...]:
-    """One plot for each of the four numbers of an action of this kind."""
+    """Return one plot for each of the four numbers of an action of this kind."""
     key = ": blue sent, pink policy, orange plan" + (", green echo" if action == "sticks" else "")
     return tuple(
         Plot(f"{action}/{name}", f"{_titled(name)}{key}", ACTION_SERIES)
@@ -135,7 +134,7 @@ def action_plots(action: ActionKind) -> tuple[Plot, ...]:
 
 
 def _titled(name: str) -> str:
-    """``yaw_rate_radps`` -> ``Yaw rate [rad/s]``."""
+    """Convert a field name to a title: ``yaw_rate_radps`` -> ``Yaw rate [rad/s]``."""
     stem, _, unit = name.rpartition("_")
     if unit not in _UNITS:
         return name.capitalize()
@@ -143,7 +142,7 @@ def _titled(name: str) -> str:
 
 
 def plan_plots(action: ActionKind) -> tuple[tuple[Plot, ...], ...]:
-    """For each lane, the planned course of each of the four numbers."""
+    """Return, for each lane, the planned course of each of the four numbers."""
     return tuple(
         tuple(Plot(f"{plot.path}/plan/{lane}", "", _PLAN_SERIES) for plot in action_plots(action))
         for lane in range(PLAN_LANES)
@@ -151,12 +150,12 @@ def plan_plots(action: ActionKind) -> tuple[tuple[Plot, ...], ...]:
 
 
 def camera_paths(cameras: tuple[str, ...]) -> tuple[str, ...]:
-    """Entity of each camera: below the vehicle, so that its images hang in the scene."""
+    """Return each camera's entity, below the vehicle so that its images hang in the scene."""
     return tuple(f"{VEHICLE}/{name}" for name in cameras)
 
 
 def styles(action: ActionKind) -> tuple[tuple[str, rr.SeriesLines], ...]:
-    """Names, colours and widths of all lines, by entity."""
+    """Return names, colours and widths of all lines, by entity."""
     plans = [plot for lane in plan_plots(action) for plot in lane]
     return tuple((plot.path, _style(plot)) for plot in (*PLOTS, *action_plots(action), *plans))
 
@@ -171,7 +170,7 @@ def _style(plot: Plot) -> rr.SeriesLines:
 
 
 def flight_blueprint(flight: ViewedFlight) -> rrb.Blueprint:
-    """Initial layout of the viewer: where the vehicle is and what it is told, then the timing."""
+    """Return the initial layout: the vehicle's position and commands, then the timing."""
     contract = flight.contract
     cameras = [
         rrb.Spatial2DView(
@@ -208,7 +207,7 @@ def flight_blueprint(flight: ViewedFlight) -> rrb.Blueprint:
 
 
 def _scenes(gates: Sequence[CourseGate]) -> rrb.Horizontal:
-    """The path as a whole where its gates are known, else from afar; and the vehicle from near."""
+    """Return two scenes: the path (whole with known gates, else from afar), the near vehicle."""
     until_now = rrb.VisibleTimeRange(
         "time", start=rrb.TimeRangeBoundary.infinite(), end=rrb.TimeRangeBoundary.cursor_relative()
     )
@@ -241,7 +240,7 @@ def _scenes(gates: Sequence[CourseGate]) -> rrb.Horizontal:
 
 
 def _overlooking(gates: Sequence[CourseGate]) -> rrb.EyeControls3D:
-    """An eye behind and above the start that sees all gates."""
+    """Return an eye behind and above the start that sees all gates."""
     centers_m = np.array([ORIGIN, *(gate.center_ned_m for gate in gates)])
     middle_m = (centers_m.min(axis=0) + centers_m.max(axis=0)) / 2
     reach_m = float(np.linalg.norm(centers_m - middle_m, axis=1).max())
@@ -267,7 +266,7 @@ def _timing() -> rrb.Horizontal:
 
 
 def _event_columns() -> rrb.TextLogColumns:
-    """Text alone: it begins with the time, for which the viewer's own column is too narrow."""
+    """Show only the text, which begins with the time; the viewer's own column is too narrow."""
     time = TimelineColumn("time", visible=False)
     return rrb.TextLogColumns(timeline_columns=[time], text_log_columns=["Body"])
 

@@ -1,4 +1,4 @@
-"""What the viewer plots over time, in columns of values; what varies fast as its spread."""
+"""Plots over time, sent in columns of values; fast signals are reduced to their spread."""
 
 import math
 from bisect import bisect_left
@@ -21,7 +21,8 @@ WINDOW_NS = NS_PER_S // 4
 class Columns:
     """Sends values to one recording on the timeline ``time``, which starts at ``start_ns``.
 
-    Rows of plots are collected until ``flush``: a call of the SDK costs as much as a hundred rows.
+    Rows of plots are collected until ``flush``, because one call of the SDK costs as much as a
+    hundred rows.
     """
 
     def __init__(self, stream: rr.RecordingStream) -> None:
@@ -36,7 +37,7 @@ class Columns:
         self.stream.send_columns(path, index, columns, strict=True)
 
     def plot(self, plot: Plot, stamps_ns: Sequence[int], rows: Sequence[Sequence[float]]) -> None:
-        """Keep a row for each stamp, a value for each series; NaN is a gap in its line."""
+        """Keep a row for each stamp, with a value for each series; NaN is a gap in its line."""
         stamps, kept = self._rows.setdefault(plot, ([], []))
         stamps += stamps_ns
         kept += rows
@@ -51,9 +52,9 @@ class Columns:
 
 
 class Spread:
-    """Least, most and median of one quantity in each window of ``WINDOW_NS``, beside a bound.
+    """Minimum, maximum and median of one quantity per window of ``WINDOW_NS``, beside a bound.
 
-    A quantity that jumps with every tick is a solid block in a plot of a minute.
+    In a plot of a minute, a quantity that jumps with every tick would be a solid block.
     """
 
     def __init__(self, columns: Columns, plot: Plot, bound_ns: float | None) -> None:
@@ -64,7 +65,7 @@ class Spread:
         self._values_ns: list[float] = []
 
     def extend(self, stamps_ns: Sequence[int], values_ns: Sequence[float]) -> None:
-        """Add values, and show the windows that have ended."""
+        """Add values, and show the completed windows."""
         self._stamps_ns += stamps_ns
         self._values_ns += values_ns
         if self._stamps_ns:
@@ -74,7 +75,7 @@ class Spread:
             )
 
     def close(self) -> None:
-        """Show the window that has not ended."""
+        """Show the unfinished window."""
         if self._stamps_ns:
             self._show(until_ns=self._stamps_ns[-1] + 1)
 
@@ -93,12 +94,12 @@ class Spread:
 
 
 ALLOWED_SHARE = 0.001
-"""Share of slots and of images that a minute at full rate may lose, by our own measure."""
+"""Our criterion: share of slots and of images that a minute at full rate is allowed to lose."""
 _GAP = Sticks(math.nan, math.nan, math.nan, math.nan)
 
 
 class TimingPlots:
-    """The page ``Timing``; images are those of the first camera."""
+    """Plots of the page ``Timing``; images are those of the first camera."""
 
     def __init__(self, columns: Columns, flight: ViewedFlight) -> None:
         self._columns = columns
@@ -124,7 +125,7 @@ class TimingPlots:
         self._first_dropped: int | None = None
 
     def show_ticks(self, ticks: Sequence[Tick]) -> None:
-        """Plot the ages, and the lateness of what was sent in a slot."""
+        """Plot the ages, and the lateness of the sends in slots."""
         ages_ns = [
             (tick.sent_ns, tick.sent_ns - tick.feature_captured_ns)
             for tick in ticks
@@ -151,12 +152,12 @@ class TimingPlots:
         self._show_channels(ticks)
 
     def _show_chunks(self, ticks: Sequence[Tick]) -> None:
-        """Periods of the chunks that were flown, and what each took to compute."""
+        """Plot the periods and the computing times of the flown chunks."""
         news: list[Tick] = []
         last = self._last_chunk
         for tick in ticks:
             if tick.chunk_serial is None or tick.chunk_computed_ns is None:
-                last = None  # the time without a chunk is no period
+                last = None  # time without a chunk is not a period
             elif last is None or tick.chunk_serial != last.chunk_serial:
                 if last is not None and last.chunk_computed_ns is not None:
                     period_ns = tick.chunk_computed_ns - last.chunk_computed_ns
@@ -205,13 +206,13 @@ class TimingPlots:
         self._spreads[plot].extend([stamp for stamp, _ in pairs], [value for _, value in pairs])
 
     def close(self) -> None:
-        """Show what waits for the end of its window."""
+        """Show the unfinished windows."""
         for spread in self._spreads.values():
             spread.close()
 
 
 class ActionPlots:
-    """Each number of the actions: as the policy put it out, as sent, and as echoed."""
+    """Plots of each number of the actions: as output by the policy, as sent, and as echoed."""
 
     def __init__(self, columns: Columns, flight: ViewedFlight) -> None:
         self._columns = columns

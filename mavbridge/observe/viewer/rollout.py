@@ -1,7 +1,6 @@
 """A rollout in the Rerun viewer: imagined and real frames side by side, states and sticks.
 
-Unlike a flight's view: a viewer that does not keep up slows the rollout down, and its errors end
-it.
+Unlike in a flight's view, a slow viewer slows the rollout down, and errors of the viewer end it.
 """
 
 from collections.abc import Callable
@@ -25,7 +24,7 @@ STATES = {
 
 
 def rollout_blueprint() -> rrb.Blueprint:
-    """Layout of the viewer when it opens."""
+    """Return the initial layout of the viewer."""
     plots = [
         rrb.TimeSeriesView(origin=path, name=name, plot_legend=rrb.PlotLegend(corner="LeftTop"))
         for path, name in [(STICKS, "Sticks"), *((path, STATES[path][0]) for path in STATES)]
@@ -50,11 +49,11 @@ def rollout_blueprint() -> rrb.Blueprint:
 class RolloutView:
     """Shows frames as they come, on the timelines ``frame`` (in the video) and ``time``.
 
-    Where iterations overlap, ``time`` goes back with each, and the viewer shows the last one.
+    If iterations overlap, ``time`` goes back with each, and the viewer shows the last one.
     """
 
     def __init__(self, target: str, *, real: Callable[[int], ImageArray | None]) -> None:
-        """Open the file or viewer; raises as ``prepare_target``.
+        """Open the file or the viewer; raise the errors of ``prepare_target``.
 
         ``real`` returns the camera's real image at a step, [H, W, 3], or None.
         """
@@ -66,25 +65,25 @@ class RolloutView:
             self._recording.stream.log(path, rr.SeriesLines(names=lines), static=True, strict=True)
 
     def show(self, frame: RolloutFrame, rgb: ImageArray | None) -> None:
-        """Send one frame; blocks while the viewer does not keep up. For one thread."""
+        """Send one frame; blocks while the viewer does not keep up. Call from one thread."""
         recording = self._recording.stream
         recording.set_time("frame", sequence=frame.number)
         recording.set_time("time", duration=frame.time_s)
         if rgb is not None:
             recording.log(IMAGINED, _png(rgb), strict=True)
         real = self._real(frame.step)
-        # Past the flight's end there is nothing to compare with: the last image must not stay.
+        # After the flight's end there is no real image; the last one must not stay.
         recording.log(REAL, rr.Clear(recursive=False) if real is None else _png(real), strict=True)
         recording.log(STICKS, rr.Scalars(frame.action), strict=True)
         for path, (_, columns) in STATES.items():
             recording.log(path, rr.Scalars(frame.state[columns]), strict=True)
 
     def close(self) -> None:
-        """Deliver the rest; blocks until it is taken. Raises MavbridgeError: the viewer is gone."""
+        """Deliver the rest and block until taken; raise MavbridgeError if the viewer is gone."""
         self._recording.close()
 
 
 def _png(rgb: ImageArray) -> rr.EncodedImage:
-    """Encode without loss: these images are small, and a person judges their quality."""
+    """Encode losslessly: these images are small, and people judge their quality."""
     _, encoded = cv2.imencode(".png", cv2.cvtColor(np.ascontiguousarray(rgb), cv2.COLOR_RGB2BGR))
     return rr.EncodedImage(contents=encoded.tobytes(), media_type="image/png")

@@ -1,4 +1,4 @@
-"""The viewer's scene: vehicle, cameras, flown path and gates, and where the policy plans to go."""
+"""Scene of the viewer: vehicle, cameras, flown path, gates and the policy's planned path."""
 
 import math
 from collections.abc import Sequence
@@ -40,13 +40,13 @@ class Motion(NamedTuple):
 
     @staticmethod
     def of(state: VehicleState, frame: StateFrame) -> "Motion":
-        """The motion that a state in this frame tells of."""
+        """Return the motion that a state in this frame describes."""
         vx, vy, vz = state.values[VELOCITY].tolist()
         w, x, y, z = state.values[QUATERNION].tolist()
         fx, fy, fz = state.values[SPECIFIC_FORCE].tolist()
         if frame == "ned_frd":
             return Motion((w, x, y, z), (vx, vy, vz), (fx, fy, fz))
-        # The change from NED/FRD to ENU/FLU (REP 103) undoes itself: half turns about the diagonal
+        # From NED/FRD to ENU/FLU (REP 103) is its own inverse: half turns about the diagonal
         # between north and east, and about the nose.
         r = _HALF_SQRT2
         attitude = (r * (w + z), r * (x + y), r * (x - y), r * (w - z))
@@ -54,7 +54,7 @@ class Motion(NamedTuple):
 
     @property
     def horizontal_mps2(self) -> NDArray[np.float64]:
-        """Acceleration towards north and east, [2]; gravity has no part in it."""
+        """Acceleration towards north and east, [2], without gravity."""
         w, x, y, z = self.ned_from_body_wxyz
         horizontal_from_body = np.array(
             [
@@ -67,26 +67,26 @@ class Motion(NamedTuple):
 
 JPEG_QUALITY = 85
 MAX_IMAGE_WIDTH = 640
-"""Wider images are scaled down, since the viewer does not show them any larger."""
+"""Wider images are scaled down, because the viewer does not show them any larger."""
 POSE_NS = 30 * NS_PER_MS
-"""Least time between two poses."""
+"""Shortest time between two poses."""
 FRUSTUM_M = 0.8
-"""Distance at which the images hang. Nobody tells a camera's angle of view: 90 degrees are drawn,
-along the direction that its name says, else forward."""
+"""Distance at which the images hang. The angle of view of a camera is unknown: 90 degrees are
+drawn, in the direction of the camera's name, else forward."""
 CAMERA_AXES = {
-    "down": rr.ViewCoordinates.URF,  # the upper edge of its image lies ahead
+    "down": rr.ViewCoordinates.URF,  # the upper edge of its image points forward
     "left": rr.ViewCoordinates.RBD,
     "right": rr.ViewCoordinates.LFD,
     "back": rr.ViewCoordinates.BLD,
 }
-"""Meaning, for a camera of this name, of the body's axes x, y, z (front, right, down)."""
+"""By camera name, the meaning of the body's axes x, y, z (front, right, down)."""
 _ARM_M = 0.25
 _PATH_RADIUS = -1.5
-"""In points of the screen, which is what a negative radius means."""
+"""In screen points, as a negative radius means."""
 
 
 class SceneView:
-    """Shows poses at tens of hertz, each image where its camera is, and the path behind them."""
+    """Shows poses at tens of hertz, each image at its camera, and the flown path."""
 
     def __init__(self, columns: Columns, flight: ViewedFlight) -> None:
         self._columns = columns
@@ -104,7 +104,7 @@ class SceneView:
         self._last_place: Position | None = None
 
     def open(self) -> None:
-        """Draw what does not move."""
+        """Draw the static parts."""
         log = self._columns.stream.log
         log(layout.SCENE, rr.ViewCoordinates.FRD, static=True, strict=True)  # north, east, down
         log(f"{layout.VEHICLE}/body", _airframe(), static=True, strict=True)
@@ -112,7 +112,7 @@ class SceneView:
             log(f"{layout.SCENE}/gates", _gates(self._gates), static=True, strict=True)
 
     def show_ticks(self, ticks: Sequence[Tick]) -> None:
-        """Move the vehicle; without a position it turns where it was last, or at the origin."""
+        """Move the vehicle. Without a position it turns at its last one, or at the origin."""
         shown: list[Tick] = []
         for tick in ticks:
             if tick.woke_ns >= self._due_ns and tick.state is not None:
@@ -138,7 +138,7 @@ class SceneView:
         self._columns.plot(layout.HEIGHT, stamps_ns, [(height,) for height in heights])
 
     def _show_path(self, ticks: Sequence[Tick]) -> None:
-        """Go on with the path from the last place of the batch before."""
+        """Continue the path from the last position of the batch before."""
         places = [tick.position_ned_m for tick in ticks if tick.position_ned_m is not None]
         strip = places if self._last_place is None else [self._last_place, *places]
         if places:
@@ -176,7 +176,7 @@ class SceneView:
 
 
 def _turn_and_lean(ned_from_body_wxyz: Quaternion) -> tuple[Quaternion, Quaternion]:
-    """The heading, and the lean in the axes that it turns; both xyzw, as the viewer has it."""
+    """Return the heading, and the lean in the turned axes; both xyzw, the viewer's order."""
     w, x, y, z = ned_from_body_wxyz
     half_rad = heading_rad(ned_from_body_wxyz) / 2
     c, s = math.cos(half_rad), math.sin(half_rad)
@@ -185,7 +185,7 @@ def _turn_and_lean(ned_from_body_wxyz: Quaternion) -> tuple[Quaternion, Quaterni
 
 
 def _airframe() -> rr.LineStrips3D:
-    """Four arms and propellers in FRD metres; the front ones are red."""
+    """Return four arms and propellers in FRD metres; the front ones are red."""
     angle = np.linspace(0, 2 * math.pi, 17)
     circle = 0.6 * _ARM_M * np.stack([np.cos(angle), np.sin(angle), np.zeros(17)], axis=1)
     strips, colors = [], []
@@ -197,7 +197,7 @@ def _airframe() -> rr.LineStrips3D:
 
 
 def _gates(gates: Sequence[CourseGate]) -> rr.LineStrips3D:
-    """The openings, numbered in the order in which they are flown."""
+    """Return the openings, numbered in the order of flight."""
     strips = []
     for gate in gates:
         half_m = gate.size_m / 2
@@ -216,7 +216,7 @@ def _gates(gates: Sequence[CourseGate]) -> rr.LineStrips3D:
 
 
 def _fitting(image: CameraImage) -> ImageArray:
-    """The image in RGB, as wide as is shown; depth darker the farther, with unknown black."""
+    """Return the image in RGB at its shown width; farther depth is darker, unknown is black."""
     rgb = np.asarray(image, np.uint8) if image.ndim == 3 else _shaded(image)
     height, width = rgb.shape[:2]
     if width <= MAX_IMAGE_WIDTH:
@@ -242,7 +242,7 @@ _STEEPEST_RAD = math.radians(80)
 
 
 class PlanView:
-    """Shows one chunk out of many: the next one that finds a lane free."""
+    """Shows a subset of the chunks: the next one that finds a free lane."""
 
     def __init__(self, columns: Columns, flight: ViewedFlight) -> None:
         self._columns = columns
@@ -253,7 +253,7 @@ class PlanView:
         self._shown = 0
 
     def show(self, solve: Solve, position: Position | None) -> None:
-        """Show this chunk, if it is due; ``position`` is the vehicle's, in NED, if known."""
+        """Show this chunk if it is due; ``position`` is the vehicle's, in NED; None: unknown."""
         if self._to_ned is None or solve.first_ns < self._next_ns:
             return
         actions = self._to_ned(solve.actions[0])
@@ -274,11 +274,11 @@ class PlanView:
 def planned_path(
     solve: Solve, actions: tuple[Action, ...], contract: Contract
 ) -> NDArray[np.float64] | None:
-    """Path [1 + horizon, 3] from the vehicle, in NED metres, if it flies as the chunk says.
+    """Return the planned path [1 + horizon, 3] from the vehicle in NED metres.
 
     Velocities are followed at once. Sticks are leans, climb and yaw rate by the contract's gains,
-    also at once; what the vehicle accelerates beyond its present lean, such as drag, stays as it
-    is. None for actions of other kinds.
+    also followed at once. Acceleration beyond that of the present lean, such as drag, is held. None
+    for actions of other kinds.
     """
     motion = Motion.of(solve.state, contract.state_frame)
     yaw_rad, step_s = heading_rad(motion.ned_from_body_wxyz), solve.step_ns / NS_PER_S
@@ -305,7 +305,7 @@ def planned_path(
 
 
 def _lean_mps2(roll_rad: float, pitch_rad: float, yaw_rad: float) -> NDArray[np.float64]:
-    """Acceleration towards north and east of a vehicle that leans so and keeps its height."""
+    """Return acceleration to north and east [m/s^2] of a vehicle that leans at constant height."""
     roll_rad, pitch_rad = (
         max(-_STEEPEST_RAD, min(lean, _STEEPEST_RAD)) for lean in (roll_rad, pitch_rad)
     )
@@ -314,6 +314,6 @@ def _lean_mps2(roll_rad: float, pitch_rad: float, yaw_rad: float) -> NDArray[np.
 
 
 def _turned(forward: float, right: float, yaw_rad: float) -> NDArray[np.float64]:
-    """A level vector in the axes of the nose -> north and east."""
+    """Rotate a level vector from heading axes to north and east."""
     sine, cosine = math.sin(yaw_rad), math.cos(yaw_rad)
     return np.array([forward * cosine - right * sine, forward * sine + right * cosine])

@@ -1,9 +1,8 @@
-"""Rerun's web viewer and the server that feeds it (``--serve``), in a process of their own.
+"""Rerun's web viewer and the server that feeds it (``--serve``), in a separate process.
 
-The server keeps what it was sent for browsers that come late, so memory is bounded there, outside
-the flight; a browser that does not keep up holds up the server, never the flight's loops. It shows
-what any program sends to the port of the data; pages of other origins cannot, and nothing of it
-reaches the flight.
+The server keeps received data for browsers that connect late, so memory is bounded there, outside
+the flight. A slow browser blocks the server, never the flight's loops. The server shows data from
+any program that sends to its data port. Pages of other origins cannot; the flight gets none of it.
 """
 
 import socket
@@ -22,7 +21,7 @@ from mavbridge.core.processes import child_environment, end
 
 SPAWN_TIMEOUT_S = 15.0
 SETTLE_S = 1.0
-"""A viewer without a display opens its port first and exits right after."""
+"""A viewer without a display opens its port first and exits immediately afterwards."""
 _POLL_S = 0.1
 
 
@@ -31,7 +30,7 @@ def start_listening(
 ) -> "subprocess.Popen[bytes]":
     """Start a program and wait until it listens on all ports and has not exited for SETTLE_S.
 
-    It gets a session of its own, out of reach of Ctrl-C.
+    The program gets a separate session, so that Ctrl-C does not reach it.
 
     Raises:
         MavbridgeError: it exited, or did not listen in time.
@@ -63,7 +62,7 @@ def start_listening(
 
 
 def listens(host: str, port: int, *, timeout_s: float = _POLL_S) -> bool:
-    """Whether a server accepts connections there."""
+    """True if a server accepts connections at this address."""
     try:
         socket.create_connection((host, port), timeout_s).close()
     except OSError:
@@ -76,7 +75,7 @@ def _not_started(name: str, reason: str) -> MavbridgeError:
 
 
 SERVER_MEMORY = "1GB"
-"""Beyond this the server forgets its oldest data."""
+"""Above this limit the server drops its oldest data."""
 LOOPBACK = ("127.0.0.1", "::1")
 _ANY = ("0.0.0.0", "::")  # noqa: S104 - compared with, where the user asks for it
 _DIE_WITH_PARENT = """
@@ -85,11 +84,11 @@ ctypes.CDLL(None).prctl(1, 15)  # PR_SET_PDEATHSIG, SIGTERM
 os.nice(10)  # the flight comes first
 os.execv(sys.argv[1], sys.argv[1:])
 """
-"""Linux ends the server with the flight's process, also after a kill -9."""
+"""Linux ends the server together with the flight's process, even after kill -9."""
 
 
 class ServeAddress(NamedTuple):
-    """Where the page is served; the data of the flight come from the next port."""
+    """Address of the page; the next port carries the data of the flight."""
 
     host: str
     """An IP address."""
@@ -102,23 +101,23 @@ class ServeAddress(NamedTuple):
 
     @property
     def data_url(self) -> str:
-        """URL of the gRPC server, from this computer."""
+        """URL of the gRPC server from this computer."""
         host = "127.0.0.1" if self.host in _ANY else self.host
         return f"rerun+http://{spelled(host, self.data_port)}/proxy"
 
     @property
     def page_url(self) -> str:
-        """Address for a browser, which tells the page where the data are."""
+        """Address for a browser; it tells the page where the data are."""
         host = socket.gethostname() if self.host in _ANY else self.host
         data_url = f"rerun+http://{spelled(host, self.data_port)}/proxy"
         return f"http://{spelled(host, self.port)}/?url={quote(data_url, safe=':/')}"
 
 
 def serve_address(text: str) -> ServeAddress:
-    """Read the value of ``--serve``, and check that both of its ports are free.
+    """Parse the value of ``--serve``, and check that both of its ports are free.
 
     Raises:
-        UserError: not HOST:PORT, or a port that cannot be listened on.
+        UserError: not HOST:PORT, or listening on a port fails.
     """
     host, first = host_port(text) or ("", 65535)
     if first == 65535:
@@ -142,17 +141,17 @@ def serve_address(text: str) -> ServeAddress:
 
 
 class WebServer:
-    """The process of one server, from the constructor to ``close``."""
+    """Process of one server, from the constructor to ``close``."""
 
     def __init__(self, address: ServeAddress) -> None:
-        """Start it and wait until it listens; raises MavbridgeError if it does not."""
+        """Start the server and wait until it listens; raise MavbridgeError if it does not."""
         options = {
             "--bind": address.host,
             "--port": str(address.data_port),
             "--web-viewer-port": str(address.port),
             "--server-memory-limit": SERVER_MEMORY,
         }
-        if address.host not in LOOPBACK:  # its own page may not read the data else
+        if address.host not in LOOPBACK:  # otherwise its own page cannot read the data
             host = "*" if address.host in _ANY else address.host
             options["--cors-allow-origin"] = f"http://{spelled(host, address.port)}"
         binary = _binary()
@@ -165,12 +164,12 @@ class WebServer:
         )
 
     def close(self) -> None:
-        """End it; pages that are open keep what they have."""
+        """Stop the server. Open pages keep their data."""
         end(self._process)
 
 
 def _binary() -> Path:
-    """Rerun's program itself: its Python wrapper would die without ending it."""
+    """Return Rerun's program itself: its Python wrapper would die without ending it."""
     spec = find_spec("rerun_cli")
     if spec is None or spec.origin is None:
         raise MavbridgeError("--serve needs Rerun's program, which is not installed: rerun_cli")

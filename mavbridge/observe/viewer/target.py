@@ -1,4 +1,4 @@
-"""A Rerun recording, and its target (``--rerun``), which is ready before the flight begins."""
+"""A Rerun recording and its target (``--rerun``), which is ready before the flight begins."""
 
 import subprocess
 import sys
@@ -22,24 +22,24 @@ VIEWER_HOST = "127.0.0.1"
 VIEWER_PORT = 9876
 VIEWER_URL = f"rerun+http://{VIEWER_HOST}:{VIEWER_PORT}/proxy"
 VIEWER_MEMORY = "2GB"
-"""Beyond this the viewer drops its oldest data: it shares the machine with the flight."""
+"""Above this limit the viewer drops its oldest data: it shares the machine with the flight."""
 CONNECT_TIMEOUT_S = 2.0
 _SCHEMES = ("rerun", "rerun+http", "rerun+https")
 
 
 class RerunRecording:
-    """One recording and its targets; every call may block while a viewer does not keep up."""
+    """One recording and its targets. Every call can block while a viewer does not keep up."""
 
     def __init__(self, application: str, target: str, *, serve: str = "") -> None:
-        """Check the targets, and start what they need.
+        """Check the targets, and start the required viewer and server.
 
         Args:
-            application: the viewer's name for what it shows.
-            target: that of ``prepare_target``; with ``serve`` it may be ``off``.
-            serve: HOST:PORT where a browser finds it, or empty; see ``serve_address``.
+            application: the viewer's name for the content.
+            target: that of ``prepare_target``; with ``serve`` it can be ``off``.
+            serve: HOST:PORT of the web viewer, or empty; see ``serve_address``.
 
         Raises:
-            MavbridgeError: as ``prepare_target`` and ``serve_address``.
+            MavbridgeError: as in ``prepare_target`` and ``serve_address``.
         """
         self._sinks: list[rr.FileSink | rr.GrpcSink] = []
         if target != "off" or not serve:
@@ -48,7 +48,7 @@ class RerunRecording:
             self._sinks.append(rr.FileSink(prepared) if is_file else rr.GrpcSink(str(prepared)))
         self._server: WebServer | None = None
         self.url: str | None = None
-        """Address for a browser; None where none is served."""
+        """Address for a browser; None if no page is served."""
         if serve:
             address = serve_address(serve)
             self._server, self.url = WebServer(address), address.page_url
@@ -61,7 +61,7 @@ class RerunRecording:
         self.stream.set_sinks(*self._sinks, default_blueprint=blueprint)
 
     def close(self) -> None:
-        """Deliver the rest and close; raises MavbridgeError if the viewer is gone."""
+        """Deliver the rest and close; raise MavbridgeError if the viewer is gone."""
         try:
             self.stream.flush()
             self.stream.disconnect()
@@ -73,7 +73,7 @@ class RerunRecording:
 
 
 def prepare_target(text: str) -> Path | str:
-    """Return the file that a recording is written to, or the URL of a viewer that listens.
+    """Return the file that a recording is written to, or the URL of a listening viewer.
 
     Args:
         text: ``spawn``, ``connect``, ``connect=URL`` or a path that ends in ``.rrd``.
@@ -94,7 +94,7 @@ def prepare_target(text: str) -> Path | str:
 
 
 def check_target(text: str) -> None:
-    """Refuse what ``prepare_target`` would, and start nothing; raises as it does."""
+    """Run the checks of ``prepare_target`` without starting anything; raise the same errors."""
     if text in ("off", "spawn"):
         return
     if text == "connect" or text.startswith("connect="):
@@ -124,7 +124,8 @@ def _reachable(url: str) -> None:
 def spawn_viewer(command: list[str], *, port: int) -> "subprocess.Popen[bytes]":
     """Start a viewer and wait until it listens and has not exited for SETTLE_S.
 
-    It gets a session of its own, out of reach of Ctrl-C, and stays open after the flight.
+    The viewer gets a separate session, so that Ctrl-C does not reach it, and stays open after the
+    flight.
 
     Raises:
         MavbridgeError: it exited, or did not listen in time.

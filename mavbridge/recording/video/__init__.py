@@ -1,1 +1,1 @@
-"""Video files, and the process that encodes them."""
+"""Video files and the process that encodes them."""

@@ -1,9 +1,9 @@
-"""H.264 in fragmented MP4, one fragment a frame: what has been appended stays readable.
+"""H.264 in fragmented MP4, one fragment per frame, so that appended frames stay readable.
 
-Depth images are kept as they are, in FFV1: 16 bits, without loss.
+Depth images are kept losslessly in 16 bits (FFV1).
 
-The muxer holds a frame back until the next one gives its duration, so a file that was cut off
-lacks at most its last frame.
+The muxer holds a frame back until the next one gives its duration, so a cut-off file lacks at most
+its last frame.
 """
 
 from collections.abc import Iterator, Sequence
@@ -20,9 +20,9 @@ from mavbridge.core.records import CameraImage
 from policy.data.flight_video import VideoParts, decode_images, video_parts
 
 CRF = "20"
-"""Constant quality; 17 to 18 is taken for visually lossless, 23 is x264's default."""
+"""Constant quality. 17 to 18 counts as visually lossless; 23 is x264's default."""
 GOP_FRAMES = 30
-"""A second between key frames."""
+"""One second between key frames."""
 TIME_BASE = Fraction(1, 90_000)
 """Usual time base of video; the exact stamps are in the table."""
 _OPTIONS: dict[str, object] = {
@@ -36,22 +36,22 @@ _DEPTH = "gray16le"
 _FRAGMENTED = {"movflags": "frag_every_frame+empty_moov+default_base_moof"}
 WRITE_ERRORS = (OSError, FFmpegError)
 _BUFFER_BYTES = 1 << 20
-"""More than a fragment: it is written in one call, which a kill cannot tear."""
+"""Larger than a fragment, which is therefore written in one call that a kill cannot tear."""
 
 
 class VideoError(MavbridgeError):
-    """A video that cannot be read."""
+    """A video cannot be read."""
 
 
 class FragmentedMp4:
-    """A video file that grows by a frame at a time; methods may raise ``WRITE_ERRORS``."""
+    """Video file that grows frame by frame. Methods can raise ``WRITE_ERRORS``."""
 
     def __init__(
         self, path: Path, *, height: int, width: int, hz: float, is_depth: bool = False
     ) -> None:
         """Create the file, which must not exist, for frames with even sides.
 
-        ``hz`` is the nominal frame rate; the frames' own stamps decide.
+        ``hz`` is the nominal frame rate; the stamps of the frames decide.
         """
         self._file: BinaryIO = path.open("xb", buffering=_BUFFER_BYTES)
         self._container: OutputContainer = av.open(
@@ -60,7 +60,7 @@ class FragmentedMp4:
         rate = Fraction(hz).limit_denominator(1000)
         if is_depth:
             stream = self._container.add_stream("ffv1", rate)
-            stream.options = {"g": "1"}  # each image by itself
+            stream.options = {"g": "1"}  # each image separately
         else:
             stream = self._container.add_stream("libx264", rate)
             stream.options = _OPTIONS
@@ -74,7 +74,7 @@ class FragmentedMp4:
     def append(self, rgb: CameraImage, captured_ns: int) -> None:
         """Encode one frame and hand it to the kernel.
 
-        A stamp that is not after the last frame's is moved behind it.
+        A stamp not later than the last frame's is moved behind it.
         """
         if self._first_ns is None:
             self._first_ns = captured_ns
@@ -87,7 +87,7 @@ class FragmentedMp4:
         self._last_pts = pts
 
     def close(self) -> None:
-        """Write what is left and close the file, also after an error."""
+        """Write the remaining data and close the file, also after an error."""
         try:
             self._container.mux(self._stream.encode(None))
             self._container.close()
@@ -96,12 +96,12 @@ class FragmentedMp4:
 
 
 def count_frames(path: Path) -> int:
-    """Whole frames of a file of ``FragmentedMp4``, however it ended; raises VideoError."""
+    """Count the complete frames of a ``FragmentedMp4`` file; raise VideoError on failure."""
     return len(find_images(path).fragments)
 
 
 def find_images(path: Path) -> VideoParts:
-    """What of a file of ``FragmentedMp4`` can be decoded; raises VideoError."""
+    """Find the decodable parts of a ``FragmentedMp4`` file; raise VideoError on failure."""
     try:
         return video_parts(path)
     except OSError as error:
@@ -109,10 +109,10 @@ def find_images(path: Path) -> VideoParts:
 
 
 def read_video(path: Path, numbers: Sequence[int] | None = None) -> Iterator[CameraImage]:
-    """Images of a file of ``FragmentedMp4``, whole or not, as they were appended.
+    """Return the images of a ``FragmentedMp4`` file, complete or not, in the order of appending.
 
-    ``numbers`` are those of the images to read, by default all that can be. Raises VideoError if
-    one of them cannot.
+    ``numbers`` selects the images to read; default: all that are decodable. Raise VideoError if one
+    of them cannot be decoded.
     """
     if numbers is not None and not len(numbers):
         return

@@ -1,7 +1,7 @@
-"""Frames from one process to another through shared memory: a fixed number of slots.
+"""Shared memory with a fixed number of slots that passes frames from one process to another.
 
-Messages over the pipe of the two processes pass the slots on and order the accesses: a slot belongs
-to the producer until ``Submit`` names it, and again from ``Written`` on.
+Messages over the pipe between the processes pass the slots on and order the accesses. A slot
+belongs to the producer until ``Submit`` names it, and again from ``Written`` on.
 """
 
 import os
@@ -16,7 +16,8 @@ from mavbridge.core.records import CameraImage
 MAX_SLOTS = 32
 MIN_SLOTS = 4
 MAX_BYTES = 32 << 20
-"""Beyond the least number of slots: a container may have no more than 64 MB of shared memory."""
+"""Size limit of a ring with more than its least number of slots: some containers have only 64 MB of
+shared memory."""
 
 
 class RingShape(NamedTuple):
@@ -30,7 +31,7 @@ class RingShape(NamedTuple):
 
     @property
     def frame(self) -> "np.dtype[np.void]":
-        """Type and axes of a frame."""
+        """Data type and axes of a frame."""
         each = (np.uint16, ()) if self.is_depth else (np.uint8, (3,))
         return np.dtype((each[0], (self.height, self.width, *each[1])))
 
@@ -39,7 +40,7 @@ class FrameRing:
     """Slots of one frame each, mapped."""
 
     def __init__(self, memory: SharedMemory, shape: RingShape) -> None:
-        """Use ``create`` in the producer, and ``attach`` in the consumer."""
+        """Call ``create`` in the producer and ``attach`` in the consumer, not this."""
         self.shape = shape
         self._memory = memory
         self._is_linked = False
@@ -47,11 +48,11 @@ class FrameRing:
 
     @classmethod
     def create(cls, height: int, width: int, *, is_depth: bool = False) -> "FrameRing":
-        """Acquire the memory, in the producer; OSError if there is not enough."""
+        """Allocate the memory in the producer; raise OSError if there is not enough."""
         frame_bytes = height * width * (2 if is_depth else 3)
         slots = max(MIN_SLOTS, min(MAX_SLOTS, MAX_BYTES // frame_bytes))
         memory = SharedMemory(create=True, size=slots * frame_bytes)
-        # Take the pages now: a page that is not there when it is first written ends the process.
+        # Allocate the pages now: a page that is unavailable at its first write ends the process.
         path = Path("/dev/shm") / memory.name.lstrip("/")  # noqa: S108 - where Linux keeps them
         try:
             if path.exists():
@@ -67,11 +68,11 @@ class FrameRing:
 
     @classmethod
     def attach(cls, shape: RingShape) -> "FrameRing":
-        """Map the memory, in the consumer; OSError if it is gone."""
+        """Map the memory in the consumer; raise OSError if it is gone."""
         return cls(SharedMemory(name=shape.name), shape)
 
     def slot(self, index: int) -> CameraImage:
-        """View of one slot; not to be kept beyond ``close``."""
+        """Return a view of one slot. Do not keep it beyond ``close``."""
         if self._frames is None:
             raise ValueError("the ring is closed")
         frame: CameraImage = self._frames[index]
@@ -84,7 +85,7 @@ class FrameRing:
             self._memory.unlink()
 
     def close(self) -> None:
-        """Unmap, and in the producer remove the name. May be called twice."""
+        """Unmap the memory and, in the producer, remove the name. Can be called twice."""
         self._frames = None
         self._memory.close()
         self.unlink()

@@ -1,4 +1,4 @@
-"""The producer's end of the writer process."""
+"""Producer's end of the writer process."""
 
 import multiprocessing
 import weakref
@@ -29,7 +29,7 @@ from mavbridge.recording.video.writer_process import (
 )
 
 Pressure = Literal["online", "offline"]
-"""With a full ring, online drops and counts the frame, and offline makes the producer wait."""
+"""With a full ring, online drops and counts the frame; offline makes the producer wait."""
 
 START_S = 30.0
 STALL_S = 30.0
@@ -38,17 +38,17 @@ END_S = 5.0
 
 
 class WriterError(MavbridgeError):
-    """The writer could not write: the disk, the folder."""
+    """The writer could not write to the disk or the folder."""
 
 
 class WriterDiedError(WriterError):
-    """The writer process is gone, or hangs."""
+    """The writer process has died or hangs."""
 
 
 class FrameSender:
-    """Frames into the ring, and the writer's messages out of the pipe; used by one thread.
+    """Sends frames through the ring and receives the writer's messages. Used by one thread.
 
-    Methods raise ``WriterError`` if the writer failed or died, now or before.
+    Methods raise ``WriterError`` if the writer has failed or died.
     """
 
     def __init__(
@@ -66,7 +66,7 @@ class FrameSender:
         self._notices: set[Notice] = set()
         self._offered = 0
         self.written = 0
-        """Frames known to be in the file."""
+        """Number of frames known to be in the file."""
 
     @property
     def size(self) -> tuple[int, int] | None:
@@ -75,17 +75,18 @@ class FrameSender:
 
     @property
     def lost(self) -> int:
-        """Frames offered and not, or not yet, in the file."""
+        """Number of offered frames that are not, or not yet, in the file."""
         return self._offered - self.written
 
     def submit(self, rgb: CameraImage, row: FrameRow) -> bool:
-        """Hand a frame over; it may be overwritten afterwards.
+        """Hand a frame over; the caller can overwrite it afterwards.
 
-        A frame of another size or kind than the first is dropped and counted online, a bug offline.
+        A frame that differs in size or kind from the first is a bug offline; online, it is dropped
+        and counted.
 
         Args:
-            rgb: the image; an odd last row or column is cut off, which H.264 cannot have.
-            row: its other facts; drops of the ring are added to ``dropped_before``.
+            rgb: the image. An odd last row or column is cut off, which H.264 cannot have.
+            row: other facts about the frame; drops of the ring are added to ``dropped_before``.
 
         Returns:
             True if it was taken.
@@ -130,26 +131,26 @@ class FrameSender:
         self._wait_until(lambda: Notice.DONE in self._notices)
 
     def _send(self, message: ToWriter) -> None:
-        """Cannot block: no more messages are under way than there are slots."""
+        """Send a message. Never blocks: no more messages are in flight than there are slots."""
         try:
             self._pipe.send(message)
-        except OSError:  # it has ended: its last message, or else its exit status, is the reason
+        except OSError:  # it has ended; its last message or exit status gives the reason
             self.receive()
             raise self._died() from None
 
     def _wait_until(self, condition: Callable[[], bool], timeout_s: float = STALL_S) -> None:
-        """Receive until the condition holds; a writer that is silent for that long has hung."""
+        """Receive until the condition holds; a writer silent for ``timeout_s`` counts as hung."""
         while not condition():
             if not wait([self._pipe, self._process.sentinel], timeout_s):
                 self._failure = WriterDiedError(f"the writer process has hung for {timeout_s:g} s")
             self.receive()
             if self._process.exitcode is not None and not condition():
-                self.receive()  # what it sent between the two
+                self.receive()  # messages sent between the two checks
                 if not condition():
                     raise self._died()
 
     def receive(self) -> None:
-        """Take in the messages that have come."""
+        """Process the messages that have arrived."""
         try:
             while not self._failure and Notice.DONE not in self._notices and self._pipe.poll():
                 match self._pipe.recv():
@@ -175,15 +176,15 @@ class FrameSender:
         return self._failure
 
     def close(self) -> None:
-        """Free the memory and the pipe. May be called twice."""
+        """Free the memory and the pipe. Can be called twice."""
         self._resources.close()
 
 
 class VideoWriter(FrameSender):
-    """One video, written by a process of its own; used by one thread.
+    """One video, written by a separate process. Used by one thread.
 
-    A producer that is killed leaves a whole video: the writer notices and finishes it. The process
-    outlives ``finish`` if the log of the link has not ended by then; it waits for that itself.
+    If the producer is killed, the writer notices and finishes the video. The process outlives
+    ``finish`` if the link's log has not ended by then; it waits for that by itself.
     """
 
     def __init__(
@@ -200,15 +201,15 @@ class VideoWriter(FrameSender):
 
         Args:
             video: MP4 file to make; must not exist.
-            pressure: what a full ring does. Online, the process yields the CPU to everybody else.
+            pressure: behaviour with a full ring. Online, the process yields the CPU to all others.
             hz: nominal frame rate.
-            rows: path and stem of a frames table to make, or None.
+            rows: path and stem of a table of frames to write, or None.
             with_truth: the table has the columns of ``FrameTruth``.
-            tlog: log of the link to write beside it; its pipe is closed here.
+            tlog: log of the link to write beside the video; its pipe is closed here.
         """
         self._tlog = tlog
         job = VideoJob(video=video, hz=hz, rows=rows, with_truth=with_truth)
-        # Not fork: threads and an engine run here.
+        # Not fork: this process has running threads and an engine.
         context = multiprocessing.get_context("spawn")
         pipe, its_pipe = context.Pipe()
         process = context.Process(
@@ -220,11 +221,11 @@ class VideoWriter(FrameSender):
         try:
             process.start()
         finally:
-            its_pipe.close()  # else this process would keep the pipe open when the writer dies
+            its_pipe.close()  # an open copy here would keep the pipe open after the writer dies
             if tlog is not None:
                 tlog.records.close()
         super().__init__(pipe, process, pressure)
-        # A producer that ends without ``close`` must not be waited for by its writer.
+        # A producer that ends without ``close`` must not wait for its writer.
         weakref.finalize(self, self._resources.close)
         try:
             self._wait_until(lambda: Notice.READY in self._notices, START_S)
@@ -240,7 +241,7 @@ class VideoWriter(FrameSender):
             self.close()
 
     def close(self) -> None:
-        """End the process; what was submitted and not written may be lost. May be called twice."""
+        """End the process; frames submitted but not written can be lost. Can be called twice."""
         super().close()
         self._process.join(END_S)
         is_keeping_log = self._tlog is not None and Notice.DONE in self._notices

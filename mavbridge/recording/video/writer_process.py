@@ -1,8 +1,8 @@
-"""The process that turns frames into a video and its table, and keeps the log of the link.
+"""Process that encodes frames into a video and its table, and keeps the log of the link.
 
-It ends by itself, with everything closed, also when its producer is killed: then the pipe ends. The
-log has a pipe of its own, from another process, whose end it awaits last. A signal to the process
-group (Ctrl-C) is the producer's to act on. Imports neither the loops nor the network, so that it
+It ends by itself with all files closed, even if its producer is killed: the pipe then ends. The log
+has a separate pipe from another process, and the end of that pipe is awaited last. The producer
+handles signals to the process group (Ctrl-C). Imports neither the loops nor the network, so that it
 starts quickly.
 """
 
@@ -23,7 +23,7 @@ from mavbridge.recording.video.ring import FrameRing, RingShape
 
 FILE_ERRORS = (*WRITE_ERRORS, *READ_ERRORS)
 FLUSH_NS = 500_000_000
-"""Longest span of frames whose rows may wait."""
+"""Longest span of frames whose rows can be pending."""
 FLUSH_ROWS = 64
 
 
@@ -39,9 +39,9 @@ class VideoJob(NamedTuple):
 
 
 class FrameFiles:
-    """The files of one job; made with the first frame, whose size is that of the video.
+    """Files of one job, created with the first frame, whose size is that of the video.
 
-    Every method may raise one of ``FILE_ERRORS``: then ``abandon`` is all that may follow.
+    Every method can raise one of ``FILE_ERRORS``; afterwards only ``abandon`` is allowed.
     """
 
     def __init__(self, job: VideoJob) -> None:
@@ -51,7 +51,7 @@ class FrameFiles:
         self._rows: list[FrameRow] = []
 
     def append(self, rgb: CameraImage, row: FrameRow) -> None:
-        """Write a frame with even sides; its row follows within half a second."""
+        """Write a frame with even sides. Its row follows within half a second."""
         if self._video is None:
             height, width = rgb.shape[:2]
             job = self._job
@@ -66,7 +66,7 @@ class FrameFiles:
                 self.flush()
 
     def flush(self) -> None:
-        """Write the rows that wait."""
+        """Write the pending rows."""
         if self._job.rows is None or not self._rows:
             return
         schema = DEMONSTRATION_FRAMES if self._job.with_truth else FRAMES
@@ -84,9 +84,9 @@ class FrameFiles:
             table.finish()
 
     def abandon(self) -> None:
-        """Leave what is written; the file that failed may be cut off at its end. Never raises."""
+        """Leave the written data; a failed file can be cut off at its end. Never raises."""
         for close in (self._close_video, self.flush):
-            with suppress(*FILE_ERRORS):  # a disk that was full still is
+            with suppress(*FILE_ERRORS):  # a disk that was full is still full
                 close()
         if self._table is not None:
             self._table.abandon()
@@ -98,10 +98,10 @@ class FrameFiles:
 
 
 IDLE_S = 0.5
-"""Longest wait of rows for a next frame."""
+"""Longest wait of pending rows for the next frame."""
 TLOG_S = 60.0
-"""Longest wait for the end of the log once the producer is gone: the process of the link has the
-vehicle to bring to safety."""
+"""Longest wait for the end of the log once the producer is gone: the link's process still has to
+bring the vehicle to safety."""
 NICENESS = 10
 
 
@@ -119,8 +119,10 @@ class Written(NamedTuple):
 
 
 class Failed(NamedTuple):
-    """Message from the writer: it has failed; it closes its files, and ends. ``reason`` is for the
-    user, a sentence without its full stop."""
+    """Message from the writer: it has failed, closes its files and ends.
+
+    ``reason`` is a sentence for the user, without its full stop.
+    """
 
     reason: str
 
@@ -129,17 +131,17 @@ class Notice(Enum):
     """A message without contents."""
 
     FINISH = auto()
-    """Sent to the writer: there are no more frames."""
+    """Sent to the writer: no more frames."""
     READY = auto()
     """Sent by the writer: it runs."""
     MAPPED = auto()
-    """Sent by the writer: it has mapped the memory, whose name is not needed any more."""
+    """Sent by the writer: it has mapped the memory, whose name is no longer needed."""
     DONE = auto()
     """Sent by the writer: everything is closed."""
 
 
 ToWriter: TypeAlias = RingShape | Submit | Notice
-"""A ``RingShape`` comes first: the frames will lie there."""
+"""A ``RingShape`` comes first: it describes the memory for the frames."""
 FromWriter: TypeAlias = Written | Failed | Notice
 
 
@@ -165,7 +167,7 @@ def run_writer(
 
 
 class WriterService:
-    """Does one job, message by message."""
+    """Writer of one job, message by message."""
 
     def __init__(
         self,
@@ -182,7 +184,7 @@ class WriterService:
         self.has_failed = False
 
     def send(self, message: FromWriter) -> None:
-        """Send a message, if the producer is still there."""
+        """Send a message if the producer is still there."""
         try:
             self._pipe.send(message)
         except OSError:

@@ -1,4 +1,4 @@
-"""Policies as a user might write them, with what can go wrong in them; the bridge loads them."""
+"""Faulty policies as a user might write them; the bridge loads them."""
 
 import ctypes
 import os
@@ -19,7 +19,7 @@ HANG_S = 20
 
 
 class Climbing:
-    """Climbs; the smallest dual-rate policy there is."""
+    """Climbs; the smallest possible dual-rate policy."""
 
     contract = Contract(arrays="numpy", feature_dim=1)
 
@@ -55,17 +55,17 @@ class Leaning(Climbing):
 
     contract = Contract(arrays="numpy", feature_dim=1, image_height=32, image_width=32)
     lean_calls, fault_calls = 120, 260
-    """Calls into the flight after which it leans, and after which its fault begins; those on the
-    ground after the first of them do not count."""
+    """Calls in flight after which it leans, and after which its fault begins. On the ground the
+    count stays below the first."""
     least_climb_mps = 0.3
-    """From here on it has left the ground: PX4 takes 2.4 s for that."""
+    """Climb rate that shows that it has left the ground; PX4 takes 2.4 s to get there."""
 
     def __init__(self) -> None:
         super().__init__()
         self._flown: int | None = None
 
     def reset(self) -> None:
-        """A flight begins, or loading is done."""
+        """Called when a flight begins, and at the end of loading."""
         self._flown = -1 if self._flown is None else 0
 
     def predict_fast(self, feature: Array, state: Array, history: Array, steps: int) -> Array:
@@ -84,7 +84,7 @@ class Leaning(Climbing):
         return chunk
 
     def misbehave(self, chunk: Array) -> None:
-        """A policy without a fault."""
+        """No-op: this policy has no fault."""
 
     @property
     def is_faulty(self) -> bool:
@@ -96,7 +96,7 @@ class Leaning(Climbing):
 
 
 class Wandering(Leaning):
-    """Climbs for two seconds, then leans to this side and that for ever, at the same height."""
+    """Climbs for two seconds, then leans left and right in turn for ever, at constant height."""
 
     climb_calls, turn_calls = 200, 400
 
@@ -110,7 +110,7 @@ class Wandering(Leaning):
 
 
 class Deliberate(Leaning):
-    """Makes two chunks a second, in 0.3 s each, and is meant to play one for a second."""
+    """Makes two chunks per second, each in 0.3 s, and plays each for one second."""
 
     contract = Contract(
         arrays="numpy", feature_dim=1, image_height=32, image_width=32, horizon=40, play_s=1.0
@@ -129,7 +129,7 @@ def compute() -> None:
 
 
 def mark_fault() -> None:
-    """Tell the catalogue when the fault began."""
+    """Write the time of the fault for the catalogue."""
     path = Path(os.environ["FAULT_MARK"])
     draft = path.with_suffix(".draft")
     draft.write_text(str(time.monotonic_ns()))
@@ -150,7 +150,7 @@ class Segfaulting(Leaning):
 
 
 class HangingNatively(Heavy):
-    """Sleeps in C with the interpreter's lock held: no other thread of Python runs."""
+    """Sleeps in C with the interpreter's lock held, so that no other Python thread runs."""
 
     def misbehave(self, chunk: Array) -> None:
         if self.has_begun:
@@ -166,7 +166,7 @@ class HangingInPython(Leaning):
 
 
 class HangingEncoder(Leaning):
-    """Its encoder stops answering once the flight leans."""
+    """Policy whose encoder hangs once the flight leans."""
 
     def encode_visual(self, image: Array) -> Array:
         if self.is_faulty:
@@ -176,7 +176,7 @@ class HangingEncoder(Leaning):
 
 
 class TwoEyed(Leaning):
-    """Takes two images of each of two cameras; leans only if they are the right ones."""
+    """Takes two images of each of two cameras; leans only if they are the expected ones."""
 
     contract = Contract(
         arrays="numpy",
@@ -199,7 +199,7 @@ class TwoEyed(Leaning):
 
 
 class HangingBelow(TwoEyed):
-    """The encoder of the second camera stops answering once the flight leans."""
+    """Policy whose encoder of the second camera hangs once the flight leans."""
 
     def encode_visual(self, image: Array, camera: int = 0) -> Array:
         if camera == 1 and self.is_faulty:
@@ -220,7 +220,7 @@ class NanEveryOther(Leaning):
 
 
 class Slow(Leaning):
-    """Each call takes longer than its own contract allows."""
+    """Policy whose calls take longer than its own contract allows."""
 
     def predict_fast(self, feature: Array, state: Array, history: Array, steps: int) -> Array:
         time.sleep(0.9)  # noqa: TID251 - the slow policy itself
@@ -228,7 +228,7 @@ class Slow(Leaning):
 
 
 class SlowInFlight(Leaning):
-    """Each call takes 0.9 s from the fault on."""
+    """Policy whose calls take 0.9 s once its fault has begun."""
 
     def misbehave(self, chunk: Array) -> None:
         time.sleep(0.9)  # noqa: TID251 - the slow policy itself
@@ -250,7 +250,7 @@ class Misshapen(Leaning):
 
 
 class Erratic(Leaning):
-    """Every tenth of a second other sticks, each at one of its limits; on the whole it climbs."""
+    """Changes the sticks every tenth of a second, each to one of its limits; climbs on average."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -270,14 +270,14 @@ class Exploding(Leaning):
 
 
 class Leaving(Leaning):
-    """Ends its process, as it believes."""
+    """Tries to end its process."""
 
     def misbehave(self, chunk: Array) -> None:
         sys.exit()
 
 
 class Greedy(Leaning):
-    """Takes memory until there is none: no process gets more than it has and 64 MB."""
+    """Allocates memory until none is left; its limit is the current size plus 64 MB."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -305,7 +305,7 @@ class Chatty(Leaning):
 
 
 class Hogging(Leaning):
-    """A thread of its own computes for ever, and gives the interpreter up only when told to."""
+    """A thread of the policy computes for ever, and releases the interpreter only on request."""
 
     def misbehave(self, chunk: Array) -> None:
         if self.has_begun:
@@ -316,10 +316,10 @@ class Hogging(Leaning):
 
 
 class HoggingNatively(Hogging):
-    """That thread holds the interpreter for 0.4 s at a time."""
+    """A thread of the policy holds the interpreter for 0.4 s at a time."""
 
     def _compute(self) -> None:
         libc = ctypes.PyDLL(None)
         for _ in range(HANG_S * 2):
             libc.usleep(400_000)
-            time.sleep(0.1)  # noqa: TID251 - somebody else's turn
+            time.sleep(0.1)  # noqa: TID251 - let the other threads run

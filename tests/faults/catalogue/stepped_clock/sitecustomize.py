@@ -1,7 +1,7 @@
 """Steps wall time by an hour in every Python process that has this folder in PYTHONPATH.
 
-Only root could step the computer's own clock, and would do it to everybody. Python imports this
-module at its start; the step is there while the file of STEPPED_CLOCK is.
+Only root could step the computer's own clock, and that would affect all programs. Python imports
+this module at its start; the step is in effect while the file of STEPPED_CLOCK exists.
 """
 
 import os
@@ -9,7 +9,7 @@ import time
 
 STEP_S = 3600
 _path = os.environ["STEPPED_CLOCK"]
-_time, _time_ns = time.time, time.time_ns  # noqa: TID251 - they are what is replaced
+_time, _time_ns = time.time, time.time_ns  # noqa: TID251 - these are replaced
 
 
 def _step_s() -> int:
