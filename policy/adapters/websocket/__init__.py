@@ -1,1 +1,2 @@
-"""Policies on a server that speaks openpi's websocket protocol, and what both sides of it share."""
+"""Policies on a server that speaks openpi's websocket protocol, and the code shared by client and
+server."""
