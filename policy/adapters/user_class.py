@@ -1,8 +1,8 @@
-"""A policy of the user's own: any class with the members of ``policy.protocol``.
+"""User-defined policies: any class with the members of ``policy.protocol``.
 
-package.module:Class   imported as Python imports it, or from the working directory
+package.module:Class   an importable module, or one in the working directory
 package:Class          from the package's ``__init__``
-path/to/file.py:Class  a file; its folder joins the search path, so that it finds what lies there
+path/to/file.py:Class  a file; its folder joins the search path, for imports of neighbouring files
 """
 
 import importlib
@@ -85,8 +85,8 @@ def load_user_class(spec: str, checkpoint: Path | None, *, seed: int = 0) -> Sin
 def _working_directory() -> Iterator[None]:
     """Context manager: append the working directory to the module search path.
 
-    Used only to load a module of that directory. At any other time a module beside weights could
-    run in place of a missing package.
+    Used only to find and import a module that the user named. At any other time a module beside
+    weights could run in place of a missing package.
     """
     here = str(Path.cwd())
     is_added = here not in sys.path
