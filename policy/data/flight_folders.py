@@ -60,7 +60,7 @@ def failure_of(folder: Path) -> str | None:
 
     ``success`` decides if it is set; else a crash, a fault that ended the flight, or the end of its
     process. A hit of a gate's frame counts as a failure. A policy's flight that an expert labelled
-    ("dagger") is always used.
+    ("dagger") is used however it ended.
     """
     meta = _read_meta(folder)
     outcome = meta.get("outcome")
