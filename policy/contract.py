@@ -78,8 +78,7 @@ FloatArray = NDArray[np.float32]
 CameraImage = NDArray[np.uint8 | np.uint16]
 """[H, W, 3] uint8 in RGB, or a depth image [H, W] uint16."""
 ImageFit = Literal["stretch", "crop", "pad"]
-"""Fit of a camera image to the policy's shape: change the proportions, crop the longer sides
-evenly, or add black bars."""
+"""Fit of a camera image: change the proportions, crop the longer sides, or add black bars."""
 ImageChannels = Literal["rgb", "bgr", "depth"]
 StateFrame = Literal["ned_frd", "enu_flu"]
 Arrays = Literal["numpy", "torch"]
@@ -173,8 +172,7 @@ class Contract:
     feature_dim: int = 0
     """F of encode_visual's [B, F], for one camera; 0 without a fast path."""
     observation_steps: int = 1
-    """Number T of states, and of images of each camera, in one input; oldest first, the last ones
-    are the newest."""
+    """Number T of states, and of images of each camera, in one input; oldest first."""
     observation_dt_s: float = 0.1
     """Time between observations."""
     horizon: int = 16
@@ -325,8 +323,7 @@ class Contract:
 
     @property
     def state_dim(self) -> int:
-        """Width of the state that the policy takes: 13, or 20 with ``since_exposure``, plus the
-        extras."""
+        """Width of the policy's state: 13, or 20 with ``since_exposure``, plus the extras."""
         return len(self.state_names)
 
     @property
@@ -371,8 +368,7 @@ class Contract:
 
     @classmethod
     def from_json(cls, text: str) -> "Contract":
-        """Read the header form. An older one gets the defaults of the fields that were added
-        later."""
+        """Read the header form; fields that an older version lacks get their defaults."""
         try:
             data: Any = parse_json(text)
         except ValueError as error:

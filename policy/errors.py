@@ -21,8 +21,7 @@ class MavbridgeError(Exception):
 
 
 class PolicyError(MavbridgeError):
-    """Policy, contract, checkpoint or dataset that cannot be used; the message names the next
-    step."""
+    """Unusable policy, contract, checkpoint or dataset; the message names the next step."""
 
 
 class ContractError(PolicyError):

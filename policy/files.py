@@ -104,8 +104,7 @@ def why_unreadable(path: Path, error: Exception, kind: str = "") -> str:
 
 @contextmanager
 def whole_file(path: Path) -> Iterator[Path]:
-    """Context manager: yield the path of a draft; replace ``path`` with it on success, else delete
-    it."""
+    """Yield the path of a draft; on success it replaces ``path``, else it is deleted."""
     draft = path.with_name(f"{path.name}.{os.getpid()}.partial")
     try:
         yield draft
@@ -156,8 +155,7 @@ def parse_json(text: str) -> Any:
 
 
 def read_json(path: Path) -> Any:
-    """Read a JSON file. Raise OSError if it cannot be opened, ValueError as in ``read_text`` and
-    ``parse_json``."""
+    """Read a JSON file; raise OSError, or ValueError as ``read_text`` and ``parse_json``."""
     return parse_json(read_text(path))
 
 

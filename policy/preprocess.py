@@ -66,8 +66,7 @@ def egocentric_columns(columns: Sequence[Any]) -> list[Any]:
 
 
 def egocentric(state: FloatArray, contract: Contract) -> FloatArray:
-    """Convert a state [B, state_dim] in SI units to a network's normalised input [B, state_dim -
-    1]."""
+    """Convert a state [B, state_dim] in SI units to a network's input [B, state_dim - 1]."""
     scale = egocentric_scale(contract)
     rows = [
         [value / unit for value, unit in zip(egocentric_columns(row), scale, strict=True)]
@@ -167,8 +166,7 @@ def _at_least_1(pixels: float) -> int:
 
 
 def resize(rgb: NDArray[_Pixel], height: int, width: int) -> NDArray[_Pixel]:
-    """Resize [H, W, 3] to [height, width, 3], or depth [H, W]; return the same array if the size
-    fits."""
+    """Resize [H, W, 3] to [height, width, 3], or depth [H, W]; no copy if the size fits."""
     if rgb.shape[:2] == (height, width):
         return rgb
     shrinks = rgb.shape[0] > height or rgb.shape[1] > width

@@ -50,8 +50,7 @@ def rotate(q: Q, vector: V) -> V:
 
 
 def matrix_columns(w: Any, x: Any, y: Any, z: Any) -> tuple[tuple[Any, Any, Any], ...]:
-    """Return the columns of the matrix world_from_body: the body's axes in the world; numbers of
-    any kind."""
+    """Return the columns of world_from_body: the body's axes in the world; any number type."""
     forward = (1 - 2 * (y * y + z * z), 2 * (x * y + w * z), 2 * (x * z - w * y))
     side = (2 * (x * y - w * z), 1 - 2 * (x * x + z * z), 2 * (y * z + w * x))
     up = (2 * (x * z + w * y), 2 * (y * z - w * x), 1 - 2 * (x * x + y * y))
@@ -70,8 +69,7 @@ def rotation_vector(q: Quaternion | Array) -> Any:
 
 
 def slerp(p: Q, q: Q, share: Any) -> Q:
-    """Return the attitude after ``share`` (float or [...]) of a uniform turn from ``p`` to
-    ``q``."""
+    """Return the attitude after ``share`` (float or [...]) of a steady turn from ``p`` to ``q``."""
     library: Any = math if isinstance(p, tuple) else np
     x, y, z = _parts(rotation_vector(multiply(conjugate(p), q)))
     angle = library.sqrt(x * x + y * y + z * z)

@@ -54,8 +54,7 @@ class StickMotion(NamedTuple):
 def motion_of_sticks(
     contract: Contract, throttle: float, yaw: float, pitch: float, roll: float
 ) -> StickMotion:
-    """Return the motion that sticks in [-1, 1] demand, by the contract's full stick and dead
-    zones."""
+    """Return the motion that sticks in [-1, 1] demand by the contract's ranges and dead zones."""
     climb = _beyond(throttle, contract.throttle_dead_zone)
     lean_rad = math.radians(contract.full_lean_deg)
     return StickMotion(
@@ -67,8 +66,7 @@ def motion_of_sticks(
 
 
 def by_rates(contract: Contract) -> Contract:
-    """Return the contract of a network that computes sticks and is flown by thrust and body
-    rates."""
+    """Return the contract of a network of sticks that is flown by thrust and body rates."""
     return contract if contract.action == "rates" else replace(contract, action="rates", modes=())
 
 
@@ -235,7 +233,6 @@ def _beyond(stick: float, dead_zone: float) -> float:
 
 
 def _deflection(share: Array, dead_zone: float) -> Array:
-    """Return the stick for a share of full motion: the inverse of ``_beyond``; 0 gives the
-    centre."""
+    """Return the stick for a share of full motion: inverts ``_beyond``; 0 gives the centre."""
     deflection: Array = np.sign(share) * (dead_zone + (1.0 - dead_zone) * np.abs(share))
     return deflection

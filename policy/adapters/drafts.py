@@ -89,8 +89,7 @@ _ASKED_FRAME = Entry(
 
 
 def draft_text(title: str, entries: Sequence[Entry]) -> str:
-    """Return a contract file that begins with ``title``; a comment above each entry names its
-    source."""
+    """Return a contract file headed by ``title``; a comment above each entry names its source."""
     lines = _comment(title)
     for table in ("contract", "state", "action", "images", "task"):
         inside = [entry for entry in entries if entry.table == table]
@@ -115,8 +114,7 @@ def _comment(text: str) -> list[str]:
 
 
 def dataset_entries(folder: Path) -> list[Entry]:
-    """Draft from a dataset (v2 or v3): names, rate, cameras, and the frame if mavbridge exported
-    it."""
+    """Draft from a dataset (v2, v3): names, rate, cameras; the frame if mavbridge exported it."""
     path = folder / INFO
     features = _features(path, read_json(path), "features")
     images = [key for key, value in features.items() if value.get("dtype") in ("video", "image")]
@@ -137,8 +135,7 @@ def checkpoint_entries(folder: Path, dataset: Path | None) -> list[Entry]:
 
 
 def dataset_of(checkpoint: Path) -> Path | None:
-    """Return the dataset that LeRobot's training recorded beside a policy, if it is on this
-    machine."""
+    """Return the dataset that LeRobot's training recorded beside a policy, if it is present."""
     try:
         noted = files.read_json(checkpoint / TRAIN_CONFIG_FILE)["dataset"]
         home = Path.home() / ".cache" / "huggingface" / "lerobot"  # LeRobot's own default

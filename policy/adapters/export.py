@@ -66,8 +66,7 @@ class _Archive(nn.Module):
 
 
 def export_onnx(policy: OurPolicy, folder: Path) -> None:
-    """Write encoder.onnx, denoiser.onnx and policy.json into the existing ``folder``. Needs the
-    onnx package."""
+    """Write encoder.onnx, denoiser.onnx and policy.json into ``folder``. Needs the onnx package."""
     encoder, denoiser = _Encoder(policy).eval(), _Denoiser(policy).eval()
     image, rest = _examples(policy)
     _write_onnx(encoder, image, folder / ENCODER, ("image",), "feature")

@@ -100,13 +100,11 @@ class Interface:
 
     contract: Contract
     state_names: tuple[str, ...] = ()
-    """Numbers of the policy's state, from ``contract.state_names`` and ``DERIVED_NAMES``; empty:
-    the contract's state."""
+    """State in ``contract.state_names`` and ``DERIVED_NAMES``; empty: the contract's state."""
     state_scale: tuple[float, ...] = ()
-    """Factors from the contract's units to the policy's, one for each number of the state; empty:
-    ones."""
+    """Factor from the contract's unit to the policy's for each number of the state; empty: ones."""
     action_names: tuple[str, ...] = ()
-    """Numbers of the policy's action, from ``ACTION_FIELDS``; empty: the contract's action."""
+    """Action in ``ACTION_FIELDS``; empty: the contract's action."""
     action_scale: tuple[float, ...] = ()
     """Factor of each action, in the policy's order; empty: ones."""
     action_offset: tuple[float, ...] = ()
@@ -191,7 +189,7 @@ class Interface:
         return cast(ArrayOrTensor, _columns(values * scale + offset, self.action_columns))
 
     def from_actions(self, actions: ArrayOrTensor) -> ArrayOrTensor:
-        """Convert the contract's actions [..., 4] to the policy's [..., 4]: the inverse of
+        """Convert the contract's actions [..., 4] to the policy's: the inverse of
         ``to_actions``."""
         columns = self.action_columns
         scale, offset = self._action_units(actions)

@@ -103,8 +103,7 @@ def load_torchscript(
 
 
 def make_schedule(where: Path, fields: dict[str, Any]) -> NoiseSchedule:
-    """Return the schedule of a description's fields; a PolicyError names the file of a wrong
-    field."""
+    """Return the schedule of a description; a PolicyError names the file of a wrong field."""
     try:
         return NoiseSchedule(**fields)
     except (TypeError, PolicyError) as error:

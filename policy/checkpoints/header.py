@@ -34,8 +34,7 @@ _FOLDERS: tuple[tuple[str, str, str], ...] = (
 
 
 def detect(path: Path) -> str | None:
-    """Return the kind of a file or folder and how to fly it; None if it is unknown, or may be
-    ours."""
+    """Return the kind of a file or folder and how to fly it; None: unknown, or may be ours."""
     try:
         found = _folder(path) if path.is_dir() else _file(path)
     except OSError:
@@ -133,8 +132,7 @@ SUFFIXES = (".safetensors", ".pt", ".pth", ".ckpt")
 
 
 def require_file(path: Path, suffixes: Sequence[str]) -> None:
-    """Raise CheckpointError if a path is not a file with one of these suffixes; the message says
-    what is there."""
+    """Raise CheckpointError, naming what was found, if a path is not a file with such a suffix."""
     if (sentence := detect(path)) is not None:
         raise CheckpointError(sentence)
     if path.suffix not in suffixes:

@@ -1,5 +1,4 @@
-"""Search for a network's weights in the result of ``torch.load``, with or without a trainer's
-wrapping."""
+"""Search for a network's weights in the result of ``torch.load``, bare or wrapped."""
 
 import re
 from collections.abc import Iterator, Mapping
@@ -62,8 +61,7 @@ def misfits(state: Mapping[str, Tensor], wanted: Shapes) -> list[str]:
 
 
 def _tables(loaded: Mapping[Any, Any]) -> Iterator[tuple[str, dict[str, Tensor]]]:
-    """Yield every dictionary of tensors, down to two levels deep, with its key; the usual keys
-    first."""
+    """Yield every dictionary of tensors, up to two levels deep, with its key; usual keys first."""
     first = [key for key in USUAL_KEYS if key in loaded]
     for key in (*first, *(key for key in loaded if key not in first)):
         value = loaded[key]
@@ -87,8 +85,7 @@ def _tensors(value: Mapping[Any, Any]) -> dict[str, Tensor]:
 def _behind_prefixes(
     table: dict[str, Tensor], wanted: Shapes
 ) -> Iterator[tuple[str, dict[str, Tensor]]]:
-    """Yield the table itself, and its entries behind each prefix of a wanted name, without the
-    prefix."""
+    """Yield the table, and its entries behind each prefix of a wanted name, prefix removed."""
     yield "", table
     anchors = list(wanted)[:: max(1, len(wanted) // ANCHORS)]
     prefixes = {

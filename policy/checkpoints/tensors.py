@@ -51,8 +51,7 @@ def shapes_of(network: nn.Module) -> Shapes:
 
 
 def require_fit(path: Path, policy: nn.Module, state: Mapping[str, Tensor], advice: str) -> None:
-    """Raise CheckpointError with the first weights that do not fit and the next step; torch's own
-    message lists hundreds."""
+    """Raise CheckpointError with the first misfits and the next step; torch would list hundreds."""
     if problems := misfits(state, shapes_of(policy)):
         raise CheckpointError(
             f"{path}: does not fit this policy in {len(problems)} places: "

@@ -30,8 +30,7 @@ GATE_DIM = 7
 after it [3] m; all at the exposure, NaN if unknown."""
 
 MAX_STATE_SCALES = 30.0
-"""A state this many times its usual size has another unit: 150 m/s, or milli-g mistaken for
-m/s^2."""
+"""A state this many times its usual size has another unit: 150 m/s, or milli-g for m/s^2."""
 
 
 class DatasetError(PolicyError):
@@ -70,8 +69,7 @@ class FlightData:
     ``policy.stick_loop`` would have converted to the same rates."""
     sent_ns: Nanoseconds
     sent: FloatArray
-    """[S, 4] sticks that flew, each until the next one; centred if there were none, and in flights
-    by rates."""
+    """[S, 4] sticks that flew, each until the next; centred if none, and in flights by rates."""
     age_ns: Nanoseconds
     """[A] measured ages of the image at a tick; may be empty."""
     captured_ns: Nanoseconds

@@ -36,8 +36,8 @@ _FRAME_COLUMNS = ("captured_ns",)
 
 
 def find_flights(paths: Sequence[Path]) -> list[Path]:
-    """Return each path that is a flight, and the flights directly inside each path that is a folder
-    of flights."""
+    """Return the paths that are flights, and the flights inside the paths that are folders of
+    flights."""
     if not paths:
         raise DatasetError("no flights to learn from: name at least one flight folder")
     found: list[Path] = []
@@ -84,8 +84,7 @@ def failure_of(folder: Path) -> str | None:
 def leave_out_failed(
     folders: Sequence[Path], *, include_failed: bool
 ) -> tuple[list[Path], str | None]:
-    """Return the flights to learn from, and a line with the number of excluded ones and the
-    reasons."""
+    """Return the flights to learn from, and a line with the exclusions and their reasons."""
     if include_failed:
         return list(folders), None
     failures = {folder: failure_of(folder) for folder in folders}
@@ -265,8 +264,7 @@ def _read_table(
 def _stamps_or(
     table: pa.Table, name: str, otherwise: Nanoseconds, use: NDArray[np.bool_]
 ) -> Nanoseconds:
-    """Return the stamps of the rows to ``use``, and ``otherwise`` for the other rows, which nothing
-    reads."""
+    """Return the stamps of the rows to ``use``; other rows, never read, get ``otherwise``."""
     rows = zip(table[name].to_pylist(), otherwise.tolist(), use, strict=True)
     return np.array([a if is_used and a is not None else b for a, b, is_used in rows], np.int64)
 

@@ -20,8 +20,7 @@ from policy.files import library_name
 _BOX_HEADER_BYTES = 8
 _KINDS = (b"ftyp", b"moov", b"moof", b"mdat", b"mfra", b"free")
 _MOOF_TO_MFHD, _MOOF_TO_NUMBER = 12, 20
-"""Offsets in a moof box: of its first child's name, and of its sequence number, which counts from
-1."""
+"""Offsets in a moof box: of its first child's name, and of its sequence number (from 1)."""
 _SLICE, _KEY_SLICE = 1, 5
 """NAL unit types of H.264."""
 
@@ -45,8 +44,7 @@ class VideoParts(NamedTuple):
     skipped_bytes: int
     skipped_frames: int
     is_ours: bool
-    """True: one image per fragment, as flights are recorded. False: another MP4, read up to its
-    first fault."""
+    """True: one image per fragment, as recorded by mavbridge. False: another MP4."""
 
     def describe(self, path: Path) -> str | None:
         """Return a sentence for the user; None if nothing was skipped."""
@@ -139,8 +137,7 @@ def _is_key(data: mmap.mmap, at: int, end: int) -> bool | None:
 
 
 def _decodable(fragments: list[Fragment]) -> Iterator[Fragment]:
-    """Drop the fragments after a gap up to the next key frame: each image needs the one before
-    it."""
+    """Drop the fragments from a gap to the next key frame: an image needs the one before it."""
     expected, is_broken = 0, False
     last = max((each.number for each in fragments), default=0)
     for place, fragment in enumerate(fragments):
@@ -193,8 +190,7 @@ def decode_images(path: Path, parts: VideoParts, numbers: Collection[int]) -> It
 
 
 def _decode_any(path: Path) -> Iterator[CameraImage]:
-    """Yield the images of a video written by another program, up to the point where it breaks
-    off."""
+    """Yield the images of another program's video, up to its first fault."""
     # Read as MP4, since a playlist would name other files.
     with av.open(library_name(path), format="mp4") as container:
         images = container.decode(video=0)

@@ -14,12 +14,10 @@ Indices = NDArray[np.int64]
 
 
 class Interpolator:
-    """Interpolates a quantity between measurements, and holds its first and last value outside
-    them."""
+    """Interpolates a quantity between measurements, and holds the end values outside them."""
 
     def __init__(self, at_ns: Nanoseconds, values: FloatArray) -> None:
-        """Sort measurements [N, D] by their times [N]; of two at one time, the later entry
-        counts."""
+        """Sort measurements [N, D] by their times [N]; of two at one time, the later counts."""
         order = np.argsort(at_ns, kind="stable")
         at_ns, values = at_ns[order], values[order]
         is_last = np.append(np.diff(at_ns) > 0, True)[: len(at_ns)]
@@ -62,8 +60,7 @@ def covered(known_ns: Nanoseconds, at_ns: Nanoseconds) -> NDArray[np.bool_]:
 
 
 def nearest(known_ns: Nanoseconds, at_ns: Nanoseconds) -> Indices:
-    """Return the index of the nearest of ``known_ns`` for each time; the earlier one of two equally
-    near."""
+    """Return the index of the nearest of ``known_ns`` for each time; the earlier one on a tie."""
     last = len(known_ns) - 1
     after = np.minimum(np.clip(np.searchsorted(known_ns, at_ns), 1, max(last, 1)), last)
     before = np.maximum(after - 1, 0)

@@ -256,8 +256,7 @@ def _flight(info: _Info, row: _Row, table: pa.Table, digest: str) -> FlightData:
 
 
 def _state_frame(info: _Info, row: _Row, state: FloatArray) -> StateFrame:
-    """Return the frame in the dataset's ``info``; else tell it by gravity: in level flight -z is up
-    in FRD, +z in FLU."""
+    """Return the frame in ``info``, else by gravity: in level flight -z is up in FRD, +z in FLU."""
     about = info.features[names.STATE_KEY].get("info")
     frame = about.get(names.STATE_FRAME) if isinstance(about, dict) else None
     if frame is not None:

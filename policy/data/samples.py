@@ -34,8 +34,7 @@ TICK_TOLERANCE_NS = 20_000_000
 HISTORY_JITTER_S = 0.005
 """Largest shift of the history's sampling times, earlier or later: half a tick at 100 Hz."""
 FRESH_START_SHARE = 0.15
-"""Share of samples that look like a policy just after takeover: the older part of the history is
-neutral."""
+"""Share of samples as just after takeover: the older part of the history is neutral."""
 BLIND_SHARE = 0.4
 """Share of samples without any history.
 
@@ -129,8 +128,7 @@ class Timeline:
         self.frames, self._any_tick = self._usable_frames()
 
     def _usable_frames(self) -> tuple[Indices, Indices]:
-        """Return the images with a tick at some age and an attitude at the exposure, and one such
-        tick for each."""
+        """Return the images with an attitude at the exposure and a later tick; a tick for each."""
         ticks_ns = self.tick_ns[self._usable_ticks]
         low = self.captured_ns + self._ages_ns[0] - TICK_TOLERANCE_NS
         high = self.captured_ns + self._ages_ns[-1] + TICK_TOLERANCE_NS
@@ -167,8 +165,7 @@ class Timeline:
     def samples(
         self, frames: Indices, ticks: Indices, random: np.random.Generator | None = None
     ) -> Samples:
-        """Return inputs and labels at ``ticks`` with the images ``frames``; augmented by
-        ``random``."""
+        """Return inputs and labels at ``ticks`` with images ``frames``; augmented by ``random``."""
         chunk, known = self.chunks(ticks)
         state = self.states(frames, ticks)
         if random is not None and self.by_rates:
@@ -184,8 +181,7 @@ class Timeline:
         )
 
     def states(self, frames: Indices, ticks: Indices) -> FloatArray:
-        """Return the states [B, state_dim] at the ticks and, if the contract asks for it, the
-        motion since the exposure."""
+        """Return states [B, state_dim] at the ticks, with motion since the exposure if needed."""
         state: FloatArray = self._state[ticks]
         if not self.contract.since_exposure:
             return state
@@ -224,8 +220,7 @@ class Timeline:
         return np.where(is_neutral, np.float32(0), history)
 
     def chunks(self, ticks: Indices) -> tuple[FloatArray, NDArray[np.bool_]]:
-        """Return the sticks [B, horizon, 4] to imitate, and a mask [B, horizon] of the known
-        ones."""
+        """Return the sticks [B, horizon, 4] to imitate, and a mask [B, horizon] of known ones."""
         horizon = self.contract.horizon
         step_ns = round(self.contract.chunk_dt_s * NS_PER_S)
         at_ns = self._attitude_ns[ticks][:, None] + np.arange(horizon) * step_ns

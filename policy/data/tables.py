@@ -54,8 +54,7 @@ def numbers(name: str, table: pa.Table, column: str) -> np.ndarray:
 
 
 def vectors(name: str, table: pa.Table, column: str, width: int) -> FloatArray:
-    """Return a column of lists of ``width`` finite numbers as [rows, width] float32, NaN for
-    null."""
+    """Return a column of lists of ``width`` finite numbers, [rows, width] float32, null as NaN."""
     values = table[column].combine_chunks()
     valid = values.is_valid().to_numpy(zero_copy_only=False).astype(bool)
     try:

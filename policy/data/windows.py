@@ -105,8 +105,7 @@ def find_windows(
 
 
 def _states_at_exposures(flight: FlightData) -> tuple[FloatArray, NDArray[np.bool_]]:
-    """Interpolate the state [N, 13] between the ticks around each exposure, and return where it is
-    known."""
+    """Interpolate the state [N, 13] at each exposure; return a mask of the known ones too."""
     captured_ns = flight.captured_ns
     state = np.zeros((len(captured_ns), STATE_DIM), np.float32)
     rows = ~np.isnan(flight.state).any(axis=1)

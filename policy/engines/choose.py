@@ -56,8 +56,7 @@ def choose_runner(
 def first_that_agrees(
     policy: SingleRatePolicy, candidates: list[Candidate], settings: ExecutionSettings
 ) -> tuple[PolicyRunner, tuple[str, ...]]:
-    """Return the first candidate that passes the check, or torch, with a line for each skipped
-    one."""
+    """Return the first candidate that passes the check, or torch; and a line per skipped one."""
     notes: tuple[str, ...] = ()
     if candidates:
         on_cpu = replace(settings, vision_device="cpu", action_device="cpu")
@@ -76,8 +75,7 @@ def first_that_agrees(
 def first_with_chunks(
     expected: FloatArray, samples: ParitySamples, candidates: Sequence[Candidate]
 ) -> tuple[PolicyRunner | None, tuple[str, ...]]:
-    """Return the first candidate that computes the expected chunks, or None, with a line for each
-    skipped one."""
+    """Return the first candidate with the expected chunks, or None; and a line per skipped one."""
     notes: list[str] = []
     for label, make in candidates:
         try:

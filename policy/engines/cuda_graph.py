@@ -25,8 +25,7 @@ from policy.protocol import PolicyRunner, SingleRatePolicy
 
 NAME = "cuda-graph"
 WARM_UP_CALLS = 3
-"""Calls before a capture, so that libraries have selected kernels and created handles (PyTorch's
-CUDA notes)."""
+"""Calls before a capture, so that libraries have set up kernels (PyTorch's CUDA notes)."""
 HIGH_PRIORITY, NORMAL_PRIORITY = -1, 0
 
 

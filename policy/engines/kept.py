@@ -33,8 +33,7 @@ def snapshot(policy: object) -> dict[str, object]:
 
 
 def changes(before: dict[str, object], after: dict[str, object]) -> list[str]:
-    """Return the names of attributes that were added, removed or changed, without the path to
-    them."""
+    """Return the names, without the path, of attributes that were added, removed or changed."""
     names = [name for name in {**before, **after} if before.get(name) != after.get(name)]
     return sorted({name.rpartition(".")[2] for name in names})
 

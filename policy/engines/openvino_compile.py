@@ -36,8 +36,7 @@ _DIGEST_BYTES = hashlib.sha256().digest_size
 
 
 def user_cache_folder() -> Path:
-    """Return mavbridge's cache folder by the XDG base directory specification: in $XDG_CACHE_HOME
-    or ~/.cache."""
+    """Return the cache folder (XDG base directory specification): $XDG_CACHE_HOME or ~/.cache."""
     base = os.environ.get("XDG_CACHE_HOME", "")
     # The specification says to ignore a relative path.
     root = Path(base) if Path(base).is_absolute() else Path("~/.cache").expanduser()
@@ -62,8 +61,7 @@ class CompileCache:
         return blob if hashlib.sha256(blob).digest() == digest else None
 
     def store(self, key: str, blob: bytes) -> None:
-        """Store ``blob`` if possible; drop the oldest files beyond ``MAX_ENTRIES`` or
-        ``MAX_BYTES``."""
+        """Store ``blob`` if possible; drop the oldest beyond ``MAX_ENTRIES`` or ``MAX_BYTES``."""
         with contextlib.suppress(OSError):
             self._folder.mkdir(parents=True, exist_ok=True)
             with whole_file(self._path(key)) as draft:
@@ -158,8 +156,7 @@ class GraphCompiler:
         self._key = f"{subject} {digest.hexdigest()} {versions} {cpu} {capabilities}"
 
     def compile(self, name: str, precision: Precision, build: Callable[[], "ov.Model"]) -> "Graph":
-        """Compile the graph that ``build`` makes at a precision; ``name`` identifies it within this
-        compiler."""
+        """Compile the graph of ``build`` at a precision; ``name`` is unique in this compiler."""
         properties = {
             "PERFORMANCE_HINT": "LATENCY",
             "NUM_STREAMS": "1",
@@ -222,8 +219,7 @@ class Traceable(nn.Module):
 
 @contextlib.contextmanager
 def quiet() -> Iterator[None]:
-    """Context manager: keep tracer and converter from writing to the terminal, and from silencing
-    other loggers permanently."""
+    """Silence tracer and converter, and keep them from silencing other loggers permanently."""
     level, disabled = logging.root.level, logging.root.manager.disable
     fast_path = torch.backends.mha.get_fastpath_enabled()
     try:

@@ -77,8 +77,7 @@ def make_module_runner(
 
 
 class ModuleConverter:
-    """Converts functions of a policy; a graph that is needed at two precisions is converted
-    once."""
+    """Converts functions of a policy; a graph needed at two precisions is converted once."""
 
     def __init__(self, policy: object, name: str) -> None:
         self._modules = nn.ModuleList(modules_of(policy)).eval()
@@ -86,8 +85,7 @@ class ModuleConverter:
         self._is_script = any(
             isinstance(module, torch.jit.ScriptModule) for module in self._modules.modules()
         )
-        """TorchScript keeps its data-dependent decisions when traced, and torch.export rejects
-        it."""
+        """Traced TorchScript keeps data-dependent decisions, and torch.export rejects it."""
         self._models: dict[str, ov.Model] = {}
         if not self._modules:
             raise PolicyError(
@@ -98,8 +96,7 @@ class ModuleConverter:
     def compile(
         self, function: Callable[..., Any], shapes: Sequence[Shape], precision: Precision
     ) -> ArrayFunction:
-        """Compile ``function`` of float32 tensors with these shapes, or load it from the user's
-        cache."""
+        """Compile ``function`` of float32 tensors with these shapes, or load it from the cache."""
         module = Traceable(self._modules, lambda *a: _float_tensor(function(*a))).eval()
         examples = tuple(torch.zeros(shape) for shape in shapes)
         with user_code(f"{self._name} cannot be converted"), quiet(), torch.no_grad():
@@ -162,8 +159,7 @@ def _digest(program: ExportedProgram) -> str:
 
 
 def _tensors(program: ExportedProgram) -> Iterator[tuple[str, Tensor, int]]:
-    """Return the weights and constants of the program: its name for each, and the number of
-    uses."""
+    """Return the program's weights and constants: its name for each, and the number of uses."""
     signature = program.graph_signature
     targets = {
         **signature.inputs_to_parameters,

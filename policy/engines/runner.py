@@ -1,5 +1,4 @@
-"""Shared code of all engines: wraps a policy as a ``PolicyRunner`` and tries it once before it
-flies."""
+"""Shared code of all engines: wrap a policy as a ``PolicyRunner`` and try it before it flies."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -147,8 +146,7 @@ def encode_all(runner: PolicyRunner, images: CameraImage) -> FloatArray:
 
 
 def level_state(contract: Contract) -> FloatArray:
-    """Return the state [1, *state_shape] of a level vehicle at rest; zeros except for the
-    attitude."""
+    """Return the state [1, *state_shape] of a level vehicle at rest: zeros but the attitude."""
     state = np.zeros((1, *contract.state_shape), np.float32)
     state[..., QUATERNION.start] = 1.0
     return state
@@ -186,8 +184,7 @@ def _require(runner: PolicyRunner, what: str, array: FloatArray, shape: tuple[in
 
 
 def require_devices(*wanted: str) -> None:
-    """Raise PolicyError if a device is not available; torch is imported only to look for a device
-    other than the CPU."""
+    """Raise PolicyError if a device is missing; imports torch only for a device other than cpu."""
     others = sorted({*wanted} - {"cpu"})
     if not others:
         return

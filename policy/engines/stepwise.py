@@ -35,8 +35,7 @@ def make_stepwise_runner(
     engine: str,
     settings: ExecutionSettings,
 ) -> PolicyRunner:
-    """Create a runner as ``runner.make_runner`` does; ``compile_end`` compiles ``to_chunk``, the
-    end of a solve."""
+    """Create a runner as ``runner.make_runner``; ``compile_end`` compiles ``to_chunk``."""
     contract = policy.contract
     image = ((1, *contract.image_shape[-3:]),)
     encode = [compile_vision(method, image) for method in encoders(policy)]

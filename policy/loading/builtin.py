@@ -19,8 +19,7 @@ BUILTIN_KINDS = ("toge", "toge-rates", "resnet-unet")
 
 
 def builtin_config(spec: str, *, image_size: int) -> "BuiltinConfig":
-    """Return the built-in network that ``spec`` names, with the default contract at that image
-    size."""
+    """Return the built-in network of ``spec``, with the default contract at that image size."""
     kind, *options = spec.split(":")
     if kind not in BUILTIN_KINDS:
         raise PolicyError(
@@ -31,8 +30,7 @@ def builtin_config(spec: str, *, image_size: int) -> "BuiltinConfig":
 
 
 def load_builtin(request: PolicyRequest) -> tuple["BuiltinPolicy", list[str]]:
-    """Build a network and load its weights, or seeded random ones; return notes for the user
-    too."""
+    """Build a network and load its weights, or seeded random ones; return notes too."""
     kind, *options = request.spec.split(":")
     config, checkpoint = _config(kind, options, request.image_size), builtin_checkpoint(request)
     if checkpoint is None:

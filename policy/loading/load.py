@@ -129,8 +129,7 @@ def load_policy(request: PolicyRequest, *, now_s: Callable[[], float]) -> Loaded
 def _on_engine(
     policy: SingleRatePolicy, request: PolicyRequest, notes: list[str]
 ) -> tuple[PolicyRunner, tuple[str, ...]]:
-    """Return the policy on its engine, tried once; add to ``notes`` the differences from the
-    request."""
+    """Return the policy on its engine, tried once; ``notes`` gets deviations from the request."""
     _require_image_size(policy.contract, request.image_size)
     dual_rate = request.dual_rate and isinstance(policy, DualRatePolicy)
     if request.dual_rate and not dual_rate:
@@ -275,8 +274,7 @@ def _life_method(policy: SingleRatePolicy, name: str, spec: str) -> Callable[[],
 
 
 def _require_flags_of_kind(kind: str, request: PolicyRequest) -> None:
-    """Raise PolicyError for flags that do not apply, and for a file of another kind than the spec
-    names."""
+    """Raise PolicyError for inapplicable flags, and for a file of another kind than the spec's."""
     if request.by_rates and kind not in BUILTIN_KINDS:
         raise PolicyError(
             f"--by-rates is for {' and '.join(BUILTIN_KINDS)}, whose sticks are known to the "

@@ -59,8 +59,7 @@ class PolicyRequest:
     spec: str
     """One of the forms in the docstring of ``policy.loading.load``."""
     checkpoint: Path | None = None
-    """Weights. A user's class gets them as ``Class(checkpoint=path)``; without any, ``toge`` uses
-    the shipped ones."""
+    """Weights; a user's class gets ``Class(checkpoint=path)``. None: ``toge`` uses shipped ones."""
     contract_file: Path | None = None
     """Contract file of a policy that was trained elsewhere, see ``adapters.interface``."""
     allow_untrained: bool = False

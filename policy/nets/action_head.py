@@ -73,8 +73,7 @@ class DiffusionHead(nn.Module):
         self.initial_noise.copy_(flight_noise(seed, self.initial_noise.shape[1]))
 
     def denoise(self, noisy: Tensor, timestep: Tensor, condition: Tensor) -> Tensor:
-        """Call the network once: [B, horizon, 4], [B] int64, [B, C] -> the schedule's
-        prediction."""
+        """Call the network: [B, horizon, 4], [B] int64, [B, C] -> the schedule's prediction."""
         film = self.unet.film_of_timestep(timestep) + self.unet.film_of_condition(condition)
         prediction: Tensor = self.unet(noisy, film)
         return prediction + self.read(condition) if self.reads_condition else prediction

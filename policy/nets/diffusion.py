@@ -89,8 +89,7 @@ class NoiseSchedule:
         return _ddim_steps(total, self.betas, count)
 
     def add_noise(self, clean: Tensor, noise: Tensor, timestep: Tensor) -> Tensor:
-        """Run the forward process, for training: clean [B, ...] and standard normal noise ->
-        noisy."""
+        """Run the forward process, for training: clean [B, ...] and standard noise -> noisy."""
         if clean.shape != noise.shape or timestep.shape != clean.shape[:1]:
             raise PolicyError(
                 f"add_noise needs clean and noise of one shape and a timestep per sample, got "
@@ -103,8 +102,7 @@ class NoiseSchedule:
         return at.sqrt().to(clean.dtype) * clean + (1 - at).sqrt().to(clean.dtype) * noise
 
     def coefficients(self, step: DdimStep) -> tuple[float, float, float, float]:
-        """Return ``ddim_update`` as coefficients of ``next = c * clip(a * noisy + b * output) + d *
-        noisy``."""
+        """Return ``ddim_update`` as ``next = c * clip(a * noisy + b * output) + d * noisy``."""
         a, b = 0.0, 1.0
         if self.prediction == "epsilon":
             a, b = 1 / step.signal, -step.noise / step.signal

@@ -48,8 +48,7 @@ class StateEncoder(nn.Module):
 
 
 class AttentionBlock(Attention):
-    """Self-attention and an MLP, each after a norm and around a shortcut; [B, T, dim] -> same
-    shape."""
+    """Self-attention and an MLP, each after a norm, around a shortcut; [B, T, dim] -> same."""
 
     def __init__(self, dim: int) -> None:
         super().__init__(dim, HEADS)
@@ -100,7 +99,6 @@ class Fusion(nn.Module):
         )
 
     def forward(self, visual: Tensor, state: Tensor, history: Tensor) -> Tensor:
-        """Fuse visual and state tokens [B, dim] and history [B, history_dim] -> condition [B,
-        dim]."""
+        """Fuse visual and state tokens [B, dim], history [B, history_dim] -> condition [B, dim]."""
         condition: Tensor = self.mlp(torch.cat([visual, state, history], dim=1))
         return condition

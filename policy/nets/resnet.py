@@ -15,8 +15,7 @@ from torch import Tensor, nn
 from policy.contract import FloatArray
 
 MOMENTS = 3
-"""Moments per channel: the average, and the averages weighted by the position to the right and
-downwards."""
+"""Moments per channel: average, and averages weighted by the position rightwards and downwards."""
 
 
 def moments(features: Tensor) -> Tensor:
@@ -36,15 +35,13 @@ def moments(features: Tensor) -> Tensor:
 
 @lru_cache(maxsize=64)
 def _weights_on_gpu(device: torch.device, dtype: torch.dtype, height: int, width: int) -> Tensor:
-    """Return ``moment_weights``, kept on the GPU: nothing may be copied during a CUDA graph
-    capture."""
+    """Return ``moment_weights``, kept on the GPU: a CUDA graph capture allows no copies."""
     with torch.inference_mode(False):
         return torch.from_numpy(moment_weights(height, width)).to(device, dtype)
 
 
 def moment_weights(height: int, width: int) -> FloatArray:
-    """Return the weight of each cell for each moment [H * W, 3]; positions have mean 0 and variance
-    of about 1."""
+    """Return each cell's weights [H * W, 3]; positions have mean 0 and variance of about 1."""
     across = np.broadcast_to(_places(width), (height, width))
     down = np.broadcast_to(_places(height)[:, None], (height, width))
     weights = np.stack([np.ones_like(across), across, down], axis=-1).reshape(-1, MOMENTS)

@@ -59,8 +59,7 @@ class ResnetUnet(nn.Module):
         self.head.seed_noise(seed)
 
     def condition(self, visual: Tensor, state_token: Tensor, action_history: Tensor) -> Tensor:
-        """Return the condition [B, C] of projected image [B, C], encoded state [B, C], history [B,
-        K, 4]."""
+        """Fuse image [B, C], encoded state [B, C], history [B, K, 4] -> condition [B, C]."""
         parts = [visual, state_token, action_history.flatten(1)]
         condition: Tensor = self.fuse(torch.cat(parts, dim=1))
         return condition
@@ -68,8 +67,7 @@ class ResnetUnet(nn.Module):
     def encode_observation(
         self, image: Tensor, state: Tensor, action_history: Tensor | None = None
     ) -> Tensor:
-        """Return the condition [B, C] of image, state, and history [B, K, 4] or None (no action
-        sent yet)."""
+        """Encode image, state, history [B, K, 4] or None (no action sent) -> condition [B, C]."""
         contract = self.contract
         if action_history is None:
             action_history = state.new_zeros(len(state), contract.history_len, ACTION_DIM)

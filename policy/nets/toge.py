@@ -98,13 +98,11 @@ class Toge(nn.Module):
     def encode_observation(
         self, image: Tensor, state: Tensor, action_history: Tensor | None = None
     ) -> Tensor:
-        """Return the condition of image, state and history: ``encode_visual``, then
-        ``encode_and_fuse``."""
+        """Call ``encode_visual``, then ``encode_and_fuse``: image, state, history -> condition."""
         return self.encode_and_fuse(self.encode_visual(image), state, action_history)
 
     def condition(self, feature: Tensor, state_token: Tensor, action_history: Tensor) -> Tensor:
-        """Return the condition [B, C] of feature [B, F], encoded state [B, F] and history [B, K,
-        4]."""
+        """Fuse feature [B, F], encoded state [B, F], history [B, K, 4] -> condition [B, C]."""
         condition: Tensor = self.fusion(feature, state_token, self.history_encoder(action_history))
         return condition
 
@@ -115,8 +113,7 @@ class Toge(nn.Module):
         action_history: Tensor | None = None,
         num_diffusion_steps: int = 10,
     ) -> Tensor:
-        """Sample a chunk [B, horizon, 4] in [-1, 1] from cached feature, newest state and
-        history."""
+        """Sample a chunk [B, horizon, 4] in [-1, 1] from cached feature, state and history."""
         condition = self.encode_and_fuse(feature, state, action_history)
         return self.head.sample(condition, num_diffusion_steps)
 

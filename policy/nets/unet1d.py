@@ -136,8 +136,7 @@ class UNet1d(nn.Module):
         self.register_buffer("_frequencies", sinusoid_frequencies(TIME_DIM), persistent=False)
 
     def film_of_timestep(self, timestep: Tensor) -> Tensor:
-        """Return the timesteps' part of FiLM [M, film_dim], for timesteps [M] of any numeric
-        type."""
+        """Return the timesteps' part of FiLM [M, film_dim]; timesteps [M] of any numeric type."""
         angle = timestep.to(self._frequencies.dtype).unsqueeze(-1) * self._frequencies
         film: Tensor = self.film_time(self.time_mlp(torch.cat([angle.sin(), angle.cos()], dim=-1)))
         return film

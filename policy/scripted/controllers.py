@@ -66,8 +66,7 @@ class DoubletStep:
         return self.back_s + self.half_s
 
     def push_at(self, time_s: float) -> Push | None:
-        """Return the push at a time since the program began; None while settling and during other
-        steps."""
+        """Return the push at a time since the program began; None outside of this doublet."""
         if not self.begin_s <= time_s < self.end_s:
             return None
         if time_s >= self.back_s:

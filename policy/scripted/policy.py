@@ -85,8 +85,7 @@ class ScriptedPolicy:
         self._last_s: float | None = None
         self._altitude_m = 0.0
         self.program_start_s: float | None = None
-        """Start of the program by ``now_s``, past or future; None before the altitude is
-        reached."""
+        """Start of the program by ``now_s``, past or future; None below the altitude."""
 
     def reset(self) -> None:
         """Begin again; the current altitude becomes the start's."""
@@ -95,8 +94,7 @@ class ScriptedPolicy:
         self._thrust_loop.reset()
 
     def encode_visual(self, image: FloatArray) -> FloatArray:
-        """Return mean and deviation of each channel of an image [1, 3, H, W], padded with zeros:
-        [1, 8]."""
+        """Return mean and deviation of each channel of [1, 3, H, W], zero-padded: [1, 8]."""
         sparse = image[:, :, ::4, ::4]
         feature = np.zeros((image.shape[0], FEATURE_DIM), np.float32)
         feature[:, :3] = sparse.mean(axis=(2, 3))

@@ -158,8 +158,7 @@ class FeatureStore:
 
 
 def next_of(among: Indices, step: int, count: int, seed: int) -> Indices:
-    """Return the ``count`` items that are due in ``step``; each pass over all items has a new
-    random order."""
+    """Return the ``count`` items due in ``step``; each pass over all has a new random order."""
     total = len(among)
     at = np.arange(step * count, (step + 1) * count)
     parts = [
@@ -214,10 +213,10 @@ class Batches:
         return self._batch(random, samples, len(frames), features=rows)
 
     def validation(self, samples: int, size: int) -> Iterator[Batch]:
-        """Return the same samples at each call, without augmentation, but with the inputs hidden
-        that training hides.
+        """Return the same samples at each call, not augmented, but with the inputs hidden as in
+        training.
 
-        For body rates, the best weights would otherwise be those that copy.
+        By body rates, the best weights would otherwise be weights that copy.
         """
         frames, count = self.frames, self._settings.batch_size
         chosen = frames[np.linspace(0, len(frames) - 1, min(samples, len(frames))).astype(int)]

@@ -245,8 +245,7 @@ def _evenly(range_ms: tuple[float, float]) -> Nanoseconds:
 
 
 def _starting_trainee(network: Network, settings: TrainSettings) -> Trainee:
-    """Return the policy to start from with a new gate head; leaves torch's global random state
-    unchanged."""
+    """Return the policy to start from with a new gate head; keeps torch's random state."""
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(settings.seed)
         if settings.start_from is not None:

@@ -95,8 +95,7 @@ class TrainingRun(ABC, Generic[M, B]):
 
     @abstractmethod
     def encode(self, stage: TrainingStage, *, is_new: bool) -> None:
-        """Encode the images once, for a stage on features. ``is_new`` is False in a resumed
-        stage."""
+        """Encode the images once, for a stage on features; ``is_new`` is False when resumed."""
 
     @abstractmethod
     def batch_maker(self, stage: TrainingStage) -> Callable[[int], B]:
@@ -119,15 +118,13 @@ class TrainingRun(ABC, Generic[M, B]):
         return self.settings.learning_rate
 
     def score(self, validation: Validation | None, *, is_last: bool) -> float | None:
-        """Return the score of the average weights, higher is better; None if they must not be
-        exported."""
+        """Return the score of the average weights, higher is better; None: do not export."""
         return None if validation is None else -validation.loss
 
     def store_flights(
         self, flights: Sequence[FlightData]
     ) -> tuple[list[FlightData], FrameStore, list[int], list[int]]:
-        """Decode all images; return the indices of the flights to train on, and of those held
-        out."""
+        """Decode all images; return the indices of the training and the held-out flights."""
         store = store_frames(
             flights,
             self.folder.frames,
@@ -142,8 +139,7 @@ class TrainingRun(ABC, Generic[M, B]):
         return whole, store, kept, held
 
     def may_encode(self, stage: TrainingStage) -> Callable[[float], bool]:
-        """Return a function that takes the completed share and is True if there is time to encode
-        more."""
+        """Return a predicate of the completed share: is there time to encode more?"""
         begun = self._fraction
 
         def should_continue(done: float) -> bool:
@@ -182,8 +178,7 @@ class TrainingRun(ABC, Generic[M, B]):
         )
 
     def _freeze_encoder(self, stage: TrainingStage, *, is_new: bool) -> None:
-        """Train on features of the average encoder from now on; a resumed run already has its
-        weights."""
+        """Train on features of the average encoder from now on; a resumed run has its weights."""
         if is_new:
             self.trainee.load_state_dict(self.average.state_dict())
         self.trainee.eval()

@@ -195,8 +195,7 @@ class WorldModelSettings(RunSettings):
 
 
 _SIZES = ((3 / 7, 0.35, 0.20), (5 / 7, 0.30, 0.15), (1.0, 0.10, 0.10))
-"""Image size relative to the full one, share of the time, share of the steps; the head gets the
-rest."""
+"""Image size relative to the full one, share of time, share of steps; the head gets the rest."""
 MIN_IMAGE_SIZE = 96
 """Below this size, an image costs a CPU hardly less."""
 

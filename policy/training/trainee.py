@@ -94,8 +94,7 @@ class Trainee(nn.Module):
         return StepLoss(total=total, metrics=losses)
 
     def _denoising_loss(self, condition: Tensor, batch: Batch) -> Tensor:
-        """Return the denoiser's loss: of all samples in eval mode, of one in ``DENOISED`` in
-        training."""
+        """Return the denoiser's loss, in training of one sample in ``DENOISED``, else of all."""
         every = max(1, min(DENOISED, len(condition) // LEAST_DENOISED)) if self.training else 1
         chunk, timestep = batch.chunk[::every], batch.timestep[::every]
         noise, schedule = batch.noise[::every], self.policy.config.schedule
@@ -112,8 +111,7 @@ def _squared(error: Tensor, known: Tensor) -> Tensor:
 
 
 def gate_labels(gate: Tensor) -> Tensor:
-    """Convert [B, 7] in body axes to labels [B, 10] of size about 1; NaN if unknown or behind the
-    camera."""
+    """Convert [B, 7] in body axes to labels [B, 10] of about 1; NaN if unknown or behind."""
 
     def place(position: Tensor) -> Tensor:
         position = torch.where(position[:, :1] > 0, position, torch.nan)

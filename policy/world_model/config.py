@@ -41,8 +41,7 @@ class WorldModelConfig:
     horizontal_fov_rad: float = math.radians(90.0)
     """Field of view of the camera, a forward-looking pinhole without distortion."""
     camera_tilt_rad: float = math.radians(10.0)
-    """Upward tilt of the camera. The defaults of tilt and field of view are the simulator's nominal
-    camera."""
+    """Upward tilt of the camera. Both defaults are those of the simulator's nominal camera."""
     autoencoder_widths: tuple[int, int, int] = (24, 40, 56)
     patch: int = 2
     """Latents along a side of one token."""

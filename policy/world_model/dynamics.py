@@ -83,8 +83,7 @@ class LatentDynamics(nn.Module):
         self.register_buffer("_frequencies", sinusoid_frequencies(TIME_DIM), persistent=False)
 
     def forward(self, noisy: Future, timestep: Tensor, known: Conditioning) -> Future:
-        """Return the network's outputs, shaped as the future, for a noisy future and timesteps
-        [B]."""
+        """Return the network's outputs, shaped as the future, for a noisy future and step [B]."""
         frames = noisy.latents.shape[1]
         knows = known.knows_actions.to(noisy.motion.dtype).view(-1, 1)
         angle = timestep.to(self._frequencies.dtype).unsqueeze(-1) * self._frequencies

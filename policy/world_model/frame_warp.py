@@ -24,8 +24,7 @@ _INITIAL_INVERSE_DEPTH = -3.0
 """Before softplus: a new network places everything 20 m away."""
 _INITIAL_STD = 0.02
 _MIN_DEPTH = 1e-3
-"""Along a ray of about unit length: points beside or behind the camera are projected far
-outside."""
+"""Along a ray of about unit length: points beside or behind the camera land far outside."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -139,8 +138,7 @@ class FrameWarp(nn.Module):
 
 
 def _body_from_camera(tilt_rad: float, state_frame: StateFrame) -> Tensor:
-    """Return the rotation [3, 3] from camera to body axes; body axes are FRD or FLU, as for the
-    states."""
+    """Return the rotation [3, 3] from camera to body axes, FRD or FLU as in the states."""
     sine, cosine = math.sin(tilt_rad), math.cos(tilt_rad)
     frd = torch.tensor([[0.0, sine, cosine], [1.0, 0.0, 0.0], [0.0, cosine, -sine]])
     return frd if state_frame == "ned_frd" else frd * torch.tensor([[1.0], [-1.0], [-1.0]])

@@ -146,8 +146,7 @@ class WorldModel(nn.Module):
         )
 
     def source_frame(self, latents: Tensor, state: Tensor) -> SourceFrame:
-        """Return the newest frame [B, C, h, w] of a vehicle in state [B, 13], ready to be
-        warped."""
+        """Return the newest frame [B, C, h, w], seen from state [B, 13], ready to be warped."""
         coder = self.autoencoder
         with torch.no_grad():
             pixels = coder.reconstruct(_channels_last(coder.denormalise(latents)))
@@ -290,6 +289,5 @@ def _one_by_one(net: Callable[[Tensor], Tensor], inputs: Tensor) -> Tensor:
 
 
 def _channels_last(images: Tensor) -> Tensor:
-    """Return a copy of [N, C, H, W] in channels-last memory, the only layout that the convolutions
-    use."""
+    """Return a copy of [N, C, H, W] in channels-last memory, as the convolutions use it."""
     return images.clone(memory_format=torch.channels_last)

@@ -133,8 +133,7 @@ class Act(nn.Module):
 
     @staticmethod
     def own_name(name: str) -> str | None:
-        """Return our name of a parameter in LeRobot's file, without the prefix; None: not
-        needed."""
+        """Return our name of a parameter in LeRobot's file, without the prefix; None: unused."""
         for theirs, ours in _ATTENTION_NAMES.items():
             name = name.replace(theirs, ours)
         return None if name.startswith("vae_encoder") else name

@@ -20,8 +20,7 @@ STATE_KEY, ACTION_KEY = "observation.state", "action"
 ENVIRONMENT_KEY = "observation.environment_state"
 """LeRobot's input for known facts of the world; here the vector to the flight's goal."""
 NO_IMAGE_PX = 16
-"""Side of the blank image of a policy without a camera [px]: the smallest that a contract
-allows."""
+"""Side of the blank image of a policy without a camera [px]: the smallest in a contract."""
 BackboneName = Literal["resnet18", "resnet34", "resnet50", "resnet101", "resnet152"]
 Size = tuple[int, int]
 """Height and width."""
@@ -49,8 +48,7 @@ class Features:
     state_dim: int | None
     """Width of observation.state; None if the policy takes none."""
     takes_goal: bool
-    """True if observation.environment_state is the vector to the goal,
-    ``policy.contract.EXTRA_NAMES``."""
+    """True if observation.environment_state is the goal vector, ``policy.contract.EXTRA_NAMES``."""
     modes: Mapping[str, str]
     """Normalisation of STATE, VISUAL and ACTION; see ``plan.MODES``."""
 
@@ -84,8 +82,8 @@ class ActConfig:
 
     @property
     def feature_dim(self) -> int:
-        """Size of one image's feature: the cells of its last map, each projected to the
-        transformer's width."""
+        """Size of an image's feature: its last map's cells, projected to the transformer's
+        width."""
         height, width = map_size(self.features.image_height, self.features.image_width)
         return self.dim_model * height * width
 
@@ -126,8 +124,7 @@ class DiffusionConfig:
 
     @property
     def feature_dim(self) -> int:
-        """Size of one image's feature: two coordinates of each keypoint; 1, a zero, without a
-        camera."""
+        """Size of an image's feature: two coordinates per keypoint; 1, a zero, without a camera."""
         return 2 * self.spatial_softmax_num_keypoints if self.features.image_keys else 1
 
     @property
@@ -142,8 +139,7 @@ C = TypeVar("C", ActConfig, DiffusionConfig)
 
 
 def map_size(height: int, width: int) -> Size:
-    """Return the size of a ResNet's last map: five layers of stride 2 halve the image, rounding
-    up."""
+    """Return the size of a ResNet's last map: five layers of stride 2, each rounding up."""
     return -(-height // 32), -(-width // 32)
 
 
@@ -312,8 +308,7 @@ class _Entries:
         self.read: set[str] = set()
 
     def get(self, name: str, kind: Any, *, default: object = None) -> Any:
-        """Return an entry of the type ``kind``, which may be a Literal, or Optional if null is
-        allowed."""
+        """Return an entry of the type ``kind``: also a Literal, or Optional if null is allowed."""
         self.read.add(name)
         value = self.data.get(name)
         value = default if value is None else value

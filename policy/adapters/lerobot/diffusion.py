@@ -83,8 +83,7 @@ class ResidualBlock(nn.Module):
             self.residual_conv = nn.Conv1d(channels_in, channels_out, 1)
 
     def forward(self, x: Tensor, film: Tensor) -> Tensor:
-        """Apply the block; ``film`` [B, film_dim] holds scales, if the block has any, then
-        shifts."""
+        """Apply the block; ``film`` [B, film_dim] holds scales, if it has any, then shifts."""
         hidden = self.conv1(x)
         if self.scales:
             scale, shift = film.unsqueeze(-1).chunk(2, dim=1)
@@ -132,20 +131,17 @@ class UNet(nn.Module):
         self.register_buffer("_frequencies", frequencies, persistent=False)
 
     def film_of_timestep(self, timestep: Tensor) -> list[Tensor]:
-        """Return the timesteps' part [B, film_dim] of each block's FiLM, for timesteps [B] in
-        float32."""
+        """Return the part [B, film_dim] of each block's FiLM from float32 timesteps [B]."""
         angle = timestep.unsqueeze(-1) * self._frequencies
         embedded = self.diffusion_step_encoder(torch.cat([angle.sin(), angle.cos()], dim=-1))
         return self._film(embedded, slice(None, self.time_dim), bias=True)
 
     def film_of_condition(self, condition: Tensor) -> list[Tensor]:
-        """Return the condition's part [B, film_dim] of each block's FiLM, for a condition [B,
-        C]."""
+        """Return the part [B, film_dim] of each block's FiLM from a condition [B, C]."""
         return self._film(condition, slice(self.time_dim, None), bias=False)
 
     def forward(self, noisy: Tensor, films: list[Tensor]) -> Tensor:
-        """Predict; ``films`` holds the FiLM [B, film_dim] of each block, in the order in which they
-        run."""
+        """Predict; ``films`` holds the FiLM [B, film_dim] of each block, in running order."""
         x, film, skips = noisy.transpose(1, 2), iter(films), []
         layers: Any = self  # its module lists are not typed
         for first, second, halve in layers.down_modules:
@@ -305,8 +301,7 @@ class Diffusion(nn.Module):
         return feature
 
     def film_of_condition(self, feature: Tensor, state: Tensor) -> list[Tensor]:
-        """Return the condition's part of FiLM for features [B, T, cameras, F] and states [B, T,
-        S]."""
+        """Return FiLM's part from the features [B, T, cameras, F] and states [B, T, S]."""
         condition = torch.cat([state, feature.flatten(2)], dim=-1).flatten(1)
         return self.unet.film_of_condition(condition)
 

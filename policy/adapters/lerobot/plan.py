@@ -60,8 +60,7 @@ class Affine:
 
 @dataclass(frozen=True, kw_only=True)
 class Normalisation:
-    """Normalisation of each input, by its name in config.json, and of the action; None:
-    unchanged."""
+    """Normalisation of each input, by its name in config.json, and of the action; None: none."""
 
     images: Mapping[str, Affine | None]
     state: Affine | None

@@ -73,8 +73,7 @@ class LeRobotPolicy(nn.Module):
     def predict_fast(
         self, feature: Tensor, state: Tensor, action_history: Tensor, num_diffusion_steps: int
     ) -> Tensor:
-        """Sample a chunk [B, horizon, 4] from cached features [B, (T,) cameras * F] and states [B,
-        (T,) S]."""
+        """Sample a chunk [B, horizon, 4]; features [B, (T,) cameras * F], states [B, (T,) S]."""
         inputs = self._network_inputs(feature, state)
         return self._in_units(self.net.act(*inputs, num_diffusion_steps))
 
@@ -94,8 +93,7 @@ class LeRobotPolicy(nn.Module):
         return self.predict_fast(feature, state, action_history, num_diffusion_steps)
 
     def _network_inputs(self, feature: Tensor, state: Tensor) -> tuple[Tensor, Tensor]:
-        """Return features [B, T, cameras, F] and normalised states [B, T, S], in the policy's
-        order."""
+        """Return features [B, T, cameras, F] and normalised states [B, T, S] in LeRobot's order."""
         steps, cameras = self.contract.observation_steps, len(self._policy_cameras)
         by_camera = feature.reshape(feature.shape[0], steps, cameras, self.contract.feature_dim)
         if self._policy_cameras != tuple(range(cameras)):
@@ -180,8 +178,7 @@ def build_policy_of(plan: Plan) -> LeRobotPolicy:
 def load_policy_of(
     plan: Plan, *, seed: int, num_diffusion_steps: int
 ) -> tuple[LeRobotPolicy, list[str]]:
-    """Build a policy and load its weights, with notes for the user. ``seed`` draws a flight's
-    initial noise."""
+    """Build a policy, load its weights, draw the initial noise; return notes for the user too."""
     policy = build_policy_of(plan)
     policy.net.load_state_dict(_read(plan.folder / WEIGHTS_FILE, policy.net))
     policy.eval().requires_grad_(False)

@@ -1,2 +1,1 @@
-"""Policies on a server that speaks openpi's websocket protocol, and the code shared by client and
-server."""
+"""Policies on a server by openpi's websocket protocol; code shared by client and server."""

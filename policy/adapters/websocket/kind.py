@@ -28,8 +28,7 @@ TERMS = (
     *("play_s", "modes", "max_state_age_s", "max_velocity_age_s", "max_feature_age_s"),
     *("max_chunk_age_s", "max_stall_s", *ENVELOPE_TERMS),
 )
-"""Contract fields that a contract file may replace for mavbridge's own server: the terms of
-flight."""
+"""Contract fields of mavbridge's own server that a contract file may replace: flight terms."""
 
 
 def require_packages(what: str) -> None:
@@ -40,8 +39,7 @@ def require_packages(what: str) -> None:
 
 
 def check_server(url: str, contract_file: Path | None, checkpoint: Path | None) -> None:
-    """Raise PolicyError for an address, a contract file or a flag that cannot work; takes
-    milliseconds."""
+    """Raise PolicyError for an unusable address, contract file or flag; takes milliseconds."""
     require_packages(f"--policy {url}")
     try:
         parts = urlsplit(url)
@@ -82,8 +80,7 @@ def load_server_policy(url: str, contract_file: Path | None) -> tuple["RemotePol
 
 
 def _interface(contract_file: Path | None, metadata: "Message") -> Interface:
-    """Return the interface: of mavbridge's own server under the terms of the user's file, or of the
-    file alone."""
+    """Return the interface: mavbridge's own server under the file's terms, or the file alone."""
     from policy.adapters.websocket.messages import CONTRACT_KEY
 
     served = metadata.get(CONTRACT_KEY)

@@ -172,8 +172,7 @@ class ServerLink:
         request.answer.set_result(Answer(data, self._loop.time() - sent_s))
 
     async def _require_silence(self, connection: ClientConnection) -> None:
-        """Raise PolicyError if a message arrived before the request: it would be taken for the
-        answer."""
+        """Raise PolicyError if a message arrived before the request: it is not an answer."""
         with suppress(TimeoutError):
             async with asyncio.timeout(0):
                 await connection.recv()

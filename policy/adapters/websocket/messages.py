@@ -47,7 +47,7 @@ def pack(message: Mapping[str, object]) -> bytes:
 def unpack(data: bytes | str) -> Message:
     """Decode a message; arrays are read-only views of ``data``.
 
-    Decoding uses at most a small multiple of the message's length in memory, whatever sizes it
+    Decoding uses at most a small multiple of the message's length in memory, for any sizes that it
     claims.
     """
     if isinstance(data, str):
@@ -62,8 +62,7 @@ def unpack(data: bytes | str) -> Message:
 
 
 def last_line(text: str) -> str:
-    """Return the last line of a traceback, or the end of another text, in at most 300
-    characters."""
+    """Return the last line of a traceback, or the end of a text, in at most 300 characters."""
     lines = [line.strip() for line in text.splitlines() if line.strip()]
     return lines[-1][:300] if lines else "(nothing)"
 
@@ -156,8 +155,7 @@ def to_message(
 def from_message(
     interface: Interface, message: Message
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Return image, state and history of a request, with the batch axis, as arguments of
-    ``predict``."""
+    """Return image, state and history of a request, batched, as arguments of ``predict``."""
     contract = interface.contract
     stack = () if contract.observation_steps == 1 else (contract.observation_steps,)
     shape, kind = (*stack, *contract.picture_shape), "f" if contract.is_depth else "u"

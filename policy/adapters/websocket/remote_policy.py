@@ -25,8 +25,7 @@ ACTIONS_KEY = "actions"
 TRIAL_S = 120.0
 """Timeout of the first answers, before any flight: servers compile on their first request."""
 MOST_WAIT_S = 1.5
-"""Upper bound of the deadline for any contract, so that a flight still ends at once when told
-to."""
+"""Upper bound of the deadline for any contract, so that a flight still ends promptly."""
 
 
 def answer_deadline_s(contract: Contract) -> float:

@@ -25,8 +25,7 @@ CONTEXT_NOISE = 0.2
 """Largest sigma of the noise on past latents, relative to their unit scale: in a rollout the past
 is itself imagined, and a network that has only seen true pasts drifts off."""
 DECODED = 2
-"""Frames of a window that are decoded in a step of the dynamics; decoding all would double its
-time."""
+"""Frames of a window to decode in a step of the dynamics; decoding all would double its time."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -72,8 +71,7 @@ def frame_batch(
     settings: WorldModelSettings,
     step: int,
 ) -> FrameBatch:
-    """Return two neighbours of each of the ``windows`` that are due in a step of the
-    autoencoder."""
+    """Return two neighbours of each of the ``windows`` due in a step of the autoencoder."""
     count = settings.batch_size // 2
     random = np.random.default_rng([settings.seed, step])
     rows = next_of(np.arange(len(windows)), step, count, settings.seed)

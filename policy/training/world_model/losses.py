@@ -19,11 +19,9 @@ from policy.world_model.model import WorldModel
 from policy.world_model.relative_state import MOTION_SCALE, motion_since
 
 SQUARED_WEIGHT = 5.0
-"""Weight of the squared pixel error, added to the absolute error: alone, that one ignores small
-objects."""
+"""Weight of the squared pixel error; the absolute error alone ignores small objects."""
 EDGE_WEIGHT = 1.0
-"""Weight of the error of differences between neighbouring pixels: a gate is a few pixels of
-edge."""
+"""Weight of the error of differences between neighbours: a gate is a few pixels of edge."""
 KL_WEIGHT = 1e-4
 """Weight of the KL divergence per latent, which keeps the latents bounded. A larger weight gives
 all of them equal spread, so that the ground's unpredictable texture counts as much as the gates."""
@@ -31,8 +29,7 @@ UNSTEADY_WEIGHT = 0.03
 """Weight of the latents' change from frame to frame, relative to their spread. Without it, copying
 the last latent is off by half of their variance after one frame; it hardly costs pixel accuracy."""
 DECODED_WEIGHT = 10.0
-"""Weight of the squared error of decoded pixels, full scale 2: not all latent errors are
-visible."""
+"""Weight of the squared error of decoded pixels, full scale 2: some latent errors are invisible."""
 MOTION_WEIGHT, ACTION_WEIGHT = 0.5, 0.5
 MOTION_PREDICTION_WEIGHT = 0.5
 """Weight of the squared error of the motion that is predicted before denoising."""
@@ -70,8 +67,7 @@ def autoencoder_loss(model: WorldModel, batch: FrameBatch) -> StepLoss:
 
 
 def reconstruction_errors(made: Tensor, images: Tensor) -> tuple[Tensor, Tensor]:
-    """Return L2 and L1 [] of [B, 3, H, W] in [-1, 1], and L1 of the differences between
-    neighbours."""
+    """Return L2 and L1 [] of [B, 3, H, W] in [-1, 1], and L1 of neighbours' differences."""
     error = made - images
     edges = error.diff(dim=2).abs().mean() + error.diff(dim=3).abs().mean()
     return SQUARED_WEIGHT * error.square().mean() + error.abs().mean(), edges
@@ -134,8 +130,7 @@ def _noisy(model: WorldModel, clean: Future, batch: WindowBatch) -> Future:
 
 
 def _decoded(model: WorldModel, latents: Tensor, chosen: Tensor) -> Tensor:
-    """Decode the frames [B, n, 3, H, W] with indices [B, n] of futures [B, T, C, h, w]; full scale
-    2."""
+    """Decode frames [B, n, 3, H, W], indices [B, n], of futures [B, T, C, h, w]; full scale 2."""
     coder, window = model.autoencoder, torch.arange(len(latents), device=latents.device)[:, None]
     some = latents[window, chosen]
     images = coder.reconstruct(coder.denormalise(some.flatten(0, 1)))
@@ -230,7 +225,6 @@ def validate_world_model(
 
 
 def psnr_db(made: Tensor, true: Tensor) -> Tensor:
-    """Return the peak signal-to-noise ratio [...] of frames [..., H, W, 3] uint8; 99 for equal
-    frames."""
+    """Return the peak signal-to-noise ratio [...] of uint8 [..., H, W, 3]; 99 if equal."""
     squared = (made.float() - true.float()).square().mean(dim=(-3, -2, -1))
     return (10 * torch.log10(255.0**2 / squared)).clamp_max(99.0)

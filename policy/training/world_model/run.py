@@ -168,8 +168,7 @@ class _WorldModelRun(TrainingRun[WorldModel, FrameBatch | WindowBatch]):
 
 
 def _starting_model(config: WorldModelConfig, settings: WorldModelSettings) -> WorldModel:
-    """Return seeded weights, except for a kept autoencoder; leaves torch's random state
-    unchanged."""
+    """Return seeded weights, except a kept autoencoder's; keeps torch's random state."""
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(settings.seed)
         model = WorldModel(config)
