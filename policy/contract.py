@@ -221,8 +221,8 @@ class Contract:
     """Longest time to fly on along a chunk while no newer one arrives; never beyond its horizon.
     The ages of a chunk are judged when it is accepted, and grow during the stall."""
     max_tilt_deg: float | None = None
-    """Largest lean before the policy loses control. For all limits from here on, None leaves the
-    limit to the flight's configuration; a number may widen it."""
+    """Largest lean before the policy loses control. None, here and in the three limits below,
+    leaves the limit to the flight's configuration; a number may widen it."""
     max_speed_mps: float | None = None
     max_height_m: float | None = None
     """Height above the estimator's origin, where the vehicle was switched on."""
@@ -393,8 +393,7 @@ def _is_within(value: object, low: float, high: float) -> bool:
 
 
 def history_ages_ns(length: int, dt_s: float) -> Sequence[int]:
-    """Return the ages of the actions in a history, oldest first; the newest is ``dt_s`` before the
-    tick.
+    """Return the ages of the actions in a history, oldest first; the newest has age ``dt_s``.
 
     An action holds until the next one is sent, so the action at a time is the newest one sent by
     then. After a release, and before the first action, it is neutral.

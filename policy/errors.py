@@ -64,8 +64,7 @@ def warned(text: str) -> Warned:
 
 @contextmanager
 def user_code(doing: str) -> Iterator[None]:
-    """Context manager: turn any exception of a user's policy into a ``PolicyError`` with file and
-    line.
+    """Turn any exception of a user's policy into a ``PolicyError`` with its file and line.
 
     The message begins with ``doing``. A ``PolicyError`` passes unchanged. ``sys.exit`` is converted
     too: it would end the flight silently, with an arbitrary status.

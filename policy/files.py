@@ -60,8 +60,7 @@ def stand_in(path: Path) -> tuple[str, str] | None:
 
 
 def stand_in_of(head: bytes) -> tuple[str, str] | None:
-    """Identify a file by its first bytes if it cannot hold the expected content, and name the
-    remedy; else return None.
+    """Return a foreign file's real content, known by its first bytes, and the remedy; else None.
 
     Recognises empty files, Git LFS pointers, and web pages saved under a file's name.
     """
@@ -85,8 +84,7 @@ def last_line(error: Exception) -> str:
 
 
 def why_unreadable(path: Path, error: Exception, kind: str = "") -> str:
-    """Return why a library could not read a file: the file's real content if known, else one line
-    of the library's error.
+    """Return why a library could not read a file: its real content, or one line of the error.
 
     ``kind`` is the expected format.
     """

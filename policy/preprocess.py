@@ -76,8 +76,7 @@ def egocentric(state: FloatArray, contract: Contract) -> FloatArray:
 
 
 def image_to_input(image: CameraImage, contract: Contract) -> FloatArray:
-    """Convert a camera image of any size to float32 [1, 3, image_height, image_width]; depth [1, 1,
-    ...].
+    """Convert a camera image to float32 [1, 3, image_height, image_width]; depth [1, 1, ...].
 
     ``fit_image`` fits it, then ``(value / 255 - mean) / std`` of the contract normalises it, with
     the channels in the contract's order. Depth is converted to metres.

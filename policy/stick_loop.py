@@ -35,7 +35,7 @@ MAX_TILT_RATE_RADPS = math.radians(200.0)
 UP_FORCE_MPS2 = (3.0, 21.0)
 """Least and largest vertical specific force."""
 MIN_COS_TILT = 0.35
-"""Beyond this lean the thrust no longer holds the height."""
+"""Cosine of the lean beyond which the thrust no longer holds the height."""
 RATES_FULL_LEAN_DEG = 65.0
 RATES_FULL_YAW_RATE_DEGPS = 115.0
 RATES_FULL_CLIMB_MPS = 6.0
@@ -116,8 +116,7 @@ class StickLoop:
             )
 
     def to_rates(self, sticks: FloatArray, state: FloatArray) -> FloatArray:
-        """Convert a chunk of sticks [1, horizon, 4] at a state [1, state_dim] to rates [1, horizon,
-        4].
+        """Convert sticks [1, horizon, 4] at a state [1, state_dim] to rates [1, horizon, 4].
 
         Each action assumes the attitude and climb that the actions before it bring about.
         """
@@ -149,8 +148,7 @@ class StickLoop:
         return rates
 
     def to_sticks(self, rates: FloatArray, state: FloatArray) -> FloatArray:
-        """Convert single actions, rates [N, 4] at states [N, state_dim], to the sticks [N, 4]
-        behind them.
+        """Convert rates [N, 4] at states [N, state_dim] to the sticks [N, 4] behind them.
 
         Motion beyond full stick is clipped.
         """
@@ -204,8 +202,7 @@ class StickLoop:
 
 
 def _tilt_rates(wanted_body: Vector) -> tuple[float, float]:
-    """Return roll and pitch rate that turn the thrust, along -z, to a unit vector, the shorter way
-    round.
+    """Return roll and pitch rate that turn the thrust, along -z, the short way to a unit vector.
 
     The tilt has its own loop, independent of the heading: the direction of thrust matters more
     (Brescianini and D'Andrea, "Tilt-Prioritized Quadrocopter Attitude Control", 2018).

@@ -54,7 +54,7 @@ class Description:
     inputs: dict[str, str] = field(default_factory=dict)
     """Name of an input by its role."""
     outputs: dict[str, str | int] = field(default_factory=dict)
-    """Name of an output, or its place in a tuple, by its result."""
+    """Name of an output, or its index in a tuple, by its result."""
     hidden: dict[str, str] = field(default_factory=dict)
     """Output that feeds each hidden input at the next call, by name."""
 

@@ -1,5 +1,4 @@
-"""First drafts of contract files: entries that were read, entries that were guessed, and questions
-to the user.
+"""First drafts of contract files: read entries, guessed entries, and questions to the user.
 
 A draft is TOML for ``interface.read_interface``. A comment at each entry names the source of its
 value. An entry that only the user can answer holds ``interface.UNANSWERED``.

@@ -81,7 +81,7 @@ def pack(state: Mapping[str, Tensor], *, coarse: str) -> dict[str, Tensor]:
 
 
 def unpack(packed: Mapping[str, Tensor]) -> dict[str, Tensor]:
-    """Return a file's weights as float32; unpacked weights are returned unchanged."""
+    """Return a file's weights as float32; weights that are not packed stay unchanged."""
     state: dict[str, Tensor] = {}
     for name, value in packed.items():
         scale = packed.get(name + SCALE)

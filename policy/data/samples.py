@@ -258,6 +258,6 @@ def state_signs(state_dim: int) -> FloatArray:
 
 
 def mirrored(values: FloatArray, signs: FloatArray, is_mirrored: NDArray[np.bool_]) -> FloatArray:
-    """Multiply ``values`` [B, ..., D] by ``signs`` [D] if ``is_mirrored`` [B]."""
+    """Multiply the ``values`` [B, ..., D] with ``is_mirrored`` [B] by ``signs`` [D]."""
     chosen = is_mirrored.reshape(-1, *[1] * (values.ndim - 1))
     return np.where(chosen, values * signs, values).astype(np.float32)

@@ -72,8 +72,7 @@ class Windows:
 def find_windows(
     flights: Sequence[FlightData], *, context_frames: int, frames: int, frame_dt_s: float
 ) -> Windows:
-    """Find every run of ``context_frames + frames`` frames, ``frame_dt_s`` apart, within one
-    flight.
+    """Find every run of ``context_frames + frames`` frames of one flight, ``frame_dt_s`` apart.
 
     No window crosses a gap: each of its frames is near its nominal time and has a state.
     """

@@ -236,8 +236,7 @@ def quiet() -> Iterator[None]:
 
 
 def convert(policy: nn.Module, function: Callable[..., Any], shapes: Sequence[Shape]) -> ov.Model:
-    """Convert ``function`` of float32 tensors with these shapes, which uses the weights of
-    ``policy``.
+    """Convert ``function`` of float32 tensors of these shapes, with the weights of ``policy``.
 
     It is traced with zeros: decisions by a tensor's values are frozen to those for zeros.
     """

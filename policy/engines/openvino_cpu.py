@@ -149,12 +149,11 @@ def denoise_graph(policy: Toge | ResnetUnet, count: int) -> ov.Model:
 def step_inputs(
     head: DiffusionHead, num_diffusion_steps: int, first: int, count: int, unrolled: int
 ) -> tuple[FloatArray, FloatArray]:
-    """Return inputs that make a graph of ``unrolled`` steps run steps ``first`` to ``first +
-    count`` of a solve.
+    """Return inputs that make a graph of ``unrolled`` steps run ``count`` steps from ``first``.
 
-    If these are fewer, steps without effect come first. Returns the timesteps' parts of FiLM
-    [unrolled, film_dim], with 1 added to the scales, and the coefficients for ``_updated``
-    [unrolled, 4].
+    If ``count`` is less than ``unrolled``, steps without effect come first. Returns the timesteps'
+    parts of FiLM [unrolled, film_dim], with 1 added to the scales, and the coefficients for
+    ``_updated`` [unrolled, 4].
     """
     steps = head.schedule.ddim_steps(num_diffusion_steps)[first : first + count]
     timesteps = torch.tensor([step.timestep for step in steps])
@@ -172,8 +171,7 @@ def step_inputs(
 
 
 def _updated(noisy: Tensor, output: Tensor, update: Tensor) -> Tensor:
-    """Take one reverse step with the net's output; ``update`` [1, 4] holds the schedule's
-    ``coefficients``.
+    """Take one reverse step with the net's output; ``update`` [1, 4] are ``coefficients``.
 
     ``noisy`` and ``update`` also reach the graph's end by a path without convolutions; OpenVINO
     keeps such a path in float32 if the rest is bf16.

@@ -83,8 +83,7 @@ class Toge(nn.Module):
     def encode_and_fuse(
         self, feature: Tensor, state: Tensor, action_history: Tensor | None = None
     ) -> Tensor:
-        """Return the condition [B, C] of feature [B, F], state [B, state_dim], and history [B, K,
-        4] or None.
+        """Fuse feature [B, F], state [B, state_dim], history [B, K, 4] or None -> condition [B, C].
 
         None: no action was sent yet. In training, such histories are centred sticks.
         """

@@ -97,8 +97,7 @@ _PLANS: dict[ActionKind, tuple[_Plan, ...]] = {
 
 
 def doublet_steps(action: ActionKind) -> tuple[DoubletStep, ...]:
-    """Return doublets on each axis that a kind of action can push, at two amplitudes, to both
-    sides.
+    """Return the doublets of an action kind: each axis, at two amplitudes, to both sides.
 
     Thrust has no gain to identify: the height balances it, and only its mean is reported.
     """

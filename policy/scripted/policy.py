@@ -85,7 +85,7 @@ class ScriptedPolicy:
         self._last_s: float | None = None
         self._altitude_m = 0.0
         self.program_start_s: float | None = None
-        """Start of the program by ``now_s``, past or future; None below the altitude."""
+        """Start, past or future, by ``now_s``; None until the altitude is reached."""
 
     def reset(self) -> None:
         """Begin again; the current altitude becomes the start's."""
@@ -119,8 +119,7 @@ class ScriptedPolicy:
         action_history: FloatArray,
         num_diffusion_steps: int,
     ) -> FloatArray:
-        """Return a chunk [1, 16, 4] for a state [1, 13] in ``ned_frd``; other arguments are
-        ignored.
+        """Return a chunk [1, 16, 4] for a state [1, 13] in ``ned_frd``; ignores the rest.
 
         Each action is the program's motion at its own time, with the current feedback.
         """

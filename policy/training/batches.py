@@ -213,8 +213,7 @@ class Batches:
         return self._batch(random, samples, len(frames), features=rows)
 
     def validation(self, samples: int, size: int) -> Iterator[Batch]:
-        """Return the same samples at each call, not augmented, but with the inputs hidden as in
-        training.
+        """Return the same samples at each call, not augmented, with inputs hidden as in training.
 
         By body rates, the best weights would otherwise be weights that copy.
         """
@@ -322,7 +321,7 @@ def normalise_image(image: Tensor, contract: Contract) -> Tensor:
 ENCODE_BATCH = 64
 
 Encode: TypeAlias = Callable[[Indices, bool], Tensor]
-"""(images, whether to mirror them all) -> [B, D]."""
+"""(images, True to mirror all of them) -> [B, D]."""
 Job: TypeAlias = tuple[tuple[Indices, bool], ...]
 """Images to encode between two checks of the time, each part plain or mirrored."""
 

@@ -63,8 +63,7 @@ def open_run(
 
 
 class TrainingRun(ABC, Generic[M, B]):
-    """Training run, from its first step or from an interruption; subclasses define the trained
-    module.
+    """Training run from its start or an interruption; subclasses define the trained module.
 
     Each phase of a run (the encoder learns, or it is frozen) has its own optimiser, and one rise
     and fall of its learning rate.

@@ -20,10 +20,10 @@ log distance of the gate after it."""
 MIN_STICK_STD = 0.1
 """Lower bound of a stick's standard deviation: bounds the weight of a stick that hardly moves."""
 DENOISED = 4
-"""In training, one sample of this number passes through the denoiser.
+"""In training, one sample in this many passes through the denoiser.
 
-The denoiser costs four times as much as everything before it, where the harder part is learned: the
-sticks for a feature and a state. All samples teach that part, through the sticks that the head
+The denoiser costs four times as much as the layers before it, which learn the harder part: the
+sticks for a feature and a state. All samples teach these layers, through the sticks that the head
 reads off the condition.
 """
 LEAST_DENOISED = 16

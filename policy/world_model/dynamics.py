@@ -171,8 +171,7 @@ class MotionPredictor(nn.Module):
         nn.init.zeros_(self.output.bias)
 
     def forward(self, features: Tensor, actions: Tensor, knows_actions: Tensor) -> Tensor:
-        """Return motions [B, T, 15] for ``relative_state.context_features`` [B, D] and actions [B,
-        T, 4].
+        """Return motions [B, T, 15] for ``context_features`` [B, D] and actions [B, T, 4].
 
         Both inputs have about unit scale. Actions are ignored if ``knows_actions`` [B] is False.
         """

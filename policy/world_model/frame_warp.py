@@ -99,8 +99,7 @@ class FrameWarp(nn.Module):
         return SourceFrame(pixels=pixels, inverse_depth=self.inverse_depth(inputs))
 
     def warp(self, source: SourceFrame, poses: Poses) -> tuple[Tensor, Tensor]:
-        """Return frames [B, N, 3, H, W] as seen from other poses, and a mask of pixels in view [B,
-        N, H, W].
+        """Return frames [B, N, 3, H, W] seen from other poses, and the pixels in view [B, N, H, W].
 
         A pixel out of view shows the nearest one of the border.
         """

@@ -277,11 +277,10 @@ class WorldModel(nn.Module):
 
 
 def _one_by_one(net: Callable[[Tensor], Tensor], inputs: Tensor) -> Tensor:
-    """Apply a network to each item of [N, C, H, W] alone: kernels for other batch sizes may round
-    differently.
+    """Apply a network to each item of [N, C, H, W] alone, so that results are bit-identical.
 
-    So a frame is bit-identical whatever frames it is coded with. Kernels also depend on the
-    strides, which a slice inherits from its batch, so each item is copied.
+    Kernels for other batch sizes may round differently. Kernels also depend on the strides, which
+    a slice inherits from its batch, so each item is copied.
     """
     if len(inputs) == 0:
         return net(_channels_last(inputs.new_zeros(1, *inputs.shape[1:])))[:0]

@@ -14,7 +14,7 @@ from policy.rotation import matrix_columns
 
 MOTION_DIM = 15
 """Change of velocity [3] m/s in the current body axes, first two columns of the rotation from the
-later to the current axes minus those of the identity [6], change of body rates [3] rad/s and of
+other to the current axes minus those of the identity [6], change of body rates [3] rad/s and of
 specific force [3] m/s^2."""
 _ROTATION = slice(3, 9)
 
@@ -42,8 +42,7 @@ def motion_since(now: Tensor, then: Tensor) -> Tensor:
 
 
 def state_after(now: Tensor, motion: Tensor) -> Tensor:
-    """Apply motions [..., 15] to ``now`` [..., 13], giving states [..., 13]; the inverse of
-    ``motion_since``.
+    """Apply motions [..., 15] to ``now`` [..., 13]: states [..., 13]; inverts ``motion_since``.
 
     The quaternion is normalised with w >= 0, for any six numbers of the rotation.
     """
@@ -81,8 +80,7 @@ def features_dim(context_frames: int) -> int:
 
 
 def context_features(states: Tensor, contract: Contract) -> Tensor:
-    """Return features [B, features_dim(K)] of size about 1 for the last states [B, K, 13], oldest
-    first.
+    """Return features [B, features_dim(K)] of about 1 for states [B, K, 13], oldest first.
 
     They are the newest state by ``preprocess.egocentric``, then the motions back to the older ones.
     """

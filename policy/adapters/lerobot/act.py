@@ -1,5 +1,4 @@
-"""ACT (Zhao et al. 2023) as LeRobot saves it: a transformer over the cells of a ResNet's map and a
-state.
+"""ACT (Zhao et al. 2023) as LeRobot saves it: a transformer over image cells and a state.
 
 Inference only: the encoder of the training latent is left out, and the latent is zero. Parameters
 have LeRobot's names, except in the attention layers.

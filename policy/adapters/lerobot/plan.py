@@ -60,7 +60,7 @@ class Affine:
 
 @dataclass(frozen=True, kw_only=True)
 class Normalisation:
-    """Normalisation of each input, by its name in config.json, and of the action; None: none."""
+    """Normalisation by an input's name in config.json, and of the action; None: unchanged."""
 
     images: Mapping[str, Affine | None]
     state: Affine | None
@@ -245,8 +245,7 @@ def read_plan(folder: Path, contract_file: Path | None) -> Plan:
 
 
 def _interface(path: Path, config: Config) -> Interface:
-    """Return the completed contract file: images in LeRobot's range [0, 1], the rest by
-    config.json.
+    """Return the completed contract file: images in [0, 1] as in LeRobot, the rest by config.json.
 
     Observations are spaced like actions: LeRobot takes both from the frames of a dataset.
     """

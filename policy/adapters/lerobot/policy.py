@@ -126,8 +126,7 @@ class LeRobotDiffusion(LeRobotPolicy):
         self._goal = Normaliser(plan.normalisation.goal)
 
     def _network_inputs(self, feature: Tensor, state: Tensor) -> tuple[Tensor, Tensor]:
-        """Return features of all cameras and the goal [B, T, 1, X], and normalised states [B, T,
-        S].
+        """Return features of cameras and goal [B, T, 1, X], and normalised states [B, T, S].
 
         In LeRobot's order: images, then the environment (``_prepare_global_conditioning``).
         """

@@ -157,7 +157,7 @@ class GraphFile:
         )
 
     def _require_types(self, model: "ov.Model", roles: list[str], pairs: Mapping[str, str]) -> bool:
-        """Raise PolicyError for undefined element types; return True if the image is uint8."""
+        """Raise PolicyError for unsupported element types; return True if the image is uint8."""
         takes_bytes = False
         for port, role in zip(model.inputs, roles, strict=True):
             kind = port.get_element_type().get_type_name()

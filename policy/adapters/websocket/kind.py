@@ -80,7 +80,7 @@ def load_server_policy(url: str, contract_file: Path | None) -> tuple["RemotePol
 
 
 def _interface(contract_file: Path | None, metadata: "Message") -> Interface:
-    """Return the interface: mavbridge's own server under the file's terms, or the file alone."""
+    """Return the contract of ``mavbridge serve`` under the file's terms, or the file's own."""
     from policy.adapters.websocket.messages import CONTRACT_KEY
 
     served = metadata.get(CONTRACT_KEY)

@@ -111,8 +111,7 @@ class WindowBatches:
         return self._make(random, rows, is_mirrored, sigma, knows_actions)
 
     def validation(self, count: int) -> list[WindowBatch]:
-        """Return all windows in batches of ``count``, equal at each call, alternating between
-        roles.
+        """Return all windows in batches of ``count``, equal at each call, in alternating roles.
 
         Each batch is spread over all flights.
         """
