@@ -78,7 +78,7 @@ FloatArray = NDArray[np.float32]
 CameraImage = NDArray[np.uint8 | np.uint16]
 """[H, W, 3] uint8 in RGB, or a depth image [H, W] uint16."""
 ImageFit = Literal["stretch", "crop", "pad"]
-"""Fit of a camera image: change the proportions, crop the longer sides, or add black bars."""
+"""Fit of a camera image: change the proportions, crop longer sides evenly, or add black bars."""
 ImageChannels = Literal["rgb", "bgr", "depth"]
 StateFrame = Literal["ned_frd", "enu_flu"]
 Arrays = Literal["numpy", "torch"]
@@ -393,7 +393,7 @@ def _is_within(value: object, low: float, high: float) -> bool:
 
 
 def history_ages_ns(length: int, dt_s: float) -> Sequence[int]:
-    """Return the ages of the actions in a history, oldest first; the newest has age ``dt_s``.
+    """Return the ages at the tick of a history's actions, oldest first; the newest is ``dt_s`` old.
 
     An action holds until the next one is sent, so the action at a time is the newest one sent by
     then. After a release, and before the first action, it is neutral.

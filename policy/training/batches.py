@@ -215,7 +215,7 @@ class Batches:
     def validation(self, samples: int, size: int) -> Iterator[Batch]:
         """Return the same samples at each call, not augmented, with inputs hidden as in training.
 
-        By body rates, the best weights would otherwise be weights that copy.
+        Otherwise, validation by body rates would favour weights that copy.
         """
         frames, count = self.frames, self._settings.batch_size
         chosen = frames[np.linspace(0, len(frames) - 1, min(samples, len(frames))).astype(int)]
