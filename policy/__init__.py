@@ -1,5 +1,6 @@
-"""Vision policies: networks, how they run, train and are stored; ``policy.contract`` is the way in.
+"""Vision policies: networks, engines, training and checkpoints. Start at ``policy.contract``.
 
-Nothing here speaks MAVLink or reads a clock of its own. A policy, file or flight that cannot be
-used raises a ``policy.errors.PolicyError`` or one of its kinds; its message says what to do.
+Nothing here speaks MAVLink or reads a clock other than an injected one. A policy, file or flight
+that cannot be used raises a ``policy.errors.PolicyError`` or a subclass; the message names the next
+step.
 """

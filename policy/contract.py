@@ -1,7 +1,7 @@
 """A policy's inputs and outputs: names, order, frames, shapes, times.
 
-This is the only module of ``policy`` that the loops see; it imports numpy alone. A checkpoint
-carries its ``Contract`` in the header, and the bridge refuses one that it cannot keep.
+This is the only module of ``policy`` that the loops depend on; it imports only numpy. A checkpoint
+carries its ``Contract`` in the header, and the bridge rejects a contract that it cannot keep.
 """
 
 import json
@@ -16,7 +16,7 @@ from policy.errors import ContractError
 from policy.files import parse_json
 
 CONTRACT_VERSION, OLDEST_VERSION = 6, 4
-"""Of contracts that are written, and the oldest that are read."""
+"""Version of contracts that are written, and the oldest version that can be read."""
 NS_PER_S = 1_000_000_000
 
 STATE_NAMES = (
@@ -34,10 +34,10 @@ SINCE_EXPOSURE_NAMES = (
     *("rotation_x_rad", "rotation_y_rad", "rotation_z_rad"),
     *("velocity_change_x_mps", "velocity_change_y_mps", "velocity_change_z_mps"),
 )
-"""From the exposure of the image to the state, appended to the state where a contract asks for it.
+"""Motion from the image's exposure to the state, appended to the state if a contract asks for it.
 
-Time between them, a little below zero where the image is newer than the attitude; the body's
-rotation vector; the change of its velocity. Both vectors in the body's axes at the exposure.
+Elapsed time, slightly negative if the image is newer than the attitude; rotation vector of the
+body; change of its velocity. Both vectors are in body axes at the exposure.
 """
 SINCE_EXPOSURE_DIM = len(SINCE_EXPOSURE_NAMES)
 StateExtra = Literal["goal", "height", "altitude"]
@@ -46,9 +46,12 @@ EXTRA_NAMES: dict[StateExtra, tuple[str, ...]] = {
     "height": ("height_above_home_m",),
     "altitude": ("altitude_m",),
 }
-"""Behind all that, where a contract asks for it: from the vehicle to the goal of the flight, in the
-world's axes of ``Contract.state_frame``; height above the home position; height above the
-estimator's origin. Heights are positive upwards in both frames."""
+"""Optional inputs appended to the state.
+
+Vector from the vehicle to the flight's goal, in the world axes of ``Contract.state_frame``; height
+above the home position; height above the estimator's origin. Heights are positive upwards in both
+frames.
+"""
 AGE, ROTATION, VELOCITY_CHANGE = slice(13, 14), slice(14, 17), slice(17, 20)
 
 ACTION_NAMES = ("throttle", "yaw", "pitch", "roll")
@@ -62,11 +65,11 @@ ActionKind = Literal["sticks", "rates", "attitude", "velocity"]
 - attitude: collective thrust in [0, 1]; roll and pitch in rad; yaw rate in rad/s.
 - velocity: x, y, z in m/s; yaw rate in rad/s.
 
-Axes and signs of the last three are those of ``Contract.state_frame``: in ned_frd a positive pitch
-is nose up and a positive yaw rate nose right, in enu_flu both are the other way round.
+Axes and signs of rates, attitude and velocity follow ``Contract.state_frame``: in ned_frd a
+positive pitch is nose up and a positive yaw rate nose right, in enu_flu nose down and nose left.
 """
 VelocityFrame = Literal["world", "heading"]
-"""Velocities along the world's axes, or along level axes that turn with the nose."""
+"""Frame of velocity actions: world axes, or level axes that turn with the nose."""
 
 IMAGENET_MEAN_RGB = (0.485, 0.456, 0.406)
 IMAGENET_STD_RGB = (0.229, 0.224, 0.225)
@@ -75,8 +78,7 @@ FloatArray = NDArray[np.float32]
 CameraImage = NDArray[np.uint8 | np.uint16]
 """[H, W, 3] uint8 in RGB, or a depth image [H, W] uint16."""
 ImageFit = Literal["stretch", "crop", "pad"]
-"""How an image takes the shape that a policy wants: by other proportions, by cutting its longer
-sides off evenly, or by black bars."""
+"""Fit of a camera image: change the proportions, crop longer sides evenly, or add black bars."""
 ImageChannels = Literal["rgb", "bgr", "depth"]
 StateFrame = Literal["ned_frd", "enu_flu"]
 Arrays = Literal["numpy", "torch"]
@@ -84,9 +86,9 @@ STICK_MODES = (
     *("STABILIZE", "ACRO", "ALT_HOLD", "LOITER", "POSHOLD", "SPORT", "DRIFT"),
     *("MANUAL", "STABILIZED", "ALTCTL", "POSCTL"),
 )
-"""Autopilot modes that are flown with sticks: ArduPilot copter, then PX4; PX4 has ACRO as well."""
+"""Autopilot modes for stick actions: ArduPilot's copter modes, then PX4's; ACRO exists in both."""
 ATTITUDE_MODES = ("GUIDED_NOGPS", "GUIDED", "OFFBOARD")
-"""Modes that follow an attitude or body rates; the first needs no position."""
+"""Autopilot modes that follow an attitude or body rates; the first needs no position."""
 ACTION_MODES: dict[ActionKind, tuple[str, ...]] = {
     "sticks": STICK_MODES,
     "rates": ATTITUDE_MODES,
@@ -94,15 +96,15 @@ ACTION_MODES: dict[ActionKind, tuple[str, ...]] = {
     "velocity": ("GUIDED", "OFFBOARD"),
 }
 LEAST = 1e-3
-"""Smallest time in seconds, and smallest of any other quantity that something is divided by."""
+"""Least time in seconds, and least value of any other quantity that is a divisor."""
 LEAST_RATE_HZ = 0.01
 MOST_PIXEL = 1e3
-"""Largest mean and deviation of an image, whose pixels are in [0, 1]."""
+"""Largest mean and standard deviation of an image; its pixels are in [0, 1]."""
 MAX_AGE_LIMIT_S = 60.0
 ENVELOPE_TERMS = ("max_tilt_deg", "max_speed_mps", "max_height_m", "max_distance_m")
 _CHUNK_AGES = ("max_state_age_s", "max_velocity_age_s", "max_feature_age_s", "max_chunk_age_s")
 FLIGHT_TERMS = ("action", "modes", *_CHUNK_AGES, *ENVELOPE_TERMS)
-"""What decides how a policy is flown, and not what its network computes."""
+"""Fields that decide how a policy is flown and do not affect its network's output."""
 _TUPLES = (
     *("cameras", "camera_rates_hz", "image_crop", "state_extras"),
     *("image_mean_rgb", "image_std_rgb"),
@@ -135,16 +137,16 @@ _NUMBERS: dict[str, tuple[float, float, str]] = {
     **dict.fromkeys(("full_climb_mps", "full_descent_mps"), (LEAST, 100.0, "m/s")),
     "depth_unit_m": (1e-6, 1.0, "m"),
 }
-"""Least and most of each number, and their unit."""
+"""Minimum, maximum and unit of each number."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Contract:
-    """The interface of one policy, and the terms under which it may fly.
+    """Interface of one policy, and the terms under which it may fly.
 
     Times are seconds, never ticks: one checkpoint behaves the same at 50, 100 or 250 Hz. Ages are
-    judged when a stick leaves for the autopilot, not when a computation starts; the configuration
-    of a flight may tighten their limits, never loosen them.
+    judged when a command leaves for the autopilot, not when its computation starts. A flight's
+    configuration may tighten their limits, never loosen them.
     """
 
     state_frame: StateFrame = "ned_frd"
@@ -154,77 +156,78 @@ class Contract:
     image_mean_rgb: tuple[float, float, float] = IMAGENET_MEAN_RGB
     image_std_rgb: tuple[float, float, float] = IMAGENET_STD_RGB
     image_crop: tuple[float, float, float, float] = (0.0, 0.0, 1.0, 1.0)
-    """Part of the camera's image that is used: top, left, bottom, right, as shares of its height
-    and width. It is cut out before the image is resized."""
+    """Part of the camera image to use: top, left, bottom, right, as shares of its height and width.
+    It is cut out before the image is resized."""
     image_fit: ImageFit = "stretch"
     image_channels: ImageChannels = "rgb"
-    """Order of the three channels; the mean and deviation are by colour, whatever the order. With
-    "depth" there is one channel, the distance along the optical axis in metres, float32, neither
-    scaled nor shifted; 0 where it is not known. It takes a camera of depth."""
+    """Order of the three channels. Mean and deviation are in the order red, green, blue in any
+    case. With "depth" there is one channel, float32: the distance along the optical axis in metres,
+    neither scaled nor shifted, 0 if unknown. It needs a depth camera."""
     depth_unit_m: float = 0.001
-    """Metres of one step of a depth camera's 16-bit pixels; 0.001 is millimetres."""
+    """Metres per step of a depth camera's 16-bit pixels; 0.001 means millimetres."""
     cameras: tuple[str, ...] = ("front",)
-    """Names of the cameras, in the order of their features; all images are of one size."""
+    """Names of the cameras, in the order of their features; all images have one size."""
     camera_rates_hz: tuple[float, ...] = ()
-    """Most images a second of each camera; empty: the visual rate of the flight for all."""
+    """Highest image rate of each camera; empty: the flight's visual rate for all."""
     feature_dim: int = 0
-    """F of encode_visual's [B, F], for one camera; 0 where there is no fast path."""
+    """F of encode_visual's [B, F], for one camera; 0 without a fast path."""
     observation_steps: int = 1
-    """T states and T images of each camera, oldest first, the last ones the newest."""
+    """Number T of states, and of images of each camera, in one input; oldest first."""
     observation_dt_s: float = 0.1
-    """Time between them."""
+    """Time between observations."""
     horizon: int = 16
     chunk_dt_s: float = 0.05
     """Time between the actions of a chunk; action 0 acts at the time of the state."""
     history_len: int = 4
-    """K past actions, oldest first, as they were sent."""
+    """Number K of past actions, as sent, oldest first."""
     history_dt_s: float = 0.05
-    """Time between them; the newest is history_dt_s before the state."""
+    """Time between past actions; the newest is history_dt_s before the state."""
     arrays: Arrays = "torch"
     since_exposure: bool = False
-    """The state is followed by ``SINCE_EXPOSURE_NAMES``."""
+    """True: append ``SINCE_EXPOSURE_NAMES`` to the state."""
     state_extras: tuple[StateExtra, ...] = ()
-    """Further inputs behind the state, in this order: ``EXTRA_NAMES``."""
+    """Further inputs appended to the state, in this order; see ``EXTRA_NAMES``."""
     play_s: float = 0.0
-    """Longest time for which the policy was meant to play one chunk before the next one; the four
-    age limits below count from its beginning. 0: a new chunk from every new state."""
+    """Longest time for which the policy was designed to play one chunk before the next; the four
+    age limits count from the chunk's beginning. 0: a new chunk from every new state."""
     action: ActionKind = "sticks"
     velocity_frame: VelocityFrame = "world"
     hover_thrust: float = 0.39
-    """Thrust that hovers, as in training; a vehicle that hovers at another one gets all in
-    proportion. For rates and attitude; 0.39 is the bundled simulator's."""
+    """Hover thrust in training; a vehicle with another hover thrust gets all thrust in proportion.
+    For rates and attitude. 0.39 is the bundled simulator's."""
     full_lean_deg: float = 30.0
-    """Vehicle motion at full stick, in training; linear from the dead zone on. For sticks, in modes
-    that hold the height, as the next six; the defaults are ArduCopter's own."""
+    """Roll and pitch at full stick, in training; linear outside the dead zone. This and the six
+    stick fields below it apply to sticks in modes that hold the height; the defaults are
+    ArduCopter's."""
     full_yaw_rate_degps: float = 202.5
     full_climb_mps: float = 2.5
     full_descent_mps: float = 2.5
     lean_dead_zone: float = 0.04
-    """Share of the stick's travel, to each side of the centre, that did nothing in training."""
+    """Dead zone of the stick in training, as a share of the travel to each side of the centre."""
     yaw_dead_zone: float = 0.04
     throttle_dead_zone: float = 0.2
     modes: tuple[str, ...] = ()
-    """Autopilot modes in which the policy may fly, best first: the same sticks mean a lean angle in
-    one and a body rate in another. Empty: the usual ones of ``action``."""
+    """Autopilot modes in which the policy may fly, best first: equal sticks mean a lean angle in
+    one mode and a body rate in another. Empty: the usual modes of ``action``."""
     max_state_age_s: float = 0.1
-    """Oldest attitude and body rates that a stick may come from."""
+    """Maximum age of the attitude and body rates behind a command."""
     max_velocity_age_s: float = 0.25
-    """Oldest velocity and acceleration."""
+    """Maximum age of the velocity and acceleration behind a command."""
     max_feature_age_s: float = 0.3
-    """Oldest image, since its exposure."""
+    """Maximum age of the image behind a command, since its exposure."""
     max_chunk_age_s: float = 0.3
-    """Longest time since the chunk was computed."""
+    """Maximum time since the chunk was computed."""
     max_stall_s: float = 0.25
-    """Longest time to fly on along a chunk when no newer one comes; never beyond its horizon. The
-    ages of a chunk are judged as it is taken, and grow by as much meanwhile."""
+    """Longest time to fly on along a chunk while no newer one arrives; never beyond its horizon.
+    The ages of a chunk are judged when it is accepted, and grow during the stall."""
     max_tilt_deg: float | None = None
-    """Largest lean, in degrees, before the policy loses the sticks. For this and the next three,
-    None leaves the limit to the flight's configuration; a number may widen it."""
+    """Largest lean before the policy loses control. None, here and in the three limits below,
+    leaves the limit to the flight's configuration; a number may widen it."""
     max_speed_mps: float | None = None
     max_height_m: float | None = None
-    """Above the estimator's origin, where the vehicle was switched on."""
+    """Height above the estimator's origin, where the vehicle was switched on."""
     max_distance_m: float | None = None
-    """From the estimator's origin, horizontally."""
+    """Horizontal distance from the estimator's origin."""
     version: int = field(default=CONTRACT_VERSION, init=False)
 
     def __post_init__(self) -> None:
@@ -314,13 +317,13 @@ class Contract:
 
     @property
     def state_names(self) -> tuple[str, ...]:
-        """Numbers of the state that the policy takes, in their order."""
+        """Numbers of the state that the policy takes, in order."""
         extras = [name for extra in self.state_extras for name in EXTRA_NAMES[extra]]
         return STATE_NAMES + (SINCE_EXPOSURE_NAMES if self.since_exposure else ()) + (*extras,)
 
     @property
     def state_dim(self) -> int:
-        """Width of the state that the policy takes: 13, 20 with ``since_exposure``, and extras."""
+        """Width of the policy's state: 13, or 20 with ``since_exposure``, plus the extras."""
         return len(self.state_names)
 
     @property
@@ -330,26 +333,29 @@ class Contract:
 
     @property
     def feature_shape(self) -> tuple[int, ...]:
-        """Shape of what ``predict_fast`` takes, without the batch: [F] or [T, F].
+        """Shape of the feature argument of ``predict_fast``, without the batch: [F] or [T, F].
 
-        F is that of all cameras, one behind the other.
+        F spans the concatenated features of all cameras.
         """
         return self._stacked(self.feature_dim * len(self.cameras))
 
     @property
     def is_depth(self) -> bool:
-        """It takes depth images."""
+        """True if the policy takes depth images."""
         return self.image_channels == "depth"
 
     @property
     def picture_shape(self) -> tuple[int, ...]:
-        """Shape of a camera's image once it is fitted: [H, W, 3], or [H, W] of depth."""
+        """Shape of a fitted camera image: [H, W, 3], or [H, W] for depth."""
         return (self.image_height, self.image_width, *(() if self.is_depth else (3,)))
 
     @property
     def image_shape(self) -> tuple[int, ...]:
-        """Shape of what ``predict`` takes, without the batch: [3, H, W], [N, 3, H, W] with several
-        cameras, and a T before that with several observations; of depth 1 in place of 3."""
+        """Shape of the image argument of ``predict``, without the batch.
+
+        [3, H, W], or [N, 3, H, W] with several cameras; several observations add a leading T; depth
+        has 1 channel.
+        """
         each = (1 if self.is_depth else 3, self.image_height, self.image_width)
         return self._stacked(*(each if len(self.cameras) == 1 else (len(self.cameras), *each)))
 
@@ -357,12 +363,12 @@ class Contract:
         return shape if self.observation_steps == 1 else (self.observation_steps, *shape)
 
     def to_json(self) -> str:
-        """Header form of a checkpoint."""
+        """Return the form that is stored in a checkpoint's header."""
         return json.dumps(asdict(self), sort_keys=True)
 
     @classmethod
     def from_json(cls, text: str) -> "Contract":
-        """Read the header form; an older one gets the defaults of the fields that came later."""
+        """Read the header form; fields that an older version lacks get their defaults."""
         try:
             data: Any = parse_json(text)
         except ValueError as error:
@@ -387,10 +393,10 @@ def _is_within(value: object, low: float, high: float) -> bool:
 
 
 def history_ages_ns(length: int, dt_s: float) -> Sequence[int]:
-    """Ages of the sticks in a history, oldest first; the newest is ``dt_s`` before the tick.
+    """Return the ages at the tick of a history's actions, oldest first; the newest is ``dt_s`` old.
 
-    A stick holds until the next one is sent, so the one at a time is the newest sent by then.
-    Released sticks, and those before the first was sent, are neutral.
+    An action holds until the next one is sent, so the action at a time is the newest one sent by
+    then. After a release, and before the first action, it is neutral.
     """
     dt_ns = round(dt_s * NS_PER_S)
     return range(length * dt_ns, 0, -dt_ns)

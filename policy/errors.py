@@ -1,6 +1,6 @@
-"""The root of every expected error, those of policies, and notes that warn.
+"""Base class of all expected errors, errors of policies, and notes for the user.
 
-``mavbridge.core.errors`` has the rest. They lie here because ``policy`` imports nothing of
+``mavbridge.core.errors`` has the rest. These are here because ``policy`` imports nothing from
 ``mavbridge``.
 """
 
@@ -14,51 +14,51 @@ _WARNING = "warning: "
 
 
 class MavbridgeError(Exception):
-    """Base of all expected errors; printed without a traceback."""
+    """Base class of all expected errors; printed without a traceback."""
 
     exit_code: int = 2
-    """Status with which the process ends; ``mavbridge.core.errors`` says what each means."""
+    """Exit status of the process; ``mavbridge.core.errors`` lists the meanings."""
 
 
 class PolicyError(MavbridgeError):
-    """A policy, contract, checkpoint or dataset that cannot be used; says what to do."""
+    """Unusable policy, contract, checkpoint or dataset; the message names the next step."""
 
 
 class ContractError(PolicyError):
-    """A contract that is malformed or that the bridge cannot keep."""
+    """Malformed contract, or contract that the bridge cannot keep."""
 
 
 class CheckpointError(PolicyError):
-    """A checkpoint that cannot be read, or does not fit; the message says what to do."""
+    """Checkpoint that cannot be read or does not fit; the message names the next step."""
 
 
 class NoChunkError(PolicyError):
-    """A policy that has no chunk for this state, and may have one for the next.
+    """The policy has no chunk for this state, but may have one for the next state.
 
-    The flight goes on by the last chunk for as long as its limits permit. The message is the reason
-    that the user is shown.
+    The flight continues along the last chunk while its limits permit. The user sees the message as
+    the reason.
     """
 
 
 class Warned(str):
-    """A note that something is not as it was asked for."""
+    """Note that something differs from the user's request."""
 
     __slots__ = ()
 
     @property
     def text(self) -> str:
-        """The note without the word in front."""
+        """Text of the note, without the word in front."""
         return self[len(_WARNING) :]
 
 
 class Agreed(str):
-    """A note that the engine computes what torch computes."""
+    """Note that the engine's output agrees with torch's."""
 
     __slots__ = ()
 
 
 def warned(text: str) -> Warned:
-    """Return a warning, shown with that word in front."""
+    """Return a warning; it is printed with that word in front."""
     return Warned(_WARNING + text)
 
 
@@ -66,8 +66,8 @@ def warned(text: str) -> Warned:
 def user_code(doing: str) -> Iterator[None]:
     """Turn any exception of a user's policy into a ``PolicyError`` with its file and line.
 
-    The message begins with ``doing``; an exception that is a ``PolicyError`` already passes. A
-    ``sys.exit`` is one as well: it would end the flight silently, with a status of its own.
+    The message begins with ``doing``. A ``PolicyError`` passes unchanged. ``sys.exit`` is converted
+    too: it would end the flight silently, with an arbitrary status.
     """
     try:
         yield

@@ -1,4 +1,4 @@
-"""The one door to files that people name: paths, text encodings, damage, JSON and TOML."""
+"""Access to files that users name: paths, text encodings, damage, JSON and TOML."""
 
 import codecs
 import errno
@@ -18,27 +18,27 @@ from policy.errors import CheckpointError
 MAX_TEXT_BYTES = 100_000_000
 MAX_TOML_BYTES = 64 * 1024
 MAX_TOML_LINE = 2_000
-"""Characters. Memory and time of ``tomllib`` grow with the square of the dots in a key, which has
-to end with its line: 200 kB of ``a.a.a`` took more than 10 GB."""
+"""Longest line [characters]. Time and memory of ``tomllib`` grow with the square of the dots in a
+key, and a key ends with its line: 200 kB of ``a.a.a`` took more than 10 GB."""
 _HEAD_BYTES = 4096
 _WIDE_MARKS = (codecs.BOM_UTF32_LE, codecs.BOM_UTF32_BE, codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)
 
 
 def user_path(name: str | Path) -> Path:
-    """Return the path that a user's flag or setting names, with ``~`` expanded."""
+    """Return the path of a user's flag or setting, with ``~`` expanded."""
     try:
         return Path(name).expanduser()
-    except RuntimeError:  # ~ of an account that does not exist: a file may have that name
+    except RuntimeError:  # ~ of an unknown account: a file may have that name
         return Path(name)
 
 
 def library_name(path: Path) -> str:
-    """Return an absolute name: FFmpeg and Arrow take ``10:30.mp4`` for an address."""
+    """Return an absolute path: FFmpeg and Arrow mistake ``10:30.mp4`` for an address."""
     return os.path.abspath(path)  # noqa: PTH100 - Path.absolute keeps ".."
 
 
 def open_regular(path: Path) -> BinaryIO:
-    """Open a file for reading without ever waiting: a pipe without a writer has no end of it.
+    """Open a regular file for reading. Never blocks; a pipe without a writer would.
 
     Raises:
         OSError: it cannot be opened, or is a pipe, a device or a folder.
@@ -51,7 +51,7 @@ def open_regular(path: Path) -> BinaryIO:
 
 
 def stand_in(path: Path) -> tuple[str, str] | None:
-    """Return what lies in place of a file's content and the remedy, as ``stand_in_of``, or None."""
+    """Return the actual content of an unusable file and the remedy, as ``stand_in_of``, or None."""
     try:
         with open_regular(path) as file:
             return stand_in_of(file.read(_HEAD_BYTES))
@@ -60,7 +60,7 @@ def stand_in(path: Path) -> tuple[str, str] | None:
 
 
 def stand_in_of(head: bytes) -> tuple[str, str] | None:
-    """Return what a file that begins so holds in place of its content and the remedy, or None.
+    """Return a foreign file's real content, known by its first bytes, and the remedy; else None.
 
     Recognises empty files, Git LFS pointers, and web pages saved under a file's name.
     """
@@ -78,14 +78,16 @@ def stand_in_of(head: bytes) -> tuple[str, str] | None:
 
 
 def last_line(error: Exception) -> str:
-    """Return the last line of an error's text, or its type where it has none."""
+    """Return the last line of an error's text, or its type if the text is empty."""
     lines = [line.strip() for line in str(error).splitlines() if line.strip()]
     return lines[-1] if lines else type(error).__name__
 
 
 def why_unreadable(path: Path, error: Exception, kind: str = "") -> str:
-    """Return why a library could not read a file: its real content if known, else one line of the
-    library's own words. ``kind`` is the format that was expected."""
+    """Return why a library could not read a file: its real content, or one line of the error.
+
+    ``kind`` is the expected format.
+    """
     if isinstance(error, OSError) and error.strerror and not path.is_file():
         return f"{path}: {error.strerror.lower()}"
     if (found := stand_in(path)) is not None:
@@ -100,7 +102,7 @@ def why_unreadable(path: Path, error: Exception, kind: str = "") -> str:
 
 @contextmanager
 def whole_file(path: Path) -> Iterator[Path]:
-    """Yield the path of a draft, which takes the place of ``path`` at the end, or goes."""
+    """Yield the path of a draft; on success it replaces ``path``, else it is deleted."""
     draft = path.with_name(f"{path.name}.{os.getpid()}.partial")
     try:
         yield draft
@@ -111,7 +113,7 @@ def whole_file(path: Path) -> Iterator[Path]:
 
 @contextmanager
 def open_safetensors(path: Path, framework: str) -> Iterator[Any]:
-    """Open a safetensors file; raises CheckpointError if it is damaged, also while it is read."""
+    """Open a safetensors file; raise CheckpointError if it is damaged, also during later reads."""
     try:
         with safe_open(path, framework=framework) as file:
             yield file
@@ -120,11 +122,12 @@ def open_safetensors(path: Path, framework: str) -> Iterator[Any]:
 
 
 def read_text(path: Path, max_bytes: int = MAX_TEXT_BYTES) -> str:
-    """Read a text file in UTF-8, with or without a byte order mark.
+    """Read a UTF-8 text file, with or without a byte order mark.
 
     Raises:
         OSError: it cannot be opened.
-        ValueError: it is not UTF-8, or larger than ``max_bytes``; the message says what it is.
+        ValueError: it is not UTF-8, or larger than ``max_bytes``; the message names its
+            content.
     """
     with open_regular(path) as file:
         data = file.read(max_bytes + 1)
@@ -142,7 +145,7 @@ def read_text(path: Path, max_bytes: int = MAX_TEXT_BYTES) -> str:
 
 
 def parse_json(text: str) -> Any:
-    """Parse JSON; raises ValueError also where it is nested too deeply."""
+    """Parse JSON; raise ValueError for deep nesting too."""
     try:
         return json.loads(text)
     except RecursionError as error:
@@ -150,7 +153,7 @@ def parse_json(text: str) -> Any:
 
 
 def read_json(path: Path) -> Any:
-    """Read a JSON file; raises OSError, or ValueError as ``read_text`` and ``parse_json``."""
+    """Read a JSON file; raise OSError, or ValueError as ``read_text`` and ``parse_json``."""
     return parse_json(read_text(path))
 
 
@@ -176,6 +179,6 @@ def read_toml(path: Path) -> dict[str, Any]:
 
     Raises:
         OSError: it cannot be opened.
-        ValueError: not UTF-8, larger than MAX_TOML_BYTES, or as ``parse_toml``.
+        ValueError: not UTF-8, larger than MAX_TOML_BYTES, or not valid as in ``parse_toml``.
     """
     return parse_toml(read_text(path, MAX_TOML_BYTES))

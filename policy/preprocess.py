@@ -1,9 +1,9 @@
-"""From a camera image and a vehicle state to what a net takes: one copy for training and flight.
+"""Preprocessing of camera images and vehicle states, shared by training and flight.
 
-The image is cut, fitted and normalised here, before the net, by the checkpoint's contract. The
-state is turned into body axes and normalised inside the nets (``encoders.StateEncoder``) by the
-functions of this module, so that a checkpoint takes SI units. No torch: the scripted policies pass
-through here too.
+Images are cropped, fitted and normalised here, before the network, by the checkpoint's contract.
+Networks turn the state into body axes and normalise it inside (``encoders.StateEncoder``) by
+functions of this module, so a checkpoint takes SI units. No torch: scripted policies use this
+module too.
 """
 
 import math
@@ -26,38 +26,38 @@ STATE_SCALE = (
     *(3.0, 3.0, 3.0),  # rad/s: about ArduPilot's default yaw and roll rates at full stick
     *(9.80665, 9.80665, 9.80665),  # m/s^2: standard gravity
 )
-"""Over this, each dimension of the state lies within [-1, 1] in typical flight.
+"""Divisor of each number of the state; the quotient is within [-1, 1] in typical flight.
 
-Fixed, not taken from data: every checkpoint shares it, and a sensor that is off by a unit shows.
+Fixed, not estimated from data: all checkpoints share it, and a sensor in the wrong unit shows.
 """
 
 SINCE_EXPOSURE_SCALE = (
-    0.1,  # s: about the age of an image that is too old to be of use
+    0.1,  # s: about the age at which an image is too old to use
     *(0.5, 0.5, 0.5),  # rad: an image turned by half its width
     *(2.0, 2.0, 2.0),  # m/s: two tenths of a second of hard acceleration
 )
-"""As ``STATE_SCALE``, for what a contract may append to the state."""
+"""Divisors of ``SINCE_EXPOSURE_NAMES``, the optional numbers after the state."""
 
 EGOCENTRIC_SCALE = (
     *(5.0, 5.0, 5.0),  # m/s
     *(1.0, 1.0, 1.0),  # a unit vector
-    *STATE_SCALE[7:],  # body rates and specific force, as they are
+    *STATE_SCALE[7:],  # body rates and specific force, unchanged
 )
-"""Each dimension of ``egocentric_columns`` is divided by this."""
+"""Divisors of the numbers of ``egocentric_columns``."""
 
 
 def egocentric_scale(contract: Contract) -> tuple[float, ...]:
-    """The divisor of each dimension of ``egocentric_columns``."""
+    """Return the divisor of each number of ``egocentric_columns``."""
     return EGOCENTRIC_SCALE + (SINCE_EXPOSURE_SCALE if contract.since_exposure else ())
 
 
 def egocentric_columns(columns: Sequence[Any]) -> list[Any]:
-    """The state relative to the vehicle: the same on every heading, and for q as for -q.
+    """Return the state relative to the vehicle: independent of the heading and of the sign of q.
 
-    Velocity in body axes, the world's vertical axis in body axes, then rates, specific force and
-    whatever the contract appends, unchanged. No net has to learn rotations, and none can recognise
-    a course by its heading. Columns are floats or arrays of any kind, in the contract's order; 12
-    or 19 come out, one fewer than came in.
+    Velocity in body axes and the world's vertical axis in body axes, then rates, specific force and
+    the contract's optional inputs, unchanged. So a network has no rotations to learn, and cannot
+    recognise a course by its heading. Columns are floats or arrays of any library, in the
+    contract's order; the output has one number fewer than the input, 12 or 19.
     """
     vx, vy, vz, w, x, y, z, *rest = columns
     forward, side, up = matrix_columns(w, x, y, z)
@@ -66,7 +66,7 @@ def egocentric_columns(columns: Sequence[Any]) -> list[Any]:
 
 
 def egocentric(state: FloatArray, contract: Contract) -> FloatArray:
-    """State [B, state_dim] in SI units -> normalised input of a net [B, state_dim - 1]."""
+    """Convert a state [B, state_dim] in SI units to a network's input [B, state_dim - 1]."""
     scale = egocentric_scale(contract)
     rows = [
         [value / unit for value, unit in zip(egocentric_columns(row), scale, strict=True)]
@@ -76,10 +76,10 @@ def egocentric(state: FloatArray, contract: Contract) -> FloatArray:
 
 
 def image_to_input(image: CameraImage, contract: Contract) -> FloatArray:
-    """Camera's image of any size -> float32 [1, 3, image_height, image_width]; depth [1, 1, ...].
+    """Convert a camera image to float32 [1, 3, image_height, image_width]; depth [1, 1, ...].
 
-    It is fitted by ``fit_image``, then normalised as ``(value / 255 - mean) / std`` by the
-    contract, with the channels in the contract's order; depth becomes metres.
+    ``fit_image`` fits it, then ``(value / 255 - mean) / std`` of the contract normalises it, with
+    the channels in the contract's order. Depth is converted to metres.
     """
     fitted = fit_image(image, contract)
     if contract.is_depth:
@@ -108,16 +108,16 @@ def input_to_bytes(planes: FloatArray, contract: Contract) -> FloatArray:
 
 
 def dummy_images(contract: Contract) -> CameraImage:
-    """Grey images, or distances of 2000 units, of all cameras at all observations.
+    """Return grey images, or depth images of 2000 units, of all cameras at all observations.
 
-    Axes before those of ``Contract.picture_shape`` are as in ``Contract.image_shape``.
+    The leading axes are as in ``Contract.image_shape``; the last are ``Contract.picture_shape``.
     """
     shape = (*contract.image_shape[:-3], *contract.picture_shape)
     return np.full(shape, 2000, np.uint16) if contract.is_depth else np.full(shape, 128, np.uint8)
 
 
 def fit_image(image: CameraImage, contract: Contract) -> CameraImage:
-    """Camera's image of any size -> the contract's part of it, of ``Contract.picture_shape``."""
+    """Crop and resize a camera image of any size by the contract, to ``Contract.picture_shape``."""
     kind = (np.dtype(np.uint16), ()) if contract.is_depth else (np.dtype(np.uint8), (3,))
     if image.ndim < 2 or (image.dtype, image.shape[2:]) != kind or 0 in image.shape:
         wanted = (
@@ -147,7 +147,7 @@ def fit_image(image: CameraImage, contract: Contract) -> CameraImage:
 
 
 def least_source_px(contract: Contract) -> int:
-    """Side that a camera's image should have, so that none of it must be enlarged."""
+    """Return the smallest side of a camera image [px] of which no part has to be enlarged."""
     top, left, bottom, right = contract.image_crop
     return math.ceil(
         max(contract.image_height / (bottom - top), contract.image_width / (right - left))
@@ -155,7 +155,7 @@ def least_source_px(contract: Contract) -> int:
 
 
 def _part(length: int, start: float, end: float) -> slice:
-    """Pixels between two shares of a side; at least one."""
+    """Return the pixels between two shares of a side; at least one."""
     first = min(round(start * length), length - 1)
     return slice(first, max(round(end * length), first + 1))
 
@@ -165,13 +165,13 @@ def _at_least_1(pixels: float) -> int:
 
 
 def resize(rgb: NDArray[_Pixel], height: int, width: int) -> NDArray[_Pixel]:
-    """[H, W, 3] -> [height, width, 3], or [H, W] of depth; the same array if it has that size."""
+    """Resize [H, W, 3] to [height, width, 3], or depth [H, W]; no copy if the size fits."""
     if rgb.shape[:2] == (height, width):
         return rgb
     shrinks = rgb.shape[0] > height or rgb.shape[1] > width
     # Area averaging does not alias when shrinking; it is nearest-neighbour when enlarging.
     interpolation = cv2.INTER_AREA if shrinks else cv2.INTER_LINEAR
-    if rgb.ndim == 2:  # between a near and a far pixel, or an unknown one, there is no distance
+    if rgb.ndim == 2:  # averages of near, far or unknown pixels are not distances
         interpolation = cv2.INTER_NEAREST
     resized = cv2.resize(np.ascontiguousarray(rgb), (width, height), interpolation=interpolation)
     return resized.astype(rgb.dtype, copy=False)

@@ -1,7 +1,7 @@
-"""Rotations as unit quaternions (w, x, y, z), world_from_body: one formula for flight and training.
+"""Rotations as unit quaternions (w, x, y, z), world_from_body; shared by flight and training.
 
-Every function takes tuples of floats, as the 100 Hz loop has them, or arrays [..., 4] of many
-quaternions and [..., 3] of vectors, and returns the same kind.
+Every function takes tuples of floats, as the 100 Hz loop has them, or arrays: [..., 4] quaternions
+and [..., 3] vectors. It returns the same kind.
 """
 
 import math
@@ -20,7 +20,7 @@ Kind = TypeVar("Kind")
 
 
 def multiply(p: Q, q: Q) -> Q:
-    """Hamilton product ``p * q``: first ``q``, then ``p``."""
+    """Return the Hamilton product ``p * q``: first ``q``, then ``p``."""
     w, x, y, z = _parts(p)
     a, b, c, d = _parts(q)
     return _like(
@@ -33,13 +33,13 @@ def multiply(p: Q, q: Q) -> Q:
 
 
 def conjugate(q: Q) -> Q:
-    """The inverse rotation."""
+    """Return the inverse rotation."""
     w, x, y, z = _parts(q)
     return _like(q, w, -x, -y, -z)
 
 
 def rotate(q: Q, vector: V) -> V:
-    """Vector in body axes -> world axes; with the conjugate, the other way round."""
+    """Rotate a vector from body to world axes; with the conjugate, from world to body axes."""
     w, x, y, z = _parts(q)
     a, b, c = _parts(vector)
     # q v q* = v + 2 u x (u x v + w v), where u is the vector part of q.
@@ -50,7 +50,7 @@ def rotate(q: Q, vector: V) -> V:
 
 
 def matrix_columns(w: Any, x: Any, y: Any, z: Any) -> tuple[tuple[Any, Any, Any], ...]:
-    """Columns of the matrix world_from_body: the body's axes in the world; numbers of any kind."""
+    """Return the columns of world_from_body: the body's axes in the world; any number type."""
     forward = (1 - 2 * (y * y + z * z), 2 * (x * y + w * z), 2 * (x * z - w * y))
     side = (2 * (x * y - w * z), 1 - 2 * (x * x + z * z), 2 * (y * z + w * x))
     up = (2 * (x * z + w * y), 2 * (y * z - w * x), 1 - 2 * (x * x + y * y))
@@ -58,7 +58,7 @@ def matrix_columns(w: Any, x: Any, y: Any, z: Any) -> tuple[tuple[Any, Any, Any]
 
 
 def rotation_vector(q: Quaternion | Array) -> Any:
-    """Axis times angle in rad, 3 numbers, the shorter way round."""
+    """Return axis times angle in rad, 3 numbers, for the shorter way round."""
     library: Any = math if isinstance(q, tuple) else np
     w, x, y, z = _parts(q)
     sign = library.copysign(1.0, w)
@@ -69,7 +69,7 @@ def rotation_vector(q: Quaternion | Array) -> Any:
 
 
 def slerp(p: Q, q: Q, share: Any) -> Q:
-    """The attitude after ``share`` (float or [...]) of an even turn from ``p`` to ``q``."""
+    """Return the attitude after ``share`` (float or [...]) of a steady turn from ``p`` to ``q``."""
     library: Any = math if isinstance(p, tuple) else np
     x, y, z = _parts(rotation_vector(multiply(conjugate(p), q)))
     angle = library.sqrt(x * x + y * y + z * z)
@@ -81,10 +81,10 @@ def slerp(p: Q, q: Q, share: Any) -> Q:
 def motion_since_exposure(
     attitude_then: Q, attitude_now: Q, velocity_change_world: V
 ) -> tuple[V, V]:
-    """Rotation vector (rad) and change of velocity (m/s) in the body axes at the exposure.
+    """Return rotation vector (rad) and change of velocity (m/s) in body axes at the exposure.
 
-    Between two readings, the body turns at a constant rate and accelerates evenly; outside of all
-    readings it does neither.
+    Between two readings, angular velocity and acceleration are constant; before the first and after
+    the last reading both are zero.
     """
     body_from_world = conjugate(attitude_then)
     turn: V = rotation_vector(multiply(body_from_world, attitude_now))
@@ -92,7 +92,7 @@ def motion_since_exposure(
 
 
 def _parts(values: Any) -> Any:
-    """Components, each a float or an array [...]."""
+    """Return the components, each a float or an array [...]."""
     return values if isinstance(values, tuple) else np.moveaxis(values, -1, 0)
 
 

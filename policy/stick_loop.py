@@ -1,12 +1,10 @@
-"""Flies sticks by thrust and body rates: closes attitude and climb, at the action rate.
+"""Converts sticks to thrust and body rates: closes attitude and climb loops at the action rate.
 
-This project's networks compute sticks, also where their contract says rates: the lean, yaw rate and
-climb that an autopilot's height-holding mode would be asked for, full stick by the contract. There
-the autopilot closes the loops that fly them; by rates, this does, from the newest state. So the
-image decides where to go, and the attitude never waits for it.
-
-A network that was trained on thrust and rates themselves copied the vehicle's own rates and flew
-into the first gates; see ``docs/dev/log.md``.
+The built-in networks compute sticks, even if their contract says rates: lean, yaw rate and climb as
+for an autopilot mode that holds the height, with full stick by the contract. In such a mode the
+autopilot closes the loops; with rates, this module does, from the newest state. So the image
+decides the direction, and the attitude never waits for it. A network trained on thrust and rates
+directly copied the vehicle's own rates and flew into the first gates; see ``docs/dev/log.md``.
 """
 
 import math
@@ -29,23 +27,23 @@ from policy.rotation import Array, Quaternion, Vector, conjugate, matrix_columns
 
 GRAVITY_MPS2 = 9.80665
 TILT_GAIN_PER_S = 8.0
-"""Body rate for an error of the tilt; the gain of the expert that demonstrates."""
+"""Body rate per tilt error [1/s]; the gain of the expert that demonstrates."""
 CLIMB_GAIN_PER_S = 4.0
 LAG_S = 0.06
-"""From a rate command to the rate: motors, and the loop before them."""
+"""Lag from rate command to rate: motors and rate controller."""
 MAX_TILT_RATE_RADPS = math.radians(200.0)
 UP_FORCE_MPS2 = (3.0, 21.0)
-"""Least and most vertical specific force."""
+"""Least and largest vertical specific force."""
 MIN_COS_TILT = 0.35
-"""In a steeper lean the thrust no longer holds the height."""
+"""Cosine of the lean beyond which the thrust no longer holds the height."""
 RATES_FULL_LEAN_DEG = 65.0
 RATES_FULL_YAW_RATE_DEGPS = 115.0
 RATES_FULL_CLIMB_MPS = 6.0
-"""What full stick means to a network that learns from flights by rates."""
+"""Motion at full stick of a network that learns from flights by rates."""
 
 
 class StickMotion(NamedTuple):
-    """Motion that sticks ask for; leans are forwards and to the right."""
+    """Motion that sticks demand; leans are forward and to the right."""
 
     climb_mps: float
     yaw_rate_radps: float
@@ -56,7 +54,7 @@ class StickMotion(NamedTuple):
 def motion_of_sticks(
     contract: Contract, throttle: float, yaw: float, pitch: float, roll: float
 ) -> StickMotion:
-    """Motion that sticks in [-1, 1] ask for, by full stick and dead zones of the contract."""
+    """Return the motion that sticks in [-1, 1] demand by the contract's ranges and dead zones."""
     climb = _beyond(throttle, contract.throttle_dead_zone)
     lean_rad = math.radians(contract.full_lean_deg)
     return StickMotion(
@@ -68,12 +66,12 @@ def motion_of_sticks(
 
 
 def by_rates(contract: Contract) -> Contract:
-    """Contract of a network that computes sticks, flown by thrust and body rates."""
+    """Return the contract of a network of sticks that is flown by thrust and body rates."""
     return contract if contract.action == "rates" else replace(contract, action="rates", modes=())
 
 
 def rates_contract(contract: Contract) -> Contract:
-    """Contract of a network that learns from flights by rates."""
+    """Return the contract of a network that learns from flights by rates."""
     return replace(
         by_rates(contract),
         full_lean_deg=RATES_FULL_LEAN_DEG,
@@ -87,9 +85,9 @@ def rates_contract(contract: Contract) -> Contract:
 
 
 def flown_by_rates(runner: PolicyRunner) -> PolicyRunner:
-    """A runner whose chunks are sticks, flown by thrust and body rates.
+    """Wrap a runner whose chunks are sticks, so that it flies by thrust and body rates.
 
-    Its network gets a history of centred sticks: what was sent are rates.
+    Its network gets a history of centred sticks, because the sent actions are rates.
     """
     loop = StickLoop(by_rates(runner.contract))
     centred = np.zeros((1, runner.contract.history_len, ACTION_DIM), np.float32)
@@ -102,7 +100,7 @@ def flown_by_rates(runner: PolicyRunner) -> PolicyRunner:
 
 @dataclass(frozen=True, slots=True)
 class StickLoop:
-    """From sticks to the thrust and body rates that fly them, and back.
+    """Conversion of sticks to the thrust and body rates that fly them, and back.
 
     Sticks are throttle, yaw, pitch, roll in [-1, 1], full stick by ``contract``; rates are thrust
     in [0, 1] and roll, pitch, yaw rate in rad/s about FRD axes.
@@ -118,9 +116,9 @@ class StickLoop:
             )
 
     def to_rates(self, sticks: FloatArray, state: FloatArray) -> FloatArray:
-        """Chunk of sticks [1, horizon, 4], state [1, state_dim] -> chunk of rates [1, horizon, 4].
+        """Convert sticks [1, horizon, 4] at a state [1, state_dim] to rates [1, horizon, 4].
 
-        Each action is for the attitude and climb that those before it bring about.
+        Each action assumes the attitude and climb that the actions before it bring about.
         """
         rates = np.empty_like(sticks)
         numbers: list[float] = state[0].tolist()
@@ -150,9 +148,9 @@ class StickLoop:
         return rates
 
     def to_sticks(self, rates: FloatArray, state: FloatArray) -> FloatArray:
-        """Single actions: rates [N, 4], states [N, state_dim] -> the sticks [N, 4] behind them.
+        """Convert rates [N, 4] at states [N, state_dim] to the sticks [N, 4] behind them.
 
-        What full stick cannot ask for is cut off.
+        Motion beyond full stick is clipped.
         """
         contract = self.contract
         attitude = np.stack(
@@ -165,7 +163,7 @@ class StickLoop:
         yaw_rate = rates[:, 3] / cos_tilt
         tilt_p = rates[:, 1] - yaw_rate * down_body[:, 0]
         tilt_q = rates[:, 2] - yaw_rate * down_body[:, 1]
-        # The inverse of _tilt_rates: the turn of the thrust's axis that takes such rates.
+        # Inverse of _tilt_rates: the turn of the thrust axis that leads to these rates.
         angle = np.hypot(tilt_p, tilt_q) / TILT_GAIN_PER_S
         share = np.sinc(angle / np.pi) / TILT_GAIN_PER_S
         wanted_body = np.stack([-share * tilt_q, share * tilt_p, -np.cos(angle)], axis=-1)
@@ -188,7 +186,7 @@ class StickLoop:
         return np.clip(np.stack(deflections, axis=-1), -1.0, 1.0).astype(np.float32)
 
     def _thrust_axis_ned(self, wanted: StickMotion, attitude: Quaternion) -> Vector:
-        """Unit vector along the thrust of this lean, for the heading of the attitude."""
+        """Return the unit vector along the thrust of this lean, for the heading of the attitude."""
         length_rad = math.hypot(wanted.forward_rad, wanted.right_rad)
         lean_rad = min(length_rad, math.radians(self.contract.full_lean_deg))
         share = math.sin(lean_rad) / max(length_rad, 1e-9)
@@ -204,9 +202,9 @@ class StickLoop:
 
 
 def _tilt_rates(wanted_body: Vector) -> tuple[float, float]:
-    """Roll and pitch rate that turn the thrust, along -z, to a unit vector, the shorter way round.
+    """Return roll and pitch rate that turn the thrust, along -z, the short way to a unit vector.
 
-    The tilt has a loop of its own, without the heading: where the thrust points matters more
+    The tilt has its own loop, independent of the heading: the direction of thrust matters more
     (Brescianini and D'Andrea, "Tilt-Prioritized Quadrocopter Attitude Control", 2018).
     """
     x, y, z = wanted_body
@@ -217,7 +215,7 @@ def _tilt_rates(wanted_body: Vector) -> tuple[float, float]:
 
 
 def _turned(attitude: Quaternion, rate: Vector, dt_s: float) -> Quaternion:
-    """The attitude after a turn at even body rates; floats, or arrays of them."""
+    """Return the attitude after a turn at constant body rates; floats, or arrays of them."""
     half = dt_s / 2
     turn = (1.0, half * rate[0], half * rate[1], half * rate[2])
     w, x, y, z = multiply(attitude, turn)
@@ -226,12 +224,12 @@ def _turned(attitude: Quaternion, rate: Vector, dt_s: float) -> Quaternion:
 
 
 def _beyond(stick: float, dead_zone: float) -> float:
-    """Share of full motion that a stick asks for, with its sign."""
+    """Return the share of full motion that a stick demands, with its sign."""
     beyond = max(abs(stick) - dead_zone, 0.0) / (1.0 - dead_zone)
     return math.copysign(min(beyond, 1.0), stick)
 
 
 def _deflection(share: Array, dead_zone: float) -> Array:
-    """The inverse; nothing is the centre."""
+    """Return the stick for a share of full motion: inverts ``_beyond``; 0 gives the centre."""
     deflection: Array = np.sign(share) * (dead_zone + (1.0 - dead_zone) * np.abs(share))
     return deflection

@@ -1,4 +1,4 @@
-"""What is said of an exported policy, beside its graphs or within them.
+"""Description of an exported policy, beside its graphs or inside them.
 
     {
       "contract": {"action": "sticks", "chunk_dt_s": 0.05},
@@ -8,12 +8,11 @@
       "hidden": {"h_in": "h_out"}
     }
 
-``contract`` are fields of ``policy.contract.Contract``, ``schedule`` those of
-``nets.diffusion.NoiseSchedule``, ``inputs`` the names of an ONNX file's inputs by their meaning. A
-contract file (``interface``) takes the place of ``contract``. ``outputs`` says which of several
-outputs is meant: its name, or its place from 0 in a TorchScript tuple. ``hidden`` are the inputs of
-a recurrent ONNX graph that take an output of the call before; names such as h_in and h_out need no
-entry.
+``contract`` holds fields of ``policy.contract.Contract``, ``schedule`` fields of
+``nets.diffusion.NoiseSchedule``, ``inputs`` the name of an ONNX file's input for each role. A
+contract file (``interface``) replaces ``contract``. ``outputs`` selects one of several outputs by
+its name, or by its index in a TorchScript tuple. ``hidden`` maps the inputs of a recurrent ONNX
+graph to the outputs that feed them at the next call; names like h_in and h_out need no entry.
 """
 
 import json
@@ -30,7 +29,7 @@ from policy.files import parse_json, why_unreadable
 
 DESCRIPTION = "policy.json"
 ROLES = ("image", "feature", "state", "action_history", "noisy", "timestep")
-"""What an input of a graph may be."""
+"""Roles of a graph's inputs."""
 USUAL_NAMES: dict[str, tuple[str, ...]] = {
     "image": ("image", "images", "rgb", "pixels"),
     "feature": ("feature", "features", "global_cond"),
@@ -39,35 +38,35 @@ USUAL_NAMES: dict[str, tuple[str, ...]] = {
     "noisy": ("noisy", "noisy_action", "noisy_actions", "sample"),
     "timestep": ("timestep", "timesteps", "t"),
 }
-"""Names by which an input is known where nothing else is said."""
+"""Input names that are recognised without an entry in the description."""
 RESULTS = ("chunk", "feature", "prediction")
-"""What an output of a graph may be: of a policy or head, an encoder, a denoiser."""
+"""Results of a graph: of a policy or head, an encoder, a denoiser."""
 TABLES = ("contract", "schedule", "inputs", "outputs", "hidden")
 
 
 @dataclass(frozen=True, kw_only=True)
 class Description:
-    """How a policy sees and acts, and what its graphs mean."""
+    """Contract, noise schedule and port names of an exported policy."""
 
     interface: Interface
     schedule: dict[str, Any] = field(default_factory=dict)
-    """Fields of ``nets.diffusion.NoiseSchedule``; empty where nothing is said."""
+    """Fields of ``nets.diffusion.NoiseSchedule``; empty: not given."""
     inputs: dict[str, str] = field(default_factory=dict)
     """Name of an input by its role."""
     outputs: dict[str, str | int] = field(default_factory=dict)
-    """Name of an output, or its place in a tuple, by its result."""
+    """Name of an output, or its index in a tuple, by its result."""
     hidden: dict[str, str] = field(default_factory=dict)
-    """Output that each hidden input takes at the next call, by name."""
+    """Output that feeds each hidden input at the next call, by name."""
 
 
 def describe(
     spec: str, text: str | None, *, where: Path, beside: Path, contract_file: Path | None
 ) -> Description:
-    """Put together what is known of the policy ``spec``.
+    """Combine everything that is known of the policy ``spec``.
 
-    ``text`` is the JSON of this module's docstring, read from ``where``, if there is one; the
-    contract is that of ``contract_file``, else that of the text, else that of mavbridge.toml in the
-    folder ``beside``.
+    ``text`` is the optional JSON of this module's docstring, read from ``where``. The contract
+    comes from ``contract_file``, else from the text, else from mavbridge.toml in the folder
+    ``beside``.
     """
     data = {} if text is None else _parsed(where, text)
     rest = {name: data.get(name, {}) for name in TABLES if name != "contract"}
@@ -104,7 +103,7 @@ def _parsed(where: Path, text: str) -> dict[str, dict[str, Any]]:
 
 
 def read_description(spec: str, path: Path, contract_file: Path | None) -> Description:
-    """What the archive of the policy ``spec`` says of itself: milliseconds."""
+    """Read the description inside the archive of the policy ``spec``; takes milliseconds."""
     try:
         with zipfile.ZipFile(path) as archive:
             names = archive.namelist()

@@ -1,7 +1,7 @@
-"""First drafts of contract files: what was read, what was guessed, and what only the user knows.
+"""First drafts of contract files: read entries, guessed entries, and questions to the user.
 
-A draft is TOML for ``interface.read_interface``, in which every entry has a comment that says where
-its value comes from. An entry that nobody but the user can answer holds ``interface.UNANSWERED``.
+A draft is TOML for ``interface.read_interface``. A comment at each entry names the source of its
+value. An entry that only the user can answer holds ``interface.UNANSWERED``.
 """
 
 import json
@@ -46,17 +46,17 @@ _SPELLINGS: Mapping[str, Sequence[str]] = {
     "pitch_rad": ("pitch",),
     "yaw_rad": ("yaw", "heading"),
 }
-"""Usual names of others for numbers of the state; their units are a guess."""
+"""Common spellings of state names in other projects; their units are guessed."""
 _STICKS = (
     *("modes", "full_lean_deg", "full_yaw_rate_degps", "full_climb_mps", "full_descent_mps"),
     *("lean_dead_zone", "yaw_dead_zone", "throttle_dead_zone"),
 )
-"""Terms of recorded flights that are written into every draft."""
+"""Terms of recorded flights that go into every draft."""
 _LIMITS = (
     *("max_state_age_s", "max_velocity_age_s", "max_feature_age_s", "max_chunk_age_s"),
     *("max_stall_s", *ENVELOPE_TERMS),
 )
-"""Terms that are written where the flights had others than the usual ones."""
+"""Terms that go into a draft only if the flights' values differ from the defaults."""
 
 
 class Entry(NamedTuple):
@@ -65,15 +65,15 @@ class Entry(NamedTuple):
     table: Table
     name: str
     value: Any
-    """Text, a number, or a list of either."""
+    """Text, number, or list of either."""
     why: str
-    """Where the value comes from, or the question to the user."""
+    """Source of the value, or the question to the user."""
     found: Literal["read", "guessed", "optional"] = "read"
     """Optional entries are written as comments."""
 
     @property
     def origin(self) -> str:
-        """What the user has to do: answer, check, or nothing."""
+        """Return "to answer" for an open question, else ``found``."""
         return "to answer" if is_unanswered(self.value) else self.found
 
 
@@ -88,7 +88,7 @@ _ASKED_FRAME = Entry(
 
 
 def draft_text(title: str, entries: Sequence[Entry]) -> str:
-    """Return a contract file that begins with ``title``, each entry below its origin."""
+    """Return a contract file headed by ``title``; a comment above each entry names its source."""
     lines = _comment(title)
     for table in ("contract", "state", "action", "images", "task"):
         inside = [entry for entry in entries if entry.table == table]
@@ -99,7 +99,7 @@ def draft_text(title: str, entries: Sequence[Entry]) -> str:
             comment = _comment(f"{entry.origin.upper()}: {entry.why}")
             lines += comment if comment != said else []
             said = comment
-            # JSON's texts, numbers and lists are TOML's as well.
+            # JSON strings, numbers and lists are valid TOML.
             line = f"{entry.name} = {json.dumps(entry.value)}"
             lines.append(f"# {line}" if entry.origin == "optional" else line)
     return "\n".join(lines) + "\n"
@@ -113,7 +113,7 @@ def _comment(text: str) -> list[str]:
 
 
 def dataset_entries(folder: Path) -> list[Entry]:
-    """Draft from a dataset (v2 or v3): names, rate, cameras, and axes if it is one of ours."""
+    """Draft from a dataset (v2, v3): names, rate, cameras; the frame if mavbridge exported it."""
     path = folder / INFO
     features = _features(path, read_json(path), "features")
     images = [key for key, value in features.items() if value.get("dtype") in ("video", "image")]
@@ -122,7 +122,7 @@ def dataset_entries(folder: Path) -> list[Entry]:
 
 
 def checkpoint_entries(folder: Path, dataset: Path | None) -> list[Entry]:
-    """Draft from a policy's shapes and, if there is one, its dataset's names and rate."""
+    """Draft from a policy's shapes, and from the names and rate of its dataset if there is one."""
     path = folder / CONFIG_FILE
     config = read_json(path)
     inputs, outputs = (
@@ -134,7 +134,7 @@ def checkpoint_entries(folder: Path, dataset: Path | None) -> list[Entry]:
 
 
 def dataset_of(checkpoint: Path) -> Path | None:
-    """Return the dataset that LeRobot's training noted beside a policy, if it is here."""
+    """Return the dataset that LeRobot's training recorded beside a policy, if it is present."""
     try:
         noted = files.read_json(checkpoint / TRAIN_CONFIG_FILE)["dataset"]
         home = Path.home() / ".cache" / "huggingface" / "lerobot"  # LeRobot's own default
@@ -173,7 +173,8 @@ def _lerobot_entries(
 
 
 def _frame(dataset: Path, features: Mapping[str, Any], names: Sequence[str] | None) -> Entry:
-    """As our export notes it; else by gravity: in level flight -z is up in FRD, +z in FLU."""
+    """Return the frame that mavbridge's export recorded; else tell it by gravity: in level flight
+    -z is up in FRD, +z in FLU."""
     about = features.get(STATE_KEY, {}).get("info")
     if isinstance(about, dict) and STATE_FRAME in about:
         return Entry("contract", "state_frame", str(about[STATE_FRAME]), f"the dataset's {INFO}")
@@ -211,16 +212,16 @@ def _features(path: Path, data: Mapping[str, Any], name: str) -> dict[str, dict[
 
 
 class _Port(NamedTuple):
-    """An input or output."""
+    """Input or output of a graph."""
 
     name: str
     where: str
     shape: tuple[int | None, ...]
-    """None where the size is open."""
+    """None for an axis of unknown size."""
 
 
 def onnx_files(source: Path) -> list[Path]:
-    """Return the graphs of a file, or of a folder; empty where it is neither."""
+    """Return the graphs of a file or folder; empty if it is neither."""
     if source.is_dir():
         return sorted(source.glob("*.onnx"))
     return [source] if source.suffix == ".onnx" and source.is_file() else []
@@ -231,7 +232,7 @@ def onnx_entries(graphs: Sequence[Path]) -> list[Entry]:
     inputs, outputs = _ports(graphs)
     images = [port for port in inputs if len(port.shape) >= 4 and port.shape[-3] in (1, 3)]
     histories = [port for port in inputs if "history" in port.name and len(port.shape) >= 2]
-    given = [port.shape for port in outputs]  # an input of the shape of an output is a hidden state
+    given = [port.shape for port in outputs]  # an input shaped like an output is a hidden state
     others = [
         port
         for port in inputs
@@ -269,7 +270,7 @@ def _pixel_entries(is_depth: bool) -> list[Entry]:
 
 
 def _ports(graphs: Sequence[Path]) -> tuple[list[_Port], list[_Port]]:
-    """Inputs and outputs of all graphs."""
+    """Return the inputs and outputs of all graphs."""
     found: dict[str, list[_Port]] = {"input": [], "output": []}
     for file in graphs:
         model = read_graph(file)
@@ -286,9 +287,9 @@ def _ports(graphs: Sequence[Path]) -> tuple[list[_Port], list[_Port]]:
 
 
 def recorded_entries(contracts: Sequence[Mapping[str, Any]]) -> list[Entry]:
-    """Draft the terms that all flights share; ask for those in which they differ.
+    """Draft the terms that all flights share, and ask for the terms that differ between flights.
 
-    ``contracts`` are those of the flights' ``meta.json``; entries that one lacks have the default.
+    ``contracts`` come from the flights' ``meta.json``; missing entries have their default.
     """
     usual = json.loads(Contract().to_json())
     entries = []
@@ -303,11 +304,11 @@ def recorded_entries(contracts: Sequence[Mapping[str, Any]]) -> list[Entry]:
     return entries
 
 
-# --- Entries of all kinds of drafts
+# --- Entries shared by all drafts
 
 
 def _state_entries(names: Sequence[str] | None, dim: int, where: str) -> list[Entry]:
-    """The state's names: known, guessed by their spelling, or to be answered."""
+    """Draft the state's names: known, guessed from their spelling, or asked for."""
     if dim == 0:
         return []
     known = (*STATE_NAMES, *DERIVED_NAMES)
@@ -328,7 +329,7 @@ def _state_entries(names: Sequence[str] | None, dim: int, where: str) -> list[En
 
 
 def _action_entries(names: Sequence[str] | None, where: str) -> list[Entry]:
-    """The kind of action, and its names: known, or to be answered."""
+    """Draft the action kind and the action's names: known, or asked for."""
     kinds = [kind for kind, own in ACTION_FIELDS.items() if sorted(own) == sorted(names or ())]
     if kinds and names:
         return [
@@ -350,7 +351,7 @@ def _action_entries(names: Sequence[str] | None, where: str) -> list[Entry]:
 
 
 def _camera_entries(keys: Sequence[str], where: str) -> list[Entry]:
-    """Names of the cameras here, and the policy's names of them."""
+    """Draft the policy's name of each camera."""
     cameras = ["front"] if len(keys) == 1 else [key.rpartition(".")[2] for key in keys]
     if len(set(cameras)) < len(keys) or not all(name.isidentifier() for name in cameras):
         cameras = [f"camera_{number}" for number in range(len(keys))]

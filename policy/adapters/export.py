@@ -1,6 +1,6 @@
-"""Our own policies as files that other programs read: ONNX, or a TorchScript archive.
+"""Export of mavbridge's own policies to ONNX or a TorchScript archive.
 
-Both hold the encoder and one step of the denoiser, and say the contract and the noise schedule.
+Both formats hold the encoder, one denoiser step, the contract and the noise schedule.
 """
 
 import json
@@ -21,7 +21,7 @@ from policy.nets.toge import Toge
 
 OurPolicy: TypeAlias = Toge | ResnetUnet
 OPSET = 18
-"""ONNX operator set: of 2022, so that every runtime in use reads it."""
+"""ONNX operator set, from 2022: every runtime in use reads it."""
 DENOISER_INPUTS = ("noisy", "timestep", "feature", "state", "action_history")
 
 
@@ -58,7 +58,7 @@ class _Denoiser(nn.Module):
 
 
 class _Archive(nn.Module):
-    """Both, by the names that ``adapters.modules`` knows."""
+    """Encoder and denoiser, under the names that ``adapters.modules`` knows."""
 
     def __init__(self, encoder: nn.Module, denoiser: nn.Module) -> None:
         super().__init__()
@@ -66,10 +66,7 @@ class _Archive(nn.Module):
 
 
 def export_onnx(policy: OurPolicy, folder: Path) -> None:
-    """Write encoder.onnx, denoiser.onnx and policy.json into ``folder``, which exists.
-
-    It needs the onnx package.
-    """
+    """Write encoder.onnx, denoiser.onnx and policy.json into ``folder``. Needs the onnx package."""
     encoder, denoiser = _Encoder(policy).eval(), _Denoiser(policy).eval()
     image, rest = _examples(policy)
     _write_onnx(encoder, image, folder / ENCODER, ("image",), "feature")
@@ -78,7 +75,7 @@ def export_onnx(policy: OurPolicy, folder: Path) -> None:
 
 
 def export_torchscript(policy: OurPolicy, path: Path) -> None:
-    """Write one archive."""
+    """Write a TorchScript archive."""
     image, rest = _examples(policy)
     trace: Any = torch.jit.trace  # without types
     script: Any = torch.jit.script
@@ -98,8 +95,8 @@ def _write_onnx(
     output: str,
 ) -> None:
     with _quiet(), torch.no_grad():
-        # Not by way of torch.export, which takes ten times as long and whose graphs are slower in
-        # OpenVINO: a step of TOGE 0.58 ms instead of 0.48 in bf16, 1.09 instead of 0.90 in float32.
+        # Not torch.export: it takes ten times as long, and its graphs are slower in OpenVINO: one
+        # step of TOGE takes 0.58 ms instead of 0.48 in bf16, 1.09 instead of 0.90 in float32.
         torch.onnx.export(
             module,
             examples,
@@ -112,7 +109,7 @@ def _write_onnx(
 
 
 def _quiet() -> "warnings.catch_warnings[None]":
-    return warnings.catch_warnings(action="ignore")  # each shape check of ours is one
+    return warnings.catch_warnings(action="ignore")  # our shape checks warn
 
 
 def _examples(policy: OurPolicy) -> tuple[tuple[Tensor, ...], tuple[Tensor, ...]]:

@@ -1,37 +1,37 @@
-"""What the files of a policy that was trained elsewhere do not say: a TOML file of the user's.
+"""Contract file: the user's TOML with the facts that a foreign policy's files do not contain.
 
     [contract]                   # fields of policy.contract.Contract
     action = "sticks"
     chunk_dt_s = 0.0333
 
-    [state]                      # the state vector that it was trained on
+    [state]                      # state vector of the policy's training
     key = "observation.state"
     names = ["vx_mps", "vy_mps", "vz_mps", "roll_rad", "pitch_rad", "yaw_rad"]
-    scale = [1.0, 1.0, 1.0, 57.29578, 57.29578, 57.29578]  # it takes its angles in degrees
+    scale = [1.0, 1.0, 1.0, 57.29578, 57.29578, 57.29578]  # angles in degrees
 
-    [action]                     # its action vector; scaled and shifted it is the contract's
+    [action]                     # the policy's action vector; contract = scale * action + offset
     key = "action"
     names = ["throttle", "yaw", "pitch", "roll"]
     scale = [1.0, 1.0, 1.0, 1.0]
     offset = [0.0, 0.0, 0.0, 0.0]
 
-    [images]                     # its name of each camera of the contract
+    [images]                     # the policy's name of each camera of the contract
     front = "observation.images.front"
 
     [task]
     prompt = "fly through the gates"
 
-All of it is optional but what the kind of policy asks for. State names are those of the contract,
-and numbers made of them:
+Entries are optional unless the kind of policy needs them. State names are those of the contract
+and of numbers derived from it:
 
-    vx_body_mps, vy_body_mps, vz_body_mps    velocity in the axes of the body
-    vertical_x, vertical_y, vertical_z       the world's third axis in the axes of the body
+    vx_body_mps, vy_body_mps, vz_body_mps    velocity in body axes
+    vertical_x, vertical_y, vertical_z       the world's third axis in body axes
     roll_rad, pitch_rad, yaw_rad             Euler angles of the attitude, turned in the order
                                              yaw, pitch, roll; signs by the contract's frame
 
-The first six are the same on every heading, so a network that takes them has no rotations to learn.
-A draft has the text "?" where only the user knows the answer, and is not flown before each has one:
-``adapters.drafts`` writes them.
+The first six do not depend on the heading, so a network that takes them has no rotations to learn.
+In a draft (``adapters.drafts``), "?" marks the entries that only the user knows; a contract with a
+"?" does not fly.
 """
 
 from collections.abc import Callable, Mapping, Sequence
@@ -48,9 +48,9 @@ from policy.preprocess import egocentric_columns
 from policy.rotation import matrix_columns
 
 CONTRACT_FILE = "mavbridge.toml"
-"""Its name beside a policy or dataset, where flights find it without --contract."""
+"""File name of a contract beside a policy or dataset, where flights find it without --contract."""
 UNANSWERED = "?"
-"""In a contract file: the user has to say."""
+"""Value in a contract file that the user has to replace."""
 
 ACTION_FIELDS: dict[str, tuple[str, ...]] = {
     "sticks": ACTION_NAMES,
@@ -58,7 +58,7 @@ ACTION_FIELDS: dict[str, tuple[str, ...]] = {
     "attitude": ("thrust", "roll_rad", "pitch_rad", "yaw_rate_radps"),
     "velocity": ("vx_mps", "vy_mps", "vz_mps", "yaw_rate_radps"),
 }
-"""Names of the four numbers of each kind of action, in the contract's order."""
+"""Names of an action's four numbers by action kind, in the contract's order."""
 EGOCENTRIC_NAMES = (
     *("vx_body_mps", "vy_body_mps", "vz_body_mps"),
     *("vertical_x", "vertical_y", "vertical_z"),
@@ -66,7 +66,7 @@ EGOCENTRIC_NAMES = (
 EULER_NAMES = ("roll_rad", "pitch_rad", "yaw_rad")
 DERIVED_NAMES = (*EGOCENTRIC_NAMES, *EULER_NAMES)
 BODY_STATE_NAMES = (*EGOCENTRIC_NAMES, *STATE_NAMES[QUATERNION.stop :])
-"""A state without a heading: velocity, vertical axis, rates and specific force of the body."""
+"""State without a heading: velocity, vertical axis, rates and specific force in body axes."""
 ArrayOrTensor = TypeVar("ArrayOrTensor")
 
 
@@ -76,10 +76,10 @@ def state_values(
     wanted: Sequence[str],
     arctan2: Callable[[Any, Any], Any] = np.arctan2,
 ) -> list[Any]:
-    """The ``wanted`` numbers of a state whose ``columns`` are called ``names``.
+    """Return the ``wanted`` numbers, computed from state ``columns`` with the names ``names``.
 
-    ``names`` begin with ``STATE_NAMES``; columns are floats or arrays of any kind, torch's too, and
-    ``arctan2`` is that of their library.
+    ``names`` begin with ``STATE_NAMES``. Columns are floats or arrays of any library, torch
+    included; ``arctan2`` comes from the same library.
     """
     known = dict(zip(names, columns, strict=True))
     base = [known[name] for name in STATE_NAMES]
@@ -96,26 +96,25 @@ def state_values(
 
 @dataclass(frozen=True, kw_only=True)
 class Interface:
-    """How a policy names and orders what it takes and gives."""
+    """Names, order and units of a policy's inputs and outputs."""
 
     contract: Contract
     state_names: tuple[str, ...] = ()
-    """Its state vector, as names of ``contract.state_names`` and ``DERIVED_NAMES``; empty:
-    the same as the contract's."""
+    """State in ``contract.state_names`` and ``DERIVED_NAMES``; empty: the contract's state."""
     state_scale: tuple[float, ...] = ()
-    """Factor from the contract's unit to the policy's of each of them; empty: ones."""
+    """Factor from the contract's unit to the policy's for each number of the state; empty: ones."""
     action_names: tuple[str, ...] = ()
-    """Its action vector, as names of ``ACTION_FIELDS``; empty: the same as the contract's."""
+    """Action in ``ACTION_FIELDS``; empty: the contract's action."""
     action_scale: tuple[float, ...] = ()
-    """Factor of each action as the policy orders them; empty: ones."""
+    """Factor of each action, in the policy's order; empty: ones."""
     action_offset: tuple[float, ...] = ()
-    """Added after the factor; empty: zeros."""
+    """Offset of each action, added after the factor; empty: zeros."""
     state_key: str = "observation.state"
     action_key: str = "action"
     image_keys: tuple[str, ...] = ()
-    """Its name of each camera, in the contract's order; empty: observation.images.NAME."""
+    """The policy's name of each camera, in the contract's order; empty: observation.images.NAME."""
     prompt: str = ""
-    """The task in words, for policies that are given one."""
+    """Task in words, for policies that take a prompt."""
 
     def __post_init__(self) -> None:
         known = (*self.contract.state_names, *DERIVED_NAMES)
@@ -148,9 +147,10 @@ class Interface:
         return len(self.state_names or self.contract.state_names)
 
     def to_state(self, state: ArrayOrTensor) -> ArrayOrTensor:
-        """The contract's state [..., S] -> the policy's [..., state_dim], float32.
+        """Convert the contract's state [..., S] to the policy's [..., state_dim], float32.
 
-        Both are numpy arrays or both torch tensors; in torch, the operations can be traced.
+        Input and output are both numpy arrays or both torch tensors; torch can trace the
+        operations.
         """
         names = self.contract.state_names
         wanted = self.state_names or names
@@ -168,7 +168,7 @@ class Interface:
 
     @property
     def action_columns(self) -> list[int]:
-        """Column of the policy's action of each number of the contract's."""
+        """Return, for each number of the contract's action, its column in the policy's action."""
         wanted = ACTION_FIELDS[self.contract.action]
         return [(self.action_names or wanted).index(name) for name in wanted]
 
@@ -178,7 +178,7 @@ class Interface:
         return self.image_keys or tuple(f"observation.images.{n}" for n in self.contract.cameras)
 
     def to_actions(self, actions: ArrayOrTensor) -> ArrayOrTensor:
-        """The policy's actions [..., 4] -> the contract's [..., 4], arrays or tensors."""
+        """Convert the policy's actions [..., 4] to the contract's [..., 4], arrays or tensors."""
         values: Any = actions
         if values.shape[-1] != ACTION_DIM:
             raise PolicyError(
@@ -189,14 +189,15 @@ class Interface:
         return cast(ArrayOrTensor, _columns(values * scale + offset, self.action_columns))
 
     def from_actions(self, actions: ArrayOrTensor) -> ArrayOrTensor:
-        """The contract's actions [..., 4] -> the policy's [..., 4]: ``to_actions``, undone."""
+        """Convert the contract's actions [..., 4] to the policy's: the inverse of
+        ``to_actions``."""
         columns = self.action_columns
         scale, offset = self._action_units(actions)
         theirs = _columns(actions, [columns.index(column) for column in range(ACTION_DIM)])
         return cast(ArrayOrTensor, (theirs - offset) / scale)
 
     def _action_units(self, actions: object) -> tuple[Any, Any]:
-        """Factor and offset of each action, in the library of ``actions``."""
+        """Return factor and offset of each action, in the library of ``actions``."""
         library, options = _library(actions)
         scale = library.asarray(self.action_scale or (1.0,) * ACTION_DIM, **options)
         return scale, library.asarray(self.action_offset or (0.0,) * ACTION_DIM, **options)
@@ -205,8 +206,8 @@ class Interface:
 def read_interface(path: Path, derived: Mapping[str, object] | None = None) -> Interface:
     """Read a contract file.
 
-    ``derived`` are fields of the contract that the policy's own files say: the contract file may
-    repeat them, not contradict them.
+    ``derived`` are contract fields that the policy's own files set. The contract file may repeat
+    them but not contradict them.
     """
     try:
         data: dict[str, Any] = read_toml(path)
@@ -262,7 +263,7 @@ def _interface(data: dict[str, Any], derived: Mapping[str, object]) -> Interface
 
 
 def _unanswered(data: Mapping[str, Any]) -> list[str]:
-    """Entries that the user has to answer."""
+    """Return the entries that the user has to answer."""
     return [
         f"[{table}] {name}"
         for table, entries in data.items()
@@ -273,18 +274,18 @@ def _unanswered(data: Mapping[str, Any]) -> list[str]:
 
 
 def is_unanswered(value: object) -> bool:
-    """Return True for an entry that is ``UNANSWERED``, or a list that holds it."""
+    """True if an entry is ``UNANSWERED``, or a list that contains it."""
     return UNANSWERED in (value if isinstance(value, list) else [value])
 
 
 def _columns(values: Any, columns: list[int]) -> Any:
-    """Columns of the last axis in another order; an array's in one piece of memory."""
+    """Reorder the columns of the last axis; an array's result is contiguous."""
     ordered = values[..., columns]
     return np.ascontiguousarray(ordered) if isinstance(ordered, np.ndarray) else ordered
 
 
 def _library(state: object) -> tuple[Any, dict[str, Any]]:
-    """The library of an array or tensor, and how its constants are made."""
+    """Return the library of an array or tensor, and its function that makes constants."""
     if isinstance(state, np.ndarray):
         return np, {"dtype": np.float32}
     import torch

@@ -1,16 +1,16 @@
-"""Torch modules as a policy: those that a user's class names, and those of a TorchScript archive.
+"""Policies made of torch modules, named by a user's class or stored in a TorchScript archive.
 
     forward(image, state, action_history)            alone: a single-rate policy
-    visual_encoder(image)                            with one of the next two: dual rate
+    visual_encoder(image)                            with action_head or denoiser: dual rate
     action_head(feature, state, action_history)      a chunk in one call
     denoiser(noisy, timestep, feature, state, action_history)
-                                                     one step of a diffusion policy; the loop is
-                                                     ours, by ``noise_schedule``
+                                                     one step of a diffusion policy; mavbridge
+                                                     runs the loop by ``noise_schedule``
 
 Shapes are those of ``policy.protocol``; ``forward`` and ``action_head`` return chunks
-[B, horizon, 4], ``denoiser`` what the schedule says that the network predicts; ``timestep`` is [B]
-float32. What is behind the last argument that a function declares is left out. A TorchScript
-archive may have methods of these names, too, and a policy.json (``adapters.description``).
+[B, horizon, 4]; ``denoiser`` returns the quantity that the schedule's ``prediction`` names;
+``timestep`` is [B] float32. Arguments beyond the last that a function declares are not passed. A
+TorchScript archive may have methods with these names, and a policy.json (``adapters.description``).
 """
 
 import inspect
@@ -46,11 +46,11 @@ def adopt_modules(
     inputs: Mapping[str, str] | None = None,
     outputs: Mapping[str, str | int] | None = None,
 ) -> SingleRatePolicy | None:
-    """The policy that the modules or methods of ``holder`` are; None where it has none of them.
+    """Return the policy made of the modules or methods of ``holder``, or None if it has none.
 
-    A contract without feature_dim gets it from the encoder's output. ``inputs`` names the state
-    of a forward that takes no image, ``outputs`` says which of several values that a module returns
-    is its result, both as ``adapters.description``.
+    A contract without feature_dim gets it from the encoder's output. ``inputs`` names the state of
+    a forward that takes no image. ``outputs`` selects the result of a module that returns several
+    values. Both are as in ``adapters.description``.
     """
     encoder, head, denoiser = (
         getattr(holder, part, None) for part in ("visual_encoder", "action_head", "denoiser")
@@ -79,9 +79,9 @@ def adopt_modules(
 def load_torchscript(
     spec: str, path: Path, description: Description, seed: int
 ) -> SingleRatePolicy:
-    """The policy of an archive, on the CPU."""
+    """Load the policy of a TorchScript archive, on the CPU."""
     try:
-        # torch says that this will go one day, in favour of a format that few export to so far.
+        # torch warns that this is deprecated; few projects export to its successor yet.
         with warnings.catch_warnings(action="ignore", category=DeprecationWarning):
             module = torch.jit.load(path, map_location="cpu").eval()  # type: ignore[no-untyped-call]
     except (RuntimeError, OSError) as error:
@@ -103,7 +103,7 @@ def load_torchscript(
 
 
 def make_schedule(where: Path, fields: dict[str, Any]) -> NoiseSchedule:
-    """A schedule from the fields of a description; a PolicyError names the file of a wrong one."""
+    """Return the schedule of a description; a PolicyError names the file of a wrong field."""
     try:
         return NoiseSchedule(**fields)
     except (TypeError, PolicyError) as error:
@@ -114,7 +114,7 @@ def make_schedule(where: Path, fields: dict[str, Any]) -> NoiseSchedule:
 
 
 class ForwardPolicy(nn.Module):
-    """Image, state and history in, a chunk out: single rate."""
+    """Single rate: one module makes a chunk from image, state and history."""
 
     def __init__(self, interface: Interface, holder: object, call: "_Call") -> None:
         super().__init__()
@@ -124,22 +124,22 @@ class ForwardPolicy(nn.Module):
         self._interface = interface
 
     def predict(self, image: Tensor, state: Tensor, action_history: Tensor, steps: int) -> Tensor:
-        """One call of the module."""
+        """Call the module once."""
         return self.to_chunk(self._call(image, *self._own(state, action_history)))
 
     def to_chunk(self, sample: Tensor) -> Tensor:
-        """Return the contract's actions for the policy's, [B, L, 4]; [B, 4] is one action."""
+        """Convert the policy's actions [B, L, 4] to the contract's; [B, 4] is a single action."""
         if sample.ndim == 2 and self.contract.horizon == 1:
             sample = sample[:, None]
         return self._interface.to_actions(sample)
 
     def _own(self, state: Tensor, history: Tensor) -> tuple[Tensor, Tensor]:
-        """State and history as the policy orders and scales them."""
+        """Return state and history in the policy's order and units."""
         return self._interface.to_state(state), self._interface.from_actions(history)
 
 
 class HeadPolicy(ForwardPolicy):
-    """An encoder and a head that makes a chunk in one call: dual rate."""
+    """Dual rate: an encoder, and a head that makes a chunk in one call."""
 
     def __init__(
         self, interface: Interface, holder: object, encode: "_Call", head: "_Call"
@@ -148,24 +148,24 @@ class HeadPolicy(ForwardPolicy):
         self._encoder = encode
 
     def encode_visual(self, image: Tensor, camera: int = 0) -> Tensor:
-        """Image [B, 3, H, W] -> feature [B, F], by one encoder for every camera."""
+        """Encode an image [B, 3, H, W] -> feature [B, F]; all cameras share one encoder."""
         return self._encoder(image).flatten(1)
 
     def predict_fast(
         self, feature: Tensor, state: Tensor, action_history: Tensor, steps: int
     ) -> Tensor:
-        """One call of the head."""
+        """Call the head once."""
         return self.to_chunk(self._call(feature, *self._own(state, action_history)))
 
     def predict(self, image: Tensor, state: Tensor, action_history: Tensor, steps: int) -> Tensor:
-        """Encode the images, then as ``predict_fast``."""
+        """Encode the images, then call ``predict_fast``."""
         feature = self.encode_visual(image.reshape(-1, *image.shape[-3:]))
         shaped = feature.reshape(-1, *self.contract.feature_shape)
         return self.predict_fast(shaped, state, action_history, steps)
 
 
 class DenoiserPolicy(HeadPolicy):
-    """An encoder and one step of a diffusion solve, as ``protocol.StepwisePolicy``: dual rate."""
+    """Dual rate: an encoder and one step of a diffusion solve, as ``protocol.StepwisePolicy``."""
 
     def __init__(
         self,
@@ -199,13 +199,13 @@ class DenoiserPolicy(HeadPolicy):
         state: Tensor,
         action_history: Tensor,
     ) -> Tensor:
-        """One call of the denoiser."""
+        """Call the denoiser once."""
         return self._call(noisy, timestep, feature, *self._own(state, action_history))
 
     def predict_fast(
         self, feature: Tensor, state: Tensor, action_history: Tensor, steps: int
     ) -> Tensor:
-        """A whole solve."""
+        """Run a whole solve."""
         noise = self.initial_noise.expand(len(state), -1, -1)
         ddim = self.schedule.ddim_steps(steps)
 
@@ -217,7 +217,7 @@ class DenoiserPolicy(HeadPolicy):
 
 
 def _with_feature(name: str, encode: "_Call", interface: Interface) -> Interface:
-    """The interface, with feature_dim by the encoder's output if it has none."""
+    """Return the interface; a missing feature_dim is taken from the encoder's output."""
     contract = interface.contract
     if contract.feature_dim > 0:
         return interface
@@ -228,10 +228,10 @@ def _with_feature(name: str, encode: "_Call", interface: Interface) -> Interface
 
 
 def _with_life(policy: ForwardPolicy, holder: object) -> ForwardPolicy:
-    """The policy with ``reset`` and ``close`` of the object whose modules it uses."""
+    """Add ``reset`` and ``close`` of the object that owns the modules to the policy."""
     for name in ("reset", "close"):
         if (method := getattr(holder, name, None)) is not None:
-            # A method of TorchScript has no signature that Python could inspect.
+            # Python cannot inspect the signature of a TorchScript method.
             setattr(policy, name, (lambda call=method: call()) if _is_script(method) else method)
     return policy
 
@@ -241,9 +241,9 @@ def _is_script(method: object) -> bool:
 
 
 def _takes_no_image(call: "_Call", interface: Interface, state_name: str | None) -> bool:
-    """Return True if the first argument of a forward is the state.
+    """True if the first argument of a forward is the state.
 
-    By its name, or, where it is the only one and its name says nothing, by what it accepts.
+    Decided by the argument's name; a single argument without a telling name is tried.
     """
     first = next(iter(call.names), "")
     if first in (state_name, *USUAL_NAMES["state"]):
@@ -258,9 +258,9 @@ def _takes_no_image(call: "_Call", interface: Interface, state_name: str | None)
             try:
                 call(torch.zeros(1, *shape))
                 accepted.append(True)
-            except PolicyError:  # it ran: what it returned is judged later
+            except PolicyError:  # it ran: its result is checked later
                 accepted.append(True)
-            except Exception:  # noqa: BLE001 - a stranger's module may raise anything
+            except Exception:  # noqa: BLE001 - a foreign module may raise anything
                 accepted.append(False)
     return accepted == [True, False]
 
@@ -272,21 +272,21 @@ def _has_forward(holder: object) -> bool:
 
 
 class _Call:
-    """A module or function: takes as many arguments as it declares, gives one tensor."""
+    """Module or function that is passed as many arguments as it declares and returns one tensor."""
 
     def __init__(
         self, name: str, function: Any, result: str, outputs: Mapping[str, str | int]
     ) -> None:
-        """Prepare the calls; ``outputs[result]`` says which of several values is the result."""
+        """Prepare the calls; ``outputs[result]`` selects the result among several values."""
         self._name, self._function = name, function
         self._result, self._pick = result, outputs.get(result)
         self.skip = 0
-        """Arguments before those that it takes: 1 for a policy that takes no image."""
+        """Leading arguments to drop: 1 for a policy that takes no image."""
         self.names: list[str]
         called = function.forward if isinstance(function, nn.Module) else function
         schema = getattr(called, "schema", None)  # of TorchScript
         if schema is not None:
-            self.names = [each.name for each in schema.arguments[1:]]  # less self
+            self.names = [each.name for each in schema.arguments[1:]]  # without self
             self._count = len(self.names)
             return
         parameters = inspect.signature(called).parameters

@@ -1,8 +1,8 @@
-"""A policy of the user's own: any class with the members of ``policy.protocol``.
+"""User-defined policies: any class with the members of ``policy.protocol``.
 
-package.module:Class   imported as Python imports it, or from the working directory
+package.module:Class   an importable module, or one in the working directory
 package:Class          from the package's ``__init__``
-path/to/file.py:Class  a file; its folder joins the search path, so that it finds what lies there
+path/to/file.py:Class  a file; its folder joins the search path, for imports of neighbouring files
 """
 
 import importlib
@@ -27,12 +27,12 @@ FORMS = (
     "lerobot:DIR, onnx:DIR_OR_FILE, torchscript:FILE, ws://HOST:PORT, package.module:Class or "
     "./file.py:Class"
 )
-"""What a user may write to name a policy."""
+"""Forms of --policy, for error messages."""
 OUR_PACKAGES = ("policy", "sitl", "mavbridge")
 
 
 def check_user_class(spec: str) -> None:
-    """Refuse, without running any code of the user's, what cannot be a class."""
+    """Raise PolicyError if the spec cannot name a class. Runs none of the user's code."""
     where, _ = _split(spec)
     if isinstance(where, Path):
         _require_python_file(spec, where)
@@ -53,10 +53,10 @@ def check_user_class(spec: str) -> None:
 
 
 def load_user_class(spec: str, checkpoint: Path | None, *, seed: int = 0) -> SingleRatePolicy:
-    """Import a class that keeps the protocol of ``policy.protocol``, and make one.
+    """Import a class that follows ``policy.protocol`` and create an instance.
 
-    It may also name the torch modules of its policy, as ``adapters.modules`` says; ``seed`` is that
-    of a denoiser's initial noise.
+    The class may instead name the torch modules of its policy, see ``adapters.modules``. ``seed``
+    draws a denoiser's initial noise.
     """
     check_user_class(spec)
     where, class_name = _split(spec)
@@ -83,9 +83,10 @@ def load_user_class(spec: str, checkpoint: Path | None, *, seed: int = 0) -> Sin
 
 @contextmanager
 def _working_directory() -> Iterator[None]:
-    """Search it too, after everything that is installed; only where a module of it is named.
+    """Context manager: append the working directory to the module search path.
 
-    At any other time a module that lies beside weights would run for a package that is missing.
+    Used only to find and import a module that the user named. At any other time a module beside
+    weights could run in place of a missing package.
     """
     here = str(Path.cwd())
     is_added = here not in sys.path
@@ -99,7 +100,7 @@ def _working_directory() -> Iterator[None]:
 
 
 def _split(spec: str) -> tuple[Path | str, str]:
-    """(file or package.module, Class); raises PolicyError if ``spec`` has another form."""
+    """Return (file or package.module, Class); raise PolicyError if ``spec`` has another form."""
     where, colon, class_name = spec.rpartition(":")
     if not colon:
         where, class_name = spec, ""
@@ -121,11 +122,11 @@ def _require_python_file(spec: str, path: Path) -> None:
 
 
 def _import_file(path: Path) -> ModuleType:
-    """Import a file under a name that no other module has, once in a process."""
+    """Import a file under a unique module name, once per process."""
     resolved = path.resolve()
     folder = str(resolved.parent)
     if folder not in sys.path:
-        sys.path.append(folder)  # last: nothing in it can stand in for an installed module
+        sys.path.append(folder)  # last: nothing in it can shadow an installed module
     name = f"_policy_file_{sha256(str(resolved).encode()).hexdigest()[:8]}_{resolved.stem}"
     if name in sys.modules:
         return sys.modules[name]
@@ -142,7 +143,7 @@ def _import_file(path: Path) -> ModuleType:
 
 
 def _import_hint(error: BaseException | None) -> str:
-    """Say what to do about a failed import."""
+    """Return the remedy for a failed import."""
     name = error.name if isinstance(error, ImportError) and error.name else ""
     package = name.partition(".")[0]
     if package in OUR_PACKAGES:

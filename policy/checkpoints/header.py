@@ -1,6 +1,6 @@
-"""What a file of weights is, and the header of ours: read without torch and without the weights.
+"""Format detection of weight files, and the header of ours; needs neither torch nor the weights.
 
-What is wrong with a file is raised as a ``CheckpointError``.
+Faults of a file are raised as ``CheckpointError``.
 """
 
 import json
@@ -16,7 +16,7 @@ from policy.files import open_regular, open_safetensors, read_json, stand_in_of
 
 HEAD_BYTES = 4096
 MAX_HEADER_BYTES = 100_000_000
-"""Longest header of safetensors, as its own reader has it."""
+"""Longest header of safetensors, as in its own reader."""
 LEROBOT_TYPES = ("act", "diffusion")
 """Types of LeRobot policies that fly from their files."""
 _FOLDERS: tuple[tuple[str, str, str], ...] = (
@@ -30,15 +30,15 @@ _FOLDERS: tuple[tuple[str, str, str], ...] = (
     ("ticks.parquet", "a recorded flight, not a policy", "train one: mavbridge train {0}"),
     ("*.onnx", "a folder of ONNX models", "fly it with --policy onnx:{0}"),
 )
-"""Entry of a folder, what the folder is, what to do."""
+"""Entry of a folder, the folder's kind, and the next step."""
 
 
 def detect(path: Path) -> str | None:
-    """Return what a file or folder is and how it flies; None if it is unknown, or may be ours."""
+    """Return the kind of a file or folder and how to fly it; None: unknown, or may be ours."""
     try:
         found = _folder(path) if path.is_dir() else _file(path)
     except OSError:
-        return None  # whoever opens it says why it cannot be read
+        return None  # the error of opening it says why
     if found is None:
         return None
     what, advice = found
@@ -81,7 +81,7 @@ def _safetensors(path: Path, text: bytes) -> tuple[str, str] | None:
             return None
         names = [str(name) for name in header]
     except (ValueError, TypeError, AttributeError, RecursionError):
-        return None  # its reader says what is wrong with it
+        return None  # its reader reports the fault
     if (beside := _lerobot(path.parent)) is not None:
         what, advice = beside
         return f"the weights of {what}", advice
@@ -105,7 +105,7 @@ def _folder(path: Path) -> tuple[str, str]:
 
 
 def _lerobot(folder: Path) -> tuple[str, str] | None:
-    """Name the LeRobot policy in a folder and what to do with it; None if there is none."""
+    """Return the LeRobot policy in a folder and the next step; None if there is none."""
     try:
         config: Any = read_json(folder / "config.json")
     except (OSError, ValueError):
@@ -132,7 +132,7 @@ SUFFIXES = (".safetensors", ".pt", ".pth", ".ckpt")
 
 
 def require_file(path: Path, suffixes: Sequence[str]) -> None:
-    """Refuse a path that is not a file of one of these suffixes, and say what is there."""
+    """Raise CheckpointError, naming what was found, if a path is not a file with such a suffix."""
     if (sentence := detect(path)) is not None:
         raise CheckpointError(sentence)
     if path.suffix not in suffixes:
@@ -145,7 +145,7 @@ def require_file(path: Path, suffixes: Sequence[str]) -> None:
 
 
 def require_header(path: Path, header: dict[str, str]) -> None:
-    """Refuse a file that does not say what it is."""
+    """Raise CheckpointError if a file's header does not identify its content."""
     for key in HEADER_KEYS:
         if key not in header:
             raise CheckpointError(
@@ -156,7 +156,7 @@ def require_header(path: Path, header: dict[str, str]) -> None:
 
 
 def read_contract(path: Path) -> Contract | None:
-    """The contract in a policy's file; None where it is a ``.pt``, which only torch can read."""
+    """Return the contract in a policy's file; None for a ``.pt``, which only torch can read."""
     require_file(path, SUFFIXES)
     if path.suffix != ".safetensors":
         return None

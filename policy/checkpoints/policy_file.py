@@ -1,9 +1,10 @@
 """Policies on disk.
 
-``.safetensors`` holds the contract and the architecture in its header, so the file alone says what
-it is. It also holds a test vector, inputs and the chunks that plain torch made of them where it was
-saved: weights that no longer make them are refused. ``.pt`` and ``.pth`` hold weights; they are
-read without executing pickles, and what they do not say is taken from the caller.
+The header of a ``.safetensors`` file holds the contract and the architecture, so the file is
+self-describing. It also holds a test vector: inputs, and the chunks that plain torch computed from
+them when the file was saved. Weights that no longer reproduce these chunks are rejected. ``.pt``
+and ``.pth`` files hold weights only; they are read without executing pickles, and the caller
+supplies the rest.
 """
 
 import copy
@@ -60,23 +61,24 @@ _DAMAGED = (
     *(OSError, EOFError, RuntimeError, ValueError, LookupError, TypeError, AttributeError),
     *(AssertionError, ArithmeticError, MemoryError, struct.error),
 )
-"""Raised by torch.load on flipped bytes, which its reader interprets before it checks them."""
+"""Exceptions of torch.load for flipped bytes: its reader interprets them before it checks them."""
 _UNSUPPORTED = re.compile(r"GLOBAL (\S+)")
-"""In an error of torch.load's: the class that it refuses to look up."""
+"""In an error of torch.load: the class that it refuses to look up."""
 
 
 def build_policy(config: BuiltinConfig) -> BuiltinPolicy:
-    """The network of ``config``, with random weights of torch's global generator."""
+    """Build the network of ``config``, with random weights from torch's global generator."""
     return Toge(config) if isinstance(config, TogeConfig) else ResnetUnet(config)
 
 
 def save_checkpoint(
     path: Path, policy: BuiltinPolicy, *, training: str | None = None, packed: bool = False
 ) -> None:
-    """Write weights, contract, architecture and a test vector; replaces ``path`` at once or not.
+    """Write weights, contract, architecture and a test vector; replaces ``path`` atomically.
 
-    ``training`` is JSON that says how it was trained, for people and reports. ``packed`` makes a
-    third of the size, rounded as ``pack`` says; the test vector is then of rounded weights.
+    ``training`` is JSON about the training, for people and reports. ``packed`` shrinks the file to
+    a third, with rounding as in ``pack``; the test vector is then computed from the rounded
+    weights.
     """
     state = {name: value.detach().contiguous() for name, value in policy.state_dict().items()}
     require_finite(path, state)
@@ -97,10 +99,10 @@ def save_checkpoint(
 def load_checkpoint_with_notes(
     path: Path, *, fallback: BuiltinConfig
 ) -> tuple[BuiltinPolicy, tuple[str, ...]]:
-    """Read a checkpoint into the network that it was made for, on the CPU, in eval mode.
+    """Read a checkpoint into its network, on the CPU, in eval mode.
 
-    ``fallback`` is the policy that was asked for: its kind must be the file's, and its values serve
-    for what a ``.pt`` does not say. The notes say where in a ``.pt`` the weights were found.
+    ``fallback`` is the requested policy: the file must be of its kind, and its values supply
+    everything that a ``.pt`` lacks. The notes say where the weights were found in a ``.pt``.
     """
     require_file(path, SUFFIXES)
     is_ours = path.suffix == ".safetensors"
@@ -148,12 +150,14 @@ def load_checkpoint(path: Path, *, fallback: BuiltinConfig) -> BuiltinPolicy:
 
 
 def _make_vector(policy: BuiltinPolicy) -> dict[str, Tensor]:
-    """Inputs, and the chunks that plain torch in float32 on a CPU computes from them."""
+    """Return inputs, and the chunks that plain torch computes from them in float32 on a CPU."""
     reference = copy.deepcopy(policy).cpu().eval()
     samples = make_parity_samples(policy.contract)
     arrays = (samples.rgb, samples.state, samples.history, _chunks(reference, samples))
     return {
-        name: torch.from_numpy(np.ascontiguousarray(array))  # safetensors takes no other
+        name: torch.from_numpy(
+            np.ascontiguousarray(array)
+        )  # safetensors requires contiguous tensors
         for name, array in zip(VECTOR_NAMES, arrays, strict=True)
     }
 
@@ -216,10 +220,10 @@ def _architecture_from_json(text: str, contract: Contract) -> BuiltinConfig:
 
 
 def read_torch(path: Path) -> dict[Any, Any]:
-    """Read a dictionary of weights that torch saved; no pickle in it is executed."""
+    """Read a dictionary of weights saved by torch; executes no pickle."""
     try:
         with warnings.catch_warnings():
-            warnings.simplefilter("ignore")  # of file formats; what matters is refused below
+            warnings.simplefilter("ignore")  # about file formats; serious faults are rejected below
             loaded: object = torch.load(path, map_location="cpu", weights_only=True)
     except pickle.UnpicklingError as error:
         named = _UNSUPPORTED.search(str(error))

@@ -1,4 +1,4 @@
-"""Weights of a network in what ``torch.load`` returned, with or without a trainer's wrapping."""
+"""Search for a network's weights in the result of ``torch.load``, bare or wrapped."""
 
 import re
 from collections.abc import Iterator, Mapping
@@ -11,20 +11,20 @@ from policy.errors import CheckpointError
 
 USUAL_KEYS = ("model_state_dict", "state_dict", "model", "policy", "net")
 ANCHORS = 8
-"""Names of weights that are looked for behind a prefix, from all parts of the network."""
+"""Number of weight names, from all parts of the network, to search for behind a prefix."""
 _AVERAGED = re.compile(r"(^|[._])(ema|averaged|average|swa|shadow)([._]|$)")
 Shapes = Mapping[str, tuple[int, ...]]
-"""Shape of each weight by its name."""
+"""Shape of each weight by name."""
 
 
 def find_weights(
     path: Path, loaded: Mapping[Any, Any], wanted: Shapes
 ) -> tuple[dict[str, Tensor], str | None]:
-    """Return the weights in a file that fit a network, or else those that come nearest.
+    """Return the weights in a file that fit a network, or else the closest candidate.
 
-    They may lie under keys (``state_dict``, ``ema``) and behind prefixes (``module.``, ``net.``).
-    Averaged weights are preferred to those that they are the average of. The second value is a line
-    for a person where there was a choice, or a prefix.
+    They may be under keys (``state_dict``, ``ema``) and behind prefixes (``module.``, ``net.``).
+    Averaged weights are preferred to the weights behind the average. The second value is a line for
+    the user if there was a choice or a prefix.
     """
     found = [
         (f"{key}.{prefix}".strip("."), state)
@@ -49,7 +49,7 @@ def find_weights(
 
 
 def misfits(state: Mapping[str, Tensor], wanted: Shapes) -> list[str]:
-    """Return a phrase for each weight that keeps a state dict from being loaded."""
+    """Return a phrase for each weight that prevents loading a state dict."""
     problems = [f"missing {name!r}" for name in wanted if name not in state]
     problems += [f"unexpected {name!r}" for name in state if name not in wanted]
     problems += [
@@ -61,7 +61,7 @@ def misfits(state: Mapping[str, Tensor], wanted: Shapes) -> list[str]:
 
 
 def _tables(loaded: Mapping[Any, Any]) -> Iterator[tuple[str, dict[str, Tensor]]]:
-    """Every dictionary of tensors by name, with its key; the usual keys first, two levels deep."""
+    """Yield every dictionary of tensors, up to two levels deep, with its key; usual keys first."""
     first = [key for key in USUAL_KEYS if key in loaded]
     for key in (*first, *(key for key in loaded if key not in first)):
         value = loaded[key]
@@ -85,7 +85,7 @@ def _tensors(value: Mapping[Any, Any]) -> dict[str, Tensor]:
 def _behind_prefixes(
     table: dict[str, Tensor], wanted: Shapes
 ) -> Iterator[tuple[str, dict[str, Tensor]]]:
-    """The table as it is, and what is left of it behind each prefix of a wanted name."""
+    """Yield the table, and its entries behind each prefix of a wanted name, prefix removed."""
     yield "", table
     anchors = list(wanted)[:: max(1, len(wanted) // ANCHORS)]
     prefixes = {

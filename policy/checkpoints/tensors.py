@@ -1,4 +1,4 @@
-"""Files of weights, whatever the network: read, written, and refused by a ``CheckpointError``."""
+"""Reading, writing and checking of weight files of any network; faults are ``CheckpointError``."""
 
 from collections.abc import Mapping
 from pathlib import Path
@@ -13,12 +13,12 @@ from policy.errors import CheckpointError
 from policy.files import open_safetensors, whole_file
 
 SCALE = ".int8_scale"
-"""After a weight's name: its scales, one an output channel."""
+"""Suffix of a weight's name for its scales, one per output channel."""
 _LARGEST = 127.0
 
 
 def write_tensors(path: Path, tensors: Mapping[str, Tensor], header: Mapping[str, str]) -> None:
-    """Write a ``.safetensors`` file; replaces ``path`` at once or not at all."""
+    """Write a ``.safetensors`` file; replaces ``path`` atomically."""
     if path.suffix != ".safetensors":
         raise CheckpointError(f"{path}: checkpoints are written as .safetensors; rename it")
     try:
@@ -29,14 +29,14 @@ def write_tensors(path: Path, tensors: Mapping[str, Tensor], header: Mapping[str
 
 
 def read_tensors(path: Path) -> tuple[dict[str, str], dict[str, Tensor]]:
-    """Header and tensors of a ``.safetensors`` file."""
+    """Return header and tensors of a ``.safetensors`` file."""
     with open_safetensors(path, "pt") as file:
         header = file.metadata() or {}
         return header, {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118 - not a dict
 
 
 def require_finite(path: Path, state: Mapping[str, Tensor]) -> None:
-    """Refuse weights with NaN or infinity among them."""
+    """Raise CheckpointError if a weight is NaN or infinite."""
     bad = [name for name, value in state.items() if not torch.isfinite(value).all()]
     if bad:
         raise CheckpointError(
@@ -46,12 +46,12 @@ def require_finite(path: Path, state: Mapping[str, Tensor]) -> None:
 
 
 def shapes_of(network: nn.Module) -> Shapes:
-    """Shape of each weight of a network."""
+    """Return the shape of each weight of a network."""
     return {name: tuple(value.shape) for name, value in network.state_dict().items()}
 
 
 def require_fit(path: Path, policy: nn.Module, state: Mapping[str, Tensor], advice: str) -> None:
-    """Name the first weights that do not fit, and what to do; torch's message lists hundreds."""
+    """Raise CheckpointError with the first misfits and the next step; torch would list hundreds."""
     if problems := misfits(state, shapes_of(policy)):
         raise CheckpointError(
             f"{path}: does not fit this policy in {len(problems)} places: "
@@ -60,11 +60,11 @@ def require_fit(path: Path, policy: nn.Module, state: Mapping[str, Tensor], advi
 
 
 def pack(state: Mapping[str, Tensor], *, coarse: str) -> dict[str, Tensor]:
-    """Weights small enough to ship, from float32: half precision, but int8 for ``coarse`` prefixes.
+    """Shrink float32 weights for shipping: half precision, and int8 for ``coarse`` prefixes.
 
-    Those are the encoder's: most of the weights, and the least sensitive. Each output channel has a
-    scale of its own, so a weight is off by at most 1/254 of its channel's largest. What has one
-    dimension (norms, biases) stays in float32.
+    The coarse weights are the encoder's: the most numerous and the least sensitive. Each output
+    channel has its own scale, so a weight's error is at most 1/254 of the largest in its channel.
+    One-dimensional weights (norms, biases) stay in float32.
     """
     packed: dict[str, Tensor] = {}
     for name, value in state.items():
@@ -81,7 +81,7 @@ def pack(state: Mapping[str, Tensor], *, coarse: str) -> dict[str, Tensor]:
 
 
 def unpack(packed: Mapping[str, Tensor]) -> dict[str, Tensor]:
-    """Weights of a file as float32; those that are not packed come back as they are."""
+    """Return a file's weights as float32; weights that are not packed stay unchanged."""
     state: dict[str, Tensor] = {}
     for name, value in packed.items():
         scale = packed.get(name + SCALE)

@@ -1,4 +1,4 @@
-"""A world model on disk: ``.safetensors`` with its configuration in the header."""
+"""World models on disk: ``.safetensors`` with the configuration in the header."""
 
 from pathlib import Path
 
@@ -12,16 +12,16 @@ from policy.world_model.config import WorldModelConfig
 from policy.world_model.model import WorldModel
 
 WORLD_MODEL_KEY = "world_model"
-"""Key in the header; a policy's file has ``architecture`` instead."""
+"""Header key; a policy's file has ``architecture`` instead."""
 
 
 def save_world_model(
     path: Path, model: WorldModel, *, training: str | None = None, half: bool = True
 ) -> None:
-    """Write weights and configuration; replaces ``path`` at once or not at all.
+    """Write weights and configuration; replaces ``path`` atomically.
 
-    ``training`` is JSON that says how it was trained, for people and reports. ``half`` stores
-    float16, at half the size and some thousandth of rounding.
+    ``training`` is JSON about the training, for people and reports. ``half`` stores float16: half
+    the size, with relative rounding errors below a thousandth.
     """
     dtype = torch.float16 if half else torch.float32
     state = {

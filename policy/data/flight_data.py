@@ -1,6 +1,6 @@
-"""One flight as arrays, whatever the format that it was read from.
+"""One flight as arrays, independent of its file format.
 
-Everything keeps its true stamp, so the rates of camera, telemetry and sticks need not match.
+All data keep their own timestamps, so the rates of camera, telemetry and sticks need not match.
 """
 
 from collections.abc import Callable, Iterator, Sequence
@@ -27,18 +27,18 @@ ImageArray = NDArray[np.uint8]
 
 GATE_DIM = 7
 """Centre of the next gate in FRD body axes [3] m, heading of its passage rad, centre of the gate
-after it [3] m; all at the exposure, NaN where unknown."""
+after it [3] m; all at the exposure, NaN if unknown."""
 
 MAX_STATE_SCALES = 30.0
-"""A state so many times its usual size has another unit: 150 m/s, or milli-g taken for m/s^2."""
+"""A state this many times its usual size has another unit: 150 m/s, or milli-g for m/s^2."""
 
 
 class DatasetError(PolicyError):
-    """Flights that cannot be learned from; the message says which and why."""
+    """Flights that cannot be learned from; the message names them and the reason."""
 
 
 class ActionTerms(NamedTuple):
-    """What the actions of a flight are, by the fields of a contract."""
+    """Kind and meaning of a flight's actions, by the fields of a contract."""
 
     action: ActionKind = "sticks"
     hover_thrust: float = 0.39
@@ -50,27 +50,26 @@ STICK_TERMS = ActionTerms()
 
 @dataclass(frozen=True, kw_only=True)
 class FlightData:
-    """One flight; its stamps are of one monotonic clock, and no list of them ever falls."""
+    """One flight; all stamps are of one monotonic clock and never decrease."""
 
     name: str
-    """For messages, e.g. its folder."""
+    """For messages, e.g. the folder."""
     state_frame: StateFrame
     tick_ns: Nanoseconds
-    """[T] when the policy looked: image age and action history count from here."""
+    """[T] ticks of the policy: image age and action history are relative to these."""
     state: FloatArray
-    """[T, 13] as it was flown; NaN where it is unknown or not to be imitated."""
+    """[T, 13] state as flown; NaN if it is unknown or must not be imitated."""
     attitude_ns: Nanoseconds
-    """[T] arrival of its attitude: the first action of a chunk acts then."""
+    """[T] arrival of the attitude: the first action of a chunk acts then."""
     velocity_ns: Nanoseconds
-    """[T] arrival of its velocity."""
+    """[T] arrival of the velocity."""
     target_ns: Nanoseconds
     target: FloatArray
-    """[M, 4] sticks to imitate, at ``target_ns`` [M]; of a flight by rates those that
-    ``policy.stick_loop`` would have flown so."""
+    """[M, 4] sticks to imitate, at ``target_ns`` [M]; for a flight by rates, the sticks that
+    ``policy.stick_loop`` would have converted to the same rates."""
     sent_ns: Nanoseconds
     sent: FloatArray
-    """[S, 4] sticks that flew, each until the next one; centred where there were none, and in
-    flights by rates."""
+    """[S, 4] sticks that flew, each until the next; centred if none, and in flights by rates."""
     age_ns: Nanoseconds
     """[A] measured ages of the image at a tick; may be empty."""
     captured_ns: Nanoseconds
@@ -83,7 +82,7 @@ class FlightData:
     """Yields the images [H, W, 3] uint8 RGB in the order of ``captured_ns``; may stop early."""
     terms: ActionTerms = STICK_TERMS
     damage: tuple[str, ...] = ()
-    """What of its files was skipped, in sentences for the user."""
+    """Skipped parts of its files, in sentences for the user."""
 
     def __post_init__(self) -> None:
         for at, of, width in (
@@ -130,12 +129,12 @@ class FlightData:
             raise DatasetError(f"{self.name}: the attitude is not a unit quaternion")
 
     def first_frames(self, count: int) -> "FlightData":
-        """The same flight with the first ``count`` images."""
+        """Return the flight with its first ``count`` images only."""
         return replace(self, captured_ns=self.captured_ns[:count], gate=self.gate[:count])
 
 
 def common_frame(flights: Sequence[FlightData]) -> StateFrame:
-    """The state frame that all flights share."""
+    """Return the state frame that all flights share."""
     if not flights:
         raise DatasetError("no flights to learn from: name at least one flight folder")
     first = flights[0]
@@ -149,7 +148,7 @@ def common_frame(flights: Sequence[FlightData]) -> StateFrame:
 
 
 def common_terms(flights: Sequence[FlightData]) -> ActionTerms:
-    """The kind of actions that all flights share, and the largest of their tilts."""
+    """Return the action terms that all flights share, with the largest of their tilts."""
     first = flights[0]
     for flight in flights:
         if flight.terms[:2] != first.terms[:2]:
@@ -165,7 +164,7 @@ def common_terms(flights: Sequence[FlightData]) -> ActionTerms:
 def hold_out(
     flights: Sequence[FlightData], fraction: float, seed: int
 ) -> tuple[list[int], list[int]]:
-    """Indices of the flights to train on and to validate on.
+    """Return the indices of the flights for training and for validation.
 
     With two flights or more and a fraction above 0, at least one is held out and one is kept.
     """

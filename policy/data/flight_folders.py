@@ -36,7 +36,8 @@ _FRAME_COLUMNS = ("captured_ns",)
 
 
 def find_flights(paths: Sequence[Path]) -> list[Path]:
-    """Each path that is a flight, and the flights directly in each that is a folder of flights."""
+    """Return the paths that are flights, and the flights inside the paths that are folders of
+    flights."""
     if not paths:
         raise DatasetError("no flights to learn from: name at least one flight folder")
     found: list[Path] = []
@@ -55,11 +56,11 @@ def find_flights(paths: Sequence[Path]) -> list[Path]:
 
 
 def failure_of(folder: Path) -> str | None:
-    """How a flight has failed; None: it may be imitated, which flying into a gate's frame may not.
+    """Return how a flight failed; None: it may be imitated.
 
-    ``success``, where somebody wrote it, decides; else a crash, a fault that ended it, or the end
-    of its process. A policy's flight that an expert has labelled ("dagger") is learnt from whatever
-    became of it.
+    ``success`` decides if it is set; else a crash, a fault that ended the flight, or the end of its
+    process. A hit of a gate's frame counts as a failure. A policy's flight that an expert labelled
+    ("dagger") is used however it ended.
     """
     meta = _read_meta(folder)
     outcome = meta.get("outcome")
@@ -83,7 +84,7 @@ def failure_of(folder: Path) -> str | None:
 def leave_out_failed(
     folders: Sequence[Path], *, include_failed: bool
 ) -> tuple[list[Path], str | None]:
-    """The flights to learn from, and a line that says how many were left out, and why."""
+    """Return the flights to learn from, and a line with the exclusions and their reasons."""
     if include_failed:
         return list(folders), None
     failures = {folder: failure_of(folder) for folder in folders}
@@ -104,10 +105,10 @@ def leave_out_failed(
 
 
 def read_flight(folder: Path) -> FlightData:
-    """Read one flight folder, finished or left behind by a crash.
+    """Read one flight folder, complete or left by a crash.
 
-    The sticks to imitate are ``expert`` where there is such a column; otherwise those that were
-    sent; in a flight where nothing was sent (``--readonly``), those of the pilot.
+    The sticks to imitate are the ``expert`` column if there is one; otherwise the sent sticks; in a
+    flight that sent nothing (``--readonly``), the pilot's.
     """
     name, contract = str(folder), _contract(folder)
     state_frame, terms = (
@@ -133,7 +134,7 @@ def read_flight(folder: Path) -> FlightData:
     state = vectors(name, ticks, "state", STATE_DIM)
     sent = _sent(name, ticks, terms)
     is_expert = "expert" in ticks.column_names
-    # The expert looked when the policy would have; its stick is for that moment.
+    # The expert observed at the policy's tick; its stick is for that time.
     target_ns = tick_ns if is_expert else sent_ns
     target = vectors(name, ticks, "expert", ACTION_DIM) if is_expert else sent
     is_target = _known(target) & np.array(ticks["armed"].to_pylist(), dtype=bool)
@@ -168,7 +169,7 @@ def read_flight(folder: Path) -> FlightData:
 
 
 def _sent(name: str, ticks: pa.Table, terms: ActionTerms) -> FloatArray:
-    """Sticks that were sent, or where none were the pilot's; centred in a flight by rates."""
+    """Return the sent sticks, or the pilot's if none were sent; centred in a flight by rates."""
     if terms.action == "sticks":
         sent = vectors(name, ticks, "sent", ACTION_DIM)
         return sent if _known(sent).any() else vectors(name, ticks, "rc_sticks", ACTION_DIM)
@@ -181,7 +182,7 @@ def _sent(name: str, ticks: pa.Table, terms: ActionTerms) -> FloatArray:
 
 
 def read_ages(folder: Path) -> Nanoseconds:
-    """Ages of the image that were measured at the ticks of a flight, sorted."""
+    """Return the sorted image ages that were measured at the ticks of a flight."""
     parse_state_frame(str(folder), _contract(folder).get("state_frame"))
     ages = _ages(_read_table(folder, "ticks", ("woke_ns", "feature_captured_ns"), [])[0])
     if not (ages > 0).any():
@@ -190,7 +191,7 @@ def read_ages(folder: Path) -> Nanoseconds:
 
 
 def decode_video(path: Path, numbers: NDArray[np.int64]) -> Iterator[ImageArray]:
-    """Yield the images of these numbers of a flight's video, [H, W, 3] RGB."""
+    """Yield the images with these numbers of a flight's video, [H, W, 3] RGB."""
     count = 0
     try:
         for image in decode_images(path, video_parts(path), numbers.tolist()):
@@ -217,20 +218,20 @@ def _read_meta(folder: Path) -> dict[str, object]:
 
 
 def _contract(folder: Path) -> dict[str, Any]:
-    """Fields of a flight's contract; the first flights had none."""
+    """Return the fields of a flight's contract; the first flights had none."""
     contract = _read_meta(folder).get("contract")
     return contract if isinstance(contract, dict) else {}
 
 
 def _terms(name: str, contract: Mapping[str, Any]) -> ActionTerms:
-    """From the contract of a flight; the first ones were flown by sticks."""
+    """Return the action terms of a flight's contract; the first flights were flown by sticks."""
     action = contract.get("action", "sticks")
     if action not in ("sticks", "rates"):
         raise DatasetError(
             f"{name} was flown by {action}: this build learns from sticks and body rates"
         )
     if action == "rates" and contract.get("state_frame") != "ned_frd":
-        # Recorded actions have NED and FRD axes, whatever those of the state; sticks have none.
+        # Recorded actions are in NED and FRD axes in any state frame; sticks have no axes.
         raise DatasetError(
             f"{name} was flown by rates with its state in {contract.get('state_frame')}: this "
             "build learns body rates in ned_frd alone"
@@ -263,13 +264,13 @@ def _read_table(
 def _stamps_or(
     table: pa.Table, name: str, otherwise: Nanoseconds, use: NDArray[np.bool_]
 ) -> Nanoseconds:
-    """Stamps of the rows to ``use``, and of the others ``otherwise``: nothing reads those."""
+    """Return the stamps of the rows to ``use``; other rows, never read, get ``otherwise``."""
     rows = zip(table[name].to_pylist(), otherwise.tolist(), use, strict=True)
     return np.array([a if is_used and a is not None else b for a, b, is_used in rows], np.int64)
 
 
 def _ages(ticks: pa.Table) -> Nanoseconds:
-    """Ages of the image at the ticks that had one."""
+    """Return the image's age at each tick that had one."""
     pairs = zip(ticks["woke_ns"].to_pylist(), ticks["feature_captured_ns"].to_pylist(), strict=True)
     return np.array([woke - exposed for woke, exposed in pairs if exposed is not None], np.int64)
 

@@ -1,8 +1,7 @@
-"""Images of a recorded flight: fragmented MP4, one fragment a frame, whole or damaged.
+"""Images of a recorded flight: fragmented MP4 with one fragment per frame, complete or damaged.
 
-RGB images are in H.264, depth images in FFV1.
-
-Layout: ISO/IEC 14496-12. A moov box without samples, then a moof and an mdat box for each frame.
+RGB images are in H.264, depth images in FFV1. Layout: ISO/IEC 14496-12. A moov box without samples,
+then a moof and an mdat box for each frame.
 """
 
 import io
@@ -21,7 +20,7 @@ from policy.files import library_name
 _BOX_HEADER_BYTES = 8
 _KINDS = (b"ftyp", b"moov", b"moof", b"mdat", b"mfra", b"free")
 _MOOF_TO_MFHD, _MOOF_TO_NUMBER = 12, 20
-"""Offsets in a moof box: of the name of its first child, and of its sequence number, from 1."""
+"""Offsets in a moof box: of its first child's name, and of its sequence number (from 1)."""
 _SLICE, _KEY_SLICE = 1, 5
 """NAL unit types of H.264."""
 
@@ -30,22 +29,22 @@ class Fragment(NamedTuple):
     """A moof box and its mdat box."""
 
     number: int
-    """Of the image in the flight, from 0."""
+    """Number of the image in the flight, from 0."""
     start: int
     end: int
     is_key: bool
 
 
 class VideoParts(NamedTuple):
-    """What of a video can be decoded."""
+    """Decodable parts of a video."""
 
     head_bytes: int
     fragments: tuple[Fragment, ...]
-    """Behind damage from the next key frame on."""
+    """After damage they continue at the next key frame."""
     skipped_bytes: int
     skipped_frames: int
     is_ours: bool
-    """One image a fragment, as flights are recorded; else any MP4, read as far as it goes."""
+    """True: one image per fragment, as recorded by mavbridge. False: another MP4."""
 
     def describe(self, path: Path) -> str | None:
         """Return a sentence for the user; None if nothing was skipped."""
@@ -96,12 +95,12 @@ def _number(data: mmap.mmap, at: int) -> int:
 def with_images(
     path: Path, numbers: NDArray[np.int64], *, is_whole: bool
 ) -> tuple[NDArray[np.int64], list[str]]:
-    """Choose the rows, of these numbers, that have an image in the video.
+    """Select the rows, given by their image numbers, that have an image in the video.
 
-    ``is_whole``: the flight ended in order, so that each row had one. Raises OSError.
+    ``is_whole``: the flight ended normally, so each row had an image. Raises OSError.
 
     Returns:
-        The places of the rows, and sentences on what is lost.
+        Indices of the rows, and sentences about the lost images.
     """
     parts = video_parts(path)
     if not parts.is_ours:
@@ -116,7 +115,7 @@ def with_images(
 
 
 def _next_moof(data: mmap.mmap, at: int) -> int:
-    """Return where the next moof box begins, here at the earliest, or the end of the data."""
+    """Return the offset of the next moof box at or after ``at``, or the end of the data."""
     at += 4  # its size comes before its name
     while (found := data.find(b"moof", at)) >= 0:
         start = found - 4
@@ -127,7 +126,7 @@ def _next_moof(data: mmap.mmap, at: int) -> int:
 
 
 def _is_key(data: mmap.mmap, at: int, end: int) -> bool | None:
-    """Return whether an image depends on no other; None if it is no H.264."""
+    """True if an image depends on no other; None if it is not H.264."""
     is_key = None
     while at + 4 < end:
         kind = data[at + 4] & 0x1F
@@ -138,7 +137,7 @@ def _is_key(data: mmap.mmap, at: int, end: int) -> bool | None:
 
 
 def _decodable(fragments: list[Fragment]) -> Iterator[Fragment]:
-    """Leave out what cannot be decoded behind a gap; each image needs the one before it."""
+    """Drop the fragments from a gap to the next key frame: an image needs the one before it."""
     expected, is_broken = 0, False
     last = max((each.number for each in fragments), default=0)
     for place, fragment in enumerate(fragments):
@@ -153,12 +152,12 @@ def _decodable(fragments: list[Fragment]) -> Iterator[Fragment]:
 
 
 def decode_images(path: Path, parts: VideoParts, numbers: Collection[int]) -> Iterator[CameraImage]:
-    """Yield the images of these numbers, rising, of those in ``parts``, as they were recorded.
+    """Yield the images of ``parts`` with these ascending numbers, as they were recorded.
 
     RGB [H, W, 3] uint8, or depth [H, W] uint16.
 
     Raises:
-        OSError, ValueError, av.FFmpegError: an image is damaged inside.
+        OSError, ValueError, av.FFmpegError: the data of an image is damaged.
     """
     wanted = set(numbers)
     if not wanted:
@@ -191,7 +190,7 @@ def decode_images(path: Path, parts: VideoParts, numbers: Collection[int]) -> It
 
 
 def _decode_any(path: Path) -> Iterator[CameraImage]:
-    """Yield the images of a video that another program wrote, up to where it breaks off."""
+    """Yield the images of another program's video, up to its first fault."""
     # Read as MP4, since a playlist would name other files.
     with av.open(library_name(path), format="mp4") as container:
         images = container.decode(video=0)

@@ -16,20 +16,20 @@ from policy.files import whole_file
 from policy.preprocess import resize
 
 _SPARE_BYTES = 1 << 30
-"""Left free on the disk for checkpoints and logs."""
+"""Disk space to leave free for checkpoints and logs."""
 
 
 class FrameStore:
-    """Images of flights [N, height, width, 3] uint8, counted over all of them in their order."""
+    """Images of flights [N, height, width, 3] uint8, numbered across all flights in order."""
 
     def __init__(self, arrays: Sequence[ImageArray]) -> None:
         self._arrays = arrays
         self.counts = [len(array) for array in arrays]
-        """Images of each flight."""
+        """Number of images of each flight."""
         self._starts = np.cumsum([0, *self.counts])
 
     def only(self, flights: Sequence[int]) -> "FrameStore":
-        """The images of some flights, counted anew."""
+        """Return the images of some flights, renumbered."""
         return FrameStore([self._arrays[index] for index in flights])
 
     def read(
@@ -40,9 +40,9 @@ class FrameStore:
         *,
         is_mirrored: bool = False,
     ) -> ImageArray:
-        """Images [B, size, size, 3], mirrored or not.
+        """Return images [B, size, size, 3], mirrored or not.
 
-        ``shifts`` [B, 2] are pixels down and right; a shifted image repeats its edge.
+        ``shifts`` [B, 2] are pixels down and right; the edge of a shifted image is repeated.
         """
         out = np.empty((len(frames), size, size, 3), np.uint8)
         flights = np.searchsorted(self._starts, frames, side="right") - 1
@@ -72,10 +72,10 @@ def store_frames(
     size: int,
     progress: Callable[[float], None] = lambda _: None,
 ) -> FrameStore:
-    """Decode and resize, as in flight, the images that ``folder`` does not hold yet.
+    """Decode the images that ``folder`` does not hold yet, and resize them as in flight.
 
-    It has a file of images of ``size`` pixels a side for each flight, named by the content of its
-    video and the size. ``progress`` is called with the fraction done.
+    It holds one file for each flight, with images of ``size`` pixels a side, named by the digest of
+    its video and the size. ``progress`` is called with the completed fraction.
     """
     try:
         folder.mkdir(parents=True, exist_ok=True)
@@ -97,7 +97,7 @@ def store_frames(
 
 
 def disk_error(path: Path, error: OSError) -> DatasetError:
-    """The error to raise for a file that could not be written."""
+    """Return the error to raise for a file that could not be written."""
     if error.errno in (errno.ENOSPC, errno.EDQUOT):
         return DatasetError(f"{path}: the disk is full: make room, or write --out elsewhere")
     return DatasetError(f"{path}: {error.strerror or error}")
@@ -112,7 +112,7 @@ def _path(folder: Path, flight: FlightData, size: int) -> Path:
 def _decode(path: Path, flight: FlightData, size: int) -> None:
     """Store all images that have a row, or those before the video breaks off.
 
-    Written, not mapped: a disk that fills up under a map would kill the process.
+    Written, not memory-mapped: a full disk under a map would kill the process.
     """
     with whole_file(path) as draft:
         with draft.open("wb") as file:

@@ -1,4 +1,4 @@
-"""Interpolation of quantities that were measured at times of their own."""
+"""Interpolation of quantities with their own measurement times."""
 
 import numpy as np
 from numpy.typing import NDArray
@@ -8,32 +8,32 @@ from policy.contract import FloatArray
 from policy.data.flight_data import Nanoseconds
 
 MAX_GAP_NS = 200_000_000
-"""Sticks and attitudes further apart are not interpolated."""
+"""Longest gap between sticks or attitudes to interpolate across."""
 
 Indices = NDArray[np.int64]
 
 
 class Interpolator:
-    """Interpolates a quantity between measurements, held at the ends."""
+    """Interpolates a quantity between measurements, and holds the end values outside them."""
 
     def __init__(self, at_ns: Nanoseconds, values: FloatArray) -> None:
-        """Sort measurements [N, D] by their times [N]; of two at the same time the later counts."""
+        """Sort measurements [N, D] by their times [N]; of two at one time, the later counts."""
         order = np.argsort(at_ns, kind="stable")
         at_ns, values = at_ns[order], values[order]
         is_last = np.append(np.diff(at_ns) > 0, True)[: len(at_ns)]
         self._at_ns, self._values = at_ns[is_last], values[is_last].astype(np.float64)
 
     def covers(self, at_ns: Nanoseconds) -> NDArray[np.bool_]:
-        """True where a time lies between two measurements that are not too far apart."""
+        """True for each time between two measurements that are not too far apart."""
         return covered(self._at_ns, at_ns)
 
     def vectors_at(self, at_ns: Nanoseconds) -> NDArray[np.float64]:
-        """Linear interpolation [B, D]."""
+        """Interpolate linearly, [B, D]."""
         before, after, weight = self._around(at_ns)
         return (1.0 - weight[:, None]) * before + weight[:, None] * after
 
     def rotations_at(self, at_ns: Nanoseconds) -> NDArray[np.float64]:
-        """Unit quaternions [B, 4], turning at an even rate between two attitudes."""
+        """Interpolate unit quaternions [B, 4], with a constant rate between two attitudes."""
         return rotation.slerp(*self._around(at_ns))
 
     def _around(
@@ -47,7 +47,7 @@ class Interpolator:
 
 
 def covered(known_ns: Nanoseconds, at_ns: Nanoseconds) -> NDArray[np.bool_]:
-    """True where a time is one of ``known_ns``, or between two that are not too far apart."""
+    """True for each time that is one of ``known_ns``, or between two that are not too far apart."""
     if len(known_ns) == 0:
         return np.zeros(at_ns.shape, bool)
     after = np.searchsorted(known_ns, at_ns, side="left")
@@ -60,7 +60,7 @@ def covered(known_ns: Nanoseconds, at_ns: Nanoseconds) -> NDArray[np.bool_]:
 
 
 def nearest(known_ns: Nanoseconds, at_ns: Nanoseconds) -> Indices:
-    """Index of the one of ``known_ns`` that is nearest to each time; of two, the earlier."""
+    """Return the index of the nearest of ``known_ns`` for each time; the earlier one on a tie."""
     last = len(known_ns) - 1
     after = np.minimum(np.clip(np.searchsorted(known_ns, at_ns), 1, max(last, 1)), last)
     before = np.maximum(after - 1, 0)

@@ -1,4 +1,4 @@
-"""Reads LeRobot datasets of format v3 with the contract's features; an episode is a flight."""
+"""Reads LeRobot v3 datasets that have the contract's features; an episode is a flight."""
 
 import math
 import os
@@ -29,7 +29,7 @@ from policy.data.tables import file_digest, numbers, parse_state_frame, read_jso
 from policy.files import library_name, why_unreadable
 
 _PATH = re.compile(r"(?:[^{}]|\{(?:chunk_index|file_index|video_key)(?::0?\dd)?\})*")
-"""Templates of paths: fields of these names, a few digits wide."""
+"""Path templates: fields with these names, a few digits wide."""
 _CONVERT = "python -m lerobot.scripts.convert_dataset_v21_to_v30 --repo-id=..."
 
 
@@ -41,10 +41,10 @@ def is_lerobot(folder: Path) -> bool:
 def read_dataset(folder: Path, camera_key: str | None = None) -> list[FlightData]:
     """Read all episodes of a dataset.
 
-    Stamps are those that ``mavbridge export`` adds; without them, image, state and action of a row
-    are of its ``timestamp``. A LeRobot dataset does not say how old an image was when a policy
-    acted on it: ``age_ns`` is empty. ``camera_key`` is the feature with the images, by default the
-    only one.
+    Stamps are those that ``mavbridge export`` adds. Without them, image, state and action of a row
+    all have the row's ``timestamp``. A LeRobot dataset does not record how old an image was when a
+    policy acted on it: ``age_ns`` is empty. ``camera_key`` is the feature with the images, by
+    default the only one.
     """
     info = _read_info(folder, camera_key)
     rows = _read_episodes(info)
@@ -72,7 +72,7 @@ def read_dataset(folder: Path, camera_key: str | None = None) -> list[FlightData
 
 @dataclass(frozen=True, kw_only=True)
 class _Info:
-    """The parts of ``meta/info.json`` that are used."""
+    """Used parts of ``meta/info.json``."""
 
     folder: Path
     fps: float
@@ -85,14 +85,14 @@ class _Info:
 
 @dataclass(frozen=True, kw_only=True)
 class _Row:
-    """The parts of a row of ``meta/episodes`` that are used."""
+    """Used parts of a row of ``meta/episodes``."""
 
     name: str
     episode_index: int
     length: int
     data: Path
     video: Path
-    """The same as ``data`` where the images are in the table."""
+    """Equal to ``data`` if the images are in the table."""
     from_s: float
 
 
@@ -256,7 +256,7 @@ def _flight(info: _Info, row: _Row, table: pa.Table, digest: str) -> FlightData:
 
 
 def _state_frame(info: _Info, row: _Row, state: FloatArray) -> StateFrame:
-    """By the dataset's ``info``; else by gravity: in level flight -z is up in FRD, +z in FLU."""
+    """Return the frame in ``info``, else by gravity: in level flight -z is up in FRD, +z in FLU."""
     about = info.features[names.STATE_KEY].get("info")
     frame = about.get(names.STATE_FRAME) if isinstance(about, dict) else None
     if frame is not None:
@@ -311,9 +311,9 @@ def _decode_table(info: _Info, row: _Row) -> Iterator[ImageArray]:
 
 
 def _encoded_image(folder: Path, value: object) -> tuple[bytes, str]:
-    """Return an image cell's bytes and path; the bytes of its file where the cell has none.
+    """Return an image cell's bytes and path; if the cell has no bytes, those of its file.
 
-    LeRobot's cells are ``{"bytes", "path"}``; before they are embedded, only the path is set. A
+    LeRobot's cells are ``{"bytes", "path"}``; until images are embedded, only the path is set. A
     path that leads out of the dataset's folder is not followed.
     """
     cell = value if isinstance(value, dict) else {"bytes": value}

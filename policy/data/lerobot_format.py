@@ -1,4 +1,4 @@
-"""Names in a LeRobot dataset of format v3.0, for what is written and what is read.
+"""Names in a LeRobot dataset of format v3.0, shared by writer and reader.
 
 Source: lerobot 0.6.1, ``datasets/utils.py`` (paths, info), ``datasets/dataset_writer.py``,
 ``datasets/dataset_metadata.py`` (columns of the episodes), ``utils/constants.py`` (features).
@@ -22,11 +22,14 @@ CAPTURED, TICK, ATTITUDE, VELOCITY, ACTED, SENT_AT = (
     *("stamp.action_ns", "stamp.sent_ns"),
 )
 STAMPS = (CAPTURED, TICK, ATTITUDE, VELOCITY, ACTED, SENT_AT)
-"""Our own columns, the true stamps of a row: exposure of the image, tick that the state is of,
-arrival of its attitude and velocity, of the action, of the sticks that flew. LeRobot takes every
-feature whose name begins with "observation" or "action" for an input or output of its policies
-(``utils/feature_utils.py:dataset_to_policy_features``), so these begin with neither."""
+"""mavbridge's columns with the true stamps of a row: exposure of the image, tick of the state,
+arrival of its attitude and velocity, stamp of the action, stamp of the sticks that flew.
+
+LeRobot takes every feature whose name begins with "observation" or "action" for an input or output
+of its policies (``utils/feature_utils.py:dataset_to_policy_features``), so these begin with
+neither.
+"""
 SENT = "sent"
-"""Our own column: the sticks that flew."""
+"""mavbridge's column with the sticks that flew."""
 STATE_FRAME = "state_frame"
 """In the ``info`` of the state's feature: ``Contract.state_frame``."""

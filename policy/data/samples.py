@@ -1,7 +1,7 @@
 """Training samples from stamped flights, for any pair of an image and a later tick.
 
-They hold what a policy is given in flight: history and motion are those of ``policy.observation``,
-and the rows of a chunk are where ``mavbridge.flight.history.sample_chunk`` expects them.
+They equal a policy's input in flight: history and motion come from ``policy.observation``, and the
+rows of a chunk are at the times where ``mavbridge.flight.history.sample_chunk`` expects them.
 """
 
 from collections.abc import Sequence
@@ -30,28 +30,31 @@ from policy.data.interpolation import Indices, Interpolator, covered, nearest
 from policy.rotation import motion_since_exposure
 
 TICK_TOLERANCE_NS = 20_000_000
-"""Largest distance of a tick from the moment that was drawn: two ticks at 100 Hz."""
+"""Largest distance of a tick from the drawn time: two ticks at 100 Hz."""
 HISTORY_JITTER_S = 0.005
-"""The history is sampled up to so much earlier or later: half a tick at 100 Hz."""
+"""Largest shift of the history's sampling times, earlier or later: half a tick at 100 Hz."""
 FRESH_START_SHARE = 0.15
-"""Samples that look like a policy just engaged: the older part of the history is neutral."""
+"""Share of samples as just after takeover: the older part of the history is neutral."""
 BLIND_SHARE = 0.4
-"""Samples without any history. Sticks change slowly, so a net that sees the last ones learns to
-copy them and not to look (de Haan et al., "Causal Confusion in Imitation Learning", 2019), and then
-drifts off in flight, however small its error on the data."""
+"""Share of samples without any history.
+
+Sticks change slowly, so a network that sees the last ones learns to copy them instead of looking
+(de Haan et al., "Causal Confusion in Imitation Learning", 2019), and then drifts off in flight,
+however small its error on the data.
+"""
 HISTORY_NOISE = 0.1
-"""Standard deviation of an offset on the sticks of a history, against the same."""
+"""Standard deviation of an offset on the sticks of a history, against copying."""
 RATE_NOISE_RADPS = 1.5
 FORCE_NOISE_MPS2 = 5.0
-"""Standard deviations that hide body rates and specific force from a network that flies by rates:
-they are the last action a moment later, and copied like a history."""
+"""Standard deviations of the noise that hides body rates and specific force from a network that
+flies by rates: both equal the last action a moment later, and are copied like a history."""
 
 _BETWEEN_NS = 10 * NS_PER_S
-"""Time between two flights on the common axis: far longer than every gap that is bridged."""
+"""Time between two flights on the common axis: far longer than any gap that is interpolated."""
 
 
 # In a mirror, the plane of the first and third axis of world and body, vectors change the sign of y
-# and rotations those of x and z. It holds in both state frames.
+# and rotations the signs of x and z. This holds in both state frames.
 _VECTOR, _AXIAL = (1.0, -1.0, 1.0), (-1.0, 1.0, -1.0)
 STICK_SIGNS = np.array((1.0, -1.0, 1.0, -1.0), np.float32)
 """Factors of throttle, yaw, pitch and roll in a mirror."""
@@ -66,14 +69,14 @@ class Samples:
     state: FloatArray
     history: FloatArray
     chunk: FloatArray
-    """[B, horizon, 4]; where the flight ends inside, its last stick is held."""
+    """[B, horizon, 4]; after the end of the flight, its last stick is held."""
     known: NDArray[np.bool_]
-    """[B, horizon]: which sticks of the chunk were flown."""
+    """[B, horizon]: True for the sticks of the chunk that were flown."""
     gate: FloatArray
-    """[B, 7] at the exposure, NaN where unknown."""
+    """[B, 7] at the exposure, NaN if unknown."""
 
     def mirrored(self, is_mirrored: NDArray[np.bool_]) -> "Samples":
-        """Exchange left and right where ``is_mirrored`` [B]."""
+        """Exchange left and right in samples with ``is_mirrored`` [B]."""
         return Samples(
             state=mirrored(self.state, state_signs(self.state.shape[1]), is_mirrored),
             history=mirrored(self.history, STICK_SIGNS, is_mirrored),
@@ -84,14 +87,14 @@ class Samples:
 
 
 class Timeline:
-    """All flights on one axis of time, seconds apart, so that one search serves a batch."""
+    """All flights on one time axis, seconds apart, so that one search serves a batch."""
 
     def __init__(
         self, flights: Sequence[FlightData], contract: Contract, ages_ns: Nanoseconds
     ) -> None:
-        """Lay out the flights in the order in which their images are counted.
+        """Lay out the flights in the order in which their images are numbered.
 
-        An image's age in a sample is drawn from ``ages_ns``, which are sorted.
+        A sample's image age is drawn from ``ages_ns``, which are sorted.
         """
         self.contract = contract
         self.by_rates = contract.action == "rates"
@@ -125,7 +128,7 @@ class Timeline:
         self.frames, self._any_tick = self._usable_frames()
 
     def _usable_frames(self) -> tuple[Indices, Indices]:
-        """Images with a tick at some age and an attitude at the exposure; such a tick of each."""
+        """Return the images with an attitude at the exposure and a later tick; a tick for each."""
         ticks_ns = self.tick_ns[self._usable_ticks]
         low = self.captured_ns + self._ages_ns[0] - TICK_TOLERANCE_NS
         high = self.captured_ns + self._ages_ns[-1] + TICK_TOLERANCE_NS
@@ -135,7 +138,7 @@ class Timeline:
         if len(ticks_ns):
             has_tick &= ticks_ns[any_tick] <= high
         has_past = self._attitude.covers(self.captured_ns) & self._velocity.covers(self.captured_ns)
-        # The expert knew of a gate behind the camera, which the image does not show.
+        # The expert knew of gates behind the camera; the image does not show them.
         is_behind = self.gate[:, 0] < 0
         usable = np.flatnonzero(has_tick & has_past & ~is_behind)
         if len(usable) == 0:
@@ -148,7 +151,7 @@ class Timeline:
         return usable, any_tick
 
     def draw_ticks(self, frames: Indices, random: np.random.Generator) -> Indices:
-        """A tick for each image: the nearest to its exposure plus a measured age."""
+        """Draw a tick for each image: the nearest to its exposure plus a measured age."""
         ages = self._ages_ns[random.integers(len(self._ages_ns), size=len(frames))]
         wanted = self.captured_ns[frames] + ages
         ticks_ns = self.tick_ns[self._usable_ticks]
@@ -162,7 +165,7 @@ class Timeline:
     def samples(
         self, frames: Indices, ticks: Indices, random: np.random.Generator | None = None
     ) -> Samples:
-        """Inputs and labels at ``ticks`` with the images ``frames``; augmented by ``random``."""
+        """Return inputs and labels at ``ticks`` with images ``frames``; augmented by ``random``."""
         chunk, known = self.chunks(ticks)
         state = self.states(frames, ticks)
         if random is not None and self.by_rates:
@@ -178,12 +181,12 @@ class Timeline:
         )
 
     def states(self, frames: Indices, ticks: Indices) -> FloatArray:
-        """[B, state_dim]: the state at the tick and, if the contract says so, the motion since."""
+        """Return states [B, state_dim] at the ticks, with motion since the exposure if needed."""
         state: FloatArray = self._state[ticks]
         if not self.contract.since_exposure:
             return state
         captured_ns, attitude_ns = self.captured_ns[frames], self._attitude_ns[ticks]
-        # An image newer than the attitude: in flight nothing later is known, so nothing has moved.
+        # Image newer than the attitude: in flight no later state is known, so the motion is zero.
         attitude_then = self._attitude.rotations_at(np.minimum(captured_ns, attitude_ns))
         was = self._velocity.vectors_at(np.minimum(captured_ns, self._velocity_ns[ticks]))
         out = np.empty((len(ticks), self.contract.state_dim), np.float32)
@@ -195,7 +198,7 @@ class Timeline:
         return out
 
     def histories(self, ticks: Indices, random: np.random.Generator | None = None) -> FloatArray:
-        """[B, K, 4] sticks as they were sent, oldest first; augmented by ``random``."""
+        """Return the sticks [B, K, 4] as sent, oldest first; augmented by ``random``."""
         count = self.contract.history_len
         ages_ns = np.array(history_ages_ns(count, self.contract.history_dt_s))
         at_ns = self.tick_ns[ticks][:, None] - ages_ns
@@ -217,7 +220,7 @@ class Timeline:
         return np.where(is_neutral, np.float32(0), history)
 
     def chunks(self, ticks: Indices) -> tuple[FloatArray, NDArray[np.bool_]]:
-        """Sticks [B, horizon, 4] to imitate, and which of them [B, horizon] are known."""
+        """Return the sticks [B, horizon, 4] to imitate, and a mask [B, horizon] of known ones."""
         horizon = self.contract.horizon
         step_ns = round(self.contract.chunk_dt_s * NS_PER_S)
         at_ns = self._attitude_ns[ticks][:, None] + np.arange(horizon) * step_ns
@@ -232,7 +235,7 @@ class Timeline:
 
 
 def _starts_and_offsets(flights: Sequence[FlightData]) -> tuple[list[int], list[int]]:
-    """Time of each flight's start on the common axis, and times to add to its stamps."""
+    """Return each flight's start on the common axis, and the offsets to add to its stamps."""
     starts, offsets, end = [], [], 0
     for flight in flights:
         lists = (flight.tick_ns, flight.attitude_ns, flight.velocity_ns, flight.target_ns)
@@ -244,7 +247,7 @@ def _starts_and_offsets(flights: Sequence[FlightData]) -> tuple[list[int], list[
 
 
 def state_signs(state_dim: int) -> FloatArray:
-    """Factors [state_dim] of a state in a mirror."""
+    """Return the factors [state_dim] of a state in a mirror."""
     signs = np.ones(state_dim, np.float32)
     signs[VELOCITY] = signs[SPECIFIC_FORCE] = _VECTOR
     signs[RATE] = signs[QUATERNION.start + 1 : QUATERNION.stop] = _AXIAL
@@ -255,6 +258,6 @@ def state_signs(state_dim: int) -> FloatArray:
 
 
 def mirrored(values: FloatArray, signs: FloatArray, is_mirrored: NDArray[np.bool_]) -> FloatArray:
-    """``values`` [B, ..., D], times ``signs`` [D] where ``is_mirrored`` [B]."""
+    """Multiply the ``values`` [B, ..., D] with ``is_mirrored`` [B] by ``signs`` [D]."""
     chosen = is_mirrored.reshape(-1, *[1] * (values.ndim - 1))
     return np.where(chosen, values * signs, values).astype(np.float32)

@@ -1,4 +1,4 @@
-"""Read JSON and columns of Arrow tables; what is wrong is raised as a ``DatasetError``."""
+"""Reading of JSON and Arrow columns; faults are raised as ``DatasetError``."""
 
 import hashlib
 from pathlib import Path
@@ -15,11 +15,11 @@ from policy.data.flight_data import DatasetError, Nanoseconds
 from policy.files import library_name
 
 MAX_ROWS = 10_000_000
-"""A day at 100 Hz, and more: a small file can claim many more rows, and fill the memory."""
+"""More than a day at 100 Hz. A small file can claim many more rows and fill the memory."""
 
 
 def read_json(path: Path, kind: str) -> Any:
-    """The contents of a JSON file; ``kind`` names what its folder should be."""
+    """Return the contents of a JSON file; ``kind`` names the expected kind of its folder."""
     try:
         return files.read_json(path)
     except OSError as error:
@@ -29,7 +29,7 @@ def read_json(path: Path, kind: str) -> Any:
 
 
 def parse_state_frame(name: str, value: object) -> StateFrame:
-    """A state frame by its name in a file."""
+    """Return the state frame with this name in a file."""
     if value not in get_args(StateFrame):
         raise DatasetError(
             f"{name}: its state frame is {value!r}; known are {list(get_args(StateFrame))}"
@@ -38,12 +38,12 @@ def parse_state_frame(name: str, value: object) -> StateFrame:
 
 
 def stamps(name: str, table: pa.Table, column: str) -> Nanoseconds:
-    """A column of integers, none of them missing."""
+    """Return a column of integers without nulls."""
     return numbers(name, table, column).astype(np.int64)
 
 
 def numbers(name: str, table: pa.Table, column: str) -> np.ndarray:
-    """A column of numbers of its own type, none of them missing."""
+    """Return a column of numbers, in its own type, without nulls."""
     values = table[column]
     if values.null_count:
         raise DatasetError(f"{name}: {column} is missing in {values.null_count} rows")
@@ -54,7 +54,7 @@ def numbers(name: str, table: pa.Table, column: str) -> np.ndarray:
 
 
 def vectors(name: str, table: pa.Table, column: str, width: int) -> FloatArray:
-    """A column of lists of ``width`` finite numbers as [rows, width] float32, NaN where null."""
+    """Return a column of lists of ``width`` finite numbers, [rows, width] float32, null as NaN."""
     values = table[column].combine_chunks()
     valid = values.is_valid().to_numpy(zero_copy_only=False).astype(bool)
     try:
@@ -73,14 +73,14 @@ def vectors(name: str, table: pa.Table, column: str, width: int) -> FloatArray:
 
 
 def read_rows(stem: Path, damage: list[str]) -> tuple[pa.Table, NDArray[np.int64]]:
-    """Read a table of a flight, finished or not; a sentence on what is lost goes to ``damage``.
+    """Read a table of a flight, complete or not; sentences about lost rows go to ``damage``.
 
     Returns:
-        The rows that can be read, and their numbers; of a file that is empty, no columns.
+        The readable rows and their indices; for an empty file, no columns.
 
     Raises:
-        DatasetError: it has more rows than a flight.
-        OSError, pa.ArrowException: there is no such table, or nothing of it can be read.
+        DatasetError: it has more rows than a flight can have.
+        OSError, pa.ArrowException: the table does not exist, or none of it can be read.
     """
     parquet = stem.with_suffix(".parquet")
     if parquet.exists():
@@ -108,7 +108,7 @@ def read_rows(stem: Path, damage: list[str]) -> tuple[pa.Table, NDArray[np.int64
 
 
 def _read_groups(path: Path, damage: list[str]) -> tuple[pa.Table, NDArray[np.int64]]:
-    """Read the row groups of a Parquet file that are not damaged."""
+    """Read the undamaged row groups of a Parquet file."""
     groups, numbers, count = [], [np.zeros(0, np.int64)], 0
     failure: Exception | None = None
     with pq.ParquetFile(library_name(path), page_checksum_verification=True) as file:
@@ -134,6 +134,6 @@ def _read_groups(path: Path, damage: list[str]) -> tuple[pa.Table, NDArray[np.in
 
 
 def file_digest(path: Path) -> str:
-    """SHA-256 of a file."""
+    """Return the SHA-256 digest of a file."""
     with path.open("rb") as file:
         return hashlib.file_digest(file, "sha256").hexdigest()

@@ -1,4 +1,4 @@
-"""Windows of evenly spaced frames, with states and sticks: what a world model learns from."""
+"""Windows of evenly spaced frames with states and sticks, the training data of a world model."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -11,25 +11,26 @@ from policy.data.flight_data import DatasetError, FlightData, Nanoseconds
 from policy.data.interpolation import Indices, Interpolator, nearest
 
 TOLERANCE = 0.25
-"""Largest distance of a frame from its time in a window, over the time between two frames: no
-neighbour can take the place of one in three frames that was dropped."""
+"""Largest distance of a frame from its nominal time in a window, relative to the time between two
+frames. Below a third: if a window uses every third camera frame, no neighbour can replace a dropped
+one."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class WindowSamples:
-    """``B`` windows of ``K`` frames of context and ``T`` of future."""
+    """``B`` windows of ``K`` context frames and ``T`` future frames."""
 
     frames: Indices
-    """[B, K + T], counted over all flights."""
+    """[B, K + T], numbered across all flights."""
     states: FloatArray
     """[B, K + T, 13] at the exposures."""
     actions: FloatArray
-    """[B, T, 4] mean stick sent from the frame before to each frame of the future."""
+    """[B, T, 4] mean sent stick between the preceding frame and each future frame."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Windows:
-    """All windows of some flights; made by ``find_windows``."""
+    """All windows of some flights; created by ``find_windows``."""
 
     frames: Indices
     """[W, K + T]"""
@@ -45,18 +46,18 @@ class Windows:
         return len(self.frames)
 
     def among(self, frames: Indices) -> "Windows":
-        """The windows all of whose frames are in ``frames``; there may be none."""
+        """Return the windows with all frames in ``frames``; may be empty."""
         is_there = np.zeros(len(self.states), bool)
         is_there[frames] = True
         return replace(self, frames=self.frames[is_there[self.frames].all(axis=1)])
 
     def spread(self, count: int) -> "Windows":
-        """At most ``count`` of them, evenly over all flights."""
+        """Return at most ``count`` windows, evenly spread over all flights."""
         rows = np.linspace(0, len(self) - 1, min(count, len(self))).astype(np.int64)
         return replace(self, frames=self.frames[rows])
 
     def samples(self, rows: Indices) -> WindowSamples:
-        """The windows with indices [B]."""
+        """Return the windows with indices [B]."""
         frames = self.frames[rows]
         ends = frames[:, self.context_frames - 1 :]
         elapsed_s = np.diff(self.captured_ns[ends], axis=1)[..., None] / NS_PER_S
@@ -71,9 +72,9 @@ class Windows:
 def find_windows(
     flights: Sequence[FlightData], *, context_frames: int, frames: int, frame_dt_s: float
 ) -> Windows:
-    """Every run of ``context_frames + frames`` frames, ``frame_dt_s`` apart, of one flight.
+    """Find every run of ``context_frames + frames`` frames of one flight, ``frame_dt_s`` apart.
 
-    No window crosses a gap: each of its frames is near its place, and has a state.
+    No window crosses a gap: each of its frames is near its nominal time and has a state.
     """
     dt_ns = round(frame_dt_s * NS_PER_S)
     states, sent, windows, first = [], [], [], 0
@@ -103,14 +104,14 @@ def find_windows(
 
 
 def _states_at_exposures(flight: FlightData) -> tuple[FloatArray, NDArray[np.bool_]]:
-    """State [N, 13] between the ticks around each exposure, and where it is known."""
+    """Interpolate the state [N, 13] at each exposure; return a mask of the known ones too."""
     captured_ns = flight.captured_ns
     state = np.zeros((len(captured_ns), STATE_DIM), np.float32)
     rows = ~np.isnan(flight.state).any(axis=1)
     if not rows.any():
         return state, np.zeros(len(captured_ns), bool)
     flown = flight.state[rows]
-    # Body rates come with the attitude; the specific force is as old, give or take a tick.
+    # Body rates come with the attitude; the specific force has the same age within a tick.
     attitude_ns, velocity_ns = flight.attitude_ns[rows], flight.velocity_ns[rows]
     body = Interpolator(attitude_ns, flown[:, QUATERNION.stop :])
     attitude = Interpolator(attitude_ns, flown[:, QUATERNION])
@@ -123,7 +124,7 @@ def _states_at_exposures(flight: FlightData) -> tuple[FloatArray, NDArray[np.boo
 
 
 def _sent_until(flight: FlightData, at_ns: Nanoseconds) -> NDArray[np.float64]:
-    """Time integral [N, 4] of the sticks up to each time; a stick is held until the next one."""
+    """Integrate the sticks [N, 4] up to each time; a stick is held until the next one."""
     stamps, sticks = flight.sent_ns, flight.sent.astype(np.float64)
     if len(stamps) == 0:
         return np.zeros((len(at_ns), ACTION_DIM))
@@ -138,7 +139,7 @@ def _sent_until(flight: FlightData, at_ns: Nanoseconds) -> NDArray[np.float64]:
 def _evenly_spaced(
     captured_ns: Nanoseconds, usable: NDArray[np.bool_], count: int, dt_ns: int
 ) -> Indices:
-    """Runs [W, count] of usable frames, each near its place after the first."""
+    """Return runs [W, count] of usable frames, each near its nominal time after the first."""
     if len(captured_ns) < count:
         return np.zeros((0, count), np.int64)
     wanted = captured_ns[:, None] + dt_ns * np.arange(count)

@@ -1,6 +1,6 @@
-"""Which engine runs a policy: the fastest that is present and computes what plain torch computes.
+"""Choice of the engine: the fastest available one whose output agrees with plain torch.
 
-An engine that cannot be made, or fails the parity check, is passed over with a note of the reason.
+An engine that cannot be created, or fails the parity check, is skipped with a note of the reason.
 Torch, the reference, is last.
 """
 
@@ -23,16 +23,16 @@ from policy.nets.toge import Toge
 from policy.protocol import PolicyRunner, SingleRatePolicy
 
 Candidate = tuple[str, Callable[[], PolicyRunner]]
-"""The name of an engine to try, and what makes it."""
+"""Name of an engine to try, and the function that creates its runner."""
 
 
 def choose_runner(
     policy: SingleRatePolicy, engine: EngineName, settings: ExecutionSettings
 ) -> tuple[PolicyRunner, tuple[str, ...]]:
-    """The runner and lines for a person: the engine, and why faster ones were passed over."""
+    """Return the runner, and lines for the user: the engine, and why faster ones were skipped."""
     modules = modules_of(policy)
     for module in modules:
-        module.eval()  # before any engine looks: a flight trains nothing
+        module.eval()  # before any engine inspects it: a flight does not train
     if engine == "torch" or (engine == "auto" and not modules):
         return make_torch_runner(policy, settings), ()
     if not modules:
@@ -56,7 +56,7 @@ def choose_runner(
 def first_that_agrees(
     policy: SingleRatePolicy, candidates: list[Candidate], settings: ExecutionSettings
 ) -> tuple[PolicyRunner, tuple[str, ...]]:
-    """The first candidate that passes the check, or torch, with a line for each one passed over."""
+    """Return the first candidate that passes the check, or torch; and a line per skipped one."""
     notes: tuple[str, ...] = ()
     if candidates:
         on_cpu = replace(settings, vision_device="cpu", action_device="cpu")
@@ -75,7 +75,7 @@ def first_that_agrees(
 def first_with_chunks(
     expected: FloatArray, samples: ParitySamples, candidates: Sequence[Candidate]
 ) -> tuple[PolicyRunner | None, tuple[str, ...]]:
-    """The first candidate that makes the expected chunks, or None; a line for each other one."""
+    """Return the first candidate with the expected chunks, or None; and a line per skipped one."""
     notes: list[str] = []
     for label, make in candidates:
         try:
@@ -90,7 +90,7 @@ def first_with_chunks(
 
 
 def chunks_of_samples(runner: PolicyRunner, samples: ParitySamples) -> FloatArray:
-    """Chunks [samples, horizon, 4] from image to stick, from a reset on."""
+    """Return chunks [samples, horizon, 4] of the whole path from image to stick, after a reset."""
     runner.reset()
     inputs = zip(samples.rgb, samples.state, samples.history, strict=True)
     return np.concatenate(
@@ -105,7 +105,7 @@ def _impurity(
     samples: ParitySamples,
     expected: FloatArray,
 ) -> str | None:
-    """Why no graph computes what this policy does; None where one may."""
+    """Return why no graph can compute this policy; None if one may."""
     if isinstance(policy, Toge | ResnetUnet):
         return None
     if changed := changes(before, snapshot(policy)):

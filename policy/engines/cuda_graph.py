@@ -1,12 +1,13 @@
-"""NVIDIA GPUs: the image path and the action path captured once as CUDA graphs, then replayed.
+"""NVIDIA GPUs: image path and action path are captured once as CUDA graphs, then replayed.
 
-A replay launches hundreds of kernels in one call, which is what an action head on a GPU spends its
-time on. Each path has a stream of its own, the action's with high priority, so that a tick does not
-wait for an image; where both are on one GPU the encoder's kernels still run between its kernels.
+A replay launches hundreds of kernels in one call; otherwise an action head on a GPU spends its time
+on launches. Each path has its own stream, the action's with high priority, so a tick does not wait
+for an image. If both are on one GPU, the encoder's kernels still run between the action's kernels.
 
-Every graph reads and writes static memory. Inputs go up and results come down through pinned memory
-on the graph's own stream, and the caller waits for an event behind them: nothing of a replay is
-left in flight, and encoded images are handed over as arrays, so no tensor has two streams.
+Every graph reads and writes static memory. Inputs and results are copied through pinned memory on
+the graph's own stream, and the caller waits for an event after the last copy. So nothing of a
+replay is left in flight; encoded images are passed on as arrays, and no tensor is used on two
+streams.
 """
 
 import copy
@@ -24,7 +25,7 @@ from policy.protocol import PolicyRunner, SingleRatePolicy
 
 NAME = "cuda-graph"
 WARM_UP_CALLS = 3
-"""Before a capture, so that libraries have their choices and handles (PyTorch's CUDA notes)."""
+"""Calls before a capture, so that libraries have set up kernels (PyTorch's CUDA notes)."""
 HIGH_PRIORITY, NORMAL_PRIORITY = -1, 0
 
 
@@ -32,8 +33,8 @@ def make_cuda_graph_runner(policy: SingleRatePolicy, settings: ExecutionSettings
     """Capture a copy of the policy for the loops; tried once.
 
     Raises:
-        PolicyError: it is no torch module, has no fast path where one was asked for, or failed on a
-            dummy sample.
+        PolicyError: it is not a torch module, lacks a required fast path, or failed on a dummy
+            sample.
         RuntimeError: a capture failed.
     """
     if not isinstance(policy, nn.Module):
@@ -59,7 +60,7 @@ def _stream(device: torch.device, priority: int) -> torch.cuda.Stream:
 
 
 class _Graph:
-    """A function captured with static inputs and output; for one thread."""
+    """Captured function with static inputs and output; for one thread."""
 
     def __init__(
         self,
@@ -69,7 +70,7 @@ class _Graph:
     ) -> None:
         self._stream = stream
         self._pinned = [torch.zeros(shape, pin_memory=True) for shape in shapes]
-        # Work of other streams that this one builds upon, such as the copy of the weights.
+        # Wait for work of other streams that the capture depends on, such as the weights' copy.
         torch.cuda.synchronize(stream.device)
         with torch.cuda.device(stream.device), torch.cuda.stream(stream), torch.inference_mode():
             self._inputs = [host.to(stream.device) for host in self._pinned]
@@ -77,14 +78,14 @@ class _Graph:
                 function(*self._inputs)
             stream.synchronize()
             self._graph = torch.cuda.CUDAGraph()
-            # thread_local: what other threads do with CUDA meanwhile does not end the capture.
+            # thread_local: CUDA calls of other threads do not abort the capture.
             with torch.cuda.graph(self._graph, stream=stream, capture_error_mode="thread_local"):
                 self._output = function(*self._inputs)
             self._result = torch.zeros(self._output.shape, pin_memory=True)
         self._done = torch.cuda.Event()  # type: ignore[no-untyped-call]
 
     def __call__(self, *arrays: FloatArray) -> FloatArray:
-        """Run the graph; the result is the caller's. An array of another shape is refused."""
+        """Run the graph and return a copy of its output; reject arrays of another shape."""
         for host, array in zip(self._pinned, arrays, strict=True):
             if array.shape != tuple(host.shape):
                 raise PolicyError(f"an input must be {list(host.shape)}, got {list(array.shape)}")

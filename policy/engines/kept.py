@@ -1,4 +1,4 @@
-"""What a policy of anybody keeps: its modules, and whatever changes from call to call."""
+"""State of a user's policy: its modules, and the attributes that change from call to call."""
 
 from collections.abc import Collection
 
@@ -6,7 +6,7 @@ from torch import Tensor, nn
 
 
 def modules_of(policy: object) -> list[nn.Module]:
-    """The policy itself where it is a module, or the modules among its attributes."""
+    """Return the policy itself if it is a module, else the modules among its attributes."""
     if isinstance(policy, nn.Module):
         return [policy]
     values = vars(policy).values() if hasattr(policy, "__dict__") else ()
@@ -14,10 +14,10 @@ def modules_of(policy: object) -> list[nn.Module]:
 
 
 def snapshot(policy: object) -> dict[str, object]:
-    """The attributes of a policy and of all its modules, by name, in a form that can be compared.
+    """Return the attributes of a policy and of all its modules, by name, in a comparable form.
 
-    A tensor stands for its values, but for the weights, which no forward call changes; a number or
-    a text for itself; a collection for the identity of its elements; any other object for its own.
+    Tensors are compared by value, except the weights, which no forward call changes; numbers and
+    texts by value; collections by the identity of their elements; other objects by identity.
     """
     holders: dict[str, object] = {"": policy}
     for at, module in enumerate(modules_of(policy)):
@@ -33,7 +33,7 @@ def snapshot(policy: object) -> dict[str, object]:
 
 
 def changes(before: dict[str, object], after: dict[str, object]) -> list[str]:
-    """Names of attributes that came, went or changed, without the path to them."""
+    """Return the names, without the path, of attributes that were added, removed or changed."""
     names = [name for name in {**before, **after} if before.get(name) != after.get(name)]
     return sorted({name.rpartition(".")[2] for name in names})
 

@@ -1,4 +1,4 @@
-"""OpenVINO graphs converted and compiled for the CPU, or taken from the user's cache.
+"""OpenVINO graphs, converted and compiled for the CPU or loaded from the user's cache.
 
 Each graph infers on the calling thread alone, without the GIL, on arrays that are bound once.
 Threads are not pinned to cores: measured beside a second loop, pinning was slower or made no
@@ -28,15 +28,15 @@ from policy.errors import PolicyError, user_code
 from policy.files import whole_file
 
 MAX_ENTRIES = 24
-"""Files kept, about eight policies of two graphs each, some at two precisions; the least recently
-used is dropped first."""
+"""Files to keep: about eight policies of two graphs each, some at two precisions. The least
+recently used is dropped first."""
 MAX_BYTES = 2_000_000_000
-"""Size of all files together: the graphs of a large policy are as large as its weights."""
+"""Total size of the files: the graphs of a large policy are as large as its weights."""
 _DIGEST_BYTES = hashlib.sha256().digest_size
 
 
 def user_cache_folder() -> Path:
-    """XDG base directory specification: $XDG_CACHE_HOME or ~/.cache; an own folder in it."""
+    """Return the cache folder (XDG base directory specification): $XDG_CACHE_HOME or ~/.cache."""
     base = os.environ.get("XDG_CACHE_HOME", "")
     # The specification says to ignore a relative path.
     root = Path(base) if Path(base).is_absolute() else Path("~/.cache").expanduser()
@@ -44,13 +44,13 @@ def user_cache_folder() -> Path:
 
 
 class CompileCache:
-    """Bytes by key, in one folder of a file each."""
+    """Cache of bytes by key, one file each in one folder."""
 
     def __init__(self, folder: Path) -> None:
         self._folder = folder
 
     def load(self, key: str) -> bytes | None:
-        """The bytes stored under ``key``; None if there are none, or they are damaged."""
+        """Return the bytes stored under ``key``; None if there are none, or they are damaged."""
         path = self._path(key)
         try:
             content = path.read_bytes()
@@ -61,7 +61,7 @@ class CompileCache:
         return blob if hashlib.sha256(blob).digest() == digest else None
 
     def store(self, key: str, blob: bytes) -> None:
-        """Keep ``blob`` if possible; the oldest beyond ``MAX_ENTRIES`` or ``MAX_BYTES`` go."""
+        """Store ``blob`` if possible; drop the oldest beyond ``MAX_ENTRIES`` or ``MAX_BYTES``."""
         with contextlib.suppress(OSError):
             self._folder.mkdir(parents=True, exist_ok=True)
             with whole_file(self._path(key)) as draft:
@@ -102,12 +102,12 @@ class _StackT(ctypes.Structure):
 
 @contextlib.contextmanager
 def signal_stack_kept() -> Iterator[None]:
-    """Give the calling thread its alternate signal stack back, or none if it had none.
+    """Context manager: restore the calling thread's alternate signal stack, or its absence.
 
-    OpenVINO's CPU plugin gives the thread that loads it an alternate signal stack, and frees that
-    memory with the last of its objects. Python's handlers ask for the alternate stack, so the next
-    Ctrl-C would be handled in memory that is gone, and end the process with the sticks still held.
-    (Seen with 2026.4: ``sigaltstack`` after loading, a segmentation fault in ``kill`` later.)
+    OpenVINO's CPU plugin gives the loading thread an alternate signal stack, and frees that memory
+    with the last of its objects. Python's handlers use the alternate stack, so the next Ctrl-C
+    would run in freed memory and end the process while it still holds the vehicle. (Seen with
+    2026.4: ``sigaltstack`` after loading, a segmentation fault in ``kill`` later.)
     """
     if sys.platform != "linux":
         yield
@@ -119,16 +119,16 @@ def signal_stack_kept() -> Iterator[None]:
         yield
     finally:
         if sigaltstack(ctypes.byref(before), None) != 0:
-            # Too small for what the CPU must save by now (AMX): none is better than a freed one.
+            # Too small for the registers that the CPU now saves (AMX): no stack beats a freed one.
             none = _StackT(ss_sp=None, ss_flags=_SS_DISABLE, ss_size=0)
             sigaltstack(ctypes.byref(none), None)
 
 
 @signal_stack_kept()
 def precisions() -> tuple[tuple[Precision, Precision], ...]:
-    """Pairs to try for the image and the action path, the fastest first.
+    """Return pairs of precisions to try for the image and the action path, the fastest first.
 
-    bf16 only where the CPU computes in it; elsewhere it is emulated, or slower than float32.
+    bf16 only if the CPU computes in it; elsewhere it is emulated, or slower than float32.
     """
     if "BF16" in ov.Core().get_property(DEVICE, "OPTIMIZATION_CAPABILITIES"):
         return ("bf16", "bf16"), ("bf16", "f32"), ("f32", "f32")
@@ -136,12 +136,12 @@ def precisions() -> tuple[tuple[Precision, Precision], ...]:
 
 
 def engine_name(vision: Precision, action: Precision) -> str:
-    """Name of the engine at these precisions of the image and the action path."""
+    """Return the name of the engine at these precisions of the image and the action path."""
     return f"{NAME}-{vision}" if vision == action else f"{NAME}-{vision}-{action}"
 
 
 class GraphCompiler:
-    """Compiles graphs; ``subject`` is a text that differs wherever one of its graphs does."""
+    """Compiles graphs; ``subject`` is a text that identifies the content of all of them."""
 
     def __init__(self, subject: str) -> None:
         self._core = ov.Core()
@@ -156,7 +156,7 @@ class GraphCompiler:
         self._key = f"{subject} {digest.hexdigest()} {versions} {cpu} {capabilities}"
 
     def compile(self, name: str, precision: Precision, build: Callable[[], "ov.Model"]) -> "Graph":
-        """The graph that ``build`` makes, at a precision; ``name`` tells it from others here."""
+        """Compile the graph of ``build`` at a precision; ``name`` is unique in this compiler."""
         properties = {
             "PERFORMANCE_HINT": "LATENCY",
             "NUM_STREAMS": "1",
@@ -170,14 +170,14 @@ class GraphCompiler:
             try:
                 return Graph(self._core.import_model(io.BytesIO(stored), DEVICE, properties))
             except RuntimeError:
-                pass  # of another build after all: compile it again
+                pass  # from another build: compile it again
         compiled = self._core.compile_model(build(), DEVICE, properties)
         self._cache.store(key, compiled.export_model().getvalue())
         return Graph(compiled)
 
 
 class Graph:
-    """One compiled graph with arrays of its own at every input; for one thread."""
+    """Compiled graph with its own arrays at every input; for one thread."""
 
     def __init__(self, compiled: "ov.CompiledModel") -> None:
         self._request = compiled.create_infer_request()
@@ -189,7 +189,7 @@ class Graph:
             self._request.set_output_tensor(index, ov.Tensor(array, shared_memory=True))
 
     def __call__(self, *arrays: FloatArray) -> FloatArray:
-        """Return the first output of a run, the caller's; refuses an array of another shape."""
+        """Run the graph and return a copy of its first output; reject arrays of another shape."""
         for index, (own, array) in enumerate(zip(self._inputs, arrays, strict=True)):
             if own.shape != array.shape:
                 raise PolicyError(
@@ -200,12 +200,12 @@ class Graph:
         return self._outputs[0].copy()
 
     def rest(self) -> list[FloatArray]:
-        """Return copies of the further outputs of the last run."""
+        """Return copies of the other outputs of the last run."""
         return [array.copy() for array in self._outputs[1:]]
 
 
 class Traceable(nn.Module):
-    """A function of tensors as a module, with the modules whose weights it uses."""
+    """Module that wraps a function of tensors and holds the modules whose weights it uses."""
 
     def __init__(self, held: nn.Module, function: Callable[..., Any]) -> None:
         super().__init__()
@@ -219,15 +219,15 @@ class Traceable(nn.Module):
 
 @contextlib.contextmanager
 def quiet() -> Iterator[None]:
-    """Keep tracer and converter from writing to the terminal, and from muting others for good."""
+    """Silence tracer and converter, and keep them from silencing other loggers permanently."""
     level, disabled = logging.root.level, logging.root.manager.disable
     fast_path = torch.backends.mha.get_fastpath_enabled()
     try:
         logging.disable(logging.CRITICAL)
-        # The fused layer of torch's own transformers is an operation that no converter knows.
+        # No converter knows the fused layer of torch's own transformers.
         torch.backends.mha.set_fastpath_enabled(False)
         with warnings.catch_warnings():
-            warnings.simplefilter("ignore")  # each shape check of ours is one, rightly constant
+            warnings.simplefilter("ignore")  # our shape checks warn; constants are right there
             yield
     finally:
         torch.backends.mha.set_fastpath_enabled(fast_path)
@@ -236,9 +236,9 @@ def quiet() -> Iterator[None]:
 
 
 def convert(policy: nn.Module, function: Callable[..., Any], shapes: Sequence[Shape]) -> ov.Model:
-    """``function`` of float32 tensors of these shapes, which uses the weights of ``policy``.
+    """Convert ``function`` of float32 tensors of these shapes, with the weights of ``policy``.
 
-    It is traced: what it decides by a tensor's values is decided once, by zeros.
+    It is traced with zeros: decisions by a tensor's values are frozen to those for zeros.
     """
     with user_code("converting it for OpenVINO failed"), quiet():
         return ov.convert_model(

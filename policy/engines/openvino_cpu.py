@@ -1,8 +1,8 @@
 """OpenVINO on the CPU: the image path and the action path as one compiled graph each.
 
-The image path is converted as it is. The denoiser is written again over the same weights, as 2-D
-convolutions over a single row, which the CPU plugin runs faster than the products of matrices that
-torch prefers (bf16: by a third). What tells the steps of a solve apart are inputs, so that one
+The image path is converted unchanged. The denoiser is rewritten over the same weights, as 2-D
+convolutions over a single row: the CPU plugin runs them faster than the matrix products that torch
+prefers (bf16: by a third). The values that differ between the steps of a solve are inputs, so one
 graph, and one copy of the weights, serves every step. The parity check compares the result with
 torch.
 """
@@ -35,7 +35,7 @@ from policy.preprocess import egocentric, egocentric_scale
 from policy.protocol import PolicyRunner, SingleRatePolicy
 
 MAX_UNROLLED = 10
-"""Denoising steps in one graph: each takes a third of a second to convert, the first time."""
+"""Denoising steps in one graph; each takes a third of a second to convert, once."""
 
 
 @signal_stack_kept()
@@ -46,15 +46,15 @@ def make_openvino_runner(
     action: Precision,
     converter: ModuleConverter | None = None,
 ) -> PolicyRunner:
-    """Compile a policy for the loops, or take it from the user's cache; tried once.
+    """Compile a policy for the loops, or load it from the user's cache; tried once.
 
-    The initial noise of the policy is taken as it is now; ``vision`` and ``action`` are the
-    precisions of both paths. A policy that is none of ours is converted by ``converter``, which
-    may be kept from one precision to the next.
+    The policy's initial noise is copied now. ``vision`` and ``action`` are the precisions of both
+    paths. ``converter`` converts a policy that is not built in; it can be reused for another
+    precision.
 
     Raises:
-        PolicyError: it holds no torch module, cannot be converted, has no fast path where one was
-            asked for, or failed on a dummy sample.
+        PolicyError: it holds no torch module, cannot be converted, lacks a required fast path,
+            or failed on a dummy sample.
         RuntimeError: OpenVINO cannot compile it.
     """
     if isinstance(policy, Toge | ResnetUnet):
@@ -80,10 +80,10 @@ def _make_builtin(
 def _solver(
     compiler: GraphCompiler, policy: Toge | ResnetUnet, precision: Precision, steps: int
 ) -> Act:
-    """(encoded image, state, history) -> chunk, by ``steps`` from the policy's noise on.
+    """Return (encoded image, state, history) -> chunk, by ``steps`` from the policy's noise.
 
-    One graph, and so one copy of the weights, runs them all, at most ``MAX_UNROLLED`` at a time:
-    what tells the steps apart are inputs.
+    One graph, and so one copy of the weights, runs all steps, at most ``MAX_UNROLLED`` at a time:
+    the values that differ between steps are inputs.
     """
     at_once = min(steps, MAX_UNROLLED)
     denoise = compiler.compile(
@@ -105,7 +105,7 @@ def _solver(
 
 
 def digest_of_weights(module: nn.Module) -> str:
-    """A text that differs wherever a weight does."""
+    """Return a digest of all weights."""
     digest = hashlib.sha256()
     for name, value in module.state_dict().items():
         digest.update(f"{name} {value.dtype} {list(value.shape)}".encode())
@@ -114,13 +114,13 @@ def digest_of_weights(module: nn.Module) -> str:
 
 
 def vision_graph(policy: Toge | ResnetUnet) -> ov.Model:
-    """Normalised image [1, 3, H, W] -> feature [1, F]."""
+    """Build the graph: normalised image [1, 3, H, W] -> feature [1, F]."""
     image = (1, 3, policy.contract.image_height, policy.contract.image_width)
     return convert(policy, lambda i: policy.visual_projection(policy.backbone(i)), [image])
 
 
 def denoise_graph(policy: Toge | ResnetUnet, count: int) -> ov.Model:
-    """``count`` steps of a solve, unrolled; ``step_inputs`` says which ones.
+    """Build the graph of ``count`` unrolled steps of a solve; ``step_inputs`` selects the steps.
 
     (feature, egocentric, history, noisy [1, horizon, 4], films, updates) -> less noisy.
     """
@@ -149,15 +149,15 @@ def denoise_graph(policy: Toge | ResnetUnet, count: int) -> ov.Model:
 def step_inputs(
     head: DiffusionHead, num_diffusion_steps: int, first: int, count: int, unrolled: int
 ) -> tuple[FloatArray, FloatArray]:
-    """Inputs that make a graph of ``unrolled`` steps run ``first`` to ``first + count`` of a solve.
+    """Return inputs that make a graph of ``unrolled`` steps run ``count`` steps from ``first``.
 
-    Where those are fewer, steps that change nothing come before them. Returns the timesteps' shares
-    of FiLM [unrolled, film_dim], 1 added to the scales, and the coefficients of ``_updated``
-    [unrolled, 4].
+    If ``count`` is less than ``unrolled``, steps without effect come first. Returns the timesteps'
+    parts of FiLM [unrolled, film_dim], with 1 added to the scales, and the coefficients for
+    ``_updated`` [unrolled, 4].
     """
     steps = head.schedule.ddim_steps(num_diffusion_steps)[first : first + count]
     timesteps = torch.tensor([step.timestep for step in steps])
-    # FiLM's scales are about 1: added here, not in each step.
+    # FiLM's scales are relative to 1: add the 1 here, not in each step.
     halves = [(torch.ones(size // 2), torch.zeros(size // 2)) for size in head.unet.film_sizes]
     one_at_every_scale = torch.cat([half for pair in halves for half in pair])
     with torch.inference_mode():
@@ -171,10 +171,10 @@ def step_inputs(
 
 
 def _updated(noisy: Tensor, output: Tensor, update: Tensor) -> Tensor:
-    """One reverse step by the net's output; ``update`` [1, 4] are the schedule's ``coefficients``.
+    """Take one reverse step with the net's output; ``update`` [1, 4] are ``coefficients``.
 
-    ``noisy`` and ``update`` also reach the graph's end by a way without convolutions; along such a
-    way OpenVINO keeps float32 where the rest is bf16.
+    ``noisy`` and ``update`` also reach the graph's end by a path without convolutions; OpenVINO
+    keeps such a path in float32 if the rest is bf16.
     """
     a, b, c, d = update.reshape(1, 4, 1, 1).chunk(4, dim=1)
     clean = (noisy * a + output * b).clamp(-1.0, 1.0)
@@ -190,7 +190,7 @@ def _to_row(chunk: Tensor) -> Tensor:
 
 
 def _unet(unet: UNet1d, noisy: Tensor, film: Tensor) -> Tensor:
-    layers: Any = unet  # its lists of modules do not say of which class
+    layers: Any = unet  # its module lists are not typed
     films = iter(torch.split(film[:, :, None, None], unet.film_sizes, dim=1))
     x, skips = noisy, []
     for block, downsample in zip(layers.down, layers.downsample, strict=True):
@@ -224,7 +224,7 @@ def _pointwise(linear: nn.Linear, x: Tensor) -> Tensor:
 
 
 class BulkEncoder:
-    """The backbone of a policy, with its weights as they are now; one image a stream and core.
+    """Backbone of a policy, with its current weights; one image per stream and core.
 
     Measured on two cores without matrix units, EfficientNet-B3 at 128x128: four times as many
     images a second as torch in batches.
@@ -243,7 +243,7 @@ class BulkEncoder:
         self._dim = policy.backbone.out_dim
 
     def __call__(self, images: FloatArray) -> FloatArray:
-        """Normalised images [B, 3, H, W] of the contract's size -> outputs [B, D]."""
+        """Return outputs [B, D] for normalised images [B, 3, H, W] of the contract's size."""
         out = np.empty((len(images), self._dim), np.float32)
 
         def keep(request: ov.InferRequest, row: int) -> None:

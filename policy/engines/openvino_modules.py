@@ -1,9 +1,9 @@
-"""Torch modules of anybody, converted to OpenVINO graphs.
+"""Conversion of a user's torch modules to OpenVINO graphs.
 
-What a policy's methods compute is traced with all modules that the policy holds: the policy itself
-where it is a module, else those among its attributes. ``torch.export`` goes through it first, on
-shapes alone: it refuses what a trace would silently freeze, decisions by the values of a tensor,
-and it tells the size and the content of the graph before any time is spent on it.
+The policy's methods are traced with all modules that it holds: the policy itself if it is a module,
+else those among its attributes. ``torch.export`` runs first, on shapes alone: it rejects decisions
+by the values of a tensor, which a trace would silently freeze, and it gives the size and content of
+the graph before the slow conversion begins.
 """
 
 import hashlib
@@ -38,14 +38,15 @@ from policy.errors import PolicyError, user_code
 from policy.protocol import PolicyRunner, SingleRatePolicy, StepwisePolicy
 
 _MANGLED = re.compile(r"___torch_mangle_\d+\.")
-"""In the name of a type: how many others of that name the process has loaded."""
+"""In a type's name: TorchScript's counter of equally named types in the process."""
 MAX_OPERATIONS = 4000
-"""In one graph: 3 ms each to convert; ten unrolled steps of a TOGE are 2,700, one is 500."""
+"""Largest number of operations in one graph, 3 ms each to convert; ten unrolled steps of a TOGE are
+2,700, one is 500."""
 MAX_SCRIPT_OPERATIONS = 20_000
-"""The same limit where the graph is TorchScript's, which counts constants and shapes as well."""
+"""Largest number of operations in a TorchScript graph, which counts constants and shapes too."""
 MAX_WEIGHTS = 600_000_000
-"""In one graph, each counted as often as it is used: a copy of 4 bytes each, at least, is made for
-each use while it is converted. One step of the largest usual diffusion policy is 263 million."""
+"""Largest number of weights in one graph, each counted once per use: during conversion every use
+makes a copy of 4 bytes or more. One step of the largest usual diffusion policy has 263 million."""
 
 
 @signal_stack_kept()
@@ -59,8 +60,8 @@ def make_module_runner(
     """Compile a policy's methods for the loops; tried once.
 
     Raises:
-        PolicyError: it cannot be converted, is too large for that, has no fast path where one was
-            asked for, or failed on a dummy sample.
+        PolicyError: it cannot be converted, is too large for that, lacks a required fast path,
+            or failed on a dummy sample.
         RuntimeError: OpenVINO cannot compile it.
     """
 
@@ -76,7 +77,7 @@ def make_module_runner(
 
 
 class ModuleConverter:
-    """Converts functions of a policy; a graph that is needed at two precisions, only once."""
+    """Converts functions of a policy; a graph needed at two precisions is converted once."""
 
     def __init__(self, policy: object, name: str) -> None:
         self._modules = nn.ModuleList(modules_of(policy)).eval()
@@ -84,7 +85,7 @@ class ModuleConverter:
         self._is_script = any(
             isinstance(module, torch.jit.ScriptModule) for module in self._modules.modules()
         )
-        """TorchScript keeps its decisions where it is traced, and torch.export does not take it."""
+        """Traced TorchScript keeps data-dependent decisions, and torch.export rejects it."""
         self._models: dict[str, ov.Model] = {}
         if not self._modules:
             raise PolicyError(
@@ -95,7 +96,7 @@ class ModuleConverter:
     def compile(
         self, function: Callable[..., Any], shapes: Sequence[Shape], precision: Precision
     ) -> ArrayFunction:
-        """``function`` of float32 tensors of these shapes, compiled or from the user's cache."""
+        """Compile ``function`` of float32 tensors with these shapes, or load it from the cache."""
         module = Traceable(self._modules, lambda *a: _float_tensor(function(*a))).eval()
         examples = tuple(torch.zeros(shape) for shape in shapes)
         with user_code(f"{self._name} cannot be converted"), quiet(), torch.no_grad():
@@ -135,7 +136,7 @@ def _exported(module: nn.Module, examples: tuple[Tensor, ...]) -> ExportedProgra
 
 
 def _require_bounded(program: ExportedProgram) -> None:
-    """Refuse a graph that would take too long, or too much memory, to convert."""
+    """Raise PolicyError if a graph would take too long or too much memory to convert."""
     operations = sum(node.op == "call_function" for node in program.graph.nodes)
     weights = sum(value.numel() * uses for _, value, uses in _tensors(program))
     for count, limit, what in (
@@ -150,7 +151,7 @@ def _require_bounded(program: ExportedProgram) -> None:
 
 
 def _digest(program: ExportedProgram) -> str:
-    """A text that differs wherever the program does: in operations, constants or weights."""
+    """Return a digest of the program: operations, constants and weights."""
     digest = hashlib.sha256(program.graph_module.code.encode())
     for name, value, _ in _tensors(program):
         _update(digest, name, value)
@@ -158,7 +159,7 @@ def _digest(program: ExportedProgram) -> str:
 
 
 def _tensors(program: ExportedProgram) -> Iterator[tuple[str, Tensor, int]]:
-    """Weights and constants that the program uses: its name for each, and how often."""
+    """Return the program's weights and constants: its name for each, and the number of uses."""
     signature = program.graph_signature
     targets = {
         **signature.inputs_to_parameters,
@@ -173,7 +174,7 @@ def _tensors(program: ExportedProgram) -> Iterator[tuple[str, Tensor, int]]:
 
 
 def _digest_of_script(module: nn.Module, examples: tuple[Tensor, ...]) -> str:
-    """As ``_digest`` of a module that calls TorchScript."""
+    """Return a digest, as ``_digest``, of a module that calls TorchScript."""
     graph = _traced(module, examples).inlined_graph
     operations = sum(1 for _ in graph.nodes())
     if operations > MAX_SCRIPT_OPERATIONS:
@@ -182,7 +183,7 @@ def _digest_of_script(module: nn.Module, examples: tuple[Tensor, ...]) -> str:
             "converted: if it loops over denoising steps, export one step as `denoiser`"
         )
     digest = hashlib.sha256(_MANGLED.sub("", str(graph)).encode())
-    # The weights of a frozen archive are constants, of which the text of a graph has no values.
+    # A frozen archive's weights are constants, and the text of a graph omits their values.
     constants = [
         ("", node.t("value"))
         for node in graph.findAllNodes("prim::Constant")
@@ -199,7 +200,7 @@ def _update(digest: "hashlib._Hash", name: str, value: Tensor) -> None:
 
 
 def _converted(module: nn.Module, examples: tuple[Tensor, ...]) -> ov.Model:
-    # Traced, and not made of the exported program, whose graphs are slower on the CPU: 0.8 ms
+    # Traced, not converted from the exported program: its graphs are slower on the CPU, 0.8 ms
     # instead of 0.45 for a step of TOGE in bf16.
     shapes = [list(example.shape) for example in examples]
     return ov.convert_model(_traced(module, examples), example_input=examples, input=shapes)

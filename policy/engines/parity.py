@@ -1,4 +1,4 @@
-"""The parity check: do two ways to compute a policy agree, from image to stick?"""
+"""Parity check: do two ways to compute a policy agree, from image to stick?"""
 
 from dataclasses import dataclass
 
@@ -16,7 +16,7 @@ from policy.contract import (
 from policy.preprocess import SINCE_EXPOSURE_SCALE
 
 MIN_COSINE = 0.999
-"""Least cosine between the two chunks of a sample, taken as vectors."""
+"""Minimum cosine between the two chunks of a sample, taken as vectors."""
 MAX_STICK_ERROR = 0.01
 """Largest difference in full deflections: 5 us of PWM on the usual 1000..2000 us."""
 SAMPLES = 4
@@ -24,11 +24,10 @@ SAMPLES = 4
 
 @dataclass(frozen=True, kw_only=True)
 class ParitySamples:
-    """Synthetic inputs that exercise every input of a policy; the same for the same contract.
+    """Synthetic samples that exercise every input of a policy; equal for equal contracts.
 
     They are rgb [samples, H, W, 3] or depth in its place, state [samples, state_dim] and history
-    [samples, K, 4]. With several cameras or observations there are axes as in
-    ``Contract.image_shape``.
+    [samples, K, 4]. Several cameras or observations add axes as in ``Contract.image_shape``.
     """
 
     rgb: CameraImage
@@ -37,7 +36,7 @@ class ParitySamples:
 
 
 def make_parity_samples(contract: Contract) -> ParitySamples:
-    """Soft random images, and states and sticks of a brisk flight."""
+    """Return smooth random images, with states and sticks of a fast flight."""
     random = np.random.default_rng(0)
     height, width = contract.image_height, contract.image_width
     images = (SAMPLES, *contract.image_shape[:-3])
@@ -64,7 +63,7 @@ def make_parity_samples(contract: Contract) -> ParitySamples:
 
 
 def parity_failure(expected: FloatArray, chunks: FloatArray) -> str | None:
-    """Why two arrays of chunks [samples, horizon, 4] are not the same policy, or None."""
+    """Return why two arrays of chunks [samples, horizon, 4] disagree, or None."""
     if expected.shape != chunks.shape:
         return f"chunks of shape {list(chunks.shape)} instead of {list(expected.shape)}"
     if not np.isfinite(chunks).all():

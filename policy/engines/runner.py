@@ -1,4 +1,4 @@
-"""Shared by all engines: a policy becomes a ``PolicyRunner``, tried once before it flies."""
+"""Shared code of all engines: wrap a policy as a ``PolicyRunner`` and try it before it flies."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -14,12 +14,12 @@ from policy.protocol import DualRatePolicy, PolicyRunner, SingleRatePolicy
 EngineName = Literal["auto", "torch", "openvino", "cuda-graph"]
 Precision = Literal["bf16", "f32"]
 Act = Callable[[FloatArray, FloatArray, FloatArray], FloatArray]
-"""``PolicyRunner.act``."""
+"""Type of ``PolicyRunner.act``."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class ExecutionSettings:
-    """Settings of an execution that do not depend on the engine."""
+    """Engine-independent settings of an execution."""
 
     name: str
     """The policy's name in messages."""
@@ -31,10 +31,10 @@ class ExecutionSettings:
 
 
 ArrayFunction = Callable[..., FloatArray]
-"""float32 arrays in, one of the caller's own out."""
+"""Function that takes float32 arrays and returns an array owned by the caller."""
 Shape = tuple[int, ...]
 Compile = Callable[[Callable[..., Any], Sequence[Shape]], ArrayFunction]
-"""(function of the engine's own kind of arrays, shapes of its float32 inputs) -> compiled."""
+"""(function of the engine's array type, shapes of its float32 inputs) -> compiled function."""
 
 
 def make_runner(
@@ -48,7 +48,7 @@ def make_runner(
 ) -> PolicyRunner:
     """Compile a policy's methods for the loops and try them on a dummy sample.
 
-    ``vision`` encodes images and ``action`` samples chunks: one policy, perhaps on two devices.
+    ``vision`` encodes images and ``action`` samples chunks: one policy, possibly on two devices.
     """
     contract, steps = action.contract, settings.num_diffusion_steps
     rest = ((1, *contract.state_shape), (1, contract.history_len, ACTION_DIM))
@@ -70,7 +70,7 @@ def make_runner(
 
 
 def encoders(vision: DualRatePolicy) -> list[Callable[..., Any]]:
-    """``encode_visual`` of each camera: one argument, the image."""
+    """Return ``encode_visual`` of each camera as a function of the image alone."""
     cameras = len(vision.contract.cameras)
     if cameras == 1:
         return [vision.encode_visual]
@@ -83,8 +83,8 @@ def make_numpy_runner(policy: SingleRatePolicy, settings: ExecutionSettings) -> 
 
     def compile_(method: Callable[..., Any], _shapes: Sequence[Shape]) -> ArrayFunction:
         def run(*arrays: FloatArray) -> FloatArray:
-            # Copies in and out: what is published is read-only, and what is returned may be a
-            # buffer that the policy writes to again.
+            # Copies in and out: published arrays are read-only, and a returned array may be a
+            # buffer that the policy overwrites.
             result = method(*(array.copy() for array in arrays))
             if not isinstance(result, np.ndarray):
                 raise PolicyError(
@@ -105,10 +105,10 @@ def assemble(
     engine: str,
     settings: ExecutionSettings,
 ) -> PolicyRunner:
-    """A runner of an engine's functions, tried on a dummy sample, which warms it up.
+    """Build a runner from an engine's functions and try it on a dummy sample, which warms it up.
 
-    ``encode`` has a function for each camera, which takes a normalised image [1, 3, H, W]; without
-    a fast path it is empty. ``act`` is that of ``PolicyRunner``.
+    ``encode`` has one function per camera, which takes a normalised image [1, 3, H, W]; it is empty
+    without a fast path. ``act`` is that of ``PolicyRunner``.
     """
 
     def encode_image(image: CameraImage, camera: int = 0, /) -> FloatArray:
@@ -133,9 +133,9 @@ def assemble(
 
 
 def encode_all(runner: PolicyRunner, images: CameraImage) -> FloatArray:
-    """One image for each camera at each observation -> what ``act`` takes.
+    """Encode one image of each camera at each observation; return the argument of ``act``.
 
-    ``images`` has the axes of ``preprocess.dummy_images``, and may be of another size.
+    ``images`` has the axes of ``preprocess.dummy_images``, and may have another size.
     """
     contract = runner.contract
     steps, cameras = contract.observation_steps, len(contract.cameras)
@@ -146,7 +146,7 @@ def encode_all(runner: PolicyRunner, images: CameraImage) -> FloatArray:
 
 
 def level_state(contract: Contract) -> FloatArray:
-    """State [1, *state_shape] of a vehicle at rest and level; zeros but for the attitude."""
+    """Return the state [1, *state_shape] of a level vehicle at rest: zeros but the attitude."""
     state = np.zeros((1, *contract.state_shape), np.float32)
     state[..., QUATERNION.start] = 1.0
     return state
@@ -184,7 +184,7 @@ def _require(runner: PolicyRunner, what: str, array: FloatArray, shape: tuple[in
 
 
 def require_devices(*wanted: str) -> None:
-    """Refuse a device that is not here; torch is imported only to look for another than the CPU."""
+    """Raise PolicyError if a device is missing; imports torch only for a device other than cpu."""
     others = sorted({*wanted} - {"cpu"})
     if not others:
         return

@@ -1,4 +1,4 @@
-"""A diffusion policy whose network is compiled alone: the solver runs around it, in numpy."""
+"""Diffusion policies of which only the network is compiled: the solver runs around it, in numpy."""
 
 from collections.abc import Callable, Sequence
 from typing import Any
@@ -22,7 +22,7 @@ Segment = Callable[[FloatArray, FloatArray, FloatArray, FloatArray], FloatArray]
 
 
 def to_numpy(array: Any) -> FloatArray:
-    """A float32 copy of an array of any kind, on any device."""
+    """Return a float32 copy of an array of any library, on any device."""
     return np.array(array.cpu().numpy() if hasattr(array, "cpu") else array, np.float32)
 
 
@@ -35,7 +35,7 @@ def make_stepwise_runner(
     engine: str,
     settings: ExecutionSettings,
 ) -> PolicyRunner:
-    """``runner.make_runner``; ``compile_end`` is for ``to_chunk``, the end of a solve."""
+    """Create a runner as ``runner.make_runner``; ``compile_end`` compiles ``to_chunk``."""
     contract = policy.contract
     image = ((1, *contract.image_shape[-3:]),)
     encode = [compile_vision(method, image) for method in encoders(policy)]
@@ -67,7 +67,7 @@ def _act(
 
 
 def _on_images(encode: Sequence[ArrayFunction], act: Act, contract: Contract) -> Act:
-    """``act`` on images [1, *contract.image_shape] in place of their features: single rate."""
+    """Single rate: apply ``act`` to images [1, *contract.image_shape] instead of their features."""
 
     def act_on_images(images: FloatArray, state: FloatArray, history: FloatArray) -> FloatArray:
         steps = images.reshape(-1, len(encode), 1, *images.shape[-3:])
@@ -81,9 +81,9 @@ def _on_images(encode: Sequence[ArrayFunction], act: Act, contract: Contract) ->
 
 
 def solver_segment(denoise: ArrayFunction, schedule: Any, num_diffusion_steps: int) -> Segment:
-    """The DDIM steps of a solve, around the network call ``denoise``.
+    """Return a function that runs the DDIM steps of a solve around the network call ``denoise``.
 
-    ``denoise`` and ``schedule`` are as those of ``protocol.StepwisePolicy``.
+    ``denoise`` and ``schedule`` are as in ``protocol.StepwisePolicy``.
     """
     steps = schedule.ddim_steps(num_diffusion_steps)
     timesteps = [np.array([step.timestep], np.float32) for step in steps]

@@ -25,11 +25,11 @@ NAME = "torch"
 def make_torch_runner(policy: SingleRatePolicy, settings: ExecutionSettings) -> PolicyRunner:
     """Wrap a torch policy for the loops: numpy in and out, no gradients, tried once.
 
-    A module is moved to the action device, and copied to the vision device where that is another
-    one. In dual rate torch is told to use one thread an operator, in the whole process.
+    A module is moved to the action device, and copied to the vision device if that differs. In dual
+    rate, torch is set to one thread per operator in the whole process.
     """
     if settings.dual_rate:
-        torch.set_num_threads(1)  # two loops infer at once: one core each, no pool to fight over
+        torch.set_num_threads(1)  # two loops infer at once: one core each, no contention
     vision = action = policy
     if isinstance(policy, nn.Module):
         policy.to(settings.action_device).eval()
@@ -46,7 +46,7 @@ def make_torch_runner(policy: SingleRatePolicy, settings: ExecutionSettings) -> 
 
 
 def run_eagerly(name: str, device: str) -> Compile:
-    """What "compiles" a function for torch on a device: arrays to tensors and back."""
+    """ "Compile" a function for torch on a device: convert arrays to tensors and back."""
 
     def compile_(method: Callable[..., Any], _shapes: Sequence[Shape]) -> ArrayFunction:
         def run(*arrays: FloatArray) -> FloatArray:
@@ -57,7 +57,7 @@ def run_eagerly(name: str, device: str) -> Compile:
                     raise PolicyError(
                         f"{name} returned {type(result).__name__}; its contract says torch tensors"
                     )
-                # A copy, too: a policy may return a buffer that it writes to again.
+                # Copy the output: a policy may return a buffer that it overwrites.
                 return np.array(result.cpu().numpy(), np.float32)
 
         return run

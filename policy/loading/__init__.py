@@ -1,1 +1,1 @@
-"""From what a user wrote to a policy that is ready to fly."""
+"""Loading: from the user's --policy to a policy that is ready to fly."""

@@ -1,4 +1,4 @@
-"""The networks of this project: TOGE and ResNet-UNet, trained or with random weights."""
+"""Built-in networks: TOGE and ResNet-UNet, trained or with random weights."""
 
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -12,14 +12,14 @@ if TYPE_CHECKING:
     from policy.checkpoints.policy_file import BuiltinConfig, BuiltinPolicy
 
 SHIPPED = Path(__file__).parents[1] / "weights" / "toge.safetensors"
-"""Flown by ``toge`` where no other weights are named; its card is beside it."""
+"""Default weights of ``toge``; its model card is beside it."""
 SHIPPED_RATES = SHIPPED.with_name("toge-rates.safetensors")
-"""The same of ``toge-rates``, by thrust and body rates."""
+"""Default weights of ``toge-rates``, which flies by thrust and body rates."""
 BUILTIN_KINDS = ("toge", "toge-rates", "resnet-unet")
 
 
 def builtin_config(spec: str, *, image_size: int) -> "BuiltinConfig":
-    """The built-in network that ``spec`` names, with the default contract at that image size."""
+    """Return the built-in network of ``spec``, with the default contract at that image size."""
     kind, *options = spec.split(":")
     if kind not in BUILTIN_KINDS:
         raise PolicyError(
@@ -30,7 +30,7 @@ def builtin_config(spec: str, *, image_size: int) -> "BuiltinConfig":
 
 
 def load_builtin(request: PolicyRequest) -> tuple["BuiltinPolicy", list[str]]:
-    """Build a network and load its weights, or seeded random ones; with notes for the user."""
+    """Build a network and load its weights, or seeded random ones; return notes too."""
     kind, *options = request.spec.split(":")
     config, checkpoint = _config(kind, options, request.image_size), builtin_checkpoint(request)
     if checkpoint is None:
@@ -39,7 +39,7 @@ def load_builtin(request: PolicyRequest) -> tuple["BuiltinPolicy", list[str]]:
 
 
 def builtin_checkpoint(request: PolicyRequest) -> Path | None:
-    """The weights of a network of ours; None where random ones will do."""
+    """Return the weights of a built-in network; None if random weights are accepted."""
     if request.checkpoint is not None or request.allow_untrained:
         return request.checkpoint
     shipped = shipped_weights(request.spec)
@@ -53,12 +53,12 @@ def builtin_checkpoint(request: PolicyRequest) -> Path | None:
 
 
 def shipped_weights(spec: str) -> Path | None:
-    """The weights that ship for a spec; None where none do."""
+    """Return the shipped weights for a spec; None if there are none."""
     return {"toge": SHIPPED, "toge-rates": SHIPPED_RATES}.get(spec)
 
 
 def parse_builtin(kind: str, options: list[str]) -> tuple[Size, BackboneName | None]:
-    """Size and backbone that a spec asks for; a checkpoint that says more overrules them."""
+    """Return the size and backbone of a spec; a checkpoint's own values take precedence."""
     rest: list[Any] = list(options)
     size: Size = rest.pop(0) if rest and rest[0] in SIZE_NAMES else "small"
     if len(rest) > (0 if kind == "resnet-unet" else 1):
@@ -114,7 +114,7 @@ def _untrained(config: "BuiltinConfig", seed: int) -> tuple["BuiltinPolicy", lis
 
     from policy.checkpoints.policy_file import build_policy
 
-    with torch.random.fork_rng(devices=[]):  # the process's own random stream stays as it was
+    with torch.random.fork_rng(devices=[]):  # leaves the global random state unchanged
         torch.manual_seed(seed)
         policy = build_policy(config).eval()
     policy.seed_noise(seed)

@@ -1,4 +1,4 @@
-"""From what a user wrote (``--policy``, ``--checkpoint``) to a runner, or a clear refusal.
+"""Loading of the user's ``--policy`` and ``--checkpoint``: returns a runner, or says what is wrong.
 
     toge[:SIZE][:BACKBONE]   TOGE, e.g. toge, toge:medium, toge:small:resnet18
     resnet-unet[:SIZE]       ResNet-UNet, single-rate
@@ -6,13 +6,13 @@
                              a fixed program in any kind of action, e.g. scripted:square:velocity;
                              air: begin in the air, without the climb
     lerobot:DIR              an ACT or DiffusionPolicy as LeRobot saved it, with --contract FILE
-    onnx:DIR, onnx:FILE.onnx an ONNX export, with --contract FILE where nothing beside it is one
-    torchscript:FILE.pt      a TorchScript archive, likewise
-    package.module:Class     any class that keeps protocol.SingleRatePolicy or DualRatePolicy
-    ./file.py:Class          the same, by its file
+    onnx:DIR, onnx:FILE.onnx an ONNX export, with --contract FILE unless a contract is beside it
+    torchscript:FILE.pt      a TorchScript archive; contract as for ONNX
+    package.module:Class     any class that follows protocol.SingleRatePolicy or DualRatePolicy
+    ./file.py:Class          a class, by its file
     ws://HOST:PORT           a server that speaks openpi's websocket protocol; wss:// with TLS
 
-torch is imported only where a policy needs it.
+torch is imported only if a policy needs it.
 """
 
 import inspect
@@ -39,21 +39,21 @@ from policy.stick_loop import by_rates, flown_by_rates
 
 LEROBOT, ONNX, TORCHSCRIPT = "lerobot", "onnx", "torchscript"
 FORMS = {LEROBOT: "lerobot:DIR", ONNX: "onnx:DIR or onnx:FILE", TORCHSCRIPT: "torchscript:FILE.pt"}
-"""Forms of the kinds that are read from files of other programs."""
+"""Forms of --policy for files of other programs."""
 _WHEN = {"reset": "when a flight begins", "close": "when it is not needed any more"}
 
 
 def check_request(request: PolicyRequest) -> Contract | None:
-    """Refuse what can be refused in milliseconds: before weights, torch or a user's code is loaded.
+    """Run the checks that take milliseconds, before weights, torch or a user's code is loaded.
 
-    That is the spec, the checkpoint's file and contract, the image size, and the device. Only to
-    look for a device other than the CPU is torch imported.
+    Checks the spec, the checkpoint's file and contract, the image size and the device. torch is
+    imported only to look for a device other than the CPU.
 
     Returns:
-        The policy's contract, where files say it.
+        The policy's contract, if its files contain one.
 
     Raises:
-        PolicyError: with what was wrong, what was available and what to do.
+        PolicyError: the message names the fault, the available choices and the next step.
     """
     kind, *options = request.spec.split(":")
     _require_flags_of_kind(kind, request)
@@ -85,10 +85,10 @@ def check_request(request: PolicyRequest) -> Contract | None:
 
 
 def read_policy_contract(request: PolicyRequest) -> Contract:
-    """Return the contract of a policy; a network of ours is not loaded for it.
+    """Return the contract of a policy, without loading a built-in network.
 
     Raises:
-        PolicyError: as ``check_request``; or a user's class cannot be made.
+        PolicyError: as ``check_request``; or a user's class cannot be instantiated.
     """
     contract = check_request(request)
     if request.spec.partition(":")[0] in BUILTIN_KINDS:
@@ -104,17 +104,17 @@ def read_policy_contract(request: PolicyRequest) -> Contract:
 def load_policy(request: PolicyRequest, *, now_s: Callable[[], float]) -> LoadedPolicy:
     """Find, build, load, try and time a policy.
 
-    ``now_s``, monotonic seconds, is what it is timed by, and what scripted programs follow.
+    ``now_s`` (monotonic seconds) times the policy and drives scripted programs.
 
     Raises:
-        PolicyError: with what was wrong, what was available and what to do.
+        PolicyError: the message names the fault, the available choices and the next step.
     """
     check_request(request)
     policy, notes = _find(request, now_s)
     reset, close = (_life_method(policy, name, request.spec) for name in ("reset", "close"))
     try:
         runner, engine_notes = _on_engine(policy, request, notes)
-        if runner.reset is keep_nothing:  # an engine that keeps the state has its own
+        if runner.reset is keep_nothing:  # engines that keep the state bring their own reset
             runner = replace(runner, reset=reset)
         times = measure_times(runner, now_s)
         runner.reset()  # forget the dummy samples
@@ -129,7 +129,7 @@ def load_policy(request: PolicyRequest, *, now_s: Callable[[], float]) -> Loaded
 def _on_engine(
     policy: SingleRatePolicy, request: PolicyRequest, notes: list[str]
 ) -> tuple[PolicyRunner, tuple[str, ...]]:
-    """The policy on its engine, tried once; adds to ``notes`` what is not as it was asked for."""
+    """Return the policy on its engine, tried once; ``notes`` gets deviations from the request."""
     _require_image_size(policy.contract, request.image_size)
     dual_rate = request.dual_rate and isinstance(policy, DualRatePolicy)
     if request.dual_rate and not dual_rate:
@@ -169,7 +169,7 @@ def _on_engine(
 
 
 def _find(request: PolicyRequest, now_s: Callable[[], float]) -> tuple[SingleRatePolicy, list[str]]:
-    """Make the policy, and notes for the user."""
+    """Create the policy, and notes for the user."""
     kind, *options = request.spec.split(":")
     if kind == "scripted":
         note = f"{request.spec}: flies a fixed program, the camera is not looked at"
@@ -242,7 +242,7 @@ def _scripted(
 
 
 def _life_method(policy: SingleRatePolicy, name: str, spec: str) -> Callable[[], None]:
-    """The policy's own ``reset`` or ``close``, ready to call; a no-op if it has none."""
+    """Return the policy's own ``reset`` or ``close``, ready to call; a no-op if it has none."""
     method: object = getattr(policy, name, None)
     if method is None:
         return keep_nothing
@@ -266,7 +266,7 @@ def _life_method(policy: SingleRatePolicy, name: str, spec: str) -> Callable[[],
             if with_torch:
                 import torch
 
-                # As chunks are computed: torch refuses to change their tensors in place elsewhere.
+                # As for chunks: outside, torch refuses in-place changes to inference tensors.
                 stack.enter_context(torch.inference_mode())
             method()
 
@@ -274,7 +274,7 @@ def _life_method(policy: SingleRatePolicy, name: str, spec: str) -> Callable[[],
 
 
 def _require_flags_of_kind(kind: str, request: PolicyRequest) -> None:
-    """Refuse flags where they have no use, and a file of another kind than was named."""
+    """Raise PolicyError for inapplicable flags, and for a file of another kind than the spec's."""
     if request.by_rates and kind not in BUILTIN_KINDS:
         raise PolicyError(
             f"--by-rates is for {' and '.join(BUILTIN_KINDS)}, whose sticks are known to the "
@@ -294,7 +294,7 @@ def _require_flags_of_kind(kind: str, request: PolicyRequest) -> None:
 
 
 def _require_no_path(spec: str) -> None:
-    """Say how that flies which was named as a policy by its path alone."""
+    """Raise PolicyError for a bare path as the policy; the message names the form that flies it."""
     path = Path(spec)
     if not spec or ":" in spec or path.suffix == ".py":
         return

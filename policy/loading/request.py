@@ -1,4 +1,4 @@
-"""The policy that a user asked for, and the one that was loaded for it, with its times here."""
+"""The requested policy, and the loaded policy with its measured times."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -15,23 +15,23 @@ from policy.protocol import PolicyRunner
 
 REPETITIONS = 5
 MOST_S = 0.5
-"""No further repetition after so much time: a slow policy is known to be slow after one."""
+"""Stop repeating after this time: one run is enough to know that a policy is slow."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class SolveTimes:
-    """Medians, by the clock that they were measured with: zero on one that stands still."""
+    """Median times by the injected clock; zero if that clock stands still."""
 
     encode_s: float
-    """One image of each camera; without a fast path that is resizing alone."""
+    """One image of each camera; without a fast path, only its resizing."""
     act_s: float
     """One chunk."""
 
 
 def measure_times(runner: PolicyRunner, now_s: Callable[[], float]) -> SolveTimes | None:
-    """Time a policy that was tried before; None if it had no chunk for the dummy sample.
+    """Time a policy that was tried before; return None if it had no chunk for the dummy sample.
 
-    By a clock that stands still, as in simulations, it is asked only once.
+    If the clock stands still, as in simulations, each call runs only once.
     """
     contract = runner.contract
     images, state = dummy_images(contract), level_state(contract)
@@ -54,57 +54,56 @@ def measure_times(runner: PolicyRunner, now_s: Callable[[], float]) -> SolveTime
 
 @dataclass(frozen=True, kw_only=True)
 class PolicyRequest:
-    """The policy that a user asked for, and how it is to run."""
+    """The requested policy, and how to run it."""
 
     spec: str
-    """One of the forms in the module's docstring."""
+    """One of the forms in the docstring of ``policy.loading.load``."""
     checkpoint: Path | None = None
-    """Weights; a user's class gets them as ``Class(checkpoint=path)``. Without any, ``toge`` takes
-    the shipped ones."""
+    """Weights; a user's class gets ``Class(checkpoint=path)``. None: ``toge`` uses shipped ones."""
     contract_file: Path | None = None
-    """What the files of a policy that was trained elsewhere do not say: ``adapters.interface``."""
+    """Contract file of a policy that was trained elsewhere, see ``adapters.interface``."""
     allow_untrained: bool = False
-    """Accept seeded random weights where there is no checkpoint."""
+    """Accept seeded random weights if there is no checkpoint."""
     engine: EngineName = "auto"
-    """Engine that runs the network; auto = the fastest that passes the parity check."""
+    """Engine for the network; auto: the fastest that passes the parity check."""
     device: str = "cpu"
-    """torch's name of where to run: cpu, cuda, cuda:0, mps."""
+    """torch device: cpu, cuda, cuda:0, mps."""
     vision_device: str | None = None
-    """Where to encode images, if that is another one."""
+    """Device for encoding images, if different."""
     action_device: str | None = None
-    """Where to sample chunks, if that is another one."""
+    """Device for sampling chunks, if different."""
     dual_rate: bool = True
-    """A policy without a fast path is made single-rate, with a note."""
+    """A policy without a fast path becomes single-rate, with a note."""
     num_diffusion_steps: int = 10
     image_size: int | None = None
-    """Height and width that the policy takes; None leaves it to the contract."""
+    """Height and width of the policy's images; None: the contract's."""
     seed: int = 0
     """Seed of untrained weights and of the flight's initial noise."""
     by_rates: bool = False
-    """A network of ours that computes sticks flies by thrust and body rates."""
+    """Fly a built-in network, which computes sticks, by thrust and body rates."""
     starts_in_air: bool = False
-    """The vehicle flies already when the policy takes over: a scripted program does not climb."""
+    """The vehicle is already in the air at takeover: a scripted program does not climb."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class LoadedPolicy:
-    """A policy that may fly, and notes about it for the user.
+    """A policy that may fly, and notes for the user.
 
-    As a context manager it closes the policy: after its loops have ended, in the thread that
-    loaded it, once. A policy that fails to close never hides why the flight failed.
+    As a context manager it closes the policy once, in the thread that loaded it, after the policy's
+    loops have ended. A failing close never hides the error that ended the flight.
     """
 
     runner: PolicyRunner
     notes: tuple[str, ...]
     times: SolveTimes | None = None
-    """Measured on a dummy sample; None where it had no chunk for that."""
+    """Measured on a dummy sample; None if the policy had no chunk for it."""
 
     def __enter__(self) -> "LoadedPolicy":
-        """Return itself."""
+        """Return self."""
         return self
 
     def __exit__(self, _kind: object, failure: BaseException | None, _traceback: object) -> None:
-        """Close the policy; raises PolicyError if that fails, unless something failed before."""
+        """Close the policy; raise PolicyError if that fails and no earlier error is under way."""
         try:
             self.runner.close()
         except PolicyError as error:
@@ -114,7 +113,7 @@ class LoadedPolicy:
 
 
 def default_contract(image_size: int | None) -> Contract:
-    """The default contract, at an image size if one is given."""
+    """Return the default contract, at an image size if one is given."""
     if image_size is None:
         return Contract()
     return Contract(image_height=image_size, image_width=image_size)

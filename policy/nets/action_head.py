@@ -1,4 +1,4 @@
-"""The diffusion action head: a condition vector in, a chunk of stick positions out."""
+"""Diffusion action head: a condition vector in, a chunk of stick positions out."""
 
 from dataclasses import dataclass
 
@@ -14,7 +14,7 @@ from policy.nets.unet1d import UNet1d
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class SizeDims:
-    """Dimensions of the network of one size."""
+    """Network dimensions of one size."""
 
     base_dim: int
     """Width of the feature, the tokens and the condition."""
@@ -23,10 +23,10 @@ class SizeDims:
 
 
 def size_dims(size: Size) -> SizeDims:
-    """Dimensions of a size: heads of about 3, 12 and 40 million parameters.
+    """Return the dimensions of a size: heads of about 3, 12 and 40 million parameters.
 
-    On a CPU every diffusion step reads all weights once: 100 Hz with 10 steps leaves room for about
-    3 million of them on one core.
+    On a CPU every diffusion step reads all weights once: 100 Hz with 10 steps allows about 3
+    million weights on one core.
     """
     match size:
         case "small":
@@ -42,15 +42,14 @@ def size_dims(size: Size) -> SizeDims:
 class DiffusionHead(nn.Module):
     """Denoiser, noise schedule and initial noise.
 
-    Where the net predicts the clean chunk, its prediction is the sum of a linear layer's output for
-    the condition and of the U-Net's output for the noisy chunk. The linear layer learns the mean
-    chunk within minutes, and the U-Net is left with the deviations from it, which are nothing at
-    the noisiest step. So a head steers in few steps and after little training.
+    If the net predicts the clean chunk, its prediction is the sum of a linear layer's output for
+    the condition and the U-Net's output for the noisy chunk. The linear layer learns the mean chunk
+    within minutes, and the U-Net learns the deviations from it, which are zero at the noisiest
+    step. So a head steers in few steps and after little training.
 
-    The initial noise is fixed for a flight: the same inputs then give the same sticks, and chunks
-    do not jitter from sample to sample. It is not part of a checkpoint.
-
-    Steps that the schedule does not have raise a ``PolicyError``.
+    The initial noise is fixed for a flight: equal inputs then give equal sticks, and chunks do not
+    jitter from sample to sample. It is not part of a checkpoint. Steps that the schedule does not
+    have raise a ``PolicyError``.
     """
 
     def __init__(self, size: Size, contract: Contract, schedule: NoiseSchedule) -> None:
@@ -74,28 +73,28 @@ class DiffusionHead(nn.Module):
         self.initial_noise.copy_(flight_noise(seed, self.initial_noise.shape[1]))
 
     def denoise(self, noisy: Tensor, timestep: Tensor, condition: Tensor) -> Tensor:
-        """One network call: [B, horizon, 4], [B] int64, [B, C] -> the schedule's prediction."""
+        """Call the network: [B, horizon, 4], [B] int64, [B, C] -> the schedule's prediction."""
         film = self.unet.film_of_timestep(timestep) + self.unet.film_of_condition(condition)
         prediction: Tensor = self.unet(noisy, film)
         return prediction + self.read(condition) if self.reads_condition else prediction
 
     @property
     def reads_condition(self) -> bool:
-        """True where ``read`` is part of the prediction: where the net predicts the clean chunk."""
+        """True if ``read`` is part of the prediction, which is then the clean chunk."""
         return self.schedule.prediction == "sample"
 
     def read(self, condition: Tensor) -> Tensor:
-        """Condition [B, C] -> mean chunk [B, horizon, 4]."""
+        """Return the mean chunk [B, horizon, 4] for a condition [B, C]."""
         chunk: Tensor = self.direct(condition)
         return chunk.reshape(condition.shape[0], -1, ACTION_DIM)
 
     def sample(self, condition: Tensor, num_diffusion_steps: int) -> Tensor:
-        """Condition [B, C] -> chunk [B, horizon, 4] in [-1, 1]."""
+        """Sample a chunk [B, horizon, 4] in [-1, 1] for a condition [B, C]."""
         noise = self.initial_noise.expand(condition.shape[0], -1, -1)
         steps = self.schedule.ddim_steps(num_diffusion_steps)
-        # Picked on the device: a capture of a CUDA graph allows no copy from the host.
+        # Selected on the device: a CUDA graph capture allows no copy from the host.
         timesteps = torch.stack([self._timesteps[step.timestep] for step in steps])
-        # Both shares of FiLM are outside the loop; that of all timesteps is one product.
+        # Both parts of FiLM are outside the loop; one product serves all timesteps.
         film_of_step = self.unet.film_of_timestep(timesteps).unsqueeze(1)
         film_of_condition = self.unet.film_of_condition(condition)
         read = self.read(condition) if self.reads_condition else 0.0

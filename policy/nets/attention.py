@@ -1,4 +1,4 @@
-"""Attention of several heads, as every network of this project and of LeRobot's ACT computes it."""
+"""Multi-head attention, for every network of this project and for LeRobot's ACT."""
 
 import torch
 import torch.nn.functional as F
@@ -6,9 +6,9 @@ from torch import Tensor, nn
 
 
 class Attention(nn.Module):
-    """Scaled dot-product attention over [B, L, dim]; one layer makes queries, keys and values.
+    """Scaled dot-product attention over [B, L, dim]; one layer computes queries, keys and values.
 
-    ``nn.MultiheadAttention`` traces to one operation of torch's own, which no other engine knows.
+    ``nn.MultiheadAttention`` traces to a torch-specific operation that no other engine supports.
     """
 
     def __init__(self, dim: int, heads: int) -> None:
@@ -17,7 +17,7 @@ class Attention(nn.Module):
         self.qkv, self.project = nn.Linear(dim, 3 * dim), nn.Linear(dim, dim)
 
     def forward(self, query: Tensor, key: Tensor, value: Tensor) -> Tensor:
-        """Query [B, L, dim], key and value [B, M, dim] -> [B, L, dim]."""
+        """Attend from a query [B, L, dim] to key and value [B, M, dim] -> [B, L, dim]."""
         weights, biases = self.qkv.weight.chunk(3), self.qkv.bias.chunk(3)
         q, k, v = (
             F.linear(x, weight, bias).reshape(*x.shape[:2], self.heads, -1).transpose(1, 2)
@@ -26,10 +26,10 @@ class Attention(nn.Module):
         return self._merged(F.scaled_dot_product_attention(q, k, v))
 
     def among(self, tokens: Tensor, *, is_causal: bool = False, plainly: bool = False) -> Tensor:
-        """Tokens [B, L, dim] to all of them, or to those before them.
+        """Attend from tokens [B, L, dim] to all of them, or to those before each.
 
         ``plainly`` spells the operation out: OpenVINO's fused one (2026.4) is wrong in float32 over
-        a handful of tokens.
+        a few tokens.
         """
         batch, count, dim = tokens.shape
         qkv = self.qkv(tokens).reshape(batch, count, 3, self.heads, dim // self.heads)
@@ -42,7 +42,7 @@ class Attention(nn.Module):
         return self._merged(F.scaled_dot_product_attention(query, key, value, is_causal=is_causal))
 
     def _merged(self, attended: Tensor) -> Tensor:
-        """[B, heads, L, dim / heads] -> [B, L, dim]."""
+        """Merge the heads: [B, heads, L, dim / heads] -> [B, L, dim]."""
         out: Tensor = self.project(attended.transpose(1, 2).flatten(2))
         return out
 

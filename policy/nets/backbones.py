@@ -1,7 +1,7 @@
-"""The image encoders to choose from, and how ImageNet weights get into them.
+"""Image encoders, and the loading of ImageNet weights into them.
 
-Written here rather than imported, with torchvision's parameter names: a torchvision state dict
-loads as it is, but for the 1000-class layer at its end, which ``load_imagenet_state`` leaves out.
+Written here instead of imported, with torchvision's parameter names: a torchvision state dict loads
+unchanged, except for the final 1000-class layer, which ``load_imagenet_state`` drops.
 """
 
 from collections.abc import Mapping
@@ -29,7 +29,7 @@ OUT_CHANNELS = 1536
 
 
 class SqueezeExcitation(nn.Module):
-    """Scale each channel by a gate of the pooled channels; [B, C, H, W] -> the same."""
+    """Scaling of each channel by a gate of the pooled channels; [B, C, H, W] -> same shape."""
 
     def __init__(self, channels: int, squeezed: int) -> None:
         super().__init__()
@@ -38,13 +38,13 @@ class SqueezeExcitation(nn.Module):
         self.activation = nn.SiLU(inplace=True)
 
     def forward(self, x: Tensor) -> Tensor:
-        """Gated ``x``."""
+        """Gate ``x``."""
         pooled = x.mean(dim=(2, 3), keepdim=True)
         return x * torch.sigmoid(self.fc2(self.activation(self.fc1(pooled))))
 
 
 class MBConv(nn.Module):
-    """Expand, filter per channel, gate, project; shortcut where the shape allows."""
+    """Expand, filter per channel, gate, project; with a shortcut if the shape allows."""
 
     def __init__(
         self, channels_in: int, channels_out: int, *, expand: int, kernel: int, stride: int
@@ -63,13 +63,13 @@ class MBConv(nn.Module):
         self.has_shortcut = stride == 1 and channels_in == channels_out
 
     def forward(self, x: Tensor) -> Tensor:
-        """[B, C_in, H, W] -> [B, C_out, H/stride, W/stride]."""
+        """Map [B, C_in, H, W] -> [B, C_out, H/stride, W/stride]."""
         out: Tensor = self.block(x)
         return out + x if self.has_shortcut else out
 
 
 class EfficientNetB3(nn.Module):
-    """Image [B, 3, H, W] -> moments [B, 3 * 1536]; torchvision's ``classifier`` is left out."""
+    """Image [B, 3, H, W] -> moments [B, 3 * 1536]; without torchvision's ``classifier``."""
 
     classifier_keys = ("classifier.1.weight", "classifier.1.bias")
 
@@ -88,7 +88,7 @@ class EfficientNetB3(nn.Module):
         self.out_dim = MOMENTS * OUT_CHANNELS
 
     def forward(self, image: Tensor) -> Tensor:
-        """``resnet.moments`` of the last map, flat."""
+        """Return ``resnet.moments`` of the last map, flattened."""
         pooled: Tensor = moments(self.features(image)).flatten(1)
         return pooled
 
@@ -119,19 +119,19 @@ class ChannelNorm(nn.LayerNorm):
     """LayerNorm over the channels of [B, C, H, W]."""
 
     def forward(self, x: Tensor) -> Tensor:
-        """[B, C, H, W] -> the same."""
+        """Normalise the channels of [B, C, H, W]."""
         return super().forward(x.permute(0, 2, 3, 1)).permute(0, 3, 1, 2)
 
 
 class Permute(nn.Module):
-    """Reorder the axes; a module because its place counts in torchvision's names."""
+    """Reordering of axes; a module because it holds an index in torchvision's parameter names."""
 
     def __init__(self, *axes: int) -> None:
         super().__init__()
         self.axes = axes
 
     def forward(self, x: Tensor) -> Tensor:
-        """``x`` with its axes in the new order."""
+        """Return ``x`` with its axes reordered."""
         return x.permute(self.axes)
 
 
@@ -152,7 +152,7 @@ class ConvNextBlock(nn.Module):
         self.layer_scale = nn.Parameter(torch.full((channels, 1, 1), 1e-6))
 
     def forward(self, x: Tensor) -> Tensor:
-        """[B, C, H, W] -> the same."""
+        """Map [B, C, H, W] to the same shape."""
         out: Tensor = x + self.layer_scale * self.block(x)
         return out
 
@@ -160,7 +160,7 @@ class ConvNextBlock(nn.Module):
 class ConvNextTiny(nn.Module):
     """Image [B, 3, H, W] -> moments [B, 3 * 768].
 
-    The norm of their average bears torchvision's name ``classifier.0``; the linear layer after it,
+    The norm of their average has torchvision's name ``classifier.0``; the linear layer after it,
     ``classifier.2``, is left out.
     """
 
@@ -180,18 +180,18 @@ class ConvNextTiny(nn.Module):
         self.out_dim = MOMENTS * WIDTHS[-1]
 
     def forward(self, image: Tensor) -> Tensor:
-        """``pooling.moments`` of the last map, flat, the average normalised."""
+        """Return ``resnet.moments`` of the last map, flattened, with the average normalised."""
         features = self.features(image)
         average = self.classifier(features.mean(dim=(2, 3), keepdim=True))
         return torch.cat([average, moments(features)[:, 1:].flatten(1)], dim=1)
 
 
 Backbone: TypeAlias = EfficientNetB3 | ConvNextTiny | ResNet | ResNet8
-"""Image [B, 3, H, W] normalised -> feature [B, out_dim]."""
+"""Normalised image [B, 3, H, W] -> feature [B, out_dim]."""
 
 
 def build_backbone(name: BackboneName) -> Backbone:
-    """A backbone with random weights."""
+    """Build a backbone with random weights."""
     backbone: Backbone
     match name:
         case "efficientnet_b3":
@@ -213,7 +213,7 @@ def build_backbone(name: BackboneName) -> Backbone:
 
 
 def load_imagenet_state(backbone: Backbone, state: Mapping[str, Tensor]) -> None:
-    """Load torchvision's state dict of the same architecture; its classifier is left out."""
+    """Load torchvision's state dict of the same architecture, without its classifier."""
     kept = {name: value for name, value in state.items() if name not in backbone.classifier_keys}
     try:
         backbone.load_state_dict(kept)

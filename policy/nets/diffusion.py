@@ -1,6 +1,6 @@
 """The diffusion process: the training noise schedule and its exact deterministic DDIM solver.
 
-Forward process, DDPM (Ho et al. 2020, eq. 4), with a_t the cumulated product of ``1 - beta``:
+Forward process, DDPM (Ho et al. 2020, eq. 4), with a_t the cumulative product of ``1 - beta``:
 
     x_t = sqrt(a_t) x_0 + sqrt(1 - a_t) eps
 
@@ -33,10 +33,10 @@ Chunk = TypeVar("Chunk", Tensor, FloatArray)
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class DdimStep:
-    """One reverse step: where it starts, and the coefficients of the state before and after it.
+    """One reverse step: its start, and the coefficients of the state before and after it.
 
-    ``signal`` is sqrt(a_t), ``noise`` sqrt(1 - a_t). They are plain floats, so that a tracer folds
-    them to constants and float64 stays float64.
+    ``signal`` is sqrt(a_t), ``noise`` sqrt(1 - a_t). They are plain floats, so a tracer folds them
+    to constants and float64 stays float64.
     """
 
     timestep: int
@@ -48,13 +48,13 @@ class DdimStep:
 
 @dataclass(frozen=True, kw_only=True)
 class NoiseSchedule:
-    """The noise schedule of training, and which quantity the net was trained to predict."""
+    """Noise schedule of the training, and the quantity that the net predicts."""
 
     num_train_timesteps: int = TRAIN_TIMESTEPS
     betas: BetaSchedule = "squared_cosine"
     prediction: Prediction = "sample"
-    """``sample``: the net returns x_0; ``epsilon``: the noise. At the first steps x_0 from epsilon
-    is divided by sqrt(a_t), which is 5e-4 at t = 99: with few steps ``sample`` is the safer one."""
+    """``sample``: the net returns x_0; ``epsilon``: the noise. With ``epsilon``, the first steps
+    divide by sqrt(a_t), which is 5e-4 at t = 99, to get x_0; with few steps ``sample`` is safer."""
 
     def __post_init__(self) -> None:
         if not (
@@ -71,14 +71,14 @@ class NoiseSchedule:
             )
 
     def signal_power(self) -> tuple[float, ...]:
-        """a_t for every training timestep, falling from almost 1 to almost 0."""
+        """Return a_t for every training timestep, falling from almost 1 to almost 0."""
         return _signal_power(self.num_train_timesteps, self.betas)
 
     def ddim_steps(self, count: int) -> tuple[DdimStep, ...]:
-        """The reverse steps of a solve with ``count`` network calls, noisiest first.
+        """Return the reverse steps of a solve with ``count`` network calls, noisiest first.
 
-        Timesteps are spaced evenly and end at the noisiest one ("trailing", Lin et al. 2024), so
-        that every count starts from pure noise, and count 1 is the net's x_0 of pure noise.
+        Timesteps are evenly spaced and include the noisiest one ("trailing", Lin et al. 2024), so
+        every count starts from pure noise, and count 1 is the net's x_0 of pure noise.
         """
         total = self.num_train_timesteps
         if not isinstance(count, int) or isinstance(count, bool) or not 1 <= count <= total:
@@ -89,7 +89,7 @@ class NoiseSchedule:
         return _ddim_steps(total, self.betas, count)
 
     def add_noise(self, clean: Tensor, noise: Tensor, timestep: Tensor) -> Tensor:
-        """Forward process, for training: clean [B, ...] and standard normal noise -> noisy."""
+        """Run the forward process, for training: clean [B, ...] and standard noise -> noisy."""
         if clean.shape != noise.shape or timestep.shape != clean.shape[:1]:
             raise PolicyError(
                 f"add_noise needs clean and noise of one shape and a timestep per sample, got "
@@ -102,7 +102,7 @@ class NoiseSchedule:
         return at.sqrt().to(clean.dtype) * clean + (1 - at).sqrt().to(clean.dtype) * noise
 
     def coefficients(self, step: DdimStep) -> tuple[float, float, float, float]:
-        """``ddim_update`` as ``next = c * clip(a * noisy + b * output) + d * noisy``."""
+        """Return ``ddim_update`` as ``next = c * clip(a * noisy + b * output) + d * noisy``."""
         a, b = 0.0, 1.0
         if self.prediction == "epsilon":
             a, b = 1 / step.signal, -step.noise / step.signal
@@ -112,7 +112,7 @@ class NoiseSchedule:
     def ddim_update(
         self, step: DdimStep, noisy: Chunk, output: Chunk, *, limit: float = 1.0
     ) -> Chunk:
-        """One reverse step from the net's output, both tensors or both arrays.
+        """Take one reverse step with the net's output, both tensors or both arrays.
 
         x_0 is clipped to [-limit, limit], by default the range of an action, and eps is then
         recomputed, so that both still explain ``noisy``.
@@ -129,7 +129,7 @@ class NoiseSchedule:
 
 
 def flight_noise(seed: int, steps: int) -> Tensor:
-    """Noise [1, steps, 4] that the solves of a flight start from: the same on every device."""
+    """Return the initial noise [1, steps, 4] of a flight's solves: equal on every device."""
     return torch.randn(1, steps, ACTION_DIM, generator=torch.Generator().manual_seed(seed))
 
 
@@ -148,11 +148,12 @@ def ddim_solve(
 
 @lru_cache(maxsize=16)
 def _signal_power(total: int, betas: BetaSchedule) -> tuple[float, ...]:
-    """Schedules of Nichol & Dhariwal 2021: section 3.2, and Ho's linear one scaled to ``total``."""
+    """Return the signal power; schedules of Nichol & Dhariwal 2021, section 3.2, and Ho's linear
+    one scaled to ``total``."""
     power, powers = 1.0, []
     for t in range(total):
         if betas == "linear":
-            # 1e-4..0.02 is made for 1000 steps; the same noise in fewer steps needs larger ones.
+            # 1e-4..0.02 is for 1000 steps; equal noise in fewer steps needs larger betas.
             beta = (1e-4 + (0.02 - 1e-4) * t / max(total - 1, 1)) * 1000 / total
         else:
             beta = 1 - cosine_power((t + 1) / total) / cosine_power(t / total)
@@ -162,7 +163,7 @@ def _signal_power(total: int, betas: BetaSchedule) -> tuple[float, ...]:
 
 
 def cosine_power(fraction: float) -> float:
-    """Signal power after a share of the process, by the squared cosine."""
+    """Return the squared-cosine signal power after a share of the process."""
     return math.cos((fraction + 0.008) / 1.008 * math.pi / 2) ** 2
 
 

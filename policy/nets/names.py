@@ -1,4 +1,4 @@
-"""Names of sizes and image encoders, as a user writes them; imports no torch."""
+"""User-visible names of sizes and image encoders; imports no torch."""
 
 from typing import Literal, get_args
 

@@ -15,15 +15,15 @@ from torch import Tensor, nn
 from policy.contract import FloatArray
 
 MOMENTS = 3
-"""The average, and the averages weighted by the place to the right and by the place below."""
+"""Moments per channel: average, and averages weighted by the position rightwards and downwards."""
 
 
 def moments(features: Tensor) -> Tensor:
-    """Map [B, C, H, W] -> [B, 3, C], a vector that still says where things are.
+    """Pool a map [B, C, H, W] to [B, 3, C], a vector that keeps the position of objects.
 
-    The usual average answers what is in the image and forgets where; steering needs both. Diffusion
+    The usual average tells what is in the image but not where; steering needs both. Diffusion
     policies therefore pool by spatial softmax (Chi et al. 2023). First moments do the same without
-    a parameter, at any image size, beside the average that ImageNet's weights were trained with.
+    parameters, at any image size, beside the average that ImageNet's weights were trained with.
     """
     height, width = (int(size) for size in features.shape[2:])  # plain numbers also in a trace
     if features.is_cuda:
@@ -35,13 +35,13 @@ def moments(features: Tensor) -> Tensor:
 
 @lru_cache(maxsize=64)
 def _weights_on_gpu(device: torch.device, dtype: torch.dtype, height: int, width: int) -> Tensor:
-    """Return ``moment_weights``, kept there: while a CUDA graph is captured nothing is copied."""
+    """Return ``moment_weights``, kept on the GPU: a CUDA graph capture allows no copies."""
     with torch.inference_mode(False):
         return torch.from_numpy(moment_weights(height, width)).to(device, dtype)
 
 
 def moment_weights(height: int, width: int) -> FloatArray:
-    """[H * W, 3]: what each cell counts; places have mean 0 and variance of about 1."""
+    """Return each cell's weights [H * W, 3]; positions have mean 0 and variance of about 1."""
     across = np.broadcast_to(_places(width), (height, width))
     down = np.broadcast_to(_places(height)[:, None], (height, width))
     weights = np.stack([np.ones_like(across), across, down], axis=-1).reshape(-1, MOMENTS)
@@ -49,7 +49,7 @@ def moment_weights(height: int, width: int) -> FloatArray:
 
 
 def _places(count: int) -> FloatArray:
-    """Centres of ``count`` cells from one border to the other, at -sqrt(3) and sqrt(3)."""
+    """Return the centres of ``count`` cells between borders at -sqrt(3) and sqrt(3)."""
     centres = (np.arange(count, dtype=np.float32) + 0.5) * (2.0 / count) - 1.0
     return (math.sqrt(3.0) * centres).astype(np.float32)
 
@@ -57,7 +57,7 @@ def _places(count: int) -> FloatArray:
 RESNET8_CHANNELS = (24, 48, 96, 128)
 """Channels out of the first convolution and of the three blocks."""
 RESNET8_CELLS = 6
-"""Cells on a side of the map that the last layer sees: those of an image of 96 pixels."""
+"""Cells along a side of the map before the last layer, for an image of 96 pixels."""
 RESNET8_CELL_CHANNELS = 32
 
 
@@ -76,7 +76,7 @@ class BasicBlock(nn.Module):
         self.relu = nn.ReLU(inplace=True)
 
     def forward(self, x: Tensor) -> Tensor:
-        """[B, C_in, H, W] -> [B, width, H/stride, W/stride]."""
+        """Map [B, C_in, H, W] -> [B, width, H/stride, W/stride]."""
         shortcut = x if self.downsample is None else self.downsample(x)
         hidden = self.relu(self.bn1(self.conv1(x)))
         out: Tensor = self.relu(self.bn2(self.conv2(hidden)) + shortcut)
@@ -101,7 +101,7 @@ class Bottleneck(nn.Module):
         self.relu = nn.ReLU(inplace=True)
 
     def forward(self, x: Tensor) -> Tensor:
-        """[B, C_in, H, W] -> [B, 4 * width, H/stride, W/stride]."""
+        """Map [B, C_in, H, W] -> [B, 4 * width, H/stride, W/stride]."""
         shortcut = x if self.downsample is None else self.downsample(x)
         hidden = self.relu(self.bn1(self.conv1(x)))
         hidden = self.relu(self.bn2(self.conv2(hidden)))
@@ -116,7 +116,7 @@ _DEPTHS: dict[str, tuple[type[BasicBlock] | type[Bottleneck], tuple[int, int, in
     "resnet101": (Bottleneck, (3, 4, 23, 3)),
     "resnet152": (Bottleneck, (3, 8, 36, 3)),
 }
-"""Kind and number of the blocks of each layer."""
+"""Type and number of the blocks of each layer."""
 
 
 class LastMap(nn.Module):
@@ -137,14 +137,14 @@ class LastMap(nn.Module):
         self.channels = 512 * wide
 
     def forward(self, image: Tensor) -> Tensor:
-        """The map itself."""
+        """Return the last map."""
         x = self.maxpool(self.relu(self.bn1(self.conv1(image))))
         out: Tensor = self.layer4(self.layer3(self.layer2(self.layer1(x))))
         return out
 
 
 class ResNet(LastMap):
-    """Image [B, 3, H, W] -> moments [B, out_dim]; torchvision's ``fc`` is left out."""
+    """Image [B, 3, H, W] -> moments [B, out_dim]; without torchvision's ``fc``."""
 
     classifier_keys = ("fc.weight", "fc.bias")
 
@@ -153,16 +153,16 @@ class ResNet(LastMap):
         self.out_dim = MOMENTS * self.channels
 
     def forward(self, image: Tensor) -> Tensor:
-        """``moments`` of the last map, flat."""
+        """Return ``moments`` of the last map, flattened."""
         pooled: Tensor = moments(super().forward(image)).flatten(1)
         return pooled
 
 
 class ResNet8(nn.Module):
-    """Image [B, 3, H, W] -> feature [B, 256], in the manner of DroNet (Loquercio et al. 2018).
+    """Image [B, 3, H, W] -> feature [B, 256], similar to DroNet (Loquercio et al. 2018).
 
     Three residual blocks, and a layer that sees every cell of the last map. Small enough to learn
-    where gates are from nothing, in some ten minutes of one core.
+    the positions of gates from scratch in about ten minutes on one core.
     """
 
     classifier_keys = ()
@@ -182,7 +182,7 @@ class ResNet8(nn.Module):
         self.fc = nn.Linear(RESNET8_CELL_CHANNELS * RESNET8_CELLS**2, self.out_dim)
 
     def forward(self, image: Tensor) -> Tensor:
-        """A fully connected layer over the cells of the last map."""
+        """Apply a fully connected layer to the cells of the last map."""
         x = self.layers(self.relu(self.bn1(self.conv1(image))))
         cells = F.adaptive_avg_pool2d(self.relu(self.bn2(self.conv2(x))), RESNET8_CELLS)
         feature: Tensor = self.relu(self.fc(cells.flatten(1)))

@@ -16,7 +16,7 @@ from policy.nets.names import Size
 
 @dataclass(frozen=True, kw_only=True)
 class ResnetUnetConfig:
-    """All that fixes the architecture."""
+    """Architecture settings."""
 
     size: Size = "small"
     contract: Contract = field(default_factory=Contract)
@@ -33,9 +33,9 @@ class ResnetUnetConfig:
 
 
 class ResnetUnet(nn.Module):
-    """The policy protocol of ``protocol.SingleRatePolicy``, on torch tensors.
+    """ResNet-UNet behind ``protocol.SingleRatePolicy``, on torch tensors.
 
-    Chunks are sticks, also where the contract says rates: ``policy.stick_loop`` flies them so.
+    Chunks are sticks, even if the contract says rates: ``policy.stick_loop`` converts them.
     """
 
     def __init__(self, config: ResnetUnetConfig) -> None:
@@ -55,11 +55,11 @@ class ResnetUnet(nn.Module):
         self.head = DiffusionHead(config.size, self.contract, config.schedule)
 
     def seed_noise(self, seed: int) -> None:
-        """Start a flight: fixes the initial noise of all samples to come."""
+        """Start a flight: draw the initial noise of all its samples."""
         self.head.seed_noise(seed)
 
     def condition(self, visual: Tensor, state_token: Tensor, action_history: Tensor) -> Tensor:
-        """Projected image [B, C], encoded state [B, C], history [B, K, 4] -> condition [B, C]."""
+        """Fuse image [B, C], encoded state [B, C], history [B, K, 4] -> condition [B, C]."""
         parts = [visual, state_token, action_history.flatten(1)]
         condition: Tensor = self.fuse(torch.cat(parts, dim=1))
         return condition
@@ -67,7 +67,7 @@ class ResnetUnet(nn.Module):
     def encode_observation(
         self, image: Tensor, state: Tensor, action_history: Tensor | None = None
     ) -> Tensor:
-        """Image, state, history [B, K, 4] or None (no action sent yet) -> condition [B, C]."""
+        """Encode image, state, history [B, K, 4] or None (no action sent) -> condition [B, C]."""
         contract = self.contract
         if action_history is None:
             action_history = state.new_zeros(len(state), contract.history_len, ACTION_DIM)
@@ -84,6 +84,6 @@ class ResnetUnet(nn.Module):
         action_history: Tensor | None = None,
         num_diffusion_steps: int = 10,
     ) -> Tensor:
-        """Image, state and history -> chunk [B, horizon, 4] in [-1, 1]."""
+        """Sample a chunk [B, horizon, 4] in [-1, 1] from image, state and history."""
         condition = self.encode_observation(image, state, action_history)
         return self.head.sample(condition, num_diffusion_steps)

@@ -4,7 +4,7 @@
     state [B, 13 or 20] ----------------------+--MLP--> condition --diffusion head--> chunk
     action history [B, K, 4] --attention------'
 
-Everything left of the feature runs at the camera's rate, the rest at the action rate.
+The path to the feature runs at the camera's rate, the rest at the action rate.
 """
 
 from dataclasses import dataclass, field, replace
@@ -22,12 +22,12 @@ from policy.nets.names import BACKBONE_NAMES, BackboneName, Size
 
 @dataclass(frozen=True, kw_only=True)
 class TogeConfig:
-    """All that fixes TOGE's architecture."""
+    """Architecture settings of TOGE."""
 
     size: Size = "small"
     backbone: BackboneName = "efficientnet_b3"
     contract: Contract = field(default_factory=Contract)
-    """``feature_dim`` 0 stands for the size's own."""
+    """``feature_dim`` 0 is replaced by the size's own."""
     schedule: NoiseSchedule = field(default_factory=NoiseSchedule)
 
     def __post_init__(self) -> None:
@@ -48,11 +48,11 @@ class TogeConfig:
 
 
 class Toge(nn.Module):
-    """The policy protocol of ``protocol.DualRatePolicy``, on torch tensors.
+    """TOGE behind ``protocol.DualRatePolicy``, on torch tensors.
 
-    Images are normalised by ``preprocess.image_to_input``, states are in SI units. A shape that is
-    not the contract's, or steps that the schedule does not have, raise a ``PolicyError``.
-    Chunks are sticks, also where the contract says rates: ``policy.stick_loop`` flies them so.
+    Images are normalised by ``preprocess.image_to_input``, states are in SI units. A shape that
+    differs from the contract's, or steps that the schedule does not have, raise a ``PolicyError``.
+    Chunks are sticks, even if the contract says rates: ``policy.stick_loop`` converts them.
     """
 
     def __init__(self, config: TogeConfig) -> None:
@@ -61,7 +61,7 @@ class Toge(nn.Module):
         self.contract = replace(config.contract, feature_dim=dim)
         self.config = replace(config, contract=self.contract)
         self.backbone = build_backbone(config.backbone)
-        # The norm gives every backbone the same scale beside the other tokens.
+        # The norm scales every backbone's feature like the other tokens.
         self.visual_projection = nn.Sequential(
             nn.Linear(self.backbone.out_dim, dim), nn.LayerNorm(dim)
         )
@@ -71,11 +71,11 @@ class Toge(nn.Module):
         self.head = DiffusionHead(config.size, self.contract, config.schedule)
 
     def seed_noise(self, seed: int) -> None:
-        """Start a flight: fixes the initial noise of all samples to come."""
+        """Start a flight: draw the initial noise of all its samples."""
         self.head.seed_noise(seed)
 
     def encode_visual(self, image: Tensor) -> Tensor:
-        """Image [B, 3, H, W] -> feature [B, F]: the slow path."""
+        """Encode an image [B, 3, H, W] -> feature [B, F]: the slow path."""
         require_shape("image", image, 3, self.contract.image_height, self.contract.image_width)
         feature: Tensor = self.visual_projection(self.backbone(image))
         return feature
@@ -83,9 +83,9 @@ class Toge(nn.Module):
     def encode_and_fuse(
         self, feature: Tensor, state: Tensor, action_history: Tensor | None = None
     ) -> Tensor:
-        """Feature [B, F], state [B, state_dim], history [B, K, 4] or None -> condition [B, C].
+        """Fuse feature [B, F], state [B, state_dim], history [B, K, 4] or None -> condition [B, C].
 
-        None: no action was sent yet. Training shows that as sticks that were always centred.
+        None: no action was sent yet. In training, such histories are centred sticks.
         """
         require_shape("feature", feature, self.contract.feature_dim)
         require_shape("state", state, self.contract.state_dim)
@@ -97,11 +97,11 @@ class Toge(nn.Module):
     def encode_observation(
         self, image: Tensor, state: Tensor, action_history: Tensor | None = None
     ) -> Tensor:
-        """``encode_visual``, then ``encode_and_fuse``: image, state, history -> condition."""
+        """Call ``encode_visual``, then ``encode_and_fuse``: image, state, history -> condition."""
         return self.encode_and_fuse(self.encode_visual(image), state, action_history)
 
     def condition(self, feature: Tensor, state_token: Tensor, action_history: Tensor) -> Tensor:
-        """Feature [B, F], encoded state [B, F], history [B, K, 4] -> condition [B, C]."""
+        """Fuse feature [B, F], encoded state [B, F], history [B, K, 4] -> condition [B, C]."""
         condition: Tensor = self.fusion(feature, state_token, self.history_encoder(action_history))
         return condition
 
@@ -112,7 +112,7 @@ class Toge(nn.Module):
         action_history: Tensor | None = None,
         num_diffusion_steps: int = 10,
     ) -> Tensor:
-        """Cached feature, newest state and history -> chunk [B, horizon, 4] in [-1, 1]."""
+        """Sample a chunk [B, horizon, 4] in [-1, 1] from cached feature, state and history."""
         condition = self.encode_and_fuse(feature, state, action_history)
         return self.head.sample(condition, num_diffusion_steps)
 
@@ -123,6 +123,6 @@ class Toge(nn.Module):
         action_history: Tensor | None = None,
         num_diffusion_steps: int = 10,
     ) -> Tensor:
-        """The image is encoded once, then as ``predict_fast``: bit for bit the same chunk."""
+        """Encode the image, then call ``predict_fast``: bit-identical to the two separate calls."""
         feature = self.encode_visual(image)
         return self.predict_fast(feature, state, action_history, num_diffusion_steps)

@@ -26,9 +26,9 @@ TIME_DIM = 128
 class Conv(nn.Module):
     """Convolution over a short sequence as one matrix product; [B, L, C_in] -> [B, L', C_out].
 
-    The same function as ``nn.Conv1d`` with padding ``taps // 2`` and its weight laid out as
-    [C_out, taps * C_in]. Over at most 16 positions a convolution is bound by reading its weights,
-    and torch's CPU kernels do that up to 4 times slower than its matrix product.
+    Computes ``nn.Conv1d`` with padding ``taps // 2``, its weight laid out as [C_out, taps * C_in].
+    Over at most 16 positions a convolution is bound by reading its weights, and torch's CPU kernels
+    read them up to 4 times slower than its matrix product.
     """
 
     def __init__(self, channels_in: int, channels_out: int, taps: int, *, stride: int = 1) -> None:
@@ -37,7 +37,7 @@ class Conv(nn.Module):
         self.linear = nn.Linear(taps * channels_in, channels_out)
 
     def forward(self, x: Tensor) -> Tensor:
-        """Taps side by side, then the product."""
+        """Concatenate the taps, then multiply by the weight."""
         length, pad = x.shape[1], self.taps // 2
         padded = F.pad(x, (0, 0, pad, pad))
         columns = [padded[:, tap : tap + length : self.stride] for tap in range(self.taps)]
@@ -49,15 +49,15 @@ class Norm(nn.GroupNorm):
     """GroupNorm of [B, L, C] over each group's channels and the whole length."""
 
     def forward(self, x: Tensor) -> Tensor:
-        """[B, L, C] -> [B, L, C]."""
+        """Normalise [B, L, C]."""
         return super().forward(x.transpose(1, 2)).transpose(1, 2)
 
 
 def norm_of_groups(norm: nn.GroupNorm, x: Tensor) -> Tensor:
     """Apply a group norm to [B, C, ...] as a layer norm of each group.
 
-    OpenVINO's CPU plugin takes a group norm apart into slower parts; and 2026.4 ends the process by
-    a segmentation fault where it compiles a ResNet-18 with group norms in float32.
+    OpenVINO's CPU plugin splits a group norm into slower parts, and version 2026.4 crashes with a
+    segmentation fault when it compiles a ResNet-18 with group norms in float32.
     """
     groups = x.reshape(x.shape[0], norm.num_groups, -1)
     normed = F.layer_norm(groups, [int(groups.shape[-1])], eps=norm.eps).reshape(x.shape)
@@ -79,7 +79,7 @@ class ResidualBlock(nn.Module):
             self.shortcut = nn.Linear(channels_in, channels_out)
 
     def forward(self, x: Tensor, film: Tensor) -> Tensor:
-        """``film`` [B, 2 * C_out]: scale (about 1) and shift."""
+        """Apply the block; ``film`` [B, 2 * C_out] holds scale (about 1) and shift."""
         scale, shift = film.unsqueeze(1).chunk(2, dim=-1)
         hidden = F.silu(self.norm1(self.conv1(x)))
         hidden = hidden * (1 + scale) + shift
@@ -136,18 +136,18 @@ class UNet1d(nn.Module):
         self.register_buffer("_frequencies", sinusoid_frequencies(TIME_DIM), persistent=False)
 
     def film_of_timestep(self, timestep: Tensor) -> Tensor:
-        """Timesteps [M] of any numeric type -> their share of FiLM [M, film_dim]."""
+        """Return the timesteps' part of FiLM [M, film_dim]; timesteps [M] of any numeric type."""
         angle = timestep.to(self._frequencies.dtype).unsqueeze(-1) * self._frequencies
         film: Tensor = self.film_time(self.time_mlp(torch.cat([angle.sin(), angle.cos()], dim=-1)))
         return film
 
     def film_of_condition(self, condition: Tensor) -> Tensor:
-        """Condition [B, C] -> its share of FiLM [B, film_dim]."""
+        """Return the condition's part of FiLM [B, film_dim], for a condition [B, C]."""
         film: Tensor = self.film_condition(condition)
         return film
 
     def forward(self, noisy: Tensor, film: Tensor) -> Tensor:
-        """Noisy actions [B, horizon, 4] and FiLM [B, film_dim] -> the net's prediction."""
+        """Return the net's prediction for noisy actions [B, horizon, 4] and FiLM [B, film_dim]."""
         films = iter(torch.split(film, self.film_sizes, dim=-1))
         x = noisy
         skips = []
@@ -165,6 +165,6 @@ class UNet1d(nn.Module):
 
 
 def sinusoid_frequencies(dim: int) -> Tensor:
-    """Geometric frequencies 1..1e-4 of the sinusoidal embedding (Vaswani et al. 2017)."""
+    """Return geometric frequencies 1..1e-4 of the sinusoidal embedding (Vaswani et al. 2017)."""
     half = dim // 2
     return torch.exp(-math.log(10_000.0) * torch.arange(half) / (half - 1))

@@ -1,7 +1,7 @@
-"""Bring-up policies that fly a fixed program by feedback on velocity: no weights, no torch.
+"""Bring-up policies that fly a fixed program by velocity feedback: no weights, no torch.
 
-They speak the whole dual-rate protocol and put out any kind of action, so both loops, the link and
-the vehicle can be tried before anything is trained.
+They implement the whole dual-rate protocol and any action kind, so both loops, the link and the
+vehicle can be tried before anything is trained.
 """
 
 from policy.scripted.controllers import PROGRAM_NAMES

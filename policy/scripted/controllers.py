@@ -1,8 +1,8 @@
-"""Programs, the motion wanted at each time, and the feedback to the four numbers of an action.
+"""Programs (the demanded motion over time), and the feedback that turns a motion into an action.
 
 Sticks are for an autopilot that holds altitude at mid-stick (ArduPilot ALT_HOLD, PX4 ALTCTL): the
-throttle stick is a climb rate, pitch and roll are lean angles, yaw is a yaw rate. All in NED and
-FRD, velocities in the horizontal frame that turns with the nose.
+throttle stick is a climb rate, pitch and roll are lean angles, yaw is a yaw rate. All values are in
+NED and FRD, velocities in the horizontal frame that turns with the nose.
 """
 
 import math
@@ -19,11 +19,11 @@ LEG_S, LEG_MPS = 4.0, 1.5
 YAW_RATE_RADPS = math.radians(30.0)
 
 Axis = Literal["roll", "pitch", "yaw", "climb"]
-"""Motions that a doublet excites: to the right, forward, nose right, up."""
+"""Axes of a doublet: right, forward, nose right, up."""
 
 
 class Push(NamedTuple):
-    """One output of the policy, held open-loop at a share of its full range."""
+    """Push of one output to a share of its full range, open loop."""
 
     axis: Axis
     share: float
@@ -37,27 +37,27 @@ class Motion(NamedTuple):
     right_mps: float = 0.0
     yaw_rate_radps: float = 0.0
     push: Push | None = None
-    """In place of the feedback on one axis."""
+    """Replaces the feedback on one axis."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class DoubletStep:
-    """One axis pushed to one side, then as far and as long to the other."""
+    """Doublet on one axis: a push to one side, then an equal one to the other side."""
 
     axis: Axis
     share: float
     begin_s: float
-    """Since the program began."""
+    """Time since the program began."""
     half_s: float
     """Length of the push to each side."""
     rest_s: float
-    """Between the two, with a push of nothing."""
+    """Pause between the two pushes, with a push of 0."""
     settle_s: float
-    """After them, with feedback."""
+    """Time with feedback after the pushes."""
 
     @property
     def back_s(self) -> float:
-        """Begin of the push to the other side."""
+        """Start of the push to the other side."""
         return self.begin_s + self.half_s + self.rest_s
 
     @property
@@ -66,7 +66,7 @@ class DoubletStep:
         return self.back_s + self.half_s
 
     def push_at(self, time_s: float) -> Push | None:
-        """The push at a time since the program began; None while it settles, and at other steps."""
+        """Return the push at a time since the program began; None outside of this doublet."""
         if not self.begin_s <= time_s < self.end_s:
             return None
         if time_s >= self.back_s:
@@ -82,8 +82,8 @@ class _Plan(NamedTuple):
     settle_s: float
 
 
-# A lean leaves no speed behind, a climb no height. Yaw and climb reach full range; a lean does not,
-# since it may be twice of what is expected. All but a lean also wait until an overshoot is over.
+# Each doublet ends without net speed or height. Yaw and climb reach full range; leans do not, since
+# they may be twice as large as expected. All but leans also wait until an overshoot is over.
 _LEANS = (_Plan("roll", (0.3, 0.6), 1.2, 0.0, 3.0), _Plan("pitch", (0.3, 0.6), 1.2, 0.0, 3.0))
 _SPEEDS = (_Plan("roll", (0.3, 0.6), 3.0, 0.0, 3.0), _Plan("pitch", (0.3, 0.6), 3.0, 0.0, 3.0))
 _YAW = _Plan("yaw", (0.5, 1.0), 3.0, 2.0, 3.5)
@@ -97,9 +97,9 @@ _PLANS: dict[ActionKind, tuple[_Plan, ...]] = {
 
 
 def doublet_steps(action: ActionKind) -> tuple[DoubletStep, ...]:
-    """Each axis that a kind of action can push, at two amplitudes, to both sides.
+    """Return the doublets of an action kind: each axis, at two amplitudes, to both sides.
 
-    Thrust has no gain to be found: it is balanced by the height, and only its mean is told.
+    Thrust has no gain to identify: the height balances it, and only its mean is reported.
     """
     planned = [(plan, share) for plan in _PLANS[action] for share in plan.shares]
     lengths = (2 * plan.half_s + plan.rest_s + plan.settle_s for plan, _ in planned)
@@ -118,7 +118,7 @@ def doublet_steps(action: ActionKind) -> tuple[DoubletStep, ...]:
 
 
 def doublet_length_s(action: ActionKind) -> float:
-    """Time after which the doublet begins again."""
+    """Return the time after which the doublets repeat."""
     last = doublet_steps(action)[-1]
     return last.end_s + last.settle_s
 
@@ -135,12 +135,12 @@ def _doublet(action: ActionKind) -> Callable[[float], Motion]:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Program:
-    """What is flown, and where."""
+    """Motion to fly, and its altitude."""
 
     motion: Callable[[float], Motion]
     """Motion by the seconds since the program began."""
     altitude_m: float = TAKEOFF_ALTITUDE_M
-    """Above the start, where that is the ground."""
+    """Altitude above the start, if the flight starts on the ground."""
 
 
 _LEGS = (Motion(LEG_MPS), Motion(0.0, LEG_MPS), Motion(-LEG_MPS), Motion(0.0, -LEG_MPS))
@@ -155,7 +155,7 @@ PROGRAM_NAMES = (*_MOTIONS, DOUBLET)
 
 
 def make_program(name: str, action: ActionKind) -> Program:
-    """A program of ``PROGRAM_NAMES`` for a policy that puts out this kind of action."""
+    """Return a program of ``PROGRAM_NAMES`` for a policy that puts out this kind of action."""
     if name == DOUBLET:
         return Program(motion=_doublet(action), altitude_m=DOUBLET_ALTITUDE_M)
     if name not in _MOTIONS:
@@ -172,21 +172,21 @@ FULL_LEAN_RAD = math.radians(30.0)
 FULL_LEAN_ACCEL_MPS2 = GRAVITY_MPS2 * math.tan(FULL_LEAN_RAD)
 FULL_YAW_RATE_RADPS = math.radians(202.5)
 THROTTLE_DEADZONE = 0.2
-"""Stick within this of the middle holds altitude."""
+"""Half width of the stick's dead zone, in which the autopilot holds altitude."""
 
-CLIMB_RATE_GAIN = 0.5  # m/s of command for each m/s short of the wanted climb
-LEAN_PER_MPS = 0.3  # of full lean for each m/s of error: closes in 0.6 s, slower than a lean builds
+CLIMB_RATE_GAIN = 0.5  # m/s of command per m/s of climb-rate error
+LEAN_PER_MPS = 0.3  # share of full lean per m/s: closes in 0.6 s, slower than a lean builds up
 LEAN_PER_WANTED_MPS = 0.04  # against drag
 YAW_RATE_GAIN = 0.3
 MAX_LEAN = 0.6
-"""Largest lean of the feedback, of the full one."""
-RATE_PER_LEAN = 4.0  # rad/s for each rad short of the wanted lean
+"""Largest lean of the feedback, as a share of the full lean."""
+RATE_PER_LEAN = 4.0  # rad/s per rad of lean error
 MAX_LEAN_RATE_RADPS = 1.5
 
-ACCEL_PER_CLIMB = 2.5  # m/s^2 for each m/s short of the wanted climb
-ACCEL_INTEGRAL = 0.8  # m/s^3 for each m/s
+ACCEL_PER_CLIMB = 2.5  # m/s^2 per m/s of climb-rate error
+ACCEL_INTEGRAL = 0.8  # m/s^3 per m/s of climb-rate error
 MAX_INTEGRAL_MPS2 = 3.5
-"""Enough for a vehicle that hovers at a third more, or less, than the contract's thrust."""
+"""Covers a vehicle whose hover thrust is a third above or below the contract's."""
 LEAST_THRUST, MOST_THRUST = 0.1, 0.85
 
 _FULL_YAW_PUSH = math.radians(90.0)
@@ -195,11 +195,11 @@ _FULL_PUSHES: dict[ActionKind, dict[Axis, float]] = {
     "velocity": {"climb": 1.5, "yaw": _FULL_YAW_PUSH, "pitch": 4.0, "roll": 4.0},
     "attitude": {"yaw": _FULL_YAW_PUSH, "pitch": 1.0, "roll": 1.0},
 }
-"""Full range of a push of each axis: of sticks, m/s, rad/s, or ``FULL_LEAN_RAD``."""
+"""Full range of a push on each axis: of sticks, m/s, rad/s, or ``FULL_LEAN_RAD``."""
 
 
 class Measured(NamedTuple):
-    """The vehicle's motion."""
+    """Motion of the vehicle."""
 
     forward_mps: float
     right_mps: float
@@ -214,13 +214,13 @@ class Climb(NamedTuple):
 
     wanted_mps: float
     is_held: bool
-    """The height is right: an autopilot that holds it needs no stick."""
+    """True at the right height: an autopilot that holds it needs no stick."""
     thrust: float
-    """Collective for it, in [0, 1]."""
+    """Collective thrust for the demand, in [0, 1]."""
 
 
 def measure(state: FloatArray) -> Measured:
-    """Motion from the 13-D state in ``ned_frd``."""
+    """Return the motion in a 13-D state in ``ned_frd``."""
     north, east, down = (float(v) for v in state[VELOCITY])
     w, x, y, z = (float(q) for q in state[QUATERNION])
     # Yaw, roll and pitch of the Z-Y-X Euler angles of a unit quaternion.
@@ -237,23 +237,23 @@ def measure(state: FloatArray) -> Measured:
 
 
 def clip(value: float, limit: float) -> float:
-    """The value within +-limit."""
+    """Clip the value to +-limit."""
     return max(-limit, min(limit, value))
 
 
 class ThrustLoop:
-    """Collective thrust for a climb rate; finds the thrust that hovers in flight."""
+    """Collective thrust for a climb rate; learns the hover thrust in flight."""
 
     def __init__(self, hover_thrust: float) -> None:
         self._hover_thrust = hover_thrust
         self._integral_mps2 = 0.0
 
     def reset(self) -> None:
-        """Begin at the contract's hover thrust."""
+        """Restart at the contract's hover thrust."""
         self._integral_mps2 = 0.0
 
     def update(self, error_mps: float, step_s: float, *, is_airborne: bool) -> float:
-        """Thrust for a climb rate that is ``error_mps`` short of the wanted one."""
+        """Return the thrust for a climb rate that is ``error_mps`` below the demand."""
         if is_airborne:  # on the ground it would wind up
             integral = self._integral_mps2 + ACCEL_INTEGRAL * error_mps * step_s
             self._integral_mps2 = clip(integral, MAX_INTEGRAL_MPS2)
@@ -263,14 +263,14 @@ class ThrustLoop:
 
 
 def _pushed(kind: ActionKind, wanted: Motion, outputs: dict[Axis, float]) -> dict[Axis, float]:
-    """Outputs by axis, with the push of the program in place of the feedback."""
+    """Return the outputs by axis; the program's push replaces the feedback on its axis."""
     if (push := wanted.push) is None or push.axis not in _FULL_PUSHES[kind]:
         return outputs
     return outputs | {push.axis: push.share * _FULL_PUSHES[kind][push.axis]}
 
 
 def sticks(wanted: Motion, measured: Measured, climb: Climb) -> Four:
-    """Throttle, yaw, pitch, roll: +pitch leans forward, +roll leans right."""
+    """Return throttle, yaw, pitch, roll: +pitch leans forward, +roll leans right."""
     pitch, roll = _leans(wanted, measured)
     yaw = clip(_yaw_rate(wanted, measured) / FULL_YAW_RATE_RADPS, 1.0)
     throttle = _throttle(measured, climb)
@@ -287,7 +287,7 @@ def _throttle(measured: Measured, climb: Climb) -> float:
 
 
 def velocity(wanted: Motion, measured: Measured, climb: Climb) -> Four:
-    """Forward, right, down in m/s, and the yaw rate: the autopilot has the feedback."""
+    """Return forward, right, down in m/s, and the yaw rate: the autopilot closes the loop."""
     own: dict[Axis, float] = {"pitch": wanted.forward_mps, "roll": wanted.right_mps}
     out = _pushed(
         "velocity", wanted, own | {"climb": climb.wanted_mps, "yaw": wanted.yaw_rate_radps}
@@ -296,7 +296,7 @@ def velocity(wanted: Motion, measured: Measured, climb: Climb) -> Four:
 
 
 def attitude(wanted: Motion, measured: Measured, climb: Climb) -> Four:
-    """Thrust, roll, pitch (+ nose up) and yaw rate."""
+    """Return thrust, roll, pitch (+ nose up) and yaw rate."""
     forward, right = _leans(wanted, measured)
     own: dict[Axis, float] = {"pitch": forward, "roll": right}
     out = _pushed("attitude", wanted, own | {"yaw": _yaw_rate(wanted, measured)})
@@ -304,7 +304,7 @@ def attitude(wanted: Motion, measured: Measured, climb: Climb) -> Four:
 
 
 def rates(wanted: Motion, measured: Measured, climb: Climb) -> Four:
-    """Thrust and body rates, which close the lean of ``attitude``."""
+    """Return thrust, and body rates that close the loop on the lean of ``attitude``."""
     thrust, roll_rad, pitch_rad, yaw_rate = attitude(wanted, measured, climb)
     roll_rate = clip(RATE_PER_LEAN * (roll_rad - measured.roll_rad), MAX_LEAN_RATE_RADPS)
     pitch_rate = clip(RATE_PER_LEAN * (pitch_rad - measured.pitch_rad), MAX_LEAN_RATE_RADPS)
@@ -321,7 +321,7 @@ CONTROLS: dict[ActionKind, Control] = {
 
 
 def _leans(wanted: Motion, measured: Measured) -> tuple[float, float]:
-    """Leans forward and to the right, of the full one."""
+    """Return the leans forward and to the right, as shares of the full lean."""
     forward = LEAN_PER_WANTED_MPS * wanted.forward_mps
     forward += LEAN_PER_MPS * (wanted.forward_mps - measured.forward_mps)
     right = LEAN_PER_WANTED_MPS * wanted.right_mps
@@ -332,6 +332,6 @@ def _leans(wanted: Motion, measured: Measured) -> tuple[float, float]:
 
 
 def _yaw_rate(wanted: Motion, measured: Measured) -> float:
-    """Commanded yaw rate, in rad/s."""
+    """Return the commanded yaw rate [rad/s]."""
     error = wanted.yaw_rate_radps - measured.yaw_rate_radps
     return wanted.yaw_rate_radps + YAW_RATE_GAIN * error

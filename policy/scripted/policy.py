@@ -1,4 +1,4 @@
-"""The policy: climbs, follows a program, and plans it for the length of a chunk."""
+"""Scripted policy: climbs, follows a program, and plans it for the length of a chunk."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import replace
@@ -25,24 +25,24 @@ DEFAULT_CONTRACT = Contract()
 TAKEOFF_CLIMB_MPS = 1.5
 TAKEOFF_TOLERANCE_M = 0.2
 HOLD_TOLERANCE_M = 0.15
-"""Within it the stick is centred and the autopilot holds altitude by itself."""
+"""Altitude error below which the stick is centred and the autopilot holds the altitude."""
 SETTLE_S = 2.0
-"""Between reaching the altitude and the start of the program."""
+"""Time between reaching the altitude and the start of the program."""
 CLIMB_PER_ALTITUDE = 1.0  # 1/s
 AIRBORNE_M = 0.3
 MOST_SINK_M = 3.0
-"""A push downwards ends that far below the altitude of the program."""
+"""A downward push ends this far below the program's altitude."""
 MAX_STEP_S = 0.2
 """Longest time over which one climb-rate reading is integrated."""
 
 
 class ScriptedPolicy:
-    """Takes off from where it is first asked, or was reset, then flies ``program`` for ever.
+    """Takes off at the first call, or the first after a reset, then flies ``program`` forever.
 
-    The state has no position: altitude is the integral of the measured climb rate, so a ground that
-    is left late costs nothing, and it drifts as the vehicle's own velocity estimate does. A state
-    at rest on the ground is that of a hover, so whoever begins in the air has to say so. Used by
-    one thread.
+    The state has no position: altitude is the integral of the measured climb rate. So a late
+    takeoff does no harm, and the altitude drifts like the vehicle's own velocity estimate. A state
+    at rest on the ground equals that of a hover, so a flight that begins in the air must be
+    declared. Used by one thread.
     """
 
     def __init__(
@@ -60,8 +60,8 @@ class ScriptedPolicy:
             program: one of ``PROGRAM_NAMES``.
             now_s: monotonic seconds.
             action: kind of the actions; velocities are in the heading frame.
-            starts_in_air: keep the altitude of the start; else climb to the program's own.
-            contract: image and chunk; frames, kind and modes are the policy's own.
+            starts_in_air: keep the initial altitude; else climb to the program's.
+            contract: image and chunk; frames, kind and modes are set by the policy.
         """
         if action not in CONTROLS:
             raise PolicyError(
@@ -73,7 +73,7 @@ class ScriptedPolicy:
             feature_dim=FEATURE_DIM,
             arrays="numpy",
             action=action,
-            modes=(),  # the usual ones of that kind
+            modes=(),  # the action kind's usual modes
             velocity_frame="heading",
         )
         self._program = make_program(program, action)
@@ -85,16 +85,16 @@ class ScriptedPolicy:
         self._last_s: float | None = None
         self._altitude_m = 0.0
         self.program_start_s: float | None = None
-        """When the program began, or will, by ``now_s``; None before the altitude is reached."""
+        """Start, past or future, by ``now_s``; None until the altitude is reached."""
 
     def reset(self) -> None:
-        """Begin again: the altitude of now is that of the start."""
+        """Begin again; the current altitude becomes the start's."""
         self._last_s = self.program_start_s = None
         self._altitude_m = 0.0
         self._thrust_loop.reset()
 
     def encode_visual(self, image: FloatArray) -> FloatArray:
-        """Image [1, 3, H, W] -> mean and deviation of each channel, zeros: [1, 8]."""
+        """Return mean and deviation of each channel of [1, 3, H, W], zero-padded: [1, 8]."""
         sparse = image[:, :, ::4, ::4]
         feature = np.zeros((image.shape[0], FEATURE_DIM), np.float32)
         feature[:, :3] = sparse.mean(axis=(2, 3))
@@ -108,7 +108,7 @@ class ScriptedPolicy:
         action_history: FloatArray,
         num_diffusion_steps: int,
     ) -> FloatArray:
-        """``encode_visual``, then ``predict_fast``."""
+        """Call ``encode_visual``, then ``predict_fast``."""
         feature = self.encode_visual(image)
         return self.predict_fast(feature, state, action_history, num_diffusion_steps)
 
@@ -119,9 +119,9 @@ class ScriptedPolicy:
         action_history: FloatArray,
         num_diffusion_steps: int,
     ) -> FloatArray:
-        """State [1, 13] in ``ned_frd`` -> chunk [1, 16, 4]; the other arguments are not used.
+        """Return a chunk [1, 16, 4] for a state [1, 13] in ``ned_frd``; ignores the rest.
 
-        Each action is the program's motion at its own time with the feedback of now.
+        Each action is the program's motion at its own time, with the current feedback.
         """
         if state.shape != (1, STATE_DIM):
             raise PolicyError(f"state must be [1, {STATE_DIM}], got {list(state.shape)}")
@@ -135,7 +135,7 @@ class ScriptedPolicy:
         return chunk
 
     def _follow(self, now_s: float, measured: Measured) -> Climb:
-        """Integrate altitude, start the program once it is reached, and demand a climb."""
+        """Integrate the altitude, start the program once it is reached, and demand a climb."""
         step_s = 0.0
         if self._last_s is not None:
             step_s = min(max(now_s - self._last_s, 0.0), MAX_STEP_S)
@@ -173,10 +173,10 @@ IN_AIR = "air"
 def make_scripted(
     options: Sequence[str], now_s: Callable[[], float], *, contract: Contract
 ) -> ScriptedPolicy:
-    """The policy that ``[PROGRAM][:ACTION][:air]``, split at the colons, names.
+    """Create the policy of ``[PROGRAM][:ACTION][:air]``, already split at the colons.
 
-    Without a program it hovers, without a kind of action it moves sticks. ``air``: it begins in the
-    air, and keeps the altitude of then.
+    Without a program it hovers; without an action kind it moves sticks. ``air``: it begins in the
+    air and keeps that altitude.
     """
     starts_in_air = options[-1:] == [IN_AIR]
     named = [*options[: len(options) - starts_in_air], "", ""]

@@ -1,8 +1,7 @@
 """Batches of training samples: a pure function of the seed and the step, prepared ahead.
 
-So a resumed run sees what an uninterrupted one would have seen, and no state of a random generator
-has to be saved. Images are encoded once, into stored features or latents, for the stages that learn
-from those.
+So a resumed run sees the same data as an uninterrupted one, and no random state has to be saved.
+For the stages that learn from features or latents, images are encoded once and stored.
 """
 
 import math
@@ -29,20 +28,20 @@ from policy.training.parallel import TensorBatch, row_parts
 from policy.training.settings import TrainSettings
 
 SHARE = 0.25
-"""Images that each of the three is done to; they are independent."""
+"""Share of the images that each of the three disturbances applies to, independently."""
 FIELD_CELLS = 4
-"""Most cells of a field along a side; one alone is the same everywhere."""
+"""Most cells of a field along a side; a field of one cell is uniform."""
 LIGHT = (0.12, 1.3)
-"""Least and largest factor on the brightness."""
+"""Range of the factor on the brightness."""
 MOST_VEIL = 0.9
-"""Most light that a veil adds, of white."""
+"""Largest amount of white light that a veil adds."""
 MOST_COVERS = 3
 COVER_SIDE = (0.08, 0.4)
-"""Least and largest side of a cover, of the image's."""
+"""Range of a cover's side, as a share of the image's."""
 
 
 def disturb(images: ImageArray, random: np.random.Generator) -> None:
-    """Change images [B, height, width, 3] uint8 in place, each in its own way or not at all."""
+    """Disturb some of the images [B, height, width, 3] uint8 in place, each at random."""
     chances = random.random((len(images), 3)) < SHARE
     for image, (is_lit, is_veiled, is_covered) in zip(images, chances, strict=True):
         height, width, _ = image.shape
@@ -62,7 +61,7 @@ def disturb(images: ImageArray, random: np.random.Generator) -> None:
 def _field(
     random: np.random.Generator, shape: tuple[int, int], low: float, high: float
 ) -> NDArray[np.float32]:
-    """A smooth field [height, width] within low .. high."""
+    """Return a smooth random field [height, width] within low .. high."""
     cells = random.integers(1, FIELD_CELLS + 1, size=2)
     coarse = random.uniform(low, high, cells).astype(np.float32)
     smooth = cv2.resize(coarse, (shape[1], shape[0]), interpolation=cv2.INTER_LINEAR)
@@ -70,7 +69,7 @@ def _field(
 
 
 def _cover(image: ImageArray, random: np.random.Generator) -> None:
-    """Paint one rectangle of one colour, partly beyond the image's edge at times."""
+    """Paint one rectangle of one colour; it may extend beyond the image's edge."""
     size = np.array(image.shape[:2])
     half = (random.uniform(*COVER_SIDE, 2) / 2 * size).astype(int)
     middle = random.integers(size)
@@ -80,32 +79,32 @@ def _cover(image: ImageArray, random: np.random.Generator) -> None:
 
 
 SHIFT = 0.015
-"""Images move by at most this share of their side, as a camera mount is off by a degree."""
+"""Largest shift of an image, as a share of its side: about a degree of camera mount error."""
 BRIGHTNESS, CONTRAST, COLOUR, NOISE = 0.15, 0.25, 0.08, 0.03
-"""Half-ranges of the image augmentations, of full scale; the noise is the largest sigma."""
+"""Half-ranges of the image augmentations, as shares of full scale; NOISE is the largest sigma."""
 AHEAD = 3
-"""Batches prepared while the net computes."""
+"""Batches to prepare while the network computes."""
 _PER_SAMPLE = ("state", "history", "chunk", "known", "noise", "timestep")
 VALIDATION_KEY = 2**31
-"""In place of a step; no run has as many."""
+"""Random key of validation samples, in place of a step; no run has this many steps."""
 
 T = TypeVar("T")
 
 
 @dataclass(frozen=True, kw_only=True)
 class Batch(TensorBatch):
-    """``B`` images and ``S`` = R times as many samples of a policy; image i serves R samples.
+    """``B`` images and R times as many samples, ``S``, of a policy; each image serves R samples.
 
     The samples are state [S, state_dim], history [S, K, 4], chunk and noise [S, horizon, 4], known
     [S, horizon] bool, and timestep [S] int64.
     """
 
     images: Tensor | None
-    """[B, height, width, 3] uint8, or None where ``features`` are given."""
+    """[B, height, width, 3] uint8; None if ``features`` are given."""
     look: Tensor
     """[B, 5]: contrast, brightness, gain of red and of blue, sigma of noise; see ``normalised``."""
     grain: Tensor | None
-    """[3, height, width] noise of sigma 1, None where the look is neutral."""
+    """[3, height, width] noise of sigma 1; None if the look is neutral."""
     features: Tensor | None
     """[B, D] outputs of the backbone."""
     state: Tensor
@@ -113,12 +112,12 @@ class Batch(TensorBatch):
     chunk: Tensor
     known: Tensor
     gate: Tensor
-    """[B, 7], NaN where unknown."""
+    """[B, 7], NaN if unknown."""
     noise: Tensor
     timestep: Tensor
 
     def split(self, count: int) -> list[Self]:
-        """At most ``count`` parts of about the same size, each of two images or more."""
+        """Split into at most ``count`` parts of about equal size, each with two images or more."""
         images = len(self.look)
         repeats = len(self.state) // images
         parts = []
@@ -138,17 +137,17 @@ class FeatureStore:
     def __init__(self, path: Path, dim: int, row_of: Indices) -> None:
         """Open a file of float16 rows, each ``dim`` wide.
 
-        ``row_of`` [2, images] is the row of each image, plain and mirrored; -1 = was not encoded.
+        ``row_of`` [2, images] is the row of each image, plain and mirrored; -1: not encoded.
         """
         self._rows = np.memmap(path, np.float16, mode="r").reshape(-1, dim)
         self._row_of = row_of
         self.frames = np.flatnonzero((row_of >= 0).any(axis=0))
         """Images that were encoded, plain or mirrored."""
         self.has_mirrored = bool((row_of[1, self.frames] >= 0).all())
-        """All of them are there mirrored, too."""
+        """True if all these images were encoded mirrored too."""
 
     def ways(self, frames: Indices, is_mirrored: NDArray[np.bool_]) -> NDArray[np.bool_]:
-        """``is_mirrored`` [B], but the other way where only that one was encoded."""
+        """Return ``is_mirrored`` [B], changed to the other variant if only that one was encoded."""
         is_there = self._row_of[is_mirrored.astype(int), frames] >= 0
         return np.where(is_there, is_mirrored, ~is_mirrored)
 
@@ -159,7 +158,7 @@ class FeatureStore:
 
 
 def next_of(among: Indices, step: int, count: int, seed: int) -> Indices:
-    """The ``count`` that are due in ``step``, in an order drawn anew for each pass over all."""
+    """Return the ``count`` items due in ``step``; each pass over all has a new random order."""
     total = len(among)
     at = np.arange(step * count, (step + 1) * count)
     parts = [
@@ -176,7 +175,7 @@ def _order(seed: int, epoch: int, total: int) -> Indices:
 
 
 class Batches:
-    """Makes batches of one set of flights."""
+    """Creates batches of one set of flights."""
 
     def __init__(
         self, timeline: Timeline, store: FrameStore, *, timesteps: int, settings: TrainSettings
@@ -186,7 +185,7 @@ class Batches:
         self.frames = timeline.frames
 
     def with_images(self, step: int, size: int) -> Batch:
-        """A batch to train encoder and head."""
+        """Return a batch to train encoder and head."""
         count = self._settings.batch_size
         random = np.random.default_rng([self._seed, step])
         frames = next_of(self.frames, step, count, self._seed)
@@ -204,7 +203,7 @@ class Batches:
         return self._batch(random, samples, len(frames), images=images, look=look)
 
     def with_features(self, step: int, features: FeatureStore) -> Batch:
-        """A batch to train the head alone."""
+        """Return a batch to train the head alone."""
         count = self._settings.head_batch_size
         random = np.random.default_rng([self._seed, step])
         frames = next_of(features.frames, step, count, self._seed)
@@ -214,9 +213,9 @@ class Batches:
         return self._batch(random, samples, len(frames), features=rows)
 
     def validation(self, samples: int, size: int) -> Iterator[Batch]:
-        """The same samples at each call, without augmentation; only what training hides is hidden.
+        """Return the same samples at each call, not augmented, with inputs hidden as in training.
 
-        By body rates weights that copy would else be the best ones.
+        Otherwise, validation by body rates would favour weights that copy.
         """
         frames, count = self.frames, self._settings.batch_size
         chosen = frames[np.linspace(0, len(frames) - 1, min(samples, len(frames))).astype(int)]
@@ -229,7 +228,7 @@ class Batches:
             yield self._batch(random, plain, len(part), images=images)
 
     def images(self, frames: Indices, *, is_mirrored: bool) -> Tensor:
-        """[B, height, width, 3] uint8 at full size, as they are or all mirrored."""
+        """Return images [B, height, width, 3] uint8 at full size, plain or all mirrored."""
         size = self._settings.image_size
         return torch.from_numpy(self._store.read(frames, size, is_mirrored=is_mirrored))
 
@@ -279,7 +278,7 @@ class Batches:
 def ahead(make: Callable[[int], T], first: int) -> Generator[T]:
     """Yield ``make(first)``, ``make(first + 1)``, ... without end, prepared in one thread.
 
-    Close the generator to end and join the thread.
+    Closing the generator ends and joins the thread.
     """
     with ThreadPoolExecutor(max_workers=1, thread_name_prefix="train-loader") as pool:
         waiting: deque[Future[T]] = deque()
@@ -296,10 +295,10 @@ def ahead(make: Callable[[int], T], first: int) -> Generator[T]:
 
 
 def normalised(batch: Batch, contract: Contract) -> Tensor:
-    """Images [B, 3, height, width] as the net takes them, in the look of ``batch.look``.
+    """Return images [B, 3, height, width] as the network takes them, in the look of ``batch.look``.
 
     A look is contrast about mid-grey, brightness, the colour of the light, and the sensor's noise.
-    A neutral one gives what ``preprocess.image_to_input`` gives. The memory is channels-last.
+    A neutral look equals ``preprocess.image_to_input``. The memory is channels-last.
     """
     if batch.images is None:
         raise ValueError("a batch without images")
@@ -313,7 +312,7 @@ def normalised(batch: Batch, contract: Contract) -> Tensor:
 
 
 def normalise_image(image: Tensor, contract: Contract) -> Tensor:
-    """[B, 3, height, width] in [0, 1] -> as the net takes it."""
+    """Normalise images [B, 3, height, width] in [0, 1] for the network."""
     mean = torch.tensor(contract.image_mean_rgb, device=image.device).view(1, 3, 1, 1)
     std = torch.tensor(contract.image_std_rgb, device=image.device).view(1, 3, 1, 1)
     return (image - mean) / std
@@ -322,21 +321,21 @@ def normalise_image(image: Tensor, contract: Contract) -> Tensor:
 ENCODE_BATCH = 64
 
 Encode: TypeAlias = Callable[[Indices, bool], Tensor]
-"""(images, whether to mirror them all) -> [B, D]."""
+"""(images, True to mirror all of them) -> [B, D]."""
 Job: TypeAlias = tuple[tuple[Indices, bool], ...]
-"""Images to encode between two checks of the time, each part as it is or mirrored."""
+"""Images to encode between two checks of the time, each part plain or mirrored."""
 
 
 def both_ways(frames: Indices, *, mirror: bool) -> list[Job]:
-    """Jobs that each encode some images both as they are and mirrored, or only as they are."""
+    """Return jobs that each encode some images both plain and mirrored, or only plain."""
     ways = (False, True) if mirror else (False,)
     return [tuple((part, way) for way in ways) for part in _parts(frames)]
 
 
 def one_way_first(frames: Indices, *, mirror: bool) -> list[Job]:
-    """Jobs that encode each image one way, and when all are done the other way.
+    """Return jobs that encode every image in one variant first, and then in the other variant.
 
-    Where time is short, two images teach more than one image both ways.
+    If time is short, two images teach more than one image in both variants.
     """
     parts = _parts(frames)
     jobs: list[Job] = [((part, mirror and index % 2 == 1),) for index, part in enumerate(parts)]
@@ -359,7 +358,7 @@ def encode_rows(
 ) -> FeatureStore:
     """Encode images to ``path``, as rows of ``dim`` float16, in the order of the jobs.
 
-    ``should_continue`` takes the share that is done; False ends the encoding.
+    ``should_continue`` is called with the completed share; False ends the encoding.
     """
     most = max(int(part.max()) for job in jobs for part, _ in job)
     row_of = np.full((2, most + 1), -1, np.int64)

@@ -1,7 +1,7 @@
-"""One optimiser step on several cores: each works on a part of the batch, alone.
+"""One optimiser step on several cores: each core works alone on a part of the batch.
 
 Splitting each operator over the cores instead wakes all of them some thousand times a step; on two
-cores that something else uses too, that left half of the time unused.
+cores shared with another program, that left half of the time unused.
 """
 
 import copy
@@ -19,7 +19,7 @@ M = TypeVar("M", bound=nn.Module)
 
 @dataclass(frozen=True)
 class TensorBatch:
-    """A batch: a dataclass of tensors that share their first axis; one may be None."""
+    """Batch: a dataclass of tensors that share their first axis; one may be None."""
 
     def to(self, device: torch.device) -> Self:
         """Copy to a device."""
@@ -27,7 +27,7 @@ class TensorBatch:
         return replace(self, **{n: v.to(device, non_blocking=True) for n, v in given.items()})
 
     def split(self, count: int) -> list[Self]:
-        """At most ``count`` parts of about the same size."""
+        """Split into at most ``count`` parts of about equal size."""
         rows = len(next(iter(vars(self).values())))
         return [
             replace(self, **{name: value[part] for name, value in vars(self).items()})
@@ -43,18 +43,18 @@ class StepLoss:
     """Losses of one batch."""
 
     total: Tensor
-    """The one that is minimised."""
+    """Loss to minimise."""
     metrics: Mapping[str, Tensor]
-    """Those that are reported, by name; ``loss`` is among them."""
+    """Reported losses by name; includes ``loss``."""
 
 
 class Gradients(Generic[M]):
-    """Computes losses and gradients of a module; close it to join its threads."""
+    """Computes losses and gradients of a module; closing it joins its threads."""
 
     def __init__(self, trainee: M, *, device: torch.device, bf16: bool) -> None:
-        """Take as many threads as torch has, on a CPU; a GPU takes the whole batch.
+        """On a CPU, use as many threads as torch; a GPU takes the whole batch.
 
-        Weights are shared, buffers are not: statistics of norms are those of the first part.
+        Weights are shared, buffers are not: the norms' statistics are those of the first part.
         """
         self._device, self._bf16 = device, bf16
         threads = torch.get_num_threads() if device.type == "cpu" else 1
@@ -76,9 +76,9 @@ class Gradients(Generic[M]):
         self._pool.shutdown()
 
     def compute(self, batch: B, losses: Callable[[M, B], StepLoss]) -> dict[str, Tensor]:
-        """Set ``grad`` of all trainable weights; returns the metrics, means over the parts.
+        """Set ``grad`` of all trainable weights; return the metrics, means over the parts.
 
-        The same numbers for the same batch and count of threads: parts are added in order.
+        Deterministic for a batch and a number of threads: parts are added in order.
         """
         weights = [p for p in self.replicas[0].parameters() if p.requires_grad]
 
@@ -101,11 +101,11 @@ class Gradients(Generic[M]):
 
 
 def row_parts(count: int, parts: int) -> list[slice]:
-    """At most ``parts`` slices of about the same size, together ``count`` rows."""
+    """Return at most ``parts`` slices of about equal size, ``count`` rows in total."""
     bounds = [count * part // parts for part in range(parts + 1)]
     return [slice(start, stop) for start, stop in pairwise(bounds) if stop > start]
 
 
 def computing_in(device: torch.device, bf16: bool) -> torch.autocast:
-    """Autocast to bfloat16, or nothing."""
+    """Return autocast to bfloat16, or a no-op context."""
     return torch.autocast(device.type, torch.bfloat16, enabled=bf16)

@@ -1,4 +1,4 @@
-"""Train a policy from flights: encoder and head, then the head alone on stored features."""
+"""Training of a policy from flights: encoder and head, then the head alone on stored features."""
 
 import copy
 import json
@@ -48,19 +48,19 @@ from policy.training.trainee import Trainee, refresh_batch_norm, validate
 
 Network: TypeAlias = TogeConfig | ResnetUnetConfig
 Check: TypeAlias = Callable[[Path], float]
-"""Flies a checkpoint in closed loop and returns a score: more is better."""
+"""Flies a checkpoint in closed loop and returns a score; higher is better."""
 
 VALIDATION_SAMPLES = 256
 NORM_IMAGES = 1024
-"""Images from which batch norms take their final statistics."""
+"""Number of images for the final statistics of batch norms."""
 USUAL_AGES_MS = (20.0, 90.0)
-"""Age of the image at a tick of a flight with frames at 30 Hz and an encoder of 5 to 35 ms."""
+"""Image age at a tick for frames at 30 Hz and an encoder latency of 5 to 35 ms."""
 AGE_BIN_MS = 5
 FINE_TUNE_RATE = 1 / 3
-"""Learning rate over the usual one, for weights that were trained before."""
+"""Learning rate relative to the usual one, for pretrained weights."""
 NS_PER_MS = 1_000_000
 HEAD_RATE = 3
-"""Learning rate over the usual one, for the head alone: large batches, no convolutions."""
+"""Learning rate relative to the usual one, for the head alone: large batches, no convolutions."""
 
 
 def train_policy(
@@ -70,9 +70,9 @@ def train_policy(
     hooks: Hooks,
     check: Check | None = None,
 ) -> TrainResult:
-    """Train, and write the best weights on held-out flights to ``settings.out``.
+    """Train, and write the weights that are best on held-out flights to ``settings.out``.
 
-    The best are those with the least validation loss, or the highest score by ``check``.
+    Best means least validation loss, or highest score by ``check``.
     """
     folder = open_run(settings, network, flights)
     return _PolicyRun(flights, network, settings, folder, hooks, check).finish()
@@ -147,7 +147,7 @@ class _PolicyRun(TrainingRun[Trainee, Batch]):
             self.note(f"{left} images were not encoded for lack of time: the head sees the rest")
 
     def _bulk_encode(self) -> Encode:
-        """The frozen backbone, by the fastest engine."""
+        """Encode images with the frozen backbone, on the fastest engine."""
         if self.device.type == "cpu":
             bulk = BulkEncoder(self.trainee.policy, "bf16" if self.bf16 else "f32")
             return lambda frames, is_mirrored: torch.from_numpy(
@@ -164,7 +164,7 @@ class _PolicyRun(TrainingRun[Trainee, Batch]):
         return in_torch
 
     def _images(self, frames: Indices, is_mirrored: bool) -> Tensor:
-        """Normalised images [B, 3, H, W] of full size, without augmentation."""
+        """Return normalised images [B, 3, H, W] of full size, without augmentation."""
         images = self._batches.images(frames, is_mirrored=is_mirrored).to(self.device)
         return normalise_image(images.permute(0, 3, 1, 2).float() / 255, self._network.contract)
 
@@ -186,7 +186,7 @@ class _PolicyRun(TrainingRun[Trainee, Batch]):
             if held is None:
                 batches = self._held.validation(VALIDATION_SAMPLES, stage.image_size)
                 held = (batch.to(self.device) for batch in batches)
-                if not stage.trains_encoder:  # it stays as it is: encode once
+                if not stage.trains_encoder:  # it no longer changes: encode once
                     held = self._held_features = [self.average.encoded(batch) for batch in held]
             return validate(self.average, held)
 
@@ -224,9 +224,9 @@ class _PolicyRun(TrainingRun[Trainee, Batch]):
 
 
 def _ages(flights: Sequence[FlightData], settings: TrainSettings) -> Nanoseconds:
-    """Sorted ages of images to train for: measured ones, or a range that is drawn from evenly.
+    """Return sorted image ages to train for: measured ones, or a uniform range.
 
-    Where nobody's policy looked, as in a human pilot's flights, the usual range.
+    If no policy flew, as in a human pilot's flights, the usual range.
     """
     if settings.age_range_ms is not None:
         return _evenly(settings.age_range_ms)
@@ -245,7 +245,7 @@ def _evenly(range_ms: tuple[float, float]) -> Nanoseconds:
 
 
 def _starting_trainee(network: Network, settings: TrainSettings) -> Trainee:
-    """The policy to start from and a new gate head; torch's global random state is kept."""
+    """Return the policy to start from with a new gate head; keeps torch's random state."""
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(settings.seed)
         if settings.start_from is not None:
@@ -263,7 +263,7 @@ def _checkpoint(network: Network, path: Path) -> BuiltinPolicy:
             f"--start-from {path} flies by {policy.contract.action}, these flights were flown by "
             f"{network.contract.action}: start from one of their kind, or anew"
         )
-    # What flags of this command do not name is taken over from the checkpoint.
+    # Contract fields without a flag of this command are taken from the checkpoint.
     kept = {name: getattr(policy.contract, name) for name in ("feature_dim", *FLIGHT_TERMS)}
     wanted = replace(network.contract, **kept)
     asked, held = (
@@ -294,7 +294,7 @@ def _training_card(
     ages_ns: Nanoseconds,
     position: Position,
 ) -> str:
-    """Facts about the training of a checkpoint, as JSON."""
+    """Return facts about a checkpoint's training, as JSON."""
     state = np.concatenate([flight.state for flight in flights])
     target = np.concatenate([flight.target for flight in flights])
     ages_ms = ages_ns / 1e6

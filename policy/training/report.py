@@ -1,4 +1,4 @@
-"""Reports of a training run, and the hooks by which it is watched and stopped."""
+"""Reports of a training run, and hooks to watch and stop it."""
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
@@ -15,12 +15,12 @@ class PolicyValidation:
     stick_error: float
     """Mean absolute error of the sampled sticks, in full deflections."""
     mean_stick_error: float
-    """The same error if the mean stick of the training flights were always flown."""
+    """Error of always flying the mean stick of the training flights."""
     hold_error: float
-    """The same error if the newest stick of the history were held."""
+    """Error of holding the newest stick of the history."""
 
     def describe(self) -> str:
-        """One line for a person."""
+        """Return one line for the user."""
         return (
             f"held-out loss {self.loss:.3f}, stick error {self.stick_error:.3f} of full deflection "
             f"(mean stick {self.mean_stick_error:.3f}, last stick held {self.hold_error:.3f})"
@@ -33,18 +33,18 @@ class WorldModelValidation:
 
     loss: float
     reconstruction_psnr_db: float
-    """PSNR of frames that were encoded and decoded: the most that imagined ones can reach."""
+    """PSNR of encoded and decoded frames: the upper limit for imagined ones."""
     psnr_db: float | None = None
     """PSNR of imagined frames, all of a future; None while only the autoencoder learns."""
     copy_psnr_db: float | None = None
-    """PSNR of showing the last frame again."""
+    """PSNR of repeating the last frame."""
     velocity_error_mps: float | None = None
-    """Mean length of the velocity's error in the last imagined state."""
+    """Mean length of the velocity error in the last imagined state."""
     held_velocity_error_mps: float | None = None
-    """The same error if the velocity stayed as it is."""
+    """Mean length of the velocity error if the velocity is held constant."""
 
     def describe(self) -> str:
-        """One line for a person."""
+        """Return one line for the user."""
         line = (
             f"held-out loss {self.loss:.4f}, frames coded to {self.reconstruction_psnr_db:.1f} dB"
         )
@@ -62,11 +62,11 @@ Validation: TypeAlias = PolicyValidation | WorldModelValidation
 
 @dataclass(frozen=True, kw_only=True)
 class TrainingProgress:
-    """Progress for a person, a few times a minute."""
+    """Progress for the user, a few times a minute."""
 
     stage: str
     fraction: float
-    """Share of the whole budget that is used."""
+    """Used share of the whole budget."""
     step: int
     losses: Mapping[str, float] | None = None
     """Means over the last steps, by name."""
@@ -76,13 +76,13 @@ class TrainingProgress:
 
 @dataclass(frozen=True, kw_only=True)
 class Hooks:
-    """Clock, progress and a request to stop, for a run."""
+    """Clock, progress callback and stop request of a run."""
 
     now_s: Callable[[], float]
-    """Monotonic seconds, for a budget in time."""
+    """Monotonic seconds, for a time budget."""
     report: Callable[[TrainingProgress], None] = lambda _: None
     should_stop: Callable[[], bool] = lambda: False
-    """Polled after every step; True ends the run, to be resumed."""
+    """Polled after every step; True stops the run, which can be resumed."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -92,6 +92,6 @@ class TrainResult:
     checkpoint: Path
     steps: int
     validation: Validation | None
-    """Validation of the exported weights; None where nothing was held out."""
+    """Validation of the exported weights; None if no flights were held out."""
     score: float | None
     """Score of the closed-loop check, if there was one."""

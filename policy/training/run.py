@@ -1,10 +1,10 @@
-"""The common part of all training runs: stages on a budget, validation, a state on disk.
+"""Shared base of all training runs: stages on a budget, validation, a state on disk.
 
     flights -> FrameStore (decoded once) -> batches with images -> encoder learns    -> moving
                 `-> features (encoded once) -> batches of features -> the rest learns -> average
 
-Everything random follows from the seed and the step, so a run that was killed continues as if it
-had not been.
+All random values are functions of the seed and the step, so a run that was killed continues as if
+it had not been interrupted.
 """
 
 import copy
@@ -39,7 +39,7 @@ LOG_STEPS = 20
 """Steps between two lines of the log."""
 GRADIENT_LIMIT = 1.0
 ENCODING_SHARE = 0.4
-"""Share of a stage's time after which images are no longer encoded for it."""
+"""Share of a stage's time after which no more images are encoded for it."""
 
 
 def open_run(
@@ -47,7 +47,7 @@ def open_run(
     network: TogeConfig | ResnetUnetConfig | WorldModelConfig,
     flights: Sequence[FlightData],
 ) -> RunFolder:
-    """Open the folder of a run, to begin it or to resume it."""
+    """Open the folder of a run, to start or resume it."""
     if not settings.out.parent.is_dir():
         raise TrainingError(f"--out {settings.out}: there is no folder {settings.out.parent}")
     folder = RunFolder(settings.work_folder, identity_of(settings, network, flights))
@@ -63,10 +63,10 @@ def open_run(
 
 
 class TrainingRun(ABC, Generic[M, B]):
-    """A run, from its first step or from where it was killed; subclasses say what is trained.
+    """Training run from its start or an interruption; subclasses define the trained module.
 
-    A phase of a run (the encoder learns, or it is frozen) has one optimiser, and one rise and fall
-    of its learning rate.
+    Each phase of a run (the encoder learns, or it is frozen) has its own optimiser, and one rise
+    and fall of its learning rate.
     """
 
     validation_type: ClassVar[type[Validation]]
@@ -83,47 +83,47 @@ class TrainingRun(ABC, Generic[M, B]):
         self.bf16 = uses_bf16(settings.precision, self.device)
         self._begun_s = hooks.now_s()
         self.average: M = copy.deepcopy(trainee).eval().requires_grad_(False)
-        """The average of the weights, in eval mode."""
+        """Moving average of the weights, in eval mode."""
         self._optimiser = self._new_optimiser(stages[0])
 
     # ---- for subclasses ----
 
     @abstractmethod
     def encoder(self, trainee: M) -> nn.Module:
-        """The part of a trainee that is frozen in the end."""
+        """Return the part of a trainee that is frozen in the end."""
 
     @abstractmethod
     def encode(self, stage: TrainingStage, *, is_new: bool) -> None:
-        """Encode the images once, for a stage on features; a resumed one is not new."""
+        """Encode the images once, for a stage on features; ``is_new`` is False when resumed."""
 
     @abstractmethod
     def batch_maker(self, stage: TrainingStage) -> Callable[[int], B]:
-        """A function that makes the batch of a step; called in another thread."""
+        """Return a function that creates the batch of a step; called in another thread."""
 
     @abstractmethod
     def losses(self, trainee: M, batch: B) -> StepLoss:
-        """Losses of a batch or a part of it, on the device; called in threads."""
+        """Return the losses of a batch or a part of it, on the device; called in threads."""
 
     @abstractmethod
     def validate(self, stage: TrainingStage) -> Validation | None:
-        """Validate the average weights; None where nothing was held out."""
+        """Validate the average weights; return None if no flights were held out."""
 
     @abstractmethod
     def export(self) -> None:
         """Write the average weights to ``settings.out``."""
 
     def learning_rate(self, stage: TrainingStage) -> float:
-        """Peak learning rate of the stage's phase."""
+        """Return the peak learning rate of the stage's phase."""
         return self.settings.learning_rate
 
     def score(self, validation: Validation | None, *, is_last: bool) -> float | None:
-        """Score of the average weights, more is better; None if they are not to be exported."""
+        """Return the score of the average weights, higher is better; None: do not export."""
         return None if validation is None else -validation.loss
 
     def store_flights(
         self, flights: Sequence[FlightData]
     ) -> tuple[list[FlightData], FrameStore, list[int], list[int]]:
-        """Decode all images; indices of the flights to train on, and of those held out."""
+        """Decode all images; return the indices of the training and the held-out flights."""
         store = store_frames(
             flights,
             self.folder.frames,
@@ -138,7 +138,7 @@ class TrainingRun(ABC, Generic[M, B]):
         return whole, store, kept, held
 
     def may_encode(self, stage: TrainingStage) -> Callable[[float], bool]:
-        """A function that takes the share done, and says whether there is time to encode more."""
+        """Return a predicate of the completed share: is there time to encode more?"""
         begun = self._fraction
 
         def should_continue(done: float) -> bool:
@@ -148,13 +148,13 @@ class TrainingRun(ABC, Generic[M, B]):
         return should_continue
 
     def note(self, text: str) -> None:
-        """Tell a person something."""
+        """Show the user a note."""
         self.hooks.report(TrainingProgress(stage="", fraction=0.0, step=0, note=text))
 
     # ---- the run ----
 
     def finish(self) -> TrainResult:
-        """Run all stages that are left; then the files of the run are removed."""
+        """Run all remaining stages, then remove the files of the run."""
         if self.settings.resume:
             self._restore()
         else:
@@ -186,7 +186,7 @@ class TrainingRun(ABC, Generic[M, B]):
             return
         self.average.load_state_dict(self.trainee.state_dict())
         self.position.phase_step, self.position.phase_start = self.position.step, self._fraction
-        self.trainee.zero_grad()  # frozen weights, too: their gradients would be clipped
+        self.trainee.zero_grad()  # frozen weights too: their gradients would be clipped
         self._optimiser = self._new_optimiser(stage)
 
     def _train(self, stage: TrainingStage) -> None:
@@ -257,7 +257,7 @@ class TrainingRun(ABC, Generic[M, B]):
         self.trainee.requires_grad_(not (stage.trains_encoder and self.encoder_learns_alone))
         self.encoder(self.trainee).requires_grad_(stage.trains_encoder)
         trainable = [p for p in self.trainee.parameters() if p.requires_grad]
-        # Biases, norms and other vectors are not decayed.
+        # No weight decay for biases, norms and other vectors.
         matrices, decay = [p for p in trainable if p.ndim >= 2], self.settings.weight_decay
         groups = [
             {"params": matrices, "weight_decay": decay},
@@ -288,7 +288,7 @@ class TrainingRun(ABC, Generic[M, B]):
         raise TrainingStoppedError("stopped: the same command with --resume continues from here")
 
     def _report_work(self, what: str) -> None:
-        """Report what is done in place of steps, and stop if that is wanted."""
+        """Report progress of work other than steps, and stop on request."""
         self._report(what)
         if self.hooks.should_stop():
             self._stop()
@@ -326,9 +326,9 @@ class TrainingRun(ABC, Generic[M, B]):
 
 @torch.no_grad()
 def update_average(average: nn.Module, trainee: nn.Module, decay: float, updates: int) -> None:
-    """Move an exponential moving average of weights, faster in the first of ``updates``.
+    """Update an exponential moving average of weights, faster in the first of ``updates``.
 
-    Frozen weights are the same in both, and are left alone; counters are copied.
+    Frozen weights are equal in both and are skipped; counters are copied.
     """
     weight = 1.0 - min(decay, (1 + updates) / (10 + updates))
     frozen = {name for name, one in trainee.named_parameters() if not one.requires_grad}
@@ -343,7 +343,7 @@ def update_average(average: nn.Module, trainee: nn.Module, decay: float, updates
 
 
 def uses_bf16(precision: Precision, device: torch.device) -> bool:
-    """True if to compute in bfloat16; ``auto`` does so where the hardware multiplies it."""
+    """True to compute in bfloat16; ``auto`` does so if the hardware multiplies it."""
     if precision != "auto":
         return precision == "bf16"
     if device.type == "cuda":

@@ -1,4 +1,4 @@
-"""A training run on disk: its state, to resume it after a kill, and its log."""
+"""Training run on disk: its state, for resuming after an interruption, and its log."""
 
 import hashlib
 import json
@@ -19,7 +19,7 @@ from policy.training.settings import RunSettings
 
 
 class TrainingError(PolicyError):
-    """A run that cannot start, be resumed or be kept; the message says what to do."""
+    """Run that cannot start, be resumed or be saved; the message names the next step."""
 
 
 class TrainingStoppedError(PolicyError):
@@ -28,21 +28,21 @@ class TrainingStoppedError(PolicyError):
 
 @dataclass(kw_only=True)
 class Position:
-    """Where a run is; saved with its weights."""
+    """Position of a run; saved with its weights."""
 
     step: int = 0
-    """Optimiser steps done."""
+    """Completed optimiser steps."""
     stage: int = 0
     """Index of the current stage."""
     phase_step: int = 0
-    """``step`` at which the phase began: the encoder learns, or it is frozen."""
+    """``step`` at the start of the phase: the encoder learns, or it is frozen."""
     phase_start: float = 0.0
-    """Fraction of the budget used up to then."""
+    """Fraction of the budget used at the start of the phase."""
     spent_s: float = 0.0
     """Time used up to the last save."""
     validations: int = 0
     best: float | None = None
-    """Score of the exported weights, more is better."""
+    """Score of the exported weights, higher is better."""
     kept: dict[str, Any] | None = None
     """Validation of the exported weights."""
 
@@ -66,7 +66,7 @@ class RunFolder:
         return self._state.is_file()
 
     def save(self, position: Position, tensors: Mapping[str, Any]) -> None:
-        """Write the state in one piece, or raise a ``TrainingError``."""
+        """Write the state atomically, or raise a ``TrainingError``."""
         contents = {"identity": self._identity, "position": asdict(position), **tensors}
         try:
             with whole_file(self._state) as draft:
@@ -76,7 +76,7 @@ class RunFolder:
             raise TrainingError(f"the training cannot be kept: {reason}") from error
 
     def load(self) -> tuple[Position, dict[str, Any]]:
-        """The state that was saved last."""
+        """Return the state that was saved last."""
         path = self._state
         if not path.is_file():
             raise TrainingError(f"{self.path} holds no run to resume: leave out --resume")
@@ -99,7 +99,7 @@ class RunFolder:
         return position, contents
 
     def log(self, record: Mapping[str, object]) -> None:
-        """One line of JSON."""
+        """Append one line of JSON to the log."""
         try:
             with self._log.open("a") as file:
                 file.write(json.dumps(record) + "\n")
@@ -107,7 +107,7 @@ class RunFolder:
             raise TrainingError(str(disk_error(self._log, error))) from error
 
     def clear(self) -> None:
-        """Remove all but the log."""
+        """Remove all files except the log."""
         shutil.rmtree(self.frames, ignore_errors=True)
         self.features.unlink(missing_ok=True)
         self._state.unlink(missing_ok=True)
@@ -121,11 +121,11 @@ def _step_of(line: str) -> float:
     try:
         return float(json.loads(line)["step"])
     except (ValueError, TypeError, KeyError):
-        return float("inf")  # the kill cut it short
+        return float("inf")  # cut short by a kill
 
 
 def identity_of(settings: RunSettings, network: object, flights: Sequence[FlightData]) -> str:
-    """Hash of everything that must be the same when a run is resumed."""
+    """Return a hash of everything that must be equal when a run is resumed."""
     free = ("resume", "device", "out", "check_every", "check_flights")
     fixed = {name: str(value) for name, value in vars(settings).items() if name not in free}
     videos = [(flight.fingerprint, len(flight.tick_ns)) for flight in flights]

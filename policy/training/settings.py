@@ -1,9 +1,9 @@
 """Settings of training, each a flag of a command, and the stages of a run.
 
-First the encoder learns: of a policy together with its head, on images that grow from stage to
-stage, because the encoders are fully convolutional and a small image costs a fraction; of a world
-model alone. Then it is frozen, each image is encoded once, and the rest learns from the stored
-features: some ten times the steps.
+First the encoder learns. A policy's encoder learns together with its head, on images that grow from
+stage to stage: the encoders are fully convolutional, and a small image costs a fraction. A world
+model's encoder learns alone. Then the encoder is frozen, each image is encoded once, and the rest
+learns from the stored features, about ten times as many steps.
 """
 
 import math
@@ -92,14 +92,14 @@ class RunSettings:
             raise PolicyError(f"--{flag} must be between {low:g} and {high:g}, got {value:g}")
 
     def fraction(self, step: int, spent_s: float) -> float:
-        """Share of the budget that is used after so many steps and seconds, 0 to 1."""
+        """Return the used share of the budget after this number of steps and seconds, 0 to 1."""
         if self.steps is not None:
             return min(step / self.steps, 1.0)
         return min(spent_s / (60.0 * (self.minutes or DEFAULT_MINUTES)), 1.0)
 
     @property
     def validation_count(self) -> int:
-        """Validations in the run."""
+        """Number of validations in the run."""
         if self.validations is not None:
             return self.validations
         due = (self.minutes or DEFAULT_MINUTES) / 2 if self.steps is None else self.steps / 50
@@ -107,7 +107,7 @@ class RunSettings:
 
     @property
     def work_folder(self) -> Path:
-        """Where an unfinished run is kept."""
+        """Folder of an unfinished run."""
         return self.out.with_name(self.out.stem + ".training")
 
 
@@ -158,7 +158,7 @@ class TrainSettings(RunSettings):
 
     @property
     def age_range_ms(self) -> tuple[float, float] | None:
-        """The range of ``--ages LOW:HIGH``; None where it names a flight, or nothing."""
+        """Return the range of ``--ages LOW:HIGH``; None if it names a flight or is not set."""
         if self.ages is None or ":" not in self.ages or Path(self.ages).is_dir():
             return None
         low, _, high = self.ages.partition(":")
@@ -195,14 +195,14 @@ class WorldModelSettings(RunSettings):
 
 
 _SIZES = ((3 / 7, 0.35, 0.20), (5 / 7, 0.30, 0.15), (1.0, 0.10, 0.10))
-"""Image size over the full one, share of the time, share of the steps; the head has the rest."""
+"""Image size relative to the full one, share of time, share of steps; the head gets the rest."""
 MIN_IMAGE_SIZE = 96
-"""Below it, an image costs a CPU hardly less."""
+"""Below this size, an image costs a CPU hardly less."""
 
 
 @dataclass(frozen=True)
 class TrainingStage:
-    """A part of a run, between two fractions of its budget."""
+    """Part of a run, between two fractions of its budget."""
 
     name: str
     start: float
@@ -215,12 +215,12 @@ class TrainingStage:
 
 
 def policy_stages(settings: TrainSettings) -> tuple[TrainingStage, ...]:
-    """Stages of a policy's training, in order; they fill the budget."""
+    """Return the stages of a policy's training, in order; they fill the budget."""
     full, shares = settings.image_size, dict[int, float]()
     if not settings.freeze_encoder:
         for wanted, of_time, of_steps in _SIZES:
             scale = max(wanted, min(MIN_IMAGE_SIZE / full, 1.0))
-            # A multiple of 32, the stride of all encoders, where it is not the full size.
+            # Below the full size, a multiple of 32, the stride of all encoders.
             size = full if scale == 1.0 else min(full, round(full * scale / 32) * 32)
             share = of_time if settings.steps is None else of_steps
             shares[size] = shares.get(size, 0.0) + share
@@ -233,7 +233,7 @@ def policy_stages(settings: TrainSettings) -> tuple[TrainingStage, ...]:
 
 
 def world_model_stages(settings: WorldModelSettings) -> tuple[TrainingStage, ...]:
-    """Autoencoder, unless it is kept, then dynamics."""
+    """Return the stages: autoencoder, unless an existing one is kept, then dynamics."""
     turn, size = settings.autoencoder_share, settings.image_size
     if settings.start_from is not None:
         return (TrainingStage("dynamics", 0.0, 1.0, size, False, True),)
@@ -244,7 +244,7 @@ def world_model_stages(settings: WorldModelSettings) -> tuple[TrainingStage, ...
 
 
 def learning_rate_factor(progress: float) -> float:
-    """Linear warm-up over the first twentieth, then half a cosine down to a hundredth."""
+    """Return a linear warm-up over the first twentieth, then half a cosine down to a hundredth."""
     warm_up = 0.05
     if progress < warm_up:
         return max(progress / warm_up, 0.01)

@@ -1,4 +1,4 @@
-"""The module that is optimised: a policy, a gate head that is not exported, and their losses."""
+"""The optimised module: a policy, a gate head that is not exported, and their losses."""
 
 from collections.abc import Iterable
 from dataclasses import replace
@@ -18,19 +18,22 @@ GATE_LABELS = 10
 """Direction [3] and log distance of the next gate, cos and sin of its passage, direction [3] and
 log distance of the gate after it."""
 MIN_STICK_STD = 0.1
-"""A stick that hardly moves in the flights does not count more than this makes it."""
+"""Lower bound of a stick's standard deviation: bounds the weight of a stick that hardly moves."""
 DENOISED = 4
-"""In training, one in so many samples passes through the denoiser. That costs four times as much as
-everything before it, where the harder part is learned: which sticks a feature and a state ask for.
-All samples teach that, by the sticks that the head reads off the condition."""
+"""In training, one sample in this many passes through the denoiser.
+
+The denoiser costs four times as much as the layers before it, which learn the harder part: the
+sticks for a feature and a state. All samples teach these layers, through the sticks that the head
+reads off the condition.
+"""
 LEAST_DENOISED = 16
-"""Samples a step through the denoiser."""
+"""Minimum number of samples per step through the denoiser."""
 VALIDATION_STEPS = 10
 """Denoising steps of the sticks that are compared with the flown ones."""
 
 
 class Trainee(nn.Module):
-    """A policy with its gate head, and the mean and spread of the sticks to imitate."""
+    """Policy with its gate head, and the mean and spread of the sticks to imitate."""
 
     def __init__(self, policy: BuiltinPolicy, gate_weight: float) -> None:
         super().__init__()
@@ -43,13 +46,13 @@ class Trainee(nn.Module):
         self.register_buffer("stick_std", torch.ones(ACTION_DIM))
 
     def set_sticks(self, sticks: FloatArray) -> None:
-        """Take the mean and the spread of all sticks [M, 4]."""
+        """Store the mean and the spread of all sticks [M, 4]."""
         values = torch.from_numpy(sticks)
         self.stick_mean.copy_(values.mean(dim=0))
         self.stick_std.copy_(values.std(dim=0, correction=0).clamp_min(MIN_STICK_STD))
 
     def encode(self, batch: Batch) -> Tensor:
-        """Outputs of the backbone [B, D], stored ones or of the images."""
+        """Return outputs of the backbone [B, D]: the stored ones, or those of the images."""
         if batch.features is not None:
             return batch.features
         image = normalised(batch, self.policy.contract)
@@ -63,21 +66,21 @@ class Trainee(nn.Module):
 
     @torch.no_grad()
     def encoded(self, batch: Batch) -> Batch:
-        """The batch with features in place of its images."""
+        """Return the batch with features in place of its images."""
         return replace(batch, features=self.encode(batch), images=None, grain=None)
 
     def condition(self, visual: Tensor, batch: Batch) -> Tensor:
-        """Projected images [B, C], each for its samples -> conditions [S, C]."""
+        """Return conditions [S, C] of projected images [B, C], each used for all of its samples."""
         visual = visual.repeat_interleave(len(batch.state) // len(visual), dim=0)
         state_token = self.policy.state_encoder(batch.state)
         return self.policy.condition(visual, state_token, batch.history)
 
     def forward(self, batch: Batch) -> StepLoss:
-        """Losses of a batch.
+        """Return the losses of a batch.
 
-        ``loss`` and ``direct_loss`` are squared errors of the denoised sticks, and of those read
-        off the condition, over the variance of the flown ones: the mean stick gives 1.
-        ``gate_loss`` is the smooth L1 of the gate labels, 0 where no image has one.
+        ``loss`` and ``direct_loss`` are squared errors, of the denoised sticks and of those read
+        off the condition, divided by the variance of the flown ones: the mean stick gives 1.
+        ``gate_loss`` is the smooth L1 of the gate labels, 0 if no image has one.
         """
         visual = self.policy.visual_projection(self.encode(batch))
         condition = self.condition(visual, batch)
@@ -91,7 +94,7 @@ class Trainee(nn.Module):
         return StepLoss(total=total, metrics=losses)
 
     def _denoising_loss(self, condition: Tensor, batch: Batch) -> Tensor:
-        """Loss of all samples in eval mode, in training of one in ``DENOISED``."""
+        """Return the denoiser's loss, in training of one sample in ``DENOISED``, else of all."""
         every = max(1, min(DENOISED, len(condition) // LEAST_DENOISED)) if self.training else 1
         chunk, timestep = batch.chunk[::every], batch.timestep[::every]
         noise, schedule = batch.noise[::every], self.policy.config.schedule
@@ -103,12 +106,12 @@ class Trainee(nn.Module):
 
 
 def _squared(error: Tensor, known: Tensor) -> Tensor:
-    """Mean square of errors [S, horizon, 4] where ``known`` [S, horizon]."""
+    """Return the mean square of errors [S, horizon, 4] over the entries ``known`` [S, horizon]."""
     return error.square().mean(dim=-1)[known].mean()
 
 
 def gate_labels(gate: Tensor) -> Tensor:
-    """[B, 7] in body axes -> [B, 10] of size about 1; NaN where unknown or behind the camera."""
+    """Convert [B, 7] in body axes to labels [B, 10] of about 1; NaN if unknown or behind."""
 
     def place(position: Tensor) -> Tensor:
         position = torch.where(position[:, :1] > 0, position, torch.nan)
@@ -120,7 +123,7 @@ def gate_labels(gate: Tensor) -> Tensor:
 
 
 def gate_loss(made: Tensor, gate: Tensor) -> Tensor:
-    """Smooth L1 [] of predicted labels [B, 10], over those that are known."""
+    """Return the smooth L1 [] of predicted labels [B, 10], over the known ones."""
     labels = gate_labels(gate)
     known = ~labels.isnan()
     error = F.smooth_l1_loss(made, labels.nan_to_num(0.0), reduction="none")
@@ -129,7 +132,7 @@ def gate_loss(made: Tensor, gate: Tensor) -> Tensor:
 
 @torch.no_grad()
 def refresh_batch_norm(trainee: Trainee, batches: Iterable[Tensor]) -> None:
-    """Take the statistics of the batch norms anew from images [B, 3, height, width].
+    """Recompute the batch norms' statistics from images [B, 3, height, width].
 
     The old ones were averaged while weights and image size changed, and fit neither.
     """
@@ -150,7 +153,7 @@ def refresh_batch_norm(trainee: Trainee, batches: Iterable[Tensor]) -> None:
 
 @torch.no_grad()
 def validate(trainee: Trainee, batches: Iterable[Batch]) -> PolicyValidation:
-    """Losses and stick errors over all ``batches``, weighted by their size."""
+    """Return losses and stick errors over all ``batches``, weighted by their size."""
     totals, weight = torch.zeros(5, dtype=torch.float64), 0
     for batch in batches:
         losses = trainee(batch).metrics
@@ -170,9 +173,9 @@ def validate(trainee: Trainee, batches: Iterable[Batch]) -> PolicyValidation:
 
 
 def encoder_learns_in_bf16(device: torch.device, image_size: tuple[int, int]) -> bool:
-    """True if bfloat16 makes the encoder's backward pass faster, where it is used at all.
+    """True if bfloat16 speeds up the encoder's backward pass, given that it is used at all.
 
-    On a CPU without matrix units it does so from about 160x160 pixels on; below, depthwise
+    On a CPU without matrix units it does from about 160x160 pixels on; below, depthwise
     convolutions are slower in it. All other parts gain at every size.
     """
     if device.type != "cpu" or torch.cpu._is_amx_tile_supported():

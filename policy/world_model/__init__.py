@@ -1,1 +1,1 @@
-"""A latent world model: what the camera will see and how the vehicle will move."""
+"""Latent world model: predicts the camera's images and the vehicle's motion."""

@@ -1,4 +1,4 @@
-"""A per-frame autoencoder: pixels to a few latent channels at an eighth of the side, and back."""
+"""Per-frame autoencoder: pixels to a few latent channels at an eighth of the side, and back."""
 
 from itertools import pairwise
 
@@ -9,11 +9,11 @@ from torch import Tensor, nn
 MAX_LOG_VARIANCE = 4.0
 _RESIDUAL_GAIN = 0.3
 _INITIAL_LOG_VARIANCE = -4.0
-"""At 0, the noise would drown what little a new encoder's latents say."""
+"""At 0, the noise would drown the weak signal of a new encoder's latents."""
 
 
 class ResidualConv(nn.Module):
-    """Two convolutions around a shortcut; [N, C, h, w] -> the same."""
+    """Two convolutions around a shortcut; [N, C, h, w] -> same shape."""
 
     def __init__(self, width: int) -> None:
         super().__init__()
@@ -21,7 +21,7 @@ class ResidualConv(nn.Module):
         self.conv2 = nn.Conv2d(width, width, 3, padding=1)
 
     def forward(self, x: Tensor) -> Tensor:
-        """Add a residual. There is no norm: so shallow a net needs none, and it would cost time."""
+        """Add a residual. No norm: a network this shallow needs none, and it would cost time."""
         out: Tensor = x + self.conv2(F.silu(self.conv1(F.silu(x))))
         return out
 
@@ -29,7 +29,7 @@ class ResidualConv(nn.Module):
 class FrameAutoencoder(nn.Module):
     """Encoder and decoder of single frames; latents are normalised to unit scale per channel.
 
-    ``widths`` are those of the levels at a half, a quarter and an eighth of the side. Only a pixel
+    ``widths`` belong to the levels at a half, a quarter and an eighth of the side. Only a pixel
     shuffle works at full resolution: a convolution there would cost more than all the others.
     """
 
@@ -54,9 +54,9 @@ class FrameAutoencoder(nn.Module):
         self.register_buffer("latent_std", torch.ones(latent_channels))
 
     def _initialise(self, out: nn.Conv2d) -> None:
-        """He initialisation and small residuals.
+        """Apply He initialisation and small residuals.
 
-        With torch's default, signals shrink by half from layer to layer, and learning is slower.
+        With torch's default, signals halve from layer to layer, and learning is slower.
         """
         for module in self.modules():
             if isinstance(module, nn.Conv2d):
@@ -69,21 +69,21 @@ class FrameAutoencoder(nn.Module):
         log_variance.fill_(_INITIAL_LOG_VARIANCE)
 
     def posterior(self, images: Tensor) -> tuple[Tensor, Tensor]:
-        """[N, 3, H, W] in [-1, 1] -> mean and log variance [N, C, h, w], not normalised."""
+        """Return mean and log variance [N, C, h, w], raw, for images [N, 3, H, W] in [-1, 1]."""
         mean, log_variance = self.moments(self.encoder(images)).chunk(2, dim=1)
         return mean, log_variance.clamp(-20.0, MAX_LOG_VARIANCE)
 
     def reconstruct(self, latents: Tensor) -> Tensor:
-        """Latents [N, C, h, w] that are not normalised -> [N, 3, H, W] about [-1, 1]."""
+        """Decode raw latents [N, C, h, w] -> [N, 3, H, W], about [-1, 1]."""
         images: Tensor = self.decoder(latents)
         return images
 
     def normalise(self, latents: Tensor) -> Tensor:
-        """Raw latents [N, C, h, w] -> unit scale."""
+        """Scale raw latents [N, C, h, w] to unit scale."""
         return (latents - _per_channel(self.latent_mean)) / _per_channel(self.latent_std)
 
     def denormalise(self, latents: Tensor) -> Tensor:
-        """The inverse of ``normalise``."""
+        """Undo ``normalise``."""
         return latents * _per_channel(self.latent_std) + _per_channel(self.latent_mean)
 
 
@@ -94,12 +94,12 @@ def _bias(conv: nn.Conv2d) -> Tensor:
 
 
 def to_unit(images: Tensor) -> Tensor:
-    """[N, H, W, 3] uint8 -> [N, 3, H, W] float in [-1, 1], channels-last memory."""
+    """Convert [N, H, W, 3] uint8 to [N, 3, H, W] float in [-1, 1], channels-last memory."""
     return images.permute(0, 3, 1, 2).float() / 127.5 - 1.0
 
 
 def to_bytes(images: Tensor) -> Tensor:
-    """[N, 3, H, W] about [-1, 1] -> [N, H, W, 3] uint8."""
+    """Convert [N, 3, H, W], about [-1, 1], to [N, H, W, 3] uint8."""
     scaled = ((images + 1.0) * 127.5).round().clamp(0.0, 255.0)
     return scaled.to(torch.uint8).permute(0, 2, 3, 1).contiguous()
 

@@ -1,4 +1,4 @@
-"""The shape of a world model, and what it assumes of the camera."""
+"""Dimensions of a world model, and its assumptions about the camera."""
 
 import json
 import math
@@ -26,7 +26,7 @@ _RANGES = {
 
 @dataclass(frozen=True, kw_only=True)
 class WorldModelConfig:
-    """Shape of a world model."""
+    """Dimensions and camera of a world model."""
 
     image_size: int = 64
     """Side of the square frames, px."""
@@ -34,12 +34,12 @@ class WorldModelConfig:
     frames: int = 16
     """Frames, states and actions in one imagined future."""
     context_frames: int = 2
-    """Frames and states of the past, the newest of them now."""
+    """Past frames and states; the newest is the current one."""
     frame_dt_s: float = 0.1
     """Time between two frames. Action k is the mean stick from frame k - 1 (the last of the context
-    for k = 0) to frame k, state k is that at the exposure of frame k."""
+    for k = 0) to frame k; state k is at the exposure of frame k."""
     horizontal_fov_rad: float = math.radians(90.0)
-    """Field of view of the camera: a pinhole without distortion that looks straight ahead."""
+    """Field of view of the camera, a forward-looking pinhole without distortion."""
     camera_tilt_rad: float = math.radians(10.0)
     """Upward tilt of the camera. Both defaults are those of the simulator's nominal camera."""
     autoencoder_widths: tuple[int, int, int] = (24, 40, 56)
@@ -48,8 +48,8 @@ class WorldModelConfig:
     dynamics_width: int = 128
     dynamics_depth: int = 5
     contract: Contract = field(default_factory=Contract)
-    """Its ``state_frame`` is that of the states. The rest of it is about policies: ``image_size``
-    and ``frame_dt_s`` are the model's own."""
+    """Its ``state_frame`` is that of the states. The other fields concern policies; ``image_size``
+    and ``frame_dt_s`` of the model are separate."""
     schedule: NoiseSchedule = field(default_factory=NoiseSchedule)
 
     def __post_init__(self) -> None:
@@ -84,7 +84,7 @@ class WorldModelConfig:
         return self.latent_channels, side, side
 
     def to_json(self) -> str:
-        """Header form of a checkpoint, without the contract."""
+        """Return the form stored in a checkpoint's header, without the contract."""
         data = {name: value for name, value in asdict(self).items() if name != "contract"}
         return json.dumps(data, sort_keys=True)
 

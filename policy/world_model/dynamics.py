@@ -1,9 +1,9 @@
-"""The denoiser of the world model: a small factorised space-time transformer.
+"""Denoiser of the world model: a small factorised space-time transformer.
 
-Each imagined frame is a few tokens: one for each patch of its latents, and one for the vehicle, its
+The tokens of an imagined frame are one for each patch of its latents, and one for the vehicle: its
 motion and the stick that led to it. A layer attends over time at each place, then over each frame.
-Attention over time is causal: a stick must not change what was before it, although a pilot's later
-sticks would give away what he saw.
+Attention over time is causal: a stick must not change earlier frames, although a pilot's later
+sticks would reveal what the pilot saw.
 """
 
 from dataclasses import dataclass
@@ -26,7 +26,7 @@ PREDICTOR_WIDTH = 192
 
 @dataclass(frozen=True, kw_only=True)
 class Future:
-    """The unknown that is denoised, or an estimate of it; every part has about unit scale.
+    """Unknown to denoise, or an estimate of it; every part has about unit scale.
 
     Latents are [B, T, C, h, w], motion is [B, T, MOTION_DIM], actions are [B, T, 4].
     """
@@ -38,24 +38,24 @@ class Future:
 
 @dataclass(frozen=True, kw_only=True)
 class Conditioning:
-    """Inputs of the denoiser that are the same at every step of a sample."""
+    """Inputs of the denoiser that are constant over the steps of a sample."""
 
     latents: Tensor
     """[B, K, C, h, w] of the past, oldest first."""
     features: Tensor
     """[B, D], see ``relative_state.context_features``."""
     knows_actions: Tensor
-    """[B] bool: the future's actions are given, not noise."""
+    """[B] bool: True if the future's actions are given, not noise."""
     predicted_motion: Tensor
     """[B, T, MOTION_DIM] of about unit scale."""
     warped: Tensor
-    """[B, T, C, h, w] the newest frame, warped by that motion."""
+    """[B, T, C, h, w] the newest frame, warped by the predicted motion."""
     in_view: Tensor
-    """[B, T, 1, h, w] share of each of its cells that was in view."""
+    """[B, T, 1, h, w] share of each warped cell that was in view."""
 
 
 class LatentDynamics(nn.Module):
-    """The network alone; ``WorldModel.denoise`` says what its output means."""
+    """Network only; ``WorldModel.denoise`` defines the meaning of its output."""
 
     def __init__(self, config: WorldModelConfig) -> None:
         super().__init__()
@@ -76,14 +76,14 @@ class LatentDynamics(nn.Module):
         self.norm = nn.LayerNorm(width)
         self.out_patch = nn.Linear(width, per_patch)
         self.out_vehicle = nn.Linear(width, MOTION_DIM + ACTION_DIM)
-        for out in (self.out_patch, self.out_vehicle):  # a new net hardly changes its inputs
+        for out in (self.out_patch, self.out_vehicle):  # a new network hardly changes its inputs
             nn.init.normal_(out.weight, std=_INITIAL_STD)
             nn.init.zeros_(out.bias)
         self._frequencies: Tensor
         self.register_buffer("_frequencies", sinusoid_frequencies(TIME_DIM), persistent=False)
 
     def forward(self, noisy: Future, timestep: Tensor, known: Conditioning) -> Future:
-        """Noisy future and timestep [B] -> the net's outputs, shaped as the future."""
+        """Return the network's outputs, shaped as the future, for a noisy future and step [B]."""
         frames = noisy.latents.shape[1]
         knows = known.knows_actions.to(noisy.motion.dtype).view(-1, 1)
         angle = timestep.to(self._frequencies.dtype).unsqueeze(-1) * self._frequencies
@@ -93,7 +93,7 @@ class LatentDynamics(nn.Module):
         seen = torch.cat([noisy.latents, past, known.warped, known.in_view], dim=2)
         patches = self.embed_patch(self._patches(seen))
         knows_each = knows.unsqueeze(1).expand(-1, frames, -1)
-        # Sticks are rates: what they add up to is nearly what they do.
+        # Sticks are rates: their running sum nearly gives the motion.
         so_far = noisy.actions.cumsum(dim=1) / frames**0.5
         vehicle = torch.cat(
             [noisy.motion, known.predicted_motion, noisy.actions, so_far, knows_each], dim=-1
@@ -108,7 +108,7 @@ class LatentDynamics(nn.Module):
         return Future(latents=latents, motion=motion, actions=actions)
 
     def _patches(self, latents: Tensor) -> Tensor:
-        """[B, T, C, h, w] -> [B, T, patches, C * patch * patch]."""
+        """Rearrange [B, T, C, h, w] -> [B, T, patches, C * patch * patch]."""
         batch, frames, channels, _, _ = latents.shape
         grid, patch = self._grid, self._patch
         split = latents.reshape(batch, frames, channels, grid, patch, grid, patch)
@@ -123,7 +123,7 @@ class LatentDynamics(nn.Module):
 
 
 class _Layer(nn.Module):
-    """Attention over time, attention over a frame, and an MLP; [B, T, S, width] -> the same."""
+    """Attention over time, attention over a frame, and an MLP; [B, T, S, width] -> same shape."""
 
     def __init__(self, width: int) -> None:
         super().__init__()
@@ -135,7 +135,7 @@ class _Layer(nn.Module):
         self._shape = (width,)
 
     def forward(self, tokens: Tensor, modulation: Tensor) -> Tensor:
-        """``modulation`` [B, 6, width] is added to the layer's own."""
+        """Apply the layer; ``modulation`` [B, 6, width] is added to the layer's own."""
         table = (self.modulation + modulation)[:, :, None, None]
         scales, shifts = table[:, ::2], table[:, 1::2]
 
@@ -153,9 +153,9 @@ class _Layer(nn.Module):
 
 
 class MotionPredictor(nn.Module):
-    """Predicts the motion that sticks lead to, once, before anything is denoised.
+    """Predicts the motion caused by the sticks, once, before denoising.
 
-    It is a GRU over the sticks in the order in which they act: none changes what was before it.
+    A GRU over the sticks in the order in which they act: no stick changes earlier motion.
     """
 
     def __init__(self, config: WorldModelConfig) -> None:
@@ -165,13 +165,15 @@ class MotionPredictor(nn.Module):
         self.gru = nn.GRU(2 * ACTION_DIM + 1 + features, PREDICTOR_WIDTH, batch_first=True)
         self.output = nn.Linear(PREDICTOR_WIDTH, MOTION_DIM)
         self.mean_motion = nn.Parameter(torch.zeros(config.frames, MOTION_DIM))
-        nn.init.normal_(self.output.weight, std=_INITIAL_STD)  # a new net predicts the mean motion
+        nn.init.normal_(
+            self.output.weight, std=_INITIAL_STD
+        )  # a new network predicts the mean motion
         nn.init.zeros_(self.output.bias)
 
     def forward(self, features: Tensor, actions: Tensor, knows_actions: Tensor) -> Tensor:
-        """``relative_state.context_features`` [B, D], actions [B, T, 4] -> motions [B, T, 15].
+        """Return motions [B, T, 15] for ``context_features`` [B, D] and actions [B, T, 4].
 
-        Both have about unit scale. Actions are ignored where ``knows_actions`` [B] is False.
+        Both inputs have about unit scale. Actions are ignored if ``knows_actions`` [B] is False.
         """
         known = knows_actions.view(-1, 1, 1)
         sticks = torch.where(known, actions, 0.0)

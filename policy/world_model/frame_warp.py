@@ -1,9 +1,10 @@
-"""Depth-based warping of the newest frame to where the vehicle will be.
+"""Depth-based warping of the newest frame to the vehicle's future poses.
 
-A pixel of a later frame looks along a ray. Turned into the camera of now, the ray points at the
-same thing in the newest frame if that is far away; translation moves it by the thing's inverse
-depth. The motion is predicted, and a small net that learns from photometric error alone gives the
-inverse depth (T. Zhou et al. 2017, "Unsupervised Learning of Depth and Ego-Motion from Video").
+A pixel of a later frame looks along a ray. Turned into the current camera's axes, the ray points at
+the same object in the newest frame if the object is far away; translation shifts it by the object's
+inverse depth. The motion is predicted. A small network that learns from photometric error alone
+gives the inverse depth (T. Zhou et al. 2017, "Unsupervised Learning of Depth and Ego-Motion from
+Video").
 """
 
 import math
@@ -18,44 +19,44 @@ from policy.world_model.config import WorldModelConfig
 
 DEPTH_WIDTH = 32
 FINER = 2
-"""Inverse depth has so many times the resolution of the latents."""
+"""Resolution of the inverse depth relative to the latents'."""
 _INITIAL_INVERSE_DEPTH = -3.0
-"""Before softplus: a new net takes everything to be 20 m away."""
+"""Before softplus: a new network places everything 20 m away."""
 _INITIAL_STD = 0.02
 _MIN_DEPTH = 1e-3
-"""Along a ray of about unit length: what is beside or behind the camera lands far outside."""
+"""Along a ray of about unit length: points beside or behind the camera land far outside."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class SourceFrame:
-    """The newest frame, ready to be warped."""
+    """Newest frame, ready to be warped."""
 
     pixels: Tensor
-    """[B, 3, H, W] about [-1, 1]"""
+    """[B, 3, H, W], about [-1, 1]."""
     inverse_depth: Tensor
-    """[B, 2, FINER h, FINER w] before softplus, 1/m: now, and by how much it grows until the end of
-    the future."""
+    """[B, 2, FINER h, FINER w] before softplus, 1/m: the current value, and its increase until the
+    end of the future."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Poses:
-    """Where the vehicle will be at N moments, in its body axes of now."""
+    """Poses of the vehicle at N moments, in its current body axes."""
 
     rotation: Tensor
-    """[B, N, 3, 3] to the axes of now from those of then."""
+    """[B, N, 3, 3], from the body axes at each moment to the current ones."""
     position_m: Tensor
     """[B, N, 3]"""
     progress: Tensor
     """[B, N] fraction of the time from now to the end of the future."""
 
     def at(self, moments: Tensor) -> "Poses":
-        """The poses with indices [B, n]."""
+        """Return the poses with indices [B, n]."""
         row = torch.arange(len(moments), device=moments.device)[:, None]
         return Poses(**{name: value[row, moments] for name, value in vars(self).items()})
 
 
 class FrameWarp(nn.Module):
-    """Warps frames of a pinhole camera without distortion that looks ahead; images are squares.
+    """Warps square frames of a forward-looking pinhole camera without distortion.
 
     Camera axes: x right, y down, z along the optical axis.
     """
@@ -88,19 +89,19 @@ class FrameWarp(nn.Module):
         self.register_buffer("_body_from_camera", axes, persistent=False)
 
     def source(self, pixels: Tensor, latents: Tensor, vertical_body: Tensor) -> SourceFrame:
-        """Estimate the inverse depth of a frame: its pixels and its latents [B, C, h, w].
+        """Estimate the inverse depth of a frame from its pixels and its latents [B, C, h, w].
 
         ``vertical_body`` [B, 3] is the third axis of the world, in body axes.
         """
-        # The steeper a ray points down, the nearer is level ground; only its scale is unknown.
+        # The steeper a ray points down, the nearer is level ground; only the height is unknown.
         below = (self._cell_rays_body @ (self._down_sign * vertical_body)[:, None, :, None])[..., 0]
         inputs = torch.cat([latents, below.clamp_min(0.0)[:, None]], dim=1)
         return SourceFrame(pixels=pixels, inverse_depth=self.inverse_depth(inputs))
 
     def warp(self, source: SourceFrame, poses: Poses) -> tuple[Tensor, Tensor]:
-        """Frames [B, N, 3, H, W] seen from other poses, and which pixels were in view [B, N, H, W].
+        """Return frames [B, N, 3, H, W] seen from other poses, and the pixels in view [B, N, H, W].
 
-        A pixel that was not shows the nearest one of the border.
+        A pixel out of view shows the nearest one of the border.
         """
         axes = self._body_from_camera
         turn = axes.T @ poses.rotation @ axes
@@ -116,7 +117,7 @@ class FrameWarp(nn.Module):
         return self._sampled(source.pixels, seen), is_ahead & is_inside
 
     def _sampled(self, image: Tensor, rays: Tensor) -> Tensor:
-        """Sample images [B, C, ., .] along rays [B, N, H, W, 3]: [B, N, C, H, W]."""
+        """Sample images [B, C, ., .] along rays [B, N, H, W, 3] -> [B, N, C, H, W]."""
         places = self._on_image(rays)
         seen = F.grid_sample(
             image, places.flatten(1, 2), padding_mode="border", align_corners=False
@@ -125,18 +126,18 @@ class FrameWarp(nn.Module):
         return seen.reshape(batch, channels, rays.shape[1], -1, width).transpose(1, 2)
 
     def _on_image(self, rays: Tensor) -> Tensor:
-        """Rays [..., 3] -> places [..., 2], -1 to 1 from border to border."""
+        """Project rays [..., 3] to image positions [..., 2], -1 to 1 from border to border."""
         return rays[..., :2] / (self._half_width * rays[..., 2:].clamp_min(_MIN_DEPTH))
 
     def _unit_rays(self, side: int) -> Tensor:
-        """[side, side, 3] through the middles of pixels, of unit depth."""
+        """Return rays [side, side, 3] of unit depth through pixel centres."""
         at = self._half_width * ((2 * torch.arange(side) + 1) / side - 1)
         y, x = torch.meshgrid(at, at, indexing="ij")
         return torch.stack([x, y, torch.ones_like(x)], dim=-1)
 
 
 def _body_from_camera(tilt_rad: float, state_frame: StateFrame) -> Tensor:
-    """[3, 3]; body axes are FRD or FLU, as those of the states."""
+    """Return the rotation [3, 3] from camera to body axes, FRD or FLU as in the states."""
     sine, cosine = math.sin(tilt_rad), math.cos(tilt_rad)
     frd = torch.tensor([[0.0, sine, cosine], [1.0, 0.0, 0.0], [0.0, cosine, -sine]])
     return frd if state_frame == "ned_frd" else frd * torch.tensor([[1.0], [-1.0], [-1.0]])

@@ -1,12 +1,12 @@
-"""A latent world model: what the camera will see and how the vehicle will move.
+"""Latent world model: predicts the camera's images and the vehicle's motion.
 
     frames --encode--> latents --sample--> 16 latents, states and actions --decode--> frames
 
-Two frames and states are the context. One net plays both roles: *simulation*, where the actions are
-given and latents and states are denoised, and *decision*, where the actions are denoised too.
+Two frames and states are the context. One network has two roles. In *simulation* the actions are
+given, and latents and states are denoised; in *decision* the actions are denoised too.
 
-Before it denoises, the model predicts the motion and warps the newest frame by it: what was in view
-already keeps its sharpness, and the denoiser has to paint only the rest.
+Before denoising, the model predicts the motion and warps the newest frame by it. Parts that were in
+view stay sharp, and the denoiser has to paint only the rest.
 """
 
 from collections.abc import Callable
@@ -33,7 +33,7 @@ from policy.world_model.relative_state import (
 )
 
 LIMIT = 6.0
-"""Estimates of unit scale are clipped to so many standard deviations."""
+"""Estimates are clipped to this many standard deviations."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -41,19 +41,19 @@ class Imagined:
     """One imagined future of each of ``B`` flights."""
 
     latents: Tensor
-    """[B, frames, C, h, w] as ``encode`` makes them."""
+    """[B, frames, C, h, w], as returned by ``encode``."""
     states: Tensor
     """[B, frames, 13] in SI units, in the contract's frame."""
     actions: Tensor
     """[B, frames, 4] sticks, given or decided."""
     video: Tensor | None
-    """[B, frames, H, W, 3] uint8, None unless it was asked for."""
+    """[B, frames, H, W, 3] uint8; None unless requested."""
 
 
 class WorldModel(nn.Module):
     """Autoencoder and dynamics; all scales are stored with the weights.
 
-    A shape or type that is not the model's raises a ``PolicyError``.
+    A shape or type that does not fit the model raises a ``PolicyError``.
     """
 
     def __init__(self, config: WorldModelConfig) -> None:
@@ -77,7 +77,7 @@ class WorldModel(nn.Module):
 
     @torch.no_grad()
     def encode(self, images: Tensor) -> Tensor:
-        """Frames [N, H, W, 3] uint8 -> latents [N, C, h, w] of about unit scale."""
+        """Encode frames [N, H, W, 3] uint8 to latents [N, C, h, w] of about unit scale."""
         size = self.config.image_size
         if images.dtype != torch.uint8 or tuple(images.shape[1:]) != (size, size, 3):
             raise PolicyError(
@@ -91,7 +91,7 @@ class WorldModel(nn.Module):
 
     @torch.no_grad()
     def decode(self, latents: Tensor) -> Tensor:
-        """Latents [N, C, h, w] -> frames [N, H, W, 3] uint8."""
+        """Decode latents [N, C, h, w] to frames [N, H, W, 3] uint8."""
         shape = self.config.latent_shape
         if tuple(latents.shape[1:]) != shape:
             raise PolicyError(
@@ -119,10 +119,10 @@ class WorldModel(nn.Module):
             states: [B, context_frames, 13] at their exposures, SI units, the contract's frame.
             actions: [B, frames, 4] in simulation, None in decision.
             ddim_steps: network calls.
-            noise_seed: seed of the initial noise, which is the same on every device; a generator is
+            noise_seed: seed of the initial noise, equal on every device; a generator is
                 advanced.
             sim_mode: True to simulate given actions, False to decide.
-            decode_video: whether to decode all frames.
+            decode_video: True to decode all frames.
         """
         self._require_context(latents, states, actions, sim_mode=sim_mode)
         steps = self.config.schedule.ddim_steps(ddim_steps)
@@ -146,7 +146,7 @@ class WorldModel(nn.Module):
         )
 
     def source_frame(self, latents: Tensor, state: Tensor) -> SourceFrame:
-        """The newest frame [B, C, h, w] of a vehicle in state [B, 13], to be warped."""
+        """Return the newest frame [B, C, h, w], seen from state [B, 13], ready to be warped."""
         coder = self.autoencoder
         with torch.no_grad():
             pixels = coder.reconstruct(_channels_last(coder.denormalise(latents)))
@@ -164,11 +164,11 @@ class WorldModel(nn.Module):
     ) -> Conditioning:
         """Predict the motion and warp the newest frame by it, once for all steps of a sample.
 
-        Latents and states are those of ``sample``. Actions [B, frames, 4] are of about unit scale,
-        and ignored where ``knows_actions`` [B] is False. It takes about as long as two denoising
-        steps, because each warped frame is encoded.
+        Latents and states are as in ``sample``. Actions [B, frames, 4] are of about unit scale, and
+        ignored if ``knows_actions`` [B] is False. It takes about as long as two denoising steps,
+        because each warped frame is encoded.
         """
-        with torch.autocast(latents.device.type, enabled=False):  # angles need all their digits
+        with torch.autocast(latents.device.type, enabled=False):  # angles need full precision
             features = context_features(states, self.config.contract)
             predicted = self.motion_predictor(features, actions, knows_actions)
         with torch.no_grad():
@@ -186,7 +186,7 @@ class WorldModel(nn.Module):
         )
 
     def poses(self, state: Tensor, motion: Tensor) -> Poses:
-        """Where motions [B, frames, 15] in SI units lead from a state [B, 13]."""
+        """Return the poses after motions [B, frames, 15] in SI units from a state [B, 13]."""
         with torch.autocast(state.device.type, enabled=False):
             rotation, position_m = poses_after(state, motion, self.config.frame_dt_s)
         progress = torch.arange(1, motion.shape[1] + 1, device=state.device) / motion.shape[1]
@@ -195,16 +195,18 @@ class WorldModel(nn.Module):
         )
 
     def warp(self, source: SourceFrame, poses: Poses) -> tuple[Tensor, Tensor]:
-        """Frames [B, N, 3, H, W], and which of their pixels were in view [B, N, H, W] bool."""
+        """Return frames [B, N, 3, H, W], and a bool mask of their pixels in view [B, N, H, W]."""
         with torch.autocast(source.pixels.device.type, enabled=False):
             return self.frame_warp.warp(source, poses)
 
     def denoise(self, noisy: Future, timestep: Tensor, known: Conditioning) -> Future:
         """Estimate the clean future, x_0, by one network call.
 
-        The net gives latents as a change of the warped frame, in units of how much they change in
-        so many steps, and the motion as a change of the predicted one. Given the actions, little of
-        a future is random: predicting x_0 works at every noise level, and few steps lose little.
+        The network gives latents as a change of the warped frame, in units of their typical change
+        over the same number of frames, and the motion as a change of the predicted one. Given the
+        actions, little of a future is random: predicting x_0 works at every noise level, and few
+        steps lose little.
+
         Known actions in ``noisy`` are clean; ``timestep`` is [B] int64.
         """
         output = self.dynamics(noisy, timestep, known)
@@ -215,11 +217,11 @@ class WorldModel(nn.Module):
         )
 
     def normalise_actions(self, actions: Tensor) -> Tensor:
-        """Sticks [..., 4] -> about unit scale."""
+        """Scale sticks [..., 4] to about unit scale."""
         return (actions - self.action_mean) / self.action_std
 
     def normalise_motion(self, motion: Tensor) -> Tensor:
-        """Motions [..., frames, 15] -> about unit scale."""
+        """Scale motions [..., frames, 15] to about unit scale."""
         return (motion - self.motion_mean) / self.motion_std
 
     def _ddim_update(self, step: DdimStep, noisy: Future, known: Conditioning) -> Future:
@@ -239,7 +241,7 @@ class WorldModel(nn.Module):
     def _initial_noise(
         self, batch: int, seed: int | torch.Generator, device: torch.device
     ) -> Future:
-        """Draw latents first, so that both roles begin with the same noise of latents."""
+        """Draw the noise of latents first, so that it is equal in both roles."""
         generator = seed
         if not isinstance(generator, torch.Generator):
             generator = torch.Generator().manual_seed(generator)
@@ -275,10 +277,10 @@ class WorldModel(nn.Module):
 
 
 def _one_by_one(net: Callable[[Tensor], Tensor], inputs: Tensor) -> Tensor:
-    """Apply a net to [N, C, H, W], each alone: kernels for other batch sizes may round otherwise.
+    """Apply a network to each item of [N, C, H, W] alone, so that results are bit-identical.
 
-    So a frame is the same, bit for bit, whatever others it is coded with. Kernels are also chosen
-    by the strides, which a slice of a batch inherits: each is a copy of its own.
+    Kernels for other batch sizes may round differently. Kernels also depend on the strides, which
+    a slice inherits from its batch, so each item is copied.
     """
     if len(inputs) == 0:
         return net(_channels_last(inputs.new_zeros(1, *inputs.shape[1:])))[:0]
@@ -286,5 +288,5 @@ def _one_by_one(net: Callable[[Tensor], Tensor], inputs: Tensor) -> Tensor:
 
 
 def _channels_last(images: Tensor) -> Tensor:
-    """A copy of [N, C, H, W] in the one memory layout that the convolutions are run in."""
+    """Return a copy of [N, C, H, W] in channels-last memory, as the convolutions use it."""
     return images.clone(memory_format=torch.channels_last)

@@ -1,7 +1,7 @@
-"""Future states relative to now: what changed, in the vehicle's body axes of now.
+"""Future states relative to now: changes in the vehicle's current body axes.
 
-So a prediction is the same on every heading and in both state frames, it is continuous in every
-attitude, and no net has to learn quaternions.
+So a prediction is independent of the heading and of the state frame, it is continuous in every
+attitude, and no network has to learn quaternions.
 """
 
 import torch
@@ -13,9 +13,9 @@ from policy.preprocess import egocentric_columns, egocentric_scale
 from policy.rotation import matrix_columns
 
 MOTION_DIM = 15
-"""Change of velocity [3] m/s in the body axes of now, the first two columns of the rotation from
-then to now less those of the identity [6], change of body rates [3] rad/s and of specific force
-[3] m/s^2."""
+"""Change of velocity [3] m/s in the current body axes, first two columns of the rotation from the
+other to the current axes minus those of the identity [6], change of body rates [3] rad/s and of
+specific force [3] m/s^2."""
 _ROTATION = slice(3, 9)
 
 MOTION_SCALE = (
@@ -24,13 +24,13 @@ MOTION_SCALE = (
     *(1.0, 1.0, 1.0),  # rad/s
     *(3.0, 3.0, 3.0),  # m/s^2
 )
-"""Divisors of the motions of the past, as nets take them."""
+"""Divisors of past motions in a network's input."""
 
 
 def motion_since(now: Tensor, then: Tensor) -> Tensor:
-    """Motions [..., 15] from ``now`` to other states, earlier or later.
+    """Return motions [..., 15] from ``now`` to other states, earlier or later.
 
-    Both are [..., 13] in SI units and of one frame, and are broadcast.
+    Both are [..., 13] in SI units and one frame, and are broadcast.
     """
     to_body = _matrix(now[..., QUATERNION]).transpose(-1, -2)
     change = then - now
@@ -44,7 +44,7 @@ def motion_since(now: Tensor, then: Tensor) -> Tensor:
 def state_after(now: Tensor, motion: Tensor) -> Tensor:
     """Apply motions [..., 15] to ``now`` [..., 13]: states [..., 13]; inverts ``motion_since``.
 
-    The quaternion is a unit one with w >= 0, whatever six numbers a net gives for the rotation.
+    The quaternion is normalised with w >= 0, for any six numbers of the rotation.
     """
     to_world = _matrix(now[..., QUATERNION])
     velocity = now[..., VELOCITY] + (to_world @ motion[..., VELOCITY, None]).squeeze(-1)
@@ -58,8 +58,8 @@ def poses_after(now: Tensor, motion: Tensor, dt_s: float) -> tuple[Tensor, Tenso
     """Integrate motions [B, T, 15], ``dt_s`` apart, from ``now`` [B, 13] in SI units.
 
     Returns:
-        Rotations [B, T, 3, 3] to the axes of now from those of then, and positions [B, T, 3] in m,
-        both in the body axes of now.
+        Rotations [B, T, 3, 3] from the later to the current axes, and positions [B, T, 3] in m,
+            both in the current body axes.
     """
     to_body = _matrix(now[:, QUATERNION]).transpose(-1, -2)
     start_mps = (to_body @ now[:, VELOCITY, None]).transpose(-1, -2)
@@ -70,7 +70,7 @@ def poses_after(now: Tensor, motion: Tensor, dt_s: float) -> tuple[Tensor, Tenso
 
 
 def vertical_in_body(states: Tensor) -> Tensor:
-    """States [..., 13] -> third axis of the world [..., 3], in body axes."""
+    """Return the third axis of the world [..., 3] in body axes, for states [..., 13]."""
     return _matrix(states[..., QUATERNION])[..., 2, :]
 
 
@@ -80,9 +80,9 @@ def features_dim(context_frames: int) -> int:
 
 
 def context_features(states: Tensor, contract: Contract) -> Tensor:
-    """Last states [B, K, 13], oldest first -> [B, features_dim(K)] of size about 1.
+    """Return features [B, features_dim(K)] of about 1 for states [B, K, 13], oldest first.
 
-    The newest as ``preprocess.egocentric`` makes it, then the motions back to the older ones.
+    They are the newest state by ``preprocess.egocentric``, then the motions back to the older ones.
     """
     now = states[:, -1:]
     scale = now.new_tensor(egocentric_scale(contract)[:12])
@@ -92,13 +92,13 @@ def context_features(states: Tensor, contract: Contract) -> Tensor:
 
 
 def _matrix(quaternion: Tensor) -> Tensor:
-    """Unit quaternions [..., 4], w first -> rotation matrices [..., 3, 3]."""
+    """Convert unit quaternions [..., 4], w first, to rotation matrices [..., 3, 3]."""
     columns = matrix_columns(*quaternion.unbind(-1))
     return torch.stack([torch.stack(column, dim=-1) for column in columns], dim=-1)
 
 
 def _orthonormal(rotation: Tensor) -> Tensor:
-    """Two columns less the identity's [..., 6] -> the nearest such rotation [..., 3, 3]."""
+    """Return the rotation [..., 3, 3] nearest to two columns minus the identity's [..., 6]."""
     identity = rotation.new_tensor((1.0, 0.0, 0.0, 0.0, 1.0, 0.0))
     first, second = (rotation + identity).chunk(2, dim=-1)
     first = F.normalize(first, dim=-1)
@@ -107,7 +107,7 @@ def _orthonormal(rotation: Tensor) -> Tensor:
 
 
 def _quaternion(matrix: Tensor) -> Tensor:
-    """Rotation matrices [..., 3, 3] -> unit quaternions [..., 4] with w >= 0.
+    """Convert rotation matrices [..., 3, 3] to unit quaternions [..., 4] with w >= 0.
 
     Row i of the outer product below is the quaternion times four times its component i: the row of
     the largest component is the most exact.

@@ -1,5 +1,5 @@
-"""ACT and DiffusionPolicy as LeRobot 0.4 to 0.6 saves them, without LeRobot.
+"""ACT and DiffusionPolicy as saved by LeRobot 0.4 to 0.6, without LeRobot installed.
 
-``plan`` puts together all that is known without the weights and without torch: config.json, the
-normalisation and the contract file. ``policy`` loads the weights into ``act`` or ``diffusion``.
+``plan`` reads config.json, the normalisation and the contract file, without weights or torch.
+``policy`` loads the weights into ``act`` or ``diffusion``.
 """

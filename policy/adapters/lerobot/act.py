@@ -1,7 +1,7 @@
-"""ACT (Zhao et al. 2023) as LeRobot saves it: a ResNet's cells and a state, through a transformer.
+"""ACT (Zhao et al. 2023) as LeRobot saves it: a transformer over image cells and a state.
 
-Only what inference needs: the encoder of the training's latent is left out, and the latent is zero.
-Parameters have LeRobot's names, but for those of attention.
+Inference only: the encoder of the training latent is left out, and the latent is zero. Parameters
+have LeRobot's names, except in the attention layers.
 """
 
 import math
@@ -16,7 +16,7 @@ from policy.nets.attention import Attention
 from policy.nets.resnet import LastMap
 
 _ATTENTION_NAMES = {"in_proj_": "qkv.", "out_proj.": "project."}
-"""Parts of LeRobot's names of parameters, and of ours."""
+"""Parts of LeRobot's parameter names, and ours."""
 
 
 class EncoderLayer(nn.Module):
@@ -32,26 +32,26 @@ class EncoderLayer(nn.Module):
         self.pre_norm = config.pre_norm
 
     def forward(self, x: Tensor, position: Tensor) -> Tensor:
-        """[B, L, D]; positions go to queries and keys alone."""
+        """Encode [B, L, D]; positions are added to queries and keys only."""
         return self.feed_forward(self.attend(x, position), self.norm2)
 
     def attend(self, x: Tensor, position: Tensor) -> Tensor:
-        """Self-attention around its shortcut."""
+        """Apply self-attention and its shortcut."""
         own = self.before(x, self.norm1)
         at = own + position
         return self.after(x, self.self_attn(at, at, own), self.norm1)
 
     def feed_forward(self, x: Tensor, norm: nn.Module) -> Tensor:
-        """Two layers around their shortcut."""
+        """Apply the two feed-forward layers and their shortcut."""
         hidden = self.activation(self.linear1(self.before(x, norm)))
         return self.after(x, self.linear2(hidden), norm)
 
     def before(self, x: Tensor, norm: nn.Module) -> Tensor:
-        """Input of a sublayer."""
+        """Return the input of a sublayer."""
         return norm(x) if self.pre_norm else x
 
     def after(self, x: Tensor, change: Tensor, norm: nn.Module) -> Tensor:
-        """Sum of a sublayer's output and its shortcut."""
+        """Return the sum of a sublayer's output and its shortcut."""
         return x + change if self.pre_norm else norm(x + change)
 
 
@@ -64,7 +64,7 @@ class DecoderLayer(EncoderLayer):
         self.multihead_attn = Attention(config.dim_model, config.n_heads)
 
     def decode(self, x: Tensor, position: Tensor, tokens: Tensor, token_position: Tensor) -> Tensor:
-        """Actions [B, L, D] and tokens [B, M, D], each with its positions."""
+        """Decode actions [B, L, D] and tokens [B, M, D], each with its positions."""
         x = self.attend(x, position)
         query = self.before(x, self.norm2) + position
         x = self.after(x, self.multihead_attn(query, tokens + token_position, tokens), self.norm2)
@@ -72,7 +72,7 @@ class DecoderLayer(EncoderLayer):
 
 
 class Encoder(nn.Module):
-    """The layers, and a norm at their end where norms come first."""
+    """Encoder layers, with a final norm if norms come first."""
 
     def __init__(self, config: ActConfig) -> None:
         super().__init__()
@@ -80,7 +80,7 @@ class Encoder(nn.Module):
         self.norm: nn.Module = nn.LayerNorm(config.dim_model) if config.pre_norm else nn.Identity()
 
     def forward(self, x: Tensor, position: Tensor) -> Tensor:
-        """[B, L, D] -> [B, L, D]."""
+        """Encode [B, L, D] -> [B, L, D]."""
         for layer in self.layers:
             x = layer(x, position)
         out: Tensor = self.norm(x)
@@ -88,7 +88,7 @@ class Encoder(nn.Module):
 
 
 class Decoder(nn.Module):
-    """The layers, and a norm at their end."""
+    """Decoder layers and a final norm."""
 
     def __init__(self, config: ActConfig) -> None:
         super().__init__()
@@ -98,7 +98,7 @@ class Decoder(nn.Module):
     def forward(
         self, x: Tensor, position: Tensor, tokens: Tensor, token_position: Tensor
     ) -> Tensor:
-        """As ``DecoderLayer.decode``."""
+        """Decode by every layer; arguments as in ``DecoderLayer.decode``."""
         for layer in self.layers:
             x = layer.decode(x, position, tokens, token_position)  # type: ignore[operator]
         out: Tensor = self.norm(x)
@@ -108,11 +108,11 @@ class Decoder(nn.Module):
 class Act(nn.Module):
     """Normalised images and state -> normalised actions.
 
-    The tokens are the latent, the state where there is one, and the cells of each camera's map.
+    Tokens: the latent, the state if there is one, and the cells of each camera's map.
     """
 
     prefix = "model."
-    """Before the names of its parameters in LeRobot's file."""
+    """Prefix of the parameter names in LeRobot's file."""
 
     def __init__(self, config: ActConfig) -> None:
         super().__init__()
@@ -132,18 +132,18 @@ class Act(nn.Module):
 
     @staticmethod
     def own_name(name: str) -> str | None:
-        """Our name of a parameter in LeRobot's file, without the prefix; None: not needed."""
+        """Return our name of a parameter in LeRobot's file, without the prefix; None: unused."""
         for theirs, ours in _ATTENTION_NAMES.items():
             name = name.replace(theirs, ours)
         return None if name.startswith("vae_encoder") else name
 
     def encode(self, image: Tensor, _camera: int) -> Tensor:
-        """[B, 3, H, W] -> cells [B, D * h * w], of any camera."""
+        """Encode an image [B, 3, H, W] of any camera -> cells [B, D * h * w]."""
         cells: Tensor = self.encoder_img_feat_input_proj(self.backbone(image)).flatten(1)
         return cells
 
     def act(self, feature: Tensor, state: Tensor, _num_diffusion_steps: int) -> Tensor:
-        """Features [B, 1, cameras, F] and state [B, 1, S] -> actions [B, chunk_size, 4]."""
+        """Return actions [B, chunk_size, 4] for features [B, 1, cameras, F] and state [B, 1, S]."""
         batch, dim = feature.shape[0], self.encoder_latent_input_proj.out_features
         latent = torch.zeros(batch, self.latent_dim, dtype=feature.dtype, device=feature.device)
         tokens = [self.encoder_latent_input_proj(latent).unsqueeze(1)]
@@ -163,10 +163,10 @@ class Act(nn.Module):
 
 
 def cell_positions(height: int, width: int, dim: int) -> Tensor:
-    """Fixed positions of the cells of a map [height * width, dim]: rows, then columns.
+    """Return fixed positions of the cells of a map [height * width, dim]: rows, then columns.
 
-    Sine and cosine by turns, of the row or column from 1 on as a share of 2 pi (DETR, Carion et al.
-    2020). Computed in float32, as in LeRobot.
+    Alternating sine and cosine of the row or column, counted from 1 and scaled to 2 pi (DETR,
+    Carion et al. 2020). Computed in float32, as in LeRobot.
     """
     half = dim // 2
     frequency = 10_000.0 ** (2 * (torch.arange(half, dtype=torch.float32) // 2) / half)

@@ -1,8 +1,8 @@
 """Entries of a LeRobot policy's config.json that inference depends on.
 
-LeRobot writes every entry that its version knows, so an entry is missing only where a version did
-not have it yet. Those have the one value that this version computed with; all others must be there,
-because the defaults of LeRobot's own code changed with 0.6.0.
+LeRobot writes every entry that its version knows, so an entry is missing only if the version did
+not have it yet. Such entries default to the one value that the old version computed with. All
+others are required, because the defaults of LeRobot's own code changed with 0.6.0.
 """
 
 from collections.abc import Callable, Mapping
@@ -18,9 +18,9 @@ from policy.errors import CheckpointError, warned
 CONFIG_FILE = "config.json"
 STATE_KEY, ACTION_KEY = "observation.state", "action"
 ENVIRONMENT_KEY = "observation.environment_state"
-"""LeRobot's input for what is known of the world; here the goal of the flight."""
+"""LeRobot's input for known facts of the world; here the vector to the flight's goal."""
 NO_IMAGE_PX = 16
-"""Side of the blank image of a policy without a camera: the smallest of a contract."""
+"""Side of the blank image of a policy without a camera [px]: the smallest in a contract."""
 BackboneName = Literal["resnet18", "resnet34", "resnet50", "resnet101", "resnet152"]
 Size = tuple[int, int]
 """Height and width."""
@@ -34,28 +34,28 @@ _WITHOUT_EFFECT = {
     *("optimizer_lr_backbone", "optimizer_betas", "optimizer_eps"),
     *("scheduler_name", "scheduler_warmup_steps"),
 }
-"""Entries that only training looks at, or that are read apart from the network's own."""
+"""Entries that only training reads, and entries that are read separately from the network's."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Features:
-    """Inputs and outputs of a policy, by LeRobot's names."""
+    """Inputs and outputs of a policy, under LeRobot's names."""
 
     image_keys: tuple[str, ...]
-    """Its cameras, in the order of their features; empty for a policy that looks at no image."""
+    """Cameras in the order of their features; empty for a policy without images."""
     image_height: int
     image_width: int
     state_dim: int | None
-    """Width of observation.state; None where it takes none."""
+    """Width of observation.state; None if the policy takes none."""
     takes_goal: bool
-    """observation.environment_state is the vector to the goal, ``policy.contract.EXTRA_NAMES``."""
+    """True if observation.environment_state is the goal vector, ``policy.contract.EXTRA_NAMES``."""
     modes: Mapping[str, str]
-    """Normalisation of STATE, VISUAL and ACTION, ``plan.MODES``."""
+    """Normalisation of STATE, VISUAL and ACTION; see ``plan.MODES``."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class ActConfig:
-    """An Action Chunking Transformer (Zhao et al. 2023); fields are named as in config.json."""
+    """Action Chunking Transformer (Zhao et al. 2023); field names as in config.json."""
 
     features: Features
     vision_backbone: BackboneName
@@ -72,31 +72,31 @@ class ActConfig:
 
     @property
     def n_obs_steps(self) -> int:
-        """Observations that it takes."""
+        """Number of observations that the policy takes."""
         return 1
 
     @property
     def horizon(self) -> int:
-        """Actions from now on."""
+        """Number of actions from now on."""
         return self.chunk_size
 
     @property
     def feature_dim(self) -> int:
-        """The cells of one image's last map, each projected to the transformer's width."""
+        """Size of an image's feature: its last map's cells, projected to the transformer's
+        width."""
         height, width = map_size(self.features.image_height, self.features.image_width)
         return self.dim_model * height * width
 
 
 @dataclass(frozen=True, kw_only=True)
 class DiffusionConfig:
-    """A diffusion policy (Chi et al. 2023) with a 1-D U-Net; fields as in config.json."""
+    """Diffusion policy (Chi et al. 2023) with a 1-D U-Net; field names as in config.json."""
 
     features: Features
     vision_backbone: BackboneName
     n_obs_steps: int
     predicted: int
-    """config.json's horizon: actions of a chunk, the first of which acts at the oldest
-    observation."""
+    """config.json's horizon: actions of a chunk; the first acts at the oldest observation."""
     resize_shape: Size | None
     crop_shape: Size | None
     use_group_norm: bool
@@ -119,17 +119,17 @@ class DiffusionConfig:
 
     @property
     def horizon(self) -> int:
-        """Actions from now on: those before the newest observation are past."""
+        """Number of actions from now on: actions before the newest observation are past."""
         return self.predicted - self.n_obs_steps + 1
 
     @property
     def feature_dim(self) -> int:
-        """Two coordinates of each keypoint, through one layer; one zero without a camera."""
+        """Size of an image's feature: two coordinates per keypoint; 1, a zero, without a camera."""
         return 2 * self.spatial_softmax_num_keypoints if self.features.image_keys else 1
 
     @property
     def encoded_size(self) -> Size:
-        """Height and width of the image that the encoder sees."""
+        """Height and width of the encoder's input image."""
         image = (self.features.image_height, self.features.image_width)
         return self.crop_shape or self.resize_shape or image
 
@@ -139,12 +139,12 @@ C = TypeVar("C", ActConfig, DiffusionConfig)
 
 
 def map_size(height: int, width: int) -> Size:
-    """Size of a ResNet's last map: its five layers of stride 2 halve it, rounding up."""
+    """Return the size of a ResNet's last map: five layers of stride 2, each rounding up."""
     return -(-height // 32), -(-width // 32)
 
 
 def read_config(folder: Path) -> tuple[Config, list[str]]:
-    """Return the policy that a folder holds, and notes for the user."""
+    """Return the policy in a folder, and notes for the user."""
     path = folder / CONFIG_FILE
     if not path.is_file():
         raise CheckpointError(f"{folder}: holds no {CONFIG_FILE}; {_where_to_look(folder)}")
@@ -225,7 +225,7 @@ def _resize_and_crop(entries: "_Entries", features: Features) -> tuple[Size | No
         entries.get("crop_ratio", float, default=1.0),
         entries.get("crop_shape", Size | None),
     )
-    if resize is not None:  # then LeRobot takes the crop from the ratio, whatever crop_shape says
+    if resize is not None:  # LeRobot then derives the crop from the ratio and ignores crop_shape
         crop = None if ratio == 1.0 else (int(resize[0] * ratio), int(resize[1] * ratio))
     before = resize or (features.image_height, features.image_width)
     if not features.image_keys:
@@ -236,10 +236,10 @@ def _resize_and_crop(entries: "_Entries", features: Features) -> tuple[Size | No
 
 
 def _features(entries: "_Entries") -> Features:
-    """Cameras, state and action.
+    """Return cameras, state and action.
 
-    LeRobot's ACT and DiffusionPolicy look at no other feature of type STATE than observation.state,
-    and at no other of type ENV than observation.environment_state.
+    LeRobot's ACT and DiffusionPolicy use no STATE feature except observation.state, and no ENV
+    feature except observation.environment_state.
     """
     inputs, outputs = entries.get("input_features", dict), entries.get("output_features", dict)
     kinds = {key: _feature(entries.path, key, value) for key, value in inputs.items()}
@@ -297,18 +297,18 @@ _KINDS: dict[object, tuple[str, Callable[[Any], bool]]] = {
     tuple[int, ...]: ("positive integers", _are_counts),
     Size: ("a height and a width", lambda value: _are_counts(value) and len(value) == 2),
 }
-"""By the type of a field: its name in messages, and the check of a JSON value."""
+"""For each field type, its name in messages and the check of a JSON value."""
 
 
 class _Entries:
-    """The entries of one config.json, each checked where it is read."""
+    """Entries of one config.json, each checked when it is read."""
 
     def __init__(self, path: Path) -> None:
         self.path, self.data = path, read_json(path)
         self.read: set[str] = set()
 
     def get(self, name: str, kind: Any, *, default: object = None) -> Any:
-        """Return an entry of the type ``kind``, which may be a Literal, or optional for null."""
+        """Return an entry of the type ``kind``: also a Literal, or Optional if null is allowed."""
         self.read.add(name)
         value = self.data.get(name)
         value = default if value is None else value
@@ -330,7 +330,7 @@ class _Entries:
         return tuple(value) if isinstance(value, list) else value
 
     def only(self, name: str, wanted: object) -> None:
-        """Refuse any other value than the one that is supported."""
+        """Raise PolicyError unless the entry has the only supported value."""
         self.read.add(name)
         if (value := self.data.get(name)) != wanted:
             raise CheckpointError(
@@ -338,7 +338,7 @@ class _Entries:
             )
 
     def fill(self, config: type[C], **given: Any) -> C:
-        """Return a config with the entries of its fields' names, but for those that are given."""
+        """Return a config filled from the entries with its fields' names, except the given ones."""
         hints = get_type_hints(config)
         read = {name: self.get(name, kind) for name, kind in hints.items() if name not in given}
         return config(**given, **read)

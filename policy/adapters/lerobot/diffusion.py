@@ -1,10 +1,11 @@
-"""LeRobot's DiffusionPolicy (Chi et al. 2023): image encoders, a 1-D U-Net, and a solve by DDIM.
+"""LeRobot's DiffusionPolicy (Chi et al. 2023): image encoders, a 1-D U-Net and a DDIM solver.
 
-LeRobot's own default is DDPM with all the steps of training, which takes seconds and ends somewhere
-else each time. Here a solve is what LeRobot computes with noise_scheduler_type DDIM: deterministic,
-in few steps, from one fixed noise. Parameters have LeRobot's names. Of the U-Net's FiLM layers, the
-weights for the timestep and those for the condition are used apart: what the condition adds is
-computed once for a whole solve.
+LeRobot's default is DDPM with all training steps, which takes seconds and gives a different result
+each time. Here a solve is what LeRobot computes with noise_scheduler_type DDIM: deterministic, in
+few steps, from one fixed noise.
+
+Parameters have LeRobot's names. The U-Net's FiLM layers apply their timestep weights and their
+condition weights separately, so the condition's part is computed once for a whole solve.
 """
 
 from typing import Any
@@ -21,27 +22,27 @@ from policy.nets.resnet import LastMap
 from policy.nets.unet1d import norm_of_groups, sinusoid_frequencies
 
 _PLACES = {"0": "conv1", "1": "bn1", "4": "layer1", "5": "layer2", "6": "layer3", "7": "layer4"}
-"""LeRobot's names of a ResNet's parts, which it has in a list, and torchvision's."""
+"""LeRobot's names of a ResNet's parts, which it keeps in a list, and torchvision's."""
 _CHANNELS_PER_GROUP = 16
 
 
 class GroupNorm(nn.GroupNorm):
-    """A group norm that OpenVINO computes fast."""
+    """Group norm in a form that OpenVINO computes fast."""
 
     def forward(self, x: Tensor) -> Tensor:
-        """[B, C, ...] -> the same shape."""
+        """Normalise [B, C, ...]; the shape stays."""
         return norm_of_groups(self, x)
 
 
 class Mish(nn.Module):
-    """Mish (Misra 2019) of vectors, ``x * tanh(softplus(x))``, without that operation.
+    """Mish (Misra 2019) of vectors, ``x * tanh(softplus(x))``, without a Mish operation.
 
     With w = exp(x), tanh(softplus(x)) = w (w + 2) / (w (w + 2) + 2). OpenVINO 2026.4 fails to
-    compile a Mish between small products of matrices in float32.
+    compile a Mish between small matrix products in float32.
     """
 
     def forward(self, x: Tensor) -> Tensor:
-        """Element by element."""
+        """Apply Mish to each element."""
         w = x.clamp(max=20.0).exp()  # above, the quotient is 1
         n = w * (w + 2)
         return x * (n / (n + 2))
@@ -59,7 +60,7 @@ class ConvBlock(nn.Module):
         )
 
     def forward(self, x: Tensor) -> Tensor:
-        """One after the other."""
+        """Apply convolution, norm and Mish."""
         out: Tensor = self.block(x)
         return out
 
@@ -82,7 +83,7 @@ class ResidualBlock(nn.Module):
             self.residual_conv = nn.Conv1d(channels_in, channels_out, 1)
 
     def forward(self, x: Tensor, film: Tensor) -> Tensor:
-        """``film`` [B, film_dim]: scales, where it has any, then shifts."""
+        """Apply the block; ``film`` [B, film_dim] holds scales, if it has any, then shifts."""
         hidden = self.conv1(x)
         if self.scales:
             scale, shift = film.unsqueeze(-1).chunk(2, dim=1)
@@ -94,7 +95,7 @@ class ResidualBlock(nn.Module):
 
 
 class UNet(nn.Module):
-    """Noisy chunk [B, horizon, 4] -> the net's prediction, by FiLM [B, film_dim]."""
+    """Noisy chunk [B, horizon, 4] and FiLM [B, film_dim] -> the net's prediction."""
 
     def __init__(self, config: DiffusionConfig, condition_dim: int) -> None:
         super().__init__()
@@ -104,7 +105,7 @@ class UNet(nn.Module):
             return ResidualBlock(channels_in, channels_out, config, self.time_dim + condition_dim)
 
         self.diffusion_step_encoder = nn.Sequential(
-            nn.Identity(),  # LeRobot has its sinusoids here, which have no parameters
+            nn.Identity(),  # LeRobot's sinusoids, which have no parameters
             nn.Linear(self.time_dim, 4 * self.time_dim),
             Mish(),
             nn.Linear(4 * self.time_dim, self.time_dim),
@@ -121,7 +122,7 @@ class UNet(nn.Module):
             double = nn.ConvTranspose1d(out, out, 4, stride=2, padding=1)
             self.up_modules.append(nn.ModuleList([block(2 * into, out), block(out, out), double]))
         self.final_conv = nn.Sequential(
-            # Eight groups whatever config.json says, as in LeRobot.
+            # Always eight groups, as in LeRobot; config.json's number is ignored.
             ConvBlock(widths[0], widths[0], config.kernel_size, 8),
             nn.Conv1d(widths[0], ACTION_DIM, 1),
         )
@@ -130,19 +131,19 @@ class UNet(nn.Module):
         self.register_buffer("_frequencies", frequencies, persistent=False)
 
     def film_of_timestep(self, timestep: Tensor) -> list[Tensor]:
-        """Timesteps [B], float32 -> their share of the FiLM of each block, [B, film_dim] of it."""
+        """Return the part [B, film_dim] of each block's FiLM from float32 timesteps [B]."""
         angle = timestep.unsqueeze(-1) * self._frequencies
         embedded = self.diffusion_step_encoder(torch.cat([angle.sin(), angle.cos()], dim=-1))
         return self._film(embedded, slice(None, self.time_dim), bias=True)
 
     def film_of_condition(self, condition: Tensor) -> list[Tensor]:
-        """Condition [B, C] -> its share of the FiLM of each block, [B, film_dim] of that block."""
+        """Return the part [B, film_dim] of each block's FiLM from a condition [B, C]."""
         return self._film(condition, slice(self.time_dim, None), bias=False)
 
     def forward(self, noisy: Tensor, films: list[Tensor]) -> Tensor:
-        """``films`` [B, film_dim] of each block, in the order in which they run."""
+        """Predict; ``films`` holds the FiLM [B, film_dim] of each block, in running order."""
         x, film, skips = noisy.transpose(1, 2), iter(films), []
-        layers: Any = self  # its lists of modules do not say of which class
+        layers: Any = self  # its module lists are not typed
         for first, second, halve in layers.down_modules:
             x = second(first(x, next(film)), next(film))
             skips.append(x)
@@ -163,7 +164,7 @@ class UNet(nn.Module):
 
 
 class SpatialSoftmax(nn.Module):
-    """Map [B, C, h, w] -> the mean place of each keypoint, x and y in [-1, 1] [B, 2 K]."""
+    """Map [B, C, h, w] -> mean position of each keypoint, x and y in [-1, 1], [B, 2 K]."""
 
     def __init__(self, channels: int, keypoints: int, height: int, width: int) -> None:
         super().__init__()
@@ -172,7 +173,7 @@ class SpatialSoftmax(nn.Module):
         self.register_buffer("pos_grid", torch.zeros(height * width, 2))  # comes with the weights
 
     def forward(self, cells: Tensor) -> Tensor:
-        """A softmax over the cells weighs their places."""
+        """Average the cells' positions, weighted by a softmax over the cells."""
         shares = self.nets(cells).flatten(2).softmax(dim=-1)
         places: Tensor = (shares @ self.pos_grid).flatten(1)
         return places
@@ -198,7 +199,7 @@ class RgbEncoder(nn.Module):
             image = F.interpolate(image, self.resize, mode="bilinear", antialias=True)
         if self.crop is not None:
             height, width = self.crop
-            # As torchvision's CenterCrop: a middle between two pixels is rounded to even.
+            # As torchvision's CenterCrop: half pixels are rounded to even.
             top = round((int(image.shape[-2]) - height) / 2)
             left = round((int(image.shape[-1]) - width) / 2)
             image = image[..., top : top + height, left : left + width]
@@ -208,20 +209,20 @@ class RgbEncoder(nn.Module):
 class DdimSchedule:
     """DDIM with eta = 0 (Song et al. 2021, eq. 12), for ``policy.protocol.StepwisePolicy``.
 
-    It differs from ``nets.diffusion.NoiseSchedule`` in the timesteps, in the noise, which is that
-    of the estimate before it is clipped, and in its choice of betas.
+    Differs from ``nets.diffusion.NoiseSchedule`` in the timesteps, the choice of betas, and the
+    noise, which is that of the unclipped estimate.
     """
 
     def __init__(self, config: DiffusionConfig) -> None:
         self._config = config
-        power = torch.cumprod(1 - _betas(config), dim=0)  # in float32, as LeRobot's
+        power = torch.cumprod(1 - _betas(config), dim=0)  # in float32, as in LeRobot
         self._signal, self._noise = power.sqrt().tolist(), (1 - power).sqrt().tolist()
 
     def ddim_steps(self, count: int) -> tuple[DdimStep, ...]:
-        """Return the steps of a solve by ``count`` network calls, noisiest first.
+        """Return the steps of a solve with ``count`` network calls, noisiest first.
 
-        Their timesteps are multiples of the spacing from 0 on ("leading", Lin et al. 2024), so that
-        few steps do not begin at the noisiest one.
+        The timesteps are multiples of the spacing, starting at 0 ("leading", Lin et al. 2024), so
+        few steps do not begin at the noisiest timestep.
         """
         total = self._config.num_train_timesteps
         if not 1 <= count <= total:
@@ -242,7 +243,7 @@ class DdimSchedule:
         )
 
     def ddim_update(self, step: DdimStep, noisy: Chunk, output: Chunk) -> Chunk:
-        """Take one reverse step by the net's output."""
+        """Take one reverse step with the net's output."""
         config = self._config
         clean: Any = output
         noise: Any = output
@@ -260,9 +261,9 @@ class Diffusion(nn.Module):
     """Normalised images and states -> normalised actions."""
 
     prefix = "diffusion."
-    """Before the names of its parameters in LeRobot's file."""
+    """Prefix of the parameter names in LeRobot's file."""
     initial_noise: Tensor
-    """[1, predicted, 4]; the same for a whole flight."""
+    """[1, predicted, 4]; fixed for a whole flight."""
 
     def __init__(self, config: DiffusionConfig) -> None:
         super().__init__()
@@ -282,37 +283,37 @@ class Diffusion(nn.Module):
 
     @staticmethod
     def own_name(name: str) -> str | None:
-        """Our name of a parameter in LeRobot's file, without the prefix."""
-        name = name.replace("unet._orig_mod.", "unet.")  # of a policy that was compiled
+        """Return our name of a parameter in LeRobot's file, without the prefix."""
+        name = name.replace("unet._orig_mod.", "unet.")  # left by torch.compile
         before, dot, after = name.partition("backbone.")
         place, _, rest = after.partition(".")
         return f"{before}{dot}{_PLACES.get(place, place)}.{rest}" if dot else name
 
     def seed_noise(self, seed: int) -> None:
-        """Draw the noise of a flight."""
+        """Draw the initial noise of a flight."""
         self.initial_noise.copy_(flight_noise(seed, self.initial_noise.shape[1]))
 
     def encode(self, image: Tensor, camera: int) -> Tensor:
-        """[B, 3, H, W] of one camera -> feature [B, F]."""
+        """Encode an image [B, 3, H, W] of one camera -> feature [B, F]."""
         encoders = self.rgb_encoder
         encoder = encoders[camera] if isinstance(encoders, nn.ModuleList) else encoders
         feature: Tensor = encoder(image)
         return feature
 
     def film_of_condition(self, feature: Tensor, state: Tensor) -> list[Tensor]:
-        """Features [B, T, cameras, F] and states [B, T, S] -> their share of FiLM."""
+        """Return FiLM's part from the features [B, T, cameras, F] and states [B, T, S]."""
         condition = torch.cat([state, feature.flatten(2)], dim=-1).flatten(1)
         return self.unet.film_of_condition(condition)
 
     def denoise(self, noisy: Tensor, timestep: Tensor, of_condition: list[Tensor]) -> Tensor:
-        """One call of the network: noisy actions [B, predicted, 4] at timesteps [B]."""
+        """Call the network once on noisy actions [B, predicted, 4] at timesteps [B]."""
         of_timestep = self.unet.film_of_timestep(timestep)
         films = [a + b for a, b in zip(of_timestep, of_condition, strict=True)]
         prediction: Tensor = self.unet(noisy, films)
         return prediction
 
     def act(self, feature: Tensor, state: Tensor, num_diffusion_steps: int) -> Tensor:
-        """A whole solve -> actions from now on [B, horizon, 4]."""
+        """Run a whole solve; return the actions from now on [B, horizon, 4]."""
         of_condition = self.film_of_condition(feature, state)
         sample = self.initial_noise.expand(feature.shape[0], -1, -1)
         for step in self.schedule.ddim_steps(num_diffusion_steps):
@@ -322,7 +323,7 @@ class Diffusion(nn.Module):
         return self.from_now(sample)
 
     def from_now(self, sample: Tensor) -> Tensor:
-        """Without the actions at the earlier observations: [B, predicted, 4] -> [B, horizon, 4]."""
+        """Drop the actions of the earlier observations: [B, predicted, 4] -> [B, horizon, 4]."""
         return sample[:, self.steps_before_now :]
 
 

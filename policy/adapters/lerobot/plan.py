@@ -1,9 +1,11 @@
-"""All that is known of a LeRobot policy before its weights are read: contract and statistics.
+"""Contract and normalisation of a LeRobot policy, read before its weights.
 
-config.json says shapes; what it does not say (rate, names, units, frame, autopilot modes) comes
-from a contract file: ``adapters.interface``. Its preprocessor and postprocessor normalise. Their
-statistics lie in a state file beside policy_preprocessor.json; before 0.4, in the weights, as
-``normalize_inputs.buffer_observation_state.mean``. All modes are of one affine form.
+config.json gives shapes. Rate, names, units, frame and autopilot modes come from a contract file:
+``adapters.interface``.
+
+The policy's preprocessor and postprocessor normalise. Their statistics are in a state file beside
+policy_preprocessor.json or, before 0.4, in the weights, as
+``normalize_inputs.buffer_observation_state.mean``. All modes have one affine form.
 """
 
 from collections.abc import Mapping
@@ -35,18 +37,18 @@ MODES: dict[str, tuple[str, ...]] = {
     "QUANTILES": ("q01", "q99"),
     "QUANTILE10": ("q10", "q90"),
 }
-"""Statistics that each mode of normalisation needs."""
+"""Statistics that each normalisation mode needs."""
 _HARMLESS = ("to_batch_processor", "device_processor")
 _EPSILON = 1e-8
 _CONSTANT = 1e-6
-"""A number of the state that varied by less did not vary."""
+"""A number of the state that varied by less counts as constant."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Affine:
-    """``normalised = gain * (value - shift) / divisor - bias``, as LeRobot's own code rounds it.
+    """``normalised = gain * (value - shift) / divisor - bias``, rounded as in LeRobot's own code.
 
-    Back it goes by ``(normalised + bias) / gain * span + shift``.
+    The inverse is ``(normalised + bias) / gain * span + shift``.
     """
 
     shift: FloatArray
@@ -58,12 +60,12 @@ class Affine:
 
 @dataclass(frozen=True, kw_only=True)
 class Normalisation:
-    """Statistics of each input, by its name in config.json, and of the action; None: as it is."""
+    """Normalisation by an input's name in config.json, and of the action; None: unchanged."""
 
     images: Mapping[str, Affine | None]
     state: Affine | None
     goal: Affine | None
-    """Of observation.environment_state."""
+    """Normalisation of observation.environment_state."""
     action: Affine | None
     renamed: Mapping[str, str]
     """Name of an input in the data -> its name in config.json."""
@@ -71,7 +73,7 @@ class Normalisation:
 
 @dataclass(frozen=True, kw_only=True)
 class _Statistics:
-    """Statistics by feature and name, and by which of them each kind of feature is normalised."""
+    """Statistics by feature and name, and the normalisation mode of each kind of feature."""
 
     path: Path
     modes: Mapping[str, str]
@@ -79,7 +81,7 @@ class _Statistics:
     arrays: Mapping[str, Mapping[str, FloatArray]]
 
     def affine(self, key: str, kind: str) -> Affine | None:
-        """Return the transformation of one feature; None where it stays as it is."""
+        """Return the transformation of one feature; None: unchanged."""
         mode, own = self.modes.get(kind, "IDENTITY"), self.arrays.get(key, {})
         if mode not in MODES:
             raise CheckpointError(
@@ -104,7 +106,7 @@ class _Statistics:
 
 
 def read_normalisation(folder: Path, features: Features) -> tuple[Normalisation, list[str]]:
-    """Read how a policy normalises; with notes for the user."""
+    """Read a policy's normalisation, with notes for the user."""
     renamed: dict[str, str] = {}
     if (folder / PREPROCESSOR).is_file():
         inputs, renamed = _processor(folder / PREPROCESSOR, "normalizer_processor")
@@ -122,7 +124,7 @@ def read_normalisation(folder: Path, features: Features) -> tuple[Normalisation,
 
 
 def _notes(folder: Path, features: Features, normalisation: Normalisation) -> list[str]:
-    """Warn of what LeRobot computes without a word, and what is seldom meant."""
+    """Warn of normalisations that LeRobot computes silently and that are seldom intended."""
     found = [(key, "VISUAL", affine) for key, affine in normalisation.images.items()]
     found += [(ACTION_KEY, "ACTION", normalisation.action)]
     found += [(ENVIRONMENT_KEY, "ENV", normalisation.goal)] if features.takes_goal else []
@@ -170,7 +172,7 @@ def _processor(path: Path, normaliser: str) -> tuple[_Statistics, dict[str, str]
 
 
 def _in_weights(folder: Path, features: Features) -> _Statistics:
-    """Statistics as LeRobot kept them before 0.4, in the weights."""
+    """Read the statistics that LeRobot before 0.4 stored in the weights."""
     path = folder / WEIGHTS_FILE
     sides = ("normalize_inputs.buffer_", "unnormalize_outputs.buffer_")
     found = _by_feature(_read_arrays(path, sides))
@@ -187,7 +189,7 @@ def _in_weights(folder: Path, features: Features) -> _Statistics:
 
 
 def _by_feature(arrays: Mapping[str, FloatArray]) -> dict[str, dict[str, FloatArray]]:
-    """Group ``observation.state.mean`` and the like by feature, then by statistic."""
+    """Group entries such as ``observation.state.mean`` by feature, then by statistic."""
     found: dict[str, dict[str, FloatArray]] = {}
     for name, array in arrays.items():
         key, _, statistic = name.rpartition(".")
@@ -211,14 +213,14 @@ class Plan:
     config: Config
     normalisation: Normalisation
     interface: Interface
-    """Its contract is complete: what config.json says is in it."""
+    """Its contract is complete: config.json's values are merged in."""
     policy_cameras: tuple[int, ...]
-    """Place among ``config.features.image_keys`` of each camera of the contract."""
+    """Index of each camera of the contract in ``config.features.image_keys``."""
     notes: tuple[str, ...]
 
 
 def read_plan(folder: Path, contract_file: Path | None) -> Plan:
-    """Read everything but the weights: milliseconds, and no torch."""
+    """Read everything but the weights; takes milliseconds and needs no torch."""
     config, notes = read_config(folder)
     if not (folder / WEIGHTS_FILE).is_file():
         raise CheckpointError(f"{folder / WEIGHTS_FILE} is missing: copy the whole folder")
@@ -243,9 +245,9 @@ def read_plan(folder: Path, contract_file: Path | None) -> Plan:
 
 
 def _interface(path: Path, config: Config) -> Interface:
-    """The contract file, completed: images as LeRobot takes them, [0, 1], all else by config.json.
+    """Return the completed contract file: images in [0, 1] as in LeRobot, the rest by config.json.
 
-    Observations lie as far apart as actions: LeRobot takes both from the frames of a dataset.
+    Observations are spaced like actions: LeRobot takes both from the frames of a dataset.
     """
     derived: dict[str, object] = {
         "arrays": "torch",
@@ -288,7 +290,7 @@ def _policy_cameras(
         return ()
     keys = [normalisation.renamed.get(key, key) for key in interface.camera_keys]
     if not interface.image_keys and len(known) == len(keys) == 1:
-        return (0,)  # one camera there and one here, whatever they are called
+        return (0,)  # one camera on both sides: names do not matter
     if sorted(keys) != sorted(known):
         raise ContractError(
             f"{path}: the policy's images are {list(known)}, the contract's are {keys}; name all "

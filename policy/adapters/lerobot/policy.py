@@ -1,4 +1,4 @@
-"""A LeRobot policy as this project's: from the contract's images and states to its actions."""
+"""LeRobot policies behind the policy protocol: the contract's images and states to its actions."""
 
 from pathlib import Path
 
@@ -13,11 +13,11 @@ from policy.checkpoints.tensors import read_tensors, require_finite, require_fit
 from policy.contract import EXTRA_NAMES, Contract
 
 _STATISTICS = ("normalize_inputs.", "normalize_targets.", "unnormalize_outputs.")
-"""Prefixes of the statistics in checkpoints before 0.4, which are read apart."""
+"""Prefixes of the statistics in checkpoints before 0.4; they are read separately."""
 
 
 class Normaliser(nn.Module):
-    """``Affine`` and its inverse on tensors; the identity where there is none."""
+    """``Affine`` and its inverse on tensors; the identity without statistics."""
 
     def __init__(self, affine: Affine | None) -> None:
         super().__init__()
@@ -30,24 +30,24 @@ class Normaliser(nn.Module):
             self.register_buffer(name, array, persistent=False)
 
     def forward(self, value: Tensor) -> Tensor:
-        """To the range that the network takes."""
+        """Normalise to the network's input range."""
         if self.affine is None:
             return value
         return self.affine.gain * (value - self.shift) / self.divisor - self.affine.bias
 
     def back(self, value: Tensor) -> Tensor:
-        """From the range that the network gives."""
+        """Undo the normalisation of the network's output."""
         if self.affine is None:
             return value
         return (value + self.affine.bias) / self.affine.gain * self.span + self.shift
 
 
 class LeRobotPolicy(nn.Module):
-    """An ACT or a DiffusionPolicy; keeps ``policy.protocol.DualRatePolicy``.
+    """ACT or DiffusionPolicy behind ``policy.protocol.DualRatePolicy``.
 
-    Images are RGB in [0, 1]; LeRobot's own statistics are applied inside, and the state's and
-    action's numbers are put into the order, and the actions into the units, of the contract. Past
-    actions are not looked at, and ACT ignores ``num_diffusion_steps``.
+    Images are RGB in [0, 1]. The policy applies LeRobot's statistics inside, reorders the numbers
+    of state and action, and scales actions to the contract's units. It ignores past actions; ACT
+    also ignores ``num_diffusion_steps``.
     """
 
     net: Act | Diffusion
@@ -63,8 +63,8 @@ class LeRobotPolicy(nn.Module):
         self._action = Normaliser(normalisation.action)
 
     def encode_visual(self, image: Tensor, camera: int = 0) -> Tensor:
-        """Image [B, 3, H, W] of that camera of the contract -> feature [B, feature_dim]; zeros for
-        a policy without a camera."""
+        """Encode an image [B, 3, H, W] of one of the contract's cameras -> feature [B,
+        feature_dim]; zeros for a policy without a camera."""
         if not self._policy_cameras:
             return image.new_zeros(image.shape[0], self.contract.feature_dim)
         own = self._policy_cameras[camera]
@@ -73,14 +73,14 @@ class LeRobotPolicy(nn.Module):
     def predict_fast(
         self, feature: Tensor, state: Tensor, action_history: Tensor, num_diffusion_steps: int
     ) -> Tensor:
-        """Cached features [B, (T,) cameras * F] and states [B, (T,) S] -> chunk [B, horizon, 4]."""
+        """Sample a chunk [B, horizon, 4]; features [B, (T,) cameras * F], states [B, (T,) S]."""
         inputs = self._network_inputs(feature, state)
         return self._in_units(self.net.act(*inputs, num_diffusion_steps))
 
     def predict(
         self, image: Tensor, state: Tensor, action_history: Tensor, num_diffusion_steps: int
     ) -> Tensor:
-        """Images [B, (T,) (cameras,) 3, H, W]: encode all of them and sample one chunk."""
+        """Encode all images [B, (T,) (cameras,) 3, H, W] and sample one chunk."""
         contract = self.contract
         batch, steps, cameras = image.shape[0], contract.observation_steps, len(contract.cameras)
         images = image.reshape(batch, steps, cameras, *image.shape[-3:])
@@ -93,7 +93,7 @@ class LeRobotPolicy(nn.Module):
         return self.predict_fast(feature, state, action_history, num_diffusion_steps)
 
     def _network_inputs(self, feature: Tensor, state: Tensor) -> tuple[Tensor, Tensor]:
-        """Features [B, T, cameras, F] and normalised states [B, T, S], in the policy's order."""
+        """Return features [B, T, cameras, F] and normalised states [B, T, S] in LeRobot's order."""
         steps, cameras = self.contract.observation_steps, len(self._policy_cameras)
         by_camera = feature.reshape(feature.shape[0], steps, cameras, self.contract.feature_dim)
         if self._policy_cameras != tuple(range(cameras)):
@@ -106,7 +106,7 @@ class LeRobotPolicy(nn.Module):
 
 
 class LeRobotAct(LeRobotPolicy):
-    """An ACT."""
+    """ACT behind the policy protocol."""
 
     def __init__(self, plan: Plan, config: ActConfig) -> None:
         super().__init__(plan)
@@ -114,7 +114,7 @@ class LeRobotAct(LeRobotPolicy):
 
 
 class LeRobotDiffusion(LeRobotPolicy):
-    """A DiffusionPolicy; keeps ``policy.protocol.StepwisePolicy``."""
+    """DiffusionPolicy behind ``policy.protocol.StepwisePolicy``."""
 
     net: Diffusion
 
@@ -126,9 +126,9 @@ class LeRobotDiffusion(LeRobotPolicy):
         self._goal = Normaliser(plan.normalisation.goal)
 
     def _network_inputs(self, feature: Tensor, state: Tensor) -> tuple[Tensor, Tensor]:
-        """Features of all cameras and the goal [B, T, 1, X], normalised states [B, T, S].
+        """Return features of cameras and goal [B, T, 1, X], and normalised states [B, T, S].
 
-        LeRobot's order: images, then the environment (``_prepare_global_conditioning``).
+        In LeRobot's order: images, then the environment (``_prepare_global_conditioning``).
         """
         if not self._goal_columns:
             return super()._network_inputs(feature, state)
@@ -142,12 +142,12 @@ class LeRobotDiffusion(LeRobotPolicy):
 
     @property
     def schedule(self) -> DdimSchedule:
-        """The steps of a solve."""
+        """Schedule whose steps make up a solve."""
         return self.net.schedule
 
     @property
     def initial_noise(self) -> Tensor:
-        """[1, predicted, 4]; the same for a whole flight."""
+        """[1, predicted, 4]; fixed for a whole flight."""
         return self.net.initial_noise
 
     def denoise(
@@ -158,12 +158,12 @@ class LeRobotDiffusion(LeRobotPolicy):
         state: Tensor,
         action_history: Tensor,
     ) -> Tensor:
-        """One call of the network: noisy actions [B, predicted, 4] at timesteps [B]."""
+        """Call the network once on noisy actions [B, predicted, 4] at timesteps [B]."""
         of_condition = self.net.film_of_condition(*self._network_inputs(feature, state))
         return self.net.denoise(noisy, timestep, of_condition)
 
     def to_chunk(self, sample: Tensor) -> Tensor:
-        """The end of a solve [B, predicted, 4] -> chunk [B, horizon, 4]."""
+        """Convert the end of a solve [B, predicted, 4] to a chunk [B, horizon, 4]."""
         return self._in_units(self.net.from_now(sample))
 
 
@@ -177,10 +177,7 @@ def build_policy_of(plan: Plan) -> LeRobotPolicy:
 def load_policy_of(
     plan: Plan, *, seed: int, num_diffusion_steps: int
 ) -> tuple[LeRobotPolicy, list[str]]:
-    """Build a policy and load its weights; with notes for the user.
-
-    ``seed`` is that of a flight's initial noise.
-    """
+    """Build a policy, load its weights, draw the initial noise; return notes for the user too."""
     policy = build_policy_of(plan)
     policy.net.load_state_dict(_read(plan.folder / WEIGHTS_FILE, policy.net))
     policy.eval().requires_grad_(False)
@@ -203,8 +200,8 @@ def load_policy_of(
 
 
 def _read(path: Path, net: Act | Diffusion) -> dict[str, Tensor]:
-    """Weights of LeRobot's file by our names."""
-    # Counts of batches may be missing: they matter to training alone.
+    """Return the weights of LeRobot's file under our names."""
+    # Batch counts may be missing: only training uses them.
     own = net.state_dict().items()
     state = {name: value for name, value in own if name.endswith("num_batches_tracked")}
     for name, value in read_tensors(path)[1].items():

@@ -1,1 +1,1 @@
-"""Policies in ONNX files, flown through OpenVINO; and ours, written as such."""
+"""ONNX policies, run by OpenVINO."""

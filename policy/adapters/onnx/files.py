@@ -1,13 +1,13 @@
-"""The files of a policy in ONNX.
+"""Files of an ONNX policy.
 
 DIR/encoder.onnx     image -> feature; with it the policy flies at two rates
 DIR/denoiser.onnx    noisy, timestep, feature, state, action_history -> prediction: one step of
-                     a diffusion policy; the loop is ours
-DIR/head.onnx        in its place: feature, state, action_history -> chunk
+                     a diffusion policy; mavbridge runs the loop
+DIR/head.onnx        instead of denoiser.onnx: feature, state, action_history -> chunk
 DIR/policy.onnx      alone, or one file instead of a folder: image, state, action_history ->
                      chunk
 DIR/policy.json      as ``description`` says; a denoiser needs its schedule
-DIR/mavbridge.toml   the contract, as of --contract, where policy.json has none
+DIR/mavbridge.toml   the contract, as for --contract, if policy.json has none
 """
 
 import re
@@ -26,27 +26,27 @@ ENCODER, DENOISER, HEAD, WHOLE = "encoder.onnx", "denoiser.onnx", "head.onnx", "
 KINDS = f"{ENCODER} and {DENOISER}, {ENCODER} and {HEAD}, or {WHOLE} alone"
 
 _EXTERNAL = re.compile(r"externally stored data in file \((.+), offset: ")
-"""In an error of OpenVINO's: the file that lacks the weights."""
+"""In an error of OpenVINO: the file whose external weights are missing."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class OnnxFiles:
-    """Where the graphs of a policy lie, and its description."""
+    """Paths of a policy's graphs, and its description."""
 
     description: Description
     encoder: Path | None
-    """None where ``rest`` is the whole policy."""
+    """None if ``rest`` is the whole policy."""
     rest: Path
-    """The denoiser, the head, or the whole policy."""
+    """Denoiser, head, or whole policy."""
 
     @property
     def is_denoiser(self) -> bool:
-        """``rest`` is one step of a diffusion policy."""
+        """True if ``rest`` is one step of a diffusion policy."""
         return self.rest.name == DENOISER and self.encoder is not None
 
 
 def find_onnx_files(spec: str, path: Path, contract_file: Path | None) -> OnnxFiles:
-    """Read everything but the graphs of the policy ``spec``: milliseconds."""
+    """Read everything of the policy ``spec`` except its graphs; takes milliseconds."""
     if not path.exists():
         raise CheckpointError(f"--policy {spec}: there is no such file or folder")
     folder = path if path.is_dir() else path.parent
@@ -82,10 +82,10 @@ def _graphs(spec: str, path: Path) -> tuple[Path | None, Path]:
 
 
 def read_graph(path: Path) -> "ov.Model":
-    """Read an ONNX file and the files of its weights."""
+    """Read an ONNX file and its external weights."""
     from openvino import frontend  # not needed to find the files
 
-    # By the frontend of ONNX alone: else parsers of all formats tell what they think of the file.
+    # The ONNX frontend alone: otherwise the parsers of all formats add their errors.
     reader = frontend.FrontEndManager().load_by_framework("onnx")
     failures = (
         *(RuntimeError, frontend.GeneralFailure, frontend.OpConversionFailure),

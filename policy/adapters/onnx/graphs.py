@@ -1,4 +1,4 @@
-"""One ONNX file as a compiled graph whose inputs are given by their role."""
+"""ONNX file as a compiled graph that takes its inputs by role."""
 
 import hashlib
 import re
@@ -17,14 +17,14 @@ from policy.errors import CheckpointError, PolicyError
 from policy.files import last_line
 
 _ALONE = {2: "state", 4: "image"}
-"""Role of the only input of a graph, by its number of axes, where its name says nothing."""
+"""Role of a graph's only input by its number of axes, if the name tells nothing."""
 _HIDDEN_IN = re.compile(r"(.+)_in(_\d+)?")
 _FLOATS = ("f16", "bf16", "f32", "f64")
 
 
 @dataclass(frozen=True, kw_only=True)
 class Wanted:
-    """Names by which one input of a policy is known, and its shape with the batch of one."""
+    """Accepted names of one policy input, and its shape with a batch of one."""
 
     names: tuple[str, ...]
     shape: Shape
@@ -32,27 +32,27 @@ class Wanted:
 
 @dataclass(frozen=True, kw_only=True)
 class Ports:
-    """Inputs and outputs that a caller of a graph asks for."""
+    """Inputs and outputs that a caller expects of a graph."""
 
     inputs: Mapping[str, Wanted]
     """By role."""
     result: str
-    """Result that the graph computes, one of ``description.RESULTS``."""
+    """Result of the graph, one of ``description.RESULTS``."""
     output: str | int | None = None
-    """Name or place of the output with the result; None where there is only one."""
+    """Name or index of the result's output; None if there is only one output."""
     hidden: Mapping[str, str] = field(default_factory=dict)
-    """Output that each hidden input takes at the next call, as far as the user says so."""
+    """Output that feeds each hidden input at the next call, as far as the user gave it."""
 
 
 class RoleGraph:
-    """A compiled graph with its hidden state, zeros at first; for one thread."""
+    """Compiled graph with its hidden state, zeros at first; for one thread."""
 
     def __init__(
         self, graph: Graph, roles: list[str], output_shape: Shape, hidden: Mapping[str, Shape]
     ) -> None:
         self._graph = graph
         self.roles = roles
-        """Role of each input, in the graph's order; a hidden one's is its name."""
+        """Role of each input, in the graph's order; the role of a hidden input is its name."""
         self.output_shape = output_shape
         self._hidden_shapes = hidden
         self._hidden: dict[str, FloatArray] = {}
@@ -64,7 +64,7 @@ class RoleGraph:
         self._hidden = {name: np.zeros(shape, np.float32) for name, shape in shapes}
 
     def __call__(self, **arrays: FloatArray) -> FloatArray:
-        """Run it on float32 arrays by role; those that it does not take are left out."""
+        """Run the graph on float32 arrays by role; arrays that it does not take are ignored."""
         given = arrays | self._hidden if self._hidden else arrays
         result = self._graph(*[given[role] for role in self.roles])
         if self._hidden:
@@ -73,7 +73,7 @@ class RoleGraph:
 
 
 class GraphFile:
-    """An ONNX file, read once and compiled at any precision."""
+    """ONNX file that is read once and can be compiled at any precision."""
 
     @signal_stack_kept()
     def __init__(self, path: Path, ports: Ports) -> None:
@@ -90,7 +90,7 @@ class GraphFile:
             raise CheckpointError(f"{path}: two inputs are the {_twice(roles)}")
         self.roles = roles
         self.takes_bytes = self._require_types(model, roles, pairs)
-        """Its image is uint8, 0 to 255."""
+        """True if the image is uint8, 0 to 255."""
         self.hidden = {
             name: _sizes(model.inputs[roles.index(name)], open_size=1)
             for name in roles
@@ -105,7 +105,7 @@ class GraphFile:
 
     @signal_stack_kept()
     def compile(self, precision: Precision) -> RoleGraph:
-        """Compile it, or take it from the user's cache.
+        """Compile the graph, or load it from the user's cache.
 
         Raises:
             RuntimeError: OpenVINO cannot compile it.
@@ -116,7 +116,7 @@ class GraphFile:
         return RoleGraph(graph, self.roles, self.output_shape, self.hidden)
 
     def _hidden_pairs(self, model: "ov.Model", ports: Ports) -> dict[str, str]:
-        """Return the output whose value each hidden input takes at the next call, by name."""
+        """Return the output that feeds each hidden input at the next call, by name."""
         inputs, outputs = (
             {name for port in side for name in port.get_names()}
             for side in (model.inputs, model.outputs)
@@ -157,7 +157,7 @@ class GraphFile:
         )
 
     def _require_types(self, model: "ov.Model", roles: list[str], pairs: Mapping[str, str]) -> bool:
-        """Refuse element types whose values the contract does not say; True for images of bytes."""
+        """Raise PolicyError for unsupported element types; return True if the image is uint8."""
         takes_bytes = False
         for port, role in zip(model.inputs, roles, strict=True):
             kind = port.get_element_type().get_type_name()
@@ -176,7 +176,7 @@ class GraphFile:
         return takes_bytes
 
     def _output(self, model: "ov.Model", ports: Ports, pairs: Mapping[str, str]) -> "ov.Output":
-        """Return the output with the result that is asked for."""
+        """Return the output that holds the requested result."""
         visible = [port for port in model.outputs if not port.get_names() & set(pairs.values())]
         names = [
             ", ".join(sorted(port.get_names())) or f"number {at}" for at, port in enumerate(visible)
@@ -225,7 +225,7 @@ class GraphFile:
 
 
 def require_roles(file: GraphFile, path: Path, roles: tuple[str, ...]) -> None:
-    """Refuse a graph that does not take an input without which it cannot be what it should be."""
+    """Raise PolicyError if a graph lacks an input that its part in the policy requires."""
     if missing := [role for role in roles if role not in file.roles]:
         raise PolicyError(f"{path} takes {file.roles}, but not the {' and the '.join(missing)}")
 
@@ -242,7 +242,7 @@ def _twice(roles: list[str]) -> str:
 
 
 def _digest(path: Path, model: ov.Model) -> str:
-    """A text that differs wherever the file, or weights that lie in other files, do."""
+    """Return a digest of the file and of the weights in external files."""
     digest = hashlib.sha256(path.read_bytes())
     for node in model.get_ordered_ops():
         if node.get_type_name() == "Constant":

@@ -1,4 +1,4 @@
-"""Policies of ONNX graphs behind the policy protocol, on numpy arrays."""
+"""ONNX graphs behind the policy protocol, on numpy arrays."""
 
 import math
 from dataclasses import replace
@@ -29,7 +29,7 @@ from policy.protocol import PolicyRunner
 
 
 class OnnxGraphs:
-    """The graphs of a policy, read and checked against its contract."""
+    """Graphs of a policy, read and checked against its contract."""
 
     def __init__(self, files: OnnxFiles, seed: int) -> None:
         wanted = _wanted(files)
@@ -64,12 +64,12 @@ class OnnxGraphs:
         return where if self.schedule is None else where + solved
 
     def at(self, vision: Precision, action: Precision) -> "OnnxPolicy":
-        """The policy with its encoder and the rest compiled at these precisions."""
+        """Return the policy with its encoder and the rest compiled at these precisions."""
         return (OnnxPolicy if self.encoder is None else EncoderPolicy)(self, vision, action)
 
 
 class OnnxPolicy:
-    """Image, state and history in, a chunk out: single rate."""
+    """Single rate: one graph makes a chunk from image, state and history."""
 
     def __init__(self, graphs: OnnxGraphs, _vision: Precision, action: Precision) -> None:
         self.graphs = graphs
@@ -78,33 +78,33 @@ class OnnxPolicy:
         self._graph = graphs.rest.compile(action)
 
     def reset(self) -> None:
-        """Forget earlier flights: a recurrent graph's hidden state becomes zeros."""
+        """Forget earlier flights: reset a recurrent graph's hidden state to zeros."""
         self._graph.reset()
 
     def predict(
         self, image: FloatArray, state: FloatArray, action_history: FloatArray, steps: int
     ) -> FloatArray:
-        """One call of the graph."""
+        """Run the graph once."""
         seen = self._image(self.graphs.rest, image)
         return self._interface.to_actions(self._call(state, action_history, image=seen))
 
     def _call(self, state: FloatArray, history: FloatArray, **arrays: FloatArray) -> FloatArray:
-        """The graph on a state and a history as the policy orders and scales them."""
+        """Run the graph on a state and a history in the policy's order and units."""
         own_state = self._interface.to_state(state)
         theirs = self._interface.from_actions(history)
         result = self._graph(state=own_state, action_history=theirs, **arrays)
-        # Policies of reinforcement learning give one action, without an axis of time.
+        # Reinforcement-learning policies return one action, without a time axis.
         return result[:, None] if result.ndim == 2 and self.contract.horizon == 1 else result
 
     def _image(self, graph: GraphFile, image: FloatArray) -> FloatArray:
-        """The image in the graph's own type: normalised by the contract, or bytes."""
+        """Return the image in the graph's type: normalised by the contract, or uint8."""
         return input_to_bytes(image, self.contract) if graph.takes_bytes else image
 
 
 class EncoderPolicy(OnnxPolicy):
-    """An encoder, and a head that makes a chunk in one call or one step of a solve: dual rate.
+    """Dual rate: an encoder, and a head that makes a chunk in one call or one step of a solve.
 
-    The noise that a solve starts from is that of our own policies for the same seed.
+    A solve starts from the same noise as mavbridge's own policies with the same seed.
     """
 
     def __init__(self, graphs: OnnxGraphs, vision: Precision, action: Precision) -> None:
@@ -118,13 +118,13 @@ class EncoderPolicy(OnnxPolicy):
         self._solver = lru_cache(maxsize=64)(solver)
 
     def encode_visual(self, image: FloatArray, camera: int = 0) -> FloatArray:
-        """Image [1, 3, H, W] -> feature [1, F], by one encoder for every camera."""
+        """Encode an image [1, 3, H, W] -> feature [1, F]; all cameras share one encoder."""
         return self._encoder(image=self._image(self._encoder_file, image)).reshape(1, -1)
 
     def predict_fast(
         self, feature: FloatArray, state: FloatArray, action_history: FloatArray, steps: int
     ) -> FloatArray:
-        """One call of the head, or a whole solve."""
+        """Call the head once, or run a whole solve."""
         if self.graphs.schedule is None:
             chunk = self._call(state, action_history, feature=feature)
         else:
@@ -134,7 +134,7 @@ class EncoderPolicy(OnnxPolicy):
     def predict(
         self, image: FloatArray, state: FloatArray, action_history: FloatArray, steps: int
     ) -> FloatArray:
-        """Encode the images, then as ``predict_fast``."""
+        """Encode the images, then call ``predict_fast``."""
         images = image.reshape(-1, 1, *image.shape[-3:])
         features = np.stack([self.encode_visual(each) for each in images])
         feature = features.reshape(1, *self.contract.feature_shape)
@@ -154,10 +154,9 @@ class EncoderPolicy(OnnxPolicy):
 def choose_precision(
     policy: OnnxPolicy, settings: ExecutionSettings
 ) -> tuple[PolicyRunner, tuple[str, ...]]:
-    """The runner at the fastest precision whose sticks are those of float32, and notes.
+    """Return the runner at the fastest precision that matches float32's actions, with notes.
 
-    ``policy`` is in float32. There is nothing else to compare with: that these graphs are the
-    policy is taken from the files.
+    ``policy`` is in float32. There is no other reference: the files are trusted to hold the policy.
     """
 
     def runner_of(vision: Precision, action: Precision) -> PolicyRunner:
@@ -210,7 +209,7 @@ def _ports(files: OnnxFiles, inputs: dict[str, Wanted], result: str) -> Ports:
 
 
 def _wanted(files: OnnxFiles) -> dict[str, Wanted]:
-    """Names and shapes of all that a graph of the policy may take."""
+    """Return names and shapes of all inputs that a graph of the policy may take."""
     interface, contract = files.description.interface, files.description.interface.contract
     state = (1, *contract.state_shape[:-1], interface.state_dim)
     keys = {"image": interface.camera_keys, "state": (interface.state_key,)}

@@ -1,1 +1,1 @@
-"""Policies on a server that speaks openpi's websocket protocol, and what both sides of it share."""
+"""Policies on a server by openpi's websocket protocol; code shared by client and server."""

@@ -1,6 +1,6 @@
-"""``--policy ws://HOST:PORT``: what is checked of it, and how it is loaded.
+"""Checks and loading of ``--policy ws://HOST:PORT``.
 
-msgpack and websockets are an extra, and imported only where such a policy is loaded.
+msgpack and websockets are an extra; only loading such a policy imports them.
 """
 
 import os
@@ -21,25 +21,25 @@ if TYPE_CHECKING:
 
 SCHEMES = ("ws", "wss")
 PACKAGES = ("msgpack", "websockets")
-"""Those of the extra ``remote``."""
+"""Packages of the extra ``remote``."""
 
 
 TERMS = (
     *("play_s", "modes", "max_state_age_s", "max_velocity_age_s", "max_feature_age_s"),
     *("max_chunk_age_s", "max_stall_s", *ENVELOPE_TERMS),
 )
-"""Fields of the contract of our own server that a contract file may replace: when it may fly."""
+"""Contract fields of mavbridge's own server that a contract file may replace: flight terms."""
 
 
 def require_packages(what: str) -> None:
-    """Refuse what cannot be done without the extra."""
+    """Raise PolicyError if the extra is missing."""
     if missing := [name for name in PACKAGES if find_spec(name) is None]:
         names = " and ".join(missing), " ".join(missing)
         raise PolicyError("{} needs {}: pip install {}".format(what, *names))
 
 
 def check_server(url: str, contract_file: Path | None, checkpoint: Path | None) -> None:
-    """Refuse in milliseconds an address, a contract file or a flag that cannot serve."""
+    """Raise PolicyError for an unusable address, contract file or flag; takes milliseconds."""
     require_packages(f"--policy {url}")
     try:
         parts = urlsplit(url)
@@ -59,7 +59,7 @@ def check_server(url: str, contract_file: Path | None, checkpoint: Path | None) 
 
 
 def load_server_policy(url: str, contract_file: Path | None) -> tuple["RemotePolicy", list[str]]:
-    """Connect to a policy server, find its contract and try it; with lines for the user."""
+    """Connect to a policy server, find its contract and try it; return lines for the user too."""
     from policy.adapters.websocket.link import API_KEY_VARIABLE, ServerLink
     from policy.adapters.websocket.messages import CONTRACT_KEY
     from policy.adapters.websocket.remote_policy import RemotePolicy
@@ -80,7 +80,7 @@ def load_server_policy(url: str, contract_file: Path | None) -> tuple["RemotePol
 
 
 def _interface(contract_file: Path | None, metadata: "Message") -> Interface:
-    """That of our own server, under the terms of the user's file; or that of the file alone."""
+    """Return the contract of ``mavbridge serve`` under the file's terms, or the file's own."""
     from policy.adapters.websocket.messages import CONTRACT_KEY
 
     served = metadata.get(CONTRACT_KEY)

@@ -1,4 +1,4 @@
-"""The connection to a policy server, held by a thread of its own that connects again by itself."""
+"""Connection to a policy server; its own thread reconnects automatically."""
 
 import asyncio
 import threading
@@ -21,20 +21,20 @@ from policy.adapters.websocket.messages import CONTRACT_KEY, Message, MessageErr
 from policy.errors import NoChunkError, PolicyError
 
 API_KEY_VARIABLE = "MAVBRIDGE_API_KEY"
-"""Environment variable with the key of a server that wants one: flags show in process lists."""
+"""Environment variable with the server's API key: flags show in process lists."""
 CONNECT_S = 5.0
-"""Longest time for a connection, and again for the server's first message."""
+"""Timeout for a connection, and again for the server's first message."""
 LOST_S = 5.0
-"""A connection without an answer for so long is given up for a new one."""
+"""Time without an answer after which the connection is replaced by a new one."""
 FIRST_PAUSE_S, LONGEST_PAUSE_S = 0.1, 2.0
-"""Between attempts to connect again: doubled each time, from the first to the longest."""
+"""Pause between reconnection attempts: doubled each time, from the first to the longest."""
 CLOSE_S, JOIN_S = 1.0, 3.0
 MAX_ANSWER_BYTES = 16 * 2**20
 UNAUTHORIZED = (401, 403)
 
 
 class Answer(NamedTuple):
-    """A message of the server, and how long it took from the request."""
+    """Message of the server, and the time from its request to its arrival."""
 
     data: bytes | str
     round_trip_s: float
@@ -48,10 +48,10 @@ class _Request:
 
 
 class ServerLink:
-    """Sends requests and hands out answers, each to the request that it belongs to.
+    """Sends requests and matches each answer to its request.
 
-    One request is on its way at a time, as the protocol has it. One that is given up is still
-    answered some day; that answer is thrown away, and the newest request follows it.
+    The protocol allows one request in flight. The server still answers a request that was given up:
+    that answer is discarded, then the newest request is sent.
     """
 
     def __init__(self, url: str, *, api_key: str | None) -> None:
@@ -60,7 +60,7 @@ class ServerLink:
         self._metadata: Future[Message] = Future()
         """Metadata of the first connection."""
         self._problem: str | None = None
-        """Why there is no connection now."""
+        """Reason why there is no connection at present."""
         self._next: _Request | None = None
         self._sent: _Request | None = None
         self._pause_s = FIRST_PAUSE_S
@@ -69,7 +69,7 @@ class ServerLink:
         )
 
     def connect(self) -> Message:
-        """Connect for the first time; returns the metadata of the server."""
+        """Connect for the first time; return the server's metadata."""
         self._thread.start()
         return self._metadata.result(2 * CONNECT_S + CLOSE_S + JOIN_S)
 
@@ -94,7 +94,7 @@ class ServerLink:
             self._thread.join(JOIN_S)
 
     def _call(self, function: Callable[[], object]) -> None:
-        """Call a function of the loop in its thread; not at all once that ends."""
+        """Call a function in the event loop's thread; no-op once that thread has ended."""
         with suppress(RuntimeError):
             self._loop.call_soon_threadsafe(function)
 
@@ -109,7 +109,7 @@ class ServerLink:
             self._fail("the connection to the policy server is closed")
 
     async def _connect_again(self) -> None:
-        """Connect, and connect again whenever that is lost; ends if there is no first time."""
+        """Connect, and reconnect after every loss; end if the first connection fails."""
         while True:
             try:
                 await self._converse()
@@ -121,7 +121,7 @@ class ServerLink:
             self._pause_s = min(2 * self._pause_s, LONGEST_PAUSE_S)
 
     async def _converse(self) -> None:
-        """One connection, from its first message to its end."""
+        """Run one connection, from its first message to its end."""
         async with connect(
             self._url,
             additional_headers=self._headers,
@@ -129,16 +129,16 @@ class ServerLink:
             max_size=MAX_ANSWER_BYTES,
             open_timeout=CONNECT_S,
             close_timeout=CLOSE_S,
-            # openpi's servers answer no ping while they compute; LOST_S takes its place.
+            # openpi's servers do not answer pings while they compute; LOST_S detects a loss.
             ping_interval=None,
             proxy=None,
-            # The zone of a link-local address: %eth0, or %25eth0 by the rules of URLs.
+            # Zone of a link-local address: %eth0, or %25eth0 when URL-encoded.
             host=(urlsplit(self._url).hostname or "").replace("%25", "%"),
         ) as connection:
             try:
                 await self._serve_requests(connection)
             except asyncio.CancelledError:
-                await connection.close()  # in order, and not as after an error of ours
+                await connection.close()  # a normal close, not one after an error on our side
                 raise
 
     async def _serve_requests(self, connection: ClientConnection) -> None:
@@ -172,7 +172,7 @@ class ServerLink:
         request.answer.set_result(Answer(data, self._loop.time() - sent_s))
 
     async def _require_silence(self, connection: ClientConnection) -> None:
-        """Refuse a message that lies there before the request: it would be taken for its answer."""
+        """Raise PolicyError if a message arrived before the request: it is not an answer."""
         with suppress(TimeoutError):
             async with asyncio.timeout(0):
                 await connection.recv()

@@ -1,13 +1,14 @@
-"""Messages of openpi's websocket protocol: msgpack maps, with numpy arrays as maps of their own.
+"""Messages of openpi's websocket protocol: msgpack maps, with numpy arrays encoded as maps.
 
-An array is ``{b"__ndarray__": True, b"data": bytes, b"dtype": "<f4", b"shape": [2, 3]}``, row by
-row; a number of numpy's is ``{b"__npgeneric__": True, b"data": 1.5, b"dtype": "<f4"}``. Some
-servers write these keys as text, which is read as well. Nothing is ever unpickled, and only numbers
-are made of bytes.
+An array is ``{b"__ndarray__": True, b"data": bytes, b"dtype": "<f4", b"shape": [2, 3]}``, in
+row-major order; a numpy scalar is ``{b"__npgeneric__": True, b"data": 1.5, b"dtype": "<f4"}``. Some
+servers write these keys as text, which is accepted too. Nothing is ever unpickled, and bytes are
+only decoded to numbers.
 
-An observation has a key of each camera: uint8 [H, W, 3], or [T, H, W, 3] with several observations,
-cut and sized by the contract and in its order of channels; depth is float32 in metres, [H, W] or
-[T, H, W]. The state is float32 [S] or [T, S]. The keys are those of ``adapters.interface``.
+An observation has one key for each camera: uint8 [H, W, 3], or [T, H, W, 3] with several
+observations, cropped and resized by the contract and in its channel order; depth is float32 in
+metres, [H, W] or [T, H, W]. The state is float32 [S] or [T, S]. The keys are those of
+``adapters.interface``.
 """
 
 import math
@@ -27,26 +28,27 @@ from policy.preprocess import image_to_input, input_to_bytes
 
 Message: TypeAlias = dict[str, object]
 CONTRACT_KEY = "mavbridge_contract"
-"""Key in the metadata of our own server: its contract as JSON."""
+"""Key in the metadata of mavbridge's own server: its contract as JSON."""
 ARRAY, NUMBER = "__ndarray__", "__npgeneric__"
 MAX_DIMENSIONS = 8
 _NUMERIC_DTYPE = re.compile(r"[<>|=]?[biuf][1248]|bool|u?int(8|16|32|64)|float(16|32|64)")
 
 
 class MessageError(PolicyError):
-    """A message that is not of the protocol."""
+    """Message that does not follow the protocol."""
 
 
 def pack(message: Mapping[str, object]) -> bytes:
-    """Write a message; its values are numbers, texts, lists, maps, and numpy arrays of numbers."""
+    """Encode a message of numbers, texts, lists, maps and numeric numpy arrays."""
     packed: bytes = msgpack.packb(message, default=_pack_numpy)
     return packed
 
 
 def unpack(data: bytes | str) -> Message:
-    """Read a message; arrays are read-only views of ``data``.
+    """Decode a message; arrays are read-only views of ``data``.
 
-    Nothing in it can claim more memory than a small multiple of its own length.
+    Decoding uses at most a small multiple of the message's length in memory, for any sizes that it
+    claims.
     """
     if isinstance(data, str):
         raise MessageError(f"a text in place of a msgpack map: {last_line(data)}")
@@ -60,7 +62,7 @@ def unpack(data: bytes | str) -> Message:
 
 
 def last_line(text: str) -> str:
-    """What a traceback ends with, or the end of another text, in at most 300 characters."""
+    """Return the last line of a traceback, or the end of a text, in at most 300 characters."""
     lines = [line.strip() for line in text.splitlines() if line.strip()]
     return lines[-1][:300] if lines else "(nothing)"
 
@@ -111,7 +113,7 @@ def _dtype(text: object) -> np.dtype[np.generic]:
 
 
 def number_array(message: Message, key: str) -> NDArray[np.generic]:
-    """An array of numbers in a message, or a list of them."""
+    """Return an array, or a list of numbers, of a message as an array."""
     if key not in message:
         raise MessageError(f"no {key!r} in it; it has {sorted(message)}")
     try:
@@ -124,17 +126,17 @@ def number_array(message: Message, key: str) -> NDArray[np.generic]:
 
 
 HISTORY_KEY = "action_history"
-"""Key in requests to our own server: float32 [K, 4]."""
+"""Key in requests to mavbridge's own server: action history, float32 [K, 4]."""
 RESET_KEY = "reset"
-"""Likewise: true where a flight has begun since the last request."""
+"""Key in requests to mavbridge's own server: true if a flight has begun since the last request."""
 
 
 def to_message(
     interface: Interface, image: FloatArray, state: FloatArray, *, history: FloatArray | None
 ) -> Message:
-    """The request for one observation: arrays of ``predict``, without the batch.
+    """Return the request for one observation: arrays of ``predict``, without the batch.
 
-    ``history`` [K, 4] is for our own server.
+    ``history`` [K, 4] is for mavbridge's own server.
     """
     contract = interface.contract
     images = image[..., 0, :, :] if contract.is_depth else to_uint8(image, contract)
@@ -153,7 +155,7 @@ def to_message(
 def from_message(
     interface: Interface, message: Message
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Image, state and history of a request, with the batch, as ``predict`` takes them."""
+    """Return image, state and history of a request, batched, as arguments of ``predict``."""
     contract = interface.contract
     stack = () if contract.observation_steps == 1 else (contract.observation_steps,)
     shape, kind = (*stack, *contract.picture_shape), "f" if contract.is_depth else "u"
@@ -183,16 +185,16 @@ def _array(message: Message, key: str, shape: tuple[int, ...], kind: str) -> NDA
 
 
 def to_uint8(planes: FloatArray, contract: Contract) -> NDArray[np.uint8]:
-    """Normalised images [..., 3, H, W] -> what they were made of, uint8 [..., H, W, 3], exactly.
+    """Convert normalised images [..., 3, H, W] back to their uint8 source [..., H, W, 3], exactly.
 
-    float32 keeps the levels of a byte far apart: they come back with an error below 0.001.
+    float32 keeps the 256 levels far apart: the error before rounding is below 0.001.
     """
     levels = input_to_bytes(planes, contract).astype(np.uint8)
     return np.ascontiguousarray(np.moveaxis(levels, -3, -1))
 
 
 def from_uint8(images: NDArray[np.uint8], contract: Contract) -> FloatArray:
-    """The way back: images that are cut and sized already -> normalised [..., 3, H, W]."""
+    """Normalise images that are already cropped and resized -> [..., 3, H, W]."""
     whole = replace(contract, image_crop=(0.0, 0.0, 1.0, 1.0))
     rgb = images if contract.image_channels == "rgb" else images[..., ::-1]
     each = rgb.reshape(-1, *rgb.shape[-3:])

@@ -1,4 +1,4 @@
-"""A policy that computes on a server: one request a chunk, with a deadline."""
+"""Policy on a server: one request per chunk, with a deadline."""
 
 from dataclasses import replace
 
@@ -21,40 +21,40 @@ from policy.engines.runner import level_state
 from policy.errors import NoChunkError
 
 ACTIONS_KEY = "actions"
-"""Key of the actions in an answer, unless the contract file's own key is there."""
+"""Key of the actions in an answer, unless the contract file names another."""
 TRIAL_S = 120.0
-"""Longest first answers, before any flight: servers compile on their first request."""
+"""Timeout of the first answers, before any flight: servers compile on their first request."""
 MOST_WAIT_S = 1.5
-"""Longest deadline of any contract: the flight still ends at once when it is told to."""
+"""Upper bound of the deadline for any contract, so that a flight still ends promptly."""
 
 
 def answer_deadline_s(contract: Contract) -> float:
-    """Time after which the guard would no longer fly by the answer."""
+    """Return the time after which the guard would reject the answer [s]."""
     ages_s = (contract.max_state_age_s, contract.max_velocity_age_s, contract.max_feature_age_s)
     chunk_s = contract.horizon * contract.chunk_dt_s
     return min(min(ages_s) + contract.play_s, chunk_s, MOST_WAIT_S)
 
 
 class RemotePolicy:
-    """``predict`` by a server; keeps ``policy.protocol.SingleRatePolicy``.
+    """``policy.protocol.SingleRatePolicy`` whose ``predict`` runs on a server.
 
-    Until the first ``reset`` it waits as long as a server may take to compile; from then on no
-    longer than ``answer_deadline_s``. What comes later is never flown.
+    Until the first ``reset`` it waits for the server's compilation; from then on at most
+    ``answer_deadline_s``. A later answer is never flown.
     """
 
     def __init__(self, link: ServerLink, interface: Interface, *, is_ours: bool) -> None:
-        """``is_ours``: the server is ``mavbridge serve``, and takes the history and the reset."""
+        """``is_ours``: the server is ``mavbridge serve``, which takes the history and the reset."""
         self.contract = replace(interface.contract, arrays="numpy", feature_dim=0)
         self._link = link
         self._interface = interface
         self._is_ours = is_ours
         self._timeout_s = TRIAL_S
         self._has_begun = False
-        """A flight has begun, and the server has not been told."""
+        """True if a flight has begun and the server has not been told."""
         self.round_trip_s = 0.0
-        """From the newest request to its answer."""
+        """Time from the newest request to its answer."""
         self.infer_s: float | None = None
-        """What the server says of its own share of that."""
+        """The server's own share of the round trip, as it reports it."""
 
     def predict(
         self,
@@ -63,7 +63,7 @@ class RemotePolicy:
         action_history: FloatArray,
         num_diffusion_steps: int,
     ) -> FloatArray:
-        """Ask the server for a chunk; it has diffusion steps of its own."""
+        """Ask the server for a chunk; the server sets the number of diffusion steps."""
         history = action_history[0] if self._is_ours else None
         message = to_message(self._interface, image[0], state[0], history=history)
         if self._is_ours and self._has_begun:
@@ -78,7 +78,7 @@ class RemotePolicy:
             raise NoChunkError(f"the policy server's answer is {error}") from error
 
     def reset(self) -> None:
-        """Tell the server with the next request that a flight has begun."""
+        """With the next request, tell the server that a flight has begun."""
         self._has_begun = True
         self._timeout_s = answer_deadline_s(self.contract)
 
@@ -87,7 +87,7 @@ class RemotePolicy:
         self._link.close()
 
     def try_out(self) -> str:
-        """Ask for two chunks of a dummy sample; returns a line with the time of the second one."""
+        """Request two chunks of a dummy sample; return a line with the second one's time."""
         contract = self.contract
         image = np.zeros((1, *contract.image_shape), np.float32)
         history = np.zeros((1, contract.history_len, ACTION_DIM), np.float32)

@@ -1,6 +1,6 @@
 """Batches for a world model: frames for its autoencoder, windows of latents for its dynamics.
 
-As those of a policy, a pure function of the seed and the step.
+A pure function of the seed and the step.
 """
 
 from dataclasses import dataclass
@@ -22,10 +22,10 @@ from policy.world_model.config import WorldModelConfig
 from policy.world_model.relative_state import MOTION_DIM
 
 CONTEXT_NOISE = 0.2
-"""Largest sigma on the latents of the past, of their unit scale: in a rollout the past is itself
-imagined, and a net that has only seen true ones drifts off."""
+"""Largest sigma of the noise on past latents, relative to their unit scale: in a rollout the past
+is itself imagined, and a network that has only seen true pasts drifts off."""
 DECODED = 2
-"""Frames of a window that are decoded in a step of the dynamics: all would double its time."""
+"""Frames of a window to decode in a step of the dynamics; decoding all would double its time."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -40,9 +40,9 @@ class FrameBatch(TensorBatch):
 
 @dataclass(frozen=True, kw_only=True)
 class WindowBatch(TensorBatch):
-    """Windows of K + T frames, and everything random about a step.
+    """Windows of K + T frames, and all random values of a step.
 
-    Noise is [B, T, ...] of the shape of what it is added to.
+    Each noise [B, T, ...] has the shape of its target.
     """
 
     latents: Tensor
@@ -52,7 +52,7 @@ class WindowBatch(TensorBatch):
     actions: Tensor
     """[B, T, 4]"""
     context_noise: Tensor
-    """[B, K, C, h, w], of unit scale as normalised latents are."""
+    """[B, K, C, h, w], at the unit scale of normalised latents."""
     latent_noise: Tensor
     motion_noise: Tensor
     action_noise: Tensor
@@ -61,7 +61,7 @@ class WindowBatch(TensorBatch):
     knows_actions: Tensor
     """[B] bool"""
     decoded: Tensor
-    """[B, DECODED] int64: frames of the future that are also compared as pixels."""
+    """[B, DECODED] int64: future frames that are also compared as pixels."""
 
 
 def frame_batch(
@@ -71,7 +71,7 @@ def frame_batch(
     settings: WorldModelSettings,
     step: int,
 ) -> FrameBatch:
-    """Two neighbours of each of the ``windows`` that are due in a step of the autoencoder."""
+    """Return two neighbours of each of the ``windows`` due in a step of the autoencoder."""
     count = settings.batch_size // 2
     random = np.random.default_rng([settings.seed, step])
     rows = next_of(np.arange(len(windows)), step, count, settings.seed)
@@ -86,7 +86,7 @@ def frame_batch(
 
 
 class WindowBatches:
-    """Makes batches of the windows of one set of flights."""
+    """Creates batches of the windows of one set of flights."""
 
     def __init__(
         self,
@@ -99,7 +99,7 @@ class WindowBatches:
         self._config, self._settings, self._seed = config, settings, settings.seed
 
     def batch(self, step: int) -> WindowBatch:
-        """The windows of a step of the dynamics."""
+        """Return the windows of a step of the dynamics."""
         count = self._settings.window_batch_size
         random = np.random.default_rng([self._seed, step])
         rows = next_of(np.arange(len(self._windows)), step, count, self._seed)
@@ -111,7 +111,7 @@ class WindowBatches:
         return self._make(random, rows, is_mirrored, sigma, knows_actions)
 
     def validation(self, count: int) -> list[WindowBatch]:
-        """All windows in batches of ``count``, the same at each call, alternating between roles.
+        """Return all windows in batches of ``count``, equal at each call, in alternating roles.
 
         Each batch is spread over all flights.
         """

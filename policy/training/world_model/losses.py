@@ -19,39 +19,39 @@ from policy.world_model.model import WorldModel
 from policy.world_model.relative_state import MOTION_SCALE, motion_since
 
 SQUARED_WEIGHT = 5.0
-"""Weight of the squared error of pixels beside the absolute one, which alone accepts a picture
-without its small things."""
+"""Weight of the squared pixel error; the absolute error alone ignores small objects."""
 EDGE_WEIGHT = 1.0
 """Weight of the error of differences between neighbours: a gate is a few pixels of edge."""
 KL_WEIGHT = 1e-4
-"""Weight of the KL divergence per latent, which keeps them in bounds. More of it gives each the
-same spread, so that the ground's unpredictable texture counts as much as the gates."""
+"""Weight of the KL divergence per latent, which keeps the latents bounded. A larger weight gives
+all of them equal spread, so that the ground's unpredictable texture counts as much as the gates."""
 UNSTEADY_WEIGHT = 0.03
-"""Weight of the change of the latents from frame to frame, over their spread. Without it, copying
-the last latent is off by half of their variance one frame on; pixels are hardly worse for it."""
+"""Weight of the latents' change from frame to frame, relative to their spread. Without it, copying
+the last latent is off by half of their variance after one frame; it hardly costs pixel accuracy."""
 DECODED_WEIGHT = 10.0
-"""Weight of the squared error of decoded pixels, full scale 2: not all errors of latents show."""
+"""Weight of the squared error of decoded pixels, full scale 2: some latent errors are invisible."""
 MOTION_WEIGHT, ACTION_WEIGHT = 0.5, 0.5
 MOTION_PREDICTION_WEIGHT = 0.5
-"""Weight of the squared error of the motion that is predicted before anything is denoised."""
+"""Weight of the squared error of the motion that is predicted before denoising."""
 WARP_WEIGHT = 1.0
-"""Weight of the absolute error of pixels of frames warped by the true motion: it alone teaches the
-inverse depth."""
+"""Weight of the absolute pixel error of frames warped by the true motion: the only loss that
+teaches the inverse depth."""
 MIN_MOTION_STD = 0.05
-"""Over ``MOTION_SCALE``: what hardly changes does not count more than this makes it."""
+"""Lower bound of a motion's standard deviation, relative to ``MOTION_SCALE``: bounds the weight of
+motions that hardly change."""
 MIN_STICK_STD = 0.1
 SCALE_SAMPLES = 4096
-"""Frames and windows from which scales are taken."""
+"""Number of frames and windows to compute the scales from."""
 CHANGE_SAMPLES = 1024
-"""Windows of them whose latents are read."""
+"""Number of these windows whose latents are read."""
 MIN_CHANGE_STD = 0.05
-"""Least spread of a change, of unit scale."""
+"""Minimum spread of a change, relative to unit scale."""
 VALIDATION_STEPS = 4
 """Denoising steps of imagined futures."""
 
 
 def autoencoder_loss(model: WorldModel, batch: FrameBatch) -> StepLoss:
-    """Errors of pixels and of their differences, unsteadiness, and a little KL."""
+    """Return the errors of pixels and of their differences, unsteadiness, and a little KL."""
     images = to_unit(batch.images.flatten(0, 1))
     mean, log_variance = model.autoencoder.posterior(images)
     latents = mean + (0.5 * log_variance).exp() * batch.noise.flatten(0, 1)
@@ -67,23 +67,23 @@ def autoencoder_loss(model: WorldModel, batch: FrameBatch) -> StepLoss:
 
 
 def reconstruction_errors(made: Tensor, images: Tensor) -> tuple[Tensor, Tensor]:
-    """L2 and L1 [] of [B, 3, H, W] in [-1, 1], and L1 of the differences between neighbours."""
+    """Return L2 and L1 [] of [B, 3, H, W] in [-1, 1], and L1 of neighbours' differences."""
     error = made - images
     edges = error.diff(dim=2).abs().mean() + error.diff(dim=3).abs().mean()
     return SQUARED_WEIGHT * error.square().mean() + error.abs().mean(), edges
 
 
 def dynamics_loss(model: WorldModel, batch: WindowBatch) -> StepLoss:
-    """Squared errors of what was denoised, and of some of its frames as pixels.
+    """Return squared errors of the denoised values, and of some of their frames as pixels.
 
-    Errors of latents are over their change since the last frame: copying it would give 1 at every
-    step, so that the first steps, which a rollout continues from, count as much as the last.
+    Latent errors are relative to the change since the last frame: copying it would give 1 at every
+    step, so the first steps, from which a rollout continues, count as much as the last.
     """
     config = model.config
     context = config.context_frames
     latents = _normalised(model, batch.latents)
     past_states, states = batch.states[:, :context], batch.states[:, context:]
-    with torch.autocast(states.device.type, enabled=False):  # angles need all their digits
+    with torch.autocast(states.device.type, enabled=False):  # angles need full precision
         motion = motion_since(past_states[:, -1:], states)
     clean = Future(
         latents=latents[:, context:],
@@ -105,7 +105,7 @@ def dynamics_loss(model: WorldModel, batch: WindowBatch) -> StepLoss:
         "warp": ((warped - true).abs().mean(dim=2) * in_view).mean(),
         "motion": (made.motion.float() - clean.motion).square().mean(),
         "motion_prediction": (known.predicted_motion - clean.motion).square().mean(),
-        # Known sticks are returned as they were given: no error.
+        # Given sticks are returned unchanged: no error.
         "sticks": (made.actions.float() - clean.actions).square().mean(),
     }
     loss = (
@@ -130,7 +130,7 @@ def _noisy(model: WorldModel, clean: Future, batch: WindowBatch) -> Future:
 
 
 def _decoded(model: WorldModel, latents: Tensor, chosen: Tensor) -> Tensor:
-    """Frames [B, n, 3, H, W] with indices [B, n] of futures [B, T, C, h, w]; full scale 2."""
+    """Decode frames [B, n, 3, H, W], indices [B, n], of futures [B, T, C, h, w]; full scale 2."""
     coder, window = model.autoencoder, torch.arange(len(latents), device=latents.device)[:, None]
     some = latents[window, chosen]
     images = coder.reconstruct(coder.denormalise(some.flatten(0, 1)))
@@ -170,7 +170,7 @@ def set_scales(
 
 
 def _change_std(model: WorldModel, windows: Windows, latents: FeatureStore) -> Tensor:
-    """Spread [T, C, 1, 1] of the change of normalised latents in some windows."""
+    """Return the spread [T, C, 1, 1] of the change of normalised latents in some windows."""
     context, frames = model.config.context_frames, windows.frames
     rows = torch.from_numpy(latents.read(frames.ravel(), np.zeros(frames.size, bool)))
     normal = _normalised(model, rows.reshape(*frames.shape, *model.config.latent_shape))
@@ -180,7 +180,7 @@ def _change_std(model: WorldModel, windows: Windows, latents: FeatureStore) -> T
 
 @torch.no_grad()
 def validate_autoencoder(model: WorldModel, images: Tensor) -> WorldModelValidation:
-    """Errors of frames [N, H, W, 3] after coding; the loss is that of the pixels."""
+    """Return the errors of frames [N, H, W, 3] after coding; the loss is that of the pixels."""
     made = model.decode(model.encode(images))
     pixels, edges = reconstruction_errors(to_unit(made), to_unit(images))
     return WorldModelValidation(
@@ -193,9 +193,9 @@ def validate_autoencoder(model: WorldModel, images: Tensor) -> WorldModelValidat
 def validate_world_model(
     model: WorldModel, batches: Sequence[WindowBatch], frames: Tensor
 ) -> WorldModelValidation:
-    """Losses of all held-out ``batches``, and errors of imagining the first of them.
+    """Return the losses of all held-out ``batches``, and the errors of imagining the first batch.
 
-    ``frames`` [B, K + T, H, W, 3] uint8 are the true ones of that batch.
+    ``frames`` [B, K + T, H, W, 3] uint8 are the true frames of that batch.
     """
     losses = [float(dynamics_loss(model, batch).metrics["loss"]) for batch in batches]
     context, first = model.config.context_frames, batches[0]
@@ -225,6 +225,6 @@ def validate_world_model(
 
 
 def psnr_db(made: Tensor, true: Tensor) -> Tensor:
-    """Peak signal to noise ratio [...] of frames [..., H, W, 3] uint8; 99 where they are equal."""
+    """Return the peak signal-to-noise ratio [...] of uint8 [..., H, W, 3]; 99 if equal."""
     squared = (made.float() - true.float()).square().mean(dim=(-3, -2, -1))
     return (10 * torch.log10(255.0**2 / squared)).clamp_max(99.0)

@@ -1,4 +1,4 @@
-"""Train a world model from flights: the autoencoder, then the dynamics on stored latents."""
+"""Training of a world model from flights: the autoencoder, then the dynamics on stored latents."""
 
 import json
 from collections.abc import Callable, Sequence
@@ -33,7 +33,7 @@ from policy.world_model.model import WorldModel
 VALIDATION_FRAMES = 128
 VALIDATION_WINDOWS = 128
 IMAGINED_WINDOWS = 16
-"""Windows of them that are imagined frame by frame."""
+"""Number of held-out windows to imagine frame by frame."""
 
 
 def train_world_model(
@@ -42,7 +42,7 @@ def train_world_model(
     settings: WorldModelSettings,
     hooks: Hooks,
 ) -> TrainResult:
-    """Train, and write the best weights on held-out flights to ``settings.out``."""
+    """Train, and write the weights that are best on held-out flights to ``settings.out``."""
     folder = open_run(settings, config, flights)
     return _WorldModelRun(flights, config, settings, folder, hooks).finish()
 
@@ -88,7 +88,7 @@ class _WorldModelRun(TrainingRun[WorldModel, FrameBatch | WindowBatch]):
         return trainee.autoencoder
 
     def encode(self, stage: TrainingStage, *, is_new: bool) -> None:
-        # Held-out frames first: without them no weights could be chosen.
+        # Held-out frames first: without them no weights could be selected.
         held, kept = np.unique(self._held.frames), np.unique(self._windows.frames)
         mirror, total = self.settings.mirror, len(self._windows)
         latents = self._latents = encode_rows(
@@ -168,7 +168,7 @@ class _WorldModelRun(TrainingRun[WorldModel, FrameBatch | WindowBatch]):
 
 
 def _starting_model(config: WorldModelConfig, settings: WorldModelSettings) -> WorldModel:
-    """Weights of the seed, but for an autoencoder that is kept; torch's random state is kept."""
+    """Return seeded weights, except a kept autoencoder's; keeps torch's random state."""
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(settings.seed)
         model = WorldModel(config)
