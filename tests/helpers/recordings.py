@@ -2,7 +2,7 @@
 
 import os
 import signal
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import replace
 from pathlib import Path
@@ -12,8 +12,9 @@ from unittest.mock import patch
 import numpy as np
 
 from helpers.factories import START_NS, make_vision_tick
-from mavbridge.core.records import ImageArray, VisionTick
+from mavbridge.core.records import ImageArray, Tick, VisionTick
 from mavbridge.recording import flight_writer
+from mavbridge.recording.flight_writer import FlightWriter
 from mavbridge.recording.meta import FlightMeta
 from mavbridge.recording.rows import FrameRow
 from mavbridge.recording.tlog import TlogJob
@@ -124,3 +125,27 @@ def send_signal(pid: int, number: signal.Signals) -> None:
     if number != signal.SIGCONT:
         with suppress(ChildProcessError):  # another thread of its parent has waited for it
             os.waitid(os.P_PID, pid, os.WEXITED | os.WSTOPPED | os.WNOWAIT)
+
+
+def write_recording(
+    folder: Path,
+    events: Iterable[Tick | VisionTick],
+    *,
+    meta: FlightMeta | None = None,
+    finish: bool = True,
+) -> Path:
+    """A flight of ``events``; without ``finish``, as a kill leaves it."""
+    folder.mkdir()
+    with without_writer_process():
+        writer = FlightWriter(folder, meta or make_meta(), pressure="offline")
+        for event in events:
+            if isinstance(event, Tick):
+                writer.tick(event)
+            else:
+                writer.frame(event)
+        if finish:
+            writer.finish(writer.meta)
+        else:
+            writer._flush()
+            writer.close()
+    return folder

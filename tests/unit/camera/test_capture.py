@@ -1,6 +1,4 @@
-import http.server
 import os
-import threading
 from pathlib import Path
 
 import cv2
@@ -11,7 +9,6 @@ from helpers.camera_senders import SIDE, RtpSender, repeating
 from helpers.fakes import START_NS, FakeClock
 from mavbridge.camera import capture
 from mavbridge.camera.capture import exposure_ns, open_device, open_stream
-from mavbridge.camera.grabber import Grabber
 from mavbridge.camera.open import open_camera
 from mavbridge.core.clock import NS_PER_MS, NS_PER_S, MonotonicClock
 from mavbridge.core.errors import CameraError
@@ -20,33 +17,24 @@ NOW_NS = 1_000 * NS_PER_S
 
 
 @pytest.mark.parametrize(
-    ("driver_ms", "captured_ns"),
+    ("driver_ms", "is_our_clock", "captured_ns"),
     [
-        pytest.param(999_990.0, NOW_NS - 10 * NS_PER_MS, id="10 ms ago on our clock"),
-        pytest.param(1_000_000.0, NOW_NS, id="now"),
-        pytest.param(999_000.0, NOW_NS - NS_PER_S, id="as old as it may be"),
-        pytest.param(998_999.0, NOW_NS, id="too old"),
-        pytest.param(1_000_000.1, NOW_NS, id="from the future"),
-        pytest.param(0.0, NOW_NS, id="no stamp"),
-        pytest.param(-1.0, NOW_NS, id="not supported"),
-        pytest.param(1.7e12, NOW_NS, id="wall clock"),
+        pytest.param(999_990.0, False, NOW_NS - 10 * NS_PER_MS, id="10 ms ago on our clock"),
+        pytest.param(1_000_000.0, False, NOW_NS, id="now"),
+        pytest.param(999_000.0, False, NOW_NS - NS_PER_S, id="as old as it may be"),
+        pytest.param(998_999.0, False, NOW_NS, id="too old"),
+        pytest.param(1_000_000.1, False, NOW_NS, id="from the future"),
+        pytest.param(0.0, False, NOW_NS, id="no stamp"),
+        pytest.param(-1.0, False, NOW_NS, id="not supported"),
+        pytest.param(1.7e12, False, NOW_NS, id="wall clock"),
+        pytest.param(997_000.0, True, NOW_NS - 3 * NS_PER_S, id="from a queue that nobody read"),
+        pytest.param(1_000_400.0, True, NOW_NS + 400 * NS_PER_MS, id="our clock, ahead"),
+        pytest.param(0.0, True, NOW_NS, id="our clock, no stamp"),
     ],
 )
-def test_the_drivers_stamp_is_taken_if_it_can_be_one(driver_ms, captured_ns):
-    assert exposure_ns(round(driver_ms * NS_PER_MS), NOW_NS) == captured_ns
-
-
-@pytest.mark.parametrize(
-    ("driver_ms", "captured_ns"),
-    [
-        pytest.param(997_000.0, NOW_NS - 3 * NS_PER_S, id="from a queue that nobody read"),
-        pytest.param(1_000_400.0, NOW_NS + 400 * NS_PER_MS, id="from the future"),
-        pytest.param(0.0, NOW_NS, id="no stamp"),
-    ],
-)
-def test_a_driver_on_our_clock_is_believed_however_old_its_frame(driver_ms, captured_ns):
+def test_the_drivers_stamp_is_taken_if_it_can_be_one(driver_ms, is_our_clock, captured_ns):
     stamp_ns = round(driver_ms * NS_PER_MS)
-    assert exposure_ns(stamp_ns, NOW_NS, is_our_clock=True) == captured_ns
+    assert exposure_ns(stamp_ns, NOW_NS, is_our_clock=is_our_clock) == captured_ns
 
 
 class FakeDevice:
@@ -98,71 +86,6 @@ def test_a_device_gives_rgb_with_the_drivers_stamp(monkeypatch):
     with pytest.raises(CameraError, match="unplugged"):
         source.next_image()
     source.close()
-
-
-class MjpegHandler(http.server.BaseHTTPRequestHandler):
-    """Serves one red frame over and over until the server is told to hang up."""
-
-    def do_GET(self):
-        _, jpeg = cv2.imencode(".jpg", np.full((48, 64, 3), (0, 0, 200), np.uint8))
-        part = b"--frame\r\nContent-Type: image/jpeg\r\nContent-Length: %d\r\n\r\n" % jpeg.size
-        self.send_response(200)
-        self.send_header("Content-Type", "multipart/x-mixed-replace; boundary=frame")
-        self.end_headers()
-        while not self.server.hang_up.wait(0.01):
-            self.wfile.write(part + jpeg.tobytes() + b"\r\n")
-
-    def log_message(self, *_):
-        pass
-
-    def handle_one_request(self):
-        try:
-            super().handle_one_request()
-        except (BrokenPipeError, ConnectionResetError):
-            self.close_connection = True
-
-
-@pytest.fixture
-def mjpeg_server():
-    server = http.server.ThreadingHTTPServer(("127.0.0.1", 0), MjpegHandler)
-    server.hang_up = threading.Event()
-    thread = threading.Thread(target=server.serve_forever, name="test-mjpeg", daemon=True)
-    thread.start()
-    yield server
-    server.hang_up.set()
-    server.shutdown()
-    thread.join(5)
-    server.server_close()
-
-
-@pytest.mark.system
-def test_a_stream_over_http_flows_and_its_end_is_noticed(mjpeg_server, monkeypatch):
-    monkeypatch.delenv(capture.FFMPEG_OPTIONS_VARIABLE, raising=False)
-    clock = MonotonicClock()
-    url = f"http://127.0.0.1:{mjpeg_server.server_address[1]}/video.mjpg"
-    sources = [lambda: open_stream(url, clock=clock)]
-
-    def open_once():
-        if not sources:
-            raise CameraError("the test allows one connection")
-        return sources.pop()()
-
-    before_ns = clock.now_ns()
-    camera = Grabber(open_once, clock=clock, reopen_delays_s=(0.0,))
-    frame = camera.read(10 * NS_PER_S)
-    assert capture.FFMPEG_OPTIONS_VARIABLE not in os.environ
-    assert before_ns < frame.captured_ns <= clock.now_ns()
-    assert frame.rgb.shape == (48, 64, 3)
-    assert frame.rgb[..., 0].mean() == pytest.approx(200, abs=5)
-    mjpeg_server.hang_up.set()
-    with pytest.raises(CameraError, match="one connection"):
-        read_until_it_ends(camera)
-    camera.close()
-
-
-def read_until_it_ends(camera):
-    while camera.read(10 * NS_PER_S) is not None:
-        pass
 
 
 @pytest.mark.parametrize(

@@ -93,19 +93,6 @@ def test_a_quarter_turn_to_the_right_with_a_push_north(
     assert since(states, T0 + 50 * MS) == pytest.approx(half, abs=1e-6)
 
 
-@pytest.mark.parametrize("frame", FRAMES)
-def test_axes_of_the_body_at_the_exposure(frame: StateFrame) -> None:
-    # Facing east; nose up by 0.2 rad, and pushed 1 m/s north, which is to the left, and 2 down.
-    states = [
-        state_at(T0, EAST, (0, 5, 0), frame),
-        state_at(T0 + 40 * MS, turned(EAST, 1, 0.2), (1, 5, 2), frame),
-    ]
-    frd = [0, 0.2, 0, 0, -1, 2]
-    flu = [0, -0.2, 0, 0, 1, -2]
-    expected = frd if frame == "ned_frd" else flu
-    assert since(states, T0) == pytest.approx([0.04, *expected], abs=1e-6)
-
-
 @pytest.mark.parametrize("axis", [0, 1, 2])
 @pytest.mark.parametrize("age_ms", [0, 3, 10, 47, 199])
 def test_at_a_constant_rate_the_rotation_is_the_rate_times_the_age(axis: int, age_ms: int) -> None:

@@ -20,6 +20,7 @@ from mavbridge.guard.wire import GuardStatus, GuardSummary
 
 FLOWN = Outcome(flights=1, has_left_ground=True)
 NO_CHUNK = because(Code.NO_CHUNK)
+HIT = "it hit gate 7"
 STATS = LinkStats(
     messages_per_s=(),
     lost_fraction=None,
@@ -49,27 +50,32 @@ def stopped(number: int | None) -> StopRequest:
 
 
 @pytest.mark.parametrize(
-    ("outcome", "number", "status", "told"),
+    ("outcome", "number", "crash", "status", "told"),
     [
-        (FLOWN, None, 0, None),
-        (FLOWN, signal.SIGINT, 0, None),  # Ctrl-C is how a flight without a duration ends
-        (FLOWN._replace(has_left_ground=None), None, 0, None),  # the vehicle does not tell
-        (FLOWN._replace(faults=1), None, 4, "a fault"),
-        (FLOWN._replace(flights=3, faults=1), signal.SIGINT, 4, "a fault"),
-        (FLOWN._replace(is_disarmed=True), None, 3, "was disarmed"),
-        (FLOWN._replace(has_left_ground=False), None, 3, "not left the ground"),
-        (FLOWN._replace(has_left_ground=False), signal.SIGTERM, 143, "not left the ground"),
-        (Outcome(), None, 3, f"the policy has not flown: {NO_CHUNK}"),
-        (Outcome(), signal.SIGINT, 130, "the policy has not flown"),
-        (None, signal.SIGINT, 130, None),  # an impatient user, while the guard holds neutral
-        (None, None, 3, None),
+        (FLOWN, None, None, 0, None),
+        (FLOWN, signal.SIGINT, None, 0, None),  # Ctrl-C is how a flight without a duration ends
+        (FLOWN._replace(has_left_ground=None), None, None, 0, None),  # the vehicle does not tell
+        (FLOWN._replace(faults=1), None, None, 4, "a fault"),
+        (FLOWN._replace(flights=3, faults=1), signal.SIGINT, None, 4, "a fault"),
+        (FLOWN._replace(is_disarmed=True), None, None, 3, "was disarmed"),
+        (FLOWN._replace(has_left_ground=False), None, None, 3, "not left the ground"),
+        (FLOWN._replace(has_left_ground=False), signal.SIGTERM, None, 143, "not left the ground"),
+        (Outcome(), None, None, 3, f"the policy has not flown: {NO_CHUNK}"),
+        (Outcome(), signal.SIGINT, None, 130, "the policy has not flown"),
+        (None, signal.SIGINT, None, 130, None),  # an impatient user, while the guard holds neutral
+        (None, None, None, 3, None),
+        (FLOWN, None, HIT, 6, HIT),
+        (FLOWN, signal.SIGINT, HIT, 6, HIT),
+        (FLOWN._replace(is_disarmed=True), None, HIT, 6, HIT),
+        (FLOWN._replace(faults=1), None, HIT, 4, ""),  # a fault comes first
+        (None, None, HIT, 3, None),
     ],
 )
 def test_the_status_says_what_a_script_needs(
-    outcome: Outcome | None, number: int | None, status: int, told: str | None
+    outcome: Outcome | None, number: int | None, crash: str | None, status: int, told: str | None
 ) -> None:
     words = None if outcome is None else summary(outcome)
-    verdict = flight_verdict(words, stopped(number), reason=NO_CHUNK, readonly=False)
+    verdict = flight_verdict(words, stopped(number), reason=NO_CHUNK, readonly=False, crash=crash)
     assert verdict.exit_code == status
     assert (told or "") in (verdict.text or "")
     assert (told is None) == (verdict.text is None)
@@ -89,26 +95,6 @@ def test_a_flight_that_sends_nothing_needs_no_air() -> None:
     assert flight_verdict(watched, stopped(None), reason=None, readonly=True).exit_code == 0
     unseen = summary(Outcome())
     assert flight_verdict(unseen, stopped(None), reason=None, readonly=True).exit_code == 3
-
-
-@pytest.mark.parametrize(
-    ("outcome", "number", "status"),
-    [
-        (FLOWN, None, 6),
-        (FLOWN, signal.SIGINT, 6),
-        (FLOWN._replace(is_disarmed=True), None, 6),
-        (FLOWN._replace(faults=1), None, 4),
-        (None, None, 3),
-    ],
-)
-def test_a_flight_that_hit_something_is_never_a_success(
-    outcome: Outcome | None, number: int | None, status: int
-) -> None:
-    words = None if outcome is None else summary(outcome)
-    verdict = flight_verdict(
-        words, stopped(number), reason=None, readonly=False, crash="it hit gate 7"
-    )
-    assert verdict.exit_code == status
 
 
 GATES = [CourseGate(Position(north, 0.0, -2.0), 0.0, 2.4) for north in (4.0, 8.0)]

@@ -14,7 +14,6 @@ from mavbridge.guard.memory import EngagementSettings
 from mavbridge.guard.sequences import DisengageSettings, EngageSettings
 from mavbridge.guard.settings import FlightSettings
 from policy.contract import Contract
-from policy.protocol import PolicyRunner
 
 LINK = LinkConfig(connect="udp:127.0.0.1:14550")
 
@@ -22,16 +21,8 @@ LINK = LinkConfig(connect="udp:127.0.0.1:14550")
 def settings_for(
     config: FlyConfig | None = None, contract: Contract | None = None, *, dual_rate: bool = True
 ) -> FlightSettings:
-    runner = PolicyRunner(
-        contract=contract or Contract(feature_dim=8),
-        name="test",
-        engine="numpy",
-        dual_rate=dual_rate,
-        encode=lambda rgb: rgb,
-        act=lambda *inputs: inputs[0],
-    )
-    contract, is_dual = runner.contract, runner.dual_rate
-    return plan_flight(config or FlyConfig(link=LINK), contract, is_dual=is_dual).guard
+    contract = contract or Contract(feature_dim=8)
+    return plan_flight(config or FlyConfig(link=LINK), contract, is_dual=dual_rate).guard
 
 
 def test_the_process_is_told_what_the_flags_say() -> None:

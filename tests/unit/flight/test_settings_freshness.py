@@ -29,16 +29,23 @@ def in_ms(
     )
 
 
-def test_ages_are_the_contracts_where_no_flag_speaks() -> None:
-    assert effective_freshness(CONTRACT, Limits()) == in_ms(200, 400, 2000, 1500)
-    assert effective_freshness(Contract(), Limits()) == in_ms(100, 250, 300, 300, 250)
-
-
-def test_flags_tighten_one_by_one() -> None:
-    limits = Limits(max_attitude_age=0.05, max_chunk_age=1.5)
-    assert effective_freshness(CONTRACT, limits) == in_ms(50, 400, 2000, 1500)
-    limits = Limits(max_velocity_age=0.3, max_feature_age=0.25, max_stall=0.2)
-    assert effective_freshness(CONTRACT, limits) == in_ms(200, 300, 250, 1500, 200)
+@pytest.mark.parametrize(
+    ("contract", "limits", "expected"),
+    [
+        (CONTRACT, Limits(), in_ms(200, 400, 2000, 1500)),
+        (Contract(), Limits(), in_ms(100, 250, 300, 300, 250)),
+        (CONTRACT, Limits(max_attitude_age=0.05, max_chunk_age=1.5), in_ms(50, 400, 2000, 1500)),
+        (
+            CONTRACT,
+            Limits(max_velocity_age=0.3, max_feature_age=0.25, max_stall=0.2),
+            in_ms(200, 300, 250, 1500, 200),
+        ),
+    ],
+)
+def test_ages_are_the_contracts_and_flags_tighten_one_by_one(
+    contract: Contract, limits: Limits, expected: FreshnessLimits
+) -> None:
+    assert effective_freshness(contract, limits) == expected
 
 
 @pytest.mark.parametrize(

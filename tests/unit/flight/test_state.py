@@ -1,5 +1,6 @@
 from dataclasses import replace
 from math import pi, sqrt
+from typing import Any
 
 import numpy as np
 import pytest
@@ -151,64 +152,49 @@ def test_each_part_keeps_its_own_stamp_and_the_array_is_frozen() -> None:
         state.values[0] = pi
 
 
-def frozen_for(seconds: float, *, rate_radps: float, moves: bool = False) -> Reason | None:
-    """What the check with a limit of 0.5 s says of the last of these states, at 100 Hz."""
-    check, problem = FrozenStateCheck(max_frozen_ns=500 * NS_PER_MS), None
+def frozen_for(
+    seconds: float,
+    rate_radps: float,
+    *,
+    moves: bool = False,
+    rate_step_radps: float = 0.0,
+    force_mps2: float = 0.0,
+    limit_ms: int = 500,
+) -> Reason | None:
+    """What the check says of the last of these states, at 100 Hz."""
+    check, problem = FrozenStateCheck(max_frozen_ns=limit_ms * NS_PER_MS), None
     for step in range(round(100 * seconds) + 1):
         turned = rate_radps * step / 100 if moves else 0.0
-        state = build_state(
-            telemetry(q=(1.0, turned / 2, 0.0, 0.0), w=(rate_radps, 0.0, 0.0)),
-            NOW_NS,
-            frame="ned_frd",
-            freshness=LIMITS,
+        source = telemetry(
+            q=(1.0, turned / 2, 0.0, 0.0),
+            w=(rate_radps + step * rate_step_radps, 0.0, 0.0),
+            a=(force_mps2, 0.0, -9.81),
         )
+        state = build_state(source, NOW_NS, frame="ned_frd", freshness=LIMITS)
         assert isinstance(state, VehicleState)
         problem = check.problem(replace(state, attitude_ns=NOW_NS + step * 10 * NS_PER_MS))
     return problem
 
 
-def test_an_attitude_that_stays_the_same_while_the_vehicle_turns_is_frozen() -> None:
-    assert frozen_for(0.5, rate_radps=0.01) is None
-    assert frozen_for(0.52, rate_radps=0.01) == because(
-        Code.ATTITUDE_FROZEN, age_ms=520.0, limit_ms=500.0
-    )
+def test_a_frozen_attitude_is_told_with_its_figures() -> None:
+    frozen = because(Code.ATTITUDE_FROZEN, age_ms=520.0, limit_ms=500.0)
+    assert frozen_for(0.52, 0.01) == frozen
 
 
-def test_a_vehicle_that_turns_slowly_or_not_at_all_is_not_frozen() -> None:
-    assert frozen_for(5.0, rate_radps=2e-4, moves=True) is None
-    assert frozen_for(5.0, rate_radps=0.0) is None
-
-
-def test_an_attitude_is_frozen_whatever_the_rates_do() -> None:
-    check = FrozenStateCheck(max_frozen_ns=500 * NS_PER_MS)
-    for step in range(60):
-        source = telemetry(w=(0.01 + step / 1000, 0.0, 0.0))
-        state = build_state(source, NOW_NS, frame="ned_frd", freshness=LIMITS)
-        assert isinstance(state, VehicleState)
-        problem = check.problem(replace(state, attitude_ns=NOW_NS + step * 10 * NS_PER_MS))
-    assert problem is not None
-    assert problem.code is Code.ATTITUDE_FROZEN
-
-
-@pytest.mark.parametrize(("rate_radps", "is_frozen"), [(0.9e-4, False), (1.1e-4, True)])
-def test_a_turn_counts_from_a_ten_thousandth_of_a_radian_per_second(
-    rate_radps: float, is_frozen: bool
+@pytest.mark.parametrize(
+    ("seconds", "rate_radps", "changes", "is_frozen"),
+    [
+        pytest.param(0.5, 0.01, {}, False, id="at the limit"),
+        pytest.param(5.0, 2e-4, {"moves": True}, False, id="turns slowly"),
+        pytest.param(5.0, 0.0, {}, False, id="rests"),
+        pytest.param(5.0, 0.0, {"force_mps2": 1.0}, False, id="a force is no turn"),
+        pytest.param(1.0, 0.9e-4, {}, False, id="less than a turn"),
+        pytest.param(1.0, 1.1e-4, {}, True, id="a turn"),
+        pytest.param(0.59, 0.01, {"rate_step_radps": 0.001}, True, id="the rates change"),
+        pytest.param(5.0, 1.0, {"limit_ms": 0}, False, id="switched off"),
+    ],
+)
+def test_an_attitude_that_stays_the_same_while_the_vehicle_turns_is_frozen(
+    seconds: float, rate_radps: float, changes: dict[str, Any], is_frozen: bool
 ) -> None:
-    assert (frozen_for(1.0, rate_radps=rate_radps) is not None) == is_frozen
-
-
-def test_a_force_is_no_turn() -> None:
-    check = FrozenStateCheck(max_frozen_ns=500 * NS_PER_MS)
-    source = telemetry(a=(1.0, 2.0, -9.81))
-    state = build_state(source, NOW_NS, frame="ned_frd", freshness=LIMITS)
-    assert isinstance(state, VehicleState)
-    assert check.problem(state) is None
-    assert check.problem(replace(state, attitude_ns=NOW_NS + 10**10)) is None
-
-
-def test_the_check_of_a_frozen_attitude_can_be_switched_off() -> None:
-    check = FrozenStateCheck(max_frozen_ns=0)
-    state = build_state(telemetry(w=(1.0, 0.0, 0.0)), NOW_NS, frame="ned_frd", freshness=LIMITS)
-    assert isinstance(state, VehicleState)
-    assert check.problem(state) is None
-    assert check.problem(replace(state, attitude_ns=NOW_NS + 10**10)) is None
+    assert (frozen_for(seconds, rate_radps, **changes) is not None) is is_frozen

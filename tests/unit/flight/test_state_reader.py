@@ -12,7 +12,6 @@ from mavbridge.core.vehicle import Reading, Telemetry
 from mavbridge.flight.plan import plan_flight
 from mavbridge.flight.state import Freshness, StateReader, Unavailable
 from policy.contract import Contract, StateExtra
-from policy.protocol import PolicyRunner
 
 MS = NS_PER_MS
 NOW_NS = 5_000 * MS
@@ -111,15 +110,8 @@ def test_a_goal_is_three_numbers(goal: str) -> None:
 
 def test_a_goal_is_given_just_where_the_policy_takes_one() -> None:
     def settings(goal: str | None, *extras: StateExtra) -> object:
-        runner = PolicyRunner(
-            contract=Contract(state_extras=extras),
-            name="",
-            engine="",
-            dual_rate=True,
-            encode=lambda rgb, camera=0: np.zeros((1, 1), np.float32),
-            act=lambda e, s, h: e,
-        )
-        return plan_flight(config(goal), runner.contract, is_dual=runner.dual_rate).guard
+        contract = Contract(state_extras=extras)
+        return plan_flight(config(goal), contract, is_dual=True).guard
 
     assert config("-10.5, 2,-3").goal_ned_m == (-10.5, 2.0, -3.0)
     with pytest.raises(UserError, match="this policy flies to a goal: give --goal"):

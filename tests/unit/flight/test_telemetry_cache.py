@@ -64,7 +64,7 @@ SOLVE = SolveInputs(
 class Viewed:
     """A view, and the vehicle's samples for it."""
 
-    def __init__(self) -> None:
+    def __init__(self, **changes: Any) -> None:
         self.sink = ListSink()
         self.history = SentHistory(length=2, dt_s=0.01)
         self.view = TelemetryCache(
@@ -72,6 +72,7 @@ class Viewed:
             sink=self.sink,
             state_frame="ned_frd",
             freshness=Freshness(attitude_ns=100 * MS, velocity_ns=250 * MS),
+            **changes,
         )
 
     def samples(self, at_ns: int = START_NS, *, height_m: float = 3.0) -> Samples:
@@ -111,13 +112,7 @@ def test_samples_are_the_newest_telemetry() -> None:
 
 
 def test_the_past_is_kept_by_datagram_until_it_is_taken() -> None:
-    view = TelemetryCache(
-        history=SentHistory(length=2, dt_s=0.01),
-        sink=ListSink(),
-        state_frame="ned_frd",
-        freshness=Freshness(attitude_ns=100 * MS, velocity_ns=250 * MS),
-        keeps_past=True,
-    )
+    view = Viewed(keeps_past=True).view
     first, second, third = (level_telemetry(START_NS + k * MS) for k in range(3))
     velocity = without(second, "ned_from_body_wxyz")
     view.receive(Samples(samples_of(first) + samples_of(velocity) + samples_of(third)))
@@ -128,13 +123,7 @@ def test_the_past_is_kept_by_datagram_until_it_is_taken() -> None:
 
 def test_packets_go_to_the_recorder_alone() -> None:
     kept: list[ForwardedPacket] = []
-    view = TelemetryCache(
-        history=SentHistory(length=2, dt_s=0.01),
-        sink=ListSink(),
-        state_frame="ned_frd",
-        freshness=Freshness(attitude_ns=100 * MS, velocity_ns=250 * MS),
-        watch_packets=kept.extend,
-    )
+    view = Viewed(watch_packets=kept.extend).view
     packet = ForwardedPacket(START_NS, START_NS, b"\xfd\x05nonsense")
     view.receive(Packets((packet,)))
     assert kept == [packet]
@@ -221,13 +210,7 @@ def test_it_is_airborne_while_the_policy_flies_and_the_vehicle_says_so() -> None
 @pytest.fixture
 def awaited() -> Iterator[Awaited]:
     guard, flight = map(SocketPort, channel_pair())
-    view = TelemetryCache(
-        history=SentHistory(length=2, dt_s=0.01),
-        sink=ListSink(),
-        state_frame="ned_frd",
-        freshness=Freshness(attitude_ns=100 * MS, velocity_ns=250 * MS),
-        samples=flight,
-    )
+    view = Viewed(samples=flight).view
     yield Awaited(view, guard)
     guard.close()
     flight.close()

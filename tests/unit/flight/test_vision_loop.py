@@ -38,20 +38,31 @@ class StillCamera:
         pass
 
 
-def faults(*, picture, image_watch, airborne_from_ns=START_NS, seconds=4):
-    """Time of the first fault after the start, and every fault from then on."""
-    clock, cache = FakeClock(), FeatureCache()
-    sink = ListSink()
-    loop = VisionLoop(
-        camera=StillCamera(clock, picture),
-        encode=lambda rgb: np.zeros((1, 8), np.float32),
+def make_loop(clock, camera, *, cache=None, sink=None, lock=None, **changes):
+    settings = {
+        "encode": lambda rgb: np.zeros((1, 8), np.float32),
+        "period_ns": lambda: FRAME_NS,
+        "encoder_lock": lock or threading.Lock(),
+    }
+    return VisionLoop(
+        camera=camera,
+        cache=cache or FeatureCache(),
+        sink=sink or ListSink(),
+        clock=clock,
+        **(settings | changes),
+    )
+
+
+def faults(picture, image_watch, airborne_from_s, seconds=4):
+    """Time of the first fault after the start, and the codes of all features from then on."""
+    clock, cache, sink = FakeClock(), FeatureCache(), ListSink()
+    loop = make_loop(
+        clock,
+        StillCamera(clock, picture),
         cache=cache,
         sink=sink,
-        clock=clock,
-        period_ns=lambda: FRAME_NS,
-        encoder_lock=threading.Lock(),
         image_watch=image_watch,
-        is_airborne=lambda: clock.now_ns() >= airborne_from_ns,
+        is_airborne=lambda: clock.now_ns() >= START_NS + airborne_from_s * NS_PER_S,
     )
     seen = []
     while clock.now_ns() < START_NS + seconds * NS_PER_S:
@@ -59,11 +70,11 @@ def faults(*, picture, image_watch, airborne_from_ns=START_NS, seconds=4):
         feature = cache.latest()
         seen.append(((feature.captured_ns - START_NS) / NS_PER_S, feature.fault))
     assert len(sink.visions) == len(seen)
-    faulty = [(at_s, fault) for at_s, fault in seen if fault is not None]
-    if not faulty:
-        return None, []
-    first_s = faulty[0][0]
-    return first_s, [fault for at_s, fault in seen if at_s >= first_s]
+    first_s = next((at_s for at_s, fault in seen if fault is not None), None)
+    if first_s is None:
+        return None, None
+    (code,) = {None if fault is None else fault.code for at_s, fault in seen if at_s >= first_s}
+    return first_s, code
 
 
 SCENE = np.random.default_rng(3).integers(0, 255, (60, 80, 3), dtype=np.uint8)
@@ -73,50 +84,39 @@ def watch():
     return ImageWatch(max_frozen_s=0.5, max_black_s=0.5)
 
 
-def test_a_frozen_image_marks_every_feature_from_the_limit_on():
-    first_s, reasons = faults(picture=SCENE, image_watch=watch())
-    assert 0.5 < first_s - FRAME_NS / NS_PER_S < 0.5 + 1.5 * FRAME_NS / NS_PER_S
-    assert {reason.code for reason in reasons} == {Code.IMAGE_FROZEN}
+FRAME_S = FRAME_NS / NS_PER_S
+BLACK, NEVER_S = np.zeros_like(SCENE), 100
+TAKEN_OFF_S = 1 + TAKEOFF_NS / NS_PER_S
 
 
-def test_before_the_vehicle_is_airborne_a_frozen_image_is_none():
-    never = START_NS + 100 * NS_PER_S
-    assert faults(picture=SCENE, image_watch=watch(), airborne_from_ns=never) == (None, [])
-
-
-def test_a_camera_that_froze_on_the_ground_is_noticed_after_take_off():
-    first_s, _ = faults(picture=SCENE, image_watch=watch(), airborne_from_ns=START_NS + NS_PER_S)
-    expected_s = 1.0 + TAKEOFF_NS / NS_PER_S + 0.5
-    assert expected_s - 2 * FRAME_NS / NS_PER_S < first_s < expected_s + 2 * FRAME_NS / NS_PER_S
-
-
-def test_a_black_image_is_a_fault_on_the_ground_too():
-    never = START_NS + 100 * NS_PER_S
-    first_s, reasons = faults(
-        picture=np.zeros_like(SCENE), image_watch=watch(), airborne_from_ns=never
-    )
-    assert 0.5 < first_s < 0.6
-    assert {reason.code for reason in reasons} == {Code.IMAGE_BLANK}
+@pytest.mark.parametrize(
+    ("picture", "airborne_from_s", "code", "at_s"),
+    [
+        pytest.param(SCENE, 0, Code.IMAGE_FROZEN, FRAME_S + 0.5, id="frozen"),
+        pytest.param(SCENE, NEVER_S, None, None, id="frozen on the ground"),
+        pytest.param(SCENE, 1, Code.IMAGE_FROZEN, TAKEN_OFF_S + 0.5, id="frozen since the ground"),
+        pytest.param(BLACK, NEVER_S, Code.IMAGE_BLANK, FRAME_S + 0.5, id="black on the ground"),
+    ],
+)
+def test_every_feature_from_the_limit_on_has_the_fault_of_its_image(
+    picture, airborne_from_s, code, at_s
+):
+    first_s, found = faults(picture, watch(), airborne_from_s)
+    assert found == code
+    assert first_s == (at_s if at_s is None else pytest.approx(at_s, abs=2 * FRAME_S))
 
 
 def test_without_a_watch_nothing_is_a_fault():
-    assert faults(picture=np.zeros_like(SCENE), image_watch=None) == (None, [])
+    assert faults(BLACK, None, 0) == (None, None)
 
 
 def test_of_two_loops_with_one_lock_only_the_one_that_computes_is_encoding():
     clock, lock = FakeClock(), threading.Lock()
     seen = []
 
-    def make_loop(encode):
-        return VisionLoop(
-            camera=StillCamera(clock, np.zeros((8, 8, 3), np.uint8)),
-            encode=encode,
-            cache=FeatureCache(),
-            sink=ListSink(),
-            clock=clock,
-            period_ns=lambda: FRAME_NS,
-            encoder_lock=lock,
-        )
+    def encoding(encode):
+        camera = StillCamera(clock, np.zeros((8, 8, 3), np.uint8))
+        return make_loop(clock, camera, lock=lock, encode=encode)
 
     def encode_second(rgb):
         seen.append((first.encoding_since_ns, second.encoding_since_ns))
@@ -128,7 +128,7 @@ def test_of_two_loops_with_one_lock_only_the_one_that_computes_is_encoding():
         seen.append((first.encoding_since_ns, second.encoding_since_ns))
         return np.zeros((1, 8), np.float32)
 
-    first, second = make_loop(encode_first), make_loop(encode_second)
+    first, second = encoding(encode_first), encoding(encode_second)
     waiting = threading.Thread(target=second.step)
     first.step()
     waiting.join(10)
@@ -147,16 +147,7 @@ def stamped_ahead(clock, cache, ahead_ms, image_watch=None):
     camera.read = lambda timeout_ns: replace(
         read(timeout_ns), captured_ns=clock.now_ns() + left_ms.pop(0) * NS_PER_MS
     )
-    return VisionLoop(
-        camera=camera,
-        encode=lambda rgb: np.zeros((1, 8), np.float32),
-        cache=cache,
-        sink=ListSink(),
-        clock=clock,
-        period_ns=lambda: FRAME_NS,
-        encoder_lock=threading.Lock(),
-        image_watch=image_watch,
-    )
+    return make_loop(clock, camera, cache=cache, image_watch=image_watch)
 
 
 @pytest.mark.parametrize("ahead_ms", [-600, 0, 20, 21, 400, 3_000, 55 * 365 * 86_400_000])

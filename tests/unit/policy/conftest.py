@@ -1,5 +1,3 @@
-from collections.abc import Iterator
-
 import pytest
 import torch
 
@@ -7,15 +5,6 @@ from policy.checkpoints.policy_file import BuiltinPolicy, load_checkpoint
 from policy.contract import Contract
 from policy.loading.builtin import SHIPPED
 from policy.nets.toge import Toge, TogeConfig
-
-
-@pytest.fixture(scope="module")
-def one_thread() -> Iterator[None]:
-    """Sums of two threads differ in the last bit; and the other cores are in use, too."""
-    before = torch.get_num_threads()
-    torch.set_num_threads(1)
-    yield
-    torch.set_num_threads(before)
 
 
 @pytest.fixture(scope="session")

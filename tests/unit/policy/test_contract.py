@@ -26,28 +26,6 @@ from policy.loading.builtin import SHIPPED
 from policy.preprocess import least_source_px
 
 
-def test_round_trips_through_its_header_form() -> None:
-    contract = Contract(
-        state_frame="enu_flu",
-        feature_dim=256,
-        horizon=8,
-        chunk_dt_s=0.02,
-        since_exposure=True,
-        modes=("ACRO", "LOITER"),
-        max_state_age_s=0.5,
-        max_velocity_age_s=1,
-        max_feature_age_s=60.0,
-        max_chunk_age_s=2.0,
-        max_stall_s=0.5,
-        max_tilt_deg=180,
-        max_speed_mps=30.0,
-        max_height_m=300.0,
-        max_distance_m=5000.0,
-    )
-    assert Contract.from_json(contract.to_json()) == contract
-    assert json.loads(contract.to_json())["version"] == 6
-
-
 def test_an_older_header_gets_the_defaults_of_what_came_later() -> None:
     header = {"version": 4, "horizon": 8, "image_height": 96}
     contract = Contract.from_json(json.dumps(header))

@@ -62,13 +62,8 @@ def test_a_vehicle_on_its_back_has_crashed_if_it_stays_there(
 
 
 def test_two_short_flips_are_no_crash() -> None:
-    over, level = state(tilt_deg=170), state()
-    assert (
-        watched(
-            *ticks(0, 0.4, state=over), *ticks(40, 0.1, state=level), *ticks(50, 0.4, state=over)
-        )
-        is None
-    )
+    first, second = (ticks(start, 0.4, state=state(tilt_deg=170)) for start in (0, 50))
+    assert watched(*first, *ticks(40, 0.1, state=state()), *second) is None
 
 
 def test_disarmed_in_the_air_is_a_fall_and_on_the_ground_is_none() -> None:

@@ -3,15 +3,12 @@
 import os
 import resource
 import signal
-import subprocess
-import sys
 import threading
 from collections.abc import Iterator
 from multiprocessing.connection import wait
 from pathlib import Path
 
 import pytest
-from pymavlink import mavutil
 
 from helpers.recordings import make_row, picture, send_signal
 from mavbridge.core.vehicle import Packet
@@ -143,71 +140,3 @@ def test_a_killed_writer_costs_the_log_and_not_the_link(tmp_path: Path, pipe: Tl
     video.close()
     link.log.close()
     assert numbers(tmp_path / "link.tlog") == [*range(10)]
-
-
-FLIGHT = """
-import os, signal, subprocess, sys
-from pathlib import Path
-from mavbridge.recording.tlog import TlogJob, open_tlog_pipe
-from mavbridge.recording.video.writer import VideoWriter
-folder = Path(sys.argv[1])
-if __name__ == "__main__":
-    signal.signal(signal.SIGINT, lambda *_: None)
-    pipe = open_tlog_pipe()
-    fd = pipe.writer.fileno()
-    link = [sys.executable, sys.argv[2], str(fd), str(os.getpid())]
-    subprocess.Popen(link, pass_fds=(fd,), start_new_session=True)
-    pipe.writer.close()
-    job = TlogJob(folder / "link.tlog", pipe.reader)
-    video = VideoWriter(folder / "camera.mp4", pressure="online", hz=30, tlog=job)
-    os.killpg(os.getpid(), signal.SIGINT)  # Ctrl-C
-    print("recording", flush=True)
-    sys.stdin.read()
-"""
-LINK = """
-import os, select, sys
-from helpers.wire import WireEnd
-from mavbridge.core.vehicle import Packet
-from mavbridge.mavlink.transport.packet_pipe import PacketPipe
-end, log = WireEnd(), PacketPipe(int(sys.argv[1]), wall_offset_ns=1_700_000_000 * 10**9)
-def send(number):
-    packet = end.pack(end.mav.manual_control_encode(1, number, 0, 0, 0, 0))
-    log.put(Packet(number * 10_000_000, packet))
-for number in range(100):
-    send(number)
-pidfd = os.pidfd_open(int(sys.argv[2]))
-print("flying", flush=True)
-select.select([pidfd], [], [], 30)
-for number in range(100, 200):
-    send(number)
-print("released", log.dropped, flush=True)
-"""
-
-
-def test_after_a_kill_of_the_flight_process_the_log_has_the_release(tmp_path: Path) -> None:
-    scripts = {name: tmp_path / f"{name}.py" for name in ("flight", "link")}
-    scripts["flight"].write_text(FLIGHT)
-    scripts["link"].write_text(LINK)
-    flight = subprocess.Popen(
-        [sys.executable, str(scripts["flight"]), str(tmp_path), str(scripts["link"])],
-        stdin=subprocess.PIPE,
-        stdout=subprocess.PIPE,
-        bufsize=0,
-        start_new_session=True,
-        env=os.environ | {"PYTHONPATH": os.pathsep.join(sys.path)},
-    )
-    with flight:
-        assert flight.stdout is not None
-        lines = set()
-        while lines != {b"flying\n", b"recording\n"} and wait([flight.stdout], DEADLINE_S):
-            lines.add(flight.stdout.readline())
-        flight.kill()
-        assert lines == {b"flying\n", b"recording\n"}
-        # All three have this output: its end is the end of the last of them.
-        assert flight.stdout.read() == b"released 0\n"
-    log = mavutil.mavlogfile(str(tmp_path / "link.tlog"))
-    sent = []
-    while (message := log.recv_msg()) is not None:
-        sent.append(message.x)
-    log.f.close()
-    assert sent == [*range(200)]

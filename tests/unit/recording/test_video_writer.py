@@ -92,26 +92,6 @@ def test_an_odd_row_and_column_are_cut_off(tmp_path: Path) -> None:
     assert number_of(rgb) == 5
 
 
-def test_online_a_full_ring_drops_and_the_next_row_says_so(tmp_path: Path) -> None:
-    with writer(tmp_path, "online") as video:
-        assert video.submit(picture(0), make_row(0))
-        kill(video, signal.SIGSTOP)
-        taken = [0] + [k for k in range(1, 60) if video.submit(picture(k), make_row(k))]
-        assert 0 < len(taken) < 60
-        kill(video, signal.SIGCONT)
-        last = 59
-        while taken[-1] == last or not video.submit(picture(last), make_row(last)):
-            last += 1
-        taken.append(last)
-        video.finish()
-    frames, rows = read_back(tmp_path)
-    assert frames == rows == taken
-    dropped = [row.dropped_before for row in read_frames(read_table(tmp_path / "frames", FRAMES))]
-    gap = last - taken[-2] - 1
-    assert dropped[:-1] == [0] * (len(taken) - 1)
-    assert dropped[-1] >= gap > 0
-
-
 def test_an_offline_producer_that_waits_hears_of_the_death(tmp_path: Path) -> None:
     with writer(tmp_path, "offline") as video:
         video.submit(picture(0), make_row(0))

@@ -51,13 +51,6 @@ def test_no_vehicle_is_a_no_go_in_status_table_and_json(
     assert "NO-GO: " in capsys.readouterr().out
 
 
-def test_json_on_standard_output_is_nothing_but_json(capsys: pytest.CaptureFixture[str]) -> None:
-    check(CheckConfig(timing=0.5, flight=flight("none"), json=Path("-")))
-    out, err = capsys.readouterr()
-    assert json.loads(out)["verdict"] == "no-go"
-    assert "heard nothing" in err
-
-
 def test_the_vehicle_must_be_named() -> None:
     with pytest.raises(UserError, match="--connect"):
         cli.check()

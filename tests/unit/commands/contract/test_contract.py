@@ -129,17 +129,19 @@ def test_one_unknown_name_leaves_the_names_to_the_user(
         read_interface(path)
 
 
-def test_several_cameras_are_called_by_the_ends_of_their_keys(tmp_path: Path) -> None:
-    cameras = ("observation.images.front", "observation.images.down")
-    read = tomllib.loads(draft(dataset(tmp_path, None, cameras=cameras)).read_text())
-    assert read["contract"]["cameras"] == ["down", "front"]
-    assert read["images"] == {key.rpartition(".")[2]: key for key in cameras}
-
-
-def test_cameras_without_usable_names_are_numbered(tmp_path: Path) -> None:
-    cameras = ("left.rgb", "right.rgb")
-    read = tomllib.loads(draft(dataset(tmp_path, None, cameras=cameras)).read_text())
-    assert read["images"] == {"camera_0": "left.rgb", "camera_1": "right.rgb"}
+@pytest.mark.parametrize(
+    ("names", "keys"),
+    [
+        (["down", "front"], ("observation.images.down", "observation.images.front")),
+        (["camera_0", "camera_1"], ("left.rgb", "right.rgb")),
+    ],
+)
+def test_cameras_are_called_by_the_ends_of_their_keys_or_numbered(
+    tmp_path: Path, names: list[str], keys: tuple[str, str]
+) -> None:
+    read = tomllib.loads(draft(dataset(tmp_path, None, cameras=keys[::-1])).read_text())
+    assert read["contract"]["cameras"] == names
+    assert read["images"] == dict(zip(names, keys, strict=True))
 
 
 def test_the_dataset_that_training_noted_is_found(

@@ -22,6 +22,8 @@ from mavbridge.commands.evaluate.run import (
 from mavbridge.config.episodes import (
     HELD_OUT_COURSE_SEED,
     MAX_EPISODES,
+    MAX_EVALUATION_SEED,
+    RACE_COURSE_SEED,
     ConditionsKind,
     EvaluateConfig,
 )
@@ -52,6 +54,8 @@ def test_seeds_follow_from_the_evaluations_seed_and_the_index_alone() -> None:
     assert [spec.seed for spec in first] == list(range(20))
     assert not {spec.course_seed for spec in first} & {spec.course_seed for spec in other}
     assert all(spec.course_seed >= HELD_OUT_COURSE_SEED for spec in (*first, *other))
+    last = EvaluateConfig(policy=PolicyConfig(seed=MAX_EVALUATION_SEED), episodes=MAX_EPISODES)
+    assert EpisodeSpec(config=last, index=MAX_EPISODES - 1).course_seed < RACE_COURSE_SEED
 
 
 @pytest.fixture(scope="module")
@@ -119,26 +123,11 @@ def test_ctrl_c_ends_with_the_results_so_far(
     assert shown.count("mind the gap") == 1
 
 
-def test_an_error_costs_no_result_that_was_there_before(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    def fly(spec: EpisodeSpec, should_stop: Any) -> FlownEpisode:
-        if spec.index == 2:
-            raise PeerError("the vehicle is gone")
-        return flown(spec)
-
-    monkeypatch.setattr(run, "fly_simulated", fly)
-    path = tmp_path / "some.json"
-    with pytest.raises(PeerError, match="the vehicle is gone"):
-        evaluate(EvaluateConfig(policy=CIRCLE, episodes=5, json=path))
-    assert len(json.loads(path.read_text())["episodes"]) == 2
-    assert "ended after 2 of 5 episodes" in capsys.readouterr().err
-
-
 @pytest.mark.parametrize(
     ("flags", "message"),
     [
         (["--episodes", "0"], f"--episodes must be between 1 and {MAX_EPISODES}"),
+        (["--seed", str(MAX_EVALUATION_SEED + 1)], "--seed must be between 0 and"),
         (["--workers", "0"], "--workers must be between"),
         (["--max-time", "0"], "--max-time must be between"),
         (["--gusts", "-1"], "--gusts must be between 0 and 10 m/s"),

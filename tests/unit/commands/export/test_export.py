@@ -4,6 +4,7 @@ import json
 import signal
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pyarrow as pa
@@ -218,23 +219,12 @@ def test_the_command_exports_what_train_can_read(
     assert len(read_dataset(tmp_path / "all")) == 3
 
 
-def _two_sizes(root: Path) -> None:
-    fly(root / "flights" / "a")
-    fly(root / "flights" / "b", size=64)
+def _flights(*each: dict[str, Any]) -> Callable[[Path], None]:
+    def prepare(root: Path) -> None:
+        for number, changes in enumerate(each):
+            fly(root / "flights" / str(number), **changes)
 
-
-def _two_rates(root: Path) -> None:
-    fly(root / "flights" / "a")
-    fly(root / "flights" / "b", period_ms=66)
-
-
-def _two_frames(root: Path) -> None:
-    fly(root / "flights" / "a")
-    fly(root / "flights" / "b", contract={"state_frame": "enu_flu"})
-
-
-def _failed(root: Path) -> None:
-    fly(root / "flights" / "a", success=False)
+    return prepare
 
 
 def _taken(root: Path) -> None:
@@ -246,10 +236,6 @@ def _taken(root: Path) -> None:
 def _left_over(root: Path) -> None:
     fly(root / "flights" / "a")
     (root / "out.unfinished").mkdir()
-
-
-def _no_images(root: Path) -> None:
-    fly(root / "flights" / "a", video_frames=1)
 
 
 def _other_clock(root: Path) -> None:
@@ -266,13 +252,13 @@ def _foreign(root: Path) -> None:
 @pytest.mark.parametrize(
     ("prepare", "says"),
     [
-        (_two_sizes, "images of 64x64"),
-        (_two_rates, "export them apart"),
-        (_two_frames, "one kind at a time"),
-        (_failed, "have failed"),
+        (_flights({}, {"size": 64}), "images of 64x64"),
+        (_flights({}, {"period_ms": 66}), "export them apart"),
+        (_flights({}, {"contract": {"state_frame": "enu_flu"}}), "one kind at a time"),
+        (_flights({"success": False}), "have failed"),
         (_taken, "not empty"),
         (_left_over, "was killed"),
-        (_no_images, "nothing to export"),
+        (_flights({"video_frames": 1}), "nothing to export"),
         (_other_clock, "of one clock"),
         (_foreign, "not a flight of mavbridge"),
     ],

@@ -1,7 +1,6 @@
 """Alignment: whatever the stamps, a row knows nothing that had not arrived at its exposure."""
 
 import numpy as np
-import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
@@ -13,7 +12,6 @@ from mavbridge.commands.export.files import (
     stretches,
     worst_shift_ns,
 )
-from mavbridge.core.errors import UserError
 from policy.data import lerobot_format as names
 from policy.data.flight_data import GATE_DIM, FlightData
 
@@ -113,8 +111,3 @@ def test_a_stretch_of_a_few_hurried_frames_has_the_rate_of_its_flight() -> None:
     both = stretches(episode(captured, list(range(0, 5000, 10))))
     assert [len(part) for part in both] == [101, 2]
     assert common_fps(both) == 30
-
-
-def test_two_rates_are_refused() -> None:
-    with pytest.raises(UserError, match="export them apart"):
-        common_fps(parts([33] * 20, [100] * 10))

@@ -14,11 +14,6 @@ from policy.contract import Contract, FloatArray
 from policy.errors import PolicyError
 
 
-@pytest.fixture(autouse=True)
-def own_cache(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
-    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
-
-
 def test_the_shipped_policy_is_written_as_onnx(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -49,12 +49,6 @@ def test_exactly_the_frames_that_are_needed(
     assert (tmp_path / "a.mp4").exists() == decode_video
 
 
-@pytest.mark.parametrize(("decider", "samples"), [("toge", 1), ("world-model", 2)])
-def test_the_plain_path_decodes_everything(tmp_path: Path, decider: str, samples: int) -> None:
-    done = run(tmp_path / "a.mp4", make_plan(), decider=decider, serial=True)
-    assert done.model.frames_decoded == samples * 3 * 16
-
-
 class RecordingDecider:
     """A decider with a queue of two that keeps what it has seen."""
 

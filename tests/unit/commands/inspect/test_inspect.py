@@ -1,15 +1,17 @@
 import io
 import json
 import shutil
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 from rich.console import Console
 
 from helpers.factories import make_released_tick, make_state, make_tick
-from helpers.recordings import make_frame, make_meta, without_writer_process
+from helpers.recordings import make_frame, make_meta, write_recording
 from mavbridge.commands.config import InspectConfig
 from mavbridge.commands.inspect.analysis import FlightAnalysis, analyse
 from mavbridge.commands.inspect.run import _events as events_of
@@ -20,8 +22,6 @@ from mavbridge.core.errors import MavbridgeError
 from mavbridge.core.reasons import Code, because, reason_to_json
 from mavbridge.core.records import Position, Tick, VisionTick
 from mavbridge.recording.flight_folder import open_flight
-from mavbridge.recording.flight_writer import FlightWriter
-from mavbridge.recording.meta import FlightMeta
 from policy.contract import Contract
 
 GOLDEN = Path(__file__).parents[3] / "data/flights"
@@ -38,26 +38,14 @@ PLANNED_ENDS = {
 
 
 def write(
-    folder: Path,
-    ticks: list[Tick],
-    *,
-    frames: int = 10,
-    meta: FlightMeta | None = None,
-    finish: bool = True,
+    folder: Path, events: Sequence[Tick | VisionTick], *, frames: int = 10, **changes: Any
 ) -> Path:
-    folder.mkdir()
-    with without_writer_process():
-        writer = FlightWriter(folder, meta or make_meta(), pressure="offline")
-        for number in range(frames):
-            writer.frame(make_frame(number))
-        for tick in ticks:
-            writer.tick(tick)
-        if finish:
-            writer.finish(writer.meta)
-        else:
-            writer._flush()
-            writer.close()
-    return folder
+    """A recording of ``events``, behind so many frames of the first camera."""
+    return write_recording(folder, [*map(make_frame, range(frames)), *events], **changes)
+
+
+def flown(count: int) -> list[Tick]:
+    return [make_tick(index) for index in range(count)]
 
 
 def flight_with_a_stall() -> list[Tick]:
@@ -175,12 +163,12 @@ def moments_of(folder: Path, ticks: list[Tick], **changes: object) -> list[tuple
 
 
 def test_a_planned_end_is_no_bad_moment_and_any_other_end_is(tmp_path: Path) -> None:
-    flown = [make_tick(index) for index in range(50)]
+    before = flown(50)
     for code in PLANNED_ENDS:
         ended = make_released_tick(50, because(code, what="flight"), phase="leaving")
-        assert moments_of(tmp_path / code, [*flown, ended]) == []
+        assert moments_of(tmp_path / code, [*before, ended]) == []
     ((what, detail),) = moments_of(
-        tmp_path / "fault", [*flown, make_released_tick(50, LINK_LOST, phase="leaving")]
+        tmp_path / "fault", [*before, make_released_tick(50, LINK_LOST, phase="leaving")]
     )
     assert what == "the policy's flight ended"
     assert detail == (
@@ -189,7 +177,7 @@ def test_a_planned_end_is_no_bad_moment_and_any_other_end_is(tmp_path: Path) -> 
 
 
 def test_coasting_is_told_with_its_reason_even_where_the_recording_ends(tmp_path: Path) -> None:
-    ticks = [make_tick(index) for index in range(50)]
+    ticks = flown(50)
     old = {"state": ticks[49].state, "chunk_serial": 49, "is_coasting": True}
     old["chunk_computed_ns"] = ticks[49].chunk_computed_ns
     ticks += [make_tick(index, **old) for index in range(61, 65)]
@@ -201,7 +189,7 @@ def test_coasting_is_told_with_its_reason_even_where_the_recording_ends(tmp_path
 
 
 def test_close_moments_are_told_as_one(tmp_path: Path) -> None:
-    ticks = [make_tick(index) for index in range(100)]
+    ticks = flown(100)
     image_ns = ticks[50].sent_ns - 200 * NS_PER_MS
     ticks[50] = replace(
         ticks[50],
@@ -217,7 +205,7 @@ def test_close_moments_are_told_as_one(tmp_path: Path) -> None:
 
 
 def test_a_crash_is_a_moment_with_its_time(tmp_path: Path) -> None:
-    ticks = [make_tick(index) for index in range(100)]
+    ticks = flown(100)
     ticks[60] = replace(ticks[60], texts=("vehicle: Crash: Disarming",))
     flight = analyse(
         write(tmp_path / "flight", ticks, frames=0, meta=make_meta(crash="the vehicle said so"))
@@ -226,17 +214,9 @@ def test_a_crash_is_a_moment_with_its_time(tmp_path: Path) -> None:
 
 
 def test_what_the_recorder_has_lost_is_neither_jitter_nor_the_cameras(tmp_path: Path) -> None:
-    folder = tmp_path / "flight"
-    folder.mkdir()
-    with without_writer_process():
-        writer = FlightWriter(folder, make_meta(), pressure="offline")
-        for number in (*range(10), *range(15, 30)):
-            writer.frame(make_frame(number))
-        for index in (*range(50), *range(550, 600)):
-            writer.tick(make_tick(index))
-        writer._flush()
-        writer.close()
-    flight = analyse(folder)
+    frames = [make_frame(number) for number in range(15, 30)]
+    ticks = [make_tick(index) for index in (*range(50), *range(550, 600))]
+    flight = analyse(write(tmp_path / "flight", [*frames, *ticks], finish=False))
     assert flight.report.sticks.rate_hz == pytest.approx(100)
     assert flight.report.sticks.flying_s == pytest.approx(0.98)
     assert np.nanmax(flight.series.period_ms) == pytest.approx(10)
@@ -249,25 +229,16 @@ def test_what_the_recorder_has_lost_is_neither_jitter_nor_the_cameras(tmp_path: 
 
 def test_all_cameras_are_told_and_shown(tmp_path: Path) -> None:
     contract = Contract(cameras=("front", "down"))
-    folder = tmp_path / "flight"
-    folder.mkdir()
-    with without_writer_process():
-        writer = FlightWriter(folder, make_meta(contract=contract), pressure="offline")
-        for number in range(6):
-            writer.frame(make_frame(number))
-        for number in range(4):
-            writer.frame(make_frame(number, camera=1))
-        for index in range(20):
-            writer.tick(make_tick(index))
-        writer.finish(writer.meta)
+    events = [make_frame(number, camera=1) for number in range(4)] + flown(20)
+    meta = make_meta(contract=contract)
+    folder = write(tmp_path / "flight", events, frames=6, meta=meta)
     flight = analyse(folder)
     assert [(each.camera, len(each.exposed_s)) for each in flight.cameras] == [
         ("front", 6),
         ("down", 4),
     ]
     assert "down: p50" in shown(flight)
-    events = list(events_of(folder, contract))
-    images = [event for event in events if isinstance(event, VisionTick)]
+    images = [event for event in events_of(folder, contract) if isinstance(event, VisionTick)]
     assert [image.camera for image in images].count(1) == 4
     assert inspect([folder], InspectConfig(rerun=str(tmp_path / "flight.rrd"))) == 0
 
@@ -312,9 +283,8 @@ def test_recorded_flights_are_told_as_their_columns_have_it(tmp_path: Path, name
     meta = json.loads((folder / "meta.json").read_text())
     (folder / "meta.json").write_text(json.dumps(meta | {"frames": 0}))
     flight = analyse(folder)
-    ticks = [row.tick for row in open_flight(folder).tick_rows()]
-    flown = [tick for tick in ticks if tick.trace is not None]
-    assert flight.report.sticks.sends == len(flown) > 100
+    sends = sum(row.tick.trace is not None for row in open_flight(folder).tick_rows())
+    assert flight.report.sticks.sends == sends > 100
     assert sum(count for _, count in flight.causes) == (
         flight.report.action.late_chunks + flight.report.sticks.missed_slots
     )

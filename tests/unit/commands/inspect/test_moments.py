@@ -17,8 +17,17 @@ def flown(count: int) -> list[Tick]:
     return [make_tick(index) for index in range(count)]
 
 
-def test_a_flight_on_time_has_no_delays() -> None:
-    assert find_delays(flown(20), stick_hz=100, action_hz=100) == ()
+@pytest.mark.parametrize(
+    "ticks",
+    [
+        pytest.param(flown(20), id="on time"),
+        pytest.param([*flown(5), make_tick(6, serial=5), make_tick(7, serial=6)], id="overtaken"),
+        pytest.param([*flown(5), make_tick(60, missed_slots=1, chunk_serial=7)], id="rows lost"),
+        pytest.param([make_released_tick(0), make_tick(5, missed_slots=4)], id="nobody flew"),
+    ],
+)
+def test_what_is_no_delay_of_ours_is_none(ticks: list[Tick]) -> None:
+    assert find_delays(ticks, stick_hz=100, action_hz=100) == ()
 
 
 def late(index: int, by_ms: int, **changes: object) -> Tick:
@@ -74,16 +83,6 @@ def test_a_chunk_after_a_long_solve_is_late_by_that_solve() -> None:
     assert [delay.cause for delay in delays] == ["the policy took long"] * 2
 
 
-def test_a_chunk_that_a_newer_one_overtook_is_not_late() -> None:
-    ticks = [*flown(5), make_tick(6, serial=5), make_tick(7, serial=6)]
-    assert find_delays(ticks, stick_hz=100, action_hz=100) == ()
-
-
-def test_nothing_is_said_about_ticks_that_the_recorder_has_lost() -> None:
-    after = make_tick(60, missed_slots=1, chunk_serial=7)
-    assert find_delays([*flown(5), after], stick_hz=100, action_hz=100) == ()
-
-
 @pytest.mark.parametrize(
     ("sending_ms", "cause"), [(2, "the guard woke late"), (8, "sending took long")]
 )
@@ -96,11 +95,6 @@ def test_missed_slots_are_put_down_to_the_send_before_or_to_the_wake_up(
     )
     (delay,) = find_delays([*flown(4), slow, after], stick_hz=100, action_hz=100)
     assert (delay.what, delay.count, delay.cause) == ("missed slots", 2, cause)
-
-
-def test_slots_while_the_policy_does_not_fly_are_not_missed() -> None:
-    ticks = [make_released_tick(0), make_tick(5, missed_slots=4)]
-    assert find_delays(ticks, stick_hz=100, action_hz=100) == ()
 
 
 def test_who_held_the_sticks_when() -> None:

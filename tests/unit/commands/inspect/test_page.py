@@ -11,14 +11,13 @@ import numpy as np
 import pytest
 
 from helpers.factories import make_released_tick, make_tick
-from helpers.recordings import make_frame, make_meta, without_writer_process
+from helpers.recordings import make_frame, make_meta, write_recording
 from mavbridge.commands.inspect import page
 from mavbridge.commands.inspect.analysis import FlightAnalysis, analyse
 from mavbridge.commands.inspect.page import page_data, write_page
 from mavbridge.core.course import CourseGate
 from mavbridge.core.reasons import Code, because
 from mavbridge.core.records import Position
-from mavbridge.recording.flight_writer import FlightWriter
 
 NASTY = "</script><script>document.title = 'mine'</script><!--"
 CHROMIUM = next(
@@ -27,17 +26,12 @@ CHROMIUM = next(
 
 
 def flight(folder: Path, *, name: str = "scripted:hover", frames: int = 10) -> FlightAnalysis:
-    folder.mkdir()
-    with without_writer_process():
-        writer = FlightWriter(folder, make_meta(policy=name), pressure="offline")
-        for number in range(frames):
-            writer.frame(make_frame(number))
-        for index in range(40):
-            writer.tick(make_tick(index, position_ned_m=Position(0.1 * index, 1.0, -2.0)))
-        writer.tick(
-            make_released_tick(40, because(Code.POLICY_REFUSED, said=NASTY), phase="released")
-        )
-        writer.finish(writer.meta)
+    ticks = [
+        make_tick(index, position_ned_m=Position(0.1 * index, 1.0, -2.0)) for index in range(40)
+    ]
+    end = make_released_tick(40, because(Code.POLICY_REFUSED, said=NASTY), phase="released")
+    events = [*map(make_frame, range(frames)), *ticks, end]
+    write_recording(folder, events, meta=make_meta(policy=name))
     return replace(analyse(folder), gates=(CourseGate(Position(5, 0, -2), 0.1, 2.4),))
 
 

@@ -1,6 +1,5 @@
 """The check of a training run flies, on courses of its own."""
 
-from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -53,51 +52,34 @@ def load_for_torch(config: PolicyConfig, clock: Clock) -> LoadedPolicy:
     return load_configured_policy(replace(config, engine="torch"), clock)
 
 
-def flights_by(fly: Callable[..., EpisodeResult]) -> Callable[..., SimpleNamespace]:
-    return lambda **seeds: SimpleNamespace(fly=partial(fly, **seeds))
-
-
-def test_counts_the_gates_of_courses_that_nothing_else_flies_with_the_weights_in_the_file(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    flown: list[int] = []
-    features: list[FloatArray] = []
+@pytest.fixture
+def flown(monkeypatch: pytest.MonkeyPatch) -> list[tuple[int, FloatArray]]:
+    """Course and feature of each flight; one with the seed n passes 2 n gates."""
+    flights: list[tuple[int, FloatArray]] = []
 
     def fly(runner: PolicyRunner, *, course_seed: int, seed: int) -> EpisodeResult:
         assert runner.dual_rate
-        flown.append(course_seed)
-        features.append(runner.encode(np.full((32, 32, 3), 128, np.uint8)))
+        flights.append((course_seed, runner.encode(np.full((32, 32, 3), 128, np.uint8))))
         return result(course_seed, seed, gates=2 * seed)
 
-    monkeypatch.setattr("mavbridge.simulation.flight.SimulatedFlight", flights_by(fly))
-
-    monkeypatch.setattr(train_check, "load_configured_policy", load_for_torch)  # compiles nothing
-    path = tmp_path / "toge.safetensors"
-    assert train_check.share_of_gates(save(path, 0), checks(path, 3)) == pytest.approx(
-        (0 + 2 + 4) / 24
+    monkeypatch.setattr(
+        "mavbridge.simulation.flight.SimulatedFlight",
+        lambda **seeds: SimpleNamespace(fly=partial(fly, **seeds)),
     )
-    assert flown == [CHECK_COURSE_SEED, CHECK_COURSE_SEED + 1, CHECK_COURSE_SEED + 2]
-    assert CHECK_COURSE_SEED + MAX_EPISODES <= HELD_OUT_COURSE_SEED
-    train_check.share_of_gates(save(path, 1), checks(path, 1))
-    assert not np.allclose(features[0], features[-1])
+    monkeypatch.setattr(train_check, "load_configured_policy", load_for_torch)  # compiles nothing
+    return flights
 
 
-def checks(path: Path, flights: int) -> TrainSettings:
-    return TrainSettings(out=path, check_flights=flights)
-
-
-def test_races_have_courses_of_their_own_to_check_by(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+def test_counts_the_gates_of_courses_that_nothing_else_flies_with_the_weights_in_the_file(
+    tmp_path: Path, flown: list[tuple[int, FloatArray]]
 ) -> None:
-    flown: list[int] = []
-
-    def fly(_runner: PolicyRunner, *, course_seed: int, seed: int) -> EpisodeResult:
-        flown.append(course_seed)
-        return result(course_seed, seed, gates=1)
-
-    monkeypatch.setattr("mavbridge.simulation.flight.SimulatedFlight", flights_by(fly))
-    monkeypatch.setattr(train_check, "load_configured_policy", load_for_torch)
-    path = save(tmp_path / "toge.safetensors", 0)
-    settings = TrainSettings(out=path, check_flights=2, check_courses="race")
-    train_check.share_of_gates(path, settings)
-    assert flown == [RACE_COURSE_SEED + CHECK_COURSE_SEED + index for index in range(2)]
+    path = tmp_path / "toge.safetensors"
+    settings = TrainSettings(out=path, check_flights=3)
+    share = train_check.share_of_gates(save(path, 0), settings)
+    assert share == pytest.approx((0 + 2 + 4) / 24)
+    assert [course for course, _ in flown] == [CHECK_COURSE_SEED + index for index in range(3)]
+    assert CHECK_COURSE_SEED + MAX_EPISODES <= HELD_OUT_COURSE_SEED
+    races = replace(settings, check_flights=1, check_courses="race")
+    train_check.share_of_gates(save(path, 1), races)
+    assert flown[-1][0] == RACE_COURSE_SEED + CHECK_COURSE_SEED
+    assert not np.allclose(flown[0][1], flown[-1][1])

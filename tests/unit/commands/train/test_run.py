@@ -1,12 +1,10 @@
 """``mavbridge train`` and ``train-world-model``, from the command line to the checkpoint."""
 
 import signal
-from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
 import pytest
-import torch
 
 from helpers.flight_folders import write_meta, write_spot_flight
 from mavbridge.__main__ import main
@@ -21,17 +19,11 @@ from policy.nets.toge import TogeConfig
 from policy.training.report import TrainingProgress
 from policy.training.settings import TrainSettings
 
+pytestmark = pytest.mark.usefixtures("one_thread")
+
 SMALL = ("--policy", "toge:small:resnet8", "--image-size", "32", "--batch-size", "4")
 OLD = ["--policy", "world-model"]
 OUT = ["flights", "--out", "a.safetensors"]
-
-
-@pytest.fixture(autouse=True)
-def one_thread() -> Iterator[None]:
-    before = torch.get_num_threads()
-    torch.set_num_threads(1)
-    yield
-    torch.set_num_threads(before)
 
 
 def status_of(*arguments: str) -> int:

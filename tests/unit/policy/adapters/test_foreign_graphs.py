@@ -25,11 +25,6 @@ from policy.protocol import PolicyRunner
 Write = Callable[[Path], None]
 
 
-@pytest.fixture(autouse=True)
-def own_cache(tmp_path_factory: pytest.TempPathFactory, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path_factory.mktemp("cache")))
-
-
 def load(spec: str) -> PolicyRunner:
     request = PolicyRequest(spec=spec, dual_rate=False)
     return load_policy(request, now_s=lambda: 0.0).runner
@@ -43,6 +38,14 @@ def act(runner: PolicyRunner, *, vx_mps: float = 0.0, level: int = 0) -> np.ndar
     rgb = np.full((contract.image_height, contract.image_width, 3), level, np.uint8)
     history = np.zeros((1, contract.history_len, 4), np.float32)
     return runner.act(runner.join([[runner.encode(rgb)]]), state, history)[0, 0]
+
+
+def require_counting(runner: PolicyRunner) -> None:
+    """Its hidden state goes from call to call until a reset."""
+    for _ in range(2):
+        throttles = [act(runner)[0] for _ in range(3)]
+        assert throttles == pytest.approx([0.1, 0.2, 0.3], abs=1e-3)
+        runner.reset()
 
 
 @pytest.mark.parametrize("state", ["obs", "observation", "x.1"])
@@ -68,11 +71,7 @@ def test_a_hidden_state_goes_from_call_to_call_until_reset(tmp_path, hidden):
     graphs.recurrent(tmp_path / "policy.onnx", hidden=hidden)
     if hidden == ("h", "hn"):
         graphs.describe(tmp_path, hidden={"h": "hn"}, outputs={"chunk": "actions"})
-    runner = load(f"onnx:{tmp_path}")
-    for _ in range(2):
-        throttles = [act(runner)[0] for _ in range(3)]
-        assert throttles == pytest.approx([0.1, 0.2, 0.3], abs=1e-3)
-        runner.reset()
+    require_counting(load(f"onnx:{tmp_path}"))
 
 
 @pytest.mark.parametrize(
@@ -211,21 +210,13 @@ def test_a_tuple_of_torchscript_needs_to_be_told_apart(tmp_path: Path) -> None:
         load(f"torchscript:{tmp_path / 'policy.pt'}")
 
 
-def test_a_torchscript_of_an_observation_alone_flies_as_it_is(tmp_path: Path) -> None:
+def test_torchscript_of_an_observation_alone_flies_and_keeps_its_state(tmp_path: Path) -> None:
     graphs.write_contract(tmp_path)
-    graphs.save_script(tmp_path / "policy.pt", graphs.StateActor())
-    runner = load(f"torchscript:{tmp_path / 'policy.pt'}")
+    graphs.save_script(tmp_path / "state.pt", graphs.StateActor())
+    runner = load(f"torchscript:{tmp_path / 'state.pt'}")
     assert act(runner, vx_mps=2.0) == pytest.approx([0.2] * 4, abs=1e-3)
-
-
-def test_a_recurrent_torchscript_keeps_its_state_until_reset(tmp_path: Path) -> None:
-    graphs.write_contract(tmp_path)
-    graphs.save_script(tmp_path / "policy.pt", graphs.CountingActor())
-    runner = load(f"torchscript:{tmp_path / 'policy.pt'}")
-    for _ in range(2):
-        throttles = [act(runner)[0] for _ in range(3)]
-        assert throttles == pytest.approx([0.1, 0.2, 0.3], abs=1e-3)
-        runner.reset()
+    graphs.save_script(tmp_path / "counting.pt", graphs.CountingActor())
+    require_counting(load(f"torchscript:{tmp_path / 'counting.pt'}"))
 
 
 class Deep(nn.Module):

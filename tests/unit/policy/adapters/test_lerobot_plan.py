@@ -80,16 +80,16 @@ def test_a_config_that_is_not_supported_is_refused(folder, change, said):
 
 
 @pytest.mark.parametrize(
-    "feature",
+    ("key", "kind"),
     [
-        {"observation.environment_state": {"type": "ENV", "shape": [4]}},
-        {"observation.wind": {"type": "ENV", "shape": [3]}},
-        {"observation.goal": {"type": "GOAL", "shape": [3]}},
+        ("observation.environment_state", {"type": "ENV", "shape": [4]}),
+        ("observation.wind", {"type": "ENV", "shape": [3]}),
+        ("observation.goal", {"type": "GOAL", "shape": [3]}),
     ],
 )
-def test_inputs_that_no_vehicle_measures_are_refused(folder, feature):
-    edit(folder / "config.json", lambda data: data["input_features"].update(feature))
-    with pytest.raises(CheckpointError, match=next(iter(feature))):
+def test_inputs_that_no_vehicle_measures_are_refused(folder, key, kind):
+    edit(folder / "config.json", lambda data: data["input_features"].update({key: kind}))
+    with pytest.raises(CheckpointError, match=key):
         read_plan(folder, None)
 
 

@@ -7,13 +7,19 @@ import pytest
 import torch
 from torch import nn
 
-from helpers.torch_policies import DUAL, SINGLE, Encoder, ForwardOnly, NamedDenoiser
-from policy.engines.choose import chunks_of_samples
-from policy.engines.parity import make_parity_samples, parity_failure
+from helpers.torch_policies import (
+    DUAL,
+    SINGLE,
+    Encoder,
+    ForwardOnly,
+    NamedDenoiser,
+    loaded,
+    require_same,
+)
+from policy.engines.parity import make_parity_samples
 from policy.errors import PolicyError
-from policy.loading.load import check_request, load_policy, read_policy_contract
+from policy.loading.load import check_request, read_policy_contract
 from policy.loading.request import PolicyRequest
-from policy.protocol import PolicyRunner
 
 pytestmark = [
     pytest.mark.filterwarnings("ignore:.*torch.jit:DeprecationWarning"),
@@ -26,21 +32,6 @@ image_height = 32
 image_width = 32
 horizon = 8
 """
-
-
-@pytest.fixture(autouse=True)
-def own_cache(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
-    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
-
-
-def loaded(request: PolicyRequest) -> tuple[PolicyRunner, str]:
-    policy = load_policy(request, now_s=lambda: 0.0)
-    return policy.runner, "\n".join(policy.notes)
-
-
-def require_same(a: PolicyRunner, b: PolicyRunner) -> None:
-    samples = make_parity_samples(a.contract)
-    assert parity_failure(chunks_of_samples(a, samples), chunks_of_samples(b, samples)) is None
 
 
 @pytest.mark.parametrize(

@@ -10,7 +10,16 @@ import numpy as np
 import pytest
 import torch
 
-from helpers.torch_policies import DUAL, SINGLE, WIDE, ForwardOnly, TwoRates, Wide
+from helpers.torch_policies import (
+    DUAL,
+    SINGLE,
+    WIDE,
+    ForwardOnly,
+    TwoRates,
+    Wide,
+    loaded,
+    require_same,
+)
 from policy.adapters.export import OurPolicy, export_onnx, export_torchscript
 from policy.adapters.onnx import policies
 from policy.adapters.onnx.graphs import GraphFile, Ports, Wanted
@@ -21,20 +30,13 @@ from policy.engines.parity import make_parity_samples, parity_failure
 from policy.engines.runner import ExecutionSettings
 from policy.engines.torch_eager import make_torch_runner
 from policy.errors import PolicyError
-from policy.loading.load import check_request, load_policy, read_policy_contract
+from policy.loading.load import check_request, read_policy_contract
 from policy.loading.request import PolicyRequest
 from policy.nets.resnet_unet import ResnetUnet, ResnetUnetConfig
 from policy.nets.toge import Toge
 from policy.protocol import PolicyRunner
 
 STEPS = 4
-
-
-@pytest.fixture(scope="module", autouse=True)
-def own_cache(tmp_path_factory: pytest.TempPathFactory) -> object:
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setenv("XDG_CACHE_HOME", str(tmp_path_factory.mktemp("cache")))
-        yield
 
 
 @pytest.fixture(scope="module")
@@ -44,20 +46,8 @@ def exported_toge(trained_toge: Toge, tmp_path_factory: pytest.TempPathFactory) 
     return folder
 
 
-def loaded(request: PolicyRequest) -> tuple[PolicyRunner, str]:
-    policy = load_policy(request, now_s=lambda: 0.0)
-    return policy.runner, "\n".join(policy.notes)
-
-
-def reference(
-    policy: OurPolicy | TwoRates | ForwardOnly, settings: ExecutionSettings
-) -> PolicyRunner:
+def reference(policy: OurPolicy | TwoRates, settings: ExecutionSettings) -> PolicyRunner:
     return make_torch_runner(policy, settings)  # type: ignore[arg-type]
-
-
-def require_same(a: PolicyRunner, b: PolicyRunner) -> None:
-    samples = make_parity_samples(a.contract)
-    assert parity_failure(chunks_of_samples(a, samples), chunks_of_samples(b, samples)) is None
 
 
 @pytest.mark.parametrize("dual_rate", [True, False])
@@ -126,27 +116,16 @@ IMAGE, STATE = (1, 3, 32, 32), (1, 13)
 
 
 def test_one_file_by_the_names_of_a_contract_file(tmp_path: Path) -> None:
-    policy = ForwardOnly()
     shapes = {"observation.images.front": IMAGE, "observation.state": STATE}
-    write(policy, tmp_path / "mine.onnx", shapes)
+    write(ForwardOnly(), tmp_path / "mine.onnx", shapes)
     (tmp_path / "mavbridge.toml").write_text(
         "[contract]\nimage_height = 32\nimage_width = 32\nhorizon = 8\n"
     )
     request = PolicyRequest(spec=f"onnx:{tmp_path / 'mine.onnx'}", dual_rate=False)
     runner, notes = loaded(request)
     assert "mine.onnx" in notes
-    samples = make_parity_samples(SINGLE)
-    for rgb, state, chunk in zip(
-        samples.rgb, samples.state, chunks_of_samples(runner, samples), strict=True
-    ):
-        image = torch.from_numpy(loaded_image(runner, rgb))
-        with torch.inference_mode():
-            wanted = policy(image.reshape(IMAGE), torch.from_numpy(state[None]))[0].numpy()
-        np.testing.assert_allclose(chunk, wanted, atol=0.01)
-
-
-def loaded_image(runner: PolicyRunner, rgb: np.ndarray) -> np.ndarray:
-    return runner.encode(rgb)
+    mine = PolicyRequest(spec="helpers.torch_policies:ForwardOnly", dual_rate=False)
+    require_same(runner, loaded(mine)[0])
 
 
 def test_an_encoder_and_a_head(tmp_path: Path) -> None:

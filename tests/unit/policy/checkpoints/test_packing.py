@@ -1,4 +1,4 @@
-"""Packed weights are close to what they were, and packing them again changes nothing."""
+"""Packed weights are close to what they were."""
 
 import torch
 
@@ -28,11 +28,3 @@ def test_each_weight_is_off_by_at_most_half_a_step() -> None:
         "backbone.norm.num_batches_tracked",
     ):
         assert torch.equal(state[name], STATE[name])
-
-
-def test_packing_again_keeps_every_step() -> None:
-    packed = pack(STATE, coarse="backbone.")
-    again = pack(unpack(packed), coarse="backbone.")
-    for name, value in packed.items():
-        torch.testing.assert_close(again[name], value)
-    assert all(torch.equal(unpack(STATE)[name], value) for name, value in STATE.items())

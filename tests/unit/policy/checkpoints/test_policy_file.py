@@ -21,8 +21,6 @@ from policy.nets.diffusion import NoiseSchedule
 from policy.nets.resnet_unet import ResnetUnetConfig
 from policy.nets.toge import Toge, TogeConfig
 
-SMALL = Contract(image_height=32, image_width=32)
-
 
 @pytest.fixture(scope="module")
 def saved(small_toge: Toge, tmp_path_factory: pytest.TempPathFactory) -> Path:

@@ -69,11 +69,9 @@ def test_files_that_are_not_there_or_cut_short_are_refused(model, tmp_path):
         load_world_model(tmp_path / "other.safetensors")
     with pytest.raises(CheckpointError, match=r"stored as \.safetensors"):
         load_world_model(tmp_path / "world.pt")
-    contents = path.read_bytes()
-    for length in (0, 7, 400, len(contents) - 1):
-        path.write_bytes(contents[:length])
-        with pytest.raises(CheckpointError, match="cut short"):
-            load_world_model(path)
+    path.write_bytes(path.read_bytes()[:-1])
+    with pytest.raises(CheckpointError, match="cut short"):
+        load_world_model(path)
 
 
 def test_a_policy_and_a_foreign_file_are_refused(small_toge, model, tmp_path):

@@ -157,49 +157,41 @@ def test_one_of_several_cameras_is_named(tmp_path: Path) -> None:
         read_dataset(tmp_path / "a", "tail")
 
 
-def _edit_rows(root: Path, name: str, change: Callable[[list[Any]], list[Any]]) -> None:
-    path = root / "data/chunk-000/file-000.parquet"
-    table = pq.read_table(path)
-    values = pa.array(change(table[name].to_pylist()), table[name].type)
-    pq.write_table(table.set_column(table.column_names.index(name), name, values), path)
+ROWS = "data/chunk-000/file-000.parquet"
+
+
+def _edit_table(change: Callable[[pa.Table], pa.Table]) -> Callable[[Path], None]:
+    return lambda root: pq.write_table(change(pq.read_table(root / ROWS)), root / ROWS)
+
+
+def _edit_rows(name: str, change: Callable[[list[Any]], list[Any]]) -> Callable[[Path], None]:
+    def edited(table: pa.Table) -> pa.Table:
+        values = pa.array(change(table[name].to_pylist()), table[name].type)
+        return table.set_column(table.column_names.index(name), name, values)
+
+    return _edit_table(edited)
 
 
 def _nan(values: list[Any]) -> list[Any]:
     return [*values[:3], [np.nan] * len(values[3]), *values[4:]]
 
 
-def _drop_column(root: Path) -> None:
-    path = root / "data/chunk-000/file-000.parquet"
-    pq.write_table(pq.read_table(path).drop_columns(["action"]), path)
-
-
-def _drop_rows(root: Path) -> None:
-    path = root / "data/chunk-000/file-000.parquet"
-    pq.write_table(pq.read_table(path).slice(0, 15), path)
-
-
-def _scalar_state(root: Path) -> None:
-    path = root / "data/chunk-000/file-000.parquet"
-    table = pq.read_table(path)
-    flat = pa.array(np.zeros(table.num_rows, np.float32))
-    pq.write_table(table.set_column(0, "observation.state", flat), path)
+def _scalar_state(table: pa.Table) -> pa.Table:
+    return table.set_column(0, "observation.state", pa.array(np.zeros(table.num_rows, "f4")))
 
 
 @pytest.mark.parametrize(
     ("spoil", "says"),
     [
-        (lambda root: _edit_rows(root, "observation.state", _nan), "NaN or infinity in row 3"),
-        (lambda root: _edit_rows(root, "timestamp", lambda v: v[::-1]), "runs backwards"),
-        (lambda root: _edit_rows(root, "timestamp", lambda v: [None, *v[1:]]), "missing in 1"),
-        (lambda root: _edit_rows(root, "action", lambda v: [[7.0] * 4] * len(v)), "sticks in"),
-        (_drop_column, "lacks .*action"),
-        (_drop_rows, "holds 3 rows"),
-        (_scalar_state, "13 numbers a row"),
-        (lambda root: (root / "data/chunk-000/file-000.parquet").unlink(), "is not there"),
-        (
-            lambda root: (root / "data/chunk-000/file-000.parquet").write_bytes(b"PAR1"),
-            "cannot be read",
-        ),
+        (_edit_rows("observation.state", _nan), "NaN or infinity in row 3"),
+        (_edit_rows("timestamp", lambda v: v[::-1]), "runs backwards"),
+        (_edit_rows("timestamp", lambda v: [None, *v[1:]]), "missing in 1"),
+        (_edit_rows("action", lambda v: [[7.0] * 4] * len(v)), "sticks in"),
+        (_edit_table(lambda table: table.drop_columns(["action"])), "lacks .*action"),
+        (_edit_table(lambda table: table.slice(0, 15)), "holds 3 rows"),
+        (_edit_table(_scalar_state), "13 numbers a row"),
+        (lambda root: (root / ROWS).unlink(), "is not there"),
+        (lambda root: (root / ROWS).write_bytes(b"PAR1"), "cannot be read"),
         (
             lambda root: (root / "meta/episodes/chunk-000/file-000.parquet").unlink(),
             "no meta/episodes",
@@ -233,11 +225,6 @@ def test_an_image_file_that_cannot_be_used_is_named(name: str, says: str, tmp_pa
     root = write(tmp_path / "a", kind="image files")
     cv2.imwrite(str(tmp_path / "out.png"), np.zeros((SIZE, SIZE, 3), np.uint8))
     (root / "images/9.png").write_bytes(b"no image")
-    path = root / "data/chunk-000/file-000.parquet"
-    table = pq.read_table(path)
-    kind = pa.struct([("bytes", pa.binary()), ("path", pa.string())])
-    cells = pa.array([{"bytes": None, "path": name}] * table.num_rows, kind)
-    at = table.column_names.index(CAMERA)
-    pq.write_table(table.set_column(at, CAMERA, cells), path)
+    _edit_rows(CAMERA, lambda cells: [{"bytes": None, "path": name}] * len(cells))(root)
     with pytest.raises(DatasetError, match=f"row 0 .*{name}.*{says}"):
         list(read_dataset(root)[0].decode())

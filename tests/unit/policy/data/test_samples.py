@@ -113,30 +113,6 @@ def test_chunk_by_hand() -> None:
     np.testing.assert_allclose(chunk[1, :, 1], [0.65, 0.75, 0.75, 0.75], atol=1e-6)  # held
 
 
-def test_since_exposure_by_hand() -> None:
-    """A quarter turn to the right in 100 ms, gathering 1 m/s northwards, nose east at exposure."""
-    tick_ns = np.arange(5) * 100 * MS
-    state = np.zeros((5, 13), np.float32)
-    state[:, QUATERNION] = about_z(np.array([0.0, 90, 180, 180, 180]) * np.pi / 180)
-    state[:, 0] = [0.0, 1.0, 2.0, 3.0, 4.0]
-    episode = flown(
-        tick_ns=tick_ns,
-        attitude_ns=tick_ns,
-        velocity_ns=tick_ns,
-        state=state,
-        target_ns=tick_ns,
-        target=np.zeros((5, 4), np.float32),
-        captured_ns=np.array([100 * MS, 150 * MS]),
-        gate=np.zeros((2, 7), np.float32),
-        age_ns=np.array([100 * MS]),
-    )
-    told = timeline(episode).states(np.array([0, 1]), np.array([2, 2]))[:, 13:]
-    # North is to the left (-y) of a body that looks east.
-    np.testing.assert_allclose(told[0], [0.1, 0, 0, np.pi / 2, 0, -1, 0], atol=1e-5)
-    half = np.sqrt(0.5) / 2
-    np.testing.assert_allclose(told[1], [0.05, 0, 0, np.pi / 4, -half, -half, 0], atol=1e-5)
-
-
 def test_the_runtime_gives_the_same_motion_since_exposure() -> None:
     episode = flown(ticks=60)
     line = timeline(episode)

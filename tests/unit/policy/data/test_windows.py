@@ -22,13 +22,6 @@ def without(episode: FlightData, *dropped: int) -> FlightData:
     return replace(episode, captured_ns=episode.captured_ns[kept], gate=episode.gate[kept])
 
 
-def test_every_frame_begins_a_window_until_the_flight_ends() -> None:
-    found = windows_of(steered_flight(0))
-    assert len(found) == 91 - 15  # 91 frames; the last of six is 15 frames after the first
-    np.testing.assert_array_equal(found.frames[0], [0, 3, 6, 9, 12, 15])
-    np.testing.assert_array_equal(found.frames[:, 0], np.arange(76))
-
-
 def test_windows_stay_in_one_flight_and_cross_no_gap() -> None:
     first, second = steered_flight(0), steered_flight(1)
     gap = range(40, 47)

@@ -8,7 +8,6 @@ import pytest
 import torch
 
 from policy.contract import Contract
-from policy.engines.parity import make_parity_samples
 from policy.engines.runner import (
     ExecutionSettings,
     encode_all,
@@ -62,14 +61,12 @@ def test_numpy_policies_are_called_as_they_are(dual_rate: bool) -> None:
 @pytest.mark.parametrize("make", [make_numpy_runner, make_torch_runner])
 def test_a_persons_policy_that_asks_gets_the_motion_since_the_exposure(make):
     seen: list[tuple[int, ...]] = []
-    policy = Fake(act=lambda feature, state: seen.append(tuple(state.shape)) or CHUNK)
-    policy.contract = replace(policy.contract, since_exposure=True)
-    if make is make_torch_runner:
-        policy = Fake(
-            encode=lambda _: torch.zeros(1, 2),
-            act=lambda feature, state: seen.append(tuple(state.shape)) or torch.tensor(CHUNK),
-        )
-        policy.contract = replace(policy.contract, since_exposure=True, arrays="torch")
+    arrays, made = ("torch", torch.tensor) if make is make_torch_runner else ("numpy", np.array)
+    policy = Fake(
+        encode=lambda _: made(np.zeros((1, 2), np.float32)),
+        act=lambda feature, state: seen.append(tuple(state.shape)) or made(CHUNK),
+    )
+    policy.contract = replace(policy.contract, since_exposure=True, arrays=arrays)
     make(policy, ExecutionSettings(name="fake"))
     assert set(seen) == {(1, 20)}
 
@@ -213,14 +210,3 @@ def test_single_rate_images_keep_camera_and_time_apart(steps, cameras, expected)
     runner.act(encode_all(runner, images), level_state(contract), HISTORY)
     assert policy.image.shape == (1, *contract.image_shape)
     np.testing.assert_allclose(policy.image[0].mean(axis=(-3, -2, -1)), expected, atol=1e-4)
-
-
-def test_parity_samples_have_every_extra_input() -> None:
-    contract = Contract(
-        observation_steps=2, since_exposure=True, state_extras=("goal", "height", "altitude")
-    )
-    samples = make_parity_samples(contract)
-    assert samples.state.shape == (4, 2, 25)
-    assert samples.rgb.shape == (4, 2, 224, 224, 3)
-    assert np.abs(samples.state).min(axis=(0, 1)).min() > 0
-    np.testing.assert_allclose(np.linalg.norm(samples.state[..., 3:7], axis=-1), 1, atol=1e-6)

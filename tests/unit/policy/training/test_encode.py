@@ -51,17 +51,3 @@ def test_with_time_for_all_both_ways_are_there(tmp_path: Path) -> None:
         assert store.has_mirrored
         for wanted in (False, True):
             assert set(store.ways(store.frames, np.full(FRAMES, wanted))) == {wanted}
-
-
-def test_unmirrored_images_are_encoded_as_they_are(tmp_path: Path) -> None:
-    jobs = one_way_first(np.arange(FRAMES), mirror=False)
-    store = encoded(tmp_path / "plain", jobs, jobs_done=len(jobs) + 1)
-    assert not store.has_mirrored
-    assert not store.ways(store.frames, np.zeros(FRAMES, bool)).any()
-
-
-def test_both_ways_at_a_time_leaves_no_image_with_one(tmp_path: Path) -> None:
-    jobs = both_ways(np.arange(FRAMES), mirror=True)
-    store = encoded(tmp_path / "cut", jobs, jobs_done=1)
-    assert store.has_mirrored
-    assert store.frames.tolist() == list(range(ENCODE_BATCH))

@@ -66,13 +66,6 @@ def gradients_of(batch: Batch, model: Trainee) -> dict[str, torch.Tensor]:
     return {name: p.grad.clone() for name, p in model.named_parameters() if p.grad is not None}
 
 
-def test_splits_between_images(batch: Batch) -> None:
-    first, second = batch.split(2)
-    assert (len(first.look), len(second.look)) == (3, 4)
-    assert (len(first.state), len(second.state)) == (9, 12)
-    torch.testing.assert_close(torch.cat([first.chunk, second.chunk]), batch.chunk)
-
-
 def test_gradients_are_those_of_the_mean_loss(batch: Batch, threads: int) -> None:
     model = trainee()
     made = gradients_of(batch, model)
@@ -83,12 +76,6 @@ def test_gradients_are_those_of_the_mean_loss(batch: Batch, threads: int) -> Non
     for name, parameter in model.named_parameters():
         assert parameter.grad is not None
         torch.testing.assert_close(parameter.grad, made[name], rtol=1e-3, atol=1e-6)
-
-
-def test_the_same_twice(batch: Batch, threads: int) -> None:
-    assert threads in (1, 2)
-    first, second = (gradients_of(batch, trainee()) for _ in range(2))
-    assert all(torch.equal(first[name], second[name]) for name in first)
 
 
 def test_statistics_of_norms_are_those_of_the_first_part(batch: Batch, threads: int) -> None:

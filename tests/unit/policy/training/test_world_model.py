@@ -17,19 +17,18 @@ from policy.checkpoints.policy_file import TRAINING_KEY
 from policy.checkpoints.world_model_file import load_world_model
 from policy.contract import QUATERNION, VELOCITY, Contract
 from policy.data.flight_data import DatasetError, FlightData
-from policy.data.frames import store_frames
 from policy.data.windows import find_windows
 from policy.errors import PolicyError
 from policy.training.batches import FeatureStore, both_ways, encode_rows
 from policy.training.report import Hooks, TrainingProgress, TrainResult, WorldModelValidation
 from policy.training.run_folder import TrainingError
 from policy.training.settings import WorldModelSettings
-from policy.training.world_model.batches import CONTEXT_NOISE, WindowBatches, frame_batch
-from policy.training.world_model.losses import autoencoder_loss, dynamics_loss, set_scales
+from policy.training.world_model.batches import CONTEXT_NOISE, WindowBatches
+from policy.training.world_model.losses import dynamics_loss
 from policy.training.world_model.run import train_world_model
 from policy.world_model.config import WorldModelConfig
 from policy.world_model.model import WorldModel
-from policy.world_model.relative_state import context_features, motion_since
+from policy.world_model.relative_state import motion_since
 
 pytestmark = pytest.mark.usefixtures("one_thread")
 
@@ -219,30 +218,6 @@ def _turn_about_z(states: torch.Tensor) -> torch.Tensor:
     return torch.atan2(motion[..., 4], 1 + motion[..., 3])
 
 
-def test_scales_make_what_is_denoised_of_unit_size(tmp_path: Path) -> None:
-    windows = find_windows(
-        [steered_flight(seed) for seed in range(3)], context_frames=2, frames=4, frame_dt_s=0.1
-    )
-    latents = latents_of(273, tmp_path / "latents", mirror=False)
-    model = WorldModel(MODEL)
-    set_scales(model, windows, latents, mirrors=False)
-    samples = windows.samples(np.arange(len(windows)))
-    states = torch.from_numpy(samples.states)
-    motion = model.normalise_motion(motion_since(states[:, 1:2], states[:, 2:]))
-    assert motion.mean(dim=0).abs().max() < 1e-3
-    moving = motion.std(dim=0)[:, [0, 3, 4, 11]]  # speed, both of yaw, and its rate
-    assert moving.min() > 0.05
-    assert moving.max() < 1.01
-    sticks = model.normalise_actions(torch.from_numpy(samples.actions))
-    torch.testing.assert_close(sticks[..., 1:3].std(dim=(0, 1)), torch.ones(2), atol=0.01, rtol=0)
-    assert sticks[..., 0].abs().max() == 0
-    raw = torch.from_numpy(latents.read(np.arange(273), np.zeros(273, bool)))
-    normal = model.autoencoder.normalise(raw.reshape(273, 4, 4, 4))
-    assert abs(float(normal.mean())) < 1e-3
-    assert float(normal.std()) == pytest.approx(1.0, abs=0.01)
-    assert context_features(states[:, :2], MODEL.contract).abs().max() < 5
-
-
 def test_known_sticks_are_no_loss(tmp_path: Path) -> None:
     windows = find_windows([steered_flight(0)], context_frames=2, frames=4, frame_dt_s=0.1)
     latents = latents_of(91, tmp_path / "latents", mirror=False)
@@ -254,24 +229,6 @@ def test_known_sticks_are_no_loss(tmp_path: Path) -> None:
         assert (float(metrics["sticks"]) > 0) == decides
         assert float(metrics["motion"]) > 0
         assert float(metrics["latents"]) > 0
-
-
-def test_the_autoencoder_sees_neighbours_and_pays_for_what_changes(tmp_path: Path) -> None:
-    flight = steered_flight(0)
-    windows = find_windows([flight], context_frames=2, frames=4, frame_dt_s=0.1)
-    size = MODEL.image_size
-    store = store_frames([flight], tmp_path, size)
-    batch = frame_batch(store, windows, MODEL, settings(tmp_path, mirror=True), 3)
-    assert batch.images.shape == (4, 2, size, size, 3)
-    assert (batch.images[:, 0] != batch.images[:, 1]).any()
-    still = replace(batch, images=batch.images[:, :1].expand_as(batch.images))
-    model = WorldModel(MODEL)
-    with torch.inference_mode():
-        unsteady, steady = (
-            float(autoencoder_loss(model, one).metrics["unsteady"]) for one in (batch, still)
-        )
-    assert unsteady > steady
-    assert steady == pytest.approx(0.0, abs=1e-6)
 
 
 def test_flights_that_do_not_fit_are_refused(flights: list[FlightData], tmp_path: Path) -> None:
