@@ -4,7 +4,7 @@ Code branches on ``Reason.code``, recordings store it and tests compare it. The 
 ``str(reason)``, is for people only.
 """
 
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from enum import Enum, StrEnum, auto
 from typing import TypeAlias
@@ -452,13 +452,8 @@ class Reason:
 
 
 def because(code: Code, **data: Value) -> Reason:
-    """Return a reason. numpy scalars become Python values, since the guard has no numpy."""
-    return Reason(code, tuple((name, _plain(value)) for name, value in data.items()))
-
-
-def _plain(value: Value) -> Value:
-    to_plain: Callable[[], Value] | None = getattr(value, "item", None)
-    return value if to_plain is None else to_plain()
+    """Return the reason with this code and these figures."""
+    return Reason(code, tuple(data.items()))
 
 
 def reason_to_json(reason: Reason, *, has_words: bool = True) -> dict[str, object]:

@@ -165,7 +165,7 @@ _TO_GUARD = (GuardSettings, FlightSettings, NoChunk, str, EndRequest)
 def encode_to_guard(message: ToGuard) -> bytes:
     """Encode a message of the flight process."""
     if not isinstance(message, Chunk):
-        return _PICKLE + pickle.dumps(message)
+        return _pickled(message)
     stamps = (*message[:7], message.reset_ns)
     count = len(message.actions)
     values = [value for action in message.actions for value in action]
@@ -189,7 +189,7 @@ def encode_from_guard(message: FromGuard) -> bytes:
             return _encode_tick(message)
         case Samples(samples):
             return encode_samples(samples)
-    return _PICKLE + pickle.dumps(message)
+    return _pickled(message)
 
 
 def decode_from_guard(data: bytes) -> FromGuard:
@@ -206,14 +206,36 @@ def decode_from_guard(data: bytes) -> FromGuard:
     return message
 
 
+class _Pickler(pickle.Pickler):
+    """Pickler that writes scalars of numpy, such as those of a user's contract, as plain ones."""
+
+    def reducer_override(self, value: Any) -> Any:
+        """Return how to rebuild a scalar of numpy; leave everything else to pickle."""
+        if type(value).__module__ != "numpy" or getattr(value, "ndim", None) != 0:
+            return NotImplemented
+        plain = value.item()
+        return type(plain), (plain,)
+
+
 class _Unpickler(pickle.Unpickler):
     """Unpickler for our own classes: importing others, such as numpy, would stall the guard."""
 
     def find_class(self, module: str, name: str) -> Any:
         """Return a class of our own, or raise UnpicklingError."""
-        if module.split(".")[0] not in ("mavbridge", "pathlib"):
+        if module == "builtins" and name in ("bool", "int", "float", "str"):
+            return super().find_class(module, name)
+        found = None
+        if module.split(".")[0] in ("mavbridge", "pathlib") and "." not in name:
+            found = super().find_class(module, name)
+        if not isinstance(found, type):
             raise pickle.UnpicklingError(f"{module}.{name} is no part of a message")
-        return super().find_class(module, name)
+        return found
+
+
+def _pickled(message: object) -> bytes:
+    file = io.BytesIO()
+    _Pickler(file).dump(message)
+    return _PICKLE + file.getvalue()
 
 
 def _unpickled(data: bytes, classes: tuple[type, ...]) -> Any:
@@ -262,7 +284,7 @@ def _encode_tick(tick: GuardTick) -> bytes:
         *stages,
         *(tick.sent or _NOTHING),
     )
-    return packed if tick.reason is None else packed + pickle.dumps(tick.reason)
+    return packed if tick.reason is None else packed + _pickled(tick.reason)
 
 
 def _decode_tick(data: bytes) -> GuardTick:
@@ -274,7 +296,7 @@ def _decode_tick(data: bytes) -> GuardTick:
     sent = _CLASSES[sent_kind](*fours[4])
     reason: Reason | None = None
     if len(data) > _TICK.size:
-        reason = _unpickled(_PICKLE + data[_TICK.size :], (Reason,))
+        reason = _unpickled(data[_TICK.size :], (Reason,))
     return GuardTick(
         index=index,
         due_ns=due_ns,

@@ -219,7 +219,9 @@ def read_reason(code: str | None, data: str) -> Reason | None:
     if code is None:
         return None
     try:
-        return reason_from_json({"code": code, "data": json.loads(data)})
+        reason = reason_from_json({"code": code, "data": json.loads(data)})
+        str(reason)  # an older version had other figures
+        return reason
     except (KeyError, TypeError, ValueError) as error:
         raise FlightError(
             f"no reason {code!r} with {data} is known here: use the mavbridge that recorded it"

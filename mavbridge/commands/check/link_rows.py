@@ -6,13 +6,16 @@ from typing import Literal, TypeAlias
 
 from mavbridge.commands.check.param_rows import Terms, cures
 from mavbridge.commands.check.rows import Row, Verdict
+from mavbridge.config.flight import Limits
 from mavbridge.core.clock import NS_PER_MS, NS_PER_S, Clock
 from mavbridge.core.reasons import Code, Reason, because
 from mavbridge.core.vehicle import NEUTRAL, Command, LinkSnapshot, LinkStats, Release
 from mavbridge.flight.plan import FlightPlan
+from mavbridge.flight.settings import effective_freshness
 from mavbridge.mavlink.link import MavlinkLink
 from mavbridge.mavlink.profiles.profile import StreamGroup
 from mavbridge.mavlink.session.vehicle import VehicleSession
+from policy.contract import Contract
 
 SET_UP_S = 15.0
 """Longest wait for version, parameters, streams and the receiver. A link without losses takes one
@@ -157,10 +160,9 @@ def _rate_row(group: StreamGroup, rates_hz: Mapping[str, float], plan: FlightPla
     name = _QUANTITIES.get(group.messages[0], group.messages[0])
     rate_hz = next((rates_hz[message] for message in group.messages if message in rates_hz), 0.0)
     least_hz = _ECHO_HZ if name == "sticks (echo)" else 0.0
-    if plan is not None:
-        limits = plan.start_limits
-        oldest_ns = limits.state_ns if name == "attitude" else limits.velocity_ns
-        least_hz = max(least_hz, NS_PER_S / oldest_ns)
+    limits = effective_freshness(Contract(), Limits()) if plan is None else plan.start_limits
+    oldest_ns = limits.state_ns if name == "attitude" else limits.velocity_ns
+    least_hz = max(least_hz, NS_PER_S / oldest_ns)
     verdict, advice = _rate_verdict(name, rate_hz, least_hz, group.rate_hz)
     return _row(name, f"{rate_hz:.1f} Hz", f"{group.rate_hz:.3g} Hz", verdict, advice)
 

@@ -3,13 +3,13 @@
 import threading
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, suppress
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import partial
 
 import numpy as np
 
 from mavbridge.commands.check.rows import Row, Verdict
-from mavbridge.config.flight import FlyConfig
+from mavbridge.config.flight import FlyConfig, Limits
 from mavbridge.core.clock import NS_PER_S, Clock, period_ns
 from mavbridge.core.errors import MavbridgeError, UserError
 from mavbridge.core.histogram import Histogram
@@ -42,7 +42,7 @@ class PolicyFindings:
 
     rows: list[Row] = field(default_factory=list)
     plan: FlightPlan | None = None
-    """None: no policy was named, it cannot be loaded, or a flag contradicts it."""
+    """None: no policy was named, or it cannot be loaded. Flags that contradict it are left out."""
 
 
 def check_policy(config: FlyConfig, clock: Clock, *, timing_s: float) -> PolicyFindings:
@@ -62,11 +62,18 @@ def check_policy(config: FlyConfig, clock: Clock, *, timing_s: float) -> PolicyF
             except UserError as error:
                 found = _contract_words(runner.contract)
                 rows.append(_row("flags of the flight", found, "no-go", str(error)))
-                return PolicyFindings(rows=rows)
+                return PolicyFindings(rows=rows, plan=_plan_by_contract(config, runner))
             rows += [*_speed_rows(plan, loaded, clock, timing_s), *_plan_rows(plan)]
             return PolicyFindings(rows=rows, plan=plan)
     except MavbridgeError as error:
         return PolicyFindings(rows=[_row("policy", config.policy.policy, "no-go", str(error))])
+
+
+def _plan_by_contract(config: FlyConfig, runner: PolicyRunner) -> FlightPlan:
+    """Plan the flight without the flags that may contradict its contract, for the other rows."""
+    goal = "0,0,0" if "goal" in runner.contract.state_extras else None
+    kept = replace(config, limits=Limits(), mode=None, goal=goal)
+    return plan_flight(kept, runner.contract, is_dual=runner.dual_rate)
 
 
 def _engine_row(loaded: LoadedPolicy) -> Row:

@@ -3,6 +3,7 @@
 import io
 import json
 import threading
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -134,3 +135,11 @@ def test_a_row_hides_the_password_of_an_address_in_table_and_json() -> None:
     row = Row(area="camera", name="camera", found=text, expected=text, advice=text)
     assert "it@" not in json.dumps(as_document([row]))
     assert row.found == "rtsp://me:***@host/1?token=***"
+
+
+def test_a_flag_that_contradicts_the_policy_leaves_the_vehicles_rows_to_its_contract() -> None:
+    config = replace(flight("scripted:square:velocity"), mode="ALT_HOLD")
+    findings = check_policy(config, MonotonicClock(), timing_s=0.5)
+    assert findings.rows[-1].verdict == "no-go"
+    assert findings.plan is not None
+    assert findings.plan.guard.meaning.kind == "velocity"
