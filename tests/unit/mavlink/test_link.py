@@ -1,6 +1,6 @@
 """The link against a vehicle made of bytes, on a virtual clock."""
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from random import Random
 from typing import Any
 
@@ -316,6 +316,8 @@ def test_a_parameter_that_matters_and_changes_in_flight_is_an_interruption() -> 
     assert snapshot.problem == because(Code.CALIBRATION_CHANGED)
     rig.vehicle.armed = False
     assert rig.run(2.0, PILOTS).problem is None
+    rig.run(0.1, Command(action=Sticks(0.0, 0.0, 0.0, 1.0)))
+    assert rig.overrides()[-1][0] == pytest.approx(1950, abs=5)  # by the new calibration
 
 
 @pytest.mark.parametrize("resting_throttle_us", [1000, 1100])
@@ -755,38 +757,25 @@ def test_setpoints_are_sent_as_such_and_their_silence_is_no_failsafe(autopilot: 
     assert not {"MANUAL_CONTROL", "RC_CHANNELS_OVERRIDE"} & {*rig.vehicle.names()}
 
 
-def test_a_takeoff_is_asked_for_once_a_second_and_its_refusal_is_told() -> None:
-    for rig in (Rig().ready(), px4_rig().ready()):
-        mav = rig.vehicle.end.mav
-        for tick in range(150):
-            rig.vehicle.put(mav.global_position_int_encode(0, 0, 0, 584_000 + tick, 0, 0, 0, 0, 0))
-            rig.link.commands.takeoff(5.0)
-            rig.run(0.01)
-        asked = [m for m in rig.vehicle.received if getattr(m, "command", 0) == 22]
-        assert len(asked) == 2
-        rig.vehicle.put(mav.command_ack_encode(22, dialect.MAV_RESULT_FAILED))
+@pytest.mark.parametrize(("make", "param7_m"), [(Rig, 5.0), (px4_rig, 494.4)])
+def test_a_takeoff_is_asked_for_once_a_second_as_the_firmware_wants_it(
+    make: Callable[[], Rig], param7_m: float
+) -> None:
+    rig = make().ready()
+    mav = rig.vehicle.end.mav
+    rig.link.commands.takeoff(5.0)  # PX4's height is not known yet
+    sent = 0 if make is px4_rig else 1
+    assert sum(getattr(m, "command", 0) == 22 for m in rig.vehicle.received) == sent
+    rig.run(2.0)
+    for tick in range(150):
+        rig.vehicle.put(mav.global_position_int_encode(0, 0, 0, 489_400 + tick, 0, 0, 0, 0, 0))
         rig.run(0.01)
-        assert "the vehicle answered NAV_TAKEOFF with FAILED" in rig.texts
-
-
-def test_a_takeoff_is_asked_for_as_the_firmware_wants_it() -> None:
-    def heights(rig: Rig) -> list[float]:
-        return [
-            round(m.param7, 1)
-            for m in rig.vehicle.received
-            if m.get_type() == "COMMAND_LONG" and m.command == dialect.MAV_CMD_NAV_TAKEOFF
-        ]
-
-    copter = Rig().ready()
-    copter.link.commands.takeoff(5.0)
-    assert heights(copter) == [5.0]
-    px4 = px4_rig().ready()
-    px4.link.commands.takeoff(5.0)  # its height is not known yet
-    assert heights(px4) == []
-    px4.vehicle.put(px4.vehicle.end.mav.global_position_int_encode(7, 0, 0, 489400, *[0] * 5))
-    px4.run(0.1)
-    px4.link.commands.takeoff(5.0)
-    assert heights(px4) == [494.4]
+        rig.link.commands.takeoff(5.0)
+    asked = [m.param7 for m in rig.vehicle.received if getattr(m, "command", 0) == 22][sent:]
+    assert (len(asked), asked[0]) == (2, pytest.approx(param7_m, abs=0.05))
+    rig.vehicle.put(mav.command_ack_encode(22, dialect.MAV_RESULT_FAILED))
+    rig.run(0.01)
+    assert "the vehicle answered NAV_TAKEOFF with FAILED" in rig.texts
 
 
 def test_an_output_that_makes_no_sense_is_refused_at_once_where_the_vehicle_is_known() -> None:

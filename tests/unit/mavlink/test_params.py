@@ -313,18 +313,6 @@ def test_an_accepted_risk_that_comes_true_in_flight_does_not_interrupt() -> None
     assert (vehicle.params.interruption, vehicle.problem()) == (None, None)
 
 
-def test_a_calibration_changed_in_flight_counts_from_the_next_time_on_the_ground() -> None:
-    vehicle = after_reading(ParamVehicle())
-    vehicle.armed = True
-    vehicle.set_by_pilot("RC1_MAX", 1950.0)
-    vehicle.run(1.0)
-    assert vehicle.problem() == because(Code.CALIBRATION_CHANGED)
-    vehicle.armed = False
-    vehicle.run(0.1)
-    assert vehicle.problem() is None
-    assert vehicle.params.calibration.roll.max_us == 1950
-
-
 def test_a_vehicle_that_is_met_in_flight_is_read_as_well() -> None:
     vehicle = ParamVehicle()
     vehicle.armed = True
