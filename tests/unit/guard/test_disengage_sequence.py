@@ -219,20 +219,16 @@ def test_a_vehicle_that_has_vanished_is_not_held_for_ever() -> None:
     assert stepped.phase is Phase.ENDED
 
 
+@pytest.mark.parametrize("facts", [IDLE_RECEIVER, MIDDLE])
 @pytest.mark.parametrize("mode", ["STABILIZE", "ACRO"])
-def test_where_the_throttle_is_thrust_the_mode_goes_before_neutral(mode: str) -> None:
-    stepped = flying(replace(IDLE_RECEIVER, mode=mode), modes=(mode,))
-    moves = [stepped.step(**FAULT), *stepped.run(0.1)]
-    assert {move.control for move in moves} == {LEVEL}
-    assert moves[0].mode == "BRAKE"
-    assert stepped.step(mode="BRAKE").control in (NEUTRAL, RELEASE)
-
-
-def test_where_the_throttle_is_thrust_no_hand_holds_the_vehicle() -> None:
-    stepped = flying(replace(MIDDLE, mode="STABILIZE"), modes=("STABILIZE",))
+def test_where_the_throttle_is_thrust_the_mode_goes_before_neutral_and_no_hand_holds_it(
+    facts: Any, mode: str
+) -> None:
+    stepped = flying(replace(facts, mode=mode), modes=(mode,))
     moves = [stepped.step(**FAULT), *stepped.run(5)]
     assert {move.control for move in moves} == {LEVEL}
     assert moves[0].mode == "BRAKE"
+    assert stepped.step(mode="BRAKE").control in (NEUTRAL, RELEASE)
 
 
 def test_where_the_throttle_is_thrust_it_stays_until_a_release_on_the_ground() -> None:
