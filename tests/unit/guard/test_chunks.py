@@ -490,28 +490,23 @@ def test_the_reason_for_no_chunk_is_the_flight_processs_own() -> None:
 # --- what a fault names
 
 
-def test_a_silent_flight_process_is_named_with_the_input_that_ran_out_first() -> None:
-    held = holding()
+@pytest.mark.parametrize(
+    ("now_ms", "stood_ms", "place"),
+    [
+        (1104, 0, "flight process"),
+        (1131, 10, "flight process"),
+        (1131, 131, "computer"),  # the guard did not look either
+    ],
+)
+def test_who_was_silent_is_named_with_the_input_that_ran_out_first(
+    now_ms: int, stood_ms: int, place: str
+) -> None:
+    held, spent_ms = holding(), now_ms - 1000
     assert held.lateness(1100 * MS) is None
-    late = held.lateness(1104 * MS)
-    assert late == ("attitude", 109 * MS, 100 * MS, "flight process", 104 * MS, None)
-    assert held.fault(1104 * MS) == because(
-        Code.LATE,
-        quantity="attitude",
-        age_ms=109,
-        limit_ms=100,
-        place="flight process",
-        spent_ms=104,
-    )
-
-
-def test_a_guard_that_did_not_look_names_the_computer() -> None:
-    held = holding()
-    late = held.lateness(1131 * MS, stood_ns=131 * MS)
-    assert late == ("attitude", 136 * MS, 100 * MS, "computer", 131 * MS, None)
-    late = held.lateness(1131 * MS, stood_ns=10 * MS)
-    assert late is not None
-    assert late.place == "flight process"
+    late = held.lateness(now_ms * MS, stood_ns=stood_ms * MS)
+    assert late == ("attitude", (spent_ms + 5) * MS, 100 * MS, place, spent_ms * MS, None)
+    told = figures(late.reason, "quantity", "age_ms", "limit_ms", "place", "spent_ms")
+    assert told == ("attitude", spent_ms + 5, 100, place, spent_ms)
 
 
 @pytest.mark.parametrize("name", ["attitude", "velocity"])
