@@ -5,7 +5,7 @@ from typing import Any
 
 import pytest
 
-from helpers.guard_facts import AIRBORNE, COPTER_MODES, PX4_MODES, codes, flying
+from helpers.guard_facts import AIRBORNE, COPTER_MODES, PX4_MODES, Stepped, codes, flying
 from mavbridge.core.reasons import Code, because
 from mavbridge.core.vehicle import NEUTRAL as CENTRED
 from mavbridge.core.vehicle import ModeRoles
@@ -20,6 +20,13 @@ PX4 = replace(NO_RECEIVER, mode="ALTCTL", modes=PX4_MODES)
 FAULT = {"chunk_fault": because(Code.NO_CHUNK)}
 LOST = because(Code.VEHICLE_LOST, after_s=30)
 OVERRULED = because(Code.OVERRULED, quantity="setpoints", cause="another station")
+
+
+def at_fault(facts: Any, **rules: Any) -> Stepped:
+    """A flight that has just met one."""
+    stepped = flying(facts, **rules)
+    stepped.step(**FAULT)
+    return stepped
 
 
 @pytest.mark.parametrize(
@@ -68,8 +75,7 @@ def test_where_moving_sticks_would_leave_the_mode_it_is_asked_for_once_they_rest
 
 def leave_for_a_hand(*, is_told: bool, **changes: Any) -> list[Actions]:
     """AUTO.LOITER becomes POSCTL 20 ms after it was entered; what follows in 0.2 s."""
-    stepped = flying(PX4)
-    stepped.step(**FAULT)
+    stepped = at_fault(PX4)
     while stepped.step().mode is None:
         pass
     stepped.step(mode="AUTO.LOITER")
@@ -116,8 +122,7 @@ def test_the_mode_is_asked_for_until_it_is_confirmed() -> None:
 
 
 def test_a_refused_mode_becomes_land() -> None:
-    stepped = flying(IDLE_RECEIVER)
-    stepped.step(**FAULT)
+    stepped = at_fault(IDLE_RECEIVER)
     moves = stepped.run(0.2, refused_mode="BRAKE")
     assert "LAND" in {move.mode for move in moves}
     assert stepped.step(mode="LAND", refused_mode=None).control is RELEASE
@@ -126,8 +131,7 @@ def test_a_refused_mode_becomes_land() -> None:
 @pytest.mark.parametrize("hold", ["", "BRAKE"])
 def test_where_the_vehicle_has_no_such_mode_neutral_holds_it(hold: str) -> None:
     facts = replace(IDLE_RECEIVER, modes=replace(COPTER_MODES, hold=hold, land=""))
-    stepped = flying(facts)
-    stepped.step(**FAULT)
+    stepped = at_fault(facts)
     assert {move.control for move in stepped.run(5, refused_mode="BRAKE")} == {NEUTRAL}
     assert stepped.phase is Phase.HOLDING
 
@@ -153,8 +157,7 @@ def test_no_hand_gets_the_sticks_that_would_not_hold_the_vehicle(
 
 
 def test_a_late_refusal_does_not_stop_the_landing() -> None:
-    stepped = flying(NO_RECEIVER)
-    stepped.step(**FAULT)
+    stepped = at_fault(NO_RECEIVER)
     stepped.run(0.2, refused_mode="BRAKE")
     assert "LAND" in {move.mode for move in stepped.run(1, refused_mode="LAND")}
     stepped.run(0.2, mode="LAND", refused_mode=None)
@@ -162,8 +165,7 @@ def test_a_late_refusal_does_not_stop_the_landing() -> None:
 
 
 def test_an_unconfirmed_mode_is_given_up_after_three_seconds() -> None:
-    stepped = flying(IDLE_RECEIVER)
-    stepped.step(**FAULT)
+    stepped = at_fault(IDLE_RECEIVER)
     stepped.run(2.98)
     assert stepped.phase is Phase.LEAVING
     assert {move.control for move in stepped.run(0.03)} == {NEUTRAL}
@@ -186,8 +188,7 @@ def test_an_unconfirmed_mode_is_given_up_after_three_seconds() -> None:
 def test_where_silence_is_a_failsafe_neutral_goes_on_until_disarmed(
     facts: Any, settings: Any
 ) -> None:
-    stepped = flying(facts, disengage=settings)
-    stepped.step(**FAULT)
+    stepped = at_fault(facts, disengage=settings)
     moves = stepped.run(0.2, mode="BRAKE" if facts.mode == "ALT_HOLD" else "AUTO.LOITER")
     assert {move.control for move in moves} == {NEUTRAL}
     assert stepped.phase is Phase.HOLDING
@@ -197,8 +198,7 @@ def test_where_silence_is_a_failsafe_neutral_goes_on_until_disarmed(
 
 def test_on_the_ground_a_release_without_a_receiver_holds_neutral_in_the_same_mode() -> None:
     landed = replace(NO_RECEIVER, is_landed=True)
-    stepped = flying(landed, disengage=DisengageSettings(on_fault="release"))
-    stepped.step(**FAULT)
+    stepped = at_fault(landed, disengage=DisengageSettings(on_fault="release"))
     assert {(move.control, move.mode) for move in stepped.run(20)} == {(NEUTRAL, None)}
     assert stepped.phase is Phase.HOLDING
 
@@ -219,20 +219,16 @@ def test_a_vehicle_that_has_vanished_is_not_held_for_ever() -> None:
     assert stepped.phase is Phase.ENDED
 
 
+@pytest.mark.parametrize("facts", [IDLE_RECEIVER, MIDDLE])
 @pytest.mark.parametrize("mode", ["STABILIZE", "ACRO"])
-def test_where_the_throttle_is_thrust_the_mode_goes_before_neutral(mode: str) -> None:
-    stepped = flying(replace(IDLE_RECEIVER, mode=mode), modes=(mode,))
-    moves = [stepped.step(**FAULT), *stepped.run(0.1)]
-    assert {move.control for move in moves} == {LEVEL}
-    assert moves[0].mode == "BRAKE"
-    assert stepped.step(mode="BRAKE").control in (NEUTRAL, RELEASE)
-
-
-def test_where_the_throttle_is_thrust_no_hand_holds_the_vehicle() -> None:
-    stepped = flying(replace(MIDDLE, mode="STABILIZE"), modes=("STABILIZE",))
+def test_where_the_throttle_is_thrust_the_mode_goes_before_neutral_and_no_hand_holds_it(
+    facts: Any, mode: str
+) -> None:
+    stepped = flying(replace(facts, mode=mode), modes=(mode,))
     moves = [stepped.step(**FAULT), *stepped.run(5)]
     assert {move.control for move in moves} == {LEVEL}
     assert moves[0].mode == "BRAKE"
+    assert stepped.step(mode="BRAKE").control in (NEUTRAL, RELEASE)
 
 
 def test_where_the_throttle_is_thrust_it_stays_until_a_release_on_the_ground() -> None:
@@ -272,8 +268,7 @@ def standstill(stepped: Any, seconds: float, **changes: Any) -> Actions:
 def test_a_vehicle_that_is_not_heard_is_asked_only_until_its_own_failsafe(
     facts: Any, blind_s: float
 ) -> None:
-    stepped = flying(facts)
-    stepped.step(**FAULT)
+    stepped = at_fault(facts)
     moves = silence(stepped, 20)
     assert stepped.phase is Phase.LEAVING, "it is not given up"
     assert {move.control for move in moves} == {NEUTRAL}
@@ -291,8 +286,7 @@ def test_a_vehicle_that_is_not_heard_is_asked_only_until_its_own_failsafe(
 def test_a_failsafe_of_its_own_is_its_way_out_after_a_silence(
     facts: Any, own: str, is_ours: bool
 ) -> None:
-    stepped = flying(facts)
-    stepped.step(**FAULT)
+    stepped = at_fault(facts)
     if is_ours:
         silence(stepped, 4)
     else:
@@ -312,8 +306,7 @@ def test_after_a_standstill_of_ours_what_had_arrived_tells_no_mode(facts: Any) -
 
 
 def test_a_vehicle_that_is_heard_again_has_its_time_to_answer() -> None:
-    stepped = flying(IDLE_RECEIVER)
-    stepped.step(**FAULT)
+    stepped = at_fault(IDLE_RECEIVER)
     silence(stepped, 10)
     moves = stepped.run(2.9, heard_ns=None, mode_ns=None)
     assert sum(move.mode == "BRAKE" for move in moves) == 29
@@ -321,8 +314,7 @@ def test_a_vehicle_that_is_heard_again_has_its_time_to_answer() -> None:
 
 
 def test_a_refusal_that_comes_after_the_mode_is_there_asks_for_nothing() -> None:
-    stepped = flying(NO_RECEIVER)
-    stepped.step(**FAULT)
+    stepped = at_fault(NO_RECEIVER)
     stepped.run(0.2, mode="BRAKE")
     assert stepped.phase is Phase.HOLDING
     moves = stepped.run(1, refused_mode="BRAKE")
@@ -394,6 +386,5 @@ def test_on_the_ground_setpoints_end_idle_since_the_thrust_that_hovers_lifts(
 def test_neutral_goes_on_unanswered_where_it_cannot_bring_the_mode_back(
     facts: Any, last: ControlSource | None
 ) -> None:
-    stepped = flying(facts, is_setpoint=True, modes=(facts.mode,), disengage=SETPOINTS)
-    stepped.step(**FAULT)
+    stepped = at_fault(facts, is_setpoint=True, modes=(facts.mode,), disengage=SETPOINTS)
     assert stepped.run(2.0)[-1].control is last

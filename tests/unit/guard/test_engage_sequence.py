@@ -254,6 +254,8 @@ def test_which_mode_is_wanted() -> None:
     assert begun(GROUND, mode="LOITER").wanted_mode(GROUND) == "LOITER"
     with_loiter_alone = replace(GROUND, modes=replace(COPTER_MODES, names=("LOITER",)))
     assert first.wanted_mode(with_loiter_alone) == "LOITER"
+    climbing = replace(GROUND, armed=True, mode="AUTO.TAKEOFF", modes=PX4_MODES)
+    assert begun(PX4_GROUND, takeoff_m=10.0).wanted_mode(climbing) is None
 
 
 def test_the_modes_of_a_takeoff_are_our_own_only_if_we_take_off() -> None:
@@ -295,9 +297,3 @@ def test_nine_tenths_of_the_height_are_enough_and_count_from_where_it_stood() ->
     assert not sequence.is_up
     sequence.step(replace(climbing, height_m=6.0), None)
     assert sequence.is_up
-
-
-def test_the_mode_in_which_it_climbs_is_left_to_the_autopilot() -> None:
-    climbing = replace(GROUND, armed=True, mode="AUTO.TAKEOFF", modes=PX4_MODES)
-    sequence = begun(replace(GROUND, modes=PX4_MODES), takeoff_m=10.0)
-    assert sequence.wanted_mode(climbing) is None

@@ -104,8 +104,6 @@ SUMMARY = GuardSummary(
     dropped_packets=2,
 )
 TO_GUARD: list[ToGuard] = [
-    CHUNK,
-    CHUNK._replace(actions=()),
     NoChunk(because(Code.OF_CAMERA, camera="größer", why=because(Code.NO_IMAGE))),
     GuardSettings(link=LinkSettings(connect="udp:127.0.0.1:14550"), tlog_fd=9, cpu=1),
     FLIGHT,
@@ -114,13 +112,6 @@ TO_GUARD: list[ToGuard] = [
     "release",
 ]
 FROM_GUARD: list[FromGuard] = [
-    TICK,
-    replace(TICK, trace=None, sent=None, chunk_serial=None, is_slot=False, is_coasting=True),
-    replace(TICK, chunk_serial=0, sent=None),
-    *(
-        replace(TICK, phase=phase, reason=because(Code.STILL_ENDING, phase=phase.value))
-        for phase in Phase
-    ),
     Samples(()),
     Samples(
         (

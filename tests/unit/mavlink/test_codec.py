@@ -261,6 +261,7 @@ def test_garbage_and_cut_off_datagrams_cost_nothing_that_comes_after(
     ours, vehicle = codec(), WireEnd()
     list(ours.decode_datagram(garbage))
     list(ours.decode_datagram(vehicle.heartbeat()[: -cut or None]))
+    list(ours.decode_datagram(vehicle.heartbeat() + vehicle.heartbeat()[: -cut or None]))
     (incoming,) = list(ours.decode_datagram(vehicle.heartbeat()))[-1:]
     assert isinstance(incoming.body, Heartbeat)
 
@@ -349,6 +350,7 @@ def test_an_attitude_is_a_quaternion_and_a_thrust() -> None:
     assert tuple(message.q) == pytest.approx(quaternion, abs=1e-7)
     assert heading_rad(tuple(message.q)) == pytest.approx(3.0, abs=1e-6)
     assert tilt_rad(quaternion) == pytest.approx(0.2232, abs=1e-3)
+    codec().encode_attitude(TARGET, (1 + 0.9e-4, 0.0, 0.0, 0.0), 0.25, now_ns=0)
 
 
 def test_body_rates_stand_beside_an_attitude_that_is_ignored() -> None:
@@ -380,7 +382,12 @@ def test_a_thrust_out_of_range_never_leaves(thrust: float) -> None:
 @pytest.mark.parametrize(
     "quaternion",
     [
-        *((1.0002, 0.0, 0.0, 0.0), (0.0, 0.0, 0.0, 0.0), (nan, 0.0, 0.0, 0.0)),
+        *(
+            (1 + 1.1e-4, 0.0, 0.0, 0.0),
+            (1 - 1.1e-4, 0.0, 0.0, 0.0),
+            (0.0, 0.0, 0.0, 0.0),
+            (nan, 0.0, 0.0, 0.0),
+        ),
         *(quaternion_from_euler(1.5, 0.0, 0.0), quaternion_from_euler(0.0, pi, 0.0)),
     ],
 )
@@ -437,12 +444,13 @@ def test_sequence_numbers_have_no_gaps() -> None:
     assert [message.get_seq() for message in reader.read(data)] == [k % 256 for k in range(300)]
 
 
-def test_the_heartbeat_is_an_onboard_controller_without_autopilot() -> None:
-    message = sent(codec().encode_heartbeat())
-    assert (message.type, message.autopilot) == (
-        dialect.MAV_TYPE_ONBOARD_CONTROLLER,
-        dialect.MAV_AUTOPILOT_INVALID,
-    )
+@pytest.mark.parametrize("kind", [None, dialect.MAV_TYPE_GCS])
+def test_the_heartbeat_is_ours_without_autopilot_and_mode(kind: int | None) -> None:
+    message = sent(codec().encode_heartbeat(*(() if kind is None else (kind,))))
+    assert (message.get_srcSystem(), message.get_srcComponent()) == (255, 191)
+    assert message.type == (kind or dialect.MAV_TYPE_ONBOARD_CONTROLLER)
+    assert message.autopilot == dialect.MAV_AUTOPILOT_INVALID
+    assert (message.base_mode, message.custom_mode) == (0, 0)
 
 
 @pytest.mark.parametrize("length", [0, 1, 49, 50, 51, 99, 100, 101, 200])

@@ -46,11 +46,6 @@ def test_what_follows_a_byte_that_begins_no_packet_is_left_over() -> None:
         assert ([frame.data for frame in frames], is_rest) == ([V1], True)
 
 
-def test_there_is_no_packet_at_the_end() -> None:
-    assert frame_at(V2, len(V2)) is None
-    assert frame_at(b"", 0) is None
-
-
 def test_a_packet_without_a_payload_is_one() -> None:
     (frame,), is_rest = split_frames(EMPTY_V1)
     assert (frame.data, frame.payload, frame.message_id, is_rest) == (EMPTY_V1, b"", 200, False)

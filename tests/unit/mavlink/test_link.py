@@ -1,6 +1,6 @@
 """The link against a vehicle made of bytes, on a virtual clock."""
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from random import Random
 from typing import Any
 
@@ -198,6 +198,11 @@ class Rig:
             self.clock.advance_ns(10 * MS)
         return snapshot
 
+    def ready(self) -> "Rig":
+        """With the handshake behind it."""
+        self.run(8.0)
+        return self
+
     def overrides(self) -> list[list[int]]:
         return [
             [getattr(message, f"chan{k}_raw") for k in range(1, 9)]
@@ -272,8 +277,7 @@ def test_heartbeats_go_out_once_a_second_and_only_while_serviced() -> None:
 
 
 def test_commands_are_echoed_and_confirmed() -> None:
-    rig = Rig()
-    rig.run(8.0)
+    rig = Rig().ready()
     snapshot = rig.run(0.2, Command(action=IDLE))
     assert snapshot.echo_confirmed
     assert snapshot.problem is None
@@ -302,8 +306,7 @@ def test_a_parameter_is_set_over_the_wire_also_after_a_reboot() -> None:
 
 
 def test_a_parameter_that_matters_and_changes_in_flight_is_an_interruption() -> None:
-    rig = Rig()
-    rig.run(8.0)
+    rig = Rig().ready()
     rig.vehicle.armed = True
     assert rig.run(1.5, Command(action=IDLE)).interruption is None
     rig.vehicle.put(rig.vehicle.end.mav.param_value_encode(b"RC1_MAX", 1950, 9, 99, 0))
@@ -313,6 +316,8 @@ def test_a_parameter_that_matters_and_changes_in_flight_is_an_interruption() -> 
     assert snapshot.problem == because(Code.CALIBRATION_CHANGED)
     rig.vehicle.armed = False
     assert rig.run(2.0, PILOTS).problem is None
+    rig.run(0.1, Command(action=Sticks(0.0, 0.0, 0.0, 1.0)))
+    assert rig.overrides()[-1][0] == pytest.approx(1950, abs=5)  # by the new calibration
 
 
 @pytest.mark.parametrize("resting_throttle_us", [1000, 1100])
@@ -332,8 +337,7 @@ def test_a_vehicle_that_ignores_us_is_noticed(resting_throttle_us: int) -> None:
 
 
 def test_releases_leave_every_50_ms_while_they_are_asked_for_and_not_for_ever() -> None:
-    rig = Rig()
-    rig.run(8.0)
+    rig = Rig().ready()
     for k in range(2):
         rig.run(0.2, Command(action=IDLE))
         count = len(rig.overrides())
@@ -353,8 +357,7 @@ def test_releases_leave_every_50_ms_while_they_are_asked_for_and_not_for_ever() 
 
 
 def test_a_release_that_could_not_be_sent_goes_before_everything_else() -> None:
-    rig = Rig()
-    rig.run(8.0)
+    rig = Rig().ready()
     rig.run(0.2, Command(action=IDLE))
     rig.vehicle.is_deaf = True
     rig.run(1.5, PILOTS)
@@ -368,8 +371,7 @@ def test_a_release_that_could_not_be_sent_goes_before_everything_else() -> None:
 
 @pytest.mark.parametrize("still_asked", [False, True])
 def test_a_release_is_the_first_packet_after_a_reopen(still_asked: bool) -> None:
-    rig = Rig()
-    rig.run(8.0)
+    rig = Rig().ready()
     rig.run(0.2, Command(action=IDLE))
     rig.vehicle.is_down = True
     rig.run(0.02, Command(action=IDLE))  # now it is noticed
@@ -387,8 +389,7 @@ def test_a_release_is_the_first_packet_after_a_reopen(still_asked: bool) -> None
 
 
 def test_sticks_that_could_not_be_sent_are_not_reported_as_sent() -> None:
-    rig = Rig()
-    rig.run(8.0)
+    rig = Rig().ready()
     rig.run(0.2, Command(action=IDLE))
     rig.vehicle.is_deaf = True
     assert rig.link.send(Command(action=IDLE)) is None
@@ -399,15 +400,13 @@ def test_sticks_that_could_not_be_sent_are_not_reported_as_sent() -> None:
 
 
 def test_nothing_is_released_that_was_never_overridden() -> None:
-    rig = Rig()
-    rig.run(8.0)
+    rig = Rig().ready()
     rig.run(1.0, PILOTS)
     assert rig.overrides() == []
 
 
 def test_readonly_sends_no_stick() -> None:
-    rig = Rig(readonly=True)
-    rig.run(8.0)
+    rig = Rig(readonly=True).ready()
     rig.run(1.0, Command(action=IDLE))
     assert rig.overrides() == []
     rig.link.announce("mavbridge: the policy has control")
@@ -416,8 +415,7 @@ def test_readonly_sends_no_stick() -> None:
 
 
 def test_a_silent_vehicle_is_lost_after_three_beats_and_found_again() -> None:
-    rig = Rig()
-    rig.run(8.0)
+    rig = Rig().ready()
     rig.vehicle.is_alive = False
     assert rig.run(1.9).problem is None  # the last beat was a second before
     assert rig.run(0.3).problem == because(Code.HEARTBEAT_LOST)
@@ -425,25 +423,15 @@ def test_a_silent_vehicle_is_lost_after_three_beats_and_found_again() -> None:
     assert rig.run(1.0).problem is None
 
 
-def test_a_lost_connection_is_opened_again_once_a_second() -> None:
-    rig = Rig()
-    rig.run(8.0)
+def test_a_lost_connection_to_the_same_peer_is_opened_again_once_a_second() -> None:
+    rig = Rig().ready()
     rig.vehicle.is_down = True
     rig.run(3.05)
     assert rig.vehicle.opened == 1 + 3
-    rig.vehicle.is_down = False
-    assert rig.run(2.0).problem is None
-    assert any("connection lost" in text for text in rig.texts)
-
-
-def test_after_reconnecting_packets_go_to_the_same_peer() -> None:
-    rig = Rig()
-    rig.run(8.0)
-    rig.vehicle.is_down = True
-    rig.run(0.5)
     rig.vehicle.is_down, rig.vehicle.answered_to = False, None
-    rig.run(2.0)
+    assert rig.run(2.0).problem is None
     assert rig.vehicle.answered_to == ("127.0.0.1", 1)
+    assert any("connection lost" in text for text in rig.texts)
 
 
 def test_on_the_ground_a_vehicle_that_moves_is_followed_and_said_to_have_moved() -> None:
@@ -464,8 +452,7 @@ def test_on_the_ground_a_vehicle_that_moves_is_followed_and_said_to_have_moved()
 
 
 def test_in_flight_another_clock_elsewhere_is_not_followed() -> None:
-    rig = Rig()
-    rig.run(8.0)
+    rig = Rig().ready()
     rig.link.is_engaged = True
     rig.run(0.5, Command(action=IDLE))
     rig.vehicle.address = ("127.0.0.1", 2)
@@ -492,8 +479,7 @@ def test_in_flight_another_clock_elsewhere_is_not_followed() -> None:
 def test_a_second_sender_with_the_vehicles_id_is_ignored_and_ends_no_flight(
     is_engaged: bool,
 ) -> None:
-    rig = Rig()
-    rig.run(8.0)
+    rig = Rig().ready()
     rig.link.is_engaged = is_engaged
     for _ in range(3):
         stranger = Received(WireEnd().heartbeat(mode=9), rig.clock.now_ns(), ("10.0.0.9", 4))
@@ -508,8 +494,7 @@ def test_a_second_sender_with_the_vehicles_id_is_ignored_and_ends_no_flight(
 
 
 def test_a_reboot_ends_the_engagement_and_still_leaves_a_release() -> None:
-    rig = Rig()
-    rig.run(8.0)
+    rig = Rig().ready()
     for interruptions in (1, 2):
         rig.link.is_engaged = True
         rig.run(0.2, Command(action=IDLE))
@@ -524,8 +509,7 @@ def test_a_reboot_ends_the_engagement_and_still_leaves_a_release() -> None:
 
 
 def test_mode_and_arm_are_not_requested_too_often_and_refusals_are_reported() -> None:
-    rig = Rig()
-    rig.run(8.0)
+    rig = Rig().ready()
     for _ in range(150):
         rig.link.commands.set_mode("ACRO")
         rig.link.commands.arm()
@@ -546,8 +530,7 @@ def test_mode_and_arm_are_not_requested_too_often_and_refusals_are_reported() ->
 
 
 def test_announcements_reach_the_vehicles_link() -> None:
-    rig = Rig()
-    rig.run(8.0)
+    rig = Rig().ready()
     rig.link.announce("mavbridge flies")
     rig.link.announce("mavbridge released: " + "x" * 60)
     texts = [m for m in rig.vehicle.received if m.get_type() == "STATUSTEXT"]
@@ -646,8 +629,7 @@ def test_it_says_what_to_select_on_unless_the_connection_is_lost() -> None:
 
 
 def test_a_port_that_was_taken_meanwhile_is_waited_for() -> None:
-    rig = Rig()
-    rig.run(8.0)
+    rig = Rig().ready()
     rig.vehicle.is_down = True
     rig.run(0.1, Command(action=IDLE))
     rig.vehicle.is_down, rig.vehicle.open_error = False, UserError("port in use")
@@ -668,8 +650,7 @@ def test_a_vehicle_heard_in_time_is_not_given_up_while_it_settles() -> None:
 
 
 def test_other_systems_on_the_link_are_ignored() -> None:
-    rig = Rig()
-    rig.run(8.0)
+    rig = Rig().ready()
     stranger = WireEnd(system=9)
     rig.vehicle.inbox.append(
         Received(
@@ -731,8 +712,7 @@ def test_the_velocity_that_px4_sends_without_an_estimate_is_nobodys_velocity() -
 
 def test_other_peoples_sticks_that_px4_passes_on_are_not_its_own() -> None:
     """PX4's links pass the packets of other senders on, under their own ids."""
-    rig = px4_rig()
-    rig.run(8.0)
+    rig = px4_rig().ready()
     count = len(rig.packets)
     for system, component in ((42, 191), (255, 190), (1, 191)):
         sender = WireEnd(system=system, component=component)
@@ -753,8 +733,7 @@ def test_other_peoples_sticks_that_px4_passes_on_are_not_its_own() -> None:
 )
 def test_only_px4_is_told_that_we_are_a_ground_station(is_px4: bool, kinds: set[int]) -> None:
     """It sends texts to nobody else; until the vehicle is known we are an onboard computer."""
-    rig = px4_rig() if is_px4 else Rig()
-    rig.run(8.0)
+    rig = (px4_rig() if is_px4 else Rig()).ready()
     beats = [m.type for m in rig.vehicle.received if m.get_type() == "HEARTBEAT"]
     assert set(beats) == kinds
     assert (beats[-1] == dialect.MAV_TYPE_GCS) is is_px4
@@ -778,46 +757,29 @@ def test_setpoints_are_sent_as_such_and_their_silence_is_no_failsafe(autopilot: 
     assert not {"MANUAL_CONTROL", "RC_CHANNELS_OVERRIDE"} & {*rig.vehicle.names()}
 
 
-def test_a_takeoff_is_asked_for_once_a_second_and_its_refusal_is_told() -> None:
-    for rig in (Rig(), px4_rig()):
-        rig.run(8.0)
-        mav = rig.vehicle.end.mav
-        for tick in range(150):
-            rig.vehicle.put(mav.global_position_int_encode(0, 0, 0, 584_000 + tick, 0, 0, 0, 0, 0))
-            rig.link.commands.takeoff(5.0)
-            rig.run(0.01)
-        asked = [m for m in rig.vehicle.received if getattr(m, "command", 0) == 22]
-        assert len(asked) == 2
-        rig.vehicle.put(mav.command_ack_encode(22, dialect.MAV_RESULT_FAILED))
+@pytest.mark.parametrize(("make", "param7_m"), [(Rig, 5.0), (px4_rig, 494.4)])
+def test_a_takeoff_is_asked_for_once_a_second_as_the_firmware_wants_it(
+    make: Callable[[], Rig], param7_m: float
+) -> None:
+    rig = make().ready()
+    mav = rig.vehicle.end.mav
+    rig.link.commands.takeoff(5.0)  # PX4's height is not known yet
+    sent = 0 if make is px4_rig else 1
+    assert sum(getattr(m, "command", 0) == 22 for m in rig.vehicle.received) == sent
+    rig.run(2.0)
+    for tick in range(150):
+        rig.vehicle.put(mav.global_position_int_encode(0, 0, 0, 489_400 + tick, 0, 0, 0, 0, 0))
         rig.run(0.01)
-        assert "the vehicle answered NAV_TAKEOFF with FAILED" in rig.texts
-
-
-def test_a_takeoff_is_asked_for_as_the_firmware_wants_it() -> None:
-    def heights(rig: Rig) -> list[float]:
-        return [
-            round(m.param7, 1)
-            for m in rig.vehicle.received
-            if m.get_type() == "COMMAND_LONG" and m.command == dialect.MAV_CMD_NAV_TAKEOFF
-        ]
-
-    copter = Rig()
-    copter.run(8.0)
-    copter.link.commands.takeoff(5.0)
-    assert heights(copter) == [5.0]
-    px4 = px4_rig()
-    px4.run(8.0)
-    px4.link.commands.takeoff(5.0)  # its height is not known yet
-    assert heights(px4) == []
-    px4.vehicle.put(px4.vehicle.end.mav.global_position_int_encode(7, 0, 0, 489400, *[0] * 5))
-    px4.run(0.1)
-    px4.link.commands.takeoff(5.0)
-    assert heights(px4) == [494.4]
+        rig.link.commands.takeoff(5.0)
+    asked = [m.param7 for m in rig.vehicle.received if getattr(m, "command", 0) == 22][sent:]
+    assert (len(asked), asked[0]) == (2, pytest.approx(param7_m, abs=0.05))
+    rig.vehicle.put(mav.command_ack_encode(22, dialect.MAV_RESULT_FAILED))
+    rig.run(0.01)
+    assert "the vehicle answered NAV_TAKEOFF with FAILED" in rig.texts
 
 
 def test_an_output_that_makes_no_sense_is_refused_at_once_where_the_vehicle_is_known() -> None:
-    rig = Rig(meaning=None)
-    rig.run(8.0)
+    rig = Rig(meaning=None).ready()
     with pytest.raises(PeerError, match="--output rc-override"):
         rig.link.begin_flight(ActionMeaning(), "manual-control")
 

@@ -10,7 +10,6 @@ from pymavlink.dialects.v20 import ardupilotmega as dialect
 from helpers.fakes import FakeClock
 from helpers.wire import ARDUPILOT, CALIBRATION
 from mavbridge.core.clock import NS_PER_MS, NS_PER_S
-from mavbridge.core.errors import PeerError
 from mavbridge.core.link_settings import LinkSettings
 from mavbridge.core.reasons import Code, Reason, because
 from mavbridge.core.vehicle import ActionMeaning, Sticks, VehicleStatus
@@ -134,14 +133,6 @@ class Session:
 
 
 # --- heartbeat, landing, battery
-
-
-def test_what_cannot_be_flown_is_refused() -> None:
-    for autopilot, vehicle_type in ((3, 1), (12, 1), (0, 2), (8, 2)):
-        with pytest.raises(PeerError, match="flown"):
-            VehicleSession(
-                identity(autopilot, vehicle_type), LinkSettings(), old_params={}, report=print
-            )
 
 
 @pytest.mark.parametrize(
@@ -481,20 +472,22 @@ def test_a_refused_mode_is_known_until_another_is_asked_for_or_it_is_granted() -
     ],
 )
 def test_the_override_switch_is_told_apart(switch_us: int, is_off: bool, may_fly: bool) -> None:
-    session = Session(is_ready=False)
-    session.params["RC7_OPTION"] = 46.0
-    for _ in range(2):  # the search for a receiver takes as long again
-        session.shake_hands()
+    session = with_override_switch()
     session.turn_switch(switch_us)
     assert session.session.is_switched_off is is_off
     assert (session.problem is None) is may_fly
 
 
-def test_the_middle_of_the_override_switch_changes_nothing() -> None:
+def with_override_switch() -> Session:
     session = Session(is_ready=False)
     session.params["RC7_OPTION"] = 46.0
-    session.shake_hands()
-    session.now_ns += 2 * S
+    for _ in range(2):  # the search for a receiver takes as long again
+        session.shake_hands()
+    return session
+
+
+def test_the_middle_of_the_override_switch_changes_nothing() -> None:
+    session = with_override_switch()
     for switch_us, may_fly in ((1500, False), (2000, True), (1500, True), (0, True), (1000, False)):
         session.turn_switch(switch_us)
         assert (session.session.switch_problem is None) is may_fly
@@ -503,9 +496,7 @@ def test_the_middle_of_the_override_switch_changes_nothing() -> None:
 
 
 def test_the_override_switch_is_on_after_the_debounce_and_off_at_once() -> None:
-    session = Session(is_ready=False)
-    session.params["RC7_OPTION"] = 46.0
-    session.shake_hands()
+    session = with_override_switch()
     session.rc((*RECEIVER[:6], 2000, 1500))
     assert session.session.switch_problem is not None
     session.turn_switch(2000)
