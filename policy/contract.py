@@ -46,12 +46,9 @@ EXTRA_NAMES: dict[StateExtra, tuple[str, ...]] = {
     "height": ("height_above_home_m",),
     "altitude": ("altitude_m",),
 }
-"""Optional inputs appended to the state.
-
-Vector from the vehicle to the flight's goal, in the world axes of ``Contract.state_frame``; height
-above the home position; height above the estimator's origin. Heights are positive upwards in both
-frames.
-"""
+"""Optional inputs appended to the state: vector from the vehicle to the flight's goal, in the world
+axes of ``Contract.state_frame``; height above the home position; height above the estimator's
+origin. Heights are positive upwards in both frames."""
 AGE, ROTATION, VELOCITY_CHANGE = slice(13, 14), slice(14, 17), slice(17, 20)
 
 ACTION_NAMES = ("throttle", "yaw", "pitch", "roll")
