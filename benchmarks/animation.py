@@ -4,8 +4,7 @@ python -m benchmarks.animation FLIGHT --gates gates.json --out docs/images/fligh
 """
 
 import argparse
-import json
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
@@ -14,7 +13,10 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 
+from mavbridge.core.course import CourseGate, read_gates
 from mavbridge.recording.flight_folder import RecordedFlight, open_flight
+from policy.contract import QUATERNION, VELOCITY
+from policy.rotation import matrix_columns
 
 Array = npt.NDArray[Any]
 
@@ -47,12 +49,10 @@ class Flight:
         self.time_s = np.array([row["sent_ns"] for row in rows]) / 1e9
         self.position = np.array([row["position_ned_m"] for row in rows])
         state = np.array([row["state"] for row in rows])
-        self.speed = np.linalg.norm(state[:, :3], axis=1)
-        w, x, y, z = state[:, 3:7].T
-        self.heading = np.arctan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z))
-        self.right = np.stack(
-            [2 * (x * y - w * z), 1 - 2 * (x * x + z * z), 2 * (y * z + w * x)], axis=1
-        )
+        self.speed = np.linalg.norm(state[:, VELOCITY], axis=1)
+        forward, right, _ = matrix_columns(*state[:, QUATERNION].T)
+        self.heading = np.unwrap(np.arctan2(forward[1], forward[0]))
+        self.right = np.stack(right, axis=1)
         self.sent = np.array([row["sent"] for row in rows])
         contract = flight.meta.contract
         self.names = NAMES[contract.action if contract else "sticks"]
@@ -88,7 +88,7 @@ class View:
         cv2.line(picture, first, last, colour, width, cv2.LINE_AA)
 
 
-def _scene(flight: Flight, index: int, gates: list[Array]) -> Array:
+def _scene(flight: Flight, index: int, gates: Sequence[CourseGate]) -> Array:
     """Draw the chase view with ground, gates, flown path and vehicle."""
     height = HEIGHT - PLOT
     picture = np.full((height, SCENE, 3), SKY, np.uint8)
@@ -101,9 +101,10 @@ def _scene(flight: Flight, index: int, gates: list[Array]) -> Array:
             ends[:, axis] = np.round(position[axis] / 4) * 4 + offset
             ends[:, 1 - axis] = position[1 - axis] + np.array([-FAR_M, FAR_M])
             view.line(picture, ends, GRID, 1)
-    for corners in gates:
-        distance = np.linalg.norm(corners.mean(axis=0) - position)
+    for gate in gates:
+        distance = np.linalg.norm(np.array(gate.center_ned_m) - position)
         if distance < FAR_M:
+            corners = gate.corners_ned_m
             for first, last in zip(corners, np.roll(corners, 1, axis=0), strict=True):
                 view.line(picture, np.stack([first, last]), GATE, max(1, int(26 / (distance + 4))))
     trail = flight.position[max(0, index - 400) : index + 1 : 4]
@@ -138,20 +139,13 @@ def _write(
     cv2.putText(picture, text, at, cv2.FONT_HERSHEY_SIMPLEX, size, colour, 1, cv2.LINE_AA)
 
 
-def _gates(path: Path) -> list[Array]:
-    """Return the corners of each gate [m] from the JSON of ``python -m sitl course --json``."""
-    corners = []
-    for gate in json.loads(path.read_text())["gates"]:
-        side = gate["size_m"] / 2
-        across = side * np.array([-np.sin(gate["yaw_rad"]), np.cos(gate["yaw_rad"]), 0.0])
-        up = np.array([0.0, 0.0, -side])
-        signs = ((-1, -1), (-1, 1), (1, 1), (1, -1))
-        corners.append(np.array([gate["center_ned_m"] + a * across + b * up for a, b in signs]))
-    return corners
-
-
 def frames(
-    recorded: RecordedFlight, gates: list[Array], *, start_s: float, seconds: float, fps: float
+    recorded: RecordedFlight,
+    gates: Sequence[CourseGate],
+    *,
+    start_s: float,
+    seconds: float,
+    fps: float,
 ) -> Iterator[Array]:
     """Yield BGR pictures at a fixed rate, from ``start_s`` after the policy's first action."""
     flight = Flight(recorded)
@@ -184,7 +178,7 @@ def main() -> None:
     animation.frames = list(
         frames(
             open_flight(options.flight),
-            _gates(options.gates),
+            read_gates(options.gates),
             start_s=options.start,
             seconds=options.seconds,
             fps=options.fps,

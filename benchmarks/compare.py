@@ -31,11 +31,12 @@ from benchmarks.results import (
     to_json,
 )
 from benchmarks.roofline import time_rooflines
-from mavbridge.commands.output import require_outputs, table_console
+from mavbridge.commands.output import table_console
 from mavbridge.config.policy import PolicyConfig
 from mavbridge.config.rates import Rates
 from mavbridge.core.errors import UserError
 from mavbridge.core.extras import require_packages
+from mavbridge.core.files import require_writable
 
 BASELINE_PROCESS = "benchmarks.baseline"
 SHIPPED = PolicyConfig(engine="openvino")
@@ -74,7 +75,7 @@ def main(
         check: compare with this budget of ratios.
     """
     budget = None if check is None else read_budget(check)
-    require_outputs(json, None)
+    require_writable(json, "--json")
     require_packages("make bench, which flies the simulator,", {"mujoco": "mujoco"})
     console = table_console()
     result = measure(is_quick=quick)

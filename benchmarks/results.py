@@ -5,7 +5,7 @@ import os
 import platform
 import sys
 from collections.abc import Callable, Iterable
-from dataclasses import asdict, dataclass, is_dataclass
+from dataclasses import asdict, dataclass
 from importlib.metadata import version
 from pathlib import Path
 
@@ -148,10 +148,8 @@ def this_machine() -> Machine:
     )
 
 
-def to_json(result: object) -> str:
-    """Return a dataclass as JSON, keys in the order of its fields; null = not measured."""
-    if not is_dataclass(result) or isinstance(result, type):
-        raise TypeError(f"not a dataclass instance: {result!r}")
+def to_json(result: BenchResult) -> str:
+    """Return the result as JSON, keys in the order of its fields; null = not measured."""
     return json.dumps(asdict(result), indent=2, allow_nan=False) + "\n"
 
 

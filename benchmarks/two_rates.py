@@ -196,7 +196,6 @@ class Flown(NamedTuple):
     success_low: float
     success_high: float
     gates: float
-    speed_mps: float
     course_speed_mps: float
 
 
@@ -221,7 +220,6 @@ def fly(flags: str, checkpoint: Path, workers: int) -> Flown:
         success_low=summary["success_rate"]["low"],
         success_high=summary["success_rate"]["high"],
         gates=value("gates_passed"),
-        speed_mps=value("mean_speed_mps"),
         course_speed_mps=value("course_speed_mps"),
     )
 

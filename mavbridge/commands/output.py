@@ -25,7 +25,7 @@ from mavbridge.core.provenance import without_secrets
 PIPED_WIDTH = 120
 """Columns of the tables if there is no terminal."""
 INK, MUTED, GRID, GREY = "#1f2933", "#6b7885", "#dfe4ea", "#a9b4bf"
-BLUE, PALE_BLUE, RED = "#2b6cb0", "#9cc5e8", "#d1495b"
+BLUE, RED = "#2b6cb0", "#d1495b"
 FIGURE_DPI = 150
 FIGURE_STYLE: dict[Any, Any] = {
     "font.size": 10,

@@ -22,7 +22,6 @@ FORMS = (
     "or MAVSDK's udpin://HOST:PORT, udpout://HOST:PORT, tcp://HOST:PORT, serial:///dev/ttyX:BAUD"
 )
 DEFAULT_BAUD = 57600
-EVERY_INTERFACE = "0.0.0.0"  # noqa: S104 - only where the user says so
 LOOPBACK = "127.0.0.1"
 _HOST_PORT = r"(?:\[([0-9A-Fa-f:.]*:[0-9A-Fa-f:.]*(?:%[^\]\s/]+)?)\]|([^:/\s\[\]]*)):(\d{1,5})"
 _KINDS = ("udp", "udpin", "udpout", "tcp", "tcpout")

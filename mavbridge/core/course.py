@@ -6,6 +6,9 @@ from itertools import pairwise
 from pathlib import Path
 from typing import Any, NamedTuple
 
+import numpy as np
+from numpy.typing import NDArray
+
 from mavbridge.core.clock import NS_PER_S
 from mavbridge.core.errors import UserError
 from mavbridge.core.records import Position
@@ -20,6 +23,15 @@ class CourseGate(NamedTuple):
     """Heading of the passage: 0 = flown through northwards, + = clockwise."""
     size_m: float
     """Side of the opening."""
+
+    @property
+    def corners_ned_m(self) -> NDArray[np.float64]:
+        """Corners of the opening [4, 3], clockwise from the upper left as flown through."""
+        half_m = self.size_m / 2
+        right = half_m * np.array([-math.sin(self.yaw_rad), math.cos(self.yaw_rad), 0.0])
+        down = np.array([0.0, 0.0, half_m])
+        corners_m = [-right - down, right - down, right + down, -right + down]
+        return np.add(corners_m, self.center_ned_m)
 
 
 class CourseProgress:

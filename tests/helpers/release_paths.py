@@ -37,10 +37,6 @@ def not_a_number(flight: OutputFlight) -> None:
     flight.return_nan()
 
 
-def pilots_mode(flight: OutputFlight) -> None:
-    flight.pilot_changes_mode()
-
-
 def stick_ramp(flight: OutputFlight) -> None:
     """Move another station's joystick: centred for half a second, then a fast ramp."""
     period_s = 0.02
@@ -94,11 +90,6 @@ def end(flight: OutputFlight) -> None:
     flight.stop()
 
 
-def key(flight: OutputFlight) -> None:
-    """Press q at the terminal."""
-    flight.act("release")
-
-
 def failsafe(flight: OutputFlight) -> None:
     """Change the mode by a failsafe of the vehicle itself."""
     if flight.is_px4:
@@ -112,21 +103,3 @@ def death_without_position(flight: OutputFlight) -> None:
     """Kill the flight process while modes that hold a position are refused."""
     flight.lose_position()
     later(flight, 0.05, flight.die)
-
-
-PATHS: dict[str, Callable[[OutputFlight], None]] = {
-    "death of the flight process": death,
-    "hang of 1 s": hang,
-    "NaN": not_a_number,
-    "pilot's mode": pilots_mode,
-    "pilot's stick ramp": stick_ramp,
-    "disarmed": disarming,
-    "vehicle not heard 2 s": deaf_guard,
-    "we are not heard 0.3 s": deaf_vehicle_short,
-    "we are not heard 1.5 s": deaf_vehicle,
-    "link cut 1.5 s": cut_link,
-    "end": end,
-    "key q": key,
-    "failsafe of the vehicle": failsafe,
-    "death without a position": death_without_position,
-}

@@ -13,7 +13,7 @@ from torch import Tensor
 
 from helpers.factories import START_NS, TICK_NS, make_state, make_tick, make_vision_tick
 from helpers.recordings import make_meta, without_writer_process
-from mavbridge.commands.imagine.inputs import RolloutStart, Sampler, read_start
+from mavbridge.commands.imagine.inputs import RolloutStart, Sampler
 from mavbridge.commands.imagine.loop import (
     Decider,
     PolicyDecider,
@@ -34,7 +34,6 @@ from mavbridge.commands.imagine.output import (
 from mavbridge.core.clock import NS_PER_S, MonotonicClock
 from mavbridge.core.records import FloatArray, ImageArray, RolloutFrame
 from mavbridge.core.vehicle import Sticks
-from mavbridge.recording.flight_folder import RecordedFlight, open_flight
 from mavbridge.recording.flight_writer import FlightWriter
 from mavbridge.recording.meta import FlightMeta
 from mavbridge.recording.tables import TableWriter
@@ -236,8 +235,3 @@ def write_flight(
 
 def grey(frame: int) -> int:
     return 20 + 7 * (frame % 30)
-
-
-def start_of(folder: Path, start_s: float = 0.0, config: WorldModelConfig = TINY) -> RolloutStart:
-    flight: RecordedFlight = open_flight(folder)
-    return read_start(flight, config, start_s)

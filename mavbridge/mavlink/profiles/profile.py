@@ -132,12 +132,14 @@ class ParamNote(NamedTuple):
     """Flag that fixes it; empty: none."""
     or_else: str = ""
     """End of the sentence, after the flag."""
+    names_cure: bool = False
+    """True if ``said`` already names the flag."""
 
     @property
     def text(self) -> str:
         """Sentence for the user, with the flag."""
-        is_told = not self.cure or self.cure in self.said
-        return self.said if is_told else f"{self.said}: use {self.cure}{self.or_else}"
+        is_complete = self.names_cure or not self.cure
+        return self.said if is_complete else f"{self.said}: use {self.cure}{self.or_else}"
 
 
 class Danger(NamedTuple):
@@ -166,7 +168,8 @@ class Danger(NamedTuple):
         return because(Code.RISK, risk=self.risk, why=self.why)
 
     def _note(self, said: str) -> ParamNote:
-        return ParamNote(() if self.name is None else (self.name,), said, self.cure)
+        names = () if self.name is None else (self.name,)
+        return ParamNote(names, said, self.cure, names_cure=True)
 
 
 LONGEST_SETPOINT_S = 3.0

@@ -198,13 +198,7 @@ def _airframe() -> rr.LineStrips3D:
 
 def _gates(gates: Sequence[CourseGate]) -> rr.LineStrips3D:
     """Return the openings, numbered in the order of flight."""
-    strips = []
-    for gate in gates:
-        half_m = gate.size_m / 2
-        right = half_m * np.array([-math.sin(gate.yaw_rad), math.cos(gate.yaw_rad), 0.0])
-        down = np.array([0.0, 0.0, half_m])
-        corners = [-right - down, right - down, right + down, -right + down, -right - down]
-        strips.append(np.array(gate.center_ned_m) + np.array(corners))
+    strips = [gate.corners_ned_m[[0, 1, 2, 3, 0]] for gate in gates]
     labels = [str(number) for number in range(1, len(gates) + 1)]
     return rr.LineStrips3D(
         strips,
