@@ -15,9 +15,9 @@ _CONTROLLED_BY = {
     Phase.FLYING: "the policy",
     Phase.LEAVING: "neutral sticks or setpoints, until a safe mode is confirmed",
     Phase.HOLDING: "neutral sticks, since silence would be a failsafe",
-    Phase.RELEASING: "nobody: a release leaves every 50 ms, also after a reopen of the link",
-    Phase.RELEASED: "the pilot; nothing is sent. As in WAITING",
-    Phase.ENDED: "the pilot; parameters of `--set` are put back (4 s at most), the process exits",
+    Phase.RELEASING: "nobody: a release is sent every 50 ms, also after the link was reopened",
+    Phase.RELEASED: "the pilot; nothing is sent. Continues as in WAITING",
+    Phase.ENDED: "the pilot; parameters of `--set` are restored (4 s at most), the process exits",
 }
 
 
@@ -32,7 +32,7 @@ def table() -> str:
     words = {
         _words(each) for row in (*TABLE, *PROGRESS) for each in (row.event, row.where, row.does)
     }
-    lines += ["", "| | which is |", "|---|---|"]
+    lines += ["", "| Term | Meaning |", "|---|---|"]
     lines += sorted(f"| {name} | {meaning} |" for name, meaning in words if meaning)
     return "\n".join(lines) + "\n"
 
@@ -47,7 +47,7 @@ def _lines(phase: Phase) -> Iterator[str]:
         if row.where is not None:
             event += f", and {_words(row.where)[0]}"
         elif row.event is condition:
-            event += ", else"
+            event += ", otherwise"
         condition = row.event if row.where is not None else None
         yield f"| | {event} | {_words(row.does)[0]} | {row.next.name if row.next else 'same'} |"
 

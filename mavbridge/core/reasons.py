@@ -120,6 +120,7 @@ class Code(StrEnum):
     HORIZON_TOO_SHORT = auto()
     TOO_SLOW = auto()
     CHUNKS_APART = auto()
+    CHUNKS_BEYOND_PLAN = auto()
     NO_CHUNK = auto()
     NOT_RECORDED = auto()
     JUST_BEGUN = auto()
@@ -172,7 +173,7 @@ _REASONS: dict[Code, tuple[Kind, str]] = {
     Code.NO_SUCH_MODE: (_VEHICLE, "this vehicle has no mode {mode}, it has {modes}"),
     Code.NO_CHUNK_SINCE_RESET: (
         _FAULT,
-        "the policy has not returned a chunk that may be flown since its reset: {why}",
+        "the policy has not returned a usable chunk since its reset: {why}",
     ),
     Code.NOT_READY: (
         _VEHICLE,
@@ -185,9 +186,9 @@ _REASONS: dict[Code, tuple[Kind, str]] = {
     Code.MODE_CHANGED: (_PILOT, "mode changed from {before} to {after}"),
     Code.DISARMED: (_VEHICLE, "the vehicle has been disarmed"),
     Code.FAILSAFE: (_VEHICLE, "a failsafe of the vehicle is active (mode {mode})"),
-    Code.OVERRULED: (_PILOT, "the vehicle ignores our {quantity}: {cause}"),
+    Code.OVERRULED: (_PILOT, "the vehicle ignores our {quantity}"),
     Code.CLOCK_SET_BACK: (_VEHICLE, "the vehicle's clock went back by {back_s:.1f} s"),
-    Code.MOVED: (_VEHICLE, "the vehicle went on from {now} instead of {before}"),
+    Code.MOVED: (_VEHICLE, "the vehicle now sends from {now} instead of {before}"),
     Code.REBOOTED: (_VEHICLE, "the vehicle has rebooted: its session starts over"),
     Code.MOVED_AT_REST: (
         _VEHICLE,
@@ -215,8 +216,8 @@ _REASONS: dict[Code, tuple[Kind, str]] = {
     Code.MODE_NOT_CONFIRMED: (_VEHICLE, "the vehicle has not confirmed {mode} in time"),
     Code.RELEASE_NOT_SEEN: (
         _VEHICLE,
-        "the vehicle still shows our last sticks, as it does without a receiver or with one that "
-        "rests there: whether it took the release is not known",
+        "the release was not seen: the vehicle still shows our last sticks, as it does without a "
+        "receiver, or with one at rest in the same position",
     ),
     Code.NOT_RELEASED: (_VEHICLE, "{instead} instead of release in the air: {why}"),
     Code.NO_RECEIVER: (_VEHICLE, "there is no receiver"),
@@ -240,9 +241,9 @@ _REASONS: dict[Code, tuple[Kind, str]] = {
         "this computer has refused every packet to the vehicle for {after_ms:.0f} ms: no route, a "
         "firewall, or a full queue",
     ),
-    Code.UNHEARD: (_VEHICLE, "the vehicle does not hear our {quantity}: {cause}"),
-    Code.NO_ECHO: (_VEHICLE, "no {message} arrive to check our {quantity} against"),
-    Code.LATE_SENDING: (_VEHICLE, "our packets take {age_ms:.0f} ms or more to the vehicle"),
+    Code.UNHEARD: (_VEHICLE, "the vehicle does not hear our {quantity}"),
+    Code.NO_ECHO: (_VEHICLE, "no {message} arrives, so our {quantity} cannot be checked"),
+    Code.LATE_SENDING: (_VEHICLE, "our packets take {age_ms:.0f} ms or more to reach the vehicle"),
     Code.READING_PARAMETERS: (_WAITING, "reading the vehicle's parameters"),
     Code.REQUESTING_TELEMETRY: (_WAITING, "requesting telemetry from the vehicle"),
     Code.LOOKING_FOR_RECEIVER: (_WAITING, "looking for the pilot's radio receiver"),
@@ -267,11 +268,11 @@ _REASONS: dict[Code, tuple[Kind, str]] = {
     Code.OBSTACLE: (_VEHICLE, "the vehicle would {what}: {causes}"),
     Code.CALIBRATION_CHANGED: (
         _PILOT,
-        "the vehicle's radio calibration was changed in flight: disarm to take it in",
+        "the vehicle's radio calibration was changed in flight: disarm to apply it",
     ),
     Code.RISK: (
         _VEHICLE,
-        "{why}, or --set-config link.accept_risk={risk} to fly all the same",
+        "{why}, or --set-config link.accept_risk={risk} to fly anyway",
     ),
     Code.ENDLESS_OVERRIDE: (
         _VEHICLE,
@@ -290,7 +291,7 @@ _REASONS: dict[Code, tuple[Kind, str]] = {
     ),
     Code.SLOW_SERIAL: (
         _VEHICLE,
-        "{baud} baud cannot carry the sticks and states that are asked for ({needed:.0f} bit/s): "
+        "{baud} baud cannot carry the requested sticks and states ({needed:.0f} bit/s): "
         "use --connect with a serial port of {enough:.0f} baud or more on both sides or with a "
         "network link, or a lower rates.action",
     ),
@@ -318,34 +319,40 @@ _REASONS: dict[Code, tuple[Kind, str]] = {
     Code.TOO_OLD: (_FAULT, "the {quantity} is {age_ms:.0f} ms old, beyond {limit_ms:.0f} ms"),
     Code.AFTER_HORIZON: (
         _FAULT,
-        "the chunk came after its horizon of {horizon_ms:.3g} ms ({steps} x {step_ms:.3g} ms) had "
-        "ended",
+        "the chunk arrived after its horizon of {horizon_ms:.3g} ms ({steps} x {step_ms:.3g} ms) "
+        "had ended",
     ),
     Code.HORIZON_TOO_SHORT: (
         _FAULT,
         "the policy's horizon of {horizon_ms:.3g} ms ({steps} x {step_ms:.3g} ms) is too short for "
-        "its rate: a chunk ends {covered_ms:.0f} ms after it came, and chunks come {gap_ms:.0f} ms "
-        "apart; ask for a higher rates.single or rates.action, or use a policy of a longer horizon",
+        "its rate: a chunk ends {covered_ms:.0f} ms after its arrival, and chunks arrive "
+        "{gap_ms:.0f} ms apart; use a higher rates.single or rates.action, or a policy with a "
+        "longer horizon",
     ),
     Code.TOO_SLOW: (
         _FAULT,
         "the policy is too slow for this computer, or the link for the policy: the last {chunks} "
-        "chunks came too late, the newest {age_ms:.0f} ms after its attitude, which may be "
-        "{limit_ms:.0f} ms old when a stick leaves; use a smaller policy, fewer steps or a faster "
-        "computer",
+        "chunks came too late, the newest {age_ms:.0f} ms after its attitude, which may be at most "
+        "{limit_ms:.0f} ms old when an action is sent; use a smaller policy, fewer steps or a "
+        "faster computer",
     ),
     Code.CHUNKS_APART: (
         _FAULT,
-        "the policy's chunks come up to {gap_ms:.0f} ms apart, beyond the {bridged_ms:.0f} ms that "
-        "are bridged: {advice}",
+        "the policy is too slow for its rate on this computer: its chunks arrive up to "
+        "{gap_ms:.0f} ms apart, and at most {bridged_ms:.0f} ms can be bridged; use a lower rate",
+    ),
+    Code.CHUNKS_BEYOND_PLAN: (
+        _FAULT,
+        "the policy's chunks arrive up to {gap_ms:.0f} ms apart, and its age limits and horizon "
+        "allow at most {bridged_ms:.0f} ms; use a higher rate",
     ),
     Code.NO_CHUNK: (_WAITING, "no chunk from the policy yet"),
     Code.NOT_RECORDED: (_FAULT, "the recording lacks {what}"),
-    Code.JUST_BEGUN: (_WAITING, "the policy has only just begun"),
+    Code.JUST_BEGUN: (_WAITING, "the policy has only just started"),
     Code.EMPTY_CHUNK: (_FAULT, "the policy returned a chunk without actions"),
     Code.WRONG_KIND: (
         _FAULT,
-        "the policy returned actions of another kind than its contract names",
+        "the policy returned actions of a different kind than its contract names",
     ),
     Code.NOT_FINITE: (_FAULT, "the policy returned a value that is not finite"),
     Code.WRONG_SHAPE: (
@@ -381,7 +388,7 @@ _REASONS: dict[Code, tuple[Kind, str]] = {
     Code.OF_CAMERA: (_FAULT, "camera {camera}: {why}"),
     Code.COMMAND_FAILED: (
         _FAULT,
-        "a command could not be made, a bug of mavbridge: {error} ({place})",
+        "a command could not be encoded or sent, a bug in mavbridge: {error} ({place})",
     ),
     Code.CAMERA_FAILED: (_FAULT, "the camera{camera} or its encoder has failed"),
     Code.POLICY_FAILED: (_FAULT, "the policy has failed"),
@@ -390,6 +397,26 @@ _REASONS: dict[Code, tuple[Kind, str]] = {
     Code.FLIGHT_PROCESS_DIED: (_FAULT, "the flight process has died"),
 }
 _WRAPPERS = (Code.THEN, Code.WITH_HINT, Code.SLOW_CLOCK, Code.OF_CAMERA)
+_CAUSES = {
+    ("rc-override", "unseen"): "another station may be overriding them, or the receiver has "
+    "priority",
+    ("rc-override", "foreign"): "another station is overriding them (a joystick on our system id?)",
+    ("rc-override", "returned"): "it also follows the sticks that it had before ours: another "
+    "station is overriding or releasing them, or the override switch is off",
+    ("manual-control", "unseen"): "it follows other sticks (a receiver, or a joystick on another "
+    "link) and keeps them (COM_RC_IN_MODE)",
+    ("manual-control", "foreign"): "another station sends sticks, or the receiver has priority "
+    "(COM_RC_IN_MODE)",
+    ("manual-control", "returned"): "it also follows the sticks that it had before ours "
+    "(COM_RC_IN_MODE)",
+    ("setpoints", "unseen"): "another station may be commanding it",
+    ("setpoints", "foreign"): "another station is commanding it too, or it limits or refuses them",
+    ("setpoints", "returned"): "it has returned to the target that it had before ours",
+    ("setpoints", "silent"): "its target has not changed for 0.4 s while ours has",
+    ("sticks", "silent"): "its sticks have not moved for 0.4 s while ours have",
+}
+_CAUSE_OF = ("output", "quantity")
+"""Likely causes of ``OVERRULED`` and ``UNHEARD``, by one of these figures and ``fault``."""
 _SPENT = {
     "computer": "the computer stood still for",
     "guard": "the guard stood still for",
@@ -441,6 +468,9 @@ class Reason:
         """Return the sentence for the user."""
         words = dict(self.data)
         text = _REASONS[self.code][1].format(**words)
+        if self.code in (Code.OVERRULED, Code.UNHEARD):
+            keys = ((str(words.get(name)), str(words.get("fault"))) for name in _CAUSE_OF)
+            return ": ".join((text, *(_CAUSES[key] for key in keys if key in _CAUSES)))
         if self.code not in (Code.LATE, Code.PAST_HORIZON):
             return text
         said, place = words.get("said"), words["place"]

@@ -241,10 +241,6 @@ class LinkSnapshot:
     """Everything that the link knows at one step."""
 
     telemetry: Telemetry
-    samples: tuple[Sample, ...] = ()
-    """Readings since the last snapshot, in order of arrival."""
-    packets: tuple["ForwardedPacket", ...] = ()
-    """Packets of the vehicle since the last snapshot, if the link keeps them."""
     status: VehicleStatus | None
     problem: Reason | None
     """Why actions must not be sent (no heartbeat, handshake, override switch, no echo), or None."""

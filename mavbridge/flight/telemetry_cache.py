@@ -181,10 +181,13 @@ class TelemetryCache:
                 pass  # its end is the business of whoever has started it
 
     def _receive_samples(self, samples: Iterable[Sample]) -> None:
+        if self._past is None:
+            self.telemetry = self.telemetry._replace(**dict(samples))
+            return
         for _, datagram in groupby(samples, key=lambda sample: sample.reading.arrived_ns):
             known_ns, self.telemetry = self.attitude_ns, self.telemetry._replace(**dict(datagram))
             # After each datagram: which of them came in one batch is not in a recording.
-            if self._past is not None and self.attitude_ns != known_ns:
+            if self.attitude_ns != known_ns:
                 self._past.append(self.telemetry)
 
     def _receive_tick(self, tick: GuardTick) -> None:

@@ -34,9 +34,9 @@ from mavbridge.mavlink.transport.sockets import make_transport
 SETTINGS_TIMEOUT_S = 5.0
 LAST_WORDS_S = 2.0
 """Longest wait [s] for a busy flight process to read the last message; control is given back."""
-LEAD_NS = 250 * NS_PER_MS // 1000
-"""Time from the decision to its slot [ns]: the work before a send takes at least 0.15 ms. A chunk
-that arrives in between waits for the slot."""
+LEAD_NS = 150 * NS_PER_MS // 1000
+"""Time from the decision to its slot [ns]: the least time that the work before a send takes.
+A chunk that arrives in between waits for the slot, so a longer lead would delay chunks."""
 _SURVIVED = ("SIGINT", "SIGHUP", "SIGTSTP", "SIGTTIN", "SIGTTOU")
 """Terminal signals that end or stop the flight process, and that the guard ignores."""
 

@@ -265,16 +265,11 @@ class ChunkBuffer:
             return because(Code.JUST_BEGUN)
         bridged_ns = self._grace_until_ns - self._taken_ns
         if (gap_ns := max(self._gaps_ns)) > bridged_ns:
-            advice = "it is too slow here for its rate; ask for a lower one"
-            if bridged_ns < self.grace_ns:
-                advice = (
-                    "its limits and horizon let none be flown for longer; ask for a higher rate"
-                )
+            is_limited = bridged_ns < self.grace_ns
             return because(
-                Code.CHUNKS_APART,
+                Code.CHUNKS_BEYOND_PLAN if is_limited else Code.CHUNKS_APART,
                 gap_ms=gap_ns / NS_PER_MS,
                 bridged_ms=bridged_ns / NS_PER_MS,
-                advice=advice,
             )
         return self._stale(chunk, now_ns)
 
@@ -384,9 +379,9 @@ class ChunkBuffer:
     def _malformed(self, chunk: Chunk) -> Reason | None:
         if not chunk.actions or chunk.step_ns <= 0:
             return because(Code.EMPTY_CHUNK)
-        if not all(type(action) is self._class for action in chunk.actions):
+        if set(map(type, chunk.actions)) != {self._class}:
             return because(Code.WRONG_KIND)
-        if not all(math.isfinite(sum(action)) for action in chunk.actions):
+        if not all(map(math.isfinite, map(sum, chunk.actions))):
             return because(Code.NOT_FINITE)
         return None
 

@@ -268,8 +268,11 @@ class Guard:
     def _inputs(self, now_ns: int, given: GuardInput, overdue: Reason | None) -> EngagementInputs:
         link, left, chunk_fault = given.link, None, given.command_fault or overdue
         status = link.status
-        if chunk_fault is None and self._engagement.phase is Phase.FLYING:
+        is_flying = self._engagement.phase is Phase.FLYING
+        if chunk_fault is None and is_flying:
             chunk_fault = self._chunks.fault(now_ns)
+        # What only prevents a flight is not asked in one; read-only, the policy seems to fly.
+        is_sought = not is_flying or self._engagement.settings.readonly
         starting_ns, newest = self._engagement.starting_ns, self._chunks.newest
         reset_ns = 0 if newest is None else newest.reset_ns
         if status is not None:
@@ -300,12 +303,12 @@ class Guard:
             is_released=link.is_released,
             shows_last=link.shows_last,
             refused_mode=link.refused_mode,
-            chunk_problem=self._chunks.problem(now_ns),
+            chunk_problem=self._chunks.problem(now_ns) if is_sought else None,
             chunk_fault=chunk_fault,
             command_failed=given.command_fault is not None,
             are_sticks_at_rest=link.are_sticks_at_rest,
             stick_override_ns=status.stick_override_ns if status else None,
-            slowness=given.command_fault or self._chunks.impossibility,
+            slowness=given.command_fault or (self._chunks.impossibility if is_sought else None),
             is_policy_reset=reset_ns >= (now_ns if starting_ns is None else starting_ns),
             envelope_problem=left.reason if left and left.kind == "fault" else None,
             landing=left.reason if left and left.kind == "landed" else None,

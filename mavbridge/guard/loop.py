@@ -34,7 +34,7 @@ from mavbridge.guard.wire import (
     encode_from_guard,
     encode_samples,
 )
-from mavbridge.mavlink.link import MavlinkLink
+from mavbridge.mavlink.link import Arrivals, MavlinkLink
 
 IDLE_PERIOD_NS = 10 * NS_PER_MS
 """Polling period of the link before a policy is loaded."""
@@ -48,7 +48,7 @@ recent."""
 _HELD = (Phase.FLYING, Phase.LEAVING, Phase.HOLDING)
 _ENGAGED = (*_HELD, Phase.RELEASING)
 _TAKEN = (*_ENGAGED, Phase.PREPARING)
-_MOTION = ("telemetry", "samples", "packets", "status", "position_ned_m")
+_MOTION = ("telemetry", "status", "position_ned_m")
 _LINK, _STATUS = (
     attrgetter(*(each.name for each in fields(kind) if each.name not in _MOTION))
     for kind in (LinkSnapshot, VehicleStatus)
@@ -169,7 +169,9 @@ class GuardLoop:
             UserError: the vehicle cannot be flown.
         """
         woke_ns = self._clock.now_ns()
-        snapshot = self._link.poll()
+        # Samples leave at once: the policy solves while the guard looks at the rest.
+        self._forward(self._link.receive())
+        snapshot = self._link.snapshot()
         self._report_vehicle(snapshot)
         given = self._receive(snapshot)
         if self._guard is None:
@@ -256,13 +258,15 @@ class GuardLoop:
         # One more pass forwards the link's messages about the parameters.
         self.is_done = (was_clean and self._is_clean) or now_ns >= self._finish_until_ns
 
-    def _report_vehicle(self, snapshot: LinkSnapshot) -> None:
-        """Forward the vehicle's samples, then its status if it has changed."""
+    def _forward(self, arrivals: Arrivals) -> None:
         # The flight process does not read samples before a policy is loaded; keep the queue free.
-        if snapshot.samples and self._guard is not None:
-            self._samples.send(encode_samples(snapshot.samples))
-        if snapshot.packets and self._guard is not None:
-            self._flight.send(encode_from_guard(Packets(snapshot.packets)))
+        if arrivals.samples and self._guard is not None:
+            self._samples.send(encode_samples(arrivals.samples))
+        if arrivals.packets and self._guard is not None:
+            self._flight.send(encode_from_guard(Packets(arrivals.packets)))
+
+    def _report_vehicle(self, snapshot: LinkSnapshot) -> None:
+        """Send the vehicle's status if it has changed, and the link's texts."""
         vehicle = snapshot.status
         if vehicle is not self._vehicle or self._status is None or snapshot.texts:
             self._vehicle = vehicle

@@ -102,7 +102,7 @@ class Memory:
         """nothing"""
 
     def refuse(self, _: EngagementInputs, why: Reason) -> None:
-        """refused and forgotten, and said why"""
+        """refuse the act and say why"""
         self.refusal, self.act = not_engaged(why), None
 
     def prepare(self, now: EngagementInputs, _cause: bool) -> None:
@@ -118,7 +118,7 @@ class Memory:
         self.seen_interruptions = now.interruptions
 
     def give_up(self, _: EngagementInputs, cause: EndRequest) -> None:
-        """said why; after `--arm` the guard ends"""
+        """say why; after `--arm` the guard ends"""
         if self.is_act:
             self.refusal = cause.reason  # the act may be repeated
         else:
@@ -126,7 +126,7 @@ class Memory:
             self.end_request, self.must_stop = cause, True
 
     def fly(self, now: EngagementInputs, _cause: bool) -> None:
-        """the policy's sticks, from the pilot's or idle ones"""
+        """the policy's actions, starting from the pilot's or idle sticks"""
         flights = self.outcome.flights + 1
         self.outcome = self.outcome._replace(flights=flights, is_disarmed=False, end=None)
         self.reason, self.own_mode, self.seen_interruptions = None, now.mode, now.interruptions
@@ -135,7 +135,7 @@ class Memory:
     def leave(self, now: EngagementInputs, cause: EndRequest) -> None:
         """neutral in the same step, then a safe mode
 
-        That of `--on-fault` after a fault or a takeover, that of `--then` after an end: see
+        The mode of `--on-fault` after a fault or a takeover, that of `--then` after an end: see
         [the way out](#the-way-out).
         """
         self._note_end(cause)
@@ -161,7 +161,7 @@ class Memory:
         self.owes_release = self.phase is not Phase.PREPARING or self.engage.has_sticks
 
     def finish(self, now: EngagementInputs, _cause: bool) -> None:
-        """as the next state says; told, if the safe mode is not confirmed"""
+        """as the next state says; a safe mode that is not confirmed is reported"""
         mode = self.disengage.mode
         if self.phase is Phase.LEAVING and mode is not None and mode != now.mode:
             self.refusal = because(Code.MODE_NOT_CONFIRMED, mode=mode)

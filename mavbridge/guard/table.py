@@ -1,21 +1,22 @@
-"""Who controls the vehicle: the states, what happens in them, and what follows from it.
+"""State machine that decides who controls the vehicle: states, events and transitions.
 
-Rules that every row keeps:
+Every row obeys these rules:
 
-1. Only an explicit act engages: ``--arm`` (once), the operator's key, the engage switch that goes
-   high after a rest, the first arming with ``--engage-on-arm``. Nothing that recovers, comes back
-   or is armed again does, and an act that no row follows is forgotten.
-2. Who takes the vehicle wins over everything else that happens in the same step: the sticks are
-   released in that step, and no mode is asked for. Only a vehicle that would go on with our last
-   setpoint is left as after a fault.
-3. What ends by our own doing is neutral in the same step, then in a safe mode, then released, and
-   only to a hand that would hold it.
-4. In WAITING, RELEASED and ENDED nothing is sent.
+1. Only an explicit act engages the policy: ``--arm`` (once), the operator's key, the engage switch
+   going high after a rest, or the first arming with ``--engage-on-arm``. A recovery, a return or a
+   second arming never does, and an act that matches no row is discarded.
+2. A takeover wins over every other event of the same step: the sticks are released in that step
+   and no mode is requested. The one exception is a vehicle that would keep following our last
+   setpoint: the policy leaves it as after a fault.
+3. When we end the flight, the action is neutral in the same step; a safe mode follows, then the
+   release, and only to a pilot or receiver that would hold the vehicle.
+4. Nothing is sent in WAITING, RELEASED and ENDED.
 
-In each step the rows of the state are read from the top. The first one whose event happens and
-whose condition holds is taken; one without a next state goes on to those below. ``TABLE`` is read
-with what comes from outside, then the state acts (``Engagement``), then ``PROGRESS`` is read with
-what its sequence has reached. The docstrings are the texts of docs/safety.md.
+Each step reads the rows of the present state from the top and takes the first one whose event has
+occurred and whose condition holds. A row without a next state continues with the rows below it.
+``TABLE`` is read first, for external events; then the state acts (``Engagement``); then
+``PROGRESS`` is read, for what the state's sequence has completed. The docstrings below are the
+texts of docs/safety.md.
 """
 
 from collections.abc import Callable
@@ -28,15 +29,15 @@ from mavbridge.guard.values import EndRequest, EngagementInputs, Phase
 
 WAITING, PREPARING, FLYING, LEAVING, HOLDING, RELEASING, RELEASED, ENDED = Phase
 RELEASE_TIMEOUT_NS = NS_PER_S
-"""Wait for the vehicle to show other sticks than ours. Without a receiver it never does."""
+"""Longest wait for the vehicle to show sticks other than ours. Without a receiver it never does."""
 UNHEARD_RELEASE_TIMEOUT_NS = 4 * NS_PER_S
-"""The same where it does not even show the last ones that we sent, so that the releases may be lost
-as well: longer than it holds ours on its own (RC_OVERRIDE_TIME, 3 s by default)."""
+"""Longest wait if it does not even show our last sticks, since the releases may be lost too.
+Longer than the vehicle holds an override by itself (RC_OVERRIDE_TIME, 3 s by default)."""
 LOST_NS = 30 * NS_PER_S
-"""A vehicle that was held for so long without a word from it is gone: nothing can be held."""
+"""Silence of a held vehicle after which it counts as lost, and holding it ends."""
 
 
-# --- events: pure, of what is remembered and what comes in
+# --- events: pure functions of the memory and the inputs
 
 
 def ended(m: Memory, now: EngagementInputs) -> bool:
@@ -56,10 +57,11 @@ def arm_flag(m: Memory, now: EngagementInputs) -> bool:
 
 
 def unfit_engage(m: Memory, now: EngagementInputs) -> Reason | None:
-    """an act that cannot be followed
+    """an act that must be refused
 
-    Disarmed, in a failsafe, outside the envelope, the engage switch low, a mode that is neither
-    allowed nor ours to change, no link, no fresh chunk; while a flight is still ending.
+    The vehicle is disarmed, in a failsafe or outside the envelope; the engage switch is low; the
+    mode is not allowed and we may not change it; there is no link or no fresh chunk; or the last
+    flight is still ending.
     """
     if m.act != "engage":
         return None
@@ -86,7 +88,7 @@ def engage(m: Memory, _: EngagementInputs) -> bool:
 def stopped(m: Memory, _: EngagementInputs) -> EndRequest | None:
     """a stop
 
-    The key `q`, a signal, the death or a fault of the flight process, the last gate of `--gates`.
+    The key `q`, a signal, a fault or the death of the flight process, the last gate of `--gates`.
     """
     if m.end_request is None and m.act == "release":
         return EndRequest(because(Code.OPERATOR), end="operator")
@@ -101,9 +103,10 @@ def stopped_anew(m: Memory, now: EngagementInputs) -> EndRequest | None:
 def taken(m: Memory, now: EngagementInputs) -> EndRequest | None:
     """**takeover**
 
-    Mode changed, disarmed, failsafe, override switch low, engage switch low (where the policy flies
-    or an act is followed), other sticks than ours followed, reboot, silence while another vehicle
-    uses its id, a parameter that matters changed.
+    The mode was changed; the vehicle was disarmed, rebooted, is in a failsafe or follows sticks
+    other than ours; the override switch is low; the engage switch is low (in flight, or while an
+    act is carried out); the vehicle is silent while another one uses its system id; or a relevant
+    parameter was changed.
     """
     if (reason := _takeover(m, now)) is None:
         return None
@@ -113,8 +116,8 @@ def taken(m: Memory, now: EngagementInputs) -> EndRequest | None:
 def late(m: Memory, now: EngagementInputs) -> EndRequest | None:
     """not ready in time
 
-    90 s with `--arm`, and a second for each metre of `--takeoff`; 3 s after another act; at once
-    where it can never be: a mode that the vehicle lacks, a policy that is too slow.
+    After 90 s with `--arm`, plus one second per metre of `--takeoff`; after 3 s with another act;
+    at once if waiting cannot help: the vehicle lacks the mode, or the policy is too slow.
     """
     problem = m.engage.impossibility(now)
     if problem is None and now.now_ns <= m.until_ns:
@@ -150,26 +153,27 @@ def landed(_: Memory, now: EngagementInputs) -> EndRequest | None:
 def fault(_: Memory, now: EngagementInputs) -> EndRequest | None:
     """**fault**
 
-    No usable chunk for longer than [the grace](#the-grace), no attitude from the vehicle for as
-    long, 5 malformed chunks (NaN), envelope left, link lost, our packets refused by the system for
-    100 ms or our sticks not heard, a command that cannot be made, the vehicle's clock set back, or
-    the vehicle at another address.
+    No usable chunk, or no attitude from the vehicle, for longer than [the grace](#the-grace); 5
+    malformed chunks (NaN); the envelope was left; the link was lost; the system has refused our
+    packets for 100 ms; the vehicle does not hear our sticks; a command could not be encoded; the
+    vehicle's clock was set back; or the vehicle sends from another address.
     """
     reason = now.link_problem or now.chunk_fault or now.envelope_problem
     return None if reason is None else EndRequest(reason, is_fault=True)
 
 
 def vanished(m: Memory, now: EngagementInputs) -> EndRequest | None:
-    """30 s without a word from the vehicle"""
+    """30 s of silence from the vehicle"""
     if now.now_ns - m.heard_ns < LOST_NS:
         return None
     return EndRequest(because(Code.VEHICLE_LOST, after_s=LOST_NS / NS_PER_S), is_fault=True)
 
 
 def released(m: Memory, now: EngagementInputs) -> bool:
-    """the vehicle shows other sticks than ours, or does not for 1 s
+    """the vehicle shows sticks other than ours, or 1 s has passed
 
-    4 s where it does not even show our last ones; then it is said that the release was not seen.
+    4 s if it does not even show our last sticks; the outcome then says that the release was not
+    seen.
     """
     timeout_ns = RELEASE_TIMEOUT_NS if now.shows_last else UNHEARD_RELEASE_TIMEOUT_NS
     return (now.is_released and not m.owes_release) or now.now_ns - m.released_ns >= timeout_ns
@@ -178,15 +182,16 @@ def released(m: Memory, now: EngagementInputs) -> bool:
 def ready(m: Memory, now: EngagementInputs) -> bool:
     """ready
 
-    Armed, in its mode, and the first chunk that was solved after a reset.
+    The vehicle is armed and in its mode, and the first chunk since the policy's reset has arrived.
     """
     return m.engage.waits_for is None and now.is_policy_reset and now.chunk_problem is None
 
 
 def over(m: Memory, _: EngagementInputs) -> bool:
-    """the way out is at its end
+    """the disengage sequence is complete
 
-    Mode confirmed, after 50 ms of neutral at least; or not within 3 s, while the vehicle is heard.
+    The mode is confirmed, after at least 50 ms of neutral; or it was not confirmed within 3 s in
+    which the vehicle was heard.
     """
     return m.disengage.is_done
 
@@ -195,7 +200,7 @@ def over(m: Memory, _: EngagementInputs) -> bool:
 
 
 def is_ours(m: Memory, now: EngagementInputs) -> bool:
-    """the vehicle is ours
+    """we hold the vehicle
 
     We have armed it, or it flies by our neutral sticks or setpoints.
     """
@@ -203,10 +208,11 @@ def is_ours(m: Memory, now: EngagementInputs) -> bool:
 
 
 def follows_us(m: Memory, now: EngagementInputs) -> bool:
-    """it would follow our last setpoint
+    """it would keep following our last setpoint
 
-    Still armed in the mode that follows setpoints, without a failsafe, and nobody else is followed:
-    silence would be the last setpoint for up to 3 s, and sticks do nothing in that mode.
+    It is still armed in a mode that follows setpoints, without a failsafe, and follows no other
+    source. After a release it would hold the last setpoint for up to 3 s, and sticks do nothing in
+    that mode.
     """
     is_own = m.phase is not Phase.PREPARING or m.engage.is_own_mode(now)
     return (
@@ -219,7 +225,8 @@ def follows_us(m: Memory, now: EngagementInputs) -> bool:
 def may_release(m: Memory, _: EngagementInputs) -> bool:
     """it may be released
 
-    A hand would hold the vehicle and silence is no failsafe, or the actions are setpoints.
+    A pilot or receiver would hold the vehicle and silence is no failsafe; or the actions are
+    setpoints.
     """
     return not m.disengage.must_hold
 
@@ -260,14 +267,14 @@ def _takeover(m: Memory, now: EngagementInputs) -> Reason | None:
 
 
 class Row(NamedTuple):
-    """One row: in these states, where this happens, that is done."""
+    """One transition: in these states, if this event occurs, do that."""
 
     states: tuple[Phase, ...]
     event: Callable[[Memory, EngagementInputs], EndRequest | Reason | bool | None]
     does: Callable[[Memory, EngagementInputs, Any], None]
-    """With what the event returned."""
+    """Called with the event's result."""
     next: Phase | None = None
-    """None: the same, and the rows below are read."""
+    """None: the state stays, and the rows below are read."""
     where: Callable[[Memory, EngagementInputs], bool] | None = None
 
 

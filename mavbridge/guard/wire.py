@@ -9,6 +9,7 @@ import pickle
 import struct
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
+from itertools import chain
 from typing import Any, Literal, NamedTuple, TypeAlias, get_args
 
 from mavbridge.core.address import SocketAddress
@@ -29,6 +30,7 @@ from mavbridge.guard.settings import FlightSettings, GuardSettings
 from mavbridge.guard.values import EndRequest, OperatorCommand, Outcome, Phase
 
 _CHUNK = struct.Struct("<cBqqqqqqqqH")
+_ACTION = struct.Struct("<4d")
 _TICK = struct.Struct("<cqqqqqqqB?iBBB20d")
 _QUANTITIES = Telemetry._fields
 _SAMPLES = tuple(struct.Struct(f"<Bqq{count}d") for count in (4, 3, 3, 3, 3, 1))
@@ -168,7 +170,7 @@ def encode_to_guard(message: ToGuard) -> bytes:
         return _pickled(message)
     stamps = (*message[:7], message.reset_ns)
     count = len(message.actions)
-    values = [value for action in message.actions for value in action]
+    values = chain.from_iterable(message.actions)
     kind = _CLASSES.index(type(message.actions[0])) if count else 0
     return _CHUNK.pack(b"C", kind, *stamps, count) + struct.pack(f"<{4 * count}d", *values)
 
@@ -248,8 +250,9 @@ def _unpickled(data: bytes, classes: tuple[type, ...]) -> Any:
 def _decode_chunk(data: bytes) -> Chunk:
     _, kind, *stamps, count = _CHUNK.unpack_from(data)
     serial, attitude_ns, velocity_ns, image_ns, computed_ns, first_ns, step_ns, reset_ns = stamps
-    make = _CLASSES[kind]
-    values = struct.unpack(f"<{4 * count}d", data[_CHUNK.size :])
+    if len(data) != _CHUNK.size + count * _ACTION.size:
+        raise ValueError("a chunk of another length")
+    actions = _ACTION.iter_unpack(memoryview(data)[_CHUNK.size :])
     return Chunk(
         serial=serial,
         attitude_ns=attitude_ns,
@@ -258,7 +261,7 @@ def _decode_chunk(data: bytes) -> Chunk:
         computed_ns=computed_ns,
         first_ns=first_ns,
         step_ns=step_ns,
-        actions=tuple(make(*values[4 * k : 4 * k + 4]) for k in range(count)),
+        actions=tuple(map(_CLASSES[kind]._make, actions)),
         reset_ns=reset_ns,
     )
 

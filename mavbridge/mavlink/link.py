@@ -2,6 +2,7 @@
 
 from collections.abc import Iterable, Mapping
 from dataclasses import replace
+from typing import NamedTuple
 
 from pymavlink.dialects.v20 import ardupilotmega as dialect
 
@@ -56,6 +57,14 @@ _EARLY_REQUEST_NS = 20 * NS_PER_MS
 _HEARTBEAT_HZ = 1.0
 
 
+class Arrivals(NamedTuple):
+    """What came from the vehicle since the last call, in order of arrival."""
+
+    samples: tuple[Sample, ...]
+    packets: tuple[ForwardedPacket, ...]
+    """Empty unless the link keeps packets."""
+
+
 class MavlinkLink:
     """Non-blocking session with one vehicle over a transport; not thread-safe.
 
@@ -76,7 +85,7 @@ class MavlinkLink:
         keeps_packets: bool = False,
         signing: Signing | None = None,
     ) -> None:
-        """``keeps_packets``: include the vehicle's packets in each snapshot, for a recorder."""
+        """``keeps_packets``: ``receive`` returns the vehicle's packets too, for a recorder."""
         self._clock, self._config, self._keeps_packets = clock, config, keeps_packets
         self._packets: list[ForwardedPacket] = []
         self._samples: list[Sample] = []
@@ -108,25 +117,27 @@ class MavlinkLink:
         self._interruptions = 0
         self._duplicate_systems = DuplicateSystems()
 
-    def poll(self) -> LinkSnapshot:
+    def receive(self) -> Arrivals:
         """Receive everything that has arrived; never block. ``service`` does the rest."""
         self._receive_all()
         if self.vehicle is not None and self.vehicle.has_rebooted:
             self._interrupt(because(Code.REBOOTED))
             self._adopt(self.vehicle.identity)
+        arrivals = Arrivals(tuple(self._samples), tuple(self._packets))
+        self._samples, self._packets = [], []
+        return arrivals
+
+    def snapshot(self) -> LinkSnapshot:
+        """Return what the link knows now."""
         now_ns = self._clock.now_ns()
         texts = self._connection.take_texts()
         vehicle, output = self.vehicle, self._sender.output
         status = vehicle.status(now_ns) if vehicle else None
         modes = vehicle.profile.modes.roles if vehicle else ModeRoles()
         problem = self._problem(now_ns)
-        samples, self._samples = tuple(self._samples), []
-        packets, self._packets = tuple(self._packets), []
         if vehicle is None or output is None:
             return LinkSnapshot(
                 telemetry=self._telemetry.telemetry,
-                samples=samples,
-                packets=packets,
                 status=status,
                 problem=problem or because(Code.NO_POLICY_LOADED),
                 interruption=self._interruption,
@@ -138,8 +149,6 @@ class MavlinkLink:
         others = None if self._connection.is_refused(now_ns) else output.overruled(now_ns)
         return LinkSnapshot(
             telemetry=self._telemetry.telemetry,
-            samples=samples,
-            packets=packets,
             status=output.in_policy_terms(status, vehicle, now_ns),
             problem=problem or others or output.unheard(now_ns),
             is_overruled=others is not None,

@@ -143,7 +143,8 @@ class HostileFlight:
 
     def _is_ready(self) -> bool:
         """An engage would be obeyed, as far as the link and the inputs are concerned."""
-        guard, link = self.flight.guard._guard, self.flight.link.poll()
+        self.flight.link.receive()
+        guard, link = self.flight.guard._guard, self.flight.link.snapshot()
         assert guard is not None
         if link.status is None or link.problem is not None:
             return False

@@ -26,6 +26,7 @@ from mavbridge.core.vehicle import (
     Telemetry,
     VehicleStatus,
 )
+from mavbridge.mavlink.link import Arrivals
 
 START_NS = 1_000 * NS_PER_S
 FOREVER_NS = 2**62
@@ -158,8 +159,11 @@ class FakeLink:
         sent = [decision for _, decision in self.decisions]
         return [one for k, one in enumerate(sent) if k == 0 or one != sent[k - 1]]
 
-    def poll(self) -> LinkSnapshot:
+    def receive(self) -> Arrivals:
         samples, self._samples = self._samples, ()
+        return Arrivals(samples, ())
+
+    def snapshot(self) -> LinkSnapshot:
         texts, self.texts = tuple(self.texts), []
         status = self.status
         if status is not None and status.rc_arrived_ns is not None:
@@ -167,7 +171,6 @@ class FakeLink:
         holds = bool(self.decisions) and isinstance(self.decisions[-1][1], Command)
         return LinkSnapshot(
             telemetry=self._telemetry,
-            samples=samples,
             status=status,
             problem=self.problem or self.overruled,
             is_overruled=self.overruled is not None,

@@ -51,7 +51,8 @@ TAKEOVERS = [
         because(
             Code.OVERRULED,
             quantity="sticks",
-            cause="another station is overriding them (a joystick on our system id?)",
+            output="rc-override",
+            fault="foreign",
         ),
         0.5,
     ),

@@ -124,7 +124,8 @@ class VehicleProbe:
             self._pass()
 
     def _pass(self) -> LinkSnapshot:
-        self._snapshot = self._link.poll()
+        self._link.receive()
+        self._snapshot = self._link.snapshot()
         self.texts += [text for text in self._snapshot.texts if text not in self.texts]
         self._link.service()
         self._clock.sleep_until_ns(self._clock.now_ns() + _POLL_NS)

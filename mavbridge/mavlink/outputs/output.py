@@ -2,14 +2,13 @@
 
 from abc import ABC, abstractmethod
 from collections import Counter
-from collections.abc import Mapping
 from typing import ClassVar, NamedTuple
 
 from mavbridge.core.reasons import Code, Reason, because
 from mavbridge.core.vehicle import Action, Output, VehicleStatus
 from mavbridge.mavlink.codec.messages import Body
 from mavbridge.mavlink.codec.packets import Codec
-from mavbridge.mavlink.outputs.echo import EchoCheck, EchoFault, EchoRules, Shown
+from mavbridge.mavlink.outputs.echo import EchoCheck, EchoRules, Shown
 from mavbridge.mavlink.session.vehicle import VehicleSession
 
 
@@ -39,8 +38,6 @@ class ActionOutput(ABC):
     """Number of packets that release the last action; 0: silence is the release."""
     _echo_message: ClassVar[str]
     """Message that shows the input that the vehicle acts on."""
-    _causes: ClassVar[Mapping[EchoFault, str]]
-    """Likely cause of each fault, for the user."""
 
     def __init__(self, codec: Codec, rules: EchoRules) -> None:
         self._codec = codec
@@ -143,7 +140,7 @@ class ActionOutput(ABC):
         fault = self.echo.fault(now_ns)
         if fault is None or fault == "silent" or self.echo.is_unshown(now_ns):
             return None
-        return because(Code.OVERRULED, quantity=self._noun, cause=self._causes[fault])
+        return because(Code.OVERRULED, quantity=self._noun, output=self.name, fault=fault)
 
     def unheard(self, now_ns: int) -> Reason | None:
         """Return the likely reason why our packets do not reach the vehicle, or None."""
@@ -151,7 +148,7 @@ class ActionOutput(ABC):
         if fault is not None and self.echo.is_unshown(now_ns):
             return because(Code.NO_ECHO, message=self._echo_message, quantity=self._noun)
         if fault == "silent":
-            return because(Code.UNHEARD, quantity=self._noun, cause=self._causes[fault])
+            return because(Code.UNHEARD, quantity=self._noun, output=self.name, fault=fault)
         return None
 
     @property

@@ -1,7 +1,6 @@
 """Outputs for setpoints: common base, and velocities by SET_POSITION_TARGET_LOCAL_NED."""
 
 import math
-from collections.abc import Mapping
 from typing import ClassVar
 
 from pymavlink.dialects.v20 import ardupilotmega as dialect
@@ -10,7 +9,7 @@ from mavbridge.core.clock import NS_PER_S
 from mavbridge.core.vehicle import Action, ActionMeaning, Output, Velocity
 from mavbridge.mavlink.codec.messages import Body, VelocityTarget
 from mavbridge.mavlink.codec.packets import Codec, CommandRefusedError
-from mavbridge.mavlink.outputs.echo import EchoFault, EchoRules
+from mavbridge.mavlink.outputs.echo import EchoRules
 from mavbridge.mavlink.outputs.output import ActionOutput, Encoded
 from mavbridge.mavlink.session.vehicle import VehicleSession
 
@@ -35,12 +34,6 @@ class SetpointOutput(ActionOutput):
     releases = 0
     takeoff_ns: ClassVar[int] = 0
     """Time after leaving the ground for which another target is normal."""
-    _causes: ClassVar[Mapping[EchoFault, str]] = {
-        "unseen": "another station may be commanding it",
-        "foreign": "another station commands it as well, or it limits or refuses them",
-        "returned": "it goes back to what it did before us",
-        "silent": "its target has stood still for 0.4 s while ours moved",
-    }
 
     def __init__(self, codec: Codec, rules: EchoRules) -> None:
         super().__init__(codec, rules)

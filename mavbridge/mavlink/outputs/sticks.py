@@ -1,8 +1,6 @@
 """Outputs for sticks: RC_CHANNELS_OVERRIDE (ArduPilot), MANUAL_CONTROL (PX4), with echoes."""
 
-from collections.abc import Mapping
 from dataclasses import replace
-from typing import ClassVar
 
 from mavbridge.core.clock import NS_PER_MS, NS_PER_S
 from mavbridge.core.vehicle import (
@@ -24,7 +22,7 @@ from mavbridge.mavlink.codec.packets import (
     manual_control_sticks,
     pwm_of,
 )
-from mavbridge.mavlink.outputs.echo import EchoFault, EchoRules, Shown
+from mavbridge.mavlink.outputs.echo import EchoRules, Shown
 from mavbridge.mavlink.outputs.output import ActionOutput, Encoded
 from mavbridge.mavlink.profiles.sticks import IDENTITY, StickCurves
 from mavbridge.mavlink.session.vehicle import VehicleSession
@@ -149,13 +147,6 @@ class OverrideOutput(StickOutput):
     """Sent over the four seconds of a release at most; the silence that follows lets another
     station override."""
     _echo_message = "RC_CHANNELS"
-    _causes: ClassVar[Mapping[EchoFault, str]] = {
-        "unseen": "another station may be overriding them, or the receiver has priority",
-        "foreign": "another station is overriding them (a joystick on our system id?)",
-        "returned": "it also acts on the sticks that it had before us: another station is "
-        "overriding or releasing them, or the override switch is off",
-        "silent": "its sticks have stood still for 0.4 s while ours moved",
-    }
 
     def __init__(self, codec: Codec, gains: StickGains | None) -> None:
         super().__init__(codec, OVERRIDE_ECHO, gains)
@@ -291,13 +282,6 @@ class ManualControlOutput(StickOutput):
     name: Output = "manual-control"
     releases = 1
     _echo_message = "MANUAL_CONTROL"
-    _causes: ClassVar[Mapping[EchoFault, str]] = {
-        "unseen": "it has other sticks (a receiver, or a joystick on another link) and keeps them "
-        "(COM_RC_IN_MODE)",
-        "foreign": "another station sends sticks, or the receiver's have priority (COM_RC_IN_MODE)",
-        "returned": "it also acts on the sticks that it had before us (COM_RC_IN_MODE)",
-        "silent": "its sticks have stood still for 0.4 s while ours moved",
-    }
 
     def __init__(self, codec: Codec, gains: StickGains | None) -> None:
         super().__init__(codec, MANUAL_ECHO, gains)

@@ -125,7 +125,7 @@ def _keep_link(
                 link.service()
         clock.sleep_until_ns(min(arrival_ns, clock.now_ns() + PREPARE_NS, until_ns))
         if clock.now_ns() < until_ns:
-            link.poll()
+            link.receive()
             link.service()
 
 
@@ -226,9 +226,9 @@ class _WatchedLink(MavlinkLink):
 
     newest: LinkSnapshot
 
-    def poll(self) -> LinkSnapshot:
+    def snapshot(self) -> LinkSnapshot:
         """See ``MavlinkLink``."""
-        self.newest = super().poll()
+        self.newest = super().snapshot()
         return self.newest
 
 

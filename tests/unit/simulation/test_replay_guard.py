@@ -18,10 +18,10 @@ class AskingLink:
     def note(self, name: str) -> None:
         self.calls.append((name, (self._clock.now_ns() - self._begin_ns) / MS))
 
-    def poll(self) -> None:
+    def receive(self) -> None:
         assert self.transport is not None
         received = len(list(self.transport.drain()))
-        self.note(f"poll {received}" if received else "poll")
+        self.note(f"receive {received}" if received else "receive")
 
     def service(self) -> None:
         self.note("service")
@@ -36,6 +36,6 @@ def test_the_link_has_asked_before_what_may_be_the_answer_arrives() -> None:
     link.transport = transport
     _keep_link(link, clock, transport, begin_ns + 12 * MS)  # type: ignore[arg-type]
     names = [name for name, _ in link.calls]
-    assert names[: names.index("poll 1") + 1] == ["service", "poll 1"]
+    assert names[: names.index("receive 1") + 1] == ["service", "receive 1"]
     assert link.calls[0][1] < 7
     assert clock.now_ns() == begin_ns + 12 * MS

@@ -199,7 +199,7 @@ def test_setpoints_of_another_station_are_noticed_but_not_a_change_of_mode(
     flight.receive(target(0.45))
     why = flight.output.overruled(flight.now_ns)
     assert (why.code, dict(why.data)["quantity"]) == (Code.OVERRULED, "setpoints")
-    assert "another station commands it" in str(why)
+    assert dict(why.data)["fault"] == "foreign"
 
 
 def test_a_vehicle_that_hears_no_setpoint_any_more_is_noticed() -> None:
