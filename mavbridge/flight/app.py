@@ -344,14 +344,14 @@ class _Flight:
             if is_holding and not is_told:
                 is_told = True
                 screen.show_message(
-                    "without a receiver silence is a failsafe, so neutral sticks go on until the "
-                    "vehicle is disarmed or its mode is changed; Ctrl-C leaves that to the guard "
-                    f"(process {self._guard.pid})"
+                    "without a receiver silence is a failsafe: neutral sticks continue until the "
+                    "vehicle is disarmed or its mode is changed; after Ctrl-C the guard (process "
+                    f"{self._guard.pid}) continues alone"
                 )
             if stop.requests > asked or self._clock.now_ns() > until_ns:
                 break
         if self._has_hung:
-            raise PeerError(f"{ending.reason}: it is too slow for this machine, or stuck")
+            raise PeerError(f"{ending.reason}: it is too slow for this computer, or stuck")
 
     def _join(self, worker: Worker) -> None:
         """Join a loop, for as long as one call of the policy may last before it counts as hung."""
@@ -374,13 +374,13 @@ class _Flight:
                 screen.show_message(f"control given back, {left}")
             elif view.phase is Phase.HOLDING and not self._guard.wait(0):
                 holder = f"the guard (process {self._guard.pid})"
-                screen.show_message(f"{left}: {holder} goes on sending neutral sticks")
+                screen.show_message(f"{left}: {holder} keeps sending neutral sticks")
         if summary is not None:
             log_link(summary)
         if summary is not None and summary.dropped_messages:
             screen.show_message(
-                f"{summary.dropped_messages} messages of the guard did not fit into its queue: "
-                "this process was too busy to take them"
+                f"{summary.dropped_messages} messages of the guard were dropped: this process was "
+                "too busy to read them"
             )
         is_found = view.status.mode is not None
         autopilot = view.status.autopilot if is_found else None

@@ -47,7 +47,7 @@ LATEST_NS = 500 * NS_PER_MS
 have left our sticks by its own timeout or by its pilot."""
 _STILL_OURS = (Phase.FLYING, Phase.LEAVING, Phase.HOLDING)
 OWN_TIMEOUT = (
-    "the vehicle keeps the last sticks or setpoint until its own timeout (ArduPilot: "
+    "the vehicle holds the last sticks or setpoint until its own timeout (ArduPilot: "
     "RC_OVERRIDE_TIME, GUID_TIMEOUT; PX4: COM_RC_LOSS_T, COM_OF_LOSS_T)"
 )
 
@@ -104,7 +104,7 @@ class GuardProcess:
             GuardDiedError: the guard has exited, or sends nothing within ``timeout_s``.
         """
         if not select.select([self._port], [], [], timeout_s)[0]:
-            raise GuardDiedError(f"the guard process has said nothing for {timeout_s:g} s")
+            raise GuardDiedError(f"the guard process has been silent for {timeout_s:g} s")
         self._early = [decode_from_guard(data) for data in self._port.receive()]
         for message in self._early:
             if isinstance(message, GuardError):
@@ -171,23 +171,23 @@ class GuardProcess:
         if words is None or newest is None or not words.packets:
             return "it held no sticks"
         if newest.phase is not words.phase and newest.phase not in _STILL_OURS:
-            return "it had given the sticks back"
+            return "it had released the sticks"
         if not self.wait(REAP_S):
-            return f"it does not end, so nothing was sent in its place; {OWN_TIMEOUT}"
+            return f"it does not exit, so nothing was sent in its place; {OWN_TIMEOUT}"
         silent_ns = self._clock.now_ns() - newest.sent_ns
         if silent_ns > LATEST_NS:
             silent_s = silent_ns / NS_PER_S
-            return f"silent for {silent_s:.1f} s, too long to speak for it; {OWN_TIMEOUT}"
+            return f"silent for {silent_s:.1f} s, too long to send its last words; {OWN_TIMEOUT}"
         sent = 0
         for after_ns, packet in words.packets:
             self._clock.sleep_until_ns(died_ns + after_ns)
             sent += self._transmit(packet, words.receiver)
         if sent == 0:
             return f"its last words could not be sent; {OWN_TIMEOUT}"
-        asked = f", and {words.mode} asked for" if words.mode else ""
+        asked = f", then {words.mode}" if words.mode else ""
         return (
-            f"its last words were sent in its place (neutral{asked}), but nobody hears the answer: "
-            "take the vehicle over"
+            f"its last words were sent in its place (neutral{asked}), but the answer cannot be "
+            "received: take over the vehicle"
         )
 
     def _transmit(self, packet: bytes, receiver: SocketAddress | None) -> bool:

@@ -182,7 +182,7 @@ def flight_verdict(
         code = interrupted or ExitCode.NOT_FLOWN
         return Verdict(code, "the vehicle has not left the ground")
     if outcome.is_disarmed:
-        text = "the vehicle was disarmed, or started anew, while the policy flew it"
+        text = "the vehicle was disarmed, or restarted, while the policy flew it"
         return Verdict(ExitCode.NOT_FLOWN, text)
     return Verdict(ExitCode.DONE)
 

@@ -15,7 +15,7 @@ from policy.loading.builtin import BUILTIN_KINDS, shipped_weights
 from policy.loading.load import check_request, load_policy, read_policy_contract
 from policy.loading.request import LoadedPolicy, PolicyRequest
 
-NO_IMAGE_ADVICE = "looks at no image: --camera none does without"
+NO_IMAGE_ADVICE = "uses no image: give --camera none"
 STATELESS = (*BUILTIN_KINDS, "onnx")
 FILE_KINDS = ("lerobot", "onnx", "torchscript")
 POLICY_SUFFIXES = (".safetensors", ".onnx", ".data", ".pt", ".json", ".toml")
@@ -99,8 +99,8 @@ def require_images(config: FlyConfig) -> None:
     """Raise UserError if a network of ours is flown without a camera."""
     if config.policy.kind in BUILTIN_KINDS and _has_no_camera(config):
         raise UserError(
-            f"--camera none: {config.policy.policy} flies by its images, so name its camera; "
-            "scripted programs, and policies of yours that look at no image, fly without one"
+            f"--camera none: {config.policy.policy} needs images, so name a camera; only "
+            "scripted policies, and policies of yours that use no image, fly without one"
         )
 
 

@@ -17,10 +17,9 @@ measurement."""
 NEARLY = 1.1
 """Factor beyond a period that counts as too slow for the rate."""
 FASTER = (
-    "Take fewer --num-diffusion-steps, a smaller policy, another network.engine or --device, a "
-    "faster "
-    "computer, or one that serves the policy (ws://); if it was trained to play each chunk for "
-    "longer, its contract may say so (play_s)"
+    "Use fewer --num-diffusion-steps, a smaller policy, another network.engine or --device, a "
+    "faster computer, or a computer that serves the policy (ws://); if it was trained to play each "
+    "chunk for longer, set play_s in its contract"
 )
 
 
@@ -55,14 +54,16 @@ def require_speed(plan: FlightPlan, name: str, times: SolveTimes | None) -> tupl
     flag = "rates.action" if is_dual else "rates.single"
     notes: list[str] = []
     if is_dual and rates.rate is not None and rates.action_rate is None:
-        notes.append(warned(f"rates.single={rates.rate:g} is of a single rate: add --single-rate"))
+        notes.append(
+            warned(f"rates.single={rates.rate:g} applies to a single rate: add --single-rate")
+        )
     if not is_dual and rates.action_rate is not None and rates.rate is None:
-        told = f"rates.action={rates.action_rate:g} is of two rates"
-        notes.append(warned(f"{told}: give rates.single"))
+        told = f"rates.action={rates.action_rate:g} applies to two rates"
+        notes.append(warned(f"{told}: use rates.single"))
     if contract.play_s and (rates.action_rate if is_dual else rates.rate) is None:
         notes.append(
-            f"{action_hz:.3g} chunks a second, since this policy is meant to play each one for "
-            f"{_text(contract.play_s)}; {flag} asks for another rate"
+            f"{action_hz:.3g} chunks a second, since this policy plays each one for "
+            f"{_text(contract.play_s)}; {flag} sets another rate"
         )
     _require_horizon(name, contract, action_hz, flag)
     if times is None:
@@ -77,18 +78,18 @@ def require_speed(plan: FlightPlan, name: str, times: SolveTimes | None) -> tupl
     if worst.share > CLEARLY:
         fastest = _worst(contract, limits, times, action_hz=math.inf, image_hz=math.inf)
         is_by_rate = fastest.share <= CLEARLY
-        advice = f"Ask for a higher {flag} or rates.visual" if is_by_rate else FASTER
+        advice = f"Use a higher {flag} or rates.visual" if is_by_rate else FASTER
         fault = "has too short a horizon" if worst.by == "horizon" else "is too slow"
         raise PolicyError(f"{name} {fault}: {told}. {advice}")
     if worst.share > 1:
-        notes.append(warned(f"{told}: it will coast"))
+        notes.append(warned(f"{told}: it will coast on old chunks"))
     for what, asked_hz, each_s in (
         ("chunks", action_hz, times.act_s),
         ("images", image_hz, times.encode_s),
     ):
         if each_s * asked_hz > NEARLY:
-            reached = f"this computer makes some {1 / each_s:.2g}"
-            notes.append(warned(f"asked for {asked_hz:.3g} {what} a second, {reached}: {figures}"))
+            reached = f"this computer reaches about {1 / each_s:.2g}"
+            notes.append(warned(f"{asked_hz:.3g} {what} a second wanted, {reached}: {figures}"))
     return tuple(notes)
 
 
@@ -100,7 +101,7 @@ def _require_horizon(name: str, contract: Contract, action_hz: float, flag: str)
         raise PolicyError(
             f"{name} has a horizon of {_text(horizon_s)} ({contract.horizon} x "
             f"{_text(contract.chunk_dt_s)}), shorter than the {_text(1 / action_hz)} between two "
-            f"solves at {action_hz:.3g} chunks a second: ask for {flag} {least_hz} or more, or "
+            f"solves at {action_hz:.3g} chunks a second: use {flag} {least_hz} or more, or "
             "correct horizon and chunk_dt_s in its contract"
         )
 

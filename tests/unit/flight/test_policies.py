@@ -64,7 +64,7 @@ def test_black_frames_are_no_fault_of_a_policy_that_is_flown_without_a_camera(
 @pytest.mark.parametrize("policy", ["toge", "toge:medium", "resnet-unet"])
 def test_a_net_of_ours_is_not_flown_without_a_camera(policy: str) -> None:
     blind = CameraConfig(camera=("none",))
-    with pytest.raises(UserError, match="name its camera"):
+    with pytest.raises(UserError, match="name a camera"):
         require_images(FlyConfig(policy=PolicyConfig(policy=policy), camera=blind))
 
 

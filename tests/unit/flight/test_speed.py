@@ -48,8 +48,8 @@ def playing(play_s: float) -> Contract:
             "a chunk takes 900 ms here.* attitude is up to 1.8 s old, beyond the 100",
         ),
         (300, 4, None, 0, "an image 300 ms.* the image is up to 614 ms old, beyond the 300 ms"),
-        (0, 900, None, 0, "Take fewer --num-diffusion-steps"),
-        (0, 20, 5, 0, "attitude is up to 220 ms old.* Ask for a higher rates.action"),
+        (0, 900, None, 0, "Use fewer --num-diffusion-steps"),
+        (0, 20, 5, 0, "attitude is up to 220 ms old.* Use a higher rates.action"),
         (0, 900, 0.5, 0.8, "attitude is up to 2.9 s old, beyond the 900 ms"),
         (500, 20, 1, 2, "when a chunk is begun, the image is up to 1 s old, beyond the 300 ms"),
     ],
@@ -98,11 +98,11 @@ def test_a_policy_of_one_step_needs_no_words_where_its_step_covers_the_time_betw
     [
         pytest.param(7, 4, 0, "", id="fast enough"),
         pytest.param(0, None, 0, "", id="not measured"),
-        pytest.param(0, 400, 1.0, "2 chunks a second, .* play each one for 1 s", id="plays long"),
+        pytest.param(0, 400, 1.0, "2 chunks a second, .* plays each one for 1 s", id="plays long"),
         # Hardly missed is a warning, for a measurement may be wrong.
         pytest.param(0, 60, 0, "up to 120 ms old, .* will coast", id="limit hardly missed"),
-        pytest.param(0, 32, 0, "asked for 100 chunks a second, .* makes some 31", id="chunk rate"),
-        pytest.param(50, 4, 0, "asked for 30 images a second, .* makes some 20", id="image rate"),
+        pytest.param(0, 32, 0, "100 chunks a second wanted, .* reaches about 31", id="chunk rate"),
+        pytest.param(50, 4, 0, "30 images a second wanted, .* reaches about 20", id="image rate"),
     ],
 )
 def test_a_policy_that_may_fly_is_told_with_what_it_will_miss(
@@ -116,11 +116,15 @@ def test_a_policy_that_may_fly_is_told_with_what_it_will_miss(
 @pytest.mark.parametrize(
     ("is_dual", "rates", "told"),
     [
-        (True, Rates(rate=2), "warning: rates.single=2 is of a single rate: add --single-rate"),
+        (
+            True,
+            Rates(rate=2),
+            "warning: rates.single=2 applies to a single rate: add --single-rate",
+        ),
         (
             False,
             Rates(action_rate=50),
-            "warning: rates.action=50 is of two rates: give rates.single",
+            "warning: rates.action=50 applies to two rates: use rates.single",
         ),
         (True, Rates(rate=30, action_rate=50), None),
     ],
