@@ -182,7 +182,7 @@ class VehicleStatus:
     mode_arrived_ns: int | None = None
     """Arrival of the newest message that reports the mode."""
     rc_sticks: Sticks | None = None
-    """Sticks that the vehicle acts on (RC_CHANNELS through its calibration)."""
+    """Sticks that the vehicle acts on (RC_CHANNELS through its calibration); None if stale."""
     rc_channels_us: tuple[int, ...] = ()
     """Radio channels, 0 if undriven; empty if stale."""
     channels_arrived_ns: int | None = None

@@ -30,6 +30,7 @@ from mavbridge.core.histogram import Histogram
 from mavbridge.core.reasons import Reason
 from mavbridge.core.records import Tick
 from mavbridge.core.vehicle import Percentiles
+from mavbridge.guard.chunks import FreshnessLimits
 from mavbridge.observe.timing import FlightTiming, ObserverDrops, TimingReport, VisionReport
 from mavbridge.recording.flight_folder import RecordedFlight, open_flight
 from mavbridge.recording.meta import FlightError, FlightMeta
@@ -124,6 +125,8 @@ class FlightAnalysis:
     """Missed slots and late chunks in the order of time, each with its cause."""
     moments: tuple[Moment, ...]
     """The ten worst, starting with the worst."""
+    limits: FreshnessLimits | None
+    """Maximum ages when a stick is sent; None: unknown."""
     damage: tuple[str, ...]
     """Skipped parts of the recording, in sentences for the user."""
 
@@ -173,6 +176,7 @@ def analyse(folder: Path, *, gates: Path | None = None) -> FlightAnalysis:
         holders=holder_spans(ticks, series.start_ns),
         delays=delays,
         moments=worst_moments(flight, ticks, frames, delays, limits),
+        limits=limits,
         damage=tuple(dict.fromkeys(damage)),
     )
 

@@ -181,13 +181,14 @@ def _arrival_ns(
 
 
 def flown_limits(folder: Path, contract: Contract | None) -> FreshnessLimits | None:
-    """Return the age limits of the flown chunks: the recorded flags', else the contract's."""
+    """Return the age limits when a stick is sent: the recorded flags', else the contract's."""
     if contract is None:
         return None
     try:
-        return effective_freshness(contract, read_settings(folder).config.limits)
+        limits = effective_freshness(contract, read_settings(folder).config.limits)
     except MavbridgeError:  # no settings, or those of another version
-        return effective_freshness(contract, Limits())
+        limits = effective_freshness(contract, Limits())
+    return limits.while_played(round(contract.play_s * NS_PER_S))
 
 
 def read_arrivals(folder: Path, damage: list[str]) -> Arrivals | None:

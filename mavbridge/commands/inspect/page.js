@@ -142,6 +142,7 @@ class Plot {
         if (values[k] > high) high = values[k];
       }
     }
+    for (const limit of this.plot.limits) high = Math.max(high, limit.value);
     if (this.plot.fromZero) low = Math.min(low, 0);
     if (this.plot.fromZero && !(high > 0)) return [0, 1];
     if (!(low < high)) { low = Number.isFinite(low) ? low - 1 : 0; high = low + 2; }
@@ -162,14 +163,18 @@ class Plot {
     c.fillText("s", box.right - 3, this.height - 5);
     c.save();
     c.beginPath(); c.rect(box.left, 0, box.right - box.left, this.height); c.clip();
-    for (const limit of this.plot.limits || []) {
-      c.strokeStyle = css("--bad"); c.setLineDash([5, 4]);
-      c.beginPath(); c.moveTo(box.left, y.at(limit)); c.lineTo(box.right, y.at(limit)); c.stroke();
-      c.setLineDash([]);
+    for (const limit of this.plot.limits) {
+      const at = y.at(limit.value);
+      c.strokeStyle = c.fillStyle = css("--bad"); c.lineWidth = 1; c.setLineDash([5, 4]);
+      c.beginPath(); c.moveTo(box.left, at); c.lineTo(box.right, at); c.stroke();
+      c.setLineDash([]); c.textAlign = "left"; c.textBaseline = "top";
+      c.fillText(`${limit.name} ${shown(limit.value)} ${this.plot.unit}`, box.left + 4, at + 2);
     }
     this.values.forEach((values, number) => {
-      c.lineWidth = this.plot.series[number].width || 1.4;
+      c.lineWidth = this.plot.series[number].width;
+      c.globalAlpha = c.lineWidth > 2 ? 0.4 : 1; // a wide line lies under the others
       this.line(c, values, color(number), first, last, x, y);
+      c.globalAlpha = 1;
     });
     if (this.timeline.cursor !== null) {
       c.strokeStyle = css("--ink"); c.lineWidth = 1;
@@ -397,6 +402,7 @@ function addFlight(parent, flight) {
   const section = add(parent, "section");
   const timeline = new Timeline(flight.end_s);
   add(section, "h1", flight.name);
+  if (flight.outcome) add(section, "p", flight.outcome.text, `outcome ${flight.outcome.verdict}`);
   const facts = add(section, "dl");
   for (const [label, text, isBad] of flight.facts) {
     add(facts, "dt", label);

@@ -3,16 +3,18 @@
 import html
 import json
 from base64 import b64encode
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict
 from importlib.resources import files
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any
 
 import numpy as np
 
 from mavbridge.commands.inspect.analysis import FlightAnalysis
 from mavbridge.commands.inspect.series import FloatColumn, Series
+from mavbridge.core.clock import NS_PER_MS, NS_PER_S
 from mavbridge.core.errors import UserError
 from mavbridge.core.vehicle import Percentiles
 from mavbridge.flight.outcome import describe
@@ -60,6 +62,7 @@ def _flight(flight: FlightAnalysis) -> dict[str, Any]:
     series = flight.series
     return {
         "name": str(flight.folder),
+        "outcome": _outcome(flight),
         "facts": list(_facts(flight)),
         "end_s": float(series.t_s[-1]) if len(series.t_s) else 0.0,
         "t": _packed(_thinned_times(series.t_s)),
@@ -73,6 +76,17 @@ def _flight(flight: FlightAnalysis) -> dict[str, Any]:
     }
 
 
+def _outcome(flight: FlightAnalysis) -> dict[str, str] | None:
+    """Return how the flight ended, and whether that is good; None if it is unknown."""
+    meta, outcome = flight.meta, flight.meta.outcome
+    if outcome is None:
+        return None
+    is_bad = outcome.crash is not None or outcome.end == "fault" or meta.success is False
+    is_done = outcome.end in ("course", "duration", "landed") or meta.success is True
+    verdict = "bad" if is_bad else "good" if is_done else "plain"
+    return {"text": describe(outcome), "verdict": verdict}
+
+
 def _facts(flight: FlightAnalysis) -> Iterator[tuple[str, str, bool]]:
     """Yield label, text, and True if the fact is bad news."""
     report, meta = flight.report, flight.meta
@@ -82,8 +96,6 @@ def _facts(flight: FlightAnalysis) -> Iterator[tuple[str, str, bool]]:
     yield "when", f"{meta.started_at}, {report.duration_s:.1f} s", False
     if meta.crash is not None:
         yield "crashed", meta.crash, True
-    if meta.outcome is not None:
-        yield "outcome", describe(meta.outcome), meta.success is False
     if not meta.finished:
         yield "recording", "cut off: shown up to its last whole batch of rows", True
     for text in flight.damage:
@@ -127,14 +139,21 @@ def _plots(flight: FlightAnalysis) -> Iterator[dict[str, Any]]:
             "smoothed": series.smoothed[:, axis],
             "sent": series.sent[:, axis],
         }
-        limits = {"range": [-1.08, 1.08]} if is_sticks else {}
+        span = {"range": [-1.08, 1.08]} if is_sticks else {}
         title = f"Stick: {name}" if is_sticks else name.replace("_", " ").capitalize()
-        yield _plot(title, "", columns) | limits
+        yield _plot(title, "", columns) | span
     ages = {"feature": series.feature_age_ms, "attitude": series.state_age_ms}
-    yield _plot("Age when sent", "ms", ages) | {"fromZero": True}
+    ages_ms: dict[str, float] = {}
+    if (limits := flight.limits) is not None:
+        ages_ms = {
+            "feature limit": limits.feature_ns / NS_PER_MS,
+            "attitude limit": limits.state_ns / NS_PER_MS,
+        }
+    yield _plot("Age when sent", "ms", ages, ages_ms) | {"fromZero": True}
     if np.nanmax(series.lateness_ms, initial=0.0) > 0:  # none in simulated time
         lateness = {"sticks after their slot": series.lateness_ms}
-        yield _plot("Lateness", "ms", lateness) | {"fromZero": True}
+        missed_ms = {"missed": NS_PER_S / NS_PER_MS / flight.stick_hz}
+        yield _plot("Lateness", "ms", lateness, missed_ms) | {"fromZero": True}
     for title, unit, names, values in (
         ("Velocity", "m/s", ("north", "east", "down"), series.velocity_ned_mps),
         ("Attitude", "deg", ("roll", "pitch", "yaw"), series.roll_pitch_yaw_deg),
@@ -144,12 +163,18 @@ def _plots(flight: FlightAnalysis) -> Iterator[dict[str, Any]]:
     yield _plot("Height above the origin", "m", {"height": -series.position_ned_m[:, 2]})
 
 
-def _plot(title: str, unit: str, columns: dict[str, FloatColumn]) -> dict[str, Any]:
-    """Return a plot of the columns that have any value."""
+def _plot(
+    title: str,
+    unit: str,
+    columns: dict[str, FloatColumn],
+    limits: Mapping[str, float] = MappingProxyType({}),
+) -> dict[str, Any]:
+    """Return a plot of the columns that have any value, with limits by name."""
     known = {name: values for name, values in columns.items() if np.isfinite(values).any()}
     return {
         "title": title,
         "unit": unit,
+        "limits": [{"name": name, "value": value} for name, value in limits.items()],
         "series": [
             {
                 "name": name,

@@ -3,6 +3,7 @@
 from dataclasses import replace
 
 from mavbridge.core.clock import NS_PER_MS, NS_PER_S
+from mavbridge.core.switch import GAP_NS
 from mavbridge.core.vehicle import (
     IDLE,
     NEUTRAL,
@@ -338,7 +339,10 @@ class ManualControlOutput(StickOutput):
         if status is not None and self._shown is not None:
             arrived_ns, sticks = self._shown
             status = replace(
-                status, rc_sticks=sticks, pilot_sticks=self._pilot, rc_arrived_ns=arrived_ns
+                status,
+                rc_sticks=sticks if now_ns - arrived_ns <= GAP_NS else None,
+                pilot_sticks=self._pilot,
+                rc_arrived_ns=arrived_ns,
             )
         return super().in_policy_terms(status, vehicle, now_ns)
 

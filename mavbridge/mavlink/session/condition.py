@@ -223,7 +223,7 @@ class VehicleCondition:
             mode=self._profile.modes.name(self._custom_mode),
             armed=self._is_armed,
             mode_arrived_ns=self._mode_ns,
-            rc_sticks=self._rc_sticks,
+            rc_sticks=self._rc_sticks if is_shown else None,
             rc_channels_us=rc.channels_us if is_shown else (),
             channels_arrived_ns=rc_ns,
             rc_arrived_ns=rc_ns,

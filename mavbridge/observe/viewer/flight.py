@@ -47,6 +47,8 @@ class RerunView:
         self._recording = RerunRecording("mavbridge", target, serve=serve)
         self._is_open = False
         self._has_start = False
+        self._until_ns = 0
+        """Newest stamp of a plotted event."""
         columns = Columns(self._recording.stream)
         self._columns = columns
         self._timing = TimingPlots(columns, flight)
@@ -71,6 +73,8 @@ class RerunView:
             self._has_start = True
             firsts: tuple[Observed, ...] = (*ticks[:1], *visions[:1], *solves[:1])
             self._begin(_happened_ns(firsts[0]))
+        stamps_ns = (*(tick.sent_ns for tick in ticks), *(each.ready_ns for each in visions))
+        self._until_ns = max((self._until_ns, *stamps_ns))
         if ticks:
             self._timing.show_ticks(ticks)
             self._actions.show(ticks)
@@ -91,6 +95,8 @@ class RerunView:
         """Deliver the rest and block until taken; raise MavbridgeError if the viewer is gone."""
         self._open()
         self._timing.close()
+        if self._has_start:
+            self._mark(self._until_ns)
         self._columns.flush()
         self._recording.close()
 
@@ -104,10 +110,14 @@ class RerunView:
         self._scene.open()
 
     def _begin(self, start_ns: int) -> None:
-        """Start the timeline. A gap at its start gives all plots the same axis."""
+        """Start the timeline."""
         self._columns.start_ns = start_ns
+        self._mark(start_ns)
+
+    def _mark(self, stamp_ns: int) -> None:
+        """Show a gap in every plot, so that all of them reach as far."""
         for plot in (*layout.PLOTS, *layout.action_plots(self._flight.contract.action)):
-            self._columns.plot(plot, [start_ns], [(math.nan,) * len(plot.series)])
+            self._columns.plot(plot, [stamp_ns], [(math.nan,) * len(plot.series)])
 
     def _show_plans(self, solves: Sequence[Solve], ticks: Sequence[Tick]) -> None:
         """Show the policy's plans while it flies, each from the vehicle's position at its time."""

@@ -101,12 +101,20 @@ BANDS = (
 _COUNTS = (Series("0.1 % of all", RED), Series("count", BLUE, width=2))
 MISSED = Plot("missed/sticks", "Missed slots since the start, red: 0.1 % of all", _COUNTS)
 DROPPED = Plot("missed/vision", "Dropped images since the start, red: 0.1 % of all", _COUNTS)
+STICK_COLORS: dict[str, Rgb] = {
+    "roll": GREY,
+    "pitch": DARK_BLUE,
+    "throttle": ORANGE,
+    "yaw": BLUE,
+}
+"""The four colours above that differ most for all kinds of colour vision."""
 _RC_SERIES = tuple(
     Series(f"channel {number}", color)
-    for number, color in enumerate((BLUE, ORANGE, GREEN, PINK), start=1)
+    for number, color in enumerate(STICK_COLORS.values(), start=1)
 )
-RC = Plot("rc", "RC channels [us]: 1 blue, 2 orange, 3 green, 4 pink", _RC_SERIES)
-"""Channels as the vehicle echoes them. Channels 1 to 4 hold the sticks, unless RCMAP_* differs."""
+RC = Plot("rc", "RC channels [us]: 1 grey, 2 dark blue, 3 orange, 4 light blue", _RC_SERIES)
+"""Channels as the vehicle echoes them. Channels 1 to 4 hold roll, pitch, throttle and yaw, unless
+RCMAP_* differs."""
 SPEED = Plot(
     "motion/speed",
     "Speed [m/s]: blue horizontal, green climb",
@@ -182,7 +190,7 @@ def flight_blueprint(flight: ViewedFlight) -> rrb.Blueprint:
         _scenes(flight.gates),
         rrb.Horizontal(
             rrb.Horizontal(*cameras),
-            rrb.TextLogView(origin=EVENTS, name="Events", columns=_event_columns()),
+            _events(),
             column_shares=[2, 3],
         ),
         row_shares=[3, 2],
@@ -259,16 +267,21 @@ def _timing() -> rrb.Horizontal:
         (LATENESS, CHUNK_PERIOD, PREDICT, MISSED),
         (VISION_JITTER, VISION_PERIOD, ENCODE, DROPPED),
     )
+    first, *others = ([_time_series(plot) for plot in column] for column in columns)
     return rrb.Horizontal(
-        *(rrb.Vertical(*(_time_series(plot) for plot in column)) for column in columns),
+        rrb.Vertical(*first, _events()),
+        *(rrb.Vertical(*views) for views in others),
         name="Timing: median, least and most of each quarter of a second",
     )
 
 
-def _event_columns() -> rrb.TextLogColumns:
-    """Show only the text, which begins with the time; the viewer's own column is too narrow."""
-    time = TimelineColumn("time", visible=False)
-    return rrb.TextLogColumns(timeline_columns=[time], text_log_columns=["Body"])
+def _events() -> rrb.TextLogView:
+    """Return a list of events that shows only the text, which begins with the time; the viewer's
+    own column of times is too narrow."""
+    columns = rrb.TextLogColumns(
+        timeline_columns=[TimelineColumn("time", visible=False)], text_log_columns=["Body"]
+    )
+    return rrb.TextLogView(origin=EVENTS, name="Events", columns=columns)
 
 
 def _time_series(plot: Plot, value_range: tuple[float, float] | None = None) -> rrb.TimeSeriesView:

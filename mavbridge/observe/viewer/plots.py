@@ -135,7 +135,8 @@ class TimingPlots:
         ages_ns = [
             (tick.sent_ns, tick.sent_ns - tick.state.attitude_ns)
             for tick in ticks
-            if tick.state is not None
+            # Before the policy is loaded, ticks may be read later than newer attitudes.
+            if tick.state is not None and tick.state.attitude_ns <= tick.sent_ns
         ]
         self._extend(layout.ATTITUDE_AGE, ages_ns)
         late_ns = [

@@ -11,6 +11,7 @@ import rerun as rr
 import rerun.blueprint as rrb
 
 from mavbridge.core.records import ImageArray, RolloutFrame
+from mavbridge.observe.viewer.layout import STICK_COLORS
 from mavbridge.observe.viewer.target import RerunRecording
 from policy.contract import ACTION_NAMES, QUATERNION, RATE, SPECIFIC_FORCE, STATE_NAMES, VELOCITY
 
@@ -60,9 +61,11 @@ class RolloutView:
         self._real = real
         self._recording = RerunRecording("mavbridge-rollout", target)
         self._recording.open(rollout_blueprint())
-        names = {path: list(STATE_NAMES[columns]) for path, (_, columns) in STATES.items()}
-        for path, lines in {STICKS: list(ACTION_NAMES), **names}.items():
-            self._recording.stream.log(path, rr.SeriesLines(names=lines), static=True, strict=True)
+        lines = {path: rr.SeriesLines(names=STATE_NAMES[at]) for path, (_, at) in STATES.items()}
+        colors = [STICK_COLORS[name] for name in ACTION_NAMES]
+        lines[STICKS] = rr.SeriesLines(names=ACTION_NAMES, colors=colors)
+        for path, style in lines.items():
+            self._recording.stream.log(path, style, static=True, strict=True)
 
     def show(self, frame: RolloutFrame, rgb: ImageArray | None) -> None:
         """Send one frame; blocks while the viewer does not keep up. Call from one thread."""

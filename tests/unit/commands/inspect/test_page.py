@@ -60,6 +60,8 @@ def test_the_page_holds_the_flight_and_needs_nothing_else(tmp_path: Path) -> Non
     (height,) = plots["Height above the origin"]["series"]
     assert unpacked(height["values"])[:40] == pytest.approx([2.0] * 40)
     assert [line["name"] for line in plots["Stick: yaw"]["series"]][-1] == "sent"
+    limits = [(each["name"], each["value"]) for each in plots["Age when sent"]["limits"]]
+    assert limits == [("feature limit", 300), ("attitude limit", 100)]
     assert shown["gates"] == [{"center_ned_m": [5, 0, -2], "yaw_rad": 0.1, "size_m": 2.4}]
     assert unpacked(shown["track"]["north"])[10] == pytest.approx(1.0)
     video = base64.b64decode(shown["video"]["source"].partition(",")[2])

@@ -27,6 +27,7 @@ from mavbridge.core.reasons import Code, because
 from mavbridge.core.records import Observed, Position, Solve
 from mavbridge.core.vehicle import ActionKind, ActionTrace, Sticks
 from mavbridge.flight.action_frames import action_frame
+from mavbridge.observe.viewer import layout
 from mavbridge.observe.viewer.flight import EVENT_CHARACTERS, RerunView
 from mavbridge.observe.viewer.layout import (
     ViewedFlight,
@@ -54,14 +55,14 @@ class Recording:
                 entity.setdefault(name, []).extend(values)
 
     def rows(self, path: str) -> list[list[float]]:
-        """All rows of an entity but the gap at the start of the timeline."""
-        return [list(row) for row in self.columns[f"/{path}"]["Scalars:scalars"]][1:]
+        """All rows of an entity but the gaps at both ends of the timeline."""
+        return [list(row) for row in self.columns[f"/{path}"]["Scalars:scalars"]][1:-1]
 
     def values(self, path: str, series: int = 0) -> list[float]:
         return [row[series] for row in self.rows(path)]
 
     def times_ms(self, path: str) -> list[float]:
-        return [stamp_ns / NS_PER_MS for stamp_ns in self.columns[f"/{path}"]["time"]][1:]
+        return [stamp_ns / NS_PER_MS for stamp_ns in self.columns[f"/{path}"]["time"]][1:-1]
 
     def events(self) -> list[str]:
         return [row[0] for row in self.columns["/events"]["TextLog:text"]]
@@ -118,6 +119,15 @@ def test_what_was_not_measured_is_a_gap_never_a_zero(rrd: Path) -> None:
     for axis in Sticks._fields:
         assert all(math.isnan(seen.values(f"sticks/{axis}", series)[0]) for series in range(3))
     assert all(math.isnan(seen.values("rc", channel)[0]) for channel in range(4))
+
+
+def test_all_plots_begin_and_end_together(rrd: Path) -> None:
+    """As after a fault, when only the vehicle's echo continues."""
+    seen = show(rrd, [make_tick(0)], [make_released_tick(500, state=None)])
+    plots = (*layout.PLOTS, *layout.action_plots("sticks"))
+    times_ns = [seen.columns[f"/{plot.path}"]["time"] for plot in plots]
+    assert {min(times) for times in times_ns} == {0}
+    assert len({max(times) for times in times_ns}) == 1
 
 
 def test_periods_of_chunks_go_on_across_batches_and_not_across_releases(rrd: Path) -> None:
@@ -351,6 +361,7 @@ FLIES_INTO_A_STALLED_VIEWER = """
 import sys
 from helpers.factories import make_tick, make_vision_tick
 from mavbridge.core.observers import ObserverThread
+from mavbridge.observe.viewer import layout
 from mavbridge.observe.viewer.flight import RerunView
 from mavbridge.observe.viewer.layout import ViewedFlight
 
