@@ -8,7 +8,7 @@ import warnings
 from collections.abc import Sequence
 from dataclasses import asdict
 from pathlib import Path
-from typing import Any, TypeAlias
+from typing import Any
 
 import torch
 from torch import Tensor, nn
@@ -16,10 +16,8 @@ from torch import Tensor, nn
 from policy.adapters.description import DESCRIPTION
 from policy.adapters.onnx.files import DENOISER, ENCODER
 from policy.contract import ACTION_DIM
-from policy.nets.resnet_unet import ResnetUnet
-from policy.nets.toge import Toge
+from policy.nets.toge import BuiltinPolicy
 
-OurPolicy: TypeAlias = Toge | ResnetUnet
 OPSET = 18
 """ONNX operator set, from 2022: every runtime in use reads it."""
 DENOISER_INPUTS = ("noisy", "timestep", "feature", "state", "action_history")
@@ -28,7 +26,7 @@ DENOISER_INPUTS = ("noisy", "timestep", "feature", "state", "action_history")
 class _Encoder(nn.Module):
     """Normalised image [1, 3, H, W] -> feature [1, F]."""
 
-    def __init__(self, policy: OurPolicy) -> None:
+    def __init__(self, policy: BuiltinPolicy) -> None:
         super().__init__()
         self.backbone, self.projection = policy.backbone, policy.visual_projection
 
@@ -40,7 +38,7 @@ class _Encoder(nn.Module):
 class _Denoiser(nn.Module):
     """One network call of a solve, in the order of ``DENOISER_INPUTS``."""
 
-    def __init__(self, policy: OurPolicy) -> None:
+    def __init__(self, policy: BuiltinPolicy) -> None:
         super().__init__()
         self.policy = policy
 
@@ -65,7 +63,7 @@ class _Archive(nn.Module):
         self.visual_encoder, self.denoiser = encoder, denoiser
 
 
-def export_onnx(policy: OurPolicy, folder: Path) -> None:
+def export_onnx(policy: BuiltinPolicy, folder: Path) -> None:
     """Write encoder.onnx, denoiser.onnx and policy.json into ``folder``. Needs the onnx package."""
     encoder, denoiser = _Encoder(policy).eval(), _Denoiser(policy).eval()
     image, rest = _examples(policy)
@@ -74,7 +72,7 @@ def export_onnx(policy: OurPolicy, folder: Path) -> None:
     (folder / DESCRIPTION).write_text(_description(policy))
 
 
-def export_torchscript(policy: OurPolicy, path: Path) -> None:
+def export_torchscript(policy: BuiltinPolicy, path: Path) -> None:
     """Write a TorchScript archive."""
     image, rest = _examples(policy)
     trace: Any = torch.jit.trace  # without types
@@ -112,7 +110,7 @@ def _quiet() -> "warnings.catch_warnings[None]":
     return warnings.catch_warnings(action="ignore")  # our shape checks warn
 
 
-def _examples(policy: OurPolicy) -> tuple[tuple[Tensor, ...], tuple[Tensor, ...]]:
+def _examples(policy: BuiltinPolicy) -> tuple[tuple[Tensor, ...], tuple[Tensor, ...]]:
     contract = policy.contract
     dim = policy.visual_projection[0].out_features
     return (torch.zeros(1, 3, contract.image_height, contract.image_width),), (
@@ -124,7 +122,7 @@ def _examples(policy: OurPolicy) -> tuple[tuple[Tensor, ...], tuple[Tensor, ...]
     )
 
 
-def _description(policy: OurPolicy) -> str:
+def _description(policy: BuiltinPolicy) -> str:
     contract = json.loads(policy.contract.to_json())
     described = {"contract": contract, "schedule": asdict(policy.config.schedule)}
     return json.dumps(described, indent=2, sort_keys=True) + "\n"

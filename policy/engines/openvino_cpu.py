@@ -28,8 +28,7 @@ from policy.engines.openvino_modules import ModuleConverter, make_module_runner
 from policy.engines.runner import Act, ExecutionSettings, Precision, assemble
 from policy.engines.stepwise import to_numpy
 from policy.nets.action_head import DiffusionHead, size_dims
-from policy.nets.resnet_unet import ResnetUnet
-from policy.nets.toge import Toge
+from policy.nets.toge import BuiltinPolicy
 from policy.nets.unet1d import Conv, ResidualBlock, UNet1d, norm_of_groups
 from policy.preprocess import egocentric, egocentric_scale
 from policy.protocol import PolicyRunner, SingleRatePolicy
@@ -57,14 +56,14 @@ def make_openvino_runner(
             or failed on a dummy sample.
         RuntimeError: OpenVINO cannot compile it.
     """
-    if isinstance(policy, Toge | ResnetUnet):
+    if isinstance(policy, BuiltinPolicy):
         return _make_builtin(policy, settings, vision, action)
     converter = converter or ModuleConverter(policy, settings.name)
     return make_module_runner(policy, settings, vision, action, converter)
 
 
 def _make_builtin(
-    policy: Toge | ResnetUnet, settings: ExecutionSettings, vision: Precision, action: Precision
+    policy: BuiltinPolicy, settings: ExecutionSettings, vision: Precision, action: Precision
 ) -> PolicyRunner:
     name = engine_name(vision, action)
     compiler = GraphCompiler(f"{policy.config} {digest_of_weights(policy)}")
@@ -78,7 +77,7 @@ def _make_builtin(
 
 
 def _solver(
-    compiler: GraphCompiler, policy: Toge | ResnetUnet, precision: Precision, steps: int
+    compiler: GraphCompiler, policy: BuiltinPolicy, precision: Precision, steps: int
 ) -> Act:
     """Return (encoded image, state, history) -> chunk, by ``steps`` from the policy's noise.
 
@@ -113,13 +112,13 @@ def digest_of_weights(module: nn.Module) -> str:
     return digest.hexdigest()
 
 
-def vision_graph(policy: Toge | ResnetUnet) -> ov.Model:
+def vision_graph(policy: BuiltinPolicy) -> ov.Model:
     """Build the graph: normalised image [1, 3, H, W] -> feature [1, F]."""
     image = (1, 3, policy.contract.image_height, policy.contract.image_width)
     return convert(policy, lambda i: policy.visual_projection(policy.backbone(i)), [image])
 
 
-def denoise_graph(policy: Toge | ResnetUnet, count: int) -> ov.Model:
+def denoise_graph(policy: BuiltinPolicy, count: int) -> ov.Model:
     """Build the graph of ``count`` unrolled steps of a solve; ``step_inputs`` selects the steps.
 
     (feature, egocentric, history, noisy [1, horizon, 4], films, updates) -> less noisy.
@@ -230,7 +229,7 @@ class BulkEncoder:
     images a second as torch in batches.
     """
 
-    def __init__(self, policy: Toge | ResnetUnet, precision: Precision) -> None:
+    def __init__(self, policy: BuiltinPolicy, precision: Precision) -> None:
         properties = {
             "PERFORMANCE_HINT": "THROUGHPUT",
             "INFERENCE_PRECISION_HINT": precision,

@@ -30,12 +30,11 @@ from policy.engines.runner import (
     ExecutionSettings,
     Precision,
     Shape,
-    make_runner,
 )
-from policy.engines.stepwise import make_stepwise_runner
+from policy.engines.stepwise import make_parts_runner
 from policy.engines.torch_eager import run_eagerly
 from policy.errors import PolicyError, user_code
-from policy.protocol import PolicyRunner, SingleRatePolicy, StepwisePolicy
+from policy.protocol import PolicyRunner, SingleRatePolicy
 
 _MANGLED = re.compile(r"___torch_mangle_\d+\.")
 """In a type's name: TorchScript's counter of equally named types in the process."""
@@ -68,12 +67,10 @@ def make_module_runner(
     def compile_as(precision: Precision) -> Compile:
         return lambda function, shapes: converter.compile(function, shapes, precision)
 
+    end = run_eagerly(settings.name, "cpu")
+    compilers = compile_as(vision), compile_as(action), end
     name = engine_name(vision, action)
-    compilers = compile_as(vision), compile_as(action)
-    if isinstance(policy, StepwisePolicy):
-        end = run_eagerly(settings.name, "cpu")
-        return make_stepwise_runner(policy, *compilers, end, engine=name, settings=settings)
-    return make_runner(policy, policy, *compilers, engine=name, settings=settings)
+    return make_parts_runner(policy, *compilers, engine=name, settings=settings)
 
 
 class ModuleConverter:

@@ -9,7 +9,7 @@ from policy.loading.request import PolicyRequest, default_contract
 from policy.nets.names import BACKBONE_NAMES, SIZE_NAMES, BackboneName, Size
 
 if TYPE_CHECKING:
-    from policy.checkpoints.policy_file import BuiltinConfig, BuiltinPolicy
+    from policy.nets.toge import BuiltinConfig, BuiltinPolicy
 
 SHIPPED = Path(__file__).parents[1] / "weights" / "toge.safetensors"
 """Default weights of ``toge``; its model card is beside it."""
@@ -72,8 +72,7 @@ def parse_builtin(kind: str, options: list[str]) -> tuple[Size, BackboneName | N
 
 
 def _config(kind: str, options: list[str], image_size: int | None) -> "BuiltinConfig":
-    from policy.nets.resnet_unet import ResnetUnetConfig
-    from policy.nets.toge import TogeConfig
+    from policy.nets.toge import ResnetUnetConfig, TogeConfig
 
     size, backbone = parse_builtin(kind, options)
     contract = default_contract(image_size)
@@ -88,12 +87,12 @@ def _trained(
     from policy.checkpoints.policy_file import load_checkpoint_with_notes
 
     policy, found = load_checkpoint_with_notes(checkpoint, fallback=config)
-    parts = (policy.config.size, getattr(policy.config, "backbone", "resnet18"))
+    parts = (policy.config.size, policy.config.backbone)
     if contradicted := [option for option in options if option not in parts]:
         raise PolicyError(
             f"{checkpoint} holds {':'.join(parts)}, not {':'.join(contradicted)}: leave that out"
         )
-    policy.seed_noise(seed)
+    policy.head.seed_noise(seed)
     notes = [f"weights of {checkpoint} ({', '.join(parts)}); noise of seed {seed}", *found]
     if checkpoint.suffix != ".safetensors":
         contract, schedule = policy.contract, policy.config.schedule
@@ -112,11 +111,11 @@ def _trained(
 def _untrained(config: "BuiltinConfig", seed: int) -> tuple["BuiltinPolicy", list[str]]:
     import torch
 
-    from policy.checkpoints.policy_file import build_policy
+    from policy.nets.toge import build_policy
 
     with torch.random.fork_rng(devices=[]):  # leaves the global random state unchanged
         torch.manual_seed(seed)
         policy = build_policy(config).eval()
-    policy.seed_noise(seed)
+    policy.head.seed_noise(seed)
     note = f"untrained: seeded random weights (seed {seed}, noise too); for bring-up only"
     return policy, [note]

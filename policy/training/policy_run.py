@@ -12,8 +12,6 @@ import torch
 from torch import Tensor, nn
 
 from policy.checkpoints.policy_file import (
-    BuiltinPolicy,
-    build_policy,
     load_checkpoint,
     read_torch,
     save_checkpoint,
@@ -27,8 +25,7 @@ from policy.data.samples import Timeline
 from policy.engines.openvino_cpu import BulkEncoder
 from policy.errors import PolicyError
 from policy.nets.backbones import load_imagenet_state
-from policy.nets.resnet_unet import ResnetUnetConfig
-from policy.nets.toge import TogeConfig
+from policy.nets.toge import BuiltinConfig, BuiltinPolicy, build_policy
 from policy.training.batches import (
     ENCODE_BATCH,
     Batch,
@@ -46,7 +43,6 @@ from policy.training.run_folder import Position, RunFolder
 from policy.training.settings import MAX_AGE_MS, TrainingStage, TrainSettings, policy_stages
 from policy.training.trainee import Trainee, refresh_batch_norm, validate
 
-Network: TypeAlias = TogeConfig | ResnetUnetConfig
 Check: TypeAlias = Callable[[Path], float]
 """Flies a checkpoint in closed loop and returns a score; higher is better."""
 
@@ -65,7 +61,7 @@ HEAD_RATE = 3
 
 def train_policy(
     flights: Sequence[FlightData],
-    network: Network,
+    network: BuiltinConfig,
     settings: TrainSettings,
     hooks: Hooks,
     check: Check | None = None,
@@ -84,7 +80,7 @@ class _PolicyRun(TrainingRun[Trainee, Batch]):
     def __init__(
         self,
         flights: Sequence[FlightData],
-        network: Network,
+        network: BuiltinConfig,
         settings: TrainSettings,
         folder: RunFolder,
         hooks: Hooks,
@@ -244,7 +240,7 @@ def _evenly(range_ms: tuple[float, float]) -> Nanoseconds:
     return np.linspace(low_ms * NS_PER_MS, high_ms * NS_PER_MS, 256).astype(np.int64)
 
 
-def _starting_trainee(network: Network, settings: TrainSettings) -> Trainee:
+def _starting_trainee(network: BuiltinConfig, settings: TrainSettings) -> Trainee:
     """Return the policy to start from with a new gate head; keeps torch's random state."""
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(settings.seed)
@@ -256,7 +252,7 @@ def _starting_trainee(network: Network, settings: TrainSettings) -> Trainee:
         return Trainee(policy, settings.gate_weight)
 
 
-def _checkpoint(network: Network, path: Path) -> BuiltinPolicy:
+def _checkpoint(network: BuiltinConfig, path: Path) -> BuiltinPolicy:
     policy = load_checkpoint(path, fallback=network)
     if policy.contract.action != network.contract.action:
         raise PolicyError(

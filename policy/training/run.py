@@ -20,8 +20,7 @@ from torch import Tensor, nn
 
 from policy.data.flight_data import DatasetError, FlightData, common_frame, hold_out
 from policy.data.frames import FrameStore, store_frames
-from policy.nets.resnet_unet import ResnetUnetConfig
-from policy.nets.toge import TogeConfig
+from policy.nets.toge import BuiltinConfig
 from policy.training.batches import ahead
 from policy.training.parallel import B, Gradients, M, StepLoss
 from policy.training.report import Hooks, TrainingProgress, TrainResult, Validation
@@ -44,7 +43,7 @@ ENCODING_SHARE = 0.4
 
 def open_run(
     settings: RunSettings,
-    network: TogeConfig | ResnetUnetConfig | WorldModelConfig,
+    network: BuiltinConfig | WorldModelConfig,
     flights: Sequence[FlightData],
 ) -> RunFolder:
     """Open the folder of a run, to start or resume it."""

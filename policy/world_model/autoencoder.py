@@ -48,10 +48,8 @@ class FrameAutoencoder(nn.Module):
         out = nn.Conv2d(first, 4 * 3, 3, padding=1)
         self.decoder = nn.Sequential(*up, nn.SiLU(), out, nn.PixelShuffle(2))
         self._initialise(out)
-        self.latent_mean: Tensor
-        self.latent_std: Tensor
-        self.register_buffer("latent_mean", torch.zeros(latent_channels))
-        self.register_buffer("latent_std", torch.ones(latent_channels))
+        self.latent_mean = nn.Buffer(torch.zeros(latent_channels))
+        self.latent_std = nn.Buffer(torch.ones(latent_channels))
 
     def _initialise(self, out: nn.Conv2d) -> None:
         """Apply He initialisation and small residuals.

@@ -79,8 +79,7 @@ class LatentDynamics(nn.Module):
         for out in (self.out_patch, self.out_vehicle):  # a new network hardly changes its inputs
             nn.init.normal_(out.weight, std=_INITIAL_STD)
             nn.init.zeros_(out.bias)
-        self._frequencies: Tensor
-        self.register_buffer("_frequencies", sinusoid_frequencies(TIME_DIM), persistent=False)
+        self._frequencies = nn.Buffer(sinusoid_frequencies(TIME_DIM), persistent=False)
 
     def forward(self, noisy: Future, timestep: Tensor, known: Conditioning) -> Future:
         """Return the network's outputs, shaped as the future, for a noisy future and step [B]."""

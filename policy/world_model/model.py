@@ -64,16 +64,11 @@ class WorldModel(nn.Module):
         self.dynamics = LatentDynamics(config)
         self.motion_predictor = MotionPredictor(config)
         self.frame_warp = FrameWarp(config)
-        self.motion_mean: Tensor
-        self.motion_std: Tensor
-        self.action_mean: Tensor
-        self.action_std: Tensor
-        self.change_std: Tensor
-        self.register_buffer("motion_mean", torch.zeros(config.frames, MOTION_DIM))
-        self.register_buffer("motion_std", torch.tensor(MOTION_SCALE).repeat(config.frames, 1))
-        self.register_buffer("action_mean", torch.zeros(ACTION_DIM))
-        self.register_buffer("action_std", torch.full((ACTION_DIM,), 0.5))
-        self.register_buffer("change_std", torch.ones(config.frames, config.latent_channels, 1, 1))
+        self.motion_mean = nn.Buffer(torch.zeros(config.frames, MOTION_DIM))
+        self.motion_std = nn.Buffer(torch.tensor(MOTION_SCALE).repeat(config.frames, 1))
+        self.action_mean = nn.Buffer(torch.zeros(ACTION_DIM))
+        self.action_std = nn.Buffer(torch.full((ACTION_DIM,), 0.5))
+        self.change_std = nn.Buffer(torch.ones(config.frames, config.latent_channels, 1, 1))
 
     @torch.no_grad()
     def encode(self, images: Tensor) -> Tensor:

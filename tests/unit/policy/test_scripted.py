@@ -9,8 +9,7 @@ import pytest
 
 from policy.contract import ActionKind
 from policy.errors import PolicyError
-from policy.protocol import DualRatePolicy
-from policy.scripted import PROGRAM_NAMES, ScriptedPolicy
+from policy.scripted import ScriptedPolicy
 from policy.scripted.controllers import doublet_length_s, doublet_steps
 from sitl.rotation import from_euler
 
@@ -148,8 +147,9 @@ def at(flown: list[Vehicle], time_s: float) -> Vehicle:
 @pytest.mark.parametrize(
     "vehicle",
     [
-        *(Vehicle("sticks", throttle_dead_zone=zone) for zone in (0.0, 0.2)),
-        *(Vehicle(kind, thrust) for kind in KINDS[1:] for thrust in (0.33, 0.5)),
+        Vehicle("sticks", throttle_dead_zone=0.0),
+        *(Vehicle(kind, thrust) for kind in KINDS[1:3] for thrust in (0.33, 0.5)),
+        Vehicle("velocity"),
         Vehicle("sticks", leaves_ground_at_s=3.0),
     ],
 )
@@ -245,21 +245,7 @@ def test_a_pause_of_the_loop_is_not_integrated_as_climb() -> None:
     assert throttle > 0.2
 
 
-@pytest.mark.parametrize("kind", KINDS)
-@pytest.mark.parametrize("program", PROGRAM_NAMES)
-def test_speaks_the_whole_protocol(program: str, kind: ActionKind) -> None:
-    policy = ScriptedPolicy(program, lambda: 0.0, action=kind)
-    assert isinstance(policy, DualRatePolicy)
-    contract = policy.contract
-    assert (contract.action, contract.velocity_frame) == (kind, "heading")
-    assert (contract.state_frame, contract.hover_thrust) == ("ned_frd", 0.39)
-    image = np.random.default_rng(0).normal(size=(1, 3, 224, 224)).astype(np.float32)
-    feature = policy.encode_visual(image)
-    assert (feature.shape, feature.dtype) == ((1, contract.feature_dim), np.float32)
-    chunk = policy.predict(image, Vehicle(kind).state(), HISTORY, 10)
-    assert (chunk.shape, chunk.dtype) == ((1, 16, 4), np.float32)
-
-
 def test_a_state_of_another_shape_is_refused() -> None:
+    policy = ScriptedPolicy("hover", lambda: 0.0)
     with pytest.raises(PolicyError, match=r"\[1, 13\]"):
-        ScriptedPolicy("hover", lambda: 0.0).predict_fast(FEATURE, np.zeros((2, 13)), HISTORY, 1)
+        policy.predict_fast(FEATURE, np.zeros((2, 13)), HISTORY, 1)

@@ -3,7 +3,6 @@
 import os
 from collections.abc import Callable
 from pathlib import Path
-from random import Random
 
 import numpy as np
 import pytest
@@ -48,17 +47,10 @@ def require_counting(runner: PolicyRunner) -> None:
         runner.reset()
 
 
-@pytest.mark.parametrize("state", ["obs", "observation", "x.1"])
+@pytest.mark.parametrize("state", ["obs", "x.1"])
 def test_one_action_for_one_observation_flies_as_it_is(tmp_path: Path, state: str) -> None:
     graphs.write_contract(tmp_path)
-    graphs.actor(tmp_path / "policy.onnx", state=state)
-    runner = load(f"onnx:{tmp_path}")
-    assert act(runner, vx_mps=2.0) == pytest.approx([0.2] * 4, abs=1e-3)
-
-
-def test_the_output_that_is_asked_for_is_flown(tmp_path: Path) -> None:
-    graphs.write_contract(tmp_path)
-    graphs.actor(tmp_path / "policy.onnx", outputs=("actions", "values", "log_prob"))
+    graphs.actor(tmp_path / "policy.onnx", state=state, outputs=("actions", "values", "log_prob"))
     with pytest.raises(PolicyError, match=r"3 outputs \(actions; values; log_prob\).*outputs"):
         load(f"onnx:{tmp_path}")
     graphs.describe(tmp_path, outputs={"chunk": "actions"})
@@ -75,19 +67,13 @@ def test_a_hidden_state_goes_from_call_to_call_until_reset(tmp_path, hidden):
 
 
 @pytest.mark.parametrize(
-    ("kind", "white"),
-    [
-        (TensorProto.FLOAT, 1.0),
-        (TensorProto.FLOAT16, 1.0),
-        (TensorProto.DOUBLE, 1.0),
-        (TensorProto.UINT8, 255.0),
-    ],
+    ("kind", "white"), [(TensorProto.FLOAT16, 1.0), (TensorProto.UINT8, 255.0)]
 )
 def test_the_element_type_says_what_a_pixel_is(tmp_path: Path, kind: int, white: float) -> None:
     graphs.write_contract(tmp_path)
     graphs.image_actor(tmp_path / "policy.onnx", kind=kind)
     runner = load(f"onnx:{tmp_path}")
-    for level in (0, 1, 128, 255):
+    for level in (0, 1, 255):
         assert act(runner, level=level) == pytest.approx([white * level / 255] * 4, rel=5e-3)
 
 
@@ -119,15 +105,10 @@ REFUSED: dict[str, tuple[Write, str]] = {
         lambda folder: external(folder, Path.unlink),
         r"policy\.onnx\.data, .* is missing or cut short: copy both",
     ),
-    "external data cut": (
-        lambda folder: external(folder, lambda path: path.write_bytes(path.read_bytes()[:50])),
-        r"policy\.onnx\.data, .* is missing or cut short: copy both",
-    ),
     "external data a pointer": (
         lambda folder: external(folder, pointer),
         r"policy\.onnx\.data, .* is a pointer of Git LFS.*git lfs pull",
     ),
-    "graph a pointer": (lambda folder: pointer(folder / "policy.onnx"), r"Git LFS.*git lfs pull"),
     "integer actions": (
         lambda folder: graphs.actor(folder / "policy.onnx", action_type=TensorProto.INT64),
         r"chunk is of type i64",
@@ -154,11 +135,6 @@ REFUSED: dict[str, tuple[Write, str]] = {
         ],
         r"no output 'action' \(actions\)",
     ),
-    "no graph": (lambda folder: (folder / "policy.onnx").write_bytes(b"\x08\x07"), r"policy\.onnx"),
-    "noise": (
-        lambda folder: (folder / "policy.onnx").write_bytes(Random(1).randbytes(500)),
-        r"policy\.onnx cannot be read as ONNX",
-    ),
     "graph cut": (
         lambda folder: [
             graphs.actor(folder / "policy.onnx"),
@@ -169,10 +145,6 @@ REFUSED: dict[str, tuple[Write, str]] = {
     "operator of a vendor": (
         lambda folder: one_node(folder, "Foo", domain="com.acme"),
         r"policy\.onnx holds what OpenVINO cannot run \(.*com\.acme\.Foo.*ONNX standard",
-    ),
-    "shapes that do not fit": (
-        lambda folder: one_node(folder, "MatMul", weight=np.zeros((7, 4), np.float32)),
-        r"policy\.onnx holds what OpenVINO cannot run",
     ),
     "three actions": (
         lambda folder: one_node(folder, "MatMul", weight=np.zeros((13, 3), np.float32)),
@@ -203,20 +175,17 @@ def test_a_draft_has_the_state_whatever_its_input_is_called(tmp_path: Path) -> N
         assert found["state", "names"] == ["?"] * 13
 
 
-def test_a_tuple_of_torchscript_needs_to_be_told_apart(tmp_path: Path) -> None:
-    graphs.write_contract(tmp_path)
-    graphs.save_script(tmp_path / "policy.pt", graphs.TupleActor())
-    with pytest.raises(PolicyError, match=r"returns 3 values \(0, 1, 2\).*\"chunk\": 0"):
-        load(f"torchscript:{tmp_path / 'policy.pt'}")
-
-
 def test_torchscript_of_an_observation_alone_flies_and_keeps_its_state(tmp_path: Path) -> None:
     graphs.write_contract(tmp_path)
-    graphs.save_script(tmp_path / "state.pt", graphs.StateActor())
-    runner = load(f"torchscript:{tmp_path / 'state.pt'}")
+    path = tmp_path / "policy.pt"
+    graphs.save_script(path, graphs.StateActor())
+    runner = load(f"torchscript:{path}")
     assert act(runner, vx_mps=2.0) == pytest.approx([0.2] * 4, abs=1e-3)
-    graphs.save_script(tmp_path / "counting.pt", graphs.CountingActor())
-    require_counting(load(f"torchscript:{tmp_path / 'counting.pt'}"))
+    graphs.save_script(path, graphs.CountingActor())
+    require_counting(load(f"torchscript:{path}"))
+    graphs.save_script(path, graphs.TupleActor())
+    with pytest.raises(PolicyError, match=r"returns 3 values \(0, 1, 2\).*\"chunk\": 0"):
+        load(f"torchscript:{path}")
 
 
 class Deep(nn.Module):

@@ -39,8 +39,6 @@ horizon = 8
     [
         ("ForwardOnly", False),
         ("NamedHead", True),
-        ("NamedHead", False),
-        ("NamedDenoiser", True),
         ("NamedDenoiser", False),
         ("Wide", True),
         ("Wide", False),

@@ -66,11 +66,8 @@ def test_the_contracts_own_state_is_passed_on_as_it_is() -> None:
     np.testing.assert_array_equal(swapped, values[:, ::-1])
 
 
-def test_a_scale_has_a_number_for_each_name() -> None:
+def test_names_and_scales_that_do_not_fit_are_refused() -> None:
     with pytest.raises(ContractError, match=r"\[state\] scale must be 2 numbers"):
         Interface(contract=Contract(), state_names=("qw", "yaw_rad"), state_scale=(1.0,))
-
-
-def test_an_unknown_name_is_refused_with_all_that_are_known() -> None:
     with pytest.raises(ContractError, match=r"\['yaw_deg'\] are unknown.*vx_mps.*yaw_rad"):
         Interface(contract=Contract(), state_names=("yaw_deg",))

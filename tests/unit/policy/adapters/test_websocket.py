@@ -37,62 +37,42 @@ from policy.preprocess import image_to_input
 
 
 @pytest.mark.parametrize(
-    "url",
-    [
-        "ws://127.0.0.1:8000",
-        "ws://[::1]:8000",
-        "wss://policies.example",
-        "ws://gpu:80/path",
-    ],
-)
-def test_addresses_of_servers(url: str) -> None:
-    check_server(url, None, None)
-
-
-@pytest.mark.parametrize(
     ("url", "told"),
     [
+        *((url, None) for url in ("ws://[::1]:8000", "wss://policies.example", "ws://gpu:80/path")),
         ("ws://127.0.0.1", "write ws://HOST:PORT"),
         ("ws:127.0.0.1:8000", "write ws://HOST:PORT"),
         ("ws://gpu:99999", "write ws://HOST:PORT"),
         ("ws://me:secret@gpu:8000", "leave the name and password out"),
     ],
 )
-def test_what_is_no_address_is_refused_at_once(url: str, told: str) -> None:
+def test_addresses_of_servers(url: str, told: str | None) -> None:
+    if told is None:
+        check_request(PolicyRequest(spec=url))
+        return
     with pytest.raises(PolicyError, match=told) as refusal:
         check_request(PolicyRequest(spec=url))
     assert "secret" not in str(refusal.value)
 
 
-def test_flags_that_a_server_does_not_take(tmp_path: Path) -> None:
+def test_flags_and_packages_that_a_server_needs(tmp_path, monkeypatch):
     url = "ws://127.0.0.1:8000"
     with pytest.raises(PolicyError, match="the server has the weights"):
         check_server(url, None, Path("my.safetensors"))
     with pytest.raises(PolicyError, match=r"--contract .*none\.toml"):
         check_server(url, tmp_path / "none.toml", None)
-
-
-def test_a_missing_package_is_told_with_its_extra(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(kind, "find_spec", lambda name: None if name == "msgpack" else object())
     with pytest.raises(PolicyError, match=r"needs msgpack: pip install msgpack"):
-        check_server("ws://127.0.0.1:8000", None, None)
+        check_server(url, None, None)
 
 
-@pytest.mark.parametrize("host", ["::1", "[::1]", "fe80::1%eth0", "[fe80::1%eth0]", "localhost"])
-def test_an_ipv6_address_to_serve_at_may_have_brackets(host: str) -> None:
-    assert ServeConfig(host=host).host == host.strip("[]")
-
-
-@pytest.mark.parametrize(
-    ("changes", "told"),
-    [
-        ({"port": 0}, "port"),
-        ({"policy": PolicyConfig(dual_rate=True)}, "leave out --dual-rate"),
-    ],
-)
-def test_what_cannot_be_served_is_refused(changes: dict[str, Any], told: str) -> None:
-    with pytest.raises(MavbridgeError, match=told):
-        ServeConfig(**changes)
+def test_settings_of_our_server() -> None:
+    for host in ("[::1]", "fe80::1%eth0", "localhost"):
+        assert ServeConfig(host=host).host == host.strip("[]")
+    with pytest.raises(MavbridgeError, match="port"):
+        ServeConfig(port=0)
+    with pytest.raises(MavbridgeError, match="leave out --dual-rate"):
+        ServeConfig(policy=PolicyConfig(dual_rate=True))
 
 
 KEYS = (b"\xc4\x0b__ndarray__\xc3", b"\xc4\x04data", b"\xc4\x05dtype", b"\xc4\x05shape")
@@ -125,7 +105,7 @@ def test_the_bytes_of_the_protocol_are_read() -> None:
     assert unpack(with_scalar)["x"] == 2.5
 
 
-@pytest.mark.parametrize("dtype", ["<f8", "<f4", "<f2", "<i8", "<i4", "|i1", "|u1", "|b1", ">f4"])
+@pytest.mark.parametrize("dtype", ["<f8", "<f2", "<i8", "|u1", "|b1", ">f4"])
 def test_every_kind_of_number_arrives_as_it_was(dtype: str) -> None:
     sent = np.array([[0, 1], [1, 0]], dtype)
     received = number_array(unpack(pack({"x": sent})), "x")
@@ -193,8 +173,6 @@ def test_errors_name_what_is_there() -> None:
 
 NORMALISATIONS: list[dict[str, Any]] = [
     {},
-    {"image_mean_rgb": (0.0, 0.0, 0.0), "image_std_rgb": (1.0, 1.0, 1.0)},
-    {"image_mean_rgb": (0.5, 0.5, 0.5), "image_std_rgb": (0.5, 0.5, 0.5)},
     {"image_mean_rgb": (0.9, 0.1, 0.5), "image_std_rgb": (0.01, 0.3, 7.0)},
 ]
 

@@ -92,25 +92,11 @@ def test_the_runtime_finds_the_expert_in_a_chunk() -> None:
             np.testing.assert_allclose(stick, expert, atol=1e-6)
 
 
-def test_chunk_by_hand() -> None:
-    tick_ns = np.arange(5) * 100 * MS
-    sticks = np.zeros((5, 4), np.float32)
-    sticks[:, 1] = [0.0, 0.2, 0.4, 0.6, 0.8]
-    episode = flown(
-        tick_ns=tick_ns,
-        attitude_ns=tick_ns + 25 * MS,
-        velocity_ns=tick_ns,
-        state=flown().state[:5],
-        target_ns=tick_ns,
-        target=sticks,
-        captured_ns=np.array([50 * MS]),
-        gate=np.zeros((1, 7), np.float32),
-    )
-    line = timeline(episode)
-    chunk, known = line.chunks(np.array([1, 3]))
-    np.testing.assert_allclose(chunk[0, :, 1], [0.25, 0.35, 0.45, 0.55], atol=1e-6)
-    assert known.tolist() == [[True] * 4, [True, True, False, False]]
-    np.testing.assert_allclose(chunk[1, :, 1], [0.65, 0.75, 0.75, 0.75], atol=1e-6)  # held
+def test_a_chunk_beyond_the_end_holds_its_last_known_stick() -> None:
+    line = timeline(flown())
+    chunk, known = line.chunks(np.array([190]))
+    assert known.tolist() == [[True, True, False, False]]
+    np.testing.assert_array_equal(chunk[0, 2:], chunk[0, [1, 1]])
 
 
 def test_the_runtime_gives_the_same_motion_since_exposure() -> None:

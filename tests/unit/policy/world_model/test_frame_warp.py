@@ -43,20 +43,6 @@ def poses(rotation: Tensor, position_m: tuple[float, float, float] = (0.0, 0.0, 
     )
 
 
-def turn(
-    *, roll_rad: float = 0.0, pitch_rad: float = 0.0, yaw_rad: float = 0.0, speed_mps: float = 0.0
-) -> Poses:
-    """A turn from level flight as a net would foresee it; FRD."""
-    before, after = (
-        torch.from_numpy(state_of(*angles))[None]
-        for angles in ((0.0, 0.0, 0.0), (roll_rad, pitch_rad, yaw_rad))
-    )
-    before[:, 0], after[:, 0] = speed_mps, speed_mps
-    before[:, 1:3], after[:, 1:3] = 0.0, 0.0
-    rotation, position_m = poses_after(before, motion_since(before[:, None], after[:, None]), 0.1)
-    return Poses(rotation=rotation, position_m=position_m, progress=torch.ones(1, 1))
-
-
 def seen(pixels: Tensor, inverse_depth: float = -3.0) -> SourceFrame:
     """The same inverse_depth everywhere, before softplus."""
     level = torch.tensor([inverse_depth, 0.0]).view(1, 2, 1, 1).expand(len(pixels), 2, 16, 16)
@@ -80,9 +66,7 @@ def place_of(frame: Tensor) -> tuple[float, float]:
 
 
 @pytest.mark.parametrize("state_frame", ["ned_frd", "enu_flu"])
-@pytest.mark.parametrize(
-    "angles", [(0.0, 0.0, 0.0), (0.3, 0.0, 0.0), (0.0, 0.2, 0.0), (0.1, -0.1, 0.4), (0.0, 0.0, 3.0)]
-)
+@pytest.mark.parametrize("angles", [(0.3, 0.0, 0.0), (0.1, -0.1, 0.4), (0.0, 0.0, 3.0)])
 def test_a_turn_shows_what_the_lens_of_the_evaluation_shows(angles, state_frame):
     lens, before, after = nominal_lens(SIZE), attitude(0.05, -0.1, 0.7), attitude(*angles)
     after = before @ after
@@ -119,8 +103,6 @@ def test_what_is_ahead_grows_as_it_is_approached() -> None:
 
 
 def test_the_translation_is_the_integral_of_the_velocity_in_the_axes_of_now() -> None:
-    ahead = turn(yaw_rad=0.4, speed_mps=5.0)
-    torch.testing.assert_close(ahead.position_m[0, 0], torch.tensor([0.5, 0.0, 0.0]))
     now = torch.from_numpy(state_of(0.0, 0.0, math.pi / 2))[None]  # facing east
     now[:, :3] = torch.tensor([0.0, 2.0, 0.0])
     then = now[:, None].repeat(1, 3, 1)
