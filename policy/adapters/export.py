@@ -23,18 +23,6 @@ OPSET = 18
 DENOISER_INPUTS = ("noisy", "timestep", "feature", "state", "action_history")
 
 
-class _Encoder(nn.Module):
-    """Normalised image [1, 3, H, W] -> feature [1, F]."""
-
-    def __init__(self, policy: BuiltinPolicy) -> None:
-        super().__init__()
-        self.backbone, self.projection = policy.backbone, policy.visual_projection
-
-    def forward(self, image: Tensor) -> Tensor:
-        feature: Tensor = self.projection(self.backbone(image))
-        return feature
-
-
 class _Denoiser(nn.Module):
     """One network call of a solve, in the order of ``DENOISER_INPUTS``."""
 
@@ -63,11 +51,15 @@ class _Archive(nn.Module):
         self.visual_encoder, self.denoiser = encoder, denoiser
 
 
+def _encoder(policy: BuiltinPolicy) -> nn.Module:
+    return nn.Sequential(policy.backbone, policy.visual_projection).eval()
+
+
 def export_onnx(policy: BuiltinPolicy, folder: Path) -> None:
     """Write encoder.onnx, denoiser.onnx and policy.json into ``folder``. Needs the onnx package."""
-    encoder, denoiser = _Encoder(policy).eval(), _Denoiser(policy).eval()
     image, rest = _examples(policy)
-    _write_onnx(encoder, image, folder / ENCODER, ("image",), "feature")
+    _write_onnx(_encoder(policy), image, folder / ENCODER, ("image",), "feature")
+    denoiser = _Denoiser(policy).eval()
     _write_onnx(denoiser, rest, folder / DENOISER, DENOISER_INPUTS, "prediction")
     (folder / DESCRIPTION).write_text(_description(policy))
 
@@ -79,7 +71,7 @@ def export_torchscript(policy: BuiltinPolicy, path: Path) -> None:
     script: Any = torch.jit.script
     with _quiet(), torch.no_grad():
         archive = _Archive(
-            trace(_Encoder(policy).eval(), image, check_trace=False),
+            trace(_encoder(policy), image, check_trace=False),
             trace(_Denoiser(policy).eval(), rest, check_trace=False),
         )
         script(archive).save(path, _extra_files={DESCRIPTION: _description(policy)})

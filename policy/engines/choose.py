@@ -132,16 +132,17 @@ def _candidates(
     if devices == {"cpu"} and find_spec("openvino") is not None:
         from policy.engines.openvino_compile import precisions
         from policy.engines.openvino_cpu import make_openvino_runner
-        from policy.engines.openvino_modules import ModuleConverter
+        from policy.engines.openvino_modules import ModuleConverter, make_module_runner
 
-        is_ours = isinstance(policy, BuiltinPolicy)
-        converter = None if is_ours else ModuleConverter(policy, settings.name)
+        make: Callable[..., PolicyRunner] = make_openvino_runner
+        if not isinstance(policy, BuiltinPolicy):
+            make = partial(make_module_runner, ModuleConverter(policy, settings.name))
         return [
             (
-                f"openvino (images {vision}, actions {action})",
-                partial(make_openvino_runner, policy, settings, vision, action, converter),
+                f"openvino (images {pair[0]}, actions {pair[1]})",
+                partial(make, policy, settings, *pair),
             )
-            for vision, action in precisions()
+            for pair in precisions()
         ]
     if engine == "openvino":
         raise PolicyError("network.engine=openvino: the package is missing; pip install openvino")

@@ -23,6 +23,7 @@ from policy.engines.openvino_compile import (
     engine_name,
     quiet,
     signal_stack_kept,
+    update_digest,
 )
 from policy.engines.runner import (
     ArrayFunction,
@@ -50,11 +51,11 @@ makes a copy of 4 bytes or more. One step of the largest usual diffusion policy 
 
 @signal_stack_kept()
 def make_module_runner(
+    converter: "ModuleConverter",
     policy: SingleRatePolicy,
     settings: ExecutionSettings,
     vision: Precision,
     action: Precision,
-    converter: "ModuleConverter",
 ) -> PolicyRunner:
     """Compile a policy's methods for the loops; tried once.
 
@@ -151,7 +152,7 @@ def _digest(program: ExportedProgram) -> str:
     """Return a digest of the program: operations, constants and weights."""
     digest = hashlib.sha256(program.graph_module.code.encode())
     for name, value, _ in _tensors(program):
-        _update(digest, name, value)
+        update_digest(digest, name, value)
     return digest.hexdigest()
 
 
@@ -187,13 +188,8 @@ def _digest_of_script(module: nn.Module, examples: tuple[Tensor, ...]) -> str:
         if node.hasAttribute("value") and node.kindOf("value") == "t"
     ]
     for name, value in [*module.state_dict().items(), *constants]:
-        _update(digest, name, value)
+        update_digest(digest, name, value)
     return digest.hexdigest()
-
-
-def _update(digest: "hashlib._Hash", name: str, value: Tensor) -> None:
-    digest.update(f"{name} {value.dtype} {list(value.shape)}".encode())
-    digest.update(value.detach().cpu().contiguous().flatten().view(torch.uint8).numpy().data)
 
 
 def _converted(module: nn.Module, examples: tuple[Tensor, ...]) -> ov.Model:

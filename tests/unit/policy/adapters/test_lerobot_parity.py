@@ -111,7 +111,7 @@ def test_the_openvino_engine_computes_the_same_step_by_step(golden):
     _, _, policy, _ = golden
     settings = ExecutionSettings(name="lerobot", num_diffusion_steps=2)
     converter = ModuleConverter(policy, "lerobot")
-    graphs = make_module_runner(policy, settings, "f32", "f32", converter)
+    graphs = make_module_runner(converter, policy, settings, "f32", "f32")
     samples = make_parity_samples(policy.contract)
     samples.state[..., STATE_NAMES.index(STATE[12])] = policy._state.shift[12]  # a constant there
     expected = chunks_of_samples(make_torch_runner(policy, settings), samples)

@@ -36,16 +36,6 @@ def test_windows_stay_in_one_flight_and_cross_no_gap() -> None:
     assert not ((in_second[:, 0] < lost_ns) & (in_second[:, -1] > lost_ns)).any()
 
 
-def test_a_window_needs_states_all_along() -> None:
-    flight = steered_flight(0)
-    state = flight.state.copy()
-    state[100:140] = np.nan  # 0.4 s in which nobody flew
-    found = windows_of(replace(flight, state=state))
-    covered = (found.captured_ns[found.frames] - flight.tick_ns[0]) / 1e9
-    assert 0 < len(found) < 76
-    assert not ((covered > 1.0) & (covered < 1.4)).any()
-
-
 def test_actions_are_the_mean_of_what_was_sent_between_the_frames() -> None:
     flight = steered_flight(0)
     samples = windows_of(flight).samples(np.array([0, 11]))

@@ -7,9 +7,8 @@ from typing import Any
 
 import numpy as np
 import pytest
-import torch
 
-from policy.contract import Contract, FloatArray
+from policy.contract import FloatArray
 from policy.engines.choose import Candidate, choose_runner, first_that_agrees
 from policy.engines.parity import MAX_STICK_ERROR
 from policy.engines.runner import ExecutionSettings
@@ -93,18 +92,3 @@ def test_an_engine_asked_for_on_the_wrong_device_is_refused(small_toge, engine, 
     settings = replace(SETTINGS, vision_device=device, action_device=device)
     with pytest.raises(PolicyError, match=message):
         choose_runner(small_toge, engine, settings)
-
-
-def test_engines_of_our_networks_do_not_take_others() -> None:
-    class Other:
-        def __init__(self, contract: Any) -> None:
-            self.contract = contract
-
-        def predict(self, image: Any, state: Any, history: Any, steps: int) -> torch.Tensor:
-            return torch.zeros(1, 16, 4)
-
-    policy = Other(Contract())
-    single = replace(SETTINGS, dual_rate=False)
-    assert choose_runner(policy, "auto", single)[0].engine == "torch"
-    with pytest.raises(PolicyError, match=r"takes a torch\.nn\.Module"):
-        choose_runner(policy, "openvino", single)
