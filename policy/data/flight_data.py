@@ -93,10 +93,8 @@ class FlightData:
         ):
             stamps, values = getattr(self, at), getattr(self, of)
             if stamps.ndim != 1 or values.shape != (len(stamps), width):
-                raise DatasetError(
-                    f"{self.name}: {of} must be [{len(stamps)}, {width}] beside {at}, got "
-                    f"{list(values.shape)}"
-                )
+                wanted = f"[{len(stamps)}, {width}], got {list(values.shape)}"
+                raise DatasetError(f"{self.name}: {of} must be {wanted}")
             if (backwards := np.flatnonzero(np.diff(stamps) < 0)).size:
                 row = int(backwards[0]) + 1
                 raise DatasetError(f"{self.name}: {at} runs backwards at row {row}")
@@ -152,11 +150,11 @@ def common_terms(flights: Sequence[FlightData]) -> ActionTerms:
     first = flights[0]
     for flight in flights:
         if flight.terms[:2] != first.terms[:2]:
-            raise DatasetError(
-                f"{first.name} was flown by {first.terms.action} and hovers at a thrust of "
-                f"{first.terms.hover_thrust:g}, {flight.name} by {flight.terms.action} at "
-                f"{flight.terms.hover_thrust:g}: train on one kind at a time"
+            one, other = (
+                f"{each.name} by {each.terms.action} (hover thrust {each.terms.hover_thrust:g})"
+                for each in (first, flight)
             )
+            raise DatasetError(f"flown were {one}, {other}: train on one kind at a time")
     tilts_deg = [each.terms.max_tilt_deg for each in flights if each.terms.max_tilt_deg is not None]
     return first.terms._replace(max_tilt_deg=max(tilts_deg, default=None))
 

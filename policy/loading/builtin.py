@@ -23,8 +23,8 @@ def builtin_config(spec: str, *, image_size: int) -> "BuiltinConfig":
     kind, *options = spec.split(":")
     if kind not in BUILTIN_KINDS:
         raise PolicyError(
-            f"--policy {spec} cannot be trained here: use toge[:SIZE][:BACKBONE], "
-            "resnet-unet[:SIZE]; a world model has a command of its own, train-world-model"
+            f"--policy {spec} cannot be trained here: use toge[:SIZE][:BACKBONE] or resnet-unet"
+            "[:SIZE]; a world model has a command of its own, train-world-model"
         )
     return _config(kind, options, image_size)
 
@@ -46,9 +46,8 @@ def builtin_checkpoint(request: PolicyRequest) -> Path | None:
     if shipped is not None and shipped.is_file():
         return shipped
     raise PolicyError(
-        f"{request.spec} needs trained weights: give --checkpoint FILE, or "
-        "network.allow_untrained=true for seeded random ones (timing and bring-up), or fly "
-        "--policy scripted"
+        f"{request.spec} needs trained weights: give --checkpoint FILE, or for bring-up "
+        "network.allow_untrained=true or --policy scripted"
     )
 
 
@@ -98,11 +97,10 @@ def _trained(
         contract, schedule = policy.contract, policy.config.schedule
         notes.append(
             warned(
-                f"{checkpoint} holds no contract; it is flown with frame "
+                f"{checkpoint} holds no contract; was it trained with frame "
                 f"{contract.state_frame}, image {contract.image_width}x{contract.image_height}, "
                 f"chunk of {contract.horizon} every {contract.chunk_dt_s:g} s, history of "
-                f"{contract.history_len} every {contract.history_dt_s:g} s, prediction of the "
-                f"{schedule.prediction}, {schedule.betas} betas: is that how it was trained?"
+                f"{contract.history_len} every {contract.history_dt_s:g} s, and {schedule}?"
             )
         )
     return policy, notes

@@ -77,8 +77,7 @@ class NoiseSchedule:
         total = self.num_train_timesteps
         if type(count) is not int or not 1 <= count <= total:
             raise PolicyError(
-                f"num_diffusion_steps must be an integer in 1..{total} (the schedule that the "
-                f"policy was trained on), got {count!r}; 10 is a good start"
+                f"num_diffusion_steps must be an integer in 1..{total}, got {count!r}"
             )
         return _ddim_steps(total, self.betas, count)
 

@@ -75,9 +75,9 @@ class WorldModel(nn.Module):
         """Encode frames [N, H, W, 3] uint8 to latents [N, C, h, w] of about unit scale."""
         size = self.config.image_size
         if images.dtype != torch.uint8 or tuple(images.shape[1:]) != (size, size, 3):
+            got = f"{images.dtype} {list(images.shape)}"
             raise PolicyError(
-                f"frames must be uint8 [N, {size}, {size}, 3], got {images.dtype} "
-                f"{list(images.shape)}: resize them with policy.preprocess.resize"
+                f"frames must be uint8 [N, {size}, {size}, 3], got {got}: resize them"
             )
         coder = self.autoencoder
         return coder.normalise(
@@ -257,10 +257,8 @@ class WorldModel(nn.Module):
     ) -> None:
         config, batch = self.config, len(latents)
         if sim_mode == (actions is None):
-            raise PolicyError(
-                "simulation (sim_mode=True) takes the actions, decision (sim_mode=False) makes "
-                f"them: actions are {'missing' if actions is None else 'not to be given'}"
-            )
+            told = "missing" if actions is None else "not to be given"
+            raise PolicyError(f"actions are {told} with sim_mode={sim_mode}")
         past = config.context_frames
         for name, array, shape in (
             ("latents", latents, (batch, past, *config.latent_shape)),
