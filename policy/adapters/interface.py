@@ -1,37 +1,10 @@
 """Contract file: the user's TOML with the facts that a foreign policy's files do not contain.
 
-    [contract]                   # fields of policy.contract.Contract
-    action = "sticks"
-    chunk_dt_s = 0.0333
-
-    [state]                      # state vector of the policy's training
-    key = "observation.state"
-    names = ["vx_mps", "vy_mps", "vz_mps", "roll_rad", "pitch_rad", "yaw_rad"]
-    scale = [1.0, 1.0, 1.0, 57.29578, 57.29578, 57.29578]  # angles in degrees
-
-    [action]                     # the policy's action vector; contract = scale * action + offset
-    key = "action"
-    names = ["throttle", "yaw", "pitch", "roll"]
-    scale = [1.0, 1.0, 1.0, 1.0]
-    offset = [0.0, 0.0, 0.0, 0.0]
-
-    [images]                     # the policy's name of each camera of the contract
-    front = "observation.images.front"
-
-    [task]
-    prompt = "fly through the gates"
-
-Entries are optional unless the kind of policy needs them. State names are those of the contract
-and of numbers derived from it:
-
-    vx_body_mps, vy_body_mps, vz_body_mps    velocity in body axes
-    vertical_x, vertical_y, vertical_z       the world's third axis in body axes
-    roll_rad, pitch_rad, yaw_rad             Euler angles of the attitude, turned in the order
-                                             yaw, pitch, roll; signs by the contract's frame
-
-The first six do not depend on the heading, so a network that takes them has no rotations to learn.
-In a draft (``adapters.drafts``), "?" marks the entries that only the user knows; a contract with a
-"?" does not fly.
+Its tables are [contract], with fields of ``policy.contract.Contract``; [state] and [action], with
+key, names and scale of the policy's own vectors; [images], with the policy's name of each camera;
+and [task], with a prompt (docs/policy_lerobot.md). Entries are optional unless the kind of policy
+needs them. State names are those of the contract and ``DERIVED_NAMES``. In a draft
+(``adapters.drafts``), "?" marks what only the user knows; a contract with a "?" does not fly.
 """
 
 from collections.abc import Callable, Mapping, Sequence
@@ -63,7 +36,10 @@ EGOCENTRIC_NAMES = (
     *("vx_body_mps", "vy_body_mps", "vz_body_mps"),
     *("vertical_x", "vertical_y", "vertical_z"),
 )
+"""Velocity and the world's third axis in body axes: independent of the heading, so a network that
+takes them has no rotations to learn."""
 EULER_NAMES = ("roll_rad", "pitch_rad", "yaw_rad")
+"""Angles of the attitude, turned in the order yaw, pitch, roll; signs by the contract's frame."""
 DERIVED_NAMES = (*EGOCENTRIC_NAMES, *EULER_NAMES)
 BODY_STATE_NAMES = (*EGOCENTRIC_NAMES, *STATE_NAMES[QUATERNION.stop :])
 """State without a heading: velocity, vertical axis, rates and specific force in body axes."""
@@ -132,8 +108,6 @@ class Interface:
                 raise ContractError(f"[action] {name} must be {ACTION_DIM} numbers, got {values}")
         if 0 in self.action_scale:
             raise ContractError(f"[action] scale must not be 0, got {self.action_scale}")
-        if self.image_keys and len(self.image_keys) != len(self.contract.cameras):
-            raise ContractError(f"[images] must name the cameras {list(self.contract.cameras)}")
 
     @property
     def state_dim(self) -> int:

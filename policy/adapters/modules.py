@@ -1,16 +1,8 @@
 """Policies made of torch modules, named by a user's class or stored in a TorchScript archive.
 
-    forward(image, state, action_history)            alone: a single-rate policy
-    visual_encoder(image)                            with action_head or denoiser: dual rate
-    action_head(feature, state, action_history)      a chunk in one call
-    denoiser(noisy, timestep, feature, state, action_history)
-                                                     one step of a diffusion policy; mavbridge
-                                                     runs the loop by ``noise_schedule``
-
-Shapes are those of ``policy.protocol``; ``forward`` and ``action_head`` return chunks
-[B, horizon, 4]; ``denoiser`` returns the quantity that the schedule's ``prediction`` names;
-``timestep`` is [B] float32. Arguments beyond the last that a function declares are not passed. A
-TorchScript archive may have methods with these names, and a policy.json (``adapters.description``).
+docs/policy_exported.md lists the names and arguments of the modules; shapes are those of
+``policy.protocol``, and ``timestep`` is [B] float32. Arguments beyond the last that a function
+declares are not passed. An archive may have methods with these names, and a policy.json.
 """
 
 import inspect

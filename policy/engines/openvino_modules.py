@@ -85,8 +85,6 @@ class ModuleConverter:
         )
         """Traced TorchScript keeps data-dependent decisions, and torch.export rejects it."""
         self._models: dict[str, ov.Model] = {}
-        if not self._modules:
-            raise PolicyError(f"{name} neither is a torch.nn.Module nor has one as an attribute")
 
     def compile(
         self, function: Callable[..., Any], shapes: Sequence[Shape], precision: Precision

@@ -1,18 +1,6 @@
 """Loading of the user's ``--policy`` and ``--checkpoint``: returns a runner, or says what is wrong.
 
-    toge[:SIZE][:BACKBONE]   TOGE, e.g. toge, toge:medium, toge:small:resnet18
-    resnet-unet[:SIZE]       ResNet-UNet, single-rate
-    scripted[:PROGRAM][:ACTION][:air]
-                             a fixed program in any kind of action, e.g. scripted:square:velocity;
-                             air: begin in the air, without the climb
-    lerobot:DIR              an ACT or DiffusionPolicy as LeRobot saved it, with --contract FILE
-    onnx:DIR, onnx:FILE.onnx an ONNX export, with --contract FILE unless a contract is beside it
-    torchscript:FILE.pt      a TorchScript archive; contract as for ONNX
-    package.module:Class     any class that follows protocol.SingleRatePolicy or DualRatePolicy
-    ./file.py:Class          a class, by its file
-    ws://HOST:PORT           a server that speaks openpi's websocket protocol; wss:// with TLS
-
-torch is imported only if a policy needs it.
+``adapters.user_class.FORMS`` lists the forms. torch is imported only if a policy needs it.
 """
 
 import inspect

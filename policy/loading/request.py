@@ -57,7 +57,7 @@ class PolicyRequest:
     """The requested policy, and how to run it."""
 
     spec: str
-    """One of the forms in the docstring of ``policy.loading.load``."""
+    """One of ``adapters.user_class.FORMS``."""
     checkpoint: Path | None = None
     """Weights; a user's class gets ``Class(checkpoint=path)``. None: ``toge`` uses shipped ones."""
     contract_file: Path | None = None

@@ -16,8 +16,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-from policy.contract import ACTION_DIM, STATE_DIM
-from policy.errors import PolicyError
+from policy.contract import ACTION_DIM
 from policy.nets.diffusion import DdimStep
 from policy.world_model.autoencoder import FrameAutoencoder, to_bytes, to_unit
 from policy.world_model.config import FACTOR, WorldModelConfig
@@ -46,15 +45,10 @@ class Imagined:
     """[B, frames, 13] in SI units, in the contract's frame."""
     actions: Tensor
     """[B, frames, 4] sticks, given or decided."""
-    video: Tensor | None
-    """[B, frames, H, W, 3] uint8; None unless requested."""
 
 
 class WorldModel(nn.Module):
-    """Autoencoder and dynamics; all scales are stored with the weights.
-
-    A shape or type that does not fit the model raises a ``PolicyError``.
-    """
+    """Autoencoder and dynamics; all scales are stored with the weights."""
 
     def __init__(self, config: WorldModelConfig) -> None:
         super().__init__()
@@ -73,12 +67,6 @@ class WorldModel(nn.Module):
     @torch.no_grad()
     def encode(self, images: Tensor) -> Tensor:
         """Encode frames [N, H, W, 3] uint8 to latents [N, C, h, w] of about unit scale."""
-        size = self.config.image_size
-        if images.dtype != torch.uint8 or tuple(images.shape[1:]) != (size, size, 3):
-            got = f"{images.dtype} {list(images.shape)}"
-            raise PolicyError(
-                f"frames must be uint8 [N, {size}, {size}, 3], got {got}: resize them"
-            )
         coder = self.autoencoder
         return coder.normalise(
             _one_by_one(lambda image: coder.posterior(image)[0], to_unit(images))
@@ -87,11 +75,6 @@ class WorldModel(nn.Module):
     @torch.no_grad()
     def decode(self, latents: Tensor) -> Tensor:
         """Decode latents [N, C, h, w] to frames [N, H, W, 3] uint8."""
-        shape = self.config.latent_shape
-        if tuple(latents.shape[1:]) != shape:
-            raise PolicyError(
-                f"latents must be [N, {', '.join(map(str, shape))}], got {list(latents.shape)}"
-            )
         coder = self.autoencoder
         return to_bytes(_one_by_one(coder.reconstruct, coder.denormalise(latents)))
 
@@ -104,40 +87,33 @@ class WorldModel(nn.Module):
         *,
         ddim_steps: int,
         noise_seed: int | torch.Generator,
-        sim_mode: bool,
-        decode_video: bool = False,
     ) -> Imagined:
-        """Imagine one future.
+        """Imagine one future: simulate given actions, or decide on them.
 
         Args:
             latents: [B, context_frames, C, h, w] of the last frames, oldest first.
             states: [B, context_frames, 13] at their exposures, SI units, the contract's frame.
-            actions: [B, frames, 4] in simulation, None in decision.
+            actions: [B, frames, 4] to simulate, None to decide.
             ddim_steps: network calls.
             noise_seed: seed of the initial noise, equal on every device; a generator is
                 advanced.
-            sim_mode: True to simulate given actions, False to decide.
-            decode_video: True to decode all frames.
         """
-        self._require_context(latents, states, actions, sim_mode=sim_mode)
         steps = self.config.schedule.ddim_steps(ddim_steps)
         batch, device = len(latents), latents.device
         noisy = self._initial_noise(batch, noise_seed, device)
         if actions is not None:
             noisy = replace(noisy, actions=self.normalise_actions(actions))
         source = self.source_frame(latents[:, -1], states[:, -1])
-        knows_actions = torch.full((batch,), sim_mode, device=device)
+        knows_actions = torch.full((batch,), actions is not None, device=device)
         known = self.predict_motion(source, latents, states, noisy.actions, knows_actions)
         for step in steps:
             noisy = self._ddim_update(step, noisy, known)
         motion = noisy.motion * self.motion_std + self.motion_mean
         decided = (noisy.actions * self.action_std + self.action_mean).clamp(-1.0, 1.0)
-        video = self.decode(noisy.latents.flatten(0, 1)) if decode_video else None
         return Imagined(
             latents=noisy.latents,
             states=state_after(states[:, -1:], motion),
             actions=decided if actions is None else actions,
-            video=None if video is None else video.reshape(batch, -1, *video.shape[1:]),
         )
 
     def source_frame(self, latents: Tensor, state: Tensor) -> SourceFrame:
@@ -251,22 +227,6 @@ class WorldModel(nn.Module):
             motion=draw(MOTION_DIM),
             actions=draw(ACTION_DIM),
         )
-
-    def _require_context(
-        self, latents: Tensor, states: Tensor, actions: Tensor | None, *, sim_mode: bool
-    ) -> None:
-        config, batch = self.config, len(latents)
-        if sim_mode == (actions is None):
-            told = "missing" if actions is None else "not to be given"
-            raise PolicyError(f"actions are {told} with sim_mode={sim_mode}")
-        past = config.context_frames
-        for name, array, shape in (
-            ("latents", latents, (batch, past, *config.latent_shape)),
-            ("states", states, (batch, past, STATE_DIM)),
-            ("actions", actions, (batch, config.frames, ACTION_DIM)),
-        ):
-            if array is not None and tuple(array.shape) != shape:
-                raise PolicyError(f"{name} must be {list(shape)}, got {list(array.shape)}")
 
 
 def _one_by_one(net: Callable[[Tensor], Tensor], inputs: Tensor) -> Tensor:

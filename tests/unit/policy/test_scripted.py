@@ -9,7 +9,6 @@ import numpy as np
 import pytest
 
 from policy.contract import ActionKind
-from policy.errors import PolicyError
 from policy.scripted import ScriptedPolicy
 from policy.scripted.controllers import doublet_length_s, doublet_steps
 from sitl.rotation import from_euler
@@ -239,9 +238,3 @@ def test_a_pause_of_the_loop_is_not_integrated_as_climb() -> None:
     vehicle.now_s += 60.0
     throttle = policy.predict_fast(FEATURE, vehicle.state(), HISTORY, 1)[0, 0, 0]
     assert throttle > 0.2
-
-
-def test_a_state_of_another_shape_is_refused() -> None:
-    policy = ScriptedPolicy("hover", lambda: 0.0)
-    with pytest.raises(PolicyError, match=r"\[1, 13\]"):
-        policy.predict_fast(FEATURE, np.zeros((2, 13)), HISTORY, 1)
