@@ -1,7 +1,6 @@
 """Training of a policy from flights: encoder and head, then the head alone on stored features."""
 
 import copy
-import json
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import asdict, replace
 from pathlib import Path
@@ -16,7 +15,7 @@ from policy.checkpoints.policy_file import (
     read_torch,
     save_checkpoint,
 )
-from policy.contract import FLIGHT_TERMS, STATE_NAMES
+from policy.contract import FLIGHT_TERMS
 from policy.data.flight_data import FlightData, Nanoseconds
 from policy.data.flight_folders import read_ages
 from policy.data.frames import FrameStore
@@ -39,7 +38,7 @@ from policy.training.batches import (
 from policy.training.parallel import StepLoss, computing_in
 from policy.training.report import Hooks, PolicyValidation, TrainResult, Validation
 from policy.training.run import TrainingRun, open_run
-from policy.training.run_folder import Position, RunFolder
+from policy.training.run_folder import RunFolder
 from policy.training.settings import MAX_AGE_MS, TrainingStage, TrainSettings, policy_stages
 from policy.training.trainee import Trainee, refresh_batch_norm, validate
 
@@ -51,7 +50,6 @@ NORM_IMAGES = 1024
 """Number of images for the final statistics of batch norms."""
 USUAL_AGES_MS = (20.0, 90.0)
 """Image age at a tick for frames at 30 Hz and an encoder latency of 5 to 35 ms."""
-AGE_BIN_MS = 5
 FINE_TUNE_RATE = 1 / 3
 """Learning rate relative to the usual one, for pretrained weights."""
 NS_PER_MS = 1_000_000
@@ -214,7 +212,11 @@ class _PolicyRun(TrainingRun[Trainee, Batch]):
         )
 
     def _write(self, path: Path) -> None:
-        card = _training_card(self.settings, self._flights, self._ages_ns, self.position)
+        card = self.card(
+            flights=len(self._flights),
+            images=sum(len(flight.captured_ns) for flight in self._flights),
+            feature_ages_ms=(self._ages_ns[[0, -1]] / NS_PER_MS).tolist(),
+        )
         policy = copy.deepcopy(self.average.policy)
         save_checkpoint(path, policy, training=card, packed=self.settings.pack)
 
@@ -274,50 +276,5 @@ def _checkpoint(network: BuiltinConfig, path: Path) -> BuiltinPolicy:
     return policy.train()
 
 
-def _source_of_ages(flights: Sequence[FlightData], settings: TrainSettings) -> str:
-    if settings.ages is not None:
-        return "--ages"
-    return "the flights" if _are_ages_measured(flights) else "nowhere: the usual range"
-
-
 def _are_ages_measured(flights: Sequence[FlightData]) -> bool:
     return any((flight.age_ns > 0).any() for flight in flights)
-
-
-def _training_card(
-    settings: TrainSettings,
-    flights: Sequence[FlightData],
-    ages_ns: Nanoseconds,
-    position: Position,
-) -> str:
-    """Return facts about a checkpoint's training, as JSON."""
-    state = np.concatenate([flight.state for flight in flights])
-    target = np.concatenate([flight.target for flight in flights])
-    ages_ms = ages_ns / 1e6
-    edges = np.arange(0, ages_ms.max() + 2 * AGE_BIN_MS, AGE_BIN_MS)
-    card = {
-        "flights": len(flights),
-        "images": sum(len(flight.captured_ns) for flight in flights),
-        "ticks": len(state),
-        "steps": position.step,
-        "batch_size": settings.batch_size,
-        "seed": settings.seed,
-        "mirror": settings.mirror,
-        "world_yaw": "drawn evenly",
-        "gate_weight": settings.gate_weight,
-        "feature_age_ms": {
-            "measured_in": _source_of_ages(flights, settings),
-            "bin_ms": AGE_BIN_MS,
-            "counts_from_0": np.histogram(ages_ms, edges)[0].tolist(),
-        },
-        "state_mean": _by_name(np.nanmean(state, axis=0)),
-        "state_std": _by_name(np.nanstd(state, axis=0)),
-        "stick_mean": target.mean(axis=0).round(4).tolist(),
-        "stick_std": target.std(axis=0).round(4).tolist(),
-        "validation": position.kept,
-    }
-    return json.dumps(card, sort_keys=True)
-
-
-def _by_name(values: np.ndarray[tuple[int, ...], np.dtype[np.float32]]) -> dict[str, float]:
-    return {name: round(float(v), 4) for name, v in zip(STATE_NAMES, values, strict=True)}

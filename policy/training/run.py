@@ -8,6 +8,7 @@ it had not been interrupted.
 """
 
 import copy
+import json
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Sequence
 from contextlib import closing
@@ -135,6 +136,12 @@ class TrainingRun(ABC, Generic[M, B]):
                 self.note(f"{flight.name}: {lost} images are missing at the end of its video")
         kept, held = hold_out(whole, self.settings.validation_fraction, self.settings.seed)
         return whole, store, kept, held
+
+    def card(self, **facts: object) -> str:
+        """Return facts about the training for a checkpoint's reader, as JSON."""
+        asked = {n: v for n, v in vars(self.settings).items() if isinstance(v, int | float)}
+        position = {"steps": self.position.step, "validation": self.position.kept}
+        return json.dumps({**asked, **facts, **position}, sort_keys=True)
 
     def may_encode(self, stage: TrainingStage) -> Callable[[float], bool]:
         """Return a predicate of the completed share: is there time to encode more?"""
