@@ -12,7 +12,6 @@ from policy.files import (
     open_regular,
     parse_json,
     read_toml,
-    user_path,
 )
 
 
@@ -59,12 +58,6 @@ def test_text_of_windows_editors_is_read(tmp_path: Path) -> None:
     path = tmp_path / "settings.toml"
     path.write_bytes(b'\xef\xbb\xbfa = 1\r\nb = "x"\r\n')
     assert read_toml(path) == {"a": 1, "b": "x"}
-
-
-def test_a_home_directory_is_expanded(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setenv("HOME", "/home/me")
-    assert user_path("~/act") == Path("/home/me/act")
-    assert user_path("~nobody-of-this-name/act") == Path("~nobody-of-this-name/act")
 
 
 @pytest.mark.parametrize(

@@ -34,13 +34,6 @@ def altered(policy: Toge, alter: Callable[[FloatArray], FloatArray]) -> Candidat
     return ("wrong", make)
 
 
-def failing(error: Exception) -> Candidate:
-    def make() -> PolicyRunner:
-        raise error
-
-    return ("broken", make)
-
-
 def one_bad_stick(chunk: FloatArray) -> FloatArray:
     chunk = chunk.copy()
     chunk[0, 7, 2] += 2 * MAX_STICK_ERROR
@@ -64,10 +57,12 @@ def test_a_wrong_engine_is_passed_over_with_its_reason(small_toge, alter, reason
     assert re.search(reason, notes[0])
 
 
-@pytest.mark.parametrize("error", [RuntimeError("no memory\nat x.cpp:3"), TypeError("no memory")])
-def test_an_engine_that_fails_is_passed_over(small_toge: Toge, error: Exception) -> None:
+def test_an_engine_that_fails_is_passed_over(small_toge: Toge) -> None:
+    def broken() -> PolicyRunner:
+        raise RuntimeError("no memory\nat x.cpp:3")
+
     right = altered(small_toge, lambda chunk: chunk)
-    runner, notes = first_that_agrees(small_toge, [failing(error), right], SETTINGS)
+    runner, notes = first_that_agrees(small_toge, [("broken", broken), right], SETTINGS)
     assert runner.engine == "wrong"  # by name only
     assert "engine broken is passed over" in notes[0]
     assert notes[0].endswith("no memory")
