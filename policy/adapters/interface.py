@@ -8,7 +8,7 @@ needs them. State names are those of the contract and ``DERIVED_NAMES``. In a dr
 """
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, TypeVar, cast
 
@@ -187,24 +187,30 @@ def read_interface(path: Path, derived: Mapping[str, object] | None = None) -> I
 
 
 def _interface(data: dict[str, Any], derived: Mapping[str, object]) -> Interface:
-    if unanswered := _unanswered(data):
+    if unanswered := [
+        f"[{table}] {name}"
+        for table, entries in data.items()
+        if isinstance(entries, dict)
+        for name, value in entries.items()
+        if is_unanswered(value)
+    ]:
         raise ContractError(
             f"this is a draft, in which {len(unanswered)} answers are missing: "
             f"{', '.join(unanswered)}. Replace each {UNANSWERED!r} there, by what the comment asks"
         )
     tables = {name: dict(data.pop(name, {})) for name in ("contract", "state", "action", "images")}
     task = dict(data.pop("task", {}))
-    known = {field.name for field in fields(Contract) if field.init}
-    if unknown := sorted(set(tables["contract"]) - known):
-        raise ContractError(f"[contract] has unknown fields {unknown}; known are {sorted(known)}")
-    said = {name: _frozen(value) for name, value in tables["contract"].items()}
+    pairs = tables["contract"].items()
+    said: dict[str, Any] = {
+        name: tuple(value) if isinstance(value, list) else value for name, value in pairs
+    }
     for name, value in derived.items():
         if said.setdefault(name, value) != value:
             raise ContractError(
                 f"[contract] {name} = {said[name]!r} contradicts the policy's own files, which say "
                 f"{value!r}: leave it out"
             )
-    contract = Contract(**said)
+    contract = Contract.from_fields(said)
     state, action, images = tables["state"], tables["action"], tables["images"]
     if images and sorted(images) != sorted(contract.cameras):
         raise ContractError(
@@ -227,17 +233,6 @@ def _interface(data: dict[str, Any], derived: Mapping[str, object]) -> Interface
     return interface
 
 
-def _unanswered(data: Mapping[str, Any]) -> list[str]:
-    """Return the entries that the user has to answer."""
-    return [
-        f"[{table}] {name}"
-        for table, entries in data.items()
-        if isinstance(entries, dict)
-        for name, value in entries.items()
-        if is_unanswered(value)
-    ]
-
-
 def is_unanswered(value: object) -> bool:
     """True if an entry is ``UNANSWERED``, or a list that contains it."""
     return UNANSWERED in (value if isinstance(value, list) else [value])
@@ -258,7 +253,3 @@ def _library(state: object) -> tuple[Any, dict[str, Any]]:
     if not isinstance(state, torch.Tensor):
         raise TypeError(f"neither an array nor a tensor: {type(state)}")
     return torch, {"dtype": torch.float32, "device": state.device}
-
-
-def _frozen(value: object) -> Any:
-    return tuple(value) if isinstance(value, list) else value

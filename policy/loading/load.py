@@ -67,9 +67,7 @@ def check_request(request: PolicyRequest) -> Contract | None:
         check_user_class(request.spec)
     if contract is not None:
         _require_image_size(contract, request.image_size)
-    require_devices(
-        request.vision_device or request.device, request.action_device or request.device
-    )
+    require_devices(*request.devices)
     return contract
 
 
@@ -127,8 +125,8 @@ def _settings(
         notes.append(warned(f"{told}: it flies at one rate (--single-rate: as intended)"))
     return ExecutionSettings(
         name=request.spec,
-        vision_device=request.vision_device or request.device,
-        action_device=request.action_device or request.device,
+        vision_device=request.devices[0],
+        action_device=request.devices[1],
         num_diffusion_steps=request.num_diffusion_steps,
         dual_rate=dual_rate,
     )
@@ -207,8 +205,7 @@ def _plan(request: PolicyRequest) -> Plan:
 
 def _onnx_files(request: PolicyRequest) -> OnnxFiles:
     path = _path(request)
-    devices = {request.vision_device or request.device, request.action_device or request.device}
-    if request.engine not in ("auto", "openvino") or devices != {"cpu"}:
+    if request.engine not in ("auto", "openvino") or set(request.devices) != {"cpu"}:
         flags = "network.engine and --device"
         raise PolicyError(f"--policy {request.spec} runs in OpenVINO on the CPU: leave out {flags}")
     return find_onnx_files(request.spec, path, request.contract_file)

@@ -84,6 +84,11 @@ class PolicyRequest:
     starts_in_air: bool = False
     """The vehicle is already in the air at takeover: a scripted program does not climb."""
 
+    @property
+    def devices(self) -> tuple[str, str]:
+        """Devices for encoding images and for sampling chunks."""
+        return self.vision_device or self.device, self.action_device or self.device
+
 
 @dataclass(frozen=True, kw_only=True)
 class LoadedPolicy:
