@@ -78,11 +78,7 @@ def export_torchscript(policy: BuiltinPolicy, path: Path) -> None:
 
 
 def _write_onnx(
-    module: nn.Module,
-    examples: tuple[Tensor, ...],
-    path: Path,
-    inputs: Sequence[str],
-    output: str,
+    module: nn.Module, examples: tuple[Tensor, ...], path: Path, inputs: Sequence[str], output: str
 ) -> None:
     with _quiet(), torch.no_grad():
         # Not torch.export: it takes ten times as long, and its graphs are slower in OpenVINO: one

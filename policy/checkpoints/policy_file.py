@@ -44,13 +44,7 @@ from policy.engines.parity import ParitySamples, make_parity_samples, parity_fai
 from policy.errors import CheckpointError, PolicyError
 from policy.files import why_unreadable
 from policy.nets.diffusion import NoiseSchedule
-from policy.nets.toge import (
-    BuiltinConfig,
-    BuiltinPolicy,
-    ResnetUnetConfig,
-    TogeConfig,
-    build_policy,
-)
+from policy.nets.toge import BuiltinConfig, BuiltinPolicy, build_policy
 from policy.preprocess import image_to_input
 
 VECTOR_PREFIX = "test_vector."
@@ -111,7 +105,7 @@ def load_checkpoint_with_notes(
         if "contract" in tensors:
             raise CheckpointError(f"{path}: holds a contract: save it as .safetensors, or without")
     try:
-        policy = build_policy(_config_of(header, fallback) if is_ours else fallback)
+        policy = build_policy(_config_of(header, type(fallback)) if is_ours else fallback)
     except (PolicyError, RecursionError) as error:
         told = str(error) if isinstance(error, PolicyError) else "its header is nested too deeply"
         raise CheckpointError(f"{path}: {told}") from error
@@ -148,12 +142,9 @@ def _make_vector(policy: BuiltinPolicy) -> dict[str, Tensor]:
     reference = copy.deepcopy(policy).cpu().eval()
     samples = make_parity_samples(policy.contract)
     arrays = (samples.rgb, samples.state, samples.history, _chunks(reference, samples))
-    return {
-        name: torch.from_numpy(
-            np.ascontiguousarray(array)
-        )  # safetensors requires contiguous tensors
-        for name, array in zip(VECTOR_NAMES, arrays, strict=True)
-    }
+    # safetensors requires contiguous tensors.
+    tensors = (torch.from_numpy(np.ascontiguousarray(array)) for array in arrays)
+    return dict(zip(VECTOR_NAMES, tensors, strict=True))
 
 
 @torch.inference_mode()
@@ -182,27 +173,17 @@ def _require_reproduced(path: Path, policy: BuiltinPolicy, vector: dict[str, Ten
         )
 
 
-def _config_of(header: dict[str, str], fallback: BuiltinConfig) -> BuiltinConfig:
-    contract = Contract.from_json(header[CONTRACT_KEY])
-    config = _architecture_from_json(header[ARCHITECTURE_KEY], contract)
-    if type(config) is not type(fallback):
-        raise CheckpointError(f"no {fallback.kind} in it: ask for it with --policy {config.kind}")
-    return config
-
-
-def _architecture_from_json(text: str, contract: Contract) -> BuiltinConfig:
+def _config_of(header: dict[str, str], wanted: type[BuiltinConfig]) -> BuiltinConfig:
+    contract, text = Contract.from_json(header[CONTRACT_KEY]), header[ARCHITECTURE_KEY]
     try:
         data: Any = json.loads(text)
-        kind = data.pop("policy")
-        schedule = NoiseSchedule(**data.pop("schedule"))
-        for config in (TogeConfig, ResnetUnetConfig):
-            if kind == config.kind:
-                return config(contract=contract, schedule=schedule, **data)
+        if (kind := data.pop("policy")) != wanted.kind:
+            raise CheckpointError(f"it holds a {kind}, no {wanted.kind}: fly it by --policy {kind}")
+        return wanted(contract=contract, schedule=NoiseSchedule(**data.pop("schedule")), **data)
     except (json.JSONDecodeError, KeyError, TypeError, AttributeError) as error:
         raise CheckpointError(
             f"malformed architecture {text[:200]!r} ({error}): export the checkpoint again"
         ) from error
-    raise CheckpointError(f"policy {kind!r} is unknown; this build knows 'toge', 'resnet-unet'")
 
 
 def read_torch(path: Path) -> dict[Any, Any]:

@@ -10,13 +10,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from policy.contract import (
-    QUATERNION,
-    STATE_NAMES,
-    ActionKind,
-    FloatArray,
-    StateFrame,
-)
+from policy.contract import QUATERNION, STATE_NAMES, ActionKind, FloatArray, StateFrame
 from policy.errors import PolicyError
 from policy.preprocess import STATE_SCALE
 

@@ -209,10 +209,7 @@ class BulkEncoder:
     """
 
     def __init__(self, policy: BuiltinPolicy, precision: Precision) -> None:
-        properties = {
-            "PERFORMANCE_HINT": "THROUGHPUT",
-            "INFERENCE_PRECISION_HINT": precision,
-        }
+        properties = {"PERFORMANCE_HINT": "THROUGHPUT", "INFERENCE_PRECISION_HINT": precision}
         image = (1, 3, policy.contract.image_height, policy.contract.image_width)
         graph = convert(policy.backbone, policy.backbone, [image])
         with signal_stack_kept():

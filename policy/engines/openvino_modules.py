@@ -25,13 +25,7 @@ from policy.engines.openvino_compile import (
     signal_stack_kept,
     update_digest,
 )
-from policy.engines.runner import (
-    ArrayFunction,
-    Compile,
-    ExecutionSettings,
-    Precision,
-    Shape,
-)
+from policy.engines.runner import ArrayFunction, Compile, ExecutionSettings, Precision, Shape
 from policy.engines.stepwise import make_parts_runner
 from policy.engines.torch_eager import run_eagerly
 from policy.errors import PolicyError, user_code

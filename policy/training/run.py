@@ -43,9 +43,7 @@ ENCODING_SHARE = 0.4
 
 
 def open_run(
-    settings: RunSettings,
-    network: BuiltinConfig | WorldModelConfig,
-    flights: Sequence[FlightData],
+    settings: RunSettings, network: BuiltinConfig | WorldModelConfig, flights: Sequence[FlightData]
 ) -> RunFolder:
     """Open the folder of a run, to start or resume it."""
     if not settings.out.parent.is_dir():

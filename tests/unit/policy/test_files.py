@@ -7,12 +7,7 @@ import pytest
 from mavbridge.__main__ import main
 from policy.adapters.interface import read_interface
 from policy.errors import ContractError
-from policy.files import (
-    MAX_TOML_BYTES,
-    open_regular,
-    parse_json,
-    read_toml,
-)
+from policy.files import MAX_TOML_BYTES, open_regular, parse_json, read_toml
 
 
 def test_a_pipe_is_no_file_and_is_not_waited_for(tmp_path: Path) -> None:

@@ -137,7 +137,7 @@ def test_a_policy_without_fast_path_becomes_single_rate_with_one_warning(tmp_pat
         ("scripted:yaw", {"by_rates": True}, "--by-rates is for toge"),
     ],
 )
-def test_refusals_say_what_to_do(spec: str, changes: dict[str, Any], message: str) -> None:
+def test_refusals_name_the_next_step(spec: str, changes: dict[str, Any], message: str) -> None:
     with pytest.raises(PolicyError, match=message):
         load(spec, **changes)
 

@@ -114,7 +114,7 @@ def test_depth_is_metres_and_the_unknown_is_zero() -> None:
 
 @pytest.mark.parametrize("fit", ["stretch", "crop", "pad"])
 @pytest.mark.parametrize("size", [(480, 640), (31, 100)])
-def test_no_distance_is_made_up_between_two(size: tuple[int, int], fit: Any) -> None:
+def test_depth_is_never_interpolated(size: tuple[int, int], fit: Any) -> None:
     depth = np.random.default_rng(0).choice(np.array([0, 1000, 9000], np.uint16), size)
     planes = image_to_input(depth, replace(DEPTH, image_fit=fit))
     assert planes.shape == (1, 1, 32, 48)
@@ -152,7 +152,7 @@ attitudes = st.tuples(*[st.floats(-1, 1)] * 4).filter(lambda q: np.linalg.norm(q
 
 
 @given(attitudes, st.tuples(number, number, number), angle)
-def test_it_is_the_same_on_every_heading(q, velocity, turn):
+def test_the_egocentric_state_does_not_depend_on_the_heading(q, velocity, turn):
     here = state(q, velocity)
     there = here.copy()
     about = about_z(np.array([turn]))
@@ -173,7 +173,7 @@ def test_velocity_and_vertical_are_those_of_the_body(q, velocity):
 
 
 @pytest.mark.parametrize("since_exposure", [False, True])
-def test_numpy_and_torch_see_the_same(since_exposure: bool) -> None:
+def test_numpy_and_torch_agree(since_exposure: bool) -> None:
     contract = Contract(since_exposure=since_exposure)
     random = np.random.default_rng(0)
     states = random.normal(size=(8, contract.state_dim)).astype(np.float32)

@@ -47,7 +47,5 @@ def test_floats_and_arrays_give_the_same(a: float, b: float, axis: int, share: f
     assert isinstance(turned, tuple)
     np.testing.assert_allclose([turned], rotation.slerp(*arrays, np.array([share])), atol=1e-12)
     np.testing.assert_allclose(
-        [rotation.rotate(p, (w, x, y))],
-        rotation.rotate(arrays[0], arrays[1][:, :3]),
-        atol=1e-12,
+        [rotation.rotate(p, (w, x, y))], rotation.rotate(arrays[0], arrays[1][:, :3]), atol=1e-12
     )

@@ -30,12 +30,7 @@ def state(
     half, side = math.radians(lean_deg) / 2, math.radians(towards_deg)
     turn = math.radians(heading_deg) / 2
     # Towards the nose is nose down: a turn about minus the y axis.
-    lean = (
-        math.cos(half),
-        math.sin(half) * math.sin(side),
-        -math.sin(half) * math.cos(side),
-        0.0,
-    )
+    lean = (math.cos(half), math.sin(half) * math.sin(side), -math.sin(half) * math.cos(side), 0.0)
     attitude = multiply((math.cos(turn), 0.0, 0.0, math.sin(turn)), lean)
     return np.array([[0.0, 0.0, -climb, *attitude, *[0.0] * 6]], np.float32)
 
@@ -84,7 +79,7 @@ def test_a_lean_keeps_the_height_and_a_climb_ends_at_its_speed() -> None:
     assert climbing[0] == pytest.approx(0.5, rel=1e-4)
 
 
-def test_no_stick_asks_for_more_than_a_vehicle_has() -> None:
+def test_rates_stay_within_limits() -> None:
     loop, random = StickLoop(CONTRACT), np.random.default_rng(0)
     for _ in range(50):
         at = state(*random.uniform(0, 170, 1), towards_deg=random.uniform(0, 360), climb=-20.0)

@@ -254,6 +254,6 @@ def test_a_failure_to_close_is_said_and_hides_no_other(mine: str) -> None:
         ("Other", {}, "'Single'"),
     ],
 )
-def test_a_class_that_will_not_do_is_refused(mine, name, changes, message):
+def test_an_unusable_class_is_refused(mine, name, changes, message):
     with pytest.raises(PolicyError, match=message):
         load(f"{mine}:{name}", **changes)

@@ -158,7 +158,7 @@ REFUSED: dict[str, tuple[Write, str]] = {
 
 
 @pytest.mark.parametrize("case", REFUSED)
-def test_what_cannot_fly_is_refused_by_its_cause(tmp_path: Path, case: str) -> None:
+def test_unusable_graphs_are_refused_by_cause(tmp_path: Path, case: str) -> None:
     write, told = REFUSED[case]
     graphs.write_contract(tmp_path)
     write(tmp_path)

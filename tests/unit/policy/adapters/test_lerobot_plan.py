@@ -87,7 +87,7 @@ def test_inputs_that_no_vehicle_measures_are_refused(folder, key, kind):
         read_plan(folder, None)
 
 
-def test_what_is_doubtful_is_a_warning(folder):
+def test_doubtful_entries_are_warnings(folder):
     edit(folder / "config.json", lambda data: data.update(use_new_trick=True))
     notes = read_plan(folder, None).notes
     assert any("use_new_trick" in note for note in notes)

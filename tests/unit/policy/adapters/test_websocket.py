@@ -132,13 +132,13 @@ def array(**changes: object) -> bytes:
         msgpack.packb({"x": {"__npgeneric__": True, "data": b"1", "dtype": "<f4"}}),
     ],
 )
-def test_what_is_malformed_is_refused(data: bytes) -> None:
+def test_malformed_messages_are_refused(data: bytes) -> None:
     with pytest.raises(MessageError):
         unpack(data)
 
 
 @given(st.binary(max_size=200))
-def test_no_bytes_raise_anything_else(data: bytes) -> None:
+def test_random_bytes_raise_nothing_but_a_message_error(data: bytes) -> None:
     with suppress(MessageError):
         assert isinstance(unpack(data), dict)
 

@@ -123,13 +123,13 @@ def test_weights_of_a_lerobot_folder_name_the_folder(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("content", [b"PK", b"\x80\x02cos", b"\xff" * 64, b"12345678{", b"{"])
-def test_what_is_unknown_is_left_to_its_reader(tmp_path: Path, content: bytes) -> None:
+def test_unknown_content_is_left_to_its_reader(tmp_path: Path, content: bytes) -> None:
     (tmp_path / TORCH).write_bytes(content)
     assert detect(tmp_path / TORCH) is None
 
 
 @pytest.mark.parametrize("kind", ["lerobot", "onnx", "torchscript"])
-def test_a_form_of_a_foreign_policy_names_what_else_its_file_is(tmp_path: Path, kind: str) -> None:
+def test_a_form_of_a_foreign_policy_names_the_kind_of_its_file(tmp_path: Path, kind: str) -> None:
     path = tmp_path / "policy.onnx"
     path.write_bytes(b"<html>")
     with pytest.raises(PolicyError, match=rf"^--policy {kind}:{path}: .*is a web page"):

@@ -85,7 +85,9 @@ def test_each_packed_weight_is_off_by_at_most_half_a_step() -> None:
         ({"head.unet.out.weight": lambda x: -x}, "do not make the sticks that they made"),
     ],
 )
-def test_weights_that_do_not_make_their_vector(small_toge, saved, tmp_path, changes, message):
+def test_weights_that_do_not_reproduce_their_test_vector_are_refused(
+    small_toge, saved, tmp_path, changes, message
+):
     contents = contents_of(saved)
     for name, change in changes.items():
         changed = change(contents.pop(name))
@@ -120,7 +122,9 @@ def test_a_malicious_pickle_is_refused_and_not_run(small_toge, tmp_path, protoco
     assert not marker.exists()
 
 
-def test_what_a_torch_file_cannot_hold_is_refused(small_toge: Toge, tmp_path: Path) -> None:
+def test_torch_files_with_a_network_or_a_contract_are_refused(
+    small_toge: Toge, tmp_path: Path
+) -> None:
     path = tmp_path / "a.pt"
     torch.save(nn.Linear(2, 2), path)
     with pytest.raises(CheckpointError, match=r"holds a torch\.nn.*--policy torchscript:FILE"):
@@ -173,7 +177,7 @@ def test_weights_that_do_not_fit_are_named(small_toge, tmp_path, name, tensor, m
         ("contract", {"feature_dim": 384}, "feature_dim 384"),
         ("architecture", {"size": "huge"}, "size 'huge' is unknown"),
         ("architecture", {"backbone": "vgg16"}, "backbone 'vgg16' is unknown"),
-        ("architecture", {"policy": "other"}, "policy 'other' is unknown"),
+        ("architecture", {"policy": "other"}, "holds a other, no toge"),
         ("architecture", {"depth": 3}, "malformed architecture"),
         ("architecture", {"schedule": {"betas": "quadratic"}}, "betas 'quadratic' is unknown"),
     ],

@@ -59,7 +59,7 @@ WRAPPED: dict[str, tuple[Callable[[State], Any], str | None]] = {
 
 
 @pytest.mark.parametrize("case", WRAPPED)
-def test_what_is_around_the_weights_is_taken_off_and_said(small_toge, tmp_path, case):
+def test_wrappers_of_weights_are_removed_and_reported(small_toge, tmp_path, case):
     wrap, note = WRAPPED[case]
     state = small_toge.state_dict()
     path = tmp_path / "a.ckpt"
@@ -87,7 +87,7 @@ def test_torchs_own_average_loads(small_toge: Toge, tmp_path: Path) -> None:
         ),
     ],
 )
-def test_what_holds_no_weights_of_this_network_is_refused(small_toge, tmp_path, wrap, message):
+def test_files_without_weights_of_this_network_are_refused(small_toge, tmp_path, wrap, message):
     path = tmp_path / "a.pt"
     torch.save(wrap(dict(small_toge.state_dict())), path)
     with pytest.raises(CheckpointError, match=message):

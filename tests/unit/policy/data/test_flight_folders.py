@@ -148,7 +148,7 @@ def test_no_flights_are_refused(tmp_path: Path) -> None:
         ({"expert": [None] * 3}, "nobody to learn from"),
     ],
 )
-def test_numbers_that_are_none_are_refused(tmp_path, changes, says):
+def test_invalid_columns_are_refused(tmp_path, changes, says):
     good = {"woke_ns": WOKE, "expert": [STICK] * 3, "sent": [STICK] * 3}
     with pytest.raises(DatasetError, match=says):
         read_flight(flight(tmp_path / "a", ticks_table(**{**good, **changes})))
@@ -204,7 +204,7 @@ def test_a_failed_flight_is_nothing_to_imitate(tmp_path, meta, failure):
         ({"action": "rates"}, "without an expert"),
     ],
 )
-def test_actions_that_nothing_here_learns_from_are_refused(tmp_path, contract, says):
+def test_actions_that_cannot_be_learned_are_refused(tmp_path, contract, says):
     folder = flight(
         tmp_path / "a",
         ticks_table(woke_ns=WOKE, expert=None, sent=[STICK] * 3),

@@ -35,7 +35,7 @@ def test_images_are_decoded_once(episode: FlightData, tmp_path: Path) -> None:
     np.testing.assert_array_equal(again.read(frames, 32), np.stack(list(episode.decode())))
 
 
-def test_the_net_gets_what_it_gets_in_flight(episode: FlightData, tmp_path: Path) -> None:
+def test_training_and_flight_prepare_images_alike(episode: FlightData, tmp_path: Path) -> None:
     """Stored at the net's size and normalised for a step: the same as image_to_input."""
     contract = Contract(image_height=20, image_width=20)
     image = torch.from_numpy(store_frames([episode], tmp_path, 20).read(np.array([3]), 20))

@@ -176,7 +176,7 @@ def test_a_mirrored_flight_is_seen_mirrored_from_the_vehicle() -> None:
     np.testing.assert_array_equal(left.gate[::2], samples.gate[::2] * [*vector, -1, *vector])
 
 
-def test_what_tells_the_next_body_rate_without_looking_is_hidden_in_training() -> None:
+def test_rates_and_forces_are_noisy_in_training_by_rates_alone() -> None:
     """Rates and forces, nothing else of the state, and only for rates."""
     by_rates = Contract(since_exposure=True, horizon=4, action="rates")
     terms = ActionTerms("rates")

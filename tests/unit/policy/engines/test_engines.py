@@ -8,12 +8,7 @@ import pytest
 import torch
 
 from policy.contract import Contract
-from policy.engines.runner import (
-    ExecutionSettings,
-    encode_all,
-    level_state,
-    make_numpy_runner,
-)
+from policy.engines.runner import ExecutionSettings, encode_all, level_state, make_numpy_runner
 from policy.engines.torch_eager import make_torch_runner
 from policy.errors import PolicyError, user_code
 from policy.nets.toge import Toge
@@ -105,7 +100,7 @@ def test_torch_policies_must_return_tensors() -> None:
 
 
 @pytest.mark.parametrize("error", [AssertionError("no"), OSError("no"), SystemExit("no")])
-def test_whatever_is_raised_becomes_one_message_with_its_place(error: BaseException) -> None:
+def test_an_exception_becomes_one_message_with_file_and_line(error: BaseException) -> None:
     with (
         pytest.raises(PolicyError, match=rf"flying: {type(error).__name__}: no \(.*:\d+\)") as info,
         user_code("flying"),
@@ -139,7 +134,7 @@ class Careless:
     predict = predict_fast
 
 
-def test_a_careless_policy_harms_nobody() -> None:
+def test_arrays_are_copied_in_and_out() -> None:
     runner = make_numpy_runner(Careless(), ExecutionSettings(name="careless"))
     first = runner.encode(np.zeros((8, 8, 3), np.uint8))
     first.setflags(write=False)  # as the vision loop publishes it

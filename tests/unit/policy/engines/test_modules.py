@@ -56,7 +56,7 @@ def test_modules_fly_converted(make: type[SingleRatePolicy], dual_rate: bool) ->
         ("Looping", "its graph has 1.. operations, and at most 90"),
     ],
 )
-def test_what_a_graph_cannot_do_runs_in_torch_and_says_why(name, reason, monkeypatch):
+def test_modules_that_no_graph_computes_run_in_torch_with_a_reason(name, reason, monkeypatch):
     monkeypatch.setattr(openvino_modules, "MAX_OPERATIONS", 90)
     policy, level = getattr(torch_policies, name)(), logging.root.level
     runner, notes = choose_runner(policy, "auto", SETTINGS)

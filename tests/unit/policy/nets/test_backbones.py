@@ -20,10 +20,7 @@ from policy.nets.names import BACKBONE_NAMES, BackboneName
         ),
         (
             *("resnet18", 11_689_512, 512),
-            {
-                "layer2.0.downsample.0.weight": (128, 64, 1, 1),
-                "layer4.1.bn2.running_mean": (512,),
-            },
+            {"layer2.0.downsample.0.weight": (128, 64, 1, 1), "layer4.1.bn2.running_mean": (512,)},
         ),
         ("resnet50", 25_557_032, 2048, {"layer3.5.conv3.weight": (1024, 256, 1, 1)}),
     ],

@@ -90,6 +90,6 @@ def test_gaussian_data_converges_to_the_probability_flow(betas, prediction):
         (partial(NoiseSchedule, prediction="velocity"), "epsilon"),
     ],
 )
-def test_what_is_no_schedule_or_does_not_fit_one_is_refused(call, told):
+def test_invalid_schedules_and_step_counts_are_refused(call, told):
     with pytest.raises(PolicyError, match=told):
         call()

@@ -92,7 +92,7 @@ def test_a_turn_moves_what_is_far_by_its_angle(state_frame: StateFrame) -> None:
     assert place_of(made) == pytest.approx((5.0, 5.0), abs=0.1)
 
 
-def test_what_is_ahead_grows_as_it_is_approached() -> None:
+def test_objects_ahead_grow_on_approach() -> None:
     distance_m, flown_m = 10.0, 4.0
     wall = math.log(math.expm1(1.0 / (distance_m - flown_m)))  # softplus makes that of it
     for state_frame in ("ned_frd", "enu_flu"):

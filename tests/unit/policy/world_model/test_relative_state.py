@@ -55,7 +55,7 @@ def test_a_motion_is_the_rotation_that_the_quaternions_tell() -> None:
     np.testing.assert_allclose(motion[:, 12:], (then - now)[:, SPECIFIC_FORCE], atol=1e-6)
 
 
-def test_what_is_told_is_the_same_on_every_heading() -> None:
+def test_features_do_not_depend_on_the_heading() -> None:
     by = about_z(np.array([1.1]))[0]
     past, then = random_states(2), random_states(7, seed=1)
     past_turned, then_turned = turned(past, by), turned(then, by)

@@ -127,7 +127,7 @@ def test_gradient_reaches_every_weight() -> None:
         assert weight.grad.abs().sum() > 0, name
 
 
-def test_what_is_not_known_of_the_sticks_is_not_decoded(model: WorldModel) -> None:
+def test_unknown_sticks_do_not_change_the_warp(model: WorldModel) -> None:
     latents, states = context(2)
     source = model.source_frame(latents[:, -1], states[:, -1])
     known, unknown = torch.ones(2, dtype=torch.bool), torch.zeros(2, dtype=torch.bool)
@@ -169,7 +169,7 @@ class KnownYaw(nn.Module):
         return motion
 
 
-def test_a_net_that_says_nothing_shows_the_last_frame_turned_as_was_warped() -> None:
+def test_a_network_with_zero_output_shows_the_warped_last_frame() -> None:
     config = replace(SMALL, image_size=64, latent_channels=3, camera_tilt_rad=0.0)
     model = WorldModel(config).eval()
     # By the first yaw, a column of cells comes to where its left neighbour was, in the middle.
