@@ -76,7 +76,7 @@ def test_torch_is_imported_by_neither_scripted_policies_nor_cheap_checks() -> No
 def test_untrained_weights_are_seeded_and_said() -> None:
     torch_state = torch.random.get_rng_state()
     first, again, other = (
-        load("toge:small:resnet18", allow_untrained=True, image_size=32, seed=seed)
+        load("toge:small:resnet8", allow_untrained=True, image_size=32, seed=seed)
         for seed in (3, 3, 4)
     )
     assert "untrained: seeded random weights (seed 3, noise too)" in first.notes[0]
@@ -95,12 +95,12 @@ def test_the_fastest_engine_that_agrees_flies_and_is_named(checkpoint: Path) -> 
 
 
 def test_a_checkpoint_decides_what_is_built(checkpoint: Path, small_toge: Toge) -> None:
-    for spec in ("toge", "toge:small:resnet18"):
+    for spec in ("toge", "toge:small:resnet8"):
         loaded = load(spec, checkpoint=checkpoint)
         assert loaded.runner.contract == small_toge.contract
-        assert "(small, resnet18)" in loaded.notes[0]
+        assert "(small, resnet8)" in loaded.notes[0]
     for spec in ("toge:medium", "toge:efficientnet_b3"):
-        with pytest.raises(PolicyError, match="holds small:resnet18"):
+        with pytest.raises(PolicyError, match="holds small:resnet8"):
             load(spec, checkpoint=checkpoint)
 
 

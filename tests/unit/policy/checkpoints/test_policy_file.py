@@ -45,7 +45,7 @@ def contents_of(path: Path) -> dict[str, torch.Tensor]:
 def test_the_file_alone_says_what_it_is(tmp_path: Path) -> None:
     contract = Contract(image_height=32, image_width=48, state_frame="enu_flu", horizon=8)
     schedule = NoiseSchedule(prediction="epsilon", betas="linear", num_train_timesteps=50)
-    config = TogeConfig(backbone="resnet18", contract=contract, schedule=schedule)
+    config = TogeConfig(backbone="resnet8", contract=contract, schedule=schedule)
     policy = build_policy(config).eval()
     path = tmp_path / "a.safetensors"
     save_checkpoint(path, policy)

@@ -82,7 +82,7 @@ def test_torchs_own_average_loads(small_toge: Toge, tmp_path: Path) -> None:
         (lambda s: torch.optim.Adam([nn.Parameter(s[NAME])]).state_dict(), "no weights found"),
         (lambda s: {"shadow_params": list(s.values())}, "no weights found"),
         (
-            lambda s: Toge(TogeConfig(backbone="resnet8")).state_dict(),
+            lambda s: Toge(TogeConfig(backbone="resnet18")).state_dict(),
             r"does not fit this policy in \d+ places: missing.*size and encoder",
         ),
     ],
