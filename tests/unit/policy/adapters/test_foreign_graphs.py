@@ -57,6 +57,16 @@ def test_one_action_for_one_observation_flies_as_it_is(tmp_path: Path, state: st
     assert act(load(f"onnx:{tmp_path}"), vx_mps=2.0) == pytest.approx([0.2] * 4, abs=1e-3)
 
 
+def test_state_and_actions_are_in_the_order_and_units_of_the_contract_file(tmp_path: Path) -> None:
+    state = '[state]\nnames = ["vx_mps", "yaw_rad"]\nscale = [3.0, 1.0]\n'
+    names = '["roll", "pitch", "yaw", "throttle"]'
+    action = f"[action]\nnames = {names}\nscale = [1.0, 1.0, 1.0, 0.5]\n"
+    graphs.write_contract(tmp_path, more=state + action)
+    graphs.actor(tmp_path / "policy.onnx", state_dim=2)
+    sticks = act(load(f"onnx:{tmp_path}"), vx_mps=2.0)
+    assert sticks == pytest.approx([0.3, 0.6, 0.6, 0.6], abs=1e-3)
+
+
 @pytest.mark.parametrize("hidden", [("h_in", "h_out"), ("state_in_0", "state_out_0"), ("h", "hn")])
 def test_a_hidden_state_goes_from_call_to_call_until_reset(tmp_path, hidden):
     graphs.write_contract(tmp_path)
