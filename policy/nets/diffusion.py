@@ -64,10 +64,6 @@ class NoiseSchedule:
             if (value := getattr(self, name)) not in get_args(known):
                 raise PolicyError(f"{name} {value!r} is unknown; use one of {get_args(known)}")
 
-    def signal_power(self) -> tuple[float, ...]:
-        """Return a_t for every training timestep, falling from almost 1 to almost 0."""
-        return _signal_power(self.num_train_timesteps, self.betas)
-
     def ddim_steps(self, count: int) -> tuple[DdimStep, ...]:
         """Return the reverse steps of a solve with ``count`` network calls, noisiest first.
 
@@ -79,11 +75,11 @@ class NoiseSchedule:
             raise PolicyError(
                 f"num_diffusion_steps must be an integer in 1..{total}, got {count!r}"
             )
-        return _ddim_steps(total, self.betas, count)
+        return _ddim_steps(self, count)
 
     def add_noise(self, clean: Tensor, noise: Tensor, timestep: Tensor) -> Tensor:
         """Run the forward process, for training: clean [B, ...] and standard noise -> noisy."""
-        power = torch.tensor(self.signal_power(), dtype=torch.float64, device=clean.device)
+        power = torch.tensor(signal_power(self), dtype=torch.float64, device=clean.device)
         at = power[timestep].reshape(-1, *[1] * (clean.ndim - 1))
         return at.sqrt().to(clean.dtype) * clean + (1 - at).sqrt().to(clean.dtype) * noise
 
@@ -133,12 +129,14 @@ def ddim_solve(
 
 
 @lru_cache(maxsize=16)
-def _signal_power(total: int, betas: BetaSchedule) -> tuple[float, ...]:
-    """Return the signal power; schedules of Nichol & Dhariwal 2021, section 3.2, and Ho's linear
-    one scaled to ``total``."""
-    power, powers = 1.0, []
+def signal_power(schedule: NoiseSchedule) -> tuple[float, ...]:
+    """Return a_t for every training timestep, falling from almost 1 to almost 0.
+
+    Schedules of Nichol & Dhariwal 2021, section 3.2, and Ho's linear one scaled to their number.
+    """
+    power, powers, total = 1.0, [], schedule.num_train_timesteps
     for t in range(total):
-        if betas == "linear":
+        if schedule.betas == "linear":
             # 1e-4..0.02 is for 1000 steps; equal noise in fewer steps needs larger betas.
             beta = (1e-4 + (0.02 - 1e-4) * t / max(total - 1, 1)) * 1000 / total
         else:
@@ -154,8 +152,8 @@ def cosine_power(fraction: float) -> float:
 
 
 @lru_cache(maxsize=256)
-def _ddim_steps(total: int, betas: BetaSchedule, count: int) -> tuple[DdimStep, ...]:
-    power = _signal_power(total, betas)
+def _ddim_steps(schedule: NoiseSchedule, count: int) -> tuple[DdimStep, ...]:
+    power, total = signal_power(schedule), schedule.num_train_timesteps
     timesteps = [total * (count - i) // count - 1 for i in range(count)]
     after = [power[t] for t in timesteps[1:]] + [1.0]
     return tuple(

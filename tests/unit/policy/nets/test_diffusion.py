@@ -7,7 +7,7 @@ import torch
 from torch import Tensor
 
 from policy.errors import PolicyError
-from policy.nets.diffusion import NoiseSchedule, ddim_solve
+from policy.nets.diffusion import NoiseSchedule, ddim_solve, signal_power
 
 
 def solve(schedule: NoiseSchedule, count: int, denoise: object, noise: Tensor) -> Tensor:
@@ -22,13 +22,13 @@ def solve(schedule: NoiseSchedule, count: int, denoise: object, noise: Tensor) -
 
 
 def test_schedules_by_hand() -> None:
-    power = NoiseSchedule().signal_power()
+    power = signal_power(NoiseSchedule())
     at_zero = math.cos(0.008 / 1.008 * math.pi / 2) ** 2
     for t in (0, 9, 49, 98):  # the last beta is capped at 0.999
         expected = math.cos(((t + 1) / 100 + 0.008) / 1.008 * math.pi / 2) ** 2 / at_zero
         assert power[t] == pytest.approx(expected, rel=1e-9)
     assert power[99] == pytest.approx(0.001 * power[98])
-    power = NoiseSchedule(betas="linear").signal_power()
+    power = signal_power(NoiseSchedule(betas="linear"))
     assert power[1] == pytest.approx((1 - 1e-3) * (1 - (1e-3 + 0.199 / 99)))
     assert power[99] < 1e-4
 
@@ -56,7 +56,7 @@ def gaussian_posterior_mean(signal: float, noise_scale: float, x: Tensor) -> Ten
 
 def gaussian_flow(schedule: NoiseSchedule, noise: Tensor) -> Tensor:
     """Closed-form end of the probability flow: it keeps x_t over its marginal deviation."""
-    power = schedule.signal_power()[-1]
+    power = signal_power(schedule)[-1]
     return noise * DEVIATION / math.sqrt(power * DEVIATION**2 + 1 - power)
 
 
