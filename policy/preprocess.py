@@ -95,7 +95,7 @@ def image_to_input(image: CameraImage, contract: Contract) -> FloatArray:
 def input_to_bytes(planes: FloatArray, contract: Contract) -> FloatArray:
     """Undo the normalisation of ``image_to_input``: [..., 3, H, W] -> whole numbers 0 to 255."""
     if contract.is_depth:
-        raise PolicyError("a depth image is in metres: export the policy with a float image")
+        raise PolicyError("the image is depth in metres: export the policy with a float image")
     scale, offset = _scale_offset(contract)
     colours = [0, 1, 2] if contract.image_channels == "rgb" else [2, 1, 0]
     per_plane = (3, 1, 1)
