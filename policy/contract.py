@@ -273,7 +273,10 @@ class Contract:
             self._require(name, is_right, f"three numbers in [{low:g}, {MOST_PIXEL:g}]")
         scaling = (self.image_mean_rgb, self.image_std_rgb)
         if self.is_depth and scaling != (IMAGENET_MEAN_RGB, IMAGENET_STD_RGB):
-            raise ContractError("leave out image_mean_rgb and image_std_rgb: depth is in metres")
+            raise ContractError(
+                "image_channels 'depth' gives metres as they are: leave image_mean_rgb and "
+                f"image_std_rgb out, got {scaling[0]} and {scaling[1]}"
+            )
         crop = self.image_crop
         is_crop = len(crop) == 4 and all(_is_within(share, 0, 1) for share in crop)
         is_crop = is_crop and min(crop[2] - crop[0], crop[3] - crop[1]) >= LEAST

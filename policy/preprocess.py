@@ -95,7 +95,10 @@ def image_to_input(image: CameraImage, contract: Contract) -> FloatArray:
 def input_to_bytes(planes: FloatArray, contract: Contract) -> FloatArray:
     """Undo the normalisation of ``image_to_input``: [..., 3, H, W] -> whole numbers 0 to 255."""
     if contract.is_depth:
-        raise PolicyError("the image is depth in metres: export the policy with a float image")
+        raise PolicyError(
+            "it takes its image as uint8, and the contract's is depth in metres: export it with "
+            "an image of type float"
+        )
     scale, offset = _scale_offset(contract)
     colours = [0, 1, 2] if contract.image_channels == "rgb" else [2, 1, 0]
     per_plane = (3, 1, 1)
@@ -117,9 +120,12 @@ def fit_image(image: CameraImage, contract: Contract) -> CameraImage:
     """Crop and resize a camera image of any size by the contract, to ``Contract.picture_shape``."""
     kind = (np.dtype(np.uint16), ()) if contract.is_depth else (np.dtype(np.uint8), (3,))
     if image.ndim < 2 or (image.dtype, image.shape[2:]) != kind or 0 in image.shape:
+        wanted = (
+            "uint16 [height, width]: depth" if contract.is_depth else "uint8 [height, width, 3]"
+        )
         raise PolicyError(
-            f"an image must be {kind[0]} [height, width, *{kind[1]}] by image_channels "
-            f"{contract.image_channels!r}, got {image.dtype} {list(image.shape)}: use such a camera"
+            f"an image must be {wanted} by image_channels {contract.image_channels!r}, got "
+            f"{image.dtype} {list(image.shape)}: use a camera of that kind"
         )
     height, width = contract.image_height, contract.image_width
     top, left, bottom, right = contract.image_crop

@@ -155,7 +155,10 @@ def _lerobot_entries(
     state_dim: int, action_dim: int, image_keys: Sequence[str], path: Path, dataset: Path | None
 ) -> list[Entry]:
     if action_dim != ACTION_DIM:
-        raise CheckpointError(f"{path}: its action has {action_dim} numbers, but {ACTION_DIM} fly")
+        raise CheckpointError(
+            f"{path}: its action has {action_dim} numbers, but {ACTION_DIM} fly a "
+            "multirotor: sticks, or thrust and rates, or thrust and attitude, or a velocity"
+        )
     names: dict[str, list[str] | None] = {STATE_KEY: None, ACTION_KEY: None}
     rate, frame, where = _ASKED_RATE, _ASKED_FRAME, path.name
     if dataset is not None:

@@ -98,11 +98,15 @@ class Interface:
             raise ContractError(f"[state] names {unknown} are unknown; known are {list(known)}")
         wanted = ACTION_FIELDS[self.contract.action]
         if self.action_names and sorted(self.action_names) != sorted(wanted):
-            got = list(self.action_names)
-            raise ContractError(f"[action] names must be {list(wanted)} in some order, got {got}")
+            raise ContractError(
+                f"[action] names must be {list(wanted)} in some order for action "
+                f"{self.contract.action!r}, got {list(self.action_names)}"
+            )
         if len(self.state_scale) not in (0, self.state_dim):
-            told = f"{self.state_dim} numbers, got {self.state_scale}"
-            raise ContractError(f"[state] scale must be {told}")
+            raise ContractError(
+                f"[state] scale must be {self.state_dim} numbers, one a name, got "
+                f"{list(self.state_scale)}"
+            )
         for name, values in (("scale", self.action_scale), ("offset", self.action_offset)):
             if values and len(values) != ACTION_DIM:
                 raise ContractError(f"[action] {name} must be {ACTION_DIM} numbers, got {values}")
@@ -149,7 +153,10 @@ class Interface:
         """Convert the policy's actions [..., 4] to the contract's [..., 4], arrays or tensors."""
         values: Any = actions
         if values.shape[-1] != ACTION_DIM:
-            raise PolicyError(f"its chunk is {list(values.shape)}, and must end with {ACTION_DIM}")
+            raise PolicyError(
+                f"its chunk is {list(values.shape)}, and its last axis must be the {ACTION_DIM} "
+                "numbers of an action"
+            )
         scale, offset = self._action_units(actions)
         return cast(ArrayOrTensor, _columns(values * scale + offset, self.action_columns))
 

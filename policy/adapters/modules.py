@@ -107,7 +107,10 @@ def make_schedule(where: Path, fields: dict[str, Any]) -> NoiseSchedule:
     try:
         return NoiseSchedule(**fields)
     except (TypeError, PolicyError) as error:
-        raise PolicyError(f"{where}: schedule {fields} is malformed: {error}") from error
+        raise PolicyError(
+            f"{where}: schedule {fields} is malformed ({error}): it takes num_train_timesteps, "
+            "betas and prediction"
+        ) from error
 
 
 class ForwardPolicy(nn.Module):
@@ -287,10 +290,11 @@ class _Call:
             values = dict(enumerate(values))
         if isinstance(values, Mapping):
             if self._pick not in values:
-                first = json.dumps({self._result: next(iter(values), 0)})
                 raise PolicyError(
-                    f"{self._name}: it returns {len(values)} values ({', '.join(map(str, values))})"
-                    f': say which to take in policy.json, as in "outputs": {first}'
+                    f"{self._name}: it returns {len(values)} values "
+                    f"({', '.join(map(str, values))}): say which "
+                    f'is the {self._result}, in policy.json, "outputs": {{"{self._result}": '
+                    f"{json.dumps(next(iter(values), 0))}}}"
                 )
             returned = values[self._pick]
         if not isinstance(returned, Tensor):
@@ -299,6 +303,7 @@ class _Call:
             )
         if not returned.is_floating_point():
             raise PolicyError(
-                f"{self._name}: its {self._result} is {returned.dtype}: export continuous actions"
+                f"{self._name}: its {self._result} is of type {returned.dtype}, and the contract's "
+                "numbers are not whole: what do they count? Export the continuous actions"
             )
         return returned

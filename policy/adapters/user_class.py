@@ -160,7 +160,10 @@ def _instance(spec: str, found: type, checkpoint: Path | None, seed: int) -> Sin
         inspect.signature(found).bind(**arguments)
     except (TypeError, ValueError) as error:
         call = "Class()" if checkpoint is None else "Class(checkpoint=path)"
-        raise PolicyError(f"--policy {spec}: cannot be made with {call}: {error}") from error
+        raise PolicyError(
+            f"--policy {spec}: cannot be made with {call}: {error}; its only argument is the "
+            "checkpoint of --checkpoint, if that is given"
+        ) from error
     with user_code(f"--policy {spec}: making it failed"):
         policy: object = found(**arguments)
     contract = getattr(policy, "contract", None)
@@ -175,9 +178,12 @@ def _instance(spec: str, found: type, checkpoint: Path | None, seed: int) -> Sin
     lacking += [] if hasattr(policy, "predict") else ["predict"]
     if not isinstance(policy, SingleRatePolicy) or not isinstance(contract, Contract):
         raise PolicyError(
-            f"--policy {spec}: missing or wrong here: {lacking}. A policy needs a member contract "
-            "(a policy.contract.Contract) and predict(image, state, action_history, "
-            "num_diffusion_steps), or torch modules by name; see docs/policy.md"
+            f"--policy {spec}: a policy needs a member contract (a policy.contract.Contract) and "
+            "predict(image, state, action_history, num_diffusion_steps); for the dual-rate mode "
+            "also encode_visual(image) and predict_fast(feature, state, action_history, "
+            "num_diffusion_steps); or torch modules as attributes (visual_encoder and action_head "
+            "or denoiser), or be one with forward(image, state, action_history). Missing or wrong "
+            f"here: {lacking}"
         )
     if isinstance(policy, DualRatePolicy) and contract.feature_dim == 0:
         raise PolicyError(f"--policy {spec}: its contract needs feature_dim, F of encode_visual")

@@ -149,8 +149,9 @@ def require_header(path: Path, header: dict[str, str]) -> None:
     for key in HEADER_KEYS:
         if key not in header:
             raise CheckpointError(
-                f"{path}: no {key!r} in the header {sorted(header)}: load the weights as .pt and "
-                "save them with policy.checkpoints.policy_file.save_checkpoint"
+                f"{path}: no {key!r} in the header (it holds {sorted(header)}), so it was not "
+                "written by this project; load the weights as .pt and save them with "
+                "policy.checkpoints.policy_file.save_checkpoint"
             )
 
 

@@ -103,7 +103,10 @@ def load_checkpoint_with_notes(
     else:
         header, tensors = {}, read_torch(path)
         if "contract" in tensors:
-            raise CheckpointError(f"{path}: holds a contract: save it as .safetensors, or without")
+            raise CheckpointError(
+                f"{path}: holds a contract, which is not read from a torch file: save it as "
+                ".safetensors, or the weights alone"
+            )
     try:
         policy = build_policy(_config_of(header, type(fallback)) if is_ours else fallback)
     except (PolicyError, RecursionError) as error:
@@ -196,12 +199,16 @@ def read_torch(path: Path) -> dict[Any, Any]:
         named = _UNSUPPORTED.search(str(error))
         held = f"a pickle that holds a {named[1]}" if named else "damaged, or no pickle of tensors"
         raise CheckpointError(
-            f"{path} is {held}, and loading that could run any program. Save model.state_dict() "
-            "alone for a network of this project, or torch.jit.trace(model, example) (--policy "
-            "torchscript:FILE), or write a class that builds it (--policy ./file.py:Class)"
+            f"{path} is {held}, and loading that could run any program. Where it was trained save "
+            "model.state_dict() alone, for a network of this project; for another one save "
+            "torch.jit.trace(model, example) (--policy torchscript:FILE), or write a class that "
+            "builds it (--policy ./file.py:Class)"
         ) from error
     except _DAMAGED as error:
         raise CheckpointError(why_unreadable(path, error)) from error
     if not isinstance(loaded, dict):
-        raise CheckpointError(f"{path}: holds a {type(loaded).__name__}: save model.state_dict()")
+        raise CheckpointError(
+            f"{path}: holds a {type(loaded).__name__}, not a dict of weights; "
+            "save model.state_dict()"
+        )
     return loaded

@@ -32,8 +32,10 @@ def find_weights(
         for prefix, state in _behind_prefixes(table, wanted)
     ]
     if not found or "param_groups" in loaded:
-        there = sorted(map(str, loaded))[:8]
-        raise CheckpointError(f"{path}: no weights found in {there}: save model.state_dict()")
+        raise CheckpointError(
+            f"{path}: no weights found; it must hold 'model_state_dict' or 'state_dict', or be a "
+            f"state dict itself, and holds {sorted(map(str, loaded))[:8]}"
+        )
     fitting = [each for each in found if not misfits(each[1], wanted)]
     if not fitting:
         return min((state for _, state in found), key=lambda each: len(misfits(each, wanted))), None

@@ -82,7 +82,7 @@ class FlightData:
                 row = int(backwards[0]) + 1
                 raise DatasetError(f"{self.name}: {name} runs backwards at row {row}")
         for name in ("target", "sent"):
-            if np.abs(getattr(self, name)).max(initial=0.0) > 1.0:
+            if not np.abs(getattr(self, name)).max(initial=0.0) <= 1.0:  # also for NaN
                 raise DatasetError(f"{self.name}: {name} must be sticks in [-1, 1]")
         self._check_state()
 
@@ -128,11 +128,11 @@ def common_terms(flights: Sequence[FlightData]) -> ActionTerms:
     first = flights[0]
     for flight in flights:
         if flight.terms[:2] != first.terms[:2]:
-            one, other = (
-                f"{each.name} by {each.terms.action} (hover thrust {each.terms.hover_thrust:g})"
-                for each in (first, flight)
+            raise DatasetError(
+                f"{first.name} was flown by {first.terms.action} and hovers at a thrust of "
+                f"{first.terms.hover_thrust:g}, {flight.name} by {flight.terms.action} at "
+                f"{flight.terms.hover_thrust:g}: train on one kind at a time"
             )
-            raise DatasetError(f"flown were {one}, {other}: train on one kind at a time")
     tilts_deg = [each.terms.max_tilt_deg for each in flights if each.terms.max_tilt_deg is not None]
     return first.terms._replace(max_tilt_deg=max(tilts_deg, default=None))
 

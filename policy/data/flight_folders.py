@@ -47,9 +47,9 @@ def find_flights(paths: Sequence[Path]) -> list[Path]:
         inside = sorted(meta.parent for meta in path.glob("*/meta.json"))
         flights = [path] if (path / "meta.json").is_file() else inside
         if not flights:
-            there = sorted(entry.name for entry in path.iterdir())[:6]
             raise DatasetError(
-                f"{path}: neither a flight nor a folder of flights; it holds {there}"
+                f"{path}: neither a flight (it has no meta.json) nor a folder of flights; it "
+                f"holds {sorted(entry.name for entry in path.iterdir())[:6]}"
             )
         found += flights
     return list(dict.fromkeys(flight.resolve() for flight in found))
@@ -175,8 +175,8 @@ def _sent(name: str, ticks: pa.Table, terms: ActionTerms) -> FloatArray:
         return sent if _known(sent).any() else vectors(name, ticks, "rc_sticks", ACTION_DIM)
     if "expert" not in ticks.column_names:
         raise DatasetError(
-            f"{name} was flown by rates without an expert, and may hold attitudes: use mavbridge "
-            "demonstrate"
+            f"{name} was flown by rates without an expert: what was sent in it may also be an "
+            "attitude, and the recording does not tell them apart; use mavbridge demonstrate"
         )
     return np.zeros((ticks.num_rows, ACTION_DIM), np.float32)
 
@@ -232,8 +232,10 @@ def _terms(name: str, contract: Mapping[str, Any]) -> ActionTerms:
         )
     if action == "rates" and contract.get("state_frame") != "ned_frd":
         # Recorded actions are in NED and FRD axes in any state frame; sticks have no axes.
-        frame = contract.get("state_frame")
-        raise DatasetError(f"{name}: its state is in {frame}; by rates ned_frd alone is learned")
+        raise DatasetError(
+            f"{name} was flown by rates with its state in {contract.get('state_frame')}: this "
+            "build learns body rates in ned_frd alone"
+        )
     hover, tilt = contract.get("hover_thrust", 0.39), contract.get("max_tilt_deg")
     for number in (hover, 1.0 if tilt is None else tilt):
         if not isinstance(number, int | float) or isinstance(number, bool) or not number > 0:

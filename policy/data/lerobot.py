@@ -62,8 +62,10 @@ def read_dataset(folder: Path, camera_key: str | None = None) -> list[FlightData
         for row in inside:
             part = _rows_of(table, row)
             if part.num_rows != row.length:
-                lacking = f"holds {part.num_rows} rows of it, not {row.length}"
-                raise DatasetError(f"{row.name}: {path} {lacking}: copy the dataset again, whole")
+                raise DatasetError(
+                    f"{row.name}: {path} holds {part.num_rows} rows of it, meta/episodes says "
+                    f"{row.length}: the dataset is incomplete"
+                )
             flights.append(_flight(info, row, part, digests[row.video]))
     return flights
 
@@ -100,7 +102,8 @@ def _read_info(folder: Path, camera_key: str | None) -> _Info:
     version = data.get("codebase_version") if isinstance(data, dict) else None
     if not isinstance(version, str) or not version.startswith("v3."):
         raise DatasetError(
-            f"{folder}: a LeRobot dataset of {version}, not v3: convert it by {_CONVERT}"
+            f"{folder}: a LeRobot dataset of version {version}, this build reads v3: convert one "
+            f"of v2.1 with lerobot itself ({_CONVERT})"
         )
     fps, features = data.get("fps"), data.get("features")
     if not isinstance(fps, int | float) or not 0 < fps < math.inf:
@@ -136,7 +139,10 @@ def _require_vector(
             f"{folder}: {key} has shape {shape}, the policy takes [{len(wanted)}]: {list(wanted)}"
         )
     if (got := names.feature_names(feature)) != list(wanted):
-        raise DatasetError(f"{folder}: {key} is named {got}, and must be {[*wanted]} in this order")
+        raise DatasetError(
+            f"{folder}: {key} is named {got}, the policy takes {list(wanted)} in this order: put "
+            "the columns so, and say so in meta/info.json"
+        )
 
 
 def _choose_camera(

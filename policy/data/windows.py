@@ -91,8 +91,8 @@ def find_windows(
         pace_ms = np.median(gaps_ms) if len(gaps_ms) else np.nan
         raise DatasetError(
             f"none of {len(flights)} flights holds {context_frames + frames} frames with states, "
-            f"{1e3 * frame_dt_s:.0f} ms apart (theirs: {pace_ms:.0f} ms apart): fly longer, or "
-            "choose another frame_dt_s"
+            f"{1e3 * frame_dt_s:.0f} ms apart (theirs are {pace_ms:.0f} ms apart): "
+            "fly longer, or choose another frame_dt_s"
         )
     return Windows(
         frames=every,

@@ -25,8 +25,8 @@ def builtin_config(spec: str, *, image_size: int | None) -> "BuiltinConfig":
     kind, *options = spec.split(":")
     if kind not in BUILTIN_KINDS:
         raise PolicyError(
-            f"--policy {spec} cannot be trained here: use toge[:SIZE][:BACKBONE] or resnet-unet"
-            "[:SIZE]; a world model has a command of its own, train-world-model"
+            f"--policy {spec} cannot be trained here: use toge[:SIZE][:BACKBONE], "
+            "resnet-unet[:SIZE]; a world model has a command of its own, train-world-model"
         )
     size, backbone = parse_builtin(kind, options)
     contract = default_contract(image_size)
@@ -60,8 +60,9 @@ def builtin_checkpoint(request: PolicyRequest) -> Path | None:
     if shipped is not None and shipped.is_file():
         return shipped
     raise PolicyError(
-        f"{request.spec} needs trained weights: give --checkpoint FILE, or for bring-up "
-        "network.allow_untrained=true or --policy scripted"
+        f"{request.spec} needs trained weights: give --checkpoint FILE, or "
+        "network.allow_untrained=true for seeded random ones (timing and bring-up), or fly "
+        "--policy scripted"
     )
 
 
@@ -101,10 +102,11 @@ def _trained(
         contract, schedule = policy.contract, policy.config.schedule
         notes.append(
             warned(
-                f"{checkpoint} holds no contract; was it trained with frame "
+                f"{checkpoint} holds no contract; it is flown with frame "
                 f"{contract.state_frame}, image {contract.image_width}x{contract.image_height}, "
                 f"chunk of {contract.horizon} every {contract.chunk_dt_s:g} s, history of "
-                f"{contract.history_len} every {contract.history_dt_s:g} s, and {schedule}?"
+                f"{contract.history_len} every {contract.history_dt_s:g} s, prediction of the "
+                f"{schedule.prediction}, {schedule.betas} betas: is that how it was trained?"
             )
         )
     return policy, notes

@@ -30,6 +30,7 @@ LEROBOT, ONNX, TORCHSCRIPT = "lerobot", "onnx", "torchscript"
 FORMS = {LEROBOT: "lerobot:DIR", ONNX: "onnx:DIR or onnx:FILE", TORCHSCRIPT: "torchscript:FILE.pt"}
 """Forms of --policy for files of other programs."""
 Engine = tuple[PolicyRunner, tuple[str, ...]]
+_WHEN = {"reset": "when a flight begins", "close": "when it is not needed any more"}
 
 
 def check_request(request: PolicyRequest) -> Contract | None:
@@ -121,8 +122,13 @@ def _settings(
     _require_image_size(policy.contract, request.image_size)
     dual_rate = request.dual_rate and isinstance(policy, DualRatePolicy)
     if request.dual_rate and not dual_rate:
-        told = f"{request.spec} has no fast path (encode_visual and predict_fast)"
-        notes.append(warned(f"{told}: it flies at one rate (--single-rate: as intended)"))
+        notes.append(
+            warned(
+                f"{request.spec} has no fast path (encode_visual and predict_fast), so it "
+                "flies in single-rate mode, the whole network for every action (--single-rate: as "
+                "intended)"
+            )
+        )
     return ExecutionSettings(
         name=request.spec,
         vision_device=request.devices[0],
@@ -139,7 +145,8 @@ def _on_engine(
     if policy.contract.arrays == "numpy":
         if request.engine != "auto":
             raise PolicyError(
-                f"{request.spec} computes in numpy: leave out network.engine={request.engine}"
+                f"{request.spec} computes in numpy, which network.engine={request.engine} cannot "
+                "run: leave it out"
             )
         return make_numpy_runner(policy, settings), ()
     from policy.engines.choose import choose_runner
@@ -222,7 +229,9 @@ def _scripted(
     options: list[str], request: PolicyRequest, now_s: Callable[[], float]
 ) -> ScriptedPolicy:
     if request.checkpoint is not None:
-        raise PolicyError(f"a scripted policy takes no weights: leave out {request.checkpoint}")
+        raise PolicyError(
+            f"scripted policies have no weights: leave out --checkpoint {request.checkpoint}"
+        )
     contract = default_contract(request.image_size)
     if request.starts_in_air and options[-1:] != [IN_AIR]:
         options = [*(options or ["hover"]), IN_AIR]
@@ -235,12 +244,16 @@ def _life_method(policy: SingleRatePolicy, name: str, spec: str) -> Callable[[],
     if method is None:
         return keep_nothing
     if not callable(method):
-        raise PolicyError(f"--policy {spec}: {name} must be a method, and is {method!r}")
+        raise PolicyError(
+            f"--policy {spec}: {name} must be a method without arguments, which is called "
+            f"{_WHEN[name]}; it is {method!r}"
+        )
     try:
         inspect.signature(method).bind()
     except (TypeError, ValueError) as error:
         raise PolicyError(
-            f"--policy {spec}: {name} is called without arguments, and cannot be: {error}"
+            f"--policy {spec}: {name} is called without arguments {_WHEN[name]}, and cannot be: "
+            f"{error}; give its parameters defaults, or give it another name"
         ) from error
     with_torch = policy.contract.arrays == "torch"
 
@@ -260,8 +273,10 @@ def _life_method(policy: SingleRatePolicy, name: str, spec: str) -> Callable[[],
 def _require_flags_of_kind(kind: str, request: PolicyRequest) -> None:
     """Raise PolicyError for inapplicable flags, and for a file of another kind than the spec's."""
     if request.by_rates and kind not in BUILTIN_KINDS:
-        kinds = ", ".join(BUILTIN_KINDS)
-        raise PolicyError(f"--by-rates is for {kinds}; {request.spec} flies by its contract")
+        raise PolicyError(
+            f"--by-rates is for {' and '.join(BUILTIN_KINDS)}, whose sticks are known to the "
+            f"degree: {request.spec} flies by what its contract says"
+        )
     if kind in FORMS:
         path = user_path(request.spec.partition(":")[2])
         sentence = detect(path) if path.is_file() else None
@@ -270,7 +285,8 @@ def _require_flags_of_kind(kind: str, request: PolicyRequest) -> None:
             raise PolicyError(f"--policy {request.spec}: {sentence}")
     elif kind not in SCHEMES and request.contract_file is not None:
         raise PolicyError(
-            f"--policy {request.spec} has a contract of its own: leave out --contract"
+            f"--policy {request.spec} has a contract of its own, and --contract "
+            f"{request.contract_file} is for files and servers that say too little: leave it out"
         )
 
 
@@ -284,8 +300,9 @@ def _require_no_path(spec: str) -> None:
         raise PolicyError(f"--policy {detect(path) or advice}")
     if path.name != spec:
         raise PolicyError(
-            f"--policy {spec}: no such file or folder; download a model of the Hugging Face hub "
-            f"first (hf download {spec} --local-dir DIR), and fly one of LeRobot as lerobot:DIR"
+            f"--policy {spec}: there is no such file or folder; a model of the Hugging Face hub is "
+            f"downloaded first (hf download {spec} --local-dir DIR), and a policy of LeRobot then "
+            "flies as lerobot:DIR"
         )
 
 
@@ -293,5 +310,6 @@ def _require_image_size(contract: Contract, image_size: int | None) -> None:
     height, width = contract.image_height, contract.image_width
     if image_size is not None and (height, width) != (image_size, image_size):
         raise PolicyError(
-            f"network.image_size={image_size}, but the policy takes {height}x{width}: leave it out"
+            f"network.image_size={image_size} contradicts the policy's contract, which takes "
+            f"{height}x{width}: leave the flag out"
         )

@@ -73,7 +73,8 @@ class NoiseSchedule:
         total = self.num_train_timesteps
         if type(count) is not int or not 1 <= count <= total:
             raise PolicyError(
-                f"num_diffusion_steps must be an integer in 1..{total}, got {count!r}"
+                f"num_diffusion_steps must be an integer in 1..{total} (the schedule that the "
+                f"policy was trained on), got {count!r}; 10 is a good start"
             )
         return _ddim_steps(self, count)
 

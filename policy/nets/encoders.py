@@ -19,8 +19,11 @@ class StateEncoder(nn.Module):
         is_plain = len(contract.cameras) == 1 and contract.observation_steps == 1
         if not is_plain or contract.state_extras or contract.is_depth:
             raise ContractError(
-                "networks of this project take the newest image of one camera in colour, the "
-                "newest state and no extras: use a policy class of your own"
+                "the networks of this project take the newest image of one camera in colour and "
+                f"the newest state; the contract asks for {contract.image_channels} of cameras "
+                f"{list(contract.cameras)}, "
+                f"{contract.observation_steps} observations and extras "
+                f"{list(contract.state_extras)}: use a policy class of your own"
             )
         scale = egocentric_scale(contract)
         self.mlp = nn.Sequential(nn.Linear(len(scale), dim), nn.SiLU(), nn.Linear(dim, dim))

@@ -99,7 +99,10 @@ class UNet1d(nn.Module):
         super().__init__()
         factor = 2 ** (len(widths) - 1)
         if horizon % factor:
-            raise PolicyError(f"horizon must be a multiple of {factor}, got {horizon}")
+            raise PolicyError(
+                f"a horizon of {horizon} does not suit {len(widths)} U-Net levels; "
+                f"use a multiple of {factor}"
+            )
         self.down, self.downsample = nn.ModuleList(), nn.ModuleList()
         self.up, self.upsample = nn.ModuleList(), nn.ModuleList()
         channels = ACTION_DIM

@@ -58,8 +58,10 @@ class WorldModelConfig:
             if not isinstance(value, int) or not low <= value <= high:
                 raise PolicyError(f"{name} must be an integer in {low}..{high}, got {value!r}")
         if self.image_size % (FACTOR * self.patch):
-            wanted = f"a multiple of {FACTOR * self.patch}"
-            raise PolicyError(f"image_size must be {wanted}, got {self.image_size}")
+            raise PolicyError(
+                f"image_size must be a multiple of {FACTOR * self.patch} ({FACTOR} pixels a "
+                f"latent, {self.patch} latents a token), got {self.image_size}"
+            )
         if self.dynamics_width % HEAD_DIM:
             raise PolicyError(f"dynamics_width must be a multiple of {HEAD_DIM}")
         if len(self.autoencoder_widths) != 3 or min(self.autoencoder_widths) < 1:

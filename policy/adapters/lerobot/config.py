@@ -149,10 +149,15 @@ def read_config(folder: Path) -> tuple[Config, list[str]]:
     features = _features(entries)
     config: Config
     config = _act(entries, features) if kind == "act" else _diffusion(entries, features)
-    if not (unknown := sorted(set(entries.data) - entries.read - _WITHOUT_EFFECT)):
-        return config, []
-    told = f"{path} has unknown entries, which may change the actions: {', '.join(unknown)}"
-    return config, [warned(told)]
+    notes: list[str] = []
+    if unknown := sorted(set(entries.data) - entries.read - _WITHOUT_EFFECT):
+        notes.append(
+            warned(
+                f"{path} has entries that this build does not know: {', '.join(unknown)}. If "
+                "they change what the policy computes, it flies wrongly"
+            )
+        )
+    return config, notes
 
 
 def read_json(path: Path) -> dict[str, Any]:
@@ -196,7 +201,8 @@ def _diffusion(entries: "_Entries", features: Features) -> DiffusionConfig:
     )
     if config.predicted % 2 ** len(config.down_dims) or config.horizon < 1:
         raise CheckpointError(
-            f"{entries.path}: horizon {config.predicted} does not suit down_dims or n_obs_steps"
+            f"{entries.path}: a horizon of {config.predicted} does not suit "
+            f"{len(config.down_dims)} down_dims and {config.n_obs_steps} n_obs_steps"
         )
     return config
 
@@ -231,13 +237,15 @@ def _features(entries: "_Entries") -> Features:
     images = {key: shape for key, (kind, shape) in kinds.items() if kind == "VISUAL"}
     shapes = sorted(set(images.values()))
     if len(shapes) != 1 or len(shapes[0]) != 3 or shapes[0][0] != 3:
-        wanted = "one shape [3, height, width]"
-        raise CheckpointError(f"{entries.path}: images must be of {wanted}, got {images}")
+        raise CheckpointError(
+            f"{entries.path}: images must be of one shape [3, height, width], got {images}"
+        )
     state = kinds.get(STATE_KEY, ("", ()))[1]
     action = _feature(entries.path, ACTION_KEY, outputs.get(ACTION_KEY))[1]
     if action != (ACTION_DIM,):
         raise CheckpointError(
-            f"{entries.path}: its action has the shape {list(action)}: train it on {ACTION_DIM}"
+            f"{entries.path}: its action has the shape {list(action)}, but {ACTION_DIM} numbers "
+            "fly a multirotor: train it on four (sticks, rates, attitude or velocity)"
         )
     modes = entries.get("normalization_mapping", dict)
     return Features(
@@ -289,7 +297,8 @@ class _Entries:
             return None
         if value is None:
             raise CheckpointError(
-                f"{self.path}: no entry {name!r}, and LeRobot's default has changed: add its value"
+                f"{self.path}: no entry {name!r}, and its default differs between versions of "
+                "LeRobot: add what it was trained with, or save the policy again with LeRobot"
             )
         if get_origin(kind) is Literal:
             wanted, is_right = f"one of {', '.join(map(str, kinds))}", value in kinds

@@ -223,7 +223,10 @@ class DdimSchedule:
         """
         total = self._config.num_train_timesteps
         if not 1 <= count <= total:
-            raise PolicyError(f"num_diffusion_steps must be in 1..{total}, got {count!r}")
+            raise PolicyError(
+                f"num_diffusion_steps must be an integer in 1..{total}, the steps of its training; "
+                f"got {count!r}"
+            )
         spacing, signal, noise = total // count, self._signal, self._noise
         return tuple(
             DdimStep(

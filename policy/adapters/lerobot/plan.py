@@ -83,13 +83,18 @@ class _Statistics:
         """Return the transformation of one feature; None: unchanged, and if unasked a note."""
         mode, own = self.modes.get(kind, "IDENTITY"), self.arrays.get(key, {})
         if mode not in MODES:
-            raise CheckpointError(f"{self.path}: {key} has mode {mode!r}; known: {[*MODES]}")
+            raise CheckpointError(
+                f"{self.path}: normalises {key} by {mode!r}; supported are {', '.join(MODES)}"
+            )
         if mode == "IDENTITY" or not own:
             if self.asked.get(kind, "IDENTITY") != "IDENTITY":
                 notes.append(warned(f"{self.path} holds no statistics of {key}: not normalised"))
             return None
         if missing := [name for name in MODES[mode] if name not in own]:
-            raise CheckpointError(f"{self.path}: {key} is normalised by {mode} without {missing}")
+            raise CheckpointError(
+                f"{self.path}: {key} is normalised by {mode}, but its statistics lack {missing}; "
+                f"there are {sorted(own)}"
+            )
         shape = (3, 1, 1) if kind == "VISUAL" else (-1,)
         low, high = (own[name].astype(np.float32).reshape(shape) for name in MODES[mode])
         if not (np.isfinite(low).all() and np.isfinite(high).all()):
@@ -112,8 +117,10 @@ def read_normalisation(folder: Path, features: Features) -> tuple[Normalisation,
     notes: list[str] = []
     state = inputs.affine(STATE_KEY, "STATE", notes) if features.state_dim else None
     if state is not None and (constant := np.flatnonzero(state.divisor < _CONSTANT).tolist()):
-        told = f"numbers {constant} (from 0) of {STATE_KEY} never changed in training"
-        notes.append(warned(f"{told}: any other value is divided by almost nothing"))
+        told = f"numbers {constant} (from 0) of {STATE_KEY} never changed in the training data"
+        notes.append(
+            warned(f"{told}: as in LeRobot, any other value is divided by almost 0 and dominates")
+        )
     normalisation = Normalisation(
         images={key: inputs.affine(key, "VISUAL", notes) for key in features.image_keys},
         state=state,
@@ -144,7 +151,8 @@ def _processor(
             found = replace(found, modes=modes, epsilon=epsilon, arrays=kept)
         elif name not in _HARMLESS:
             raise CheckpointError(
-                f"{path}: the step {name!r} is not supported: serve it for --policy ws://HOST:PORT"
+                f"{path}: the step {name!r} is not supported: serve the policy from its own "
+                "environment, and fly --policy ws://HOST:PORT"
             )
     return found, renamed
 
@@ -207,8 +215,9 @@ def read_plan(folder: Path, contract_file: Path | None) -> Plan:
     path = contract_file or folder / CONTRACT_FILE
     if not path.is_file():
         raise ContractError(
-            f"{path}: no such file says rate, state and action: draft one by mavbridge contract "
-            f"{folder}, or give --contract FILE.toml"
+            f"{path}: no such file. A LeRobot folder does not say at which rate it was trained, "
+            "nor what its state and action mean: mavbridge contract "
+            f"{folder} writes a first draft there, or name a file by --contract FILE.toml"
         )
     interface = _interface(path, config)
     _require_state(path, interface, config.features)
@@ -246,8 +255,8 @@ def _require_state(path: Path, interface: Interface, features: Features) -> None
     names = interface.state_names or interface.contract.state_names
     if features.state_dim is not None and interface.state_dim != features.state_dim:
         raise ContractError(
-            f"{path}: the policy takes a state of {features.state_dim} numbers, not these "
-            f"{len(names)}: {', '.join(names)}. Name its numbers in [state] names"
+            f"{path}: the policy takes a state of {features.state_dim} numbers, and these are "
+            f"{len(names)}: {', '.join(names)}. Name its numbers in their order: [state] names"
         )
     if features.state_dim is not None and interface.state_key != STATE_KEY:
         raise ContractError(
@@ -265,6 +274,7 @@ def _policy_cameras(
     if sorted(keys) != sorted(known):
         raise ContractError(
             f"{path}: the policy's images are {list(known)}, the contract's are {keys}; name all "
-            'in [contract] cameras = [...], and the key of each in [images] NAME = "KEY"'
+            'cameras in [contract] cameras = [...], and in [images] NAME = "KEY" the policy\'s '
+            "key of each"
         )
     return tuple(known.index(key) for key in keys)

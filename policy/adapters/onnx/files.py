@@ -94,8 +94,10 @@ def read_graph(path: Path) -> "ov.Model":
     try:
         model: ov.Model = reader.convert(loaded)
     except failures as error:
-        told = f"{path} holds what OpenVINO cannot run ({last_line(error)})"
-        raise CheckpointError(f"{told}: use operators of the ONNX standard alone") from error
+        raise CheckpointError(
+            f"{path} holds what OpenVINO cannot run ({last_line(error)}): export it with operators "
+            "of the ONNX standard alone, and without errors of onnx.checker"
+        ) from error
     if not model.outputs:
         raise CheckpointError(why_unreadable(path, ValueError("there is no graph in it"), "ONNX"))
     return model

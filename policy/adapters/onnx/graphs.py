@@ -163,8 +163,9 @@ class GraphFile:
                 takes_bytes = True
             elif kind not in _FLOATS and not (role == "timestep" and kind in ("i32", "i64")):
                 raise CheckpointError(
-                    f"{self._path}: input {sorted(port.get_names())} is of type {kind}: export it "
-                    "with a float type (an image may be uint8, 0 to 255)"
+                    f"{self._path}: input {sorted(port.get_names())} is of type {kind}, and the "
+                    f"contract's {role} is made of floating-point numbers (an image may be uint8, "
+                    "0 to 255): export the graph with float inputs"
                 )
         for port in model.outputs:
             kind = port.get_element_type().get_type_name()
@@ -194,7 +195,8 @@ class GraphFile:
         kind = chosen[0].get_element_type().get_type_name()
         if kind not in _FLOATS:
             raise CheckpointError(
-                f"{self._path}: its {result} is of type {kind}: export the continuous actions"
+                f"{self._path}: its {result} is of type {kind}, and the contract's numbers "
+                "are not whole: what do they count? Export the continuous actions"
             )
         return chosen[0]
 

@@ -124,7 +124,10 @@ class OnnxGraphs:
 def _with_feature(contract: Contract, encoder: GraphFile, path: Path) -> Contract:
     dim = math.prod(encoder.output_shape[1:])
     if contract.feature_dim not in (0, dim):
-        raise PolicyError(f"{path} makes {dim} features, and feature_dim is {contract.feature_dim}")
+        raise PolicyError(
+            f"{path} makes {dim} numbers of an image, and the contract says feature_dim "
+            f"{contract.feature_dim}"
+        )
     return replace(contract, feature_dim=dim)
 
 

@@ -176,7 +176,10 @@ class ServerLink:
         with suppress(TimeoutError):
             async with asyncio.timeout(0):
                 await connection.recv()
-                raise PolicyError(f"{self._url} sent what nobody asked for; connecting again")
+                raise PolicyError(
+                    f"{self._url} has sent a message that nobody asked for, so its answers cannot "
+                    "be told apart; connecting again"
+                )
 
     def _fail(self, reason: str) -> None:
         self._problem = reason

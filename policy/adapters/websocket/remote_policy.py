@@ -109,5 +109,8 @@ class RemotePolicy:
             actions = actions[0]
         wanted = (self.contract.horizon, ACTION_DIM)
         if actions.shape != wanted:
-            raise MessageError(f"actions {list(actions.shape)}, the contract's are {list(wanted)}")
+            raise MessageError(
+                f"actions {list(actions.shape)} where the contract has [horizon, 4] = "
+                f"{list(wanted)}"
+            )
         return self._interface.to_actions(actions.astype(np.float32))[None]

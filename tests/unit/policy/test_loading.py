@@ -169,7 +169,7 @@ def test_weights_that_learned_from_rates_are_flown_by_them(small_toge, checkpoin
     ("changes", "message"),
     [
         ({"checkpoint": Path("weights.bin")}, "not a checkpoint"),
-        ({"image_size": 64}, "network.image_size=64, but the policy takes 32x32"),
+        ({"image_size": 64}, "network.image_size=64 contradicts"),
         ({"spec": "toge:medium", "checkpoint": None}, "network.allow_untrained"),
     ],
 )

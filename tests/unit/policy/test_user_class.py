@@ -241,11 +241,11 @@ def test_a_failure_to_close_is_said_and_hides_no_other(mine: str) -> None:
 @pytest.mark.parametrize(
     ("name", "changes", "message"),
     [
-        ("NoContract", {}, r"missing or wrong here: \['contract'\]"),
-        ("NoPredict", {}, r"missing or wrong here: \['predict'\]"),
+        ("NoContract", {}, r"Missing or wrong here: \['contract'\]"),
+        ("NoPredict", {}, r"Missing or wrong here: \['predict'\]"),
         ("NoFeatureDim", {}, "needs feature_dim"),
-        ("ResetIsNoMethod", {}, "reset must be a method, and is True"),
-        ("ResetNeedsMore", {}, "cannot be: missing a required argument: 'seed'"),
+        ("ResetIsNoMethod", {}, "reset must be a method without arguments.*it is True"),
+        ("ResetNeedsMore", {}, "cannot be: missing a required argument: 'seed'; give its"),
         ("ResetFails", {}, r"failed to reset: RuntimeError: no memory to clear \(.*mine.py:"),
         ("NeedsMore", {}, r"cannot be made with Class\(\)"),
         ("Single", {"checkpoint": Path("a.pt")}, r"Class\(checkpoint=path\)"),

@@ -55,8 +55,8 @@ def test_the_contract_has_what_the_files_say(folder, tmp_path_factory):
     [
         ({"type": "pi0"}, "type must be one of act, diffusion, got 'pi0'"),
         ({"prediction_type": "v_prediction"}, "prediction_type must be one of epsilon, sample"),
-        ({"use_group_norm": None}, "no entry 'use_group_norm', and LeRobot's default has changed"),
-        ({"down_dims": [16, 32, 64, 128]}, "horizon 8 does not suit"),
+        ({"use_group_norm": None}, "no entry 'use_group_norm', and its default differs"),
+        ({"down_dims": [16, 32, 64, 128]}, "a horizon of 8 does not suit"),
         ({"crop_shape": [65, 65]}, "cannot crop"),
         ({"kernel_size": True}, "kernel_size must be a positive integer"),
         ({"clip_sample": 1}, "clip_sample must be true or false"),
@@ -136,9 +136,9 @@ def test_a_missing_file_is_named(folder, file, said):
         ("image_height = 224", "image_height = 224 contradicts .* 64"),
         ("horizon = 16", "horizon = 16 contradicts .* 7"),
         ('cameras = ["front", "down"]', r"policy's images are \['observation.images.front'\]"),
-        ('[state]\nnames = ["vx_mps", "qw"]', "takes a state of 13 numbers, not these 2"),
+        ('[state]\nnames = ["vx_mps", "qw"]', "takes a state of 13 numbers, and these are 2"),
         ('[state]\nkey = "state"', "LeRobot's is 'observation.state'"),
-        ('[images]\nfront = "observation.images.nose"', "name all in"),
+        ('[images]\nfront = "observation.images.nose"', "name all cameras"),
     ],
 )
 def test_a_contract_that_contradicts_the_policy_is_refused(folder, contract, said):

@@ -199,7 +199,7 @@ def test_a_failed_flight_is_nothing_to_imitate(tmp_path, meta, failure):
     ("contract", "says"),
     [
         ({"action": "velocity"}, "was flown by velocity: this build learns from sticks and body"),
-        ({"action": "rates", "state_frame": "enu_flu"}, "by rates ned_frd alone is learned"),
+        ({"action": "rates", "state_frame": "enu_flu"}, "learns body rates in ned_frd alone"),
         ({"action": "rates", "hover_thrust": 0.0}, "0.0 in its contract is no number above 0"),
         ({"action": "rates"}, "without an expert"),
     ],
