@@ -12,11 +12,15 @@ from types import NoneType
 from typing import Any, Literal, TypeVar, get_args, get_origin, get_type_hints
 
 from policy import files
-from policy.contract import ACTION_DIM
+from policy.contract import ACTION_DIM, EXTRA_NAMES
 from policy.errors import CheckpointError, warned
 
 CONFIG_FILE = "config.json"
 STATE_KEY, ACTION_KEY = "observation.state", "action"
+ENVIRONMENT_KEY = "observation.environment_state"
+"""LeRobot's input for known facts of the world; here the vector to the flight's goal."""
+NO_IMAGE_PX = 16
+"""Side of the blank image of a policy without a camera [px]: the smallest in a contract."""
 BackboneName = Literal["resnet18", "resnet34", "resnet50", "resnet101", "resnet152"]
 Size = tuple[int, int]
 """Height and width."""
@@ -38,11 +42,13 @@ class Features:
     """Inputs and outputs of a policy, under LeRobot's names."""
 
     image_keys: tuple[str, ...]
-    """Cameras in the order of their features."""
+    """Cameras in the order of their features; empty for a policy without images."""
     image_height: int
     image_width: int
     state_dim: int | None
     """Width of observation.state; None if the policy takes none."""
+    takes_goal: bool
+    """True if observation.environment_state is the goal vector, ``policy.contract.EXTRA_NAMES``."""
     modes: Mapping[str, str]
     """Normalisation of STATE, VISUAL and ACTION; see ``plan.MODES``."""
 
@@ -118,8 +124,8 @@ class DiffusionConfig:
 
     @property
     def feature_dim(self) -> int:
-        """Size of an image's feature: two coordinates per keypoint."""
-        return 2 * self.spatial_softmax_num_keypoints
+        """Size of an image's feature: two coordinates per keypoint; 1, a zero, without a camera."""
+        return 2 * self.spatial_softmax_num_keypoints if self.features.image_keys else 1
 
     @property
     def encoded_size(self) -> Size:
@@ -181,8 +187,13 @@ def _where_to_look(folder: Path) -> str:
 
 
 def _act(entries: "_Entries", features: Features) -> ActConfig:
-    entries.get("n_obs_steps", Literal[1])
-    entries.get("replace_final_stride_with_dilation", Literal[False])
+    entries.only("n_obs_steps", 1)
+    if features.takes_goal or not features.image_keys:
+        raise CheckpointError(
+            f"{entries.path}: of LeRobot's ACT those with cameras and without {ENVIRONMENT_KEY} "
+            "fly from their files; run this one behind --policy ws://HOST:PORT"
+        )
+    entries.only("replace_final_stride_with_dilation", False)
     return entries.fill(ActConfig, features=features)
 
 
@@ -217,6 +228,8 @@ def _resize_and_crop(entries: "_Entries", features: Features) -> tuple[Size | No
     if resize is not None:  # LeRobot then derives the crop from the ratio and ignores crop_shape
         crop = None if ratio == 1.0 else (int(resize[0] * ratio), int(resize[1] * ratio))
     before = resize or (features.image_height, features.image_width)
+    if not features.image_keys:
+        return None, None
     if crop is not None and (crop[0] > before[0] or crop[1] > before[1]):
         raise CheckpointError(f"{entries.path}: cannot crop images of {before} to {crop}")
     return resize, crop
@@ -225,17 +238,23 @@ def _resize_and_crop(entries: "_Entries", features: Features) -> tuple[Size | No
 def _features(entries: "_Entries") -> Features:
     """Return cameras, state and action.
 
-    LeRobot's ACT and DiffusionPolicy use no STATE feature except observation.state.
+    LeRobot's ACT and DiffusionPolicy use no STATE feature except observation.state, and no ENV
+    feature except observation.environment_state.
     """
     inputs, outputs = entries.get("input_features", dict), entries.get("output_features", dict)
     kinds = {key: _feature(entries.path, key, value) for key, value in inputs.items()}
-    if others := [key for key, (kind, _) in kinds.items() if kind not in ("STATE", "VISUAL")]:
+    goal = (len(EXTRA_NAMES["goal"]),)
+    takes_goal = kinds.pop(ENVIRONMENT_KEY, None) == ("ENV", goal)
+    others = [key for key in inputs if key not in kinds and not takes_goal]
+    if others := others + [k for k, (kind, _) in kinds.items() if kind not in ("STATE", "VISUAL")]:
         raise CheckpointError(
-            f"{entries.path}: takes {others}, which no vehicle measures; supported are images and "
-            f"{STATE_KEY}: run this one behind --policy ws://HOST:PORT"
+            f"{entries.path}: takes {others}, which no vehicle measures; supported are images, "
+            f"{STATE_KEY}, and {ENVIRONMENT_KEY} of {goal[0]} numbers: {EXTRA_NAMES['goal']}"
         )
     images = {key: shape for key, (kind, shape) in kinds.items() if kind == "VISUAL"}
     shapes = sorted(set(images.values()))
+    if not images and takes_goal:
+        shapes = [(3, NO_IMAGE_PX, NO_IMAGE_PX)]
     if len(shapes) != 1 or len(shapes[0]) != 3 or shapes[0][0] != 3:
         raise CheckpointError(
             f"{entries.path}: images must be of one shape [3, height, width], got {images}"
@@ -253,6 +272,7 @@ def _features(entries: "_Entries") -> Features:
         image_height=shapes[0][1],
         image_width=shapes[0][2],
         state_dim=state[0] if state else None,
+        takes_goal=takes_goal,
         modes={str(kind): str(mode) for kind, mode in modes.items()},
     )
 
@@ -301,13 +321,21 @@ class _Entries:
                 "LeRobot: add what it was trained with, or save the policy again with LeRobot"
             )
         if get_origin(kind) is Literal:
-            wanted, is_right = f"one of {', '.join(map(str, kinds))}", value in kinds
+            wanted, is_right = f"one of {', '.join(kinds)}", value in kinds
         else:
             wanted, check = _KINDS[kind if kind in _KINDS else kinds[0]]
             is_right = check(value)
         if not is_right:
             raise CheckpointError(f"{self.path}: {name} must be {wanted}, got {value!r}")
         return tuple(value) if isinstance(value, list) else value
+
+    def only(self, name: str, wanted: object) -> None:
+        """Raise PolicyError unless the entry has the only supported value."""
+        self.read.add(name)
+        if (value := self.data.get(name)) != wanted:
+            raise CheckpointError(
+                f"{self.path}: {name} must be {wanted!r}, which alone is supported, got {value!r}"
+            )
 
     def fill(self, config: type[C], **given: Any) -> C:
         """Return a config filled from the entries with its fields' names, except the given ones."""

@@ -17,13 +17,14 @@ import numpy as np
 from policy.adapters.interface import CONTRACT_FILE, Interface, read_interface
 from policy.adapters.lerobot.config import (
     ACTION_KEY,
+    ENVIRONMENT_KEY,
     STATE_KEY,
     Config,
     Features,
     read_config,
     read_json,
 )
-from policy.contract import Contract, FloatArray
+from policy.contract import EXTRA_NAMES, Contract, FloatArray
 from policy.errors import CheckpointError, ContractError, warned
 from policy.files import open_safetensors
 
@@ -63,6 +64,8 @@ class Normalisation:
 
     images: Mapping[str, Affine | None]
     state: Affine | None
+    goal: Affine | None
+    """Normalisation of observation.environment_state."""
     action: Affine | None
     renamed: Mapping[str, str]
     """Name of an input in the data -> its name in config.json."""
@@ -124,6 +127,7 @@ def read_normalisation(folder: Path, features: Features) -> tuple[Normalisation,
     normalisation = Normalisation(
         images={key: inputs.affine(key, "VISUAL", notes) for key in features.image_keys},
         state=state,
+        goal=inputs.affine(ENVIRONMENT_KEY, "ENV", notes) if features.takes_goal else None,
         action=outputs.affine(ACTION_KEY, "ACTION", notes),
         renamed=renamed,
     )
@@ -167,7 +171,7 @@ def _in_weights(folder: Path, features: Features) -> _Statistics:
             f"{folder}: there is no {PREPROCESSOR}, and {WEIGHTS_FILE} holds no statistics "
             "(normalize_inputs.buffer_*): copy the whole folder that LeRobot wrote"
         )
-    names = (*features.image_keys, STATE_KEY)
+    names = (*features.image_keys, STATE_KEY, ENVIRONMENT_KEY)
     keys = {key: sides[0] + key.replace(".", "_") for key in names}
     keys[ACTION_KEY] = sides[1] + ACTION_KEY
     arrays = {key: found[name] for key, name in keys.items() if name in found}
@@ -248,6 +252,11 @@ def _interface(path: Path, config: Config) -> Interface:
     }
     interface = read_interface(path, derived)
     contract: Contract = interface.contract
+    if config.features.takes_goal and "goal" not in contract.state_extras:
+        contract = replace(contract, state_extras=(*contract.state_extras, "goal"))
+    if config.features.takes_goal and not interface.state_names:
+        own = tuple(name for name in contract.state_names if name not in EXTRA_NAMES["goal"])
+        interface = replace(interface, contract=contract, state_names=own)
     return replace(interface, contract=replace(contract, observation_dt_s=contract.chunk_dt_s))
 
 
@@ -268,6 +277,8 @@ def _policy_cameras(
     path: Path, interface: Interface, features: Features, normalisation: Normalisation
 ) -> tuple[int, ...]:
     known = features.image_keys
+    if not known:
+        return ()
     keys = [normalisation.renamed.get(key, key) for key in interface.camera_keys]
     if not interface.image_keys and len(known) == len(keys) == 1:
         return (0,)  # one camera on both sides: names do not matter

@@ -10,7 +10,7 @@ from policy.adapters.lerobot.config import ActConfig, DiffusionConfig
 from policy.adapters.lerobot.diffusion import DdimSchedule, Diffusion
 from policy.adapters.lerobot.plan import WEIGHTS_FILE, Affine, Plan
 from policy.checkpoints.tensors import read_tensors, require_finite, require_fit
-from policy.contract import Contract
+from policy.contract import EXTRA_NAMES, Contract
 
 _STATISTICS = ("normalize_inputs.", "normalize_targets.", "unnormalize_outputs.")
 """Prefixes of the statistics in checkpoints before 0.4; they are read separately."""
@@ -19,15 +19,14 @@ _STATISTICS = ("normalize_inputs.", "normalize_targets.", "unnormalize_outputs."
 class Normaliser(nn.Module):
     """``Affine`` and its inverse on tensors; the identity without statistics."""
 
-    shift: Tensor
-    divisor: Tensor
-    span: Tensor
-
     def __init__(self, affine: Affine | None) -> None:
         super().__init__()
         self.affine = affine
-        for name in ("shift", "divisor", "span") if affine is not None else ():
-            array = torch.from_numpy(getattr(affine, name))
+        self.shift: Tensor
+        self.divisor: Tensor
+        self.span: Tensor
+        for name in ("shift", "divisor", "span"):
+            array = torch.zeros(1) if affine is None else torch.from_numpy(getattr(affine, name))
             self.register_buffer(name, array, persistent=False)
 
     def forward(self, value: Tensor) -> Tensor:
@@ -64,7 +63,10 @@ class LeRobotPolicy(nn.Module):
         self._action = Normaliser(normalisation.action)
 
     def encode_visual(self, image: Tensor, camera: int = 0) -> Tensor:
-        """Encode an image [B, 3, H, W] of one of the contract's cameras -> feature [B, F]."""
+        """Encode an image [B, 3, H, W] of one of the contract's cameras -> feature [B,
+        feature_dim]; zeros for a policy without a camera."""
+        if not self._policy_cameras:
+            return image.new_zeros(image.shape[0], self.contract.feature_dim)
         own = self._policy_cameras[camera]
         return self.net.encode(self._images[own](image), own)
 
@@ -119,6 +121,24 @@ class LeRobotDiffusion(LeRobotPolicy):
     def __init__(self, plan: Plan, config: DiffusionConfig) -> None:
         super().__init__(plan)
         self.net = Diffusion(config)
+        goal = EXTRA_NAMES["goal"] if config.features.takes_goal else ()
+        self._goal_columns = [self.contract.state_names.index(name) for name in goal]
+        self._goal = Normaliser(plan.normalisation.goal)
+
+    def _network_inputs(self, feature: Tensor, state: Tensor) -> tuple[Tensor, Tensor]:
+        """Return features of cameras and goal [B, T, 1, X], and normalised states [B, T, S].
+
+        In LeRobot's order: images, then the environment (``_prepare_global_conditioning``).
+        """
+        if not self._goal_columns:
+            return super()._network_inputs(feature, state)
+        states = state.reshape(state.shape[0], self.contract.observation_steps, -1)
+        parts = [self._goal(states[..., self._goal_columns])]
+        own = self._state(self._interface.to_state(states))
+        if self._policy_cameras:
+            by_camera, own = super()._network_inputs(feature, state)
+            parts.insert(0, by_camera.flatten(2))
+        return torch.cat(parts, dim=-1).unsqueeze(2), own
 
     @property
     def schedule(self) -> DdimSchedule:
