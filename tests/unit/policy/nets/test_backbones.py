@@ -19,6 +19,15 @@ from policy.nets.names import BACKBONE_NAMES, BackboneName
             },
         ),
         (
+            *("convnext_tiny", 28_589_128, 768),
+            {
+                "features.0.1.weight": (96,),
+                "features.1.0.layer_scale": (96, 1, 1),
+                "features.7.2.block.5.weight": (768, 3072),
+                "classifier.0.weight": (768,),
+            },
+        ),
+        (
             *("resnet18", 11_689_512, 512),
             {"layer2.0.downsample.0.weight": (128, 64, 1, 1), "layer4.1.bn2.running_mean": (512,)},
         ),
