@@ -28,10 +28,10 @@ from mavbridge.camera.open import open_camera
 from mavbridge.config.policy import PolicyConfig
 from mavbridge.core.clock import NS_PER_MS, NS_PER_S, MonotonicClock
 from mavbridge.core.histogram import Histogram
-from policy.checkpoints.policy_file import build_policy, load_checkpoint
+from policy.checkpoints.policy_file import load_checkpoint
 from policy.contract import ACTION_DIM
 from policy.loading.builtin import SHIPPED
-from policy.nets.toge import Toge, TogeConfig
+from policy.nets.toge import Toge, TogeConfig, build_policy
 from policy.preprocess import image_to_input
 
 STREAMS = (
@@ -59,7 +59,7 @@ def eager_toge(policy: PolicyConfig) -> Toge:
     if not isinstance(net, Toge):
         raise TypeError(f"not a Toge: {type(net).__name__}")
     net.eval()
-    net.seed_noise(policy.seed)
+    net.head.seed_noise(policy.seed)
     return net
 
 

@@ -5,7 +5,7 @@ carries its ``Contract`` in the header, and the bridge rejects a contract that i
 """
 
 import json
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, field, fields
 from typing import Any, Literal, get_args
 
@@ -378,6 +378,11 @@ class Contract:
                 f"contract version {version!r} is not supported; this build reads versions "
                 f"{OLDEST_VERSION} to {CONTRACT_VERSION}: export it again, or update mavbridge"
             )
+        return cls.from_fields(data)
+
+    @classmethod
+    def from_fields(cls, data: Mapping[str, Any]) -> "Contract":
+        """Return the contract with these fields; raise ContractError for unknown ones."""
         known = {each.name for each in fields(cls) if each.init}
         if unknown := sorted(set(data) - known):
             raise ContractError(f"unknown contract keys {unknown}; there are {sorted(known)}")

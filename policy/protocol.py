@@ -122,8 +122,6 @@ class PolicyRunner:
 
         A single image is returned unchanged.
         """
-        rows = [row[0] if len(row) == 1 else self._side_by_side(row) for row in encoded]
+        combine = np.concatenate if self.dual_rate else np.stack
+        rows = [row[0] if len(row) == 1 else combine(row, axis=1) for row in encoded]
         return rows[0] if len(rows) == 1 else np.stack(rows, axis=1)
-
-    def _side_by_side(self, row: Sequence[FloatArray]) -> FloatArray:
-        return np.concatenate(row, axis=1) if self.dual_rate else np.stack(row, axis=1)

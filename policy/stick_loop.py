@@ -13,14 +13,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from policy.contract import (
-    ACTION_DIM,
-    QUATERNION,
-    RATE,
-    VELOCITY,
-    Contract,
-    FloatArray,
-)
+from policy.contract import ACTION_DIM, QUATERNION, RATE, VELOCITY, Contract, FloatArray
 from policy.errors import ContractError
 from policy.protocol import PolicyRunner
 from policy.rotation import Array, Quaternion, Vector, conjugate, matrix_columns, multiply, rotate

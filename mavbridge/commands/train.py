@@ -22,8 +22,9 @@ from policy.data.flight_folders import find_flights, leave_out_failed, read_flig
 from policy.data.lerobot import is_lerobot, read_dataset
 from policy.engines.runner import require_devices
 from policy.loading.builtin import builtin_config
+from policy.nets.toge import BuiltinConfig
 from policy.stick_loop import rates_contract
-from policy.training.policy_run import Check, Network, train_policy
+from policy.training.policy_run import Check, train_policy
 from policy.training.report import Hooks, TrainingProgress, TrainResult
 from policy.training.run_folder import TrainingStoppedError
 from policy.training.settings import RunSettings, TrainSettings, WorldModelSettings
@@ -90,8 +91,8 @@ def share_of_gates(checkpoint: Path, settings: TrainSettings) -> float:
 
 
 def fit_to_flights(
-    network: Network, flights: Sequence[FlightData], settings: TrainSettings
-) -> Network:
+    network: BuiltinConfig, flights: Sequence[FlightData], settings: TrainSettings
+) -> BuiltinConfig:
     """Return the network with the flights' frame and actions, and the settings' inputs."""
     terms = common_terms(flights)
     contract = replace(

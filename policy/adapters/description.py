@@ -1,18 +1,6 @@
-"""Description of an exported policy, beside its graphs or inside them.
+"""Description of an exported policy, beside its graphs or inside them: docs/policy_exported.md.
 
-    {
-      "contract": {"action": "sticks", "chunk_dt_s": 0.05},
-      "schedule": {"num_train_timesteps": 100, "betas": "squared_cosine", "prediction": "sample"},
-      "inputs": {"state": "obs_vector"},
-      "outputs": {"chunk": "actions"},
-      "hidden": {"h_in": "h_out"}
-    }
-
-``contract`` holds fields of ``policy.contract.Contract``, ``schedule`` fields of
-``nets.diffusion.NoiseSchedule``, ``inputs`` the name of an ONNX file's input for each role. A
-contract file (``interface``) replaces ``contract``. ``outputs`` selects one of several outputs by
-its name, or by its index in a TorchScript tuple. ``hidden`` maps the inputs of a recurrent ONNX
-graph to the outputs that feed them at the next call; names like h_in and h_out need no entry.
+A contract file (``interface``) replaces the ``contract`` in it.
 """
 
 import json

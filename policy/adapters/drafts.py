@@ -22,7 +22,14 @@ from policy.contract import (
     STATE_NAMES,
     Contract,
 )
-from policy.data.lerobot_format import ACTION_KEY, INFO, STATE_FRAME, STATE_KEY, STATS
+from policy.data.lerobot_format import (
+    ACTION_KEY,
+    INFO,
+    STATE_FRAME,
+    STATE_KEY,
+    STATS,
+    feature_names,
+)
 from policy.errors import CheckpointError
 
 Table = Literal["contract", "state", "action", "images", "task"]
@@ -157,7 +164,7 @@ def _lerobot_entries(
     if dataset is not None:
         info, where = read_json(dataset / INFO), f"the dataset's {INFO}"
         features = _features(dataset / INFO, info, "features")
-        names = {key: _names(features.get(key)) for key in names}
+        names = {key: feature_names(features.get(key)) for key in names}
         fps = info.get("fps")
         if isinstance(fps, int | float) and fps >= 1:
             why = f"{where}: {fps:g} a second"
@@ -186,13 +193,6 @@ def _frame(dataset: Path, features: Mapping[str, Any], names: Sequence[str] | No
     why = f"the mean of az_mps2 is {mean:.1f}, by {STATS}"
     frame = "ned_frd" if mean < 0 else "enu_flu"
     return Entry("contract", "state_frame", frame, why, "guessed")
-
-
-def _names(feature: object) -> list[str] | None:
-    names = feature.get("names") if isinstance(feature, dict) else None
-    if isinstance(names, dict) and len(names) == 1:  # {"motors": [...]}, as older datasets have it
-        names = next(iter(names.values()))
-    return [str(name) for name in names] if isinstance(names, list) else None
 
 
 def _width(feature: object) -> int:

@@ -8,7 +8,7 @@ import warnings
 from collections.abc import Sequence
 from dataclasses import asdict
 from pathlib import Path
-from typing import Any, TypeAlias
+from typing import Any
 
 import torch
 from torch import Tensor, nn
@@ -16,31 +16,17 @@ from torch import Tensor, nn
 from policy.adapters.description import DESCRIPTION
 from policy.adapters.onnx.files import DENOISER, ENCODER
 from policy.contract import ACTION_DIM
-from policy.nets.resnet_unet import ResnetUnet
-from policy.nets.toge import Toge
+from policy.nets.toge import BuiltinPolicy
 
-OurPolicy: TypeAlias = Toge | ResnetUnet
 OPSET = 18
 """ONNX operator set, from 2022: every runtime in use reads it."""
 DENOISER_INPUTS = ("noisy", "timestep", "feature", "state", "action_history")
 
 
-class _Encoder(nn.Module):
-    """Normalised image [1, 3, H, W] -> feature [1, F]."""
-
-    def __init__(self, policy: OurPolicy) -> None:
-        super().__init__()
-        self.backbone, self.projection = policy.backbone, policy.visual_projection
-
-    def forward(self, image: Tensor) -> Tensor:
-        feature: Tensor = self.projection(self.backbone(image))
-        return feature
-
-
 class _Denoiser(nn.Module):
     """One network call of a solve, in the order of ``DENOISER_INPUTS``."""
 
-    def __init__(self, policy: OurPolicy) -> None:
+    def __init__(self, policy: BuiltinPolicy) -> None:
         super().__init__()
         self.policy = policy
 
@@ -65,34 +51,34 @@ class _Archive(nn.Module):
         self.visual_encoder, self.denoiser = encoder, denoiser
 
 
-def export_onnx(policy: OurPolicy, folder: Path) -> None:
+def _encoder(policy: BuiltinPolicy) -> nn.Module:
+    return nn.Sequential(policy.backbone, policy.visual_projection).eval()
+
+
+def export_onnx(policy: BuiltinPolicy, folder: Path) -> None:
     """Write encoder.onnx, denoiser.onnx and policy.json into ``folder``. Needs the onnx package."""
-    encoder, denoiser = _Encoder(policy).eval(), _Denoiser(policy).eval()
     image, rest = _examples(policy)
-    _write_onnx(encoder, image, folder / ENCODER, ("image",), "feature")
+    _write_onnx(_encoder(policy), image, folder / ENCODER, ("image",), "feature")
+    denoiser = _Denoiser(policy).eval()
     _write_onnx(denoiser, rest, folder / DENOISER, DENOISER_INPUTS, "prediction")
     (folder / DESCRIPTION).write_text(_description(policy))
 
 
-def export_torchscript(policy: OurPolicy, path: Path) -> None:
+def export_torchscript(policy: BuiltinPolicy, path: Path) -> None:
     """Write a TorchScript archive."""
     image, rest = _examples(policy)
     trace: Any = torch.jit.trace  # without types
     script: Any = torch.jit.script
     with _quiet(), torch.no_grad():
         archive = _Archive(
-            trace(_Encoder(policy).eval(), image, check_trace=False),
+            trace(_encoder(policy), image, check_trace=False),
             trace(_Denoiser(policy).eval(), rest, check_trace=False),
         )
         script(archive).save(path, _extra_files={DESCRIPTION: _description(policy)})
 
 
 def _write_onnx(
-    module: nn.Module,
-    examples: tuple[Tensor, ...],
-    path: Path,
-    inputs: Sequence[str],
-    output: str,
+    module: nn.Module, examples: tuple[Tensor, ...], path: Path, inputs: Sequence[str], output: str
 ) -> None:
     with _quiet(), torch.no_grad():
         # Not torch.export: it takes ten times as long, and its graphs are slower in OpenVINO: one
@@ -112,7 +98,7 @@ def _quiet() -> "warnings.catch_warnings[None]":
     return warnings.catch_warnings(action="ignore")  # our shape checks warn
 
 
-def _examples(policy: OurPolicy) -> tuple[tuple[Tensor, ...], tuple[Tensor, ...]]:
+def _examples(policy: BuiltinPolicy) -> tuple[tuple[Tensor, ...], tuple[Tensor, ...]]:
     contract = policy.contract
     dim = policy.visual_projection[0].out_features
     return (torch.zeros(1, 3, contract.image_height, contract.image_width),), (
@@ -124,7 +110,7 @@ def _examples(policy: OurPolicy) -> tuple[tuple[Tensor, ...], tuple[Tensor, ...]
     )
 
 
-def _description(policy: OurPolicy) -> str:
+def _description(policy: BuiltinPolicy) -> str:
     contract = json.loads(policy.contract.to_json())
     described = {"contract": contract, "schedule": asdict(policy.config.schedule)}
     return json.dumps(described, indent=2, sort_keys=True) + "\n"

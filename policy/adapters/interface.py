@@ -1,41 +1,14 @@
 """Contract file: the user's TOML with the facts that a foreign policy's files do not contain.
 
-    [contract]                   # fields of policy.contract.Contract
-    action = "sticks"
-    chunk_dt_s = 0.0333
-
-    [state]                      # state vector of the policy's training
-    key = "observation.state"
-    names = ["vx_mps", "vy_mps", "vz_mps", "roll_rad", "pitch_rad", "yaw_rad"]
-    scale = [1.0, 1.0, 1.0, 57.29578, 57.29578, 57.29578]  # angles in degrees
-
-    [action]                     # the policy's action vector; contract = scale * action + offset
-    key = "action"
-    names = ["throttle", "yaw", "pitch", "roll"]
-    scale = [1.0, 1.0, 1.0, 1.0]
-    offset = [0.0, 0.0, 0.0, 0.0]
-
-    [images]                     # the policy's name of each camera of the contract
-    front = "observation.images.front"
-
-    [task]
-    prompt = "fly through the gates"
-
-Entries are optional unless the kind of policy needs them. State names are those of the contract
-and of numbers derived from it:
-
-    vx_body_mps, vy_body_mps, vz_body_mps    velocity in body axes
-    vertical_x, vertical_y, vertical_z       the world's third axis in body axes
-    roll_rad, pitch_rad, yaw_rad             Euler angles of the attitude, turned in the order
-                                             yaw, pitch, roll; signs by the contract's frame
-
-The first six do not depend on the heading, so a network that takes them has no rotations to learn.
-In a draft (``adapters.drafts``), "?" marks the entries that only the user knows; a contract with a
-"?" does not fly.
+Its tables are [contract], with fields of ``policy.contract.Contract``; [state] and [action], with
+key, names and scale of the policy's own vectors; [images], with the policy's name of each camera;
+and [task], with a prompt (docs/policy_lerobot.md). Entries are optional unless the kind of policy
+needs them. State names are those of the contract and ``DERIVED_NAMES``. In a draft
+(``adapters.drafts``), "?" marks what only the user knows; a contract with a "?" does not fly.
 """
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, TypeVar, cast
 
@@ -63,7 +36,10 @@ EGOCENTRIC_NAMES = (
     *("vx_body_mps", "vy_body_mps", "vz_body_mps"),
     *("vertical_x", "vertical_y", "vertical_z"),
 )
+"""Velocity and the world's third axis in body axes: independent of the heading, so a network that
+takes them has no rotations to learn."""
 EULER_NAMES = ("roll_rad", "pitch_rad", "yaw_rad")
+"""Angles of the attitude, turned in the order yaw, pitch, roll; signs by the contract's frame."""
 DERIVED_NAMES = (*EGOCENTRIC_NAMES, *EULER_NAMES)
 BODY_STATE_NAMES = (*EGOCENTRIC_NAMES, *STATE_NAMES[QUATERNION.stop :])
 """State without a heading: velocity, vertical axis, rates and specific force in body axes."""
@@ -136,10 +112,6 @@ class Interface:
                 raise ContractError(f"[action] {name} must be {ACTION_DIM} numbers, got {values}")
         if 0 in self.action_scale:
             raise ContractError(f"[action] scale must not be 0, got {self.action_scale}")
-        if self.image_keys and len(self.image_keys) != len(self.contract.cameras):
-            raise ContractError(
-                f"[images] must name each of the cameras {list(self.contract.cameras)}"
-            )
 
     @property
     def state_dim(self) -> int:
@@ -222,24 +194,30 @@ def read_interface(path: Path, derived: Mapping[str, object] | None = None) -> I
 
 
 def _interface(data: dict[str, Any], derived: Mapping[str, object]) -> Interface:
-    if unanswered := _unanswered(data):
+    if unanswered := [
+        f"[{table}] {name}"
+        for table, entries in data.items()
+        if isinstance(entries, dict)
+        for name, value in entries.items()
+        if is_unanswered(value)
+    ]:
         raise ContractError(
             f"this is a draft, in which {len(unanswered)} answers are missing: "
             f"{', '.join(unanswered)}. Replace each {UNANSWERED!r} there, by what the comment asks"
         )
     tables = {name: dict(data.pop(name, {})) for name in ("contract", "state", "action", "images")}
     task = dict(data.pop("task", {}))
-    known = {field.name for field in fields(Contract) if field.init}
-    if unknown := sorted(set(tables["contract"]) - known):
-        raise ContractError(f"[contract] has unknown fields {unknown}; known are {sorted(known)}")
-    said = {name: _frozen(value) for name, value in tables["contract"].items()}
+    pairs = tables["contract"].items()
+    said: dict[str, Any] = {
+        name: tuple(value) if isinstance(value, list) else value for name, value in pairs
+    }
     for name, value in derived.items():
         if said.setdefault(name, value) != value:
             raise ContractError(
                 f"[contract] {name} = {said[name]!r} contradicts the policy's own files, which say "
                 f"{value!r}: leave it out"
             )
-    contract = Contract(**said)
+    contract = Contract.from_fields(said)
     state, action, images = tables["state"], tables["action"], tables["images"]
     if images and sorted(images) != sorted(contract.cameras):
         raise ContractError(
@@ -262,17 +240,6 @@ def _interface(data: dict[str, Any], derived: Mapping[str, object]) -> Interface
     return interface
 
 
-def _unanswered(data: Mapping[str, Any]) -> list[str]:
-    """Return the entries that the user has to answer."""
-    return [
-        f"[{table}] {name}"
-        for table, entries in data.items()
-        if isinstance(entries, dict)
-        for name, value in entries.items()
-        if is_unanswered(value)
-    ]
-
-
 def is_unanswered(value: object) -> bool:
     """True if an entry is ``UNANSWERED``, or a list that contains it."""
     return UNANSWERED in (value if isinstance(value, list) else [value])
@@ -293,7 +260,3 @@ def _library(state: object) -> tuple[Any, dict[str, Any]]:
     if not isinstance(state, torch.Tensor):
         raise TypeError(f"neither an array nor a tensor: {type(state)}")
     return torch, {"dtype": torch.float32, "device": state.device}
-
-
-def _frozen(value: object) -> Any:
-    return tuple(value) if isinstance(value, list) else value

@@ -1,27 +1,20 @@
 """Policies made of torch modules, named by a user's class or stored in a TorchScript archive.
 
-    forward(image, state, action_history)            alone: a single-rate policy
-    visual_encoder(image)                            with action_head or denoiser: dual rate
-    action_head(feature, state, action_history)      a chunk in one call
-    denoiser(noisy, timestep, feature, state, action_history)
-                                                     one step of a diffusion policy; mavbridge
-                                                     runs the loop by ``noise_schedule``
-
-Shapes are those of ``policy.protocol``; ``forward`` and ``action_head`` return chunks
-[B, horizon, 4]; ``denoiser`` returns the quantity that the schedule's ``prediction`` names;
-``timestep`` is [B] float32. Arguments beyond the last that a function declares are not passed. A
-TorchScript archive may have methods with these names, and a policy.json (``adapters.description``).
+docs/policy_exported.md lists the names and arguments of the modules; shapes are those of
+``policy.protocol``, and ``timestep`` is [B] float32. Arguments beyond the last that a function
+declares are not passed. An archive may have methods with these names, and a policy.json.
 """
 
 import inspect
 import json
 import sys
 import warnings
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import torch
 from torch import Tensor, nn
 
@@ -33,6 +26,8 @@ from policy.files import why_unreadable
 from policy.nets.diffusion import NoiseSchedule, ddim_solve, flight_noise
 from policy.protocol import SingleRatePolicy
 
+Call = Callable[..., Any]
+"""Part of a policy, called as this module's docstring says."""
 PARTS = "forward alone, visual_encoder and action_head, or visual_encoder and denoiser"
 
 
@@ -55,25 +50,30 @@ def adopt_modules(
     encoder, head, denoiser = (
         getattr(holder, part, None) for part in ("visual_encoder", "action_head", "denoiser")
     )
-    picks = outputs or {}
+    picks, modules = outputs or {}, modules_of(holder)
     if encoder is None and head is None and denoiser is None:
         if not _has_forward(holder):
             return None
         call = _Call(name, holder, "chunk", picks)
         call.skip = int(_takes_no_image(call, interface, (inputs or {}).get("state")))
-        return _with_life(ForwardPolicy(interface, holder, call), holder)
+        return _with_life(ForwardPolicy(interface, call, modules), holder)
     if encoder is None or (head is None) == (denoiser is None):
         raise PolicyError(f"{name}: its modules do not make a policy: it takes {PARTS}")
-    for module in modules_of(holder):
+    for module in modules:
         module.eval()
-    encode = _Call(name, encoder, "feature", picks)
+    features = _Call(name, encoder, "feature", picks)
+
+    def encode(image: Tensor) -> Tensor:
+        return features(image).flatten(1)
+
     interface = _with_feature(name, encode, interface)
     if head is not None:
         call = _Call(name, head, "chunk", picks)
-        return _with_life(HeadPolicy(interface, holder, encode, call), holder)
+        return _with_life(HeadPolicy(interface, encode, call, modules), holder)
     schedule = schedule or getattr(holder, "noise_schedule", None) or NoiseSchedule()
     call = _Call(name, denoiser, "prediction", picks)
-    return _with_life(DenoiserPolicy(interface, holder, encode, call, schedule, seed), holder)
+    policy = DenoiserPolicy(interface, encode, call, schedule, seed, modules)
+    return _with_life(policy, holder)
 
 
 def load_torchscript(
@@ -114,26 +114,28 @@ def make_schedule(where: Path, fields: dict[str, Any]) -> NoiseSchedule:
 
 
 class ForwardPolicy(nn.Module):
-    """Single rate: one module makes a chunk from image, state and history."""
+    """Single rate: one call makes a chunk from image, state and history.
 
-    def __init__(self, interface: Interface, holder: object, call: "_Call") -> None:
+    Calls take and return tensors, or numpy arrays if the contract says so.
+    """
+
+    def __init__(self, interface: Interface, call: Call, held: Iterable[nn.Module] = ()) -> None:
         super().__init__()
         self.contract = interface.contract
-        self.held = nn.ModuleList(modules_of(holder))
-        self._call = call
-        self._interface = interface
+        self.held = nn.ModuleList(held)
+        self._call, self._interface = call, interface
 
-    def predict(self, image: Tensor, state: Tensor, action_history: Tensor, steps: int) -> Tensor:
-        """Call the module once."""
+    def predict(self, image: Any, state: Any, action_history: Any, steps: int) -> Any:
+        """Make the call."""
         return self.to_chunk(self._call(image, *self._own(state, action_history)))
 
-    def to_chunk(self, sample: Tensor) -> Tensor:
+    def to_chunk(self, sample: Any) -> Any:
         """Convert the policy's actions [B, L, 4] to the contract's; [B, 4] is a single action."""
         if sample.ndim == 2 and self.contract.horizon == 1:
             sample = sample[:, None]
         return self._interface.to_actions(sample)
 
-    def _own(self, state: Tensor, history: Tensor) -> tuple[Tensor, Tensor]:
+    def _own(self, state: Any, history: Any) -> tuple[Any, Any]:
         """Return state and history in the policy's order and units."""
         return self._interface.to_state(state), self._interface.from_actions(history)
 
@@ -142,26 +144,25 @@ class HeadPolicy(ForwardPolicy):
     """Dual rate: an encoder, and a head that makes a chunk in one call."""
 
     def __init__(
-        self, interface: Interface, holder: object, encode: "_Call", head: "_Call"
+        self, interface: Interface, encode: Call, head: Call, held: Iterable[nn.Module] = ()
     ) -> None:
-        super().__init__(interface, holder, head)
-        self._encoder = encode
+        super().__init__(interface, head, held)
+        self._encode = encode
 
-    def encode_visual(self, image: Tensor, camera: int = 0) -> Tensor:
-        """Encode an image [B, 3, H, W] -> feature [B, F]; all cameras share one encoder."""
-        return self._encoder(image).flatten(1)
+    def encode_visual(self, image: Any, camera: int = 0) -> Any:
+        """Encode an image [1, 3, H, W] -> feature [1, F]; all cameras share one encoder."""
+        return self._encode(image)
 
-    def predict_fast(
-        self, feature: Tensor, state: Tensor, action_history: Tensor, steps: int
-    ) -> Tensor:
+    def predict_fast(self, feature: Any, state: Any, action_history: Any, steps: int) -> Any:
         """Call the head once."""
         return self.to_chunk(self._call(feature, *self._own(state, action_history)))
 
-    def predict(self, image: Tensor, state: Tensor, action_history: Tensor, steps: int) -> Tensor:
+    def predict(self, image: Any, state: Any, action_history: Any, steps: int) -> Any:
         """Encode the images, then call ``predict_fast``."""
-        feature = self.encode_visual(image.reshape(-1, *image.shape[-3:]))
-        shaped = feature.reshape(-1, *self.contract.feature_shape)
-        return self.predict_fast(shaped, state, action_history, steps)
+        library: Any = torch if isinstance(image, Tensor) else np
+        features = [self.encode_visual(each) for each in image.reshape(-1, 1, *image.shape[-3:])]
+        feature = library.stack(features).reshape(1, *self.contract.feature_shape)
+        return self.predict_fast(feature, state, action_history, steps)
 
 
 class DenoiserPolicy(HeadPolicy):
@@ -170,60 +171,48 @@ class DenoiserPolicy(HeadPolicy):
     def __init__(
         self,
         interface: Interface,
-        holder: object,
-        encode: "_Call",
-        denoiser: "_Call",
+        encode: Call,
+        denoiser: Call,
         schedule: NoiseSchedule,
         seed: int,
+        held: Iterable[nn.Module] = (),
     ) -> None:
-        super().__init__(interface, holder, encode, denoiser)
+        super().__init__(interface, encode, denoiser, held)
         if not isinstance(schedule, NoiseSchedule):
             raise PolicyError(
                 f"noise_schedule must be a policy.nets.diffusion.NoiseSchedule, got {schedule!r}"
             )
-        if interface.action_scale or interface.action_offset or interface.action_names:
-            raise PolicyError(
-                "a denoiser works on the contract's actions as they are: leave [action] out of "
-                "the contract file"
-            )
+        if any(interface.action_offset):
+            raise PolicyError("[action] offset must be zeros for a denoiser: noise is about 0")
         self.schedule = schedule
-        self.initial_noise: Tensor
-        noise = flight_noise(seed, self.contract.horizon)
-        self.register_buffer("initial_noise", noise, persistent=False)
+        self.initial_noise = nn.Buffer(flight_noise(seed, self.contract.horizon), persistent=False)
 
     def denoise(
-        self,
-        noisy: Tensor,
-        timestep: Tensor,
-        feature: Tensor,
-        state: Tensor,
-        action_history: Tensor,
-    ) -> Tensor:
+        self, noisy: Any, timestep: Any, feature: Any, state: Any, action_history: Any
+    ) -> Any:
         """Call the denoiser once."""
         return self._call(noisy, timestep, feature, *self._own(state, action_history))
 
-    def predict_fast(
-        self, feature: Tensor, state: Tensor, action_history: Tensor, steps: int
-    ) -> Tensor:
-        """Run a whole solve."""
-        noise = self.initial_noise.expand(len(state), -1, -1)
+    def predict_fast(self, feature: Any, state: Any, action_history: Any, steps: int) -> Any:
+        """Run a whole solve, in torch."""
         ddim = self.schedule.ddim_steps(steps)
 
         def denoise(index: int, noisy: Tensor) -> Tensor:
-            timestep = noisy.new_full((len(noisy),), float(ddim[index].timestep))
-            return self.denoise(noisy, timestep, feature, state, action_history)
+            timestep = noisy.new_full((1,), float(ddim[index].timestep))
+            made: Tensor = self.denoise(noisy, timestep, feature, state, action_history)
+            return made
 
-        return ddim_solve(self.schedule, ddim, denoise, noise)
+        return self.to_chunk(ddim_solve(self.schedule, ddim, denoise, self.initial_noise))
 
 
-def _with_feature(name: str, encode: "_Call", interface: Interface) -> Interface:
+def _with_feature(name: str, encode: Call, interface: Interface) -> Interface:
     """Return the interface; a missing feature_dim is taken from the encoder's output."""
     contract = interface.contract
     if contract.feature_dim > 0:
         return interface
     with user_code(f"{name}: visual_encoder failed on a dummy image"), torch.inference_mode():
         image = torch.zeros(1, *contract.image_shape[-3:])
-        dim = encode(image).flatten(1).shape[1]
+        dim = encode(image).shape[1]
     return replace(interface, contract=replace(contract, feature_dim=dim))
 
 

@@ -53,12 +53,11 @@ def check_user_class(spec: str) -> None:
 
 
 def load_user_class(spec: str, checkpoint: Path | None, *, seed: int = 0) -> SingleRatePolicy:
-    """Import a class that follows ``policy.protocol`` and create an instance.
+    """Import a class that ``check_user_class`` accepts, and create an instance.
 
     The class may instead name the torch modules of its policy, see ``adapters.modules``. ``seed``
     draws a denoiser's initial noise.
     """
-    check_user_class(spec)
     where, class_name = _split(spec)
     try:
         with user_code(f"importing {where} failed"):

@@ -15,7 +15,7 @@ import struct
 import warnings
 from dataclasses import asdict
 from pathlib import Path
-from typing import Any, TypeAlias
+from typing import Any
 
 import numpy as np
 import torch
@@ -44,12 +44,8 @@ from policy.engines.parity import ParitySamples, make_parity_samples, parity_fai
 from policy.errors import CheckpointError, PolicyError
 from policy.files import why_unreadable
 from policy.nets.diffusion import NoiseSchedule
-from policy.nets.resnet_unet import ResnetUnet, ResnetUnetConfig
-from policy.nets.toge import Toge, TogeConfig
+from policy.nets.toge import BuiltinConfig, BuiltinPolicy, build_policy
 from policy.preprocess import image_to_input
-
-BuiltinPolicy: TypeAlias = Toge | ResnetUnet
-BuiltinConfig: TypeAlias = TogeConfig | ResnetUnetConfig
 
 VECTOR_PREFIX = "test_vector."
 BACKBONE_PREFIX = "backbone."
@@ -64,11 +60,6 @@ _DAMAGED = (
 """Exceptions of torch.load for flipped bytes: its reader interprets them before it checks them."""
 _UNSUPPORTED = re.compile(r"GLOBAL (\S+)")
 """In an error of torch.load: the class that it refuses to look up."""
-
-
-def build_policy(config: BuiltinConfig) -> BuiltinPolicy:
-    """Build the network of ``config``, with random weights from torch's global generator."""
-    return Toge(config) if isinstance(config, TogeConfig) else ResnetUnet(config)
 
 
 def save_checkpoint(
@@ -89,7 +80,7 @@ def save_checkpoint(
     for name, value in _make_vector(policy).items():
         state[VECTOR_PREFIX + name] = value
     config = {name: value for name, value in asdict(policy.config).items() if name != "contract"}
-    architecture = json.dumps({"policy": _kind(policy.config), **config}, sort_keys=True)
+    architecture = json.dumps({"policy": policy.config.kind, **config}, sort_keys=True)
     header = {CONTRACT_KEY: policy.contract.to_json(), ARCHITECTURE_KEY: architecture}
     if training is not None:
         header[TRAINING_KEY] = training
@@ -117,7 +108,7 @@ def load_checkpoint_with_notes(
                 ".safetensors, or the weights alone"
             )
     try:
-        policy = build_policy(_config_of(header, fallback) if is_ours else fallback)
+        policy = build_policy(_config_of(header, type(fallback)) if is_ours else fallback)
     except (PolicyError, RecursionError) as error:
         told = str(error) if isinstance(error, PolicyError) else "its header is nested too deeply"
         raise CheckpointError(f"{path}: {told}") from error
@@ -154,17 +145,14 @@ def _make_vector(policy: BuiltinPolicy) -> dict[str, Tensor]:
     reference = copy.deepcopy(policy).cpu().eval()
     samples = make_parity_samples(policy.contract)
     arrays = (samples.rgb, samples.state, samples.history, _chunks(reference, samples))
-    return {
-        name: torch.from_numpy(
-            np.ascontiguousarray(array)
-        )  # safetensors requires contiguous tensors
-        for name, array in zip(VECTOR_NAMES, arrays, strict=True)
-    }
+    # safetensors requires contiguous tensors.
+    tensors = (torch.from_numpy(np.ascontiguousarray(array)) for array in arrays)
+    return dict(zip(VECTOR_NAMES, tensors, strict=True))
 
 
 @torch.inference_mode()
 def _chunks(policy: BuiltinPolicy, samples: ParitySamples) -> FloatArray:
-    policy.seed_noise(0)
+    policy.head.seed_noise(0)
     images = np.concatenate([image_to_input(rgb, policy.contract) for rgb in samples.rgb])
     steps = min(VECTOR_STEPS, policy.config.schedule.num_train_timesteps)
     image, state, history = map(torch.from_numpy, (images, samples.state, samples.history))
@@ -188,35 +176,17 @@ def _require_reproduced(path: Path, policy: BuiltinPolicy, vector: dict[str, Ten
         )
 
 
-def _config_of(header: dict[str, str], fallback: BuiltinConfig) -> BuiltinConfig:
-    contract = Contract.from_json(header[CONTRACT_KEY])
-    config = _architecture_from_json(header[ARCHITECTURE_KEY], contract)
-    if type(config) is not type(fallback):
-        raise CheckpointError(
-            f"it holds a {_kind(config)!r} policy, not a {_kind(fallback)!r} one: "
-            f"ask for it with --policy {_kind(config)}"
-        )
-    return config
-
-
-def _kind(config: BuiltinConfig) -> str:
-    return "toge" if isinstance(config, TogeConfig) else "resnet-unet"
-
-
-def _architecture_from_json(text: str, contract: Contract) -> BuiltinConfig:
+def _config_of(header: dict[str, str], wanted: type[BuiltinConfig]) -> BuiltinConfig:
+    contract, text = Contract.from_json(header[CONTRACT_KEY]), header[ARCHITECTURE_KEY]
     try:
         data: Any = json.loads(text)
-        kind = data.pop("policy")
-        schedule = NoiseSchedule(**data.pop("schedule"))
-        if kind == "toge":
-            return TogeConfig(contract=contract, schedule=schedule, **data)
-        if kind == "resnet-unet":
-            return ResnetUnetConfig(contract=contract, schedule=schedule, **data)
+        if (kind := data.pop("policy")) != wanted.kind:
+            raise CheckpointError(f"it holds a {kind}, no {wanted.kind}: fly it by --policy {kind}")
+        return wanted(contract=contract, schedule=NoiseSchedule(**data.pop("schedule")), **data)
     except (json.JSONDecodeError, KeyError, TypeError, AttributeError) as error:
         raise CheckpointError(
             f"malformed architecture {text[:200]!r} ({error}): export the checkpoint again"
         ) from error
-    raise CheckpointError(f"policy {kind!r} is unknown; this build knows 'toge', 'resnet-unet'")
 
 
 def read_torch(path: Path) -> dict[Any, Any]:

@@ -138,10 +138,7 @@ def _require_vector(
         raise DatasetError(
             f"{folder}: {key} has shape {shape}, the policy takes [{len(wanted)}]: {list(wanted)}"
         )
-    got = feature.get("names")
-    if isinstance(got, dict) and len(got) == 1:  # {"motors": [...]}, as older datasets have it
-        got = next(iter(got.values()))
-    if not isinstance(got, list) or [str(name) for name in got] != list(wanted):
+    if (got := names.feature_names(feature)) != list(wanted):
         raise DatasetError(
             f"{folder}: {key} is named {got}, the policy takes {list(wanted)} in this order: put "
             "the columns so, and say so in meta/info.json"

@@ -33,3 +33,11 @@ SENT = "sent"
 """mavbridge's column with the sticks that flew."""
 STATE_FRAME = "state_frame"
 """In the ``info`` of the state's feature: ``Contract.state_frame``."""
+
+
+def feature_names(feature: object) -> list[str] | None:
+    """Return the names of a feature's numbers; None if it has none."""
+    names = feature.get("names") if isinstance(feature, dict) else None
+    if isinstance(names, dict) and len(names) == 1:  # {"motors": [...]}, as older datasets have it
+        names = next(iter(names.values()))
+    return [str(name) for name in names] if isinstance(names, list) else None

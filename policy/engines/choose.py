@@ -18,8 +18,7 @@ from policy.engines.parity import ParitySamples, make_parity_samples, parity_fai
 from policy.engines.runner import EngineName, ExecutionSettings, encode_all
 from policy.engines.torch_eager import make_torch_runner
 from policy.errors import Agreed, PolicyError, warned
-from policy.nets.resnet_unet import ResnetUnet
-from policy.nets.toge import Toge
+from policy.nets.toge import BuiltinPolicy
 from policy.protocol import PolicyRunner, SingleRatePolicy
 
 Candidate = tuple[str, Callable[[], PolicyRunner]]
@@ -40,7 +39,7 @@ def choose_runner(
             f"network.engine={engine} takes a torch.nn.Module, or a class that holds one as an "
             f"attribute: leave it out, and {settings.name} runs on torch"
         )
-    if engine == "auto" and not isinstance(policy, Toge | ResnetUnet):
+    if engine == "auto" and not isinstance(policy, BuiltinPolicy):
         if settings.vision_device != "cpu" or settings.action_device != "cpu":
             return make_torch_runner(policy, settings), ()
         if hasattr(policy, "reset"):
@@ -106,7 +105,7 @@ def _impurity(
     expected: FloatArray,
 ) -> str | None:
     """Return why no graph can compute this policy; None if one may."""
-    if isinstance(policy, Toge | ResnetUnet):
+    if isinstance(policy, BuiltinPolicy):
         return None
     if changed := changes(before, snapshot(policy)):
         return f"it keeps {', '.join(changed)} from call to call, which a graph cannot"
@@ -133,16 +132,17 @@ def _candidates(
     if devices == {"cpu"} and find_spec("openvino") is not None:
         from policy.engines.openvino_compile import precisions
         from policy.engines.openvino_cpu import make_openvino_runner
-        from policy.engines.openvino_modules import ModuleConverter
+        from policy.engines.openvino_modules import ModuleConverter, make_module_runner
 
-        is_ours = isinstance(policy, Toge | ResnetUnet)
-        converter = None if is_ours else ModuleConverter(policy, settings.name)
+        make: Callable[..., PolicyRunner] = make_openvino_runner
+        if not isinstance(policy, BuiltinPolicy):
+            make = partial(make_module_runner, ModuleConverter(policy, settings.name))
         return [
             (
-                f"openvino (images {vision}, actions {action})",
-                partial(make_openvino_runner, policy, settings, vision, action, converter),
+                f"openvino (images {pair[0]}, actions {pair[1]})",
+                partial(make, policy, settings, *pair),
             )
-            for vision, action in precisions()
+            for pair in precisions()
         ]
     if engine == "openvino":
         raise PolicyError("network.engine=openvino: the package is missing; pip install openvino")

@@ -63,10 +63,7 @@ class _Graph:
     """Captured function with static inputs and output; for one thread."""
 
     def __init__(
-        self,
-        function: Callable[..., Tensor],
-        shapes: Sequence[Shape],
-        stream: torch.cuda.Stream,
+        self, function: Callable[..., Tensor], shapes: Sequence[Shape], stream: torch.cuda.Stream
     ) -> None:
         self._stream = stream
         self._pinned = [torch.zeros(shape, pin_memory=True) for shape in shapes]

@@ -204,6 +204,12 @@ class Graph:
         return [array.copy() for array in self._outputs[1:]]
 
 
+def update_digest(digest: "hashlib._Hash", name: str, value: Tensor) -> None:
+    """Add a weight to a digest."""
+    digest.update(f"{name} {value.dtype} {list(value.shape)}".encode())
+    digest.update(value.detach().cpu().contiguous().flatten().view(torch.uint8).numpy().data)
+
+
 class Traceable(nn.Module):
     """Module that wraps a function of tensors and holds the modules whose weights it uses."""
 

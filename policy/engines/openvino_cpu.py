@@ -23,16 +23,15 @@ from policy.engines.openvino_compile import (
     convert,
     engine_name,
     signal_stack_kept,
+    update_digest,
 )
-from policy.engines.openvino_modules import ModuleConverter, make_module_runner
 from policy.engines.runner import Act, ExecutionSettings, Precision, assemble
 from policy.engines.stepwise import to_numpy
 from policy.nets.action_head import DiffusionHead, size_dims
-from policy.nets.resnet_unet import ResnetUnet
-from policy.nets.toge import Toge
+from policy.nets.toge import BuiltinPolicy
 from policy.nets.unet1d import Conv, ResidualBlock, UNet1d, norm_of_groups
 from policy.preprocess import egocentric, egocentric_scale
-from policy.protocol import PolicyRunner, SingleRatePolicy
+from policy.protocol import PolicyRunner
 
 MAX_UNROLLED = 10
 """Denoising steps in one graph; each takes a third of a second to convert, once."""
@@ -40,34 +39,22 @@ MAX_UNROLLED = 10
 
 @signal_stack_kept()
 def make_openvino_runner(
-    policy: SingleRatePolicy,
-    settings: ExecutionSettings,
-    vision: Precision,
-    action: Precision,
-    converter: ModuleConverter | None = None,
+    policy: BuiltinPolicy, settings: ExecutionSettings, vision: Precision, action: Precision
 ) -> PolicyRunner:
     """Compile a policy for the loops, or load it from the user's cache; tried once.
 
     The policy's initial noise is copied now. ``vision`` and ``action`` are the precisions of both
-    paths. ``converter`` converts a policy that is not built in; it can be reused for another
-    precision.
+    paths.
 
     Raises:
-        PolicyError: it holds no torch module, cannot be converted, lacks a required fast path,
-            or failed on a dummy sample.
+        PolicyError: it lacks a required fast path, or failed on a dummy sample.
         RuntimeError: OpenVINO cannot compile it.
     """
-    if isinstance(policy, Toge | ResnetUnet):
-        return _make_builtin(policy, settings, vision, action)
-    converter = converter or ModuleConverter(policy, settings.name)
-    return make_module_runner(policy, settings, vision, action, converter)
-
-
-def _make_builtin(
-    policy: Toge | ResnetUnet, settings: ExecutionSettings, vision: Precision, action: Precision
-) -> PolicyRunner:
     name = engine_name(vision, action)
-    compiler = GraphCompiler(f"{policy.config} {digest_of_weights(policy)}")
+    digest = hashlib.sha256()
+    for key, value in policy.state_dict().items():
+        update_digest(digest, key, value)
+    compiler = GraphCompiler(f"{policy.config} {digest.hexdigest()}")
     encode = compiler.compile("vision", vision, lambda: vision_graph(policy))
     sample = _solver(compiler, policy, action, settings.num_diffusion_steps)
     if settings.dual_rate:
@@ -78,7 +65,7 @@ def _make_builtin(
 
 
 def _solver(
-    compiler: GraphCompiler, policy: Toge | ResnetUnet, precision: Precision, steps: int
+    compiler: GraphCompiler, policy: BuiltinPolicy, precision: Precision, steps: int
 ) -> Act:
     """Return (encoded image, state, history) -> chunk, by ``steps`` from the policy's noise.
 
@@ -104,22 +91,13 @@ def _solver(
     return sample
 
 
-def digest_of_weights(module: nn.Module) -> str:
-    """Return a digest of all weights."""
-    digest = hashlib.sha256()
-    for name, value in module.state_dict().items():
-        digest.update(f"{name} {value.dtype} {list(value.shape)}".encode())
-        digest.update(value.cpu().contiguous().numpy())
-    return digest.hexdigest()
-
-
-def vision_graph(policy: Toge | ResnetUnet) -> ov.Model:
+def vision_graph(policy: BuiltinPolicy) -> ov.Model:
     """Build the graph: normalised image [1, 3, H, W] -> feature [1, F]."""
     image = (1, 3, policy.contract.image_height, policy.contract.image_width)
     return convert(policy, lambda i: policy.visual_projection(policy.backbone(i)), [image])
 
 
-def denoise_graph(policy: Toge | ResnetUnet, count: int) -> ov.Model:
+def denoise_graph(policy: BuiltinPolicy, count: int) -> ov.Model:
     """Build the graph of ``count`` unrolled steps of a solve; ``step_inputs`` selects the steps.
 
     (feature, egocentric, history, noisy [1, horizon, 4], films, updates) -> less noisy.
@@ -230,11 +208,8 @@ class BulkEncoder:
     images a second as torch in batches.
     """
 
-    def __init__(self, policy: Toge | ResnetUnet, precision: Precision) -> None:
-        properties = {
-            "PERFORMANCE_HINT": "THROUGHPUT",
-            "INFERENCE_PRECISION_HINT": precision,
-        }
+    def __init__(self, policy: BuiltinPolicy, precision: Precision) -> None:
+        properties = {"PERFORMANCE_HINT": "THROUGHPUT", "INFERENCE_PRECISION_HINT": precision}
         image = (1, 3, policy.contract.image_height, policy.contract.image_width)
         graph = convert(policy.backbone, policy.backbone, [image])
         with signal_stack_kept():

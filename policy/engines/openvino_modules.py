@@ -23,19 +23,13 @@ from policy.engines.openvino_compile import (
     engine_name,
     quiet,
     signal_stack_kept,
+    update_digest,
 )
-from policy.engines.runner import (
-    ArrayFunction,
-    Compile,
-    ExecutionSettings,
-    Precision,
-    Shape,
-    make_runner,
-)
-from policy.engines.stepwise import make_stepwise_runner
+from policy.engines.runner import ArrayFunction, Compile, ExecutionSettings, Precision, Shape
+from policy.engines.stepwise import make_parts_runner
 from policy.engines.torch_eager import run_eagerly
 from policy.errors import PolicyError, user_code
-from policy.protocol import PolicyRunner, SingleRatePolicy, StepwisePolicy
+from policy.protocol import PolicyRunner, SingleRatePolicy
 
 _MANGLED = re.compile(r"___torch_mangle_\d+\.")
 """In a type's name: TorchScript's counter of equally named types in the process."""
@@ -51,11 +45,11 @@ makes a copy of 4 bytes or more. One step of the largest usual diffusion policy 
 
 @signal_stack_kept()
 def make_module_runner(
+    converter: "ModuleConverter",
     policy: SingleRatePolicy,
     settings: ExecutionSettings,
     vision: Precision,
     action: Precision,
-    converter: "ModuleConverter",
 ) -> PolicyRunner:
     """Compile a policy's methods for the loops; tried once.
 
@@ -68,12 +62,10 @@ def make_module_runner(
     def compile_as(precision: Precision) -> Compile:
         return lambda function, shapes: converter.compile(function, shapes, precision)
 
+    end = run_eagerly(settings.name, "cpu")
+    compilers = compile_as(vision), compile_as(action), end
     name = engine_name(vision, action)
-    compilers = compile_as(vision), compile_as(action)
-    if isinstance(policy, StepwisePolicy):
-        end = run_eagerly(settings.name, "cpu")
-        return make_stepwise_runner(policy, *compilers, end, engine=name, settings=settings)
-    return make_runner(policy, policy, *compilers, engine=name, settings=settings)
+    return make_parts_runner(policy, *compilers, engine=name, settings=settings)
 
 
 class ModuleConverter:
@@ -87,11 +79,6 @@ class ModuleConverter:
         )
         """Traced TorchScript keeps data-dependent decisions, and torch.export rejects it."""
         self._models: dict[str, ov.Model] = {}
-        if not self._modules:
-            raise PolicyError(
-                f"{name} neither is a torch.nn.Module nor has one as an attribute, so there is "
-                "nothing to convert"
-            )
 
     def compile(
         self, function: Callable[..., Any], shapes: Sequence[Shape], precision: Precision
@@ -154,7 +141,7 @@ def _digest(program: ExportedProgram) -> str:
     """Return a digest of the program: operations, constants and weights."""
     digest = hashlib.sha256(program.graph_module.code.encode())
     for name, value, _ in _tensors(program):
-        _update(digest, name, value)
+        update_digest(digest, name, value)
     return digest.hexdigest()
 
 
@@ -190,13 +177,8 @@ def _digest_of_script(module: nn.Module, examples: tuple[Tensor, ...]) -> str:
         if node.hasAttribute("value") and node.kindOf("value") == "t"
     ]
     for name, value in [*module.state_dict().items(), *constants]:
-        _update(digest, name, value)
+        update_digest(digest, name, value)
     return digest.hexdigest()
-
-
-def _update(digest: "hashlib._Hash", name: str, value: Tensor) -> None:
-    digest.update(f"{name} {value.dtype} {list(value.shape)}".encode())
-    digest.update(value.detach().cpu().contiguous().flatten().view(torch.uint8).numpy().data)
 
 
 def _converted(module: nn.Module, examples: tuple[Tensor, ...]) -> ov.Model:

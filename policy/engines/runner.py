@@ -80,6 +80,12 @@ def encoders(vision: DualRatePolicy) -> list[Callable[..., Any]]:
 
 def make_numpy_runner(policy: SingleRatePolicy, settings: ExecutionSettings) -> PolicyRunner:
     """Wrap a numpy policy for the loops; tried once."""
+    run = run_in_numpy(settings.name)
+    return make_runner(policy, policy, run, run, engine="numpy", settings=settings)
+
+
+def run_in_numpy(name: str) -> Compile:
+    """ "Compile" a function of numpy arrays: check its result, and keep its arrays apart."""
 
     def compile_(method: Callable[..., Any], _shapes: Sequence[Shape]) -> ArrayFunction:
         def run(*arrays: FloatArray) -> FloatArray:
@@ -88,14 +94,13 @@ def make_numpy_runner(policy: SingleRatePolicy, settings: ExecutionSettings) -> 
             result = method(*(array.copy() for array in arrays))
             if not isinstance(result, np.ndarray):
                 raise PolicyError(
-                    f"{settings.name} returned {type(result).__name__}; its contract says numpy "
-                    "arrays"
+                    f"{name} returned {type(result).__name__}; its contract says numpy arrays"
                 )
             return np.array(result, np.float32)
 
         return run
 
-    return make_runner(policy, policy, compile_, compile_, engine="numpy", settings=settings)
+    return compile_
 
 
 def assemble(

@@ -9,13 +9,7 @@ import torch
 from torch import Tensor, nn
 
 from policy.contract import FloatArray
-from policy.engines.runner import (
-    ArrayFunction,
-    Compile,
-    ExecutionSettings,
-    Shape,
-    make_runner,
-)
+from policy.engines.runner import ArrayFunction, Compile, ExecutionSettings, Shape, make_runner
 from policy.errors import PolicyError
 from policy.protocol import PolicyRunner, SingleRatePolicy
 

@@ -9,7 +9,7 @@ from policy.loading.request import PolicyRequest, default_contract
 from policy.nets.names import BACKBONE_NAMES, SIZE_NAMES, BackboneName, Size
 
 if TYPE_CHECKING:
-    from policy.checkpoints.policy_file import BuiltinConfig, BuiltinPolicy
+    from policy.nets.toge import BuiltinConfig, BuiltinPolicy
 
 SHIPPED = Path(__file__).parents[1] / "weights" / "toge.safetensors"
 """Default weights of ``toge``; its model card is beside it."""
@@ -18,24 +18,38 @@ SHIPPED_RATES = SHIPPED.with_name("toge-rates.safetensors")
 BUILTIN_KINDS = ("toge", "toge-rates", "resnet-unet")
 
 
-def builtin_config(spec: str, *, image_size: int) -> "BuiltinConfig":
+def builtin_config(spec: str, *, image_size: int | None) -> "BuiltinConfig":
     """Return the built-in network of ``spec``, with the default contract at that image size."""
+    from policy.nets.toge import ResnetUnetConfig, TogeConfig
+
     kind, *options = spec.split(":")
     if kind not in BUILTIN_KINDS:
         raise PolicyError(
             f"--policy {spec} cannot be trained here: use toge[:SIZE][:BACKBONE], "
             "resnet-unet[:SIZE]; a world model has a command of its own, train-world-model"
         )
-    return _config(kind, options, image_size)
+    size, backbone = parse_builtin(kind, options)
+    contract = default_contract(image_size)
+    if kind == "resnet-unet":
+        return ResnetUnetConfig(size=size, contract=contract)
+    return TogeConfig(size=size, backbone=backbone or TogeConfig.backbone, contract=contract)
 
 
 def load_builtin(request: PolicyRequest) -> tuple["BuiltinPolicy", list[str]]:
     """Build a network and load its weights, or seeded random ones; return notes too."""
-    kind, *options = request.spec.split(":")
-    config, checkpoint = _config(kind, options, request.image_size), builtin_checkpoint(request)
-    if checkpoint is None:
-        return _untrained(config, request.seed)
-    return _trained(config, options, checkpoint, request.seed)
+    import torch
+
+    from policy.nets.toge import build_policy
+
+    config = builtin_config(request.spec, image_size=request.image_size)
+    if (checkpoint := builtin_checkpoint(request)) is not None:
+        return _trained(config, request.spec.split(":")[1:], checkpoint, request.seed)
+    with torch.random.fork_rng(devices=[]):  # leaves the global random state unchanged
+        torch.manual_seed(request.seed)
+        policy = build_policy(config).eval()
+    policy.head.seed_noise(request.seed)
+    note = f"untrained: seeded random weights (seed {request.seed}, noise too); for bring-up only"
+    return policy, [note]
 
 
 def builtin_checkpoint(request: PolicyRequest) -> Path | None:
@@ -71,29 +85,18 @@ def parse_builtin(kind: str, options: list[str]) -> tuple[Size, BackboneName | N
     return size, rest[0] if rest else None
 
 
-def _config(kind: str, options: list[str], image_size: int | None) -> "BuiltinConfig":
-    from policy.nets.resnet_unet import ResnetUnetConfig
-    from policy.nets.toge import TogeConfig
-
-    size, backbone = parse_builtin(kind, options)
-    contract = default_contract(image_size)
-    if kind != "resnet-unet":
-        return TogeConfig(size=size, backbone=backbone or TogeConfig.backbone, contract=contract)
-    return ResnetUnetConfig(size=size, contract=contract)
-
-
 def _trained(
     config: "BuiltinConfig", options: list[str], checkpoint: Path, seed: int
 ) -> tuple["BuiltinPolicy", list[str]]:
     from policy.checkpoints.policy_file import load_checkpoint_with_notes
 
     policy, found = load_checkpoint_with_notes(checkpoint, fallback=config)
-    parts = (policy.config.size, getattr(policy.config, "backbone", "resnet18"))
+    parts = (policy.config.size, policy.config.backbone)
     if contradicted := [option for option in options if option not in parts]:
         raise PolicyError(
             f"{checkpoint} holds {':'.join(parts)}, not {':'.join(contradicted)}: leave that out"
         )
-    policy.seed_noise(seed)
+    policy.head.seed_noise(seed)
     notes = [f"weights of {checkpoint} ({', '.join(parts)}); noise of seed {seed}", *found]
     if checkpoint.suffix != ".safetensors":
         contract, schedule = policy.contract, policy.config.schedule
@@ -107,16 +110,3 @@ def _trained(
             )
         )
     return policy, notes
-
-
-def _untrained(config: "BuiltinConfig", seed: int) -> tuple["BuiltinPolicy", list[str]]:
-    import torch
-
-    from policy.checkpoints.policy_file import build_policy
-
-    with torch.random.fork_rng(devices=[]):  # leaves the global random state unchanged
-        torch.manual_seed(seed)
-        policy = build_policy(config).eval()
-    policy.seed_noise(seed)
-    note = f"untrained: seeded random weights (seed {seed}, noise too); for bring-up only"
-    return policy, [note]

@@ -1,24 +1,13 @@
 """Loading of the user's ``--policy`` and ``--checkpoint``: returns a runner, or says what is wrong.
 
-    toge[:SIZE][:BACKBONE]   TOGE, e.g. toge, toge:medium, toge:small:resnet18
-    resnet-unet[:SIZE]       ResNet-UNet, single-rate
-    scripted[:PROGRAM][:ACTION][:air]
-                             a fixed program in any kind of action, e.g. scripted:square:velocity;
-                             air: begin in the air, without the climb
-    lerobot:DIR              an ACT or DiffusionPolicy as LeRobot saved it, with --contract FILE
-    onnx:DIR, onnx:FILE.onnx an ONNX export, with --contract FILE unless a contract is beside it
-    torchscript:FILE.pt      a TorchScript archive; contract as for ONNX
-    package.module:Class     any class that follows protocol.SingleRatePolicy or DualRatePolicy
-    ./file.py:Class          a class, by its file
-    ws://HOST:PORT           a server that speaks openpi's websocket protocol; wss:// with TLS
-
-torch is imported only if a policy needs it.
+``adapters.user_class.FORMS`` lists the forms. torch is imported only if a policy needs it.
 """
 
 import inspect
 from collections.abc import Callable
 from contextlib import ExitStack, suppress
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 
 from policy.adapters.description import Description, read_description
@@ -40,6 +29,7 @@ from policy.stick_loop import by_rates, flown_by_rates
 LEROBOT, ONNX, TORCHSCRIPT = "lerobot", "onnx", "torchscript"
 FORMS = {LEROBOT: "lerobot:DIR", ONNX: "onnx:DIR or onnx:FILE", TORCHSCRIPT: "torchscript:FILE.pt"}
 """Forms of --policy for files of other programs."""
+Engine = tuple[PolicyRunner, tuple[str, ...]]
 _WHEN = {"reset": "when a flight begins", "close": "when it is not needed any more"}
 
 
@@ -78,9 +68,7 @@ def check_request(request: PolicyRequest) -> Contract | None:
         check_user_class(request.spec)
     if contract is not None:
         _require_image_size(contract, request.image_size)
-    require_devices(
-        request.vision_device or request.device, request.action_device or request.device
-    )
+    require_devices(*request.devices)
     return contract
 
 
@@ -95,7 +83,7 @@ def read_policy_contract(request: PolicyRequest) -> Contract:
         contract = contract or default_contract(request.image_size)
         return by_rates(contract) if request.by_rates else contract
     if contract is None:
-        policy, _ = _find(request, lambda: 0.0)
+        policy, _ = _find_other(request, lambda: 0.0)
         _life_method(policy, "close", request.spec)()
         contract = policy.contract
     return contract
@@ -110,10 +98,11 @@ def load_policy(request: PolicyRequest, *, now_s: Callable[[], float]) -> Loaded
         PolicyError: the message names the fault, the available choices and the next step.
     """
     check_request(request)
-    policy, notes = _find(request, now_s)
+    policy, notes, make_runner = _find(request, now_s)
     reset, close = (_life_method(policy, name, request.spec) for name in ("reset", "close"))
     try:
-        runner, engine_notes = _on_engine(policy, request, notes)
+        settings = _settings(policy, request, notes)
+        runner, engine_notes = (make_runner or partial(_on_engine, policy, request))(settings)
         if runner.reset is keep_nothing:  # engines that keep the state bring their own reset
             runner = replace(runner, reset=reset)
         times = measure_times(runner, now_s)
@@ -126,10 +115,10 @@ def load_policy(request: PolicyRequest, *, now_s: Callable[[], float]) -> Loaded
     return LoadedPolicy(runner=runner, notes=(*notes, *engine_notes), times=times)
 
 
-def _on_engine(
+def _settings(
     policy: SingleRatePolicy, request: PolicyRequest, notes: list[str]
-) -> tuple[PolicyRunner, tuple[str, ...]]:
-    """Return the policy on its engine, tried once; ``notes`` gets deviations from the request."""
+) -> ExecutionSettings:
+    """Return how to execute the policy; ``notes`` gets deviations from the request."""
     _require_image_size(policy.contract, request.image_size)
     dual_rate = request.dual_rate and isinstance(policy, DualRatePolicy)
     if request.dual_rate and not dual_rate:
@@ -140,19 +129,19 @@ def _on_engine(
                 "intended)"
             )
         )
-    settings = ExecutionSettings(
+    return ExecutionSettings(
         name=request.spec,
-        vision_device=request.vision_device or request.device,
-        action_device=request.action_device or request.device,
+        vision_device=request.devices[0],
+        action_device=request.devices[1],
         num_diffusion_steps=request.num_diffusion_steps,
         dual_rate=dual_rate,
     )
-    kind = request.spec.partition(":")[0]
-    if kind == ONNX:
-        from policy.adapters.onnx.policies import OnnxPolicy, choose_precision
 
-        if isinstance(policy, OnnxPolicy):
-            return choose_precision(policy, settings)
+
+def _on_engine(
+    policy: SingleRatePolicy, request: PolicyRequest, settings: ExecutionSettings
+) -> Engine:
+    """Return the policy on its engine, tried once, and notes."""
     if policy.contract.arrays == "numpy":
         if request.engine != "auto":
             raise PolicyError(
@@ -163,13 +152,29 @@ def _on_engine(
     from policy.engines.choose import choose_runner
 
     runner, engine_notes = choose_runner(policy, request.engine, settings)
-    if kind in BUILTIN_KINDS and (request.by_rates or policy.contract.action == "rates"):
+    is_builtin = request.spec.partition(":")[0] in BUILTIN_KINDS
+    if is_builtin and (request.by_rates or policy.contract.action == "rates"):
         runner = flown_by_rates(runner)
     return runner, engine_notes
 
 
-def _find(request: PolicyRequest, now_s: Callable[[], float]) -> tuple[SingleRatePolicy, list[str]]:
-    """Create the policy, and notes for the user."""
+def _find(
+    request: PolicyRequest, now_s: Callable[[], float]
+) -> tuple[SingleRatePolicy, list[str], Callable[[ExecutionSettings], Engine] | None]:
+    """Create the policy, notes for the user, and its own choice of an engine if it has one."""
+    if not request.spec.startswith(f"{ONNX}:"):
+        return *_find_other(request, now_s), None
+    from policy.adapters.onnx.policies import OnnxGraphs
+
+    graphs = OnnxGraphs(_onnx_files(request), request.seed)
+    in_float32 = graphs.at("f32", "f32")
+    notes = [graphs.describe(request.num_diffusion_steps)]
+    return in_float32[0], notes, partial(graphs.make_runner, in_float32)
+
+
+def _find_other(
+    request: PolicyRequest, now_s: Callable[[], float]
+) -> tuple[SingleRatePolicy, list[str]]:
     kind, *options = request.spec.split(":")
     if kind == "scripted":
         note = f"{request.spec}: flies a fixed program, the camera is not looked at"
@@ -183,11 +188,6 @@ def _find(request: PolicyRequest, now_s: Callable[[], float]) -> tuple[SingleRat
 
         steps = request.num_diffusion_steps
         return load_policy_of(_plan(request), seed=request.seed, num_diffusion_steps=steps)
-    if kind == ONNX:
-        from policy.adapters.onnx.policies import OnnxGraphs
-
-        graphs = OnnxGraphs(_onnx_files(request), request.seed)
-        return graphs.at("f32", "f32"), [graphs.describe(request.num_diffusion_steps)]
     if kind == TORCHSCRIPT:
         from policy.adapters.modules import load_torchscript
 
@@ -212,12 +212,9 @@ def _plan(request: PolicyRequest) -> Plan:
 
 def _onnx_files(request: PolicyRequest) -> OnnxFiles:
     path = _path(request)
-    devices = {request.vision_device or request.device, request.action_device or request.device}
-    if request.engine not in ("auto", "openvino") or devices != {"cpu"}:
-        raise PolicyError(
-            f"--policy {request.spec} runs through OpenVINO on the CPU: leave out "
-            "network.engine and --device"
-        )
+    if request.engine not in ("auto", "openvino") or set(request.devices) != {"cpu"}:
+        flags = "network.engine and --device"
+        raise PolicyError(f"--policy {request.spec} runs in OpenVINO on the CPU: leave out {flags}")
     return find_onnx_files(request.spec, path, request.contract_file)
 
 

@@ -57,7 +57,7 @@ class PolicyRequest:
     """The requested policy, and how to run it."""
 
     spec: str
-    """One of the forms in the docstring of ``policy.loading.load``."""
+    """One of ``adapters.user_class.FORMS``."""
     checkpoint: Path | None = None
     """Weights; a user's class gets ``Class(checkpoint=path)``. None: ``toge`` uses shipped ones."""
     contract_file: Path | None = None
@@ -83,6 +83,11 @@ class PolicyRequest:
     """Fly a built-in network, which computes sticks, by thrust and body rates."""
     starts_in_air: bool = False
     """The vehicle is already in the air at takeover: a scripted program does not climb."""
+
+    @property
+    def devices(self) -> tuple[str, str]:
+        """Devices for encoding images and for sampling chunks."""
+        return self.vision_device or self.device, self.action_device or self.device
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -60,13 +60,9 @@ class DiffusionHead(nn.Module):
             horizon=contract.horizon, condition_dim=dims.base_dim, widths=dims.widths
         )
         self.direct = nn.Linear(dims.base_dim, contract.horizon * ACTION_DIM)
-        self._timesteps: Tensor
         timesteps = torch.arange(schedule.num_train_timesteps)
-        self.register_buffer("_timesteps", timesteps, persistent=False)
-        self.initial_noise: Tensor
-        noise = torch.empty(1, contract.horizon, ACTION_DIM)
-        self.register_buffer("initial_noise", noise, persistent=False)
-        self.seed_noise(0)
+        self._timesteps = nn.Buffer(timesteps, persistent=False)
+        self.initial_noise = nn.Buffer(flight_noise(0, contract.horizon), persistent=False)
 
     def seed_noise(self, seed: int) -> None:
         """Draw the initial noise of a flight."""

@@ -15,7 +15,7 @@ import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
-from typing import Any, Literal, TypeVar
+from typing import Any, Literal, TypeVar, get_args
 
 import torch
 from torch import Tensor
@@ -57,22 +57,12 @@ class NoiseSchedule:
     divide by sqrt(a_t), which is 5e-4 at t = 99, to get x_0; with few steps ``sample`` is safer."""
 
     def __post_init__(self) -> None:
-        if not (
-            isinstance(self.num_train_timesteps, int) and 1 <= self.num_train_timesteps <= 1000
-        ):
-            raise PolicyError(
-                f"num_train_timesteps must be an integer in 1..1000, got {self.num_train_timesteps}"
-            )
-        if self.betas not in ("squared_cosine", "linear"):
-            raise PolicyError(f"betas {self.betas!r} is unknown; use 'squared_cosine' or 'linear'")
-        if self.prediction not in ("sample", "epsilon"):
-            raise PolicyError(
-                f"prediction {self.prediction!r} is unknown; use 'sample' or 'epsilon'"
-            )
-
-    def signal_power(self) -> tuple[float, ...]:
-        """Return a_t for every training timestep, falling from almost 1 to almost 0."""
-        return _signal_power(self.num_train_timesteps, self.betas)
+        total = self.num_train_timesteps
+        if not isinstance(total, int) or not 1 <= total <= 1000:
+            raise PolicyError(f"num_train_timesteps must be an integer in 1..1000, got {total}")
+        for name, known in (("betas", BetaSchedule), ("prediction", Prediction)):
+            if (value := getattr(self, name)) not in get_args(known):
+                raise PolicyError(f"{name} {value!r} is unknown; use one of {get_args(known)}")
 
     def ddim_steps(self, count: int) -> tuple[DdimStep, ...]:
         """Return the reverse steps of a solve with ``count`` network calls, noisiest first.
@@ -81,23 +71,16 @@ class NoiseSchedule:
         every count starts from pure noise, and count 1 is the net's x_0 of pure noise.
         """
         total = self.num_train_timesteps
-        if not isinstance(count, int) or isinstance(count, bool) or not 1 <= count <= total:
+        if type(count) is not int or not 1 <= count <= total:
             raise PolicyError(
                 f"num_diffusion_steps must be an integer in 1..{total} (the schedule that the "
                 f"policy was trained on), got {count!r}; 10 is a good start"
             )
-        return _ddim_steps(total, self.betas, count)
+        return _ddim_steps(self, count)
 
     def add_noise(self, clean: Tensor, noise: Tensor, timestep: Tensor) -> Tensor:
         """Run the forward process, for training: clean [B, ...] and standard noise -> noisy."""
-        if clean.shape != noise.shape or timestep.shape != clean.shape[:1]:
-            raise PolicyError(
-                f"add_noise needs clean and noise of one shape and a timestep per sample, got "
-                f"{list(clean.shape)}, {list(noise.shape)}, {list(timestep.shape)}"
-            )
-        if timestep.min() < 0 or timestep.max() >= self.num_train_timesteps:
-            raise PolicyError(f"timesteps must be in 0..{self.num_train_timesteps - 1}")
-        power = torch.tensor(self.signal_power(), dtype=torch.float64, device=clean.device)
+        power = torch.tensor(signal_power(self), dtype=torch.float64, device=clean.device)
         at = power[timestep].reshape(-1, *[1] * (clean.ndim - 1))
         return at.sqrt().to(clean.dtype) * clean + (1 - at).sqrt().to(clean.dtype) * noise
 
@@ -147,12 +130,14 @@ def ddim_solve(
 
 
 @lru_cache(maxsize=16)
-def _signal_power(total: int, betas: BetaSchedule) -> tuple[float, ...]:
-    """Return the signal power; schedules of Nichol & Dhariwal 2021, section 3.2, and Ho's linear
-    one scaled to ``total``."""
-    power, powers = 1.0, []
+def signal_power(schedule: NoiseSchedule) -> tuple[float, ...]:
+    """Return a_t for every training timestep, falling from almost 1 to almost 0.
+
+    Schedules of Nichol & Dhariwal 2021, section 3.2, and Ho's linear one scaled to their number.
+    """
+    power, powers, total = 1.0, [], schedule.num_train_timesteps
     for t in range(total):
-        if betas == "linear":
+        if schedule.betas == "linear":
             # 1e-4..0.02 is for 1000 steps; equal noise in fewer steps needs larger betas.
             beta = (1e-4 + (0.02 - 1e-4) * t / max(total - 1, 1)) * 1000 / total
         else:
@@ -168,8 +153,8 @@ def cosine_power(fraction: float) -> float:
 
 
 @lru_cache(maxsize=256)
-def _ddim_steps(total: int, betas: BetaSchedule, count: int) -> tuple[DdimStep, ...]:
-    power = _signal_power(total, betas)
+def _ddim_steps(schedule: NoiseSchedule, count: int) -> tuple[DdimStep, ...]:
+    power, total = signal_power(schedule), schedule.num_train_timesteps
     timesteps = [total * (count - i) // count - 1 for i in range(count)]
     after = [power[t] for t in timesteps[1:]] + [1.0]
     return tuple(

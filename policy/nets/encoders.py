@@ -4,18 +4,11 @@ import torch
 from torch import Tensor, nn
 
 from policy.contract import ACTION_DIM, Contract
-from policy.errors import ContractError, PolicyError
+from policy.errors import ContractError
 from policy.nets.attention import Attention, is_tracing
 from policy.preprocess import egocentric_columns, egocentric_scale
 
 HEADS = 4
-
-
-def require_shape(name: str, array: Tensor, *shape: int) -> None:
-    """Raise a ``PolicyError`` unless ``array`` is [B, *shape]."""
-    if array.ndim != len(shape) + 1 or tuple(array.shape[1:]) != shape:
-        wanted = ", ".join(["B", *map(str, shape)])
-        raise PolicyError(f"{name} must be [{wanted}], got {list(array.shape)}")
 
 
 class StateEncoder(nn.Module):
@@ -34,8 +27,7 @@ class StateEncoder(nn.Module):
             )
         scale = egocentric_scale(contract)
         self.mlp = nn.Sequential(nn.Linear(len(scale), dim), nn.SiLU(), nn.Linear(dim, dim))
-        self._scale: Tensor
-        self.register_buffer("_scale", torch.tensor(scale), persistent=False)
+        self._scale = nn.Buffer(torch.tensor(scale), persistent=False)
 
     def normalise(self, state: Tensor) -> Tensor:
         """Apply ``preprocess.egocentric`` to tensors."""

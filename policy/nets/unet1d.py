@@ -132,8 +132,7 @@ class UNet1d(nn.Module):
         self.film_condition = nn.Sequential(
             nn.SiLU(), nn.Linear(condition_dim, self.film_dim, bias=False)
         )
-        self._frequencies: Tensor
-        self.register_buffer("_frequencies", sinusoid_frequencies(TIME_DIM), persistent=False)
+        self._frequencies = nn.Buffer(sinusoid_frequencies(TIME_DIM), persistent=False)
 
     def film_of_timestep(self, timestep: Tensor) -> Tensor:
         """Return the timesteps' part of FiLM [M, film_dim]; timesteps [M] of any numeric type."""

@@ -8,7 +8,6 @@ NED and FRD, velocities in the horizontal frame that turns with the nose.
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
-from itertools import accumulate
 from typing import Literal, NamedTuple, TypeAlias
 
 from policy.contract import QUATERNION, RATE, VELOCITY, ActionKind, FloatArray
@@ -40,20 +39,19 @@ class Motion(NamedTuple):
     """Replaces the feedback on one axis."""
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class DoubletStep:
+class DoubletStep(NamedTuple):
     """Doublet on one axis: a push to one side, then an equal one to the other side."""
 
     axis: Axis
     share: float
-    begin_s: float
-    """Time since the program began."""
     half_s: float
     """Length of the push to each side."""
     rest_s: float
     """Pause between the two pushes, with a push of 0."""
     settle_s: float
     """Time with feedback after the pushes."""
+    begin_s: float = 0.0
+    """Time since the program began."""
 
     @property
     def back_s(self) -> float:
@@ -74,25 +72,22 @@ class DoubletStep:
         return Push(self.axis, self.share if time_s < self.begin_s + self.half_s else 0.0)
 
 
-class _Plan(NamedTuple):
-    axis: Axis
-    shares: tuple[float, float]
-    half_s: float
-    rest_s: float
-    settle_s: float
+def _twice(axis: Axis, shares: tuple[float, float], *times_s: float) -> tuple[DoubletStep, ...]:
+    return tuple(DoubletStep(axis, share, *times_s) for share in shares)
 
 
 # Each doublet ends without net speed or height. Yaw and climb reach full range; leans do not, since
 # they may be twice as large as expected. All but leans also wait until an overshoot is over.
-_LEANS = (_Plan("roll", (0.3, 0.6), 1.2, 0.0, 3.0), _Plan("pitch", (0.3, 0.6), 1.2, 0.0, 3.0))
-_SPEEDS = (_Plan("roll", (0.3, 0.6), 3.0, 0.0, 3.0), _Plan("pitch", (0.3, 0.6), 3.0, 0.0, 3.0))
-_YAW = _Plan("yaw", (0.5, 1.0), 3.0, 2.0, 3.5)
-_CLIMB = _Plan("climb", (0.6, 1.0), 3.2, 1.7, 3.5)
-_PLANS: dict[ActionKind, tuple[_Plan, ...]] = {
-    "sticks": (*_LEANS, _YAW, _CLIMB),
-    "attitude": (*_LEANS, _YAW),
-    "rates": (*_LEANS, _YAW),
-    "velocity": (*_SPEEDS, _YAW, _CLIMB),
+_LEAN = (0.3, 0.6)
+_LEANS = (*_twice("roll", _LEAN, 1.2, 0.0, 3.0), *_twice("pitch", _LEAN, 1.2, 0.0, 3.0))
+_SPEEDS = (*_twice("roll", _LEAN, 3.0, 0.0, 3.0), *_twice("pitch", _LEAN, 3.0, 0.0, 3.0))
+_YAW = _twice("yaw", (0.5, 1.0), 3.0, 2.0, 3.5)
+_CLIMB = _twice("climb", (0.6, 1.0), 3.2, 1.7, 3.5)
+_STEPS: dict[ActionKind, tuple[DoubletStep, ...]] = {
+    "sticks": (*_LEANS, *_YAW, *_CLIMB),
+    "attitude": (*_LEANS, *_YAW),
+    "rates": (*_LEANS, *_YAW),
+    "velocity": (*_SPEEDS, *_YAW, *_CLIMB),
 }
 
 
@@ -101,20 +96,12 @@ def doublet_steps(action: ActionKind) -> tuple[DoubletStep, ...]:
 
     Thrust has no gain to identify: the height balances it, and only its mean is reported.
     """
-    planned = [(plan, share) for plan in _PLANS[action] for share in plan.shares]
-    lengths = (2 * plan.half_s + plan.rest_s + plan.settle_s for plan, _ in planned)
-    begins = accumulate(lengths, initial=0.0)
-    return tuple(
-        DoubletStep(
-            axis=plan.axis,
-            share=share,
-            begin_s=begin_s,
-            half_s=plan.half_s,
-            rest_s=plan.rest_s,
-            settle_s=plan.settle_s,
-        )
-        for (plan, share), begin_s in zip(planned, begins, strict=False)
-    )
+    steps: list[DoubletStep] = []
+    begin_s = 0.0
+    for step in _STEPS[action]:
+        steps.append(step._replace(begin_s=begin_s))
+        begin_s = steps[-1].end_s + step.settle_s
+    return tuple(steps)
 
 
 def doublet_length_s(action: ActionKind) -> float:

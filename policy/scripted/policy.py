@@ -6,7 +6,7 @@ from typing import get_args
 
 import numpy as np
 
-from policy.contract import ACTION_DIM, STATE_DIM, ActionKind, Contract, FloatArray
+from policy.contract import ACTION_DIM, ActionKind, Contract, FloatArray
 from policy.errors import PolicyError
 from policy.scripted.controllers import (
     CONTROLS,
@@ -63,10 +63,6 @@ class ScriptedPolicy:
             starts_in_air: keep the initial altitude; else climb to the program's.
             contract: image and chunk; frames, kind and modes are set by the policy.
         """
-        if action not in CONTROLS:
-            raise PolicyError(
-                f"scripted programs do not put out {action!r}; use one of {list(CONTROLS)}"
-            )
         self.contract = replace(
             contract,
             state_frame="ned_frd",
@@ -123,8 +119,6 @@ class ScriptedPolicy:
 
         Each action is the program's motion at its own time, with the current feedback.
         """
-        if state.shape != (1, STATE_DIM):
-            raise PolicyError(f"state must be [1, {STATE_DIM}], got {list(state.shape)}")
         now_s = self._now_s()
         measured = measure(state[0])
         climb = self._follow(now_s, measured)

@@ -63,10 +63,7 @@ class Gradients(Generic[M]):
         self.replicas = [trainee, *others]
         """The trainee, and copies that share its weights."""
         self._pool = ThreadPoolExecutor(
-            threads,
-            thread_name_prefix="train",
-            initializer=torch.set_num_threads,
-            initargs=(1,),
+            threads, thread_name_prefix="train", initializer=torch.set_num_threads, initargs=(1,)
         )
 
     def __enter__(self) -> Self:

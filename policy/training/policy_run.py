@@ -1,7 +1,6 @@
 """Training of a policy from flights: encoder and head, then the head alone on stored features."""
 
 import copy
-import json
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import asdict, replace
 from pathlib import Path
@@ -11,14 +10,8 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-from policy.checkpoints.policy_file import (
-    BuiltinPolicy,
-    build_policy,
-    load_checkpoint,
-    read_torch,
-    save_checkpoint,
-)
-from policy.contract import FLIGHT_TERMS, STATE_NAMES
+from policy.checkpoints.policy_file import load_checkpoint, read_torch, save_checkpoint
+from policy.contract import FLIGHT_TERMS
 from policy.data.flight_data import FlightData, Nanoseconds
 from policy.data.flight_folders import read_ages
 from policy.data.frames import FrameStore
@@ -27,8 +20,7 @@ from policy.data.samples import Timeline
 from policy.engines.openvino_cpu import BulkEncoder
 from policy.errors import PolicyError
 from policy.nets.backbones import load_imagenet_state
-from policy.nets.resnet_unet import ResnetUnetConfig
-from policy.nets.toge import TogeConfig
+from policy.nets.toge import BuiltinConfig, BuiltinPolicy, build_policy
 from policy.training.batches import (
     ENCODE_BATCH,
     Batch,
@@ -42,11 +34,10 @@ from policy.training.batches import (
 from policy.training.parallel import StepLoss, computing_in
 from policy.training.report import Hooks, PolicyValidation, TrainResult, Validation
 from policy.training.run import TrainingRun, open_run
-from policy.training.run_folder import Position, RunFolder
+from policy.training.run_folder import RunFolder
 from policy.training.settings import MAX_AGE_MS, TrainingStage, TrainSettings, policy_stages
 from policy.training.trainee import Trainee, refresh_batch_norm, validate
 
-Network: TypeAlias = TogeConfig | ResnetUnetConfig
 Check: TypeAlias = Callable[[Path], float]
 """Flies a checkpoint in closed loop and returns a score; higher is better."""
 
@@ -55,7 +46,6 @@ NORM_IMAGES = 1024
 """Number of images for the final statistics of batch norms."""
 USUAL_AGES_MS = (20.0, 90.0)
 """Image age at a tick for frames at 30 Hz and an encoder latency of 5 to 35 ms."""
-AGE_BIN_MS = 5
 FINE_TUNE_RATE = 1 / 3
 """Learning rate relative to the usual one, for pretrained weights."""
 NS_PER_MS = 1_000_000
@@ -65,7 +55,7 @@ HEAD_RATE = 3
 
 def train_policy(
     flights: Sequence[FlightData],
-    network: Network,
+    network: BuiltinConfig,
     settings: TrainSettings,
     hooks: Hooks,
     check: Check | None = None,
@@ -84,7 +74,7 @@ class _PolicyRun(TrainingRun[Trainee, Batch]):
     def __init__(
         self,
         flights: Sequence[FlightData],
-        network: Network,
+        network: BuiltinConfig,
         settings: TrainSettings,
         folder: RunFolder,
         hooks: Hooks,
@@ -218,7 +208,11 @@ class _PolicyRun(TrainingRun[Trainee, Batch]):
         )
 
     def _write(self, path: Path) -> None:
-        card = _training_card(self.settings, self._flights, self._ages_ns, self.position)
+        card = self.card(
+            flights=len(self._flights),
+            images=sum(len(flight.captured_ns) for flight in self._flights),
+            feature_ages_ms=(self._ages_ns[[0, -1]] / NS_PER_MS).tolist(),
+        )
         policy = copy.deepcopy(self.average.policy)
         save_checkpoint(path, policy, training=card, packed=self.settings.pack)
 
@@ -244,7 +238,7 @@ def _evenly(range_ms: tuple[float, float]) -> Nanoseconds:
     return np.linspace(low_ms * NS_PER_MS, high_ms * NS_PER_MS, 256).astype(np.int64)
 
 
-def _starting_trainee(network: Network, settings: TrainSettings) -> Trainee:
+def _starting_trainee(network: BuiltinConfig, settings: TrainSettings) -> Trainee:
     """Return the policy to start from with a new gate head; keeps torch's random state."""
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(settings.seed)
@@ -256,7 +250,7 @@ def _starting_trainee(network: Network, settings: TrainSettings) -> Trainee:
         return Trainee(policy, settings.gate_weight)
 
 
-def _checkpoint(network: Network, path: Path) -> BuiltinPolicy:
+def _checkpoint(network: BuiltinConfig, path: Path) -> BuiltinPolicy:
     policy = load_checkpoint(path, fallback=network)
     if policy.contract.action != network.contract.action:
         raise PolicyError(
@@ -278,50 +272,5 @@ def _checkpoint(network: Network, path: Path) -> BuiltinPolicy:
     return policy.train()
 
 
-def _source_of_ages(flights: Sequence[FlightData], settings: TrainSettings) -> str:
-    if settings.ages is not None:
-        return "--ages"
-    return "the flights" if _are_ages_measured(flights) else "nowhere: the usual range"
-
-
 def _are_ages_measured(flights: Sequence[FlightData]) -> bool:
     return any((flight.age_ns > 0).any() for flight in flights)
-
-
-def _training_card(
-    settings: TrainSettings,
-    flights: Sequence[FlightData],
-    ages_ns: Nanoseconds,
-    position: Position,
-) -> str:
-    """Return facts about a checkpoint's training, as JSON."""
-    state = np.concatenate([flight.state for flight in flights])
-    target = np.concatenate([flight.target for flight in flights])
-    ages_ms = ages_ns / 1e6
-    edges = np.arange(0, ages_ms.max() + 2 * AGE_BIN_MS, AGE_BIN_MS)
-    card = {
-        "flights": len(flights),
-        "images": sum(len(flight.captured_ns) for flight in flights),
-        "ticks": len(state),
-        "steps": position.step,
-        "batch_size": settings.batch_size,
-        "seed": settings.seed,
-        "mirror": settings.mirror,
-        "world_yaw": "drawn evenly",
-        "gate_weight": settings.gate_weight,
-        "feature_age_ms": {
-            "measured_in": _source_of_ages(flights, settings),
-            "bin_ms": AGE_BIN_MS,
-            "counts_from_0": np.histogram(ages_ms, edges)[0].tolist(),
-        },
-        "state_mean": _by_name(np.nanmean(state, axis=0)),
-        "state_std": _by_name(np.nanstd(state, axis=0)),
-        "stick_mean": target.mean(axis=0).round(4).tolist(),
-        "stick_std": target.std(axis=0).round(4).tolist(),
-        "validation": position.kept,
-    }
-    return json.dumps(card, sort_keys=True)
-
-
-def _by_name(values: np.ndarray[tuple[int, ...], np.dtype[np.float32]]) -> dict[str, float]:
-    return {name: round(float(v), 4) for name, v in zip(STATE_NAMES, values, strict=True)}

@@ -8,6 +8,7 @@ it had not been interrupted.
 """
 
 import copy
+import json
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Sequence
 from contextlib import closing
@@ -20,8 +21,7 @@ from torch import Tensor, nn
 
 from policy.data.flight_data import DatasetError, FlightData, common_frame, hold_out
 from policy.data.frames import FrameStore, store_frames
-from policy.nets.resnet_unet import ResnetUnetConfig
-from policy.nets.toge import TogeConfig
+from policy.nets.toge import BuiltinConfig
 from policy.training.batches import ahead
 from policy.training.parallel import B, Gradients, M, StepLoss
 from policy.training.report import Hooks, TrainingProgress, TrainResult, Validation
@@ -43,9 +43,7 @@ ENCODING_SHARE = 0.4
 
 
 def open_run(
-    settings: RunSettings,
-    network: TogeConfig | ResnetUnetConfig | WorldModelConfig,
-    flights: Sequence[FlightData],
+    settings: RunSettings, network: BuiltinConfig | WorldModelConfig, flights: Sequence[FlightData]
 ) -> RunFolder:
     """Open the folder of a run, to start or resume it."""
     if not settings.out.parent.is_dir():
@@ -136,6 +134,12 @@ class TrainingRun(ABC, Generic[M, B]):
                 self.note(f"{flight.name}: {lost} images are missing at the end of its video")
         kept, held = hold_out(whole, self.settings.validation_fraction, self.settings.seed)
         return whole, store, kept, held
+
+    def card(self, **facts: object) -> str:
+        """Return facts about the training for a checkpoint's reader, as JSON."""
+        asked = {n: v for n, v in vars(self.settings).items() if isinstance(v, int | float)}
+        position = {"steps": self.position.step, "validation": self.position.kept}
+        return json.dumps({**asked, **facts, **position}, sort_keys=True)
 
     def may_encode(self, stage: TrainingStage) -> Callable[[float], bool]:
         """Return a predicate of the completed share: is there time to encode more?"""

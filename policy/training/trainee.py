@@ -7,9 +7,9 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-from policy.checkpoints.policy_file import BuiltinPolicy
 from policy.contract import ACTION_DIM, FloatArray
 from policy.nets.action_head import size_dims
+from policy.nets.toge import BuiltinPolicy
 from policy.training.batches import Batch, normalised
 from policy.training.parallel import StepLoss, computing_in
 from policy.training.report import PolicyValidation
@@ -40,10 +40,8 @@ class Trainee(nn.Module):
         self.policy = policy
         self.gate_head = nn.Linear(size_dims(policy.config.size).base_dim, GATE_LABELS)
         self._gate_weight = gate_weight
-        self.stick_mean: Tensor
-        self.stick_std: Tensor
-        self.register_buffer("stick_mean", torch.zeros(ACTION_DIM))
-        self.register_buffer("stick_std", torch.ones(ACTION_DIM))
+        self.stick_mean = nn.Buffer(torch.zeros(ACTION_DIM))
+        self.stick_std = nn.Buffer(torch.ones(ACTION_DIM))
 
     def set_sticks(self, sticks: FloatArray) -> None:
         """Store the mean and the spread of all sticks [M, 4]."""

@@ -48,10 +48,8 @@ class FrameAutoencoder(nn.Module):
         out = nn.Conv2d(first, 4 * 3, 3, padding=1)
         self.decoder = nn.Sequential(*up, nn.SiLU(), out, nn.PixelShuffle(2))
         self._initialise(out)
-        self.latent_mean: Tensor
-        self.latent_std: Tensor
-        self.register_buffer("latent_mean", torch.zeros(latent_channels))
-        self.register_buffer("latent_std", torch.ones(latent_channels))
+        self.latent_mean = nn.Buffer(torch.zeros(latent_channels))
+        self.latent_std = nn.Buffer(torch.ones(latent_channels))
 
     def _initialise(self, out: nn.Conv2d) -> None:
         """Apply He initialisation and small residuals.
@@ -61,11 +59,11 @@ class FrameAutoencoder(nn.Module):
         for module in self.modules():
             if isinstance(module, nn.Conv2d):
                 nn.init.kaiming_normal_(module.weight, nonlinearity="relu")
-                nn.init.zeros_(_bias(module))
+                nn.init.zeros_(module.bias)  # type: ignore[arg-type]
         residuals = [m.conv2 for m in self.modules() if isinstance(m, ResidualConv)]
         for conv in (*residuals, out):
             conv.weight.data.mul_(_RESIDUAL_GAIN)
-        _, log_variance = _bias(self.moments).data.chunk(2)
+        _, log_variance = self.moments.bias.data.chunk(2)  # type: ignore[union-attr]
         log_variance.fill_(_INITIAL_LOG_VARIANCE)
 
     def posterior(self, images: Tensor) -> tuple[Tensor, Tensor]:
@@ -85,12 +83,6 @@ class FrameAutoencoder(nn.Module):
     def denormalise(self, latents: Tensor) -> Tensor:
         """Undo ``normalise``."""
         return latents * _per_channel(self.latent_std) + _per_channel(self.latent_mean)
-
-
-def _bias(conv: nn.Conv2d) -> Tensor:
-    if conv.bias is None:
-        raise TypeError("all convolutions here have a bias")
-    return conv.bias
 
 
 def to_unit(images: Tensor) -> Tensor:

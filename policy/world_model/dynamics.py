@@ -79,8 +79,7 @@ class LatentDynamics(nn.Module):
         for out in (self.out_patch, self.out_vehicle):  # a new network hardly changes its inputs
             nn.init.normal_(out.weight, std=_INITIAL_STD)
             nn.init.zeros_(out.bias)
-        self._frequencies: Tensor
-        self.register_buffer("_frequencies", sinusoid_frequencies(TIME_DIM), persistent=False)
+        self._frequencies = nn.Buffer(sinusoid_frequencies(TIME_DIM), persistent=False)
 
     def forward(self, noisy: Future, timestep: Tensor, known: Conditioning) -> Future:
         """Return the network's outputs, shaped as the future, for a noisy future and step [B]."""
@@ -91,7 +90,9 @@ class LatentDynamics(nn.Module):
         modulation = self.condition(inputs).unflatten(-1, (MODULATIONS, -1))
         past = known.latents.flatten(1, 2).unsqueeze(1).expand(-1, frames, -1, -1, -1)
         seen = torch.cat([noisy.latents, past, known.warped, known.in_view], dim=2)
-        patches = self.embed_patch(self._patches(seen))
+        # [B, T, C, h, w] -> [B, T, patches, C * patch * patch], and back.
+        cells = F.pixel_unshuffle(seen, self._patch).flatten(3).transpose(2, 3)
+        patches = self.embed_patch(cells)
         knows_each = knows.unsqueeze(1).expand(-1, frames, -1)
         # Sticks are rates: their running sum nearly gives the motion.
         so_far = noisy.actions.cumsum(dim=1) / frames**0.5
@@ -104,22 +105,9 @@ class LatentDynamics(nn.Module):
             tokens = layer(tokens, modulation)
         tokens = self.norm(tokens)
         motion, actions = self.out_vehicle(tokens[:, :, -1]).split([MOTION_DIM, ACTION_DIM], dim=-1)
-        latents = self._unpatched(self.out_patch(tokens[:, :, :-1]))
+        cells = self.out_patch(tokens[:, :, :-1]).transpose(2, 3).unflatten(3, (self._grid,) * 2)
+        latents = F.pixel_shuffle(cells, self._patch)
         return Future(latents=latents, motion=motion, actions=actions)
-
-    def _patches(self, latents: Tensor) -> Tensor:
-        """Rearrange [B, T, C, h, w] -> [B, T, patches, C * patch * patch]."""
-        batch, frames, channels, _, _ = latents.shape
-        grid, patch = self._grid, self._patch
-        split = latents.reshape(batch, frames, channels, grid, patch, grid, patch)
-        return split.permute(0, 1, 3, 5, 2, 4, 6).reshape(batch, frames, grid * grid, -1)
-
-    def _unpatched(self, patches: Tensor) -> Tensor:
-        batch, frames = patches.shape[:2]
-        grid, patch = self._grid, self._patch
-        split = patches.reshape(batch, frames, grid, grid, -1, patch, patch)
-        merged = split.permute(0, 1, 4, 2, 5, 3, 6)
-        return merged.reshape(batch, frames, -1, grid * patch, grid * patch)
 
 
 class _Layer(nn.Module):

@@ -80,13 +80,10 @@ class FrameWarp(nn.Module):
             nn.PixelShuffle(FINER),
         )
         axes = _body_from_camera(config.camera_tilt_rad, state_frame)
-        self._rays: Tensor
-        self._cell_rays_body: Tensor
-        self._body_from_camera: Tensor
-        self.register_buffer("_rays", self._unit_rays(config.image_size), persistent=False)
+        self._rays = nn.Buffer(self._unit_rays(config.image_size), persistent=False)
         cells = self._unit_rays(config.latent_shape[-1]) @ axes.T
-        self.register_buffer("_cell_rays_body", cells, persistent=False)
-        self.register_buffer("_body_from_camera", axes, persistent=False)
+        self._cell_rays_body = nn.Buffer(cells, persistent=False)
+        self._body_from_camera = nn.Buffer(axes, persistent=False)
 
     def source(self, pixels: Tensor, latents: Tensor, vertical_body: Tensor) -> SourceFrame:
         """Estimate the inverse depth of a frame from its pixels and its latents [B, C, h, w].

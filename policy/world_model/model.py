@@ -16,8 +16,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-from policy.contract import ACTION_DIM, STATE_DIM
-from policy.errors import PolicyError
+from policy.contract import ACTION_DIM
 from policy.nets.diffusion import DdimStep
 from policy.world_model.autoencoder import FrameAutoencoder, to_bytes, to_unit
 from policy.world_model.config import FACTOR, WorldModelConfig
@@ -46,15 +45,10 @@ class Imagined:
     """[B, frames, 13] in SI units, in the contract's frame."""
     actions: Tensor
     """[B, frames, 4] sticks, given or decided."""
-    video: Tensor | None
-    """[B, frames, H, W, 3] uint8; None unless requested."""
 
 
 class WorldModel(nn.Module):
-    """Autoencoder and dynamics; all scales are stored with the weights.
-
-    A shape or type that does not fit the model raises a ``PolicyError``.
-    """
+    """Autoencoder and dynamics; all scales are stored with the weights."""
 
     def __init__(self, config: WorldModelConfig) -> None:
         super().__init__()
@@ -64,26 +58,15 @@ class WorldModel(nn.Module):
         self.dynamics = LatentDynamics(config)
         self.motion_predictor = MotionPredictor(config)
         self.frame_warp = FrameWarp(config)
-        self.motion_mean: Tensor
-        self.motion_std: Tensor
-        self.action_mean: Tensor
-        self.action_std: Tensor
-        self.change_std: Tensor
-        self.register_buffer("motion_mean", torch.zeros(config.frames, MOTION_DIM))
-        self.register_buffer("motion_std", torch.tensor(MOTION_SCALE).repeat(config.frames, 1))
-        self.register_buffer("action_mean", torch.zeros(ACTION_DIM))
-        self.register_buffer("action_std", torch.full((ACTION_DIM,), 0.5))
-        self.register_buffer("change_std", torch.ones(config.frames, config.latent_channels, 1, 1))
+        self.motion_mean = nn.Buffer(torch.zeros(config.frames, MOTION_DIM))
+        self.motion_std = nn.Buffer(torch.tensor(MOTION_SCALE).repeat(config.frames, 1))
+        self.action_mean = nn.Buffer(torch.zeros(ACTION_DIM))
+        self.action_std = nn.Buffer(torch.full((ACTION_DIM,), 0.5))
+        self.change_std = nn.Buffer(torch.ones(config.frames, config.latent_channels, 1, 1))
 
     @torch.no_grad()
     def encode(self, images: Tensor) -> Tensor:
         """Encode frames [N, H, W, 3] uint8 to latents [N, C, h, w] of about unit scale."""
-        size = self.config.image_size
-        if images.dtype != torch.uint8 or tuple(images.shape[1:]) != (size, size, 3):
-            raise PolicyError(
-                f"frames must be uint8 [N, {size}, {size}, 3], got {images.dtype} "
-                f"{list(images.shape)}: resize them with policy.preprocess.resize"
-            )
         coder = self.autoencoder
         return coder.normalise(
             _one_by_one(lambda image: coder.posterior(image)[0], to_unit(images))
@@ -92,11 +75,6 @@ class WorldModel(nn.Module):
     @torch.no_grad()
     def decode(self, latents: Tensor) -> Tensor:
         """Decode latents [N, C, h, w] to frames [N, H, W, 3] uint8."""
-        shape = self.config.latent_shape
-        if tuple(latents.shape[1:]) != shape:
-            raise PolicyError(
-                f"latents must be [N, {', '.join(map(str, shape))}], got {list(latents.shape)}"
-            )
         coder = self.autoencoder
         return to_bytes(_one_by_one(coder.reconstruct, coder.denormalise(latents)))
 
@@ -109,40 +87,33 @@ class WorldModel(nn.Module):
         *,
         ddim_steps: int,
         noise_seed: int | torch.Generator,
-        sim_mode: bool,
-        decode_video: bool = False,
     ) -> Imagined:
-        """Imagine one future.
+        """Imagine one future: simulate given actions, or decide on them.
 
         Args:
             latents: [B, context_frames, C, h, w] of the last frames, oldest first.
             states: [B, context_frames, 13] at their exposures, SI units, the contract's frame.
-            actions: [B, frames, 4] in simulation, None in decision.
+            actions: [B, frames, 4] to simulate, None to decide.
             ddim_steps: network calls.
             noise_seed: seed of the initial noise, equal on every device; a generator is
                 advanced.
-            sim_mode: True to simulate given actions, False to decide.
-            decode_video: True to decode all frames.
         """
-        self._require_context(latents, states, actions, sim_mode=sim_mode)
         steps = self.config.schedule.ddim_steps(ddim_steps)
         batch, device = len(latents), latents.device
         noisy = self._initial_noise(batch, noise_seed, device)
         if actions is not None:
             noisy = replace(noisy, actions=self.normalise_actions(actions))
         source = self.source_frame(latents[:, -1], states[:, -1])
-        knows_actions = torch.full((batch,), sim_mode, device=device)
+        knows_actions = torch.full((batch,), actions is not None, device=device)
         known = self.predict_motion(source, latents, states, noisy.actions, knows_actions)
         for step in steps:
             noisy = self._ddim_update(step, noisy, known)
         motion = noisy.motion * self.motion_std + self.motion_mean
         decided = (noisy.actions * self.action_std + self.action_mean).clamp(-1.0, 1.0)
-        video = self.decode(noisy.latents.flatten(0, 1)) if decode_video else None
         return Imagined(
             latents=noisy.latents,
             states=state_after(states[:, -1:], motion),
             actions=decided if actions is None else actions,
-            video=None if video is None else video.reshape(batch, -1, *video.shape[1:]),
         )
 
     def source_frame(self, latents: Tensor, state: Tensor) -> SourceFrame:
@@ -256,24 +227,6 @@ class WorldModel(nn.Module):
             motion=draw(MOTION_DIM),
             actions=draw(ACTION_DIM),
         )
-
-    def _require_context(
-        self, latents: Tensor, states: Tensor, actions: Tensor | None, *, sim_mode: bool
-    ) -> None:
-        config, batch = self.config, len(latents)
-        if sim_mode == (actions is None):
-            raise PolicyError(
-                "simulation (sim_mode=True) takes the actions, decision (sim_mode=False) makes "
-                f"them: actions are {'missing' if actions is None else 'not to be given'}"
-            )
-        past = config.context_frames
-        for name, array, shape in (
-            ("latents", latents, (batch, past, *config.latent_shape)),
-            ("states", states, (batch, past, STATE_DIM)),
-            ("actions", actions, (batch, config.frames, ACTION_DIM)),
-        ):
-            if array is not None and tuple(array.shape) != shape:
-                raise PolicyError(f"{name} must be {list(shape)}, got {list(array.shape)}")
 
 
 def _one_by_one(net: Callable[[Tensor], Tensor], inputs: Tensor) -> Tensor:

@@ -71,19 +71,13 @@ class PlainClass:
     """The whole protocol on a class that is not a module, but holds two."""
 
     contract = DUAL
+    encode_visual: Any = TwoRates.encode_visual
+    predict_fast: Any = TwoRates.predict_fast
+    predict: Any = TwoRates.predict
 
     def __init__(self) -> None:
         whole = TwoRates()
-        self.encoder, self.head = whole.visual_encoder, whole.head
-
-    def encode_visual(self, image: Tensor) -> Tensor:
-        return torch.as_tensor(self.encoder(image))
-
-    def predict_fast(self, feature: Tensor, state: Tensor, history: Tensor, steps: int) -> Tensor:
-        return torch.as_tensor(self.head(feature, state, history))
-
-    def predict(self, image: Tensor, state: Tensor, history: Tensor, steps: int) -> Tensor:
-        return self.predict_fast(self.encode_visual(image), state, history, steps)
+        self.visual_encoder, self.head = whole.visual_encoder, whole.head
 
 
 class Counting(TwoRates):
@@ -114,7 +108,7 @@ class Resetting(TwoRates):
 class Looping(TwoRates):
     def predict_fast(self, feature: Tensor, state: Tensor, history: Tensor, steps: int) -> Tensor:
         chunk = super().predict_fast(feature, state, history, steps)
-        for _ in range(5000):
+        for _ in range(100):
             chunk = chunk + 1e-9
         return chunk
 

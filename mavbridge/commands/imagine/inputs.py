@@ -129,7 +129,6 @@ class Sampler:
                 None if actions is None else self._tensor(actions[None]),
                 ddim_steps=self._ddim_steps,
                 noise_seed=seed,
-                sim_mode=actions is not None,
             )
             sampled_states = imagined.states[0].float().cpu().numpy()
             sampled_actions = imagined.actions[0].float().cpu().numpy()

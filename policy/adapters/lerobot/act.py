@@ -127,8 +127,7 @@ class Act(nn.Module):
         self.decoder_pos_embed = nn.Embedding(config.chunk_size, dim)
         self.action_head = nn.Linear(dim, ACTION_DIM)
         cells = map_size(config.features.image_height, config.features.image_width)
-        self._cell_position: Tensor
-        self.register_buffer("_cell_position", cell_positions(*cells, dim), persistent=False)
+        self._cell_position = nn.Buffer(cell_positions(*cells, dim), persistent=False)
 
     @staticmethod
     def own_name(name: str) -> str | None:

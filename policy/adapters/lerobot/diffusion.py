@@ -126,9 +126,7 @@ class UNet(nn.Module):
             ConvBlock(widths[0], widths[0], config.kernel_size, 8),
             nn.Conv1d(widths[0], ACTION_DIM, 1),
         )
-        self._frequencies: Tensor
-        frequencies = sinusoid_frequencies(self.time_dim)
-        self.register_buffer("_frequencies", frequencies, persistent=False)
+        self._frequencies = nn.Buffer(sinusoid_frequencies(self.time_dim), persistent=False)
 
     def film_of_timestep(self, timestep: Tensor) -> list[Tensor]:
         """Return the part [B, film_dim] of each block's FiLM from float32 timesteps [B]."""
@@ -169,8 +167,7 @@ class SpatialSoftmax(nn.Module):
     def __init__(self, channels: int, keypoints: int, height: int, width: int) -> None:
         super().__init__()
         self.nets = nn.Conv2d(channels, keypoints, 1)
-        self.pos_grid: Tensor
-        self.register_buffer("pos_grid", torch.zeros(height * width, 2))  # comes with the weights
+        self.pos_grid = nn.Buffer(torch.zeros(height * width, 2))  # comes with the weights
 
     def forward(self, cells: Tensor) -> Tensor:
         """Average the cells' positions, weighted by a softmax over the cells."""
@@ -279,7 +276,7 @@ class Diffusion(nn.Module):
         each += len(EXTRA_NAMES["goal"]) if config.features.takes_goal else 0
         self.unet = UNet(config, each * config.n_obs_steps)
         noise = torch.zeros(1, config.predicted, ACTION_DIM)
-        self.register_buffer("initial_noise", noise, persistent=False)
+        self.initial_noise = nn.Buffer(noise, persistent=False)
 
     @staticmethod
     def own_name(name: str) -> str | None:

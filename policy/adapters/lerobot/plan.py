@@ -76,18 +76,22 @@ class _Statistics:
     """Statistics by feature and name, and the normalisation mode of each kind of feature."""
 
     path: Path
+    asked: Mapping[str, str]
+    """Modes of config.json; a processor may have others."""
     modes: Mapping[str, str]
     epsilon: float
     arrays: Mapping[str, Mapping[str, FloatArray]]
 
-    def affine(self, key: str, kind: str) -> Affine | None:
-        """Return the transformation of one feature; None: unchanged."""
+    def affine(self, key: str, kind: str, notes: list[str]) -> Affine | None:
+        """Return the transformation of one feature; None: unchanged, and if unasked a note."""
         mode, own = self.modes.get(kind, "IDENTITY"), self.arrays.get(key, {})
         if mode not in MODES:
             raise CheckpointError(
                 f"{self.path}: normalises {key} by {mode!r}; supported are {', '.join(MODES)}"
             )
         if mode == "IDENTITY" or not own:
+            if self.asked.get(kind, "IDENTITY") != "IDENTITY":
+                notes.append(warned(f"{self.path} holds no statistics of {key}: not normalised"))
             return None
         if missing := [name for name in MODES[mode] if name not in own]:
             raise CheckpointError(
@@ -109,47 +113,33 @@ def read_normalisation(folder: Path, features: Features) -> tuple[Normalisation,
     """Read a policy's normalisation, with notes for the user."""
     renamed: dict[str, str] = {}
     if (folder / PREPROCESSOR).is_file():
-        inputs, renamed = _processor(folder / PREPROCESSOR, "normalizer_processor")
-        outputs, _ = _processor(folder / POSTPROCESSOR, "unnormalizer_processor")
+        inputs, renamed = _processor(folder / PREPROCESSOR, "normalizer_processor", features)
+        outputs, _ = _processor(folder / POSTPROCESSOR, "unnormalizer_processor", features)
     else:
         inputs = outputs = _in_weights(folder, features)
+    notes: list[str] = []
+    state = inputs.affine(STATE_KEY, "STATE", notes) if features.state_dim else None
+    if state is not None and (constant := np.flatnonzero(state.divisor < _CONSTANT).tolist()):
+        told = f"numbers {constant} (from 0) of {STATE_KEY} never changed in the training data"
+        notes.append(
+            warned(f"{told}: as in LeRobot, any other value is divided by almost 0 and dominates")
+        )
     normalisation = Normalisation(
-        images={key: inputs.affine(key, "VISUAL") for key in features.image_keys},
-        state=inputs.affine(STATE_KEY, "STATE") if features.state_dim else None,
-        goal=inputs.affine(ENVIRONMENT_KEY, "ENV") if features.takes_goal else None,
-        action=outputs.affine(ACTION_KEY, "ACTION"),
+        images={key: inputs.affine(key, "VISUAL", notes) for key in features.image_keys},
+        state=state,
+        goal=inputs.affine(ENVIRONMENT_KEY, "ENV", notes) if features.takes_goal else None,
+        action=outputs.affine(ACTION_KEY, "ACTION", notes),
         renamed=renamed,
     )
-    return normalisation, _notes(folder, features, normalisation)
+    return normalisation, notes
 
 
-def _notes(folder: Path, features: Features, normalisation: Normalisation) -> list[str]:
-    """Warn of normalisations that LeRobot computes silently and that are seldom intended."""
-    found = [(key, "VISUAL", affine) for key, affine in normalisation.images.items()]
-    found += [(ACTION_KEY, "ACTION", normalisation.action)]
-    found += [(ENVIRONMENT_KEY, "ENV", normalisation.goal)] if features.takes_goal else []
-    found += [(STATE_KEY, "STATE", normalisation.state)] if features.state_dim else []
-    notes: list[str] = [
-        warned(f"{folder} holds no statistics of {key}: it flies as it is, not normalised")
-        for key, kind, affine in found
-        if affine is None and features.modes.get(kind, "IDENTITY") != "IDENTITY"
-    ]
-    state = normalisation.state
-    if state is not None and (constant := np.flatnonzero(state.divisor < _CONSTANT).tolist()):
-        notes.append(
-            warned(
-                f"numbers {constant} (from 0) of {STATE_KEY} never changed in the training "
-                "data: any other value is divided by almost nothing, as in LeRobot, and rules the "
-                "chunk"
-            )
-        )
-    return notes
-
-
-def _processor(path: Path, normaliser: str) -> tuple[_Statistics, dict[str, str]]:
+def _processor(
+    path: Path, normaliser: str, features: Features
+) -> tuple[_Statistics, dict[str, str]]:
     """Read the steps of a processor: at most one normalisation, and renamings."""
     renamed: dict[str, str] = {}
-    found = _Statistics(path=path, modes={}, epsilon=0.0, arrays={})
+    found = _Statistics(path=path, asked=features.modes, modes={}, epsilon=0.0, arrays={})
     steps = read_json(path).get("steps")
     if not isinstance(steps, list) or not all(isinstance(step, dict) for step in steps):
         raise CheckpointError(f"{path}: no list of steps")
@@ -162,7 +152,7 @@ def _processor(path: Path, normaliser: str) -> tuple[_Statistics, dict[str, str]
             arrays = _by_feature(_read_arrays(path.parent / file)) if file else {}
             kept = {k: v for k, v in arrays.items() if only is None or k in (*only, ACTION_KEY)}
             modes, epsilon = config.get("norm_map", {}), float(config.get("eps", _EPSILON))
-            found = _Statistics(path=path, modes=modes, epsilon=epsilon, arrays=kept)
+            found = replace(found, modes=modes, epsilon=epsilon, arrays=kept)
         elif name not in _HARMLESS:
             raise CheckpointError(
                 f"{path}: the step {name!r} is not supported: serve the policy from its own "
@@ -185,7 +175,8 @@ def _in_weights(folder: Path, features: Features) -> _Statistics:
     keys = {key: sides[0] + key.replace(".", "_") for key in names}
     keys[ACTION_KEY] = sides[1] + ACTION_KEY
     arrays = {key: found[name] for key, name in keys.items() if name in found}
-    return _Statistics(path=path, modes=features.modes, epsilon=_EPSILON, arrays=arrays)
+    modes = features.modes
+    return _Statistics(path=path, asked=modes, modes=modes, epsilon=_EPSILON, arrays=arrays)
 
 
 def _by_feature(arrays: Mapping[str, FloatArray]) -> dict[str, dict[str, FloatArray]]:

@@ -1,14 +1,4 @@
-"""Files of an ONNX policy.
-
-DIR/encoder.onnx     image -> feature; with it the policy flies at two rates
-DIR/denoiser.onnx    noisy, timestep, feature, state, action_history -> prediction: one step of
-                     a diffusion policy; mavbridge runs the loop
-DIR/head.onnx        instead of denoiser.onnx: feature, state, action_history -> chunk
-DIR/policy.onnx      alone, or one file instead of a folder: image, state, action_history ->
-                     chunk
-DIR/policy.json      as ``description`` says; a denoiser needs its schedule
-DIR/mavbridge.toml   the contract, as for --contract, if policy.json has none
-"""
+"""Files of an ONNX policy, by the names that docs/policy_exported.md lists."""
 
 import re
 from dataclasses import dataclass

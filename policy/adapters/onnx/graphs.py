@@ -3,7 +3,7 @@
 import hashlib
 import re
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -13,7 +13,7 @@ from policy.adapters.onnx.files import read_graph
 from policy.contract import FloatArray
 from policy.engines.openvino_compile import Graph, GraphCompiler, signal_stack_kept
 from policy.engines.runner import Precision, Shape
-from policy.errors import CheckpointError, PolicyError
+from policy.errors import CheckpointError
 from policy.files import last_line
 
 _ALONE = {2: "state", 4: "image"}
@@ -28,20 +28,6 @@ class Wanted:
 
     names: tuple[str, ...]
     shape: Shape
-
-
-@dataclass(frozen=True, kw_only=True)
-class Ports:
-    """Inputs and outputs that a caller expects of a graph."""
-
-    inputs: Mapping[str, Wanted]
-    """By role."""
-    result: str
-    """Result of the graph, one of ``description.RESULTS``."""
-    output: str | int | None = None
-    """Name or index of the result's output; None if there is only one output."""
-    hidden: Mapping[str, str] = field(default_factory=dict)
-    """Output that feeds each hidden input at the next call, as far as the user gave it."""
 
 
 class RoleGraph:
@@ -76,31 +62,43 @@ class GraphFile:
     """ONNX file that is read once and can be compiled at any precision."""
 
     @signal_stack_kept()
-    def __init__(self, path: Path, ports: Ports) -> None:
+    def __init__(
+        self,
+        path: Path,
+        inputs: Mapping[str, Wanted],
+        result: str,
+        output: str | int | None = None,
+        hidden: Mapping[str, str] | None = None,
+    ) -> None:
+        """Read a file, and find the expected inputs, by role, and the output.
+
+        ``result`` is one of ``description.RESULTS``; ``output`` and ``hidden`` are as there.
+        """
         self._path = path
         model = read_graph(path)
-        pairs = self._hidden_pairs(model, ports)
+        pairs = self._hidden_pairs(model, hidden or {})
         visible = [port for port in model.inputs if not port.get_names() & set(pairs)]
         roles = [
             next(iter(port.get_names() & set(pairs)), "")
-            or self._role(port, ports.inputs, is_alone=len(visible) == 1)
+            or self._role(port, inputs, is_alone=len(visible) == 1)
             for port in model.inputs
         ]
         if len(set(roles)) < len(roles):
-            raise CheckpointError(f"{path}: two inputs are the {_twice(roles)}")
+            raise CheckpointError(f"{path}: two inputs have one role: {roles}")
         self.roles = roles
         self.takes_bytes = self._require_types(model, roles, pairs)
         """True if the image is uint8, 0 to 255."""
         self.hidden = {
-            name: _sizes(model.inputs[roles.index(name)], open_size=1)
-            for name in roles
-            if name in pairs
+            name: _sizes(model.inputs[roles.index(name)]) for name in roles if name in pairs
         }
-        kept = [self._output(model, ports, pairs), *(model.output(pairs[n]) for n in self.hidden)]
+        kept = [
+            self._output(model, result, output, pairs),
+            *(model.output(pairs[n]) for n in self.hidden),
+        ]
         self._model = ov.Model(
             [port.get_node().input_value(0) for port in kept], model.get_parameters(), "policy"
         )
-        self._make_static({role: each.shape for role, each in ports.inputs.items()} | self.hidden)
+        self._make_static({role: each.shape for role, each in inputs.items()} | self.hidden)
         self.output_shape = tuple(self._model.outputs[0].shape)
 
     @signal_stack_kept()
@@ -115,7 +113,7 @@ class GraphFile:
         graph = compiler.compile("onnx", precision, lambda: self._model)
         return RoleGraph(graph, self.roles, self.output_shape, self.hidden)
 
-    def _hidden_pairs(self, model: "ov.Model", ports: Ports) -> dict[str, str]:
+    def _hidden_pairs(self, model: "ov.Model", given: Mapping[str, str]) -> dict[str, str]:
         """Return the output that feeds each hidden input at the next call, by name."""
         inputs, outputs = (
             {name for port in side for name in port.get_names()}
@@ -126,18 +124,18 @@ class GraphFile:
             for name in inputs
             if (found := _HIDDEN_IN.fullmatch(name)) is not None
         }
-        pairs = {name: out for name, out in pairs.items() if out in outputs} | dict(ports.hidden)
+        pairs = {name: out for name, out in pairs.items() if out in outputs} | dict(given)
         for name, out in pairs.items():
             if name not in inputs or out not in outputs:
                 raise CheckpointError(
                     f'{self._path} has no input {name} with an output {out}, as "hidden" in '
                     f"policy.json says; it has {sorted(inputs)} and {sorted(outputs)}"
                 )
-            taken, given = (_sizes(port, 1) for port in (model.input(name), model.output(out)))
-            if taken != given:
+            taken, made = (_sizes(port) for port in (model.input(name), model.output(out)))
+            if taken != made:
                 raise CheckpointError(
                     f"{self._path}: hidden input {name} is {list(taken)} and its output {out} "
-                    f"{list(given)}: they must be of one shape"
+                    f"{list(made)}: they must be of one shape"
                 )
         return pairs
 
@@ -175,13 +173,14 @@ class GraphFile:
                 raise CheckpointError(f"{self._path}: hidden output of type {kind}, not a float")
         return takes_bytes
 
-    def _output(self, model: "ov.Model", ports: Ports, pairs: Mapping[str, str]) -> "ov.Output":
+    def _output(
+        self, model: "ov.Model", result: str, asked: str | int | None, pairs: Mapping[str, str]
+    ) -> "ov.Output":
         """Return the output that holds the requested result."""
         visible = [port for port in model.outputs if not port.get_names() & set(pairs.values())]
         names = [
             ", ".join(sorted(port.get_names())) or f"number {at}" for at, port in enumerate(visible)
         ]
-        asked = ports.output
         chosen = [
             port for at, port in enumerate(visible) if asked in port.get_names() or asked == at
         ]
@@ -190,13 +189,13 @@ class GraphFile:
         if len(chosen) != 1:
             said = f"no output {asked!r}" if asked is not None else f"{len(visible)} outputs"
             raise CheckpointError(
-                f"{self._path} has {said} ({'; '.join(names)}): say which is the {ports.result}, "
-                f'in policy.json beside it, "outputs": {{"{ports.result}": "its name"}}'
+                f"{self._path} has {said} ({'; '.join(names)}): say which is the {result}, "
+                f'in policy.json beside it, "outputs": {{"{result}": "its name"}}'
             )
         kind = chosen[0].get_element_type().get_type_name()
         if kind not in _FLOATS:
             raise CheckpointError(
-                f"{self._path}: its {ports.result} is of type {kind}, and the contract's numbers "
+                f"{self._path}: its {result} is of type {kind}, and the contract's numbers "
                 "are not whole: what do they count? Export the continuous actions"
             )
         return chosen[0]
@@ -224,21 +223,9 @@ class GraphFile:
             ) from error
 
 
-def require_roles(file: GraphFile, path: Path, roles: tuple[str, ...]) -> None:
-    """Raise PolicyError if a graph lacks an input that its part in the policy requires."""
-    if missing := [role for role in roles if role not in file.roles]:
-        raise PolicyError(f"{path} takes {file.roles}, but not the {' and the '.join(missing)}")
-
-
-def _sizes(port: "ov.Output", open_size: int) -> Shape:
-    """Return a port's shape, with ``open_size`` for each axis of unknown size."""
-    return tuple(
-        size.get_length() if size.is_static else open_size for size in port.get_partial_shape()
-    )
-
-
-def _twice(roles: list[str]) -> str:
-    return next(role for role in roles if roles.count(role) > 1)
+def _sizes(port: "ov.Output") -> Shape:
+    """Return a port's shape, with 1 for each axis of unknown size."""
+    return tuple(size.get_length() if size.is_static else 1 for size in port.get_partial_shape())
 
 
 def _digest(path: Path, model: ov.Model) -> str:

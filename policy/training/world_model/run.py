@@ -1,6 +1,5 @@
 """Training of a world model from flights: the autoencoder, then the dynamics on stored latents."""
 
-import json
 from collections.abc import Callable, Sequence
 
 import numpy as np
@@ -140,21 +139,9 @@ class _WorldModelRun(TrainingRun[WorldModel, FrameBatch | WindowBatch]):
             )
 
     def export(self) -> None:
-        settings = self.settings
-        card = {
-            "flights": self._flights,
-            "images": len(self._frames),
-            "windows": len(self._windows),
-            "steps": self.position.step,
-            "batch_size": settings.batch_size,
-            "window_batch_size": settings.window_batch_size,
-            "seed": settings.seed,
-            "mirror": settings.mirror,
-            "decision_share": settings.decision_share,
-            "autoencoder": "trained" if settings.start_from is None else "kept",
-            "validation": self.position.kept,
-        }
-        save_world_model(settings.out, self.average, training=json.dumps(card, sort_keys=True))
+        counts = {"flights": self._flights, "images": len(self._frames)}
+        card = self.card(**counts, windows=len(self._windows))
+        save_world_model(self.settings.out, self.average, training=card)
 
     @torch.no_grad()
     def _encode_images(self, frames: Indices, is_mirrored: bool) -> Tensor:

@@ -1,6 +1,5 @@
 import json
 from dataclasses import fields, replace
-from typing import Any
 
 import numpy as np
 import pytest
@@ -12,15 +11,7 @@ from mavbridge.config.rates import Rates
 from mavbridge.flight.observation import observation_ages_ns
 from mavbridge.flight.settings import effective_freshness
 from policy.checkpoints.header import read_contract
-from policy.contract import (
-    AGE,
-    ROTATION,
-    SINCE_EXPOSURE_NAMES,
-    STATE_NAMES,
-    VELOCITY_CHANGE,
-    Contract,
-    history_ages_ns,
-)
+from policy.contract import Contract, history_ages_ns
 from policy.errors import ContractError
 from policy.loading.builtin import SHIPPED
 from policy.preprocess import least_source_px
@@ -52,53 +43,37 @@ def test_shapes_grow_by_cameras_observations_and_extras() -> None:
     assert past.state_names[20:] == ("height_above_home_m", "goal_x_m", "goal_y_m", "goal_z_m")
     assert (past.feature_shape, past.image_shape) == ((2, 128), (2, 2, 3, 48, 96))
     assert replace(one, observation_steps=2).image_shape == (2, 3, 48, 96)
-    assert Contract.from_json(past.to_json()) == past
-
-
-def test_the_appended_names_lie_where_their_slices_say() -> None:
-    names = STATE_NAMES + SINCE_EXPOSURE_NAMES
-    assert names[AGE] == ("age_s",)
-    assert all(name.startswith("rotation_") for name in names[ROTATION])
-    assert all(name.startswith("velocity_change_") for name in names[VELOCITY_CHANGE])
-    assert VELOCITY_CHANGE.stop == len(names)
+    depth = replace(eyes, image_channels="depth")
+    assert (depth.image_shape, depth.picture_shape) == ((2, 1, 48, 96), (48, 96))
 
 
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
         ({"cameras": "front"}, "cameras must be a list"),
-        ({"cameras": []}, "one or more different names"),
         ({"cameras": ["front", "front"]}, "one or more different names"),
         ({"cameras": [1]}, "malformed"),
         ({"camera_rates_hz": [30.0, 10.0]}, "a rate in"),
         ({"image_crop": [0.0, 0.0, 1.0]}, "top, left, bottom, right"),
-        ({"image_crop": [0.5, 0.0, 0.5, 1.0]}, "top, left, bottom, right"),
         ({"image_fit": "squash"}, "'stretch' or 'crop' or 'pad'"),
         ({"image_channels": "depth", "image_mean_rgb": [0.0, 0.0, 0.0]}, "image_mean_rgb"),
-        ({"observation_steps": 0}, "observation_steps must be an integer in 1..16"),
         ({"state_extras": ["speed"]}, "goal, height, altitude"),
-        ({"state_extras": ["goal", "goal"]}, "each once"),
         ({"play_s": 0.9}, "at most the 0.8 s of a chunk"),
         ({"version": 3}, "version 3 is not supported"),
         ({"horizon": 0}, "horizon must be an integer in"),
-        ({"image_height": 224.0}, "image_height must be an integer"),
-        ({"image_mean_rgb": [0.5, 0.5]}, "three numbers"),
         ({"image_std_rgb": [0.2, 0.2, 0.0]}, "three numbers in"),
         ({"since_exposure": 1}, "since_exposure must be true or false"),
         ({"colour": "bgr"}, "unknown contract keys"),
-        ({"version": "2"}, "this build reads versions 4 to 6"),
         ({"action": "torque"}, "'torque' is unknown; use one of sticks, rates, attitude, velocity"),
         ({"action": "velocity", "modes": ["GUIDED_NOGPS"]}, "known are GUIDED, OFFBOARD"),
         ({"throttle_dead_zone": 1.0}, "throttle_dead_zone must be in"),
         ({"modes": "ALT_HOLD"}, "at least one mode"),
         ({"modes": ["ALT_HOLD", "GUIDED"]}, r"\['GUIDED'\] are not flown with sticks; known are"),
-        ({"modes": [["ALT_HOLD"]]}, "known are STABILIZE"),
         ({"max_state_age_s": 0}, r"max_state_age_s must be in \[0.001, 60\] seconds, got 0"),
-        ({"max_chunk_age_s": float("nan")}, "max_chunk_age_s must be in"),
         ({"max_tilt_deg": 181}, r"max_tilt_deg must be in \[0.001, 180\] degrees"),
     ],
 )
-def test_refuses_what_cannot_be_kept(changes: dict[str, object], message: str) -> None:
+def test_invalid_fields_are_refused(changes: dict[str, object], message: str) -> None:
     text = json.dumps({**json.loads(Contract().to_json()), **changes})
     with pytest.raises(ContractError, match=message):
         Contract.from_json(text)
@@ -122,8 +97,8 @@ EXTREMES = st.one_of(
     value=st.one_of(EXTREMES, st.lists(EXTREMES, max_size=4), st.lists(EXTREMES).map(tuple)),
     through_json=st.booleans(),
 )
-@settings(max_examples=2000, deadline=None)
-def test_every_value_of_every_field_makes_a_contract_or_an_error(name, value, through_json):
+@settings(max_examples=1000, deadline=None)
+def test_any_value_of_any_field_gives_a_contract_or_an_error(name, value, through_json):
     """One that is made can be written, read, and computed with."""
     try:
         if through_json:
@@ -153,15 +128,7 @@ def test_every_value_of_every_field_makes_a_contract_or_an_error(name, value, th
         assert effective_freshness(contract, Limits()).state_ns >= 0
 
 
-@pytest.mark.parametrize("text", ["", "[]", "{", "null"])
-def test_refuses_what_is_no_json_object(text: str) -> None:
+@pytest.mark.parametrize("text", ["", "[]", "{"])
+def test_text_that_is_no_json_object_is_refused(text: str) -> None:
     with pytest.raises(ContractError):
         Contract.from_json(text)
-
-
-@pytest.mark.parametrize("changes", [{}, {"cameras": ("left", "right"), "observation_steps": 2}])
-def test_depth_has_one_channel_in_place_of_three(changes: dict[str, Any]) -> None:
-    colour, depth = Contract(**changes), Contract(image_channels="depth", **changes)
-    assert depth.image_shape == (*colour.image_shape[:-3], 1, *colour.image_shape[-2:])
-    assert (colour.picture_shape, depth.picture_shape) == ((224, 224, 3), (224, 224))
-    assert Contract.from_json(depth.to_json()) == depth

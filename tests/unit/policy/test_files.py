@@ -1,4 +1,5 @@
 import os
+import re
 from pathlib import Path
 
 import pytest
@@ -6,15 +7,7 @@ import pytest
 from mavbridge.__main__ import main
 from policy.adapters.interface import read_interface
 from policy.errors import ContractError
-from policy.files import (
-    MAX_TOML_BYTES,
-    open_regular,
-    parse_json,
-    read_json,
-    read_text,
-    read_toml,
-    user_path,
-)
+from policy.files import MAX_TOML_BYTES, open_regular, parse_json, read_toml
 
 
 def test_a_pipe_is_no_file_and_is_not_waited_for(tmp_path: Path) -> None:
@@ -24,7 +17,7 @@ def test_a_pipe_is_no_file_and_is_not_waited_for(tmp_path: Path) -> None:
             open_regular(path)
 
 
-@pytest.mark.parametrize("text", ["[" * 200_000, '{"a":' * 100_000, "[" * 2_000 + "1,"])
+@pytest.mark.parametrize("text", ["[" * 200_000, "[" * 2_000 + "1,"])
 def test_json_that_is_nested_too_deeply_is_a_value_error(text: str) -> None:
     with pytest.raises(ValueError, match=r"nested too deeply|Expecting value"):
         parse_json(text)
@@ -37,12 +30,13 @@ def test_json_that_is_nested_too_deeply_is_a_value_error(text: str) -> None:
         (b"a." * 30_000 + b"a = 1", "a line of it has 60005 characters"),
         ('"\u2028".'.encode() * 5_000 + b"a = 1", "a line of it has 20005 characters"),
         (b"#" * (MAX_TOML_BYTES + 1), "larger than 64 KiB"),
-        (b"\xff\xfe", "UTF-16"),
-        (b"a = '\xe4'", "not UTF-8"),
+        (b"\xff\xfe", "UTF-16 or UTF-32"),
+        (b"a = 1\nb = '\xe4'", "not UTF-8 text .line 2"),
+        (b"version https://git-lfs.github.com/spec/v1\noid sha256:0\n", "git lfs pull"),
         (b"a = \0", "Invalid"),
     ],
 )
-def test_toml_that_would_fill_the_memory_is_refused(content, told, tmp_path, capsys):
+def test_settings_that_are_no_text_or_fill_the_memory_are_refused(content, told, tmp_path, capsys):
     path = tmp_path / "settings.toml"
     path.write_bytes(content)
     with pytest.raises(ValueError, match=told):
@@ -52,39 +46,13 @@ def test_toml_that_would_fill_the_memory_is_refused(content, told, tmp_path, cap
     with pytest.raises(SystemExit) as ended:
         main(["--config", str(path), "--connect", "udp:127.0.0.1:1"])
     assert ended.value.code == 2
-    assert told in capsys.readouterr().err.replace("\n", " ")
+    assert re.search(told, capsys.readouterr().err.replace("\n", " "))
 
 
-@pytest.mark.parametrize("newline", ["\n", "\r\n"])
-def test_text_of_windows_editors_is_read(tmp_path: Path, newline: str) -> None:
+def test_text_of_windows_editors_is_read(tmp_path: Path) -> None:
     path = tmp_path / "settings.toml"
-    path.write_bytes(b"\xef\xbb\xbf" + f'a = 1{newline}b = "x"{newline}'.encode())
+    path.write_bytes(b'\xef\xbb\xbfa = 1\r\nb = "x"\r\n')
     assert read_toml(path) == {"a": 1, "b": "x"}
-    path.write_bytes(b"\xef\xbb\xbf" + b'{"a": 1}')
-    assert read_json(path) == {"a": 1}
-
-
-@pytest.mark.parametrize(
-    ("content", "told"),
-    [
-        ("a".encode("utf-16"), "UTF-16"),
-        ("a".encode("utf-32"), "UTF-16 or UTF-32"),
-        (b"a = 1\nb = '\xe4'", r"line 2"),
-        (b"version https://git-lfs.github.com/spec/v1\noid sha256:0\n", "git lfs pull"),
-        (b"<!DOCTYPE html><html>", "web page"),
-    ],
-)
-def test_what_is_no_text_is_named(tmp_path: Path, content: bytes, told: str) -> None:
-    path = tmp_path / "config.json"
-    path.write_bytes(content)
-    with pytest.raises(ValueError, match=told):
-        read_text(path)
-
-
-def test_a_home_directory_is_expanded(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setenv("HOME", "/home/me")
-    assert user_path("~/act") == Path("/home/me/act")
-    assert user_path("~nobody-of-this-name/act") == Path("~nobody-of-this-name/act")
 
 
 @pytest.mark.parametrize(

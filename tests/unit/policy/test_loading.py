@@ -9,13 +9,12 @@ import numpy as np
 import pytest
 import torch
 
-from policy.checkpoints.policy_file import build_policy, save_checkpoint
+from policy.checkpoints.policy_file import save_checkpoint
 from policy.contract import Contract
 from policy.errors import PolicyError
 from policy.loading.load import check_request, load_policy, read_policy_contract
 from policy.loading.request import LoadedPolicy, PolicyRequest
-from policy.nets.resnet_unet import ResnetUnetConfig
-from policy.nets.toge import Toge
+from policy.nets.toge import ResnetUnetConfig, Toge, build_policy
 from policy.stick_loop import StickLoop, by_rates, rates_contract
 
 RGB = np.full((48, 64, 3), 90, np.uint8)
@@ -25,7 +24,7 @@ HISTORY = np.zeros((1, 4, 4), np.float32)
 
 def load(spec: str, **changes: Any) -> LoadedPolicy:
     # Policies that compute in numpy have no choice of engines.
-    engine = "auto" if spec.startswith(("scripted", "my_user_policies")) else "torch"
+    engine = "auto" if spec.startswith("scripted") else "torch"
     request = PolicyRequest(**{"spec": spec, "engine": engine, "num_diffusion_steps": 2, **changes})
     return load_policy(request, now_s=lambda: 0.0)
 
@@ -43,37 +42,23 @@ def checkpoint(small_toge: Toge, tmp_path_factory: pytest.TempPathFactory) -> Pa
 
 
 @pytest.mark.parametrize(
-    ("spec", "action"),
+    ("spec", "starts_in_air", "action", "climbs"),
     [
-        ("scripted", "sticks"),
-        ("scripted:hover", "sticks"),
-        ("scripted:hover:air", "sticks"),
-        ("scripted:square:velocity", "velocity"),
-        ("scripted:doublet:rates:air", "rates"),
+        ("scripted", False, "sticks", True),
+        ("scripted", True, "sticks", False),
+        ("scripted:hover:velocity:air", True, "velocity", False),
+        ("scripted:hover:velocity", False, "velocity", True),
+        ("scripted:doublet:rates:air", False, "rates", None),
     ],
 )
-def test_scripted_flies_dual_rate_without_weights(spec: str, action: str) -> None:
-    loaded = load(spec, image_size=64)
-    assert loaded.runner.contract.action == action
+def test_scripted_programs_fly_without_weights(spec, starts_in_air, action, climbs):
+    loaded = load(spec, starts_in_air=starts_in_air, image_size=64)
+    contract = loaded.runner.contract
+    assert (contract.action, contract.image_height) == (action, 64)
     assert loaded.runner.dual_rate
-    assert loaded.runner.contract.image_height == 64
-    assert act(loaded).shape == (1, 16, 4)
-
-
-@pytest.mark.parametrize(
-    ("spec", "starts_in_air", "climbs"),
-    [
-        ("scripted", False, True),
-        ("scripted", True, False),
-        ("scripted:hover:velocity:air", False, False),
-        ("scripted:hover:velocity:air", True, False),
-        ("scripted:hover:velocity", False, True),
-    ],
-)
-def test_a_scripted_program_climbs_unless_it_starts_in_the_air(spec, starts_in_air, climbs):
-    action = act(load(spec, starts_in_air=starts_in_air))[0, 0]
-    up = -action[2] if "velocity" in spec else action[0]
-    assert bool(up > 0.2) is climbs
+    first = act(loaded)[0, 0]
+    if climbs is not None:
+        assert bool((-first[2] if action == "velocity" else first[0]) > 0.2) is climbs
 
 
 def test_torch_is_imported_by_neither_scripted_policies_nor_cheap_checks() -> None:
@@ -91,7 +76,7 @@ def test_torch_is_imported_by_neither_scripted_policies_nor_cheap_checks() -> No
 def test_untrained_weights_are_seeded_and_said() -> None:
     torch_state = torch.random.get_rng_state()
     first, again, other = (
-        load("toge:small:resnet18", allow_untrained=True, image_size=32, seed=seed)
+        load("toge:small:resnet8", allow_untrained=True, image_size=32, seed=seed)
         for seed in (3, 3, 4)
     )
     assert "untrained: seeded random weights (seed 3, noise too)" in first.notes[0]
@@ -109,18 +94,14 @@ def test_the_fastest_engine_that_agrees_flies_and_is_named(checkpoint: Path) -> 
     np.testing.assert_allclose(act(fast), act(reference), atol=0.01)
 
 
-@pytest.mark.parametrize("spec", ["toge", "toge:small", "toge:small:resnet18", "toge:resnet18"])
-def test_a_checkpoint_decides_what_is_built(spec: str, checkpoint: Path, small_toge: Toge) -> None:
-    loaded = load(spec, checkpoint=checkpoint)
-    assert loaded.runner.contract == small_toge.contract
-    assert loaded.runner.dual_rate
-    assert "(small, resnet18)" in loaded.notes[0]
-
-
-@pytest.mark.parametrize("spec", ["toge:medium", "toge:efficientnet_b3"])
-def test_a_spec_that_contradicts_the_checkpoint_is_refused(spec: str, checkpoint: Path) -> None:
-    with pytest.raises(PolicyError, match="holds small:resnet18"):
-        load(spec, checkpoint=checkpoint)
+def test_a_checkpoint_decides_what_is_built(checkpoint: Path, small_toge: Toge) -> None:
+    for spec in ("toge", "toge:small:resnet8"):
+        loaded = load(spec, checkpoint=checkpoint)
+        assert loaded.runner.contract == small_toge.contract
+        assert "(small, resnet8)" in loaded.notes[0]
+    for spec in ("toge:medium", "toge:efficientnet_b3"):
+        with pytest.raises(PolicyError, match="holds small:resnet8"):
+            load(spec, checkpoint=checkpoint)
 
 
 def test_a_policy_without_fast_path_becomes_single_rate_with_one_warning(tmp_path: Path) -> None:
@@ -131,10 +112,8 @@ def test_a_policy_without_fast_path_becomes_single_rate_with_one_warning(tmp_pat
         load("resnet-unet", checkpoint=path, dual_rate=dual_rate) for dual_rate in (True, False)
     )
     assert not asked.runner.dual_rate
-    assert [note for note in asked.notes if note.startswith("warning")] == [
-        "warning: resnet-unet has no fast path (encode_visual and predict_fast), so it flies in "
-        "single-rate mode, the whole network for every action (--single-rate: as intended)"
-    ]
+    (warning,) = (note for note in asked.notes if note.startswith("warning"))
+    assert "resnet-unet has no fast path" in warning
     assert not any(note.startswith("warning") for note in not_asked.notes)
     assert act(asked).shape == (1, 16, 4)
 
@@ -143,17 +122,14 @@ def test_a_policy_without_fast_path_becomes_single_rate_with_one_warning(tmp_pat
     ("spec", "changes", "message"),
     [
         ("vla", {}, "package.module:Class"),
-        ("..toge:Toge", {}, "package.module:Class"),
         ("scripted:loop", {}, "square"),
         ("scripted:square:position", {}, "velocity"),
         ("scripted", {"checkpoint": Path("a.pt")}, "no weights"),
         ("toge:huge", {"allow_untrained": True}, "neither a size"),
-        ("toge:small:vgg16", {"allow_untrained": True}, "efficientnet_b3"),
         ("resnet-unet:resnet50", {"allow_untrained": True}, "does not take 'resnet50'"),
         ("toge", {"checkpoint": Path("absent.safetensors")}, "no such file"),
         ("toge:resnet18", {"allow_untrained": True, "image_size": 1}, "image_height"),
         ("resnet-unet", {"allow_untrained": True, "device": "tpu"}, "this computer has"),
-        ("resnet-unet", {"allow_untrained": True, "action_device": "cuda:9"}, "this computer has"),
         ("scripted:yaw", {"engine": "openvino"}, "computes in numpy"),
         ("resnet-unet", {"allow_untrained": True, "num_diffusion_steps": 101}, r"1\.\.100"),
         ("json.decoder:Nothing", {}, "no class Nothing"),
@@ -161,7 +137,7 @@ def test_a_policy_without_fast_path_becomes_single_rate_with_one_warning(tmp_pat
         ("scripted:yaw", {"by_rates": True}, "--by-rates is for toge"),
     ],
 )
-def test_refusals_say_what_to_do(spec: str, changes: dict[str, Any], message: str) -> None:
+def test_refusals_name_the_next_step(spec: str, changes: dict[str, Any], message: str) -> None:
     with pytest.raises(PolicyError, match=message):
         load(spec, **changes)
 
@@ -183,10 +159,9 @@ def test_weights_that_learned_from_rates_are_flown_by_them(small_toge, checkpoin
     network.config = replace(network.config, contract=network.contract)
     path = tmp_path / "rates.safetensors"
     save_checkpoint(path, network)
-    loaded = load("toge", checkpoint=path, num_diffusion_steps=4)
+    loaded = load("toge", checkpoint=path)
     assert loaded.runner.contract == network.contract
-    sticks = act(load("toge", checkpoint=checkpoint, num_diffusion_steps=4))
-    flown = StickLoop(network.contract).to_rates(sticks, STATE)
+    flown = StickLoop(network.contract).to_rates(act(load("toge", checkpoint=checkpoint)), STATE)
     np.testing.assert_allclose(act(loaded), flown, atol=1e-6)
 
 
@@ -203,111 +178,3 @@ def test_cheap_checks_refuse_without_loading(checkpoint, changes, message):
     check_request(PolicyRequest(**good))
     with pytest.raises(PolicyError, match=message):
         check_request(PolicyRequest(**{**good, **changes}))
-
-
-USER_CLASSES = """
-import numpy as np
-from policy.contract import Contract
-
-
-class Single:
-    contract = Contract(arrays="numpy", image_height=32, image_width=32)
-
-    def predict(self, image, state, action_history, num_diffusion_steps):
-        return np.full((1, 16, 4), num_diffusion_steps / 10, np.float32)
-
-
-class NoContract:
-    def predict(self, image, state, action_history, num_diffusion_steps):
-        return None
-
-
-class NoPredict:
-    contract = Contract()
-
-
-class NoFeatureDim(Single):
-    contract = Contract(arrays="numpy")
-    encode_visual = predict_fast = Single.predict
-
-
-class Remembers(Single):
-    chunks = 0
-
-    def predict(self, image, state, action_history, num_diffusion_steps):
-        self.chunks += 1
-        return np.full((1, 16, 4), self.chunks / 100, np.float32)
-
-    def reset(self):
-        self.chunks = 0
-
-
-class TorchRemembers:
-    contract = Contract(image_height=32, image_width=32)
-    memory = None
-
-    def predict(self, image, state, action_history, num_diffusion_steps):
-        self.memory = state[:, :1] + (0 if self.memory is None else self.memory) + 0.25
-        return self.memory[:, None].repeat(1, 16, 4)
-
-    def reset(self):
-        self.memory.zero_()
-
-
-class ResetIsNoMethod(Single):
-    reset = True
-
-
-class ResetNeedsMore(Single):
-    def reset(self, seed):
-        pass
-
-
-class ResetFails(Single):
-    def reset(self):
-        raise RuntimeError("no memory to clear")
-
-
-class NeedsMore:
-    def __init__(self, weights):
-        pass
-"""
-
-
-@pytest.fixture
-def user_module(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> str:
-    (tmp_path / "my_user_policies.py").write_text(USER_CLASSES)
-    (tmp_path / "my_broken_policies.py").write_text("def (:\n")
-    monkeypatch.syspath_prepend(tmp_path)
-    monkeypatch.delitem(sys.modules, "my_user_policies", raising=False)
-    return "my_user_policies"
-
-
-@pytest.mark.parametrize(
-    ("name", "engine", "step"), [("Remembers", "auto", 0.01), ("TorchRemembers", "torch", 0.25)]
-)
-def test_a_policy_that_remembers_is_reset_after_loading(user_module, name, engine, step):
-    loaded = load(f"{user_module}:{name}", engine=engine)
-    assert [float(act(loaded).max()) for _ in range(2)] == pytest.approx([step, 2 * step])
-    loaded.runner.reset()
-    assert float(act(loaded).max()) == pytest.approx(step)
-
-
-@pytest.mark.parametrize(
-    ("name", "changes", "message"),
-    [
-        ("NoContract", {}, r"Missing or wrong here: \['contract'\]"),
-        ("NoPredict", {}, r"Missing or wrong here: \['predict'\]"),
-        ("NoFeatureDim", {}, "needs feature_dim"),
-        ("ResetIsNoMethod", {}, "reset must be a method without arguments.*it is True"),
-        ("ResetNeedsMore", {}, "cannot be: missing a required argument: 'seed'; give its"),
-        ("ResetFails", {}, r"failed to reset: RuntimeError: no memory to clear \(.*policies.py:"),
-        ("NeedsMore", {}, r"cannot be made with Class\(\)"),
-        ("Single", {"checkpoint": Path("a.pt")}, r"Class\(checkpoint=path\)"),
-        ("Single", {"image_size": 64}, "takes 32x32"),
-        ("Other", {}, "'Single'"),
-    ],
-)
-def test_a_class_that_will_not_do_is_refused(user_module, name, changes, message):
-    with pytest.raises(PolicyError, match=message):
-        load(f"{user_module}:{name}", **changes)

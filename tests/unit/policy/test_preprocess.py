@@ -17,24 +17,14 @@ from policy.preprocess import egocentric, image_to_input
 CONTRACT = Contract(image_height=32, image_width=48)
 
 
-def test_normalises_each_channel_by_the_contract() -> None:
-    rgb = np.empty((32, 48, 3), np.uint8)
-    rgb[:] = (255, 0, 51)
-    planes = image_to_input(rgb, CONTRACT)
-    assert planes.shape == (1, 3, 32, 48)
-    assert planes.dtype == np.float32
-    expected = [(1.0 - 0.485) / 0.229, (0.0 - 0.456) / 0.224, (0.2 - 0.406) / 0.225]
-    for channel, value in enumerate(expected):
-        np.testing.assert_allclose(planes[0, channel], value, rtol=1e-5)
-
-
-def test_shrinking_averages_instead_of_picking_pixels() -> None:
+def test_normalises_each_channel_by_the_contract_and_averages_when_shrinking() -> None:
     rgb = np.zeros((64, 96, 3), np.uint8)
-    rgb[::2] = 200
-    unchanged = Contract(
-        image_height=32, image_width=48, image_mean_rgb=(0, 0, 0), image_std_rgb=(1, 1, 1)
-    )
-    np.testing.assert_allclose(image_to_input(rgb, unchanged), 100 / 255, atol=1 / 255)
+    rgb[::2] = (254, 0, 102)
+    planes = image_to_input(rgb, CONTRACT)
+    assert (planes.shape, planes.dtype) == ((1, 3, 32, 48), np.float32)
+    expected = [(127 / 255 - 0.485) / 0.229, (0.0 - 0.456) / 0.224, (51 / 255 - 0.406) / 0.225]
+    for channel, value in enumerate(expected):
+        np.testing.assert_allclose(planes[0, channel], value, rtol=1e-4)
 
 
 RED, GREEN, BLUE, WHITE = (255, 0, 0), (0, 255, 0), (0, 0, 255), (255, 255, 255)
@@ -70,7 +60,7 @@ def corners(seen: np.ndarray) -> list[tuple[int, ...]]:
     return [tuple(seen[row, column].tolist()) for row in (0, -1) for column in (0, -1)]
 
 
-@pytest.mark.parametrize("size", [(32, 32), (64, 64), (48, 96), (90, 40), (20, 200)])
+@pytest.mark.parametrize("size", [(32, 32), (48, 96), (20, 200)])
 def test_a_stretched_picture_keeps_its_four_corners(size: tuple[int, int]) -> None:
     seen = pixels(quarters(*size), plain())
     assert corners(seen) == [RED, GREEN, BLUE, WHITE]
@@ -79,12 +69,6 @@ def test_a_stretched_picture_keeps_its_four_corners(size: tuple[int, int]) -> No
 
 
 def test_bgr_swaps_red_and_blue_and_their_normalisation() -> None:
-    assert corners(pixels(quarters(64, 64), plain(image_channels="bgr"))) == [
-        BLUE,
-        GREEN,
-        RED,
-        WHITE,
-    ]
     rgb = np.full((8, 8, 3), (255, 0, 51), np.uint8)
     usual, swapped = (
         image_to_input(rgb, Contract(image_height=16, image_width=16, image_channels=order))
@@ -102,24 +86,17 @@ def test_the_part_of_the_image_is_cut_out_before_it_is_resized() -> None:
 
 
 @pytest.mark.parametrize("size", [(40, 80), (80, 40)])
-def test_crop_cuts_the_longer_sides_off_evenly(size: tuple[int, int]) -> None:
+def test_crop_cuts_the_longer_sides_off_and_pad_adds_black_bars(size: tuple[int, int]) -> None:
     height, width = size
-    image = np.zeros((*size, 3), np.uint8)
-    image[:] = RED
+    image = np.full((*size, 3), RED, np.uint8)
     image[height // 2 - 20 : height // 2 + 20, width // 2 - 20 : width // 2 + 20] = quarters(40, 40)
-    seen = pixels(image, plain(image_fit="crop"))
-    assert corners(seen) == [RED, GREEN, BLUE, WHITE]
-    np.testing.assert_array_equal(seen, pixels(quarters(40, 40), plain()))
-
-
-def test_pad_keeps_proportions_between_black_bars() -> None:
-    wide = pixels(quarters(40, 80), plain(image_fit="pad"))
-    assert (wide[:8] == BLACK).all()
-    assert (wide[24:] == BLACK).all()
-    assert corners(wide[8:24]) == [RED, GREEN, BLUE, WHITE]
-    tall = pixels(quarters(80, 40), plain(image_fit="pad"))
-    assert corners(tall[:, 8:24]) == [RED, GREEN, BLUE, WHITE]
-    assert corners(tall) == [BLACK] * 4
+    cropped = pixels(image, plain(image_fit="crop"))
+    np.testing.assert_array_equal(cropped, pixels(quarters(40, 40), plain()))
+    padded = pixels(quarters(*size), plain(image_fit="pad"))
+    padded = padded if width > height else padded.transpose(1, 0, 2)[..., [0, 2, 1]]
+    assert (padded[:8] == BLACK).all()
+    assert (padded[24:] == BLACK).all()
+    assert corners(padded[8:24]) == [RED, GREEN, BLUE, WHITE]
 
 
 DEPTH = Contract(image_height=32, image_width=48, image_channels="depth")
@@ -136,8 +113,8 @@ def test_depth_is_metres_and_the_unknown_is_zero() -> None:
 
 
 @pytest.mark.parametrize("fit", ["stretch", "crop", "pad"])
-@pytest.mark.parametrize("size", [(64, 96), (480, 640), (16, 24), (31, 100)])
-def test_no_distance_is_made_up_between_two(size: tuple[int, int], fit: Any) -> None:
+@pytest.mark.parametrize("size", [(480, 640), (31, 100)])
+def test_depth_is_never_interpolated(size: tuple[int, int], fit: Any) -> None:
     depth = np.random.default_rng(0).choice(np.array([0, 1000, 9000], np.uint16), size)
     planes = image_to_input(depth, replace(DEPTH, image_fit=fit))
     assert planes.shape == (1, 1, 32, 48)
@@ -149,12 +126,9 @@ def test_no_distance_is_made_up_between_two(size: tuple[int, int], fit: Any) -> 
     [
         (np.zeros((32, 48), np.uint16), CONTRACT),
         (np.zeros((32, 48, 3), np.float32), CONTRACT),
-        (np.zeros((32, 48), np.uint8), CONTRACT),
-        (np.zeros((3, 32, 48), np.uint8), CONTRACT),
         (np.zeros((0, 48, 3), np.uint8), CONTRACT),
         (np.zeros((32, 48, 3), np.uint8), DEPTH),
         (np.zeros((32, 48), np.float32), DEPTH),
-        (np.zeros((0, 48), np.uint16), DEPTH),
     ],
 )
 def test_an_image_of_the_other_kind_is_refused(image: Any, contract: Contract) -> None:
@@ -178,7 +152,7 @@ attitudes = st.tuples(*[st.floats(-1, 1)] * 4).filter(lambda q: np.linalg.norm(q
 
 
 @given(attitudes, st.tuples(number, number, number), angle)
-def test_it_is_the_same_on_every_heading(q, velocity, turn):
+def test_the_egocentric_state_does_not_depend_on_the_heading(q, velocity, turn):
     here = state(q, velocity)
     there = here.copy()
     about = about_z(np.array([turn]))
@@ -199,7 +173,7 @@ def test_velocity_and_vertical_are_those_of_the_body(q, velocity):
 
 
 @pytest.mark.parametrize("since_exposure", [False, True])
-def test_numpy_and_torch_see_the_same(since_exposure: bool) -> None:
+def test_numpy_and_torch_agree(since_exposure: bool) -> None:
     contract = Contract(since_exposure=since_exposure)
     random = np.random.default_rng(0)
     states = random.normal(size=(8, contract.state_dim)).astype(np.float32)

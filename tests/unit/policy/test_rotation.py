@@ -3,7 +3,6 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from helpers.factories import about_z
 from policy import rotation
 
 ANGLE = st.floats(-3.0, 3.0)
@@ -13,11 +12,6 @@ def about(axis: int, angle: float) -> np.ndarray:
     q = np.zeros((1, 4))
     q[0, 0], q[0, 1 + axis] = np.cos(angle / 2), np.sin(angle / 2)
     return q
-
-
-def test_a_quarter_turn_about_the_third_axis_takes_x_to_y() -> None:
-    turned = rotation.rotate(about_z(np.array([np.pi / 2])), np.array([[1.0, 0.0, 0.5]]))
-    np.testing.assert_allclose(turned, [[0.0, 1.0, 0.5]], atol=1e-12)
 
 
 @given(ANGLE, ANGLE, st.integers(0, 2), st.integers(0, 2))
@@ -53,7 +47,5 @@ def test_floats_and_arrays_give_the_same(a: float, b: float, axis: int, share: f
     assert isinstance(turned, tuple)
     np.testing.assert_allclose([turned], rotation.slerp(*arrays, np.array([share])), atol=1e-12)
     np.testing.assert_allclose(
-        [rotation.rotate(p, (w, x, y))],
-        rotation.rotate(arrays[0], arrays[1][:, :3]),
-        atol=1e-12,
+        [rotation.rotate(p, (w, x, y))], rotation.rotate(arrays[0], arrays[1][:, :3]), atol=1e-12
     )

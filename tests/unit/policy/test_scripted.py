@@ -2,15 +2,14 @@
 
 import math
 from collections import deque
-from dataclasses import dataclass, field
+from collections.abc import Callable
+from dataclasses import dataclass, replace
 
 import numpy as np
 import pytest
 
 from policy.contract import ActionKind
-from policy.errors import PolicyError
-from policy.protocol import DualRatePolicy
-from policy.scripted import PROGRAM_NAMES, ScriptedPolicy
+from policy.scripted import ScriptedPolicy
 from policy.scripted.controllers import doublet_length_s, doublet_steps
 from sitl.rotation import from_euler
 
@@ -34,77 +33,79 @@ class Vehicle:
     hover_thrust: float = 0.39
     leaves_ground_at_s: float = 0.0
     throttle_dead_zone: float = 0.2
+    sinks_faster: float = 1.0
     now_s: float = 0.0
-    north_m: float = 0.0
-    east_m: float = 0.0
-    up_m: float = 0.0
     north_mps: float = 0.0
     east_mps: float = 0.0
     climb_mps: float = 0.0
+    up_m: float = 0.0
     roll_rad: float = 0.0
     pitch_rad: float = 0.0
     yaw_rad: float = 0.0
-    rates: list[float] = field(default_factory=lambda: [0.0, 0.0, 0.0])
+    roll_rate: float = 0.0
+    pitch_rate: float = 0.0
+    yaw_rate: float = 0.0
     thrust: float = 0.0
 
     def state(self) -> np.ndarray:
         quaternion = from_euler(self.roll_rad, self.pitch_rad, self.yaw_rad)
         velocity = (self.north_mps, self.east_mps, -self.climb_mps)
-        return np.array([[*velocity, *quaternion, *self.rates, 0.0, 0.0, -9.81]], np.float32)
+        rates = (self.roll_rate, self.pitch_rate, self.yaw_rate)
+        return np.array([[*velocity, *quaternion, *rates, 0.0, 0.0, -9.81]], np.float32)
 
     def step(self, action: np.ndarray) -> None:
         four = [float(number) for number in action]
         self.now_s += STEP_S
         if self.now_s < self.leaves_ground_at_s:
             return
-        match self.action:
-            case "sticks":
-                self._follow_sticks(*four)
-            case "velocity":
-                self._follow_velocity(*four)
-            case _:
-                self._follow_thrust(*four)
-        self.yaw_rad += self.rates[2] * STEP_S
-        self.north_m += self.north_mps * STEP_S
-        self.east_m += self.east_mps * STEP_S
+        if self.action == "sticks":
+            self._follow_sticks(*four)
+        elif self.action == "velocity":
+            self._follow_velocity(*four)
+        else:
+            self._follow_thrust(*four)
+        self.yaw_rad += self.yaw_rate * STEP_S
         self.up_m += self.climb_mps * STEP_S
         if self.up_m <= 0.0 and self.climb_mps < 0.0:
             self.up_m = self.climb_mps = 0.0
 
+    def _lag(self, wanted: float, lag_s: float, name: str) -> None:
+        now: float = getattr(self, name)
+        setattr(self, name, now + (wanted - now) * STEP_S / lag_s)
+
     def _follow_sticks(self, throttle: float, yaw: float, pitch: float, roll: float) -> None:
-        climb = 2.5 * beyond(throttle, self.throttle_dead_zone)
-        self.climb_mps += (climb - self.climb_mps) * STEP_S / 0.4
-        rate = math.radians(202.5) * beyond(yaw, 0.04)
-        self.rates[2] += (rate - self.rates[2]) * STEP_S / 0.1
         full = math.radians(30.0)
-        self.roll_rad += (full * beyond(roll, 0.04) - self.roll_rad) * STEP_S / 0.15
-        self.pitch_rad += (-full * beyond(pitch, 0.04) - self.pitch_rad) * STEP_S / 0.15
-        self._push(-GRAVITY_MPS2 * math.tan(self.pitch_rad), GRAVITY_MPS2 * math.tan(self.roll_rad))
+        self._lag(2.5 * beyond(throttle, self.throttle_dead_zone), 0.4, "climb_mps")
+        self._lag(math.radians(202.5) * beyond(yaw, 0.04), 0.1, "yaw_rate")
+        self._lag(full * beyond(roll, 0.04), 0.15, "roll_rad")
+        self._lag(-full * beyond(pitch, 0.04), 0.15, "pitch_rad")
+        self._push(GRAVITY_MPS2, math.tan)
 
     def _follow_velocity(self, forward: float, right: float, down: float, yaw: float) -> None:
         cos, sin = math.cos(self.yaw_rad), math.sin(self.yaw_rad)
-        north, east = cos * forward - sin * right, sin * forward + cos * right
-        self.north_mps += (north - self.north_mps) * STEP_S / 0.4
-        self.east_mps += (east - self.east_mps) * STEP_S / 0.4
-        self.climb_mps += (-down - self.climb_mps) * STEP_S / 0.4
-        self.rates[2] += (yaw - self.rates[2]) * STEP_S / 0.2
+        self._lag(cos * forward - sin * right, 0.4, "north_mps")
+        self._lag(sin * forward + cos * right, 0.4, "east_mps")
+        self._lag(-down * (self.sinks_faster if down > 0 else 1.0), 0.4, "climb_mps")
+        self._lag(yaw, 0.2, "yaw_rate")
 
     def _follow_thrust(self, thrust: float, roll: float, pitch: float, yaw: float) -> None:
         if self.action == "attitude":
             roll, pitch = 6.0 * (roll - self.roll_rad), 6.0 * (pitch - self.pitch_rad)
-        for index, wanted in enumerate((roll, pitch, yaw)):
-            self.rates[index] += (wanted - self.rates[index]) * STEP_S / (0.06, 0.06, 0.2)[index]
-        self.roll_rad += self.rates[0] * STEP_S
-        self.pitch_rad += self.rates[1] * STEP_S
-        self.thrust += (thrust - self.thrust) * STEP_S / 0.05
+        self._lag(roll, 0.06, "roll_rate")
+        self._lag(pitch, 0.06, "pitch_rate")
+        self._lag(yaw, 0.2, "yaw_rate")
+        self.roll_rad += self.roll_rate * STEP_S
+        self.pitch_rad += self.pitch_rate * STEP_S
+        self._lag(thrust, 0.05, "thrust")
         accel = GRAVITY_MPS2 * self.thrust / self.hover_thrust
         up = accel * math.cos(self.roll_rad) * math.cos(self.pitch_rad)
-        self._push(-accel * math.sin(self.pitch_rad), accel * math.sin(self.roll_rad))
+        self._push(accel, math.sin)
         if self.up_m > 0.0 or up > GRAVITY_MPS2:
             self.climb_mps += (up - GRAVITY_MPS2 - 0.2 * self.climb_mps) * STEP_S
 
-    def _push(self, forward: float, right: float) -> None:
+    def _push(self, accel: float, share: Callable[[float], float]) -> None:
         cos, sin = math.cos(self.yaw_rad), math.sin(self.yaw_rad)
+        forward, right = -accel * share(self.pitch_rad), accel * share(self.roll_rad)
         self.north_mps += (cos * forward - sin * right - 0.2 * self.north_mps) * STEP_S
         self.east_mps += (sin * forward + cos * right - 0.2 * self.east_mps) * STEP_S
 
@@ -137,7 +138,7 @@ def fly_on(policy: ScriptedPolicy, duration_s: float, vehicle: Vehicle) -> list[
     for _ in range(round(duration_s / STEP_S)):
         on_the_way.append(policy.predict_fast(FEATURE, vehicle.state(), HISTORY, 10)[0, 0])
         vehicle.step(on_the_way[0])
-        flown.append(Vehicle(**{**vars(vehicle), "rates": list(vehicle.rates)}))
+        flown.append(replace(vehicle))
     return flown
 
 
@@ -148,8 +149,9 @@ def at(flown: list[Vehicle], time_s: float) -> Vehicle:
 @pytest.mark.parametrize(
     "vehicle",
     [
-        *(Vehicle("sticks", throttle_dead_zone=zone) for zone in (0.0, 0.2)),
-        *(Vehicle(kind, thrust) for kind in KINDS[1:] for thrust in (0.33, 0.5)),
+        Vehicle("sticks", throttle_dead_zone=0.0),
+        *(Vehicle(kind, thrust) for kind in KINDS[1:3] for thrust in (0.33, 0.5)),
+        Vehicle("velocity"),
         Vehicle("sticks", leaves_ground_at_s=3.0),
     ],
 )
@@ -168,8 +170,6 @@ def test_flies_its_square_along_its_heading(kind: ActionKind) -> None:
     for leg, wanted in enumerate([(1.5, 0.0), (0.0, 1.5), (-1.5, 0.0), (0.0, -1.5)]):
         end = at(flown, start_s + 4.0 * (leg + 1) - 0.1)
         assert (end.forward_mps, end.right_mps) == pytest.approx(wanted, abs=0.35)
-    begin, back = at(flown, start_s), at(flown, start_s + 16.0)
-    assert math.hypot(back.north_m - begin.north_m, back.east_m - begin.east_m) < 2.0
     assert all(2.5 < v.up_m < 3.5 for v in flown[round(start_s / STEP_S) :])
 
 
@@ -201,7 +201,7 @@ def test_the_doublet_pushes_every_axis_to_both_sides_and_comes_back(kind: Action
         middle_s = step.begin_s + step.half_s
         one, other = (at(flown, start_s + s - 0.02) for s in (middle_s, step.end_s))
         moved = {
-            "yaw": lambda v: v.rates[2],
+            "yaw": lambda v: v.yaw_rate,
             "climb": lambda v: v.climb_mps,
             "roll": lambda v: v.right_mps if kind == "velocity" else v.roll_rad,
             "pitch": lambda v: v.forward_mps if kind == "velocity" else -v.pitch_rad,
@@ -214,13 +214,8 @@ def test_the_doublet_pushes_every_axis_to_both_sides_and_comes_back(kind: Action
 
 
 def test_a_push_down_ends_before_the_ground() -> None:
-    """The vehicle sinks at twice the speed at which it climbs."""
-
-    class Sinking(Vehicle):
-        def _follow_velocity(self, forward: float, right: float, down: float, yaw: float) -> None:
-            super()._follow_velocity(forward, right, down * (2.5 if down > 0 else 1.0), yaw)
-
-    _, flown = fly("doublet", 15.0 + doublet_length_s("velocity"), Sinking("velocity"))
+    sinking = Vehicle("velocity", sinks_faster=2.5)
+    _, flown = fly("doublet", 15.0 + doublet_length_s("velocity"), sinking)
     assert min(v.up_m for v in flown[1000:]) > 3.0
 
 
@@ -243,23 +238,3 @@ def test_a_pause_of_the_loop_is_not_integrated_as_climb() -> None:
     vehicle.now_s += 60.0
     throttle = policy.predict_fast(FEATURE, vehicle.state(), HISTORY, 1)[0, 0, 0]
     assert throttle > 0.2
-
-
-@pytest.mark.parametrize("kind", KINDS)
-@pytest.mark.parametrize("program", PROGRAM_NAMES)
-def test_speaks_the_whole_protocol(program: str, kind: ActionKind) -> None:
-    policy = ScriptedPolicy(program, lambda: 0.0, action=kind)
-    assert isinstance(policy, DualRatePolicy)
-    contract = policy.contract
-    assert (contract.action, contract.velocity_frame) == (kind, "heading")
-    assert (contract.state_frame, contract.hover_thrust) == ("ned_frd", 0.39)
-    image = np.random.default_rng(0).normal(size=(1, 3, 224, 224)).astype(np.float32)
-    feature = policy.encode_visual(image)
-    assert (feature.shape, feature.dtype) == ((1, contract.feature_dim), np.float32)
-    chunk = policy.predict(image, Vehicle(kind).state(), HISTORY, 10)
-    assert (chunk.shape, chunk.dtype) == ((1, 16, 4), np.float32)
-
-
-def test_a_state_of_another_shape_is_refused() -> None:
-    with pytest.raises(PolicyError, match=r"\[1, 13\]"):
-        ScriptedPolicy("hover", lambda: 0.0).predict_fast(FEATURE, np.zeros((2, 13)), HISTORY, 1)

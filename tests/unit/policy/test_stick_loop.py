@@ -9,7 +9,7 @@ import pytest
 from policy.contract import Contract, FloatArray
 from policy.errors import ContractError
 from policy.protocol import PolicyRunner
-from policy.rotation import matrix_columns, multiply
+from policy.rotation import multiply
 from policy.stick_loop import (
     MAX_TILT_RATE_RADPS,
     StickLoop,
@@ -30,12 +30,7 @@ def state(
     half, side = math.radians(lean_deg) / 2, math.radians(towards_deg)
     turn = math.radians(heading_deg) / 2
     # Towards the nose is nose down: a turn about minus the y axis.
-    lean = (
-        math.cos(half),
-        math.sin(half) * math.sin(side),
-        -math.sin(half) * math.cos(side),
-        0.0,
-    )
+    lean = (math.cos(half), math.sin(half) * math.sin(side), -math.sin(half) * math.cos(side), 0.0)
     attitude = multiply((math.cos(turn), 0.0, 0.0, math.sin(turn)), lean)
     return np.array([[0.0, 0.0, -climb, *attitude, *[0.0] * 6]], np.float32)
 
@@ -84,26 +79,7 @@ def test_a_lean_keeps_the_height_and_a_climb_ends_at_its_speed() -> None:
     assert climbing[0] == pytest.approx(0.5, rel=1e-4)
 
 
-def test_a_turn_in_a_lean_is_about_the_worlds_vertical() -> None:
-    loop, leaning = StickLoop(CONTRACT), state(50.0)
-    rates = first_rates(loop, (0.0, 0.5, 50.0 / CONTRACT.full_lean_deg, 0.0), leaning)
-    w, x, y, z = (float(part) for part in leaning[0, 3:7])
-    columns = np.array(matrix_columns(w, x, y, z)).T
-    world = columns @ rates[1:]
-    assert np.degrees(world) == pytest.approx([0.0, 0.0, 0.5 * 115.0], abs=0.5)
-
-
-def test_a_chunk_ends_where_its_sticks_point() -> None:
-    """Each action counts on those before it: held sticks turn the attitude, and then rest."""
-    loop, stick = StickLoop(CONTRACT), 0.5
-    chunk = np.tile(np.array([0.0, 0.0, 0.0, stick], np.float32), (1, 16, 1))
-    rates = loop.to_rates(chunk, state())[0]
-    rolled_deg = math.degrees(rates[:, 1].sum() * CONTRACT.chunk_dt_s)
-    assert rolled_deg == pytest.approx(stick * CONTRACT.full_lean_deg, rel=0.01)
-    assert abs(rates[-1, 1]) < 0.05
-
-
-def test_no_stick_asks_for_more_than_a_vehicle_has() -> None:
+def test_rates_stay_within_limits() -> None:
     loop, random = StickLoop(CONTRACT), np.random.default_rng(0)
     for _ in range(50):
         at = state(*random.uniform(0, 170, 1), towards_deg=random.uniform(0, 360), climb=-20.0)
@@ -134,16 +110,9 @@ def test_sticks_are_read_back_from_the_rates_that_flew_them(contract: Contract) 
         beyond = np.abs(sticks) > contract.lean_dead_zone  # inside, nothing tells them apart
         rates = loop.to_rates(sticks[None, None], at)[0]
         back = loop.to_sticks(rates, at)[0]
+        assert np.abs(loop.to_sticks(9 * rates, at)).max() <= 1.0
         np.testing.assert_allclose(back[beyond], sticks[beyond], atol=1e-3)
         assert np.abs(back[~beyond]).max(initial=0.0) <= contract.lean_dead_zone + 1e-3
-
-
-def test_rates_beyond_full_stick_are_cut_off() -> None:
-    loop = StickLoop(CONTRACT)
-    rates = np.array([[1.0, 30.0, 0.0, 9.0], [0.0, 0.0, 0.0, 0.0]], np.float32)
-    sticks = loop.to_sticks(rates, np.repeat(state(climb=9.0), 2, axis=0))
-    assert sticks[0].tolist()[:2] == [1.0, 1.0]
-    assert np.abs(sticks).max() <= 1.0
 
 
 def test_the_policy_flies_its_own_network_by_rates() -> None:
@@ -153,15 +122,10 @@ def test_the_policy_flies_its_own_network_by_rates() -> None:
         given.append(history)
         return np.full((1, 16, 4), 0.5, np.float32)
 
-    sticks = PolicyRunner(
-        contract=Contract(),
-        name="sticks",
-        engine="numpy",
-        dual_rate=True,
-        encode=lambda _rgb, _camera=0: np.zeros((1, 1), np.float32),
-        act=act,
+    parts = {"encode": lambda _rgb, _camera=0: np.zeros((1, 1), np.float32), "act": act}
+    flown = flown_by_rates(
+        PolicyRunner(contract=Contract(), name="s", engine="numpy", dual_rate=True, **parts)
     )
-    flown = flown_by_rates(sticks)
     assert flown.contract.action == "rates"
     assert flown.contract.modes == ("GUIDED_NOGPS", "GUIDED", "OFFBOARD")
     chunk = flown.act(np.zeros((1, 1), np.float32), state(), np.ones((1, 4, 4), np.float32))

@@ -1,6 +1,7 @@
 import sys
 from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -42,8 +43,8 @@ def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
         del sys.modules[name]
 
 
-def load(spec: str, checkpoint: Path | None = None) -> LoadedPolicy:
-    return load_policy(PolicyRequest(spec=spec, checkpoint=checkpoint), now_s=lambda: 0.0)
+def load(spec: str, **changes: Any) -> LoadedPolicy:
+    return load_policy(PolicyRequest(spec=spec, **changes), now_s=lambda: 0.0)
 
 
 def throttle(loaded: LoadedPolicy) -> float:
@@ -52,13 +53,13 @@ def throttle(loaded: LoadedPolicy) -> float:
     return float(act(encode(rgb), STATE, HISTORY)[0, 0, 0])
 
 
-@pytest.mark.parametrize("form", ["./flying.py:Flying", "flying.py:Flying", "{}/flying.py:Flying"])
+@pytest.mark.parametrize("form", ["./flying.py:Flying", "{}/flying.py:Flying"])
 def test_a_file_of_the_users_flies_and_finds_its_neighbours(folder: Path, form: str) -> None:
     spec = form.format(folder)
     loaded = load(spec)
     assert throttle(loaded) == pytest.approx(0.25)
     assert loaded.runner.name == spec
-    assert throttle(load(spec, folder / "weights.txt")) == pytest.approx(0.5)
+    assert throttle(load(spec, checkpoint=folder / "weights.txt")) == pytest.approx(0.5)
     assert "flying" not in sys.modules
 
 
@@ -114,90 +115,145 @@ def test_a_file_that_cannot_be_imported_says_why(folder: Path, code: str, messag
             load("./broken.py:Flying")
 
 
-LIFE = """
+MINE = """
 import numpy as np
 import torch
 from policy.contract import Contract
 
 
-class Life:
+class Single:
     contract = Contract(arrays="numpy", image_height=32, image_width=32)
-    closed = 0
+    closed = chunks = 0
 
     def predict(self, image, state, action_history, num_diffusion_steps):
-        return np.zeros((1, 16, 4), np.float32)
+        self.chunks += 1
+        return np.full((1, 16, 4), self.chunks / 100, np.float32)
+
+    def reset(self):
+        self.chunks = 0
 
     def close(self):
         type(self).closed += 1
 
 
-class Fails(Life):
+class TorchRemembers:
+    contract = Contract(image_height=32, image_width=32)
+    memory = None
+    closed = 0
+
+    def predict(self, image, state, action_history, num_diffusion_steps):
+        self.memory = state[:, :1] + (0 if self.memory is None else self.memory) + 0.25
+        return self.memory[:, None].repeat(1, 16, 4)
+
+    def reset(self):
+        self.memory.zero_()
+
+    def close(self):
+        type(self).closed += 1
+        self.memory.zero_()
+
+
+class FailsToClose(Single):
+    def close(self):
+        super().close()
+        raise OSError("no socket")
+
+
+class FailsTwice(FailsToClose):
     def predict(self, image, state, action_history, num_diffusion_steps):
         raise RuntimeError("no weights")
 
 
-class FailsTwice(Fails):
-    def close(self):
-        super().close()
-        raise OSError("no socket")
+class NoContract:
+    predict = Single.predict
 
 
-class FailsToClose(Life):
-    def close(self):
-        raise OSError("no socket")
+class NoPredict:
+    contract = Contract()
 
 
-class ClosesTensors(Life):
-    contract = Contract(image_height=32, image_width=32)
+class NoFeatureDim(Single):
+    contract = Contract(arrays="numpy")
+    encode_visual = predict_fast = Single.predict
 
-    def predict(self, image, state, action_history, num_diffusion_steps):
-        self.memory = state + 1
-        return torch.zeros(1, 16, 4)
 
-    def close(self):
-        super().close()
-        self.memory.zero_()
+class ResetIsNoMethod(Single):
+    reset = True
+
+
+class ResetNeedsMore(Single):
+    def reset(self, seed):
+        pass
+
+
+class ResetFails(Single):
+    def reset(self):
+        raise RuntimeError("no memory to clear")
+
+
+class NeedsMore:
+    def __init__(self, weights):
+        pass
 """
 
 
 @pytest.fixture
-def life(folder: Path) -> str:
-    (folder / "life.py").write_text(LIFE)
-    return "./life.py"
+def mine(folder: Path) -> str:
+    (folder / "mine.py").write_text(MINE)
+    return "./mine.py"
 
 
-def closed(loaded_or_failed: str) -> int:
-    named = (each for each in sys.modules if each.startswith("_policy_file_"))
-    module = next(sys.modules[each] for each in named if each.endswith("_life"))
-    times: int = getattr(module, loaded_or_failed).closed
+def closed(name: str) -> int:
+    module = next(sys.modules[each] for each in sys.modules if each.endswith("_mine"))
+    times: int = getattr(module, name).closed
     return times
 
 
-@pytest.mark.parametrize("name", ["Life", "ClosesTensors"])
-def test_a_policy_is_closed_once_at_the_end(life: str, name: str) -> None:
-    with load(f"{life}:{name}"):
+@pytest.mark.parametrize(("name", "step"), [("Single", 0.01), ("TorchRemembers", 0.25)])
+def test_a_policy_is_reset_after_loading_and_closed_once(mine: str, name: str, step: float) -> None:
+    with load(f"{mine}:{name}") as loaded:
+        assert [throttle(loaded) for _ in range(2)] == pytest.approx([step, 2 * step])
+        loaded.runner.reset()
+        assert throttle(loaded) == pytest.approx(step)
         assert closed(name) == 0
     assert closed(name) == 1
 
 
-@pytest.mark.parametrize("name", ["Fails", "FailsTwice"])
-def test_a_policy_that_fails_its_trial_is_closed(life: str, name: str) -> None:
+def test_a_policy_that_fails_its_trial_or_whose_contract_is_read_is_closed(mine: str) -> None:
     with pytest.raises(PolicyError, match="no weights"):
-        load(f"{life}:{name}")
-    assert closed(name) == 1
+        load(f"{mine}:FailsTwice")
+    assert closed("FailsTwice") == 1
+    assert read_policy_contract(PolicyRequest(spec=f"{mine}:Single")).image_height == 32
+    assert closed("Single") == 1
 
 
-def test_a_policy_whose_contract_is_read_is_closed(life: str) -> None:
-    assert read_policy_contract(PolicyRequest(spec=f"{life}:Life")).image_height == 32
-    assert closed("Life") == 1
-
-
-def test_a_failure_to_close_is_said_and_hides_no_other(life: str) -> None:
+def test_a_failure_to_close_is_said_and_hides_no_other(mine: str) -> None:
     with (
-        pytest.raises(PolicyError, match=r"failed to close: OSError: no socket \(.*life\.py"),
-        load(f"{life}:FailsToClose"),
+        pytest.raises(PolicyError, match=r"failed to close: OSError: no socket \(.*mine\.py"),
+        load(f"{mine}:FailsToClose"),
     ):
         pass
-    with pytest.raises(ZeroDivisionError) as caught, load(f"{life}:FailsToClose"):
+    with pytest.raises(ZeroDivisionError) as caught, load(f"{mine}:FailsToClose"):
         raise ZeroDivisionError
     assert "failed to close" in caught.value.__notes__[0]
+
+
+@pytest.mark.parametrize(
+    ("name", "changes", "message"),
+    [
+        ("NoContract", {}, r"Missing or wrong here: \['contract'\]"),
+        ("NoPredict", {}, r"Missing or wrong here: \['predict'\]"),
+        ("NoFeatureDim", {}, "needs feature_dim"),
+        ("ResetIsNoMethod", {}, "reset must be a method without arguments.*it is True"),
+        ("ResetNeedsMore", {}, "cannot be: missing a required argument: 'seed'; give its"),
+        ("ResetFails", {}, r"failed to reset: RuntimeError: no memory to clear \(.*mine.py:"),
+        ("NeedsMore", {}, r"cannot be made with Class\(\)"),
+        ("Single", {"checkpoint": Path("a.pt")}, r"Class\(checkpoint=path\)"),
+        ("Single", {"image_size": 64}, "takes 32x32"),
+        ("TorchRemembers", {"engine": "openvino"}, r"takes a torch\.nn\.Module"),
+        ("Other", {}, "'Single'"),
+    ],
+)
+def test_an_unusable_class_is_refused(mine, name, changes, message):
+    with pytest.raises(PolicyError, match=message):
+        load(f"{mine}:{name}", **changes)

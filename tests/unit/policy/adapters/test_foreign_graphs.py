@@ -3,7 +3,6 @@
 import os
 from collections.abc import Callable
 from pathlib import Path
-from random import Random
 
 import numpy as np
 import pytest
@@ -48,21 +47,24 @@ def require_counting(runner: PolicyRunner) -> None:
         runner.reset()
 
 
-@pytest.mark.parametrize("state", ["obs", "observation", "x.1"])
+@pytest.mark.parametrize("state", ["obs", "x.1"])
 def test_one_action_for_one_observation_flies_as_it_is(tmp_path: Path, state: str) -> None:
     graphs.write_contract(tmp_path)
-    graphs.actor(tmp_path / "policy.onnx", state=state)
-    runner = load(f"onnx:{tmp_path}")
-    assert act(runner, vx_mps=2.0) == pytest.approx([0.2] * 4, abs=1e-3)
-
-
-def test_the_output_that_is_asked_for_is_flown(tmp_path: Path) -> None:
-    graphs.write_contract(tmp_path)
-    graphs.actor(tmp_path / "policy.onnx", outputs=("actions", "values", "log_prob"))
+    graphs.actor(tmp_path / "policy.onnx", state=state, outputs=("actions", "values", "log_prob"))
     with pytest.raises(PolicyError, match=r"3 outputs \(actions; values; log_prob\).*outputs"):
         load(f"onnx:{tmp_path}")
     graphs.describe(tmp_path, outputs={"chunk": "actions"})
     assert act(load(f"onnx:{tmp_path}"), vx_mps=2.0) == pytest.approx([0.2] * 4, abs=1e-3)
+
+
+def test_state_and_actions_are_in_the_order_and_units_of_the_contract_file(tmp_path: Path) -> None:
+    state = '[state]\nnames = ["vx_mps", "yaw_rad"]\nscale = [3.0, 1.0]\n'
+    names = '["roll", "pitch", "yaw", "throttle"]'
+    action = f"[action]\nnames = {names}\nscale = [1.0, 1.0, 1.0, 0.5]\n"
+    graphs.write_contract(tmp_path, more=state + action)
+    graphs.actor(tmp_path / "policy.onnx", state_dim=2)
+    sticks = act(load(f"onnx:{tmp_path}"), vx_mps=2.0)
+    assert sticks == pytest.approx([0.3, 0.6, 0.6, 0.6], abs=1e-3)
 
 
 @pytest.mark.parametrize("hidden", [("h_in", "h_out"), ("state_in_0", "state_out_0"), ("h", "hn")])
@@ -75,19 +77,13 @@ def test_a_hidden_state_goes_from_call_to_call_until_reset(tmp_path, hidden):
 
 
 @pytest.mark.parametrize(
-    ("kind", "white"),
-    [
-        (TensorProto.FLOAT, 1.0),
-        (TensorProto.FLOAT16, 1.0),
-        (TensorProto.DOUBLE, 1.0),
-        (TensorProto.UINT8, 255.0),
-    ],
+    ("kind", "white"), [(TensorProto.FLOAT16, 1.0), (TensorProto.UINT8, 255.0)]
 )
 def test_the_element_type_says_what_a_pixel_is(tmp_path: Path, kind: int, white: float) -> None:
     graphs.write_contract(tmp_path)
     graphs.image_actor(tmp_path / "policy.onnx", kind=kind)
     runner = load(f"onnx:{tmp_path}")
-    for level in (0, 1, 128, 255):
+    for level in (0, 1, 255):
         assert act(runner, level=level) == pytest.approx([white * level / 255] * 4, rel=5e-3)
 
 
@@ -119,15 +115,10 @@ REFUSED: dict[str, tuple[Write, str]] = {
         lambda folder: external(folder, Path.unlink),
         r"policy\.onnx\.data, .* is missing or cut short: copy both",
     ),
-    "external data cut": (
-        lambda folder: external(folder, lambda path: path.write_bytes(path.read_bytes()[:50])),
-        r"policy\.onnx\.data, .* is missing or cut short: copy both",
-    ),
     "external data a pointer": (
         lambda folder: external(folder, pointer),
         r"policy\.onnx\.data, .* is a pointer of Git LFS.*git lfs pull",
     ),
-    "graph a pointer": (lambda folder: pointer(folder / "policy.onnx"), r"Git LFS.*git lfs pull"),
     "integer actions": (
         lambda folder: graphs.actor(folder / "policy.onnx", action_type=TensorProto.INT64),
         r"chunk is of type i64",
@@ -154,11 +145,6 @@ REFUSED: dict[str, tuple[Write, str]] = {
         ],
         r"no output 'action' \(actions\)",
     ),
-    "no graph": (lambda folder: (folder / "policy.onnx").write_bytes(b"\x08\x07"), r"policy\.onnx"),
-    "noise": (
-        lambda folder: (folder / "policy.onnx").write_bytes(Random(1).randbytes(500)),
-        r"policy\.onnx cannot be read as ONNX",
-    ),
     "graph cut": (
         lambda folder: [
             graphs.actor(folder / "policy.onnx"),
@@ -169,10 +155,6 @@ REFUSED: dict[str, tuple[Write, str]] = {
     "operator of a vendor": (
         lambda folder: one_node(folder, "Foo", domain="com.acme"),
         r"policy\.onnx holds what OpenVINO cannot run \(.*com\.acme\.Foo.*ONNX standard",
-    ),
-    "shapes that do not fit": (
-        lambda folder: one_node(folder, "MatMul", weight=np.zeros((7, 4), np.float32)),
-        r"policy\.onnx holds what OpenVINO cannot run",
     ),
     "three actions": (
         lambda folder: one_node(folder, "MatMul", weight=np.zeros((13, 3), np.float32)),
@@ -186,7 +168,7 @@ REFUSED: dict[str, tuple[Write, str]] = {
 
 
 @pytest.mark.parametrize("case", REFUSED)
-def test_what_cannot_fly_is_refused_by_its_cause(tmp_path: Path, case: str) -> None:
+def test_unusable_graphs_are_refused_by_cause(tmp_path: Path, case: str) -> None:
     write, told = REFUSED[case]
     graphs.write_contract(tmp_path)
     write(tmp_path)
@@ -203,20 +185,17 @@ def test_a_draft_has_the_state_whatever_its_input_is_called(tmp_path: Path) -> N
         assert found["state", "names"] == ["?"] * 13
 
 
-def test_a_tuple_of_torchscript_needs_to_be_told_apart(tmp_path: Path) -> None:
-    graphs.write_contract(tmp_path)
-    graphs.save_script(tmp_path / "policy.pt", graphs.TupleActor())
-    with pytest.raises(PolicyError, match=r"returns 3 values \(0, 1, 2\).*\"chunk\": 0"):
-        load(f"torchscript:{tmp_path / 'policy.pt'}")
-
-
 def test_torchscript_of_an_observation_alone_flies_and_keeps_its_state(tmp_path: Path) -> None:
     graphs.write_contract(tmp_path)
-    graphs.save_script(tmp_path / "state.pt", graphs.StateActor())
-    runner = load(f"torchscript:{tmp_path / 'state.pt'}")
+    path = tmp_path / "policy.pt"
+    graphs.save_script(path, graphs.StateActor())
+    runner = load(f"torchscript:{path}")
     assert act(runner, vx_mps=2.0) == pytest.approx([0.2] * 4, abs=1e-3)
-    graphs.save_script(tmp_path / "counting.pt", graphs.CountingActor())
-    require_counting(load(f"torchscript:{tmp_path / 'counting.pt'}"))
+    graphs.save_script(path, graphs.CountingActor())
+    require_counting(load(f"torchscript:{path}"))
+    graphs.save_script(path, graphs.TupleActor())
+    with pytest.raises(PolicyError, match=r"returns 3 values \(0, 1, 2\).*\"chunk\": 0"):
+        load(f"torchscript:{path}")
 
 
 class Deep(nn.Module):

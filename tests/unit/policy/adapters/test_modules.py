@@ -39,8 +39,6 @@ horizon = 8
     [
         ("ForwardOnly", False),
         ("NamedHead", True),
-        ("NamedHead", False),
-        ("NamedDenoiser", True),
         ("NamedDenoiser", False),
         ("Wide", True),
         ("Wide", False),
@@ -48,9 +46,7 @@ horizon = 8
 )
 def test_a_class_that_names_its_modules_flies_converted(name: str, dual_rate: bool) -> None:
     request = PolicyRequest(
-        spec=f"helpers.torch_policies:{name}",
-        dual_rate=dual_rate,
-        num_diffusion_steps=4,
+        spec=f"helpers.torch_policies:{name}", dual_rate=dual_rate, num_diffusion_steps=4
     )
     runner, notes = loaded(request)
     assert runner.engine.startswith("openvino"), notes
@@ -139,7 +135,9 @@ def test_the_decisions_of_a_script_are_kept(tmp_path: Path) -> None:
     ("content", "reason"),
     [(None, "there is no file"), (b"junk", "cannot be read"), (b"", "is empty, or cut short")],
 )
-def test_what_is_no_archive_is_refused(tmp_path: Path, content: bytes | None, reason: str) -> None:
+def test_a_file_that_is_no_archive_is_refused(
+    tmp_path: Path, content: bytes | None, reason: str
+) -> None:
     path = tmp_path / "mine.pt"
     if content is not None:
         path.write_bytes(content)

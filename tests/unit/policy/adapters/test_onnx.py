@@ -2,7 +2,6 @@
 
 import json
 import warnings
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -20,21 +19,16 @@ from helpers.torch_policies import (
     loaded,
     require_same,
 )
-from policy.adapters.export import OurPolicy, export_onnx, export_torchscript
+from policy.adapters.export import export_onnx, export_torchscript
 from policy.adapters.onnx import policies
-from policy.adapters.onnx.graphs import GraphFile, Ports, Wanted
-from policy.contract import Contract
+from policy.adapters.onnx.graphs import GraphFile, Wanted
 from policy.engines import choose
-from policy.engines.choose import chunks_of_samples
-from policy.engines.parity import make_parity_samples, parity_failure
 from policy.engines.runner import ExecutionSettings
 from policy.engines.torch_eager import make_torch_runner
 from policy.errors import PolicyError
 from policy.loading.load import check_request, read_policy_contract
 from policy.loading.request import PolicyRequest
-from policy.nets.resnet_unet import ResnetUnet, ResnetUnetConfig
 from policy.nets.toge import Toge
-from policy.protocol import PolicyRunner
 
 STEPS = 4
 
@@ -43,60 +37,21 @@ STEPS = 4
 def exported_toge(trained_toge: Toge, tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("toge")
     export_onnx(trained_toge, folder)
+    export_torchscript(trained_toge, folder / "toge.pt")
     return folder
 
 
-def reference(policy: OurPolicy | TwoRates, settings: ExecutionSettings) -> PolicyRunner:
-    return make_torch_runner(policy, settings)  # type: ignore[arg-type]
-
-
-@pytest.mark.parametrize("dual_rate", [True, False])
-def test_our_policy_is_the_same_from_image_to_stick(trained_toge, exported_toge, dual_rate):
-    request = PolicyRequest(
-        spec=f"onnx:{exported_toge}",
-        dual_rate=dual_rate,
-        num_diffusion_steps=STEPS,
-    )
-    settings = ExecutionSettings(
-        name="toge",
-        dual_rate=dual_rate,
-        num_diffusion_steps=STEPS,
-    )
-    runner, notes = loaded(request)
-    assert runner.engine.startswith("openvino")
-    assert "agrees with float32" in notes or runner.engine == "openvino-f32"
-    assert runner.contract == replace(trained_toge.contract, arrays="numpy")
-    trained_toge.seed_noise(0)
-    require_same(runner, reference(trained_toge, settings))
-
-
-def test_the_archive_of_our_policy_is_the_same(trained_toge: Toge, tmp_path: Path) -> None:
-    export_torchscript(trained_toge, tmp_path / "toge.pt")
-    request = PolicyRequest(spec=f"torchscript:{tmp_path / 'toge.pt'}", num_diffusion_steps=STEPS)
-    trained_toge.seed_noise(0)
-    settings = ExecutionSettings(name="toge", num_diffusion_steps=STEPS)
-    runner, notes = loaded(request)
+@pytest.mark.parametrize(
+    ("form", "dual_rate"), [("onnx:{}", True), ("onnx:{}", False), ("torchscript:{}/toge.pt", True)]
+)
+def test_our_policy_is_the_same_from_image_to_stick(trained_toge, exported_toge, form, dual_rate):
+    flags = {"dual_rate": dual_rate, "num_diffusion_steps": STEPS}
+    runner, notes = loaded(PolicyRequest(spec=form.format(exported_toge), **flags))
     assert runner.engine.startswith("openvino"), notes
-    require_same(runner, reference(trained_toge, settings))
-
-
-def test_a_single_rate_policy_of_ours_gains_a_fast_path(tmp_path: Path) -> None:
-    with torch.random.fork_rng(devices=[]):
-        torch.manual_seed(0)
-        contract = Contract(image_height=32, image_width=32)
-        policy = ResnetUnet(ResnetUnetConfig(contract=contract)).eval()
-    export_onnx(policy, tmp_path)
-    settings = ExecutionSettings(name="it", dual_rate=False, num_diffusion_steps=STEPS)
-    expected = reference(policy, settings)
-    samples = make_parity_samples(policy.contract)
-    for dual_rate in (False, True):
-        request = PolicyRequest(
-            spec=f"onnx:{tmp_path}", dual_rate=dual_rate, num_diffusion_steps=STEPS
-        )
-        runner, _ = loaded(request)
-        assert runner.dual_rate == dual_rate
-        chunks = chunks_of_samples(runner, samples)
-        assert parity_failure(chunks_of_samples(expected, samples), chunks) is None
+    assert runner.contract.feature_dim == trained_toge.contract.feature_dim
+    trained_toge.head.seed_noise(0)
+    settings = ExecutionSettings(name="toge", **flags)
+    require_same(runner, make_torch_runner(trained_toge, settings))
 
 
 def write(module: torch.nn.Module, path: Path, shapes: dict[str, tuple[int, ...]]) -> None:
@@ -139,7 +94,7 @@ def test_an_encoder_and_a_head(tmp_path: Path) -> None:
     assert read_policy_contract(request).feature_dim == 0
     runner, _ = loaded(request)
     assert runner.contract.feature_dim == DUAL.feature_dim
-    require_same(runner, reference(policy, ExecutionSettings(name="it")))
+    require_same(runner, make_torch_runner(policy, ExecutionSettings(name="it")))
 
 
 @pytest.mark.parametrize("dual_rate", [True, False])
@@ -194,40 +149,24 @@ def test_flags_that_do_not_go_with_onnx_are_refused(exported_toge, flags):
         check_request(PolicyRequest(spec=f"onnx:{exported_toge}", **flags))  # type: ignore[arg-type]
 
 
-def one_file(tmp_path: Path, shapes: dict[str, tuple[int, ...]]) -> PolicyRequest:
-    write(ForwardOnly(), tmp_path / "policy.onnx", shapes)
-    (tmp_path / "policy.json").write_text(json.dumps({"contract": json.loads(SINGLE.to_json())}))
-    return PolicyRequest(spec=f"onnx:{tmp_path}", dual_rate=False)
-
-
 def test_inputs_that_are_not_known_are_named(tmp_path: Path) -> None:
-    request = one_file(tmp_path, {"image": IMAGE, "thing": STATE})
+    write(ForwardOnly(), tmp_path / "policy.onnx", {"image": IMAGE, "thing": STATE})
+    (tmp_path / "policy.json").write_text(json.dumps({"contract": json.loads(SINGLE.to_json())}))
     with pytest.raises(PolicyError, match=r"input \['thing'\] is unknown.*'state': \[.*'proprio'"):
-        loaded(request)
+        loaded(PolicyRequest(spec=f"onnx:{tmp_path}", dual_rate=False))
 
 
-@pytest.mark.parametrize("weights_file", ["policy.onnx_data", "weights.bin"])
-def test_new_weights_in_a_file_of_their_own_are_flown(tmp_path: Path, weights_file: str) -> None:
-    onnx = pytest.importorskip("onnx", reason="the extra onnx writes the graphs")
+def test_new_weights_in_a_file_of_their_own_are_flown(tmp_path: Path) -> None:
+    graphs = pytest.importorskip("helpers.foreign_graphs", reason="the extra onnx writes them")
 
-    def compiled(factor: float) -> float:
-        for old in tmp_path.iterdir():
-            old.unlink()
-        weights = onnx.numpy_helper.from_array(factor * np.eye(13, dtype=np.float32), "w")
-        ends = [
-            onnx.helper.make_tensor_value_info(name, onnx.TensorProto.FLOAT, [1, 13])
-            for name in ("state", "out")
-        ]
-        product = onnx.helper.make_node("MatMul", ["state", "w"], ["out"])
-        graph = onnx.helper.make_graph([product], "graph", ends[:1], ends[1:], [weights])
-        opsets = [onnx.helper.make_opsetid("", 18)]
-        path = tmp_path / "policy.onnx"
-        model = onnx.helper.make_model(graph, opset_imports=opsets, ir_version=9)
-        onnx.save_model(
-            model, path, save_as_external_data=True, location=weights_file, size_threshold=0
-        )
-        state = Wanted(names=("state",), shape=(1, 13))
-        file = GraphFile(path, Ports(inputs={"state": state}, result="chunk"))
+    def throttle() -> float:
+        file = GraphFile(path, {"state": Wanted(names=("obs",), shape=(1, 13))}, "chunk")
         return float(file.compile("f32")(state=np.ones((1, 13), np.float32))[0, 0])
 
-    assert [compiled(1.0), compiled(2.0)] == [1.0, 2.0]
+    path = tmp_path / "policy.onnx"
+    graphs.actor(path, external=True)
+    assert throttle() == pytest.approx(0.1)
+    weights = path.with_name("policy.onnx.data")
+    doubled = 2 * np.frombuffer(weights.read_bytes(), np.float32)
+    weights.write_bytes(doubled.tobytes())
+    assert throttle() == pytest.approx(0.2)

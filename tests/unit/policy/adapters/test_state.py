@@ -66,11 +66,22 @@ def test_the_contracts_own_state_is_passed_on_as_it_is() -> None:
     np.testing.assert_array_equal(swapped, values[:, ::-1])
 
 
-def test_a_scale_has_a_number_for_each_name() -> None:
+def test_actions_are_in_the_policys_order_and_units_and_back() -> None:
+    interface = Interface(
+        contract=Contract(),
+        action_names=("roll", "pitch", "yaw", "throttle"),
+        action_scale=(1.0, 1.0, 1.0, 0.5),
+        action_offset=(0.0, 0.0, 0.25, 0.0),
+    )
+    sticks = np.array([[[0.1, 0.2, 0.3, 0.4]]], np.float32)
+    for given in (sticks, torch.from_numpy(sticks)):
+        theirs = interface.from_actions(given)
+        np.testing.assert_allclose(theirs, [[[0.4, 0.3, -0.05, 0.2]]], atol=1e-6)
+        np.testing.assert_allclose(interface.to_actions(theirs), sticks, atol=1e-6)
+
+
+def test_names_and_scales_that_do_not_fit_are_refused() -> None:
     with pytest.raises(ContractError, match=r"\[state\] scale must be 2 numbers"):
         Interface(contract=Contract(), state_names=("qw", "yaw_rad"), state_scale=(1.0,))
-
-
-def test_an_unknown_name_is_refused_with_all_that_are_known() -> None:
     with pytest.raises(ContractError, match=r"\['yaw_deg'\] are unknown.*vx_mps.*yaw_rad"):
         Interface(contract=Contract(), state_names=("yaw_deg",))

@@ -18,7 +18,6 @@ from policy.adapters.interface import Interface
 from policy.adapters.websocket import kind
 from policy.adapters.websocket.kind import check_server
 from policy.adapters.websocket.messages import (
-    HISTORY_KEY,
     MessageError,
     from_message,
     from_uint8,
@@ -37,62 +36,42 @@ from policy.preprocess import image_to_input
 
 
 @pytest.mark.parametrize(
-    "url",
-    [
-        "ws://127.0.0.1:8000",
-        "ws://[::1]:8000",
-        "wss://policies.example",
-        "ws://gpu:80/path",
-    ],
-)
-def test_addresses_of_servers(url: str) -> None:
-    check_server(url, None, None)
-
-
-@pytest.mark.parametrize(
     ("url", "told"),
     [
+        *((url, None) for url in ("ws://[::1]:8000", "wss://policies.example", "ws://gpu:80/path")),
         ("ws://127.0.0.1", "write ws://HOST:PORT"),
         ("ws:127.0.0.1:8000", "write ws://HOST:PORT"),
         ("ws://gpu:99999", "write ws://HOST:PORT"),
         ("ws://me:secret@gpu:8000", "leave the name and password out"),
     ],
 )
-def test_what_is_no_address_is_refused_at_once(url: str, told: str) -> None:
+def test_addresses_of_servers(url: str, told: str | None) -> None:
+    if told is None:
+        check_request(PolicyRequest(spec=url))
+        return
     with pytest.raises(PolicyError, match=told) as refusal:
         check_request(PolicyRequest(spec=url))
     assert "secret" not in str(refusal.value)
 
 
-def test_flags_that_a_server_does_not_take(tmp_path: Path) -> None:
+def test_flags_and_packages_that_a_server_needs(tmp_path, monkeypatch):
     url = "ws://127.0.0.1:8000"
     with pytest.raises(PolicyError, match="the server has the weights"):
         check_server(url, None, Path("my.safetensors"))
     with pytest.raises(PolicyError, match=r"--contract .*none\.toml"):
         check_server(url, tmp_path / "none.toml", None)
-
-
-def test_a_missing_package_is_told_with_its_extra(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(kind, "find_spec", lambda name: None if name == "msgpack" else object())
     with pytest.raises(PolicyError, match=r"needs msgpack: pip install msgpack"):
-        check_server("ws://127.0.0.1:8000", None, None)
+        check_server(url, None, None)
 
 
-@pytest.mark.parametrize("host", ["::1", "[::1]", "fe80::1%eth0", "[fe80::1%eth0]", "localhost"])
-def test_an_ipv6_address_to_serve_at_may_have_brackets(host: str) -> None:
-    assert ServeConfig(host=host).host == host.strip("[]")
-
-
-@pytest.mark.parametrize(
-    ("changes", "told"),
-    [
-        ({"port": 0}, "port"),
-        ({"policy": PolicyConfig(dual_rate=True)}, "leave out --dual-rate"),
-    ],
-)
-def test_what_cannot_be_served_is_refused(changes: dict[str, Any], told: str) -> None:
-    with pytest.raises(MavbridgeError, match=told):
-        ServeConfig(**changes)
+def test_settings_of_our_server() -> None:
+    for host in ("[::1]", "fe80::1%eth0", "localhost"):
+        assert ServeConfig(host=host).host == host.strip("[]")
+    with pytest.raises(MavbridgeError, match="port"):
+        ServeConfig(port=0)
+    with pytest.raises(MavbridgeError, match="leave out --dual-rate"):
+        ServeConfig(policy=PolicyConfig(dual_rate=True))
 
 
 KEYS = (b"\xc4\x0b__ndarray__\xc3", b"\xc4\x04data", b"\xc4\x05dtype", b"\xc4\x05shape")
@@ -100,24 +79,11 @@ KEYS = (b"\xc4\x0b__ndarray__\xc3", b"\xc4\x04data", b"\xc4\x05dtype", b"\xc4\x0
 ONE_F32 = b"\x81\xa5state\x84" + KEYS[0] + KEYS[1] + b"\xc4\x04\x00\x00\x80\x3f"
 ONE_F32 += KEYS[2] + b"\xa3<f4" + KEYS[3] + b"\x91\x01"
 """{"state": array([1.0], float32)}."""
-IMAGE = b"\x82\xa5image\x84" + KEYS[0] + KEYS[1] + b"\xc4\x06\x01\x02\x03\x04\x05\x06"
-IMAGE += KEYS[2] + b"\xa3|u1" + KEYS[3] + b"\x93\x01\x02\x03" + b"\xa6prompt\xa2go"
 
 
-def test_a_request_has_the_bytes_of_the_protocol() -> None:
+def test_messages_have_the_bytes_of_the_protocol() -> None:
     assert pack({"state": np.array([1.0], np.float32)}) == ONE_F32
-    image = np.arange(1, 7, dtype=np.uint8).reshape(1, 2, 3)
-    assert pack({"image": image, "prompt": "go"}) == IMAGE
-    flipped = image[:, ::-1][:, ::-1]  # strides of its own, the same pixels
-    assert pack({"image": flipped, "prompt": "go"}) == IMAGE
-
-
-def test_the_bytes_of_the_protocol_are_read() -> None:
     assert unpack(ONE_F32)["state"] == np.float32(1.0)
-    message = unpack(IMAGE)
-    image = number_array(message, "image")
-    assert (image.dtype, image.shape, message["prompt"]) == (np.uint8, (1, 2, 3), "go")
-    assert image.tolist() == [[[1, 2, 3], [4, 5, 6]]]
     with_scalar = pack({"x": np.float32(2.5)})
     assert with_scalar == b"\x81\xa1x\x83\xc4\x0d__npgeneric__\xc3\xc4\x04data\xcb" + (
         b"\x40\x04\x00\x00\x00\x00\x00\x00\xc4\x05dtype\xa3<f4"
@@ -125,9 +91,9 @@ def test_the_bytes_of_the_protocol_are_read() -> None:
     assert unpack(with_scalar)["x"] == 2.5
 
 
-@pytest.mark.parametrize("dtype", ["<f8", "<f4", "<f2", "<i8", "<i4", "|i1", "|u1", "|b1", ">f4"])
+@pytest.mark.parametrize("dtype", ["<f8", "<f2", "<i8", "|u1", "|b1", ">f4"])
 def test_every_kind_of_number_arrives_as_it_was(dtype: str) -> None:
-    sent = np.array([[0, 1], [1, 0]], dtype)
+    sent = np.array([[0, 1], [1, 0]], dtype)[:, ::-1]
     received = number_array(unpack(pack({"x": sent})), "x")
     assert received.dtype == sent.dtype
     assert np.array_equal(received, sent)
@@ -166,13 +132,13 @@ def array(**changes: object) -> bytes:
         msgpack.packb({"x": {"__npgeneric__": True, "data": b"1", "dtype": "<f4"}}),
     ],
 )
-def test_what_is_malformed_is_refused(data: bytes) -> None:
+def test_malformed_messages_are_refused(data: bytes) -> None:
     with pytest.raises(MessageError):
         unpack(data)
 
 
 @given(st.binary(max_size=200))
-def test_no_bytes_raise_anything_else(data: bytes) -> None:
+def test_random_bytes_raise_nothing_but_a_message_error(data: bytes) -> None:
     with suppress(MessageError):
         assert isinstance(unpack(data), dict)
 
@@ -191,18 +157,10 @@ def test_errors_name_what_is_there() -> None:
         pack({"x": object()})
 
 
-NORMALISATIONS: list[dict[str, Any]] = [
-    {},
-    {"image_mean_rgb": (0.0, 0.0, 0.0), "image_std_rgb": (1.0, 1.0, 1.0)},
-    {"image_mean_rgb": (0.5, 0.5, 0.5), "image_std_rgb": (0.5, 0.5, 0.5)},
-    {"image_mean_rgb": (0.9, 0.1, 0.5), "image_std_rgb": (0.01, 0.3, 7.0)},
-]
-
-
-@pytest.mark.parametrize("normalisation", NORMALISATIONS)
 @pytest.mark.parametrize("channels", ["rgb", "bgr"])
-def test_every_level_of_a_picture_comes_back(normalisation: dict[str, Any], channels: Any) -> None:
-    contract = Contract(image_height=16, image_width=16, image_channels=channels, **normalisation)
+def test_every_level_of_a_picture_comes_back(channels: Any) -> None:
+    scaling: Any = {"image_mean_rgb": (0.9, 0.1, 0.5), "image_std_rgb": (0.01, 0.3, 7.0)}
+    contract = Contract(image_height=16, image_width=16, image_channels=channels, **scaling)
     levels = np.arange(256, dtype=np.uint8).reshape(16, 16)
     rgb = np.stack([levels, levels[::-1], levels.T], axis=-1)
     planes = image_to_input(rgb, contract)
@@ -263,7 +221,6 @@ def test_keys_and_names_are_those_of_the_contract_file() -> None:
         ({"observation.state": None}, "no 'observation.state'"),
         ({"observation.state": np.zeros(12, np.float32)}, r"float32 \[13\], got float32 \[12\]"),
         ({"observation.state": np.full(13, np.nan, np.float32)}, "NaN"),
-        ({HISTORY_KEY: np.zeros((4, 3), np.float32)}, r"\[4, 4\]"),
         ({"observation.images.front": np.zeros((16, 24, 3), np.float32)}, "uint8"),
         ({"observation.images.front": np.zeros((3, 16, 24), np.uint8)}, r"\[16, 24, 3\]"),
     ],

@@ -22,11 +22,10 @@ PI0 = json.dumps({"type": "pi0", "input_features": {}, "output_features": {}})
 SAFETENSORS, TORCH = "model.safetensors", "model.pt"
 
 
-@pytest.mark.parametrize("name", ["weights.safetensors", "weights.pt"])
-def test_a_pipe_is_refused_and_not_waited_for(tmp_path: Path, name: str) -> None:
-    os.mkfifo(tmp_path / name)
+def test_a_pipe_is_refused_and_not_waited_for(tmp_path: Path) -> None:
+    os.mkfifo(tmp_path / TORCH)
     with pytest.raises(CheckpointError, match="not a file but a pipe or a device"):
-        read_contract(tmp_path / name)
+        read_contract(tmp_path / TORCH)
 
 
 def tensors(*names: str, dtype: torch.dtype = torch.float32) -> dict[str, torch.Tensor]:
@@ -57,7 +56,6 @@ LFS = b"version https://git-lfs.github.com/spec/v1\noid sha256:00\nsize 1\n"
 FILES: list[tuple[str, Callable[[], bytes], str]] = [
     (TORCH, lambda: b"", "is empty, or cut short: copy it again"),
     (SAFETENSORS, lambda: LFS, "is a pointer of Git LFS.*git lfs pull"),
-    (SAFETENSORS, lambda: b"\n<!DOCTYPE html><html>", "is a web page.*download it again"),
     ("m.onnx", lambda: b"\x08\x08\x12\x07pytorch", r"--policy onnx:.*m\.onnx"),
     (
         TORCH,
@@ -125,23 +123,16 @@ def test_weights_of_a_lerobot_folder_name_the_folder(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("content", [b"PK", b"\x80\x02cos", b"\xff" * 64, b"12345678{", b"{"])
-def test_what_is_unknown_is_left_to_its_reader(tmp_path: Path, content: bytes) -> None:
+def test_unknown_content_is_left_to_its_reader(tmp_path: Path, content: bytes) -> None:
     (tmp_path / TORCH).write_bytes(content)
     assert detect(tmp_path / TORCH) is None
 
 
 @pytest.mark.parametrize("kind", ["lerobot", "onnx", "torchscript"])
-@pytest.mark.parametrize(
-    ("content", "message"),
-    [
-        (b"<html>", "is a web page"),
-        (b"version https://git-lfs.github.com/spec/v1\n", "git lfs pull"),
-    ],
-)
-def test_a_form_of_a_foreign_policy_names_what_else_its_file_is(tmp_path, kind, content, message):
+def test_a_form_of_a_foreign_policy_names_the_kind_of_its_file(tmp_path: Path, kind: str) -> None:
     path = tmp_path / "policy.onnx"
-    path.write_bytes(content)
-    with pytest.raises(PolicyError, match=rf"^--policy {kind}:{path}: .*{message}"):
+    path.write_bytes(b"<html>")
+    with pytest.raises(PolicyError, match=rf"^--policy {kind}:{path}: .*is a web page"):
         check_request(PolicyRequest(spec=f"{kind}:{path}"))
 
 

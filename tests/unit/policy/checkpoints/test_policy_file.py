@@ -10,16 +10,12 @@ from safetensors import safe_open
 from safetensors.torch import save_file
 from torch import nn
 
-from policy.checkpoints.policy_file import (
-    build_policy,
-    load_checkpoint,
-    save_checkpoint,
-)
+from policy.checkpoints.policy_file import load_checkpoint, save_checkpoint
+from policy.checkpoints.tensors import pack, unpack
 from policy.contract import Contract
 from policy.errors import CheckpointError
 from policy.nets.diffusion import NoiseSchedule
-from policy.nets.resnet_unet import ResnetUnetConfig
-from policy.nets.toge import Toge, TogeConfig
+from policy.nets.toge import ResnetUnetConfig, Toge, TogeConfig, build_policy
 
 
 @pytest.fixture(scope="module")
@@ -41,18 +37,19 @@ def with_header(path: Path, header: dict[str, str]) -> Path:
     return path
 
 
+def contents_of(path: Path) -> dict[str, torch.Tensor]:
+    with safe_open(path, framework="pt") as file:
+        return {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
+
+
 def test_the_file_alone_says_what_it_is(tmp_path: Path) -> None:
-    config = TogeConfig(
-        size="small",
-        backbone="resnet18",
-        contract=Contract(
-            image_height=32, image_width=48, state_frame="enu_flu", horizon=8, since_exposure=True
-        ),
-        schedule=NoiseSchedule(prediction="epsilon", betas="linear", num_train_timesteps=50),
-    )
+    contract = Contract(image_height=32, image_width=48, state_frame="enu_flu", horizon=8)
+    schedule = NoiseSchedule(prediction="epsilon", betas="linear", num_train_timesteps=50)
+    config = TogeConfig(backbone="resnet8", contract=contract, schedule=schedule)
     policy = build_policy(config).eval()
     path = tmp_path / "a.safetensors"
     save_checkpoint(path, policy)
+    assert contents_of(path)["test_vector.chunks"].abs().max() > 0.1
     loaded = load_checkpoint(path, fallback=TogeConfig())
     assert loaded.config == policy.config
     assert not loaded.training
@@ -61,18 +58,21 @@ def test_the_file_alone_says_what_it_is(tmp_path: Path) -> None:
     assert [p.name for p in tmp_path.iterdir()] == ["a.safetensors"]
 
 
-def contents_of(path: Path) -> dict[str, torch.Tensor]:
-    with safe_open(path, framework="pt") as file:
-        return {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
-
-
-def test_a_test_vector_is_carried_and_kept(small_toge: Toge, saved: Path) -> None:
-    contents = contents_of(saved)
-    assert contents["test_vector.rgb"].shape == (4, 32, 32, 3)
-    assert contents["test_vector.chunks"].shape == (4, 16, 4)
-    assert contents["test_vector.chunks"].abs().max() > 0.1
-    loaded = load_checkpoint(saved, fallback=small_toge.config)
-    assert not any(name.startswith("test_vector") for name in loaded.state_dict())
+def test_each_packed_weight_is_off_by_at_most_half_a_step() -> None:
+    random = torch.Generator().manual_seed(0)
+    plain = {
+        "backbone.conv.weight": torch.randn(8, 3, 3, 3, generator=random),
+        "backbone.dead.weight": torch.zeros(4, 2, 1, 1),
+        "backbone.norm.weight": torch.tensor([1e-9, 1e9]),
+        "backbone.norm.num_batches_tracked": torch.tensor(7),
+        "head.weight": torch.randn(5, 4, generator=random),
+    }
+    state = unpack(pack(plain, coarse="backbone."))
+    conv = plain.pop("backbone.conv.weight")
+    step = conv.flatten(1).abs().amax(dim=1) / 127
+    off = (state.pop("backbone.conv.weight") - conv).flatten(1).abs().amax(dim=1)
+    assert bool((off <= 0.5001 * step).all() and (off > 0).any())
+    torch.testing.assert_close(state, plain, rtol=2**-11, atol=0)
 
 
 @pytest.mark.parametrize(
@@ -80,12 +80,14 @@ def test_a_test_vector_is_carried_and_kept(small_toge: Toge, saved: Path) -> Non
     [
         ({"test_vector.chunks": lambda x: x + 0.02}, r"off by 0\.02.*damaged"),
         ({"test_vector.rgb": lambda x: x.float()}, "test vector is damaged: an image must be"),
-        ({"test_vector.state": lambda x: x[:, :12]}, "test vector is damaged: state must be"),
+        ({"test_vector.state": lambda x: x[:, :12]}, "test vector is damaged: .*copy the file"),
         ({"test_vector.history": lambda x: None}, "test vector is damaged: it must hold"),
         ({"head.unet.out.weight": lambda x: -x}, "do not make the sticks that they made"),
     ],
 )
-def test_weights_that_do_not_make_their_vector(small_toge, saved, tmp_path, changes, message):
+def test_weights_that_do_not_reproduce_their_test_vector_are_refused(
+    small_toge, saved, tmp_path, changes, message
+):
     contents = contents_of(saved)
     for name, change in changes.items():
         changed = change(contents.pop(name))
@@ -107,7 +109,7 @@ class Malicious:
         return os.mkdir, (str(self.marker),)
 
 
-@pytest.mark.parametrize("protocol", [None, 0, 2, 4])
+@pytest.mark.parametrize("protocol", [None, 0, 4])
 def test_a_malicious_pickle_is_refused_and_not_run(small_toge, tmp_path, protocol):
     marker, path = tmp_path / "ran", tmp_path / "a.pt"
     content = {"state_dict": {"weight": Malicious(marker)}}
@@ -120,18 +122,13 @@ def test_a_malicious_pickle_is_refused_and_not_run(small_toge, tmp_path, protoco
     assert not marker.exists()
 
 
-@pytest.mark.parametrize("zipped", [True, False])
-def test_a_pickled_network_is_named_with_its_ways_to_fly(small_toge, tmp_path, zipped):
-    path = tmp_path / "a.pt"
-    torch.save(nn.Linear(2, 2), path, _use_new_zipfile_serialization=zipped)
-    with pytest.raises(CheckpointError, match=r"holds a torch\.nn.*--policy torchscript:FILE"):
-        load_checkpoint(path, fallback=small_toge.config)
-
-
-def test_a_torch_file_with_a_contract_is_refused_and_not_flown_by_another(
+def test_torch_files_with_a_network_or_a_contract_are_refused(
     small_toge: Toge, tmp_path: Path
 ) -> None:
-    path = tmp_path / "own.pt"
+    path = tmp_path / "a.pt"
+    torch.save(nn.Linear(2, 2), path)
+    with pytest.raises(CheckpointError, match=r"holds a torch\.nn.*--policy torchscript:FILE"):
+        load_checkpoint(path, fallback=small_toge.config)
     torch.save({"state_dict": small_toge.state_dict(), "contract": "{}"}, path)
     with pytest.raises(CheckpointError, match="holds a contract"):
         load_checkpoint(path, fallback=small_toge.config)
@@ -178,10 +175,9 @@ def test_weights_that_do_not_fit_are_named(small_toge, tmp_path, name, tensor, m
     [
         ("contract", {"version": 9}, "version 9 is not supported"),
         ("contract", {"feature_dim": 384}, "feature_dim 384"),
-        ("contract", {"unknown": 1}, "unknown contract keys"),
         ("architecture", {"size": "huge"}, "size 'huge' is unknown"),
         ("architecture", {"backbone": "vgg16"}, "backbone 'vgg16' is unknown"),
-        ("architecture", {"policy": "other"}, "policy 'other' is unknown"),
+        ("architecture", {"policy": "other"}, "holds a other, no toge"),
         ("architecture", {"depth": 3}, "malformed architecture"),
         ("architecture", {"schedule": {"betas": "quadratic"}}, "betas 'quadratic' is unknown"),
     ],
@@ -195,20 +191,12 @@ def test_headers_of_another_build_are_refused(saved, tmp_path, key, changes, mes
     assert str(path) in str(caught.value)
 
 
-@pytest.mark.parametrize("text", ["[" * 100_000, "null", "[]", "{"])
+@pytest.mark.parametrize("text", ["[" * 100_000, "null", "{", None])
 @pytest.mark.parametrize("key", ["contract", "architecture"])
-def test_header_text_that_is_nonsense_is_refused(saved, tmp_path, key, text):
-    path = with_header(tmp_path / "a.safetensors", {**header_of(saved), key: text})
-    with pytest.raises(CheckpointError, match=r"a\.safetensors"):
-        load_checkpoint(path, fallback=TogeConfig())
-
-
-@pytest.mark.parametrize("key", ["contract", "architecture"])
-def test_a_file_without_header_says_how_to_convert_it(saved, tmp_path, key):
-    header = header_of(saved)
-    del header[key]
-    path = with_header(tmp_path / "a.safetensors", header)
-    with pytest.raises(CheckpointError, match="save_checkpoint"):
+def test_headers_that_are_nonsense_or_missing_are_refused(saved, tmp_path, key, text):
+    header = {name: value for name, value in header_of(saved).items() if name != key}
+    path = with_header(tmp_path / "a.safetensors", header | ({key: text} if text else {}))
+    with pytest.raises(CheckpointError, match=r"a\.safetensors" if text else "save_checkpoint"):
         load_checkpoint(path, fallback=TogeConfig())
 
 

@@ -38,44 +38,29 @@ def model() -> WorldModel:
         return WorldModel(CONFIG).eval()
 
 
-def test_a_file_alone_says_what_it_is(model: WorldModel, tmp_path: Path) -> None:
+def test_a_file_alone_says_what_it_is_in_half_precision(model: WorldModel, tmp_path: Path) -> None:
     path = tmp_path / "world.safetensors"
-    save_world_model(path, model, training='{"flights": 3}', half=False)
+    save_world_model(path, model, training='{"flights": 3}')
     loaded = load_world_model(path)
     assert loaded.config == CONFIG
     assert not loaded.training
     for name, value in model.state_dict().items():
-        assert torch.equal(loaded.state_dict()[name], value), name
+        assert torch.equal(loaded.state_dict()[name], value.half().float()), name
     assert read_tensors(path)[0]["training"] == '{"flights": 3}'
     assert list(tmp_path.iterdir()) == [path]
-
-
-def test_half_precision_halves_the_file_and_hardly_changes_a_frame(model, tmp_path):
-    half, full = tmp_path / "half.safetensors", tmp_path / "full.safetensors"
-    save_world_model(half, model)
-    save_world_model(full, model, half=False)
-    assert half.stat().st_size < 0.7 * full.stat().st_size
-    loaded = load_world_model(half)
-    assert all(value.dtype == torch.float32 for value in loaded.state_dict().values())
     latents = torch.randn(2, 3, 4, 4, generator=torch.Generator().manual_seed(0))
     shown, wanted = loaded.decode(latents).float(), model.decode(latents).float()
     assert (shown - wanted).abs().max() <= 1
 
 
-def test_files_that_are_not_there_or_cut_short_are_refused(model, tmp_path):
+def test_another_file_is_refused(small_toge, model, tmp_path):
     path = tmp_path / "world.safetensors"
-    save_world_model(path, model)
-    with pytest.raises(CheckpointError, match=r"no such file.*world\.safetensors"):
-        load_world_model(tmp_path / "other.safetensors")
     with pytest.raises(CheckpointError, match=r"stored as \.safetensors"):
         load_world_model(tmp_path / "world.pt")
+    save_world_model(path, model)
     path.write_bytes(path.read_bytes()[:-1])
     with pytest.raises(CheckpointError, match="cut short"):
         load_world_model(path)
-
-
-def test_a_policy_and_a_foreign_file_are_refused(small_toge, model, tmp_path):
-    path = tmp_path / "policy.safetensors"
     save_checkpoint(path, small_toge)
     with pytest.raises(CheckpointError, match="holds a policy"):
         load_world_model(path)
@@ -112,7 +97,6 @@ def test_weights_that_are_not_finite_or_do_not_fit_are_refused(model, tmp_path):
         ("world_model", "{}", "must hold"),
         ("world_model", CONFIG.to_json().replace('"frames": 4', '"frames": 0'), "frames"),
         ("contract", "{}x", "not JSON"),
-        ("contract", '{"version": 99}', "version 99"),
     ],
 )
 def test_headers_of_another_make_are_refused(model, tmp_path, key, text, says):

@@ -56,16 +56,12 @@ def test_expert_is_imitated_where_there_is_one(tmp_path: Path) -> None:
 
 
 def test_without_an_expert_what_was_sent_while_armed_is_imitated(tmp_path: Path) -> None:
-    ticks = ticks_table(
-        woke_ns=WOKE, expert=None, sent=[STICK] * 3, armed=[False, True, True], sent_lag_ns=MS
-    )
+    armed = [False, True, True]
+    ticks = ticks_table(woke_ns=WOKE, expert=None, sent=[STICK] * 3, armed=armed, sent_lag_ns=MS)
     episode = read_flight(flight(tmp_path / "a", ticks))
     assert episode.target_ns.tolist() == [11 * MS, 21 * MS]
-
-
-def test_in_a_read_only_flight_the_pilot_is_imitated(tmp_path: Path) -> None:
-    ticks = ticks_table(woke_ns=WOKE, expert=None, sent=[None] * 3, rc_sticks=[STICK] * 3)
-    episode = read_flight(flight(tmp_path / "a", ticks))
+    pilot = ticks_table(woke_ns=WOKE, expert=None, sent=[None] * 3, rc_sticks=[STICK] * 3)
+    episode = read_flight(flight(tmp_path / "b", pilot))
     np.testing.assert_allclose(episode.target, [STICK] * 3)
     np.testing.assert_allclose(episode.sent, [STICK] * 3)
 
@@ -109,7 +105,6 @@ def test_failed_flights_are_left_out_and_counted_unless_they_are_asked_for(tmp_p
     [
         ("{", "not JSON"),
         ("[]", "not a flight of mavbridge"),
-        ({"format": "other"}, "not a flight of mavbridge"),
         ({"version": 2}, "version 2"),
         ({"contract": None}, "state frame is"),
     ],
@@ -153,7 +148,7 @@ def test_no_flights_are_refused(tmp_path: Path) -> None:
         ({"expert": [None] * 3}, "nobody to learn from"),
     ],
 )
-def test_numbers_that_are_none_are_refused(tmp_path, changes, says):
+def test_invalid_columns_are_refused(tmp_path, changes, says):
     good = {"woke_ns": WOKE, "expert": [STICK] * 3, "sent": [STICK] * 3}
     with pytest.raises(DatasetError, match=says):
         read_flight(flight(tmp_path / "a", ticks_table(**{**good, **changes})))
@@ -162,9 +157,7 @@ def test_numbers_that_are_none_are_refused(tmp_path, changes, says):
 def test_ages_are_measured_where_a_policy_looked(tmp_path: Path) -> None:
     seen = [None, 2 * MS, 5 * MS]
     ticks = ticks_table(woke_ns=WOKE, expert=[STICK] * 3, sent=[STICK] * 3, captured_ns=seen)
-    folder = flight(tmp_path / "a", ticks)
-    assert read_ages(folder).tolist() == [8 * MS, 15 * MS]
-    assert sorted(read_flight(folder).age_ns.tolist()) == [8 * MS, 15 * MS]
+    assert read_ages(flight(tmp_path / "a", ticks)).tolist() == [8 * MS, 15 * MS]
     blind = ticks_table(woke_ns=WOKE, expert=[STICK] * 3, sent=[STICK] * 3)
     with pytest.raises(DatasetError, match="no policy looked"):
         read_ages(flight(tmp_path / "b", blind))
@@ -177,25 +170,21 @@ def test_some_flights_are_held_out_and_some_are_kept(tmp_path: Path) -> None:
     assert sorted(kept + held) == list(range(10))
     assert len(held) == 2
     assert hold_out([episode] * 10, 0.2, seed=3) == (kept, held)
-    assert len(hold_out([episode] * 2, 0.01, seed=0)[1]) == 1
-    assert hold_out([episode], 0.5, seed=0) == ([0], [])
-    assert hold_out([episode] * 3, 0.0, seed=0)[1] == []
+    for count, fraction, held_out in ((2, 0.01, 1), (1, 0.5, 0), (3, 0.0, 0)):
+        assert len(hold_out([episode] * count, fraction, seed=0)[1]) == held_out
 
 
 @pytest.mark.parametrize(
     ("meta", "failure"),
     [
         ({"source": "demonstration", "success": False}, "off the course"),
-        ({"source": "demonstration", "success": True}, None),
         ({"source": "dagger", "success": False}, None),
         ({"source": "dagger", "success": False, "ticks": 0}, "empty"),
-        ({"source": "flight", "success": None}, None),
         ({"source": "flight", "success": None, "finished": False}, "cut off"),
         ({"source": "flight", "success": None, "outcome": {"end": "duration"}}, None),
         ({"source": "flight", "success": None, "outcome": {"end": "fault"}}, "ended by a fault"),
         ({"source": "flight", "success": True, "outcome": {"end": "fault"}}, None),
         ({"source": "flight", "outcome": {"end": "course", "crash": "hit gate 7"}}, "crashed"),
-        ({"source": "flight", "success": False, "crash": "it lay on its back"}, "crashed"),
         ({"source": "pilot", "success": None, "finished": False}, None),
         ({"source": "pilot", "success": True, "crash": "a hard landing"}, None),
         ({"source": "pilot", "success": False}, "marked as bad"),
@@ -215,7 +204,7 @@ def test_a_failed_flight_is_nothing_to_imitate(tmp_path, meta, failure):
         ({"action": "rates"}, "without an expert"),
     ],
 )
-def test_actions_that_nothing_here_learns_from_are_refused(tmp_path, contract, says):
+def test_actions_that_cannot_be_learned_are_refused(tmp_path, contract, says):
     folder = flight(
         tmp_path / "a",
         ticks_table(woke_ns=WOKE, expert=None, sent=[STICK] * 3),

@@ -109,7 +109,9 @@ def test_a_foreign_dataset_has_its_timestamps_for_everything(kind: str, tmp_path
 def test_the_frame_of_the_state_is_where_gravity_says(tmp_path: Path) -> None:
     flu = (*LEVEL[:-1], 9.8)
     assert read_dataset(write(tmp_path / "a"))[0].state_frame == "ned_frd"
-    assert read_dataset(write(tmp_path / "b", state=flu))[0].state_frame == "enu_flu"
+    assert read_dataset(write(tmp_path / "b", state=flu), CAMERA)[0].state_frame == "enu_flu"
+    with pytest.raises(DatasetError, match="no camera tail"):
+        read_dataset(tmp_path / "a", "tail")
 
 
 Change = Callable[[dict[str, Any]], None]
@@ -129,7 +131,6 @@ def _second_camera(info: dict[str, Any]) -> None:
         (lambda info: info.update(codebase_version="v2.1"), "convert_dataset_v21_to_v30"),
         (lambda info: info.update(fps=0), "fps"),
         (lambda info: info["features"].pop("observation.state"), "no feature observation.state"),
-        (_state(shape=[14]), r"shape \[14\]"),
         (_state(names=list(STATE_NAMES[::-1])), "in this order"),
         (_state(info={"state_frame": "body"}), "state frame is 'body'"),
         (lambda info: info["features"].pop(CAMERA), "no camera"),
@@ -145,16 +146,6 @@ def test_another_kind_of_dataset_is_refused(change: Change, says: str, tmp_path:
     path.write_text(json.dumps(info))
     with pytest.raises(DatasetError, match=says):
         read_dataset(tmp_path / "a")
-
-
-def test_one_of_several_cameras_is_named(tmp_path: Path) -> None:
-    path = write(tmp_path / "a") / "meta/info.json"
-    info = json.loads(path.read_text())
-    _second_camera(info)
-    path.write_text(json.dumps(info))
-    assert len(read_dataset(tmp_path / "a", CAMERA)) == 2
-    with pytest.raises(DatasetError, match="no camera tail"):
-        read_dataset(tmp_path / "a", "tail")
 
 
 ROWS = "data/chunk-000/file-000.parquet"
@@ -184,14 +175,11 @@ def _scalar_state(table: pa.Table) -> pa.Table:
     ("spoil", "says"),
     [
         (_edit_rows("observation.state", _nan), "NaN or infinity in row 3"),
-        (_edit_rows("timestamp", lambda v: v[::-1]), "runs backwards"),
         (_edit_rows("timestamp", lambda v: [None, *v[1:]]), "missing in 1"),
-        (_edit_rows("action", lambda v: [[7.0] * 4] * len(v)), "sticks in"),
         (_edit_table(lambda table: table.drop_columns(["action"])), "lacks .*action"),
         (_edit_table(lambda table: table.slice(0, 15)), "holds 3 rows"),
         (_edit_table(_scalar_state), "13 numbers a row"),
         (lambda root: (root / ROWS).unlink(), "is not there"),
-        (lambda root: (root / ROWS).write_bytes(b"PAR1"), "cannot be read"),
         (
             lambda root: (root / "meta/episodes/chunk-000/file-000.parquet").unlink(),
             "no meta/episodes",
@@ -204,16 +192,13 @@ def test_a_damaged_dataset_is_refused(spoil, says, tmp_path):
         read_dataset(tmp_path / "a")
 
 
-@pytest.mark.parametrize(
-    ("shown", "says"), [(14, "ends after 2 of 8"), (12, "ends after 0 of 8|cannot be read")]
-)
-def test_a_video_that_ends_early_is_refused(shown: int, says: str, tmp_path: Path) -> None:
+def test_a_video_that_ends_early_is_refused(tmp_path: Path) -> None:
     root = write(tmp_path / "a")
     images = [image for episode in range(2) for image in images_of(episode)]
-    encode(root / f"videos/{CAMERA}/chunk-000/file-000.mp4", images[:shown])
+    encode(root / f"videos/{CAMERA}/chunk-000/file-000.mp4", images[:14])
     first, second = read_dataset(root)
     assert len(list(first.decode())) == LENGTHS[0]
-    with pytest.raises(DatasetError, match=says):
+    with pytest.raises(DatasetError, match="ends after 2 of 8"):
         list(second.decode())
 
 

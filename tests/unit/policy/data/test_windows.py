@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from helpers.steered_flights import ACCELERATION_MPS2, MS, YAW_RATE_RADPS, steered_flight
+from helpers.steered_flights import ACCELERATION_MPS2, MS, steered_flight
 from policy.contract import QUATERNION, VELOCITY
 from policy.data.flight_data import DatasetError, FlightData
 from policy.data.windows import TOLERANCE, Windows, find_windows
@@ -36,16 +36,6 @@ def test_windows_stay_in_one_flight_and_cross_no_gap() -> None:
     assert not ((in_second[:, 0] < lost_ns) & (in_second[:, -1] > lost_ns)).any()
 
 
-def test_a_window_needs_states_all_along() -> None:
-    flight = steered_flight(0)
-    state = flight.state.copy()
-    state[100:140] = np.nan  # 0.4 s in which nobody flew
-    found = windows_of(replace(flight, state=state))
-    covered = (found.captured_ns[found.frames] - flight.tick_ns[0]) / 1e9
-    assert 0 < len(found) < 76
-    assert not ((covered > 1.0) & (covered < 1.4)).any()
-
-
 def test_actions_are_the_mean_of_what_was_sent_between_the_frames() -> None:
     flight = steered_flight(0)
     samples = windows_of(flight).samples(np.array([0, 11]))
@@ -74,16 +64,14 @@ def test_sticks_are_neutral_before_the_first_and_held_after_the_last() -> None:
 def test_states_are_those_of_the_exposures_and_follow_the_actions() -> None:
     found = windows_of(steered_flight(0))
     samples = found.samples(np.arange(len(found)))
-    np.testing.assert_allclose(
-        np.linalg.norm(samples.states[..., QUATERNION], axis=-1), 1.0, atol=1e-5
-    )
+    lengths = np.linalg.norm(samples.states[..., QUATERNION], axis=-1)
+    np.testing.assert_allclose(lengths, 1.0, atol=1e-5)
     assert (samples.states[..., QUATERNION.start] >= 0).all()
     moved = np.diff(samples.states[:, 1:, VELOCITY], axis=1)
     elapsed_s = np.diff(found.captured_ns[found.frames[:, 1:]], axis=1) / 1e9
     foretold = np.abs(samples.actions[..., 2]) * elapsed_s * ACCELERATION_MPS2
     met = np.abs(np.linalg.norm(moved, axis=-1) - foretold) < 0.01 * ACCELERATION_MPS2
     assert met.mean() > 0.9  # not where it turns or changes its mind on the way
-    assert YAW_RATE_RADPS > np.abs(samples.states[..., 9]).max() > 0.5
 
 
 def test_flights_without_a_window_are_refused() -> None:
@@ -91,6 +79,3 @@ def test_flights_without_a_window_are_refused() -> None:
         windows_of(steered_flight(0, seconds=0.3))
     with pytest.raises(DatasetError, match="choose another frame_dt_s"):
         windows_of(steered_flight(0), dt_s=0.02)
-    nobody = replace(steered_flight(0), state=np.full((300, 13), np.nan, np.float32))
-    with pytest.raises(DatasetError, match="with states"):
-        windows_of(nobody)

@@ -7,9 +7,8 @@ from typing import Any
 
 import numpy as np
 import pytest
-import torch
 
-from policy.contract import Contract, FloatArray
+from policy.contract import FloatArray
 from policy.engines.choose import Candidate, choose_runner, first_that_agrees
 from policy.engines.parity import MAX_STICK_ERROR
 from policy.engines.runner import ExecutionSettings
@@ -35,13 +34,6 @@ def altered(policy: Toge, alter: Callable[[FloatArray], FloatArray]) -> Candidat
     return ("wrong", make)
 
 
-def failing(error: Exception) -> Candidate:
-    def make() -> PolicyRunner:
-        raise error
-
-    return ("broken", make)
-
-
 def one_bad_stick(chunk: FloatArray) -> FloatArray:
     chunk = chunk.copy()
     chunk[0, 7, 2] += 2 * MAX_STICK_ERROR
@@ -65,13 +57,12 @@ def test_a_wrong_engine_is_passed_over_with_its_reason(small_toge, alter, reason
     assert re.search(reason, notes[0])
 
 
-@pytest.mark.parametrize(
-    "error",
-    [RuntimeError("no memory\nat x.cpp:3"), PolicyError("no memory"), TypeError("no memory")],
-)
-def test_an_engine_that_fails_is_passed_over(small_toge: Toge, error: Exception) -> None:
+def test_an_engine_that_fails_is_passed_over(small_toge: Toge) -> None:
+    def broken() -> PolicyRunner:
+        raise RuntimeError("no memory\nat x.cpp:3")
+
     right = altered(small_toge, lambda chunk: chunk)
-    runner, notes = first_that_agrees(small_toge, [failing(error), right], SETTINGS)
+    runner, notes = first_that_agrees(small_toge, [("broken", broken), right], SETTINGS)
     assert runner.engine == "wrong"  # by name only
     assert "engine broken is passed over" in notes[0]
     assert notes[0].endswith("no memory")
@@ -80,8 +71,7 @@ def test_an_engine_that_fails_is_passed_over(small_toge: Toge, error: Exception)
 
 def test_without_openvino_torch_flies(small_toge: Toge, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("policy.engines.choose.find_spec", lambda name: None)
-    runner, _ = choose_runner(small_toge, "auto", SETTINGS)
-    assert runner.engine == "torch"
+    assert choose_runner(small_toge, "auto", SETTINGS)[0].engine == "torch"
     with pytest.raises(PolicyError, match="pip install openvino"):
         choose_runner(small_toge, "openvino", SETTINGS)
 
@@ -97,18 +87,3 @@ def test_an_engine_asked_for_on_the_wrong_device_is_refused(small_toge, engine, 
     settings = replace(SETTINGS, vision_device=device, action_device=device)
     with pytest.raises(PolicyError, match=message):
         choose_runner(small_toge, engine, settings)
-
-
-def test_engines_of_our_networks_do_not_take_others() -> None:
-    class Other:
-        def __init__(self, contract: Any) -> None:
-            self.contract = contract
-
-        def predict(self, image: Any, state: Any, history: Any, steps: int) -> torch.Tensor:
-            return torch.zeros(1, 16, 4)
-
-    policy = Other(Contract())
-    single = replace(SETTINGS, dual_rate=False)
-    assert choose_runner(policy, "auto", single)[0].engine == "torch"
-    with pytest.raises(PolicyError, match=r"takes a torch\.nn\.Module"):
-        choose_runner(policy, "openvino", single)

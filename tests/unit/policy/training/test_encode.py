@@ -7,9 +7,11 @@ import torch
 
 from policy.training.batches import (
     ENCODE_BATCH,
+    SHARE,
     FeatureStore,
     Job,
     both_ways,
+    disturb,
     encode_rows,
     one_way_first,
 )
@@ -42,12 +44,23 @@ def test_half_of_the_time_encodes_each_image_one_way(tmp_path: Path) -> None:
 
 
 def test_with_time_for_all_both_ways_are_there(tmp_path: Path) -> None:
-    frames = np.random.default_rng(0).permutation(FRAMES)
-    for name, jobs in (
-        ("one", one_way_first(frames, mirror=True)),
-        ("both", both_ways(frames, mirror=True)),
-    ):
-        store = encoded(tmp_path / name, jobs, jobs_done=len(jobs) + 1)
+    frames = np.arange(FRAMES)
+    for order in (one_way_first, both_ways):
+        jobs = order(frames, mirror=True)
+        store = encoded(tmp_path / "all", jobs, jobs_done=len(jobs) + 1)
         assert store.has_mirrored
         for wanted in (False, True):
             assert set(store.ways(store.frames, np.full(FRAMES, wanted))) == {wanted}
+
+
+def test_images_are_disturbed_and_as_many_left_alone_as_the_shares_say() -> None:
+    images = np.full((800, 48, 64, 3), 128, np.uint8)
+    disturb(images, np.random.default_rng(0))
+    same = (images == 128).all(axis=(1, 2, 3)).mean()
+    assert abs(same - (1 - SHARE) ** 3) < 0.06
+    means = images.mean(axis=(1, 2, 3))
+    assert means.min() < 45
+    assert means.max() > 200
+    coloured = np.ptp(images, axis=3).max(axis=(1, 2)) > 0
+    assert 0.15 < coloured.mean() < 0.35
+    assert (images[~coloured].std(axis=(1, 2)).max(axis=1) > 20).any()
