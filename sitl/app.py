@@ -77,14 +77,7 @@ def run_vehicle(
         with filming(vehicle, course, camera, clock) if camera is not None else nullcontext():
             print_status("ready on " + ", ".join(links))
             end_ns = None if duration_s is None else clock.now_ns() + round(duration_s * NS_PER_S)
-            fly(
-                vehicle,
-                transports,
-                clock,
-                stop,
-                end_ns,
-                rc_input=rc_input,
-            )
+            fly(vehicle, transports, clock, stop, end_ns, rc_input=rc_input)
         if fly_on_s:
             os.nice(LEAST_PRIORITY)
             fly_on(vehicle, fly_on_s)

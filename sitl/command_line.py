@@ -15,12 +15,7 @@ from sitl.clock import NS_PER_S, stop_on_signal, wall_ns
 from sitl.course import course_to_json, make_course
 from sitl.pilot.transmitter import DEFAULT_AXES
 from sitl.vehicle.conditions import NOMINAL, random_conditions
-from sitl.vehicle.config import (
-    IDLE_RECEIVER_US,
-    MID_RECEIVER_US,
-    SigningKey,
-    VehicleConfig,
-)
+from sitl.vehicle.config import IDLE_RECEIVER_US, MID_RECEIVER_US, SigningKey, VehicleConfig
 
 KEY_BYTES = 32
 EPOCH_2015_NS = 1_420_070_400 * NS_PER_S

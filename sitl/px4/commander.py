@@ -217,7 +217,7 @@ class Commander:
         self._choose_mode()
 
     def _read_gestures(self) -> None:
-        gesture = self._sticks.gesture(self.now_ns)
+        gesture = self._sticks.gesture.take(self.now_ns)
         if not gesture or not self._params.integer("MAN_ARM_GESTURE"):
             return
         if gesture > 0:

@@ -7,7 +7,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from pymavlink.dialects.v20 import ardupilotmega as mav
 
-from sitl.ardupilot.endpoint import BUILDERS, ArduPilotStreams
+from sitl.ardupilot.endpoint import BUILDERS
 from sitl.ardupilot.flight_modes import Mode
 from sitl.clock import NS_PER_MS, NS_PER_S
 from sitl.simulated_vehicle import SimulatedVehicle
@@ -179,15 +179,16 @@ def test_a_host_stall_advances_physics_but_sends_no_burst(station):
     assert burst[0].time_boot_ms == pytest.approx(station.now_ns / NS_PER_MS, abs=3)
 
 
-def test_an_eleventh_interval_joins_the_nearest_of_ten():
-    streams = ArduPilotStreams(range(100), 0)
-    for index in range(9):
-        streams.set_interval(10 + index, (10 + index) * 1000, loop_hz=400.0, now_ns=0)
+def test_an_eleventh_interval_joins_the_nearest_of_ten(station):
+    link = station.vehicle.server.links[0]
+    first, *others, eleventh = [key for key in BUILDERS if key != mav.MAVLINK_MSG_ID_HEARTBEAT][:10]
+    for index, message_id in enumerate((first, *others)):
+        assert link.set_interval(message_id, (10 + index) * 1000)
 
-    streams.set_interval(50, 142_000, loop_hz=400.0, now_ns=0)
+    assert link.set_interval(eleventh, 142_000)
 
-    assert streams.interval_us(50) == 18_000
-    assert streams.interval_us(10) == 10_000
+    assert link.interval_us(eleventh) == 18_000
+    assert link.interval_us(first) == 10_000
 
 
 def test_the_report_counts_the_setpoints_that_were_followed(station):

@@ -82,6 +82,15 @@ def test_a_ground_stations_link_gets_no_imu_and_a_companions_does(ends_of):
     assert len([m for m in named(messages, "TIMESYNC") if m.tc1 == 0]) == pytest.approx(20, abs=1)
 
 
+def test_interval_zero_restores_the_default_of_the_link(ends):
+    link = ends.vehicle.server.links[0]
+    default_us = link.interval_us(mav.MAVLINK_MSG_ID_ATTITUDE)
+    for asked_us, interval_us in ((-1, -1), (4000, 4000), (0, default_us)):
+        assert link.set_interval(mav.MAVLINK_MSG_ID_ATTITUDE, asked_us)
+        assert link.interval_us(mav.MAVLINK_MSG_ID_ATTITUDE) == interval_us
+    assert default_us == 20_000
+
+
 def test_without_a_position_its_message_goes_on(ends):
     ends.ap.position_lost = True
     messages = ends.run(1.5)
