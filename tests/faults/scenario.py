@@ -114,14 +114,24 @@ class Variant:
 
 
 def load_catalogue(folder: Path = CATALOGUE) -> dict[str, Scenario]:
-    """Return all scenarios by name, in the order of the files; raise UsageError if invalid."""
+    """Return all scenarios by name, in the order of the files; raise UsageError if invalid.
+
+    ``[default]`` holds keys of all scenarios of its file, and ``like`` names one whose keys a
+    scenario takes over. A scenario's own keys replace both.
+    """
     files = sorted(folder.glob("*.toml"))
     return {scenario.name: scenario for path in files for scenario in _read(path)}
 
 
 def _read(path: Path) -> Iterator[Scenario]:
-    for name, table in tomllib.loads(path.read_text()).items():
+    tables = tomllib.loads(path.read_text())
+    default = tables.pop("default", {})
+    for name, own in tables.items():
         where = f"{path.name}: [{name}]"
+        like = own.pop("like", name)
+        if like not in tables or "like" in tables[like]:
+            raise UsageError(f"{where}: like = {like!r} is no earlier scenario of this file")
+        table = default | tables[like] | own
         for key in ("steps", "before"):
             table[key] = tuple(make_step(step, where) for step in table.get(key, []))
         try:
