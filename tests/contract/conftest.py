@@ -67,13 +67,19 @@ def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item
     if EXTERNAL not in config.stash:
         return
     external = config.stash[EXTERNAL]
-    own = [item for item in items if external.runs(getattr(item, "fixturenames", []))]
+    own = [item for item in items if external.runs(_fixtures(item))]
     config.hook.pytest_deselected(items=[item for item in items if item not in own])
     items[:] = sorted(own, key=_stage)
 
 
+def _fixtures(item: pytest.Item) -> list[str]:
+    """Return the names of a test's fixtures, and of the vehicle that it is parametrized with."""
+    params = getattr(getattr(item, "callspec", None), "params", {})
+    return [*getattr(item, "fixturenames", []), str(params.get("vehicle", ""))]
+
+
 def _stage(item: pytest.Item) -> int:
-    names: list[str] = getattr(item, "fixturenames", [])
+    names = _fixtures(item)
     kinds = ("armable", "grounded", "flying", "expendable")
     return 1 + max((n for n, kind in enumerate(kinds) if any(kind in f for f in names)), default=-1)
 

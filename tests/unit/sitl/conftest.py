@@ -71,8 +71,3 @@ class Pilot:
 @pytest.fixture
 def pilot() -> Pilot:
     return Pilot(VehicleConfig())
-
-
-@pytest.fixture
-def pilot_without_receiver() -> Pilot:
-    return Pilot(VehicleConfig(receiver=False))

@@ -13,12 +13,12 @@ import pytest
 from pymavlink.dialects.v20 import ardupilotmega as mav
 
 from sitl.__main__ import main
-from sitl.app import filming, fly, fly_on
+from sitl.app import filming, fly
 from sitl.camera.fpv import CameraOptions
 from sitl.clock import NS_PER_MS, NS_PER_S, Clock, StopRequest
-from sitl.course import AirborneStart, make_course
+from sitl.course import make_course
 from sitl.simulated_vehicle import SimulatedVehicle
-from sitl.vehicle.config import STEP_NS, VehicleConfig
+from sitl.vehicle.config import STEP_NS
 
 
 class FakeClock:
@@ -102,24 +102,6 @@ def test_terminating_the_process_writes_the_report(tmp_path, flags, least_s):
     report = json.loads(path.read_text())
     assert report["final"]["mode"] == "STABILIZE"
     assert report["duration_s"] >= least_s - 0.01
-
-
-@pytest.mark.parametrize("autopilot", ["ardupilot", "px4"])
-def test_a_vehicle_flies_on_by_itself(autopilot):
-    vehicle = SimulatedVehicle(links=1, boot_ns=0, config=VehicleConfig(autopilot=autopilot))
-    level = (1.0, 0.0, 0.0, 0.0)
-    start = AirborneStart(
-        position_ned_m=(0.0, 0.0, -5.0),
-        velocity_ned_mps=(0.0, 0.0, 0.0),
-        ned_from_body_wxyz=level,
-        next_gate=0,
-    )
-    vehicle.launch(start)
-
-    fly_on(vehicle, 10.0)
-
-    assert vehicle.ap.now_ns == pytest.approx(10 * NS_PER_S, abs=5 * NS_PER_MS)
-    assert vehicle.take_outgoing(0) == b""
 
 
 @pytest.mark.parametrize(

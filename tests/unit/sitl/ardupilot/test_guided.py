@@ -160,10 +160,3 @@ def test_without_gps_guided_is_taken_on_the_ground_but_arms_only_in_nogps(pilot)
 
     assert pilot.ap.set_mode(Mode.GUIDED_NOGPS)
     assert pilot.ap.arm(force=False)
-    stream(pilot, 6.0, lean(thrust=0.8))
-    pilot.texts()
-
-    assert not pilot.ap.set_mode(Mode.GUIDED)
-    assert pilot.texts() == ["Mode change to GUIDED failed: requires position"]
-    assert pilot.ap.set_mode(Mode.LAND)
-    assert pilot.ap.set_mode(Mode.GUIDED_NOGPS)

@@ -43,23 +43,9 @@ def roll_deg(body):
     return math.degrees(to_euler(body.ned_from_body_wxyz)[0])
 
 
-def read_param(vehicle, name):
-    """PARAM_REQUEST_READ over the wire."""
-    station = mav.MAVLink(None, srcSystem=255, srcComponent=190)
-    request = mav.MAVLink_param_request_read_message(1, 1, name.encode(), -1)
-    vehicle.receive(0, request.pack(station), vehicle.ap.now_ns)
-    (answer,) = (
-        message
-        for message in mav.MAVLink(None).parse_buffer(vehicle.take_outgoing(0))
-        if message.get_type() == "PARAM_VALUE"
-    )
-    assert answer.param_id == name
-    return answer.param_value
-
-
-def test_the_vehicle_tells_what_its_conditions_are():
+def test_conditions_become_parameters():
     drawn = random_conditions(8)
-    vehicle = SimulatedVehicle(links=1, boot_ns=0, config=VehicleConfig(conditions=drawn))
+    params = ArduPilotParams(drawn)
     wanted = {
         "ANGLE_MAX": drawn.angle_max_cdeg,
         "PILOT_Y_RATE": drawn.pilot_yaw_rate_degps,
@@ -75,7 +61,7 @@ def test_the_vehicle_tells_what_its_conditions_are():
         "ATC_RATE_R_MAX": drawn.lean_rate_max_degps,
         "ATC_ACCEL_P_MAX": drawn.lean_accel_max_cdegps2,
     }
-    assert {name: read_param(vehicle, name) for name in wanted} == pytest.approx(wanted, rel=1e-6)
+    assert {name: params.on_wire(name) for name in wanted} == pytest.approx(wanted, rel=1e-6)
     nominal = ArduPilotParams()
     assert not [name for name, value in wanted.items() if value == nominal[name]]
 
