@@ -16,17 +16,9 @@ from sitl.ardupilot.autopilot import ArduCopter
 from sitl.ardupilot.flight_modes import Mode
 from sitl.ardupilot.guided import Submode
 from sitl.clock import NS_PER_MS, NS_PER_S
+from sitl.firmware import Autopilot
 from sitl.link.server import MAX_STATUSTEXT, Endpoint, Message, flags
-from sitl.link.telemetry import (
-    Home,
-    autopilot_version,
-    battery_status,
-    boot_ms,
-    boot_us,
-    extended_sys_state,
-    sys_status,
-    vfr_hud,
-)
+from sitl.link.telemetry import Home, boot_ms, boot_us, extended_sys_state, sys_status, vfr_hud
 from sitl.rotation import Vec3
 from sitl.vehicle.config import ArduPilotRelease
 
@@ -59,10 +51,13 @@ _VELOCITY_ONLY = 3079  # POSITION_TARGET_LOCAL_NED.type_mask: velocity and accel
 _POSITION_ONLY = 3576  # type_mask: position only
 
 
-def _raw_gyro(ap: ArduCopter) -> tuple[float, ...]:
-    return tuple(
-        rate + bias for rate, bias in zip(ap.sensed.rate_body_radps, GYRO_BIAS_RADPS, strict=True)
-    )
+def _raw_gyro(ap: Autopilot) -> Vec3:
+    (x, y, z), (bias_x, bias_y, bias_z) = ap.sensed.rate_body_radps, GYRO_BIAS_RADPS
+    return (x + bias_x, y + bias_y, z + bias_z)
+
+
+def _scaled_imu(ap: Autopilot) -> tuple[int, ...]:
+    return HOME.scaled_imu(ap, _raw_gyro(ap))
 
 
 def _heartbeat(ap: ArduCopter) -> Message:
@@ -82,16 +77,6 @@ def _heartbeat(ap: ArduCopter) -> Message:
     return mav.MAVLink_heartbeat_message(
         ap.config.vehicle_type, autopilot, base_mode, int(ap.mode), status, 3
     )
-
-
-def _scaled_imu(ap: ArduCopter) -> tuple[int, ...]:
-    return HOME.scaled_imu(ap, _raw_gyro(ap))
-
-
-def _highres_imu(ap: ArduCopter) -> Message:
-    """Build HIGHRES_IMU: rates with bias, field in micro-gauss, as in the firmware."""
-    field = (1e6 * b for b in HOME.mag_gauss(ap))
-    return HOME.highres_imu(ap, _raw_gyro(ap), field, has_difference=True)
 
 
 def _vfr_hud(ap: ArduCopter) -> Message:
@@ -130,11 +115,6 @@ def _extended_sys_state(ap: ArduCopter) -> Message:
     return extended_sys_state(ap, vtol, is_landing=is_landing, is_taking_off=is_taking_off)
 
 
-def _autopilot_version(ap: ArduCopter) -> Message:
-    version = _FIRMWARE_VERSIONS[ap.config.ardupilot_release]
-    return autopilot_version(ap, capabilities=_CAPABILITIES, version=version)
-
-
 def _attitude_target(ap: ArduCopter) -> Message:
     """Build ATTITUDE_TARGET: the controller's shaped target, not the received setpoint, and the
     thrust before the lean boost."""
@@ -161,18 +141,22 @@ def _position_target(ap: ArduCopter) -> Message | None:
 
 
 BUILDERS: dict[int, Callable[[ArduCopter], Message | None]] = {
-    **HOME.builders(),
+    **HOME.builders(
+        gyro=_raw_gyro,
+        field_per_gauss=1e6,  # in micro-gauss, as in the firmware
+        has_pressure_difference=True,
+        version=lambda ap: _FIRMWARE_VERSIONS[ap.config.ardupilot_release],
+        capabilities=_CAPABILITIES,
+        energy_hj=0,
+    ),
     mav.MAVLINK_MSG_ID_HEARTBEAT: _heartbeat,
     mav.MAVLINK_MSG_ID_SYS_STATUS: _sys_status,
     mav.MAVLINK_MSG_ID_GPS_RAW_INT: lambda ap: HOME.gps_raw_int(
         ap, fix=mav.GPS_FIX_TYPE_3D_FIX, eph=121, epv=200
     ),
-    mav.MAVLINK_MSG_ID_SCALED_IMU: lambda ap: mav.MAVLink_scaled_imu_message(
-        boot_ms(ap), *_scaled_imu(ap), HOME.temperature_cdeg
-    ),
     # Scaled integers in spite of the name.
     mav.MAVLINK_MSG_ID_RAW_IMU: lambda ap: mav.MAVLink_raw_imu_message(
-        boot_us(ap), *_scaled_imu(ap), 0, HOME.temperature_cdeg
+        boot_us(ap), *_scaled_imu(ap)[:-1], 0, _scaled_imu(ap)[-1]
     ),
     mav.MAVLINK_MSG_ID_LOCAL_POSITION_NED: lambda ap: (
         mav.MAVLink_local_position_ned_message(
@@ -188,13 +172,10 @@ BUILDERS: dict[int, Callable[[ArduCopter], Message | None]] = {
     ),
     mav.MAVLINK_MSG_ID_VFR_HUD: _vfr_hud,
     mav.MAVLINK_MSG_ID_OPTICAL_FLOW: lambda _: None,  # accepted by the firmware, never sent
-    mav.MAVLINK_MSG_ID_HIGHRES_IMU: _highres_imu,
     # The second IMU agrees with the first.
     mav.MAVLINK_MSG_ID_SCALED_IMU2: lambda ap: mav.MAVLink_scaled_imu2_message(
-        boot_ms(ap), *_scaled_imu(ap), HOME.temperature_cdeg
+        boot_ms(ap), *_scaled_imu(ap)
     ),
-    mav.MAVLINK_MSG_ID_BATTERY_STATUS: lambda ap: battery_status(ap, energy_hj=0),
-    mav.MAVLINK_MSG_ID_AUTOPILOT_VERSION: _autopilot_version,
     mav.MAVLINK_MSG_ID_EKF_STATUS_REPORT: _ekf_status_report,
     mav.MAVLINK_MSG_ID_ATTITUDE_TARGET: _attitude_target,
     mav.MAVLINK_MSG_ID_POSITION_TARGET_LOCAL_NED: _position_target,
