@@ -11,7 +11,7 @@ from dataclasses import asdict, dataclass
 import numpy as np
 
 from sitl import UsageError
-from sitl.rotation import Quat, Vec3, conjugate, rotate, to_euler, wrap_pi
+from sitl.vehicle.rotation import Quat, Vec3, conjugate, rotate, to_euler, wrap_pi
 
 OPENING_M = 2.4  # side of the opening: five times the width of a 0.5 m quadrotor
 BAR_M = 0.32  # width of the bars around an opening

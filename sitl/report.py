@@ -9,8 +9,8 @@ from typing import Any, Literal, TypeAlias
 
 from sitl.clock import NS_PER_S
 from sitl.course import Course, Crash, GateCounter, GatePass, struck_gate
-from sitl.firmware import Autopilot
-from sitl.rotation import Vec3, cos_tilt, to_euler
+from sitl.vehicle.firmware import Autopilot
+from sitl.vehicle.rotation import Vec3, cos_tilt, to_euler
 
 CRASH_SPEED_MPS = 3.5  # ALT_HOLD descends at up to 2.5 m/s, a hard landing but no crash
 CRASH_TILT_COS = math.cos(math.radians(45.0))

@@ -21,10 +21,10 @@ from sitl.ardupilot.sticks import (
     read_sticks,
 )
 from sitl.clock import NS_PER_S
-from sitl.firmware import STOPPED, Autopilot, HeldGesture
-from sitl.rotation import cos_tilt
 from sitl.vehicle.config import STEP_NS, VehicleConfig
 from sitl.vehicle.dynamics import QUAD
+from sitl.vehicle.firmware import STOPPED, Autopilot, HeldGesture
+from sitl.vehicle.rotation import cos_tilt
 
 LOW_READS_TO_FAIL = 3
 GCS_CHECK_PERIOD_NS = NS_PER_S // 3  # ArduCopter checks the ground station at 3 Hz

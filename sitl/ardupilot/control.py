@@ -4,7 +4,9 @@ import math
 
 from sitl.ardupilot.params import DEFAULT_RATE_P, ArduPilotParams
 from sitl.clock import NS_PER_S
-from sitl.rotation import (
+from sitl.vehicle.config import STEP_NS
+from sitl.vehicle.dynamics import GRAVITY_MPS2, BodyState, clamp
+from sitl.vehicle.rotation import (
     IDENTITY,
     Quat,
     Vec3,
@@ -18,8 +20,6 @@ from sitl.rotation import (
     to_heading,
     yaw_of,
 )
-from sitl.vehicle.config import STEP_NS
-from sitl.vehicle.dynamics import GRAVITY_MPS2, BodyState, clamp
 
 STEP_S = STEP_NS / NS_PER_S
 

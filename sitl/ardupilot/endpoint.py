@@ -16,11 +16,11 @@ from sitl.ardupilot.autopilot import ArduCopter
 from sitl.ardupilot.flight_modes import Mode
 from sitl.ardupilot.guided import Submode
 from sitl.clock import NS_PER_MS, NS_PER_S
-from sitl.firmware import Autopilot
 from sitl.link.server import MAX_STATUSTEXT, Endpoint, Message, flags
 from sitl.link.telemetry import Home, boot_ms, boot_us, extended_sys_state, sys_status, vfr_hud
-from sitl.rotation import Vec3
 from sitl.vehicle.config import ArduPilotRelease
+from sitl.vehicle.firmware import Autopilot
+from sitl.vehicle.rotation import Vec3
 
 HOME = Home(-35.3632621, 149.1652374, 584.0, (0.2322, 0.0520, -0.5280), 945.0, 35.0)
 """Default home of ArduPilot's SITL."""

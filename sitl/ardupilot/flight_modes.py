@@ -8,8 +8,8 @@ from sitl.ardupilot.control import STEP_S, AttitudeController, boosted, lean_for
 from sitl.ardupilot.guided import GuidedControl
 from sitl.ardupilot.params import ArduPilotParams
 from sitl.ardupilot.sticks import Sticks
-from sitl.rotation import Quat, Vec3, to_euler, wrap_pi
 from sitl.vehicle.dynamics import BodyState, HeightController, mix, thrust_for
+from sitl.vehicle.rotation import Quat, Vec3, to_euler, wrap_pi
 
 IDLE = (0.03, 0.03, 0.03, 0.03)  # armed on the ground, throttle down
 

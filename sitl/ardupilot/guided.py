@@ -11,9 +11,9 @@ from typing import NamedTuple
 from sitl.ardupilot.control import STEP_S, AttitudeController, lean_for
 from sitl.ardupilot.params import ArduPilotParams
 from sitl.clock import NS_PER_MS, NS_PER_S
-from sitl.firmware import AttitudeSetpoint
-from sitl.rotation import Vec3, from_euler, integrate, to_euler
 from sitl.vehicle.dynamics import BodyState, HeightController, clamp, thrust_for
+from sitl.vehicle.firmware import AttitudeSetpoint
+from sitl.vehicle.rotation import Vec3, from_euler, integrate, to_euler
 
 OPTION_THRUST = 8
 """Bit of GUID_OPTIONS: SET_ATTITUDE_TARGET.thrust is a collective instead of a climb rate."""

@@ -16,7 +16,6 @@ from sitl.ardupilot.flight_modes import Mode
 from sitl.ardupilot.guided import VelocitySetpoint
 from sitl.ardupilot.rc import IGNORE, PRIMARY_CHANNELS, RELEASE
 from sitl.ardupilot.sticks import Axes
-from sitl.firmware import AttitudeSetpoint
 from sitl.link.server import (
     ACCEPTED,
     COMMAND_FIELDS,
@@ -32,7 +31,8 @@ from sitl.link.server import (
     sender_of,
 )
 from sitl.report import FlightLog
-from sitl.rotation import from_euler, rotate
+from sitl.vehicle.firmware import AttitudeSetpoint
+from sitl.vehicle.rotation import from_euler, rotate
 
 FORCE_REBOOT = 20190226.0  # param 6 of PREFLIGHT_REBOOT_SHUTDOWN: even while armed (ArduPilot)
 SIMPLE_MODE, SWITCH_LOW = 3.0, 0.0  # params of DO_AUX_FUNCTION

@@ -12,7 +12,7 @@ from typing import NamedTuple
 from sitl.ardupilot.params import RC_CHANNELS_WITH_PARAMS, ArduPilotParams
 from sitl.ardupilot.rc import RcEngine
 from sitl.clock import NS_PER_S
-from sitl.rotation import Vec3, from_heading
+from sitl.vehicle.rotation import Vec3, from_heading
 
 THROTTLE_FULL = 1000.0
 GESTURE_NS = 2 * NS_PER_S  # hold time: ArduCopter's ARM_DELAY and DISARM_DELAY of the sticks

@@ -13,8 +13,8 @@ from typing import Any, ClassVar, Generic, TypeAlias, TypeVar
 from pymavlink.dialects.v20 import ardupilotmega as mav
 
 from sitl.clock import NS_PER_MS
-from sitl.firmware import Autopilot
 from sitl.report import FlightLog
+from sitl.vehicle.firmware import Autopilot
 
 Message: TypeAlias = Any  # a pymavlink message (the library has no types)
 Ap = TypeVar("Ap", bound=Autopilot)

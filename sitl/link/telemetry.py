@@ -6,10 +6,10 @@ from typing import NamedTuple
 
 from pymavlink.dialects.v20 import ardupilotmega as mav
 
-from sitl.firmware import Autopilot
 from sitl.link.server import Message
-from sitl.rotation import Vec3, conjugate, rotate, to_euler
 from sitl.vehicle.dynamics import GRAVITY_MPS2
+from sitl.vehicle.firmware import Autopilot
+from sitl.vehicle.rotation import Vec3, conjugate, rotate, to_euler
 
 METRES_PER_DEGREE = 111_319.5
 INT16 = 32767

@@ -1,14 +1,16 @@
-"""Simulated transmitter: from a pilot's hand to receiver channels."""
+"""Simulated transmitter: from a pilot's hand to receiver channels; and the choice of pilot."""
 
+import os
 import re
 from collections.abc import Sequence
 from typing import Literal, NamedTuple, Protocol
 
 from sitl import UsageError
-from sitl.clock import NS_PER_MS, NS_PER_S
+from sitl.clock import NS_PER_MS, NS_PER_S, Clock
 from sitl.course import Course
-from sitl.expert.demonstrator import CENTRED, Expert, StickPositions
+from sitl.pilot.demonstrator import CENTRED, Expert, StickPositions
 from sitl.simulated_vehicle import SimulatedVehicle
+from sitl.vehicle.config import AutopilotName
 
 OFF_US = (0,) * 8  # no signal from the transmitter
 PERIOD_NS = 20 * NS_PER_MS  # between two frames of a receiver
@@ -185,3 +187,64 @@ class ExpertPilot:
         return sticks
 
     def close(self) -> None: ...
+
+
+PilotName = Literal["gamepad", "keyboard", "expert"]
+PILOTS: tuple[PilotName, ...] = ("gamepad", "keyboard", "expert")
+_PX4_PARAMS = {"COM_RC_IN_MODE": 0.0, "COM_FLTMODE_BOOT": 1.0}
+"""Parameters for a pilot: sticks from the receiver only, Altitude mode after boot."""
+
+
+class PilotOptions(NamedTuple):
+    """Pilot that moves the receiver."""
+
+    name: PilotName
+    axes: str  # gamepad axes, in the format of `parse_axes`
+    speed_mps: float  # speed of the expert
+
+
+def prepare_vehicle(vehicle: SimulatedVehicle, autopilot: AutopilotName) -> None:
+    """Make the vehicle fly by its receiver in ALT_HOLD or ALTCTL. Call before the flight."""
+    if autopilot == "px4":
+        for name, value in _PX4_PARAMS.items():
+            vehicle.params.set(name, value)
+        vehicle.reboot()
+
+
+def make_pilot(
+    options: PilotOptions,
+    *,
+    vehicle: SimulatedVehicle,
+    autopilot: AutopilotName,
+    course: Course,
+    clock: Clock,
+) -> tuple[Pilot, str]:
+    """Return the pilot and a line about it for the user.
+
+    Raises:
+        UsageError: the pilot lacks its package, display or vehicle, or its axes cannot be read.
+    """
+    name, axes, speed_mps = options
+    if name == "expert":
+        if autopilot != "ardupilot":
+            raise UsageError("--pilot expert knows the sticks of ardupilot alone")
+        expert = ExpertPilot(vehicle, course, speed_mps=speed_mps)
+        return expert, f"the expert flies at {speed_mps:g} m/s"
+    wanted = parse_axes(axes)
+    os.environ.setdefault("PYGAME_HIDE_SUPPORT_PROMPT", "1")  # no banner on import
+    try:
+        import pygame
+
+        from sitl.pilot import devices
+    except ModuleNotFoundError as error:
+        if error.name != "pygame":
+            raise
+        raise UsageError(f"--pilot {name} needs pygame: pip install pygame-ce") from error
+    try:
+        if name == "keyboard":
+            return devices.KeyboardPilot(clock), devices.KEYS_HELP
+        pad = devices.PygamePad()
+    except pygame.error as error:
+        raise UsageError(f"--pilot {name} needs a display: {error}") from error
+    found = pad.description or "no gamepad yet: plug one in (until then the receiver has no signal)"
+    return devices.GamepadPilot(pad, wanted, clock), f"{found}; {devices.PAD_HELP}"

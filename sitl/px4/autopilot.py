@@ -8,7 +8,6 @@ import math
 from collections.abc import Sequence
 
 from sitl.clock import NS_PER_S
-from sitl.firmware import STOPPED, Autopilot
 from sitl.px4.commander import Commander
 from sitl.px4.control import SIH_QUAD, STEP_NS
 from sitl.px4.flight import Px4Control, Setpoint
@@ -16,6 +15,7 @@ from sitl.px4.modes import Mode
 from sitl.px4.params import Px4Params
 from sitl.px4.sticks import RC_SOURCE, StickInput, Sticks
 from sitl.vehicle.config import Battery, VehicleConfig
+from sitl.vehicle.firmware import STOPPED, Autopilot
 
 RECEIVER_PERIOD_NS = NS_PER_S // 50
 RAMP_FROM_MPS = -2.4  # chosen to match the measured time on the ground

@@ -11,7 +11,8 @@ from typing import TypeAlias
 
 from sitl.clock import NS_PER_MS, NS_PER_S
 from sitl.px4.params import DEFAULT_RATE_P, Px4Params
-from sitl.rotation import (
+from sitl.vehicle.dynamics import GRAVITY_MPS2, Airframe, BodyState, clamp
+from sitl.vehicle.rotation import (
     Quat,
     Vec3,
     conjugate,
@@ -21,7 +22,6 @@ from sitl.rotation import (
     rotation_vector,
     to_heading,
 )
-from sitl.vehicle.dynamics import GRAVITY_MPS2, Airframe, BodyState, clamp
 
 STEP_NS = 4 * NS_PER_MS
 STEP_S = STEP_NS / NS_PER_S

@@ -3,7 +3,6 @@
 import math
 from typing import NamedTuple, TypeAlias
 
-from sitl.firmware import AttitudeSetpoint
 from sitl.px4 import sticks as pilot
 from sitl.px4.control import (
     HOVER_THRUST,
@@ -18,8 +17,9 @@ from sitl.px4.control import (
 from sitl.px4.modes import Mode
 from sitl.px4.params import Px4Params
 from sitl.px4.sticks import Sticks
-from sitl.rotation import IDENTITY, Quat, Vec3, cos_tilt, from_euler, from_heading, yaw_of
 from sitl.vehicle.dynamics import BodyState, HeightController, mix, thrust_for
+from sitl.vehicle.firmware import AttitudeSetpoint
+from sitl.vehicle.rotation import IDENTITY, Quat, Vec3, cos_tilt, from_euler, from_heading, yaw_of
 
 IDLE = (0.05, 0.05, 0.05, 0.05)  # armed on the ground
 STILL_YAW_RADPS = 0.01  # a slower yaw command holds the heading

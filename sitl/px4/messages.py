@@ -18,8 +18,8 @@ from sitl.px4.autopilot import Px4
 from sitl.px4.commander import Event
 from sitl.px4.flight import PositionSetpoint
 from sitl.px4.modes import Mode
-from sitl.rotation import conjugate, rotate
 from sitl.vehicle.config import Px4Release
+from sitl.vehicle.rotation import conjugate, rotate
 
 CURRENT_MODE = 436
 EVENT = 410

@@ -8,7 +8,6 @@ import math
 
 from pymavlink.dialects.v20 import ardupilotmega as mav
 
-from sitl.firmware import AttitudeSetpoint
 from sitl.link.server import (
     ACCEPTED,
     DENIED,
@@ -29,7 +28,8 @@ from sitl.px4.messages import HOME
 from sitl.px4.modes import Mode, mode_of
 from sitl.px4.sticks import from_manual_control
 from sitl.report import FlightLog
-from sitl.rotation import Vec3, from_heading
+from sitl.vehicle.firmware import AttitudeSetpoint
+from sitl.vehicle.rotation import Vec3, from_heading
 
 _RC_IGNORE = 65535
 _IGNORE_ATTITUDE = mav.ATTITUDE_TARGET_TYPEMASK_ATTITUDE_IGNORE

@@ -10,10 +10,10 @@ import math
 from typing import NamedTuple
 
 from sitl.clock import NS_PER_S
-from sitl.firmware import HeldGesture
 from sitl.px4.params import Px4Params
-from sitl.rotation import Vec3
 from sitl.vehicle.dynamics import GRAVITY_MPS2
+from sitl.vehicle.firmware import HeldGesture
+from sitl.vehicle.rotation import Vec3
 
 RC_SOURCE = -1  # the receiver; links are numbered from 0
 POLL_NS = NS_PER_S // 5

@@ -12,7 +12,7 @@ from typing import TypeAlias
 import numpy as np
 
 from sitl import UsageError
-from sitl.rotation import Vec3
+from sitl.vehicle.rotation import Vec3
 
 Rgb: TypeAlias = tuple[int, int, int]
 

@@ -15,8 +15,8 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
-from sitl.rotation import Quat, Vec3, cos_tilt
 from sitl.vehicle.conditions import NOMINAL, Conditions
+from sitl.vehicle.rotation import Quat, Vec3, cos_tilt
 
 GRAVITY_MPS2 = 9.80665
 INERTIA_KGM2: Vec3 = (0.012, 0.012, 0.022)

@@ -16,7 +16,7 @@ from helpers.copter_companion import (
     RTL,
     velocity,
 )
-from sitl.rotation import from_euler
+from sitl.vehicle.rotation import from_euler
 
 ATTITUDE_MASK, RATES_MASK = 7, 128
 HOLD_HEIGHT = 0.5  # thrust without bit 3 of GUID_OPTIONS

@@ -9,8 +9,8 @@ import numpy as np
 from sitl.ardupilot.flight_modes import Mode
 from sitl.clock import NS_PER_S
 from sitl.course import AirborneStart, Course
-from sitl.expert.demonstrator import Expert, StickPositions
-from sitl.expert.disturbance import Disturbance
+from sitl.pilot.demonstrator import Expert, StickPositions
+from sitl.pilot.disturbance import Disturbance
 from sitl.simulated_vehicle import Pose, SimulatedVehicle
 from sitl.vehicle.conditions import NOMINAL, Conditions
 from sitl.vehicle.config import STEP_NS, VehicleConfig

@@ -11,7 +11,7 @@ from helpers.factories import make_state
 from mavbridge.core.records import ImageArray
 from policy import rotation
 from policy.contract import QUATERNION
-from sitl.rotation import from_euler
+from sitl.vehicle.rotation import from_euler
 
 Array = NDArray[np.float64]
 FRD_FROM_FLU = np.diag([1.0, -1.0, -1.0])

@@ -9,7 +9,7 @@ from pymavlink.dialects.v20 import ardupilotmega as mav
 
 from helpers.contract_peers import ARM, GCS, TICK_NS, Companion, Peer, named
 from sitl.clock import NS_PER_S
-from sitl.rotation import from_euler
+from sitl.vehicle.rotation import from_euler
 
 ACCEPTED, REJECTED = mav.MAV_RESULT_ACCEPTED, mav.MAV_RESULT_TEMPORARILY_REJECTED
 ALTCTL, POSCTL, ACRO, OFFBOARD, STAB = (2, 0), (3, 0), (5, 0), (6, 0), (7, 0)

@@ -12,7 +12,7 @@ from policy.errors import PolicyError
 from policy.protocol import DualRatePolicy
 from policy.scripted import PROGRAM_NAMES, ScriptedPolicy
 from policy.scripted.controllers import doublet_length_s, doublet_steps
-from sitl.rotation import from_euler
+from sitl.vehicle.rotation import from_euler
 
 STEP_S = 0.01
 DELAY_STEPS = 4

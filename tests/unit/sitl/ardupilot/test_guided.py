@@ -6,9 +6,9 @@ import pytest
 
 from sitl.ardupilot.flight_modes import Mode
 from sitl.clock import NS_PER_S
-from sitl.firmware import AttitudeSetpoint
-from sitl.rotation import from_euler, to_euler
 from sitl.vehicle.config import MID_RECEIVER_US, STEP_NS, VehicleConfig
+from sitl.vehicle.firmware import AttitudeSetpoint
+from sitl.vehicle.rotation import from_euler, to_euler
 
 ZERO = (0.0, 0.0, 0.0)
 

@@ -8,8 +8,8 @@ from hypothesis import strategies as st
 from sitl.camera import scenery
 from sitl.camera.fpv import FpvRenderer
 from sitl.course import Course, Gate, make_course
-from sitl.rotation import IDENTITY, from_euler
 from sitl.vehicle.conditions import NOMINAL
+from sitl.vehicle.rotation import IDENTITY, from_euler
 
 TILT_UP_RAD = NOMINAL.camera_tilt_rad
 SIZE_PX = 201

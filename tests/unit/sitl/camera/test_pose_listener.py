@@ -8,7 +8,7 @@ from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from sitl.camera.follow import SYSTEM_ID, PoseListener
 from sitl.clock import NS_PER_S
-from sitl.rotation import IDENTITY, from_euler
+from sitl.vehicle.rotation import IDENTITY, from_euler
 
 T0_NS = 100 * NS_PER_S
 RATE_HZ = 60.0

@@ -7,8 +7,8 @@ import pytest
 
 from sitl.camera.fpv import FpvRenderer, Shutter
 from sitl.course import make_course
-from sitl.rotation import from_euler
 from sitl.vehicle.conditions import NOMINAL
+from sitl.vehicle.rotation import from_euler
 
 SIZE_PX = 97
 FOCAL_PX = (SIZE_PX - 1) / 2  # 90 degrees wide

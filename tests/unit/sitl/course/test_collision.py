@@ -3,9 +3,9 @@ from pymavlink.dialects.v20 import ardupilotmega as mav
 
 from sitl.ardupilot.flight_modes import Mode
 from sitl.course import BAR_M, DEPTH_M, VEHICLE_RADIUS_M, AirborneStart, Course, Gate, struck_gate
-from sitl.rotation import IDENTITY
 from sitl.simulated_vehicle import SimulatedVehicle
 from sitl.vehicle.config import STEP_NS, VehicleConfig
+from sitl.vehicle.rotation import IDENTITY
 
 GATE = Gate(center_ned_m=(10.0, 0.0, -2.0), yaw_rad=0.0, size_m=2.4, index=0)
 FAR_GATE = Gate(center_ned_m=(20.0, 0.0, -2.0), yaw_rad=0.0, size_m=2.4, index=1)

@@ -4,11 +4,18 @@ import pytest
 
 from sitl import UsageError
 from sitl.__main__ import main
-from sitl.app import PilotOptions, make_pilot, prepare_vehicle
 from sitl.clock import NS_PER_S, Clock
 from sitl.course import make_course
-from sitl.expert.demonstrator import CENTRED
-from sitl.pilot.transmitter import DEFAULT_AXES, OFF_US, Hand, Transmitter
+from sitl.pilot.demonstrator import CENTRED
+from sitl.pilot.transmitter import (
+    DEFAULT_AXES,
+    OFF_US,
+    Hand,
+    PilotOptions,
+    Transmitter,
+    make_pilot,
+    prepare_vehicle,
+)
 from sitl.simulated_vehicle import SimulatedVehicle
 from sitl.vehicle.config import STEP_NS, VehicleConfig
 

@@ -8,7 +8,7 @@ from pymavlink.dialects.v20 import ardupilotmega as mav
 
 from sitl.course import AirborneStart
 from sitl.px4.modes import Mode
-from sitl.rotation import from_euler
+from sitl.vehicle.rotation import from_euler
 
 MID = (0, 0, 500, 0)
 START = AirborneStart(

@@ -12,9 +12,9 @@ from sitl.ardupilot.flight_modes import Mode
 from sitl.ardupilot.params import ArduPilotParams
 from sitl.camera.fpv import FpvRenderer
 from sitl.course import make_course
-from sitl.rotation import from_euler
 from sitl.vehicle.conditions import NOMINAL, held_out_conditions, random_conditions
 from sitl.vehicle.config import VehicleConfig
+from sitl.vehicle.rotation import from_euler
 
 POSE = ((1.0, 0.3, -2.2), from_euler(0.1, -0.15, 0.05))
 

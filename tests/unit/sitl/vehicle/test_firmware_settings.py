@@ -11,12 +11,12 @@ from helpers.course_flights import pwm_us
 from sitl.ardupilot.params import ArduPilotParams
 from sitl.clock import NS_PER_MS, NS_PER_S
 from sitl.course import AirborneStart, make_course
-from sitl.expert.demonstrator import Expert, StickPositions
-from sitl.rotation import IDENTITY, to_euler
+from sitl.pilot.demonstrator import Expert, StickPositions
 from sitl.simulated_vehicle import SimulatedVehicle
 from sitl.vehicle.conditions import NOMINAL, random_conditions
 from sitl.vehicle.config import STEP_NS, VehicleConfig
 from sitl.vehicle.dynamics import Quadrotor
+from sitl.vehicle.rotation import IDENTITY, to_euler
 
 ALOFT = AirborneStart(
     position_ned_m=(0.0, 0.0, -30.0),

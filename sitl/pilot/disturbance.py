@@ -11,9 +11,9 @@ from typing import Literal, NamedTuple, TypeAlias, TypeVar
 import numpy as np
 
 from sitl.course import RACE_SEEDS, AirborneStart, Course
-from sitl.expert.demonstrator import RateCommand, StickPositions
-from sitl.rotation import from_euler
+from sitl.pilot.demonstrator import RateCommand, StickPositions
 from sitl.vehicle.dynamics import clamp
+from sitl.vehicle.rotation import from_euler
 
 Numbers: TypeAlias = tuple[float, ...]
 Commanded = TypeVar("Commanded", StickPositions, RateCommand)

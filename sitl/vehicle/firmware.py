@@ -14,9 +14,9 @@ from typing import ClassVar, NamedTuple, Self
 from pymavlink.dialects.v20 import ardupilotmega as mav
 
 from sitl.clock import NS_PER_S
-from sitl.rotation import Quat, Vec3, yaw_of
 from sitl.vehicle.config import Battery, VehicleConfig
 from sitl.vehicle.dynamics import Airframe, BodyState, Quadrotor, SensorNoise, Wind
+from sitl.vehicle.rotation import Quat, Vec3, yaw_of
 
 STOPPED = (0.0, 0.0, 0.0, 0.0)
 LANDED_AFTER_NS = NS_PER_S
