@@ -44,8 +44,6 @@ class Scenario:
     """``Code`` of a reason, in the bridge's report, for which the policy lost the sticks."""
     says: str = ""
     """Text that the bridge prints if no reason tells: a warning, refusal or foreign error."""
-    modes: list[str] = field(default_factory=list)
-    """Allowed first mode after the fault; empty: any or none."""
     receivers: list[Receiver] = field(default_factory=list)
     """Empty: mid and none, and also idle if the policy loses the sticks and the bridge ends it."""
     autopilots: list[AutopilotName] = field(default_factory=lambda: ["ardupilot", "px4"])

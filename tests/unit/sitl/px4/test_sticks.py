@@ -5,6 +5,7 @@ import pytest
 from sitl.clock import NS_PER_MS, NS_PER_S
 from sitl.px4.params import Px4Params
 from sitl.px4.sticks import RC_SOURCE, StickInput, Sticks
+from sitl.vehicle.firmware import HeldGesture
 
 PERIOD_NS = 20 * NS_PER_MS
 GCS, ONBOARD = 0, 1
@@ -69,3 +70,12 @@ def test_pretended_sticks_stay_until_real_ones_come():
     senders.send(0.7)
 
     assert not senders.input.valid
+
+
+def test_a_held_gesture_acts_once_until_it_is_made_again():
+    gesture = HeldGesture(10)
+    gesture.see(1, 0)
+    assert [gesture.take(now_ns) for now_ns in (9, 10, 30)] == [0, 1, 0]
+    gesture.see(0, 31)
+    gesture.see(-1, 32)
+    assert gesture.take(42) == -1

@@ -96,10 +96,9 @@ def test_what_hides_gates_changes_the_picture(name):
     assert np.abs(changed - render(usual)).mean() > 0.5
 
 
-@pytest.mark.parametrize(("seed", "strength"), [(-1, 1.0), (1, -0.1), (1, math.nan)])
-def test_what_makes_no_sense_is_refused(seed, strength):
+def test_a_negative_seed_is_refused():
     with pytest.raises(UsageError):
-        random_conditions(seed, strength)
+        random_conditions(-1)
 
 
 def test_the_wind_carries_a_level_vehicle_along():
