@@ -33,9 +33,9 @@ def attitude(roll_deg=0.0, yaw_deg=0.0, *, thrust=HOLD_HEIGHT, mask=ATTITUDE_MAS
     return mav.MAVLink_set_attitude_target_message(0, 1, 1, mask, q, 0.0, 0.0, 0.0, thrust)
 
 
-def rates(roll_degps=0.0, yaw_degps=0.0, *, thrust=HOLD_HEIGHT, mask=RATES_MASK):
-    body = (math.radians(roll_degps), 0.0, math.radians(yaw_degps))
-    return mav.MAVLink_set_attitude_target_message(0, 1, 1, mask, [0.0] * 4, *body, thrust)
+def rates(roll_degps=0.0, *, mask=RATES_MASK):
+    body = (math.radians(roll_degps), 0.0, 0.0)
+    return mav.MAVLink_set_attitude_target_message(0, 1, 1, mask, [0.0] * 4, *body, HOLD_HEIGHT)
 
 
 def stream(companion, message, seconds, system_id=255):

@@ -62,7 +62,7 @@ def test_a_step_of_attitude_takes_as_long_as_measured(offboard):
 
 def test_rates_are_followed(offboard):
     offboard.stream_setpoint(attitude_target(yaw=heading(offboard)), 1.0, hz=100)
-    messages = offboard.stream_setpoint(rate_target(yaw=40.0), 1.5, hz=100)
+    messages = offboard.stream_setpoint(rate_target(40.0), 1.5, hz=100)
     rates = [math.degrees(m.yawspeed) for m in named(messages, "ATTITUDE")[-60:]]
     assert sum(rates) / len(rates) == pytest.approx(40.0, abs=5.0)
 

@@ -111,13 +111,13 @@ class Variant:
         return "ALT_HOLD" if self.autopilot == "ardupilot" else "ALTCTL"
 
 
-def load_catalogue(folder: Path = CATALOGUE) -> dict[str, Scenario]:
+def load_catalogue() -> dict[str, Scenario]:
     """Return all scenarios by name, in the order of the files; raise UsageError if invalid.
 
     ``[default]`` holds keys of all scenarios of its file, and ``like`` names one whose keys a
     scenario takes over. A scenario's own keys replace both.
     """
-    files = sorted(folder.glob("*.toml"))
+    files = sorted(CATALOGUE.glob("*.toml"))
     return {scenario.name: scenario for path in files for scenario in _read(path)}
 
 

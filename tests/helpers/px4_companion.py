@@ -49,19 +49,15 @@ def event_id(message: Any) -> int:
     return int(number)
 
 
-def attitude_target(
-    roll_deg: float = 0.0, thrust: float = HOVER_THRUST, pitch_deg: float = 0.0, yaw: float = 0.0
-) -> Any:
-    q = from_euler(math.radians(roll_deg), math.radians(pitch_deg), yaw)
+def attitude_target(roll_deg: float = 0.0, thrust: float = HOVER_THRUST, yaw: float = 0.0) -> Any:
+    q = from_euler(math.radians(roll_deg), 0.0, yaw)
     return mav.MAVLink_set_attitude_target_message(0, 1, 1, 7, q, 0, 0, 0, thrust)
 
 
-def rate_target(
-    roll: float = 0.0, pitch: float = 0.0, yaw: float = 0.0, thrust: float = HOVER_THRUST
-) -> Any:
-    """Return a setpoint of body rates in deg/s."""
-    rates = [math.radians(v) for v in (roll, pitch, yaw)]
-    return mav.MAVLink_set_attitude_target_message(0, 1, 1, 128, [1, 0, 0, 0], *rates, thrust)
+def rate_target(yaw_degps: float) -> Any:
+    """Return a setpoint of body rates."""
+    rates = (0, 0, math.radians(yaw_degps), HOVER_THRUST)
+    return mav.MAVLink_set_attitude_target_message(0, 1, 1, 128, [1, 0, 0, 0], *rates)
 
 
 def velocity_target(
