@@ -18,7 +18,7 @@ from sitl.vehicle.config import IDLE_RECEIVER_US, AutopilotName, VehicleConfig
 
 PEER, ALLOW, RECEIVER = ("MAVBRIDGE_TEST_PEER", "MAVBRIDGE_TEST_ALLOW", "MAVBRIDGE_TEST_RECEIVER")
 PERMISSIONS = ("ground", "arm", "fly")
-"""What tests may do to a real flight controller; each allows what is before it, too."""
+"""Permissions of tests on a real flight controller; each includes those before it."""
 COPTER_FIXTURES = ("companion", "armable", "grounded", "flying", "expendable", "without_receiver")
 PX4_FIXTURES = ("px4", "px4_armable", "px4_grounded", "px4_flying", "px4_expendable")
 FIRMWARES = {mav.MAV_AUTOPILOT_ARDUPILOTMEGA: COPTER_FIXTURES, mav.MAV_AUTOPILOT_PX4: PX4_FIXTURES}

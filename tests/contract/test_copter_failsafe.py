@@ -1,4 +1,4 @@
-"""What is left when sticks or the ground station fall silent, as measured on ArduCopter."""
+"""Loss of sticks or of the ground station, as measured on ArduCopter."""
 
 import math
 

@@ -52,7 +52,7 @@ def test_intervals_are_cut_to_whole_milliseconds(companion, asked_hz, got_us):
         mav.MAVLINK_MSG_ID_SERVO_OUTPUT_RAW,
     ],
 )
-def test_state_comes_at_the_rate_asked_for_by_its_own_stamps(companion, message_id):
+def test_state_streams_at_the_requested_rate(companion, message_id):
     companion.stream(message_id, 100)
     name = mav.mavlink_map[message_id].msgname
     companion.wait(name)

@@ -1,4 +1,4 @@
-"""What PX4 does when sticks or setpoints stop, and who gets the vehicle back."""
+"""Loss of sticks or setpoints on PX4, and the takeover after it."""
 
 import math
 

@@ -23,7 +23,7 @@ FAILED, UNSUPPORTED = mav.MAV_RESULT_FAILED, mav.MAV_RESULT_UNSUPPORTED
 SET_INTERVAL = mav.MAV_CMD_SET_MESSAGE_INTERVAL
 
 
-def test_heartbeats_stay_at_one_hertz_whatever_is_asked_or_changes(px4):
+def test_heartbeats_stay_at_one_hertz(px4):
     assert px4.command(SET_INTERVAL, mav.MAVLINK_MSG_ID_HEARTBEAT, 100_000) == FAILED
 
     def change_modes(elapsed_s: float) -> None:
@@ -35,7 +35,7 @@ def test_heartbeats_stay_at_one_hertz_whatever_is_asked_or_changes(px4):
     assert len(named(messages, "HEARTBEAT")) == pytest.approx(3, abs=1)
 
 
-def test_current_mode_tells_a_change_at_once_and_twice_a_second_otherwise(px4):
+def test_current_mode_comes_at_a_change_and_twice_a_second(px4):
     px4.set_mode(LOITER)
     assert px4.stream(CURRENT_MODE, 50) == ACCEPTED
     px4.advance(1.0)
@@ -67,7 +67,7 @@ def test_the_version_comes_on_request(px4):
         (mav.MAVLINK_MSG_ID_EXTENDED_SYS_STATE, 50, 44, 56),  # by arrival: it has no stamp
     ],
 )
-def test_state_comes_at_the_rate_asked_for_up_to_its_topics(
+def test_state_streams_at_the_requested_rate_up_to_that_of_its_topic(
     px4, message_id, asked_hz, low_hz, high_hz
 ):
     assert px4.stream(message_id, asked_hz) == ACCEPTED
@@ -84,11 +84,11 @@ def test_state_comes_at_the_rate_asked_for_up_to_its_topics(
 
 
 @pytest.mark.parametrize("message_id", [0, 27, 35, 60_000])
-def test_what_cannot_be_streamed_fails(px4, message_id):
+def test_a_message_that_cannot_be_streamed_fails(px4, message_id):
     assert px4.stream(message_id, 10) == FAILED
 
 
-def test_the_interval_is_told(px4):
+def test_the_interval_is_reported(px4):
     px4.stream(mav.MAVLINK_MSG_ID_ATTITUDE, 50)
     px4.send(
         mav.MAVLink_command_long_message(
@@ -105,7 +105,7 @@ def test_an_integer_travels_as_its_bytes(px4):
     assert px4.get_int("COM_RC_IN_MODE") == 3
 
 
-def test_local_position_streams_and_the_estimator_tells_whether_it_is_one(px4):
+def test_local_position_streams_and_the_estimator_reports_its_validity(px4):
     px4.stream(mav.MAVLINK_MSG_ID_LOCAL_POSITION_NED, 50)
     px4.stream(mav.MAVLINK_MSG_ID_ESTIMATOR_STATUS, 5)
     px4.get_ready(POSCTL)

@@ -1,4 +1,4 @@
-"""GUIDED on the simulated body: response times, the ground, what ends it; no wire."""
+"""GUIDED on the simulated body, without a link: response times and the ground."""
 
 import math
 
@@ -124,7 +124,7 @@ def test_entering_from_a_lean_without_a_stream_levels_or_brakes(pilot):
     ("options", "thrust", "seconds"),
     [(8, 0.55, 3.06), (0, 0.8, 4.0), (8, 0.25, None), (0, 0.5, None)],
 )
-def test_what_lifts_off_and_when(pilot, options, thrust, seconds):
+def test_lift_off_times(pilot, options, thrust, seconds):
     pilot.ap.params.set("GUID_OPTIONS", float(options))
     armed(pilot, Mode.GUIDED_NOGPS)
     armed_ns, lifted_ns = pilot.ap.now_ns, []

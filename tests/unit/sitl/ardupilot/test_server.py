@@ -7,17 +7,14 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from pymavlink.dialects.v20 import ardupilotmega as mav
 
+from helpers.contract_peers import named
 from sitl.ardupilot.endpoint import BUILDERS
 from sitl.ardupilot.flight_modes import Mode
 from sitl.clock import NS_PER_MS, NS_PER_S
 from sitl.simulated_vehicle import SimulatedVehicle
 
 
-def named(messages, name):
-    return [message for message in messages if message.get_type() == name]
-
-
-def test_only_heartbeats_and_timesync_come_unasked(station):
+def test_only_heartbeats_and_timesync_come_without_a_request(station):
     messages = station.run(10.5)
 
     assert {m.get_type() for m in messages} == {"HEARTBEAT", "TIMESYNC"}
@@ -44,7 +41,7 @@ def test_texts_go_to_all_links(station_of):
 
 
 @pytest.mark.parametrize("message_id", sorted(BUILDERS))
-def test_every_message_packs_and_says_when_it_was_sent(station, message_id):
+def test_every_message_packs_with_its_time(station, message_id):
     station.run(6.0)
     station.interval(message_id, 50)
 

@@ -33,7 +33,7 @@ def renderer():
     return FpvRenderer(COURSE, SIZE_PX, SIZE_PX)
 
 
-def test_the_gate_appears_where_the_pinhole_says(renderer):
+def test_the_gate_appears_where_a_pinhole_camera_projects_it(renderer):
     """Eye 6 m before the front face, level: outer half side 1.2 + 0.32 m, inner 1.2 m."""
     image = renderer.render((10.0 - scenery.DEPTH_M / 2 - 6.0, 0.0, -2.0), LEVEL_CAMERA)
     outer_px = FOCAL_PX * (1.2 + scenery.BAR_M) / 6.0

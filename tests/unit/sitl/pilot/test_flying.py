@@ -120,7 +120,7 @@ def test_the_expert_flies_the_course_lands_and_disarms():
     pilot.close()
 
 
-def test_what_a_pilot_cannot_be_is_refused(monkeypatch):
+def test_unusable_pilots_are_refused(monkeypatch):
     vehicle = vehicle_of("px4")
     with pytest.raises(UsageError, match="ardupilot alone"):
         pilot_of("expert", vehicle, autopilot="px4")

@@ -1,4 +1,4 @@
-"""The expert by body rates: what it asks for, and that it flies race courses on both firmwares."""
+"""The expert by body rates: its commands, and races on both firmwares."""
 
 import math
 from collections.abc import Callable

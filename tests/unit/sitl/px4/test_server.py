@@ -5,6 +5,7 @@ import struct
 import pytest
 from pymavlink.dialects.v20 import ardupilotmega as mav
 
+from helpers.contract_peers import named
 from sitl.clock import NS_PER_S
 from sitl.px4.commander import Event
 from sitl.px4.messages import event_message
@@ -12,10 +13,6 @@ from sitl.px4.messages import event_message
 MID = (0, 0, 500, 0)
 ACCEPTED = mav.MAV_RESULT_ACCEPTED
 REJECTED = mav.MAV_RESULT_TEMPORARILY_REJECTED
-
-
-def named(messages, name):
-    return [message for message in messages if message.get_type() == name]
 
 
 def test_sticks_of_one_link_arrive_on_the_other_like_an_echo(ends_of):

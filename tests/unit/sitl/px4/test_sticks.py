@@ -1,4 +1,4 @@
-"""Which sender's sticks PX4 takes, when it counts them as lost, what it reads from them."""
+"""Choice and loss of PX4's stick input, and its gestures."""
 
 import pytest
 
@@ -33,7 +33,7 @@ class Senders:
     ("in_mode", "with_both"),
     [(1, GCS), (2, GCS), (3, GCS), (5, GCS), (6, GCS), (7, ONBOARD), (8, ONBOARD)],
 )
-def test_of_two_links_the_mode_says_which_wins(in_mode, with_both):
+def test_the_input_mode_selects_one_of_two_links(in_mode, with_both):
     senders = Senders(in_mode)
     senders.send(0.1, GCS)
 
@@ -56,7 +56,7 @@ def test_another_link_takes_over_when_the_first_has_stopped(in_mode, after):
     ("in_mode", "source"),
     [(0, RC_SOURCE), (1, GCS), (4, None), (5, RC_SOURCE), (6, GCS), (7, RC_SOURCE), (8, GCS)],
 )
-def test_a_receiver_counts_where_the_mode_says_so(in_mode, source):
+def test_the_input_mode_selects_the_receiver_or_a_link(in_mode, source):
     assert Senders(in_mode).send(0.2, RC_SOURCE, GCS) == source
 
 

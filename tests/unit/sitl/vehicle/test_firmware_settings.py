@@ -1,4 +1,4 @@
-"""Vehicles that are set up differently: they say so, and they fly so."""
+"""Firmware settings and stream timing that conditions change."""
 
 import math
 from dataclasses import replace
@@ -29,7 +29,7 @@ ATTITUDE = mav.MAVLINK_MSG_ID_ATTITUDE
 
 
 def hold(sticks, seconds=2.0, **conditions):
-    """The vehicle after it has been flown with these sticks since it hung in the air."""
+    """Return the state after holding these sticks from a hover."""
     config = VehicleConfig(conditions=replace(NOMINAL, **conditions))
     vehicle = SimulatedVehicle(links=1, boot_ns=0, config=config)
     vehicle.launch(ALOFT)
