@@ -10,12 +10,10 @@ from sitl.vehicle.rotation import (
     IDENTITY,
     Quat,
     Vec3,
-    conjugate,
     cos_tilt,
     from_euler,
     integrate,
-    multiply,
-    rotation_vector,
+    rotation_between,
     to_euler,
     to_heading,
     yaw_of,
@@ -78,14 +76,14 @@ class AttitudeController:
     def rates(self, body: BodyState, rate_radps: Vec3) -> Vec3:
         """Return body angular acceleration [rad/s^2] towards a body rate; zero holds attitude."""
         self._target = integrate(self._target, rate_radps, STEP_S)
-        error = rotation_vector(multiply(conjugate(body.ned_from_body_wxyz), self._target))
+        error = rotation_between(body.ned_from_body_wxyz, self._target)
         if math.hypot(*error) > MAX_TARGET_LEAD_RAD:
             self._target = body.ned_from_body_wxyz
         return self._track(body, self._target, rate_radps)
 
     def approach(self, body: BodyState, ned_from_body_wxyz: Quat, rate_body_radps: Vec3) -> Vec3:
         """Return body angular acceleration [rad/s^2] towards an attitude turning at a body rate."""
-        error = rotation_vector(multiply(conjugate(self._target), ned_from_body_wxyz))
+        error = rotation_between(self._target, ned_from_body_wxyz)
         rate = [
             self._shape(axis, error[k], self._target_rate_radps[k], rate_body_radps[k])
             for k, axis in enumerate("RPY")
@@ -118,7 +116,7 @@ class AttitudeController:
 
     def _track(self, body: BodyState, attitude: Quat, feedforward_radps: Vec3) -> Vec3:
         self._target_rate_radps = feedforward_radps
-        error = rotation_vector(multiply(conjugate(body.ned_from_body_wxyz), attitude))
+        error = rotation_between(body.ned_from_body_wxyz, attitude)
         gains = [self._params[name] for name in _ANGLE_GAINS]
         roll_share, pitch_share = (self._params[name] / DEFAULT_RATE_P for name in _RATE_GAINS)
         shares = (roll_share, pitch_share, 1.0)
@@ -171,7 +169,7 @@ class _Response:
         self._yaw_accel_radps2 = 0.0
 
     def step(self, target: Quat, rate_radps: Vec3) -> Vec3:
-        error = rotation_vector(multiply(conjugate(self.attitude), target))
+        error = rotation_between(self.attitude, target)
         roll, pitch, yaw = (rate_radps[k] + CATCH_UP_PER_S * error[k] for k in range(3))
         before = self._command_radps
         yaw_accel = YAW_GAIN_PER_S * (yaw - before[2])

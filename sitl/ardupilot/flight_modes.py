@@ -8,7 +8,7 @@ from sitl.ardupilot.control import STEP_S, AttitudeController, boosted, lean_for
 from sitl.ardupilot.guided import GuidedControl
 from sitl.ardupilot.params import ArduPilotParams
 from sitl.ardupilot.sticks import Sticks
-from sitl.vehicle.dynamics import BodyState, HeightController, mix, thrust_for
+from sitl.vehicle.dynamics import BodyState, HeightController, mix, shorten, thrust_for
 from sitl.vehicle.rotation import Quat, Vec3, to_euler, wrap_pi
 
 IDLE = (0.03, 0.03, 0.03, 0.03)  # armed on the ground, throttle down
@@ -212,5 +212,4 @@ def _lean_towards(wanted_n_mps: float, wanted_e_mps: float, body: BodyState) -> 
     """Return roll and pitch [rad] that bring the velocity to the wanted one, within the limit."""
     accel_n_mps2 = VELOCITY_GAIN_PER_S * (wanted_n_mps - body.velocity_ned_mps[0])
     accel_e_mps2 = VELOCITY_GAIN_PER_S * (wanted_e_mps - body.velocity_ned_mps[1])
-    scale = HOLD_ACCEL_MPS2 / max(HOLD_ACCEL_MPS2, math.hypot(accel_n_mps2, accel_e_mps2))
-    return lean_for((scale * accel_n_mps2, scale * accel_e_mps2), body)
+    return lean_for(shorten((accel_n_mps2, accel_e_mps2), HOLD_ACCEL_MPS2), body)

@@ -11,7 +11,7 @@ from typing import NamedTuple
 from sitl.ardupilot.control import STEP_S, AttitudeController, lean_for
 from sitl.ardupilot.params import ArduPilotParams
 from sitl.clock import NS_PER_MS, NS_PER_S
-from sitl.vehicle.dynamics import BodyState, HeightController, clamp, thrust_for
+from sitl.vehicle.dynamics import BodyState, HeightController, clamp, shorten, thrust_for
 from sitl.vehicle.firmware import AttitudeSetpoint
 from sitl.vehicle.rotation import Vec3, from_euler, integrate, to_euler
 
@@ -235,5 +235,4 @@ class _Track:
                 - body.velocity_ned_mps[k]
             )
             accel[k] = self._accel_mps2[k] + VELOCITY_GAIN_PER_S * speed_error
-        shrink = MAX_LEAN_ACCEL_MPS2 / max(MAX_LEAN_ACCEL_MPS2, math.hypot(*accel))
-        return accel[0] * shrink, accel[1] * shrink
+        return shorten((accel[0], accel[1]), MAX_LEAN_ACCEL_MPS2)

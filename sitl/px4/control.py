@@ -11,7 +11,7 @@ from typing import TypeAlias
 
 from sitl.clock import NS_PER_MS, NS_PER_S
 from sitl.px4.params import DEFAULT_RATE_P, Px4Params
-from sitl.vehicle.dynamics import GRAVITY_MPS2, Airframe, BodyState, clamp
+from sitl.vehicle.dynamics import GRAVITY_MPS2, Airframe, BodyState, clamp, shorten
 from sitl.vehicle.rotation import (
     Quat,
     Vec3,
@@ -19,7 +19,7 @@ from sitl.vehicle.rotation import (
     from_euler,
     multiply,
     rotate,
-    rotation_vector,
+    rotation_between,
     to_heading,
 )
 
@@ -70,7 +70,7 @@ class RateController:
         target, yaw_rate_radps = self._targets[0]
         turned_rad = yaw_rate_radps * STEP_S * (len(self._targets) - 1)  # turn since the demand
         target = multiply(from_euler(0.0, 0.0, turned_rad), target)
-        error = rotation_vector(multiply(conjugate(body.ned_from_body_wxyz), target))
+        error = rotation_between(body.ned_from_body_wxyz, target)
         gains = [self._params[f"MC_{axis}_P"] for axis in ("ROLL", "PITCH", "YAW")]
         down_body = rotate(conjugate(body.ned_from_body_wxyz), (0.0, 0.0, 1.0))
         roll, pitch, yaw = (
@@ -135,8 +135,7 @@ class VelocityController:
             wanted = params["MPC_XY_VEL_P_ACC"] * error + self._integral[axis] - damping
             accel.append(wanted + feedforward_ne_mps2[axis])
         self._last_mps = (actual[0], actual[1])
-        scale = limit / max(limit, math.hypot(*accel))
-        return accel[0] * scale, accel[1] * scale
+        return shorten((accel[0], accel[1]), limit)
 
 
 class Horizontal:
@@ -237,12 +236,6 @@ class Horizontal:
     def _follow(self, velocity: NorthEast, feedforward: NorthEast, body: BodyState) -> NorthEast:
         self.accel_mps2 = self._velocity.update(body, velocity, feedforward)
         return self.accel_mps2
-
-
-def shorten(vector: NorthEast, limit: float) -> NorthEast:
-    """Limit a vector's length and keep its direction."""
-    scale = limit / max(limit, math.hypot(*vector))
-    return vector[0] * scale, vector[1] * scale
 
 
 def _place(body: BodyState) -> NorthEast:

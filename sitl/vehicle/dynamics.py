@@ -255,6 +255,12 @@ def clamp(value: float, limit: float) -> float:
     return max(-limit, min(limit, value))
 
 
+def shorten(vector: tuple[float, float], limit: float) -> tuple[float, float]:
+    """Limit a vector's length and keep its direction."""
+    scale = limit / max(limit, math.hypot(*vector))
+    return vector[0] * scale, vector[1] * scale
+
+
 class HeightController:
     """Controller from climb rate demand to vertical acceleration; zero demand holds the height."""
 
