@@ -240,6 +240,7 @@ class Px4Companion(Companion):
         PX4 does so when any parameter changes, so ``seconds`` is not exactly the default of 5 s.
         """
         self.change("COM_FAIL_ACT_T", seconds)
+        self.fly(0.1)
 
     def restore(self) -> None:
         """Leave the vehicle in the air in Hold, or disarmed on the ground."""
