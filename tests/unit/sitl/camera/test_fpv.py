@@ -18,6 +18,8 @@ MIDDLE_PX = (SIZE_PX - 1) / 2
 COURSE = Course(
     seed=0, gates=(Gate(center_ned_m=(10.0, 0.0, -2.0), yaw_rad=0.0, size_m=2.4, index=0),)
 )
+WHOLE_COURSE = make_course(7)
+WHOLE_RENDERER = FpvRenderer(WHOLE_COURSE, 64, 48)
 LEVEL_CAMERA = from_euler(0.0, -TILT_UP_RAD, 0.0)
 """Body pitch that makes the optical axis horizontal."""
 
@@ -109,8 +111,8 @@ def test_a_wall_that_reaches_behind_the_eye_is_cut_where_it_should_be(renderer):
     st.tuples(*[st.floats(-math.pi, math.pi)] * 3),
 )
 def test_any_pose_gives_a_picture(position, angles):
-    course = make_course(7)
-    near_gate = tuple(p + c for p, c in zip(position, course.gates[1].center_ned_m, strict=True))
-    image = FpvRenderer(course, 64, 48).render(near_gate, from_euler(*angles))
+    center_ned_m = WHOLE_COURSE.gates[1].center_ned_m
+    near_gate = tuple(p + c for p, c in zip(position, center_ned_m, strict=True))
+    image = WHOLE_RENDERER.render(near_gate, from_euler(*angles))
     assert image.shape == (48, 64, 3)
     assert image.dtype == np.uint8
