@@ -20,7 +20,6 @@ from sitl.pilot.transmitter import (
     DEFAULT_AXES,
     PILOTS,
     Pilot,
-    PilotOptions,
     make_pilot,
     prepare_vehicle,
 )
@@ -38,56 +37,6 @@ from sitl.vehicle.config import (
 JOIN_TIMEOUT_S = 5.0
 LEAST_PRIORITY = 19
 """Niceness while flying on faster than real time, to protect the timing of other flights."""
-
-
-def run_vehicle(
-    links: Sequence[str],
-    config: VehicleConfig,
-    course: Course,
-    *,
-    camera: CameraOptions | None,
-    rc_port: int | None,
-    pilot: PilotOptions | None = None,
-    report: Path | None,
-    duration_s: float | None,
-    fly_on_s: float = 0.0,
-) -> None:
-    """Fly for ``duration_s`` (None: endless) or until a signal, then write the report.
-
-    Before the report the vehicle flies on for ``fly_on_s`` without links or pilot.
-
-    Raises:
-        UsageError: a link, RC input, pilot, camera name or report folder cannot be used.
-    """
-    if report is not None and not report.parent.is_dir():
-        raise UsageError(f"--report {report}: there is no folder {report.parent}")
-    clock = Clock()
-    with ExitStack() as stack:
-        transports = [stack.enter_context(closing(open_transport(url, clock))) for url in links]
-        vehicle = SimulatedVehicle(
-            links=len(transports), boot_ns=clock.now_ns(), config=config, course=course
-        )
-        rc_input: Pilot | None = None
-        if rc_port is not None:
-            rc_input = stack.enter_context(closing(RcInput(rc_port)))
-        if pilot is not None:
-            prepare_vehicle(vehicle, config.autopilot)
-            rc_input, line = make_pilot(
-                pilot, vehicle=vehicle, autopilot=config.autopilot, course=course, clock=clock
-            )
-            stack.enter_context(closing(rc_input))
-            print_status(line)
-        stop = stack.enter_context(stop_on_signal())
-        with filming(vehicle, course, camera, clock) if camera is not None else nullcontext():
-            print_status("ready on " + ", ".join(links))
-            end_ns = None if duration_s is None else clock.now_ns() + round(duration_s * NS_PER_S)
-            fly(vehicle, transports, clock, stop, end_ns, rc_input=rc_input)
-        if fly_on_s:
-            os.nice(LEAST_PRIORITY)
-            fly_on(vehicle, fly_on_s)
-        if report is not None:
-            write_report(report, vehicle.log.summary(vehicle.ap, vehicle.bad_frames))
-            print_status(f"report written to {report}")
 
 
 def fly(
@@ -276,30 +225,59 @@ def _add_camera_flags(parser: argparse.ArgumentParser) -> None:
 
 
 def _fly(args: argparse.Namespace) -> None:
+    """Fly until the end or a signal, fly on without links or pilot, then write the report."""
     links, onboard = args.connect or [], args.connect_onboard or []
     if not links + onboard:
         raise UsageError("no link: give at least one, such as --connect udpout:127.0.0.1:14550")
     if args.pilot and (args.rc_in or args.receiver):
         raise UsageError("--pilot moves the receiver: leave out --rc-in and --receiver")
+    if args.report is not None and not args.report.parent.is_dir():
+        raise UsageError(f"--report {args.report}: there is no folder {args.report.parent}")
+    config, course, clock = (
+        _config(args, len(links), len(onboard)),
+        make_course(args.course),
+        Clock(),
+    )
+    with ExitStack() as stack:
+        urls = links + onboard
+        transports = [stack.enter_context(closing(open_transport(url, clock))) for url in urls]
+        vehicle = SimulatedVehicle(
+            links=len(transports), boot_ns=clock.now_ns(), config=config, course=course
+        )
+        rc_input: Pilot | None = None
+        if args.rc_in is not None:
+            rc_input = stack.enter_context(closing(RcInput(args.rc_in)))
+        if args.pilot is not None:
+            prepare_vehicle(vehicle)
+            pilot = (args.pilot, args.pilot_axes, args.pilot_speed)
+            rc_input, line = make_pilot(*pilot, vehicle=vehicle, course=course, clock=clock)
+            stack.enter_context(closing(rc_input))
+            print_status(line)
+        stop = stack.enter_context(stop_on_signal())
+        films = args.camera is not None
+        with filming(vehicle, course, _camera(args), clock) if films else nullcontext():
+            print_status("ready on " + ", ".join(urls))
+            is_endless = args.duration is None
+            end_ns = None if is_endless else clock.now_ns() + round(args.duration * NS_PER_S)
+            fly(vehicle, transports, clock, stop, end_ns, rc_input=rc_input)
+        if args.fly_on:
+            os.nice(LEAST_PRIORITY)
+            fly_on(vehicle, args.fly_on)
+        if args.report is not None:
+            write_report(args.report, vehicle.log.summary(vehicle.ap, vehicle.bad_frames))
+            print_status(f"report written to {args.report}")
+
+
+def _config(args: argparse.Namespace, links: int, onboard: int) -> VehicleConfig:
     has_receiver = args.autopilot != "px4" or args.pilot
     receiver = args.receiver or ("mid" if has_receiver else "none")
-    run_vehicle(
-        links + onboard,
-        VehicleConfig(
-            autopilot=args.autopilot,
-            onboard_links=frozenset(range(len(links), len(links + onboard))),
-            receiver=receiver != "none",
-            receiver_us=IDLE_RECEIVER_US if receiver == "idle" else MID_RECEIVER_US,
-            signing=args.signing_key_file and _signing_key(args.signing_key_file),
-            conditions=args.conditions,
-        ),
-        make_course(args.course),
-        camera=None if args.camera is None else _camera(args),
-        rc_port=args.rc_in,
-        pilot=PilotOptions(args.pilot, args.pilot_axes, args.pilot_speed) if args.pilot else None,
-        report=args.report,
-        duration_s=args.duration,
-        fly_on_s=args.fly_on,
+    return VehicleConfig(
+        autopilot=args.autopilot,
+        onboard_links=frozenset(range(links, links + onboard)),
+        receiver=receiver != "none",
+        receiver_us=IDLE_RECEIVER_US if receiver == "idle" else MID_RECEIVER_US,
+        signing=args.signing_key_file and _signing_key(args.signing_key_file),
+        conditions=args.conditions,
     )
 
 

@@ -10,7 +10,6 @@ from sitl.clock import NS_PER_MS, NS_PER_S, Clock
 from sitl.course import Course
 from sitl.pilot.demonstrator import CENTRED, Expert, StickPositions
 from sitl.simulated_vehicle import SimulatedVehicle
-from sitl.vehicle.config import AutopilotName
 
 OFF_US = (0,) * 8  # no signal from the transmitter
 PERIOD_NS = 20 * NS_PER_MS  # between two frames of a receiver
@@ -195,38 +194,32 @@ _PX4_PARAMS = {"COM_RC_IN_MODE": 0.0, "COM_FLTMODE_BOOT": 1.0}
 """Parameters for a pilot: sticks from the receiver only, Altitude mode after boot."""
 
 
-class PilotOptions(NamedTuple):
-    """Pilot that moves the receiver."""
-
-    name: PilotName
-    axes: str  # gamepad axes, in the format of `parse_axes`
-    speed_mps: float  # speed of the expert
-
-
-def prepare_vehicle(vehicle: SimulatedVehicle, autopilot: AutopilotName) -> None:
+def prepare_vehicle(vehicle: SimulatedVehicle) -> None:
     """Make the vehicle fly by its receiver in ALT_HOLD or ALTCTL. Call before the flight."""
-    if autopilot == "px4":
+    if vehicle.ap.config.autopilot == "px4":
         for name, value in _PX4_PARAMS.items():
             vehicle.params.set(name, value)
         vehicle.reboot()
 
 
 def make_pilot(
-    options: PilotOptions,
+    name: PilotName,
+    axes: str,
+    speed_mps: float,
     *,
     vehicle: SimulatedVehicle,
-    autopilot: AutopilotName,
     course: Course,
     clock: Clock,
 ) -> tuple[Pilot, str]:
     """Return the pilot and a line about it for the user.
 
+    ``axes`` are a gamepad's, in the format of `parse_axes`, and ``speed_mps`` is the expert's.
+
     Raises:
         UsageError: the pilot lacks its package, display or vehicle, or its axes cannot be read.
     """
-    name, axes, speed_mps = options
     if name == "expert":
-        if autopilot != "ardupilot":
+        if vehicle.ap.config.autopilot != "ardupilot":
             raise UsageError("--pilot expert knows the sticks of ardupilot alone")
         expert = ExpertPilot(vehicle, course, speed_mps=speed_mps)
         return expert, f"the expert flies at {speed_mps:g} m/s"

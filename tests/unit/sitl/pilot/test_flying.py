@@ -11,7 +11,6 @@ from sitl.pilot.transmitter import (
     DEFAULT_AXES,
     OFF_US,
     Hand,
-    PilotOptions,
     Transmitter,
     make_pilot,
     prepare_vehicle,
@@ -26,18 +25,12 @@ DOWN = Hand(CENTRED._replace(throttle=-1.0))
 def vehicle_of(autopilot, **changes):
     config = VehicleConfig(autopilot=autopilot, receiver=True, **changes)
     made = SimulatedVehicle(links=1, boot_ns=0, config=config, course=COURSE)
-    prepare_vehicle(made, autopilot)
+    prepare_vehicle(made)
     return made
 
 
-def pilot_of(name, vehicle, autopilot="ardupilot", axes=DEFAULT_AXES):
-    pilot, _ = make_pilot(
-        PilotOptions(name, axes, 5.0),
-        vehicle=vehicle,
-        autopilot=autopilot,
-        course=COURSE,
-        clock=Clock(),
-    )
+def pilot_of(name, vehicle, axes=DEFAULT_AXES):
+    pilot, _ = make_pilot(name, axes, 5.0, vehicle=vehicle, course=COURSE, clock=Clock())
     return pilot
 
 
@@ -123,7 +116,7 @@ def test_the_expert_flies_the_course_lands_and_disarms():
 def test_unusable_pilots_are_refused(monkeypatch):
     vehicle = vehicle_of("px4")
     with pytest.raises(UsageError, match="ardupilot alone"):
-        pilot_of("expert", vehicle, autopilot="px4")
+        pilot_of("expert", vehicle)
     with pytest.raises(UsageError, match="--pilot-axes"):
         pilot_of("gamepad", vehicle, axes="roll=1")
     monkeypatch.setenv("SDL_VIDEODRIVER", "no-such-driver")
