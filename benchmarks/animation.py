@@ -23,6 +23,7 @@ Array = npt.NDArray[Any]
 HEIGHT, CAMERA, SCENE = 400, 400, 500
 PLOT = 130
 """Pixels: of the picture, the camera's square, the scene's width and the plot's height."""
+START_S, SECONDS, FPS, QUALITY = 2.0, 10.0, 15.0, 55
 TRACE_S = 3.0
 """Length of the plot [s]."""
 BACK_M, UP_M, FOCAL = 5.0, 2.2, 330.0
@@ -139,23 +140,16 @@ def _write(
     cv2.putText(picture, text, at, cv2.FONT_HERSHEY_SIMPLEX, size, colour, 1, cv2.LINE_AA)
 
 
-def frames(
-    recorded: RecordedFlight,
-    gates: Sequence[CourseGate],
-    *,
-    start_s: float,
-    seconds: float,
-    fps: float,
-) -> Iterator[Array]:
-    """Yield BGR pictures at a fixed rate, from ``start_s`` after the policy's first action."""
+def frames(recorded: RecordedFlight, gates: Sequence[CourseGate]) -> Iterator[Array]:
+    """Yield BGR pictures at a fixed rate, from ``START_S`` after the policy's first action."""
     flight = Flight(recorded)
-    due = flight.time_s[0] + start_s
-    end = due + seconds
+    due = flight.time_s[0] + START_S
+    end = due + SECONDS
     for row, image in zip(recorded.frame_rows(), recorded.rgb_images(), strict=True):
         captured = row.captured_ns / 1e9
         if captured < due or captured > end:
             continue
-        due += 1 / fps
+        due += 1 / FPS
         index = flight.at(captured)
         camera = cv2.resize(cv2.cvtColor(image, cv2.COLOR_RGB2BGR), (CAMERA, CAMERA))
         _write(camera, "camera", (12, 24), 0.6)
@@ -169,23 +163,11 @@ def main() -> None:
     parser.add_argument("flight", type=Path)
     parser.add_argument("--gates", type=Path, required=True)
     parser.add_argument("--out", type=Path, required=True)
-    parser.add_argument("--start", type=float, default=2.0)
-    parser.add_argument("--seconds", type=float, default=10.0)
-    parser.add_argument("--fps", type=float, default=15.0)
-    parser.add_argument("--quality", type=int, default=55)
     options = parser.parse_args()
     animation = cv2.Animation()
-    animation.frames = list(
-        frames(
-            open_flight(options.flight),
-            read_gates(options.gates),
-            start_s=options.start,
-            seconds=options.seconds,
-            fps=options.fps,
-        )
-    )
-    animation.durations = [round(1000 / options.fps)] * len(animation.frames)
-    quality = [cv2.IMWRITE_WEBP_QUALITY, options.quality]
+    animation.frames = list(frames(open_flight(options.flight), read_gates(options.gates)))
+    animation.durations = [round(1000 / FPS)] * len(animation.frames)
+    quality = [cv2.IMWRITE_WEBP_QUALITY, QUALITY]
     if not cv2.imwriteanimation(str(options.out), animation, quality):
         raise SystemExit(f"cannot write {options.out}")
 

@@ -10,7 +10,7 @@ PACKAGES = {"mujoco": "mujoco", "cv2": "opencv-python-headless", "pymavlink": "p
 def main(argv: Sequence[str] | None = None) -> int:
     """Run the command. Return the exit code: 2 for a usage error or a missing package."""
     try:
-        from sitl.command_line import run
+        from sitl.app import run
     except ModuleNotFoundError as error:
         if error.name not in PACKAGES:
             raise

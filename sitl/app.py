@@ -1,143 +1,42 @@
-"""Real-time flight: sockets, the 400 Hz loop, the camera thread and the final report."""
+"""Commands of ``python -m sitl``: fly in real time, film another vehicle, print a course."""
 
+import argparse
+import math
 import os
 import sys
 import threading
-from collections.abc import Iterator, Sequence
-from contextlib import ExitStack, closing, contextmanager, nullcontext
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import ExitStack, closing, contextmanager, nullcontext, suppress
 from pathlib import Path
-from typing import Literal, NamedTuple
 
 from sitl import UsageError
+from sitl.camera.follow import film_vehicle
 from sitl.camera.fpv import CameraOptions, FpvRenderer
 from sitl.camera.shm import FramePublisher
-from sitl.clock import NS_PER_S, Clock, StopRequest, stop_on_signal
-from sitl.course import Course
+from sitl.clock import NS_PER_S, Clock, StopRequest, stop_on_signal, wall_ns
+from sitl.course import Course, course_to_json, make_course
 from sitl.link.transport import RcInput, Transport, open_transport
-from sitl.pilot.transmitter import ExpertPilot, Pilot, parse_axes
+from sitl.pilot.transmitter import (
+    DEFAULT_AXES,
+    PILOTS,
+    Pilot,
+    make_pilot,
+    prepare_vehicle,
+)
 from sitl.report import write_report
 from sitl.simulated_vehicle import SimulatedVehicle
-from sitl.vehicle.config import STEP_NS, AutopilotName, VehicleConfig
+from sitl.vehicle.conditions import NOMINAL, random_conditions
+from sitl.vehicle.config import (
+    IDLE_RECEIVER_US,
+    MID_RECEIVER_US,
+    STEP_NS,
+    SigningKey,
+    VehicleConfig,
+)
 
 JOIN_TIMEOUT_S = 5.0
 LEAST_PRIORITY = 19
 """Niceness while flying on faster than real time, to protect the timing of other flights."""
-PilotName = Literal["gamepad", "keyboard", "expert"]
-PILOTS: tuple[PilotName, ...] = ("gamepad", "keyboard", "expert")
-_PX4_PARAMS = {"COM_RC_IN_MODE": 0.0, "COM_FLTMODE_BOOT": 1.0}
-"""Parameters for a pilot: sticks from the receiver only, Altitude mode after boot."""
-
-
-class PilotOptions(NamedTuple):
-    """Pilot that moves the receiver."""
-
-    name: PilotName
-    axes: str  # gamepad axes, in the format of ``sitl.pilot.transmitter``
-    speed_mps: float  # speed of the expert
-
-
-def run_vehicle(
-    links: Sequence[str],
-    config: VehicleConfig,
-    course: Course,
-    *,
-    camera: CameraOptions | None,
-    rc_port: int | None,
-    pilot: PilotOptions | None = None,
-    report: Path | None,
-    duration_s: float | None,
-    fly_on_s: float = 0.0,
-) -> None:
-    """Fly for ``duration_s`` (None: endless) or until a signal, then write the report.
-
-    Before the report the vehicle flies on for ``fly_on_s`` without links or pilot.
-
-    Raises:
-        UsageError: a link, RC input, pilot, camera name or report folder cannot be used.
-    """
-    if report is not None and not report.parent.is_dir():
-        raise UsageError(f"--report {report}: there is no folder {report.parent}")
-    clock = Clock()
-    with ExitStack() as stack:
-        transports = [stack.enter_context(closing(open_transport(url, clock))) for url in links]
-        vehicle = SimulatedVehicle(
-            links=len(transports), boot_ns=clock.now_ns(), config=config, course=course
-        )
-        rc_input: Pilot | None = None
-        if rc_port is not None:
-            rc_input = stack.enter_context(closing(RcInput(rc_port)))
-        if pilot is not None:
-            prepare_vehicle(vehicle, config.autopilot)
-            rc_input, line = make_pilot(
-                pilot, vehicle=vehicle, autopilot=config.autopilot, course=course, clock=clock
-            )
-            stack.enter_context(closing(rc_input))
-            print_status(line)
-        stop = stack.enter_context(stop_on_signal())
-        with filming(vehicle, course, camera, clock) if camera is not None else nullcontext():
-            print_status("ready on " + ", ".join(links))
-            end_ns = None if duration_s is None else clock.now_ns() + round(duration_s * NS_PER_S)
-            fly(
-                vehicle,
-                transports,
-                clock,
-                stop,
-                end_ns,
-                rc_input=rc_input,
-            )
-        if fly_on_s:
-            os.nice(LEAST_PRIORITY)
-            fly_on(vehicle, fly_on_s)
-        if report is not None:
-            write_report(report, vehicle.log.summary(vehicle.ap, vehicle.bad_frames))
-            print_status(f"report written to {report}")
-
-
-def prepare_vehicle(vehicle: SimulatedVehicle, autopilot: AutopilotName) -> None:
-    """Make the vehicle fly by its receiver in ALT_HOLD or ALTCTL. Call before the flight."""
-    if autopilot == "px4":
-        for name, value in _PX4_PARAMS.items():
-            vehicle.params.set(name, value)
-        vehicle.reboot()
-
-
-def make_pilot(
-    options: PilotOptions,
-    *,
-    vehicle: SimulatedVehicle,
-    autopilot: AutopilotName,
-    course: Course,
-    clock: Clock,
-) -> tuple[Pilot, str]:
-    """Return the pilot and a line about it for the user.
-
-    Raises:
-        UsageError: the pilot lacks its package, display or vehicle, or its axes cannot be read.
-    """
-    name, axes, speed_mps = options
-    if name == "expert":
-        if autopilot != "ardupilot":
-            raise UsageError("--pilot expert knows the sticks of ardupilot alone")
-        expert = ExpertPilot(vehicle, course, speed_mps=speed_mps)
-        return expert, f"the expert flies at {speed_mps:g} m/s"
-    wanted = parse_axes(axes)
-    os.environ.setdefault("PYGAME_HIDE_SUPPORT_PROMPT", "1")  # no banner on import
-    try:
-        import pygame
-
-        from sitl.pilot import devices
-    except ModuleNotFoundError as error:
-        if error.name != "pygame":
-            raise
-        raise UsageError(f"--pilot {name} needs pygame: pip install pygame-ce") from error
-    try:
-        if name == "keyboard":
-            return devices.KeyboardPilot(clock), devices.KEYS_HELP
-        pad = devices.PygamePad()
-    except pygame.error as error:
-        raise UsageError(f"--pilot {name} needs a display: {error}") from error
-    found = pad.description or "no gamepad yet: plug one in (until then the receiver has no signal)"
-    return devices.GamepadPilot(pad, wanted, clock), f"{found}; {devices.PAD_HELP}"
 
 
 def fly(
@@ -244,3 +143,205 @@ def filming(
         stop.set()
         thread.join(JOIN_TIMEOUT_S)
         publisher.close()
+
+
+KEY_BYTES = 32
+EPOCH_2015_NS = 1_420_070_400 * NS_PER_S
+"""Unix time of the epoch of MAVLink 2 signing timestamps."""
+SIGNING_TICK_NS = 10_000
+
+
+def run(argv: Sequence[str] | None = None) -> int:
+    args = _parser().parse_args(argv)
+    try:
+        args.run(args)
+    except UsageError as error:
+        print_status(f"error: {error}")
+        return 2
+    return 0
+
+
+def _parser() -> argparse.ArgumentParser:
+    parser = argparse.ArgumentParser(
+        prog="python -m sitl",
+        description="A simulated ArduCopter or PX4 that speaks MAVLink, with an FPV camera in "
+        "shared memory over a course of gates.",
+        allow_abbrev=False,
+    )
+    parser.set_defaults(run=_fly)
+    add = parser.add_argument
+    connect_help = "MAVLink: udpout:HOST:PORT, udpin:HOST:PORT or tcpin:HOST:PORT; repeatable"
+    add("--connect", action="append", metavar="LINK", help=connect_help)
+    onboard_help = "such a link for a companion computer: PX4 gives it other streams"
+    add("--connect-onboard", action="append", metavar="LINK", help=onboard_help)
+    names = ("ardupilot", "px4")
+    add("--autopilot", choices=names, default=names[0], help="firmware (default: ardupilot)")
+    add("--report", type=Path, metavar="FILE", help="write a report (docs/formats.md)")
+    add("--duration", type=_POSITIVE, metavar="S", help="stop after S seconds")
+    fly_on_help = "before the report, fly S seconds more without links, faster than real time"
+    add("--fly-on", type=_POSITIVE, default=0.0, metavar="S", help=fly_on_help)
+    receiver_help = "RC receiver: throttle down, every stick centred, or none (default: mid; "
+    receiver_help += "none with PX4, which looks at one only if COM_RC_IN_MODE tells it to)"
+    add("--receiver", choices=("idle", "mid", "none"), help=receiver_help)
+    rc_help = "take the receiver's values from UDP datagrams on this port (sitl/link/transport.py)"
+    add("--rc-in", type=_PORT, metavar="PORT", help=rc_help)
+    pilot_help = "a gamepad, the keys of a window, or the expert over the course moves the receiver"
+    add("--pilot", choices=PILOTS, help=pilot_help)
+    axes_help = f"axes of the gamepad, a minus reverses one (default: {DEFAULT_AXES})"
+    add("--pilot-axes", default=DEFAULT_AXES, metavar="AXES", help=axes_help)
+    add("--pilot-speed", type=_POSITIVE, default=4.0, metavar="MPS", help="of the expert")
+    key_help = "sign with this key (MAVLink 2): a file of 32 bytes or 64 hexadecimal digits"
+    add("--signing-key-file", type=Path, metavar="FILE", help=key_help)
+    conditions_help = "random airframe, firmware settings, wind, light and lens by seed"
+    add(
+        "--conditions",
+        type=lambda text: random_conditions(int(_SEED(text))),
+        default=NOMINAL,
+        metavar="SEED",
+        help=conditions_help,
+    )
+    _add_camera_flags(parser)
+    commands = parser.add_subparsers(title="other commands", metavar="COMMAND")
+    camera_help = "film the course from another vehicle's reported pose"
+    camera = commands.add_parser("camera", help=camera_help, allow_abbrev=False)
+    camera.set_defaults(run=_film)
+    follow_help = "its MAVLink link: udp:HOST:PORT or udpin: to listen, udpout: or tcp: to connect"
+    camera.add_argument("--follow", required=True, metavar="LINK", help=follow_help)
+    _add_camera_flags(camera)
+    course = commands.add_parser("course", help="print a course", allow_abbrev=False)
+    course.set_defaults(run=_print_course)
+    course.add_argument("--course", type=_SEED, default=0, metavar="SEED", help="default: 0")
+    course.add_argument("--json", action="store_true", help="print JSON instead of a table")
+    return parser
+
+
+def _add_camera_flags(parser: argparse.ArgumentParser) -> None:
+    add = parser.add_argument
+    add("--camera", type=_shm_name, metavar="shm:NAME", help="publish frames under this name")
+    add("--course", type=_SEED, default=0, metavar="SEED", help="seed of the gates (default: 0)")
+    size_help = "side of the square image (default: 224)"
+    add("--image-size", type=_IMAGE_SIZE, default=224, metavar="PIXELS", help=size_help)
+    add("--fps", type=_POSITIVE, default=30.0, metavar="HZ", help="frame rate (default: 30)")
+
+
+def _fly(args: argparse.Namespace) -> None:
+    """Fly until the end or a signal, fly on without links or pilot, then write the report."""
+    links, onboard = args.connect or [], args.connect_onboard or []
+    if not links + onboard:
+        raise UsageError("no link: give at least one, such as --connect udpout:127.0.0.1:14550")
+    if args.pilot and (args.rc_in or args.receiver):
+        raise UsageError("--pilot moves the receiver: leave out --rc-in and --receiver")
+    if args.report is not None and not args.report.parent.is_dir():
+        raise UsageError(f"--report {args.report}: there is no folder {args.report.parent}")
+    config, course, clock = (
+        _config(args, len(links), len(onboard)),
+        make_course(args.course),
+        Clock(),
+    )
+    with ExitStack() as stack:
+        urls = links + onboard
+        transports = [stack.enter_context(closing(open_transport(url, clock))) for url in urls]
+        vehicle = SimulatedVehicle(
+            links=len(transports), boot_ns=clock.now_ns(), config=config, course=course
+        )
+        rc_input: Pilot | None = None
+        if args.rc_in is not None:
+            rc_input = stack.enter_context(closing(RcInput(args.rc_in)))
+        if args.pilot is not None:
+            prepare_vehicle(vehicle)
+            pilot = (args.pilot, args.pilot_axes, args.pilot_speed)
+            rc_input, line = make_pilot(*pilot, vehicle=vehicle, course=course, clock=clock)
+            stack.enter_context(closing(rc_input))
+            print_status(line)
+        stop = stack.enter_context(stop_on_signal())
+        films = args.camera is not None
+        with filming(vehicle, course, _camera(args), clock) if films else nullcontext():
+            print_status("ready on " + ", ".join(urls))
+            is_endless = args.duration is None
+            end_ns = None if is_endless else clock.now_ns() + round(args.duration * NS_PER_S)
+            fly(vehicle, transports, clock, stop, end_ns, rc_input=rc_input)
+        if args.fly_on:
+            os.nice(LEAST_PRIORITY)
+            fly_on(vehicle, args.fly_on)
+        if args.report is not None:
+            write_report(args.report, vehicle.log.summary(vehicle.ap, vehicle.bad_frames))
+            print_status(f"report written to {args.report}")
+
+
+def _config(args: argparse.Namespace, links: int, onboard: int) -> VehicleConfig:
+    has_receiver = args.autopilot != "px4" or args.pilot
+    receiver = args.receiver or ("mid" if has_receiver else "none")
+    return VehicleConfig(
+        autopilot=args.autopilot,
+        onboard_links=frozenset(range(links, links + onboard)),
+        receiver=receiver != "none",
+        receiver_us=IDLE_RECEIVER_US if receiver == "idle" else MID_RECEIVER_US,
+        signing=args.signing_key_file and _signing_key(args.signing_key_file),
+        conditions=args.conditions,
+    )
+
+
+def _signing_key(path: Path) -> SigningKey:
+    try:
+        data = path.read_bytes()
+        key = data if len(data) == KEY_BYTES else bytes.fromhex(data.decode().strip())
+    except (OSError, ValueError) as error:
+        raise UsageError(f"--signing-key-file {path}: {error}") from error
+    if len(key) != KEY_BYTES:
+        raise UsageError(f"--signing-key-file {path}: want {KEY_BYTES} bytes, got {len(key)}")
+    since_2015_ns = wall_ns() - EPOCH_2015_NS
+    return SigningKey(key, since_2015_ns // SIGNING_TICK_NS)
+
+
+def _film(args: argparse.Namespace) -> None:
+    if args.camera is None:
+        raise UsageError(
+            "camera --follow needs --camera shm:NAME, the name to publish frames under"
+        )
+    with stop_on_signal() as stop:
+        film_vehicle(args.follow, make_course(args.course), _camera(args), stop.is_set)
+
+
+def _camera(args: argparse.Namespace) -> CameraOptions:
+    return CameraOptions(shm_name=args.camera, image_size=args.image_size, fps=args.fps)
+
+
+def _print_course(args: argparse.Namespace) -> None:
+    course = make_course(args.course)
+    if args.json:
+        sys.stdout.write(course_to_json(course) + "\n")
+        return
+    sys.stdout.write("gate  north_m  east_m  up_m  yaw_deg  size_m\n")
+    for gate in course.gates:
+        north, east, down = gate.center_ned_m
+        sys.stdout.write(
+            f"{gate.index:4d}  {north:7.1f}  {east:6.1f}  {-down:4.1f}  "
+            f"{math.degrees(gate.yaw_rad):7.1f}  {gate.size_m:6.1f}\n"
+        )
+
+
+def _number(
+    parse: type[int] | type[float], low: float, high: float, wanted: str
+) -> Callable[[str], float]:
+    """Return a flag's type: a number within [low, high]."""
+
+    def convert(text: str) -> float:
+        with suppress(ValueError):
+            if low <= (value := parse(text)) <= high:
+                return value
+        raise argparse.ArgumentTypeError(f"must be {wanted}, got {text!r}")
+
+    return convert
+
+
+_POSITIVE = _number(float, sys.float_info.min, sys.float_info.max, "a positive number")
+_SEED = _number(int, 0, math.inf, "a whole number, 0 or more")
+_PORT = _number(int, 1, 65535, "a port, 1 to 65535")
+_IMAGE_SIZE = _number(int, 16, 4096, "16 to 4096 pixels")
+
+
+def _shm_name(text: str) -> str:
+    prefix, _, name = text.partition(":")
+    if prefix != "shm" or not name or "/" in name:
+        raise argparse.ArgumentTypeError(f"must be shm:NAME, such as shm:fpv, got {text!r}")
+    return name

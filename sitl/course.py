@@ -11,7 +11,7 @@ from dataclasses import asdict, dataclass
 import numpy as np
 
 from sitl import UsageError
-from sitl.rotation import Quat, Vec3, conjugate, rotate, to_euler, wrap_pi
+from sitl.vehicle.rotation import Quat, Vec3, conjugate, rotate, to_euler, to_heading, wrap_pi
 
 OPENING_M = 2.4  # side of the opening: five times the width of a 0.5 m quadrotor
 BAR_M = 0.32  # width of the bars around an opening
@@ -68,8 +68,7 @@ class Gate:
     def to_axes(self, vector_ned: Vec3) -> Vec3:
         """Rotate a NED direction, velocity or offset into gate axes: forward, right, down."""
         north, east, down = vector_ned
-        cos_yaw, sin_yaw = math.cos(self.yaw_rad), math.sin(self.yaw_rad)
-        return (north * cos_yaw + east * sin_yaw, east * cos_yaw - north * sin_yaw, down)
+        return (*to_heading(north, east, self.yaw_rad), down)
 
     def offset_m(self, position_ned_m: Vec3) -> Vec3:
         """Return the position relative to the gate's centre in gate axes: forward, right, down."""

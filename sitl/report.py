@@ -5,12 +5,12 @@ import math
 from collections import deque
 from dataclasses import asdict
 from pathlib import Path
-from typing import Any, Literal, NamedTuple, TypeAlias
+from typing import Any, Literal, TypeAlias
 
 from sitl.clock import NS_PER_S
 from sitl.course import Course, Crash, GateCounter, GatePass, struck_gate
-from sitl.firmware import Autopilot
-from sitl.rotation import Vec3, cos_tilt, to_euler
+from sitl.vehicle.firmware import Autopilot
+from sitl.vehicle.rotation import Vec3, cos_tilt, to_euler
 
 CRASH_SPEED_MPS = 3.5  # ALT_HOLD descends at up to 2.5 m/s, a hard landing but no crash
 CRASH_TILT_COS = math.cos(math.radians(45.0))
@@ -107,7 +107,7 @@ class FlightLog:
     def on_step(self, ap: Autopilot) -> None:
         if not self._modes or self._modes[-1]["mode"] != ap.mode_name:
             self._modes.append({"t_s": self._t_s(ap.now_ns), "mode": ap.mode_name})
-        self._sticks.update(ap, max(ap.now_ns, self._arrived_ns))
+        self._sticks.update(ap, self._t_s(max(ap.now_ns, self._arrived_ns)))
         if ap.armed:
             self._armed_ns += ap.now_ns - self._last_ns
         self._last_ns = ap.now_ns
@@ -171,55 +171,36 @@ class FlightLog:
                 "velocity_ned_mps": body.velocity_ned_mps,
                 "roll_pitch_yaw_deg": [math.degrees(angle) for angle in angles],
             },
-            "sticks": self._sticks.summary(self._start_ns),
+            "sticks": list(self._sticks.rows),
         }
 
     def _t_s(self, now_ns: int) -> float:
         return (now_ns - self._start_ns) / NS_PER_S
 
 
-class _StickEntry(NamedTuple):
-    stamp_ns: int
-    us: tuple[int, int, int, int]  # roll, pitch, throttle, yaw
-    mode: str
-    armed: bool
-    failsafe: bool
-    lean_deg: float  # angle between the vehicle's vertical axis and the vertical
-    climb_mps: float
-    height_m: float
-
-
 class _StickRecord:
     """Sticks that the vehicle acted on and its motion, at changes and periodically while armed."""
 
     def __init__(self) -> None:
-        self._entries: deque[_StickEntry] = deque(maxlen=MAX_STICK_ENTRIES)
+        self.rows: deque[dict[str, Any]] = deque(maxlen=MAX_STICK_ENTRIES)
+        self._last: tuple[Any, ...] = ()
         self._due_ns = 0
 
-    def update(self, ap: Autopilot, stamp_ns: int) -> None:
-        """Add an entry, stamped ``stamp_ns``, if one is due after this control step."""
-        last = self._entries[-1] if self._entries else None
-        us, state = ap.sticks_us, (ap.mode_name, ap.armed, ap.in_failsafe)
-        is_same = last is not None and state == last[2:5]
-        is_due = ap.armed and ap.now_ns >= self._due_ns
-        if is_same and not is_due and last is not None and us == last.us:
+    def update(self, ap: Autopilot, t_s: float) -> None:
+        """Add a row, stamped ``t_s``, if one is due after this control step."""
+        state = (ap.sticks_us, ap.mode_name, ap.armed, ap.in_failsafe)
+        if state == self._last and not (ap.armed and ap.now_ns >= self._due_ns):
             return
-        body = ap.truth
-        lean_deg = math.degrees(math.acos(max(-1.0, min(1.0, cos_tilt(body.ned_from_body_wxyz)))))
-        climb_mps = -body.velocity_ned_mps[2]
+        self._last = state
         self._due_ns = ap.now_ns + STICK_PERIOD_NS
-        height_m = -body.position_ned_m[2]
-        entry = _StickEntry(stamp_ns, us, *state, lean_deg, climb_mps, height_m)
-        self._entries.append(entry)
-
-    def summary(self, start_ns: int) -> list[dict[str, Any]]:
-        rows = []
-        for stamp_ns, *state, lean_deg, climb_mps, height_m in self._entries:
-            row: dict[str, Any] = {"t_s": (stamp_ns - start_ns) / NS_PER_S}
-            row |= dict(zip(("us", "mode", "armed", "failsafe"), state, strict=True))
-            row |= {"lean_deg": round(lean_deg, 2), "climb_mps": round(climb_mps, 3)}
-            rows.append(row | {"height_m": round(height_m, 3)})
-        return rows
+        body = ap.truth
+        lean_rad = math.acos(max(-1.0, min(1.0, cos_tilt(body.ned_from_body_wxyz))))
+        row: dict[str, Any] = {"t_s": t_s}
+        row |= zip(("us", "mode", "armed", "failsafe"), state, strict=True)
+        row["lean_deg"] = round(math.degrees(lean_rad), 2)
+        row["climb_mps"] = round(-body.velocity_ned_mps[2], 3)
+        row["height_m"] = round(-body.position_ned_m[2], 3)
+        self.rows.append(row)
 
 
 class _Arrivals:

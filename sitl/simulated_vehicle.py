@@ -9,7 +9,6 @@ from sitl.ardupilot.params import ArduPilotParams
 from sitl.ardupilot.server import ArduPilotServer
 from sitl.clock import NS_PER_S
 from sitl.course import AirborneStart, Course
-from sitl.firmware import Autopilot, Params, StatusText
 from sitl.link.server import MavlinkServer
 from sitl.px4.autopilot import Px4
 from sitl.px4.params import Px4Params
@@ -17,6 +16,7 @@ from sitl.px4.server import Px4Server
 from sitl.report import FlightLog
 from sitl.vehicle.config import VehicleConfig
 from sitl.vehicle.dynamics import BodyState
+from sitl.vehicle.firmware import Autopilot, Params, StatusText
 
 SEVERITY_CRITICAL = 2
 MAX_CATCH_UP_NS = NS_PER_S

@@ -32,8 +32,8 @@ from mavbridge.simulation.world import Exposure, make_vehicle
 from policy.contract import ACTION_DIM, Contract, FloatArray
 from policy.protocol import PolicyRunner
 from sitl.course import gate_truth
-from sitl.expert.demonstrator import Expert, RateExpert
-from sitl.expert.disturbance import RATE_STRENGTHS, STICK_STRENGTHS, Disturbance, random_start
+from sitl.pilot.demonstrator import Expert, RateExpert
+from sitl.pilot.disturbance import RATE_STRENGTHS, STICK_STRENGTHS, Disturbance, random_start
 from sitl.vehicle.conditions import NOMINAL, Conditions, random_conditions
 from sitl.vehicle.dynamics import BodyState
 

@@ -41,9 +41,9 @@ from policy.contract import Contract, FloatArray
 from policy.protocol import PolicyRunner
 from sitl.camera.fpv import FpvRenderer
 from sitl.course import make_course
-from sitl.rotation import Quat
 from sitl.simulated_vehicle import SimulatedVehicle
 from sitl.vehicle.config import STEP_NS, VehicleConfig
+from sitl.vehicle.rotation import Quat
 
 MAX_TIME_S = 60.0
 """Default limit [s]: courses are some 80 m long, so a policy slower than 1.5 m/s fails."""

@@ -19,7 +19,6 @@ from mavbridge.simulation.network import DelayedChannel
 from policy.contract import Contract
 from sitl.ardupilot.guided import OPTION_THRUST
 from sitl.camera.fpv import FpvRenderer
-from sitl.rotation import IDENTITY, Quat, Vec3, conjugate, from_euler, multiply, rotate
 from sitl.simulated_vehicle import Pose, SimulatedVehicle
 from sitl.vehicle.conditions import (
     NOMINAL,
@@ -29,6 +28,7 @@ from sitl.vehicle.conditions import (
 )
 from sitl.vehicle.config import STEP_NS, AutopilotName, VehicleConfig
 from sitl.vehicle.dynamics import BodyState
+from sitl.vehicle.rotation import IDENTITY, Quat, Vec3, conjugate, from_euler, multiply, rotate
 
 MOUNTS: dict[str, Quat] = {
     "front": IDENTITY,

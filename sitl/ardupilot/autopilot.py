@@ -12,12 +12,19 @@ from sitl.ardupilot.flight_modes import CopterControl, Mode
 from sitl.ardupilot.guided import GuidedControl
 from sitl.ardupilot.params import ArduPilotParams
 from sitl.ardupilot.rc import ModeSwitch, RcEngine
-from sitl.ardupilot.sticks import RudderGesture, SimpleMode, Sticks, climb_rate_mps, read_sticks
+from sitl.ardupilot.sticks import (
+    GESTURE_NS,
+    SimpleMode,
+    Sticks,
+    climb_rate_mps,
+    gesture_side,
+    read_sticks,
+)
 from sitl.clock import NS_PER_S
-from sitl.firmware import STOPPED, Autopilot
-from sitl.rotation import cos_tilt
 from sitl.vehicle.config import STEP_NS, VehicleConfig
 from sitl.vehicle.dynamics import QUAD
+from sitl.vehicle.firmware import STOPPED, Autopilot, HeldGesture
+from sitl.vehicle.rotation import cos_tilt
 
 LOW_READS_TO_FAIL = 3
 GCS_CHECK_PERIOD_NS = NS_PER_S // 3  # ArduCopter checks the ground station at 3 Hz
@@ -118,7 +125,7 @@ class ArduCopter(Autopilot):
         self.simple = SimpleMode(params)
         self._armed = False
         self._mode_switch = ModeSwitch()
-        self._gesture = RudderGesture()
+        self._gesture = HeldGesture(GESTURE_NS)
         self._tipped_since_ns: int | None = None
         self._idle_since_ns = self._armed_ns = boot_ns
 
@@ -274,12 +281,7 @@ class ArduCopter(Autopilot):
             self._set_landed(landed=False)
         self._idle_since_ns = self.now_ns
         return self.control.fly(
-            self.mode,
-            sticks,
-            self.sensed,
-            self.now_ns,
-            has_position=self.position_ready,
-            dt_s=self.step_s,
+            self.mode, sticks, self.sensed, self.now_ns, has_position=self.position_ready
         )
 
     def _lifts_off(self, sticks: Sticks) -> bool:
@@ -327,10 +329,11 @@ class ArduCopter(Autopilot):
             self._send_text(SEVERITY_WARNING, "Radio Failsafe Cleared")
 
     def _read_gesture(self) -> None:
-        match self._gesture.update(read_sticks(self.rc, self.params), self.now_ns):
-            case "arm":
+        self._gesture.see(gesture_side(read_sticks(self.rc, self.params)), self.now_ns)
+        match self._gesture.take(self.now_ns):
+            case 1:
                 self.arm(force=False, by_rudder=True)
-            case "disarm":
+            case -1:
                 self.disarm(force=False)
 
     def _read_mode_switch(self) -> None:

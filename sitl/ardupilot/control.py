@@ -3,21 +3,23 @@
 import math
 
 from sitl.ardupilot.params import DEFAULT_RATE_P, ArduPilotParams
-from sitl.rotation import (
+from sitl.clock import NS_PER_S
+from sitl.vehicle.config import STEP_NS
+from sitl.vehicle.dynamics import GRAVITY_MPS2, BodyState, clamp
+from sitl.vehicle.rotation import (
     IDENTITY,
     Quat,
     Vec3,
-    conjugate,
     cos_tilt,
     from_euler,
     integrate,
-    multiply,
-    rotation_vector,
+    rotation_between,
     to_euler,
     to_heading,
     yaw_of,
 )
-from sitl.vehicle.dynamics import GRAVITY_MPS2, BodyState, clamp
+
+STEP_S = STEP_NS / NS_PER_S
 
 RATE_GAIN_PER_S: Vec3 = (18.0, 18.0, 6.0)
 """At the default gains. With 28 ms of motor lag, 18/s gives a damping ratio of about 0.7."""
@@ -54,15 +56,13 @@ class AttitudeController:
         self._target_rate_radps = (0.0, 0.0, 0.0)
         self._response.reset(body)
 
-    def lean(
-        self, body: BodyState, roll: float, pitch: float, yaw_rate_radps: float, dt_s: float
-    ) -> Vec3:
+    def lean(self, body: BodyState, roll: float, pitch: float, yaw_rate_radps: float) -> Vec3:
         """Return body angular acceleration [rad/s^2] towards a roll and pitch, with a yaw rate."""
-        self._roll_rate = self._shape("R", roll - self._roll, self._roll_rate, dt_s)
-        self._pitch_rate = self._shape("P", pitch - self._pitch, self._pitch_rate, dt_s)
-        self._roll += self._roll_rate * dt_s
-        self._pitch += self._pitch_rate * dt_s
-        self._yaw += yaw_rate_radps * dt_s
+        self._roll_rate = self._shape("R", roll - self._roll, self._roll_rate)
+        self._pitch_rate = self._shape("P", pitch - self._pitch, self._pitch_rate)
+        self._roll += self._roll_rate * STEP_S
+        self._pitch += self._pitch_rate * STEP_S
+        self._yaw += yaw_rate_radps * STEP_S
         self._target = from_euler(self._roll, self._pitch, self._yaw)
         sr, cr = math.sin(self._roll), math.cos(self._roll)
         sp, cp = math.sin(self._pitch), math.cos(self._pitch)
@@ -73,40 +73,38 @@ class AttitudeController:
         )
         return self._track(body, self._target, feedforward)
 
-    def rates(self, body: BodyState, rate_radps: Vec3, dt_s: float) -> Vec3:
+    def rates(self, body: BodyState, rate_radps: Vec3) -> Vec3:
         """Return body angular acceleration [rad/s^2] towards a body rate; zero holds attitude."""
-        self._target = integrate(self._target, rate_radps, dt_s)
-        error = rotation_vector(multiply(conjugate(body.ned_from_body_wxyz), self._target))
+        self._target = integrate(self._target, rate_radps, STEP_S)
+        error = rotation_between(body.ned_from_body_wxyz, self._target)
         if math.hypot(*error) > MAX_TARGET_LEAD_RAD:
             self._target = body.ned_from_body_wxyz
         return self._track(body, self._target, rate_radps)
 
-    def approach(
-        self, body: BodyState, ned_from_body_wxyz: Quat, rate_body_radps: Vec3, dt_s: float
-    ) -> Vec3:
+    def approach(self, body: BodyState, ned_from_body_wxyz: Quat, rate_body_radps: Vec3) -> Vec3:
         """Return body angular acceleration [rad/s^2] towards an attitude turning at a body rate."""
-        error = rotation_vector(multiply(conjugate(self._target), ned_from_body_wxyz))
+        error = rotation_between(self._target, ned_from_body_wxyz)
         rate = [
-            self._shape(axis, error[k], self._target_rate_radps[k], dt_s, rate_body_radps[k])
+            self._shape(axis, error[k], self._target_rate_radps[k], rate_body_radps[k])
             for k, axis in enumerate("RPY")
         ]
-        return self._advance(body, (rate[0], rate[1], rate[2]), dt_s)
+        return self._advance(body, (rate[0], rate[1], rate[2]))
 
-    def turn(self, body: BodyState, rate_body_radps: Vec3, dt_s: float) -> Vec3:
+    def turn(self, body: BodyState, rate_body_radps: Vec3) -> Vec3:
         """Return body angular acceleration [rad/s^2] towards a body rate, without target jumps.
 
         As in the firmware, the target does not wait for the vehicle. The vehicle later makes up for
         the angle that it lost at the start, so a weak axis overshoots its rate.
         """
         rate = [
-            self.slew(axis, rate_body_radps[k], self._target_rate_radps[k], dt_s)
+            self.slew(axis, rate_body_radps[k], self._target_rate_radps[k])
             for k, axis in enumerate("RPY")
         ]
-        return self._advance(body, (rate[0], rate[1], rate[2]), dt_s)
+        return self._advance(body, (rate[0], rate[1], rate[2]))
 
-    def _advance(self, body: BodyState, rate_radps: Vec3, dt_s: float) -> Vec3:
-        self._set_target(integrate(self._target, rate_radps, dt_s))
-        feedforward = self._response.step(self._target, rate_radps, dt_s)
+    def _advance(self, body: BodyState, rate_radps: Vec3) -> Vec3:
+        self._set_target(integrate(self._target, rate_radps, STEP_S))
+        feedforward = self._response.step(self._target, rate_radps)
         accel = self._track(body, self._response.attitude, self._response.rate_radps)
         self._target_rate_radps = rate_radps
         return accel[0] + feedforward[0], accel[1] + feedforward[1], accel[2] + feedforward[2]
@@ -118,7 +116,7 @@ class AttitudeController:
 
     def _track(self, body: BodyState, attitude: Quat, feedforward_radps: Vec3) -> Vec3:
         self._target_rate_radps = feedforward_radps
-        error = rotation_vector(multiply(conjugate(body.ned_from_body_wxyz), attitude))
+        error = rotation_between(body.ned_from_body_wxyz, attitude)
         gains = [self._params[name] for name in _ANGLE_GAINS]
         roll_share, pitch_share = (self._params[name] / DEFAULT_RATE_P for name in _RATE_GAINS)
         shares = (roll_share, pitch_share, 1.0)
@@ -131,7 +129,7 @@ class AttitudeController:
         return (ax, ay, az)
 
     def _shape(
-        self, axis: str, error_rad: float, rate_radps: float, dt_s: float, wanted_radps: float = 0.0
+        self, axis: str, error_rad: float, rate_radps: float, wanted_radps: float = 0.0
     ) -> float:
         """Return the next rate of a target angle that closes its error without a jump in rate.
 
@@ -140,12 +138,12 @@ class AttitudeController:
         input_time_s = max(MIN_INPUT_TIME_S, self._params.decimal("ATC_INPUT_TC"))
         max_rate_radps = math.radians(self._limit(f"ATC_RATE_{axis}_MAX"))
         wanted = clamp(error_rad / input_time_s + wanted_radps, max_rate_radps)
-        return self.slew(axis, wanted, rate_radps, dt_s)
+        return self.slew(axis, wanted, rate_radps)
 
-    def slew(self, axis: str, wanted_radps: float, rate_radps: float, dt_s: float) -> float:
+    def slew(self, axis: str, wanted_radps: float, rate_radps: float) -> float:
         """Return the next rate of axis R, P or Y, within the axis' acceleration limit."""
         max_accel_radps2 = math.radians(self._limit(f"ATC_ACCEL_{axis}_MAX") / 100.0)
-        return rate_radps + clamp(wanted_radps - rate_radps, max_accel_radps2 * dt_s)
+        return rate_radps + clamp(wanted_radps - rate_radps, max_accel_radps2 * STEP_S)
 
     def _limit(self, name: str) -> float:
         limit = self._params[name]
@@ -170,21 +168,21 @@ class _Response:
         self.rate_radps = self._command_radps = (0.0, 0.0, 0.0)
         self._yaw_accel_radps2 = 0.0
 
-    def step(self, target: Quat, rate_radps: Vec3, dt_s: float) -> Vec3:
-        error = rotation_vector(multiply(conjugate(self.attitude), target))
+    def step(self, target: Quat, rate_radps: Vec3) -> Vec3:
+        error = rotation_between(self.attitude, target)
         roll, pitch, yaw = (rate_radps[k] + CATCH_UP_PER_S * error[k] for k in range(3))
         before = self._command_radps
         yaw_accel = YAW_GAIN_PER_S * (yaw - before[2])
-        self._yaw_accel_radps2 += (yaw_accel - self._yaw_accel_radps2) * dt_s / YAW_LAG_S
-        command = (roll, pitch, before[2] + self._yaw_accel_radps2 * dt_s)
+        self._yaw_accel_radps2 += (yaw_accel - self._yaw_accel_radps2) * STEP_S / YAW_LAG_S
+        command = (roll, pitch, before[2] + self._yaw_accel_radps2 * STEP_S)
         self._command_radps = command
-        part = dt_s / MOTOR_LAG_S
+        part = STEP_S / MOTOR_LAG_S
         roll, pitch, yaw = (
             r + part * (c - r) for r, c in zip(self.rate_radps, command, strict=True)
         )
         self.rate_radps = (roll, pitch, yaw)
-        self.attitude = integrate(self.attitude, self.rate_radps, dt_s)
-        roll, pitch, yaw = ((c - b) / dt_s for c, b in zip(command, before, strict=True))
+        self.attitude = integrate(self.attitude, self.rate_radps, STEP_S)
+        roll, pitch, yaw = ((c - b) / STEP_S for c, b in zip(command, before, strict=True))
         return roll, pitch, yaw
 
 

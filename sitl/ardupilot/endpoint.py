@@ -6,7 +6,7 @@ keeps its bias and whose magnetometer is a million times too large, positions wi
 estimator has one.
 """
 
-from collections.abc import Callable, Collection
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -17,19 +17,10 @@ from sitl.ardupilot.flight_modes import Mode
 from sitl.ardupilot.guided import Submode
 from sitl.clock import NS_PER_MS, NS_PER_S
 from sitl.link.server import MAX_STATUSTEXT, Endpoint, Message, flags
-from sitl.link.telemetry import (
-    Home,
-    autopilot_version,
-    battery_status,
-    boot_ms,
-    boot_us,
-    extended_sys_state,
-    sys_status,
-    vfr_hud,
-)
-from sitl.rotation import Vec3
-from sitl.vehicle.conditions import NOMINAL, Conditions
+from sitl.link.telemetry import Home, boot_ms, boot_us, extended_sys_state, sys_status, vfr_hud
 from sitl.vehicle.config import ArduPilotRelease
+from sitl.vehicle.firmware import Autopilot
+from sitl.vehicle.rotation import Vec3
 
 HOME = Home(-35.3632621, 149.1652374, 584.0, (0.2322, 0.0520, -0.5280), 945.0, 35.0)
 """Default home of ArduPilot's SITL."""
@@ -60,10 +51,13 @@ _VELOCITY_ONLY = 3079  # POSITION_TARGET_LOCAL_NED.type_mask: velocity and accel
 _POSITION_ONLY = 3576  # type_mask: position only
 
 
-def _raw_gyro(ap: ArduCopter) -> tuple[float, ...]:
-    return tuple(
-        rate + bias for rate, bias in zip(ap.sensed.rate_body_radps, GYRO_BIAS_RADPS, strict=True)
-    )
+def _raw_gyro(ap: Autopilot) -> Vec3:
+    (x, y, z), (bias_x, bias_y, bias_z) = ap.sensed.rate_body_radps, GYRO_BIAS_RADPS
+    return (x + bias_x, y + bias_y, z + bias_z)
+
+
+def _scaled_imu(ap: Autopilot) -> tuple[int, ...]:
+    return HOME.scaled_imu(ap, _raw_gyro(ap))
 
 
 def _heartbeat(ap: ArduCopter) -> Message:
@@ -83,16 +77,6 @@ def _heartbeat(ap: ArduCopter) -> Message:
     return mav.MAVLink_heartbeat_message(
         ap.config.vehicle_type, autopilot, base_mode, int(ap.mode), status, 3
     )
-
-
-def _scaled_imu(ap: ArduCopter) -> tuple[int, ...]:
-    return HOME.scaled_imu(ap, _raw_gyro(ap))
-
-
-def _highres_imu(ap: ArduCopter) -> Message:
-    """Build HIGHRES_IMU: rates with bias, field in micro-gauss, as in the firmware."""
-    field = (1e6 * b for b in HOME.mag_gauss(ap))
-    return HOME.highres_imu(ap, _raw_gyro(ap), field, has_difference=True)
 
 
 def _vfr_hud(ap: ArduCopter) -> Message:
@@ -131,11 +115,6 @@ def _extended_sys_state(ap: ArduCopter) -> Message:
     return extended_sys_state(ap, vtol, is_landing=is_landing, is_taking_off=is_taking_off)
 
 
-def _autopilot_version(ap: ArduCopter) -> Message:
-    version = _FIRMWARE_VERSIONS[ap.config.ardupilot_release]
-    return autopilot_version(ap, capabilities=_CAPABILITIES, version=version)
-
-
 def _attitude_target(ap: ArduCopter) -> Message:
     """Build ATTITUDE_TARGET: the controller's shaped target, not the received setpoint, and the
     thrust before the lean boost."""
@@ -162,18 +141,22 @@ def _position_target(ap: ArduCopter) -> Message | None:
 
 
 BUILDERS: dict[int, Callable[[ArduCopter], Message | None]] = {
-    **HOME.builders(),
+    **HOME.builders(
+        gyro=_raw_gyro,
+        field_per_gauss=1e6,  # in micro-gauss, as in the firmware
+        has_pressure_difference=True,
+        version=lambda ap: _FIRMWARE_VERSIONS[ap.config.ardupilot_release],
+        capabilities=_CAPABILITIES,
+        energy_hj=0,
+    ),
     mav.MAVLINK_MSG_ID_HEARTBEAT: _heartbeat,
     mav.MAVLINK_MSG_ID_SYS_STATUS: _sys_status,
     mav.MAVLINK_MSG_ID_GPS_RAW_INT: lambda ap: HOME.gps_raw_int(
         ap, fix=mav.GPS_FIX_TYPE_3D_FIX, eph=121, epv=200
     ),
-    mav.MAVLINK_MSG_ID_SCALED_IMU: lambda ap: mav.MAVLink_scaled_imu_message(
-        boot_ms(ap), *_scaled_imu(ap), HOME.temperature_cdeg
-    ),
     # Scaled integers in spite of the name.
     mav.MAVLINK_MSG_ID_RAW_IMU: lambda ap: mav.MAVLink_raw_imu_message(
-        boot_us(ap), *_scaled_imu(ap), 0, HOME.temperature_cdeg
+        boot_us(ap), *_scaled_imu(ap)[:-1], 0, _scaled_imu(ap)[-1]
     ),
     mav.MAVLINK_MSG_ID_LOCAL_POSITION_NED: lambda ap: (
         mav.MAVLink_local_position_ned_message(
@@ -189,13 +172,10 @@ BUILDERS: dict[int, Callable[[ArduCopter], Message | None]] = {
     ),
     mav.MAVLINK_MSG_ID_VFR_HUD: _vfr_hud,
     mav.MAVLINK_MSG_ID_OPTICAL_FLOW: lambda _: None,  # accepted by the firmware, never sent
-    mav.MAVLINK_MSG_ID_HIGHRES_IMU: _highres_imu,
     # The second IMU agrees with the first.
     mav.MAVLINK_MSG_ID_SCALED_IMU2: lambda ap: mav.MAVLink_scaled_imu2_message(
-        boot_ms(ap), *_scaled_imu(ap), HOME.temperature_cdeg
+        boot_ms(ap), *_scaled_imu(ap)
     ),
-    mav.MAVLINK_MSG_ID_BATTERY_STATUS: lambda ap: battery_status(ap, energy_hj=0),
-    mav.MAVLINK_MSG_ID_AUTOPILOT_VERSION: _autopilot_version,
     mav.MAVLINK_MSG_ID_EKF_STATUS_REPORT: _ekf_status_report,
     mav.MAVLINK_MSG_ID_ATTITUDE_TARGET: _attitude_target,
     mav.MAVLINK_MSG_ID_POSITION_TARGET_LOCAL_NED: _position_target,
@@ -233,123 +213,105 @@ class _Stream:
     late_ns: int = 0  # delay of the next message after its slot
 
 
-class ArduPilotStreams:
-    """Message intervals of one link, in whole ms. Stamps are those of the vehicle's clock.
+class ArduPilotEndpoint(Endpoint[ArduCopter]):
+    """Link whose message intervals, in whole ms, are shared by all of its senders.
 
     MESSAGE_INTERVAL reports the interval without the conditions' delays (slow link, jitter,
     phases), as the firmware does.
     """
-
-    def __init__(
-        self, known: Collection[int], now_ns: int, conditions: Conditions = NOMINAL
-    ) -> None:
-        self._known = known
-        self._slowdown_ms = conditions.stream_slowdown_ms
-        self._jitter_ns = conditions.stream_jitter_ms * NS_PER_MS
-        self._phase_spread = conditions.stream_phase_spread
-        self._random = np.random.Generator(np.random.PCG64((conditions.seed, 5)))
-        self._streams: dict[int, _Stream] = {}
-        self._start(mav.MAVLINK_MSG_ID_HEARTBEAT, HEARTBEAT_INTERVAL_MS, now_ns)
-
-    def set_interval(
-        self, message_id: int, interval_us: int, *, loop_hz: float, now_ns: int
-    ) -> str | None:
-        """Apply MAV_CMD_SET_MESSAGE_INTERVAL: -1 stops, 0 restores the default.
-
-        Returns:
-            None if accepted; else the reason, and the old interval is kept.
-        """
-        if message_id not in self._known:
-            return f"No ap_message for mavlink id ({message_id})"
-        interval_ms = max(1, min(interval_us, MAX_INTERVAL_US) // 1000) if interval_us > 0 else 0
-        if interval_us == 0 and message_id == mav.MAVLINK_MSG_ID_HEARTBEAT:
-            interval_ms = HEARTBEAT_INTERVAL_MS
-        if 0 < interval_ms < shortest_ms(loop_hz):
-            return f"Requested rate for message ID {message_id} too fast. Increase SCHED_LOOP_RATE"
-        self._start(message_id, interval_ms, now_ns)
-        return None
-
-    def set_group(self, group: int, rate_hz: int, *, loop_hz: float, now_ns: int) -> None:
-        """Apply REQUEST_DATA_STREAM, which replaces earlier intervals. Rate 0 stops the group."""
-        interval_ms = max(1000 // rate_hz, shortest_ms(loop_hz)) if rate_hz > 0 else 0
-        for one in STREAM_GROUPS if group == mav.MAV_DATA_STREAM_ALL else (group,):
-            for message_id in STREAM_GROUPS.get(one, ()):
-                self._start(message_id, interval_ms, now_ns)
-
-    def interval_us(self, message_id: int) -> int:
-        """Return the interval for MESSAGE_INTERVAL: 0 = unknown message, -1 = not streamed."""
-        if message_id not in self._known:
-            return 0
-        stream = self._streams.get(message_id)
-        return stream.interval_ms * 1000 if stream else -1
-
-    def due(self, now_ns: int, slowdown: int) -> list[int]:
-        """Return the ids of the messages to send now; after missed slots, each is sent once."""
-        ready = [
-            key for key, stream in self._streams.items() if now_ns >= stream.due_ns + stream.late_ns
-        ]
-        for message_id in ready:
-            stream = self._streams[message_id]
-            period_ns = (stream.interval_ms + self._slowdown_ms) * NS_PER_MS * slowdown
-            stream.due_ns += period_ns * ((now_ns - stream.due_ns) // period_ns + 1)
-            stream.late_ns = self._random_ns(self._jitter_ns)
-        return ready
-
-    def _random_ns(self, most_ns: float) -> int:
-        return int(self._random.uniform(0.0, most_ns)) if most_ns else 0
-
-    def _start(self, message_id: int, interval_ms: int, now_ns: int) -> None:
-        self._streams.pop(message_id, None)
-        if interval_ms > 0:
-            # The firmware keeps ten distinct intervals per link; the nearest replaces an eleventh.
-            taken = {stream.interval_ms for stream in self._streams.values()}
-            if interval_ms not in taken and len(taken) >= MAX_DISTINCT_INTERVALS:
-                interval_ms = min(taken, key=lambda other: abs(other - interval_ms))
-            period_ns = (interval_ms + self._slowdown_ms) * NS_PER_MS
-            due_ns = now_ns + period_ns - self._random_ns(self._phase_spread * period_ns)
-            self._streams[message_id] = _Stream(interval_ms=interval_ms, due_ns=due_ns)
-
-
-def shortest_ms(loop_hz: float) -> int:
-    """Return the shortest interval, 1 / (0.8 * loop rate) in whole milliseconds: 3 ms at 400 Hz."""
-    return int(1000.0 / (0.8 * max(50.0, loop_hz)))
-
-
-class ArduPilotEndpoint(Endpoint[ArduCopter]):
-    """Link whose intervals all senders share, for example two ground stations."""
 
     def __init__(self, ap: ArduCopter) -> None:
         super().__init__(ap, BUILDERS)
 
     def restart(self, ap: ArduCopter) -> None:
         super().restart(ap)
-        self._streams = ArduPilotStreams(BUILDERS, ap.now_ns, ap.config.conditions)
+        self._conditions = ap.config.conditions
+        self._random = np.random.Generator(np.random.PCG64((self._conditions.seed, 5)))
+        self._streams: dict[int, _Stream] = {}
+        self._start(mav.MAVLINK_MSG_ID_HEARTBEAT, HEARTBEAT_INTERVAL_MS)
         self._timesync_due_ns = ap.now_ns + TIMESYNC_PERIOD_NS
 
     def step(self, _now_ns: int) -> None:
         now_ns = self._ap.now_ns
         self._send_next_param(now_ns)
-        for message_id in self._streams.due(now_ns, PARAM_SLOWDOWN if self._queued_params else 1):
+        for message_id in self._due(now_ns):
             self.send_now(message_id)
         if now_ns >= self._timesync_due_ns:
             self._timesync_due_ns += TIMESYNC_PERIOD_NS
             uptime_ns = self._ap.uptime_ns
             self.send(mav.MAVLink_timesync_message(0, uptime_ns + self._ap.system_id))
 
-    def set_interval(self, message_id: int, interval_us: int) -> str | None:
-        loop_hz = self._ap.params["SCHED_LOOP_RATE"]
-        return self._streams.set_interval(
-            message_id, interval_us, loop_hz=loop_hz, now_ns=self._ap.now_ns
-        )
+    def set_interval(self, message_id: int, interval_us: int) -> bool:
+        """Apply MAV_CMD_SET_MESSAGE_INTERVAL: -1 stops, 0 restores the default.
+
+        A refusal keeps the old interval and is sent as a text.
+        """
+        interval_ms = max(1, min(interval_us, MAX_INTERVAL_US) // 1000) if interval_us > 0 else 0
+        if interval_us == 0 and message_id == mav.MAVLINK_MSG_ID_HEARTBEAT:
+            interval_ms = HEARTBEAT_INTERVAL_MS
+        refusal = None
+        if message_id not in BUILDERS:
+            refusal = f"No ap_message for mavlink id ({message_id})"
+        elif 0 < interval_ms < self._shortest_ms:
+            refusal = f"Requested rate for message ID {message_id} too fast. "
+            refusal += "Increase SCHED_LOOP_RATE"
+        if refusal is not None:
+            self.send_text(mav.MAV_SEVERITY_INFO, refusal)
+            return False
+        self._start(message_id, interval_ms)
+        return True
 
     def set_group(self, group: int, rate_hz: int) -> None:
-        loop_hz = self._ap.params["SCHED_LOOP_RATE"]
-        self._streams.set_group(group, rate_hz, loop_hz=loop_hz, now_ns=self._ap.now_ns)
+        """Apply REQUEST_DATA_STREAM, which replaces earlier intervals. Rate 0 stops the group."""
+        interval_ms = max(1000 // rate_hz, self._shortest_ms) if rate_hz > 0 else 0
+        for one in STREAM_GROUPS if group == mav.MAV_DATA_STREAM_ALL else (group,):
+            for message_id in STREAM_GROUPS.get(one, ()):
+                self._start(message_id, interval_ms)
 
     def interval_us(self, message_id: int) -> int:
-        return self._streams.interval_us(message_id)
+        """Return the interval for MESSAGE_INTERVAL: 0 = unknown message, -1 = not streamed."""
+        if message_id not in BUILDERS:
+            return 0
+        stream = self._streams.get(message_id)
+        return stream.interval_ms * 1000 if stream else -1
 
     def send_text(self, severity: int, text: str) -> None:
         for start in range(0, len(text), MAX_STATUSTEXT):
             chunk = text[start : start + MAX_STATUSTEXT].encode("ascii", "replace")
             self.send(mav.MAVLink_statustext_message(severity, chunk))
+
+    @property
+    def _shortest_ms(self) -> int:
+        """Shortest interval, 1 / (0.8 * loop rate) in whole milliseconds: 3 ms at 400 Hz."""
+        return int(1000.0 / (0.8 * max(50.0, self._ap.params["SCHED_LOOP_RATE"])))
+
+    def _due(self, now_ns: int) -> list[int]:
+        """Return the ids of the messages to send now; after missed slots, each is sent once."""
+        ready = [
+            key for key, stream in self._streams.items() if now_ns >= stream.due_ns + stream.late_ns
+        ]
+        slowdown = PARAM_SLOWDOWN if self._queued_params else 1
+        for message_id in ready:
+            stream = self._streams[message_id]
+            period_ns = self._period_ns(stream.interval_ms) * slowdown
+            stream.due_ns += period_ns * ((now_ns - stream.due_ns) // period_ns + 1)
+            stream.late_ns = self._random_ns(self._conditions.stream_jitter_ms * NS_PER_MS)
+        return ready
+
+    def _period_ns(self, interval_ms: int) -> int:
+        return (interval_ms + self._conditions.stream_slowdown_ms) * NS_PER_MS
+
+    def _random_ns(self, most_ns: float) -> int:
+        return int(self._random.uniform(0.0, most_ns)) if most_ns else 0
+
+    def _start(self, message_id: int, interval_ms: int) -> None:
+        self._streams.pop(message_id, None)
+        if interval_ms > 0:
+            # The firmware keeps ten distinct intervals per link; the nearest replaces an eleventh.
+            taken = {stream.interval_ms for stream in self._streams.values()}
+            if interval_ms not in taken and len(taken) >= MAX_DISTINCT_INTERVALS:
+                interval_ms = min(taken, key=lambda other: abs(other - interval_ms))
+            period_ns = self._period_ns(interval_ms)
+            early_ns = self._random_ns(self._conditions.stream_phase_spread * period_ns)
+            due_ns = self._ap.now_ns + period_ns - early_ns
+            self._streams[message_id] = _Stream(interval_ms=interval_ms, due_ns=due_ns)

@@ -4,12 +4,12 @@ import math
 from enum import IntEnum
 
 from sitl.ardupilot import sticks as pilot
-from sitl.ardupilot.control import AttitudeController, boosted, lean_for
+from sitl.ardupilot.control import STEP_S, AttitudeController, boosted, lean_for
 from sitl.ardupilot.guided import GuidedControl
 from sitl.ardupilot.params import ArduPilotParams
 from sitl.ardupilot.sticks import Sticks
-from sitl.rotation import Quat, Vec3, to_euler, wrap_pi
-from sitl.vehicle.dynamics import BodyState, HeightController, mix, thrust_for
+from sitl.vehicle.dynamics import BodyState, HeightController, mix, shorten, thrust_for
+from sitl.vehicle.rotation import Quat, Vec3, to_euler, wrap_pi
 
 IDLE = (0.03, 0.03, 0.03, 0.03)  # armed on the ground, throttle down
 
@@ -81,7 +81,7 @@ class CopterControl:
     def __init__(self, params: ArduPilotParams) -> None:
         self._params = params
         self._attitude = AttitudeController(params)
-        self._height = HeightController()
+        self._height = HeightController(STEP_S)
         self._home_reached = False
         self._hold_ned_m: Vec3 | None = None
         self.guided = GuidedControl(params, self._attitude, self._height)
@@ -115,28 +115,19 @@ class CopterControl:
         return mode.throttle_is_climb_rate and is_climb
 
     def fly(
-        self,
-        mode: Mode,
-        sticks: Sticks,
-        body: BodyState,
-        now_ns: int,
-        *,
-        has_position: bool,
-        dt_s: float,
+        self, mode: Mode, sticks: Sticks, body: BodyState, now_ns: int, *, has_position: bool
     ) -> tuple[float, ...]:
         if mode.is_guided:
-            turn, self.thrust = self.guided.fly(body, now_ns, has_position=has_position, dt_s=dt_s)
+            turn, self.thrust = self.guided.fly(body, now_ns, has_position=has_position)
             self.collective = boosted(self.thrust, body, self._params)
         elif mode is Mode.ACRO:
-            turn = self._attitude.rates(body, self._acro_rates(sticks, body), dt_s)
+            turn = self._attitude.rates(body, self._acro_rates(sticks, body))
             self.thrust = self.collective = pilot.manual_thrust(sticks, self._params)
         else:
-            turn = self._lean(mode, sticks, body, has_position=has_position, dt_s=dt_s)
+            turn = self._lean(mode, sticks, body, has_position=has_position)
         return mix(self.collective, turn)
 
-    def _lean(
-        self, mode: Mode, sticks: Sticks, body: BodyState, *, has_position: bool, dt_s: float
-    ) -> Vec3:
+    def _lean(self, mode: Mode, sticks: Sticks, body: BodyState, *, has_position: bool) -> Vec3:
         """Run one step of a leaning mode. Return the body angular acceleration [rad/s^2]."""
         roll, pitch = pilot.lean_angles(sticks, self._params) if mode.piloted else (0.0, 0.0)
         if roll or pitch or not has_position:
@@ -150,10 +141,10 @@ class CopterControl:
             self.thrust = self.collective = pilot.manual_thrust(sticks, self._params)
         else:
             limit = max(0.5, self._params["PILOT_ACCEL_Z"] / 100.0)
-            accel = self._height.update(body, self._climb_mps(mode, sticks, body), limit, dt_s)
+            accel = self._height.update(body, self._climb_mps(mode, sticks, body), limit)
             self.thrust = thrust_for(accel, 1.0, self._params["MOT_THST_HOVER"])
             self.collective = boosted(self.thrust, body, self._params)
-        return self._attitude.lean(body, roll, pitch, yaw_rate, dt_s)
+        return self._attitude.lean(body, roll, pitch, yaw_rate)
 
     def _climb_mps(self, mode: Mode, sticks: Sticks, body: BodyState) -> float:
         if mode.throttle_is_climb_rate:
@@ -183,7 +174,7 @@ class CopterControl:
             elif -down > self._params["RTL_ALT"] / 100.0 - RTL_ARRIVED_M:
                 speed = min(RTL_SPEED_MPS, POSITION_GAIN_PER_S * distance)
                 wanted_n, wanted_e = -north / distance * speed, -east / distance * speed
-        return _lean_towards(wanted_n, wanted_e, body, HOLD_ACCEL_MPS2)
+        return _lean_towards(wanted_n, wanted_e, body)
 
     def _lean_to_hold(self, body: BodyState) -> tuple[float, float]:
         """Return the lean that stops the vehicle and then holds its resting position."""
@@ -194,7 +185,7 @@ class CopterControl:
             wanted_e = POSITION_GAIN_PER_S * (east - body.position_ned_m[1])
         elif math.hypot(*body.velocity_ned_mps[:2]) < HOLD_BELOW_MPS:
             self._hold_ned_m = body.position_ned_m
-        return _lean_towards(wanted_n, wanted_e, body, HOLD_ACCEL_MPS2)
+        return _lean_towards(wanted_n, wanted_e, body)
 
     def _acro_rates(self, sticks: Sticks, body: BodyState) -> Vec3:
         roll_rate, pitch_rate, yaw_rate = pilot.acro_rates_radps(sticks, self._params)
@@ -217,11 +208,8 @@ def _stay_within(angle: float, limit: float, rate: float) -> float:
     return max(TRAINER_GAIN_PER_S * lowest, min(TRAINER_GAIN_PER_S * highest, rate))
 
 
-def _lean_towards(
-    wanted_n_mps: float, wanted_e_mps: float, body: BodyState, limit_mps2: float
-) -> tuple[float, float]:
+def _lean_towards(wanted_n_mps: float, wanted_e_mps: float, body: BodyState) -> tuple[float, float]:
     """Return roll and pitch [rad] that bring the velocity to the wanted one, within the limit."""
     accel_n_mps2 = VELOCITY_GAIN_PER_S * (wanted_n_mps - body.velocity_ned_mps[0])
     accel_e_mps2 = VELOCITY_GAIN_PER_S * (wanted_e_mps - body.velocity_ned_mps[1])
-    scale = limit_mps2 / max(limit_mps2, math.hypot(accel_n_mps2, accel_e_mps2))
-    return lean_for((scale * accel_n_mps2, scale * accel_e_mps2), body)
+    return lean_for(shorten((accel_n_mps2, accel_e_mps2), HOLD_ACCEL_MPS2), body)

@@ -8,12 +8,12 @@ import math
 from enum import Enum, auto
 from typing import NamedTuple
 
-from sitl.ardupilot.control import AttitudeController, lean_for
+from sitl.ardupilot.control import STEP_S, AttitudeController, lean_for
 from sitl.ardupilot.params import ArduPilotParams
 from sitl.clock import NS_PER_MS, NS_PER_S
-from sitl.firmware import AttitudeSetpoint
-from sitl.rotation import Vec3, from_euler, integrate, to_euler
-from sitl.vehicle.dynamics import BodyState, HeightController, clamp, thrust_for
+from sitl.vehicle.dynamics import BodyState, HeightController, clamp, shorten, thrust_for
+from sitl.vehicle.firmware import AttitudeSetpoint
+from sitl.vehicle.rotation import Vec3, from_euler, integrate, to_euler
 
 OPTION_THRUST = 8
 """Bit of GUID_OPTIONS: SET_ATTITUDE_TARGET.thrust is a collective instead of a climb rate."""
@@ -127,15 +127,13 @@ class GuidedControl:
             return now_ns - self._spooling_since_ns >= SPOOL_UP_NS + windup_ns
         return False
 
-    def fly(
-        self, body: BodyState, now_ns: int, *, has_position: bool, dt_s: float
-    ) -> tuple[Vec3, float]:
+    def fly(self, body: BodyState, now_ns: int, *, has_position: bool) -> tuple[Vec3, float]:
         """Return body angular acceleration [rad/s^2] and thrust (0..1, of a level vehicle)."""
         if self.submode is Submode.ATTITUDE:
-            return self._fly_attitude(body, now_ns, dt_s)
-        return self._fly_velocity(body, now_ns, has_position=has_position, dt_s=dt_s)
+            return self._fly_attitude(body, now_ns)
+        return self._fly_velocity(body, now_ns, has_position=has_position)
 
-    def _fly_attitude(self, body: BodyState, now_ns: int, dt_s: float) -> tuple[Vec3, float]:
+    def _fly_attitude(self, body: BodyState, now_ns: int) -> tuple[Vec3, float]:
         setpoint = self._setpoint
         if setpoint is None or self._is_over(now_ns):
             if self._has_thrust:
@@ -143,20 +141,20 @@ class GuidedControl:
                 self._has_thrust = False
             yaw = to_euler(self._attitude.target[0])[2]
             level = from_euler(0.0, 0.0, yaw)
-            turn = self._attitude.approach(body, level, (0.0, 0.0, 0.0), dt_s)
-            return turn, self._hold_climb(body, 0.0, dt_s)
+            turn = self._attitude.approach(body, level, (0.0, 0.0, 0.0))
+            return turn, self._hold_climb(body, 0.0)
         attitude, rate = setpoint.ned_from_body_wxyz, setpoint.rate_body_radps
         if attitude is None:
-            turn = self._attitude.turn(body, rate, dt_s)
+            turn = self._attitude.turn(body, rate)
         else:
-            turn = self._attitude.approach(body, attitude, rate, dt_s)
-            self._setpoint = setpoint._replace(ned_from_body_wxyz=integrate(attitude, rate, dt_s))
+            turn = self._attitude.approach(body, attitude, rate)
+            self._setpoint = setpoint._replace(ned_from_body_wxyz=integrate(attitude, rate, STEP_S))
         if self._has_thrust:
             return turn, self._thrust()
-        return turn, self._hold_climb(body, self._climb_mps(), dt_s)
+        return turn, self._hold_climb(body, self._climb_mps())
 
     def _fly_velocity(
-        self, body: BodyState, now_ns: int, *, has_position: bool, dt_s: float
+        self, body: BodyState, now_ns: int, *, has_position: bool
     ) -> tuple[Vec3, float]:
         (north, east, down), yaw_rate = self.velocity
         if self.submode is Submode.TAKEOFF:
@@ -169,13 +167,13 @@ class GuidedControl:
             self.velocity = VelocitySetpoint((0.0, 0.0, 0.0), 0.0)
         roll = pitch = 0.0
         if has_position:
-            accel = self._track.step((north, east), body, dt_s)
+            accel = self._track.step((north, east), body)
             roll, pitch = lean_for(accel, body)
-        self._yaw_rate_radps = self._attitude.slew("Y", yaw_rate, self._yaw_rate_radps, dt_s)
-        self._yaw += self._yaw_rate_radps * dt_s
+        self._yaw_rate_radps = self._attitude.slew("Y", yaw_rate, self._yaw_rate_radps)
+        self._yaw += self._yaw_rate_radps * STEP_S
         attitude = from_euler(roll, pitch, self._yaw)
-        turn = self._attitude.approach(body, attitude, (0.0, 0.0, self._yaw_rate_radps), dt_s)
-        return turn, self._hold_climb(body, -down, dt_s)
+        turn = self._attitude.approach(body, attitude, (0.0, 0.0, self._yaw_rate_radps))
+        return turn, self._hold_climb(body, -down)
 
     def _start(self, submode: Submode, body: BodyState) -> None:
         """Set the velocity to zero, and reset the controllers if the submode changes."""
@@ -200,9 +198,9 @@ class GuidedControl:
         limit = "WPNAV_SPEED_UP" if above_half > 0.0 else "WPNAV_SPEED_DN"
         return above_half * self._params[limit] / 100.0
 
-    def _hold_climb(self, body: BodyState, climb_mps: float, dt_s: float) -> float:
+    def _hold_climb(self, body: BodyState, climb_mps: float) -> float:
         limit_mps2 = max(MIN_CLIMB_ACCEL_MPS2, self._params["WPNAV_ACCEL_Z"] / 100.0)
-        accel_mps2 = self._height.update(body, climb_mps, limit_mps2, dt_s)
+        accel_mps2 = self._height.update(body, climb_mps, limit_mps2)
         return thrust_for(accel_mps2, 1.0, self._params["MOT_THST_HOVER"])
 
 
@@ -219,19 +217,17 @@ class _Track:
         self._velocity_mps = list(body.velocity_ned_mps[:2])
         self._accel_mps2 = [0.0, 0.0]
 
-    def step(
-        self, wanted_mps: tuple[float, float], body: BodyState, dt_s: float
-    ) -> tuple[float, float]:
+    def step(self, wanted_mps: tuple[float, float], body: BodyState) -> tuple[float, float]:
         """Return the vehicle's acceleration north and east [m/s^2]."""
         error = [w - v for w, v in zip(wanted_mps, self._velocity_mps, strict=True)]
         scale = min(SPEED_GAIN_PER_S, ACCEL_MPS2 / max(1e-6, math.hypot(*error)))
         accel = [0.0, 0.0]
         for k in range(2):
-            change = clamp(scale * error[k] - self._accel_mps2[k], JERK_MPS3 * dt_s)
+            change = clamp(scale * error[k] - self._accel_mps2[k], JERK_MPS3 * STEP_S)
             self._accel_mps2[k] += change
-            self._velocity_mps[k] += self._accel_mps2[k] * dt_s
+            self._velocity_mps[k] += self._accel_mps2[k] * STEP_S
             here_m = body.position_ned_m[k]
-            ahead_m = self._position_m[k] + self._velocity_mps[k] * dt_s - here_m
+            ahead_m = self._position_m[k] + self._velocity_mps[k] * STEP_S - here_m
             self._position_m[k] = here_m + clamp(ahead_m, MAX_POSITION_ERROR_M)
             speed_error = (
                 self._velocity_mps[k]
@@ -239,5 +235,4 @@ class _Track:
                 - body.velocity_ned_mps[k]
             )
             accel[k] = self._accel_mps2[k] + VELOCITY_GAIN_PER_S * speed_error
-        shrink = MAX_LEAN_ACCEL_MPS2 / max(MAX_LEAN_ACCEL_MPS2, math.hypot(*accel))
-        return accel[0] * shrink, accel[1] * shrink
+        return shorten((accel[0], accel[1]), MAX_LEAN_ACCEL_MPS2)

@@ -7,9 +7,9 @@ Values that vary between vehicles come from the conditions; their nominal attitu
 limits are this vehicle's tuning, not the firmware's defaults.
 """
 
-from sitl.firmware import Params, float32
 from sitl.vehicle.conditions import NOMINAL, Conditions
 from sitl.vehicle.config import ArduPilotRelease
+from sitl.vehicle.firmware import Params, float32
 
 RC_CHANNELS_WITH_PARAMS = 8
 DEFAULT_RATE_P = float32(0.135)  # gain from body rates to torque, roll and pitch

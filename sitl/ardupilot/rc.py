@@ -147,25 +147,36 @@ class RcEngine:
                 return
 
 
+class _Debounce:
+    """Time for which a switch has been in its present position."""
+
+    _HOLD_NS = NS_PER_S // 5
+
+    def __init__(self) -> None:
+        self._position: int | None = None
+        self._since_ns = 0
+
+    def has_settled(self, position: int, now_ns: int) -> bool:
+        if position != self._position:
+            self._position, self._since_ns = position, now_ns
+        return now_ns - self._since_ns >= self._HOLD_NS
+
+
 class ModeSwitch:
     """Switch on FLTMODE_CH, debounced: a new position acts after 0.2 s."""
 
     _HIGHEST_US = (1230, 1360, 1490, 1620, 1749)  # of the first five positions
-    _DEBOUNCE_NS = NS_PER_S // 5
 
     def __init__(self) -> None:
         self.position: int | None = None
-        self._candidate: int | None = None
-        self._since_ns = 0
+        self._debounce = _Debounce()
 
     def update(self, pwm_us: int, now_ns: int) -> int | None:
         """Return the position, 1..6, when it has just changed; None otherwise and for the first."""
         if not 900 < pwm_us < 2200:
             return None
         position = 1 + bisect_left(self._HIGHEST_US, pwm_us)
-        if position != self._candidate:
-            self._candidate, self._since_ns = position, now_ns
-        if position == self.position or now_ns - self._since_ns < self._DEBOUNCE_NS:
+        if not self._debounce.has_settled(position, now_ns) or position == self.position:
             return None
         before, self.position = self.position, position
         return None if before is None else position
@@ -178,28 +189,19 @@ class _OverrideSwitch:
     """
 
     _PERIOD_NS = NS_PER_S // 10
-    _DEBOUNCE_NS = NS_PER_S // 5
 
     def __init__(self) -> None:
         self.enabled = True
         self._due_ns = 0
-        self._candidate = "unknown"
-        self._since_ns = 0
+        self._debounce = _Debounce()
 
     def update(self, pwm_us: int, now_ns: int) -> bool:
         """Return True if overrides have just been forbidden."""
         if now_ns < self._due_ns:
             return False
         self._due_ns = now_ns + self._PERIOD_NS
-        position = "neither"
-        if 900 < pwm_us < 1200:
-            position = "low"
-        elif 1800 < pwm_us < 2200:
-            position = "high"
-        if position != self._candidate:
-            self._candidate, self._since_ns = position, now_ns
+        position = (1800 < pwm_us < 2200) - (900 < pwm_us < 1200)
+        if not self._debounce.has_settled(position, now_ns) or position == 0:
             return False
-        if position == "neither" or now_ns - self._since_ns < self._DEBOUNCE_NS:
-            return False
-        was_enabled, self.enabled = self.enabled, position == "high"
+        was_enabled, self.enabled = self.enabled, position > 0
         return was_enabled and not self.enabled

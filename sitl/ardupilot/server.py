@@ -16,7 +16,6 @@ from sitl.ardupilot.flight_modes import Mode
 from sitl.ardupilot.guided import VelocitySetpoint
 from sitl.ardupilot.rc import IGNORE, PRIMARY_CHANNELS, RELEASE
 from sitl.ardupilot.sticks import Axes
-from sitl.firmware import AttitudeSetpoint
 from sitl.link.server import (
     ACCEPTED,
     COMMAND_FIELDS,
@@ -32,7 +31,8 @@ from sitl.link.server import (
     sender_of,
 )
 from sitl.report import FlightLog
-from sitl.rotation import from_euler, rotate
+from sitl.vehicle.firmware import AttitudeSetpoint
+from sitl.vehicle.rotation import from_euler, rotate
 
 FORCE_REBOOT = 20190226.0  # param 6 of PREFLIGHT_REBOOT_SHUTDOWN: even while armed (ArduPilot)
 SIMPLE_MODE, SWITCH_LOW = 3.0, 0.0  # params of DO_AUX_FUNCTION
@@ -48,7 +48,8 @@ _BODY_AXES = (mav.MAV_FRAME_BODY_NED, mav.MAV_FRAME_BODY_OFFSET_NED)
 class ArduPilotServer(MavlinkServer[ArduCopter, ArduPilotEndpoint]):
     """ArduPilot's messages and commands."""
 
-    bad_interval = DENIED
+    bad_interval, unknown_message = DENIED, FAILED
+    zero_interval_params = (2,)
 
     def __init__(self, ap: ArduCopter, link_count: int, log: FlightLog) -> None:
         super().__init__(ap, [ArduPilotEndpoint(ap) for _ in range(link_count)], log)
@@ -73,8 +74,6 @@ class ArduPilotServer(MavlinkServer[ArduCopter, ArduPilotEndpoint]):
             mav.MAV_CMD_PREFLIGHT_REBOOT_SHUTDOWN: self._reboot,
             mav.MAV_CMD_COMPONENT_ARM_DISARM: self._arm_disarm,
             mav.MAV_CMD_GET_HOME_POSITION: self._send_home,
-            mav.MAV_CMD_SET_MESSAGE_INTERVAL: self._set_interval,
-            mav.MAV_CMD_REQUEST_MESSAGE: self._request_message,
             mav.MAV_CMD_REQUEST_AUTOPILOT_CAPABILITIES: self._send_version,
         }
 
@@ -194,21 +193,10 @@ class ArduPilotServer(MavlinkServer[ArduCopter, ArduPilotEndpoint]):
         done = self._ap.arm(force=force) if params[0] else self._ap.disarm(force=force)
         return ACCEPTED if done else FAILED
 
-    def _set_interval(self, params: Params7, link: ArduPilotEndpoint) -> int:
-        if not _are_finite(params[:2]) or params[2] != 0.0:
-            return DENIED
-        refusal = link.set_interval(int(params[0]), int(params[1]))
-        if refusal is None:
-            return ACCEPTED
-        link.send_text(mav.MAV_SEVERITY_INFO, refusal)
-        return DENIED
-
     def _request_message(self, params: Params7, link: ArduPilotEndpoint) -> int:
-        if not _are_finite(params[:1]):
-            return DENIED
-        if int(params[0]) == mav.MAVLINK_MSG_ID_MESSAGE_INTERVAL:
+        if params[0] == mav.MAVLINK_MSG_ID_MESSAGE_INTERVAL:
             return self._get_interval(params[1:], link)
-        return ACCEPTED if link.send_now(int(params[0])) else FAILED
+        return super()._request_message(params, link)
 
     def _send_home(self, _params: Params7, link: ArduPilotEndpoint) -> int:
         link.send_now(mav.MAVLINK_MSG_ID_HOME_POSITION)

@@ -7,12 +7,12 @@ Formulas: ArduPilot ``RC_Channel`` (calibration), Copter ``get_pilot_desired_thr
 import math
 from collections.abc import Sequence
 from enum import IntEnum
-from typing import Literal, NamedTuple
+from typing import NamedTuple
 
 from sitl.ardupilot.params import RC_CHANNELS_WITH_PARAMS, ArduPilotParams
 from sitl.ardupilot.rc import RcEngine
 from sitl.clock import NS_PER_S
-from sitl.rotation import Vec3, from_heading
+from sitl.vehicle.rotation import Vec3, from_heading
 
 THROTTLE_FULL = 1000.0
 GESTURE_NS = 2 * NS_PER_S  # hold time: ArduCopter's ARM_DELAY and DISARM_DELAY of the sticks
@@ -132,24 +132,11 @@ def manual_thrust(sticks: Sticks, params: ArduPilotParams) -> float:
     return max(0.0, min(1.0, position * (1.0 - expo) + expo * position**3))
 
 
-class RudderGesture:
-    """Arming gesture: throttle at the bottom with full yaw, right to arm, left to disarm."""
-
-    def __init__(self) -> None:
-        self._side = 0
-        self._since_ns: int | None = None
-
-    def update(self, sticks: Sticks, now_ns: int) -> Literal["arm", "disarm"] | None:
-        """Return the gesture, once, when it has been held for GESTURE_NS."""
-        side = 0
-        if sticks.throttle == 0.0 and abs(sticks.yaw) > FULL_YAW:
-            side = 1 if sticks.yaw > 0.0 else -1
-        if side != self._side:
-            self._side, self._since_ns = side, now_ns
-        if side == 0 or self._since_ns is None or now_ns - self._since_ns < GESTURE_NS:
-            return None
-        self._since_ns = None
-        return "arm" if side > 0 else "disarm"
+def gesture_side(sticks: Sticks) -> int:
+    """Return the side of the rudder gesture, throttle down and full yaw: 1 arms, -1 disarms."""
+    if sticks.throttle != 0.0 or abs(sticks.yaw) <= FULL_YAW:
+        return 0
+    return 1 if sticks.yaw > 0.0 else -1
 
 
 class Axes(IntEnum):

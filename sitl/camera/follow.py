@@ -19,7 +19,7 @@ from sitl.clock import NS_PER_S, Clock
 from sitl.course import Course
 from sitl.link.server import Message
 from sitl.link.transport import FOLLOWER_KINDS, open_transport
-from sitl.rotation import Quat, Vec3, integrate
+from sitl.vehicle.rotation import Quat, Vec3, integrate
 
 ReportedPose: TypeAlias = tuple[Vec3, Quat]  # position_ned_m, ned_from_body_wxyz
 

@@ -16,8 +16,8 @@ from sitl import UsageError
 from sitl.camera import scenery
 from sitl.camera.scenery import FloatArray, Image
 from sitl.course import Course
-from sitl.rotation import Quat, Vec3, from_euler, rotate
 from sitl.vehicle.conditions import NOMINAL, Conditions
+from sitl.vehicle.rotation import Quat, Vec3, from_euler, rotate
 
 NEAR_M = 0.05  # anything nearer or behind is clipped before projection
 LOWEST_EYE_M = 0.12

@@ -10,8 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sitl.course import BAR_M, DEPTH_M, Course, Gate
-from sitl.rotation import Vec3, wrap_pi
 from sitl.vehicle.conditions import NOMINAL, Conditions, Rgb
+from sitl.vehicle.rotation import Vec3, wrap_pi
 
 FloatArray: TypeAlias = NDArray[np.float64]
 Image: TypeAlias = NDArray[np.uint8]

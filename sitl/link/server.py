@@ -13,8 +13,8 @@ from typing import Any, ClassVar, Generic, TypeAlias, TypeVar
 from pymavlink.dialects.v20 import ardupilotmega as mav
 
 from sitl.clock import NS_PER_MS
-from sitl.firmware import Autopilot
 from sitl.report import FlightLog
+from sitl.vehicle.firmware import Autopilot
 
 Message: TypeAlias = Any  # a pymavlink message (the library has no types)
 Ap = TypeVar("Ap", bound=Autopilot)
@@ -64,6 +64,10 @@ class Endpoint(ABC, Generic[Ap]):
     @abstractmethod
     def step(self, now_ns: int) -> None:
         """Queue due messages; ``now_ns`` is at most one control step ahead of the vehicle."""
+
+    @abstractmethod
+    def set_interval(self, message_id: int, interval_us: int) -> bool:
+        """Change a stream. Return False if the firmware refuses."""
 
     @abstractmethod
     def interval_us(self, message_id: int) -> int: ...
@@ -146,7 +150,11 @@ class MavlinkServer(ABC, Generic[Ap, Link]):
     """Receives on all links of one vehicle, and acts on the messages."""
 
     bad_interval: ClassVar[int]
-    """MAV_RESULT for GET_MESSAGE_INTERVAL with an invalid message number."""
+    """MAV_RESULT for an invalid message number or interval."""
+    unknown_message: ClassVar[int]
+    """MAV_RESULT for a request of an unknown message."""
+    zero_interval_params: ClassVar[tuple[int, ...]]
+    """Indices of the parameters of SET_MESSAGE_INTERVAL that must be 0."""
 
     def __init__(self, ap: Ap, links: Sequence[Link], log: FlightLog) -> None:
         self.links = tuple(links)
@@ -165,7 +173,9 @@ class MavlinkServer(ABC, Generic[Ap, Link]):
         }
         """Handlers by message name, called with the link, the message and its arrival."""
         self._commands: dict[int, Callable[[Params7, Link], int | None]] = {
-            mav.MAV_CMD_GET_MESSAGE_INTERVAL: self._get_interval
+            mav.MAV_CMD_GET_MESSAGE_INTERVAL: self._get_interval,
+            mav.MAV_CMD_SET_MESSAGE_INTERVAL: self._set_interval,
+            mav.MAV_CMD_REQUEST_MESSAGE: self._request_message,
         }
         """Handlers by command number; they return the MAV_RESULT of the ack, or None for no ack."""
 
@@ -225,6 +235,18 @@ class MavlinkServer(ABC, Generic[Ap, Link]):
             return self.bad_interval
         link.send_interval(int(params[0]))
         return ACCEPTED
+
+    def _set_interval(self, params: Params7, link: Link) -> int:
+        is_plain = all(params[index] == 0.0 for index in self.zero_interval_params)
+        if not is_plain or not all(map(math.isfinite, params[:2])):
+            return self.bad_interval
+        is_set = link.set_interval(int(params[0]), int(params[1]))
+        return ACCEPTED if is_set else self.bad_interval
+
+    def _request_message(self, params: Params7, link: Link) -> int:
+        if not math.isfinite(params[0]):
+            return DENIED
+        return ACCEPTED if link.send_now(int(params[0])) else self.unknown_message
 
     def _param_read(self, link: Link, message: Message, _arrived_ns: int) -> None:
         index, names = message.param_index, self._ap.params.names

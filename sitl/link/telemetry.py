@@ -6,10 +6,10 @@ from typing import NamedTuple
 
 from pymavlink.dialects.v20 import ardupilotmega as mav
 
-from sitl.firmware import Autopilot
 from sitl.link.server import Message
-from sitl.rotation import Vec3, conjugate, rotate, to_euler
 from sitl.vehicle.dynamics import GRAVITY_MPS2
+from sitl.vehicle.firmware import Autopilot
+from sitl.vehicle.rotation import Vec3, conjugate, rotate, to_euler
 
 METRES_PER_DEGREE = 111_319.5
 INT16 = 32767
@@ -32,11 +32,11 @@ class Home(NamedTuple):
         lon = self.lon_deg + east_m / (METRES_PER_DEGREE * math.cos(math.radians(self.lat_deg)))
         return round(lat * 1e7), round(lon * 1e7)
 
-    def mag_gauss(self, ap: Autopilot) -> Vec3:
+    def _mag_gauss(self, ap: Autopilot) -> Vec3:
         """Return the magnetic field in body axes."""
         return rotate(conjugate(ap.sensed.ned_from_body_wxyz), self.field_ned_gauss)
 
-    def global_position_int(self, ap: Autopilot) -> Message | None:
+    def _global_position_int(self, ap: Autopilot) -> Message | None:
         """Build GLOBAL_POSITION_INT; None without a position."""
         if not ap.position_ready:
             return None
@@ -50,7 +50,7 @@ class Home(NamedTuple):
             heading(ap.yaw_rad, 100.0),
         )
 
-    def home_position(self, ap: Autopilot) -> Message | None:
+    def _home_position(self, ap: Autopilot) -> Message | None:
         """Build HOME_POSITION; None without a position."""
         if not ap.position_ready:
             return None
@@ -67,37 +67,32 @@ class Home(NamedTuple):
         motion = (round(100.0 * math.hypot(vn, ve)), heading(math.atan2(ve, vn), 100.0))
         return mav.MAVLink_gps_raw_int_message(boot_us(ap), fix, *place, eph, epv, *motion, 10)
 
-    def highres_imu(
+    def builders(
         self,
-        ap: Autopilot,
-        gyro_radps: Iterable[float],
-        field: Iterable[float],
         *,
-        has_difference: bool,
-    ) -> Message:
-        """Build HIGHRES_IMU in m/s^2 and rad/s; the field is in the firmware's unit.
+        gyro: Callable[[Autopilot], Vec3],
+        field_per_gauss: float,
+        has_pressure_difference: bool,
+        version: Callable[[Autopilot], int],
+        capabilities: int,
+        energy_hj: int,
+    ) -> dict[int, Callable[[Autopilot], Message | None]]:
+        """Return the builders of messages of both firmwares, by message number.
 
-        The differential pressure is relative to the origin with ``has_difference``, else 0.
+        HIGHRES_IMU has the gyro in rad/s, the field in the firmware's unit, and the pressure
+        relative to the origin with ``has_pressure_difference``, else 0. SCALED_IMU has milli-g,
+        mrad/s and mGauss. ``energy_hj`` -1: not known.
         """
-        height_m = -ap.sensed.position_ned_m[2]
-        pressure = self.pressure_hpa * math.exp(-height_m / 8434.0)
-        difference = pressure - self.pressure_hpa if has_difference else 0.0
-        air = (pressure, difference, self.alt_m + height_m, self.temperature_c)
-        imu = (*ap.sensed.specific_force_body_mps2, *gyro_radps, *field)
-        return mav.MAVLink_highres_imu_message(boot_us(ap), *imu, *air, _IMU_FIELDS_UPDATED, 0)
 
-    def scaled_imu(self, ap: Autopilot, gyro_radps: Iterable[float]) -> tuple[int, ...]:
-        """Return acceleration in milli-g, gyro in mrad/s, field in mGauss."""
-        accel = [1000.0 * force / GRAVITY_MPS2 for force in ap.sensed.specific_force_body_mps2]
-        field = int16(self.mag_gauss(ap), 1000.0)
-        return (*int16(accel, 1.0), *int16(gyro_radps, 1000.0), *field)
+        def highres_imu(ap: Autopilot) -> Message:
+            height_m = -ap.sensed.position_ned_m[2]
+            pressure = self.pressure_hpa * math.exp(-height_m / 8434.0)
+            difference = pressure - self.pressure_hpa if has_pressure_difference else 0.0
+            air = (pressure, difference, self.alt_m + height_m, self.temperature_c)
+            field = (field_per_gauss * gauss for gauss in self._mag_gauss(ap))
+            imu = (*ap.sensed.specific_force_body_mps2, *gyro(ap), *field)
+            return mav.MAVLink_highres_imu_message(boot_us(ap), *imu, *air, _IMU_FIELDS_UPDATED, 0)
 
-    @property
-    def temperature_cdeg(self) -> int:
-        return round(100.0 * self.temperature_c)
-
-    def builders(self) -> dict[int, Callable[[Autopilot], Message | None]]:
-        """Return the builders of messages identical in both firmwares, by message number."""
         return {
             # No date: the vehicle has no wall clock.
             mav.MAVLINK_MSG_ID_SYSTEM_TIME: lambda ap: mav.MAVLink_system_time_message(
@@ -111,10 +106,25 @@ class Home(NamedTuple):
                     boot_ms(ap), *ap.sensed.ned_from_body_wxyz, *ap.sensed.rate_body_radps
                 )
             ),
-            mav.MAVLINK_MSG_ID_GLOBAL_POSITION_INT: self.global_position_int,
-            mav.MAVLINK_MSG_ID_HOME_POSITION: self.home_position,
+            mav.MAVLINK_MSG_ID_GLOBAL_POSITION_INT: self._global_position_int,
+            mav.MAVLINK_MSG_ID_HOME_POSITION: self._home_position,
             mav.MAVLINK_MSG_ID_SERVO_OUTPUT_RAW: servo_output_raw,
+            mav.MAVLINK_MSG_ID_SCALED_IMU: lambda ap: mav.MAVLink_scaled_imu_message(
+                boot_ms(ap), *self.scaled_imu(ap, gyro(ap))
+            ),
+            mav.MAVLINK_MSG_ID_HIGHRES_IMU: highres_imu,
+            mav.MAVLINK_MSG_ID_BATTERY_STATUS: lambda ap: battery_status(ap, energy_hj=energy_hj),
+            mav.MAVLINK_MSG_ID_AUTOPILOT_VERSION: lambda ap: mav.MAVLink_autopilot_version_message(
+                capabilities, version(ap), 0, 0, 0, *[[0] * 8] * 3, 0, 0, ap.system_id
+            ),
         }
+
+    def scaled_imu(self, ap: Autopilot, gyro_radps: Iterable[float]) -> tuple[int, ...]:
+        """Return acceleration, gyro, field and temperature of SCALED_IMU."""
+        accel = [1000.0 * force / GRAVITY_MPS2 for force in ap.sensed.specific_force_body_mps2]
+        field = int16(self._mag_gauss(ap), 1000.0)
+        temperature_cdeg = round(100.0 * self.temperature_c)
+        return (*int16(accel, 1.0), *int16(gyro_radps, 1000.0), *field, temperature_cdeg)
 
 
 def boot_ms(ap: Autopilot) -> int:
@@ -174,14 +184,6 @@ def battery_status(ap: Autopilot, *, energy_hj: int) -> Message:
 
 def _battery_mv_ca(ap: Autopilot) -> tuple[int, int]:
     return round(1000.0 * ap.battery.voltage_v), round(100.0 * ap.battery.current_a)
-
-
-def autopilot_version(ap: Autopilot, *, capabilities: int, version: int) -> Message:
-    """Build AUTOPILOT_VERSION; the unique number is the system id."""
-    no_hash = [0] * 8
-    return mav.MAVLink_autopilot_version_message(
-        capabilities, version, 0, 0, 0, no_hash, no_hash, no_hash, 0, 0, ap.system_id
-    )
 
 
 def extended_sys_state(

@@ -64,8 +64,12 @@ def open_transport(url: str, clock: Clock, kinds: tuple[str, ...] = VEHICLE_KIND
             return TcpLink(address, clock, listen=kind == "tcpin")
         return UdpLink(address, clock, listen=kind != "udpout")
     except OSError as error:
-        reason = "already in use" if error.errno == errno.EADDRINUSE else error.strerror or error
-        raise UsageError(f"link {url!r}: {reason}") from error
+        raise UsageError(f"link {url!r}: {_reason(error)}") from error
+
+
+def _reason(error: OSError) -> str:
+    in_use = error.errno == errno.EADDRINUSE
+    return "already in use" if in_use else error.strerror or str(error)
 
 
 def _resolve(host: str, port: int) -> Address:
@@ -220,7 +224,6 @@ def split_frames(data: bytes, limit: int) -> Iterator[bytes]:
 
 
 HOST = "127.0.0.1"
-MAX_RC_READS = 100  # reads per call, so that a flood cannot stop the loop
 _LAYOUTS = {layout.size: layout for layout in (struct.Struct("<8H"), struct.Struct("<16H"))}
 
 
@@ -235,14 +238,10 @@ class RcInput:
     """
 
     def __init__(self, port: int) -> None:
-        self._socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
         try:
-            self._socket.bind((HOST, port))
+            self._link = UdpLink((HOST, port), Clock(), listen=True)
         except OSError as error:
-            self._socket.close()
-            reason = "already in use" if error.errno == errno.EADDRINUSE else error.strerror
-            raise UsageError(f"--rc-in {port}: {reason}") from error
-        self._socket.setblocking(False)
+            raise UsageError(f"--rc-in {port}: {_reason(error)}") from error
 
     def latest(self) -> tuple[int, ...] | None:
         """Return the newest values since the last call [us]; None if none came.
@@ -250,14 +249,10 @@ class RcInput:
         Datagrams of any other size are ignored.
         """
         newest = None
-        for _ in range(MAX_RC_READS):
-            try:
-                data = self._socket.recv(1024)
-            except BlockingIOError:
-                break
-            if layout := _LAYOUTS.get(len(data)):
-                newest = layout.unpack(data)
+        for received in self._link.drain():
+            if layout := _LAYOUTS.get(len(received.data)):
+                newest = layout.unpack(received.data)
         return newest
 
     def close(self) -> None:
-        self._socket.close()
+        self._link.close()

@@ -1,1 +1,1 @@
-"""Pilot of the simulated vehicle, who moves its receiver: a person or the expert."""
+"""Pilots of the simulated vehicle: a person at its transmitter, and the expert."""

@@ -7,7 +7,7 @@ from typing import Protocol
 import pygame
 
 from sitl.clock import NS_PER_S, Clock
-from sitl.expert.demonstrator import StickPositions
+from sitl.pilot.demonstrator import StickPositions
 from sitl.pilot.transmitter import OFF_US, Axes, Gesture, Hand, Switch, Transmitter
 
 RECORD_BUTTON, BAD_BUTTON, DISARM_BUTTON, ARM_BUTTON = 0, 1, 6, 7

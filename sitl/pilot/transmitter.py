@@ -1,13 +1,14 @@
-"""Simulated transmitter: from a pilot's hand to receiver channels."""
+"""Simulated transmitter: from a pilot's hand to receiver channels; and the choice of pilot."""
 
+import os
 import re
 from collections.abc import Sequence
 from typing import Literal, NamedTuple, Protocol
 
 from sitl import UsageError
-from sitl.clock import NS_PER_MS, NS_PER_S
+from sitl.clock import NS_PER_MS, NS_PER_S, Clock
 from sitl.course import Course
-from sitl.expert.demonstrator import CENTRED, Expert, StickPositions
+from sitl.pilot.demonstrator import CENTRED, Expert, StickPositions
 from sitl.simulated_vehicle import SimulatedVehicle
 
 OFF_US = (0,) * 8  # no signal from the transmitter
@@ -185,3 +186,58 @@ class ExpertPilot:
         return sticks
 
     def close(self) -> None: ...
+
+
+PilotName = Literal["gamepad", "keyboard", "expert"]
+PILOTS: tuple[PilotName, ...] = ("gamepad", "keyboard", "expert")
+_PX4_PARAMS = {"COM_RC_IN_MODE": 0.0, "COM_FLTMODE_BOOT": 1.0}
+"""Parameters for a pilot: sticks from the receiver only, Altitude mode after boot."""
+
+
+def prepare_vehicle(vehicle: SimulatedVehicle) -> None:
+    """Make the vehicle fly by its receiver in ALT_HOLD or ALTCTL. Call before the flight."""
+    if vehicle.ap.config.autopilot == "px4":
+        for name, value in _PX4_PARAMS.items():
+            vehicle.params.set(name, value)
+        vehicle.reboot()
+
+
+def make_pilot(
+    name: PilotName,
+    axes: str,
+    speed_mps: float,
+    *,
+    vehicle: SimulatedVehicle,
+    course: Course,
+    clock: Clock,
+) -> tuple[Pilot, str]:
+    """Return the pilot and a line about it for the user.
+
+    ``axes`` are a gamepad's, in the format of `parse_axes`, and ``speed_mps`` is the expert's.
+
+    Raises:
+        UsageError: the pilot lacks its package, display or vehicle, or its axes cannot be read.
+    """
+    if name == "expert":
+        if vehicle.ap.config.autopilot != "ardupilot":
+            raise UsageError("--pilot expert knows the sticks of ardupilot alone")
+        expert = ExpertPilot(vehicle, course, speed_mps=speed_mps)
+        return expert, f"the expert flies at {speed_mps:g} m/s"
+    wanted = parse_axes(axes)
+    os.environ.setdefault("PYGAME_HIDE_SUPPORT_PROMPT", "1")  # no banner on import
+    try:
+        import pygame
+
+        from sitl.pilot import devices
+    except ModuleNotFoundError as error:
+        if error.name != "pygame":
+            raise
+        raise UsageError(f"--pilot {name} needs pygame: pip install pygame-ce") from error
+    try:
+        if name == "keyboard":
+            return devices.KeyboardPilot(clock), devices.KEYS_HELP
+        pad = devices.PygamePad()
+    except pygame.error as error:
+        raise UsageError(f"--pilot {name} needs a display: {error}") from error
+    found = pad.description or "no gamepad yet: plug one in (until then the receiver has no signal)"
+    return devices.GamepadPilot(pad, wanted, clock), f"{found}; {devices.PAD_HELP}"

@@ -7,15 +7,15 @@ links, sockets or the host's time.
 import math
 from collections.abc import Sequence
 
-from sitl.clock import NS_PER_MS, NS_PER_S
-from sitl.firmware import STOPPED, Autopilot
+from sitl.clock import NS_PER_S
 from sitl.px4.commander import Commander
-from sitl.px4.control import SIH_QUAD
+from sitl.px4.control import SIH_QUAD, STEP_NS
 from sitl.px4.flight import Px4Control, Setpoint
 from sitl.px4.modes import Mode
 from sitl.px4.params import Px4Params
 from sitl.px4.sticks import RC_SOURCE, StickInput, Sticks
 from sitl.vehicle.config import Battery, VehicleConfig
+from sitl.vehicle.firmware import STOPPED, Autopilot
 
 RECEIVER_PERIOD_NS = NS_PER_S // 50
 RAMP_FROM_MPS = -2.4  # chosen to match the measured time on the ground
@@ -28,7 +28,7 @@ class Px4(Autopilot):
     Every stamp is a multiple of the control period.
     """
 
-    step_ns = 4 * NS_PER_MS
+    step_ns = STEP_NS
     airframe = SIH_QUAD
     gps_period_ns = NS_PER_S // 8
     gyro_noise_radps = math.radians(5.0)
@@ -154,7 +154,6 @@ class Px4(Autopilot):
             self.setpoint,
             self.sensed,
             has_position=self.position_ready,
-            dt_s=self.step_s,
         )
         height_m = -self.sensed.position_ned_m[2]
         if height_m >= self.flight.takeoff_to_m - TAKEOFF_MARGIN_M:

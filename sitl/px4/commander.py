@@ -8,10 +8,10 @@ import struct
 from typing import NamedTuple
 
 from sitl.clock import NS_PER_MS, NS_PER_S
-from sitl.firmware import StatusText
 from sitl.px4.modes import LostSticks, Mode, Phase, mode_without_stream
 from sitl.px4.params import Px4Params
 from sitl.px4.sticks import StickInput
+from sitl.vehicle.firmware import StatusText
 
 SEVERITY_CRITICAL, SEVERITY_INFO = 2, 6
 LEVELS_INFO, LEVELS_DENIED, LEVELS_FAILSAFE = 0x66, 0x62, 0x42
@@ -217,7 +217,7 @@ class Commander:
         self._choose_mode()
 
     def _read_gestures(self) -> None:
-        gesture = self._sticks.gesture(self.now_ns)
+        gesture = self._sticks.gesture.take(self.now_ns)
         if not gesture or not self._params.integer("MAN_ARM_GESTURE"):
             return
         if gesture > 0:

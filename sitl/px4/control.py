@@ -9,19 +9,22 @@ import math
 from collections import deque
 from typing import TypeAlias
 
+from sitl.clock import NS_PER_MS, NS_PER_S
 from sitl.px4.params import DEFAULT_RATE_P, Px4Params
-from sitl.rotation import (
+from sitl.vehicle.dynamics import GRAVITY_MPS2, Airframe, BodyState, clamp, shorten
+from sitl.vehicle.rotation import (
     Quat,
     Vec3,
     conjugate,
     from_euler,
     multiply,
     rotate,
-    rotation_vector,
+    rotation_between,
     to_heading,
 )
-from sitl.vehicle.dynamics import GRAVITY_MPS2, Airframe, BodyState, clamp
 
+STEP_NS = 4 * NS_PER_MS
+STEP_S = STEP_NS / NS_PER_S
 SIH_QUAD = Airframe(
     mass_kg=1.0,
     max_motor_thrust_n=GRAVITY_MPS2 / 4.0 / 0.484,  # hovers at 0.484 of full thrust
@@ -61,22 +64,22 @@ class RateController:
         self._targets.clear()
         self.rates_radps = (0.0, 0.0, 0.0)
 
-    def attitude(self, body: BodyState, target: Quat, yaw_rate_radps: float, dt_s: float) -> Vec3:
+    def attitude(self, body: BodyState, target: Quat, yaw_rate_radps: float) -> Vec3:
         """Return the angular acceleration towards an attitude that turns about the vertical."""
         self._targets.append((target, yaw_rate_radps))
         target, yaw_rate_radps = self._targets[0]
-        turned_rad = yaw_rate_radps * dt_s * (len(self._targets) - 1)  # turn since the demand
+        turned_rad = yaw_rate_radps * STEP_S * (len(self._targets) - 1)  # turn since the demand
         target = multiply(from_euler(0.0, 0.0, turned_rad), target)
-        error = rotation_vector(multiply(conjugate(body.ned_from_body_wxyz), target))
+        error = rotation_between(body.ned_from_body_wxyz, target)
         gains = [self._params[f"MC_{axis}_P"] for axis in ("ROLL", "PITCH", "YAW")]
         down_body = rotate(conjugate(body.ned_from_body_wxyz), (0.0, 0.0, 1.0))
         roll, pitch, yaw = (
             gain * angle + yaw_rate_radps * down
             for gain, angle, down in zip(gains, error, down_body, strict=True)
         )
-        return self.rates(body, (roll, pitch, yaw), dt_s)
+        return self.rates(body, (roll, pitch, yaw))
 
-    def rates(self, body: BodyState, wanted_radps: Vec3, dt_s: float) -> Vec3:
+    def rates(self, body: BodyState, wanted_radps: Vec3) -> Vec3:
         """Return the angular acceleration towards body rates, each limited to its MC_*RATE_MAX."""
         limits = [self._params[f"MC_{axis}RATE_MAX"] for axis in ("ROLL", "PITCH", "YAW")]
         roll, pitch, yaw = (
@@ -89,7 +92,7 @@ class RateController:
         )
         actual = body.rate_body_radps
         yaw_accel = YAW_GAIN_PER_S * (yaw - actual[2])
-        self._yaw_accel_radps2 += (yaw_accel - self._yaw_accel_radps2) * dt_s / YAW_TORQUE_LAG_S
+        self._yaw_accel_radps2 += (yaw_accel - self._yaw_accel_radps2) * STEP_S / YAW_TORQUE_LAG_S
         return (
             roll_share * RATE_GAIN_PER_S * (roll - actual[0]),
             pitch_share * RATE_GAIN_PER_S * (pitch - actual[1]),
@@ -113,11 +116,7 @@ class VelocityController:
         self._accel = [0.0, 0.0]
 
     def update(
-        self,
-        body: BodyState,
-        wanted_ne_mps: NorthEast,
-        dt_s: float,
-        feedforward_ne_mps2: NorthEast = (0.0, 0.0),
+        self, body: BodyState, wanted_ne_mps: NorthEast, feedforward_ne_mps2: NorthEast = (0.0, 0.0)
     ) -> NorthEast:
         """Return the acceleration north and east [m/s^2], limited by MPC_TILTMAX_AIR."""
         params = self._params
@@ -127,17 +126,16 @@ class VelocityController:
         accel = []
         for axis in range(2):
             error = wanted_ne_mps[axis] - actual[axis]
-            self._accel[axis] += 0.1 * ((actual[axis] - last[axis]) / dt_s - self._accel[axis])
+            self._accel[axis] += 0.1 * ((actual[axis] - last[axis]) / STEP_S - self._accel[axis])
             self._integral[axis] = clamp(
-                self._integral[axis] + params["MPC_XY_VEL_I_ACC"] * error * dt_s,
+                self._integral[axis] + params["MPC_XY_VEL_I_ACC"] * error * STEP_S,
                 MAX_VELOCITY_INTEGRAL_MPS2,
             )
             damping = params["MPC_XY_VEL_D_ACC"] * self._accel[axis]
             wanted = params["MPC_XY_VEL_P_ACC"] * error + self._integral[axis] - damping
             accel.append(wanted + feedforward_ne_mps2[axis])
         self._last_mps = (actual[0], actual[1])
-        scale = limit / max(limit, math.hypot(*accel))
-        return accel[0] * scale, accel[1] * scale
+        return shorten((accel[0], accel[1]), limit)
 
 
 class Horizontal:
@@ -165,12 +163,12 @@ class Horizontal:
         self._place_m = None
         self._reaction_s = REACTION_S if math.hypot(*self.speed_mps) > MOVING_MPS else 0.0
 
-    def track(self, velocity_mps: NorthEast, body: BodyState, dt_s: float) -> NorthEast:
+    def track(self, velocity_mps: NorthEast, body: BodyState) -> NorthEast:
         """Track an OFFBOARD velocity, limited to MPC_XY_VEL_MAX."""
         self.speed_mps = shorten(velocity_mps, self._params["MPC_XY_VEL_MAX"])
-        return self._follow(self.speed_mps, STILL, body, dt_s)
+        return self._follow(self.speed_mps, STILL, body)
 
-    def steer(self, wanted_mps: NorthEast, body: BodyState, dt_s: float) -> NorthEast:
+    def steer(self, wanted_mps: NorthEast, body: BodyState) -> NorthEast:
         """Approach the velocity of POSCTL's sticks; with centred sticks, stop and hold."""
         params = self._params
         full = 2.0 * params["MPC_ACC_HOR"]  # at full stick, before drag
@@ -178,21 +176,21 @@ class Horizontal:
         if wanted_mps == STILL:
             per_s = BRAKING_PER_S
         gaps = [per_s * (w - v) for w, v in zip(wanted_mps, self.speed_mps, strict=True)]
-        self._approach((gaps[0], gaps[1]), full, params["MPC_JERK_MAX"], dt_s)
+        self._approach((gaps[0], gaps[1]), full, params["MPC_JERK_MAX"])
         if wanted_mps != STILL:
             self._place_m = None
         elif self._place_m is None and math.hypot(*self.speed_mps) < HOLD_BELOW_MPS:
             self._place_m = _place(body)
         if self._place_m is None:
-            return self._follow(self.speed_mps, self._path_accel, body, dt_s)
+            return self._follow(self.speed_mps, self._path_accel, body)
         self.speed_mps = self._path_accel = STILL
-        return self._follow(self._towards(self._place_m, body), STILL, body, dt_s)
+        return self._follow(self._towards(self._place_m, body), STILL, body)
 
-    def fly_to(self, target_m: NorthEast | None, body: BodyState, dt_s: float) -> NorthEast:
+    def fly_to(self, target_m: NorthEast | None, body: BodyState) -> NorthEast:
         """Fly to a position north and east of home, in AUTO modes; None: brake to a stop."""
         params = self._params
         if self._reaction_s > 0.0:
-            self._reaction_s -= dt_s
+            self._reaction_s -= STEP_S
             self.speed_mps = (body.velocity_ned_mps[0], body.velocity_ned_mps[1])
             return self.accel_mps2
         accel, jerk = params["MPC_ACC_HOR"], params["MPC_JERK_AUTO"]
@@ -209,22 +207,25 @@ class Horizontal:
         gaps = [w - v for w, v in zip(wanted, self.speed_mps, strict=True)]
         gap = math.hypot(*gaps)
         scale = math.sqrt(2.0 * jerk * gap) / gap if gap > 1e-6 else 0.0
-        self._approach((scale * gaps[0], scale * gaps[1]), accel, jerk, dt_s)
+        self._approach((scale * gaps[0], scale * gaps[1]), accel, jerk)
         north, east = self._place_m
-        self._place_m = (north + self.speed_mps[0] * dt_s, east + self.speed_mps[1] * dt_s)
+        self._place_m = (north + self.speed_mps[0] * STEP_S, east + self.speed_mps[1] * STEP_S)
         correction = self._towards(self._place_m, body)
         velocity = (self.speed_mps[0] + correction[0], self.speed_mps[1] + correction[1])
-        return self._follow(velocity, self._path_accel, body, dt_s)
+        return self._follow(velocity, self._path_accel, body)
 
-    def _approach(self, wanted: NorthEast, limit: float, jerk: float, dt_s: float) -> None:
+    def _approach(self, wanted: NorthEast, limit: float, jerk: float) -> None:
         """Move the path's acceleration towards the wanted one, and integrate its velocity."""
         wanted = shorten(wanted, limit)
-        step = jerk * dt_s
+        step = jerk * STEP_S
         now_n, now_e = self._path_accel
         accel_n = now_n + clamp(wanted[0] - now_n, step)
         accel_e = now_e + clamp(wanted[1] - now_e, step)
         self._path_accel = (accel_n, accel_e)
-        self.speed_mps = (self.speed_mps[0] + accel_n * dt_s, self.speed_mps[1] + accel_e * dt_s)
+        self.speed_mps = (
+            self.speed_mps[0] + accel_n * STEP_S,
+            self.speed_mps[1] + accel_e * STEP_S,
+        )
 
     def _towards(self, place_m: NorthEast, body: BodyState) -> NorthEast:
         gain = self._params["MPC_XY_P"]
@@ -232,17 +233,9 @@ class Horizontal:
         offset = (gain * (place_m[0] - north), gain * (place_m[1] - east))
         return shorten(offset, self._params["MPC_XY_CRUISE"])
 
-    def _follow(
-        self, velocity: NorthEast, feedforward: NorthEast, body: BodyState, dt_s: float
-    ) -> NorthEast:
-        self.accel_mps2 = self._velocity.update(body, velocity, dt_s, feedforward)
+    def _follow(self, velocity: NorthEast, feedforward: NorthEast, body: BodyState) -> NorthEast:
+        self.accel_mps2 = self._velocity.update(body, velocity, feedforward)
         return self.accel_mps2
-
-
-def shorten(vector: NorthEast, limit: float) -> NorthEast:
-    """Limit a vector's length and keep its direction."""
-    scale = limit / max(limit, math.hypot(*vector))
-    return vector[0] * scale, vector[1] * scale
 
 
 def _place(body: BodyState) -> NorthEast:

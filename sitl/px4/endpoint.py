@@ -5,7 +5,7 @@ is late by less than half an interval keeps its grid; a later one starts a new g
 250 Hz topic become 125 Hz, as measured. A small bandwidth silently scales all rates down.
 """
 
-from collections.abc import Callable, Hashable, Mapping
+from collections.abc import Hashable, Mapping
 from dataclasses import dataclass
 from types import MappingProxyType
 
@@ -43,8 +43,6 @@ GCS_HZ: Mapping[int, float] = MappingProxyType(
 )
 """Message rates on a link to a ground station (mode Normal with the SITL script's additions)."""
 
-_UNSCALED = (mav.MAVLINK_MSG_ID_HEARTBEAT,)
-
 
 @dataclass(slots=True, kw_only=True)
 class _Stream:
@@ -53,78 +51,25 @@ class _Stream:
     version: Hashable = None  # topic version when last sent
 
 
-class Px4Streams:
-    """Message intervals of one link. Stamps are those of the vehicle's clock."""
-
-    def __init__(
-        self, default_hz: Mapping[int, float], bandwidth_bytes_ps: float, now_ns: int
-    ) -> None:
-        self._default_us = {key: round(1e6 / rate) for key, rate in default_hz.items()}
-        self._bandwidth = bandwidth_bytes_ps
-        self._streams: dict[int, _Stream] = {}
-        self.scale = 1.0
-        """Factor that fits all rates into the link's bandwidth; never reported to the peer."""
-        for message_id, interval_us in self._default_us.items():
-            self.set_interval(message_id, interval_us, now_ns)
-
-    def set_interval(self, message_id: int, interval_us: int, now_ns: int) -> None:
-        """Apply MAV_CMD_SET_MESSAGE_INTERVAL: -1 stops, 0 restores the link's default."""
-        if interval_us == 0:
-            interval_us = self._default_us.get(message_id, -1)
-        if interval_us < 0:
-            self._streams.pop(message_id, None)
-        else:
-            sent_us = now_ns // NS_PER_US
-            self._streams[message_id] = _Stream(interval_us=interval_us, sent_us=sent_us)
-        wanted = float(OTHER_STREAMS_BYTES_PS)
-        for number, stream in self._streams.items():
-            wanted += payload_bytes(number) * 1e6 / max(1, stream.interval_us)
-        self.scale = max(LOWEST_SCALE, min(1.0, self._bandwidth / wanted))
-
-    def interval_us(self, message_id: int) -> int:
-        """Return the interval for MESSAGE_INTERVAL; -1: not streamed."""
-        stream = self._streams.get(message_id)
-        return -1 if stream is None else stream.interval_us
-
-    def due(self, now_ns: int, version_of: Callable[[int], Hashable]) -> list[int]:
-        """Return the ids of the messages to send now; ``version_of`` changes with each topic."""
-        now_us, scale = now_ns // NS_PER_US, self.scale
-        ready = []
-        for message_id, stream in self._streams.items():
-            interval_us = stream.interval_us / (1.0 if message_id in _UNSCALED else scale)
-            if now_us - stream.sent_us < interval_us:
-                continue
-            if (version := version_of(message_id)) == stream.version:
-                continue
-            is_on_grid = now_us - stream.sent_us < 1.5 * interval_us
-            stream.sent_us = int(stream.sent_us + interval_us) if is_on_grid else now_us
-            stream.version = version
-            ready.append(message_id)
-        return ready
-
-
-def payload_bytes(message_id: int) -> int:
-    """Return the largest size of the message on the wire, without a signature."""
-    if message_id == CURRENT_MODE:
-        return 9 + FRAME_BYTES
-    fields = mav.mavlink_map[message_id]
-    return int(fields.unpacker.size) + FRAME_BYTES
-
-
 class Px4Endpoint(Endpoint[Px4]):
     """Link to a ground station, or to a companion computer, which gets other streams."""
 
     def __init__(self, ap: Px4, *, is_onboard: bool) -> None:
         self.heard: set[tuple[int, int]] = set()
         """Systems and components heard on this link."""
-        self._default_hz = ONBOARD_HZ if is_onboard else GCS_HZ
+        default_hz = ONBOARD_HZ if is_onboard else GCS_HZ
+        self._default_us = {key: round(1e6 / rate) for key, rate in default_hz.items()}
         self._text_id = self._event_sequence = 0
         super().__init__(ap, BUILDERS_1_14 if ap.config.px4_release == "1.14" else BUILDERS)
 
     def restart(self, ap: Px4) -> None:
         super().restart(ap)
         self.has_gcs = False  # heard a ground station's heartbeat; no text is sent before
-        self._streams = Px4Streams(self._default_hz, ap.config.link_bytes_ps, ap.now_ns)
+        self._streams: dict[int, _Stream] = {}
+        self._scale = 1.0
+        """Factor that fits all rates into the link's bandwidth; never reported to the peer."""
+        for message_id, interval_us in self._default_us.items():
+            self._start(message_id, interval_us)
         self._heartbeat_due_ns = ap.now_ns
         self._looked_ns = ap.now_ns
 
@@ -137,18 +82,20 @@ class Px4Endpoint(Endpoint[Px4]):
             self.send_now(mav.MAVLINK_MSG_ID_HEARTBEAT)
         if ap.now_ns != self._looked_ns:
             self._looked_ns = ap.now_ns
-            for message_id in self._streams.due(ap.now_ns, lambda key: topic_version(key, ap)):
+            for message_id in self._due():
                 self.send_now(message_id)
 
     def set_interval(self, message_id: int, interval_us: int) -> bool:
-        """Change a stream. Return False for a message that cannot be streamed."""
+        """Apply MAV_CMD_SET_MESSAGE_INTERVAL: -1 stops, 0 restores the link's default."""
         if message_id not in self._builders or message_id == mav.MAVLINK_MSG_ID_HEARTBEAT:
             return False
-        self._streams.set_interval(message_id, interval_us, self._ap.now_ns)
+        self._start(message_id, interval_us or self._default_us.get(message_id, -1))
         return True
 
     def interval_us(self, message_id: int) -> int:
-        return self._streams.interval_us(message_id)
+        """Return the interval for MESSAGE_INTERVAL; -1: not streamed."""
+        stream = self._streams.get(message_id)
+        return -1 if stream is None else stream.interval_us
 
     def send_text(self, severity: int, text: str) -> None:
         """Send STATUSTEXT once a ground station is known; number the chunks of a long text."""
@@ -166,3 +113,36 @@ class Px4Endpoint(Endpoint[Px4]):
     def send_event(self, event: Event) -> None:
         self._event_sequence = (self._event_sequence + 1) % 65536
         self.send(event_message(event, self._event_sequence))
+
+    def _start(self, message_id: int, interval_us: int) -> None:
+        if interval_us < 0:
+            self._streams.pop(message_id, None)
+        else:
+            sent_us = self._ap.now_ns // NS_PER_US
+            self._streams[message_id] = _Stream(interval_us=interval_us, sent_us=sent_us)
+        wanted = float(OTHER_STREAMS_BYTES_PS)
+        for number, stream in self._streams.items():
+            wanted += payload_bytes(number) * 1e6 / max(1, stream.interval_us)
+        self._scale = max(LOWEST_SCALE, min(1.0, self._ap.config.link_bytes_ps / wanted))
+
+    def _due(self) -> list[int]:
+        """Return the ids of the messages whose interval has passed and whose topic is new."""
+        now_us, ready = self._ap.now_ns // NS_PER_US, []
+        for message_id, stream in self._streams.items():
+            interval_us = stream.interval_us / self._scale
+            if now_us - stream.sent_us < interval_us:
+                continue
+            if (version := topic_version(message_id, self._ap)) == stream.version:
+                continue
+            is_on_grid = now_us - stream.sent_us < 1.5 * interval_us
+            stream.sent_us = int(stream.sent_us + interval_us) if is_on_grid else now_us
+            stream.version = version
+            ready.append(message_id)
+        return ready
+
+
+def payload_bytes(message_id: int) -> int:
+    """Return the largest size of the message on the wire, without a signature."""
+    if message_id == CURRENT_MODE:
+        return 9 + FRAME_BYTES
+    return int(mav.mavlink_map[message_id].unpacker.size) + FRAME_BYTES

@@ -3,11 +3,11 @@
 import math
 from typing import NamedTuple, TypeAlias
 
-from sitl.firmware import AttitudeSetpoint
 from sitl.px4 import sticks as pilot
 from sitl.px4.control import (
     HOVER_THRUST,
     SIH_QUAD,
+    STEP_S,
     STILL,
     Horizontal,
     NorthEast,
@@ -17,8 +17,9 @@ from sitl.px4.control import (
 from sitl.px4.modes import Mode
 from sitl.px4.params import Px4Params
 from sitl.px4.sticks import Sticks
-from sitl.rotation import IDENTITY, Quat, Vec3, cos_tilt, from_euler, from_heading, yaw_of
 from sitl.vehicle.dynamics import BodyState, HeightController, mix, thrust_for
+from sitl.vehicle.firmware import AttitudeSetpoint
+from sitl.vehicle.rotation import IDENTITY, Quat, Vec3, cos_tilt, from_euler, from_heading, yaw_of
 
 IDLE = (0.05, 0.05, 0.05, 0.05)  # armed on the ground
 STILL_YAW_RADPS = 0.01  # a slower yaw command holds the heading
@@ -46,7 +47,7 @@ class Px4Control:
         self._params = params
         self._rates = RateController(params)
         self._horizontal = Horizontal(params)
-        self._height = HeightController()
+        self._height = HeightController(STEP_S)
         self._yaw_rate_radps = 0.0
         self._yaw_hold_rad: float | None = None
         self._accel_mps2 = STILL  # last demanded, north and east
@@ -112,24 +113,22 @@ class Px4Control:
         body: BodyState,
         *,
         has_position: bool,
-        dt_s: float,
     ) -> tuple[float, ...]:
         if mode is Mode.OFFBOARD and setpoint is not None:
-            return self._fly_offboard(setpoint, body, dt_s)
+            return self._fly_offboard(setpoint, body)
         if mode is Mode.ACRO:
             self.attitude = body.ned_from_body_wxyz
             return self._turn_at(
                 pilot.acro_rates_radps(sticks, self._params),
                 pilot.manual_thrust(sticks, self._params, HOVER_THRUST),
                 body,
-                dt_s,
             )
-        yaw_rate = self._stick_yaw(sticks if mode.piloted else Sticks(), body, dt_s)
+        yaw_rate = self._stick_yaw(sticks if mode.piloted else Sticks(), body)
         yaw = yaw_of(body.ned_from_body_wxyz) if self._yaw_hold_rad is None else self._yaw_hold_rad
         if mode.manual_throttle:
             roll, pitch = pilot.lean_rad(sticks, self._params)
             thrust = pilot.manual_thrust(sticks, self._params, HOVER_THRUST)
-            return self._lean_to(from_euler(roll, pitch, yaw), yaw_rate, thrust, body, dt_s)
+            return self._lean_to(from_euler(roll, pitch, yaw), yaw_rate, thrust, body)
         if mode is Mode.ALTCTL:
             forward, right = pilot.lean_accel_mps2(sticks, self._params)
             accel = from_heading(forward, right, yaw)
@@ -137,34 +136,34 @@ class Px4Control:
             accel = STILL
         elif mode is Mode.POSCTL:
             speed = pilot.speed_mps(sticks, self._params)
-            accel = self._horizontal.steer(from_heading(*speed, yaw), body, dt_s)
+            accel = self._horizontal.steer(from_heading(*speed, yaw), body)
         else:
-            accel = self._horizontal.fly_to(self._destination(mode, body), body, dt_s)
+            accel = self._horizontal.fly_to(self._destination(mode, body), body)
         self._accel_mps2 = accel
-        thrust = self._climb(self._climb_mps(mode, sticks, body), body, dt_s)
-        return self._lean_to(attitude_for(accel, yaw), yaw_rate, thrust, body, dt_s)
+        thrust = self._climb(self._climb_mps(mode, sticks, body), body)
+        return self._lean_to(attitude_for(accel, yaw), yaw_rate, thrust, body)
 
-    def _fly_offboard(self, setpoint: Setpoint, body: BodyState, dt_s: float) -> tuple[float, ...]:
+    def _fly_offboard(self, setpoint: Setpoint, body: BodyState) -> tuple[float, ...]:
         if isinstance(setpoint, AttitudeSetpoint):
             target, rates, thrust = setpoint
             if target is not None:
-                return self._lean_to(target, rates[2], thrust, body, dt_s)
+                return self._lean_to(target, rates[2], thrust, body)
             self.attitude = body.ned_from_body_wxyz
-            return self._turn_at(rates, thrust, body, dt_s)
+            return self._turn_at(rates, thrust, body)
         north, east, _ = setpoint.velocity_ned_mps or (0.0, 0.0, 0.0)
         if setpoint.position_ned_m is not None:
             gain = self._params["MPC_XY_P"]
             north += gain * (setpoint.position_ned_m[0] - body.position_ned_m[0])
             east += gain * (setpoint.position_ned_m[1] - body.position_ned_m[1])
-        accel = self._accel_mps2 = self._horizontal.track((north, east), body, dt_s)
+        accel = self._accel_mps2 = self._horizontal.track((north, east), body)
         climb = self._offboard_climb_mps(setpoint, body)
         if setpoint.yaw_rad is not None:
             self._yaw_hold_rad, yaw_rate = setpoint.yaw_rad, setpoint.yaw_rate_radps
         else:
             yaw_rate = self._hold_yaw(setpoint.yaw_rate_radps, body)
         yaw = yaw_of(body.ned_from_body_wxyz) if self._yaw_hold_rad is None else self._yaw_hold_rad
-        thrust = self._climb(climb, body, dt_s)
-        return self._lean_to(attitude_for(accel, yaw), yaw_rate, thrust, body, dt_s)
+        thrust = self._climb(climb, body)
+        return self._lean_to(attitude_for(accel, yaw), yaw_rate, thrust, body)
 
     def _offboard_climb_mps(self, setpoint: PositionSetpoint, body: BodyState) -> float:
         climb = -setpoint.velocity_ned_mps[2] if setpoint.velocity_ned_mps else 0.0
@@ -173,21 +172,19 @@ class Px4Control:
         return max(-self._params["MPC_Z_VEL_MAX_DN"], min(self._params["MPC_Z_VEL_MAX_UP"], climb))
 
     def _lean_to(
-        self, target: Quat, yaw_rate_radps: float, thrust: float, body: BodyState, dt_s: float
+        self, target: Quat, yaw_rate_radps: float, thrust: float, body: BodyState
     ) -> tuple[float, ...]:
         self.attitude, self.thrust, self.yaw_rate_radps = target, thrust, yaw_rate_radps
-        return mix(thrust, self._rates.attitude(body, target, yaw_rate_radps, dt_s), SIH_QUAD)
+        return mix(thrust, self._rates.attitude(body, target, yaw_rate_radps), SIH_QUAD)
 
-    def _turn_at(
-        self, rates_radps: Vec3, thrust: float, body: BodyState, dt_s: float
-    ) -> tuple[float, ...]:
+    def _turn_at(self, rates_radps: Vec3, thrust: float, body: BodyState) -> tuple[float, ...]:
         self.thrust = thrust
-        return mix(thrust, self._rates.rates(body, rates_radps, dt_s), SIH_QUAD)
+        return mix(thrust, self._rates.rates(body, rates_radps), SIH_QUAD)
 
-    def _stick_yaw(self, sticks: Sticks, body: BodyState, dt_s: float) -> float:
+    def _stick_yaw(self, sticks: Sticks, body: BodyState) -> float:
         wanted = pilot.yaw_rate_radps(sticks, self._params)
-        lag_s = max(dt_s, self._params["MPC_MAN_Y_TAU"])
-        self._yaw_rate_radps += (wanted - self._yaw_rate_radps) * dt_s / lag_s
+        lag_s = max(STEP_S, self._params["MPC_MAN_Y_TAU"])
+        self._yaw_rate_radps += (wanted - self._yaw_rate_radps) * STEP_S / lag_s
         return self._hold_yaw(self._yaw_rate_radps, body)
 
     def _hold_yaw(self, yaw_rate_radps: float, body: BodyState) -> float:
@@ -199,10 +196,10 @@ class Px4Control:
             self._yaw_hold_rad = yaw_of(body.ned_from_body_wxyz)
         return 0.0
 
-    def _climb(self, climb_mps: float, body: BodyState, dt_s: float) -> float:
+    def _climb(self, climb_mps: float, body: BodyState) -> float:
         climb_mps = min(climb_mps, self.most_climb_mps)
         max_accel_mps2 = self._params["MPC_ACC_UP_MAX" if climb_mps > 0 else "MPC_ACC_DOWN_MAX"]
-        accel = self._height.update(body, climb_mps, max_accel_mps2, dt_s)
+        accel = self._height.update(body, climb_mps, max_accel_mps2)
         thrust = thrust_for(accel, cos_tilt(body.ned_from_body_wxyz), HOVER_THRUST)
         self.velocity_ned_mps = (*self._horizontal.speed_mps, -climb_mps)
         return max(self._params["MPC_THR_MIN"], min(self._params["MPC_THR_MAX"], thrust))

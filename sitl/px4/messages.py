@@ -13,22 +13,13 @@ from pymavlink.dialects.v20 import ardupilotmega as mav
 
 from sitl.clock import NS_PER_MS
 from sitl.link.server import Message
-from sitl.link.telemetry import (
-    Home,
-    autopilot_version,
-    battery_status,
-    boot_ms,
-    boot_us,
-    extended_sys_state,
-    sys_status,
-    vfr_hud,
-)
+from sitl.link.telemetry import Home, boot_ms, boot_us, extended_sys_state, sys_status, vfr_hud
 from sitl.px4.autopilot import Px4
 from sitl.px4.commander import Event
 from sitl.px4.flight import PositionSetpoint
 from sitl.px4.modes import Mode
-from sitl.rotation import conjugate, rotate
 from sitl.vehicle.config import Px4Release
+from sitl.vehicle.rotation import conjugate, rotate
 
 CURRENT_MODE = 436
 EVENT = 410
@@ -119,11 +110,6 @@ def _gps_raw_int(ap: Px4) -> Message:
     return HOME.gps_raw_int(ap, fix=fix, eph=70, epv=110)
 
 
-def _highres_imu(ap: Px4) -> Message:
-    gyro, field = ap.sensed.rate_body_radps, HOME.mag_gauss(ap)
-    return HOME.highres_imu(ap, gyro, field, has_difference=False)
-
-
 def _local_position_ned(ap: Px4) -> Message:
     """Build LOCAL_POSITION_NED; without a position, zeros that nothing marks as invalid."""
     (north, east, down), (vn, ve, vd) = ap.sensed.position_ned_m, ap.sensed.velocity_ned_mps
@@ -203,11 +189,6 @@ def _estimator_status(ap: Px4) -> Message:
     )
 
 
-def _autopilot_version(ap: Px4) -> Message:
-    version = _FIRMWARE_VERSIONS[ap.config.px4_release]
-    return autopilot_version(ap, capabilities=CAPABILITIES, version=version)
-
-
 def _extended_sys_state(ap: Px4) -> Message:
     is_landing, is_taking_off = ap.mode is Mode.AUTO_LAND, ap.mode is Mode.AUTO_TAKEOFF
     vtol = mav.MAV_VTOL_STATE_MC
@@ -215,24 +196,25 @@ def _extended_sys_state(ap: Px4) -> Message:
 
 
 BUILDERS: dict[int, Callable[[Px4], Message | None]] = {
-    **HOME.builders(),
+    **HOME.builders(
+        gyro=lambda ap: ap.sensed.rate_body_radps,
+        field_per_gauss=1.0,
+        has_pressure_difference=False,
+        version=lambda ap: _FIRMWARE_VERSIONS[ap.config.px4_release],
+        capabilities=CAPABILITIES,
+        energy_hj=-1,
+    ),
     mav.MAVLINK_MSG_ID_HEARTBEAT: _heartbeat,
     mav.MAVLINK_MSG_ID_SYS_STATUS: _sys_status,
     mav.MAVLINK_MSG_ID_GPS_RAW_INT: _gps_raw_int,
-    mav.MAVLINK_MSG_ID_SCALED_IMU: lambda ap: mav.MAVLink_scaled_imu_message(
-        boot_ms(ap), *HOME.scaled_imu(ap, ap.sensed.rate_body_radps), HOME.temperature_cdeg
-    ),
     mav.MAVLINK_MSG_ID_LOCAL_POSITION_NED: _local_position_ned,
     mav.MAVLINK_MSG_ID_RC_CHANNELS: _rc_channels,
     mav.MAVLINK_MSG_ID_MANUAL_CONTROL: _manual_control,
     mav.MAVLINK_MSG_ID_VFR_HUD: _vfr_hud,
     mav.MAVLINK_MSG_ID_ATTITUDE_TARGET: _attitude_target,
     mav.MAVLINK_MSG_ID_POSITION_TARGET_LOCAL_NED: _position_target,
-    mav.MAVLINK_MSG_ID_HIGHRES_IMU: _highres_imu,
     # The vehicle's request; the peer's answer needs no action.
     mav.MAVLINK_MSG_ID_TIMESYNC: lambda ap: mav.MAVLink_timesync_message(0, ap.uptime_ns),
-    mav.MAVLINK_MSG_ID_BATTERY_STATUS: lambda ap: battery_status(ap, energy_hj=-1),
-    mav.MAVLINK_MSG_ID_AUTOPILOT_VERSION: _autopilot_version,
     mav.MAVLINK_MSG_ID_ESTIMATOR_STATUS: _estimator_status,
     mav.MAVLINK_MSG_ID_EXTENDED_SYS_STATE: _extended_sys_state,
     mav.MAVLINK_MSG_ID_ODOMETRY: _odometry,

@@ -6,9 +6,9 @@ PX4 stores INT32 and float.
 from collections.abc import Mapping
 from types import MappingProxyType
 
-from sitl.firmware import Params, float32
 from sitl.vehicle.conditions import NOMINAL, Conditions
 from sitl.vehicle.config import Px4Release
+from sitl.vehicle.firmware import Params, float32
 
 DEAD_ZONE = "MAN_DEADZONE"
 _INTEGERS: Mapping[str, int] = MappingProxyType(

@@ -8,7 +8,6 @@ import math
 
 from pymavlink.dialects.v20 import ardupilotmega as mav
 
-from sitl.firmware import AttitudeSetpoint
 from sitl.link.server import (
     ACCEPTED,
     DENIED,
@@ -29,7 +28,8 @@ from sitl.px4.messages import HOME
 from sitl.px4.modes import Mode, mode_of
 from sitl.px4.sticks import from_manual_control
 from sitl.report import FlightLog
-from sitl.rotation import Vec3, from_heading
+from sitl.vehicle.firmware import AttitudeSetpoint
+from sitl.vehicle.rotation import Vec3, from_heading
 
 _RC_IGNORE = 65535
 _IGNORE_ATTITUDE = mav.ATTITUDE_TARGET_TYPEMASK_ATTITUDE_IGNORE
@@ -42,7 +42,8 @@ _IGNORE_YAW, _IGNORE_YAW_SPEED = 1 << 10, 1 << 11
 class Px4Server(MavlinkServer[Px4, Px4Endpoint]):
     """PX4's messages and commands; in simulation PX4 denies a reboot."""
 
-    bad_interval = FAILED
+    bad_interval, unknown_message = FAILED, DENIED
+    zero_interval_params = (2, 6)
 
     def __init__(self, ap: Px4, link_count: int, log: FlightLog) -> None:
         onboard = ap.config.onboard_links
@@ -63,8 +64,6 @@ class Px4Server(MavlinkServer[Px4, Px4Endpoint]):
             mav.MAV_CMD_DO_FLIGHTTERMINATION: self._terminate,
             mav.MAV_CMD_PREFLIGHT_REBOOT_SHUTDOWN: self._reboot,
             mav.MAV_CMD_COMPONENT_ARM_DISARM: self._arm_disarm,
-            mav.MAV_CMD_SET_MESSAGE_INTERVAL: self._set_interval,
-            mav.MAV_CMD_REQUEST_MESSAGE: self._request_message,
         }
 
     def _announce(self) -> None:
@@ -204,16 +203,6 @@ class Px4Server(MavlinkServer[Px4, Px4Endpoint]):
         height_m = params[6] - HOME.alt_m
         self._ap.prepare_takeoff(height_m if math.isfinite(height_m) else None)
         return ACCEPTED if self._ap.commander.set_mode(Mode.AUTO_TAKEOFF) else REJECTED
-
-    def _set_interval(self, params: Params7, link: Px4Endpoint) -> int:
-        is_plain = params[2] == 0.0 and params[6] == 0.0
-        if not is_plain or not all(map(math.isfinite, params[:2])):
-            return FAILED
-        return ACCEPTED if link.set_interval(int(params[0]), int(params[1])) else FAILED
-
-    def _request_message(self, params: Params7, link: Px4Endpoint) -> int:
-        is_known = math.isfinite(params[0]) and link.send_now(int(params[0]))
-        return ACCEPTED if is_known else DENIED
 
     def _terminate(self, params: Params7, _link: Px4Endpoint) -> int:
         if params[0] > 0.5:

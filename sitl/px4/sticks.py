@@ -11,8 +11,9 @@ from typing import NamedTuple
 
 from sitl.clock import NS_PER_S
 from sitl.px4.params import Px4Params
-from sitl.rotation import Vec3
 from sitl.vehicle.dynamics import GRAVITY_MPS2
+from sitl.vehicle.firmware import HeldGesture
+from sitl.vehicle.rotation import Vec3
 
 RC_SOURCE = -1  # the receiver; links are numbered from 0
 POLL_NS = NS_PER_S // 5
@@ -88,9 +89,8 @@ class StickInput:
         self._never_ages = False
         self._speeds = tuple(StickSpeed() for _ in Sticks())
         self._looked_ns = 0
-        self._gesture = 0
-        self._gesture_since_ns = 0
-        self._gesture_done = False
+        self.gesture = HeldGesture(GESTURE_NS)
+        """Arming gesture (throttle down, full right yaw, no lean) and disarming (full left yaw)."""
 
     @property
     def source(self) -> int | None:
@@ -115,18 +115,8 @@ class StickInput:
         if self.valid and not self._never_ages and now_ns - self.sampled_ns >= self._lost_after_ns:
             self.valid = False
             self.moved_fast = False
-            self._gesture = 0
+            self.gesture.see(0, now_ns)
             self._speeds = tuple(StickSpeed() for _ in Sticks())
-
-    def gesture(self, now_ns: int) -> int:
-        """Return 1 for the arming gesture, -1 for the disarming one, else 0. Each is reported once.
-
-        Arming: throttle down with full right yaw and no lean for 1 s; disarming: full left yaw.
-        """
-        if not self._gesture or self._gesture_done or now_ns - self._gesture_since_ns < GESTURE_NS:
-            return 0
-        self._gesture_done = True
-        return self._gesture
 
     @property
     def _lost_after_ns(self) -> int:
@@ -171,13 +161,12 @@ class StickInput:
         self._look(now_ns)
         self._never_ages = False
         self.count += 1
-        gesture = 0
+        side = 0
         is_level = max(abs(sticks.forward), abs(sticks.right)) < GESTURE_MOST_LEAN
         is_turned = abs(sticks.yaw) > GESTURE_FULL_YAW
         if is_level and is_turned and sticks.throttle < GESTURE_LOW_THROTTLE:
-            gesture = 1 if sticks.yaw > 0.0 else -1
-        if gesture != self._gesture:
-            self._gesture, self._gesture_since_ns, self._gesture_done = gesture, now_ns, False
+            side = 1 if sticks.yaw > 0.0 else -1
+        self.gesture.see(side, now_ns)
 
 
 def curve(value: float, dead_zone: float, expo: float = EXPO) -> float:

@@ -1,1 +1,1 @@
-"""Simulated quadrotor without its firmware: physics, air, sensors."""
+"""Simulated quadrotor: physics, air, sensors, attitudes, and the base of both firmwares."""

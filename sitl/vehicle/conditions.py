@@ -12,7 +12,7 @@ from typing import TypeAlias
 import numpy as np
 
 from sitl import UsageError
-from sitl.rotation import Vec3
+from sitl.vehicle.rotation import Vec3
 
 Rgb: TypeAlias = tuple[int, int, int]
 
@@ -102,23 +102,18 @@ class Conditions:
 NOMINAL = Conditions()
 
 
-def random_conditions(seed: int, strength: float = 1.0) -> Conditions:
+def random_conditions(seed: int) -> Conditions:
     """Draw the conditions of this seed; they are the same on every machine.
 
-    A ``strength`` of 0 gives the nominal conditions with this seed, 1 the usual spread.
-
     Raises:
-        UsageError: a negative seed, or a strength outside [0, 2].
+        UsageError: a negative seed.
     """
     if seed < 0:
         raise UsageError(f"a conditions seed is 0 or more, got {seed}")
-    if not 0.0 <= strength <= 2.0:
-        raise UsageError(f"the strength of conditions lies within 0..2, got {strength}")
     conditions = replace(NOMINAL, seed=seed)
-    if strength > 0.0:
-        draw = _Draw(np.random.Generator(np.random.PCG64(seed)), strength)
-        for vary in _VARIATIONS:
-            conditions = vary(conditions, draw)
+    draw = _Draw(np.random.Generator(np.random.PCG64(seed)))
+    for vary in _VARIATIONS:
+        conditions = vary(conditions, draw)
     return conditions
 
 
@@ -132,7 +127,7 @@ def held_out_conditions(seed: int) -> Conditions:
         UsageError: a negative seed.
     """
     conditions = random_conditions(seed)
-    draw = _Draw(np.random.Generator(np.random.PCG64((seed, 7))), 1.0)
+    draw = _Draw(np.random.Generator(np.random.PCG64((seed, 7))))
     match seed % 5:
         case 0:
             return replace(conditions, hidden_gates=0.7)
@@ -146,21 +141,20 @@ def held_out_conditions(seed: int) -> Conditions:
 
 
 class _Draw:
-    """Uniform draws around a nominal value; the strength scales their width."""
+    """Uniform draws around a nominal value."""
 
-    def __init__(self, random: np.random.Generator, strength: float) -> None:
+    def __init__(self, random: np.random.Generator) -> None:
         self.random = random
-        self.strength = strength
 
     def offset(self, half: float) -> float:
-        return self.strength * float(self.random.uniform(-half, half))
+        return float(self.random.uniform(-half, half))
 
     def factor(self, most: float) -> float:
         """Return a factor within 1 / most .. most, as likely above 1 as below."""
         return math.exp(self.offset(math.log(most)))
 
     def amount(self, most: float) -> float:
-        return self.strength * float(self.random.uniform(0.0, most))
+        return float(self.random.uniform(0.0, most))
 
     def tint(self, most: float) -> Vec3:
         """Return one factor each for red, green and blue."""
@@ -172,7 +166,7 @@ class _Draw:
         return (brightness * red, brightness * green, brightness * blue)
 
     def angle_rad(self) -> float:
-        """Return any direction, independent of the strength."""
+        """Return any direction."""
         return float(self.random.uniform(-math.pi, math.pi))
 
     def shade(self, rgb: Rgb) -> Rgb:

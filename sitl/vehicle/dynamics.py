@@ -15,8 +15,8 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
-from sitl.rotation import Quat, Vec3, cos_tilt
 from sitl.vehicle.conditions import NOMINAL, Conditions
+from sitl.vehicle.rotation import Quat, Vec3, cos_tilt
 
 GRAVITY_MPS2 = 9.80665
 INERTIA_KGM2: Vec3 = (0.012, 0.012, 0.022)
@@ -255,6 +255,12 @@ def clamp(value: float, limit: float) -> float:
     return max(-limit, min(limit, value))
 
 
+def shorten(vector: tuple[float, float], limit: float) -> tuple[float, float]:
+    """Limit a vector's length and keep its direction."""
+    scale = limit / max(limit, math.hypot(*vector))
+    return vector[0] * scale, vector[1] * scale
+
+
 class HeightController:
     """Controller from climb rate demand to vertical acceleration; zero demand holds the height."""
 
@@ -265,7 +271,8 @@ class HeightController:
     MAX_HEIGHT_ERROR_M = 2.0
     MAX_ACCEL_MPS2 = 0.7 * GRAVITY_MPS2
 
-    def __init__(self) -> None:
+    def __init__(self, step_s: float) -> None:
+        self._step_s = step_s
         self._height_m = self._climb_mps = self._integral_mps2 = 0.0
 
     def reset(self, body: BodyState) -> None:
@@ -273,18 +280,17 @@ class HeightController:
         self._climb_mps = -body.velocity_ned_mps[2]
         self._integral_mps2 = 0.0
 
-    def update(
-        self, body: BodyState, climb_mps: float, max_accel_mps2: float, dt_s: float
-    ) -> float:
+    def update(self, body: BodyState, climb_mps: float, max_accel_mps2: float) -> float:
         """Return the upward acceleration [m/s^2]; ``max_accel_mps2`` limits the demand's change."""
         height, climb = -body.position_ned_m[2], -body.velocity_ned_mps[2]
-        self._climb_mps += clamp(climb_mps - self._climb_mps, max_accel_mps2 * dt_s)
-        self._height_m += self._climb_mps * dt_s
+        self._climb_mps += clamp(climb_mps - self._climb_mps, max_accel_mps2 * self._step_s)
+        self._height_m += self._climb_mps * self._step_s
         self._height_m = height + clamp(self._height_m - height, self.MAX_HEIGHT_ERROR_M)
         wanted = self._climb_mps + self.HEIGHT_GAIN_PER_S * (self._height_m - height)
         error = wanted - climb
         self._integral_mps2 = clamp(
-            self._integral_mps2 + self.INTEGRAL_GAIN_PER_S2 * error * dt_s, self.MAX_INTEGRAL_MPS2
+            self._integral_mps2 + self.INTEGRAL_GAIN_PER_S2 * error * self._step_s,
+            self.MAX_INTEGRAL_MPS2,
         )
         accel = self.CLIMB_GAIN_PER_S * error + self._integral_mps2
         return clamp(accel, self.MAX_ACCEL_MPS2)

@@ -18,7 +18,7 @@ from sitl.vehicle.config import IDLE_RECEIVER_US, AutopilotName, VehicleConfig
 
 PEER, ALLOW, RECEIVER = ("MAVBRIDGE_TEST_PEER", "MAVBRIDGE_TEST_ALLOW", "MAVBRIDGE_TEST_RECEIVER")
 PERMISSIONS = ("ground", "arm", "fly")
-"""What tests may do to a real flight controller; each allows what is before it, too."""
+"""Permissions of tests on a real flight controller; each includes those before it."""
 COPTER_FIXTURES = ("companion", "armable", "grounded", "flying", "expendable", "without_receiver")
 PX4_FIXTURES = ("px4", "px4_armable", "px4_grounded", "px4_flying", "px4_expendable")
 FIRMWARES = {mav.MAV_AUTOPILOT_ARDUPILOTMEGA: COPTER_FIXTURES, mav.MAV_AUTOPILOT_PX4: PX4_FIXTURES}
@@ -67,13 +67,19 @@ def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item
     if EXTERNAL not in config.stash:
         return
     external = config.stash[EXTERNAL]
-    own = [item for item in items if external.runs(getattr(item, "fixturenames", []))]
+    own = [item for item in items if external.runs(_fixtures(item))]
     config.hook.pytest_deselected(items=[item for item in items if item not in own])
     items[:] = sorted(own, key=_stage)
 
 
+def _fixtures(item: pytest.Item) -> list[str]:
+    """Return the names of a test's fixtures, and of the vehicle that it is parametrized with."""
+    params = getattr(getattr(item, "callspec", None), "params", {})
+    return [*getattr(item, "fixturenames", []), str(params.get("vehicle", ""))]
+
+
 def _stage(item: pytest.Item) -> int:
-    names: list[str] = getattr(item, "fixturenames", [])
+    names = _fixtures(item)
     kinds = ("armable", "grounded", "flying", "expendable")
     return 1 + max((n for n, kind in enumerate(kinds) if any(kind in f for f in names)), default=-1)
 

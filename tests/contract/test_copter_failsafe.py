@@ -1,4 +1,4 @@
-"""What is left when sticks or the ground station fall silent, as measured on ArduCopter."""
+"""Loss of sticks or of the ground station, as measured on ArduCopter."""
 
 import math
 
@@ -101,10 +101,12 @@ def test_lost_ground_station_in_guided_returns(flying):
     wait_for_text(flying, "GCS Failsafe Cleared")
 
 
-def in_the_air(companion):
-    """In ALT_HOLD at some metres; a vehicle without a receiver has sticks as long as we send."""
-    companion.fly_up()
-    companion.seen.clear()
+@pytest.fixture
+def airborne(without_receiver):
+    """In ALT_HOLD some metres up; it has sticks only while the test sends them."""
+    without_receiver.fly_up()
+    without_receiver.seen.clear()
+    return without_receiver
 
 
 def test_without_receiver_arming_needs_overrides(without_receiver):
@@ -120,68 +122,56 @@ def test_without_receiver_arming_needs_overrides(without_receiver):
     assert companion.arm() == ACCEPTED
 
 
-def test_without_receiver_silence_is_a_radio_failsafe(without_receiver):
-    companion = without_receiver
-    in_the_air(companion)
-    companion.hold(0.5, roll=1600)
-    silent_ns = companion.peer.now_ns()
-    companion.wait("STATUSTEXT", where=lambda m: m.text == "Radio Failsafe")
-    fired_s = (companion.peer.now_ns() - silent_ns) / 1e9
+def test_without_receiver_silence_is_a_radio_failsafe(airborne):
+    airborne.hold(0.5, roll=1600)
+    silent_ns = airborne.peer.now_ns()
+    airborne.wait("STATUSTEXT", where=lambda m: m.text == "Radio Failsafe")
+    fired_s = (airborne.peer.now_ns() - silent_ns) / 1e9
     assert 0.95 <= fired_s <= 1.1
-    assert companion.wait("HEARTBEAT", where=lambda m: m.custom_mode == RTL)
-    assert companion.channels()[0] == 1600
-    messages = companion.hold(1.5)
+    assert airborne.wait("HEARTBEAT", where=lambda m: m.custom_mode == RTL)
+    assert airborne.channels()[0] == 1600
+    messages = airborne.hold(1.5)
     assert "Radio Failsafe Cleared" in texts(messages)
     assert modes(messages)[-1] == RTL
 
 
 @pytest.mark.parametrize(("gap_s", "fails"), [(0.4, False), (0.9, False), (1.2, True)])
-def test_without_receiver_short_gaps_are_forgiven(without_receiver, gap_s, fails):
-    companion = without_receiver
-    in_the_air(companion)
-    messages = companion.advance(gap_s - 0.02)
+def test_without_receiver_short_gaps_are_forgiven(airborne, gap_s, fails):
+    messages = airborne.advance(gap_s - 0.02)
     assert ("Radio Failsafe" in texts(messages)) == fails
 
 
-def test_manual_throttle_modes_are_refused_in_radio_failsafe(without_receiver):
-    companion = without_receiver
-    in_the_air(companion)
-    companion.advance(2.0)
-    assert companion.set_mode(ACRO) == FAILED
-    assert companion.set_mode(STABILIZE) == FAILED
-    companion.hold(0.3)
-    assert companion.set_mode(STABILIZE) == ACCEPTED
+def test_manual_throttle_modes_are_refused_in_radio_failsafe(airborne):
+    airborne.advance(2.0)
+    assert airborne.set_mode(ACRO) == FAILED
+    assert airborne.set_mode(STABILIZE) == FAILED
+    airborne.hold(0.3)
+    assert airborne.set_mode(STABILIZE) == ACCEPTED
 
 
-def test_a_radio_failsafe_replaces_brake_and_one_set_after_it_stays(without_receiver):
-    companion = without_receiver
-    in_the_air(companion)
-    assert companion.set_mode(BRAKE) == ACCEPTED
-    companion.hold(0.2)
-    companion.wait("STATUSTEXT", where=lambda m: m.text == "Radio Failsafe")
-    heartbeat = companion.wait("HEARTBEAT", where=lambda m: m.custom_mode == RTL)
+def test_a_radio_failsafe_replaces_brake_and_one_set_after_it_stays(airborne):
+    assert airborne.set_mode(BRAKE) == ACCEPTED
+    airborne.hold(0.2)
+    airborne.wait("STATUSTEXT", where=lambda m: m.text == "Radio Failsafe")
+    heartbeat = airborne.wait("HEARTBEAT", where=lambda m: m.custom_mode == RTL)
     assert heartbeat.system_status == mav.MAV_STATE_CRITICAL
-    assert companion.set_mode(BRAKE) == ACCEPTED
-    assert modes(companion.advance(5.0))[-1] == BRAKE
+    assert airborne.set_mode(BRAKE) == ACCEPTED
+    assert modes(airborne.advance(5.0))[-1] == BRAKE
 
 
-def test_zeros_without_a_receiver_keep_the_lean_for_a_second(without_receiver):
-    companion = without_receiver
-    in_the_air(companion)
-    companion.hold(1.0, roll=1700)
-    companion.override(*[0] * 8)
-    held = companion.advance(0.9)
-    levelled = companion.advance(1.0)
+def test_zeros_without_a_receiver_keep_the_lean_for_a_second(airborne):
+    airborne.hold(1.0, roll=1700)
+    airborne.override(*[0] * 8)
+    held = airborne.advance(0.9)
+    levelled = airborne.advance(1.0)
     assert math.degrees(last(held, "ATTITUDE").roll) == pytest.approx(11.26, abs=0.5)
     assert last(levelled, "RC_CHANNELS").chan1_raw == 1700
     assert modes(levelled)[-1] == RTL
 
 
-def test_without_its_failsafe_the_last_stick_stays_for_good(without_receiver):
-    companion = without_receiver
-    in_the_air(companion)
-    companion.set_param("FS_THR_ENABLE", 0)
-    companion.hold(1.0, roll=1700)
-    messages = companion.advance(5.0)
+def test_without_its_failsafe_the_last_stick_stays_for_good(airborne):
+    airborne.set_param("FS_THR_ENABLE", 0)
+    airborne.hold(1.0, roll=1700)
+    messages = airborne.advance(5.0)
     assert math.degrees(last(messages, "ATTITUDE").roll) == pytest.approx(11.26, abs=0.5)
     assert modes(messages)[-1] == ALT_HOLD

@@ -44,7 +44,7 @@ def test_arming_twice_is_accepted(armable):
 
 
 @pytest.mark.parametrize(("throttle_us", "disarms"), [(1000, True), (1500, False)])
-def test_who_does_not_take_off_is_disarmed_with_the_throttle_down(armable, throttle_us, disarms):
+def test_an_idle_vehicle_is_disarmed_with_the_throttle_down(armable, throttle_us, disarms):
     armable.set_param("DISARM_DELAY", 1)
     armable.stream(mav.MAVLINK_MSG_ID_HEARTBEAT, 10)
     armable.get_ready(ALT_HOLD)

@@ -4,8 +4,14 @@ import pytest
 from pymavlink.dialects.v20 import ardupilotmega as mav
 
 
-def test_an_override_shows_in_rc_channels(companion):
+@pytest.fixture
+def companion(companion):
+    """Return a companion that watches the channels."""
     companion.stream(mav.MAVLINK_MSG_ID_RC_CHANNELS, 100)
+    return companion
+
+
+def test_an_override_shows_in_rc_channels(companion):
     companion.override(1501, 1502, 1103, 1504)
     companion.advance(0.05)
     assert companion.channels()[:4] == (1501, 1502, 1103, 1504)
@@ -13,7 +19,6 @@ def test_an_override_shows_in_rc_channels(companion):
 
 @pytest.mark.parametrize("value", [1, 900, 2500, 32767, 40000, 65534])
 def test_overrides_have_no_range_check(companion, value):
-    companion.stream(mav.MAVLINK_MSG_ID_RC_CHANNELS, 100)
     companion.override(value)
     companion.advance(0.05)
     assert companion.channels()[0] == value
@@ -21,7 +26,6 @@ def test_overrides_have_no_range_check(companion, value):
 
 @pytest.mark.parametrize(("system_id", "target"), [(42, 1), (254, 1), (1, 1), (255, 2), (255, 99)])
 def test_overrides_of_others_are_ignored(companion, system_id, target):
-    companion.stream(mav.MAVLINK_MSG_ID_RC_CHANNELS, 100)
     before = companion.channels()
     companion.override(1777, system_id=system_id, target=target)
     companion.advance(0.05)
@@ -29,7 +33,6 @@ def test_overrides_of_others_are_ignored(companion, system_id, target):
 
 
 def test_the_gcs_sysid_parameter_decides_at_once(companion):
-    companion.stream(mav.MAVLINK_MSG_ID_RC_CHANNELS, 100)
     companion.set_param("MAV_GCS_SYSID", 42)
     companion.override(1601, system_id=42)
     companion.advance(0.05)
@@ -39,7 +42,6 @@ def test_the_gcs_sysid_parameter_decides_at_once(companion):
 
 
 def test_zero_releases_at_once_and_65535_changes_nothing(companion):
-    companion.stream(mav.MAVLINK_MSG_ID_RC_CHANNELS, 100)
     companion.override(1700, 1600)
     companion.advance(0.05)
     companion.override(0, 65535)
@@ -49,7 +51,6 @@ def test_zero_releases_at_once_and_65535_changes_nothing(companion):
 
 @pytest.mark.parametrize(("override_time_s", "low_s", "high_s"), [(3.0, 3.0, 3.1), (0.5, 0.5, 0.6)])
 def test_an_override_expires(companion, override_time_s, low_s, high_s):
-    companion.stream(mav.MAVLINK_MSG_ID_RC_CHANNELS, 100)
     companion.set_param("RC_OVERRIDE_TIME", override_time_s)
     sent_ns = companion.peer.now_ns()
     companion.override(1700)
@@ -59,7 +60,6 @@ def test_an_override_expires(companion, override_time_s, low_s, high_s):
 
 
 def test_ignored_fields_do_not_keep_an_override_alive(companion):
-    companion.stream(mav.MAVLINK_MSG_ID_RC_CHANNELS, 100)
     companion.override(1700)
     for _ in range(160):
         companion.override()
@@ -69,7 +69,6 @@ def test_ignored_fields_do_not_keep_an_override_alive(companion):
 
 @pytest.mark.parametrize("override_time_s", [0.0, -1.0])
 def test_override_time_zero_refuses_and_minus_one_never_expires(companion, override_time_s):
-    companion.stream(mav.MAVLINK_MSG_ID_RC_CHANNELS, 100)
     companion.set_param("RC_OVERRIDE_TIME", override_time_s)
     companion.override(1700)
     companion.advance(3.5 if override_time_s else 0.5)

@@ -16,7 +16,7 @@ from helpers.copter_companion import (
     RTL,
     velocity,
 )
-from sitl.rotation import from_euler
+from sitl.vehicle.rotation import from_euler
 
 ATTITUDE_MASK, RATES_MASK = 7, 128
 HOLD_HEIGHT = 0.5  # thrust without bit 3 of GUID_OPTIONS
@@ -33,9 +33,9 @@ def attitude(roll_deg=0.0, yaw_deg=0.0, *, thrust=HOLD_HEIGHT, mask=ATTITUDE_MAS
     return mav.MAVLink_set_attitude_target_message(0, 1, 1, mask, q, 0.0, 0.0, 0.0, thrust)
 
 
-def rates(roll_degps=0.0, yaw_degps=0.0, *, thrust=HOLD_HEIGHT, mask=RATES_MASK):
-    body = (math.radians(roll_degps), 0.0, math.radians(yaw_degps))
-    return mav.MAVLink_set_attitude_target_message(0, 1, 1, mask, [0.0] * 4, *body, thrust)
+def rates(roll_degps=0.0, *, mask=RATES_MASK):
+    body = (math.radians(roll_degps), 0.0, 0.0)
+    return mav.MAVLink_set_attitude_target_message(0, 1, 1, mask, [0.0] * 4, *body, HOLD_HEIGHT)
 
 
 def stream(companion, message, seconds, system_id=255):
@@ -90,7 +90,7 @@ def test_a_lean_is_reached_in_its_time_and_beyond_angle_max(flying, mode):
 
 
 @pytest.mark.parametrize("mode", [GUIDED, GUIDED_NOGPS])
-def test_setpoints_of_anybody_are_taken_without_a_word(flying, mode):
+def test_setpoints_of_any_system_are_followed_without_an_answer(flying, mode):
     in_the_air(flying, mode)
     heading = yaw_deg(flying.advance(0.1))
     messages = stream(flying, attitude(10.0, heading), 1.0, system_id=42)
@@ -156,7 +156,9 @@ def test_a_stream_that_stops_is_held_and_resumes_at_once(flying, mode):
     ("options", "thrust", "climb_mps"),
     [(0, 0.5, 0.0), (0, 0.6, 0.5), (0, 0.0, -1.5), (8, 1.0, 3.0)],
 )
-def test_thrust_is_a_climb_rate_unless_an_option_says_otherwise(flying, options, thrust, climb_mps):
+def test_thrust_is_a_climb_rate_unless_an_option_makes_it_a_collective(
+    flying, options, thrust, climb_mps
+):
     in_the_air(flying, GUIDED_NOGPS)
     flying.set_param("GUID_OPTIONS", options)
     messages = stream(flying, attitude(thrust=thrust), 0.6 if options else 2.5)
@@ -260,7 +262,7 @@ def test_a_takeoff_ends_at_its_height_alt_hold_keeps_it_and_land_disarms_on_the_
     assert start - last(landing, "LOCAL_POSITION_NED").z < 1.0
 
 
-def test_attitude_target_is_the_shaped_target_and_tells_the_thrust(flying):
+def test_attitude_target_has_the_shaped_target_and_the_thrust(flying):
     for message_id in STREAMED:
         flying.stream(message_id, 100)
     # After a flight that was ended in the air the firmware keeps its last thrust; the mock has 0.

@@ -66,7 +66,7 @@ class Console:
         self._process.stdin.flush()
 
     def has(self, text: str, timeout_s: float) -> bool:
-        """Whether the text appears in what is said from now on."""
+        """True if the text appears in the output from now on."""
         self.seen = ""
         end_ns = self._clock.now_ns() + round(timeout_s * NS_PER_S)
         with selectors.DefaultSelector() as selector:

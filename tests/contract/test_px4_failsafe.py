@@ -1,4 +1,4 @@
-"""What PX4 does when sticks or setpoints stop, and who gets the vehicle back."""
+"""Loss of sticks or setpoints on PX4, and the takeover after it."""
 
 import math
 
@@ -35,6 +35,17 @@ def goes_to(px4, mode, within_s, send=lambda _: None):
     return took_s
 
 
+def take_off_by_setpoints(px4):
+    """Arm and climb in OFFBOARD, without sticks."""
+    px4.track()
+    px4.get_ready(LOITER)
+    px4.advance(1.0)
+    px4.stream_setpoint(attitude_target(thrust=0.0), 0.3)
+    assert px4.set_mode(OFFBOARD) == ACCEPTED
+    assert px4.arm() == ACCEPTED
+    px4.stream_setpoint(attitude_target(thrust=0.65), 4.0)
+
+
 def send_mid(px4):
     return lambda _: px4.sticks(MID)
 
@@ -42,14 +53,12 @@ def send_mid(px4):
 @pytest.mark.parametrize(("gap_s", "fails"), [(0.3, False), (0.5, False), (0.8, True)])
 def test_a_short_gap_is_forgiven(px4_flying, gap_s, fails):
     px4_flying.refill_delay()
-    px4_flying.fly(0.1)
     px4_flying.advance(gap_s)
     assert px4_flying.hears(HOLD_TEXT, 1.0, send_mid(px4_flying)) == fails
 
 
 def test_lost_sticks_are_held_then_hold_then_return(px4_flying):
     px4_flying.refill_delay()
-    px4_flying.fly(0.1)
     px4_flying.fly(1.0, LEANING)
     held_s, messages = px4_flying.until(
         lambda m: any(x.custom_mode == custom(LOITER) for x in modes_in(m)), 2.0
@@ -67,7 +76,6 @@ def test_lost_sticks_are_held_then_hold_then_return(px4_flying):
 
 def test_returning_sticks_do_not_give_the_mode_back(px4_flying):
     px4_flying.refill_delay(2.0)
-    px4_flying.fly(0.1)
     goes_to(px4_flying, LOITER, 2.0)
     assert goes_to(px4_flying, RTL, 7.0, send_mid(px4_flying)) <= 2.6
     px4_flying.fly(1.0)
@@ -76,7 +84,6 @@ def test_returning_sticks_do_not_give_the_mode_back(px4_flying):
 
 def test_a_mode_command_ends_the_failsafe(px4_flying):
     px4_flying.refill_delay(2.0)
-    px4_flying.fly(0.1)
     goes_to(px4_flying, LOITER, 2.0)
     assert px4_flying.set_mode(ALTCTL) == REJECTED, "it needs sticks"
     assert px4_flying.set_mode(LOITER) == ACCEPTED
@@ -90,7 +97,6 @@ def test_a_mode_command_ends_the_failsafe(px4_flying):
 
 def test_moving_the_sticks_takes_the_return_over_in_posctl(px4_flying):
     px4_flying.refill_delay(1.0)
-    px4_flying.fly(0.1)
     goes_to(px4_flying, RTL, 8.0)
     px4_flying.fly(0.5)
 
@@ -105,20 +111,13 @@ def test_moving_the_sticks_takes_the_return_over_in_posctl(px4_flying):
 
 def test_the_loss_time_is_a_parameter(px4_flying):
     px4_flying.refill_delay()
-    px4_flying.fly(0.1)
     px4_flying.change("COM_RC_LOSS_T", 2.0)
     px4_flying.fly(0.2)
     assert 1.9 <= goes_to(px4_flying, LOITER, 4.0) <= 2.4
 
 
 def test_sticks_that_were_never_there_are_not_missed(px4_grounded):
-    px4_grounded.track()
-    px4_grounded.get_ready(LOITER)
-    px4_grounded.advance(1.0)
-    px4_grounded.stream_setpoint(attitude_target(thrust=0.0), 0.3)
-    assert px4_grounded.set_mode(OFFBOARD) == ACCEPTED
-    assert px4_grounded.arm() == ACCEPTED
-    px4_grounded.stream_setpoint(attitude_target(thrust=0.6), 4.0)
+    take_off_by_setpoints(px4_grounded)
     assert px4_grounded.mode() == custom(OFFBOARD)
     assert not [text for text in px4_grounded.texts() if "Failsafe" in text]
 
@@ -163,13 +162,7 @@ def test_a_lost_stream_leaves_offboard_and_its_return_brings_it_back(px4_flying)
 
 
 def test_without_sticks_a_lost_stream_returns_at_once(px4_grounded):
-    px4_grounded.track()
-    px4_grounded.get_ready(LOITER)
-    px4_grounded.advance(1.0)
-    px4_grounded.stream_setpoint(attitude_target(thrust=0.0), 0.3)
-    assert px4_grounded.set_mode(OFFBOARD) == ACCEPTED
-    assert px4_grounded.arm() == ACCEPTED
-    px4_grounded.stream_setpoint(attitude_target(thrust=0.65), 4.0)
+    take_off_by_setpoints(px4_grounded)
     assert 0.95 <= goes_to(px4_grounded, RTL, 2.0) <= 1.25
     assert px4_grounded.hears("Failsafe activated")
 

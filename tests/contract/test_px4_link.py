@@ -23,15 +23,7 @@ FAILED, UNSUPPORTED = mav.MAV_RESULT_FAILED, mav.MAV_RESULT_UNSUPPORTED
 SET_INTERVAL = mav.MAV_CMD_SET_MESSAGE_INTERVAL
 
 
-def test_heartbeat_names_a_quadrotor_with_px4(px4):
-    heartbeat = px4.wait("HEARTBEAT")
-    assert (heartbeat.get_srcSystem(), heartbeat.get_srcComponent()) == (1, 1)
-    assert heartbeat.type == mav.MAV_TYPE_QUADROTOR
-    assert heartbeat.autopilot == mav.MAV_AUTOPILOT_PX4
-    assert heartbeat.get_msgbuf()[0] == 0xFD
-
-
-def test_heartbeats_stay_at_one_hertz_whatever_is_asked_or_changes(px4):
+def test_heartbeats_stay_at_one_hertz(px4):
     assert px4.command(SET_INTERVAL, mav.MAVLINK_MSG_ID_HEARTBEAT, 100_000) == FAILED
 
     def change_modes(elapsed_s: float) -> None:
@@ -43,7 +35,7 @@ def test_heartbeats_stay_at_one_hertz_whatever_is_asked_or_changes(px4):
     assert len(named(messages, "HEARTBEAT")) == pytest.approx(3, abs=1)
 
 
-def test_current_mode_tells_a_change_at_once_and_twice_a_second_otherwise(px4):
+def test_current_mode_comes_at_a_change_and_twice_a_second(px4):
     px4.set_mode(LOITER)
     assert px4.stream(CURRENT_MODE, 50) == ACCEPTED
     px4.advance(1.0)
@@ -75,7 +67,7 @@ def test_the_version_comes_on_request(px4):
         (mav.MAVLINK_MSG_ID_EXTENDED_SYS_STATE, 50, 44, 56),  # by arrival: it has no stamp
     ],
 )
-def test_state_comes_at_the_rate_asked_for_up_to_its_topics(
+def test_state_streams_at_the_requested_rate_up_to_that_of_its_topic(
     px4, message_id, asked_hz, low_hz, high_hz
 ):
     assert px4.stream(message_id, asked_hz) == ACCEPTED
@@ -92,19 +84,11 @@ def test_state_comes_at_the_rate_asked_for_up_to_its_topics(
 
 
 @pytest.mark.parametrize("message_id", [0, 27, 35, 60_000])
-def test_what_cannot_be_streamed_fails(px4, message_id):
+def test_a_message_that_cannot_be_streamed_fails(px4, message_id):
     assert px4.stream(message_id, 10) == FAILED
 
 
-def test_minus_one_stops_a_stream(px4):
-    px4.stream(mav.MAVLINK_MSG_ID_ATTITUDE, 100)
-    px4.wait("ATTITUDE")
-    assert px4.command(SET_INTERVAL, mav.MAVLINK_MSG_ID_ATTITUDE, -1) == ACCEPTED
-    px4.advance(0.1)
-    assert not named(px4.advance(0.5), "ATTITUDE")
-
-
-def test_the_interval_is_told(px4):
+def test_the_interval_is_reported(px4):
     px4.stream(mav.MAVLINK_MSG_ID_ATTITUDE, 50)
     px4.send(
         mav.MAVLink_command_long_message(
@@ -115,34 +99,13 @@ def test_the_interval_is_told(px4):
     assert (interval.message_id, interval.interval_us) == (mav.MAVLINK_MSG_ID_ATTITUDE, 20_000)
 
 
-@pytest.mark.parametrize("system_id", [255, 42, 1])
-def test_commands_are_taken_from_any_system(px4, system_id):
-    result = px4.command(SET_INTERVAL, mav.MAVLINK_MSG_ID_ATTITUDE, 10_000, system_id=system_id)
-    assert result == ACCEPTED
-
-
 def test_an_integer_travels_as_its_bytes(px4):
     assert px4.get_int("COM_RC_IN_MODE") == 1
     px4.change("COM_RC_IN_MODE", 3)
     assert px4.get_int("COM_RC_IN_MODE") == 3
 
 
-def test_a_float_parameter_is_read_and_written(px4):
-    px4.change("COM_RC_LOSS_T", 2.0)
-    assert px4.get_param("COM_RC_LOSS_T") == 2.0
-
-
-@pytest.mark.parametrize("system_id", [255, 42])
-def test_timesync_echoes_the_request_in_the_clock_of_the_telemetry(px4, system_id):
-    px4.stream(mav.MAVLINK_MSG_ID_ATTITUDE, 100)
-    px4.send(mav.MAVLink_timesync_message(0, 123_456_789_012), system_id=system_id)
-    answer = px4.wait("TIMESYNC", where=lambda m: m.tc1 != 0 and m.ts1 == 123_456_789_012)
-    attitude = px4.wait("ATTITUDE")
-    assert answer.tc1 % 1000 == 0
-    assert attitude.time_boot_ms - answer.tc1 / 1e6 == pytest.approx(10.0, abs=50.0)
-
-
-def test_local_position_streams_and_the_estimator_tells_whether_it_is_one(px4):
+def test_local_position_streams_and_the_estimator_reports_its_validity(px4):
     px4.stream(mav.MAVLINK_MSG_ID_LOCAL_POSITION_NED, 50)
     px4.stream(mav.MAVLINK_MSG_ID_ESTIMATOR_STATUS, 5)
     px4.get_ready(POSCTL)

@@ -7,8 +7,13 @@ from pymavlink.dialects.v20 import ardupilotmega as mav
 
 from helpers.px4_companion import (
     ACCEPTED,
+    LAND,
+    LOITER,
+    MID,
     OFFBOARD,
+    TAKEOFF,
     attitude_target,
+    custom,
     named,
     rate_target,
     velocity_target,
@@ -57,7 +62,7 @@ def test_a_step_of_attitude_takes_as_long_as_measured(offboard):
 
 def test_rates_are_followed(offboard):
     offboard.stream_setpoint(attitude_target(yaw=heading(offboard)), 1.0, hz=100)
-    messages = offboard.stream_setpoint(rate_target(yaw=40.0), 1.5, hz=100)
+    messages = offboard.stream_setpoint(rate_target(40.0), 1.5, hz=100)
     rates = [math.degrees(m.yawspeed) for m in named(messages, "ATTITUDE")[-60:]]
     assert sum(rates) / len(rates) == pytest.approx(40.0, abs=5.0)
 
@@ -106,3 +111,32 @@ def test_the_position_target_echoes_a_velocity(offboard):
     echo = named(messages, "POSITION_TARGET_LOCAL_NED")[-1]
     assert (echo.vx, echo.vy, echo.vz) == pytest.approx((1.0, -0.5, -0.2), abs=0.01)
     assert math.degrees(echo.yaw_rate) == pytest.approx(20.0, abs=0.5)
+
+
+def has_said(text):
+    return lambda messages: any(text in m.text for m in named(messages, "STATUSTEXT"))
+
+
+def test_the_vehicle_takes_off_holds_and_lands_by_itself(px4_grounded):
+    px4_grounded.change("MPC_LAND_SPEED", 1.2)
+    px4_grounded.track()
+    px4_grounded.get_ready(LOITER)
+    ground = named(px4_grounded.seen, "LOCAL_POSITION_NED")[-1].z
+    assert px4_grounded.set_mode(TAKEOFF) == ACCEPTED
+    assert px4_grounded.arm() == ACCEPTED
+    px4_grounded.until(
+        lambda m: any(x.landed_state == 2 for x in named(m, "EXTENDED_SYS_STATE")),
+        20.0,
+        lambda _: px4_grounded.sticks(MID),
+    )
+    messages = px4_grounded.fly(2.0)
+    height = ground - named(messages, "LOCAL_POSITION_NED")[-1].z
+    assert px4_grounded.mode() == custom(LOITER)
+    assert height == pytest.approx(2.5, abs=0.8)
+    assert px4_grounded.set_mode(LAND) == ACCEPTED
+    px4_grounded.until(has_said("Landing detected"), 20.0, lambda _: px4_grounded.sticks(MID))
+    disarmed = has_said("Disarmed by landing")
+    took_s, _ = px4_grounded.until(disarmed, 5.0, lambda _: px4_grounded.sticks(MID))
+    assert 1.7 <= took_s <= 2.6
+    px4_grounded.fly(0.5)
+    assert px4_grounded.mode() == custom(LOITER), "the last one that can arm"

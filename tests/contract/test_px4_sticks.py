@@ -128,7 +128,7 @@ def test_throttle_down_and_full_yaw_arms_and_disarms(px4_armable):
     )
 
 
-def test_who_does_not_take_off_is_disarmed(px4_armable):
+def test_an_idle_vehicle_is_disarmed(px4_armable):
     px4_armable.change("COM_DISARM_PRFLT", 4.0)
     px4_armable.get_ready(ALTCTL)
     assert px4_armable.arm() == ACCEPTED

@@ -1,4 +1,4 @@
-"""What is left when the bridge lets go: modes, receivers, failsafes as measured on ArduCopter."""
+"""Flight after a release by the bridge, as measured on ArduCopter."""
 
 import math
 
@@ -43,7 +43,7 @@ def test_position_modes_stop_at_centred_sticks(flying, mode):
     assert math.dist(start, end) < 0.5
 
 
-def test_heartbeats_are_sent_as_often_as_asked(companion):
+def test_heartbeats_stream_at_the_requested_rate(companion):
     assert companion.stream(mav.MAVLINK_MSG_ID_HEARTBEAT, 10) == ACCEPTED
     companion.wait("HEARTBEAT")
     messages = companion.advance(2.0)

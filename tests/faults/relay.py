@@ -12,6 +12,7 @@ from typing import Any, NamedTuple
 from pymavlink.dialects.v20 import ardupilotmega as dialect
 
 from faults.link import LOOPBACK, Carrier, FaultyLink, LinkFaults
+from faults.props import Worker
 from faults.record import DITHER_US, NEUTRAL_US
 from sitl.clock import NS_PER_S, Clock
 
@@ -33,7 +34,6 @@ PX4_MODES = {
 """Main mode and sub-mode of PX4's ``custom_mode``, as MAV_CMD_DO_SET_MODE takes them."""
 FORCE = 21196
 """Parameter with which MAV_CMD_COMPONENT_ARM_DISARM disarms in the air."""
-JOIN_S = 5.0
 UNREADABLE = ("BAD_DATA", "UNKNOWN")
 """Types of messages that pymavlink's dialect lacks, such as PX4's CURRENT_MODE and EVENT."""
 IGNORED_US = 65535
@@ -140,11 +140,12 @@ class _Way:
         return min((link.due_ns or FOREVER_NS for link in self._links), default=FOREVER_NS)
 
 
-class Relay:
+class Relay(Worker):
     """Passes packets between the vehicle and the bridge, and keeps the bridge's messages."""
 
     def __init__(self, carrier: Carrier, clock: Clock) -> None:
         """``carrier`` leads to the bridge; the relay closes it."""
+        super().__init__("relay")
         self.carrier = carrier
         self._clock = clock
         self._vehicle: tuple[str, int] | None = None
@@ -157,8 +158,6 @@ class Relay:
         self._vehicles = _parser(VEHICLE[0])
         self._station = dialect.MAVLink(None, srcSystem=PILOTS_STATION, srcComponent=190)
         self._joystick = dialect.MAVLink(None, srcSystem=BRIDGE, srcComponent=190)
-        self._stop = threading.Event()
-        self._thread = threading.Thread(target=self._run, name="relay")
         self._news = threading.Condition()
         self.sent: list[Sent] = []
         self.overrides: list[Override] = []
@@ -167,13 +166,8 @@ class Relay:
         """Set once the vehicle has sent something, so that its address is known."""
         self.port: int = self._socket.getsockname()[1]
 
-    def __enter__(self) -> "Relay":
-        self._thread.start()
-        return self
-
     def __exit__(self, *_: object) -> None:
-        self._stop.set()
-        self._thread.join(JOIN_S)
+        super().__exit__()
         self._socket.close()
         self.carrier.close()
 

@@ -44,8 +44,6 @@ class Scenario:
     """``Code`` of a reason, in the bridge's report, for which the policy lost the sticks."""
     says: str = ""
     """Text that the bridge prints if no reason tells: a warning, refusal or foreign error."""
-    modes: list[str] = field(default_factory=list)
-    """Allowed first mode after the fault; empty: any or none."""
     receivers: list[Receiver] = field(default_factory=list)
     """Empty: mid and none, and also idle if the policy loses the sticks and the bridge ends it."""
     autopilots: list[AutopilotName] = field(default_factory=lambda: ["ardupilot", "px4"])
@@ -113,15 +111,25 @@ class Variant:
         return "ALT_HOLD" if self.autopilot == "ardupilot" else "ALTCTL"
 
 
-def load_catalogue(folder: Path = CATALOGUE) -> dict[str, Scenario]:
-    """Return all scenarios by name, in the order of the files; raise UsageError if invalid."""
-    files = sorted(folder.glob("*.toml"))
+def load_catalogue() -> dict[str, Scenario]:
+    """Return all scenarios by name, in the order of the files; raise UsageError if invalid.
+
+    ``[default]`` holds keys of all scenarios of its file, and ``like`` names one whose keys a
+    scenario takes over. A scenario's own keys replace both.
+    """
+    files = sorted(CATALOGUE.glob("*.toml"))
     return {scenario.name: scenario for path in files for scenario in _read(path)}
 
 
 def _read(path: Path) -> Iterator[Scenario]:
-    for name, table in tomllib.loads(path.read_text()).items():
+    tables = tomllib.loads(path.read_text())
+    default = tables.pop("default", {})
+    for name, own in tables.items():
         where = f"{path.name}: [{name}]"
+        like = own.pop("like", name)
+        if like not in tables or "like" in tables[like]:
+            raise UsageError(f"{where}: like = {like!r} is no earlier scenario of this file")
+        table = default | tables[like] | own
         for key in ("steps", "before"):
             table[key] = tuple(make_step(step, where) for step in table.get(key, []))
         try:

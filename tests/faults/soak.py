@@ -3,6 +3,7 @@
 import json
 import random
 import signal
+import tomllib
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -12,7 +13,7 @@ from typing import NamedTuple
 from faults.processes import StageError, status_of
 from faults.props import Transmitter
 from faults.stage import ORDERLY, Stage, faulty_policy, free_port, staged
-from faults.steps import make_step
+from faults.steps import Step, make_step
 from helpers.flight_logs import logged_overrides
 from mavbridge.core.reasons import Code, because
 from sitl.clock import NS_PER_S
@@ -51,48 +52,19 @@ ENGAGE_TRIES = 6
 
 
 class Fault(NamedTuple):
-    """A fault after which the pilot's switch can engage the policy again."""
+    """A fault of ``soak.toml``."""
 
-    steps: tuple[dict[str, object], ...]
-    loses: bool = True
-    """True if the policy must lose the sticks, False if it must keep them."""
-
-
-def _wait(s: float) -> dict[str, object]:
-    return {"do": "wait", "s": s}
+    steps: tuple[Step, ...]
+    keeps: bool
 
 
-WHOLE: dict[str, object] = {"do": "link"}
-FAULTS = {
-    "silence of the vehicle": Fault(({"do": "silence", "way": "to_bridge", "s": 1.0},)),
-    "silence of both": Fault(({"do": "silence", "s": 1.5},)),
-    "the pilot's mode": Fault(({"do": "pilot", "act": "mode", "mode": "LOITER"},)),
-    "images gone": Fault(
-        ({"do": "images", "show": "gone"}, _wait(1.0), {"do": "images", "show": "none"})
-    ),
-    "images frozen": Fault(
-        ({"do": "images", "show": "frozen"}, _wait(3.0), {"do": "images", "show": "none"})
-    ),
-    "stopped": Fault(
-        (
-            {"do": "signal", "name": "SIGSTOP", "to": "group"},
-            _wait(1.0),
-            {"do": "signal", "name": "SIGCONT", "to": "group"},
-        )
-    ),
-    "joystick on our id": Fault(({"do": "joystick", "hz": 50, "s": 1.5},)),
-    "no attitude": Fault(
-        (
-            {"do": "messages", "names": ["ATTITUDE", "ATTITUDE_QUATERNION"]},
-            _wait(1.0),
-            {"do": "whole messages"},
-        )
-    ),
-    "loss": Fault(
-        ({"do": "link", "loss": 0.2, "duplicate": 0.2, "reorder": 0.2}, _wait(3.0), WHOLE), False
-    ),
-    "corruption": Fault(({"do": "link", "corrupt": 0.2}, _wait(2.0), WHOLE), False),
-}
+def load_faults() -> dict[str, Fault]:
+    """Return the faults of a soak by name."""
+    tables = tomllib.loads(Path(__file__).with_suffix(".toml").read_text())
+    return {
+        name: Fault(tuple(make_step(step, name) for step in table["steps"]), "keeps" in table)
+        for name, table in tables.items()
+    }
 
 
 @dataclass(kw_only=True)
@@ -158,19 +130,20 @@ def _fly(
     """Break the flight repeatedly; return the usage of both processes after each fault."""
     pids = {"flight": stage.bridge_pid, "guard": stage.guard.pid}
     usages: dict[str, list[Usage]] = {name: [] for name in pids}
+    faults = list(load_faults().items())
     end_ns = stage.clock.now_ns() + round(minutes * 60 * NS_PER_S)
     while stage.clock.now_ns() < end_ns:
-        name, fault = chance.choice(list(FAULTS.items()))
+        name, fault = chance.choice(faults)
         result.faults[name] = result.faults.get(name, 0) + 1
-        for table in fault.steps:
-            make_step(table, name).perform(stage)
+        for step in fault.steps:
+            step.perform(stage)
         stage.observe(SETTLE_S)
         quiet_ns = stage.clock.now_ns() - QUIET_NS
         newest = stage.relay.newest_steering(LEANING_ROWS)
         has_lost = not any(sent.leans for sent in newest if sent.at_ns > quiet_ns)
-        if fault.loses and not has_lost:
+        if not fault.keeps and not has_lost:
             result.failures.append(f"{name}: the policy kept the sticks")
-        if has_lost and not fault.loses:
+        if has_lost and fault.keeps:
             result.stalls += 1  # a busy machine, or a lasting loss: the flight ended in order
         result.sent += stage.relay.forget()
         if has_lost:

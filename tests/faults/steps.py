@@ -159,9 +159,9 @@ def pilot(stage: Stage, *, act: str, mode: str = "") -> int:
     return {"arm": relay.arm, "disarm": relay.disarm}[act]()
 
 
-def joystick(stage: Stage, *, hz: float, s: float, roll_us: int = 1400) -> int:
+def joystick(stage: Stage, *, hz: float, s: float) -> int:
     """Send sticks of another program with the bridge's system id; return the first's time."""
-    sticks = Override(roll=roll_us, pitch=1500, throttle=1500, yaw=1500)
+    sticks = Override(roll=1400, pitch=1500, throttle=1500, yaw=1500)
     began_ns = stage.relay.move_joystick(sticks, is_manual=stage.is_px4)
     for _ in range(round(s * hz)):
         stage.observe(1 / hz)
@@ -186,10 +186,10 @@ def switch(stage: Stage, *, channel: int, us: int) -> int:
     return at_ns
 
 
-def radio(stage: Stage, *, lost: bool = True) -> int:
-    """Cut the transmitter's signal to the receiver, or restore it."""
+def radio(stage: Stage) -> int:
+    """Cut the transmitter's signal to the receiver."""
     at_ns = stage.clock.now_ns()
-    stage.transmitter.switch_off() if lost else stage.transmitter.switch_on()
+    stage.transmitter.switch_off()
     return at_ns
 
 

@@ -128,8 +128,6 @@ def _judge_loss(
         late.append(f"last stick of the policy after {last_ms:.0f} ms, not {limit_ms:.0f}")
     if measured.flew_again and not others:
         verdict.wrong.append(f"the policy flew again, until {measured.final_safe_ms:.0f} ms")
-    if scenario.modes and measured.mode not in scenario.modes:
-        late.append(f"mode {measured.mode}, not {' or '.join(scenario.modes)}")
     has_release = variant.autopilot == "ardupilot" and variant.receiver != "none"
     if has_release and scenario.releases and any(stage.relay.overrides[-1]):
         late.append(f"the last sticks are no release: {stage.relay.overrides[-1]}")

@@ -82,7 +82,7 @@ class Datagrams:
         self._numbers = None if is_all else tuple(self._draw.choice(_READ) for _ in range(few))
 
     def foreign(self) -> bytes:
-        """Garbage, or a message of anybody but component 1 of system 1."""
+        """Garbage, or a message of any sender but component 1 of system 1."""
         return self._draw.choice(self._foreign)(self._stranger())[:MOST_BYTES]
 
     def own(self) -> bytes:
@@ -196,7 +196,7 @@ class Datagrams:
                 del data[self._draw.randrange(len(data)) :]
             case 4:
                 data += self._draw.randbytes(self._draw.choice((1, 13, 40)))
-            case 5:  # says that it is signed, or has flags that nobody knows
+            case 5:  # signed flag without a signature, or unknown flags
                 data[2] = self._draw.choice((1, 2, 255))
                 data += self._draw.randbytes(self._draw.choice((0, 13)))
         return bytes(data)

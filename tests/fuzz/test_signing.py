@@ -6,5 +6,5 @@ from fuzz.signed_target import fuzz_signing
 
 
 @pytest.mark.parametrize("seed", range(2))
-def test_nothing_is_taken_but_what_the_holder_of_the_key_has_signed_and_once(seed: int) -> None:
+def test_only_packets_signed_with_the_key_are_accepted_and_each_once(seed: int) -> None:
     fuzz_signing(seed, 10_000)

@@ -70,7 +70,7 @@ class CopterCompanion(Companion):
                 return
         raise AssertionError(f"the vehicle does not get ready to arm: {self.texts()}")
 
-    def fly_up(self, mode: int = ALT_HOLD, height_m: float = HEIGHT_M) -> None:
+    def fly_up(self, mode: int = ALT_HOLD) -> None:
         """Reach a height, level and still, in this mode; neutral sticks have just been sent."""
         for message_id in (
             mav.MAVLINK_MSG_ID_ATTITUDE,
@@ -83,28 +83,28 @@ class CopterCompanion(Companion):
         if self.in_the_air:
             assert self.set_mode(GUIDED) == ACCEPTED
         else:
-            self._take_off(height_m)
-        self._settle(height_m)
+            self._take_off()
+        self._settle()
         assert self.set_mode(mode) == ACCEPTED
 
     def texts(self) -> list[str]:
         """Return the status texts since ``seen`` was cleared."""
         return [m.text for m in named(self.seen, "STATUSTEXT")]
 
-    def _take_off(self, height_m: float) -> None:
+    def _take_off(self) -> None:
         self.get_ready(GUIDED, needs_position=True)
         assert self.arm() == ACCEPTED, self.texts()
-        assert self.command(mav.MAV_CMD_NAV_TAKEOFF, *[0] * 6, height_m) == ACCEPTED
+        assert self.command(mav.MAV_CMD_NAV_TAKEOFF, *[0] * 6, HEIGHT_M) == ACCEPTED
         for _ in range(150):
-            if any(m.z < 1.0 - height_m for m in named(self.hold(0.1), "LOCAL_POSITION_NED")):
+            if any(m.z < 1.0 - HEIGHT_M for m in named(self.hold(0.1), "LOCAL_POSITION_NED")):
                 return
         raise AssertionError("the vehicle does not take off")
 
-    def _settle(self, height_m: float) -> None:
+    def _settle(self) -> None:
         for _ in range(400):
             self.override(1500, 1500, 1500, 1500)
             for state in named(self.advance(0.05), "LOCAL_POSITION_NED")[-1:]:
-                too_low_m = height_m + state.z
+                too_low_m = HEIGHT_M + state.z
                 speeds_mps = (abs(state.vx), abs(state.vy), abs(state.vz))
                 is_there = -TOO_HIGH_M < too_low_m < TOO_LOW_M
                 if is_there and max(speeds_mps) < STILL_MPS:
@@ -135,28 +135,11 @@ class CopterCompanion(Companion):
 
 def velocity(
     x: float = 0.0,
-    y: float = 0.0,
     z: float = 0.0,
     *,
     yaw_degps: float = 0.0,
     frame: int = mav.MAV_FRAME_LOCAL_NED,
 ) -> Any:
     """Return SET_POSITION_TARGET_LOCAL_NED with only a velocity in m/s and a yaw rate in deg/s."""
-    return mav.MAVLink_set_position_target_local_ned_message(
-        0,
-        1,
-        1,
-        frame,
-        VELOCITY_MASK,
-        0,
-        0,
-        0,
-        x,
-        y,
-        z,
-        0,
-        0,
-        0,
-        0,
-        math.radians(yaw_degps),
-    )
+    motion = (*[0] * 3, x, 0, z, *[0] * 4, math.radians(yaw_degps))
+    return mav.MAVLink_set_position_target_local_ned_message(0, 1, 1, frame, VELOCITY_MASK, *motion)

@@ -9,8 +9,8 @@ import numpy as np
 from sitl.ardupilot.flight_modes import Mode
 from sitl.clock import NS_PER_S
 from sitl.course import AirborneStart, Course
-from sitl.expert.demonstrator import Expert, StickPositions
-from sitl.expert.disturbance import Disturbance
+from sitl.pilot.demonstrator import Expert, StickPositions
+from sitl.pilot.disturbance import Disturbance
 from sitl.simulated_vehicle import Pose, SimulatedVehicle
 from sitl.vehicle.conditions import NOMINAL, Conditions
 from sitl.vehicle.config import STEP_NS, VehicleConfig
@@ -18,6 +18,7 @@ from sitl.vehicle.config import STEP_NS, VehicleConfig
 TICK_NS = NS_PER_S // 100
 REST_S = 3.0
 """Flight time after the last gate."""
+LIMIT_S = 60.0
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -74,7 +75,6 @@ def fly_course(
     conditions: Conditions = NOMINAL,
     start: AirborneStart | None = None,
     disturbance: Disturbance | None = None,
-    limit_s: float = 60.0,
 ) -> CourseFlight:
     config = VehicleConfig(estimator_ready_s=0.0, position_ready_s=0.0, conditions=conditions)
     vehicle = SimulatedVehicle(links=1, boot_ns=0, config=config, course=course)
@@ -89,7 +89,7 @@ def fly_course(
     ticks: list[Tick] = []
     over_ns = None
     begin_ns = now_ns = vehicle.ap.now_ns
-    while not vehicle.log.crashed and now_ns - begin_ns < limit_s * NS_PER_S:
+    while not vehicle.log.crashed and now_ns - begin_ns < LIMIT_S * NS_PER_S:
         pose, next_gate = vehicle.pose, vehicle.log.next_gate
         if next_gate is None:
             over_ns = over_ns or now_ns + round(REST_S * NS_PER_S)

@@ -48,5 +48,5 @@ class Ends:
         acks = [m for m in self.run(0.01, link=link) if m.get_type() == "COMMAND_ACK"]
         return acks[-1].result if acks else None
 
-    def gcs_heartbeat(self, link=0):
-        self.send(mav.MAVLink_heartbeat_message(mav.MAV_TYPE_GCS, 8, 0, 0, 0, 3), link)
+    def gcs_heartbeat(self):
+        self.send(mav.MAVLink_heartbeat_message(mav.MAV_TYPE_GCS, 8, 0, 0, 0, 3))

@@ -26,8 +26,8 @@ from sitl.course import AirborneStart
 from sitl.px4.autopilot import Px4
 from sitl.px4.flight import PositionSetpoint
 from sitl.px4.modes import Mode as Px4Mode
-from sitl.rotation import Quat, cos_tilt
 from sitl.vehicle.config import MID_RECEIVER_US, AutopilotName, Px4Release
+from sitl.vehicle.rotation import Quat, cos_tilt
 
 LEANING = Program(motion=lambda _: Motion(push=Push("roll", 0.5)))
 """Lean 15 degrees to the right, or fly 2 m/s to the right: far from neutral in every record."""

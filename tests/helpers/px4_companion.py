@@ -9,7 +9,7 @@ from pymavlink.dialects.v20 import ardupilotmega as mav
 
 from helpers.contract_peers import ARM, GCS, TICK_NS, Companion, Peer, named
 from sitl.clock import NS_PER_S
-from sitl.rotation import from_euler
+from sitl.vehicle.rotation import from_euler
 
 ACCEPTED, REJECTED = mav.MAV_RESULT_ACCEPTED, mav.MAV_RESULT_TEMPORARILY_REJECTED
 ALTCTL, POSCTL, ACRO, OFFBOARD, STAB = (2, 0), (3, 0), (5, 0), (6, 0), (7, 0)
@@ -49,19 +49,15 @@ def event_id(message: Any) -> int:
     return int(number)
 
 
-def attitude_target(
-    roll_deg: float = 0.0, thrust: float = HOVER_THRUST, pitch_deg: float = 0.0, yaw: float = 0.0
-) -> Any:
-    q = from_euler(math.radians(roll_deg), math.radians(pitch_deg), yaw)
+def attitude_target(roll_deg: float = 0.0, thrust: float = HOVER_THRUST, yaw: float = 0.0) -> Any:
+    q = from_euler(math.radians(roll_deg), 0.0, yaw)
     return mav.MAVLink_set_attitude_target_message(0, 1, 1, 7, q, 0, 0, 0, thrust)
 
 
-def rate_target(
-    roll: float = 0.0, pitch: float = 0.0, yaw: float = 0.0, thrust: float = HOVER_THRUST
-) -> Any:
-    """Return a setpoint of body rates in deg/s."""
-    rates = [math.radians(v) for v in (roll, pitch, yaw)]
-    return mav.MAVLink_set_attitude_target_message(0, 1, 1, 128, [1, 0, 0, 0], *rates, thrust)
+def rate_target(yaw_degps: float) -> Any:
+    """Return a setpoint of body rates."""
+    rates = (0, 0, math.radians(yaw_degps), HOVER_THRUST)
+    return mav.MAVLink_set_attitude_target_message(0, 1, 1, 128, [1, 0, 0, 0], *rates)
 
 
 def velocity_target(
@@ -244,6 +240,7 @@ class Px4Companion(Companion):
         PX4 does so when any parameter changes, so ``seconds`` is not exactly the default of 5 s.
         """
         self.change("COM_FAIL_ACT_T", seconds)
+        self.fly(0.1)
 
     def restore(self) -> None:
         """Leave the vehicle in the air in Hold, or disarmed on the ground."""

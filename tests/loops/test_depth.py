@@ -28,7 +28,7 @@ from policy.loading.load import load_policy
 from policy.loading.request import PolicyRequest
 from policy.protocol import PolicyRunner
 from sitl.camera.fpv import FpvRenderer
-from sitl.rotation import Quat, Vec3
+from sitl.vehicle.rotation import Quat, Vec3
 
 SIDE = 32
 HELD_M = 4.0

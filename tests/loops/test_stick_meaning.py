@@ -13,8 +13,8 @@ from mavbridge.core.clock import NS_PER_S
 from mavbridge.simulation.flight import SimulatedFlight, SimulationSettings
 from mavbridge.simulation.world import make_vehicle
 from policy.stick_loop import flown_by_rates
-from sitl.rotation import cos_tilt
 from sitl.vehicle.dynamics import BodyState
+from sitl.vehicle.rotation import cos_tilt
 
 CLIMB = (0.6, 0.0, 0.0, 0.0)
 STICKS = (-0.35, 0.3, 0.2, -0.3)

@@ -1,4 +1,4 @@
-"""What a flight has left behind is found and named."""
+"""Leftovers of a flight are found and named."""
 
 import subprocess
 import sys

@@ -1,4 +1,4 @@
-"""What a faulty link and a serial carrier do to packets, on a clock of the test."""
+"""Effect of a faulty link and of a serial carrier on packets, on a clock of the test."""
 
 import os
 import tty

@@ -43,7 +43,7 @@ def test_the_height_lost_is_that_of_the_lowest_point(
     assert found == Ending(mode="BRAKE", lost_m=lost_m, impact_mps=0.0)
 
 
-def test_a_landing_loses_no_height_and_is_told_by_its_touchdown() -> None:
+def test_a_landing_loses_no_height_and_reports_its_touchdown() -> None:
     sticks = (entry(1.0, 5.0), entry(1.1, 4.8), entry(1.2, 4.8, "LAND"), entry(9.0, 0.0, "LAND"))
     found = ending(report(*sticks, impact_mps=0.5), since_s=1.0, until_s=99.0)
     assert found.mode == "LAND"
@@ -51,5 +51,5 @@ def test_a_landing_loses_no_height_and_is_told_by_its_touchdown() -> None:
     assert found.impact_mps == 0.5
 
 
-def test_without_an_entry_after_the_end_the_final_mode_is_told() -> None:
+def test_without_an_entry_after_the_end_the_final_mode_counts() -> None:
     assert ending(report(entry(1.0, 5.0)), 2.0, 9.0) == Ending("LOITER", 0.0, 0.0)

@@ -11,7 +11,7 @@ import pytest
 from policy.contract import ActionKind
 from policy.scripted import ScriptedPolicy
 from policy.scripted.controllers import doublet_length_s, doublet_steps
-from sitl.rotation import from_euler
+from sitl.vehicle.rotation import from_euler
 
 STEP_S = 0.01
 DELAY_STEPS = 4

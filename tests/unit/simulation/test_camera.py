@@ -10,9 +10,9 @@ from mavbridge.core.clock import NS_PER_MS
 from mavbridge.core.records import ImageArray
 from mavbridge.simulation.clock import SteppedClock
 from mavbridge.simulation.world import MOUNTS, SimulatedCamera
-from sitl.rotation import IDENTITY, Quat, Vec3
 from sitl.simulated_vehicle import Pose
 from sitl.vehicle.dynamics import BodyState
+from sitl.vehicle.rotation import IDENTITY, Quat, Vec3
 
 BODY = BodyState(
     position_ned_m=(0.0, 0.0, -2.0),

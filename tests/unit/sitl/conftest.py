@@ -9,8 +9,8 @@ from sitl.ardupilot.autopilot import ArduCopter
 from sitl.ardupilot.flight_modes import Mode
 from sitl.ardupilot.params import ArduPilotParams
 from sitl.clock import NS_PER_S
-from sitl.rotation import to_euler
 from sitl.vehicle.config import STEP_NS, VehicleConfig
+from sitl.vehicle.rotation import to_euler
 
 STEPS_PER_STICK_UPDATE = 8
 
@@ -71,8 +71,3 @@ class Pilot:
 @pytest.fixture
 def pilot() -> Pilot:
     return Pilot(VehicleConfig())
-
-
-@pytest.fixture
-def pilot_without_receiver() -> Pilot:
-    return Pilot(VehicleConfig(receiver=False))

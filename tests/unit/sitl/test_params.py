@@ -34,19 +34,13 @@ def test_values_are_float32_and_travel_as_themselves(make, seconds):
 
 
 @BOTH
-@pytest.mark.parametrize("value", [math.nan, math.inf, -math.inf, 1e39])
-def test_what_is_no_float32_is_refused(make, seconds, value):
+def test_unknown_names_and_values_beyond_float32_are_refused(make, seconds):
     params = make()
     before = params[seconds]
 
-    assert not params.set(seconds, value)
+    for value in (math.nan, math.inf, -math.inf, 1e39):
+        assert not params.set(seconds, value)
     assert params[seconds] == before
-
-
-@BOTH
-def test_unknown_names_are_refused(make, seconds):
-    params = make()
-
     assert not params.set("SYSID_MYGCS", 1.0)
     assert "SYSID_MYGCS" not in params.names
 

@@ -1,4 +1,4 @@
-"""The flight log: what is counted, what is a crash, and the report as JSON."""
+"""Flight log: counts, sticks and crashes."""
 
 from itertools import pairwise
 

@@ -1,10 +1,13 @@
-"""Flying the simulated body through every mode, and what happens when pilot or ground are lost."""
+"""Modes, arming and failsafes of ArduCopter on the simulated body, without a link."""
 
 import math
+from dataclasses import replace
 
 import pytest
 
 from sitl.ardupilot.flight_modes import Mode
+from sitl.vehicle.conditions import NOMINAL
+from sitl.vehicle.config import VehicleConfig
 
 
 def test_stabilize_hovers_at_mid_stick_and_climbs_above(pilot):
@@ -53,46 +56,95 @@ def test_a_tipped_vehicle_stops_its_motors(pilot):
     assert not pilot.ap.armed
 
 
-def test_arming_waits_for_the_estimator(pilot):
-    pilot.hold(2.0, thr=1000)
-    assert not pilot.ap.arm(force=False)
-    assert pilot.texts() == ["Arm: AHRS: EKF3 not started"]
+@pytest.mark.parametrize(
+    ("seconds", "mode", "refusal"),
+    [
+        (2.0, Mode.STABILIZE, "AHRS: EKF3 not started"),
+        (4.0, Mode.LOITER, "Need Position Estimate"),
+        (4.0, Mode.POSHOLD, "Need Position Estimate"),
+        (6.0, Mode.LAND, "LAND mode not armable"),
+        (6.0, Mode.RTL, "RTL mode not armable"),
+        (6.0, Mode.BRAKE, "BRAKE mode not armable"),
+        (6.0, Mode.STABILIZE, None),
+    ],
+)
+def test_arming_is_refused_with_its_reason(pilot, seconds, mode, refusal):
+    pilot.hold(seconds, thr=1000)
+    assert pilot.ap.set_mode(mode)
 
-    pilot.hold(1.1, thr=1000)
-    assert pilot.ap.arm(force=False)
+    assert pilot.ap.arm(force=False) == (refusal is None)
+    assert pilot.texts() == ["Arming motors" if refusal is None else f"Arm: {refusal}"]
 
 
-@pytest.mark.parametrize("mode", [Mode.LAND, Mode.RTL, Mode.BRAKE])
-def test_automatic_modes_cannot_be_armed(pilot, mode):
-    pilot.hold(6.0, thr=1000)
-    pilot.ap.set_mode(mode)
+@pytest.mark.parametrize("mode", [Mode.BRAKE, Mode.LOITER, Mode.POSHOLD])
+def test_position_modes_stop_and_hold_in_the_wind(pilot, mode):
+    windy = replace(NOMINAL, wind_ned_mps=(4.0, 0.0, 0.0), gust_rms_mps=0.5)
+    pilot = type(pilot)(VehicleConfig(conditions=windy))
+    pilot.take_off()
+    pilot.hold(1.5, roll=1750)
+    start_m = pilot.height_m
+    assert math.hypot(*pilot.ap.truth.velocity_ned_mps) > 2.0
+    assert pilot.ap.set_mode(mode)
 
-    assert not pilot.ap.arm(force=False)
-    assert pilot.texts() == [f"Arm: {mode.name} mode not armable"]
+    pilot.hold(5.0)
+    stopped_ned_m = pilot.ap.truth.position_ned_m
+    pilot.hold(20.0)
+
+    assert math.dist(pilot.ap.truth.position_ned_m, stopped_ned_m) < 0.3
+    assert pilot.height_m == pytest.approx(start_m, abs=0.3)
 
 
-def test_radio_failsafe_without_position_lands(pilot_without_receiver):
-    pilot = pilot_without_receiver
-    pilot.hold(3.2, thr=1000)
-    pilot.ap.set_mode(Mode.ALT_HOLD)
-    assert pilot.ap.arm(force=False)
-    pilot.hold(0.7, thr=2000)
-    pilot.silence(1.05)
+def test_a_lost_position_levels_the_vehicle_and_refuses_position_modes(pilot):
+    pilot.take_off()
+    pilot.hold(1.0, roll=1700)
+    assert pilot.ap.set_mode(Mode.BRAKE)
+    pilot.ap.position_lost = True
 
-    assert pilot.ap.mode is Mode.LAND
+    pilot.hold(1.0)
+
+    assert pilot.angles_deg()[:2] == pytest.approx([0.0, 0.0], abs=0.5)
+    assert math.hypot(*pilot.ap.truth.velocity_ned_mps[:2]) > 1.0
+    assert pilot.ap.set_mode(Mode.ALT_HOLD)
+    for mode in (Mode.BRAKE, Mode.LOITER, Mode.POSHOLD, Mode.RTL, Mode.GUIDED):
+        assert not pilot.ap.set_mode(mode)
+        assert pilot.texts() == [f"Mode change to {mode.name} failed: requires position"]
 
 
 @pytest.mark.parametrize(
-    ("choice", "mode"), [(0, Mode.ALT_HOLD), (1, Mode.RTL), (3, Mode.LAND), (7, Mode.BRAKE)]
+    ("parameter", "choice", "mode"),
+    [
+        ("FS_THR_ENABLE", 0, Mode.ALT_HOLD),
+        ("FS_THR_ENABLE", 1, Mode.RTL),
+        ("FS_THR_ENABLE", 3, Mode.LAND),
+        ("FS_THR_ENABLE", 7, Mode.BRAKE),
+        ("FS_GCS_ENABLE", 1, Mode.RTL),
+        ("FS_GCS_ENABLE", 5, Mode.LAND),
+    ],
 )
-def test_fs_thr_enable_chooses_the_action(pilot_without_receiver, choice, mode):
-    pilot = pilot_without_receiver
-    pilot.ap.params.set("FS_THR_ENABLE", float(choice))
+def test_a_parameter_selects_the_mode_of_a_failsafe(pilot, parameter, choice, mode):
+    is_of_gcs = parameter == "FS_GCS_ENABLE"
+    pilot = type(pilot)(VehicleConfig(receiver=is_of_gcs))
+    pilot.ap.params.set(parameter, float(choice))
+    pilot.ap.params.set("FS_OPTIONS", 0.0)
     pilot.take_off()
+    pilot.ap.gcs_failsafe.on_contact(pilot.ap.now_ns)
 
-    pilot.silence(1.5)
+    pilot.silence(5.5 if is_of_gcs else 1.5)
 
     assert pilot.ap.mode is mode
+
+
+@pytest.mark.parametrize("lifts_off", [False, True])
+def test_a_radio_failsafe_on_the_ground_disarms_and_without_a_position_lands(pilot, lifts_off):
+    pilot = type(pilot)(VehicleConfig(receiver=False))
+    pilot.hold(3.2, thr=1000)
+    pilot.ap.set_mode(Mode.ALT_HOLD)
+    assert pilot.ap.arm(force=False)
+    pilot.hold(0.7, thr=2000 if lifts_off else 1000)
+    pilot.silence(1.05)
+
+    assert pilot.ap.armed == lifts_off
+    assert pilot.ap.mode is (Mode.LAND if lifts_off else Mode.ALT_HOLD)
 
 
 def test_the_transmitter_switched_off_is_a_radio_failsafe(pilot):
@@ -127,17 +179,6 @@ def test_the_mode_switch_acts_after_its_debounce_and_only_when_it_moves(pilot):
     assert pilot.ap.mode is Mode.ALT_HOLD
 
 
-def test_radio_failsafe_on_the_ground_disarms(pilot_without_receiver):
-    pilot = pilot_without_receiver
-    pilot.hold(3.5, thr=1000)
-    assert pilot.ap.arm(force=False)
-
-    pilot.silence(1.5)
-
-    assert not pilot.ap.armed
-    assert "Radio Failsafe - Disarming" in pilot.texts()
-
-
 def test_a_throttle_below_fs_thr_value_is_a_radio_failsafe_after_three_reads(pilot):
     pilot.take_off()
 
@@ -148,15 +189,3 @@ def test_a_throttle_below_fs_thr_value_is_a_radio_failsafe_after_three_reads(pil
     assert pilot.ap.mode is Mode.RTL
     pilot.hold(0.2)
     assert pilot.texts() == ["Radio Failsafe", "Radio Failsafe Cleared"]
-
-
-@pytest.mark.parametrize(("choice", "mode"), [(1, Mode.RTL), (5, Mode.LAND)])
-def test_gcs_failsafe_can_end_the_flight(pilot, choice, mode):
-    pilot.ap.params.set("FS_GCS_ENABLE", float(choice))
-    pilot.ap.params.set("FS_OPTIONS", 0.0)
-    pilot.take_off()
-    pilot.ap.gcs_failsafe.on_contact(pilot.ap.now_ns)
-
-    pilot.silence(5.5)
-
-    assert pilot.ap.mode is mode

@@ -28,25 +28,14 @@ def run(rc, start_ms, end_ms):
         rc.update(ms * NS_PER_MS)
 
 
-def test_ignore_overrides_option_works_live():
-    rc, params = engine()
+@pytest.mark.parametrize(
+    ("options", "channels_us"), [(0, [1700, 1500]), (1, [1700, 0]), (2, [1500, 1500])]
+)
+def test_options_ignore_receiver_or_overrides(options, channels_us):
+    rc, _ = engine(RC_OPTIONS=options)
     rc.override([1700] + [KEEP] * 7, 0)
     run(rc, 0, 50)
-    assert rc.channels_us[0] == 1700
-
-    params.set("RC_OPTIONS", 2.0)
-    run(rc, 50, 100)
-
-    assert rc.channels_us[0] == 1500
-
-
-def test_ignore_receiver_option_keeps_only_overrides():
-    rc, _ = engine(RC_OPTIONS=1.0)
-    assert not rc.update(0)
-    rc.override([1600] + [KEEP] * 7, 0)
-
-    assert rc.update(0)
-    assert rc.channels_us[:2] == [1600, 0]
+    assert rc.channels_us[:2] == channels_us
 
 
 def test_the_override_switch_cuts_overrides_after_its_debounce():
@@ -76,18 +65,6 @@ def test_manual_control_axes_can_be_absent_and_negative_thrust_is_refused():
     run(rc, 50, 100)
 
     assert rc.channels_us[:4] == [2000, 1500, 1000, 1000]
-
-
-def test_the_receiver_moves_at_its_next_frame():
-    rc, _ = engine()
-    rc.update(0)
-    rc.set_receiver([1600, 1500, 1400, 1500])
-    run(rc, 1, 20)
-    assert rc.channels_us[:4] == list(IDLE_RECEIVER_US[:4])
-
-    run(rc, 20, 21)
-
-    assert rc.channels_us[:8] == [1600, 1500, 1400, 1500, 1500, 1500, 1500, 1500]
 
 
 def test_a_receiver_may_turn_up_later():

@@ -7,17 +7,14 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from pymavlink.dialects.v20 import ardupilotmega as mav
 
-from sitl.ardupilot.endpoint import BUILDERS, ArduPilotStreams
+from helpers.contract_peers import named
+from sitl.ardupilot.endpoint import BUILDERS
 from sitl.ardupilot.flight_modes import Mode
 from sitl.clock import NS_PER_MS, NS_PER_S
 from sitl.simulated_vehicle import SimulatedVehicle
 
 
-def named(messages, name):
-    return [message for message in messages if message.get_type() == name]
-
-
-def test_only_heartbeats_and_timesync_come_unasked(station):
+def test_only_heartbeats_and_timesync_come_without_a_request(station):
     messages = station.run(10.5)
 
     assert {m.get_type() for m in messages} == {"HEARTBEAT", "TIMESYNC"}
@@ -44,7 +41,7 @@ def test_texts_go_to_all_links(station_of):
 
 
 @pytest.mark.parametrize("message_id", sorted(BUILDERS))
-def test_every_message_packs_and_says_when_it_was_sent(station, message_id):
+def test_every_message_packs_with_its_time(station, message_id):
     station.run(6.0)
     station.interval(message_id, 50)
 
@@ -179,15 +176,16 @@ def test_a_host_stall_advances_physics_but_sends_no_burst(station):
     assert burst[0].time_boot_ms == pytest.approx(station.now_ns / NS_PER_MS, abs=3)
 
 
-def test_an_eleventh_interval_joins_the_nearest_of_ten():
-    streams = ArduPilotStreams(range(100), 0)
-    for index in range(9):
-        streams.set_interval(10 + index, (10 + index) * 1000, loop_hz=400.0, now_ns=0)
+def test_an_eleventh_interval_joins_the_nearest_of_ten(station):
+    link = station.vehicle.server.links[0]
+    first, *others, eleventh = [key for key in BUILDERS if key != mav.MAVLINK_MSG_ID_HEARTBEAT][:10]
+    for index, message_id in enumerate((first, *others)):
+        assert link.set_interval(message_id, (10 + index) * 1000)
 
-    streams.set_interval(50, 142_000, loop_hz=400.0, now_ns=0)
+    assert link.set_interval(eleventh, 142_000)
 
-    assert streams.interval_us(50) == 18_000
-    assert streams.interval_us(10) == 10_000
+    assert link.interval_us(eleventh) == 18_000
+    assert link.interval_us(first) == 10_000
 
 
 def test_the_report_counts_the_setpoints_that_were_followed(station):

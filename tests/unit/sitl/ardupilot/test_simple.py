@@ -1,4 +1,4 @@
-"""Simple and Super Simple mode: in which axes pitch and roll count, and what changes them."""
+"""Axes of pitch and roll in Simple and Super Simple mode, and how they change."""
 
 import math
 

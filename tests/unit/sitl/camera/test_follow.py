@@ -12,7 +12,7 @@ from sitl.camera.follow import film_vehicle
 from sitl.camera.fpv import CameraOptions, FpvRenderer
 from sitl.clock import StopRequest
 from sitl.course import make_course
-from sitl.rotation import IDENTITY
+from sitl.vehicle.rotation import IDENTITY
 
 SHM = "mb-test-follow"
 POSITION_M = (2.0, 0.5, -2.5)

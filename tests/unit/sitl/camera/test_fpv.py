@@ -8,8 +8,8 @@ from hypothesis import strategies as st
 from sitl.camera import scenery
 from sitl.camera.fpv import FpvRenderer
 from sitl.course import Course, Gate, make_course
-from sitl.rotation import IDENTITY, from_euler
 from sitl.vehicle.conditions import NOMINAL
+from sitl.vehicle.rotation import IDENTITY, from_euler
 
 TILT_UP_RAD = NOMINAL.camera_tilt_rad
 SIZE_PX = 201
@@ -18,6 +18,8 @@ MIDDLE_PX = (SIZE_PX - 1) / 2
 COURSE = Course(
     seed=0, gates=(Gate(center_ned_m=(10.0, 0.0, -2.0), yaw_rad=0.0, size_m=2.4, index=0),)
 )
+WHOLE_COURSE = make_course(7)
+WHOLE_RENDERER = FpvRenderer(WHOLE_COURSE, 64, 48)
 LEVEL_CAMERA = from_euler(0.0, -TILT_UP_RAD, 0.0)
 """Body pitch that makes the optical axis horizontal."""
 
@@ -33,7 +35,7 @@ def renderer():
     return FpvRenderer(COURSE, SIZE_PX, SIZE_PX)
 
 
-def test_the_gate_appears_where_the_pinhole_says(renderer):
+def test_the_gate_appears_where_a_pinhole_camera_projects_it(renderer):
     """Eye 6 m before the front face, level: outer half side 1.2 + 0.32 m, inner 1.2 m."""
     image = renderer.render((10.0 - scenery.DEPTH_M / 2 - 6.0, 0.0, -2.0), LEVEL_CAMERA)
     outer_px = FOCAL_PX * (1.2 + scenery.BAR_M) / 6.0
@@ -109,8 +111,8 @@ def test_a_wall_that_reaches_behind_the_eye_is_cut_where_it_should_be(renderer):
     st.tuples(*[st.floats(-math.pi, math.pi)] * 3),
 )
 def test_any_pose_gives_a_picture(position, angles):
-    course = make_course(7)
-    near_gate = tuple(p + c for p, c in zip(position, course.gates[1].center_ned_m, strict=True))
-    image = FpvRenderer(course, 64, 48).render(near_gate, from_euler(*angles))
+    center_ned_m = WHOLE_COURSE.gates[1].center_ned_m
+    near_gate = tuple(p + c for p, c in zip(position, center_ned_m, strict=True))
+    image = WHOLE_RENDERER.render(near_gate, from_euler(*angles))
     assert image.shape == (48, 64, 3)
     assert image.dtype == np.uint8

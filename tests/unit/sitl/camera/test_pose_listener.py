@@ -8,7 +8,7 @@ from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from sitl.camera.follow import SYSTEM_ID, PoseListener
 from sitl.clock import NS_PER_S
-from sitl.rotation import IDENTITY, from_euler
+from sitl.vehicle.rotation import IDENTITY, from_euler
 
 T0_NS = 100 * NS_PER_S
 RATE_HZ = 60.0
@@ -120,7 +120,7 @@ def run_second(listener, second, packets):
     return requested(listener.outgoing(T0_NS + second * NS_PER_S))
 
 
-def test_a_message_is_asked_for_until_it_flows_and_again_when_its_rate_drops(listener, vehicle):
+def test_a_message_is_requested_until_it_streams_and_again_when_its_rate_drops(listener, vehicle):
     flows = [vehicle.quaternion(), vehicle.position()] * 60
     assert requested(listener.outgoing(T0_NS)) == [QUATERNION, POSITION]
     assert run_second(listener, 1, []) == [QUATERNION, POSITION]

@@ -55,7 +55,7 @@ def test_frames_go_round_the_slots(publisher, name):
         assert set(data[start + 32 : start + 32 + WIDTH * HEIGHT * 3]) == {frame_id}
 
 
-def test_close_tells_the_readers_and_removes_the_name(name):
+def test_close_marks_the_stream_as_closed_and_removes_the_name(name):
     publisher = FramePublisher(name, WIDTH, HEIGHT)
     with Path("/dev/shm", name).open("rb") as kept:
         publisher.close()

@@ -1,4 +1,4 @@
-"""A camera that turns during a frame: rows lean, edges smear, and a still one is left alone."""
+"""Rolling shutter and motion blur of a turning camera."""
 
 from dataclasses import replace
 
@@ -7,8 +7,8 @@ import pytest
 
 from sitl.camera.fpv import FpvRenderer, Shutter
 from sitl.course import make_course
-from sitl.rotation import from_euler
 from sitl.vehicle.conditions import NOMINAL
+from sitl.vehicle.rotation import from_euler
 
 SIZE_PX = 97
 FOCAL_PX = (SIZE_PX - 1) / 2  # 90 degrees wide
@@ -58,7 +58,7 @@ def test_an_exposure_smears_evenly_over_the_angle_that_it_turns():
 
 
 @pytest.mark.parametrize("axis", [0, 1, 2])
-def test_each_row_is_what_a_camera_that_has_turned_so_far_sees(axis):
+def test_each_row_is_the_view_at_its_time(axis):
     """Against renderings at the time of every row."""
     size_px, readout_s, rate = 96, 0.05, [0.0, 0.0, 0.0]
     rate[axis] = 3.0

@@ -3,9 +3,9 @@ from pymavlink.dialects.v20 import ardupilotmega as mav
 
 from sitl.ardupilot.flight_modes import Mode
 from sitl.course import BAR_M, DEPTH_M, VEHICLE_RADIUS_M, AirborneStart, Course, Gate, struck_gate
-from sitl.rotation import IDENTITY
 from sitl.simulated_vehicle import SimulatedVehicle
 from sitl.vehicle.config import STEP_NS, VehicleConfig
+from sitl.vehicle.rotation import IDENTITY
 
 GATE = Gate(center_ned_m=(10.0, 0.0, -2.0), yaw_rad=0.0, size_m=2.4, index=0)
 FAR_GATE = Gate(center_ned_m=(20.0, 0.0, -2.0), yaw_rad=0.0, size_m=2.4, index=1)
@@ -71,7 +71,7 @@ def test_hitting_a_frame_is_a_crash_and_the_gates_after_it_do_not_count():
 
 
 @pytest.mark.parametrize("firmware", ["ardupilot", "px4"])
-def test_every_station_is_told_of_a_crash_once(firmware):
+def test_every_station_gets_one_text_about_a_crash(firmware):
     vehicle = launched((7.0, 1.1, -2.0), north_mps=6.0, next_gate=0, autopilot=firmware)
     for _ in range(100):
         heartbeat = mav.MAVLink_heartbeat_message(mav.MAV_TYPE_GCS, 8, 0, 0, 0, 3)

@@ -1,6 +1,7 @@
 """Real sockets on loopback, without waiting: what was sent is there when the kernel says so."""
 
 import socket
+import struct
 from contextlib import closing, suppress
 
 import pytest
@@ -10,7 +11,7 @@ from helpers.network import needs_ipv6
 from mavbridge.core.processes import free_port
 from sitl import UsageError
 from sitl.clock import NS_PER_S, Clock
-from sitl.link.transport import FOLLOWER_KINDS, MAX_PEERS, open_transport, split_frames
+from sitl.link.transport import FOLLOWER_KINDS, MAX_PEERS, RcInput, open_transport, split_frames
 
 DEADLINE_S = 5.0
 STAMP_ATTEMPTS = 10
@@ -173,3 +174,35 @@ def test_frames_are_never_split_across_datagrams():
     assert all(len(datagram) <= 200 for datagram in datagrams)
     assert all(datagram[0] in (0xFD, 0xFE) for datagram in datagrams)
     assert len(datagrams) < len(frames) / 3
+
+
+@pytest.fixture
+def rc_link():
+    """A receiver's port, and a socket that sends to it."""
+    port = free_port()
+    with closing(RcInput(port)) as rc_input, udp_client() as transmitter:
+        transmitter.connect(("127.0.0.1", port))
+        yield rc_input, transmitter
+
+
+@pytest.mark.parametrize("count", [8, 16])
+def test_the_newest_8_or_16_receiver_values_count_and_other_sizes_are_ignored(rc_link, count):
+    rc_input, transmitter = rc_link
+    assert rc_input.latest() is None
+    values = tuple(range(1000, 1000 + count))
+    for data in (
+        struct.pack("<8H", *[1100] * 8),
+        struct.pack(f"<{count}H", *values),
+        b"",
+        b"x" * 31,
+    ):
+        transmitter.send(data)
+
+    assert rc_input.latest() == values
+    assert rc_input.latest() is None
+
+
+def test_a_taken_receiver_port_is_named(rc_link):
+    port = rc_link[1].getpeername()[1]
+    with pytest.raises(UsageError, match=f"--rc-in {port}"):
+        RcInput(port)

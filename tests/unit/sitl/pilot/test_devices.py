@@ -1,4 +1,4 @@
-"""Gamepad and keyboard as the pilot: sticks, gestures, the switch, and a lost signal."""
+"""Gamepad and keyboard as the pilot: sticks, gestures, switch, lost signal."""
 
 import pygame
 import pytest

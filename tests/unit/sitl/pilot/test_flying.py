@@ -4,32 +4,33 @@ import pytest
 
 from sitl import UsageError
 from sitl.__main__ import main
-from sitl.app import PilotOptions, make_pilot, prepare_vehicle
 from sitl.clock import NS_PER_S, Clock
 from sitl.course import make_course
-from sitl.expert.demonstrator import CENTRED
-from sitl.pilot.transmitter import DEFAULT_AXES, OFF_US, Hand, Transmitter
+from sitl.pilot.demonstrator import CENTRED
+from sitl.pilot.transmitter import (
+    DEFAULT_AXES,
+    OFF_US,
+    Hand,
+    Transmitter,
+    make_pilot,
+    prepare_vehicle,
+)
 from sitl.simulated_vehicle import SimulatedVehicle
 from sitl.vehicle.config import STEP_NS, VehicleConfig
 
 COURSE = make_course(5)
+DOWN = Hand(CENTRED._replace(throttle=-1.0))
 
 
 def vehicle_of(autopilot, **changes):
     config = VehicleConfig(autopilot=autopilot, receiver=True, **changes)
     made = SimulatedVehicle(links=1, boot_ns=0, config=config, course=COURSE)
-    prepare_vehicle(made, autopilot)
+    prepare_vehicle(made)
     return made
 
 
-def pilot_of(name, vehicle, autopilot="ardupilot", axes=DEFAULT_AXES):
-    pilot, _ = make_pilot(
-        PilotOptions(name, axes, 5.0),
-        vehicle=vehicle,
-        autopilot=autopilot,
-        course=COURSE,
-        clock=Clock(),
-    )
+def pilot_of(name, vehicle, axes=DEFAULT_AXES):
+    pilot, _ = make_pilot(name, axes, 5.0, vehicle=vehicle, course=COURSE, clock=Clock())
     return pilot
 
 
@@ -50,17 +51,22 @@ class Flight:
             self.vehicle.step(self.now_ns)
 
 
+def flown(autopilot, mode=None):
+    """Return a flight that was armed by the receiver and has climbed."""
+    flight = Flight(vehicle_of(autopilot))
+    flight.hold(DOWN, 7)
+    assert not flight.vehicle.ap.armed
+    assert mode in (None, flight.vehicle.ap.mode_name)
+    flight.hold(Hand(gesture="arm"), 3)
+    assert flight.vehicle.ap.armed
+    flight.hold(Hand(CENTRED._replace(throttle=0.7)), 4)
+    return flight
+
+
 @pytest.mark.parametrize(("autopilot", "mode"), [("ardupilot", "ALT_HOLD"), ("px4", "ALTCTL")])
 def test_both_firmwares_are_armed_flown_and_disarmed_by_the_receiver(autopilot, mode):
-    vehicle = vehicle_of(autopilot)
-    flight = Flight(vehicle)
-    down = Hand(CENTRED._replace(throttle=-1.0))
-    flight.hold(down, 7)
-    assert not vehicle.ap.armed
-    assert vehicle.ap.mode_name == mode
-    flight.hold(Hand(gesture="arm"), 3)
-    assert vehicle.ap.armed
-    flight.hold(Hand(CENTRED._replace(throttle=0.7)), 4)
+    flight = flown(autopilot, mode)
+    vehicle = flight.vehicle
     climbed_m = -vehicle.ap.truth.position_ned_m[2]
     assert climbed_m > 2.0
     assert not vehicle.ap.landed
@@ -68,7 +74,7 @@ def test_both_firmwares_are_armed_flown_and_disarmed_by_the_receiver(autopilot, 
     assert vehicle.ap.truth.velocity_ned_mps[0] > 1.0, "nose down flies forward, north"
     flight.hold(Hand(gesture="disarm"), 1.5)
     assert vehicle.ap.armed, "not in the air"
-    flight.hold(down, 8)
+    flight.hold(DOWN, 8)
     assert vehicle.ap.landed
     flight.hold(Hand(gesture="disarm"), 3)
     assert not vehicle.ap.armed
@@ -76,11 +82,8 @@ def test_both_firmwares_are_armed_flown_and_disarmed_by_the_receiver(autopilot, 
 
 @pytest.mark.parametrize("autopilot", ["ardupilot", "px4"])
 def test_a_lost_signal_in_flight_is_a_failsafe(autopilot):
-    vehicle = vehicle_of(autopilot)
-    flight = Flight(vehicle)
-    flight.hold(Hand(CENTRED._replace(throttle=-1.0)), 7)
-    flight.hold(Hand(gesture="arm"), 3)
-    flight.hold(Hand(CENTRED._replace(throttle=0.7)), 4)
+    flight = flown(autopilot)
+    vehicle = flight.vehicle
     assert not vehicle.ap.in_failsafe
     flight.hold(None, 3)
     assert vehicle.ap.in_failsafe
@@ -110,10 +113,10 @@ def test_the_expert_flies_the_course_lands_and_disarms():
     pilot.close()
 
 
-def test_what_a_pilot_cannot_be_is_refused(monkeypatch):
+def test_unusable_pilots_are_refused(monkeypatch):
     vehicle = vehicle_of("px4")
     with pytest.raises(UsageError, match="ardupilot alone"):
-        pilot_of("expert", vehicle, autopilot="px4")
+        pilot_of("expert", vehicle)
     with pytest.raises(UsageError, match="--pilot-axes"):
         pilot_of("gamepad", vehicle, axes="roll=1")
     monkeypatch.setenv("SDL_VIDEODRIVER", "no-such-driver")

@@ -8,7 +8,7 @@ from pymavlink.dialects.v20 import ardupilotmega as mav
 
 from sitl.course import AirborneStart
 from sitl.px4.modes import Mode
-from sitl.rotation import from_euler
+from sitl.vehicle.rotation import from_euler
 
 MID = (0, 0, 500, 0)
 START = AirborneStart(
@@ -45,7 +45,7 @@ def test_a_launched_vehicle_misses_the_sticks_that_came_and_stopped(airborne):
 
 
 def test_a_launch_under_sticks_leaves_them(ends):
-    """Else the vehicle would show sticks that nobody has sent."""
+    """Otherwise the vehicle would report sticks that were never sent."""
     ends.run(0.2, {0: (0, 300, 500, 0)})
     ends.vehicle.launch(START)
 

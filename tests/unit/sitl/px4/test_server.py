@@ -5,6 +5,7 @@ import struct
 import pytest
 from pymavlink.dialects.v20 import ardupilotmega as mav
 
+from helpers.contract_peers import named
 from sitl.clock import NS_PER_S
 from sitl.px4.commander import Event
 from sitl.px4.messages import event_message
@@ -12,10 +13,6 @@ from sitl.px4.messages import event_message
 MID = (0, 0, 500, 0)
 ACCEPTED = mav.MAV_RESULT_ACCEPTED
 REJECTED = mav.MAV_RESULT_TEMPORARILY_REJECTED
-
-
-def named(messages, name):
-    return [message for message in messages if message.get_type() == name]
 
 
 def test_sticks_of_one_link_arrive_on_the_other_like_an_echo(ends_of):
@@ -80,6 +77,15 @@ def test_a_ground_stations_link_gets_no_imu_and_a_companions_does(ends_of):
     messages = ends.run(1.0, link=1)  # and those of the second before
     assert len(named(messages, "HIGHRES_IMU")) == pytest.approx(100, abs=2)
     assert len([m for m in named(messages, "TIMESYNC") if m.tc1 == 0]) == pytest.approx(20, abs=1)
+
+
+def test_interval_zero_restores_the_default_of_the_link(ends):
+    link = ends.vehicle.server.links[0]
+    default_us = link.interval_us(mav.MAVLINK_MSG_ID_ATTITUDE)
+    for asked_us, interval_us in ((-1, -1), (4000, 4000), (0, default_us)):
+        assert link.set_interval(mav.MAVLINK_MSG_ID_ATTITUDE, asked_us)
+        assert link.interval_us(mav.MAVLINK_MSG_ID_ATTITUDE) == interval_us
+    assert default_us == 20_000
 
 
 def test_without_a_position_its_message_goes_on(ends):

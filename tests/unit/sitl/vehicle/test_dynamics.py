@@ -6,7 +6,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from sitl import rotation
+from sitl.vehicle import rotation
 from sitl.vehicle.dynamics import GRAVITY_MPS2, QUAD, Quadrotor
 
 STEPS_PER_S = 1_000_000_000 // QUAD.step_ns

@@ -21,8 +21,8 @@ from numpy.typing import NDArray
 
 from sitl import UsageError
 from sitl.course import Course, Gate, GateCounter, crossing
-from sitl.rotation import Vec3, wrap_pi
 from sitl.vehicle.dynamics import clamp
+from sitl.vehicle.rotation import Vec3, wrap_pi
 
 FloatArray = NDArray[np.float64]
 

@@ -8,10 +8,10 @@ from helpers.course_flights import fly_course
 from sitl import UsageError
 from sitl.camera.fpv import body_from_camera
 from sitl.course import AirborneStart, gate_truth, make_course
-from sitl.expert.demonstrator import Expert
-from sitl.expert.disturbance import Disturbance, random_start
-from sitl.rotation import IDENTITY, from_euler
+from sitl.pilot.demonstrator import Expert
+from sitl.pilot.disturbance import Disturbance, random_start
 from sitl.vehicle.conditions import random_conditions
+from sitl.vehicle.rotation import IDENTITY, from_euler
 
 
 @pytest.fixture(scope="module")

@@ -14,9 +14,9 @@ from typing import ClassVar, NamedTuple, Self
 from pymavlink.dialects.v20 import ardupilotmega as mav
 
 from sitl.clock import NS_PER_S
-from sitl.rotation import Quat, Vec3, yaw_of
 from sitl.vehicle.config import Battery, VehicleConfig
 from sitl.vehicle.dynamics import Airframe, BodyState, Quadrotor, SensorNoise, Wind
+from sitl.vehicle.rotation import Quat, Vec3, yaw_of
 
 STOPPED = (0.0, 0.0, 0.0, 0.0)
 LANDED_AFTER_NS = NS_PER_S
@@ -37,6 +37,27 @@ class AttitudeSetpoint(NamedTuple):
     ned_from_body_wxyz: Quat | None  # None: rates only
     rate_body_radps: Vec3
     thrust: float  # PX4: collective, 0..1; ArduPilot: as GUID_OPTIONS says
+
+
+class HeldGesture:
+    """Stick gesture to one of two sides, 1 or -1, that acts once after it was held."""
+
+    def __init__(self, hold_ns: int) -> None:
+        self._hold_ns = hold_ns
+        self._side = 0
+        self._since_ns: int | None = None
+
+    def see(self, side: int, now_ns: int) -> None:
+        """Note the present side; 0: no gesture."""
+        if side != self._side:
+            self._side, self._since_ns = side, now_ns
+
+    def take(self, now_ns: int) -> int:
+        """Return the side, once, when it has been held long enough; else 0."""
+        if not self._side or self._since_ns is None or now_ns - self._since_ns < self._hold_ns:
+            return 0
+        self._since_ns = None
+        return self._side
 
 
 def float32(value: float) -> float:

@@ -11,9 +11,9 @@ from typing import Literal, NamedTuple, TypeAlias, TypeVar
 import numpy as np
 
 from sitl.course import RACE_SEEDS, AirborneStart, Course
-from sitl.expert.demonstrator import RateCommand, StickPositions
-from sitl.rotation import from_euler
+from sitl.pilot.demonstrator import RateCommand, StickPositions
 from sitl.vehicle.dynamics import clamp
+from sitl.vehicle.rotation import from_euler
 
 Numbers: TypeAlias = tuple[float, ...]
 Commanded = TypeVar("Commanded", StickPositions, RateCommand)
@@ -128,20 +128,18 @@ class Disturbance:
         return _Stretch("pulse", ended.end_s + length_s, tuple(held.tolist()))
 
 
-def random_start(
-    course: Course, seed: int, *, speed_mps: float, strength: float = 1.0
-) -> AirborneStart:
+def random_start(course: Course, seed: int, *, speed_mps: float) -> AirborneStart:
     """Draw a start before a random gate, off its axis, moving and facing roughly along it."""
     random = np.random.Generator(np.random.PCG64(seed))
     gate = course.gates[int(random.integers(len(course.gates)))]
     is_race = course.seed >= RACE_SEEDS
     away_m = float(random.uniform(*(RACE_START_AWAY_M if is_race else START_AWAY_M)))
-    side_m = clamp(float(random.normal(0.0, 1.2 * strength)), 0.4 * away_m)
-    up_m = float(random.normal(0.0, 0.5 * strength))
-    heading_rad = gate.yaw_rad + float(random.normal(0.0, 0.2 * strength))
-    track_rad = gate.yaw_rad + float(random.normal(0.0, 0.25 * strength))
+    side_m = clamp(float(random.normal(0.0, 1.2)), 0.4 * away_m)
+    up_m = float(random.normal(0.0, 0.5))
+    heading_rad = gate.yaw_rad + float(random.normal(0.0, 0.2))
+    track_rad = gate.yaw_rad + float(random.normal(0.0, 0.25))
     pace_mps = speed_mps * float(random.uniform(0.2, 1.0))
-    lean_rad = random.normal(0.0, 0.12 * strength, 2).tolist()
+    lean_rad = random.normal(0.0, 0.12, 2).tolist()
     north_m, east_m, down_m = gate.center_ned_m
     cos_yaw, sin_yaw = math.cos(gate.yaw_rad), math.sin(gate.yaw_rad)
     return AirborneStart(
@@ -153,7 +151,7 @@ def random_start(
         velocity_ned_mps=(
             pace_mps * math.cos(track_rad),
             pace_mps * math.sin(track_rad),
-            float(random.normal(0.0, 0.5 * strength)),
+            float(random.normal(0.0, 0.5)),
         ),
         ned_from_body_wxyz=from_euler(lean_rad[0], lean_rad[1] - 0.05, heading_rad),
         next_gate=gate.index,

@@ -1,4 +1,4 @@
-"""The expert by body rates: what it asks for, and that it flies race courses on both firmwares."""
+"""The expert by body rates: its commands, and races on both firmwares."""
 
 import math
 from collections.abc import Callable
@@ -12,17 +12,17 @@ from sitl.ardupilot.flight_modes import Mode
 from sitl.ardupilot.params import ArduPilotParams
 from sitl.clock import NS_PER_MS, NS_PER_S
 from sitl.course import RACE_SEEDS, AirborneStart, Course, make_course
-from sitl.expert.demonstrator import HOVER_THRUST, RateCommand, RateExpert
-from sitl.expert.disturbance import RATE_STRENGTHS, Disturbance, random_start
-from sitl.firmware import AttitudeSetpoint
+from sitl.pilot.demonstrator import HOVER_THRUST, RateCommand, RateExpert
+from sitl.pilot.disturbance import RATE_STRENGTHS, Disturbance, random_start
 from sitl.px4.autopilot import Px4
 from sitl.px4.control import HOVER_THRUST as PX4_HOVER_THRUST
 from sitl.px4.modes import Mode as Px4Mode
 from sitl.px4.params import Px4Params
 from sitl.report import FlightLog
-from sitl.rotation import cos_tilt, from_euler
 from sitl.vehicle.config import VehicleConfig
 from sitl.vehicle.dynamics import BodyState
+from sitl.vehicle.firmware import AttitudeSetpoint
+from sitl.vehicle.rotation import cos_tilt, from_euler
 
 TICK_NS = 10 * NS_PER_MS
 READY = VehicleConfig(estimator_ready_s=0.0, position_ready_s=0.0)

@@ -74,6 +74,11 @@ def rotation_vector(q: Quat) -> Vec3:
     return (x * scale, y * scale, z * scale)
 
 
+def rotation_between(start: Quat, end: Quat) -> Vec3:
+    """Return the rotation vector [rad] from one attitude to another, in axes of the first."""
+    return rotation_vector(multiply(conjugate(start), end))
+
+
 def integrate(q: Quat, rate_body_radps: Vec3, dt_s: float) -> Quat:
     """Return the attitude after ``dt_s`` at a constant body rate, renormalised."""
     wx, wy, wz = rate_body_radps

@@ -6,10 +6,10 @@ from typing import NamedTuple
 
 from sitl.ardupilot.params import ArduPilotParams
 from sitl.course import Course
-from sitl.expert.course_guide import Agility, CourseGuide, Demand, Predicted
-from sitl.rotation import Quat, Vec3, conjugate, integrate, rotate, wrap_pi, yaw_of
+from sitl.pilot.course_guide import Agility, CourseGuide, Demand, Predicted
 from sitl.vehicle.conditions import NOMINAL
 from sitl.vehicle.dynamics import GRAVITY_MPS2, BodyState, clamp
+from sitl.vehicle.rotation import Quat, Vec3, conjugate, integrate, rotate, wrap_pi, yaw_of
 
 HOVER_THRUST = 0.39
 TILT_GAIN_PER_S = 8.0

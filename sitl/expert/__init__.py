@@ -1,1 +1,0 @@
-"""Demonstrators that fly gate courses from the true pose."""
