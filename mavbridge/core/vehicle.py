@@ -338,6 +338,14 @@ class ForwardedPacket(NamedTuple):
     data: bytes
 
 
+class Arrivals(NamedTuple):
+    """What came from the vehicle since the last call, in order of arrival."""
+
+    samples: tuple[Sample, ...]
+    packets: tuple[ForwardedPacket, ...]
+    """Empty unless the link keeps packets."""
+
+
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Percentiles:
     """Distribution of a measured quantity. The name of the field that holds it tells the unit."""

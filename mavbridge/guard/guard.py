@@ -31,62 +31,14 @@ from mavbridge.guard.values import (
     OperatorCommand,
     Outcome,
     Phase,
+    Slot,
+    StickGrid,
 )
 
 PILOT_FRESH_NS = 500 * NS_PER_MS
 """Oldest RC_CHANNELS that still tells the position of the pilot's sticks."""
 STOOD_STILL_NS = 60 * NS_PER_MS
 """Time between two steps that means a stall of the guard; longer than the slowest stick period."""
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Slot:
-    """One slot of the stick grid that has come due."""
-
-    index: int
-    due_ns: int
-    missed: int
-    """Number of earlier slots for which no stick left within one period."""
-
-
-class StickGrid:
-    """Fixed grid of slots at ``origin + index * period``.
-
-    A slot is served by the first send from half a period before it to one period after it. A slot
-    that was served early is skipped. A slot without a send in time is missed, and never made up
-    for.
-    """
-
-    def __init__(self, period_ns: int, origin_ns: int) -> None:
-        self._period_ns = period_ns
-        self._origin_ns = origin_ns
-        self._index = -1
-        self._served_ns = origin_ns - period_ns
-        """Last send, or last slot with nothing to send."""
-
-    @property
-    def next_ns(self) -> int:
-        """Time of the next slot."""
-        return self._origin_ns + (self._index + 1) * self._period_ns
-
-    def take(self, now_ns: int) -> Slot | None:
-        """Return the newest slot that has come due since the last call; None: nothing to serve."""
-        index = (now_ns - self._origin_ns) // self._period_ns
-        if index <= self._index:
-            return None
-        first, self._index = self._index + 1, index
-        missed = index - first
-        first_ns = self._origin_ns + first * self._period_ns
-        if first_ns - self._served_ns < self._period_ns // 2:
-            if not missed:
-                return None
-            missed -= 1
-        due_ns = self._origin_ns + index * self._period_ns
-        return Slot(index=index, due_ns=due_ns, missed=missed)
-
-    def serve(self, sent_ns: int) -> None:
-        """Note that sticks were sent, or that there was nothing to send."""
-        self._served_ns = sent_ns
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -13,6 +13,7 @@ from mavbridge.core.clock import NS_PER_MS, NS_PER_S, Clock
 from mavbridge.core.reasons import Code, Reason, because
 from mavbridge.core.vehicle import (
     Action,
+    Arrivals,
     Command,
     LinkSnapshot,
     Outlet,
@@ -34,7 +35,7 @@ from mavbridge.guard.wire import (
     encode_from_guard,
     encode_samples,
 )
-from mavbridge.mavlink.link import Arrivals, MavlinkLink
+from mavbridge.mavlink.link import MavlinkLink
 
 IDLE_PERIOD_NS = 10 * NS_PER_MS
 """Polling period of the link before a policy is loaded."""

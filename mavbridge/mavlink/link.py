@@ -2,7 +2,6 @@
 
 from collections.abc import Iterable, Mapping
 from dataclasses import replace
-from typing import NamedTuple
 
 from pymavlink.dialects.v20 import ardupilotmega as dialect
 
@@ -15,6 +14,7 @@ from mavbridge.core.reasons import Code, Reason, because
 from mavbridge.core.vehicle import (
     Action,
     ActionMeaning,
+    Arrivals,
     Decision,
     ForwardedPacket,
     LinkSnapshot,
@@ -55,14 +55,6 @@ SOURCE_COMPONENT = dialect.MAV_COMP_ID_ONBOARD_COMPUTER
 _EARLY_REQUEST_NS = 20 * NS_PER_MS
 """Two usual stick periods: a due request leaves before a stick message, never after it."""
 _HEARTBEAT_HZ = 1.0
-
-
-class Arrivals(NamedTuple):
-    """What came from the vehicle since the last call, in order of arrival."""
-
-    samples: tuple[Sample, ...]
-    packets: tuple[ForwardedPacket, ...]
-    """Empty unless the link keeps packets."""
 
 
 class MavlinkLink:

@@ -14,6 +14,7 @@ from mavbridge.core.vehicle import (
     NEUTRAL,
     Action,
     ActionMeaning,
+    Arrivals,
     Command,
     Decision,
     LinkSnapshot,
@@ -26,7 +27,6 @@ from mavbridge.core.vehicle import (
     Telemetry,
     VehicleStatus,
 )
-from mavbridge.mavlink.link import Arrivals
 
 START_NS = 1_000 * NS_PER_S
 FOREVER_NS = 2**62

@@ -206,7 +206,7 @@ def flight_blueprint(flight: ViewedFlight) -> rrb.Blueprint:
     return rrb.Blueprint(
         rrb.Tabs(
             rrb.Horizontal(place, motion, column_shares=[3, 2], name="Flight"),
-            _timing(),
+            timing_page(),
             active_tab=0,
         ),
         rrb.TimePanel(state="collapsed", timeline="time"),
@@ -261,7 +261,8 @@ def _behind(position_m: tuple[float, float, float]) -> rrb.EyeControls3D:
     return rrb.EyeControls3D(position=position_m, look_target=(1.0, 0.0, 0.0), eye_up=UP)
 
 
-def _timing() -> rrb.Horizontal:
+def timing_page() -> rrb.Horizontal:
+    """Return the page ``Timing``: every age, period and count beside its limit, and the events."""
     columns = (
         (IMAGE_AGE, ATTITUDE_AGE, RC),
         (LATENESS, CHUNK_PERIOD, PREDICT, MISSED),

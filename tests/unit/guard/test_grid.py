@@ -1,7 +1,7 @@
 import pytest
 
 from mavbridge.core.clock import NS_PER_MS
-from mavbridge.guard.guard import StickGrid
+from mavbridge.guard.values import StickGrid
 
 MS = NS_PER_MS
 PERIOD = 10 * MS

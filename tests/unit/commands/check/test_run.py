@@ -60,7 +60,7 @@ def test_the_vehicle_must_be_named() -> None:
 def test_a_net_without_its_camera_is_a_no_go(capsys: pytest.CaptureFixture[str]) -> None:
     check(CheckConfig(timing=0.5, flight=flight("resnet-unet:nonsense"), json=Path("-")))
     rows = {row["name"]: row for row in json.loads(capsys.readouterr().out)["rows"]}
-    assert "name its camera" in rows["cameras"]["advice"]
+    assert "name a camera" in rows["cameras"]["advice"]
     assert rows["policy"]["verdict"] == "no-go", "a policy that cannot be loaded is a row"
 
 

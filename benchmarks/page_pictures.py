@@ -1,0 +1,42 @@
+"""Draw the viewer's page Timing and the page of inspect as PNG.
+
+python -m benchmarks.page_pictures out/flight.rrd flights/race docs/images
+
+Needs Chromium, and a screen or ``xvfb-run`` with a Vulkan driver (mesa-vulkan-drivers).
+"""
+
+import subprocess
+import sys
+from pathlib import Path
+from tempfile import TemporaryDirectory
+
+import rerun.blueprint as rrb
+
+from mavbridge.commands.inspect.analysis import analyse
+from mavbridge.commands.inspect.page import write_page
+from mavbridge.observe.viewer.layout import timing_page
+
+SIZE_PX, PAGE_PX = "1500x900", "1000,1500"
+TIMEOUT_S = 120.0
+
+
+def main() -> None:
+    """Draw timing.png and inspect.png into a folder."""
+    rrd, flight, out = map(Path, sys.argv[1:])
+    with TemporaryDirectory(prefix="mavbridge-pages-") as name:
+        layout, page = Path(name) / "timing.rbl", Path(name) / "page.html"
+        panel = rrb.TimePanel(state="collapsed", timeline="time")
+        rrb.Blueprint(timing_page(), panel, collapse_panels=True).save("mavbridge", str(layout))
+        _run("rerun", rrd, layout, "--window-size", SIZE_PX, "--screenshot-to", out / "timing.png")
+        write_page(page, [analyse(flight)])
+        flags = ("--headless", "--no-sandbox", "--hide-scrollbars", f"--window-size={PAGE_PX}")
+        wait = "--virtual-time-budget=8000"
+        _run("chromium", *flags, wait, f"--screenshot={out / 'inspect.png'}", page.as_uri())
+
+
+def _run(*command: object) -> None:
+    subprocess.run([*map(str, command)], check=True, timeout=TIMEOUT_S)
+
+
+if __name__ == "__main__":
+    main()
