@@ -18,6 +18,7 @@ from mavbridge.core.clock import NS_PER_MS, NS_PER_S
 from mavbridge.core.errors import UserError
 from mavbridge.core.vehicle import Percentiles
 from mavbridge.flight.outcome import describe
+from mavbridge.observe.viewer.layout import action_title
 
 MAX_POINTS = 20_000
 """Points of a line: four times the pixels of a wide screen. Longer flights keep both extremes."""
@@ -140,7 +141,7 @@ def _plots(flight: FlightAnalysis) -> Iterator[dict[str, Any]]:
             "sent": series.sent[:, axis],
         }
         span = {"range": [-1.08, 1.08]} if is_sticks else {}
-        title = f"Stick: {name}" if is_sticks else name.replace("_", " ").capitalize()
+        title = f"Stick: {name}" if is_sticks else action_title(name)
         yield _plot(title, "", columns) | span
     ages = {"feature": series.feature_age_ms, "attitude": series.state_age_ms}
     ages_ms: dict[str, float] = {}

@@ -136,12 +136,12 @@ def action_plots(action: ActionKind) -> tuple[Plot, ...]:
     """Return one plot for each of the four numbers of an action of this kind."""
     key = ": blue sent, pink policy, orange plan" + (", green echo" if action == "sticks" else "")
     return tuple(
-        Plot(f"{action}/{name}", f"{_titled(name)}{key}", ACTION_SERIES)
+        Plot(f"{action}/{name}", f"{action_title(name)}{key}", ACTION_SERIES)
         for name in ACTION_CLASSES[action]._fields
     )
 
 
-def _titled(name: str) -> str:
+def action_title(name: str) -> str:
     """Convert a field name to a title: ``yaw_rate_radps`` -> ``Yaw rate [rad/s]``."""
     stem, _, unit = name.rpartition("_")
     if unit not in _UNITS:
