@@ -367,9 +367,11 @@ class Contract:
     def from_json(cls, text: str) -> "Contract":
         """Read the header form; fields that an older version lacks get their defaults."""
         try:
-            data = dict(parse_json(text))
-        except (ValueError, TypeError) as error:
+            data: Any = parse_json(text)
+        except ValueError as error:
             raise ContractError(f"the contract in the checkpoint is not JSON: {error}") from error
+        if not isinstance(data, dict):
+            raise ContractError("the contract in the checkpoint is not a JSON object")
         version = data.pop("version", CONTRACT_VERSION)
         if not isinstance(version, int) or not OLDEST_VERSION <= version <= CONTRACT_VERSION:
             raise ContractError(

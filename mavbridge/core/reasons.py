@@ -107,6 +107,7 @@ class Code(StrEnum):
     OVERRIDE_SWITCH_NOT_ON = auto()
     WITH_HINT = auto()
     SLOW_CLOCK = auto()
+    VEHICLE_SIGNS = auto()
     # The envelope
     BEYOND = auto()
     ESTIMATOR_LOST = auto()
@@ -300,7 +301,15 @@ _REASONS: dict[Code, tuple[Kind, str]] = {
         "the override switch (RC{channel}) is off: switch it on to fly",
     ),
     Code.WITH_HINT: (_VEHICLE, "{first}; {hint}"),
-    Code.SLOW_CLOCK: (_VEHICLE, "{hint}; {first}"),
+    Code.SLOW_CLOCK: (
+        _VEHICLE,
+        "the vehicle's clock runs at {pace:.2g} of real time: the simulator is slow, not the link; "
+        "let it run at 1 (its speedup, or a faster computer)",
+    ),
+    Code.VEHICLE_SIGNS: (
+        _VEHICLE,
+        "the vehicle signs its packets and may ignore ours: give its key by --signing-key-file",
+    ),
     Code.BEYOND: (
         _FAULT,
         "{quantity} {value:.1f} {unit} is beyond {limit:g} {unit} (envelope.{quantity})",
@@ -396,7 +405,7 @@ _REASONS: dict[Code, tuple[Kind, str]] = {
     Code.GUARD_DIED: (_FAULT, "the guard has died"),
     Code.FLIGHT_PROCESS_DIED: (_FAULT, "the flight process has died"),
 }
-_WRAPPERS = (Code.THEN, Code.WITH_HINT, Code.SLOW_CLOCK, Code.OF_CAMERA)
+_WRAPPERS = (Code.THEN, Code.WITH_HINT, Code.OF_CAMERA)
 _CAUSES = {
     ("rc-override", "unseen"): "another station may be overriding them, or the receiver has "
     "priority",

@@ -163,9 +163,7 @@ class MavlinkLink:
         if (vehicle := self.vehicle) is None:
             return because(Code.NO_HEARTBEAT)
         if (problem := vehicle.problem(now_ns)) is not None:
-            if (slow := self._timesync.slow_clock) is not None:
-                return because(Code.SLOW_CLOCK, first=problem, hint=slow)
-            hint = self._connection.hint
+            hint = self._timesync.slow_clock or self._connection.hint
             return problem if hint is None else because(Code.WITH_HINT, first=problem, hint=hint)
         if self._connection.is_refused(now_ns) and not self._config.readonly:
             return because(Code.PACKETS_REFUSED, after_ms=REFUSED_NS / NS_PER_MS)

@@ -73,6 +73,6 @@ class LinkCounters:
             ),
             vehicle_clock_offset_ns=timesync.offset_ns,
             is_timesync_good=timesync.is_good,
-            slow_clock=timesync.slow_clock,
+            slow_clock=None if (slow := timesync.slow_clock) is None else str(slow),
             timesync_error_ms=None if error_ns is None else error_ns / NS_PER_MS,
         )

@@ -118,7 +118,7 @@ class TimesyncFilter:
         self._sending_ns.append(sending_ns - self._error_ns(best, arrived_ns))
         if not self._has_told_pace and (slow := self.slow_clock) is not None:
             self._has_told_pace = True
-            self._report(slow)
+            self._report(str(slow))
 
     @property
     def slow_pace(self) -> float | None:
@@ -134,14 +134,10 @@ class TimesyncFilter:
         return (last[1] - first[1]) / (last[0] - first[0]) if is_slow else None
 
     @property
-    def slow_clock(self) -> str | None:
-        """Text for the user about a slow clock, or None."""
-        if (pace := self.slow_pace) is None:
-            return None
-        return (
-            f"the vehicle's clock runs at {pace:.2g} of real time: the simulator is slow, and not "
-            "the link; let it run at 1 (its speedup, or a faster computer)"
-        )
+    def slow_clock(self) -> Reason | None:
+        """Why the vehicle's stamps lag real time, or None."""
+        pace = self.slow_pace
+        return None if pace is None else because(Code.SLOW_CLOCK, pace=pace)
 
     @property
     def late_sending(self) -> Reason | None:

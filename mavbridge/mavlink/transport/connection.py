@@ -5,6 +5,7 @@ from typing import Protocol, TypeAlias
 
 from mavbridge.core.clock import NS_PER_MS, NS_PER_S, Clock
 from mavbridge.core.errors import UserError
+from mavbridge.core.reasons import Code, Reason, because
 from mavbridge.core.vehicle import Outlet, Packet
 from mavbridge.mavlink.codec.messages import ReceivedMessage
 from mavbridge.mavlink.codec.packets import Codec
@@ -21,9 +22,6 @@ REFUSED_NS = 100 * NS_PER_MS
 """Time of refused sends after which they count as a problem."""
 
 
-SIGNED_VEHICLE = (
-    "the vehicle signs its packets, and may ignore ours: give its key by --signing-key-file"
-)
 REFUSALS: dict[Refusal, str] = {
     "unsigned": "refusing packets without a signature: the vehicle does not sign (give it the key "
     "of --signing-key-file), or somebody else sends on this link",
@@ -142,7 +140,7 @@ class Connection:
         """Report rejected signatures to the user, each kind once."""
         signing = self._codec.signing
         if signing is None:
-            reasons = [self.hint] if self.hint else []
+            reasons = [str(self.hint)] if self.hint else []
         else:
             reasons = [REFUSALS[refusal] for refusal in signing.refused]
         for text in reasons[len(self._told) :]:
@@ -150,9 +148,9 @@ class Connection:
             self.texts.append(text)
 
     @property
-    def hint(self) -> str | None:
+    def hint(self) -> Reason | None:
         """Possible reason why the vehicle does not answer, or None."""
-        return SIGNED_VEHICLE if self._codec.hears_signed else None
+        return because(Code.VEHICLE_SIGNS) if self._codec.hears_signed else None
 
     def is_refused(self, now_ns: int) -> bool:
         """True if the system has refused all our packets for ``REFUSED_NS``."""
