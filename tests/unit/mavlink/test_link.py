@@ -580,10 +580,9 @@ def test_a_slow_clock_is_told_once_and_explains_a_heartbeat_that_is_late() -> No
     rig.run(10.0)
     rig.vehicle.is_alive = False
     snapshot = rig.run(4.0)
-    (told,) = [text for text in rig.texts if "the vehicle's clock runs at 0.25" in text]
-    assert snapshot.problem == because(
-        Code.SLOW_CLOCK, first=because(Code.HEARTBEAT_LOST), hint=told
-    )
+    assert len([text for text in rig.texts if "the vehicle's clock runs at 0.25" in text]) == 1
+    assert snapshot.problem is not None
+    assert snapshot.problem.codes == (Code.WITH_HINT, Code.HEARTBEAT_LOST, Code.SLOW_CLOCK)
 
 
 def test_packets_and_samples_say_the_same() -> None:
