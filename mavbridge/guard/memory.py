@@ -102,7 +102,7 @@ class Memory:
         """nothing"""
 
     def refuse(self, _: EngagementInputs, why: Reason) -> None:
-        """refuse the act and say why"""
+        """refused, with the reason"""
         self.refusal, self.act = not_engaged(why), None
 
     def prepare(self, now: EngagementInputs, _cause: bool) -> None:
@@ -133,10 +133,10 @@ class Memory:
         self.engaged_ns = now.now_ns if self.engaged_ns is None else self.engaged_ns
 
     def leave(self, now: EngagementInputs, cause: EndRequest) -> None:
-        """neutral in the same step, then a safe mode
+        """neutral, then a safe mode
 
-        The mode of `--on-fault` after a fault or a takeover, that of `--then` after an end: see
-        [the way out](#the-way-out).
+        Neutral in the same step; then the mode of `--on-fault` after a fault or a takeover, that
+        of `--then` after an end: see [the way out](#the-way-out).
         """
         self._note_end(cause)
         self.reason = cause.reason
@@ -152,7 +152,10 @@ class Memory:
         self.leave(now, cause)
 
     def release(self, now: EngagementInputs, cause: EndRequest) -> None:
-        """**release in the same step, no mode**"""
+        """**release at once**
+
+        In the same step; no mode is requested.
+        """
         self._note_end(cause)
         reason = cause.reason
         if self.phase in (Phase.LEAVING, Phase.HOLDING) and self.reason is not None:
@@ -161,7 +164,10 @@ class Memory:
         self.owes_release = self.phase is not Phase.PREPARING or self.engage.has_sticks
 
     def finish(self, now: EngagementInputs, _cause: bool) -> None:
-        """as the next state says; a safe mode that is not confirmed is reported"""
+        """that of the next state
+
+        A safe mode that is not confirmed is reported.
+        """
         mode = self.disengage.mode
         if self.phase is Phase.LEAVING and mode is not None and mode != now.mode:
             self.refusal = because(Code.MODE_NOT_CONFIRMED, mode=mode)

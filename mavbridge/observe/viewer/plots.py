@@ -135,8 +135,9 @@ class TimingPlots:
         ages_ns = [
             (tick.sent_ns, tick.sent_ns - tick.state.attitude_ns)
             for tick in ticks
-            # Before the policy is loaded, ticks may be read later than newer attitudes.
-            if tick.state is not None and tick.state.attitude_ns <= tick.sent_ns
+            if tick.state is not None
+            # Without a chunk the state is the newest when the tick is read, perhaps a later one.
+            and (tick.trace is not None or tick.state.attitude_ns <= tick.sent_ns)
         ]
         self._extend(layout.ATTITUDE_AGE, ages_ns)
         late_ns = [
