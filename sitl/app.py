@@ -35,6 +35,10 @@ from sitl.vehicle.config import (
 )
 
 JOIN_TIMEOUT_S = 5.0
+KEY_BYTES = 32
+EPOCH_2015_NS = 1_420_070_400 * NS_PER_S
+"""Unix time of the epoch of MAVLink 2 signing timestamps."""
+SIGNING_TICK_NS = 10_000
 LEAST_PRIORITY = 19
 """Niceness while flying on faster than real time, to protect the timing of other flights."""
 
@@ -145,12 +149,6 @@ def filming(
         publisher.close()
 
 
-KEY_BYTES = 32
-EPOCH_2015_NS = 1_420_070_400 * NS_PER_S
-"""Unix time of the epoch of MAVLink 2 signing timestamps."""
-SIGNING_TICK_NS = 10_000
-
-
 def run(argv: Sequence[str] | None = None) -> int:
     args = _parser().parse_args(argv)
     try:
@@ -233,11 +231,8 @@ def _fly(args: argparse.Namespace) -> None:
         raise UsageError("--pilot moves the receiver: leave out --rc-in and --receiver")
     if args.report is not None and not args.report.parent.is_dir():
         raise UsageError(f"--report {args.report}: there is no folder {args.report.parent}")
-    config, course, clock = (
-        _config(args, len(links), len(onboard)),
-        make_course(args.course),
-        Clock(),
-    )
+    config, course = _config(args, len(links), len(onboard)), make_course(args.course)
+    clock = Clock()
     with ExitStack() as stack:
         urls = links + onboard
         transports = [stack.enter_context(closing(open_transport(url, clock))) for url in urls]

@@ -338,7 +338,7 @@ class ForwardedPacket(NamedTuple):
     data: bytes
 
 
-class Arrivals(NamedTuple):
+class LinkArrivals(NamedTuple):
     """What came from the vehicle since the last call, in order of arrival."""
 
     samples: tuple[Sample, ...]

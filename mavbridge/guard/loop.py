@@ -13,8 +13,8 @@ from mavbridge.core.clock import NS_PER_MS, NS_PER_S, Clock
 from mavbridge.core.reasons import Code, Reason, because
 from mavbridge.core.vehicle import (
     Action,
-    Arrivals,
     Command,
+    LinkArrivals,
     LinkSnapshot,
     Outlet,
     VehicleStatus,
@@ -259,7 +259,7 @@ class GuardLoop:
         # One more pass forwards the link's messages about the parameters.
         self.is_done = (was_clean and self._is_clean) or now_ns >= self._finish_until_ns
 
-    def _forward(self, arrivals: Arrivals) -> None:
+    def _forward(self, arrivals: LinkArrivals) -> None:
         # The flight process does not read samples before a policy is loaded; keep the queue free.
         if arrivals.samples and self._guard is not None:
             self._samples.send(encode_samples(arrivals.samples))

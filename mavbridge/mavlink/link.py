@@ -14,9 +14,9 @@ from mavbridge.core.reasons import Code, Reason, because
 from mavbridge.core.vehicle import (
     Action,
     ActionMeaning,
-    Arrivals,
     Decision,
     ForwardedPacket,
+    LinkArrivals,
     LinkSnapshot,
     LinkStats,
     ModeRoles,
@@ -109,13 +109,13 @@ class MavlinkLink:
         self._interruptions = 0
         self._duplicate_systems = DuplicateSystems()
 
-    def receive(self) -> Arrivals:
+    def receive(self) -> LinkArrivals:
         """Receive everything that has arrived; never block. ``service`` does the rest."""
         self._receive_all()
         if self.vehicle is not None and self.vehicle.has_rebooted:
             self._interrupt(because(Code.REBOOTED))
             self._adopt(self.vehicle.identity)
-        arrivals = Arrivals(tuple(self._samples), tuple(self._packets))
+        arrivals = LinkArrivals(tuple(self._samples), tuple(self._packets))
         self._samples, self._packets = [], []
         return arrivals
 

@@ -52,11 +52,11 @@ def make_parts_runner(
         denoise = compile_action(policy.denoise, shapes)
         to_chunk = compile_end(policy.to_chunk, (noise.shape,))
         steps = policy.schedule.ddim_steps(settings.num_diffusion_steps)
+    timesteps = [np.array([step.timestep], np.float32) for step in steps]
 
     def act(encoded: FloatArray, state: FloatArray, history: FloatArray) -> FloatArray:
         noisy = noise
-        for step in steps:
-            timestep = np.array([step.timestep], np.float32)
+        for step, timestep in zip(steps, timesteps, strict=True):
             output = denoise(noisy, timestep, encoded, state, history)
             noisy = policy.schedule.ddim_update(step, noisy, output)
         return to_chunk(noisy)

@@ -4,11 +4,18 @@ import torch
 from torch import Tensor, nn
 
 from policy.contract import ACTION_DIM, Contract
-from policy.errors import ContractError
+from policy.errors import ContractError, PolicyError
 from policy.nets.attention import Attention, is_tracing
 from policy.preprocess import egocentric_columns, egocentric_scale
 
 HEADS = 4
+
+
+def require_shape(name: str, array: Tensor, *shape: int) -> None:
+    """Raise a ``PolicyError`` unless ``array`` is [B, *shape]."""
+    if array.ndim != len(shape) + 1 or tuple(array.shape[1:]) != shape:
+        wanted = ", ".join(["B", *map(str, shape)])
+        raise PolicyError(f"{name} must be [{wanted}], got {list(array.shape)}")
 
 
 class StateEncoder(nn.Module):

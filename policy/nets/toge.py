@@ -15,12 +15,12 @@ import torch
 from torch import Tensor, nn
 
 from policy.contract import ACTION_DIM, Contract
-from policy.errors import ContractError
+from policy.errors import ContractError, PolicyError
 from policy.nets.action_head import DiffusionHead, size_dims
 from policy.nets.backbones import build_backbone
 from policy.nets.diffusion import NoiseSchedule
-from policy.nets.encoders import Fusion, HistoryEncoder, StateEncoder
-from policy.nets.names import BackboneName, Size
+from policy.nets.encoders import Fusion, HistoryEncoder, StateEncoder, require_shape
+from policy.nets.names import BACKBONE_NAMES, BackboneName, Size
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -41,6 +41,11 @@ class BuiltinConfig:
         return 0
 
     def __post_init__(self) -> None:
+        size_dims(self.size)
+        if self.backbone not in BACKBONE_NAMES:
+            raise PolicyError(
+                f"backbone {self.backbone!r} is unknown; use one of {list(BACKBONE_NAMES)}"
+            )
         if self.contract.feature_dim not in (0, self.feature_dim):
             raise ContractError(
                 f"the contract says feature_dim {self.contract.feature_dim}, but {self.kind} "
@@ -55,9 +60,9 @@ class BuiltinConfig:
 class BuiltinPolicy(nn.Module):
     """Network behind ``protocol.SingleRatePolicy``, on torch tensors.
 
-    Images are normalised by ``preprocess.image_to_input``, states are in SI units. Steps that the
-    schedule does not have raise a ``PolicyError``. Chunks are sticks, even if the contract says
-    rates: ``policy.stick_loop`` converts them.
+    Images are normalised by ``preprocess.image_to_input``, states are in SI units. A shape that
+    differs from the contract's, or steps that the schedule does not have, raise a ``PolicyError``.
+    Chunks are sticks, even if the contract says rates: ``policy.stick_loop`` converts them.
     """
 
     head: DiffusionHead
@@ -78,16 +83,34 @@ class BuiltinPolicy(nn.Module):
         """Fuse feature [B, F], encoded state [B, F], history [B, K, 4] -> condition [B, C]."""
         raise NotImplementedError
 
+    def _encode(self, image: Tensor) -> Tensor:
+        require_shape("image", image, 3, self.contract.image_height, self.contract.image_width)
+        feature: Tensor = self.visual_projection(self.backbone(image))
+        return feature
+
+    def _fuse(self, feature: Tensor, state: Tensor, action_history: Tensor | None) -> Tensor:
+        require_shape("state", state, self.contract.state_dim)
+        if action_history is None:
+            action_history = state.new_zeros(len(state), self.contract.history_len, ACTION_DIM)
+        require_shape("action_history", action_history, self.contract.history_len, ACTION_DIM)
+        return self.condition(feature, self.state_encoder(state), action_history)
+
+    def encode_observation(
+        self, image: Tensor, state: Tensor, action_history: Tensor | None = None
+    ) -> Tensor:
+        """Encode image, state, history [B, K, 4] or None (no action sent) -> condition [B, C]."""
+        return self._fuse(self._encode(image), state, action_history)
+
     def predict(
-        self, image: Tensor, state: Tensor, action_history: Tensor, num_diffusion_steps: int
+        self,
+        image: Tensor,
+        state: Tensor,
+        action_history: Tensor | None = None,
+        num_diffusion_steps: int = 10,
     ) -> Tensor:
         """Sample a chunk [B, horizon, 4] in [-1, 1] from image, state and history."""
-        feature = self.visual_projection(self.backbone(image))
-        return self._sample(feature, state, action_history, num_diffusion_steps)
-
-    def _sample(self, feature: Tensor, state: Tensor, history: Tensor, steps: int) -> Tensor:
-        condition = self.condition(feature, self.state_encoder(state), history)
-        return self.head.sample(condition, steps)
+        condition = self.encode_observation(image, state, action_history)
+        return self.head.sample(condition, num_diffusion_steps)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -120,14 +143,28 @@ class Toge(BuiltinPolicy):
 
     def encode_visual(self, image: Tensor) -> Tensor:
         """Encode an image [B, 3, H, W] -> feature [B, F]: the slow path."""
-        feature: Tensor = self.visual_projection(self.backbone(image))
-        return feature
+        return self._encode(image)
+
+    def encode_and_fuse(
+        self, feature: Tensor, state: Tensor, action_history: Tensor | None = None
+    ) -> Tensor:
+        """Fuse feature [B, F], state [B, state_dim], history [B, K, 4] or None -> condition [B, C].
+
+        None: no action was sent yet. In training, such histories are centred sticks.
+        """
+        require_shape("feature", feature, self.contract.feature_dim)
+        return self._fuse(feature, state, action_history)
 
     def predict_fast(
-        self, feature: Tensor, state: Tensor, action_history: Tensor, num_diffusion_steps: int
+        self,
+        feature: Tensor,
+        state: Tensor,
+        action_history: Tensor | None = None,
+        num_diffusion_steps: int = 10,
     ) -> Tensor:
         """Sample a chunk from a cached feature: bit-identical to ``predict`` on its image."""
-        return self._sample(feature, state, action_history, num_diffusion_steps)
+        condition = self.encode_and_fuse(feature, state, action_history)
+        return self.head.sample(condition, num_diffusion_steps)
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -14,9 +14,9 @@ from mavbridge.core.vehicle import (
     NEUTRAL,
     Action,
     ActionMeaning,
-    Arrivals,
     Command,
     Decision,
+    LinkArrivals,
     LinkSnapshot,
     LinkStats,
     Outlet,
@@ -159,9 +159,9 @@ class FakeLink:
         sent = [decision for _, decision in self.decisions]
         return [one for k, one in enumerate(sent) if k == 0 or one != sent[k - 1]]
 
-    def receive(self) -> Arrivals:
+    def receive(self) -> LinkArrivals:
         samples, self._samples = self._samples, ()
-        return Arrivals(samples, ())
+        return LinkArrivals(samples, ())
 
     def snapshot(self) -> LinkSnapshot:
         texts, self.texts = tuple(self.texts), []

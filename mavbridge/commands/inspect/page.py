@@ -7,7 +7,6 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict
 from importlib.resources import files
 from pathlib import Path
-from types import MappingProxyType
 from typing import Any
 
 import numpy as np
@@ -168,14 +167,14 @@ def _plot(
     title: str,
     unit: str,
     columns: dict[str, FloatColumn],
-    limits: Mapping[str, float] = MappingProxyType({}),
+    limits: Mapping[str, float] | None = None,
 ) -> dict[str, Any]:
     """Return a plot of the columns that have any value, with limits by name."""
     known = {name: values for name, values in columns.items() if np.isfinite(values).any()}
     return {
         "title": title,
         "unit": unit,
-        "limits": [{"name": name, "value": value} for name, value in limits.items()],
+        "limits": [{"name": name, "value": value} for name, value in (limits or {}).items()],
         "series": [
             {
                 "name": name,

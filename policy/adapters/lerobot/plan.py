@@ -83,7 +83,7 @@ class _Statistics:
     arrays: Mapping[str, Mapping[str, FloatArray]]
 
     def affine(self, key: str, kind: str, notes: list[str]) -> Affine | None:
-        """Return the transformation of one feature; None: unchanged, and if unasked a note."""
+        """Return the transformation of one feature; None: unchanged, noted if it is asked for."""
         mode, own = self.modes.get(kind, "IDENTITY"), self.arrays.get(key, {})
         if mode not in MODES:
             raise CheckpointError(

@@ -84,3 +84,41 @@ def test_the_noise_of_a_flight_is_drawn_from_its_seed_alone(small_toge: Toge) ->
 def test_a_contract_of_another_network_is_refused(config, changes, message):
     with pytest.raises(PolicyError, match=message):
         build_policy(config(contract=Contract(**changes)))
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [({"size": "huge"}, "small"), ({"backbone": "vgg16"}, "efficientnet_b3")],
+)
+def test_an_unknown_size_or_backbone_is_refused(changes: dict[str, str], message: str) -> None:
+    with pytest.raises(PolicyError, match=message):
+        TogeConfig(**changes)  # type: ignore[arg-type]
+
+
+@torch.inference_mode()
+def test_refuses_wrong_shapes_and_names_them(small_toge: Toge) -> None:
+    image, state, history = sample()
+    with pytest.raises(PolicyError, match=r"image must be \[B, 3, 32, 32\]"):
+        small_toge.encode_visual(image[..., :31])
+    feature = small_toge.encode_visual(image)
+    with pytest.raises(PolicyError, match=r"feature must be \[B, 256\]"):
+        small_toge.predict_fast(feature[:, :-1], state, history)
+    with pytest.raises(PolicyError, match=r"state must be \[B, 13\]"):
+        small_toge.predict_fast(feature, state[0], history)
+    with pytest.raises(PolicyError, match=r"action_history must be \[B, 4, 4\]"):
+        small_toge.predict_fast(feature, state, history[:, :3])
+
+
+@torch.inference_mode()
+@pytest.mark.parametrize("kind", [TogeConfig, ResnetUnetConfig])
+def test_without_a_history_no_action_was_sent(kind: type[TogeConfig | ResnetUnetConfig]) -> None:
+    torch.manual_seed(0)
+    contract = Contract(image_height=32, image_width=32)
+    policy = build_policy(kind(backbone="resnet18", contract=contract)).eval()
+    image, state, history = sample()
+    centred = policy.encode_observation(image, state, history * 0)
+    assert torch.equal(policy.encode_observation(image, state), centred)
+    assert torch.equal(policy.predict(image, state), policy.predict(image, state, history * 0, 10))
+    if isinstance(policy, Toge):
+        feature = policy.encode_visual(image)
+        assert torch.equal(policy.encode_and_fuse(feature, state), centred)
