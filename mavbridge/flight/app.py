@@ -31,12 +31,12 @@ from mavbridge.flight.bridge import Bridge, CameraPath, build_bridge
 from mavbridge.flight.checks import check_flight, signing_note
 from mavbridge.flight.feature_cache import FeatureCache
 from mavbridge.flight.guard_process import StartedGuard, start_guard
-from mavbridge.flight.observation import observation_ages_ns
 from mavbridge.flight.observers import FlightObservers
 from mavbridge.flight.outcome import flight_verdict, log_link
 from mavbridge.flight.plan import FlightPlan, plan_flight
 from mavbridge.flight.policies import load_configured_policy, looks_at_images
 from mavbridge.flight.speed import require_speed
+from mavbridge.flight.state import observation_ages_ns
 from mavbridge.guard.values import EndRequest, Phase
 from mavbridge.observe.keyboard import ENGAGE_KEY, KEYS_HINT, Keyboard
 from mavbridge.observe.output import flight_console

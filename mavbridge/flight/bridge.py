@@ -16,10 +16,9 @@ from mavbridge.core.vehicle import ForwardedPacket
 from mavbridge.flight.action_frames import action_frame
 from mavbridge.flight.feature_cache import FeatureCache
 from mavbridge.flight.history import SentHistory
-from mavbridge.flight.observation import ObservationSource, observation_ages_ns
 from mavbridge.flight.plan import FlightPlan
 from mavbridge.flight.policy_loop import PolicyLoop, PolicySettings
-from mavbridge.flight.state import Freshness, StateReader
+from mavbridge.flight.state import Freshness, ObservationSource, StateReader, observation_ages_ns
 from mavbridge.flight.telemetry_cache import TelemetryCache
 from mavbridge.flight.vision_loop import VisionLoop
 from mavbridge.flight.vision_rate import AdaptiveRate

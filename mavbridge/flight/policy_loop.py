@@ -12,8 +12,13 @@ from mavbridge.core.records import FloatArray, Solve, VehicleState
 from mavbridge.core.vehicle import Action
 from mavbridge.flight.action_frames import ActionFrame
 from mavbridge.flight.history import SentHistory
-from mavbridge.flight.observation import Observation, ObservationSource
-from mavbridge.flight.state import FrozenStateCheck, StateReader, Unavailable
+from mavbridge.flight.state import (
+    FrozenStateCheck,
+    Observation,
+    ObservationSource,
+    StateReader,
+    Unavailable,
+)
 from mavbridge.flight.telemetry_cache import SolveInputs, TelemetryCache
 from mavbridge.guard.chunks import Chunk
 from mavbridge.guard.wire import NoChunk

@@ -10,7 +10,7 @@ import socket
 import sys
 import traceback
 
-from mavbridge.core.clock import NS_PER_MS, NS_PER_S, MonotonicClock
+from mavbridge.core.clock import NS_PER_MS, MonotonicClock
 from mavbridge.core.errors import MavbridgeError, UserError
 from mavbridge.core.realtime import settle_guard
 from mavbridge.core.reasons import Code, because
@@ -103,7 +103,7 @@ def _fly(
     if refusal is not None:
         port.send(encode_from_guard(GuardMessage(refusal)))
     try:
-        _serve(loop, clock, port, link)
+        loop.run(port)
     except BaseException:
         loop.abandon()
         raise
@@ -119,17 +119,6 @@ def _fly(
         dropped_packets=log.dropped if log else 0,
     )
     port.finish(encode_from_guard(summary), LAST_WORDS_S)
-
-
-def _serve(loop: GuardLoop, clock: MonotonicClock, port: SocketPort, link: MavlinkLink) -> None:
-    """Step at every arrival and at every deadline until the loop is done."""
-    while not loop.is_done:
-        due_ns = loop.step()
-        ends = (None if port.is_closed else port.fileno(), link.fileno())
-        files = [end for end in ends if end is not None]
-        timeout_ns = due_ns - clock.now_ns()
-        if timeout_ns > 0:
-            select.select(files, [], [], timeout_ns / NS_PER_S)
 
 
 if __name__ == "__main__":

@@ -1,5 +1,6 @@
 """The guard's loop: connects the guard to the vehicle's link and to the flight process."""
 
+import select
 import traceback
 from collections.abc import Callable, Sequence
 from contextlib import suppress
@@ -19,7 +20,7 @@ from mavbridge.core.vehicle import (
     Outlet,
     VehicleStatus,
 )
-from mavbridge.guard.channel import Port
+from mavbridge.guard.channel import Port, SocketPort
 from mavbridge.guard.chunks import Chunk
 from mavbridge.guard.guard import Guard, GuardInput, GuardOutput
 from mavbridge.guard.settings import FlightSettings
@@ -161,6 +162,20 @@ class GuardLoop:
         words = LastWords(self._guard.phase, mode, outlet.receiver, is_new, self._words)
         is_told = self._flight.send(encode_from_guard(words), outlet.fd if is_new else None)
         self._words_outlet = outlet if is_told and self._words else None
+
+    def run(self, woken_by: SocketPort) -> None:
+        """Step at every arrival and at every deadline until control has been given back.
+
+        Args:
+            woken_by: channel to the flight process, whose messages wake the loop like the link's.
+        """
+        while not self.is_done:
+            due_ns = self.step()
+            ends = (None if woken_by.is_closed else woken_by.fileno(), self._link.fileno())
+            timeout_ns = due_ns - self._clock.now_ns()
+            if timeout_ns > 0:
+                readable = [end for end in ends if end is not None]
+                select.select(readable, [], [], timeout_ns / NS_PER_S)
 
     def step(self) -> int:
         """Run one pass. Return the latest time of the next one.

@@ -14,9 +14,9 @@ from mavbridge.core.ports import TickSink
 from mavbridge.core.reasons import Code, because
 from mavbridge.core.records import CameraImage
 from mavbridge.flight.bridge import CameraPath, build_bridge
-from mavbridge.flight.observation import observation_ages_ns
 from mavbridge.flight.plan import plan_flight
 from mavbridge.flight.settings import link_settings
+from mavbridge.flight.state import observation_ages_ns
 from mavbridge.guard.loop import GuardLoop
 from mavbridge.guard.values import EndRequest
 from mavbridge.mavlink.link import MavlinkLink

@@ -5,6 +5,8 @@ from typing import NamedTuple, TypeAlias
 
 from pymavlink.dialects.v20 import ardupilotmega as dialect
 
+from mavbridge.core.vehicle import Sticks
+
 _REAL, _INTEGER = struct.Struct("<f"), struct.Struct("<i")
 _LEAST, _MOST = -(2**31), 2**31 - 1
 
@@ -106,6 +108,12 @@ class ManualControl(NamedTuple):
     z: int
     """Up, 0 to 1000."""
     r: int
+
+    @property
+    def sticks(self) -> Sticks:
+        """The integers as sticks."""
+        x, y, z, r = self
+        return Sticks(2 * z / STICK_END - 1, r / STICK_END, x / STICK_END, y / STICK_END)
 
 
 class AttitudeTarget(NamedTuple):

@@ -1,6 +1,7 @@
 """Encoding and decoding of MAVLink packets, with range checks; no socket, no clock."""
 
 import math
+import struct
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 
@@ -10,7 +11,6 @@ from mavbridge.core.clock import NS_PER_MS
 from mavbridge.core.rotation import Quaternion, tilt_rad
 from mavbridge.core.vehicle import Sticks, Velocity
 from mavbridge.mavlink.codec.calibration import PWM_LIMITS_US, Pwm, RcCalibration
-from mavbridge.mavlink.codec.fast_path import decode_packet, pack_override, packet_end
 from mavbridge.mavlink.codec.messages import (
     STICK_END,
     CommandRequest,
@@ -22,7 +22,16 @@ from mavbridge.mavlink.codec.messages import (
     Request,
     StreamRequest,
 )
-from mavbridge.mavlink.codec.readers import READERS, UnusableError
+from mavbridge.mavlink.codec.readers import (
+    HEADER,
+    MAVLINK_2,
+    READERS,
+    UnusableError,
+    checksum,
+    decode_packet,
+    packet_end,
+    unread,
+)
 from mavbridge.mavlink.codec.signing import LAST_WORDS_LINK_ID, LINK_ID, Signing, is_signed
 
 RELEASE_US = 0
@@ -37,6 +46,9 @@ _TEXT_CHUNKS = 4
 MOST_DATAGRAM_BYTES = 4096
 """Bytes that are decoded of one datagram: more than any autopilot or router sends in one. The worst
 case for the parser takes 2 ms; the largest UDP datagram would take 35 ms."""
+_OVERRIDE = dialect.MAVLink_rc_channels_override_message
+_OVERRIDE_PAYLOAD = struct.Struct("<8H2B")
+"""Channels 1 to 8, target system and component. Channels 9 to 18 are zeros, which are truncated."""
 _PACKET_STARTS = (b"\xfd", b"\xfe")
 """Start bytes of MAVLink 2 and 1."""
 
@@ -63,13 +75,6 @@ _VELOCITY_MASK = 0x5C7
 
 class CommandRefusedError(Exception):
     """Stick command that must not be sent; always a bug upstream of the codec."""
-
-
-def _unread(name: str, packet: bytes) -> ReceivedMessage:
-    """Return a message unknown to the dialect; its sequence number is counted."""
-    at = 4 if packet[0] == dialect.PROTOCOL_MARKER_V2 else 2
-    sequence, system, component = packet[at : at + 3]
-    return ReceivedMessage(Endpoint(system, component), sequence, name, None, packet)
 
 
 class Codec:
@@ -172,7 +177,7 @@ class Codec:
     def _decoded(self, message: dialect.MAVLink_message, packet: bytes) -> ReceivedMessage:
         name = message.get_type()
         if isinstance(message, dialect.MAVLink_unknown):
-            return decode_packet(packet) or _unread(name, packet)
+            return decode_packet(packet) or unread(name, packet)
         reader = READERS.get(name)
         try:
             body = None if reader is None else reader(message)
@@ -372,10 +377,14 @@ def manual_control_of(sticks: Sticks) -> ManualControl:
     return ManualControl(x, y, z, r)
 
 
-def manual_control_sticks(values: ManualControl) -> Sticks:
-    """Return MANUAL_CONTROL's integers as sticks."""
-    x, y, z, r = values
-    return Sticks(2 * z / STICK_END - 1, r / STICK_END, x / STICK_END, y / STICK_END)
+def pack_override(
+    source: Endpoint, sequence: int, target: Endpoint, channels_us: Sequence[int]
+) -> bytes:
+    """Encode RC_CHANNELS_OVERRIDE of channels 1 to 8, without trailing zeros (MAVLink 2)."""
+    payload = _OVERRIDE_PAYLOAD.pack(*channels_us, *target).rstrip(b"\0") or b"\0"
+    header = HEADER.pack(MAVLINK_2, len(payload), 0, 0, sequence, *source, _OVERRIDE.id, 0)
+    packet = header + payload
+    return packet + checksum(packet[1:], _OVERRIDE.crc_extra)
 
 
 def _stamp_ms(now_ns: int) -> int:

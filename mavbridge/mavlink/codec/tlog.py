@@ -9,9 +9,9 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from mavbridge.core.errors import UserError
-from mavbridge.mavlink.codec.fast_path import CRC_EXTRA
 from mavbridge.mavlink.codec.frames import RawPacket, frame_at
 from mavbridge.mavlink.codec.messages import Endpoint
+from mavbridge.mavlink.codec.readers import CRC_EXTRA
 
 _STAMP_BYTES = 8
 """Timestamp size; big-endian, unsigned."""

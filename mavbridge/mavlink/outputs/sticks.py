@@ -20,7 +20,6 @@ from mavbridge.mavlink.codec.packets import (
     Codec,
     CommandRefusedError,
     manual_control_of,
-    manual_control_sticks,
     pwm_of,
 )
 from mavbridge.mavlink.outputs.echo import EchoRules, Shown
@@ -315,7 +314,7 @@ class ManualControlOutput(StickOutput):
         values = ManualControl(x, y, z, r)
         packet = self._codec.encode_manual_control(vehicle.identity.source.system, values)
         self._last = values
-        return Encoded(packet, curves.to_policy(manual_control_sticks(values)), shown)
+        return Encoded(packet, curves.to_policy(values.sticks), shown)
 
     def encode_resting(self, action: Action, vehicle: VehicleSession, now_ns: int) -> bytes | None:
         """See `ActionOutput`."""
@@ -327,7 +326,7 @@ class ManualControlOutput(StickOutput):
         if not isinstance(body, ManualControl):
             return
         self.echo.received(tuple(body), arrived_ns // 1000, arrived_ns)
-        self._shown = (arrived_ns, manual_control_sticks(body))
+        self._shown = (arrived_ns, body.sticks)
         if self.echo.is_released and not self.echo.is_sending:
             self._pilot = self._shown[1]
 

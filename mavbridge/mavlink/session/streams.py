@@ -5,8 +5,8 @@ from collections.abc import Callable, Iterator
 from pymavlink.dialects.v20 import ardupilotmega as dialect
 
 from mavbridge.core.clock import NS_PER_MS, NS_PER_S
-from mavbridge.mavlink.codec.fast_path import MISSING_IDS
 from mavbridge.mavlink.codec.messages import CommandAck, CommandRequest, Request, StreamRequest
+from mavbridge.mavlink.codec.readers import MISSING_IDS
 from mavbridge.mavlink.profiles.profile import StreamGroup
 
 _ACK_TIMEOUT_NS = 500 * NS_PER_MS

@@ -21,9 +21,8 @@ from mavbridge.core.records import FeatureFrame, FloatArray, Frame, Solve, Tick,
 from mavbridge.core.vehicle import Sample, Telemetry
 from mavbridge.flight.bridge import CameraPath, build_bridge
 from mavbridge.flight.feature_cache import FeatureCache
-from mavbridge.flight.observation import observation_ages_ns
 from mavbridge.flight.plan import plan_flight
-from mavbridge.flight.state import Freshness, StateReader
+from mavbridge.flight.state import Freshness, StateReader, observation_ages_ns
 from mavbridge.flight.telemetry_cache import TelemetryCache
 from mavbridge.guard.chunks import Chunk
 from mavbridge.guard.values import Phase

@@ -10,13 +10,13 @@ from mavbridge.core.clock import NS_PER_MS
 from mavbridge.core.reasons import Code, Reason, because
 from mavbridge.core.records import FeatureFrame, VehicleState
 from mavbridge.flight.feature_cache import MAX_PAST, FeatureCache
-from mavbridge.flight.observation import (
+from mavbridge.flight.state import (
     MAX_STATES,
     Observation,
     ObservationSource,
+    Unavailable,
     observation_ages_ns,
 )
-from mavbridge.flight.state import Unavailable
 from policy.contract import Contract
 from policy.protocol import PolicyRunner
 

@@ -16,9 +16,8 @@ from mavbridge.core.vehicle import Sample, Velocity
 from mavbridge.flight.action_frames import ActionFrame, action_frame
 from mavbridge.flight.feature_cache import FeatureCache
 from mavbridge.flight.history import SentHistory
-from mavbridge.flight.observation import ObservationSource
 from mavbridge.flight.policy_loop import MAX_HORIZON, RETRY_NS, PolicyLoop, PolicySettings
-from mavbridge.flight.state import Freshness, StateReader
+from mavbridge.flight.state import Freshness, ObservationSource, StateReader
 from mavbridge.flight.telemetry_cache import TelemetryCache
 from mavbridge.guard.chunks import Chunk
 from mavbridge.guard.values import Phase

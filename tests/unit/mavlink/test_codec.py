@@ -37,7 +37,6 @@ from mavbridge.mavlink.codec.messages import (
 from mavbridge.mavlink.codec.packets import (
     CommandRefusedError,
     manual_control_of,
-    manual_control_sticks,
     pwm_of,
 )
 
@@ -317,7 +316,7 @@ def test_manual_control(sticks: Sticks, xyzr: tuple[int, ...]) -> None:
     values = manual_control_of(sticks)
     message = sent(codec().encode_manual_control(1, values))
     assert (message.x, message.y, message.z, message.r) == xyzr
-    assert manual_control_sticks(values) == sticks
+    assert values.sticks == sticks
 
 
 @pytest.mark.parametrize(

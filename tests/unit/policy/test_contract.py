@@ -8,8 +8,8 @@ from hypothesis import strategies as st
 
 from mavbridge.config.flight import Limits
 from mavbridge.config.rates import Rates
-from mavbridge.flight.observation import observation_ages_ns
 from mavbridge.flight.settings import effective_freshness
+from mavbridge.flight.state import observation_ages_ns
 from policy.checkpoints.header import read_contract
 from policy.contract import Contract, history_ages_ns
 from policy.errors import ContractError

@@ -5,7 +5,6 @@ from hypothesis import given
 from hypothesis import strategies as st
 from pymavlink.dialects.v20 import ardupilotmega as dialect
 
-from mavbridge.mavlink.codec.fast_path import MISSING_IDS, decode_packet, pack_override
 from mavbridge.mavlink.codec.messages import (
     Body,
     CurrentMode,
@@ -13,8 +12,8 @@ from mavbridge.mavlink.codec.messages import (
     Event,
     ReceivedMessage,
 )
-from mavbridge.mavlink.codec.packets import Codec
-from mavbridge.mavlink.codec.readers import READERS
+from mavbridge.mavlink.codec.packets import Codec, pack_override
+from mavbridge.mavlink.codec.readers import MISSING_IDS, READERS, decode_packet
 
 byte = st.integers(0, 255)
 pwm = st.integers(0, 65535)
