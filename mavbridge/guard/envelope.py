@@ -1,14 +1,13 @@
 """Flight envelope: tilt, height, speed, distance, estimator, battery, landing."""
 
 import math
-from collections.abc import Iterator
 from dataclasses import dataclass, fields
 from typing import Literal, NamedTuple, TypeAlias
 
 from mavbridge.core.clock import NS_PER_MS
 from mavbridge.core.reasons import Code, Reason, because
 from mavbridge.core.rotation import tilt_rad
-from mavbridge.core.vehicle import Reading, Telemetry, VehicleStatus
+from mavbridge.core.vehicle import Telemetry, VehicleStatus
 
 READING_PERSIST_NS = 50 * NS_PER_MS
 """Debounce time of tilt and speed, by the readings' timestamps: six readings at 100 Hz, two at 20
@@ -66,15 +65,6 @@ class EnvelopeExit(NamedTuple):
     reason: Reason
 
 
-class _Finding(NamedTuple):
-    """Check of one quantity at one tick."""
-
-    name: str
-    problem: Reason | None
-    stamp_ns: int
-    persist_ns: int
-
-
 class Envelope:
     """Detects when the vehicle leaves its envelope, and which quantities cannot be watched.
 
@@ -89,6 +79,8 @@ class Envelope:
         self._had_position = False
         self._was_in_air = False
         self._unwatched: list[str] = []
+        self._found: EnvelopeExit | None = None
+        """First limit exceeded at this tick."""
 
     def reset(self) -> None:
         """Start the checks of a new flight."""
@@ -103,80 +95,78 @@ class Envelope:
     def check(self, vehicle: EnvelopeInput) -> EnvelopeExit | None:
         """Return the first limit that has been exceeded for its debounce time, or None."""
         self._unwatched.clear()
-        found: EnvelopeExit | None = None
-        for finding in self._findings(vehicle):
-            if finding.problem is None:
-                self._since_ns.pop(finding.name, None)
-                continue
-            since_ns = self._since_ns.setdefault(finding.name, finding.stamp_ns)
-            if found is None and finding.stamp_ns - since_ns >= finding.persist_ns:
-                kind: _Kind = "landed" if finding.name == "landing" else "fault"
-                found = EnvelopeExit(kind, finding.problem)
-        return found
+        self._found = None
+        self._check_motion(vehicle.telemetry, vehicle.now_ns)
+        self._check_position(vehicle.status.position_ned_m, vehicle.now_ns)
+        self._check_flags(vehicle.status, vehicle.now_ns)
+        return self._found
 
-    def _findings(self, vehicle: EnvelopeInput) -> Iterator[_Finding]:
-        limits, telemetry, now_ns = self._limits, vehicle.telemetry, vehicle.now_ns
-        if reading := self._fresh("tilt", limits.tilt_deg, telemetry.ned_from_body_wxyz, now_ns):
-            problem = _beyond(
-                "tilt", math.degrees(tilt_rad(reading.values)), limits.tilt_deg, "deg"
-            )
-            yield _Finding("tilt", problem, reading.arrived_ns, READING_PERSIST_NS)
-        if reading := self._fresh("speed", limits.speed_mps, telemetry.velocity_ned_mps, now_ns):
-            problem = _beyond("speed", math.hypot(*reading.values), limits.speed_mps, "m/s")
-            yield _Finding("speed", problem, reading.arrived_ns, READING_PERSIST_NS)
-        yield from self._position_findings(vehicle)
-        yield from self._flag_findings(vehicle)
-
-    def _fresh(
-        self, name: str, limit: float, reading: Reading | None, now_ns: int
-    ) -> Reading | None:
-        """Return the reading if its limit is set and the reading is fresh, else None."""
-        if not _is_limit(limit):
-            return None
-        if reading is None or now_ns - reading.arrived_ns > FRESH_NS:
-            self._ignore(name, "no fresh attitude" if name == "tilt" else "no valid velocity")
-            return None
-        return reading
+    def _note(self, name: str, problem: Reason | None, stamp_ns: int, persist_ns: int) -> None:
+        """Note the state of one quantity; ``stamp_ns`` counts for its debounce time."""
+        if problem is None:
+            self._since_ns.pop(name, None)
+            return
+        since_ns = self._since_ns.setdefault(name, stamp_ns)
+        if self._found is None and stamp_ns - since_ns >= persist_ns:
+            self._found = EnvelopeExit("landed" if name == "landing" else "fault", problem)
 
     def _ignore(self, name: str, reason: str) -> None:
         """Note a quantity without data, and restart its debounce."""
         self._since_ns.pop(name, None)
         self._unwatched.append(f"{name} is not watched: {reason}")
 
-    def _position_findings(self, vehicle: EnvelopeInput) -> Iterator[_Finding]:
-        position = vehicle.status.position_ned_m
-        for name, limit in (
-            ("height", self._limits.height_m),
-            ("distance", self._limits.distance_m),
-        ):
-            if not _is_limit(limit):
+    def _check_motion(self, telemetry: Telemetry, now_ns: int) -> None:
+        oldest_ns, limits = now_ns - FRESH_NS, self._limits
+        if _is_limit(limits.tilt_deg):
+            attitude = telemetry.ned_from_body_wxyz
+            if attitude is None or attitude.arrived_ns < oldest_ns:
+                self._ignore("tilt", "no fresh attitude")
+            else:
+                tilt_deg = math.degrees(tilt_rad(attitude.values))
+                problem = _beyond("tilt", tilt_deg, limits.tilt_deg, "deg")
+                self._note("tilt", problem, attitude.arrived_ns, READING_PERSIST_NS)
+        if _is_limit(limits.speed_mps):
+            velocity = telemetry.velocity_ned_mps
+            if velocity is None or velocity.arrived_ns < oldest_ns:
+                self._ignore("speed", "no valid velocity")
+            else:
+                speed_mps = math.hypot(*velocity.values)
+                problem = _beyond("speed", speed_mps, limits.speed_mps, "m/s")
+                self._note("speed", problem, velocity.arrived_ns, READING_PERSIST_NS)
+
+    def _check_position(
+        self, position_ned_m: tuple[float, float, float] | None, now_ns: int
+    ) -> None:
+        watched = (("height", self._limits.height_m), ("distance", self._limits.distance_m))
+        for name, limit_m in watched:
+            if not _is_limit(limit_m):
                 continue
-            if position is None:
+            if position_ned_m is None:
                 self._ignore(name, "no valid position")
                 continue
-            north_m, east_m, down_m = position
+            north_m, east_m, down_m = position_ned_m
             value_m = -down_m if name == "height" else math.hypot(north_m, east_m)
-            problem = _beyond(name, value_m, limit, "m")
-            yield _Finding(name, problem, vehicle.now_ns, POSITION_PERSIST_NS)
+            problem = _beyond(name, value_m, limit_m, "m")
+            self._note(name, problem, now_ns, POSITION_PERSIST_NS)
 
-    def _flag_findings(self, vehicle: EnvelopeInput) -> Iterator[_Finding]:
-        limits, status, now_ns = self._limits, vehicle.status, vehicle.now_ns
+    def _check_flags(self, status: VehicleStatus, now_ns: int) -> None:
+        limits = self._limits
         if limits.estimator:
             self._had_position |= status.is_position_valid is True
             if not self._had_position or status.is_position_valid is None:
                 self._ignore("estimator", "it reports no valid position")
             lost = self._had_position and status.is_position_valid is False
             problem = because(Code.ESTIMATOR_LOST) if lost else None
-            yield _Finding("estimator", problem, now_ns, FLAG_PERSIST_NS)
+            self._note("estimator", problem, now_ns, FLAG_PERSIST_NS)
         if limits.battery:
-            yield _Finding("battery", status.battery_problem, now_ns, FLAG_PERSIST_NS)
+            self._note("battery", status.battery_problem, now_ns, FLAG_PERSIST_NS)
         if limits.landing:
             if status.is_landed is None:
                 self._ignore("landing", "the vehicle does not say whether it is in the air")
             self._was_in_air |= status.armed and status.is_landed is False
             has_landed = self._was_in_air and status.armed and status.is_landed is True
             problem = because(Code.LANDED) if has_landed else None
-            yield _Finding("landing", problem, now_ns, FLAG_PERSIST_NS)
+            self._note("landing", problem, now_ns, FLAG_PERSIST_NS)
 
 
 def _is_limit(limit: float) -> bool:
