@@ -78,6 +78,7 @@ ImageFit = Literal["stretch", "crop", "pad"]
 """Fit of a camera image: change the proportions, crop longer sides evenly, or add black bars."""
 ImageChannels = Literal["rgb", "bgr", "depth"]
 StateFrame = Literal["ned_frd", "enu_flu"]
+StateTime = Literal["measured", "execution"]
 Arrays = Literal["numpy", "torch"]
 STICK_MODES = (
     *("STABILIZE", "ACRO", "ALT_HOLD", "LOITER", "POSHOLD", "SPORT", "DRIFT"),
@@ -108,6 +109,7 @@ _TUPLES = (
 )
 _CHOICES: dict[str, Any] = {
     "state_frame": StateFrame,
+    "state_time": StateTime,
     "arrays": Arrays,
     "velocity_frame": VelocityFrame,
     "image_fit": ImageFit,
@@ -180,6 +182,9 @@ class Contract:
     history_dt_s: float = 0.05
     """Time between past actions; the newest is history_dt_s before the state."""
     arrays: Arrays = "torch"
+    state_time: StateTime = "measured"
+    """Time of the newest state. "execution": predicted to the moment at which the chunk will act,
+    from the actions flown until then; for policies that take long."""
     since_exposure: bool = False
     """True: append ``SINCE_EXPOSURE_NAMES`` to the state."""
     state_extras: tuple[StateExtra, ...] = ()

@@ -100,6 +100,7 @@ class StickLoop:
     """
 
     contract: Contract
+    tilt_gain_per_s: float = TILT_GAIN_PER_S
 
     def __post_init__(self) -> None:
         if self.contract.state_frame != "ned_frd":
@@ -117,28 +118,38 @@ class StickLoop:
         numbers: list[float] = state[0].tolist()
         w, x, y, z = numbers[QUATERNION]
         p, q, r = numbers[RATE]
-        attitude = _turned((w, x, y, z), (p, q, r), LAG_S)
+        attitude = turned((w, x, y, z), (p, q, r), LAG_S)
         climb_mps = -numbers[VELOCITY][2]
         dt_s, hover = self.contract.chunk_dt_s, self.contract.hover_thrust
         for step, positions in enumerate(sticks[0].tolist()):
             wanted = motion_of_sticks(self.contract, *positions)
-            body_from_ned: Quaternion = conjugate(attitude)
-            down_body: Vector = rotate(body_from_ned, (0.0, 0.0, 1.0))
-            up_mps2 = GRAVITY_MPS2 + CLIMB_GAIN_PER_S * (wanted.climb_mps - climb_mps)
-            up_mps2 = min(max(up_mps2, UP_FORCE_MPS2[0]), UP_FORCE_MPS2[1])
-            thrust = hover * up_mps2 / (GRAVITY_MPS2 * max(down_body[2], MIN_COS_TILT))
-            axis_body = rotate(body_from_ned, self._thrust_axis_ned(wanted, attitude))
-            tilt_p, tilt_q = _tilt_rates(axis_body)
-            yaw_rate = wanted.yaw_rate_radps
-            rate = (
-                tilt_p + yaw_rate * down_body[0],
-                tilt_q + yaw_rate * down_body[1],
-                yaw_rate * down_body[2],
-            )
-            rates[0, step] = (min(thrust, 1.0), *rate)
-            attitude = _turned(attitude, rate, dt_s)
+            up_mps2, cos_tilt, rate = self.demand(wanted, attitude, climb_mps)
+            rates[0, step] = (min(hover * up_mps2 / (GRAVITY_MPS2 * cos_tilt), 1.0), *rate)
+            attitude = turned(attitude, rate, dt_s)
             climb_mps += (up_mps2 - GRAVITY_MPS2) * dt_s
         return rates
+
+    def demand(
+        self, wanted: StickMotion, attitude: Quaternion, climb_mps: float
+    ) -> tuple[float, float, Vector]:
+        """Return what brings a vehicle from an attitude and climb to a motion.
+
+        Vertical specific force [m/s^2], the cosine of the tilt that the thrust is divided by, and
+        body rates [rad/s].
+        """
+        body_from_ned: Quaternion = conjugate(attitude)
+        down_body: Vector = rotate(body_from_ned, (0.0, 0.0, 1.0))
+        up_mps2 = GRAVITY_MPS2 + CLIMB_GAIN_PER_S * (wanted.climb_mps - climb_mps)
+        up_mps2 = min(max(up_mps2, UP_FORCE_MPS2[0]), UP_FORCE_MPS2[1])
+        axis_body = rotate(body_from_ned, self._thrust_axis_ned(wanted, attitude))
+        tilt_p, tilt_q = _tilt_rates(axis_body, self.tilt_gain_per_s)
+        yaw_rate = wanted.yaw_rate_radps
+        rate = (
+            tilt_p + yaw_rate * down_body[0],
+            tilt_q + yaw_rate * down_body[1],
+            yaw_rate * down_body[2],
+        )
+        return up_mps2, max(down_body[2], MIN_COS_TILT), rate
 
     def to_sticks(self, rates: FloatArray, state: FloatArray) -> FloatArray:
         """Convert rates [N, 4] at states [N, state_dim] to the sticks [N, 4] behind them.
@@ -147,7 +158,7 @@ class StickLoop:
         """
         contract = self.contract
         attitude = np.stack(
-            _turned(tuple(state[:, QUATERNION].T), tuple(state[:, RATE].T), LAG_S), axis=-1
+            turned(tuple(state[:, QUATERNION].T), tuple(state[:, RATE].T), LAG_S), axis=-1
         ).astype(np.float64)
         down_body = rotate(conjugate(attitude), np.tile([0.0, 0.0, 1.0], (len(rates), 1)))
         cos_tilt = np.maximum(down_body[:, 2], MIN_COS_TILT)
@@ -194,7 +205,7 @@ class StickLoop:
         )
 
 
-def _tilt_rates(wanted_body: Vector) -> tuple[float, float]:
+def _tilt_rates(wanted_body: Vector, gain_per_s: float) -> tuple[float, float]:
     """Return roll and pitch rate that turn the thrust, along -z, the short way to a unit vector.
 
     The tilt has its own loop, independent of the heading: the direction of thrust matters more
@@ -202,12 +213,12 @@ def _tilt_rates(wanted_body: Vector) -> tuple[float, float]:
     """
     x, y, z = wanted_body
     sine = math.hypot(x, y)
-    rate = min(TILT_GAIN_PER_S * math.atan2(sine, -z), MAX_TILT_RATE_RADPS)
-    share = rate / sine if sine > 1e-6 else TILT_GAIN_PER_S
+    rate = min(gain_per_s * math.atan2(sine, -z), MAX_TILT_RATE_RADPS)
+    share = rate / sine if sine > 1e-6 else gain_per_s
     return share * y, -share * x
 
 
-def _turned(attitude: Quaternion, rate: Vector, dt_s: float) -> Quaternion:
+def turned(attitude: Quaternion, rate: Vector, dt_s: float) -> Quaternion:
     """Return the attitude after a turn at constant body rates; floats, or arrays of them."""
     half = dt_s / 2
     turn = (1.0, half * rate[0], half * rate[1], half * rate[2])

@@ -11,6 +11,7 @@ from mavbridge.config.flight import Limits
 from mavbridge.config.policy import PolicyConfig
 from mavbridge.config.rates import Rates
 from mavbridge.core.errors import UserError
+from policy.contract import StateTime
 
 AutopilotKind = Literal["ardupilot", "px4"]
 CourseKind = Literal["easy", "race"]
@@ -103,6 +104,13 @@ class EvaluateConfig:
     vision_time: float | None = None
     """Milliseconds that an image takes to encode, always; by default as on two shared
     cores: 11, and 25 at the 99th percentile."""
+    solve_time: float | None = None
+    """Milliseconds from image and attitude to the chunk, always, as of a slow head or a server; by
+    default 3, and 6 at the 99th percentile. The policy's play_s, and so its age limits and its
+    rate, follow."""
+    state_time: StateTime | None = None
+    """measured, or execution: the state is predicted to the time at which the chunk will act; by
+    default as the contract says."""
     stalls: float = 0.0
     """Milliseconds for which the flight process stands still, at a random moment every 3 s;
     limits.stall may be looser than the policy's here, too."""
@@ -123,6 +131,8 @@ class EvaluateConfig:
             raise UserError("--resume needs the --json FILE to go on with")
         if self.vision_time is not None:
             check_range("vision-time", self.vision_time, 0, 5000, "ms")
+        if self.solve_time is not None:
+            check_range("solve-time", self.solve_time, 0, 5000, "ms")
         check_range("gains", self.gains, 0.2, 2.5, "")
         check_range("seed", self.policy.seed, 0, MAX_EVALUATION_SEED, "")
         if self.gains != 1 and self.autopilot != "ardupilot":

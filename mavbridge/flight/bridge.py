@@ -15,6 +15,7 @@ from mavbridge.core.records import CameraImage, FloatArray, Solve
 from mavbridge.core.vehicle import ForwardedPacket
 from mavbridge.flight.action_frames import action_frame
 from mavbridge.flight.feature_cache import FeatureCache
+from mavbridge.flight.forward_state import ForwardState
 from mavbridge.flight.history import SentHistory
 from mavbridge.flight.plan import FlightPlan
 from mavbridge.flight.policy_loop import PolicyLoop, PolicySettings
@@ -93,6 +94,7 @@ def build_bridge(
     settings = PolicySettings(
         action_frame=action_frame(contract),
         chunk_dt_s=contract.chunk_dt_s,
+        forward=ForwardState(contract) if contract.state_time == "execution" else None,
         max_frozen_ns=round(config.limits.max_frozen_state * NS_PER_S),
         period_ns=plan.guard.chunk_period_ns,
     )

@@ -6,6 +6,7 @@ from bisect import bisect_right
 from mavbridge.core.records import FloatArray
 from mavbridge.core.vehicle import Action, Sticks
 from mavbridge.flight.action_frames import ActionFrame
+from mavbridge.guard.chunks import Chunk
 from policy.contract import history_ages_ns
 
 
@@ -53,8 +54,26 @@ class SentHistory:
             if (old := bisect_right(self._sent_ns, now_ns - self._span_ns)) > 1:
                 del self._sent_ns[: old - 1], self._sent[: old - 1]
 
-    def resample(self, now_ns: int) -> FloatArray:
-        """Return the history [1, K, 4] on the grid of ``policy.contract.history_ages_ns``."""
+    def at(self, at_ns: int, plan: Chunk | None = None) -> Action:
+        """Return the action flown at a time, of the policy's kind, in NED and FRD axes.
+
+        ``plan``: chunk that is flown from the end of its solve on.
+        """
+        if plan is not None and at_ns >= plan.computed_ns:
+            return plan.action_at(at_ns)
         with self._lock:
-            rows = [self._sent[bisect_right(self._sent_ns, now_ns - age)] for age in self._ages_ns]
+            action = self._sent[bisect_right(self._sent_ns, at_ns)]
+        return action if type(action) is type(self._frame.neutral) else self._frame.neutral
+
+    def resample(self, at_ns: int, plan: Chunk | None = None) -> FloatArray:
+        """Return the history [1, K, 4] on the grid of ``policy.contract.history_ages_ns``.
+
+        ``plan``: as in ``at``, for a time that is still to come.
+        """
+        if plan is not None:
+            return self._frame.from_guard([self.at(at_ns - age, plan) for age in self._ages_ns])[
+                None
+            ]
+        with self._lock:
+            rows = [self._sent[bisect_right(self._sent_ns, at_ns - age)] for age in self._ages_ns]
         return self._frame.from_guard(rows)[None]

@@ -1,16 +1,19 @@
 """Fast path: newest attitude, cached feature and sent actions become a chunk for the guard."""
 
 import threading
+from collections import deque
 from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import dataclass
+from functools import partial
 from typing import TypeAlias
 
 from mavbridge.core.clock import NS_PER_MS, NS_PER_S, Clock
 from mavbridge.core.reasons import Code, Reason, because
 from mavbridge.core.records import FloatArray, Solve, VehicleState
-from mavbridge.core.vehicle import Action
+from mavbridge.core.vehicle import Action, Telemetry
 from mavbridge.flight.action_frames import ActionFrame
+from mavbridge.flight.forward_state import ForwardState
 from mavbridge.flight.history import SentHistory
 from mavbridge.flight.state import (
     FrozenStateCheck,
@@ -21,6 +24,7 @@ from mavbridge.flight.state import (
 )
 from mavbridge.flight.telemetry_cache import SolveInputs, TelemetryCache
 from mavbridge.guard.chunks import Chunk
+from mavbridge.guard.values import Phase
 from mavbridge.guard.wire import NoChunk
 from policy.errors import NoChunkError
 
@@ -33,6 +37,8 @@ WAIT_NS = 100 * NS_PER_MS
 RETRY_NS = 100 * NS_PER_MS
 """Longest pause after a solve that was refused, for slow policies too."""
 
+RECENT_SOLVES = 5
+"""Solves whose median duration tells when the next chunk will act."""
 MAX_HORIZON = 1024
 """Most actions in a chunk, as in a contract: the guard reads each one between two sends."""
 
@@ -45,6 +51,8 @@ class PolicySettings:
     chunk_dt_s: float
     max_frozen_ns: int
     """Longest time for which the attitude may stay bit-identical; 0: no limit."""
+    forward: ForwardState | None = None
+    """Predicts the state to the time at which the chunk acts; None: the state as measured."""
     period_ns: int
     """Minimum mean period of solves. Attitudes that arrive close together may shorten a single
     one."""
@@ -82,6 +90,11 @@ class PolicyLoop:
         self._watch = watch
         self._frozen = FrozenStateCheck(max_frozen_ns=settings.max_frozen_ns)
         self._serial = 0
+        self._forward = settings.forward
+        self._chunk: Chunk | None = None
+        """Last chunk that was sent."""
+        self._solves_ns: deque[int] = deque(maxlen=RECENT_SOLVES)
+        """Durations of the last solves."""
         self._reset_ns = 0
         self._seen_ns = 0
         """Arrival of the newest attitude at the last step."""
@@ -149,16 +162,37 @@ class PolicyLoop:
             if (before := self._reader.past(past, has_position=has_position)) is not None:
                 self._observations.remember(before)
         state = self._reader.read(telemetry, now_ns, has_position=has_position)
-        observation = self._observe(state, now_ns) if isinstance(state, VehicleState) else state
+        if isinstance(state, Unavailable):
+            self._refuse(state.reason)
+            return
+        plan = self._chunk if self._is_rolled_forward else None
+        observation = self._observe(state, telemetry, now_ns, plan)
         if isinstance(observation, Unavailable):
             self._refuse(observation.reason)
         else:
-            self._solve(observation, now_ns)
+            self._solve(state, observation, now_ns, plan)
 
-    def _observe(self, state: VehicleState, now_ns: int) -> Observation | Unavailable:
+    @property
+    def _is_rolled_forward(self) -> bool:
+        """True if the next solve takes a predicted state: the policy moves a vehicle in the air."""
+        is_flying = self._view.phase is Phase.FLYING and self._view.status.is_landed is not True
+        return self._forward is not None and is_flying
+
+    def _observe(
+        self, state: VehicleState, telemetry: Telemetry, now_ns: int, plan: Chunk | None
+    ) -> Observation | Unavailable:
         self._observations.push(state)
-        frozen = self._frozen.problem(state)
-        return self._observations.observe(state, now_ns) if frozen is None else Unavailable(frozen)
+        if (frozen := self._frozen.problem(state)) is not None:
+            return Unavailable(frozen)
+        if self._forward is not None and plan is not None:
+            acts_ns = now_ns + sorted(self._solves_ns)[len(self._solves_ns) // 2]
+            ahead = self._forward.at(telemetry, acts_ns, partial(self._history.at, plan=plan))
+            has_position = self._view.status.has_position
+            acting = self._reader.read(ahead, acts_ns, has_position=has_position)
+            if isinstance(acting, Unavailable):
+                return acting
+            state = acting
+        return self._observations.observe(state, now_ns)
 
     def _refuse(self, reason: Reason) -> None:
         if self._due_ns is not None:
@@ -166,9 +200,12 @@ class PolicyLoop:
             self._due_ns = min(self._due_ns, soon_ns)
         self._send(NoChunk(reason))
 
-    def _solve(self, observation: Observation, now_ns: int) -> None:
-        state, feature = observation.state, observation.feature
-        history = self._history.resample(now_ns)
+    def _solve(
+        self, state: VehicleState, observation: Observation, now_ns: int, plan: Chunk | None
+    ) -> None:
+        """Compute and send a chunk. ``observation`` may be predicted, ``state`` is as measured."""
+        feature, acts_ns = observation.feature, observation.state.attitude_ns
+        history = self._history.resample(now_ns if plan is None else acts_ns, plan)
         try:
             array = self._act(observation.encoded, observation.states, history)
         except NoChunkError as error:
@@ -181,6 +218,7 @@ class PolicyLoop:
             self._refuse(because(Code.WRONG_SHAPE, shape=shape, most=MAX_HORIZON))
             return
         self._serial += 1
+        self._solves_ns.append(done_ns - now_ns)
         self._view.remember(
             SolveInputs(
                 serial=self._serial,
@@ -197,9 +235,11 @@ class PolicyLoop:
             self._settings.action_frame.to_guard(array[0]),
             image_ns=observation.image_ns,
             computed_ns=done_ns,
+            first_ns=acts_ns,
             step_ns=round(self._settings.chunk_dt_s * NS_PER_S),
             reset_ns=self._reset_ns,
         )
+        self._chunk = chunk
         self._send(chunk)
         if self._watch is not None:
             self._watch(
@@ -227,6 +267,7 @@ def make_chunk(
     *,
     image_ns: int,
     computed_ns: int,
+    first_ns: int,
     step_ns: int,
     reset_ns: int,
 ) -> Chunk:
@@ -234,10 +275,11 @@ def make_chunk(
 
     Args:
         serial: its number.
-        state: the newest that the policy was given; the first action acts at its attitude.
+        state: the newest as measured, whose ages count.
         actions: what the policy returned, in NED and FRD axes.
         image_ns: exposure of the oldest among the newest images of all cameras.
         computed_ns: end of the solve.
+        first_ns: time at which the first action acts: the attitude's that the policy was given.
         step_ns: time from one action to the next.
         reset_ns: when the policy was last reset before it; 0: when it was loaded.
     """
@@ -248,7 +290,7 @@ def make_chunk(
         velocity_ns=velocity_ns if state.extras_ns is None else min(velocity_ns, state.extras_ns),
         image_ns=image_ns,
         computed_ns=computed_ns,
-        first_ns=state.attitude_ns,
+        first_ns=first_ns,
         step_ns=step_ns,
         actions=actions,
         reset_ns=reset_ns,

@@ -30,7 +30,7 @@ VIDEO = "camera.mp4"
 
 _TICK_COLUMNS = (
     *("woke_ns", "sent_ns", "feature_captured_ns", "state", "attitude_ns", "velocity_ns"),
-    *("sent", "rc_sticks", "armed"),
+    *("sent", "rc_sticks", "armed", "phase", "mode"),
 )
 _FRAME_COLUMNS = ("captured_ns",)
 
@@ -107,8 +107,9 @@ def leave_out_failed(
 def read_flight(folder: Path) -> FlightData:
     """Read one flight folder, complete or left by a crash.
 
-    The sticks to imitate are the ``expert`` column if there is one; otherwise the sent sticks; in a
-    flight that sent nothing (``--readonly``), the pilot's.
+    The sticks to imitate are the ``expert`` column if there is one; otherwise the pilot's after
+    taking over from the policy; otherwise the sent sticks; in a flight that sent nothing
+    (``--readonly``), the pilot's.
     """
     name, contract = str(folder), _contract(folder)
     state_frame, terms = (
@@ -138,6 +139,10 @@ def read_flight(folder: Path) -> FlightData:
     target_ns = tick_ns if is_expert else sent_ns
     target = vectors(name, ticks, "expert", ACTION_DIM) if is_expert else sent
     is_target = _known(target) & np.array(ticks["armed"].to_pylist(), dtype=bool)
+    is_correction = _corrections(folder, ticks)
+    if not is_expert and is_correction.any():
+        sent[is_correction] = vectors(name, ticks, "rc_sticks", ACTION_DIM)[is_correction]
+        target, is_target = sent, is_correction
     if not is_target.any():
         raise DatasetError(
             f"{folder}: nobody to learn from: no expert, and no stick was sent while armed"
@@ -179,6 +184,27 @@ def _sent(name: str, ticks: pa.Table, terms: ActionTerms) -> FloatArray:
             "attitude, and the recording does not tell them apart; use mavbridge demonstrate"
         )
     return np.zeros((ticks.num_rows, ACTION_DIM), np.float32)
+
+
+def _corrections(folder: Path, ticks: pa.Table) -> NDArray[np.bool_]:
+    """Return the ticks in which a pilot flew on after taking over from the policy by the sticks.
+
+    Only in a mode of the contract do a pilot's sticks mean what the policy's mean.
+    """
+    contract, outcome = _contract(folder), _read_meta(folder).get("outcome")
+    is_takeover = isinstance(outcome, dict) and outcome.get("end") == "takeover"
+    if not is_takeover or contract.get("action", "sticks") != "sticks":
+        return np.zeros(ticks.num_rows, bool)
+    names = ("phase", "mode", "armed", "sent", "rc_sticks")
+    modes = contract.get("modes", ())
+    rows = zip(*(ticks[name].to_pylist() for name in names), strict=True)
+    return np.array(
+        [
+            phase == "released" and armed and mode in modes and sent is None and sticks is not None
+            for phase, mode, armed, sent, sticks in rows
+        ],
+        bool,
+    )
 
 
 def read_ages(folder: Path) -> Nanoseconds:

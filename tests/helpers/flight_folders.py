@@ -41,6 +41,7 @@ def ticks_table(
     sent_lag_ns: int = 0,
     armed: Sequence[bool] | None = None,
     rc_sticks: Sequence[Sequence[float] | None] | None = None,
+    phase: Sequence[str] | None = None,
 ) -> pa.Table:
     count = len(woke_ns)
     state = [LEVEL] * count if state is None else state
@@ -55,6 +56,8 @@ def ticks_table(
         "velocity_ns": pa.array(attitude_ns, pa.int64()),
         "sent": pa.array(sent, _STICKS),
         "rc_sticks": pa.array(rc_sticks or [None] * count, _STICKS),
+        "phase": pa.array(phase or ["flying"] * count),
+        "mode": pa.array(["ALT_HOLD"] * count),
         "armed": pa.array([True] * count if armed is None else armed, pa.bool_()),
     }
     if expert is not None:

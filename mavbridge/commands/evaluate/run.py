@@ -18,6 +18,7 @@ from mavbridge.config.episodes import (
     WorkersConfig,
     first_seed,
 )
+from mavbridge.config.rates import SOLVES_PER_PLAY
 from mavbridge.core.clock import NS_PER_MS
 from mavbridge.core.errors import MavbridgeError, UserError
 from mavbridge.core.files import require_writable, write_durably
@@ -77,10 +78,14 @@ def fly_simulated(spec: EpisodeSpec, should_stop: Callable[[], bool]) -> FlownEp
     if config.vision_time is not None:
         vision = Delay(p50_ns=round(config.vision_time * NS_PER_MS))
     vision = replace(vision, offset_ns=round(config.vision_delay * NS_PER_MS))
+    action = delays.action
+    if config.solve_time is not None:
+        action = Delay(p50_ns=round(config.solve_time * NS_PER_MS))
+    stall_ns = round(config.stalls * NS_PER_MS)
     settings = SimulationSettings(
         rates=config.rates,
         limits=config.limits,
-        delays=replace(delays, vision=vision, stall_ns=round(config.stalls * NS_PER_MS)),
+        delays=replace(delays, vision=vision, action=action, stall_ns=stall_ns),
         raw_sticks=config.raw_sticks,
         draw_images=not is_scripted(config.policy),
     )
@@ -95,6 +100,12 @@ def fly_simulated(spec: EpisodeSpec, should_stop: Callable[[], bool]) -> FlownEp
     )
     with load_for_episodes(config.policy, flight.clock) as loaded:
         contract = contract_with_ages(loaded.runner.contract, config.limits)
+        if config.solve_time is not None:
+            longest_s = contract.horizon * contract.chunk_dt_s
+            play_s = min(SOLVES_PER_PLAY * config.solve_time / 1000, longest_s)
+            contract = replace(contract, play_s=max(contract.play_s, play_s))
+        if config.state_time is not None:
+            contract = replace(contract, state_time=config.state_time)
         runner = replace(loaded.runner, contract=contract)
         result = flight.fly(runner, max_time_s=config.max_time, should_stop=should_stop)
     return FlownEpisode(engine=loaded.runner.engine, notes=tuple(loaded.notes), result=result)

@@ -65,6 +65,7 @@ def chunk_of(solve: Solve, contract: Contract) -> Chunk:
         action_frame(contract).to_guard(solve.actions[0]),
         image_ns=solve.image_ns,
         computed_ns=solve.computed_ns,
+        first_ns=solve.first_ns,
         step_ns=solve.step_ns,
         reset_ns=solve.reset_ns,
     )

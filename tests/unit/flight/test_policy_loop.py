@@ -15,6 +15,7 @@ from mavbridge.core.records import FeatureFrame, FloatArray
 from mavbridge.core.vehicle import Sample, Velocity
 from mavbridge.flight.action_frames import ActionFrame, action_frame
 from mavbridge.flight.feature_cache import FeatureCache
+from mavbridge.flight.forward_state import ForwardState
 from mavbridge.flight.history import SentHistory
 from mavbridge.flight.policy_loop import MAX_HORIZON, RETRY_NS, PolicyLoop, PolicySettings
 from mavbridge.flight.state import Freshness, ObservationSource, StateReader
@@ -39,6 +40,7 @@ class Rig:
         chunk: Callable[[], FloatArray] | None = None,
         frame: ActionFrame = STICKS_FRAME,
         period_ms: int = 10,
+        forward: ForwardState | None = None,
     ) -> None:
         self.clock, self.cache = FakeClock(), FeatureCache()
         history = SentHistory(length=2, dt_s=0.05, frame=frame)
@@ -47,6 +49,7 @@ class Rig:
         )
         self.sent: list[Chunk | NoChunk] = []
         self.solves = self.resets = 0
+        self.solve_ns, self.given = 3 * MS, (np.zeros(0, np.float32),) * 3
         self._chunk = chunk or (lambda: np.zeros((1, 3, 4), np.float32))
         self.loop = PolicyLoop(
             clock=self.clock,
@@ -66,13 +69,14 @@ class Rig:
                 action_frame=frame,
                 chunk_dt_s=0.05,
                 max_frozen_ns=500 * MS,
+                forward=forward,
                 period_ns=period_ms * MS,
             ),
         )
 
-    def _act(self, *_inputs: Any) -> FloatArray:
-        self.solves += 1
-        self.clock.advance_ns(3 * MS)
+    def _act(self, *inputs: Any) -> FloatArray:
+        self.solves, self.given = self.solves + 1, inputs
+        self.clock.advance_ns(self.solve_ns)
         return self._chunk()
 
     def _reset(self) -> None:
@@ -136,6 +140,23 @@ def test_actions_reach_the_guard_in_its_own_kind_and_axes() -> None:
     (action,) = chunk.actions
     assert isinstance(action, Velocity)
     assert action == Velocity(2.0, 1.0, -3.0, -0.5)
+
+
+def test_a_predicted_state_is_that_of_the_moment_at_which_the_chunk_acts() -> None:
+    pitch = np.tile(np.array([0.0, 0.0, 0.8, 0.0], np.float32), (1, 16, 1))
+    rig = Rig(lambda: pitch, period_ms=200, forward=ForwardState(Contract())).measure().see()
+    rig.solve_ns = 200 * MS
+    rig.loop.step()  # not flying yet: as measured
+    rig.view.receive(make_guard_tick(rig.clock.now_ns(), phase=Phase.FLYING))
+    run_on(rig, 7)
+    _, predicted = rig.sent
+    assert isinstance(predicted, Chunk)
+    started_ns = START_NS + 207 * MS
+    assert predicted.first_ns == started_ns + 200 * MS
+    assert predicted.attitude_ns == started_ns  # ages count from the measurement
+    _, states, history = rig.given
+    assert states[0, 0] > 0.2  # the plan, stick forward, has gathered speed to the north
+    assert history[0, -1].tolist() == [0.0, 0.0, pytest.approx(0.8), 0.0]
 
 
 def too_old(quantity: str, age_ms: float, limit_ms: float) -> Reason:

@@ -1,3 +1,4 @@
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
@@ -15,6 +16,7 @@ from helpers.flight_folders import (
     write_meta,
     write_spot_flight,
 )
+from policy.contract import Contract
 from policy.data.flight_data import DatasetError, hold_out
 from policy.data.flight_folders import (
     failure_of,
@@ -64,6 +66,26 @@ def test_without_an_expert_what_was_sent_while_armed_is_imitated(tmp_path: Path)
     episode = read_flight(flight(tmp_path / "b", pilot))
     np.testing.assert_allclose(episode.target, [STICK] * 3)
     np.testing.assert_allclose(episode.sent, [STICK] * 3)
+
+
+@pytest.mark.parametrize("end", ["takeover", "fault"])
+def test_after_a_takeover_the_pilots_sticks_alone_are_imitated(tmp_path: Path, end: str) -> None:
+    pilots = (0.0, 0.0, 0.5, 0.0)
+    ticks = ticks_table(
+        woke_ns=WOKE,
+        expert=None,
+        sent=[STICK, None, None],
+        rc_sticks=[STICK, pilots, pilots],
+        phase=["flying", "released", "released"],
+    )
+    contract = asdict(Contract())
+    folder = flight(tmp_path / "a", ticks, source="flight", contract=contract, outcome={"end": end})
+    episode = read_flight(folder)
+    is_corrected = end == "takeover"
+    assert episode.target_ns.tolist() == (WOKE[1:] if is_corrected else WOKE[:1])
+    np.testing.assert_allclose(episode.target, [pilots] * 2 if is_corrected else [STICK])
+    after = pilots if is_corrected else (0.0,) * 4
+    np.testing.assert_allclose(episode.sent, [STICK, after, after])
 
 
 def test_a_flight_left_behind_by_a_crash_is_read_to_its_last_whole_batch(tmp_path: Path) -> None:
