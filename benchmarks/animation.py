@@ -41,7 +41,7 @@ NAMES = {
 }
 
 
-class Flight:
+class FilmedFlight:
     """Columns of a recorded flight as arrays, over the time in which the policy flew."""
 
     def __init__(self, flight: RecordedFlight) -> None:
@@ -89,7 +89,7 @@ class View:
         cv2.line(picture, first, last, colour, width, cv2.LINE_AA)
 
 
-def _scene(flight: Flight, index: int, gates: Sequence[CourseGate]) -> Array:
+def _scene(flight: FilmedFlight, index: int, gates: Sequence[CourseGate]) -> Array:
     """Draw the chase view with ground, gates, flown path and vehicle."""
     height = HEIGHT - PLOT
     picture = np.full((height, SCENE, 3), SKY, np.uint8)
@@ -117,7 +117,7 @@ def _scene(flight: Flight, index: int, gates: Sequence[CourseGate]) -> Array:
     return picture
 
 
-def _plot(flight: Flight, index: int) -> Array:
+def _plot(flight: FilmedFlight, index: int) -> Array:
     """Draw the last seconds of the four actions, one band each."""
     picture = np.full((PLOT, SCENE, 3), (28, 24, 20), np.uint8)
     now = flight.time_s[index]
@@ -142,7 +142,7 @@ def _write(
 
 def frames(recorded: RecordedFlight, gates: Sequence[CourseGate]) -> Iterator[Array]:
     """Yield BGR pictures at a fixed rate, from ``START_S`` after the policy's first action."""
-    flight = Flight(recorded)
+    flight = FilmedFlight(recorded)
     due = flight.time_s[0] + START_S
     end = due + SECONDS
     for row, image in zip(recorded.frame_rows(), recorded.rgb_images(), strict=True):

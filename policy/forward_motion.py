@@ -22,7 +22,7 @@ VELOCITY_LAG_S = 0.5
 MOST_LEAN_DEG = 80.0
 
 
-class Motion(NamedTuple):
+class VehicleMotion(NamedTuple):
     """Motion of a vehicle; world NED, body FRD."""
 
     ned_from_body_wxyz: Quaternion
@@ -41,7 +41,7 @@ class ForwardMotion:
         level = replace(contract, state_frame="ned_frd", full_lean_deg=lean_deg)
         self._loop = StickLoop(level, AUTOPILOT_TILT_GAIN_PER_S)
 
-    def after(self, start: Motion, actions: Iterable[Four], dt_s: float) -> Motion:
+    def after(self, start: VehicleMotion, actions: Iterable[Four], dt_s: float) -> VehicleMotion:
         """Return the motion after flying each action for ``dt_s``.
 
         Actions are of the contract's kind, in NED and FRD axes whatever its frame.
@@ -70,7 +70,7 @@ class ForwardMotion:
             velocity = (vx, vy, vz + dt_s * GRAVITY_MPS2)
         fx, fy, fz = rotate(conjugate(attitude), drag_ned)
         force = start.specific_force_body_mps2 if is_velocity else (fx, fy, fz - thrust_mps2)
-        return Motion(attitude, rate, velocity, force)
+        return VehicleMotion(attitude, rate, velocity, force)
 
     def _demand(self, action: Four, attitude: Quaternion, climb_mps: float) -> tuple[float, Vector]:
         """Return the specific force along the thrust [m/s^2] and the body rates of an action."""

@@ -28,7 +28,7 @@ SETTLED = 0.1
 """A push has settled if its last two eighths differ by at most this share of the whole."""
 
 
-class Motion(NamedTuple):
+class StepMotion(NamedTuple):
     """Motion quantity of a state. + is right, forward, nose right, up."""
 
     name: str
@@ -45,19 +45,25 @@ class Channel(NamedTuple):
     column: int
     scale: float
     """Factor from the number of the action to the motion's unit, or to shares of full stick."""
-    motion: Motion
+    motion: StepMotion
 
 
-def _lean(name: str, sign: float) -> Motion:
-    return Motion("lean", "deg", "attitude_ns", lambda s: sign * getattr(measure(s.values), name))
+def _lean(name: str, sign: float) -> StepMotion:
+    return StepMotion(
+        "lean", "deg", "attitude_ns", lambda s: sign * getattr(measure(s.values), name)
+    )
 
 
-def _rate(number: int, sign: float = 1.0) -> Motion:
-    return Motion("rate", "deg/s", "rate_ns", lambda s: sign * _DEG * float(s.values[RATE][number]))
+def _rate(number: int, sign: float = 1.0) -> StepMotion:
+    return StepMotion(
+        "rate", "deg/s", "rate_ns", lambda s: sign * _DEG * float(s.values[RATE][number])
+    )
 
 
-def _speed(name: str) -> Motion:
-    return Motion("speed", "m/s", "velocity_ns", lambda s: float(getattr(measure(s.values), name)))
+def _speed(name: str) -> StepMotion:
+    return StepMotion(
+        "speed", "m/s", "velocity_ns", lambda s: float(getattr(measure(s.values), name))
+    )
 
 
 _DEG = math.degrees(1.0)
@@ -107,7 +113,7 @@ class ResponseRecording:
         times = np.array([at_ns for at_ns, _ in self._sent], np.float64) / NS_PER_S
         return times, np.array([action[column] for _, action in self._sent], np.float64)
 
-    def outputs(self, motion: Motion) -> tuple[Array, Array]:
+    def outputs(self, motion: StepMotion) -> tuple[Array, Array]:
         """Return times in s and values of a motion, without repeated times."""
         times = np.array([getattr(state, motion.stamp) for state in self._states], np.int64)
         values = np.array([motion.read(state) for state in self._states], np.float64)

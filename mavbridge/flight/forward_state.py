@@ -6,7 +6,7 @@ from typing import TypeAlias
 from mavbridge.core.clock import NS_PER_MS, NS_PER_S
 from mavbridge.core.vehicle import Action, Reading, Telemetry
 from policy.contract import Contract
-from policy.forward_motion import ForwardMotion, Motion
+from policy.forward_motion import ForwardMotion, VehicleMotion
 
 STEP_NS = 10 * NS_PER_MS
 """Step of the prediction."""
@@ -36,7 +36,7 @@ class ForwardState:
         if dt_ns <= 0:
             return telemetry
         w, x, y, z = attitude.values
-        start = Motion((w, x, y, z), _three(rate), _three(velocity), _three(force))
+        start = VehicleMotion((w, x, y, z), _three(rate), _three(velocity), _three(force))
         actions = [_four(flown_at(now_ns + step * dt_ns)) for step in range(steps)]
         end = self._model.after(start, actions, dt_ns / NS_PER_S)
         half_s = (until_ns - now_ns) / NS_PER_S / 2

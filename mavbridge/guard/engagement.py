@@ -8,7 +8,7 @@ from mavbridge.core.clock import NS_PER_MS, NS_PER_S
 from mavbridge.core.reasons import Code, because
 from mavbridge.guard.memory import ACT_TIMEOUT_NS, REST_NS, EngagementSettings, Memory, not_engaged
 from mavbridge.guard.sequences import STICK_REST_NS, DisengageSequence, EngageSequence
-from mavbridge.guard.table import PROGRESS, TABLE, Row, ended, objection
+from mavbridge.guard.table import PROGRESS, TABLE, Transition, ended, objection
 from mavbridge.guard.values import (
     Actions,
     ControlSource,
@@ -68,7 +68,7 @@ class Engagement(Memory):
         begun = self._read(PROGRESS, now)
         return self._control(now) if begun in (Phase.FLYING, Phase.RELEASING) else actions
 
-    def _read(self, rows: Sequence[Row], now: EngagementInputs) -> Phase | None:
+    def _read(self, rows: Sequence[Transition], now: EngagementInputs) -> Phase | None:
         """Execute the first matching row; return the state that begins, or None."""
         for row in rows:
             if self.phase not in row.states or not (cause := row.event(self, now)):

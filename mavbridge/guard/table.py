@@ -266,7 +266,7 @@ def _takeover(m: Memory, now: EngagementInputs) -> Reason | None:
     return because(Code.DISARMED) if is_preparing and m.was_armed and not now.armed else None
 
 
-class Row(NamedTuple):
+class Transition(NamedTuple):
     """One transition: in these states, if this event occurs, do that."""
 
     states: tuple[Phase, ...]
@@ -280,28 +280,28 @@ class Row(NamedTuple):
 
 AT_REST = (WAITING, RELEASED)
 TABLE = (
-    Row(AT_REST, ended, Memory.nothing, ENDED),
-    Row((WAITING,), arm_flag, Memory.prepare, PREPARING),
-    Row((*AT_REST, LEAVING, HOLDING, RELEASING), unfit_engage, Memory.refuse),
-    Row(AT_REST, engage, Memory.prepare, PREPARING),
-    Row((PREPARING,), stopped, Memory.leave, LEAVING, where=is_ours),
-    Row((PREPARING,), stopped, Memory.release, RELEASING),
-    Row((PREPARING, FLYING), taken, Memory.leave, LEAVING, where=follows_us),
-    Row((PREPARING, FLYING), taken, Memory.release, RELEASING),
-    Row((PREPARING,), late, Memory.give_up),
-    Row((PREPARING,), late, Memory.leave, LEAVING, where=is_ours),
-    Row((PREPARING,), late, Memory.release, RELEASING),
-    Row((FLYING,), stopped, Memory.leave, LEAVING),
-    Row((FLYING,), duration_over, Memory.leave_for_good, LEAVING),
-    Row((FLYING,), landed, Memory.leave, LEAVING),
-    Row((FLYING,), fault, Memory.leave, LEAVING),
-    Row((HOLDING,), stopped_anew, Memory.leave, LEAVING),
-    Row((LEAVING, HOLDING), taken, Memory.release, RELEASING),
-    Row((LEAVING, HOLDING), vanished, Memory.release, RELEASING),
-    Row((RELEASING,), released, Memory.forget, RELEASED),
+    Transition(AT_REST, ended, Memory.nothing, ENDED),
+    Transition((WAITING,), arm_flag, Memory.prepare, PREPARING),
+    Transition((*AT_REST, LEAVING, HOLDING, RELEASING), unfit_engage, Memory.refuse),
+    Transition(AT_REST, engage, Memory.prepare, PREPARING),
+    Transition((PREPARING,), stopped, Memory.leave, LEAVING, where=is_ours),
+    Transition((PREPARING,), stopped, Memory.release, RELEASING),
+    Transition((PREPARING, FLYING), taken, Memory.leave, LEAVING, where=follows_us),
+    Transition((PREPARING, FLYING), taken, Memory.release, RELEASING),
+    Transition((PREPARING,), late, Memory.give_up),
+    Transition((PREPARING,), late, Memory.leave, LEAVING, where=is_ours),
+    Transition((PREPARING,), late, Memory.release, RELEASING),
+    Transition((FLYING,), stopped, Memory.leave, LEAVING),
+    Transition((FLYING,), duration_over, Memory.leave_for_good, LEAVING),
+    Transition((FLYING,), landed, Memory.leave, LEAVING),
+    Transition((FLYING,), fault, Memory.leave, LEAVING),
+    Transition((HOLDING,), stopped_anew, Memory.leave, LEAVING),
+    Transition((LEAVING, HOLDING), taken, Memory.release, RELEASING),
+    Transition((LEAVING, HOLDING), vanished, Memory.release, RELEASING),
+    Transition((RELEASING,), released, Memory.forget, RELEASED),
 )
 PROGRESS = (
-    Row((PREPARING,), ready, Memory.fly, FLYING),
-    Row((LEAVING, HOLDING), over, Memory.finish, RELEASING, where=may_release),
-    Row((LEAVING,), over, Memory.finish, HOLDING),
+    Transition((PREPARING,), ready, Memory.fly, FLYING),
+    Transition((LEAVING, HOLDING), over, Memory.finish, RELEASING, where=may_release),
+    Transition((LEAVING,), over, Memory.finish, HOLDING),
 )

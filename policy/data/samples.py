@@ -63,7 +63,7 @@ GATE_SIGNS = np.array((*_VECTOR, -1.0, *_VECTOR), np.float32)
 
 
 @dataclass(frozen=True, kw_only=True)
-class Samples:
+class TrainingSamples:
     """``B`` pairs of an image and a later tick: state [B, state_dim], history [B, K, 4], labels."""
 
     state: FloatArray
@@ -75,9 +75,9 @@ class Samples:
     gate: FloatArray
     """[B, 7] at the exposure, NaN if unknown."""
 
-    def mirrored(self, is_mirrored: NDArray[np.bool_]) -> "Samples":
+    def mirrored(self, is_mirrored: NDArray[np.bool_]) -> "TrainingSamples":
         """Exchange left and right in samples with ``is_mirrored`` [B]."""
-        return Samples(
+        return TrainingSamples(
             state=mirrored(self.state, state_signs(self.state.shape[1]), is_mirrored),
             history=mirrored(self.history, STICK_SIGNS, is_mirrored),
             chunk=mirrored(self.chunk, STICK_SIGNS, is_mirrored),
@@ -164,7 +164,7 @@ class Timeline:
 
     def samples(
         self, frames: Indices, ticks: Indices, random: np.random.Generator | None = None
-    ) -> Samples:
+    ) -> TrainingSamples:
         """Return inputs and labels at ``ticks`` with images ``frames``; augmented by ``random``."""
         chunk, known = self.chunks(ticks)
         state = self.states(frames, ticks)
@@ -172,7 +172,7 @@ class Timeline:
             for part, spread in ((RATE, RATE_NOISE_RADPS), (SPECIFIC_FORCE, FORCE_NOISE_MPS2)):
                 noise = random.normal(0.0, spread, state[:, part].shape)
                 state[:, part] += noise.astype(np.float32)
-        return Samples(
+        return TrainingSamples(
             state=state,
             history=self.histories(ticks, random),
             chunk=chunk,

@@ -23,7 +23,7 @@ from policy.contract import Contract, FloatArray
 from policy.data.flight_data import ImageArray
 from policy.data.frames import FrameStore, disk_error
 from policy.data.interpolation import Indices
-from policy.data.samples import Samples, Timeline
+from policy.data.samples import Timeline, TrainingSamples
 from policy.training.parallel import TensorBatch, row_parts
 from policy.training.settings import TrainSettings
 
@@ -241,7 +241,7 @@ class Batches:
         frames: Indices,
         is_mirrored: NDArray[np.bool_],
         repeats: int,
-    ) -> Samples:
+    ) -> TrainingSamples:
         repeated = np.repeat(frames, repeats)
         ticks = self._timeline.draw_ticks(repeated, random)
         samples = self._timeline.samples(repeated, ticks, random)
@@ -250,7 +250,7 @@ class Batches:
     def _batch(
         self,
         random: np.random.Generator,
-        samples: Samples,
+        samples: TrainingSamples,
         frames: int,
         *,
         images: ImageArray | None = None,

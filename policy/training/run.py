@@ -26,9 +26,9 @@ from policy.training.batches import ahead
 from policy.training.parallel import B, Gradients, M, StepLoss
 from policy.training.report import Hooks, TrainingProgress, TrainResult, Validation
 from policy.training.run_folder import (
-    Position,
     RunFolder,
     TrainingError,
+    TrainingPosition,
     TrainingStoppedError,
     identity_of,
 )
@@ -76,7 +76,7 @@ class TrainingRun(ABC, Generic[M, B]):
     ) -> None:
         settings = self.settings
         self.folder, self.trainee, self.stages, self.hooks = folder, trainee, stages, hooks
-        self.position = Position()
+        self.position = TrainingPosition()
         self.device = torch.device(settings.device)
         self.bf16 = uses_bf16(settings.precision, self.device)
         self._begun_s = hooks.now_s()

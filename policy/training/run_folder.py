@@ -27,7 +27,7 @@ class TrainingStoppedError(PolicyError):
 
 
 @dataclass(kw_only=True)
-class Position:
+class TrainingPosition:
     """Position of a run; saved with its weights."""
 
     step: int = 0
@@ -65,7 +65,7 @@ class RunFolder:
         """True if there is a state to resume from."""
         return self._state.is_file()
 
-    def save(self, position: Position, tensors: Mapping[str, Any]) -> None:
+    def save(self, position: TrainingPosition, tensors: Mapping[str, Any]) -> None:
         """Write the state atomically, or raise a ``TrainingError``."""
         contents = {"identity": self._identity, "position": asdict(position), **tensors}
         try:
@@ -75,14 +75,17 @@ class RunFolder:
             reason = disk_error(self._state, error) if isinstance(error, OSError) else error
             raise TrainingError(f"the training cannot be kept: {reason}") from error
 
-    def load(self) -> tuple[Position, dict[str, Any]]:
+    def load(self) -> tuple[TrainingPosition, dict[str, Any]]:
         """Return the state that was saved last."""
         path = self._state
         if not path.is_file():
             raise TrainingError(f"{self.path} holds no run to resume: leave out --resume")
         try:
             contents = torch.load(path, map_location="cpu", weights_only=True)
-            identity, position = contents.pop("identity"), Position(**contents.pop("position"))
+            identity, position = (
+                contents.pop("identity"),
+                TrainingPosition(**contents.pop("position")),
+            )
         except (OSError, RuntimeError, KeyError, TypeError, EOFError, pickle.PickleError) as error:
             raise TrainingError(
                 f"{path} is damaged ({error}): remove {self.path} and start again"

@@ -6,7 +6,7 @@ from typing import Any
 
 import pytest
 
-from mavbridge.commands.check.rows import Row, overall
+from mavbridge.commands.check.rows import CheckRow, overall
 from mavbridge.commands.check.vehicle import check_vehicle
 from mavbridge.config.flight import FlyConfig, LinkConfig
 from mavbridge.core.clock import NS_PER_MS, NS_PER_S
@@ -73,7 +73,7 @@ class Bench:
 
     def check(
         self, *, contract: Contract | None = None, echo_test: bool = False, **link: Any
-    ) -> dict[str, Row]:
+    ) -> dict[str, CheckRow]:
         """The rows by their names."""
         config = FlyConfig(link=LinkConfig(connect="udp:127.0.0.1:1", **link))
         rows = check_vehicle(
@@ -86,7 +86,7 @@ class Bench:
         return {row.name: row for row in rows}
 
 
-def verdicts(rows: dict[str, Row]) -> dict[str, str]:
+def verdicts(rows: dict[str, CheckRow]) -> dict[str, str]:
     """The rows that are not go."""
     return {name: row.verdict for name, row in rows.items() if row.verdict != "go"}
 

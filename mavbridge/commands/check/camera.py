@@ -9,7 +9,7 @@ from statistics import median
 
 from mavbridge.camera.image_watch import is_blank
 from mavbridge.camera.open import open_camera, require_present
-from mavbridge.commands.check.rows import Row, Verdict
+from mavbridge.commands.check.rows import CheckRow, Verdict
 from mavbridge.config.flight import CameraConfig
 from mavbridge.core.clock import NS_PER_MS, NS_PER_S, Clock
 from mavbridge.core.errors import CameraError, MavbridgeError
@@ -45,7 +45,7 @@ class CameraNeeds:
 
 
 @dataclass(kw_only=True)
-class Seen:
+class CameraView:
     """Frames received from one camera in two seconds."""
 
     captured_ns: list[int] = field(default_factory=list)
@@ -67,9 +67,9 @@ class Seen:
         return (len(self.captured_ns) - 1 + self.dropped) * NS_PER_S / span_ns if span_ns else 0.0
 
 
-def camera_rows(needs: Sequence[CameraNeeds], config: CameraConfig, clock: Clock) -> list[Row]:
+def camera_rows(needs: Sequence[CameraNeeds], config: CameraConfig, clock: Clock) -> list[CheckRow]:
     """Open, read and close every camera; a failure becomes a row."""
-    rows: list[Row] = []
+    rows: list[CheckRow] = []
     with ExitStack() as stack:
         opened: list[tuple[CameraNeeds, Camera]] = []
         for need in needs:
@@ -100,8 +100,8 @@ def _open(need: CameraNeeds, config: CameraConfig, clock: Clock) -> Camera:
     )
 
 
-def _watch_all(cameras: Sequence[Camera], clock: Clock) -> list[Seen]:
-    seen = [Seen() for _ in cameras]
+def _watch_all(cameras: Sequence[Camera], clock: Clock) -> list[CameraView]:
+    seen = [CameraView() for _ in cameras]
     workers = [
         Worker(f"mavbridge-check-camera-{number}", partial(_watch, camera, what, clock))
         for number, (camera, what) in enumerate(zip(cameras, seen, strict=True))
@@ -117,7 +117,7 @@ def _watch_all(cameras: Sequence[Camera], clock: Clock) -> list[Seen]:
     return seen
 
 
-def _watch(camera: Camera, seen: Seen, clock: Clock, stop: threading.Event) -> None:
+def _watch(camera: Camera, seen: CameraView, clock: Clock, stop: threading.Event) -> None:
     until_ns = clock.now_ns() + round(MEASURE_S * NS_PER_S)
     dropped_before = camera.dropped_frames
     try:
@@ -134,7 +134,7 @@ def _watch(camera: Camera, seen: Seen, clock: Clock, stop: threading.Event) -> N
     seen.dropped = camera.dropped_frames - dropped_before
 
 
-def judge(need: CameraNeeds, seen: Seen, *, latency_ms: float) -> list[Row]:
+def judge(need: CameraNeeds, seen: CameraView, *, latency_ms: float) -> list[CheckRow]:
     """Return the rows of one camera from its frames; ``latency_ms`` is that of --camera-latency."""
     if seen.failure is not None or not seen.captured_ns:
         why = seen.failure or f"no frame came in {MEASURE_S:g} s"
@@ -142,7 +142,7 @@ def judge(need: CameraNeeds, seen: Seen, *, latency_ms: float) -> list[Row]:
     return [_rate_row(need, seen), _image_row(need, seen), _age_row(need, seen, latency_ms)]
 
 
-def _rate_row(need: CameraNeeds, seen: Seen) -> Row:
+def _rate_row(need: CameraNeeds, seen: CameraView) -> CheckRow:
     is_slow = seen.rate_hz < _ENOUGH * need.rate_hz
     advice = (
         f"the camera delivers {seen.rate_hz:.1f} images a second of {need.rate_hz:.3g}: more "
@@ -158,7 +158,7 @@ def _rate_row(need: CameraNeeds, seen: Seen) -> Row:
     )
 
 
-def _image_row(need: CameraNeeds, seen: Seen) -> Row:
+def _image_row(need: CameraNeeds, seen: CameraView) -> CheckRow:
     advice = ""
     if need.is_flown_by and min(seen.height_px, seen.width_px) < need.side_px:
         advice = "the image is smaller than what the policy takes, and is enlarged for it"
@@ -175,7 +175,7 @@ def _image_row(need: CameraNeeds, seen: Seen) -> Row:
     )
 
 
-def _age_row(need: CameraNeeds, seen: Seen, latency_ms: float) -> Row:
+def _age_row(need: CameraNeeds, seen: CameraView, latency_ms: float) -> CheckRow:
     ages_ms = sorted(age_ns / NS_PER_MS for age_ns in seen.ages_ns)
     typical_ms, oldest_ms = median(ages_ms), ages_ms[-1]
     steps_back = sum(b <= a for a, b in zip(seen.captured_ns, seen.captured_ns[1:], strict=False))
@@ -210,6 +210,6 @@ def _row(
     part: str = "",
     verdict: Verdict = "go",
     advice: str = "",
-) -> Row:
+) -> CheckRow:
     name = " ".join(filter(None, (need.name or need.source, part)))
-    return Row("camera", name, found, expected, verdict, advice)
+    return CheckRow("camera", name, found, expected, verdict, advice)

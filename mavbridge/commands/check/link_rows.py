@@ -5,7 +5,7 @@ from functools import partial
 from typing import Literal, TypeAlias
 
 from mavbridge.commands.check.param_rows import Terms, cures
-from mavbridge.commands.check.rows import Row, Verdict
+from mavbridge.commands.check.rows import CheckRow, Verdict
 from mavbridge.config.flight import Limits
 from mavbridge.core.clock import NS_PER_MS, NS_PER_S, Clock
 from mavbridge.core.reasons import Code, Reason, because
@@ -45,7 +45,7 @@ _QUANTITIES = {
     "HIGHRES_IMU": "acceleration",
     "RC_CHANNELS": "sticks (echo)",
 }
-_row = partial(Row, "link")
+_row = partial(CheckRow, "link")
 
 
 class VehicleProbe:
@@ -134,7 +134,7 @@ class VehicleProbe:
 
 def link_rows(
     vehicle: VehicleSession, stats: LinkStats, terms: Terms, *, unfinished: Reason | None
-) -> Iterator[Row]:
+) -> Iterator[CheckRow]:
     """Return all rows about the link except for the echo test."""
     yield _vehicle_row(vehicle, unfinished)
     rates_hz = dict(stats.messages_per_s)
@@ -146,7 +146,7 @@ def link_rows(
     yield from _time_rows(stats)
 
 
-def _vehicle_row(vehicle: VehicleSession, unfinished: Reason | None) -> Row:
+def _vehicle_row(vehicle: VehicleSession, unfinished: Reason | None) -> CheckRow:
     place = f"system {vehicle.identity.source.system} at {vehicle.identity.place}"
     return _row(
         "vehicle",
@@ -157,7 +157,9 @@ def _vehicle_row(vehicle: VehicleSession, unfinished: Reason | None) -> Row:
     )
 
 
-def _rate_row(group: StreamGroup, rates_hz: Mapping[str, float], plan: FlightPlan | None) -> Row:
+def _rate_row(
+    group: StreamGroup, rates_hz: Mapping[str, float], plan: FlightPlan | None
+) -> CheckRow:
     name = _QUANTITIES.get(group.messages[0], group.messages[0])
     rate_hz = next((rates_hz[message] for message in group.messages if message in rates_hz), 0.0)
     least_hz = _ECHO_HZ if name == "sticks (echo)" else 0.0
@@ -187,7 +189,7 @@ def _rate_verdict(
     return "go", ""
 
 
-def _optional_row(terms: Terms, rates_hz: Mapping[str, float]) -> Row:
+def _optional_row(terms: Terms, rates_hz: Mapping[str, float]) -> CheckRow:
     watched = [group for group in terms.streams if group.is_optional and group.least_hz != 0.0]
     silent = [group.messages[0] for group in watched if group.messages[0] not in rates_hz]
     return _row(
@@ -199,7 +201,7 @@ def _optional_row(terms: Terms, rates_hz: Mapping[str, float]) -> Row:
     )
 
 
-def _loss_row(stats: LinkStats) -> Row:
+def _loss_row(stats: LinkStats) -> CheckRow:
     lost = stats.lost_fraction or 0.0
     verdict: Verdict = "no-go" if lost > _TOO_LOSSY else "warn" if lost > _LOSSY else "go"
     bad = f", {stats.unusable_packets} unusable" if stats.unusable_packets else ""
@@ -215,7 +217,7 @@ def _loss_row(stats: LinkStats) -> Row:
     )
 
 
-def _time_rows(stats: LinkStats) -> Iterator[Row]:
+def _time_rows(stats: LinkStats) -> Iterator[CheckRow]:
     trip = stats.rtt_ms
     is_slow = trip is None or trip.p50 > _SLOW_MS
     yield _row(
@@ -238,7 +240,7 @@ def _time_rows(stats: LinkStats) -> Iterator[Row]:
     )
 
 
-def echo_row(probe: VehicleProbe, terms: Terms) -> Row:
+def echo_row(probe: VehicleProbe, terms: Terms) -> CheckRow:
     """Send neutral sticks unless the vehicle is armed; return a row with the vehicle's response."""
     name, expected = "echo test", f"our sticks from system {terms.context.source_system}"
     if not terms.is_sticks:

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 from functools import partial
 from typing import NamedTuple
 
-from mavbridge.commands.check.rows import Row, Verdict
+from mavbridge.commands.check.rows import CheckRow, Verdict
 from mavbridge.config.flight import FlyConfig
 from mavbridge.core.address import serial_baud
 from mavbridge.core.link_settings import LinkSettings
@@ -21,7 +21,7 @@ from policy.contract import Contract
 
 _STICK_OUTPUTS = ("rc-override", "manual-control")
 _NOT_SENT = "not sent"
-_row = partial(Row, "parameters")
+_row = partial(CheckRow, "parameters")
 
 
 class JudgedNote(NamedTuple):
@@ -132,7 +132,7 @@ class Terms:
         yield from (JudgedNote("warn", note) for note in self.profile.hints(values, context))
 
 
-def param_rows(terms: Terms) -> Iterator[Row]:
+def param_rows(terms: Terms) -> Iterator[CheckRow]:
     """Yield every relevant parameter, then the calibration, then the motion at full stick."""
     left = list(terms.notes())
     for name, should_be in terms.profile.wanted_params(terms.values, terms.context):
@@ -169,7 +169,7 @@ def _found(terms: Terms, name: str) -> str:
     return f"{_NOT_SENT if read is None else f'{read:g}'}; --set makes it {flown:g}"
 
 
-def _calibration_rows(terms: Terms) -> Iterator[Row]:
+def _calibration_rows(terms: Terms) -> Iterator[CheckRow]:
     """Yield the four override channels; an unusable calibration is already a note."""
     calibration = terms.assessment.calibration
     if terms.context.output != "rc-override" or calibration is None:
@@ -184,7 +184,7 @@ def _channel(channel: RcChannel) -> str:
     return f"{ends}, dead zone {channel.dead_zone_us}{turned}"
 
 
-def _curve_rows(terms: Terms) -> Iterator[Row]:
+def _curve_rows(terms: Terms) -> Iterator[CheckRow]:
     """Yield the motion at full stick, beside that of the policy's training."""
     mode, gains = terms.mode, terms.gains
     if terms.plan is None or mode is None or not terms.is_sticks:
@@ -220,7 +220,7 @@ def _curve_rows(terms: Terms) -> Iterator[Row]:
         yield _row(f"full {noun}", found, f"{trained:.3g} {unit}", "warn" if note else "go", note)
 
 
-def _thrust_rows(terms: Terms) -> Iterator[Row]:
+def _thrust_rows(terms: Terms) -> Iterator[CheckRow]:
     if terms.contract is None or terms.contract.action not in ("rates", "attitude"):
         return
     hover = terms.profile.hover_thrust(terms.values)

@@ -8,7 +8,7 @@ from functools import partial
 
 import numpy as np
 
-from mavbridge.commands.check.rows import Row, Verdict
+from mavbridge.commands.check.rows import CheckRow, Verdict
 from mavbridge.config.flight import FlyConfig, Limits
 from mavbridge.core.clock import NS_PER_S, Clock, period_ns
 from mavbridge.core.errors import MavbridgeError, UserError
@@ -40,7 +40,7 @@ _JOIN_S = 60.0
 class PolicyFindings:
     """Rows about the policy, and its plan for the other checks."""
 
-    rows: list[Row] = field(default_factory=list)
+    rows: list[CheckRow] = field(default_factory=list)
     plan: FlightPlan | None = None
     """None: no policy was named, or it cannot be loaded. Flags that contradict it are left out."""
 
@@ -76,7 +76,7 @@ def _plan_by_contract(config: FlyConfig, runner: PolicyRunner) -> FlightPlan:
     return plan_flight(kept, runner.contract, is_dual=runner.dual_rate)
 
 
-def _engine_row(loaded: LoadedPolicy) -> Row:
+def _engine_row(loaded: LoadedPolicy) -> CheckRow:
     """Return a row on the engine and its agreement with torch; any deviation is a warning."""
     runner = loaded.runner
     warnings = [note.text for note in loaded.notes if isinstance(note, Warned)]
@@ -93,7 +93,7 @@ def _engine_row(loaded: LoadedPolicy) -> Row:
 
 def _speed_rows(
     plan: FlightPlan, loaded: LoadedPolicy, clock: Clock, timing_s: float
-) -> Iterator[Row]:
+) -> Iterator[CheckRow]:
     """Yield rows on the held rates, and the flight's warnings about the policy's speed."""
     if loaded.times is None:
         yield _row("speed", "not measured: no chunk on a dummy sample")
@@ -145,7 +145,7 @@ class Pace:
             ended_ns, due_ns = now_ns, max(due_ns + every_ns, now_ns)
         self.rate_hz = self.took.count * NS_PER_S / max(due_ns - begun_ns, 1)
 
-    def row(self) -> Row:
+    def row(self) -> CheckRow:
         """Return a row with rate and times; a warning if the rate was not held, or only just."""
         took_ms = self.took.percentiles_ms()
         if took_ms is None:
@@ -205,7 +205,7 @@ def _contract_words(contract: Contract) -> str:
     return f"{contract.action}, {contract.state_frame}, {takes}"
 
 
-def _plan_rows(plan: FlightPlan) -> list[Row]:
+def _plan_rows(plan: FlightPlan) -> list[CheckRow]:
     figures = ", ".join(f"{name} {value:.4g}" for name, value in plan.figures().items())
     expected = "no flag that contradicts it"
     return [
@@ -216,5 +216,5 @@ def _plan_rows(plan: FlightPlan) -> list[Row]:
 
 def _row(
     name: str, found: str, verdict: Verdict = "go", advice: str = "", *, expected: str = ""
-) -> Row:
-    return Row("policy", name, found, expected, verdict, advice)
+) -> CheckRow:
+    return CheckRow("policy", name, found, expected, verdict, advice)

@@ -21,7 +21,7 @@ _FOOT = (
 
 
 @dataclass(frozen=True, slots=True)
-class Row:
+class CheckRow:
     """One checked item."""
 
     area: Area
@@ -40,13 +40,13 @@ class Row:
             object.__setattr__(self, name, without_secrets(getattr(self, name)))
 
 
-def overall(rows: Sequence[Row]) -> Verdict:
+def overall(rows: Sequence[CheckRow]) -> Verdict:
     """Return the worst verdict of all rows."""
     verdicts = {row.verdict for row in rows}
     return "no-go" if "no-go" in verdicts else "warn" if "warn" in verdicts else "go"
 
 
-def as_document(rows: Sequence[Row]) -> dict[str, object]:
+def as_document(rows: Sequence[CheckRow]) -> dict[str, object]:
     """Return all rows in the order of the table, for JSON."""
     names = ("area", "name", "verdict", "found", "expected", "advice")
     return {
@@ -58,7 +58,7 @@ def as_document(rows: Sequence[Row]) -> dict[str, object]:
     }
 
 
-def print_check(rows: Sequence[Row], console: Console) -> None:
+def print_check(rows: Sequence[CheckRow], console: Console) -> None:
     """Print all rows, then reasons and fixes of those that are not go, then the verdict."""
     if not console.is_terminal:
         console.width = PIPED_WIDTH
@@ -70,7 +70,7 @@ def print_check(rows: Sequence[Row], console: Console) -> None:
     console.print(_summary(rows))
 
 
-def _table(rows: Sequence[Row]) -> Table:
+def _table(rows: Sequence[CheckRow]) -> Table:
     table = Table(pad_edge=False, box=None, padding=(0, 1), header_style="bold")
     table.add_column("", no_wrap=True)
     table.add_column("what", overflow="fold")
@@ -86,7 +86,7 @@ def _table(rows: Sequence[Row]) -> Table:
     return table
 
 
-def _print_reasons(rows: Sequence[Row], console: Console) -> None:
+def _print_reasons(rows: Sequence[CheckRow], console: Console) -> None:
     """Print each reason with its row's name; reasons about parameters name those themselves."""
     if not rows:
         return
@@ -101,7 +101,7 @@ def _print_reasons(rows: Sequence[Row], console: Console) -> None:
     console.print(grid)
 
 
-def _summary(rows: Sequence[Row]) -> Text:
+def _summary(rows: Sequence[CheckRow]) -> Text:
     verdict = overall(rows)
     counts = {each: sum(row.verdict == each for row in rows) for each in _STYLES}
     told = f"{counts['go']} go, {counts['warn']} to be warned of, {counts['no-go']} no-go"

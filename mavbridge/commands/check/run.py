@@ -14,7 +14,7 @@ from rich.console import Console
 from mavbridge.camera.open import NO_CAMERA
 from mavbridge.commands.check.camera import CameraNeeds, camera_rows
 from mavbridge.commands.check.policy import NO_POLICY, check_policy
-from mavbridge.commands.check.rows import Row, as_document, overall, print_check
+from mavbridge.commands.check.rows import CheckRow, as_document, overall, print_check
 from mavbridge.commands.check.vehicle import check_vehicle
 from mavbridge.commands.config import CheckConfig
 from mavbridge.commands.output import print_status
@@ -48,11 +48,11 @@ print("; ".join(filter(None, refusals)))
 """Requests the guard's rights in a separate process, so that this one is not affected."""
 STDOUT = Path("-")
 NO_VEHICLE = "none"
-_row = partial(Row, "computer")
-_camera_row = partial(Row, "camera", "cameras")
+_row = partial(CheckRow, "computer")
+_camera_row = partial(CheckRow, "camera", "cameras")
 
 
-def computer_rows(rates: Rates) -> list[Row]:
+def computer_rows(rates: Rates) -> list[CheckRow]:
     """Return rows about clock source, cores, real-time scheduling and locked memory."""
     try:
         source = _CLOCK_SOURCE.read_text().strip()
@@ -124,7 +124,7 @@ def check(config: CheckConfig) -> int:
     return ExitCode.NOT_FLOWN if overall(rows) == "no-go" else ExitCode.DONE
 
 
-def check_all(config: CheckConfig) -> list[Row]:
+def check_all(config: CheckConfig) -> list[CheckRow]:
     """Return all rows in the order of the table."""
     flight, clock = config.flight, MonotonicClock()
     if flight.policy.policy != NO_POLICY:
@@ -132,14 +132,14 @@ def check_all(config: CheckConfig) -> list[Row]:
     policy = check_policy(flight, clock, timing_s=config.timing)
     cameras = _check_cameras(flight, policy.plan, clock)
     if flight.link.connect == NO_VEHICLE:
-        vehicle = [Row("link", "vehicle", "none", "none for this check")]
+        vehicle = [CheckRow("link", "vehicle", "none", "none for this check")]
     else:
         print_status(f"listening to the vehicle on {flight.link.connect}")
         vehicle = check_vehicle(flight, policy.plan, clock, echo_test=config.echo_test)
     return [*vehicle, *cameras, *policy.rows, *computer_rows(flight.rates)]
 
 
-def _check_cameras(config: FlyConfig, plan: FlightPlan | None, clock: Clock) -> list[Row]:
+def _check_cameras(config: FlyConfig, plan: FlightPlan | None, clock: Clock) -> list[CheckRow]:
     """Return rows on every camera of the flight, or on the flags that do not fit the policy."""
     if config.link.connect == NO_VEHICLE and set(config.camera.sources) == {NO_CAMERA}:
         return []  # only this computer is checked

@@ -7,7 +7,7 @@ from functools import partial
 
 from mavbridge.commands.check.link_rows import VehicleProbe, echo_row, link_rows
 from mavbridge.commands.check.param_rows import Terms, param_rows
-from mavbridge.commands.check.rows import Row
+from mavbridge.commands.check.rows import CheckRow
 from mavbridge.config.flight import FlyConfig
 from mavbridge.core.clock import Clock
 from mavbridge.core.errors import MavbridgeError
@@ -30,12 +30,12 @@ from mavbridge.mavlink.transport.sockets import Transport, make_transport
 _TEXTS_SHOWN = 4
 REFUSES_TO_ARM = "PreArm"
 """Prefix of ArduPilot's texts about its pre-arm checks."""
-_row = partial(Row, "vehicle")
+_row = partial(CheckRow, "vehicle")
 
 
 def vehicle_rows(
     vehicle: VehicleSession, snapshot: LinkSnapshot, terms: Terms, *, texts: Sequence[str]
-) -> Iterator[Row]:
+) -> Iterator[CheckRow]:
     """Return all rows about the vehicle; ``texts`` are those of the vehicle and the link."""
     yield from _mode_rows(terms)
     if (status := snapshot.status) is not None:
@@ -51,7 +51,7 @@ def vehicle_rows(
     yield from _text_rows(texts)
 
 
-def _mode_rows(terms: Terms) -> Iterator[Row]:
+def _mode_rows(terms: Terms) -> Iterator[CheckRow]:
     names = terms.profile.modes.roles.names
     wanted = () if terms.contract is None else terms.contract.modes
     if not wanted:
@@ -69,7 +69,7 @@ def _mode_rows(terms: Terms) -> Iterator[Row]:
     )
 
 
-def _state_row(status: VehicleStatus) -> Row:
+def _state_row(status: VehicleStatus) -> CheckRow:
     found = f"{'armed' if status.armed else 'disarmed'} in {status.mode}"
     if status.is_failsafe:
         text = "a failsafe of the vehicle is active"
@@ -80,7 +80,7 @@ def _state_row(status: VehicleStatus) -> Row:
     return _row("state", found, "disarmed, no failsafe")
 
 
-def _receiver_row(status: VehicleStatus) -> Row:
+def _receiver_row(status: VehicleStatus) -> CheckRow:
     expected = "a pilot who can take over"
     if status.has_receiver:
         throttle = status.pilot_sticks.throttle if status.pilot_sticks else None
@@ -107,7 +107,7 @@ def _receiver_row(status: VehicleStatus) -> Row:
     )
 
 
-def _position_row(status: VehicleStatus) -> Row:
+def _position_row(status: VehicleStatus) -> CheckRow:
     if status.is_position_valid is None:
         return _row("position", "the estimator does not say", "valid")
     if status.is_position_valid:
@@ -121,7 +121,7 @@ def _position_row(status: VehicleStatus) -> Row:
     )
 
 
-def _arming_row(*, is_ready: bool) -> Row:
+def _arming_row(*, is_ready: bool) -> CheckRow:
     return _row(
         "checks before arming",
         "passed" if is_ready else "not passed",
@@ -134,7 +134,7 @@ def _arming_row(*, is_ready: bool) -> Row:
     )
 
 
-def _text_rows(texts: Sequence[str]) -> Iterator[Row]:
+def _text_rows(texts: Sequence[str]) -> Iterator[CheckRow]:
     """Yield rows for texts, except advice about parameters and sticks, which has its own rows."""
     for text in [text for text in texts if not isinstance(text, AdviceText)][-_TEXTS_SHOWN:]:
         if not isinstance(text, VehicleText):
@@ -152,12 +152,12 @@ def check_vehicle(
     *,
     echo_test: bool,
     transport: Transport | None = None,
-) -> list[Row]:
+) -> list[CheckRow]:
     """Return all rows about the link, the vehicle and its parameters; a failure becomes a row.
 
     ``plan`` is None if no policy flies. ``transport`` replaces that of the address in ``config``.
     """
-    rows: list[Row] = []
+    rows: list[CheckRow] = []
     settings = checking_settings(config, is_dual=plan is None or plan.is_dual, sends=echo_test)
     try:
         with ExitStack() as stack:
@@ -184,7 +184,9 @@ def check_vehicle(
             rows += param_rows(terms)
     except MavbridgeError as error:
         expected = "ArduCopter or a PX4 multicopter"
-        rows.append(Row("link", "vehicle", "none that can be flown", expected, "no-go", str(error)))
+        rows.append(
+            CheckRow("link", "vehicle", "none that can be flown", expected, "no-go", str(error))
+        )
     return rows
 
 

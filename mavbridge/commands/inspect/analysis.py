@@ -9,7 +9,7 @@ from typing import Literal
 import numpy as np
 
 from mavbridge.commands.inspect.delays import (
-    Delay,
+    DelayEvent,
     find_delays,
     flown_limits,
     is_gap,
@@ -18,7 +18,7 @@ from mavbridge.commands.inspect.delays import (
 from mavbridge.commands.inspect.moments import Moment, worst_moments
 from mavbridge.commands.inspect.series import (
     FloatColumn,
-    Series,
+    TickSeries,
     Track,
     course_gates,
     make_series,
@@ -113,7 +113,7 @@ class FlightAnalysis:
     """Rate of the stick grid, derived from the slots themselves."""
     report: TimingReport
     """Figures of the table that ended the flight, except for those of the link."""
-    series: Series
+    series: TickSeries
     cameras: tuple[Images, ...]
     """Cameras in the contract's order; ``report`` describes the first one."""
     track: Track | None
@@ -121,7 +121,7 @@ class FlightAnalysis:
     gates: tuple[CourseGate, ...]
     """Empty if the course is unknown."""
     holders: tuple[HolderSpan, ...]
-    delays: tuple[Delay, ...]
+    delays: tuple[DelayEvent, ...]
     """Missed slots and late chunks in the order of time, each with its cause."""
     moments: tuple[Moment, ...]
     """The ten worst, starting with the worst."""

@@ -47,7 +47,7 @@ class Arrivals(NamedTuple):
 
 
 @dataclass(frozen=True, kw_only=True)
-class Delay:
+class DelayEvent:
     """A late chunk, or consecutive missed slots."""
 
     at_ns: int
@@ -75,7 +75,7 @@ def is_gap(last: Tick, tick: Tick) -> bool:
 
 def find_delays(
     ticks: Sequence[Tick], *, stick_hz: float, action_hz: float, arrivals: Arrivals | None = None
-) -> tuple[Delay, ...]:
+) -> tuple[DelayEvent, ...]:
     """Return missed slots and late chunks while the policy flew, in the order of time.
 
     Gaps in which the recorder lost ticks are left out.
@@ -85,13 +85,13 @@ def find_delays(
     return tuple(sorted(found, key=lambda delay: delay.at_ns))
 
 
-def _missed_slots(ticks: Sequence[Tick], slot_ns: float) -> Iterator[Delay]:
+def _missed_slots(ticks: Sequence[Tick], slot_ns: float) -> Iterator[DelayEvent]:
     for last, tick in pairwise(ticks):
         is_flown = last.trace is not None and tick.trace is not None
         if not is_flown or not tick.missed_slots or is_gap(last, tick):
             continue
         is_slow_send = last.sent_ns - last.woke_ns > slot_ns / 2
-        yield Delay(
+        yield DelayEvent(
             at_ns=tick.woke_ns,
             what="missed slots",
             count=tick.missed_slots,
@@ -102,7 +102,7 @@ def _missed_slots(ticks: Sequence[Tick], slot_ns: float) -> Iterator[Delay]:
 
 def _late_chunks(
     ticks: Sequence[Tick], chunk_ns: float, arrivals: Arrivals | None
-) -> Iterator[Delay]:
+) -> Iterator[DelayEvent]:
     """Yield chunks that came more than ``LATE_PERIODS`` after the one before."""
     before: Tick | None = None
     last: _Solve | None = None
@@ -118,7 +118,7 @@ def _late_chunks(
         count = solve.serial - last.serial
         period_ns = (solve.computed_ns - last.computed_ns) / count
         if period_ns > LATE_PERIODS * chunk_ns:
-            yield Delay(
+            yield DelayEvent(
                 at_ns=tick.woke_ns,
                 what="late chunk",
                 count=1,

@@ -4,7 +4,7 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from itertools import groupby, pairwise
 
-from mavbridge.commands.inspect.delays import Delay
+from mavbridge.commands.inspect.delays import DelayEvent
 from mavbridge.core.clock import NS_PER_MS, NS_PER_S
 from mavbridge.core.reasons import Code, Kind
 from mavbridge.core.records import Tick
@@ -41,7 +41,7 @@ def worst_moments(
     flight: RecordedFlight,
     ticks: Sequence[Tick],
     frames: Sequence[FrameRow],
-    delays: Sequence[Delay],
+    delays: Sequence[DelayEvent],
     limits: FreshnessLimits | None = None,
 ) -> tuple[Moment, ...]:
     """Return the ``MOMENTS`` worst, at least ``APART_S`` apart, starting with the worst.
@@ -126,7 +126,7 @@ def _ages(tick: Tick) -> str:
     return f"; its last sticks were by {' and '.join(parts)}" if parts else ""
 
 
-def _delay_moments(delays: Sequence[Delay], start_ns: int) -> Iterator[Moment]:
+def _delay_moments(delays: Sequence[DelayEvent], start_ns: int) -> Iterator[Moment]:
     for delay in delays:
         what = "late chunk"
         if delay.what == "missed slots":

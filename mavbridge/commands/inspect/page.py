@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from mavbridge.commands.inspect.analysis import FlightAnalysis
-from mavbridge.commands.inspect.series import FloatColumn, Series
+from mavbridge.commands.inspect.series import FloatColumn, TickSeries
 from mavbridge.core.clock import NS_PER_MS, NS_PER_S
 from mavbridge.core.errors import UserError
 from mavbridge.core.vehicle import Percentiles
@@ -219,7 +219,7 @@ def _packed(values: FloatColumn) -> str:
     return b64encode(values.astype("<f4").tobytes()).decode()
 
 
-def _histograms(series: Series) -> Iterator[dict[str, Any]]:
+def _histograms(series: TickSeries) -> Iterator[dict[str, Any]]:
     for title, values_ms in (
         ("Stick lateness", series.lateness_ms),
         ("Period of the slots", series.period_ms),

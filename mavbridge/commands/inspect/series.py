@@ -23,7 +23,7 @@ _ENU_FROM_NED, _FRD_FROM_FLU = (0.0, _HALF, _HALF, 0.0), (0.0, 1.0, 0.0, 0.0)
 
 
 @dataclass(frozen=True, kw_only=True)
-class Series:
+class TickSeries:
     """Values of all N ticks, in NED and FRD for any policy; NaN for missing ones."""
 
     start_ns: int
@@ -57,7 +57,7 @@ class Series:
     """[N, 3] from the estimator's origin."""
 
 
-def make_series(flight: RecordedFlight, ticks: Sequence[Tick]) -> Series:
+def make_series(flight: RecordedFlight, ticks: Sequence[Tick]) -> TickSeries:
     """Convert the ticks of a flight to arrays."""
     start_ns = ticks[0].woke_ns if ticks else flight.meta.start_ns
     woke_ns = np.array([tick.woke_ns for tick in ticks], np.int64)
@@ -72,7 +72,7 @@ def make_series(flight: RecordedFlight, ticks: Sequence[Tick]) -> Series:
         left = np.broadcast_to(to_ned, attitude.shape)
         attitude = multiply(multiply(left, attitude), np.broadcast_to(to_flu, attitude.shape))
     names = next((t.sent._fields for t in ticks if t.sent is not None), None)
-    return Series(
+    return TickSeries(
         start_ns=start_ns,
         t_s=(woke_ns - start_ns) / NS_PER_S,
         action_names=names or ("throttle", "yaw", "pitch", "roll"),
@@ -170,7 +170,7 @@ def course_gates(seed: int | None) -> tuple[CourseGate, ...]:
     )
 
 
-def read_track(series: Series, frames: Sequence[FrameRow]) -> Track | None:
+def read_track(series: TickSeries, frames: Sequence[FrameRow]) -> Track | None:
     """Return the simulator's true positions, else the positions in the ticks."""
     rows = [
         ((frame.captured_ns - series.start_ns) / NS_PER_S, frame.truth.position_ned_m)

@@ -31,7 +31,7 @@ from policy.stick_loop import motion_of_sticks
 _HALF_SQRT2 = math.sqrt(0.5)
 
 
-class Motion(NamedTuple):
+class SceneMotion(NamedTuple):
     """Attitude, velocity and acceleration at one time."""
 
     ned_from_body_wxyz: Quaternion
@@ -39,18 +39,18 @@ class Motion(NamedTuple):
     specific_force_body_mps2: tuple[float, float, float]
 
     @staticmethod
-    def of(state: VehicleState, frame: StateFrame) -> "Motion":
+    def of(state: VehicleState, frame: StateFrame) -> "SceneMotion":
         """Return the motion that a state in this frame describes."""
         vx, vy, vz = state.values[VELOCITY].tolist()
         w, x, y, z = state.values[QUATERNION].tolist()
         fx, fy, fz = state.values[SPECIFIC_FORCE].tolist()
         if frame == "ned_frd":
-            return Motion((w, x, y, z), (vx, vy, vz), (fx, fy, fz))
+            return SceneMotion((w, x, y, z), (vx, vy, vz), (fx, fy, fz))
         # From NED/FRD to ENU/FLU (REP 103) is its own inverse: half turns about the diagonal
         # between north and east, and about the nose.
         r = _HALF_SQRT2
         attitude = (r * (w + z), r * (x + y), r * (x - y), r * (w - z))
-        return Motion(attitude, (vy, vx, -vz), (fx, -fy, -fz))
+        return SceneMotion(attitude, (vy, vx, -vz), (fx, -fy, -fz))
 
     @property
     def horizontal_mps2(self) -> NDArray[np.float64]:
@@ -120,7 +120,9 @@ class SceneView:
                 shown.append(tick)
         if not shown:
             return
-        motions = [Motion.of(tick.state, self._frame) for tick in shown if tick.state is not None]
+        motions = [
+            SceneMotion.of(tick.state, self._frame) for tick in shown if tick.state is not None
+        ]
         stamps_ns = [tick.woke_ns for tick in shown]
         self._show_path(shown)
         places, last = [], self._last_place or layout.ORIGIN
@@ -274,7 +276,7 @@ def planned_path(
     also followed at once. Acceleration beyond that of the present lean, such as drag, is held. None
     for actions of other kinds.
     """
-    motion = Motion.of(solve.state, contract.state_frame)
+    motion = SceneMotion.of(solve.state, contract.state_frame)
     yaw_rad, step_s = heading_rad(motion.ned_from_body_wxyz), solve.step_ns / NS_PER_S
     lean_rad = roll_pitch_rad(motion.ned_from_body_wxyz)
     beyond_mps2 = motion.horizontal_mps2 - _lean_mps2(*lean_rad, yaw_rad)

@@ -65,7 +65,7 @@ class ConvBlock(nn.Module):
         return out
 
 
-class ResidualBlock(nn.Module):
+class LerobotResidualBlock(nn.Module):
     """Two convolutions with FiLM between them, around a shortcut."""
 
     def __init__(
@@ -101,8 +101,10 @@ class UNet(nn.Module):
         super().__init__()
         widths, self.time_dim = config.down_dims, config.diffusion_step_embed_dim
 
-        def block(channels_in: int, channels_out: int) -> ResidualBlock:
-            return ResidualBlock(channels_in, channels_out, config, self.time_dim + condition_dim)
+        def block(channels_in: int, channels_out: int) -> LerobotResidualBlock:
+            return LerobotResidualBlock(
+                channels_in, channels_out, config, self.time_dim + condition_dim
+            )
 
         self.diffusion_step_encoder = nn.Sequential(
             nn.Identity(),  # LeRobot's sinusoids, which have no parameters
@@ -155,7 +157,7 @@ class UNet(nn.Module):
         return out.transpose(1, 2)
 
     def _film(self, value: Tensor, columns: slice, *, bias: bool) -> list[Tensor]:
-        blocks = [module for module in self.modules() if isinstance(module, ResidualBlock)]
+        blocks = [module for module in self.modules() if isinstance(module, LerobotResidualBlock)]
         active: Tensor = blocks[0].cond_encoder[0](value)
         linears: list[Any] = [block.cond_encoder[1] for block in blocks]
         return [F.linear(active, m.weight[:, columns], m.bias if bias else None) for m in linears]

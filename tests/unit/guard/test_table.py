@@ -21,7 +21,7 @@ from mavbridge.core.reasons import Code, because
 from mavbridge.core.vehicle import NEUTRAL as CENTRED
 from mavbridge.guard import engagement
 from mavbridge.guard.sequences import DisengageSettings
-from mavbridge.guard.table import PROGRESS, TABLE, Row
+from mavbridge.guard.table import PROGRESS, TABLE, Transition
 from mavbridge.guard.values import Actions, ControlSource, EndRequest, Phase
 
 IDLE, POLICY, NEUTRAL, LEVEL, RELEASE = ControlSource
@@ -358,9 +358,9 @@ def test_rows(name: str) -> None:
 
 
 def test_every_row_has_a_case(monkeypatch: pytest.MonkeyPatch) -> None:
-    taken: set[tuple[Row, Phase]] = set()
+    taken: set[tuple[Transition, Phase]] = set()
 
-    def noting(row: Row) -> Row:
+    def noting(row: Transition) -> Transition:
         def does(memory: Any, now: Any, cause: Any) -> None:
             taken.add((row, memory.phase))
             row.does(memory, now, cause)

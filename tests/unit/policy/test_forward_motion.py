@@ -4,10 +4,10 @@ from typing import Any
 import pytest
 
 from policy.contract import Contract
-from policy.forward_motion import ForwardMotion, Four, Motion
+from policy.forward_motion import ForwardMotion, Four, VehicleMotion
 from policy.stick_loop import GRAVITY_MPS2
 
-HOVER = Motion((1.0, 0.0, 0.0, 0.0), (0.0,) * 3, (0.0,) * 3, (0.0, 0.0, -GRAVITY_MPS2))
+HOVER = VehicleMotion((1.0, 0.0, 0.0, 0.0), (0.0,) * 3, (0.0,) * 3, (0.0, 0.0, -GRAVITY_MPS2))
 HEADING_EAST = (math.sqrt(0.5), 0.0, 0.0, math.sqrt(0.5))
 REST: dict[Any, Four] = {
     "sticks": (0.0, 0.0, 0.0, 0.0),
@@ -17,7 +17,7 @@ REST: dict[Any, Four] = {
 }
 
 
-def after(flown: Four, seconds: float, start: Motion = HOVER, **terms: Any) -> Motion:
+def after(flown: Four, seconds: float, start: VehicleMotion = HOVER, **terms: Any) -> VehicleMotion:
     steps = round(seconds / 0.01)
     return ForwardMotion(Contract(**terms)).after(start, [flown] * steps, 0.01)
 

@@ -4,8 +4,8 @@ from pathlib import Path
 
 import pytest
 
-from mavbridge.commands.check.camera import CameraNeeds, Seen, camera_rows, judge
-from mavbridge.commands.check.rows import Row
+from mavbridge.commands.check.camera import CameraNeeds, CameraView, camera_rows, judge
+from mavbridge.commands.check.rows import CheckRow
 from mavbridge.config.flight import CameraConfig
 from mavbridge.core.clock import NS_PER_MS, MonotonicClock
 
@@ -17,8 +17,8 @@ def needs(source: str = "shm:fpv", **changed: object) -> CameraNeeds:
     return CameraNeeds(source=source, **(values | changed))  # type: ignore[arg-type]
 
 
-def seen(*, age_ms: float = 15.0, period_ns: int = FRAME_NS, size_px: int = 224) -> Seen:
-    return Seen(
+def seen(*, age_ms: float = 15.0, period_ns: int = FRAME_NS, size_px: int = 224) -> CameraView:
+    return CameraView(
         captured_ns=[k * period_ns for k in range(60)],
         ages_ns=[round(age_ms * NS_PER_MS)] * 60,
         height_px=size_px,
@@ -26,7 +26,7 @@ def seen(*, age_ms: float = 15.0, period_ns: int = FRAME_NS, size_px: int = 224)
     )
 
 
-def rows(need: CameraNeeds, what: Seen, latency_ms: float = 0.0) -> dict[str, Row]:
+def rows(need: CameraNeeds, what: CameraView, latency_ms: float = 0.0) -> dict[str, CheckRow]:
     """By the last words of their names."""
     return {
         row.name.removeprefix(need.source).strip(): row

@@ -12,7 +12,7 @@ from rich.console import Console
 from helpers.fakes import FakeClock
 from mavbridge import cli
 from mavbridge.commands.check.policy import Pace, check_policy
-from mavbridge.commands.check.rows import Row, as_document, overall, print_check
+from mavbridge.commands.check.rows import CheckRow, as_document, overall, print_check
 from mavbridge.commands.check.run import check
 from mavbridge.commands.config import CheckConfig
 from mavbridge.config.flight import CameraConfig, FlyConfig, LinkConfig
@@ -22,7 +22,7 @@ from mavbridge.core.errors import ExitCode, UserError
 from mavbridge.core.processes import free_port
 
 BLIND = CameraConfig(camera=("none",))
-REFUSED = Row(
+REFUSED = CheckRow(
     area="parameters",
     name="RC_OVERRIDE_TIME",
     found="-1",
@@ -31,7 +31,7 @@ REFUSED = Row(
     advice="it would hold its last sticks for ever: use --set RC_OVERRIDE_TIME=0.5, or else",
     commands=("--set RC_OVERRIDE_TIME=0.5",),
 )
-GO = Row(area="link", name="attitude", found="100.0 Hz", expected="100 Hz")
+GO = CheckRow(area="link", name="attitude", found="100.0 Hz", expected="100 Hz")
 
 
 def flight(policy: str, camera: CameraConfig = BLIND) -> FlyConfig:
@@ -113,7 +113,7 @@ def test_a_flag_that_contradicts_the_policy_is_a_no_go() -> None:
 
 def test_the_worst_row_is_the_verdict() -> None:
     assert overall([GO]) == "go"
-    assert overall([GO, Row(area="link", name="loss", found="3%", verdict="warn")]) == "warn"
+    assert overall([GO, CheckRow(area="link", name="loss", found="3%", verdict="warn")]) == "warn"
     assert overall([GO, REFUSED]) == "no-go"
     assert as_document([REFUSED])["rows"][0]["commands"] == ["--set RC_OVERRIDE_TIME=0.5"]
 
@@ -132,7 +132,7 @@ def test_the_table_fits_its_terminal_and_ends_with_what_to_do(width: int) -> Non
 
 def test_a_row_hides_the_password_of_an_address_in_table_and_json() -> None:
     text = "rtsp://me:it@host/1?token=abc"
-    row = Row(area="camera", name="camera", found=text, expected=text, advice=text)
+    row = CheckRow(area="camera", name="camera", found=text, expected=text, advice=text)
     assert "it@" not in json.dumps(as_document([row]))
     assert row.found == "rtsp://me:***@host/1?token=***"
 

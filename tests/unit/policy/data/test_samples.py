@@ -19,8 +19,8 @@ from policy.data.samples import (
     FRESH_START_SHARE,
     HISTORY_NOISE,
     RATE_NOISE_RADPS,
-    Samples,
     Timeline,
+    TrainingSamples,
 )
 from policy.preprocess import egocentric
 
@@ -147,7 +147,7 @@ def test_a_mirrored_flight_is_seen_mirrored_from_the_vehicle() -> None:
     random = np.random.default_rng(4)
     state = random.normal(size=(30, 20)).astype(np.float32)
     state[:, QUATERNION] /= np.linalg.norm(state[:, QUATERNION], axis=1, keepdims=True)
-    samples = Samples(
+    samples = TrainingSamples(
         state=state,
         history=random.normal(size=(30, 4, 4)).astype(np.float32),
         chunk=random.normal(size=(30, 4, 4)).astype(np.float32),

@@ -26,7 +26,7 @@ from policy.training import batches as batches_module
 from policy.training.batches import Batches
 from policy.training.policy_run import train_policy
 from policy.training.report import Hooks, TrainingProgress, TrainResult
-from policy.training.run_folder import Position, RunFolder, TrainingError
+from policy.training.run_folder import RunFolder, TrainingError, TrainingPosition
 from policy.training.settings import TrainSettings, policy_stages
 from policy.training.trainee import gate_labels, gate_loss
 
@@ -266,7 +266,7 @@ def test_a_state_that_cannot_be_written_is_one_message(tmp_path: Path) -> None:
     folder = RunFolder(tmp_path / "run", "identity")
     folder.path.rmdir()
     with pytest.raises(TrainingError, match="the training cannot be kept"):
-        folder.save(Position(), {})
+        folder.save(TrainingPosition(), {})
     assert not folder.has_state
     folder.path.mkdir()
     (folder.path / "state.pt").write_bytes(b"PK torn")
