@@ -44,7 +44,7 @@ class ForwardMotion:
     def after(self, start: VehicleMotion, actions: Iterable[Four], dt_s: float) -> VehicleMotion:
         """Return the motion after flying each action for ``dt_s``.
 
-        Actions are of the contract's kind, in NED and FRD axes whatever its frame.
+        Actions are of the contract's kind, in NED and FRD axes even for a contract in ENU.
         """
         attitude, rate, velocity, _ = start
         x, y, _ = start.specific_force_body_mps2

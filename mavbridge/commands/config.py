@@ -225,7 +225,7 @@ class RecordConfig:
     on_arm: Annotated[bool, Parameter(group=EPISODES, negative="")] = False
     """Record while the vehicle is armed."""
     episodes: Annotated[int | None, Parameter(group=EPISODES)] = None
-    """End after so many."""
+    """End after this number of episodes."""
     rerun: Annotated[str, Parameter(group=OUTPUT)] = "off"
     """Rerun viewer: spawn, connect[=URL], FILE.rrd, or off."""
     disk_reserve: Annotated[float, Parameter(group=OUTPUT)] = 1.0

@@ -97,7 +97,7 @@ class EvaluateConfig:
     """Gusts of this many m/s (standard deviation) along each horizontal axis, in place of those of
     --conditions."""
     raw_sticks: bool = False
-    """Send the policy's sticks as they are, whatever the vehicle's curves make of them."""
+    """Send the policy's sticks as they are, without the inverse of the vehicle's curves."""
     vision_delay: float = 0.0
     """Milliseconds added to the encoding of each image; an image older than
     limits.feature_age is not flown by. Here such limits may also be looser than the policy's."""
@@ -105,12 +105,10 @@ class EvaluateConfig:
     """Milliseconds that an image takes to encode, always; by default as on two shared
     cores: 11, and 25 at the 99th percentile."""
     solve_time: float | None = None
-    """Milliseconds from image and attitude to the chunk, always, as of a slow head or a server; by
-    default 3, and 6 at the 99th percentile. The policy's play_s, and so its age limits and its
-    rate, follow."""
+    """Milliseconds that a chunk takes, as from a slow head or a server; default: 3, and 6 at the
+    99th percentile. The policy's play_s, and so its age limits and its rate, follow."""
     state_time: StateTime | None = None
-    """measured, or execution: the state is predicted to the time at which the chunk will act; by
-    default as the contract says."""
+    """measured, or execution (predicted to when the chunk acts); default: the contract's."""
     stalls: float = 0.0
     """Milliseconds for which the flight process stands still, at a random moment every 3 s;
     limits.stall may be looser than the policy's here, too."""

@@ -58,7 +58,7 @@ class Rates:
     """Most chunks of actions per second (single rate), each from the newest image; default: 30, or
     2 / play_s for slow policies."""
     stick_rate: Annotated[float, hidden("rates.stick")] = 100.0
-    """Commands sent to the autopilot per second, whatever the policy's rate."""
+    """Commands sent to the autopilot per second, independent of the policy's rate."""
     realtime: Annotated[bool, hidden("scheduling.realtime")] = True
     """Real-time scheduling (SCHED_FIFO) of the guard and of the policy, where the system permits
     it."""

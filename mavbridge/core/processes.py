@@ -44,7 +44,7 @@ def user_environment() -> dict[str, str]:
 def running(*command: str, log: Path) -> Iterator[subprocess.Popen[bytes]]:
     """Context manager: run a process with its output in ``log``; end it with the block.
 
-    A Python child imports this mavbridge, whatever the working directory holds.
+    A Python child imports this mavbridge from any working directory.
     """
     with log.open("wb") as out:
         process = subprocess.Popen(

@@ -216,7 +216,7 @@ class ModeRoles:
     names: tuple[str, ...] = ()
     """Modes that can be requested."""
     hold: str = ""
-    """Mode that holds the position whatever the sticks say; empty: the firmware has none."""
+    """Mode that holds the position and ignores the sticks; empty: the firmware has none."""
     land: str = ""
     rtl: str = ""
     takeoff: tuple[str, ...] = ()

@@ -67,7 +67,7 @@ def fly(config: FlyConfig) -> int:
     console = flight_console()
     report_folder = config.report.parent if config.report else None
     viewer_folder = Path(config.rerun).parent if config.rerun.endswith(".rrd") else None
-    # The policy is closed last: whatever its close does, the guard has ended before.
+    # The policy is closed last, after the guard has ended: its close may hang or raise.
     with (
         empty_folders_removed(config.record, report_folder, viewer_folder),
         ExitStack() as policy_life,

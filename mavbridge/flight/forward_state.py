@@ -1,5 +1,6 @@
 """Telemetry predicted to the time at which the next chunk will act, for slow policies."""
 
+import math
 from collections.abc import Callable
 from typing import TypeAlias
 
@@ -10,6 +11,8 @@ from policy.forward_motion import ForwardMotion, VehicleMotion
 
 STEP_NS = 10 * NS_PER_MS
 """Step of the prediction."""
+LEAST_SPEED_MPS = 0.3
+"""A slower vehicle may stand on the ground, where the model would let it fall."""
 FlownAt: TypeAlias = Callable[[int], Action]
 """Returns the action that the vehicle flies at a time [ns]: sent already, or planned."""
 
@@ -21,7 +24,7 @@ class ForwardState:
         self._model = ForwardMotion(contract)
 
     def at(self, telemetry: Telemetry, until_ns: int, flown_at: FlownAt) -> Telemetry:
-        """Return the telemetry at ``until_ns``; as it is if a part of the motion is missing.
+        """Return the telemetry at ``until_ns``; as it is for a vehicle that stands still.
 
         Each reading is predicted from the attitude's time, and counts as measured at ``until_ns``.
         Positions and heights move with the velocity.
@@ -33,7 +36,7 @@ class ForwardState:
         now_ns = attitude.happened_ns
         steps = max(round((until_ns - now_ns) / STEP_NS), 1)
         dt_ns = (until_ns - now_ns) // steps
-        if dt_ns <= 0:
+        if dt_ns <= 0 or math.hypot(*velocity.values) < LEAST_SPEED_MPS:
             return telemetry
         w, x, y, z = attitude.values
         start = VehicleMotion((w, x, y, z), _three(rate), _three(velocity), _three(force))

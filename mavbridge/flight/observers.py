@@ -217,7 +217,7 @@ class FlightObservers:
                 self._report(summary, autopilot, outcome)
             else:
                 self._discard()
-        finally:  # whatever is raised is printed only then
+        finally:  # an exception is printed only then
             self.screen.close(SCREEN_CLOSE_S)
 
     def _discard(self) -> None:

@@ -165,18 +165,13 @@ class PolicyLoop:
         if isinstance(state, Unavailable):
             self._refuse(state.reason)
             return
-        plan = self._chunk if self._is_rolled_forward else None
+        is_planned = self._forward is not None and self._view.phase is Phase.FLYING
+        plan = self._chunk if is_planned else None
         observation = self._observe(state, telemetry, now_ns, plan)
         if isinstance(observation, Unavailable):
             self._refuse(observation.reason)
         else:
             self._solve(state, observation, now_ns, plan)
-
-    @property
-    def _is_rolled_forward(self) -> bool:
-        """True if the next solve takes a predicted state: the policy moves a vehicle in the air."""
-        is_flying = self._view.phase is Phase.FLYING and self._view.status.is_landed is not True
-        return self._forward is not None and is_flying
 
     def _observe(
         self, state: VehicleState, telemetry: Telemetry, now_ns: int, plan: Chunk | None
@@ -187,11 +182,12 @@ class PolicyLoop:
         if self._forward is not None and plan is not None:
             acts_ns = now_ns + sorted(self._solves_ns)[len(self._solves_ns) // 2]
             ahead = self._forward.at(telemetry, acts_ns, partial(self._history.at, plan=plan))
-            has_position = self._view.status.has_position
-            acting = self._reader.read(ahead, acts_ns, has_position=has_position)
-            if isinstance(acting, Unavailable):
-                return acting
-            state = acting
+            if ahead is not telemetry:
+                has_position = self._view.status.has_position
+                acting = self._reader.read(ahead, acts_ns, has_position=has_position)
+                if isinstance(acting, Unavailable):
+                    return acting
+                state = acting
         return self._observations.observe(state, now_ns)
 
     def _refuse(self, reason: Reason) -> None:

@@ -40,7 +40,7 @@ from policy.protocol import PolicyRunner
 from sitl.vehicle.config import AutopilotName
 
 EXAMPLES = Path(__file__).parents[2] / "examples"
-FLIGHT_S = 1.0
+FLIGHT_S = 1.5
 BASE = Contract(arrays="numpy", feature_dim=3, image_height=32, image_width=32, horizon=16)
 
 
@@ -181,6 +181,9 @@ PAST = {"observation_steps": 3, "observation_dt_s": 0.07}
         {"since_exposure": True},
         PAST,
         {"since_exposure": True, **PAST},
+        {"state_time": "execution"},
+        {"state_time": "execution", "since_exposure": True, "state_extras": ("altitude", "height")},
+        {"state_time": "execution", "action": "velocity", "state_frame": "enu_flu", **PAST},
         TWO_EYES,
         {"state_extras": ("height",), **TWO_EYES, **PAST},
         {"history_len": 1, "history_dt_s": 0.001},

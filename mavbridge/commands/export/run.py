@@ -132,7 +132,7 @@ def write_contract(dataset: Path, flights: Sequence[Path], config: ExportConfig)
     """
     metas = [read_json(flight / "meta.json", "flight folder") for flight in flights]
     contracts = [meta.get("contract") for meta in metas]
-    # The only camera is the vehicle's own, whatever its name: the contract's default.
+    # The only camera is the vehicle's own under any name: the contract's default.
     entries = [
         *(entry for entry in dataset_entries(dataset) if entry.name != "cameras"),
         *recorded_entries([each for each in contracts if isinstance(each, dict)]),

@@ -182,7 +182,7 @@ class ParamValue(NamedTuple):
 
     name: str
     value: float
-    """Numeric value, whatever the parameter's type."""
+    """Numeric value of a parameter of any type."""
     kind: int = dialect.MAV_PARAM_TYPE_REAL32
     """MAV_PARAM_TYPE."""
 

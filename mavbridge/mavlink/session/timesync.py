@@ -53,8 +53,8 @@ class _Exchange(NamedTuple):
 class TimesyncFilter:
     """Estimates the offset from the most accurate exchange.
 
-    A request and its answer that together take t give the offset within t / 2, whatever the delay
-    of each direction. So the fastest exchange is kept, however old, until possible clock drift
+    A request and its answer that together take t give the offset within t / 2, however t is split
+    between the directions. So the fastest exchange is kept, however old, until possible clock drift
     makes a newer one as accurate: a delay that begins in flight does not move the offset, and shows
     as age. An exchange that contradicts the kept one shows that the vehicle's clock has stepped or
     drifts, and replaces it.

@@ -124,7 +124,7 @@ class _FileTransport(Transport, Generic[_Handle]):
             self._handle, self._unsent = None, b""
 
     def _end(self, handle: _Handle) -> None:
-        """End whatever would outlive ``close`` while another process has the file open."""
+        """End what outlives ``close`` while another process has the file open."""
 
     def _put(self, data: bytes, write: Callable[[bytes], int]) -> bool:
         """Write the packet, or drop it whole; raise OSError as ``write`` does."""

@@ -12,7 +12,7 @@ from helpers.fakes import START_NS, FakeClock, ListSink, level_telemetry, sample
 from mavbridge.core.clock import NS_PER_MS, Clock
 from mavbridge.core.reasons import Code, Reason, because
 from mavbridge.core.records import FeatureFrame, FloatArray
-from mavbridge.core.vehicle import Sample, Velocity
+from mavbridge.core.vehicle import Reading, Sample, Telemetry, Velocity
 from mavbridge.flight.action_frames import ActionFrame, action_frame
 from mavbridge.flight.feature_cache import FeatureCache
 from mavbridge.flight.forward_state import ForwardState
@@ -49,7 +49,7 @@ class Rig:
         )
         self.sent: list[Chunk | NoChunk] = []
         self.solves = self.resets = 0
-        self.solve_ns, self.given = 3 * MS, (np.zeros(0, np.float32),) * 3
+        self.north_mps, self.solve_ns, self.given = 0.0, 3 * MS, (np.zeros(0, np.float32),) * 3
         self._chunk = chunk or (lambda: np.zeros((1, 3, 4), np.float32))
         self.loop = PolicyLoop(
             clock=self.clock,
@@ -88,10 +88,15 @@ class Rig:
         ages_ns = {"velocity_ned_mps": velocity_age_ns, "specific_force_body_mps2": force_age_ns}
         samples = (
             Sample(name, reading._replace(delay_ns=ages_ns.get(name, attitude_age_ns)))
-            for name, reading in samples_of(level_telemetry(self.clock.now_ns()))
+            for name, reading in samples_of(self._telemetry())
         )
         self.view.receive(Samples(tuple(samples)))
         return self
+
+    def _telemetry(self) -> Telemetry:
+        level = level_telemetry(self.clock.now_ns())
+        moving = Reading(self.clock.now_ns(), (self.north_mps, 0.0, 0.0))
+        return level._replace(velocity_ned_mps=moving)
 
     def see(self, *, age_ns: int = 30 * MS, fault: Reason | None = None) -> "Rig":
         captured_ns = self.clock.now_ns() - age_ns
@@ -142,20 +147,26 @@ def test_actions_reach_the_guard_in_its_own_kind_and_axes() -> None:
     assert action == Velocity(2.0, 1.0, -3.0, -0.5)
 
 
-def test_a_predicted_state_is_that_of_the_moment_at_which_the_chunk_acts() -> None:
+@pytest.mark.parametrize("north_mps", [0.0, 2.0])
+def test_the_state_of_a_vehicle_that_moves_is_predicted_to_when_the_chunk_acts(
+    north_mps: float,
+) -> None:
     pitch = np.tile(np.array([0.0, 0.0, 0.8, 0.0], np.float32), (1, 16, 1))
     rig = Rig(lambda: pitch, period_ms=200, forward=ForwardState(Contract())).measure().see()
-    rig.solve_ns = 200 * MS
+    rig.north_mps, rig.solve_ns = north_mps, 200 * MS
     rig.loop.step()  # not flying yet: as measured
     rig.view.receive(make_guard_tick(rig.clock.now_ns(), phase=Phase.FLYING))
     run_on(rig, 7)
-    _, predicted = rig.sent
-    assert isinstance(predicted, Chunk)
+    _, chunk = rig.sent
+    assert isinstance(chunk, Chunk)
     started_ns = START_NS + 207 * MS
-    assert predicted.first_ns == started_ns + 200 * MS
-    assert predicted.attitude_ns == started_ns  # ages count from the measurement
+    assert chunk.attitude_ns == started_ns  # ages count from the measurement
     _, states, history = rig.given
-    assert states[0, 0] > 0.2  # the plan, stick forward, has gathered speed to the north
+    if north_mps == 0.0:  # it may stand on the ground
+        assert (chunk.first_ns, states[0, 0]) == (started_ns, 0.0)
+        return
+    assert chunk.first_ns == started_ns + 200 * MS
+    assert states[0, 0] > north_mps + 0.2  # the plan, stick forward, has gathered speed
     assert history[0, -1].tolist() == [0.0, 0.0, pytest.approx(0.8), 0.0]
 
 
