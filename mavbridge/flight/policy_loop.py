@@ -238,22 +238,32 @@ class PolicyLoop:
         self._chunk = chunk
         self._send(chunk)
         if self._watch is not None:
-            self._watch(
-                Solve(
-                    serial=chunk.serial,
-                    started_ns=now_ns,
-                    computed_ns=done_ns,
-                    reset_ns=chunk.reset_ns,
-                    state=state,
-                    states=_kept(observation.states),
-                    history=_kept(history),
-                    frame_ids=observation.frame_ids,
-                    image_ns=chunk.image_ns,
-                    first_ns=chunk.first_ns,
-                    step_ns=chunk.step_ns,
-                    actions=_kept(array),
-                )
-            )
+            self._watch(_solve_of(chunk, state, observation, history, array, started_ns=now_ns))
+
+
+def _solve_of(
+    chunk: Chunk,
+    state: VehicleState,
+    observation: Observation,
+    history: FloatArray,
+    array: FloatArray,
+    *,
+    started_ns: int,
+) -> Solve:
+    return Solve(
+        serial=chunk.serial,
+        started_ns=started_ns,
+        computed_ns=chunk.computed_ns,
+        reset_ns=chunk.reset_ns,
+        state=state,
+        states=_kept(observation.states),
+        history=_kept(history),
+        frame_ids=observation.frame_ids,
+        image_ns=chunk.image_ns,
+        first_ns=chunk.first_ns,
+        step_ns=chunk.step_ns,
+        actions=_kept(array),
+    )
 
 
 def make_chunk(

@@ -133,20 +133,9 @@ def read_flight(folder: Path) -> FlightData:
     frames, numbers, damage = frames.take(places), numbers[places], [*damage, *more]
     tick_ns, sent_ns = stamps(name, ticks, "woke_ns"), stamps(name, ticks, "sent_ns")
     state = vectors(name, ticks, "state", STATE_DIM)
-    sent = _sent(name, ticks, terms)
-    is_expert = "expert" in ticks.column_names
+    sent, target, is_target = _sticks(folder, ticks, terms)
     # The expert observed at the policy's tick; its stick is for that time.
-    target_ns = tick_ns if is_expert else sent_ns
-    target = vectors(name, ticks, "expert", ACTION_DIM) if is_expert else sent
-    is_target = _known(target) & np.array(ticks["armed"].to_pylist(), dtype=bool)
-    is_correction = _corrections(folder, ticks)
-    if not is_expert and is_correction.any():
-        sent[is_correction] = vectors(name, ticks, "rc_sticks", ACTION_DIM)[is_correction]
-        target, is_target = sent, is_correction
-    if not is_target.any():
-        raise DatasetError(
-            f"{folder}: nobody to learn from: no expert, and no stick was sent while armed"
-        )
+    target_ns = tick_ns if "expert" in ticks.column_names else sent_ns
     if terms.action == "rates":
         is_target &= _known(state)
         loop = StickLoop(rates_contract(Contract(hover_thrust=terms.hover_thrust)))
@@ -171,6 +160,26 @@ def read_flight(folder: Path) -> FlightData:
         decode=partial(decode_video, video, numbers),
         damage=tuple(damage),
     )
+
+
+def _sticks(
+    folder: Path, ticks: pa.Table, terms: ActionTerms
+) -> tuple[FloatArray, FloatArray, NDArray[np.bool_]]:
+    """Return the sticks that flew, those to imitate, and True for the ticks to imitate."""
+    name = str(folder)
+    sent = _sent(name, ticks, terms)
+    is_expert = "expert" in ticks.column_names
+    target = vectors(name, ticks, "expert", ACTION_DIM) if is_expert else sent
+    is_target = _known(target) & np.array(ticks["armed"].to_pylist(), dtype=bool)
+    is_correction = _corrections(folder, ticks)
+    if not is_expert and is_correction.any():
+        sent[is_correction] = vectors(name, ticks, "rc_sticks", ACTION_DIM)[is_correction]
+        target, is_target = sent, is_correction
+    if not is_target.any():
+        raise DatasetError(
+            f"{folder}: nobody to learn from: no expert, and no stick was sent while armed"
+        )
+    return sent, target, is_target
 
 
 def _sent(name: str, ticks: pa.Table, terms: ActionTerms) -> FloatArray:
