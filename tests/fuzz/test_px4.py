@@ -8,7 +8,7 @@ from mavbridge.core.vehicle import ActionKind
 
 @pytest.mark.parametrize("kind", ["sticks", "attitude", "rates", "velocity"])
 def test_hostile_datagrams_neither_fly_nor_break_anything(kind: ActionKind) -> None:
-    flight = HostileFlight(1, "px4", kind, share=1100)
-    flight.run(4500)
-    assert flight.fed >= 4500
+    flight = HostileFlight(1, "px4", kind, share=550)
+    flight.run(2250)
+    assert flight.fed >= 2250
     assert flight.flights >= 1
