@@ -26,12 +26,13 @@ from benchmarks.results import (
     BASELINE,
     OURS,
     BenchResult,
+    Flight,
     print_result,
     this_machine,
     to_json,
 )
 from benchmarks.roofline import time_rooflines
-from mavbridge.commands.output import table_console
+from mavbridge.commands.output import print_status, table_console
 from mavbridge.config.policy import PolicyConfig
 from mavbridge.config.rates import Rates
 from mavbridge.core.errors import UserError
@@ -103,12 +104,28 @@ def measure(*, is_quick: bool) -> BenchResult:
         quick=is_quick,
         engines=(*engines, *time_rooflines(policies)),
         flights=(
-            *(fly(policy, Rates(), flight_s, module=module) for policy, module in FLIGHTS),
-            *(fly(SHIPPED, rates, flight_s, load=load) for rates, load in LOADED_FLIGHTS),
+            *(_fly(policy, Rates(), flight_s, module=module) for policy, module in FLIGHTS),
+            *(_fly(SHIPPED, rates, flight_s, load=load) for rates, load in LOADED_FLIGHTS),
         ),
         links=tuple(time_link(client, attitudes) for client in clients),
         notes=(*notes, *peer_notes),
     )
+
+
+def _fly(
+    policy: PolicyConfig,
+    rates: Rates,
+    duration_s: float,
+    *,
+    module: str = FLIGHT_PROCESS,
+    load: Load = "none",
+) -> Flight:
+    """Fly; fly once more if the first flight was lost, as to a stall of the machine."""
+    try:
+        return fly(policy, rates, duration_s, module=module, load=load)
+    except UserError as error:
+        print_status(f"flown again: {error}")
+        return fly(policy, rates, duration_s, module=module, load=load)
 
 
 def ratios(result: BenchResult) -> dict[str, float]:
