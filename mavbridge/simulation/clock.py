@@ -75,3 +75,34 @@ class AheadClock:
     def sleep_until_ns(self, deadline_ns: int) -> None:
         """Count the time until ``deadline_ns`` as working time."""
         self.ahead_ns = max(self.ahead_ns, deadline_ns - self._world.now_ns())
+
+
+class Stepper:
+    """Runs a step of a loop, as an event, whenever the loop is idle and has work."""
+
+    def __init__(
+        self,
+        world: SteppedClock,
+        clock: AheadClock,
+        has_work: Callable[[], bool],
+        step: Callable[[], object],
+    ) -> None:
+        """``clock`` is that of the loop: it tells how long a step takes."""
+        self._world = world
+        self._clock = clock
+        self._has_work = has_work
+        self._step = step
+        self._is_busy = False
+
+    def run(self) -> None:
+        """Step until there is no work or a step takes time; go on when that has passed."""
+        while not self._is_busy and self._has_work():
+            self._step()
+            busy_ns, self._clock.ahead_ns = self._clock.ahead_ns, 0
+            if busy_ns:
+                self._is_busy = True
+                self._world.schedule(self._world.now_ns() + busy_ns, self._end)
+
+    def _end(self) -> None:
+        self._is_busy = False
+        self.run()

@@ -20,9 +20,9 @@ from mavbridge.flight.state import observation_ages_ns
 from mavbridge.guard.loop import GuardLoop
 from mavbridge.guard.values import EndRequest
 from mavbridge.mavlink.link import MavlinkLink
-from mavbridge.simulation.clock import AheadClock, SteppedClock
+from mavbridge.simulation.clock import AheadClock, SteppedClock, Stepper
 from mavbridge.simulation.delays import Delays, Stalls
-from mavbridge.simulation.guard import GuardStepper, MemoryPort, PolicyStepper, sender
+from mavbridge.simulation.guard import GuardStepper, MemoryPort, flight_process, sender
 from mavbridge.simulation.network import DelayedChannel, MemoryTransport
 from mavbridge.simulation.referee import EpisodeResult, Referee
 from mavbridge.simulation.world import (
@@ -34,7 +34,6 @@ from mavbridge.simulation.world import (
     Exposure,
     SimulatedCamera,
     VehicleStepper,
-    VisionStepper,
     needed_params,
 )
 from policy.contract import Contract, FloatArray
@@ -213,10 +212,12 @@ class SimulatedFlight:
             delay_vision=lambda sink: DelayedSink(world, sink),
         )
         for clock, camera, vision in zip(vision_clocks, cameras, bridge.visions, strict=True):
-            VisionStepper(world, clock, camera, vision)
-        policy = PolicyStepper(world, policy_clock, flight_port, bridge.policy, bridge.view)
+            stepper = Stepper(world, clock, camera.has_frame, vision.step)
+            camera.arrival_watchers.append(stepper.run)
+        to_flight.on_arrival = flight_process(
+            world, policy_clock, flight_port, bridge.policy, bridge.view
+        )
         guard_stepper = GuardStepper(world, guard)
-        to_flight.on_arrival = policy.receive
         to_guard.on_arrival = self._downlink.on_arrival = guard_stepper.step
         return guard
 

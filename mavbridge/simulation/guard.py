@@ -7,7 +7,7 @@ from mavbridge.flight.policy_loop import PolicyLoop
 from mavbridge.flight.telemetry_cache import TelemetryCache
 from mavbridge.guard.loop import GuardLoop
 from mavbridge.guard.wire import ToGuard, decode_from_guard, encode_to_guard
-from mavbridge.simulation.clock import AheadClock, SteppedClock
+from mavbridge.simulation.clock import AheadClock, SteppedClock, Stepper
 from mavbridge.simulation.network import DelayedChannel
 
 
@@ -53,41 +53,22 @@ class GuardStepper:
             self.step()
 
 
-class PolicyStepper:
-    """Runs the policy loop whenever it is idle and a new attitude has arrived."""
+def flight_process(
+    world: SteppedClock,
+    clock: AheadClock,
+    port: MemoryPort,
+    loop: PolicyLoop,
+    view: TelemetryCache,
+) -> Callable[[], None]:
+    """Return a function that takes the guard's arrived messages, and solves if there is news."""
+    stepper = Stepper(world, clock, lambda: loop.has_news, loop.step)
 
-    def __init__(
-        self,
-        world: SteppedClock,
-        clock: AheadClock,
-        port: MemoryPort,
-        loop: PolicyLoop,
-        view: TelemetryCache,
-    ) -> None:
-        self._world = world
-        self._clock = clock
-        self._port = port
-        self._loop = loop
-        self._view = view
-        self._is_busy = False
+    def receive() -> None:
+        for data in port.receive():
+            view.receive(decode_from_guard(data))
+        stepper.run()
 
-    def receive(self) -> None:
-        """Take the guard's messages that have arrived; solve if there is a new attitude."""
-        for data in self._port.receive():
-            self._view.receive(decode_from_guard(data))
-        self._solve()
-
-    def _solve(self) -> None:
-        if self._is_busy or not self._loop.has_news:
-            return
-        self._is_busy = True
-        self._loop.step()
-        busy_ns, self._clock.ahead_ns = self._clock.ahead_ns, 0
-        self._world.schedule(self._world.now_ns() + busy_ns, self._end)
-
-    def _end(self) -> None:
-        self._is_busy = False
-        self._solve()
+    return receive
 
 
 def sender(world: SteppedClock, clock: AheadClock, port: MemoryPort) -> Callable[[ToGuard], object]:

@@ -13,8 +13,7 @@ from mavbridge.config.episodes import ConditionsKind
 from mavbridge.core.ports import TickSink
 from mavbridge.core.records import Event, FeatureFrame, Frame, ImageArray, VisionTick
 from mavbridge.flight.feature_cache import FeatureCache
-from mavbridge.flight.vision_loop import VisionLoop
-from mavbridge.simulation.clock import AheadClock, SteppedClock
+from mavbridge.simulation.clock import SteppedClock
 from mavbridge.simulation.network import DelayedChannel
 from policy.contract import Contract
 from sitl.ardupilot.guided import OPTION_THRUST
@@ -175,7 +174,6 @@ class SimulatedCamera:
         self.arrival_watchers: list[Callable[[], None]] = []
         clock.schedule(clock.now_ns() + phase_ns, self._expose)
 
-    @property
     def has_frame(self) -> bool:
         """True if an unread frame has arrived."""
         return self._arrived is not None
@@ -192,7 +190,7 @@ class SimulatedCamera:
         self._clock.schedule(now_ns + self._period_ns, self._expose)
 
     def _arrive(self, exposure: Exposure) -> None:
-        self.dropped_frames += self.has_frame
+        self.dropped_frames += self.has_frame()
         if self._arrived is None or self._arrived.frame_id < exposure.frame_id:
             self._arrived = exposure
         for watch in self.arrival_watchers:
@@ -241,29 +239,3 @@ class DelayedSink:
         """Schedule a vision tick."""
         if isinstance(event, VisionTick):
             self._clock.schedule(event.ready_ns, lambda: self._sink.emit(event))
-
-
-class VisionStepper:
-    """Runs a step of the vision loop whenever the loop is idle and a frame has arrived."""
-
-    def __init__(
-        self, world: SteppedClock, clock: AheadClock, camera: SimulatedCamera, loop: VisionLoop
-    ) -> None:
-        self._world = world
-        self._clock = clock
-        self._camera = camera
-        self._loop = loop
-        self._is_busy = False
-        camera.arrival_watchers.append(self._run)
-
-    def _run(self) -> None:
-        while self._camera.has_frame and not self._is_busy:
-            self._loop.step()
-            busy_ns, self._clock.ahead_ns = self._clock.ahead_ns, 0
-            if busy_ns:
-                self._is_busy = True
-                self._world.schedule(self._world.now_ns() + busy_ns, self._end)
-
-    def _end(self) -> None:
-        self._is_busy = False
-        self._run()

@@ -31,7 +31,7 @@ from mavbridge.guard.wire import GuardMessage, GuardTick, LastWords, ToGuard, en
 from mavbridge.mavlink.link import MavlinkLink
 from mavbridge.mavlink.transport.sockets import Address, Received
 from mavbridge.simulation.clock import AheadClock, SteppedClock
-from mavbridge.simulation.guard import GuardStepper, MemoryPort, PolicyStepper
+from mavbridge.simulation.guard import GuardStepper, MemoryPort, flight_process
 from mavbridge.simulation.network import DelayedChannel
 from mavbridge.simulation.world import NOMINAL_VEHICLE
 from policy.contract import Contract, FloatArray
@@ -152,12 +152,12 @@ class GuardFlight:
         )
         self.view = bridge.view
         self.tell(plan.guard)
-        policy = PolicyStepper(
+        receive = flight_process(
             self.clock, self._policy_clock, self._port, bridge.policy, bridge.view
         )
         stepper = StoppableStepper(self.clock, self.guard)
         self.guard_stepper = stepper
-        to_flight.on_arrival = lambda: None if self.is_flight_process_stopped else policy.receive()
+        to_flight.on_arrival = lambda: None if self.is_flight_process_stopped else receive()
         to_guard.on_arrival = self.down.on_arrival = stepper.step
         self._wake = stepper.step
 

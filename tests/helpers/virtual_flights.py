@@ -18,10 +18,10 @@ from mavbridge.flight.bridge import CameraPath, build_bridge
 from mavbridge.flight.plan import plan_flight
 from mavbridge.guard.loop import GuardLoop
 from mavbridge.guard.values import EndRequest, Phase
-from mavbridge.simulation.clock import AheadClock, SteppedClock
-from mavbridge.simulation.guard import GuardStepper, MemoryPort, PolicyStepper, sender
+from mavbridge.simulation.clock import AheadClock, SteppedClock, Stepper
+from mavbridge.simulation.guard import GuardStepper, MemoryPort, flight_process, sender
 from mavbridge.simulation.network import DelayedChannel
-from mavbridge.simulation.world import DelayedFeatureCache, DelayedSink, VisionStepper
+from mavbridge.simulation.world import DelayedFeatureCache, DelayedSink
 from policy.contract import Contract
 from policy.protocol import PolicyRunner
 
@@ -55,12 +55,11 @@ class EventCamera:
             world.schedule(at_ns, lambda frame=frame: self._arrive(frame))
         self.change: Callable[[Frame], Frame] = lambda frame: frame
 
-    @property
     def has_frame(self) -> bool:
         return self._arrived is not None
 
     def _arrive(self, frame: Frame) -> None:
-        self.dropped_frames += self.has_frame
+        self.dropped_frames += self.has_frame()
         self._arrived = frame
         for watch in self.arrival_watchers:
             watch()
@@ -150,10 +149,11 @@ class VirtualFlight:
             delay_vision=lambda sink: DelayedSink(world, sink),
         )
         self.view = bridge.view
-        VisionStepper(world, self._vision_clock, self.camera, bridge.visions[0])  # type: ignore[arg-type]
-        policy = PolicyStepper(world, self._policy_clock, port, bridge.policy, bridge.view)
+        stepper = Stepper(world, self._vision_clock, self.camera.has_frame, bridge.visions[0].step)
+        self.camera.arrival_watchers.append(stepper.run)
+        receive = flight_process(world, self._policy_clock, port, bridge.policy, bridge.view)
         self._guard_stepper = GuardStepper(world, guard)
-        to_flight.on_arrival, to_guard.on_arrival = policy.receive, self._guard_stepper.step
+        to_flight.on_arrival, to_guard.on_arrival = receive, self._guard_stepper.step
         return guard
 
     def _encode(self, rgb: ImageArray) -> FloatArray:

@@ -1,6 +1,6 @@
 import pytest
 
-from mavbridge.simulation.clock import START_NS, AheadClock, SteppedClock
+from mavbridge.simulation.clock import START_NS, SteppedClock
 
 
 def test_events_run_at_their_time_in_order_of_scheduling() -> None:
@@ -14,20 +14,6 @@ def test_events_run_at_their_time_in_order_of_scheduling() -> None:
     assert clock.now_ns() == 15
     clock.sleep_until_ns(20)
     assert seen[-1] == ("late", 20)
-
-
-def test_an_event_may_plan_the_next_one_within_the_same_wait() -> None:
-    clock = SteppedClock(0)
-    seen: list[int] = []
-
-    def tick() -> None:
-        seen.append(clock.now_ns())
-        clock.schedule(clock.now_ns() + 10, tick)
-
-    clock.schedule(10, tick)
-    clock.sleep_until_ns(35)
-    assert seen == [10, 20, 30]
-    assert clock.next_event_ns == 40
 
 
 def test_time_never_goes_back() -> None:
@@ -53,12 +39,3 @@ def test_an_event_may_ask_for_a_time_that_has_passed() -> None:
     clock.schedule(5, lambda: seen.append(clock.now_ns()))
     clock.sleep_until_ns(5)
     assert seen == [5]
-
-
-def test_a_loop_that_works_as_an_event_is_ahead_of_the_world() -> None:
-    world = SteppedClock(100)
-    clock = AheadClock(world)
-    clock.ahead_ns += 30
-    assert (clock.now_ns(), world.now_ns()) == (130, 100)
-    clock.sleep_until_ns(150)
-    assert clock.ahead_ns == 50

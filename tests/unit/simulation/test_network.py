@@ -4,7 +4,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from mavbridge.simulation.clock import SteppedClock
-from mavbridge.simulation.network import VEHICLE, DelayedChannel, MemoryTransport
+from mavbridge.simulation.network import DelayedChannel, MemoryTransport
 
 
 def network(
@@ -16,25 +16,6 @@ def network(
 
     up, down = DelayedChannel(clock, draws()), DelayedChannel(clock, draws())
     return MemoryTransport(clock, to_vehicle=up, from_vehicle=down), up, down
-
-
-def test_a_datagram_arrives_whole_after_its_delay_with_its_own_stamp() -> None:
-    clock = SteppedClock(0)
-    transport, _, down = network(clock, 300)
-    down.send(b"hello")
-    clock.sleep_until_ns(299)
-    assert list(transport.drain()) == []
-    clock.sleep_until_ns(1000)
-    assert list(transport.drain()) == [(b"hello", 300, VEHICLE)]
-    assert list(transport.drain()) == []
-
-
-def test_what_is_sent_reaches_the_other_end() -> None:
-    clock = SteppedClock(0)
-    transport, up, _ = network(clock, 7)
-    assert transport.send(b"sticks")
-    clock.sleep_until_ns(7)
-    assert list(up.receive()) == [(7, b"sticks")]
 
 
 @given(st.lists(st.integers(0, 50), min_size=1, max_size=20))
