@@ -1,3 +1,4 @@
+import os
 import sys
 import threading
 from pathlib import Path
@@ -93,17 +94,36 @@ def test_shared_memory_carries_its_own_stamps_and_refuses_a_latency():
 
 
 @pytest.mark.skipif(not Path("/dev/shm").is_dir(), reason="needs /dev/shm")
-def test_shared_memory_that_never_appears_is_counted_down_and_refused():
-    lines = []
-    with pytest.raises(CameraError, match=r"within 3 s \(link.camera_timeout\): shm:mb-none"):
-        open_camera(
-            "shm:mb-none", image_size=224, clock=FakeClock(), timeout_s=3.0, report=lines.append
-        )
-    assert [line.partition(" (")[0] for line in lines] == [
-        "waiting for the camera: 2 s left",
-        "waiting for the camera: 1 s left",
-    ]
-    assert "python -m sitl --camera shm:mb-none" in lines[0]
+@pytest.mark.parametrize(("timeout_s", "left_s"), [(3.0, [2, 1]), (2.5, [2, 1]), (0.4, [])])
+def test_shared_memory_that_never_appears_is_counted_down_and_refused(timeout_s, left_s):
+    lines, clock = [], FakeClock()
+    camera = {"image_size": 224, "clock": clock, "timeout_s": timeout_s, "report": lines.append}
+    told = rf"within {timeout_s:g} s \(link.camera_timeout\): shm:mb-none"
+    with pytest.raises(CameraError, match=told):
+        open_camera("shm:mb-none", **camera)
+    assert clock.now_ns() == START_NS + round(timeout_s * NS_PER_S)
+    said = [line.partition(" (") for line in lines]
+    assert [line for line, _, _ in said] == [f"waiting for the camera: {s} s left" for s in left_s]
+    assert ["python -m sitl --camera shm:mb-none" in reason for _, _, reason in said] == [
+        second == 2 for second in left_s
+    ], "a reason is told once"
+
+
+@pytest.mark.skipif(not Path("/dev/shm").is_dir(), reason="needs /dev/shm")
+def test_a_segment_that_no_wait_can_mend_ends_the_wait(monkeypatch):
+    path, clock = Path("/dev/shm", f"mb-wrong-{os.getpid()}"), FakeClock()
+    reasons = []
+
+    def report(line):
+        reasons.append(line)
+        path.write_bytes(b"no frames")
+
+    try:
+        with pytest.raises(CameraError, match="wrong magic"):
+            open_camera(f"shm:{path.name}", image_size=224, clock=clock, report=report)
+    finally:
+        path.unlink()
+    assert len(reasons) == 1
 
 
 @pytest.mark.parametrize("spec", ["", "nowhere.mp4", "-1", "ftp://host/x", "camera", "."])

@@ -163,17 +163,6 @@ def test_takes_off_to_three_metres_and_stays(vehicle: Vehicle) -> None:
 
 
 @pytest.mark.parametrize("kind", KINDS)
-def test_flies_its_square_along_its_heading(kind: ActionKind) -> None:
-    policy, flown = fly("square", 32.0, Vehicle(kind, yaw_rad=0.7))
-    start_s = policy.program_start_s
-    assert start_s is not None
-    for leg, wanted in enumerate([(1.5, 0.0), (0.0, 1.5), (-1.5, 0.0), (0.0, -1.5)]):
-        end = at(flown, start_s + 4.0 * (leg + 1) - 0.1)
-        assert (end.forward_mps, end.right_mps) == pytest.approx(wanted, abs=0.35)
-    assert all(2.5 < v.up_m < 3.5 for v in flown[round(start_s / STEP_S) :])
-
-
-@pytest.mark.parametrize("kind", KINDS)
 def test_begun_in_the_air_it_stops_a_drift_and_keeps_its_altitude(kind: ActionKind) -> None:
     drifting = Vehicle(kind, up_m=9.0, north_mps=3.0, east_mps=-2.0, thrust=0.39)
     policy, flown = fly("hover", 10.0, drifting, starts_in_air=True)

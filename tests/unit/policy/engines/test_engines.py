@@ -13,7 +13,6 @@ from policy.engines.torch_eager import make_torch_runner
 from policy.errors import PolicyError, user_code
 from policy.nets.toge import Toge
 from policy.preprocess import image_to_input
-from policy.scripted import ScriptedPolicy
 
 RGB = np.random.default_rng(0).integers(0, 255, (120, 160, 3), dtype=np.uint8)
 STATE = np.eye(1, 13, 3, dtype=np.float32)
@@ -36,17 +35,6 @@ def test_dual_rate_torch_matches_the_net_called_directly(small_toge: Toge) -> No
         expected = small_toge.predict(image, torch.tensor(STATE), torch.tensor(HISTORY), 3)
     assert feature.dtype == chunk.dtype == np.float32
     np.testing.assert_array_equal(chunk, expected.numpy())
-
-
-def test_numpy_policies_are_called_as_they_are() -> None:
-    policy = ScriptedPolicy("hover", lambda: 0.0)
-    runner = make_numpy_runner(policy, ExecutionSettings(name="scripted"))
-    encoded = runner.encode(RGB)
-    assert (runner.engine, encoded.shape) == ("numpy", (1, 8))
-    chunk = runner.act(encoded, STATE, HISTORY)
-    np.testing.assert_array_equal(
-        chunk, policy.predict_fast(np.zeros((1, 8), np.float32), STATE, HISTORY, 10)
-    )
 
 
 class Fake:
