@@ -1,61 +1,71 @@
-"""Single-threaded writer of a flight's folder: ticks, frames and meta."""
+"""Single-threaded writer of a flight's folder: tables, videos and meta."""
 
 from dataclasses import replace
 from pathlib import Path
 
-from mavbridge.core.records import Tick, VisionTick
-from mavbridge.recording import rows
-from mavbridge.recording.folder import TICKS, TLOG, frames_of, video_of
+import pyarrow as pa
+
+from mavbridge.core.observers import BoundedQueue
+from mavbridge.core.records import Solve, Tick, VisionTick
+from mavbridge.core.vehicle import ForwardedPacket
+from mavbridge.recording import replay_tables, rows
+from mavbridge.recording.folder import (
+    PACKETS,
+    SOLVES,
+    TICKS,
+    TLOG,
+    features_of,
+    frames_of,
+    video_of,
+)
 from mavbridge.recording.meta import FlightMeta, write_meta
-from mavbridge.recording.rows import FrameRow, FrameTruth, TickLabels, TickRow, ticks_batch
-from mavbridge.recording.tables import TableWriter
+from mavbridge.recording.rows import FrameRow, FrameTruth, TickLabels, TickRow, tick_columns
+from mavbridge.recording.tables import FLUSH_NS, TableWriter
 from mavbridge.recording.tlog import TlogJob, TlogPipe
 from mavbridge.recording.video.writer import Pressure, VideoWriter, WriterDiedError, WriterError
+
+PACKET_CAPACITY = 60_000
+"""Capacity of the queue of packet stamps: one minute of the busiest link."""
+
+
+class SerialNumbers:
+    """Consecutive numbers, some of which are missing."""
+
+    def __init__(self, first: int = 0) -> None:
+        self.next = first
+        self.dropped = 0
+
+    def take(self, serial: int) -> int:
+        """Return how many numbers were skipped before this one."""
+        skipped, self.next = serial - self.next, serial + 1
+        self.dropped += skipped
+        return skipped
 
 
 class CameraFiles:
     """Frames of one camera, written by a separate process, whose death loses only these."""
 
-    def __init__(
-        self,
-        folder: Path,
-        camera: str | None,
-        *,
-        pressure: Pressure,
-        hz: float,
-        with_truth: bool = False,
-        tlog: TlogJob | None = None,
-    ) -> None:
-        """Start the process. ``camera`` is the camera's name, or None for the first one."""
+    def __init__(self, video: VideoWriter) -> None:
+        self._video = video
+        self._serials = SerialNumbers()
         self.failure: WriterDiedError | None = None
         """Why no more frames are recorded."""
         self.source_size: tuple[int, int] | None = None
         """Height and width of the incoming frames; None before the first."""
-        self._serial = -1
-        self._video = VideoWriter(
-            folder / video_of(camera),
-            pressure=pressure,
-            hz=hz,
-            rows=folder / frames_of(camera),
-            with_truth=with_truth,
-            tlog=tlog,
-        )
 
     def write(self, vision: VisionTick, truth: FrameTruth | None) -> None:
         """Record a frame. Skipped serial numbers count as dropped."""
-        dropped = vision.serial - self._serial - 1
-        self._serial = vision.serial
-        if self.failure is not None:
-            return
-        if self.source_size is None:
-            self.source_size = (vision.rgb.shape[0], vision.rgb.shape[1])
         row = FrameRow(
             frame_id=vision.frame_id,
             captured_ns=vision.captured_ns,
             ready_ns=vision.ready_ns,
-            dropped_before=dropped,
+            dropped_before=self._serials.take(vision.serial),
             truth=truth,
         )
+        if self.failure is not None:
+            return
+        if self.source_size is None:
+            self.source_size = (vision.rgb.shape[0], vision.rgb.shape[1])
         try:
             self._video.submit(vision.rgb, row)
         except WriterDiedError as error:
@@ -69,7 +79,7 @@ class CameraFiles:
     @property
     def dropped(self) -> int:
         """Number of frames missing from the video, up to the newest one."""
-        return self._serial + 1 - self._video.written
+        return self._serials.next - self.written
 
     @property
     def size(self) -> tuple[int, int] | None:
@@ -90,11 +100,6 @@ class CameraFiles:
         self._video.close()
 
 
-FLUSH_NS = 500_000_000
-"""Longest span of events that a crash can lose."""
-FLUSH_ROWS = 256
-
-
 class FlightWriter:
     """Writer used during the flight; ``finish`` closes the files in order.
 
@@ -109,6 +114,7 @@ class FlightWriter:
         *,
         pressure: Pressure,
         with_labels: bool = False,
+        with_replay: bool = False,
         tlog_pipe: TlogPipe | None = None,
     ) -> None:
         """Create the files in a folder from ``prepare_folder``, and start the writer process.
@@ -118,56 +124,77 @@ class FlightWriter:
             meta: the facts known at the start.
             pressure: "offline" waits and drops nothing; see ``VideoWriter``.
             with_labels: the tables have the columns of ``TickLabels`` and ``FrameTruth``.
+            with_replay: the folder also has the tables for a replay.
             tlog_pipe: its reader becomes ``link.tlog`` and is closed here; None: no such file.
         """
         self._folder = folder
         self.meta = meta
-        self._schema = rows.DEMONSTRATION_TICKS if with_labels else rows.TICKS
-        self._rows: list[TickRow] = []
         self._flushed_ns = meta.start_ns
-        self._tick_serial = -1
-        self._ticks_dropped = 0
-        names = (None,) if meta.contract is None else (None, *meta.contract.cameras[1:])
-        job = None if tlog_pipe is None else TlogJob(folder / TLOG, tlog_pipe.reader)
+        self._serials, self._solve_serials = SerialNumbers(), SerialNumbers(first=1)
+        self._tables: list[TableWriter] = []
         self.cameras: list[CameraFiles] = []
         """Cameras in the contract's order."""
+        self.packets: BoundedQueue[tuple[ForwardedPacket, ...]] = BoundedQueue(PACKET_CAPACITY)
+        """Groups of packets in order of arrival; filled by another thread."""
+        self._packets_lost = 0
+        names = (None,) if meta.contract is None else (None, *meta.contract.cameras[1:])
+        job = None if tlog_pipe is None else TlogJob(folder / TLOG, tlog_pipe.reader)
         try:
             for camera in names:
-                self.cameras.append(
-                    CameraFiles(
-                        folder,
-                        camera,
-                        pressure=pressure,
-                        hz=meta.visual_hz,
-                        with_truth=with_labels,
-                        tlog=job if camera is None else None,
-                    )
+                video = VideoWriter(
+                    folder / video_of(camera),
+                    pressure=pressure,
+                    hz=meta.visual_hz,
+                    rows=folder / frames_of(camera),
+                    with_truth=with_labels,
+                    tlog=job if camera is None else None,
                 )
+                self.cameras.append(CameraFiles(video))
             write_meta(folder, meta)
-            self._table = TableWriter(folder / TICKS, self._schema)
-            # Import the modules of the first conversion now, not in flight.
-            self._table.append(ticks_batch([], self._schema))
+            self._ticks = self._table(
+                TICKS, rows.DEMONSTRATION_TICKS if with_labels else rows.TICKS
+            )
+            self._solves = self._table(SOLVES, replay_tables.SOLVES) if with_replay else None
+            self._packets = self._table(PACKETS, replay_tables.PACKETS) if with_replay else None
+            has_features = with_replay and meta.mode == "dual"  # else only resized images
+            self._features = [
+                (self._table(features_of(camera), replay_tables.FEATURES), SerialNumbers())
+                for camera in (names if has_features else ())
+            ]
         except (OSError, WriterError):
-            self._close_cameras()
+            self.close()
             raise
+
+    def _table(self, stem: str, schema: pa.Schema) -> TableWriter:
+        table = TableWriter(self._folder / stem, schema)
+        self._tables.append(table)
+        return table
 
     def tick(self, tick: Tick, labels: TickLabels | None = None) -> None:
         """Record a tick. Skipped serial numbers count as dropped."""
-        dropped = tick.serial - self._tick_serial - 1
-        self._tick_serial = tick.serial
-        self._ticks_dropped += dropped
-        self._rows.append(TickRow(tick, dropped, labels))
-        if len(self._rows) >= FLUSH_ROWS:
-            self._flush()
+        self._ticks.add(tick_columns(TickRow(tick, self._serials.take(tick.serial), labels)))
         self._flush_if_due(tick.woke_ns)
 
     def frame(self, vision: VisionTick, truth: FrameTruth | None = None) -> None:
-        """Record a frame of any camera. Skipped serial numbers count as dropped.
+        """Record a frame of any camera, and its feature. Skipped serial numbers count as dropped.
 
         If a writer process dies, only its frames are lost: see ``video_failure``.
         """
+        if self._features and vision.feature is not None:
+            table, serials = self._features[vision.camera]
+            table.add(
+                replay_tables.feature_columns(vision, vision.feature, serials.take(vision.serial))
+            )
         self._flush_if_due(vision.ready_ns)
         self.cameras[vision.camera].write(vision, truth)
+
+    def solve(self, solve: Solve) -> None:
+        """Record a solve for a replay. Skipped serial numbers count as dropped."""
+        if self._solves is not None:
+            self._solves.add(
+                replay_tables.solve_columns(solve, self._solve_serials.take(solve.serial))
+            )
+            self._flush_if_due(solve.computed_ns)
 
     @property
     def video_failure(self) -> WriterDiedError | None:
@@ -178,13 +205,16 @@ class FlightWriter:
     def _flush_if_due(self, now_ns: int) -> None:
         if now_ns - self._flushed_ns >= FLUSH_NS:
             self._flushed_ns = now_ns
-            self._flush()
+            self.flush()
 
-    def _flush(self) -> None:
-        if self._rows:
-            # Clear first, so that rows that could not be written are not retried.
-            waiting, self._rows = self._rows, []
-            self._table.append(ticks_batch(waiting, self._schema))
+    def flush(self) -> None:
+        """Hand all rows to the kernel."""
+        if self._packets is not None:
+            for packet in (packet for group in self.packets.take() for packet in group):
+                lost, self._packets_lost = self._packets_lost, self.packets.dropped
+                self._packets.add(replay_tables.packet_columns(packet, self._packets_lost - lost))
+        for table in self._tables:
+            table.flush()
 
     @property
     def frames_written(self) -> int:
@@ -194,7 +224,7 @@ class FlightWriter:
     @property
     def ticks(self) -> int:
         """Number of rows so far."""
-        return self._table.rows + len(self._rows)
+        return self._ticks.rows
 
     def finish(self, meta: FlightMeta) -> None:
         """Close everything in order, and complete ``meta`` with the counts kept here.
@@ -202,8 +232,9 @@ class FlightWriter:
         If a writer has died, its table stays as it was and ``finished`` stays false.
         """
         try:
-            self._flush()
-            self._table.finish()
+            self.flush()
+            for table in self._tables:
+                table.finish()
             for files in self.cameras:
                 files.finish()
         except BaseException:
@@ -220,18 +251,16 @@ class FlightWriter:
             source_height=source_height,
             source_width=source_width,
             finished=is_whole,
-            ticks=self._table.rows,
+            ticks=self._ticks.rows,
             frames=first.written if is_whole else None,
-            ticks_dropped=self._ticks_dropped,
+            ticks_dropped=self._serials.dropped,
             frames_dropped=first.dropped,
         )
         write_meta(self._folder, self.meta)
 
     def close(self) -> None:
         """Leave everything as it is, after an error. Can be called twice."""
-        self._close_cameras()
-        self._table.abandon()
-
-    def _close_cameras(self) -> None:
         for files in self.cameras:
             files.close()
+        for table in self._tables:
+            table.abandon()

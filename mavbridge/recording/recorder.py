@@ -9,12 +9,11 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 from mavbridge.core.observers import ObserverThread
-from mavbridge.core.records import Observed, Solve, Tick, VisionTick
+from mavbridge.core.records import Observed, Tick, VisionTick
 from mavbridge.core.vehicle import ForwardedPacket
 from mavbridge.recording.crash import CrashWatch
-from mavbridge.recording.flight_writer import FLUSH_NS, FlightWriter
+from mavbridge.recording.flight_writer import FlightWriter
 from mavbridge.recording.meta import FlightMeta
-from mavbridge.recording.replay_tables import ReplayTables
 from mavbridge.recording.settings import ReplaySettings, write_settings
 from mavbridge.recording.tlog import TlogPipe
 
@@ -52,16 +51,16 @@ class Recorder:
             OSError, WriterError: the folder is not writable, or the writer process fails.
         """
         self._folder = folder
-        writer = FlightWriter(folder, meta, pressure="online", tlog_pipe=tlog_pipe)
-        cameras = ("front",) if meta.contract is None else meta.contract.cameras
-        try:
-            self._tables = ReplayTables(folder, cameras, has_features=meta.mode == "dual")
-            if settings is not None:
+        writer = FlightWriter(
+            folder, meta, pressure="online", with_replay=True, tlog_pipe=tlog_pipe
+        )
+        if settings is not None:
+            try:
                 write_settings(folder, settings)
-        except OSError:
-            writer.close()
-            raise
-        self._consumer = _FlightConsumer(writer, self._tables, packets_dropped, autopilot, report)
+            except OSError:
+                writer.close()
+                raise
+        self._consumer = _FlightConsumer(writer, packets_dropped, autopilot, report)
         self._packets_dropped = packets_dropped
         self._observer = ObserverThread(
             "mavbridge-recorder",
@@ -77,7 +76,7 @@ class Recorder:
 
     def watch_packets(self, packets: tuple[ForwardedPacket, ...]) -> None:
         """Queue the stamps of received packets, or drop and count them. For one thread only."""
-        self._tables.packets.put(packets)
+        self._consumer.writer.packets.put(packets)
 
     def close(self, timeout_s: float) -> None:
         """Finish the recording within ``timeout_s``. Call once the link is closed.
@@ -89,8 +88,8 @@ class Recorder:
     @property
     def dropped(self) -> int:
         """Number of ticks, frames and packets missing from the recording; exact after ``close``."""
-        lost = self._consumer.frames_lost + self._packets_dropped() + self._tables.packets.dropped
-        return self._observer.dropped + lost
+        packets = self._packets_dropped() + self._consumer.writer.packets.dropped
+        return self._observer.dropped + self._consumer.frames_lost + packets
 
     @property
     def crash(self) -> str | None:
@@ -118,14 +117,12 @@ class _FlightConsumer:
     """Consumer on the recorder's thread; can raise OSError and WriterError."""
 
     writer: FlightWriter
-    tables: ReplayTables
     packets_dropped: Callable[[], int]
     autopilot: Callable[[], str]
     report: Callable[[str], None]
     crash_watch: CrashWatch = field(default_factory=CrashWatch)
     _seen_frames: int = 0
     _has_failed: bool = False
-    _flushed_ns: int = 0
 
     @property
     def frames_lost(self) -> int:
@@ -141,21 +138,13 @@ class _FlightConsumer:
                     self.crash_watch.see(event)
                     self.writer.tick(event)
                 elif isinstance(event, VisionTick):
-                    self.tables.feature(event)
                     self._write_frame(event)
                 else:
-                    self.tables.solve(event)
-            self._flush_if_due(batch[-1])
+                    self.writer.solve(event)
         except BaseException:
             self._has_failed = True
             self._seen_frames = seen_frames  # the observer counts the whole batch as lost
             raise
-
-    def _flush_if_due(self, newest: Observed) -> None:
-        now_ns = newest.woke_ns if isinstance(newest, Tick) else _ready_ns(newest)
-        if now_ns - self._flushed_ns >= FLUSH_NS:
-            self._flushed_ns = now_ns
-            self.tables.flush()
 
     def _write_frame(self, vision: VisionTick) -> None:
         self._seen_frames += 1
@@ -169,9 +158,7 @@ class _FlightConsumer:
         """Finish in order; after an error, leave the files as they are."""
         if self._has_failed:
             self.writer.close()
-            self.tables.abandon()
             return
-        self.tables.finish()
         crash = self.crash_watch.reason
         self.writer.finish(
             replace(
@@ -182,7 +169,3 @@ class _FlightConsumer:
                 crash=crash,
             )
         )
-
-
-def _ready_ns(event: VisionTick | Solve) -> int:
-    return event.ready_ns if isinstance(event, VisionTick) else event.computed_ns

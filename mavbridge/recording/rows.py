@@ -5,7 +5,7 @@ value is null.
 """
 
 import json
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, fields
 from typing import Any, NamedTuple, TypeAlias
 
@@ -16,6 +16,7 @@ from mavbridge.core.reasons import Reason, reason_from_json, reason_to_json
 from mavbridge.core.records import Position, Tick, VehicleState
 from mavbridge.core.vehicle import ACTION_CLASSES, Action, ActionKind, ActionTrace, Sticks
 from mavbridge.recording.meta import FlightError
+from mavbridge.recording.tables import Row
 from policy.contract import ACTION_DIM, STATE_DIM
 
 Vector: TypeAlias = tuple[float, float, float]
@@ -69,7 +70,7 @@ class TickRow(NamedTuple):
 
 _STICKS = pa.list_(pa.float32(), ACTION_DIM)
 _VECTOR = pa.list_(pa.float32(), 3)
-_STAMPS = ("attitude_ns", "rate_ns", "velocity_ns", "specific_force_ns")
+STATE_STAMPS = ("attitude_ns", "rate_ns", "velocity_ns", "specific_force_ns")
 _TRACE = ("raw", "clipped", "slewed", "smoothed")
 _TRUTH = tuple(field.name for field in fields(FrameTruth))
 
@@ -84,7 +85,7 @@ TICKS = pa.schema(
         pa.field("missed_slots", pa.int32(), nullable=False),
         *_fields(pa.int64(), "predict_ns", "feature_frame_id", "feature_captured_ns"),
         pa.field("state", pa.list_(pa.float32(), STATE_DIM)),
-        *_fields(pa.int64(), *_STAMPS),
+        *_fields(pa.int64(), *STATE_STAMPS),
         *_fields(_STICKS, *_TRACE, "sent", "rc_sticks"),
         pa.field("rc_channels_us", pa.list_(pa.uint16()), nullable=False),
         *_fields(pa.string(), "release_reason", "release_code", "release_data", "mode"),
@@ -125,24 +126,21 @@ _TICK = tuple(
 _ROWS_AT_ONCE = 4096
 
 
-def ticks_batch(rows: Sequence[TickRow], schema: pa.Schema) -> pa.RecordBatch:
-    """Convert consecutive ticks to rows; with ``DEMONSTRATION_TICKS``, labels included."""
-    columns = [
-        {
-            **_attributes(row.tick, _TICK),
-            **_reason_columns(row.tick.release_reason),
-            **_attributes(row.tick.state, _STAMPS),
-            **_attributes(row.tick.trace, _TRACE),
-            **_attributes(row.labels, ("expert",)),
-            "state": row.tick.state and row.tick.state.values.tolist(),
-            "dropped_before": row.dropped_before,
-        }
-        for row in rows
-    ]
-    return pa.RecordBatch.from_pylist(columns, schema=schema)
+def tick_columns(row: TickRow) -> Row:
+    """Convert a tick to a row; the labels have columns in ``DEMONSTRATION_TICKS`` only."""
+    tick = row.tick
+    return {
+        **attributes(tick, _TICK),
+        **_reason_columns(tick.release_reason),
+        **attributes(tick.state, STATE_STAMPS),
+        **attributes(tick.trace, _TRACE),
+        **attributes(row.labels, ("expert",)),
+        "state": None if tick.state is None else tick.state.values,
+        "dropped_before": row.dropped_before,
+    }
 
 
-def _reason_columns(reason: Reason | None) -> dict[str, object]:
+def _reason_columns(reason: Reason | None) -> Row:
     """Return a reason's columns: the sentence for people, the code and the figures for programs."""
     if reason is None:
         return {}
@@ -154,15 +152,13 @@ def _reason_columns(reason: Reason | None) -> dict[str, object]:
     }
 
 
-def frames_batch(rows: Sequence[FrameRow], schema: pa.Schema) -> pa.RecordBatch:
-    """Convert consecutive frames to rows; with ``DEMONSTRATION_FRAMES``, the truth included."""
-    return pa.RecordBatch.from_pylist(
-        [_attributes(row, tuple(FRAMES.names)) | _attributes(row.truth, _TRUTH) for row in rows],
-        schema=schema,
-    )
+def frame_columns(row: FrameRow) -> Row:
+    """Convert a frame to a row; the truth has columns in ``DEMONSTRATION_FRAMES`` only."""
+    return attributes(row, FRAMES.names) | attributes(row.truth, _TRUTH)
 
 
-def _attributes(source: object | None, names: Iterable[str]) -> dict[str, object]:
+def attributes(source: object | None, names: Iterable[str]) -> Row:
+    """Return the columns that hold attributes unchanged; none if there is no source."""
     return {} if source is None else {name: getattr(source, name) for name in names}
 
 
@@ -201,14 +197,15 @@ def _tick(row: dict[str, Any], serial: int, make: type[Action]) -> Tick:
     values = {name: row[name] for name in _TICK}
     values |= {name: tuple(row[name]) for name in ("rc_channels_us", "texts")}
     values |= {"release_reason": read_reason(row["release_code"], row["release_data"])}
-    values |= {"sent": row["sent"] and make(*row["sent"]), "rc_sticks": _sticks(row["rc_sticks"])}
+    values["sent"] = row["sent"] and make(*row["sent"])
+    values["rc_sticks"] = row["rc_sticks"] and Sticks(*row["rc_sticks"])
     if row["position_ned_m"] is not None:
         values["position_ned_m"] = Position(*row["position_ned_m"])
     state, trace = None, None
     if row["state"] is not None:
         array = np.array(row["state"], np.float32)
         array.setflags(write=False)
-        state = VehicleState(values=array, **{name: row[name] for name in _STAMPS})
+        state = VehicleState(values=array, **{name: row[name] for name in STATE_STAMPS})
     if row["raw"] is not None:
         trace = ActionTrace(**{name: make(*row[name]) for name in _TRACE})
     return Tick(**values | {"serial": serial, "state": state, "trace": trace})
@@ -226,7 +223,3 @@ def read_reason(code: str | None, data: str) -> Reason | None:
         raise FlightError(
             f"no reason {code!r} with {data} is known here: use the mavbridge that recorded it"
         ) from error
-
-
-def _sticks(values: list[float] | None) -> Sticks | None:
-    return None if values is None else Sticks(*values)

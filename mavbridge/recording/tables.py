@@ -2,7 +2,7 @@
 
 from collections.abc import Iterator
 from pathlib import Path
-from typing import IO, Any
+from typing import IO, Any, TypeAlias
 
 import numpy as np
 import pyarrow as pa
@@ -14,6 +14,10 @@ from policy.data.flight_data import DatasetError
 from policy.data.tables import read_rows
 from policy.files import library_name
 
+Row: TypeAlias = dict[str, object]
+"""Values by column."""
+FLUSH_NS = 500_000_000
+"""Longest span of events that a crash can lose."""
 READ_ERRORS = (pa.ArrowException, OSError)
 _GROUP_ROWS = 2_048
 """Rows per Parquet row group: twenty seconds of ticks. Encoding 16,384 rows at once took 27 MB."""
@@ -24,7 +28,7 @@ class TableError(MavbridgeError):
 
 
 class TableWriter:
-    """Appends batches to ``STEM.arrows``; ``finish`` converts it to ``STEM.parquet``.
+    """Appends rows to ``STEM.arrows``; ``finish`` converts it to ``STEM.parquet``.
 
     Methods raise OSError if a file cannot be written; everything written before stays readable.
     """
@@ -33,18 +37,31 @@ class TableWriter:
         """Create the stream. ``stem`` is a path without a suffix; no stream may exist there."""
         self._stream = stem.with_suffix(".arrows")
         self._parquet = stem.with_suffix(".parquet")
+        self._schema = schema
         self._stream.open("xb").close()
         self._sink = pa.OSFile(str(self._stream), "wb")  # unbuffered
         self._writer = pa.ipc.new_stream(self._sink, schema)
+        self._waiting: list[Row] = []
         self.rows = 0
+        self._write([])  # imports the modules of the first conversion now, not in flight
 
-    def append(self, batch: pa.RecordBatch) -> None:
-        """Hand a batch to the kernel."""
-        self._writer.write_batch(batch)
-        self.rows += batch.num_rows
+    def add(self, row: Row) -> None:
+        """Keep a row for ``flush``. Keys without a column are ignored; a missing one is null."""
+        self._waiting.append(row)
+        self.rows += 1
+
+    def flush(self) -> None:
+        """Hand all rows to the kernel. Rows that cannot be written are not retried."""
+        if self._waiting:
+            waiting, self._waiting = self._waiting, []
+            self._write(waiting)
+
+    def _write(self, rows: list[Row]) -> None:
+        self._writer.write_batch(pa.RecordBatch.from_pylist(rows, schema=self._schema))
 
     def finish(self) -> None:
         """Close the stream and replace it by Parquet; if the disk is full, keep the stream."""
+        self.flush()
         self._writer.close()
         self._sink.close()
         to_parquet(self._stream, self._parquet)

@@ -146,6 +146,6 @@ def write_recording(
         if finish:
             writer.finish(writer.meta)
         else:
-            writer._flush()
+            writer.flush()
             writer.close()
     return folder

@@ -26,9 +26,9 @@ from mavbridge.commands.imagine.output import (
     SCHEMA,
     OnFrame,
     StreamedOutput,
+    add_rows,
     captured_ns,
     ignore_frame,
-    rows_batch,
     writing,
 )
 from mavbridge.core.clock import NS_PER_S, MonotonicClock
@@ -77,7 +77,7 @@ class SerialOutput(StreamedOutput):
         with self._sampler.meter.write, writing(self.out):
             table = TableWriter(self.out, SCHEMA)
             try:
-                table.append(rows_batch([frame for frame, _ in self._collected]))
+                add_rows(table, [frame for frame, _ in self._collected])
                 if self._decode_video:
                     size, hz = self._sampler.config.image_size, 1 / self._frame_dt_s
                     with closing(FragmentedMp4(self.out, height=size, width=size, hz=hz)) as video:

@@ -96,10 +96,11 @@ def writing(path: Path) -> Iterator[None]:
         raise RolloutError(f"{path} cannot be written: {reason}") from error
 
 
-def rows_batch(frames: Sequence[RolloutFrame]) -> pa.RecordBatch:
-    """Convert frames to rows of the table."""
-    rows = [{name: getattr(frame, name) for name in SCHEMA.names} for frame in frames]
-    return pa.RecordBatch.from_pylist(rows, schema=SCHEMA)
+def add_rows(table: TableWriter, frames: Sequence[RolloutFrame]) -> None:
+    """Write a row for each frame."""
+    for frame in frames:
+        table.add({name: getattr(frame, name) for name in SCHEMA.names})
+    table.flush()
 
 
 def captured_ns(frame: RolloutFrame) -> int:
@@ -320,7 +321,7 @@ class StreamedOutput:
     def _write(self, job: _DecodeJob, stop: Event) -> None:
         # Rows first: after a crash, rows without a frame are possible, but no frame without a row.
         with writing(self._table_path):
-            self._table.append(rows_batch(job.frames))
+            add_rows(self._table, job.frames)
         images: Iterator[ImageArray] = iter(())
         if job.missing is not None:
             images = self._decoder.frames(job.missing, job.ready)

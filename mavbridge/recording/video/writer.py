@@ -45,20 +45,36 @@ class WriterDiedError(WriterError):
     """The writer process has died or hangs."""
 
 
-class FrameSender:
-    """Sends frames through the ring and receives the writer's messages. Used by one thread.
+class VideoWriter:
+    """One video, written by a separate process. Used by one thread.
 
-    Methods raise ``WriterError`` if the writer has failed or died.
+    Methods raise ``WriterError`` if the process has failed or died. If the producer is killed, the
+    process notices and finishes the video. It outlives ``finish`` if the link's log has not ended
+    by then, and waits for that by itself.
     """
 
     def __init__(
-        self, pipe: "Connection[ToWriter, FromWriter]", process: BaseProcess, pressure: Pressure
+        self,
+        video: Path,
+        *,
+        pressure: Pressure,
+        hz: float,
+        rows: Path | None = None,
+        with_truth: bool = False,
+        tlog: TlogJob | None = None,
     ) -> None:
-        self._pipe = pipe
-        self._process = process
+        """Start the process and wait until it runs.
+
+        Args:
+            video: MP4 file to make; must not exist.
+            pressure: behaviour with a full ring. Online, the process yields the CPU to all others.
+            hz: nominal frame rate.
+            rows: path and stem of a table of frames to write, or None.
+            with_truth: the table has the columns of ``FrameTruth``.
+            tlog: log of the link to write beside the video; its pipe is closed here.
+        """
         self._pressure: Pressure = pressure
-        self._resources = ExitStack()
-        self._resources.callback(pipe.close)
+        self._tlog = tlog
         self._ring: FrameRing | None = None
         self._free: deque[int] = deque()
         self._failure: WriterError | None = None
@@ -67,6 +83,17 @@ class FrameSender:
         self._offered = 0
         self.written = 0
         """Number of frames known to be in the file."""
+        job = VideoJob(video=video, hz=hz, rows=rows, with_truth=with_truth)
+        self._pipe, self._process = start_process(job, pressure, tlog)
+        self._resources = ExitStack()
+        self._resources.callback(self._pipe.close)
+        # A producer that ends without ``close`` must not wait for its writer.
+        weakref.finalize(self, self._resources.close)
+        try:
+            self._wait_until(lambda: Notice.READY in self._notices, START_S)
+        except WriterError:
+            self.close()
+            raise
 
     @property
     def size(self) -> tuple[int, int] | None:
@@ -92,7 +119,7 @@ class FrameSender:
             True if it was taken.
         """
         self._offered += 1
-        self.receive()
+        self._receive()
         height, width = rgb.shape[:2]
         rgb = rgb[: height // 2 * 2, : width // 2 * 2]
         ring = self._ring or self._open(rgb)
@@ -126,30 +153,34 @@ class FrameSender:
         return ring
 
     def finish(self) -> None:
-        """Wait until every frame is on disk and the files are closed."""
-        self._send(Notice.FINISH)
-        self._wait_until(lambda: Notice.DONE in self._notices)
+        """Wait until every frame is on disk and the files are closed, and end the process."""
+        try:
+            self._send(Notice.FINISH)
+            self._wait_until(lambda: Notice.DONE in self._notices)
+        finally:
+            self.close()
 
     def _send(self, message: ToWriter) -> None:
         """Send a message. Never blocks: no more messages are in flight than there are slots."""
         try:
             self._pipe.send(message)
         except OSError:  # it has ended; its last message or exit status gives the reason
-            self.receive()
+            self._receive()
             raise self._died() from None
 
     def _wait_until(self, condition: Callable[[], bool], timeout_s: float = STALL_S) -> None:
         """Receive until the condition holds; a writer silent for ``timeout_s`` counts as hung."""
+        self._receive()
         while not condition():
             if not wait([self._pipe, self._process.sentinel], timeout_s):
                 self._failure = WriterDiedError(f"the writer process has hung for {timeout_s:g} s")
-            self.receive()
+            self._receive()
             if self._process.exitcode is not None and not condition():
-                self.receive()  # messages sent between the two checks
+                self._receive()  # messages sent between the two checks
                 if not condition():
                     raise self._died()
 
-    def receive(self) -> None:
+    def _receive(self) -> None:
         """Process the messages that have arrived."""
         try:
             while not self._failure and Notice.DONE not in self._notices and self._pipe.poll():
@@ -176,73 +207,8 @@ class FrameSender:
         return self._failure
 
     def close(self) -> None:
-        """Free the memory and the pipe. Can be called twice."""
-        self._resources.close()
-
-
-class VideoWriter(FrameSender):
-    """One video, written by a separate process. Used by one thread.
-
-    If the producer is killed, the writer notices and finishes the video. The process outlives
-    ``finish`` if the link's log has not ended by then; it waits for that by itself.
-    """
-
-    def __init__(
-        self,
-        video: Path,
-        *,
-        pressure: Pressure,
-        hz: float,
-        rows: Path | None = None,
-        with_truth: bool = False,
-        tlog: TlogJob | None = None,
-    ) -> None:
-        """Start the process and wait until it runs.
-
-        Args:
-            video: MP4 file to make; must not exist.
-            pressure: behaviour with a full ring. Online, the process yields the CPU to all others.
-            hz: nominal frame rate.
-            rows: path and stem of a table of frames to write, or None.
-            with_truth: the table has the columns of ``FrameTruth``.
-            tlog: log of the link to write beside the video; its pipe is closed here.
-        """
-        self._tlog = tlog
-        job = VideoJob(video=video, hz=hz, rows=rows, with_truth=with_truth)
-        # Not fork: this process has running threads and an engine.
-        context = multiprocessing.get_context("spawn")
-        pipe, its_pipe = context.Pipe()
-        process = context.Process(
-            target=run_writer,
-            args=(its_pipe, job, NICENESS if pressure == "online" else 0, tlog),
-            name="mavbridge-writer",
-            daemon=True,
-        )
-        try:
-            process.start()
-        finally:
-            its_pipe.close()  # an open copy here would keep the pipe open after the writer dies
-            if tlog is not None:
-                tlog.records.close()
-        super().__init__(pipe, process, pressure)
-        # A producer that ends without ``close`` must not wait for its writer.
-        weakref.finalize(self, self._resources.close)
-        try:
-            self._wait_until(lambda: Notice.READY in self._notices, START_S)
-        except WriterError:
-            self.close()
-            raise
-
-    def finish(self) -> None:
-        """Wait until every frame is on disk and the files are closed, and end the process."""
-        try:
-            super().finish()
-        finally:
-            self.close()
-
-    def close(self) -> None:
         """End the process; frames submitted but not written can be lost. Can be called twice."""
-        super().close()
+        self._resources.close()
         self._process.join(END_S)
         is_keeping_log = self._tlog is not None and Notice.DONE in self._notices
         if self._process.is_alive() and not is_keeping_log:
@@ -253,3 +219,24 @@ class VideoWriter(FrameSender):
     def pid(self) -> int | None:
         """Process id of the writer."""
         return self._process.pid
+
+
+def start_process(
+    job: VideoJob, pressure: Pressure, tlog: TlogJob | None
+) -> "tuple[Connection[ToWriter, FromWriter], BaseProcess]":
+    """Start the writer's process; return the pipe to it and the process."""
+    context = multiprocessing.get_context("spawn")  # not fork: this process has running threads
+    pipe, its_pipe = context.Pipe()
+    process = context.Process(
+        target=run_writer,
+        args=(its_pipe, job, NICENESS if pressure == "online" else 0, tlog),
+        name="mavbridge-writer",
+        daemon=True,
+    )
+    try:
+        process.start()
+    finally:
+        its_pipe.close()  # an open copy here would keep the pipe open after the writer dies
+        if tlog is not None:
+            tlog.records.close()
+    return pipe, process

@@ -15,16 +15,13 @@ from pathlib import Path
 from typing import NamedTuple, TypeAlias
 
 from mavbridge.core.records import CameraImage
-from mavbridge.recording.rows import DEMONSTRATION_FRAMES, FRAMES, FrameRow, frames_batch
-from mavbridge.recording.tables import READ_ERRORS, TableWriter
+from mavbridge.recording.rows import DEMONSTRATION_FRAMES, FRAMES, FrameRow, frame_columns
+from mavbridge.recording.tables import FLUSH_NS, READ_ERRORS, TableWriter
 from mavbridge.recording.tlog import TlogJob, TlogThread
 from mavbridge.recording.video.file import WRITE_ERRORS, FragmentedMp4
 from mavbridge.recording.video.ring import FrameRing, RingShape
 
 FILE_ERRORS = (*WRITE_ERRORS, *READ_ERRORS)
-FLUSH_NS = 500_000_000
-"""Longest span of frames whose rows can be pending."""
-FLUSH_ROWS = 64
 
 
 class VideoJob(NamedTuple):
@@ -48,37 +45,34 @@ class FrameFiles:
         self._job = job
         self._video: FragmentedMp4 | None = None
         self._table: TableWriter | None = None
-        self._rows: list[FrameRow] = []
+        self._flushed_ns = 0
 
     def append(self, rgb: CameraImage, row: FrameRow) -> None:
         """Write a frame with even sides. Its row follows within half a second."""
+        job = self._job
         if self._video is None:
             height, width = rgb.shape[:2]
-            job = self._job
             self._video = FragmentedMp4(
                 job.video, height=height, width=width, hz=job.hz, is_depth=rgb.ndim == 2
             )
         self._video.append(rgb, row.captured_ns)
-        if self._job.rows is not None:
-            self._rows.append(row)
-            is_due = row.captured_ns - self._rows[0].captured_ns >= FLUSH_NS
-            if is_due or len(self._rows) >= FLUSH_ROWS:
-                self.flush()
+        if job.rows is None:
+            return
+        if self._table is None:
+            self._table = TableWriter(job.rows, DEMONSTRATION_FRAMES if job.with_truth else FRAMES)
+        self._table.add(frame_columns(row))
+        if row.captured_ns - self._flushed_ns >= FLUSH_NS:
+            self._flushed_ns = row.captured_ns
+            self.flush()
 
     def flush(self) -> None:
         """Write the pending rows."""
-        if self._job.rows is None or not self._rows:
-            return
-        schema = DEMONSTRATION_FRAMES if self._job.with_truth else FRAMES
-        if self._table is None:
-            self._table = TableWriter(self._job.rows, schema)
-        rows, self._rows = self._rows, []
-        self._table.append(frames_batch(rows, schema))
+        if self._table is not None:
+            self._table.flush()
 
     def finish(self) -> None:
         """Close both files in order."""
         self._close_video()
-        self.flush()
         if self._table is not None:
             table, self._table = self._table, None
             table.finish()
@@ -119,12 +113,10 @@ class Written(NamedTuple):
 
 
 class Failed(NamedTuple):
-    """Message from the writer: it has failed, closes its files and ends.
-
-    ``reason`` is a sentence for the user, without its full stop.
-    """
+    """Message from the writer: it has failed, closes its files and ends."""
 
     reason: str
+    """Sentence for the user, without its full stop."""
 
 
 class Notice(Enum):

@@ -1,11 +1,13 @@
 import json
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 
-from helpers.factories import START_NS, make_state, make_vision_tick
+from helpers.factories import START_NS, make_state
+from helpers.recordings import make_frame, make_meta, without_writer_process
 from mavbridge.config.flight import CameraConfig, FlyConfig, Limits, LinkConfig
 from mavbridge.config.policy import PolicyConfig
 from mavbridge.config.rates import Rates
@@ -13,9 +15,9 @@ from mavbridge.core.reasons import Code, because, reason_to_json
 from mavbridge.core.records import Solve
 from mavbridge.core.vehicle import ForwardedPacket
 from mavbridge.recording import replay_tables
+from mavbridge.recording.flight_writer import FlightWriter
 from mavbridge.recording.folder import SETTINGS
 from mavbridge.recording.replay_tables import (
-    ReplayTables,
     packet_key,
     read_features,
     read_packets,
@@ -75,17 +77,22 @@ def assert_same(solve: Solve, read: Solve) -> None:
     assert str(plain[0]) == str(plain[1])
 
 
+def record(folder: Path, **changes: Any) -> FlightWriter:
+    with without_writer_process():
+        return FlightWriter(folder, make_meta(**changes), pressure="offline", with_replay=True)
+
+
 @pytest.mark.parametrize("is_finished", [True, False])
 def test_solves_come_back_bit_for_bit_also_from_a_flight_that_was_cut_off(
     tmp_path: Path, is_finished: bool
 ) -> None:
-    tables = ReplayTables(tmp_path, ("front",), has_features=True)
+    writer = record(tmp_path)
     solves = [make_solve(serial) for serial in (1, 2, 5)]
     for solve in solves:
-        tables.solve(solve)
-    tables.flush()
+        writer.solve(solve)
+    writer.flush()
     if is_finished:
-        tables.finish()
+        writer.finish(writer.meta)
 
     rows = list(read_solves(read_table(tmp_path / "solves", replay_tables.SOLVES), CONTRACT))
 
@@ -95,12 +102,12 @@ def test_solves_come_back_bit_for_bit_also_from_a_flight_that_was_cut_off(
 
 
 def test_features_of_each_camera_have_a_table_of_their_own(tmp_path: Path) -> None:
-    tables = ReplayTables(tmp_path, ("front", "down"), has_features=True)
+    writer = record(tmp_path, contract=Contract(cameras=("front", "down")))
     value = np.array([[0.1, -1e-30, 3.0]], np.float32)
-    vision = replace(make_vision_tick(3), serial=0, feature=value)
-    tables.feature(vision)
-    tables.feature(replace(vision, camera=1, serial=2, fault=FROZEN, feature=-value))
-    tables.finish()
+    vision = make_frame(2, serial=0, feature=value)
+    writer.frame(vision)
+    writer.frame(replace(vision, camera=1, serial=2, fault=FROZEN, feature=-value))
+    writer.finish(writer.meta)
 
     (front,) = read_features(read_table(tmp_path / "features", replay_tables.FEATURES))
     down = read_table(tmp_path / "features_down", replay_tables.FEATURES)
@@ -109,19 +116,21 @@ def test_features_of_each_camera_have_a_table_of_their_own(tmp_path: Path) -> No
     assert front.value.shape == (1, 3)
     assert (front.frame_id, front.captured_ns) == (vision.frame_id, vision.captured_ns)
     assert [json.loads(text) for text in down["fault"].to_pylist()] == [reason_to_json(FROZEN)]
+    assert [each.fault for each in read_features(down)] == [FROZEN]
     assert down["dropped_before"].to_pylist() == [2]
 
 
-def test_stamps_of_packets_name_the_packet_in_the_log(tmp_path: Path) -> None:
-    tables = ReplayTables(tmp_path, ("front",), has_features=True)
-    tables.packets.put((ForwardedPacket(7, 5, HEARTBEAT), ForwardedPacket(9, 9, HEARTBEAT)))
-    tables.finish()
+def test_a_single_rate_flight_keeps_packets_and_no_images_as_features(tmp_path: Path) -> None:
+    writer = record(tmp_path, mode="single")
+    writer.packets.put((ForwardedPacket(7, 5, HEARTBEAT), ForwardedPacket(9, 9, HEARTBEAT)))
+    writer.frame(make_frame(0, feature=np.zeros((1, 3, 8, 8), np.float32)))
+    writer.finish(writer.meta)
 
     first, second = read_packets(read_table(tmp_path / "packets", replay_tables.PACKETS))
 
-    assert first == (7, 5, 0, 7)
-    assert second == (9, 9, 0, 7)
+    assert (first, second) == ((7, 5, 0, 7), (9, 9, 0, 7))
     assert packet_key(HEARTBEAT) == (0, 7)
+    assert not [*tmp_path.glob("features*")]
 
 
 def test_every_setting_of_a_flight_comes_back(tmp_path: Path) -> None:
@@ -152,11 +161,3 @@ def test_a_flag_of_a_later_version_is_left_out_and_damage_is_named(tmp_path: Pat
     (tmp_path / SETTINGS).unlink()
     with pytest.raises(SettingsError, match="older mavbridge"):
         read_settings(tmp_path)
-
-
-def test_a_single_rate_flight_keeps_no_images_as_features(tmp_path: Path) -> None:
-    tables = ReplayTables(tmp_path, ("front",), has_features=False)
-    tables.feature(replace(make_vision_tick(1), feature=np.zeros((1, 3, 8, 8), np.float32)))
-    tables.finish()
-
-    assert sorted(path.name for path in tmp_path.iterdir()) == ["packets.parquet", "solves.parquet"]

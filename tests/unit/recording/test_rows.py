@@ -1,4 +1,5 @@
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pyarrow as pa
@@ -17,10 +18,10 @@ from mavbridge.recording.rows import (
     FrameTruth,
     TickLabels,
     TickRow,
-    frames_batch,
+    frame_columns,
     read_frames,
     read_ticks,
-    ticks_batch,
+    tick_columns,
 )
 
 floats = st.floats(-1e3, 1e3, width=32)
@@ -96,7 +97,7 @@ def same_state(one: VehicleState | None, other: VehicleState | None) -> bool:
 @settings(max_examples=30)
 @given(st.lists(tick_rows, max_size=8))
 def test_ticks_come_back_as_they_were(rows: list[TickRow]) -> None:
-    table = pa.Table.from_batches([ticks_batch(rows, DEMONSTRATION_TICKS)])
+    table = pa.Table.from_pylist([*map(tick_columns, rows)], DEMONSTRATION_TICKS)
     back = list(read_ticks(table))
     assert len(back) == len(rows)
     serial = -1
@@ -109,13 +110,11 @@ def test_ticks_come_back_as_they_were(rows: list[TickRow]) -> None:
 
 @given(st.lists(frame_rows, max_size=8))
 def test_frames_come_back_as_they_were(rows: list[FrameRow]) -> None:
-    table = pa.Table.from_batches([frames_batch(rows, DEMONSTRATION_FRAMES)])
+    table = pa.Table.from_pylist([*map(frame_columns, rows)], DEMONSTRATION_FRAMES)
     assert list(read_frames(table)) == rows
 
 
 def test_the_columns_are_those_of_the_document() -> None:
-    from pathlib import Path
-
     text = (Path(__file__).parents[3] / "docs" / "formats.md").read_text()
     tables = (DEMONSTRATION_TICKS, DEMONSTRATION_FRAMES)
     names = {name for table in tables for name in table.names}
@@ -126,6 +125,7 @@ def test_actions_of_another_kind_come_back_as_that_kind() -> None:
     moves = Velocity(1.0, -2.0, 0.5, 0.25)
     trace = ActionTrace(raw=moves, clipped=moves, slewed=moves, smoothed=moves)
     tick = make_tick(sent=moves, trace=trace)
-    (row,) = read_ticks(pa.Table.from_batches([ticks_batch([TickRow(tick, 0)], TICKS)]), "velocity")
+    table = pa.Table.from_pylist([tick_columns(TickRow(tick, 0))], TICKS)
+    (row,) = read_ticks(table, "velocity")
     assert (row.tick.sent, row.tick.trace) == (moves, trace)
     assert isinstance(row.tick.sent, Velocity)

@@ -3,8 +3,7 @@ import signal
 import subprocess
 import sys
 import threading
-from collections.abc import Iterator
-from contextlib import closing, contextmanager
+from contextlib import closing
 from multiprocessing import Pipe
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -18,32 +17,19 @@ from helpers.recordings import make_row, number_of, picture, send_signal
 from mavbridge.recording.rows import FRAMES, read_frames
 from mavbridge.recording.tables import read_table
 from mavbridge.recording.video import ring
+from mavbridge.recording.video import writer as writer_module
 from mavbridge.recording.video.file import count_frames, read_video
 from mavbridge.recording.video.ring import MIN_SLOTS
-from mavbridge.recording.video.writer import (
-    FrameSender,
-    Pressure,
-    VideoWriter,
-    WriterError,
-)
+from mavbridge.recording.video.writer import Pressure, VideoWriter, WriterError
 from mavbridge.recording.video.writer_process import Notice, VideoJob, WriterService
 
 DEADLINE_S = 30.0
 
 
-@contextmanager
-def writer(folder: Path, pressure: Pressure, *, with_truth: bool = False) -> Iterator[VideoWriter]:
-    video = VideoWriter(
-        folder / "camera.mp4",
-        pressure=pressure,
-        hz=30,
-        rows=folder / "frames",
-        with_truth=with_truth,
+def writer(folder: Path, pressure: Pressure) -> closing[VideoWriter]:
+    return closing(
+        VideoWriter(folder / "camera.mp4", pressure=pressure, hz=30, rows=folder / "frames")
     )
-    try:
-        yield video
-    finally:
-        video.close()
 
 
 def kill(video: VideoWriter, number: signal.Signals) -> None:
@@ -159,8 +145,13 @@ def test_without_its_producer_the_writer_finishes_by_itself(tmp_path: Path, how:
 class Alive:
     """A process that never ends; the service is driven by hand in the same thread."""
 
-    sentinel = -1
-    exitcode = None
+    sentinel, exitcode = -1, None
+
+    def join(self, timeout_s: float) -> None:
+        pass
+
+    def is_alive(self) -> bool:
+        return False
 
 
 @settings(max_examples=40)
@@ -169,14 +160,12 @@ def test_rows_are_frames_and_every_drop_is_told(steps: list[int]) -> None:
     """0..2: a frame is offered, with so many lost before it; 3: the writer does one thing."""
     with TemporaryDirectory() as name, patch.object(ring, "MAX_SLOTS", MIN_SLOTS):
         folder = Path(name)
+        video, table = folder / "camera.mp4", folder / "frames"
         ours, its = Pipe()
-        job = VideoJob(
-            video=folder / "camera.mp4",
-            rows=folder / "frames",
-            hz=30,
-        )
-        service = WriterService(its, job)
-        sender = FrameSender(ours, Alive(), "online")
+        service = WriterService(its, VideoJob(video, hz=30, rows=table))
+        service.send(Notice.READY)
+        with patch.object(writer_module, "start_process", lambda *_: (ours, Alive())):
+            sender = VideoWriter(video, pressure="online", hz=30, rows=table)
         offered = lost_upstream = 0
         taken: list[int] = []
         for step in steps:
@@ -192,15 +181,14 @@ def test_rows_are_frames_and_every_drop_is_told(steps: list[int]) -> None:
         ours.send(Notice.FINISH)
         while service.is_open:
             service.serve(0)
-        sender.receive()
+        sender._receive()
         sender.close()
         its.close()
         if not taken:
             return
-        table = read_table(folder / "frames", FRAMES)
-        rows = list(read_frames(table))
+        rows = list(read_frames(read_table(table, FRAMES)))
         assert [row.frame_id for row in rows] == taken
-        assert count_frames(folder / "camera.mp4") == len(rows)
+        assert count_frames(video) == len(rows)
         dropped = sum(row.dropped_before for row in rows)
         assert dropped == lost_upstream_taken + taken[-1] + 1 - len(taken)
         assert sender.written == len(rows)

@@ -100,16 +100,16 @@ def test_a_slow_disk_holds_the_loop_up_and_nothing_is_lost(tmp_path: Path) -> No
 def test_a_full_disk_under_the_rows_reaches_the_loop(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    out, append = tmp_path / "a.mp4", TableWriter.append
-    appended = []
+    out, flush = tmp_path / "a.mp4", TableWriter.flush
+    flushed = []
 
-    def fills_up(self: TableWriter, batch: object) -> None:
-        appended.append(batch)
-        if len(appended) > 3:
+    def fills_up(self: TableWriter) -> None:
+        flushed.append(self)
+        if len(flushed) > 3:
             raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
-        append(self, batch)
+        flush(self)
 
-    monkeypatch.setattr(TableWriter, "append", fills_up)
+    monkeypatch.setattr(TableWriter, "flush", fills_up)
     with output(out) as made, pytest.raises(RolloutError, match=r"a\.arrows.*No space left"):
         put_all(made)
     require_whole(out, 48)
