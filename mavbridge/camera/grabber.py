@@ -72,8 +72,11 @@ class Image(NamedTuple):
 class ImageSource(Protocol):
     """Open blocking source, used only by the grabber's thread."""
 
-    def next_image(self) -> Image:
-        """Block until the next frame. Raises CameraError if there will be none."""
+    def next_image(self) -> Image | None:
+        """Wait for the next frame, for seconds at most; None: not yet.
+
+        Raises CameraError if there will be none.
+        """
 
     def close(self) -> None:
         """Free the device or connection."""
@@ -185,7 +188,9 @@ class Grabber:
         """Receive frames until the source ends. Return the reason for the end."""
         try:
             while not self._stopping.is_set():
-                captured_ns, rgb = source.next_image()
+                if (image := source.next_image()) is None:
+                    continue
+                captured_ns, rgb = image
                 rgb.flags.writeable = False
                 with self._changed:
                     self._frame_count += 1

@@ -29,7 +29,7 @@ SILENT_NS = 2 * NS_PER_S
 _POLL_S = 0.1
 _RECEIVE_BUFFER_BYTES = 4 << 20
 _MOST_QUEUED = 4096
-"""Limit of datagrams read after a whole frame, in case the sender is faster than this computer."""
+"""Limit of datagrams read per frame, in case the sender is faster than this computer."""
 _log = logging.getLogger(__name__)
 
 
@@ -140,7 +140,8 @@ class JpegUdpSource:
         self._name = f"jpeg-udp:{spelled(host, port)}"
         self._clock = clock
         self._frames = FrameAssembler()
-        self._datagrams = 0
+        self._datagrams = self._bad_frames = 0
+        self._silent_after_ns = clock.now_ns() + SILENT_NS
         family = socket.AF_INET6 if ":" in host else socket.AF_INET
         self._socket = socket.socket(family, socket.SOCK_DGRAM)
         self._socket.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, _RECEIVE_BUFFER_BYTES)
@@ -151,38 +152,37 @@ class JpegUdpSource:
             self.close()
             raise CameraError(f"{self._name} cannot be opened: {error.strerror}") from error
 
-    def next_image(self) -> Image:
+    def next_image(self) -> Image | None:
         """See `ImageSource`."""
-        silent_after_ns = self._clock.now_ns() + SILENT_NS
-        for _ in range(MAX_BAD_FRAMES + 1):
-            frame = self._newest_frame(silent_after_ns)
-            if (pixels := decode_picture(frame.picture)) is not None:
-                captured_ns = exposure_ns(frame.key.stamp_ns, frame.arrived_ns)
-                return Image(captured_ns=captured_ns, rgb=pixels)
-        raise CameraError(f"{self._name}: {MAX_BAD_FRAMES + 1} pictures in a row are damaged")
-
-    def _newest_frame(self, silent_after_ns: int) -> Assembly:
-        """Receive until a frame is whole, then drain the socket, which may hold a newer frame."""
-        newest: Assembly | None = None
-        more = _MOST_QUEUED
-        while newest is None or more > 0:
-            datagram = self._receive(is_waiting=newest is None)
-            now_ns = self._clock.now_ns()
-            if datagram is not None:
-                self._datagrams += 1
-                newest = self._frames.put(datagram, now_ns) or newest
-                more -= newest is not None
-            elif newest is not None:
-                break
-            if newest is None and now_ns > silent_after_ns:
+        if (frame := self._newest_frame()) is None:
+            if self._clock.now_ns() > self._silent_after_ns:
                 raise CameraError(
                     f"{self._name}: no whole frame in {SILENT_NS / NS_PER_S:g} s: {self._counts}"
                 )
+            return None
+        self._silent_after_ns = self._clock.now_ns() + SILENT_NS
+        if (pixels := decode_picture(frame.picture)) is not None:
+            self._bad_frames = 0
+            captured_ns = exposure_ns(frame.key.stamp_ns, frame.arrived_ns)
+            return Image(captured_ns=captured_ns, rgb=pixels)
+        self._bad_frames += 1
+        if self._bad_frames > MAX_BAD_FRAMES:
+            raise CameraError(f"{self._name}: {self._bad_frames} pictures in a row are damaged")
+        return None
+
+    def _newest_frame(self) -> Assembly | None:
+        """Receive until a frame is whole, then drain the socket, which may hold a newer frame."""
+        newest: Assembly | None = None
+        for _ in range(_MOST_QUEUED):
+            if (datagram := self._receive(0.0 if newest else _POLL_S)) is None:
+                break
+            self._datagrams += 1
+            newest = self._frames.put(datagram, self._clock.now_ns()) or newest
         return newest
 
-    def _receive(self, *, is_waiting: bool) -> bytes | None:
+    def _receive(self, timeout_s: float) -> bytes | None:
         try:
-            ready, _, _ = select.select([self._socket], [], [], _POLL_S if is_waiting else 0.0)
+            ready, _, _ = select.select([self._socket], [], [], timeout_s)
             return self._socket.recv(1 << 16) if ready else None
         except BlockingIOError:  # a datagram with a wrong checksum
             return None

@@ -17,7 +17,7 @@ from mavbridge.camera.grabber import (
     wait_until_due,
 )
 from mavbridge.camera.jpeg_udp import JpegUdpSource, parse_jpeg_udp
-from mavbridge.camera.pipe import PipeCamera, parse_pipe
+from mavbridge.camera.pipe import PipeSource, parse_pipe
 from mavbridge.camera.shared_memory import SharedMemoryCamera
 from mavbridge.camera.video_file import VideoFileCamera
 from mavbridge.core.clock import NS_PER_MS, NS_PER_S, Clock
@@ -49,23 +49,20 @@ def check_camera(spec: str, *, latency_ms: float = 0.0) -> None:
         UserError: ``spec`` has no known form, names no file, needs a package that is missing,
             or stamps its frames itself and ``latency_ms`` is not 0.
     """
-    kind = spec.partition(":")[0]
-    if kind == "shm" and latency_ms != 0.0:
-        raise UserError(
-            f"--camera-latency {latency_ms:g} cannot be used with {spec}: its writer stamps each "
-            "frame with its exposure; mend the stamps there, or leave the flag out"
-        )
-    if kind == "pipe":
-        parse_pipe(spec.partition(":")[2])
-        return
-    if kind == "jpeg-udp":
-        parse_jpeg_udp(spec.partition(":")[2])
-        return
-    if kind == "screen":
+    kind, _, rest = spec.partition(":")
+    if kind == "shm":
+        if latency_ms != 0.0:
+            raise UserError(
+                f"--camera-latency {latency_ms:g} cannot be used with {spec}: its writer stamps "
+                "each frame with its exposure; mend the stamps there, or leave the flag out"
+            )
+    elif kind == "pipe":
+        parse_pipe(rest)
+    elif kind == "jpeg-udp":
+        parse_jpeg_udp(rest)
+    elif kind == "screen":
         require_packages("--camera screen:", SCREEN_PACKAGES)
-        return
-    is_known = kind == "shm" or spec == NO_CAMERA or _is_stream(spec) or _is_device(spec)
-    if not is_known and not Path(spec).is_file():
+    elif not (spec == NO_CAMERA or _is_stream(spec) or _is_device(spec) or Path(spec).is_file()):
         raise UserError(f"--camera {spec!r}: no such file, and not a known source; use {FORMS}")
 
 
@@ -167,7 +164,7 @@ def _open(spec: str, *, image_size: int, clock: Clock, is_depth: bool | None) ->
 
         return ScreenCamera(rest, clock=clock)
     if kind == "pipe":
-        return PipeCamera(parse_pipe(rest), clock=clock)
+        return Grabber(partial(PipeSource, parse_pipe(rest), clock=clock), clock=clock)
     if kind == "jpeg-udp":
         host, port = parse_jpeg_udp(rest)
         return Grabber(partial(JpegUdpSource, host, port, clock=clock), clock=clock)

@@ -15,11 +15,10 @@ import shlex
 import shutil
 import signal
 import subprocess
-import threading
 from contextlib import suppress
 from typing import NamedTuple
 
-from mavbridge.camera.grabber import Grabber, Image
+from mavbridge.camera.grabber import Image
 from mavbridge.camera.pipe_frames import (
     MAX_BAD_FRAMES,
     MAX_SIDE_PX,
@@ -40,8 +39,8 @@ END_S = 1.0
 _POLL_S = 0.1
 _READ_BYTES = 1 << 16
 """Capacity of a pipe. A full pipe blocks the program, so no frame in it is old."""
-_MORE_READS = 64
-"""Limit of reads after a whole frame, in case the program is faster than this computer."""
+_MOST_READS = 64
+"""Limit of reads per frame, in case the program is faster than this computer."""
 _MAX_ERROR_BYTES = 2000
 _RAW = re.compile(r"(\d{1,5})x(\d{1,5}):([a-z0-9]+):(.*)", re.DOTALL)
 
@@ -90,30 +89,16 @@ def parse_pipe(text: str) -> PipeCommand:
     return PipeCommand(words, raw)
 
 
-class PipeCamera(Grabber):
-    """`LiveCamera` over a program; its thread starts the program, ends it and waits for it."""
-
-    def __init__(self, command: PipeCommand, *, clock: Clock) -> None:
-        self._ending = threading.Event()
-        super().__init__(lambda: PipeSource(command, clock, self._ending), clock=clock)
-
-    def close(self) -> None:
-        """Stop the thread, which ends the program."""
-        self._ending.set()
-        super().close()
-
-
 class PipeSource:
     """`ImageSource` over a program; returns the newest whole frame.
 
     The program runs in a separate session, so that Ctrl-C ends the flight but not the camera.
     """
 
-    def __init__(self, command: PipeCommand, clock: Clock, ending: threading.Event) -> None:
+    def __init__(self, command: PipeCommand, *, clock: Clock) -> None:
         """Start the program. Raises CameraError on failure."""
         self._name = f"program {command.words[0]}"
         self._clock = clock
-        self._ending = ending
         self._cutter = command.cutter()
         self._errors = b""
         self._bad_frames = 0
@@ -136,35 +121,30 @@ class PipeSource:
         self._out, self._err = out.fileno(), err.fileno()
         self._open = [self._out, self._err]
 
-    def next_image(self) -> Image:
+    def next_image(self) -> Image | None:
         """See `ImageSource`."""
-        while True:
-            frame, first_ns = self._newest_frame()
-            if (rgb := self._cutter.decode(frame)) is not None:
-                self._bad_frames = 0
-                return Image(captured_ns=first_ns, rgb=rgb)
-            self._bad_frames += 1
-            if self._bad_frames > MAX_BAD_FRAMES:
-                raise CameraError(f"{self._name}: {self._bad_frames} pictures in a row are damaged")
-
-    def _newest_frame(self) -> tuple[bytes, int]:
-        """Read until a frame is whole, then drain the pipe, which may hold a newer frame."""
-        more = _MORE_READS
-        while True:
-            ready, _, _ = select.select(
-                self._open, [], [], 0 if self._cutter.has_frame else _POLL_S
-            )
-            if self._ending.is_set():
-                raise CameraError("the camera has been closed")
-            more -= self._cutter.has_frame
-            if (self._out not in ready or more < 0) and (frame := self._cutter.take()) is not None:
-                return frame
+        for _ in range(_MOST_READS):
+            # A pipe with a whole frame may hold a newer one.
+            timeout_s = 0.0 if self._cutter.has_frame else _POLL_S
+            ready = select.select(self._open, [], [], timeout_s)[0]
+            if not ready:
+                break
             if self._err in ready:
                 self._read_error()
             if self._out in ready:
                 self._read_frames()
-            elif self._clock.now_ns() > self._silent_after_ns:
+        if (newest := self._cutter.take()) is None:
+            if self._clock.now_ns() > self._silent_after_ns:
                 raise CameraError(f"{self._name} is silent{self._last_error()}")
+            return None
+        frame, first_ns = newest
+        if (rgb := self._cutter.decode(frame)) is not None:
+            self._bad_frames = 0
+            return Image(captured_ns=first_ns, rgb=rgb)
+        self._bad_frames += 1
+        if self._bad_frames > MAX_BAD_FRAMES:
+            raise CameraError(f"{self._name}: {self._bad_frames} pictures in a row are damaged")
+        return None
 
     def _read_frames(self) -> None:
         data = os.read(self._out, _READ_BYTES)

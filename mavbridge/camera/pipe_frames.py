@@ -86,6 +86,7 @@ class FrameCutter(ABC):
     """Consumes a byte stream, and provides the newest whole frame."""
 
     def __init__(self) -> None:
+        self._buffer = bytearray()
         self._newest: tuple[bytes, int] | None = None
         self._first_ns = 0
         """Arrival of the first byte of the incomplete frame."""
@@ -100,9 +101,19 @@ class FrameCutter(ABC):
         newest, self._newest = self._newest, None
         return newest
 
-    @abstractmethod
     def put(self, data: bytes, arrived_ns: int) -> None:
         """Take bytes. Raises CameraError if they cannot be frames."""
+        if not self._buffer:
+            self._first_ns = arrived_ns
+        self._buffer += data
+        while (end := self._find_end(arrived_ns)) is not None:
+            self._newest = bytes(self._buffer[:end]), self._first_ns
+            del self._buffer[:end]
+            self._first_ns = arrived_ns
+
+    @abstractmethod
+    def _find_end(self, arrived_ns: int) -> int | None:
+        """Move the first frame to the front; return its length, or None if it is incomplete."""
 
     @abstractmethod
     def decode(self, frame: bytes) -> CameraImage | None:
@@ -114,27 +125,19 @@ class FrameCutter(ABC):
 
 
 class RawCutter(FrameCutter):
-    """Cutter for consecutive raw pictures of one size."""
+    """Cutter for consecutive raw pictures of one size, any bytes of which are valid."""
 
     def __init__(self, width: int, height: int, pixels: RawFormat) -> None:
         super().__init__()
         self._shape = (height, width)
         self._format = pixels
         self._size = width * height * pixels.bits // 8
-        self._partial = bytearray()
 
-    def put(self, data: bytes, arrived_ns: int) -> None:
-        """See `FrameCutter`."""
-        if not self._partial:
-            self._first_ns = arrived_ns
-        self._partial += data
-        while len(self._partial) >= self._size:
-            self._newest = bytes(self._partial[: self._size]), self._first_ns
-            del self._partial[: self._size]
-            self._first_ns = arrived_ns
+    def _find_end(self, arrived_ns: int) -> int | None:
+        return self._size if len(self._buffer) >= self._size else None
 
     def decode(self, frame: bytes) -> CameraImage:
-        """See `FrameCutter`. Raw pictures are never damaged: any bytes are valid."""
+        """See `FrameCutter`."""
         height, width = self._shape
         if self._format.is_depth:
             return np.frombuffer(frame, "<u2").reshape(height, width).astype(np.uint16)
@@ -148,11 +151,11 @@ class RawCutter(FrameCutter):
 
     def rest(self) -> str:
         """See `FrameCutter`."""
-        if not self._partial:
+        if not self._buffer:
             return ""
         height, width = self._shape
         return (
-            f"; its last {len(self._partial)} bytes are no whole picture of {self._size} bytes: is "
+            f"; its last {len(self._buffer)} bytes are no whole picture of {self._size} bytes: is "
             f"{width}x{height} right, and the format?"
         )
 
@@ -162,24 +165,19 @@ class PictureCutter(FrameCutter):
 
     def __init__(self) -> None:
         super().__init__()
-        self._buffer = bytearray()
         self._at = 0
         """Position at which the search continues; 0 until a picture's start is found."""
         self._in_scan = self._is_png = False
 
-    def put(self, data: bytes, arrived_ns: int) -> None:
-        """See `FrameCutter`."""
-        self._buffer += data
-        while True:
-            if self._at == 0 and not self._find_start(arrived_ns):
-                return
-            if not (self._find_png_end() if self._is_png else self._find_end()):
-                if len(self._buffer) > MAX_JPEG_BYTES:
-                    raise CameraError(f"no picture ended within {MAX_JPEG_BYTES >> 20} MiB")
-                return
-            self._newest = bytes(self._buffer[: self._at]), self._first_ns
-            del self._buffer[: self._at]
-            self._at, self._in_scan = 0, False
+    def _find_end(self, arrived_ns: int) -> int | None:
+        if self._at == 0 and not self._find_start(arrived_ns):
+            return None
+        if not (self._find_png_end() if self._is_png else self._find_jpeg_end()):
+            if len(self._buffer) > MAX_JPEG_BYTES:
+                raise CameraError(f"no picture ended within {MAX_JPEG_BYTES >> 20} MiB")
+            return None
+        end, self._at, self._in_scan = self._at, 0, False
+        return end
 
     def _find_start(self, arrived_ns: int) -> bool:
         start = _START.search(self._buffer)
@@ -196,7 +194,7 @@ class PictureCutter(FrameCutter):
         del self._buffer[: start.start()]
         return True
 
-    def _find_end(self) -> bool:
+    def _find_jpeg_end(self) -> bool:
         """Walk over the segments of the picture. Return True if it ends at ``_at``."""
         buffer = self._buffer
         while True:

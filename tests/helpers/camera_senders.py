@@ -14,6 +14,7 @@ import av
 import cv2
 import numpy as np
 
+from mavbridge.camera.grabber import Image, ImageSource
 from mavbridge.core.clock import NS_PER_S, MonotonicClock
 
 HEADER = Struct("<IHHIIQ")
@@ -51,6 +52,14 @@ def depth_scene(number: int) -> np.ndarray:
     depth = (2000 + 50 * rows + columns + number).astype(np.uint16)
     depth[:8, :8] = 0
     return depth
+
+
+def next_image(source: ImageSource) -> Image:
+    """Return the next frame of a source, which says every 0.1 s that there is none yet."""
+    for _ in range(1000):
+        if (image := source.next_image()) is not None:
+            return image
+    raise TimeoutError
 
 
 @contextmanager

@@ -7,7 +7,15 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from helpers.camera_senders import HEADER, UdpSender, chunks, depth_scene, encoded, scene
+from helpers.camera_senders import (
+    HEADER,
+    UdpSender,
+    chunks,
+    depth_scene,
+    encoded,
+    next_image,
+    scene,
+)
 from helpers.fakes import START_NS, FakeClock
 from mavbridge.camera import jpeg_udp
 from mavbridge.camera.jpeg_udp import (
@@ -140,23 +148,23 @@ def test_the_newest_frame_is_read_and_older_ones_are_left(host):
         before_ns = MonotonicClock().now_ns()
         for number in range(3):
             sender.send(number, encoded(scene(number), ".png"), stamp_ns=before_ns)
-        image = source.next_image()
+        image = next_image(source)
         assert np.array_equal(image.rgb, scene(2))
         assert image.captured_ns == before_ns
         sender.send(7, encoded(depth_scene(1), ".png"))
-        assert np.array_equal(source.next_image().rgb, depth_scene(1))
+        assert np.array_equal(next_image(source).rgb, depth_scene(1))
     source.close()
 
 
 def test_silence_says_what_has_come():
     source = JpegUdpSource("127.0.0.1", 17202, clock=TickingClock())
     with pytest.raises(CameraError, match="no datagram has come"):
-        source.next_image()
+        next_image(source)
     with UdpSender(17202) as sender:
         sender.send_raw(b"hello")
         sender.send_raw(chunks(1, payload(1), part=9)[0])
         with pytest.raises(CameraError, match="of 2 datagrams 1 were malformed"):
-            source.next_image()
+            next_image(source)
     source.close()
 
 
@@ -172,9 +180,9 @@ def test_damaged_pictures_are_skipped_and_many_in_a_row_are_an_error(monkeypatch
 
         monkeypatch.setattr(jpeg_udp, "decode_picture", decode)
         sender.send(0, b"no picture")
-        assert source.next_image().rgb.shape == scene(0).shape
+        assert next_image(source).rgb.shape == scene(0).shape
         with pytest.raises(CameraError, match="11 pictures in a row are damaged"):
-            source.next_image()
+            next_image(source)
     source.close()
 
 

@@ -3,7 +3,6 @@
 import os
 import shlex
 import sys
-import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -15,7 +14,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from faults.processes import child_of
-from helpers.camera_senders import SIDE, depth_scene, encoded, scene
+from helpers.camera_senders import SIDE, depth_scene, encoded, next_image, scene
 from mavbridge.camera.open import check_camera, open_camera
 from mavbridge.camera.pipe import PipeCommand, PipeSource, parse_pipe
 from mavbridge.camera.pipe_frames import RAW_FORMATS, PictureCutter, RawCutter
@@ -56,7 +55,7 @@ def with_thumbnail(data: bytes) -> bytes:
 
 @contextmanager
 def source(command: str) -> Iterator[PipeSource]:
-    opened = PipeSource(parse_pipe(command), MonotonicClock(), threading.Event())
+    opened = PipeSource(parse_pipe(command), clock=MonotonicClock())
     try:
         yield opened
     finally:
@@ -205,7 +204,7 @@ def test_frames_come_from_a_program(tmp_path: Path) -> None:
 def test_a_program_faster_than_this_computer_still_gives_frames() -> None:
     with source(f"{WIDTH}x{HEIGHT}:rgb24:cat /dev/zero") as opened:
         for _ in range(3):
-            assert opened.next_image().rgb.shape == (HEIGHT, WIDTH, 3)
+            assert next_image(opened).rgb.shape == (HEIGHT, WIDTH, 3)
 
 
 @pytest.mark.parametrize(
@@ -219,7 +218,7 @@ def test_a_program_faster_than_this_computer_still_gives_frames() -> None:
 )
 def test_why_a_program_gives_no_more_frames_is_said(body: str, raw: str, told: str) -> None:
     with source(raw + python(body)) as opened, pytest.raises(CameraError, match=told):
-        opened.next_image()
+        next_image(opened)
 
 
 @pytest.mark.skipif(sys.platform != "linux", reason="looks into /proc")
