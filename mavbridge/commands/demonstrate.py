@@ -25,7 +25,7 @@ from mavbridge.flight.policies import load_for_episodes
 from mavbridge.recording.flight_writer import FlightWriter
 from mavbridge.recording.folder import META, prepare_folder
 from mavbridge.recording.meta import FlightError, FlightMeta, read_meta
-from mavbridge.recording.rows import FrameTruth, TickLabels
+from mavbridge.recording.rows import FrameTruth
 from mavbridge.simulation.delays import Delay, Delays
 from mavbridge.simulation.flight import SimulatedFlight, SimulationSettings
 from mavbridge.simulation.world import Exposure, make_vehicle
@@ -348,8 +348,8 @@ class _LabelledRecorder:
         if tick.woke_ns < from_ns or serial is None or serial == self._chunk_serial:
             return
         self._chunk_serial = serial
-        labels = TickLabels(expert=self._pilot.expert_action(serial))
-        self._writer.tick(replace(tick, serial=self._ticks), labels)
+        expert = self._pilot.expert_action(serial)
+        self._writer.tick(replace(tick, serial=self._ticks), expert)
         self._ticks += 1
 
 

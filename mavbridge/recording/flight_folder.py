@@ -35,7 +35,7 @@ class RecordedFlight:
     """Skipped parts of the flight, in sentences for the user."""
 
     def tick_rows(self) -> Iterator[TickRow]:
-        """Return the ticks as records, with their labels if the flight is a demonstration."""
+        """Return the ticks as records, with the expert's if it is a demonstration."""
         contract = self.meta.contract
         return read_ticks(self.ticks, "sticks" if contract is None else contract.action)
 

@@ -7,7 +7,7 @@ import pyarrow as pa
 
 from mavbridge.core.observers import BoundedQueue
 from mavbridge.core.records import Solve, Tick, VisionTick
-from mavbridge.core.vehicle import ForwardedPacket
+from mavbridge.core.vehicle import Action, ForwardedPacket
 from mavbridge.recording import replay_tables, rows
 from mavbridge.recording.folder import (
     PACKETS,
@@ -19,7 +19,7 @@ from mavbridge.recording.folder import (
     video_of,
 )
 from mavbridge.recording.meta import FlightMeta, write_meta
-from mavbridge.recording.rows import FrameRow, FrameTruth, TickLabels, TickRow, tick_columns
+from mavbridge.recording.rows import FrameRow, FrameTruth, TickRow, tick_columns
 from mavbridge.recording.tables import FLUSH_NS, TableWriter
 from mavbridge.recording.tlog import TlogJob, TlogPipe
 from mavbridge.recording.video.writer import Pressure, VideoWriter, WriterDiedError, WriterError
@@ -123,7 +123,7 @@ class FlightWriter:
             folder: the flight's folder.
             meta: the facts known at the start.
             pressure: "offline" waits and drops nothing; see ``VideoWriter``.
-            with_labels: the tables have the columns of ``TickLabels`` and ``FrameTruth``.
+            with_labels: the tables have the columns of the expert and of ``FrameTruth``.
             with_replay: the folder also has the tables for a replay.
             tlog_pipe: its reader becomes ``link.tlog`` and is closed here; None: no such file.
         """
@@ -170,9 +170,9 @@ class FlightWriter:
         self._tables.append(table)
         return table
 
-    def tick(self, tick: Tick, labels: TickLabels | None = None) -> None:
+    def tick(self, tick: Tick, expert: Action | None = None) -> None:
         """Record a tick. Skipped serial numbers count as dropped."""
-        self._ticks.add(tick_columns(TickRow(tick, self._serials.take(tick.serial), labels)))
+        self._ticks.add(tick_columns(TickRow(tick, self._serials.take(tick.serial), expert)))
         self._flush_if_due(tick.woke_ns)
 
     def frame(self, vision: VisionTick, truth: FrameTruth | None = None) -> None:

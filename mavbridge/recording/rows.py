@@ -52,20 +52,13 @@ class FrameRow:
     truth: FrameTruth | None = None
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class TickLabels:
-    """Labels of a tick in a demonstration."""
-
-    expert: Action | None
-    """The expert's action for this tick, without the disturbance that was flown."""
-
-
 class TickRow(NamedTuple):
     """One row of the table of ticks."""
 
     tick: Tick
     dropped_before: int
-    labels: TickLabels | None = None
+    expert: Action | None = None
+    """In a demonstration, the expert's action, without the disturbance that was flown."""
 
 
 _STICKS = pa.list_(pa.float32(), ACTION_DIM)
@@ -127,16 +120,15 @@ _ROWS_AT_ONCE = 4096
 
 
 def tick_columns(row: TickRow) -> Row:
-    """Convert a tick to a row; the labels have columns in ``DEMONSTRATION_TICKS`` only."""
+    """Convert a tick to a row; ``DEMONSTRATION_TICKS`` alone has a column of the expert."""
     tick = row.tick
     return {
         **attributes(tick, _TICK),
         **_reason_columns(tick.release_reason),
         **attributes(tick.state, STATE_STAMPS),
         **attributes(tick.trace, _TRACE),
-        **attributes(row.labels, ("expert",)),
         "state": None if tick.state is None else tick.state.values,
-        "dropped_before": row.dropped_before,
+        **attributes(row, ("expert", "dropped_before")),
     }
 
 
@@ -167,14 +159,11 @@ def read_ticks(table: pa.Table, action: ActionKind = "sticks") -> Iterator[TickR
 
     Whole columns are never converted to Python objects at once.
     """
-    serial = -1
-    has_labels = "expert" in table.column_names
+    serial, make = -1, ACTION_CLASSES[action]
     for row in _rows(table):
         serial += 1 + row["dropped_before"]
-        make, labels = ACTION_CLASSES[action], None
-        if has_labels:
-            labels = TickLabels(expert=row["expert"] and make(*row["expert"]))
-        yield TickRow(_tick(row, serial, make), row["dropped_before"], labels)
+        expert = row.get("expert")
+        yield TickRow(_tick(row, serial, make), row["dropped_before"], expert and make(*expert))
 
 
 def read_frames(table: pa.Table) -> Iterator[FrameRow]:

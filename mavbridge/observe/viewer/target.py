@@ -83,29 +83,28 @@ def prepare_target(text: str) -> Path | str:
         PeerError: nothing listens at the URL.
         MavbridgeError: the viewer does not start.
     """
-    if text == "spawn":
-        if not listens(VIEWER_HOST, VIEWER_PORT):
-            spawn_viewer([sys.executable, "-m", "rerun_cli"], port=VIEWER_PORT)
-        return VIEWER_URL
     check_target(text)
     if text.endswith(".rrd"):
         return Path(text)
-    return text.removeprefix("connect").removeprefix("=") or VIEWER_URL
+    if text == "spawn" and not listens(VIEWER_HOST, VIEWER_PORT):
+        spawn_viewer([sys.executable, "-m", "rerun_cli"], port=VIEWER_PORT)
+    return _url(text)
+
+
+def _url(text: str) -> str:
+    return text.partition("=")[2] or VIEWER_URL
 
 
 def check_target(text: str) -> None:
     """Run the checks of ``prepare_target`` without starting anything; raise the same errors."""
     if text in ("off", "spawn"):
         return
-    if text == "connect" or text.startswith("connect="):
-        _reachable(text.removeprefix("connect").removeprefix("=") or VIEWER_URL)
-    elif text.endswith(".rrd"):
+    if text.endswith(".rrd"):
         require_writable(Path(text), "--rerun")
-    else:
+        return
+    if text != "connect" and not text.startswith("connect="):
         raise UserError(f"--rerun {text!r} is none of: spawn, connect, connect=URL, FILE.rrd, off")
-
-
-def _reachable(url: str) -> None:
+    url = _url(text)
     problem = f"--rerun: {url!r} is not a viewer's address; it should look like {VIEWER_URL}"
     try:
         parts = urlsplit(url)
@@ -122,14 +121,7 @@ def _reachable(url: str) -> None:
 
 
 def spawn_viewer(command: list[str], *, port: int) -> "subprocess.Popen[bytes]":
-    """Start a viewer and wait until it listens and has not exited for SETTLE_S.
-
-    The viewer gets a separate session, so that Ctrl-C does not reach it, and stays open after the
-    flight.
-
-    Raises:
-        MavbridgeError: it exited, or did not listen in time.
-    """
+    """Start a viewer, which stays open after the flight; raises as ``start_listening``."""
     options = ["--port", str(port), "--bind", VIEWER_HOST, "--memory-limit", VIEWER_MEMORY]
     return start_listening(
         [*command, *options, "--hide-welcome-screen", "--expect-data-soon"],

@@ -91,20 +91,20 @@ def replay_guard(source: ReplaySource) -> list[GuardStep]:
     # The grid begins when the guard gets its settings.
     port.begin_ns = ticks[0].due_ns - ticks[0].index * settings.stick_period_ns
     steps = []
-    for arrivals in _arrivals(source):
-        tick = arrivals.tick
+    for tick, chunk, act, stop in _arrivals(source):
         _keep_link(link, clock, transport, tick.woke_ns)
         port.decided_ns, transport.sent_ns = tick.decided_ns or tick.woke_ns, tick.sent_ns
-        port.inbox += [encode_to_guard(message) for message in arrivals.messages]
+        messages: tuple[Chunk | OperatorCommand | EndRequest | None, ...] = (chunk, act, stop)
+        port.inbox += [encode_to_guard(each) for each in messages if each is not None]
         loop.step()
         steps.append(
             GuardStep(
                 recorded=tick,
                 replayed=port.take_tick(),
                 snapshot=link.newest,
-                chunk_serial=arrivals.chunk.serial if arrivals.chunk else None,
-                act=arrivals.act,
-                stop=arrivals.stop,
+                chunk_serial=chunk.serial if chunk else None,
+                act=act,
+                stop=stop,
             )
         )
     return steps
@@ -152,22 +152,10 @@ def replay_other(
         )
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class _Arrivals:
-    """Messages of the flight process that the guard had got by one tick."""
-
-    tick: Tick
-    chunk: Chunk | None
-    act: OperatorCommand | None
-    stop: EndRequest | None
-
-    @property
-    def messages(self) -> list[Chunk | OperatorCommand | EndRequest]:
-        return [each for each in (self.chunk, self.act, self.stop) if each is not None]
-
-
-def _arrivals(source: ReplaySource) -> Iterator[_Arrivals]:
-    """Derive the arrivals from each tick.
+def _arrivals(
+    source: ReplaySource,
+) -> Iterator[tuple[Tick, Chunk | None, OperatorCommand | None, EndRequest | None]]:
+    """Yield each tick, and the messages of the flight process that the guard had got by then.
 
     A tick that flies a chunk names it. Before a flight, a chunk counts from the end of its solve.
     """
@@ -180,12 +168,8 @@ def _arrivals(source: ReplaySource) -> Iterator[_Arrivals]:
         newest: Solve | None = None
         while waiting is not None and _is_seen(waiting, tick):
             newest, waiting = waiting, next(solves, None)
-        yield _Arrivals(
-            tick=tick,
-            chunk=None if newest is None else chunk_of(newest, source.contract),
-            act=_act(before, tick, is_called=is_called),
-            stop=_stop(before, tick),
-        )
+        chunk = None if newest is None else chunk_of(newest, source.contract)
+        yield tick, chunk, _act(before, tick, is_called=is_called), _stop(before, tick)
         before = tick
 
 

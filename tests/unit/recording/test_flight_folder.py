@@ -14,7 +14,7 @@ from mavbridge.recording.flight_folder import open_flight
 from mavbridge.recording.flight_writer import FlightWriter
 from mavbridge.recording.folder import prepare_folder
 from mavbridge.recording.meta import FlightError, read_meta, write_meta
-from mavbridge.recording.rows import FrameTruth, TickLabels
+from mavbridge.recording.rows import FrameTruth
 from mavbridge.recording.tlog import open_tlog_pipe
 from policy.contract import (
     Contract,
@@ -76,7 +76,7 @@ def test_a_flight_comes_back(flight: Path) -> None:
 
 
 def test_a_demonstration_has_its_labels(tmp_path: Path) -> None:
-    expert = TickLabels(expert=Sticks(0.25, 0.5, -0.5, 1.0))
+    expert = Sticks(0.25, 0.5, -0.5, 1.0)
     truth = FrameTruth(
         position_ned_m=(1.0, 2.0, -3.0),
         ned_from_body_wxyz=(1.0, 0.0, 0.0, 0.0),
@@ -92,7 +92,7 @@ def test_a_demonstration_has_its_labels(tmp_path: Path) -> None:
     writer.frame(make_frame(0), truth)
     writer.finish(meta)
     back = open_flight(tmp_path)
-    assert [row.labels for row in back.tick_rows()] == [expert]
+    assert [row.expert for row in back.tick_rows()] == [expert]
     assert [row.truth for row in back.frame_rows()] == [truth]
     assert back.meta.conditions == {"wind_mps": 3.5}
     assert not (tmp_path / "link.tlog").exists()

@@ -16,7 +16,6 @@ from mavbridge.recording.rows import (
     TICKS,
     FrameRow,
     FrameTruth,
-    TickLabels,
     TickRow,
     frame_columns,
     read_frames,
@@ -65,8 +64,7 @@ def ticks(draw: st.DrawFn) -> Tick:
     )
 
 
-labels = st.builds(TickLabels, expert=st.none() | sticks)
-tick_rows = st.builds(TickRow, ticks(), st.integers(0, 9), labels)
+tick_rows = st.builds(TickRow, ticks(), st.integers(0, 9), st.none() | sticks)
 truths = st.builds(
     FrameTruth,
     position_ned_m=vectors,
@@ -105,7 +103,7 @@ def test_ticks_come_back_as_they_were(rows: list[TickRow]) -> None:
         serial += 1 + before.dropped_before
         assert same_state(before.tick.state, after.tick.state)
         expected = replace(before.tick, serial=serial, state=after.tick.state)
-        assert after == TickRow(expected, before.dropped_before, before.labels)
+        assert after == TickRow(expected, before.dropped_before, before.expert)
 
 
 @given(st.lists(frame_rows, max_size=8))

@@ -168,7 +168,7 @@ def test_by_body_rates_races_are_demonstrated_and_read_back(
     assert set(column(flight, "mode")) == {
         "GUIDED_NOGPS" if autopilot == "ardupilot" else "OFFBOARD"
     }
-    first, *words = [row.labels.expert for row in flight.tick_rows() if row.labels]
+    first, *words = [row.expert for row in flight.tick_rows()]
     assert first is None or isinstance(first, BodyRates)  # the chunk may be from before
     assert {type(word) for word in words} == {BodyRates}
     data = read_flight(flight.folder)
