@@ -4,8 +4,9 @@ Messages over the pipe between the processes pass the slots on and order the acc
 belongs to the producer until ``Submit`` names it, and again from ``Written`` on.
 """
 
+import mmap
 import os
-from multiprocessing.shared_memory import SharedMemory
+import tempfile
 from pathlib import Path
 from typing import NamedTuple
 
@@ -21,55 +22,54 @@ shared memory."""
 
 
 class RingShape(NamedTuple):
-    """Name and layout of the memory, for the other process."""
+    """Layout of the memory, for the other process. Its file descriptor follows on the pipe."""
 
-    name: str
     slots: int
     height: int
     width: int
-    is_depth: bool = False
+    is_depth: bool
 
     @property
     def frame(self) -> "np.dtype[np.void]":
         """Data type and axes of a frame."""
-        each = (np.uint16, ()) if self.is_depth else (np.uint8, (3,))
-        return np.dtype((each[0], (self.height, self.width, *each[1])))
+        kind, axes = (np.uint16, ()) if self.is_depth else (np.uint8, (3,))
+        return np.dtype((kind, (self.height, self.width, *axes)))
+
+
+def ring_shape(height: int, width: int, *, is_depth: bool = False) -> RingShape:
+    """Return the layout for frames of this size."""
+    slots = MAX_BYTES // RingShape(1, height, width, is_depth).frame.itemsize
+    return RingShape(max(MIN_SLOTS, min(MAX_SLOTS, slots)), height, width, is_depth)
+
+
+def allocate(shape: RingShape) -> int:
+    """Return the descriptor of a file without a name; raise OSError if there is no memory left.
+
+    The memory is freed with its last descriptor, even if both processes are killed. Its pages are
+    allocated now: a page that is unavailable at its first write ends the process.
+    """
+    size_bytes = shape.slots * shape.frame.itemsize
+    shared = Path("/dev/shm")  # noqa: S108 - the system's place for shared memory
+    has_shared = shared.is_dir()
+    with tempfile.TemporaryFile(dir=shared if has_shared else None) as file:
+        if has_shared:
+            os.posix_fallocate(file.fileno(), 0, size_bytes)
+        else:
+            file.truncate(size_bytes)
+        return os.dup(file.fileno())
 
 
 class FrameRing:
     """Slots of one frame each, mapped."""
 
-    def __init__(self, memory: SharedMemory, shape: RingShape) -> None:
-        """Call ``create`` in the producer and ``attach`` in the consumer, not this."""
+    def __init__(self, shape: RingShape, descriptor: int) -> None:
+        """Map the memory, and close the descriptor."""
         self.shape = shape
-        self._memory = memory
-        self._is_linked = False
-        self._frames: CameraImage | None = np.ndarray(shape.slots, shape.frame, memory.buf)
-
-    @classmethod
-    def create(cls, height: int, width: int, *, is_depth: bool = False) -> "FrameRing":
-        """Allocate the memory in the producer; raise OSError if there is not enough."""
-        frame_bytes = height * width * (2 if is_depth else 3)
-        slots = max(MIN_SLOTS, min(MAX_SLOTS, MAX_BYTES // frame_bytes))
-        memory = SharedMemory(create=True, size=slots * frame_bytes)
-        # Allocate the pages now: a page that is unavailable at its first write ends the process.
-        path = Path("/dev/shm") / memory.name.lstrip("/")  # noqa: S108 - where Linux keeps them
         try:
-            if path.exists():
-                with path.open("r+b") as file:
-                    os.posix_fallocate(file.fileno(), 0, memory.size)
-        except OSError:
-            memory.close()
-            memory.unlink()
-            raise
-        ring = cls(memory, RingShape(memory.name, slots, height, width, is_depth))
-        ring._is_linked = True
-        return ring
-
-    @classmethod
-    def attach(cls, shape: RingShape) -> "FrameRing":
-        """Map the memory in the consumer; raise OSError if it is gone."""
-        return cls(SharedMemory(name=shape.name), shape)
+            self._memory = mmap.mmap(descriptor, shape.slots * shape.frame.itemsize)
+        finally:
+            os.close(descriptor)
+        self._frames: CameraImage | None = np.ndarray(shape.slots, shape.frame, self._memory)
 
     def slot(self, index: int) -> CameraImage:
         """Return a view of one slot. Do not keep it beyond ``close``."""
@@ -78,14 +78,7 @@ class FrameRing:
         frame: CameraImage = self._frames[index]
         return frame
 
-    def unlink(self) -> None:
-        """Remove the name, in the producer: the memory is freed even if both are killed."""
-        if self._is_linked:
-            self._is_linked = False
-            self._memory.unlink()
-
     def close(self) -> None:
-        """Unmap the memory and, in the producer, remove the name. Can be called twice."""
+        """Unmap the memory. Can be called twice."""
         self._frames = None
         self._memory.close()
-        self.unlink()

@@ -8,6 +8,7 @@ from contextlib import ExitStack
 from dataclasses import replace
 from multiprocessing.connection import Connection, wait
 from multiprocessing.process import BaseProcess
+from multiprocessing.reduction import send_handle
 from pathlib import Path
 from typing import Literal
 
@@ -15,7 +16,7 @@ from mavbridge.core.errors import MavbridgeError
 from mavbridge.core.records import CameraImage
 from mavbridge.recording.rows import FrameRow
 from mavbridge.recording.tlog import TlogJob
-from mavbridge.recording.video.ring import FrameRing
+from mavbridge.recording.video.ring import FrameRing, allocate, ring_shape
 from mavbridge.recording.video.writer_process import (
     NICENESS,
     Failed,
@@ -139,17 +140,24 @@ class VideoWriter:
 
     def _open(self, rgb: CameraImage) -> FrameRing:
         height, width = rgb.shape[:2]
+        shape = ring_shape(height, width, is_depth=rgb.ndim == 2)
         try:
-            ring = self._ring = FrameRing.create(height, width, is_depth=rgb.ndim == 2)
+            descriptor = allocate(shape)
         except OSError as error:
             self._failure = WriterError(
                 f"no shared memory for frames of {width}x{height}: {error.strerror}; a container "
                 "needs more of it (docker run --shm-size)"
             )
             raise self._failure from error
-        self._resources.callback(ring.close)
-        self._free.extend(range(ring.shape.slots))
-        self._send(ring.shape)
+        try:
+            self._send(shape)
+            send_handle(self._pipe, descriptor, None)
+        except OSError:
+            raise self._died() from None
+        finally:
+            ring = self._ring = FrameRing(shape, descriptor)
+            self._resources.callback(ring.close)
+        self._free.extend(range(shape.slots))
         return ring
 
     def finish(self) -> None:
@@ -192,8 +200,6 @@ class VideoWriter:
                         self._failure = WriterError(reason)
                     case Notice() as notice:
                         self._notices.add(notice)
-                        if notice is Notice.MAPPED and self._ring is not None:
-                            self._ring.unlink()
         except (EOFError, OSError):
             raise self._died() from None
         if self._failure is not None:

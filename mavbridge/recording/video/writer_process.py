@@ -11,6 +11,7 @@ import signal
 from contextlib import suppress
 from enum import Enum, auto
 from multiprocessing.connection import Connection
+from multiprocessing.reduction import recv_handle
 from pathlib import Path
 from typing import NamedTuple, TypeAlias
 
@@ -126,8 +127,6 @@ class Notice(Enum):
     """Sent to the writer: no more frames."""
     READY = auto()
     """Sent by the writer: it runs."""
-    MAPPED = auto()
-    """Sent by the writer: it has mapped the memory, whose name is no longer needed."""
     DONE = auto()
     """Sent by the writer: everything is closed."""
 
@@ -191,13 +190,26 @@ class WriterService:
             if not self._pipe.poll(timeout_s):
                 self._files.flush()
                 return
-            try:
-                message = self._pipe.recv()
-            except (EOFError, ConnectionResetError):  # the producer is gone
-                message = Notice.FINISH
-            self._handle(message)
+            match self._receive():
+                case Submit(slot=slot, row=row) if self._ring is not None:
+                    self._files.append(self._ring.slot(slot), row)
+                    self.send(Written(slot))
+                case Notice.FINISH:
+                    self._files.finish()
+                    self._close()
+                    self.send(Notice.DONE)
         except FILE_ERRORS as error:
             self._fail("video", error)
+
+    def _receive(self) -> ToWriter:
+        """Return the next message, or ``FINISH`` if the producer is gone; open the ring."""
+        try:
+            message = self._pipe.recv()
+            if isinstance(message, RingShape):
+                self._ring = FrameRing(message, recv_handle(self._pipe))
+        except (EOFError, ConnectionResetError):
+            return Notice.FINISH
+        return message
 
     def _fail(self, what: str, error: Exception) -> None:
         self.has_failed = True
@@ -205,21 +217,6 @@ class WriterService:
         self._close()
         reason = getattr(error, "strerror", None) or error
         self.send(Failed(f"the {what} cannot be written: {self._folder}: {reason}"))
-
-    def _handle(self, message: ToWriter) -> None:
-        match message:
-            case RingShape():
-                self._ring = FrameRing.attach(message)
-                self.send(Notice.MAPPED)
-            case Submit(slot=slot, row=row):
-                if self._ring is None:
-                    raise RuntimeError("a frame came before the ring was opened")
-                self._files.append(self._ring.slot(slot), row)
-                self.send(Written(slot))
-            case Notice.FINISH:
-                self._files.finish()
-                self._close()
-                self.send(Notice.DONE)
 
     def _close(self) -> None:
         self.is_open = False

@@ -60,9 +60,7 @@ def test_offline_nothing_is_dropped_and_rows_match_frames(tmp_path: Path) -> Non
 
 def test_a_video_alone_needs_no_table(tmp_path: Path) -> None:
     with closing(VideoWriter(tmp_path / "rollout.mp4", pressure="offline", hz=10)) as video:
-        submit(video, 40)  # more than a ring: the writer has mapped it by now
-        name = video._ring.shape.name
-        assert not (Path("/dev/shm") / name).exists(), "nothing stays, whoever is killed"
+        submit(video, 40)
         video.finish()
     assert [path.name for path in tmp_path.iterdir()] == ["rollout.mp4"]
     assert [number_of(rgb) for rgb in read_video(tmp_path / "rollout.mp4")] == list(range(40))
