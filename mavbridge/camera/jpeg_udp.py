@@ -103,25 +103,19 @@ class FrameAssembler:
         if chunk not in frame.parts:
             frame.parts[chunk] = payload
             frame.size_bytes += length
-        return self._kept(frame, arrived_ns)
-
-    def _kept(self, frame: Assembly, now_ns: int) -> Assembly | None:
-        """Return a whole frame and drop older ones, or keep an incomplete frame."""
-        key, is_whole = frame.key, len(frame.parts) == frame.key.chunks
-        if frame.size_bytes > key.size_bytes or (is_whole and frame.size_bytes < key.size_bytes):
+        is_whole = len(frame.parts) == chunks
+        if frame.size_bytes > size_bytes or (is_whole and frame.size_bytes < size_bytes):
             self.malformed += 1
             return None
-        kept = self._partial
         if is_whole:
-            self._last, self._whole_ns = key, now_ns
-            kept = {key: each for key, each in kept.items() if self._is_news(key, now_ns)}
+            self._last, self._whole_ns = key, arrived_ns
+            given_up = [each for each in self._partial if not self._is_news(each, arrived_ns)]
         else:
-            kept[key] = frame
-        while len(kept) > MAX_PARTIAL:
-            del kept[next(iter(kept))]
-            self.incomplete += 1
-        self.incomplete += len(self._partial) - len(kept)
-        self._partial = kept
+            self._partial[key] = frame
+            given_up = [*self._partial][:-MAX_PARTIAL]
+        for each in given_up:
+            del self._partial[each]
+        self.incomplete += len(given_up)
         return frame if is_whole else None
 
     def _is_news(self, key: FrameKey, now_ns: int) -> bool:

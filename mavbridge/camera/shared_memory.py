@@ -92,8 +92,7 @@ class SharedMemoryCamera:
 
     def close(self) -> None:
         """Unmap the file; it belongs to the writer and stays."""
-        if self._segment is not None:
-            self._segment.close()
+        self._segment = None
 
     def _take(self) -> Frame | None:
         """Return the newest frame if it is new, complete and recent, else None."""
@@ -125,12 +124,9 @@ class SharedMemoryCamera:
             status = self._path.stat()
         except FileNotFoundError:
             return
-        replaced = self._segment
-        if replaced is not None and os.path.samestat(status, replaced.status):
+        if self._segment is not None and os.path.samestat(status, self._segment.status):
             return
         self._segment = _Segment(self._path)
-        if replaced is not None:
-            replaced.close()
         self._first_id += self._seen_id
         self._seen_id = max(0, self._segment.newest_id() - 1)
 
@@ -193,12 +189,6 @@ class _Segment:
         """True if the writer has ended."""
         return bool(self._header[STATE] == CLOSED)
 
-    def close(self) -> None:
-        """Unmap the file, after the views of it."""
-        self._slots = self._slots[:0].copy()
-        self._header = np.array([0, 0, 0, 0, CLOSED], np.int64)
-        self._map.close()
-
 
 def memory_barrier() -> None:
     """Order earlier loads before later ones.
@@ -207,19 +197,6 @@ def memory_barrier() -> None:
     """
     with threading.Lock():
         pass
-
-
-def _slot_type(width: int, height: int, channels: int) -> np.dtype[np.void]:
-    kind, axes = PIXELS[channels]
-    pixels = np.dtype((kind, (height, width, *axes)))
-    return np.dtype(
-        {
-            "names": ["seq", "frame_id", "captured_ns", "rgb"],
-            "formats": ["<i8", "<i8", "<i8", pixels],
-            "offsets": [0, 8, 16, SLOT_HEADER_BYTES],
-            "itemsize": -(-(SLOT_HEADER_BYTES + pixels.itemsize) // 64) * 64,
-        }
-    )
 
 
 def _checked_slot(name: str, header: bytes, file_bytes: int) -> np.dtype[np.void]:
@@ -234,13 +211,22 @@ def _checked_slot(name: str, header: bytes, file_bytes: int) -> np.dtype[np.void
         )
     if not (0 < width <= MAX_SIDE_PX and 0 < height <= MAX_SIDE_PX):
         raise CameraError(f"shm:{name}: impossible frame size {width}x{height}")
-    slot = _slot_type(width, height, channels)
-    expected_bytes = HEADER_BYTES + SLOTS * slot.itemsize
-    if file_bytes != expected_bytes:
+    kind, axes = PIXELS[channels]
+    pixels = np.dtype((kind, (height, width, *axes)))
+    slot_bytes = -(-(SLOT_HEADER_BYTES + pixels.itemsize) // 64) * 64
+    if file_bytes != HEADER_BYTES + SLOTS * slot_bytes:
         raise CameraError(
-            f"shm:{name}: {width}x{height} frames take {expected_bytes} bytes, it has {file_bytes}"
+            f"shm:{name}: {width}x{height} frames take {HEADER_BYTES + SLOTS * slot_bytes} bytes, "
+            f"it has {file_bytes}"
         )
-    return slot
+    return np.dtype(
+        {
+            "names": ["seq", "frame_id", "captured_ns", "rgb"],
+            "formats": ["<i8", "<i8", "<i8", pixels],
+            "offsets": [0, 8, 16, SLOT_HEADER_BYTES],
+            "itemsize": slot_bytes,
+        }
+    )
 
 
 def _absent(path: Path) -> str:
