@@ -1,8 +1,8 @@
 """Tables that survive a crash: Arrow IPC streams while they grow, Parquet when complete."""
 
-from collections.abc import Iterator
+from collections.abc import Iterable
 from pathlib import Path
-from typing import IO, Any, TypeAlias
+from typing import Any, TypeAlias
 
 import numpy as np
 import pyarrow as pa
@@ -60,49 +60,39 @@ class TableWriter:
         self._writer.write_batch(pa.RecordBatch.from_pylist(rows, schema=self._schema))
 
     def finish(self) -> None:
-        """Close the stream and replace it by Parquet; if the disk is full, keep the stream."""
+        """Close the stream and replace it by Parquet, in constant memory.
+
+        If that cannot be written, the stream stays.
+        """
         self.flush()
         self._writer.close()
         self._sink.close()
-        to_parquet(self._stream, self._parquet)
+        part = self._parquet.with_suffix(".parquet.part")
+        try:
+            with self._stream.open("rb") as file:
+                self._write_parquet(pa.ipc.open_stream(file), part)
+            part.replace(self._parquet)
+        except OSError:
+            part.unlink(missing_ok=True)
+            raise
+        self._stream.unlink()
+
+    def _write_parquet(self, batches: Iterable[pa.RecordBatch], path: Path) -> None:
+        """Join small batches: a row group each would make the file larger than the stream."""
+        options: dict[str, Any] = {"compression": "zstd", "write_page_checksum": True}
+        group: list[pa.RecordBatch] = []
+        with pq.ParquetWriter(library_name(path), self._schema, **options) as writer:
+            for batch in batches:
+                group.append(batch)
+                if sum(each.num_rows for each in group) >= _GROUP_ROWS:
+                    writer.write_table(pa.Table.from_batches(group).combine_chunks())
+                    group.clear()
+            if group:
+                writer.write_table(pa.Table.from_batches(group).combine_chunks())
 
     def abandon(self) -> None:
         """Leave the stream as it is, after an error."""
         self._sink.close()
-
-
-def to_parquet(stream: Path, parquet: Path) -> None:
-    """Replace an Arrow stream by a Parquet file of its complete batches, in constant memory.
-
-    If that cannot be written, raise OSError and keep the stream.
-    """
-    part = parquet.with_suffix(".parquet.part")
-    try:
-        with stream.open("rb") as file:
-            schema, batches = _whole_batches(file)
-            options: dict[str, Any] = {"compression": "zstd", "write_page_checksum": True}
-            with pq.ParquetWriter(library_name(part), schema, **options) as writer:
-                for table in _groups(schema, batches):
-                    writer.write_table(table)
-        part.replace(parquet)
-    except OSError:
-        part.unlink(missing_ok=True)
-        raise
-    stream.unlink()
-
-
-def _groups(schema: pa.Schema, batches: Iterator[pa.RecordBatch]) -> Iterator[pa.Table]:
-    """Join small batches: one row group per batch would make the file larger than the stream."""
-    group: list[pa.RecordBatch] = []
-    rows = 0
-    for batch in batches:
-        group.append(batch)
-        rows += batch.num_rows
-        if rows >= _GROUP_ROWS:
-            yield pa.Table.from_batches(group, schema).combine_chunks()
-            group, rows = [], 0
-    if group:
-        yield pa.Table.from_batches(group, schema).combine_chunks()
 
 
 def read_table(stem: Path, schema: pa.Schema, *, damage: list[str] | None = None) -> pa.Table:
@@ -145,17 +135,3 @@ def read_numbered(
             "of docs/formats.md: another program or version wrote it"
         )
     return table, numbers
-
-
-def _whole_batches(file: IO[bytes]) -> tuple[pa.Schema, Iterator[pa.RecordBatch]]:
-    reader = pa.ipc.open_stream(file)
-
-    def batches() -> Iterator[pa.RecordBatch]:
-        while True:
-            try:
-                batch = reader.read_next_batch()
-            except (StopIteration, pa.ArrowInvalid, OSError):
-                return  # end of file, or the point at which the writer was killed
-            yield batch
-
-    return reader.schema, batches()
