@@ -78,12 +78,17 @@ def test_rows_keep_their_images_where_the_video_is_damaged(flight: Path) -> None
 
 
 def test_a_stream_that_is_cut_off_is_told(tmp_path: Path) -> None:
-    folder = write_recording(tmp_path / "flight", map(make_tick, range(1000)), finish=False)
+    folder = write_recording(
+        tmp_path / "flight",
+        [*map(make_frame, range(5)), *map(make_tick, range(1000))],
+        finish=False,
+    )
     stream = folder / "ticks.arrows"
     stream.write_bytes(stream.read_bytes()[:-100])
     whole = open_flight(folder)
     assert 0 < whole.ticks.num_rows < 1000
     assert any("ticks.arrows" in text for text in whole.damage)
+    assert len(read_flight(folder).tick_ns) == whole.ticks.num_rows
 
 
 @pytest.mark.parametrize(

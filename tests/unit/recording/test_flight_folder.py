@@ -193,6 +193,8 @@ def _as_stream(stem: str) -> Callable[[Path], object]:
         (_meta(version=2), "has version 2 of the format, this build reads 1"),
         (_meta(contract={"horizon": 0}), "horizon must be an integer"),
         (_meta(source="dream"), "source 'dream'"),
+        (_meta(outcome={"end": "duration"}), "incomplete or damaged"),
+        (_meta(outcome="good"), "incomplete or damaged"),
         (_meta(start_ns="now"), "start_ns is 'now', not a number"),
     ],
 )

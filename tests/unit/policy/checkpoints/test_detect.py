@@ -2,7 +2,6 @@
 
 import io
 import json
-import os
 import struct
 import zipfile
 from collections.abc import Callable
@@ -20,12 +19,6 @@ from policy.loading.request import PolicyRequest
 ACT = json.dumps({"type": "act", "input_features": {}, "output_features": {}})
 PI0 = json.dumps({"type": "pi0", "input_features": {}, "output_features": {}})
 SAFETENSORS, TORCH = "model.safetensors", "model.pt"
-
-
-def test_a_pipe_is_refused_and_not_waited_for(tmp_path: Path) -> None:
-    os.mkfifo(tmp_path / TORCH)
-    with pytest.raises(CheckpointError, match="not a file but a pipe or a device"):
-        read_contract(tmp_path / TORCH)
 
 
 def tensors(*names: str, dtype: torch.dtype = torch.float32) -> dict[str, torch.Tensor]:

@@ -4,7 +4,6 @@ from typing import Any
 
 import numpy as np
 import pyarrow as pa
-import pyarrow.parquet as pq
 import pytest
 
 from helpers.flight_folders import (
@@ -14,7 +13,6 @@ from helpers.flight_folders import (
     ticks_table,
     write_flight,
     write_meta,
-    write_spot_flight,
 )
 from policy.contract import Contract
 from policy.data.flight_data import DatasetError, hold_out
@@ -86,23 +84,6 @@ def test_after_a_takeover_the_pilots_sticks_alone_are_imitated(tmp_path: Path, e
     np.testing.assert_allclose(episode.target, [pilots] * 2 if is_corrected else [STICK])
     after = pilots if is_corrected else (0.0,) * 4
     np.testing.assert_allclose(episode.sent, [STICK, after, after])
-
-
-def test_a_flight_left_behind_by_a_crash_is_read_to_its_last_whole_batch(tmp_path: Path) -> None:
-    folder = write_spot_flight(tmp_path / "a", 0, seconds=0.5)
-    for stem in ("ticks", "frames"):
-        table = pq.read_table(folder / f"{stem}.parquet")
-        (folder / f"{stem}.parquet").unlink()
-        with pa.OSFile(str(folder / f"{stem}.arrows"), "wb") as file:
-            writer = pa.ipc.new_stream(file, table.schema)
-            for batch in table.to_batches(max_chunksize=10):
-                writer.write_batch(batch)
-            file.flush()
-        whole = (folder / f"{stem}.arrows").read_bytes()
-        (folder / f"{stem}.arrows").write_bytes(whole[:-40])
-    episode = read_flight(folder)
-    assert len(episode.tick_ns) == 40  # of 50
-    assert len(episode.captured_ns) == 10  # of 15
 
 
 def test_failed_flights_are_left_out_and_counted_unless_they_are_asked_for(tmp_path: Path) -> None:

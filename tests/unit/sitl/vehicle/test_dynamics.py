@@ -59,12 +59,3 @@ def test_euler_angles_survive_the_quaternion(roll, pitch, yaw):
     again = rotation.to_euler(rotation.from_euler(roll, pitch, yaw))
 
     assert again == pytest.approx((roll, pitch, yaw), abs=1e-6)
-
-
-@given(roll=angle, pitch=pitch, yaw=angle)
-def test_rotating_there_and_back_changes_nothing(roll, pitch, yaw):
-    q = rotation.from_euler(roll, pitch, yaw)
-
-    back = rotation.rotate(rotation.conjugate(q), rotation.rotate(q, (1.0, -2.0, 3.0)))
-
-    assert back == pytest.approx((1.0, -2.0, 3.0), abs=1e-9)
