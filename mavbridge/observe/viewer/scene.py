@@ -2,7 +2,6 @@
 
 import math
 from collections.abc import Sequence
-from typing import NamedTuple
 
 import cv2
 import numpy as np
@@ -20,49 +19,28 @@ from mavbridge.core.records import (
     VehicleState,
     VisionTick,
 )
-from mavbridge.core.rotation import Quaternion, heading_rad, roll_pitch_rad
-from mavbridge.core.vehicle import Action, Sticks, Velocity
+from mavbridge.core.rotation import Quaternion, heading_rad
+from mavbridge.core.vehicle import Action
 from mavbridge.observe.viewer import layout
 from mavbridge.observe.viewer.layout import ViewedFlight
 from mavbridge.observe.viewer.plots import Columns
-from policy.contract import QUATERNION, SPECIFIC_FORCE, VELOCITY, Contract, StateFrame
-from policy.stick_loop import motion_of_sticks
-
-_HALF_SQRT2 = math.sqrt(0.5)
+from policy.contract import QUATERNION, RATE, SPECIFIC_FORCE, VELOCITY, StateFrame
+from policy.forward_motion import ForwardMotion, VehicleMotion
 
 
-class SceneMotion(NamedTuple):
-    """Attitude, velocity and acceleration at one time."""
-
-    ned_from_body_wxyz: Quaternion
-    velocity_ned_mps: tuple[float, float, float]
-    specific_force_body_mps2: tuple[float, float, float]
-
-    @staticmethod
-    def of(state: VehicleState, frame: StateFrame) -> "SceneMotion":
-        """Return the motion that a state in this frame describes."""
-        vx, vy, vz = state.values[VELOCITY].tolist()
-        w, x, y, z = state.values[QUATERNION].tolist()
-        fx, fy, fz = state.values[SPECIFIC_FORCE].tolist()
-        if frame == "ned_frd":
-            return SceneMotion((w, x, y, z), (vx, vy, vz), (fx, fy, fz))
-        # From NED/FRD to ENU/FLU (REP 103) is its own inverse: half turns about the diagonal
-        # between north and east, and about the nose.
-        r = _HALF_SQRT2
-        attitude = (r * (w + z), r * (x + y), r * (x - y), r * (w - z))
-        return SceneMotion(attitude, (vy, vx, -vz), (fx, -fy, -fz))
-
-    @property
-    def horizontal_mps2(self) -> NDArray[np.float64]:
-        """Acceleration towards north and east, [2], without gravity."""
-        w, x, y, z = self.ned_from_body_wxyz
-        horizontal_from_body = np.array(
-            [
-                [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
-                [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
-            ]
-        )
-        return np.asarray(horizontal_from_body @ np.array(self.specific_force_body_mps2))
+def motion_of(state: VehicleState, frame: StateFrame) -> VehicleMotion:
+    """Return the motion that a state in this frame describes, in NED and FRD."""
+    vx, vy, vz = state.values[VELOCITY].tolist()
+    w, x, y, z = state.values[QUATERNION].tolist()
+    p, q, r = state.values[RATE].tolist()
+    fx, fy, fz = state.values[SPECIFIC_FORCE].tolist()
+    if frame == "ned_frd":
+        return VehicleMotion((w, x, y, z), (p, q, r), (vx, vy, vz), (fx, fy, fz))
+    # From NED/FRD to ENU/FLU (REP 103) is its own inverse: half turns about the diagonal between
+    # north and east, and about the nose.
+    h = math.sqrt(0.5)
+    attitude = (h * (w + z), h * (x + y), h * (x - y), h * (w - z))
+    return VehicleMotion(attitude, (p, -q, -r), (vy, vx, -vz), (fx, -fy, -fz))
 
 
 JPEG_QUALITY = 85
@@ -120,9 +98,7 @@ class SceneView:
                 shown.append(tick)
         if not shown:
             return
-        motions = [
-            SceneMotion.of(tick.state, self._frame) for tick in shown if tick.state is not None
-        ]
+        motions = [motion_of(tick.state, self._frame) for tick in shown if tick.state is not None]
         stamps_ns = [tick.woke_ns for tick in shown]
         self._show_path(shown)
         places, last = [], self._last_place or layout.ORIGIN
@@ -233,8 +209,8 @@ def _jpeg(rgb: ImageArray) -> bytes:
     return encoded.tobytes()
 
 
-GRAVITY_MPS2 = 9.81
-_STEEPEST_RAD = math.radians(80)
+PREDICTION_S = 0.01
+"""Step of the prediction of a planned path."""
 
 
 class PlanView:
@@ -242,7 +218,8 @@ class PlanView:
 
     def __init__(self, columns: Columns, flight: ViewedFlight) -> None:
         self._columns = columns
-        self._contract = flight.contract
+        self._frame = flight.contract.state_frame
+        self._model = ForwardMotion(flight.contract)
         self._to_ned = flight.to_ned
         self._lanes = layout.plan_plots(flight.contract.action)
         self._next_ns = 0
@@ -261,55 +238,19 @@ class PlanView:
         for axis, plot in enumerate(lane):
             values = [*(action[axis] for action in actions), math.nan]  # the gap ends this line
             self._columns.plot(plot, stamps_ns, [(value,) for value in values])
-        path = planned_path(solve, actions, self._contract)
-        if position is not None and path is not None:
-            strips = rr.LineStrips3D.columns(strips=[path + np.array(position)])
+        if position is not None:
+            strips = rr.LineStrips3D.columns(strips=[self._path(solve, actions) + position])
             self._columns.send(layout.PLANNED_PATH, [solve.computed_ns], strips)
 
-
-def planned_path(
-    solve: Solve, actions: tuple[Action, ...], contract: Contract
-) -> NDArray[np.float64] | None:
-    """Return the planned path [1 + horizon, 3] from the vehicle in NED metres.
-
-    Velocities are followed at once. Sticks are leans, climb and yaw rate by the contract's gains,
-    also followed at once. Acceleration beyond that of the present lean, such as drag, is held. None
-    for actions of other kinds.
-    """
-    motion = SceneMotion.of(solve.state, contract.state_frame)
-    yaw_rad, step_s = heading_rad(motion.ned_from_body_wxyz), solve.step_ns / NS_PER_S
-    lean_rad = roll_pitch_rad(motion.ned_from_body_wxyz)
-    beyond_mps2 = motion.horizontal_mps2 - _lean_mps2(*lean_rad, yaw_rad)
-    velocity = np.array(motion.velocity_ned_mps)
-    path = [np.zeros(3)]
-    for action in actions:
-        if isinstance(action, Velocity):
-            velocity = np.array(action[:3])
-            if contract.velocity_frame != "world":
-                velocity[:2] = _turned(velocity[0], velocity[1], yaw_rad)
-            yaw_rad += action.yaw_rate_radps * step_s
-        elif isinstance(action, Sticks):
-            wanted = motion_of_sticks(contract, *action)
-            yaw_rad += wanted.yaw_rate_radps * step_s
-            lean_mps2 = _lean_mps2(wanted.right_rad, -wanted.forward_rad, yaw_rad)
-            velocity[:2] += (lean_mps2 + beyond_mps2) * step_s
-            velocity[2] = -wanted.climb_mps
-        else:
-            return None
-        path.append(path[-1] + velocity * step_s)
-    return np.array(path)
-
-
-def _lean_mps2(roll_rad: float, pitch_rad: float, yaw_rad: float) -> NDArray[np.float64]:
-    """Return acceleration to north and east [m/s^2] of a vehicle that leans at constant height."""
-    roll_rad, pitch_rad = (
-        max(-_STEEPEST_RAD, min(lean, _STEEPEST_RAD)) for lean in (roll_rad, pitch_rad)
-    )
-    forward, right = -math.tan(pitch_rad), math.tan(roll_rad) / math.cos(pitch_rad)
-    return GRAVITY_MPS2 * _turned(forward, right, yaw_rad)
-
-
-def _turned(forward: float, right: float, yaw_rad: float) -> NDArray[np.float64]:
-    """Rotate a level vector from heading axes to north and east."""
-    sine, cosine = math.sin(yaw_rad), math.cos(yaw_rad)
-    return np.array([forward * cosine - right * sine, forward * sine + right * cosine])
+    def _path(self, solve: Solve, actions: Sequence[Action]) -> NDArray[np.float64]:
+        """Return the planned path [1 + horizon, 3] from the vehicle in NED metres."""
+        motion, step_s = motion_of(solve.state, self._frame), solve.step_ns / NS_PER_S
+        count = math.ceil(step_s / PREDICTION_S)
+        path = [np.zeros(3)]
+        for action in actions:
+            place = path[-1]
+            for _ in range(count):
+                motion = self._model.after(motion, [action], step_s / count)
+                place = place + np.array(motion.velocity_ned_mps) * (step_s / count)
+            path.append(place)
+        return np.array(path)

@@ -24,7 +24,7 @@ from helpers.factories import (
 from mavbridge.core.clock import NS_PER_MS
 from mavbridge.core.course import CourseGate
 from mavbridge.core.reasons import Code, because
-from mavbridge.core.records import Observed, Position, Solve
+from mavbridge.core.records import Observed, Position, Solve, VehicleState
 from mavbridge.core.vehicle import ActionKind, ActionTrace, Sticks
 from mavbridge.flight.action_frames import action_frame
 from mavbridge.observe.viewer import layout
@@ -35,6 +35,7 @@ from mavbridge.observe.viewer.layout import (
     styles,
 )
 from policy.contract import Contract
+from policy.stick_loop import GRAVITY_MPS2
 
 CAMERA = "/scene/chase/vehicle/front"
 
@@ -401,20 +402,38 @@ def test_chunks_that_nobody_flies_are_not_shown(rrd: Path) -> None:
     assert "/sticks/throttle/plan/0" not in seen.columns
 
 
+def in_motion(*, lean_deg: float = 0.0, north_mps: float, down_mps: float) -> VehicleState:
+    """A vehicle that leans forward by the thrust that holds it."""
+    half_rad = math.radians(lean_deg) / 2
+    attitude = (math.cos(half_rad), 0.0, -math.sin(half_rad), 0.0)
+    force = (0.0, 0.0, -GRAVITY_MPS2 / math.cos(2 * half_rad))
+    values = np.array((north_mps, 0, down_mps, *attitude, 0, 0, 0, *force), np.float32)
+    return make_state(START_NS, values=values)
+
+
 def test_a_chunk_of_velocities_is_a_path_from_the_vehicle(rrd: Path) -> None:
     contract = Contract(action="velocity")
     tick = make_tick(0, position_ned_m=Position(1.0, 2.0, -3.0))
-    solve = make_solve(0, [[2.0, 0.0, -1.0, 0.0]] * 2)
+    state = in_motion(north_mps=2.0, down_mps=-1.0)
+    solve = make_solve(0, [[2.0, 0.0, -1.0, 0.0]] * 2, state=state)
     seen = show(rrd, [tick, solve], flight=viewed(contract))
     assert np.allclose(
         strips(seen, "scene/planned"), [[[1, 2, -3], [1.1, 2, -3.05], [1.2, 2, -3.1]]]
     )
 
 
-def test_sticks_become_the_path_of_the_leans_that_they_mean(rrd: Path) -> None:
-    contract = Contract(lean_dead_zone=0.0, throttle_dead_zone=0.0, full_lean_deg=45.0)
+@pytest.mark.parametrize("action", ["sticks", "attitude"])
+def test_actions_become_the_path_of_the_leans_that_they_mean(rrd: Path, action: Any) -> None:
+    contract = Contract(
+        action=action, lean_dead_zone=0.0, throttle_dead_zone=0.0, full_lean_deg=45.0
+    )
     tick = make_tick(0, position_ned_m=Position(0.0, 0.0, 0.0))
-    forward = [[1.0, 0.0, 1.0, 0.0]] * 20  # full climb, 45 degrees nose down, for a second
-    seen = show(rrd, [tick, make_solve(0, forward)], flight=viewed(contract))
-    end = strips(seen, "scene/planned")[0][-1]
+    thrust = contract.hover_thrust * math.sqrt(2)
+    forward = {
+        "sticks": [1.0, 0.0, 1.0, 0.0],  # full climb, 45 degrees nose down
+        "attitude": [thrust, 0.0, -math.radians(45.0), 0.0],
+    }[action]
+    state = in_motion(lean_deg=45.0, north_mps=0.0, down_mps=-contract.full_climb_mps)
+    seen = show(rrd, [tick, make_solve(0, [forward] * 20, state=state)], flight=viewed(contract))
+    end = strips(seen, "scene/planned")[0][-1]  # after a second
     assert end == pytest.approx([9.81 / 2, 0, -contract.full_climb_mps], rel=0.06, abs=1e-6)
