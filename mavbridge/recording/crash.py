@@ -3,8 +3,10 @@
 import math
 
 from mavbridge.core.clock import NS_PER_MS, NS_PER_S
-from mavbridge.core.records import FloatArray, Tick
+from mavbridge.core.records import Tick
+from mavbridge.core.rotation import tilt_rad
 from mavbridge.core.vehicle import VehicleText, recorded_text
+from policy.contract import QUATERNION
 
 OVERTURNED_NS = 500 * NS_PER_MS
 """Shortest time armed beyond 90 degrees of tilt that counts as a crash; a flip takes less."""
@@ -41,7 +43,11 @@ class CrashWatch:
         return None
 
     def _overturned(self, tick: Tick) -> str | None:
-        if tick.state is None or not tick.armed or not _is_overturned(tick.state.values[3:7]):
+        if (
+            tick.state is None
+            or not tick.armed
+            or tilt_rad(tick.state.values[QUATERNION].tolist()) <= math.pi / 2
+        ):
             self._over_since_ns = None
             return None
         if self._over_since_ns is None:
@@ -60,9 +66,3 @@ class CrashWatch:
         if not is_soon or speed_mps < FALL_MPS:
             return None
         return f"it was disarmed in the air, and moved at {speed_mps:.1f} m/s"
-
-
-def _is_overturned(wxyz: FloatArray) -> bool:
-    """True beyond 90 degrees between the body's down and the world's. In NED/FRD and in ENU/FLU the
-    cosine is 1 - 2 (x^2 + y^2)."""
-    return bool(wxyz[1] ** 2 + wxyz[2] ** 2 > 0.5)

@@ -4,6 +4,7 @@ import math
 from bisect import bisect_left
 from collections.abc import Iterable, Sequence
 from itertools import groupby, pairwise
+from statistics import median
 from typing import Any
 
 import numpy as np
@@ -87,9 +88,7 @@ class Spread:
         pairs = zip(stamps_ns, values_ns, strict=True)
         for _, window in groupby(pairs, key=lambda pair: (pair[0] - start_ns) // WINDOW_NS):
             stamps, values = zip(*window, strict=True)
-            ordered = sorted(values)
-            middle = (ordered[(len(ordered) - 1) // 2] + ordered[len(ordered) // 2]) / 2
-            row = [value / NS_PER_MS for value in (ordered[0], ordered[-1], middle)]
+            row = [value / NS_PER_MS for value in (min(values), max(values), median(values))]
             self._columns.plot(self._plot, stamps[-1:], [[*row, self._bound_ms]])
 
 

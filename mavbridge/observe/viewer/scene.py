@@ -26,6 +26,7 @@ from mavbridge.observe.viewer.layout import ViewedFlight
 from mavbridge.observe.viewer.plots import Columns
 from policy.contract import QUATERNION, RATE, SPECIFIC_FORCE, VELOCITY, StateFrame
 from policy.forward_motion import ForwardMotion, VehicleMotion
+from policy.rotation import conjugate, multiply
 
 
 def motion_of(state: VehicleState, frame: StateFrame) -> VehicleMotion:
@@ -155,11 +156,10 @@ class SceneView:
 
 def _turn_and_lean(ned_from_body_wxyz: Quaternion) -> tuple[Quaternion, Quaternion]:
     """Return the heading, and the lean in the turned axes; both xyzw, the viewer's order."""
-    w, x, y, z = ned_from_body_wxyz
     half_rad = heading_rad(ned_from_body_wxyz) / 2
-    c, s = math.cos(half_rad), math.sin(half_rad)
-    lean = (c * x + s * y, c * y - s * x, c * z - s * w, c * w + s * z)
-    return (0.0, 0.0, s, c), lean
+    turn = (math.cos(half_rad), 0.0, 0.0, math.sin(half_rad))
+    w, x, y, z = multiply(conjugate(turn), ned_from_body_wxyz)
+    return (0.0, 0.0, turn[3], turn[0]), (x, y, z, w)
 
 
 def _airframe() -> rr.LineStrips3D:

@@ -1,5 +1,6 @@
 """Comparison of a replay with the recording, bit for bit."""
 
+from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import TypeAlias
@@ -94,8 +95,8 @@ def deviation_of(difference: Array) -> Deviation:
 
 def compare_policy(pairs: Iterable[SolvePair]) -> PolicyComparison:
     """Compare inputs and results of all solves."""
-    missing: dict[str, int] = {}
-    inputs: dict[str, int] = {}
+    missing: Counter[str] = Counter()
+    inputs: Counter[str] = Counter()
     sentences: dict[object, str] = {}
     """First sentence of each reason; later ones differ only by their figures."""
     differences: list[Array] = []
@@ -104,27 +105,22 @@ def compare_policy(pairs: Iterable[SolvePair]) -> PolicyComparison:
         solves += 1
         if pair.replayed is None:
             reason = pair.refusal or because(Code.NO_CHUNK)
-            _count(missing, sentences.setdefault(reason.key, str(reason)))
+            missing[sentences.setdefault(reason.key, str(reason))] += 1
             continue
-        for name in _other_inputs(pair):
-            _count(inputs, name)
+        inputs.update(_other_inputs(pair))
         one, other = pair.recorded.actions, pair.replayed.actions
         if one.shape != other.shape:
-            _count(missing, f"its chunk has {other.shape[1]} actions instead of {one.shape[1]}")
+            missing[f"its chunk has {other.shape[1]} actions instead of {one.shape[1]}"] += 1
             continue
         equal += one.tobytes() == other.tobytes()
         differences.append(np.abs(one[0].astype(np.float64) - other[0]))
     return PolicyComparison(
         solves=solves,
-        missing=missing,
-        inputs_differ=inputs,
+        missing=dict(missing),
+        inputs_differ=dict(inputs),
         equal_chunks=equal,
         deviation=deviation_of(np.concatenate([np.zeros((0, 4)), *differences])),
     )
-
-
-def _count(counts: dict[str, int], name: str) -> None:
-    counts[name] = counts.get(name, 0) + 1
 
 
 def _other_inputs(pair: SolvePair) -> list[str]:
@@ -153,16 +149,16 @@ def compare_guard(steps: Sequence[GuardStep]) -> GuardComparison:
 
     The first pass only reads the settings, and decides nothing.
     """
-    differ: dict[str, int] = {}
+    differ: Counter[str] = Counter()
     first: str | None = None
     for number, step in enumerate(steps):
         for name in _other_results(step):
-            _count(differ, name)
+            differ[name] += 1
             first = first or f"{name} of tick {number} ({step.recorded.phase})"
     return GuardComparison(
         steps=len(steps),
         flown=sum(step.recorded.trace is not None for step in steps),
-        differ=differ,
+        differ=dict(differ),
         first=first,
         deviation=guard_traces(steps).deviation,
     )

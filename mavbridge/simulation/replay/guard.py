@@ -184,7 +184,8 @@ def _act(before: Tick | None, tick: Tick, *, is_called: bool) -> OperatorCommand
     was = None if before is None else before.phase
     if is_called and was in ("waiting", "released") and tick.phase in ("preparing", "flying"):
         return "engage"
-    if tick.phase != was and _code(tick) is Code.OPERATOR and was in ("preparing", "flying"):
+    is_ended = was in ("preparing", "flying") and tick.phase != was
+    if is_ended and tick.release_reason and tick.release_reason.code is Code.OPERATOR:
         return "release"
     return None
 
@@ -200,10 +201,6 @@ def _stop(before: Tick | None, tick: Tick) -> EndRequest | None:
     if tick.phase == Phase.ENDED.value != was:  # the second of two stops has no effect
         return EndRequest(reason=because(Code.SIGNAL))
     return None
-
-
-def _code(tick: Tick) -> Code | None:
-    return None if tick.release_reason is None else tick.release_reason.code
 
 
 class _WatchedLink(MavlinkLink):

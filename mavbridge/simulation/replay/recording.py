@@ -1,6 +1,6 @@
 """Contents of a recorded flight that a replay needs."""
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import NamedTuple
@@ -97,8 +97,11 @@ def open_source(folder: Path) -> ReplaySource:
     stamps = list(read_packets(read_table(folder / PACKETS, replay_tables.PACKETS, damage=damage)))
     offset_ns, system = settings.wall_offset_ns, config.link.source_system
     skipped = Skipped()
-    log = read_tlog(folder / TLOG, skipped)
-    packets = list(_received(log, stamps, offset_ns=offset_ns, own_system=system))
+    log = list(read_tlog(folder / TLOG, skipped))
+    received = [each for each in log if each[1].source.system != system]
+    asked = [packet for _, packet in log if packet.source.system == system]
+    packets = tuple(_packets(received, stamps, offset_ns))
+    cameras = (None, *meta.contract.cameras[1:]) if meta.mode == "dual" else ()
     return ReplaySource(
         folder=folder,
         meta=meta,
@@ -106,9 +109,20 @@ def open_source(folder: Path) -> ReplaySource:
         config=config,
         ticks=tuple(row.tick for row in ticks),
         solves=tuple(row.solve for row in solve_rows),
-        features=_features(folder, meta, meta.contract, damage),
-        packets=tuple(packets),
-        known_params=frozenset(_asked_params(folder / TLOG, system)),
+        features=tuple(
+            tuple(
+                read_features(
+                    read_table(folder / features_of(name), replay_tables.FEATURES, damage=damage)
+                )
+            )
+            for name in cameras
+        ),
+        packets=packets,
+        known_params=frozenset(
+            packet.payload[_PARAM_ID].rstrip(b"\0").decode("ascii", "replace")
+            for packet in asked
+            if packet.message_id == _PARAM_REQUEST_READ
+        ),
         gaps=(
             *damage,
             *filter(None, [skipped.describe(folder / TLOG)]),
@@ -125,44 +139,16 @@ def open_source(folder: Path) -> ReplaySource:
     )
 
 
-def _features(
-    folder: Path, meta: FlightMeta, contract: Contract, damage: list[str]
-) -> tuple[tuple[FeatureFrame, ...], ...]:
-    if meta.mode != "dual":
-        return ()
-    return tuple(
-        tuple(
-            read_features(
-                read_table(folder / features_of(name), replay_tables.FEATURES, damage=damage)
-            )
-        )
-        for name in (None, *contract.cameras[1:])
-    )
-
-
-def _asked_params(log: Path, own_system: int) -> Iterator[str]:
-    for _, packet in read_tlog(log):
-        is_ours = packet.source.system == own_system
-        if is_ours and packet.message_id == _PARAM_REQUEST_READ:
-            yield packet.payload[_PARAM_ID].rstrip(b"\0").decode("ascii", "replace")
-
-
-def _received(
-    log: Iterator[tuple[int, RawPacket]],
-    stamps: list[PacketStamp],
-    *,
-    offset_ns: int,
-    own_system: int,
+def _packets(
+    log: Sequence[tuple[int, RawPacket]], stamps: Sequence[PacketStamp], offset_ns: int
 ) -> Iterator[RecordedPacket]:
-    """Yield the packets of other senders, with exact stamps for those in the table.
+    """Yield the packets of the log, with exact stamps for those in the table.
 
     Log and table have the same order, so each packet is searched after the previous match.
     """
     waiting = 0
     latest_ns = 0
     for stamp_us, packet in log:
-        if packet.source.system == own_system:
-            continue
         rough_ns = 1000 * stamp_us - offset_ns
         key = packet_key(packet.data)
         found = None
