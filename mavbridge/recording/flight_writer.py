@@ -1,5 +1,6 @@
 """Single-threaded writer of a flight's folder: tables, videos and meta."""
 
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
@@ -42,64 +43,6 @@ class SerialNumbers:
         return skipped
 
 
-class CameraFiles:
-    """Frames of one camera, written by a separate process, whose death loses only these."""
-
-    def __init__(self, video: VideoWriter) -> None:
-        self._video = video
-        self._serials = SerialNumbers()
-        self.failure: WriterDiedError | None = None
-        """Why no more frames are recorded."""
-        self.source_size: tuple[int, int] | None = None
-        """Height and width of the incoming frames; None before the first."""
-
-    def write(self, vision: VisionTick, truth: FrameTruth | None) -> None:
-        """Record a frame. Skipped serial numbers count as dropped."""
-        row = FrameRow(
-            frame_id=vision.frame_id,
-            captured_ns=vision.captured_ns,
-            ready_ns=vision.ready_ns,
-            dropped_before=self._serials.take(vision.serial),
-            truth=truth,
-        )
-        if self.failure is not None:
-            return
-        if self.source_size is None:
-            self.source_size = (vision.rgb.shape[0], vision.rgb.shape[1])
-        try:
-            self._video.submit(vision.rgb, row)
-        except WriterDiedError as error:
-            self.failure = error
-
-    @property
-    def written(self) -> int:
-        """Frames known to be in the video."""
-        return self._video.written
-
-    @property
-    def dropped(self) -> int:
-        """Number of frames missing from the video, up to the newest one."""
-        return self._serials.next - self.written
-
-    @property
-    def size(self) -> tuple[int, int] | None:
-        """Height and width of the video; None before the first frame."""
-        return self._video.size
-
-    def finish(self) -> None:
-        """Close the files in order if the process is alive."""
-        if self.failure is not None:
-            return
-        try:
-            self._video.finish()
-        except WriterDiedError as error:
-            self.failure = error
-
-    def close(self) -> None:
-        """Leave the files as they are. Can be called twice."""
-        self._video.close()
-
-
 class FlightWriter:
     """Writer used during the flight; ``finish`` closes the files in order.
 
@@ -132,8 +75,12 @@ class FlightWriter:
         self._flushed_ns = meta.start_ns
         self._serials, self._solve_serials = SerialNumbers(), SerialNumbers(first=1)
         self._tables: list[TableWriter] = []
-        self.cameras: list[CameraFiles] = []
-        """Cameras in the contract's order."""
+        self._videos: list[VideoWriter] = []
+        """One for each camera, in the contract's order."""
+        self._dead: set[int] = set()
+        self.video_failure: WriterDiedError | None = None
+        """Why frames of a camera are no longer recorded while the rest is."""
+        self._source_size: tuple[int, int] | None = None
         self.packets: BoundedQueue[tuple[ForwardedPacket, ...]] = BoundedQueue(PACKET_CAPACITY)
         """Groups of packets in order of arrival; filled by another thread."""
         self._packets_lost = 0
@@ -149,7 +96,8 @@ class FlightWriter:
                     with_truth=with_labels,
                     tlog=job if camera is None else None,
                 )
-                self.cameras.append(CameraFiles(video))
+                self._videos.append(video)
+            self._frame_serials = [SerialNumbers() for _ in names]
             write_meta(folder, meta)
             self._ticks = self._table(
                 TICKS, rows.DEMONSTRATION_TICKS if with_labels else rows.TICKS
@@ -186,7 +134,27 @@ class FlightWriter:
                 replay_tables.feature_columns(vision, vision.feature, serials.take(vision.serial))
             )
         self._flush_if_due(vision.ready_ns)
-        self.cameras[vision.camera].write(vision, truth)
+        dropped = self._frame_serials[vision.camera].take(vision.serial)
+        if vision.camera == 0 and self._source_size is None:
+            self._source_size = (vision.rgb.shape[0], vision.rgb.shape[1])
+        row = FrameRow(
+            frame_id=vision.frame_id,
+            captured_ns=vision.captured_ns,
+            ready_ns=vision.ready_ns,
+            dropped_before=dropped,
+            truth=truth,
+        )
+        self._act(vision.camera, lambda video: video.submit(vision.rgb, row))
+
+    def _act(self, camera: int, act: Callable[[VideoWriter], object]) -> None:
+        """Use the writer of a camera; its death loses only its frames."""
+        if camera in self._dead:
+            return
+        try:
+            act(self._videos[camera])
+        except WriterDiedError as error:
+            self._dead.add(camera)
+            self.video_failure = self.video_failure or error
 
     def solve(self, solve: Solve) -> None:
         """Record a solve for a replay. Skipped serial numbers count as dropped."""
@@ -195,12 +163,6 @@ class FlightWriter:
                 replay_tables.solve_columns(solve, self._solve_serials.take(solve.serial))
             )
             self._flush_if_due(solve.computed_ns)
-
-    @property
-    def video_failure(self) -> WriterDiedError | None:
-        """Return why frames of a camera are no longer recorded while the rest is, or None."""
-        failures = (files.failure for files in self.cameras)
-        return next((failure for failure in failures if failure is not None), None)
 
     def _flush_if_due(self, now_ns: int) -> None:
         if now_ns - self._flushed_ns >= FLUSH_NS:
@@ -219,7 +181,7 @@ class FlightWriter:
     @property
     def frames_written(self) -> int:
         """Number of frames known to be in the videos."""
-        return sum(files.written for files in self.cameras)
+        return sum(video.written for video in self._videos)
 
     @property
     def ticks(self) -> int:
@@ -235,15 +197,15 @@ class FlightWriter:
             self.flush()
             for table in self._tables:
                 table.finish()
-            for files in self.cameras:
-                files.finish()
+            for camera in range(len(self._videos)):
+                self._act(camera, lambda video: video.finish())
         except BaseException:
             self.close()
             raise
         is_whole = self.video_failure is None
-        first = self.cameras[0]
+        first = self._videos[0]
         height, width = first.size or (None, None)
-        source_height, source_width = first.source_size or (None, None)
+        source_height, source_width = self._source_size or (None, None)
         self.meta = replace(
             meta,
             image_height=height,
@@ -254,13 +216,13 @@ class FlightWriter:
             ticks=self._ticks.rows,
             frames=first.written if is_whole else None,
             ticks_dropped=self._serials.dropped,
-            frames_dropped=first.dropped,
+            frames_dropped=self._frame_serials[0].next - first.written,
         )
         write_meta(self._folder, self.meta)
 
     def close(self) -> None:
         """Leave everything as it is, after an error. Can be called twice."""
-        for files in self.cameras:
-            files.close()
+        for video in self._videos:
+            video.close()
         for table in self._tables:
             table.abandon()

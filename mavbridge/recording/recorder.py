@@ -67,7 +67,7 @@ class Recorder:
             self._consumer,
             capacity=CAPACITY,
             image_capacity=IMAGE_CAPACITY,
-            cameras=len(writer.cameras),
+            cameras=1 if meta.contract is None else len(meta.contract.cameras),
         )
 
     def emit(self, event: Observed) -> None:
