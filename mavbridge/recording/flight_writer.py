@@ -84,34 +84,40 @@ class FlightWriter:
         self.packets: BoundedQueue[tuple[ForwardedPacket, ...]] = BoundedQueue(PACKET_CAPACITY)
         """Groups of packets in order of arrival; filled by another thread."""
         self._packets_lost = 0
-        names = (None,) if meta.contract is None else (None, *meta.contract.cameras[1:])
-        job = None if tlog_pipe is None else TlogJob(folder / TLOG, tlog_pipe.reader)
+        self._names = (None,) if meta.contract is None else (None, *meta.contract.cameras[1:])
+        self._frame_serials = [SerialNumbers() for _ in self._names]
         try:
-            for camera in names:
-                video = VideoWriter(
-                    folder / video_of(camera),
-                    pressure=pressure,
-                    hz=meta.visual_hz,
-                    rows=folder / frames_of(camera),
-                    with_truth=with_labels,
-                    tlog=job if camera is None else None,
-                )
-                self._videos.append(video)
-            self._frame_serials = [SerialNumbers() for _ in names]
+            self._start_videos(pressure, tlog_pipe, with_truth=with_labels)
             write_meta(folder, meta)
-            self._ticks = self._table(
-                TICKS, rows.DEMONSTRATION_TICKS if with_labels else rows.TICKS
-            )
-            self._solves = self._table(SOLVES, replay_tables.SOLVES) if with_replay else None
-            self._packets = self._table(PACKETS, replay_tables.PACKETS) if with_replay else None
-            has_features = with_replay and meta.mode == "dual"  # else only resized images
-            self._features = [
-                (self._table(features_of(camera), replay_tables.FEATURES), SerialNumbers())
-                for camera in (names if has_features else ())
-            ]
+            self._open_tables(with_labels=with_labels, with_replay=with_replay)
         except (OSError, WriterError):
             self.close()
             raise
+
+    def _start_videos(
+        self, pressure: Pressure, tlog_pipe: TlogPipe | None, *, with_truth: bool
+    ) -> None:
+        job = None if tlog_pipe is None else TlogJob(self._folder / TLOG, tlog_pipe.reader)
+        for camera in self._names:
+            video = VideoWriter(
+                self._folder / video_of(camera),
+                pressure=pressure,
+                hz=self.meta.visual_hz,
+                rows=self._folder / frames_of(camera),
+                with_truth=with_truth,
+                tlog=job if camera is None else None,
+            )
+            self._videos.append(video)
+
+    def _open_tables(self, *, with_labels: bool, with_replay: bool) -> None:
+        self._ticks = self._table(TICKS, rows.DEMONSTRATION_TICKS if with_labels else rows.TICKS)
+        self._solves = self._table(SOLVES, replay_tables.SOLVES) if with_replay else None
+        self._packets = self._table(PACKETS, replay_tables.PACKETS) if with_replay else None
+        has_features = with_replay and self.meta.mode == "dual"  # else only resized images
+        self._features = [
+            (self._table(features_of(camera), replay_tables.FEATURES), SerialNumbers())
+            for camera in (self._names if has_features else ())
+        ]
 
     def _table(self, stem: str, schema: pa.Schema) -> TableWriter:
         table = TableWriter(self._folder / stem, schema)

@@ -101,7 +101,7 @@ def open_source(folder: Path) -> ReplaySource:
     received = [each for each in log if each[1].source.system != system]
     asked = [packet for _, packet in log if packet.source.system == system]
     packets = tuple(_packets(received, stamps, offset_ns))
-    cameras = (None, *meta.contract.cameras[1:]) if meta.mode == "dual" else ()
+    features = _features(folder, meta, damage)
     return ReplaySource(
         folder=folder,
         meta=meta,
@@ -109,14 +109,7 @@ def open_source(folder: Path) -> ReplaySource:
         config=config,
         ticks=tuple(row.tick for row in ticks),
         solves=tuple(row.solve for row in solve_rows),
-        features=tuple(
-            tuple(
-                read_features(
-                    read_table(folder / features_of(name), replay_tables.FEATURES, damage=damage)
-                )
-            )
-            for name in cameras
-        ),
+        features=features,
         packets=packets,
         known_params=frozenset(
             packet.payload[_PARAM_ID].rstrip(b"\0").decode("ascii", "replace")
@@ -126,17 +119,31 @@ def open_source(folder: Path) -> ReplaySource:
         gaps=(
             *damage,
             *filter(None, [skipped.describe(folder / TLOG)]),
-            *(
-                f"{count} {what} are not in the recording"
-                for what, count in (
-                    ("ticks", sum(row.dropped_before for row in ticks)),
-                    ("solves", sum(row.dropped_before for row in solve_rows)),
-                    ("packets", len(stamps) - sum(p.happened_ns is not None for p in packets)),
-                )
-                if count
+            *_lost(
+                ticks=sum(row.dropped_before for row in ticks),
+                solves=sum(row.dropped_before for row in solve_rows),
+                packets=len(stamps) - sum(p.happened_ns is not None for p in packets),
             ),
         ),
     )
+
+
+def _lost(**counts: int) -> Iterator[str]:
+    for what, count in counts.items():
+        if count:
+            yield f"{count} {what} are not in the recording"
+
+
+def _features(
+    folder: Path, meta: FlightMeta, damage: list[str]
+) -> tuple[tuple[FeatureFrame, ...], ...]:
+    if meta.mode != "dual" or meta.contract is None:
+        return ()
+    tables = [
+        read_table(folder / features_of(name), replay_tables.FEATURES, damage=damage)
+        for name in (None, *meta.contract.cameras[1:])
+    ]
+    return tuple(tuple(read_features(table)) for table in tables)
 
 
 def _packets(
