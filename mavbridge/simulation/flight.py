@@ -42,7 +42,6 @@ from sitl.camera.fpv import FpvRenderer
 from sitl.course import make_course
 from sitl.simulated_vehicle import SimulatedVehicle
 from sitl.vehicle.config import STEP_NS, VehicleConfig
-from sitl.vehicle.rotation import Quat
 
 MAX_TIME_S = 60.0
 """Default limit [s]: courses are some 80 m long, so a policy slower than 1.5 m/s fails."""
@@ -233,31 +232,28 @@ class SimulatedFlight:
                 f"the simulator has no cameras {unknown}: a policy with several cameras takes some "
                 f"of {', '.join(MOUNTS)} here"
             )
+        conditions, settings = self._vehicle_config.conditions, self._settings
+        width = max(contract.image_width, settings.least_camera_px)
+        height = max(contract.image_height, settings.least_camera_px)
+        every_ns = period_ns(camera_hz)
         cameras = [
-            self._make_camera(contract, number, MOUNTS[name], period_ns(camera_hz))
+            SimulatedCamera(
+                self.clock,
+                lambda: self.vehicle.pose,
+                FpvRenderer(self.course, width, height, conditions)
+                if settings.draw_images
+                else BlankRenderer(width, height),
+                period_ns=every_ns,
+                phase_ns=int(self._random(10 * number + 2).integers(every_ns)),
+                delays_ns=settings.delays.camera.samples_ns(self._random(10 * number + 3)),
+                stalled_until_ns=self._stalls.end_ns,
+                to_end_ns=round(conditions.frame_time_s / 2 * NS_PER_S),
+                mount=MOUNTS[name],
+            )
             for number, name in enumerate(mounts)
         ]
         cameras[0].exposure_watchers += self._exposure_watchers
         return cameras
-
-    def _make_camera(
-        self, contract: Contract, number: int, mount: Quat, camera_period_ns: int
-    ) -> SimulatedCamera:
-        least_px, conditions = self._settings.least_camera_px, self._vehicle_config.conditions
-        width, height = max(contract.image_width, least_px), max(contract.image_height, least_px)
-        return SimulatedCamera(
-            self.clock,
-            lambda: self.vehicle.pose,
-            FpvRenderer(self.course, width, height, conditions)
-            if self._settings.draw_images
-            else BlankRenderer(width, height),
-            period_ns=camera_period_ns,
-            phase_ns=int(self._random(10 * number + 2).integers(camera_period_ns)),
-            delays_ns=self._settings.delays.camera.samples_ns(self._random(10 * number + 3)),
-            stalled_until_ns=self._stalls.end_ns,
-            to_end_ns=round(conditions.frame_time_s / 2 * NS_PER_S),
-            mount=mount,
-        )
 
     def _take_time(
         self, runner: PolicyRunner, vision_clocks: Sequence[AheadClock], policy_clock: AheadClock
