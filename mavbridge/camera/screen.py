@@ -22,15 +22,6 @@ INTERVAL_NS = NS_PER_S // 60
 """Shortest capture interval: screens change no faster, and a capture takes milliseconds."""
 
 
-class Region(NamedTuple):
-    """Rectangle of the screen [pixels]."""
-
-    left: int
-    top: int
-    width: int
-    height: int
-
-
 class Window(NamedTuple):
     """Visible window with a title."""
 
@@ -72,8 +63,8 @@ class X11Screen:
                 continue
             yield from self._titled(child)
 
-    def region(self, window_id: int) -> Region | None:
-        """Return the on-screen part of the window; None if it is closed or hidden."""
+    def region(self, window_id: int) -> dict[str, int] | None:
+        """Return the on-screen part of the window for mss; None if it is closed or hidden."""
         window = self._display.create_resource_object("window", window_id)
         try:
             size = window.get_geometry()
@@ -88,7 +79,7 @@ class X11Screen:
         bottom = min(origin.y + size.height, self._screen.height_in_pixels)
         if not is_viewable or right <= left or bottom <= top:
             return None
-        return Region(left, top, right - left, bottom - top)
+        return {"left": left, "top": top, "width": right - left, "height": bottom - top}
 
     def close(self) -> None:
         """Disconnect; may be called twice."""
@@ -134,17 +125,15 @@ class ScreenCamera:
         if not wait_until_due(self._clock, self._due_ns, timeout_ns):
             return None
         captured_ns = self._clock.now_ns()
-        if self._windows is None:
-            everything = self._screen.monitors[0]
-            region = Region(**{side: everything[side] for side in Region._fields})
-        elif (found := self._windows.region(self._window.id)) is not None:
-            region = found
-        else:
+        region: dict[str, int] | None = self._screen.monitors[0]  # everything
+        if self._windows is not None:
+            region = self._windows.region(self._window.id)
+        if region is None:
             raise CameraError(
                 f"the window {self._title!r} has been closed, hidden or moved off the screen"
             )
         try:
-            bgra = np.asarray(self._screen.grab(region._asdict()))
+            bgra = np.asarray(self._screen.grab(region))
         except ScreenShotError as error:
             raise CameraError(f"the screen cannot be captured: {error}") from error
         rgb = np.asarray(cv2.cvtColor(bgra, cv2.COLOR_BGRA2RGB), dtype=np.uint8)

@@ -4,7 +4,6 @@ import logging
 import threading
 from collections import deque
 from contextlib import AbstractContextManager, ExitStack, nullcontext
-from typing import NamedTuple
 
 from rich.console import Console, Group, RenderableType
 from rich.live import Live
@@ -54,11 +53,6 @@ class RateMeter:
         return (last - first) * NS_PER_S / (last_ns - first_ns) if last_ns > first_ns else None
 
 
-class _Message(NamedTuple):
-    what: RenderableType
-    soft_wrap: bool
-
-
 class FlightScreen:
     """``TickSink`` that shows a status line and a final table on one console.
 
@@ -81,7 +75,8 @@ class FlightScreen:
         self._missed_slots = 0
         self._activity_ns = 0
         self._stage: tuple[object, ...] = ()
-        self._messages: deque[_Message] = deque(maxlen=MAX_MESSAGES)
+        self._messages: deque[tuple[RenderableType, bool]] = deque(maxlen=MAX_MESSAGES)
+        """Pending messages, and whether their lines are left to the terminal to wrap."""
         self._dropped_messages = 0
         self._refreshes = 0
         # Not Live's own redirection: any printing thread would wait for the console's lock.
@@ -173,7 +168,7 @@ class FlightScreen:
     def _show(self, what: RenderableType, *, soft_wrap: bool) -> None:
         if len(self._messages) == MAX_MESSAGES:
             self._dropped_messages += 1  # two threads at once can lose one count
-        self._messages.append(_Message(what, soft_wrap))
+        self._messages.append((what, soft_wrap))
 
     def status_line(self) -> Text:
         """Return the current status. Call at ``STATUS_HZ``: rates are averages over calls."""
@@ -238,8 +233,8 @@ class FlightScreen:
         if dropped:
             self._console.print(Text(f"({dropped} older messages were dropped)"), soft_wrap=True)
         while self._messages:
-            message = self._messages.popleft()
-            self._console.print(message.what, soft_wrap=message.soft_wrap)
+            what, soft_wrap = self._messages.popleft()
+            self._console.print(what, soft_wrap=soft_wrap)
 
 
 def _age(now_ns: int, stamp_ns: int | None) -> str:

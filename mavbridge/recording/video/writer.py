@@ -75,7 +75,6 @@ class VideoWriter:
             tlog: log of the link to write beside the video; its pipe is closed here.
         """
         self._pressure: Pressure = pressure
-        self._tlog = tlog
         self._ring: FrameRing | None = None
         self._free: deque[int] = deque()
         self._failure: WriterError | None = None
@@ -84,8 +83,9 @@ class VideoWriter:
         self._offered = 0
         self.written = 0
         """Number of frames known to be in the file."""
-        job = VideoJob(video=video, hz=hz, rows=rows, with_truth=with_truth)
-        self._pipe, self._process = start_process(job, pressure, tlog)
+        niceness = NICENESS if pressure == "online" else 0
+        self._job = VideoJob(video, hz, rows, with_truth, niceness, tlog)
+        self._pipe, self._process = start_process(self._job)
         self._resources = ExitStack()
         self._resources.callback(self._pipe.close)
         # A producer that ends without ``close`` must not wait for its writer.
@@ -216,7 +216,7 @@ class VideoWriter:
         """End the process; frames submitted but not written can be lost. Can be called twice."""
         self._resources.close()
         self._process.join(END_S)
-        is_keeping_log = self._tlog is not None and Notice.DONE in self._notices
+        is_keeping_log = self._job.tlog is not None and Notice.DONE in self._notices
         if self._process.is_alive() and not is_keeping_log:
             self._process.kill()
             self._process.join(END_S)
@@ -227,22 +227,17 @@ class VideoWriter:
         return self._process.pid
 
 
-def start_process(
-    job: VideoJob, pressure: Pressure, tlog: TlogJob | None
-) -> "tuple[Connection[ToWriter, FromWriter], BaseProcess]":
+def start_process(job: VideoJob) -> "tuple[Connection[ToWriter, FromWriter], BaseProcess]":
     """Start the writer's process; return the pipe to it and the process."""
     context = multiprocessing.get_context("spawn")  # not fork: this process has running threads
     pipe, its_pipe = context.Pipe()
     process = context.Process(
-        target=run_writer,
-        args=(its_pipe, job, NICENESS if pressure == "online" else 0, tlog),
-        name="mavbridge-writer",
-        daemon=True,
+        target=run_writer, args=(its_pipe, job), name="mavbridge-writer", daemon=True
     )
     try:
         process.start()
     finally:
         its_pipe.close()  # an open copy here would keep the pipe open after the writer dies
-        if tlog is not None:
-            tlog.records.close()
+        if job.tlog is not None:
+            job.tlog.records.close()
     return pipe, process

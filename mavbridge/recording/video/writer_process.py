@@ -34,6 +34,9 @@ class VideoJob(NamedTuple):
     rows: Path | None = None
     """Path and stem of the frames table; None: only a video."""
     with_truth: bool = False
+    niceness: int = 0
+    tlog: TlogJob | None = None
+    """Log of the link to write beside the video."""
 
 
 class FrameFiles:
@@ -136,19 +139,13 @@ ToWriter: TypeAlias = RingShape | Submit | Notice
 FromWriter: TypeAlias = Written | Failed | Notice
 
 
-def run_writer(
-    pipe: "Connection[FromWriter, ToWriter]",
-    job: VideoJob,
-    niceness: int,
-    tlog_job: TlogJob | None,
-) -> None:
+def run_writer(pipe: "Connection[FromWriter, ToWriter]", job: VideoJob) -> None:
     """Entry point of the process."""
     for name in ("SIGINT", "SIGTERM", "SIGHUP", "SIGTSTP"):
         if hasattr(signal, name):
             signal.signal(getattr(signal, name), signal.SIG_IGN)
-    if niceness:
-        os.nice(niceness)
-    tlog = None if tlog_job is None else TlogThread(tlog_job)
+    os.nice(job.niceness)
+    tlog = None if job.tlog is None else TlogThread(job.tlog)
     service = WriterService(pipe, job, tlog)
     service.send(Notice.READY)
     while service.is_open:
