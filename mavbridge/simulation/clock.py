@@ -27,11 +27,6 @@ class SteppedClock:
         """Return the simulated time."""
         return self._now_ns
 
-    @property
-    def next_event_ns(self) -> int | None:
-        """Time of the next event; None = no event is scheduled."""
-        return self._events[0][0] if self._events else None
-
     def schedule(self, at_ns: int, event: Callable[[], object]) -> None:
         """Run ``event`` at ``at_ns``; if that has passed, as soon as time advances."""
         heapq.heappush(self._events, (at_ns, next(self._order), event))

@@ -105,7 +105,7 @@ class SimulatedFlight:
         delays = self._settings.delays
         uplink = DelayedChannel(self.clock, delays.uplink.samples_ns(self._random(0)))
         downlink = DelayedChannel(self.clock, delays.downlink.samples_ns(self._random(1)))
-        self._transport = MemoryTransport(self.clock, to_vehicle=uplink, from_vehicle=downlink)
+        self._transport = MemoryTransport(to_vehicle=uplink, from_vehicle=downlink)
         self._downlink = downlink
         self._stalls = Stalls(delays.stall_ns, self.clock.now_ns(), self._random(9))
         self._stepper = VehicleStepper(

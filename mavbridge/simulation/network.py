@@ -42,19 +42,11 @@ class DelayedChannel:
         while self._in_flight and self._in_flight[0][0] <= now_ns:
             yield self._in_flight.popleft()
 
-    @property
-    def next_arrival_ns(self) -> int | None:
-        """Arrival of the oldest datagram not yet received; None = there is none."""
-        return self._in_flight[0][0] if self._in_flight else None
-
 
 class MemoryTransport(Transport):
     """The bridge's end of the network, with exact arrival stamps."""
 
-    def __init__(
-        self, clock: SteppedClock, *, to_vehicle: DelayedChannel, from_vehicle: DelayedChannel
-    ) -> None:
-        self._clock = clock
+    def __init__(self, *, to_vehicle: DelayedChannel, from_vehicle: DelayedChannel) -> None:
         self._to_vehicle = to_vehicle
         self._from_vehicle = from_vehicle
 
@@ -66,18 +58,6 @@ class MemoryTransport(Transport):
     def receiver(self, peer: Address | None) -> Address | None:
         """See ``Transport``."""
         return peer
-
-    def wait(self, until_ns: int) -> None:
-        """Advance time until a datagram has arrived, or to ``until_ns``.
-
-        Time advances from event to event, since an event may send a datagram that arrives in time.
-        """
-        while (now_ns := self._clock.now_ns()) < until_ns:
-            arrival_ns, event_ns = self._from_vehicle.next_arrival_ns, self._clock.next_event_ns
-            if arrival_ns is not None and arrival_ns <= now_ns:
-                return
-            stops = [stop for stop in (arrival_ns, event_ns) if stop is not None]
-            self._clock.sleep_until_ns(min([until_ns, *stops]))
 
     def send(self, data: bytes, peer: Address | None = None) -> bool:
         """Send one packet; always succeeds."""

@@ -56,7 +56,8 @@ class Network(MemoryTransport):
     """The guard's end of the link, which other addresses can write to, too."""
 
     def __init__(self, clock: SteppedClock, to_vehicle: Direction, from_vehicle: Direction) -> None:
-        super().__init__(clock, to_vehicle=to_vehicle, from_vehicle=from_vehicle)
+        self._clock = clock
+        super().__init__(to_vehicle=to_vehicle, from_vehicle=from_vehicle)
         self._to_vehicle: Direction = to_vehicle
         self.address: Address = VEHICLE
         """Address that the vehicle sends from."""

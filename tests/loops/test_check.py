@@ -49,7 +49,7 @@ class Bench:
         for name, value in (params or {}).items():
             assert self.vehicle.params.set(name, value), name
         up, down = (DelayedChannel(self.clock, repeat(NS_PER_MS)) for _ in range(2))
-        self.transport = MemoryTransport(self.clock, to_vehicle=up, from_vehicle=down)
+        self.transport = MemoryTransport(to_vehicle=up, from_vehicle=down)
         self.stepper = VehicleStepper(
             self.clock, self.vehicle, self.clock.now_ns(), to_vehicle=up, from_vehicle=down
         )
