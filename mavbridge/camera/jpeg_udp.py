@@ -29,7 +29,7 @@ SILENT_NS = 2 * NS_PER_S
 _POLL_S = 0.1
 _RECEIVE_BUFFER_BYTES = 4 << 20
 _MOST_QUEUED = 4096
-"""Limit of datagrams read per frame, in case the sender is faster than this computer."""
+"""Limit of datagrams read at a time, in case the sender is faster than this computer."""
 _log = logging.getLogger(__name__)
 
 
@@ -165,10 +165,10 @@ class JpegUdpSource:
         return None
 
     def _newest_frame(self) -> Assembly | None:
-        """Receive until a frame is whole, then drain the socket, which may hold a newer frame."""
+        """Drain the socket, which may hold several frames."""
         newest: Assembly | None = None
-        for _ in range(_MOST_QUEUED):
-            if (datagram := self._receive(0.0 if newest else _POLL_S)) is None:
+        for number in range(_MOST_QUEUED):
+            if (datagram := self._receive(0.0 if number else _POLL_S)) is None:
                 break
             self._datagrams += 1
             newest = self._frames.put(datagram, self._clock.now_ns()) or newest

@@ -40,7 +40,7 @@ _POLL_S = 0.1
 _READ_BYTES = 1 << 16
 """Capacity of a pipe. A full pipe blocks the program, so no frame in it is old."""
 _MOST_READS = 64
-"""Limit of reads per frame, in case the program is faster than this computer."""
+"""Limit of reads at a time, in case the program is faster than this computer."""
 _MAX_ERROR_BYTES = 2000
 _RAW = re.compile(r"(\d{1,5})x(\d{1,5}):([a-z0-9]+):(.*)", re.DOTALL)
 
@@ -123,10 +123,8 @@ class PipeSource:
 
     def next_image(self) -> Image | None:
         """See `ImageSource`."""
-        for _ in range(_MOST_READS):
-            # A pipe with a whole frame may hold a newer one.
-            timeout_s = 0.0 if self._cutter.has_frame else _POLL_S
-            ready = select.select(self._open, [], [], timeout_s)[0]
+        for number in range(_MOST_READS):  # a pipe with a whole frame may hold a newer one
+            ready = select.select(self._open, [], [], 0.0 if number else _POLL_S)[0]
             if not ready:
                 break
             if self._err in ready:

@@ -91,11 +91,6 @@ class FrameCutter(ABC):
         self._first_ns = 0
         """Arrival of the first byte of the incomplete frame."""
 
-    @property
-    def has_frame(self) -> bool:
-        """True if a whole frame is available."""
-        return self._newest is not None
-
     def take(self) -> tuple[bytes, int] | None:
         """Return the newest whole frame and the arrival of its first byte, or None."""
         newest, self._newest = self._newest, None

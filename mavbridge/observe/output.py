@@ -45,10 +45,6 @@ class PatientOutput(io.TextIOBase):
         """True if the file is a terminal."""
         return os.isatty(self._fd)
 
-    def writable(self) -> bool:
-        """True."""
-        return True
-
     def give_up(self) -> None:
         """Drop all pending and future text; ends a ``flush`` in another thread."""
         self._is_given_up = True
@@ -91,9 +87,6 @@ class _Lines(io.TextIOBase):
 
     def fileno(self) -> int:
         return self._replaced.fileno()
-
-    def writable(self) -> bool:
-        return True
 
     def write(self, text: str) -> int:
         *lines, partial = (self._partial + text).replace("\r", "\n").split("\n")

@@ -136,7 +136,7 @@ def test_a_frame_is_as_old_as_its_first_byte_and_the_newest_wins() -> None:
         assert cutter.take() == (frames[0], 1)
         cutter.put(frames[1][2:] + frames[2], 9)
         assert cutter.take() == (frames[2], 9)
-        assert not cutter.has_frame
+        assert cutter.take() is None
 
 
 def test_every_raw_format_shows_the_colours() -> None:
