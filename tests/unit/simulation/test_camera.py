@@ -1,7 +1,7 @@
 """The simulated camera: frames arrive after their end, and turn with the vehicle, mount and all."""
 
-from collections.abc import Callable
 from itertools import repeat
+from typing import Any
 
 import numpy as np
 import pytest
@@ -36,30 +36,22 @@ class Renderer:
         return np.zeros((16, 16, 3), np.uint8)
 
 
-@pytest.fixture
-def camera() -> Callable[..., tuple[SteppedClock, SimulatedCamera, Renderer]]:
-    def make(**settings: object) -> tuple[SteppedClock, SimulatedCamera, Renderer]:
-        clock, renderer = SteppedClock(), Renderer()
-        made = SimulatedCamera(
-            clock,
-            lambda: Pose(stamp_ns=clock.now_ns(), body=BODY),
-            renderer,  # type: ignore[arg-type]
-            period_ns=100 * NS_PER_MS,
-            phase_ns=0,
-            delays_ns=repeat(3 * NS_PER_MS),
-            **settings,  # type: ignore[arg-type]
-        )
-        return clock, made, renderer
-
-    return make
+def camera(**settings: Any) -> tuple[SteppedClock, SimulatedCamera, Renderer]:
+    clock, renderer = SteppedClock(), Renderer()
+    made = SimulatedCamera(
+        clock,
+        lambda: Pose(stamp_ns=clock.now_ns(), body=BODY),
+        renderer,  # type: ignore[arg-type]
+        period_ns=100 * NS_PER_MS,
+        phase_ns=0,
+        delays_ns=repeat(3 * NS_PER_MS),
+        **settings,
+    )
+    return clock, made, renderer
 
 
 @pytest.mark.parametrize(("to_end_ms", "arrival_ms"), [(0, 3), (15, 18)])
-def test_no_frame_arrives_before_its_last_row_was_exposed(
-    camera: Callable[..., tuple[SteppedClock, SimulatedCamera, Renderer]],
-    to_end_ms: int,
-    arrival_ms: int,
-) -> None:
+def test_no_frame_arrives_before_its_last_row_was_exposed(to_end_ms: int, arrival_ms: int) -> None:
     clock, made, _ = camera(to_end_ns=to_end_ms * NS_PER_MS)
     begun_ns = clock.now_ns()
     clock.sleep_until_ns(begun_ns + arrival_ms * NS_PER_MS - 1)
@@ -78,11 +70,7 @@ def test_no_frame_arrives_before_its_last_row_was_exposed(
         ("down", (3.0, 2.0, -1.0)),  # the vehicle's yaw is a roll about the optical axis
     ],
 )
-def test_a_mounted_camera_turns_about_its_own_axes(
-    camera: Callable[..., tuple[SteppedClock, SimulatedCamera, Renderer]],
-    mount: str,
-    rate_radps: Vec3,
-) -> None:
+def test_a_mounted_camera_turns_about_its_own_axes(mount: str, rate_radps: Vec3) -> None:
     clock, made, renderer = camera(mount=MOUNTS[mount])
     clock.sleep_until_ns(clock.now_ns() + 3 * NS_PER_MS)
     assert made.read(0) is not None
