@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mavbridge.core.reasons import Code, because
-from mavbridge.core.vehicle import Action, ActionTrace
+from mavbridge.core.vehicle import ActionTrace
 from mavbridge.guard.guard import GuardOutput
 from mavbridge.simulation.replay.guard import GuardStep, same_action
 from mavbridge.simulation.replay.policy import SolvePair
@@ -169,21 +169,16 @@ def _other_results(step: GuardStep) -> list[str]:
     if other is None:
         is_told = one.trace is not None or one.sent is not None or one.is_slot
         return ["ticks"] if is_told else []
-    found = []
-    if one.phase != other.phase.value:
-        found.append("phase")
-    if one.chunk_serial != other.chunk_serial:
-        found.append("chunk")
-    for stage in STAGES:
-        if not same_action(_stage(one.trace, stage), _stage(other.trace, stage)):
-            found.append(stage)
-    if not same_action(one.sent, other.sent):
-        found.append("sent")
-    return found
-
-
-def _stage(trace: ActionTrace | None, stage: str) -> Action | None:
-    return None if trace is None else getattr(trace, stage)
+    is_same = {
+        "phase": one.phase == other.phase.value,
+        "chunk": one.chunk_serial == other.chunk_serial,
+        **{
+            stage: same_action(getattr(one.trace, stage, None), getattr(other.trace, stage, None))
+            for stage in STAGES
+        },
+        "sent": same_action(one.sent, other.sent),
+    }
+    return [name for name in is_same if not is_same[name]]
 
 
 def guard_traces(steps: Sequence[GuardStep]) -> StickTraces:
