@@ -2,7 +2,7 @@
 
 import socket
 import threading
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from fractions import Fraction
 from pathlib import Path
@@ -144,3 +144,34 @@ class RtpSender:
 
     def close(self) -> None:
         self._container.close()
+
+
+class FakeCapture:
+    """Stands in for cv2.VideoCapture; a stamp of -1 is a frame that cannot be decoded."""
+
+    def __init__(self, stamps_ms: Iterable[float], *, fps: float = 0.0) -> None:
+        self.settings: dict[int, float] = {}
+        self._fps = fps
+        self._stamps_ms = list(stamps_ms)
+        self._stamp_ms = 0.0
+
+    def isOpened(self) -> bool:
+        return True
+
+    def set(self, property_id: int, value: float) -> None:
+        self.settings[property_id] = value
+
+    def get(self, property_id: int) -> float:
+        return self._fps if property_id == cv2.CAP_PROP_FPS else self._stamp_ms
+
+    def grab(self) -> bool:
+        if not self._stamps_ms:
+            return False
+        self._stamp_ms = self._stamps_ms.pop(0)
+        return True
+
+    def retrieve(self) -> tuple[bool, np.ndarray]:
+        return self._stamp_ms >= 0, np.array([[[1, 2, 3]]], np.uint8)
+
+    def release(self) -> None:
+        pass

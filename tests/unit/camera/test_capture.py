@@ -5,7 +5,7 @@ import cv2
 import numpy as np
 import pytest
 
-from helpers.camera_senders import SIDE, RtpSender, repeating
+from helpers.camera_senders import SIDE, FakeCapture, RtpSender, repeating
 from helpers.fakes import START_NS, FakeClock
 from mavbridge.camera import capture
 from mavbridge.camera.capture import exposure_ns, open_device, open_stream
@@ -37,49 +37,17 @@ def test_the_drivers_stamp_is_taken_if_it_can_be_one(driver_ms, is_our_clock, ca
     assert exposure_ns(stamp_ns, NOW_NS, is_our_clock=is_our_clock) == captured_ns
 
 
-class FakeDevice:
-    """Stands in for cv2.VideoCapture on a machine without a camera."""
-
-    def __init__(self, *opened_with):
-        self.opened_with = opened_with
-        self.settings = {}
-        self.frames = 1
-
-    def isOpened(self):
-        return True
-
-    def set(self, property_id, value):
-        self.settings[property_id] = value
-
-    def get(self, property_id):
-        assert property_id == cv2.CAP_PROP_POS_MSEC
-        return START_NS / NS_PER_MS - 7
-
-    def grab(self):
-        self.frames -= 1
-        return self.frames >= 0
-
-    def retrieve(self):
-        return True, np.array([[[1, 2, 3]]], np.uint8)
-
-    def release(self):
-        self.settings.clear()
-
-
 def test_a_device_gives_rgb_with_the_drivers_stamp(monkeypatch):
-    opened = []
+    opened_with, device = [], FakeCapture([START_NS / NS_PER_MS - 7])
 
     def open_capture(*arguments):
-        opened.append(FakeDevice(*arguments))
-        return opened[0]
+        opened_with.append(arguments)
+        return device
 
     monkeypatch.setattr(cv2, "VideoCapture", open_capture)
     source = open_device(Path("/dev/video7"), image_size=300, clock=FakeClock())
-    assert opened[0].opened_with == ("/dev/video7", cv2.CAP_V4L2)
-    assert opened[0].settings == {
-        cv2.CAP_PROP_FRAME_WIDTH: 640,
-        cv2.CAP_PROP_FRAME_HEIGHT: 480,
-    }
+    assert opened_with == [("/dev/video7", cv2.CAP_V4L2)]
+    assert device.settings == {cv2.CAP_PROP_FRAME_WIDTH: 640, cv2.CAP_PROP_FRAME_HEIGHT: 480}
     image = source.next_image()
     assert image.captured_ns == START_NS - 7 * NS_PER_MS
     assert image.rgb.tolist() == [[[3, 2, 1]]]
@@ -103,7 +71,7 @@ def test_a_stream_is_opened_for_low_latency_unless_the_user_says_otherwise(
     def open_capture(*arguments):
         options.append(os.environ[capture.FFMPEG_OPTIONS_VARIABLE])
         log_levels.append(os.environ[capture.FFMPEG_LOG_VARIABLE])
-        return FakeDevice(*arguments)
+        return FakeCapture([0.0])
 
     monkeypatch.setattr(cv2, "VideoCapture", open_capture)
     source = open_stream("udp://0.0.0.0:5600", clock=FakeClock())

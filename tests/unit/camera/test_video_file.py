@@ -2,6 +2,7 @@ import cv2
 import numpy as np
 import pytest
 
+from helpers.camera_senders import FakeCapture
 from helpers.fakes import START_NS, FakeClock
 from mavbridge.camera.video_file import VideoFileCamera
 from mavbridge.core.clock import NS_PER_MS, NS_PER_S
@@ -74,30 +75,6 @@ def test_a_file_that_is_no_video_is_refused(tmp_path, clock):
         VideoFileCamera(path, clock=clock)
 
 
-class StampedCapture:
-    """A capture whose stamps are given, -1 for a frame that cannot be decoded."""
-
-    def __init__(self, fps, stamps_ms):
-        self._fps = fps
-        self._stamps_ms = list(stamps_ms)
-        self._stamp_ms = 0.0
-
-    def get(self, property_id):
-        return self._fps if property_id == cv2.CAP_PROP_FPS else self._stamp_ms
-
-    def grab(self):
-        if not self._stamps_ms:
-            return False
-        self._stamp_ms = self._stamps_ms.pop(0)
-        return True
-
-    def retrieve(self):
-        return self._stamp_ms >= 0, np.zeros((2, 2, 3), np.uint8)
-
-    def release(self):
-        pass
-
-
 @pytest.mark.parametrize(
     ("fps", "stamps_ms", "due_ms"),
     [
@@ -109,7 +86,7 @@ class StampedCapture:
     ],
 )
 def test_stamps(monkeypatch, tmp_path, clock, fps, stamps_ms, due_ms):
-    monkeypatch.setattr(cv2, "VideoCapture", lambda path: StampedCapture(fps, stamps_ms))
+    monkeypatch.setattr(cv2, "VideoCapture", lambda path: FakeCapture(stamps_ms, fps=fps))
     camera = VideoFileCamera(tmp_path, clock=clock)
     stamps_ns = [camera.read(NS_PER_S).captured_ns - START_NS for _ in due_ms]
     assert stamps_ns == pytest.approx([NS_PER_MS * due for due in due_ms], abs=10)
