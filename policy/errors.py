@@ -74,12 +74,16 @@ def user_code(doing: str) -> Iterator[None]:
     except PolicyError:
         raise
     except (Exception, SystemExit) as error:
-        theirs = [
-            frame
-            for frame in traceback.extract_tb(error.__traceback__)
-            if not frame.filename.startswith("<") and _OURS not in Path(frame.filename).parents
-        ]
         lines = [line.strip() for line in str(error).splitlines() if line.strip()]
         told = lines[-1] if "Traceback" in str(error) else " ".join(lines)
-        where = f" ({theirs[-1].filename}:{theirs[-1].lineno})" if theirs else ""
-        raise PolicyError(f"{doing}: {type(error).__name__}: {told}{where}") from error
+        raise PolicyError(f"{doing}: {type(error).__name__}: {told}{user_line(error)}") from error
+
+
+def user_line(error: BaseException) -> str:
+    """Return " (file:line)" of the user's innermost line that raised; empty if none did."""
+    theirs = [
+        frame
+        for frame in traceback.extract_tb(error.__traceback__)
+        if not frame.filename.startswith("<") and _OURS not in Path(frame.filename).parents
+    ]
+    return f" ({theirs[-1].filename}:{theirs[-1].lineno})" if theirs else ""

@@ -15,10 +15,11 @@ from contextlib import contextmanager
 from hashlib import sha256
 from pathlib import Path
 from types import ModuleType
+from typing import Any
 
 from policy.adapters.interface import Interface
 from policy.contract import Contract
-from policy.errors import PolicyError, user_code
+from policy.errors import ContractError, PolicyError, user_code, user_line
 from policy.files import user_path
 from policy.protocol import DualRatePolicy, SingleRatePolicy
 
@@ -28,6 +29,8 @@ FORMS = (
     "./file.py:Class"
 )
 """Forms of --policy, for error messages."""
+_PREDICT = "predict(image, state, action_history, num_diffusion_steps)"
+_FAST_PAIR = ("encode_visual", "predict_fast")
 OUR_PACKAGES = ("policy", "sitl", "mavbridge")
 
 
@@ -66,6 +69,8 @@ def load_user_class(spec: str, checkpoint: Path | None, *, seed: int = 0) -> Sin
             else:
                 with _working_directory():
                     module = importlib.import_module(where)
+    except ContractError as error:
+        raise PolicyError(f"--policy {spec}: {error}{user_line(error)}") from error
     except PolicyError as error:
         raise PolicyError(f"--policy {spec}: {error}; {_import_hint(error.__cause__)}") from error
     found = getattr(module, class_name, None)
@@ -151,7 +156,24 @@ def _import_hint(error: BaseException | None) -> str:
         return "import its neighbours by their plain names, or name it as package.module:Class"
     if isinstance(error, ModuleNotFoundError):
         return f"install {name} beside mavbridge, or put its folder on PYTHONPATH"
-    return f"mend that, or write {FORMS}"
+    return "mend that line"
+
+
+def _with_predict(found: type) -> type:
+    """Return the class, with a ``predict`` made of its fast pair if it has that pair alone."""
+    has_pair = all(callable(getattr(found, name, None)) for name in _FAST_PAIR)
+    if not has_pair or getattr(found, "predict", None) is not None:
+        return found
+
+    def predict(
+        self: DualRatePolicy, image: Any, state: Any, action_history: Any, num_diffusion_steps: int
+    ) -> Any:
+        if len(self.contract.image_shape) > 3:
+            raise PolicyError("with several images --single-rate needs a method predict")
+        feature = self.encode_visual(image)
+        return self.predict_fast(feature, state, action_history, num_diffusion_steps)
+
+    return type(found.__name__, (found,), {"predict": predict, "__module__": found.__module__})
 
 
 def _instance(spec: str, found: type, checkpoint: Path | None, seed: int) -> SingleRatePolicy:
@@ -165,7 +187,7 @@ def _instance(spec: str, found: type, checkpoint: Path | None, seed: int) -> Sin
             "checkpoint of --checkpoint, if that is given"
         ) from error
     with user_code(f"--policy {spec}: making it failed"):
-        policy: object = found(**arguments)
+        policy: object = _with_predict(found)(**arguments)
     contract = getattr(policy, "contract", None)
     if isinstance(contract, Contract) and not hasattr(policy, "predict") and "torch" in sys.modules:
         from policy.adapters.modules import adopt_modules  # imports torch
@@ -174,16 +196,16 @@ def _instance(spec: str, found: type, checkpoint: Path | None, seed: int) -> Sin
         adopted = adopt_modules(f"--policy {spec}", policy, interface, schedule=None, seed=seed)
         if adopted is not None:
             return adopted
-    lacking = [] if isinstance(contract, Contract) else ["contract"]
-    lacking += [] if hasattr(policy, "predict") else ["predict"]
-    if not isinstance(policy, SingleRatePolicy) or not isinstance(contract, Contract):
+    if not isinstance(contract, Contract):
         raise PolicyError(
-            f"--policy {spec}: a policy needs a member contract (a policy.contract.Contract) and "
-            "predict(image, state, action_history, num_diffusion_steps); for the dual-rate mode "
-            "also encode_visual(image) and predict_fast(feature, state, action_history, "
-            "num_diffusion_steps); or torch modules as attributes (visual_encoder and action_head "
-            "or denoiser), or be one with forward(image, state, action_history). Missing or wrong "
-            f"here: {lacking}"
+            f"--policy {spec}: its member contract must be a policy.contract.Contract, "
+            f"and it is {contract!r}"
+        )
+    if not isinstance(policy, SingleRatePolicy):
+        raise PolicyError(
+            f"--policy {spec}: it has no method {_PREDICT}, and not both encode_visual(image) and "
+            "predict_fast(feature, state, action_history, num_diffusion_steps); a class of torch "
+            "modules has visual_encoder and action_head, or forward"
         )
     if isinstance(policy, DualRatePolicy) and contract.feature_dim == 0:
         raise PolicyError(f"--policy {spec}: its contract needs feature_dim, F of encode_visual")

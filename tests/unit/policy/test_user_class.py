@@ -105,6 +105,10 @@ def test_a_wrong_form_is_refused_before_any_code_of_the_users_runs(folder, spec,
         ("raise ValueError('no camera here')", r"ValueError: no camera here \(.*broken\.py:1\)"),
         ("import no_such_library", "install no_such_library beside mavbridge"),
         ("from .neighbour import VALUE", "import its neighbours by their plain names"),
+        (
+            "from policy.contract import Contract\nContract(horizon=-3)",
+            r"horizon must be .*got -3 \(.*broken\.py:2\)$",
+        ),
         ("import policy.of_mine", "policy is a package of mavbridge: one of yours needs another"),
     ],
 )
@@ -170,6 +174,20 @@ class NoContract:
 
 class NoPredict:
     contract = Contract()
+
+
+class PredictIsNone(NoPredict):
+    predict = None
+
+
+class FastPair:
+    contract = Contract(arrays="numpy", image_height=32, image_width=32, feature_dim=1)
+
+    def encode_visual(self, image):
+        return image.mean(axis=(2, 3))[:, :1]
+
+    def predict_fast(self, feature, state, action_history, num_diffusion_steps):
+        return np.full((1, 16, 4), feature[0, 0], np.float32)
 
 
 class NoFeatureDim(Single):
@@ -241,8 +259,9 @@ def test_a_failure_to_close_is_said_and_hides_no_other(mine: str) -> None:
 @pytest.mark.parametrize(
     ("name", "changes", "message"),
     [
-        ("NoContract", {}, r"Missing or wrong here: \['contract'\]"),
-        ("NoPredict", {}, r"Missing or wrong here: \['predict'\]"),
+        ("NoContract", {}, "member contract must be.*it is None"),
+        ("NoPredict", {}, "no method predict"),
+        ("PredictIsNone", {}, "no method predict"),
         ("NoFeatureDim", {}, "needs feature_dim"),
         ("ResetIsNoMethod", {}, "reset must be a method without arguments.*it is True"),
         ("ResetNeedsMore", {}, "cannot be: missing a required argument: 'seed'; give its"),
@@ -257,3 +276,9 @@ def test_a_failure_to_close_is_said_and_hides_no_other(mine: str) -> None:
 def test_an_unusable_class_is_refused(mine, name, changes, message):
     with pytest.raises(PolicyError, match=message):
         load(f"{mine}:{name}", **changes)
+
+
+def test_a_class_of_the_fast_pair_alone_flies_at_both_rates(mine: str) -> None:
+    dual, single = (load(f"{mine}:FastPair", dual_rate=is_dual) for is_dual in (True, False))
+    assert (dual.runner.dual_rate, single.runner.dual_rate) == (True, False)
+    assert throttle(dual) == throttle(single) != 0.0
