@@ -133,10 +133,10 @@ class Tick:
 
     @property
     def holder(self) -> str:
-        """WAITING, PREPARING, NEUTRAL or RELEASED; for ticks in which the policy does not fly."""
-        if self.phase in ("waiting", "preparing"):
+        """The phase, for ticks in which the policy does not fly; RELEASED from RELEASING on."""
+        if self.phase in ("waiting", "preparing", "leaving", "holding"):
             return self.phase.upper()
-        return "NEUTRAL" if self.phase in ("leaving", "holding") else "RELEASED"
+        return "RELEASED"
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -64,7 +64,7 @@ def test_the_line_of_a_good_flight() -> None:
         (make_released_tick(0), "RELEASED  ALT_HOLD armed"),
         (
             make_released_tick(0, because(Code.NO_RECEIVER), sent=NEUTRAL, phase="holding"),
-            "NEUTRAL  ALT_HOLD armed",
+            "HOLDING  ALT_HOLD armed",
         ),
         (
             make_released_tick(0, because(Code.NOT_ENGAGED), phase="waiting"),
