@@ -51,7 +51,7 @@ $(VENV)/documents: $(VENV)/installed
 	touch $@
 
 fly: $(VENV)/flies  ## a simulated vehicle in its own process, and a policy flying its course over UDP
-	@mkdir -p out
+	@mkdir -p out && rm -f out/report.json out/fc.json out/flight.rrd
 	@$(BIN)/python -m sitl course --course $(COURSE) --json > out/gates.json
 	@$(BIN)/python -m sitl --autopilot $(AUTOPILOT) --connect udpout:127.0.0.1:$(PORT) \
 		--camera shm:fpv-$(PORT) --course $(COURSE) --report out/fc.json & sitl=$$!; \
@@ -60,7 +60,7 @@ fly: $(VENV)/flies  ## a simulated vehicle in its own process, and a policy flyi
 		--camera shm:fpv-$(PORT) --arm --duration $(DURATION) $(BRIEF) $(BY_RATES) $(FLAGS) \
 		--rerun out/flight.rrd --gates out/gates.json --report out/report.json; status=$$?; \
 	kill $$sitl 2>/dev/null; wait $$sitl 2>/dev/null; trap - EXIT; \
-	echo "wrote out/report.json, out/fc.json and out/flight.rrd (open it with: $(BIN)/rerun out/flight.rrd)"; \
+	[ ! -e out/report.json ] || echo "wrote out/report.json, out/fc.json and out/flight.rrd (open it with: $(BIN)/rerun out/flight.rrd)"; \
 	exit $$status
 
 lint: $(VENV)/installed  ## format, lint, types, import direction

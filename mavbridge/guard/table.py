@@ -33,6 +33,8 @@ RELEASE_TIMEOUT_NS = NS_PER_S
 UNHEARD_RELEASE_TIMEOUT_NS = 4 * NS_PER_S
 """Longest wait if it does not even show our last sticks, since the releases may be lost too.
 Longer than the vehicle holds an override by itself (RC_OVERRIDE_TIME, 3 s by default)."""
+NOT_SET = (Code.SET_ABSENT, Code.SET_REFUSED, Code.SET_UNANSWERED)
+"""Problems of a link that are over only after another start."""
 LOST_NS = 30 * NS_PER_S
 """Silence of a held vehicle after which it counts as lost, and holding it ends."""
 
@@ -56,8 +58,16 @@ def arm_flag(m: Memory, now: EngagementInputs) -> bool:
     return m.wants_arm and now.link_problem is None
 
 
+def not_set(m: Memory, now: EngagementInputs) -> EndRequest | None:
+    """the vehicle did not take a `--set`, and `--arm` waits for it"""
+    problem = now.link_problem
+    if not m.wants_arm or problem is None or problem.code not in NOT_SET:
+        return None
+    return EndRequest(problem, is_fault=True)
+
+
 def unfit_engage(m: Memory, now: EngagementInputs) -> Reason | None:
-    """an act that must be refused
+    """an engage command that must be refused
 
     The vehicle is disarmed, in a failsafe or outside the envelope; the engage switch is low; the
     mode is not allowed and we may not change it; there is no link or no fresh chunk; or the last
@@ -78,7 +88,7 @@ def unfit_engage(m: Memory, now: EngagementInputs) -> Reason | None:
 
 
 def engage(m: Memory, _: EngagementInputs) -> bool:
-    """an act
+    """an engage command
 
     The key `e`, the engage switch, the first arming with `--engage-on-arm`.
     """
@@ -105,8 +115,8 @@ def taken(m: Memory, now: EngagementInputs) -> EndRequest | None:
 
     The mode was changed; the vehicle was disarmed, rebooted, is in a failsafe or follows sticks
     other than ours; the override switch is low; the engage switch is low (in flight, or while an
-    act is carried out); the vehicle is silent while another one uses its system id; or a relevant
-    parameter was changed.
+    engage command is carried out); the vehicle is silent while another one uses its system id; or a
+    relevant parameter was changed.
     """
     if (reason := _takeover(m, now)) is None:
         return None
@@ -116,8 +126,8 @@ def taken(m: Memory, now: EngagementInputs) -> EndRequest | None:
 def late(m: Memory, now: EngagementInputs) -> EndRequest | None:
     """not ready in time
 
-    After 90 s with `--arm`, plus one second per metre of `--takeoff`; after 3 s with another act;
-    at once if waiting cannot help: the vehicle lacks the mode, or the policy is too slow.
+    After 90 s with `--arm`, plus one second per metre of `--takeoff`; after 3 s with another engage
+    command; at once if waiting cannot help: the vehicle lacks the mode, or the policy is too slow.
     """
     problem = m.engage.impossibility(now)
     if problem is None and now.now_ns <= m.until_ns:
@@ -281,6 +291,7 @@ class Transition(NamedTuple):
 AT_REST = (WAITING, RELEASED)
 TABLE = (
     Transition(AT_REST, ended, Memory.nothing, ENDED),
+    Transition((WAITING,), not_set, Memory.give_up, ENDED),
     Transition((WAITING,), arm_flag, Memory.prepare, PREPARING),
     Transition((*AT_REST, LEAVING, HOLDING, RELEASING), unfit_engage, Memory.refuse),
     Transition(AT_REST, engage, Memory.prepare, PREPARING),
