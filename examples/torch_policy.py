@@ -20,6 +20,3 @@ class TowardsLight(nn.Module):
         yaw = (feature[:, 1] - feature[:, 0]).clamp(-0.3, 0.3)
         sticks = torch.stack([throttle, yaw, 0 * yaw, 0 * yaw], dim=-1)
         return sticks[:, None].repeat(1, self.contract.horizon, 1)
-
-    def predict(self, image, *rest):  # without --dual-rate
-        return self.predict_fast(self.encode_visual(image), *rest)
