@@ -101,7 +101,10 @@ MOST_PIXEL = 1e3
 MAX_AGE_LIMIT_S = 60.0
 ENVELOPE_TERMS = ("max_tilt_deg", "max_speed_mps", "max_height_m", "max_distance_m")
 _CHUNK_AGES = ("max_state_age_s", "max_velocity_age_s", "max_feature_age_s", "max_chunk_age_s")
-FLIGHT_TERMS = ("action", "modes", *_CHUNK_AGES, *ENVELOPE_TERMS)
+FLIGHT_TERMS = (
+    *("action", "modes", "play_s", "state_time", "max_stall_s"),
+    *(*_CHUNK_AGES, *ENVELOPE_TERMS),
+)
 """Fields that decide how a policy is flown and do not affect its network's output."""
 _TUPLES = (
     *("cameras", "camera_rates_hz", "image_crop", "state_extras"),

@@ -159,7 +159,8 @@ def with_contract(checkpoint: Path, contract: Contract, path: Path) -> Path:
 
 
 def test_a_frozen_encoder_stays_and_the_head_learns(flights, tmp_path, whole):
-    wider = replace(CONTRACT, modes=("LOITER",), max_chunk_age_s=1.0)
+    terms = {"modes": ("LOITER",), "max_chunk_age_s": 1.0, "max_stall_s": 0.35, "play_s": 0.1}
+    wider = replace(CONTRACT, **terms)
     start_from = with_contract(whole.checkpoint, wider, tmp_path / "start.safetensors")
     made = settings(tmp_path, start_from=start_from, freeze_encoder=True, steps=3)
     stages: list[str] = []
@@ -169,7 +170,7 @@ def test_a_frozen_encoder_stays_and_the_head_learns(flights, tmp_path, whole):
     assert [name for name in encoder if before[name] != after[name]] == []
     assert before["head.unet.out.weight"] != after["head.unet.out.weight"]
     trained = load_checkpoint(result.checkpoint, fallback=NETWORK).contract
-    assert (trained.modes, trained.max_chunk_age_s) == (("LOITER",), 1.0)
+    assert terms == {name: getattr(trained, name) for name in terms}
     assert not any(stage.startswith("encoder") for stage in stages)
     with pytest.raises(PolicyError, match="--start-from"):
         replace(made, start_from=None)
