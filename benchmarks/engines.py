@@ -14,7 +14,6 @@ from mavbridge.config.policy import Engine, PolicyConfig
 from mavbridge.core.clock import NS_PER_S, MonotonicClock
 from mavbridge.core.histogram import Histogram
 from mavbridge.flight.policies import load_configured_policy
-from policy.contract import ACTION_DIM
 from policy.engines.runner import encode_all, level_state
 from policy.errors import PolicyError
 from policy.preprocess import dummy_images
@@ -81,7 +80,7 @@ def _cases_on(policy: PolicyConfig, lives: ExitStack) -> list[_Case]:
     contract = runner.contract
     images, state = dummy_images(contract), level_state(contract)
     image = images.reshape(-1, *contract.picture_shape)[0]
-    history = np.zeros((1, contract.history_len, ACTION_DIM), np.float32)
+    history = np.zeros((1, *contract.history_shape), np.float32)
     feature = encode_all(runner, images)
     engine = runner.engine if policy.engine == "auto" else policy.engine
 

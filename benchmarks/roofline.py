@@ -17,7 +17,6 @@ from benchmarks.engines import CHUNK, ENCODE
 from benchmarks.results import EngineTiming
 from mavbridge.config.policy import PolicyConfig
 from mavbridge.core.clock import NS_PER_MS, NS_PER_S, MonotonicClock
-from policy.contract import ACTION_DIM
 from policy.engines.openvino_compile import precisions
 
 DTYPES = {"f32": torch.float32, "bf16": torch.bfloat16}
@@ -69,7 +68,7 @@ def works_of(policy: PolicyConfig) -> Iterator[tuple[str, Work]]:
     )
     feature = torch.zeros(1, contract.feature_dim)
     state = torch.zeros(1, contract.state_dim)
-    history = torch.zeros(1, contract.history_len, ACTION_DIM)
+    history = torch.zeros(1, *contract.history_shape)
     uses = {net.state_encoder: 1, net.history_encoder: 1, net.fusion: 1, net.head: steps}
     yield CHUNK, count_work(lambda: net.predict_fast(feature, state, history, steps), uses)
 

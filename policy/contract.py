@@ -124,6 +124,7 @@ _INTEGERS = {
     "feature_dim": (0, 1 << 20),  # the cells of an ACT at 640x480 are 153,600
     "horizon": (1, 1024),
     "history_len": (1, 1024),
+    "prefix_len": (0, 1024),
     "observation_steps": (1, 16),
 }
 _NUMBERS: dict[str, tuple[float, float, str]] = {
@@ -184,6 +185,10 @@ class Contract:
     """Number K of past actions, as sent, oldest first."""
     history_dt_s: float = 0.05
     """Time between past actions; the newest is history_dt_s before the state."""
+    prefix_len: int = 0
+    """Number P of rows behind the past actions in the action history: the committed actions, which
+    the vehicle flies before the next chunk can take over. Row p acts ``p * chunk_dt_s`` after the
+    state, as row p of that chunk. Rows beyond the expected takeover are NaN."""
     arrays: Arrays = "torch"
     state_time: StateTime = "measured"
     """Time of the newest state. "execution": predicted to the moment at which the chunk will act,
@@ -306,6 +311,11 @@ class Contract:
         is_play = _is_within(self.play_s, 0, longest_s) and not 0 < self.play_s < LEAST
         wanted = f"0, or at least {LEAST:g} and at most the {longest_s:g} s of a chunk"
         self._require("play_s", is_play, wanted)
+        is_prefix = self.prefix_len < self.horizon and (
+            self.prefix_len == 0 or self.state_time == "measured"
+        )
+        wanted = f"less than horizon {self.horizon}, and 0 if state_time is 'execution'"
+        self._require("prefix_len", is_prefix, wanted)
 
     def _require_modes(self) -> None:
         if self.action not in ACTION_MODES:
@@ -343,6 +353,11 @@ class Contract:
         F spans the concatenated features of all cameras.
         """
         return self._stacked(self.feature_dim * len(self.cameras))
+
+    @property
+    def history_shape(self) -> tuple[int, int]:
+        """Shape [K + P, 4] of the action history, without the batch."""
+        return self.history_len + self.prefix_len, ACTION_DIM
 
     @property
     def is_depth(self) -> bool:

@@ -13,7 +13,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from policy.contract import ACTION_DIM, QUATERNION, RATE, VELOCITY, Contract, FloatArray
+from policy.contract import QUATERNION, RATE, VELOCITY, Contract, FloatArray
 from policy.errors import ContractError
 from policy.protocol import PolicyRunner
 from policy.rotation import Array, Quaternion, Vector, conjugate, matrix_columns, multiply, rotate
@@ -83,7 +83,7 @@ def flown_by_rates(runner: PolicyRunner) -> PolicyRunner:
     Its network gets a history of centred sticks, because the sent actions are rates.
     """
     loop = StickLoop(by_rates(runner.contract))
-    centred = np.zeros((1, runner.contract.history_len, ACTION_DIM), np.float32)
+    centred = np.zeros((1, *runner.contract.history_shape), np.float32)
 
     def act(encoded: FloatArray, state: FloatArray, _history: FloatArray) -> FloatArray:
         return loop.to_rates(runner.act(encoded, state, centred), state)

@@ -2,6 +2,9 @@
 
 import threading
 from bisect import bisect_right
+from collections.abc import Sequence
+
+import numpy as np
 
 from mavbridge.core.records import FloatArray
 from mavbridge.core.vehicle import Action, Sticks
@@ -64,6 +67,15 @@ class SentHistory:
         with self._lock:
             action = self._sent[bisect_right(self._sent_ns, at_ns)]
         return action if type(action) is type(self._frame.neutral) else self._frame.neutral
+
+    def committed(self, plan: Chunk | None, times_ns: Sequence[int], until_ns: int) -> FloatArray:
+        """Return the actions [1, len(times_ns), 4] that fly at these times; NaN from ``until_ns``
+        on, and without a ``plan``."""
+        prefix = np.full((1, len(times_ns), 4), np.nan, np.float32)
+        flown = [self.at(at_ns, plan) for at_ns in times_ns if plan and at_ns < until_ns]
+        if flown:
+            prefix[0, : len(flown)] = self._frame.from_guard(flown)
+        return prefix
 
     def resample(self, at_ns: int, plan: Chunk | None = None) -> FloatArray:
         """Return the history [1, K, 4] on the grid of ``policy.contract.history_ages_ns``.

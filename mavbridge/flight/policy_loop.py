@@ -8,6 +8,8 @@ from dataclasses import dataclass
 from functools import partial
 from typing import TypeAlias
 
+import numpy as np
+
 from mavbridge.core.clock import NS_PER_MS, NS_PER_S, Clock
 from mavbridge.core.reasons import Code, Reason, because
 from mavbridge.core.records import FloatArray, Solve, VehicleState
@@ -53,6 +55,8 @@ class PolicySettings:
     """Longest time for which the attitude may stay bit-identical; 0: no limit."""
     forward: ForwardState | None = None
     """Predicts the state to the time at which the chunk acts; None: the state as measured."""
+    prefix_len: int = 0
+    """Committed actions behind the action history."""
     period_ns: int
     """Minimum mean period of solves. Attitudes that arrive close together may shorten a single
     one."""
@@ -180,7 +184,7 @@ class PolicyLoop:
         if (frozen := self._frozen.problem(state)) is not None:
             return Unavailable(frozen)
         if self._forward is not None and plan is not None:
-            acts_ns = now_ns + sorted(self._solves_ns)[len(self._solves_ns) // 2]
+            acts_ns = self._takeover_ns(now_ns)
             ahead = self._forward.at(telemetry, acts_ns, partial(self._history.at, plan=plan))
             if ahead is not telemetry:
                 has_position = self._view.status.has_position
@@ -189,6 +193,11 @@ class PolicyLoop:
                     return acting
                 state = acting
         return self._observations.observe(state, now_ns)
+
+    def _takeover_ns(self, now_ns: int) -> int:
+        """Return when the chunk of a solve that begins now will take over, by the last solves."""
+        solves_ns = sorted(self._solves_ns)
+        return now_ns + (solves_ns[len(solves_ns) // 2] if solves_ns else 0)
 
     def _refuse(self, reason: Reason) -> None:
         if self._due_ns is not None:
@@ -202,6 +211,11 @@ class PolicyLoop:
         """Compute and send a chunk. ``observation`` may be predicted, ``state`` is as measured."""
         feature, acts_ns = observation.feature, observation.state.attitude_ns
         history = self._history.resample(now_ns if plan is None else acts_ns, plan)
+        step_ns = round(self._settings.chunk_dt_s * NS_PER_S)
+        if count := self._settings.prefix_len:
+            times_ns = range(acts_ns, acts_ns + count * step_ns, step_ns)
+            prefix = self._history.committed(self._chunk, times_ns, self._takeover_ns(now_ns))
+            history = np.concatenate([history, prefix], axis=1)
         try:
             array = self._act(observation.encoded, observation.states, history)
         except NoChunkError as error:
@@ -232,7 +246,7 @@ class PolicyLoop:
             image_ns=observation.image_ns,
             computed_ns=done_ns,
             first_ns=acts_ns,
-            step_ns=round(self._settings.chunk_dt_s * NS_PER_S),
+            step_ns=step_ns,
             reset_ns=self._reset_ns,
         )
         self._chunk = chunk

@@ -106,7 +106,7 @@ def _examples(policy: BuiltinPolicy) -> tuple[tuple[Tensor, ...], tuple[Tensor, 
         torch.zeros(1),
         torch.zeros(1, int(dim)),  # type: ignore[arg-type]
         torch.zeros(1, contract.state_dim),
-        torch.zeros(1, contract.history_len, ACTION_DIM),
+        torch.zeros(1, *contract.history_shape),
     )
 
 

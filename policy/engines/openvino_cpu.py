@@ -119,7 +119,7 @@ def denoise_graph(policy: BuiltinPolicy, count: int) -> ov.Model:
         return sample.squeeze(2).transpose(1, 2)
 
     feature = (1, size_dims(policy.config.size).base_dim)
-    state, history = (1, len(egocentric_scale(contract))), (1, contract.history_len, ACTION_DIM)
+    state, history = (1, len(egocentric_scale(contract))), (1, *contract.history_shape)
     noisy, steps = (1, contract.horizon, ACTION_DIM), ((count, head.unet.film_dim), (count, 4))
     return convert(policy, denoise, [feature, state, history, noisy, *steps])
 

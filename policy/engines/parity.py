@@ -5,7 +5,6 @@ from dataclasses import dataclass
 import numpy as np
 
 from policy.contract import (
-    ACTION_DIM,
     QUATERNION,
     SINCE_EXPOSURE_DIM,
     STATE_DIM,
@@ -47,7 +46,7 @@ def make_parity_samples(contract: Contract) -> ParitySamples:
     states = (SAMPLES, *contract.state_shape[:-1])
     parts = [random.normal(0.0, 2.0, (*states, STATE_DIM))]
     parts[0][..., QUATERNION] /= np.linalg.norm(parts[0][..., QUATERNION], axis=-1, keepdims=True)
-    history = random.uniform(-1.0, 1.0, (SAMPLES, contract.history_len, ACTION_DIM))
+    history = random.uniform(-1.0, 1.0, (SAMPLES, *contract.history_shape))
     if contract.since_exposure:
         since = random.uniform(-1.0, 1.0, (*states, SINCE_EXPOSURE_DIM)) * SINCE_EXPOSURE_SCALE
         since[..., 0] = np.abs(since[..., 0])

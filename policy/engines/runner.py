@@ -51,7 +51,7 @@ def make_runner(
     ``vision`` encodes images and ``action`` samples chunks: one policy, possibly on two devices.
     """
     contract, steps = action.contract, settings.num_diffusion_steps
-    rest = ((1, *contract.state_shape), (1, contract.history_len, ACTION_DIM))
+    rest = ((1, *contract.state_shape), (1, *contract.history_shape))
     if not settings.dual_rate:
         predict = compile_action(
             lambda i, s, h: action.predict(i, s, h, steps), ((1, *contract.image_shape), *rest)
@@ -160,7 +160,7 @@ def level_state(contract: Contract) -> FloatArray:
 def _try(runner: PolicyRunner) -> None:
     contract = runner.contract
     images, state = dummy_images(contract), level_state(contract)
-    history = np.zeros((1, contract.history_len, ACTION_DIM), np.float32)
+    history = np.zeros((1, *contract.history_shape), np.float32)
     try:
         if runner.dual_rate:
             for camera in range(len(contract.cameras)):
@@ -173,8 +173,8 @@ def _try(runner: PolicyRunner) -> None:
         told = str(error) if runner.name in str(error) else f"{runner.name}: {error}"
         raise PolicyError(
             f"{told}; this was a dummy sample: image {[1, *contract.image_shape]}, state "
-            f"{[1, *contract.state_shape]}, action_history [1, {contract.history_len}, "
-            f"{ACTION_DIM}], as {contract.arrays} arrays"
+            f"{[1, *contract.state_shape]}, action_history "
+            f"{[1, *contract.history_shape]}, as {contract.arrays} arrays"
         ) from error
     _require(runner, "the chunk", chunk, (1, contract.horizon, ACTION_DIM))
 

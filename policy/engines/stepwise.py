@@ -5,7 +5,7 @@ from typing import Any
 
 import numpy as np
 
-from policy.contract import ACTION_DIM, Contract, FloatArray
+from policy.contract import Contract, FloatArray
 from policy.engines.runner import (
     Act,
     ArrayFunction,
@@ -47,7 +47,7 @@ def make_parts_runner(
         noise = to_numpy(policy.initial_noise)
         shapes = (
             *(noise.shape, (1,), (1, *contract.feature_shape)),
-            *((1, *contract.state_shape), (1, contract.history_len, ACTION_DIM)),
+            *((1, *contract.state_shape), (1, *contract.history_shape)),
         )
         denoise = compile_action(policy.denoise, shapes)
         to_chunk = compile_end(policy.to_chunk, (noise.shape,))

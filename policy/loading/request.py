@@ -7,7 +7,7 @@ from statistics import median
 
 import numpy as np
 
-from policy.contract import ACTION_DIM, Contract
+from policy.contract import Contract
 from policy.engines.runner import EngineName, encode_all, level_state
 from policy.errors import NoChunkError, PolicyError
 from policy.preprocess import dummy_images
@@ -35,7 +35,7 @@ def measure_times(runner: PolicyRunner, now_s: Callable[[], float]) -> SolveTime
     """
     contract = runner.contract
     images, state = dummy_images(contract), level_state(contract)
-    history = np.zeros((1, contract.history_len, ACTION_DIM), np.float32)
+    history = np.zeros((1, *contract.history_shape), np.float32)
     encode_s: list[float] = []
     act_s: list[float] = []
     begun_s = now_s()

@@ -55,6 +55,8 @@ class BuiltinConfig:
             raise ContractError(
                 f"{self.kind} takes torch arrays, the contract says {self.contract.arrays}"
             )
+        if self.contract.prefix_len:
+            raise ContractError(f"{self.kind} takes no prefix: leave prefix_len out")
 
 
 class BuiltinPolicy(nn.Module):

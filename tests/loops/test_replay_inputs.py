@@ -186,6 +186,7 @@ PAST = {"observation_steps": 3, "observation_dt_s": 0.07}
         {"state_time": "execution", "action": "velocity", "state_frame": "enu_flu", **PAST},
         TWO_EYES,
         {"state_extras": ("height",), **TWO_EYES, **PAST},
+        {"prefix_len": 4},
         {"history_len": 1, "history_dt_s": 0.001},
         {"history_len": 64, "history_dt_s": 0.003},
     ],

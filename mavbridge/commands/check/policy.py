@@ -18,7 +18,7 @@ from mavbridge.core.workers import Worker
 from mavbridge.flight.plan import FlightPlan, plan_flight
 from mavbridge.flight.policies import load_configured_policy
 from mavbridge.flight.speed import require_speed
-from policy.contract import ACTION_DIM, Contract
+from policy.contract import Contract
 from policy.engines.runner import encode_all, level_state
 from policy.errors import Agreed, NoChunkError, Warned
 from policy.loading.request import LoadedPolicy
@@ -172,7 +172,7 @@ def _run_at_rates(
     """Compute chunks and images of a dummy sample, each in a thread, at the rates of the flight."""
     contract, rates, loops = runner.contract, plan.config.rates, plan.loops
     images, state = dummy_images(contract), level_state(contract)
-    history = np.zeros((1, contract.history_len, ACTION_DIM), np.float32)
+    history = np.zeros((1, *contract.history_shape), np.float32)
     encoded = encode_all(runner, images)
     one_of_each = images.reshape(-1, len(contract.cameras), *contract.picture_shape)[0]
 

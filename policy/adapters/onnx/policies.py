@@ -139,7 +139,7 @@ def _wanted(files: OnnxFiles) -> dict[str, Wanted]:
         "image": (1, *contract.image_shape),
         "feature": (1, *contract.feature_shape),
         "state": (1, *contract.state_shape[:-1], interface.state_dim),
-        "action_history": (1, contract.history_len, ACTION_DIM),
+        "action_history": (1, *contract.history_shape),
         "noisy": (1, contract.horizon, ACTION_DIM),
         "timestep": (1,),
     }

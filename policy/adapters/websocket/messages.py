@@ -22,7 +22,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from policy.adapters.interface import Interface
-from policy.contract import ACTION_DIM, Contract, FloatArray
+from policy.contract import Contract, FloatArray
 from policy.errors import PolicyError
 from policy.preprocess import image_to_input, input_to_bytes
 
@@ -126,17 +126,26 @@ def number_array(message: Message, key: str) -> NDArray[np.generic]:
 
 
 HISTORY_KEY = "action_history"
-"""Key in requests to mavbridge's own server: action history, float32 [K, 4]."""
+"""Key in requests to mavbridge's own server: action history, float32 [K + P, 4]."""
+PREFIX_KEY, DELAY_KEY = "prefix", "delay_s"
+"""Keys in requests under a contract with ``prefix_len`` P: the committed actions, float32 [P, 4] in
+the server's units and order, NaN where none is committed; and the time of the last answer [s]."""
 RESET_KEY = "reset"
 """Key in requests to mavbridge's own server: true if a flight has begun since the last request."""
 
 
 def to_message(
-    interface: Interface, image: FloatArray, state: FloatArray, *, history: FloatArray | None
+    interface: Interface,
+    image: FloatArray,
+    state: FloatArray,
+    history: FloatArray,
+    *,
+    is_ours: bool,
+    delay_s: float,
 ) -> Message:
     """Return the request for one observation: arrays of ``predict``, without the batch.
 
-    ``history`` [K, 4] is for mavbridge's own server.
+    ``is_ours``: for mavbridge's own server, which takes the history.
     """
     contract = interface.contract
     images = image[..., 0, :, :] if contract.is_depth else to_uint8(image, contract)
@@ -147,8 +156,11 @@ def to_message(
     message[interface.state_key] = interface.to_state(state)
     if interface.prompt:
         message["prompt"] = interface.prompt
-    if history is not None:
+    if is_ours:
         message[HISTORY_KEY] = history
+    elif contract.prefix_len:
+        message[PREFIX_KEY] = interface.from_actions(history[contract.history_len :])
+        message[DELAY_KEY] = delay_s
     return message
 
 
@@ -163,23 +175,25 @@ def from_message(
     cameras = -1 - len(contract.picture_shape)
     stacked = images[0] if len(images) == 1 else np.stack(images, axis=cameras)
     state = _array(message, interface.state_key, contract.state_shape, "f").astype(np.float32)
-    history_shape = (contract.history_len, ACTION_DIM)
-    history = _array(message, HISTORY_KEY, history_shape, "f").astype(np.float32)
+    history = _array(message, HISTORY_KEY, contract.history_shape, "f", contract.history_len)
     if contract.is_depth:
         planes: FloatArray = stacked.astype(np.float32)[..., None, :, :]
     else:
         planes = from_uint8(stacked.astype(np.uint8), contract)
-    return planes[None], state[None], history[None]
+    return planes[None], state[None], history.astype(np.float32)[None]
 
 
-def _array(message: Message, key: str, shape: tuple[int, ...], kind: str) -> NDArray[np.generic]:
+def _array(
+    message: Message, key: str, shape: tuple[int, ...], kind: str, finite: int | None = None
+) -> NDArray[np.generic]:
+    """Return an array of the request; its first ``finite`` rows, or all, must be finite."""
     array = number_array(message, key)
     if array.dtype.kind != kind or array.shape != shape:
         wanted = "uint8" if kind == "u" else "float32"
         raise MessageError(
             f"{key!r} must be {wanted} {list(shape)}, got {array.dtype} {list(array.shape)}"
         )
-    if kind == "f" and not np.isfinite(array).all():
+    if kind == "f" and not np.isfinite(array[:finite]).all():
         raise MessageError(f"{key!r} holds NaN or infinity")
     return array
 

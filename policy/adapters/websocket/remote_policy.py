@@ -64,8 +64,14 @@ class RemotePolicy:
         num_diffusion_steps: int,
     ) -> FloatArray:
         """Ask the server for a chunk; the server sets the number of diffusion steps."""
-        history = action_history[0] if self._is_ours else None
-        message = to_message(self._interface, image[0], state[0], history=history)
+        message = to_message(
+            self._interface,
+            image[0],
+            state[0],
+            action_history[0],
+            is_ours=self._is_ours,
+            delay_s=self.round_trip_s,
+        )
         if self._is_ours and self._has_begun:
             message[RESET_KEY] = True
         answer = self._link.ask(pack(message), self._timeout_s)
@@ -90,7 +96,7 @@ class RemotePolicy:
         """Request two chunks of a dummy sample; return a line with the second one's time."""
         contract = self.contract
         image = np.zeros((1, *contract.image_shape), np.float32)
-        history = np.zeros((1, contract.history_len, ACTION_DIM), np.float32)
+        history = np.zeros((1, *contract.history_shape), np.float32)
         for _ in range(2):  # the first one may compile
             self.predict(image, level_state(contract), history, 1)
         share = "" if self.infer_s is None else f", {1e3 * self.infer_s:.1f} ms of them its own"

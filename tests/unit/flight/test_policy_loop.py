@@ -41,6 +41,7 @@ class Rig:
         frame: ActionFrame = STICKS_FRAME,
         period_ms: int = 10,
         forward: ForwardState | None = None,
+        prefix_len: int = 0,
     ) -> None:
         self.clock, self.cache = FakeClock(), FeatureCache()
         history = SentHistory(length=2, dt_s=0.05, frame=frame)
@@ -70,6 +71,7 @@ class Rig:
                 chunk_dt_s=0.05,
                 max_frozen_ns=500 * MS,
                 forward=forward,
+                prefix_len=prefix_len,
                 period_ns=period_ms * MS,
             ),
         )
@@ -168,6 +170,21 @@ def test_the_state_of_a_vehicle_that_moves_is_predicted_to_when_the_chunk_acts(
     assert chunk.first_ns == started_ns + 200 * MS
     assert states[0, 0] > north_mps + 0.2  # the plan, stick forward, has gathered speed
     assert history[0, -1].tolist() == [0.0, 0.0, pytest.approx(0.8), 0.0]
+
+
+def test_the_prefix_holds_what_flies_until_the_chunk_takes_over() -> None:
+    rising = np.zeros((1, 16, 4), np.float32)
+    rising[0, :, 0] = np.arange(16) / 100
+    rig = Rig(lambda: rising, period_ms=100, prefix_len=6).measure().see()
+    rig.solve_ns = 200 * MS
+    rig.loop.step()
+    _, _, history = rig.given
+    assert (history.shape, np.isnan(history[0, 2:]).all()) == ((1, 8, 4), True)  # nothing planned
+    run_on(rig, 7)
+    _, _, history = rig.given
+    assert not np.isnan(history[0, :2]).any()
+    assert history[0, 2:6, 0] == pytest.approx((207 + 50 * np.arange(4)) / 50 / 100)
+    assert np.isnan(history[0, 6:]).all()  # 200 ms later the next chunk flies
 
 
 def too_old(quantity: str, age_ms: float, limit_ms: float) -> Reason:

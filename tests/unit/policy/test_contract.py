@@ -59,6 +59,8 @@ def test_shapes_grow_by_cameras_observations_and_extras() -> None:
         ({"image_channels": "depth", "image_mean_rgb": [0.0, 0.0, 0.0]}, "image_mean_rgb"),
         ({"state_extras": ["speed"]}, "goal, height, altitude"),
         ({"play_s": 0.9}, "at most the 0.8 s of a chunk"),
+        ({"prefix_len": 16}, "prefix_len must be less than horizon 16"),
+        ({"prefix_len": 4, "state_time": "execution"}, "0 if state_time is 'execution', got 4"),
         ({"version": 3}, "version 3 is not supported"),
         ({"horizon": 0}, "horizon must be an integer in"),
         ({"image_std_rgb": [0.2, 0.2, 0.0]}, "three numbers in"),

@@ -177,7 +177,7 @@ def contract_of(steps: int, cameras: tuple[str, ...]) -> Contract:
 @pytest.mark.parametrize("steps", [1, 2])
 @pytest.mark.parametrize("cameras", [("front",), ("front", "down")])
 def test_an_observation_arrives_as_it_was_sent(steps, cameras, channels):
-    contract = replace(contract_of(steps, cameras), image_channels=channels)
+    contract = replace(contract_of(steps, cameras), image_channels=channels, prefix_len=steps)
     interface, rng = Interface(contract=contract), np.random.default_rng(0)
     stack = contract.image_shape[:-3]
     if contract.is_depth:  # float32 metres, without an axis of channels
@@ -187,8 +187,9 @@ def test_an_observation_arrives_as_it_was_sent(steps, cameras, channels):
         pictures = rng.integers(0, 256, (*stack, 16, 24, 3), dtype=np.uint8)
         image = from_uint8(pictures, contract)
     state = rng.normal(size=contract.state_shape).astype(np.float32)
-    history = rng.normal(size=(4, 4)).astype(np.float32)
-    message = unpack(pack(to_message(interface, image, state, history=history)))
+    history = rng.normal(size=contract.history_shape).astype(np.float32)
+    history[contract.history_len + 1 :] = np.nan  # not committed
+    message = unpack(pack(to_message(interface, image, state, history, is_ours=True, delay_s=0.1)))
     names = [f"observation.images.{name}" for name in cameras]
     assert set(message) == {*names, "observation.state", "action_history"}
     camera = -1 - len(contract.picture_shape)
@@ -197,20 +198,25 @@ def test_an_observation_arrives_as_it_was_sent(steps, cameras, channels):
     assert sent.dtype == pictures.dtype
     assert np.array_equal(sent, wanted)
     for got, given_ in zip(from_message(interface, message), (image, state, history), strict=True):
-        assert np.array_equal(got, given_[None])
+        assert np.array_equal(got, given_[None], equal_nan=True)
 
 
 def test_keys_and_names_are_those_of_the_contract_file() -> None:
     interface = Interface(
-        contract=contract_of(1, ("front",)),
+        contract=replace(contract_of(1, ("front",)), prefix_len=2),
         state_names=("wz_radps", "vx_mps"),
+        action_scale=(2.0, 1.0, 1.0, 1.0),
         state_key="observation/state",
         image_keys=("observation/image",),
         prompt="fly through the gates",
     )
     state = np.arange(13, dtype=np.float32)
-    message = to_message(interface, np.zeros((3, 16, 24), np.float32), state, history=None)
-    assert set(message) == {"observation/image", "observation/state", "prompt"}
+    image, history = np.zeros((3, 16, 24), np.float32), np.full((6, 4), 0.5, np.float32)
+    message = to_message(interface, image, state, history, is_ours=False, delay_s=0.1)
+    own = {"observation/image", "observation/state", "prompt"}
+    assert set(message) == {*own, "prefix", "delay_s"}
+    prefix: Any = message["prefix"]
+    assert (prefix.tolist(), message["delay_s"]) == ([[0.25, 0.5, 0.5, 0.5]] * 2, 0.1)
     sent: Any = message["observation/state"]
     assert (sent.tolist(), sent.dtype) == ([9.0, 0.0], np.float32)
 
@@ -221,6 +227,7 @@ def test_keys_and_names_are_those_of_the_contract_file() -> None:
         ({"observation.state": None}, "no 'observation.state'"),
         ({"observation.state": np.zeros(12, np.float32)}, r"float32 \[13\], got float32 \[12\]"),
         ({"observation.state": np.full(13, np.nan, np.float32)}, "NaN"),
+        ({"action_history": np.full((4, 4), np.nan, np.float32)}, "NaN"),
         ({"observation.images.front": np.zeros((16, 24, 3), np.float32)}, "uint8"),
         ({"observation.images.front": np.zeros((3, 16, 24), np.uint8)}, r"\[16, 24, 3\]"),
     ],
@@ -229,7 +236,8 @@ def test_a_request_that_does_not_fit_is_refused(changes: dict[str, Any], told: s
     interface = Interface(contract=contract_of(1, ("front",)))
     image = np.zeros((3, 16, 24), np.float32)
     state, history = np.zeros(13, np.float32), np.zeros((4, 4), np.float32)
-    message = {**to_message(interface, image, state, history=history), **changes}
+    asked = to_message(interface, image, state, history, is_ours=True, delay_s=0.1)
+    message = {**asked, **changes}
     message = {key: value for key, value in message.items() if value is not None}
     with pytest.raises(MessageError, match=told):
         from_message(interface, message)
