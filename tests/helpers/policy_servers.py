@@ -5,6 +5,7 @@ import threading
 from collections.abc import Callable, Iterator
 from concurrent.futures import Future
 from contextlib import contextmanager, suppress
+from typing import TypeVar
 
 import numpy as np
 from websockets.asyncio.server import Server, ServerConnection, serve
@@ -15,12 +16,12 @@ from mavbridge.core.clock import NS_PER_S, MonotonicClock
 from mavbridge.core.workers import Worker
 from policy.adapters.websocket.messages import Message, pack, unpack
 from policy.errors import PolicyError
-from policy.loading.request import LoadedPolicy
 from policy.protocol import PolicyRunner
 
 Reply = bytes | str | tuple[bytes, ...] | None
 """Several: sent one after the other; None: close the connection."""
 START_S = 10.0
+Connected = TypeVar("Connected")
 
 
 @contextmanager
@@ -128,10 +129,10 @@ class Guard:
         return chunk_of(number)
 
 
-def when_it_listens(connect: Callable[[], LoadedPolicy]) -> LoadedPolicy:
+def when_it_listens(connect: Callable[[], Connected], within_s: int = 30) -> Connected:
     """Connect to a starting server, which refuses connections until it listens."""
     clock = MonotonicClock()
-    until_ns = clock.now_ns() + 30 * NS_PER_S
+    until_ns = clock.now_ns() + within_s * NS_PER_S
     while clock.now_ns() < until_ns:
         with suppress(PolicyError):
             return connect()

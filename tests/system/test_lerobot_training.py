@@ -8,6 +8,7 @@ import json
 import os
 import subprocess
 from collections.abc import Sequence
+from contextlib import closing
 from pathlib import Path
 
 import numpy as np
@@ -15,10 +16,13 @@ import pytest
 import torch
 
 from helpers.flight_folders import write_spot_flight
+from helpers.policy_servers import when_it_listens
 from mavbridge.__main__ import main
 from mavbridge.commands.export.files import stretches
+from mavbridge.core.processes import free_port, running
 from policy.adapters.lerobot.plan import read_plan
 from policy.adapters.lerobot.policy import load_policy_of
+from policy.adapters.websocket.kind import load_server_policy
 from policy.data.flight_folders import read_flight
 from policy.data.lerobot_format import STATE_KEY
 from policy.preprocess import image_to_input
@@ -28,6 +32,7 @@ pytestmark = [
     pytest.mark.system,
     pytest.mark.skipif(not PYTHON, reason="MAVBRIDGE_LEROBOT_PYTHON names no Python with LeRobot"),
 ]
+SERVER = Path(__file__).parents[2] / "examples" / "servers" / "lerobot_server.py"
 ROW = 20
 TINY_ACT = (
     *("--policy.type=act", "--policy.device=cpu", "--policy.push_to_hub=false"),
@@ -107,6 +112,29 @@ def test_a_row_of_the_dataset_gives_the_actions_that_lerobot_gives(
         chunk = policy.predict(torch.from_numpy(image), torch.from_numpy(state), history, 1)
     assert policy.contract.chunk_dt_s == pytest.approx(1 / 30, abs=1e-6)
     np.testing.assert_allclose(chunk.numpy(), expected["chunk"], atol=1e-4)
+
+
+def test_the_server_of_the_examples_gives_the_actions_that_are_computed_here(
+    trained: Sequence[Path], tmp_path: Path
+) -> None:
+    _, dataset, checkpoint = trained
+    contract_file, port = dataset / "mavbridge.toml", free_port()
+    here, _ = load_policy_of(read_plan(checkpoint, contract_file), seed=0, num_diffusion_steps=1)
+    contract, random = here.contract, np.random.default_rng(0)
+    picture = random.integers(0, 256, (48, 48, 3), dtype=np.uint8)
+    state = random.normal(size=(1, *contract.state_shape)).astype(np.float32)
+    history = np.zeros((1, *contract.history_shape), np.float32)
+    inputs = (image_to_input(picture, contract), state, history)
+    with torch.inference_mode():
+        expected = here.predict(*map(torch.from_numpy, inputs), 1).numpy()
+    command = (PYTHON, str(SERVER), str(checkpoint), "--port", str(port))
+    url = f"ws://127.0.0.1:{port}"
+    with running(*command, log=tmp_path / "server.log"):
+        remote, _ = when_it_listens(lambda: load_server_policy(url, contract_file), within_s=120)
+        with closing(remote):
+            image = image_to_input(picture, remote.contract)
+            chunk = remote.predict(image, state, history, 1)
+    np.testing.assert_allclose(chunk, expected, atol=1e-4)
 
 
 def test_the_policy_flies_by_the_file_that_mavbridge_contract_finds(

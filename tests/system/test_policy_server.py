@@ -213,6 +213,31 @@ def test_what_is_no_chunk_is_refused_at_loading_and_coasted_over_in_flight(
         predict_until(policy, lambda found: found == 0.75)
 
 
+@pytest.mark.parametrize(
+    ("fields", "told"),
+    [
+        ('{"horizon": 4, "image_height": 32}', None),
+        ('{"image_height": 48}', "image_height = 32 contradicts"),
+        ('{"height": 48}', "unknown contract keys"),
+        ("[]", "not a JSON object"),
+        ("{", "not JSON"),
+    ],
+)
+def test_a_server_may_say_fields_that_the_file_lacks(
+    contract_file: Path, fields: str, told: str | None
+) -> None:
+    greeting = pack({"mavbridge_fields": fields})
+    with scripted_server(lambda _: pack({"actions": [[0.5] * 4] * 4}), greeting=greeting) as port:
+        url = f"ws://127.0.0.1:{port}"
+        if told is not None:
+            with pytest.raises(PolicyError, match=told):
+                load_server_policy(url, contract_file)
+            return
+        policy, _ = load_server_policy(url, contract_file)
+        with closing(policy):
+            assert (policy.contract.horizon, predict(policy)) == (4, 0.5)
+
+
 def test_a_policy_that_gives_no_numbers_is_refused_at_loading(contract_file: Path) -> None:
     with scripted_server(lambda _: chunk_of(np.nan)) as port:
         request = PolicyRequest(spec=f"ws://127.0.0.1:{port}", contract_file=contract_file)

@@ -3,6 +3,7 @@
 msgpack and websockets are an extra; only loading such a policy imports them.
 """
 
+import json
 import os
 from dataclasses import fields, replace
 from importlib.util import find_spec
@@ -80,13 +81,14 @@ def load_server_policy(url: str, contract_file: Path | None) -> tuple["RemotePol
 
 
 def _interface(contract_file: Path | None, metadata: "Message") -> Interface:
-    """Return the contract of ``mavbridge serve`` under the file's terms, or the file's own."""
-    from policy.adapters.websocket.messages import CONTRACT_KEY
+    """Return the contract of ``mavbridge serve`` under the file's terms, or the file's own with
+    the fields that the server knows."""
+    from policy.adapters.websocket.messages import CONTRACT_KEY, FIELDS_KEY
 
     served = metadata.get(CONTRACT_KEY)
     if not isinstance(served, str):
         if contract_file is not None:
-            return read_interface(contract_file)
+            return read_interface(contract_file, _known_fields(metadata.get(FIELDS_KEY)))
         raise PolicyError(
             "the server does not say its rate nor what its state and actions mean: write that in a "
             "file, and give --contract FILE; docs/policy.md has one to begin with"
@@ -104,3 +106,16 @@ def _interface(contract_file: Path | None, metadata: "Message") -> Interface:
         if field.init and not (field.name in TERMS and field.name in said)
     }
     return read_interface(contract_file, kept)
+
+
+def _known_fields(text: object) -> dict[str, object]:
+    """Return the contract fields of a server's metadata; none without them."""
+    if not isinstance(text, str):
+        return {}
+    try:
+        known = json.loads(text)
+    except ValueError as error:
+        raise ContractError(f"the server's contract fields are not JSON: {error}") from error
+    if not isinstance(known, dict):
+        raise ContractError("the server's contract fields are not a JSON object")
+    return known

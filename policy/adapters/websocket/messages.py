@@ -29,6 +29,8 @@ from policy.preprocess import image_to_input, input_to_bytes
 Message: TypeAlias = dict[str, object]
 CONTRACT_KEY = "mavbridge_contract"
 """Key in the metadata of mavbridge's own server: its contract as JSON."""
+FIELDS_KEY = "mavbridge_fields"
+"""Key in the metadata of another server: the contract fields that it knows, as JSON."""
 ARRAY, NUMBER = "__ndarray__", "__npgeneric__"
 MAX_DIMENSIONS = 8
 _NUMERIC_DTYPE = re.compile(r"[<>|=]?[biuf][1248]|bool|u?int(8|16|32|64)|float(16|32|64)")

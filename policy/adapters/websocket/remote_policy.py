@@ -117,6 +117,6 @@ class RemotePolicy:
         if actions.shape != wanted:
             raise MessageError(
                 f"actions {list(actions.shape)} where the contract has [horizon, 4] = "
-                f"{list(wanted)}"
+                f"{list(wanted)}: set [contract] horizon to what the server returns"
             )
         return self._interface.to_actions(actions.astype(np.float32))[None]
