@@ -5,11 +5,12 @@ from collections.abc import Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass, field
 from functools import partial
+from itertools import pairwise
 from statistics import median
 
 from mavbridge.camera.image_watch import is_blank
 from mavbridge.camera.open import open_camera, require_present
-from mavbridge.commands.check.rows import CheckRow, Verdict
+from mavbridge.commands.check.rows import CheckRow
 from mavbridge.config.flight import CameraConfig
 from mavbridge.core.clock import NS_PER_MS, NS_PER_S, Clock
 from mavbridge.core.errors import CameraError, MavbridgeError
@@ -71,20 +72,27 @@ def camera_rows(needs: Sequence[CameraNeeds], config: CameraConfig, clock: Clock
     """Open, read and close every camera; a failure becomes a row."""
     rows: list[CheckRow] = []
     with ExitStack() as stack:
-        opened: list[tuple[CameraNeeds, Camera]] = []
+        watched: list[tuple[CameraNeeds, CameraView, Worker]] = []
         for need in needs:
             try:
                 camera = _open(need, config, clock)
             except MavbridgeError as error:
                 hint = "" if need.is_flown_by else f"; the policy {NO_IMAGE_ADVICE}"
-                advice = f"{error}{hint}"
-                rows.append(_row(need, "not opened", verdict="no-go", advice=advice))
+                rows.append(_row(need, "not opened", no_go=f"{error}{hint}"))
                 continue
             stack.callback(camera.close)
-            opened.append((need, camera))
-        seen = _watch_all([camera for _, camera in opened], clock)
-        for (need, _), what in zip(opened, seen, strict=True):
-            rows += judge(need, what, latency_ms=config.camera_latency)
+            view = CameraView()
+            name = f"mavbridge-check-camera-{len(watched)}"
+            watched.append((need, view, Worker(name, partial(_watch, camera, view, clock))))
+        for _, _, worker in watched:
+            worker.start()
+        for need, view, worker in watched:
+            worker.ends_within(MEASURE_S + _JOIN_S)
+            try:
+                worker.join(_JOIN_S)
+            except HungError as error:
+                view.failure = f"the camera hangs: {error}"
+            rows += judge(need, view, latency_ms=config.camera_latency)
     return rows
 
 
@@ -98,23 +106,6 @@ def _open(need: CameraNeeds, config: CameraConfig, clock: Clock) -> Camera:
         latency_ms=config.camera_latency,
         is_depth=need.is_depth,
     )
-
-
-def _watch_all(cameras: Sequence[Camera], clock: Clock) -> list[CameraView]:
-    seen = [CameraView() for _ in cameras]
-    workers = [
-        Worker(f"mavbridge-check-camera-{number}", partial(_watch, camera, what, clock))
-        for number, (camera, what) in enumerate(zip(cameras, seen, strict=True))
-    ]
-    for worker in workers:
-        worker.start()
-    for worker, what in zip(workers, seen, strict=True):
-        worker.ends_within(MEASURE_S + _JOIN_S)
-        try:
-            worker.join(_JOIN_S)
-        except HungError as error:
-            what.failure = f"the camera hangs: {error}"
-    return seen
 
 
 def _watch(camera: Camera, seen: CameraView, clock: Clock, stop: threading.Event) -> None:
@@ -138,24 +129,19 @@ def judge(need: CameraNeeds, seen: CameraView, *, latency_ms: float) -> list[Che
     """Return the rows of one camera from its frames; ``latency_ms`` is that of --camera-latency."""
     if seen.failure is not None or not seen.captured_ns:
         why = seen.failure or f"no frame came in {MEASURE_S:g} s"
-        return [_row(need, "stopped", verdict="no-go", advice=why)]
-    return [_rate_row(need, seen), _image_row(need, seen), _age_row(need, seen, latency_ms)]
-
-
-def _rate_row(need: CameraNeeds, seen: CameraView) -> CheckRow:
-    is_slow = seen.rate_hz < _ENOUGH * need.rate_hz
-    advice = (
+        return [_row(need, "stopped", no_go=why)]
+    slow = (
         f"the camera delivers {seen.rate_hz:.1f} images a second of {need.rate_hz:.3g}: more "
         "light, a smaller image or another mode may help; or ask for fewer by rates.visual"
     )
-    return _row(
+    rate_row = _row(
         need,
         f"{seen.rate_hz:.1f} Hz",
         f"{need.rate_hz:.3g} Hz",
         part="rate",
-        verdict="warn" if is_slow else "go",
-        advice=advice if is_slow else "",
+        warn=slow if seen.rate_hz < _ENOUGH * need.rate_hz else "",
     )
+    return [rate_row, _image_row(need, seen), _age_row(need, seen, latency_ms)]
 
 
 def _image_row(need: CameraNeeds, seen: CameraView) -> CheckRow:
@@ -170,35 +156,31 @@ def _image_row(need: CameraNeeds, seen: CameraView) -> CheckRow:
         f"{seen.width_px}x{seen.height_px}{' depth' if seen.is_depth else ''}",
         f"{need.side_px} px a side or more",
         part="image",
-        verdict="no-go" if seen.is_blank and need.is_flown_by else "warn" if advice else "go",
-        advice=advice,
+        warn=advice,
+        no_go=advice if seen.is_blank and need.is_flown_by else "",
     )
 
 
 def _age_row(need: CameraNeeds, seen: CameraView, latency_ms: float) -> CheckRow:
     ages_ms = sorted(age_ns / NS_PER_MS for age_ns in seen.ages_ns)
     typical_ms, oldest_ms = median(ages_ms), ages_ms[-1]
-    steps_back = sum(b <= a for a, b in zip(seen.captured_ns, seen.captured_ns[1:], strict=False))
-    verdict: Verdict = "go"
-    advice = ""
+    steps_back = sum(after <= before for before, after in pairwise(seen.captured_ns))
+    warn = ""
     if steps_back:
-        verdict, advice = "warn", f"{steps_back} stamps do not rise: their source does not count on"
+        warn = f"{steps_back} stamps do not rise: their source does not count on"
     elif typical_ms < _ON_ARRIVAL_MS and not latency_ms and not need.source.startswith("shm:"):
-        verdict = "warn"
-        advice = (
+        warn = (
             "frames are stamped as they arrive, so their true age is not known: measure the time "
             "from exposure to arrival, and give it as --camera-latency MS"
         )
-    if typical_ms / 1000 > need.max_age_s:
-        verdict = "no-go"
-        advice = f"images are older than the {need.max_age_s:g} s at which they may be acted on"
+    old = f"images are older than the {need.max_age_s:g} s at which they may be acted on"
     return _row(
         need,
         f"{typical_ms:.1f} ms, at most {oldest_ms:.1f}",
         f"exposure stamps, under {need.max_age_s * 1000:.0f} ms",
         part="age when read",
-        verdict=verdict,
-        advice=advice,
+        warn=warn,
+        no_go=old if typical_ms / 1000 > need.max_age_s else "",
     )
 
 
@@ -208,8 +190,8 @@ def _row(
     expected: str = "frames",
     *,
     part: str = "",
-    verdict: Verdict = "go",
-    advice: str = "",
+    warn: str = "",
+    no_go: str = "",
 ) -> CheckRow:
     name = " ".join(filter(None, (need.name or need.source, part)))
-    return CheckRow("camera", name, found, expected, verdict, advice)
+    return CheckRow("camera", name, found, expected, warn, no_go)

@@ -1,14 +1,14 @@
 """Rows about the policy: its loading, its engine, its rates on this computer, and its contract."""
 
 import threading
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import ExitStack, suppress
 from dataclasses import dataclass, field, replace
 from functools import partial
 
 import numpy as np
 
-from mavbridge.commands.check.rows import CheckRow, Verdict
+from mavbridge.commands.check.rows import CheckRow
 from mavbridge.config.flight import FlyConfig, Limits
 from mavbridge.core.clock import NS_PER_S, Clock, period_ns
 from mavbridge.core.errors import MavbridgeError, UserError
@@ -34,39 +34,49 @@ _LATE_PERIODS = 1.5
 """A chunk is late if it comes more than this many periods after the last, as in a report."""
 _JOIN_S = 60.0
 """Longest wait for the last call of a slow policy."""
+_row = partial(CheckRow, "policy")
 
 
-@dataclass(frozen=True, kw_only=True)
-class PolicyFindings:
-    """Rows about the policy, and its plan for the other checks."""
+def check_policy(
+    config: FlyConfig, clock: Clock, *, timing_s: float
+) -> tuple[list[CheckRow], FlightPlan | None]:
+    """Load the policy as a flight does, and run it for ``timing_s``; a failure becomes a row.
 
-    rows: list[CheckRow] = field(default_factory=list)
-    plan: FlightPlan | None = None
-    """None: no policy was named, or it cannot be loaded. Flags that contradict it are left out."""
-
-
-def check_policy(config: FlyConfig, clock: Clock, *, timing_s: float) -> PolicyFindings:
-    """Load the policy as a flight does, and run it for ``timing_s``; a failure becomes a row."""
+    Return its rows, and its plan for the other checks, without flags that contradict it; None: no
+    policy was named, or it cannot be loaded.
+    """
     if config.policy.policy == NO_POLICY:
-        return PolicyFindings()
+        return [], None
     try:
-        with ExitStack() as stack:
-            loaded = load_configured_policy(
-                config.policy, clock, starts_in_air=config.takeoff is not None
-            )
-            stack.enter_context(loaded)
-            rows = [_engine_row(loaded)]
+        in_air = config.takeoff is not None
+        with load_configured_policy(config.policy, clock, starts_in_air=in_air) as loaded:
             runner = loaded.runner
+            agrees = any(isinstance(note, Agreed) for note in loaded.notes)
+            found = f"{runner.name} on {runner.engine}{', agrees with torch' if agrees else ''}"
+            expected = "the fastest that agrees with torch"
+            rows = [_row("engine", found, expected, warn=_warnings(loaded.notes))]
+            takes = _contract_words(runner.contract)
             try:
                 plan = plan_flight(config, runner.contract, is_dual=runner.dual_rate)
             except UserError as error:
-                found = _contract_words(runner.contract)
-                rows.append(_row("flags of the flight", found, "no-go", str(error)))
-                return PolicyFindings(rows=rows, plan=_plan_by_contract(config, runner))
-            rows += [*_speed_rows(plan, loaded, clock, timing_s), *_plan_rows(plan)]
-            return PolicyFindings(rows=rows, plan=plan)
+                rows.append(_row("flags of the flight", takes, no_go=str(error)))
+                return rows, _plan_by_contract(config, runner)
+            rows += _speed_rows(plan, loaded, clock, timing_s)
+            figures = ", ".join(f"{name} {value:.4g}" for name, value in plan.figures().items())
+            rows.append(_row("contract", takes, "no flag that contradicts it"))
+            rows.append(_row("plan", figures))
+            return rows, plan
     except MavbridgeError as error:
-        return PolicyFindings(rows=[_row("policy", config.policy.policy, "no-go", str(error))])
+        return [_row("policy", config.policy.policy, no_go=str(error))], None
+
+
+def _contract_words(contract: Contract) -> str:
+    takes = f"{contract.image_width}x{contract.image_height} of {', '.join(contract.cameras)}"
+    return f"{contract.action}, {contract.state_frame}, {takes}"
+
+
+def _warnings(notes: Iterable[str]) -> str:
+    return "; ".join(note.text for note in notes if isinstance(note, Warned))
 
 
 def _plan_by_contract(config: FlyConfig, runner: PolicyRunner) -> FlightPlan:
@@ -74,21 +84,6 @@ def _plan_by_contract(config: FlyConfig, runner: PolicyRunner) -> FlightPlan:
     goal = "0,0,0" if "goal" in runner.contract.state_extras else None
     kept = replace(config, limits=Limits(), mode=None, goal=goal)
     return plan_flight(kept, runner.contract, is_dual=runner.dual_rate)
-
-
-def _engine_row(loaded: LoadedPolicy) -> CheckRow:
-    """Return a row on the engine and its agreement with torch; any deviation is a warning."""
-    runner = loaded.runner
-    warnings = [note.text for note in loaded.notes if isinstance(note, Warned)]
-    agrees = any(isinstance(note, Agreed) for note in loaded.notes)
-    found = f"{runner.name} on {runner.engine}{', agrees with torch' if agrees else ''}"
-    return _row(
-        "engine",
-        found,
-        "warn" if warnings else "go",
-        "; ".join(warnings),
-        expected="the fastest that agrees with torch",
-    )
 
 
 def _speed_rows(
@@ -104,11 +99,10 @@ def _speed_rows(
     try:
         notes = require_speed(plan, loaded.runner.name, loaded.times)
     except MavbridgeError as error:
-        yield _row("speed", "too slow", "no-go", str(error), expected=expected)
+        yield _row("speed", "too slow", expected, no_go=str(error))
         return
-    warnings = [note.text for note in notes if isinstance(note, Warned)]
-    if warnings:
-        yield _row("speed", "slower than asked", "warn", "; ".join(warnings), expected=expected)
+    if warnings := _warnings(notes):
+        yield _row("speed", "slower than asked", expected, warn=warnings)
 
 
 @dataclass(kw_only=True)
@@ -149,7 +143,7 @@ class Pace:
         """Return a row with rate and times; a warning if the rate was not held, or only just."""
         took_ms = self.took.percentiles_ms()
         if took_ms is None:
-            return _row(self.name, "not one in time", "warn", "far too slow for this computer")
+            return _row(self.name, "not one in time", warn="far too slow for this computer")
         share, advice = took_ms.p50 * self.asked_hz / 1000, ""
         if self.rate_hz < _HELD * self.asked_hz:
             advice = f"this computer makes {self.rate_hz:.1f} {self.name} a second here"
@@ -160,9 +154,8 @@ class Pace:
             self.name,
             f"{self.rate_hz:.1f} Hz, {self.late} of {self.took.count} late; {times} "
             f"(p50 / p99 / max), {share:.0%} of a slot",
-            "warn" if advice else "go",
-            advice,
-            expected=f"{self.asked_hz:.3g} Hz, under {_BUSY:.0%} of a slot",
+            f"{self.asked_hz:.3g} Hz, under {_BUSY:.0%} of a slot",
+            warn=advice,
         )
 
 
@@ -198,23 +191,3 @@ def _run_at_rates(
         for worker in workers:
             worker.ends_within(timing_s + _JOIN_S)
     return [chunks, pictures]
-
-
-def _contract_words(contract: Contract) -> str:
-    takes = f"{contract.image_width}x{contract.image_height} of {', '.join(contract.cameras)}"
-    return f"{contract.action}, {contract.state_frame}, {takes}"
-
-
-def _plan_rows(plan: FlightPlan) -> list[CheckRow]:
-    figures = ", ".join(f"{name} {value:.4g}" for name, value in plan.figures().items())
-    expected = "no flag that contradicts it"
-    return [
-        _row("contract", _contract_words(plan.contract), expected=expected),
-        _row("plan", figures),
-    ]
-
-
-def _row(
-    name: str, found: str, verdict: Verdict = "go", advice: str = "", *, expected: str = ""
-) -> CheckRow:
-    return CheckRow("policy", name, found, expected, verdict, advice)

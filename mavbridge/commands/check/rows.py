@@ -22,22 +22,33 @@ _FOOT = (
 
 @dataclass(frozen=True, slots=True)
 class CheckRow:
-    """One checked item."""
+    """One checked item: a go, unless there is a reason for a warning or a no-go."""
 
     area: Area
     name: str
     found: str
     expected: str = ""
-    verdict: Verdict = "go"
-    advice: str = ""
-    """Reason for a warning or a no-go, and the next step; empty for a go."""
+    warn: str = ""
+    """Reason for a warning, and the next step."""
+    no_go: str = ""
+    """Reason for a no-go, and the next step."""
     commands: tuple[str, ...] = ()
     """Flags that fix the problem for one flight."""
 
     def __post_init__(self) -> None:
         """Hide passwords in addresses, for the table and the JSON."""
-        for name in ("found", "expected", "advice"):
+        for name in ("found", "expected", "warn", "no_go"):
             object.__setattr__(self, name, without_secrets(getattr(self, name)))
+
+    @property
+    def verdict(self) -> Verdict:
+        """The worse of the two, or a go."""
+        return "no-go" if self.no_go else "warn" if self.warn else "go"
+
+    @property
+    def advice(self) -> str:
+        """Reason for the verdict; empty for a go."""
+        return self.no_go or self.warn
 
 
 def overall(rows: Sequence[CheckRow]) -> Verdict:

@@ -5,6 +5,7 @@ import os
 import platform
 import subprocess
 import sys
+from collections.abc import Iterator
 from functools import partial
 from pathlib import Path
 
@@ -37,6 +38,7 @@ _CORES = 2
 _RIGHTS_TIMEOUT_S = 10.0
 _TRY_RIGHTS = """
 import sys
+from collections.abc import Iterator
 from functools import partial
 from mavbridge.core.realtime import settle_guard, settle_thread
 cpus = [int(word) if word else None for word in sys.argv[2:]]
@@ -52,8 +54,8 @@ _row = partial(CheckRow, "computer")
 _camera_row = partial(CheckRow, "camera", "cameras")
 
 
-def computer_rows(rates: Rates) -> list[CheckRow]:
-    """Return rows about clock source, cores, real-time scheduling and locked memory."""
+def computer_rows(rates: Rates) -> Iterator[CheckRow]:
+    """Yield rows about clock source, cores, real-time scheduling and locked memory."""
     try:
         source = _CLOCK_SOURCE.read_text().strip()
     except OSError:  # no such file on macOS, or in some containers
@@ -62,27 +64,23 @@ def computer_rows(rates: Rates) -> list[CheckRow]:
         f"the clock source {source} is slow to read or coarse: stamps are late by its time; see "
         "current_clocksource in the kernel's documentation"
     )
+    yield _row(
+        "clock",
+        source or f"not told by {platform.system()}",
+        "one that the processor reads by itself, such as tsc",
+        slow if source in _SLOW_CLOCKS else "",
+    )
     has_affinity = hasattr(os, "sched_getaffinity")
     cores = len(os.sched_getaffinity(0)) if has_affinity else os.cpu_count() or 1
     shared = "guard and policy share one core: a slow policy delays the sticks"
+    yield _row("cores", str(cores), f"{_CORES} or more", "" if cores >= _CORES else shared)
     refused = _refused_rights(rates)
-    return [
-        _row(
-            "clock",
-            source or f"not told by {platform.system()}",
-            "one that the processor reads by itself, such as tsc",
-            *(("warn", slow) if source in _SLOW_CLOCKS else ()),
-        ),
-        _row(
-            "cores", str(cores), f"{_CORES} or more", *(() if cores >= _CORES else ("warn", shared))
-        ),
-        _row(
-            "rights of the guard",
-            "refused in part" if refused else "granted",
-            "SCHED_FIFO and locked memory" if rates.realtime else "locked memory",
-            *(("warn", refused) if refused else ()),
-        ),
-    ]
+    yield _row(
+        "rights of the guard",
+        "refused in part" if refused else "granted",
+        "SCHED_FIFO and locked memory" if rates.realtime else "locked memory",
+        refused,
+    )
 
 
 def _refused_rights(rates: Rates) -> str:
@@ -114,7 +112,7 @@ def check(config: CheckConfig) -> int:
     if not is_on_stdout:
         require_writable(config.json, "--json")
     cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_SILENT)
-    rows = check_all(config)
+    rows = _check_all(config)
     document = json.dumps(as_document(rows), indent=2) + "\n"
     if config.json is not None and not is_on_stdout:
         config.json.write_text(document)
@@ -124,30 +122,31 @@ def check(config: CheckConfig) -> int:
     return ExitCode.NOT_FLOWN if overall(rows) == "no-go" else ExitCode.DONE
 
 
-def check_all(config: CheckConfig) -> list[CheckRow]:
+def _check_all(config: CheckConfig) -> list[CheckRow]:
     """Return all rows in the order of the table."""
     flight, clock = config.flight, MonotonicClock()
     if flight.policy.policy != NO_POLICY:
         print_status(f"loading the policy, then running it for {config.timing:g} s")
-    policy = check_policy(flight, clock, timing_s=config.timing)
-    cameras = _check_cameras(flight, policy.plan, clock)
+    policy, plan = check_policy(flight, clock, timing_s=config.timing)
+    cameras = _check_cameras(flight, plan, clock)
     if flight.link.connect == NO_VEHICLE:
         vehicle = [CheckRow("link", "vehicle", "none", "none for this check")]
     else:
         print_status(f"listening to the vehicle on {flight.link.connect}")
-        vehicle = check_vehicle(flight, policy.plan, clock, echo_test=config.echo_test)
-    return [*vehicle, *cameras, *policy.rows, *computer_rows(flight.rates)]
+        vehicle = check_vehicle(flight, plan, clock, echo_test=config.echo_test)
+    return [*vehicle, *cameras, *policy, *computer_rows(flight.rates)]
 
 
 def _check_cameras(config: FlyConfig, plan: FlightPlan | None, clock: Clock) -> list[CheckRow]:
     """Return rows on every camera of the flight, or on the flags that do not fit the policy."""
-    if config.link.connect == NO_VEHICLE and set(config.camera.sources) == {NO_CAMERA}:
+    is_blind = set(config.camera.sources) == {NO_CAMERA}
+    if is_blind and config.link.connect == NO_VEHICLE:
         return []  # only this computer is checked
     try:
         require_images(config)
-        needs = _camera_needs(config, plan)
+        needs = [] if is_blind else _camera_needs(config, plan)
     except MavbridgeError as error:
-        return [_camera_row(" ".join(config.camera.sources), "", "no-go", str(error))]
+        return [_camera_row(" ".join(config.camera.sources), no_go=str(error))]
     if not needs:
         return [_camera_row("none", "none for this flight")]
     print_status("watching the camera")
@@ -159,8 +158,6 @@ def _camera_needs(config: FlyConfig, plan: FlightPlan | None) -> list[CameraNeed
 
     Without a policy only cameras named by flags are checked.
     """
-    if set(config.camera.sources) == {NO_CAMERA}:
-        return []
     if plan is None:
         if config.camera == CameraConfig():
             return []

@@ -1,148 +1,154 @@
-"""From the address of a vehicle to its rows: find it, set it up, measure it, run the echo test."""
+"""Rows about the link and the vehicle: find it, set it up, measure it, run the echo test."""
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import ExitStack
 from dataclasses import replace
 from functools import partial
+from typing import Literal, TypeAlias
 
-from mavbridge.commands.check.link_rows import VehicleProbe, echo_row, link_rows
-from mavbridge.commands.check.param_rows import Terms, param_rows
+from mavbridge.commands.check.params import Terms, cures, param_rows
 from mavbridge.commands.check.rows import CheckRow
-from mavbridge.config.flight import FlyConfig
-from mavbridge.core.clock import Clock
+from mavbridge.config.flight import FlyConfig, Limits
+from mavbridge.core.clock import NS_PER_MS, NS_PER_S, Clock
 from mavbridge.core.errors import MavbridgeError
-from mavbridge.core.link_settings import LinkSettings
+from mavbridge.core.reasons import Code, Reason, because
 from mavbridge.core.vehicle import (
+    NEUTRAL,
     ActionMeaning,
     AdviceText,
+    Command,
     LinkSnapshot,
+    LinkStats,
+    Release,
     VehicleStatus,
     VehicleText,
 )
 from mavbridge.flight.plan import FlightPlan
-from mavbridge.flight.settings import guard_settings
+from mavbridge.flight.settings import effective_freshness, guard_settings
 from mavbridge.guard.sequences import MIDDLE_STICK
 from mavbridge.mavlink.link import MavlinkLink
+from mavbridge.mavlink.profiles.profile import StreamGroup
 from mavbridge.mavlink.session.vehicle import VehicleSession
 from mavbridge.mavlink.transport.signing_files import SigningStore
 from mavbridge.mavlink.transport.sockets import Transport, make_transport
+from policy.contract import Contract
 
+SET_UP_S = 15.0
+"""Longest wait for version, parameters, streams and the receiver. A link without losses takes one
+to three seconds."""
+SETTLE_S, MEASURE_S = 1.0, 3.0
+"""Time from the grant of the streams until their rates are counted, and time of counting."""
+ECHO_S, RELEASE_S = 3.0, 4.0
+"""Longest wait for the echo; longest time over which the releases of an override are spread."""
+_POLL_NS = NS_PER_MS
+"""Time between two polls of the link; the kernel stamps messages that arrive meanwhile."""
+_STICK_NS = 20 * NS_PER_MS
+_ENOUGH = 0.9
+"""Least acceptable share of the requested rate."""
+_ECHO_HZ = 20.0
+"""Rate of RC_CHANNELS that the echo check needs."""
+_LOSSY, _TOO_LOSSY = 0.01, 0.1
+_SLOW_MS = 50.0
+"""Round trip above which the sticks are noticeably late."""
+_QUANTITIES = {
+    "ATTITUDE_QUATERNION": "attitude",
+    "LOCAL_POSITION_NED": "velocity",
+    "HIGHRES_IMU": "acceleration",
+    "RC_CHANNELS": "sticks (echo)",
+}
 _TEXTS_SHOWN = 4
 REFUSES_TO_ARM = "PreArm"
 """Prefix of ArduPilot's texts about its pre-arm checks."""
+_FLOWN = "ArduCopter or a PX4 multicopter"
+_link_row = partial(CheckRow, "link")
 _row = partial(CheckRow, "vehicle")
 
-
-def vehicle_rows(
-    vehicle: VehicleSession, snapshot: LinkSnapshot, terms: Terms, *, texts: Sequence[str]
-) -> Iterator[CheckRow]:
-    """Return all rows about the vehicle; ``texts`` are those of the vehicle and the link."""
-    yield from _mode_rows(terms)
-    if (status := snapshot.status) is not None:
-        yield _state_row(status)
-        yield _receiver_row(status)
-        yield _position_row(status)
-        if status.battery_problem is not None:
-            yield _row("battery", "low", "charged", "no-go", str(status.battery_problem))
-    if (is_ready := vehicle.condition.is_ready_to_arm) is not None:
-        yield _arming_row(is_ready=is_ready)
-    if vehicle.switch_problem is not None:
-        yield _row("override switch", "off", "on", "warn", str(vehicle.switch_problem))
-    yield from _text_rows(texts)
+EchoResult: TypeAlias = Literal["taken", "not taken", "armed"]
+"""``armed``: the vehicle is or became armed, so that sticks were not sent, or no longer."""
 
 
-def _mode_rows(terms: Terms) -> Iterator[CheckRow]:
-    names = terms.profile.modes.roles.names
-    wanted = () if terms.contract is None else terms.contract.modes
-    if not wanted:
-        return
-    present = [mode for mode in wanted if mode in names]
-    is_lacking = terms.mode is None
-    yield _row(
-        "modes",
-        ", ".join(present) or "none of them",
-        " or ".join(wanted),
-        "no-go" if is_lacking else "go",
-        f"the policy cannot fly in any mode of this vehicle: {', '.join(names)}"
-        if is_lacking
-        else "",
-    )
+class VehicleProbe:
+    """Runs a ``MavlinkLink`` without a guard. Call its methods in the order of their definition."""
 
+    def __init__(self, link: MavlinkLink, clock: Clock) -> None:
+        self._link = link
+        self._clock = clock
+        self._snapshot: LinkSnapshot | None = None
+        self.texts: list[str] = []
+        """Texts of the vehicle and the link."""
+        self.echo_problem: Reason | None = None
+        """The link's reason why the sticks of the echo test were not taken."""
 
-def _state_row(status: VehicleStatus) -> CheckRow:
-    found = f"{'armed' if status.armed else 'disarmed'} in {status.mode}"
-    if status.is_failsafe:
-        text = "a failsafe of the vehicle is active"
-        return _row("state", f"{found}, failsafe", "disarmed", "no-go", text)
-    if status.armed:
-        text = "it is armed: this check sends nothing that moves it"
-        return _row("state", found, "disarmed", "warn", text)
-    return _row("state", found, "disarmed, no failsafe")
+    def find(self) -> VehicleSession:
+        """Wait for the vehicle; raise the link's PeerError if there is none in time."""
+        while (vehicle := self._link.vehicle) is None:
+            self._pass()
+        return vehicle
 
+    def set_up(self) -> Reason | None:
+        """Read parameters and request streams; return the step that did not finish in time."""
 
-def _receiver_row(status: VehicleStatus) -> CheckRow:
-    expected = "a pilot who can take over"
-    if status.has_receiver:
-        throttle = status.pilot_sticks.throttle if status.pilot_sticks else None
-        if throttle is None or abs(throttle) <= MIDDLE_STICK:
-            return _row("radio receiver", "there", expected)
-        return _row(
-            "radio receiver",
-            f"throttle at {100 * throttle:+.0f} %",
-            f"throttle within {100 * MIDDLE_STICK:.0f} % of the middle in flight",
-            "warn",
-            "sticks are not released to such a throttle in the air; if this computer died, the "
-            "vehicle would get it after RC_OVERRIDE_TIME (ArduPilot; measured over an idle one: on "
-            "the ground after 4.7 s with 0.5, 15 m farther and sinking with 3): put the throttle "
-            "in the middle before the policy flies",
-        )
-    return _row(
-        "radio receiver",
-        "none seen" if status.has_receiver is False else "not known",
-        expected,
-        "warn",
-        "without a receiver nobody takes over by stick, and neutral sticks go on after a flight "
-        "until the vehicle is disarmed or its mode is changed; if this computer died, its radio "
-        "failsafe would act (ArduPilot: RTL after RC_FS_TIMEOUT, 1 s, whatever RC_OVERRIDE_TIME)",
-    )
+        def unfinished() -> Reason | None:
+            return self.find().unfinished(self._clock.now_ns())
 
+        self._until(SET_UP_S, lambda: unfinished() is None)
+        return unfinished()
 
-def _position_row(status: VehicleStatus) -> CheckRow:
-    if status.is_position_valid is None:
-        return _row("position", "the estimator does not say", "valid")
-    if status.is_position_valid:
-        return _row("position", "valid", "valid")
-    return _row(
-        "position",
-        "none",
-        "valid",
-        "warn",
-        "without a position, hold is LAND, and the autopilot does not take off by itself",
-    )
+    def measure(self) -> LinkStats:
+        """Count messages, losses and round trips."""
+        self._until(SETTLE_S)
+        self._link.restart_counters()
+        self._until(MEASURE_S)
+        return self._link.stats()
 
+    def snapshot(self) -> LinkSnapshot:
+        """Return everything that the link knows now."""
+        return self._snapshot or self._pass()
 
-def _arming_row(*, is_ready: bool) -> CheckRow:
-    return _row(
-        "checks before arming",
-        "passed" if is_ready else "not passed",
-        "passed",
-        "go" if is_ready else "warn",
-        ""
-        if is_ready
-        else "the autopilot would refuse to arm now; it says why as PreArm texts, "
-        "also to a ground station",
-    )
+    def echo(self) -> EchoResult:
+        """Send neutral sticks while the vehicle is disarmed, watch their echo, and release them."""
+        result: EchoResult = "not taken"
+        due_ns = 0
 
+        def is_over() -> bool:
+            nonlocal result, due_ns
+            snapshot = self.snapshot()
+            if snapshot.status is None or snapshot.status.armed:
+                result = "armed"
+            elif snapshot.echo_confirmed:
+                result = "taken"
+            elif (now_ns := self._clock.now_ns()) >= due_ns:
+                due_ns = now_ns + _STICK_NS
+                self.echo_problem = snapshot.problem or self.echo_problem
+                self._link.send(Command(action=NEUTRAL))
+            return result != "not taken"
 
-def _text_rows(texts: Sequence[str]) -> Iterator[CheckRow]:
-    """Yield rows for texts, except advice about parameters and sticks, which has its own rows."""
-    for text in [text for text in texts if not isinstance(text, AdviceText)][-_TEXTS_SHOWN:]:
-        if not isinstance(text, VehicleText):
-            yield _row("link", "see below", "", "warn", text)
-        elif text.said.startswith(REFUSES_TO_ARM):
-            yield _row("it says", "see below", "", "warn", text.said)
-        else:
-            yield _row("it says", text.said)
+        self._link.is_engaged = True
+        try:
+            self._until(ECHO_S, is_over)
+        finally:
+            if result != "armed" or due_ns:
+                self._until(RELEASE_S, self._release)
+            self._link.is_engaged = False
+        return result
+
+    def _release(self) -> bool:
+        """Release the sticks; return True once the vehicle confirms it."""
+        self._link.send(Release(because(Code.FINISHED, what="echo test")))
+        return self.snapshot().is_released and not self._link.is_release_owed
+
+    def _until(self, limit_s: float, is_over: Callable[[], bool] = lambda: False) -> None:
+        deadline_ns = self._clock.now_ns() + round(limit_s * NS_PER_S)
+        while self._clock.now_ns() < deadline_ns and not is_over():
+            self._pass()
+
+    def _pass(self) -> LinkSnapshot:
+        self._link.receive()
+        self._snapshot = self._link.snapshot()
+        self.texts += [text for text in self._snapshot.texts if text not in self.texts]
+        self._link.service()
+        self._clock.sleep_until_ns(self._clock.now_ns() + _POLL_NS)
+        return self._snapshot
 
 
 def check_vehicle(
@@ -157,8 +163,11 @@ def check_vehicle(
 
     ``plan`` is None if no policy flies. ``transport`` replaces that of the address in ``config``.
     """
+    is_dual = plan is None or plan.is_dual
+    settings = guard_settings(config, is_dual=is_dual, tlog_fd=None, wall_offset_ns=0).link
+    # No parameter is set, and no stick is sent without the test.
+    settings = replace(settings, readonly=not echo_test, set_params=())
     rows: list[CheckRow] = []
-    settings = checking_settings(config, is_dual=plan is None or plan.is_dual, sends=echo_test)
     try:
         with ExitStack() as stack:
             transport = transport or make_transport(settings.connect, clock)
@@ -169,28 +178,211 @@ def check_vehicle(
             stack.callback(link.close)
             # Without a policy, sticks are sent unchanged.
             meaning = ActionMeaning() if plan is None else plan.guard.meaning
-            output = None if config.link.output == "auto" else config.link.output
-            link.begin_flight(meaning, output)
+            link.begin_flight(meaning, None if config.link.output == "auto" else config.link.output)
             probe = VehicleProbe(link, clock)
             probe.find()
             unfinished = probe.set_up()
             stats = probe.measure()
             vehicle, snapshot, texts = probe.find(), probe.snapshot(), list(probe.texts)
-            terms = Terms.of(config, settings, plan, vehicle, snapshot.status)
-            rows += link_rows(vehicle, stats, terms, unfinished=unfinished)
+            terms = Terms(
+                config=config,
+                settings=settings,
+                plan=plan,
+                vehicle=vehicle,
+                has_receiver=snapshot.status.has_receiver if snapshot.status else None,
+            )
+            rows += _link_rows(vehicle, stats, terms, unfinished)
             if echo_test:
-                rows.append(echo_row(probe, terms))
-            rows += vehicle_rows(vehicle, snapshot, terms, texts=texts)
+                rows.append(_echo_row(probe, terms))
+            rows += _vehicle_rows(vehicle, snapshot.status, terms)
+            rows += _text_rows(texts)
             rows += param_rows(terms)
     except MavbridgeError as error:
-        expected = "ArduCopter or a PX4 multicopter"
-        rows.append(
-            CheckRow("link", "vehicle", "none that can be flown", expected, "no-go", str(error))
-        )
+        rows.append(_link_row("vehicle", "none that can be flown", _FLOWN, no_go=str(error)))
     return rows
 
 
-def checking_settings(config: FlyConfig, *, is_dual: bool, sends: bool) -> LinkSettings:
-    """Return the flight's link settings without parameters to set; sticks only if ``sends``."""
-    guard = guard_settings(config, is_dual=is_dual, tlog_fd=None, wall_offset_ns=0)
-    return replace(guard.link, readonly=not sends, set_params=())
+def _link_rows(
+    vehicle: VehicleSession, stats: LinkStats, terms: Terms, unfinished: Reason | None
+) -> Iterator[CheckRow]:
+    place = f"system {vehicle.identity.source.system} at {vehicle.identity.place}"
+    no_go = "" if unfinished is None else f"the set-up of the link did not finish: {unfinished}"
+    found = f"{vehicle.profile.name} {vehicle.version or '(no version)'}, {place}"
+    yield _link_row("vehicle", found, _FLOWN, no_go=no_go)
+    rates_hz = dict(stats.messages_per_s)
+    for group in terms.streams:
+        if not group.is_optional:
+            yield _rate_row(group, rates_hz, terms.plan)
+    watched = [
+        each.messages[0] for each in terms.streams if each.is_optional and each.least_hz != 0.0
+    ]
+    silent = [name for name in watched if name not in rates_hz]
+    yield _link_row(
+        "also watched",
+        f"{len(watched) - len(silent)} of {len(watched)} messages",
+        ", ".join(watched),
+        warn=f"not sent: {', '.join(silent)}; the flight does without" if silent else "",
+    )
+    lost = stats.lost_fraction or 0.0
+    bad = f", {stats.unusable_packets} unusable" if stats.unusable_packets else ""
+    advice = (
+        "messages of the vehicle get lost: look at cable, baud rate and radio, and at other "
+        "programs on its port"
+    )
+    yield _link_row(
+        "loss",
+        f"{lost:.1%} of its messages{bad}",
+        f"under {_LOSSY:.0%}",
+        warn=advice if lost > _LOSSY else "",
+        no_go=advice if lost > _TOO_LOSSY else "",
+    )
+    trip, error_ms = stats.rtt_ms, stats.timesync_error_ms
+    is_slow = trip is None or trip.p50 > _SLOW_MS
+    yield _link_row(
+        "round trip",
+        "no answer" if trip is None else f"{trip.p50:.1f} ms, at most {trip.max:.1f}",
+        f"under {_SLOW_MS:.0f} ms",
+        warn="half of it is added to the age of every stick" if is_slow else "",
+    )
+    advice = stats.slow_clock or (
+        "the vehicle's stamps cannot be trusted: ages count from arrival, which hides delay"
+    )
+    yield _link_row(
+        "clocks (TIMESYNC)",
+        f"within {error_ms:.1f} ms" if error_ms is not None else "no answer",
+        "good: ages count from the vehicle's own stamps",
+        warn="" if stats.is_timesync_good else advice,
+    )
+
+
+def _rate_row(
+    group: StreamGroup, rates_hz: Mapping[str, float], plan: FlightPlan | None
+) -> CheckRow:
+    name = _QUANTITIES.get(group.messages[0], group.messages[0])
+    rate_hz = next((rates_hz[message] for message in group.messages if message in rates_hz), 0.0)
+    limits = effective_freshness(Contract(), Limits()) if plan is None else plan.start_limits
+    oldest_ns = limits.state_ns if name == "attitude" else limits.velocity_ns
+    least_hz = max(_ECHO_HZ if name == "sticks (echo)" else 0.0, NS_PER_S / oldest_ns)
+    row = partial(_link_row, name, f"{rate_hz:.1f} Hz", f"{group.rate_hz:.3g} Hz")
+    if rate_hz == 0.0 and name == "velocity":
+        return row(
+            no_go="no velocity comes: the estimator has no position yet (some 40 s after the "
+            "start, and never without GPS or another source of position)"
+        )
+    if rate_hz < least_hz:
+        return row(no_go=f"{name}: below {least_hz:.3g} Hz it is too old to act on between two")
+    if rate_hz < _ENOUGH * group.rate_hz:
+        return row(
+            warn=f"{name} comes at {rate_hz:.1f} Hz of {group.rate_hz:.3g}: a faster link (a "
+            "higher baud rate; on PX4 also MAV_n_RATE), another station that asks for other "
+            "rates, or a lower rates.action"
+        )
+    return row()
+
+
+def _echo_row(probe: VehicleProbe, terms: Terms) -> CheckRow:
+    """Send neutral sticks unless the vehicle is armed; return a row with the vehicle's response."""
+    name, expected = "echo test", f"our sticks from system {terms.context.source_system}"
+    if not terms.is_sticks:
+        text = "not sent: the vehicle shows setpoints only in their mode"
+        return _link_row(name, text, "actions that are sticks")
+    match probe.echo():
+        case "armed":
+            text = "the vehicle is armed: disarm it for the test"
+            return _link_row(name, "refused", expected, no_go=text)
+        case "taken":
+            return _link_row(name, "taken, and released", expected)
+    problem = probe.echo_problem
+    is_obstacle = problem is not None and problem.code is Code.OBSTACLE
+    return _link_row(
+        name,
+        f"not seen in {ECHO_S:g} s",
+        expected,
+        no_go=str(problem)
+        if problem is not None
+        else "the vehicle does not show our sticks: another station may be overriding them, or "
+        "it obeys another system id",
+        commands=cures(terms.assessment.obstacles) if is_obstacle else (),
+    )
+
+
+def _vehicle_rows(
+    vehicle: VehicleSession, status: VehicleStatus | None, terms: Terms
+) -> Iterator[CheckRow]:
+    names = vehicle.profile.modes.roles.names
+    if wanted := () if terms.contract is None else terms.contract.modes:
+        lacking = f"the policy cannot fly in any mode of this vehicle: {', '.join(names)}"
+        yield _row(
+            "modes",
+            ", ".join(mode for mode in wanted if mode in names) or "none of them",
+            " or ".join(wanted),
+            no_go=lacking if terms.mode is None else "",
+        )
+    if status is not None:
+        yield from _status_rows(status)
+    if (is_ready := vehicle.condition.is_ready_to_arm) is not None:
+        refuses = (
+            "the autopilot would refuse to arm now; it says why as PreArm texts, also to a ground "
+            "station"
+        )
+        found, advice = ("passed", "") if is_ready else ("not passed", refuses)
+        yield _row("checks before arming", found, "passed", warn=advice)
+    if vehicle.switch_problem is not None:
+        yield _row("override switch", "off", "on", warn=str(vehicle.switch_problem))
+
+
+def _status_rows(status: VehicleStatus) -> Iterator[CheckRow]:
+    found = f"{'armed' if status.armed else 'disarmed'} in {status.mode}"
+    if status.is_failsafe:
+        text = "a failsafe of the vehicle is active"
+        yield _row("state", f"{found}, failsafe", "disarmed", no_go=text)
+    elif status.armed:
+        text = "it is armed: this check sends nothing that moves it"
+        yield _row("state", found, "disarmed", warn=text)
+    else:
+        yield _row("state", found, "disarmed, no failsafe")
+    yield _receiver_row(status)
+    position = {True: "valid", False: "none", None: "the estimator does not say"}
+    text = "without a position, hold is LAND, and the autopilot does not take off by itself"
+    is_lacking = status.is_position_valid is False
+    found = position[status.is_position_valid]
+    yield _row("position", found, "valid", warn=text if is_lacking else "")
+    if status.battery_problem is not None:
+        yield _row("battery", "low", "charged", no_go=str(status.battery_problem))
+
+
+def _receiver_row(status: VehicleStatus) -> CheckRow:
+    name, expected = "radio receiver", "a pilot who can take over"
+    if not status.has_receiver:
+        return _row(
+            name,
+            "none seen" if status.has_receiver is False else "not known",
+            expected,
+            "without a receiver nobody takes over by stick, and neutral sticks go on after a "
+            "flight until the vehicle is disarmed or its mode is changed; if this computer died, "
+            "its radio failsafe would act (ArduPilot: RTL after RC_FS_TIMEOUT, 1 s, whatever "
+            "RC_OVERRIDE_TIME)",
+        )
+    throttle = status.pilot_sticks.throttle if status.pilot_sticks else None
+    if throttle is None or abs(throttle) <= MIDDLE_STICK:
+        return _row(name, "there", expected)
+    return _row(
+        name,
+        f"throttle at {100 * throttle:+.0f} %",
+        f"throttle within {100 * MIDDLE_STICK:.0f} % of the middle in flight",
+        "sticks are not released to such a throttle in the air; if this computer died, the "
+        "vehicle would get it after RC_OVERRIDE_TIME (ArduPilot; measured over an idle one: on "
+        "the ground after 4.7 s with 0.5, 15 m farther and sinking with 3): put the throttle "
+        "in the middle before the policy flies",
+    )
+
+
+def _text_rows(texts: Sequence[str]) -> Iterator[CheckRow]:
+    """Yield rows for texts, except advice about parameters and sticks, which has its own rows."""
+    for text in [text for text in texts if not isinstance(text, AdviceText)][-_TEXTS_SHOWN:]:
+        if not isinstance(text, VehicleText):
+            yield _row("link", "see below", warn=text)
+        elif text.said.startswith(REFUSES_TO_ARM):
+            yield _row("it says", "see below", warn=text.said)
+        else:
+            yield _row("it says", text.said)

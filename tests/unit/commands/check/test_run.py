@@ -27,8 +27,7 @@ REFUSED = CheckRow(
     name="RC_OVERRIDE_TIME",
     found="-1",
     expected="0.5",
-    verdict="no-go",
-    advice="it would hold its last sticks for ever: use --set RC_OVERRIDE_TIME=0.5, or else",
+    no_go="it would hold its last sticks for ever: use --set RC_OVERRIDE_TIME=0.5, or else",
     commands=("--set RC_OVERRIDE_TIME=0.5",),
 )
 GO = CheckRow(area="link", name="attitude", found="100.0 Hz", expected="100 Hz")
@@ -96,24 +95,15 @@ def test_a_pace_that_is_not_held_is_a_warning(
 
 
 def test_a_policy_tells_its_engine_speed_and_contract() -> None:
-    findings = check_policy(flight("scripted:square:velocity"), MonotonicClock(), timing_s=0.5)
-    names = [row.name for row in findings.rows]
-    assert names == ["engine", "chunks", "images", "contract", "plan"]
-    assert findings.plan is not None
-    assert findings.plan.contract.action == "velocity"
-
-
-def test_a_flag_that_contradicts_the_policy_is_a_no_go() -> None:
-    config = FlyConfig(policy=PolicyConfig(policy="scripted:hover"), mode="LOITER", camera=BLIND)
-    row = check_policy(config, MonotonicClock(), timing_s=0.5).rows[-1]
-    assert row.name == "flags of the flight"
-    assert row.verdict == "no-go"
-    assert "--mode LOITER" in row.advice
+    rows, plan = check_policy(flight("scripted:square:velocity"), MonotonicClock(), timing_s=0.5)
+    assert [row.name for row in rows] == ["engine", "chunks", "images", "contract", "plan"]
+    assert plan is not None
+    assert plan.contract.action == "velocity"
 
 
 def test_the_worst_row_is_the_verdict() -> None:
     assert overall([GO]) == "go"
-    assert overall([GO, CheckRow(area="link", name="loss", found="3%", verdict="warn")]) == "warn"
+    assert overall([GO, CheckRow(area="link", name="loss", found="3%", warn="lossy")]) == "warn"
     assert overall([GO, REFUSED]) == "no-go"
     assert as_document([REFUSED])["rows"][0]["commands"] == ["--set RC_OVERRIDE_TIME=0.5"]
 
@@ -132,14 +122,15 @@ def test_the_table_fits_its_terminal_and_ends_with_what_to_do(width: int) -> Non
 
 def test_a_row_hides_the_password_of_an_address_in_table_and_json() -> None:
     text = "rtsp://me:it@host/1?token=abc"
-    row = CheckRow(area="camera", name="camera", found=text, expected=text, advice=text)
+    row = CheckRow(area="camera", name="camera", found=text, expected=text, warn=text)
     assert "it@" not in json.dumps(as_document([row]))
     assert row.found == "rtsp://me:***@host/1?token=***"
 
 
 def test_a_flag_that_contradicts_the_policy_leaves_the_vehicles_rows_to_its_contract() -> None:
     config = replace(flight("scripted:square:velocity"), mode="ALT_HOLD")
-    findings = check_policy(config, MonotonicClock(), timing_s=0.5)
-    assert findings.rows[-1].verdict == "no-go"
-    assert findings.plan is not None
-    assert findings.plan.guard.meaning.kind == "velocity"
+    rows, plan = check_policy(config, MonotonicClock(), timing_s=0.5)
+    assert (rows[-1].name, rows[-1].verdict) == ("flags of the flight", "no-go")
+    assert "--mode ALT_HOLD" in rows[-1].advice
+    assert plan is not None
+    assert plan.guard.meaning.kind == "velocity"
