@@ -157,8 +157,7 @@ class ImagineConfig:
         """Refuse values out of range."""
         check_range("start-at", self.start_at, 0, 86400, "s")
         check_range("n-iter", self.n_iter, 1, 1_000_000, "")
-        if self.frames is not None:
-            check_range("frames", self.frames, 1, 256, "")
+        check_range("frames", self.frames, 1, 256, "")
         check_range("exe-steps", self.exe_steps, 1, 256, "")
         check_range("ddim-steps", self.ddim_steps, 1, 1000, "")
 
@@ -236,10 +235,8 @@ class RecordConfig:
         """Refuse contradictions, and rates that no autopilot serves."""
         check_range("rate", self.rate, 20, 250, "Hz")
         check_range("disk-reserve", self.disk_reserve, 0.05, 10_000, "GB")
-        if self.episode_channel is not None:
-            check_range("episode-channel", self.episode_channel, 5, 18, "")
-        if self.episodes is not None:
-            check_range("episodes", self.episodes, 1, 9999, "")
+        check_range("episode-channel", self.episode_channel, 5, 18, "")
+        check_range("episodes", self.episodes, 1, 9999, "")
         if self.on_arm and self.episode_channel is not None:
             raise UserError("--on-arm and --episode-channel both say when to record: leave one out")
 
@@ -286,8 +283,7 @@ class ReplayConfig:
 
     def __post_init__(self) -> None:
         """Refuse what cannot be combined."""
-        if self.tolerance is not None:
-            check_range("tolerance", self.tolerance, 0, 10, "")
+        check_range("tolerance", self.tolerance, 0, 10, "")
         if self.source == "chunks" and self.changes_policy:
             raise UserError(
                 "--from chunks takes the recorded chunks and asks no policy: leave out the flags "

@@ -127,16 +127,13 @@ class EvaluateConfig:
         check_range("stalls", self.stalls, 0, 5000, "ms")
         if self.resume and self.json is None:
             raise UserError("--resume needs the --json FILE to go on with")
-        if self.vision_time is not None:
-            check_range("vision-time", self.vision_time, 0, 5000, "ms")
-        if self.solve_time is not None:
-            check_range("solve-time", self.solve_time, 0, 5000, "ms")
+        check_range("vision-time", self.vision_time, 0, 5000, "ms")
+        check_range("solve-time", self.solve_time, 0, 5000, "ms")
         check_range("gains", self.gains, 0.2, 2.5, "")
         check_range("seed", self.policy.seed, 0, MAX_EVALUATION_SEED, "")
         if self.gains != 1 and self.autopilot != "ardupilot":
             raise UserError("--gains needs --autopilot ardupilot")
-        if self.gusts is not None:
-            check_range("gusts", self.gusts, 0, 10, "m/s")
+        check_range("gusts", self.gusts, 0, 10, "m/s")
         _ = self.rates
 
     @property

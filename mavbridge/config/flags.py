@@ -7,9 +7,9 @@ from cyclopts import Group, Parameter
 from mavbridge.core.errors import UserError
 
 
-def check_range(name: str, value: float, low: float, high: float, unit: str) -> None:
-    """Raise UserError, naming the flag or setting, if a number is not within [low, high]."""
-    if not (math.isfinite(value) and low <= value <= high):
+def check_range(name: str, value: float | None, low: float, high: float, unit: str) -> None:
+    """Raise UserError, naming the flag or setting, if a given number is not within [low, high]."""
+    if value is not None and not (math.isfinite(value) and low <= value <= high):
         limits = f"{low:g} and {high:g} {unit}".rstrip()
         flag = name if "." in name else f"--{name}"
         raise UserError(f"{flag} must be between {limits}, got {value:g}")

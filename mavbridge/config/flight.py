@@ -61,8 +61,9 @@ class Limits:
             ("tau", "s", 0, 2),
             ("max_slew", "1/s", 0, 1000),
         ):
-            if (value := getattr(self, name)) is not None:
-                check_range(f"limits.{name.removeprefix('max_')}", value, least, largest, unit)
+            check_range(
+                f"limits.{name.removeprefix('max_')}", getattr(self, name), least, largest, unit
+            )
 
 
 @section("envelope")
@@ -90,8 +91,9 @@ class EnvelopeConfig:
             ("max_distance", "m", 100_000),
             ("min_battery", "%", 100),
         ):
-            if (value := getattr(self, name)) is not None:
-                check_range(f"envelope.{name.removeprefix('max_')}", value, 0, largest, unit)
+            check_range(
+                f"envelope.{name.removeprefix('max_')}", getattr(self, name), 0, largest, unit
+            )
 
 
 @section("setpoints")
@@ -296,15 +298,13 @@ class FlyConfig:
 
     def __post_init__(self) -> None:
         """Raise UserError for contradictions."""
-        if self.duration is not None:
-            check_range("duration", self.duration, 0.1, 86400, "s")
+        check_range("duration", self.duration, 0.1, 86400, "s")
         if self.takeoff is not None:
             check_range("takeoff", self.takeoff, 0.5, 100, "m")
             if not self.arm:
                 raise UserError("--takeoff needs --arm: nothing else takes off by itself")
         _ = self.goal_ned_m
-        if self.engage_channel is not None:
-            check_range("engage-channel", self.engage_channel, 5, 18, "")
+        check_range("engage-channel", self.engage_channel, 5, 18, "")
         engages = self.arm or self.engage_on_arm or self.engage_channel is not None
         if self.link.readonly and (engages or self.mode is not None):
             raise UserError(

@@ -51,8 +51,7 @@ class PolicyConfig:
     def __post_init__(self) -> None:
         """Raise UserError for values that scheduler or encoder do not support."""
         check_range("num-diffusion-steps", self.steps, 1, 100, "steps")
-        if self.image_size is not None:
-            check_range("network.image_size", self.image_size, 32, 1024, "pixels")
+        check_range("network.image_size", self.image_size, 32, 1024, "pixels")
         check_range("seed", self.seed, 0, 2**63 - 1, "")
 
     @property

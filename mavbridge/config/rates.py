@@ -75,8 +75,7 @@ class Rates:
         check_range("rates.visual", low_hz, 0.5, high_hz, "Hz")
         check_range("rates.visual", high_hz, low_hz, 240, "Hz")
         for name, rate_hz in (("rates.action", self.action_rate), ("rates.single", self.rate)):
-            if rate_hz is not None:
-                check_range(name, rate_hz, LEAST_HZ, 500, "Hz")
+            check_range(name, rate_hz, LEAST_HZ, 500, "Hz")
         check_range("rates.stick", self.stick_rate, 20, 400, "Hz")
 
     @property
