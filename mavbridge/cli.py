@@ -206,7 +206,7 @@ def _needs_simulator(command: str) -> Iterator[None]:
 def evaluate(config: EvaluateConfig | None = None) -> int:
     """Fly a policy over many simulated courses, and count the gates."""
     with _needs_simulator("evaluate"):
-        from mavbridge.commands.evaluate.run import evaluate as run_evaluation
+        from mavbridge.commands.evaluate import evaluate as run_evaluation
     return run_evaluation(EvaluateConfig() if config is None else config)
 
 

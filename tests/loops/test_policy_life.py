@@ -5,7 +5,7 @@ from pathlib import Path
 import pytest
 
 from benchmarks.engines import time_engines
-from mavbridge.commands.evaluate.run import EpisodeSpec, fly_simulated
+from mavbridge.commands.evaluate import EpisodeSpec, fly_simulated
 from mavbridge.config.episodes import EvaluateConfig
 from mavbridge.config.policy import PolicyConfig
 from mavbridge.simulation.referee import EpisodeInterruptedError

@@ -4,7 +4,7 @@ from pathlib import Path
 
 import pytest
 
-from mavbridge.commands.evaluate.run import evaluate
+from mavbridge.commands.evaluate import evaluate
 from mavbridge.config.episodes import EvaluateConfig, WorkersConfig
 from mavbridge.config.policy import PolicyConfig
 

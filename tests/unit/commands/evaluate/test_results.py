@@ -7,25 +7,18 @@ from rich.console import Console
 
 from helpers.evaluated_flights import FINISHED, crashed, finished
 from helpers.factories import make_released_tick, make_tick, make_trace, make_vision_tick
-from mavbridge.commands.evaluate.results import (
-    Evaluation,
-    print_evaluation,
-    summarise,
-    to_json,
-)
+from mavbridge.commands.evaluate import FlownEpisode, print_evaluation, summarise, to_json
 from mavbridge.config.episodes import EvaluateConfig
 from mavbridge.core.clock import NS_PER_MS
 from mavbridge.core.vehicle import NEUTRAL, Sticks
-from mavbridge.simulation.referee import EpisodeResult, StickMeter
+from mavbridge.simulation.referee import StickMeter
 from sitl.course import make_course
 
-
-def evaluation(*episodes: EpisodeResult) -> Evaluation:
-    return Evaluation(
-        config=EvaluateConfig(episodes=5, conditions="random", vision_delay=50.0),
-        engine="openvino",
-        episodes=episodes,
-    )
+CONFIG = EvaluateConfig(episodes=5, conditions="random", vision_delay=50.0)
+FLOWN = {
+    index: FlownEpisode(engine="openvino", result=result)
+    for index, result in enumerate((finished(), crashed()))
+}
 
 
 def test_the_figures_of_three_flights() -> None:
@@ -45,7 +38,7 @@ def test_the_figures_of_three_flights() -> None:
 
 
 def test_json_holds_the_summary_and_every_episode() -> None:
-    document = json.loads(to_json(evaluation(finished(), crashed()), "digest"))
+    document = json.loads(to_json(CONFIG, FLOWN, "digest"))
     assert document["summary"]["success_rate"]["value"] == 0.5
     assert document["summary"]["outcomes"] == {"finished": 1, "crashed": 1}
     assert document["asked_episodes"] == 5
@@ -56,7 +49,7 @@ def test_json_holds_the_summary_and_every_episode() -> None:
 
 def test_the_table_shows_rate_interval_and_ends() -> None:
     console = Console(width=100, record=True, file=Path("/dev/null").open("w"))  # noqa: SIM115
-    print_evaluation(evaluation(finished(), crashed()), console)
+    print_evaluation(CONFIG, FLOWN, console)
     text = console.export_text()
     console.file.close()
     assert "50.0%" in text

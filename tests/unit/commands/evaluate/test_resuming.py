@@ -8,8 +8,7 @@ from typing import Any
 import pytest
 
 from helpers.evaluated_flights import finished
-from mavbridge.commands.evaluate import run
-from mavbridge.commands.evaluate.run import EpisodeSpec, FlownEpisode, evaluate
+from mavbridge.commands.evaluate import EpisodeSpec, FlownEpisode, evaluate
 from mavbridge.config.episodes import EvaluateConfig, WorkersConfig
 from mavbridge.config.policy import PolicyConfig
 from mavbridge.core.errors import PeerError, UserError
@@ -35,7 +34,7 @@ class Flights:
 @pytest.fixture
 def flights(monkeypatch: pytest.MonkeyPatch) -> Flights:
     made = Flights()
-    monkeypatch.setattr(run, "fly_simulated", made.fly)
+    monkeypatch.setattr(f"{evaluate.__module__}.fly_simulated", made.fly)
     return made
 
 
@@ -72,7 +71,7 @@ def test_each_flight_is_on_disk_when_the_next_one_begins(
             seen.append(len(json.loads(path.read_text())["episodes"]))
         return flights.fly(spec, stop)
 
-    monkeypatch.setattr(run, "fly_simulated", fly)
+    monkeypatch.setattr(f"{evaluate.__module__}.fly_simulated", fly)
     evaluate(config)
     assert seen == [1, 2, 3, 4]
 
@@ -114,7 +113,7 @@ def test_flights_of_another_engine_are_not_mixed(
     def fly(spec: EpisodeSpec, stop: Any) -> FlownEpisode:
         return replace(flights.fly(spec, stop), engine="torch")
 
-    monkeypatch.setattr(run, "fly_simulated", fly)
+    monkeypatch.setattr(f"{evaluate.__module__}.fly_simulated", fly)
     with pytest.raises(UserError, match="flown by the engine numpy, here it is torch"):
         evaluate(replace(config, episodes=6))
     after = json.loads(config.json.read_text())

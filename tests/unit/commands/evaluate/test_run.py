@@ -11,8 +11,7 @@ import pytest
 
 from helpers.evaluated_flights import finished
 from mavbridge.__main__ import main
-from mavbridge.commands.evaluate import run
-from mavbridge.commands.evaluate.run import (
+from mavbridge.commands.evaluate import (
     INTERRUPTED,
     EpisodeSpec,
     FlownEpisode,
@@ -114,7 +113,7 @@ def test_ctrl_c_ends_with_the_results_so_far(
             signal.raise_signal(signal.SIGINT)
         return flown(spec)
 
-    monkeypatch.setattr(run, "fly_simulated", fly)
+    monkeypatch.setattr(f"{evaluate.__module__}.fly_simulated", fly)
     path = tmp_path / "some.json"
     assert evaluate(EvaluateConfig(policy=CIRCLE, episodes=5, json=path)) == INTERRUPTED
     assert len(json.loads(path.read_text())["episodes"]) == 2

@@ -1,6 +1,6 @@
 import pytest
 
-from mavbridge.commands.evaluate.results import mean, rate
+from mavbridge.commands.evaluate import mean, rate
 
 
 @pytest.mark.parametrize(

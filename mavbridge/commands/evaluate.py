@@ -1,16 +1,20 @@
-"""``mavbridge evaluate``: fly or resume the episodes, print and write the results."""
+"""``mavbridge evaluate``: fly or resume the episodes, print and write the results with 95 %
+intervals."""
 
 import hashlib
-from collections.abc import Callable, Generator, Mapping
+import json
+import math
+from collections import Counter
+from collections.abc import Callable, Generator, Mapping, Sequence
 from contextlib import closing
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
 
+import numpy as np
 from rich.console import Console
 from rich.text import Text
 
 from mavbridge.commands.episode_workers import fly_jobs
-from mavbridge.commands.evaluate.results import Evaluation, print_evaluation, to_json
-from mavbridge.commands.output import progress_bar
+from mavbridge.commands.output import make_table, progress_bar
 from mavbridge.config.episodes import (
     HELD_OUT_COURSE_SEED,
     MAX_EPISODES,
@@ -28,12 +32,16 @@ from mavbridge.flight.policies import is_scripted, load_for_episodes, policy_fil
 from mavbridge.flight.settings import contract_with_ages
 from mavbridge.simulation.delays import Delay, Delays
 from mavbridge.simulation.flight import SimulatedFlight, SimulationSettings
-from mavbridge.simulation.referee import EpisodeResult
-from mavbridge.simulation.world import (
-    draw_conditions,
-    make_vehicle,
-)
+from mavbridge.simulation.referee import EpisodeResult, Outcome
+from mavbridge.simulation.world import draw_conditions, make_vehicle
 from policy.files import read_json
+
+Z95 = 1.959963984540054
+"""95 % of a normal distribution are within this many standard deviations."""
+_BLOCKS, _BLOCK = 100, 100
+"""10,000 resamples, one block at a time."""
+_SEED = 0
+"""Seed of the resampling, so that equal flights have equal intervals."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -170,19 +178,6 @@ def flown_before(config: EvaluateConfig, flown_by: str) -> dict[int, FlownEpisod
     return by_index
 
 
-def require_same_engine(flown: Mapping[int, FlownEpisode], engine: str) -> None:
-    """Refuse a flight by an engine other than that of earlier flights.
-
-    Raises:
-        UserError: the engine differs, as on another computer.
-    """
-    if others := {episode.engine for episode in flown.values()} - {engine}:
-        raise UserError(
-            f"--resume: the flights before were flown by the engine {', '.join(others)}, here it "
-            f"is {engine}: go on where they were flown, or name another --json"
-        )
-
-
 def evaluate(config: EvaluateConfig) -> int:
     """Fly every episode of the config; return 130 if interrupted, with the results so far.
 
@@ -198,18 +193,21 @@ def evaluate(config: EvaluateConfig) -> int:
         try:
             with closing(_fly(config, console, dict(flown), stop.is_set)) as episodes:
                 for index, episode in episodes:
-                    if config.resume:
-                        require_same_engine(flown, episode.engine)
+                    if config.resume and (engine := _engine(flown)) not in ("", episode.engine):
+                        raise UserError(
+                            f"--resume: the flights before were flown by the engine {engine}, "
+                            f"here it is {episode.engine}: go on where they were flown, or name "
+                            "another --json"
+                        )
                     flown[index] = episode
                     _keep(config, flown, flown_by)
         except MavbridgeError as error:
             failure = error  # the episodes flown before that still count
         was_stopped = stop.is_set()
-    evaluation = _evaluation(config, flown)
     if flown:
-        print_evaluation(evaluation, Console())
+        print_evaluation(config, flown, Console())
     if config.json is not None and (flown or failure is None):
-        config.json.write_text(to_json(evaluation, flown_by))
+        config.json.write_text(to_json(config, flown, flown_by))
     if failure is not None or was_stopped:
         ended = f"{'interrupted' if failure is None else 'ended'} after {len(flown)} of "
         console.print(Text(f"{ended}{config.episodes} episodes", style="yellow"))
@@ -222,19 +220,10 @@ def _keep(config: EvaluateConfig, flown: dict[int, FlownEpisode], flown_by: str)
     """Write the results so far if the evaluation can be resumed."""
     if config.resume and config.json is not None:
         try:
-            write_durably(config.json, to_json(_evaluation(config, flown), flown_by))
+            write_durably(config.json, to_json(config, flown, flown_by))
         except OSError as error:
             reason = error.strerror or error
             raise UserError(f"cannot write --json {config.json}: {reason}") from error
-
-
-def _evaluation(config: EvaluateConfig, flown: dict[int, FlownEpisode]) -> Evaluation:
-    episodes = [flown[index] for index in sorted(flown)]
-    return Evaluation(
-        config=config,
-        engine=episodes[0].engine if episodes else "",
-        episodes=tuple(one.result for one in episodes),
-    )
 
 
 def _fly(
@@ -256,3 +245,154 @@ def _fly(
             done += 1
             finished += episode.result.has_finished
             progress.update(bar, advance=1, status=f"{finished} of {done} finished")
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Estimate:
+    """Mean or rate; the interval is None if a single flight gives none."""
+
+    value: float
+    low: float | None
+    high: float | None
+    count: int
+
+
+def rate(successes: int, count: int) -> Estimate:
+    """Return the success rate with Wilson's score interval (E. B. Wilson 1927, JASA 22, 209-212).
+
+    Raises:
+        ValueError: no trials, or more successes than trials.
+    """
+    if not 0 <= successes <= count or count == 0:
+        raise ValueError(f"{successes} successes of {count} are no rate")
+    share, z2 = successes / count, Z95**2
+    centre = (share + z2 / (2 * count)) / (1 + z2 / count)
+    spread = math.sqrt(share * (1 - share) / count + z2 / (4 * count**2))
+    half = Z95 * spread / (1 + z2 / count)
+    return Estimate(
+        value=share, low=max(0.0, centre - half), high=min(1.0, centre + half), count=count
+    )
+
+
+def mean(values: Sequence[float]) -> Estimate | None:
+    """Return the mean with a percentile bootstrap interval (B. Efron 1979); None without values."""
+    if not values:
+        return None
+    sample = np.asarray(values, dtype=np.float64)
+    low = high = None
+    if len(sample) > 1:
+        random = np.random.Generator(np.random.PCG64(_SEED))
+        size = (_BLOCK, len(sample))
+        means = [
+            sample[random.integers(len(sample), size=size)].mean(axis=1) for _ in range(_BLOCKS)
+        ]
+        low, high = (float(bound) for bound in np.percentile(means, (2.5, 97.5)))
+    return Estimate(value=float(sample.mean()), low=low, high=high, count=len(sample))
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Summary:
+    """Figures over all episodes unless stated otherwise; None: no episode has the figure."""
+
+    success_rate: Estimate
+    """Success: all gates in order, no crash."""
+    gates_passed: Estimate | None
+    mean_speed_mps: Estimate | None
+    """Path length over time, take-off included."""
+    course_speed_mps: Estimate | None
+    """Length of the straight legs over time, from the first gate to the last one passed."""
+    stick_rate_per_s: Estimate | None
+    """Mean |change| of a number of the action per second; lower is smoother."""
+    flown_s: Estimate | None
+    course_s: Estimate | None
+    """Time from the first action to the last gate, of the successful flights."""
+    outcomes: tuple[tuple[Outcome, int], ...]
+
+
+def summarise(episodes: Sequence[EpisodeResult]) -> Summary:
+    """Compute the figures of one or more episodes."""
+
+    def mean_of(name: str) -> Estimate | None:
+        values = [getattr(one, name) for one in episodes]
+        return mean([value for value in values if value is not None])
+
+    return Summary(
+        success_rate=rate(sum(one.has_finished for one in episodes), len(episodes)),
+        gates_passed=mean_of("gates_passed"),
+        mean_speed_mps=mean_of("mean_speed_mps"),
+        course_speed_mps=mean_of("course_speed_mps"),
+        stick_rate_per_s=mean_of("stick_rate_per_s"),
+        flown_s=mean_of("flown_s"),
+        course_s=mean_of("course_s"),
+        outcomes=tuple(Counter(one.outcome for one in episodes).most_common()),
+    )
+
+
+def to_json(config: EvaluateConfig, flown: Mapping[int, FlownEpisode], flown_by: str) -> str:
+    """Return all results as JSON; the summary is null without episodes, ``flown_by`` from
+    ``identity``."""
+    episodes = _results(flown)
+    summary = None
+    if episodes:
+        summary = asdict(summarise(episodes))
+        summary["outcomes"] = dict(summary["outcomes"])
+    document = {
+        "policy": config.policy.policy,
+        "engine": _engine(flown),
+        "conditions": config.conditions,
+        "gusts_mps": config.gusts,
+        "vision_delay_ms": config.vision_delay,
+        "seed": config.policy.seed,
+        "asked_episodes": config.episodes,
+        "flown_by": flown_by,
+        "summary": summary,
+        "episodes": [asdict(one) for one in episodes],
+    }
+    return json.dumps(document, indent=2, allow_nan=False) + "\n"
+
+
+def print_evaluation(
+    config: EvaluateConfig, flown: Mapping[int, FlownEpisode], console: Console
+) -> None:
+    """Print each figure with its 95 % interval, then how the flights ended."""
+    episodes = _results(flown)
+    summary = summarise(episodes)
+    figures = (
+        (f"gates passed, of {episodes[0].gates_total}", summary.gates_passed),
+        ("mean speed, m/s", summary.mean_speed_mps),
+        ("speed from gate to gate, m/s", summary.course_speed_mps),
+        ("change of actions, 1/s", summary.stick_rate_per_s),
+        ("flown, s", summary.flown_s),
+        ("course time, s (successful flights)", summary.course_s),
+    )
+    rows = [("success rate", *_cells(summary.success_rate, "{:.1%}"))]
+    rows += [(name, *_cells(estimate, "{:.2f}")) for name, estimate in figures]
+    title = [f"{config.policy.policy} ({_engine(flown)})"]
+    if config.conditions != "nominal":
+        title.append(f"{config.conditions} conditions")
+    if config.gusts is not None:
+        title.append(f"gusts of {config.gusts:g} m/s")
+    if config.vision_delay:
+        title.append(f"images {config.vision_delay:g} ms later")
+    header = ("", "mean", "95 % interval", "flights")
+    console.print(make_table(", ".join(title), header, rows))
+    ends = ", ".join(f"{count} {outcome}" for outcome, count in summary.outcomes)
+    console.print(Text(f"{len(episodes)} flights: {ends}"))
+
+
+def _results(flown: Mapping[int, FlownEpisode]) -> list[EpisodeResult]:
+    return [flown[index].result for index in sorted(flown)]
+
+
+def _engine(flown: Mapping[int, FlownEpisode]) -> str:
+    """Return the engine of the flights; empty if there are none."""
+    return flown[min(flown)].engine if flown else ""
+
+
+def _cells(estimate: Estimate | None, form: str) -> tuple[str, str, str]:
+    if estimate is None:
+        return "-", "-", "0"
+    interval = "-"
+    if estimate.low is not None and estimate.high is not None:
+        interval = f"{form.format(estimate.low)} to {form.format(estimate.high)}"
+    return form.format(estimate.value), interval, str(estimate.count)

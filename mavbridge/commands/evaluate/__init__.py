@@ -1,1 +1,0 @@
-"""``mavbridge evaluate``: performance of a policy on courses that it was not trained on."""
