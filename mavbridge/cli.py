@@ -152,7 +152,7 @@ def replay(flight: Path, config: ReplayConfig | None = None) -> int:
         config: the settings.
     """
     require_extra("replay")
-    from mavbridge.commands.replay.run import replay as run_replay
+    from mavbridge.commands.replay import replay as run_replay
 
     return run_replay(flight, ReplayConfig() if config is None else config)
 

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from helpers.golden_flights import FLIGHTS, NAMES, golden, through_gate
-from mavbridge.commands.replay.run import CLOCK_TOLERANCE, ENGINE_TOLERANCE
+from mavbridge.commands.replay import CLOCK_TOLERANCE, ENGINE_TOLERANCE
 from mavbridge.core.clock import NS_PER_S
 from mavbridge.core.reasons import Code, because
 from mavbridge.core.records import Solve

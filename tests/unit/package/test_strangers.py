@@ -13,7 +13,7 @@ from helpers.golden_flights import FLIGHTS, copied
 from mavbridge.__main__ import main
 from mavbridge.cli import cli
 from mavbridge.commands.config import ReplayConfig
-from mavbridge.commands.replay.run import replay
+from mavbridge.commands.replay import replay
 from mavbridge.config.flight import FlyConfig
 from mavbridge.config.settings_files import untrusted_settings
 from mavbridge.core.errors import UserError

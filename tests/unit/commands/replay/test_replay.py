@@ -7,8 +7,8 @@ import pyarrow.parquet as pq
 import pytest
 
 from helpers.golden_flights import FLIGHTS, copied
-from mavbridge.commands.config import ReplayConfig
-from mavbridge.commands.replay.run import (
+from mavbridge.commands.config import ReplayConfig, ReplayFrom
+from mavbridge.commands.replay import (
     ENGINE_TOLERANCE,
     VIDEO_TOLERANCE,
     other_config,
@@ -99,15 +99,10 @@ def test_flags_of_the_replay_replace_those_of_the_flight_and_no_others() -> None
     ],
 )
 def test_what_counts_as_equal(
-    config: ReplayConfig, chosen: str, engine: str, expected: float | None
+    config: ReplayConfig, chosen: ReplayFrom, engine: str, expected: float | None
 ) -> None:
-    found = tolerance_of(
-        config,
-        chosen,  # type: ignore[arg-type]
-        recorded_engine="numpy",
-        engine=engine,
-        is_scripted=False,
-    )
+    is_same = engine == "numpy"
+    found = tolerance_of(config, chosen, is_same_engine=is_same, is_scripted=False)
     assert found == expected
 
 

@@ -1,39 +1,50 @@
-"""Replay command: read the flight, compute it again, report the differences."""
+"""``mavbridge replay``: read a flight, compute it again, report the differences."""
 
+import json
+import math
 from collections.abc import Iterable, Iterator, Sequence
-from dataclasses import fields, replace
+from dataclasses import asdict, dataclass, fields, replace
 from pathlib import Path
 from typing import Any
 
 import cv2
+from rich.console import Console
+from rich.text import Text
 
 from mavbridge.commands.config import ReplayConfig, ReplayFrom
-from mavbridge.commands.output import print_status, require_outputs, table_console
-from mavbridge.commands.replay.results import ReplayResult, draw, print_replay, to_json
+from mavbridge.commands.output import (
+    BLUE,
+    FIGURE_DPI,
+    FIGURE_STYLE,
+    GREY,
+    MUTED,
+    make_table,
+    print_status,
+    require_outputs,
+    table_console,
+)
 from mavbridge.config.flight import FlyConfig
 from mavbridge.config.settings_files import foreign_policy
 from mavbridge.core.clock import NS_PER_S
 from mavbridge.core.errors import ExitCode, UserError
 from mavbridge.core.records import FeatureFrame
+from mavbridge.core.vehicle import ACTION_CLASSES
 from mavbridge.flight.plan import plan_flight
 from mavbridge.flight.policies import is_scripted, load_configured_policy
-from mavbridge.guard.chunks import Chunk
 from mavbridge.recording.flight_folder import open_flight
-from mavbridge.recording.folder import require_extra
 from mavbridge.simulation.clock import SteppedClock
 from mavbridge.simulation.replay.compare import (
+    PAST_INPUTS,
+    Deviation,
+    GuardComparison,
     PolicyComparison,
+    StickTraces,
     compare_guard,
     compare_policy,
     guard_traces,
     other_traces,
 )
-from mavbridge.simulation.replay.guard import (
-    chunk_of,
-    recorded_plan,
-    replay_guard,
-    replay_other,
-)
+from mavbridge.simulation.replay.guard import chunk_of, recorded_plan, replay_guard, replay_other
 from mavbridge.simulation.replay.policy import SolvePair, replay_policy
 from mavbridge.simulation.replay.recording import ReplaySource, open_source
 from policy.protocol import PolicyRunner
@@ -55,7 +66,6 @@ def replay(folder: Path, config: ReplayConfig) -> int:
     Raises:
         MavbridgeError: the flight cannot be read or replayed, or the policy cannot be loaded.
     """
-    require_extra("replay")
     require_outputs(config.json, config.plot)
     source = open_source(folder)
     config = _trusted(source, config)
@@ -74,11 +84,17 @@ def replay(folder: Path, config: ReplayConfig) -> int:
             plan = plan_flight(flown.config, runner.contract, is_dual=runner.dual_rate)
             pairs = _replayed(flown, runner, clock, chosen)
         compared = compare_policy(pairs)
-        chunks = _other_chunks(runner, pairs)
+        # The new chunks, by the serial numbers of the recorded ones.
+        chunks = {
+            pair.recorded.serial: chunk_of(
+                replace(pair.replayed, serial=pair.recorded.serial), runner.contract
+            )
+            for pair in pairs
+            if pair.replayed is not None
+        }
     is_same = compared is None or compared.equal_chunks == compared.solves
-    if is_same and not config.changes_limits:
-        traces = guard_traces(steps)
-    else:
+    traces = guard_traces(steps)
+    if config.changes_limits or not is_same:
         traces = other_traces(steps, replay_other(steps, plan.guard, chunks))
     if chosen == "video":
         names = (None, *source.contract.cameras[1:])
@@ -94,8 +110,7 @@ def replay(folder: Path, config: ReplayConfig) -> int:
         tolerance=tolerance_of(
             config,
             chosen,
-            recorded_engine=source.meta.engine,
-            engine=engine,
+            is_same_engine=engine == source.meta.engine,
             is_scripted=is_scripted(flown.config.policy),
         ),
     )
@@ -172,12 +187,7 @@ def other_config(flown: FlyConfig, asked: ReplayConfig) -> FlyConfig:
 
 
 def tolerance_of(
-    config: ReplayConfig,
-    chosen: ReplayFrom,
-    *,
-    recorded_engine: str | None,
-    engine: str,
-    is_scripted: bool,
+    config: ReplayConfig, chosen: ReplayFrom, *, is_same_engine: bool, is_scripted: bool
 ) -> float | None:
     """Return the largest stick difference that counts as equal; None: no agreement is expected."""
     if config.tolerance is not None:
@@ -188,7 +198,7 @@ def tolerance_of(
         return VIDEO_TOLERANCE
     if chosen == "chunks":
         return 0.0
-    if engine != recorded_engine:
+    if not is_same_engine:
         return ENGINE_TOLERANCE
     return CLOCK_TOLERANCE if is_scripted else 0.0
 
@@ -240,12 +250,143 @@ def _encoded(
         )
 
 
-def _other_chunks(runner: PolicyRunner, pairs: Sequence[SolvePair]) -> dict[int, Chunk]:
-    """Return the new chunks by the serial numbers of the recorded ones."""
-    return {
-        pair.recorded.serial: chunk_of(
-            replace(pair.replayed, serial=pair.recorded.serial), runner.contract
-        )
-        for pair in pairs
-        if pair.replayed is not None
+@dataclass(frozen=True, kw_only=True)
+class ReplayResult:
+    """Results of one replay."""
+
+    source: ReplaySource
+    chosen: ReplayFrom
+    engine: str | None
+    """Engine of the policy; None: the policy was not used."""
+    policy: PolicyComparison | None
+    guard: GuardComparison
+    """Comparison with the recorded chunks and settings."""
+    sticks: StickTraces
+    """Sticks from the new chunks and settings."""
+    tolerance: float | None
+    """None: the policy or the limits were changed, so that no agreement is expected."""
+
+    @property
+    def problems(self) -> tuple[str, ...]:
+        """Reasons why the replay is not equal, in words."""
+        found = []
+        if self.guard.first is not None:
+            found.append(f"the guard came out differently, first in the {self.guard.first}")
+        if self.tolerance is None:
+            return tuple(found)
+        for name, count in self.policy.missing.items() if self.policy else ():
+            found.append(f"{count} solves were not repeated: {name}")
+        for name, count in self.policy.inputs_differ.items() if self.policy else ():
+            if name not in PAST_INPUTS:
+                found.append(f"{count} solves were given another input: {name}")
+        other = 0 if self.policy is None else self.policy.solves - self.policy.equal_chunks
+        if other and self.policy is not None and self.tolerance == 0:
+            found.append(f"{other} of {self.policy.solves} chunks differ")
+        if self.sticks.deviation.most > self.tolerance:
+            found.append(
+                f"a stick is off by {self.sticks.deviation.most:.4g}, more than {self.tolerance:g}"
+            )
+        return tuple(found)
+
+    @property
+    def is_equal(self) -> bool:
+        """True if it is equal within the tolerance, or no agreement was expected."""
+        return not self.problems
+
+
+def print_replay(result: ReplayResult, console: Console) -> None:
+    """Print tables, and a verdict in words."""
+    names = ACTION_CLASSES[result.source.contract.action]._fields
+    rows = []
+    if (policy := result.policy) is not None:
+        equal = f"{policy.equal_chunks} of {policy.solves} chunks"
+        rows.append(_row("policy: chunks", equal, policy.deviation))
+    guard = result.guard
+    same = f"{guard.steps - max(guard.differ.values(), default=0)} of {guard.steps} ticks"
+    rows.append(_row("guard: sticks, recorded chunks", same, guard.deviation))
+    if result.policy is not None or result.tolerance is None:
+        moved = result.sticks.deviation
+        rows.append(_row("sticks, these chunks and limits", "", moved))
+        rows.append(_row("the same, rms", "", Deviation(largest=moved.rms, rms=moved.rms)))
+    title = f"replay of {result.source.folder} from {result.chosen}"
+    header = ["largest difference", "equal", *names]
+    console.print(make_table(title, header, rows, left_columns=2))
+    recorded = f"recorded with {result.source.meta.policy} on {result.source.meta.engine}"
+    console.print(Text(recorded + (f", replayed on {result.engine}" if result.engine else "")))
+    for gap in result.source.gaps:
+        console.print(Text(f"note: {gap}", style="yellow"))
+    past = result.policy.inputs_differ if result.policy and result.tolerance is not None else {}
+    for name in PAST_INPUTS:
+        if name in past:
+            note = f"{name} of {past[name]} solves are the recorded ones: built anew, they differ"
+            console.print(Text(f"note: {note}", style="yellow"))
+    for problem in result.problems:
+        console.print(Text(f"different: {problem}", style="red"))
+    console.print(Text(_verdict(result), style="bold"))
+
+
+def _verdict(result: ReplayResult) -> str:
+    if not result.is_equal:
+        return "NOT EQUAL"
+    if result.tolerance is None:
+        return "the difference is what was asked for"
+    if result.tolerance == 0:
+        return "EQUAL, bit for bit"
+    return f"EQUAL within {result.tolerance:g} of full stick"
+
+
+def _row(name: str, equal: str, deviation: Deviation) -> list[str]:
+    return [name, equal, *("0" if each == 0 else f"{each:.2g}" for each in deviation.largest)]
+
+
+def to_json(result: ReplayResult) -> str:
+    """Return all figures as JSON."""
+    document = {
+        "flight": str(result.source.folder),
+        "from": result.chosen,
+        "recorded_engine": result.source.meta.engine,
+        "engine": result.engine,
+        "tolerance": result.tolerance,
+        "is_equal": result.is_equal,
+        "problems": result.problems,
+        "gaps": result.source.gaps,
+        "policy": None if result.policy is None else asdict(result.policy),
+        "guard": asdict(result.guard),
+        "sticks": asdict(result.sticks.deviation),
     }
+    return json.dumps(_finite(document), indent=2) + "\n"
+
+
+def _finite(value: object) -> object:
+    """Replace infinity, which JSON lacks, by null: only one of the two was flown."""
+    if isinstance(value, dict):
+        return {name: _finite(each) for name, each in value.items()}
+    if isinstance(value, list | tuple):
+        return [_finite(each) for each in value]
+    return None if value == math.inf else value
+
+
+def draw(result: ReplayResult, path: Path) -> None:
+    """Draw the smoothed sticks, recorded and replayed, over time: one row per stick."""
+    from matplotlib import rc_context
+    from matplotlib.figure import Figure
+
+    names = ACTION_CLASSES[result.source.contract.action]._fields
+    sticks = result.sticks
+    with rc_context(FIGURE_STYLE):
+        figure = Figure(figsize=(12.0, 8.0), dpi=FIGURE_DPI, facecolor="white")
+        rows = figure.subplots(4, 1, sharex=True)
+        for number, (axes, name) in enumerate(zip(rows, names, strict=True)):
+            for values, label, color, width in (
+                (sticks.recorded, "recorded", GREY, 3.0),
+                (sticks.replayed, "replayed", BLUE, 1.2),
+            ):
+                axes.plot(sticks.times_s, values[:, number], color=color, lw=width, label=label)
+            largest = sticks.deviation.largest[number]
+            axes.set_title(f"{name}, largest difference {largest:.2g}", fontsize=10)
+        rows[0].legend(loc="upper right", ncols=2)
+        rows[-1].set_xlabel("s since the first tick")
+        title = f"{result.source.folder.name}: smoothed actions, replayed from {result.chosen}"
+        figure.suptitle(title, x=0.012, ha="left", color=MUTED, fontsize=10)
+        figure.tight_layout(rect=(0, 0, 1, 0.98))
+        figure.savefig(path)

@@ -1,1 +1,0 @@
-"""``mavbridge replay``: computes a recorded flight again with the flight's own code."""
