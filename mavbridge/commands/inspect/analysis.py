@@ -8,33 +8,44 @@ from typing import Literal
 
 import numpy as np
 
-from mavbridge.commands.inspect.delays import (
+from mavbridge.commands.inspect.moments import (
+    Arrivals,
     DelayEvent,
+    Moment,
     find_delays,
-    flown_limits,
-    is_gap,
-    read_arrivals,
+    worst_moments,
 )
-from mavbridge.commands.inspect.moments import Moment, worst_moments
 from mavbridge.commands.inspect.series import (
     FloatColumn,
     TickSeries,
     Track,
     course_gates,
+    is_gap,
     make_series,
     read_track,
 )
+from mavbridge.config.flight import Limits
 from mavbridge.core.clock import NS_PER_S
 from mavbridge.core.course import CourseGate, read_gates
+from mavbridge.core.errors import MavbridgeError
 from mavbridge.core.histogram import Histogram
 from mavbridge.core.reasons import Reason
-from mavbridge.core.records import Tick
+from mavbridge.core.records import Solve, Tick
 from mavbridge.core.vehicle import Percentiles
+from mavbridge.flight.settings import effective_freshness
 from mavbridge.guard.chunks import FreshnessLimits
 from mavbridge.observe.timing import FlightTiming, ObserverDrops, TimingReport, VisionReport
+from mavbridge.recording import replay_tables
 from mavbridge.recording.flight_folder import RecordedFlight, open_flight
+from mavbridge.recording.folder import PACKETS, SOLVES
 from mavbridge.recording.meta import FlightError, FlightMeta
 from mavbridge.recording.rows import FrameRow
+from mavbridge.recording.settings import read_settings
+from mavbridge.recording.tables import read_table
+from policy.contract import Contract
+
+ATTITUDES = (30, 31)
+"""Message ids of ATTITUDE and ATTITUDE_QUATERNION (MAVLink, common.xml)."""
 
 Holder = Literal["policy", "read-only", "idle", "neutral", "release", "pilot"]
 """idle: ours, before the policy flies; neutral: ours, on the way out; release: given back, not yet
@@ -54,8 +65,7 @@ class HolderSpan:
     """Why the policy did not fly, for most of the span; None while it flew."""
 
 
-def holder_of(tick: Tick) -> Holder:
-    """Return the holder of the sticks after this tick."""
+def _holder(tick: Tick) -> Holder:
     if tick.trace is not None:
         return "read-only" if tick.sent is None else "policy"
     if tick.sent is not None:
@@ -67,22 +77,20 @@ def holder_spans(ticks: Sequence[Tick], start_ns: int) -> tuple[HolderSpan, ...]
     """Return the stretches in the order of time, each with its longest-lasting reason. A new reason
     does not start a new stretch."""
     spans: list[HolderSpan] = []
-    at = 0
-    for holder, group in groupby(ticks, holder_of):
-        first = at
+    ends_ns = [tick.woke_ns for tick in ticks[1:]] + [tick.woke_ns for tick in ticks[-1:]]
+    for holder, group in groupby(zip(ticks, ends_ns, strict=True), lambda pair: _holder(pair[0])):
+        span = list(group)
         lasted_ns: dict[object, int] = {}
         reasons: dict[object, Reason | None] = {}
-        for tick in group:
-            at += 1
-            end_ns = ticks[min(at, len(ticks) - 1)].woke_ns
+        for tick, end_ns in span:
             reason = None if tick.trace is not None else tick.release_reason
             key = None if reason is None else reason.key
             lasted_ns[key] = lasted_ns.get(key, 0) + end_ns - tick.woke_ns
             reasons[key] = reason
         spans.append(
             HolderSpan(
-                start_s=(ticks[first].woke_ns - start_ns) / NS_PER_S,
-                end_s=(end_ns - start_ns) / NS_PER_S,
+                start_s=(span[0][0].woke_ns - start_ns) / NS_PER_S,
+                end_s=(span[-1][1] - start_ns) / NS_PER_S,
                 holder=holder,
                 reason=reasons[max(lasted_ns, key=lasted_ns.__getitem__)],
             )
@@ -161,9 +169,9 @@ def analyse(folder: Path, *, gates: Path | None = None) -> FlightAnalysis:
         ticks,
         stick_hz=stick_hz,
         action_hz=flight.meta.action_hz,
-        arrivals=read_arrivals(folder, damage),
+        arrivals=_read_arrivals(folder, damage),
     )
-    limits = flown_limits(folder, flight.meta.contract)
+    limits = _flown_limits(folder, flight.meta.contract)
     return FlightAnalysis(
         folder=folder,
         meta=flight.meta,
@@ -282,3 +290,48 @@ def _images(
         exposed_s=(exposed_ns - start_ns) / NS_PER_S,
         latency_ms=latency.percentiles_ms(),
     )
+
+
+def _flown_limits(folder: Path, contract: Contract | None) -> FreshnessLimits | None:
+    """Return the age limits when a stick is sent: the recorded flags', else the contract's."""
+    if contract is None:
+        return None
+    try:
+        limits = effective_freshness(contract, read_settings(folder).config.limits)
+    except MavbridgeError:  # no settings, or those of another version
+        limits = effective_freshness(contract, Limits())
+    return limits.while_played(round(contract.play_s * NS_PER_S))
+
+
+def _read_arrivals(folder: Path, damage: list[str]) -> Arrivals | None:
+    """Return the attitudes that reached the flight process; None if there is no such table.
+
+    A sentence about any loss is appended to ``damage``.
+
+    Raises:
+        MavbridgeError: the table is damaged.
+    """
+    if not _has(folder, PACKETS):
+        return None
+    table = read_table(folder / PACKETS, replay_tables.PACKETS, damage=damage)
+    columns = {name: table.column(name).to_numpy() for name in table.column_names}
+    rows = np.flatnonzero(np.isin(columns["message_id"], ATTITUDES))
+    if not len(rows):
+        return None
+    rows = rows[np.argsort(columns["happened_ns"][rows], kind="stable")]
+    return Arrivals(columns["happened_ns"][rows], columns["arrived_ns"][rows])
+
+
+def recorded_solves(folder: Path, contract: Contract | None) -> Iterator[Solve]:
+    """Return the policy's solves in the order of time; nothing if they were not recorded.
+
+    Raises:
+        MavbridgeError: the table is damaged.
+    """
+    if contract is not None and _has(folder, SOLVES):
+        table = read_table(folder / SOLVES, replay_tables.SOLVES)
+        yield from (row.solve for row in replay_tables.read_solves(table, contract))
+
+
+def _has(folder: Path, stem: str) -> bool:
+    return any((folder / stem).with_suffix(end).exists() for end in (".parquet", ".arrows"))

@@ -1,18 +1,33 @@
-"""Worst moments of a recorded flight, and their descriptions."""
+"""Missed slots and late chunks of a recorded flight with their causes, and its worst moments."""
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from itertools import groupby, pairwise
+from typing import Literal, NamedTuple, TypeAlias
 
-from mavbridge.commands.inspect.delays import DelayEvent
+import numpy as np
+from numpy.typing import NDArray
+
+from mavbridge.commands.inspect.series import is_gap
 from mavbridge.core.clock import NS_PER_MS, NS_PER_S
 from mavbridge.core.reasons import Code, Kind
 from mavbridge.core.records import Tick
 from mavbridge.guard.chunks import FreshnessLimits
+from mavbridge.observe.timing import LATE_PERIODS
 from mavbridge.recording.crash import CrashWatch
 from mavbridge.recording.flight_folder import RecordedFlight
 from mavbridge.recording.rows import FrameRow
 
+Stamps: TypeAlias = NDArray[np.int64]
+Cause = Literal[
+    "the guard woke late",
+    "sending took long",
+    "the policy took long",
+    "the attitude came late",
+    "the policy loop began late",
+    "the attitude or the policy loop was late",
+]
+"""The last cause covers recordings without arrivals, which would tell its two cases apart."""
 MOMENTS = 10
 APART_S = 0.25
 """Moments closer together than this are merged into one."""
@@ -24,7 +39,134 @@ LEAST_MS = 1.0
 """Coasting that ends sooner, with a chunk between two slots, is not reported."""
 
 
-@dataclass(frozen=True, kw_only=True)
+class Arrivals(NamedTuple):
+    """Attitudes of the vehicle in the order of measurement."""
+
+    happened_ns: Stamps
+    """[K] measurement times, as in ``VehicleState.attitude_ns``."""
+    arrived_ns: Stamps
+    """[K] arrivals at this computer."""
+
+
+@dataclass(frozen=True)
+class DelayEvent:
+    """A late chunk, or consecutive missed slots."""
+
+    at_ns: int
+    what: Literal["late chunk", "missed slots"]
+    count: int
+    """Number of missed slots; 1 for a chunk."""
+    delay_ms: float
+    """Time beyond the period."""
+    cause: Cause
+
+
+class _Solve(NamedTuple):
+    """Computation of the chunk that a tick flew."""
+
+    serial: int
+    started_ns: int
+    computed_ns: int
+    attitude_ns: int | None
+
+
+def find_delays(
+    ticks: Sequence[Tick], *, stick_hz: float, action_hz: float, arrivals: Arrivals | None = None
+) -> tuple[DelayEvent, ...]:
+    """Return missed slots and late chunks while the policy flew, in the order of time.
+
+    Gaps in which the recorder lost ticks are left out.
+    """
+    slot_ns, chunk_ns = NS_PER_S / stick_hz, NS_PER_S / action_hz
+    found = [*_missed_slots(ticks, slot_ns), *_late_chunks(ticks, chunk_ns, arrivals)]
+    return tuple(sorted(found, key=lambda delay: delay.at_ns))
+
+
+def _missed_slots(ticks: Sequence[Tick], slot_ns: float) -> Iterator[DelayEvent]:
+    for last, tick in pairwise(ticks):
+        is_flown = last.trace is not None and tick.trace is not None
+        if is_flown and tick.missed_slots and not is_gap(last, tick):
+            delay_ms = max(0.0, tick.sent_ns - last.sent_ns - slot_ns) / NS_PER_MS
+            is_slow_send = last.sent_ns - last.woke_ns > slot_ns / 2
+            cause: Cause = "sending took long" if is_slow_send else "the guard woke late"
+            yield DelayEvent(tick.woke_ns, "missed slots", tick.missed_slots, delay_ms, cause)
+
+
+def _late_chunks(
+    ticks: Sequence[Tick], chunk_ns: float, arrivals: Arrivals | None
+) -> Iterator[DelayEvent]:
+    """Yield chunks that came more than ``LATE_PERIODS`` after the one before."""
+    before: Tick | None = None
+    last: _Solve | None = None
+    for tick in ticks:
+        if before is not None and is_gap(before, tick):
+            last = None
+        before, solve = tick, _solve_of(tick)
+        if solve is None or last is None or solve.serial < last.serial:
+            last = solve
+        elif solve.serial > last.serial:
+            # Chunks in between, overtaken by newer ones before any send, were not late.
+            period_ns = (solve.computed_ns - last.computed_ns) / (solve.serial - last.serial)
+            if period_ns > LATE_PERIODS * chunk_ns:
+                delay_ms = (period_ns - chunk_ns) / NS_PER_MS
+                cause = _cause(last, solve, chunk_ns, arrivals)
+                yield DelayEvent(tick.woke_ns, "late chunk", 1, delay_ms, cause)
+            last = solve
+
+
+def _solve_of(tick: Tick) -> _Solve | None:
+    if tick.trace is None or tick.chunk_serial is None or tick.chunk_computed_ns is None:
+        return None
+    return _Solve(
+        serial=tick.chunk_serial,
+        started_ns=tick.chunk_computed_ns - (tick.predict_ns or 0),
+        computed_ns=tick.chunk_computed_ns,
+        attitude_ns=None if tick.state is None else tick.state.attitude_ns,
+    )
+
+
+def _cause(last: _Solve, solve: _Solve, chunk_ns: float, arrivals: Arrivals | None) -> Cause:
+    """Return the stage that caused most of the delay.
+
+    A solve can start one period after the last one, once that has ended and an attitude is new.
+    """
+    due_ns = last.started_ns + (solve.serial - last.serial) * chunk_ns
+    free_ns = max(due_ns, last.computed_ns)
+    longer_ns = (solve.computed_ns - solve.started_ns) - (last.computed_ns - last.started_ns)
+    solving_ns = max(0, longer_ns) + free_ns - due_ns
+    waiting_ns = max(0.0, solve.started_ns - free_ns)
+    if solving_ns >= waiting_ns:
+        return "the policy took long"
+    arrived_ns = _arrival_ns(arrivals, last, solve, chunk_ns)
+    if arrived_ns is None:
+        return "the attitude or the policy loop was late"
+    attitude_ns = min(waiting_ns, max(0.0, arrived_ns - free_ns))
+    loop_ns = waiting_ns - attitude_ns
+    if solving_ns >= max(attitude_ns, loop_ns):
+        return "the policy took long"
+    return "the attitude came late" if attitude_ns > loop_ns else "the policy loop began late"
+
+
+def _arrival_ns(
+    arrivals: Arrivals | None, last: _Solve, solve: _Solve, chunk_ns: float
+) -> int | None:
+    """Return the arrival of the first attitude that could have started a solve; None: not recorded.
+
+    It is newer than the last solve's attitude by half a period: the loop takes one that comes a
+    quarter of a period early, and its due time can follow a late solve by half a period.
+    """
+    if arrivals is None or last.attitude_ns is None or solve.attitude_ns is None:
+        return None
+    usable_ns = min(last.attitude_ns + round(chunk_ns / 2), solve.attitude_ns)
+    number = int(np.searchsorted(arrivals.happened_ns, usable_ns))
+    if number == len(arrivals.happened_ns):
+        return None
+    if int(arrivals.happened_ns[number]) > solve.attitude_ns:
+        return None  # the attitude used is not in the table: its row was lost
+    return int(arrivals.arrived_ns[number])
+
+
+@dataclass(frozen=True)
 class Moment:
     """Moment worth a user's attention."""
 
@@ -35,6 +177,10 @@ class Moment:
     """Length of the delay, age or gap; sort key of the moments."""
     detail: str
     """Figures and cause, as a phrase."""
+
+
+_Found: TypeAlias = tuple[int, str, float, str]
+"""Time in ns, and the rest of a moment."""
 
 
 def worst_moments(
@@ -50,38 +196,37 @@ def worst_moments(
     """
     if not ticks:
         return ()
-    start_ns = ticks[0].woke_ns
     found = [
         *_crash(flight, ticks),
-        *_ends(ticks, start_ns),
-        *_delay_moments(delays, start_ns),
+        *_ends(ticks),
+        *_delay_moments(delays),
         *_coasting(ticks, limits),
-        *_old_images(ticks, start_ns),
+        *_old_images(ticks),
         *_image_gaps(flight, frames, ticks),
-        *_rows_lost(flight, start_ns),
+        *_rows_lost(flight),
+    ]
+    start_ns = ticks[0].woke_ns
+    moments = [
+        Moment((at_ns - start_ns) / NS_PER_S, what, severity_ms, detail)
+        for at_ns, what, severity_ms, detail in found
     ]
     groups: list[list[Moment]] = []
-    for moment in sorted(found, key=lambda moment: -moment.severity_ms):
-        near = [group for group in groups if abs(moment.t_s - group[0].t_s) < APART_S]
-        if not near:
+    for moment in sorted(moments, key=lambda moment: -moment.severity_ms):
+        near = next((one for one in groups if abs(moment.t_s - one[0].t_s) < APART_S), None)
+        if near is None:
             groups.append([moment])
-        elif all(moment.what != other.what for other in near[0]):
-            near[0].append(moment)
-    return tuple(_told_together(group) for group in groups[:MOMENTS])
+        elif all(moment.what != other.what for other in near):
+            near.append(moment)
+    return tuple(_told_together(*group) for group in groups[:MOMENTS])
 
 
-def _told_together(group: Sequence[Moment]) -> Moment:
+def _told_together(worst: Moment, *others: Moment) -> Moment:
     """Merge close moments: the worst one, with the worst of each other kind in its detail."""
-    worst, *others = group
     phrases = [worst.detail, *(f"{other.what}: {other.detail}" for other in others)]
     return replace(worst, detail="; ".join(phrases))
 
 
-def _since_s(at_ns: int, start_ns: int) -> float:
-    return (at_ns - start_ns) / NS_PER_S
-
-
-def _crash(flight: RecordedFlight, ticks: Sequence[Tick]) -> Iterator[Moment]:
+def _crash(flight: RecordedFlight, ticks: Sequence[Tick]) -> Iterator[_Found]:
     """Yield the first crash in the ticks. The meta of a recording that was cut off cannot report
     one, so its ticks are searched, too."""
     if flight.meta.finished and flight.meta.crash is None:
@@ -90,28 +235,18 @@ def _crash(flight: RecordedFlight, ticks: Sequence[Tick]) -> Iterator[Moment]:
     for tick in ticks:
         watch.see(tick)
         if watch.reason is not None:
-            yield Moment(
-                t_s=_since_s(tick.woke_ns, ticks[0].woke_ns),
-                what="crash",
-                severity_ms=CRASH_MS,
-                detail=watch.reason,
-            )
+            yield tick.woke_ns, "crash", CRASH_MS, watch.reason
             return
 
 
-def _ends(ticks: Sequence[Tick], start_ns: int) -> Iterator[Moment]:
+def _ends(ticks: Sequence[Tick]) -> Iterator[_Found]:
     for last, tick in pairwise(ticks):
         reason = tick.release_reason
         is_asked = reason is not None and (reason.kind is Kind.END or reason.code is Code.OPERATOR)
         is_planned = is_asked or (tick.phase == "ended" and reason is None)
-        if last.trace is None or tick.trace is not None or is_planned:
-            continue
-        yield Moment(
-            t_s=_since_s(tick.woke_ns, start_ns),
-            what="the policy's flight ended",
-            severity_ms=END_MS,
-            detail=f"{reason or 'no reason was recorded'}{_ages(last)}",
-        )
+        if last.trace is not None and tick.trace is None and not is_planned:
+            detail = f"{reason or 'no reason was recorded'}{_ages(last)}"
+            yield tick.woke_ns, "the policy's flight ended", END_MS, detail
 
 
 def _ages(tick: Tick) -> str:
@@ -126,37 +261,26 @@ def _ages(tick: Tick) -> str:
     return f"; its last sticks were by {' and '.join(parts)}" if parts else ""
 
 
-def _delay_moments(delays: Sequence[DelayEvent], start_ns: int) -> Iterator[Moment]:
+def _delay_moments(delays: Sequence[DelayEvent]) -> Iterator[_Found]:
     for delay in delays:
-        what = "late chunk"
+        what: str = delay.what
         if delay.what == "missed slots":
             what = f"{delay.count} missed slot{'' if delay.count == 1 else 's'}"
-        yield Moment(
-            t_s=_since_s(delay.at_ns, start_ns),
-            what=what,
-            severity_ms=delay.delay_ms,
-            detail=f"{delay.delay_ms:.1f} ms late: {delay.cause}",
-        )
+        detail = f"{delay.delay_ms:.1f} ms late: {delay.cause}"
+        yield delay.at_ns, what, delay.delay_ms, detail
 
 
-def _coasting(ticks: Sequence[Tick], limits: FreshnessLimits | None) -> Iterator[Moment]:
+def _coasting(ticks: Sequence[Tick], limits: FreshnessLimits | None) -> Iterator[_Found]:
     """Yield sends of an outdated chunk, up to the first send of a fresh one."""
     at = 0
     for is_coasting, group in groupby(ticks, lambda tick: tick.is_coasting and bool(tick.trace)):
         run = list(group)
         at += len(run)
-        if not is_coasting:
-            continue
         end_ns = ticks[at].woke_ns if at < len(ticks) else run[-1].sent_ns
         lasted_ms = (end_ns - run[0].woke_ns) / NS_PER_MS
-        if lasted_ms < LEAST_MS:
-            continue
-        yield Moment(
-            t_s=_since_s(run[0].woke_ns, ticks[0].woke_ns),
-            what="coasting",
-            severity_ms=lasted_ms,
-            detail=f"for {lasted_ms:.0f} ms along an old chunk: {_staleness(run[0], limits)}",
-        )
+        if is_coasting and lasted_ms >= LEAST_MS:
+            detail = f"for {lasted_ms:.0f} ms along an old chunk: {_staleness(run[0], limits)}"
+            yield run[0].woke_ns, "coasting", lasted_ms, detail
 
 
 def _staleness(tick: Tick, limits: FreshnessLimits | None) -> str:
@@ -177,7 +301,7 @@ def _staleness(tick: Tick, limits: FreshnessLimits | None) -> str:
     return "no newer one came in time"
 
 
-def _old_images(ticks: Sequence[Tick], start_ns: int) -> Iterator[Moment]:
+def _old_images(ticks: Sequence[Tick]) -> Iterator[_Found]:
     """Yield the oldest image of each stretch of sticks based on images twice as old as usual."""
     aged = [
         (tick.sent_ns - tick.feature_captured_ns, tick)
@@ -190,41 +314,27 @@ def _old_images(ticks: Sequence[Tick], start_ns: int) -> Iterator[Moment]:
     for is_old, group in groupby(aged, lambda pair: pair[0] > 2 * usual_ns):
         if is_old:
             age_ns, tick = max(group, key=lambda pair: pair[0])
-            yield Moment(
-                t_s=_since_s(tick.woke_ns, start_ns),
-                what="old image",
-                severity_ms=(age_ns - usual_ns) / NS_PER_MS,
-                detail=f"sticks by an image of {age_ns / NS_PER_MS:.0f} ms ago",
-            )
+            detail = f"sticks by an image of {age_ns / NS_PER_MS:.0f} ms ago"
+            yield tick.woke_ns, "old image", (age_ns - usual_ns) / NS_PER_MS, detail
 
 
 def _image_gaps(
     flight: RecordedFlight, frames: Sequence[FrameRow], ticks: Sequence[Tick]
-) -> Iterator[Moment]:
+) -> Iterator[_Found]:
     """Yield gaps between exposures from the first tick to the last, except the recorder's."""
     period_ms = 1000 / flight.meta.visual_hz
     for last, frame in pairwise(frames):
         gap_ms = (frame.captured_ns - last.captured_ns) / NS_PER_MS
         is_in_flight = ticks[0].woke_ns <= frame.captured_ns <= ticks[-1].woke_ns
         if gap_ms > IMAGE_PERIODS * period_ms and is_in_flight and not frame.dropped_before:
-            yield Moment(
-                t_s=_since_s(frame.captured_ns, ticks[0].woke_ns),
-                what="gap between images",
-                severity_ms=gap_ms - period_ms,
-                detail=f"{gap_ms:.0f} ms without an exposure that was used",
-            )
+            detail = f"{gap_ms:.0f} ms without an exposure that was used"
+            yield frame.captured_ns, "gap between images", gap_ms - period_ms, detail
 
 
-def _rows_lost(flight: RecordedFlight, start_ns: int) -> Iterator[Moment]:
+def _rows_lost(flight: RecordedFlight) -> Iterator[_Found]:
     dropped = flight.ticks.column("dropped_before").to_pylist()
     woke_ns = flight.ticks.column("woke_ns").to_pylist()
     for count, at_ns in zip(dropped, woke_ns, strict=True):
         if count:
-            lost_ms = 1000 * count / flight.meta.action_hz
-            yield Moment(
-                t_s=_since_s(at_ns, start_ns),
-                what="rows lost",
-                severity_ms=lost_ms,
-                detail=f"{count} ticks before this are not in the recording: the recorder fell "
-                "behind",
-            )
+            detail = f"{count} ticks before this are not in the recording: the recorder fell behind"
+            yield at_ns, "rows lost", 1000 * count / flight.meta.action_hz, detail

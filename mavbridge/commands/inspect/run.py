@@ -15,8 +15,7 @@ from rich.table import Table
 from rich.text import Text
 
 from mavbridge.commands.config import InspectConfig
-from mavbridge.commands.inspect.analysis import FlightAnalysis, HolderSpan, analyse
-from mavbridge.commands.inspect.delays import flown_limits, recorded_solves
+from mavbridge.commands.inspect.analysis import FlightAnalysis, analyse, recorded_solves
 from mavbridge.commands.inspect.page import write_page
 from mavbridge.commands.output import number, print_status, table_console
 from mavbridge.core.clock import NS_PER_S
@@ -101,7 +100,7 @@ def _facts(flight: FlightAnalysis) -> Iterator[Text]:
         yield Text(f"course {meta.course_seed}: {meta.gates_passed} gates passed, {result}")
     if flight.track is not None and len(flight.track.t_s):
         heights_m = -flight.track.position_ned_m[:, 2]
-        yield Text(f"highest {heights_m.max():.1f} m, path of {path_length_m(flight):.0f} m")
+        yield Text(f"highest {heights_m.max():.1f} m, path of {flight.track.length_m:.0f} m")
 
 
 def _pilot_lines(flight: FlightAnalysis) -> Iterator[Text]:
@@ -121,15 +120,6 @@ def _pilot_lines(flight: FlightAnalysis) -> Iterator[Text]:
         yield Text.assemble((f"{'recorder':9}", "bold"), (text, "yellow"))
 
 
-def path_length_m(flight: FlightAnalysis) -> float:
-    """Return the length of the flown path; 0 if no position is known."""
-    if flight.track is None:
-        return 0.0
-    position = flight.track.position_ned_m
-    steps = position[1:] - position[:-1]
-    return float(((steps**2).sum(axis=1) ** 0.5).sum())
-
-
 def _holders_table(flight: FlightAnalysis) -> Table:
     spans = flight.holders
     is_expert = flight.meta.source == "demonstration"
@@ -138,23 +128,15 @@ def _holders_table(flight: FlightAnalysis) -> Table:
         table.add_column(name, justify="right")
     table.add_column("holder", no_wrap=True)
     table.add_column("why the policy did not fly")
-    shown = spans if len(spans) <= HOLDERS_SHOWN else _longest(spans)
+    longest = sorted(spans, key=lambda span: span.start_s - span.end_s)[:HOLDERS_SHOWN]
+    shown = sorted(longest, key=lambda span: span.start_s)
     for span in shown:
         holder = "expert" if is_expert and span.holder == "policy" else span.holder
-        table.add_row(
-            f"{span.start_s:.2f}",
-            f"{span.end_s:.2f}",
-            holder,
-            Text(str(span.reason or "")),
-        )
+        reason = Text(str(span.reason or ""))
+        table.add_row(f"{span.start_s:.2f}", f"{span.end_s:.2f}", holder, reason)
     if len(shown) < len(spans):
         table.caption = f"the {len(shown)} longest of {len(spans)}"
     return table
-
-
-def _longest(spans: Sequence[HolderSpan]) -> list[HolderSpan]:
-    longest = sorted(spans, key=lambda span: span.start_s - span.end_s)[:HOLDERS_SHOWN]
-    return sorted(longest, key=lambda span: span.start_s)
 
 
 def _moments_table(flight: FlightAnalysis) -> Table | Text:
@@ -174,10 +156,12 @@ def print_comparison(flights: Sequence[FlightAnalysis], console: Console) -> Non
     first, second = flights
     table = Table(title="Two flights", title_justify="left")
     table.add_column("", no_wrap=True)
-    for name in _names(first, second):
+    is_same = first.folder.name == second.folder.name
+    for flight in flights:
+        name = str(flight.folder) if is_same else flight.folder.name
         table.add_column(name, justify="right", overflow="fold")
     table.add_column("second by first", justify="right")
-    for label, one, other in _texts(first, second):
+    for (label, one), (_, other) in zip(_texts(first), _texts(second), strict=True):
         table.add_row(label, Text(one), Text(other), "" if one == other else "differs")
     table.add_section()
     for figure in FIGURES:
@@ -195,26 +179,14 @@ def print_comparison(flights: Sequence[FlightAnalysis], console: Console) -> Non
         print_damage(flight, console)
 
 
-def _names(first: FlightAnalysis, second: FlightAnalysis) -> tuple[str, str]:
-    names = (first.folder.name, second.folder.name)
-    return names if names[0] != names[1] else (str(first.folder), str(second.folder))
-
-
-def _texts(first: FlightAnalysis, second: FlightAnalysis) -> Iterator[tuple[str, str, str]]:
-    for label, text in (
-        ("policy", lambda flight: flight.report.policy),
-        ("engine", lambda flight: flight.report.engine),
-        ("vehicle", lambda flight: flight.report.autopilot or "-"),
-        ("loops", lambda flight: f"{flight.meta.mode} rate"),
-        ("ended", _end),
-    ):
-        yield label, text(first), text(second)
-
-
-def _end(flight: FlightAnalysis) -> str:
-    if flight.meta.crash is not None:
-        return "crashed"
-    return "in order" if flight.meta.finished else "cut off"
+def _texts(flight: FlightAnalysis) -> Iterator[tuple[str, str]]:
+    meta, report = flight.meta, flight.report
+    yield "policy", report.policy
+    yield "engine", report.engine
+    yield "vehicle", report.autopilot or "-"
+    yield "loops", f"{meta.mode} rate"
+    end = "in order" if meta.finished else "cut off"
+    yield "ended", end if meta.crash is None else "crashed"
 
 
 def _difference(figure: Figure, one: float | None, other: float | None) -> Text:
@@ -233,20 +205,16 @@ def _difference(figure: Figure, one: float | None, other: float | None) -> Text:
     return Text(f"{shown} worse", style="red")
 
 
-def _percentile(
+def _percentiles(
     name: str, measured: Callable[[FlightAnalysis], Percentiles | None]
-) -> tuple[Figure, Figure]:
-    def at(pick: Callable[[Percentiles], float]) -> Callable[[FlightAnalysis], float | None]:
-        def value(flight: FlightAnalysis) -> float | None:
-            found = measured(flight)
-            return None if found is None else pick(found)
+) -> Iterator[Figure]:
+    for at in ("p50", "p99"):
 
-        return value
+        def value(flight: FlightAnalysis, at: str = at) -> float | None:
+            found: float | None = getattr(measured(flight), at, None)
+            return found
 
-    return (
-        Figure(f"{name}, p50", "ms", at(lambda p: p.p50), 2),
-        Figure(f"{name}, p99", "ms", at(lambda p: p.p99), 2),
-    )
+        yield Figure(f"{name}, {at}", "ms", value, 2)
 
 
 FIGURES = (
@@ -259,14 +227,14 @@ FIGURES = (
     Figure("late chunks", "", lambda f: f.report.action.late_chunks, 0),
     Figure("sends coasting", "", lambda f: f.report.sticks.coasting_sends, 0),
     Figure("releases", "", lambda f: f.report.release_count, 0),
-    *_percentile("stick lateness", lambda f: f.report.sticks.lateness_ms),
-    *_percentile("chunk period", lambda f: f.report.action.period_ms),
-    *_percentile("predict", lambda f: f.report.action.predict_ms),
-    *_percentile("feature age at send", lambda f: f.report.feature_age_ms),
-    *_percentile("attitude age at send", lambda f: f.report.state_age_ms),
-    *_percentile("new attitude to wire", lambda f: f.report.state_to_wire_ms),
-    *_percentile("exposure to feature", lambda f: f.images.latency_ms),
-    Figure("path", "m", path_length_m, more_is_better=None),
+    *_percentiles("stick lateness", lambda f: f.report.sticks.lateness_ms),
+    *_percentiles("chunk period", lambda f: f.report.action.period_ms),
+    *_percentiles("predict", lambda f: f.report.action.predict_ms),
+    *_percentiles("feature age at send", lambda f: f.report.feature_age_ms),
+    *_percentiles("attitude age at send", lambda f: f.report.state_age_ms),
+    *_percentiles("new attitude to wire", lambda f: f.report.state_to_wire_ms),
+    *_percentiles("exposure to feature", lambda f: f.images.latency_ms),
+    Figure("path", "m", lambda f: f.track.length_m if f.track else 0.0, more_is_better=None),
     Figure("gates passed", "", lambda f: f.meta.gates_passed, 0, more_is_better=True),
 )
 """Compared figures, in the order of the rows."""
@@ -333,7 +301,7 @@ def to_json(analyses: Sequence[FlightAnalysis]) -> str:
 def show_in_viewer(flight: FlightAnalysis, target: str) -> None:
     """Send the whole recording to the viewer for live flights."""
     meta, contract = flight.meta, flight.meta.contract or Contract()
-    limits = flown_limits(flight.folder, meta.contract)
+    limits = flight.limits
     view = RerunView(
         target,
         ViewedFlight(

@@ -7,7 +7,6 @@ from typing import Literal, TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
-from mavbridge.commands.inspect.delays import is_gap
 from mavbridge.core.clock import NS_PER_MS, NS_PER_S
 from mavbridge.core.course import CourseGate
 from mavbridge.core.records import Position, Tick
@@ -57,15 +56,19 @@ class TickSeries:
     """[N, 3] from the estimator's origin."""
 
 
+def is_gap(last: Tick, tick: Tick) -> bool:
+    """True if the recording lacks ticks between these two neighbours."""
+    return tick.serial != last.serial + 1
+
+
 def make_series(flight: RecordedFlight, ticks: Sequence[Tick]) -> TickSeries:
     """Convert the ticks of a flight to arrays."""
     start_ns = ticks[0].woke_ns if ticks else flight.meta.start_ns
     woke_ns = np.array([tick.woke_ns for tick in ticks], np.int64)
     contract = flight.meta.contract
-    is_enu = contract is not None and contract.state_frame == "enu_flu"
     state = _rows(ticks, STATE_DIM, lambda tick: None if tick.state is None else tick.state.values)
     velocity, attitude, rate = state[:, 0:3], state[:, 3:7], state[:, 7:10]
-    if is_enu:
+    if contract is not None and contract.state_frame == "enu_flu":
         velocity = velocity[:, (1, 0, 2)] * (1, 1, -1)
         rate = rate * (1, -1, -1)
         to_ned, to_flu = conjugate(_ENU_FROM_NED), conjugate(_FRD_FROM_FLU)
@@ -80,17 +83,11 @@ def make_series(flight: RecordedFlight, ticks: Sequence[Tick]) -> TickSeries:
         smoothed=_rows(ticks, 4, lambda tick: None if tick.trace is None else tick.trace.smoothed),
         sent=_rows(ticks, 4, lambda tick: tick.sent),
         echo=_rows(ticks, 4, lambda tick: tick.rc_sticks),
-        feature_age_ms=_ms(_feature_age_ns(tick) for tick in ticks),
-        state_age_ms=_ms(
-            None
-            if tick.trace is None or tick.state is None
-            else tick.sent_ns - tick.state.attitude_ns
-            for tick in ticks
+        feature_age_ms=_flown_ms(ticks, _feature_age_ns),
+        state_age_ms=_flown_ms(
+            ticks, lambda t: None if t.state is None else t.sent_ns - t.state.attitude_ns
         ),
-        lateness_ms=_ms(
-            max(0, tick.sent_ns - tick.due_ns) if tick.trace and tick.is_slot else None
-            for tick in ticks
-        ),
+        lateness_ms=_flown_ms(ticks, lambda t: max(0, t.sent_ns - t.due_ns) if t.is_slot else None),
         period_ms=_periods_ms(ticks),
         velocity_ned_mps=velocity,
         roll_pitch_yaw_deg=_euler_deg(attitude),
@@ -109,32 +106,28 @@ def _rows(
     return rows
 
 
-def _ms(values_ns: Iterable[int | None]) -> FloatColumn:
-    return np.array(list(values_ns), np.float64) / NS_PER_MS
+def _flown_ms(ticks: Sequence[Tick], value_ns: Callable[[Tick], int | None]) -> FloatColumn:
+    values_ns = [None if tick.trace is None else value_ns(tick) for tick in ticks]
+    return np.array(values_ns, np.float64) / NS_PER_MS
 
 
 def _feature_age_ns(tick: Tick) -> int | None:
     captured_ns = tick.feature_captured_ns
-    return None if tick.trace is None or captured_ns is None else tick.sent_ns - captured_ns
+    return None if captured_ns is None else tick.sent_ns - captured_ns
 
 
 def _periods_ms(ticks: Sequence[Tick]) -> FloatColumn:
     """Return times between the sends of consecutive flown slots without lost ticks."""
-    periods_ns: list[int | None] = []
+    periods_ns = np.full(len(ticks), np.nan)
     last_ns: int | None = None
-    before: Tick | None = None
-    for tick in ticks:
-        is_flown = tick.trace is not None
-        if before is not None and is_gap(before, tick):
+    for index, tick in enumerate(ticks):
+        if tick.trace is None or (index and is_gap(ticks[index - 1], tick)):
             last_ns = None
-        before = tick
-        periods_ns.append(None)
-        if is_flown and tick.is_slot:
-            periods_ns[-1] = None if last_ns is None else tick.sent_ns - last_ns
+        if tick.trace is not None and tick.is_slot:
+            if last_ns is not None:
+                periods_ns[index] = tick.sent_ns - last_ns
             last_ns = tick.sent_ns
-        elif not is_flown:
-            last_ns = None
-    return _ms(periods_ns)
+    return periods_ns / NS_PER_MS
 
 
 def _euler_deg(ned_from_frd_wxyz: FloatColumn) -> FloatColumn:
@@ -156,6 +149,12 @@ class Track:
     position_ned_m: FloatColumn
     """[M, 3] from the estimator's origin."""
     source: Literal["estimator", "simulator"]
+
+    @property
+    def length_m(self) -> float:
+        """Length of the path."""
+        steps = self.position_ned_m[1:] - self.position_ned_m[:-1]
+        return float(((steps**2).sum(axis=1) ** 0.5).sum())
 
 
 def course_gates(seed: int | None) -> tuple[CourseGate, ...]:
@@ -182,9 +181,6 @@ def read_track(series: TickSeries, frames: Sequence[FrameRow]) -> Track | None:
         return Track(t_s=np.array(times), position_ned_m=np.array(positions), source="simulator")
     known = np.isfinite(series.position_ned_m[:, 0])
     if known.any():
-        return Track(
-            t_s=series.t_s[known],
-            position_ned_m=series.position_ned_m[known],
-            source="estimator",
-        )
+        position = series.position_ned_m[known]
+        return Track(t_s=series.t_s[known], position_ned_m=position, source="estimator")
     return None

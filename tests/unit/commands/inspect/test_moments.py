@@ -6,7 +6,7 @@ from numpy.typing import NDArray
 
 from helpers.factories import START_NS, TICK_NS, make_released_tick, make_state, make_tick
 from mavbridge.commands.inspect.analysis import holder_spans
-from mavbridge.commands.inspect.delays import Arrivals, find_delays
+from mavbridge.commands.inspect.moments import Arrivals, find_delays
 from mavbridge.core.clock import NS_PER_MS
 from mavbridge.core.reasons import Code, because
 from mavbridge.core.records import Tick
