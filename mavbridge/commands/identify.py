@@ -82,15 +82,13 @@ def trained_motion(contract: Contract, axis: Axis, amount: float) -> float:
     """
     if contract.action != "sticks":
         return amount
-    full, dead_zone = {
-        "roll": (contract.full_lean_deg, contract.lean_dead_zone),
-        "pitch": (contract.full_lean_deg, contract.lean_dead_zone),
-        "yaw": (contract.full_yaw_rate_degps, contract.yaw_dead_zone),
-        "climb": (
-            contract.full_climb_mps if amount > 0.0 else contract.full_descent_mps,
-            contract.throttle_dead_zone,
-        ),
-    }[axis]
+    if axis == "climb":
+        full = contract.full_climb_mps if amount > 0.0 else contract.full_descent_mps
+        dead_zone = contract.throttle_dead_zone
+    elif axis == "yaw":
+        full, dead_zone = contract.full_yaw_rate_degps, contract.yaw_dead_zone
+    else:
+        full, dead_zone = contract.full_lean_deg, contract.lean_dead_zone
     beyond = max(0.0, abs(amount) - dead_zone) / (1.0 - dead_zone)
     return math.copysign(full * beyond, amount)
 
@@ -98,13 +96,8 @@ def trained_motion(contract: Contract, axis: Axis, amount: float) -> float:
 def identify_pushes(
     recording: ResponseRecording, *, contract: Contract, program_start_s: float
 ) -> Identification:
-    """Fit every push of the flown doublet.
-
-    Args:
-        recording: of the flight.
-        contract: of the policy to compare with; the doublet used its kind of action.
-        program_start_s: start of the doublet on the clock of the stamps.
-    """
+    """Fit every push of the flown doublet, which began at ``program_start_s`` on the clock of the
+    stamps; ``contract`` is of the policy to compare with."""
     pushes: list[PushResult] = []
     missing: list[str] = []
     channels = {channel.axis: channel for channel in CHANNELS[contract.action]}
@@ -187,25 +180,26 @@ def full_stick(pushes: list[PushResult]) -> Sides | None:
 def print_identification(found: Identification, contract: Contract, console: Console) -> None:
     """Print every push, the hover thrust, and the missing results."""
     is_sticks = contract.action == "sticks"
-    header = (
-        *("axis", "stick" if is_sticks else "commanded", "motion", "measured"),
-        *("trained with" if is_sticks else "expected", "ratio", "dead time", "63 %"),
-        *(("full stick",) if is_sticks else ()),
-    )
+    given, expected = ("stick", "trained with") if is_sticks else ("commanded", "expected")
+    header = ["axis", given, "motion", "measured", expected, "ratio", "dead time", "63 %"]
     rows = []
     for push in found.pushes:
-        full = full_stick([each for each in found.pushes if each.axis == push.axis])
-        ratios = ["-" if ratio is None else f"{ratio:.2f}" for ratio in push.ratio]
         rows.append(
-            (
-                *(push.axis, f"{push.action[0]:.0%}" if is_sticks else f"{push.action[0]:.2f}"),
+            [
+                push.axis,
+                f"{push.action[0]:.0%}" if is_sticks else f"{push.action[0]:.2f}",
                 f"{push.motion}, {push.unit}",
-                *("{:+.2f} {:+.2f}".format(*each) for each in (push.measured, push.trained)),
-                " ".join(ratios),
-                *(f"{1e3 * push.dead_time_s:.0f} ms", f"{1e3 * push.time_63_s:.0f} ms"),
-                *(("{:+.1f} {:+.1f}".format(*full) if full else "-",) if is_sticks else ()),
-            )
+                "{:+.2f} {:+.2f}".format(*push.measured),
+                "{:+.2f} {:+.2f}".format(*push.trained),
+                " ".join("-" if ratio is None else f"{ratio:.2f}" for ratio in push.ratio),
+                f"{1e3 * push.dead_time_s:.0f} ms",
+                f"{1e3 * push.time_63_s:.0f} ms",
+            ]
         )
+        if is_sticks:
+            full = full_stick([each for each in found.pushes if each.axis == push.axis])
+            rows[-1].append("{:+.1f} {:+.1f}".format(*full) if full else "-")
+    header += ["full stick"] if is_sticks else []
     console.print(make_table("what the vehicle does", header, rows, left_columns=3))
     if found.hover_thrust is not None:
         told = f"hovers at a thrust of {found.hover_thrust:.3f}, trained with"

@@ -3,6 +3,7 @@
 import math
 from collections import deque
 from collections.abc import Callable
+from functools import partial
 from typing import NamedTuple
 
 import numpy as np
@@ -48,44 +49,40 @@ class Channel(NamedTuple):
     motion: StepMotion
 
 
-def _lean(name: str, sign: float) -> StepMotion:
-    return StepMotion(
-        "lean", "deg", "attitude_ns", lambda s: sign * getattr(measure(s.values), name)
-    )
-
-
-def _rate(number: int, sign: float = 1.0) -> StepMotion:
-    return StepMotion(
-        "rate", "deg/s", "rate_ns", lambda s: sign * _DEG * float(s.values[RATE][number])
-    )
-
-
-def _speed(name: str) -> StepMotion:
-    return StepMotion(
-        "speed", "m/s", "velocity_ns", lambda s: float(getattr(measure(s.values), name))
-    )
-
-
 _DEG = math.degrees(1.0)
-_LEANS = _lean("roll_rad", _DEG), _lean("pitch_rad", -_DEG)
-_CLIMB = _speed("climb_mps")
+_LEAN = partial(StepMotion, "lean", "deg", "attitude_ns")
+_ROLL = _LEAN(lambda state: _DEG * measure(state.values).roll_rad)
+_PITCH = _LEAN(lambda state: -_DEG * measure(state.values).pitch_rad)
+_RATE = partial(StepMotion, "rate", "deg/s", "rate_ns")
+_ROLL_RATE = _RATE(lambda state: _DEG * float(state.values[RATE][0]))
+_PITCH_RATE = _RATE(lambda state: -_DEG * float(state.values[RATE][1]))
+_YAW_RATE = _RATE(lambda state: _DEG * float(state.values[RATE][2]))
+_SPEED = partial(StepMotion, "speed", "m/s", "velocity_ns")
+_RIGHT = _SPEED(lambda state: measure(state.values).right_mps)
+_FORWARD = _SPEED(lambda state: measure(state.values).forward_mps)
+_CLIMB = _SPEED(lambda state: measure(state.values).climb_mps)
 CHANNELS: dict[ActionKind, tuple[Channel, ...]] = {
     "sticks": (
-        *(Channel("roll", 3, 1.0, _LEANS[0]), Channel("pitch", 2, 1.0, _LEANS[1])),
-        *(Channel("yaw", 1, 1.0, _rate(2)), Channel("climb", 0, 1.0, _CLIMB)),
+        Channel("roll", 3, 1.0, _ROLL),
+        Channel("pitch", 2, 1.0, _PITCH),
+        Channel("yaw", 1, 1.0, _YAW_RATE),
+        Channel("climb", 0, 1.0, _CLIMB),
     ),
     "attitude": (
-        *(Channel("roll", 1, _DEG, _LEANS[0]), Channel("pitch", 2, -_DEG, _LEANS[1])),
-        Channel("yaw", 3, _DEG, _rate(2)),
+        Channel("roll", 1, _DEG, _ROLL),
+        Channel("pitch", 2, -_DEG, _PITCH),
+        Channel("yaw", 3, _DEG, _YAW_RATE),
     ),
     "rates": (
-        *(Channel("roll", 1, _DEG, _rate(0)), Channel("pitch", 2, -_DEG, _rate(1, -1.0))),
-        Channel("yaw", 3, _DEG, _rate(2)),
+        Channel("roll", 1, _DEG, _ROLL_RATE),
+        Channel("pitch", 2, -_DEG, _PITCH_RATE),
+        Channel("yaw", 3, _DEG, _YAW_RATE),
     ),
     "velocity": (
-        Channel("roll", 1, 1.0, _speed("right_mps")),
-        Channel("pitch", 0, 1.0, _speed("forward_mps")),
-        *(Channel("yaw", 3, _DEG, _rate(2)), Channel("climb", 2, -1.0, _CLIMB)),
+        Channel("roll", 1, 1.0, _RIGHT),
+        Channel("pitch", 0, 1.0, _FORWARD),
+        Channel("yaw", 3, _DEG, _YAW_RATE),
+        Channel("climb", 2, -1.0, _CLIMB),
     ),
 }
 """Axes pushed by the doublet of each kind of action."""
