@@ -1,11 +1,10 @@
 """A small and fast world model, flights to start from, and rollouts of both."""
 
-import queue
 import threading
-from collections.abc import Callable, Iterator
-from contextlib import closing
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
@@ -22,22 +21,14 @@ from mavbridge.commands.imagine.loop import (
     WorldModelDecider,
     rollout,
 )
-from mavbridge.commands.imagine.output import (
-    SCHEMA,
-    OnFrame,
-    StreamedOutput,
-    add_rows,
-    captured_ns,
-    ignore_frame,
-    writing,
-)
+from mavbridge.commands.imagine.output import SCHEMA, OnFrame, StreamedOutput, ignore_frame
 from mavbridge.core.clock import NS_PER_S, MonotonicClock
-from mavbridge.core.records import FloatArray, ImageArray, RolloutFrame
+from mavbridge.core.records import FloatArray, ImageArray
 from mavbridge.core.vehicle import Sticks
 from mavbridge.recording.flight_writer import FlightWriter
 from mavbridge.recording.meta import FlightMeta
-from mavbridge.recording.tables import TableWriter
-from mavbridge.recording.video.file import FragmentedMp4
+from mavbridge.recording.tables import read_table
+from mavbridge.recording.video.file import count_frames
 from policy.contract import Contract
 from policy.protocol import PolicyRunner
 from policy.world_model.config import WorldModelConfig
@@ -51,46 +42,6 @@ TINY = WorldModelConfig(
     dynamics_width=32,
     dynamics_depth=1,
 )
-
-
-class SerialOutput(StreamedOutput):
-    """Simple reference: all frames in a list, everything written at the end.
-
-    The loop must have decoded every frame.
-    """
-
-    def _open(self) -> None:
-        self._video, self._jobs = None, queue.Queue(1)  # nothing runs beside the loop
-        self._collected: list[tuple[RolloutFrame, ImageArray]] = []
-
-    @property
-    def writer_queue(self) -> int:
-        return len(self._collected)
-
-    def put(self, segment: Segment) -> None:
-        for frame in self._rows(segment):
-            rgb = segment.decoded[frame.frame]
-            self._collected.append((frame, rgb))
-            self._show(frame, rgb if self._decode_video else None)
-
-    def finish(self, on_wait: Callable[[], None] = lambda: None) -> None:
-        with self._sampler.meter.write, writing(self.out):
-            table = TableWriter(self.out, SCHEMA)
-            try:
-                add_rows(table, [frame for frame, _ in self._collected])
-                if self._decode_video:
-                    size, hz = self._sampler.config.image_size, 1 / self._frame_dt_s
-                    with closing(FragmentedMp4(self.out, height=size, width=size, hz=hz)) as video:
-                        for frame, rgb in self._collected:
-                            video.append(rgb, captured_ns(frame))
-                            on_wait()
-            except BaseException:
-                table.abandon()
-                raise
-            table.finish()
-
-    def close(self) -> None:
-        pass
 
 
 class TinyWorld(WorldModel):
@@ -159,12 +110,8 @@ def make_decider(name: str, sampler: Sampler) -> Decider:
     return WorldModelDecider(sampler, from_pixels="pixels" in name)
 
 
-def make_sampler(
-    model: WorldModel | None = None, *, serial: bool = False, steps: int = 1
-) -> Sampler:
-    return Sampler(
-        model or TinyWorld(), ddim_steps=steps, decode_all=serial, clock=MonotonicClock()
-    )
+def make_sampler(model: WorldModel | None = None, *, steps: int = 1) -> Sampler:
+    return Sampler(model or TinyWorld(), ddim_steps=steps, clock=MonotonicClock())
 
 
 @dataclass(frozen=True)
@@ -174,7 +121,7 @@ class Finished:
     sha256: str
     model: TinyWorld
     sampler: Sampler
-    output: StreamedOutput | SerialOutput
+    output: StreamedOutput
 
 
 def run(
@@ -182,15 +129,13 @@ def run(
     plan: RolloutPlan,
     *,
     decider: str = "world-model",
-    serial: bool = False,
     decode_video: bool = True,
     model: TinyWorld | None = None,
     on_frame: OnFrame = ignore_frame,
 ) -> Finished:
     model = model or TinyWorld()
-    sampler = make_sampler(model, serial=serial, steps=plan.ddim_steps)
-    kind = SerialOutput if serial else StreamedOutput
-    output = kind(out, sampler, plan, decode_video=decode_video, on_frame=on_frame)
+    sampler = make_sampler(model, steps=plan.ddim_steps)
+    output = StreamedOutput(out, sampler, plan, decode_video=decode_video, on_frame=on_frame)
     try:
         for segment in segments(sampler, plan, decider):
             output.put(segment)
@@ -199,6 +144,12 @@ def run(
         output.close()
         raise
     return Finished(output.sha256, model, sampler, output)
+
+
+def read_rows(out: Path) -> Any:
+    """Rows of a rollout, finished or cut off: as many as its video has frames."""
+    table = read_table(out, SCHEMA)
+    return table.slice(0, count_frames(out)) if out.exists() else table
 
 
 def segments(sampler: Sampler, plan: RolloutPlan, decider: str) -> Iterator[Segment]:

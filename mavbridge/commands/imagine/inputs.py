@@ -4,6 +4,7 @@ from collections import deque
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
+from typing import Literal, TypeAlias
 
 import numpy as np
 import torch
@@ -18,6 +19,8 @@ from mavbridge.recording.flight_folder import RecordedFlight
 from policy.preprocess import resize
 from policy.world_model.config import WorldModelConfig
 from policy.world_model.model import WorldModel
+
+Part: TypeAlias = Literal["sample", "decode", "write"]
 
 
 class ImaginationError(MavbridgeError):
@@ -35,36 +38,26 @@ def torch_threads(count: int) -> Iterator[None]:
         torch.set_num_threads(before)
 
 
-class Stopwatch:
-    """Adds up the time of its ``with`` blocks, which cannot be nested."""
-
-    def __init__(self, clock: Clock) -> None:
-        self._clock = clock
-        self._started_ns = 0
-        self.seconds = 0.0
-
-    def __enter__(self) -> None:
-        """Start counting."""
-        self._started_ns = self._clock.now_ns()
-
-    def __exit__(self, *_: object) -> None:
-        """Add the elapsed time."""
-        self.seconds += (self._clock.now_ns() - self._started_ns) / NS_PER_S
-
-
 class Meter:
     """Time that the loop's own thread spends in each part. Only that thread writes it."""
 
     def __init__(self, clock: Clock) -> None:
-        self.sample = Stopwatch(clock)
-        self.decode = Stopwatch(clock)
-        """Time for pixels: decoding in this thread, and waits for room in the decode queue."""
-        self.write = Stopwatch(clock)
-        """Time for the files: writing in this thread, or waits for the writer to finish."""
+        self._clock = clock
+        self.seconds: dict[Part, float] = {"sample": 0.0, "decode": 0.0, "write": 0.0}
+        """decode: for pixels, waits for room in the decode queue included; write: for the files."""
         self.frames_decoded = 0
 
+    @contextmanager
+    def timed(self, part: Part) -> Iterator[None]:
+        """Context manager: add the block's time."""
+        begun_ns = self._clock.now_ns()
+        try:
+            yield
+        finally:
+            self.seconds[part] += (self._clock.now_ns() - begun_ns) / NS_PER_S
 
-@dataclass(frozen=True, kw_only=True)
+
+@dataclass(frozen=True)
 class ImaginedSteps:
     """One sample of the world model."""
 
@@ -74,26 +67,18 @@ class ImaginedSteps:
     """[frames, 13]"""
     actions: FloatArray
     """[frames, 4]"""
-    pixels: NDArray[np.uint8] | None
-    """[frames, H, W, 3] if everything is decoded at once, or None."""
 
 
 class Sampler:
     """One world model in both roles, simulation and decision. Used by the loop's thread."""
 
-    def __init__(
-        self, model: WorldModel, *, ddim_steps: int, clock: Clock, decode_all: bool = False
-    ) -> None:
-        """Wrap a model that is already on its device.
-
-        ``decode_all`` decodes every sample's frames at once.
-        """
+    def __init__(self, model: WorldModel, *, ddim_steps: int, clock: Clock) -> None:
+        """Wrap a model that is already on its device."""
         self.model = model
         self.config: WorldModelConfig = model.config
         self.clock = clock
         self.meter = Meter(clock)
         self._ddim_steps = ddim_steps
-        self._decode_all = decode_all
         self._device = next(model.parameters()).device
 
     def encode(self, images: NDArray[np.uint8]) -> Tensor:
@@ -106,7 +91,7 @@ class Sampler:
 
         On one thread, like ``FrameDecoder``, because splitting a sum changes its rounding.
         """
-        with torch.inference_mode(), torch_threads(1), self.meter.decode:
+        with torch.inference_mode(), torch_threads(1), self.meter.timed("decode"):
             pixels: NDArray[np.uint8] = self.model.decode(latents).cpu().numpy()
         self.meter.frames_decoded += len(pixels)
         return pixels
@@ -122,7 +107,7 @@ class Sampler:
         Raises:
             ImaginationError: the result is not finite.
         """
-        with torch.inference_mode(), self.meter.sample:
+        with torch.inference_mode(), self.meter.timed("sample"):
             imagined = self.model.sample(
                 latents,
                 self._tensor(states),
@@ -137,12 +122,7 @@ class Sampler:
                 "the world model imagined NaN or infinity: its weights are damaged, or it has left "
                 "what it was trained on; try more --ddim-steps, or another checkpoint"
             )
-        return ImaginedSteps(
-            latents=imagined.latents[0],
-            states=sampled_states,
-            actions=sampled_actions,
-            pixels=self.decode(imagined.latents[0]) if self._decode_all else None,
-        )
+        return ImaginedSteps(imagined.latents[0], sampled_states, sampled_actions)
 
     def _tensor(self, values: FloatArray) -> Tensor:
         return torch.from_numpy(np.ascontiguousarray(values)).to(self._device)

@@ -10,7 +10,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from mavbridge.commands.imagine.inputs import ImaginedSteps, RolloutStart, Sampler
+from mavbridge.commands.imagine.inputs import RolloutStart, Sampler
 from mavbridge.core.clock import NS_PER_S
 from mavbridge.core.errors import UserError
 from mavbridge.core.records import FloatArray, ImageArray
@@ -240,9 +240,11 @@ def rollout(
             actions,
             seed=plan.stage_seed(iteration, NoiseStage.SIMULATE),
         )
-        decoded = {} if imagined.pixels is None else dict(enumerate(imagined.pixels))
+        decoded: dict[int, ImageArray] = {}
         if iteration + 1 < plan.iterations:
-            decoded |= _decode_needed(sampler, imagined, decider.images, plan.exe_steps)
+            if rows := range(plan.exe_steps)[-decider.images :] if decider.images else ():
+                pixels = sampler.decode(imagined.latents[rows[0] : plan.exe_steps])
+                decoded = dict(zip(rows, pixels, strict=True))
             for row in range(plan.exe_steps):
                 seen.push(imagined.latents[row], imagined.states[row], actions[row])
                 if row in decoded:
@@ -254,14 +256,3 @@ def rollout(
             actions=actions[: plan.frames],
             decoded={row: rgb for row, rgb in decoded.items() if row < plan.frames},
         )
-
-
-def _decode_needed(
-    sampler: Sampler, imagined: ImaginedSteps, images: int, exe_steps: int
-) -> dict[int, ImageArray]:
-    """Decode, in one call, the newest executed frames that fit into the decider's queue; by row."""
-    if images == 0 or imagined.pixels is not None:
-        return {}
-    rows = range(exe_steps)[-images:]
-    pixels = sampler.decode(imagined.latents[rows.start : rows.stop])
-    return dict(zip(rows, pixels, strict=True))

@@ -7,12 +7,12 @@ decodes, the writer process writes.
 import hashlib
 import queue
 from collections import deque
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
 from threading import Event
-from typing import Any, TypeAlias
+from typing import TypeAlias
 
 import numpy as np
 import pyarrow as pa
@@ -29,8 +29,8 @@ from mavbridge.core.records import ImageArray, RolloutFrame
 from mavbridge.core.workers import HungError, Worker
 from mavbridge.recording.folder import require_extra
 from mavbridge.recording.rows import FrameRow
-from mavbridge.recording.tables import TableWriter, read_table
-from mavbridge.recording.video.file import WRITE_ERRORS, count_frames
+from mavbridge.recording.tables import TableWriter
+from mavbridge.recording.video.file import WRITE_ERRORS
 from mavbridge.recording.video.writer import VideoWriter
 from policy.contract import ACTION_DIM, STATE_DIM
 from policy.world_model.model import WorldModel
@@ -74,18 +74,6 @@ def prepare_out(out: Path) -> None:
     require_writable(out, "--out")
 
 
-def read_rows(out: Path) -> Any:
-    """Return the rows of a rollout, finished or cut off: a ``pyarrow.Table`` of ``SCHEMA``.
-
-    A rollout without a video has only its rows.
-
-    Raises:
-        MavbridgeError: the table is missing or damaged.
-    """
-    table = read_table(out, SCHEMA)
-    return table.slice(0, count_frames(out)) if out.exists() else table
-
-
 @contextmanager
 def writing(path: Path) -> Iterator[None]:
     """Context manager: convert errors of writing a file to ``RolloutError``."""
@@ -94,18 +82,6 @@ def writing(path: Path) -> Iterator[None]:
     except WRITE_ERRORS as error:
         reason = getattr(error, "strerror", None) or str(error)
         raise RolloutError(f"{path} cannot be written: {reason}") from error
-
-
-def add_rows(table: TableWriter, frames: Sequence[RolloutFrame]) -> None:
-    """Write a row for each frame."""
-    for frame in frames:
-        table.add({name: getattr(frame, name) for name in SCHEMA.names})
-    table.flush()
-
-
-def captured_ns(frame: RolloutFrame) -> int:
-    """Return the time of a frame in the video, where frames are evenly spaced."""
-    return round(frame.number * frame.frame_dt_s * NS_PER_S)
 
 
 QUEUED_SEGMENTS = 2
@@ -201,27 +177,23 @@ class StreamedOutput:
         """Open the output at ``out``; without ``decode_video``, only the rows."""
         self.out = out
         self._plan = plan
-        self._decode_video = decode_video
         self._clock = sampler.clock
-        self._sampler = sampler
+        self._meter = sampler.meter
         self._frame_dt_s = sampler.config.frame_dt_s
         self._on_frame = on_frame
         self._digest = hashlib.sha256()
         self.frames = 0
         self.frames_decoded = 0
         """Frames decoded outside the loop's thread, whose own frames are in its meter."""
-        self._open()
-
-    def _open(self) -> None:
-        self._decoder = FrameDecoder(self._sampler.model)
+        self._decoder = FrameDecoder(sampler.model)
         self._jobs: queue.Queue[_DecodeJob | None] = queue.Queue(QUEUED_SEGMENTS)
-        self._table_path = self.out.with_suffix(".arrows")
-        self._video: VideoWriter | None = None
+        self._table_path = out.with_suffix(".arrows")
+        self.video: VideoWriter | None = None
         with writing(self._table_path):
-            self._table = TableWriter(self.out, SCHEMA)
-        if self._decode_video:
+            self._table = TableWriter(out, SCHEMA)
+        if decode_video:
             try:
-                self._video = VideoWriter(self.out, pressure="offline", hz=1 / self._frame_dt_s)
+                self.video = VideoWriter(out, pressure="offline", hz=1 / self._frame_dt_s)
             except BaseException:
                 self._table.abandon()
                 raise
@@ -241,23 +213,31 @@ class StreamedOutput:
     @property
     def writer_queue(self) -> int:
         """Number of frames waiting to be written."""
-        return 0 if self._video is None else self._video.lost
-
-    @property
-    def writer_pid(self) -> int | None:
-        """Process id of the writer; None if there is none."""
-        return None if self._video is None else self._video.pid
+        return 0 if self.video is None else self.video.lost
 
     def put(self, segment: Segment) -> None:
         """Queue a segment; wait while the queue is full."""
-        frames = self._rows(segment)
+        plan = self._plan
+        frames = [
+            RolloutFrame(
+                number=segment.iteration * plan.frames + row,
+                iteration=segment.iteration,
+                frame=row,
+                executed=row < plan.exe_steps,
+                step=segment.iteration * plan.exe_steps + row + 1,
+                frame_dt_s=self._frame_dt_s,
+                state=segment.states[row],
+                action=segment.actions[row],
+            )
+            for row in range(plan.frames)
+        ]
         missing = ready = None
-        if self._video is not None:
+        if self.video is not None:
             missing = segment.latents[[k for k in range(len(frames)) if k not in segment.decoded]]
             if missing.is_cuda:
                 ready = torch.cuda.current_stream(missing.device).record_event()
         job = _DecodeJob(frames=frames, decoded=segment.decoded, missing=missing, ready=ready)
-        with self._sampler.meter.decode:
+        with self._meter.timed("decode"):
             self._enqueue(job)
 
     def _enqueue(self, job: _DecodeJob | None, on_wait: Callable[[], None] = lambda: None) -> None:
@@ -285,16 +265,16 @@ class StreamedOutput:
 
     def finish(self, on_wait: Callable[[], None] = lambda: None) -> None:
         """Process the queue, close the files, and compare their lengths."""
-        with self._sampler.meter.decode:
+        with self._meter.timed("decode"):
             self._enqueue(None, on_wait)
             self._wait_until(lambda: self._worker.ends_within(_POLL_S), on_wait)
             self._worker.join(END_S)
-        with self._sampler.meter.write:
-            if self._video is not None:
-                self._video.finish()
-                if self._video.written != self._table.rows:
+        with self._meter.timed("write"):
+            if self.video is not None:
+                self.video.finish()
+                if self.video.written != self._table.rows:
                     raise RolloutError(
-                        f"{self._video.written} frames were written for {self._table.rows} rows"
+                        f"{self.video.written} frames were written for {self._table.rows} rows"
                     )
             with writing(self._table_path):
                 self._table.finish()
@@ -303,8 +283,8 @@ class StreamedOutput:
         """Stop the thread and the writer; the data written so far stays readable."""
         with suppress(BaseException):  # its exception led here
             self._worker.join(END_S)
-        if self._video is not None:
-            self._video.close()
+        if self.video is not None:
+            self.video.close()
         self._table.abandon()
 
     def _serve(self, stop: Event) -> None:
@@ -321,7 +301,9 @@ class StreamedOutput:
     def _write(self, job: _DecodeJob, stop: Event) -> None:
         # Rows first: after a crash, rows without a frame are possible, but no frame without a row.
         with writing(self._table_path):
-            add_rows(self._table, job.frames)
+            for frame in job.frames:
+                self._table.add({name: getattr(frame, name) for name in SCHEMA.names})
+            self._table.flush()
         images: Iterator[ImageArray] = iter(())
         if job.missing is not None:
             images = self._decoder.frames(job.missing, job.ready)
@@ -329,38 +311,17 @@ class StreamedOutput:
             if stop.is_set():
                 return
             rgb = None
-            if self._video is not None:
+            if self.video is not None:
                 rgb = job.decoded.get(frame.frame)
                 if rgb is None:
                     rgb = next(images)
                     self.frames_decoded += 1
+                # Frames of the video are evenly spaced.
+                captured_ns = round(frame.number * frame.frame_dt_s * NS_PER_S)
                 row = FrameRow(
-                    frame_id=frame.number,
-                    captured_ns=captured_ns(frame),
-                    ready_ns=self._clock.now_ns(),
+                    frame_id=frame.number, captured_ns=captured_ns, ready_ns=self._clock.now_ns()
                 )
-                self._video.submit(rgb, row)
-            self._show(frame, rgb)
-
-    def _rows(self, segment: Segment) -> list[RolloutFrame]:
-        plan = self._plan
-        return [
-            RolloutFrame(
-                number=segment.iteration * plan.frames + row,
-                iteration=segment.iteration,
-                frame=row,
-                executed=row < plan.exe_steps,
-                step=segment.iteration * plan.exe_steps + row + 1,
-                frame_dt_s=self._frame_dt_s,
-                state=segment.states[row],
-                action=segment.actions[row],
-            )
-            for row in range(plan.frames)
-        ]
-
-    def _show(self, frame: RolloutFrame, rgb: ImageArray | None) -> None:
-        """Count a decoded frame, and pass it to the observer."""
-        if rgb is not None:
-            self._digest.update(np.ascontiguousarray(rgb).data)
-        self._on_frame(frame, rgb)
-        self.frames += 1
+                self.video.submit(rgb, row)
+                self._digest.update(np.ascontiguousarray(rgb).data)
+            self._on_frame(frame, rgb)
+            self.frames += 1

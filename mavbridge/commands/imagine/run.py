@@ -168,14 +168,14 @@ def _make_decider(
 
 def _print_summary(config: ImagineConfig, sampler: Sampler, output: StreamedOutput) -> None:
     console = Console(highlight=False)
-    meter = sampler.meter
-    decoded = meter.frames_decoded + output.frames_decoded
+    seconds = sampler.meter.seconds
+    decoded = sampler.meter.frames_decoded + output.frames_decoded
     what = f"{config.out}: {output.frames} frames"
     if not config.decode_video:
         what = f"{config.out.with_suffix('.parquet')}: {output.frames} rows, no video"
     console.print(
-        f"{what}, {decoded} decoded; sampling {meter.sample.seconds:.2f} s, waiting for pixels "
-        f"{meter.decode.seconds:.2f} s, for the files {meter.write.seconds:.2f} s",
+        f"{what}, {decoded} decoded; sampling {seconds['sample']:.2f} s, waiting for pixels "
+        f"{seconds['decode']:.2f} s, for the files {seconds['write']:.2f} s",
         soft_wrap=True,
     )
     if config.decode_video:

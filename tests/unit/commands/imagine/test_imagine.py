@@ -10,11 +10,10 @@ import pytest
 from rerun.chunk import RrdReader
 
 from helpers.recordings import make_meta
-from helpers.rollouts import TINY, TinyWorld, write_flight
+from helpers.rollouts import TINY, TinyWorld, read_rows, write_flight
 from mavbridge.__main__ import main
 from mavbridge.commands.imagine import inputs, run
 from mavbridge.commands.imagine.inputs import Sampler
-from mavbridge.commands.imagine.output import read_rows
 from mavbridge.recording.video.file import count_frames
 from policy.checkpoints.world_model_file import save_world_model
 from policy.contract import Contract
@@ -136,7 +135,7 @@ def test_a_writer_that_dies_is_one_message_that_says_what_is_left(
 
     def start(*arguments: object, **named: object) -> object:
         made = start_output(*arguments, **named)  # type: ignore[arg-type]
-        os.kill(made.writer_pid, signal.SIGKILL)  # type: ignore[arg-type]
+        os.kill(made.video.pid, signal.SIGKILL)  # type: ignore[union-attr, arg-type]
         return made
 
     monkeypatch.setattr(run, "StreamedOutput", start)

@@ -6,8 +6,8 @@ import cv2
 import numpy as np
 import pytest
 
+from helpers.rollouts import read_rows
 from mavbridge.__main__ import main
-from mavbridge.commands.imagine.output import read_rows
 from mavbridge.commands.imagine.run import SHIPPED
 from mavbridge.recording.flight_folder import open_flight
 from mavbridge.recording.video.file import read_video

@@ -14,13 +14,12 @@ import torch
 from torch import Tensor
 
 from helpers.recordings import send_signal
-from helpers.rollouts import TinyWorld, make_plan, make_sampler
+from helpers.rollouts import TinyWorld, make_plan, make_sampler, read_rows
 from mavbridge.commands.imagine.loop import Segment
 from mavbridge.commands.imagine.output import (
     QUEUED_SEGMENTS,
     RolloutError,
     StreamedOutput,
-    read_rows,
 )
 from mavbridge.core.workers import HungError
 from mavbridge.recording.tables import TableWriter
@@ -52,8 +51,9 @@ def make_segment(iteration: int) -> Segment:
 
 
 def pid_of(made: StreamedOutput) -> int:
-    assert made.writer_pid is not None
-    return made.writer_pid
+    assert made.video is not None
+    assert made.video.pid is not None
+    return made.video.pid
 
 
 def require_whole(out: Path, at_least: int) -> None:
