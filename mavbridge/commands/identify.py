@@ -12,6 +12,7 @@ from mavbridge.commands.config import IdentifyConfig
 from mavbridge.commands.output import make_table, table_console
 from mavbridge.commands.step_response import (
     CHANNELS,
+    UNITS,
     Channel,
     ResponseRecording,
     Sides,
@@ -32,7 +33,13 @@ from policy.contract import Contract
 from policy.engines.runner import ExecutionSettings, make_numpy_runner
 from policy.protocol import PolicyRunner
 from policy.scripted import ScriptedPolicy
-from policy.scripted.controllers import Axis, DoubletStep, doublet_length_s, doublet_steps
+from policy.scripted.controllers import (
+    Axis,
+    DoubletStep,
+    doublet_length_s,
+    doublet_steps,
+)
+from policy.stick_loop import motion_of_sticks
 
 LEAST_R_SQUARED = 0.7
 EARLY_S, BEFORE_S, STILL_S, LONGEST_GAP_S, CLIMB_S = 0.12, 0.1, 1.0, 0.25, 20.0
@@ -75,22 +82,17 @@ class Identification:
     hover_thrust: float | None
 
 
-def trained_motion(contract: Contract, axis: Axis, amount: float) -> float:
+def trained_motion(contract: Contract, channel: Channel, amount: float) -> float:
     """Return the motion that a policy expects of an action held at ``amount``.
 
     ``amount`` is in shares of full stick if the actions are sticks, else the commanded motion.
     """
     if contract.action != "sticks":
         return amount
-    if axis == "climb":
-        full = contract.full_climb_mps if amount > 0.0 else contract.full_descent_mps
-        dead_zone = contract.throttle_dead_zone
-    elif axis == "yaw":
-        full, dead_zone = contract.full_yaw_rate_degps, contract.yaw_dead_zone
-    else:
-        full, dead_zone = contract.full_lean_deg, contract.lean_dead_zone
-    beyond = max(0.0, abs(amount) - dead_zone) / (1.0 - dead_zone)
-    return math.copysign(full * beyond, amount)
+    sticks = [0.0] * 4
+    sticks[channel.column] = amount
+    motion = motion_of_sticks(contract, *sticks)[channel.column]
+    return motion if channel.motion == "speed" else math.degrees(motion)
 
 
 def identify_pushes(
@@ -135,7 +137,7 @@ def _fit_push(
     up, down = float(inputs[within].max()), float(inputs[within].min())
     if up <= 0.0 or down >= 0.0:
         return "it was not pushed to both sides"
-    output_s, outputs = recording.outputs(channel.motion)
+    output_s, outputs = recording.outputs(channel)
     data = (input_s, inputs, output_s, outputs)
     up_gain, down_gain = (
         settled_gain(*data, at_s - EARLY_S, step.half_s) for at_s in (begin_s + step.half_s, end_s)
@@ -150,13 +152,13 @@ def _fit_push(
     gain_up, gain_down = response.gains
     return PushResult(
         axis=step.axis,
-        motion=channel.motion.name,
-        unit=channel.motion.unit,
+        motion=channel.motion,
+        unit=UNITS[channel.motion][0],
         action=(up, down),
         measured=(gain_up * up, gain_down * down),
         trained=(
-            trained_motion(contract, step.axis, up),
-            trained_motion(contract, step.axis, down),
+            trained_motion(contract, channel, up),
+            trained_motion(contract, channel, down),
         ),
         dead_time_s=response.dead_time_s,
         time_63_s=response.dead_time_s + response.lag_s,

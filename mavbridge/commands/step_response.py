@@ -4,7 +4,7 @@ import math
 from collections import deque
 from collections.abc import Callable
 from functools import partial
-from typing import NamedTuple
+from typing import Literal, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from mavbridge.core.clock import NS_PER_S
 from mavbridge.core.records import Event, Tick, VehicleState
 from mavbridge.core.vehicle import Action
-from policy.contract import RATE, ActionKind
+from policy.contract import RATE, ActionKind, FloatArray
 from policy.scripted.controllers import Axis, measure
 
 Array = NDArray[np.float64]
@@ -27,16 +27,13 @@ FINE_DEAD_S, FINE_LAG = np.arange(-0.02, 0.0201, 0.004), np.geomspace(0.85, 1.18
 OUTLIER_MADS, LEAST_SAMPLES = 6.0, 20
 SETTLED = 0.1
 """A push has settled if its last two eighths differ by at most this share of the whole."""
-
-
-class StepMotion(NamedTuple):
-    """Motion quantity of a state. + is right, forward, nose right, up."""
-
-    name: str
-    unit: str
-    stamp: str
-    """Field of a state with the measurement time in ns."""
-    read: Callable[[VehicleState], float]
+_DEG = math.degrees(1.0)
+UNITS = {
+    "lean": ("deg", "attitude_ns"),
+    "rate": ("deg/s", "rate_ns"),
+    "speed": ("m/s", "velocity_ns"),
+}
+"""Unit of each motion, and the field of a state with its measurement time."""
 
 
 class Channel(NamedTuple):
@@ -46,43 +43,30 @@ class Channel(NamedTuple):
     column: int
     scale: float
     """Factor from the number of the action to the motion's unit, or to shares of full stick."""
-    motion: StepMotion
+    motion: Literal["lean", "rate", "speed"]
+    read: Callable[[FloatArray], float]
+    """Returns the motion in a 13-D state: + is right, forward, nose right, up."""
 
 
-_DEG = math.degrees(1.0)
-_LEAN = partial(StepMotion, "lean", "deg", "attitude_ns")
-_ROLL = _LEAN(lambda state: _DEG * measure(state.values).roll_rad)
-_PITCH = _LEAN(lambda state: -_DEG * measure(state.values).pitch_rad)
-_RATE = partial(StepMotion, "rate", "deg/s", "rate_ns")
-_ROLL_RATE = _RATE(lambda state: _DEG * float(state.values[RATE][0]))
-_PITCH_RATE = _RATE(lambda state: -_DEG * float(state.values[RATE][1]))
-_YAW_RATE = _RATE(lambda state: _DEG * float(state.values[RATE][2]))
-_SPEED = partial(StepMotion, "speed", "m/s", "velocity_ns")
-_RIGHT = _SPEED(lambda state: measure(state.values).right_mps)
-_FORWARD = _SPEED(lambda state: measure(state.values).forward_mps)
-_CLIMB = _SPEED(lambda state: measure(state.values).climb_mps)
+_ROLL = partial(Channel, "roll", motion="lean", read=lambda values: _DEG * measure(values).roll_rad)
+_PITCH = partial(
+    Channel, "pitch", motion="lean", read=lambda values: -_DEG * measure(values).pitch_rad
+)
+_YAW = partial(Channel, "yaw", motion="rate", read=lambda values: _DEG * float(values[RATE][2]))
+_CLIMB = partial(Channel, "climb", motion="speed", read=lambda values: measure(values).climb_mps)
 CHANNELS: dict[ActionKind, tuple[Channel, ...]] = {
-    "sticks": (
-        Channel("roll", 3, 1.0, _ROLL),
-        Channel("pitch", 2, 1.0, _PITCH),
-        Channel("yaw", 1, 1.0, _YAW_RATE),
-        Channel("climb", 0, 1.0, _CLIMB),
-    ),
-    "attitude": (
-        Channel("roll", 1, _DEG, _ROLL),
-        Channel("pitch", 2, -_DEG, _PITCH),
-        Channel("yaw", 3, _DEG, _YAW_RATE),
-    ),
+    "sticks": (_ROLL(3, 1.0), _PITCH(2, 1.0), _YAW(1, 1.0), _CLIMB(0, 1.0)),
+    "attitude": (_ROLL(1, _DEG), _PITCH(2, -_DEG), _YAW(3, _DEG)),
     "rates": (
-        Channel("roll", 1, _DEG, _ROLL_RATE),
-        Channel("pitch", 2, -_DEG, _PITCH_RATE),
-        Channel("yaw", 3, _DEG, _YAW_RATE),
+        Channel("roll", 1, _DEG, "rate", lambda values: _DEG * float(values[RATE][0])),
+        Channel("pitch", 2, -_DEG, "rate", lambda values: -_DEG * float(values[RATE][1])),
+        _YAW(3, _DEG),
     ),
     "velocity": (
-        Channel("roll", 1, 1.0, _RIGHT),
-        Channel("pitch", 0, 1.0, _FORWARD),
-        Channel("yaw", 3, _DEG, _YAW_RATE),
-        Channel("climb", 2, -1.0, _CLIMB),
+        Channel("roll", 1, 1.0, "speed", lambda values: measure(values).right_mps),
+        Channel("pitch", 0, 1.0, "speed", lambda values: measure(values).forward_mps),
+        _YAW(3, _DEG),
+        _CLIMB(2, -1.0),
     ),
 }
 """Axes pushed by the doublet of each kind of action."""
@@ -110,10 +94,11 @@ class ResponseRecording:
         times = np.array([at_ns for at_ns, _ in self._sent], np.float64) / NS_PER_S
         return times, np.array([action[column] for _, action in self._sent], np.float64)
 
-    def outputs(self, motion: StepMotion) -> tuple[Array, Array]:
+    def outputs(self, channel: Channel) -> tuple[Array, Array]:
         """Return times in s and values of a motion, without repeated times."""
-        times = np.array([getattr(state, motion.stamp) for state in self._states], np.int64)
-        values = np.array([motion.read(state) for state in self._states], np.float64)
+        _, stamp = UNITS[channel.motion]
+        times = np.array([getattr(state, stamp) for state in self._states], np.int64)
+        values = np.array([channel.read(state.values) for state in self._states], np.float64)
         _, first = np.unique(times, return_index=True)
         return times[first].astype(np.float64) / NS_PER_S, values[first]
 
