@@ -146,20 +146,12 @@ MEASURED_NS = 5 * NS_PER_S
 """Shortest episode from which the bytes per second are measured."""
 
 
-def free_bytes(folder: Path) -> int:
-    """Return the bytes that an ordinary user can still write there; raise OSError if unknown."""
-    return disk_usage(folder).free
-
-
 class DiskWatch:
     """Room on the disk, in recording time at the data rate of the newest episode."""
 
-    def __init__(
-        self, folder: Path, *, reserve_bytes: float, free: Callable[[Path], int] = free_bytes
-    ) -> None:
+    def __init__(self, folder: Path, *, reserve_bytes: float) -> None:
         self._folder = folder
         self._reserve_bytes = reserve_bytes
-        self._free = free
         self._bytes_ps = FIRST_BYTES_PS
 
     def measure(self, episode: Path, duration_ns: int) -> None:
@@ -170,17 +162,14 @@ class DiskWatch:
 
     def left_s(self) -> float:
         """Return the recording time until only the reserve is left; raise OSError if unknown."""
-        return max(0.0, (self._free(self._folder) - self._reserve_bytes) / self._bytes_ps)
+        free_bytes = disk_usage(self._folder).free
+        return max(0.0, (free_bytes - self._reserve_bytes) / self._bytes_ps)
 
-    @property
-    def may_begin(self) -> bool:
-        """True if there is room for another episode; raise OSError if unknown."""
-        return self.left_s() >= LEAST_S
-
-    @property
-    def is_full(self) -> bool:
-        """True if only the reserve is left; raise OSError if unknown."""
-        return self.left_s() == 0.0
+    def missing(self) -> str | None:
+        """Return the room that another episode lacks, or None; raise OSError if unknown."""
+        if (left_s := self.left_s()) >= LEAST_S:
+            return None
+        return f"room on the disk for {left_s:.0f} of {LEAST_S:.0f} s above --disk-reserve"
 
 
 PREFIX = "episode-"
@@ -188,20 +177,24 @@ CLOSE_S = 60.0
 """Timeout for closing an episode; converting the tables of a long one to Parquet takes seconds."""
 
 
-class _Recording:
-    """The current episode. Ticks come from one thread, frames from another."""
+@dataclass(kw_only=True)
+class Episode:
+    """Current or past episode. Ticks come from one thread, frames from another."""
 
-    def __init__(
-        self, folder: Path, number: int, begin_ns: int, log: PacketPipe, recorder: Recorder
-    ) -> None:
-        self.folder = folder
-        self.number = number
-        self.begin_ns = begin_ns
-        self.log = log
-        self.recorder = recorder
-        self.mark: Mark | None = None
-        self._first_tick: int | None = None
-        self._first_frame: int | None = None
+    folder: Path
+    number: int
+    begin_ns: int
+    log: PacketPipe
+    recorder: Recorder
+    mark: Mark | None = None
+    _first_tick: int | None = None
+    _first_frame: int | None = None
+
+    @property
+    def meta(self) -> FlightMeta:
+        """Facts of the flight; the mark has the last word on its success."""
+        meta = self.recorder.meta
+        return meta if self.mark is None else replace(meta, success=self.mark == "good")
 
     def emit(self, event: Event) -> None:
         """Record events since the start of the episode, numbered from there."""
@@ -212,14 +205,6 @@ class _Recording:
         elif event.captured_ns >= self.begin_ns:
             self._first_frame = event.serial if self._first_frame is None else self._first_frame
             self.recorder.emit(replace(event, serial=event.serial - self._first_frame))
-
-
-class Finished(NamedTuple):
-    """Episode on disk."""
-
-    folder: Path
-    number: int
-    meta: FlightMeta
 
 
 class Episodes:
@@ -254,46 +239,21 @@ class Episodes:
         self._autopilot = autopilot
         self._wall_offset_ns = wall_offset_ns
         self._report = report
-        self._current: _Recording | None = None
-        self._last: Finished | None = None
+        self.current: Episode | None = None
+        self._last: Episode | None = None
         self._marks: dict[int, bool | None] = {}
         self._next = 1 + max(map(_number, out.glob(f"{PREFIX}*")), default=0)
 
     def emit(self, event: Event) -> None:
         """Record the event if an episode is in progress; a ``TickSink``."""
-        current = self._current
+        current = self.current
         if current is not None:
             current.emit(event)
 
     @property
-    def is_recording(self) -> bool:
-        """True if an episode is in progress."""
-        return self._current is not None
-
-    @property
     def number(self) -> int:
         """Number of the current episode, or of the next one."""
-        return self._next if self._current is None else self._current.number
-
-    @property
-    def folder(self) -> Path | None:
-        """Folder of the current episode."""
-        return None if self._current is None else self._current.folder
-
-    @property
-    def duration_ns(self) -> int:
-        """Length of the current episode."""
-        return 0 if self._current is None else self._clock.now_ns() - self._current.begin_ns
-
-    @property
-    def crash(self) -> str | None:
-        """How the vehicle has crashed in the current episode, or None."""
-        return None if self._current is None else self._current.recorder.crash
-
-    @property
-    def finished(self) -> int:
-        """Number of episodes recorded in this session."""
-        return len(self._marks)
+        return self._next if self.current is None else self.current.number
 
     @property
     def counts(self) -> Counter[bool | None]:
@@ -324,55 +284,55 @@ class Episodes:
         except OSError as error:
             raise UserError(f"{folder}: {error}") from error
         self._log_to(log)
-        self._current = _Recording(folder, self._next, begin_ns, log, recorder)
+        self.current = Episode(
+            folder=folder, number=self._next, begin_ns=begin_ns, log=log, recorder=recorder
+        )
         self._next += 1
 
     def end(self, reason: str) -> None:
         """End the current episode, mark it, and report its contents."""
-        current, self._current = self._current, None
-        if current is None:
+        episode, self.current = self.current, None
+        if episode is None:
             return
-        seconds = (self._clock.now_ns() - current.begin_ns) / NS_PER_S
+        seconds = (self._clock.now_ns() - episode.begin_ns) / NS_PER_S
         self._log_to(None)
-        current.log.close()
-        current.recorder.close(CLOSE_S)
-        self._last = Finished(current.folder, current.number, current.recorder.meta)
-        self._marks[current.number] = self._last.meta.success
-        if current.mark is not None:
-            self._write_mark(current.mark)
+        episode.log.close()
+        episode.recorder.close(CLOSE_S)
+        self._last = episode
+        self._keep_mark(episode)
         self._report(
-            f"episode {current.number}: {seconds:.1f} s, ended by {reason}, {self._verdict()}; "
-            f"{current.recorder.summary()}"
+            f"episode {episode.number}: {seconds:.1f} s, ended by {reason}, {_verdict(episode)}; "
+            f"{episode.recorder.summary()}"
         )
 
     def mark(self, mark: Mark) -> None:
         """Mark the current episode, or else the last one."""
-        if self._current is not None:
-            self._current.mark = mark
-            self._report(f"episode {self._current.number} will be marked as {mark}")
-        elif self._last is not None:
-            self._write_mark(mark)
-            self._report(f"episode {self._last.number}: {self._verdict()}")
-        else:
+        episode = self.current or self._last
+        if episode is None:
             self._report("there is no episode yet to mark")
-
-    def _write_mark(self, mark: Mark) -> None:
-        if self._last is None:
             return
-        meta = replace(self._last.meta, success=mark == "good")
-        self._last = self._last._replace(meta=meta)
-        self._marks[self._last.number] = meta.success
-        try:
-            write_meta(self._last.folder, meta)
-        except OSError as error:
-            self._report(f"episode {self._last.number} cannot be marked: {error}")
+        episode.mark = mark
+        if episode is self.current:
+            self._report(f"episode {episode.number} will be marked as {mark}")
+        else:
+            self._keep_mark(episode)
+            self._report(f"episode {episode.number}: {_verdict(episode)}")
 
-    def _verdict(self) -> str:
-        meta = self._last.meta if self._last is not None else None
-        if meta is None or (meta.success is None and meta.crash is None):
-            return "not marked (g good, b bad)"
-        word = "good" if meta.success else "bad"
-        return word if meta.crash is None else f"{word} (crashed: {meta.crash})"
+    def _keep_mark(self, episode: Episode) -> None:
+        self._marks[episode.number] = episode.meta.success
+        if episode.mark is not None:
+            try:
+                write_meta(episode.folder, episode.meta)
+            except OSError as error:
+                self._report(f"episode {episode.number} cannot be marked: {error}")
+
+
+def _verdict(episode: Episode) -> str:
+    success, crash = episode.meta.success, episode.meta.crash
+    if success is None and crash is None:
+        return "not marked (g good, b bad)"
+    word = "good" if success else "bad"
+    return word if crash is None else f"{word} (crashed: {crash})"
 
 
 def prepare_out(out: Path) -> None:

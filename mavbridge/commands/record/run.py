@@ -18,7 +18,6 @@ from mavbridge.commands.config import RecordConfig
 from mavbridge.commands.record.episodes import (
     KEYS,
     KEYS_HINT,
-    LEAST_S,
     DiskWatch,
     EpisodeControl,
     Episodes,
@@ -26,7 +25,7 @@ from mavbridge.commands.record.episodes import (
     Seen,
     prepare_out,
 )
-from mavbridge.commands.record.view import STICKS_FRESH_NS, PilotView, RecordScreen, Shown
+from mavbridge.commands.record.view import CONTRACT, STICKS_FRESH_NS, PilotView, RecordScreen, Shown
 from mavbridge.config.flight import FlyConfig, LinkConfig
 from mavbridge.config.rates import Rates
 from mavbridge.core.clock import NS_PER_S, Clock, MonotonicClock, period_ns, wall_offset_ns
@@ -39,7 +38,6 @@ from mavbridge.core.stopping import StopRequest, stop_on_signals
 from mavbridge.core.workers import Worker
 from mavbridge.flight.feature_cache import FeatureCache
 from mavbridge.flight.guard_process import GuardProcess
-from mavbridge.flight.history import SentHistory
 from mavbridge.flight.plan import plan_flight
 from mavbridge.flight.settings import guard_settings
 from mavbridge.flight.state import Freshness
@@ -52,7 +50,6 @@ from mavbridge.observe.output import flight_console
 from mavbridge.observe.viewer.flight import RerunView
 from mavbridge.observe.viewer.layout import ViewedFlight
 from mavbridge.recording.meta import FlightMeta
-from policy.contract import Contract
 
 STEP_S = 0.05
 MAX_KEYS = 64
@@ -65,9 +62,6 @@ GUARD_END_S = 5.0
 MAX_FROZEN_S = MAX_BLACK_S = 0.5
 """Time for which an image can be frozen or black before it is reported as a problem."""
 NOTHING = np.zeros((1, 1), np.float32)
-CONTRACT = Contract(feature_dim=1, arrays="numpy")
-"""Meaning of the recorded sticks: those of a policy with the default contract, to which the
-vehicle's own sticks are mapped."""
 
 
 def record(config: RecordConfig) -> int:
@@ -85,14 +79,9 @@ def record(config: RecordConfig) -> int:
     prepare_out(config.out)
     cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_SILENT)
     cv2.setNumThreads(1)
-    session: _Session | None = None
-    try:
-        with ExitStack() as stack:
-            session = _Session(config, clock, flight_console(), stack)
-            session.run(stack.enter_context(stop_on_signals()))
-    finally:
-        if session is not None:
-            session.screen.close(JOIN_S)
+    with ExitStack() as stack:
+        session = _Session(config, clock, flight_console(), stack)
+        session.run(stack.enter_context(stop_on_signals()))
     return 0
 
 
@@ -133,7 +122,8 @@ class _Session:
         self._disk_s, self._disk_due_ns = 0.0, 0
         self._told_missing: str | None = None
         """Why the last request for an episode was refused."""
-        self.screen = RecordScreen(console, rate_hz=config.rate, vision_hz=config.film.visual_rate)
+        self._screen = RecordScreen(console, rate_hz=config.rate, vision_hz=config.film.visual_rate)
+        stack.callback(self._screen.close, JOIN_S)
         viewer = self._open_viewer()
         self._guard = GuardProcess(listening_guard(config, clock), clock)
         stack.callback(self._guard.close)
@@ -146,14 +136,12 @@ class _Session:
             log_to=lambda log: self._view.log_to(log),
             autopilot=lambda: self._view.status.autopilot,
             wall_offset_ns=wall_offset_ns(clock),
-            report=self.screen.show_message,
+            report=self._screen.show_message,
         )
-        sink = FanOut((self.screen, self._episodes, *viewer))
+        sink = FanOut((self._screen, self._episodes, *viewer))
         flight = plan_flight(pilot_flight(config), CONTRACT, is_dual=True).guard
         self._view = PilotView(
-            history=SentHistory(length=CONTRACT.history_len, dt_s=CONTRACT.history_dt_s),
             sink=sink,
-            state_frame=CONTRACT.state_frame,
             freshness=Freshness(
                 attitude_ns=flight.freshness.state_ns, velocity_ns=flight.freshness.velocity_ns
             ),
@@ -224,14 +212,14 @@ class _Session:
     def run(self, stop: StopRequest) -> None:
         """Follow orders until one of them, a signal, a worker's death or the disk ends it."""
         vision = Worker("mavbridge-vision", self._vision.run)
-        listener = Worker("mavbridge-guard", self._listen)
+        listener = Worker("mavbridge-guard", lambda ended: self._guard.listen(ended, self._view))
         for worker in (vision, listener):
             self._stack.callback(worker.join, JOIN_S)
             worker.start()
         keyboard = Keyboard(self._keys.append, keys=KEYS)
         self._stack.callback(keyboard.stop, JOIN_S)
         has_keys = keyboard.start()
-        self.screen.start(hint=KEYS_HINT if has_keys else None)
+        self._screen.start(hint=KEYS_HINT if has_keys else None)
         reason = "a signal"
         try:
             while not stop.wait(STEP_S):
@@ -246,15 +234,12 @@ class _Session:
         finally:
             self._episodes.end(reason)
         counts, out = self._episodes.counts, self._config.out
-        self.screen.show_message(
-            f"{self._episodes.finished} episodes recorded in {out}: {counts[True]} good, "
+        self._screen.show_message(
+            f"{counts.total()} episodes recorded in {out}: {counts[True]} good, "
             f"{counts[False]} bad, {counts[None]} not marked"
         )
         self._guard.send(EndRequest(reason=because(Code.FINISHED, what="recording")))
         listener.ends_within(GUARD_END_S)
-
-    def _listen(self, stop: threading.Event) -> None:
-        self._guard.listen(stop, self._view)
 
     def _step(self) -> bool:
         """Update the episodes and the status line; return False when the session is over."""
@@ -263,54 +248,49 @@ class _Session:
             self._episodes.mark(orders.mark_before)
         self._follow(orders)
         self._look_at_disk()
-        counts, config = self._episodes.counts, self._config
-        self.screen.shown = Shown(
+        config, episode, counts = self._config, self._episodes.current, self._episodes.counts
+        self._screen.shown = Shown(
             number=self._episodes.number,
-            duration_ns=self._episodes.duration_ns if self._episodes.is_recording else None,
+            duration_ns=None if episode is None else self._clock.now_ns() - episode.begin_ns,
             counts=counts,
             disk_s=self._disk_s,
             stick_packets=self._view.stick_packets,
             sticks_ns=self._view.sticks_ns,
             problem=self._missing() or self._doubt(),
         )
-        is_enough = config.episodes is not None and self._episodes.finished >= config.episodes
+        is_enough = config.episodes is not None and counts.total() >= config.episodes
         return not (orders.quit or is_enough)
 
     def _seen(self) -> Seen:
-        keys = ""
-        while self._keys:
-            keys += self._keys.popleft()
+        keys = "".join(self._keys.popleft() for _ in range(len(self._keys)))
         status, channel = self._view.status, self._config.episode_channel
         has_channel = channel is not None and len(status.rc_channels_us) >= channel
         return Seen(
             now_ns=self._clock.now_ns(),
             armed=status.armed,
             switch_us=status.rc_channels_us[channel - 1] if channel and has_channel else 0,
-            is_recording=self._episodes.is_recording,
+            is_recording=self._episodes.current is not None,
             keys=keys,
         )
 
     def _follow(self, orders: Orders) -> None:
         if orders.end is not None:
             self._episodes.end(orders.end)
-        elif (crash := self._episodes.crash) is not None:
+        elif (episode := self._episodes.current) and (crash := episode.recorder.crash) is not None:
             self._episodes.end(f"a crash ({crash})")
         if orders.begin is None:
             self._told_missing = None
             return
-        missing = self._missing()
-        if missing is None and not self._disk.may_begin:
-            left_s = self._disk.left_s()
-            missing = f"room on the disk for {left_s:.0f} of {LEAST_S:.0f} s above --disk-reserve"
+        missing = self._missing() or self._disk.missing()
         told, self._told_missing = self._told_missing, missing
         if missing is not None:
             if missing != told:
-                self.screen.show_message(f"not recording: {missing}")
+                self._screen.show_message(f"not recording: {missing}")
             return
         self._episodes.begin()
         doubt = self._doubt()
         begun = f"episode {self._episodes.number} begins ({orders.begin})"
-        self.screen.show_message(begun if doubt is None else f"{begun}; {doubt}")
+        self._screen.show_message(begun if doubt is None else f"{begun}; {doubt}")
 
     def _missing(self) -> str | None:
         """Return the requirement of a demonstration that is missing, or None."""
@@ -320,8 +300,7 @@ class _Session:
             return "no attitude from the vehicle"
         if self._view.telemetry.velocity_ned_mps is None:
             return "no velocity from the vehicle: it has no position estimate"
-        is_silent = self._clock.now_ns() - self._view.sticks_ns > STICKS_FRESH_NS
-        if is_silent:
+        if self._clock.now_ns() - self._view.sticks_ns > STICKS_FRESH_NS:
             return "no sticks of a pilot: is the transmitter on?"
         if self._view.status.rc_sticks is None:
             return f"the pilot's sticks cannot be read ({self._view.reason})"
@@ -341,8 +320,8 @@ class _Session:
         if now_ns < self._disk_due_ns:
             return
         self._disk_due_ns = now_ns + DISK_NS
-        if (folder := self._episodes.folder) is not None:
-            self._disk.measure(folder, self._episodes.duration_ns)
+        if (episode := self._episodes.current) is not None:
+            self._disk.measure(episode.folder, now_ns - episode.begin_ns)
         self._disk_s = self._disk.left_s()
-        if self._episodes.is_recording and self._disk.is_full:
+        if self._disk_s == 0.0:
             self._episodes.end("the disk, which is full up to --disk-reserve")

@@ -11,44 +11,42 @@ from mavbridge.core.clock import NS_PER_MS, NS_PER_S
 from mavbridge.core.ports import TickSink
 from mavbridge.core.reasons import Code, because
 from mavbridge.core.records import Event, Tick
-from mavbridge.core.vehicle import Packet, Sticks
+from mavbridge.core.vehicle import ForwardedPacket, Packet, Sticks
 from mavbridge.flight.history import SentHistory
-from mavbridge.flight.state import Freshness, StateFrame
+from mavbridge.flight.state import Freshness
 from mavbridge.flight.telemetry_cache import TelemetryCache
 from mavbridge.guard.channel import SocketPort
-from mavbridge.guard.wire import FromGuard, Packets
 from mavbridge.mavlink.codec.frames import split_frames
 from mavbridge.mavlink.session.streams import message_id
 from mavbridge.mavlink.transport.packet_pipe import PacketPipe
 from mavbridge.observe.report_table import rate_style, shown_rate
 from mavbridge.observe.terminal import FlightScreen, RateMeter
+from policy.contract import Contract
 
 STICK_IDS = {"ardupilot": message_id("RC_CHANNELS"), "px4": message_id("MANUAL_CONTROL")}
 """Message with the pilot's sticks, by the first word of the autopilot's name."""
 STICKS_FRESH_NS = 500 * NS_PER_MS
 """Older sticks do not count as the pilot's: PX4 goes silent when its receiver does."""
 PILOTS = because(Code.PILOT_FLIES)
+CONTRACT = Contract(feature_dim=1, arrays="numpy")
+"""Meaning of the recorded sticks: those of a policy with the default contract, to which the
+vehicle's own sticks are mapped."""
 
 
 class PilotView(TelemetryCache):
-    """``TelemetryCache`` that also logs the vehicle's packets and counts those with sticks."""
+    """``TelemetryCache`` that passes its ticks on as the pilot's, logs the vehicle's packets, and
+    counts those with sticks."""
 
-    def __init__(
-        self,
-        *,
-        history: SentHistory,
-        sink: TickSink,
-        state_frame: StateFrame,
-        freshness: Freshness,
-        samples: SocketPort,
-    ) -> None:
+    def __init__(self, *, sink: TickSink, freshness: Freshness, samples: SocketPort) -> None:
         super().__init__(
-            history=history,
-            sink=PilotTicks(self, sink),
-            state_frame=state_frame,
+            history=SentHistory(length=CONTRACT.history_len, dt_s=CONTRACT.history_dt_s),
+            sink=self,
+            state_frame=CONTRACT.state_frame,
             freshness=freshness,
             samples=samples,
+            watch_packets=self._watch,
         )
+        self._pilot_sink = sink
         self._log: PacketPipe | None = None
         self._log_lock = threading.Lock()
         self.sticks_ns = 0
@@ -60,14 +58,10 @@ class PilotView(TelemetryCache):
         with self._log_lock:
             self._log = log
 
-    def receive(self, message: FromGuard) -> None:
-        """Handle one message of the guard."""
-        super().receive(message)
-        if not isinstance(message, Packets):
-            return
+    def _watch(self, packets: tuple[ForwardedPacket, ...]) -> None:
         stick_id = STICK_IDS.get(self.status.autopilot.partition(" ")[0])
         with self._log_lock:
-            for packet in message.packets:
+            for packet in packets:
                 if self._log is not None:
                     self._log.put(Packet(packet.arrived_ns, packet.data))
                 frames, _ = split_frames(packet.data)
@@ -75,25 +69,17 @@ class PilotView(TelemetryCache):
                     self.sticks_ns = packet.arrived_ns
                     self.stick_packets += 1
 
-
-class PilotTicks:
-    """``TickSink`` that marks the ticks as flown by the pilot, since no policy flies."""
-
-    def __init__(self, view: PilotView, sink: TickSink) -> None:
-        self._view = view
-        self._sink = sink
-
     def emit(self, event: Event) -> None:
-        """Pass the event on, without stale sticks."""
+        """Pass a tick on as flown by the pilot, since no policy flies, and without stale sticks."""
         if isinstance(event, Tick):
-            is_fresh = event.woke_ns - self._view.sticks_ns <= STICKS_FRESH_NS
+            is_fresh = event.woke_ns - self.sticks_ns <= STICKS_FRESH_NS
             event = replace(
                 event,
                 rc_sticks=event.rc_sticks if is_fresh else None,
                 release_reason=PILOTS,
                 phase="released",
             )
-        self._sink.emit(event)
+        self._pilot_sink.emit(event)
 
 
 LOW_MINUTES = 10.0

@@ -82,7 +82,7 @@ def test_each_episode_is_a_flight_of_its_own_without_drops(stand: Stand) -> None
         assert flight.meta.success is None
         assert (flight.folder / "link.tlog").read_bytes().endswith(PACKET)
     assert [row.tick.index for row in stand.flight(2).tick_rows()] == [40, 41, 42]
-    assert stand.episodes.finished == 2
+    assert stand.episodes.counts.total() == 2
     assert stand.log is None, "no packet goes into the log of an episode that has ended"
 
 

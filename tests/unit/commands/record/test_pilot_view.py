@@ -12,7 +12,6 @@ from mavbridge.core.clock import NS_PER_MS
 from mavbridge.core.reasons import Code, because
 from mavbridge.core.records import Tick
 from mavbridge.core.vehicle import ForwardedPacket, Sticks
-from mavbridge.flight.history import SentHistory
 from mavbridge.flight.state import Freshness
 from mavbridge.guard.channel import SocketPort, channel_pair
 from mavbridge.guard.wire import GuardMessage, GuardStatus, Packets
@@ -52,13 +51,7 @@ class Viewed:
 def viewed() -> Iterator[Viewed]:
     sink = ListSink()
     ours, guards = map(SocketPort, channel_pair())
-    view = PilotView(
-        history=SentHistory(length=2, dt_s=0.01),
-        sink=sink,
-        state_frame="ned_frd",
-        freshness=Freshness(attitude_ns=1, velocity_ns=1),
-        samples=ours,
-    )
+    view = PilotView(sink=sink, freshness=Freshness(attitude_ns=1, velocity_ns=1), samples=ours)
     yield Viewed(sink, view, WireEnd(), guards)
     ours.close()
     guards.close()
