@@ -13,6 +13,7 @@ from mavbridge.commands.inspect.moments import (
     DelayEvent,
     Moment,
     find_delays,
+    is_gap,
     worst_moments,
 )
 from mavbridge.commands.inspect.series import (
@@ -20,7 +21,6 @@ from mavbridge.commands.inspect.series import (
     TickSeries,
     Track,
     course_gates,
-    is_gap,
     make_series,
     read_track,
 )
@@ -163,7 +163,7 @@ def analyse(folder: Path, *, gates: Path | None = None) -> FlightAnalysis:
     ticks = [row.tick for row in flight.tick_rows()]
     frames = list(flight.frame_rows())
     damage = list(flight.damage)
-    series = make_series(flight, ticks)
+    series = make_series(flight)
     stick_hz = _stick_hz(ticks, flight.meta)
     delays = find_delays(
         ticks,

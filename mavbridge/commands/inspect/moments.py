@@ -8,7 +8,6 @@ from typing import Literal, NamedTuple, TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
-from mavbridge.commands.inspect.series import is_gap
 from mavbridge.core.clock import NS_PER_MS, NS_PER_S
 from mavbridge.core.reasons import Code, Kind
 from mavbridge.core.records import Tick
@@ -68,6 +67,11 @@ class _Solve(NamedTuple):
     started_ns: int
     computed_ns: int
     attitude_ns: int | None
+
+
+def is_gap(last: Tick, tick: Tick) -> bool:
+    """True if the recording lacks ticks between these two neighbours."""
+    return tick.serial != last.serial + 1
 
 
 def find_delays(

@@ -1,18 +1,20 @@
 """Ticks and path of a recorded flight as arrays, and the gates along it, for figures and plots."""
 
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Literal, TypeAlias
+from typing import TypeAlias
 
 import numpy as np
+import pyarrow as pa
+import pyarrow.compute as pc
 from numpy.typing import NDArray
 
 from mavbridge.core.clock import NS_PER_MS, NS_PER_S
 from mavbridge.core.course import CourseGate
-from mavbridge.core.records import Position, Tick
+from mavbridge.core.records import Position
+from mavbridge.core.vehicle import ACTION_CLASSES
 from mavbridge.recording.flight_folder import RecordedFlight
 from mavbridge.recording.rows import FrameRow
-from policy.contract import STATE_DIM
 from policy.rotation import conjugate, multiply
 
 FloatColumn: TypeAlias = NDArray[np.float64]
@@ -56,17 +58,19 @@ class TickSeries:
     """[N, 3] from the estimator's origin."""
 
 
-def is_gap(last: Tick, tick: Tick) -> bool:
-    """True if the recording lacks ticks between these two neighbours."""
-    return tick.serial != last.serial + 1
-
-
-def make_series(flight: RecordedFlight, ticks: Sequence[Tick]) -> TickSeries:
+def make_series(flight: RecordedFlight) -> TickSeries:
     """Convert the ticks of a flight to arrays."""
-    start_ns = ticks[0].woke_ns if ticks else flight.meta.start_ns
-    woke_ns = np.array([tick.woke_ns for tick in ticks], np.int64)
-    contract = flight.meta.contract
-    state = _rows(ticks, STATE_DIM, lambda tick: None if tick.state is None else tick.state.values)
+    ticks, contract = flight.ticks, flight.meta.contract
+    woke_ns = ticks["woke_ns"].to_numpy()
+    start_ns = int(woke_ns[0]) if len(woke_ns) else flight.meta.start_ns
+    is_flown = ticks["raw"].is_valid()
+    is_slot = pc.and_(is_flown, pc.fill_null(ticks["is_slot"], False))
+
+    def flown_ms(later: str, earlier: str, where: pa.ChunkedArray = is_flown) -> FloatColumn:
+        lasted_ns = pc.subtract(ticks[later], ticks[earlier])
+        return np.asarray(pc.if_else(where, lasted_ns, None), np.float64) / NS_PER_MS
+
+    state = _vectors(ticks["state"])
     velocity, attitude, rate = state[:, 0:3], state[:, 3:7], state[:, 7:10]
     if contract is not None and contract.state_frame == "enu_flu":
         velocity = velocity[:, (1, 0, 2)] * (1, 1, -1)
@@ -74,60 +78,46 @@ def make_series(flight: RecordedFlight, ticks: Sequence[Tick]) -> TickSeries:
         to_ned, to_flu = conjugate(_ENU_FROM_NED), conjugate(_FRD_FROM_FLU)
         left = np.broadcast_to(to_ned, attitude.shape)
         attitude = multiply(multiply(left, attitude), np.broadcast_to(to_flu, attitude.shape))
-    names = next((t.sent._fields for t in ticks if t.sent is not None), None)
     return TickSeries(
         start_ns=start_ns,
         t_s=(woke_ns - start_ns) / NS_PER_S,
-        action_names=names or ("throttle", "yaw", "pitch", "roll"),
-        raw=_rows(ticks, 4, lambda tick: None if tick.trace is None else tick.trace.raw),
-        smoothed=_rows(ticks, 4, lambda tick: None if tick.trace is None else tick.trace.smoothed),
-        sent=_rows(ticks, 4, lambda tick: tick.sent),
-        echo=_rows(ticks, 4, lambda tick: tick.rc_sticks),
-        feature_age_ms=_flown_ms(ticks, _feature_age_ns),
-        state_age_ms=_flown_ms(
-            ticks, lambda t: None if t.state is None else t.sent_ns - t.state.attitude_ns
-        ),
-        lateness_ms=_flown_ms(ticks, lambda t: max(0, t.sent_ns - t.due_ns) if t.is_slot else None),
-        period_ms=_periods_ms(ticks),
+        action_names=ACTION_CLASSES["sticks" if contract is None else contract.action]._fields,
+        raw=_vectors(ticks["raw"]),
+        smoothed=_vectors(ticks["smoothed"]),
+        sent=_vectors(ticks["sent"]),
+        echo=_vectors(ticks["rc_sticks"]),
+        feature_age_ms=flown_ms("sent_ns", "feature_captured_ns"),
+        state_age_ms=flown_ms("sent_ns", "attitude_ns"),
+        lateness_ms=np.maximum(flown_ms("sent_ns", "due_ns", is_slot), 0.0),
+        period_ms=_periods_ms(ticks, is_flown.to_numpy(), is_slot.to_numpy()),
         velocity_ned_mps=velocity,
         roll_pitch_yaw_deg=_euler_deg(attitude),
         rate_frd_dps=np.degrees(rate),
-        position_ned_m=_rows(ticks, 3, lambda tick: tick.position_ned_m),
+        position_ned_m=_vectors(ticks["position_ned_m"]),
     )
 
 
-def _rows(
-    ticks: Sequence[Tick], width: int, value: Callable[[Tick], Iterable[float] | None]
-) -> FloatColumn:
-    rows = np.full((len(ticks), width), np.nan)
-    for row, tick in zip(rows, ticks, strict=True):
-        if (found := value(tick)) is not None:
-            row[:] = tuple(found)
+def _vectors(column: pa.ChunkedArray) -> FloatColumn:
+    """Return a column of vectors as rows [N, D], NaN for null."""
+    rows = np.full((len(column), column.type.list_size), np.nan)
+    rows[column.is_valid().to_numpy()] = (
+        column.combine_chunks().flatten().to_numpy().reshape(-1, column.type.list_size)
+    )
     return rows
 
 
-def _flown_ms(ticks: Sequence[Tick], value_ns: Callable[[Tick], int | None]) -> FloatColumn:
-    values_ns = [None if tick.trace is None else value_ns(tick) for tick in ticks]
-    return np.array(values_ns, np.float64) / NS_PER_MS
-
-
-def _feature_age_ns(tick: Tick) -> int | None:
-    captured_ns = tick.feature_captured_ns
-    return None if captured_ns is None else tick.sent_ns - captured_ns
-
-
-def _periods_ms(ticks: Sequence[Tick]) -> FloatColumn:
+def _periods_ms(
+    ticks: pa.Table, is_flown: NDArray[np.bool_], is_slot: NDArray[np.bool_]
+) -> FloatColumn:
     """Return times between the sends of consecutive flown slots without lost ticks."""
-    periods_ns = np.full(len(ticks), np.nan)
-    last_ns: int | None = None
-    for index, tick in enumerate(ticks):
-        if tick.trace is None or (index and is_gap(ticks[index - 1], tick)):
-            last_ns = None
-        if tick.trace is not None and tick.is_slot:
-            if last_ns is not None:
-                periods_ns[index] = tick.sent_ns - last_ns
-            last_ns = tick.sent_ns
-    return periods_ns / NS_PER_MS
+    sent_ns, periods_ms = ticks["sent_ns"].to_numpy(), np.full(len(ticks), np.nan)
+    breaks = np.cumsum(~is_flown | (ticks["dropped_before"].to_numpy() > 0))
+    slots = np.flatnonzero(is_slot)
+    slots, before = slots[1:], slots[:-1]
+    is_whole = breaks[slots] == breaks[before]
+    slots, before = slots[is_whole], before[is_whole]
+    periods_ms[slots] = (sent_ns[slots] - sent_ns[before]) / NS_PER_MS
+    return periods_ms
 
 
 def _euler_deg(ned_from_frd_wxyz: FloatColumn) -> FloatColumn:
@@ -148,7 +138,6 @@ class Track:
     """[M] seconds since the first tick."""
     position_ned_m: FloatColumn
     """[M, 3] from the estimator's origin."""
-    source: Literal["estimator", "simulator"]
 
     @property
     def length_m(self) -> float:
@@ -178,9 +167,9 @@ def read_track(series: TickSeries, frames: Sequence[FrameRow]) -> Track | None:
     ]
     if rows:
         times, positions = zip(*rows, strict=True)
-        return Track(t_s=np.array(times), position_ned_m=np.array(positions), source="simulator")
+        return Track(t_s=np.array(times), position_ned_m=np.array(positions))
     known = np.isfinite(series.position_ned_m[:, 0])
     if known.any():
         position = series.position_ned_m[known]
-        return Track(t_s=series.t_s[known], position_ned_m=position, source="estimator")
+        return Track(t_s=series.t_s[known], position_ned_m=position)
     return None
