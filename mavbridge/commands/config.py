@@ -160,6 +160,11 @@ class ImagineConfig:
         check_range("frames", self.frames, 1, 256, "")
         check_range("exe-steps", self.exe_steps, 1, 256, "")
         check_range("ddim-steps", self.ddim_steps, 1, 1000, "")
+        if self.frames is not None and self.exe_steps > self.frames:
+            raise UserError(
+                f"--exe-steps {self.exe_steps} is more than --frames {self.frames}: only frames "
+                "that are imagined can be gone through; lower the one or raise the other"
+            )
 
 
 @Parameter(name="*", group=OUTPUT)

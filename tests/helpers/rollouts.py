@@ -97,7 +97,7 @@ def make_start(config: WorldModelConfig = TINY) -> RolloutStart:
 
 
 def make_plan(**changes: int) -> RolloutPlan:
-    plan = RolloutPlan(iterations=3, frames=16, exe_steps=1, ddim_steps=1, seed=7)
+    plan = RolloutPlan(iterations=3, frames=16, exe_steps=1, seed=7)
     return replace(plan, **changes)
 
 
@@ -110,8 +110,8 @@ def make_decider(name: str, sampler: Sampler) -> Decider:
     return WorldModelDecider(sampler, from_pixels="pixels" in name)
 
 
-def make_sampler(model: WorldModel | None = None, *, steps: int = 1) -> Sampler:
-    return Sampler(model or TinyWorld(), ddim_steps=steps, clock=MonotonicClock())
+def make_sampler(model: WorldModel | None = None) -> Sampler:
+    return Sampler(model or TinyWorld(), ddim_steps=1, clock=MonotonicClock())
 
 
 @dataclass(frozen=True)
@@ -134,7 +134,7 @@ def run(
     on_frame: OnFrame = ignore_frame,
 ) -> Finished:
     model = model or TinyWorld()
-    sampler = make_sampler(model, steps=plan.ddim_steps)
+    sampler = make_sampler(model)
     output = StreamedOutput(out, sampler, plan, decode_video=decode_video, on_frame=on_frame)
     try:
         for segment in segments(sampler, plan, decider):

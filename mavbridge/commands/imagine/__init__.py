@@ -8,6 +8,5 @@
                            rollout.parquet
 
 ``loop.rollout`` is the loop and does not use files. ``StreamedOutput`` writes its segments as they
-come; the tests' ``SerialOutput`` writes bit-identical frames at the end. Only the files grow with
-the number of iterations.
+come. Only the files grow with the number of iterations.
 """

@@ -38,37 +38,6 @@ def torch_threads(count: int) -> Iterator[None]:
         torch.set_num_threads(before)
 
 
-class Meter:
-    """Time that the loop's own thread spends in each part. Only that thread writes it."""
-
-    def __init__(self, clock: Clock) -> None:
-        self._clock = clock
-        self.seconds: dict[Part, float] = {"sample": 0.0, "decode": 0.0, "write": 0.0}
-        """decode: for pixels, waits for room in the decode queue included; write: for the files."""
-        self.frames_decoded = 0
-
-    @contextmanager
-    def timed(self, part: Part) -> Iterator[None]:
-        """Context manager: add the block's time."""
-        begun_ns = self._clock.now_ns()
-        try:
-            yield
-        finally:
-            self.seconds[part] += (self._clock.now_ns() - begun_ns) / NS_PER_S
-
-
-@dataclass(frozen=True)
-class ImaginedSteps:
-    """One sample of the world model."""
-
-    latents: Tensor
-    """[frames, C, h, w], on the model's device."""
-    states: FloatArray
-    """[frames, 13]"""
-    actions: FloatArray
-    """[frames, 4]"""
-
-
 class Sampler:
     """One world model in both roles, simulation and decision. Used by the loop's thread."""
 
@@ -77,9 +46,20 @@ class Sampler:
         self.model = model
         self.config: WorldModelConfig = model.config
         self.clock = clock
-        self.meter = Meter(clock)
+        self.seconds: dict[Part, float] = {"sample": 0.0, "decode": 0.0, "write": 0.0}
+        """Time of the loop's thread; decode: waits for room in the decoder's queue included."""
+        self.frames_decoded = 0
         self._ddim_steps = ddim_steps
         self._device = next(model.parameters()).device
+
+    @contextmanager
+    def timed(self, part: Part) -> Iterator[None]:
+        """Context manager: add the block's time."""
+        begun_ns = self.clock.now_ns()
+        try:
+            yield
+        finally:
+            self.seconds[part] += (self.clock.now_ns() - begun_ns) / NS_PER_S
 
     def encode(self, images: NDArray[np.uint8]) -> Tensor:
         """Encode images [N, H, W, 3] to latents [N, C, h, w]."""
@@ -91,15 +71,17 @@ class Sampler:
 
         On one thread, like ``FrameDecoder``, because splitting a sum changes its rounding.
         """
-        with torch.inference_mode(), torch_threads(1), self.meter.timed("decode"):
+        with torch.inference_mode(), torch_threads(1), self.timed("decode"):
             pixels: NDArray[np.uint8] = self.model.decode(latents).cpu().numpy()
-        self.meter.frames_decoded += len(pixels)
+        self.frames_decoded += len(pixels)
         return pixels
 
     def sample(
         self, latents: Tensor, states: FloatArray, actions: FloatArray | None, *, seed: int
-    ) -> ImaginedSteps:
+    ) -> tuple[Tensor, FloatArray, FloatArray]:
         """Simulate the actions [frames, 4], or sample actions if they are None.
+
+        Return latents [frames, C, h, w], on the model's device, states [frames, 13] and actions.
 
         Latents are [1, context_frames, C, h, w], states [1, context_frames, 13]; ``seed`` is that
         of the noise.
@@ -107,7 +89,7 @@ class Sampler:
         Raises:
             ImaginationError: the result is not finite.
         """
-        with torch.inference_mode(), self.meter.timed("sample"):
+        with torch.inference_mode(), self.timed("sample"):
             imagined = self.model.sample(
                 latents,
                 self._tensor(states),
@@ -122,7 +104,7 @@ class Sampler:
                 "the world model imagined NaN or infinity: its weights are damaged, or it has left "
                 "what it was trained on; try more --ddim-steps, or another checkpoint"
             )
-        return ImaginedSteps(imagined.latents[0], sampled_states, sampled_actions)
+        return imagined.latents[0], sampled_states, sampled_actions
 
     def _tensor(self, values: FloatArray) -> Tensor:
         return torch.from_numpy(np.ascontiguousarray(values)).to(self._device)

@@ -154,7 +154,8 @@ class WorldModelDecider:
             latents = self._sampler.encode(np.stack(seen.images))[None]
         else:
             latents = seen.latents()
-        return self._sampler.sample(latents, seen.states(), None, seed=seed).actions
+        _, _, actions = self._sampler.sample(latents, seen.states(), None, seed=seed)
+        return actions
 
 
 class NoiseStage(IntEnum):
@@ -164,39 +165,21 @@ class NoiseStage(IntEnum):
     SIMULATE = 1
 
 
-def noise_seed(*numbers: int) -> int:
-    """Return the seed of one sample, independent of those of all other numbers."""
-    sequence = np.random.SeedSequence(numbers)
-    return int(sequence.generate_state(1, np.uint64)[0]) & MAX_SEED
-
-
 @dataclass(frozen=True, kw_only=True)
 class RolloutPlan:
-    """Settings of one rollout.
-
-    Raises:
-        UserError: more steps are executed than are imagined.
-    """
+    """Settings of one rollout."""
 
     iterations: int
     frames: int
     """Number of imagined frames that are shown in each iteration, from the first on."""
     exe_steps: int
     """Number of actions executed before the next decision."""
-    ddim_steps: int
     seed: int
-
-    def __post_init__(self) -> None:
-        """Raise UserError if no iteration can satisfy the plan."""
-        if self.exe_steps > self.frames:
-            raise UserError(
-                f"--exe-steps {self.exe_steps} is more than --frames {self.frames}: only frames "
-                "that are imagined can be gone through; lower the one or raise the other"
-            )
 
     def stage_seed(self, iteration: int, stage: NoiseStage) -> int:
         """Return the seed of one stage of one iteration, independent of all others."""
-        return noise_seed(self.seed, iteration, int(stage))
+        sequence = np.random.SeedSequence((self.seed, iteration, int(stage)))
+        return int(sequence.generate_state(1, np.uint64)[0]) & MAX_SEED
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -234,25 +217,21 @@ def rollout(
     )
     for iteration in range(plan.iterations):
         actions = decider.decide(seen, plan.stage_seed(iteration, NoiseStage.DECIDE))
-        imagined = sampler.sample(
-            seen.latents(),
-            seen.states(),
-            actions,
-            seed=plan.stage_seed(iteration, NoiseStage.SIMULATE),
-        )
+        seed = plan.stage_seed(iteration, NoiseStage.SIMULATE)
+        latents, states, _ = sampler.sample(seen.latents(), seen.states(), actions, seed=seed)
         decoded: dict[int, ImageArray] = {}
         if iteration + 1 < plan.iterations:
             if rows := range(plan.exe_steps)[-decider.images :] if decider.images else ():
-                pixels = sampler.decode(imagined.latents[rows[0] : plan.exe_steps])
+                pixels = sampler.decode(latents[rows[0] : plan.exe_steps])
                 decoded = dict(zip(rows, pixels, strict=True))
             for row in range(plan.exe_steps):
-                seen.push(imagined.latents[row], imagined.states[row], actions[row])
+                seen.push(latents[row], states[row], actions[row])
                 if row in decoded:
                     seen.images.append(decoded[row])
         yield Segment(
             iteration=iteration,
-            latents=imagined.latents[: plan.frames],
-            states=imagined.states[: plan.frames],
+            latents=latents[: plan.frames],
+            states=states[: plan.frames],
             actions=actions[: plan.frames],
             decoded={row: rgb for row, rgb in decoded.items() if row < plan.frames},
         )

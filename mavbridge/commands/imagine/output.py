@@ -6,9 +6,8 @@ decodes, the writer process writes.
 
 import hashlib
 import queue
-from collections import deque
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager, nullcontext, suppress
 from dataclasses import dataclass
 from pathlib import Path
 from threading import Event
@@ -17,7 +16,6 @@ from typing import TypeAlias
 import numpy as np
 import pyarrow as pa
 import torch
-from numpy.typing import NDArray
 from torch import Tensor
 
 from mavbridge.commands.imagine.inputs import Sampler, torch_threads
@@ -91,62 +89,35 @@ STALL_S = 120.0
 """Longest time without a finished frame."""
 END_S = 45.0
 """Longer than the timeout for a hung writer process."""
-PINNED_FRAMES = 4
-"""Frames in transit from the GPU at a time."""
 _POLL_S = 0.1
 
 
 class FrameDecoder:
     """Converts latents to images, one frame at a time, because the loop needs the processor, too.
 
-    On a GPU it uses a stream beside the sampler's, and frames return through a ring of pinned
-    memory. Used by one thread.
+    On a GPU it uses a stream beside the sampler's. Used by one thread.
     """
 
     def __init__(self, model: WorldModel) -> None:
         self._model = model
-        device = next(model.parameters()).device
         self._stream: torch.cuda.Stream | None = None
-        if device.type == "cuda":
+        if (device := next(model.parameters()).device).type == "cuda":
             self._stream = torch.cuda.Stream(device)  # type: ignore[no-untyped-call]
-            shape = (PINNED_FRAMES, *(model.config.image_size,) * 2, 3)
-            self._ring = torch.empty(shape, dtype=torch.uint8, pin_memory=True)
-            self._views: NDArray[np.uint8] = self._ring.numpy()
 
     def frames(self, latents: Tensor, ready: torch.cuda.Event | None) -> Iterator[ImageArray]:
-        """Return images [H, W, 3] of latents [N, C, h, w]; use each before taking the next.
+        """Return images [H, W, 3] of latents [N, C, h, w].
 
         On a GPU the latents can be read after the event ``ready``.
         """
-        if self._stream is None:
-            for latent in latents:
-                with torch.inference_mode():
-                    pixels = self._model.decode(latent[None])
-                yield pixels[0].cpu().numpy()
-            return
-        under_way: deque[tuple[int, torch.cuda.Event]] = deque()
-        if ready is not None:
+        if self._stream is not None and ready is not None:
             self._stream.wait_event(ready)
-        # Once the loop's stream frees the memory, it must not be reused before this stream is done.
-        latents.record_stream(self._stream)
-        for row, latent in enumerate(latents):
-            if len(under_way) == PINNED_FRAMES:  # a slot is free once its frame has been used
-                yield self._arrived(*under_way.popleft())
-            slot = row % PINNED_FRAMES
-            under_way.append((slot, self._launch(latent, slot, self._stream)))
-        while under_way:
-            yield self._arrived(*under_way.popleft())
-
-    def _launch(self, latent: Tensor, slot: int, stream: torch.cuda.Stream) -> torch.cuda.Event:
-        with torch.inference_mode(), torch.cuda.stream(stream):
-            self._ring[slot].copy_(self._model.decode(latent[None])[0], non_blocking=True)
-            event: torch.cuda.Event = stream.record_event()
-        return event
-
-    def _arrived(self, slot: int, event: torch.cuda.Event) -> ImageArray:
-        event.synchronize()
-        view: ImageArray = self._views[slot]
-        return view
+            # Once the loop's stream frees the memory, it must not be reused before this one ends.
+            latents.record_stream(self._stream)
+        for latent in latents:
+            beside = nullcontext() if self._stream is None else torch.cuda.stream(self._stream)
+            with torch.inference_mode(), beside:
+                pixels: ImageArray = self._model.decode(latent[None])[0].cpu().numpy()
+            yield pixels
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -177,14 +148,13 @@ class StreamedOutput:
         """Open the output at ``out``; without ``decode_video``, only the rows."""
         self.out = out
         self._plan = plan
-        self._clock = sampler.clock
-        self._meter = sampler.meter
+        self._sampler = sampler
         self._frame_dt_s = sampler.config.frame_dt_s
         self._on_frame = on_frame
         self._digest = hashlib.sha256()
         self.frames = 0
         self.frames_decoded = 0
-        """Frames decoded outside the loop's thread, whose own frames are in its meter."""
+        """Frames decoded outside the loop's thread, whose own frames the sampler counts."""
         self._decoder = FrameDecoder(sampler.model)
         self._jobs: queue.Queue[_DecodeJob | None] = queue.Queue(QUEUED_SEGMENTS)
         self._table_path = out.with_suffix(".arrows")
@@ -237,7 +207,7 @@ class StreamedOutput:
             if missing.is_cuda:
                 ready = torch.cuda.current_stream(missing.device).record_event()
         job = _DecodeJob(frames=frames, decoded=segment.decoded, missing=missing, ready=ready)
-        with self._meter.timed("decode"):
+        with self._sampler.timed("decode"):
             self._enqueue(job)
 
     def _enqueue(self, job: _DecodeJob | None, on_wait: Callable[[], None] = lambda: None) -> None:
@@ -255,21 +225,21 @@ class StreamedOutput:
 
     def _wait_until(self, condition: Callable[[], bool], on_wait: Callable[[], None]) -> None:
         """Wait for the condition, which itself waits briefly, as long as frames are finished."""
-        seen, since_ns = self.frames, self._clock.now_ns()
+        seen, since_ns = self.frames, self._sampler.clock.now_ns()
         while not condition():
             on_wait()
             if self.frames != seen:
-                seen, since_ns = self.frames, self._clock.now_ns()
-            elif self._clock.now_ns() - since_ns > STALL_S * NS_PER_S:
+                seen, since_ns = self.frames, self._sampler.clock.now_ns()
+            elif self._sampler.clock.now_ns() - since_ns > STALL_S * NS_PER_S:
                 raise HungError(f"no frame has been decoded and written for {STALL_S:g} s")
 
     def finish(self, on_wait: Callable[[], None] = lambda: None) -> None:
         """Process the queue, close the files, and compare their lengths."""
-        with self._meter.timed("decode"):
+        with self._sampler.timed("decode"):
             self._enqueue(None, on_wait)
             self._wait_until(lambda: self._worker.ends_within(_POLL_S), on_wait)
             self._worker.join(END_S)
-        with self._meter.timed("write"):
+        with self._sampler.timed("write"):
             if self.video is not None:
                 self.video.finish()
                 if self.video.written != self._table.rows:
@@ -319,7 +289,9 @@ class StreamedOutput:
                 # Frames of the video are evenly spaced.
                 captured_ns = round(frame.number * frame.frame_dt_s * NS_PER_S)
                 row = FrameRow(
-                    frame_id=frame.number, captured_ns=captured_ns, ready_ns=self._clock.now_ns()
+                    frame_id=frame.number,
+                    captured_ns=captured_ns,
+                    ready_ns=self._sampler.clock.now_ns(),
                 )
                 self.video.submit(rgb, row)
                 self._digest.update(np.ascontiguousarray(rgb).data)

@@ -53,14 +53,15 @@ def imagine(config: ImagineConfig) -> int:
         iterations=config.n_iter,
         frames=config.frames or config.exe_steps,
         exe_steps=config.exe_steps,
-        ddim_steps=config.ddim_steps,
         seed=config.policy.seed,
     )
     prepare_out(config.out)
     flight = open_flight(config.start)
     for text in flight.damage:
         console.print(f"warning: {text}", soft_wrap=True)
-    model = load_model(config.world_model, ddim_steps=plan.ddim_steps, device=config.policy.device)
+    model = load_model(
+        config.world_model, ddim_steps=config.ddim_steps, device=config.policy.device
+    )
     if plan.frames > model.config.frames:
         flag = "--frames" if config.frames else "--exe-steps"
         raise UserError(
@@ -68,7 +69,7 @@ def imagine(config: ImagineConfig) -> int:
             "imagines: lower it"
         )
     start = read_start(flight, model.config, config.start_at)
-    sampler = Sampler(model, ddim_steps=plan.ddim_steps, clock=clock)
+    sampler = Sampler(model, ddim_steps=config.ddim_steps, clock=clock)
     # Leave one core for the decoder: torch's threads spin at the end of every operation until the
     # last of them is done.
     free = torch.get_num_threads() - 1
@@ -168,8 +169,8 @@ def _make_decider(
 
 def _print_summary(config: ImagineConfig, sampler: Sampler, output: StreamedOutput) -> None:
     console = Console(highlight=False)
-    seconds = sampler.meter.seconds
-    decoded = sampler.meter.frames_decoded + output.frames_decoded
+    seconds = sampler.seconds
+    decoded = sampler.frames_decoded + output.frames_decoded
     what = f"{config.out}: {output.frames} frames"
     if not config.decode_video:
         what = f"{config.out.with_suffix('.parquet')}: {output.frames} rows, no video"

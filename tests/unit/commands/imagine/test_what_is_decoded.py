@@ -43,7 +43,7 @@ def test_exactly_the_frames_that_are_needed(
     for name, count in done.model.decoded:
         by_thread[name == THREAD] += count
     needed = in_loop * (plan.iterations - 1)
-    assert by_thread[False] == done.sampler.meter.frames_decoded == needed
+    assert by_thread[False] == done.sampler.frames_decoded == needed
     beside = plan.iterations * plan.frames - needed if decode_video else 0
     assert by_thread[True] == done.output.frames_decoded == beside
     assert (tmp_path / "a.mp4").exists() == decode_video
