@@ -2,7 +2,6 @@
 
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass
 from itertools import chain, islice
 from pathlib import Path
 from shutil import rmtree
@@ -15,7 +14,6 @@ from mavbridge.commands.config import ExportConfig
 from mavbridge.commands.export.dataset import DatasetWriter, fit_size
 from mavbridge.commands.export.files import (
     DatasetSpec,
-    Stretch,
     common_fps,
     stretches,
     worst_shift_ns,
@@ -31,18 +29,6 @@ from policy.contract import STATE_NAMES
 from policy.data.flight_data import FlightData, common_frame, common_terms
 from policy.data.flight_folders import find_flights, leave_out_failed, read_flight
 from policy.data.tables import read_json
-
-
-@dataclass(frozen=True, kw_only=True)
-class ExportSummary:
-    """Counts of the written data."""
-
-    episodes: int
-    rows: int
-    fps: int
-    frames_lost: int
-    worst_shift_ns: int
-    """Largest distance of an exposure from its place on the even grid."""
 
 
 def export(flights: Sequence[Path], config: ExportConfig) -> int:
@@ -72,9 +58,10 @@ def export(flights: Sequence[Path], config: ExportConfig) -> int:
             advance(reading)
         frames = sum(len(episode.captured_ns) for episode in episodes)
         writing = progress.add_task("writing frames", total=frames)
-        done = write_dataset(episodes, folder, config, lambda: advance(writing))
+        summary = write_dataset(episodes, folder, config, lambda: advance(writing))
         write_contract(folder, exemplary, config)
-    _print_summary(done, config.out)
+    for line in summary:
+        Console(highlight=False).print(f"{config.out}: {line}", soft_wrap=True)
     return 0
 
 
@@ -83,8 +70,10 @@ def write_dataset(
     folder: Path,
     config: ExportConfig,
     on_frame: Callable[[], None] = lambda: None,
-) -> ExportSummary:
+) -> list[str]:
     """Write flights into an empty folder; ``on_frame`` is called for every decoded frame.
+
+    Return what was written, and what is missing, in sentences for the user.
 
     Raises:
         UserError, VideoError, DatasetError: damaged flights, or they do not fit in one dataset.
@@ -113,15 +102,19 @@ def write_dataset(
     )
     writer = DatasetWriter(folder, spec, config.image_size)
     for episode, of_flight in zip(episodes, parts, strict=True):
-        _write_flight(writer, episode, of_flight, on_frame)
+        images, at = _decoded(episode, on_frame), 0
+        for part in of_flight:  # the video is decoded once, from its beginning
+            skipped = sum(1 for _ in islice(images, part.first_frame - at))
+            at += skipped + writer.add(part, islice(images, len(part)))
     writer.finish()
-    return ExportSummary(
-        episodes=writer.episodes,
-        rows=writer.rows,
-        fps=fps,
-        frames_lost=sum(map(len, every)) - writer.rows,
-        worst_shift_ns=max(worst_shift_ns(part, fps) for part in every),
-    )
+    shift_ms = max(worst_shift_ns(part, fps) for part in every) / NS_PER_MS
+    summary = [
+        f"{writer.episodes} episodes, {writer.rows} frames at {fps} Hz; an exposure is at most "
+        f"{shift_ms:.0f} ms from its timestamp (the true stamps are in the stamp.* columns)"
+    ]
+    if lost := sum(map(len, every)) - writer.rows:
+        summary.append(f"{lost} frames are missing at the end of videos that break off")
+    return summary
 
 
 def write_contract(dataset: Path, flights: Sequence[Path], config: ExportConfig) -> None:
@@ -145,21 +138,10 @@ def write_contract(dataset: Path, flights: Sequence[Path], config: ExportConfig)
     (dataset / CONTRACT_FILE).write_text(draft_text(title, entries))
 
 
-def _write_flight(
-    writer: DatasetWriter, episode: FlightData, parts: list[Stretch], on_frame: Callable[[], None]
-) -> None:
-    """Decode the video once from its beginning, and write its stretches."""
-
-    def decoded() -> Iterator[ImageArray]:
-        for image in episode.decode():
-            on_frame()
-            yield image
-
-    images = decoded()
-    at = 0
-    for part in parts:
-        skipped = sum(1 for _ in islice(images, part.first_frame - at))
-        at += skipped + writer.add(part, islice(images, len(part)))
+def _decoded(episode: FlightData, on_frame: Callable[[], None]) -> Iterator[ImageArray]:
+    for image in episode.decode():
+        on_frame()
+        yield image
 
 
 @contextmanager
@@ -189,15 +171,3 @@ def _whole_or_nothing(out: Path) -> Iterator[Path]:
         raise UserError(f"--out {out} cannot be written: {error.strerror or error}") from error
     finally:
         rmtree(part, ignore_errors=True)
-
-
-def _print_summary(done: ExportSummary, out: Path) -> None:
-    console = Console(highlight=False)
-    console.print(
-        f"{out}: {done.episodes} episodes, {done.rows} frames at {done.fps} Hz; an exposure is at "
-        f"most {done.worst_shift_ns / NS_PER_MS:.0f} ms from its timestamp (the true stamps are in "
-        "the stamp.* columns)",
-        soft_wrap=True,
-    )
-    if done.frames_lost:
-        console.print(f"{done.frames_lost} frames are missing at the end of videos that break off")
