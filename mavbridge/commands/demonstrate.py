@@ -366,7 +366,7 @@ def demonstrate(config: DemonstrateConfig) -> int:
         console.print(Text(f"{done} of {config.episodes} are there already", style="dim"))
     successes = 0
     with stop_on_signals() as stop, progress_bar(console) as progress:
-        bar = progress.add_task("demonstrating", total=config.episodes, completed=done)
+        bar = progress.add_task("demonstrating", total=config.episodes, completed=done, status="")
         flown = fly_jobs(fly_demonstration, specs, config.workers, stop.is_set)
         for count, (_, success) in enumerate(flown, start=1):
             successes += success

@@ -237,7 +237,7 @@ def _fly(
     specs = [EpisodeSpec(config=config, index=index) for index in indices]
     done, finished = len(before), sum(one.result.has_finished for one in before.values())
     with progress_bar(console) as progress:
-        bar = progress.add_task("flying", total=config.episodes, completed=done)
+        bar = progress.add_task("flying", total=config.episodes, completed=done, status="")
         for at, episode in fly_jobs(fly_simulated, specs, config.workers, should_stop):
             for note in () if done > len(before) else episode.notes:
                 console.print(Text(note, style="yellow"))

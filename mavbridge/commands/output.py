@@ -9,8 +9,6 @@ from rich.progress import (
     BarColumn,
     MofNCompleteColumn,
     Progress,
-    ProgressColumn,
-    Task,
     TaskProgressColumn,
     TextColumn,
     TimeRemainingColumn,
@@ -46,15 +44,6 @@ FIGURE_STYLE: dict[Any, Any] = {
 }
 
 
-def require_matplotlib(flag: str = "--plot") -> None:
-    """Raise UserError before a long run if no figure can be drawn.
-
-    Raises:
-        UserError: matplotlib is not installed.
-    """
-    require_packages(flag, {"matplotlib": "matplotlib"})
-
-
 def require_outputs(json: Path | None, plot: Path | None) -> None:
     """Check the flags ``--json`` and ``--plot`` before a long run.
 
@@ -64,7 +53,7 @@ def require_outputs(json: Path | None, plot: Path | None) -> None:
     require_writable(json, "--json")
     require_writable(plot, "--plot")
     if plot is not None:
-        require_matplotlib()
+        require_packages("--plot", {"matplotlib": "matplotlib"})
 
 
 def table_console() -> Console:
@@ -97,18 +86,14 @@ def print_status(line: str) -> None:
     Console(stderr=True).print(Text(without_secrets(line), style="dim"), soft_wrap=True)
 
 
-class _StatusColumn(ProgressColumn):
-    def render(self, task: Task) -> Text:
-        return Text(str(task.fields.get("status", "")))
-
-
 def progress_bar(console: Console, *, as_percentage: bool = False) -> Progress:
-    """Return a bar with description, count (or percentage), field ``status``, and time left."""
+    """Return a bar with description, count (or percentage), the text of each task's field
+    ``status``, and time left."""
     return Progress(
         TextColumn("{task.description}"),
         BarColumn(),
         TaskProgressColumn() if as_percentage else MofNCompleteColumn(),
-        _StatusColumn(),
+        TextColumn("{task.fields[status]}", markup=False),
         TimeRemainingColumn(),
         console=console,
     )

@@ -16,7 +16,7 @@ import threading
 from collections.abc import Callable
 from concurrent.futures import Future
 from contextlib import ExitStack, suppress
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from ipaddress import ip_address
 
 from rich.console import Console
@@ -37,7 +37,6 @@ from policy.adapters.interface import Interface
 from policy.adapters.websocket.link import API_KEY_VARIABLE
 from policy.adapters.websocket.messages import CONTRACT_KEY, RESET_KEY, from_message, pack, unpack
 from policy.adapters.websocket.remote_policy import ACTIONS_KEY
-from policy.contract import Contract
 from policy.errors import PolicyError
 from policy.protocol import PolicyRunner, keep_nothing
 
@@ -57,14 +56,6 @@ LOOK_S = 0.5
 JOIN_S = 2.0
 
 
-@dataclass(frozen=True, slots=True)
-class Job:
-    """A request, and a future for its answer: bytes, or the text of an error."""
-
-    request: bytes | str
-    answer: Future[bytes | str]
-
-
 class AnswerLoop:
     """Answers one request after the other. Only its own thread calls the policy."""
 
@@ -75,33 +66,33 @@ class AnswerLoop:
         self._clock = clock
         self.max_clients = MAX_CLIENTS if runner.reset is keep_nothing else 1
         """One client only if the policy has state: two flights would share it."""
-        self._jobs: queue.Queue[Job] = queue.Queue(self.max_clients)
+        self._jobs: queue.Queue[tuple[bytes | str, Future[bytes | str]]] = queue.Queue(
+            self.max_clients
+        )
 
     @property
     def metadata(self) -> bytes:
         """First message to every client."""
-        return pack(
-            {
-                CONTRACT_KEY: self._runner.contract.to_json(),
-                "policy": self._runner.name,
-            }
-        )
+        return pack({CONTRACT_KEY: self._runner.contract.to_json(), "policy": self._runner.name})
 
     def submit(self, request: bytes | str) -> Future[bytes | str]:
-        """Queue a request; raise queue.Full if the queue is full."""
-        job = Job(request, Future())
-        self._jobs.put_nowait(job)
-        return job.answer
+        """Queue a request; raise queue.Full if the queue is full.
+
+        Return a future for the answer: bytes, or the text of an error.
+        """
+        answer: Future[bytes | str] = Future()
+        self._jobs.put_nowait((request, answer))
+        return answer
 
     def run(self, stop: threading.Event) -> None:
         """Answer until told to stop."""
         while not stop.is_set():
             try:
-                job = self._jobs.get(timeout=WAIT_S)
+                request, answer = self._jobs.get(timeout=WAIT_S)
             except queue.Empty:
                 continue
-            if job.answer.set_running_or_notify_cancel():
-                job.answer.set_result(self.answer(job.request))
+            if answer.set_running_or_notify_cancel():
+                answer.set_result(self.answer(request))
 
     def answer(self, request: bytes | str) -> bytes | str:
         """Return a chunk as msgpack, or a text that describes the request's or policy's error."""
@@ -243,7 +234,7 @@ def serve(config: ServeConfig) -> int:
         answers = AnswerLoop(loaded.runner, clock=clock)
         server = PolicyServer(
             answers,
-            image_bytes=_image_bytes(loaded.runner.contract),
+            image_bytes=math.prod(loaded.runner.contract.image_shape),
             api_key=os.environ.get(API_KEY_VARIABLE) or None,
             report=lambda line: console.print(Text(line)),
         )
@@ -261,9 +252,16 @@ async def _serve(
     for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
         asyncio.get_running_loop().add_signal_handler(number, stop.set)
     listener = await server.listen(config.host, config.port)
-    console.print(Text(f"serving {config.policy.policy} at {_url(config)}; Ctrl-C ends it"))
-    for line in _warnings(config):
-        console.print(Text(line, style="yellow"))
+    url = f"ws://{spelled(config.host, config.port)}"
+    console.print(Text(f"serving {config.policy.policy} at {url}; Ctrl-C ends it"))
+    if not _is_local(config.host):
+        who = "every computer that reaches it"
+        if os.environ.get(API_KEY_VARIABLE):
+            who += " and has the API key"
+        else:
+            who += f": set {API_KEY_VARIABLE} on both sides to keep strangers out"
+        told = f"warning: {config.host} is open to {who}; nothing is encrypted"
+        console.print(Text(told, style="yellow"))
     while not stop.is_set() and policy.is_alive:
         with suppress(TimeoutError):
             await asyncio.wait_for(stop.wait(), LOOK_S)
@@ -272,27 +270,8 @@ async def _serve(
         await asyncio.wait_for(listener.wait_closed(), JOIN_S)
 
 
-def _warnings(config: ServeConfig) -> list[str]:
-    """Return warnings for a user who listens to other computers."""
+def _is_local(host: str) -> bool:
     try:
-        is_local = config.host == "localhost" or ip_address(config.host).is_loopback
+        return host == "localhost" or ip_address(host).is_loopback
     except ValueError:
-        is_local = False
-    if is_local:
-        return []
-    has_key = bool(os.environ.get(API_KEY_VARIABLE))
-    who = (
-        "every computer that reaches it and has the API key"
-        if has_key
-        else f"every computer that reaches it: set {API_KEY_VARIABLE} on both sides to keep "
-        "strangers out"
-    )
-    return [f"warning: {config.host} is open to {who}; nothing is encrypted"]
-
-
-def _url(config: ServeConfig) -> str:
-    return f"ws://{spelled(config.host, config.port)}"
-
-
-def _image_bytes(contract: Contract) -> int:
-    return math.prod(contract.image_shape)
+        return False

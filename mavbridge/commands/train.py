@@ -2,10 +2,11 @@
 
 from collections.abc import Callable, Sequence
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
-from typing import Self
 
 from rich.console import Console
+from rich.progress import Progress, TaskID
 from rich.text import Text
 
 from mavbridge.commands.output import progress_bar
@@ -107,45 +108,33 @@ def fit_to_flights(
     return replace(network, contract=contract)
 
 
-class Display:
-    """Progress bar that ends with the losses, and lines of text for the run's reports."""
-
-    def __init__(self) -> None:
-        self._bar = progress_bar(Console(stderr=True, highlight=False), as_percentage=True)
-        self._task = self._bar.add_task("starting", total=1.0)
-
-    def __enter__(self) -> Self:
-        self._bar.start()
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self._bar.stop()
-
-    def show(self, progress: TrainingProgress) -> None:
-        """Show one report of the run."""
-        if progress.note is not None:
-            self._bar.print(f"note: {progress.note}")
-            return
-        self._bar.update(self._task, description=progress.stage, completed=progress.fraction)
-        if progress.losses is not None:
-            parts = (f"{name} {value:.3f}" for name, value in progress.losses.items())
-            losses = f"step {progress.step}  {'  '.join(parts).replace('_', ' ')}"
-            self._bar.update(self._task, status=losses)
-        if progress.validation is not None:
-            self._bar.print(
-                f"{progress.fraction:4.0%} {progress.stage}, step {progress.step}: "
-                f"{progress.validation.describe()}"
-            )
+def _show(bar: Progress, task: TaskID, progress: TrainingProgress) -> None:
+    """Show one report of the run: the losses at the end of the bar, all else as lines of text."""
+    if progress.note is not None:
+        bar.print(f"note: {progress.note}")
+        return
+    bar.update(task, description=progress.stage, completed=progress.fraction)
+    if progress.losses is not None:
+        parts = "  ".join(f"{name} {value:.3f}" for name, value in progress.losses.items())
+        bar.update(task, status=f"step {progress.step}  {parts.replace('_', ' ')}")
+    if progress.validation is not None:
+        bar.print(
+            f"{progress.fraction:4.0%} {progress.stage}, step {progress.step}: "
+            f"{progress.validation.describe()}"
+        )
 
 
 def _finish(train: Callable[[Hooks], TrainResult]) -> int:
     clock = MonotonicClock()
     try:
-        with stop_on_signals() as stop, Display() as display:
+        with (
+            stop_on_signals() as stop,
+            progress_bar(Console(stderr=True, highlight=False), as_percentage=True) as bar,
+        ):
             result = train(
                 Hooks(
                     now_s=lambda: clock.now_ns() / NS_PER_S,
-                    report=display.show,
+                    report=partial(_show, bar, bar.add_task("starting", total=1.0, status="")),
                     should_stop=stop.is_set,
                 )
             )

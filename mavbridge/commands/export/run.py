@@ -49,7 +49,7 @@ def export(flights: Sequence[Path], config: ExportConfig) -> int:
                 raise KeyboardInterrupt
             progress.advance(task)
 
-        reading = progress.add_task("reading flights", total=len(exemplary))
+        reading = progress.add_task("reading flights", total=len(exemplary), status="")
         episodes = []
         for flight in exemplary:
             episodes.append(read_flight(flight))
@@ -57,7 +57,7 @@ def export(flights: Sequence[Path], config: ExportConfig) -> int:
                 console.print(f"warning: {text}", soft_wrap=True)
             advance(reading)
         frames = sum(len(episode.captured_ns) for episode in episodes)
-        writing = progress.add_task("writing frames", total=frames)
+        writing = progress.add_task("writing frames", total=frames, status="")
         summary = write_dataset(episodes, folder, config, lambda: advance(writing))
         write_contract(folder, exemplary, config)
     for line in summary:

@@ -109,7 +109,7 @@ def run_rollout(
     done = 0
     try:
         with stop_on_signals() as stop, progress_bar(console) as bar:
-            task = bar.add_task("imagining", total=plan.iterations * plan.frames)
+            task = bar.add_task("imagining", total=plan.iterations * plan.frames, status="")
 
             def refresh() -> None:
                 status = (

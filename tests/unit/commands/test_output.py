@@ -3,7 +3,7 @@ from pathlib import Path
 
 import pytest
 
-from mavbridge.commands.output import print_status, require_matplotlib
+from mavbridge.commands.output import print_status, require_outputs
 from mavbridge.core.errors import UserError
 from mavbridge.core.files import require_writable
 
@@ -22,10 +22,12 @@ def test_what_cannot_be_written_is_refused_with_its_flag(tmp_path: Path, name: s
         require_writable(tmp_path / name, "--json")
 
 
-def test_a_figure_without_matplotlib_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_figure_without_matplotlib_is_refused(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
     monkeypatch.setattr(importlib.util, "find_spec", lambda _: None)
     with pytest.raises(UserError, match=r"--plot needs matplotlib: pip install"):
-        require_matplotlib()
+        require_outputs(None, tmp_path / "a.png")
 
 
 def test_what_is_being_done_is_told_without_passwords(capsys: pytest.CaptureFixture[str]) -> None:

@@ -124,12 +124,12 @@ def test_ctrl_c_keeps_the_run_and_says_how_to_resume_it(
     out = tmp_path / "a.safetensors"
     command = ("train", str(tmp_path / "flights"), "--out", str(out), *SMALL, "--steps", "8")
 
-    def interrupt(_: run.Display, progress: TrainingProgress) -> None:
+    def interrupt(_bar: object, _task: object, progress: TrainingProgress) -> None:
         if progress.stage.startswith("encoding"):
             signal.raise_signal(signal.SIGINT)
 
     with monkeypatch.context() as patch:
-        patch.setattr(run.Display, "show", interrupt)
+        patch.setattr(run, "_show", interrupt)
         assert status_of(*command) == INTERRUPTED
     assert "--resume" in capsys.readouterr().err
     assert not out.exists()
