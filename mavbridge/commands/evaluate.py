@@ -32,7 +32,7 @@ from mavbridge.flight.policies import is_scripted, load_for_episodes, policy_fil
 from mavbridge.flight.settings import contract_with_ages
 from mavbridge.simulation.delays import Delay, Delays
 from mavbridge.simulation.flight import SimulatedFlight, SimulationSettings
-from mavbridge.simulation.referee import EpisodeResult, Outcome
+from mavbridge.simulation.referee import EpisodeResult
 from mavbridge.simulation.world import draw_conditions, make_vehicle
 from policy.files import read_json
 
@@ -290,52 +290,41 @@ def mean(values: Sequence[float]) -> Estimate | None:
     return Estimate(value=float(sample.mean()), low=low, high=high, count=len(sample))
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Summary:
-    """Figures over all episodes unless stated otherwise; None: no episode has the figure."""
-
-    success_rate: Estimate
-    """Success: all gates in order, no crash."""
-    gates_passed: Estimate | None
-    mean_speed_mps: Estimate | None
-    """Path length over time, take-off included."""
-    course_speed_mps: Estimate | None
-    """Length of the straight legs over time, from the first gate to the last one passed."""
-    stick_rate_per_s: Estimate | None
-    """Mean |change| of a number of the action per second; lower is smoother."""
-    flown_s: Estimate | None
-    course_s: Estimate | None
-    """Time from the first action to the last gate, of the successful flights."""
-    outcomes: tuple[tuple[Outcome, int], ...]
+FIGURES = {
+    "gates_passed": "gates passed",
+    "mean_speed_mps": "mean speed, m/s",
+    "course_speed_mps": "speed from gate to gate, m/s",
+    "stick_rate_per_s": "change of actions, 1/s",
+    "flown_s": "flown, s",
+    "course_s": "course time, s (successful flights)",
+}
+"""Fields of an ``EpisodeResult`` of which the mean is shown, and their names in the table."""
 
 
-def summarise(episodes: Sequence[EpisodeResult]) -> Summary:
-    """Compute the figures of one or more episodes."""
-
-    def mean_of(name: str) -> Estimate | None:
+def summarise(episodes: Sequence[EpisodeResult]) -> dict[str, Estimate | None]:
+    """Return the success rate and the means of one or more episodes; None: no episode has one."""
+    summary: dict[str, Estimate | None] = {
+        "success_rate": rate(sum(one.has_finished for one in episodes), len(episodes))
+    }
+    for name in FIGURES:
         values = [getattr(one, name) for one in episodes]
-        return mean([value for value in values if value is not None])
+        summary[name] = mean([value for value in values if value is not None])
+    return summary
 
-    return Summary(
-        success_rate=rate(sum(one.has_finished for one in episodes), len(episodes)),
-        gates_passed=mean_of("gates_passed"),
-        mean_speed_mps=mean_of("mean_speed_mps"),
-        course_speed_mps=mean_of("course_speed_mps"),
-        stick_rate_per_s=mean_of("stick_rate_per_s"),
-        flown_s=mean_of("flown_s"),
-        course_s=mean_of("course_s"),
-        outcomes=tuple(Counter(one.outcome for one in episodes).most_common()),
-    )
+
+def _outcomes(episodes: Sequence[EpisodeResult]) -> dict[str, int]:
+    return dict(Counter(one.outcome for one in episodes).most_common())
 
 
 def to_json(config: EvaluateConfig, flown: Mapping[int, FlownEpisode], flown_by: str) -> str:
     """Return all results as JSON; the summary is null without episodes, ``flown_by`` from
     ``identity``."""
     episodes = _results(flown)
-    summary = None
+    summary: dict[str, object] | None = None
     if episodes:
-        summary = asdict(summarise(episodes))
-        summary["outcomes"] = dict(summary["outcomes"])
+        found = summarise(episodes).items()
+        summary = {name: estimate and asdict(estimate) for name, estimate in found}
+        summary["outcomes"] = _outcomes(episodes)
     document = {
         "policy": config.policy.policy,
         "engine": _engine(flown),
@@ -357,16 +346,10 @@ def print_evaluation(
     """Print each figure with its 95 % interval, then how the flights ended."""
     episodes = _results(flown)
     summary = summarise(episodes)
-    figures = (
-        (f"gates passed, of {episodes[0].gates_total}", summary.gates_passed),
-        ("mean speed, m/s", summary.mean_speed_mps),
-        ("speed from gate to gate, m/s", summary.course_speed_mps),
-        ("change of actions, 1/s", summary.stick_rate_per_s),
-        ("flown, s", summary.flown_s),
-        ("course time, s (successful flights)", summary.course_s),
-    )
-    rows = [("success rate", *_cells(summary.success_rate, "{:.1%}"))]
-    rows += [(name, *_cells(estimate, "{:.2f}")) for name, estimate in figures]
+    rows = [("success rate", *_cells(summary["success_rate"], "{:.1%}"))]
+    for name, shown in FIGURES.items():
+        label = f"{shown}, of {episodes[0].gates_total}" if name == "gates_passed" else shown
+        rows.append((label, *_cells(summary[name], "{:.2f}")))
     title = [f"{config.policy.policy} ({_engine(flown)})"]
     if config.conditions != "nominal":
         title.append(f"{config.conditions} conditions")
@@ -376,7 +359,7 @@ def print_evaluation(
         title.append(f"images {config.vision_delay:g} ms later")
     header = ("", "mean", "95 % interval", "flights")
     console.print(make_table(", ".join(title), header, rows))
-    ends = ", ".join(f"{count} {outcome}" for outcome, count in summary.outcomes)
+    ends = ", ".join(f"{count} {outcome}" for outcome, count in _outcomes(episodes).items())
     console.print(Text(f"{len(episodes)} flights: {ends}"))
 
 
