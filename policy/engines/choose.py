@@ -13,10 +13,9 @@ import numpy as np
 import torch
 
 from policy.contract import FloatArray
-from policy.engines.kept import changes, modules_of, snapshot
 from policy.engines.parity import ParitySamples, make_parity_samples, parity_failure
 from policy.engines.runner import EngineName, ExecutionSettings, encode_all
-from policy.engines.torch_eager import make_torch_runner
+from policy.engines.torch_eager import changes, make_torch_runner, modules_of, snapshot
 from policy.errors import Agreed, PolicyError, warned
 from policy.nets.toge import BuiltinPolicy
 from policy.protocol import PolicyRunner, SingleRatePolicy

@@ -25,8 +25,7 @@ from policy.engines.openvino_compile import (
     signal_stack_kept,
     update_digest,
 )
-from policy.engines.runner import Act, ExecutionSettings, Precision, assemble
-from policy.engines.stepwise import to_numpy
+from policy.engines.runner import Act, ExecutionSettings, Precision, assemble, to_numpy
 from policy.nets.action_head import DiffusionHead, size_dims
 from policy.nets.toge import BuiltinPolicy
 from policy.nets.unet1d import Conv, ResidualBlock, UNet1d, norm_of_groups

@@ -16,7 +16,6 @@ import torch
 from torch import Tensor, nn
 from torch.export import ExportedProgram
 
-from policy.engines.kept import modules_of
 from policy.engines.openvino_compile import (
     GraphCompiler,
     Traceable,
@@ -25,9 +24,15 @@ from policy.engines.openvino_compile import (
     signal_stack_kept,
     update_digest,
 )
-from policy.engines.runner import ArrayFunction, Compile, ExecutionSettings, Precision, Shape
-from policy.engines.stepwise import make_parts_runner
-from policy.engines.torch_eager import run_eagerly
+from policy.engines.runner import (
+    ArrayFunction,
+    Compile,
+    ExecutionSettings,
+    Precision,
+    Shape,
+    make_runner,
+)
+from policy.engines.torch_eager import modules_of, run_eagerly
 from policy.errors import PolicyError, user_code
 from policy.protocol import PolicyRunner, SingleRatePolicy
 
@@ -62,10 +67,12 @@ def make_module_runner(
     def compile_as(precision: Precision) -> Compile:
         return lambda function, shapes: converter.compile(function, shapes, precision)
 
-    end = run_eagerly(settings.name, "cpu")
-    compilers = compile_as(vision), compile_as(action), end
-    name = engine_name(vision, action)
-    return make_parts_runner(policy, *compilers, engine=name, settings=settings)
+    return make_runner(
+        *(policy, policy, compile_as(vision), compile_as(action)),
+        engine=engine_name(vision, action),
+        settings=settings,
+        compile_end=run_eagerly(settings.name, "cpu"),
+    )
 
 
 class ModuleConverter:

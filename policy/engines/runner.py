@@ -9,7 +9,7 @@ import numpy as np
 from policy.contract import ACTION_DIM, QUATERNION, CameraImage, Contract, FloatArray
 from policy.errors import PolicyError, user_code
 from policy.preprocess import dummy_images, image_to_input
-from policy.protocol import DualRatePolicy, PolicyRunner, SingleRatePolicy
+from policy.protocol import DualRatePolicy, PolicyRunner, SingleRatePolicy, StepwisePolicy
 
 EngineName = Literal["auto", "torch", "openvino", "cuda-graph"]
 Precision = Literal["bf16", "f32"]
@@ -45,13 +45,21 @@ def make_runner(
     *,
     engine: str,
     settings: ExecutionSettings,
+    compile_end: Compile | None = None,
 ) -> PolicyRunner:
     """Compile a policy's methods for the loops and try them on a dummy sample.
 
     ``vision`` encodes images and ``action`` samples chunks: one policy, possibly on two devices.
+    With ``compile_end``, for ``to_chunk``, only the network of a ``StepwisePolicy`` is compiled.
     """
     contract, steps = action.contract, settings.num_diffusion_steps
     rest = ((1, *contract.state_shape), (1, *contract.history_shape))
+    if compile_end is not None and isinstance(action, StepwisePolicy):
+        encode = _encoders(action, compile_vision)
+        act = _solver(action, compile_action, compile_end, settings)
+        if settings.dual_rate:
+            return assemble(contract, encode, act, engine, settings)
+        return assemble(contract, (), _on_images(encode, act, contract), engine, settings)
     if not settings.dual_rate:
         predict = compile_action(
             lambda i, s, h: action.predict(i, s, h, steps), ((1, *contract.image_shape), *rest)
@@ -61,21 +69,68 @@ def make_runner(
         raise PolicyError(
             f"{settings.name} has no encode_visual and predict_fast: fly it single-rate"
         )
-    image = ((1, *contract.image_shape[-3:]),)
-    encode = [compile_vision(method, image) for method in encoders(vision)]
+    encode, sampler = _encoders(vision, compile_vision), action
     fast = ((1, *contract.feature_shape), *rest)
-    sampler = action
     act = compile_action(lambda e, s, h: sampler.predict_fast(e, s, h, steps), fast)
     return assemble(contract, encode, act, engine, settings)
 
 
-def encoders(vision: DualRatePolicy) -> list[Callable[..., Any]]:
-    """Return ``encode_visual`` of each camera as a function of the image alone."""
-    cameras = len(vision.contract.cameras)
-    if cameras == 1:
-        return [vision.encode_visual]
+def _encoders(vision: DualRatePolicy, compile_vision: Compile) -> list[ArrayFunction]:
+    """Compile ``encode_visual`` for each camera, as a function of the image alone."""
+    contract = vision.contract
     encode: Callable[..., Any] = vision.encode_visual
-    return [lambda image, camera=camera: encode(image, camera) for camera in range(cameras)]
+    methods = [encode]
+    if (cameras := len(contract.cameras)) > 1:
+        methods = [lambda image, camera=i: encode(image, camera) for i in range(cameras)]
+    return [compile_vision(method, ((1, *contract.image_shape[-3:]),)) for method in methods]
+
+
+def _solver(
+    policy: StepwisePolicy,
+    compile_action: Compile,
+    compile_end: Compile,
+    settings: ExecutionSettings,
+) -> Act:
+    """Run the solver around the compiled network, in numpy."""
+    contract = policy.contract
+    with user_code(f"{settings.name} failed to prepare its solver"):
+        noise = to_numpy(policy.initial_noise)
+        shapes = (
+            *(noise.shape, (1,), (1, *contract.feature_shape)),
+            *((1, *contract.state_shape), (1, *contract.history_shape)),
+        )
+        denoise = compile_action(policy.denoise, shapes)
+        to_chunk = compile_end(policy.to_chunk, (noise.shape,))
+        steps = policy.schedule.ddim_steps(settings.num_diffusion_steps)
+    timesteps = [np.array([step.timestep], np.float32) for step in steps]
+
+    def act(encoded: FloatArray, state: FloatArray, history: FloatArray) -> FloatArray:
+        noisy = noise
+        for step, timestep in zip(steps, timesteps, strict=True):
+            output = denoise(noisy, timestep, encoded, state, history)
+            noisy = policy.schedule.ddim_update(step, noisy, output)
+        return to_chunk(noisy)
+
+    return act
+
+
+def _on_images(encode: Sequence[ArrayFunction], act: Act, contract: Contract) -> Act:
+    """Single rate: apply ``act`` to images [1, *contract.image_shape] instead of their features."""
+
+    def act_on_images(images: FloatArray, state: FloatArray, history: FloatArray) -> FloatArray:
+        steps = images.reshape(-1, len(encode), 1, *images.shape[-3:])
+        features = [
+            encode_one(step[camera]) for step in steps for camera, encode_one in enumerate(encode)
+        ]
+        feature = np.concatenate(features, axis=1).reshape(1, *contract.feature_shape)
+        return act(feature, state, history)
+
+    return act_on_images
+
+
+def to_numpy(array: Any) -> FloatArray:
+    """Return a float32 copy of an array of any library, on any device."""
+    return np.array(array.cpu().numpy() if hasattr(array, "cpu") else array, np.float32)
 
 
 def make_numpy_runner(policy: SingleRatePolicy, settings: ExecutionSettings) -> PolicyRunner:

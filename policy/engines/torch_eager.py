@@ -1,7 +1,10 @@
-"""Plain torch, operator by operator: the reference for every other engine."""
+"""Plain torch, operator by operator: the reference for every other engine.
+
+And what a user's policy holds: its modules, and the attributes that change from call to call.
+"""
 
 import copy
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Collection, Sequence
 from typing import Any
 
 import numpy as np
@@ -57,3 +60,49 @@ def run_eagerly(name: str, device: str) -> Compile:
         return run
 
     return compile_
+
+
+def modules_of(policy: object) -> list[nn.Module]:
+    """Return the policy itself if it is a module, else the modules among its attributes."""
+    if isinstance(policy, nn.Module):
+        return [policy]
+    values = vars(policy).values() if hasattr(policy, "__dict__") else ()
+    return [value for value in values if isinstance(value, nn.Module)]
+
+
+def snapshot(policy: object) -> dict[str, object]:
+    """Return the attributes of a policy and of all its modules, by name, in a comparable form.
+
+    Tensors are compared by value, except the weights, which no forward call changes; numbers and
+    texts by value; collections by the identity of their elements; other objects by identity.
+    """
+    holders: dict[str, object] = {"": policy}
+    for at, module in enumerate(modules_of(policy)):
+        holders |= {f"{at}.{name}.": child for name, child in module.named_modules() if name}
+        holders[f"{at}."] = module
+    marks: dict[str, object] = {}
+    for path, holder in holders.items():
+        attributes = dict(vars(holder)) if hasattr(holder, "__dict__") else {}
+        attributes |= attributes.pop("_buffers", {})
+        attributes.pop("_parameters", None)
+        marks |= {f"{path}{name}": _mark(value) for name, value in attributes.items()}
+    return marks
+
+
+def changes(before: dict[str, object], after: dict[str, object]) -> list[str]:
+    """Return the names, without the path, of attributes that were added, removed or changed."""
+    names = [name for name in {**before, **after} if before.get(name) != after.get(name)]
+    return sorted({name.rpartition(".")[2] for name in names})
+
+
+def _mark(value: object) -> object:
+    if isinstance(value, Tensor):
+        array = value.detach().cpu().contiguous()
+        return str(array.dtype), tuple(array.shape), array.float().numpy().tobytes()
+    if value is None or isinstance(value, bool | int | float | str | bytes):
+        return value
+    if isinstance(value, dict):
+        return tuple((id(key), id(element)) for key, element in value.items())
+    if isinstance(value, Collection):
+        return tuple(map(id, value))
+    return id(value)

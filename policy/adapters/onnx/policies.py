@@ -14,8 +14,7 @@ from policy.contract import ACTION_DIM, Contract, FloatArray
 from policy.engines.choose import chunks_of_samples, first_with_chunks
 from policy.engines.openvino_compile import engine_name, precisions
 from policy.engines.parity import make_parity_samples
-from policy.engines.runner import ExecutionSettings, Precision, Shape, run_in_numpy
-from policy.engines.stepwise import make_parts_runner
+from policy.engines.runner import ExecutionSettings, Precision, Shape, make_runner, run_in_numpy
 from policy.errors import PolicyError
 from policy.preprocess import input_to_bytes
 from policy.protocol import PolicyRunner
@@ -105,8 +104,12 @@ class OnnxGraphs:
         def runner_of(vision: Precision, action: Precision) -> PolicyRunner:
             is_given = vision == action == "f32"
             policy, reset = in_float32 if is_given else self.at(vision, action)
-            name = engine_name(vision, action)
-            runner = make_parts_runner(policy, run, run, run, engine=name, settings=settings)
+            runner = make_runner(
+                *(policy, policy, run, run),
+                engine=engine_name(vision, action),
+                settings=settings,
+                compile_end=run,
+            )
             return replace(runner, reset=reset)
 
         reference, samples = runner_of("f32", "f32"), make_parity_samples(self.interface.contract)
