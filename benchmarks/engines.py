@@ -5,7 +5,6 @@ from collections.abc import Callable, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass, field, replace
 
-import numpy as np
 import torch
 
 from benchmarks.results import EngineTiming, name_of
@@ -14,9 +13,8 @@ from mavbridge.config.policy import Engine, PolicyConfig
 from mavbridge.core.clock import NS_PER_S, MonotonicClock
 from mavbridge.core.histogram import Histogram
 from mavbridge.flight.policies import load_configured_policy
-from policy.engines.runner import encode_all, level_state
+from policy.engines.runner import dummy_sample, encode_all
 from policy.errors import PolicyError
-from policy.preprocess import dummy_images
 from policy.protocol import PolicyRunner
 
 EAGER: Engine = "torch"
@@ -78,9 +76,8 @@ def _cases(policy: PolicyConfig, lives: ExitStack) -> tuple[list[_Case], list[st
 def _cases_on(policy: PolicyConfig, lives: ExitStack) -> list[_Case]:
     runner = _load(policy, lives)
     contract = runner.contract
-    images, state = dummy_images(contract), level_state(contract)
+    images, state, history = dummy_sample(contract)
     image = images.reshape(-1, *contract.picture_shape)[0]
-    history = np.zeros((1, *contract.history_shape), np.float32)
     feature = encode_all(runner, images)
     engine = runner.engine if policy.engine == "auto" else policy.engine
 

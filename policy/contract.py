@@ -5,8 +5,9 @@ carries its ``Contract`` in the header, and the bridge rejects a contract that i
 """
 
 import json
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, field, fields
+from itertools import chain
 from typing import Any, Literal, get_args
 
 import numpy as np
@@ -101,10 +102,8 @@ MOST_PIXEL = 1e3
 MAX_AGE_LIMIT_S = 60.0
 ENVELOPE_TERMS = ("max_tilt_deg", "max_speed_mps", "max_height_m", "max_distance_m")
 _CHUNK_AGES = ("max_state_age_s", "max_velocity_age_s", "max_feature_age_s", "max_chunk_age_s")
-FLIGHT_TERMS = (
-    *("action", "modes", "play_s", "state_time", "max_stall_s"),
-    *(*_CHUNK_AGES, *ENVELOPE_TERMS),
-)
+LIMIT_TERMS = (*_CHUNK_AGES, "max_stall_s", *ENVELOPE_TERMS)
+FLIGHT_TERMS = ("action", "modes", "play_s", "state_time", *LIMIT_TERMS)
 """Fields that decide how a policy is flown and do not affect its network's output."""
 _TUPLES = (
     *("cameras", "camera_rates_hz", "image_crop", "state_extras"),
@@ -117,6 +116,7 @@ _CHOICES: dict[str, Any] = {
     "velocity_frame": VelocityFrame,
     "image_fit": ImageFit,
     "image_channels": ImageChannels,
+    "action": ActionKind,
 }
 _INTEGERS = {
     "image_height": (16, 4096),
@@ -139,6 +139,9 @@ _NUMBERS: dict[str, tuple[float, float, str]] = {
     "full_yaw_rate_degps": (LEAST, 2000.0, "degrees/s"),
     **dict.fromkeys(("full_climb_mps", "full_descent_mps"), (LEAST, 100.0, "m/s")),
     "depth_unit_m": (1e-6, 1.0, "m"),
+    **dict.fromkeys(
+        ("lean_dead_zone", "yaw_dead_zone", "throttle_dead_zone"), (0.0, 0.9, "of the travel")
+    ),
 }
 """Minimum, maximum and unit of each number."""
 
@@ -242,93 +245,69 @@ class Contract:
 
     def __post_init__(self) -> None:
         try:
-            self._require_values()
-            self._require_images()
-            self._require_observation()
-            self._require_modes()
+            for name in ("modes", *_TUPLES):
+                if isinstance(value := getattr(self, name), list):
+                    object.__setattr__(self, name, tuple(value))
+            if self.modes == () and self.action in ACTION_MODES:
+                usual = ("ALT_HOLD", "ALTCTL") if self.action == "sticks" else None
+                object.__setattr__(self, "modes", usual or ACTION_MODES[self.action])
+            for name, is_right, wanted in chain(self._checked_values(), self._checked_lists()):
+                if not is_right:
+                    raise ContractError(f"{name} must be {wanted}, got {getattr(self, name)!r}")
         except (TypeError, ValueError, OverflowError, AttributeError) as error:
             raise ContractError(f"malformed contract: {error}") from error
 
-    def _require_values(self) -> None:
-        for name in ("modes", *_TUPLES):
-            if isinstance(value := getattr(self, name), list):
-                object.__setattr__(self, name, tuple(value))
-        if self.modes == () and self.action in ACTION_MODES:
-            modes = ("ALT_HOLD", "ALTCTL") if self.action == "sticks" else ACTION_MODES[self.action]
-            object.__setattr__(self, "modes", modes)
-        for name, known in _CHOICES.items():
-            if (value := getattr(self, name)) not in get_args(known):
-                choices = " or ".join(map(repr, get_args(known)))
-                raise ContractError(f"{name} {value!r} is unknown; use {choices}")
-        self._require("since_exposure", isinstance(self.since_exposure, bool), "true or false")
+    def _checked_values(self) -> Iterator[tuple[str, bool, str]]:
+        """Yield the name of each field of one value, True if it is right, and what it must be."""
+        for name, kind in _CHOICES.items():
+            choices = get_args(kind)
+            yield name, getattr(self, name) in choices, " or ".join(map(repr, choices))
+        yield "since_exposure", isinstance(self.since_exposure, bool), "true or false"
         for name, (low, high) in _INTEGERS.items():
             value = getattr(self, name)
-            is_right = type(value) is int and low <= value <= high
-            self._require(name, is_right, f"an integer in {low}..{high}")
+            yield name, type(value) is int and low <= value <= high, f"an integer in {low}..{high}"
         for name, (least, most, unit) in _NUMBERS.items():
             value = getattr(self, name)
             is_right = _is_within(value, least, most) or (value is None and name in ENVELOPE_TERMS)
-            self._require(name, is_right, f"in [{least:g}, {most:g}] {unit}")
-        for name in ("lean_dead_zone", "yaw_dead_zone", "throttle_dead_zone"):
-            share = getattr(self, name)
-            self._require(name, _is_within(share, 0, 0.9) and share < 0.9, "in [0, 0.9) of travel")
+            yield name, is_right, f"in [{least:g}, {most:g}] {unit}"
+        longest_s = self.horizon * self.chunk_dt_s
+        is_play = _is_within(self.play_s, 0, longest_s) and not 0 < self.play_s < LEAST
+        yield "play_s", is_play, f"0, or {LEAST:g} to at most the {longest_s:g} s of a chunk"
+        is_prefix = self.prefix_len == 0 or self.state_time == "measured"
+        wanted = f"less than horizon {self.horizon}, and 0 if state_time is 'execution'"
+        yield "prefix_len", is_prefix and self.prefix_len < self.horizon, wanted
 
-    def _require(self, name: str, is_right: bool, wanted: str) -> None:
-        if not is_right:
-            raise ContractError(f"{name} must be {wanted}, got {getattr(self, name)!r}")
-
-    def _require_images(self) -> None:
+    def _checked_lists(self) -> Iterator[tuple[str, bool, str]]:
+        """Yield as ``_checked_values`` for fields of several values."""
         for name in _TUPLES:
-            self._require(name, isinstance(getattr(self, name), tuple), "a list")
-        for name, low in (("image_mean_rgb", -MOST_PIXEL), ("image_std_rgb", 1e-6)):
+            yield name, isinstance(getattr(self, name), tuple), "a list"
+        for name, low, usual in (
+            ("image_mean_rgb", -MOST_PIXEL, IMAGENET_MEAN_RGB),
+            ("image_std_rgb", 1e-6, IMAGENET_STD_RGB),
+        ):
             rgb = getattr(self, name)
             is_right = len(rgb) == 3 and all(_is_within(value, low, MOST_PIXEL) for value in rgb)
-            self._require(name, is_right, f"three numbers in [{low:g}, {MOST_PIXEL:g}]")
-        scaling = (self.image_mean_rgb, self.image_std_rgb)
-        if self.is_depth and scaling != (IMAGENET_MEAN_RGB, IMAGENET_STD_RGB):
-            raise ContractError(
-                "image_channels 'depth' gives metres as they are: leave image_mean_rgb and "
-                f"image_std_rgb out, got {scaling[0]} and {scaling[1]}"
-            )
-        crop = self.image_crop
+            yield name, is_right, f"three numbers in [{low:g}, {MOST_PIXEL:g}]"
+            wanted = "left out: image_channels 'depth' gives metres as they are"
+            yield name, not self.is_depth or rgb == usual, wanted
+        crop, names, extras = self.image_crop, self.cameras, self.state_extras
         is_crop = len(crop) == 4 and all(_is_within(share, 0, 1) for share in crop)
         is_crop = is_crop and min(crop[2] - crop[0], crop[3] - crop[1]) >= LEAST
         wanted = f"top, left, bottom, right within [0, 1], at least {LEAST:g} apart"
-        self._require("image_crop", is_crop, wanted)
-
-    def _require_observation(self) -> None:
-        names, rates_hz, extras = self.cameras, self.camera_rates_hz, self.state_extras
+        yield "image_crop", is_crop, wanted
         are_names = len(names) > 0 and len(set(names)) == len(names)
         are_names = are_names and all(map(str.isidentifier, names))
-        self._require("cameras", are_names, "one or more different names")
-        are_rates = all(_is_within(hz, LEAST_RATE_HZ, 240) for hz in rates_hz)
+        yield "cameras", are_names, "one or more different names"
+        are_rates = all(_is_within(hz, LEAST_RATE_HZ, 240) for hz in self.camera_rates_hz)
+        are_rates = are_rates and len(self.camera_rates_hz) in (0, len(names))
         wanted = f"a rate in [{LEAST_RATE_HZ:g}, 240] Hz for each of {names}"
-        self._require("camera_rates_hz", are_rates and len(rates_hz) in (0, len(names)), wanted)
+        yield "camera_rates_hz", are_rates, wanted
         are_extras = len(set(extras)) == len(extras) and set(extras) <= set(EXTRA_NAMES)
-        wanted = f"some of {', '.join(EXTRA_NAMES)}, each once"
-        self._require("state_extras", are_extras, wanted)
-        longest_s = self.horizon * self.chunk_dt_s
-        is_play = _is_within(self.play_s, 0, longest_s) and not 0 < self.play_s < LEAST
-        wanted = f"0, or at least {LEAST:g} and at most the {longest_s:g} s of a chunk"
-        self._require("play_s", is_play, wanted)
-        is_prefix = self.prefix_len < self.horizon and (
-            self.prefix_len == 0 or self.state_time == "measured"
-        )
-        wanted = f"less than horizon {self.horizon}, and 0 if state_time is 'execution'"
-        self._require("prefix_len", is_prefix, wanted)
-
-    def _require_modes(self) -> None:
-        if self.action not in ACTION_MODES:
-            raise ContractError(
-                f"action {self.action!r} is unknown; use one of {', '.join(ACTION_MODES)}"
-            )
-        is_some = isinstance(self.modes, tuple) and len(self.modes) > 0
-        self._require("modes", is_some, "a tuple of at least one mode")
+        yield "state_extras", are_extras, f"some of {', '.join(EXTRA_NAMES)}, each once"
         known = ACTION_MODES[self.action]
-        if unknown := [mode for mode in self.modes if mode not in known]:
-            raise ContractError(
-                f"modes {unknown} are not flown with {self.action}; known are {', '.join(known)}"
-            )
+        are_modes = isinstance(self.modes, tuple) and len(self.modes) > 0
+        wanted = f"one or more of {', '.join(known)} for action {self.action!r}"
+        yield "modes", are_modes and set(self.modes) <= set(known), wanted
 
     @property
     def state_names(self) -> tuple[str, ...]:

@@ -77,10 +77,11 @@ def stand_in_of(head: bytes) -> tuple[str, str] | None:
     return None
 
 
-def last_line(error: Exception) -> str:
-    """Return the last line of an error's text, or its type if the text is empty."""
-    lines = [line.strip() for line in str(error).splitlines() if line.strip()]
-    return lines[-1] if lines else type(error).__name__
+def last_line(said: str | Exception) -> str:
+    """Return the last line of a text or an error; the error's type if that is empty."""
+    lines = [line.strip() for line in str(said).splitlines() if line.strip()]
+    nothing = "(nothing)" if isinstance(said, str) else type(said).__name__
+    return lines[-1][:300] if lines else nothing
 
 
 def why_unreadable(path: Path, error: Exception, kind: str = "") -> str:

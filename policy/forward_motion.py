@@ -11,7 +11,7 @@ from dataclasses import replace
 from typing import NamedTuple, TypeAlias
 
 from policy.contract import Contract
-from policy.rotation import Quaternion, Vector, conjugate, matrix_columns, rotate
+from policy.rotation import Quaternion, Vector, conjugate, level_heading, rotate
 from policy.stick_loop import GRAVITY_MPS2, LAG_S, StickLoop, StickMotion, motion_of_sticks, turned
 
 Four: TypeAlias = tuple[float, float, float, float]
@@ -89,9 +89,7 @@ class ForwardMotion:
     def _towards(self, velocity: Vector, action: Four, attitude: Quaternion, dt_s: float) -> Vector:
         x, y, down, _ = action
         if self._contract.velocity_frame == "heading":
-            (north, east, _), _, _ = matrix_columns(*attitude)
-            level = max(math.hypot(north, east), 1e-9)
-            cosine, sine = north / level, east / level
+            cosine, sine = level_heading(attitude)
             x, y = cosine * x - sine * y, sine * x + cosine * y
         share = 1.0 - math.exp(-dt_s / VELOCITY_LAG_S)
         vx, vy, vz = (v + share * (to - v) for v, to in zip(velocity, (x, y, down), strict=True))

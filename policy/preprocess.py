@@ -1,7 +1,7 @@
 """Preprocessing of camera images and vehicle states, shared by training and flight.
 
 Images are cropped, fitted and normalised here, before the network, by the checkpoint's contract.
-Networks turn the state into body axes and normalise it inside (``encoders.StateEncoder``) by
+Networks turn the state into body axes and normalise it inside (``nets.toge.StateEncoder``) by
 functions of this module, so a checkpoint takes SI units. No torch: scripted policies use this
 module too.
 """
@@ -105,15 +105,6 @@ def input_to_bytes(planes: FloatArray, contract: Contract) -> FloatArray:
     values = (planes - offset[colours].reshape(per_plane)) / scale[colours].reshape(per_plane)
     whole: FloatArray = np.rint(values).clip(0.0, 255.0).astype(np.float32)
     return whole
-
-
-def dummy_images(contract: Contract) -> CameraImage:
-    """Return grey images, or depth images of 2000 units, of all cameras at all observations.
-
-    The leading axes are as in ``Contract.image_shape``; the last are ``Contract.picture_shape``.
-    """
-    shape = (*contract.image_shape[:-3], *contract.picture_shape)
-    return np.full(shape, 2000, np.uint16) if contract.is_depth else np.full(shape, 128, np.uint8)
 
 
 def fit_image(image: CameraImage, contract: Contract) -> CameraImage:

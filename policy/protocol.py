@@ -2,6 +2,7 @@
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from itertools import product
 from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
@@ -52,6 +53,29 @@ class DualRatePolicy(SingleRatePolicy, Protocol):
         self, feature: Any, state: Any, action_history: Any, num_diffusion_steps: int
     ) -> Any:
         """Sample a chunk from cached features [B, *contract.feature_shape], states and history."""
+
+
+def predict_by_pair(
+    self: DualRatePolicy, image: Any, state: Any, action_history: Any, num_diffusion_steps: int
+) -> Any:
+    """``predict`` of a policy with a fast pair: encode every image, then sample one chunk."""
+    contract, shape = self.contract, image.shape
+    steps, cameras = contract.observation_steps, len(contract.cameras)
+    encode: Callable[..., Any] = self.encode_visual
+    if cameras == 1:
+        images = image.reshape(len(image), steps, *shape[-3:])
+        features = [encode(images[:, step]) for step in range(steps)]
+    else:
+        images = image.reshape(len(image), steps, cameras, *shape[-3:])
+        pairs = product(range(steps), range(cameras))
+        features = [encode(images[:, step, camera], camera) for step, camera in pairs]
+    feature = features[0]
+    if len(features) > 1:
+        library: Any = np
+        if not isinstance(feature, np.ndarray):
+            import torch as library  # not for scripted policies
+        feature = library.stack(features, 1).reshape(len(image), *contract.feature_shape)
+    return self.predict_fast(feature, state, action_history, num_diffusion_steps)
 
 
 class Encode(Protocol):

@@ -57,6 +57,13 @@ def matrix_columns(w: Any, x: Any, y: Any, z: Any) -> tuple[tuple[Any, Any, Any]
     return forward, side, up
 
 
+def level_heading(q: Quaternion) -> tuple[float, float]:
+    """Return cosine and sine of the heading of the body's first axis."""
+    (north, east, _), _, _ = matrix_columns(*q)
+    level = max(math.hypot(north, east), 1e-9)
+    return north / level, east / level
+
+
 def rotation_vector(q: Quaternion | Array) -> Any:
     """Return axis times angle in rad, 3 numbers, for the shorter way round."""
     library: Any = math if isinstance(q, tuple) else np

@@ -16,7 +16,16 @@ import numpy as np
 from policy.contract import QUATERNION, RATE, VELOCITY, Contract, FloatArray
 from policy.errors import ContractError
 from policy.protocol import PolicyRunner
-from policy.rotation import Array, Quaternion, Vector, conjugate, matrix_columns, multiply, rotate
+from policy.rotation import (
+    Array,
+    Quaternion,
+    Vector,
+    conjugate,
+    level_heading,
+    matrix_columns,
+    multiply,
+    rotate,
+)
 
 GRAVITY_MPS2 = 9.80665
 TILT_GAIN_PER_S = 8.0
@@ -195,9 +204,7 @@ class StickLoop:
         lean_rad = min(length_rad, math.radians(self.contract.full_lean_deg))
         share = math.sin(lean_rad) / max(length_rad, 1e-9)
         ahead, right = wanted.forward_rad, wanted.right_rad
-        (north, east, _), _, _ = matrix_columns(*attitude)
-        level = max(math.hypot(north, east), 1e-9)
-        cosine, sine = north / level, east / level
+        cosine, sine = level_heading(attitude)
         return (
             share * (cosine * ahead - sine * right),
             share * (sine * ahead + cosine * right),

@@ -9,8 +9,7 @@ from mavbridge.commands.config import ExportPolicyConfig
 from mavbridge.core.errors import UserError
 from mavbridge.core.extras import require_packages
 from policy.adapters.export import export_onnx, export_torchscript
-from policy.engines.choose import chunks_of_samples
-from policy.engines.parity import make_parity_samples, parity_failure
+from policy.engines.choose import chunks_of_samples, make_parity_samples, parity_failure
 from policy.loading.builtin import BUILTIN_KINDS, load_builtin
 from policy.loading.load import load_policy
 from policy.loading.request import PolicyRequest

@@ -32,13 +32,13 @@ from mavbridge.observe.output import flight_console
 from policy.contract import Contract
 from policy.engines.runner import ExecutionSettings, make_numpy_runner
 from policy.protocol import PolicyRunner
-from policy.scripted import ScriptedPolicy
 from policy.scripted.controllers import (
     Axis,
     DoubletStep,
     doublet_length_s,
     doublet_steps,
 )
+from policy.scripted.policy import ScriptedPolicy
 from policy.stick_loop import motion_of_sticks
 
 LEAST_R_SQUARED = 0.7

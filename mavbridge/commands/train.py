@@ -29,7 +29,7 @@ from policy.training.policy_run import Check, train_policy
 from policy.training.report import Hooks, TrainingProgress, TrainResult
 from policy.training.run_folder import TrainingStoppedError
 from policy.training.settings import RunSettings, TrainSettings, WorldModelSettings
-from policy.training.world_model.run import train_world_model
+from policy.training.world_model_run import train_world_model
 from policy.world_model.config import WorldModelConfig
 
 

@@ -11,14 +11,14 @@ from pathlib import Path
 from typing import Any, Literal, NamedTuple
 
 from policy import files
+from policy.adapters.description import read_graph
 from policy.adapters.interface import ACTION_FIELDS, DERIVED_NAMES, UNANSWERED, is_unanswered
 from policy.adapters.lerobot.config import CONFIG_FILE, read_json
-from policy.adapters.onnx.files import read_graph
 from policy.contract import (
     ACTION_DIM,
-    ENVELOPE_TERMS,
     IMAGENET_MEAN_RGB,
     IMAGENET_STD_RGB,
+    LIMIT_TERMS,
     STATE_NAMES,
     Contract,
 )
@@ -59,11 +59,6 @@ _STICKS = (
     *("lean_dead_zone", "yaw_dead_zone", "throttle_dead_zone"),
 )
 """Terms of recorded flights that go into every draft."""
-_LIMITS = (
-    *("max_state_age_s", "max_velocity_age_s", "max_feature_age_s", "max_chunk_age_s"),
-    *("max_stall_s", *ENVELOPE_TERMS),
-)
-"""Terms that go into a draft only if the flights' values differ from the defaults."""
 
 
 class Entry(NamedTuple):
@@ -289,11 +284,12 @@ def _ports(graphs: Sequence[Path]) -> tuple[list[_Port], list[_Port]]:
 def recorded_entries(contracts: Sequence[Mapping[str, Any]]) -> list[Entry]:
     """Draft the terms that all flights share, and ask for the terms that differ between flights.
 
+    Limits go into a draft only if the flights' values differ from the defaults.
     ``contracts`` come from the flights' ``meta.json``; missing entries have their default.
     """
     usual = json.loads(Contract().to_json())
     entries = []
-    for name in (*_STICKS, *_LIMITS):
+    for name in (*_STICKS, *LIMIT_TERMS):
         found = sorted({json.dumps(each.get(name, usual[name])) for each in contracts})
         value = json.loads(found[0]) if found else usual[name]
         if len(found) > 1:

@@ -13,8 +13,7 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
-from policy.adapters.description import DESCRIPTION
-from policy.adapters.onnx.files import DENOISER, ENCODER
+from policy.adapters.description import DENOISER, DESCRIPTION, ENCODER
 from policy.contract import ACTION_DIM
 from policy.nets.toge import BuiltinPolicy
 

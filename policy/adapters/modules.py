@@ -14,7 +14,6 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import torch
 from torch import Tensor, nn
 
@@ -24,7 +23,7 @@ from policy.engines.torch_eager import modules_of
 from policy.errors import CheckpointError, PolicyError, user_code
 from policy.files import why_unreadable
 from policy.nets.diffusion import NoiseSchedule, ddim_solve, flight_noise
-from policy.protocol import SingleRatePolicy
+from policy.protocol import SingleRatePolicy, predict_by_pair
 
 Call = Callable[..., Any]
 """Part of a policy, called as this module's docstring says."""
@@ -125,7 +124,7 @@ class ForwardPolicy(nn.Module):
         self.held = nn.ModuleList(held)
         self._call, self._interface = call, interface
 
-    def predict(self, image: Any, state: Any, action_history: Any, steps: int) -> Any:
+    def predict(self, image: Any, state: Any, action_history: Any, num_diffusion_steps: int) -> Any:
         """Make the call."""
         return self.to_chunk(self._call(image, *self._own(state, action_history)))
 
@@ -153,16 +152,13 @@ class HeadPolicy(ForwardPolicy):
         """Encode an image [1, 3, H, W] -> feature [1, F]; all cameras share one encoder."""
         return self._encode(image)
 
-    def predict_fast(self, feature: Any, state: Any, action_history: Any, steps: int) -> Any:
+    def predict_fast(
+        self, feature: Any, state: Any, action_history: Any, num_diffusion_steps: int
+    ) -> Any:
         """Call the head once."""
         return self.to_chunk(self._call(feature, *self._own(state, action_history)))
 
-    def predict(self, image: Any, state: Any, action_history: Any, steps: int) -> Any:
-        """Encode the images, then call ``predict_fast``."""
-        library: Any = torch if isinstance(image, Tensor) else np
-        features = [self.encode_visual(each) for each in image.reshape(-1, 1, *image.shape[-3:])]
-        feature = library.stack(features).reshape(1, *self.contract.feature_shape)
-        return self.predict_fast(feature, state, action_history, steps)
+    predict = predict_by_pair
 
 
 class DenoiserPolicy(HeadPolicy):
@@ -193,9 +189,11 @@ class DenoiserPolicy(HeadPolicy):
         """Call the denoiser once."""
         return self._call(noisy, timestep, feature, *self._own(state, action_history))
 
-    def predict_fast(self, feature: Any, state: Any, action_history: Any, steps: int) -> Any:
+    def predict_fast(
+        self, feature: Any, state: Any, action_history: Any, num_diffusion_steps: int
+    ) -> Any:
         """Run a whole solve, in torch."""
-        ddim = self.schedule.ddim_steps(steps)
+        ddim = self.schedule.ddim_steps(num_diffusion_steps)
 
         def denoise(index: int, noisy: Tensor) -> Tensor:
             timestep = noisy.new_full((1,), float(ddim[index].timestep))

@@ -15,13 +15,12 @@ from contextlib import contextmanager
 from hashlib import sha256
 from pathlib import Path
 from types import ModuleType
-from typing import Any
 
 from policy.adapters.interface import Interface
 from policy.contract import Contract
 from policy.errors import ContractError, PolicyError, user_code, user_line
 from policy.files import user_path
-from policy.protocol import DualRatePolicy, SingleRatePolicy
+from policy.protocol import DualRatePolicy, SingleRatePolicy, predict_by_pair
 
 FORMS = (
     "toge[:SIZE][:BACKBONE], resnet-unet[:SIZE], scripted[:PROGRAM][:ACTION][:air], "
@@ -164,16 +163,8 @@ def _with_predict(found: type) -> type:
     has_pair = all(callable(getattr(found, name, None)) for name in _FAST_PAIR)
     if not has_pair or getattr(found, "predict", None) is not None:
         return found
-
-    def predict(
-        self: DualRatePolicy, image: Any, state: Any, action_history: Any, num_diffusion_steps: int
-    ) -> Any:
-        if len(self.contract.image_shape) > 3:
-            raise PolicyError("with several images --single-rate needs a method predict")
-        feature = self.encode_visual(image)
-        return self.predict_fast(feature, state, action_history, num_diffusion_steps)
-
-    return type(found.__name__, (found,), {"predict": predict, "__module__": found.__module__})
+    members = {"predict": predict_by_pair, "__module__": found.__module__}
+    return type(found.__name__, (found,), members)
 
 
 def _instance(spec: str, found: type, checkpoint: Path | None, seed: int) -> SingleRatePolicy:

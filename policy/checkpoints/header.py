@@ -31,6 +31,11 @@ _FOLDERS: tuple[tuple[str, str, str], ...] = (
     ("*.onnx", "a folder of ONNX models", "fly it with --policy onnx:{0}"),
 )
 """Entry of a folder, the folder's kind, and the next step."""
+CONTRACT_KEY = "contract"
+ARCHITECTURE_KEY = "architecture"
+TRAINING_KEY = "training"
+HEADER_KEYS = (CONTRACT_KEY, ARCHITECTURE_KEY)
+SUFFIXES = (".safetensors", ".pt", ".pth", ".ckpt")
 
 
 def detect(path: Path) -> str | None:
@@ -122,13 +127,6 @@ def _lerobot(folder: Path) -> tuple[str, str] | None:
         f"of its types {' and '.join(LEROBOT_TYPES)} fly from their files; run this one in "
         "LeRobot's own environment behind --policy ws://HOST:PORT",
     )
-
-
-CONTRACT_KEY = "contract"
-ARCHITECTURE_KEY = "architecture"
-TRAINING_KEY = "training"
-HEADER_KEYS = (CONTRACT_KEY, ARCHITECTURE_KEY)
-SUFFIXES = (".safetensors", ".pt", ".pth", ".ckpt")
 
 
 def require_file(path: Path, suffixes: Sequence[str]) -> None:

@@ -29,8 +29,8 @@ from policy.checkpoints.header import (
     require_file,
     require_header,
 )
-from policy.checkpoints.state_dicts import find_weights
 from policy.checkpoints.tensors import (
+    find_weights,
     pack,
     read_tensors,
     require_finite,
@@ -40,7 +40,7 @@ from policy.checkpoints.tensors import (
     write_tensors,
 )
 from policy.contract import Contract, FloatArray
-from policy.engines.parity import ParitySamples, make_parity_samples, parity_failure
+from policy.engines.choose import ParitySamples, make_parity_samples, parity_failure
 from policy.errors import CheckpointError, PolicyError
 from policy.files import why_unreadable
 from policy.nets.diffusion import NoiseSchedule

@@ -26,7 +26,7 @@ from policy.engines.openvino_compile import (
     update_digest,
 )
 from policy.engines.runner import Act, ExecutionSettings, Precision, assemble, to_numpy
-from policy.nets.action_head import DiffusionHead, size_dims
+from policy.nets.diffusion import DiffusionHead, size_dims
 from policy.nets.toge import BuiltinPolicy
 from policy.nets.unet1d import Conv, ResidualBlock, UNet1d, norm_of_groups
 from policy.preprocess import egocentric, egocentric_scale

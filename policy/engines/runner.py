@@ -8,7 +8,7 @@ import numpy as np
 
 from policy.contract import ACTION_DIM, QUATERNION, CameraImage, Contract, FloatArray
 from policy.errors import PolicyError, user_code
-from policy.preprocess import dummy_images, image_to_input
+from policy.preprocess import image_to_input
 from policy.protocol import DualRatePolicy, PolicyRunner, SingleRatePolicy, StepwisePolicy
 
 EngineName = Literal["auto", "torch", "openvino", "cuda-graph"]
@@ -195,7 +195,7 @@ def assemble(
 def encode_all(runner: PolicyRunner, images: CameraImage) -> FloatArray:
     """Encode one image of each camera at each observation; return the argument of ``act``.
 
-    ``images`` has the axes of ``preprocess.dummy_images``, and may have another size.
+    ``images`` has the axes of ``dummy_sample``, and may have another size.
     """
     contract = runner.contract
     steps, cameras = contract.observation_steps, len(contract.cameras)
@@ -203,6 +203,17 @@ def encode_all(runner: PolicyRunner, images: CameraImage) -> FloatArray:
     return runner.join(
         [[runner.encode(image, camera) for camera, image in enumerate(row)] for row in images]
     )
+
+
+def dummy_sample(contract: Contract) -> tuple[CameraImage, FloatArray, FloatArray]:
+    """Return grey images, or depth images of 2000 units, a level state and neutral actions.
+
+    The images' leading axes are as in ``Contract.image_shape``, the last ``picture_shape``.
+    """
+    shape = (*contract.image_shape[:-3], *contract.picture_shape)
+    images = np.full(shape, 2000, np.uint16) if contract.is_depth else np.full(shape, 128, np.uint8)
+    history = np.zeros((1, *contract.history_shape), np.float32)
+    return images, level_state(contract), history
 
 
 def level_state(contract: Contract) -> FloatArray:
@@ -214,8 +225,7 @@ def level_state(contract: Contract) -> FloatArray:
 
 def _try(runner: PolicyRunner) -> None:
     contract = runner.contract
-    images, state = dummy_images(contract), level_state(contract)
-    history = np.zeros((1, *contract.history_shape), np.float32)
+    images, state, history = dummy_sample(contract)
     try:
         if runner.dual_rate:
             for camera in range(len(contract.cameras)):

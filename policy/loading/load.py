@@ -10,9 +10,8 @@ from dataclasses import replace
 from functools import partial
 from pathlib import Path
 
-from policy.adapters.description import Description, read_description
+from policy.adapters.description import Description, OnnxFiles, find_onnx_files, read_description
 from policy.adapters.lerobot.plan import Plan, read_plan
-from policy.adapters.onnx.files import OnnxFiles, find_onnx_files
 from policy.adapters.user_class import check_user_class, load_user_class
 from policy.adapters.websocket.kind import SCHEMES, check_server, load_server_policy
 from policy.checkpoints.header import detect, read_contract
@@ -164,7 +163,7 @@ def _find(
     """Create the policy, notes for the user, and its own choice of an engine if it has one."""
     if not request.spec.startswith(f"{ONNX}:"):
         return *_find_other(request, now_s), None
-    from policy.adapters.onnx.policies import OnnxGraphs
+    from policy.adapters.onnx import OnnxGraphs
 
     graphs = OnnxGraphs(_onnx_files(request), request.seed)
     in_float32 = graphs.at("f32", "f32")

@@ -5,12 +5,9 @@ from dataclasses import dataclass
 from pathlib import Path
 from statistics import median
 
-import numpy as np
-
 from policy.contract import Contract
-from policy.engines.runner import EngineName, encode_all, level_state
+from policy.engines.runner import EngineName, dummy_sample, encode_all
 from policy.errors import NoChunkError, PolicyError
-from policy.preprocess import dummy_images
 from policy.protocol import PolicyRunner
 
 REPETITIONS = 5
@@ -34,8 +31,7 @@ def measure_times(runner: PolicyRunner, now_s: Callable[[], float]) -> SolveTime
     If the clock stands still, as in simulations, each call runs only once.
     """
     contract = runner.contract
-    images, state = dummy_images(contract), level_state(contract)
-    history = np.zeros((1, *contract.history_shape), np.float32)
+    images, state, history = dummy_sample(contract)
     encode_s: list[float] = []
     act_s: list[float] = []
     begun_s = now_s()

@@ -43,8 +43,7 @@ class Attention(nn.Module):
 
     def _merged(self, attended: Tensor) -> Tensor:
         """Merge the heads: [B, heads, L, dim / heads] -> [B, L, dim]."""
-        out: Tensor = self.project(attended.transpose(1, 2).flatten(2))
-        return out
+        return self.project(attended.transpose(1, 2).flatten(2))
 
 
 def is_tracing() -> bool:

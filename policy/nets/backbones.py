@@ -26,6 +26,9 @@ STAGES = (
     (6, 3, 1, 384, 2),
 )
 OUT_CHANNELS = 1536
+WIDTHS = (96, 192, 384, 768)
+DEPTHS = (3, 3, 9, 3)
+NORM_EPS = 1e-6
 
 
 class SqueezeExcitation(nn.Module):
@@ -38,7 +41,6 @@ class SqueezeExcitation(nn.Module):
         self.activation = nn.SiLU(inplace=True)
 
     def forward(self, x: Tensor) -> Tensor:
-        """Gate ``x``."""
         pooled = x.mean(dim=(2, 3), keepdim=True)
         return x * torch.sigmoid(self.fc2(self.activation(self.fc1(pooled))))
 
@@ -88,9 +90,7 @@ class EfficientNetB3(nn.Module):
         self.out_dim = MOMENTS * OUT_CHANNELS
 
     def forward(self, image: Tensor) -> Tensor:
-        """Return ``resnet.moments`` of the last map, flattened."""
-        pooled: Tensor = moments(self.features(image)).flatten(1)
-        return pooled
+        return moments(self.features(image)).flatten(1)
 
 
 def _conv_norm(
@@ -110,16 +110,10 @@ def _conv_norm(
     return nn.Sequential(*layers)
 
 
-WIDTHS = (96, 192, 384, 768)
-DEPTHS = (3, 3, 9, 3)
-NORM_EPS = 1e-6
-
-
 class ChannelNorm(nn.LayerNorm):
     """LayerNorm over the channels of [B, C, H, W]."""
 
     def forward(self, x: Tensor) -> Tensor:
-        """Normalise the channels of [B, C, H, W]."""
         return super().forward(x.permute(0, 2, 3, 1)).permute(0, 3, 1, 2)
 
 
@@ -131,7 +125,6 @@ class Permute(nn.Module):
         self.axes = axes
 
     def forward(self, x: Tensor) -> Tensor:
-        """Return ``x`` with its axes reordered."""
         return x.permute(self.axes)
 
 
@@ -153,8 +146,7 @@ class ConvNextBlock(nn.Module):
 
     def forward(self, x: Tensor) -> Tensor:
         """Map [B, C, H, W] to the same shape."""
-        out: Tensor = x + self.layer_scale * self.block(x)
-        return out
+        return x + self.layer_scale * self.block(x)
 
 
 class ConvNextTiny(nn.Module):

@@ -16,6 +16,11 @@ from policy.contract import FloatArray
 
 MOMENTS = 3
 """Moments per channel: average, and averages weighted by the position rightwards and downwards."""
+RESNET8_CHANNELS = (24, 48, 96, 128)
+"""Channels out of the first convolution and of the three blocks."""
+RESNET8_CELLS = 6
+"""Cells along a side of the map before the last layer, for an image of 96 pixels."""
+RESNET8_CELL_CHANNELS = 32
 
 
 def moments(features: Tensor) -> Tensor:
@@ -54,13 +59,6 @@ def _places(count: int) -> FloatArray:
     return (math.sqrt(3.0) * centres).astype(np.float32)
 
 
-RESNET8_CHANNELS = (24, 48, 96, 128)
-"""Channels out of the first convolution and of the three blocks."""
-RESNET8_CELLS = 6
-"""Cells along a side of the map before the last layer, for an image of 96 pixels."""
-RESNET8_CELL_CHANNELS = 32
-
-
 class BasicBlock(nn.Module):
     """Two 3x3 convolutions around a shortcut."""
 
@@ -79,8 +77,7 @@ class BasicBlock(nn.Module):
         """Map [B, C_in, H, W] -> [B, width, H/stride, W/stride]."""
         shortcut = x if self.downsample is None else self.downsample(x)
         hidden = self.relu(self.bn1(self.conv1(x)))
-        out: Tensor = self.relu(self.bn2(self.conv2(hidden)) + shortcut)
-        return out
+        return self.relu(self.bn2(self.conv2(hidden)) + shortcut)
 
 
 class Bottleneck(nn.Module):
@@ -105,8 +102,7 @@ class Bottleneck(nn.Module):
         shortcut = x if self.downsample is None else self.downsample(x)
         hidden = self.relu(self.bn1(self.conv1(x)))
         hidden = self.relu(self.bn2(self.conv2(hidden)))
-        out: Tensor = self.relu(self.bn3(self.conv3(hidden)) + shortcut)
-        return out
+        return self.relu(self.bn3(self.conv3(hidden)) + shortcut)
 
 
 _DEPTHS: dict[str, tuple[type[BasicBlock] | type[Bottleneck], tuple[int, int, int, int]]] = {
@@ -137,10 +133,8 @@ class LastMap(nn.Module):
         self.channels = 512 * wide
 
     def forward(self, image: Tensor) -> Tensor:
-        """Return the last map."""
         x = self.maxpool(self.relu(self.bn1(self.conv1(image))))
-        out: Tensor = self.layer4(self.layer3(self.layer2(self.layer1(x))))
-        return out
+        return self.layer4(self.layer3(self.layer2(self.layer1(x))))
 
 
 class ResNet(LastMap):
@@ -153,9 +147,7 @@ class ResNet(LastMap):
         self.out_dim = MOMENTS * self.channels
 
     def forward(self, image: Tensor) -> Tensor:
-        """Return ``moments`` of the last map, flattened."""
-        pooled: Tensor = moments(super().forward(image)).flatten(1)
-        return pooled
+        return moments(super().forward(image)).flatten(1)
 
 
 class ResNet8(nn.Module):
@@ -182,11 +174,9 @@ class ResNet8(nn.Module):
         self.fc = nn.Linear(RESNET8_CELL_CHANNELS * RESNET8_CELLS**2, self.out_dim)
 
     def forward(self, image: Tensor) -> Tensor:
-        """Apply a fully connected layer to the cells of the last map."""
         x = self.layers(self.relu(self.bn1(self.conv1(image))))
         cells = F.adaptive_avg_pool2d(self.relu(self.bn2(self.conv2(x))), RESNET8_CELLS)
-        feature: Tensor = self.relu(self.fc(cells.flatten(1)))
-        return feature
+        return self.relu(self.fc(cells.flatten(1)))
 
 
 def _layer(

@@ -16,11 +16,99 @@ from torch import Tensor, nn
 
 from policy.contract import ACTION_DIM, Contract
 from policy.errors import ContractError, PolicyError
-from policy.nets.action_head import DiffusionHead, size_dims
+from policy.nets.attention import Attention, is_tracing
 from policy.nets.backbones import build_backbone
-from policy.nets.diffusion import NoiseSchedule
-from policy.nets.encoders import Fusion, HistoryEncoder, StateEncoder, require_shape
+from policy.nets.diffusion import DiffusionHead, NoiseSchedule, size_dims
 from policy.nets.names import BACKBONE_NAMES, BackboneName, Size
+from policy.preprocess import egocentric_columns, egocentric_scale
+
+HEADS = 4
+
+
+def require_shape(name: str, array: Tensor, *shape: int) -> None:
+    """Raise a ``PolicyError`` unless ``array`` is [B, *shape]."""
+    if array.ndim != len(shape) + 1 or tuple(array.shape[1:]) != shape:
+        wanted = ", ".join(["B", *map(str, shape)])
+        raise PolicyError(f"{name} must be [{wanted}], got {list(array.shape)}")
+
+
+class StateEncoder(nn.Module):
+    """State [B, state_dim] in SI units -> token [B, dim]."""
+
+    def __init__(self, dim: int, contract: Contract) -> None:
+        super().__init__()
+        is_plain = len(contract.cameras) == 1 and contract.observation_steps == 1
+        if not is_plain or contract.state_extras or contract.is_depth:
+            raise ContractError(
+                "the networks of this project take the newest image of one camera in colour and "
+                f"the newest state; the contract asks for {contract.image_channels} of cameras "
+                f"{list(contract.cameras)}, "
+                f"{contract.observation_steps} observations and extras "
+                f"{list(contract.state_extras)}: use a policy class of your own"
+            )
+        scale = egocentric_scale(contract)
+        self.mlp = nn.Sequential(nn.Linear(len(scale), dim), nn.SiLU(), nn.Linear(dim, dim))
+        self._scale = nn.Buffer(torch.tensor(scale), persistent=False)
+
+    def normalise(self, state: Tensor) -> Tensor:
+        """Apply ``preprocess.egocentric`` to tensors."""
+        return torch.stack(egocentric_columns(state.unbind(1)), dim=1) / self._scale
+
+    def forward(self, state: Tensor) -> Tensor:
+        return self.mlp(self.normalise(state))
+
+
+class AttentionBlock(Attention):
+    """Self-attention and an MLP, each after a norm, around a shortcut; [B, T, dim] -> same."""
+
+    def __init__(self, dim: int) -> None:
+        super().__init__(dim, HEADS)
+        self.norm1, self.norm2 = nn.LayerNorm(dim), nn.LayerNorm(dim)
+        self.mlp = nn.Sequential(nn.Linear(dim, 2 * dim), nn.SiLU(), nn.Linear(2 * dim, dim))
+
+    def transform(self, tokens: Tensor) -> Tensor:
+        """Transform tokens [B, T, dim] to the same shape, each informed by all."""
+        tokens = tokens + self.among(self.norm1(tokens), plainly=is_tracing())
+        return tokens + self.mlp(self.norm2(tokens))
+
+
+class HistoryEncoder(nn.Module):
+    """Past actions [B, K, 4], oldest first, through self-attention -> [B, out_dim]."""
+
+    def __init__(self, dim: int, history_len: int) -> None:
+        super().__init__()
+        self.out_dim = history_len * dim
+        self.embed = nn.Linear(ACTION_DIM, dim)
+        self.position = nn.Parameter(0.02 * torch.randn(1, history_len, dim))
+        self.attention = AttentionBlock(dim)
+
+    def forward(self, action_history: Tensor) -> Tensor:
+        tokens = self.attention.transform(self.embed(action_history) + self.position)
+        return tokens.flatten(1)
+
+
+class Fusion(nn.Module):
+    """Visual token, state token and encoded history -> condition [B, dim].
+
+    The right sticks depend jointly on the view and on the vehicle's motion. That takes depth, and
+    depth is cheapest here: a layer costs a hundredth of the denoiser. In equal training time,
+    attention among the tokens reached a stick error of 0.091, this network 0.085.
+    """
+
+    def __init__(self, dim: int, history_dim: int) -> None:
+        super().__init__()
+        self.mlp = nn.Sequential(
+            nn.Linear(2 * dim + history_dim, 2 * dim),
+            nn.SiLU(),
+            nn.Linear(2 * dim, 2 * dim),
+            nn.SiLU(),
+            nn.Linear(2 * dim, 2 * dim),
+            nn.SiLU(),
+            nn.Linear(2 * dim, dim),
+        )
+
+    def forward(self, visual: Tensor, state: Tensor, history: Tensor) -> Tensor:
+        return self.mlp(torch.cat([visual, state, history], dim=1))
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -87,8 +175,7 @@ class BuiltinPolicy(nn.Module):
 
     def _encode(self, image: Tensor) -> Tensor:
         require_shape("image", image, 3, self.contract.image_height, self.contract.image_width)
-        feature: Tensor = self.visual_projection(self.backbone(image))
-        return feature
+        return self.visual_projection(self.backbone(image))
 
     def _fuse(self, feature: Tensor, state: Tensor, action_history: Tensor | None) -> Tensor:
         require_shape("state", state, self.contract.state_dim)
@@ -124,7 +211,6 @@ class TogeConfig(BuiltinConfig):
 
     @property
     def feature_dim(self) -> int:
-        """Width of the cached feature."""
         return size_dims(self.size).base_dim
 
 
@@ -139,9 +225,7 @@ class Toge(BuiltinPolicy):
         self.head = DiffusionHead(config.size, self.contract, config.schedule)
 
     def condition(self, feature: Tensor, state_token: Tensor, action_history: Tensor) -> Tensor:
-        """Fuse feature [B, F], encoded state [B, F], history [B, K, 4] -> condition [B, C]."""
-        condition: Tensor = self.fusion(feature, state_token, self.history_encoder(action_history))
-        return condition
+        return self.fusion(feature, state_token, self.history_encoder(action_history))
 
     def encode_visual(self, image: Tensor) -> Tensor:
         """Encode an image [B, 3, H, W] -> feature [B, F]: the slow path."""
@@ -190,11 +274,7 @@ class ResnetUnet(BuiltinPolicy):
         self.head = DiffusionHead(config.size, self.contract, config.schedule)
 
     def condition(self, feature: Tensor, state_token: Tensor, action_history: Tensor) -> Tensor:
-        """Fuse feature [B, F], encoded state [B, F], history [B, K, 4] -> condition [B, C]."""
-        condition: Tensor = self.fuse(
-            torch.cat([feature, state_token, action_history.flatten(1)], dim=1)
-        )
-        return condition
+        return self.fuse(torch.cat([feature, state_token, action_history.flatten(1)], dim=1))
 
 
 def build_policy(config: BuiltinConfig) -> BuiltinPolicy:

@@ -38,6 +38,21 @@ MOST_VEIL = 0.9
 MOST_COVERS = 3
 COVER_SIDE = (0.08, 0.4)
 """Range of a cover's side, as a share of the image's."""
+SHIFT = 0.015
+"""Largest shift of an image, as a share of its side: about a degree of camera mount error."""
+BRIGHTNESS, CONTRAST, COLOUR, NOISE = 0.15, 0.25, 0.08, 0.03
+"""Half-ranges of the image augmentations, as shares of full scale; NOISE is the largest sigma."""
+AHEAD = 3
+"""Batches to prepare while the network computes."""
+_PER_SAMPLE = ("state", "history", "chunk", "known", "noise", "timestep")
+VALIDATION_KEY = 2**31
+"""Random key of validation samples, in place of a step; no run has this many steps."""
+T = TypeVar("T")
+ENCODE_BATCH = 64
+Encode: TypeAlias = Callable[[Indices, bool], Tensor]
+"""(images, True to mirror all of them) -> [B, D]."""
+Job: TypeAlias = tuple[tuple[Indices, bool], ...]
+"""Images to encode between two checks of the time, each part plain or mirrored."""
 
 
 def disturb(images: ImageArray, random: np.random.Generator) -> None:
@@ -76,19 +91,6 @@ def _cover(image: ImageArray, random: np.random.Generator) -> None:
     top, left = np.maximum(middle - half, 0)
     bottom, right = middle + half + 1
     image[top:bottom, left:right] = random.integers(0, 256, 3)
-
-
-SHIFT = 0.015
-"""Largest shift of an image, as a share of its side: about a degree of camera mount error."""
-BRIGHTNESS, CONTRAST, COLOUR, NOISE = 0.15, 0.25, 0.08, 0.03
-"""Half-ranges of the image augmentations, as shares of full scale; NOISE is the largest sigma."""
-AHEAD = 3
-"""Batches to prepare while the network computes."""
-_PER_SAMPLE = ("state", "history", "chunk", "known", "noise", "timestep")
-VALIDATION_KEY = 2**31
-"""Random key of validation samples, in place of a step; no run has this many steps."""
-
-T = TypeVar("T")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -165,8 +167,7 @@ def next_of(among: Indices, step: int, count: int, seed: int) -> Indices:
         _order(seed, int(epoch), total)[at[at // total == epoch] % total]
         for epoch in np.unique(at // total)
     ]
-    chosen: Indices = among[np.concatenate(parts)]
-    return chosen
+    return among[np.concatenate(parts)]
 
 
 @lru_cache(maxsize=4)
@@ -316,14 +317,6 @@ def normalise_image(image: Tensor, contract: Contract) -> Tensor:
     mean = torch.tensor(contract.image_mean_rgb, device=image.device).view(1, 3, 1, 1)
     std = torch.tensor(contract.image_std_rgb, device=image.device).view(1, 3, 1, 1)
     return (image - mean) / std
-
-
-ENCODE_BATCH = 64
-
-Encode: TypeAlias = Callable[[Indices, bool], Tensor]
-"""(images, True to mirror all of them) -> [B, D]."""
-Job: TypeAlias = tuple[tuple[Indices, bool], ...]
-"""Images to encode between two checks of the time, each part plain or mirrored."""
 
 
 def both_ways(frames: Indices, *, mirror: bool) -> list[Job]:

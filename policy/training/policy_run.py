@@ -114,8 +114,7 @@ class _PolicyRun(TrainingRun[Trainee, Batch]):
         return self.settings.learning_rate * (FINE_TUNE_RATE if self.settings.start_from else 1)
 
     def encoder(self, trainee: Trainee) -> nn.Module:
-        backbone: nn.Module = trainee.policy.backbone
-        return backbone
+        return trainee.policy.backbone
 
     def encode(self, stage: TrainingStage, *, is_new: bool) -> None:
         settings, trainee, every = self.settings, self.trainee, self._batches.frames
@@ -165,8 +164,7 @@ class _PolicyRun(TrainingRun[Trainee, Batch]):
         return lambda step: self._batches.with_images(step, stage.image_size)
 
     def losses(self, trainee: Trainee, batch: Batch) -> StepLoss:
-        loss: StepLoss = trainee(batch)
-        return loss
+        return trainee(batch)
 
     def validate(self, stage: TrainingStage) -> Validation | None:
         if self._held is None:

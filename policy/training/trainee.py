@@ -8,7 +8,7 @@ import torch.nn.functional as F
 from torch import Tensor, nn
 
 from policy.contract import ACTION_DIM, FloatArray
-from policy.nets.action_head import size_dims
+from policy.nets.diffusion import size_dims
 from policy.nets.toge import BuiltinPolicy
 from policy.training.batches import Batch, normalised
 from policy.training.parallel import StepLoss, computing_in

@@ -22,8 +22,7 @@ class ResidualConv(nn.Module):
 
     def forward(self, x: Tensor) -> Tensor:
         """Add a residual. No norm: a network this shallow needs none, and it would cost time."""
-        out: Tensor = x + self.conv2(F.silu(self.conv1(F.silu(x))))
-        return out
+        return x + self.conv2(F.silu(self.conv1(F.silu(x))))
 
 
 class FrameAutoencoder(nn.Module):
@@ -73,15 +72,13 @@ class FrameAutoencoder(nn.Module):
 
     def reconstruct(self, latents: Tensor) -> Tensor:
         """Decode raw latents [N, C, h, w] -> [N, 3, H, W], about [-1, 1]."""
-        images: Tensor = self.decoder(latents)
-        return images
+        return self.decoder(latents)
 
     def normalise(self, latents: Tensor) -> Tensor:
         """Scale raw latents [N, C, h, w] to unit scale."""
         return (latents - _per_channel(self.latent_mean)) / _per_channel(self.latent_std)
 
     def denormalise(self, latents: Tensor) -> Tensor:
-        """Undo ``normalise``."""
         return latents * _per_channel(self.latent_std) + _per_channel(self.latent_mean)
 
 

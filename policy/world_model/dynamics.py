@@ -16,7 +16,7 @@ from policy.contract import ACTION_DIM
 from policy.nets.attention import Attention
 from policy.nets.unet1d import TIME_DIM, sinusoid_frequencies
 from policy.world_model.config import HEAD_DIM, WorldModelConfig
-from policy.world_model.relative_state import MOTION_DIM, features_dim
+from policy.world_model.motion import MOTION_DIM, features_dim
 
 MODULATIONS = 6
 """Scale and shift of each of a layer's three norms."""
@@ -43,7 +43,7 @@ class Conditioning:
     latents: Tensor
     """[B, K, C, h, w] of the past, oldest first."""
     features: Tensor
-    """[B, D], see ``relative_state.context_features``."""
+    """[B, D], see ``motion.context_features``."""
     knows_actions: Tensor
     """[B] bool: True if the future's actions are given, not noise."""
     predicted_motion: Tensor
@@ -136,8 +136,7 @@ class _Layer(nn.Module):
         tokens = tokens + over_time.reshape(by_place.shape).transpose(1, 2)
         by_frame = normed(1)
         tokens = tokens + self.space.among(by_frame.flatten(0, 1)).reshape(by_frame.shape)
-        out: Tensor = tokens + self.mlp(normed(2))
-        return out
+        return tokens + self.mlp(normed(2))
 
 
 class MotionPredictor(nn.Module):
@@ -170,5 +169,4 @@ class MotionPredictor(nn.Module):
         each = start.unsqueeze(1).expand(-1, sticks.shape[1], -1)
         hidden = torch.tanh(self.initial_hidden(features)).unsqueeze(0)
         read, _ = self.gru(torch.cat([sticks, so_far, each], dim=-1), hidden)
-        motion: Tensor = self.output(read) + self.mean_motion
-        return motion
+        return self.output(read) + self.mean_motion

@@ -21,10 +21,12 @@ from policy.nets.diffusion import DdimStep
 from policy.world_model.autoencoder import FrameAutoencoder, to_bytes, to_unit
 from policy.world_model.config import FACTOR, WorldModelConfig
 from policy.world_model.dynamics import Conditioning, Future, LatentDynamics, MotionPredictor
-from policy.world_model.frame_warp import FrameWarp, Poses, SourceFrame
-from policy.world_model.relative_state import (
+from policy.world_model.motion import (
     MOTION_DIM,
     MOTION_SCALE,
+    FrameWarp,
+    Poses,
+    SourceFrame,
     context_features,
     poses_after,
     state_after,
@@ -159,11 +161,7 @@ class WorldModel(nn.Module):
     def poses(self, state: Tensor, motion: Tensor) -> Poses:
         """Return the poses after motions [B, frames, 15] in SI units from a state [B, 13]."""
         with torch.autocast(state.device.type, enabled=False):
-            rotation, position_m = poses_after(state, motion, self.config.frame_dt_s)
-        progress = torch.arange(1, motion.shape[1] + 1, device=state.device) / motion.shape[1]
-        return Poses(
-            rotation=rotation, position_m=position_m, progress=progress.expand(len(state), -1)
-        )
+            return poses_after(state, motion, self.config.frame_dt_s)
 
     def warp(self, source: SourceFrame, poses: Poses) -> tuple[Tensor, Tensor]:
         """Return frames [B, N, 3, H, W], and a bool mask of their pixels in view [B, N, H, W]."""

@@ -6,8 +6,7 @@ import torch
 from torch import Tensor, nn
 
 from policy.contract import Contract
-from policy.engines.choose import chunks_of_samples
-from policy.engines.parity import make_parity_samples, parity_failure
+from policy.engines.choose import chunks_of_samples, make_parity_samples, parity_failure
 from policy.loading.load import load_policy
 from policy.loading.request import PolicyRequest
 from policy.nets.diffusion import DdimStep, NoiseSchedule, ddim_solve

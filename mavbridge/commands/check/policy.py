@@ -6,8 +6,6 @@ from contextlib import ExitStack, suppress
 from dataclasses import dataclass, field, replace
 from functools import partial
 
-import numpy as np
-
 from mavbridge.commands.check.rows import CheckRow
 from mavbridge.config.flight import FlyConfig, Limits
 from mavbridge.core.clock import NS_PER_S, Clock, period_ns
@@ -19,10 +17,9 @@ from mavbridge.flight.plan import FlightPlan, plan_flight
 from mavbridge.flight.policies import load_configured_policy
 from mavbridge.flight.speed import require_speed
 from policy.contract import Contract
-from policy.engines.runner import encode_all, level_state
+from policy.engines.runner import dummy_sample, encode_all
 from policy.errors import Agreed, NoChunkError, Warned
 from policy.loading.request import LoadedPolicy
-from policy.preprocess import dummy_images
 from policy.protocol import PolicyRunner
 
 NO_POLICY = "none"
@@ -164,8 +161,7 @@ def _run_at_rates(
 ) -> list[Pace]:
     """Compute chunks and images of a dummy sample, each in a thread, at the rates of the flight."""
     contract, rates, loops = runner.contract, plan.config.rates, plan.loops
-    images, state = dummy_images(contract), level_state(contract)
-    history = np.zeros((1, *contract.history_shape), np.float32)
+    images, state, history = dummy_sample(contract)
     encoded = encode_all(runner, images)
     one_of_each = images.reshape(-1, len(contract.cameras), *contract.picture_shape)[0]
 

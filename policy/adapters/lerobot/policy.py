@@ -11,6 +11,7 @@ from policy.adapters.lerobot.diffusion import DdimSchedule, Diffusion
 from policy.adapters.lerobot.plan import WEIGHTS_FILE, Affine, Plan
 from policy.checkpoints.tensors import read_tensors, require_finite, require_fit
 from policy.contract import EXTRA_NAMES, Contract
+from policy.protocol import predict_by_pair
 
 _STATISTICS = ("normalize_inputs.", "normalize_targets.", "unnormalize_outputs.")
 """Prefixes of the statistics in checkpoints before 0.4; they are read separately."""
@@ -30,7 +31,6 @@ class Normaliser(nn.Module):
             self.register_buffer(name, array, persistent=False)
 
     def forward(self, value: Tensor) -> Tensor:
-        """Normalise to the network's input range."""
         if self.affine is None:
             return value
         return self.affine.gain * (value - self.shift) / self.divisor - self.affine.bias
@@ -77,20 +77,7 @@ class LeRobotPolicy(nn.Module):
         inputs = self._network_inputs(feature, state)
         return self._in_units(self.net.act(*inputs, num_diffusion_steps))
 
-    def predict(
-        self, image: Tensor, state: Tensor, action_history: Tensor, num_diffusion_steps: int
-    ) -> Tensor:
-        """Encode all images [B, (T,) (cameras,) 3, H, W] and sample one chunk."""
-        contract = self.contract
-        batch, steps, cameras = image.shape[0], contract.observation_steps, len(contract.cameras)
-        images = image.reshape(batch, steps, cameras, *image.shape[-3:])
-        features = [
-            self.encode_visual(images[:, step, camera], camera)
-            for step in range(steps)
-            for camera in range(cameras)
-        ]
-        feature = torch.cat(features, dim=1).reshape(batch, *contract.feature_shape)
-        return self.predict_fast(feature, state, action_history, num_diffusion_steps)
+    predict = predict_by_pair
 
     def _network_inputs(self, feature: Tensor, state: Tensor) -> tuple[Tensor, Tensor]:
         """Return features [B, T, cameras, F] and normalised states [B, T, S] in LeRobot's order."""

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING
 from urllib.parse import urlsplit
 
 from policy.adapters.interface import Interface, read_interface
-from policy.contract import ENVELOPE_TERMS, Contract
+from policy.contract import LIMIT_TERMS, Contract
 from policy.errors import ContractError, PolicyError
 from policy.files import read_toml
 
@@ -24,11 +24,7 @@ SCHEMES = ("ws", "wss")
 PACKAGES = ("msgpack", "websockets")
 """Packages of the extra ``remote``."""
 
-
-TERMS = (
-    *("play_s", "modes", "max_state_age_s", "max_velocity_age_s", "max_feature_age_s"),
-    *("max_chunk_age_s", "max_stall_s", *ENVELOPE_TERMS),
-)
+TERMS = ("play_s", "modes", *LIMIT_TERMS)
 """Contract fields of mavbridge's own server that a contract file may replace: flight terms."""
 
 

@@ -24,6 +24,7 @@ from numpy.typing import NDArray
 from policy.adapters.interface import Interface
 from policy.contract import Contract, FloatArray
 from policy.errors import PolicyError
+from policy.files import last_line
 from policy.preprocess import image_to_input, input_to_bytes
 
 Message: TypeAlias = dict[str, object]
@@ -34,6 +35,13 @@ FIELDS_KEY = "mavbridge_fields"
 ARRAY, NUMBER = "__ndarray__", "__npgeneric__"
 MAX_DIMENSIONS = 8
 _NUMERIC_DTYPE = re.compile(r"[<>|=]?[biuf][1248]|bool|u?int(8|16|32|64)|float(16|32|64)")
+HISTORY_KEY = "action_history"
+"""Key in requests to mavbridge's own server: action history, float32 [K + P, 4]."""
+PREFIX_KEY, DELAY_KEY = "prefix", "delay_s"
+"""Keys in requests under a contract with ``prefix_len`` P: the committed actions, float32 [P, 4] in
+the server's units and order, NaN where none is committed; and the time of the last answer [s]."""
+RESET_KEY = "reset"
+"""Key in requests to mavbridge's own server: true if a flight has begun since the last request."""
 
 
 class MessageError(PolicyError):
@@ -61,12 +69,6 @@ def unpack(data: bytes | str) -> Message:
     if not isinstance(message, dict):
         raise MessageError(f"a msgpack {type(message).__name__} in place of a map")
     return {_text(key): value for key, value in message.items()}
-
-
-def last_line(text: str) -> str:
-    """Return the last line of a traceback, or the end of a text, in at most 300 characters."""
-    lines = [line.strip() for line in text.splitlines() if line.strip()]
-    return lines[-1][:300] if lines else "(nothing)"
 
 
 def _text(value: object) -> str:
@@ -125,15 +127,6 @@ def number_array(message: Message, key: str) -> NDArray[np.generic]:
     if array.dtype.kind not in "biuf":
         raise MessageError(f"{key!r} is no array of numbers but {type(message[key]).__name__}")
     return array
-
-
-HISTORY_KEY = "action_history"
-"""Key in requests to mavbridge's own server: action history, float32 [K + P, 4]."""
-PREFIX_KEY, DELAY_KEY = "prefix", "delay_s"
-"""Keys in requests under a contract with ``prefix_len`` P: the committed actions, float32 [P, 4] in
-the server's units and order, NaN where none is committed; and the time of the last answer [s]."""
-RESET_KEY = "reset"
-"""Key in requests to mavbridge's own server: true if a flight has begun since the last request."""
 
 
 def to_message(

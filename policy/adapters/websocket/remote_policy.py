@@ -10,7 +10,6 @@ from policy.adapters.websocket.messages import (
     RESET_KEY,
     Message,
     MessageError,
-    last_line,
     number_array,
     pack,
     to_message,
@@ -19,6 +18,7 @@ from policy.adapters.websocket.messages import (
 from policy.contract import ACTION_DIM, Contract, FloatArray
 from policy.engines.runner import level_state
 from policy.errors import NoChunkError
+from policy.files import last_line
 
 ACTIONS_KEY = "actions"
 """Key of the actions in an answer, unless the contract file names another."""

@@ -11,7 +11,7 @@ from helpers.factories import about_z
 from policy import rotation
 from policy.contract import QUATERNION, VELOCITY, Contract
 from policy.errors import PolicyError
-from policy.nets.encoders import StateEncoder
+from policy.nets.toge import StateEncoder
 from policy.preprocess import egocentric, image_to_input
 
 CONTRACT = Contract(image_height=32, image_width=48)

@@ -12,9 +12,8 @@ from helpers import lerobot_checkpoints as formula
 from policy.adapters.lerobot.plan import read_plan
 from policy.adapters.lerobot.policy import load_policy_of
 from policy.contract import STATE_NAMES
-from policy.engines.choose import chunks_of_samples
+from policy.engines.choose import chunks_of_samples, make_parity_samples
 from policy.engines.openvino_modules import ModuleConverter, make_module_runner
-from policy.engines.parity import make_parity_samples
 from policy.engines.runner import ExecutionSettings
 from policy.engines.torch_eager import make_torch_runner
 from policy.errors import CheckpointError

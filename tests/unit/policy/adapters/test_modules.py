@@ -17,7 +17,7 @@ from helpers.torch_policies import (
     loaded,
     require_same,
 )
-from policy.engines.parity import make_parity_samples
+from policy.engines.choose import make_parity_samples
 from policy.errors import PolicyError
 from policy.loading.load import check_request, read_policy_contract
 from policy.loading.request import PolicyRequest

@@ -20,8 +20,7 @@ from helpers.torch_policies import (
     require_same,
 )
 from policy.adapters.export import export_onnx, export_torchscript
-from policy.adapters.onnx import policies
-from policy.adapters.onnx.graphs import GraphFile, Wanted
+from policy.adapters.onnx import GraphFile, Wanted
 from policy.engines import choose
 from policy.engines.runner import ExecutionSettings
 from policy.engines.torch_eager import make_torch_runner
@@ -113,7 +112,9 @@ def test_several_cameras_and_observations(tmp_path: Path, dual_rate: bool) -> No
 
 def test_bf16_is_flown_only_where_it_agrees(exported_toge, monkeypatch):
     failures = iter(["a stick is off", "a stick is off"])
-    monkeypatch.setattr(policies, "precisions", lambda: (("bf16", "bf16"), ("f32", "f32")))
+    monkeypatch.setattr(
+        "policy.adapters.onnx.precisions", lambda: (("bf16", "bf16"), ("f32", "f32"))
+    )
     monkeypatch.setattr(choose, "parity_failure", lambda *_: next(failures))
     runner, notes = loaded(PolicyRequest(spec=f"onnx:{exported_toge}"))
     assert runner.engine == "openvino-f32"

@@ -9,8 +9,7 @@ import numpy as np
 import pytest
 
 from policy.contract import FloatArray
-from policy.engines.choose import Candidate, choose_runner, first_that_agrees
-from policy.engines.parity import MAX_STICK_ERROR
+from policy.engines.choose import MAX_STICK_ERROR, Candidate, choose_runner, first_that_agrees
 from policy.engines.runner import ExecutionSettings
 from policy.engines.torch_eager import make_torch_runner
 from policy.errors import PolicyError

@@ -7,9 +7,13 @@ import pytest
 import torch
 
 from policy.contract import Contract, FloatArray
-from policy.engines.choose import choose_runner, chunks_of_samples
+from policy.engines.choose import (
+    choose_runner,
+    chunks_of_samples,
+    make_parity_samples,
+    parity_failure,
+)
 from policy.engines.cuda_graph import make_cuda_graph_runner
-from policy.engines.parity import make_parity_samples, parity_failure
 from policy.engines.runner import ExecutionSettings
 from policy.engines.torch_eager import make_torch_runner
 from policy.nets.names import Size

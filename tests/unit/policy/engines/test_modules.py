@@ -14,8 +14,12 @@ from torch import nn
 from helpers import torch_policies
 from helpers.torch_policies import PlainClass, Stepwise, TwoRates
 from policy.engines import openvino_modules
-from policy.engines.choose import choose_runner, chunks_of_samples
-from policy.engines.parity import make_parity_samples, parity_failure
+from policy.engines.choose import (
+    choose_runner,
+    chunks_of_samples,
+    make_parity_samples,
+    parity_failure,
+)
 from policy.engines.runner import ExecutionSettings
 from policy.engines.torch_eager import make_torch_runner
 from policy.protocol import SingleRatePolicy

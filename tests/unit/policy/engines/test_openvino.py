@@ -12,10 +12,9 @@ import torch
 from policy.checkpoints.policy_file import BuiltinConfig, BuiltinPolicy, build_policy
 from policy.contract import Contract, FloatArray
 from policy.engines import openvino_cpu
-from policy.engines.choose import chunks_of_samples
+from policy.engines.choose import chunks_of_samples, make_parity_samples
 from policy.engines.openvino_compile import precisions
 from policy.engines.openvino_cpu import BulkEncoder, make_openvino_runner
-from policy.engines.parity import make_parity_samples
 from policy.engines.runner import ExecutionSettings
 from policy.engines.torch_eager import make_torch_runner
 from policy.errors import PolicyError

@@ -21,12 +21,11 @@ from policy.errors import PolicyError
 from policy.training.batches import FeatureStore, both_ways, encode_rows
 from policy.training.report import Hooks, TrainingProgress, TrainResult, WorldModelValidation
 from policy.training.settings import WorldModelSettings
-from policy.training.world_model.batches import CONTEXT_NOISE, WindowBatches
-from policy.training.world_model.losses import dynamics_loss
-from policy.training.world_model.run import train_world_model
+from policy.training.world_model_losses import CONTEXT_NOISE, WindowBatches, dynamics_loss
+from policy.training.world_model_run import train_world_model
 from policy.world_model.config import WorldModelConfig
 from policy.world_model.model import WorldModel
-from policy.world_model.relative_state import motion_since
+from policy.world_model.motion import motion_since
 
 pytestmark = pytest.mark.usefixtures("one_thread")
 

@@ -8,8 +8,14 @@ from torch import Tensor
 
 from policy.contract import Contract, StateFrame
 from policy.world_model.config import WorldModelConfig
-from policy.world_model.frame_warp import FrameWarp, Poses, SourceFrame
-from policy.world_model.relative_state import motion_since, poses_after, vertical_in_body
+from policy.world_model.motion import (
+    FrameWarp,
+    Poses,
+    SourceFrame,
+    motion_since,
+    poses_after,
+    vertical_in_body,
+)
 
 pytestmark = pytest.mark.usefixtures("one_thread")
 
@@ -114,10 +120,10 @@ def test_the_translation_is_the_integral_of_the_velocity_in_the_axes_of_now() ->
     now[0, 1] = 2.0
     then = now[:, None].repeat(1, 3, 1)
     then[0, :, 1] = torch.tensor([4.0, 6.0, 8.0])
-    rotation, position_m = poses_after(now, motion_since(now[:, None], then), 0.5)
-    torch.testing.assert_close(rotation, torch.eye(3).expand(1, 3, 3, 3), atol=1e-6, rtol=0)
+    after = poses_after(now, motion_since(now[:, None], then), 0.5)
+    torch.testing.assert_close(after.rotation, torch.eye(3).expand(1, 3, 3, 3), atol=1e-6, rtol=0)
     expected = torch.tensor([[1.5, 4.0, 7.5], [0.0] * 3, [0.0] * 3]).T[None]
-    torch.testing.assert_close(position_m, expected, atol=1e-5, rtol=0)
+    torch.testing.assert_close(after.position_m, expected, atol=1e-5, rtol=0)
 
 
 @pytest.mark.parametrize("state_frame", ["ned_frd", "enu_flu"])

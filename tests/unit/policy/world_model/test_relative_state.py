@@ -7,7 +7,7 @@ from torch import Tensor
 from helpers.factories import about_z
 from policy import rotation
 from policy.contract import QUATERNION, RATE, SPECIFIC_FORCE, VELOCITY, Contract
-from policy.world_model.relative_state import (
+from policy.world_model.motion import (
     MOTION_DIM,
     context_features,
     motion_since,

@@ -13,7 +13,7 @@ from policy.nets.diffusion import NoiseSchedule
 from policy.world_model.config import WorldModelConfig
 from policy.world_model.dynamics import Future
 from policy.world_model.model import Imagined, WorldModel
-from policy.world_model.relative_state import MOTION_DIM
+from policy.world_model.motion import MOTION_DIM
 
 pytestmark = pytest.mark.usefixtures("one_thread")
 

@@ -17,10 +17,13 @@ from policy.training.report import Hooks, TrainResult, Validation, WorldModelVal
 from policy.training.run import TrainingRun, open_run
 from policy.training.run_folder import RunFolder
 from policy.training.settings import TrainingStage, WorldModelSettings, world_model_stages
-from policy.training.world_model.batches import FrameBatch, WindowBatch, WindowBatches, frame_batch
-from policy.training.world_model.losses import (
+from policy.training.world_model_losses import (
+    FrameBatch,
+    WindowBatch,
+    WindowBatches,
     autoencoder_loss,
     dynamics_loss,
+    frame_batch,
     set_scales,
     validate_autoencoder,
     validate_world_model,

@@ -1,1 +1,0 @@
-"""ONNX policies, run by OpenVINO."""

@@ -1,1 +1,0 @@
-"""Training of a world model: autoencoder first, then dynamics."""
