@@ -15,7 +15,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from policy.contract import CameraImage
-from policy.files import library_name
 
 _BOX_HEADER_BYTES = 8
 _KINDS = (b"ftyp", b"moov", b"moof", b"mdat", b"mfra", b"free")
@@ -43,8 +42,6 @@ class VideoParts(NamedTuple):
     """After damage they continue at the next key frame."""
     skipped_bytes: int
     skipped_frames: int
-    is_ours: bool
-    """True: one image per fragment, as recorded by mavbridge. False: another MP4."""
 
     def describe(self, path: Path) -> str | None:
         """Return a sentence for the user; None if nothing was skipped."""
@@ -60,11 +57,11 @@ def video_parts(path: Path) -> VideoParts:
     """Find the images of a video without decoding them; raises OSError."""
     size = path.stat().st_size
     if not size:
-        return VideoParts(0, (), 0, 0, is_ours=True)
+        return VideoParts(0, (), 0, 0)
     with path.open("rb") as file, mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ) as data:
         fragments, skipped, head = [], 0, 0
         is_intra = data.find(b"FFV1", 0, max(0, data.find(b"moof"))) >= 0  # depth images
-        at, moof, others = 0, -1, 0
+        at, moof = 0, -1
         while at < size:
             kind, end = data[at + 4 : at + 8], at + int.from_bytes(data[at : at + 4], "big")
             if kind not in _KINDS or not at + _BOX_HEADER_BYTES <= end <= size:
@@ -78,14 +75,14 @@ def video_parts(path: Path) -> VideoParts:
                 if is_single:
                     is_key = is_intra or _is_key(data, at + _BOX_HEADER_BYTES, end)
                 if is_key is None:
-                    others, skipped = others + (not is_single), skipped + end - max(moof, 0)
+                    skipped += end - max(moof, 0)
                 else:
                     number = _number(data, moof + _MOOF_TO_NUMBER) - 1
                     fragments.append(Fragment(number, moof, end, is_key))
                 moof = -1
             at = end
-    kept, is_ours = list(_decodable(fragments)), others <= len(fragments)
-    return VideoParts(head, tuple(kept), skipped, len(fragments) - len(kept), is_ours)
+    kept = tuple(_decodable(fragments))
+    return VideoParts(head, kept, skipped, len(fragments) - len(kept))
 
 
 def _number(data: mmap.mmap, at: int) -> int:
@@ -103,8 +100,6 @@ def with_images(
         Indices of the rows, and sentences about the lost images.
     """
     parts = video_parts(path)
-    if not parts.is_ours:
-        return np.arange(len(numbers)), []
     found = [fragment.number for fragment in parts.fragments]
     places = np.flatnonzero(np.isin(numbers, found))
     damage = [text] if (text := parts.describe(path)) else []
@@ -162,9 +157,6 @@ def decode_images(path: Path, parts: VideoParts, numbers: Collection[int]) -> It
     wanted = set(numbers)
     if not wanted:
         return
-    if not parts.is_ours:
-        yield from _decode_any(path)
-        return
     if missing := wanted - {fragment.number for fragment in parts.fragments}:
         raise ValueError(f"{len(missing)} of {len(wanted)} images are missing")
     end = parts.fragments[-1].end
@@ -187,21 +179,6 @@ def decode_images(path: Path, parts: VideoParts, numbers: Collection[int]) -> It
                     if not left:
                         return
         raise ValueError(f"{left} images are missing at its end")
-
-
-def _decode_any(path: Path) -> Iterator[CameraImage]:
-    """Yield the images of another program's video, up to its first fault."""
-    # Read as MP4, since a playlist would name other files.
-    with av.open(library_name(path), format="mp4") as container:
-        images = container.decode(video=0)
-        while True:
-            try:
-                image = next(images, None)
-            except av.FFmpegError:
-                return
-            if image is None:
-                return
-            yield _pixels(image)
 
 
 def _pixels(image: av.VideoFrame) -> CameraImage:

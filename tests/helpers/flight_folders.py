@@ -66,7 +66,8 @@ def ticks_table(
 
 
 def write_video(path: Path, images: Sequence[NDArray[np.uint8]]) -> None:
-    with av.open(str(path), "w", options={"movflags": "frag_keyframe+empty_moov"}) as container:
+    movflags = "frag_every_frame+empty_moov+default_base_moof"
+    with av.open(str(path), "w", options={"movflags": movflags}) as container:
         stream = container.add_stream("libx264", rate=30, options={"crf": "12", "bf": "0"})
         stream.height, stream.width = images[0].shape[:2]
         stream.pix_fmt = "yuv420p"
