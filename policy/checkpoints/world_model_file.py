@@ -2,8 +2,6 @@
 
 from pathlib import Path
 
-import torch
-
 from policy.checkpoints.header import ARCHITECTURE_KEY, CONTRACT_KEY, TRAINING_KEY, require_file
 from policy.checkpoints.tensors import read_tensors, require_finite, require_fit, write_tensors
 from policy.contract import Contract
@@ -15,18 +13,13 @@ WORLD_MODEL_KEY = "world_model"
 """Header key; a policy's file has ``architecture`` instead."""
 
 
-def save_world_model(
-    path: Path, model: WorldModel, *, training: str | None = None, half: bool = True
-) -> None:
-    """Write weights and configuration; replaces ``path`` atomically.
+def save_world_model(path: Path, model: WorldModel, *, training: str | None = None) -> None:
+    """Write weights, in float16, and configuration; replaces ``path`` atomically.
 
-    ``training`` is JSON about the training, for people and reports. ``half`` stores float16: half
-    the size, with relative rounding errors below a thousandth.
+    ``training`` is JSON about the training, for people and reports.
     """
-    dtype = torch.float16 if half else torch.float32
     state = {
-        name: value.detach().to(dtype).cpu().contiguous()
-        for name, value in model.state_dict().items()
+        name: value.detach().half().cpu().contiguous() for name, value in model.state_dict().items()
     }
     require_finite(path, state)
     config = model.config

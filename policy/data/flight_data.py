@@ -4,7 +4,7 @@ All data keep their own timestamps, so the rates of camera, telemetry and sticks
 """
 
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
@@ -71,7 +71,7 @@ class FlightData:
     fingerprint: str
     """Changes with the images."""
     decode: Callable[[], Iterator[ImageArray]]
-    """Yields the images [H, W, 3] uint8 RGB in the order of ``captured_ns``; may stop early."""
+    """Yields the images [H, W, 3] uint8 RGB in the order of ``captured_ns``."""
     terms: ActionTerms = STICK_TERMS
     damage: tuple[str, ...] = ()
     """Skipped parts of its files, in sentences for the user."""
@@ -103,10 +103,6 @@ class FlightData:
         length = np.linalg.norm(known[:, QUATERNION], axis=1)
         if np.abs(length - 1.0).max() > 0.01:
             raise DatasetError(f"{self.name}: the attitude is not a unit quaternion")
-
-    def first_frames(self, count: int) -> "FlightData":
-        """Return the flight with its first ``count`` images only."""
-        return replace(self, captured_ns=self.captured_ns[:count], gate=self.gate[:count])
 
 
 def common_frame(flights: Sequence[FlightData]) -> StateFrame:

@@ -111,11 +111,10 @@ def read_flight(folder: Path) -> FlightData:
     taking over from the policy; otherwise the sent sticks; in a flight that sent nothing
     (``--readonly``), the pilot's.
     """
-    name, contract = str(folder), _contract(folder)
-    state_frame, terms = (
-        parse_state_frame(name, contract.get("state_frame")),
-        _terms(name, contract),
-    )
+    name, meta = str(folder), _read_meta(folder)
+    contract = _contract(meta)
+    state_frame = parse_state_frame(name, contract.get("state_frame"))
+    terms = _terms(name, contract)
     damage: list[str] = []
     ticks, _ = _read_table(folder, "ticks", _TICK_COLUMNS, damage)
     frames, numbers = _read_table(folder, "frames", _FRAME_COLUMNS, damage)
@@ -123,9 +122,7 @@ def read_flight(folder: Path) -> FlightData:
     if not video.is_file() or frames.num_rows == 0:
         raise DatasetError(f"{folder}: no frames: record the flight with its camera")
     try:
-        places, more = with_images(
-            video, numbers, is_whole=_read_meta(folder).get("finished") is True
-        )
+        places, more = with_images(video, numbers, is_whole=meta.get("finished") is True)
     except OSError as error:
         raise DatasetError(why_unreadable(video, error)) from error
     if not len(places):
@@ -133,7 +130,7 @@ def read_flight(folder: Path) -> FlightData:
     frames, numbers, damage = frames.take(places), numbers[places], [*damage, *more]
     tick_ns, sent_ns = stamps(name, ticks, "woke_ns"), stamps(name, ticks, "sent_ns")
     state = vectors(name, ticks, "state", STATE_DIM)
-    sent, target, is_target = _sticks(folder, ticks, terms)
+    sent, target, is_target = _sticks(name, meta, ticks, terms)
     # The expert observed at the policy's tick; its stick is for that time.
     target_ns = tick_ns if "expert" in ticks.column_names else sent_ns
     if terms.action == "rates":
@@ -163,21 +160,20 @@ def read_flight(folder: Path) -> FlightData:
 
 
 def _sticks(
-    folder: Path, ticks: pa.Table, terms: ActionTerms
+    name: str, meta: Mapping[str, object], ticks: pa.Table, terms: ActionTerms
 ) -> tuple[FloatArray, FloatArray, NDArray[np.bool_]]:
     """Return the sticks that flew, those to imitate, and True for the ticks to imitate."""
-    name = str(folder)
     sent = _sent(name, ticks, terms)
     is_expert = "expert" in ticks.column_names
     target = vectors(name, ticks, "expert", ACTION_DIM) if is_expert else sent
     is_target = _known(target) & np.array(ticks["armed"].to_pylist(), dtype=bool)
-    is_correction = _corrections(folder, ticks)
+    is_correction = _corrections(meta, ticks)
     if not is_expert and is_correction.any():
         sent[is_correction] = vectors(name, ticks, "rc_sticks", ACTION_DIM)[is_correction]
         target, is_target = sent, is_correction
     if not is_target.any():
         raise DatasetError(
-            f"{folder}: nobody to learn from: no expert, and no stick was sent while armed"
+            f"{name}: nobody to learn from: no expert, and no stick was sent while armed"
         )
     return sent, target, is_target
 
@@ -195,12 +191,12 @@ def _sent(name: str, ticks: pa.Table, terms: ActionTerms) -> FloatArray:
     return np.zeros((ticks.num_rows, ACTION_DIM), np.float32)
 
 
-def _corrections(folder: Path, ticks: pa.Table) -> NDArray[np.bool_]:
+def _corrections(meta: Mapping[str, object], ticks: pa.Table) -> NDArray[np.bool_]:
     """Return the ticks in which a pilot flew on after taking over from the policy by the sticks.
 
     Only in a mode of the contract do a pilot's sticks mean what the policy's mean.
     """
-    contract, outcome = _contract(folder), _read_meta(folder).get("outcome")
+    contract, outcome = _contract(meta), meta.get("outcome")
     is_takeover = isinstance(outcome, dict) and outcome.get("end") == "takeover"
     if not is_takeover or contract.get("action", "sticks") != "sticks":
         return np.zeros(ticks.num_rows, bool)
@@ -218,7 +214,7 @@ def _corrections(folder: Path, ticks: pa.Table) -> NDArray[np.bool_]:
 
 def read_ages(folder: Path) -> Nanoseconds:
     """Return the sorted image ages that were measured at the ticks of a flight."""
-    parse_state_frame(str(folder), _contract(folder).get("state_frame"))
+    parse_state_frame(str(folder), _contract(_read_meta(folder)).get("state_frame"))
     ages = _ages(_read_table(folder, "ticks", ("woke_ns", "feature_captured_ns"), [])[0])
     if not (ages > 0).any():
         raise DatasetError(f"{folder}: no image had an age in it: no policy looked at its camera")
@@ -252,9 +248,9 @@ def _read_meta(folder: Path) -> dict[str, object]:
     return data
 
 
-def _contract(folder: Path) -> dict[str, Any]:
+def _contract(meta: Mapping[str, object]) -> dict[str, Any]:
     """Return the fields of a flight's contract; the first flights had none."""
-    contract = _read_meta(folder).get("contract")
+    contract = meta.get("contract")
     return contract if isinstance(contract, dict) else {}
 
 

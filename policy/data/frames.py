@@ -4,7 +4,6 @@ import errno
 import hashlib
 import shutil
 from collections.abc import Callable, Sequence
-from itertools import islice
 from pathlib import Path
 
 import cv2
@@ -110,13 +109,10 @@ def _path(folder: Path, flight: FlightData, size: int) -> Path:
 
 
 def _decode(path: Path, flight: FlightData, size: int) -> None:
-    """Store all images that have a row, or those before the video breaks off.
+    """Store all images.
 
     Written, not memory-mapped: a full disk under a map would kill the process.
     """
-    with whole_file(path) as draft:
-        with draft.open("wb") as file:
-            for image in islice(flight.decode(), len(flight.captured_ns)):
-                file.write(np.ascontiguousarray(resize(image, size, size)).data)
-        if draft.stat().st_size == 0:
-            raise DatasetError(f"{flight.name}: no frame of its video can be read")
+    with whole_file(path) as draft, draft.open("wb") as file:
+        for image in flight.decode():
+            file.write(np.ascontiguousarray(resize(image, size, size)).data)

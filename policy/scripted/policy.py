@@ -8,6 +8,7 @@ import numpy as np
 
 from policy.contract import ACTION_DIM, ActionKind, Contract, FloatArray
 from policy.errors import PolicyError
+from policy.protocol import predict_by_pair
 from policy.scripted.controllers import (
     CONTROLS,
     Climb,
@@ -97,16 +98,7 @@ class ScriptedPolicy:
         feature[:, 3:6] = sparse.std(axis=(2, 3))
         return feature
 
-    def predict(
-        self,
-        image: FloatArray,
-        state: FloatArray,
-        action_history: FloatArray,
-        num_diffusion_steps: int,
-    ) -> FloatArray:
-        """Call ``encode_visual``, then ``predict_fast``."""
-        feature = self.encode_visual(image)
-        return self.predict_fast(feature, state, action_history, num_diffusion_steps)
+    predict = predict_by_pair
 
     def predict_fast(
         self,

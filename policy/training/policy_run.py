@@ -86,11 +86,12 @@ class _PolicyRun(TrainingRun[Trainee, Batch]):
         trainee = _starting_trainee(network, settings)
         trainee.to(settings.device, memory_format=torch.channels_last)  # type: ignore[call-overload]
         super().__init__(folder, trainee, policy_stages(settings), hooks)
-        whole, store, kept, held = self.store_flights(flights)
-        self._flights = [whole[index] for index in kept]
-        self._batches = self._batches_of(whole, kept, store)
-        self._held = self._batches_of(whole, held, store) if held else None
-        if settings.ages is None and not _are_ages_measured(flights):
+        store, kept, held = self.store_flights(flights)
+        self._flights = [flights[index] for index in kept]
+        self._batches = self._batches_of(flights, kept, store)
+        self._held = self._batches_of(flights, held, store) if held else None
+        is_measured = any((flight.age_ns > 0).any() for flight in flights)
+        if settings.ages is None and not is_measured:
             low_ms, high_ms = USUAL_AGES_MS
             self.note(
                 f"no policy looked in these flights: image ages of {low_ms:g} to {high_ms:g} ms "
@@ -195,7 +196,7 @@ class _PolicyRun(TrainingRun[Trainee, Batch]):
         self._write(self.settings.out)
 
     def _batches_of(
-        self, flights: list[FlightData], indices: list[int], store: FrameStore
+        self, flights: Sequence[FlightData], indices: list[int], store: FrameStore
     ) -> Batches:
         chosen = [flights[index] for index in indices]
         return Batches(
@@ -268,7 +269,3 @@ def _checkpoint(network: BuiltinConfig, path: Path) -> BuiltinPolicy:
             f"--start-from {path} holds another policy: {', '.join(other)}; ask for the same one"
         )
     return policy.train()
-
-
-def _are_ages_measured(flights: Sequence[FlightData]) -> bool:
-    return any((flight.age_ns > 0).any() for flight in flights)

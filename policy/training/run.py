@@ -120,7 +120,7 @@ class TrainingRun(ABC, Generic[M, B]):
 
     def store_flights(
         self, flights: Sequence[FlightData]
-    ) -> tuple[list[FlightData], FrameStore, list[int], list[int]]:
+    ) -> tuple[FrameStore, list[int], list[int]]:
         """Decode all images; return the indices of the training and the held-out flights."""
         store = store_frames(
             flights,
@@ -128,12 +128,7 @@ class TrainingRun(ABC, Generic[M, B]):
             self.settings.image_size,
             progress=lambda fraction: self._report_work(f"decoding, {fraction:.0%}"),
         )
-        whole = [f.first_frames(n) for f, n in zip(flights, store.counts, strict=True)]
-        for flight, count in zip(flights, store.counts, strict=True):
-            if lost := len(flight.captured_ns) - count:
-                self.note(f"{flight.name}: {lost} images are missing at the end of its video")
-        kept, held = hold_out(whole, self.settings.validation_fraction, self.settings.seed)
-        return whole, store, kept, held
+        return store, *hold_out(flights, self.settings.validation_fraction, self.settings.seed)
 
     def card(self, **facts: object) -> str:
         """Return facts about the training for a checkpoint's reader, as JSON."""

@@ -65,14 +65,14 @@ class _WorldModelRun(TrainingRun[WorldModel, FrameBatch | WindowBatch]):
         super().__init__(
             folder, _starting_model(config, settings), world_model_stages(settings), hooks
         )
-        whole, self._store, kept, held = self.store_flights(flights)
+        self._store, kept, held = self.store_flights(flights)
         windows = find_windows(
-            whole,
+            flights,
             context_frames=config.context_frames,
             frames=config.frames,
             frame_dt_s=config.frame_dt_s,
         )
-        flight_of = np.repeat(np.arange(len(whole)), self._store.counts)
+        flight_of = np.repeat(np.arange(len(flights)), self._store.counts)
         self._frames, self._held_frames = (
             np.flatnonzero(np.isin(flight_of, chosen)) for chosen in (kept, held)
         )

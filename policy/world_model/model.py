@@ -88,7 +88,7 @@ class WorldModel(nn.Module):
         actions: Tensor | None,
         *,
         ddim_steps: int,
-        noise_seed: int | torch.Generator,
+        noise_seed: int,
     ) -> Imagined:
         """Imagine one future: simulate given actions, or decide on them.
 
@@ -97,8 +97,7 @@ class WorldModel(nn.Module):
             states: [B, context_frames, 13] at their exposures, SI units, the contract's frame.
             actions: [B, frames, 4] to simulate, None to decide.
             ddim_steps: network calls.
-            noise_seed: seed of the initial noise, equal on every device; a generator is
-                advanced.
+            noise_seed: seed of the initial noise, equal on every device.
         """
         steps = self.config.schedule.ddim_steps(ddim_steps)
         batch, device = len(latents), latents.device
@@ -207,18 +206,12 @@ class WorldModel(nn.Module):
             actions=torch.where(known.knows_actions.view(-1, 1, 1), noisy.actions, actions),
         )
 
-    def _initial_noise(
-        self, batch: int, seed: int | torch.Generator, device: torch.device
-    ) -> Future:
+    def _initial_noise(self, batch: int, seed: int, device: torch.device) -> Future:
         """Draw the noise of latents first, so that it is equal in both roles."""
-        generator = seed
-        if not isinstance(generator, torch.Generator):
-            generator = torch.Generator().manual_seed(generator)
-        frames = self.config.frames
+        generator, frames = torch.Generator().manual_seed(seed), self.config.frames
 
         def draw(*shape: int) -> Tensor:
-            drawn = torch.randn(batch, frames, *shape, generator=generator, device=generator.device)
-            return drawn.to(device)
+            return torch.randn(batch, frames, *shape, generator=generator).to(device)
 
         return Future(
             latents=draw(*self.config.latent_shape),

@@ -60,8 +60,7 @@ def export(flights: Sequence[Path], config: ExportConfig) -> int:
         writing = progress.add_task("writing frames", total=frames, status="")
         summary = write_dataset(episodes, folder, config, lambda: advance(writing))
         write_contract(folder, exemplary, config)
-    for line in summary:
-        Console(highlight=False).print(f"{config.out}: {line}", soft_wrap=True)
+    Console(highlight=False).print(f"{config.out}: {summary}", soft_wrap=True)
     return 0
 
 
@@ -70,10 +69,10 @@ def write_dataset(
     folder: Path,
     config: ExportConfig,
     on_frame: Callable[[], None] = lambda: None,
-) -> list[str]:
+) -> str:
     """Write flights into an empty folder; ``on_frame`` is called for every decoded frame.
 
-    Return what was written, and what is missing, in sentences for the user.
+    Return what was written, in a line for the user.
 
     Raises:
         UserError, VideoError, DatasetError: damaged flights, or they do not fit in one dataset.
@@ -108,13 +107,10 @@ def write_dataset(
             at += skipped + writer.add(part, islice(images, len(part)))
     writer.finish()
     shift_ms = max(worst_shift_ns(part, fps) for part in every) / NS_PER_MS
-    summary = [
+    return (
         f"{writer.episodes} episodes, {writer.rows} frames at {fps} Hz; an exposure is at most "
         f"{shift_ms:.0f} ms from its timestamp (the true stamps are in the stamp.* columns)"
-    ]
-    if lost := sum(map(len, every)) - writer.rows:
-        summary.append(f"{lost} frames are missing at the end of videos that break off")
-    return summary
+    )
 
 
 def write_contract(dataset: Path, flights: Sequence[Path], config: ExportConfig) -> None:

@@ -6,10 +6,10 @@ others are required, because the defaults of LeRobot's own code changed with 0.6
 """
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from pathlib import Path
 from types import NoneType
-from typing import Any, Literal, TypeVar, get_args, get_origin, get_type_hints
+from typing import Any, ClassVar, Literal, TypeVar, get_args, get_origin, get_type_hints
 
 from policy import files
 from policy.contract import ACTION_DIM, EXTRA_NAMES
@@ -57,6 +57,7 @@ class Features:
 class ActConfig:
     """Action Chunking Transformer (Zhao et al. 2023); field names as in config.json."""
 
+    n_obs_steps: ClassVar[int] = 1
     features: Features
     vision_backbone: BackboneName
     chunk_size: int
@@ -69,11 +70,6 @@ class ActConfig:
     pre_norm: bool
     latent_dim: int
     temporal_ensemble_coeff: float | None
-
-    @property
-    def n_obs_steps(self) -> int:
-        """Number of observations that the policy takes."""
-        return 1
 
     @property
     def horizon(self) -> int:
@@ -340,5 +336,6 @@ class _Entries:
     def fill(self, config: type[C], **given: Any) -> C:
         """Return a config filled from the entries with its fields' names, except the given ones."""
         hints = get_type_hints(config)
-        read = {name: self.get(name, kind) for name, kind in hints.items() if name not in given}
+        names = [each.name for each in fields(config) if each.name not in given]
+        read = {name: self.get(name, hints[name]) for name in names}
         return config(**given, **read)

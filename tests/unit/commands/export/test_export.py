@@ -61,7 +61,7 @@ def fly(
     )
 
 
-def write(flights: list[Path], out: Path) -> list[str]:
+def write(flights: list[Path], out: Path) -> str:
     out.mkdir()
     return write_dataset(
         [read_flight(flight) for flight in flights],
@@ -169,8 +169,7 @@ def test_a_pause_makes_two_episodes(tmp_path: Path) -> None:
 
 def test_a_video_that_breaks_off_ends_its_episode(tmp_path: Path) -> None:
     flights = [fly(tmp_path / "a", video_frames=12), fly(tmp_path / "b", number=1)]
-    _, missing = write(flights, tmp_path / "out")
-    assert missing.startswith("18 frames")
+    write(flights, tmp_path / "out")
     assert broken_rules(tmp_path / "out") == []
     assert [len(episode.captured_ns) for episode in read_dataset(tmp_path / "out")] == [12, 30]
 

@@ -15,6 +15,7 @@ from mavbridge.__main__ import main
 from mavbridge.commands.imagine import inputs, run
 from mavbridge.commands.imagine.inputs import Sampler
 from mavbridge.recording.video.file import count_frames
+from policy.checkpoints.tensors import read_tensors, write_tensors
 from policy.checkpoints.world_model_file import save_world_model
 from policy.contract import Contract
 
@@ -35,13 +36,15 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     (folder / "empty").mkdir()
     (folder / "foreign").mkdir()
     (folder / "foreign" / "meta.json").write_text("{}")
-    save_world_model(folder / "world.safetensors", TinyWorld(), half=False)
+    save_world_model(folder / "world.safetensors", TinyWorld())
     enu = replace(TINY, contract=Contract(state_frame="enu_flu"))
-    save_world_model(folder / "enu.safetensors", TinyWorld(enu), half=False)
+    save_world_model(folder / "enu.safetensors", TinyWorld(enu))
     broken = TinyWorld()
     for weight in broken.dynamics.parameters():
         weight.data.fill_(1e30)  # finite, and nothing that it makes is
-    save_world_model(folder / "broken.safetensors", broken, half=False)
+    weights = {name: value.contiguous() for name, value in broken.state_dict().items()}
+    header, _ = read_tensors(folder / "world.safetensors")
+    write_tensors(folder / "broken.safetensors", weights, header)
     (folder / "taken.mp4").write_text("precious")
     return folder
 

@@ -44,15 +44,6 @@ def test_training_and_flight_prepare_images_alike(episode: FlightData, tmp_path:
     np.testing.assert_allclose(planes.numpy(), expected, atol=1e-6)
 
 
-def test_a_video_that_breaks_off_gives_its_first_images(episode, tmp_path):
-    images = list(episode.decode())[:5]
-    broken = replace(episode, fingerprint="broken", decode=lambda: iter(images))
-    both = store_frames([episode, broken], tmp_path, 32)
-    assert both.counts == [12, 5]
-    np.testing.assert_array_equal(both.read(np.array([14]), 32)[0], images[2])
-    assert both.only([1]).counts == [5]
-
-
 def test_a_shift_moves_down_and_right_and_repeats_the_edge() -> None:
     image = np.arange(16, dtype=np.uint8).reshape(1, 4, 4, 1).repeat(3, axis=3)
     moved = FrameStore([image]).read(np.array([0]), 4, np.array([[1, -1]]))[0, :, :, 0]

@@ -52,7 +52,7 @@ def actions(batch: int) -> Tensor:
     return torch.rand(batch, 4, 4, generator=torch.Generator().manual_seed(2)) * 2 - 1
 
 
-def simulate(model: WorldModel, given: Tensor, *, seed: int | torch.Generator = 0) -> Imagined:
+def simulate(model: WorldModel, given: Tensor, *, seed: int = 0) -> Imagined:
     return model.sample(*context(len(given)), given, ddim_steps=3, noise_seed=seed)
 
 
@@ -70,9 +70,7 @@ def test_a_seed_repeats_itself_and_another_does_not(model: WorldModel) -> None:
     first = simulate(model, given, seed=7)
     torch.manual_seed(6)  # the process's own random stream plays no part
     assert torch.equal(first.latents, simulate(model, given, seed=7).latents)
-    generator = torch.Generator().manual_seed(7)
-    assert torch.equal(first.latents, simulate(model, given, seed=generator).latents)
-    assert not torch.equal(first.latents, simulate(model, given, seed=generator).latents)
+    assert not torch.equal(first.latents, simulate(model, given, seed=8).latents)
 
 
 def test_a_stick_changes_what_comes_after_it_and_nothing_before(model: WorldModel) -> None:
