@@ -8,6 +8,7 @@ from collections import Counter
 from collections.abc import Callable, Generator, Mapping, Sequence
 from contextlib import closing
 from dataclasses import asdict, dataclass, replace
+from typing import Any
 
 import numpy as np
 from rich.console import Console
@@ -27,6 +28,7 @@ from mavbridge.core.clock import NS_PER_MS
 from mavbridge.core.errors import MavbridgeError, UserError
 from mavbridge.core.files import require_writable, write_durably
 from mavbridge.core.provenance import digests, git_revision, versions
+from mavbridge.core.reasons import reason_from_json, reason_to_json
 from mavbridge.core.stopping import INTERRUPTED, stop_on_signals
 from mavbridge.flight.policies import is_scripted, load_for_episodes, policy_files
 from mavbridge.flight.settings import contract_with_ages
@@ -154,11 +156,7 @@ def flown_before(config: EvaluateConfig, flown_by: str) -> dict[int, FlownEpisod
         document = read_json(path)
         held_by, engine = document["flown_by"], str(document["engine"])
         episodes = [
-            FlownEpisode(
-                engine=engine,
-                result=EpisodeResult(**one | {"gate_times_s": tuple(one["gate_times_s"])}),
-            )
-            for one in document["episodes"]
+            FlownEpisode(engine=engine, result=_from_json(one)) for one in document["episodes"]
         ]
     except (OSError, ValueError, KeyError, TypeError) as error:
         raise UserError(
@@ -316,6 +314,17 @@ def _outcomes(episodes: Sequence[EpisodeResult]) -> dict[str, int]:
     return dict(Counter(one.outcome for one in episodes).most_common())
 
 
+def _as_json(episode: EpisodeResult) -> dict[str, object]:
+    lost = None if episode.lost is None else reason_to_json(episode.lost)
+    return asdict(replace(episode, lost=None)) | {"lost": lost}
+
+
+def _from_json(document: dict[str, Any]) -> EpisodeResult:
+    lost = None if document["lost"] is None else reason_from_json(document["lost"])
+    times_s = tuple(document["gate_times_s"])
+    return EpisodeResult(**document | {"gate_times_s": times_s, "lost": lost})
+
+
 def to_json(config: EvaluateConfig, flown: Mapping[int, FlownEpisode], flown_by: str) -> str:
     """Return all results as JSON; the summary is null without episodes, ``flown_by`` from
     ``identity``."""
@@ -335,7 +344,7 @@ def to_json(config: EvaluateConfig, flown: Mapping[int, FlownEpisode], flown_by:
         "asked_episodes": config.episodes,
         "flown_by": flown_by,
         "summary": summary,
-        "episodes": [asdict(one) for one in episodes],
+        "episodes": [_as_json(one) for one in episodes],
     }
     return json.dumps(document, indent=2, allow_nan=False) + "\n"
 
@@ -361,6 +370,10 @@ def print_evaluation(
     console.print(make_table(", ".join(title), header, rows))
     ends = ", ".join(f"{count} {outcome}" for outcome, count in _outcomes(episodes).items())
     console.print(Text(f"{len(episodes)} flights: {ends}"))
+    reasons = [one.lost for one in episodes if one.lost is not None]
+    for code, count in Counter(reason.code for reason in reasons).most_common():
+        first = next(reason for reason in reasons if reason.code is code)
+        console.print(Text(f"the policy lost control in {count}: {first}", style="yellow"))
 
 
 def _results(flown: Mapping[int, FlownEpisode]) -> list[EpisodeResult]:

@@ -39,6 +39,8 @@ class EpisodeResult:
     stick_rate_per_s: float | None
     """Mean over the four sticks of |change| per second, as sent; full deflection is 1. None = the
     policy never had the sticks for two actions in a row."""
+    lost: Reason | None = None
+    """Why the policy lost control before the end; None: it kept it."""
 
     @property
     def has_finished(self) -> bool:
@@ -125,6 +127,7 @@ class Referee:
         self._start_ns = clock.now_ns()
         self._meter = StickMeter()
         self._release_reason: Reason | None = None
+        self._lost: Reason | None = None
         self._outcome: Outcome | None = None
         self._end_ns = 0
         self._distance_m = 0.0
@@ -135,6 +138,8 @@ class Referee:
         if isinstance(event, Tick) and not self.stop.is_set():
             self._release_reason = event.release_reason
             self._meter.emit(event)
+            if self._meter.engaged_ns is not None:
+                self._lost = self._lost or event.release_reason
 
     def watch(self) -> None:
         """Check the vehicle; called after each of its steps."""
@@ -188,4 +193,5 @@ class Referee:
             flown_s=(self._end_ns - engaged_ns) / NS_PER_S,
             distance_m=self._distance_m,
             stick_rate_per_s=self._meter.rate_per_s,
+            lost=self._lost,
         )

@@ -10,6 +10,7 @@ from helpers.factories import make_released_tick, make_tick, make_trace, make_vi
 from mavbridge.commands.evaluate import FlownEpisode, print_evaluation, summarise, to_json
 from mavbridge.config.episodes import EvaluateConfig
 from mavbridge.core.clock import NS_PER_MS
+from mavbridge.core.reasons import Code, because
 from mavbridge.core.vehicle import NEUTRAL, Sticks
 from mavbridge.simulation.referee import StickMeter
 from sitl.course import make_course
@@ -17,7 +18,7 @@ from sitl.course import make_course
 CONFIG = EvaluateConfig(episodes=5, conditions="random", vision_delay=50.0)
 FLOWN = {
     index: FlownEpisode(engine="openvino", result=result)
-    for index, result in enumerate((finished(), crashed()))
+    for index, result in enumerate((finished(), crashed(lost=because(Code.DISARMED))))
 }
 GATES = make_course(FINISHED.course_seed).gates
 LEG_M = math.dist(GATES[0].center_ned_m, GATES[1].center_ned_m)
@@ -56,6 +57,7 @@ def test_the_table_shows_rate_interval_and_ends() -> None:
     assert "50.0%" in text
     assert "9.5% to 90.5%" in text  # Wilson's of 1 in 2
     assert "2 flights: 1 finished, 1 crashed" in text
+    assert f"the policy lost control in 1: {because(Code.DISARMED)}" in text
     assert "random conditions, images 50 ms later" in text
 
 

@@ -12,6 +12,7 @@ from mavbridge.commands.evaluate import EpisodeSpec, FlownEpisode, evaluate
 from mavbridge.config.episodes import EvaluateConfig, WorkersConfig
 from mavbridge.config.policy import PolicyConfig
 from mavbridge.core.errors import PeerError, UserError
+from mavbridge.core.reasons import Code, because
 
 
 class Flights:
@@ -26,7 +27,10 @@ class Flights:
             raise PeerError("the vehicle is gone")
         self.flown.append(spec.index)
         result = finished(
-            course_seed=spec.course_seed, seed=spec.seed, distance_m=30.0 + spec.index
+            course_seed=spec.course_seed,
+            seed=spec.seed,
+            distance_m=30.0 + spec.index,
+            lost=because(Code.TOO_SLOW, chunks=5, age_ms=9.5, limit_ms=5.0) if spec.index else None,
         )
         return FlownEpisode(engine="numpy", result=result)
 

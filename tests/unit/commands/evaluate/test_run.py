@@ -28,6 +28,7 @@ from mavbridge.config.episodes import (
 )
 from mavbridge.config.policy import PolicyConfig
 from mavbridge.core.errors import PeerError
+from mavbridge.core.reasons import Code
 from mavbridge.flight.policies import is_stateless
 
 CIRCLE = PolicyConfig(policy="scripted:circle", dual_rate=True)
@@ -98,6 +99,13 @@ def test_images_later_than_the_age_limit_are_not_flown_by() -> None:
     config = EvaluateConfig(policy=CIRCLE, max_time=1.0, vision_delay=400.0)
     with pytest.raises(PeerError, match=r"within 30 s: the image is \d{3} ms old, beyond 300 ms"):
         fly_simulated(EpisodeSpec(config=config, index=0), lambda: False)
+
+
+@pytest.mark.parametrize(("stalls", "codes"), [(0.0, ()), (1500.0, (Code.LATE,))])
+def test_a_flight_says_why_the_policy_lost_control(stalls: float, codes: tuple[Code, ...]) -> None:
+    config = EvaluateConfig(policy=CIRCLE, max_time=6.0, stalls=stalls)
+    lost = fly_simulated(EpisodeSpec(config=config, index=0), lambda: False).result.lost
+    assert (() if lost is None else lost.codes) == codes
 
 
 def flown(spec: EpisodeSpec) -> FlownEpisode:
