@@ -16,7 +16,7 @@ import numpy.typing as npt
 from mavbridge.core.course import CourseGate, read_gates
 from mavbridge.recording.flight_folder import RecordedFlight, open_flight
 from policy.contract import QUATERNION, VELOCITY
-from policy.rotation import matrix_columns
+from policy.motion.rotation import matrix_columns
 
 Array = npt.NDArray[Any]
 

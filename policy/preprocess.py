@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from policy.contract import CameraImage, Contract, FloatArray
 from policy.errors import PolicyError
-from policy.rotation import matrix_columns
+from policy.motion.rotation import matrix_columns
 
 _Pixel = TypeVar("_Pixel", np.uint8, np.uint8 | np.uint16)
 STATE_SCALE = (

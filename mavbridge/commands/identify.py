@@ -31,15 +31,15 @@ from mavbridge.flight.policies import configured_contract
 from mavbridge.observe.output import flight_console
 from policy.contract import Contract
 from policy.engines.runner import ExecutionSettings, make_numpy_runner
-from policy.protocol import PolicyRunner
-from policy.scripted.controllers import (
+from policy.motion.controllers import (
     Axis,
     DoubletStep,
     doublet_length_s,
     doublet_steps,
 )
-from policy.scripted.policy import ScriptedPolicy
-from policy.stick_loop import motion_of_sticks
+from policy.motion.scripted import ScriptedPolicy
+from policy.motion.stick_loop import motion_of_sticks
+from policy.protocol import PolicyRunner
 
 LEAST_R_SQUARED = 0.7
 EARLY_S, BEFORE_S, STILL_S, LONGEST_GAP_S, CLIMB_S = 0.12, 0.1, 1.0, 0.25, 20.0

@@ -13,7 +13,7 @@ from mavbridge.core.clock import NS_PER_S
 from mavbridge.core.records import Event, Tick, VehicleState
 from mavbridge.core.vehicle import Action
 from policy.contract import RATE, ActionKind, FloatArray
-from policy.scripted.controllers import Axis, measure
+from policy.motion.controllers import Axis, measure
 
 Array = NDArray[np.float64]
 Sides = tuple[float, float]

@@ -23,14 +23,14 @@ from policy.data.flight_folders import find_flights, leave_out_failed, read_flig
 from policy.data.lerobot import is_lerobot, read_dataset
 from policy.engines.runner import require_devices
 from policy.loading.builtin import builtin_config
+from policy.motion.stick_loop import rates_contract
 from policy.nets.toge import BuiltinConfig
-from policy.stick_loop import rates_contract
+from policy.nets.world_model.config import WorldModelConfig
 from policy.training.policy_run import Check, train_policy
 from policy.training.report import Hooks, TrainingProgress, TrainResult
 from policy.training.run_folder import TrainingStoppedError
 from policy.training.settings import RunSettings, TrainSettings, WorldModelSettings
 from policy.training.world_model_run import train_world_model
-from policy.world_model.config import WorldModelConfig
 
 
 def run_policy_training(paths: Sequence[Path], settings: TrainSettings) -> int:

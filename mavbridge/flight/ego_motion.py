@@ -16,7 +16,7 @@ from policy.contract import (
     VELOCITY,
     VELOCITY_CHANGE,
 )
-from policy.rotation import motion_since_exposure, slerp
+from policy.motion.rotation import motion_since_exposure, slerp
 
 MAX_READINGS = 1024
 """Attitudes, and velocities, kept: five seconds of the fastest attitude stream that a link

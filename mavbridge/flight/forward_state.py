@@ -7,7 +7,7 @@ from typing import TypeAlias
 from mavbridge.core.clock import NS_PER_MS, NS_PER_S
 from mavbridge.core.vehicle import Action, Reading, Telemetry
 from policy.contract import Contract
-from policy.forward_motion import ForwardMotion, VehicleMotion
+from policy.motion.forward_motion import ForwardMotion, VehicleMotion
 
 STEP_NS = 10 * NS_PER_MS
 """Step of the prediction."""

@@ -17,8 +17,8 @@ import numpy as np
 from policy.contract import ACTION_DIM, ACTION_NAMES, QUATERNION, STATE_NAMES, Contract
 from policy.errors import ContractError, PolicyError
 from policy.files import read_toml
+from policy.motion.rotation import matrix_columns
 from policy.preprocess import egocentric_columns
-from policy.rotation import matrix_columns
 
 CONTRACT_FILE = "mavbridge.toml"
 """File name of a contract beside a policy or dataset, where flights find it without --contract."""

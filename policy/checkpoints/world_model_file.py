@@ -6,8 +6,8 @@ from policy.checkpoints.header import ARCHITECTURE_KEY, CONTRACT_KEY, TRAINING_K
 from policy.checkpoints.tensors import read_tensors, require_finite, require_fit, write_tensors
 from policy.contract import Contract
 from policy.errors import CheckpointError, PolicyError
-from policy.world_model.config import WorldModelConfig
-from policy.world_model.model import WorldModel
+from policy.nets.world_model.config import WorldModelConfig
+from policy.nets.world_model.model import WorldModel
 
 WORLD_MODEL_KEY = "world_model"
 """Header key; a policy's file has ``architecture`` instead."""

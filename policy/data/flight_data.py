@@ -58,7 +58,7 @@ class FlightData:
     target_ns: Nanoseconds
     target: FloatArray
     """[M, 4] sticks to imitate, at ``target_ns`` [M]; for a flight by rates, the sticks that
-    ``policy.stick_loop`` would have converted to the same rates."""
+    ``policy.motion.stick_loop`` would have converted to the same rates."""
     sent_ns: Nanoseconds
     sent: FloatArray
     """[S, 4] sticks that flew, each until the next; centred if none, and in flights by rates."""

@@ -23,7 +23,7 @@ from policy.data.flight_data import (
 from policy.data.flight_video import decode_images, video_parts, with_images
 from policy.data.tables import file_digest, parse_state_frame, read_json, read_rows, stamps, vectors
 from policy.files import why_unreadable
-from policy.stick_loop import StickLoop, rates_contract
+from policy.motion.stick_loop import StickLoop, rates_contract
 
 FORMAT, VERSION = "mavbridge-flight", 1
 VIDEO = "camera.mp4"

@@ -3,9 +3,9 @@
 import numpy as np
 from numpy.typing import NDArray
 
-from policy import rotation
 from policy.contract import FloatArray
 from policy.data.flight_data import Nanoseconds
+from policy.motion import rotation
 
 MAX_GAP_NS = 200_000_000
 """Longest gap between sticks or attitudes to interpolate across."""

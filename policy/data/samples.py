@@ -27,7 +27,7 @@ from policy.contract import (
 )
 from policy.data.flight_data import GATE_DIM, DatasetError, FlightData, Nanoseconds
 from policy.data.interpolation import Indices, Interpolator, covered, nearest
-from policy.rotation import motion_since_exposure
+from policy.motion.rotation import motion_since_exposure
 
 TICK_TOLERANCE_NS = 20_000_000
 """Largest distance of a tick from the drawn time: two ticks at 100 Hz."""

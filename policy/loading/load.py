@@ -21,9 +21,9 @@ from policy.errors import PolicyError, user_code, warned
 from policy.files import user_path
 from policy.loading.builtin import BUILTIN_KINDS, builtin_checkpoint, load_builtin, parse_builtin
 from policy.loading.request import LoadedPolicy, PolicyRequest, default_contract, measure_times
+from policy.motion.scripted import IN_AIR, ScriptedPolicy, make_scripted
+from policy.motion.stick_loop import by_rates, flown_by_rates
 from policy.protocol import DualRatePolicy, PolicyRunner, SingleRatePolicy, keep_nothing
-from policy.scripted.policy import IN_AIR, ScriptedPolicy, make_scripted
-from policy.stick_loop import by_rates, flown_by_rates
 
 LEROBOT, ONNX, TORCHSCRIPT = "lerobot", "onnx", "torchscript"
 FORMS = {LEROBOT: "lerobot:DIR", ONNX: "onnx:DIR or onnx:FILE", TORCHSCRIPT: "torchscript:FILE.pt"}

@@ -152,7 +152,7 @@ class BuiltinPolicy(nn.Module):
 
     Images are normalised by ``preprocess.image_to_input``, states are in SI units. A shape that
     differs from the contract's, or steps that the schedule does not have, raise a ``PolicyError``.
-    Chunks are sticks, even if the contract says rates: ``policy.stick_loop`` converts them.
+    Chunks are sticks, even if the contract says rates: ``policy.motion.stick_loop`` converts them.
     """
 
     head: DiffusionHead

@@ -22,6 +22,7 @@ from torch import Tensor, nn
 from policy.data.flight_data import DatasetError, FlightData, common_frame, hold_out
 from policy.data.frames import FrameStore, store_frames
 from policy.nets.toge import BuiltinConfig
+from policy.nets.world_model.config import WorldModelConfig
 from policy.training.batches import ahead
 from policy.training.parallel import B, Gradients, M, StepLoss
 from policy.training.report import Hooks, TrainingProgress, TrainResult, Validation
@@ -33,7 +34,6 @@ from policy.training.run_folder import (
     identity_of,
 )
 from policy.training.settings import Precision, RunSettings, TrainingStage, learning_rate_factor
-from policy.world_model.config import WorldModelConfig
 
 LOG_STEPS = 20
 """Steps between two lines of the log."""

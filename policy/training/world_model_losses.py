@@ -17,15 +17,15 @@ from policy.data.frames import FrameStore
 from policy.data.interpolation import Indices
 from policy.data.samples import STICK_SIGNS, mirrored, state_signs
 from policy.data.windows import Windows
+from policy.nets.world_model.autoencoder import to_unit
+from policy.nets.world_model.config import WorldModelConfig
+from policy.nets.world_model.dynamics import Future
+from policy.nets.world_model.model import WorldModel
+from policy.nets.world_model.motion import MOTION_DIM, MOTION_SCALE, motion_since
 from policy.training.batches import VALIDATION_KEY, FeatureStore, next_of
 from policy.training.parallel import StepLoss, TensorBatch
 from policy.training.report import WorldModelValidation
 from policy.training.settings import WorldModelSettings
-from policy.world_model.autoencoder import to_unit
-from policy.world_model.config import WorldModelConfig
-from policy.world_model.dynamics import Future
-from policy.world_model.model import WorldModel
-from policy.world_model.motion import MOTION_DIM, MOTION_SCALE, motion_since
 
 CONTEXT_NOISE = 0.2
 """Largest sigma of the noise on past latents, relative to their unit scale: in a rollout the past

@@ -11,6 +11,9 @@ from policy.data.flight_data import DatasetError, FlightData
 from policy.data.interpolation import Indices
 from policy.data.windows import find_windows
 from policy.errors import PolicyError
+from policy.nets.world_model.autoencoder import to_unit
+from policy.nets.world_model.config import WorldModelConfig
+from policy.nets.world_model.model import WorldModel
 from policy.training.batches import FeatureStore, both_ways, encode_rows
 from policy.training.parallel import StepLoss, computing_in
 from policy.training.report import Hooks, TrainResult, Validation, WorldModelValidation
@@ -28,9 +31,6 @@ from policy.training.world_model_losses import (
     validate_autoencoder,
     validate_world_model,
 )
-from policy.world_model.autoencoder import to_unit
-from policy.world_model.config import WorldModelConfig
-from policy.world_model.model import WorldModel
 
 VALIDATION_FRAMES = 128
 VALIDATION_WINDOWS = 128

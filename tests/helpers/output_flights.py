@@ -16,9 +16,9 @@ from mavbridge.core.reasons import Code
 from mavbridge.guard.values import Phase
 from mavbridge.simulation.world import NOMINAL_VEHICLE
 from policy.contract import ActionKind, Contract, FloatArray
+from policy.motion.controllers import LEG_MPS, LEG_S, Motion, Program, Push, make_program
+from policy.motion.scripted import ScriptedPolicy
 from policy.protocol import PolicyRunner
-from policy.scripted.controllers import LEG_MPS, LEG_S, Motion, Program, Push, make_program
-from policy.scripted.policy import ScriptedPolicy
 from sitl.ardupilot.autopilot import ArduCopter
 from sitl.ardupilot.flight_modes import Mode as ArduMode
 from sitl.ardupilot.guided import Submode

@@ -8,8 +8,8 @@ import numpy as np
 
 from mavbridge.simulation.flight import SimulatedFlight
 from policy.contract import Contract, FloatArray
+from policy.motion.controllers import LEAN_PER_MPS, LEAN_PER_WANTED_MPS, THROTTLE_DEADZONE
 from policy.protocol import PolicyRunner
-from policy.scripted.controllers import LEAN_PER_MPS, LEAN_PER_WANTED_MPS, THROTTLE_DEADZONE
 
 SPEED_MPS = 3.0
 CONTRACT = Contract(feature_dim=1, arrays="numpy", image_height=32, image_width=32)

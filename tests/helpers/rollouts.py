@@ -30,9 +30,9 @@ from mavbridge.recording.meta import FlightMeta
 from mavbridge.recording.tables import read_table
 from mavbridge.recording.video.file import count_frames
 from policy.contract import Contract
+from policy.nets.world_model.config import WorldModelConfig
+from policy.nets.world_model.model import WorldModel
 from policy.protocol import PolicyRunner
-from policy.world_model.config import WorldModelConfig
-from policy.world_model.model import WorldModel
 
 SIZE = 32
 TINY = WorldModelConfig(

@@ -7,7 +7,7 @@ from mavbridge.commands.step_response import ResponseRecording
 from mavbridge.simulation.flight import SimulatedFlight, SimulationSettings
 from mavbridge.simulation.world import make_vehicle
 from policy.contract import Contract
-from policy.scripted.controllers import doublet_length_s
+from policy.motion.controllers import doublet_length_s
 
 
 def test_the_parameters_of_a_vehicle_are_found_in_flight() -> None:

@@ -16,7 +16,7 @@ from mavbridge.guard.values import Phase
 from mavbridge.mavlink.codec.packets import CommandRefusedError
 from mavbridge.mavlink.session.vehicle import VehicleSession
 from policy.contract import ActionKind
-from policy.scripted.controllers import Motion, Program, Push
+from policy.motion.controllers import Motion, Program, Push
 from sitl.vehicle.config import AutopilotName, Px4Release
 
 FULL_YAW = Program(motion=lambda _: Motion(push=Push("yaw", 1.0)))

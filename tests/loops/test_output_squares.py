@@ -8,7 +8,7 @@ import pytest
 from helpers.output_flights import COMBINATIONS, LEG_M, SQUARE, SQUARE_S, OutputFlight
 from mavbridge.guard.values import Phase
 from policy.contract import ActionKind
-from policy.scripted.controllers import LEG_S
+from policy.motion.controllers import LEG_S
 from sitl.vehicle.config import AutopilotName
 
 TAKEOFF_M = 3.0

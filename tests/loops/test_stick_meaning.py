@@ -12,7 +12,7 @@ from helpers.pilots import steady
 from mavbridge.core.clock import NS_PER_S
 from mavbridge.simulation.flight import SimulatedFlight, SimulationSettings
 from mavbridge.simulation.world import make_vehicle
-from policy.stick_loop import flown_by_rates
+from policy.motion.stick_loop import flown_by_rates
 from sitl.vehicle.dynamics import BodyState
 from sitl.vehicle.rotation import cos_tilt
 

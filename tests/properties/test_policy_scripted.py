@@ -2,8 +2,8 @@ import numpy as np
 from hypothesis import given
 from hypothesis import strategies as st
 
-from policy.scripted.controllers import PROGRAM_NAMES
-from policy.scripted.policy import ScriptedPolicy
+from policy.motion.controllers import PROGRAM_NAMES
+from policy.motion.scripted import ScriptedPolicy
 
 FEATURE, HISTORY = np.zeros((1, 8), np.float32), np.zeros((1, 4, 4), np.float32)
 STATES = st.lists(st.floats(-50, 50, width=32), min_size=13, max_size=13)

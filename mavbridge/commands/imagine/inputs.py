@@ -16,9 +16,9 @@ from mavbridge.core.errors import MavbridgeError, UserError
 from mavbridge.core.records import FloatArray, ImageArray
 from mavbridge.core.vehicle import Sticks
 from mavbridge.recording.flight_folder import RecordedFlight
+from policy.nets.world_model.config import WorldModelConfig
+from policy.nets.world_model.model import WorldModel
 from policy.preprocess import resize
-from policy.world_model.config import WorldModelConfig
-from policy.world_model.model import WorldModel
 
 Part: TypeAlias = Literal["sample", "decode", "write"]
 

@@ -31,7 +31,7 @@ from mavbridge.recording.tables import TableWriter
 from mavbridge.recording.video.file import WRITE_ERRORS
 from mavbridge.recording.video.writer import VideoWriter
 from policy.contract import ACTION_DIM, STATE_DIM
-from policy.world_model.model import WorldModel
+from policy.nets.world_model.model import WorldModel
 
 SCHEMA = pa.schema(
     [

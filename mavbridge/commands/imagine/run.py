@@ -40,7 +40,7 @@ from mavbridge.recording.flight_folder import open_flight
 from policy.checkpoints.world_model_file import load_world_model
 from policy.engines.runner import require_devices
 from policy.errors import Warned
-from policy.world_model.model import WorldModel
+from policy.nets.world_model.model import WorldModel
 
 SHIPPED = Path(policy.__file__).parent / "weights" / "world_model.safetensors"
 

@@ -15,7 +15,7 @@ from mavbridge.core.records import Position
 from mavbridge.core.vehicle import ACTION_CLASSES
 from mavbridge.recording.flight_folder import RecordedFlight
 from mavbridge.recording.rows import FrameRow
-from policy.rotation import conjugate, multiply
+from policy.motion.rotation import conjugate, multiply
 
 FloatColumn: TypeAlias = NDArray[np.float64]
 _HALF = 0.5**0.5

@@ -25,8 +25,8 @@ from mavbridge.observe.viewer import layout
 from mavbridge.observe.viewer.layout import ViewedFlight
 from mavbridge.observe.viewer.plots import Columns
 from policy.contract import QUATERNION, RATE, SPECIFIC_FORCE, VELOCITY, StateFrame
-from policy.forward_motion import ForwardMotion, VehicleMotion
-from policy.rotation import conjugate, multiply
+from policy.motion.forward_motion import ForwardMotion, VehicleMotion
+from policy.motion.rotation import conjugate, multiply
 
 
 def motion_of(state: VehicleState, frame: StateFrame) -> VehicleMotion:

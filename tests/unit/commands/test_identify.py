@@ -28,7 +28,7 @@ from mavbridge.core.clock import NS_PER_S
 from mavbridge.core.errors import UserError
 from mavbridge.core.vehicle import ACTION_CLASSES
 from policy.contract import ActionKind, Contract
-from policy.scripted.controllers import doublet_length_s, doublet_steps
+from policy.motion.controllers import doublet_length_s, doublet_steps
 
 START_S = 100.0
 STEP_S = 0.01

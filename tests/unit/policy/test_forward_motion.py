@@ -4,8 +4,8 @@ from typing import Any
 import pytest
 
 from policy.contract import Contract
-from policy.forward_motion import ForwardMotion, Four, VehicleMotion
-from policy.stick_loop import GRAVITY_MPS2
+from policy.motion.forward_motion import ForwardMotion, Four, VehicleMotion
+from policy.motion.stick_loop import GRAVITY_MPS2
 
 HOVER = VehicleMotion((1.0, 0.0, 0.0, 0.0), (0.0,) * 3, (0.0,) * 3, (0.0, 0.0, -GRAVITY_MPS2))
 HEADING_EAST = (math.sqrt(0.5), 0.0, 0.0, math.sqrt(0.5))

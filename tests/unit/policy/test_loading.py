@@ -14,8 +14,8 @@ from policy.contract import Contract
 from policy.errors import PolicyError
 from policy.loading.load import check_request, load_policy, read_policy_contract
 from policy.loading.request import LoadedPolicy, PolicyRequest
+from policy.motion.stick_loop import StickLoop, by_rates, rates_contract
 from policy.nets.toge import ResnetUnetConfig, Toge, build_policy
-from policy.stick_loop import StickLoop, by_rates, rates_contract
 
 RGB = np.full((48, 64, 3), 90, np.uint8)
 STATE = np.eye(1, 13, 3, dtype=np.float32)

@@ -8,9 +8,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from helpers.factories import about_z
-from policy import rotation
 from policy.contract import QUATERNION, VELOCITY, Contract
 from policy.errors import PolicyError
+from policy.motion import rotation
 from policy.nets.toge import StateEncoder
 from policy.preprocess import egocentric, image_to_input
 

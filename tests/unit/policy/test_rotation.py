@@ -3,7 +3,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from policy import rotation
+from policy.motion import rotation
 
 ANGLE = st.floats(-3.0, 3.0)
 

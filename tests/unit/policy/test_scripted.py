@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 
 from policy.contract import ActionKind
-from policy.scripted.controllers import doublet_length_s, doublet_steps
-from policy.scripted.policy import ScriptedPolicy
+from policy.motion.controllers import doublet_length_s, doublet_steps
+from policy.motion.scripted import ScriptedPolicy
 from sitl.vehicle.rotation import from_euler
 
 STEP_S = 0.01

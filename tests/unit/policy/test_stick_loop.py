@@ -8,15 +8,15 @@ import pytest
 
 from policy.contract import Contract, FloatArray
 from policy.errors import ContractError
-from policy.protocol import PolicyRunner
-from policy.rotation import multiply
-from policy.stick_loop import (
+from policy.motion.rotation import multiply
+from policy.motion.stick_loop import (
     MAX_TILT_RATE_RADPS,
     StickLoop,
     by_rates,
     flown_by_rates,
     rates_contract,
 )
+from policy.protocol import PolicyRunner
 
 CONTRACT = rates_contract(Contract(hover_thrust=0.5))
 STICKS = by_rates(Contract(hover_thrust=0.5))

@@ -35,7 +35,7 @@ from mavbridge.observe.viewer.layout import (
     styles,
 )
 from policy.contract import Contract
-from policy.stick_loop import GRAVITY_MPS2
+from policy.motion.stick_loop import GRAVITY_MPS2
 
 CAMERA = "/scene/chase/vehicle/front"
 

@@ -10,7 +10,7 @@ import torch
 from policy.adapters.interface import BODY_STATE_NAMES, DERIVED_NAMES, Interface
 from policy.contract import STATE_NAMES, Contract
 from policy.errors import ContractError
-from policy.rotation import multiply, rotate
+from policy.motion.rotation import multiply, rotate
 
 REST = (0.1, 0.2, 0.3, 1.0, 2.0, -9.0)
 EULER = (0.4, -0.3, 2.5)

@@ -12,8 +12,8 @@ from policy.checkpoints.world_model_file import load_world_model, save_world_mod
 from policy.contract import Contract
 from policy.errors import CheckpointError
 from policy.nets.diffusion import NoiseSchedule
-from policy.world_model.config import WorldModelConfig
-from policy.world_model.model import WorldModel
+from policy.nets.world_model.config import WorldModelConfig
+from policy.nets.world_model.model import WorldModel
 
 CONFIG = WorldModelConfig(
     image_size=32,

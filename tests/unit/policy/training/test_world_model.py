@@ -18,14 +18,14 @@ from policy.contract import Contract
 from policy.data.flight_data import DatasetError, FlightData
 from policy.data.windows import find_windows
 from policy.errors import PolicyError
+from policy.nets.world_model.config import WorldModelConfig
+from policy.nets.world_model.model import WorldModel
+from policy.nets.world_model.motion import motion_since
 from policy.training.batches import FeatureStore, both_ways, encode_rows
 from policy.training.report import Hooks, TrainingProgress, TrainResult, WorldModelValidation
 from policy.training.settings import WorldModelSettings
 from policy.training.world_model_losses import CONTEXT_NOISE, WindowBatches, dynamics_loss
 from policy.training.world_model_run import train_world_model
-from policy.world_model.config import WorldModelConfig
-from policy.world_model.model import WorldModel
-from policy.world_model.motion import motion_since
 
 pytestmark = pytest.mark.usefixtures("one_thread")
 

@@ -7,8 +7,8 @@ import torch
 from torch import Tensor
 
 from policy.contract import Contract, StateFrame
-from policy.world_model.config import WorldModelConfig
-from policy.world_model.motion import (
+from policy.nets.world_model.config import WorldModelConfig
+from policy.nets.world_model.motion import (
     FrameWarp,
     Poses,
     SourceFrame,

@@ -5,9 +5,9 @@ import torch
 from torch import Tensor
 
 from helpers.factories import about_z
-from policy import rotation
 from policy.contract import QUATERNION, RATE, SPECIFIC_FORCE, VELOCITY, Contract
-from policy.world_model.motion import (
+from policy.motion import rotation
+from policy.nets.world_model.motion import (
     MOTION_DIM,
     context_features,
     motion_since,

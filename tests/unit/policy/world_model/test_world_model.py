@@ -10,10 +10,10 @@ from torch.nn import functional
 from policy.contract import QUATERNION, Contract
 from policy.errors import PolicyError
 from policy.nets.diffusion import NoiseSchedule
-from policy.world_model.config import WorldModelConfig
-from policy.world_model.dynamics import Future
-from policy.world_model.model import Imagined, WorldModel
-from policy.world_model.motion import MOTION_DIM
+from policy.nets.world_model.config import WorldModelConfig
+from policy.nets.world_model.dynamics import Future
+from policy.nets.world_model.model import Imagined, WorldModel
+from policy.nets.world_model.motion import MOTION_DIM
 
 pytestmark = pytest.mark.usefixtures("one_thread")
 

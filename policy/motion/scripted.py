@@ -8,8 +8,7 @@ import numpy as np
 
 from policy.contract import ACTION_DIM, ActionKind, Contract, FloatArray
 from policy.errors import PolicyError
-from policy.protocol import predict_by_pair
-from policy.scripted.controllers import (
+from policy.motion.controllers import (
     CONTROLS,
     Climb,
     Measured,
@@ -19,6 +18,7 @@ from policy.scripted.controllers import (
     make_program,
     measure,
 )
+from policy.protocol import predict_by_pair
 
 FEATURE_DIM = 8
 DEFAULT_CONTRACT = Contract()

@@ -15,8 +15,7 @@ import numpy as np
 
 from policy.contract import QUATERNION, RATE, VELOCITY, Contract, FloatArray
 from policy.errors import ContractError
-from policy.protocol import PolicyRunner
-from policy.rotation import (
+from policy.motion.rotation import (
     Array,
     Quaternion,
     Vector,
@@ -26,6 +25,7 @@ from policy.rotation import (
     multiply,
     rotate,
 )
+from policy.protocol import PolicyRunner
 
 GRAVITY_MPS2 = 9.80665
 TILT_GAIN_PER_S = 8.0

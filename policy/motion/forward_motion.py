@@ -11,8 +11,15 @@ from dataclasses import replace
 from typing import NamedTuple, TypeAlias
 
 from policy.contract import Contract
-from policy.rotation import Quaternion, Vector, conjugate, level_heading, rotate
-from policy.stick_loop import GRAVITY_MPS2, LAG_S, StickLoop, StickMotion, motion_of_sticks, turned
+from policy.motion.rotation import Quaternion, Vector, conjugate, level_heading, rotate
+from policy.motion.stick_loop import (
+    GRAVITY_MPS2,
+    LAG_S,
+    StickLoop,
+    StickMotion,
+    motion_of_sticks,
+    turned,
+)
 
 Four: TypeAlias = tuple[float, float, float, float]
 AUTOPILOT_TILT_GAIN_PER_S, AUTOPILOT_LAG_S = 6.0, 0.1

@@ -15,8 +15,8 @@ from torch import Tensor, nn
 from policy.contract import ACTION_DIM
 from policy.nets.attention import Attention
 from policy.nets.unet1d import TIME_DIM, sinusoid_frequencies
-from policy.world_model.config import HEAD_DIM, WorldModelConfig
-from policy.world_model.motion import MOTION_DIM, features_dim
+from policy.nets.world_model.config import HEAD_DIM, WorldModelConfig
+from policy.nets.world_model.motion import MOTION_DIM, features_dim
 
 MODULATIONS = 6
 """Scale and shift of each of a layer's three norms."""

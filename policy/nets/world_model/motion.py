@@ -17,9 +17,9 @@ import torch.nn.functional as F
 from torch import Tensor, nn
 
 from policy.contract import QUATERNION, RATE, SPECIFIC_FORCE, VELOCITY, Contract, StateFrame
+from policy.motion.rotation import matrix_columns
+from policy.nets.world_model.config import WorldModelConfig
 from policy.preprocess import egocentric_columns, egocentric_scale
-from policy.rotation import matrix_columns
-from policy.world_model.config import WorldModelConfig
 
 MOTION_DIM = 15
 """Change of velocity [3] m/s in the current body axes, first two columns of the rotation from the

@@ -18,10 +18,10 @@ from torch import Tensor, nn
 
 from policy.contract import ACTION_DIM
 from policy.nets.diffusion import DdimStep
-from policy.world_model.autoencoder import FrameAutoencoder, to_bytes, to_unit
-from policy.world_model.config import FACTOR, WorldModelConfig
-from policy.world_model.dynamics import Conditioning, Future, LatentDynamics, MotionPredictor
-from policy.world_model.motion import (
+from policy.nets.world_model.autoencoder import FrameAutoencoder, to_bytes, to_unit
+from policy.nets.world_model.config import FACTOR, WorldModelConfig
+from policy.nets.world_model.dynamics import Conditioning, Future, LatentDynamics, MotionPredictor
+from policy.nets.world_model.motion import (
     MOTION_DIM,
     MOTION_SCALE,
     FrameWarp,
