@@ -28,7 +28,7 @@ from mavbridge.camera.open import open_camera
 from mavbridge.config.policy import PolicyConfig
 from mavbridge.core.clock import NS_PER_MS, NS_PER_S, MonotonicClock
 from mavbridge.core.histogram import Histogram
-from policy.checkpoints.policy_file import load_checkpoint
+from policy.checkpoints.networks import load_checkpoint
 from policy.contract import ACTION_DIM
 from policy.loading.builtin import SHIPPED
 from policy.nets.toge import Toge, TogeConfig, build_policy

@@ -130,7 +130,8 @@ def fit_image(image: CameraImage, contract: Contract) -> CameraImage:
         columns = _part(image.shape[1], spare_columns, 1 - spare_columns)
         return resize(image[rows, columns], height, width)
     least = min(tall, wide)
-    inner = resize(image, _at_least_1(image.shape[0] * least), _at_least_1(image.shape[1] * least))
+    inner_height, inner_width = (max(round(side * least), 1) for side in image.shape[:2])
+    inner = resize(image, inner_height, inner_width)
     above, beside = (height - inner.shape[0]) // 2, (width - inner.shape[1]) // 2
     padded = np.zeros(contract.picture_shape, image.dtype)
     padded[above : above + inner.shape[0], beside : beside + inner.shape[1]] = inner
@@ -149,10 +150,6 @@ def _part(length: int, start: float, end: float) -> slice:
     """Return the pixels between two shares of a side; at least one."""
     first = min(round(start * length), length - 1)
     return slice(first, max(round(end * length), first + 1))
-
-
-def _at_least_1(pixels: float) -> int:
-    return max(round(pixels), 1)
 
 
 def resize(rgb: NDArray[_Pixel], height: int, width: int) -> NDArray[_Pixel]:

@@ -21,8 +21,6 @@ if TYPE_CHECKING:
     import openvino as ov
 
 DESCRIPTION = "policy.json"
-ROLES = ("image", "feature", "state", "action_history", "noisy", "timestep")
-"""Roles of a graph's inputs."""
 USUAL_NAMES: dict[str, tuple[str, ...]] = {
     "image": ("image", "images", "rgb", "pixels"),
     "feature": ("feature", "features", "global_cond"),
@@ -31,7 +29,7 @@ USUAL_NAMES: dict[str, tuple[str, ...]] = {
     "noisy": ("noisy", "noisy_action", "noisy_actions", "sample"),
     "timestep": ("timestep", "timesteps", "t"),
 }
-"""Input names that are recognised without an entry in the description."""
+"""Names of a graph's inputs by their role, recognised without an entry in the description."""
 RESULTS = ("chunk", "feature", "prediction")
 """Results of a graph: of a policy or head, an encoder, a denoiser."""
 TABLES = ("contract", "schedule", "inputs", "outputs", "hidden")
@@ -67,7 +65,7 @@ def describe(
     """
     data = {} if text is None else _parsed(where, text)
     rest = {name: data.get(name, {}) for name in TABLES if name != "contract"}
-    for name, known in (("inputs", ROLES), ("outputs", RESULTS)):
+    for name, known in (("inputs", USUAL_NAMES), ("outputs", RESULTS)):
         if unknown := sorted(set(rest[name]) - set(known)):
             raise CheckpointError(f"{where}: {name} {unknown} are unknown; known are {list(known)}")
     if contract_file is not None:

@@ -10,6 +10,7 @@ import json
 import sys
 import warnings
 from collections.abc import Callable, Iterable, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -241,14 +242,12 @@ def _takes_no_image(call: "_Call", interface: Interface, state_name: str | None)
     shapes = ((*contract.state_shape[:-1], interface.state_dim), contract.image_shape)
     accepted = []
     for shape in shapes:
-        with torch.inference_mode():
-            try:
+        try:
+            with torch.inference_mode(), suppress(PolicyError):  # it ran: its result comes later
                 call(torch.zeros(1, *shape))
-                accepted.append(True)
-            except PolicyError:  # it ran: its result is checked later
-                accepted.append(True)
-            except Exception:  # noqa: BLE001 - a foreign module may raise anything
-                accepted.append(False)
+            accepted.append(True)
+        except Exception:  # noqa: BLE001 - a foreign module may raise anything
+            accepted.append(False)
     return accepted == [True, False]
 
 

@@ -149,7 +149,7 @@ def require_header(path: Path, header: dict[str, str]) -> None:
             raise CheckpointError(
                 f"{path}: no {key!r} in the header (it holds {sorted(header)}), so it was not "
                 "written by this project; load the weights as .pt and save them with "
-                "policy.checkpoints.policy_file.save_checkpoint"
+                "policy.checkpoints.networks.save_checkpoint"
             )
 
 

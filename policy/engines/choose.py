@@ -33,7 +33,9 @@ MAX_STICK_ERROR = 0.01
 """Largest difference in full deflections: 5 us of PWM on the usual 1000..2000 us."""
 SAMPLES = 4
 Candidate = tuple[str, Callable[[], PolicyRunner]]
-"""Name of an engine to try, and the function that creates its runner."""
+"""Name of an engine to try, and the function that creates its runner.
+
+It raises PolicyError or RuntimeError for a policy that the engine cannot run."""
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -30,13 +30,7 @@ HIGH_PRIORITY, NORMAL_PRIORITY = -1, 0
 
 
 def make_cuda_graph_runner(policy: SingleRatePolicy, settings: ExecutionSettings) -> PolicyRunner:
-    """Capture a copy of the policy for the loops; tried once.
-
-    Raises:
-        PolicyError: it is not a torch module, lacks a required fast path, or failed on a dummy
-            sample.
-        RuntimeError: a capture failed.
-    """
+    """Capture a copy of the policy for the loops; tried once."""
     if not isinstance(policy, nn.Module):
         raise PolicyError(f"{settings.name} is no torch.nn.Module, so its work cannot be captured")
     action_device = torch.device(settings.action_device)

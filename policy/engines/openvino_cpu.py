@@ -44,10 +44,6 @@ def make_openvino_runner(
 
     The policy's initial noise is copied now. ``vision`` and ``action`` are the precisions of both
     paths.
-
-    Raises:
-        PolicyError: it lacks a required fast path, or failed on a dummy sample.
-        RuntimeError: OpenVINO cannot compile it.
     """
     name = engine_name(vision, action)
     digest = hashlib.sha256()

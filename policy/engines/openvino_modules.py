@@ -56,13 +56,7 @@ def make_module_runner(
     vision: Precision,
     action: Precision,
 ) -> PolicyRunner:
-    """Compile a policy's methods for the loops; tried once.
-
-    Raises:
-        PolicyError: it cannot be converted, is too large for that, lacks a required fast path,
-            or failed on a dummy sample.
-        RuntimeError: OpenVINO cannot compile it.
-    """
+    """Compile a policy's methods for the loops; tried once."""
 
     def compile_as(precision: Precision) -> Compile:
         return lambda function, shapes: converter.compile(function, shapes, precision)

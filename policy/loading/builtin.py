@@ -88,7 +88,7 @@ def parse_builtin(kind: str, options: list[str]) -> tuple[Size, BackboneName | N
 def _trained(
     config: "BuiltinConfig", options: list[str], checkpoint: Path, seed: int
 ) -> tuple["BuiltinPolicy", list[str]]:
-    from policy.checkpoints.policy_file import load_checkpoint_with_notes
+    from policy.checkpoints.networks import load_checkpoint_with_notes
 
     policy, found = load_checkpoint_with_notes(checkpoint, fallback=config)
     parts = (policy.config.size, policy.config.backbone)

@@ -36,13 +36,8 @@ def check_request(request: PolicyRequest) -> Contract | None:
     """Run the checks that take milliseconds, before weights, torch or a user's code is loaded.
 
     Checks the spec, the checkpoint's file and contract, the image size and the device. torch is
-    imported only to look for a device other than the CPU.
-
-    Returns:
-        The policy's contract, if its files contain one.
-
-    Raises:
-        PolicyError: the message names the fault, the available choices and the next step.
+    imported only to look for a device other than the CPU. Returns the policy's contract, if its
+    files contain one.
     """
     kind, *options = request.spec.split(":")
     _require_flags_of_kind(kind, request)
@@ -72,11 +67,7 @@ def check_request(request: PolicyRequest) -> Contract | None:
 
 
 def read_policy_contract(request: PolicyRequest) -> Contract:
-    """Return the contract of a policy, without loading a built-in network.
-
-    Raises:
-        PolicyError: as ``check_request``; or a user's class cannot be instantiated.
-    """
+    """Return the contract of a policy, without loading a built-in network."""
     contract = check_request(request)
     if request.spec.partition(":")[0] in BUILTIN_KINDS:
         contract = contract or default_contract(request.image_size)
@@ -92,9 +83,6 @@ def load_policy(request: PolicyRequest, *, now_s: Callable[[], float]) -> Loaded
     """Find, build, load, try and time a policy.
 
     ``now_s`` (monotonic seconds) times the policy and drives scripted programs.
-
-    Raises:
-        PolicyError: the message names the fault, the available choices and the next step.
     """
     check_request(request)
     policy, notes, make_runner = _find(request, now_s)

@@ -10,7 +10,7 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-from policy.checkpoints.policy_file import load_checkpoint, read_torch, save_checkpoint
+from policy.checkpoints.networks import load_checkpoint, read_torch, save_checkpoint
 from policy.contract import FLIGHT_TERMS
 from policy.data.flight_data import FlightData, Nanoseconds
 from policy.data.flight_folders import read_ages

@@ -6,7 +6,7 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-from policy.checkpoints.world_model_file import load_world_model, save_world_model
+from policy.checkpoints.networks import load_world_model, save_world_model
 from policy.data.flight_data import DatasetError, FlightData
 from policy.data.interpolation import Indices
 from policy.data.windows import find_windows

@@ -7,7 +7,7 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from safetensors.torch import save
 
-from policy.checkpoints.policy_file import load_checkpoint
+from policy.checkpoints.networks import load_checkpoint
 from policy.contract import Contract
 from policy.errors import CheckpointError
 from policy.nets.toge import TogeConfig

@@ -37,7 +37,7 @@ from mavbridge.core.errors import MavbridgeError, UserError
 from mavbridge.core.stopping import INTERRUPTED, stop_on_signals
 from mavbridge.flight.policies import load_configured_policy
 from mavbridge.recording.flight_folder import open_flight
-from policy.checkpoints.world_model_file import load_world_model
+from policy.checkpoints.networks import load_world_model
 from policy.engines.runner import require_devices
 from policy.errors import Warned
 from policy.nets.world_model.model import WorldModel

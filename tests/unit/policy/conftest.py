@@ -1,7 +1,7 @@
 import pytest
 import torch
 
-from policy.checkpoints.policy_file import BuiltinPolicy, load_checkpoint
+from policy.checkpoints.networks import BuiltinPolicy, load_checkpoint
 from policy.contract import Contract
 from policy.loading.builtin import SHIPPED
 from policy.nets.toge import Toge, TogeConfig

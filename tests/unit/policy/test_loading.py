@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 import torch
 
-from policy.checkpoints.policy_file import save_checkpoint
+from policy.checkpoints.networks import save_checkpoint
 from policy.contract import Contract
 from policy.errors import PolicyError
 from policy.loading.load import check_request, load_policy, read_policy_contract

@@ -15,8 +15,8 @@ from mavbridge.__main__ import main
 from mavbridge.commands.imagine import inputs, run
 from mavbridge.commands.imagine.inputs import Sampler
 from mavbridge.recording.video.file import count_frames
+from policy.checkpoints.networks import save_world_model
 from policy.checkpoints.tensors import read_tensors, write_tensors
-from policy.checkpoints.world_model_file import save_world_model
 from policy.contract import Contract
 
 Imagine = Callable[..., tuple[int, str]]

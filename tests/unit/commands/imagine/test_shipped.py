@@ -11,7 +11,7 @@ from mavbridge.__main__ import main
 from mavbridge.commands.imagine.run import SHIPPED
 from mavbridge.recording.flight_folder import open_flight
 from mavbridge.recording.video.file import read_video
-from policy.checkpoints.world_model_file import load_world_model
+from policy.checkpoints.networks import load_world_model
 from policy.preprocess import resize
 
 ROOT = Path(__file__).parents[4]

@@ -20,7 +20,7 @@ from mavbridge.config.policy import PolicyConfig
 from mavbridge.core.clock import Clock
 from mavbridge.flight.policies import load_configured_policy
 from mavbridge.simulation.referee import EpisodeResult
-from policy.checkpoints.policy_file import save_checkpoint
+from policy.checkpoints.networks import save_checkpoint
 from policy.contract import Contract, FloatArray
 from policy.loading.request import LoadedPolicy
 from policy.nets.toge import Toge, TogeConfig

@@ -10,7 +10,7 @@ from helpers.flight_folders import write_meta, write_spot_flight
 from mavbridge.__main__ import main
 from mavbridge.commands import train as run
 from mavbridge.core.stopping import INTERRUPTED
-from policy.checkpoints.world_model_file import load_world_model
+from policy.checkpoints.networks import load_world_model
 from policy.contract import Contract
 from policy.data.flight_folders import read_flight
 from policy.loading.load import load_policy

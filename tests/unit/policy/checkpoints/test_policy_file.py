@@ -10,7 +10,7 @@ from safetensors import safe_open
 from safetensors.torch import save_file
 from torch import nn
 
-from policy.checkpoints.policy_file import load_checkpoint, save_checkpoint
+from policy.checkpoints.networks import load_checkpoint, save_checkpoint
 from policy.checkpoints.tensors import pack, unpack
 from policy.contract import Contract
 from policy.errors import CheckpointError

@@ -9,7 +9,7 @@ import torch
 from torch import Tensor, nn
 from torch.optim.swa_utils import AveragedModel
 
-from policy.checkpoints.policy_file import load_checkpoint_with_notes
+from policy.checkpoints.networks import load_checkpoint_with_notes
 from policy.errors import CheckpointError
 from policy.nets.toge import Toge, TogeConfig
 

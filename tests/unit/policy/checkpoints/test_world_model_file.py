@@ -6,9 +6,8 @@ import pytest
 import torch
 from safetensors.torch import load_file, save_file
 
-from policy.checkpoints.policy_file import save_checkpoint
+from policy.checkpoints.networks import load_world_model, save_checkpoint, save_world_model
 from policy.checkpoints.tensors import read_tensors
-from policy.checkpoints.world_model_file import load_world_model, save_world_model
 from policy.contract import Contract
 from policy.errors import CheckpointError
 from policy.nets.diffusion import NoiseSchedule

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 import torch
 
-from policy.checkpoints.policy_file import BuiltinConfig, BuiltinPolicy, build_policy
+from policy.checkpoints.networks import BuiltinConfig, BuiltinPolicy, build_policy
 from policy.contract import Contract, FloatArray
 from policy.engines import openvino_cpu
 from policy.engines.choose import chunks_of_samples, make_parity_samples

@@ -14,7 +14,7 @@ from safetensors import safe_open
 
 from helpers.flight_folders import write_spot_flight
 from helpers.training_runs import check_resuming, check_stopping, make_hooks, weights_of
-from policy.checkpoints.policy_file import TRAINING_KEY, load_checkpoint, save_checkpoint
+from policy.checkpoints.networks import TRAINING_KEY, load_checkpoint, save_checkpoint
 from policy.contract import Contract
 from policy.data.flight_data import DatasetError, FlightData
 from policy.data.flight_folders import read_flight

@@ -13,7 +13,7 @@ from safetensors import safe_open
 
 from helpers.steered_flights import steered_flight
 from helpers.training_runs import check_resuming, make_hooks, weights_of
-from policy.checkpoints.policy_file import TRAINING_KEY
+from policy.checkpoints.networks import TRAINING_KEY
 from policy.contract import Contract
 from policy.data.flight_data import DatasetError, FlightData
 from policy.data.windows import find_windows

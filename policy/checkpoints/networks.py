@@ -1,10 +1,10 @@
-"""Policies on disk.
+"""Policies and world models on disk.
 
 The header of a ``.safetensors`` file holds the contract and the architecture, so the file is
-self-describing. It also holds a test vector: inputs, and the chunks that plain torch computed from
-them when the file was saved. Weights that no longer reproduce these chunks are rejected. ``.pt``
-and ``.pth`` files hold weights only; they are read without executing pickles, and the caller
-supplies the rest.
+self-describing. A policy's file also holds a test vector: inputs, and the chunks that plain torch
+computed from them when the file was saved. Weights that no longer reproduce these chunks are
+rejected. ``.pt`` and ``.pth`` files hold weights only; they are read without executing pickles, and
+the caller supplies the rest.
 """
 
 import copy
@@ -45,6 +45,8 @@ from policy.errors import CheckpointError, PolicyError
 from policy.files import why_unreadable
 from policy.nets.diffusion import NoiseSchedule
 from policy.nets.toge import BuiltinConfig, BuiltinPolicy, build_policy
+from policy.nets.world_model.config import WorldModelConfig
+from policy.nets.world_model.model import WorldModel
 from policy.preprocess import image_to_input
 
 VECTOR_PREFIX = "test_vector."
@@ -60,6 +62,8 @@ _DAMAGED = (
 """Exceptions of torch.load for flipped bytes: its reader interprets them before it checks them."""
 _UNSUPPORTED = re.compile(r"GLOBAL (\S+)")
 """In an error of torch.load: the class that it refuses to look up."""
+WORLD_MODEL_KEY = "world_model"
+"""Header key; a policy's file has ``architecture`` instead."""
 
 
 def save_checkpoint(
@@ -212,3 +216,39 @@ def read_torch(path: Path) -> dict[Any, Any]:
             "save model.state_dict()"
         )
     return loaded
+
+
+def save_world_model(path: Path, model: WorldModel, *, training: str | None = None) -> None:
+    """Write weights, in float16, and configuration; replaces ``path`` atomically.
+
+    ``training`` is JSON about the training, for people and reports.
+    """
+    state = {
+        name: value.detach().half().cpu().contiguous() for name, value in model.state_dict().items()
+    }
+    require_finite(path, state)
+    config = model.config
+    header = {WORLD_MODEL_KEY: config.to_json(), CONTRACT_KEY: config.contract.to_json()}
+    if training is not None:
+        header[TRAINING_KEY] = training
+    write_tensors(path, state, header)
+
+
+def load_world_model(path: Path) -> WorldModel:
+    """Read a world model, in float32 on the CPU and in eval mode."""
+    if path.suffix != ".safetensors":
+        raise CheckpointError(f"{path}: world models are stored as .safetensors")
+    require_file(path, (".safetensors",))
+    header, state = read_tensors(path)
+    if WORLD_MODEL_KEY not in header or CONTRACT_KEY not in header:
+        held = "a policy" if ARCHITECTURE_KEY in header else f"no world model ({sorted(header)})"
+        raise CheckpointError(f"{path} holds {held}: name a file of mavbridge train-world-model")
+    require_finite(path, state)
+    try:
+        contract = Contract.from_json(header[CONTRACT_KEY])
+        model = WorldModel(WorldModelConfig.from_json(header[WORLD_MODEL_KEY], contract))
+    except PolicyError as error:
+        raise CheckpointError(f"{path}: {error}") from error
+    require_fit(path, model, state, "Train it again with this version of mavbridge")
+    model.load_state_dict(state)
+    return model.eval()
