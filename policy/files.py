@@ -13,7 +13,7 @@ from typing import Any, BinaryIO
 
 from safetensors import SafetensorError, safe_open
 
-from policy.errors import CheckpointError
+from policy.errors import CheckpointError, PolicyError
 
 MAX_TEXT_BYTES = 100_000_000
 MAX_TOML_BYTES = 64 * 1024
@@ -156,6 +156,19 @@ def parse_json(text: str) -> Any:
 def read_json(path: Path) -> Any:
     """Read a JSON file; raise OSError, or ValueError as ``read_text`` and ``parse_json``."""
     return parse_json(read_text(path))
+
+
+def read_object(path: Path, error: type[PolicyError], kind: str) -> dict[str, Any]:
+    """Read a JSON object in a folder of this ``kind``; raise ``error`` if there is none."""
+    try:
+        data = read_json(path)
+    except OSError as failure:
+        raise error(f"{path}: {failure.strerror}: is it a {kind}?") from failure
+    except ValueError as failure:
+        raise error(f"{path} is not JSON: {failure}") from failure
+    if not isinstance(data, dict):
+        raise error(f"{path} is not a JSON object: is it a {kind}?")
+    return data
 
 
 def parse_toml(text: str) -> dict[str, Any]:

@@ -21,8 +21,8 @@ from policy.data.flight_data import (
     Nanoseconds,
 )
 from policy.data.flight_video import decode_images, video_parts, with_images
-from policy.data.tables import file_digest, parse_state_frame, read_json, read_rows, stamps, vectors
-from policy.files import why_unreadable
+from policy.data.tables import file_digest, parse_state_frame, read_rows, stamps, vectors
+from policy.files import read_object, why_unreadable
 from policy.motion.stick_loop import StickLoop, rates_contract
 
 FORMAT, VERSION = "mavbridge-flight", 1
@@ -238,8 +238,8 @@ def decode_video(path: Path, numbers: NDArray[np.int64]) -> Iterator[ImageArray]
 
 
 def _read_meta(folder: Path) -> dict[str, object]:
-    data = read_json(folder / "meta.json", "flight folder")
-    if not isinstance(data, dict) or data.get("format") != FORMAT:
+    data = read_object(folder / "meta.json", DatasetError, "flight folder")
+    if data.get("format") != FORMAT:
         raise DatasetError(f"{folder}: not a flight of mavbridge (meta.json has no {FORMAT!r})")
     if data.get("version") != VERSION:
         raise DatasetError(

@@ -25,8 +25,8 @@ from policy.contract import (
 )
 from policy.data import lerobot_format as names
 from policy.data.flight_data import GATE_DIM, DatasetError, FlightData, ImageArray, Nanoseconds
-from policy.data.tables import file_digest, numbers, parse_state_frame, read_json, stamps, vectors
-from policy.files import library_name, why_unreadable
+from policy.data.tables import file_digest, numbers, parse_state_frame, stamps, vectors
+from policy.files import library_name, read_object, why_unreadable
 
 _PATH = re.compile(r"(?:[^{}]|\{(?:chunk_index|file_index|video_key)(?::0?\dd)?\})*")
 """Path templates: fields with these names, a few digits wide."""
@@ -98,8 +98,8 @@ class _Row:
 
 def _read_info(folder: Path, camera_key: str | None) -> _Info:
     path = folder / names.INFO
-    data = read_json(path, "LeRobot dataset")
-    version = data.get("codebase_version") if isinstance(data, dict) else None
+    data = read_object(path, DatasetError, "LeRobot dataset")
+    version = data.get("codebase_version")
     if not isinstance(version, str) or not version.startswith("v3."):
         raise DatasetError(
             f"{folder}: a LeRobot dataset of version {version}, this build reads v3: convert one "

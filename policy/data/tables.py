@@ -2,30 +2,19 @@
 
 import hashlib
 from pathlib import Path
-from typing import Any, cast, get_args
+from typing import cast, get_args
 
 import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 from numpy.typing import NDArray
 
-from policy import files
 from policy.contract import FloatArray, StateFrame
 from policy.data.flight_data import DatasetError, Nanoseconds
 from policy.files import library_name
 
 MAX_ROWS = 10_000_000
 """More than a day at 100 Hz. A small file can claim many more rows and fill the memory."""
-
-
-def read_json(path: Path, kind: str) -> Any:
-    """Return the contents of a JSON file; ``kind`` names the expected kind of its folder."""
-    try:
-        return files.read_json(path)
-    except OSError as error:
-        raise DatasetError(f"{path}: {error.strerror}: is it a {kind}?") from error
-    except ValueError as error:
-        raise DatasetError(f"{path} is not JSON: {error}") from error
 
 
 def parse_state_frame(name: str, value: object) -> StateFrame:

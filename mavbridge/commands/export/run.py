@@ -26,9 +26,9 @@ from mavbridge.core.stopping import stop_on_signals
 from policy.adapters.drafts import Entry, dataset_entries, draft_text, recorded_entries
 from policy.adapters.interface import BODY_STATE_NAMES, CONTRACT_FILE
 from policy.contract import STATE_NAMES
-from policy.data.flight_data import FlightData, common_frame, common_terms
+from policy.data.flight_data import DatasetError, FlightData, common_frame, common_terms
 from policy.data.flight_folders import find_flights, leave_out_failed, read_flight
-from policy.data.tables import read_json
+from policy.files import read_object
 
 
 def export(flights: Sequence[Path], config: ExportConfig) -> int:
@@ -119,7 +119,8 @@ def write_contract(dataset: Path, flights: Sequence[Path], config: ExportConfig)
     Raises:
         DatasetError: a flight's meta.json cannot be read.
     """
-    metas = [read_json(flight / "meta.json", "flight folder") for flight in flights]
+    kind = "flight folder"
+    metas = [read_object(flight / "meta.json", DatasetError, kind) for flight in flights]
     contracts = [meta.get("contract") for meta in metas]
     # The only camera is the vehicle's own under any name: the contract's default.
     entries = [

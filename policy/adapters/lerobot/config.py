@@ -11,9 +11,9 @@ from pathlib import Path
 from types import NoneType
 from typing import Any, ClassVar, Literal, TypeVar, get_args, get_origin, get_type_hints
 
-from policy import files
 from policy.contract import ACTION_DIM, EXTRA_NAMES
 from policy.errors import CheckpointError, warned
+from policy.files import read_object
 
 CONFIG_FILE = "config.json"
 STATE_KEY, ACTION_KEY = "observation.state", "action"
@@ -163,16 +163,8 @@ def read_config(folder: Path) -> tuple[Config, list[str]]:
 
 
 def read_json(path: Path) -> dict[str, Any]:
-    """Read a JSON object."""
-    try:
-        data = files.read_json(path)
-    except OSError as error:
-        raise CheckpointError(f"{path}: {error.strerror}") from error
-    except ValueError as error:
-        raise CheckpointError(f"{path}: not JSON ({error})") from error
-    if not isinstance(data, dict):
-        raise CheckpointError(f"{path}: not a JSON object")
-    return data
+    """Read a JSON object of a policy or dataset."""
+    return read_object(path, CheckpointError, "folder of LeRobot's")
 
 
 def _where_to_look(folder: Path) -> str:

@@ -107,7 +107,8 @@ def test_failed_flights_are_left_out_and_counted_unless_they_are_asked_for(tmp_p
     ("meta", "says"),
     [
         ("{", "not JSON"),
-        ("[]", "not a flight of mavbridge"),
+        ("[]", "not a JSON object"),
+        ({"format": "other"}, "not a flight of mavbridge"),
         ({"version": 2}, "version 2"),
         ({"contract": None}, "state frame is"),
     ],
