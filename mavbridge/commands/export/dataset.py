@@ -55,44 +55,31 @@ def vector_stats(values: NDArray[np.generic]) -> Stats:
     }
 
 
-class ImageStats:
-    """Histogram of the colours of many images."""
+def colour_counts(rgb: ImageArray) -> NDArray[np.int64]:
+    """Return how often each level occurs in each channel of an image [H, W, 3] uint8, [3, 256]."""
+    sample = rgb[::_PIXEL_STEP, ::_PIXEL_STEP].reshape(-1, 3).T
+    return np.stack([np.bincount(channel, minlength=_LEVELS) for channel in sample])
 
-    def __init__(self) -> None:
-        self._counts = np.zeros((3, _LEVELS), np.int64)
-        self._images = 0
 
-    def add(self, rgb: ImageArray) -> None:
-        """Count an image [H, W, 3] uint8."""
-        for channel in range(3):
-            sample = rgb[::_PIXEL_STEP, ::_PIXEL_STEP, channel].ravel()
-            self._counts[channel] += np.bincount(sample, minlength=_LEVELS)
-        self._images += 1
-
-    def merge(self, other: "ImageStats") -> None:
-        """Add the images counted by another ``ImageStats``."""
-        self._counts += other._counts
-        self._images += other._images
-
-    def stats(self) -> Stats:
-        """Statistics [3, 1, 1] of colours in [0, 1]; "count" is the number of images."""
-        levels = np.arange(_LEVELS) / (_LEVELS - 1)
-        total = self._counts.sum(axis=1)
-        mean = self._counts @ levels / total
-        variance = self._counts @ levels**2 / total - mean**2
-        up_to = np.cumsum(self._counts, axis=1)
-        found: dict[str, NDArray[np.float64]] = {
-            "min": levels[(self._counts > 0).argmax(axis=1)],
-            "max": levels[_LEVELS - 1 - (self._counts[:, ::-1] > 0).argmax(axis=1)],
-            "mean": mean,
-            "std": np.sqrt(np.maximum(variance, 0.0)),
-            **{
-                name: levels[(up_to >= at * total[:, None]).argmax(axis=1)]
-                for name, at in QUANTILES.items()
-            },
-        }
-        out: Stats = {name: values.reshape(3, 1, 1) for name, values in found.items()}
-        return out | {"count": np.array([self._images], np.int64)}
+def colour_stats(counts: NDArray[np.int64], images: int) -> Stats:
+    """Return statistics [3, 1, 1] of colours in [0, 1]; "count" is the number of images."""
+    levels = np.arange(_LEVELS) / (_LEVELS - 1)
+    total = counts.sum(axis=1)
+    mean = counts @ levels / total
+    variance = counts @ levels**2 / total - mean**2
+    up_to = np.cumsum(counts, axis=1)
+    found: dict[str, NDArray[np.float64]] = {
+        "min": levels[(counts > 0).argmax(axis=1)],
+        "max": levels[_LEVELS - 1 - (counts[:, ::-1] > 0).argmax(axis=1)],
+        "mean": mean,
+        "std": np.sqrt(np.maximum(variance, 0.0)),
+        **{
+            name: levels[(up_to >= at * total[:, None]).argmax(axis=1)]
+            for name, at in QUANTILES.items()
+        },
+    }
+    out: Stats = {name: values.reshape(3, 1, 1) for name, values in found.items()}
+    return out | {"count": np.array([images], np.int64)}
 
 
 class DatasetWriter:
@@ -109,7 +96,7 @@ class DatasetWriter:
         self._folder, self._spec, self._image_size = folder, spec, image_size
         self._tables: list[Path] = []
         self._episodes: list[dict[str, Json]] = []
-        self._colours = ImageStats()
+        self._colours = np.zeros((3, _LEVELS), np.int64)
         self.rows = 0
 
     @property
@@ -130,25 +117,27 @@ class DatasetWriter:
         first = list(islice(images, MIN_ROWS))
         if len(first) < MIN_ROWS:
             return 0
-        colours = ImageStats()
+        colours = np.zeros_like(self._colours)
         count = 0
         path = episode_file(self._folder, names.VIDEO, self.episodes)
         with closing(EpisodeVideo(path, self._spec)) as video:
             for rgb in chain(first, images):
                 image = np.ascontiguousarray(fit_size(rgb, self._image_size))
-                self._require_size(part, image)
+                if image.shape[:2] != (self._spec.height, self._spec.width):
+                    raise VideoError(
+                        f"{part.episode.name} has images of {image.shape[1]}x{image.shape[0]}, the "
+                        f"first flight of {self._spec.width}x{self._spec.height}: export them apart"
+                    )
                 video.append(image)
-                colours.add(image)
+                colours += colour_counts(image)
                 count += 1
         columns = self._columns(part.part(0, count))
-        if len(columns["index"]) != count:
-            raise ValueError(f"{count} frames, {len(columns['index'])} rows")
         table = pa.table({name: _arrow(values) for name, values in columns.items()})
         self._tables.append(episode_file(self._folder, names.DATA, self.episodes))
         pq.write_table(table, library_name(self._tables[-1]))
         stats = {name: vector_stats(values) for name, values in columns.items()}
-        stats[names.CAMERA_KEY] = colours.stats()
-        self._colours.merge(colours)
+        stats[names.CAMERA_KEY] = colour_stats(colours, count)
+        self._colours += colours
         self._episodes.append(
             self._episode_row(count)
             | {
@@ -159,14 +148,6 @@ class DatasetWriter:
         )
         self.rows += count
         return count
-
-    def _require_size(self, part: Stretch, image: ImageArray) -> None:
-        height, width = image.shape[:2]
-        if (height, width) != (self._spec.height, self._spec.width):
-            raise VideoError(
-                f"{part.episode.name} has images of {width}x{height}, the first flight of "
-                f"{self._spec.width}x{self._spec.height}: export them apart"
-            )
 
     def _columns(self, part: Stretch) -> dict[str, NDArray[np.generic]]:
         count = len(part)
@@ -219,13 +200,14 @@ class DatasetWriter:
         # One feature at a time, so that memory holds only one.
         columns = (name for name in _features(self._spec) if name != names.CAMERA_KEY)
         stats = {name: vector_stats(self._column(name)) for name in columns}
-        stats[names.CAMERA_KEY] = self._colours.stats()
+        stats[names.CAMERA_KEY] = colour_stats(self._colours, self.rows)
         lists: Json = {
             feature: {name: values.tolist() for name, values in found.items()}
             for feature, found in stats.items()
         }
-        self._write_json(names.STATS, lists)
-        self._write_json(names.INFO, self._info())
+        for name, document in ((names.STATS, lists), (names.INFO, self._info())):
+            text = json.dumps(document, indent=4, allow_nan=False)
+            (self._folder / name).write_text(text + "\n")
 
     def _column(self, name: str) -> NDArray[np.generic]:
         """Return one column of all episodes, [rows, D]."""
@@ -252,9 +234,6 @@ class DatasetWriter:
             "video_path": names.VIDEO,
             "features": _features(spec),
         }
-
-    def _write_json(self, name: str, document: Json) -> None:
-        (self._folder / name).write_text(json.dumps(document, indent=4, allow_nan=False) + "\n")
 
 
 def fit_size(rgb: ImageArray, image_size: int | None) -> ImageArray:
