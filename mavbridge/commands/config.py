@@ -289,7 +289,8 @@ class ReplayConfig:
     def __post_init__(self) -> None:
         """Refuse what cannot be combined."""
         check_range("tolerance", self.tolerance, 0, 10, "")
-        if self.source == "chunks" and self.changes_policy:
+        changes_policy = self.is_other_policy or self.engine is not None or self.device is not None
+        if self.source == "chunks" and changes_policy:
             raise UserError(
                 "--from chunks takes the recorded chunks and asks no policy: leave out the flags "
                 "of the policy, or use --from features or video"
@@ -300,11 +301,6 @@ class ReplayConfig:
         """The recorded features may be of another network."""
         given = (self.policy, self.checkpoint, self.contract)
         return any(value is not None for value in given)
-
-    @property
-    def changes_policy(self) -> bool:
-        """Something of the policy is not as it was."""
-        return self.is_other_policy or self.engine is not None or self.device is not None
 
     @property
     def is_other_policy(self) -> bool:

@@ -35,7 +35,6 @@ from sitl.course import gate_truth
 from sitl.pilot.demonstrator import Expert, RateExpert
 from sitl.pilot.disturbance import RATE_STRENGTHS, STICK_STRENGTHS, Disturbance, random_start
 from sitl.vehicle.conditions import NOMINAL, Conditions, random_conditions
-from sitl.vehicle.dynamics import BodyState
 
 SETTLE_NS = 300 * NS_PER_MS
 """Wait after a start in the air, until the last frame and state from the ground are gone."""
@@ -120,8 +119,8 @@ class Pilot:
         self._turns = TurnSchedule(variation.seed)
         self._expert: Expert | RateExpert | None = None
         self._solves = 0
-        self._expert_actions: dict[int, Action] = {}
-        """Expert actions by the serial of the chunk that was computed with them."""
+        self.expert_actions: dict[int, Action] = {}
+        """Recent expert actions by the serial of the chunk that was computed at their states."""
         self.begin_ns: int | None = None
         """Start of the demonstration; None before the policy has the sticks."""
         expert = PolicyRunner(
@@ -133,10 +132,6 @@ class Pilot:
             act=self._act,
         )
         self.runner = replace(student or expert, act=self._act, reset=self._start)
-
-    def expert_action(self, chunk_serial: int) -> Action | None:
-        """Return the expert's action at a recent chunk's state; None before the demonstration."""
-        return self._expert_actions.get(chunk_serial)
 
     def _start(self) -> None:
         """Begin, now that the policy has the sticks: a vehicle placed in the air is controlled."""
@@ -150,24 +145,22 @@ class Pilot:
         if self._expert is None:  # not engaged yet: the guard has to see chunks first
             return np.zeros((1, horizon, ACTION_DIM), np.float32)
         now_s, body = self._flight.clock.now_ns() / NS_PER_S, self._flight.vehicle.ap.truth
-        self._expert_actions[self._solves], disturbed = self._demonstrate(self._expert, body, now_s)
-        self._expert_actions.pop(self._solves - SOLVES_KEPT, None)
+        disturbed: Sequence[float]
+        if isinstance(self._expert, RateExpert):
+            command = self._expert.command(body, now_s)
+            self.expert_actions[self._solves] = BodyRates(*command)
+            disturbed = self._disturbance.flown(command, now_s)
+        else:
+            sticks = self._expert.sticks(body, now_s)
+            self.expert_actions[self._solves] = Sticks(*sticks)
+            disturbed = self._disturbance.flown(sticks, now_s)
+        self.expert_actions.pop(self._solves - SOLVES_KEPT, None)
         chunk = np.tile(np.array(disturbed, np.float32), (1, horizon, 1))
         if self._student is None:
             return chunk
         # Called at every tick, also in the expert's turns: the student can have internal state.
         students = self._student.act(encoded, state, history)
         return students if self._turns.is_students(now_s) else chunk
-
-    def _demonstrate(
-        self, expert: Expert | RateExpert, body: BodyState, now_s: float
-    ) -> tuple[Action, Sequence[float]]:
-        """Return the expert's action, and the disturbed action to fly."""
-        if isinstance(expert, RateExpert):
-            command = expert.command(body, now_s)
-            return BodyRates(*command), self._disturbance.flown(command, now_s)
-        sticks = expert.sticks(body, now_s)
-        return Sticks(*sticks), self._disturbance.flown(sticks, now_s)
 
     def _begin(self, now_ns: int) -> Expert | RateExpert:
         """Move the vehicle to the start of the demonstration, and create the expert.
@@ -348,8 +341,7 @@ class _LabelledRecorder:
         if tick.woke_ns < from_ns or serial is None or serial == self._chunk_serial:
             return
         self._chunk_serial = serial
-        expert = self._pilot.expert_action(serial)
-        self._writer.tick(replace(tick, serial=self._ticks), expert)
+        self._writer.tick(replace(tick, serial=self._ticks), self._pilot.expert_actions.get(serial))
         self._ticks += 1
 
 

@@ -26,7 +26,7 @@ from policy.loading.builtin import builtin_config
 from policy.motion.stick_loop import rates_contract
 from policy.nets.toge import BuiltinConfig
 from policy.nets.world_model.config import WorldModelConfig
-from policy.training.policy_run import Check, train_policy
+from policy.training.policy_run import train_policy
 from policy.training.report import Hooks, TrainingProgress, TrainResult
 from policy.training.run_folder import TrainingStoppedError
 from policy.training.settings import RunSettings, TrainSettings, WorldModelSettings
@@ -45,7 +45,7 @@ def run_policy_training(paths: Sequence[Path], settings: TrainSettings) -> int:
     require_devices(settings.device)
     network = builtin_config(settings.policy, image_size=settings.image_size)
     check_range("check-flights", settings.check_flights, 0, MAX_EPISODES, "")
-    check: Check | None = None
+    check = None
     if settings.check_flights:
         try:
             import mavbridge.simulation.flight  # noqa: F401 - share_of_gates needs it
@@ -53,9 +53,7 @@ def run_policy_training(paths: Sequence[Path], settings: TrainSettings) -> int:
             raise UserError(
                 f"--check-flights needs the simulator ({error}): install mavbridge[sitl]"
             ) from error
-
-        def check(checkpoint: Path) -> float:
-            return share_of_gates(checkpoint, settings)
+        check = partial(share_of_gates, settings=settings)
 
     flights = _read_flights(paths, settings)
     network = fit_to_flights(network, flights, settings)

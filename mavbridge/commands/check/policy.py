@@ -16,7 +16,6 @@ from mavbridge.core.workers import Worker
 from mavbridge.flight.plan import FlightPlan, plan_flight
 from mavbridge.flight.policies import load_configured_policy
 from mavbridge.flight.speed import require_speed
-from policy.contract import Contract
 from policy.engines.runner import dummy_sample, encode_all
 from policy.errors import Agreed, NoChunkError, Warned
 from policy.loading.request import LoadedPolicy
@@ -52,12 +51,18 @@ def check_policy(
             found = f"{runner.name} on {runner.engine}{', agrees with torch' if agrees else ''}"
             expected = "the fastest that agrees with torch"
             rows = [_row("engine", found, expected, warn=_warnings(loaded.notes))]
-            takes = _contract_words(runner.contract)
+            contract = runner.contract
+            size = f"{contract.image_width}x{contract.image_height}"
+            images = f"{size} of {', '.join(contract.cameras)}"
+            takes = f"{contract.action}, {contract.state_frame}, {images}"
             try:
-                plan = plan_flight(config, runner.contract, is_dual=runner.dual_rate)
+                plan = plan_flight(config, contract, is_dual=runner.dual_rate)
             except UserError as error:
                 rows.append(_row("flags of the flight", takes, no_go=str(error)))
-                return rows, _plan_by_contract(config, runner)
+                # Flags that may contradict the contract are left out, for the other rows.
+                goal = "0,0,0" if "goal" in contract.state_extras else None
+                kept = replace(config, limits=Limits(), mode=None, goal=goal)
+                return rows, plan_flight(kept, contract, is_dual=runner.dual_rate)
             rows += _speed_rows(plan, loaded, clock, timing_s)
             figures = ", ".join(f"{name} {value:.4g}" for name, value in plan.figures().items())
             rows.append(_row("contract", takes, "no flag that contradicts it"))
@@ -67,20 +72,8 @@ def check_policy(
         return [_row("policy", config.policy.policy, no_go=str(error))], None
 
 
-def _contract_words(contract: Contract) -> str:
-    takes = f"{contract.image_width}x{contract.image_height} of {', '.join(contract.cameras)}"
-    return f"{contract.action}, {contract.state_frame}, {takes}"
-
-
 def _warnings(notes: Iterable[str]) -> str:
     return "; ".join(note.text for note in notes if isinstance(note, Warned))
-
-
-def _plan_by_contract(config: FlyConfig, runner: PolicyRunner) -> FlightPlan:
-    """Plan the flight without the flags that may contradict its contract, for the other rows."""
-    goal = "0,0,0" if "goal" in runner.contract.state_extras else None
-    kept = replace(config, limits=Limits(), mode=None, goal=goal)
-    return plan_flight(kept, runner.contract, is_dual=runner.dual_rate)
 
 
 def _speed_rows(

@@ -221,13 +221,11 @@ def worst_moments(
             groups.append([moment])
         elif all(moment.what != other.what for other in near):
             near.append(moment)
-    return tuple(_told_together(*group) for group in groups[:MOMENTS])
-
-
-def _told_together(worst: Moment, *others: Moment) -> Moment:
-    """Merge close moments: the worst one, with the worst of each other kind in its detail."""
-    phrases = [worst.detail, *(f"{other.what}: {other.detail}" for other in others)]
-    return replace(worst, detail="; ".join(phrases))
+    told = []
+    for worst, *others in groups[:MOMENTS]:
+        phrases = [worst.detail, *(f"{other.what}: {other.detail}" for other in others)]
+        told.append(replace(worst, detail="; ".join(phrases)))
+    return tuple(told)
 
 
 def _crash(flight: RecordedFlight, ticks: Sequence[Tick]) -> Iterator[_Found]:

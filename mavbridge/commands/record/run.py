@@ -124,7 +124,7 @@ class _Session:
         """Why the last request for an episode was refused."""
         self._screen = RecordScreen(console, rate_hz=config.rate, vision_hz=config.film.visual_rate)
         stack.callback(self._screen.close, JOIN_S)
-        viewer = self._open_viewer()
+        viewer = () if config.rerun == "off" else (self._open_viewer(),)
         self._guard = GuardProcess(listening_guard(config, clock), clock)
         stack.callback(self._guard.close)
         self._guard.wait_until_open()
@@ -180,15 +180,13 @@ class _Session:
             is_airborne=lambda: self._view.status.armed and self._view.status.is_landed is False,
         )
 
-    def _open_viewer(self) -> tuple[TickSink, ...]:
-        if self._config.rerun == "off":
-            return ()
+    def _open_viewer(self) -> TickSink:
         rate = self._config.rate
         flight = ViewedFlight(vision_hz=self._config.film.visual_rate, chunk_hz=rate, stick_hz=rate)
         view = RerunView(self._config.rerun, flight)
         viewer = ObserverThread("mavbridge-rerun", view, capacity=RERUN_CAPACITY)
         self._stack.callback(viewer.close, JOIN_S)
-        return (viewer,)
+        return viewer
 
     def _meta(self, begin_ns: int) -> FlightMeta:
         wall_s = (begin_ns + wall_offset_ns(self._clock)) / NS_PER_S
