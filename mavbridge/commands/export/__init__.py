@@ -1,5 +1,4 @@
 """``mavbridge export``: flights as a LeRobot dataset of format v3.0.
 
-flights --policy.data--> Episode --rows--> Stretch --dataset--> meta/*
-                                                       '--files--> data/*.parquet, videos/*.mp4
+flights --policy.data--> FlightData --run--> Stretch --dataset--> meta/*, data/*, videos/*
 """

@@ -1,33 +1,35 @@
-"""Writer of LeRobot datasets of format v3.0, episode by episode, with their statistics."""
+"""Writer of LeRobot datasets of format v3.0, episode by episode, with their statistics.
+
+LeRobot's reader expects frame k of an episode at ``from_timestamp + k / fps``, within 0.1 ms
+(lerobot 0.6.1, ``datasets/lerobot_dataset.py`` ``tolerance_s``, ``datasets/video_utils.py``), so a
+video has one frame every 1/fps exactly, starting at 0.
+"""
 
 import json
 from collections.abc import Iterable
 from contextlib import closing
+from dataclasses import dataclass
+from fractions import Fraction
 from itertools import chain, islice
 from pathlib import Path
 from typing import TypeAlias
 
+import av
 import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 from numpy.typing import NDArray
 
-from mavbridge.commands.export.files import (
-    FILES_A_CHUNK,
-    MIN_ROWS,
-    DatasetSpec,
-    EpisodeVideo,
-    Stretch,
-    episode_file,
-)
 from mavbridge.core.records import ImageArray
 from mavbridge.recording.video.file import VideoError
 from policy.adapters.interface import state_values
-from policy.contract import ACTION_NAMES, STATE_NAMES
+from policy.contract import ACTION_NAMES, STATE_NAMES, StateFrame
 from policy.data import lerobot_format as names
 from policy.files import library_name
 from policy.preprocess import resize
 
+MIN_ROWS = 2
+"""Fewer rows show no motion."""
 QUANTILES = {"q01": 0.01, "q10": 0.10, "q50": 0.50, "q90": 0.90, "q99": 0.99}
 Stats: TypeAlias = dict[str, NDArray[np.float64] | NDArray[np.int64]]
 """By name; "count" is [1] int64, the others are as wide as the feature."""
@@ -82,6 +84,69 @@ def colour_stats(counts: NDArray[np.int64], images: int) -> Stats:
     return out | {"count": np.array([images], np.int64)}
 
 
+FILES_A_CHUNK = 1000
+"""LeRobot's ``DEFAULT_CHUNK_SIZE``."""
+_OPTIONS: dict[str, object] = {
+    "preset": "veryfast",
+    "crf": "20",  # as the recorder's
+    "g": "2",  # LeRobot's own: any frame is available after decoding two
+    "tune": "zerolatency",  # a frame in, a packet out; none is before time 0
+    "threads": "1",
+}
+
+
+@dataclass(frozen=True, kw_only=True)
+class DatasetSpec:
+    """Properties shared by all episodes."""
+
+    fps: int
+    height: int
+    """Image height, even like ``width``."""
+    width: int
+    state_frame: StateFrame
+    task: str
+    state_names: tuple[str, ...] = STATE_NAMES
+    """Names of the numbers in ``observation.state``: by the contract or ``adapters.interface``."""
+
+
+class EpisodeVideo:
+    """Video of one episode, H.264, yuv420p, starting at time 0.
+
+    Methods raise OSError or FFmpegError if it cannot be written.
+    """
+
+    def __init__(self, path: Path, spec: DatasetSpec) -> None:
+        """Create the file."""
+        self._container = av.open(library_name(path), "w", options={"movflags": "faststart"})
+        self._stream = self._container.add_stream("libx264", spec.fps)
+        self._stream.height, self._stream.width = spec.height, spec.width
+        self._stream.pix_fmt, self._stream.options = "yuv420p", dict(_OPTIONS)
+        self._time_base = self._stream.codec_context.time_base = Fraction(1, spec.fps)
+        self._frames = 0
+
+    def append(self, rgb: ImageArray) -> None:
+        """Encode a frame [H, W, 3] uint8."""
+        frame = av.VideoFrame.from_ndarray(rgb, format="rgb24")
+        frame.pts, frame.time_base = self._frames, self._time_base
+        self._container.mux(self._stream.encode(frame))
+        self._frames += 1
+
+    def close(self) -> None:
+        """Finish the file."""
+        try:
+            self._container.mux(self._stream.encode(None))
+        finally:
+            self._container.close()
+
+
+def episode_file(folder: Path, pattern: str, number: int) -> Path:
+    """Return the path of one episode's file in an existing folder."""
+    chunk, file = divmod(number, FILES_A_CHUNK)
+    path = folder / pattern.format(video_key=names.CAMERA_KEY, chunk_index=chunk, file_index=file)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    return path
+
+
 class DatasetWriter:
     """Dataset that grows episode by episode; complete only after ``finish``.
 
@@ -104,10 +169,13 @@ class DatasetWriter:
         """Number of episodes so far."""
         return len(self._episodes)
 
-    def add(self, part: Stretch, images: Iterable[ImageArray]) -> int:
-        """Append an episode; return the number of its rows.
+    def add(
+        self, name: str, columns: dict[str, NDArray[np.generic]], images: Iterable[ImageArray]
+    ) -> int:
+        """Append an episode of the flight called ``name``; return the number of its rows.
 
-        It ends early if its images do, and is left out if it has fewer than ``MIN_ROWS`` rows.
+        ``columns`` are rows for all images, as of a ``Stretch``. The episode ends early if its
+        images do, and is left out if it has fewer than ``MIN_ROWS`` rows.
 
         Raises:
             VideoError: images of another size.
@@ -125,17 +193,17 @@ class DatasetWriter:
                 image = np.ascontiguousarray(fit_size(rgb, self._image_size))
                 if image.shape[:2] != (self._spec.height, self._spec.width):
                     raise VideoError(
-                        f"{part.episode.name} has images of {image.shape[1]}x{image.shape[0]}, the "
+                        f"{name} has images of {image.shape[1]}x{image.shape[0]}, the "
                         f"first flight of {self._spec.width}x{self._spec.height}: export them apart"
                     )
                 video.append(image)
                 colours += colour_counts(image)
                 count += 1
-        columns = self._columns(part.part(0, count))
-        table = pa.table({name: _arrow(values) for name, values in columns.items()})
+        rows = self._rows({key: values[:count] for key, values in columns.items()}, count)
+        table = pa.table({key: _arrow(values) for key, values in rows.items()})
         self._tables.append(episode_file(self._folder, names.DATA, self.episodes))
         pq.write_table(table, library_name(self._tables[-1]))
-        stats = {name: vector_stats(values) for name, values in columns.items()}
+        stats = {key: vector_stats(values) for key, values in rows.items()}
         stats[names.CAMERA_KEY] = colour_stats(colours, count)
         self._colours += colours
         self._episodes.append(
@@ -149,13 +217,14 @@ class DatasetWriter:
         self.rows += count
         return count
 
-    def _columns(self, part: Stretch) -> dict[str, NDArray[np.generic]]:
-        count = len(part)
+    def _rows(
+        self, columns: dict[str, NDArray[np.generic]], count: int
+    ) -> dict[str, NDArray[np.generic]]:
         frame_index = np.arange(count, dtype=np.int64)
-        state = part.columns[names.STATE_KEY]
+        state = columns[names.STATE_KEY]
         wanted = state_values(list(state.T), STATE_NAMES, self._spec.state_names)
         return {
-            **part.columns,
+            **columns,
             names.STATE_KEY: np.stack(wanted, axis=1),
             "timestamp": (frame_index / self._spec.fps).astype(np.float32),
             "frame_index": frame_index,

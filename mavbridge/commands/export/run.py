@@ -1,34 +1,150 @@
-"""``mavbridge export``: flights in, a LeRobot dataset out, complete or not at all."""
+"""``mavbridge export``: flights in, a LeRobot dataset out, complete or not at all.
+
+A row holds the data known at the exposure of its image: the state of the newest tick whose messages
+had all arrived by then, and the newest sticks to imitate up to then. Nothing is interpolated; the
+stamps give the age of each.
+"""
 
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
-from itertools import chain, islice
+from dataclasses import dataclass
+from itertools import chain, groupby, islice, pairwise
 from pathlib import Path
 from shutil import rmtree
 
+import numpy as np
 from av.error import FFmpegError
+from numpy.typing import NDArray
 from rich.console import Console
 from rich.progress import TaskID
 
 from mavbridge.commands.config import ExportConfig
-from mavbridge.commands.export.dataset import DatasetWriter, fit_size
-from mavbridge.commands.export.files import (
-    DatasetSpec,
-    common_fps,
-    stretches,
-    worst_shift_ns,
-)
+from mavbridge.commands.export.dataset import MIN_ROWS, DatasetSpec, DatasetWriter, fit_size
 from mavbridge.commands.output import progress_bar
-from mavbridge.core.clock import NS_PER_MS
+from mavbridge.core.clock import NS_PER_MS, NS_PER_S
 from mavbridge.core.errors import UserError
 from mavbridge.core.records import ImageArray
 from mavbridge.core.stopping import stop_on_signals
 from policy.adapters.drafts import Entry, dataset_entries, draft_text, recorded_entries
 from policy.adapters.interface import BODY_STATE_NAMES, CONTRACT_FILE
-from policy.contract import STATE_NAMES
-from policy.data.flight_data import DatasetError, FlightData, common_frame, common_terms
+from policy.contract import ACTION_DIM, STATE_NAMES
+from policy.data import lerobot_format as names
+from policy.data.flight_data import (
+    DatasetError,
+    FlightData,
+    Nanoseconds,
+    common_frame,
+    common_terms,
+)
 from policy.data.flight_folders import find_flights, leave_out_failed, read_flight
+from policy.data.interpolation import MAX_GAP_NS
 from policy.files import read_object
+
+MAX_HELD_NS = MAX_GAP_NS
+"""A state or sticks older than this no longer belong to a frame."""
+MAX_MISSING_FRAMES = 1
+"""Longest run of missing frames. After a longer one a new episode begins, because LeRobot assumes
+rows at equal intervals."""
+MAX_RATE_OFF = 0.2
+"""Largest relative difference between the rate of a flight and the common rate."""
+
+
+@dataclass(frozen=True)
+class Stretch:
+    """Consecutive frames of a flight during which it was flown: one LeRobot episode."""
+
+    episode: FlightData
+    first_frame: int
+    columns: dict[str, NDArray[np.generic]]
+    """State [N, 13], action and sent sticks [N, 4], then the stamps [N], under their names in the
+    dataset. Sent sticks are zeros if they were released or none had been sent yet."""
+
+    def __len__(self) -> int:
+        return len(self.captured_ns)
+
+    @property
+    def captured_ns(self) -> Nanoseconds:
+        """Exposures, [N]."""
+        return self.columns[names.CAPTURED].astype(np.int64, copy=False)
+
+    def part(self, start: int, stop: int) -> "Stretch":
+        """Return the rows from ``start`` up to ``stop``."""
+        columns = {name: values[start:stop] for name, values in self.columns.items()}
+        return Stretch(self.episode, self.first_frame + start, columns)
+
+
+def stretches(episode: FlightData) -> list[Stretch]:
+    """Align a flight to its frames, and leave out frames without a state or sticks."""
+    captured_ns = episode.captured_ns
+    arrived_ns = np.maximum.accumulate(np.maximum(episode.attitude_ns, episode.velocity_ns))
+    tick = _newest(arrived_ns, captured_ns)
+    target = _newest(episode.target_ns, captured_ns)
+    sent = _newest(episode.sent_ns, captured_ns)
+    is_known = (tick >= 0) & (target >= 0)
+    is_known &= captured_ns - arrived_ns[tick] <= MAX_HELD_NS
+    is_known &= captured_ns - episode.target_ns[target] <= MAX_HELD_NS
+    is_known &= np.isfinite(episode.state[tick]).all(axis=1)
+    # If nothing had been sent yet, index -1 selects the appended row.
+    sent_sticks = np.concatenate([episode.sent, np.zeros((1, ACTION_DIM), np.float32)])[sent]
+    sent_ns = np.where(sent < 0, captured_ns, np.append(episode.sent_ns, 0)[sent])
+    stamps = (
+        *(captured_ns, episode.tick_ns[tick], episode.attitude_ns[tick]),
+        *(episode.velocity_ns[tick], episode.target_ns[target], sent_ns.astype(np.int64)),
+    )
+    columns: dict[str, NDArray[np.generic]] = {
+        names.STATE_KEY: episode.state[tick],
+        names.ACTION_KEY: episode.target[target],
+        names.SENT: sent_sticks,
+        **dict(zip(names.STAMPS, stamps, strict=True)),
+    }
+    whole = Stretch(episode, 0, columns)
+    return [whole.part(start, stop) for start, stop in _runs(captured_ns, is_known)]
+
+
+def _newest(stamps_ns: Nanoseconds, at_ns: Nanoseconds) -> NDArray[np.intp]:
+    """Return [N], the index of the newest stamp at or before each time; -1 if there is none."""
+    return np.searchsorted(stamps_ns, at_ns, side="right") - 1
+
+
+def _runs(captured_ns: Nanoseconds, is_known: NDArray[np.bool_]) -> list[tuple[int, int]]:
+    """Return the runs of known frames without a hole: start and stop index of each."""
+    if len(captured_ns) < MIN_ROWS:
+        return []
+    periods = np.diff(captured_ns)
+    longest = (MAX_MISSING_FRAMES + 1.5) * np.median(periods)
+    is_cut = (periods > longest) | (is_known[1:] != is_known[:-1])
+    edges = [0, *(np.flatnonzero(is_cut) + 1).tolist(), len(captured_ns)]
+    return [(a, b) for a, b in pairwise(edges) if is_known[a] and b - a >= MIN_ROWS]
+
+
+def common_fps(parts: Sequence[Stretch]) -> int:
+    """Return the integer frame rate that LeRobot assumes for all frames.
+
+    Raises:
+        UserError: flights of several rates.
+    """
+    fps = max(1, round(_rate_hz(np.concatenate([np.diff(p.captured_ns) for p in parts]))))
+    # Per flight, because a stretch of a few frames has no rate of its own.
+    for _, of_flight in groupby(parts, key=lambda part: id(part.episode)):
+        whole = list(of_flight)
+        own = _rate_hz(np.concatenate([np.diff(part.captured_ns) for part in whole]))
+        if abs(own / fps - 1.0) > MAX_RATE_OFF:
+            raise UserError(
+                f"{whole[0].episode.name} has {own:.3g} frames a second, most of the rest {fps}: a "
+                "LeRobot dataset has one rate, so export them apart"
+            )
+    return fps
+
+
+def _rate_hz(periods_ns: Nanoseconds) -> float:
+    whole = periods_ns[periods_ns <= 1.5 * np.median(periods_ns)]
+    return NS_PER_S / float(np.maximum(whole.mean(), 1.0))
+
+
+def worst_shift_ns(part: Stretch, fps: int) -> int:
+    """Return the largest distance of a frame from its place on LeRobot's even grid."""
+    even_ns = np.round(np.arange(len(part)) * (NS_PER_S / fps)).astype(np.int64)
+    return int(np.abs(part.captured_ns - part.captured_ns[0] - even_ns).max())
 
 
 def export(flights: Sequence[Path], config: ExportConfig) -> int:
@@ -104,7 +220,7 @@ def write_dataset(
         images, at = _decoded(episode, on_frame), 0
         for part in of_flight:  # the video is decoded once, from its beginning
             skipped = sum(1 for _ in islice(images, part.first_frame - at))
-            at += skipped + writer.add(part, islice(images, len(part)))
+            at += skipped + writer.add(episode.name, part.columns, islice(images, len(part)))
     writer.finish()
     shift_ms = max(worst_shift_ns(part, fps) for part in every) / NS_PER_MS
     return (

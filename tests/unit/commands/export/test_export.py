@@ -145,8 +145,7 @@ def test_what_was_sent_is_imitated_where_there_is_no_expert(tmp_path: Path) -> N
 def test_files_are_grouped_in_chunks(
     flights: list[Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    for module in ("files", "dataset"):
-        monkeypatch.setattr(f"mavbridge.commands.export.{module}.FILES_A_CHUNK", 2)
+    monkeypatch.setattr("mavbridge.commands.export.dataset.FILES_A_CHUNK", 2)
     write(flights, tmp_path / "out")
     assert broken_rules(tmp_path / "out") == []
     assert len(list(tmp_path.glob("out/videos/*/chunk-001/file-000.mp4"))) == 1

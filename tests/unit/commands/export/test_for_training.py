@@ -11,8 +11,7 @@ import pytest
 from helpers.flight_folders import write_meta, write_spot_flight
 from helpers.lerobot_rules import broken_rules
 from mavbridge.commands.config import ExportConfig
-from mavbridge.commands.export.files import stretches
-from mavbridge.commands.export.run import export
+from mavbridge.commands.export.run import export, stretches
 from mavbridge.core.errors import UserError
 from policy.adapters.interface import BODY_STATE_NAMES, Interface, read_interface
 from policy.contract import Contract
