@@ -12,11 +12,12 @@ from torch import Tensor
 
 from helpers.factories import START_NS, TICK_NS, make_state, make_tick, make_vision_tick
 from helpers.recordings import make_meta, without_writer_process
-from mavbridge.commands.imagine.inputs import RolloutStart, Sampler
 from mavbridge.commands.imagine.loop import (
     Decider,
     PolicyDecider,
     RolloutPlan,
+    RolloutStart,
+    Sampler,
     Segment,
     WorldModelDecider,
     rollout,

@@ -1,28 +1,133 @@
-"""Deciders of the sticks in an imagined flight, and the loop that calls them."""
+"""The world model, the deciders of the sticks in an imagined flight, and the loop of both."""
 
 from collections import deque
 from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from enum import IntEnum
-from typing import Protocol
+from typing import Literal, Protocol, TypeAlias
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
+from policy.world_model.config import WorldModelConfig
+from policy.world_model.model import WorldModel
 from torch import Tensor
 
-from mavbridge.commands.imagine.inputs import RolloutStart, Sampler
-from mavbridge.core.clock import NS_PER_S
-from mavbridge.core.errors import UserError
+from mavbridge.core.clock import NS_PER_S, Clock
+from mavbridge.core.errors import MavbridgeError, UserError
 from mavbridge.core.records import FloatArray, ImageArray
 from mavbridge.core.vehicle import Sticks
 from mavbridge.flight.history import SentHistory, sample_chunk
 from policy.contract import SINCE_EXPOSURE_DIM, Contract
 from policy.protocol import PolicyRunner
 
+Part: TypeAlias = Literal["sample", "decode", "write"]
 SAMPLES_PER_STEP = 8
 """Samples whose mean is one action of the world model, the mean stick of a step."""
 MAX_SEED = 2**63 - 1
 """Largest seed that torch's generators accept."""
+
+
+class ImaginationError(MavbridgeError):
+    """The world model imagined NaN or infinity."""
+
+
+@contextmanager
+def torch_threads(count: int) -> Iterator[None]:
+    """Context manager: let torch use ``count`` threads, at least one."""
+    before = torch.get_num_threads()
+    torch.set_num_threads(max(1, count))
+    try:
+        yield
+    finally:
+        torch.set_num_threads(before)
+
+
+class Sampler:
+    """One world model in both roles, simulation and decision. Used by the loop's thread."""
+
+    def __init__(self, model: WorldModel, *, ddim_steps: int, clock: Clock) -> None:
+        """Wrap a model that is already on its device."""
+        self.model = model
+        self.config: WorldModelConfig = model.config
+        self.clock = clock
+        self.seconds: dict[Part, float] = {"sample": 0.0, "decode": 0.0, "write": 0.0}
+        """Time of the loop's thread; decode: waits for room in the decoder's queue included."""
+        self.frames_decoded = 0
+        self._ddim_steps = ddim_steps
+        self._device = next(model.parameters()).device
+
+    @contextmanager
+    def timed(self, part: Part) -> Iterator[None]:
+        """Context manager: add the block's time."""
+        begun_ns = self.clock.now_ns()
+        try:
+            yield
+        finally:
+            self.seconds[part] += (self.clock.now_ns() - begun_ns) / NS_PER_S
+
+    def encode(self, images: NDArray[np.uint8]) -> Tensor:
+        """Encode images [N, H, W, 3] to latents [N, C, h, w]."""
+        with torch.inference_mode():
+            return self.model.encode(torch.from_numpy(images).to(self._device))
+
+    def decode(self, latents: Tensor) -> NDArray[np.uint8]:
+        """Decode latents [N, C, h, w] to images [N, H, W, 3].
+
+        On one thread, like ``FrameDecoder``, because splitting a sum changes its rounding.
+        """
+        with torch.inference_mode(), torch_threads(1), self.timed("decode"):
+            pixels: NDArray[np.uint8] = self.model.decode(latents).cpu().numpy()
+        self.frames_decoded += len(pixels)
+        return pixels
+
+    def sample(
+        self, latents: Tensor, states: FloatArray, actions: FloatArray | None, *, seed: int
+    ) -> tuple[Tensor, FloatArray, FloatArray]:
+        """Simulate the actions [frames, 4], or sample actions if they are None.
+
+        Return latents [frames, C, h, w], on the model's device, states [frames, 13] and actions.
+
+        Latents are [1, context_frames, C, h, w], states [1, context_frames, 13]; ``seed`` is that
+        of the noise.
+
+        Raises:
+            ImaginationError: the result is not finite.
+        """
+        with torch.inference_mode(), self.timed("sample"):
+            imagined = self.model.sample(
+                latents,
+                self._tensor(states),
+                None if actions is None else self._tensor(actions[None]),
+                ddim_steps=self._ddim_steps,
+                noise_seed=seed,
+            )
+            sampled_states = imagined.states[0].float().cpu().numpy()
+            sampled_actions = imagined.actions[0].float().cpu().numpy()
+        if not (np.isfinite(sampled_states).all() and np.isfinite(sampled_actions).all()):
+            raise ImaginationError(
+                "the world model imagined NaN or infinity: its weights are damaged, or it has left "
+                "what it was trained on; try more --ddim-steps, or another checkpoint"
+            )
+        return imagined.latents[0], sampled_states, sampled_actions
+
+    def _tensor(self, values: FloatArray) -> Tensor:
+        return torch.from_numpy(np.ascontiguousarray(values)).to(self._device)
+
+
+@dataclass(frozen=True, kw_only=True)
+class RolloutStart:
+    """Observed past of a rollout, oldest first; the newest frame is its time zero."""
+
+    images: NDArray[np.uint8]
+    """[context_frames, H, W, 3] at the world model's size."""
+    states: FloatArray
+    """[context_frames, 13]"""
+    newest_ns: int
+    """Exposure of the newest frame, on the flight's clock."""
+    sent: tuple[tuple[int, Sticks | None], ...]
+    """Sticks sent before ``newest_ns``, each with its time; None: released."""
 
 
 class ObservationQueue:

@@ -18,8 +18,7 @@ import pyarrow as pa
 import torch
 from torch import Tensor
 
-from mavbridge.commands.imagine.inputs import Sampler, torch_threads
-from mavbridge.commands.imagine.loop import RolloutPlan, Segment
+from mavbridge.commands.imagine.loop import RolloutPlan, Sampler, Segment, torch_threads
 from mavbridge.core.clock import NS_PER_S
 from mavbridge.core.errors import MavbridgeError, UserError
 from mavbridge.core.files import require_writable

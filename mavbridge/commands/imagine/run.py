@@ -1,28 +1,28 @@
 """``mavbridge imagine``: from a recorded flight and the settings to the files of a rollout."""
 
+from collections import deque
+from collections.abc import Iterator
 from contextlib import ExitStack, closing
 from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
 import torch
+from numpy.typing import NDArray
 from rich.console import Console
 from rich.text import Text
 
 import policy
 from mavbridge.commands.config import ImagineConfig
-from mavbridge.commands.imagine.inputs import (
-    RealFrames,
-    RolloutStart,
-    Sampler,
-    read_start,
-    torch_threads,
-)
 from mavbridge.commands.imagine.loop import (
     Decider,
     PolicyDecider,
     RolloutPlan,
+    RolloutStart,
+    Sampler,
     WorldModelDecider,
     rollout,
+    torch_threads,
 )
 from mavbridge.commands.imagine.output import (
     OnFrame,
@@ -32,16 +32,24 @@ from mavbridge.commands.imagine.output import (
     prepare_out,
 )
 from mavbridge.commands.output import progress_bar
-from mavbridge.core.clock import Clock, MonotonicClock
+from mavbridge.core.clock import NS_PER_S, Clock, MonotonicClock
 from mavbridge.core.errors import MavbridgeError, UserError
+from mavbridge.core.records import ImageArray
 from mavbridge.core.stopping import INTERRUPTED, stop_on_signals
+from mavbridge.core.vehicle import Sticks
 from mavbridge.flight.policies import load_configured_policy
-from mavbridge.recording.flight_folder import open_flight
+from mavbridge.recording.flight_folder import RecordedFlight, open_flight
 from policy.checkpoints.networks import load_world_model
 from policy.engines.runner import require_devices
 from policy.errors import Warned
+from policy.nets.world_model.config import WorldModelConfig
 from policy.nets.world_model.model import WorldModel
+from policy.preprocess import resize
 
+MAX_STATE_AGE_NS = 100_000_000
+"""Oldest state, at the exposure of a frame, that still belongs to it."""
+MAX_HISTORY_S = 10.0
+"""Longest history that any policy uses."""
 SHIPPED = Path(policy.__file__).parent / "weights" / "world_model.safetensors"
 
 
@@ -181,3 +189,123 @@ def _print_summary(config: ImagineConfig, sampler: Sampler, output: StreamedOutp
     )
     if config.decode_video:
         console.print(f"sha256 of the frames: {output.sha256}", soft_wrap=True)
+
+
+def read_start(flight: RecordedFlight, config: WorldModelConfig, start_s: float) -> RolloutStart:
+    """Read the context, from ``start_s`` after the first frame that has a state.
+
+    Raises:
+        UserError: the flight is too short, has no states, or has them in another frame.
+        VideoError: its video is damaged.
+    """
+    _require_state_frame(flight, config)
+    captured_ns = flight.frames["captured_ns"].to_numpy()
+    ticks = flight.ticks.filter(flight.ticks["state"].is_valid())
+    if not (len(captured_ns) and ticks.num_rows):
+        lacks = "no state of the vehicle" if len(captured_ns) else "no frames"
+        raise UserError(f"--start {flight.folder} holds {lacks}: name a flight that was flown")
+    state_ns = ticks["attitude_ns"].to_numpy()
+    with_state = captured_ns[captured_ns >= state_ns[0]]
+    first_ns = int(with_state[0] if len(with_state) else captured_ns[-1] + 1)
+    first_ns += round(start_s * NS_PER_S)
+    dt_s = config.frame_dt_s
+    wanted_ns = [first_ns + round(k * dt_s * NS_PER_S) for k in range(config.context_frames)]
+    if wanted_ns[-1] > captured_ns[-1] + round(dt_s * NS_PER_S / 2):
+        raise UserError(
+            f"--start {flight.folder} is too short: {config.context_frames} frames {dt_s:g} s "
+            f"apart are needed from {start_s:g} s after its first state on, its frames end "
+            f"{(captured_ns[-1] - first_ns) / NS_PER_S + start_s:.2f} s after it"
+        )
+    frames = [_nearest(captured_ns, at_ns) for at_ns in wanted_ns]
+    newest_ns = int(captured_ns[frames[-1]])
+    # The newest state known at each exposure.
+    known = np.searchsorted(state_ns, captured_ns[frames], side="right") - 1
+    for row, at_ns in zip(known, captured_ns[frames], strict=True):
+        if row < 0 or at_ns - state_ns[row] > MAX_STATE_AGE_NS:
+            raise UserError(
+                f"--start {flight.folder} has no state of the vehicle there, at "
+                f"{(at_ns - state_ns[0]) / NS_PER_S:.2f} s: choose another --start-at"
+            )
+    return RolloutStart(
+        images=_start_images(flight, frames, config.image_size),
+        states=np.array(ticks["state"].take(known).to_pylist(), np.float32),
+        newest_ns=newest_ns,
+        sent=_sent_before(flight, newest_ns),
+    )
+
+
+def _require_state_frame(flight: RecordedFlight, config: WorldModelConfig) -> None:
+    contract, wanted = flight.meta.contract, config.contract.state_frame
+    if contract is None or contract.state_frame != wanted:
+        found = "an unknown frame" if contract is None else contract.state_frame
+        raise UserError(
+            f"--start {flight.folder} has its states in {found}, the world model takes {wanted}: "
+            "name a flight of that kind, or a world model that was trained on this one"
+        )
+    if contract.action != "sticks":
+        raise UserError(
+            f"--start {flight.folder} was flown by {contract.action}, the world model takes sticks"
+        )
+
+
+def _sent_before(flight: RecordedFlight, now_ns: int) -> tuple[tuple[int, Sticks | None], ...]:
+    since_ns = now_ns - round(MAX_HISTORY_S * NS_PER_S)
+    columns = (flight.ticks["sent_ns"].to_pylist(), flight.ticks["sent"].to_pylist())
+    return tuple(
+        (sent_ns, None if sent is None else Sticks(*sent))
+        for sent_ns, sent in zip(*columns, strict=True)
+        if since_ns <= sent_ns < now_ns
+    )
+
+
+def _start_images(flight: RecordedFlight, frames: list[int], size: int) -> NDArray[np.uint8]:
+    found: dict[int, ImageArray] = {}
+    for index, rgb in enumerate(flight.rgb_images()):
+        if index in frames:
+            found[index] = resize(rgb, size, size)
+        if index >= frames[-1]:
+            break
+    return np.stack([found[index] for index in frames])
+
+
+def _nearest(stamps_ns: NDArray[np.int64], at_ns: int) -> int:
+    return int(np.abs(stamps_ns - at_ns).argmin())
+
+
+class RealFrames:
+    """Images of the flight's camera after the start, at the world model's times and size.
+
+    Decodes forward only. Keeps as many frames as one segment has, because segments overlap.
+    """
+
+    def __init__(self, flight: RecordedFlight, config: WorldModelConfig, newest_ns: int) -> None:
+        self._captured_ns: NDArray[np.int64] = flight.frames["captured_ns"].to_numpy()
+        self._images: Iterator[ImageArray] = flight.rgb_images()
+        self._config = config
+        self._newest_ns = newest_ns
+        self._decoded = 0
+        self._newest_step = 0
+        self._window: deque[ImageArray] = deque(maxlen=config.frames)
+
+    def at(self, step: int) -> ImageArray | None:
+        """Return the frame ``step`` times ``frame_dt_s`` after the start; None after the flight.
+
+        Raises:
+            ValueError: it has left the window: steps can go back by one segment at most.
+            VideoError: the video is damaged.
+        """
+        while self._newest_step < step:
+            dt_s, size = self._config.frame_dt_s, self._config.image_size
+            at_ns = self._newest_ns + round((self._newest_step + 1) * dt_s * NS_PER_S)
+            if at_ns > self._captured_ns[-1]:
+                return None
+            rgb = None
+            while self._decoded <= _nearest(self._captured_ns, at_ns):
+                rgb = next(self._images)
+                self._decoded += 1
+            self._newest_step += 1
+            # Two steps share a frame only if the camera is slower than the world model.
+            self._window.append(self._window[-1] if rgb is None else resize(rgb, size, size))
+        if self._newest_step - step >= len(self._window):
+            raise ValueError(f"step {step} has left the window")
+        return self._window[step - self._newest_step - 1]

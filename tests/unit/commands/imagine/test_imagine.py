@@ -7,13 +7,14 @@ from dataclasses import replace
 from pathlib import Path
 
 import pytest
+import torch
 from rerun.chunk import RrdReader
 
 from helpers.recordings import make_meta
 from helpers.rollouts import TINY, TinyWorld, read_rows, write_flight
 from mavbridge.__main__ import main
-from mavbridge.commands.imagine import inputs, run
-from mavbridge.commands.imagine.inputs import Sampler
+from mavbridge.commands.imagine import run
+from mavbridge.commands.imagine.loop import Sampler
 from mavbridge.recording.video.file import count_frames
 from policy.checkpoints.networks import save_world_model
 from policy.checkpoints.tensors import read_tensors, write_tensors
@@ -75,8 +76,8 @@ def test_sampling_leaves_a_core_to_decoding(
     imagine: Imagine, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     asked: list[int] = []
-    monkeypatch.setattr(inputs.torch, "get_num_threads", lambda: 8)
-    monkeypatch.setattr(inputs.torch, "set_num_threads", asked.append)
+    monkeypatch.setattr(torch, "get_num_threads", lambda: 8)
+    monkeypatch.setattr(torch, "set_num_threads", asked.append)
     status, text = imagine("--out", str(tmp_path / "a.mp4"), "--n-iter", "1")
     assert status == 0, text
     assert asked[0] == 7

@@ -16,8 +16,8 @@ from helpers.rollouts import (
     noise_runner,
     write_flight,
 )
-from mavbridge.commands.imagine.inputs import RealFrames, read_start
 from mavbridge.commands.imagine.loop import ObservationQueue, PolicyDecider
+from mavbridge.commands.imagine.run import RealFrames, read_start
 from mavbridge.core.clock import NS_PER_MS, NS_PER_S
 from mavbridge.core.errors import UserError
 from mavbridge.core.records import FloatArray
