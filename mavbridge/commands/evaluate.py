@@ -256,13 +256,7 @@ class Estimate:
 
 
 def rate(successes: int, count: int) -> Estimate:
-    """Return the success rate with Wilson's score interval (E. B. Wilson 1927, JASA 22, 209-212).
-
-    Raises:
-        ValueError: no trials, or more successes than trials.
-    """
-    if not 0 <= successes <= count or count == 0:
-        raise ValueError(f"{successes} successes of {count} are no rate")
+    """Return the success rate with Wilson's score interval (E. B. Wilson 1927, JASA 22, 209)."""
     share, z2 = successes / count, Z95**2
     centre = (share + z2 / (2 * count)) / (1 + z2 / count)
     spread = math.sqrt(share * (1 - share) / count + z2 / (4 * count**2))
