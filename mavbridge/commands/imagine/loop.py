@@ -10,8 +10,6 @@ from typing import Literal, Protocol, TypeAlias
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from policy.world_model.config import WorldModelConfig
-from policy.world_model.model import WorldModel
 from torch import Tensor
 
 from mavbridge.core.clock import NS_PER_S, Clock
@@ -20,6 +18,8 @@ from mavbridge.core.records import FloatArray, ImageArray
 from mavbridge.core.vehicle import Sticks
 from mavbridge.flight.history import SentHistory, sample_chunk
 from policy.contract import SINCE_EXPOSURE_DIM, Contract
+from policy.nets.world_model.config import WorldModelConfig
+from policy.nets.world_model.model import WorldModel
 from policy.protocol import PolicyRunner
 
 Part: TypeAlias = Literal["sample", "decode", "write"]

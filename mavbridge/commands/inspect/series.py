@@ -15,12 +15,10 @@ from mavbridge.core.records import Position
 from mavbridge.core.vehicle import ACTION_CLASSES
 from mavbridge.recording.flight_folder import RecordedFlight
 from mavbridge.recording.rows import FrameRow
-from policy.motion.rotation import conjugate, multiply
+from policy.adapters.interface import EULER_NAMES, state_values
+from policy.contract import QUATERNION, RATE, STATE_NAMES, VELOCITY
 
 FloatColumn: TypeAlias = NDArray[np.float64]
-_HALF = 0.5**0.5
-_ENU_FROM_NED, _FRD_FROM_FLU = (0.0, _HALF, _HALF, 0.0), (0.0, 1.0, 0.0, 0.0)
-"""As in ``mavbridge.flight.state``."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -71,13 +69,9 @@ def make_series(flight: RecordedFlight) -> TickSeries:
         return np.asarray(pc.if_else(where, lasted_ns, None), np.float64) / NS_PER_MS
 
     state = _vectors(ticks["state"])
-    velocity, attitude, rate = state[:, 0:3], state[:, 3:7], state[:, 7:10]
     if contract is not None and contract.state_frame == "enu_flu":
-        velocity = velocity[:, (1, 0, 2)] * (1, 1, -1)
-        rate = rate * (1, -1, -1)
-        to_ned, to_flu = conjugate(_ENU_FROM_NED), conjugate(_FRD_FROM_FLU)
-        left = np.broadcast_to(to_ned, attitude.shape)
-        attitude = multiply(multiply(left, attitude), np.broadcast_to(to_flu, attitude.shape))
+        state = _ned_frd(state)
+    angles_rad = state_values(list(state.T), STATE_NAMES, EULER_NAMES)
     return TickSeries(
         start_ns=start_ns,
         t_s=(woke_ns - start_ns) / NS_PER_S,
@@ -90,9 +84,9 @@ def make_series(flight: RecordedFlight) -> TickSeries:
         state_age_ms=flown_ms("sent_ns", "attitude_ns"),
         lateness_ms=np.maximum(flown_ms("sent_ns", "due_ns", is_slot), 0.0),
         period_ms=_periods_ms(ticks, is_flown.to_numpy(), is_slot.to_numpy()),
-        velocity_ned_mps=velocity,
-        roll_pitch_yaw_deg=_euler_deg(attitude),
-        rate_frd_dps=np.degrees(rate),
+        velocity_ned_mps=state[:, VELOCITY],
+        roll_pitch_yaw_deg=np.degrees(np.stack(angles_rad, axis=-1)),
+        rate_frd_dps=np.degrees(state[:, RATE]),
         position_ned_m=_vectors(ticks["position_ned_m"]),
     )
 
@@ -120,14 +114,14 @@ def _periods_ms(
     return periods_ms
 
 
-def _euler_deg(ned_from_frd_wxyz: FloatColumn) -> FloatColumn:
-    """Return roll, pitch and yaw of the aerospace sequence (yaw, then pitch, then roll)."""
-    w, x, y, z = np.moveaxis(ned_from_frd_wxyz, -1, 0)
-    roll = np.arctan2(2 * (w * x + y * z), 1 - 2 * (x * x + y * y))
-    pitch = np.arcsin(np.clip(2 * (w * y - z * x), -1, 1))
-    yaw = np.arctan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z))
-    angles_rad: FloatColumn = np.stack((roll, pitch, yaw), axis=-1)
-    return np.degrees(angles_rad)
+def _ned_frd(state: FloatColumn) -> FloatColumn:
+    """Convert states from ``enu_flu``; the inverse of the conversion in ``flight.state``."""
+    w, x, y, z = state[:, QUATERNION].T * 0.5**0.5
+    attitude = np.stack((w + z, x + y, x - y, w - z), axis=-1)
+    velocity = state[:, VELOCITY][:, (1, 0, 2)] * (1, 1, -1)
+    body = state[:, QUATERNION.stop :] * (1, -1, -1, 1, -1, -1)
+    converted: FloatColumn = np.concatenate((velocity, attitude, body), axis=1)
+    return converted
 
 
 @dataclass(frozen=True, kw_only=True)
