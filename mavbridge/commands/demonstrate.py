@@ -346,11 +346,7 @@ class _LabelledRecorder:
 
 
 def demonstrate(config: DemonstrateConfig) -> int:
-    """Fly every episode that is not recorded yet; return 130 if interrupted, to be resumed later.
-
-    Raises:
-        MavbridgeError: a flight cannot be flown or recorded.
-    """
+    """Fly every episode that is not recorded yet; return 130 if interrupted, to be resumed."""
     console = Console(stderr=True, emoji=False)
     specs = _missing(config)
     done = config.episodes - len(specs)

@@ -177,11 +177,7 @@ def flown_before(config: EvaluateConfig, flown_by: str) -> dict[int, FlownEpisod
 
 
 def evaluate(config: EvaluateConfig) -> int:
-    """Fly every episode of the config; return 130 if interrupted, with the results so far.
-
-    Raises:
-        MavbridgeError: an episode cannot be flown, or the results cannot be written.
-    """
+    """Fly every episode of the config; return 130 if interrupted, with the results so far."""
     require_writable(config.json, "--json")
     console = Console(stderr=True, emoji=False)
     flown_by = "" if config.json is None else identity(config)

@@ -225,11 +225,7 @@ def to_json(found: Identification, contract: Contract, config: IdentifyConfig) -
 
 
 def identify(config: IdentifyConfig) -> int:
-    """Fly the doublet, and print how the vehicle's gains and lags compare with the policy's.
-
-    Raises:
-        MavbridgeError: as for a flight, or the flight ended before any result.
-    """
+    """Fly the doublet, and print how the vehicle's gains and lags compare with the policy's."""
     clock = MonotonicClock()
     trained = configured_contract(config.flight.policy)
     flight = doublet_flight(config, trained)
@@ -251,11 +247,7 @@ def identify(config: IdentifyConfig) -> int:
 
 
 def doublet_flight(config: IdentifyConfig, trained: Contract) -> FlyConfig:
-    """Return the flight of the flags, with the doublet in place of the policy.
-
-    Raises:
-        UserError: ``--readonly`` was given.
-    """
+    """Return the flight of the flags, with the doublet in place of the policy."""
     flight = config.flight
     if flight.link.readonly:
         raise UserError("identify has to move the vehicle: leave out --readonly")

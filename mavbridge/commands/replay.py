@@ -61,11 +61,7 @@ differences of some 0.1 ms."""
 
 
 def replay(folder: Path, config: ReplayConfig) -> int:
-    """Compute a recorded flight again; return an ``ExitCode``.
-
-    Raises:
-        MavbridgeError: the flight cannot be read or replayed, or the policy cannot be loaded.
-    """
+    """Compute a recorded flight again; return an ``ExitCode``."""
     require_outputs(config.json, config.plot)
     source = open_source(folder)
     config = _trusted(source, config)

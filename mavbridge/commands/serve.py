@@ -137,11 +137,7 @@ class PolicyServer:
         """Clients without a request so far, with the time of their connection."""
 
     async def listen(self, host: str, port: int) -> Server:
-        """Start listening.
-
-        Raises:
-            UserError: listening at this address fails.
-        """
+        """Start listening."""
         # It would print a traceback for every unknown client that probes the port.
         logging.getLogger("websockets.server").setLevel(logging.CRITICAL)
         try:
@@ -219,11 +215,7 @@ def _name(connection: ServerConnection) -> str:
 
 
 def serve(config: ServeConfig) -> int:
-    """Serve a policy until a signal comes.
-
-    Raises:
-        MavbridgeError: the policy cannot be loaded, or the address cannot be listened at.
-    """
+    """Serve a policy until a signal comes."""
     policy_config = replace(config.policy, dual_rate=False)
     check_configured_policy(policy_config)
     console, clock = Console(highlight=False), MonotonicClock()

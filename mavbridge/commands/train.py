@@ -37,10 +37,6 @@ def run_policy_training(paths: Sequence[Path], settings: TrainSettings) -> int:
     """Train a policy; return 0 when the checkpoint is written, 130 if interrupted.
 
     Paths are flight folders, folders of them, or LeRobot datasets.
-
-    Raises:
-        UserError: a flag that cannot be used.
-        PolicyError: flights, weights or a run that cannot be used.
     """
     require_devices(settings.device)
     network = builtin_config(settings.policy, image_size=settings.image_size)
@@ -72,11 +68,7 @@ def run_world_model_training(paths: Sequence[Path], settings: WorldModelSettings
 
 
 def share_of_gates(checkpoint: Path, settings: TrainSettings) -> float:
-    """Return the share of gates that a checkpoint passes at two rates on ``check_flights`` courses.
-
-    Raises:
-        MavbridgeError, PolicyError: it cannot be flown.
-    """
+    """Return the share of gates that a checkpoint passes at two rates on all check courses."""
     from mavbridge.simulation.flight import SimulatedFlight
 
     wanted = PolicyConfig(policy=settings.policy, checkpoint=checkpoint, dual_rate=True)

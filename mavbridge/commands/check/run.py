@@ -103,11 +103,7 @@ def _refused_rights(rates: Rates) -> str:
 
 
 def check(config: CheckConfig) -> int:
-    """Check everything that a flight needs, print the table; return the exit status.
-
-    Raises:
-        UserError: --json names a file that cannot be written.
-    """
+    """Check everything that a flight needs, print the table; return the exit status."""
     is_on_stdout = config.json == STDOUT
     if not is_on_stdout:
         require_writable(config.json, "--json")

@@ -153,11 +153,7 @@ class FlightAnalysis:
 
 
 def analyse(folder: Path, *, gates: Path | None = None) -> FlightAnalysis:
-    """Read a recorded flight; ``gates`` is a file of ``read_gates``, for an unknown course.
-
-    Raises:
-        MavbridgeError: not a recorded flight, or a damaged one.
-    """
+    """Read a recorded flight; ``gates`` is a file of ``read_gates``, for an unknown course."""
     flight = open_flight(folder)
     _require_sound(flight)
     ticks = [row.tick for row in flight.tick_rows()]
@@ -307,9 +303,6 @@ def _read_arrivals(folder: Path, damage: list[str]) -> Arrivals | None:
     """Return the attitudes that reached the flight process; None if there is no such table.
 
     A sentence about any loss is appended to ``damage``.
-
-    Raises:
-        MavbridgeError: the table is damaged.
     """
     if not _has(folder, PACKETS):
         return None
@@ -323,11 +316,7 @@ def _read_arrivals(folder: Path, damage: list[str]) -> Arrivals | None:
 
 
 def recorded_solves(folder: Path, contract: Contract | None) -> Iterator[Solve]:
-    """Return the policy's solves in the order of time; nothing if they were not recorded.
-
-    Raises:
-        MavbridgeError: the table is damaged.
-    """
+    """Return the policy's solves in the order of time; nothing if they were not recorded."""
     if contract is not None and _has(folder, SOLVES):
         table = read_table(folder / SOLVES, replay_tables.SOLVES)
         yield from (row.solve for row in replay_tables.read_solves(table, contract))

@@ -31,11 +31,7 @@ _HERE = files("mavbridge.commands.inspect")
 
 
 def write_page(path: Path, flights: Sequence[FlightAnalysis]) -> None:
-    """Write one page with the flights side by side, which needs no other file and no network.
-
-    Raises:
-        UserError: the page cannot be written, or a video cannot be read.
-    """
+    """Write one page with the flights side by side, which needs no other file and no network."""
     title = "mavbridge: " + " and ".join(flight.folder.name for flight in flights)
     try:
         text = _HERE.joinpath("page.html").read_text()

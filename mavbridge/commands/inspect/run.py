@@ -246,11 +246,7 @@ BATCH_EVENTS = 25
 
 
 def inspect(flights: Sequence[Path], config: InspectConfig) -> int:
-    """Report on one flight, or compare two.
-
-    Raises:
-        MavbridgeError: a flight cannot be read, or an output cannot be written.
-    """
+    """Report on one flight, or compare two."""
     if not 1 <= len(flights) <= MAX_FLIGHTS:
         raise UserError(f"name one flight, or two to compare, not {len(flights)}")
     if config.rerun != "off" and len(flights) > 1:

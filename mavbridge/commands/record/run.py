@@ -65,11 +65,7 @@ NOTHING = np.zeros((1, 1), np.float32)
 
 
 def record(config: RecordConfig) -> int:
-    """Record until the user, a signal or a full disk ends it; return the exit status.
-
-    Raises:
-        MavbridgeError: a problem with the flags, the vehicle or the camera.
-    """
+    """Record until the user, a signal or a full disk ends it; return the exit status."""
     clock = MonotonicClock()
     make_transport(config.vehicle.connect, clock)
     check_camera(config.film.camera, latency_ms=config.film.camera_latency)
