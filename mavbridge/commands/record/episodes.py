@@ -42,7 +42,7 @@ class Seen(NamedTuple):
     """Keys typed since the last step, in order."""
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
+@dataclass(slots=True, kw_only=True)
 class Orders:
     """Actions for the recorder, in the order of execution."""
 
@@ -73,69 +73,58 @@ class EpisodeControl:
 
     def step(self, seen: Seen) -> Orders:
         """Advance to this time; return the resulting orders."""
-        keyed = self._by_keys(seen)
-        switched = self._by_switch(seen) if self._has_switch else Orders()
-        armed = self._by_arming(seen) if self._on_arm else Orders()
-        self._keep_wanting(seen, switched.begin or armed.begin)
-        every = (keyed, switched, armed)
-        return Orders(
-            mark_before=next((o.mark_before for o in every if o.mark_before), None),
-            end=next((o.end for o in every if o.end), None),
-            begin=keyed.begin or self._wanted,
-            quit=keyed.quit,
-        )
-
-    def _keep_wanting(self, seen: Seen, begin: str | None) -> None:
-        """Repeat the request while switch or arming asks: the obstacle can still disappear."""
+        orders = Orders()
+        if self._has_switch:
+            self._by_switch(seen, orders)
+        if self._on_arm:
+            self._by_arming(seen, orders)
+        # Repeat the request while switch or arming asks: the obstacle can still disappear.
         is_on = self._position == "high" if self._has_switch else seen.armed
-        if begin is not None:
-            self._wanted = begin
+        if orders.begin is not None:
+            self._wanted = orders.begin
         elif seen.is_recording or not is_on:
             self._wanted = None
+        orders.begin = self._wanted
+        self._by_keys(seen, orders)
+        return orders
 
-    def _by_keys(self, seen: Seen) -> Orders:
-        marks = [_MARKS[key] for key in seen.keys if key in _MARKS]
+    def _by_keys(self, seen: Seen, orders: Orders) -> None:
+        for key in seen.keys:
+            orders.mark_before = _MARKS.get(key, orders.mark_before)
+        orders.quit = QUIT_KEY in seen.keys
         is_toggled = sum(seen.keys.count(key) for key in (TOGGLE_KEY, " ")) % 2 == 1
-        is_over = QUIT_KEY in seen.keys
-        return Orders(
-            mark_before=marks[-1] if marks else None,
-            end="a key" if seen.is_recording and (is_toggled or is_over) else None,
-            begin="a key" if is_toggled and not (seen.is_recording or is_over) else None,
-            quit=is_over,
-        )
+        if seen.is_recording and (is_toggled or orders.quit):
+            orders.end = "a key"
+        elif is_toggled and not orders.quit:
+            orders.begin = "a key"
 
-    def _by_switch(self, seen: Seen) -> Orders:
+    def _by_switch(self, seen: Seen, orders: Orders) -> None:
         is_act = self._switch.read(seen.switch_us, seen.now_ns)
         before, now = self._position, self._switch.position or self._position
         self._position = now
         if now == "high":
             self._middle_since_ns = None
-            return Orders(begin="the switch") if is_act else Orders()
-        if before == "high":
+            orders.begin = "the switch" if is_act else None
+        elif before == "high":
             self._middle_since_ns = seen.now_ns if now == "middle" else None
-            return Orders(end="the switch") if seen.is_recording else Orders()
-        since_ns = self._middle_since_ns
-        if now == "low":
+            orders.end = "the switch" if seen.is_recording else None
+        elif now == "low":
             self._middle_since_ns = None
-        elif since_ns is not None and seen.now_ns - since_ns >= MIDDLE_NS:
+        elif self._middle_since_ns and seen.now_ns - self._middle_since_ns >= MIDDLE_NS:
             self._middle_since_ns = None
-            return Orders(mark_before="bad")
-        return Orders()
+            orders.mark_before = "bad"
 
-    def _by_arming(self, seen: Seen) -> Orders:
+    def _by_arming(self, seen: Seen, orders: Orders) -> None:
         was_armed, self._was_armed = self._was_armed, seen.armed
         if seen.armed:
             self._disarmed_ns = None
-            return Orders() if was_armed or seen.is_recording else Orders(begin="armed")
+            orders.begin = None if was_armed or seen.is_recording else "armed"
+            return
         if was_armed:
             self._disarmed_ns = seen.now_ns
-        is_over = (
-            self._disarmed_ns is not None and seen.now_ns - self._disarmed_ns >= AFTER_DISARM_NS
-        )
-        if not is_over:
-            return Orders()
-        self._disarmed_ns = None
-        return Orders(end="disarmed") if seen.is_recording else Orders()
+        if self._disarmed_ns and seen.now_ns - self._disarmed_ns >= AFTER_DISARM_NS:
+            self._disarmed_ns = None
+            orders.end = "disarmed" if seen.is_recording else None
 
 
 FIRST_BYTES_PS = 600_000.0
