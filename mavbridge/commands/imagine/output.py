@@ -8,7 +8,6 @@ import hashlib
 import queue
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, nullcontext, suppress
-from dataclasses import dataclass
 from pathlib import Path
 from threading import Event
 from typing import TypeAlias
@@ -103,8 +102,10 @@ class FrameDecoder:
         if (device := next(model.parameters()).device).type == "cuda":
             self._stream = torch.cuda.Stream(device)  # type: ignore[no-untyped-call]
 
-    def frames(self, latents: Tensor, ready: torch.cuda.Event | None) -> Iterator[ImageArray]:
-        """Return images [H, W, 3] of latents [N, C, h, w].
+    def frames(
+        self, latents: Tensor, rows: list[int], ready: torch.cuda.Event | None
+    ) -> Iterator[ImageArray]:
+        """Return images [H, W, 3] of these rows of the latents [N, C, h, w].
 
         On a GPU the latents can be read after the event ``ready``.
         """
@@ -112,21 +113,15 @@ class FrameDecoder:
             self._stream.wait_event(ready)
             # Once the loop's stream frees the memory, it must not be reused before this one ends.
             latents.record_stream(self._stream)
-        for latent in latents:
+        for row in rows:
             beside = nullcontext() if self._stream is None else torch.cuda.stream(self._stream)
             with torch.inference_mode(), beside:
-                pixels: ImageArray = self._model.decode(latent[None])[0].cpu().numpy()
+                pixels: ImageArray = self._model.decode(latents[row, None])[0].cpu().numpy()
             yield pixels
 
 
-@dataclass(frozen=True, kw_only=True)
-class _DecodeJob:
-    frames: list[RolloutFrame]
-    decoded: dict[int, ImageArray]
-    missing: Tensor | None
-    """Latents of the frames not decoded yet, in order; None: no video."""
-    ready: torch.cuda.Event | None
-    """GPU event after which the latents can be read."""
+_Job: TypeAlias = tuple[Segment, torch.cuda.Event | None]
+"""A segment, and the GPU event after which its latents can be read."""
 
 
 class StreamedOutput:
@@ -155,7 +150,7 @@ class StreamedOutput:
         self.frames_decoded = 0
         """Frames decoded outside the loop's thread, whose own frames the sampler counts."""
         self._decoder = FrameDecoder(sampler.model)
-        self._jobs: queue.Queue[_DecodeJob | None] = queue.Queue(QUEUED_SEGMENTS)
+        self._jobs: queue.Queue[_Job | None] = queue.Queue(QUEUED_SEGMENTS)
         self._table_path = out.with_suffix(".arrows")
         self.video: VideoWriter | None = None
         with writing(self._table_path):
@@ -186,30 +181,13 @@ class StreamedOutput:
 
     def put(self, segment: Segment) -> None:
         """Queue a segment; wait while the queue is full."""
-        plan = self._plan
-        frames = [
-            RolloutFrame(
-                number=segment.iteration * plan.frames + row,
-                iteration=segment.iteration,
-                frame=row,
-                executed=row < plan.exe_steps,
-                step=segment.iteration * plan.exe_steps + row + 1,
-                frame_dt_s=self._frame_dt_s,
-                state=segment.states[row],
-                action=segment.actions[row],
-            )
-            for row in range(plan.frames)
-        ]
-        missing = ready = None
-        if self.video is not None:
-            missing = segment.latents[[k for k in range(len(frames)) if k not in segment.decoded]]
-            if missing.is_cuda:
-                ready = torch.cuda.current_stream(missing.device).record_event()
-        job = _DecodeJob(frames=frames, decoded=segment.decoded, missing=missing, ready=ready)
+        ready = None
+        if self.video is not None and segment.latents.is_cuda:
+            ready = torch.cuda.current_stream(segment.latents.device).record_event()
         with self._sampler.timed("decode"):
-            self._enqueue(job)
+            self._enqueue((segment, ready))
 
-    def _enqueue(self, job: _DecodeJob | None, on_wait: Callable[[], None] = lambda: None) -> None:
+    def _enqueue(self, job: _Job | None, on_wait: Callable[[], None] = lambda: None) -> None:
         def was_put() -> bool:
             if not self._worker.is_alive:
                 self._worker.join(END_S)  # raises the thread's exception
@@ -265,23 +243,36 @@ class StreamedOutput:
                     continue
                 if job is None:
                     return
-                self._write(job, stop)
+                self._write(*job, stop)
 
-    def _write(self, job: _DecodeJob, stop: Event) -> None:
+    def _write(self, segment: Segment, ready: torch.cuda.Event | None, stop: Event) -> None:
+        plan = self._plan
+        frames = [
+            RolloutFrame(
+                number=segment.iteration * plan.frames + row,
+                iteration=segment.iteration,
+                frame=row,
+                executed=row < plan.exe_steps,
+                step=segment.iteration * plan.exe_steps + row + 1,
+                frame_dt_s=self._frame_dt_s,
+                state=segment.states[row],
+                action=segment.actions[row],
+            )
+            for row in range(plan.frames)
+        ]
         # Rows first: after a crash, rows without a frame are possible, but no frame without a row.
         with writing(self._table_path):
-            for frame in job.frames:
+            for frame in frames:
                 self._table.add({name: getattr(frame, name) for name in SCHEMA.names})
             self._table.flush()
-        images: Iterator[ImageArray] = iter(())
-        if job.missing is not None:
-            images = self._decoder.frames(job.missing, job.ready)
-        for frame in job.frames:
+        missing = [row for row in range(plan.frames) if row not in segment.decoded]
+        images = self._decoder.frames(segment.latents, missing, ready)
+        for frame in frames:
             if stop.is_set():
                 return
             rgb = None
             if self.video is not None:
-                rgb = job.decoded.get(frame.frame)
+                rgb = segment.decoded.get(frame.frame)
                 if rgb is None:
                     rgb = next(images)
                     self.frames_decoded += 1
