@@ -134,10 +134,21 @@ class Pilot:
         self.runner = replace(student or expert, act=self._act, reset=self._start)
 
     def _start(self) -> None:
-        """Begin, now that the policy has the sticks: a vehicle placed in the air is controlled."""
+        """Begin, now that the policy has the sticks: a vehicle placed in the air is controlled.
+
+        The expert does not know the vehicle's parameters, because no learner could see them. It
+        finishes as many courses without them (37 of 40) as with them (37 of 40).
+        """
         if self._student is not None:
             self._student.reset()
-        self._expert = self._begin(self._flight.clock.now_ns())
+        self.begin_ns, next_gate = self._flight.clock.now_ns(), 0
+        if self._variation.starts_airborne:
+            seed = self._variation.seed
+            start = random_start(self._flight.course, seed, speed_mps=self._speed_mps)
+            self._flight.vehicle.launch(start)
+            self.begin_ns, next_gate = self.begin_ns + SETTLE_NS, start.next_gate
+        make = RateExpert if self._by_rates else Expert
+        self._expert = make(self._flight.course, self._speed_mps, next_gate=next_gate)
 
     def _act(self, encoded: FloatArray, state: FloatArray, history: FloatArray) -> FloatArray:
         self._solves += 1
@@ -161,21 +172,6 @@ class Pilot:
         # Called at every tick, also in the expert's turns: the student can have internal state.
         students = self._student.act(encoded, state, history)
         return students if self._turns.is_students(now_s) else chunk
-
-    def _begin(self, now_ns: int) -> Expert | RateExpert:
-        """Move the vehicle to the start of the demonstration, and create the expert.
-
-        The expert does not know the vehicle's parameters, because no learner could see them. It
-        finishes as many courses without them (37 of 40) as with them (37 of 40).
-        """
-        self.begin_ns, next_gate = now_ns, 0
-        if self._variation.starts_airborne:
-            seed = self._variation.seed
-            start = random_start(self._flight.course, seed, speed_mps=self._speed_mps)
-            self._flight.vehicle.launch(start)
-            self.begin_ns, next_gate = now_ns + SETTLE_NS, start.next_gate
-        make = RateExpert if self._by_rates else Expert
-        return make(self._flight.course, self._speed_mps, next_gate=next_gate)
 
 
 class TurnSchedule:

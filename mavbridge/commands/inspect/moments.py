@@ -52,7 +52,7 @@ class DelayEvent:
     """A late chunk, or consecutive missed slots."""
 
     at_ns: int
-    what: Literal["late chunk", "missed slots"]
+    what: str
     count: int
     """Number of missed slots; 1 for a chunk."""
     delay_ms: float
@@ -93,7 +93,9 @@ def _missed_slots(ticks: Sequence[Tick], slot_ns: float) -> Iterator[DelayEvent]
             delay_ms = max(0.0, tick.sent_ns - last.sent_ns - slot_ns) / NS_PER_MS
             is_slow_send = last.sent_ns - last.woke_ns > slot_ns / 2
             cause: Cause = "sending took long" if is_slow_send else "the guard woke late"
-            yield DelayEvent(tick.woke_ns, "missed slots", tick.missed_slots, delay_ms, cause)
+            count = tick.missed_slots
+            what = f"{count} missed slot{'' if count == 1 else 's'}"
+            yield DelayEvent(tick.woke_ns, what, count, delay_ms, cause)
 
 
 def _late_chunks(
@@ -203,7 +205,15 @@ def worst_moments(
     found = [
         *_crash(flight, ticks),
         *_ends(ticks),
-        *_delay_moments(delays),
+        *(
+            (
+                delay.at_ns,
+                delay.what,
+                delay.delay_ms,
+                f"{delay.delay_ms:.1f} ms late: {delay.cause}",
+            )
+            for delay in delays
+        ),
         *_coasting(ticks, limits),
         *_old_images(ticks),
         *_image_gaps(flight, frames, ticks),
@@ -261,15 +271,6 @@ def _ages(tick: Tick) -> str:
         age_ms = (tick.sent_ns - tick.feature_captured_ns) / NS_PER_MS
         parts.append(f"an image of {age_ms:.0f} ms ago")
     return f"; its last sticks were by {' and '.join(parts)}" if parts else ""
-
-
-def _delay_moments(delays: Sequence[DelayEvent]) -> Iterator[_Found]:
-    for delay in delays:
-        what: str = delay.what
-        if delay.what == "missed slots":
-            what = f"{delay.count} missed slot{'' if delay.count == 1 else 's'}"
-        detail = f"{delay.delay_ms:.1f} ms late: {delay.cause}"
-        yield delay.at_ns, what, delay.delay_ms, detail
 
 
 def _coasting(ticks: Sequence[Tick], limits: FreshnessLimits | None) -> Iterator[_Found]:

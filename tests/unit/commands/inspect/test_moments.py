@@ -94,7 +94,7 @@ def test_missed_slots_are_put_down_to_the_send_before_or_to_the_wake_up(
         7, serial=5, missed_slots=2, chunk_serial=4, chunk_computed_ns=slow.chunk_computed_ns
     )
     (delay,) = find_delays([*flown(4), slow, after], stick_hz=100, action_hz=100)
-    assert (delay.what, delay.count, delay.cause) == ("missed slots", 2, cause)
+    assert (delay.what, delay.count, delay.cause) == ("2 missed slots", 2, cause)
 
 
 def test_who_held_the_sticks_when() -> None:
