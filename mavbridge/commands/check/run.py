@@ -108,7 +108,17 @@ def check(config: CheckConfig) -> int:
     if not is_on_stdout:
         require_writable(config.json, "--json")
     cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_SILENT)
-    rows = _check_all(config)
+    flight, clock = config.flight, MonotonicClock()
+    if flight.policy.policy != NO_POLICY:
+        print_status(f"loading the policy, then running it for {config.timing:g} s")
+    policy, plan = check_policy(flight, clock, timing_s=config.timing)
+    cameras = _check_cameras(flight, plan, clock)
+    if flight.link.connect == NO_VEHICLE:
+        rows = [CheckRow("link", "vehicle", "none", "none for this check")]
+    else:
+        print_status(f"listening to the vehicle on {flight.link.connect}")
+        rows = check_vehicle(flight, plan, clock, echo_test=config.echo_test)
+    rows += [*cameras, *policy, *computer_rows(flight.rates)]
     document = json.dumps(as_document(rows), indent=2) + "\n"
     if config.json is not None and not is_on_stdout:
         config.json.write_text(document)
@@ -116,21 +126,6 @@ def check(config: CheckConfig) -> int:
     if is_on_stdout:
         sys.stdout.write(document)
     return ExitCode.NOT_FLOWN if overall(rows) == "no-go" else ExitCode.DONE
-
-
-def _check_all(config: CheckConfig) -> list[CheckRow]:
-    """Return all rows in the order of the table."""
-    flight, clock = config.flight, MonotonicClock()
-    if flight.policy.policy != NO_POLICY:
-        print_status(f"loading the policy, then running it for {config.timing:g} s")
-    policy, plan = check_policy(flight, clock, timing_s=config.timing)
-    cameras = _check_cameras(flight, plan, clock)
-    if flight.link.connect == NO_VEHICLE:
-        vehicle = [CheckRow("link", "vehicle", "none", "none for this check")]
-    else:
-        print_status(f"listening to the vehicle on {flight.link.connect}")
-        vehicle = check_vehicle(flight, plan, clock, echo_test=config.echo_test)
-    return [*vehicle, *cameras, *policy, *computer_rows(flight.rates)]
 
 
 def _check_cameras(config: FlyConfig, plan: FlightPlan | None, clock: Clock) -> list[CheckRow]:

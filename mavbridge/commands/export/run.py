@@ -67,11 +67,6 @@ class Stretch:
         """Exposures, [N]."""
         return self.columns[names.CAPTURED].astype(np.int64, copy=False)
 
-    def part(self, start: int, stop: int) -> "Stretch":
-        """Return the rows from ``start`` up to ``stop``."""
-        columns = {name: values[start:stop] for name, values in self.columns.items()}
-        return Stretch(self.episode, self.first_frame + start, columns)
-
 
 def stretches(episode: FlightData) -> list[Stretch]:
     """Align a flight to its frames, and leave out frames without a state or sticks."""
@@ -97,8 +92,10 @@ def stretches(episode: FlightData) -> list[Stretch]:
         names.SENT: sent_sticks,
         **dict(zip(names.STAMPS, stamps, strict=True)),
     }
-    whole = Stretch(episode, 0, columns)
-    return [whole.part(start, stop) for start, stop in _runs(captured_ns, is_known)]
+    return [
+        Stretch(episode, start, {name: values[start:stop] for name, values in columns.items()})
+        for start, stop in _runs(captured_ns, is_known)
+    ]
 
 
 def _newest(stamps_ns: Nanoseconds, at_ns: Nanoseconds) -> NDArray[np.intp]:
