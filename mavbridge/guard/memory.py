@@ -147,7 +147,7 @@ class Memory:
         self.heard_ns = now.now_ns
 
     def leave_for_good(self, now: EngagementInputs, cause: EndRequest) -> None:
-        """the same, and the guard ends"""
+        """neutral, then a safe mode; the guard exits after that"""
         self.end_request = cause
         self.leave(now, cause)
 
@@ -164,10 +164,7 @@ class Memory:
         self.owes_release = self.phase is not Phase.PREPARING or self.engage.has_sticks
 
     def finish(self, now: EngagementInputs, _cause: bool) -> None:
-        """that of the next state
-
-        A safe mode that is not confirmed is reported.
-        """
+        """an unconfirmed mode is reported"""
         mode = self.disengage.mode
         if self.phase is Phase.LEAVING and mode is not None and mode != now.mode:
             self.refusal = because(Code.MODE_NOT_CONFIRMED, mode=mode)

@@ -98,7 +98,7 @@ def engage(m: Memory, _: EngagementInputs) -> bool:
 def stopped(m: Memory, _: EngagementInputs) -> EndRequest | None:
     """a stop
 
-    The key `q`, a signal, a fault or the death of the flight process, the last gate of `--gates`.
+    The key `q`, a signal, a flight process that failed or died, the last gate of `--gates`.
     """
     if m.end_request is None and m.act == "release":
         return EndRequest(because(Code.OPERATOR), end="operator")
@@ -164,9 +164,9 @@ def fault(_: Memory, now: EngagementInputs) -> EndRequest | None:
     """**fault**
 
     No usable chunk, or no attitude from the vehicle, for longer than [the grace](#the-grace); 5
-    malformed chunks (NaN); the envelope was left; the link was lost; the system has refused our
-    packets for 100 ms; the vehicle does not hear our sticks; a command could not be encoded; the
-    vehicle's clock was set back; or the vehicle sends from another address.
+    malformed chunks (NaN) in a second; the envelope was left; the link was lost; the system has
+    refused our packets for 100 ms; the vehicle does not hear our sticks; a command could not be
+    encoded; the vehicle's clock was set back; or the vehicle sends from another address.
     """
     reason = now.link_problem or now.chunk_fault or now.envelope_problem
     return None if reason is None else EndRequest(reason, is_fault=True)
