@@ -8,7 +8,7 @@ import pygame
 
 from sitl.clock import NS_PER_S, Clock
 from sitl.pilot.demonstrator import StickPositions
-from sitl.pilot.transmitter import OFF_US, Axes, Gesture, Hand, Switch, Transmitter
+from sitl.pilot.transmitter import OFF_US, Gesture, Hand, PadAxes, Switch, Transmitter
 
 RECORD_BUTTON, BAD_BUTTON, DISARM_BUTTON, ARM_BUTTON = 0, 1, 6, 7
 """A, B, back and start on a common pad."""
@@ -70,7 +70,7 @@ class _DevicePilot(ABC):
 class GamepadPilot(_DevicePilot):
     """Pilot at a gamepad; without the pad the receiver has no signal."""
 
-    def __init__(self, pad: Pad, axes: Axes, clock: Clock) -> None:
+    def __init__(self, pad: Pad, axes: PadAxes, clock: Clock) -> None:
         super().__init__(
             clock, arm=ARM_BUTTON, disarm=DISARM_BUTTON, up=RECORD_BUTTON, middle=BAD_BUTTON
         )

@@ -85,7 +85,7 @@ class Axis(NamedTuple):
     is_reversed: bool
 
 
-class Axes(NamedTuple):
+class PadAxes(NamedTuple):
     """Axis of each stick."""
 
     throttle: Axis
@@ -106,7 +106,7 @@ DEFAULT_AXES = "throttle=-1,yaw=0,pitch=-4,roll=3"
 """Mode 2 on a common pad: the left stick climbs and turns, the right one leans."""
 
 
-def parse_axes(text: str) -> Axes:
+def parse_axes(text: str) -> PadAxes:
     """Parse ``throttle=-1,yaw=0,pitch=-4,roll=3``; a minus reverses the axis.
 
     Raises:
@@ -118,12 +118,12 @@ def parse_axes(text: str) -> Axes:
         if match is None or match[1] in found:
             break
         found[match[1]] = Axis(int(match[3]), is_reversed=match[2] == "-")
-    if len(found) != len(Axes._fields) or text.count(",") != len(found) - 1:
+    if len(found) != len(PadAxes._fields) or text.count(",") != len(found) - 1:
         raise UsageError(
             f"--pilot-axes {text}: give the axis of each stick, with a minus to reverse it, such "
             f"as {DEFAULT_AXES}"
         )
-    return Axes(**found)
+    return PadAxes(**found)
 
 
 def past_dead_zone(value: float) -> float:

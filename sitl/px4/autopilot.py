@@ -11,9 +11,9 @@ from sitl.clock import NS_PER_S
 from sitl.px4.commander import Commander
 from sitl.px4.control import SIH_QUAD, STEP_NS
 from sitl.px4.flight import Px4Control, Setpoint
-from sitl.px4.modes import Mode
+from sitl.px4.modes import Px4Mode
 from sitl.px4.params import Px4Params
-from sitl.px4.sticks import RC_SOURCE, StickInput, Sticks
+from sitl.px4.sticks import RC_SOURCE, Px4Sticks, StickInput
 from sitl.vehicle.config import Battery, VehicleConfig
 from sitl.vehicle.firmware import STOPPED, Autopilot
 
@@ -52,7 +52,7 @@ class Px4(Autopilot):
         self._flown_mode = self.mode
 
     @property
-    def mode(self) -> Mode:
+    def mode(self) -> Px4Mode:
         return self.commander.mode
 
     @property
@@ -105,10 +105,10 @@ class Px4(Autopilot):
         until the first real ones come.
         """
         commander = self.commander
-        if commander.mode is not Mode.OFFBOARD:
+        if commander.mode is not Px4Mode.OFFBOARD:
             if not self.stick_input.valid:
                 self.stick_input.pretend_centred(self.now_ns)
-            commander.mode = commander.intended = self._flown_mode = Mode.ALTCTL
+            commander.mode = commander.intended = self._flown_mode = Px4Mode.ALTCTL
             commander.start(ignores_sticks=False)
         self._set_landed(landed=False)
         self.texts.clear()
@@ -128,7 +128,7 @@ class Px4(Autopilot):
         if all(1 <= channel <= len(self.receiver_us) for channel in channels):
             values = [(self.receiver_us[channel - 1] - 1500) / 500.0 for channel in channels]
             pitch, roll, throttle, yaw = (max(-1.0, min(1.0, value)) for value in values)
-            sticks = Sticks(forward=-pitch, right=roll, throttle=throttle, yaw=yaw)
+            sticks = Px4Sticks(forward=-pitch, right=roll, throttle=throttle, yaw=yaw)
             self.stick_input.on_sticks(RC_SOURCE, sticks, self.now_ns)
 
     def _update_commander(self) -> None:

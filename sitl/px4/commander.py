@@ -8,7 +8,7 @@ import struct
 from typing import NamedTuple
 
 from sitl.clock import NS_PER_MS, NS_PER_S
-from sitl.px4.modes import LostSticks, Mode, Phase, mode_without_stream
+from sitl.px4.modes import LostSticks, Phase, Px4Mode, mode_without_stream
 from sitl.px4.params import Px4Params
 from sitl.px4.sticks import StickInput
 from sitl.vehicle.firmware import StatusText
@@ -61,7 +61,7 @@ CHECK_PERIOD_NS = 20 * NS_PER_MS
 LOW_THROTTLE, MIDDLE_THROTTLE = -0.8, 0.2
 """Highest throttle for arming in modes where the stick is thrust, and where it is a climb rate."""
 
-_BOOT_MODES = {1: Mode.ALTCTL, 2: Mode.POSCTL}
+_BOOT_MODES = {1: Px4Mode.ALTCTL, 2: Px4Mode.POSCTL}
 """Modes of COM_FLTMODE_BOOT; 4, and any mode that this vehicle lacks, means Hold."""
 
 
@@ -74,7 +74,7 @@ class Commander:
         self._params = params
         self._sticks = sticks
         self._boot_ns = self.now_ns = boot_ns
-        boot_mode = _BOOT_MODES.get(params.integer("COM_FLTMODE_BOOT"), Mode.AUTO_LOITER)
+        boot_mode = _BOOT_MODES.get(params.integer("COM_FLTMODE_BOOT"), Px4Mode.AUTO_LOITER)
         self.mode = self.intended = self._last_armable = boot_mode
         self.armed = False
         self.terminated = False
@@ -97,13 +97,13 @@ class Commander:
     def in_failsafe(self) -> bool:
         return self.armed and (self.lost_sticks.active or self._fallback)
 
-    def can_fly(self, mode: Mode) -> bool:
+    def can_fly(self, mode: Px4Mode) -> bool:
         """True if the mode has the sticks, position or stream of setpoints that it needs."""
         if mode.piloted and not self._sticks.valid:
             return False
         if mode.needs_position and not self.position_ready:
             return False
-        return self.setpoint_fresh if mode is Mode.OFFBOARD else mode is not Mode.AUTO_MISSION
+        return self.setpoint_fresh if mode is Px4Mode.OFFBOARD else mode is not Px4Mode.AUTO_MISSION
 
     def can_arm(self) -> bool:
         """True if the vehicle's health allows arming; sticks may still be too high."""
@@ -157,14 +157,14 @@ class Commander:
         self.mode = self.intended
         return True
 
-    def set_mode(self, mode: Mode, *, says_why: bool = True) -> bool:
+    def set_mode(self, mode: Px4Mode, *, says_why: bool = True) -> bool:
         """Take a commanded mode. Return True if it is the intended one afterwards.
 
         A refusal becomes a text if ``says_why``.
         """
         if self.terminated:
             return False
-        if self.armed and mode is not Mode.AUTO_LAND and not self.can_fly(mode):
+        if self.armed and mode is not Px4Mode.AUTO_LAND and not self.can_fly(mode):
             arguments = pack("IB", self.mode.custom_mode, mode.event_number)
             text = f"Switching to {mode.spoken} is currently not available"
             if says_why:
@@ -177,7 +177,7 @@ class Commander:
         """Stop the motors for good; the vehicle stays armed until it is forced to disarm."""
         mode = self.mode.custom_mode
         self.terminated = True
-        self._intend(Mode.TERMINATION)
+        self._intend(Px4Mode.TERMINATION)
         self._say(SEVERITY_CRITICAL, "Failsafe activated")
         arguments = pack("IB", mode, ACTION_TERMINATE)
         self._emit("commander_failsafe_enter_generic", LEVELS_FAILSAFE, arguments)
@@ -192,8 +192,8 @@ class Commander:
         )
 
     def finish_takeoff(self) -> None:
-        if self.intended is Mode.AUTO_TAKEOFF:
-            self._intend(Mode.AUTO_LOITER)
+        if self.intended is Px4Mode.AUTO_TAKEOFF:
+            self._intend(Px4Mode.AUTO_LOITER)
 
     def on_landed_change(self, *, landed: bool) -> None:
         self.landed = landed
@@ -253,10 +253,10 @@ class Commander:
         is_held = self.lost_sticks.phase is Phase.HOLDING
         bits = int(self._params.get("COM_RC_OVERRIDE", 0b11))  # 1.18 has no parameter and does both
         is_autonomous = bool(bits & 1) and self.mode.is_auto
-        is_autonomous = is_autonomous or (bool(bits & 2) and self.mode is Mode.OFFBOARD)
+        is_autonomous = is_autonomous or (bool(bits & 2) and self.mode is Px4Mode.OFFBOARD)
         if self._sticks.moved_fast and is_autonomous and not is_held and not self.landed:
             was_failsafe = self.in_failsafe
-            self._intend(Mode.POSCTL if self.position_ready else Mode.ALTCTL)
+            self._intend(Px4Mode.POSCTL if self.position_ready else Px4Mode.ALTCTL)
             if was_failsafe:
                 self._emit("failsafe_rc_override", LEVELS_INFO)
             else:
@@ -281,7 +281,7 @@ class Commander:
             self.mode = self._with_position(self.lost_sticks.mode())
             return
         wanted = self.intended
-        if wanted is Mode.OFFBOARD and not self.setpoint_fresh:
+        if wanted is Px4Mode.OFFBOARD and not self.setpoint_fresh:
             wanted = mode_without_stream(self._params, has_sticks=self._sticks.valid)
         wanted = self._with_position(wanted)
         was_fallback, self._fallback = self._fallback, wanted is not self.intended
@@ -289,13 +289,13 @@ class Commander:
         if self._fallback and not was_fallback:
             self._say_failsafe(ACTION_POSCTL if wanted.piloted else ACTION_RTL)
 
-    def _with_position(self, mode: Mode) -> Mode:
+    def _with_position(self, mode: Px4Mode) -> Px4Mode:
         if self.position_ready or not mode.needs_position:
             return mode
-        is_stick_flown = mode is Mode.POSCTL and self._sticks.valid
-        return Mode.ALTCTL if is_stick_flown else Mode.AUTO_LAND
+        is_stick_flown = mode is Px4Mode.POSCTL and self._sticks.valid
+        return Px4Mode.ALTCTL if is_stick_flown else Px4Mode.AUTO_LAND
 
-    def _intend(self, mode: Mode) -> None:
+    def _intend(self, mode: Px4Mode) -> None:
         if self.intended.armable:
             self._last_armable = self.intended
         self.intended = self.mode = mode

@@ -14,9 +14,9 @@ from sitl.px4.control import (
     RateController,
     attitude_for,
 )
-from sitl.px4.modes import Mode
+from sitl.px4.modes import Px4Mode
 from sitl.px4.params import Px4Params
-from sitl.px4.sticks import Sticks
+from sitl.px4.sticks import Px4Sticks
 from sitl.vehicle.dynamics import BodyState, HeightController, mix, thrust_for
 from sitl.vehicle.firmware import AttitudeSetpoint
 from sitl.vehicle.rotation import IDENTITY, Quat, Vec3, cos_tilt, from_euler, from_heading, yaw_of
@@ -86,55 +86,55 @@ class Px4Control:
         return IDLE
 
     def wants_takeoff(
-        self, mode: Mode, sticks: Sticks, setpoint: Setpoint | None, body: BodyState
+        self, mode: Px4Mode, sticks: Px4Sticks, setpoint: Setpoint | None, body: BodyState
     ) -> bool:
-        if mode is Mode.AUTO_TAKEOFF:
+        if mode is Px4Mode.AUTO_TAKEOFF:
             return -body.position_ned_m[2] < self.takeoff_to_m
         if mode.manual_throttle:
             return pilot.manual_thrust(sticks, self._params, HOVER_THRUST) > 0.9 * HOVER_THRUST
         if mode.piloted:
             return pilot.climb_mps(sticks, self._params) > TAKEOFF_CLIMB_MPS
-        if mode is not Mode.OFFBOARD or setpoint is None:
+        if mode is not Px4Mode.OFFBOARD or setpoint is None:
             return False
         if isinstance(setpoint, PositionSetpoint):
             return self._offboard_climb_mps(setpoint, body) > TAKEOFF_CLIMB_MPS
         return setpoint.thrust > 0.9 * HOVER_THRUST
 
     @staticmethod
-    def is_direct(mode: Mode, setpoint: Setpoint | None) -> bool:
+    def is_direct(mode: Px4Mode, setpoint: Setpoint | None) -> bool:
         is_velocity = isinstance(setpoint, PositionSetpoint)
-        return mode.manual_throttle or (mode is Mode.OFFBOARD and not is_velocity)
+        return mode.manual_throttle or (mode is Px4Mode.OFFBOARD and not is_velocity)
 
     def fly(
         self,
-        mode: Mode,
-        sticks: Sticks,
+        mode: Px4Mode,
+        sticks: Px4Sticks,
         setpoint: Setpoint | None,
         body: BodyState,
         *,
         has_position: bool,
     ) -> tuple[float, ...]:
-        if mode is Mode.OFFBOARD and setpoint is not None:
+        if mode is Px4Mode.OFFBOARD and setpoint is not None:
             return self._fly_offboard(setpoint, body)
-        if mode is Mode.ACRO:
+        if mode is Px4Mode.ACRO:
             self.attitude = body.ned_from_body_wxyz
             return self._turn_at(
                 pilot.acro_rates_radps(sticks, self._params),
                 pilot.manual_thrust(sticks, self._params, HOVER_THRUST),
                 body,
             )
-        yaw_rate = self._stick_yaw(sticks if mode.piloted else Sticks(), body)
+        yaw_rate = self._stick_yaw(sticks if mode.piloted else Px4Sticks(), body)
         yaw = yaw_of(body.ned_from_body_wxyz) if self._yaw_hold_rad is None else self._yaw_hold_rad
         if mode.manual_throttle:
             roll, pitch = pilot.lean_rad(sticks, self._params)
             thrust = pilot.manual_thrust(sticks, self._params, HOVER_THRUST)
             return self._lean_to(from_euler(roll, pitch, yaw), yaw_rate, thrust, body)
-        if mode is Mode.ALTCTL:
+        if mode is Px4Mode.ALTCTL:
             forward, right = pilot.lean_accel_mps2(sticks, self._params)
             accel = from_heading(forward, right, yaw)
         elif not has_position:
             accel = STILL
-        elif mode is Mode.POSCTL:
+        elif mode is Px4Mode.POSCTL:
             speed = pilot.speed_mps(sticks, self._params)
             accel = self._horizontal.steer(from_heading(*speed, yaw), body)
         else:
@@ -181,7 +181,7 @@ class Px4Control:
         self.thrust = thrust
         return mix(thrust, self._rates.rates(body, rates_radps), SIH_QUAD)
 
-    def _stick_yaw(self, sticks: Sticks, body: BodyState) -> float:
+    def _stick_yaw(self, sticks: Px4Sticks, body: BodyState) -> float:
         wanted = pilot.yaw_rate_radps(sticks, self._params)
         lag_s = max(STEP_S, self._params["MPC_MAN_Y_TAU"])
         self._yaw_rate_radps += (wanted - self._yaw_rate_radps) * STEP_S / lag_s
@@ -204,7 +204,7 @@ class Px4Control:
         self.velocity_ned_mps = (*self._horizontal.speed_mps, -climb_mps)
         return max(self._params["MPC_THR_MIN"], min(self._params["MPC_THR_MAX"], thrust))
 
-    def _climb_mps(self, mode: Mode, sticks: Sticks, body: BodyState) -> float:
+    def _climb_mps(self, mode: Px4Mode, sticks: Px4Sticks, body: BodyState) -> float:
         """Return the climb rate demanded by mode and sticks; near the ground it is slower."""
         params, height = self._params, -body.position_ned_m[2]
         low, high = params["MPC_LAND_ALT2"], params["MPC_LAND_ALT1"]
@@ -215,18 +215,18 @@ class Px4Control:
             up += share * (params["MPC_Z_VEL_MAX_UP"] - up)
             down = slow + share * (params["MPC_Z_VEL_MAX_DN"] - slow)
             return max(-down, min(up, pilot.climb_mps(sticks, params)))
-        if mode is Mode.AUTO_TAKEOFF:
+        if mode is Px4Mode.AUTO_TAKEOFF:
             return max(0.0, min(params["MPC_TKO_SPEED"], 1.5 * (self.takeoff_to_m + 0.1 - height)))
-        if mode is Mode.AUTO_RTL and not self._home_reached:
+        if mode is Px4Mode.AUTO_RTL and not self._home_reached:
             up = self._return_height_m(body) - height
             return max(-params["MPC_Z_V_AUTO_DN"], min(params["MPC_Z_V_AUTO_UP"], up))
-        if mode not in (Mode.AUTO_RTL, Mode.AUTO_LAND):
+        if mode not in (Px4Mode.AUTO_RTL, Px4Mode.AUTO_LAND):
             return 0.0
         return -(slow + share * (fast - slow))
 
-    def _destination(self, mode: Mode, body: BodyState) -> NorthEast | None:
+    def _destination(self, mode: Px4Mode, body: BodyState) -> NorthEast | None:
         """Return the target of an AUTO mode, north and east; None: stay at the resting position."""
-        if mode is not Mode.AUTO_RTL or self._home_reached:
+        if mode is not Px4Mode.AUTO_RTL or self._home_reached:
             return self._target_m
         north, east, down = body.position_ned_m
         if -down > self._return_height_m(body) - ARRIVED_M:

@@ -17,7 +17,7 @@ from sitl.link.telemetry import Home, boot_ms, boot_us, extended_sys_state, sys_
 from sitl.px4.autopilot import Px4
 from sitl.px4.commander import Event
 from sitl.px4.flight import PositionSetpoint
-from sitl.px4.modes import Mode
+from sitl.px4.modes import Px4Mode
 from sitl.vehicle.config import Px4Release
 from sitl.vehicle.rotation import conjugate, rotate
 
@@ -76,7 +76,7 @@ def _current_mode(ap: Px4) -> Message:
 def _heartbeat(ap: Px4) -> Message:
     """Build HEARTBEAT; once a second, so a short change, even an arming, may never show."""
     flags = ap.mode.base_flags
-    if ap.mode is Mode.OFFBOARD and isinstance(ap.setpoint, PositionSetpoint):
+    if ap.mode is Px4Mode.OFFBOARD and isinstance(ap.setpoint, PositionSetpoint):
         flags |= mav.MAV_MODE_FLAG_STABILIZE_ENABLED
     if ap.armed:
         flags |= mav.MAV_MODE_FLAG_SAFETY_ARMED
@@ -190,7 +190,7 @@ def _estimator_status(ap: Px4) -> Message:
 
 
 def _extended_sys_state(ap: Px4) -> Message:
-    is_landing, is_taking_off = ap.mode is Mode.AUTO_LAND, ap.mode is Mode.AUTO_TAKEOFF
+    is_landing, is_taking_off = ap.mode is Px4Mode.AUTO_LAND, ap.mode is Px4Mode.AUTO_TAKEOFF
     vtol = mav.MAV_VTOL_STATE_MC
     return extended_sys_state(ap, vtol, is_landing=is_landing, is_taking_off=is_taking_off)
 
@@ -237,7 +237,9 @@ def topic_version(message_id: int, ap: Px4) -> Hashable:
     if message_id in _SLOW_TOPICS:
         return _at_rate(ap, 8)
     if message_id == mav.MAVLINK_MSG_ID_ATTITUDE_TARGET:
-        sends_attitude = ap.mode is Mode.OFFBOARD and not isinstance(ap.setpoint, PositionSetpoint)
+        sends_attitude = ap.mode is Px4Mode.OFFBOARD and not isinstance(
+            ap.setpoint, PositionSetpoint
+        )
         return ap.setpoint_count if sends_attitude else _at_rate(ap, 8)
     if message_id == mav.MAVLINK_MSG_ID_MANUAL_CONTROL:
         return ap.stick_input.count

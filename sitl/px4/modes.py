@@ -11,7 +11,7 @@ MAIN_AUTO = 4
 _SUB_ANY = (1, 2)  # POSCTL's orbit and slow flight, flown here as POSCTL
 
 
-class Mode(Enum):
+class Px4Mode(Enum):
     """Flight mode.
 
     Values: main and sub mode of HEARTBEAT.custom_mode, name in status texts, number as the argument
@@ -55,25 +55,25 @@ class Mode(Enum):
         return self.name.replace("_", ".")
 
 
-def mode_of(main: int, sub: int) -> Mode | None:
+def mode_of(main: int, sub: int) -> Px4Mode | None:
     """Return the mode with these numbers, or None; AUTO without a sub mode is a mission."""
     if (main, sub) == (MAIN_AUTO, 0):
-        return Mode.AUTO_MISSION
-    if main == Mode.POSCTL.main and sub in _SUB_ANY:
-        return Mode.POSCTL
-    return next((mode for mode in Mode if (mode.main, mode.sub) == (main, sub)), None)
+        return Px4Mode.AUTO_MISSION
+    if main == Px4Mode.POSCTL.main and sub in _SUB_ANY:
+        return Px4Mode.POSCTL
+    return next((mode for mode in Px4Mode if (mode.main, mode.sub) == (main, sub)), None)
 
 
 REFILL = 0.25
 
-_STICKS_LOST_MODES = {1: Mode.AUTO_LOITER, 2: Mode.AUTO_RTL, 3: Mode.AUTO_LAND}
+_STICKS_LOST_MODES = {1: Px4Mode.AUTO_LOITER, 2: Px4Mode.AUTO_RTL, 3: Px4Mode.AUTO_LAND}
 _STREAM_LOST_MODES = {
-    0: Mode.POSCTL,
-    1: Mode.ALTCTL,
-    2: Mode.STAB,
-    3: Mode.AUTO_RTL,
-    4: Mode.AUTO_LAND,
-    5: Mode.AUTO_LOITER,
+    0: Px4Mode.POSCTL,
+    1: Px4Mode.ALTCTL,
+    2: Px4Mode.STAB,
+    3: Px4Mode.AUTO_RTL,
+    4: Px4Mode.AUTO_LAND,
+    5: Px4Mode.AUTO_LOITER,
 }
 _EXCEPT_MISSION, _EXCEPT_AUTO, _EXCEPT_OFFBOARD = 1, 2, 4
 
@@ -108,13 +108,13 @@ class LostSticks:
         """Duration of the next Hold, or the rest of the present one."""
         return max(0.0, self._params["COM_FAIL_ACT_T"] - self._spent_s)
 
-    def is_excepted(self, mode: Mode) -> bool:
+    def is_excepted(self, mode: Px4Mode) -> bool:
         bits = self._params.integer("COM_RCL_EXCEPT")
-        if mode in (Mode.AUTO_RTL, Mode.AUTO_LAND, Mode.TERMINATION):
+        if mode in (Px4Mode.AUTO_RTL, Px4Mode.AUTO_LAND, Px4Mode.TERMINATION):
             return True
-        if mode is Mode.AUTO_MISSION:
+        if mode is Px4Mode.AUTO_MISSION:
             return bool(bits & _EXCEPT_MISSION)
-        if mode is Mode.OFFBOARD:
+        if mode is Px4Mode.OFFBOARD:
             return bool(bits & _EXCEPT_OFFBOARD)
         return mode.is_auto and bool(bits & _EXCEPT_AUTO)
 
@@ -138,13 +138,13 @@ class LostSticks:
         self.phase = Phase.ACTING
         return True
 
-    def mode(self) -> Mode:
+    def mode(self) -> Px4Mode:
         if self.phase is Phase.HOLDING:
-            return Mode.AUTO_LOITER
-        return _STICKS_LOST_MODES.get(self._params.integer("NAV_RCL_ACT"), Mode.AUTO_RTL)
+            return Px4Mode.AUTO_LOITER
+        return _STICKS_LOST_MODES.get(self._params.integer("NAV_RCL_ACT"), Px4Mode.AUTO_RTL)
 
 
-def mode_without_stream(params: Px4Params, *, has_sticks: bool) -> Mode:
+def mode_without_stream(params: Px4Params, *, has_sticks: bool) -> Px4Mode:
     """Return the mode that replaces OFFBOARD without setpoints; RTL if that one lacks sticks."""
-    mode = _STREAM_LOST_MODES.get(params.integer("COM_OBL_RC_ACT"), Mode.AUTO_RTL)
-    return Mode.AUTO_RTL if mode.piloted and not has_sticks else mode
+    mode = _STREAM_LOST_MODES.get(params.integer("COM_OBL_RC_ACT"), Px4Mode.AUTO_RTL)
+    return Px4Mode.AUTO_RTL if mode.piloted and not has_sticks else mode

@@ -25,7 +25,7 @@ from sitl.px4.autopilot import Px4
 from sitl.px4.endpoint import Px4Endpoint
 from sitl.px4.flight import PositionSetpoint, Setpoint
 from sitl.px4.messages import HOME
-from sitl.px4.modes import Mode, mode_of
+from sitl.px4.modes import Px4Mode, mode_of
 from sitl.px4.sticks import from_manual_control
 from sitl.report import FlightLog
 from sitl.vehicle.firmware import AttitudeSetpoint
@@ -58,8 +58,8 @@ class Px4Server(MavlinkServer[Px4, Px4Endpoint]):
             "SET_POSITION_TARGET_LOCAL_NED": self._set_position_target,
         }
         self._commands |= {
-            mav.MAV_CMD_NAV_RETURN_TO_LAUNCH: lambda *_: self._to_mode(Mode.AUTO_RTL),
-            mav.MAV_CMD_NAV_LAND: lambda *_: self._to_mode(Mode.AUTO_LAND),
+            mav.MAV_CMD_NAV_RETURN_TO_LAUNCH: lambda *_: self._to_mode(Px4Mode.AUTO_RTL),
+            mav.MAV_CMD_NAV_LAND: lambda *_: self._to_mode(Px4Mode.AUTO_LAND),
             mav.MAV_CMD_NAV_TAKEOFF: self._takeoff,
             mav.MAV_CMD_DO_FLIGHTTERMINATION: self._terminate,
             mav.MAV_CMD_PREFLIGHT_REBOOT_SHUTDOWN: self._reboot,
@@ -186,8 +186,8 @@ class Px4Server(MavlinkServer[Px4, Px4Endpoint]):
         is_station = message.get_srcComponent() == mav.MAV_COMP_ID_MISSIONPLANNER
         return self._to_mode(mode, says_why=is_station)
 
-    def _to_mode(self, mode: Mode, *, says_why: bool = True) -> int:
-        if mode is Mode.AUTO_TAKEOFF:
+    def _to_mode(self, mode: Px4Mode, *, says_why: bool = True) -> int:
+        if mode is Px4Mode.AUTO_TAKEOFF:
             self._ap.prepare_takeoff(None)
         return ACCEPTED if self._ap.commander.set_mode(mode, says_why=says_why) else REJECTED
 
@@ -202,7 +202,7 @@ class Px4Server(MavlinkServer[Px4, Px4Endpoint]):
         """Take off to param 7, an altitude above sea level; NaN: climb by MIS_TAKEOFF_ALT."""
         height_m = params[6] - HOME.alt_m
         self._ap.prepare_takeoff(height_m if math.isfinite(height_m) else None)
-        return ACCEPTED if self._ap.commander.set_mode(Mode.AUTO_TAKEOFF) else REJECTED
+        return ACCEPTED if self._ap.commander.set_mode(Px4Mode.AUTO_TAKEOFF) else REJECTED
 
     def _terminate(self, params: Params7, _link: Px4Endpoint) -> int:
         if params[0] > 0.5:

@@ -37,7 +37,7 @@ EXPO = 0.6
 have no dead zone; they are linear in the tangent in ALTCTL, in the angle in STAB."""
 
 
-class Sticks(NamedTuple):
+class Px4Sticks(NamedTuple):
     """Positions in [-1, 1]; throttle 0 is the middle."""
 
     forward: float = 0.0  # + nose down
@@ -46,10 +46,10 @@ class Sticks(NamedTuple):
     yaw: float = 0.0  # + nose right
 
 
-def from_manual_control(x: int, y: int, z: int, r: int) -> Sticks:
+def from_manual_control(x: int, y: int, z: int, r: int) -> Px4Sticks:
     """Convert a MANUAL_CONTROL; a field beyond its range counts as centred."""
     forward, right, yaw = (v / 1000.0 if -1000 <= v <= 1000 else 0.0 for v in (x, y, r))
-    return Sticks(forward, right, z / 500.0 - 1.0 if 0 <= z <= 1000 else 0.0, yaw)
+    return Px4Sticks(forward, right, z / 500.0 - 1.0 if 0 <= z <= 1000 else 0.0, yaw)
 
 
 class StickSpeed:
@@ -78,7 +78,7 @@ class StickInput:
 
     def __init__(self, params: Px4Params) -> None:
         self._params = params
-        self.sticks = Sticks()
+        self.sticks = Px4Sticks()
         self.valid = False  # the winner is still sending
         self.count = 0  # samples chosen so far; a change tells a reader of a new one
         self.sampled_ns = 0
@@ -87,7 +87,7 @@ class StickInput:
         self._source: int | None = None
         self._first_source: int | None = None
         self._never_ages = False
-        self._speeds = tuple(StickSpeed() for _ in Sticks())
+        self._speeds = tuple(StickSpeed() for _ in Px4Sticks())
         self._looked_ns = 0
         self.gesture = HeldGesture(GESTURE_NS)
         """Arming gesture (throttle down, full right yaw, no lean) and disarming (full left yaw)."""
@@ -98,10 +98,10 @@ class StickInput:
 
     def pretend_centred(self, now_ns: int) -> None:
         """Treat the sticks as valid and centred until the first real ones come."""
-        self._choose(Sticks(), now_ns)
+        self._choose(Px4Sticks(), now_ns)
         self._never_ages = True
 
-    def on_sticks(self, source: int, sticks: Sticks, now_ns: int) -> None:
+    def on_sticks(self, source: int, sticks: Px4Sticks, now_ns: int) -> None:
         if self._wins(source):
             self._source = source
             if self._first_source is None:
@@ -116,7 +116,7 @@ class StickInput:
             self.valid = False
             self.moved_fast = False
             self.gesture.see(0, now_ns)
-            self._speeds = tuple(StickSpeed() for _ in Sticks())
+            self._speeds = tuple(StickSpeed() for _ in Px4Sticks())
 
     @property
     def _lost_after_ns(self) -> int:
@@ -156,7 +156,7 @@ class StickInput:
             for speed in self._speeds
         )
 
-    def _choose(self, sticks: Sticks, now_ns: int) -> None:
+    def _choose(self, sticks: Px4Sticks, now_ns: int) -> None:
         self.sticks, self.sampled_ns, self.valid = sticks, now_ns, True
         self._look(now_ns)
         self._never_ages = False
@@ -175,32 +175,32 @@ def curve(value: float, dead_zone: float, expo: float = EXPO) -> float:
     return math.copysign((1.0 - expo) * beyond + expo * beyond**3, value)
 
 
-def climb_mps(sticks: Sticks, params: Px4Params) -> float:
+def climb_mps(sticks: Px4Sticks, params: Px4Params) -> float:
     """Return the climb rate of ALTCTL and POSCTL, + up."""
     share = curve(sticks.throttle, params.dead_zone, params.get("MPC_Z_MAN_EXPO", EXPO))
     return share * params["MPC_Z_VEL_MAX_UP" if share > 0.0 else "MPC_Z_VEL_MAX_DN"]
 
 
-def yaw_rate_radps(sticks: Sticks, params: Px4Params) -> float:
+def yaw_rate_radps(sticks: Px4Sticks, params: Px4Params) -> float:
     share = curve(sticks.yaw, params.dead_zone, params.get("MPC_YAW_EXPO", EXPO))
     return math.radians(params["MPC_MAN_Y_MAX"]) * share
 
 
-def lean_accel_mps2(sticks: Sticks, params: Px4Params) -> tuple[float, float]:
+def lean_accel_mps2(sticks: Px4Sticks, params: Px4Params) -> tuple[float, float]:
     """Return ALTCTL's acceleration forward and right; both sticks share MPC_MAN_TILT_MAX."""
     scale = GRAVITY_MPS2 * math.tan(math.radians(params["MPC_MAN_TILT_MAX"]))
     scale /= max(1.0, math.hypot(sticks.forward, sticks.right))
     return sticks.forward * scale, sticks.right * scale
 
 
-def lean_rad(sticks: Sticks, params: Px4Params) -> tuple[float, float]:
+def lean_rad(sticks: Px4Sticks, params: Px4Params) -> tuple[float, float]:
     """Return roll and pitch (+ nose up) of STAB; both sticks share MPC_MAN_TILT_MAX."""
     scale = math.radians(params["MPC_MAN_TILT_MAX"])
     scale /= max(1.0, math.hypot(sticks.forward, sticks.right))
     return sticks.right * scale, -sticks.forward * scale
 
 
-def acro_rates_radps(sticks: Sticks, params: Px4Params) -> Vec3:
+def acro_rates_radps(sticks: Px4Sticks, params: Px4Params) -> Vec3:
     return (
         math.radians(params["MC_ACRO_R_MAX"]) * sticks.right,
         -math.radians(params["MC_ACRO_P_MAX"]) * sticks.forward,
@@ -208,7 +208,7 @@ def acro_rates_radps(sticks: Sticks, params: Px4Params) -> Vec3:
     )
 
 
-def speed_mps(sticks: Sticks, params: Px4Params) -> tuple[float, float]:
+def speed_mps(sticks: Px4Sticks, params: Px4Params) -> tuple[float, float]:
     """Return POSCTL's final forward and right speed; both sticks share MPC_VEL_MANUAL."""
     length = math.hypot(sticks.forward, sticks.right)
     if length == 0.0:
@@ -217,7 +217,7 @@ def speed_mps(sticks: Sticks, params: Px4Params) -> tuple[float, float]:
     return speed * sticks.forward / length, speed * sticks.right / length
 
 
-def manual_thrust(sticks: Sticks, params: Px4Params, hover: float) -> float:
+def manual_thrust(sticks: Px4Sticks, params: Px4Params, hover: float) -> float:
     """Return the collective of STAB and ACRO: two lines that meet at hover thrust, mid-stick."""
     if sticks.throttle < 0.0:
         least = params["MPC_MANTHR_MIN"]

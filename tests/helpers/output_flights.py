@@ -25,7 +25,7 @@ from sitl.ardupilot.guided import Submode
 from sitl.course import AirborneStart
 from sitl.px4.autopilot import Px4
 from sitl.px4.flight import PositionSetpoint
-from sitl.px4.modes import Mode as Px4Mode
+from sitl.px4.modes import Px4Mode
 from sitl.vehicle.config import MID_RECEIVER_US, AutopilotName, Px4Release
 from sitl.vehicle.rotation import Quat, cos_tilt
 

@@ -16,7 +16,7 @@ from sitl.pilot.demonstrator import HOVER_THRUST, RateCommand, RateExpert
 from sitl.pilot.disturbance import RATE_STRENGTHS, Disturbance, random_start
 from sitl.px4.autopilot import Px4
 from sitl.px4.control import HOVER_THRUST as PX4_HOVER_THRUST
-from sitl.px4.modes import Mode as Px4Mode
+from sitl.px4.modes import Px4Mode
 from sitl.px4.params import Px4Params
 from sitl.report import FlightLog
 from sitl.vehicle.config import VehicleConfig

@@ -7,7 +7,7 @@ import pytest
 from pymavlink.dialects.v20 import ardupilotmega as mav
 
 from sitl.course import AirborneStart
-from sitl.px4.modes import Mode
+from sitl.px4.modes import Px4Mode
 from sitl.vehicle.rotation import from_euler
 
 MID = (0, 0, 500, 0)
@@ -40,7 +40,7 @@ def test_a_launched_vehicle_misses_the_sticks_that_came_and_stopped(airborne):
     airborne.run(0.5, {0: MID})
     airborne.run(0.9)
 
-    assert airborne.ap.mode is Mode.AUTO_LOITER
+    assert airborne.ap.mode is Px4Mode.AUTO_LOITER
     assert airborne.ap.in_failsafe
 
 
@@ -60,13 +60,13 @@ def test_a_lost_position_leaves_posctl_for_altctl_and_gives_it_back(airborne):
     airborne.ap.position_lost = True
     airborne.run(0.2, {0: MID})
 
-    assert airborne.ap.mode is Mode.ALTCTL
-    assert airborne.ap.commander.intended is Mode.POSCTL
+    assert airborne.ap.mode is Px4Mode.ALTCTL
+    assert airborne.ap.commander.intended is Px4Mode.POSCTL
     refused = airborne.command(mav.MAV_CMD_DO_SET_MODE, 1, 4, 3)
     assert refused == mav.MAV_RESULT_TEMPORARILY_REJECTED
     airborne.ap.position_lost = False
     airborne.run(0.2, {0: MID})
-    assert airborne.ap.mode is Mode.POSCTL
+    assert airborne.ap.mode is Px4Mode.POSCTL
 
 
 def test_a_return_climbs_flies_home_lands_and_disarms(ends):

@@ -4,7 +4,7 @@ import pytest
 
 from sitl.clock import NS_PER_MS, NS_PER_S
 from sitl.px4.params import Px4Params
-from sitl.px4.sticks import RC_SOURCE, StickInput, Sticks
+from sitl.px4.sticks import RC_SOURCE, Px4Sticks, StickInput
 from sitl.vehicle.firmware import HeldGesture
 
 PERIOD_NS = 20 * NS_PER_MS
@@ -24,7 +24,7 @@ class Senders:
         for _ in range(round(seconds * NS_PER_S / PERIOD_NS)):
             self.now_ns += PERIOD_NS
             for source in sources:
-                self.input.on_sticks(source, sticks or Sticks(), self.now_ns)
+                self.input.on_sticks(source, sticks or Px4Sticks(), self.now_ns)
             self.input.update(self.now_ns)
         return self.input.source
 
