@@ -8,7 +8,7 @@ from typing import Any
 
 import pytest
 
-from mavbridge.__main__ import main
+from helpers.status import status_of
 from policy.adapters.interface import read_interface
 from policy.contract import ACTION_NAMES, STATE_NAMES
 from policy.errors import ContractError
@@ -56,14 +56,8 @@ def checkpoint(folder: Path, state_dim: int = 3, action_dim: int = 4) -> Path:
 
 
 def draft(source: Path, *options: str) -> Path:
-    assert status("contract", str(source), *options) == 0
+    assert status_of("contract", source, *options) == 0
     return source / "mavbridge.toml"
-
-
-def status(*arguments: str) -> object:
-    with pytest.raises(SystemExit) as ended:
-        main(arguments)
-    return ended.value.code
 
 
 def test_a_policy_alone_leaves_the_answers_to_the_user(
@@ -187,7 +181,7 @@ def test_what_cannot_be_drafted_is_refused_and_nothing_is_written(
     folder = tmp_path / "source"
     prepare(folder)
     before = {path: path.read_bytes() for path in folder.rglob("*")}
-    assert status("contract", str(folder)) == 2
+    assert status_of("contract", folder) == 2
     assert said in " ".join(capsys.readouterr().err.split())
     assert {path: path.read_bytes() for path in folder.rglob("*")} == before
 
@@ -196,5 +190,5 @@ def test_a_folder_that_is_no_dataset_is_refused(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     policy = checkpoint(tmp_path / "policy")
-    assert status("contract", str(policy), "--dataset", str(tmp_path)) == 2
+    assert status_of("contract", policy, "--dataset", tmp_path) == 2
     assert "not a LeRobot dataset" in capsys.readouterr().err

@@ -10,7 +10,7 @@ from typing import Any
 import pytest
 
 from helpers.evaluated_flights import finished
-from mavbridge.__main__ import main
+from helpers.status import status_of
 from mavbridge.commands.evaluate import (
     INTERRUPTED,
     EpisodeSpec,
@@ -35,13 +35,11 @@ CIRCLE = PolicyConfig(policy="scripted:circle", dual_rate=True)
 
 
 def output(capsys: pytest.CaptureFixture[str], *flags: str) -> tuple[int, str]:
-    with pytest.raises(SystemExit) as exit_info:
-        main(("evaluate", *flags))
+    status = status_of("evaluate", *flags)
     captured = capsys.readouterr()
     text = " ".join((captured.out + captured.err).replace("│", " ").split())
     assert "Traceback" not in text
-    assert isinstance(exit_info.value.code, int)
-    return exit_info.value.code, text
+    return status, text
 
 
 def specs(config: EvaluateConfig, count: int = 20) -> list[EpisodeSpec]:

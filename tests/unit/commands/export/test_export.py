@@ -13,7 +13,7 @@ import pytest
 
 from helpers.flight_folders import LEVEL, MS, spot, ticks_table, write_flight, write_meta
 from helpers.lerobot_rules import broken_rules
-from mavbridge.__main__ import main
+from helpers.status import status_of
 from mavbridge.commands.config import ExportConfig
 from mavbridge.commands.export.run import export, write_dataset
 from mavbridge.core.errors import MavbridgeError, UserError
@@ -187,13 +187,6 @@ def test_statistics_are_those_of_the_data(dataset: Path) -> None:
     np.testing.assert_allclose(np.ravel(colours["mean"]), images.mean(axis=(0, 1, 2)), atol=0.02)
     np.testing.assert_allclose(np.ravel(colours["std"]), images.std(axis=(0, 1, 2)), atol=0.02)
     assert np.ravel(colours["q01"]).min() < np.ravel(colours["q50"]).min() < 0.4
-
-
-def status_of(*arguments: object) -> int:
-    with pytest.raises(SystemExit) as stopped:
-        main([str(argument) for argument in arguments])
-    assert isinstance(stopped.value.code, int)
-    return stopped.value.code
 
 
 def test_the_command_exports_what_train_can_read(

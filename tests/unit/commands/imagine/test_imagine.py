@@ -12,7 +12,7 @@ from rerun.chunk import RrdReader
 
 from helpers.recordings import make_meta
 from helpers.rollouts import TINY, TinyWorld, read_rows, write_flight
-from mavbridge.__main__ import main
+from helpers.status import status_of
 from mavbridge.commands.imagine import run
 from mavbridge.commands.imagine.loop import Sampler
 from mavbridge.recording.video.file import count_frames
@@ -62,12 +62,10 @@ def imagine(
         given = [
             part for key, value in defaults.items() if key not in flags for part in (key, value)
         ]
-        with pytest.raises(SystemExit) as stopped:
-            main(["imagine", *given, *flags])
+        status = status_of("imagine", *given, *flags)
         captured = capsys.readouterr()
         assert "Traceback" not in captured.err
-        assert isinstance(stopped.value.code, int)
-        return stopped.value.code, " ".join((captured.out + captured.err).split())
+        return status, " ".join((captured.out + captured.err).split())
 
     return run
 

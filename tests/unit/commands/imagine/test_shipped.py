@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from helpers.rollouts import read_rows
-from mavbridge.__main__ import main
+from helpers.status import status_of
 from mavbridge.commands.imagine.run import SHIPPED
 from mavbridge.recording.flight_folder import open_flight
 from mavbridge.recording.video.file import read_video
@@ -28,9 +28,7 @@ def test_the_documented_command_imagines_what_might_come(
 ) -> None:
     out = tmp_path / "rollout.mp4"
     flags = ("--n-iter", "2", "--exe-steps", "8", "--out", str(out), *decider)
-    with pytest.raises(SystemExit) as stopped:
-        main(["imagine", "--start", str(START), *flags])
-    assert stopped.value.code == 0
+    assert status_of("imagine", "--start", START, *flags) == 0
     rows, frames = read_rows(out), list(read_video(out))
     assert rows.num_rows == len(frames) == 16
     first_seen = resize(next(iter(open_flight(START).images())), 64, 64)

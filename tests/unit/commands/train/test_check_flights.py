@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 import torch
 
+from helpers.evaluated_flights import crashed
 from mavbridge.commands import train as train_check
 from mavbridge.config.episodes import (
     CHECK_COURSE_SEED,
@@ -35,19 +36,6 @@ def save(path: Path, seed: int) -> Path:
     return path
 
 
-def result(course_seed: int, seed: int, gates: int) -> EpisodeResult:
-    return EpisodeResult(
-        course_seed=course_seed,
-        seed=seed,
-        outcome="crashed",
-        gates_total=8,
-        gate_times_s=(1.0,) * gates,
-        flown_s=9.0,
-        distance_m=20.0,
-        stick_rate_per_s=None,
-    )
-
-
 def load_for_torch(config: PolicyConfig, clock: Clock) -> LoadedPolicy:
     return load_configured_policy(replace(config, engine="torch"), clock)
 
@@ -60,7 +48,9 @@ def flown(monkeypatch: pytest.MonkeyPatch) -> list[tuple[int, FloatArray]]:
     def fly(runner: PolicyRunner, *, course_seed: int, seed: int) -> EpisodeResult:
         assert runner.dual_rate
         flights.append((course_seed, runner.encode(np.full((32, 32, 3), 128, np.uint8))))
-        return result(course_seed, seed, gates=2 * seed)
+        return crashed(
+            course_seed=course_seed, seed=seed, gates_total=8, gate_times_s=(1.0,) * (2 * seed)
+        )
 
     monkeypatch.setattr(
         "mavbridge.simulation.flight.SimulatedFlight",

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from helpers.flight_folders import write_meta, write_spot_flight
-from mavbridge.__main__ import main
+from helpers.status import status_of
 from mavbridge.commands import train as run
 from mavbridge.core.stopping import INTERRUPTED
 from policy.checkpoints.networks import load_world_model
@@ -24,13 +24,6 @@ pytestmark = pytest.mark.usefixtures("one_thread")
 SMALL = ("--policy", "toge:small:resnet8", "--image-size", "32", "--batch-size", "4")
 OLD = ["--policy", "world-model"]
 OUT = ["flights", "--out", "a.safetensors"]
-
-
-def status_of(*arguments: str) -> int:
-    with pytest.raises(SystemExit) as stopped:
-        main(arguments)
-    assert isinstance(stopped.value.code, int)
-    return stopped.value.code
 
 
 def trained(folder: Path, command: str, *flags: str, seconds: float) -> Path:
