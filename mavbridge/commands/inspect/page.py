@@ -13,9 +13,9 @@ import numpy as np
 
 from mavbridge.commands.inspect.analysis import FlightAnalysis
 from mavbridge.commands.inspect.series import FloatColumn, TickSeries
+from mavbridge.commands.output import number
 from mavbridge.core.clock import NS_PER_MS, NS_PER_S
 from mavbridge.core.errors import UserError
-from mavbridge.core.vehicle import Percentiles
 from mavbridge.flight.outcome import describe
 from mavbridge.observe.viewer.layout import action_title
 
@@ -102,13 +102,10 @@ def _facts(flight: FlightAnalysis) -> Iterator[tuple[str, str, bool]]:
         f"{sticks.missed_slots} of {sticks.slots} slots missed, {sticks.coasting_sends} coasting"
     )
     yield "sticks", f"{flight.stick_hz:g} Hz grid, {missed}", sticks.missed_slots > 0
-    for name, hz, target_hz, rest in (
-        ("chunks", action.rate_hz, action.target_hz, f"{action.late_chunks} late"),
-        ("images", vision.rate_hz, vision.target_hz, f"{vision.frames} in all"),
-    ):
-        shown = "-" if hz is None else f"{hz:.1f}"
-        is_slow = hz is not None and hz < 0.9 * target_hz
-        yield name, f"{shown} of {target_hz:.4g} Hz, {rest}", is_slow
+    late, shown = f"{action.late_chunks} late", f"{vision.frames} in all"
+    for name, loop, rest in (("chunks", action, late), ("images", vision, shown)):
+        is_slow = loop.rate_hz is not None and loop.rate_hz < 0.9 * loop.target_hz
+        yield name, f"{number(loop.rate_hz, 1)} of {loop.target_hz:.4g} Hz, {rest}", is_slow
     for name, measured in (
         ("stick lateness", sticks.lateness_ms),
         ("feature age", report.feature_age_ms),
@@ -116,13 +113,10 @@ def _facts(flight: FlightAnalysis) -> Iterator[tuple[str, str, bool]]:
         ("exposure to feature", flight.images.latency_ms),
     ):
         if measured is not None:
-            yield name, _percentiles(measured), False
+            p50, p99 = f"p50 {measured.p50:.2f}", f"p99 {measured.p99:.2f}"
+            yield name, f"{p50}, {p99}, most {measured.max:.2f} ms", False
     for cause, count in flight.causes:
         yield "delayed", f"{cause} ({count})", False
-
-
-def _percentiles(measured: Percentiles) -> str:
-    return f"p50 {measured.p50:.2f}, p99 {measured.p99:.2f}, most {measured.max:.2f} ms"
 
 
 def _plots(flight: FlightAnalysis) -> Iterator[dict[str, Any]]:
@@ -192,9 +186,8 @@ def _thinned_times(t_s: FloatColumn) -> FloatColumn:
     if size == 1:
         return t_s
     starts = np.arange(0, len(t_s), size)
-    kept: FloatColumn = t_s[
-        np.stack((starts, np.minimum(starts + size // 2, len(t_s) - 1)), axis=1).ravel()
-    ]
+    middles = np.minimum(starts + size // 2, len(t_s) - 1)
+    kept: FloatColumn = t_s[np.stack((starts, middles), axis=1).ravel()]
     return kept
 
 
@@ -237,15 +230,11 @@ def _histograms(series: TickSeries) -> Iterator[dict[str, Any]]:
 
 
 def _track(flight: FlightAnalysis) -> dict[str, str] | None:
-    if flight.track is None:
+    if (track := flight.track) is None:
         return None
-    north, east, down = flight.track.position_ned_m[:: _bin_size(len(flight.track.t_s))].T
-    return {
-        "t": _packed(flight.track.t_s[:: _bin_size(len(flight.track.t_s))]),
-        "north": _packed(north),
-        "east": _packed(east),
-        "down": _packed(down),
-    }
+    size = _bin_size(len(track.t_s))
+    columns = dict(zip(("north", "east", "down"), track.position_ned_m.T, strict=True))
+    return {name: _packed(each[::size]) for name, each in ({"t": track.t_s} | columns).items()}
 
 
 def _video(flight: FlightAnalysis) -> dict[str, Any] | None:
@@ -255,10 +244,8 @@ def _video(flight: FlightAnalysis) -> dict[str, Any] | None:
         return None
     size = images.video.stat().st_size
     if size > MAX_VIDEO_BYTES:
-        text = (
-            f"{images.video.name} has {size / 1e6:.0f} MB, too much for a page: open it beside it"
-        )
-        return {"note": text}
+        told = f"{images.video.name} has {size / 1e6:.0f} MB, too much for a page"
+        return {"note": f"{told}: open it beside it"}
     data = b64encode(images.video.read_bytes()).decode()
     return {
         "source": f"data:video/mp4;base64,{data}",
