@@ -200,7 +200,7 @@ def _require_sound(flight: RecordedFlight) -> None:
 def _stick_hz(ticks: Iterable[Tick], meta: FlightMeta) -> float:
     """Return the stick rate by the median time between slots; without slots, the action rate."""
     due_ns = np.array([tick.due_ns for tick in ticks if tick.is_slot and tick.due_ns > 0], np.int64)
-    periods_ns = due_ns[1:] - due_ns[:-1]
+    periods_ns = np.diff(due_ns)
     periods_ns = periods_ns[periods_ns > 0]
     if not len(periods_ns):
         return meta.action_hz

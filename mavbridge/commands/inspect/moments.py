@@ -263,13 +263,12 @@ def _ends(ticks: Sequence[Tick]) -> Iterator[_Found]:
 
 def _ages(tick: Tick) -> str:
     """Return the ages of the data behind a tick's sticks, as the end of a phrase."""
-    parts = []
-    if tick.state is not None:
-        age_ms = (tick.sent_ns - tick.state.attitude_ns) / NS_PER_MS
-        parts.append(f"an attitude of {age_ms:.0f} ms ago")
-    if tick.feature_captured_ns is not None:
-        age_ms = (tick.sent_ns - tick.feature_captured_ns) / NS_PER_MS
-        parts.append(f"an image of {age_ms:.0f} ms ago")
+    attitude_ns = None if tick.state is None else tick.state.attitude_ns
+    parts = [
+        f"{name} of {(tick.sent_ns - at_ns) / NS_PER_MS:.0f} ms ago"
+        for name, at_ns in (("an attitude", attitude_ns), ("an image", tick.feature_captured_ns))
+        if at_ns is not None
+    ]
     return f"; its last sticks were by {' and '.join(parts)}" if parts else ""
 
 

@@ -22,7 +22,7 @@ from mavbridge.core.clock import NS_PER_S
 from mavbridge.core.errors import UserError
 from mavbridge.core.files import require_writable
 from mavbridge.core.reasons import reason_to_json
-from mavbridge.core.records import Observed, Solve, Tick, VisionTick
+from mavbridge.core.records import Observed, Tick, VisionTick
 from mavbridge.core.vehicle import Percentiles
 from mavbridge.flight.action_frames import action_frame
 from mavbridge.flight.outcome import describe
@@ -328,13 +328,9 @@ def _events(folder: Path, contract: Contract | None) -> Iterator[Observed]:
 
 
 def _at_ns(event: Observed) -> int:
-    match event:
-        case Tick():
-            return event.woke_ns
-        case VisionTick():
-            return event.ready_ns
-        case Solve():
-            return event.computed_ns
+    if isinstance(event, Tick):
+        return event.woke_ns
+    return event.ready_ns if isinstance(event, VisionTick) else event.computed_ns
 
 
 def _images(recorded: RecordedFlight, camera: int) -> Iterator[Observed]:

@@ -136,8 +136,8 @@ class Track:
     @property
     def length_m(self) -> float:
         """Length of the path."""
-        steps = self.position_ned_m[1:] - self.position_ned_m[:-1]
-        return float(((steps**2).sum(axis=1) ** 0.5).sum())
+        steps_m = np.linalg.norm(np.diff(self.position_ned_m, axis=0), axis=1)
+        return float(steps_m.sum())
 
 
 def course_gates(seed: int | None) -> tuple[CourseGate, ...]:
