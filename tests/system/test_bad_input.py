@@ -64,7 +64,7 @@ FLY = ("--connect", "udp:127.0.0.1:1")
         (["--connect", "udp:127.0.0.1:1", "--policy", "nowhere.at_all:Policy"], "nowhere"),
         (
             ["--connect", "udp:127.0.0.1:1", "--camera", "none", "--policy", "pathlib:Path"],
-            "predict",
+            "its member contract",
         ),
         (["--connect", "udp:127.0.0.1:1", "--policy", "scripted:loop"], "square"),
         (["--connect", "udp:127.0.0.1:1", "--policy", "scripted:yaw:position"], "velocity"),

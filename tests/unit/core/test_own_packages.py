@@ -87,7 +87,7 @@ def test_a_class_of_the_working_directory_leaves_no_trace_on_the_path(
     (trap / "beside_weights.py").write_text("class Mine:\n    contract = None\n")
     monkeypatch.chdir(trap)
     before = list(sys.path)
-    with pytest.raises(PolicyError, match="needs a member contract"):
+    with pytest.raises(PolicyError, match="member contract must be"):
         load_user_class("beside_weights:Mine", None)
     assert sys.path == before
 
