@@ -43,7 +43,8 @@ class Attention(nn.Module):
 
     def _merged(self, attended: Tensor) -> Tensor:
         """Merge the heads: [B, heads, L, dim / heads] -> [B, L, dim]."""
-        return self.project(attended.transpose(1, 2).flatten(2))
+        out: Tensor = self.project(attended.transpose(1, 2).flatten(2))
+        return out
 
 
 def is_tracing() -> bool:

@@ -41,6 +41,7 @@ class SqueezeExcitation(nn.Module):
         self.activation = nn.SiLU(inplace=True)
 
     def forward(self, x: Tensor) -> Tensor:
+        """Gate ``x``."""
         pooled = x.mean(dim=(2, 3), keepdim=True)
         return x * torch.sigmoid(self.fc2(self.activation(self.fc1(pooled))))
 
@@ -90,6 +91,7 @@ class EfficientNetB3(nn.Module):
         self.out_dim = MOMENTS * OUT_CHANNELS
 
     def forward(self, image: Tensor) -> Tensor:
+        """Return ``resnet.moments`` of the last map, flattened."""
         return moments(self.features(image)).flatten(1)
 
 
@@ -114,6 +116,7 @@ class ChannelNorm(nn.LayerNorm):
     """LayerNorm over the channels of [B, C, H, W]."""
 
     def forward(self, x: Tensor) -> Tensor:
+        """Normalise the channels of [B, C, H, W]."""
         return super().forward(x.permute(0, 2, 3, 1)).permute(0, 3, 1, 2)
 
 
@@ -125,6 +128,7 @@ class Permute(nn.Module):
         self.axes = axes
 
     def forward(self, x: Tensor) -> Tensor:
+        """Return ``x`` with its axes reordered."""
         return x.permute(self.axes)
 
 
@@ -146,7 +150,8 @@ class ConvNextBlock(nn.Module):
 
     def forward(self, x: Tensor) -> Tensor:
         """Map [B, C, H, W] to the same shape."""
-        return x + self.layer_scale * self.block(x)
+        out: Tensor = x + self.layer_scale * self.block(x)
+        return out
 
 
 class ConvNextTiny(nn.Module):

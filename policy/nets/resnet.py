@@ -77,7 +77,8 @@ class BasicBlock(nn.Module):
         """Map [B, C_in, H, W] -> [B, width, H/stride, W/stride]."""
         shortcut = x if self.downsample is None else self.downsample(x)
         hidden = self.relu(self.bn1(self.conv1(x)))
-        return self.relu(self.bn2(self.conv2(hidden)) + shortcut)
+        out: Tensor = self.relu(self.bn2(self.conv2(hidden)) + shortcut)
+        return out
 
 
 class Bottleneck(nn.Module):
@@ -102,7 +103,8 @@ class Bottleneck(nn.Module):
         shortcut = x if self.downsample is None else self.downsample(x)
         hidden = self.relu(self.bn1(self.conv1(x)))
         hidden = self.relu(self.bn2(self.conv2(hidden)))
-        return self.relu(self.bn3(self.conv3(hidden)) + shortcut)
+        out: Tensor = self.relu(self.bn3(self.conv3(hidden)) + shortcut)
+        return out
 
 
 _DEPTHS: dict[str, tuple[type[BasicBlock] | type[Bottleneck], tuple[int, int, int, int]]] = {
@@ -133,8 +135,10 @@ class LastMap(nn.Module):
         self.channels = 512 * wide
 
     def forward(self, image: Tensor) -> Tensor:
+        """Return the last map."""
         x = self.maxpool(self.relu(self.bn1(self.conv1(image))))
-        return self.layer4(self.layer3(self.layer2(self.layer1(x))))
+        out: Tensor = self.layer4(self.layer3(self.layer2(self.layer1(x))))
+        return out
 
 
 class ResNet(LastMap):
@@ -147,6 +151,7 @@ class ResNet(LastMap):
         self.out_dim = MOMENTS * self.channels
 
     def forward(self, image: Tensor) -> Tensor:
+        """Return ``moments`` of the last map, flattened."""
         return moments(super().forward(image)).flatten(1)
 
 
@@ -174,9 +179,11 @@ class ResNet8(nn.Module):
         self.fc = nn.Linear(RESNET8_CELL_CHANNELS * RESNET8_CELLS**2, self.out_dim)
 
     def forward(self, image: Tensor) -> Tensor:
+        """Apply a fully connected layer to the cells of the last map."""
         x = self.layers(self.relu(self.bn1(self.conv1(image))))
         cells = F.adaptive_avg_pool2d(self.relu(self.bn2(self.conv2(x))), RESNET8_CELLS)
-        return self.relu(self.fc(cells.flatten(1)))
+        feature: Tensor = self.relu(self.fc(cells.flatten(1)))
+        return feature
 
 
 def _layer(

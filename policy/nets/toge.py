@@ -55,7 +55,9 @@ class StateEncoder(nn.Module):
         return torch.stack(egocentric_columns(state.unbind(1)), dim=1) / self._scale
 
     def forward(self, state: Tensor) -> Tensor:
-        return self.mlp(self.normalise(state))
+        """Encode a state [B, state_dim] -> token [B, dim]."""
+        token: Tensor = self.mlp(self.normalise(state))
+        return token
 
 
 class AttentionBlock(Attention):
@@ -69,7 +71,8 @@ class AttentionBlock(Attention):
     def transform(self, tokens: Tensor) -> Tensor:
         """Transform tokens [B, T, dim] to the same shape, each informed by all."""
         tokens = tokens + self.among(self.norm1(tokens), plainly=is_tracing())
-        return tokens + self.mlp(self.norm2(tokens))
+        out: Tensor = tokens + self.mlp(self.norm2(tokens))
+        return out
 
 
 class HistoryEncoder(nn.Module):
@@ -83,6 +86,7 @@ class HistoryEncoder(nn.Module):
         self.attention = AttentionBlock(dim)
 
     def forward(self, action_history: Tensor) -> Tensor:
+        """Encode past actions [B, K, 4] -> concatenated tokens [B, K * dim]."""
         tokens = self.attention.transform(self.embed(action_history) + self.position)
         return tokens.flatten(1)
 
@@ -108,7 +112,9 @@ class Fusion(nn.Module):
         )
 
     def forward(self, visual: Tensor, state: Tensor, history: Tensor) -> Tensor:
-        return self.mlp(torch.cat([visual, state, history], dim=1))
+        """Fuse visual and state tokens [B, dim], history [B, history_dim] -> condition [B, dim]."""
+        condition: Tensor = self.mlp(torch.cat([visual, state, history], dim=1))
+        return condition
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -175,7 +181,8 @@ class BuiltinPolicy(nn.Module):
 
     def _encode(self, image: Tensor) -> Tensor:
         require_shape("image", image, 3, self.contract.image_height, self.contract.image_width)
-        return self.visual_projection(self.backbone(image))
+        feature: Tensor = self.visual_projection(self.backbone(image))
+        return feature
 
     def _fuse(self, feature: Tensor, state: Tensor, action_history: Tensor | None) -> Tensor:
         require_shape("state", state, self.contract.state_dim)
@@ -211,6 +218,7 @@ class TogeConfig(BuiltinConfig):
 
     @property
     def feature_dim(self) -> int:
+        """Width of the cached feature."""
         return size_dims(self.size).base_dim
 
 
@@ -225,7 +233,9 @@ class Toge(BuiltinPolicy):
         self.head = DiffusionHead(config.size, self.contract, config.schedule)
 
     def condition(self, feature: Tensor, state_token: Tensor, action_history: Tensor) -> Tensor:
-        return self.fusion(feature, state_token, self.history_encoder(action_history))
+        """Fuse feature [B, F], encoded state [B, F], history [B, K, 4] -> condition [B, C]."""
+        condition: Tensor = self.fusion(feature, state_token, self.history_encoder(action_history))
+        return condition
 
     def encode_visual(self, image: Tensor) -> Tensor:
         """Encode an image [B, 3, H, W] -> feature [B, F]: the slow path."""
@@ -274,7 +284,11 @@ class ResnetUnet(BuiltinPolicy):
         self.head = DiffusionHead(config.size, self.contract, config.schedule)
 
     def condition(self, feature: Tensor, state_token: Tensor, action_history: Tensor) -> Tensor:
-        return self.fuse(torch.cat([feature, state_token, action_history.flatten(1)], dim=1))
+        """Fuse feature [B, F], encoded state [B, F], history [B, K, 4] -> condition [B, C]."""
+        condition: Tensor = self.fuse(
+            torch.cat([feature, state_token, action_history.flatten(1)], dim=1)
+        )
+        return condition
 
 
 def build_policy(config: BuiltinConfig) -> BuiltinPolicy:

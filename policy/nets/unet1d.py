@@ -41,13 +41,15 @@ class Conv(nn.Module):
         length, pad = x.shape[1], self.taps // 2
         padded = F.pad(x, (0, 0, pad, pad))
         columns = [padded[:, tap : tap + length : self.stride] for tap in range(self.taps)]
-        return self.linear(torch.cat(columns, dim=-1))
+        out: Tensor = self.linear(torch.cat(columns, dim=-1))
+        return out
 
 
 class Norm(nn.GroupNorm):
     """GroupNorm of [B, L, C] over each group's channels and the whole length."""
 
     def forward(self, x: Tensor) -> Tensor:
+        """Normalise [B, L, C]."""
         return super().forward(x.transpose(1, 2)).transpose(1, 2)
 
 
@@ -82,7 +84,8 @@ class ResidualBlock(nn.Module):
         hidden = F.silu(self.norm1(self.conv1(x)))
         hidden = hidden * (1 + scale) + shift
         hidden = F.silu(self.norm2(self.conv2(hidden)))
-        return hidden + self.shortcut(x)
+        out: Tensor = hidden + self.shortcut(x)
+        return out
 
 
 class UNet1d(nn.Module):
@@ -134,13 +137,16 @@ class UNet1d(nn.Module):
     def film_of_timestep(self, timestep: Tensor) -> Tensor:
         """Return the timesteps' part of FiLM [M, film_dim]; timesteps [M] of any numeric type."""
         angle = timestep.to(self._frequencies.dtype).unsqueeze(-1) * self._frequencies
-        return self.film_time(self.time_mlp(torch.cat([angle.sin(), angle.cos()], dim=-1)))
+        film: Tensor = self.film_time(self.time_mlp(torch.cat([angle.sin(), angle.cos()], dim=-1)))
+        return film
 
     def film_of_condition(self, condition: Tensor) -> Tensor:
         """Return the condition's part of FiLM [B, film_dim], for a condition [B, C]."""
-        return self.film_condition(condition)
+        film: Tensor = self.film_condition(condition)
+        return film
 
     def forward(self, noisy: Tensor, film: Tensor) -> Tensor:
+        """Return the net's prediction for noisy actions [B, horizon, 4] and FiLM [B, film_dim]."""
         films = iter(torch.split(film, self.film_sizes, dim=-1))
         x = noisy
         skips = []
@@ -153,7 +159,8 @@ class UNet1d(nn.Module):
         for block, upsample in zip(self.up, self.upsample, strict=True):
             x = upsample(x.repeat_interleave(2, dim=1))
             x = block(torch.cat([x, skips.pop()], dim=-1), next(films))
-        return self.out(x)
+        out: Tensor = self.out(x)
+        return out
 
 
 def sinusoid_frequencies(dim: int) -> Tensor:

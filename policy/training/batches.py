@@ -167,7 +167,8 @@ def next_of(among: Indices, step: int, count: int, seed: int) -> Indices:
         _order(seed, int(epoch), total)[at[at // total == epoch] % total]
         for epoch in np.unique(at // total)
     ]
-    return among[np.concatenate(parts)]
+    chosen: Indices = among[np.concatenate(parts)]
+    return chosen
 
 
 @lru_cache(maxsize=4)

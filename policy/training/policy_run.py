@@ -165,7 +165,8 @@ class _PolicyRun(TrainingRun[Trainee, Batch]):
         return lambda step: self._batches.with_images(step, stage.image_size)
 
     def losses(self, trainee: Trainee, batch: Batch) -> StepLoss:
-        return trainee(batch)
+        loss: StepLoss = trainee(batch)
+        return loss
 
     def validate(self, stage: TrainingStage) -> Validation | None:
         if self._held is None:

@@ -36,6 +36,7 @@ class EncoderLayer(nn.Module):
         return self.feed_forward(self.attend(x, position), self.norm2)
 
     def attend(self, x: Tensor, position: Tensor) -> Tensor:
+        """Apply self-attention and its shortcut."""
         own = self.before(x, self.norm1)
         at = own + position
         return self.after(x, self.self_attn(at, at, own), self.norm1)
@@ -46,9 +47,11 @@ class EncoderLayer(nn.Module):
         return self.after(x, self.linear2(hidden), norm)
 
     def before(self, x: Tensor, norm: nn.Module) -> Tensor:
+        """Return the input of a sublayer."""
         return norm(x) if self.pre_norm else x
 
     def after(self, x: Tensor, change: Tensor, norm: nn.Module) -> Tensor:
+        """Return the sum of a sublayer's output and its shortcut."""
         return x + change if self.pre_norm else norm(x + change)
 
 
@@ -77,9 +80,11 @@ class Encoder(nn.Module):
         self.norm: nn.Module = nn.LayerNorm(config.dim_model) if config.pre_norm else nn.Identity()
 
     def forward(self, x: Tensor, position: Tensor) -> Tensor:
+        """Encode [B, L, D] -> [B, L, D]."""
         for layer in self.layers:
             x = layer(x, position)
-        return self.norm(x)
+        out: Tensor = self.norm(x)
+        return out
 
 
 class Decoder(nn.Module):
@@ -93,9 +98,11 @@ class Decoder(nn.Module):
     def forward(
         self, x: Tensor, position: Tensor, tokens: Tensor, token_position: Tensor
     ) -> Tensor:
+        """Decode by every layer; arguments as in ``DecoderLayer.decode``."""
         for layer in self.layers:
             x = layer.decode(x, position, tokens, token_position)  # type: ignore[operator]
-        return self.norm(x)
+        out: Tensor = self.norm(x)
+        return out
 
 
 class Act(nn.Module):
@@ -131,7 +138,8 @@ class Act(nn.Module):
 
     def encode(self, image: Tensor, _camera: int) -> Tensor:
         """Encode an image [B, 3, H, W] of any camera -> cells [B, D * h * w]."""
-        return self.encoder_img_feat_input_proj(self.backbone(image)).flatten(1)
+        cells: Tensor = self.encoder_img_feat_input_proj(self.backbone(image)).flatten(1)
+        return cells
 
     def act(self, feature: Tensor, state: Tensor, _num_diffusion_steps: int) -> Tensor:
         """Return actions [B, chunk_size, 4] for features [B, 1, cameras, F] and state [B, 1, S]."""
@@ -149,7 +157,8 @@ class Act(nn.Module):
         encoded = self.encoder(torch.cat(tokens, dim=1), position)
         of_actions = self.decoder_pos_embed.weight.unsqueeze(0)
         start = torch.zeros_like(of_actions).expand(batch, -1, -1)
-        return self.action_head(self.decoder(start, of_actions, encoded, position))
+        actions: Tensor = self.action_head(self.decoder(start, of_actions, encoded, position))
+        return actions
 
 
 def cell_positions(height: int, width: int, dim: int) -> Tensor:

@@ -30,6 +30,7 @@ class GroupNorm(nn.GroupNorm):
     """Group norm in a form that OpenVINO computes fast."""
 
     def forward(self, x: Tensor) -> Tensor:
+        """Normalise [B, C, ...]; the shape stays."""
         return norm_of_groups(self, x)
 
 
@@ -41,6 +42,7 @@ class Mish(nn.Module):
     """
 
     def forward(self, x: Tensor) -> Tensor:
+        """Apply Mish to each element."""
         w = x.clamp(max=20.0).exp()  # above, the quotient is 1
         n = w * (w + 2)
         return x * (n / (n + 2))
@@ -58,7 +60,9 @@ class ConvBlock(nn.Module):
         )
 
     def forward(self, x: Tensor) -> Tensor:
-        return self.block(x)
+        """Apply convolution, norm and Mish."""
+        out: Tensor = self.block(x)
+        return out
 
 
 class LerobotResidualBlock(nn.Module):
@@ -86,7 +90,8 @@ class LerobotResidualBlock(nn.Module):
             hidden = scale * hidden + shift
         else:
             hidden = hidden + film.unsqueeze(-1)
-        return self.conv2(hidden) + self.residual_conv(x)
+        out: Tensor = self.conv2(hidden) + self.residual_conv(x)
+        return out
 
 
 class UNet(nn.Module):
@@ -167,8 +172,10 @@ class SpatialSoftmax(nn.Module):
         self.pos_grid = nn.Buffer(torch.zeros(height * width, 2))  # comes with the weights
 
     def forward(self, cells: Tensor) -> Tensor:
+        """Average the cells' positions, weighted by a softmax over the cells."""
         shares = self.nets(cells).flatten(2).softmax(dim=-1)
-        return (shares @ self.pos_grid).flatten(1)
+        places: Tensor = (shares @ self.pos_grid).flatten(1)
+        return places
 
 
 class RgbEncoder(nn.Module):
@@ -245,7 +252,8 @@ class DdimSchedule:
             noise = (noisy - step.signal * output) / step.noise
         if config.clip_sample:
             clean = clean.clip(-config.clip_sample_range, config.clip_sample_range)
-        return step.next_signal * clean + step.next_noise * noise
+        after: Chunk = step.next_signal * clean + step.next_noise * noise
+        return after
 
 
 class Diffusion(nn.Module):
@@ -281,13 +289,15 @@ class Diffusion(nn.Module):
         return f"{before}{dot}{_PLACES.get(place, place)}.{rest}" if dot else name
 
     def seed_noise(self, seed: int) -> None:
+        """Draw the initial noise of a flight."""
         self.initial_noise.copy_(flight_noise(seed, self.initial_noise.shape[1]))
 
     def encode(self, image: Tensor, camera: int) -> Tensor:
         """Encode an image [B, 3, H, W] of one camera -> feature [B, F]."""
         encoders = self.rgb_encoder
         encoder = encoders[camera] if isinstance(encoders, nn.ModuleList) else encoders
-        return encoder(image)
+        feature: Tensor = encoder(image)
+        return feature
 
     def film_of_condition(self, feature: Tensor, state: Tensor) -> list[Tensor]:
         """Return FiLM's part from the features [B, T, cameras, F] and states [B, T, S]."""
@@ -298,7 +308,8 @@ class Diffusion(nn.Module):
         """Call the network once on noisy actions [B, predicted, 4] at timesteps [B]."""
         of_timestep = self.unet.film_of_timestep(timestep)
         films = [a + b for a, b in zip(of_timestep, of_condition, strict=True)]
-        return self.unet(noisy, films)
+        prediction: Tensor = self.unet(noisy, films)
+        return prediction
 
     def act(self, feature: Tensor, state: Tensor, num_diffusion_steps: int) -> Tensor:
         """Run a whole solve; return the actions from now on [B, horizon, 4]."""

@@ -31,6 +31,7 @@ class Normaliser(nn.Module):
             self.register_buffer(name, array, persistent=False)
 
     def forward(self, value: Tensor) -> Tensor:
+        """Normalise to the network's input range."""
         if self.affine is None:
             return value
         return self.affine.gain * (value - self.shift) / self.divisor - self.affine.bias

@@ -22,7 +22,8 @@ class ResidualConv(nn.Module):
 
     def forward(self, x: Tensor) -> Tensor:
         """Add a residual. No norm: a network this shallow needs none, and it would cost time."""
-        return x + self.conv2(F.silu(self.conv1(F.silu(x))))
+        out: Tensor = x + self.conv2(F.silu(self.conv1(F.silu(x))))
+        return out
 
 
 class FrameAutoencoder(nn.Module):
@@ -72,13 +73,15 @@ class FrameAutoencoder(nn.Module):
 
     def reconstruct(self, latents: Tensor) -> Tensor:
         """Decode raw latents [N, C, h, w] -> [N, 3, H, W], about [-1, 1]."""
-        return self.decoder(latents)
+        images: Tensor = self.decoder(latents)
+        return images
 
     def normalise(self, latents: Tensor) -> Tensor:
         """Scale raw latents [N, C, h, w] to unit scale."""
         return (latents - _per_channel(self.latent_mean)) / _per_channel(self.latent_std)
 
     def denormalise(self, latents: Tensor) -> Tensor:
+        """Undo ``normalise``."""
         return latents * _per_channel(self.latent_std) + _per_channel(self.latent_mean)
 
 

@@ -136,7 +136,8 @@ class _Layer(nn.Module):
         tokens = tokens + over_time.reshape(by_place.shape).transpose(1, 2)
         by_frame = normed(1)
         tokens = tokens + self.space.among(by_frame.flatten(0, 1)).reshape(by_frame.shape)
-        return tokens + self.mlp(normed(2))
+        out: Tensor = tokens + self.mlp(normed(2))
+        return out
 
 
 class MotionPredictor(nn.Module):
@@ -169,4 +170,5 @@ class MotionPredictor(nn.Module):
         each = start.unsqueeze(1).expand(-1, sticks.shape[1], -1)
         hidden = torch.tanh(self.initial_hidden(features)).unsqueeze(0)
         read, _ = self.gru(torch.cat([sticks, so_far, each], dim=-1), hidden)
-        return self.output(read) + self.mean_motion
+        motion: Tensor = self.output(read) + self.mean_motion
+        return motion
