@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from policy.errors import ContractError
-from policy.files import parse_json
+from policy.files import parse_object
 
 CONTRACT_VERSION, OLDEST_VERSION = 6, 4
 """Version of contracts that are written, and the oldest version that can be read."""
@@ -139,9 +139,6 @@ _NUMBERS: dict[str, tuple[float, float, str]] = {
     "full_yaw_rate_degps": (LEAST, 2000.0, "degrees/s"),
     **dict.fromkeys(("full_climb_mps", "full_descent_mps"), (LEAST, 100.0, "m/s")),
     "depth_unit_m": (1e-6, 1.0, "m"),
-    **dict.fromkeys(
-        ("lean_dead_zone", "yaw_dead_zone", "throttle_dead_zone"), (0.0, 0.9, "of the travel")
-    ),
 }
 """Minimum, maximum and unit of each number."""
 
@@ -270,6 +267,9 @@ class Contract:
             value = getattr(self, name)
             is_right = _is_within(value, least, most) or (value is None and name in ENVELOPE_TERMS)
             yield name, is_right, f"in [{least:g}, {most:g}] {unit}"
+        for name in ("lean_dead_zone", "yaw_dead_zone", "throttle_dead_zone"):
+            share = getattr(self, name)
+            yield name, _is_within(share, 0, 0.9) and share < 0.9, "in [0, 0.9) of the travel"
         longest_s = self.horizon * self.chunk_dt_s
         is_play = _is_within(self.play_s, 0, longest_s) and not 0 < self.play_s < LEAST
         yield "play_s", is_play, f"0, or {LEAST:g} to at most the {longest_s:g} s of a chunk"
@@ -368,12 +368,7 @@ class Contract:
     @classmethod
     def from_json(cls, text: str) -> "Contract":
         """Read the header form; fields that an older version lacks get their defaults."""
-        try:
-            data: Any = parse_json(text)
-        except ValueError as error:
-            raise ContractError(f"the contract in the checkpoint is not JSON: {error}") from error
-        if not isinstance(data, dict):
-            raise ContractError("the contract in the checkpoint is not a JSON object")
+        data = parse_object(text, ContractError, "the contract in the checkpoint")
         version = data.pop("version", CONTRACT_VERSION)
         if not isinstance(version, int) or not OLDEST_VERSION <= version <= CONTRACT_VERSION:
             raise ContractError(

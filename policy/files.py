@@ -153,6 +153,17 @@ def parse_json(text: str) -> Any:
         raise ValueError("it is nested too deeply") from error
 
 
+def parse_object(text: str, error: type[PolicyError], what: str) -> dict[str, Any]:
+    """Parse a JSON object; raise ``error``, which names it as ``what``, for anything else."""
+    try:
+        data = parse_json(text)
+    except ValueError as failure:
+        raise error(f"{what} is not JSON: {failure}") from failure
+    if not isinstance(data, dict):
+        raise error(f"{what} is not a JSON object")
+    return data
+
+
 def read_json(path: Path) -> Any:
     """Read a JSON file; raise OSError, or ValueError as ``read_text`` and ``parse_json``."""
     return parse_json(read_text(path))

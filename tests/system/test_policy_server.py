@@ -221,6 +221,7 @@ def test_what_is_no_chunk_is_refused_at_loading_and_coasted_over_in_flight(
         ('{"height": 48}', "unknown contract keys"),
         ("[]", "not a JSON object"),
         ("{", "not JSON"),
+        ("[" * 100_000, "nested too deeply"),
     ],
 )
 def test_a_server_may_say_fields_that_the_file_lacks(

@@ -3,7 +3,6 @@
 msgpack and websockets are an extra; only loading such a policy imports them.
 """
 
-import json
 import os
 from dataclasses import fields, replace
 from importlib.util import find_spec
@@ -14,7 +13,7 @@ from urllib.parse import urlsplit
 from policy.adapters.interface import Interface, read_interface
 from policy.contract import LIMIT_TERMS, Contract
 from policy.errors import ContractError, PolicyError
-from policy.files import read_toml
+from policy.files import parse_object, read_toml
 
 if TYPE_CHECKING:
     from policy.adapters.websocket.messages import Message
@@ -84,7 +83,9 @@ def _interface(contract_file: Path | None, metadata: "Message") -> Interface:
     served = metadata.get(CONTRACT_KEY)
     if not isinstance(served, str):
         if contract_file is not None:
-            return read_interface(contract_file, _known_fields(metadata.get(FIELDS_KEY)))
+            known = metadata.get(FIELDS_KEY)
+            text = known if isinstance(known, str) else "{}"
+            return read_interface(contract_file, parse_object(text, ContractError, FIELDS_KEY))
         raise PolicyError(
             "the server does not say its rate nor what its state and actions mean: write that in a "
             "file, and give --contract FILE; docs/policy.md has one to begin with"
@@ -102,16 +103,3 @@ def _interface(contract_file: Path | None, metadata: "Message") -> Interface:
         if field.init and not (field.name in TERMS and field.name in said)
     }
     return read_interface(contract_file, kept)
-
-
-def _known_fields(text: object) -> dict[str, object]:
-    """Return the contract fields of a server's metadata; none without them."""
-    if not isinstance(text, str):
-        return {}
-    try:
-        known = json.loads(text)
-    except ValueError as error:
-        raise ContractError(f"the server's contract fields are not JSON: {error}") from error
-    if not isinstance(known, dict):
-        raise ContractError("the server's contract fields are not a JSON object")
-    return known

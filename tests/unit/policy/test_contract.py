@@ -69,6 +69,7 @@ def test_shapes_grow_by_cameras_observations_and_extras() -> None:
         ({"action": "torque"}, "action must be .*'velocity', got 'torque'"),
         ({"action": "velocity", "modes": ["GUIDED_NOGPS"]}, "of GUIDED, OFFBOARD for"),
         ({"throttle_dead_zone": 1.0}, "throttle_dead_zone must be in"),
+        ({"lean_dead_zone": 0.9}, r"lean_dead_zone must be in \[0, 0.9\)"),
         ({"modes": "ALT_HOLD"}, "modes must be one or more"),
         ({"modes": ["ALT_HOLD", "GUIDED"]}, r"for action 'sticks', got .*'GUIDED'"),
         ({"max_state_age_s": 0}, r"max_state_age_s must be in \[0.001, 60\] seconds, got 0"),
