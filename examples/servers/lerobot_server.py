@@ -1,4 +1,4 @@
-"""Any LeRobot policy (ACT, SmolVLA, pi0, ...) on a server, in LeRobot's own environment.
+"""LeRobot's ACT, SmolVLA or pi0 on a server, in LeRobot's own environment.
 
 pip install lerobot websockets msgpack          # LeRobot 0.4 or newer
 python lerobot_server.py run/checkpoints/last/pretrained_model --host 0.0.0.0
@@ -44,8 +44,8 @@ class Server:
             try:
                 actions = self.actions(msgpack.unpackb(request, object_hook=to_array))
                 connection.send(msgpack.packb({"actions": actions.tolist()}))
-            except Exception as error:
-                connection.send(f"{type(error).__name__}: {error}")  # the client reports a text
+            except Exception as error:  # noqa: BLE001 - the client reports a text
+                connection.send(f"{type(error).__name__}: {error}")
 
     @torch.no_grad()
     def actions(self, message: dict) -> torch.Tensor:
@@ -53,7 +53,7 @@ class Server:
         arrays.pop("prefix", None)  # LeRobot wants its own last chunk, normalised
         prompt = message.get("prompt", "")
         batch = self.before(prepare_observation_for_inference(arrays, self.device, prompt))
-        asked_s, options = time.monotonic(), {}
+        asked_s, options = time.monotonic(), {}  # noqa: TID251 - knows no mavbridge
         if self.rtc_dt_s is not None and self.left_over is not None:
             flown = round((asked_s - self.asked_s) / self.rtc_dt_s)
             delay = round(message.get("delay_s", 0.0) / self.rtc_dt_s)

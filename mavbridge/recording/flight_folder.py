@@ -12,7 +12,7 @@ from mavbridge.recording import rows
 from mavbridge.recording.folder import TICKS, VIDEO, frames_of, video_of
 from mavbridge.recording.meta import FlightError, FlightMeta, read_meta
 from mavbridge.recording.rows import FrameRow, TickRow, read_frames, read_ticks
-from mavbridge.recording.tables import read_numbered, read_table
+from mavbridge.recording.tables import read_numbered, read_table, table_exists
 from mavbridge.recording.video.file import read_video
 from policy.data.flight_video import with_images
 
@@ -87,7 +87,7 @@ def _frames(
     folder: Path, meta: FlightMeta, camera: str | None, damage: list[str]
 ) -> tuple[Any, tuple[int, ...]]:
     stem, video = frames_of(camera), video_of(camera)
-    has_table = any((folder / stem).with_suffix(end).exists() for end in (".parquet", ".arrows"))
+    has_table = table_exists(folder / stem)
     has_video = (folder / video).exists()
     if not (has_table and has_video):
         if meta.finished and meta.frames and (camera is None or has_table or has_video):

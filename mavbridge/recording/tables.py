@@ -106,6 +106,11 @@ def read_table(stem: Path, schema: pa.Schema, *, damage: list[str] | None = None
     return read_numbered(stem, schema, damage=damage)[0]
 
 
+def table_exists(stem: Path) -> bool:
+    """True if there is a table, complete or still growing."""
+    return any(stem.with_suffix(end).exists() for end in (".parquet", ".arrows"))
+
+
 def read_numbered(
     stem: Path, schema: pa.Schema, *, damage: list[str] | None = None
 ) -> tuple[pa.Table, NDArray[np.int64]]:

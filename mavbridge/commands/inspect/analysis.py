@@ -41,7 +41,7 @@ from mavbridge.recording.folder import PACKETS, SOLVES
 from mavbridge.recording.meta import FlightError, FlightMeta
 from mavbridge.recording.rows import FrameRow
 from mavbridge.recording.settings import read_settings
-from mavbridge.recording.tables import read_table
+from mavbridge.recording.tables import read_table, table_exists
 from policy.contract import Contract
 
 ATTITUDES = (30, 31)
@@ -304,7 +304,7 @@ def _read_arrivals(folder: Path, damage: list[str]) -> Arrivals | None:
 
     A sentence about any loss is appended to ``damage``.
     """
-    if not _has(folder, PACKETS):
+    if not table_exists(folder / PACKETS):
         return None
     table = read_table(folder / PACKETS, replay_tables.PACKETS, damage=damage)
     columns = {name: table.column(name).to_numpy() for name in table.column_names}
@@ -317,10 +317,6 @@ def _read_arrivals(folder: Path, damage: list[str]) -> Arrivals | None:
 
 def recorded_solves(folder: Path, contract: Contract | None) -> Iterator[Solve]:
     """Return the policy's solves in the order of time; nothing if they were not recorded."""
-    if contract is not None and _has(folder, SOLVES):
+    if contract is not None and table_exists(folder / SOLVES):
         table = read_table(folder / SOLVES, replay_tables.SOLVES)
         yield from (row.solve for row in replay_tables.read_solves(table, contract))
-
-
-def _has(folder: Path, stem: str) -> bool:
-    return any((folder / stem).with_suffix(end).exists() for end in (".parquet", ".arrows"))
