@@ -72,8 +72,9 @@ class SentHistory:
         """Return the actions [1, len(times_ns), 4] that fly at these times; NaN from ``until_ns``
         on, and without a ``plan``."""
         prefix = np.full((1, len(times_ns), 4), np.nan, np.float32)
-        flown = [self.at(at_ns, plan) for at_ns in times_ns if plan and at_ns < until_ns]
-        if flown:
+        soon_ns = [] if plan is None else [at_ns for at_ns in times_ns if at_ns < until_ns]
+        if soon_ns:
+            flown = [self.at(at_ns, plan) for at_ns in soon_ns]
             prefix[0, : len(flown)] = self._frame.from_guard(flown)
         return prefix
 

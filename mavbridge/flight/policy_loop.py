@@ -169,8 +169,7 @@ class PolicyLoop:
         if isinstance(state, Unavailable):
             self._refuse(state.reason)
             return
-        is_planned = self._forward is not None and self._view.phase is Phase.FLYING
-        plan = self._chunk if is_planned else None
+        plan = self._chunk if self._view.phase is Phase.FLYING else None
         observation = self._observe(state, telemetry, now_ns, plan)
         if isinstance(observation, Unavailable):
             self._refuse(observation.reason)
@@ -208,13 +207,17 @@ class PolicyLoop:
     def _solve(
         self, state: VehicleState, observation: Observation, now_ns: int, plan: Chunk | None
     ) -> None:
-        """Compute and send a chunk. ``observation`` may be predicted, ``state`` is as measured."""
+        """Compute and send a chunk. ``observation`` may be predicted, ``state`` is as measured;
+        ``plan`` is the chunk that flies, if one does."""
         feature, acts_ns = observation.feature, observation.state.attitude_ns
-        history = self._history.resample(now_ns if plan is None else acts_ns, plan)
+        if self._forward is None or plan is None:
+            history = self._history.resample(now_ns)
+        else:
+            history = self._history.resample(acts_ns, plan)
         step_ns = round(self._settings.chunk_dt_s * NS_PER_S)
         if count := self._settings.prefix_len:
             times_ns = range(acts_ns, acts_ns + count * step_ns, step_ns)
-            prefix = self._history.committed(self._chunk, times_ns, self._takeover_ns(now_ns))
+            prefix = self._history.committed(plan, times_ns, self._takeover_ns(now_ns))
             history = np.concatenate([history, prefix], axis=1)
         try:
             array = self._act(observation.encoded, observation.states, history)

@@ -180,6 +180,9 @@ def test_the_prefix_holds_what_flies_until_the_chunk_takes_over() -> None:
     rig.loop.step()
     _, _, history = rig.given
     assert (history.shape, np.isnan(history[0, 2:]).all()) == ((1, 8, 4), True)  # nothing planned
+    run_on(rig, 93)
+    assert np.isnan(rig.given[2][0, 2:]).all()  # planned, and not flown
+    rig.view.receive(make_guard_tick(rig.clock.now_ns(), phase=Phase.FLYING))
     run_on(rig, 7)
     _, _, history = rig.given
     assert not np.isnan(history[0, :2]).any()
