@@ -28,10 +28,10 @@ from benchmarks.results import (
     BenchResult,
     Flight,
     print_result,
-    this_machine,
     to_json,
 )
 from benchmarks.roofline import time_rooflines
+from mavbridge.commands.check.computer import this_computer
 from mavbridge.commands.output import print_status, table_console
 from mavbridge.config.policy import PolicyConfig
 from mavbridge.config.rates import Rates
@@ -100,7 +100,7 @@ def measure(*, is_quick: bool) -> BenchResult:
     engines, notes = time_engines(policies, rounds=rounds, block_s=block_s)
     clients, peer_notes = link_clients()
     return BenchResult(
-        machine=this_machine(),
+        machine=this_computer(),
         quick=is_quick,
         engines=(*engines, *time_rooflines(policies)),
         flights=(

@@ -1,33 +1,19 @@
 """Results of a benchmark as frozen values, their JSON, and their tables."""
 
 import json
-import os
-import platform
-import sys
 from collections.abc import Callable, Iterable
 from dataclasses import asdict, dataclass
-from importlib.metadata import version
-from pathlib import Path
 
 from rich.console import Console
 from rich.table import Table
 from rich.text import Text
 
+from mavbridge.commands.check.computer import Computer
 from mavbridge.commands.output import make_table, number
 from mavbridge.config.policy import PolicyConfig
 from mavbridge.core.vehicle import Percentiles
 
 OURS, BASELINE = "mavbridge", "baseline"
-
-
-@dataclass(frozen=True, kw_only=True)
-class Machine:
-    """Computer of a run."""
-
-    cpu: str
-    cores: int
-    python: str
-    torch: str
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -114,7 +100,7 @@ class LinkLatency:
 class BenchResult:
     """Results of one run."""
 
-    machine: Machine
+    machine: Computer
     quick: bool
     engines: tuple[EngineTiming, ...]
     flights: tuple[Flight, ...]
@@ -133,21 +119,6 @@ def solves_of(policy: PolicyConfig) -> str:
     return steps if policy.may_be_dual else f"single rate, {steps}"
 
 
-def this_machine() -> Machine:
-    """Describe this computer."""
-    try:
-        lines = Path("/proc/cpuinfo").read_text().splitlines()
-    except OSError:
-        lines = []
-    names = (line.partition(":")[2].strip() for line in lines if line.startswith("model name"))
-    return Machine(
-        cpu=next(names, platform.processor() or "unknown processor"),
-        cores=len(os.sched_getaffinity(0)) if sys.platform == "linux" else os.cpu_count() or 1,
-        python=platform.python_version(),
-        torch=version("torch"),
-    )
-
-
 def to_json(result: BenchResult) -> str:
     """Return the result as JSON, keys in the order of its fields; null = not measured."""
     return json.dumps(asdict(result), indent=2, allow_nan=False) + "\n"
@@ -156,7 +127,8 @@ def to_json(result: BenchResult) -> str:
 def print_result(result: BenchResult, console: Console) -> None:
     """Print the machine, all tables and the notes."""
     here = result.machine
-    console.print(Text(f"{here.cpu}, {here.cores} cores, Python {here.python}, torch {here.torch}"))
+    python, torch = here.versions["python"], here.versions.get("torch")
+    console.print(Text(f"{here.cpu}, {here.cores} cores, Python {python}, torch {torch}"))
     for table in (
         engine_table(result.engines),
         flight_table(result.flights),

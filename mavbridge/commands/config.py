@@ -88,6 +88,9 @@ class CheckConfig:
     timing: Annotated[float, Parameter(group=RATES)] = 3.0
     """Seconds for which the policy is run at its rates, on one dummy sample; minutes show whether
     this computer throttles."""
+    soak: Annotated[float | None, Parameter(group=RATES)] = None
+    """Seconds for which the policy runs at the bundled vehicle, which only climbs: rates held, CPU,
+    temperature, for the table and the JSON. It needs the extra "sitl"."""
     json: Annotated[Path | None, Parameter(group=OUTPUT, allow_leading_hyphen=True)] = None
     """Write the rows here as JSON; - is standard output, and the table then goes to standard
     error."""
@@ -95,6 +98,9 @@ class CheckConfig:
     def __post_init__(self) -> None:
         """Refuse durations that show nothing."""
         check_range("timing", self.timing, 0.5, 36_000, "s")
+        check_range("soak", self.soak, 1, 36_000, "s")
+        if self.soak is not None and self.flight.policy.policy == "none":
+            raise UserError("--soak needs a policy")
 
 
 @Parameter(name="*")

@@ -5,8 +5,8 @@ from benchmarks.results import (
     EngineTiming,
     Flight,
     LinkLatency,
-    Machine,
 )
+from mavbridge.commands.check.computer import Computer
 from mavbridge.core.vehicle import Percentiles
 
 
@@ -55,8 +55,17 @@ def make_link(client: str, *, round_trip_ms: float) -> LinkLatency:
     )
 
 
+COMPUTER = Computer(
+    model="",
+    cpu="some cpu",
+    machine="x86_64",
+    cores=2,
+    kernel="6.1",
+    governor="",
+    versions={"python": "3.11.0", "torch": "2.13.0"},
+)
 RESULT = BenchResult(
-    machine=Machine(cpu="some cpu", cores=2, python="3.11.0", torch="2.13.0"),
+    machine=COMPUTER,
     quick=True,
     engines=(
         make_timing("encode", "torch", 60.0),

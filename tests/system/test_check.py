@@ -52,3 +52,19 @@ def test_a_vehicle_without_a_camera_is_checked_and_flown(tmp_path: Path) -> None
         assert status == ExitCode.DONE, told
         assert "frozen" not in told
         assert "black" not in told
+
+
+def test_a_soak_measures_this_computer_at_the_bundled_vehicle(tmp_path: Path) -> None:
+    report = tmp_path / "soak.json"
+    words = ("--connect", "none", "--timing", "0.5", "--soak", "2", "--json", str(report))
+    status, told = run("check", *words)
+    assert status == ExitCode.DONE, told
+    assert "NO-GO" not in told
+    document = json.loads(report.read_text())
+    soak = document["soak"]
+    assert soak["timing"]["sticks"]["slots"] > 150
+    assert soak["timing"]["action"]["rate_hz"] > 0
+    assert soak["timing"]["vision"]["rate_hz"] > 0
+    assert 0 < soak["cpu_cores"]["guard"] < 1
+    assert soak["computer"]["kernel"]
+    assert [row["area"] for row in document["rows"] if row["name"] == "soak"] == ["computer"]
