@@ -17,7 +17,8 @@ _CONTROLLED_BY = {
     Phase.HOLDING: "neutral sticks, since silence would be a failsafe",
     Phase.RELEASING: "nobody: a release is sent every 50 ms, also after the link was reopened",
     Phase.RELEASED: "the pilot; nothing is sent. Continues as in WAITING",
-    Phase.ENDED: "the pilot; parameters of `--set` are restored (4 s at most), the process exits",
+    Phase.ENDED: "the pilot; a disarmed vehicle gets back the parameters of `--set` (4 s at most), "
+    "and the process exits",
 }
 
 

@@ -231,8 +231,9 @@ class Contract:
     """Longest time to fly on along a chunk while no newer one arrives; never beyond its horizon.
     The ages of a chunk are judged when it is accepted, and grow during the stall."""
     max_tilt_deg: float | None = None
-    """Largest lean before the policy loses control. None, here and in the three limits below,
-    leaves the limit to the flight's configuration; a number may widen it."""
+    """Lean that the policy needs. This and the three limits below only widen the default envelope
+    of a flight (60 degrees); None or a smaller number leaves it. The setting envelope.tilt has the
+    last word."""
     max_speed_mps: float | None = None
     max_height_m: float | None = None
     """Height above the estimator's origin, where the vehicle was switched on."""

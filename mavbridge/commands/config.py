@@ -89,8 +89,8 @@ class CheckConfig:
     """Seconds for which the policy is run at its rates, on one dummy sample; minutes show whether
     this computer throttles."""
     soak: Annotated[float | None, Parameter(group=RATES)] = None
-    """Seconds for which the policy runs at the bundled vehicle, which only climbs: rates held, CPU,
-    temperature, for the table and the JSON. It needs the extra "sitl"."""
+    """Seconds to run the policy at the bundled vehicle, which climbs, and measure this computer.
+    Needs the extra "sitl"."""
     json: Annotated[Path | None, Parameter(group=OUTPUT, allow_leading_hyphen=True)] = None
     """Write the rows here as JSON; - is standard output, and the table then goes to standard
     error."""

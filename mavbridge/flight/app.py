@@ -47,8 +47,8 @@ from policy.protocol import PolicyRunner
 _log = logging.getLogger(__name__)
 JOIN_S = 2.0
 LEAST_HANG_NS = NS_PER_S
-"""Silence of the policy or the encoder that ends the flight. The guard has released the vehicle
-long before."""
+"""Silence of the policy or the encoder that ends the program. The guard has ended the policy's
+flight long before."""
 HANG_PERIODS = 5
 STOPPED_NS = LEAST_HANG_NS // 2
 """The main thread checks STATUS_HZ times a second. A longer gap means that the whole process was

@@ -182,7 +182,8 @@ class Guard:
         )
 
     def _silence(self, now_ns: int, stood_ns: int, attitude: Reading | None) -> Reason | None:
-        """Return why a silent link ends the flight, or None; a plan bridges only our own stall."""
+        """Return why a silent link ends the flight, or None: a chunk bridges a stall
+        of this computer, not a silent vehicle."""
         if stood_ns > STOOD_STILL_NS:
             self._heard_ns = now_ns
         limit_ns = self._chunks.grace_ns
@@ -223,7 +224,8 @@ class Guard:
         is_flying = self._engagement.phase is Phase.FLYING
         if chunk_fault is None and is_flying:
             chunk_fault = self._chunks.fault(now_ns)
-        # What only prevents a flight is not asked in one; read-only, the policy seems to fly.
+        # These block only an engagement, so they are skipped in flight. A read-only flight is only
+        # shown as FLYING, so they are always checked there.
         is_sought = not is_flying or self._engagement.settings.readonly
         starting_ns, newest = self._engagement.starting_ns, self._chunks.newest
         reset_ns = 0 if newest is None else newest.reset_ns

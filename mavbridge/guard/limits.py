@@ -184,9 +184,8 @@ class ActionSmoother:
 
     - Rate limit: the output moves towards the input by at most ``change_per_s * dt``.
     - Low-pass: ``tau dy/dt = u - y``, solved (not stepped) for an input linear over the step:
-      ``y1 = u1 - m tau + (y0 - u0 + m tau) exp(-dt/tau)`` with ``m = (u1 - u0) / dt``. The output
-          at a
-      tick is therefore independent of where the earlier ticks fall.
+      ``y1 = u1 - m tau + (y0 - u0 + m tau) exp(-dt/tau)`` with ``m = (u1 - u0) / dt``. The
+      output at a tick is therefore independent of where the earlier ticks fall.
 
     The rate limit comes first: the low-pass averages limited values, so it keeps the bound.
     """

@@ -1,4 +1,7 @@
-"""State of the engagement, and the actions of its table's rows."""
+"""State of the engagement, and the actions of its table's rows.
+
+An "act" is an operator's engage command.
+"""
 
 from dataclasses import dataclass, field
 
@@ -136,7 +139,8 @@ class Memory:
         """neutral, then a safe mode
 
         Neutral in the same step; then the mode of `--on-fault` after a fault or a takeover, that
-        of `--then` after an end: see [the way out](#the-way-out).
+        of `--then` after an end, or no other mode if a pilot gets the sticks: see [the way
+        out](#the-way-out).
         """
         self._note_end(cause)
         self.reason = cause.reason

@@ -44,7 +44,8 @@ class EndRequest(NamedTuple):
     reason: Reason
     is_fault: bool = False
     end: FlightEnd = "signal"
-    """How the flight ends; with ``is_fault`` it counts only if it is a takeover or a disarming."""
+    """How the flight ends; "fault" is recorded with ``is_fault``, unless this is "takeover" or
+    "disarmed"."""
 
 
 class Outcome(NamedTuple):

@@ -99,7 +99,8 @@ class TimingReport:
     feature_age_ms: Percentiles | None
     """Time from the exposure of an image to the send of each action based on it."""
     state_age_ms: Percentiles | None
-    """Time from the arrival of an attitude to the send of each action based on it."""
+    """Time from the measurement of an attitude (its arrival, if the vehicle sends no stamp) to the
+    send of each action based on it."""
     state_to_wire_ms: Percentiles | None
     """State to wire: time from the arrival of a new attitude to the first send based on it."""
     link: LinkStats | None
