@@ -15,6 +15,7 @@ import mavbridge
 from mavbridge.commands.episode_workers import fly_jobs
 from mavbridge.commands.output import progress_bar
 from mavbridge.config.episodes import DemonstrateConfig
+from mavbridge.config.flight import Limits
 from mavbridge.config.rates import SIM_CAMERA_PX, Rates
 from mavbridge.core.clock import NS_PER_MS, NS_PER_S, MonotonicClock
 from mavbridge.core.errors import UserError
@@ -22,6 +23,7 @@ from mavbridge.core.records import Event, Tick
 from mavbridge.core.stopping import INTERRUPTED, stop_on_signals
 from mavbridge.core.vehicle import Action, BodyRates, Sticks
 from mavbridge.flight.policies import load_for_episodes
+from mavbridge.flight.settings import contract_with_ages
 from mavbridge.recording.flight_writer import FlightWriter
 from mavbridge.recording.folder import META, prepare_folder
 from mavbridge.recording.meta import FlightError, FlightMeta, read_meta
@@ -60,19 +62,29 @@ class Variation:
     delays: Delays
     starts_airborne: bool
     disturbance: float
+    solve_ns: int
+    """Time from the image to the student's chunk, beyond that of the delays."""
 
 
-def draw_variation(seed: int) -> Variation:
-    """Draw the variation of a seed."""
+def draw_variation(seed: int, *, longest_solve_ns: int = 0) -> Variation:
+    """Draw the variation of a seed, with a solve of a quarter to all of ``longest_solve_ns``.
+
+    The student's image is as old as a solve of that length would make it. Its state is not: it is
+    as measured, as if predicted without error (``state_time = "execution"``).
+    """
     random = np.random.Generator(np.random.PCG64((seed, 4)))
     shares = (NOMINAL_SHARE, AIRBORNE_SHARE, UNDISTURBED_SHARE)
     is_nominal, is_airborne, is_undisturbed = random.random(3) < shares
+    delays = _random_delays(random)
+    disturbance = 0.0 if is_undisturbed else float(random.uniform(0.5, 1.0))
+    solve_ns = round(longest_solve_ns * float(random.uniform(0.25, 1.0)))
     return Variation(
         seed=seed,
         conditions=NOMINAL if is_nominal else random_conditions(seed),
-        delays=_random_delays(random),
+        delays=replace(delays, vision=replace(delays.vision, offset_ns=solve_ns)),
         starts_airborne=bool(is_airborne),
-        disturbance=0.0 if is_undisturbed else float(random.uniform(0.5, 1.0)),
+        disturbance=disturbance,
+        solve_ns=solve_ns,
     )
 
 
@@ -119,6 +131,8 @@ class Pilot:
         self._turns = TurnSchedule(variation.seed)
         self._expert: Expert | RateExpert | None = None
         self._solves = 0
+        self._planned: tuple[int, FloatArray] | None = None
+        """Time and values of the student's chunk that flies."""
         self.expert_actions: dict[int, Action] = {}
         """Recent expert actions by the serial of the chunk that was computed at their states."""
         self.begin_ns: int | None = None
@@ -169,9 +183,20 @@ class Pilot:
         chunk = np.tile(np.array(disturbed, np.float32), (1, horizon, 1))
         if self._student is None:
             return chunk
-        # Called at every tick, also in the expert's turns: the student can have internal state.
-        students = self._student.act(encoded, state, history)
-        return students if self._turns.is_students(now_s) else chunk
+        # Also in the expert's turns: the student can have internal state.
+        now_ns, solve_ns = self._flight.clock.now_ns(), self._variation.solve_ns
+        if self._planned is None or now_ns - self._planned[0] >= solve_ns:
+            self._planned = now_ns, self._student.act(encoded, state, history).copy()
+        planned_ns, plan = self._planned
+        passed = (now_ns - planned_ns) / NS_PER_S / self._student.contract.chunk_dt_s
+        return from_now(plan, passed) if self._turns.is_students(now_s) else chunk
+
+
+def from_now(plan: FloatArray, passed: float) -> FloatArray:
+    """Return a chunk [1, L, 4] of which ``passed`` steps are over, its last action repeated."""
+    steps = np.arange(plan.shape[1])
+    actions = [np.interp(steps + passed, steps, column) for column in plan[0].T]
+    return np.stack(actions, axis=-1)[None].astype(np.float32)
 
 
 class TurnSchedule:
@@ -224,7 +249,9 @@ def fly_demonstration(spec: DemonstrationSpec, should_stop: Callable[[], bool]) 
 
 def _fly(spec: DemonstrationSpec, should_stop: Callable[[], bool], stack: ExitStack) -> bool:
     """Fly and record one course; ``stack`` closes the student."""
-    variation, wanted = draw_variation(spec.seed), spec.config.policy
+    longest_solve_ns = round(spec.config.solve_time * NS_PER_MS)
+    variation = draw_variation(spec.seed, longest_solve_ns=longest_solve_ns)
+    wanted, limits = spec.config.policy, Limits()
     student: PolicyRunner | None = None
     size_px = wanted.image_size or SIM_CAMERA_PX
     contract = Contract(
@@ -238,7 +265,10 @@ def _fly(spec: DemonstrationSpec, should_stop: Callable[[], bool], stack: ExitSt
     if wanted.checkpoint is not None:
         loaded = load_for_episodes(replace(wanted, dual_rate=True), MonotonicClock())
         student = stack.enter_context(loaded).runner
-        contract = student.contract
+        max_age_s = student.contract.max_feature_age_s + longest_solve_ns / NS_PER_S
+        limits = Limits(max_feature_age=max_age_s)
+        contract = contract_with_ages(student.contract, limits)
+        student = replace(student, contract=contract)
         if contract.action != spec.config.action:
             raise UserError(
                 f"{wanted.checkpoint} flies by {contract.action}: use --action {contract.action}"
@@ -248,7 +278,9 @@ def _fly(spec: DemonstrationSpec, should_stop: Callable[[], bool], stack: ExitSt
         seed=spec.seed,
         # The expert uses no image: frames are drawn in the size of the recording.
         settings=SimulationSettings(
-            delays=variation.delays, least_camera_px=SIM_CAMERA_PX if student else 1
+            limits=limits,
+            delays=variation.delays,
+            least_camera_px=SIM_CAMERA_PX if student else 1,
         ),
         vehicle=make_vehicle(autopilot=spec.config.autopilot, conditions=variation.conditions),
     )

@@ -164,6 +164,9 @@ class DemonstrateConfig:
     policy: PolicyConfig = field(default_factory=PolicyConfig)
     """With --checkpoint the policy flies most of the time, and the expert's actions are recorded as
     labels (DAgger)."""
+    solve_time: float = 0.0
+    """With --checkpoint: longest time in milliseconds that the policy takes for a chunk, as a slow
+    head or a server does. Each flight draws its own, from a quarter of it on."""
     workers: WorkersConfig = field(default_factory=WorkersConfig)
 
     def __post_init__(self) -> None:
@@ -171,6 +174,9 @@ class DemonstrateConfig:
         check_range("episodes", self.episodes, 1, MAX_EPISODES, "")
         check_range("speed", self.speed, 1.5, 14 if self.action == "rates" else 10, "m/s")
         check_range("max-time", self.max_time, 1, 3600, "s")
+        check_range("solve-time", self.solve_time, 0, 1000, "ms")
+        if self.solve_time > 0 and self.policy.checkpoint is None:
+            raise UserError("--solve-time is the student's: give its --checkpoint")
         check_range("seed", self.policy.seed, 0, CHECK_COURSE_SEED // MAX_EPISODES - 1, "")
 
     @property

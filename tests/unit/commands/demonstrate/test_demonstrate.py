@@ -14,6 +14,7 @@ from mavbridge.commands.demonstrate import (
     demonstrate,
     draw_variation,
     fly_demonstration,
+    from_now,
 )
 from mavbridge.commands.train import fit_to_flights
 from mavbridge.config.episodes import RACE_COURSE_SEED, AutopilotKind, DemonstrateConfig
@@ -131,6 +132,36 @@ def test_a_folder_of_somebody_elses_is_left_alone(tmp_path: Path) -> None:
 def test_no_demonstration_flies_a_held_out_course(tmp_path: Path) -> None:
     with pytest.raises(UserError, match="seed"):
         config(tmp_path, seed=100)
+
+
+def test_a_slow_student_flies_along_its_plan_from_an_old_image() -> None:
+    plan = np.arange(16, dtype=np.float32).reshape(1, 4, 4)
+    assert from_now(plan, 0.0).tolist() == plan.tolist()
+    assert from_now(plan, 1.5)[0, :, 0].tolist() == [6.0, 10.0, 12.0, 12.0]
+    fast, slow = draw_variation(7), draw_variation(7, longest_solve_ns=400_000_000)
+    assert 100_000_000 <= slow.solve_ns <= 400_000_000
+    assert slow.delays.vision.offset_ns == slow.solve_ns
+    assert fast.delays.vision.offset_ns == fast.solve_ns == 0
+    assert replace(slow, solve_ns=0, delays=fast.delays) == fast, "all else is as without it"
+
+
+def test_a_slow_student_sees_old_images_and_every_tick_has_a_label(tmp_path: Path) -> None:
+    slow = replace(
+        config(tmp_path, max_time=2.0),
+        policy=PolicyConfig(checkpoint=SHIPPED, seed=3),
+        solve_time=400.0,
+    )
+    assert demonstrate(slow) == 0
+    ticks = open_flight(tmp_path / "000000").ticks
+    ages_ns = np.array(ticks["sent_ns"]) - np.array(ticks["feature_captured_ns"])
+    assert ages_ns.min() > 100_000_000
+    assert len(set(ticks["chunk_serial"].to_pylist())) == ticks.num_rows > 100
+    assert ticks["expert"].null_count == 0
+
+
+def test_only_a_student_is_slow(tmp_path: Path) -> None:
+    with pytest.raises(UserError, match="--solve-time"):
+        replace(config(tmp_path), solve_time=100.0)
 
 
 def test_flights_differ() -> None:
