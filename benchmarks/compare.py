@@ -164,6 +164,9 @@ def _flight_ratios(result: BenchResult) -> Iterator[tuple[str, float]]:
         if flight.lateness_ms is not None:
             periods = flight.lateness_ms.p99 * flight.asked_stick_hz / MS_PER_S
             yield f"{name}: stick lateness p99 / period", periods
+        yield f"{name}: cores in all", flight.cpu_cores
+        if flight.guard_cpu_cores is not None:
+            yield f"{name}: cores of the guard", flight.guard_cpu_cores
         baseline = baselines.get(flight.policy)
         if baseline is None or not baseline.action_hz or flight.conditions:
             continue

@@ -7,6 +7,8 @@ from benchmarks.compare import ratios, read_budget, violations
 from helpers.bench_results import RESULT
 from mavbridge.core.errors import UserError
 
+FLOWN = next(flight for flight in RESULT.flights if flight.runner == "mavbridge")
+
 
 @pytest.mark.parametrize(
     ("name", "value"),
@@ -20,12 +22,14 @@ from mavbridge.core.errors import UserError
         ("flight: toge:small, 1 step, torch: cpu an action / baseline", 0.5),
         ("flight: toge:small, 1 step, torch: state to wire / baseline", 0.05),
         ("flight: toge:small, 1 step, torch: stick lateness p99 / period", 0.05),
+        ("flight: toge:small, 1 step, torch: cores in all", FLOWN.cpu_cores),
+        ("flight: toge:small, 1 step, torch: cores of the guard", 0.125),
         ("link: mavbridge: round trip / bare pymavlink loop", 2.0),
     ],
 )
 def test_ratios_compare_two_figures_of_one_run(name: str, value: float) -> None:
     assert ratios(RESULT)[name] == pytest.approx(value)
-    assert len(ratios(RESULT)) == 10
+    assert len(ratios(RESULT)) == 12
 
 
 def test_reads_what_the_repository_holds() -> None:
