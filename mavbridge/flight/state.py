@@ -18,12 +18,12 @@ from mavbridge.core.vehicle import Reading, Telemetry
 from mavbridge.flight.ego_motion import EgoMotion
 from mavbridge.flight.feature_cache import FeatureCache
 from policy.contract import Contract
+from policy.motion.rotation import other_frame
 
 StateFrame = Literal["ned_frd", "enu_flu"]
 Ned = tuple[float, float, float]
 _READINGS = {"goal": "position", "altitude": "position", "height": "height above home"}
 
-_HALF_SQRT2 = math.sqrt(0.5)
 LEAST_RATE_RADPS = 1e-4
 """Body rate that excludes a constant attitude: a hundredth of a gyroscope's noise, and above the
 residual rate of a noise-free simulator at hover."""
@@ -68,10 +68,10 @@ def build_state(
         return stale(velocity, "velocity", now_ns, freshness.velocity_ns)
     if force is None or not force.is_fresh(now_ns, freshness.velocity_ns):
         return stale(force, "acceleration", now_ns, freshness.velocity_ns)
-    v, q, w, a = velocity.values, attitude.values, rate.values, force.values
+    row = (*velocity.values, *attitude.values, *rate.values, *force.values)
     if frame == "enu_flu":
-        v, q, w, a = _to_enu_flu(v, q, w, a)
-    values = np.array((*v, *_unit_positive(q), *w, *a), dtype=np.float32)
+        row = other_frame(row)
+    values = np.array((*row[:3], *_unit_positive(row[3:7]), *row[7:]), dtype=np.float32)
     values.setflags(write=False)
     return VehicleState(
         values=values,
@@ -180,29 +180,6 @@ def stale(reading: Reading | None, quantity: str, now_ns: int, limit_ns: int) ->
         return Unavailable(because(Code.READING_AHEAD, quantity=quantity, ahead_ms=ahead_ms))
     age_ms, limit_ms = (now_ns - reading.happened_ns) / NS_PER_MS, limit_ns / NS_PER_MS
     return Unavailable(because(Code.TOO_OLD, quantity=quantity, age_ms=age_ms, limit_ms=limit_ms))
-
-
-_Parts = tuple[tuple[float, ...], tuple[float, ...], tuple[float, ...], tuple[float, ...]]
-
-
-def _to_enu_flu(
-    v: tuple[float, ...], q: tuple[float, ...], w: tuple[float, ...], a: tuple[float, ...]
-) -> _Parts:
-    """NED/FRD -> ENU/FLU (REP 103).
-
-    World: enu = (n_east, n_north, -n_down). Body: flu = (x, -y, -z). Attitude:
-    ``enu_from_flu = enu_from_ned * ned_from_frd * frd_from_flu`` with
-    ``enu_from_ned = (0, r, r, 0)``, ``r = sqrt(1/2)`` and ``frd_from_flu = (0, 1, 0, 0)``,
-    multiplied out: ``r * (w + z, x + y, x - y, w - z)`` up to the common sign.
-    """
-    qw, qx, qy, qz = q
-    r = _HALF_SQRT2
-    return (
-        (v[1], v[0], -v[2]),
-        (r * (qw + qz), r * (qx + qy), r * (qx - qy), r * (qw - qz)),
-        (w[0], -w[1], -w[2]),
-        (a[0], -a[1], -a[2]),
-    )
 
 
 def _unit_positive(q: tuple[float, ...]) -> tuple[float, ...]:

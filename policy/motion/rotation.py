@@ -15,6 +15,7 @@ Vector = tuple[float, float, float]
 Quaternion = tuple[float, float, float, float]
 
 V = TypeVar("V", Vector, Array)
+State = TypeVar("State", tuple[float, ...], Array)
 Q = TypeVar("Q", Quaternion, Array)
 Kind = TypeVar("Kind")
 
@@ -47,6 +48,20 @@ def rotate(q: Q, vector: V) -> V:
     return _like(
         vector, a + 2 * (y * sz - z * sy), b + 2 * (z * sx - x * sz), c + 2 * (x * sy - y * sx)
     )
+
+
+def other_frame(state: State) -> State:
+    """Convert a state [..., 13] between NED/FRD and ENU/FLU (REP 103); its own inverse.
+
+    Also converts seven numbers: a position and an attitude. The attitude may come out with w < 0.
+    """
+    x, y, z, qw, qx, qy, qz, *body = _parts(state)
+    h = math.sqrt(0.5)
+    # Half turns about the diagonal between north and east, and about the nose.
+    attitude = (h * (qw + qz), h * (qx + qy), h * (qx - qy), h * (qw - qz))
+    signs = (1, -1, -1, 1, -1, -1)
+    turned = (sign * value for sign, value in zip(signs, body, strict=False))
+    return _like(state, y, x, -z, *attitude, *turned)
 
 
 def matrix_columns(w: Any, x: Any, y: Any, z: Any) -> tuple[tuple[Any, Any, Any], ...]:

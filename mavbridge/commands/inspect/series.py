@@ -16,7 +16,8 @@ from mavbridge.core.vehicle import ACTION_CLASSES
 from mavbridge.recording.flight_folder import RecordedFlight
 from mavbridge.recording.rows import FrameRow
 from policy.adapters.interface import EULER_NAMES, state_values
-from policy.contract import QUATERNION, RATE, STATE_NAMES, VELOCITY
+from policy.contract import RATE, STATE_NAMES, VELOCITY
+from policy.motion.rotation import other_frame
 
 FloatColumn: TypeAlias = NDArray[np.float64]
 
@@ -70,7 +71,7 @@ def make_series(flight: RecordedFlight) -> TickSeries:
 
     state = _vectors(ticks["state"])
     if contract is not None and contract.state_frame == "enu_flu":
-        state = _ned_frd(state)
+        state = other_frame(state)
     angles_rad = state_values(list(state.T), STATE_NAMES, EULER_NAMES)
     return TickSeries(
         start_ns=start_ns,
@@ -112,16 +113,6 @@ def _periods_ms(
     slots, before = slots[is_whole], before[is_whole]
     periods_ms[slots] = (sent_ns[slots] - sent_ns[before]) / NS_PER_MS
     return periods_ms
-
-
-def _ned_frd(state: FloatColumn) -> FloatColumn:
-    """Convert states from ``enu_flu``; the inverse of the conversion in ``flight.state``."""
-    w, x, y, z = state[:, QUATERNION].T * 0.5**0.5
-    attitude = np.stack((w + z, x + y, x - y, w - z), axis=-1)
-    velocity = state[:, VELOCITY][:, (1, 0, 2)] * (1, 1, -1)
-    body = state[:, QUATERNION.stop :] * (1, -1, -1, 1, -1, -1)
-    converted: FloatColumn = np.concatenate((velocity, attitude, body), axis=1)
-    return converted
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -24,24 +24,18 @@ from mavbridge.core.vehicle import Action
 from mavbridge.observe.viewer import layout
 from mavbridge.observe.viewer.layout import ViewedFlight
 from mavbridge.observe.viewer.plots import Columns
-from policy.contract import QUATERNION, RATE, SPECIFIC_FORCE, VELOCITY, StateFrame
+from policy.contract import StateFrame
 from policy.motion.forward_motion import ForwardMotion, VehicleMotion
-from policy.motion.rotation import conjugate, multiply
+from policy.motion.rotation import conjugate, multiply, other_frame
 
 
 def motion_of(state: VehicleState, frame: StateFrame) -> VehicleMotion:
     """Return the motion that a state in this frame describes, in NED and FRD."""
-    vx, vy, vz = state.values[VELOCITY].tolist()
-    w, x, y, z = state.values[QUATERNION].tolist()
-    p, q, r = state.values[RATE].tolist()
-    fx, fy, fz = state.values[SPECIFIC_FORCE].tolist()
-    if frame == "ned_frd":
-        return VehicleMotion((w, x, y, z), (p, q, r), (vx, vy, vz), (fx, fy, fz))
-    # From NED/FRD to ENU/FLU (REP 103) is its own inverse: half turns about the diagonal between
-    # north and east, and about the nose.
-    h = math.sqrt(0.5)
-    attitude = (h * (w + z), h * (x + y), h * (x - y), h * (w - z))
-    return VehicleMotion(attitude, (p, -q, -r), (vy, vx, -vz), (fx, -fy, -fz))
+    row = tuple(state.values.tolist())
+    if frame == "enu_flu":
+        row = other_frame(row)
+    vx, vy, vz, w, x, y, z, p, q, r, fx, fy, fz = row
+    return VehicleMotion((w, x, y, z), (p, q, r), (vx, vy, vz), (fx, fy, fz))
 
 
 JPEG_QUALITY = 85

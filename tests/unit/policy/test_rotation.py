@@ -49,3 +49,22 @@ def test_floats_and_arrays_give_the_same(a: float, b: float, axis: int, share: f
     np.testing.assert_allclose(
         [rotation.rotate(p, (w, x, y))], rotation.rotate(arrays[0], arrays[1][:, :3]), atol=1e-12
     )
+
+
+def test_the_other_frame_describes_the_same_motion_in_other_axes() -> None:
+    """East, north, up and front, left, up are NED and FRD with two axes swapped or reversed."""
+    enu_of_ned, flu_of_frd = np.array([[0, 1, 0], [1, 0, 0], [0, 0, -1]]), np.diag([1, -1, -1])
+    random = np.random.default_rng(3)
+    states = random.normal(size=(20, 13))
+    states[:, 3:7] /= np.linalg.norm(states[:, 3:7], axis=1, keepdims=True)
+    made = rotation.other_frame(states)
+    np.testing.assert_allclose(made[:, :3], states[:, :3] @ enu_of_ned.T)
+    np.testing.assert_allclose(made[:, 7:10], states[:, 7:10] @ flu_of_frd)
+    np.testing.assert_allclose(made[:, 10:], states[:, 10:] @ flu_of_frd)
+    in_body = random.normal(size=(20, 3))
+    in_world = rotation.rotate(states[:, 3:7], in_body) @ enu_of_ned.T
+    np.testing.assert_allclose(rotation.rotate(made[:, 3:7], in_body @ flu_of_frd), in_world)
+    np.testing.assert_allclose(rotation.other_frame(made), states, atol=1e-12)
+    row = tuple(states[0].tolist())
+    assert rotation.other_frame(row) == pytest.approx(tuple(made[0]))
+    assert rotation.other_frame(row[:7]) == pytest.approx(tuple(made[0, :7]))
