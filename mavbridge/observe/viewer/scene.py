@@ -21,6 +21,7 @@ from mavbridge.core.records import (
 )
 from mavbridge.core.rotation import Quaternion, heading_rad
 from mavbridge.core.vehicle import Action
+from mavbridge.observe.images import as_rgb, jpeg
 from mavbridge.observe.viewer import layout
 from mavbridge.observe.viewer.layout import ViewedFlight
 from mavbridge.observe.viewer.plots import Columns
@@ -38,7 +39,6 @@ def motion_of(state: VehicleState, frame: StateFrame) -> VehicleMotion:
     return VehicleMotion((w, x, y, z), (p, q, r), (vx, vy, vz), (fx, fy, fz))
 
 
-JPEG_QUALITY = 85
 MAX_IMAGE_WIDTH = 640
 """Wider images are scaled down, because the viewer does not show them any larger."""
 POSE_NS = 30 * NS_PER_MS
@@ -143,7 +143,7 @@ class SceneView:
             )
             self._columns.stream.log(path, pinhole, static=True, strict=True)
         encoded = rr.EncodedImage.columns(
-            blob=[_jpeg(image) for image in images], media_type=["image/jpeg"] * len(images)
+            blob=[jpeg(image) for image in images], media_type=["image/jpeg"] * len(images)
         )
         self._columns.send(path, [vision.captured_ns for vision in visions], encoded)
 
@@ -182,25 +182,13 @@ def _gates(gates: Sequence[CourseGate]) -> rr.LineStrips3D:
 
 
 def _fitting(image: CameraImage) -> ImageArray:
-    """Return the image in RGB at its shown width; farther depth is darker, unknown is black."""
-    rgb = np.asarray(image, np.uint8) if image.ndim == 3 else _shaded(image)
+    """Return the image in RGB at its shown width."""
+    rgb = as_rgb(image)
     height, width = rgb.shape[:2]
     if width <= MAX_IMAGE_WIDTH:
         return rgb
     size = (MAX_IMAGE_WIDTH, max(1, round(height * MAX_IMAGE_WIDTH / width)))
     return np.asarray(cv2.resize(rgb, size, interpolation=cv2.INTER_AREA), dtype=np.uint8)
-
-
-def _shaded(depth: CameraImage) -> ImageArray:
-    shares = 1.0 - depth.astype(np.float32) / max(int(depth.max()), 1)
-    grey = np.where(depth > 0, 55 + 200 * shares, 0).astype(np.uint8)
-    return np.repeat(grey[..., None], 3, axis=2)
-
-
-def _jpeg(rgb: ImageArray) -> bytes:
-    bgr = cv2.cvtColor(rgb, cv2.COLOR_RGB2BGR)
-    _, encoded = cv2.imencode(".jpg", bgr, [cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY])
-    return encoded.tobytes()
 
 
 PREDICTION_S = 0.01
