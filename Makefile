@@ -36,7 +36,7 @@ $(VENV)/flies: pyproject.toml constraints.txt
 	touch $@
 
 $(VENV)/installed: $(VENV)/flies
-	$(PIP) --editable '.[sitl,record,remote,screen,pilot,bench,onnx,cluster,dev]'
+	$(PIP) --editable '.[sitl,record,remote,screen,pilot,bench,onnx,mcap,cluster,dev]'
 	touch $@
 
 # The peers live apart: MAVProxy brings the OpenCV build with a GUI, which shadows the headless one.

@@ -34,10 +34,11 @@ from mavbridge.config.settings_files import (
     with_home,
 )
 from mavbridge.core.errors import UserError
+from mavbridge.core.extras import require_packages
 from mavbridge.core.log import run_log
 from mavbridge.core.realtime import require_supported_system
 from mavbridge.recording.folder import require_extra
-from policy.adapters.websocket.kind import require_packages
+from policy.adapters.websocket.kind import require_packages as require_websocket
 from policy.files import read_toml, user_path
 from policy.training.settings import RunSettings, TrainSettings, WorldModelSettings
 
@@ -174,7 +175,7 @@ def inspect(*flights: Path, config: InspectConfig | None = None) -> int:
 @cli.command(group=CONVERTING)
 def serve(config: ServeConfig | None = None) -> int:
     """Serve a policy to other computers, for --policy ws://HOST:PORT."""
-    require_packages("serve")
+    require_websocket("serve")
     from mavbridge.commands.serve import serve as run_server
 
     return run_server(ServeConfig() if config is None else config)
@@ -277,17 +278,20 @@ def train_world_model(
 
 @cli.command(group=LEARNING)
 def export(*flights: Path, config: ExportConfig) -> int:
-    """Convert flights to a LeRobot dataset (v3.0), without those that failed.
+    """Convert flights to a LeRobot dataset (v3.0), without those that failed, or to MCAP.
 
     Args:
         flights: flight folders, or folders of them.
         config: the settings.
     """
     require_extra("export")
-    from mavbridge.commands.export.run import export as run_export
-
     if not flights:
         raise UserError("name the flights to export: mavbridge export DIR... --out DIR")
+    if config.format == "mcap":
+        require_packages("export --format mcap", {"mcap": "mcap"})
+        from mavbridge.commands.export.mcap_file import export as run_export
+    else:
+        from mavbridge.commands.export.run import export as run_export
     return run_export(flights, config)
 
 

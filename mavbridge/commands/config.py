@@ -109,11 +109,14 @@ class ExportConfig:
     """Settings of ``mavbridge export``."""
 
     out: Path
-    """Folder for the dataset, new or empty."""
+    """Folder to write, new or empty."""
+    format: Literal["lerobot", "mcap"] = "lerobot"
+    """lerobot, a dataset, or mcap, a file for each flight, for Foxglove and PlotJuggler. mcap takes
+    failed flights, too, and ignores the other flags."""
     task: str = "fly"
-    """Task of the flights, in words, for policies that are given one."""
+    """Task in words, for policies that take one."""
     include_failed: Annotated[bool, Parameter(negative="")] = False
-    """Export flights, too, that crashed, ended by a fault, were marked as bad, or missed gates."""
+    """Also flights that crashed, ended by a fault, were marked as bad, or missed gates."""
     image_size: int | None = None
     """Height and width of the images, as the policy is to see them; by default as recorded."""
     state: Literal["world", "body"] = "world"

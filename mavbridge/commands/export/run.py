@@ -154,7 +154,7 @@ def export(flights: Sequence[Path], config: ExportConfig) -> int:
     with (
         stop_on_signals() as stop,
         progress_bar(console) as progress,
-        _whole_or_nothing(config.out) as folder,
+        whole_or_nothing(config.out) as folder,
     ):
 
         def advance(task: TaskID) -> None:
@@ -255,7 +255,7 @@ def _decoded(episode: FlightData, on_frame: Callable[[], None]) -> Iterator[Imag
 
 
 @contextmanager
-def _whole_or_nothing(out: Path) -> Iterator[Path]:
+def whole_or_nothing(out: Path) -> Iterator[Path]:
     """Context manager: a folder beside ``out`` that is renamed to ``out`` when complete.
 
     Raises:
