@@ -201,8 +201,7 @@ class FilmConfig:
     """The camera, whose images are recorded in the size in which they come."""
 
     camera: str = "0"
-    """Device index or /dev/videoN, rtsp:// udp:// http:// URL, video file, shm:NAME,
-    screen:WINDOW TITLE, pipe:COMMAND, or jpeg-udp:[HOST:]PORT."""
+    """0, /dev/videoN, URL, FILE, shm:NAME, screen:TITLE, pipe:COMMAND or jpeg-udp:PORT."""
     camera_size: int = 224
     """Pixels a side that the image must cover; a device is asked for such a mode."""
     camera_timeout: Annotated[float, hidden("link.camera-timeout")] = 10.0
@@ -242,7 +241,7 @@ class RecordConfig:
     rerun: Annotated[str, Parameter(group=OUTPUT)] = "off"
     """Rerun viewer: spawn, connect[=URL], FILE.rrd, or off."""
     disk_reserve: Annotated[float, Parameter(group=OUTPUT)] = 1.0
-    """Gigabytes of the disk that stay free: an episode ends when only these are left, and none
+    """Gigabytes of the disk that stay free. An episode ends when only these are left, and none
     begins with less than a minute of recording before that."""
 
     def __post_init__(self) -> None:

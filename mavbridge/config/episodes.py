@@ -94,7 +94,7 @@ class EvaluateConfig:
     gains: float = 1.0
     """Factor on the lean, yaw rate and climb of ArduPilot at full stick."""
     gusts: float | None = None
-    """Gusts of this many m/s (standard deviation) along each horizontal axis, in place of those of
+    """Gusts of this many m/s (standard deviation). Along each horizontal axis, in place of those of
     --conditions."""
     raw_sticks: bool = False
     """Send the policy's sticks as they are, without the inverse of the vehicle's curves."""
@@ -116,8 +116,8 @@ class EvaluateConfig:
     json: Path | None = None
     """Write all results here as JSON."""
     resume: bool = False
-    """Go on with the flights that --json holds, if they were flown by the same flags, weights and
-    versions; the file is written anew after each flight."""
+    """Go on with the flights that --json holds. They must have been flown by the same flags,
+    weights and versions; the file is written anew after each flight."""
 
     def __post_init__(self) -> None:
         """Raise UserError for values out of range, and for contradictions."""
@@ -165,8 +165,9 @@ class DemonstrateConfig:
     """With --checkpoint the policy flies most of the time, and the expert's actions are recorded as
     labels (DAgger)."""
     solve_time: float = 0.0
-    """With --checkpoint: longest time in milliseconds that the policy takes for a chunk, as a slow
-    head or a server does. Each flight draws its own, from a quarter of it on."""
+    """With --checkpoint: longest time for a chunk, in milliseconds. The policy then flies as one
+    with a slow head or behind a server does; each flight draws its own time, from a quarter of this
+    on."""
     workers: WorkersConfig = field(default_factory=WorkersConfig)
 
     def __post_init__(self) -> None:
