@@ -1,4 +1,4 @@
-"""A policy in numpy: climbs to 3 m above home and turns on the spot.
+"""A policy in numpy: climbs to 2.8 m above home and turns on the spot.
 
 make fly POLICY=./examples/numpy_policy.py:ClimbAndTurn DURATION=20
 """

@@ -1,4 +1,4 @@
-"""A policy on a server: climbs to 3 m above home and turns. Needs no mavbridge where it runs.
+"""A policy on a server: climbs to 2.8 m above home and turns. Needs no mavbridge where it runs.
 
 pip install websockets msgpack numpy && python examples/server_policy.py
 make fly POLICY=ws://127.0.0.1:8000 DURATION=20

@@ -1,4 +1,4 @@
-"""A policy in torch, at two rates: holds 3 m above home and turns to the brighter side.
+"""A policy in torch, at two rates: holds 2.8 m above home and turns to the brighter side.
 
 make fly POLICY=./examples/torch_policy.py:TowardsLight DURATION=20
 """
