@@ -103,10 +103,16 @@ def why_unreadable(path: Path, error: Exception, kind: str = "") -> str:
 
 @contextmanager
 def whole_file(path: Path) -> Iterator[Path]:
-    """Yield the path of a draft; on success it replaces ``path``, else it is deleted."""
+    """Yield the path of an empty draft; on success it replaces ``path``, else it is deleted.
+
+    The file has the permissions of the umask: safetensors makes files that only the owner can read.
+    """
     draft = path.with_name(f"{path.name}.{os.getpid()}.partial")
     try:
+        draft.touch()
+        mode = stat.S_IMODE(draft.stat().st_mode)
         yield draft
+        draft.chmod(mode)
         draft.replace(path)
     finally:
         draft.unlink(missing_ok=True)
