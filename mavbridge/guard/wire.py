@@ -9,6 +9,7 @@ import pickle
 import struct
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
+from enum import Enum
 from itertools import chain
 from typing import Any, Literal, NamedTuple, TypeAlias, get_args
 
@@ -209,10 +210,15 @@ def decode_from_guard(data: bytes) -> FromGuard:
 
 
 class _Pickler(pickle.Pickler):
-    """Pickler that writes scalars of numpy, such as those of a user's contract, as plain ones."""
+    """Pickler that writes scalars of numpy, such as those of a user's contract, as plain ones.
+
+    It writes members of an Enum by value: Python 3.11.2 (Debian 12) would write ``getattr``.
+    """
 
     def reducer_override(self, value: Any) -> Any:
-        """Return how to rebuild a scalar of numpy; leave everything else to pickle."""
+        """Return how to rebuild a member of an Enum or a scalar of numpy; else NotImplemented."""
+        if isinstance(value, Enum):
+            return type(value), (value.value,)
         if type(value).__module__ != "numpy" or getattr(value, "ndim", None) != 0:
             return NotImplemented
         plain = value.item()

@@ -150,7 +150,8 @@ class UdpTransport(_FileTransport[socket.socket]):
         """See `Transport`."""
         udp = new_socket(self._address, socket.SOCK_DGRAM)
         if sys.platform == "linux":
-            udp.setsockopt(socket.SOL_SOCKET, _SO_TIMESTAMPNS, 1)
+            with contextlib.suppress(OSError):  # emulators of Linux lack it: stamped when read
+                udp.setsockopt(socket.SOL_SOCKET, _SO_TIMESTAMPNS, 1)
         try:
             if self._listen:
                 udp.bind(self._address)

@@ -4,6 +4,7 @@ import math
 import os
 import struct
 from dataclasses import replace
+from enum import Enum
 from functools import partial
 from subprocess import Popen
 from typing import Any
@@ -241,6 +242,17 @@ def test_a_number_of_numpy_crosses_as_a_plain_one(number: Any) -> None:
     received = decode_to_guard(encode_to_guard(message))
     assert received == message
     assert type(dict(received.reason.data)["age_ms"]) in (float, int, bool)
+
+
+def test_reasons_cross_in_python_3_11_2(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The one of Debian 12: its enumerations ask pickle for ``getattr``."""
+
+    def by_name(code: Enum, protocol: int) -> tuple[object, ...]:
+        return getattr, (type(code), code.name)
+
+    monkeypatch.setattr(Enum, "__reduce_ex__", by_name)
+    message = NoChunk(because(Code.OF_CAMERA, camera="front", why=because(Code.NO_IMAGE)))
+    assert decode_to_guard(encode_to_guard(message)) == message
 
 
 @pytest.mark.parametrize("foreign", [np.zeros(2), os.system, partial(print), Popen])

@@ -20,6 +20,7 @@ from helpers.network import needs_ipv6
 from mavbridge.core.clock import Clock, MonotonicClock
 from mavbridge.core.errors import PeerError, UserError
 from mavbridge.core.processes import free_port
+from mavbridge.mavlink.transport import sockets
 from mavbridge.mavlink.transport.holders import device_holder, udp_holder
 from mavbridge.mavlink.transport.sockets import (
     TCP_SILENCE_NS,
@@ -83,6 +84,21 @@ def test_udp_listens_answers_whom_it_is_told_and_stamps_arrival() -> None:
         assert ours.send(b"hello", first.sender)
         assert vehicle.recv(100) == b"hello"
     ours.close()
+    ours.close()
+
+
+def test_udp_without_stamps_of_the_kernel_is_stamped_when_read(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """As under an emulator of Linux, which refuses the option."""
+    monkeypatch.setattr(sockets, "_SO_TIMESTAMPNS", 9999)
+    port, clock = free_port(), FakeClock()
+    ours = make_transport(f"udp:127.0.0.1:{port}", clock)
+    ours.open()
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as vehicle:
+        vehicle.sendto(b"one", ("127.0.0.1", port))
+        (heard,) = ours.drain()
+    assert (heard.data, heard.arrived_ns) == (b"one", clock.now_ns())
     ours.close()
 
 
