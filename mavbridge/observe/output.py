@@ -32,9 +32,9 @@ class PatientOutput(io.TextIOBase):
     def __init__(self, stream: TextIO) -> None:
         """Write to the file behind ``stream``; raise OSError if there is none."""
         super().__init__()
-        self._fd = stream.fileno()
-        self._waiting = b""
+        self._waiting = b""  # before anything fails: Python 3.13 reports errors of closing, too
         self._is_given_up = False
+        self._fd = stream.fileno()
         self.encoding = stream.encoding or "utf-8"
 
     def fileno(self) -> int:

@@ -89,7 +89,7 @@ def same_state(one: VehicleState | None, other: VehicleState | None) -> bool:
     if one is None or other is None:
         return one is other
     values = np.array_equal(one.values, other.values)
-    return values and replace(one, values=other.values) == other
+    return values and replace(one, values=None) == replace(other, values=None)
 
 
 @settings(max_examples=30)
@@ -102,8 +102,10 @@ def test_ticks_come_back_as_they_were(rows: list[TickRow]) -> None:
     for before, after in zip(rows, back, strict=True):
         serial += 1 + before.dropped_before
         assert same_state(before.tick.state, after.tick.state)
-        expected = replace(before.tick, serial=serial, state=after.tick.state)
-        assert after == TickRow(expected, before.dropped_before, before.expert)
+        expected = replace(before.tick, serial=serial, state=None)
+        assert replace(after.tick, state=None) == expected
+        assert after.dropped_before == before.dropped_before
+        assert after.expert == before.expert
 
 
 @given(st.lists(frame_rows, max_size=8))
