@@ -2,6 +2,7 @@
 
 import ctypes
 import os
+import re
 import shutil
 import signal
 import subprocess
@@ -62,6 +63,22 @@ def test_the_simulator_says_what_it_lacks() -> None:
     assert ended.stderr == "sitl: error: the simulated vehicle needs mujoco: pip install mujoco\n"
 
 
+@pytest.mark.skipif(shutil.which("systemd-analyze") is None, reason="no systemd is installed here")
+def test_systemd_understands_the_unit(tmp_path: Path) -> None:
+    unit = tmp_path / "mavbridge.service"
+    text, count = re.subn("ExecStart=.*", "ExecStart=/bin/true", (DEPLOY / unit.name).read_text())
+    assert count == 1
+    unit.write_text(text)
+    verified = subprocess.run(
+        ["systemd-analyze", "verify", "--man=no", str(unit)],
+        capture_output=True,
+        text=True,
+        check=False,
+        timeout=60,
+    )
+    assert (verified.returncode, verified.stderr) == (0, "")
+
+
 @pytest.mark.skipif(shutil.which("bash") is None, reason="no bash is installed here")
 def test_bash_completes_commands_and_flags(tmp_path: Path) -> None:
     home = {"HOME": str(tmp_path), "SHELL": "/bin/bash", "PYTHONPATH": str(ROOT)}
@@ -81,9 +98,9 @@ def test_bash_completes_commands_and_flags(tmp_path: Path) -> None:
     assert reply.stdout.split() == ["--html"]
 
 
-def test_the_wheel_holds_all_three_packages_and_nothing_else(tmp_path: Path) -> None:
-    tree = tmp_path / "tree"
-    tree.mkdir()
+def build_wheel(folder: Path) -> Path:
+    """Copy what a wheel is built of, and build it in ``folder``."""
+    tree = folder / "tree"
     for name in ("mavbridge", "policy", "sitl"):
         shutil.copytree(ROOT / name, tree / name, ignore=shutil.ignore_patterns("__pycache__"))
     for name in ("pyproject.toml", "LICENSE", "docs/dev/package.md"):
@@ -91,10 +108,21 @@ def test_the_wheel_holds_all_three_packages_and_nothing_else(tmp_path: Path) -> 
         shutil.copy(ROOT / name, tree / name)
     command = "from setuptools.build_meta import build_wheel; print(build_wheel('..'))"
     made = subprocess.run(
-        [sys.executable, "-c", command], cwd=tree, capture_output=True, text=True, check=False
+        [sys.executable, "-c", command],
+        cwd=tree,
+        env=os.environ | {"SOURCE_DATE_EPOCH": "1800000000"},
+        capture_output=True,
+        text=True,
+        check=False,
     )
     assert made.returncode == 0, made.stderr
-    names = zipfile.ZipFile(tmp_path / made.stdout.split()[-1]).namelist()
+    return folder / made.stdout.split()[-1]
+
+
+def test_the_wheel_holds_all_three_packages_and_nothing_else(tmp_path: Path) -> None:
+    wheel, tree = build_wheel(tmp_path), tmp_path / "tree"
+    assert wheel.name.endswith("-py3-none-any.whl")
+    names = zipfile.ZipFile(wheel).namelist()
     info = {name for name in names if ".dist-info/" in name}
     assert {name.split("/")[0] for name in set(names) - info} == {"mavbridge", "policy", "sitl"}
     sources = {str(path.relative_to(tree)) for path in tree.rglob("*.py")}
@@ -102,6 +130,11 @@ def test_the_wheel_holds_all_three_packages_and_nothing_else(tmp_path: Path) -> 
     page = {f"mavbridge/commands/inspect/page.{end}" for end in ("html", "css", "js")}
     assert {"policy/weights/toge.safetensors", *page} <= set(names)
     assert any(name.endswith("licenses/LICENSE") for name in info)
+
+
+def test_a_wheel_can_be_built_again_bit_by_bit(tmp_path: Path) -> None:
+    first, again = build_wheel(tmp_path / "one"), build_wheel(tmp_path / "another" / "folder")
+    assert first.read_bytes() == again.read_bytes()
 
 
 def become_subreaper() -> None:
