@@ -6,9 +6,11 @@ belongs to the producer until ``Submit`` names it, and again from ``Written`` on
 
 import mmap
 import os
+import socket
 import tempfile
+from multiprocessing.connection import Connection
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -57,6 +59,24 @@ def allocate(shape: RingShape) -> int:
         else:
             file.truncate(size_bytes)
         return os.dup(file.fileno())
+
+
+def send_descriptor(pipe: "Connection[Any, Any]", descriptor: int) -> None:
+    """Send a file descriptor over a duplex pipe; raise OSError if the receiver is gone.
+
+    Never waits: since Python 3.14 ``multiprocessing.reduction.send_handle`` waits for an answer.
+    """
+    with socket.fromfd(pipe.fileno(), socket.AF_UNIX, socket.SOCK_STREAM) as carrier:
+        socket.send_fds(carrier, [b"F"], [descriptor])
+
+
+def receive_descriptor(pipe: "Connection[Any, Any]") -> int:
+    """Return the file descriptor of ``send_descriptor``; raise EOFError if the sender is gone."""
+    with socket.fromfd(pipe.fileno(), socket.AF_UNIX, socket.SOCK_STREAM) as carrier:
+        _, descriptors, _, _ = socket.recv_fds(carrier, 1, 1)
+    if not descriptors:
+        raise EOFError
+    return descriptors[0]
 
 
 class FrameRing:

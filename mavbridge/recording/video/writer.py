@@ -8,7 +8,6 @@ from contextlib import ExitStack
 from dataclasses import replace
 from multiprocessing.connection import Connection, wait
 from multiprocessing.process import BaseProcess
-from multiprocessing.reduction import send_handle
 from pathlib import Path
 from typing import Literal
 
@@ -16,7 +15,7 @@ from mavbridge.core.errors import MavbridgeError
 from mavbridge.core.records import CameraImage
 from mavbridge.recording.rows import FrameRow
 from mavbridge.recording.tlog import TlogJob
-from mavbridge.recording.video.ring import FrameRing, allocate, ring_shape
+from mavbridge.recording.video.ring import FrameRing, allocate, ring_shape, send_descriptor
 from mavbridge.recording.video.writer_process import (
     NICENESS,
     Failed,
@@ -151,7 +150,7 @@ class VideoWriter:
             raise self._failure from error
         try:
             self._send(shape)
-            send_handle(self._pipe, descriptor, None)
+            send_descriptor(self._pipe, descriptor)
         except OSError:
             raise self._died() from None
         finally:

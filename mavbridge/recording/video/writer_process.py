@@ -11,7 +11,6 @@ import signal
 from contextlib import suppress
 from enum import Enum, auto
 from multiprocessing.connection import Connection
-from multiprocessing.reduction import recv_handle
 from pathlib import Path
 from typing import NamedTuple, TypeAlias
 
@@ -20,7 +19,7 @@ from mavbridge.recording.rows import DEMONSTRATION_FRAMES, FRAMES, FrameRow, fra
 from mavbridge.recording.tables import FLUSH_NS, READ_ERRORS, TableWriter
 from mavbridge.recording.tlog import TlogJob, TlogThread
 from mavbridge.recording.video.file import WRITE_ERRORS, FragmentedMp4
-from mavbridge.recording.video.ring import FrameRing, RingShape
+from mavbridge.recording.video.ring import FrameRing, RingShape, receive_descriptor
 
 FILE_ERRORS = (*WRITE_ERRORS, *READ_ERRORS)
 
@@ -203,7 +202,7 @@ class WriterService:
         try:
             message = self._pipe.recv()
             if isinstance(message, RingShape):
-                self._ring = FrameRing(message, recv_handle(self._pipe))
+                self._ring = FrameRing(message, receive_descriptor(self._pipe))
         except (EOFError, ConnectionResetError):
             return Notice.FINISH
         return message
