@@ -27,7 +27,7 @@ FLIGHTS := --numprocesses auto --maxprocesses 2 --dist worksteal
 MODULES ?=
 ONLY ?=
 
-.PHONY: fly check test lint docs bench faults fuzz mutants soak clean
+.PHONY: fly check test lint docs bench faults fuzz mutants soak dist clean
 
 # What flies, records and trains; `installed` adds what tests, plots and computes on many machines.
 $(VENV)/flies: pyproject.toml constraints.txt
@@ -44,6 +44,12 @@ $(VENV)/installed: $(VENV)/flies
 	$(PYTHON) -m venv .venv-peers
 	.venv-peers/bin/pip install --quiet --disable-pip-version-check --constraint constraints.txt \
 		MAVProxy mavsdk
+	touch $@
+
+.venv-release/installed: constraints.txt
+	$(PYTHON) -m venv .venv-release
+	.venv-release/bin/pip install --quiet --disable-pip-version-check --constraint constraints.txt \
+		build check-wheel-contents pip-licenses twine
 	touch $@
 
 $(VENV)/documents: $(VENV)/installed
@@ -98,5 +104,19 @@ fuzz: $(VENV)/installed  ## hostile datagrams on all cores: FUZZ_DATAGRAMS=N, FU
 	PYTHONPATH=.:tests $(BIN)/python -m fuzz --datagrams $(FUZZ_DATAGRAMS) $(if $(FUZZ_SEED),--seed $(FUZZ_SEED))
 	GUARD_EXAMPLES=1000 $(BIN)/pytest -q tests/properties/test_guard.py
 
+EPOCH = $(shell git log -1 --format=%ct)
+dist: .venv-release/installed  ## wheel and sdist of HEAD in dist/, checked; one commit gives the same bits anywhere
+	rm -rf dist && mkdir -p dist/tree
+	git -c tar.umask=0022 archive HEAD | tar -xp -C dist/tree
+	umask 022; cd dist/tree; SOURCE_DATE_EPOCH=$(EPOCH) PIP_CONSTRAINT=$(CURDIR)/constraints.txt \
+		$(CURDIR)/.venv-release/bin/python -m build --outdir .. > ../build.log 2>&1 || { cat ../build.log; exit 1; }
+	# setuptools dates and owns the files of an sdist by the moment and the person of its build
+	cd dist && tar -xzf mavbridge-*.tar.gz && rm -r mavbridge-*.tar.gz tree build.log && for tree in mavbridge-*/; do \
+		tar --sort=name --mtime=@$(EPOCH) --owner=0 --group=0 --numeric-owner --mode=u=rwX,go=rX \
+			-cf - $$tree | gzip -n > $${tree%/}.tar.gz; rm -r $$tree; done
+	.venv-release/bin/twine check --strict dist/*
+	.venv-release/bin/check-wheel-contents dist/*.whl
+	cd dist && sha256sum *
+
 clean:  ## forget the environments and outputs
-	rm -rf $(VENV) .venv-peers out
+	rm -rf $(VENV) .venv-peers .venv-release dist out
