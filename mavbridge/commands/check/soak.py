@@ -51,7 +51,7 @@ LEAST_SHARE = 0.95
 """Minimum share of the requested duration; a flight that ended earlier is no measurement."""
 HELD_SHARE = 0.98
 """Share of a requested rate that counts as held."""
-USAGE_NS = NS_PER_S
+USAGE_NS = NS_PER_S // 4
 """Time between two readings of processor times and temperature."""
 
 
