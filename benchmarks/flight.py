@@ -164,7 +164,7 @@ def measure(job: FlightJob, clock: Clock, runner: PolicyRunner) -> None:
     config = FlyConfig(policy=job.policy, rates=job.rates, duration=job.duration_s)
     config = climb_config(config, climb.contract, port=job.port, source=job.camera)
     meter = fly_and_measure(config, climb, clock)
-    job.out.write_bytes(pickle.dumps(_flight(job, meter.figures(climb))))
+    job.out.write_bytes(pickle.dumps(_flight(job, meter.figures())))
 
 
 def _flight(job: FlightJob, figures: Soak) -> Flight:

@@ -15,10 +15,9 @@ class SingleRatePolicy(Protocol):
     """Minimal policy: image, state and history in, a chunk out.
 
     Shapes, float32: image [B, *contract.image_shape] normalised by the contract, state [B,
-    *contract.state_shape] in SI units, action_history [B,
-    *contract.history_shape]; returns [B, horizon, 4] actions of
-    ``contract.action``. Arrays are numpy or torch, by ``contract.arrays``. Any class with these
-    members fits; no base class is needed.
+    *contract.state_shape] in SI units, action_history [B, *contract.history_shape]; returns [B,
+    horizon, 4] actions of ``contract.action``. Arrays are numpy or torch, by ``contract.arrays``.
+    Any class with these members fits; no base class is needed.
 
     Two more methods, without arguments, are optional. ``reset()`` is called once after loading and
     at the start of each flight; ``close()`` once at the end, also after an error.
@@ -136,8 +135,7 @@ class PolicyRunner:
     act: Callable[[FloatArray, FloatArray, FloatArray], FloatArray]
     """(joined images [1, *contract.feature_shape], or without a fast path [1,
     *contract.image_shape]; state [1, *contract.state_shape]; history
-    [1, *contract.history_shape]) -> chunk
-    [1, horizon, 4]."""
+    [1, *contract.history_shape]) -> chunk [1, horizon, 4]."""
     close: Callable[[], None] = keep_nothing
     """Release the policy's resources; called once, after the last call of the other functions."""
     reset: Callable[[], None] = keep_nothing

@@ -76,6 +76,10 @@ class ServeConfig:
             raise UserError("each request is answered from its own image: leave out --dual-rate")
 
 
+NO_POLICY = "none"
+"""Value of ``--policy`` of a check without a policy."""
+
+
 @Parameter(name="*")
 @dataclass(frozen=True, kw_only=True)
 class CheckConfig:
@@ -99,7 +103,7 @@ class CheckConfig:
         """Refuse durations that show nothing."""
         check_range("timing", self.timing, 0.5, 36_000, "s")
         check_range("soak", self.soak, 1, 36_000, "s")
-        if self.soak is not None and self.flight.policy.policy == "none":
+        if self.soak is not None and self.flight.policy.policy == NO_POLICY:
             raise UserError("--soak needs a policy")
 
 

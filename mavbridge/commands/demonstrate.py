@@ -15,7 +15,6 @@ import mavbridge
 from mavbridge.commands.episode_workers import fly_jobs
 from mavbridge.commands.output import progress_bar
 from mavbridge.config.episodes import DemonstrateConfig
-from mavbridge.config.flight import Limits
 from mavbridge.config.rates import SIM_CAMERA_PX, Rates
 from mavbridge.core.clock import NS_PER_MS, NS_PER_S, MonotonicClock
 from mavbridge.core.errors import UserError
@@ -23,7 +22,6 @@ from mavbridge.core.records import Event, Tick
 from mavbridge.core.stopping import INTERRUPTED, stop_on_signals
 from mavbridge.core.vehicle import Action, BodyRates, Sticks
 from mavbridge.flight.policies import load_for_episodes
-from mavbridge.flight.settings import contract_with_ages
 from mavbridge.recording.flight_writer import FlightWriter
 from mavbridge.recording.folder import META, prepare_folder
 from mavbridge.recording.meta import FlightError, FlightMeta, read_meta
@@ -251,7 +249,7 @@ def _fly(spec: DemonstrationSpec, should_stop: Callable[[], bool], stack: ExitSt
     """Fly and record one course; ``stack`` closes the student."""
     longest_solve_ns = round(spec.config.solve_time * NS_PER_MS)
     variation = draw_variation(spec.seed, longest_solve_ns=longest_solve_ns)
-    wanted, limits = spec.config.policy, Limits()
+    wanted = spec.config.policy
     student: PolicyRunner | None = None
     size_px = wanted.image_size or SIM_CAMERA_PX
     contract = Contract(
@@ -266,8 +264,7 @@ def _fly(spec: DemonstrationSpec, should_stop: Callable[[], bool], stack: ExitSt
         loaded = load_for_episodes(replace(wanted, dual_rate=True), MonotonicClock())
         student = stack.enter_context(loaded).runner
         max_age_s = student.contract.max_feature_age_s + longest_solve_ns / NS_PER_S
-        limits = Limits(max_feature_age=max_age_s)
-        contract = contract_with_ages(student.contract, limits)
+        contract = replace(student.contract, max_feature_age_s=max_age_s)
         student = replace(student, contract=contract)
         if contract.action != spec.config.action:
             raise UserError(
@@ -278,9 +275,7 @@ def _fly(spec: DemonstrationSpec, should_stop: Callable[[], bool], stack: ExitSt
         seed=spec.seed,
         # The expert uses no image: frames are drawn in the size of the recording.
         settings=SimulationSettings(
-            limits=limits,
-            delays=variation.delays,
-            least_camera_px=SIM_CAMERA_PX if student else 1,
+            delays=variation.delays, least_camera_px=SIM_CAMERA_PX if student else 1
         ),
         vehicle=make_vehicle(autopilot=spec.config.autopilot, conditions=variation.conditions),
     )

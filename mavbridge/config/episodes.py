@@ -94,7 +94,7 @@ class EvaluateConfig:
     gains: float = 1.0
     """Factor on the lean, yaw rate and climb of ArduPilot at full stick."""
     gusts: float | None = None
-    """Gusts of this many m/s (standard deviation). Along each horizontal axis, in place of those of
+    """Standard deviation of horizontal gusts, in m/s. Each axis has its own; they replace those of
     --conditions."""
     raw_sticks: bool = False
     """Send the policy's sticks as they are, without the inverse of the vehicle's curves."""

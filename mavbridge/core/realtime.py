@@ -83,13 +83,14 @@ def settle_thread(*, realtime: bool, cpu: int | None) -> str | None:
     if (refusal := _pin("a loop", cpu)) is not None:
         return refusal
     # On a single CPU a slow policy would leave nothing to the thread that watches over it.
-    if not realtime or _cpu_count() == 1:
+    if not realtime or usable_cores() == 1:
         return None
     # Threads that the policy starts are ordinary again, or several could hold every CPU.
     return _use_fifo(ACTION_FIFO_PRIORITY, "the policy", resets_on_fork=True)
 
 
-def _cpu_count() -> int:
+def usable_cores() -> int:
+    """Return the number of CPU cores that this process may use."""
     if hasattr(os, "sched_getaffinity"):
         return len(os.sched_getaffinity(0))
     return os.cpu_count() or 1

@@ -45,9 +45,8 @@ FINISH_NS = 4 * NS_PER_S
 _Sent = TypeVar("_Sent")
 WORDS_NS, THRUST_WORDS_NS = NS_PER_S, 100 * NS_PER_MS
 """Renewal periods of the last words, the packets that the flight process sends if the guard dies:
-their signatures must be less than a minute old, and the
-choice of the safe mode may change. In thrust modes they repeat the last throttle, which should be
-recent."""
+their signatures must be less than a minute old, and the choice of the safe mode may change. In
+thrust modes they repeat the last throttle, which should be recent."""
 _HELD = (Phase.FLYING, Phase.LEAVING, Phase.HOLDING)
 _ENGAGED = (*_HELD, Phase.RELEASING)
 _TAKEN = (*_ENGAGED, Phase.PREPARING)

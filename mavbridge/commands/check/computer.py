@@ -16,6 +16,7 @@ from mavbridge.config.rates import Rates
 from mavbridge.core.clock import NS_PER_S, Clock
 from mavbridge.core.processes import child_environment
 from mavbridge.core.provenance import versions
+from mavbridge.core.realtime import usable_cores
 
 PROC, SYS = Path("/proc"), Path("/sys")
 _CLOCK_SOURCE = SYS / "devices/system/clocksource/clocksource0/current_clocksource"
@@ -44,10 +45,7 @@ _row = partial(CheckRow, "computer")
 
 def computer_rows(rates: Rates) -> Iterator[CheckRow]:
     """Yield rows about clock source, cores, real-time scheduling and locked memory."""
-    try:
-        source = _CLOCK_SOURCE.read_text().strip()
-    except OSError:  # no such file on macOS, or in some containers
-        source = ""
+    source = _text(_CLOCK_SOURCE)  # no such file on macOS, or in some containers
     slow = (
         f"the clock source {source} is slow to read or coarse: stamps are late by its time; see "
         "current_clocksource in the kernel's documentation"
@@ -58,8 +56,7 @@ def computer_rows(rates: Rates) -> Iterator[CheckRow]:
         "one that the processor reads by itself, such as tsc",
         slow if source in _SLOW_CLOCKS else "",
     )
-    has_affinity = hasattr(os, "sched_getaffinity")
-    cores = len(os.sched_getaffinity(0)) if has_affinity else os.cpu_count() or 1
+    cores = usable_cores()
     shared = "guard and policy share one core: a slow policy delays the sticks"
     yield _row("cores", str(cores), f"{_CORES} or more", "" if cores >= _CORES else shared)
     refused = _refused_rights(rates)
@@ -112,12 +109,11 @@ def this_computer() -> Computer:
     """Describe this computer."""
     lines = _text(PROC / "cpuinfo").splitlines()
     names = (line.partition(":")[2].strip() for line in lines if line.startswith("model name"))
-    has_affinity = hasattr(os, "sched_getaffinity")
     return Computer(
         model=_text(PROC / "device-tree/model").strip("\0"),
         cpu=next(names, platform.processor() or "unknown processor"),
         machine=platform.machine(),
-        cores=len(os.sched_getaffinity(0)) if has_affinity else os.cpu_count() or 1,
+        cores=usable_cores(),
         kernel=platform.release(),
         governor=_text(_GOVERNOR),
         versions=versions(),

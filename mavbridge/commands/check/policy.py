@@ -7,6 +7,7 @@ from dataclasses import dataclass, field, replace
 from functools import partial
 
 from mavbridge.commands.check.rows import CheckRow
+from mavbridge.commands.config import NO_POLICY
 from mavbridge.config.flight import FlyConfig, Limits
 from mavbridge.core.clock import NS_PER_S, Clock, period_ns
 from mavbridge.core.errors import MavbridgeError, UserError
@@ -21,10 +22,9 @@ from policy.errors import Agreed, NoChunkError, Warned
 from policy.loading.request import LoadedPolicy
 from policy.protocol import PolicyRunner
 
-NO_POLICY = "none"
 _BUSY = 0.8
 """Share of a slot above which other work on this computer makes chunks late."""
-_HELD = 0.98
+HELD = 0.98
 """Share of the requested rate that counts as held."""
 _LATE_PERIODS = 1.5
 """A chunk is late if it comes more than this many periods after the last, as in a report."""
@@ -135,7 +135,7 @@ class Pace:
         if took_ms is None:
             return _row(self.name, "not one in time", warn="far too slow for this computer")
         share, advice = took_ms.p50 * self.asked_hz / 1000, ""
-        if self.rate_hz < _HELD * self.asked_hz:
+        if self.rate_hz < HELD * self.asked_hz:
             advice = f"this computer makes {self.rate_hz:.1f} {self.name} a second here"
         elif share > _BUSY:
             advice = f"{self.name} leave little of their slots: other programs will make them late"

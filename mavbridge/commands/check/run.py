@@ -11,11 +11,11 @@ from rich.console import Console
 from mavbridge.camera.open import NO_CAMERA
 from mavbridge.commands.check.camera import CameraNeeds, camera_rows
 from mavbridge.commands.check.computer import computer_rows
-from mavbridge.commands.check.policy import NO_POLICY, check_policy
+from mavbridge.commands.check.policy import check_policy
 from mavbridge.commands.check.rows import CheckRow, as_document, overall, print_check
 from mavbridge.commands.check.soak import soak
 from mavbridge.commands.check.vehicle import check_vehicle
-from mavbridge.commands.config import CheckConfig
+from mavbridge.commands.config import NO_POLICY, CheckConfig
 from mavbridge.commands.output import print_status
 from mavbridge.config.flight import CameraConfig, FlyConfig
 from mavbridge.core.clock import NS_PER_S, Clock, MonotonicClock

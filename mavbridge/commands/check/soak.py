@@ -18,15 +18,10 @@ from mavbridge.commands.check.computer import (
     read_usage,
     this_computer,
 )
+from mavbridge.commands.check.policy import HELD
 from mavbridge.commands.check.rows import CheckRow
 from mavbridge.commands.output import number
-from mavbridge.config.flight import (
-    CameraConfig,
-    EnvelopeConfig,
-    FlyConfig,
-    Limits,
-    LinkConfig,
-)
+from mavbridge.config.flight import CameraConfig, EnvelopeConfig, FlyConfig, LinkConfig
 from mavbridge.core.clock import NS_PER_MS, NS_PER_S, Clock
 from mavbridge.core.errors import MavbridgeError, PeerError, UserError
 from mavbridge.core.processes import end, free_port, log_tail, running
@@ -49,8 +44,6 @@ MAX_AGE_S = 5.0
 """Age limit far above any engine's need, so that a slow engine is measured, not released."""
 LEAST_SHARE = 0.95
 """Minimum share of the requested duration; a flight that ended earlier is no measurement."""
-HELD_SHARE = 0.98
-"""Share of a requested rate that counts as held."""
 USAGE_NS = NS_PER_S // 4
 """Time between two readings of processor times and temperature."""
 
@@ -81,7 +74,7 @@ class Soak:
         slow = [
             name
             for name, part in (("chunks", action), ("images", vision))
-            if part.rate_hz is not None and part.rate_hz < HELD_SHARE * part.target_hz
+            if part.rate_hz is not None and part.rate_hz < HELD * part.target_hz
         ]
         warnings = [f"this computer does not hold the rate of {' and '.join(slow)}"] if slow else []
         if sticks.missed_slots:
@@ -106,10 +99,18 @@ class FlightMeter:
     """
 
     def __init__(
-        self, clock: Clock, guard_pid: int, *, stick_hz: float, action_hz: float, vision_hz: float
+        self,
+        clock: Clock,
+        guard_pid: int,
+        runner: PolicyRunner,
+        *,
+        stick_hz: float,
+        action_hz: float,
+        vision_hz: float,
     ) -> None:
         self._clock = clock
         self._guard_pid = guard_pid
+        self._runner = runner
         self._timing = FlightTiming(stick_hz=stick_hz, action_hz=action_hz, vision_hz=vision_hz)
         self._first: Usage | None = None
         self._last: Usage | None = None
@@ -136,20 +137,19 @@ class FlightMeter:
         if heat_c is not None:
             self._hottest_c = heat_c if self._hottest_c is None else max(self._hottest_c, heat_c)
 
-    def report(self, *, engine: str = "", policy: str = "") -> TimingReport:
+    def report(self) -> TimingReport:
         """Return the figures of the flight so far, without those of its link."""
-        drops = ObserverDrops(rerun=None, recorder=None)
         return self._timing.report(
-            mode="dual",
-            engine=engine,
-            policy=policy,
+            mode="dual" if self._runner.dual_rate else "single",
+            engine=self._runner.engine,
+            policy=self._runner.name,
             autopilot=None,
             link=None,
-            observer_drops=drops,
+            observer_drops=ObserverDrops(rerun=None, recorder=None),
         )
 
-    def figures(self, runner: PolicyRunner) -> Soak:
-        """Return all figures of a flight of ``runner``.
+    def figures(self) -> Soak:
+        """Return all figures of the flight.
 
         Raises:
             PeerError: the policy never had the sticks.
@@ -166,7 +166,7 @@ class FlightMeter:
         elapsed_ns = max(last.at_ns - first.at_ns, 1)
         return Soak(
             computer=this_computer(),
-            timing=self.report(engine=runner.engine, policy=runner.name),
+            timing=self.report(),
             cpu_cores={name: round(spent / elapsed_ns, 3) for name, spent in spent_ns.items()},
             guard_waited_ms=round((last.guard_waited_ns - first.guard_waited_ns) / NS_PER_MS, 1),
             host_took_ms=round((last.host_ns - first.host_ns) / NS_PER_MS, 1),
@@ -191,21 +191,24 @@ def soak(config: FlyConfig, clock: Clock, *, duration_s: float) -> Soak:
         command = ("-m", "sitl", "--connect", f"udpout:127.0.0.1:{port}", "--camera", shared)
         log = folder / "vehicle.log"
         vehicle = stack.enter_context(running(sys.executable, *command, log=log))
+        flight = FlyConfig(
+            policy=config.policy, rates=config.rates, goal=config.goal, duration=duration_s
+        )
         source = NO_CAMERA if set(config.camera.sources) == {NO_CAMERA} else shared
-        flight = climb_config(config, runner.contract, port=port, source=source)
+        flight = climb_config(flight, runner.contract, port=port, source=source)
         try:
-            meter = fly_and_measure(replace(flight, duration=duration_s), runner, clock)
+            meter = fly_and_measure(flight, runner, clock)
         except MavbridgeError as error:
             if vehicle.poll() is None:
                 raise
             raise UserError(f"python -m sitl failed: {log_tail(log)}") from error
         finally:
             end(vehicle)
-    return meter.figures(runner)
+    return meter.figures()
 
 
 def climb_config(config: FlyConfig, contract: Contract, *, port: int, source: str) -> FlyConfig:
-    """Return the flight of a ``level_climb`` at a bundled vehicle, with one source of images for
+    """Return ``config`` for a ``level_climb`` at a bundled vehicle, with one source of images for
     all cameras of the policy."""
     names = contract.cameras
     sources = (source,) if len(names) == 1 else tuple(f"{name}={source}" for name in names)
@@ -214,7 +217,6 @@ def climb_config(config: FlyConfig, contract: Contract, *, port: int, source: st
         link=LinkConfig(connect=f"udp:127.0.0.1:{port}"),
         # High above the course, the simulator's noiseless view hardly changes.
         camera=CameraConfig(camera=sources, max_frozen_image=0.0),
-        limits=Limits(),
         envelope=NO_CEILING,
         mode="ALT_HOLD",
         arm=True,
@@ -234,6 +236,7 @@ def fly_and_measure(config: FlyConfig, runner: PolicyRunner, clock: Clock) -> Fl
         meter = FlightMeter(
             clock,
             guard.process.pid,
+            runner,
             stick_hz=config.rates.stick_rate,
             action_hz=plan.loops.action_hz,
             vision_hz=plan.loops.max_vision_hz,

@@ -106,7 +106,7 @@ def write_flight(flight: RecordedFlight, path: Path) -> int:
         OSError: the file cannot be written.
     """
     contract = flight.meta.contract or Contract()
-    offset_ns, known = wall_offset_ns(flight.meta), schemas(contract.action)
+    offset_ns, known = unix_offset_ns(flight.meta), schemas(contract.action)
     others = [open_flight(flight.folder, camera) for camera in contract.cameras[1:]]
     videos = zip(contract.cameras, (flight, *others), strict=True)
     streams = [_ticks(flight, contract.state_frame), *(_images(*each) for each in videos)]
@@ -133,7 +133,7 @@ def write_flight(flight: RecordedFlight, path: Path) -> int:
     return count
 
 
-def wall_offset_ns(meta: FlightMeta) -> int:
+def unix_offset_ns(meta: FlightMeta) -> int:
     """Return Unix time minus the flight's clock; 0 if the start's wall time is unknown."""
     try:
         started_s = datetime.fromisoformat(meta.started_at).timestamp()

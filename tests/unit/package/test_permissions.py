@@ -13,7 +13,9 @@ import torch
 from helpers.factories import make_tick
 from helpers.flight_folders import write_spot_flight
 from helpers.recordings import make_frame, make_meta
+from helpers.rollouts import TINY
 from mavbridge.commands.config import ExportConfig
+from mavbridge.commands.export import mcap_file
 from mavbridge.commands.export.run import export
 from mavbridge.core.files import write_durably
 from mavbridge.observe.viewer.target import RerunRecording
@@ -26,12 +28,11 @@ from policy.data.flight_folders import read_flight
 from policy.data.frames import store_frames
 from policy.engines.openvino_compile import CompileCache
 from policy.nets.toge import Toge, TogeConfig
-from policy.nets.world_model.config import WorldModelConfig
 from policy.nets.world_model.model import WorldModel
 from policy.training.run_folder import RunFolder, TrainingPosition
 
+ROOT = Path(__file__).parents[3]
 UMASK = 0o027
-CONTRACT = Contract(image_height=32, image_width=32)
 
 
 def toge(size: int = 32) -> Toge:
@@ -40,17 +41,7 @@ def toge(size: int = 32) -> Toge:
 
 
 def write_world_model(out: Path) -> None:
-    config = WorldModelConfig(
-        image_size=32,
-        frame_dt_s=0.2,
-        horizontal_fov_rad=1.2,
-        camera_tilt_rad=-0.1,
-        autoencoder_widths=(8, 8, 16),
-        dynamics_width=32,
-        dynamics_depth=1,
-        contract=CONTRACT,
-    )
-    save_world_model(out / "world.safetensors", WorldModel(config))
+    save_world_model(out / "world.safetensors", WorldModel(TINY))
 
 
 def write_training_state(out: Path) -> None:
@@ -69,8 +60,8 @@ def write_dataset(out: Path) -> None:
 
 
 def write_mcap(out: Path) -> None:
-    flight = write_spot_flight(out / "flight", 0, seconds=0.5)
-    assert export([flight], ExportConfig(out=out / "mcap", format="mcap")) == 0
+    flight = ROOT / "examples" / "start"
+    assert mcap_file.export([flight], ExportConfig(out=out / "mcap", format="mcap")) == 0
 
 
 def write_recording(out: Path) -> None:
@@ -107,7 +98,7 @@ WRITERS: dict[str, tuple[Callable[[Path], object], set[str]]] = {
     "decoded frames": (write_decoded_frames, set()),
     "compiled graph": (lambda out: CompileCache(out).store("key", b"blob"), set()),
     "dataset": (write_dataset, {"info.json"}),
-    "mcap": (write_mcap, set()),
+    "mcap": (write_mcap, {"start.mcap"}),
     "recording": (
         write_recording,
         {"camera.mp4", "frames.parquet", "link.tlog", "meta.json", "ticks.parquet"},

@@ -48,7 +48,8 @@ def make_runner(calls: list[int], contract: Contract = RATES) -> PolicyRunner:
 
 
 def make_meter(clock: FakeClock) -> FlightMeter:
-    return FlightMeter(clock, os.getpid(), stick_hz=100, action_hz=100, vision_hz=30)
+    runner = make_runner([])
+    return FlightMeter(clock, os.getpid(), runner, stick_hz=100, action_hz=100, vision_hz=30)
 
 
 def test_a_level_climb_does_the_work_and_returns_other_sticks() -> None:
@@ -75,7 +76,7 @@ def test_a_flight_is_measured_from_its_first_action_on() -> None:
         meter.emit(make_released_tick(index))
         meter.emit(make_vision_tick(index))
     with pytest.raises(PeerError, match="never had the sticks"):
-        meter.figures(make_runner([]))
+        meter.figures()
     for index in range(100, 112):
         meter.emit(make_tick(index, missed_slots=50 if index == 100 else 0))
     report = meter.report()
@@ -101,11 +102,12 @@ def test_figures_are_those_between_two_readings_a_second_apart() -> None:
     sum(range(200_000))  # some processor time
     clock.advance_ns(USAGE_NS)
     meter.emit(make_tick(100, missed_slots=3))
-    soak = meter.figures(make_runner([]))
+    soak = meter.figures()
     assert 0 < soak.cpu_cores["flight"] < 1
     assert "flight/MainThread" in soak.cpu_cores
     document = json.loads(json.dumps(soak.document()))
     assert document["timing"]["policy"] == "mine"
+    assert document["timing"]["mode"] == "dual"
     assert document["computer"]["cores"] >= 1
     row = replace(soak, computer=COMPUTER, hottest_c=71.4).row()
     assert row.verdict == "warn"
