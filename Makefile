@@ -9,6 +9,8 @@ POLICY ?= toge
 COURSE ?= $(if $(filter toge-rates,$(POLICY)),1001000007,1000007)
 # Longest flight in seconds: it ends with the course.
 DURATION ?= 60
+# Rounds of a loop, as in COURSE=2001000007 LAPS=10 DURATION=300.
+LAPS ?= 1
 # Flags of mavbridge for this flight, as in FLAGS="--takeoff 5".
 FLAGS ?=
 # Firmware of the simulated vehicle: ardupilot or px4.
@@ -58,12 +60,12 @@ $(VENV)/documents: $(VENV)/installed
 
 fly: $(VENV)/flies  ## a simulated vehicle in its own process, and a policy flying its course over UDP
 	@mkdir -p out && rm -f out/report.json out/fc.json out/flight.rrd
-	@$(BIN)/python -m sitl course --course $(COURSE) --json > out/gates.json
+	@$(BIN)/python -m sitl course --course $(COURSE) --laps $(LAPS) --json > out/gates.json
 	@$(BIN)/python -m sitl --autopilot $(AUTOPILOT) --connect udpout:127.0.0.1:$(PORT) \
-		--camera shm:fpv-$(PORT) --course $(COURSE) --report out/fc.json & sitl=$$!; \
+		--camera shm:fpv-$(PORT) --course $(COURSE) --laps $(LAPS) --fly-on 10 --report out/fc.json & sitl=$$!; \
 	trap 'kill $$sitl 2>/dev/null' EXIT; \
 	$(BIN)/mavbridge --connect udp:127.0.0.1:$(PORT) --policy $(POLICY) \
-		--camera shm:fpv-$(PORT) --arm --duration $(DURATION) $(BRIEF) $(BY_RATES) $(FLAGS) \
+		--camera shm:fpv-$(PORT) --arm --duration $(DURATION) --then land $(BRIEF) $(BY_RATES) $(FLAGS) \
 		--rerun out/flight.rrd --gates out/gates.json --report out/report.json; status=$$?; \
 	kill $$sitl 2>/dev/null; wait $$sitl 2>/dev/null; trap - EXIT; \
 	[ ! -e out/report.json ] || echo "wrote out/report.json, out/fc.json and out/flight.rrd (open it with: $(BIN)/rerun out/flight.rrd)"; \

@@ -103,7 +103,7 @@ MAX_AGE_LIMIT_S = 60.0
 ENVELOPE_TERMS = ("max_tilt_deg", "max_speed_mps", "max_height_m", "max_distance_m")
 _CHUNK_AGES = ("max_state_age_s", "max_velocity_age_s", "max_feature_age_s", "max_chunk_age_s")
 LIMIT_TERMS = (*_CHUNK_AGES, "max_stall_s", *ENVELOPE_TERMS)
-FLIGHT_TERMS = ("action", "modes", "play_s", "state_time", *LIMIT_TERMS)
+FLIGHT_TERMS = ("action", "modes", "play_s", "state_time", "holds_position", *LIMIT_TERMS)
 """Fields that decide how a policy is flown and do not affect its network's output."""
 _TUPLES = (
     *("cameras", "camera_rates_hz", "image_crop", "state_extras"),
@@ -200,6 +200,9 @@ class Contract:
     play_s: float = 0.0
     """Longest time for which the policy was designed to play one chunk before the next; the four
     age limits count from the chunk's beginning. 0: a new chunk from every new state."""
+    holds_position: bool = False
+    """True: while the vehicle stands still, the velocity in the state includes half of its
+    displacement per second. A policy that brakes to a stop then stays where it stopped."""
     action: ActionKind = "sticks"
     velocity_frame: VelocityFrame = "world"
     hover_thrust: float = 0.39
@@ -260,7 +263,8 @@ class Contract:
         for name, kind in _CHOICES.items():
             choices = get_args(kind)
             yield name, getattr(self, name) in choices, " or ".join(map(repr, choices))
-        yield "since_exposure", isinstance(self.since_exposure, bool), "true or false"
+        for name in ("since_exposure", "holds_position"):
+            yield name, isinstance(getattr(self, name), bool), "true or false"
         for name, (low, high) in _INTEGERS.items():
             value = getattr(self, name)
             yield name, type(value) is int and low <= value <= high, f"an integer in {low}..{high}"

@@ -14,7 +14,7 @@ from sitl.camera.follow import film_vehicle
 from sitl.camera.fpv import CameraOptions, FpvRenderer
 from sitl.camera.shm import FramePublisher
 from sitl.clock import NS_PER_S, Clock, StopRequest, stop_on_signal, wall_ns
-from sitl.course import Course, course_to_json, make_course
+from sitl.course import LOOP_SEEDS, Course, course_to_json, make_course
 from sitl.link.transport import RcInput, Transport, open_transport
 from sitl.pilot.transmitter import (
     DEFAULT_AXES,
@@ -76,11 +76,13 @@ def fly(
 
 def fly_on(vehicle: SimulatedVehicle, duration_s: float) -> None:
     """Advance the vehicle as fast as the computer can, without receiving or sending."""
+    status = _Status(vehicle)
     start_ns = vehicle.ap.now_ns
     for now_ns in range(start_ns, start_ns + round(duration_s * NS_PER_S), STEP_NS):
         vehicle.step(now_ns)
         for link_id in range(len(vehicle.server.links)):
             vehicle.take_outgoing(link_id)
+        status.print_changes()
 
 
 def print_status(line: str) -> None:
@@ -96,7 +98,7 @@ class _Status:
         self._connected: set[int] = set()
         self._mode = vehicle.ap.mode_name
         self._armed = vehicle.ap.armed
-        self._texts = 0
+        self._texts = len(vehicle.log.texts)
 
     def on_received(self, link_id: int) -> None:
         if link_id not in self._connected:
@@ -208,7 +210,7 @@ def _parser() -> argparse.ArgumentParser:
     _add_camera_flags(camera)
     course = commands.add_parser("course", help="print a course", allow_abbrev=False)
     course.set_defaults(run=_print_course)
-    course.add_argument("--course", type=_SEED, default=0, metavar="SEED", help="default: 0")
+    _add_course_flags(course)
     course.add_argument("--json", action="store_true", help="print JSON instead of a table")
     return parser
 
@@ -216,10 +218,17 @@ def _parser() -> argparse.ArgumentParser:
 def _add_camera_flags(parser: argparse.ArgumentParser) -> None:
     add = parser.add_argument
     add("--camera", type=_shm_name, metavar="shm:NAME", help="publish frames under this name")
-    add("--course", type=_SEED, default=0, metavar="SEED", help="seed of the gates (default: 0)")
+    _add_course_flags(parser)
     size_help = "side of the square image (default: 224)"
     add("--image-size", type=_IMAGE_SIZE, default=224, metavar="PIXELS", help=size_help)
     add("--fps", type=_POSITIVE, default=30.0, metavar="HZ", help="frame rate (default: 30)")
+
+
+def _add_course_flags(parser: argparse.ArgumentParser) -> None:
+    add = parser.add_argument
+    add("--course", type=_SEED, default=0, metavar="SEED", help="seed of the gates (default: 0)")
+    laps_help = f"laps of a loop, a course from seed {LOOP_SEEDS} on (default: 1)"
+    add("--laps", type=_LAPS, default=1, metavar="N", help=laps_help)
 
 
 def _fly(args: argparse.Namespace) -> None:
@@ -231,7 +240,7 @@ def _fly(args: argparse.Namespace) -> None:
         raise UsageError("--pilot moves the receiver: leave out --rc-in and --receiver")
     if args.report is not None and not args.report.parent.is_dir():
         raise UsageError(f"--report {args.report}: there is no folder {args.report.parent}")
-    config, course = _config(args, len(links), len(onboard)), make_course(args.course)
+    config, course = _config(args, len(links), len(onboard)), make_course(args.course, args.laps)
     clock = Clock()
     with ExitStack() as stack:
         urls = links + onboard
@@ -302,7 +311,7 @@ def _camera(args: argparse.Namespace) -> CameraOptions:
 
 
 def _print_course(args: argparse.Namespace) -> None:
-    course = make_course(args.course)
+    course = make_course(args.course, args.laps)
     if args.json:
         sys.stdout.write(course_to_json(course) + "\n")
         return
@@ -331,6 +340,7 @@ def _number(
 
 _POSITIVE = _number(float, sys.float_info.min, sys.float_info.max, "a positive number")
 _SEED = _number(int, 0, math.inf, "a whole number, 0 or more")
+_LAPS = _number(int, 1, 10_000, "a number of laps, 1 to 10000")
 _PORT = _number(int, 1, 65535, "a port, 1 to 65535")
 _IMAGE_SIZE = _number(int, 16, 4096, "16 to 4096 pixels")
 

@@ -4,6 +4,7 @@ Frame: local NED in metres, origin at the start, the vehicle heads north. A gate
 square opening; ``yaw_rad`` is the heading in which it must be flown through (0 = north).
 """
 
+import cmath
 import json
 import math
 from dataclasses import asdict, dataclass
@@ -17,6 +18,12 @@ OPENING_M = 2.4  # side of the opening: five times the width of a 0.5 m quadroto
 BAR_M = 0.32  # width of the bars around an opening
 DEPTH_M = 0.24  # depth of the frame along the passage; the gate's centre is halfway in
 RACE_SEEDS = 1_000_000_000  # seeds from here on give race courses, smaller ones easy courses
+LOOP_SEEDS = 2_000_000_000  # seeds from here on give loops
+LOOP_GATES = 8
+LOOP_FIRST_LEG_M = 6.0
+LOOP_RADIUS_M = (13.5, 16.5)  # distance of a loop's gates from its middle; legs of 8 to 15 m
+LOOP_TURN_RAD = math.radians(5.0)  # largest shift of a gate along the loop, to either side
+LOOP_ALTITUDE_M = (2.2, 3.4)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -83,6 +90,19 @@ class Course:
 
     seed: int
     gates: tuple[Gate, ...]
+    laps: int = 1
+    is_loop: bool = False  # the first gate comes after the last
+
+    @property
+    def passages(self) -> int:
+        """Number of gates to pass, in all laps."""
+        return self.laps * len(self.gates)
+
+    def ahead(self, passed: int, count: int) -> tuple[Gate, ...]:
+        """Return up to ``count`` gates that come after ``passed`` passages; a loop never ends."""
+        if not self.is_loop:
+            return self.gates[passed : passed + count]
+        return tuple(self.gates[k % len(self.gates)] for k in range(passed, passed + count))
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -95,17 +115,22 @@ class AirborneStart:
     next_gate: int  # index of the first gate to pass
 
 
-def make_course(seed: int) -> Course:
+def make_course(seed: int, laps: int = 1) -> Course:
     """Generate the course of this seed; it is the same on every machine.
 
     Below ``RACE_SEEDS``, legs turn by up to 35 degrees and rise or fall by up to 1 m; from there
-    on, by up to 50 degrees and 3 m. A gate faces the mean of the legs before and after it.
+    on, by up to 50 degrees and 3 m. From ``LOOP_SEEDS`` on, eight gates stand around a circle and
+    are flown ``laps`` times. A gate faces the mean of the legs before and after it.
 
     Raises:
-        UsageError: the seed is negative.
+        UsageError: the seed is negative, or the course is no loop and has several laps.
     """
     if seed < 0:
         raise UsageError(f"a course seed is 0 or more, got {seed}")
+    if seed >= LOOP_SEEDS:
+        return _make_loop(seed, laps)
+    if laps != 1:
+        raise UsageError(f"only a loop, from seed {LOOP_SEEDS} on, has laps: got {laps} of {seed}")
     family = EASY if seed < RACE_SEEDS else RACE
     random = np.random.Generator(np.random.PCG64(seed))
     turns_rad = random.uniform(-family.turn_rad, family.turn_rad, family.gate_count)
@@ -134,14 +159,44 @@ def make_course(seed: int) -> Course:
     return Course(seed=seed, gates=tuple(gates))
 
 
+def _make_loop(seed: int, laps: int) -> Course:
+    """Return a loop, flown clockwise or the other way round, that passes over the start."""
+    random = np.random.Generator(np.random.PCG64(seed))
+    radius_m = random.uniform(*LOOP_RADIUS_M, LOOP_GATES)
+    shift_rad = random.uniform(-LOOP_TURN_RAD, LOOP_TURN_RAD, LOOP_GATES)
+    altitude_m = random.uniform(*LOOP_ALTITUDE_M, LOOP_GATES).tolist()
+    side = 1 if random.random() < 0.5 else -1
+    angle_rad = side * (np.arange(LOOP_GATES) * math.tau / LOOP_GATES + shift_rad)
+    points = [cmath.rect(r, a) for r, a in zip(radius_m.tolist(), angle_rad.tolist(), strict=True)]
+    after = [*points[1:], points[0]]
+    headings_rad = [cmath.phase(b - a) for a, b in zip(points, after, strict=True)]
+    through_rad = [
+        out_rad - wrap_pi(out_rad - in_rad) / 2
+        for in_rad, out_rad in zip([headings_rad[-1], *headings_rad], headings_rad, strict=False)
+    ]
+    gates = []
+    for k, point in enumerate(points):
+        # The first gate stands north of the start and is flown northwards.
+        at_m = (point - points[0]) * cmath.rect(1.0, -through_rad[0]) + LOOP_FIRST_LEG_M
+        gates.append(
+            Gate(
+                center_ned_m=(at_m.real, at_m.imag, -altitude_m[k]),
+                yaw_rad=wrap_pi(through_rad[k] - through_rad[0]),
+                size_m=OPENING_M,
+                index=k,
+            )
+        )
+    return Course(seed=seed, gates=tuple(gates), laps=laps, is_loop=True)
+
+
 def course_to_json(course: Course) -> str:
-    """Return the course as JSON: seed, frame and gates in order."""
+    """Return the course as JSON: seed, frame and gates in order, those of each lap."""
     return json.dumps(
         {
             "seed": course.seed,
             "frame": "local NED, metres; origin = start, which heads north; "
             "yaw_rad = heading of the passage; size_m = side of the square opening",
-            "gates": [asdict(gate) for gate in course.gates],
+            "gates": [asdict(gate) for gate in course.ahead(0, course.passages)],
         },
         indent=2,
     )
@@ -151,7 +206,7 @@ def course_to_json(course: Course) -> str:
 class GateTruth:
     """The next two gates relative to one pose; None past the end of the course."""
 
-    next_gate: int | None = None  # index of the next gate
+    next_gate: int | None = None  # passages before the next gate
     gate_body_m: Vec3 | None = None  # centre of the next gate in FRD body axes
     gate_yaw_rad: float | None = None  # heading of its passage minus the body's, in [-pi, pi]
     gate_after_body_m: Vec3 | None = None  # centre of the gate after it, in FRD body axes
@@ -165,7 +220,8 @@ def gate_truth(
         return GateTruth()
     body_from_ned = conjugate(ned_from_body_wxyz)
     centers_body_m = []
-    for gate in course.gates[next_gate : next_gate + 2]:
+    ahead = course.ahead(next_gate, 2)
+    for gate in ahead:
         north_m, east_m, down_m = (
             center - own for center, own in zip(gate.center_ned_m, position_ned_m, strict=True)
         )
@@ -174,7 +230,7 @@ def gate_truth(
     return GateTruth(
         next_gate=next_gate,
         gate_body_m=centers_body_m[0],
-        gate_yaw_rad=wrap_pi(course.gates[next_gate].yaw_rad - yaw_rad),
+        gate_yaw_rad=wrap_pi(ahead[0].yaw_rad - yaw_rad),
         gate_after_body_m=centers_body_m[1] if len(centers_body_m) > 1 else None,
     )
 
@@ -208,15 +264,16 @@ class GateCounter:
     """
 
     def __init__(self, course: Course, *, first: int = 0) -> None:
-        self._gates = course.gates
+        self._course = course
         self._first = first
         self._previous: tuple[Vec3, float] | None = None
         self.passed: list[GatePass] = []
 
     @property
     def next_gate(self) -> int | None:
+        """Number of passages before the next gate; None after the last."""
         index = self._first + len(self.passed)
-        return index if index < len(self._gates) else None
+        return index if index < self._course.passages else None
 
     def interrupt(self) -> None:
         """Start a new trajectory after a jump in position, for example a reboot."""
@@ -230,7 +287,8 @@ class GateCounter:
         start_ned_m, start_s = previous
         reached = 0.0
         while (index := self.next_gate) is not None:
-            fraction = crossing(self._gates[index], start_ned_m, position_ned_m)
+            (gate,) = self._course.ahead(index, 1)
+            fraction = crossing(gate, start_ned_m, position_ned_m)
             if fraction is None or fraction < reached:
                 return
             reached = fraction

@@ -15,8 +15,6 @@ from sitl.vehicle.rotation import Vec3, cos_tilt, to_euler
 CRASH_SPEED_MPS = 3.5  # ALT_HOLD descends at up to 2.5 m/s, a hard landing but no crash
 CRASH_TILT_COS = math.cos(math.radians(45.0))
 MAX_TEXTS = 200
-END_AFTER_NS = NS_PER_S
-"""Time from the last gate to the end of the course: a crash just behind the gate counts."""
 PATH_PERIOD_NS = NS_PER_S // 20
 """Path length is summed at 20 Hz: fine enough for turns, coarse enough to leave out vibration."""
 
@@ -64,7 +62,7 @@ class FlightLog:
 
     @property
     def gates_total(self) -> int:
-        return len(self._course.gates)
+        return self._course.passages
 
     @property
     def gates_passed(self) -> tuple[GatePass, ...]:
@@ -83,13 +81,16 @@ class FlightLog:
         self._position_ned_m = None
         self._was_touching = True
 
-    def verdict(self, now_ns: int) -> Literal["crashed", "finished"] | None:
-        """Return the end of the course: a crash, or 1 s after the last gate; None before that."""
+    def verdict(
+        self, now_ns: int, run_out_ns: int = NS_PER_S
+    ) -> Literal["crashed", "finished"] | None:
+        """Return the end of the course: a crash, or the run-out after the last gate; None before
+        that."""
         if self.crashed:
             return "crashed"
         if not self._gates.passed or self.next_gate is not None:
             return None
-        over_ns = now_ns - self._start_ns - END_AFTER_NS
+        over_ns = now_ns - self._start_ns - run_out_ns
         return "finished" if self._gates.passed[-1].t_s * NS_PER_S <= over_ns else None
 
     def on_received(self, arrived_ns: int) -> None:

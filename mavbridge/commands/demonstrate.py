@@ -47,6 +47,9 @@ SOLVES_KEPT = TRUTHS_KEPT = 64
 NOMINAL_SHARE, AIRBORNE_SHARE, UNDISTURBED_SHARE = 0.25, 0.35, 0.3
 """Shares of flights without random conditions, as most users fly first; that start in the air and
 off the course; and without disturbed actions, as examples of a good flight."""
+HOVER_S = (2.0, 9.0)
+"""Range of the time that a flight goes on after the last gate: the end is learned, too."""
+ENDLESS_LAPS = 1000
 RATE_TILT_DEG = 80.0
 """Tilt limit of a policy that learns from a body-rate expert, which leans by up to 62 degrees."""
 
@@ -60,6 +63,8 @@ class Variation:
     delays: Delays
     starts_airborne: bool
     disturbance: float
+    hover_s: float
+    """Time to fly on after the last gate."""
     solve_ns: int
     """Time from the image to the student's chunk, beyond that of the delays."""
 
@@ -82,6 +87,7 @@ def draw_variation(seed: int, *, longest_solve_ns: int = 0) -> Variation:
         delays=replace(delays, vision=replace(delays.vision, offset_ns=solve_ns)),
         starts_airborne=bool(is_airborne),
         disturbance=disturbance,
+        hover_s=float(np.random.Generator(np.random.PCG64((seed, 10))).uniform(*HOVER_S)),
         solve_ns=solve_ns,
     )
 
@@ -259,12 +265,13 @@ def _fly(spec: DemonstrationSpec, should_stop: Callable[[], bool], stack: ExitSt
         image_width=size_px,
         action=spec.config.action,
         max_tilt_deg=RATE_TILT_DEG if spec.config.action == "rates" else None,
+        holds_position=True,
     )
     if wanted.checkpoint is not None:
         loaded = load_for_episodes(replace(wanted, dual_rate=True), MonotonicClock())
         student = stack.enter_context(loaded).runner
         max_age_s = student.contract.max_feature_age_s + longest_solve_ns / NS_PER_S
-        contract = replace(student.contract, max_feature_age_s=max_age_s)
+        contract = replace(student.contract, max_feature_age_s=max_age_s, holds_position=True)
         student = replace(student, contract=contract)
         if contract.action != spec.config.action:
             raise UserError(
@@ -273,6 +280,7 @@ def _fly(spec: DemonstrationSpec, should_stop: Callable[[], bool], stack: ExitSt
     flight = SimulatedFlight(
         course_seed=spec.seed,
         seed=spec.seed,
+        laps=ENDLESS_LAPS if spec.config.courses == "loop" else 1,
         # The expert uses no image: frames are drawn in the size of the recording.
         settings=SimulationSettings(
             delays=variation.delays, least_camera_px=SIM_CAMERA_PX if student else 1
@@ -289,13 +297,15 @@ def _fly(spec: DemonstrationSpec, should_stop: Callable[[], bool], stack: ExitSt
         result = flight.fly(
             pilot.runner,
             max_time_s=spec.config.max_time,
+            run_out_s=variation.hover_s,
             sinks=(recorder,),
             should_stop=should_stop,
         )
     except BaseException:
         writer.close()
         raise
-    success = flight.vehicle.log.next_gate is None and not flight.vehicle.log.crashed
+    log = flight.vehicle.log
+    success = not log.crashed and (log.next_gate is None or flight.course.is_loop)
     writer.finish(
         replace(writer.meta, autopilot="sitl", success=success, gates_passed=result.gates_passed)
     )

@@ -17,11 +17,11 @@ from rich.text import Text
 from mavbridge.commands.episode_workers import fly_jobs
 from mavbridge.commands.output import make_table, progress_bar
 from mavbridge.config.episodes import (
+    COURSE_SEEDS,
     HELD_OUT_COURSE_SEED,
     MAX_EPISODES,
     EvaluateConfig,
     WorkersConfig,
-    first_seed,
 )
 from mavbridge.config.rates import SOLVES_PER_PLAY
 from mavbridge.core.clock import NS_PER_MS
@@ -61,7 +61,7 @@ class EpisodeSpec:
     @property
     def course_seed(self) -> int:
         """Seed of a held-out course."""
-        return first_seed(self.config.courses) + HELD_OUT_COURSE_SEED + self.seed
+        return COURSE_SEEDS[self.config.courses] + HELD_OUT_COURSE_SEED + self.seed
 
     def __str__(self) -> str:
         return f"course {self.course_seed}"
@@ -105,6 +105,7 @@ def fly_simulated(spec: EpisodeSpec, should_stop: Callable[[], bool]) -> FlownEp
     flight = SimulatedFlight(
         course_seed=spec.course_seed,
         seed=spec.seed,
+        laps=config.laps,
         settings=settings,
         vehicle=make_vehicle(autopilot=config.autopilot, gains=config.gains, conditions=conditions),
     )
@@ -117,7 +118,9 @@ def fly_simulated(spec: EpisodeSpec, should_stop: Callable[[], bool]) -> FlownEp
         if config.state_time is not None:
             contract = replace(contract, state_time=config.state_time)
         runner = replace(loaded.runner, contract=contract)
-        result = flight.fly(runner, max_time_s=config.max_time, should_stop=should_stop)
+        result = flight.fly(
+            runner, max_time_s=config.max_time, run_out_s=config.hover, should_stop=should_stop
+        )
     return FlownEpisode(engine=loaded.runner.engine, notes=tuple(loaded.notes), result=result)
 
 
@@ -285,6 +288,7 @@ FIGURES = {
     "stick_rate_per_s": "change of actions, 1/s",
     "flown_s": "flown, s",
     "course_s": "course time, s (successful flights)",
+    "drift_m": "drift after the stop, m",
 }
 """Fields of an ``EpisodeResult`` of which the mean is shown, and their names in the table."""
 

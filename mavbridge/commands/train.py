@@ -10,7 +10,7 @@ from rich.progress import Progress, TaskID
 from rich.text import Text
 
 from mavbridge.commands.output import progress_bar
-from mavbridge.config.episodes import CHECK_COURSE_SEED, MAX_EPISODES, first_seed
+from mavbridge.config.episodes import CHECK_COURSE_SEED, COURSE_SEEDS, MAX_EPISODES
 from mavbridge.config.flags import check_range
 from mavbridge.config.policy import PolicyConfig
 from mavbridge.core.clock import NS_PER_S, MonotonicClock
@@ -72,7 +72,7 @@ def share_of_gates(checkpoint: Path, settings: TrainSettings) -> float:
     from mavbridge.simulation.flight import SimulatedFlight
 
     wanted = PolicyConfig(policy=settings.policy, checkpoint=checkpoint, dual_rate=True)
-    first, passed, total = first_seed(settings.check_courses) + CHECK_COURSE_SEED, 0, 0
+    first, passed, total = COURSE_SEEDS[settings.check_courses] + CHECK_COURSE_SEED, 0, 0
     with load_configured_policy(wanted, MonotonicClock()) as loaded:
         for index in range(settings.check_flights):
             flight = SimulatedFlight(course_seed=first + index, seed=index)
@@ -92,6 +92,7 @@ def fit_to_flights(
         since_exposure=settings.since_exposure,
         hover_thrust=terms.hover_thrust,
         max_tilt_deg=terms.max_tilt_deg,
+        holds_position=terms.holds_position,
     )
     if terms.action == "rates":
         contract = rates_contract(contract)

@@ -14,14 +14,14 @@ from mavbridge.core.errors import UserError
 from policy.contract import StateTime
 
 AutopilotKind = Literal["ardupilot", "px4"]
-CourseKind = Literal["easy", "race"]
+CourseKind = Literal["easy", "race", "loop"]
 """Families of courses, each with its own seeds and the same ranges of them."""
 ConditionsKind = Literal["nominal", "random", "held-out"]
 """Vehicles, wind and light: constant, drawn as in demonstrations, or with looks that no
 demonstration has."""
 
-RACE_COURSE_SEED = 1_000_000_000
-"""First seed of race courses (`sitl.course.RACE_SEEDS`)."""
+COURSE_SEEDS: dict[CourseKind, int] = {"easy": 0, "race": 1_000_000_000, "loop": 2_000_000_000}
+"""First seed of each family (`sitl.course`)."""
 
 CHECK_COURSE_SEED = 900_000
 """First seed of the courses flown during training; never learned from or evaluated on."""
@@ -32,13 +32,8 @@ HELD_OUT_COURSE_SEED = 1_000_000
 MAX_EPISODES = 10_000
 """Most episodes per evaluation, so that different seeds never share courses."""
 
-MAX_EVALUATION_SEED = (RACE_COURSE_SEED - HELD_OUT_COURSE_SEED) // MAX_EPISODES - 1
+MAX_EVALUATION_SEED = (COURSE_SEEDS["race"] - HELD_OUT_COURSE_SEED) // MAX_EPISODES - 1
 """Beyond this seed, easy courses would be race courses, some of them trained on."""
-
-
-def first_seed(courses: CourseKind) -> int:
-    """Return the first seed of a family."""
-    return RACE_COURSE_SEED if courses == "race" else 0
 
 
 @Parameter(name="*")
@@ -84,7 +79,11 @@ class EvaluateConfig:
     max_time: float = 60.0
     """Seconds that a flight may take, from the policy's first action."""
     courses: CourseKind = "easy"
-    """easy, or race: longer, with sharper turns, climbs and dives."""
+    """easy; race: longer, with sharper turns, climbs and dives; loop: gates around a circle."""
+    laps: int = 1
+    """Rounds of a loop."""
+    hover: float = 1.0
+    """Seconds to fly on after the last gate; the drift from where it stopped is told."""
     conditions: ConditionsKind = "nominal"
     """random: each flight has another vehicle, firmware settings, wind, light, colours and lens.
     held-out: the same, and a look that no demonstration has: gates partly hidden, in shadow, at
@@ -123,6 +122,10 @@ class EvaluateConfig:
         """Raise UserError for values out of range, and for contradictions."""
         check_range("episodes", self.episodes, 1, MAX_EPISODES, "")
         check_range("max-time", self.max_time, 1, 3600, "s")
+        check_range("hover", self.hover, 0, 3600, "s")
+        check_range("laps", self.laps, 1, 1000, "")
+        if self.laps > 1 and self.courses != "loop":
+            raise UserError("--laps needs --courses loop")
         check_range("vision-delay", self.vision_delay, 0, 5000, "ms")
         check_range("stalls", self.stalls, 0, 5000, "ms")
         if self.resume and self.json is None:
@@ -158,7 +161,8 @@ class DemonstrateConfig:
     autopilot: AutopilotKind = "ardupilot"
     """Firmware of the bundled flight controller: its modes, stick curves and airframe."""
     courses: CourseKind = "easy"
-    """easy, or race: longer, with sharper turns, climbs and dives."""
+    """easy; race: longer, with sharper turns, climbs and dives; loop: gates around a circle, flown
+    until the time is over."""
     max_time: float = 40.0
     """Seconds after which a flight ends, on the course or not; a short one can start a rollout."""
     policy: PolicyConfig = field(default_factory=PolicyConfig)
@@ -183,4 +187,4 @@ class DemonstrateConfig:
     @property
     def first_course_seed(self) -> int:
         """Course of the first flight. Training and evaluation never fly these courses."""
-        return first_seed(self.courses) + self.policy.seed * MAX_EPISODES
+        return COURSE_SEEDS[self.courses] + self.policy.seed * MAX_EPISODES

@@ -290,7 +290,7 @@ class FlyConfig:
     serve: Annotated[str, Parameter(group=OUTPUT, show_default=False)] = ""
     """HOST:PORT of a web page with the live flight; its data use PORT + 1."""
     gates: Annotated[Path | None, Parameter(group=OUTPUT)] = None
-    """JSON of the course's gates: shown, counted, and the last one ends the flight."""
+    """JSON of the course's gates: shown, counted, and the flight ends after the last one."""
     record: Annotated[Path | None, Parameter(group=OUTPUT)] = None
     """New folder for the recorded flight; needs the extra "record"."""
     report: Annotated[Path | None, Parameter(group=OUTPUT)] = None

@@ -21,6 +21,10 @@ from mavbridge.recording.crash import CrashWatch
 _log = logging.getLogger(__name__)
 RUN_OUT_NS = NS_PER_S
 """Time from the last gate to the end of the flight, in which a crash still counts."""
+MAX_RUN_OUT_NS = 10 * NS_PER_S
+"""Longest such time of a policy that stops after the last gate."""
+STOPPED_MPS = 0.3
+"""Speed below which a vehicle has stopped."""
 _ENDS: dict[FlightEnd, str] = {
     "course": "the end of the course",
     "duration": "--duration",
@@ -37,8 +41,12 @@ _UNPLANNED = ("takeover", "disarmed", "fault")
 class FlightReferee:
     """``TickSink`` that follows the policy's flight to its outcome; other threads may ask it."""
 
-    def __init__(self, gates: Sequence[CourseGate] | None) -> None:
-        """``gates``: the course's gates in order; None if no course was named."""
+    def __init__(self, gates: Sequence[CourseGate] | None, *, stops: bool = False) -> None:
+        """``gates``: the course's gates in order; None if no course was named.
+
+        ``stops``: the policy stops after the last one, and the flight ends only then.
+        """
+        self._stops = stops
         self._gates_total = len(gates) if gates else None
         self._course = CourseProgress(gates or ())
         self._crashes = CrashWatch()
@@ -78,8 +86,18 @@ class FlightReferee:
         return self._crashes.reason
 
     def is_course_over(self, now_ns: int) -> bool:
-        """True if the last gate was passed more than the run-out ago."""
-        return self._course.is_done and now_ns - self._course.passed_ns[-1] >= RUN_OUT_NS
+        """True if the last gate was passed more than the run-out ago, and the vehicle stopped."""
+        if not self._course.is_done or now_ns - self._course.passed_ns[-1] < RUN_OUT_NS:
+            return False
+        is_late = now_ns - self._course.passed_ns[-1] >= MAX_RUN_OUT_NS
+        speed_mps = self._speed_mps
+        return not self._stops or is_late or (speed_mps is not None and speed_mps < STOPPED_MPS)
+
+    @property
+    def _speed_mps(self) -> float | None:
+        """Speed at the last tick in which the policy had control."""
+        state = None if self._flown is None else self._flown.state
+        return None if state is None else math.hypot(*state.values[:3].tolist())
 
     def outcome(
         self, end: FlightEnd, vehicle: GuardStatus, asked: Reason | None = None
@@ -90,14 +108,14 @@ class FlightReferee:
         """
         if (flown := self._flown) is None:
             return None
-        position, state, passed_ns = flown.position_ned_m, flown.state, self._course.passed_ns
+        position, passed_ns = flown.position_ned_m, self._course.passed_ns
         knows_gates = self._gates_total is not None and self._has_position
         return FlightOutcome(
             end=end,
             reason=asked if self._reason is None else self._reason,
             flown_s=(flown.sent_ns - self._began_ns) / NS_PER_S,
             height_m=None if position is None else -position.down,
-            speed_mps=None if state is None else math.hypot(*state.values[:3].tolist()),
+            speed_mps=self._speed_mps,
             mode=vehicle.mode,
             is_armed=vehicle.armed,
             is_landed=vehicle.is_landed,

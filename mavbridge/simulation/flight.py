@@ -24,7 +24,7 @@ from mavbridge.simulation.clock import AheadClock, SteppedClock, Stepper
 from mavbridge.simulation.delays import Delays, Stalls
 from mavbridge.simulation.guard import GuardStepper, MemoryPort, flight_process, sender
 from mavbridge.simulation.network import DelayedChannel, MemoryTransport
-from mavbridge.simulation.referee import EpisodeResult, Referee
+from mavbridge.simulation.referee import RUN_OUT_S, EpisodeResult, Referee
 from mavbridge.simulation.world import (
     MOUNTS,
     NOMINAL_VEHICLE,
@@ -78,6 +78,7 @@ class SimulatedFlight:
         *,
         course_seed: int,
         seed: int,
+        laps: int = 1,
         settings: SimulationSettings | None = None,
         vehicle: VehicleConfig = NOMINAL_VEHICLE,
     ) -> None:
@@ -97,7 +98,7 @@ class SimulatedFlight:
         self.clock = SteppedClock()
         # A real vehicle and bridge are not in phase; the phase stays constant during a flight.
         boot_ns = self.clock.now_ns() + int(self._random(6).integers(STEP_NS))
-        self.course = make_course(course_seed)
+        self.course = make_course(course_seed, laps)
         self._vehicle_config = vehicle
         self.vehicle = SimulatedVehicle(
             links=1, boot_ns=boot_ns, config=vehicle, course=self.course
@@ -131,12 +132,14 @@ class SimulatedFlight:
         runner: PolicyRunner,
         *,
         max_time_s: float = MAX_TIME_S,
+        run_out_s: float = RUN_OUT_S,
         sinks: tuple[TickSink, ...] = (),
         should_stop: Callable[[], bool] | None = None,
     ) -> EpisodeResult:
         """Arm, fly and return the sticks; ends after the last gate, a crash or ``max_time_s``.
 
-        The runner must not remember earlier flights; ``max_time_s`` counts from its first action.
+        The runner must not remember earlier flights; ``max_time_s`` counts from its first action,
+        ``run_out_s`` from the last gate.
         ``should_stop`` is called after each step of the vehicle.
 
         Raises:
@@ -149,7 +152,13 @@ class SimulatedFlight:
             raise UserError("a simulated flight is flown once: make another one")
         self._has_flown = True
         cv2.setNumThreads(1)  # same images on any machine, and no thread pool to wake
-        referee = Referee(self.clock, self.vehicle, max_time_s=max_time_s, should_stop=should_stop)
+        referee = Referee(
+            self.clock,
+            self.vehicle,
+            max_time_s=max_time_s,
+            run_out_s=run_out_s,
+            should_stop=should_stop,
+        )
         self.watch_steps(referee.watch)
         guard = self._compose(runner, (referee, *sinks))
         while not referee.stop.is_set():

@@ -15,11 +15,16 @@ from mavbridge.core.vehicle import Action
 from policy.contract import ACTION_DIM
 from sitl.course import make_course
 from sitl.simulated_vehicle import SimulatedVehicle
+from sitl.vehicle.rotation import Vec3
 
 READY_NS = 30 * NS_PER_S
 """Limit from the start to the policy's first action, which comes after some 4 s."""
 
 
+RUN_OUT_S = 1.0
+"""Time from the last gate to the end: a crash just behind the gate counts."""
+STILL_MPS = 0.3
+"""Speed below which the vehicle has stopped."""
 Outcome = Literal["finished", "crashed", "disarmed", "timed out"]
 """All gates passed; ground or gate hit; motors stopped in flight; none of these in time."""
 
@@ -34,13 +39,16 @@ class EpisodeResult:
     gates_total: int
     gate_times_s: tuple[float, ...]
     flown_s: float
-    """Time to the end of the episode: one second after the last gate, the crash, or the limit."""
+    """Time to the end of the episode: the run-out after the last gate, the crash, or the limit."""
     distance_m: float
     stick_rate_per_s: float | None
     """Mean over the four sticks of |change| per second, as sent; full deflection is 1. None = the
     policy never had the sticks for two actions in a row."""
     lost: Reason | None = None
     """Why the policy lost control before the end; None: it kept it."""
+    drift_m: float | None = None
+    """Distance between the place where it first stopped after the last gate and the place at the
+    end; None if it did not stop."""
 
     @property
     def has_finished(self) -> bool:
@@ -62,7 +70,7 @@ class EpisodeResult:
         """Mean speed along the straight legs between the passed gates; None for fewer than two."""
         if self.gates_passed < 2:
             return None
-        gates = make_course(self.course_seed).gates[: self.gates_passed]
+        gates = make_course(self.course_seed).ahead(0, self.gates_passed)
         legs_m = [math.dist(a.center_ned_m, b.center_ned_m) for a, b in pairwise(gates)]
         return sum(legs_m) / (self.gate_times_s[-1] - self.gate_times_s[0])
 
@@ -118,10 +126,13 @@ class Referee:
         vehicle: SimulatedVehicle,
         *,
         max_time_s: float,
+        run_out_s: float = RUN_OUT_S,
         should_stop: Callable[[], bool] | None,
     ) -> None:
         self._clock = clock
         self._vehicle = vehicle
+        self._run_out_ns = round(run_out_s * NS_PER_S)
+        self._stopped_ned_m: Vec3 | None = None
         self._max_time_ns = round(max_time_s * NS_PER_S)
         self._should_stop = should_stop
         self._start_ns = clock.now_ns()
@@ -146,6 +157,10 @@ class Referee:
         if self.stop.is_set():
             return
         self._outcome = self._find_outcome()
+        body, log = self._vehicle.ap.truth, self._vehicle.log
+        if self._stopped_ned_m is None and log.gates_passed and log.next_gate is None:
+            is_still = math.hypot(*body.velocity_ned_mps) < STILL_MPS
+            self._stopped_ned_m = body.position_ned_m if is_still else None
         is_interrupted = self._should_stop is not None and self._should_stop()
         if self._outcome is not None or self._has_failed_to_engage or is_interrupted:
             self._end_ns = self._clock.now_ns()
@@ -161,7 +176,7 @@ class Referee:
         if (engaged_ns := self._meter.engaged_ns) is None:
             return None
         ap = self._vehicle.ap
-        if (verdict := self._vehicle.log.verdict(ap.now_ns)) is not None:
+        if (verdict := self._vehicle.log.verdict(ap.now_ns, self._run_out_ns)) is not None:
             return verdict
         if not ap.armed:
             return "disarmed"
@@ -183,6 +198,7 @@ class Referee:
         engaged_ns, log = self._meter.engaged_ns, self._vehicle.log
         if self._outcome is None or engaged_ns is None:
             raise EpisodeInterruptedError(f"course {course_seed}: interrupted")
+        stopped_ned_m, ended_ned_m = self._stopped_ned_m, self._vehicle.ap.truth.position_ned_m
         offset_s = (engaged_ns - self._start_ns) / NS_PER_S
         return EpisodeResult(
             course_seed=course_seed,
@@ -194,4 +210,5 @@ class Referee:
             distance_m=self._distance_m,
             stick_rate_per_s=self._meter.rate_per_s,
             lost=self._lost,
+            drift_m=None if stopped_ned_m is None else math.dist(stopped_ned_m, ended_ned_m),
         )

@@ -35,6 +35,7 @@ class ActionTerms(NamedTuple):
     action: ActionKind = "sticks"
     hover_thrust: float = 0.39
     max_tilt_deg: float | None = None
+    holds_position: bool = False
 
 
 STICK_TERMS = ActionTerms()
@@ -120,7 +121,10 @@ def common_frame(flights: Sequence[FlightData]) -> StateFrame:
 
 
 def common_terms(flights: Sequence[FlightData]) -> ActionTerms:
-    """Return the action terms that all flights share, with the largest of their tilts."""
+    """Return the action terms that all flights share, with the largest of their tilts.
+
+    Position is held if all flights say so.
+    """
     first = flights[0]
     for flight in flights:
         if flight.terms[:2] != first.terms[:2]:
@@ -130,7 +134,10 @@ def common_terms(flights: Sequence[FlightData]) -> ActionTerms:
                 f"{flight.terms.hover_thrust:g}: train on one kind at a time"
             )
     tilts_deg = [each.terms.max_tilt_deg for each in flights if each.terms.max_tilt_deg is not None]
-    return first.terms._replace(max_tilt_deg=max(tilts_deg, default=None))
+    return first.terms._replace(
+        max_tilt_deg=max(tilts_deg, default=None),
+        holds_position=all(flight.terms.holds_position for flight in flights),
+    )
 
 
 def hold_out(

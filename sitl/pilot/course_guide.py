@@ -89,6 +89,7 @@ class CourseGuide:
                 f"the expert flies at {MIN_SPEED_MPS} to {agility.max_speed_mps} m/s, "
                 f"got {speed_mps}"
             )
+        self._course = course
         self._last = course.gates[-1]
         # Points straight ahead of the last gate, so that it is flown like any other.
         north_m, east_m, down_m = self._last.center_ned_m
@@ -98,7 +99,6 @@ class CourseGuide:
             for k in range(1, GATES_AHEAD + 1)
         ]
         self._beyond = tuple(replace(self._last, center_ned_m=point) for point in beyond_ned_m)
-        self._gates = course.gates + self._beyond
         self._agility = agility
         self._speed_mps = speed_mps
         self._referee = GateCounter(course, first=next_gate)
@@ -130,10 +130,10 @@ class CourseGuide:
 
     def _gates_ahead(self, position_ned_m: Vec3, state: "Predicted") -> tuple[Gate, ...]:
         """Return the gates ahead, without one that is passed before the action takes effect."""
-        next_gate = self.next_gate
-        if next_gate is None:
+        if (passed := self.next_gate) is None:
             return self._beyond
-        ahead = self._gates[next_gate:]
+        left = self._course.passages - passed
+        ahead = self._course.ahead(passed, min(left, GATES_AHEAD + 1)) + self._beyond
         is_passing = crossing(ahead[0], position_ned_m, state.position_ned_m) is not None
         return ahead[1:] if is_passing else ahead
 

@@ -10,7 +10,7 @@ from typing import Literal, NamedTuple, TypeAlias, TypeVar
 
 import numpy as np
 
-from sitl.course import RACE_SEEDS, AirborneStart, Course
+from sitl.course import LOOP_SEEDS, RACE_SEEDS, AirborneStart, Course
 from sitl.pilot.demonstrator import RateCommand, StickPositions
 from sitl.vehicle.dynamics import clamp
 from sitl.vehicle.rotation import from_euler
@@ -132,7 +132,7 @@ def random_start(course: Course, seed: int, *, speed_mps: float) -> AirborneStar
     """Draw a start before a random gate, off its axis, moving and facing roughly along it."""
     random = np.random.Generator(np.random.PCG64(seed))
     gate = course.gates[int(random.integers(len(course.gates)))]
-    is_race = course.seed >= RACE_SEEDS
+    is_race = RACE_SEEDS <= course.seed < LOOP_SEEDS
     away_m = float(random.uniform(*(RACE_START_AWAY_M if is_race else START_AWAY_M)))
     side_m = clamp(float(random.normal(0.0, 1.2)), 0.4 * away_m)
     up_m = float(random.normal(0.0, 0.5))

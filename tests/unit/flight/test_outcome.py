@@ -1,6 +1,7 @@
 """What a script and a person are told about a flight."""
 
 import signal
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -14,7 +15,13 @@ from mavbridge.core.reasons import Code, because
 from mavbridge.core.records import FlightOutcome, Position, Tick
 from mavbridge.core.stopping import StopRequest
 from mavbridge.core.vehicle import FlightEnd, LinkStats
-from mavbridge.flight.outcome import RUN_OUT_NS, FlightReferee, describe, flight_verdict
+from mavbridge.flight.outcome import (
+    MAX_RUN_OUT_NS,
+    RUN_OUT_NS,
+    FlightReferee,
+    describe,
+    flight_verdict,
+)
 from mavbridge.guard.values import Outcome
 from mavbridge.guard.wire import GuardStatus, GuardSummary
 
@@ -139,6 +146,22 @@ def test_a_course_is_over_a_second_after_its_last_guard() -> None:
     assert outcome.course_s == pytest.approx(0.8)
     assert outcome.course_speed_mps == pytest.approx(10.0)
     assert describe(outcome) == "2 of 2 gates in 0.8 s, 10.0 m/s, no contact seen"
+
+
+def test_a_policy_that_stops_is_given_the_time_to() -> None:
+    def over(*speeds_mps: float) -> list[int]:
+        referee, found = FlightReferee(GATES, stops=True), []
+        for index, tick in enumerate(course_ticks(1900)):
+            moving = np.zeros(13, np.float32)
+            moving[0] = speeds_mps[min(index // 200, len(speeds_mps) - 1)]
+            referee.emit(replace(tick, state=make_state(values=moving)))
+            if referee.is_course_over(tick.sent_ns):
+                found.append(index)
+        return found
+
+    assert over(6.0, 2.0, 0.2)[0] == 400, "when it has stopped"
+    assert over(0.1)[0] == 80 + RUN_OUT_NS // 10_000_000, "not before the run-out"
+    assert over(3.0)[0] == 80 + MAX_RUN_OUT_NS // 10_000_000, "at last"
 
 
 def test_without_guards_a_flight_is_told_by_its_end() -> None:

@@ -17,7 +17,7 @@ from mavbridge.commands.demonstrate import (
     from_now,
 )
 from mavbridge.commands.train import fit_to_flights
-from mavbridge.config.episodes import RACE_COURSE_SEED, AutopilotKind, DemonstrateConfig
+from mavbridge.config.episodes import COURSE_SEEDS, AutopilotKind, DemonstrateConfig
 from mavbridge.config.policy import PolicyConfig
 from mavbridge.core.errors import UserError
 from mavbridge.core.vehicle import BodyRates
@@ -195,7 +195,7 @@ def test_by_body_rates_races_are_demonstrated_and_read_back(
     )
     assert demonstrate(by_rates) == 0
     flight = open_flight(tmp_path / "000000")
-    assert flight.meta.course_seed == RACE_COURSE_SEED + 30_000
+    assert flight.meta.course_seed == COURSE_SEEDS["race"] + 30_000
     assert set(column(flight, "mode")) == {
         "GUIDED_NOGPS" if autopilot == "ardupilot" else "OFFBOARD"
     }
@@ -203,11 +203,12 @@ def test_by_body_rates_races_are_demonstrated_and_read_back(
     assert first is None or isinstance(first, BodyRates)  # the chunk may be from before
     assert {type(word) for word in words} == {BodyRates}
     data = read_flight(flight.folder)
-    assert data.terms == ActionTerms("rates", 0.39, 80.0)
+    assert data.terms == ActionTerms("rates", 0.39, 80.0, holds_position=True)
     assert 0.1 < np.abs(data.target).max() <= 1.0
     assert not data.sent.any()
     network = fit_to_flights(TogeConfig(), [data], TrainSettings(out=tmp_path / "a.safetensors"))
     assert (network.contract.action, network.contract.max_tilt_deg) == ("rates", 80.0)
+    assert network.contract.holds_position
     assert network.contract.modes == ("GUIDED_NOGPS", "GUIDED", "OFFBOARD")
 
 

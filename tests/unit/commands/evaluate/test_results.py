@@ -43,6 +43,7 @@ def test_the_figures_of_three_flights() -> None:
         "stick_rate_per_s": (0.5, 2),
         "flown_s": (pytest.approx(22.5 / 3), 3),
         "course_s": (7.5, 2),
+        "drift_m": None,
     }
 
 

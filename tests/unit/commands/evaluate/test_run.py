@@ -19,10 +19,10 @@ from mavbridge.commands.evaluate import (
     fly_simulated,
 )
 from mavbridge.config.episodes import (
+    COURSE_SEEDS,
     HELD_OUT_COURSE_SEED,
     MAX_EPISODES,
     MAX_EVALUATION_SEED,
-    RACE_COURSE_SEED,
     ConditionsKind,
     EvaluateConfig,
 )
@@ -53,7 +53,7 @@ def test_seeds_follow_from_the_evaluations_seed_and_the_index_alone() -> None:
     assert not {spec.course_seed for spec in first} & {spec.course_seed for spec in other}
     assert all(spec.course_seed >= HELD_OUT_COURSE_SEED for spec in (*first, *other))
     last = EvaluateConfig(policy=PolicyConfig(seed=MAX_EVALUATION_SEED), episodes=MAX_EPISODES)
-    assert EpisodeSpec(config=last, index=MAX_EPISODES - 1).course_seed < RACE_COURSE_SEED
+    assert EpisodeSpec(config=last, index=MAX_EPISODES - 1).course_seed < COURSE_SEEDS["race"]
 
 
 @pytest.fixture(scope="module")

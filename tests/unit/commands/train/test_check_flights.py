@@ -13,9 +13,9 @@ from helpers.evaluated_flights import crashed
 from mavbridge.commands import train as train_check
 from mavbridge.config.episodes import (
     CHECK_COURSE_SEED,
+    COURSE_SEEDS,
     HELD_OUT_COURSE_SEED,
     MAX_EPISODES,
-    RACE_COURSE_SEED,
 )
 from mavbridge.config.policy import PolicyConfig
 from mavbridge.core.clock import Clock
@@ -71,5 +71,5 @@ def test_counts_the_gates_of_courses_that_nothing_else_flies_with_the_weights_in
     assert CHECK_COURSE_SEED + MAX_EPISODES <= HELD_OUT_COURSE_SEED
     races = replace(settings, check_flights=1, check_courses="race")
     train_check.share_of_gates(save(path, 1), races)
-    assert flown[-1][0] == RACE_COURSE_SEED + CHECK_COURSE_SEED
+    assert flown[-1][0] == COURSE_SEEDS["race"] + CHECK_COURSE_SEED
     assert not np.allclose(flown[0][1], flown[-1][1])

@@ -4,7 +4,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from sitl.course import Course, Gate, GateCounter, make_course
+from sitl.course import LOOP_SEEDS, Course, Gate, GateCounter, make_course
 
 NORTH_GATE = Gate(center_ned_m=(10.0, 0.0, -2.0), yaw_rad=0.0, size_m=2.0, index=0)
 EAST_GATE = Gate(center_ned_m=(20.0, 5.0, -2.0), yaw_rad=math.pi / 2, size_m=2.0, index=1)
@@ -49,7 +49,15 @@ def test_gates_count_in_order_with_interpolated_times():
     assert [(passed.index, passed.t_s) for passed in counter.passed] == [(0, 0.625), (1, 2.25)]
 
 
-@given(st.integers(0, 2**32))
+def test_every_lap_of_a_loop_counts() -> None:
+    course = make_course(LOOP_SEEDS + 4, laps=3)
+    counter = GateCounter(course)
+    centers = [gate.center_ned_m for gate in course.ahead(0, 30)]
+    assert fly(counter, (0.0, 0.0, -2.0), *centers) == list(range(24))
+    assert counter.next_gate is None
+
+
+@given(st.integers(0, LOOP_SEEDS - 1))
 def test_flying_centre_to_centre_passes_every_gate(seed):
     course = make_course(seed)
     counter = GateCounter(course)
