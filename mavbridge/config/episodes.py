@@ -161,8 +161,7 @@ class DemonstrateConfig:
     autopilot: AutopilotKind = "ardupilot"
     """Firmware of the bundled flight controller: its modes, stick curves and airframe."""
     courses: CourseKind = "easy"
-    """easy; race: longer, with sharper turns, climbs and dives; loop: gates around a circle, flown
-    until the time is over."""
+    """easy; race: longer, with sharper turns, climbs and dives; loop: gates around a circle."""
     max_time: float = 40.0
     """Seconds after which a flight ends, on the course or not; a short one can start a rollout."""
     policy: PolicyConfig = field(default_factory=PolicyConfig)
