@@ -34,7 +34,8 @@ from policy.protocol import PolicyRunner
 from sitl.course import gate_truth
 from sitl.pilot.demonstrator import Expert, RateExpert
 from sitl.pilot.disturbance import RATE_STRENGTHS, STICK_STRENGTHS, Disturbance, random_start
-from sitl.vehicle.conditions import NOMINAL, Conditions, random_conditions
+from sitl.vehicle.conditions import NOMINAL, Conditions
+from sitl.vehicle.looks import training_conditions
 
 SETTLE_NS = 300 * NS_PER_MS
 """Wait after a start in the air, until the last frame and state from the ground are gone."""
@@ -45,7 +46,7 @@ a student that crashes at the first gate would learn nothing about later ones (D
 SOLVES_KEPT = TRUTHS_KEPT = 64
 """Solves and exposures kept until their ticks and frames are recorded."""
 NOMINAL_SHARE, AIRBORNE_SHARE, UNDISTURBED_SHARE = 0.25, 0.35, 0.3
-"""Shares of flights without random conditions, as most users fly first; that start in the air and
+"""Shares of flights without varied conditions, as most users fly first; that start in the air and
 off the course; and without disturbed actions, as examples of a good flight."""
 HOVER_S = (2.0, 9.0)
 """Range of the time that a flight goes on after the last gate: the end is learned, too."""
@@ -83,7 +84,7 @@ def draw_variation(seed: int, *, longest_solve_ns: int = 0) -> Variation:
     solve_ns = round(longest_solve_ns * float(random.uniform(0.25, 1.0)))
     return Variation(
         seed=seed,
-        conditions=NOMINAL if is_nominal else random_conditions(seed),
+        conditions=NOMINAL if is_nominal else training_conditions(seed),
         delays=replace(delays, vision=replace(delays.vision, offset_ns=solve_ns)),
         starts_airborne=bool(is_airborne),
         disturbance=disturbance,

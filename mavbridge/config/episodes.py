@@ -16,9 +16,8 @@ from policy.contract import StateTime
 AutopilotKind = Literal["ardupilot", "px4"]
 CourseKind = Literal["easy", "race", "loop"]
 """Families of courses, each with its own seeds and the same ranges of them."""
-ConditionsKind = Literal["nominal", "random", "held-out"]
-"""Vehicles, wind and light: constant, drawn as in demonstrations, or with looks that no
-demonstration has."""
+ConditionsKind = Literal["nominal", "random", "held-out", "unseen"]
+"""Vehicles, wind and light: constant, drawn at random, or with looks that no demonstration has."""
 
 COURSE_SEEDS: dict[CourseKind, int] = {"easy": 0, "race": 1_000_000_000, "loop": 2_000_000_000}
 """First seed of each family (`sitl.course`)."""
@@ -87,7 +86,8 @@ class EvaluateConfig:
     conditions: ConditionsKind = "nominal"
     """random: each flight has another vehicle, firmware settings, wind, light, colours and lens.
     held-out: the same, and a look that no demonstration has: gates partly hidden, in shadow, at
-    night, against the sun, or beside others that are out of order."""
+    night, against the sun, or beside others that are out of order. unseen: in fog, or through a
+    dirty lens."""
     autopilot: AutopilotKind = "ardupilot"
     """Firmware of the bundled flight controller: its modes, stick curves and airframe."""
     gains: float = 1.0

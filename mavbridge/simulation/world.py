@@ -19,14 +19,10 @@ from policy.contract import Contract
 from sitl.ardupilot.guided import OPTION_THRUST
 from sitl.camera.fpv import FpvRenderer
 from sitl.simulated_vehicle import Pose, SimulatedVehicle
-from sitl.vehicle.conditions import (
-    NOMINAL,
-    Conditions,
-    held_out_conditions,
-    random_conditions,
-)
+from sitl.vehicle.conditions import NOMINAL, Conditions, random_conditions
 from sitl.vehicle.config import STEP_NS, AutopilotName, VehicleConfig
 from sitl.vehicle.dynamics import BodyState
+from sitl.vehicle.looks import held_out_conditions, unseen_conditions
 from sitl.vehicle.rotation import IDENTITY, Quat, Vec3, conjugate, from_euler, multiply, rotate
 
 MOUNTS: dict[str, Quat] = {
@@ -57,6 +53,8 @@ def draw_conditions(kind: ConditionsKind, seed: int) -> Conditions:
             return random_conditions(seed)
         case "held-out":
             return held_out_conditions(seed)
+        case "unseen":
+            return unseen_conditions(seed)
 
 
 def make_vehicle(

@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from sitl import UsageError
 from sitl.camera import scenery
+from sitl.camera.lens import LensDirt
 from sitl.camera.scenery import FloatArray, Image
 from sitl.course import Course
 from sitl.vehicle.conditions import NOMINAL, Conditions
@@ -22,9 +23,6 @@ from sitl.vehicle.rotation import Quat, Vec3, from_euler, rotate
 NEAR_M = 0.05  # anything nearer or behind is clipped before projection
 LOWEST_EYE_M = 0.12
 """Minimum height of the eye in the rendering, so that a vehicle on the ground sees ground."""
-GATE_HAZE_M = 90.0  # distance at which a gate has lost 63 % of its contrast
-GROUND_FADE_M = 14.0
-"""Distance at which the ground has lost 3/4 of its contrast; farther texture would alias."""
 GLOW_SHARE = 0.18  # share of the image's width at which the sun's glow has lost 63 %
 SUBPIXEL_BITS = 4  # corners are rounded to 1/16 pixel
 REFERENCE_WIDTH_PX = 224  # image width that the conditions' blur refers to
@@ -68,14 +66,16 @@ class FpvRenderer:
         self._body_from_camera = body_from_camera(conditions)
         self._offset_body_m = conditions.camera_offset_body_m
         self._backdrop = scenery.backdrop_colours(conditions)
-        self._haze_rgb = scenery.tinted(scenery.HAZE_RGB, conditions.sky_tint)
-        self._ridge_rgb = scenery.tinted(scenery.RIDGE_RGB, conditions.sky_tint)
+        self._haze_rgb = scenery.tinted(conditions.sky_rgb[0], conditions.sky_tint)
+        self._ridge_rgb = scenery.tinted(conditions.ridge_rgb, conditions.sky_tint)
+        self._haze_m, self._ground_fade_m = conditions.haze_m, conditions.ground_fade_m
         self._ground = scenery.ground_tile(conditions)
         self._ridge = scenery.ridge_directions(course.seed)
         self._faces = scenery.course_faces(course, conditions)
         self._shutter = Shutter(
             conditions, u_px=self._u_px, v_px=self._v_px, focal_px=self._focal_px
         )
+        self._dirt = LensDirt(conditions, width, height) if conditions.lens_drops else None
         self._sensor = _ImageSensor(conditions, width, height)
         self._glare, self._sun_ned = conditions.glare, np.array(conditions.sun_ned)
 
@@ -98,7 +98,7 @@ class FpvRenderer:
         if self._glare:
             image = self._add_glare(image, self._sun_ned @ ned_from_camera)
         image = self._shutter.expose(image, np.array(rate_body_radps) @ self._body_from_camera)
-        return self._sensor.expose(image)
+        return self._sensor.expose(self._dirt.cover(image) if self._dirt else image)
 
     def _draw_backdrop(self, eye_ned_m: FloatArray, ned_from_camera: FloatArray) -> Image:
         ned_ray_from_pixel = ned_from_camera @ self._ray_from_pixel
@@ -124,7 +124,7 @@ class FpvRenderer:
         """Blend in the ground's texture, less with distance."""
         height_m = -eye_ned_m[2]
         weight = np.maximum(falls, 0)
-        weight /= weight + np.float32(height_m / GROUND_FADE_M)
+        weight /= weight + np.float32(height_m / self._ground_fade_m)
         weight *= weight
         # The ground point of a ray is a homography of the pixel; modulo the tile keeps it small.
         north_east_m = np.mod(eye_ned_m[:2], scenery.GROUND_TILE_M)
@@ -149,7 +149,7 @@ class FpvRenderer:
         distance_m = np.linalg.norm(faces.centers_ned_m - eye_ned_m, axis=1)[faces.owner]
         order = np.argsort(-distance_m, kind="stable")
         order = order[facing[order]]
-        haze = 1 - np.exp(-distance_m[order, None] / GATE_HAZE_M)
+        haze = 1 - np.exp(-distance_m[order, None] / self._haze_m)
         rgb = faces.rgb[order] * (1 - haze) + self._haze_rgb * haze
         self._fill(image, from_eye_m[order] @ ned_from_camera, rgb, cv2.LINE_AA)
 

@@ -7,8 +7,9 @@ from typing import NamedTuple, TypeAlias
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
+from sitl.camera.clutter import clutter
 from sitl.course import BAR_M, DEPTH_M, Course, Gate
 from sitl.vehicle.conditions import NOMINAL, Conditions, Rgb
 from sitl.vehicle.rotation import Vec3, wrap_pi
@@ -16,8 +17,6 @@ from sitl.vehicle.rotation import Vec3, wrap_pi
 FloatArray: TypeAlias = NDArray[np.float64]
 Image: TypeAlias = NDArray[np.uint8]
 
-LEG_M = 0.09  # width of the two posts that reach down to the ground
-PIP_M = 0.16
 PIP_PITCH_M = 0.32  # white squares on the front of the top bar count the gate's number from one
 INSIDE_BRIGHTNESS = 0.7
 SHADE_BRIGHTNESS = 0.4
@@ -40,27 +39,10 @@ RIDGE_ELEVATION_RAD = (math.radians(0.8), math.radians(6.5))
 
 GROUND_TILE_M = 16.0
 GROUND_TILE_PX = 512
-GRID_M = 2.0
 
-HAZE_RGB = (226, 210, 194)
-RIDGE_RGB = (150, 152, 170)
-SOIL_RGB = (112, 116, 74)
-GRASS_RGB = (62, 96, 62)
-GRID_RGB = (196, 200, 160)
-LEG_RGB = (58, 60, 68)
 PANEL_RGB = (74, 72, 66)
-PIP_RGB = (255, 248, 232)
-BACK_RGB = (96, 98, 112)  # a gate is grey from behind, the side that must not be entered
-BACKDROP_RGB = (
-    (-1.0, (78, 98, 66)),
-    (-0.30, (92, 108, 76)),
-    (-0.05, (168, 166, 146)),
-    (0.0, HAZE_RGB),
-    (0.10, (204, 214, 224)),
-    (0.40, (126, 172, 222)),
-    (1.0, (52, 100, 182)),
-)
-"""Rise of a viewing ray of unit depth and its colour, with interpolation in between."""
+BACKDROP_RISES = (-1.0, -0.30, -0.05, 0.0, 0.10, 0.40, 1.0)
+"""Rise of a viewing ray of unit depth for each colour of far ground, then sky; interpolated."""
 
 
 class _Face(NamedTuple):
@@ -68,7 +50,7 @@ class _Face(NamedTuple):
 
     corners_m: tuple[Vec3, ...]
     normal: Vec3  # towards the visible side; zero = visible from both sides
-    rgb: Rgb
+    rgb: ArrayLike
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -83,15 +65,19 @@ class Faces:
     """[N] row in ``centers_ned_m`` of the object that a face belongs to. Of one object's visible
     faces, a later one is never hidden by an earlier one."""
     centers_ned_m: FloatArray
-    """[M, 3] of the course's gates, the stray gates, then the panels."""
+    """[M, 3] of the course's gates, the stray gates, then the panels and other objects."""
 
 
 def course_faces(course: Course, conditions: Conditions = NOMINAL) -> Faces:
-    """Build all surfaces of the course's gates, stray gates and panels.
+    """Build all surfaces of the course's gates, stray gates, panels and clutter.
 
     A stray gate has the shading of the course's gate with the same number.
     """
     sun_ned, ambient = np.array(conditions.sun_ned), conditions.ambient
+
+    def light_on(normal_ned: FloatArray) -> float:
+        return ambient + (1 - ambient) * max(0.0, float(normal_ned @ sun_ned))
+
     random = np.random.Generator(np.random.PCG64((conditions.seed, 6)))
     is_shaded = random.random(len(course.gates)) < conditions.shaded_gates
     is_hidden = random.random(len(course.gates)) < conditions.hidden_gates
@@ -101,10 +87,9 @@ def course_faces(course: Course, conditions: Conditions = NOMINAL) -> Faces:
     for owner, gate in enumerate(gates):
         cos_yaw, sin_yaw = math.cos(gate.yaw_rad), math.sin(gate.yaw_rad)
         ned_from_gate = np.array([[cos_yaw, -sin_yaw, 0], [sin_yaw, cos_yaw, 0], [0, 0, 1]])
-        for face in _faces_of(gate, conditions.gate_rgb):
+        for face in _faces_of(gate, conditions):
             normal_ned = ned_from_gate @ np.array(face.normal)
-            light = ambient + (1 - ambient) * max(0.0, float(normal_ned @ sun_ned))
-            light *= SHADE_BRIGHTNESS if is_shaded[gate.index] else 1.0
+            light = light_on(normal_ned) * (SHADE_BRIGHTNESS if is_shaded[gate.index] else 1.0)
             corners.append(np.array(face.corners_m) @ ned_from_gate.T + gate.center_ned_m)
             normals.append(normal_ned)
             rgb.append(np.array(face.rgb) * light)
@@ -119,6 +104,12 @@ def course_faces(course: Course, conditions: Conditions = NOMINAL) -> Faces:
             rgb.append(tinted(PANEL_RGB, conditions.ground_tint))
             owners.append(len(centers))
             centers.append(tuple(corners[-1].mean(axis=0).tolist()))
+    for part in clutter(course, conditions):
+        corners.extend(part.corners_m)
+        normals.extend(part.normals)
+        rgb.extend(np.array(part.rgb) * light_on(normal) for normal in part.normals)
+        owners.extend([len(centers)] * len(part.normals))
+        centers.append(tuple(part.corners_m.mean(axis=(0, 1)).tolist()))
     return Faces(
         corners_ned_m=np.array(corners),
         normals_ned=np.array(normals),
@@ -151,32 +142,33 @@ def _stray_gates(course: Course, conditions: Conditions) -> list[Gate]:
     return strays
 
 
-def _faces_of(gate: Gate, front_rgb: tuple[Rgb, Rgb]) -> list[_Face]:
+def _faces_of(gate: Gate, look: Conditions) -> list[_Face]:
     """Return the faces in drawing order: posts, inner walls, outer walls, back, front, number.
 
     The walls inside the opening come first, since any other part of the frame may hide them. Two
     visible faces among the outer walls and rings never hide each other.
     """
     inner_m = gate.size_m / 2
-    outer_m = inner_m + BAR_M
-    middle_m = inner_m + BAR_M / 2
-    front_m, back_m = -DEPTH_M / 2, DEPTH_M / 2
-    paint = front_rgb[gate.index % len(front_rgb)]
-    red, green, blue = (round(value * INSIDE_BRIGHTNESS) for value in paint)
-    inside = (red, green, blue)
+    bar_m, half_m = BAR_M * look.bar_factor, DEPTH_M / 2 * look.depth_factor
+    outer_m, middle_m = inner_m + bar_m, inner_m + bar_m / 2
+    own = gate.index % 2
+    paints = np.array(look.gate_rgb, dtype=float)[[own, 1 - own if look.two_tone else own]]
+    inside = (paints * INSIDE_BRIGHTNESS).round()
     to_ground_m = (outer_m, -gate.center_ned_m[2])
-    number_m = (-middle_m - PIP_M / 2, -middle_m + PIP_M / 2)
-    pips = [(k - gate.index / 2) * PIP_PITCH_M for k in range(gate.index + 1)]
+    number_m = (-middle_m - look.pip_m / 2, -middle_m + look.pip_m / 2)
+    pips = [(k - gate.index / 2) * PIP_PITCH_M for k in range(gate.index + 1) if look.pip_m]
+    back, front = (1.0, 0.0, 0.0), (-1.0, 0.0, 0.0)
     return [
         *(
-            _Face(_upright(0.0, m, LEG_M, to_ground_m), BOTH_SIDES, LEG_RGB)
+            _Face(_upright(0.0, m, look.leg_m, to_ground_m), BOTH_SIDES, look.leg_rgb)
             for m in (-middle_m, middle_m)
+            if look.leg_m
         ),
-        *_tube(inner_m, (0.0, 0.0, 1.0), inside),
-        *_tube(outer_m, (0.0, 0.0, -1.0), inside),
-        *_ring(outer_m, inner_m, back_m, (1.0, 0.0, 0.0), BACK_RGB),
-        *_ring(outer_m, inner_m, front_m, (-1.0, 0.0, 0.0), paint),
-        *(_Face(_upright(front_m, m, PIP_M, number_m), (-1.0, 0.0, 0.0), PIP_RGB) for m in pips),
+        *_tube(inner_m, half_m, (0.0, 0.0, 1.0), inside),
+        *_tube(outer_m, half_m, (0.0, 0.0, -1.0), inside),
+        *_ring(outer_m, inner_m, half_m, back, np.array([look.gate_back_rgb] * 2, dtype=float)),
+        *_ring(outer_m, inner_m, -half_m, front, paints),
+        *(_Face(_upright(-half_m, m, look.pip_m, number_m), front, look.pip_rgb) for m in pips),
     ]
 
 
@@ -194,19 +186,20 @@ def _upright(
     )
 
 
-def _tube(half_m: float, top_normal: Vec3, rgb: Rgb) -> list[_Face]:
+def _tube(half_m: float, depth_m: float, top_normal: Vec3, paints: FloatArray) -> list[_Face]:
     """Return the walls of a square tube along the passage, given the normal of its top wall."""
-    depth_m = DEPTH_M / 2
     top = (
         (-depth_m, -half_m, -half_m),
         (-depth_m, half_m, -half_m),
         (depth_m, half_m, -half_m),
         (depth_m, -half_m, -half_m),
     )
-    return _quarter_turns(_Face(top, top_normal, rgb))
+    return _quarter_turns(top, top_normal, paints)
 
 
-def _ring(outer_m: float, inner_m: float, forward_m: float, normal: Vec3, rgb: Rgb) -> list[_Face]:
+def _ring(
+    outer_m: float, inner_m: float, forward_m: float, normal: Vec3, paints: FloatArray
+) -> list[_Face]:
     """Return the front or back of the frame around the opening, in four parts."""
     top = (
         (forward_m, -outer_m, -outer_m),
@@ -214,14 +207,17 @@ def _ring(outer_m: float, inner_m: float, forward_m: float, normal: Vec3, rgb: R
         (forward_m, inner_m, -inner_m),
         (forward_m, -inner_m, -inner_m),
     )
-    return _quarter_turns(_Face(top, normal, rgb))
+    return _quarter_turns(top, normal, paints)
 
 
-def _quarter_turns(top: _Face) -> list[_Face]:
-    """Return the face and its copies, turned about the passage by one to three quarter turns."""
-    faces = [top]
-    for _ in range(3):
-        corners_m, normal, rgb = faces[-1]
+def _quarter_turns(top_m: tuple[Vec3, ...], normal: Vec3, paints: FloatArray) -> list[_Face]:
+    """Return a face and its copies, turned about the passage by one to three quarter turns.
+
+    ``paints`` [2, 3] is the colour of top and bottom, then that of the sides.
+    """
+    faces = [_Face(top_m, normal, paints[0])]
+    for rgb in (paints[1], paints[0], paints[1]):
+        corners_m, normal, _ = faces[-1]
         faces.append(_Face(tuple(map(_quarter_turn, corners_m)), _quarter_turn(normal), rgb))
     return faces
 
@@ -257,8 +253,8 @@ def backdrop_colours(conditions: Conditions = NOMINAL) -> Image:
     Entry k is for a ray of unit depth that rises by k / 127.5 - 1.
     """
     up = np.linspace(-1.0, 1.0, 256)
-    stops, rgb = zip(*BACKDROP_RGB, strict=True)
-    channels = [np.interp(up, stops, [c[k] for c in rgb]) for k in range(3)]
+    rgb = (*conditions.far_ground_rgb, *conditions.sky_rgb)
+    channels = [np.interp(up, BACKDROP_RISES, [c[k] for c in rgb]) for k in range(3)]
     colours = (np.stack(channels, axis=1) * conditions.sky_tint).round().reshape(256, 1, 3)
     return np.asarray(np.clip(colours, 0, 255), dtype=np.uint8)
 
@@ -266,22 +262,34 @@ def backdrop_colours(conditions: Conditions = NOMINAL) -> Image:
 def ground_tile(conditions: Conditions = NOMINAL) -> Image:
     """Return a square of ground that repeats seamlessly, [GROUND_TILE_PX, GROUND_TILE_PX, 3] RGB.
 
-    Mottled grass and soil (for optic flow) under a 2 m grid (for scale). Axis 0 is east, 1 north.
+    Mottled grass and soil (for optic flow), in fields if any, under a grid (for scale). Axis 0 is
+    east, 1 north.
     """
     random = np.random.Generator(np.random.PCG64(conditions.ground_seed))
     patches = _periodic_noise(random, smooth_m=1.2)[..., None]
     speckle = _periodic_noise(random, smooth_m=0.06)[..., None]
     contrast = conditions.ground_contrast
-    mix = np.clip(0.5 + 0.35 * contrast * patches, 0, 1)
-    ground = mix * np.array(SOIL_RGB) + (1 - mix) * np.array(GRASS_RGB)
+    mix = np.clip(0.5 + 0.35 * contrast * patches + _fields(conditions.field_m), 0, 1)
+    first, second = map(np.array, conditions.ground_rgb)
+    ground = mix * first + (1 - mix) * second
     lit = ground * (1 + 0.13 * contrast * speckle) * conditions.ground_tint
     tile = np.asarray(np.clip(lit, 0, 255), dtype=np.uint8)
-    grid_rgb = tinted(GRID_RGB, conditions.ground_tint).tolist()
-    pitch_px = round(GRID_M * GROUND_TILE_PX / GROUND_TILE_M)
+    if not conditions.grid_m:
+        return tile
+    grid_rgb = tinted(conditions.grid_rgb, conditions.ground_tint).tolist()
+    pitch_px = round(conditions.grid_m * GROUND_TILE_PX / GROUND_TILE_M)
     for at_px in range(pitch_px // 2, GROUND_TILE_PX, pitch_px):
         cv2.line(tile, (at_px, 0), (at_px, GROUND_TILE_PX), grid_rgb, thickness=3)
         cv2.line(tile, (0, at_px), (GROUND_TILE_PX, at_px), grid_rgb, thickness=3)
     return tile
+
+
+def _fields(field_m: tuple[float, float]) -> FloatArray:
+    """Return what sets each pixel's field off, [GROUND_TILE_PX, GROUND_TILE_PX, 1]: -0.7 or 0.7; 0
+    without fields."""
+    at_m = np.arange(GROUND_TILE_PX) * (GROUND_TILE_M / GROUND_TILE_PX)
+    east, north = (np.where(at_m % (2 * m) < m, 1.0, -1.0) if m else 0 * at_m + 1 for m in field_m)
+    return np.outer(east, north)[..., None] * (0.7 if any(field_m) else 0.0)
 
 
 def _periodic_noise(random: np.random.Generator, *, smooth_m: float) -> FloatArray:

@@ -1,20 +1,24 @@
 """Differences between flights: airframe, firmware settings, wind, noise, light, lens.
 
 The defaults are exactly the nominal vehicle and view. `random_conditions` draws others, so that a
-policy generalises beyond this vehicle (Tobin et al., "Domain Randomization", 2017).
+policy generalises beyond this vehicle (Tobin et al., "Domain Randomization", 2017);
+`sitl.vehicle.looks` also changes colours, objects and weather.
 """
 
 import colorsys
 import math
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass, replace
-from typing import TypeAlias
+from typing import TypeAlias, TypeVar
 
 import numpy as np
 
 from sitl import UsageError
 from sitl.vehicle.rotation import Vec3
 
+T = TypeVar("T")
 Rgb: TypeAlias = tuple[int, int, int]
+Hsv: TypeAlias = tuple[Vec3, Vec3]  # least and most hue, saturation and value, each in 0..1
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -66,6 +70,31 @@ class Conditions:
     horizontal_fov_rad: float = math.radians(90.0)
 
     gate_rgb: tuple[Rgb, Rgb] = ((255, 126, 22), (222, 34, 48))  # even gates, odd gates
+    gate_back_rgb: Rgb = (96, 98, 112)  # grey: the side that must not be entered
+    pip_rgb: Rgb = (255, 248, 232)  # of the squares that count a gate's number
+    pip_m: float = 0.16  # side of these squares; 0: none
+    leg_rgb: Rgb = (58, 60, 68)
+    leg_m: float = 0.09  # width of the two posts that reach down to the ground; 0: none
+    bar_factor: float = 1.0  # on the drawn width of the bars around an opening
+    depth_factor: float = 1.0  # on the drawn depth of a gate
+    two_tone: float = 0.0  # 1: the upright bars of a gate have the other gates' colour
+    sky_rgb: tuple[Rgb, ...] = ((226, 210, 194), (204, 214, 224), (126, 172, 222), (52, 100, 182))
+    """From the horizon, whose colour is also that of haze, to the zenith."""
+    far_ground_rgb: tuple[Rgb, ...] = ((78, 98, 66), (92, 108, 76), (168, 166, 146))
+    """From straight down to the horizon."""
+    ridge_rgb: Rgb = (150, 152, 170)
+    haze_m: float = 90.0  # distance at which an object has lost 63 % of its contrast
+    ground_fade_m: float = 14.0
+    """Distance at which the ground has lost 3/4 of its contrast; farther texture would alias."""
+    ground_rgb: tuple[Rgb, Rgb] = ((112, 116, 74), (62, 96, 62))  # soil, grass
+    field_m: tuple[float, float] = (0.0, 0.0)
+    """Width of alternating fields from west to east and from south to north, a divisor of 8; 0: no
+    change in this direction."""
+    grid_rgb: Rgb = (196, 200, 160)
+    grid_m: float = 2.0  # pitch of the lines on the ground, a divisor of 16; 0: none
+    clutter: float = 0.0  # objects for each gate, clear of the path
+    lens_drops: float = 0.0  # on the lens
+
     ground_tint: Vec3 = (1.0, 1.0, 1.0)  # factors on red, green and blue
     sky_tint: Vec3 = (1.0, 1.0, 1.0)  # factors on red, green, blue; also tints haze and far ground
     ground_seed: int = 0  # seed of the pattern of grass and soil
@@ -111,36 +140,13 @@ def random_conditions(seed: int) -> Conditions:
     if seed < 0:
         raise UsageError(f"a conditions seed is 0 or more, got {seed}")
     conditions = replace(NOMINAL, seed=seed)
-    draw = _Draw(np.random.Generator(np.random.PCG64(seed)))
+    draw = Draw(np.random.Generator(np.random.PCG64(seed)))
     for vary in _VARIATIONS:
         conditions = vary(conditions, draw)
     return conditions
 
 
-def held_out_conditions(seed: int) -> Conditions:
-    """Return vehicle, wind and lens of ``random_conditions`` with a look that no demonstration has.
-
-    One seed in five each: gates partly hidden by panels; gates in shadow over high-contrast ground;
-    night with shining gates; a low sun in the lens; stray gates beside the path.
-
-    Raises:
-        UsageError: a negative seed.
-    """
-    conditions = random_conditions(seed)
-    draw = _Draw(np.random.Generator(np.random.PCG64((seed, 7))))
-    match seed % 5:
-        case 0:
-            return replace(conditions, hidden_gates=0.7)
-        case 1:
-            return replace(conditions, shaded_gates=0.6, ground_contrast=2.0 * draw.factor(1.3))
-        case 2:
-            return _make_night(conditions, draw)
-        case 3:
-            return _make_glare(conditions, draw)
-    return replace(conditions, stray_gates=0.8)
-
-
-class _Draw:
+class Draw:
     """Uniform draws around a nominal value."""
 
     def __init__(self, random: np.random.Generator) -> None:
@@ -155,6 +161,20 @@ class _Draw:
 
     def amount(self, most: float) -> float:
         return float(self.random.uniform(0.0, most))
+
+    def between(self, least: float, most: float) -> float:
+        return float(self.random.uniform(least, most))
+
+    def chance(self, share: float) -> bool:
+        return bool(self.random.random() < share)
+
+    def one_of(self, options: Sequence[T]) -> T:
+        return options[int(self.random.integers(len(options)))]
+
+    def colour(self, ranges: Hsv) -> Rgb:
+        parts = colorsys.hsv_to_rgb(*self.random.uniform(*ranges))
+        red, green, blue = (round(255 * float(part)) for part in parts)
+        return (red, green, blue)
 
     def tint(self, most: float) -> Vec3:
         """Return one factor each for red, green and blue."""
@@ -180,7 +200,7 @@ class _Draw:
         return (round(255 * red), round(255 * green), round(255 * blue))
 
 
-def _direction_ned(azimuth_rad: float, elevation_rad: float) -> Vec3:
+def direction_ned(azimuth_rad: float, elevation_rad: float) -> Vec3:
     return (
         math.cos(elevation_rad) * math.cos(azimuth_rad),
         math.cos(elevation_rad) * math.sin(azimuth_rad),
@@ -188,7 +208,7 @@ def _direction_ned(azimuth_rad: float, elevation_rad: float) -> Vec3:
     )
 
 
-def _vary_physics(nominal: Conditions, draw: _Draw) -> Conditions:
+def _vary_physics(nominal: Conditions, draw: Draw) -> Conditions:
     body = replace(
         nominal,
         mass_factor=draw.factor(1.12),
@@ -208,7 +228,7 @@ def _vary_physics(nominal: Conditions, draw: _Draw) -> Conditions:
     )
 
 
-def _vary_lens(nominal: Conditions, draw: _Draw) -> Conditions:
+def _vary_lens(nominal: Conditions, draw: Draw) -> Conditions:
     return replace(
         nominal,
         camera_tilt_rad=nominal.camera_tilt_rad + draw.offset(math.radians(6.0)),
@@ -219,7 +239,7 @@ def _vary_lens(nominal: Conditions, draw: _Draw) -> Conditions:
     )
 
 
-def _vary_scene(nominal: Conditions, draw: _Draw) -> Conditions:
+def _vary_scene(nominal: Conditions, draw: Draw) -> Conditions:
     azimuth_rad = draw.angle_rad()
     elevation_rad = math.radians(float(draw.random.uniform(15.0, 80.0)))
     first, second = nominal.gate_rgb
@@ -229,7 +249,7 @@ def _vary_scene(nominal: Conditions, draw: _Draw) -> Conditions:
         ground_tint=draw.light(1.25, 1.3),
         sky_tint=draw.light(1.1, 1.15),
         ground_seed=int(draw.random.integers(1 << 16)),
-        sun_ned=_direction_ned(azimuth_rad, elevation_rad),
+        sun_ned=direction_ned(azimuth_rad, elevation_rad),
         ambient=min(0.95, max(0.4, nominal.ambient + draw.offset(0.15))),
         exposure=draw.factor(1.3),
         white_balance=draw.tint(1.08),
@@ -238,7 +258,7 @@ def _vary_scene(nominal: Conditions, draw: _Draw) -> Conditions:
     )
 
 
-def _vary_firmware(nominal: Conditions, draw: _Draw) -> Conditions:
+def _vary_firmware(nominal: Conditions, draw: Draw) -> Conditions:
     """Draw firmware settings: whole numbers for integer parameters, three decimals for floats."""
     lean_gain_factor = draw.factor(1.35)
     roll_gain, pitch_gain, yaw_gain = nominal.angle_gains_per_s
@@ -264,7 +284,7 @@ def _vary_firmware(nominal: Conditions, draw: _Draw) -> Conditions:
     )
 
 
-def _vary_streams(nominal: Conditions, draw: _Draw) -> Conditions:
+def _vary_streams(nominal: Conditions, draw: Draw) -> Conditions:
     """Draw stream timing; half of the links send every message at the requested rate."""
     is_slow = draw.random.random() < 0.5
     slowdown_ms = round(draw.amount(23.0))
@@ -276,7 +296,7 @@ def _vary_streams(nominal: Conditions, draw: _Draw) -> Conditions:
     )
 
 
-def _vary_airframe_and_shutter(nominal: Conditions, draw: _Draw) -> Conditions:
+def _vary_airframe_and_shutter(nominal: Conditions, draw: Draw) -> Conditions:
     """Draw drag from a racing frame's to that of PX4's SIH, 1 N per m/s; half of the frames keep
     the lower drag. Exposure and read-out reach those of a common 30 Hz rolling shutter camera."""
     is_heavy = draw.random.random() < 0.5
@@ -301,22 +321,3 @@ _VARIATIONS = (
     _vary_airframe_and_shutter,
 )
 """Order of the draws, which is part of the seed's meaning."""
-
-
-def _make_night(usual: Conditions, draw: _Draw) -> Conditions:
-    sky, ground = 0.12 * draw.factor(1.5), 0.2 * draw.factor(1.5)
-    return replace(
-        usual,
-        sky_tint=(sky, sky, 1.3 * sky),
-        ground_tint=(ground, ground, ground),
-        ambient=1.0,
-        image_noise=10.0 + draw.amount(6.0),
-    )
-
-
-def _make_glare(usual: Conditions, draw: _Draw) -> Conditions:
-    """Put the sun ahead on the first leg, up to 60 degrees to either side."""
-    azimuth_rad, elevation_rad = draw.offset(math.pi / 3), math.radians(4.0 + draw.amount(14.0))
-    return replace(
-        usual, glare=0.5 + draw.amount(0.5), sun_ned=_direction_ned(azimuth_rad, elevation_rad)
-    )

@@ -11,15 +11,23 @@ from sitl.ardupilot.autopilot import ArduCopter
 from sitl.ardupilot.flight_modes import Mode
 from sitl.ardupilot.params import ArduPilotParams
 from sitl.camera.fpv import FpvRenderer
-from sitl.course import make_course
-from sitl.vehicle.conditions import NOMINAL, held_out_conditions, random_conditions
+from sitl.course import Course, Gate, make_course
+from sitl.vehicle.conditions import NOMINAL, random_conditions
 from sitl.vehicle.config import VehicleConfig
+from sitl.vehicle.looks import held_out_conditions, training_conditions, unseen_conditions
 from sitl.vehicle.rotation import from_euler
 
 POSE = ((1.0, 0.3, -2.2), from_euler(0.1, -0.15, 0.05))
 
 HELD_OUT = {"hidden_gates", "shaded_gates", "stray_gates", "glare"}
+UNSEEN = {"haze_m", "ground_fade_m", "lens_drops"}
 """Never drawn for a demonstration."""
+MAKE = {
+    *("gate_back_rgb", "pip_rgb", "pip_m", "leg_rgb", "leg_m", "bar_factor", "depth_factor"),
+    *("two_tone", "sky_rgb", "far_ground_rgb", "ridge_rgb", "ground_rgb", "field_m", "grid_rgb"),
+    *("grid_m", "clutter"),
+}
+"""Drawn for demonstrations, but not by ``random_conditions``."""
 NOMINAL_POSITION = (-0.661369108, -8.008113679, -3.14245931)
 NOMINAL_ATTITUDE = (0.995199671, 0.097863692, -0.00053679, -0.000157648)
 NOMINAL_VIEW = [
@@ -70,7 +78,7 @@ def test_every_field_is_drawn_and_the_seed_decides():
     drawn = random_conditions(8)
     assert drawn == random_conditions(8)
     same = {f.name for f in fields(drawn) if getattr(drawn, f.name) == getattr(NOMINAL, f.name)}
-    assert same == HELD_OUT
+    assert same == HELD_OUT | UNSEEN | MAKE
 
 
 def test_a_held_out_look_is_one_that_no_demonstration_has():
@@ -88,6 +96,46 @@ def test_a_held_out_look_is_one_that_no_demonstration_has():
     assert set(changed.values()) == {8}
 
 
+def test_a_training_look_changes_anything_but_what_is_held_out():
+    """Its darkest sky is brighter than the brightest night. One in three is as drawn at random."""
+    looks = [training_conditions(seed) for seed in range(300)]
+    plain = [look for look in looks if look == random_conditions(look.seed)]
+    assert 60 < len(plain) < 140
+    changed = set()
+    for look in looks:
+        usual = random_conditions(look.seed)
+        changed |= {f.name for f in fields(look) if getattr(look, f.name) != getattr(usual, f.name)}
+        assert all(getattr(look, name) == getattr(NOMINAL, name) for name in HELD_OUT | UNSEEN)
+        assert look.ground_contrast == usual.ground_contrast
+        assert sky_level(look) > 60
+    assert changed == MAKE | {"gate_rgb", "ground_tint", "sun_ned", "ambient", "exposure"}
+    nights = [held_out_conditions(seed) for seed in range(2, 300, 5)]
+    assert max(sky_level(replace(night, exposure=1.0)) for night in nights) < 45
+
+
+def sky_level(look):
+    """Mean level of the sky, 0..255."""
+    return look.exposure * (np.mean(look.sky_rgb, axis=0) * look.sky_tint).mean()
+
+
+def test_an_unseen_look_is_fog_or_a_dirty_lens():
+    for seed in range(8):
+        usual, unseen = random_conditions(seed), unseen_conditions(seed)
+        assert unseen.wind_ned_mps == usual.wind_ned_mps
+        assert (unseen.lens_drops > 0) == bool(seed % 2) == (unseen.haze_m == usual.haze_m)
+
+
+def test_fog_hides_all_that_is_far():
+    """A gate 30 m away and the ground before it look like the sky; the near ground does not."""
+    fog = replace(unseen_conditions(4), image_noise=0.0, camera_roll_rad=0.0)
+    gate = Gate(center_ned_m=(30.0, 0.0, -2.0), yaw_rad=0.0, size_m=2.4, index=0)
+    image = FpvRenderer(Course(seed=0, gates=(gate,)), 64, 64, fog).render(
+        (0.0, 0.0, -2.0), from_euler(0.0, -fog.camera_tilt_rad, 0.0)
+    )
+    assert np.ptp(image[:34], axis=(0, 1)).max() < 12
+    assert np.ptp(image[50:], axis=(0, 1)).max() > 20
+
+
 @pytest.mark.parametrize("name", ["hidden_gates", "shaded_gates", "stray_gates", "glare"])
 def test_conditions_that_hide_gates_change_the_picture(name):
     """A sun straight ahead, for the glare."""
@@ -96,9 +144,12 @@ def test_conditions_that_hide_gates_change_the_picture(name):
     assert np.abs(changed - render(usual)).mean() > 0.5
 
 
-def test_a_negative_seed_is_refused():
+@pytest.mark.parametrize(
+    "draw", [random_conditions, held_out_conditions, training_conditions, unseen_conditions]
+)
+def test_a_negative_seed_is_refused(draw):
     with pytest.raises(UsageError):
-        random_conditions(-1)
+        draw(-1)
 
 
 def test_the_wind_carries_a_level_vehicle_along():
