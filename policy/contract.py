@@ -103,7 +103,7 @@ MAX_AGE_LIMIT_S = 60.0
 ENVELOPE_TERMS = ("max_tilt_deg", "max_speed_mps", "max_height_m", "max_distance_m")
 _CHUNK_AGES = ("max_state_age_s", "max_velocity_age_s", "max_feature_age_s", "max_chunk_age_s")
 LIMIT_TERMS = (*_CHUNK_AGES, "max_stall_s", *ENVELOPE_TERMS)
-FLIGHT_TERMS = ("action", "modes", "play_s", "state_time", "holds_position", *LIMIT_TERMS)
+FLIGHT_TERMS = ("action", "modes", "play_s", "state_time", "stops_at_end", *LIMIT_TERMS)
 """Fields that decide how a policy is flown and do not affect its network's output."""
 _TUPLES = (
     *("cameras", "camera_rates_hz", "image_crop", "state_extras"),
@@ -200,9 +200,9 @@ class Contract:
     play_s: float = 0.0
     """Longest time for which the policy was designed to play one chunk before the next; the four
     age limits count from the chunk's beginning. 0: a new chunk from every new state."""
-    holds_position: bool = False
-    """True: while the vehicle stands still, the velocity in the state includes half of its
-    displacement per second. A policy that brakes to a stop then stays where it stopped."""
+    stops_at_end: bool = False
+    """True: the policy stops where its task ends. Once it has stood still for 1.5 s, the flight
+    ends and the autopilot holds the place, which a policy without memory cannot."""
     action: ActionKind = "sticks"
     velocity_frame: VelocityFrame = "world"
     hover_thrust: float = 0.39
@@ -263,7 +263,7 @@ class Contract:
         for name, kind in _CHOICES.items():
             choices = get_args(kind)
             yield name, getattr(self, name) in choices, " or ".join(map(repr, choices))
-        for name in ("since_exposure", "holds_position"):
+        for name in ("since_exposure", "stops_at_end"):
             yield name, isinstance(getattr(self, name), bool), "true or false"
         for name, (low, high) in _INTEGERS.items():
             value = getattr(self, name)

@@ -266,13 +266,13 @@ def _fly(spec: DemonstrationSpec, should_stop: Callable[[], bool], stack: ExitSt
         image_width=size_px,
         action=spec.config.action,
         max_tilt_deg=RATE_TILT_DEG if spec.config.action == "rates" else None,
-        holds_position=True,
+        stops_at_end=True,
     )
     if wanted.checkpoint is not None:
         loaded = load_for_episodes(replace(wanted, dual_rate=True), MonotonicClock())
         student = stack.enter_context(loaded).runner
         max_age_s = student.contract.max_feature_age_s + longest_solve_ns / NS_PER_S
-        contract = replace(student.contract, max_feature_age_s=max_age_s, holds_position=True)
+        contract = replace(student.contract, max_feature_age_s=max_age_s, stops_at_end=True)
         student = replace(student, contract=contract)
         if contract.action != spec.config.action:
             raise UserError(
@@ -299,6 +299,7 @@ def _fly(spec: DemonstrationSpec, should_stop: Callable[[], bool], stack: ExitSt
             pilot.runner,
             max_time_s=spec.config.max_time,
             run_out_s=variation.hover_s,
+            ends_by_stop=False,
             sinks=(recorder,),
             should_stop=should_stop,
         )

@@ -92,7 +92,7 @@ def fit_to_flights(
         since_exposure=settings.since_exposure,
         hover_thrust=terms.hover_thrust,
         max_tilt_deg=terms.max_tilt_deg,
-        holds_position=terms.holds_position,
+        stops_at_end=terms.stops_at_end,
     )
     if terms.action == "rates":
         contract = rates_contract(contract)

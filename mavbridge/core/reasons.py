@@ -63,6 +63,7 @@ class Code(StrEnum):
     DURATION = auto()
     SIGNAL = auto()
     COURSE_DONE = auto()
+    POLICY_STOPPED = auto()
     LANDED = auto()
     TOLD_TO_END = auto()
     FINISHED = auto()
@@ -208,6 +209,7 @@ _REASONS: dict[Code, tuple[Kind, str]] = {
     Code.DURATION: (_END, "the flight is over"),
     Code.SIGNAL: (_END, "the flight was ended by a signal"),
     Code.COURSE_DONE: (_END, "the course is done"),
+    Code.POLICY_STOPPED: (_END, "the policy has stopped"),
     Code.LANDED: (_END, "the vehicle has landed"),
     Code.TOLD_TO_END: (_END, "the guard was told to end"),
     Code.FINISHED: (_END, "the {what} is over"),

@@ -19,7 +19,7 @@ ActionKind: TypeAlias = Literal["sticks", "rates", "attitude", "velocity"]
 OnFault: TypeAlias = Literal["auto", "release", "hold", "land", "rtl"]
 """What follows the neutral sticks when a flight ends by our own doing."""
 FlightEnd: TypeAlias = Literal[
-    "course", "duration", "landed", "operator", "signal", "takeover", "disarmed", "fault"
+    "course", "stopped", "duration", "landed", "operator", "signal", "takeover", "disarmed", "fault"
 ]
 """How the policy's flight ended: planned, by the pilot or the vehicle, or by a fault of ours."""
 

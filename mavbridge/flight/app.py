@@ -255,8 +255,8 @@ class _Flight:
             if (fault := self._fault(visions, policy)) is not None:
                 ending = EndRequest(reason=fault, is_fault=True)
                 break
-            if referee.is_course_over(self._clock.now_ns()):
-                ending = EndRequest(reason=because(Code.COURSE_DONE), end="course")
+            if (over := referee.ending(self._clock.now_ns())) is not None:
+                ending = over
                 break
             stop.wait(1 / STATUS_HZ)
         self._end(ending, listener, stop)

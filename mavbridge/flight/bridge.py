@@ -96,7 +96,6 @@ def build_bridge(
         chunk_dt_s=contract.chunk_dt_s,
         forward=ForwardState(contract) if contract.state_time == "execution" else None,
         prefix_len=contract.prefix_len,
-        holds_position=contract.holds_position,
         max_frozen_ns=round(config.limits.max_frozen_state * NS_PER_S),
         period_ns=plan.guard.chunk_period_ns,
     )

@@ -68,7 +68,7 @@ class FlightObservers:
             stick_hz=config.rates.stick_rate, action_hz=action_hz, vision_hz=vision_hz
         )
         self._gates = None if config.gates is None else read_gates(config.gates)
-        self.referee = FlightReferee(self._gates, stops=plan.contract.holds_position)
+        self.referee = FlightReferee(self._gates, stops=plan.contract.stops_at_end)
         self._viewer: ObserverThread | None = None
         self._recorder: Recorder | None = None
         self._guard: GuardProcess | None = None

@@ -10,11 +10,11 @@ from typing import NamedTuple
 from mavbridge.core.clock import NS_PER_S
 from mavbridge.core.course import CourseGate, CourseProgress
 from mavbridge.core.errors import ExitCode
-from mavbridge.core.reasons import Reason
+from mavbridge.core.reasons import Code, Reason, because
 from mavbridge.core.records import Event, FlightOutcome, Tick
 from mavbridge.core.stopping import StopRequest
 from mavbridge.core.vehicle import FlightEnd
-from mavbridge.guard.values import Phase
+from mavbridge.guard.values import EndRequest, Phase
 from mavbridge.guard.wire import GuardStatus, GuardSummary
 from mavbridge.recording.crash import CrashWatch
 
@@ -23,10 +23,13 @@ RUN_OUT_NS = NS_PER_S
 """Time from the last gate to the end of the flight, in which a crash still counts."""
 MAX_RUN_OUT_NS = 10 * NS_PER_S
 """Longest such time of a policy that stops after the last gate."""
-STOPPED_MPS = 0.3
-"""Speed below which a vehicle has stopped."""
+STILL_MPS, MOVED_MPS = 0.6, 1.5
+"""Speeds below which a vehicle stands still, and above which it has flown."""
+STILL_NS = 3 * NS_PER_S // 2
+"""Time of standing still that ends the flight of a policy that stops."""
 _ENDS: dict[FlightEnd, str] = {
     "course": "the end of the course",
+    "stopped": "the policy's stop",
     "duration": "--duration",
     "landed": "a landing",
     "operator": "the operator",
@@ -38,15 +41,42 @@ _ENDS: dict[FlightEnd, str] = {
 _UNPLANNED = ("takeover", "disarmed", "fault")
 
 
+class Standstill:
+    """Tells by the ticks of a policy when it has stopped a vehicle that it had flown."""
+
+    def __init__(self) -> None:
+        self._has_moved = False
+        self._since_ns: int | None = None
+
+    def see(self, tick: Tick) -> None:
+        """Follow a tick; those without the policy in control interrupt a standstill."""
+        speed_mps = speed_of(tick)
+        self._has_moved = self._has_moved or (speed_mps or 0.0) > MOVED_MPS
+        is_still = speed_mps is not None and speed_mps < STILL_MPS and self._has_moved
+        if tick.phase != Phase.FLYING.value or not is_still:
+            self._since_ns = None
+        elif self._since_ns is None:
+            self._since_ns = tick.sent_ns
+
+    def has_lasted(self, now_ns: int) -> bool:
+        """True if the vehicle has been standing still for long enough."""
+        return self._since_ns is not None and now_ns - self._since_ns >= STILL_NS
+
+
+def speed_of(tick: Tick) -> float | None:
+    """Return the speed in m/s; None if the policy had no state."""
+    return None if tick.state is None else math.hypot(*tick.state.values[:3].tolist())
+
+
 class FlightReferee:
     """``TickSink`` that follows the policy's flight to its outcome; other threads may ask it."""
 
     def __init__(self, gates: Sequence[CourseGate] | None, *, stops: bool = False) -> None:
         """``gates``: the course's gates in order; None if no course was named.
 
-        ``stops``: the policy stops after the last one, and the flight ends only then.
+        ``stops``: the policy stops at the end, and the flight ends only then.
         """
-        self._stops = stops
+        self._standstill = Standstill() if stops else None
         self._gates_total = len(gates) if gates else None
         self._course = CourseProgress(gates or ())
         self._crashes = CrashWatch()
@@ -60,6 +90,8 @@ class FlightReferee:
         """Follow the ticks from the policy's first action on."""
         if not isinstance(event, Tick):
             return
+        if self._standstill is not None:
+            self._standstill.see(event)
         was_flying, self._is_flying = self._is_flying, event.phase == Phase.FLYING.value
         if self._is_flying:
             self._began_ns = self._began_ns or event.sent_ns
@@ -85,19 +117,22 @@ class FlightReferee:
         """How the vehicle hit something, in words; None if it was not seen to."""
         return self._crashes.reason
 
-    def is_course_over(self, now_ns: int) -> bool:
-        """True if the last gate was passed more than the run-out ago, and the vehicle stopped."""
-        if not self._course.is_done or now_ns - self._course.passed_ns[-1] < RUN_OUT_NS:
-            return False
-        is_late = now_ns - self._course.passed_ns[-1] >= MAX_RUN_OUT_NS
-        speed_mps = self._speed_mps
-        return not self._stops or is_late or (speed_mps is not None and speed_mps < STOPPED_MPS)
+    def ending(self, now_ns: int) -> EndRequest | None:
+        """Return the end of the course, or of a policy that stops; None before it.
 
-    @property
-    def _speed_mps(self) -> float | None:
-        """Speed at the last tick in which the policy had control."""
-        state = None if self._flown is None else self._flown.state
-        return None if state is None else math.hypot(*state.values[:3].tolist())
+        The course ends a run-out after the last gate; where the policy stops, once it has.
+        """
+        done_ns = now_ns - self._course.passed_ns[-1] if self._course.is_done else None
+        run_out_ns = RUN_OUT_NS
+        if self._standstill is not None:
+            run_out_ns = MAX_RUN_OUT_NS
+            if self._standstill.has_lasted(now_ns):
+                run_out_ns = 0
+                if done_ns is None:
+                    return EndRequest(reason=because(Code.POLICY_STOPPED), end="stopped")
+        if done_ns is None or done_ns < run_out_ns:
+            return None
+        return EndRequest(reason=because(Code.COURSE_DONE), end="course")
 
     def outcome(
         self, end: FlightEnd, vehicle: GuardStatus, asked: Reason | None = None
@@ -115,7 +150,7 @@ class FlightReferee:
             reason=asked if self._reason is None else self._reason,
             flown_s=(flown.sent_ns - self._began_ns) / NS_PER_S,
             height_m=None if position is None else -position.down,
-            speed_mps=self._speed_mps,
+            speed_mps=speed_of(flown),
             mode=vehicle.mode,
             is_armed=vehicle.armed,
             is_landed=vehicle.is_landed,

@@ -24,7 +24,6 @@ from mavbridge.flight.state import (
     StateReader,
     Unavailable,
 )
-from mavbridge.flight.station import StationKeeper
 from mavbridge.flight.telemetry_cache import SolveInputs, TelemetryCache
 from mavbridge.guard.chunks import Chunk
 from mavbridge.guard.values import Phase
@@ -58,8 +57,6 @@ class PolicySettings:
     """Predicts the state to the time at which the chunk acts; None: the state as measured."""
     prefix_len: int = 0
     """Committed actions behind the action history."""
-    holds_position: bool = False
-    """Tell a policy that stands still how far it has been displaced."""
     period_ns: int
     """Minimum mean period of solves. Attitudes that arrive close together may shorten a single
     one."""
@@ -98,7 +95,6 @@ class PolicyLoop:
         self._frozen = FrozenStateCheck(max_frozen_ns=settings.max_frozen_ns)
         self._serial = 0
         self._forward = settings.forward
-        self._station = StationKeeper() if settings.holds_position else None
         self._chunk: Chunk | None = None
         """Last chunk that was sent."""
         self._solves_ns: deque[int] = deque(maxlen=RECENT_SOLVES)
@@ -166,7 +162,6 @@ class PolicyLoop:
         if is_starting:
             self._reset_ns = now_ns
             self._reset()
-            self._station = StationKeeper() if self._settings.holds_position else None
         for past in self._view.take_past(self._seen_ns):
             if (before := self._reader.past(past, has_position=has_position)) is not None:
                 self._observations.remember(before)
@@ -178,11 +173,8 @@ class PolicyLoop:
         observation = self._observe(state, telemetry, now_ns, plan)
         if isinstance(observation, Unavailable):
             self._refuse(observation.reason)
-            return
-        if self._station is not None:
-            states = self._station.corrected(state, observation.states)
-            observation = observation._replace(states=states)
-        self._solve(state, observation, now_ns, plan)
+        else:
+            self._solve(state, observation, now_ns, plan)
 
     def _observe(
         self, state: VehicleState, telemetry: Telemetry, now_ns: int, plan: Chunk | None

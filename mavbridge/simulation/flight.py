@@ -133,13 +133,15 @@ class SimulatedFlight:
         *,
         max_time_s: float = MAX_TIME_S,
         run_out_s: float = RUN_OUT_S,
+        ends_by_stop: bool = True,
         sinks: tuple[TickSink, ...] = (),
         should_stop: Callable[[], bool] | None = None,
     ) -> EpisodeResult:
         """Arm, fly and return the sticks; ends after the last gate, a crash or ``max_time_s``.
 
         The runner must not remember earlier flights; ``max_time_s`` counts from its first action,
-        ``run_out_s`` from the last gate.
+        ``run_out_s`` from the last gate. A policy that stops at the end hands the vehicle to the
+        autopilot then, unless ``ends_by_stop`` is False.
         ``should_stop`` is called after each step of the vehicle.
 
         Raises:
@@ -157,11 +159,14 @@ class SimulatedFlight:
             self.vehicle,
             max_time_s=max_time_s,
             run_out_s=run_out_s,
+            stops=ends_by_stop and runner.contract.stops_at_end,
             should_stop=should_stop,
         )
         self.watch_steps(referee.watch)
         guard = self._compose(runner, (referee, *sinks))
         while not referee.stop.is_set():
+            if referee.has_stopped:  # the autopilot holds the place for the rest of the run-out
+                guard.stop(EndRequest(reason=because(Code.POLICY_STOPPED), end="stopped"))
             self.clock.sleep_until_ns(self.clock.now_ns() + STEP_NS)
         guard.stop(EndRequest(reason=because(Code.DURATION)))
         end_ns = self.clock.now_ns() + END_NS

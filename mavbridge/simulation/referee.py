@@ -12,6 +12,7 @@ from mavbridge.core.errors import MavbridgeError, PeerError
 from mavbridge.core.reasons import Reason
 from mavbridge.core.records import Event, Tick
 from mavbridge.core.vehicle import Action
+from mavbridge.flight.outcome import Standstill
 from policy.contract import ACTION_DIM
 from sitl.course import make_course
 from sitl.simulated_vehicle import SimulatedVehicle
@@ -25,8 +26,9 @@ RUN_OUT_S = 1.0
 """Time from the last gate to the end: a crash just behind the gate counts."""
 STILL_MPS = 0.3
 """Speed below which the vehicle has stopped."""
-Outcome = Literal["finished", "crashed", "disarmed", "timed out"]
-"""All gates passed; ground or gate hit; motors stopped in flight; none of these in time."""
+Outcome = Literal["finished", "crashed", "disarmed", "stopped", "timed out"]
+"""All gates passed; ground or gate hit; motors stopped in flight; the policy stopped before the
+last gate; none of these in time."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -47,8 +49,8 @@ class EpisodeResult:
     lost: Reason | None = None
     """Why the policy lost control before the end; None: it kept it."""
     drift_m: float | None = None
-    """Distance between the place where it first stopped after the last gate and the place at the
-    end; None if it did not stop."""
+    """Horizontal distance between the place where it first stopped after the last gate and the
+    place at the end; None if it did not stop."""
 
     @property
     def has_finished(self) -> bool:
@@ -127,11 +129,13 @@ class Referee:
         *,
         max_time_s: float,
         run_out_s: float = RUN_OUT_S,
+        stops: bool = False,
         should_stop: Callable[[], bool] | None,
     ) -> None:
         self._clock = clock
         self._vehicle = vehicle
         self._run_out_ns = round(run_out_s * NS_PER_S)
+        self._standstill = Standstill() if stops else None
         self._stopped_ned_m: Vec3 | None = None
         self._max_time_ns = round(max_time_s * NS_PER_S)
         self._should_stop = should_stop
@@ -146,9 +150,11 @@ class Referee:
 
     def emit(self, event: Event) -> None:
         """Follow the bridge's ticks."""
-        if isinstance(event, Tick) and not self.stop.is_set():
+        if isinstance(event, Tick) and not (self.stop.is_set() or self.has_stopped):
             self._release_reason = event.release_reason
             self._meter.emit(event)
+            if self._standstill is not None:
+                self._standstill.see(event)
             if self._meter.engaged_ns is not None:
                 self._lost = self._lost or event.release_reason
 
@@ -168,6 +174,11 @@ class Referee:
             self.stop.set()
 
     @property
+    def has_stopped(self) -> bool:
+        """True if the policy has stopped, as it does at the end."""
+        return self._standstill is not None and self._standstill.has_lasted(self._clock.now_ns())
+
+    @property
     def _has_failed_to_engage(self) -> bool:
         is_late = self._clock.now_ns() - self._start_ns > READY_NS
         return self._meter.engaged_ns is None and is_late
@@ -178,6 +189,8 @@ class Referee:
         ap = self._vehicle.ap
         if (verdict := self._vehicle.log.verdict(ap.now_ns, self._run_out_ns)) is not None:
             return verdict
+        if self.has_stopped and self._vehicle.log.next_gate is not None:
+            return "stopped"
         if not ap.armed:
             return "disarmed"
         is_late = self._clock.now_ns() - engaged_ns >= self._max_time_ns
@@ -198,7 +211,9 @@ class Referee:
         engaged_ns, log = self._meter.engaged_ns, self._vehicle.log
         if self._outcome is None or engaged_ns is None:
             raise EpisodeInterruptedError(f"course {course_seed}: interrupted")
-        stopped_ned_m, ended_ned_m = self._stopped_ned_m, self._vehicle.ap.truth.position_ned_m
+        drift_m, stopped_ned_m = None, self._stopped_ned_m
+        if stopped_ned_m is not None:
+            drift_m = math.dist(stopped_ned_m[:2], self._vehicle.ap.truth.position_ned_m[:2])
         offset_s = (engaged_ns - self._start_ns) / NS_PER_S
         return EpisodeResult(
             course_seed=course_seed,
@@ -210,5 +225,5 @@ class Referee:
             distance_m=self._distance_m,
             stick_rate_per_s=self._meter.rate_per_s,
             lost=self._lost,
-            drift_m=None if stopped_ned_m is None else math.dist(stopped_ned_m, ended_ned_m),
+            drift_m=drift_m,
         )

@@ -35,7 +35,7 @@ class ActionTerms(NamedTuple):
     action: ActionKind = "sticks"
     hover_thrust: float = 0.39
     max_tilt_deg: float | None = None
-    holds_position: bool = False
+    stops_at_end: bool = False
 
 
 STICK_TERMS = ActionTerms()
@@ -123,7 +123,7 @@ def common_frame(flights: Sequence[FlightData]) -> StateFrame:
 def common_terms(flights: Sequence[FlightData]) -> ActionTerms:
     """Return the action terms that all flights share, with the largest of their tilts.
 
-    Position is held if all flights say so.
+    They stop at the end if all flights do.
     """
     first = flights[0]
     for flight in flights:
@@ -136,7 +136,7 @@ def common_terms(flights: Sequence[FlightData]) -> ActionTerms:
     tilts_deg = [each.terms.max_tilt_deg for each in flights if each.terms.max_tilt_deg is not None]
     return first.terms._replace(
         max_tilt_deg=max(tilts_deg, default=None),
-        holds_position=all(flight.terms.holds_position for flight in flights),
+        stops_at_end=all(flight.terms.stops_at_end for flight in flights),
     )
 
 

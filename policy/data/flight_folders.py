@@ -271,8 +271,8 @@ def _terms(name: str, contract: Mapping[str, Any]) -> ActionTerms:
     for number in (hover, 1.0 if tilt is None else tilt):
         if not isinstance(number, int | float) or isinstance(number, bool) or not number > 0:
             raise DatasetError(f"{name}: {number!r} in its contract is no number above 0")
-    holds = contract.get("holds_position") is True
-    return ActionTerms(action, float(hover), None if tilt is None else float(tilt), holds)
+    stops = contract.get("stops_at_end") is True
+    return ActionTerms(action, float(hover), None if tilt is None else float(tilt), stops)
 
 
 def _read_table(

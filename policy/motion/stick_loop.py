@@ -38,11 +38,6 @@ UP_FORCE_MPS2 = (3.0, 21.0)
 """Least and largest vertical specific force."""
 MIN_COS_TILT = 0.35
 """Cosine of the lean beyond which the thrust no longer holds the height."""
-HEADING_GAIN_PER_S = 1.0
-SLOW_MPS = 1.0
-"""Speed below which a heading is held."""
-CENTRED_YAW = 0.06
-"""Largest yaw stick at which a heading is held."""
 RATES_FULL_LEAN_DEG = 65.0
 RATES_FULL_YAW_RATE_DEGPS = 115.0
 RATES_FULL_CLIMB_MPS = 6.0
@@ -94,46 +89,15 @@ def rates_contract(contract: Contract) -> Contract:
 def flown_by_rates(runner: PolicyRunner) -> PolicyRunner:
     """Wrap a runner whose chunks are sticks, so that it flies by thrust and body rates.
 
-    Its network gets a history of centred sticks, because the sent actions are rates. Where its
-    contract holds the position, the heading is held too.
+    Its network gets a history of centred sticks, because the sent actions are rates.
     """
     loop = StickLoop(by_rates(runner.contract))
-    hold = HeadingHold(loop.contract)
     centred = np.zeros((1, *runner.contract.history_shape), np.float32)
 
     def act(encoded: FloatArray, state: FloatArray, _history: FloatArray) -> FloatArray:
-        sticks = runner.act(encoded, state, centred)
-        if loop.contract.holds_position:
-            hold.correct(sticks, state)
-        return loop.to_rates(sticks, state)
+        return loop.to_rates(runner.act(encoded, state, centred), state)
 
-    def reset() -> None:
-        runner.reset()
-        hold.heading_rad = None
-
-    return replace(runner, contract=loop.contract, act=act, reset=reset)
-
-
-class HeadingHold:
-    """Holds the heading of a slow vehicle while the yaw stick is centred, as autopilots do."""
-
-    def __init__(self, contract: Contract) -> None:
-        self._full_radps = math.radians(contract.full_yaw_rate_degps)
-        self.heading_rad: float | None = None
-
-    def correct(self, sticks: FloatArray, state: FloatArray) -> None:
-        """Replace the yaw of centred sticks [1, horizon, 4] at a state [1, state_dim]."""
-        velocity, (w, x, y, z) = state[0, VELOCITY], state[0, QUATERNION].tolist()
-        cosine, sine = level_heading((w, x, y, z))
-        heading_rad = math.atan2(sine, cosine)
-        if np.linalg.norm(velocity) > SLOW_MPS or abs(sticks[0, 0, 1]) > CENTRED_YAW:
-            self.heading_rad = None
-            return
-        if self.heading_rad is None:
-            self.heading_rad = heading_rad
-        error_rad = math.remainder(self.heading_rad - heading_rad, math.tau)
-        share = HEADING_GAIN_PER_S * error_rad / self._full_radps
-        sticks[:, :, 1] = min(max(share, -2 * CENTRED_YAW), 2 * CENTRED_YAW)
+    return replace(runner, contract=loop.contract, act=act)
 
 
 @dataclass(frozen=True, slots=True)

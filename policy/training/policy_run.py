@@ -257,7 +257,8 @@ def _checkpoint(network: BuiltinConfig, path: Path) -> BuiltinPolicy:
             f"--start-from {path} flies by {policy.contract.action}, these flights were flown by "
             f"{network.contract.action}: start from one of their kind, or anew"
         )
-    # Contract fields without a flag of this command are taken from the checkpoint.
+    # Contract fields without a flag of this command are taken from the checkpoint, but for the end
+    # that these flights teach.
     kept = {name: getattr(policy.contract, name) for name in ("feature_dim", *FLIGHT_TERMS)}
     wanted = replace(network.contract, **kept)
     asked, held = (
@@ -269,4 +270,6 @@ def _checkpoint(network: BuiltinConfig, path: Path) -> BuiltinPolicy:
         raise PolicyError(
             f"--start-from {path} holds another policy: {', '.join(other)}; ask for the same one"
         )
+    policy.contract = replace(policy.contract, stops_at_end=network.contract.stops_at_end)
+    policy.config = replace(policy.config, contract=policy.contract)
     return policy.train()

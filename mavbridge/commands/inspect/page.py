@@ -78,7 +78,7 @@ def _outcome(flight: FlightAnalysis) -> dict[str, str] | None:
     if outcome is None:
         return None
     is_bad = outcome.crash is not None or outcome.end == "fault" or meta.success is False
-    is_done = outcome.end in ("course", "duration", "landed") or meta.success is True
+    is_done = outcome.end in ("course", "stopped", "duration", "landed") or meta.success is True
     verdict = "bad" if is_bad else "good" if is_done else "plain"
     return {"text": describe(outcome), "verdict": verdict}
 

@@ -36,7 +36,8 @@ from policy.contract import Contract
 PREPARE_NS = 10 * NS_PER_MS
 """Longest time between two polls of the link, as while no policy is loaded."""
 _OWN_ENDINGS = (
-    *(Code.SIGNAL, Code.COURSE_DONE, Code.POLICY_FAILED, Code.CAMERA_FAILED, Code.HANGS),
+    *(Code.SIGNAL, Code.COURSE_DONE, Code.POLICY_STOPPED),
+    *(Code.POLICY_FAILED, Code.CAMERA_FAILED, Code.HANGS),
     *(Code.TOLD_TO_END, Code.FLIGHT_PROCESS_DIED),
 )
 """Reasons for which the guard was asked to end."""

@@ -18,6 +18,7 @@ from mavbridge.core.vehicle import FlightEnd, LinkStats
 from mavbridge.flight.outcome import (
     MAX_RUN_OUT_NS,
     RUN_OUT_NS,
+    STILL_NS,
     FlightReferee,
     describe,
     flight_verdict,
@@ -136,9 +137,7 @@ def judged(
 
 def test_a_course_is_over_a_second_after_its_last_guard() -> None:
     referee, ticks = FlightReferee(GATES), course_ticks(300)
-    over = [
-        tick.index for tick in ticks if referee.emit(tick) or referee.is_course_over(tick.sent_ns)
-    ]
+    over = [tick.index for tick in ticks if referee.emit(tick) or referee.ending(tick.sent_ns)]
     assert over[0] == 80 + RUN_OUT_NS // 10_000_000
     outcome = referee.outcome("course", HOVERING)
     assert outcome is not None
@@ -148,20 +147,28 @@ def test_a_course_is_over_a_second_after_its_last_guard() -> None:
     assert describe(outcome) == "2 of 2 gates in 0.8 s, 10.0 m/s, no contact seen"
 
 
-def test_a_policy_that_stops_is_given_the_time_to() -> None:
-    def over(*speeds_mps: float) -> list[int]:
-        referee, found = FlightReferee(GATES, stops=True), []
-        for index, tick in enumerate(course_ticks(1900)):
-            moving = np.zeros(13, np.float32)
-            moving[0] = speeds_mps[min(index // 200, len(speeds_mps) - 1)]
-            referee.emit(replace(tick, state=make_state(values=moving)))
-            if referee.is_course_over(tick.sent_ns):
-                found.append(index)
-        return found
+STILL = STILL_NS // 10_000_000
 
-    assert over(6.0, 2.0, 0.2)[0] == 400, "when it has stopped"
-    assert over(0.1)[0] == 80 + RUN_OUT_NS // 10_000_000, "not before the run-out"
-    assert over(3.0)[0] == 80 + MAX_RUN_OUT_NS // 10_000_000, "at last"
+
+def stopping(*speeds_mps: float, gates: list[CourseGate] | None) -> tuple[int, str] | None:
+    """Return tick and kind of the end of a flight with these speeds, each for 2 s."""
+    referee = FlightReferee(gates, stops=True)
+    for index, tick in enumerate(course_ticks(1900)):
+        moving = np.zeros(13, np.float32)
+        moving[0] = speeds_mps[min(index // 200, len(speeds_mps) - 1)]
+        referee.emit(replace(tick, state=make_state(values=moving)))
+        if (ending := referee.ending(tick.sent_ns)) is not None:
+            return index, ending.end
+    return None
+
+
+def test_a_policy_that_stops_ends_its_flight_by_that() -> None:
+    assert stopping(6.0, 2.0, 0.2, gates=None) == (400 + STILL, "stopped")
+    assert stopping(6.0, 2.0, 0.2, gates=GATES) == (400 + STILL, "course")
+    assert stopping(0.1, 0.4, gates=None) is None, "it has not flown yet"
+    assert stopping(6.0, 3.0, gates=None) is None
+    late = 80 + MAX_RUN_OUT_NS // 10_000_000
+    assert stopping(3.0, gates=GATES) == (late, "course"), "at last"
 
 
 def test_without_guards_a_flight_is_told_by_its_end() -> None:
@@ -170,7 +177,7 @@ def test_without_guards_a_flight_is_told_by_its_end() -> None:
     assert (outcome.height_m, outcome.speed_mps) == (2.0, 10.0)
     told = "ended by --duration after 2.0 s, at 2.0 m, 10.0 m/s, now armed in LOITER"
     assert describe(outcome) == told
-    assert not FlightReferee(None).is_course_over(10**18)
+    assert FlightReferee(None).ending(10**18) is None
     assert FlightReferee(GATES).outcome("signal", HOVERING) is None, "nobody has flown"
 
 

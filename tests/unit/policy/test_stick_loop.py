@@ -134,35 +134,6 @@ def test_the_policy_flies_its_own_network_by_rates() -> None:
     assert not given[0].any()  # what was sent are rates: the network sees centred sticks
 
 
-@pytest.mark.parametrize("bias", [-0.03, 0.02])
-def test_a_slow_vehicle_keeps_its_heading_while_the_yaw_stick_is_centred(bias: float) -> None:
-    sticks = np.full((1, 16, 4), bias, np.float32)
-    runner = flown_by_rates(
-        PolicyRunner(
-            contract=replace(CONTRACT, holds_position=True),
-            name="s",
-            engine="numpy",
-            dual_rate=True,
-            encode=lambda _rgb, _camera=0: np.zeros((1, 1), np.float32),
-            act=lambda _encoded, _state, _history: sticks.copy(),
-        )
-    )
-
-    def turned_deg(start_deg: float, speed_mps: float) -> float:
-        heading_deg = start_deg
-        for _ in range(3000):
-            at = state(heading_deg=heading_deg)
-            at[0, 0] = speed_mps
-            chunk = runner.act(np.zeros((1, 1), np.float32), at, np.zeros((1, 4, 4), np.float32))
-            heading_deg += math.degrees(chunk[0, 0, 3]) * 0.01
-        return heading_deg - start_deg
-
-    assert abs(turned_deg(40.0, 0.2)) < 0.1
-    assert abs(turned_deg(40.0, 3.0)) > 50.0, "a fast one turns as its policy wants"
-    runner.reset()
-    assert abs(turned_deg(-170.0, 0.0)) < 0.1, "the next flight has a heading of its own"
-
-
 def test_other_axes_are_refused() -> None:
     with pytest.raises(ContractError, match="not in enu_flu"):
         StickLoop(replace(CONTRACT, state_frame="enu_flu"))

@@ -203,12 +203,12 @@ def test_by_body_rates_races_are_demonstrated_and_read_back(
     assert first is None or isinstance(first, BodyRates)  # the chunk may be from before
     assert {type(word) for word in words} == {BodyRates}
     data = read_flight(flight.folder)
-    assert data.terms == ActionTerms("rates", 0.39, 80.0, holds_position=True)
+    assert data.terms == ActionTerms("rates", 0.39, 80.0, stops_at_end=True)
     assert 0.1 < np.abs(data.target).max() <= 1.0
     assert not data.sent.any()
     network = fit_to_flights(TogeConfig(), [data], TrainSettings(out=tmp_path / "a.safetensors"))
     assert (network.contract.action, network.contract.max_tilt_deg) == ("rates", 80.0)
-    assert network.contract.holds_position
+    assert network.contract.stops_at_end
     assert network.contract.modes == ("GUIDED_NOGPS", "GUIDED", "OFFBOARD")
 
 
