@@ -80,3 +80,9 @@ def test_statistics_of_norms_are_those_of_the_first_part(batch: Batch, threads: 
     after, expected = (m.policy.backbone.bn1.running_mean for m in (model, alone))  # type: ignore[union-attr]
     assert after.any()
     torch.testing.assert_close(after, expected)
+
+
+def test_caller_computes_on_one_thread_while_open(threads: int) -> None:
+    with Gradients(trainee(), device=CPU, bf16=False):
+        assert torch.get_num_threads() == 1
+    assert torch.get_num_threads() == threads
