@@ -11,6 +11,7 @@ import torch
 from torch import Tensor, nn
 
 from policy.errors import PolicyError
+from policy.nets.depthwise import Depthwise
 from policy.nets.names import BackboneName
 from policy.nets.resnet import MOMENTS, ResNet, ResNet8, moments
 
@@ -38,11 +39,14 @@ class SqueezeExcitation(nn.Module):
         super().__init__()
         self.fc1 = nn.Conv2d(channels, squeezed, 1)
         self.fc2 = nn.Conv2d(squeezed, channels, 1)
-        self.activation = nn.SiLU(inplace=True)
+        self.activation = nn.SiLU()
 
     def forward(self, x: Tensor) -> Tensor:
         """Gate ``x``."""
-        pooled = x.mean(dim=(2, 3), keepdim=True)
+        if self.training:  # the gradient of mean is a tensor of x's size, its axes out of order
+            pooled = x.sum(dim=(2, 3), keepdim=True) * (1.0 / x[0, 0].numel())
+        else:
+            pooled = x.mean(dim=(2, 3), keepdim=True)
         return x * torch.sigmoid(self.fc2(self.activation(self.fc1(pooled))))
 
 
@@ -58,7 +62,7 @@ class MBConv(nn.Module):
         if expand != 1:
             layers.append(_conv_norm(channels_in, hidden, 1))
         layers += [
-            _conv_norm(hidden, hidden, kernel, stride=stride, groups=hidden),
+            _norm_after(Depthwise(hidden, kernel, stride=stride), hidden),
             SqueezeExcitation(hidden, max(1, channels_in // 4)),
             _conv_norm(hidden, channels_out, 1, activation=False),
         ]
@@ -96,19 +100,16 @@ class EfficientNetB3(nn.Module):
 
 
 def _conv_norm(
-    channels_in: int,
-    channels_out: int,
-    kernel: int,
-    *,
-    stride: int = 1,
-    groups: int = 1,
-    activation: bool = True,
+    channels_in: int, channels_out: int, kernel: int, *, stride: int = 1, activation: bool = True
 ) -> nn.Sequential:
-    pad = kernel // 2
-    conv = nn.Conv2d(channels_in, channels_out, kernel, stride, pad, groups=groups, bias=False)
-    layers: list[nn.Module] = [conv, nn.BatchNorm2d(channels_out)]
+    conv = nn.Conv2d(channels_in, channels_out, kernel, stride, kernel // 2, bias=False)
+    return _norm_after(conv, channels_out, activation=activation)
+
+
+def _norm_after(conv: nn.Conv2d, channels: int, *, activation: bool = True) -> nn.Sequential:
+    layers: list[nn.Module] = [conv, nn.BatchNorm2d(channels)]
     if activation:
-        layers.append(nn.SiLU(inplace=True))
+        layers.append(nn.SiLU())  # in place, training would copy its input first
     return nn.Sequential(*layers)
 
 
@@ -138,7 +139,7 @@ class ConvNextBlock(nn.Module):
     def __init__(self, channels: int) -> None:
         super().__init__()
         self.block = nn.Sequential(
-            nn.Conv2d(channels, channels, 7, padding=3, groups=channels),
+            Depthwise(channels, 7, bias=True),
             Permute(0, 2, 3, 1),
             nn.LayerNorm(channels, eps=NORM_EPS),
             nn.Linear(channels, 4 * channels),

@@ -11,7 +11,7 @@ from policy.contract import ACTION_DIM, FloatArray
 from policy.nets.diffusion import size_dims
 from policy.nets.toge import BuiltinPolicy
 from policy.training.batches import Batch, normalised
-from policy.training.parallel import StepLoss, computing_in
+from policy.training.parallel import StepLoss
 from policy.training.report import PolicyValidation
 
 GATE_LABELS = 10
@@ -53,13 +53,7 @@ class Trainee(nn.Module):
         """Return outputs of the backbone [B, D]: the stored ones, or those of the images."""
         if batch.features is not None:
             return batch.features
-        image = normalised(batch, self.policy.contract)
-        size = (image.shape[2], image.shape[3])
-        bf16 = torch.is_autocast_enabled(image.device.type) and (
-            not torch.is_grad_enabled() or encoder_learns_in_bf16(image.device, size)
-        )
-        with computing_in(image.device, bf16):
-            features: Tensor = self.policy.backbone(image)
+        features: Tensor = self.policy.backbone(normalised(batch, self.policy.contract))
         return features
 
     @torch.no_grad()
@@ -168,14 +162,3 @@ def validate(trainee: Trainee, batches: Iterable[Batch]) -> PolicyValidation:
     return PolicyValidation(
         loss=loss, gate_loss=gate, stick_error=sticks, mean_stick_error=mean, hold_error=hold
     )
-
-
-def encoder_learns_in_bf16(device: torch.device, image_size: tuple[int, int]) -> bool:
-    """True if bfloat16 speeds up the encoder's backward pass, given that it is used at all.
-
-    On a CPU without matrix units it does from about 160x160 pixels on; below, depthwise
-    convolutions are slower in it. All other parts gain at every size.
-    """
-    if device.type != "cpu" or torch.cpu._is_amx_tile_supported():
-        return True
-    return image_size[0] * image_size[1] >= 160 * 160

@@ -3,6 +3,7 @@ import torch
 
 from policy.errors import PolicyError
 from policy.nets.backbones import build_backbone, load_imagenet_state
+from policy.nets.depthwise import Depthwise
 from policy.nets.names import BACKBONE_NAMES, BackboneName
 
 
@@ -62,3 +63,24 @@ def test_imagenet_weights_load_without_their_classifier() -> None:
     assert torch.equal(target.state_dict()["layer4.1.conv2.weight"], state["layer4.1.conv2.weight"])
     with pytest.raises(PolicyError, match="not of this backbone"):
         load_imagenet_state(build_backbone("resnet50"), state)
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.bfloat16])
+@pytest.mark.parametrize(("kernel", "stride"), [(3, 1), (3, 2), (5, 1), (5, 2), (7, 1)])
+@pytest.mark.parametrize("size", [8, 9])
+def test_depthwise_gradients_are_those_of_a_convolution(
+    kernel: int, stride: int, size: int, dtype: torch.dtype
+) -> None:
+    torch.manual_seed(0)
+    module = Depthwise(6, kernel, stride=stride, bias=True).to(dtype)
+    x = torch.randn(2, 6, size, size, dtype=dtype, requires_grad=True)
+    made, expected = module(x), torch.nn.Conv2d.forward(module, x)
+    torch.testing.assert_close(made, expected, rtol=0, atol=0)
+    gradient = torch.randn_like(made)
+    wanted = [x, *module.parameters()]
+    for one, other in zip(
+        torch.autograd.grad(made, wanted, gradient),
+        torch.autograd.grad(expected, wanted, gradient),
+        strict=True,
+    ):
+        torch.testing.assert_close(one, other)
