@@ -5,8 +5,9 @@ cores shared with another program, that left half of the time unused.
 """
 
 import copy
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Generator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from itertools import pairwise
 from typing import Generic, Self, TypeVar
@@ -49,21 +50,15 @@ class StepLoss:
 
 
 class Gradients(Generic[M]):
-    """Computes losses and gradients of a module; closing it joins its threads.
+    """Computes losses and gradients of a module; closing it joins its threads."""
 
-    While it is open, torch also runs on one thread in the caller's: on cores shared with another
-    program, threads that wait for each other in every small operator of an optimiser's step took a
-    hundred times the processor time of one.
-    """
-
-    def __init__(self, trainee: M, *, device: torch.device, bf16: bool) -> None:
-        """On a CPU, use as many threads as torch; a GPU takes the whole batch.
+    def __init__(self, trainee: M, *, device: torch.device, bf16: bool, threads: int) -> None:
+        """On a CPU, use that many threads; a GPU takes the whole batch.
 
         Weights are shared, buffers are not: the norms' statistics are those of the first part.
         """
         self._device, self._bf16 = device, bf16
-        self._callers_threads = torch.get_num_threads()
-        threads = self._callers_threads if device.type == "cpu" else 1
+        threads = threads if device.type == "cpu" else 1
         shared = {id(weight): weight for weight in trainee.parameters()}
         others = [copy.deepcopy(trainee, dict(shared)) for _ in range(threads - 1)]
         self.replicas = [trainee, *others]
@@ -73,12 +68,10 @@ class Gradients(Generic[M]):
         )
 
     def __enter__(self) -> Self:
-        torch.set_num_threads(1)
         return self
 
     def __exit__(self, *_: object) -> None:
         self._pool.shutdown()
-        torch.set_num_threads(self._callers_threads)
 
     def compute(self, batch: B, losses: Callable[[M, B], StepLoss]) -> dict[str, Tensor]:
         """Set ``grad`` of all trainable weights; return the metrics, means over the parts.
@@ -103,6 +96,21 @@ class Gradients(Generic[M]):
         for weight, gradient in zip(weights, sums, strict=True):
             weight.grad = gradient
         return metrics
+
+
+@contextmanager
+def one_thread() -> Generator[int]:
+    """Run torch on one thread inside the block; yields the number of threads that it had.
+
+    On cores shared with another program, threads that wait for each other in every small operator
+    of an optimiser's step took a hundred times the processor time of one.
+    """
+    before = torch.get_num_threads()
+    torch.set_num_threads(1)
+    try:
+        yield before
+    finally:
+        torch.set_num_threads(before)
 
 
 def row_parts(count: int, parts: int) -> list[slice]:

@@ -24,7 +24,7 @@ from policy.data.frames import FrameStore, store_frames
 from policy.nets.toge import BuiltinConfig
 from policy.nets.world_model.config import WorldModelConfig
 from policy.training.batches import ahead
-from policy.training.parallel import B, Gradients, M, StepLoss
+from policy.training.parallel import B, Gradients, M, StepLoss, one_thread
 from policy.training.report import Hooks, TrainingProgress, TrainResult, Validation
 from policy.training.run_folder import (
     RunFolder,
@@ -154,6 +154,17 @@ class TrainingRun(ABC, Generic[M, B]):
 
     def finish(self) -> TrainResult:
         """Run all remaining stages, then remove the files of the run."""
+        with one_thread() as threads:
+            self._run(threads)
+        kept = self.position.kept
+        return TrainResult(
+            checkpoint=self.settings.out,
+            steps=self.position.step,
+            validation=None if kept is None else self.validation_type(**kept),
+            score=None,
+        )
+
+    def _run(self, threads: int) -> None:
         if self.settings.resume:
             self._restore()
         else:
@@ -164,16 +175,9 @@ class TrainingRun(ABC, Generic[M, B]):
             position.stage, stage = index, self.stages[index]
             if not stage.trains_encoder:
                 self._freeze_encoder(stage, is_new=is_new)
-            self._train(stage)
+            self._train(stage, threads)
         self._validate(self.stages[-1], is_last=True)
         self.folder.clear()
-        kept = position.kept
-        return TrainResult(
-            checkpoint=self.settings.out,
-            steps=position.step,
-            validation=None if kept is None else self.validation_type(**kept),
-            score=None,
-        )
 
     def _freeze_encoder(self, stage: TrainingStage, *, is_new: bool) -> None:
         """Train on features of the average encoder from now on; a resumed run has its weights."""
@@ -188,11 +192,13 @@ class TrainingRun(ABC, Generic[M, B]):
         self.trainee.zero_grad()  # frozen weights too: their gradients would be clipped
         self._optimiser = self._new_optimiser(stage)
 
-    def _train(self, stage: TrainingStage) -> None:
+    def _train(self, stage: TrainingStage, threads: int) -> None:
         position, count = self.position, self.settings.validation_count
         sums: dict[str, Tensor] = {}
         with (
-            Gradients(self.trainee, device=self.device, bf16=self.bf16) as gradients,
+            Gradients(
+                self.trainee, device=self.device, bf16=self.bf16, threads=threads
+            ) as gradients,
             closing(ahead(self.batch_maker(stage), position.step)) as batches,
         ):
             for replica in gradients.replicas:

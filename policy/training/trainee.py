@@ -147,7 +147,7 @@ def refresh_batch_norm(trainee: Trainee, batches: Iterable[Tensor]) -> None:
 def validate(trainee: Trainee, batches: Iterable[Batch]) -> PolicyValidation:
     """Return losses and stick errors over all ``batches``, weighted by their size."""
     totals, weight = torch.zeros(5, dtype=torch.float64), 0
-    for batch in batches:
+    for batch in map(trainee.encoded, batches):
         losses = trainee(batch).metrics
         visual = trainee.policy.visual_projection(trainee.encode(batch))
         steps = min(VALIDATION_STEPS, trainee.policy.config.schedule.num_train_timesteps)

@@ -1,7 +1,5 @@
 """A step on two threads is the step on one."""
 
-from collections.abc import Iterator
-
 import numpy as np
 import pytest
 import torch
@@ -13,7 +11,7 @@ from policy.data.frames import store_frames
 from policy.data.samples import Timeline
 from policy.nets.toge import Toge, TogeConfig
 from policy.training.batches import Batch, Batches
-from policy.training.parallel import Gradients, StepLoss
+from policy.training.parallel import Gradients, StepLoss, one_thread
 from policy.training.settings import TrainSettings
 from policy.training.trainee import Trainee
 
@@ -22,11 +20,9 @@ CPU = torch.device("cpu")
 
 
 @pytest.fixture(params=[1, 2], ids=["one thread", "two threads"])
-def threads(request: pytest.FixtureRequest) -> Iterator[int]:
-    before = torch.get_num_threads()
-    torch.set_num_threads(request.param)
-    yield request.param
-    torch.set_num_threads(before)
+def threads(request: pytest.FixtureRequest) -> int:
+    count: int = request.param
+    return count
 
 
 @pytest.fixture(scope="module")
@@ -52,8 +48,10 @@ def losses(model: Trainee, batch: Batch) -> StepLoss:
     return loss
 
 
-def gradients_of(batch: Batch, model: Trainee, *, with_norms: bool) -> dict[str, torch.Tensor]:
-    with Gradients(model, device=CPU, bf16=False) as gradients:
+def gradients_of(
+    batch: Batch, model: Trainee, threads: int, *, with_norms: bool
+) -> dict[str, torch.Tensor]:
+    with Gradients(model, device=CPU, bf16=False, threads=threads) as gradients:
         for replica in gradients.replicas:
             replica.train()
             replica.policy.backbone.train(with_norms)  # batch norms would see other batches
@@ -63,7 +61,7 @@ def gradients_of(batch: Batch, model: Trainee, *, with_norms: bool) -> dict[str,
 
 def test_gradients_are_those_of_the_mean_loss(batch: Batch, threads: int) -> None:
     model = trainee()
-    made = gradients_of(batch, model, with_norms=False)
+    made = gradients_of(batch, model, threads, with_norms=False)
     model.zero_grad()
     parts = batch.split(threads)
     for part in parts:
@@ -75,14 +73,18 @@ def test_gradients_are_those_of_the_mean_loss(batch: Batch, threads: int) -> Non
 
 def test_statistics_of_norms_are_those_of_the_first_part(batch: Batch, threads: int) -> None:
     model, alone = trainee(), trainee().train()
-    gradients_of(batch, model, with_norms=True)
+    gradients_of(batch, model, threads, with_norms=True)
     alone(batch.split(threads)[0])
     after, expected = (m.policy.backbone.bn1.running_mean for m in (model, alone))  # type: ignore[union-attr]
     assert after.any()
     torch.testing.assert_close(after, expected)
 
 
-def test_caller_computes_on_one_thread_while_open(threads: int) -> None:
-    with Gradients(trainee(), device=CPU, bf16=False):
-        assert torch.get_num_threads() == 1
-    assert torch.get_num_threads() == threads
+def test_one_thread_is_left_as_it_was() -> None:
+    torch.set_num_threads(2)  # every test starts with one, and ends so
+    try:
+        with one_thread() as before:
+            assert (before, torch.get_num_threads()) == (2, 1)
+        assert torch.get_num_threads() == 2
+    finally:
+        torch.set_num_threads(1)
