@@ -30,7 +30,7 @@ def test_the_shipped_weights_are_read_as_they_are() -> None:
     contract = read_contract(SHIPPED)
     assert contract is not None
     same = {"image_height": 96, "image_width": 96, "feature_dim": 256, "since_exposure": True}
-    assert contract == Contract(**same, max_stall_s=0.35)
+    assert contract == Contract(**same, max_stall_s=0.35, stops_at_end=True)
 
 
 def test_shapes_grow_by_cameras_observations_and_extras() -> None:
