@@ -107,9 +107,9 @@ def engagement_settings(config: FlyConfig, contract: Contract) -> EngagementSett
         duration_ns=None if config.duration is None else round(config.duration * NS_PER_S),
         disengage=DisengageSettings(
             on_fault=config.on_fault,
-            # A vehicle that a policy has stopped stays there: a pilot's sticks would let it drift.
-            then="hold" if config.then == "auto" and contract.stops_at_end else config.then,
+            then=config.then,
             is_setpoint=is_setpoint,
+            keeps_place=contract.stops_at_end,
         ),
     )
 

@@ -73,6 +73,8 @@ class DisengageSettings:
     is_setpoint: bool = False
     """True if the policy's actions are setpoints: no sticks can take over, so a mode that holds
     replaces the release, followed by silence."""
+    keeps_place: bool = False
+    """True: at an end, auto holds the vehicle before a hand gets it, for a policy that stops."""
 
 
 @dataclass(slots=True)
@@ -263,7 +265,12 @@ class DisengageSequence:
             instead: OnFault = "hold" if is_fault else "land"
             if objection is not None and choice == "release":
                 note = because(Code.NOT_RELEASED, instead=instead, why=objection)
-            choice = "release" if objection is None else instead
+            if objection is not None:
+                choice = instead
+            elif choice == "auto" and self.settings.keeps_place and not is_fault:
+                choice = "hold"  # centred sticks would let it drift
+            else:
+                choice = "release"
         # A pilot's sticks would do nothing in a setpoint mode or during the autopilot's takeoff.
         is_deaf = now.mode in (*now.modes.setpoint, *now.modes.takeoff)
         if choice == "release" and (self.settings.is_setpoint or is_deaf):

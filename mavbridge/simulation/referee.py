@@ -191,8 +191,8 @@ class Referee:
             return verdict
         if self.has_stopped and self._vehicle.log.next_gate is not None:
             return "stopped"
-        if not ap.armed:
-            return "disarmed"
+        if not ap.armed:  # where nobody takes the sticks, a stopped vehicle lands
+            return "finished" if self.has_stopped else "disarmed"
         is_late = self._clock.now_ns() - engaged_ns >= self._max_time_ns
         return "timed out" if is_late else None
 
