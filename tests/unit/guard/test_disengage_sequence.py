@@ -113,6 +113,25 @@ def test_the_mode_at_a_normal_end(facts: Any, choice: Any, mode: str | None) -> 
     assert stepped.step("release") == Actions(control=NEUTRAL, mode=mode)
 
 
+@pytest.mark.parametrize(
+    ("facts", "choice", "mode"),
+    [
+        (MIDDLE, "auto", "BRAKE"),
+        (MIDDLE, "release", None),
+        (MIDDLE, "land", "LAND"),
+        (NO_RECEIVER, "auto", "LAND"),
+    ],
+)
+def test_a_vehicle_that_its_policy_stopped_is_held_before_a_hand_gets_it(
+    facts: Any, choice: Any, mode: str | None
+) -> None:
+    settings = DisengageSettings(then=choice, keeps_place=True)
+    stepped = flying(facts, disengage=settings)
+    assert stepped.step("release") == Actions(control=NEUTRAL, mode=mode)
+    if mode == "BRAKE":
+        assert stepped.step(mode="BRAKE").control is RELEASE
+
+
 def test_the_mode_is_asked_for_until_it_is_confirmed() -> None:
     stepped = flying(IDLE_RECEIVER)
     moves = [stepped.step(**FAULT), *stepped.run(0.99)]
