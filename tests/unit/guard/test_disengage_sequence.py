@@ -129,7 +129,7 @@ def test_a_vehicle_that_its_policy_stopped_is_held_before_a_hand_gets_it(
     stepped = flying(facts, disengage=settings)
     assert stepped.step("release") == Actions(control=NEUTRAL, mode=mode)
     if mode == "BRAKE":
-        assert stepped.step(mode="BRAKE").control is RELEASE
+        assert RELEASE in {move.control for move in stepped.run(1.0, mode="BRAKE")}
 
 
 def test_the_mode_is_asked_for_until_it_is_confirmed() -> None:
