@@ -19,6 +19,7 @@ AUTOPILOT ?= ardupilot
 BRIEF := $(if $(filter ardupilot,$(AUTOPILOT)),--set RC_OVERRIDE_TIME=0.5 --set GUID_TIMEOUT=0.5)
 # ArduPilot takes the thrust of body rates for a climb rate without this.
 BY_RATES := $(if $(filter toge-rates/ardupilot,$(POLICY)/$(AUTOPILOT)),--set GUID_OPTIONS=8)
+LANDED := $(if $(findstring --then,$(FLAGS)),,--then land)
 SOAK_MINUTES ?= 60
 PARALLEL := --numprocesses auto --maxprocesses 8 --dist loadfile
 # Flights in real time have the machine for themselves: they are judged by the millisecond.
@@ -65,7 +66,7 @@ fly: $(VENV)/flies  ## a simulated vehicle in its own process, and a policy flyi
 		--camera shm:fpv-$(PORT) --course $(COURSE) --laps $(LAPS) --fly-on 10 --report out/fc.json & sitl=$$!; \
 	trap 'kill $$sitl 2>/dev/null' EXIT; \
 	$(BIN)/mavbridge --connect udp:127.0.0.1:$(PORT) --policy $(POLICY) \
-		--camera shm:fpv-$(PORT) --arm --duration $(DURATION) --then land $(BRIEF) $(BY_RATES) $(FLAGS) \
+		--camera shm:fpv-$(PORT) --arm --duration $(DURATION) $(LANDED) $(BRIEF) $(BY_RATES) $(FLAGS) \
 		--rerun out/flight.rrd --gates out/gates.json --report out/report.json; status=$$?; \
 	kill $$sitl 2>/dev/null; wait $$sitl 2>/dev/null; trap - EXIT; \
 	[ ! -e out/report.json ] || echo "wrote out/report.json, out/fc.json and out/flight.rrd (open it with: $(BIN)/rerun out/flight.rrd)"; \

@@ -168,12 +168,9 @@ def _make_loop(seed: int, laps: int) -> Course:
     side = 1 if random.random() < 0.5 else -1
     angle_rad = side * (np.arange(LOOP_GATES) * math.tau / LOOP_GATES + shift_rad)
     points = [cmath.rect(r, a) for r, a in zip(radius_m.tolist(), angle_rad.tolist(), strict=True)]
-    after = [*points[1:], points[0]]
-    headings_rad = [cmath.phase(b - a) for a, b in zip(points, after, strict=True)]
-    through_rad = [
-        out_rad - wrap_pi(out_rad - in_rad) / 2
-        for in_rad, out_rad in zip([headings_rad[-1], *headings_rad], headings_rad, strict=False)
-    ]
+    in_rad = [cmath.phase(point - points[k - 1]) for k, point in enumerate(points)]
+    out_rad = [*in_rad[1:], in_rad[0]]
+    through_rad = [out - wrap_pi(out - come) / 2 for come, out in zip(in_rad, out_rad, strict=True)]
     gates = []
     for k, point in enumerate(points):
         # The first gate stands north of the start and is flown northwards.
@@ -287,8 +284,8 @@ class GateCounter:
         start_ned_m, start_s = previous
         reached = 0.0
         while (index := self.next_gate) is not None:
-            (gate,) = self._course.ahead(index, 1)
-            fraction = crossing(gate, start_ned_m, position_ned_m)
+            gates = self._course.gates
+            fraction = crossing(gates[index % len(gates)], start_ned_m, position_ned_m)
             if fraction is None or fraction < reached:
                 return
             reached = fraction

@@ -15,6 +15,8 @@ from sitl.vehicle.rotation import Vec3, cos_tilt, to_euler
 CRASH_SPEED_MPS = 3.5  # ALT_HOLD descends at up to 2.5 m/s, a hard landing but no crash
 CRASH_TILT_COS = math.cos(math.radians(45.0))
 MAX_TEXTS = 200
+END_AFTER_NS = NS_PER_S
+"""Time from the last gate to the end of the course: a crash just behind the gate counts."""
 PATH_PERIOD_NS = NS_PER_S // 20
 """Path length is summed at 20 Hz: fine enough for turns, coarse enough to leave out vibration."""
 
@@ -82,7 +84,7 @@ class FlightLog:
         self._was_touching = True
 
     def verdict(
-        self, now_ns: int, run_out_ns: int = NS_PER_S
+        self, now_ns: int, run_out_ns: int = END_AFTER_NS
     ) -> Literal["crashed", "finished"] | None:
         """Return the end of the course: a crash, or the run-out after the last gate; None before
         that."""

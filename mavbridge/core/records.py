@@ -4,6 +4,7 @@ Stamps are nanoseconds of the injected clock, taken at the source (exposure, dat
 Arrays are read-only once they are published here.
 """
 
+import math
 from dataclasses import asdict, dataclass, replace
 from typing import NamedTuple, TypeAlias
 
@@ -59,6 +60,11 @@ class VehicleState:
     """Optional inputs (``state_extras``), in the contract's order."""
     extras_ns: int | None = None
     """When the oldest optional input was measured; None without any."""
+
+    @property
+    def speed_mps(self) -> float:
+        """Length of the velocity."""
+        return math.hypot(*self.values[:3].tolist())
 
 
 class Position(NamedTuple):

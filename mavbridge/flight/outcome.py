@@ -50,9 +50,9 @@ class Standstill:
 
     def see(self, tick: Tick) -> None:
         """Follow a tick; those without the policy in control interrupt a standstill."""
-        speed_mps = speed_of(tick)
-        self._has_moved = self._has_moved or (speed_mps or 0.0) > MOVED_MPS
-        is_still = speed_mps is not None and speed_mps < STILL_MPS and self._has_moved
+        speed_mps = math.nan if tick.state is None else tick.state.speed_mps
+        self._has_moved = self._has_moved or speed_mps > MOVED_MPS
+        is_still = self._has_moved and speed_mps < STILL_MPS
         if tick.phase != Phase.FLYING.value or not is_still:
             self._since_ns = None
         elif self._since_ns is None:
@@ -61,11 +61,6 @@ class Standstill:
     def has_lasted(self, now_ns: int) -> bool:
         """True if the vehicle has been standing still for long enough."""
         return self._since_ns is not None and now_ns - self._since_ns >= STILL_NS
-
-
-def speed_of(tick: Tick) -> float | None:
-    """Return the speed in m/s; None if the policy had no state."""
-    return None if tick.state is None else math.hypot(*tick.state.values[:3].tolist())
 
 
 class FlightReferee:
@@ -122,17 +117,14 @@ class FlightReferee:
 
         The course ends a run-out after the last gate; where the policy stops, once it has.
         """
-        done_ns = now_ns - self._course.passed_ns[-1] if self._course.is_done else None
-        run_out_ns = RUN_OUT_NS
-        if self._standstill is not None:
-            run_out_ns = MAX_RUN_OUT_NS
-            if self._standstill.has_lasted(now_ns):
-                run_out_ns = 0
-                if done_ns is None:
-                    return EndRequest(reason=because(Code.POLICY_STOPPED), end="stopped")
-        if done_ns is None or done_ns < run_out_ns:
-            return None
-        return EndRequest(reason=because(Code.COURSE_DONE), end="course")
+        standstill = self._standstill
+        has_stopped = standstill is not None and standstill.has_lasted(now_ns)
+        if not self._course.is_done:
+            stopped = EndRequest(reason=because(Code.POLICY_STOPPED), end="stopped")
+            return stopped if has_stopped else None
+        run_out_ns = RUN_OUT_NS if standstill is None else MAX_RUN_OUT_NS
+        is_over = has_stopped or now_ns - self._course.passed_ns[-1] >= run_out_ns
+        return EndRequest(reason=because(Code.COURSE_DONE), end="course") if is_over else None
 
     def outcome(
         self, end: FlightEnd, vehicle: GuardStatus, asked: Reason | None = None
@@ -143,14 +135,14 @@ class FlightReferee:
         """
         if (flown := self._flown) is None:
             return None
-        position, passed_ns = flown.position_ned_m, self._course.passed_ns
+        position, state, passed_ns = flown.position_ned_m, flown.state, self._course.passed_ns
         knows_gates = self._gates_total is not None and self._has_position
         return FlightOutcome(
             end=end,
             reason=asked if self._reason is None else self._reason,
             flown_s=(flown.sent_ns - self._began_ns) / NS_PER_S,
             height_m=None if position is None else -position.down,
-            speed_mps=speed_of(flown),
+            speed_mps=None if state is None else state.speed_mps,
             mode=vehicle.mode,
             is_armed=vehicle.armed,
             is_landed=vehicle.is_landed,

@@ -265,12 +265,10 @@ class DisengageSequence:
             instead: OnFault = "hold" if is_fault else "land"
             if objection is not None and choice == "release":
                 note = because(Code.NOT_RELEASED, instead=instead, why=objection)
-            if objection is not None:
-                choice = instead
-            elif choice == "auto" and self.settings.keeps_place and not is_fault:
-                choice = "hold"  # centred sticks would let it drift
-            else:
-                choice = "release"
+            # Centred sticks would let a vehicle drift that its policy has stopped.
+            is_kept = choice == "auto" and self.settings.keeps_place and not is_fault
+            released: OnFault = "hold" if is_kept else "release"
+            choice = released if objection is None else instead
         # A pilot's sticks would do nothing in a setpoint mode or during the autopilot's takeoff.
         is_deaf = now.mode in (*now.modes.setpoint, *now.modes.takeoff)
         if choice == "release" and (self.settings.is_setpoint or is_deaf):

@@ -62,7 +62,7 @@ class CrashWatch:
         if self._disarmed_ns is None or tick.armed or tick.state is None:
             return None
         is_soon = tick.woke_ns - self._disarmed_ns <= FALL_NS
-        speed_mps = math.hypot(*tick.state.values[:3].tolist())
+        speed_mps = tick.state.speed_mps
         if not is_soon or speed_mps < FALL_MPS:
             return None
         return f"it was disarmed in the air, and moved at {speed_mps:.1f} m/s"

@@ -12,7 +12,7 @@ from mavbridge.core.errors import MavbridgeError, PeerError
 from mavbridge.core.reasons import Reason
 from mavbridge.core.records import Event, Tick
 from mavbridge.core.vehicle import Action
-from mavbridge.flight.outcome import Standstill
+from mavbridge.flight.outcome import RUN_OUT_NS, Standstill
 from policy.contract import ACTION_DIM
 from sitl.course import make_course
 from sitl.simulated_vehicle import SimulatedVehicle
@@ -22,9 +22,9 @@ READY_NS = 30 * NS_PER_S
 """Limit from the start to the policy's first action, which comes after some 4 s."""
 
 
-RUN_OUT_S = 1.0
-"""Time from the last gate to the end: a crash just behind the gate counts."""
-STILL_MPS = 0.3
+RUN_OUT_S = RUN_OUT_NS / NS_PER_S
+"""Time from the last gate to the end, as in a flight in real time."""
+STOPPED_MPS = 0.3
 """Speed below which the vehicle has stopped."""
 Outcome = Literal["finished", "crashed", "disarmed", "stopped", "timed out"]
 """All gates passed; ground or gate hit; motors stopped in flight; the policy stopped before the
@@ -163,10 +163,11 @@ class Referee:
         if self.stop.is_set():
             return
         self._outcome = self._find_outcome()
-        body, log = self._vehicle.ap.truth, self._vehicle.log
-        if self._stopped_ned_m is None and log.gates_passed and log.next_gate is None:
-            is_still = math.hypot(*body.velocity_ned_mps) < STILL_MPS
-            self._stopped_ned_m = body.position_ned_m if is_still else None
+        log = self._vehicle.log
+        if self._stopped_ned_m is None and log.next_gate is None and log.gates_passed:
+            body = self._vehicle.ap.truth
+            has_stopped = math.hypot(*body.velocity_ned_mps) < STOPPED_MPS
+            self._stopped_ned_m = body.position_ned_m if has_stopped else None
         is_interrupted = self._should_stop is not None and self._should_stop()
         if self._outcome is not None or self._has_failed_to_engage or is_interrupted:
             self._end_ns = self._clock.now_ns()

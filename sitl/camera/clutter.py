@@ -17,7 +17,7 @@ from sitl.vehicle.conditions import Conditions, Draw, Hsv, Rgb
 CLEARANCE_M = 3.0  # least distance of an object from the legs and from the gates' frames
 BESIDE_M = 14.0  # largest distance from a leg, beyond the clearance
 FRAME_M = math.sqrt(0.5) * OPENING_M + 2 * BAR_M  # from a gate's centre to beyond its corners
-PAINTS: tuple[Hsv, ...] = (
+MATERIALS: tuple[Hsv, ...] = (
     ((0.0, 0.0, 0.1), (1.0, 1.0, 1.0)),  # any
     ((0.05, 0.0, 0.2), (0.4, 0.55, 0.8)),  # wood, stone
 )
@@ -76,7 +76,7 @@ def _shape(draw: Draw) -> list[Part]:
     """
     small_m, large_m, up_m = draw.between(0.04, 0.2), draw.between(0.4, 2.5), draw.between(1.5, 5.0)
     share = draw.amount(1.0)
-    paint, other = (draw.colour(draw.one_of(PAINTS)) for _ in range(2))
+    paint, other = (draw.colour(draw.one_of(MATERIALS)) for _ in range(2))
     match int(draw.random.integers(6)):
         case 0:  # box, wall
             deep_m = draw.one_of((0.1, large_m * share))

@@ -37,6 +37,11 @@ def stepped_clock(source: ReplaySource) -> SteppedClock:
     return SteppedClock(source.solves[0].started_ns - NS_PER_S)
 
 
+def test_a_recording_names_no_path_of_the_machine_that_made_it() -> None:
+    for path in FLIGHTS.rglob("*.json"):
+        assert '"/' not in path.read_text(), f"record {path.parent} in the clone"
+
+
 @pytest.fixture
 def numpy_runner() -> Iterator[PolicyRunner]:
     """The policy as a flight loads it."""
