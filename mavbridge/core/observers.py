@@ -38,8 +38,6 @@ class BoundedQueue(Generic[_Item]):
     """Lock-free queue of one producer and one consumer. Neither ever waits."""
 
     def __init__(self, capacity: int) -> None:
-        if capacity < 1:
-            raise ValueError(f"capacity must be at least 1, got {capacity}")
         self._capacity = capacity
         self._items: deque[_Item] = deque()
         self.dropped = 0

@@ -16,12 +16,13 @@ of the user do not inherit ours."""
 OURS = ("policy", "sitl")
 """Packages beside ``mavbridge`` whose names a user's module may have."""
 _ROOT = Path(__file__).parents[2]
+"""Folder of ``mavbridge`` and of the packages beside it."""
 
 
-def hidden_package(root: Path = _ROOT) -> str | None:
-    """Return an error message if another module hides a package in ``root``, else None.
+def hidden_package() -> str | None:
+    """Return an error message if another module hides one of our packages, else None.
 
-    ``root`` is the folder of ``mavbridge``. Python searches the working directory first (``python
+    Python searches the working directory first (``python
     -m``), then PYTHONPATH. Nothing is imported.
     """
     for name in OURS:
@@ -30,7 +31,7 @@ def hidden_package(root: Path = _ROOT) -> str | None:
             return f"mavbridge's own package {name} is missing: install mavbridge again"
         places = [spec.origin, *(spec.submodule_search_locations or ())]
         found = next(place for place in places if place is not None)
-        if Path(found).resolve() != (root / name / "__init__.py").resolve():
+        if Path(found).resolve() != (_ROOT / name / "__init__.py").resolve():
             return (
                 f"{found} hides mavbridge's own package {name}: run `mavbridge`, not `python -m "
                 "mavbridge`, and take that folder off PYTHONPATH; or rename it. As a policy it "

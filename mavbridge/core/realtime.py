@@ -72,7 +72,7 @@ def settle_guard(*, realtime: bool, cpu: int | None) -> str | None:
     gc.freeze()
     refusals = [
         _pin("the guard", cpu),
-        _use_fifo(GUARD_FIFO_PRIORITY, "the guard", resets_on_fork=True) if realtime else None,
+        _use_fifo(GUARD_FIFO_PRIORITY, "the guard") if realtime else None,
         _lock_memory(),
     ]
     return "; ".join(filter(None, refusals)) or None
@@ -86,7 +86,7 @@ def settle_thread(*, realtime: bool, cpu: int | None) -> str | None:
     if not realtime or usable_cores() == 1:
         return None
     # Threads that the policy starts are ordinary again, or several could hold every CPU.
-    return _use_fifo(ACTION_FIFO_PRIORITY, "the policy", resets_on_fork=True)
+    return _use_fifo(ACTION_FIFO_PRIORITY, "the policy")
 
 
 def usable_cores() -> int:
@@ -108,13 +108,12 @@ def _pin(who: str, cpu: int | None) -> str | None:
     return None
 
 
-def _use_fifo(priority: int, who: str, *, resets_on_fork: bool) -> str | None:
+def _use_fifo(priority: int, who: str) -> str | None:
     lacking = f"{who} has no real-time scheduling, so others may delay it"
     if not hasattr(os, "SCHED_RESET_ON_FORK"):
         return f"{lacking}: {platform.system()} has no SCHED_FIFO for a process, use Linux"
-    policy = os.SCHED_FIFO | (os.SCHED_RESET_ON_FORK if resets_on_fork else 0)
     try:
-        os.sched_setscheduler(0, policy, os.sched_param(priority))
+        os.sched_setscheduler(0, os.SCHED_FIFO | os.SCHED_RESET_ON_FORK, os.sched_param(priority))
     except OSError:
         cure = "allow it with ulimit -r 10 or CAP_SYS_NICE, or set scheduling.realtime=false"
         return f"{lacking}: {cure}"

@@ -52,15 +52,12 @@ class StopRequest:
         """Return True if a stop was requested."""
         return self.requests > 0
 
-    def wait(self, timeout_s: float, *, requests: int = 1) -> bool:
-        """Wait for a number of requests; return whether they have come.
-
-        It may return early without them, once for each earlier signal.
-        """
-        if self.requests < requests:
+    def wait(self, timeout_s: float) -> bool:
+        """Wait for the request; return whether it has come."""
+        if not self.is_set():
             with suppress(queue.Empty):
                 self._wake.get(timeout=timeout_s)
-        return self.requests >= requests
+        return self.is_set()
 
 
 @contextmanager

@@ -48,9 +48,8 @@ def test_each_reason_can_be_said_and_comes_through_json(code: Code) -> None:
 
 
 def test_no_two_reasons_say_the_same() -> None:
-    texts = [text for _, text in reasons._REASONS.values() if text != "{said}"]
+    texts = [text for _, text in reasons._REASONS.values()]
     assert len(texts) == len(set(texts))
-    assert set(reasons._REASONS) == set(Code)
 
 
 @pytest.mark.parametrize(
