@@ -71,29 +71,28 @@ def _features(info: dict[str, Any], rows: pa.Table) -> Iterator[str]:
 
 
 def _rows(info: dict[str, Any], episodes: pa.Table, rows: pa.Table) -> Iterator[str]:
-    if info["total_frames"] != rows.num_rows or info["total_episodes"] != episodes.num_rows:
+    lengths = episodes["length"].to_numpy()
+    ends, frames = np.cumsum(lengths), np.concatenate([np.arange(count) for count in lengths])
+    if (info["total_frames"], info["total_episodes"]) != (rows.num_rows, len(lengths)):
         yield "totals"
-    if rows["index"].to_pylist() != list(range(rows.num_rows)):
-        yield "index is not the place of the row"  # dataset_reader.py:223: rows by absolute index
-    start = 0
-    for number, episode in enumerate(episodes.to_pylist()):
-        end = start + episode["length"]
-        if (episode["episode_index"], episode["dataset_from_index"]) != (number, start):
-            yield f"episode {number} is not the next"  # dataset_reader.py:218: by position
-        if episode["dataset_to_index"] != end:  # dataset_reader.py:220-228
-            yield f"dataset_to_index of episode {number}"
-        part = rows.slice(start, episode["length"])
-        if set(part["episode_index"].to_pylist()) != {number}:
-            yield f"episode_index of episode {number}"
-        count = np.arange(part.num_rows)
-        if part["frame_index"].to_pylist() != count.tolist():
-            yield f"frame_index of episode {number}"
-        even = (count / info["fps"]).astype(np.float32)  # dataset_writer.py:225
-        if not np.array_equal(part["timestamp"].to_numpy(), even):
-            yield f"timestamp of episode {number}"
-        start = end
-    if start != rows.num_rows:
-        yield "rows without an episode"
+    wanted_rows = {
+        "index": np.arange(rows.num_rows),  # dataset_reader.py:223: rows by absolute index
+        "episode_index": np.repeat(np.arange(len(lengths)), lengths),
+        "frame_index": frames,
+        "timestamp": (frames / info["fps"]).astype(np.float32),  # dataset_writer.py:225
+    }
+    wanted_episodes = {  # dataset_reader.py:218-228: by position
+        "episode_index": np.arange(len(lengths)),
+        "dataset_from_index": ends - lengths,
+        "dataset_to_index": ends,
+    }
+    for what, table, wanted in (
+        ("rows", rows, wanted_rows),
+        ("episodes", episodes, wanted_episodes),
+    ):
+        for name, values in wanted.items():
+            if not np.array_equal(table[name].to_numpy(), values):
+                yield f"{name} of the {what}"
 
 
 def _files(root: Path, info: dict[str, Any], episodes: pa.Table) -> Iterator[str]:

@@ -14,13 +14,10 @@ from mavbridge.simulation.referee import EpisodeInterruptedError
 JOBS = [Job(number=number) for number in (10, 20, 30)]
 
 
-def test_one_worker_flies_in_order_until_it_is_told_to_stop() -> None:
+def test_one_worker_flies_in_order_until_it_is_told_to_stop_or_interrupted() -> None:
     assert list(fly_jobs(run, JOBS, WorkersConfig(), lambda: False)) == [(0, 10), (1, 20), (2, 30)]
     answers = iter([False, False, True])
     assert list(fly_jobs(run, JOBS, WorkersConfig(), lambda: next(answers))) == [(0, 10), (1, 20)]
-
-
-def test_an_interrupted_job_has_no_result_and_is_no_error() -> None:
     jobs = [JOBS[0], Job(number=1, error=EpisodeInterruptedError("stopped")), JOBS[1]]
     assert list(fly_jobs(run, jobs, WorkersConfig(), lambda: False)) == [(0, 10)]
 

@@ -21,7 +21,7 @@ from mavbridge.commands.identify import (
     print_identification,
     to_json,
 )
-from mavbridge.commands.step_response import CHANNELS, ResponseRecording, fit_response
+from mavbridge.commands.step_response import CHANNELS, ResponseRecording
 from mavbridge.config.flight import FlyConfig, LinkConfig
 from mavbridge.config.policy import PolicyConfig
 from mavbridge.core.clock import NS_PER_S
@@ -50,9 +50,13 @@ def recorded(
     curve: Curve = usual_sticks,
     *,
     hover: float = 0.0,
+    lag_s: float = LAG_S,
+    noise: float = 0.0,
     is_flown: Callable[[float], bool] = lambda _: True,
 ) -> ResponseRecording:
-    """A doublet of this kind, flown by a vehicle of first order with a dead time."""
+    """A doublet of this kind, flown by a vehicle of first order with a dead time, in gusts where
+    there is ``noise``, a share of the full amount."""
+    random = np.random.default_rng(0)
     recording = ResponseRecording()
     amounts = {"sticks": 1.0, "attitude": 20.0, "rates": 40.0, "velocity": 2.0}
     channels = {channel.axis: channel for channel in CHANNELS[kind]}
@@ -61,7 +65,9 @@ def recorded(
     for index in range(round((doublet_length_s(kind) + 2 * MARGIN_S) / STEP_S)):
         time_s = index * STEP_S - MARGIN_S
         at_ns = round((START_S + time_s) * NS_PER_S)
-        state = _state(motions, kind, at_ns)
+        is_gust = noise > 0.0 and time_s % 7.0 < 0.1
+        blown = noise * amounts[kind] * (random.normal() + 10.0 * is_gust)
+        state = _state({axis: value + blown for axis, value in motions.items()}, kind, at_ns)
         pushes = [push for step in doublet_steps(kind) if (push := step.push_at(time_s))]
         action = [0.0] * 4
         if kind in ("attitude", "rates"):
@@ -71,7 +77,7 @@ def recorded(
             action[channel.column] = amount / channel.scale
             waiting[axis].append(amount)
             wanted = curve(axis, waiting[axis].pop(0))
-            motions[axis] += (wanted - motions[axis]) * STEP_S / LAG_S
+            motions[axis] += (wanted - motions[axis]) * STEP_S / lag_s
         trace = make_trace(ACTION_CLASSES[kind](*action))  # type: ignore[arg-type]
         tick = make_tick(index, trace=trace, sent_ns=at_ns, state=state)
         recording.emit(tick if is_flown(time_s) else make_released_tick(index))
@@ -128,6 +134,23 @@ def test_setpoints_are_compared_with_what_was_commanded(kind: ActionKind) -> Non
         assert found.hover_thrust == pytest.approx(0.45)
     else:
         assert found.hover_thrust is None
+
+
+@pytest.mark.parametrize(("lag_s", "noise"), [(0.15, 0.02), (0.7, 0.0)])
+def test_each_side_has_its_gain_in_gusts_too_and_if_it_settles_late(
+    lag_s: float, noise: float
+) -> None:
+    recording = recorded(
+        "velocity",
+        lambda axis, amount: amount * (1.0 if amount > 0.0 else 0.7),
+        lag_s=lag_s,
+        noise=noise,
+    )
+    found, _ = identified(recording, Contract(action="velocity"))
+    assert len(found.pushes) == 8
+    for push in found.pushes:
+        assert push.ratio == pytest.approx((1.0, 0.7), abs=0.05), push
+        assert push.time_63_s == pytest.approx(DEAD_STEPS * STEP_S + lag_s, abs=0.04), push
 
 
 def test_what_the_policy_did_not_fly_is_missing_with_its_reason() -> None:
@@ -194,69 +217,3 @@ def test_the_doublet_means_by_its_sticks_what_the_policy_means() -> None:
     assert runner.contract.yaw_dead_zone == 0.1
     assert runner.dual_rate
     assert policy.program_start_s is None
-
-
-# --- the fit
-
-
-INPUT_S = np.arange(0.0, 3.0, 0.01)
-OUTPUT_S = np.arange(0.2, 2.9, 0.01) + 0.003
-DOUBLET = np.where((INPUT_S > 0.5) & (INPUT_S < 1.7), 0.6, 0.0) - np.where(INPUT_S >= 1.7, 0.6, 0.0)
-
-
-def respond(
-    inputs: np.ndarray, *, dead_s: float, lag_s: float, up: float, down: float, offset: float = 0.0
-) -> np.ndarray:
-    """A lag of first order behind a dead time, integrated on a grid ten times finer."""
-    step_s = 0.0005
-    fine_s = np.arange(-1.0, 3.0, step_s)
-    newest = np.searchsorted(INPUT_S, fine_s, side="right") - 1
-    held = np.where(newest < 0, 0.0, inputs[np.clip(newest, 0, None)])
-    wanted = np.where(held > 0, up * held, down * held)
-    outputs, value = np.empty(len(fine_s)), 0.0
-    for index, now in enumerate(wanted):
-        outputs[index] = value
-        value += (1 - np.exp(-step_s / lag_s)) * (now - value)
-    return offset + np.interp(OUTPUT_S - dead_s, fine_s, outputs)
-
-
-@pytest.mark.parametrize(
-    ("dead_s", "lag_s", "up", "down", "noise"),
-    [
-        (0.08, 0.08, 30.0, 30.0, 0.0),
-        (0.08, 0.08, 30.0, 30.0, 0.5),
-        (0.02, 0.05, 200.0, 180.0, 3.0),
-        (0.25, 0.40, 2.5, 1.5, 0.05),
-        (0.0, 0.70, 1.0, 1.0, 0.02),
-        (0.15, 0.10, -5.0, -4.0, 0.1),
-    ],
-)
-def test_gains_of_both_sides_dead_time_and_lag_are_found(
-    dead_s: float, lag_s: float, up: float, down: float, noise: float
-) -> None:
-    outputs = respond(DOUBLET, dead_s=dead_s, lag_s=lag_s, up=up, down=down, offset=0.3)
-    outputs += np.random.default_rng(0).normal(0.0, noise, len(outputs))
-    found = fit_response(INPUT_S, DOUBLET, OUTPUT_S, outputs)
-    assert found is not None
-    assert found.gains == pytest.approx((up, down), rel=0.05)
-    assert found.dead_time_s == pytest.approx(dead_s, abs=0.02)
-    assert found.dead_time_s + found.lag_s == pytest.approx(dead_s + lag_s, rel=0.06)
-    assert found.r_squared > 0.97
-
-
-@pytest.mark.parametrize("outputs", [np.zeros(len(OUTPUT_S)), np.ones(5)])
-def test_what_does_not_move_or_is_too_short_has_no_response(outputs: np.ndarray) -> None:
-    assert fit_response(INPUT_S, DOUBLET, OUTPUT_S[: len(outputs)], outputs) is None
-
-
-def test_a_gust_does_not_move_the_result() -> None:
-    outputs = respond(DOUBLET, dead_s=0.1, lag_s=0.15, up=30.0, down=30.0)
-    clean = fit_response(INPUT_S, DOUBLET, OUTPUT_S, outputs)
-    outputs += np.random.default_rng(1).normal(0.0, 0.2, len(outputs))
-    outputs[130:140] += 25.0
-    found = fit_response(INPUT_S, DOUBLET, OUTPUT_S, outputs)
-    assert clean is not None
-    assert found is not None
-    assert found.gains[0] == pytest.approx(clean.gains[0], rel=0.03)
-    assert found.lag_s == pytest.approx(clean.lag_s, rel=0.2)
-    assert found.r_squared < 0.99  # the gust is counted, though

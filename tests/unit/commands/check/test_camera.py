@@ -70,10 +70,7 @@ def test_a_black_image_is_a_no_go_only_for_a_policy_that_looks_at_it() -> None:
     black.is_blank = True
     assert rows(needs(), black)["image"].verdict == "no-go"
     assert rows(needs(is_flown_by=False), black)["image"].verdict == "warn"
-
-
-def test_a_small_image_is_enlarged_and_said() -> None:
-    assert rows(needs(), seen(size_px=160))["image"].verdict == "warn"
+    assert rows(needs(), seen(size_px=160))["image"].verdict == "warn", "small: it is enlarged"
 
 
 def test_a_camera_that_is_not_there_is_one_row(tmp_path: Path) -> None:

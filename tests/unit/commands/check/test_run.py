@@ -94,13 +94,6 @@ def test_a_pace_that_is_not_held_is_a_warning(
     assert (pace.late, pace.row().verdict) == (late, verdict)
 
 
-def test_a_policy_tells_its_engine_speed_and_contract() -> None:
-    rows, plan = check_policy(flight("scripted:square:velocity"), MonotonicClock(), timing_s=0.5)
-    assert [row.name for row in rows] == ["engine", "chunks", "images", "contract", "plan"]
-    assert plan is not None
-    assert plan.contract.action == "velocity"
-
-
 def test_the_worst_row_is_the_verdict() -> None:
     assert overall([GO]) == "go"
     assert overall([GO, CheckRow(area="link", name="loss", found="3%", warn="lossy")]) == "warn"
@@ -127,9 +120,11 @@ def test_a_row_hides_the_password_of_an_address_in_table_and_json() -> None:
     assert row.found == "rtsp://me:***@host/1?token=***"
 
 
-def test_a_flag_that_contradicts_the_policy_leaves_the_vehicles_rows_to_its_contract() -> None:
-    config = replace(flight("scripted:square:velocity"), mode="ALT_HOLD")
+def test_a_policy_tells_its_engine_speed_and_contract_and_which_flag_contradicts_it() -> None:
+    config = flight("scripted:square:velocity")
     rows, plan = check_policy(config, MonotonicClock(), timing_s=0.5)
+    assert [row.name for row in rows] == ["engine", "chunks", "images", "contract", "plan"]
+    rows, plan = check_policy(replace(config, mode="ALT_HOLD"), MonotonicClock(), timing_s=0.5)
     assert (rows[-1].name, rows[-1].verdict) == ("flags of the flight", "no-go")
     assert "--mode ALT_HOLD" in rows[-1].advice
     assert plan is not None

@@ -155,9 +155,14 @@ def test_the_file_beside_the_dataset_is_taken_as_it_is(tmp_path: Path) -> None:
     assert path.read_text() == (data / "mavbridge.toml").read_text()
 
 
-def test_the_datasets_state_must_be_the_policys(tmp_path: Path) -> None:
+def test_the_datasets_state_must_be_the_policys(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    policy = checkpoint(tmp_path / "policy", state_dim=5)
+    assert status_of("contract", policy, "--dataset", tmp_path) == 2
+    assert "not a LeRobot dataset" in capsys.readouterr().err
     data = dataset(tmp_path / "data", ["vx_mps", "vy_mps", "az_mps2"], az_mps2=-9.0)
-    path = draft(checkpoint(tmp_path / "policy", state_dim=5), "--dataset", str(data))
+    path = draft(policy, "--dataset", str(data))
     with pytest.raises(ContractError, match=r"\[state\] names"):
         read_interface(path)
 
@@ -184,11 +189,3 @@ def test_what_cannot_be_drafted_is_refused_and_nothing_is_written(
     assert status_of("contract", folder) == 2
     assert said in " ".join(capsys.readouterr().err.split())
     assert {path: path.read_bytes() for path in folder.rglob("*")} == before
-
-
-def test_a_folder_that_is_no_dataset_is_refused(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    policy = checkpoint(tmp_path / "policy")
-    assert status_of("contract", policy, "--dataset", tmp_path) == 2
-    assert "not a LeRobot dataset" in capsys.readouterr().err

@@ -129,9 +129,13 @@ def test_a_folder_of_somebody_elses_is_left_alone(tmp_path: Path) -> None:
         demonstrate(config(tmp_path))
 
 
-def test_no_demonstration_flies_a_held_out_course(tmp_path: Path) -> None:
+def test_no_demonstration_flies_a_held_out_course_and_only_a_student_is_slow(
+    tmp_path: Path,
+) -> None:
     with pytest.raises(UserError, match="seed"):
         config(tmp_path, seed=100)
+    with pytest.raises(UserError, match="--solve-time"):
+        replace(config(tmp_path), solve_time=100.0)
 
 
 def test_a_slow_student_flies_along_its_plan_from_an_old_image() -> None:
@@ -157,11 +161,6 @@ def test_a_slow_student_sees_old_images_and_every_tick_has_a_label(tmp_path: Pat
     assert ages_ns.min() > 100_000_000
     assert len(set(ticks["chunk_serial"].to_pylist())) == ticks.num_rows > 100
     assert ticks["expert"].null_count == 0
-
-
-def test_only_a_student_is_slow(tmp_path: Path) -> None:
-    with pytest.raises(UserError, match="--solve-time"):
-        replace(config(tmp_path), solve_time=100.0)
 
 
 def test_flights_differ() -> None:

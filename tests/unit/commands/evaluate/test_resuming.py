@@ -21,18 +21,24 @@ class Flights:
     def __init__(self) -> None:
         self.flown: list[int] = []
         self.fails_at: int | None = None
+        self.engine = "numpy"
+        self.path: Path | None = None
+        self.on_disk: list[int] = []
+        """Flights in the file at ``path`` as each one ends."""
 
     def fly(self, spec: EpisodeSpec, _: Any) -> FlownEpisode:
         if spec.index == self.fails_at:
             raise PeerError("the vehicle is gone")
         self.flown.append(spec.index)
+        if spec.index and self.path is not None:
+            self.on_disk.append(len(json.loads(self.path.read_text())["episodes"]))
         result = finished(
             course_seed=spec.course_seed,
             seed=spec.seed,
             distance_m=30.0 + spec.index,
             lost=because(Code.TOO_SLOW, chunks=5, age_ms=9.5, limit_ms=5.0) if spec.index else None,
         )
-        return FlownEpisode(engine="numpy", result=result)
+        return FlownEpisode(engine=self.engine, result=result)
 
 
 @pytest.fixture
@@ -48,36 +54,22 @@ def config(tmp_path: Path) -> EvaluateConfig:
     return EvaluateConfig(policy=policy, episodes=5, json=tmp_path / "out.json", resume=True)
 
 
-def test_what_was_flown_is_not_flown_again(
+def test_what_was_flown_is_on_disk_and_not_flown_again(
     flights: Flights, config: EvaluateConfig, tmp_path: Path
 ) -> None:
-    flights.fails_at = 3
+    flights.fails_at, flights.path = 3, config.json
     with pytest.raises(PeerError):
         evaluate(config)
     flights.fails_at = None
     assert evaluate(config) == 0
+    assert flights.on_disk == [1, 2, 3, 4], "each flight, as the next one begins"
     assert flights.flown == [0, 1, 2, 3, 4]
     assert config.json is not None
+    flights.path = None
     at_once = replace(config, json=tmp_path / "at_once.json")
     evaluate(at_once)
     assert at_once.json is not None
     assert config.json.read_text() == at_once.json.read_text()
-
-
-def test_each_flight_is_on_disk_when_the_next_one_begins(
-    flights: Flights, config: EvaluateConfig, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    assert config.json is not None
-    path, seen = config.json, list[int]()
-
-    def fly(spec: EpisodeSpec, stop: Any) -> FlownEpisode:
-        if spec.index:
-            seen.append(len(json.loads(path.read_text())["episodes"]))
-        return flights.fly(spec, stop)
-
-    monkeypatch.setattr(f"{evaluate.__module__}.fly_simulated", fly)
-    evaluate(config)
-    assert seen == [1, 2, 3, 4]
 
 
 def test_more_episodes_and_workers_go_on_and_fewer_lose_none(
@@ -107,17 +99,11 @@ def test_flights_by_other_flags_or_weights_are_not_mixed(
         evaluate(config)
 
 
-def test_flights_of_another_engine_are_not_mixed(
-    flights: Flights, config: EvaluateConfig, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_flights_of_another_engine_are_not_mixed(flights: Flights, config: EvaluateConfig) -> None:
     evaluate(config)
     assert config.json is not None
     before = json.loads(config.json.read_text())
-
-    def fly(spec: EpisodeSpec, stop: Any) -> FlownEpisode:
-        return replace(flights.fly(spec, stop), engine="torch")
-
-    monkeypatch.setattr(f"{evaluate.__module__}.fly_simulated", fly)
+    flights.engine = "torch"
     with pytest.raises(UserError, match="flown by the engine numpy, here it is torch"):
         evaluate(replace(config, episodes=6))
     after = json.loads(config.json.read_text())

@@ -145,7 +145,6 @@ def test_ctrl_c_ends_with_the_results_so_far(
         (["--policy", "scripted", "--json", "/proc/none/out.json"], "cannot write"),
         (["--policy", "scripted", "--json", "/"], "cannot write --json /"),
         (["--policy", "scripted", "--ray", "cluster"], "--ray cluster: nothing answers there"),
-        (["--fast"], "Unknown option: --fast"),
     ],
 )
 def test_a_bad_flag_is_one_clear_error(

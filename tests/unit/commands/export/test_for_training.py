@@ -93,7 +93,11 @@ def test_a_state_in_body_axes_is_what_the_policy_gets_in_flight(tmp_path: Path) 
         read_dataset(out)  # mavbridge train takes the world's axes
 
 
-@pytest.mark.parametrize("size", [0, 15, 97, 5000])
-def test_sizes_that_no_video_has_are_refused(tmp_path: Path, size: int) -> None:
-    with pytest.raises(UserError, match="--image-size"):
-        ExportConfig(out=tmp_path, image_size=size)
+@pytest.mark.parametrize(
+    ("flag", "value"), [*(("image_size", size) for size in (0, 15, 97, 5000)), ("task", " ")]
+)
+def test_sizes_that_no_video_has_and_a_task_that_says_nothing_are_refused(
+    tmp_path: Path, flag: str, value: object
+) -> None:
+    with pytest.raises(UserError, match=f"--{flag.replace('_', '-')}"):
+        ExportConfig(out=tmp_path, **{flag: value})  # type: ignore[arg-type]

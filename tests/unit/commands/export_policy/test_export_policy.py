@@ -66,11 +66,3 @@ def test_what_cannot_be_written_is_refused(
     with pytest.raises((UserError, PolicyError), match=message):
         export_policy(None, ExportPolicyConfig(**wanted))  # type: ignore[arg-type]
     assert (tmp_path / "taken").read_bytes() == b""
-
-
-def test_without_the_package_it_says_what_to_install(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr("importlib.util.find_spec", lambda name: None)
-    with pytest.raises(UserError, match=r"needs onnx: pip install onnx"):
-        export_policy(None, ExportPolicyConfig(out=tmp_path / "here"))

@@ -57,35 +57,27 @@ def test_a_key_begins_and_ends_and_marks() -> None:
     assert session.step(keys="q") == ["end", "quit"]
 
 
-def test_a_switch_records_while_it_is_high() -> None:
+def test_a_switch_records_while_it_is_high_and_its_middle_marks_as_bad() -> None:
     session = Session(has_switch=True)
-    assert session.step(switch_us=LOW) == []
-    assert session.step(switch_us=MIDDLE, times=5) == []
-    assert session.step(switch_us=HIGH, times=5) == ["begin"]
-    assert session.step(switch_us=MIDDLE, times=3) == ["end"], "passing through the middle"
-    assert session.step(switch_us=LOW, times=20) == []
-    assert session.step(switch_us=HIGH, times=5) == ["begin"]
-    assert session.step(switch_us=LOW) == ["end"]
-
-
-def test_the_middle_of_the_switch_marks_as_bad() -> None:
-    session = Session(has_switch=True)
-    session.step(switch_us=LOW, times=5)
-    assert session.step(switch_us=HIGH, times=5) == ["begin"]
-    assert session.step(switch_us=MIDDLE, times=20) == ["end", "bad"]
-    assert session.step(switch_us=HIGH, times=5) == ["begin"], "the next one"
-    assert session.step(switch_us=LOW) == ["end"]
-    assert session.step(switch_us=MIDDLE, times=20) == [], "it did not come from high"
-
-
-def test_a_switch_that_is_high_already_begins_nothing_nor_does_a_lost_radio_end() -> None:
-    session = Session(has_switch=True)
-    assert session.step(switch_us=HIGH, times=5) == []
-    session.step(switch_us=LOW, times=5)
-    assert session.step(switch_us=HIGH, times=5) == ["begin"]
-    assert session.step(switch_us=0, times=20) == []
-    assert session.step(switch_us=HIGH) == []
-    assert session.step(switch_us=LOW) == ["end"]
+    for switch_us, times, done in (
+        (HIGH, 5, []),  # it is high already
+        (LOW, 5, []),
+        (MIDDLE, 5, []),
+        (HIGH, 5, ["begin"]),
+        (0, 20, []),  # a lost radio ends nothing
+        (HIGH, 1, []),
+        (MIDDLE, 3, ["end"]),  # passing through the middle
+        (LOW, 20, []),
+        (HIGH, 5, ["begin"]),
+        (LOW, 1, ["end"]),
+        (LOW, 5, []),
+        (HIGH, 5, ["begin"]),
+        (MIDDLE, 20, ["end", "bad"]),
+        (HIGH, 5, ["begin"]),  # the next one
+        (LOW, 1, ["end"]),
+        (MIDDLE, 20, []),  # it did not come from high
+    ):
+        assert session.step(switch_us=switch_us, times=times) == done, (switch_us, times)
 
 
 @pytest.mark.parametrize(

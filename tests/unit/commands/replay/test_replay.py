@@ -67,14 +67,6 @@ def test_another_limit_shows_its_effect_and_is_no_failure(
     assert replay(NUMPY, config) == ExitCode.DIFFERENT, "a tolerance was asked for"
 
 
-def test_a_flight_whose_log_is_gone_is_refused_in_words(tmp_path: Path) -> None:
-    folder = copied("numpy_px4", tmp_path)
-    (folder / "link.tlog").unlink()
-
-    with pytest.raises(UserError, match=r"link\.tlog"):
-        replay(folder, ReplayConfig())
-
-
 def test_flags_of_the_replay_replace_those_of_the_flight_and_no_others() -> None:
     flown = FlyConfig(policy=PolicyConfig(checkpoint=Path("a.pt"), seed=3, num_diffusion_steps=1))
 
@@ -134,3 +126,6 @@ def test_a_damaged_log_is_told_with_what_was_skipped(tmp_path: Path) -> None:
     told = json.loads(written.read_text())["gaps"]
     assert re.search(r"link.tlog is damaged.*: 5\d\d bytes were skipped, with \d+ packets", told[0])
     assert re.search(r"\d+ packets are not in the recording", told[1])
+    (folder / "link.tlog").unlink()
+    with pytest.raises(UserError, match=r"link\.tlog"):
+        replay(folder, ReplayConfig())
