@@ -29,8 +29,8 @@ MAX_SEED = 2**63 - 1
 """Largest seed that torch's generators accept."""
 
 
-class ImaginationError(MavbridgeError):
-    """The world model imagined NaN or infinity."""
+class RolloutError(MavbridgeError):
+    """The rollout had to end; the part written so far is readable."""
 
 
 @contextmanager
@@ -75,7 +75,7 @@ class Sampler:
     def decode(self, latents: Tensor) -> NDArray[np.uint8]:
         """Decode latents [N, C, h, w] to images [N, H, W, 3].
 
-        On one thread, like ``FrameDecoder``, because splitting a sum changes its rounding.
+        On one thread, like the decoder's, because splitting a sum changes its rounding.
         """
         with torch.inference_mode(), torch_threads(1), self.timed("decode"):
             pixels: NDArray[np.uint8] = self.model.decode(latents).cpu().numpy()
@@ -93,7 +93,7 @@ class Sampler:
         of the noise.
 
         Raises:
-            ImaginationError: the result is not finite.
+            RolloutError: the result is not finite.
         """
         with torch.inference_mode(), self.timed("sample"):
             imagined = self.model.sample(
@@ -106,7 +106,7 @@ class Sampler:
             sampled_states = imagined.states[0].float().cpu().numpy()
             sampled_actions = imagined.actions[0].float().cpu().numpy()
         if not (np.isfinite(sampled_states).all() and np.isfinite(sampled_actions).all()):
-            raise ImaginationError(
+            raise RolloutError(
                 "the world model imagined NaN or infinity: its weights are damaged, or it has left "
                 "what it was trained on; try more --ddim-steps, or another checkpoint"
             )
@@ -311,7 +311,7 @@ def rollout(
     be in its queue, and none after the last iteration.
 
     Raises:
-        ImaginationError: the world model imagines NaN or infinity.
+        RolloutError: the world model imagines NaN or infinity.
     """
     seen = ObservationQueue(
         start,

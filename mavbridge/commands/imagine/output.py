@@ -17,9 +17,15 @@ import pyarrow as pa
 import torch
 from torch import Tensor
 
-from mavbridge.commands.imagine.loop import RolloutPlan, Sampler, Segment, torch_threads
+from mavbridge.commands.imagine.loop import (
+    RolloutError,
+    RolloutPlan,
+    Sampler,
+    Segment,
+    torch_threads,
+)
 from mavbridge.core.clock import NS_PER_S
-from mavbridge.core.errors import MavbridgeError, UserError
+from mavbridge.core.errors import UserError
 from mavbridge.core.files import require_writable
 from mavbridge.core.records import ImageArray, RolloutFrame
 from mavbridge.core.workers import HungError, Worker
@@ -29,7 +35,6 @@ from mavbridge.recording.tables import TableWriter
 from mavbridge.recording.video.file import WRITE_ERRORS
 from mavbridge.recording.video.writer import VideoWriter
 from policy.contract import ACTION_DIM, STATE_DIM
-from policy.nets.world_model.model import WorldModel
 
 SCHEMA = pa.schema(
     [
@@ -49,10 +54,6 @@ OnFrame: TypeAlias = Callable[[RolloutFrame, ImageArray | None], None]
 
 def ignore_frame(frame: RolloutFrame, rgb: ImageArray | None) -> None:
     """An ``OnFrame`` that does nothing."""
-
-
-class RolloutError(MavbridgeError):
-    """The rollout could not be written to its end; the part written so far is readable."""
 
 
 def prepare_out(out: Path) -> None:
@@ -90,36 +91,6 @@ END_S = 45.0
 _POLL_S = 0.1
 
 
-class FrameDecoder:
-    """Converts latents to images, one frame at a time, because the loop needs the processor, too.
-
-    On a GPU it uses a stream beside the sampler's. Used by one thread.
-    """
-
-    def __init__(self, model: WorldModel) -> None:
-        self._model = model
-        self._stream: torch.cuda.Stream | None = None
-        if (device := next(model.parameters()).device).type == "cuda":
-            self._stream = torch.cuda.Stream(device)  # type: ignore[no-untyped-call]
-
-    def frames(
-        self, latents: Tensor, rows: list[int], ready: torch.cuda.Event | None
-    ) -> Iterator[ImageArray]:
-        """Return images [H, W, 3] of these rows of the latents [N, C, h, w].
-
-        On a GPU the latents can be read after the event ``ready``.
-        """
-        if self._stream is not None and ready is not None:
-            self._stream.wait_event(ready)
-            # Once the loop's stream frees the memory, it must not be reused before this one ends.
-            latents.record_stream(self._stream)
-        for row in rows:
-            beside = nullcontext() if self._stream is None else torch.cuda.stream(self._stream)
-            with torch.inference_mode(), beside:
-                pixels: ImageArray = self._model.decode(latents[row, None])[0].cpu().numpy()
-            yield pixels
-
-
 _Job: TypeAlias = tuple[Segment, torch.cuda.Event | None]
 """A segment, and the GPU event after which its latents can be read."""
 
@@ -149,7 +120,10 @@ class StreamedOutput:
         self.frames = 0
         self.frames_decoded = 0
         """Frames decoded outside the loop's thread, whose own frames the sampler counts."""
-        self._decoder = FrameDecoder(sampler.model)
+        self._stream: torch.cuda.Stream | None = None
+        """On a GPU, the decoder's stream beside the sampler's."""
+        if (device := next(sampler.model.parameters()).device).type == "cuda":
+            self._stream = torch.cuda.Stream(device)  # type: ignore[no-untyped-call]
         self._jobs: queue.Queue[_Job | None] = queue.Queue(QUEUED_SEGMENTS)
         self._table_path = out.with_suffix(".arrows")
         self.video: VideoWriter | None = None
@@ -266,7 +240,7 @@ class StreamedOutput:
                 self._table.add({name: getattr(frame, name) for name in SCHEMA.names})
             self._table.flush()
         missing = [row for row in range(plan.frames) if row not in segment.decoded]
-        images = self._decoder.frames(segment.latents, missing, ready)
+        images = self._decoded(segment.latents, missing, ready)
         for frame in frames:
             if stop.is_set():
                 return
@@ -287,3 +261,21 @@ class StreamedOutput:
                 self._digest.update(np.ascontiguousarray(rgb).data)
             self._on_frame(frame, rgb)
             self.frames += 1
+
+    def _decoded(
+        self, latents: Tensor, rows: list[int], ready: torch.cuda.Event | None
+    ) -> Iterator[ImageArray]:
+        """Decode rows of latents [N, C, h, w], one at a time: the loop needs the processor, too.
+
+        On a GPU the latents can be read after the event ``ready``.
+        """
+        if self._stream is not None and ready is not None:
+            self._stream.wait_event(ready)
+            # Once the loop's stream frees the memory, it must not be reused before this one ends.
+            latents.record_stream(self._stream)
+        for row in rows:
+            beside = nullcontext() if self._stream is None else torch.cuda.stream(self._stream)
+            with torch.inference_mode(), beside:
+                decoded = self._sampler.model.decode(latents[row, None])[0]
+                pixels: ImageArray = decoded.cpu().numpy()
+            yield pixels

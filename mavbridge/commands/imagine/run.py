@@ -17,6 +17,7 @@ from mavbridge.commands.config import ImagineConfig
 from mavbridge.commands.imagine.loop import (
     Decider,
     PolicyDecider,
+    RolloutError,
     RolloutPlan,
     RolloutStart,
     Sampler,
@@ -24,13 +25,7 @@ from mavbridge.commands.imagine.loop import (
     rollout,
     torch_threads,
 )
-from mavbridge.commands.imagine.output import (
-    OnFrame,
-    RolloutError,
-    StreamedOutput,
-    ignore_frame,
-    prepare_out,
-)
+from mavbridge.commands.imagine.output import OnFrame, StreamedOutput, ignore_frame, prepare_out
 from mavbridge.commands.output import progress_bar
 from mavbridge.core.clock import NS_PER_S, Clock, MonotonicClock
 from mavbridge.core.errors import MavbridgeError, UserError

@@ -54,21 +54,13 @@ def test_real_frames_follow_at_the_same_spacing_until_the_flight_ends(flight: Pa
     assert real.at(9) is None
 
 
-@pytest.mark.parametrize(
-    ("changes", "told"), [({"ticks": False}, "no state"), ({"camera_hz": 0.0}, "no frames")]
-)
-def test_a_flight_without_states_or_frames_is_refused(
-    tmp_path: Path, changes: dict[str, object], told: str
-) -> None:
-    flight = open_flight(write_flight(tmp_path / "a", **changes))  # type: ignore[arg-type]
-    with pytest.raises(UserError, match=told):
-        read_start(flight, TINY, 0.0)
-
-
-def test_a_flight_whose_axes_are_unknown_is_refused(flight: Path) -> None:
-    opened = open_flight(flight)
-    with pytest.raises(UserError, match="unknown frame"):
-        read_start(replace(opened, meta=replace(opened.meta, contract=None)), TINY, 0.0)
+def test_a_flight_without_states_frames_or_known_axes_is_refused(tmp_path: Path) -> None:
+    blind = open_flight(write_flight(tmp_path / "a", camera_hz=0.0))
+    axes = replace(blind, meta=replace(blind.meta, contract=None))
+    silent = open_flight(write_flight(tmp_path / "b", ticks=False))
+    for flight, told in ((silent, "no state"), (blind, "no frames"), (axes, "unknown frame")):
+        with pytest.raises(UserError, match=told):
+            read_start(flight, TINY, 0.0)
 
 
 def test_a_policy_by_body_rates_is_refused() -> None:

@@ -15,12 +15,8 @@ from torch import Tensor
 
 from helpers.recordings import send_signal
 from helpers.rollouts import TinyWorld, make_plan, make_sampler, read_rows
-from mavbridge.commands.imagine.loop import Segment
-from mavbridge.commands.imagine.output import (
-    QUEUED_SEGMENTS,
-    RolloutError,
-    StreamedOutput,
-)
+from mavbridge.commands.imagine.loop import RolloutError, Segment
+from mavbridge.commands.imagine.output import QUEUED_SEGMENTS, StreamedOutput
 from mavbridge.core.workers import HungError
 from mavbridge.recording.tables import TableWriter
 from mavbridge.recording.video.file import count_frames, read_video
