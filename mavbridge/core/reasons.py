@@ -8,7 +8,7 @@ from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from enum import Enum, StrEnum, auto
 from functools import partial
-from typing import Any, TypeAlias
+from typing import Any, Self, TypeAlias
 
 Value: TypeAlias = "str | int | float | bool | Reason"
 
@@ -28,20 +28,24 @@ class Kind(Enum):
     """A planned end."""
 
 
-_told: list[tuple[Kind, str]] = []
-
-
 def _member(kind: Kind, sentence: str) -> Any:
-    """Note kind and sentence of the next code."""
-    _told.append((kind, sentence))
-    return auto()
+    return auto(), kind, sentence
 
 
 _waiting, _pilot, _vehicle, _fault, _end = (partial(_member, kind) for kind in Kind)
 
 
 class Code(StrEnum):
-    """Identifier of a reason, declared with its kind and its sentence."""
+    """Identifier of a reason, with its kind and the format of its sentence."""
+
+    kind: Kind
+    sentence: str
+
+    def __new__(cls, value: str, kind: Kind, sentence: str) -> Self:
+        """Return the member; ``value`` is its name in lower case."""
+        member = str.__new__(cls, value)
+        member._value_, member.kind, member.sentence = value, kind, sentence
+        return member
 
     # Before a flight
     NOT_ENGAGED = _waiting("not engaged: press e, use the engage switch, or --arm")
@@ -255,7 +259,6 @@ class Code(StrEnum):
     FLIGHT_PROCESS_DIED = _fault("the flight process has died")
 
 
-_REASONS = dict(zip(Code, _told, strict=True))
 _WRAPPERS = (Code.THEN, Code.WITH_HINT, Code.OF_CAMERA)
 _CAUSES = {
     ("rc-override", "unseen"): "another station may be overriding them, or the receiver has "
@@ -301,7 +304,7 @@ class Reason:
         inner = dict(self.data).get("first") or dict(self.data).get("why")
         if self.code in _WRAPPERS and isinstance(inner, Reason):
             return inner.kind
-        return _REASONS[self.code][0]
+        return self.code.kind
 
     @property
     def codes(self) -> tuple[Code, ...]:
@@ -327,7 +330,7 @@ class Reason:
     def __str__(self) -> str:
         """Return the sentence for the user."""
         words = dict(self.data)
-        text = _REASONS[self.code][1].format(**words)
+        text = self.code.sentence.format(**words)
         if self.code in (Code.OVERRULED, Code.UNHEARD):
             keys = ((str(words.get(name)), str(words.get("fault"))) for name in _CAUSE_OF)
             return ": ".join((text, *(_CAUSES[key] for key in keys if key in _CAUSES)))
@@ -368,7 +371,7 @@ def reason_from_json(document: Mapping[str, object]) -> Reason:
     if not isinstance(data, dict):
         raise TypeError(f"data is {type(data).__name__}, not an object")
     return because(
-        Code(str(document["code"])),
+        Code[str(document["code"]).upper()],
         **{
             name: reason_from_json(value) if isinstance(value, dict) else value
             for name, value in data.items()

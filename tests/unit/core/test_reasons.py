@@ -26,9 +26,8 @@ LATE = {"quantity": "attitude", "age_ms": 104.2, "limit_ms": 100.0, "spent_ms": 
 
 def example(code: Code) -> Reason:
     """A reason with every figure that its sentence names."""
-    _, text = reasons._REASONS[code]
     data: dict[str, reasons.Value] = {}
-    for _, name, spec, _ in FORMATTER.parse(text):
+    for _, name, spec, _ in FORMATTER.parse(code.sentence):
         if name is not None:
             data[name] = 1.5 if spec else "a word"
     if code in (Code.LATE, Code.PAST_HORIZON):
@@ -48,8 +47,7 @@ def test_each_reason_can_be_said_and_comes_through_json(code: Code) -> None:
 
 
 def test_no_two_reasons_say_the_same() -> None:
-    texts = [text for _, text in reasons._REASONS.values()]
-    assert len(texts) == len(set(texts))
+    assert len({code.sentence for code in Code}) == len(Code)
 
 
 @pytest.mark.parametrize(
@@ -124,13 +122,9 @@ def test_each_reason_that_the_source_makes_has_the_figures_of_its_sentence() -> 
     wrong = [
         (place, code)
         for place, code, figures in calls
-        if not figures >= {name for _, name, _, _ in FORMATTER.parse(_text(code)) if name}
+        if not figures >= {name for _, name, _, _ in FORMATTER.parse(code.sentence) if name}
     ]
     assert not wrong
-
-
-def _text(code: Code) -> str:
-    return reasons._REASONS[code][1]
 
 
 def test_the_key_differs_by_words_and_not_by_numbers() -> None:
