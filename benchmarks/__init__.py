@@ -2,7 +2,6 @@
 
 compare             our engines, flights and link beside a roofline, a baseline runner and others
 link                latency of our link client and of others, in turn
-lerobot_policies    LeRobot's policies on our engines, beside LeRobot's code
 two_rates           one rate and two rates, over the time to encode an image
 train_shipped       training of the shipped policies
 """

@@ -57,6 +57,8 @@ LOADED_FLIGHTS: tuple[tuple[Rates, Load], ...] = tuple(
 """Flights of the shipped policy for stick timing: with slow solves, and with a busy interpreter."""
 ROOFLINE = "roofline f32"
 MS_PER_S = 1000.0
+FLIGHT_S, ATTITUDES = 60.0, 1500
+"""Length of a flight, and number of attitudes that each client of the link answers."""
 
 app = App(help=__doc__)
 
@@ -64,14 +66,12 @@ app = App(help=__doc__)
 @app.default
 def main(
     *,
-    quick: bool = False,
     json: Path | None = None,
     check: Path | None = None,
 ) -> int:
     """Measure everything, print and write; exit with 1 if the budget is exceeded.
 
     Args:
-        quick: measure for seconds instead of minutes: figures to look at, not to quote.
         json: write all figures here.
         check: compare with this budget of ratios.
     """
@@ -79,7 +79,7 @@ def main(
     require_writable(json, "--json")
     require_packages("make bench, which flies the simulator,", {"mujoco": "mujoco"})
     console = table_console()
-    result = measure(is_quick=quick)
+    result = measure()
     print_result(result, console)
     if json is not None:
         json.write_text(to_json(result))
@@ -93,21 +93,19 @@ def main(
     return 1 if exceeded else 0
 
 
-def measure(*, is_quick: bool) -> BenchResult:
+def measure() -> BenchResult:
     """Measure the sections one after the other, since they would disturb each other."""
     policies = tuple(replace(policy, engine="auto") for policy in (SHIPPED, LARGE))
-    rounds, block_s, flight_s, attitudes = (2, 0.5, 5.0, 200) if is_quick else (5, 1.5, 60.0, 1500)
-    engines, notes = time_engines(policies, rounds=rounds, block_s=block_s)
+    engines, notes = time_engines(policies, rounds=5, block_s=1.5)
     clients, peer_notes = link_clients()
     return BenchResult(
         machine=this_computer(),
-        quick=is_quick,
         engines=(*engines, *time_rooflines(policies)),
         flights=(
-            *(_fly(policy, Rates(), flight_s, module=module) for policy, module in FLIGHTS),
-            *(_fly(SHIPPED, rates, flight_s, load=load) for rates, load in LOADED_FLIGHTS),
+            *(_fly(policy, Rates(), FLIGHT_S, module=module) for policy, module in FLIGHTS),
+            *(_fly(SHIPPED, rates, FLIGHT_S, load=load) for rates, load in LOADED_FLIGHTS),
         ),
-        links=tuple(time_link(client, attitudes) for client in clients),
+        links=tuple(time_link(client, ATTITUDES) for client in clients),
         notes=(*notes, *peer_notes),
     )
 

@@ -101,7 +101,6 @@ class BenchResult:
     """Results of one run."""
 
     machine: Computer
-    quick: bool
     engines: tuple[EngineTiming, ...]
     flights: tuple[Flight, ...]
     links: tuple[LinkLatency, ...]

@@ -148,17 +148,12 @@ def shown_cells(cells: list[Cell], sticks: Path, rates: Path) -> list[Cell]:
 
 def flags_of(loop: Loop, encoder_ms: int) -> str:
     """Return the flags of ``mavbridge evaluate`` for a loop beside an encoder of this speed."""
-    images_hz = min(CAMERA_HZ, 1000 / encoder_ms)
     if loop == "one rate":
         rate_hz = min(MOST_HZ, 1000 / (encoder_ms + HEAD_MS))
-        images_hz = max(CAMERA_HZ, rate_hz)
-        return (
-            f"--single-rate --set-config rates.single={rate_hz:.4g} "
-            f"--set-config rates.visual={images_hz:.4g}"
-        )
-    action_hz = loop.partition(" ")[0]
-    visual = f"--set-config rates.visual={images_hz:.4g}"
-    return f"--dual-rate {visual} --set-config rates.action={action_hz}"
+        visual = f"--set-config rates.visual={max(CAMERA_HZ, rate_hz):.4g}"
+        return f"--single-rate --set-config rates.single={rate_hz:.4g} {visual}"
+    visual = f"--set-config rates.visual={min(CAMERA_HZ, 1000 / encoder_ms):.4g}"
+    return f"--dual-rate {visual} --set-config rates.action={loop.partition(' ')[0]}"
 
 
 def evaluate(
@@ -169,11 +164,15 @@ def evaluate(
     Raises:
         subprocess.CalledProcessError: the evaluation failed, and printed why.
     """
-    loop_flags = flags_of(loop, encoder_ms)
-    flags = f"{control.flags} {loop_flags} --num-diffusion-steps 1"
-    flags += f" --vision-time {encoder_ms} {LOOSE}"
-    flags += f" --episodes {episodes} --max-time 45"
-    flown = fly(flags, weights, workers)
+    flags = f"{control.flags} {flags_of(loop, encoder_ms)} --num-diffusion-steps 1"
+    flags += f" --vision-time {encoder_ms} {LOOSE} --episodes {episodes} --max-time 45"
+    with TemporaryDirectory() as folder:
+        out = Path(folder) / "evaluation.json"
+        files = ("--checkpoint", str(weights), "--workers", str(workers), "--json", str(out))
+        command = [sys.executable, "-m", "mavbridge", "evaluate", *flags.split(), *files]
+        subprocess.run(command, check=True, stdout=subprocess.DEVNULL)
+        summary = loads(out.read_text())["summary"]
+    success, speed = summary["success_rate"], summary["course_speed_mps"]
     return Cell(
         control=control.name,
         loop=loop,
@@ -181,46 +180,11 @@ def evaluate(
         command=f"mavbridge evaluate {flags}",
         checkpoint_sha256=sha256(weights),
         episodes=episodes,
-        success=flown.success,
-        success_low=flown.success_low,
-        success_high=flown.success_high,
-        gates=flown.gates,
-        speed_mps=0.0 if math.isnan(flown.course_speed_mps) else flown.course_speed_mps,
-    )
-
-
-class Flown(NamedTuple):
-    """Figures of one ``mavbridge evaluate``; intervals are 95 %. NaN: no flight has the figure."""
-
-    success: float
-    success_low: float
-    success_high: float
-    gates: float
-    course_speed_mps: float
-
-
-def fly(flags: str, checkpoint: Path, workers: int) -> Flown:
-    """Run ``mavbridge evaluate`` with these flags.
-
-    Raises:
-        subprocess.CalledProcessError: the evaluation failed, and printed why.
-    """
-    with TemporaryDirectory() as folder:
-        out = Path(folder) / "evaluation.json"
-        files = ("--checkpoint", str(checkpoint), "--workers", str(workers), "--json", str(out))
-        command = [sys.executable, "-m", "mavbridge", "evaluate", *flags.split(), *files]
-        subprocess.run(command, check=True, stdout=subprocess.DEVNULL)
-        summary = loads(out.read_text())["summary"]
-
-    def value(name: str) -> float:
-        return float(summary[name]["value"]) if summary[name] else math.nan
-
-    return Flown(
-        success=value("success_rate"),
-        success_low=summary["success_rate"]["low"],
-        success_high=summary["success_rate"]["high"],
-        gates=value("gates_passed"),
-        course_speed_mps=value("course_speed_mps"),
+        success=success["value"],
+        success_low=success["low"],
+        success_high=success["high"],
+        gates=summary["gates_passed"]["value"],
+        speed_mps=speed["value"] if speed else 0.0,
     )
 
 
@@ -251,8 +215,7 @@ def draw(cells: list[Cell], path: Path) -> None:
     from matplotlib import rc_context
     from matplotlib.figure import Figure
 
-    times = {(cell.control, cell.encoder_ms): None for cell in cells}
-    flown = Counter(control for control, _ in times)
+    flown = Counter(control for control, _ in {(c.control, c.encoder_ms): None for c in cells})
     names = [name for name, count in flown.items() if count > 1] or list(flown)
     encoders_ms = sorted({cell.encoder_ms for cell in cells})
     with rc_context(FIGURE_STYLE):

@@ -14,7 +14,6 @@ from sitl.ardupilot.params import ArduPilotParams
 from sitl.ardupilot.rc import ModeSwitch, RcEngine
 from sitl.ardupilot.sticks import (
     GESTURE_NS,
-    SimpleMode,
     Sticks,
     climb_rate_mps,
     gesture_side,
@@ -112,6 +111,7 @@ class ArduCopter(Autopilot):
     airframe = QUAD
     gps_period_ns = NS_PER_S // 5
     id_param = "MAV_SYSID"
+    battery_mv = 12_600
     params: ArduPilotParams
 
     def __init__(self, params: ArduPilotParams, config: VehicleConfig, boot_ns: int) -> None:
@@ -122,7 +122,6 @@ class ArduCopter(Autopilot):
         self.gcs_failsafe = GcsFailsafe(params)
         self.control = CopterControl(params)
         """Targets and thrust, for telemetry to read; only this class commands it."""
-        self.simple = SimpleMode(params)
         self._armed = False
         self._mode_switch = ModeSwitch()
         self._gesture = HeldGesture(GESTURE_NS)
@@ -199,7 +198,6 @@ class ArduCopter(Autopilot):
             return False
         self._armed = True
         self._armed_ns = self._idle_since_ns = self.now_ns
-        self.simple.arm(self.yaw_rad)
         self.control.enter(self.mode, self.sensed)
         self._send_text(SEVERITY_INFO, "Arming motors")
         return True
@@ -270,9 +268,7 @@ class ArduCopter(Autopilot):
         if not self.armed:
             self.control.reset(self.sensed)
             return STOPPED
-        sticks = self.simple.turned(
-            read_sticks(self.rc, self.params), self.yaw_rad, self.sensed.position_ned_m
-        )
+        sticks = read_sticks(self.rc, self.params)
         if self.landed:
             if not self._lifts_off(sticks):
                 if self.mode.lands or self._is_idle(sticks):
@@ -311,7 +307,6 @@ class ArduCopter(Autopilot):
 
     def _read_radio(self) -> None:
         new_input = self.rc.update(self.now_ns)
-        self.simple.read_aux(self.rc.channels_us)
         self._read_mode_switch()
         if new_input:
             self._read_gesture()
@@ -340,10 +335,7 @@ class ArduCopter(Autopilot):
         channel = self.params.integer("FLTMODE_CH")
         if not 1 <= channel <= len(self.rc.channels_us):
             return
-        before = self._mode_switch.position
         position = self._mode_switch.update(self.rc.channels_us[channel - 1], self.now_ns)
-        if self._mode_switch.position not in (None, before):
-            self.simple.read_mode_switch(self._mode_switch.position)
         if position is not None:
             with suppress(ValueError):  # ignore a mode that this vehicle lacks
                 self.set_mode(Mode(self.params.integer(f"FLTMODE{position}")))

@@ -71,7 +71,7 @@ def _heartbeat(ap: ArduCopter) -> Message:
     if ap.armed:
         base_mode |= mav.MAV_MODE_FLAG_SAFETY_ARMED
         status = mav.MAV_STATE_ACTIVE
-    if ap.radio_failsafe.active or ap.gcs_failsafe.active or ap.battery.is_low:
+    if ap.radio_failsafe.active or ap.gcs_failsafe.active:
         status = mav.MAV_STATE_CRITICAL
     autopilot = mav.MAV_AUTOPILOT_ARDUPILOTMEGA
     return mav.MAVLink_heartbeat_message(
@@ -94,8 +94,6 @@ def _sys_status(ap: ArduCopter) -> Message:
         faults |= mav.MAV_SYS_STATUS_PREARM_CHECK
     if ap.radio_failsafe.active:
         faults |= mav.MAV_SYS_STATUS_SENSOR_RC_RECEIVER
-    if ap.battery.is_low:
-        faults |= mav.MAV_SYS_STATUS_SENSOR_BATTERY
     return sys_status(ap, present=present, enabled=present, healthy=present & ~faults)
 
 

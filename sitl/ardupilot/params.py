@@ -53,7 +53,7 @@ _FIXED = {
     "RC_OVERRIDE_TIME": 3.0,  # s; 0 refuses overrides, < 0 never expires
     "RTL_ALT": 1500.0,  # cm
     "SCHED_LOOP_RATE": 400.0,  # Hz; bounds the message rates
-    "SIMPLE": 0.0,  # one bit for each position of the mode switch
+    "SIMPLE": 0.0,  # stored only: the sticks keep the vehicle's axes
     "SUPER_SIMPLE": 0.0,
     "WPNAV_ACCEL_Z": 100.0,  # cm/s^2
     "WPNAV_SPEED_DN": 150.0,  # cm/s

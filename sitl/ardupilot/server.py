@@ -15,7 +15,6 @@ from sitl.ardupilot.endpoint import ArduPilotEndpoint
 from sitl.ardupilot.flight_modes import Mode
 from sitl.ardupilot.guided import VelocitySetpoint
 from sitl.ardupilot.rc import IGNORE, PRIMARY_CHANNELS, RELEASE
-from sitl.ardupilot.sticks import Axes
 from sitl.link.server import (
     ACCEPTED,
     COMMAND_FIELDS,
@@ -35,7 +34,6 @@ from sitl.vehicle.firmware import AttitudeSetpoint
 from sitl.vehicle.rotation import from_euler, rotate
 
 FORCE_REBOOT = 20190226.0  # param 6 of PREFLIGHT_REBOOT_SHUTDOWN: even while armed (ArduPilot)
-SIMPLE_MODE, SWITCH_LOW = 3.0, 0.0  # params of DO_AUX_FUNCTION
 _OPTION_GCS_ONLY = 1
 MAX_NORM_ERROR = 1e-3  # tolerance for the squared length of a quaternion
 
@@ -70,7 +68,6 @@ class ArduPilotServer(MavlinkServer[ArduCopter, ArduPilotEndpoint]):
             mav.MAV_CMD_NAV_TAKEOFF: self._take_off,
             mav.MAV_CMD_NAV_LAND: lambda *_: self._to_mode(Mode.LAND),
             mav.MAV_CMD_DO_SET_MODE: self._do_set_mode,
-            mav.MAV_CMD_DO_AUX_FUNCTION: self._aux_function,
             mav.MAV_CMD_PREFLIGHT_REBOOT_SHUTDOWN: self._reboot,
             mav.MAV_CMD_COMPONENT_ARM_DISARM: self._arm_disarm,
             mav.MAV_CMD_GET_HOME_POSITION: self._send_home,
@@ -209,13 +206,6 @@ class ArduPilotServer(MavlinkServer[ArduCopter, ArduPilotEndpoint]):
     def _take_off(self, params: Params7, _link: ArduPilotEndpoint) -> int:
         height_m = params[6]
         return ACCEPTED if math.isfinite(height_m) and self._ap.take_off(height_m) else FAILED
-
-    def _aux_function(self, params: Params7, _link: ArduPilotEndpoint) -> int:
-        """Turn Simple mode off, the only function supported by command."""
-        if params[:2] != (SIMPLE_MODE, SWITCH_LOW):
-            return FAILED
-        self._ap.simple.axes = Axes.VEHICLE
-        return ACCEPTED
 
     def _reboot(self, params: Params7, _link: ArduPilotEndpoint) -> int:
         if self._ap.armed and params[5] != FORCE_REBOOT:

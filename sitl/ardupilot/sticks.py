@@ -1,25 +1,19 @@
-"""Stick processing: dead zones, curves, the arming gesture, Simple mode.
+"""Stick processing: dead zones, curves, the arming gesture.
 
 Formulas: ArduPilot ``RC_Channel`` (calibration), Copter ``get_pilot_desired_throttle`` and
 ``get_pilot_desired_climb_rate``; checked against leans and rates measured on the firmware.
 """
 
 import math
-from collections.abc import Sequence
-from enum import IntEnum
 from typing import NamedTuple
 
-from sitl.ardupilot.params import RC_CHANNELS_WITH_PARAMS, ArduPilotParams
+from sitl.ardupilot.params import ArduPilotParams
 from sitl.ardupilot.rc import RcEngine
 from sitl.clock import NS_PER_S
-from sitl.vehicle.rotation import Vec3, from_heading
 
 THROTTLE_FULL = 1000.0
 GESTURE_NS = 2 * NS_PER_S  # hold time: ArduCopter's ARM_DELAY and DISARM_DELAY of the sticks
 FULL_YAW = 4000 / 4500
-_OPTION_SIMPLE, _OPTION_SUPER_SIMPLE = 3, 13
-_LOW_US, _HIGH_US = 1200, 1800
-_SUPER_SIMPLE_RADIUS_M = 10.0
 
 
 class Sticks(NamedTuple):
@@ -137,59 +131,3 @@ def gesture_side(sticks: Sticks) -> int:
     if sticks.throttle != 0.0 or abs(sticks.yaw) <= FULL_YAW:
         return 0
     return 1 if sticks.yaw > 0.0 else -1
-
-
-class Axes(IntEnum):
-    """Axes in which pitch and roll sticks are interpreted."""
-
-    VEHICLE = 0
-    ARMING = 1
-    HOME = 2
-
-
-class SimpleMode:
-    """Simple and Super Simple mode: pitch and roll in other axes than the vehicle's.
-
-    As in Copter up to 4.6 and from 4.8 on; 4.7.0 accepts the switch but rotates nothing. Only a
-    switch or a command changes the axes; a changed parameter has no effect until then.
-    """
-
-    def __init__(self, params: ArduPilotParams) -> None:
-        self._params = params
-        self.axes = Axes.VEHICLE
-        self._arming_rad = self._home_rad = 0.0
-        self._aux: Axes | None = None
-
-    def arm(self, yaw_rad: float) -> None:
-        self._arming_rad = self._home_rad = yaw_rad
-
-    def read_mode_switch(self, position: int) -> None:
-        """Apply a mode switch position, 1 to 6, that is new or was read for the first time."""
-        if self._aux is None:
-            bit = 1 << (position - 1)
-            is_super = self._params.integer("SUPER_SIMPLE") & bit
-            is_simple = self._params.integer("SIMPLE") & bit
-            self.axes = Axes.HOME if is_super else Axes.ARMING if is_simple else Axes.VEHICLE
-
-    def read_aux(self, channels_us: Sequence[int]) -> None:
-        """Follow the movements of a switch with RCn_OPTION 3 or 13."""
-        before, self._aux = self._aux, None
-        for index in range(RC_CHANNELS_WITH_PARAMS):
-            option, pwm_us = self._params.integer(f"RC{index + 1}_OPTION"), channels_us[index]
-            if option in (_OPTION_SIMPLE, _OPTION_SUPER_SIMPLE) and pwm_us:
-                high = Axes.HOME if option == _OPTION_SUPER_SIMPLE else Axes.ARMING
-                is_low = pwm_us < _LOW_US
-                self._aux = Axes.VEHICLE if is_low else high if pwm_us > _HIGH_US else Axes.ARMING
-        if self._aux is not None and self._aux is not before:
-            self.axes = self._aux
-
-    def turned(self, sticks: Sticks, yaw_rad: float, position_ned_m: Vec3) -> Sticks:
-        """Return the sticks rotated into the vehicle's axes."""
-        if self.axes is Axes.VEHICLE:
-            return sticks
-        north_m, east_m, _ = position_ned_m
-        if math.hypot(north_m, east_m) > _SUPER_SIMPLE_RADIUS_M:
-            self._home_rad = math.atan2(east_m, north_m)
-        angle_rad = self._home_rad if self.axes is Axes.HOME else self._arming_rad
-        forward, right = from_heading(-sticks.pitch, sticks.roll, angle_rad - yaw_rad)
-        return sticks._replace(pitch=-forward, roll=right)

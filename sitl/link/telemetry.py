@@ -12,6 +12,7 @@ from sitl.vehicle.firmware import Autopilot
 from sitl.vehicle.rotation import Vec3, conjugate, rotate, to_euler
 
 METRES_PER_DEGREE = 111_319.5
+FULL_PERCENT = 100  # of the battery
 INT16 = 32767
 _IMU_FIELDS_UPDATED = 0x1FFF
 
@@ -163,7 +164,7 @@ def vfr_hud(ap: Autopilot, *, altitude_m: float, throttle: float) -> Message:
 
 def sys_status(ap: Autopilot, *, present: int, enabled: int, healthy: int) -> Message:
     """Build SYS_STATUS with these sensors and the battery."""
-    battery = (*_battery_mv_ca(ap), ap.battery.remaining_percent)
+    battery = (ap.battery_mv, 0, FULL_PERCENT)
     return mav.MAVLink_sys_status_message(
         present, enabled, healthy, 100, *battery, 0, 0, 0, 0, 0, 0
     )
@@ -171,19 +172,11 @@ def sys_status(ap: Autopilot, *, present: int, enabled: int, healthy: int) -> Me
 
 def battery_status(ap: Autopilot, *, energy_hj: int) -> Message:
     """Build BATTERY_STATUS: one pack, reported as one cell; ``energy_hj`` -1: not known."""
-    charge = mav.MAV_BATTERY_CHARGE_STATE_OK
-    if ap.battery.is_low:
-        charge = mav.MAV_BATTERY_CHARGE_STATE_LOW
     kind = (mav.MAV_BATTERY_FUNCTION_ALL, mav.MAV_BATTERY_TYPE_LIPO)
-    pack_mv, current_ca = _battery_mv_ca(ap)
-    cells_mv, used = [pack_mv] + [65535] * 9, (0, energy_hj)
+    cells_mv, charge = [ap.battery_mv] + [65535] * 9, mav.MAV_BATTERY_CHARGE_STATE_OK
     return mav.MAVLink_battery_status_message(
-        0, *kind, INT16, cells_mv, current_ca, *used, ap.battery.remaining_percent, 0, charge
+        0, *kind, INT16, cells_mv, 0, 0, energy_hj, FULL_PERCENT, 0, charge
     )
-
-
-def _battery_mv_ca(ap: Autopilot) -> tuple[int, int]:
-    return round(1000.0 * ap.battery.voltage_v), round(100.0 * ap.battery.current_a)
 
 
 def extended_sys_state(

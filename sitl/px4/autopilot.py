@@ -14,7 +14,7 @@ from sitl.px4.flight import Px4Control, Setpoint
 from sitl.px4.modes import Px4Mode
 from sitl.px4.params import Px4Params
 from sitl.px4.sticks import RC_SOURCE, Px4Sticks, StickInput
-from sitl.vehicle.config import Battery, VehicleConfig
+from sitl.vehicle.config import VehicleConfig
 from sitl.vehicle.firmware import STOPPED, Autopilot
 
 RECEIVER_PERIOD_NS = NS_PER_S // 50
@@ -33,11 +33,11 @@ class Px4(Autopilot):
     gps_period_ns = NS_PER_S // 8
     gyro_noise_radps = math.radians(5.0)
     id_param = "MAV_SYS_ID"
+    battery_mv = 16_200
     params: Px4Params
 
     def __init__(self, params: Px4Params, config: VehicleConfig, boot_ns: int) -> None:
         super().__init__(params, config, boot_ns)
-        self.battery = Battery(voltage_v=16.2)
         self.stick_input = StickInput(params)
         self.commander = Commander(params, self.stick_input, boot_ns, self.texts)
         self.receiver_us: tuple[int, ...] | None = config.receiver_us if config.receiver else None
@@ -141,7 +141,7 @@ class Px4(Autopilot):
         commander.update(self.now_ns)
 
     def _motors(self) -> tuple[float, ...]:
-        if not self.armed or self.commander.terminated:
+        if not self.armed:
             return STOPPED
         if self.mode is not self._flown_mode:
             self._flown_mode = self.mode

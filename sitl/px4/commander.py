@@ -28,7 +28,7 @@ REASON_NAMES = {
     ARM_REASON_INACTION: "auto preflight disarming",
 }
 
-ACTION_POSCTL, ACTION_RTL, ACTION_TERMINATE = 2, 6, 10
+ACTION_POSCTL, ACTION_RTL = 2, 6
 CAUSE_STICKS_LOST = 1
 
 
@@ -77,7 +77,6 @@ class Commander:
         boot_mode = _BOOT_MODES.get(params.integer("COM_FLTMODE_BOOT"), Px4Mode.AUTO_LOITER)
         self.mode = self.intended = self._last_armable = boot_mode
         self.armed = False
-        self.terminated = False
         self.landed = True  # set by the autopilot, as are readiness and setpoint_fresh
         self.estimator_ready = self.position_ready = False
         self.setpoint_fresh = False
@@ -113,7 +112,7 @@ class Commander:
         """Start the motors, or send the refusal as a text. Return True if armed afterwards."""
         if self.armed:
             return True
-        if self.terminated or not self.can_arm():
+        if not self.can_arm():
             self._deny(
                 "Arming denied: Resolve system health failures first",
                 "commander_arm_denied_resolve_failures",
@@ -145,14 +144,14 @@ class Commander:
         """Stop the motors; refused in flight unless forced. Return True if disarmed afterwards."""
         if not self.armed:
             return True
-        if not (self.landed or force) or (self.terminated and not force):
+        if not (self.landed or force):
             self._deny("Disarming denied: not landed", "commander_disarm_denied_not_landed")
             return False
         self.armed = self._fallback = False
         self.lost_sticks.clear()
         self._say(SEVERITY_INFO, f"Disarmed by {REASON_NAMES[reason]}")
         self._emit("commander_disarmed_by", LEVELS_INFO, pack("B", reason))
-        if not self.intended.armable and not self.terminated:
+        if not self.intended.armable:
             self.intended = self._last_armable
         self.mode = self.intended
         return True
@@ -162,8 +161,6 @@ class Commander:
 
         A refusal becomes a text if ``says_why``.
         """
-        if self.terminated:
-            return False
         if self.armed and mode is not Px4Mode.AUTO_LAND and not self.can_fly(mode):
             arguments = pack("IB", self.mode.custom_mode, mode.event_number)
             text = f"Switching to {mode.spoken} is currently not available"
@@ -172,15 +169,6 @@ class Commander:
             return False
         self._intend(mode)
         return True
-
-    def terminate(self) -> None:
-        """Stop the motors for good; the vehicle stays armed until it is forced to disarm."""
-        mode = self.mode.custom_mode
-        self.terminated = True
-        self._intend(Px4Mode.TERMINATION)
-        self._say(SEVERITY_CRITICAL, "Failsafe activated")
-        arguments = pack("IB", mode, ACTION_TERMINATE)
-        self._emit("commander_failsafe_enter_generic", LEVELS_FAILSAFE, arguments)
 
     def refuse_frame(self, frame: int) -> None:
         """Report a velocity setpoint in axes that PX4 does not support."""
@@ -211,7 +199,7 @@ class Commander:
         if now_ns >= self._check_due_ns:
             self._check_due_ns = now_ns + CHECK_PERIOD_NS
             self._watch_sticks()
-        if self.armed and not self.terminated:
+        if self.armed:
             self._yield_to_pilot()
             self._disarm_by_time()
         self._choose_mode()
@@ -274,7 +262,7 @@ class Commander:
             self.disarm(force=False, reason=reason)
 
     def _choose_mode(self) -> None:
-        if not self.armed or self.terminated:
+        if not self.armed:
             self.mode, self._fallback = self.intended, False
             return
         if self.lost_sticks.active:

@@ -1,8 +1,8 @@
-"""One link of a PX4 vehicle: texts, events and streams within a bandwidth.
+"""One link of a PX4 vehicle: texts, events and streams.
 
 Each control step, a stream is sent if its interval has passed and its topic is new. A stream that
 is late by less than half an interval keeps its grid; a later one starts a new grid. So 200 Hz of a
-250 Hz topic become 125 Hz, as measured. A small bandwidth silently scales all rates down.
+250 Hz topic become 125 Hz, as measured.
 """
 
 from collections.abc import Hashable, Mapping
@@ -18,10 +18,6 @@ from sitl.px4.commander import Event
 from sitl.px4.messages import BUILDERS, BUILDERS_1_14, CURRENT_MODE, event_message, topic_version
 
 NS_PER_US = 1000
-LOWEST_SCALE = 0.05
-FRAME_BYTES = 12
-OTHER_STREAMS_BYTES_PS = 9000
-"""Bandwidth of the PX4 streams that this vehicle lacks."""
 
 _BOTH = by_message(SYSTEM_TIME=1.0, BATTERY_STATUS=0.5, HOME_POSITION=0.5, ESTIMATOR_STATUS=1.0)
 _BOTH[CURRENT_MODE] = 0.5
@@ -66,8 +62,6 @@ class Px4Endpoint(Endpoint[Px4]):
         super().restart(ap)
         self.has_gcs = False  # heard a ground station's heartbeat; no text is sent before
         self._streams: dict[int, _Stream] = {}
-        self._scale = 1.0
-        """Factor that fits all rates into the link's bandwidth; never reported to the peer."""
         for message_id, interval_us in self._default_us.items():
             self._start(message_id, interval_us)
         self._heartbeat_due_ns = ap.now_ns
@@ -120,29 +114,18 @@ class Px4Endpoint(Endpoint[Px4]):
         else:
             sent_us = self._ap.now_ns // NS_PER_US
             self._streams[message_id] = _Stream(interval_us=interval_us, sent_us=sent_us)
-        wanted = float(OTHER_STREAMS_BYTES_PS)
-        for number, stream in self._streams.items():
-            wanted += payload_bytes(number) * 1e6 / max(1, stream.interval_us)
-        self._scale = max(LOWEST_SCALE, min(1.0, self._ap.config.link_bytes_ps / wanted))
 
     def _due(self) -> list[int]:
         """Return the ids of the messages whose interval has passed and whose topic is new."""
         now_us, ready = self._ap.now_ns // NS_PER_US, []
         for message_id, stream in self._streams.items():
-            interval_us = stream.interval_us / self._scale
+            interval_us = stream.interval_us
             if now_us - stream.sent_us < interval_us:
                 continue
             if (version := topic_version(message_id, self._ap)) == stream.version:
                 continue
             is_on_grid = now_us - stream.sent_us < 1.5 * interval_us
-            stream.sent_us = int(stream.sent_us + interval_us) if is_on_grid else now_us
+            stream.sent_us = stream.sent_us + interval_us if is_on_grid else now_us
             stream.version = version
             ready.append(message_id)
         return ready
-
-
-def payload_bytes(message_id: int) -> int:
-    """Return the largest size of the message on the wire, without a signature."""
-    if message_id == CURRENT_MODE:
-        return 9 + FRAME_BYTES
-    return int(mav.mavlink_map[message_id].unpacker.size) + FRAME_BYTES

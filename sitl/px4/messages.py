@@ -44,7 +44,7 @@ _SENSORS_PRESENT, _SENSORS_ENABLED, _SENSORS_HEALTHY = 0x200C02F, 0x201C02F, 0x3
 _ESTIMATOR_WITHOUT_POSITION = 0xE5
 _ESTIMATOR_WITH_POSITION, _ESTIMATOR_ON_GROUND = 0x37F, 0x3FF
 _STATE_UNINIT, _STATE_STANDBY, _STATE_ACTIVE = 0, 3, 4
-_STATE_CRITICAL, _STATE_TERMINATED = 5, 8
+_STATE_CRITICAL = 5
 _ODOMETRY_COVARIANCE = [math.nan, *[0.0] * 20]
 
 
@@ -80,9 +80,7 @@ def _heartbeat(ap: Px4) -> Message:
         flags |= mav.MAV_MODE_FLAG_STABILIZE_ENABLED
     if ap.armed:
         flags |= mav.MAV_MODE_FLAG_SAFETY_ARMED
-    if ap.commander.terminated:
-        status = _STATE_TERMINATED
-    elif ap.in_failsafe:
+    if ap.in_failsafe:
         status = _STATE_CRITICAL
     elif ap.armed:
         status = _STATE_ACTIVE
@@ -99,8 +97,6 @@ def _sys_status(ap: Px4) -> Message:
     healthy = _SENSORS_HEALTHY | sticks
     if ap.armed or ap.commander.can_arm():
         healthy |= mav.MAV_SYS_STATUS_PREARM_CHECK
-    if ap.battery.is_low:
-        healthy &= ~mav.MAV_SYS_STATUS_SENSOR_BATTERY
     present, enabled = _SENSORS_PRESENT | sticks, _SENSORS_ENABLED
     return sys_status(ap, present=present, enabled=enabled, healthy=healthy)
 

@@ -29,7 +29,6 @@ class Px4Mode(Enum):
     ACRO = (5, 0, "Acro", 6, 0)
     OFFBOARD = (6, 0, "Offboard", 7, 0)
     STAB = (7, 0, "Stabilized", 8, 0)
-    TERMINATION = (10, 0, "Termination", 255, 0)
 
     def __init__(self, main: int, sub: int, spoken: str, event_number: int, standard: int) -> None:
         self.main, self.sub = main, sub
@@ -39,7 +38,7 @@ class Px4Mode(Enum):
         self.manual_throttle = main in (1, 5, 7)  # the stick is thrust: down for arming
         self.piloted = main in (1, 2, 3, 5, 7)  # flown by sticks: refused without them
         self.needs_position = main == 3 or (self.is_auto and sub != 6)
-        self.armable = main != 10 and (main, sub) not in ((4, 4), (4, 5), (4, 6))
+        self.armable = (main, sub) not in ((4, 4), (4, 5), (4, 6))
         flags = mav.MAV_MODE_FLAG_CUSTOM_MODE_ENABLED
         if self.piloted:
             flags |= mav.MAV_MODE_FLAG_MANUAL_INPUT_ENABLED
@@ -110,7 +109,7 @@ class LostSticks:
 
     def is_excepted(self, mode: Px4Mode) -> bool:
         bits = self._params.integer("COM_RCL_EXCEPT")
-        if mode in (Px4Mode.AUTO_RTL, Px4Mode.AUTO_LAND, Px4Mode.TERMINATION):
+        if mode in (Px4Mode.AUTO_RTL, Px4Mode.AUTO_LAND):
             return True
         if mode is Px4Mode.AUTO_MISSION:
             return bool(bits & _EXCEPT_MISSION)

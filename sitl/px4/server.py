@@ -61,7 +61,6 @@ class Px4Server(MavlinkServer[Px4, Px4Endpoint]):
             mav.MAV_CMD_NAV_RETURN_TO_LAUNCH: lambda *_: self._to_mode(Px4Mode.AUTO_RTL),
             mav.MAV_CMD_NAV_LAND: lambda *_: self._to_mode(Px4Mode.AUTO_LAND),
             mav.MAV_CMD_NAV_TAKEOFF: self._takeoff,
-            mav.MAV_CMD_DO_FLIGHTTERMINATION: self._terminate,
             mav.MAV_CMD_PREFLIGHT_REBOOT_SHUTDOWN: self._reboot,
             mav.MAV_CMD_COMPONENT_ARM_DISARM: self._arm_disarm,
         }
@@ -203,11 +202,6 @@ class Px4Server(MavlinkServer[Px4, Px4Endpoint]):
         height_m = params[6] - HOME.alt_m
         self._ap.prepare_takeoff(height_m if math.isfinite(height_m) else None)
         return ACCEPTED if self._ap.commander.set_mode(Px4Mode.AUTO_TAKEOFF) else REJECTED
-
-    def _terminate(self, params: Params7, _link: Px4Endpoint) -> int:
-        if params[0] > 0.5:
-            self._ap.commander.terminate()
-        return ACCEPTED
 
     def _reboot(self, params: Params7, _link: Px4Endpoint) -> int:
         """Accept 0, a no-op. PX4 refuses a reboot while armed, and always in SITL."""

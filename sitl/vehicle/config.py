@@ -22,16 +22,6 @@ Px4Release: TypeAlias = Literal["1.14", "1.15", "1.16", "1.17", "1.18"]
 """PX4 release for parameters, stick override and messages; 1.18 was measured."""
 
 
-class Battery(NamedTuple):
-    """Reported state of the battery; it never empties by itself."""
-
-    voltage_v: float = 12.6
-    current_a: float = 0.0
-    remaining_percent: int = 100
-    is_low: bool = False
-    """The firmware's battery failsafe has fired; this vehicle reports it and flies on."""
-
-
 class SigningKey(NamedTuple):
     """MAVLink 2 signing of every link."""
 
@@ -59,8 +49,6 @@ class VehicleConfig:
     """Time from boot until the estimator has a position (about 40 s on the real firmware)."""
     onboard_links: frozenset[int] = frozenset()
     """Indices of the links to companion computers, which get other streams from PX4."""
-    link_bytes_ps: float = 4_000_000.0
-    """Bandwidth that PX4 assumes for each link; too little slows its streams silently."""
     signing: SigningKey | None = None
     """Sign all messages, and refuse those not signed with this key."""
     conditions: Conditions = NOMINAL

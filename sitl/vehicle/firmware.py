@@ -14,7 +14,7 @@ from typing import ClassVar, NamedTuple, Self
 from pymavlink.dialects.v20 import ardupilotmega as mav
 
 from sitl.clock import NS_PER_S
-from sitl.vehicle.config import Battery, VehicleConfig
+from sitl.vehicle.config import VehicleConfig
 from sitl.vehicle.dynamics import Airframe, BodyState, Quadrotor, SensorNoise, Wind
 from sitl.vehicle.rotation import Quat, Vec3, yaw_of
 
@@ -141,6 +141,7 @@ class Autopilot(ABC):
     gyro_noise_radps: ClassVar[float] = 0.0
     """Noise of the body rates on each axis, in addition to the conditions'."""
     id_param: ClassVar[str]  # name of the system id's parameter
+    battery_mv: ClassVar[int]  # the battery never empties
 
     def __init__(self, params: Params, config: VehicleConfig, boot_ns: int) -> None:
         self.params = params  # survives a reboot
@@ -148,7 +149,6 @@ class Autopilot(ABC):
         self.boot_ns = boot_ns
         self.now_ns = boot_ns  # time of the last control step
         self.landed = True
-        self.battery = Battery()  # to change it, replace the whole object
         self.sensors_frozen = False
         """Injected fault: telemetry and control keep the last state while the physics goes on."""
         self.position_lost = False

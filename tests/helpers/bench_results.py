@@ -66,7 +66,6 @@ COMPUTER = Computer(
 )
 RESULT = BenchResult(
     machine=COMPUTER,
-    quick=True,
     engines=(
         make_timing("encode", "torch", 60.0),
         make_timing("sample", "torch", 18.0),

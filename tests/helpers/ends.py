@@ -47,6 +47,3 @@ class Ends:
         self.send(mav.MAVLink_command_long_message(1, 1, number, 0, *padded), link)
         acks = [m for m in self.run(0.01, link=link) if m.get_type() == "COMMAND_ACK"]
         return acks[-1].result if acks else None
-
-    def gcs_heartbeat(self):
-        self.send(mav.MAVLink_heartbeat_message(mav.MAV_TYPE_GCS, 8, 0, 0, 0, 3))

@@ -63,9 +63,7 @@ class FakeTransport:
 def test_the_loop_keeps_an_absolute_grid_and_flies_in_real_time():
     clock = FakeClock()
     vehicle = SimulatedVehicle(links=1, boot_ns=0)
-
     fly(vehicle, [FakeTransport(clock)], clock, StopRequest(), end_ns=NS_PER_S)
-
     assert clock.sleeps_ns == [STEP_NS * n for n in range(1, 401)]
     assert vehicle.ap.now_ns == NS_PER_S - STEP_NS
 
@@ -75,9 +73,7 @@ def test_after_a_stall_it_catches_up_without_a_burst():
     vehicle = SimulatedVehicle(links=1, boot_ns=0)
     vehicle.server.links[0].set_interval(mav.MAVLINK_MSG_ID_ATTITUDE, 10_000)
     transport = FakeTransport(clock)
-
     fly(vehicle, [transport], clock, StopRequest(), end_ns=2 * NS_PER_S)
-
     sent_ns = [stamp_ns for stamp_ns, _ in transport.sent]
     after_ns = [stamp_ns for stamp_ns in sent_ns if stamp_ns > NS_PER_S]
     assert min(b - a for a, b in pairwise(sent_ns)) >= STEP_NS
@@ -94,7 +90,6 @@ def test_a_terminated_process_flies_on_and_writes_the_report(tmp_path):
         assert process.stderr.readline().startswith("sitl: ready")
         process.terminate()
         process.communicate(timeout=60.0)
-
     assert process.returncode == 0
     report = json.loads(path.read_text())
     assert report["final"]["mode"] == "STABILIZE"
@@ -120,7 +115,6 @@ def test_a_terminated_process_flies_on_and_writes_the_report(tmp_path):
 def test_bad_flags_exit_with_two(argv, capsys):
     with pytest.raises(SystemExit) as exit_info:
         main(argv)
-
     assert exit_info.value.code == 2
     assert "error" in capsys.readouterr().err
 
@@ -157,7 +151,6 @@ def test_the_camera_publishes_while_its_context_lasts():
         while frame_id < 3 and clock.now_ns() < deadline_ns:
             clock.sleep_until_ns(clock.now_ns() + NS_PER_MS)
             frame_id = int.from_bytes(path.read_bytes()[24:32], "little")
-
     assert frame_id >= 3
     assert not path.exists()
     assert not any(thread.name == "sitl-camera" for thread in threading.enumerate())

@@ -21,19 +21,11 @@ def turn(x_degps=0.0, z_degps=0.0, thrust=0.5):
     return AttitudeSetpoint(None, (math.radians(x_degps), 0.0, math.radians(z_degps)), thrust)
 
 
-def send(pilot, setpoint):
-    ap = pilot.ap
-    if isinstance(setpoint, AttitudeSetpoint):
-        ap.guided.follow_attitude(setpoint, ap.sensed, ap.now_ns)
-    else:
-        ap.guided.follow_velocity(setpoint, ap.sensed, ap.now_ns)
-
-
 def stream(pilot, seconds, setpoint, watch=lambda ap: None):
     """The setpoint at 50 Hz."""
     for index in range(round(seconds * NS_PER_S / STEP_NS)):
         if index % 8 == 0:
-            send(pilot, setpoint)
+            pilot.ap.guided.follow_attitude(setpoint, pilot.ap.sensed, pilot.ap.now_ns)
         pilot.ap.step()
         watch(pilot.ap)
 
@@ -87,9 +79,7 @@ def in_the_air(pilot, mode=Mode.GUIDED):
 def test_rate_steps_take_the_measured_times(pilot, setpoint, axis, measured_ms, measured_peak):
     in_the_air(pilot, Mode.GUIDED_NOGPS)
     stream(pilot, 1.0, lean())
-
     times, peak = step_ms(pilot, 1.0, setpoint, rate_degps(axis), 40.0)
-
     assert times == pytest.approx(measured_ms, abs=20)
     assert peak == pytest.approx(measured_peak, abs=0.06)
 
@@ -116,7 +106,6 @@ def test_entering_from_a_lean_without_a_stream_levels_or_brakes(pilot):
         other.silence(0.4)
         assert stops or abs(roll_deg(other.ap)) < 2.0
         other.silence(4.0)
-
         assert (math.hypot(*other.ap.truth.velocity_ned_mps[:2]) < 0.3) == stops
 
 
@@ -134,7 +123,6 @@ def test_lift_off_times(pilot, options, thrust, seconds):
             lifted_ns.append(ap.now_ns)
 
     stream(pilot, 6.0, lean(thrust=thrust), watch)
-
     if seconds is None:
         assert not lifted_ns
     else:
@@ -145,9 +133,7 @@ def test_a_vehicle_landed_by_thrust_stays_armed(pilot):
     in_the_air(pilot, Mode.GUIDED_NOGPS)
     stream(pilot, 10.0, lean(thrust=0.0))
     assert pilot.ap.landed
-
     stream(pilot, 15.0, lean(thrust=0.0))
-
     assert pilot.ap.armed
 
 
@@ -157,6 +143,5 @@ def test_without_gps_guided_is_taken_on_the_ground_but_arms_only_in_nogps(pilot)
     assert pilot.ap.set_mode(Mode.GUIDED)
     assert not pilot.ap.arm(force=False)
     assert pilot.texts() == ["Arm: GPS 1: Bad fix"]
-
     assert pilot.ap.set_mode(Mode.GUIDED_NOGPS)
     assert pilot.ap.arm(force=False)

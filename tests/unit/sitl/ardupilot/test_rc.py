@@ -47,11 +47,9 @@ def test_the_override_switch_cuts_overrides_after_its_debounce():
     rc.override([1650] + [KEEP] * 7, 650 * NS_PER_MS)
     run(rc, 650, 651)
     assert rc.channels_us[0] == 1650
-
     run(rc, 651, 1000)
     rc.override([1600] + [KEEP] * 7, 1000 * NS_PER_MS)
     run(rc, 1000, 1100)
-
     assert rc.channels_us[0] == 1650
 
 
@@ -60,10 +58,8 @@ def test_manual_control_axes_can_be_absent_and_negative_thrust_is_refused():
     rc.manual_control(x=32767, y=1000, z=32767, r=-1000, now_ns=0)
     run(rc, 0, 50)
     assert rc.channels_us[:4] == [2000, 1500, 1000, 1000]
-
     rc.manual_control(x=0, y=0, z=-1, r=0, now_ns=50 * NS_PER_MS)
     run(rc, 50, 100)
-
     assert rc.channels_us[:4] == [2000, 1500, 1000, 1000]
 
 
@@ -72,9 +68,7 @@ def test_a_receiver_may_turn_up_later():
     rc.set_receiver([0] * 8)
     assert not rc.update(0)
     assert not rc.found
-
     rc.set_receiver([1500] * 8)
-
     assert rc.update(NS_PER_MS)
     assert rc.found
     assert rc.channels_us[:8] == [1500] * 8
@@ -115,7 +109,5 @@ def test_reversed_channels_and_channel_map():
 @given(st.integers(0, 65534), st.integers(0, 65534))
 def test_the_lean_never_exceeds_angle_max(roll_us, pitch_us):
     sticks, params = sticks_at(pwm=[roll_us, pitch_us])
-
     roll, pitch = pilot_sticks.lean_angles(sticks, params)
-
     assert math.hypot(roll, pitch) <= math.radians(30.0) + 1e-9

@@ -16,7 +16,6 @@ from sitl.simulated_vehicle import SimulatedVehicle
 
 def test_only_heartbeats_and_timesync_come_without_a_request(station):
     messages = station.run(10.5)
-
     assert {m.get_type() for m in messages} == {"HEARTBEAT", "TIMESYNC"}
     assert len(named(messages, "HEARTBEAT")) == 10
     (request,) = named(messages, "TIMESYNC")
@@ -27,7 +26,6 @@ def test_only_heartbeats_and_timesync_come_without_a_request(station):
 def test_intervals_belong_to_the_link_they_came_on(station_of):
     station = station_of(links=2)
     station.interval(mav.MAVLINK_MSG_ID_ATTITUDE, 100, link=1)
-
     assert not named(station.run(0.5, link=0), "ATTITUDE")
     assert len(named(station.run(0.5, link=1), "ATTITUDE")) >= 49
 
@@ -35,7 +33,6 @@ def test_intervals_belong_to_the_link_they_came_on(station_of):
 def test_texts_go_to_all_links(station_of):
     station = station_of(links=2)
     station.command(mav.MAV_CMD_COMPONENT_ARM_DISARM, 1, 21196, link=0)
-
     (text,) = named(station.run(0.1, link=1), "STATUSTEXT")
     assert text.text == "Arming motors"
 
@@ -44,10 +41,8 @@ def test_texts_go_to_all_links(station_of):
 def test_every_message_packs_with_its_time(station, message_id):
     station.run(6.0)
     station.interval(message_id, 50)
-
     name = mav.mavlink_map[message_id].msgname
     messages = named(station.run(0.2), name)
-
     silent = (
         mav.MAVLINK_MSG_ID_RC_CHANNELS_RAW,
         mav.MAVLINK_MSG_ID_OPTICAL_FLOW,
@@ -65,7 +60,6 @@ def test_every_message_packs_with_its_time(station, message_id):
 def test_positions_are_withheld_until_the_estimator_has_one(station, message_id):
     station.interval(message_id, 50)
     name = mav.mavlink_map[message_id].msgname
-
     assert not named(station.run(4.9), name)
     assert named(station.run(0.2), name)
 
@@ -78,7 +72,6 @@ def test_imu_units_and_oddities(station):
     raw = named(messages, "RAW_IMU")[-1]
     highres = named(messages, "HIGHRES_IMU")[-1]
     attitude = named(messages, "ATTITUDE")[-1]
-
     assert (raw.zacc, raw.xgyro) == (-1000, 3)
     assert highres.zacc == pytest.approx(-9.81, abs=0.01)
     assert highres.xgyro - attitude.rollspeed == pytest.approx(0.003, abs=1e-6)
@@ -90,10 +83,8 @@ def test_streams_slow_down_while_parameters_are_sent(station):
     station.interval(mav.MAVLINK_MSG_ID_ATTITUDE, 200)
     station.run(0.1)
     station.send(mav.MAVLink_param_request_list_message(1, 1))
-
     messages = station.run(0.2)
     afterwards = station.run(1.5)
-
     assert named(messages, "PARAM_VALUE")
     assert len(named(messages, "ATTITUDE")) <= 12
     assert len(named(afterwards[-200:], "ATTITUDE")) > 150
@@ -101,7 +92,6 @@ def test_streams_slow_down_while_parameters_are_sent(station):
 
 def test_nan_in_a_message_is_refused_and_counted(station):
     station.send(mav.MAVLink_param_set_message(1, 1, b"RC_OVERRIDE_TIME", math.nan, 9))
-
     assert not named(station.run(0.1), "PARAM_VALUE")
     assert station.vehicle.params["RC_OVERRIDE_TIME"] == 3.0
     assert station.vehicle.log.refused_messages == 1
@@ -160,7 +150,6 @@ def test_garbage_never_raises_and_a_good_frame_still_gets_through(chunks):
     ping = mav.MAVLink_timesync_message(0, 77).pack(mav.MAVLink(None, srcSystem=255))
     for _ in range(30):  # an open frame of garbage may swallow up to 280 bytes
         vehicle.receive(0, ping, 0)
-
     answers = mav.MAVLink(None).parse_buffer(vehicle.take_outgoing(0)) or []
     assert any(m.get_type() == "TIMESYNC" and m.ts1 == 77 for m in answers)
 
@@ -170,9 +159,7 @@ def test_an_eleventh_interval_joins_the_nearest_of_ten(station):
     first, *others, eleventh = [key for key in BUILDERS if key != mav.MAVLINK_MSG_ID_HEARTBEAT][:10]
     for index, message_id in enumerate((first, *others)):
         assert link.set_interval(message_id, (10 + index) * 1000)
-
     assert link.set_interval(eleventh, 142_000)
-
     assert link.interval_us(eleventh) == 18_000
     assert link.interval_us(first) == 10_000
 
@@ -185,7 +172,6 @@ def test_the_report_counts_the_setpoints_that_were_followed(station):
         for _ in range(5):
             station.send(message)
             station.run(0.02)
-
     vehicle = station.vehicle
     setpoints = vehicle.log.summary(vehicle.ap, 0)["setpoints"]
     assert setpoints["count"] == 5

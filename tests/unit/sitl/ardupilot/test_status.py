@@ -1,15 +1,14 @@
-"""Heartbeats, SYS_STATUS and battery of ArduPilot."""
+"""Heartbeats and SYS_STATUS of ArduPilot."""
 
 import pytest
 from pymavlink.dialects.v20 import ardupilotmega as mav
 
 from helpers.contract_peers import last, named
 from sitl.ardupilot.flight_modes import Mode
-from sitl.vehicle.config import Battery, VehicleConfig
+from sitl.vehicle.config import VehicleConfig
 
 WITHOUT_RECEIVER = VehicleConfig(receiver=False, estimator_ready_s=0.0, position_ready_s=0.0)
 RECEIVER = mav.MAV_SYS_STATUS_SENSOR_RC_RECEIVER
-BATTERY = mav.MAV_SYS_STATUS_SENSOR_BATTERY
 
 
 def override(station, *values_us):
@@ -24,9 +23,7 @@ def test_a_change_of_mode_sends_a_heartbeat_on_every_link_at_once(station_of, li
     set_mode = mav.MAV_CMD_DO_SET_MODE
     command = mav.MAVLink_command_long_message(1, 1, set_mode, 0, 1, Mode.ALT_HOLD, *[0] * 5)
     station.send(command)
-
     (heartbeat,) = named(station.run(0.0025, link=link), "HEARTBEAT")
-
     assert heartbeat.custom_mode == Mode.ALT_HOLD
 
 
@@ -35,7 +32,6 @@ def test_a_radio_failsafe_shows_in_heartbeat_and_receiver_health(station_of):
     station.interval(mav.MAVLINK_MSG_ID_SYS_STATUS, 10)
     station.interval(mav.MAVLINK_MSG_ID_HEARTBEAT, 10)
     assert not last(station.run(0.2), "SYS_STATUS").onboard_control_sensors_present & RECEIVER
-
     override(station, 1500, 1500, 1000, 1500)
     assert station.vehicle.ap.set_mode(Mode.ALT_HOLD)
     assert station.vehicle.ap.arm(force=False)
@@ -48,22 +44,3 @@ def test_a_radio_failsafe_shows_in_heartbeat_and_receiver_health(station_of):
         assert status.onboard_control_sensors_present & RECEIVER
         assert bool(status.onboard_control_sensors_health & RECEIVER) == is_healthy
         assert last(messages, "HEARTBEAT").system_status == state
-
-
-@pytest.mark.parametrize("is_low", [False, True])
-def test_the_battery_is_reported_as_set(station, is_low):
-    station.vehicle.ap.battery = Battery(
-        voltage_v=10.9, current_a=12.5, remaining_percent=14, is_low=is_low
-    )
-    station.interval(mav.MAVLINK_MSG_ID_SYS_STATUS, 10)
-    station.interval(mav.MAVLINK_MSG_ID_BATTERY_STATUS, 10)
-
-    messages = station.run(1.1)
-
-    status, battery = last(messages, "SYS_STATUS"), last(messages, "BATTERY_STATUS")
-    heartbeat = last(messages, "HEARTBEAT")
-    assert (status.voltage_battery, status.current_battery) == (10_900, 1_250)
-    assert (status.battery_remaining, battery.battery_remaining) == (14, 14)
-    assert bool(status.onboard_control_sensors_health & BATTERY) != is_low
-    assert (battery.charge_state == mav.MAV_BATTERY_CHARGE_STATE_LOW) == is_low
-    assert (heartbeat.system_status == mav.MAV_STATE_CRITICAL) == is_low

@@ -6,7 +6,7 @@ import pytest
 
 from sitl.camera.clutter import CLEARANCE_M, clutter
 from sitl.course import BAR_M, RACE_SEEDS, make_course
-from sitl.vehicle.conditions import NOMINAL, Conditions
+from sitl.vehicle.conditions import Conditions
 
 CROWDED = Conditions(clutter=6.0)
 
@@ -47,7 +47,3 @@ def test_normals_point_out_of_a_part():
             assert (np.einsum("nk,nk->n", outward, part.normals) > 0).all()
             edges = part.corners_m - np.roll(part.corners_m, 1, axis=1)
             assert np.abs(np.einsum("nik,nk->ni", edges, part.normals)).max() < 1e-9
-
-
-def test_without_clutter_there_are_no_objects():
-    assert clutter(make_course(3), NOMINAL) == []

@@ -35,22 +35,6 @@ def renderer():
     return FpvRenderer(COURSE, SIZE_PX, SIZE_PX)
 
 
-def test_the_gate_appears_where_a_pinhole_camera_projects_it(renderer):
-    """Eye 6 m before the front face, level: outer half side 1.2 + 0.32 m, inner 1.2 m."""
-    image = renderer.render((10.0 - scenery.DEPTH_M / 2 - 6.0, 0.0, -2.0), LEVEL_CAMERA)
-    outer_px = FOCAL_PX * (1.2 + scenery.BAR_M) / 6.0
-    inner_px = FOCAL_PX * 1.2 / 6.0
-    column = is_orange(image)[round(MIDDLE_PX)]
-    left, right = np.flatnonzero(column)[[0, -1]]
-    assert left == pytest.approx(MIDDLE_PX - outer_px, abs=1)
-    assert right == pytest.approx(MIDDLE_PX + outer_px, abs=1)
-    below = np.flatnonzero(is_orange(image)[:, round(MIDDLE_PX)])
-    assert below[-1] == pytest.approx(MIDDLE_PX + outer_px, abs=1)
-    front = np.abs(image[round(MIDDLE_PX)] - image[round(MIDDLE_PX), left + 2].astype(int)).sum(-1)
-    bar = np.flatnonzero(front < 6)
-    assert bar[bar < MIDDLE_PX][-1] == pytest.approx(MIDDLE_PX - inner_px, abs=1)
-
-
 @pytest.mark.parametrize(
     ("position", "attitude", "centre_px"),
     [

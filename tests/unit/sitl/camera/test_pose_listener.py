@@ -53,14 +53,6 @@ def requested(packets):
     return [int(m.param1) for m in decode(packets) if m.get_type() == "COMMAND_LONG"]
 
 
-def test_pose_of_quaternion_and_position(listener, vehicle):
-    tilted = from_euler(0.1, -0.2, 2.0)
-    listener.receive(vehicle.quaternion(tilted) + vehicle.position(), T0_NS)
-    position_m, wxyz = listener.pose_at(T0_NS)
-    assert position_m == (1.0, 2.0, -3.0)
-    assert wxyz == pytest.approx(tilted, abs=1e-6)
-
-
 def test_the_pose_is_carried_on_at_constant_velocity_and_rate(listener, vehicle):
     turning = vehicle.quaternion(from_euler(0.0, 0.0, 1.0), (0.0, 0.0, 2.0))
     listener.receive(turning, T0_NS)

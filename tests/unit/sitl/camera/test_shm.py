@@ -36,12 +36,6 @@ def grey(value):
     return np.full((HEIGHT, WIDTH, 3), value, np.uint8)
 
 
-def test_layout_before_the_first_frame(publisher, name):
-    data = raw(name)
-    assert len(data) == 64 + 4 * STRIDE
-    assert struct.unpack_from("<8sIIIIQQ", data) == (b"MBSHM\0\0\1", WIDTH, HEIGHT, 3, 4, 0, 1)
-
-
 def test_frames_go_round_the_slots(publisher, name):
     for frame_id in range(1, 7):
         publisher.publish(grey(frame_id), captured_ns=1000 + frame_id)

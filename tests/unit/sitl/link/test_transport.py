@@ -52,7 +52,6 @@ def test_udpout_sends_first_and_hears_the_answer(host, spelling):
             data, address = ground.recvfrom(2048)
             ground.sendto(b"answer", address)
             (received,) = drain_until(link, 1)
-
     assert data == FRAME
     assert received.data == b"answer"
 
@@ -73,7 +72,6 @@ def test_arrival_is_stamped_when_it_came_not_when_it_was_read():
                 (received,) = drain_until(link, 1)
                 if received.arrived_ns <= sent_ns + margin_ns:
                     break
-
     assert before_ns - margin_ns <= received.arrived_ns <= sent_ns + margin_ns
 
 
@@ -86,7 +84,6 @@ def test_udpin_answers_everybody_it_has_heard_and_forgets_the_oldest():
             ground.sendto(b"hello", ("127.0.0.1", port))
             drain_until(link, 1)
         link.send(FRAME)
-
         assert all(ground.recv(2048) == FRAME for ground in grounds[1:])
         grounds[0].setblocking(False)
         with pytest.raises(BlockingIOError):
@@ -167,9 +164,7 @@ def test_frames_are_never_split_across_datagrams():
     sender = mav.MAVLink(None)
     frames = [mav.MAVLink_timesync_message(0, n).pack(sender) for n in range(100)]
     frames.append(mav.MAVLink_timesync_message(0, 5).pack(sender, force_mavlink1=True))
-
     datagrams = list(split_frames(b"".join(frames), 200))
-
     assert b"".join(datagrams) == b"".join(frames)
     assert all(len(datagram) <= 200 for datagram in datagrams)
     assert all(datagram[0] in (0xFD, 0xFE) for datagram in datagrams)
@@ -197,7 +192,6 @@ def test_the_newest_8_or_16_receiver_values_count_and_other_sizes_are_ignored(rc
         b"x" * 31,
     ):
         transmitter.send(data)
-
     assert rc_input.latest() == values
     assert rc_input.latest() is None
 

@@ -8,8 +8,8 @@ from helpers.course_flights import fly_course
 from sitl import UsageError
 from sitl.camera.fpv import body_from_camera
 from sitl.course import AirborneStart, gate_truth, make_course
-from sitl.pilot.demonstrator import Expert
-from sitl.pilot.disturbance import Disturbance, random_start
+from sitl.pilot.demonstrator import Expert, RateExpert
+from sitl.pilot.disturbance import Disturbance
 from sitl.vehicle.conditions import random_conditions
 from sitl.vehicle.rotation import IDENTITY, from_euler
 
@@ -76,15 +76,16 @@ def test_a_missed_gate_is_flown_at_again(axial_m, right_m):
     assert fly_course(course, 5.0, start=start).succeeded
 
 
-def test_it_takes_over_in_the_air():
-    course = make_course(11)
-    assert fly_course(course, 6.0, start=random_start(course, 11, speed_mps=6.0)).succeeded
-
-
-@pytest.mark.parametrize("speed_mps", [0.0, 20.0, math.nan])
-def test_a_speed_it_cannot_fly_at_is_refused(speed_mps):
-    with pytest.raises(UsageError, match=r"1\.5 to 10\.0 m/s"):
-        Expert(make_course(0), speed_mps)
+@pytest.mark.parametrize(
+    ("expert", "speed_mps", "most"),
+    [
+        *((Expert, speed_mps, "10.0") for speed_mps in (0.0, 20.0, math.nan)),
+        *((RateExpert, speed_mps, "14") for speed_mps in (1.0, 15.0)),
+    ],
+)
+def test_a_speed_it_cannot_fly_at_is_refused(expert, speed_mps, most):
+    with pytest.raises(UsageError, match=f"1.5 to {most}"):
+        expert(make_course(0), speed_mps)
 
 
 def test_truth_by_hand():

@@ -1,13 +1,8 @@
-"""The expert by body rates: its commands, and races on both firmwares."""
+"""The expert by body rates: races on both firmwares."""
 
-import math
 from collections.abc import Callable
 
-import pytest
-
-from sitl import UsageError
 from sitl.ardupilot.autopilot import ArduCopter
-from sitl.ardupilot.control import boosted
 from sitl.ardupilot.flight_modes import Mode
 from sitl.ardupilot.params import ArduPilotParams
 from sitl.clock import NS_PER_MS, NS_PER_S
@@ -20,45 +15,11 @@ from sitl.px4.modes import Px4Mode
 from sitl.px4.params import Px4Params
 from sitl.report import FlightLog
 from sitl.vehicle.config import VehicleConfig
-from sitl.vehicle.dynamics import BodyState
 from sitl.vehicle.firmware import AttitudeSetpoint
-from sitl.vehicle.rotation import cos_tilt, from_euler
+from sitl.vehicle.rotation import cos_tilt
 
 TICK_NS = 10 * NS_PER_MS
 READY = VehicleConfig(estimator_ready_s=0.0, position_ready_s=0.0)
-
-
-def body(**changes: object) -> BodyState:
-    hovering = BodyState(
-        position_ned_m=(0.0, 0.0, -3.0),
-        ned_from_body_wxyz=(1.0, 0.0, 0.0, 0.0),
-        velocity_ned_mps=(0.0, 0.0, 0.0),
-        rate_body_radps=(0.0, 0.0, 0.0),
-        specific_force_body_mps2=(0.0, 0.0, -9.80665),
-        motors=(0.39,) * 4,
-        touching=False,
-    )
-    return hovering._replace(**changes)  # type: ignore[arg-type]
-
-
-def command(**changes: object) -> RateCommand:
-    return RateExpert(make_course(RACE_SEEDS), 6.0).command(body(**changes), 0.0)
-
-
-def test_drag_is_read_off_the_accelerometer_not_assumed() -> None:
-    """A heavier drag from ahead asks for more lean into it."""
-    light = command(velocity_ned_mps=(6.0, 0.0, 0.0))
-    heavy = command(
-        velocity_ned_mps=(6.0, 0.0, 0.0), specific_force_body_mps2=(-3.0, 0.0, -9.80665)
-    )
-    assert abs(light.pitch_radps) < 1.5
-    assert heavy.pitch_radps < light.pitch_radps - 1.5
-
-
-@pytest.mark.parametrize("speed_mps", [1.0, 15.0])
-def test_a_speed_that_it_cannot_fly_is_refused(speed_mps: float) -> None:
-    with pytest.raises(UsageError, match=r"1\.5 to 14"):
-        RateExpert(make_course(RACE_SEEDS), speed_mps)
 
 
 def fly(
@@ -106,9 +67,8 @@ def fly_ardupilot(
     return fly(course, expert, ap, send, disturbance)
 
 
-@pytest.mark.parametrize("seed", [3, 14])
-def test_it_flies_a_race_on_ardupilot(seed: int) -> None:
-    log = fly_ardupilot(make_course(RACE_SEEDS + seed), 10.0)
+def test_it_flies_a_race_on_ardupilot() -> None:
+    log = fly_ardupilot(make_course(RACE_SEEDS + 3), 10.0)
     assert not log.crashed
     assert log.next_gate is None
     first, *_, last = log.gates_passed
@@ -140,12 +100,3 @@ def test_it_flies_a_race_on_px4_with_its_heavy_drag() -> None:
     log = fly(course, RateExpert(course, 8.0), ap, send, Disturbance(0, strength=0.0))
     assert not log.crashed
     assert log.next_gate is None
-
-
-def test_ardupilot_boosts_the_thrust_of_a_lean_to_84_degrees() -> None:
-    params = ArduPilotParams()
-    for lean_deg, factor in ((0.0, 1.0), (60.0, 2.0), (80.0, 1 / math.cos(math.radians(80)))):
-        leaning = body(ned_from_body_wxyz=from_euler(math.radians(lean_deg), 0.0, 0.0))
-        assert boosted(0.1, leaning, params) == pytest.approx(0.1 * factor)
-    upside_down = body(ned_from_body_wxyz=from_euler(math.pi, 0.0, 0.0))
-    assert boosted(0.1, upside_down, params) == 0.0

@@ -17,5 +17,5 @@ def ends():
 
 @pytest.fixture(scope="session")
 def ends_of():
-    """Makes ends: ``ends_of(links=2, link_bytes_ps=4000.0)``."""
+    """Makes ends: ``ends_of(links=2, onboard_links=frozenset({1}))``."""
     return lambda links=1, **changes: Ends(links, replace(READY, **changes))

@@ -36,7 +36,6 @@ class Senders:
 def test_the_input_mode_selects_one_of_two_links(in_mode, with_both):
     senders = Senders(in_mode)
     senders.send(0.1, GCS)
-
     assert senders.send(0.1, GCS, ONBOARD) == with_both
 
 
@@ -46,7 +45,6 @@ def test_the_input_mode_selects_one_of_two_links(in_mode, with_both):
 def test_another_link_takes_over_when_the_first_has_stopped(in_mode, after):
     senders = Senders(in_mode)
     senders.send(0.1, GCS)
-
     if in_mode != 8:
         assert senders.send(0.56, ONBOARD) == GCS
     assert senders.send(0.1, ONBOARD) == after
@@ -65,10 +63,8 @@ def test_pretended_sticks_stay_until_real_ones_come():
     senders.input.pretend_centred(0)
     senders.send(5.0)
     assert senders.input.valid
-
     senders.send(0.1, ONBOARD)
     senders.send(0.7)
-
     assert not senders.input.valid
 
 

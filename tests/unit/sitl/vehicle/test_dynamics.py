@@ -19,7 +19,6 @@ def fly(commands, seconds, state=None, quad=None):
 
 def test_it_rests_on_the_ground_and_feels_one_g_upwards():
     body = fly((0.0,) * 4, 1.0).body
-
     assert body.touching
     assert body.position_ned_m == pytest.approx((0.0, 0.0, 0.0), abs=1e-3)
     assert body.specific_force_body_mps2 == pytest.approx((0.0, 0.0, -GRAVITY_MPS2), abs=0.01)
@@ -27,7 +26,6 @@ def test_it_rests_on_the_ground_and_feels_one_g_upwards():
 
 def test_motors_follow_with_a_first_order_lag():
     body = fly((1.0,) * 4, QUAD.motor_lag_s).body
-
     assert body.motors == pytest.approx([1.0 - math.exp(-1.0)] * 4, rel=0.03)
 
 
@@ -43,9 +41,7 @@ def test_motors_follow_with_a_first_order_lag():
 def test_motor_order_and_signs(commands, axis, sign):
     quad = Quadrotor()
     flying = fly((0.5,) * 4, 1.0, quad=quad)
-
     rates = fly(commands, 0.1, state=flying, quad=quad).body.rate_body_radps
-
     assert sign * rates[axis] > 0.05
     assert all(abs(rate) < 1e-3 for other, rate in enumerate(rates) if other != axis)
 
@@ -57,5 +53,4 @@ pitch = st.floats(-1.5, 1.5)
 @given(roll=angle, pitch=pitch, yaw=angle)
 def test_euler_angles_survive_the_quaternion(roll, pitch, yaw):
     again = rotation.to_euler(rotation.from_euler(roll, pitch, yaw))
-
     assert again == pytest.approx((roll, pitch, yaw), abs=1e-6)
