@@ -58,10 +58,6 @@ class FilmedFlight:
         contract = flight.meta.contract
         self.names = NAMES[contract.action if contract else "sticks"]
 
-    def at(self, time_s: float) -> int:
-        """Return the index of the newest row at a time."""
-        return max(0, int(np.searchsorted(self.time_s, time_s, "right")) - 1)
-
 
 class View:
     """Pinhole camera behind the vehicle, looking along its heading."""
@@ -150,7 +146,7 @@ def frames(recorded: RecordedFlight, gates: Sequence[CourseGate]) -> Iterator[Ar
         if captured < due or captured > end:
             continue
         due += 1 / FPS
-        index = flight.at(captured)
+        index = max(0, int(np.searchsorted(flight.time_s, captured, "right")) - 1)
         camera = cv2.resize(cv2.cvtColor(image, cv2.COLOR_RGB2BGR), (CAMERA, CAMERA))
         _write(camera, "camera", (12, 24), 0.6)
         right = np.concatenate([_scene(flight, index, gates), _plot(flight, index)])

@@ -12,8 +12,8 @@ Smaller is better. The file is JSON, ``{"ratios": {name: most}}``, with the name
 import math
 import sys
 from collections.abc import Iterator, Mapping
-from dataclasses import replace
-from json import loads
+from dataclasses import asdict, replace
+from json import dumps, loads
 from pathlib import Path
 
 from cyclopts import App
@@ -28,7 +28,6 @@ from benchmarks.results import (
     BenchResult,
     Flight,
     print_result,
-    to_json,
 )
 from benchmarks.roofline import time_rooflines
 from mavbridge.commands.check.computer import this_computer
@@ -82,7 +81,7 @@ def main(
     result = measure()
     print_result(result, console)
     if json is not None:
-        json.write_text(to_json(result))
+        json.write_text(dumps(asdict(result), indent=2, allow_nan=False) + "\n")
     if budget is None:
         return 0
     exceeded = violations(ratios(result), budget)

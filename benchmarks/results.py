@@ -1,8 +1,7 @@
 """Results of a benchmark as frozen values, their JSON, and their tables."""
 
-import json
 from collections.abc import Callable, Iterable
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 
 from rich.console import Console
 from rich.table import Table
@@ -116,11 +115,6 @@ def solves_of(policy: PolicyConfig) -> str:
     """Return the kind of solve that makes a policy's chunks, for tables."""
     steps = f"{policy.steps} step" + "s" * (policy.steps > 1)
     return steps if policy.may_be_dual else f"single rate, {steps}"
-
-
-def to_json(result: BenchResult) -> str:
-    """Return the result as JSON, keys in the order of its fields; null = not measured."""
-    return json.dumps(asdict(result), indent=2, allow_nan=False) + "\n"
 
 
 def print_result(result: BenchResult, console: Console) -> None:

@@ -6,7 +6,6 @@ from typing import NamedTuple, Protocol
 
 from mavbridge.core.clock import NS_PER_S, Clock
 from mavbridge.core.errors import CameraError
-from mavbridge.core.ports import Camera
 from mavbridge.core.records import CameraImage, Frame
 
 REOPENED_NS = 10 * NS_PER_S
@@ -15,43 +14,6 @@ STALL_NS = 2 * NS_PER_S
 """Limit for all other frames."""
 REOPEN_DELAYS_S = (0.5, 1.0, 2.0, 4.0)
 JOIN_S = 3.0
-
-
-class LiveCamera(Camera, Protocol):
-    """Camera that may deliver its first frame long after it was opened.
-
-    Before its first frame ``read`` raises CameraError only for errors that waiting cannot fix.
-    """
-
-    @property
-    def waiting_reason(self) -> str:
-        """Known reason why there is no frame yet."""
-
-
-def wait_for_first_frame(
-    camera: LiveCamera, *, clock: Clock, timeout_s: float, report: Callable[[str], None]
-) -> Frame:
-    """Return the first frame. Every second until then, ``report`` gets a line of a countdown.
-
-    The line contains the reason for the wait when it changes. Raises CameraError if no frame comes
-    in time, or as ``read`` does.
-    """
-    deadline_ns = clock.now_ns() + round(timeout_s * NS_PER_S)
-    told: str | None = None
-    while (left_ns := deadline_ns - clock.now_ns()) > 0:
-        if (frame := camera.read(left_ns % NS_PER_S or NS_PER_S)) is not None:
-            return frame
-        left_s = round((deadline_ns - clock.now_ns()) / NS_PER_S)
-        if left_s > 0:
-            reason = camera.waiting_reason
-            report(
-                f"waiting for the camera: {left_s} s left{'' if told == reason else f' ({reason})'}"
-            )
-            told = reason
-    raise CameraError(
-        f"the camera has delivered no frame within {timeout_s:g} s (link.camera_timeout): "
-        f"{camera.waiting_reason}"
-    )
 
 
 def wait_until_due(clock: Clock, due_ns: int, timeout_ns: int) -> bool:
@@ -83,7 +45,7 @@ class ImageSource(Protocol):
 
 
 class Grabber:
-    """`LiveCamera` over a blocking source, which its thread opens, reads and closes.
+    """`Camera` over a blocking source, which its thread opens, reads and closes.
 
     Before the first frame, opening is retried until ``close``. A source that fails later is
     reopened, up to ``len(reopen_delays_s)`` times in a row; meanwhile ``read`` returns None.
@@ -122,7 +84,7 @@ class Grabber:
 
     @property
     def waiting_reason(self) -> str:
-        """See `LiveCamera`."""
+        """Known reason why there is no frame yet."""
         with self._changed:
             return self._waiting_reason
 

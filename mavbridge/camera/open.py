@@ -9,13 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from mavbridge.camera.capture import open_device, open_stream, present_devices
-from mavbridge.camera.grabber import (
-    Grabber,
-    Image,
-    LiveCamera,
-    wait_for_first_frame,
-    wait_until_due,
-)
+from mavbridge.camera.grabber import Grabber, Image, wait_until_due
 from mavbridge.camera.jpeg_udp import JpegUdpSource, parse_jpeg_udp
 from mavbridge.camera.pipe import PipeSource, parse_pipe
 from mavbridge.camera.shared_memory import SharedMemoryCamera
@@ -125,8 +119,7 @@ def open_camera(
     first: Image | Frame | None = camera.upcoming if isinstance(camera, VideoFileCamera) else None
     try:
         if isinstance(camera, Grabber | SharedMemoryCamera):
-            live: LiveCamera = camera
-            first = wait_for_first_frame(live, clock=clock, timeout_s=timeout_s, report=report)
+            first = _wait_for_first_frame(camera, clock=clock, timeout_s=timeout_s, report=report)
         if spec != NO_CAMERA:
             _require_kind(spec, first, is_depth)
     except BaseException:
@@ -135,6 +128,36 @@ def open_camera(
     if latency_ms == 0.0:
         return camera
     return LatencyCompensatedCamera(camera, latency_ns=round(latency_ms * NS_PER_MS))
+
+
+def _wait_for_first_frame(
+    camera: Grabber | SharedMemoryCamera,
+    *,
+    clock: Clock,
+    timeout_s: float,
+    report: Callable[[str], None],
+) -> Frame:
+    """Return the first frame. Every second until then, ``report`` gets a line of a countdown.
+
+    The line contains the reason for the wait when it changes. Raises CameraError if no frame comes
+    in time, or as ``read`` does.
+    """
+    deadline_ns = clock.now_ns() + round(timeout_s * NS_PER_S)
+    told: str | None = None
+    while (left_ns := deadline_ns - clock.now_ns()) > 0:
+        if (frame := camera.read(left_ns % NS_PER_S or NS_PER_S)) is not None:
+            return frame
+        left_s = round((deadline_ns - clock.now_ns()) / NS_PER_S)
+        if left_s > 0:
+            reason = camera.waiting_reason
+            report(
+                f"waiting for the camera: {left_s} s left{'' if told == reason else f' ({reason})'}"
+            )
+            told = reason
+    raise CameraError(
+        f"the camera has delivered no frame within {timeout_s:g} s (link.camera_timeout): "
+        f"{camera.waiting_reason}"
+    )
 
 
 def _require_kind(spec: str, first: Image | Frame | None, is_depth: bool | None) -> None:

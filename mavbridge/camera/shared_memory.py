@@ -70,7 +70,7 @@ class SharedMemoryCamera:
 
     @property
     def waiting_reason(self) -> str:
-        """See `LiveCamera`."""
+        """Known reason why there is no frame yet."""
         return _absent(self._path) if self._segment is None else self._failure(self._segment)
 
     def read(self, timeout_ns: int) -> Frame | None:

@@ -121,9 +121,9 @@ def test_the_server_ends_with_the_view(address: ServeAddress) -> None:
 LEAVES_ITS_SERVER = """
 import os, sys
 from mavbridge.observe.viewer.server import listens
-from mavbridge.observe.viewer.server import WebServer, serve_address
+from mavbridge.observe.viewer.server import serve_address, start_web_server
 
-WebServer(serve_address(sys.argv[1]))
+start_web_server(serve_address(sys.argv[1]))
 os.kill(os.getpid(), 9)
 """
 

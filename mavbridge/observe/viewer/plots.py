@@ -4,6 +4,7 @@ import math
 from bisect import bisect_left
 from collections.abc import Iterable, Sequence
 from itertools import groupby, pairwise
+from operator import itemgetter
 from statistics import median
 from typing import Any
 
@@ -62,31 +63,28 @@ class Spread:
         self._columns = columns
         self._plot = plot
         self._bound_ms = np.nan if bound_ns is None else bound_ns / NS_PER_MS
-        self._stamps_ns: list[int] = []
-        self._values_ns: list[float] = []
+        self._values_ns: list[tuple[int, float]] = []
+        """Stamps and values that no completed window has shown yet."""
 
-    def extend(self, stamps_ns: Sequence[int], values_ns: Sequence[float]) -> None:
-        """Add values, and show the completed windows."""
-        self._stamps_ns += stamps_ns
+    def extend(self, values_ns: Iterable[tuple[int, float]]) -> None:
+        """Add stamps with their values, and show the completed windows."""
         self._values_ns += values_ns
-        if self._stamps_ns:
+        if self._values_ns:
             start_ns = self._columns.start_ns
-            self._show(
-                until_ns=start_ns + (self._stamps_ns[-1] - start_ns) // WINDOW_NS * WINDOW_NS
-            )
+            elapsed_ns = self._values_ns[-1][0] - start_ns
+            self._show(until_ns=start_ns + elapsed_ns // WINDOW_NS * WINDOW_NS)
 
     def close(self) -> None:
         """Show the unfinished window."""
-        if self._stamps_ns:
-            self._show(until_ns=self._stamps_ns[-1] + 1)
+        if self._values_ns:
+            self._show(until_ns=self._values_ns[-1][0] + 1)
 
     def _show(self, until_ns: int) -> None:
-        count = bisect_left(self._stamps_ns, until_ns)
-        stamps_ns, values_ns = self._stamps_ns[:count], self._values_ns[:count]
-        del self._stamps_ns[:count], self._values_ns[:count]
+        count = bisect_left(self._values_ns, until_ns, key=itemgetter(0))
+        shown_ns = self._values_ns[:count]
+        del self._values_ns[:count]
         start_ns = self._columns.start_ns
-        pairs = zip(stamps_ns, values_ns, strict=True)
-        for _, window in groupby(pairs, key=lambda pair: (pair[0] - start_ns) // WINDOW_NS):
+        for _, window in groupby(shown_ns, key=lambda pair: (pair[0] - start_ns) // WINDOW_NS):
             stamps, values = zip(*window, strict=True)
             row = [value / NS_PER_MS for value in (min(values), max(values), median(values))]
             self._columns.plot(self._plot, stamps[-1:], [[*row, self._bound_ms]])
@@ -130,7 +128,7 @@ class TimingPlots:
             for tick in ticks
             if tick.feature_captured_ns is not None
         ]
-        self._extend(layout.IMAGE_AGE, ages_ns)
+        self._spreads[layout.IMAGE_AGE].extend(ages_ns)
         ages_ns = [
             (tick.sent_ns, tick.sent_ns - tick.state.attitude_ns)
             for tick in ticks
@@ -138,13 +136,13 @@ class TimingPlots:
             # Without a chunk the state is the newest when the tick is read, perhaps a later one.
             and (tick.trace is not None or tick.state.attitude_ns <= tick.sent_ns)
         ]
-        self._extend(layout.ATTITUDE_AGE, ages_ns)
+        self._spreads[layout.ATTITUDE_AGE].extend(ages_ns)
         late_ns = [
             (tick.sent_ns, max(0, tick.sent_ns - tick.due_ns))
             for tick in ticks
             if tick.is_slot and tick.trace is not None
         ]
-        self._extend(layout.LATENESS, late_ns)
+        self._spreads[layout.LATENESS].extend(late_ns)
         self._show_chunks(ticks)
         self._missed_slots += sum(tick.missed_slots for tick in ticks)
         last_ns = ticks[-1].woke_ns
@@ -162,12 +160,12 @@ class TimingPlots:
             elif last is None or tick.chunk_serial != last.chunk_serial:
                 if last is not None and last.chunk_computed_ns is not None:
                     period_ns = tick.chunk_computed_ns - last.chunk_computed_ns
-                    self._extend(layout.CHUNK_PERIOD, [(tick.sent_ns, period_ns)])
+                    self._spreads[layout.CHUNK_PERIOD].extend([(tick.sent_ns, period_ns)])
                 news.append(tick)
                 last = tick
         self._last_chunk = last
         predict_ns = [(new.sent_ns, new.predict_ns) for new in news if new.predict_ns is not None]
-        self._extend(layout.PREDICT, predict_ns)
+        self._spreads[layout.PREDICT].extend(predict_ns)
 
     def _show_channels(self, ticks: Sequence[Tick]) -> None:
         width = len(layout.RC.series)
@@ -182,29 +180,24 @@ class TimingPlots:
 
     def show_visions(self, visions: Sequence[VisionTick]) -> None:
         """Plot the images of one camera."""
-        ready_ns = [vision.ready_ns for vision in visions]
-        encode_ns = [vision.ready_ns - vision.started_ns for vision in visions]
-        self._spreads[layout.ENCODE].extend(ready_ns, encode_ns)
+        encode_ns = [(each.ready_ns, each.ready_ns - each.started_ns) for each in visions]
+        self._spreads[layout.ENCODE].extend(encode_ns)
         started_ns = [vision.started_ns for vision in visions]
         if self._last_started_ns is not None:
             started_ns.insert(0, self._last_started_ns)
         self._last_started_ns = started_ns[-1]
         periods_ns = [(after, after - before) for before, after in pairwise(started_ns)]
-        self._extend(layout.VISION_PERIOD, periods_ns)
+        self._spreads[layout.VISION_PERIOD].extend(periods_ns)
         jitter_ns = [(stamp, abs(period - self._vision_ns)) for stamp, period in periods_ns]
-        self._extend(layout.VISION_JITTER, jitter_ns)
+        self._spreads[layout.VISION_JITTER].extend(jitter_ns)
         if self._first_dropped is None:
             self._first_dropped = visions[0].dropped_frames
         dropped = visions[-1].dropped_frames - self._first_dropped
         self._images += len(visions)
-        self._count(layout.DROPPED, ready_ns[-1], dropped, self._images + dropped)
+        self._count(layout.DROPPED, visions[-1].ready_ns, dropped, self._images + dropped)
 
     def _count(self, plot: layout.Plot, stamp_ns: int, count: int, of_all: float) -> None:
         self._columns.plot(plot, [stamp_ns], [(of_all * ALLOWED_SHARE, count)])
-
-    def _extend(self, plot: layout.Plot, values: Iterable[tuple[int, float]]) -> None:
-        pairs = list(values)
-        self._spreads[plot].extend([stamp for stamp, _ in pairs], [value for _, value in pairs])
 
     def close(self) -> None:
         """Show the unfinished windows."""

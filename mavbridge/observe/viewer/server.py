@@ -17,7 +17,7 @@ from urllib.parse import quote
 
 from mavbridge.core.address import host_port, spelled
 from mavbridge.core.errors import MavbridgeError, UserError
-from mavbridge.core.processes import child_environment, end
+from mavbridge.core.processes import child_environment
 
 SPAWN_TIMEOUT_S = 15.0
 SETTLE_S = 1.0
@@ -140,32 +140,27 @@ def serve_address(text: str) -> ServeAddress:
     return ServeAddress(str(found[4][0]), first)
 
 
-class WebServer:
-    """Process of one server, from the constructor to ``close``."""
+def start_web_server(address: ServeAddress) -> "subprocess.Popen[bytes]":
+    """Start the server and wait until it listens; raise MavbridgeError if it does not.
 
-    def __init__(self, address: ServeAddress) -> None:
-        """Start the server and wait until it listens; raise MavbridgeError if it does not."""
-        options = {
-            "--bind": address.host,
-            "--port": str(address.data_port),
-            "--web-viewer-port": str(address.port),
-            "--server-memory-limit": SERVER_MEMORY,
-        }
-        if address.host not in LOOPBACK:  # otherwise its own page cannot read the data
-            host = "*" if address.host in _ANY else address.host
-            options["--cors-allow-origin"] = f"http://{spelled(host, address.port)}"
-        binary = _binary()
-        flags = [word for option in options.items() for word in option]
-        self._process: subprocess.Popen[bytes] = start_listening(
-            [sys.executable, "-c", _DIE_WITH_PARENT, str(binary), "--serve-web", *flags],
-            name="Rerun's web server",
-            host="127.0.0.1" if address.host in _ANY else address.host,
-            ports=(address.port, address.data_port),
-        )
-
-    def close(self) -> None:
-        """Stop the server. Open pages keep their data."""
-        end(self._process)
+    Open pages keep their data when it ends.
+    """
+    options = {
+        "--bind": address.host,
+        "--port": str(address.data_port),
+        "--web-viewer-port": str(address.port),
+        "--server-memory-limit": SERVER_MEMORY,
+    }
+    if address.host not in LOOPBACK:  # otherwise its own page cannot read the data
+        host = "*" if address.host in _ANY else address.host
+        options["--cors-allow-origin"] = f"http://{spelled(host, address.port)}"
+    flags = [word for option in options.items() for word in option]
+    return start_listening(
+        [sys.executable, "-c", _DIE_WITH_PARENT, str(_binary()), "--serve-web", *flags],
+        name="Rerun's web server",
+        host="127.0.0.1" if address.host in _ANY else address.host,
+        ports=(address.port, address.data_port),
+    )
 
 
 def _binary() -> Path:

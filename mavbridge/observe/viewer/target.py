@@ -11,11 +11,12 @@ import rerun.blueprint as rrb
 
 from mavbridge.core.errors import MavbridgeError, PeerError, UserError
 from mavbridge.core.files import require_writable
+from mavbridge.core.processes import end
 from mavbridge.observe.viewer.server import (
-    WebServer,
     listens,
     serve_address,
     start_listening,
+    start_web_server,
 )
 
 VIEWER_HOST = "127.0.0.1"
@@ -46,12 +47,12 @@ class RerunRecording:
             prepared = prepare_target(target)
             is_file = isinstance(prepared, Path)
             self._sinks.append(rr.FileSink(prepared) if is_file else rr.GrpcSink(str(prepared)))
-        self._server: WebServer | None = None
+        self._server: subprocess.Popen[bytes] | None = None
         self.url: str | None = None
         """Address for a browser; None if no page is served."""
         if serve:
             address = serve_address(serve)
-            self._server, self.url = WebServer(address), address.page_url
+            self._server, self.url = start_web_server(address), address.page_url
             self._sinks.append(rr.GrpcSink(address.data_url))
         rr.unregister_shutdown()  # its atexit hook waits forever for a stalled viewer
         self.stream = rr.RecordingStream(application, recording_id=uuid4())
@@ -69,7 +70,7 @@ class RerunRecording:
             raise MavbridgeError(f"the viewer did not take the whole recording: {error}") from error
         finally:
             if self._server is not None:
-                self._server.close()
+                end(self._server)
 
 
 def prepare_target(text: str) -> Path | str:

@@ -1,6 +1,7 @@
 import json
 import shutil
 from collections.abc import Callable, Iterator
+from dataclasses import asdict
 from pathlib import Path
 
 import pytest
@@ -8,6 +9,8 @@ import pytest
 from helpers.factories import make_tick
 from helpers.recordings import make_frame, make_meta, number_of, without_writer_process
 from mavbridge.core.errors import MavbridgeError, UserError
+from mavbridge.core.reasons import Code, because
+from mavbridge.core.records import FlightOutcome
 from mavbridge.core.vehicle import Sticks
 from mavbridge.recording import folder as names
 from mavbridge.recording.flight_folder import open_flight
@@ -16,9 +19,7 @@ from mavbridge.recording.folder import prepare_folder
 from mavbridge.recording.meta import FlightError, read_meta, write_meta
 from mavbridge.recording.rows import FrameTruth
 from mavbridge.recording.tlog import open_tlog_pipe
-from policy.contract import (
-    Contract,
-)
+from policy.contract import Contract
 
 
 def record(folder: Path, *, ticks: int = 30, frames: int = 10) -> FlightWriter:
@@ -253,3 +254,33 @@ def test_what_ran_comes_back_and_older_flights_know_nothing_of_it(flight: Path) 
         del document[key]
     (flight / "meta.json").write_text(json.dumps(document))
     assert read_meta(flight) == make_meta()
+
+
+OUTCOME = FlightOutcome(
+    end="duration",
+    reason=because(Code.DURATION),
+    flown_s=20.0,
+    height_m=3.1,
+    speed_mps=0.2,
+    mode="LOITER",
+    is_armed=True,
+    is_landed=False,
+    gates_total=8,
+    gates_passed=5,
+    course_s=9.1,
+    course_speed_mps=6.3,
+    crash=None,
+)
+
+
+def test_the_outcome_is_kept_as_numbers_and_codes(tmp_path: Path) -> None:
+    write_meta(tmp_path, make_meta().with_outcome(OUTCOME))
+    written = json.loads((tmp_path / "meta.json").read_text())
+    reason = {"code": "duration", "kind": "end", "data": {}, "text": "the flight is over"}
+    assert written["outcome"] == asdict(OUTCOME) | {"reason": reason}
+    assert written["success"] is False, "three gates are missing"
+    assert read_meta(tmp_path).outcome == OUTCOME
+
+
+def test_what_somebody_has_said_of_a_flight_stands() -> None:
+    assert make_meta(success=True).with_outcome(OUTCOME).success is True

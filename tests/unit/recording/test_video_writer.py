@@ -1,3 +1,4 @@
+import errno
 import os
 import signal
 import subprocess
@@ -19,7 +20,7 @@ from mavbridge.recording.tables import read_table
 from mavbridge.recording.video import ring
 from mavbridge.recording.video import writer as writer_module
 from mavbridge.recording.video.file import count_frames, read_video
-from mavbridge.recording.video.ring import MIN_SLOTS
+from mavbridge.recording.video.ring import MAX_BYTES, MAX_SLOTS, MIN_SLOTS, allocate, ring_shape
 from mavbridge.recording.video.writer import Pressure, VideoWriter, WriterError
 from mavbridge.recording.video.writer_process import Notice, VideoJob, WriterService
 
@@ -178,3 +179,25 @@ def test_rows_are_frames_and_every_drop_is_told(steps: list[int]) -> None:
         dropped = sum(row.dropped_before for row in rows)
         assert dropped == lost_upstream_taken + taken[-1] + 1 - len(taken)
         assert sender.written == len(rows)
+
+
+@pytest.mark.parametrize(("side", "slots"), [(224, MAX_SLOTS), (1080, 9), (3000, MIN_SLOTS)])
+def test_memory_is_bounded(side: int, slots: int) -> None:
+    assert ring_shape(side, side).slots == slots
+    assert slots == MIN_SLOTS or slots * side * side * 3 <= MAX_BYTES
+
+
+def test_too_little_memory_is_an_error_now_and_not_a_crash_later(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    reserved: list[str] = []
+
+    def refuse(fd: int, _offset: int, _size: int) -> None:
+        reserved.append(str(Path(f"/proc/self/fd/{fd}").readlink()))
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    monkeypatch.setattr(os, "posix_fallocate", refuse)
+    with pytest.raises(OSError, match="No space"):
+        allocate(ring_shape(20, 20))
+    assert reserved[0].startswith("/dev/shm/")
+    assert reserved[0].endswith("(deleted)"), "nothing stays, whoever is killed"

@@ -41,23 +41,18 @@ class FakeClock:
 
 
 class FakeTransport:
-    """Scripted arrivals, recorded departures."""
+    """Receives nothing and notes what is sent."""
 
-    def __init__(self, clock, arrivals=()):
+    def __init__(self, clock):
         self._clock = clock
-        self._arrivals = list(arrivals)
         self.sent = []
 
     def drain(self):
-        while self._arrivals and self._arrivals[0].arrived_ns <= self._clock.now_ns():
-            yield self._arrivals.pop(0)
+        return ()
 
     def send(self, data):
         if data:
             self.sent.append((self._clock.now_ns(), data))
-
-    def close(self):
-        pass
 
 
 def test_the_loop_keeps_an_absolute_grid_and_flies_in_real_time():
