@@ -22,13 +22,7 @@ from rich.text import Text
 from benchmarks.engines import EAGER, time_engines
 from benchmarks.flight import FLIGHT_PROCESS, Load, fly
 from benchmarks.link import BARE_CLIENT, link_clients, time_link
-from benchmarks.results import (
-    BASELINE,
-    OURS,
-    BenchResult,
-    Flight,
-    print_result,
-)
+from benchmarks.results import BASELINE, OURS, BenchResult, Flight, print_result
 from benchmarks.roofline import time_rooflines
 from mavbridge.commands.check.computer import this_computer
 from mavbridge.commands.output import print_status, table_console
@@ -63,11 +57,7 @@ app = App(help=__doc__)
 
 
 @app.default
-def main(
-    *,
-    json: Path | None = None,
-    check: Path | None = None,
-) -> int:
+def main(*, json: Path | None = None, check: Path | None = None) -> int:
     """Measure everything, print and write; exit with 1 if the budget is exceeded.
 
     Args:

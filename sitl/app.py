@@ -16,13 +16,7 @@ from sitl.camera.shm import FramePublisher
 from sitl.clock import NS_PER_S, Clock, StopRequest, stop_on_signal, wall_ns
 from sitl.course import LOOP_SEEDS, Course, course_to_json, make_course
 from sitl.link.transport import RcInput, Transport, open_transport
-from sitl.pilot.transmitter import (
-    DEFAULT_AXES,
-    PILOTS,
-    Pilot,
-    make_pilot,
-    prepare_vehicle,
-)
+from sitl.pilot.transmitter import DEFAULT_AXES, PILOTS, Pilot, make_pilot, prepare_vehicle
 from sitl.report import write_report
 from sitl.simulated_vehicle import SimulatedVehicle
 from sitl.vehicle.conditions import NOMINAL, random_conditions

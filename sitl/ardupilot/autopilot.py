@@ -12,13 +12,7 @@ from sitl.ardupilot.flight_modes import CopterControl, Mode
 from sitl.ardupilot.guided import GuidedControl
 from sitl.ardupilot.params import ArduPilotParams
 from sitl.ardupilot.rc import ModeSwitch, RcEngine
-from sitl.ardupilot.sticks import (
-    GESTURE_NS,
-    Sticks,
-    climb_rate_mps,
-    gesture_side,
-    read_sticks,
-)
+from sitl.ardupilot.sticks import GESTURE_NS, Sticks, climb_rate_mps, gesture_side, read_sticks
 from sitl.clock import NS_PER_S
 from sitl.vehicle.config import STEP_NS, VehicleConfig
 from sitl.vehicle.dynamics import QUAD

@@ -1,11 +1,6 @@
 from typing import Any
 
-from benchmarks.results import (
-    BenchResult,
-    EngineTiming,
-    Flight,
-    LinkLatency,
-)
+from benchmarks.results import BenchResult, EngineTiming, Flight, LinkLatency
 from mavbridge.commands.check.computer import Computer
 from mavbridge.core.vehicle import Percentiles
 

@@ -101,12 +101,7 @@ BANDS = (
 _COUNTS = (Series("0.1 % of all", RED), Series("count", BLUE, width=2))
 MISSED = Plot("missed/sticks", "Missed slots since the start, red: 0.1 % of all", _COUNTS)
 DROPPED = Plot("missed/vision", "Dropped images since the start, red: 0.1 % of all", _COUNTS)
-STICK_COLORS: dict[str, Rgb] = {
-    "roll": GREY,
-    "pitch": DARK_BLUE,
-    "throttle": ORANGE,
-    "yaw": BLUE,
-}
+STICK_COLORS: dict[str, Rgb] = {"roll": GREY, "pitch": DARK_BLUE, "throttle": ORANGE, "yaw": BLUE}
 """The four colours above that differ most for all kinds of colour vision."""
 _RC_SERIES = tuple(
     Series(f"channel {number}", color)
@@ -188,11 +183,7 @@ def flight_blueprint(flight: ViewedFlight) -> rrb.Blueprint:
     ]
     place = rrb.Vertical(
         _scenes(flight.gates),
-        rrb.Horizontal(
-            rrb.Horizontal(*cameras),
-            _events(),
-            column_shares=[2, 3],
-        ),
+        rrb.Horizontal(rrb.Horizontal(*cameras), _events(), column_shares=[2, 3]),
         row_shares=[3, 2],
     )
     motion = rrb.Vertical(
@@ -231,11 +222,7 @@ def _scenes(gates: Sequence[CourseGate]) -> rrb.Horizontal:
 
     def scene(name: str, origin: str, eye: rrb.EyeControls3D) -> rrb.Spatial3DView:
         return rrb.Spatial3DView(
-            name=name,
-            origin=origin,
-            contents=[f"/{SCENE}/**"],
-            overrides=trails,
-            eye_controls=eye,
+            name=name, origin=origin, contents=[f"/{SCENE}/**"], overrides=trails, eye_controls=eye
         )
 
     name = "Path: blue policy, grey others, orange plan"

@@ -172,13 +172,7 @@ def _gates(gates: Sequence[CourseGate]) -> rr.LineStrips3D:
     """Return the openings, numbered in the order of flight."""
     strips = [gate.corners_ned_m[[0, 1, 2, 3, 0]] for gate in gates]
     labels = [str(number) for number in range(1, len(gates) + 1)]
-    return rr.LineStrips3D(
-        strips,
-        colors=layout.PINK,
-        radii=-2.0,
-        labels=labels,
-        show_labels=True,
-    )
+    return rr.LineStrips3D(strips, colors=layout.PINK, radii=-2.0, labels=labels, show_labels=True)
 
 
 def _fitting(image: CameraImage) -> ImageArray:

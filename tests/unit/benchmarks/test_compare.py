@@ -98,10 +98,7 @@ def budget(tmp_path: Path) -> Callable[[float], Path]:
 @pytest.mark.usefixtures("canned")
 @pytest.mark.parametrize(("most", "status"), [(3.1, 0), (2.9, 1)])
 def test_exit_status_tells_whether_the_budget_holds(
-    budget: Callable[[float], Path],
-    capsys: pytest.CaptureFixture[str],
-    most: float,
-    status: int,
+    budget: Callable[[float], Path], capsys: pytest.CaptureFixture[str], most: float, status: int
 ) -> None:
     assert compare.main(check=budget(most)) == status
     out = capsys.readouterr().out

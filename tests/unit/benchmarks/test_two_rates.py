@@ -6,15 +6,7 @@ from pathlib import Path
 import pytest
 
 from benchmarks import two_rates
-from benchmarks.two_rates import (
-    CONTROLS,
-    ENCODER_MS,
-    LOOPS,
-    Cell,
-    Control,
-    Loop,
-    flags_of,
-)
+from benchmarks.two_rates import CONTROLS, ENCODER_MS, LOOPS, Cell, Control, Loop, flags_of
 
 
 def made(control: Control, loop: Loop, encoder_ms: int, weights: Path, episodes: int) -> Cell:

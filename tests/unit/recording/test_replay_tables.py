@@ -17,12 +17,7 @@ from mavbridge.core.vehicle import ForwardedPacket
 from mavbridge.recording import replay_tables
 from mavbridge.recording.flight_writer import FlightWriter
 from mavbridge.recording.folder import SETTINGS
-from mavbridge.recording.replay_tables import (
-    packet_key,
-    read_features,
-    read_packets,
-    read_solves,
-)
+from mavbridge.recording.replay_tables import packet_key, read_features, read_packets, read_solves
 from mavbridge.recording.settings import (
     ReplaySettings,
     SettingsError,

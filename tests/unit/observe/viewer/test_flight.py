@@ -14,13 +14,7 @@ import numpy as np
 import pytest
 from rerun.chunk import RrdReader
 
-from helpers.factories import (
-    START_NS,
-    make_released_tick,
-    make_state,
-    make_tick,
-    make_vision_tick,
-)
+from helpers.factories import START_NS, make_released_tick, make_state, make_tick, make_vision_tick
 from mavbridge.core.clock import NS_PER_MS
 from mavbridge.core.course import CourseGate
 from mavbridge.core.reasons import Code, because
@@ -29,11 +23,7 @@ from mavbridge.core.vehicle import ActionKind, ActionTrace, Sticks
 from mavbridge.flight.action_frames import action_frame
 from mavbridge.observe.viewer import layout
 from mavbridge.observe.viewer.flight import EVENT_CHARACTERS, RerunView
-from mavbridge.observe.viewer.layout import (
-    ViewedFlight,
-    flight_blueprint,
-    styles,
-)
+from mavbridge.observe.viewer.layout import ViewedFlight, flight_blueprint, styles
 from policy.contract import Contract
 from policy.motion.stick_loop import GRAVITY_MPS2
 

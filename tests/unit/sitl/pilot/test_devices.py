@@ -7,13 +7,7 @@ from sitl import UsageError
 from sitl.clock import NS_PER_S
 from sitl.pilot import devices
 from sitl.pilot.devices import GamepadPilot, KeyboardPilot
-from sitl.pilot.transmitter import (
-    DEFAULT_AXES,
-    OFF_US,
-    PERIOD_NS,
-    Axis,
-    parse_axes,
-)
+from sitl.pilot.transmitter import DEFAULT_AXES, OFF_US, PERIOD_NS, Axis, parse_axes
 
 MIDDLE = (1500, 1500, 1500, 1500)
 
