@@ -22,8 +22,12 @@ CAPACITY = 6000
 IMAGE_CAPACITY = 32
 
 
-class Recorder:
-    """Recording of one flight while it flies."""
+class Recorder(ObserverThread):
+    """Recording of one flight while it flies.
+
+    Call ``close`` once the link is closed; if the link's process is still running, the writer
+    process keeps its log to the end.
+    """
 
     def __init__(
         self,
@@ -60,51 +64,40 @@ class Recorder:
             except OSError:
                 writer.close()
                 raise
-        self._consumer = _FlightConsumer(writer, packets_dropped, autopilot, report)
+        self._flight = _FlightConsumer(writer, packets_dropped, autopilot, report)
         self._packets_dropped = packets_dropped
-        self._observer = ObserverThread(
+        super().__init__(
             "mavbridge-recorder",
-            self._consumer,
+            self._flight,
             capacity=CAPACITY,
             image_capacity=IMAGE_CAPACITY,
             cameras=1 if meta.contract is None else len(meta.contract.cameras),
         )
 
-    def emit(self, event: Observed) -> None:
-        """Queue the event, or drop and count it."""
-        self._observer.emit(event)
-
     def watch_packets(self, packets: tuple[ForwardedPacket, ...]) -> None:
         """Queue the stamps of received packets, or drop and count them. For one thread only."""
-        self._consumer.writer.packets.put(packets)
-
-    def close(self, timeout_s: float) -> None:
-        """Finish the recording within ``timeout_s``. Call once the link is closed.
-
-        If the link's process is still running, the writer process keeps its log to the end.
-        """
-        self._observer.close(timeout_s)
+        self._flight.writer.packets.put(packets)
 
     @property
     def dropped(self) -> int:
         """Number of ticks, frames and packets missing from the recording; exact after ``close``."""
-        packets = self._packets_dropped() + self._consumer.writer.packets.dropped
-        return self._observer.dropped + self._consumer.frames_lost + packets
+        packets = self._packets_dropped() + self._flight.writer.packets.dropped
+        return super().dropped + self._flight.frames_lost + packets
 
     @property
     def crash(self) -> str | None:
         """How the vehicle has crashed so far, in words, or None; readable by any thread."""
-        return self._consumer.crash_watch.reason
+        return self._flight.crash_watch.reason
 
     @property
     def meta(self) -> FlightMeta:
         """Contents of ``meta.json``; complete after ``close``."""
-        return self._consumer.writer.meta
+        return self._flight.writer.meta
 
     def summary(self) -> str:
         """Return one line for the user: the folder, its contents and the losses."""
-        writer = self._consumer.writer
-        failure = self._observer.failure or writer.video_failure
+        writer = self._flight.writer
+        failure = self.failure or writer.video_failure
         if failure is None and not self.dropped:
             counted = f"{writer.ticks} ticks and {writer.frames_written} frames"
             return f"recorded {counted} in {self._folder}"

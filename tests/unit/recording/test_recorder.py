@@ -39,7 +39,7 @@ class RecorderStand:
             autopilot=lambda: "ardupilot 4.6.0",
             report=self.told.append,
         )
-        self.writer = self.recorder._consumer.writer
+        self.writer = self.recorder._flight.writer
         (process,) = (
             child for child in multiprocessing.active_children() if child.name == "mavbridge-writer"
         )
@@ -62,7 +62,7 @@ def until(stood: RecorderStand, ticks: int) -> None:
     for _ in range(10_000):
         if stood.writer.ticks >= ticks:
             return
-        stood.recorder._observer._closing.wait(0.01)
+        stood.recorder._closing.wait(0.01)
     raise TimeoutError
 
 
@@ -112,12 +112,12 @@ def test_a_full_disk_ends_the_recording_with_one_warning(
     with stand(tmp_path) as stood:
         resource.prlimit(stood.pid, resource.RLIMIT_FSIZE, (6_000, 6_000))
         number = 0
-        while stood.recorder._observer.failure is None:
+        while stood.recorder.failure is None:
             assert number < 10_000
             stood.recorder.emit(make_tick(number))
             stood.recorder.emit(make_frame(number))
             number += 1
-            stood.recorder._observer._closing.wait(0.005)
+            stood.recorder._closing.wait(0.005)
         stood.recorder.emit(make_tick(number))  # the flight goes on
     warnings = [record.getMessage() for record in caplog.records] + stood.told
     assert len(warnings) == 1
