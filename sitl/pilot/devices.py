@@ -2,7 +2,6 @@
 
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
-from typing import Protocol
 
 import pygame
 
@@ -16,18 +15,6 @@ PAD_HELP = (
     "hold button 7 (start) to arm, 6 (back) to disarm; button 0 (A) moves the switch of channel 7 "
     "up and down, 1 (B) to its middle"
 )
-
-
-class Pad(Protocol):
-    """Gamepad, as far as `GamepadPilot` uses it."""
-
-    def poll(self) -> bool: ...
-
-    def axes(self) -> Sequence[float]:
-        """Return the positions in [-1, 1], by number."""
-
-    def buttons(self) -> Sequence[bool]:
-        """Return the buttons' states, by number: True if pressed."""
 
 
 class _DevicePilot(ABC):
@@ -67,28 +54,6 @@ class _DevicePilot(ABC):
         pygame.quit()
 
 
-class GamepadPilot(_DevicePilot):
-    """Pilot at a gamepad; without the pad the receiver has no signal."""
-
-    def __init__(self, pad: Pad, axes: PadAxes, clock: Clock) -> None:
-        super().__init__(
-            clock, arm=ARM_BUTTON, disarm=DISARM_BUTTON, up=RECORD_BUTTON, middle=BAD_BUTTON
-        )
-        self._pad = pad
-        self._axes = axes
-
-    def _poll(self, _now_ns: int) -> StickPositions | None:
-        if not self._pad.poll():
-            self._down.clear()
-            return None
-        for number, is_down in enumerate(self._pad.buttons()):
-            if not is_down:
-                self._down.discard(number)
-            elif number not in self._down:
-                self._press(number)
-        return self._axes.sticks(self._pad.axes())
-
-
 class PygamePad:
     """First gamepad of this computer; it may be unplugged and replaced."""
 
@@ -117,12 +82,36 @@ class PygamePad:
         return self._pad is not None
 
     def axes(self) -> Sequence[float]:
+        """Return the positions in [-1, 1], by number."""
         pad = self._pad
         return () if pad is None else [pad.get_axis(k) for k in range(pad.get_numaxes())]
 
     def buttons(self) -> Sequence[bool]:
+        """Return the buttons' states, by number: True if pressed."""
         pad = self._pad
         return () if pad is None else [pad.get_button(k) for k in range(pad.get_numbuttons())]
+
+
+class GamepadPilot(_DevicePilot):
+    """Pilot at a gamepad; without the pad the receiver has no signal."""
+
+    def __init__(self, pad: PygamePad, axes: PadAxes, clock: Clock) -> None:
+        super().__init__(
+            clock, arm=ARM_BUTTON, disarm=DISARM_BUTTON, up=RECORD_BUTTON, middle=BAD_BUTTON
+        )
+        self._pad = pad
+        self._axes = axes
+
+    def _poll(self, _now_ns: int) -> StickPositions | None:
+        if not self._pad.poll():
+            self._down.clear()
+            return None
+        for number, is_down in enumerate(self._pad.buttons()):
+            if not is_down:
+                self._down.discard(number)
+            elif number not in self._down:
+                self._press(number)
+        return self._axes.sticks(self._pad.axes())
 
 
 KEYS_HELP = (
