@@ -1,8 +1,6 @@
 """A replay gives each solve what it was given in flight, whatever the contract asks for."""
 
-import sys
 from collections.abc import Callable
-from contextlib import ExitStack
 from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
@@ -12,11 +10,9 @@ import numpy as np
 import pytest
 
 from helpers.fakes import ListSink, level_telemetry, samples_of
-from helpers.policy_servers import when_it_listens
 from helpers.recordings import make_meta
 from mavbridge.config.flight import FlyConfig
 from mavbridge.core.clock import NS_PER_S
-from mavbridge.core.processes import free_port, running
 from mavbridge.core.records import FeatureFrame, Solve, Tick, VisionTick
 from mavbridge.core.vehicle import ForwardedPacket
 from mavbridge.flight.history import SentHistory
@@ -170,21 +166,12 @@ PAST = {"observation_steps": 3, "observation_dt_s": 0.07}
     [
         {},
         {"dual_rate": False},
-        {"state_extras": ("height",)},
-        {"state_extras": ("altitude",)},
-        {"state_extras": ("goal",)},
-        {"state_extras": ("altitude", "height")},
         {"state_extras": ("height", "goal", "altitude")},
         {"state_extras": ("height",), **PAST},
         {"state_extras": ("height",), "state_frame": "enu_flu", "since_exposure": True},
-        {"state_frame": "enu_flu"},
-        {"since_exposure": True},
-        PAST,
         {"since_exposure": True, **PAST},
-        {"state_time": "execution"},
         {"state_time": "execution", "since_exposure": True, "state_extras": ("altitude", "height")},
         {"state_time": "execution", "action": "velocity", "state_frame": "enu_flu", **PAST},
-        TWO_EYES,
         {"state_extras": ("height",), **TWO_EYES, **PAST},
         {"prefix_len": 4},
         {"history_len": 1, "history_dt_s": 0.001},
@@ -200,9 +187,7 @@ def test_every_field_of_the_state_is_repeated_bit_for_bit(
     assert_equal(compared)
 
 
-@pytest.mark.parametrize(
-    "changes", [{}, {"since_exposure": True}, {"state_extras": ("height",), **PAST}]
-)
+@pytest.mark.parametrize("changes", [{}, {"state_extras": ("height",), **PAST}])
 def test_what_solves_without_a_chunk_had_seen_does_not_change_the_others(
     monkeypatch: pytest.MonkeyPatch, changes: dict[str, Any]
 ) -> None:
@@ -238,29 +223,6 @@ def test_the_examples_are_repeated_bit_for_bit(monkeypatch: pytest.MonkeyPatch, 
         return load_policy(request, now_s=lambda: 0.0).runner
 
     assert_equal(flown_and_repeated(monkeypatch, load))
-
-
-def test_the_example_on_a_server_is_repeated_bit_for_bit(
-    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
-) -> None:
-    for package in ("websockets", "msgpack"):
-        pytest.importorskip(package)
-    port = free_port()
-    with ExitStack() as stack:
-        command = (sys.executable, str(EXAMPLES / "server_policy.py"), str(port))
-        stack.enter_context(running(*command, log=tmp_path / "server.log"))
-
-        def load() -> PolicyRunner:
-            request = PolicyRequest(spec=f"ws://127.0.0.1:{port}")
-            loaded = when_it_listens(lambda: load_policy(request, now_s=lambda: 0.0))
-            return stack.enter_context(loaded).runner
-
-        compared = flown_and_repeated(monkeypatch, load)
-    # The server runs in real time: on a busy machine it is late now and then, in either run.
-    late = sum(compared.missing.values())
-    assert all("has not answered within" in why for why in compared.missing)
-    assert set(compared.inputs_differ) <= {"elapsed"}
-    assert compared.equal_chunks == compared.solves - late >= 50
 
 
 def test_what_reaches_the_policy_in_one_batch_does_not_change_past_states() -> None:

@@ -4,6 +4,7 @@ import platform
 import subprocess
 import sys
 from collections.abc import Iterator
+from unittest.mock import Mock
 
 import pytest
 
@@ -135,6 +136,8 @@ def test_the_action_loop_is_below_the_guard_and_never_takes_the_only_cpu(
     policy = os.SCHED_FIFO | os.SCHED_RESET_ON_FORK
     assert asked == [(0, policy, os.sched_param(ACTION_FIFO_PRIORITY))]
     assert ACTION_FIFO_PRIORITY < GUARD_FIFO_PRIORITY
+    monkeypatch.setattr(os, "sched_setscheduler", Mock(side_effect=PermissionError))
+    assert "ulimit" in (settle_thread(realtime=True, cpu=None) or "")
 
 
 @linux

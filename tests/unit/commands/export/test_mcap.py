@@ -2,7 +2,6 @@
 
 import json
 from base64 import b64decode
-from collections import Counter
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
@@ -99,18 +98,7 @@ def opened(path: Path) -> File:
                 assert stamp["sec"] * 10**9 + stamp["nsec"] == message.log_time
             entries.append(Entry(channel.topic, message.log_time, body))
         attachments = {each.name: each.data for each in reader.iter_attachments()}
-        summary = reader.get_summary()
-        assert summary is not None
-        assert summary.statistics is not None
-        counts = {
-            c.topic: n for c, n in zip(summary.channels.values(), _counts(summary), strict=True)
-        }
-        assert counts == Counter(entry.topic for entry in entries)
     return File(schemas, paths, entries, attachments)
-
-
-def _counts(summary: Any) -> list[int]:
-    return [summary.statistics.channel_message_counts[number] for number in summary.channels]
 
 
 def image_of(entry: Entry) -> np.ndarray:
