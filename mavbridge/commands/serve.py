@@ -17,7 +17,6 @@ from collections.abc import Callable
 from concurrent.futures import Future
 from contextlib import ExitStack, suppress
 from dataclasses import replace
-from ipaddress import ip_address
 
 from rich.console import Console
 from rich.text import Text
@@ -28,7 +27,7 @@ from websockets.frames import CloseCode
 from websockets.http11 import Request, Response
 
 from mavbridge.commands.config import ServeConfig
-from mavbridge.core.address import spelled
+from mavbridge.core.address import is_local, spelled
 from mavbridge.core.clock import NS_PER_MS, Clock, MonotonicClock
 from mavbridge.core.errors import UserError
 from mavbridge.core.workers import Worker
@@ -246,7 +245,7 @@ async def _serve(
     listener = await server.listen(config.host, config.port)
     url = f"ws://{spelled(config.host, config.port)}"
     console.print(Text(f"serving {config.policy.policy} at {url}; Ctrl-C ends it"))
-    if not _is_local(config.host):
+    if not is_local(config.host):
         who = "every computer that reaches it"
         if os.environ.get(API_KEY_VARIABLE):
             who += " and has the API key"
@@ -260,10 +259,3 @@ async def _serve(
     listener.close()
     with suppress(TimeoutError):  # a hung solve is for the policy thread to report
         await asyncio.wait_for(listener.wait_closed(), JOIN_S)
-
-
-def _is_local(host: str) -> bool:
-    try:
-        return host == "localhost" or ip_address(host).is_loopback
-    except ValueError:
-        return False

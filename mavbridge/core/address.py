@@ -13,6 +13,7 @@ it is every network, which is 0.0.0.0 here.
 
 import re
 import socket
+from ipaddress import ip_address
 from typing import NamedTuple, TypeAlias
 
 from mavbridge.core.errors import UserError
@@ -89,7 +90,15 @@ def is_reachable(spec: str) -> bool:
     address = parse_address(spec)
     if isinstance(address, SerialAddress):
         return False
-    return not (address.host.startswith("127.") or address.host in ("localhost", "::1"))
+    return not is_local(address.host)
+
+
+def is_local(host: str) -> bool:
+    """Return True for ``localhost`` and addresses of the loopback interface."""
+    try:
+        return host == "localhost" or ip_address(host).is_loopback
+    except ValueError:
+        return False
 
 
 def host_port(text: str) -> tuple[str, int] | None:

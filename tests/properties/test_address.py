@@ -139,7 +139,13 @@ def test_a_name_with_both_kinds_of_address_is_the_older_kind() -> None:
 
 @pytest.mark.parametrize(
     ("spec", "expected"),
-    [("udp:[::1]:14550", False), ("udp:[::]:14550", True), ("udpout:[fe80::1%lo]:14550", True)],
+    [
+        ("udp:[::1]:14550", False),
+        ("udpout:127.0.0.2:14550", False),
+        ("udp:[::]:14550", True),
+        ("udpout:[fe80::1%lo]:14550", True),
+        ("tcp:127.0.0.1.example.org:5760", True),
+    ],
 )
 def test_who_else_can_send_to_it(spec: str, expected: bool) -> None:
     assert is_reachable(spec) is expected
