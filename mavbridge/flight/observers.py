@@ -80,13 +80,7 @@ class FlightObservers:
     @property
     def sinks(self) -> tuple[TickSink, ...]:
         """Open observers, for the bridge."""
-        optional = (self._recorder, self._viewer)
-        return (
-            self._timing,
-            self.screen,
-            self.referee,
-            *(sink for sink in optional if sink is not None),
-        )
+        return (self._timing, self.screen, self.referee, *self.recorders)
 
     @property
     def recorders(self) -> tuple[TickSink, ...]:

@@ -22,7 +22,6 @@ from mavbridge.flight.state import (
     Observation,
     ObservationSource,
     StateReader,
-    Unavailable,
 )
 from mavbridge.flight.telemetry_cache import SolveInputs, TelemetryCache
 from mavbridge.guard.chunks import Chunk
@@ -166,29 +165,29 @@ class PolicyLoop:
             if (before := self._reader.past(past, has_position=has_position)) is not None:
                 self._observations.remember(before)
         state = self._reader.read(telemetry, now_ns, has_position=has_position)
-        if isinstance(state, Unavailable):
-            self._refuse(state.reason)
+        if isinstance(state, Reason):
+            self._refuse(state)
             return
         plan = self._chunk if self._view.phase is Phase.FLYING else None
         observation = self._observe(state, telemetry, now_ns, plan)
-        if isinstance(observation, Unavailable):
-            self._refuse(observation.reason)
+        if isinstance(observation, Reason):
+            self._refuse(observation)
         else:
             self._solve(state, observation, now_ns, plan)
 
     def _observe(
         self, state: VehicleState, telemetry: Telemetry, now_ns: int, plan: Chunk | None
-    ) -> Observation | Unavailable:
+    ) -> Observation | Reason:
         self._observations.push(state)
         if (frozen := self._frozen.problem(state)) is not None:
-            return Unavailable(frozen)
+            return frozen
         if self._forward is not None and plan is not None:
             acts_ns = self._takeover_ns(now_ns)
             ahead = self._forward.at(telemetry, acts_ns, partial(self._history.at, plan=plan))
             if ahead is not telemetry:
                 has_position = self._view.status.has_position
                 acting = self._reader.read(ahead, acts_ns, has_position=has_position)
-                if isinstance(acting, Unavailable):
+                if isinstance(acting, Reason):
                     return acting
                 state = acting
         return self._observations.observe(state, now_ns)

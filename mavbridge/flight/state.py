@@ -1,6 +1,6 @@
 """The policy's inputs: the contract's state from telemetry, beside images and past states.
 
-A missing or stale input makes the result ``Unavailable``, with the reason.
+Where an input is missing or stale, the result is the ``Reason`` instead.
 """
 
 import math
@@ -35,12 +35,6 @@ MAX_STATES = 4096
 """Past states kept: ten seconds of the fastest attitude stream."""
 
 
-class Unavailable(NamedTuple):
-    """Returned in place of a state or observation that does not exist now."""
-
-    reason: Reason
-
-
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Freshness:
     """Maximum age of each kind of reading."""
@@ -53,10 +47,10 @@ class Freshness:
 
 def build_state(
     telemetry: Telemetry, now_ns: int, *, frame: StateFrame, freshness: Freshness
-) -> VehicleState | Unavailable:
+) -> VehicleState | Reason:
     """Join the newest readings into a state in ``frame``, the contract's.
 
-    A missing or stale reading makes the state ``Unavailable``, never a zero.
+    A missing or stale reading is a reason, never a zero.
     """
     attitude, rate = telemetry.ned_from_body_wxyz, telemetry.rate_body_radps
     velocity, force = telemetry.velocity_ned_mps, telemetry.specific_force_body_mps2
@@ -127,11 +121,11 @@ class StateReader:
 
     def read(
         self, telemetry: Telemetry, now_ns: int, *, has_position: bool
-    ) -> VehicleState | Unavailable:
+    ) -> VehicleState | Reason:
         """Return the state at ``now_ns``. ``has_position``: the vehicle's position may be
         trusted."""
         state = build_state(telemetry, now_ns, frame=self._frame, freshness=self._freshness)
-        if isinstance(state, Unavailable) or not self._extras:
+        if isinstance(state, Reason) or not self._extras:
             return state
         position = telemetry.position_ned_m if has_position else None
         numbers: list[float] = []
@@ -155,10 +149,10 @@ class StateReader:
         state = self.read(telemetry, attitude.arrived_ns, has_position=has_position)
         return state if isinstance(state, VehicleState) else None
 
-    def _missing(self, extra: str, reading: Reading | None, now_ns: int) -> Unavailable:
+    def _missing(self, extra: str, reading: Reading | None, now_ns: int) -> Reason:
         what = _READINGS[extra]
         if reading is None:
-            return Unavailable(because(Code.NO_TRUSTED_READING, quantity=what))
+            return because(Code.NO_TRUSTED_READING, quantity=what)
         return stale(reading, what, now_ns, self._freshness.velocity_ns)
 
     def _to_goal(self, position_ned_m: tuple[float, ...]) -> list[float]:
@@ -171,15 +165,15 @@ class StateReader:
         return [north, east, down] if self._frame == "ned_frd" else [east, north, -down]
 
 
-def stale(reading: Reading | None, quantity: str, now_ns: int, limit_ns: int) -> Unavailable:
-    """Return ``Unavailable`` with the reason for a missing, stale or future reading."""
+def stale(reading: Reading | None, quantity: str, now_ns: int, limit_ns: int) -> Reason:
+    """Return what is wrong with a missing, stale or future reading."""
     if reading is None:
-        return Unavailable(because(Code.NO_READING, quantity=quantity))
+        return because(Code.NO_READING, quantity=quantity)
     if reading.delay_ns < 0:
         ahead_ms = -reading.delay_ns / NS_PER_MS
-        return Unavailable(because(Code.READING_AHEAD, quantity=quantity, ahead_ms=ahead_ms))
+        return because(Code.READING_AHEAD, quantity=quantity, ahead_ms=ahead_ms)
     age_ms, limit_ms = (now_ns - reading.happened_ns) / NS_PER_MS, limit_ns / NS_PER_MS
-    return Unavailable(because(Code.TOO_OLD, quantity=quantity, age_ms=age_ms, limit_ms=limit_ms))
+    return because(Code.TOO_OLD, quantity=quantity, age_ms=age_ms, limit_ms=limit_ms)
 
 
 def _unit_positive(q: tuple[float, ...]) -> tuple[float, ...]:
@@ -261,9 +255,8 @@ class ObservationSource:
         if self._ego_motion is not None:
             self._ego_motion.push(state)
 
-    def observe(self, state: VehicleState, now_ns: int) -> Observation | Unavailable:
-        """Return the inputs of a chunk from ``state``, the newest pushed; ``Unavailable`` if one is
-        missing."""
+    def observe(self, state: VehicleState, now_ns: int) -> Observation | Reason:
+        """Return the inputs of a chunk from ``state``, the newest pushed, or why one is missing."""
         newest = []
         for camera, cache in enumerate(self._caches):
             feature = cache.latest()
@@ -314,11 +307,11 @@ class ObservationSource:
             row = np.append(row, np.array([state.extras], np.float32), axis=1)
         return row
 
-    def _missing(self, camera: int, why: Reason) -> Unavailable:
-        """Return ``Unavailable``; of several cameras, name the one."""
-        is_only = len(self._cameras) == 1
-        name = self._cameras[camera]
-        return Unavailable(why if is_only else because(Code.OF_CAMERA, camera=name, why=why))
+    def _missing(self, camera: int, why: Reason) -> Reason:
+        """Of several cameras, name the one."""
+        if len(self._cameras) == 1:
+            return why
+        return because(Code.OF_CAMERA, camera=self._cameras[camera], why=why)
 
 
 def observation_ages_ns(contract: Contract) -> tuple[int, ...]:

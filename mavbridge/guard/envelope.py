@@ -2,7 +2,6 @@
 
 import math
 from dataclasses import dataclass, fields
-from typing import Literal, NamedTuple, TypeAlias
 
 from mavbridge.core.clock import NS_PER_MS
 from mavbridge.core.reasons import Code, Reason, because
@@ -18,8 +17,6 @@ FLAG_PERSIST_NS = 600 * NS_PER_MS
 """Debounce time of estimator, battery and landing: more than one message at 2 Hz."""
 FRESH_NS = 500 * NS_PER_MS
 """Oldest attitude and velocity that are checked; the policy's inputs have stricter age limits."""
-
-_Kind: TypeAlias = Literal["fault", "landed"]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -49,22 +46,6 @@ class EnvelopeLimits:
         return EnvelopeLimits(**wider)  # type: ignore[arg-type]
 
 
-class EnvelopeInput(NamedTuple):
-    """State of the vehicle at one tick, from the link's snapshot."""
-
-    now_ns: int
-    telemetry: Telemetry
-    status: VehicleStatus
-
-
-class EnvelopeExit(NamedTuple):
-    """End of a flight by its envelope."""
-
-    kind: _Kind
-    """fault: a limit was exceeded. landed: a normal end."""
-    reason: Reason
-
-
 class Envelope:
     """Detects when the vehicle leaves its envelope, and which quantities cannot be watched.
 
@@ -78,8 +59,9 @@ class Envelope:
         """Timestamp at which a problem began that has lasted since, by quantity; at most seven."""
         self._had_position = False
         self._was_in_air = False
-        self._unwatched: list[str] = []
-        self._found: EnvelopeExit | None = None
+        self.unwatched: list[str] = []
+        """Limits that could not be checked at the last tick, as sentences for the user."""
+        self._found: Reason | None = None
         """First limit exceeded at this tick."""
 
     def reset(self) -> None:
@@ -87,18 +69,16 @@ class Envelope:
         self._since_ns.clear()
         self._had_position = self._was_in_air = False
 
-    @property
-    def unwatched(self) -> tuple[str, ...]:
-        """Limits that could not be checked at the last tick, as sentences for the user."""
-        return tuple(self._unwatched)
+    def check(self, now_ns: int, telemetry: Telemetry, status: VehicleStatus) -> Reason | None:
+        """Return the first limit that has been exceeded for its debounce time, or None.
 
-    def check(self, vehicle: EnvelopeInput) -> EnvelopeExit | None:
-        """Return the first limit that has been exceeded for its debounce time, or None."""
-        self._unwatched.clear()
+        A landing, ``Code.LANDED``, is a normal end; every other reason is a fault.
+        """
+        self.unwatched.clear()
         self._found = None
-        self._check_motion(vehicle.telemetry, vehicle.now_ns)
-        self._check_position(vehicle.status.position_ned_m, vehicle.now_ns)
-        self._check_flags(vehicle.status, vehicle.now_ns)
+        self._check_motion(telemetry, now_ns)
+        self._check_position(status.position_ned_m, now_ns)
+        self._check_flags(status, now_ns)
         return self._found
 
     def _note(self, name: str, problem: Reason | None, stamp_ns: int, persist_ns: int) -> None:
@@ -108,12 +88,12 @@ class Envelope:
             return
         since_ns = self._since_ns.setdefault(name, stamp_ns)
         if self._found is None and stamp_ns - since_ns >= persist_ns:
-            self._found = EnvelopeExit("landed" if name == "landing" else "fault", problem)
+            self._found = problem
 
     def _ignore(self, name: str, reason: str) -> None:
         """Note a quantity without data, and restart its debounce."""
         self._since_ns.pop(name, None)
-        self._unwatched.append(f"{name} is not watched: {reason}")
+        self.unwatched.append(f"{name} is not watched: {reason}")
 
     def _check_motion(self, telemetry: Telemetry, now_ns: int) -> None:
         oldest_ns, limits = now_ns - FRESH_NS, self._limits

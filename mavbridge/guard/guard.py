@@ -21,7 +21,7 @@ from mavbridge.core.vehicle import (
 )
 from mavbridge.guard.chunks import Chunk, ChunkBuffer, Lateness
 from mavbridge.guard.engagement import Engagement
-from mavbridge.guard.envelope import Envelope, EnvelopeInput
+from mavbridge.guard.envelope import Envelope
 from mavbridge.guard.limits import ActionSmoother, first_action, idle_action, neutral_action
 from mavbridge.guard.settings import FlightSettings
 from mavbridge.guard.values import (
@@ -230,7 +230,8 @@ class Guard:
         starting_ns, newest = self._engagement.starting_ns, self._chunks.newest
         reset_ns = 0 if newest is None else newest.reset_ns
         if status is not None:
-            left = self._envelope.check(EnvelopeInput(now_ns, link.telemetry, status))
+            left = self._envelope.check(now_ns, link.telemetry, status)
+        has_landed = left is not None and left.code is Code.LANDED
         return EngagementInputs(
             now_ns=now_ns,
             is_connected=status is not None,
@@ -264,8 +265,8 @@ class Guard:
             stick_override_ns=status.stick_override_ns if status else None,
             slowness=given.command_fault or (self._chunks.impossibility if is_sought else None),
             is_policy_reset=reset_ns >= (now_ns if starting_ns is None else starting_ns),
-            envelope_problem=left.reason if left and left.kind == "fault" else None,
-            landing=left.reason if left and left.kind == "landed" else None,
+            envelope_problem=None if has_landed else left,
+            landing=left if has_landed else None,
         )
 
     def _change_control(

@@ -193,15 +193,12 @@ class ActionSmoother:
     def __init__(self, settings: Smoothing, start: Action) -> None:
         self._settings = settings
         self.limits = settings.limits
-        self._last_ns: int | None = None
-        self._slewed = start
-        self._smoothed = self._before = start
+        self.reset(start)
 
     def reset(self, start: Action) -> None:
         """Reset the filter to the vehicle's current command."""
-        self._last_ns = None
-        self._slewed = start
-        self._smoothed = self._before = start
+        self._last_ns: int | None = None
+        self._slewed = self._smoothed = self._before = start
 
     def undo(self) -> None:
         """Reset the filter to the output before the last step, which was not sent."""

@@ -254,22 +254,11 @@ def _unpickled(data: bytes, classes: tuple[type, ...]) -> Any:
 
 
 def _decode_chunk(data: bytes) -> Chunk:
-    _, kind, *stamps, count = _CHUNK.unpack_from(data)
-    serial, attitude_ns, velocity_ns, image_ns, computed_ns, first_ns, step_ns, reset_ns = stamps
+    _, kind, *stamps, reset_ns, count = _CHUNK.unpack_from(data)
     if len(data) != _CHUNK.size + count * _ACTION.size:
         raise ValueError("a chunk of another length")
     actions = _ACTION.iter_unpack(memoryview(data)[_CHUNK.size :])
-    return Chunk(
-        serial=serial,
-        attitude_ns=attitude_ns,
-        velocity_ns=velocity_ns,
-        image_ns=image_ns,
-        computed_ns=computed_ns,
-        first_ns=first_ns,
-        step_ns=step_ns,
-        actions=tuple(map(_CLASSES[kind]._make, actions)),
-        reset_ns=reset_ns,
-    )
+    return Chunk._make((*stamps, tuple(map(_CLASSES[kind]._make, actions)), reset_ns))
 
 
 def _encode_tick(tick: GuardTick) -> bytes:

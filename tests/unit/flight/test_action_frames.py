@@ -41,13 +41,6 @@ def test_actions_in_ros_axes_by_hand_and_back(
     np.testing.assert_array_equal(frame.from_guard(sent), FOUR)
 
 
-@pytest.mark.parametrize("kind", ["sticks", "rates", "attitude", "velocity"])
-def test_actions_in_the_guards_own_axes_are_not_changed(kind: ActionKind) -> None:
-    frame = action_frame(Contract(action=kind))
-    assert frame.to_guard(FOUR) == tuple(tuple(row) for row in FOUR.tolist())
-    np.testing.assert_array_equal(frame.from_guard(frame.to_guard(FOUR)), FOUR)
-
-
 @pytest.mark.parametrize("state_frame", ["ned_frd", "enu_flu"])
 def test_an_action_that_repeats_the_state_asks_for_the_motion_of_now(
     state_frame: StateFrame,

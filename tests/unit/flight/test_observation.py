@@ -14,7 +14,6 @@ from mavbridge.flight.state import (
     MAX_STATES,
     Observation,
     ObservationSource,
-    Unavailable,
     observation_ages_ns,
 )
 from policy.contract import Contract
@@ -81,7 +80,7 @@ def cache_of(*ago_ms: float, span_ms: int = 200) -> FeatureCache:
     return cache
 
 
-def observed(found: Observation | Unavailable) -> Observation:
+def observed(found: Observation | Reason) -> Observation:
     assert isinstance(found, Observation)
     return found
 
@@ -157,7 +156,7 @@ def test_no_camera_may_be_missing_old_or_at_fault(
         if frame is not None:
             cache.publish(frame)
     found = source(TWO_CAMERAS, *caches).observe(felt(0), NOW_NS)
-    assert (found.reason if isinstance(found, Unavailable) else None) == reason
+    assert (found if isinstance(found, Reason) else None) == reason
 
 
 def test_the_age_is_that_of_the_oldest_of_the_newest_images() -> None:

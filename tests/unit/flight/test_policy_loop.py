@@ -246,17 +246,6 @@ def test_a_flight_that_begins_resets_the_policy_once() -> None:
     assert START_NS < resets_ns[1] == resets_ns[2] <= rig.clock.now_ns()
 
 
-def test_serial_numbers_rise_by_one_and_a_refusal_takes_none() -> None:
-    rig = Rig().measure().see()
-    for _ in range(3):
-        run_on(rig, 7)
-    rig.see(age_ns=400 * MS)
-    rig.loop.step()
-    run_on(rig, 7)
-    assert [one.serial for one in rig.sent if isinstance(one, Chunk)] == [1, 2, 3, 4]
-    assert len(rig.sent) == 5
-
-
 def test_an_attitude_starts_a_solve_from_a_quarter_of_a_period_before_it_is_due() -> None:
     rig = Rig().measure().see()
     rig.loop.step()

@@ -1,15 +1,28 @@
 """What the flags and the contract tell the guard."""
 
+import math
+from collections.abc import Callable
 from dataclasses import replace
+from functools import partial
+from pathlib import Path
 
 import pytest
 
 from mavbridge.config.flight import EnvelopeConfig, FlyConfig, Limits, LinkConfig
 from mavbridge.config.rates import Rates
+from mavbridge.core.clock import NS_PER_MS
 from mavbridge.core.errors import UserError
 from mavbridge.core.vehicle import ActionMeaning, StickGains
 from mavbridge.flight.plan import plan_flight
-from mavbridge.flight.settings import action_meaning, guard_settings
+from mavbridge.flight.settings import (
+    action_meaning,
+    contract_with_ages,
+    effective_freshness,
+    guard_settings,
+    link_settings,
+    state_folder,
+)
+from mavbridge.guard.chunks import FreshnessLimits
 from mavbridge.guard.memory import EngagementSettings
 from mavbridge.guard.sequences import DisengageSettings, EngageSettings
 from mavbridge.guard.settings import FlightSettings
@@ -47,17 +60,6 @@ def test_periods_follow_the_rates(dual_rate: bool, chunk_period_ns: int) -> None
     settings = settings_for(FlyConfig(link=LINK, rates=rates), dual_rate=dual_rate)
     assert settings.stick_period_ns == 2_500_000
     assert settings.chunk_period_ns == chunk_period_ns
-
-
-def test_ages_are_those_of_the_contract_and_a_flag_may_tighten_them() -> None:
-    contract = Contract(feature_dim=8, max_state_age_s=0.5, max_chunk_age_s=2.0)
-    loose = settings_for(contract=contract).freshness
-    assert (loose.state_ns, loose.velocity_ns) == (500_000_000, 250_000_000)
-    assert (loose.feature_ns, loose.chunk_ns) == (300_000_000, 2_000_000_000)
-    config = FlyConfig(link=LINK, limits=Limits(max_attitude_age=0.05))
-    assert settings_for(config, contract).freshness == replace(loose, state_ns=50_000_000)
-    with pytest.raises(UserError, match="looser than"):
-        settings_for(FlyConfig(link=LINK, limits=Limits(max_chunk_age=2.1)), contract)
 
 
 def test_smoothing_is_that_of_the_flags() -> None:
@@ -117,6 +119,44 @@ def test_a_mode_in_which_the_policy_does_not_fly_is_refused(mode: str) -> None:
         settings_for(FlyConfig(link=LINK, mode=mode))
 
 
+REFUSED: list[tuple[Callable[[], object], str]] = [
+    *(
+        (partial(LinkConfig, set=(value,)), "NAME=VALUE")
+        for value in ("A", "A=", "A=fast", "A=nan", "A=1e39", "A_NAME_THAT_IS_TOO_LONG=1", "../A=1")
+    ),
+    (partial(LinkConfig, set=("A=1", "a=2")), "names A twice"),
+    (partial(LinkConfig, set=("A=1",), readonly=True), "--readonly sets no parameter"),
+    *(
+        (
+            partial(Limits, **{f"max_{name}_age": age_s}),
+            f"limits.{name}_age must be between 0.01 and 60 s",
+        )
+        for name in ("attitude", "velocity", "feature", "chunk")
+        for age_s in (0.0, -1.0, 61.0, math.nan)
+    ),
+    *(
+        (partial(EnvelopeConfig, **{f"max_{name}": value}), f"envelope.{name}")
+        for name in ("tilt", "height", "speed", "distance")
+        for value in (-1.0, math.nan)
+    ),
+    *(
+        (partial(Rates, visual_rate=rate), "rates.visual")
+        for rate in ("car", "auto:5", "auto:a:b", "auto:30:10", 0.0, "auto:0:30")
+    ),
+    *(
+        (partial(FlyConfig, link=LINK, goal=goal), "use NORTH,EAST,DOWN in metres")
+        for goal in ("1,2", "1,2,3,4", "", "a,b,c", "nan,0,0", "0,inf,0", "1e6,0,0")
+    ),
+    (partial(FlyConfig, engage_channel=3), "--engage-channel"),
+]
+
+
+@pytest.mark.parametrize(("make", "message"), REFUSED)
+def test_a_flag_that_cannot_be_is_refused(make: Callable[[], object], message: str) -> None:
+    with pytest.raises(UserError, match=message):
+        make()
+
+
 def test_the_contract_says_what_full_stick_means_and_raw_sticks_says_nothing() -> None:
     contract = Contract(
         full_lean_deg=45.0,
@@ -145,3 +185,99 @@ def test_other_actions_than_sticks_have_no_gains() -> None:
     assert action_meaning(contract, LINK) == ActionMeaning(
         kind="velocity", hover_thrust=0.5, is_heading_frame=True
     )
+
+
+# --- ages
+
+AGED = Contract(
+    max_state_age_s=0.2,
+    max_velocity_age_s=0.4,
+    max_feature_age_s=2,
+    max_chunk_age_s=1.5,
+    max_stall_s=0.5,
+)
+STALL_MS = 500
+
+
+def in_ms(
+    state: int, velocity: int, feature: int, chunk: int, stall: int = STALL_MS
+) -> FreshnessLimits:
+    return FreshnessLimits(
+        state_ns=state * NS_PER_MS,
+        velocity_ns=velocity * NS_PER_MS,
+        feature_ns=feature * NS_PER_MS,
+        chunk_ns=chunk * NS_PER_MS,
+        stall_ns=stall * NS_PER_MS,
+    )
+
+
+@pytest.mark.parametrize(
+    ("contract", "limits", "expected"),
+    [
+        (AGED, Limits(), in_ms(200, 400, 2000, 1500)),
+        (Contract(), Limits(), in_ms(100, 250, 300, 300, 250)),
+        (AGED, Limits(max_attitude_age=0.05, max_chunk_age=1.5), in_ms(50, 400, 2000, 1500)),
+        (
+            AGED,
+            Limits(max_velocity_age=0.3, max_feature_age=0.25, max_stall=0.2),
+            in_ms(200, 300, 250, 1500, 200),
+        ),
+    ],
+)
+def test_ages_are_the_contracts_and_flags_tighten_one_by_one(
+    contract: Contract, limits: Limits, expected: FreshnessLimits
+) -> None:
+    assert effective_freshness(contract, limits) == expected
+
+
+@pytest.mark.parametrize(
+    ("limits", "message"),
+    [
+        (
+            Limits(max_attitude_age=0.25),
+            "limits.attitude_age=0.25 is looser than the 0.2 s",
+        ),
+        (Limits(max_velocity_age=0.5), "limits.velocity_age=0.5 is looser than the 0.4 s"),
+        (Limits(max_feature_age=5), "limits.feature_age=5 is looser than the 2 s"),
+        (Limits(max_chunk_age=1.6), "limits.chunk_age=1.6 is looser than the 1.5 s"),
+        (Limits(max_stall=0.6), "limits.stall=0.6 is looser than the 0.5 s"),
+    ],
+)
+def test_a_flag_that_would_loosen_is_refused(limits: Limits, message: str) -> None:
+    with pytest.raises(UserError, match=message):
+        settings_for(FlyConfig(link=LINK, limits=limits), AGED)
+    allowed = effective_freshness(contract_with_ages(AGED, limits), limits)
+    assert allowed != effective_freshness(AGED, Limits())
+
+
+def test_a_measured_flight_may_have_tighter_ages_too() -> None:
+    limits = Limits(max_attitude_age=0.02, max_velocity_age=1, max_feature_age=0.5, max_chunk_age=9)
+    contract = contract_with_ages(AGED, limits)
+    assert effective_freshness(contract, Limits()) == in_ms(20, 1000, 500, 9000)
+    assert contract_with_ages(AGED, Limits()) == AGED
+
+
+# --- the link
+
+
+def test_parameters_and_risks_reach_the_link() -> None:
+    config = LinkConfig(
+        set=("rc_override_time=0.5", "FS_THR_ENABLE=1"),
+        accept_risk=("slow-serial",),
+    )
+    settings = link_settings(config, state_hz=100.0, stick_hz=200.0, min_battery_percent=15.0)
+    assert settings.set_params == (("RC_OVERRIDE_TIME", 0.5), ("FS_THR_ENABLE", 1.0))
+    assert settings.accepted_risks == ("slow-serial",)
+    assert settings.min_battery_percent == 15.0
+    assert settings.stick_hz == 200.0
+
+
+def test_the_state_folder_follows_the_users_environment(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("XDG_STATE_HOME", str(tmp_path))
+    assert state_folder() == tmp_path / "mavbridge"
+    monkeypatch.setenv("HOME", str(tmp_path / "home"))
+    for value in ("", "not/absolute"):
+        monkeypatch.setenv("XDG_STATE_HOME", value)
+        assert state_folder() == tmp_path / "home" / ".local" / "state" / "mavbridge"

@@ -12,7 +12,7 @@ from mavbridge.core.clock import NS_PER_MS
 from mavbridge.core.reasons import Code, Reason, because
 from mavbridge.core.records import VehicleState
 from mavbridge.core.vehicle import Reading, Telemetry
-from mavbridge.flight.state import Freshness, FrozenStateCheck, StateFrame, Unavailable, build_state
+from mavbridge.flight.state import Freshness, FrozenStateCheck, StateFrame, build_state
 
 NOW_NS = 5_000_000_000
 LIMITS = Freshness(attitude_ns=50 * NS_PER_MS, velocity_ns=100 * NS_PER_MS)
@@ -110,7 +110,7 @@ def test_enu_attitude_is_the_same_rotation_between_other_axes(q: tuple[float, ..
 def test_a_missing_or_old_part_is_a_reason(field: str, what: str) -> None:
     good = level_telemetry(NOW_NS)
     missing = build_state(without(good, field), NOW_NS, frame="ned_frd", freshness=LIMITS)
-    assert missing == Unavailable(because(Code.NO_READING, quantity=what))
+    assert missing == because(Code.NO_READING, quantity=what)
 
     limit_ns = LIMITS.attitude_ns if what in ("attitude", "body rate") else LIMITS.velocity_ns
     reading = getattr(good, field)
@@ -121,14 +121,12 @@ def test_a_missing_or_old_part_is_a_reason(field: str, what: str) -> None:
     )
     refused = build_state(old, NOW_NS, frame="ned_frd", freshness=LIMITS)
     limit_ms, age_ms = limit_ns / NS_PER_MS, (limit_ns + 1) / NS_PER_MS
-    assert refused == Unavailable(
-        because(Code.TOO_OLD, quantity=what, age_ms=age_ms, limit_ms=limit_ms)
-    )
+    assert refused == because(Code.TOO_OLD, quantity=what, age_ms=age_ms, limit_ms=limit_ms)
 
     future = good._replace(**{field: Reading(NOW_NS, reading.values, delay_ns=-400 * NS_PER_MS)})
     for now_ns in (NOW_NS, NOW_NS + 40 * NS_PER_MS):
-        assert build_state(future, now_ns, frame="ned_frd", freshness=LIMITS) == Unavailable(
-            because(Code.READING_AHEAD, quantity=what, ahead_ms=400.0)
+        assert build_state(future, now_ns, frame="ned_frd", freshness=LIMITS) == because(
+            Code.READING_AHEAD, quantity=what, ahead_ms=400.0
         )
 
 
@@ -139,7 +137,7 @@ def test_a_reading_that_arrived_just_now_but_happened_long_ago_is_old() -> None:
     assert isinstance(state, VehicleState)
     assert (state.attitude_ns, state.rate_ns) == (NOW_NS - LIMITS.attitude_ns, NOW_NS)
     refused = build_state(fresh, NOW_NS + 1, frame="ned_frd", freshness=LIMITS)
-    assert isinstance(refused, Unavailable)
+    assert isinstance(refused, Reason)
 
 
 def test_each_part_keeps_its_own_stamp_and_the_array_is_frozen() -> None:

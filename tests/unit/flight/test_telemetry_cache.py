@@ -168,12 +168,6 @@ def test_while_nobody_flies_ticks_have_the_newest_state_if_it_is_fresh(
     assert tick.release_reason == WAIT
 
 
-@pytest.mark.parametrize("phase", list(Phase))
-def test_a_reason_is_told_unless_the_policy_has_the_sticks(phase: Phase) -> None:
-    (tick,) = Viewed().receive(replace(NOBODY, phase=phase)).sink.ticks
-    assert tick.release_reason == (None if phase is Phase.FLYING else WAIT)
-
-
 def test_ticks_are_numbered_without_gaps_and_take_the_words_along() -> None:
     viewed = Viewed().receive(
         NOBODY, GuardMessage("one"), GuardMessage("two"), NOBODY, NOBODY, GuardError("bug", "three")
