@@ -65,8 +65,6 @@ class Sample(NamedTuple):
     is_neutral: bool
     """True if the last command is level or at rest."""
     lean_deg: float
-    speed_mps: float
-    """Horizontal speed."""
     position_ned_m: tuple[float, float, float]
 
 
@@ -81,14 +79,9 @@ class Aftermath:
     """First mode that differs from that of the flight."""
     lean_held_ms: float
     """Time for which it kept nine tenths of its initial lean."""
-    level_ms: float | None
-    """Time until it leaned by less than 2 degrees."""
-    rest_ms: float | None
-    """Time until it was slower than 0.3 m/s, and stayed so."""
     flew_again: bool
     """True if, after it was neutral, it got other commands in the mode of the flight."""
     final_mode: str
-    final_armed: bool
 
 
 class OutputFlight(GuardFlight):
@@ -254,7 +247,6 @@ class OutputFlight(GuardFlight):
     def _sample(self) -> Sample:
         ap = self.vehicle.ap
         body = ap.truth
-        north, east, _ = body.velocity_ned_mps
         return Sample(
             t_s=(ap.now_ns - self._boot_ns) / NS_PER_S,
             mode=ap.mode_name,
@@ -262,7 +254,6 @@ class OutputFlight(GuardFlight):
             failsafe=ap.in_failsafe,
             is_neutral=self._is_neutral(),
             lean_deg=math.degrees(_tilt_rad(body.ned_from_body_wxyz)),
-            speed_mps=math.hypot(north, east),
             position_ned_m=body.position_ned_m,
         )
 
@@ -301,7 +292,6 @@ class OutputFlight(GuardFlight):
             return next(((s.t_s - since_s) * 1e3 for s in after if matches(s)), None)
 
         neutral_ms = first_ms(lambda s: s.is_neutral or s.mode != self.mode or not s.armed)
-        moving = [s.t_s for s in after if s.speed_mps >= 0.3]
         flew_again = neutral_ms is not None and any(
             s.mode == self.mode and s.armed and not s.is_neutral
             for s in after
@@ -309,17 +299,13 @@ class OutputFlight(GuardFlight):
         )
         lean_ms = first_ms(lambda s: s.lean_deg < 0.9 * before.lean_deg)
         other = next((s.mode for s in after if s.mode != self.mode), None)
-        is_at_rest = after[-1].speed_mps < 0.3
         return Aftermath(
             neutral_ms=neutral_ms,
             mode_ms=first_ms(lambda s: s.mode != self.mode),
             mode=other,
             lean_held_ms=(after[-1].t_s - since_s) * 1e3 if lean_ms is None else lean_ms,
-            level_ms=first_ms(lambda s: s.lean_deg < 2.0),
-            rest_ms=((moving[-1] if moving else since_s) - since_s) * 1e3 if is_at_rest else None,
             flew_again=flew_again,
             final_mode=after[-1].mode,
-            final_armed=after[-1].armed,
         )
 
 

@@ -147,15 +147,3 @@ def test_after_an_ending_px4_holds_or_lands(name: str) -> None:
     else:
         is_end = name in ("end", "end, release", "key")
         assert modes == (["AUTO.LAND"] if is_end else ["AUTO.LOITER"])
-
-
-@pytest.mark.parametrize("receiver", [None, IDLE_RECEIVER_US])
-@pytest.mark.parametrize("name", ["death", "end", "cut 1.5 s"])
-def test_after_an_ending_px4_does_so_by_setpoints_too(
-    name: str, receiver: tuple[int, ...] | None
-) -> None:
-    ending = ENDINGS[name]
-    flight = OutputFlight("px4", "velocity", receiver_us=receiver).fly(1.2)
-    modes = judge(flight, ending)
-    assert modes
-    assert modes[-1] in ("AUTO.LOITER", "AUTO.LAND", "AUTO.RTL", "POSCTL")

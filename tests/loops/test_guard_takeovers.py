@@ -1,10 +1,11 @@
-"""The pilot or the autopilot takes the sticks: points 2, 5 and 8 of the guard, on the vehicle."""
+"""The policy gets the sticks, the pilot or the autopilot takes them, on the vehicle."""
 
 from collections.abc import Callable
+from itertools import pairwise
 
 import pytest
 
-from helpers.guard_flights import GuardFlight, hovering, leaning
+from helpers.guard_flights import GuardFlight, climbing_first, hovering, leaning
 from mavbridge.core.clock import NS_PER_MS
 from mavbridge.core.reasons import Code, Reason, because
 from mavbridge.guard.values import Phase
@@ -172,3 +173,66 @@ def test_without_a_receiver_no_takeover_leaves_a_lean_behind(
 def climbing_then_leaning(t_s: float) -> tuple[float, float, float, float]:
     """For a takeoff of five seconds that ends in a lean."""
     return (0.7, 0.0, 0.0, 0.0) if t_s < 3 else (0.2, 0.0, 0.0, 0.5)
+
+
+# --- who gets the sticks, and how
+
+
+def test_arm_idles_the_throttle_until_the_policy_takes_over_from_there() -> None:
+    flight = GuardFlight(climbing_first, receiver_us=None, arm=True).take_off(2.5)
+    sticks = [sticks for _, sticks in flight.sticks_sent()]
+    steps = [b.throttle - a.throttle for a, b in pairwise(sticks)]
+
+    assert sticks[0].throttle == pytest.approx(-1.0, abs=0.05)
+    assert max(steps) < 0.09, "8 /s at 100 Hz, and not a jump from idle to the policy"
+
+
+@pytest.mark.parametrize("gap_s", [0.15, 1.0, 4.0])
+@pytest.mark.parametrize("lost", ["refused", "to the vehicle", "from the vehicle"])
+def test_a_gap_of_the_link_delays_arming_and_never_prevents_it(lost: str, gap_s: float) -> None:
+    """Nothing is sent meanwhile: what the echo shows then must not keep us from trying again."""
+    flight = GuardFlight(climbing_first, receiver_us=None, arm=True, mode="ALT_HOLD")
+    flight.until(lambda: flight.phase is Phase.PREPARING, within_s=12)
+    if lost == "refused":
+        flight.network.send = lambda data, peer=None: False  # type: ignore[method-assign]
+    flight.up.is_silent, flight.down.is_silent = lost == "to the vehicle", lost.startswith("from")
+    flight.run(gap_s)
+    if lost == "refused":
+        del flight.network.send  # type: ignore[attr-defined]
+    flight.up.is_silent = flight.down.is_silent = False
+    flight.until(lambda: flight.phase is Phase.FLYING, within_s=5)
+
+
+def test_from_pilot_to_policy_without_a_jump_and_back_without_a_blend() -> None:
+    flight = GuardFlight(lambda _: (0.0, 0.0, -0.5, -0.5))
+    flight.receiver(ch1=1620, ch2=1450, ch3=1540)
+    flight.launch()
+    flight.act("engage")
+    flight.until(lambda: flight.phase is Phase.FLYING, within_s=0.1)
+    flight.run(1)
+
+    channels = [us for _, us in flight.overrides()]
+    assert channels[0] == pytest.approx((1620, 1450, 1540, 1500), abs=12)
+    jumps_us = [
+        max(abs(a - b) for a, b in zip(one, other, strict=True))
+        for one, other in pairwise(channels)
+    ]
+    assert max(jumps_us) <= 52, "8 /s at 100 Hz are 40 us, and the echo's steps are 4 or 8"
+    assert channels[-1][:2] == pytest.approx((1250, 1750), abs=10)
+
+    flight.ap.set_mode(Mode.LOITER)
+    taken_s = flight.t_s
+    flight.run(0.06)
+    assert flight.record(taken_s)[-1]["us"] == (1620, 1450, 1540, 1500)
+    between = {entry["us"][0] for entry in flight.record(taken_s)}
+    assert between <= {*range(1240, 1260), 1620}, "the sticks were given back in one step"
+
+
+def test_a_policy_takes_over_where_the_pilot_lands_it_on_the_ground() -> None:
+    """Engaged while landed, the policy's first stick follows the idle throttle."""
+    flight = GuardFlight(leaning, arm=True)
+    flight.until(lambda: flight.phase is Phase.FLYING, within_s=12)
+    flight.run(2)
+    assert flight.ap.landed, "neutral throttle is no take-off"
+    assert flight.phase is Phase.FLYING
+    assert flight.clock.now_ns() - flight.overrides()[-1][0] < 20 * MS

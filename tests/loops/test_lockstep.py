@@ -10,20 +10,20 @@ import pytest
 from helpers.fakes import ListSink
 from helpers.pilots import pursuit, single_rate, steady
 from mavbridge.config.policy import PolicyConfig
+from mavbridge.config.rates import Rates
 from mavbridge.core.clock import NS_PER_MS, NS_PER_S
 from mavbridge.core.errors import PeerError, UserError
 from mavbridge.core.records import Tick
-from mavbridge.core.vehicle import ACTION_CLASSES
 from mavbridge.flight.policies import load_configured_policy
 from mavbridge.simulation.delays import Delay, Delays
 from mavbridge.simulation.flight import SimulatedFlight, SimulationSettings
 from mavbridge.simulation.network import MemoryTransport
 from mavbridge.simulation.referee import EpisodeInterruptedError, EpisodeResult
-from mavbridge.simulation.world import Exposure, make_vehicle
+from mavbridge.simulation.world import Exposure
 from policy.contract import FloatArray
 from policy.errors import PolicyError
 from policy.protocol import PolicyRunner
-from sitl.vehicle.config import STEP_NS, AutopilotName, VehicleConfig
+from sitl.vehicle.config import STEP_NS, VehicleConfig
 
 MS = NS_PER_MS
 HOP_NS = MS // 10
@@ -201,6 +201,20 @@ def test_thirty_frames_feed_a_hundred_actions_a_second() -> None:
         assert stamps == sorted(stamps)
 
 
+@pytest.mark.parametrize(("stick_hz", "action_hz"), [(50, 100.0), (100, 5.0), (400, 30.0)])
+def test_the_sticks_keep_their_rate_whatever_the_rate_of_the_policy(
+    stick_hz: float, action_hz: float
+) -> None:
+    rates = Rates(stick_rate=stick_hz, action_rate=action_hz)
+    sink, pilot = ListSink(), steady(lambda: CLIMB)
+    pilot = replace(pilot, contract=replace(pilot.contract, play_s=0.2))
+    flight(replace(BLIND, delays=FIXED, rates=rates)).fly(pilot, max_time_s=1.0, sinks=(sink,))
+    ticks = flown(sink)
+    assert max(b.sent_ns - a.sent_ns for a, b in pairwise(ticks)) <= 1.5 * NS_PER_S / stick_hz
+    assert {tick.missed_slots for tick in ticks} == {0}
+    assert len({tick.chunk_serial for tick in ticks}) == pytest.approx(action_hz, abs=2)
+
+
 def test_a_slow_encoder_takes_the_newest_frame_and_drops_the_rest() -> None:
     vision, action = Delay(p50_ns=80 * MS), Delay(p50_ns=MS)
     delays = Delays(camera=Delay(p50_ns=0), vision=vision, action=action)
@@ -319,35 +333,3 @@ def test_no_result_without_a_whole_flight(
 ) -> None:
     with pytest.raises(error, match=message):
         fly()
-
-
-@pytest.mark.parametrize(
-    ("autopilot", "action"),
-    [
-        ("px4", "attitude"),
-        ("px4", "rates"),
-        ("px4", "velocity"),
-        ("ardupilot", "attitude"),
-        ("ardupilot", "rates"),
-    ],
-)
-def test_a_scripted_square_flies_in_every_setpoint_that_takes_off(
-    autopilot: AutopilotName, action: str
-) -> None:
-    """A velocity does not lift an ArduPilot off: that takes --takeoff."""
-    one = SimulatedFlight(
-        course_seed=3, seed=0, settings=BLIND, vehicle=make_vehicle(autopilot=autopilot)
-    )
-    if autopilot == "ardupilot":
-        one.vehicle.params.set("GUID_OPTIONS", 8)  # thrust, not a climb rate
-    wanted = PolicyConfig(policy=f"scripted:square:{action}", dual_rate=True)
-    runner: PolicyRunner = load_configured_policy(wanted, one.clock).runner
-    sink = ListSink()
-    result = one.fly(runner, max_time_s=15.0, sinks=(sink,))
-    assert result.outcome == "timed out"
-    body = one.vehicle.ap.truth
-    assert -body.position_ned_m[2] == pytest.approx(3.0, abs=0.5)
-    assert result.distance_m > 8.0
-    assert {type(tick.trace.smoothed) for tick in flown(sink) if tick.trace} == {
-        ACTION_CLASSES[runner.contract.action]
-    }

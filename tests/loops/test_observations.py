@@ -8,11 +8,9 @@ import numpy as np
 import pytest
 
 from helpers.fakes import ListSink
-from helpers.guard_facts import figures
 from mavbridge.config.rates import Rates
 from mavbridge.core.clock import NS_PER_MS, NS_PER_S, Clock
 from mavbridge.core.errors import UserError
-from mavbridge.core.reasons import Code
 from mavbridge.simulation.flight import SimulatedFlight, SimulationSettings
 from mavbridge.simulation.world import make_vehicle
 from policy.contract import Contract
@@ -108,26 +106,6 @@ def test_a_past_state_is_the_one_of_that_time(flown: tuple[Watchful, ListSink]) 
         assert 0 < state[0, 0, 13] < 0.08
         checked += 1
     assert checked > 100
-
-
-def test_the_slowest_camera_decides_whether_an_image_is_too_old() -> None:
-    """An image every half second from below, where 0.3 s is the limit; the other is fast."""
-    contract = Contract(
-        arrays="numpy",
-        feature_dim=2,
-        cameras=("front", "down"),
-        camera_rates_hz=(30.0, 2.0),
-        image_height=32,
-        image_width=32,
-    )
-    one, sink = SimulatedFlight(course_seed=3, seed=0), ListSink()
-    runner = make_numpy_runner(Watchful(one.clock, contract), ExecutionSettings(name="w"))
-    one.fly(runner, max_time_s=4.0, sinks=(sink,))
-    reasons = {tick.release_reason for tick in sink.ticks}
-    missing = [figures(reason, Code.OF_CAMERA) for reason in reasons]
-    assert {found["camera"] for found in missing if found} == {"down"}
-    old = [figures(reason, Code.TOO_OLD) for reason in reasons]
-    assert ("image", 300) in [(found["quantity"], found["limit_ms"]) for found in old if found]
 
 
 def test_the_simulator_says_which_cameras_it_has() -> None:

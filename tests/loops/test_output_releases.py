@@ -4,12 +4,13 @@ Limits are those of docs/safety.md; the vehicle leans 15 degrees or flies 2 m/s 
 """
 
 from collections.abc import Callable
-from typing import Any
+from typing import Any, NamedTuple
 
 import pytest
+from pymavlink.dialects.v20 import ardupilotmega as dialect
 
-from helpers import release_paths as paths
-from helpers.output_flights import COMBINATIONS, Aftermath, OutputFlight
+from helpers.output_flights import COMBINATIONS, OutputFlight
+from mavbridge.core.clock import NS_PER_S
 from mavbridge.core.reasons import Code
 from mavbridge.core.vehicle import Action
 from mavbridge.guard.values import Phase
@@ -17,6 +18,8 @@ from mavbridge.mavlink.codec.packets import CommandRefusedError
 from mavbridge.mavlink.session.vehicle import VehicleSession
 from policy.contract import ActionKind
 from policy.motion.controllers import Motion, Program, Push
+from sitl.ardupilot.flight_modes import Mode as ArduMode
+from sitl.px4.modes import Phase as LostPhase
 from sitl.vehicle.config import AutopilotName, Px4Release
 
 FULL_YAW = Program(motion=lambda _: Motion(push=Push("yaw", 1.0)))
@@ -33,19 +36,50 @@ UNLIKE: tuple[tuple[AutopilotName, ActionKind], ...] = (
     ("px4", "sticks"),
     ("px4", "rates"),
 )
-"""Where the guard alone decides, these stand for the others; ArduPilot's sticks have tests of their
-own (``test_guard_faults``)."""
+"""Where the guard alone decides, these stand for the others."""
+FORCE = 21196
+"""Parameter 2 of a disarming that is not refused in flight."""
+RAMP_S = 0.3
+EACH = pytest.mark.parametrize(("autopilot", "kind"), COMBINATIONS)
+SOME = pytest.mark.parametrize(("autopilot", "kind"), UNLIKE)
 
 
-def after(
-    flight: OutputFlight, path: Callable[[OutputFlight], None], seconds: float = 3.0
-) -> Aftermath:
-    """What the vehicle does in the seconds after a fault."""
-    flight.fly(1.2)
-    at_s = flight.t_s
-    path(flight)
-    flight.run(seconds)
-    return flight.aftermath(at_s)
+def later(flight: OutputFlight, seconds: float, act: Callable[[], object]) -> None:
+    """Call ``act`` after this time."""
+    flight.clock.schedule(flight.clock.now_ns() + round(seconds * NS_PER_S), act)
+
+
+def hang(flight: OutputFlight) -> None:
+    """Stop the flight process for a second, and let it continue."""
+    flight.is_flight_process_stopped = True
+    later(flight, 1.0, lambda: setattr(flight, "is_flight_process_stopped", False))
+
+
+def silence(flight: OutputFlight, *, up_s: float = 0.0, down_s: float = 0.0) -> None:
+    """Lose all messages to and from the vehicle for this long."""
+    for direction, seconds in ((flight.up, up_s), (flight.down, down_s)):
+        direction.is_silent = seconds > 0
+        later(flight, seconds, lambda one=direction: setattr(one, "is_silent", False))  # type: ignore[misc]
+
+
+def die_without_position(flight: OutputFlight) -> None:
+    """Kill the flight process while modes that hold a position are refused."""
+    flight.lose_position()
+    later(flight, 0.05, flight.die)
+
+
+def refuse_commands(flight: OutputFlight) -> None:
+    """Let the codec refuse each command, the first neutral one among them."""
+    output = flight.link._sender.output
+    assert output is not None
+    encode = output.encode
+
+    def encode_or_refuse(action: Action, vehicle: VehicleSession, now_ns: int) -> Any:
+        if flight.phase is Phase.FLYING:  # as last told
+            raise CommandRefusedError("1.0000000000000002 is not in [-1, 1]")
+        return encode(action, vehicle, now_ns)
+
+    output.encode = encode_or_refuse  # type: ignore[method-assign]
 
 
 def hold(flight: OutputFlight) -> str:
@@ -55,27 +89,63 @@ def hold(flight: OutputFlight) -> str:
     return "ALT_HOLD" if flight.kind == "sticks" else "BRAKE"
 
 
-def assert_safe(flight: OutputFlight, found: Aftermath, *, mode: str, neutral_ms: float) -> None:
+def land_px4(flight: OutputFlight) -> str:
+    return "AUTO.LAND" if flight.is_px4 else hold(flight)
+
+
+def land(flight: OutputFlight) -> str:
+    return "AUTO.LAND" if flight.is_px4 else "LAND"
+
+
+class Way(NamedTuple):
+    """A way in which a flight ends by our doing."""
+
+    act: Callable[[OutputFlight], object]
+    neutral_ms: float
+    on: tuple[tuple[AutopilotName, ActionKind], ...] = COMBINATIONS
+    mode: Callable[[OutputFlight], str] = hold
+    code: Code | None = None
+
+
+WAYS = {
+    "death": Way(OutputFlight.die, DEATH_MS),
+    # OFFBOARD, too, is over for good: PX4 would go back to it if the stream came again.
+    "hang": Way(hang, STALL_MS, UNLIKE),
+    "NaN": Way(OutputFlight.return_nan, GRACE_MS, UNLIKE, code=Code.UNUSABLE_CHUNKS),
+    "refused": Way(refuse_commands, DEATH_MS, UNLIKE, code=Code.COMMAND_FAILED),
+    "not heard": Way(lambda flight: silence(flight, down_s=2.0), GRACE_MS),
+    "end": Way(OutputFlight.stop, DEATH_MS, mode=land_px4),
+    "no position": Way(die_without_position, 50 + DEATH_MS + 100, UNLIKE, mode=land),
+    "guard killed": Way(OutputFlight.kill_guard, 20),
+}
+
+
+@pytest.mark.parametrize(
+    ("name", "autopilot", "kind"), [(name, *each) for name, way in WAYS.items() for each in way.on]
+)
+def test_neutral_in_time_then_a_safe_mode_and_never_back(
+    name: str, autopilot: AutopilotName, kind: ActionKind
+) -> None:
+    way, flight = WAYS[name], OutputFlight(autopilot, kind).fly(1.2)
+    at_s = flight.t_s
+    way.act(flight)
+    flight.run(3.0)
+    found = flight.aftermath(at_s)
     assert found.neutral_ms is not None, found
-    assert found.neutral_ms <= neutral_ms, found
+    assert found.neutral_ms <= way.neutral_ms, found
     assert not found.flew_again, found
-    assert found.final_mode == mode, (found, flight.describe())
-    assert flight.phase is not Phase.FLYING
-    assert found.lean_held_ms <= neutral_ms + 250, found
-
-
-@pytest.mark.parametrize(("autopilot", "kind"), COMBINATIONS)
-def test_death_of_the_flight_process(autopilot: AutopilotName, kind: ActionKind) -> None:
-    flight = OutputFlight(autopilot, kind)
-    found = after(flight, paths.death)
-    assert_safe(flight, found, mode=hold(flight), neutral_ms=DEATH_MS)
-    # PX4 would take the end of its only sticks for a failsafe.
-    is_held = flight.is_px4 and kind == "sticks"
-    assert flight.phase is (Phase.HOLDING if is_held else Phase.ENDED)
+    assert found.final_mode == way.mode(flight), (found, flight.describe())
+    assert found.lean_held_ms <= way.neutral_ms + 250, found
+    assert way.code is None or way.code in flight.codes
+    if name != "guard killed":
+        assert flight.phase is not Phase.FLYING
+    if name == "death":  # PX4 would take the end of its only sticks for a failsafe
+        is_held = flight.is_px4 and kind == "sticks"
+        assert flight.phase is (Phase.HOLDING if is_held else Phase.ENDED)
 
 
 @pytest.mark.parametrize("release", ["1.14", "1.17", "1.18"])
-@pytest.mark.parametrize("end", [paths.death, paths.end])
+@pytest.mark.parametrize("end", [OutputFlight.die, OutputFlight.stop])
 def test_no_px4_takes_our_jump_to_neutral_for_a_hand(
     release: Px4Release, end: Callable[[OutputFlight], None]
 ) -> None:
@@ -86,9 +156,10 @@ def test_no_px4_takes_our_jump_to_neutral_for_a_hand(
     at_s = flight.t_s
     end(flight)
     flight.run(2.0)
-    later = {sample.mode for sample in flight.samples if sample.t_s > at_s}
-    assert "POSCTL" not in later, flight.describe()
-    assert flight.px4.mode_name == ("AUTO.LOITER" if end is paths.death else "AUTO.LAND")
+    after = {sample.mode for sample in flight.samples if sample.t_s > at_s}
+    assert "POSCTL" not in after, flight.describe()
+    is_dead = end is OutputFlight.die
+    assert flight.px4.mode_name == ("AUTO.LOITER" if is_dead else "AUTO.LAND")
 
 
 def test_a_px4_without_sticks_is_lent_neutral_ones_for_a_mode_that_needs_some() -> None:
@@ -101,47 +172,7 @@ def test_a_px4_without_sticks_is_lent_neutral_ones_for_a_mode_that_needs_some() 
     assert flight.px4.mode_name == "ALTCTL"
 
 
-@pytest.mark.parametrize(("autopilot", "kind"), UNLIKE)
-def test_a_hang_whose_chunks_come_again_is_over_for_good(
-    autopilot: AutopilotName, kind: ActionKind
-) -> None:
-    """So is OFFBOARD: PX4 would go back to it by itself if the stream came again."""
-    flight = OutputFlight(autopilot, kind)
-    found = after(flight, paths.hang)
-    assert_safe(flight, found, mode=hold(flight), neutral_ms=STALL_MS)
-
-
-@pytest.mark.parametrize(("autopilot", "kind"), UNLIKE)
-def test_chunks_that_are_not_numbers(autopilot: AutopilotName, kind: ActionKind) -> None:
-    flight = OutputFlight(autopilot, kind)
-    found = after(flight, paths.not_a_number)
-    assert_safe(flight, found, mode=hold(flight), neutral_ms=GRACE_MS)
-    assert Code.UNUSABLE_CHUNKS in flight.codes
-
-
-@pytest.mark.parametrize(("autopilot", "kind"), UNLIKE)
-def test_a_command_that_the_codec_refuses(autopilot: AutopilotName, kind: ActionKind) -> None:
-    flight = OutputFlight(autopilot, kind)
-
-    def refuse(flight: OutputFlight) -> None:
-        output = flight.link._sender.output
-        assert output is not None
-        encode = output.encode
-
-        def encode_or_refuse(action: Action, vehicle: VehicleSession, now_ns: int) -> Any:
-            if flight.phase is Phase.FLYING:  # as last told: the first neutral one is refused too
-                raise CommandRefusedError("1.0000000000000002 is not in [-1, 1]")
-            return encode(action, vehicle, now_ns)
-
-        output.encode = encode_or_refuse  # type: ignore[method-assign]
-
-    found = after(flight, refuse)
-    assert Code.COMMAND_FAILED in flight.codes
-    assert_safe(flight, found, mode=hold(flight), neutral_ms=DEATH_MS)
-    assert not flight.guard.is_done
-
-
-@pytest.mark.parametrize(("autopilot", "kind"), COMBINATIONS)
+@EACH
 def test_the_pilots_mode_by_a_ground_station(autopilot: AutopilotName, kind: ActionKind) -> None:
     flight = OutputFlight(autopilot, kind).fly(1.2)
     at_s, at_ns = flight.t_s, flight.clock.now_ns()
@@ -163,8 +194,14 @@ def test_the_pilots_mode_by_a_ground_station(autopilot: AutopilotName, kind: Act
 
 @pytest.mark.parametrize("kind", ["attitude", "rates", "velocity"])
 def test_a_pilots_stick_ramp_takes_px4_out_of_offboard(kind: ActionKind) -> None:
-    flight = OutputFlight("px4", kind)
-    found = after(flight, paths.stick_ramp, 2.0)
+    """Another station's joystick is centred for half a second, then moves fast."""
+    flight = OutputFlight("px4", kind).fly(1.2)
+    at_s = flight.t_s
+    for step in range(100):
+        x = round(800 * min(max(0.02 * step - 0.5, 0.0) / RAMP_S, 1.0))
+        flight.station(lambda mav, x=x: mav.manual_control_encode(1, x, 0, 500, 0, 0), system=42)  # type: ignore[misc]
+        flight.run(0.02)
+    found = flight.aftermath(at_s)
     assert found.mode == found.final_mode == "POSCTL"
     assert not found.flew_again
     assert flight.codes == (Code.MODE_CHANGED,)
@@ -172,35 +209,27 @@ def test_a_pilots_stick_ramp_takes_px4_out_of_offboard(kind: ActionKind) -> None
     assert not flight.modes_asked()[1:], "only OFFBOARD itself was asked for"
 
 
-@pytest.mark.parametrize(("autopilot", "kind"), UNLIKE)
+@SOME
 def test_a_disarming_in_flight(autopilot: AutopilotName, kind: ActionKind) -> None:
-    flight = OutputFlight(autopilot, kind)
-    found = after(flight, paths.disarming, 1.0)
-    assert not found.final_armed
+    flight = OutputFlight(autopilot, kind).fly(1.2)
+    flight.command(dialect.MAV_CMD_COMPONENT_ARM_DISARM, 0, FORCE)
+    flight.run(1.0)
+    assert not flight.samples[-1].armed
     assert flight.codes == (Code.DISARMED,)
     assert flight.phase in (Phase.RELEASING, Phase.RELEASED)
 
 
-@pytest.mark.parametrize(("autopilot", "kind"), COMBINATIONS)
-def test_a_vehicle_that_is_not_heard_gets_neutral_and_a_mode_all_the_same(
-    autopilot: AutopilotName, kind: ActionKind
-) -> None:
-    flight = OutputFlight(autopilot, kind)
-    found = after(flight, paths.deaf_guard)
-    assert_safe(flight, found, mode=hold(flight), neutral_ms=GRACE_MS)
-
-
-@pytest.mark.parametrize(("autopilot", "kind"), COMBINATIONS)
+@EACH
 def test_a_vehicle_that_does_not_hear_us_for_a_moment_flies_on_and_for_longer_never_again(
     autopilot: AutopilotName, kind: ActionKind
 ) -> None:
     flight = OutputFlight(autopilot, kind).fly(1.2)
-    paths.deaf_vehicle_short(flight)
+    silence(flight, up_s=0.3)
     flight.run(1.0)
     assert flight.phase is Phase.FLYING, flight.describe()
     assert not any(s.failsafe for s in flight.samples)
     at_s = flight.t_s
-    paths.deaf_vehicle(flight)
+    silence(flight, up_s=1.5)
     flight.run(4)
 
     found = flight.aftermath(at_s)
@@ -216,13 +245,16 @@ def test_a_vehicle_that_does_not_hear_us_for_a_moment_flies_on_and_for_longer_ne
         assert found.final_mode == hold(flight)
 
 
-@pytest.mark.parametrize(("autopilot", "kind"), UNLIKE)
+@SOME
 def test_a_link_that_is_cut_both_ways_is_no_way_back(
     autopilot: AutopilotName, kind: ActionKind
 ) -> None:
     """Setpoints of ours after it would bring PX4 back into OFFBOARD: there are none."""
-    flight = OutputFlight(autopilot, kind)
-    found = after(flight, paths.cut_link, 4.0)
+    flight = OutputFlight(autopilot, kind).fly(1.2)
+    at_s = flight.t_s
+    silence(flight, up_s=1.5, down_s=1.5)
+    flight.run(4.0)
+    found = flight.aftermath(at_s)
     assert not found.flew_again, found
     # A failsafe of PX4 that has acted meanwhile is left alone.
     is_returning = flight.is_px4 and kind != "sticks"
@@ -230,41 +262,22 @@ def test_a_link_that_is_cut_both_ways_is_no_way_back(
     assert flight.phase is not Phase.FLYING
 
 
-@pytest.mark.parametrize(("autopilot", "kind"), COMBINATIONS)
-def test_an_end(autopilot: AutopilotName, kind: ActionKind) -> None:
-    flight = OutputFlight(autopilot, kind)
-    found = after(flight, paths.end, 2.0)
-    mode = "AUTO.LAND" if flight.is_px4 else hold(flight)
-    assert_safe(flight, found, mode=mode, neutral_ms=DEATH_MS)
-
-
-@pytest.mark.parametrize(("autopilot", "kind"), COMBINATIONS)
+@EACH
 def test_a_failsafe_of_the_vehicle_is_left_alone(
     autopilot: AutopilotName, kind: ActionKind
 ) -> None:
     flight = OutputFlight(autopilot, kind).fly(1.2)
-    at_s, at_ns = flight.t_s, flight.clock.now_ns()
-    paths.failsafe(flight)
+    at_ns = flight.clock.now_ns()
+    if flight.is_px4:
+        flight.px4.commander.lost_sticks.phase = LostPhase.ACTING
+    else:
+        flight.ardupilot.gcs_failsafe.active = True
+        flight.ardupilot.set_mode(ArduMode.RTL)
     flight.run(2)
-    found = flight.aftermath(at_s)
-    assert found.final_mode == ("AUTO.RTL" if flight.is_px4 else "RTL")
+    assert flight.samples[-1].mode == ("AUTO.RTL" if flight.is_px4 else "RTL")
     assert Code.FAILSAFE in flight.codes
     assert not flight.modes_asked(at_ns)
     assert flight.phase is Phase.RELEASED
-
-
-@pytest.mark.parametrize(("autopilot", "kind"), UNLIKE)
-def test_where_the_mode_that_holds_is_refused_it_lands(
-    autopilot: AutopilotName, kind: ActionKind
-) -> None:
-    flight = OutputFlight(autopilot, kind)
-    found = after(flight, paths.death_without_position)
-    assert_safe(
-        flight,
-        found,
-        mode="AUTO.LAND" if flight.is_px4 else "LAND",
-        neutral_ms=50 + DEATH_MS + 100,
-    )
 
 
 @pytest.mark.parametrize("gap_s", [0.3, 0.6, 0.9, 1.5])
@@ -282,17 +295,6 @@ def test_px4s_sticks_shown_again_after_a_gap_are_no_takeover(gap_s: float, is_he
     assert flight.phase is Phase.HOLDING, flight.describe()
     assert flight.samples[-1].mode == "AUTO.LOITER"
     assert not any(s.failsafe for s in flight.samples)
-
-
-@pytest.mark.parametrize(("autopilot", "kind"), COMBINATIONS)
-def test_death_of_the_guard(autopilot: AutopilotName, kind: ActionKind) -> None:
-    flight = OutputFlight(autopilot, kind)
-    found = after(flight, OutputFlight.kill_guard)
-    assert found.neutral_ms is not None, found
-    assert found.neutral_ms <= 20, found
-    assert not found.flew_again, found
-    assert found.final_mode == hold(flight), (found, flight.describe())
-    assert found.lean_held_ms <= 20 + 250, found
 
 
 @pytest.mark.parametrize("phase_ms", [0, 150, 430, 810])

@@ -3,7 +3,6 @@
 import pytest
 from pymavlink.dialects.v20 import ardupilotmega as dialect
 
-from helpers import release_paths as paths
 from helpers.output_flights import HOVERING, OutputFlight
 from mavbridge.core.reasons import Code
 from mavbridge.guard.values import Phase
@@ -69,7 +68,7 @@ def test_a_takeoff_is_ended_by_the_death_of_the_flight_process(
     autopilot: AutopilotName, kind: ActionKind
 ) -> None:
     flight = taking_off(autopilot, kind)
-    paths.death(flight)
+    flight.die()
     flight.run(4)
     hold = "AUTO.LOITER" if flight.is_px4 else "BRAKE"
     assert flight.samples[-1].mode == hold, flight.describe()

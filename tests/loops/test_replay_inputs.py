@@ -30,12 +30,9 @@ from mavbridge.simulation.world import make_vehicle
 from policy.contract import Contract
 from policy.engines.runner import ExecutionSettings, make_numpy_runner
 from policy.errors import NoChunkError
-from policy.loading.load import load_policy
-from policy.loading.request import PolicyRequest
 from policy.protocol import PolicyRunner
 from sitl.vehicle.config import AutopilotName
 
-EXAMPLES = Path(__file__).parents[2] / "examples"
 FLIGHT_S = 1.5
 BASE = Contract(arrays="numpy", feature_dim=3, image_height=32, image_width=32, horizon=16)
 
@@ -213,16 +210,6 @@ def test_every_kind_of_action_is_repeated_bit_for_bit(
 ) -> None:
     compared = flown_and_repeated(monkeypatch, attentive(**changes), autopilot=autopilot)
     assert_equal(compared)
-
-
-@pytest.mark.parametrize("name", ["numpy_policy.py:ClimbAndTurn", "torch_policy.py:TowardsLight"])
-def test_the_examples_are_repeated_bit_for_bit(monkeypatch: pytest.MonkeyPatch, name: str) -> None:
-    request = PolicyRequest(spec=f"{EXAMPLES}/{name}", dual_rate=True)
-
-    def load() -> PolicyRunner:
-        return load_policy(request, now_s=lambda: 0.0).runner
-
-    assert_equal(flown_and_repeated(monkeypatch, load))
 
 
 def test_what_reaches_the_policy_in_one_batch_does_not_change_past_states() -> None:
