@@ -1,13 +1,10 @@
 """The death of the guard, seen by the flight process, which then sends the last words."""
 
 import os
-import pty
 import socket
 import subprocess
 import threading
-import tty
 from collections.abc import Callable, Iterator
-from contextlib import suppress
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -140,22 +137,7 @@ def tcp() -> Link:
     return Link(ours.detach(), None, lambda: [vehicle.recv(100)], vehicle.close)
 
 
-def serial() -> Link:
-    vehicle, ours = pty.openpty()
-    tty.setraw(ours)
-    os.set_blocking(vehicle, False)
-
-    def heard() -> list[bytes]:
-        received = []
-        with suppress(BlockingIOError):
-            while True:
-                received.append(os.read(vehicle, 100))
-        return received
-
-    return Link(ours, None, heard, lambda: os.close(vehicle))
-
-
-@pytest.fixture(params=[udp, pytest.param(udp_over_ipv6, marks=needs_ipv6), tcp, serial])
+@pytest.fixture(params=[udp, pytest.param(udp_over_ipv6, marks=needs_ipv6), tcp])
 def link(request: pytest.FixtureRequest) -> Iterator[Link]:
     made: Link = request.param()
     yield made

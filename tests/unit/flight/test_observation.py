@@ -126,10 +126,11 @@ def test_each_past_state_is_told_of_its_own_image() -> None:
 
 
 def test_one_observation_of_one_camera_passes_through_untouched() -> None:
-    cache = FeatureCache()
+    cache, state = FeatureCache(), felt(0)
+    looks = source(Contract(feature_dim=1), cache)
+    assert looks.observe(state, NOW_NS) == because(Code.NO_IMAGE)
     cache.publish(feature := seen(20))
-    state = felt(0)
-    found = observed(source(Contract(feature_dim=1), cache).observe(state, NOW_NS))
+    found = observed(looks.observe(state, NOW_NS))
     assert found.encoded is feature.value
     np.testing.assert_array_equal(found.states, state.values[None])
 

