@@ -1,4 +1,4 @@
-"""The shipped policies fly loops; the one by sticks stops after the last gate, and stays there."""
+"""The shipped policies fly races and loops; the one by sticks stops at the end, and stays there."""
 
 from dataclasses import replace
 
@@ -12,7 +12,7 @@ from mavbridge.simulation.flight import SimulatedFlight
 from mavbridge.simulation.world import NOMINAL, make_vehicle
 from sitl.course import LOOP_SEEDS
 
-EASY = 1_000_007
+RACE, EASY = 1_001_000_007, 1_000_007
 WIND = replace(NOMINAL, wind_ned_mps=(1.0, -1.0, 0.0), gust_rms_mps=0.5)
 
 
@@ -33,3 +33,22 @@ def test_it_flies_two_laps_of_a_loop(policy: str) -> None:
     with load_configured_policy(PolicyConfig(policy=policy), MonotonicClock()) as loaded:
         result = flight.fly(loaded.runner)
     assert (result.outcome, result.gates_passed) == ("finished", 16)
+
+
+@pytest.mark.parametrize(
+    ("policy", "autopilot", "course", "gates"),
+    [
+        (PolicyConfig(policy="toge-rates"), "ardupilot", RACE, 3),
+        (PolicyConfig(policy="toge-rates"), "px4", RACE, 2),
+        (PolicyConfig(by_rates=True), "ardupilot", EASY, 2),
+    ],
+    ids=["race", "race on px4", "sticks by rates"],
+)
+def test_gates_are_passed_by_body_rates(
+    policy: PolicyConfig, autopilot: AutopilotKind, course: int, gates: int
+) -> None:
+    flight = SimulatedFlight(course_seed=course, seed=0, vehicle=make_vehicle(autopilot=autopilot))
+    with load_configured_policy(policy, MonotonicClock()) as loaded:
+        assert loaded.runner.contract.action == "rates"
+        result = flight.fly(loaded.runner, max_time_s=15.0)
+    assert result.gates_passed >= gates, result
