@@ -9,7 +9,6 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 from numpy.typing import NDArray
 
-from mavbridge.core.errors import MavbridgeError
 from policy.data.flight_data import DatasetError
 from policy.data.tables import read_rows
 from policy.files import library_name
@@ -21,10 +20,6 @@ FLUSH_NS = 500_000_000
 READ_ERRORS = (pa.ArrowException, OSError)
 _GROUP_ROWS = 2_048
 """Rows per Parquet row group: twenty seconds of ticks. Encoding 16,384 rows at once took 27 MB."""
-
-
-class TableError(MavbridgeError):
-    """A table cannot be read."""
 
 
 class TableWriter:
@@ -101,7 +96,7 @@ def read_table(stem: Path, schema: pa.Schema, *, damage: list[str] | None = None
     A sentence about any loss is appended to ``damage``.
 
     Raises:
-        TableError: the table is missing or damaged, or lacks a column of ``schema``.
+        DatasetError: the table is missing or damaged, or lacks a column of ``schema``.
     """
     return read_numbered(stem, schema, damage=damage)[0]
 
@@ -115,18 +110,7 @@ def read_numbered(
     stem: Path, schema: pa.Schema, *, damage: list[str] | None = None
 ) -> tuple[pa.Table, NDArray[np.int64]]:
     """Read the table as ``read_table`` does, with the row numbers from before any loss."""
-    parquet, stream = stem.with_suffix(".parquet"), stem.with_suffix(".arrows")
-    path = parquet if parquet.exists() else stream
-    try:
-        table, numbers = read_rows(stem, [] if damage is None else damage)
-    except DatasetError as error:
-        raise TableError(str(error)) from error
-    except FileNotFoundError as error:
-        raise TableError(
-            f"{stem.parent} has neither {parquet.name} nor {stream.name}: it is no whole flight"
-        ) from error
-    except READ_ERRORS as error:
-        raise TableError(f"{path} is damaged: {error}") from error
+    table, numbers = read_rows(stem, [] if damage is None else damage)
     if not table.column_names:
         table = schema.empty_table()
     missing = [
@@ -135,8 +119,8 @@ def read_numbered(
         if field.name not in table.column_names or table.schema.field(field.name).type != field.type
     ]
     if missing:
-        raise TableError(
-            f"{path} lacks the column{'s' * (len(missing) > 1)} {', '.join(missing)} "
+        raise DatasetError(
+            f"the table {stem} lacks the column{'s' * (len(missing) > 1)} {', '.join(missing)} "
             "of docs/formats.md: another program or version wrote it"
         )
     return table, numbers

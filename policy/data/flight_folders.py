@@ -278,14 +278,7 @@ def _terms(name: str, contract: Mapping[str, Any]) -> ActionTerms:
 def _read_table(
     folder: Path, stem: str, columns: tuple[str, ...], damage: list[str]
 ) -> tuple[pa.Table, NDArray[np.int64]]:
-    try:
-        table, numbers = read_rows(folder / stem, damage)
-    except FileNotFoundError as error:
-        raise DatasetError(
-            f"{folder}: neither {stem}.parquet nor {stem}.arrows is there"
-        ) from error
-    except (pa.ArrowException, OSError) as error:
-        raise DatasetError(f"{folder}: {stem} cannot be read: {error}") from error
+    table, numbers = read_rows(folder / stem, damage)
     if missing := [name for name in columns if name not in table.column_names]:
         raise DatasetError(f"{folder}: {stem} lacks {missing}; it has {table.column_names}")
     if table.num_rows == 0 and stem == "ticks":

@@ -68,30 +68,38 @@ def read_rows(stem: Path, damage: list[str]) -> tuple[pa.Table, NDArray[np.int64
         The readable rows and their indices; for an empty file, no columns.
 
     Raises:
-        DatasetError: it has more rows than a flight can have.
-        OSError, pa.ArrowException: the table does not exist, or none of it can be read.
+        DatasetError: there is no such table, none of it can be read, or it has more rows than a
+            flight can have.
     """
-    parquet = stem.with_suffix(".parquet")
-    if parquet.exists():
-        return _read_groups(parquet, damage)
-    stream = stem.with_suffix(".arrows")
-    batches, rows, end, size = [], 0, 0, stream.stat().st_size
+    parquet, stream = stem.with_suffix(".parquet"), stem.with_suffix(".arrows")
+    path, read = (parquet, _read_groups) if parquet.exists() else (stream, _read_batches)
+    try:
+        return read(path, damage)
+    except FileNotFoundError as error:
+        raise DatasetError(
+            f"{stem.parent} has neither {parquet.name} nor {stream.name}: it is no whole flight"
+        ) from error
+    except (pa.ArrowException, OSError) as error:
+        raise DatasetError(f"{path} is damaged: {error}") from error
+
+
+def _read_batches(path: Path, damage: list[str]) -> tuple[pa.Table, NDArray[np.int64]]:
+    """Read the complete batches of a stream that still grew, or was cut off."""
+    batches, rows, end, size = [], 0, 0, path.stat().st_size
     if size == 0:  # killed before the first batch
         return pa.table({}), np.zeros(0, np.int64)
-    with stream.open("rb") as file, pa.ipc.open_stream(file) as reader:
+    with path.open("rb") as file, pa.ipc.open_stream(file) as reader:
         try:
             while True:
                 end = file.tell()
                 batches.append(reader.read_next_batch())
                 rows += batches[-1].num_rows
                 if rows > MAX_ROWS:
-                    raise DatasetError(f"{stream} has {rows} rows, more rows than a flight has")
+                    raise DatasetError(f"{path} has {rows} rows, more rows than a flight has")
         except StopIteration:
             end = size
         except (pa.ArrowException, OSError):
-            damage.append(
-                f"{stream} is damaged or cut off: its last {size - end} bytes were skipped"
-            )
+            damage.append(f"{path} is damaged or cut off: its last {size - end} bytes were skipped")
         table = pa.Table.from_batches(batches, schema=reader.schema)
     return table, np.arange(table.num_rows)
 

@@ -12,7 +12,8 @@ from hypothesis import strategies as st
 
 from helpers.recordings import make_row
 from mavbridge.recording.rows import FRAMES, TICKS, frame_columns
-from mavbridge.recording.tables import TableError, TableWriter, read_table
+from mavbridge.recording.tables import TableWriter, read_table
+from policy.data.flight_data import DatasetError
 
 SCHEMA_BYTES = FRAMES.serialize().size
 
@@ -86,5 +87,5 @@ def test_no_room_for_parquet_leaves_the_stream(tmp_path: Path) -> None:
 
 def test_another_programs_table_is_refused(tmp_path: Path) -> None:
     pq.write_table(pa.table({"index": [1.5]}), tmp_path / "ticks.parquet")
-    with pytest.raises(TableError, match="lacks the columns index, due_ns"):
+    with pytest.raises(DatasetError, match="lacks the columns index, due_ns"):
         read_table(tmp_path / "ticks", TICKS)
