@@ -162,16 +162,6 @@ def test_the_egocentric_state_does_not_depend_on_the_heading(q, velocity, turn):
     np.testing.assert_allclose(egocentric(there, contract), egocentric(here, contract), atol=2e-5)
 
 
-@given(attitudes, st.tuples(number, number, number))
-def test_velocity_and_vertical_are_those_of_the_body(q, velocity):
-    seen = egocentric(state(q, velocity), Contract())[0]
-    back = rotation.conjugate(q[None])
-    expected = rotation.rotate(back, np.array([velocity]))[0] / 5
-    np.testing.assert_allclose(seen[:3], expected, atol=1e-5)
-    down = rotation.rotate(back, np.array([[0.0, 0.0, 1.0]]))[0]
-    np.testing.assert_allclose(seen[3:6], down, atol=1e-6)
-
-
 @pytest.mark.parametrize("since_exposure", [False, True])
 def test_numpy_and_torch_agree(since_exposure: bool) -> None:
     contract = Contract(since_exposure=since_exposure)

@@ -1,125 +1,65 @@
 """Scripted programs in every kind of action, flown in closed loop against a small vehicle."""
 
+import copy
 import math
 from collections import deque
-from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field
 
 import numpy as np
 import pytest
 
-from policy.contract import ActionKind
-from policy.motion.controllers import doublet_length_s, doublet_steps
+from policy.contract import ActionKind, Contract
+from policy.motion.controllers import Measured, doublet_length_s, doublet_steps, measure
+from policy.motion.forward_motion import ForwardMotion, VehicleMotion
 from policy.motion.scripted import ScriptedPolicy
-from sitl.vehicle.rotation import from_euler
+from policy.motion.stick_loop import GRAVITY_MPS2
 
 STEP_S = 0.01
 DELAY_STEPS = 4
 """From a state to the action that was computed from it."""
-GRAVITY_MPS2 = 9.81
 FEATURE, HISTORY = np.zeros((1, 8), np.float32), np.zeros((1, 4, 4), np.float32)
 KINDS: tuple[ActionKind, ...] = ("sticks", "rates", "attitude", "velocity")
-
-
-def beyond(stick: float, dead_zone: float) -> float:
-    return math.copysign(max(0.0, abs(stick) - dead_zone) / (1 - dead_zone), stick)
+AT_REST = VehicleMotion((1.0, 0.0, 0.0, 0.0), (0.0,) * 3, (0.0,) * 3, (0.0, 0.0, -GRAVITY_MPS2))
 
 
 @dataclass
 class Vehicle:
-    """Lags of first order from an action to body rate, lean, climb and velocity; may stand."""
+    """Follows each action as ``ForwardMotion`` predicts it; may stand on the ground at first."""
 
     action: ActionKind
-    hover_thrust: float = 0.39
+    terms: dict[str, float] = field(default_factory=dict)
+    """Of its contract, where they differ from the policy's."""
     leaves_ground_at_s: float = 0.0
-    throttle_dead_zone: float = 0.2
     sinks_faster: float = 1.0
+    motion: VehicleMotion = AT_REST
     now_s: float = 0.0
-    north_mps: float = 0.0
-    east_mps: float = 0.0
-    climb_mps: float = 0.0
     up_m: float = 0.0
-    roll_rad: float = 0.0
-    pitch_rad: float = 0.0
-    yaw_rad: float = 0.0
-    roll_rate: float = 0.0
-    pitch_rate: float = 0.0
-    yaw_rate: float = 0.0
-    thrust: float = 0.0
+
+    def __post_init__(self) -> None:
+        contract = Contract(action=self.action, velocity_frame="heading", **self.terms)  # type: ignore[arg-type]
+        self.model = ForwardMotion(contract)
 
     def state(self) -> np.ndarray:
-        quaternion = from_euler(self.roll_rad, self.pitch_rad, self.yaw_rad)
-        velocity = (self.north_mps, self.east_mps, -self.climb_mps)
-        rates = (self.roll_rate, self.pitch_rate, self.yaw_rate)
-        return np.array([[*velocity, *quaternion, *rates, 0.0, 0.0, -9.81]], np.float32)
+        attitude, rate, velocity, force = self.motion
+        return np.array([[*velocity, *attitude, *rate, *force]], np.float32)
 
     def step(self, action: np.ndarray) -> None:
-        four = [float(number) for number in action]
         self.now_s += STEP_S
         if self.now_s < self.leaves_ground_at_s:
             return
-        if self.action == "sticks":
-            self._follow_sticks(*four)
-        elif self.action == "velocity":
-            self._follow_velocity(*four)
-        else:
-            self._follow_thrust(*four)
-        self.yaw_rad += self.yaw_rate * STEP_S
-        self.up_m += self.climb_mps * STEP_S
-        if self.up_m <= 0.0 and self.climb_mps < 0.0:
-            self.up_m = self.climb_mps = 0.0
-
-    def _lag(self, wanted: float, lag_s: float, name: str) -> None:
-        now: float = getattr(self, name)
-        setattr(self, name, now + (wanted - now) * STEP_S / lag_s)
-
-    def _follow_sticks(self, throttle: float, yaw: float, pitch: float, roll: float) -> None:
-        full = math.radians(30.0)
-        self._lag(2.5 * beyond(throttle, self.throttle_dead_zone), 0.4, "climb_mps")
-        self._lag(math.radians(202.5) * beyond(yaw, 0.04), 0.1, "yaw_rate")
-        self._lag(full * beyond(roll, 0.04), 0.15, "roll_rad")
-        self._lag(-full * beyond(pitch, 0.04), 0.15, "pitch_rad")
-        self._push(GRAVITY_MPS2, math.tan)
-
-    def _follow_velocity(self, forward: float, right: float, down: float, yaw: float) -> None:
-        cos, sin = math.cos(self.yaw_rad), math.sin(self.yaw_rad)
-        self._lag(cos * forward - sin * right, 0.4, "north_mps")
-        self._lag(sin * forward + cos * right, 0.4, "east_mps")
-        self._lag(-down * (self.sinks_faster if down > 0 else 1.0), 0.4, "climb_mps")
-        self._lag(yaw, 0.2, "yaw_rate")
-
-    def _follow_thrust(self, thrust: float, roll: float, pitch: float, yaw: float) -> None:
-        if self.action == "attitude":
-            roll, pitch = 6.0 * (roll - self.roll_rad), 6.0 * (pitch - self.pitch_rad)
-        self._lag(roll, 0.06, "roll_rate")
-        self._lag(pitch, 0.06, "pitch_rate")
-        self._lag(yaw, 0.2, "yaw_rate")
-        self.roll_rad += self.roll_rate * STEP_S
-        self.pitch_rad += self.pitch_rate * STEP_S
-        self._lag(thrust, 0.05, "thrust")
-        accel = GRAVITY_MPS2 * self.thrust / self.hover_thrust
-        up = accel * math.cos(self.roll_rad) * math.cos(self.pitch_rad)
-        self._push(accel, math.sin)
-        if self.up_m > 0.0 or up > GRAVITY_MPS2:
-            self.climb_mps += (up - GRAVITY_MPS2 - 0.2 * self.climb_mps) * STEP_S
-
-    def _push(self, accel: float, share: Callable[[float], float]) -> None:
-        cos, sin = math.cos(self.yaw_rad), math.sin(self.yaw_rad)
-        forward, right = -accel * share(self.pitch_rad), accel * share(self.roll_rad)
-        self.north_mps += (cos * forward - sin * right - 0.2 * self.north_mps) * STEP_S
-        self.east_mps += (sin * forward + cos * right - 0.2 * self.east_mps) * STEP_S
+        first, second, third, fourth = action.tolist()
+        if self.action == "velocity" and third > 0:
+            third *= self.sinks_faster
+        self.motion = self.model.after(self.motion, [(first, second, third, fourth)], STEP_S)
+        self.up_m -= self.motion.velocity_ned_mps[2] * STEP_S
 
     @property
-    def forward_mps(self) -> float:
-        return math.cos(self.yaw_rad) * self.north_mps + math.sin(self.yaw_rad) * self.east_mps
-
-    @property
-    def right_mps(self) -> float:
-        return math.cos(self.yaw_rad) * self.east_mps - math.sin(self.yaw_rad) * self.north_mps
+    def measured(self) -> Measured:
+        return measure(self.state()[0])
 
     @property
     def speed_mps(self) -> float:
-        return math.hypot(self.north_mps, self.east_mps)
+        return math.hypot(*self.motion.velocity_ned_mps[:2])
 
 
 def fly(
@@ -138,19 +78,19 @@ def fly_on(policy: ScriptedPolicy, duration_s: float, vehicle: Vehicle) -> list[
     for _ in range(round(duration_s / STEP_S)):
         on_the_way.append(policy.predict_fast(FEATURE, vehicle.state(), HISTORY, 10)[0, 0])
         vehicle.step(on_the_way[0])
-        flown.append(replace(vehicle))
+        flown.append(copy.copy(vehicle))
     return flown
 
 
-def at(flown: list[Vehicle], time_s: float) -> Vehicle:
-    return flown[round(time_s / STEP_S)]
+def drifting(north_mps: float, east_mps: float, climb_mps: float = 0.0) -> VehicleMotion:
+    return AT_REST._replace(velocity_ned_mps=(north_mps, east_mps, -climb_mps))
 
 
 @pytest.mark.parametrize(
     "vehicle",
     [
-        Vehicle("sticks", throttle_dead_zone=0.0),
-        *(Vehicle(kind, thrust) for kind in KINDS[1:3] for thrust in (0.33, 0.5)),
+        Vehicle("sticks", {"throttle_dead_zone": 0.0}),
+        *(Vehicle(kind, {"hover_thrust": at}) for kind in KINDS[1:3] for at in (0.33, 0.5)),
         Vehicle("velocity"),
         Vehicle("sticks", leaves_ground_at_s=3.0),
     ],
@@ -164,8 +104,8 @@ def test_takes_off_to_three_metres_and_stays(vehicle: Vehicle) -> None:
 
 @pytest.mark.parametrize("kind", KINDS)
 def test_begun_in_the_air_it_stops_a_drift_and_keeps_its_altitude(kind: ActionKind) -> None:
-    drifting = Vehicle(kind, up_m=9.0, north_mps=3.0, east_mps=-2.0, thrust=0.39)
-    policy, flown = fly("hover", 10.0, drifting, starts_in_air=True)
+    vehicle = Vehicle(kind, up_m=9.0, motion=drifting(3.0, -2.0))
+    policy, flown = fly("hover", 10.0, vehicle, starts_in_air=True)
     assert policy.program_start_s == pytest.approx(2.0, abs=0.02)
     assert flown[-1].speed_mps < 0.25
     assert all(8.0 < v.up_m < 10.0 for v in flown)
@@ -188,16 +128,16 @@ def test_the_doublet_pushes_every_axis_to_both_sides_and_comes_back(kind: Action
     assert start_s is not None
     for step in doublet_steps(kind):
         middle_s = step.begin_s + step.half_s
-        one, other = (at(flown, start_s + s - 0.02) for s in (middle_s, step.end_s))
+        ends_s = (middle_s, step.end_s, step.end_s + step.settle_s)
+        one, other, settled = (flown[round((start_s + s - 0.02) / STEP_S)] for s in ends_s)
         moved = {
-            "yaw": lambda v: v.yaw_rate,
-            "climb": lambda v: v.climb_mps,
-            "roll": lambda v: v.right_mps if kind == "velocity" else v.roll_rad,
-            "pitch": lambda v: v.forward_mps if kind == "velocity" else -v.pitch_rad,
+            "yaw": lambda m: m.yaw_rate_radps,
+            "climb": lambda m: m.climb_mps,
+            "roll": lambda m: m.right_mps if kind == "velocity" else m.roll_rad,
+            "pitch": lambda m: m.forward_mps if kind == "velocity" else -m.pitch_rad,
         }[step.axis]
-        assert moved(one) > 0.15 * step.share, step
-        assert moved(other) < -0.15 * step.share, step
-        settled = at(flown, start_s + step.end_s + step.settle_s - 0.02)
+        assert moved(one.measured) > 0.15 * step.share, step
+        assert moved(other.measured) < -0.15 * step.share, step
         assert settled.speed_mps < 0.6, step
     assert all(v.up_m > 4.0 for v in flown[round(start_s / STEP_S) :])
 
@@ -221,7 +161,7 @@ def test_chunk_is_the_plan_of_the_next_seconds() -> None:
 
 
 def test_a_pause_of_the_loop_is_not_integrated_as_climb() -> None:
-    vehicle = Vehicle("sticks", climb_mps=1.0)
+    vehicle = Vehicle("sticks", motion=drifting(0.0, 0.0, climb_mps=1.0))
     policy = ScriptedPolicy("hover", lambda: vehicle.now_s)
     policy.predict_fast(FEATURE, vehicle.state(), HISTORY, 1)
     vehicle.now_s += 60.0

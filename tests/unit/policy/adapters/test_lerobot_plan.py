@@ -191,9 +191,3 @@ def test_processors_that_are_not_supported_are_refused(folder):
     edit(folder / "policy_preprocessor.json", lambda data: data["steps"].append(step))
     with pytest.raises(CheckpointError, match="relative_actions_processor"):
         read_plan(folder, None)
-
-
-def test_weights_are_named_by_the_folder_alone(folder):
-    request = PolicyRequest(spec=f"lerobot:{folder}", checkpoint=folder / "model.safetensors")
-    with pytest.raises(PolicyError, match="leave out --checkpoint"):
-        check_request(request)

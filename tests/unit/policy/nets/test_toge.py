@@ -86,15 +86,6 @@ def test_a_contract_of_another_network_is_refused(config, changes, message):
         build_policy(config(contract=Contract(**changes)))
 
 
-@pytest.mark.parametrize(
-    ("changes", "message"),
-    [({"size": "huge"}, "small"), ({"backbone": "vgg16"}, "efficientnet_b3")],
-)
-def test_an_unknown_size_or_backbone_is_refused(changes: dict[str, str], message: str) -> None:
-    with pytest.raises(PolicyError, match=message):
-        TogeConfig(**changes)  # type: ignore[arg-type]
-
-
 @torch.inference_mode()
 def test_refuses_wrong_shapes_and_names_them(small_toge: Toge) -> None:
     image, state, history = sample()
