@@ -47,15 +47,8 @@ class Wanted:
 class RoleGraph:
     """Compiled graph with its hidden state, zeros at first; for one thread."""
 
-    def __init__(
-        self, graph: Graph, roles: list[str], output_shape: Shape, hidden: Mapping[str, Shape]
-    ) -> None:
-        self._graph = graph
-        self.roles = roles
-        """Role of each input, in the graph's order; the role of a hidden input is its name."""
-        self.output_shape = output_shape
-        self._hidden_shapes = hidden
-        self._hidden: dict[str, FloatArray] = {}
+    def __init__(self, graph: Graph, roles: list[str], hidden: Mapping[str, Shape]) -> None:
+        self._graph, self._roles, self._hidden_shapes = graph, roles, hidden
         self.reset()
 
     def reset(self) -> None:
@@ -66,7 +59,7 @@ class RoleGraph:
     def __call__(self, **arrays: FloatArray) -> FloatArray:
         """Run the graph on float32 arrays by role; arrays that it does not take are ignored."""
         given = arrays | self._hidden if self._hidden else arrays
-        result = self._graph(*[given[role] for role in self.roles])
+        result = self._graph(*[given[role] for role in self._roles])
         if self._hidden:
             self._hidden = dict(zip(self._hidden, self._graph.rest(), strict=True))
         return result
@@ -100,6 +93,7 @@ class GraphFile:
         if len(set(roles)) < len(roles):
             raise CheckpointError(f"{path}: two inputs have one role: {roles}")
         self.roles = roles
+        """Role of each input, in the graph's order; the role of a hidden input is its name."""
         self.takes_bytes = self._require_types(model, roles, pairs)
         """True if the image is uint8, 0 to 255."""
         self.hidden = {
@@ -125,7 +119,7 @@ class GraphFile:
         shapes = [list(port.shape) for port in self._model.inputs]
         compiler = GraphCompiler(f"{_digest(self._path, self._model)} {shapes}")
         graph = compiler.compile("onnx", precision, lambda: self._model)
-        return RoleGraph(graph, self.roles, self.output_shape, self.hidden)
+        return RoleGraph(graph, self.roles, self.hidden)
 
     def _hidden_pairs(self, model: "ov.Model", given: Mapping[str, str]) -> dict[str, str]:
         """Return the output that feeds each hidden input at the next call, by name."""

@@ -140,18 +140,25 @@ def make_numpy_runner(policy: SingleRatePolicy, settings: ExecutionSettings) -> 
 
 
 def run_in_numpy(name: str) -> Compile:
-    """ "Compile" a function of numpy arrays: check its result, and keep its arrays apart."""
+    """ "Compile" a function of numpy arrays."""
+    return run_as(name, np.copy, np.ndarray, "numpy arrays")
+
+
+def run_as(name: str, convert: Callable[[FloatArray], Any], kind: type, said: str) -> Compile:
+    """ "Compile" a function of arrays of one library: check its result, and keep its arrays apart.
+
+    Copies in and out: published arrays are read-only, and a returned array may be a buffer that the
+    policy overwrites. ``convert`` makes a copy of that library.
+    """
 
     def compile_(method: Callable[..., Any], _shapes: Sequence[Shape]) -> ArrayFunction:
         def run(*arrays: FloatArray) -> FloatArray:
-            # Copies in and out: published arrays are read-only, and a returned array may be a
-            # buffer that the policy overwrites.
-            result = method(*(array.copy() for array in arrays))
-            if not isinstance(result, np.ndarray):
+            result = method(*map(convert, arrays))
+            if not isinstance(result, kind):
                 raise PolicyError(
-                    f"{name} returned {type(result).__name__}; its contract says numpy arrays"
+                    f"{name} returned {type(result).__name__}; its contract says {said}"
                 )
-            return np.array(result, np.float32)
+            return to_numpy(result)
 
         return run
 

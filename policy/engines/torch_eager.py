@@ -4,16 +4,13 @@ And what a user's policy holds: its modules, and the attributes that change from
 """
 
 import copy
-from collections.abc import Callable, Collection, Sequence
-from typing import Any
+from collections.abc import Collection
+from functools import partial
 
-import numpy as np
 import torch
 from torch import Tensor, nn
 
-from policy.contract import FloatArray
-from policy.engines.runner import ArrayFunction, Compile, ExecutionSettings, Shape, make_runner
-from policy.errors import PolicyError
+from policy.engines.runner import Compile, ExecutionSettings, make_runner, run_as
 from policy.protocol import PolicyRunner, SingleRatePolicy
 
 NAME = "torch"
@@ -44,22 +41,9 @@ def make_torch_runner(policy: SingleRatePolicy, settings: ExecutionSettings) -> 
 
 def run_eagerly(name: str, device: str) -> Compile:
     """ "Compile" a function for torch on a device: convert arrays to tensors and back."""
-
-    def compile_(method: Callable[..., Any], _shapes: Sequence[Shape]) -> ArrayFunction:
-        def run(*arrays: FloatArray) -> FloatArray:
-            with torch.inference_mode():
-                # torch.tensor copies: published arrays are read-only, which torch cannot express.
-                result = method(*[torch.tensor(array, device=device) for array in arrays])
-                if not isinstance(result, Tensor):
-                    raise PolicyError(
-                        f"{name} returned {type(result).__name__}; its contract says torch tensors"
-                    )
-                # Copy the output: a policy may return a buffer that it overwrites.
-                return np.array(result.cpu().numpy(), np.float32)
-
-        return run
-
-    return compile_
+    # torch.tensor copies: published arrays are read-only, which torch cannot express.
+    run = run_as(name, partial(torch.tensor, device=device), Tensor, "torch tensors")
+    return lambda method, shapes: torch.inference_mode()(run(method, shapes))
 
 
 def modules_of(policy: object) -> list[nn.Module]:

@@ -12,6 +12,7 @@ from typing import Literal, NamedTuple, TypeAlias
 
 from policy.contract import QUATERNION, RATE, VELOCITY, ActionKind, FloatArray
 from policy.errors import PolicyError
+from policy.motion.stick_loop import GRAVITY_MPS2
 
 TAKEOFF_ALTITUDE_M, DOUBLET_ALTITUDE_M = 3.0, 8.0
 LEG_S, LEG_MPS = 4.0, 1.5
@@ -152,7 +153,6 @@ def make_program(name: str, action: ActionKind) -> Program:
 
 Four: TypeAlias = tuple[float, float, float, float]
 
-GRAVITY_MPS2 = 9.80665
 # ArduCopter at full stick, default parameters; and the dead zone of its throttle.
 FULL_CLIMB_MPS = 2.5
 FULL_LEAN_RAD = math.radians(30.0)

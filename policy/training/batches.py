@@ -11,7 +11,7 @@ from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from functools import lru_cache
 from pathlib import Path
-from typing import Self, TypeAlias, TypeVar
+from typing import Any, Self, TypeAlias, TypeVar
 
 import cv2
 import numpy as np
@@ -262,19 +262,21 @@ class Batches:
         count, grain = len(samples.state), None
         if look is not None and images is not None:
             grain = random.standard_normal((3, *images.shape[1:3]), dtype=np.float32)
-        return Batch(
-            images=None if images is None else torch.from_numpy(images),
-            look=torch.zeros(frames, 5) if look is None else torch.from_numpy(look),
-            grain=None if grain is None else torch.from_numpy(grain),
-            features=None if features is None else torch.from_numpy(features),
-            state=torch.from_numpy(samples.state),
-            history=torch.from_numpy(samples.history),
-            chunk=torch.from_numpy(samples.chunk),
-            known=torch.from_numpy(samples.known),
-            gate=torch.from_numpy(samples.gate[:: count // frames].copy()),
-            noise=torch.from_numpy(random.standard_normal(samples.chunk.shape, dtype=np.float32)),
-            timestep=torch.from_numpy(random.integers(0, self._timesteps, count)),
-        )
+        arrays = {
+            **vars(samples),
+            "images": images,
+            "look": np.zeros((frames, 5), np.float32) if look is None else look,
+            "grain": grain,
+            "features": features,
+            "gate": samples.gate[:: count // frames].copy(),
+            "noise": random.standard_normal(samples.chunk.shape, dtype=np.float32),
+            "timestep": random.integers(0, self._timesteps, count),
+        }
+        tensors: dict[str, Any] = {
+            name: None if array is None else torch.from_numpy(array)
+            for name, array in arrays.items()
+        }
+        return Batch(**tensors)
 
 
 def ahead(make: Callable[[int], T], first: int) -> Generator[T]:

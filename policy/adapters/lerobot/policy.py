@@ -7,7 +7,7 @@ from torch import Tensor, nn
 
 from policy.adapters.lerobot.act import Act
 from policy.adapters.lerobot.config import ActConfig, DiffusionConfig
-from policy.adapters.lerobot.diffusion import DdimSchedule, Diffusion
+from policy.adapters.lerobot.diffusion import Diffusion
 from policy.adapters.lerobot.plan import WEIGHTS_FILE, Affine, Plan
 from policy.checkpoints.tensors import read_tensors, require_finite, require_fit
 from policy.contract import EXTRA_NAMES, Contract
@@ -53,8 +53,9 @@ class LeRobotPolicy(nn.Module):
 
     net: Act | Diffusion
 
-    def __init__(self, plan: Plan) -> None:
+    def __init__(self, plan: Plan, net: Act | Diffusion) -> None:
         super().__init__()
+        self.net = net
         self.contract: Contract = plan.interface.contract
         normalisation = plan.normalisation
         self._interface, self._policy_cameras = plan.interface, plan.policy_cameras
@@ -93,22 +94,14 @@ class LeRobotPolicy(nn.Module):
         return self._interface.to_actions(self._action.back(actions))
 
 
-class LeRobotAct(LeRobotPolicy):
-    """ACT behind the policy protocol."""
-
-    def __init__(self, plan: Plan, config: ActConfig) -> None:
-        super().__init__(plan)
-        self.net = Act(config)
-
-
 class LeRobotDiffusion(LeRobotPolicy):
     """DiffusionPolicy behind ``policy.protocol.StepwisePolicy``."""
 
     net: Diffusion
 
     def __init__(self, plan: Plan, config: DiffusionConfig) -> None:
-        super().__init__(plan)
-        self.net = Diffusion(config)
+        super().__init__(plan, Diffusion(config))
+        self.schedule = self.net.schedule
         goal = EXTRA_NAMES["goal"] if config.features.takes_goal else ()
         self._goal_columns = [self.contract.state_names.index(name) for name in goal]
         self._goal = Normaliser(plan.normalisation.goal)
@@ -127,11 +120,6 @@ class LeRobotDiffusion(LeRobotPolicy):
             by_camera, own = super()._network_inputs(feature, state)
             parts.insert(0, by_camera.flatten(2))
         return torch.cat(parts, dim=-1).unsqueeze(2), own
-
-    @property
-    def schedule(self) -> DdimSchedule:
-        """Schedule whose steps make up a solve."""
-        return self.net.schedule
 
     @property
     def initial_noise(self) -> Tensor:
@@ -158,7 +146,7 @@ class LeRobotDiffusion(LeRobotPolicy):
 def build_policy_of(plan: Plan) -> LeRobotPolicy:
     """Return a policy with random weights."""
     if isinstance(plan.config, ActConfig):
-        return LeRobotAct(plan, plan.config)
+        return LeRobotPolicy(plan, Act(plan.config))
     return LeRobotDiffusion(plan, plan.config)
 
 
