@@ -172,8 +172,6 @@ def test_a_frozen_encoder_stays_and_the_head_learns(flights, tmp_path, whole):
     trained = load_checkpoint(result.checkpoint, fallback=NETWORK).contract
     assert terms == {name: getattr(trained, name) for name in terms}
     assert not any(stage.startswith("encoder") for stage in stages)
-    with pytest.raises(PolicyError, match="--start-from"):
-        replace(made, start_from=None)
 
 
 def test_images_are_disturbed_in_training_and_never_in_validation(flights, tmp_path, monkeypatch):
@@ -215,10 +213,6 @@ def test_flights_that_do_not_fit_are_refused(flights: list[FlightData], tmp_path
         run([flights[0], enu], settings(tmp_path))
     with pytest.raises(DatasetError, match="enu_flu states"):
         run([enu], settings(tmp_path))
-    with pytest.raises(TrainingError, match="no folder"):
-        run(flights, settings(tmp_path / "missing"))
-    with pytest.raises(TrainingError, match="no run to resume"):
-        run(flights[:2], settings(tmp_path, resume=True))
 
 
 @pytest.mark.parametrize(
@@ -226,7 +220,6 @@ def test_flights_that_do_not_fit_are_refused(flights: list[FlightData], tmp_path
     [
         ({"batch_size": 1}, "--batch-size must be between 2 and"),
         ({"start_from": Path(), "backbone_weights": Path()}, "leave out --backbone-weights"),
-        ({"steps": 0}, "--steps"),
         ({"steps": None, "minutes": float("nan")}, "--minutes"),
         ({"ages": "few:many"}, "LOW:HIGH"),
     ],
@@ -234,8 +227,6 @@ def test_flights_that_do_not_fit_are_refused(flights: list[FlightData], tmp_path
 def test_settings_that_no_run_could_use_are_refused(tmp_path, changes, says):
     with pytest.raises(PolicyError, match=says):
         settings(tmp_path, **changes)
-    with pytest.raises(PolicyError, match="safetensors"):
-        replace(settings(tmp_path), out=tmp_path / "a.pt")
 
 
 def test_stages_grow_and_fill_the_budget(tmp_path: Path) -> None:
