@@ -28,13 +28,15 @@ from policy.training.parallel import TensorBatch, row_parts
 from policy.training.settings import TrainSettings
 
 SHARE = 0.25
-"""Share of the images that each of the three disturbances applies to, independently."""
+"""Share of the images that each of the four disturbances applies to, independently."""
 FIELD_CELLS = 4
 """Most cells of a field along a side; a field of one cell is uniform."""
 LIGHT = (0.12, 1.3)
 """Range of the factor on the brightness."""
 MOST_VEIL = 0.9
 """Largest amount of white light that a veil adds."""
+MOST_COLOUR = 1.5
+"""Largest factor on the distance of colours from grey."""
 MOST_COVERS = 3
 COVER_SIDE = (0.08, 0.4)
 """Range of a cover's side, as a share of the image's."""
@@ -57,9 +59,12 @@ Job: TypeAlias = tuple[tuple[Indices, bool], ...]
 
 def disturb(images: ImageArray, random: np.random.Generator) -> None:
     """Disturb some of the images [B, height, width, 3] uint8 in place, each at random."""
-    chances = random.random((len(images), 3)) < SHARE
-    for image, (is_lit, is_veiled, is_covered) in zip(images, chances, strict=True):
+    chances = random.random((len(images), 4)) < SHARE
+    for image, (is_recoloured, is_lit, is_veiled, is_covered) in zip(images, chances, strict=True):
         height, width, _ = image.shape
+        if is_recoloured:
+            turn_rad, factor = random.uniform(0.0, math.tau), random.uniform(0.0, MOST_COLOUR)
+            cv2.transform(image, colour_matrix(turn_rad, factor), dst=image)
         if is_lit:
             low, high = map(math.log, LIGHT)
             light = np.exp(_field(random, (height, width), low, high))
@@ -71,6 +76,13 @@ def disturb(images: ImageArray, random: np.random.Generator) -> None:
         if is_covered:
             for _ in range(random.integers(1, MOST_COVERS + 1)):
                 _cover(image, random)
+
+
+def colour_matrix(turn_rad: float, factor: float) -> NDArray[np.float64]:
+    """Return the matrix [3, 3] that turns colours about grey and scales their distance from it."""
+    turn = np.array([[0.0, -1.0, 1.0], [1.0, 0.0, -1.0], [-1.0, 1.0, 0.0]]) / math.sqrt(3)
+    grey: NDArray[np.float64] = np.full((3, 3), 1 / 3)
+    return grey + factor * (math.cos(turn_rad) * (np.eye(3) - grey) + math.sin(turn_rad) * turn)
 
 
 def _field(
