@@ -17,13 +17,13 @@ from mavbridge.flight.state import Freshness
 from mavbridge.flight.telemetry_cache import TelemetryCache
 from mavbridge.guard.channel import SocketPort
 from mavbridge.mavlink.codec.frames import split_frames
-from mavbridge.mavlink.session.streams import message_id
+from mavbridge.mavlink.codec.readers import IDS
 from mavbridge.mavlink.transport.packet_pipe import PacketPipe
 from mavbridge.observe.report_table import rate_style, shown_rate
 from mavbridge.observe.terminal import FlightScreen, RateMeter
 from policy.contract import Contract
 
-STICK_IDS = {"ardupilot": message_id("RC_CHANNELS"), "px4": message_id("MANUAL_CONTROL")}
+STICK_IDS = {"ardupilot": IDS["RC_CHANNELS"], "px4": IDS["MANUAL_CONTROL"]}
 """Message with the pilot's sticks, by the first word of the autopilot's name."""
 STICKS_FRESH_NS = 500 * NS_PER_MS
 """Older sticks do not count as the pilot's: PX4 goes silent when its receiver does."""

@@ -1,13 +1,30 @@
-"""Splitting of datagrams into MAVLink packets, without decoding."""
+"""MAVLink packets in bytes: where they begin and end, their checksums, not their values."""
 
+import struct
+from binascii import crc_hqx
 from mmap import mmap
 from typing import NamedTuple
 
-from mavbridge.mavlink.codec.messages import Endpoint
-from mavbridge.mavlink.codec.signing import SIGNATURE_BYTES, SIGNED
+from pymavlink.dialects.v20 import ardupilotmega as dialect
 
-_V1, _V2 = 0xFE, 0xFD
-_V1_HEADER, _V2_HEADER, _CHECKSUM = 6, 10, 2
+from mavbridge.mavlink.codec.messages import Endpoint
+
+MARKER_V1, MARKER_V2 = 0xFE, 0xFD
+SIGNED = 0x01
+"""Incompatibility flag of a signed packet."""
+SIGNATURE_BYTES = 13
+"""Link id, timestamp (6 bytes) and the first 6 bytes of the hash."""
+_HEADER_V1 = struct.Struct("<BBBBBB")
+"""Marker, payload length, sequence, system, component, message id."""
+HEADER = struct.Struct("<BBBBBBBHB")
+"""Marker, payload length, incompatible and compatible flags, sequence, system, component, id."""
+CHECKSUM_BYTES = 2
+_MIRRORED = bytes(int(f"{byte:08b}"[::-1], 2) for byte in range(256))
+CURRENT_MODE, EVENT = 436, 410
+"""Messages of MAVLink's common dialect that pymavlink's ardupilotmega lacks."""
+_SEEDS = {number: bytes((message.crc_extra,)) for number, message in dialect.mavlink_map.items()}
+_SEEDS |= {CURRENT_MODE: b"\xc1", EVENT: b"\xa0"}
+"""Last byte under the checksum (crc_extra) by message id."""
 
 
 class RawPacket(NamedTuple):
@@ -18,17 +35,30 @@ class RawPacket(NamedTuple):
     message_id: int
     payload: bytes
     """Payload without the trailing zeros that MAVLink 2 truncates."""
+    flags: int
+    """Incompatibility flags; none in MAVLink 1."""
 
     @property
     def sequence(self) -> int:
         """Sender's sequence number, 0 to 255."""
-        return self.data[2 if self.data[0] == _V1 else 4]
+        return self.data[2 if self.data[0] == MARKER_V1 else 4]
 
     @property
-    def sealed(self) -> tuple[bytes, bytes]:
-        """Bytes covered by the checksum, and the received checksum."""
-        end = (_V1_HEADER if self.data[0] == _V1 else _V2_HEADER) + len(self.payload)
-        return self.data[1:end], self.data[end : end + _CHECKSUM]
+    def is_sound(self) -> bool | None:
+        """True if the checksum is valid; None if the message is unknown."""
+        if (seed := _SEEDS.get(self.message_id)) is None:
+            return None
+        data, header = self.data, _HEADER_V1 if self.data[0] == MARKER_V1 else HEADER
+        end = header.size + len(self.payload)
+        # The CRC of data and their checksum is 0.
+        sealed = data[1:end] + seed + data[end : end + CHECKSUM_BYTES]
+        return crc_hqx(sealed.translate(_MIRRORED), 0xFFFF) == 0
+
+
+def checksum(data: bytes, crc_extra: int) -> bytes:
+    """Return the CRC-16/MCRF4XX of a packet without its marker, followed by crc_extra."""
+    crc = crc_hqx((data + bytes((crc_extra,))).translate(_MIRRORED), 0xFFFF)
+    return crc.to_bytes(CHECKSUM_BYTES, "big").translate(_MIRRORED)
 
 
 def split_frames(data: bytes) -> tuple[list[RawPacket], bool]:
@@ -46,21 +76,18 @@ def split_frames(data: bytes) -> tuple[list[RawPacket], bool]:
 
 def frame_at(data: bytes | mmap, at: int) -> RawPacket | None:
     """Return the packet that begins at ``at``; None if there is no complete one."""
-    if at >= len(data):
-        return None
-    marker = data[at]
-    header = _V1_HEADER if marker == _V1 else _V2_HEADER
-    if marker not in (_V1, _V2) or len(data) - at < header:
-        return None
-    length = data[at + 1]
-    end = at + header + length + _CHECKSUM
-    if marker == _V1:
-        system, component, message_id = data[at + 3 : at + 6]
+    room = len(data) - at
+    marker = data[at] if room > 0 else None
+    if marker == MARKER_V2 and room >= HEADER.size:
+        _, length, flags, _, _, system, component, low, high = HEADER.unpack_from(data, at)
+        start, number = at + HEADER.size, low | high << 16
+    elif marker == MARKER_V1 and room >= _HEADER_V1.size:
+        _, length, _, system, component, number = _HEADER_V1.unpack_from(data, at)
+        start, flags = at + _HEADER_V1.size, 0
     else:
-        system, component = data[at + 5 : at + 7]
-        message_id = int.from_bytes(data[at + 7 : at + 10], "little")
-        end += SIGNATURE_BYTES if data[at + 2] & SIGNED else 0
+        return None
+    end = start + length + CHECKSUM_BYTES + (SIGNATURE_BYTES if flags & SIGNED else 0)
     if end > len(data):
         return None
-    payload = data[at + header : at + header + length]
-    return RawPacket(data[at:end], Endpoint(system, component), message_id, payload)
+    source, payload = Endpoint(system, component), data[start : start + length]
+    return RawPacket(data[at:end], source, number, payload, flags)

@@ -1,6 +1,7 @@
 """Encoding and decoding of MAVLink packets, with range checks; no socket, no clock."""
 
 import math
+import re
 import struct
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
@@ -11,6 +12,7 @@ from mavbridge.core.clock import NS_PER_MS
 from mavbridge.core.rotation import Quaternion, tilt_rad
 from mavbridge.core.vehicle import Sticks, Velocity
 from mavbridge.mavlink.codec.calibration import PWM_LIMITS_US, Pwm, RcCalibration
+from mavbridge.mavlink.codec.frames import HEADER, MARKER_V2, SIGNED, RawPacket, checksum, frame_at
 from mavbridge.mavlink.codec.messages import (
     STICK_END,
     CommandRequest,
@@ -22,17 +24,8 @@ from mavbridge.mavlink.codec.messages import (
     Request,
     StreamRequest,
 )
-from mavbridge.mavlink.codec.readers import (
-    HEADER,
-    MAVLINK_2,
-    READERS,
-    UnusableError,
-    checksum,
-    decode_packet,
-    packet_end,
-    unread,
-)
-from mavbridge.mavlink.codec.signing import LAST_WORDS_LINK_ID, LINK_ID, Signing, is_signed
+from mavbridge.mavlink.codec.readers import LAYOUTS, NAMES, UnusableError
+from mavbridge.mavlink.codec.signing import LAST_WORDS_LINK_ID, LINK_ID, Signing
 
 RELEASE_US = 0
 """RC_CHANNELS_OVERRIDE, channels 1-8: release the channel to the receiver."""
@@ -44,13 +37,14 @@ _TEXT_BYTES = 50
 _TEXT_CHUNKS = 4
 
 MOST_DATAGRAM_BYTES = 4096
-"""Bytes that are decoded of one datagram: more than any autopilot or router sends in one. The worst
-case for the parser takes 2 ms; the largest UDP datagram would take 35 ms."""
+"""Bytes that are decoded of one datagram: more than any autopilot or router sends in one. The
+largest UDP datagram would take several milliseconds."""
 _OVERRIDE = dialect.MAVLink_rc_channels_override_message
 _OVERRIDE_PAYLOAD = struct.Struct("<8H2B")
 """Channels 1 to 8, target system and component. Channels 9 to 18 are zeros, which are truncated."""
 _PACKET_STARTS = (b"\xfd", b"\xfe")
 """Start bytes of MAVLink 2 and 1."""
+_MARKER = re.compile(rb"[\xfd\xfe]")
 
 
 GESTURE_Z, MOST_LOW_R = 150, 800
@@ -78,14 +72,15 @@ class CommandRefusedError(Exception):
 
 
 class Codec:
-    """One MAVLink 2 endpoint without I/O; owns the parser state and the sending sequence."""
+    """One MAVLink 2 endpoint without I/O; owns the unfinished packet and the sending sequence."""
 
     def __init__(
         self, *, source_system: int, source_component: int, signing: Signing | None = None
     ) -> None:
         self.source = Endpoint(source_system, source_component)
         self._mav = dialect.MAVLink(None, srcSystem=source_system, srcComponent=source_component)
-        self._mav.robust_parsing = True
+        self._partial = b""
+        """Beginning of a packet whose end has not arrived."""
         self.bad_data_count = 0
         self.signing = signing
         """Signs sent packets and checks received ones; None: neither."""
@@ -111,13 +106,12 @@ class Codec:
 
     def forget_partial(self) -> None:
         """Drop an unfinished packet, which the next bytes do not continue."""
-        self._mav.buf = bytearray()
-        self._mav.buf_index = 0
+        self._partial = b""
 
     def decode_datagram(self, data: bytes) -> Iterator[ReceivedMessage]:
         """Yield the messages of one datagram, which usually holds one or several whole packets.
 
-        A whole packet at its start means that an unfinished earlier one was cut off and is dropped.
+        A marker at its start means that an unfinished earlier packet was cut off and is dropped.
         A datagram that starts otherwise may continue a forwarded serial stream. Bytes beyond
         ``MOST_DATAGRAM_BYTES`` are ignored.
         """
@@ -126,66 +120,49 @@ class Codec:
             self.bad_data_count += 1
         if data[:1] in _PACKET_STARTS:
             self.forget_partial()
-            at = 0
-            while (end := packet_end(data, at)) is not None:
-                packet = data[at:end]
-                if (whole := decode_packet(packet)) is None:
-                    break
-                at = end
-                if self._is_admitted(packet):
-                    yield whole
-            if rest := data[at:]:
-                yield from self._decode_unusual(rest)
-        elif self._mav.buf_len():
-            yield from self.decode(data)
-        else:
+        elif not self._partial:
             self.bad_data_count += 1
-
-    def _decode_unusual(self, data: bytes) -> Iterator[ReceivedMessage]:
-        try:
-            message = self._mav.decode(bytearray(data))  # twice as fast as the parser
-        except dialect.MAVError:
-            yield from self.decode(data)
-        else:
-            yield from self._read(message)
+            return
+        yield from self.decode(data)
 
     def decode(self, data: bytes) -> Iterator[ReceivedMessage]:
         """Yield the messages completed by these bytes; count corrupt bytes and unusable values."""
-        for message in self._mav.parse_buffer(data) or ():
-            if message.get_type() == "BAD_DATA":
-                self.bad_data_count += 1
+        data, at = self._partial + data, 0
+        self._partial = b""
+        while at < len(data):
+            if (frame := frame_at(data, at)) is not None:
+                at += len(frame.data)
+                if (message := self._decoded(frame)) is not None:
+                    yield message
+            elif data[at : at + 1] in _PACKET_STARTS:
+                self._partial = data[at:]
+                return
             else:
-                yield from self._read(message)
+                self.bad_data_count += 1
+                start = _MARKER.search(data, at)
+                at = len(data) if start is None else start.start()
 
     @property
     def refused_signatures(self) -> int:
         """Number of packets rejected by the signature check."""
         return sum(self.signing.refused.values()) if self.signing is not None else 0
 
-    def _is_admitted(self, packet: bytes) -> bool:
-        if self.signing is not None:
-            return self.signing.accepts(packet)
-        self.hears_signed = self.hears_signed or is_signed(packet)
-        return True
-
-    def _read(self, message: dialect.MAVLink_message) -> Iterator[ReceivedMessage]:
-        """Yield the message if its signature is accepted."""
-        packet = bytes(message.get_msgbuf())
-        if self._is_admitted(packet):
-            yield self._decoded(message, packet)
-
-    def _decoded(self, message: dialect.MAVLink_message, packet: bytes) -> ReceivedMessage:
-        name = message.get_type()
-        if isinstance(message, dialect.MAVLink_unknown):
-            return decode_packet(packet) or unread(name, packet)
-        reader = READERS.get(name)
+    def _decoded(self, frame: RawPacket) -> ReceivedMessage | None:
+        """Return the message of a packet; None if it is damaged, or its signature refused."""
+        if frame.flags & ~SIGNED or frame.is_sound is False:
+            self.bad_data_count += 1
+            return None
+        if self.signing is None:
+            self.hears_signed = self.hears_signed or frame.flags == SIGNED
+        elif not self.signing.accepts(frame):
+            return None
+        body, layout = None, LAYOUTS.get(frame.message_id)
         try:
-            body = None if reader is None else reader(message)
+            body = None if layout is None else layout.read(frame.payload)
         except UnusableError:
             self.bad_data_count += 1
-            body = None
-        source = Endpoint(message.get_srcSystem(), message.get_srcComponent())
-        return ReceivedMessage(source, message.get_seq(), name, body, packet)
+        name = NAMES.get(frame.message_id) or f"UNKNOWN_{frame.message_id}"
+        return ReceivedMessage(frame.source, frame.sequence, name, body, frame.data)
 
     def _pack(self, message: dialect.MAVLink_message) -> bytes:
         data: bytes = message.pack(self._mav)
@@ -382,7 +359,7 @@ def pack_override(
 ) -> bytes:
     """Encode RC_CHANNELS_OVERRIDE of channels 1 to 8, without trailing zeros (MAVLink 2)."""
     payload = _OVERRIDE_PAYLOAD.pack(*channels_us, *target).rstrip(b"\0") or b"\0"
-    header = HEADER.pack(MAVLINK_2, len(payload), 0, 0, sequence, *source, _OVERRIDE.id, 0)
+    header = HEADER.pack(MARKER_V2, len(payload), 0, 0, sequence, *source, _OVERRIDE.id, 0)
     packet = header + payload
     return packet + checksum(packet[1:], _OVERRIDE.crc_extra)
 

@@ -1,21 +1,20 @@
-"""Decoder of whole MAVLink 2 packets, and readers: checked records in SI units.
+"""Readers of payloads: checked records in SI units.
 
-The decoder gives what pymavlink's general parser gives, in less than half the time. It leaves
-unusual input to that parser: MAVLink 1, streams, messages with arrays. Only it decodes messages
-that pymavlink's dialect lacks.
+pymavlink's own parser takes twice as long, and lacks two messages.
 """
 
 import math
 import struct
 from collections import namedtuple
-from collections.abc import Callable
-from operator import attrgetter
+from collections.abc import Callable, Sequence
+from operator import attrgetter, itemgetter
 from typing import Any, NamedTuple
 
 from pymavlink.dialects.v20 import ardupilotmega as dialect
 
 from mavbridge.core.rotation import quaternion_from_euler
 from mavbridge.core.switch import RADIO_US
+from mavbridge.mavlink.codec.frames import CURRENT_MODE, EVENT
 from mavbridge.mavlink.codec.messages import (
     STICK_END,
     Altitude,
@@ -35,14 +34,12 @@ from mavbridge.mavlink.codec.messages import (
     ParamAbsent,
     ParamValue,
     RcChannels,
-    ReceivedMessage,
     SpecificForce,
     StatusText,
     SystemStatus,
     Timesync,
     VelocityTarget,
 )
-from mavbridge.mavlink.codec.signing import SIGNATURE_BYTES, SIGNED
 
 MG_TO_MPS2 = 9.80665e-3
 """Milli-g to m/s^2, by standard gravity."""
@@ -73,6 +70,11 @@ def _require_finite(value: float) -> None:
 def _require_usable(*values: float) -> None:
     if not max(map(abs, values)) <= MOST_VALUE or math.isnan(sum(values)):
         raise UnusableError
+
+
+def _text(data: bytes) -> str:
+    """Return a text up to its first zero byte, each byte as one character."""
+    return data.split(b"\0", 1)[0].decode("ascii", errors="replace")
 
 
 def _heartbeat(m: dialect.MAVLink_heartbeat_message) -> Body:
@@ -146,18 +148,18 @@ def _command_ack(m: dialect.MAVLink_command_ack_message) -> Body:
 def _param_value(m: dialect.MAVLink_param_value_message) -> Body:
     if m.param_type == dialect.MAV_PARAM_TYPE_REAL32:
         _require_finite(m.param_value)  # the bytes of an integer may be those of NaN
-    return ParamValue(name=m.param_id, value=m.param_value, kind=m.param_type)
+    return ParamValue(name=_text(m.param_id), value=m.param_value, kind=m.param_type)
 
 
 def _param_error(m: dialect.MAVLink_param_error_message) -> Body | None:
     is_absent = m.error == dialect.MAV_PARAM_ERROR_DOES_NOT_EXIST
-    return ParamAbsent(m.param_id) if is_absent else None
+    return ParamAbsent(_text(m.param_id)) if is_absent else None
 
 
 def _status_text(m: dialect.MAVLink_statustext_message) -> Body:
-    # pymavlink has stripped zero bytes, and decoded each other byte to one character.
-    is_full = m.id != 0 and len(m.text) >= _TEXT_BYTES
-    ended = m.text.rstrip("\t") if is_full else m.text.rstrip()  # PX4 ends its texts with a tab
+    text = _text(m.text)
+    is_full = m.id != 0 and len(text) >= _TEXT_BYTES
+    ended = text.rstrip("\t") if is_full else text.rstrip()  # PX4 ends its texts with a tab
     # Make terminal control codes visible.
     text = "".join(c if c.isprintable() else UNPRINTABLE for c in ended)
     return StatusText(text, m.id, m.chunk_seq, is_full)
@@ -213,119 +215,59 @@ READERS: dict[str, Callable[[dialect.MAVLink_message], Body | None]] = {
 }
 """Reader of each MAVLink message that the bridge uses; raises UnusableError."""
 
-MAVLINK_2 = 0xFD
-HEADER = struct.Struct("<BBBBBBBHB")
-"""Marker, payload length, incompatible and compatible flags, sequence, system, component, id."""
-_HEADER_BYTES, _CHECKSUM_BYTES = 10, 2
 
-
-class _Layout(NamedTuple):
-    """Wire layout of a message; ``fields`` has pymavlink's names, so that one reader serves both.
-
-    An array is always the last field; ``fields`` holds its first element.
-    """
+class Layout(NamedTuple):
+    """Wire layout of a message that is read."""
 
     name: str
-    crc_extra: int
     payload: struct.Struct
+    pick: Callable[[tuple[Any, ...]], tuple[Any, ...]]
+    """Takes the fields from the unpacked numbers: an array has several."""
     fields: Any
+    """Record with pymavlink's names of the fields, in the order of the wire."""
+
+    def read(self, payload: bytes) -> Body | None:
+        """Return the record of a payload, whose trailing zeros may be missing.
+
+        Raises:
+            UnusableError: the values are unusable.
+        """
+        size = self.payload.size
+        values = self.payload.unpack(payload[:size].ljust(size, b"\0"))
+        return READERS[self.name](self.fields._make(self.pick(values)))
 
 
-_LAYOUTS = {
-    message.id: _Layout(
-        message.msgname,
-        message.crc_extra,
-        struct.Struct(message.unpacker.format),
-        namedtuple(message.msgname, message.ordered_fieldnames),
+def _layout(name: str, format_: str, fields: Sequence[str], lengths: Sequence[int]) -> Layout:
+    """Return a layout; ``lengths``: numbers in each field, more than one for an array."""
+    places: list[int | slice] = []
+    at = 0
+    for length in lengths:
+        places.append(at if length == 1 else slice(at, at + length))
+        at += length
+    return Layout(name, struct.Struct(format_), itemgetter(*places), namedtuple(name, fields))
+
+
+LAYOUTS = {
+    message.id: _layout(
+        *(message.msgname, message.unpacker.format, message.ordered_fieldnames, message.lengths)
     )
     for message in dialect.mavlink_map.values()
-    if message.msgname == "ATTITUDE_QUATERNION"  # its array comes last, and is not used
-    or (message.msgname in READERS and not any(message.array_lengths))
-}
-_UNREAD: dict[int, str] = {
-    message.id: message.msgname
-    for message in dialect.mavlink_map.values()
-    if message.msgname not in READERS
-}
-"""Messages of which only the sequence number is used."""
-
-_MISSING_LAYOUTS = {
-    436: _Layout(
-        "CURRENT_MODE",
-        193,
-        struct.Struct("<IIB"),
-        namedtuple("CURRENT_MODE", "custom_mode intended_custom_mode standard_mode"),
+    if message.msgname in READERS
+} | {
+    # On the wire, fields are sorted by decreasing size.
+    CURRENT_MODE: _layout(
+        *("CURRENT_MODE", "<IIB", ("custom_mode", "intended_custom_mode", "standard_mode")),
+        (1, 1, 1),
     ),
-    410: _Layout(
-        "EVENT",
-        160,
-        struct.Struct("<IIHBBB40s"),
-        namedtuple("EVENT", "id time_boot_ms sequence component system log_levels arguments"),
+    EVENT: _layout(
+        *("EVENT", "<IIHBBB40s"),
+        ("id", "time_boot_ms", "sequence", "component", "system", "log_levels", "arguments"),
+        (1,) * 7,
     ),
 }
-"""Messages of MAVLink's common dialect that pymavlink's ardupilotmega lacks, by id. Layouts from
-common.xml; on the wire, fields are sorted by decreasing size."""
-MISSING_IDS = {layout.name: number for number, layout in _MISSING_LAYOUTS.items()}
-_LAYOUTS |= _MISSING_LAYOUTS
-CRC_EXTRA: dict[int, int] = {
-    number: message.crc_extra for number, message in dialect.mavlink_map.items()
-} | {number: layout.crc_extra for number, layout in _LAYOUTS.items()}
-"""Checksum seed (crc_extra) by message id."""
-
-
-def packet_end(data: bytes, at: int) -> int | None:
-    """Return the end of the MAVLink 2 packet at ``at``; None if there is no whole one."""
-    if len(data) - at < _HEADER_BYTES + _CHECKSUM_BYTES or data[at] != MAVLINK_2:
-        return None
-    end = at + _HEADER_BYTES + data[at + 1] + _CHECKSUM_BYTES
-    end += SIGNATURE_BYTES if data[at + 2] & SIGNED else 0
-    return end if end <= len(data) else None
-
-
-def decode_packet(data: bytes) -> ReceivedMessage | None:
-    """Decode one whole, valid and usable packet without arrays; return None for anything else.
-
-    The caller checks the signature.
-    """
-    if len(data) < _HEADER_BYTES + _CHECKSUM_BYTES:
-        return None
-    start, length, incompatible, _, sequence, system, component, low, high = HEADER.unpack_from(
-        data
-    )
-    number = low | high << 16
-    layout, unread = _LAYOUTS.get(number), _UNREAD.get(number)
-    if start != MAVLINK_2 or incompatible not in (0, SIGNED):
-        return None
-    crc_extra = CRC_EXTRA.get(number)
-    if crc_extra is None or (layout is None and unread is None):
-        return None
-    sealed = data[:-SIGNATURE_BYTES] if incompatible else data
-    if len(sealed) != _HEADER_BYTES + length + _CHECKSUM_BYTES:
-        return None
-    if checksum(sealed[1:-_CHECKSUM_BYTES], crc_extra) != sealed[-_CHECKSUM_BYTES:]:
-        return None
-    source = Endpoint(system, component)
-    if unread is not None:
-        return ReceivedMessage(source, sequence, unread, None, data)
-    if layout is None or length > layout.payload.size:
-        return None
-    payload = sealed[_HEADER_BYTES:-_CHECKSUM_BYTES].ljust(layout.payload.size, b"\0")
-    values = layout.payload.unpack(payload)[: len(layout.fields._fields)]
-    try:
-        body = READERS[layout.name](layout.fields._make(values))
-    except UnusableError:
-        return None  # the general parser counts it
-    return ReceivedMessage(source, sequence, layout.name, body, data)
-
-
-def checksum(data: bytes, crc_extra: int) -> bytes:
-    """Return the CRC-16/MCRF4XX of a packet without its marker, followed by crc_extra."""
-    crc: int = dialect.x25crc(data + bytes((crc_extra,))).crc
-    return crc.to_bytes(_CHECKSUM_BYTES, "little")
-
-
-def unread(name: str, packet: bytes) -> ReceivedMessage:
-    """Return a message unknown to the dialect; its sequence number is counted."""
-    at = 4 if packet[0] == dialect.PROTOCOL_MARKER_V2 else 2
-    sequence, system, component = packet[at : at + 3]
-    return ReceivedMessage(Endpoint(system, component), sequence, name, None, packet)
+"""Layout of each message that is read, by its number."""
+IDS: dict[str, int] = {m.msgname: m.id for m in dialect.mavlink_map.values()} | {
+    layout.name: number for number, layout in LAYOUTS.items()
+}
+"""Number of each message."""
+NAMES: dict[int, str] = {number: name for name, number in IDS.items()}

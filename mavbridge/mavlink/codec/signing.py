@@ -6,15 +6,17 @@ from collections.abc import Callable, Mapping
 from types import MappingProxyType
 from typing import Literal, NamedTuple, TypeAlias
 
-from pymavlink.dialects.v20 import ardupilotmega as dialect
+from mavbridge.mavlink.codec.frames import (
+    CHECKSUM_BYTES,
+    SIGNATURE_BYTES,
+    SIGNED,
+    RawPacket,
+    checksum,
+)
 
 KEY_BYTES = 32
-SIGNED = 0x01
-"""Incompatibility flag of a signed packet."""
-SIGNATURE_BYTES = 13
-"""Link id, timestamp (6 bytes) and the first 6 bytes of the hash."""
 _TIMESTAMP_BYTES, _HASH_BYTES = 6, 6
-_FLAGS_AT, _SYSTEM_AT, _ID_AT, _HEADER_BYTES, _CHECKSUM_BYTES = 2, 5, 7, 10, 2
+_FLAGS_AT = 2
 TICK_NS = 10_000
 """Unit of a timestamp, 10 us."""
 EPOCH_NS = 1_420_070_400 * 10**9
@@ -77,38 +79,34 @@ class Signing:
 
     def sign(self, packet: bytes, crc_extra: int) -> bytes:
         """Return the packet with a signature and the checksum that this requires."""
-        body = bytearray(packet[1:-_CHECKSUM_BYTES])
-        body[_FLAGS_AT - 1] |= SIGNED
-        crc: int = dialect.x25crc(bytes(body) + bytes((crc_extra,))).crc
+        body = bytearray(packet[:-CHECKSUM_BYTES])
+        body[_FLAGS_AT] |= SIGNED
         self._sent_ticks = max(self._sent_ticks + 1, self.now_ticks)
         unsealed = (
-            packet[:1]
-            + bytes(body)
-            + crc.to_bytes(_CHECKSUM_BYTES, "little")
+            bytes(body)
+            + checksum(bytes(body[1:]), crc_extra)
             + bytes((self.link_id,))
             + self._sent_ticks.to_bytes(_TIMESTAMP_BYTES, "little")
         )
         return unsealed + self._hash(unsealed)
 
-    def accepts(self, packet: bytes) -> bool:
-        """True if a whole packet with a valid checksum is accepted; count refusals."""
-        refusal = self._refusal(packet)
+    def accepts(self, frame: RawPacket) -> bool:
+        """True if a packet with a valid checksum is accepted; count refusals."""
+        refusal = self._refusal(frame)
         if refusal is None:
             self.accepted += 1
             return True
         self.refused[refusal] = self.refused.get(refusal, 0) + 1
         return False
 
-    def _refusal(self, packet: bytes) -> Refusal | None:
-        if packet[0] != dialect.PROTOCOL_MARKER_V2 or not packet[_FLAGS_AT] & SIGNED:
-            is_radio = message_id(packet) == _RADIO_STATUS
-            return None if is_radio else "unsigned"
-        signed, seal = packet[:-_HASH_BYTES], packet[-_HASH_BYTES:]
+    def _refusal(self, frame: RawPacket) -> Refusal | None:
+        if not frame.flags & SIGNED:
+            return None if frame.message_id == _RADIO_STATUS else "unsigned"
+        signed, seal = frame.data[:-_HASH_BYTES], frame.data[-_HASH_BYTES:]
         if not hmac.compare_digest(self._hash(signed), seal):
             return "wrong key"
-        link_id = packet[-SIGNATURE_BYTES]
         ticks = int.from_bytes(signed[-_TIMESTAMP_BYTES:], "little")
-        stream = (link_id, packet[_SYSTEM_AT], packet[_SYSTEM_AT + 1])
+        stream = (frame.data[-SIGNATURE_BYTES], *frame.source)
         if (newest := self._heard.get(stream)) is not None:
             if ticks <= newest:
                 return "replayed"
@@ -129,15 +127,3 @@ class Signing:
 
     def _hash(self, signed: bytes) -> bytes:
         return hashlib.sha256(self._key + signed).digest()[:_HASH_BYTES]
-
-
-def message_id(packet: bytes) -> int:
-    """Return the message id of a whole packet of MAVLink 1 or 2."""
-    if packet[0] != dialect.PROTOCOL_MARKER_V2:
-        return packet[_SYSTEM_AT]  # MAVLink 1 has the message id here
-    return int.from_bytes(packet[_ID_AT:_HEADER_BYTES], "little")
-
-
-def is_signed(packet: bytes) -> bool:
-    """True if the packet has a signature, valid or not."""
-    return packet[0] == dialect.PROTOCOL_MARKER_V2 and bool(packet[_FLAGS_AT] & SIGNED)

@@ -3,7 +3,6 @@
 import mmap
 import os
 import re
-from binascii import crc_hqx
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -11,12 +10,10 @@ from pathlib import Path
 from mavbridge.core.errors import UserError
 from mavbridge.mavlink.codec.frames import RawPacket, frame_at
 from mavbridge.mavlink.codec.messages import Endpoint
-from mavbridge.mavlink.codec.readers import CRC_EXTRA
 
 _STAMP_BYTES = 8
 """Timestamp size; big-endian, unsigned."""
 _MARKER = re.compile(rb"[\xfd\xfe]")
-_MIRRORED = bytes(int(f"{byte:08b}"[::-1], 2) for byte in range(256))
 
 
 @dataclass
@@ -83,7 +80,7 @@ def _packet_at(data: mmap.mmap, at: int) -> RawPacket | None:
     If it cannot be tested, another record must follow the packet, and none begin inside it.
     """
     packet = frame_at(data, at + _STAMP_BYTES)
-    if packet is None or (is_sound := _is_sound(packet)) is False:
+    if packet is None or (is_sound := packet.is_sound) is False:
         return None
     end = at + _STAMP_BYTES + len(packet.data)
     is_followed = end == len(data) or frame_at(data, end + _STAMP_BYTES) is not None
@@ -91,19 +88,10 @@ def _packet_at(data: mmap.mmap, at: int) -> RawPacket | None:
     return packet if is_sound or is_record else None
 
 
-def _is_sound(packet: RawPacket) -> bool | None:
-    """True if the checksum is valid; None if the dialect lacks the message."""
-    if (extra := CRC_EXTRA.get(packet.message_id)) is None:
-        return None
-    body, checksum = packet.sealed
-    crc = crc_hqx((body + bytes((extra,))).translate(_MIRRORED), 0xFFFF)
-    return checksum == crc.to_bytes(2, "big").translate(_MIRRORED)
-
-
 def _next_sound(data: mmap.mmap, at: int, end: int) -> int | None:
     """Return the start of the first record in this range with a valid checksum."""
     for marker in _MARKER.finditer(data, at + _STAMP_BYTES, end + _STAMP_BYTES):
         packet = frame_at(data, marker.start())
-        if packet is not None and _is_sound(packet):
+        if packet is not None and packet.is_sound:
             return marker.start() - _STAMP_BYTES
     return None

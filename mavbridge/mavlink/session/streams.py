@@ -6,7 +6,7 @@ from pymavlink.dialects.v20 import ardupilotmega as dialect
 
 from mavbridge.core.clock import NS_PER_MS, NS_PER_S
 from mavbridge.mavlink.codec.messages import CommandAck, CommandRequest, Request, StreamRequest
-from mavbridge.mavlink.codec.readers import MISSING_IDS
+from mavbridge.mavlink.codec.readers import IDS
 from mavbridge.mavlink.profiles.profile import StreamGroup
 
 _ACK_TIMEOUT_NS = 500 * NS_PER_MS
@@ -54,7 +54,7 @@ class _Stream:
         self.is_denied = False
         if self._choice >= len(self.group.messages) and self.group.stream is not None:
             return StreamRequest(self.group.stream, max(round(self.rate_hz), 1))
-        number = message_id(self.group.messages[self._choice % len(self.group.messages)])
+        number = IDS[self.group.messages[self._choice % len(self.group.messages)]]
         return CommandRequest(dialect.MAV_CMD_SET_MESSAGE_INTERVAL, (number, 1e6 / self.rate_hz))
 
     def want(self, group: StreamGroup) -> None:
@@ -101,12 +101,6 @@ class _Stream:
         least_hz = self.group.least_hz
         least_hz = _ENOUGH * self.rate_hz if least_hz is None else least_hz
         return not self.is_given_up and self._count < least_hz * span_s
-
-
-def message_id(name: str) -> int:
-    """Return the number of a MAVLink message."""
-    number: int = MISSING_IDS.get(name) or getattr(dialect, f"MAVLINK_MSG_ID_{name}")
-    return number
 
 
 class StreamRequester:
@@ -207,7 +201,7 @@ class StreamRequester:
                 continue
             if now_ns - stream.newest_ns >= _AWAY_NS:
                 stream.stand_in_due_ns = now_ns + _STAND_IN_NS
-                yield CommandRequest(dialect.MAV_CMD_REQUEST_MESSAGE, (float(message_id(name)),))
+                yield CommandRequest(dialect.MAV_CMD_REQUEST_MESSAGE, (float(IDS[name]),))
 
     def _check_rates(self, now_ns: int) -> None:
         if not self.is_settled:

@@ -10,6 +10,7 @@ from dataclasses import replace
 from pymavlink.dialects.v20 import ardupilotmega as dialect
 
 from mavbridge.core.clock import NS_PER_MS, NS_PER_S
+from mavbridge.core.errors import PeerError
 from mavbridge.core.link_settings import LinkSettings
 from mavbridge.core.reasons import Code, Reason, because
 from mavbridge.core.switch import Switch
@@ -31,12 +32,47 @@ from mavbridge.mavlink.codec.messages import (
     StatusText,
     later_by_us,
 )
-from mavbridge.mavlink.profiles.choice import require_profile
-from mavbridge.mavlink.profiles.profile import HOME_HEIGHT
+from mavbridge.mavlink.profiles.ardupilot import ARDUPILOT
+from mavbridge.mavlink.profiles.profile import HOME_HEIGHT, Profile
+from mavbridge.mavlink.profiles.px4 import PX4
 from mavbridge.mavlink.session.condition import ConditionMessage, VehicleCondition
 from mavbridge.mavlink.session.discovery import VehicleIdentity
 from mavbridge.mavlink.session.params.vehicle_params import VehicleParams
-from mavbridge.mavlink.session.streams import StreamRequester, message_id
+from mavbridge.mavlink.session.streams import StreamRequester
+
+_PROFILES: dict[int, Profile] = {
+    dialect.MAV_AUTOPILOT_ARDUPILOTMEGA: ARDUPILOT,
+    dialect.MAV_AUTOPILOT_PX4: PX4,
+}
+_MULTIROTORS = (
+    *(dialect.MAV_TYPE_QUADROTOR, dialect.MAV_TYPE_HEXAROTOR, dialect.MAV_TYPE_OCTOROTOR),
+    *(dialect.MAV_TYPE_TRICOPTER, dialect.MAV_TYPE_COAXIAL),
+    *(dialect.MAV_TYPE_DECAROTOR, dialect.MAV_TYPE_DODECAROTOR),
+)
+
+
+def require_profile(autopilot: int, vehicle_type: int) -> Profile:
+    """Return the profile of a multirotor's firmware.
+
+    Raises:
+        PeerError: the firmware is not supported, or the vehicle is no multirotor.
+    """
+    if autopilot not in _PROFILES:
+        raise PeerError(
+            f"the vehicle's firmware is {_name('MAV_AUTOPILOT', autopilot)}, and only ArduPilot "
+            "and PX4 are flown"
+        )
+    if vehicle_type not in _MULTIROTORS:
+        name = _name("MAV_TYPE", vehicle_type)
+        raise PeerError(f"the vehicle is a {name}, and only multirotors are flown")
+    return _PROFILES[autopilot]
+
+
+def _name(enum: str, number: int) -> str:
+    entry = dialect.enums[enum].get(number)
+    name = entry.name.removeprefix(f"{enum}_") if entry else "unknown"
+    return f"{name} ({enum} {number})"
+
 
 _WAIT_NS = NS_PER_S
 """Longest wait for a missing piece of a text."""
@@ -229,7 +265,7 @@ class VehicleSession:
         if is_version_open and now_ns >= self._version_due_ns:
             self._version_due_ns = now_ns + _VERSION_TIMEOUT_NS
             self._version_attempts += 1
-            number = float(message_id("AUTOPILOT_VERSION"))
+            number = float(dialect.MAVLINK_MSG_ID_AUTOPILOT_VERSION)
             yield CommandRequest(dialect.MAV_CMD_REQUEST_MESSAGE, (number,))
         # Parameters first: a vehicle slows its streams down while it sends parameters.
         yield from self.params.step(now_ns, self.status(now_ns))

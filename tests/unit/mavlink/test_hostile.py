@@ -11,7 +11,7 @@ from helpers.parameters import ParamVehicle
 from helpers.wire import WireEnd
 from mavbridge.core.clock import NS_PER_MS, NS_PER_S
 from mavbridge.core.vehicle import ActionMeaning, Velocity
-from mavbridge.mavlink.codec.messages import ParamValue, StatusText
+from mavbridge.mavlink.codec.messages import ParamValue
 from mavbridge.mavlink.codec.packets import MOST_DATAGRAM_BYTES
 from mavbridge.mavlink.outputs.echo import EchoCheck
 from mavbridge.mavlink.outputs.setpoints import VelocityOutput
@@ -32,31 +32,8 @@ def test_a_huge_datagram_costs_no_more_than_a_large_one(unit: bytes) -> None:
     start_s = time.thread_time()
     assert list(ours.decode_datagram(huge)) == []
     assert time.thread_time() - start_s < 0.05
-    assert ours._mav.total_bytes_received <= MOST_DATAGRAM_BYTES
+    assert ours.bad_data_count <= 1 + MOST_DATAGRAM_BYTES // 8
     assert [m.name for m in ours.decode_datagram(WireEnd().heartbeat())] == ["HEARTBEAT"]
-
-
-def test_a_text_cannot_write_into_the_terminal() -> None:
-    end = WireEnd()
-    (message,) = codec().decode_datagram(end.pack(end.mav.statustext_encode(4, b"\x1b[2J a\tb")))
-    assert message.body == StatusText("\ufffd[2J a\ufffdb")
-
-
-@pytest.mark.parametrize(
-    ("data", "text_id"),
-    [(b"Pilot took over using sticks\t", 0), (b"Armed \t\r\n", 0), (b"x" * 49 + b"\t", 3)],
-)
-def test_a_text_ends_with_its_last_visible_character(data: bytes, text_id: int) -> None:
-    end = WireEnd()
-    (message,) = codec().decode_datagram(end.pack(end.mav.statustext_encode(6, data, text_id)))
-    assert message.body.text == data.decode().rstrip()
-
-
-def test_a_piece_with_many_bytes_beyond_ascii_is_the_last_one_all_the_same() -> None:
-    end = WireEnd()
-    text = "Höhe überschritten, äöüÄÖÜß".encode()
-    (message,) = codec().decode_datagram(end.pack(end.mav.statustext_encode(4, text, 7, 1)))
-    assert not message.body.is_full
 
 
 def test_a_stamp_from_the_far_future_does_not_blind_the_echo_check() -> None:

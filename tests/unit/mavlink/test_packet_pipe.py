@@ -1,9 +1,18 @@
+"""Packets through the pipe to a telemetry log, which pymavlink and our own reader read."""
+
 import os
 from collections.abc import Iterator
+from datetime import datetime
+from pathlib import Path
 
 import pytest
+from pymavlink import mavutil
+from pymavlink.dialects.v20 import ardupilotmega as dialect
 
+from helpers.wire import WireEnd
+from mavbridge.core.errors import UserError
 from mavbridge.core.vehicle import Packet
+from mavbridge.mavlink.codec.tlog import read_tlog
 from mavbridge.mavlink.transport.packet_pipe import PacketPipe
 
 
@@ -27,12 +36,13 @@ def stand() -> Iterator[Stand]:
 
 
 def test_a_record_is_the_time_of_the_packet_and_the_packet(stand: Stand) -> None:
+    stand.log.put(Packet(0, bytes(1 << 14)))  # what could be torn is dropped
     stand.log.put(Packet(11_000, b"first"))
     stand.log.put(Packet(23_000, b"second"))
     stand.log.close()
     assert stand.read() == bytes(7) + b"\x0cfirst" + bytes(7) + b"\x18second"
     assert stand.read() == b"", "the end"
-    assert stand.log.dropped == 0
+    assert stand.log.dropped == 1
 
 
 def test_a_full_pipe_drops_whole_records_and_counts_them(stand: Stand) -> None:
@@ -40,12 +50,9 @@ def test_a_full_pipe_drops_whole_records_and_counts_them(stand: Stand) -> None:
     while stand.log.dropped < 3:
         stand.log.put(Packet(0, offered.to_bytes(4, "big") + bytes(276)))
         offered += 1
-    data = stand.read()
-    size = 8 + 280
-    assert len(data) == (offered - 3) * size
-    assert [int.from_bytes(data[at + 8 : at + 12], "big") for at in range(0, len(data), size)] == [
-        *range(offered - 3)
-    ]
+    data, size = stand.read(), 8 + 280
+    numbers = [int.from_bytes(data[at + 8 : at + 12], "big") for at in range(0, len(data), size)]
+    assert numbers == [*range(offered - 3)]
     stand.log.put(Packet(0, b"there is room again"))
     assert stand.read().endswith(b"there is room again")
     assert stand.log.dropped == 3
@@ -63,8 +70,37 @@ def test_after_the_reader_is_gone_everything_is_counted_and_nothing_is_raised() 
     assert log.dropped == 6
 
 
-def test_what_could_be_torn_is_dropped(stand: Stand) -> None:
-    stand.log.put(Packet(0, bytes(1 << 14)))
-    stand.log.put(Packet(0, b"whole"))
-    assert stand.read() == bytes(8) + b"whole"
-    assert stand.log.dropped == 1
+def test_pymavlink_reads_the_log(tmp_path: Path) -> None:
+    path, end = tmp_path / "link.tlog", WireEnd()
+    unix_ns = 1_700_000_000_123_456_789
+    fd = os.open(path, os.O_CREAT | os.O_WRONLY)
+    log = PacketPipe(fd, wall_offset_ns=unix_ns - 5_000_000_000)
+    for k in range(5):
+        stamp_ns = 5_000_000_000 + k * 10_000_000
+        sent = end.pack(end.mav.manual_control_encode(1, k, 0, 0, 0, 0))
+        log.put(Packet(stamp_ns, end.heartbeat()))
+        log.put(Packet(stamp_ns + 2_000_000, sent))
+    log.close()
+    reader = mavutil.mavlogfile(str(path))
+    read = []
+    while (message := reader.recv_msg()) is not None:
+        read.append(message)
+    reader.f.close()
+    assert [m.get_type() for m in read] == ["HEARTBEAT", "MANUAL_CONTROL"] * 5
+    assert [m.x for m in read[1::2]] == [0, 1, 2, 3, 4]
+    assert read[1]._timestamp - read[0]._timestamp == pytest.approx(0.002, abs=1e-5)
+    first = datetime.fromtimestamp(read[0]._timestamp)
+    assert abs(first.timestamp() - unix_ns / 1e9) < 1e-4
+
+
+def test_a_log_of_several_blocks_is_read_whole_up_to_where_it_is_cut_off(tmp_path: Path) -> None:
+    mav = dialect.MAVLink(None, srcSystem=1, srcComponent=1)
+    packets = [mav.statustext_encode(6, b"x" * 50).pack(mav) for _ in range(20_000)]
+    data = b"".join(us.to_bytes(8, "big") + packet for us, packet in enumerate(packets))
+    assert len(data) > 1_200_000  # more than one block
+    path = tmp_path / "flight.tlog"
+    path.write_bytes(data[:-5])
+    found = list(read_tlog(path))
+    assert [(us, packet.data) for us, packet in found] == list(enumerate(packets))[:-1]
+    with pytest.raises(UserError, match="cannot be read"):
+        list(read_tlog(tmp_path / "none.tlog"))

@@ -11,10 +11,11 @@ from mavbridge.mavlink.codec.messages import (
     Request,
     StreamRequest,
 )
+from mavbridge.mavlink.codec.readers import IDS
 from mavbridge.mavlink.profiles.ardupilot import ARDUPILOT
 from mavbridge.mavlink.profiles.profile import HOME_HEIGHT, Profile, StreamGroup
 from mavbridge.mavlink.profiles.px4 import PX4
-from mavbridge.mavlink.session.streams import StreamRequester, message_id
+from mavbridge.mavlink.session.streams import StreamRequester
 
 S = NS_PER_S
 
@@ -222,7 +223,7 @@ class Link:
         self.share = 1.0
         self._due: dict[int, float] = {}
         self._sequence = 0
-        self._names = {message_id(name): name for group in groups for name in group.messages}
+        self._names = {IDS[name]: name for group in groups for name in group.messages}
         self._now_ns = 0
         self.silent: set[int] = set()
         """Messages that the vehicle grants and does not send."""
@@ -246,7 +247,7 @@ class Link:
                     self._sequence += 1
                     if loses_every is None or self._sequence % loses_every:
                         self._deliver(self._names[number])
-                        if number == message_id("ATTITUDE_QUATERNION"):
+                        if number == IDS["ATTITUDE_QUATERNION"]:
                             self._sequence += 1
                             self._deliver("ATTITUDE")  # unasked
 
@@ -275,7 +276,7 @@ def test_what_stays_away_is_told_once_and_stood_in_for_while_it_does() -> None:
     groups = PX4.streams(state_hz=100)
     (mode,) = [group for group in groups if group.stand_in]
     link = Link(groups, capacity_hz=1e4)
-    link.silent = {message_id(mode.messages[0]), message_id("EXTENDED_SYS_STATE")}
+    link.silent = {IDS[mode.messages[0]], IDS["EXTENDED_SYS_STATE"]}
     link.run(8.0)
     assert [text.partition(" does not come")[0] for text in link.texts] == [
         "CURRENT_MODE",
