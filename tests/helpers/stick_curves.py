@@ -4,7 +4,7 @@ import math
 from dataclasses import dataclass
 
 from mavbridge.core.vehicle import StickGains, Sticks
-from mavbridge.mavlink.profiles.ardupilot_params import calibration
+from mavbridge.mavlink.profiles.ardupilot_sticks import calibration
 from sitl.ardupilot.params import ArduPilotParams
 from sitl.ardupilot.rc import RcEngine
 from sitl.ardupilot.sticks import climb_rate_mps, lean_angles, read_sticks, yaw_rate_radps

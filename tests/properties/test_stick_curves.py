@@ -134,7 +134,7 @@ def test_the_other_way_round_leads_back(found: StickCurves, given_sticks: Sticks
             assert getattr(back, name) == pytest.approx(getattr(given_sticks, name), abs=1e-6)
     lean = found.lean
     if lean is not None and "pitch" not in saturated and "roll" not in saturated:
-        within = math.hypot(*map(lean.policy.motion, given_sticks[2:])) <= lean.policy.above.full
+        within = math.hypot(*map(lean.policy.pitch.motion, given_sticks[2:])) <= lean.policy.full
         for before, after, there in zip(given_sticks[2:], back[2:], moved[2:], strict=True):
             if within and there != 0.0:
                 assert after == pytest.approx(before, abs=1e-6)

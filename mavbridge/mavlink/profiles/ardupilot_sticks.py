@@ -1,27 +1,42 @@
-"""Motion of ArduCopter for given sticks, by its parameters.
+"""Radio calibration and sticks of ArduCopter: their motion, and what turns them.
 
 Formulas: ArduPilot's ``RC_Channel::norm_input_dz``, ``rc_input_to_roll_pitch``, ``input_expo`` and
 Copter's ``get_pilot_desired_yaw_rate`` and ``get_pilot_desired_climb_rate``. The tests compare them
 with leans and rates measured on the firmware.
 """
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from typing import NamedTuple
 
 from mavbridge.core.vehicle import StickGains
-from mavbridge.mavlink.codec.calibration import PWM_SIGN
+from mavbridge.mavlink.codec.calibration import (
+    DEAD_ZONE_US,
+    FS_THR_MARGIN_US,
+    PWM_SIGN,
+    RcCalibration,
+    RcChannel,
+)
+from mavbridge.mavlink.profiles.profile import StickSetting
 from mavbridge.mavlink.profiles.sticks import (
     IDENTITY,
     MAX_DEAD_ZONE,
     Axis,
     Half,
+    Lean,
     StickCurves,
-    VehicleCurves,
-    VehicleLean,
     curves_between,
     unusable,
 )
 
+STICKS = ("THROTTLE", "YAW", "PITCH", "ROLL")
+"""RCMAP_* suffixes in the order of ``Sticks``."""
+OPTION_CHANNELS = range(5, 17)
+"""Channels of a radio's switches; by default the first four carry the sticks."""
+SIMPLE_NAMES = ("SIMPLE", "SUPER_SIMPLE")
+_SIMPLE_OPTIONS = (3.0, 13.0)
+"""RCn_OPTION "Simple Mode" and "Super Simple Mode"."""
+TURNED = "pitch and roll sticks count in the axes of "
+_CALIBRATION_PARTS = ("MIN", "TRIM", "MAX", "REVERSED")
 _LEAN_MODES = ("ALT_HOLD", "STABILIZE")
 """Modes in which sticks are a lean and a yaw rate."""
 _CLIMB_MODE = "ALT_HOLD"
@@ -59,7 +74,7 @@ def ardupilot_curves(
     lean = _present(values, "ATC_ANGLE_MAX", "ANGLE_MAX")
     up = _present(values, "PILOT_SPD_UP", "PILOT_SPEED_UP")
     down = _present(values, "PILOT_SPD_DN", "PILOT_SPEED_DN")
-    needed = (lean, "PILOT_Y_RATE", up, down, "THR_DZ", *_calibration_names(values))
+    needed = (lean, "PILOT_Y_RATE", up, down, "THR_DZ", *_curve_names(values))
     if (
         nothing := unusable(values, needed=needed, positive=(lean, "PILOT_Y_RATE", up))
     ) is not None:
@@ -70,16 +85,13 @@ def ardupilot_curves(
     yaw = Half(values["PILOT_Y_RATE"], bend=bend, parameter="PILOT_Y_RATE")
     return curves_between(
         gains,
-        VehicleCurves(
-            throttle=_throttle(values, up, down) if mode == _CLIMB_MODE else None,
-            yaw=_centred(values, "YAW", yaw, PWM_SIGN.yaw),
-            lean=VehicleLean(
-                pitch=_centred(values, "PITCH", Half(full_deg), PWM_SIGN.pitch),
-                roll=_centred(values, "ROLL", Half(full_deg), PWM_SIGN.roll),
-                full=full_deg,
-                is_tangent=False,
-                parameter=lean,
-            ),
+        throttle=_throttle(values, up, down) if mode == _CLIMB_MODE else None,
+        yaw=_centred(values, "YAW", yaw, PWM_SIGN.yaw),
+        lean=Lean(
+            pitch=_centred(values, "PITCH", Half(full_deg), PWM_SIGN.pitch),
+            roll=_centred(values, "ROLL", Half(full_deg), PWM_SIGN.roll),
+            full=full_deg,
+            parameter=lean,
         ),
     )
 
@@ -89,10 +101,10 @@ def _present(values: Mapping[str, float], new: str, old: str) -> str:
     return new if new in values else old
 
 
-def _calibration_names(values: Mapping[str, float]) -> tuple[str, ...]:
+def _curve_names(values: Mapping[str, float]) -> tuple[str, ...]:
     """Return the parameters that define the dead zones, as far as RCMAP_* is known."""
     names: tuple[str, ...] = ()
-    for stick in ("THROTTLE", "YAW", "PITCH", "ROLL"):
+    for stick in STICKS:
         names += (f"RCMAP_{stick}",)
         if (number := values.get(f"RCMAP_{stick}")) is not None:
             parts = ("MIN", "MAX", "DZ", *(() if stick == "THROTTLE" else ("TRIM", "REVERSED")))
@@ -129,3 +141,73 @@ def _throttle(values: Mapping[str, float], up: str, down: str) -> Axis:
         Half(climb_mps, start, parameter=up),
         Half(descent_mps or climb_mps, start, end, parameter=down if descent_mps else up),
     )
+
+
+def calibration_names(values: Mapping[str, float]) -> tuple[str, ...]:
+    """Return the parameters needed to map sticks to channels, as far as RCMAP_* is known."""
+    names = tuple(f"RCMAP_{stick}" for stick in STICKS)
+    numbers = sorted({int(values[name]) for name in names if name in values})
+    return names + tuple(f"RC{number}_{part}" for number in numbers for part in _CALIBRATION_PARTS)
+
+
+def calibration(values: Mapping[str, float]) -> RcCalibration:
+    """Return the radio calibration. Raise ValueError if parameters are missing or contradictory."""
+    throttle, yaw, pitch, roll = (
+        _channel(values, int(_require(values, f"RCMAP_{stick}"))) for stick in STICKS
+    )
+    floor_us = int(values.get("FS_THR_VALUE", 0)) + FS_THR_MARGIN_US
+    return RcCalibration(
+        throttle=throttle, yaw=yaw, pitch=pitch, roll=roll, throttle_floor_us=floor_us
+    )
+
+
+def _channel(values: Mapping[str, float], number: int) -> RcChannel:
+    return RcChannel(
+        number=number,
+        min_us=int(_require(values, f"RC{number}_MIN")),
+        trim_us=int(_require(values, f"RC{number}_TRIM")),
+        max_us=int(_require(values, f"RC{number}_MAX")),
+        is_reversed=bool(_require(values, f"RC{number}_REVERSED")),
+        dead_zone_us=int(values.get(f"RC{number}_DZ", DEAD_ZONE_US)),
+    )
+
+
+def _require(values: Mapping[str, float], name: str) -> float:
+    if name not in values:
+        raise ValueError(
+            f"the vehicle has not sent parameter {name}, which is asked for again; does it have RC "
+            "input?"
+        )
+    return values[name]
+
+
+def stick_settings(values: Mapping[str, float]) -> Iterator[StickSetting]:
+    """Yield parameters that can turn our sticks, or let them operate a switch.
+
+    The bits of SIMPLE_NAMES belong to positions of the pilot's mode switch, which may move at any
+    time. Simple mode turns by the heading at arming, which is not reported and so cannot be mapped.
+    """
+    yield StickSetting("SIMPLE", f"{TURNED}the heading at arming", lambda bits: bits == 0, 0)
+    yield StickSetting("SUPER_SIMPLE", f"{TURNED}the way home", lambda bits: bits == 0, 0)
+    sticks = {values[name]: name for name in map("RCMAP_{}".format, STICKS) if name in values}
+    for number in sorted({*OPTION_CHANNELS, *map(int, sticks)}):
+        name = f"RC{number}_OPTION"
+        if number in sticks:
+            effect = f"the stick of {sticks[number]} would work a switch"
+            yield StickSetting(name, effect, lambda option: option == 0, 0)
+        else:
+            effect = f"with that switch, {TURNED}the heading at arming or of the way home"
+            yield StickSetting(name, effect, lambda option: option not in _SIMPLE_OPTIONS, 0)
+    channel = values.get("FLTMODE_CH", 0)
+    yield StickSetting(
+        "FLTMODE_CH",
+        f"the stick of {sticks.get(channel)} would change the flight mode",
+        lambda number: number not in sticks,
+        next((number for number in range(5, 9) if number not in sticks), 0),
+    )
+
+
+def is_simple_setting(name: str, value: float) -> bool:
+    """True if this parameter can put the vehicle into Simple mode."""
+    is_option = name.endswith("_OPTION") and value in _SIMPLE_OPTIONS
+    return is_option or (name in SIMPLE_NAMES and value != 0)

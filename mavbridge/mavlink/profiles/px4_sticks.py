@@ -16,9 +16,8 @@ from mavbridge.mavlink.profiles.sticks import (
     Axis,
     Bend,
     Half,
+    Lean,
     StickCurves,
-    VehicleCurves,
-    VehicleLean,
     curves_between,
     unusable,
 )
@@ -76,11 +75,9 @@ def px4_curves(values: Mapping[str, float], mode: str, gains: StickGains | None)
     throttle = Axis(half("MPC_Z_VEL_MAX_UP", climb), half("MPC_Z_VEL_MAX_DN", climb))
     return curves_between(
         gains,
-        VehicleCurves(
-            throttle=throttle if mode == _CLIMB_MODE else None,
-            yaw=Axis.even(half("MPC_MAN_Y_MAX", _expo(values, "MPC_YAW_EXPO"))),
-            lean=_lean(values["MPC_MAN_TILT_MAX"], is_tangent=mode == _CLIMB_MODE),
-        ),
+        throttle=throttle if mode == _CLIMB_MODE else None,
+        yaw=Axis.even(half("MPC_MAN_Y_MAX", _expo(values, "MPC_YAW_EXPO"))),
+        lean=_lean(values["MPC_MAN_TILT_MAX"], is_tangent=mode == _CLIMB_MODE),
     )
 
 
@@ -89,9 +86,9 @@ def _expo(values: Mapping[str, float], name: str) -> Bend | None:
     return CubicExpo(expo) if expo >= _LEAST_EXPO else None
 
 
-def _lean(tilt_deg: float, *, is_tangent: bool) -> VehicleLean:
+def _lean(tilt_deg: float, *, is_tangent: bool) -> Lean:
     """Return the lean: no dead zone; an acceleration in ALTCTL, a tilt in STABILIZED."""
     tilt_deg = min(tilt_deg, _MAX_TILT_DEG)
     full = math.tan(math.radians(tilt_deg)) if is_tangent else tilt_deg
     axis = Axis.even(Half(full))
-    return VehicleLean(axis, axis, full, is_tangent, "MPC_MAN_TILT_MAX")
+    return Lean(axis, axis, full, is_tangent, "MPC_MAN_TILT_MAX")

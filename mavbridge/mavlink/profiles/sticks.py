@@ -109,14 +109,6 @@ class AxisMap(NamedTuple):
     policy: Axis
     vehicle: Axis
 
-    def to_vehicle(self, stick: float) -> float:
-        """Return the vehicle's stick for the policy's."""
-        return self.vehicle.stick(self.policy.motion(stick))
-
-    def to_policy(self, stick: float) -> float:
-        """Return the policy's stick for the vehicle's."""
-        return self.policy.stick(self.vehicle.motion(stick))
-
     def saturates(self, stick: float) -> bool:
         """True if the policy's stick demands more than the vehicle can do."""
         motion = self.policy.motion(stick)
@@ -124,60 +116,56 @@ class AxisMap(NamedTuple):
         return abs(motion) > half.full * (1.0 + _ROUNDING)
 
 
-class VehicleLean(NamedTuple):
-    """Pitch and roll of the vehicle; their combined lean is limited to a circle."""
+class Lean(NamedTuple):
+    """Pitch and roll; their combined lean is limited to a circle."""
 
     pitch: Axis
     """Unit of ``pitch``, ``roll`` and ``full``: degrees, or the tangent of the lean."""
     roll: Axis
     full: float
-    is_tangent: bool
+    is_tangent: bool = False
     """True if sticks command an acceleration, and so the tangent of a lean."""
-    parameter: str
+    parameter: str = ""
 
     @property
     def full_deg(self) -> float:
         """Largest lean."""
         return math.degrees(math.atan(self.full)) if self.is_tangent else self.full
 
-    def is_like(self, policy: Axis) -> bool:
+    def is_like(self, policy: "Lean") -> bool:
         """True if the lean is so close to the policy's that its sticks need no mapping."""
-        return not self.is_tangent and self.pitch.is_like(policy) and self.roll.is_like(policy)
+        is_near = self.pitch.is_like(policy.pitch) and self.roll.is_like(policy.roll)
+        return not self.is_tangent and is_near
+
+    def motion_deg(self, pitch: float, roll: float) -> tuple[float, float]:
+        """Return the leans for these sticks."""
+        pitch, roll = _within(self.full, self.pitch.motion(pitch), self.roll.motion(roll))
+        if self.is_tangent:
+            return math.degrees(math.atan(pitch)), math.degrees(math.atan(roll))
+        return pitch, roll
+
+    def in_own_unit(self, pitch_deg: float, roll_deg: float) -> tuple[float, float]:
+        """Return leans in the unit of ``full``."""
+        if self.is_tangent:
+            return math.tan(math.radians(pitch_deg)), math.tan(math.radians(roll_deg))
+        return pitch_deg, roll_deg
+
+    def sticks(self, pitch_deg: float, roll_deg: float) -> tuple[float, float]:
+        """Return the sticks for these leans."""
+        pitch, roll = _within(self.full, *self.in_own_unit(pitch_deg, roll_deg))
+        return self.pitch.stick(pitch), self.roll.stick(roll)
 
 
 class LeanMap(NamedTuple):
     """Map of pitch and roll."""
 
-    policy: Axis
-    """Lean of each stick [degrees]; the combined lean is limited to its full value."""
-    vehicle: VehicleLean
-
-    def to_vehicle(self, pitch: float, roll: float) -> tuple[float, float]:
-        """Return the vehicle's pitch and roll sticks for the policy's."""
-        vehicle = self.vehicle
-        pitch, roll = _within(vehicle.full, *self._asked(pitch, roll))
-        return vehicle.pitch.stick(pitch), vehicle.roll.stick(roll)
-
-    def to_policy(self, pitch: float, roll: float) -> tuple[float, float]:
-        """Return the policy's pitch and roll sticks for the vehicle's."""
-        vehicle, policy = self.vehicle, self.policy
-        pitch, roll = _within(vehicle.full, vehicle.pitch.motion(pitch), vehicle.roll.motion(roll))
-        if vehicle.is_tangent:
-            pitch, roll = math.degrees(math.atan(pitch)), math.degrees(math.atan(roll))
-        pitch, roll = _within(policy.above.full, pitch, roll)
-        return policy.stick(pitch), policy.stick(roll)
+    policy: Lean
+    vehicle: Lean
 
     def saturates(self, pitch: float, roll: float) -> bool:
         """True if the policy's sticks demand more lean than the vehicle has."""
-        return math.hypot(*self._asked(pitch, roll)) > self.vehicle.full * (1.0 + _ROUNDING)
-
-    def _asked(self, pitch: float, roll: float) -> tuple[float, float]:
-        """Return the lean that the policy's sticks demand, in the vehicle's unit."""
-        policy = self.policy
-        pitch, roll = _within(policy.above.full, policy.motion(pitch), policy.motion(roll))
-        if self.vehicle.is_tangent:
-            return math.tan(math.radians(pitch)), math.tan(math.radians(roll))
-        return pitch, roll
+        asked = self.vehicle.in_own_unit(*self.policy.motion_deg(pitch, roll))
+        return math.hypot(*asked) > self.vehicle.full * (1.0 + _ROUNDING)
 
 
 def _within(full: float, pitch: float, roll: float) -> tuple[float, float]:
@@ -219,17 +207,7 @@ class StickCurves:
 
     def to_vehicle(self, sticks: Sticks) -> Sticks:
         """Return the vehicle's sticks for the policy's; centred within the policy's dead zone."""
-        if self.is_identity:
-            return sticks
-        throttle, yaw, pitch, roll = sticks
-        if self.lean is not None:
-            pitch, roll = self.lean.to_vehicle(pitch, roll)
-        return Sticks(
-            throttle=throttle if self.throttle is None else self.throttle.to_vehicle(throttle),
-            yaw=yaw if self.yaw is None else self.yaw.to_vehicle(yaw),
-            pitch=pitch,
-            roll=roll,
-        )
+        return self._mapped(sticks, 1)
 
     def to_policy(self, sticks: Sticks) -> Sticks:
         """Return the policy's sticks for the motion that the vehicle's sticks cause.
@@ -237,17 +215,23 @@ class StickCurves:
         The inverse of ``to_vehicle``, for sticks as sent and for the pilot's. Motion beyond the
         policy's range becomes its full stick.
         """
+        return self._mapped(sticks, -1)
+
+    def _mapped(self, sticks: Sticks, order: Literal[1, -1]) -> Sticks:
+        """Map by each pair of curves, from the first to the second, or back (-1)."""
         if self.is_identity:
             return sticks
         throttle, yaw, pitch, roll = sticks
+        if self.throttle is not None:
+            before, after = self.throttle[::order]
+            throttle = after.stick(before.motion(throttle))
+        if self.yaw is not None:
+            before, after = self.yaw[::order]
+            yaw = after.stick(before.motion(yaw))
         if self.lean is not None:
-            pitch, roll = self.lean.to_policy(pitch, roll)
-        return Sticks(
-            throttle=throttle if self.throttle is None else self.throttle.to_policy(throttle),
-            yaw=yaw if self.yaw is None else self.yaw.to_policy(yaw),
-            pitch=pitch,
-            roll=roll,
-        )
+            leaning, leant = self.lean[::order]
+            pitch, roll = leant.sticks(*leaning.motion_deg(pitch, roll))
+        return Sticks(throttle=throttle, yaw=yaw, pitch=pitch, roll=roll)
 
     def saturated(self, sticks: Sticks) -> tuple[str, ...]:
         """Return the names of sticks that demand more than the vehicle can do, in Sticks' order."""
@@ -257,7 +241,7 @@ class StickCurves:
         if self.yaw is not None and self.yaw.saturates(sticks.yaw):
             names += ("yaw",)
         if self.lean is not None and self.lean.saturates(sticks.pitch, sticks.roll):
-            motion = self.lean.policy.motion
+            motion = self.lean.policy.pitch.motion
             names += ("pitch",) if motion(sticks.pitch) else ()
             names += ("roll",) if motion(sticks.roll) else ()
         return names
@@ -266,38 +250,34 @@ class StickCurves:
 IDENTITY = StickCurves()
 
 
-class VehicleCurves(NamedTuple):
-    """Motion of one vehicle for its sticks in one flight mode."""
+def curves_between(
+    gains: StickGains, *, throttle: Axis | None, yaw: Axis, lean: Lean
+) -> StickCurves:
+    """Return the map from a policy's sticks to a vehicle's; sticks that need none stay unmapped.
 
-    throttle: Axis | None
-    """Climb rate [m/s], + up; None if the stick has another meaning."""
-    yaw: Axis
-    """Yaw rate [degrees/s], + nose right."""
-    lean: VehicleLean
-
-
-def curves_between(gains: StickGains, vehicle: VehicleCurves) -> StickCurves:
-    """Return the map from a policy's sticks to a vehicle's; sticks that need none stay unmapped."""
-    yaw = AxisMap(Axis.even(Half(gains.yaw_rate_degps, gains.yaw_dead_zone)), vehicle.yaw)
-    lean = LeanMap(Axis.even(Half(gains.lean_deg, gains.lean_dead_zone)), vehicle.lean)
-    throttle = None
-    if vehicle.throttle is not None:
+    Args:
+        gains: meaning of the policy's sticks.
+        throttle: climb rate [m/s] of the vehicle, + up; None if the stick has another meaning.
+        yaw: yaw rate [degrees/s], + nose right.
+        lean: lean of the vehicle.
+    """
+    turns = AxisMap(Axis.even(Half(gains.yaw_rate_degps, gains.yaw_dead_zone)), yaw)
+    leans = Axis.even(Half(gains.lean_deg, gains.lean_dead_zone))
+    leaning = LeanMap(Lean(leans, leans, gains.lean_deg), lean)
+    climbs = None
+    if throttle is not None:
         dead_zone = gains.throttle_dead_zone
         climb, descent = Half(gains.climb_mps, dead_zone), Half(gains.descent_mps, dead_zone)
-        throttle = AxisMap(Axis(climb, descent), vehicle.throttle)
+        climbs = AxisMap(Axis(climb, descent), throttle)
     return StickCurves(
-        throttle=None if throttle is None or _is_same(throttle) else throttle,
-        yaw=None if _is_same(yaw) else yaw,
-        lean=None if lean.vehicle.is_like(lean.policy) else lean,
-        shortfalls=(*_axis_notes(throttle, yaw), *_lean_notes(lean)),
+        throttle=None if climbs is None or climbs.vehicle.is_like(climbs.policy) else climbs,
+        yaw=None if yaw.is_like(turns.policy) else turns,
+        lean=None if lean.is_like(leaning.policy) else leaning,
+        shortfalls=tuple(_notes(climbs, turns, leaning)),
     )
 
 
-def _is_same(axis: AxisMap) -> bool:
-    return axis.vehicle.is_like(axis.policy)
-
-
-def _axis_notes(throttle: AxisMap | None, yaw: AxisMap) -> Iterator[tuple[Quantity, str]]:
+def _notes(throttle: AxisMap | None, yaw: AxisMap, lean: LeanMap) -> Iterator[tuple[Quantity, str]]:
     if throttle is not None:
         up, down = throttle.vehicle
         yield from _note("climb", "climbs", "m/s", throttle.policy.above, up.full, up.parameter)
@@ -306,11 +286,10 @@ def _axis_notes(throttle: AxisMap | None, yaw: AxisMap) -> Iterator[tuple[Quanti
         )
     right = yaw.vehicle.above
     yield from _note("yaw rate", "turns", "deg/s", yaw.policy.above, right.full, right.parameter)
-
-
-def _lean_notes(lean: LeanMap) -> Iterator[tuple[Quantity, str]]:
-    vehicle = lean.vehicle
-    yield from _note("lean", "leans", "deg", lean.policy.above, vehicle.full_deg, vehicle.parameter)
+    policy, vehicle = lean
+    yield from _note(
+        "lean", "leans", "deg", policy.pitch.above, vehicle.full_deg, vehicle.parameter
+    )
 
 
 def _note(

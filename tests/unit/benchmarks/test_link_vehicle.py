@@ -14,7 +14,7 @@ from mavbridge.core.clock import NS_PER_MS
 from mavbridge.core.vehicle import Sticks
 from mavbridge.mavlink.outputs.echo import DITHER_STEP_NS, EchoCheck
 from mavbridge.mavlink.outputs.sticks import OVERRIDE_ECHO
-from mavbridge.mavlink.profiles.ardupilot_params import calibration
+from mavbridge.mavlink.profiles.ardupilot_sticks import calibration
 
 DITHER_LEVELS = 3
 

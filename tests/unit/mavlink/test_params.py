@@ -5,14 +5,15 @@ from typing import Any
 import pytest
 from pymavlink.dialects.v20 import ardupilotmega as dialect
 
-from helpers.parameters import NAMES, ParamVehicle, lossy, status
+from helpers.parameters import NAMES, ParamVehicle, lossy
 from helpers.wire import CALIBRATION
 from mavbridge.core.clock import NS_PER_S
 from mavbridge.core.reasons import Code, because
 from mavbridge.core.vehicle import Output, Risk
 from mavbridge.mavlink.codec.messages import CommandRequest, ParamValue, ParamWrite
-from mavbridge.mavlink.profiles import ardupilot_params
 from mavbridge.mavlink.profiles.ardupilot import ARDUPILOT
+from mavbridge.mavlink.profiles.ardupilot_sticks import calibration
+from mavbridge.mavlink.profiles.profile import ParamContext
 from mavbridge.mavlink.profiles.px4 import PX4
 from mavbridge.mavlink.session.params.checks import serial_dangers
 from mavbridge.mavlink.session.params.vehicle_params import ParamReader
@@ -42,15 +43,17 @@ def test_parameters_are_requested_a_few_at_a_time_and_again_when_lost() -> None:
         reader.receive(ParamValue(name=name, value=2.0))
     assert reader.is_done
     assert reader.values["P0"] == 2.0
+    reader.request(("ANGLE_MAX",))
+    assert len(list(reader.step(0))) == 1
+    reader.absent("ANGLE_MAX")  # the vehicle says that it lacks it
+    assert reader.is_done
 
 
 # --- the radio calibration
 
 
 def test_calibration_comes_from_the_vehicle() -> None:
-    ours = ardupilot_params.calibration(
-        CALIBRATION | {"RC2_REVERSED": 1.0, "RC2_TRIM": 1510.0, "RC1_DZ": 30.0}
-    )
+    ours = calibration(CALIBRATION | {"RC2_REVERSED": 1.0, "RC2_TRIM": 1510.0, "RC1_DZ": 30.0})
     assert ours.pitch.number == 2
     assert ours.pitch.is_reversed
     assert ours.pitch.trim_us == 1510
@@ -105,7 +108,8 @@ def test_a_calibration_that_the_codec_would_refuse_later_cannot_be_accepted(
 def test_obstacles_are_read_from_parameters(
     values: dict[str, float], source_system: int, expected: str | None
 ) -> None:
-    found = [note.text for note in ardupilot_params.override_obstacles(values, source_system)]
+    context = ParamContext("rc-override", source_system, None)
+    found = [note.text for note in ARDUPILOT.obstacles(values, context)]
     if expected is None:
         assert found == []
     else:
@@ -128,22 +132,20 @@ def test_a_risk_is_refused_until_it_is_accepted_or_mended(
     assert (problem.code, dict(problem.data)["risk"]) == (Code.RISK, risk)
     assert cure in str(problem)
     assert f"--set-config link.accept_risk={risk}" in str(problem)
+    refused.has_receiver = True  # which makes up for a disabled throttle failsafe
+    assert (refused.problem() is None) is (risk == "no-throttle-failsafe")
     for name in change:
         refused.set_by_pilot(name, 1.0)
     assert refused.problem() is None
 
     accepted = after_reading(ParamVehicle(change, accepted_risks=(risk,)))
     assert accepted.problem() is None
+    later = after_reading(ParamVehicle(accepted_risks=(risk,)))
+    later.armed = True
+    for name, value in change.items():
+        later.set_by_pilot(name, value)
+    assert (later.params.interruption, later.problem()) == (None, None)
     assert any(text.startswith(f"risk {risk} is accepted") for text in accepted.texts)
-
-
-def test_a_receiver_makes_up_for_a_disabled_throttle_failsafe() -> None:
-    vehicle = after_reading(ParamVehicle({"FS_THR_ENABLE": 0.0}))
-    problem = vehicle.problem()
-    assert dict(problem.data)["risk"] == "no-throttle-failsafe"
-    assert "no receiver was seen" in str(problem)
-    vehicle.has_receiver = True
-    assert vehicle.problem() is None
 
 
 def test_advice_is_given_once_and_waits_for_what_it_needs_to_know() -> None:
@@ -306,22 +308,6 @@ def test_other_changes_in_flight_do_not_interrupt(name: str, value: float) -> No
     assert (vehicle.params.interruption, vehicle.problem()) == (None, None)
 
 
-def test_an_accepted_risk_that_comes_true_in_flight_does_not_interrupt() -> None:
-    vehicle = after_reading(ParamVehicle(accepted_risks=("endless-override",)))
-    vehicle.armed = True
-    vehicle.set_by_pilot("RC_OVERRIDE_TIME", -1.0)
-    assert (vehicle.params.interruption, vehicle.problem()) == (None, None)
-
-
-def test_a_vehicle_that_is_met_in_flight_is_read_as_well() -> None:
-    vehicle = ParamVehicle()
-    vehicle.armed = True
-    vehicle.run(6.0)
-    assert vehicle.problem() is None
-    assert vehicle.params.calibration is not None
-    assert status(vehicle.armed, None).armed
-
-
 # --- outputs
 
 
@@ -370,12 +356,3 @@ def test_px4s_parameters_are_set_with_their_type_and_put_back() -> None:
     vehicle.run(3.0)
     assert vehicle.params.restore()
     assert (vehicle.values["COM_RC_IN_MODE"], vehicle.values["COM_RC_LOSS_T"]) == (0.0, 0.5)
-
-
-def test_a_name_that_the_vehicle_says_it_lacks_is_not_waited_for() -> None:
-    reader = ParamReader(("ANGLE_MAX", "ATC_ANGLE_MAX"))
-    assert len(list(reader.step(0))) == 2
-    reader.absent("ANGLE_MAX")
-    reader.receive(ParamValue("ATC_ANGLE_MAX", 30.0))
-    assert reader.is_done
-    assert reader.values == {"ATC_ANGLE_MAX": 30.0}

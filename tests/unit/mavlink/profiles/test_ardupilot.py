@@ -6,7 +6,7 @@ from pymavlink.dialects.v20 import ardupilotmega as dialect
 from mavbridge.core.vehicle import Output
 from mavbridge.mavlink.codec.messages import CommandRequest
 from mavbridge.mavlink.profiles.ardupilot import ARDUPILOT
-from mavbridge.mavlink.profiles.ardupilot_params import stick_settings
+from mavbridge.mavlink.profiles.ardupilot_sticks import stick_settings
 from mavbridge.mavlink.profiles.profile import ParamContext
 
 

@@ -5,9 +5,9 @@ import pytest
 from mavbridge.core.errors import PeerError, UserError
 from mavbridge.core.vehicle import ACTION_CLASSES, Output
 from mavbridge.mavlink.profiles.ardupilot import ARDUPILOT
-from mavbridge.mavlink.profiles.choice import require_profile
 from mavbridge.mavlink.profiles.profile import Profile
 from mavbridge.mavlink.profiles.px4 import PX4
+from mavbridge.mavlink.session.vehicle import require_profile
 
 OUTPUTS: tuple[Output, ...] = ("rc-override", "manual-control", "attitude", "rates", "velocity")
 

@@ -1,15 +1,16 @@
-"""A policy's sticks on an ArduCopter with other gains than those of its training."""
+"""A policy's sticks on vehicles with other gains than those of its training."""
 
 from collections.abc import Callable
 
 import pytest
 
-from helpers.stick_curves import copter_motion, copter_values, policy_motion
+from helpers.stick_curves import PX4_DEFAULTS, copter_motion, copter_values, policy_motion
 from mavbridge.core.vehicle import NEUTRAL, StickGains, Sticks
 from mavbridge.mavlink.profiles.ardupilot import ARDUPILOT
-from mavbridge.mavlink.profiles.ardupilot_params import calibration
-from mavbridge.mavlink.profiles.ardupilot_sticks import ardupilot_curves
-from mavbridge.mavlink.profiles.sticks import IDENTITY
+from mavbridge.mavlink.profiles.ardupilot_sticks import ardupilot_curves, calibration
+from mavbridge.mavlink.profiles.px4 import PX4
+from mavbridge.mavlink.profiles.px4_sticks import px4_curves
+from mavbridge.mavlink.profiles.sticks import IDENTITY, StickCurves
 from sitl.ardupilot.params import ArduPilotParams
 from sitl.vehicle.conditions import Conditions
 
@@ -32,9 +33,10 @@ def test_the_vehicle_of_the_training_gets_the_same_sticks() -> None:
     assert curves.to_policy(sticks) is sticks
 
 
-def test_a_radio_that_was_never_calibrated_changes_nothing_either() -> None:
+def test_a_radio_never_calibrated_and_an_ignored_expo_change_nothing_either() -> None:
     changed = {f"RC{number}_MIN": 1100.0 for number in range(1, 5)}
     changed |= {f"RC{number}_MAX": 1900.0 for number in range(1, 5)}
+    changed["PILOT_Y_EXPO"] = 1.0  # which the firmware ignores
     assert ardupilot_curves(copter_values(**changed), "ALT_HOLD", GAINS).is_identity
 
 
@@ -68,7 +70,9 @@ def test_a_policy_of_other_gains_gets_what_was_measured(
     assert rc.to_pwm_us(curves.to_vehicle(sticks)) == (pwm[3], pwm[4], pwm[2], pwm[1])
 
 
-@pytest.mark.parametrize("conditions", [HALF, TWICE], ids=["half", "twice"])
+@pytest.mark.parametrize(
+    "conditions", [HALF, TWICE, Conditions(pilot_yaw_expo=0.4)], ids=["half", "twice", "expo"]
+)
 def test_other_gains_give_the_motion_of_the_training(conditions: Conditions) -> None:
     curves = ardupilot_curves(values_of(conditions), "ALT_HOLD", GAINS)
     for sticks in (
@@ -110,6 +114,9 @@ def test_the_profile_has_read_all_that_the_curves_need() -> None:
     curves = ARDUPILOT.stick_curves(read, "ALT_HOLD", GAINS)
     assert curves == ardupilot_curves(values, "ALT_HOLD", GAINS)
     assert not curves.is_identity
+    values = PX4_DEFAULTS | {"MPC_YAW_EXPO": 0.3, "MPC_Z_MAN_EXPO": 0.4}
+    assert set(values) <= set(PX4.params)
+    assert PX4.stick_curves(values, "ALTCTL", GAINS) == px4_curves(values, "ALTCTL", GAINS)
 
 
 def test_the_newer_names_and_units_mean_the_same() -> None:
@@ -124,19 +131,6 @@ def test_the_newer_names_and_units_mean_the_same() -> None:
     assert moved[0].throttle < -0.4
 
 
-def test_a_yaw_stick_with_an_expo_is_straightened() -> None:
-    conditions = Conditions(pilot_yaw_expo=0.4)
-    curves = ardupilot_curves(values_of(conditions), "ALT_HOLD", GAINS)
-    for yaw in (-1.0, -0.5, 0.1, 0.7):
-        sticks = NEUTRAL._replace(yaw=yaw)
-        moved = copter_motion(curves.to_vehicle(sticks), conditions)
-        assert moved.yaw_degps == pytest.approx(policy_motion(sticks, GAINS).yaw_degps, abs=0.7)
-
-
-def test_an_expo_that_the_firmware_ignores_is_none() -> None:
-    assert ardupilot_curves(copter_values(PILOT_Y_EXPO=1.0), "ALT_HOLD", GAINS).is_identity
-
-
 def test_the_throttle_is_left_alone_in_stabilize_where_it_is_thrust() -> None:
     curves = ardupilot_curves(values_of(TWICE), "STABILIZE", GAINS)
     sticks = Sticks(throttle=0.7, yaw=0.4, pitch=0.3, roll=-0.2)
@@ -145,12 +139,6 @@ def test_the_throttle_is_left_alone_in_stabilize_where_it_is_thrust() -> None:
     assert moved.yaw < 0.25
     assert moved.pitch < 0.2
     assert curves.notes == ()
-
-
-@pytest.mark.parametrize("mode", ["LOITER", "POSHOLD", "ACRO", "SPORT", "DRIFT", "GUIDED", "17"])
-def test_in_other_modes_every_stick_is_left_alone(mode: str) -> None:
-    assert ardupilot_curves(values_of(TWICE), mode, GAINS) == IDENTITY
-    assert ardupilot_curves(values_of(TWICE), "ALT_HOLD", None) == IDENTITY  # raw
 
 
 def test_parameters_that_are_missing_or_zero_leave_all_sticks_alone_and_are_named() -> None:
@@ -166,6 +154,34 @@ def test_parameters_that_are_missing_or_zero_leave_all_sticks_alone_and_are_name
     assert note.endswith("whatever they mean to it: PILOT_Y_RATE is 0")
     (note,) = ardupilot_curves({}, "ALT_HOLD", GAINS).notes
     assert "RCMAP_ROLL" in note
+    (note,) = px4_curves({}, "ALTCTL", GAINS).notes
+    assert note.endswith("MPC_Z_VEL_MAX_UP, MPC_Z_VEL_MAX_DN, MAN_DEADZONE")
+    curves = px4_curves(PX4_DEFAULTS | {"MPC_MAN_TILT_MAX": 0.0}, "ALTCTL", GAINS)
+    assert curves.is_identity
+    assert curves.notes[0].endswith("whatever they mean to it: MPC_MAN_TILT_MAX is 0")
+
+
+@pytest.mark.parametrize(
+    ("curves_of", "values", "usual", "modes"),
+    [
+        (
+            *(ardupilot_curves, values_of(TWICE), "ALT_HOLD"),
+            ("LOITER", "POSHOLD", "ACRO", "SPORT", "DRIFT", "GUIDED", "17"),
+        ),
+        (
+            *(px4_curves, PX4_DEFAULTS, "ALTCTL"),
+            ("POSCTL", "ACRO", "MANUAL", "OFFBOARD", "AUTO.LOITER"),
+        ),
+    ],
+)
+def test_in_other_modes_every_stick_is_left_alone(
+    curves_of: Callable[..., StickCurves],
+    values: dict[str, float],
+    usual: str,
+    modes: tuple[str, ...],
+) -> None:
+    assert all(curves_of(values, mode, GAINS) == IDENTITY for mode in modes)
+    assert curves_of(values, usual, None) == IDENTITY  # raw
 
 
 def test_dead_zones_follow_a_trim_off_the_middle_and_a_reversed_channel() -> None:
@@ -176,3 +192,65 @@ def test_dead_zones_follow_a_trim_off_the_middle_and_a_reversed_channel() -> Non
         pwm = rc.to_pwm_us(curves.to_vehicle(NEUTRAL._replace(roll=roll)))
         assert pwm[3] == 1600 + dead_us
     assert rc.to_pwm_us(curves.to_vehicle(NEUTRAL._replace(roll=1.0)))[3] == 1000
+
+
+# --- PX4
+
+
+@pytest.mark.parametrize(
+    ("stick", "position", "measure", "seen", "error"),
+    [
+        ("roll", 0.5, lambda motion: motion.roll_deg, 19.1, 0.3),
+        ("roll", 0.1, lambda motion: motion.roll_deg, 4.0, 0.05),
+        ("roll", 0.05, lambda motion: motion.roll_deg, 2.0, 0.05),
+        ("pitch", -0.5, lambda motion: motion.pitch_deg, -19.1, 0.3),
+        ("throttle", 0.2, lambda motion: motion.climb_mps, 0.15, 0.02),
+        ("throttle", 0.5, lambda motion: motion.climb_mps, 0.7, 0.02),
+        ("throttle", 1.0, lambda motion: motion.climb_mps, 2.9, 0.11),
+        ("throttle", -1.0, lambda motion: motion.climb_mps, -1.35, 0.16),
+        ("yaw", 0.5, lambda motion: motion.yaw_degps, 35.0, 1.0),
+        ("yaw", 0.1, lambda motion: motion.yaw_degps, 0.0, 0.0),
+        ("yaw", 1.0, lambda motion: motion.yaw_degps, 144.0, 6.5),
+    ],
+)
+def test_altctl_does_what_was_measured(
+    stick: str, position: float, measure: Callable[..., float], seen: float, error: float
+) -> None:
+    """MANUAL_CONTROL y 500 gave 19.1 degrees on the firmware, and so on."""
+    gains = StickGains(lean_deg=50.0, yaw_rate_degps=300.0, climb_mps=4.0, descent_mps=4.0)
+    curves = px4_curves(PX4_DEFAULTS, "ALTCTL", gains)
+    sent = NEUTRAL._replace(**{stick: position})
+    meant = curves.to_policy(sent)
+    assert measure(policy_motion(meant, gains)) == pytest.approx(seen, abs=error)
+    if position != 0.1 or stick != "yaw":
+        assert curves.to_vehicle(meant) == pytest.approx(sent)
+
+
+def test_stabilized_leans_in_proportion_as_was_measured() -> None:
+    curves = px4_curves(PX4_DEFAULTS, "STABILIZED", GAINS)
+    meant = curves.to_policy(Sticks(throttle=0.3, yaw=0.0, pitch=0.0, roll=0.5))
+    assert policy_motion(meant, GAINS).roll_deg == pytest.approx(17.2, abs=0.4)
+    assert meant.throttle == 0.3  # thrust
+
+
+def test_what_a_px4_cannot_do_is_said_at_once_and_named_stick_by_stick() -> None:
+    values = PX4_DEFAULTS | {"MPC_Z_VEL_MAX_UP": 1.2, "MPC_MAN_TILT_MAX": 20.0}
+    curves = px4_curves(values, "ALTCTL", GAINS)
+    names = ("MPC_Z_VEL_MAX_UP", "MPC_Z_VEL_MAX_DN", "MPC_MAN_Y_MAX", "MPC_MAN_TILT_MAX")
+    shares = ("0.58", "0.68", "0.75", "0.68")
+    for note, name, share in zip(curves.notes, names, shares, strict=True):
+        assert f"({name}): beyond {share} of the stick" in note
+    full = Sticks(throttle=1.0, yaw=1.0, pitch=0.0, roll=-1.0)
+    assert curves.saturated(full) == ("throttle", "yaw", "roll")
+    assert curves.to_vehicle(full) == full
+    back = curves.to_policy(full)
+    assert back == pytest.approx((0.584, 0.75111, 0.0, -0.68), abs=1e-5)
+
+
+def test_older_versions_have_expos_of_their_own_and_another_name_of_the_dead_zone() -> None:
+    old = {name: value for name, value in PX4_DEFAULTS.items() if name != "MAN_DEADZONE"}
+    old |= {"MPC_HOLD_DZ": 0.2, "MPC_YAW_EXPO": 0.0, "MPC_Z_MAN_EXPO": 1.0}
+    curves = px4_curves(old, "ALTCTL", StickGains(yaw_rate_degps=150.0, yaw_dead_zone=0.2))
+    assert curves.yaw is None  # a straight line, as the policy's
+    sticks = NEUTRAL._replace(throttle=0.2 + 0.8 * 3.0 / 2.5 / 8.0)  # an eighth of 3 m/s
+    assert curves.to_vehicle(sticks).throttle == pytest.approx(0.2 + 0.8 * 0.5)
