@@ -16,7 +16,7 @@ from mavbridge.flight.history import SentHistory
 from mavbridge.flight.state import Freshness
 from mavbridge.flight.telemetry_cache import TelemetryCache
 from mavbridge.guard.channel import SocketPort
-from mavbridge.mavlink.codec.frames import split_frames
+from mavbridge.mavlink.codec.frames import frame_at
 from mavbridge.mavlink.codec.readers import IDS
 from mavbridge.mavlink.transport.packet_pipe import PacketPipe
 from mavbridge.observe.report_table import rate_style, shown_rate
@@ -64,8 +64,8 @@ class PilotView(TelemetryCache):
             for packet in packets:
                 if self._log is not None:
                     self._log.put(Packet(packet.arrived_ns, packet.data))
-                frames, _ = split_frames(packet.data)
-                if frames and frames[0].message_id == stick_id:
+                frame = frame_at(packet.data, 0)
+                if frame is not None and frame.message_id == stick_id:
                     self.sticks_ns = packet.arrived_ns
                     self.stick_packets += 1
 

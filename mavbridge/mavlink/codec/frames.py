@@ -61,19 +61,6 @@ def checksum(data: bytes, crc_extra: int) -> bytes:
     return crc.to_bytes(CHECKSUM_BYTES, "big").translate(_MIRRORED)
 
 
-def split_frames(data: bytes) -> tuple[list[RawPacket], bool]:
-    """Return the packets of a datagram, and True if other bytes were left over."""
-    frames: list[RawPacket] = []
-    at = 0
-    while at < len(data):
-        frame = frame_at(data, at)
-        if frame is None:
-            return frames, True
-        frames.append(frame)
-        at += len(frame.data)
-    return frames, False
-
-
 def frame_at(data: bytes | mmap, at: int) -> RawPacket | None:
     """Return the packet that begins at ``at``; None if there is no complete one."""
     room = len(data) - at

@@ -37,8 +37,8 @@ _TEXT_BYTES = 50
 _TEXT_CHUNKS = 4
 
 MOST_DATAGRAM_BYTES = 4096
-"""Bytes that are decoded of one datagram: more than any autopilot or router sends in one. The
-largest UDP datagram would take several milliseconds."""
+"""Bytes that are decoded of one datagram: more than any autopilot or router sends in one. The worst
+case takes 0.7 ms; the largest UDP datagram would take 10 ms."""
 _OVERRIDE = dialect.MAVLink_rc_channels_override_message
 _OVERRIDE_PAYLOAD = struct.Struct("<8H2B")
 """Channels 1 to 8, target system and component. Channels 9 to 18 are zeros, which are truncated."""

@@ -52,6 +52,8 @@ class StickOutput(ActionOutput):
         """Cached conversion: status of the vehicle, curves, status in the policy's terms."""
         self._new_notes: list[str] = []
         self._told: set[str] = set()
+        self._status: VehicleStatus | None = None
+        """Last status of the vehicle, kept when its session restarts."""
 
     def restart(self) -> None:
         """Start a new session, with its own parameters and mode."""
@@ -72,6 +74,7 @@ class StickOutput(ActionOutput):
         self, status: VehicleStatus | None, vehicle: VehicleSession, now_ns: int
     ) -> VehicleStatus | None:
         """Return the status with its sticks converted to the policy's."""
+        self._status = status or self._status
         if self._gains is None or status is None:
             return status
         curves = self._curves_of(vehicle, status.mode, now_ns)
@@ -154,8 +157,6 @@ class OverrideOutput(StickOutput):
         """Calibration of the last override, for its release even after a reboot."""
         self._last: Shown = (0, 0, 0, 0)
         """Last override [us]: throttle, yaw, pitch, roll."""
-        self._status: VehicleStatus | None = None
-        """Last status of the vehicle, kept when its session restarts."""
 
     def encode(self, action: Action, vehicle: VehicleSession, now_ns: int) -> Encoded | None:
         """Encode the override of the four sticks; return None without a calibration."""
@@ -183,13 +184,6 @@ class OverrideOutput(StickOutput):
             pwm_us = vehicle.calibration.stick_channels_us(body.channels_us)
             if pwm_us is not None:
                 self.echo.received(pwm_us, body.boot_us, arrived_ns)
-
-    def in_policy_terms(
-        self, status: VehicleStatus | None, vehicle: VehicleSession, now_ns: int
-    ) -> VehicleStatus | None:
-        """Return the status with its sticks converted to the policy's."""
-        self._status = status or self._status
-        return super().in_policy_terms(status, vehicle, now_ns)
 
     def last_sticks(self, vehicle: VehicleSession, now_ns: int) -> Encoded | None:
         """Level an armed vehicle without a receiver, with the last throttle in thrust modes.
@@ -292,8 +286,6 @@ class ManualControlOutput(StickOutput):
         """Arrival of the sticks that the vehicle acts on, and those sticks."""
         self._pilot: Sticks | None = None
         """Sticks that the vehicle acted on when they were not ours."""
-        self._status: VehicleStatus | None = None
-        """Last status of the vehicle, kept when its session restarts."""
 
     def sent(self, encoded: Encoded, vehicle: VehicleSession, now_ns: int) -> None:
         """Note sticks that were sent."""
@@ -334,7 +326,6 @@ class ManualControlOutput(StickOutput):
         self, status: VehicleStatus | None, vehicle: VehicleSession, now_ns: int
     ) -> VehicleStatus | None:
         """Return the status with the sticks of MANUAL_CONTROL, never those of RC_CHANNELS."""
-        self._status = status or self._status
         if status is not None and self._shown is not None:
             arrived_ns, sticks = self._shown
             status = replace(

@@ -1,7 +1,7 @@
 """Condition of the vehicle apart from its motion: mode, receiver, estimator, landing, battery."""
 
 import sys
-from typing import TypeAlias
+from typing import TypeAlias, TypeVar
 
 from pymavlink.dialects.v20 import ardupilotmega as dialect
 
@@ -22,6 +22,7 @@ from mavbridge.mavlink.codec.messages import (
 )
 from mavbridge.mavlink.profiles.profile import Profile
 
+_T = TypeVar("_T")
 ConditionMessage: TypeAlias = (
     Heartbeat
     | CurrentMode
@@ -187,14 +188,11 @@ class VehicleCondition:
 
     def amsl_m(self, now_ns: int) -> float | None:
         """Return the height above mean sea level; None without a fresh one."""
-        if self._altitude is None or now_ns - self._altitude[0] > SLOW_FRESH_NS:
-            return None
-        return self._altitude[1]
+        return _fresh(self._altitude, now_ns)
 
     def _flags(self, now_ns: int) -> int | None:
-        if self._estimator is None or now_ns - self._estimator[0] > SLOW_FRESH_NS:
-            return None
-        return self._estimator[1].flags
+        estimator = _fresh(self._estimator, now_ns)
+        return None if estimator is None else estimator.flags
 
     def status(self, now_ns: int) -> VehicleStatus | None:
         """Return the vehicle's status; None before its first heartbeat."""
@@ -252,26 +250,27 @@ class VehicleCondition:
         """Return the position if valid: some firmware also sends one without an estimate."""
         is_trusted = is_valid is None and not self._profile.sends_invalid_estimates
         is_good = is_valid is True or is_trusted
-        if self._position is None or not is_good:
-            return None
-        arrived_ns, body = self._position
-        return body.position_ned_m if now_ns - arrived_ns <= POSITION_FRESH_NS else None
+        position = _fresh(self._position, now_ns, POSITION_FRESH_NS) if is_good else None
+        return None if position is None else position.position_ned_m
 
     def _is_landed(self, now_ns: int) -> bool | None:
-        if self._landed is None or now_ns - self._landed[0] > SLOW_FRESH_NS:
+        landed = _fresh(self._landed, now_ns)
+        if landed is None or landed.landed_state == dialect.MAV_LANDED_STATE_UNDEFINED:
             return None
-        state = self._landed[1].landed_state
-        if state == dialect.MAV_LANDED_STATE_UNDEFINED:
-            return None
-        return bool(state == dialect.MAV_LANDED_STATE_ON_GROUND)
+        return bool(landed.landed_state == dialect.MAV_LANDED_STATE_ON_GROUND)
 
     def _battery_problem(self, now_ns: int) -> Reason | None:
-        if self._system is None or now_ns - self._system[0] > SLOW_FRESH_NS:
+        if (system := _fresh(self._system, now_ns)) is None:
             return None
-        system, bit = self._system[1], dialect.MAV_SYS_STATUS_SENSOR_BATTERY
+        bit = dialect.MAV_SYS_STATUS_SENSOR_BATTERY
         if system.present & bit and not system.healthy & bit:
             return because(Code.BATTERY)
         if 0 <= system.battery_percent < self._min_battery_percent:
             percent, limit = system.battery_percent, self._min_battery_percent
             return because(Code.BATTERY_BELOW, percent=percent, limit=limit)
         return None
+
+
+def _fresh(told: tuple[int, _T] | None, now_ns: int, most_ns: int = SLOW_FRESH_NS) -> _T | None:
+    """Return what was told, with its arrival [ns], unless it is too old."""
+    return told[1] if told is not None and now_ns - told[0] <= most_ns else None

@@ -1,6 +1,6 @@
 """The link against a vehicle made of bytes, on a virtual clock."""
 
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from random import Random
 from typing import Any
 
@@ -17,7 +17,6 @@ from mavbridge.core.reasons import Code, because
 from mavbridge.core.vehicle import (
     IDLE,
     ActionMeaning,
-    AttitudeThrust,
     Command,
     ForwardedPacket,
     LinkSnapshot,
@@ -57,8 +56,6 @@ class Vehicle:
         self.params = dict(PARAMS)
         self.mode, self.armed = 2, False
         self.channels = [1500, 1500, 1000, 1500, 1500, 1500, 1500, 1500]
-        self.follows_overrides = True
-        self.shows_rc = True
         self.is_down = False
         self.is_deaf = False
         self.open_error: UserError | None = None
@@ -68,8 +65,6 @@ class Vehicle:
         self.boot_ns = clock.now_ns()
         self.pace = 1.0
         self.is_alive = True
-        self.results: dict[tuple[int, float | None], int] = {}
-        """MAV_RESULT of commands, and of modes by their number."""
 
     # transport
 
@@ -123,20 +118,12 @@ class Vehicle:
             case "PARAM_REQUEST_READ" if message.param_id in self.params:
                 value = self.params[message.param_id]
                 self.put(mav.param_value_encode(message.param_id.encode(), value, 9, 99, 0))
-            case "PARAM_SET":
-                self.params[message.param_id] = message.param_value
-                value = message.param_value
-                self.put(mav.param_value_encode(message.param_id.encode(), value, 9, 99, 0))
             case "COMMAND_LONG":
-                key = (message.command, message.param2 if message.command == 176 else None)
-                self.put(mav.command_ack_encode(message.command, self.results.get(key, 0)))
+                self.put(mav.command_ack_encode(message.command, 0))
             case "TIMESYNC":
                 tc1 = round(self.pace * (self.clock.now_ns() - self.boot_ns))
                 self.put(mav.timesync_encode(tc1, message.ts1))
-            case "MANUAL_CONTROL" if self.follows_overrides:
-                x, y, z, r = message.x, message.y, message.z, message.r
-                self.put(mav.manual_control_encode(1, x, y, z, r, 0))
-            case "RC_CHANNELS_OVERRIDE" if self.follows_overrides:
+            case "RC_CHANNELS_OVERRIDE":
                 for k in range(8):
                     value = getattr(message, f"chan{k + 1}_raw")
                     if value not in (0, 65535):
@@ -150,7 +137,7 @@ class Vehicle:
         self.put(mav.attitude_quaternion_encode(ms, 1, 0, 0, 0, 0, 0, 0))
         self.put(mav.local_position_ned_encode(ms, 0, 0, 0, 0, 0, 0))
         self.put(mav.highres_imu_encode(1000 * ms, 0, 0, -9.81, *[0.0] * 10, 8191))
-        if tick % 2 == 0 and self.shows_rc:
+        if tick % 2 == 0:
             self.put(mav.rc_channels_encode(ms, 8, *self.channels, *[0] * 10, 255))
 
     def names(self) -> list[str]:
@@ -165,6 +152,7 @@ class Rig:
         *,
         meaning: ActionMeaning | None = ActionMeaning(),  # noqa: B008 - frozen
         output: Output | None = None,
+        keeps_packets: bool = True,
         **config: Any,
     ) -> None:
         self.clock = FakeClock()
@@ -177,7 +165,7 @@ class Rig:
             self.clock,
             LinkSettings(connect="udp:127.0.0.1:14550", **config),
             packet_log=self.packet_log,
-            keeps_packets=True,
+            keeps_packets=keeps_packets,
         )
         if meaning is not None:
             self.link.begin_flight(meaning, output)
@@ -293,19 +281,6 @@ def test_commands_are_echoed_and_confirmed() -> None:
     assert rig.link.stats().echo_confirmed is True
 
 
-def test_a_parameter_is_set_over_the_wire_also_after_a_reboot() -> None:
-    rig = Rig(set_params=(("RC_OVERRIDE_TIME", 0.5),))
-    assert rig.run(8.0).problem is None
-    assert rig.vehicle.params["RC_OVERRIDE_TIME"] == 0.5
-    assert "RC_OVERRIDE_TIME set from 3 to 0.5 for this flight" in rig.texts
-    rig.vehicle.boot_ns = rig.clock.now_ns()
-    assert rig.run(8.0).problem is None
-    assert not rig.link.restore()
-    rig.run(1.0)
-    assert rig.link.restore()
-    assert rig.vehicle.params["RC_OVERRIDE_TIME"] == rig.link.known_params["RC_OVERRIDE_TIME"] == 3
-
-
 def test_a_parameter_that_matters_and_changes_in_flight_is_an_interruption() -> None:
     rig = Rig().ready()
     rig.vehicle.armed = True
@@ -319,22 +294,6 @@ def test_a_parameter_that_matters_and_changes_in_flight_is_an_interruption() -> 
     assert rig.run(2.0, PILOTS).problem is None
     rig.run(0.1, Command(action=Sticks(0.0, 0.0, 0.0, 1.0)))
     assert rig.overrides()[-1][0] == pytest.approx(1950, abs=5)  # by the new calibration
-
-
-@pytest.mark.parametrize("resting_throttle_us", [1000, 1100])
-def test_a_vehicle_that_ignores_us_is_noticed(resting_throttle_us: int) -> None:
-    rig = Rig()
-    rig.vehicle.channels[2] = resting_throttle_us  # 1100: just where IDLE is
-    rig.vehicle.follows_overrides = False
-    rig.run(8.0)
-    assert rig.run(0.9, Command(action=IDLE)).problem is None
-    snapshot = rig.run(0.3, Command(action=IDLE))
-    assert snapshot.problem is not None
-    assert snapshot.problem.code is Code.OVERRULED
-    assert "another station may be overriding" in str(snapshot.problem)
-    assert snapshot.is_overruled
-    assert not snapshot.echo_confirmed
-    assert rig.link.stats().echo_confirmed is False
 
 
 def test_releases_leave_every_50_ms_while_they_are_asked_for_and_not_for_ever() -> None:
@@ -370,25 +329,6 @@ def test_a_release_that_could_not_be_sent_goes_before_everything_else() -> None:
     assert rig.overrides()[-2] == RELEASE_US != rig.overrides()[-1]
 
 
-@pytest.mark.parametrize("still_asked", [False, True])
-def test_a_release_is_the_first_packet_after_a_reopen(still_asked: bool) -> None:
-    rig = Rig().ready()
-    rig.run(0.2, Command(action=IDLE))
-    rig.vehicle.is_down = True
-    rig.run(0.02, Command(action=IDLE))  # now it is noticed
-    rig.run(0.01, PILOTS)
-    rig.run(2.5, PILOTS if still_asked else None)
-    count = len(rig.vehicle.received)
-    rig.vehicle.is_down = False
-    rig.run(1.2, PILOTS if still_asked else None)
-    names = rig.vehicle.names()[count:]
-    assert names[0] == "RC_CHANNELS_OVERRIDE"
-    assert "HEARTBEAT" in names
-    releases = rig.overrides()[20:]
-    assert all(release == RELEASE_US for release in releases)
-    assert len(releases) > 10 if still_asked else len(releases) == 1
-
-
 def test_sticks_that_could_not_be_sent_are_not_reported_as_sent() -> None:
     rig = Rig().ready()
     rig.run(0.2, Command(action=IDLE))
@@ -400,15 +340,12 @@ def test_sticks_that_could_not_be_sent_are_not_reported_as_sent() -> None:
     assert rig.link.stats().sent_overrides == 20
 
 
-def test_nothing_is_released_that_was_never_overridden() -> None:
-    rig = Rig().ready()
-    rig.run(1.0, PILOTS)
-    assert rig.overrides() == []
-
-
 def test_readonly_sends_no_stick() -> None:
-    rig = Rig(readonly=True).ready()
+    # Heard in time, it may settle; nobody records its packets.
+    rig = Rig(readonly=True, connect_timeout_s=0.1, keeps_packets=False).ready()
     rig.run(1.0, Command(action=IDLE))
+    assert rig.samples
+    assert rig.packets == []
     assert rig.overrides() == []
     rig.link.announce("mavbridge: the policy has control")
     rig.run(0.1)
@@ -426,10 +363,13 @@ def test_a_silent_vehicle_is_lost_after_three_beats_and_found_again() -> None:
 
 def test_a_lost_connection_to_the_same_peer_is_opened_again_once_a_second() -> None:
     rig = Rig().ready()
+    assert rig.link.fileno() == 7
     rig.vehicle.is_down = True
     rig.run(3.05)
-    assert rig.vehicle.opened == 1 + 3
-    rig.vehicle.is_down, rig.vehicle.answered_to = False, None
+    assert (rig.vehicle.opened, rig.link.fileno()) == (1 + 3, None)  # nothing to select on
+    rig.vehicle.is_down, rig.vehicle.open_error = False, UserError("port in use")
+    assert rig.run(3.0).problem == because(Code.CONNECTION_LOST)
+    rig.vehicle.open_error, rig.vehicle.answered_to = None, None
     assert rig.run(2.0).problem is None
     assert rig.vehicle.answered_to == ("127.0.0.1", 1)
     assert any("connection lost" in text for text in rig.texts)
@@ -452,30 +392,6 @@ def test_on_the_ground_a_vehicle_that_moves_is_followed_and_said_to_have_moved()
     assert told[0] != told[1]
 
 
-def test_in_flight_another_clock_elsewhere_is_not_followed() -> None:
-    rig = Rig().ready()
-    rig.link.is_engaged = True
-    rig.run(0.5, Command(action=IDLE))
-    rig.vehicle.address = ("127.0.0.1", 2)
-    rig.vehicle.boot_ns -= 5 * NS_PER_S
-    count = len(rig.packets)
-    snapshot = rig.run(9.0, Command(action=IDLE))
-    assert snapshot.interruption is not None
-    assert snapshot.interruption.code is Code.REPLACED
-    for part in ("127.0.0.1:1 is silent", "heard from 127.0.0.1:2", "engage again"):
-        assert part in str(snapshot.interruption)
-    assert rig.vehicle.answered_to == ("127.0.0.1", 1)
-    assert len(rig.packets) == count
-    attitude = snapshot.telemetry.ned_from_body_wxyz
-    assert attitude is not None
-    assert rig.clock.now_ns() - attitude.happened_ns >= 9 * NS_PER_S
-    rig.link.is_engaged = False
-    rig.run(1.0, PILOTS)
-    assert rig.vehicle.answered_to == ("127.0.0.1", 2)
-    assert rig.run(5.0).problem is None
-    assert rig.overrides()[-20:] == [RELEASE_US] * 20  # by the calibration of the last override
-
-
 @pytest.mark.parametrize("is_engaged", [False, True])
 def test_a_second_sender_with_the_vehicles_id_is_ignored_and_ends_no_flight(
     is_engaged: bool,
@@ -492,21 +408,6 @@ def test_a_second_sender_with_the_vehicles_id_is_ignored_and_ends_no_flight(
     told = [text for text in rig.texts if "10.0.0.9:4" in text]
     assert len(told) == 1
     assert "is ignored: the vehicle is at 127.0.0.1:1" in told[0]
-
-
-def test_a_reboot_ends_the_engagement_and_still_leaves_a_release() -> None:
-    rig = Rig().ready()
-    for interruptions in (1, 2):
-        rig.link.is_engaged = True
-        rig.run(0.2, Command(action=IDLE))
-        rig.vehicle.boot_ns = rig.clock.now_ns()
-        snapshot = rig.run(0.05, Command(action=IDLE))
-        assert snapshot.interruption == because(Code.REBOOTED)
-        assert snapshot.interruptions == interruptions
-        count = len(rig.overrides())
-        rig.run(0.2, PILOTS)
-        assert rig.overrides()[count:] == [RELEASE_US] * 4
-        assert rig.run(8.0).problem is None
 
 
 def test_mode_and_arm_are_not_requested_too_often_and_refusals_are_reported() -> None:
@@ -533,45 +434,8 @@ def test_mode_and_arm_are_not_requested_too_often_and_refusals_are_reported() ->
 def test_announcements_reach_the_vehicles_link() -> None:
     rig = Rig().ready()
     rig.link.announce("mavbridge flies")
-    rig.link.announce("mavbridge released: " + "x" * 60)
-    texts = [m for m in rig.vehicle.received if m.get_type() == "STATUSTEXT"]
-    assert [(m.severity, m.text) for m in texts] == [
-        (dialect.MAV_SEVERITY_NOTICE, "mavbridge flies"),
-        (dialect.MAV_SEVERITY_NOTICE, "mavbridge released: " + "x" * 30),
-        (dialect.MAV_SEVERITY_NOTICE, "x" * 30),
-    ]
-
-
-def ages_ms(rig: Rig, snapshot: LinkSnapshot) -> list[float]:
-    telemetry = snapshot.telemetry
-    readings = (
-        telemetry.ned_from_body_wxyz,
-        telemetry.rate_body_radps,
-        telemetry.velocity_ned_mps,
-        telemetry.specific_force_body_mps2,
-    )
-    assert all(reading is not None for reading in readings)
-    return [(rig.clock.now_ns() - r.happened_ns) / MS for r in readings if r is not None]
-
-
-@pytest.mark.parametrize("is_from_the_start", [True, False])
-def test_200_ms_of_delay_each_way_are_200_ms_of_age(is_from_the_start: bool) -> None:
-    rig = Rig()
-    if is_from_the_start:
-        rig.vehicle.delay_ns = 200 * MS
-    snapshot = rig.run(12.0)
-    assert snapshot.problem is None
-    assert rig.link.stats().is_timesync_good
-    if not is_from_the_start:
-        assert ages_ms(rig, snapshot) == [10] * 4  # the tick that has passed since
-        rig.vehicle.delay_ns = 200 * MS
-        snapshot = rig.run(0.2)
-        assert ages_ms(rig, snapshot) == [210] * 4
-        snapshot = rig.run(60.0)
-    assert ages_ms(rig, snapshot) == pytest.approx([210] * 4, abs=1)
-    error_ms = rig.link.stats().timesync_error_ms
-    assert error_ms is not None
-    assert error_ms == pytest.approx(205 if is_from_the_start else 12, abs=7)
+    (text,) = [m for m in rig.vehicle.received if m.get_type() == "STATUSTEXT"]
+    assert (text.severity, text.text) == (dialect.MAV_SEVERITY_NOTICE, "mavbridge flies")
 
 
 def test_a_slow_clock_is_told_once_and_explains_a_heartbeat_that_is_late() -> None:
@@ -605,48 +469,11 @@ def test_packets_and_samples_say_the_same() -> None:
     assert {"HEARTBEAT", "COMMAND_ACK", "PARAM_VALUE", "RC_CHANNELS", "TIMESYNC"} <= set(names)
 
 
-def test_packets_are_kept_for_a_recorder_alone() -> None:
-    rig = Rig()
-    link = MavlinkLink(rig.vehicle, rig.clock, LinkSettings(connect="udp:127.0.0.1:14550"))
-    for tick in range(300):
-        rig.vehicle.tick(tick)
-        samples, packets = link.receive()
-        link.service()
-        assert packets == ()
-        rig.clock.advance_ns(10 * MS)
-    assert samples
-
-
-def test_it_says_what_to_select_on_unless_the_connection_is_lost() -> None:
-    rig = Rig()
-    assert rig.link.fileno() == 7
-    rig.vehicle.is_down = True
-    rig.run(0.01)
-    assert rig.link.fileno() is None
-    rig.vehicle.is_down = False
-    rig.run(1.1)
-    assert rig.link.fileno() == 7
-
-
-def test_a_port_that_was_taken_meanwhile_is_waited_for() -> None:
-    rig = Rig().ready()
-    rig.vehicle.is_down = True
-    rig.run(0.1, Command(action=IDLE))
-    rig.vehicle.is_down, rig.vehicle.open_error = False, UserError("port in use")
-    assert rig.run(3.0, Command(action=IDLE)).problem is not None
-    rig.vehicle.open_error = None
-    assert rig.run(2.0).problem is None
-
-
 def test_no_vehicle_is_an_error_with_advice() -> None:
     rig = Rig(connect_timeout_s=2.0)
     rig.vehicle.is_alive = False
     with pytest.raises(PeerError, match=r"14550 after 2 s: .* without a heartbeat"):
         rig.run(3.0)
-
-
-def test_a_vehicle_heard_in_time_is_not_given_up_while_it_settles() -> None:
-    assert Rig(connect_timeout_s=0.1).run(8.0).problem is None
 
 
 def test_other_systems_on_the_link_are_ignored() -> None:
@@ -671,32 +498,6 @@ def px4_rig(**config: Any) -> Rig:
         lambda **options: beat(**(options | {"autopilot": 12, "mode": 2 << 16}))
     )
     return rig
-
-
-def test_px4_is_flown_with_manual_control_and_released_by_silence() -> None:
-    rig = px4_rig()
-    snapshot = rig.run(8.0)
-    assert snapshot.problem is None
-    assert snapshot.status is not None
-    assert snapshot.status.mode == "ALTCTL"
-    snapshot = rig.run(0.1, Command(action=IDLE))
-    assert snapshot.echo_confirmed
-    assert not snapshot.is_released
-    assert rig.run(0.5, PILOTS).is_released is False
-    assert rig.run(0.3, PILOTS).is_released
-    sticks = [m for m in rig.vehicle.received if m.get_type() == "MANUAL_CONTROL"]
-    assert len(sticks) == 10
-    assert rig.overrides() == []
-
-
-def test_where_nobody_else_has_sticks_px4_gets_neutral_ones_before_the_silence() -> None:
-    rig = px4_rig()
-    rig.vehicle.channels = [0] * 8
-    rig.run(8.0)
-    rig.run(0.1, Command(action=IDLE))
-    rig.run(0.5, PILOTS)
-    sticks = [m for m in rig.vehicle.received if m.get_type() == "MANUAL_CONTROL"]
-    assert [(m.x, m.y, m.z, m.r) for m in sticks[10:]] == [(0, 0, 500, 0)]
 
 
 def test_the_velocity_that_px4_sends_without_an_estimate_is_nobodys_velocity() -> None:
@@ -739,57 +540,15 @@ def test_only_px4_is_told_that_we_are_a_ground_station(is_px4: bool, kinds: set[
     assert (beats[-1] == dialect.MAV_TYPE_GCS) is is_px4
 
 
-@pytest.mark.parametrize("autopilot", ["ardupilot", "px4"])
-def test_setpoints_are_sent_as_such_and_their_silence_is_no_failsafe(autopilot: str) -> None:
-    meaning = ActionMeaning(kind="attitude", hover_thrust=0.4)
-    rig = px4_rig(meaning=meaning) if autopilot == "px4" else Rig(meaning=meaning)
-    rig.vehicle.params["GUID_OPTIONS"] = 8.0
-    snapshot = rig.run(9.0)
-    assert snapshot.problem is None
-    assert snapshot.echo_confirmed
-    assert not snapshot.modes.is_silence_failsafe
-    snapshot = rig.run(2.0, Command(action=AttitudeThrust(0.4, 0.1, 0.0, 0.0)))
-    assert (snapshot.problem, snapshot.echo_confirmed) == (None, True)  # in a mode with sticks
-    names = rig.vehicle.names()
-    assert names.count("SET_ATTITUDE_TARGET") == 200
-    assert rig.run(0.5, PILOTS).is_released
-    assert rig.vehicle.names().count("SET_ATTITUDE_TARGET") == 200
-    assert not {"MANUAL_CONTROL", "RC_CHANNELS_OVERRIDE"} & {*rig.vehicle.names()}
-
-
-@pytest.mark.parametrize(("make", "param7_m"), [(Rig, 5.0), (px4_rig, 494.4)])
-def test_a_takeoff_is_asked_for_once_a_second_as_the_firmware_wants_it(
-    make: Callable[[], Rig], param7_m: float
-) -> None:
-    rig = make().ready()
-    mav = rig.vehicle.end.mav
-    rig.link.commands.takeoff(5.0)  # PX4's height is not known yet
-    sent = 0 if make is px4_rig else 1
-    assert sum(getattr(m, "command", 0) == 22 for m in rig.vehicle.received) == sent
-    rig.run(2.0)
-    for tick in range(150):
-        rig.vehicle.put(mav.global_position_int_encode(0, 0, 0, 489_400 + tick, 0, 0, 0, 0, 0))
-        rig.run(0.01)
-        rig.link.commands.takeoff(5.0)
-    asked = [m.param7 for m in rig.vehicle.received if getattr(m, "command", 0) == 22][sent:]
-    assert (len(asked), asked[0]) == (2, pytest.approx(param7_m, abs=0.05))
-    rig.vehicle.put(mav.command_ack_encode(22, dialect.MAV_RESULT_FAILED))
-    rig.run(0.01)
-    assert "the vehicle answered NAV_TAKEOFF with FAILED" in rig.texts
-
-
-def test_an_output_that_makes_no_sense_is_refused_at_once_where_the_vehicle_is_known() -> None:
-    rig = Rig(meaning=None).ready()
-    with pytest.raises(PeerError, match="--output rc-override"):
-        rig.link.begin_flight(ActionMeaning(), "manual-control")
-
-
 def test_without_a_policy_nothing_is_sent() -> None:
     rig = Rig(meaning=None)
     assert rig.run(8.0, Command(action=IDLE)).problem == because(Code.NO_POLICY_LOADED)
     assert rig.overrides() == []
+    with pytest.raises(PeerError, match="--output rc-override"):
+        rig.link.begin_flight(ActionMeaning(), "manual-control")
     rig.link.begin_flight(ActionMeaning(), None)
-    assert rig.run(0.1).problem is None
+    assert rig.run(0.1, PILOTS).problem is None
+    assert rig.overrides() == []  # nothing is released that was never overridden
     assert rig.run(0.1, Command(action=IDLE)).echo_confirmed
 
 

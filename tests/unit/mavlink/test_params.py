@@ -356,3 +356,22 @@ def test_px4s_parameters_are_set_with_their_type_and_put_back() -> None:
     vehicle.run(3.0)
     assert vehicle.params.restore()
     assert (vehicle.values["COM_RC_IN_MODE"], vehicle.values["COM_RC_LOSS_T"]) == (0.0, 0.5)
+
+
+def test_names_that_nobody_needs_are_not_collected() -> None:
+    vehicle = ParamVehicle()
+    vehicle.run(2.0)
+    known = len(vehicle.params._kinds)
+    for k in range(5000):
+        vehicle.params.receive(ParamValue(name=f"X{k}", value=1.0), None)
+    assert len(vehicle.params._kinds) == known
+
+
+def test_advice_about_values_that_keep_changing_ends() -> None:
+    vehicle = ParamVehicle()
+    vehicle.run(8.0)
+    for k in range(1000):
+        vehicle.has_receiver = k % 2 == 0  # so that it is judged anew
+        vehicle.set_by_pilot("RC_OVERRIDE_TIME", 2.0 + k)
+        vehicle.run(0.01)
+    assert 50 < len(vehicle.texts) <= 110

@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 from pymavlink.dialects.v20 import ardupilotmega as dialect
 
 from helpers.flown_vehicle import codec
-from mavbridge.mavlink.codec.frames import checksum, frame_at, split_frames
+from mavbridge.mavlink.codec.frames import checksum, frame_at
 from mavbridge.mavlink.codec.messages import Body, CurrentMode, Endpoint, Event, ReceivedMessage
 from mavbridge.mavlink.codec.packets import pack_override
 from mavbridge.mavlink.codec.readers import IDS, LAYOUTS, READERS, UnusableError
@@ -163,24 +163,16 @@ V1, V2, SIGNED = packet(is_v1=True), packet(), packet(is_signed=True)
 EMPTY_V1 = bytes((0xFE, 0, 3, 7, 9, 200)) + b"\x12\x34"
 
 
-@pytest.mark.parametrize("kinds", [[V1], [V2], [SIGNED], [V1, V2, SIGNED, V1], []])
-def test_a_datagram_is_cut_into_its_packets(kinds: list[bytes]) -> None:
-    frames, is_rest = split_frames(b"".join(kinds))
-    assert [frame.data for frame in frames] == kinds
-    assert not is_rest
-    for frame in frames:
-        assert (frame.source, frame.message_id, frame.sequence) == (Endpoint(7, 9), 0, 3)
-        assert (frame.payload, frame.flags) == (V2[10:19], frame.data == SIGNED)
-        assert frame.is_sound
-
-
 @pytest.mark.parametrize("whole", [V1, V2, SIGNED])
-def test_what_is_cut_off_or_begins_no_packet_is_left_over(whole: bytes) -> None:
-    for length in range(1, len(whole)):
-        assert split_frames(whole[:length]) == ([], True)
+def test_a_packet_is_cut_out_where_it_begins(whole: bytes) -> None:
+    frame = frame_at(V2 + whole + V1, len(V2))
+    assert (frame.data, frame.source) == (whole, Endpoint(7, 9))
+    assert (frame.message_id, frame.sequence, frame.payload) == (0, 3, V2[10:19])
+    assert (frame.flags, frame.is_sound) == (whole == SIGNED, True)
+    for length in range(len(whole)):
+        assert frame_at(whole[:length], 0) is None
     for marker in (0x00, 0xFC, 0xFF):
-        frames, is_rest = split_frames(V1 + bytes((marker,)) + whole[1:])
-        assert ([frame.data for frame in frames], is_rest) == ([V1], True)
+        assert frame_at(bytes((marker,)) + whole[1:], 0) is None
 
 
 def test_a_packet_without_a_payload_is_one_and_a_number_may_have_three_bytes() -> None:

@@ -195,7 +195,7 @@ def test_a_packet_of_mavlink_1_has_no_signature_whatever_its_sequence_number():
 
 
 def test_a_judgement_is_a_bool_and_the_first_timestamp_is_one_before_2015():
-    early = Signing(KEY, unix_ns=TimeOfDay(0))
+    early = Signing(KEY, unix_ns=TimeOfDay(0), state=SigningState())
     packet = make_codec(None).encode_heartbeat()
     assert early.accepts(frame_at(packet, 0)) is False
     assert timestamp(early.sign(packet, dialect.MAVLink_heartbeat_message.crc_extra)) == 1

@@ -92,12 +92,6 @@ def kill(store):
     store.path.write_text(text)
 
 
-def test_timestamps_are_reserved_before_anything_is_sent(tmp_path):
-    store = make_store(tmp_path)
-    with store as signing:
-        assert saved_ticks(store) >= signing.now_ticks + AHEAD_TICKS - 100_000
-
-
 def test_no_clean_start_moves_the_timestamps_ahead_of_the_time_of_day(tmp_path):
     newest = 0
     for _ in range(12):
@@ -105,13 +99,6 @@ def test_no_clean_start_moves_the_timestamps_ahead_of_the_time_of_day(tmp_path):
             ticks = sign_one(signing)
             assert newest < ticks <= signing.now_ticks + 100
         newest = ticks
-
-
-def test_the_end_saves_what_was_really_sent(tmp_path):
-    store = make_store(tmp_path)
-    with store as signing:
-        ticks = sign_one(signing)
-    assert saved_ticks(store) == ticks
 
 
 def test_kills_never_repeat_a_timestamp_and_gain_no_more_than_packets_could_take(tmp_path):
@@ -129,18 +116,23 @@ def test_kills_never_repeat_a_timestamp_and_gain_no_more_than_packets_could_take
         assert sign_one(signing) == first + 1
 
 
+def test_timestamps_are_reserved_at_once_and_the_end_saves_what_was_really_sent(tmp_path):
+    store = make_store(tmp_path)
+    with store as signing:
+        assert saved_ticks(store) >= signing.now_ticks + AHEAD_TICKS - 100_000
+        assert (store._thread.is_alive(), store._thread.name) == (True, "mavbridge-signing")
+        signing._heard[(0, 1, 1)] = 77
+        ticks = sign_one(signing)
+    assert (saved_ticks(store), store.problem, store._thread.is_alive()) == (ticks, None, False)
+    with make_store(tmp_path) as again:
+        assert dict(again.state.heard_ticks) == {(0, 1, 1): 77}
+
+
 def test_each_key_has_a_state_of_its_own_that_does_not_tell_it(tmp_path):
     with (store := make_store(tmp_path)), (other := make_store(tmp_path, bytes(range(1, 33)))):
         assert store.path != other.path
-        assert KEY.hex() not in store.path.name + store.path.read_text()
-
-
-def test_what_was_heard_is_kept(tmp_path):
-    with (store := make_store(tmp_path)) as signing:
-        signing._heard[(0, 1, 1)] = 77
-    with make_store(tmp_path) as again:
-        assert dict(again.state.heard_ticks) == {(0, 1, 1): 77}
-    assert store.problem is None
+        files = SigningFiles(key_file=tmp_path / "key", state_folder=tmp_path)
+        assert KEY.hex() not in store.path.name + store.path.read_text() + repr(files)
 
 
 def test_a_damaged_state_is_told(tmp_path):
@@ -167,17 +159,3 @@ def test_a_folder_that_cannot_be_written_is_told_and_survived(tmp_path):
     (tmp_path / "state").write_text("")
     with store:
         assert "cannot be kept" in store.problem
-
-
-def test_the_thread_saves_and_ends(tmp_path):
-    store = make_store(tmp_path)
-    with store:
-        assert store._thread.is_alive()
-        assert store._thread.name == "mavbridge-signing"
-    assert not store._thread.is_alive()
-
-
-def test_the_key_is_no_setting(tmp_path):
-    files = SigningFiles(key_file=write_key(tmp_path), state_folder=tmp_path)
-    assert KEY.hex() not in repr(files)
-    assert repr(KEY) not in repr(files)

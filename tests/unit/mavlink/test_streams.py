@@ -6,7 +6,6 @@ from pymavlink.dialects.v20 import ardupilotmega as dialect
 from mavbridge.core.clock import NS_PER_MS, NS_PER_S
 from mavbridge.mavlink.codec.messages import (
     CommandAck,
-    CommandRequest,
     Endpoint,
     Request,
     StreamRequest,
@@ -26,10 +25,6 @@ def ack(result: int, command: int = dialect.MAV_CMD_SET_MESSAGE_INTERVAL) -> Com
 
 def ids(request: object) -> tuple[float, float]:
     return request.params[0], round(request.params[1])
-
-
-def one_group() -> StreamRequester:
-    return StreamRequester(ARDUPILOT.streams(state_hz=100)[:1])
 
 
 STATE = [(31, 10000), (32, 10000), (105, 10000)]
@@ -71,17 +66,6 @@ def test_streams_are_requested_one_after_the_other_what_is_needed_first(
     assert requested == expected
 
 
-@pytest.mark.parametrize("profile", [ARDUPILOT, PX4])
-def test_the_radio_comes_at_the_rate_of_a_recording(profile: Profile) -> None:
-    def radio_hz(pilot_hz: float | None) -> float:
-        groups = profile.streams(state_hz=100, pilot_hz=pilot_hz)
-        (group,) = (group for group in groups if group.messages == ("RC_CHANNELS",))
-        return group.rate_hz
-
-    assert radio_hz(100.0) == 100.0
-    assert radio_hz(None) < 60.0
-
-
 @pytest.mark.parametrize("answer", [None, dialect.MAV_RESULT_DENIED, dialect.MAV_RESULT_FAILED])
 def test_what_is_only_watched_holds_nothing_up(answer: int | None) -> None:
     requester = StreamRequester(ARDUPILOT.streams(state_hz=100))
@@ -108,28 +92,35 @@ def test_what_is_only_watched_holds_nothing_up(answer: int | None) -> None:
     assert requester.renewals == 0
 
 
-def test_a_watched_stream_that_stops_is_asked_for_again_and_not_lost() -> None:
-    wanted = ARDUPILOT.streams(state_hz=100)[4:5]
-    requester, requested_s = StreamRequester(wanted), []
-    for tick in range(1000):
-        if tick < 300 and tick % 50 == 0:
-            requester.receive("SYS_STATUS", 0, 0)
-        if requester.step(tick * 10 * NS_PER_MS) is not None:
-            requested_s.append(tick // 100)
-            requester.receive_ack(ack(0))
-    assert requested_s == [0, 4, 6, 8]
-    assert requester.renewals == 0
-    assert requester.is_settled
+LEGACY = StreamRequest(dialect.MAV_DATA_STREAM_EXTRA1, 100)
+DENIED_ONCE = [(number, us) for number in (31, 30) for us in (10000, 20000, 40000)]
 
 
-def test_denied_means_slower_then_another_message_then_the_legacy_stream() -> None:
-    requester, requested = one_group(), []
-    for k in range(6):
-        requested.append(ids(requester.step(k)))
-        requester.receive_ack(ack(dialect.MAV_RESULT_DENIED))
-    assert requested == [(id_, us) for id_ in (31, 30) for us in (10000, 20000, 40000)]
-    assert requester.step(9) == StreamRequest(dialect.MAV_DATA_STREAM_EXTRA1, 100)
-    assert requester.is_settled
+@pytest.mark.parametrize(
+    ("profile", "answer", "requested", "last_s"),
+    [
+        # slower, then another message, then the legacy stream
+        (ARDUPILOT, dialect.MAV_RESULT_DENIED, [*DENIED_ONCE, LEGACY], 0.06),
+        # undecided or unanswered: repeated without haste
+        (ARDUPILOT, dialect.MAV_RESULT_TEMPORARILY_REJECTED, [(31, 10000)] * 4 + [LEGACY], 2.0),
+        (ARDUPILOT, None, [(31, 10000)] * 4 + [LEGACY], 2.0),
+        (PX4, None, [(31, 10000)] * 10, 4.5),  # no legacy stream: for ever
+    ],
+)
+def test_what_is_not_granted_is_asked_for_otherwise(
+    profile: Profile, answer: int | None, requested: list[object], last_s: float
+) -> None:
+    requester, found, found_s = StreamRequester(profile.streams(state_hz=100)[:1]), [], []
+    for tick in range(500):
+        if (request := requester.step(tick * 10 * NS_PER_MS)) is not None:
+            found.append(request if isinstance(request, StreamRequest) else ids(request))
+            found_s.append(tick / 100)
+            if answer is not None:
+                requester.receive_ack(ack(answer))
+            if request == LEGACY:
+                break
+    assert (found, found_s[-1]) == (requested, last_s)
+    assert requester.is_settled is (LEGACY in requested)
 
 
 def test_a_vehicle_that_denies_everything_is_not_flooded_with_requests() -> None:
@@ -141,42 +132,26 @@ def test_a_vehicle_that_denies_everything_is_not_flooded_with_requests() -> None
     assert 20 < requests < 200  # each cycle of messages and rates half a second after the last
 
 
-def test_a_request_that_is_undecided_is_repeated_without_haste() -> None:
-    requester, requested_s = one_group(), []
-    for tick in range(300):
-        if requester.step(tick * 10 * NS_PER_MS) is not None:
-            requested_s.append(tick / 100)
-            requester.receive_ack(ack(dialect.MAV_RESULT_TEMPORARILY_REJECTED))
-    assert requested_s == [0.0, 0.5, 1.0, 1.5, 2.0]  # the last is the legacy stream
-
-
-def test_an_unanswered_request_is_repeated_and_then_the_legacy_stream_used() -> None:
-    requester = one_group()
-    requests = [requester.step(k * S) for k in range(5)]
-    assert [type(request) for request in requests] == [CommandRequest] * 4 + [StreamRequest]
-
-
-def test_a_stream_that_slows_down_is_requested_again() -> None:
-    requester = one_group()
-    requester.step(0)
-    requester.receive_ack(ack(0))
-    now_ns, renewed = 0, []
+@pytest.mark.parametrize(
+    ("group", "message", "every", "slower", "renewals"),
+    [
+        (0, "ATTITUDE_QUATERNION", 1, 25, 3),  # a ground station sets 4 Hz after three seconds
+        (4, "SYS_STATUS", 50, 10_000, 0),  # one that is only watched stops, and is not lost
+    ],
+)
+def test_a_stream_that_slows_down_is_requested_again(
+    group: int, message: str, every: int, slower: int, renewals: int
+) -> None:
+    requester = StreamRequester(ARDUPILOT.streams(state_hz=100)[group : group + 1])
+    requested_s = []
     for tick in range(1000):
-        now_ns = tick * 10 * NS_PER_MS
-        # a ground station sets 4 Hz after three seconds
-        if tick < 300 or tick % 25 == 0:
-            requester.receive("ATTITUDE_QUATERNION", 0, 0)
-        if requester.step(now_ns) is not None:
-            renewed.append(now_ns // S)
+        if tick % (every if tick < 300 else slower) == 0:
+            requester.receive(message, 0, 0)
+        if requester.step(tick * 10 * NS_PER_MS) is not None:
+            requested_s.append(tick // 100)
             requester.receive_ack(ack(0))
-    assert renewed == [4, 6, 8]
-    assert requester.renewals == 3
-
-
-def test_where_there_is_no_legacy_stream_the_interval_is_asked_for_for_ever() -> None:
-    requester = StreamRequester(PX4.streams(state_hz=100)[:1])
-    requests = [requester.step(k * S) for k in range(12)]
-    assert {ids(request)[0] for request in requests} == {31}
+    assert requested_s == [0, 4, 6, 8]
+    assert (requester.renewals, requester.is_settled) == (renewals, True)
 
 
 def test_an_echo_is_asked_for_once_it_is_known_which() -> None:
@@ -312,6 +287,9 @@ def test_px4_is_asked_for_rates_that_it_keeps(
     """Measured: 200 Hz asked for come as 125; beyond, attitude and IMU come at 205 to 250 Hz, the
     estimator's position at 125."""
     attitude, position, imu = PX4.streams(state_hz=state_hz)[:3]
+    for profile in (PX4, ARDUPILOT):  # the radio comes at the rate of a recording
+        groups = profile.streams(state_hz=state_hz, pilot_hz=100.0)
+        assert [g.rate_hz for g in groups if g.messages == ("RC_CHANNELS",)] == [100.0]
     assert (attitude.rate_hz, position.rate_hz, imu.rate_hz) == (
         *(attitude_hz, position_hz),
         attitude_hz,

@@ -1,5 +1,6 @@
 """The session with one vehicle: its condition, its receiver, its modes."""
 
+from itertools import permutations
 from typing import Any
 
 import pytest
@@ -37,7 +38,7 @@ from mavbridge.mavlink.codec.packets import Codec
 from mavbridge.mavlink.outputs.sender import choose_output
 from mavbridge.mavlink.session.commands import VehicleCommands
 from mavbridge.mavlink.session.discovery import VehicleIdentity
-from mavbridge.mavlink.session.vehicle import VehicleSession
+from mavbridge.mavlink.session.vehicle import TextJoiner, VehicleSession
 
 S, MS = NS_PER_S, NS_PER_MS
 RECEIVER = (1500, 1500, 1000, 1500, 1500, 1500, 1500, 1500)
@@ -213,11 +214,17 @@ def test_px4s_arming_is_told_by_an_event_at_once() -> None:
     assert not session.status.armed
     session.put(Event(ARMED_BY))
     assert session.status.armed
+    ardupilot = Session()
+    for event in (ARMED_BY, FAILSAFE_HOLD):  # numbers of PX4's mean nothing there
+        ardupilot.put(Event(event))
+    assert (ardupilot.status.armed, ardupilot.status.is_failsafe) == (False, False)
     session.now_ns += 50 * MS
     session.heartbeat(armed=False)
     assert session.status.armed
     session.now_ns += S
     session.heartbeat(armed=True)
+    session.put(Event(FAILSAFE_HOLD))
+    assert session.status.is_failsafe
     session.put(Event(DISARMED_BY))
     assert not session.status.armed
     session.now_ns += S
@@ -247,17 +254,6 @@ def test_a_mode_that_px4_has_left_by_itself_is_a_failsafe() -> None:
     assert (session.status.mode, session.status.is_failsafe) == ("AUTO.LAND", False)
 
 
-def test_a_failsafe_is_told_by_an_event_too() -> None:
-    session = Session("px4")
-    session.heartbeat(armed=True)
-    session.put(Event(FAILSAFE_HOLD))
-    assert session.status.is_failsafe
-    ardupilot = Session()
-    ardupilot.heartbeat(armed=True)
-    ardupilot.put(Event(FAILSAFE_HOLD))  # a number of PX4's means nothing there
-    assert not ardupilot.status.is_failsafe
-
-
 def test_px4s_events_without_a_text_are_shown_and_its_long_texts_put_together() -> None:
     session = Session("px4")
     session.put(Event(0x155CD44))
@@ -267,14 +263,6 @@ def test_px4s_events_without_a_text_are_shown_and_its_long_texts_put_together() 
         "vehicle: manual control lost",
         "vehicle: RTL: start return at 495 m (5 m above destination)",
     ]
-
-
-def test_the_height_above_the_sea_is_known_while_it_comes() -> None:
-    session = Session("px4")
-    assert session.session.condition.amsl_m(session.now_ns) is None
-    session.put(Altitude(489.4))
-    assert session.session.condition.amsl_m(session.now_ns) == 489.4
-    assert session.session.condition.amsl_m(session.now_ns + 3 * S) is None
 
 
 def test_a_receiver_that_px4_does_not_listen_to_is_none() -> None:
@@ -314,7 +302,10 @@ def test_a_position_counts_if_the_estimator_says_so(
     session.put(EstimatorFlags(flags))
     session.put(NED)
     assert session.status.is_position_valid is is_valid
+    session.now_ns += 500 * MS
     assert session.status.position_ned_m == ((1.0, 2.0, -3.0) if is_valid else None)
+    session.now_ns += 1
+    assert session.status.position_ned_m is None
 
 
 def test_without_flags_only_ardupilots_position_counts() -> None:
@@ -324,15 +315,6 @@ def test_without_flags_only_ardupilots_position_counts() -> None:
         session.put(NED)
         assert session.status.is_position_valid is None
         assert session.status.position_ned_m == expected
-
-
-def test_a_position_gets_old() -> None:
-    session = Session()
-    session.put(NED)
-    session.now_ns += 500 * MS
-    assert session.status.position_ned_m is not None
-    session.now_ns += 1
-    assert session.status.position_ned_m is None
 
 
 # --- the receiver
@@ -462,6 +444,24 @@ def test_a_refused_mode_is_known_until_another_is_asked_for_or_it_is_granted() -
     assert commands.refused_mode is None
 
 
+def test_a_takeoff_waits_for_the_height_and_is_asked_for_once_a_second() -> None:
+    session, sent, clock = Session("px4"), [], FakeClock()
+    commands = VehicleCommands(sent.append, session.texts.append, clock)
+    commands.takeoff(5.0)  # of no vehicle
+    commands.adopt(session.session)
+    for _ in range(2):
+        commands.takeoff(5.0)
+    (told,) = (text for text in session.texts if text.startswith("no takeoff yet"))
+    assert told.endswith("the vehicle does not tell its height above the sea")
+    assert sent == []
+    session.now_ns = clock.now_ns()
+    session.put(Altitude(489.4))
+    for _ in range(150):
+        commands.takeoff(5.0)
+        clock.advance_ns(10 * MS)
+    assert [request.params[6] for request in sent] == pytest.approx([494.4] * 2)
+
+
 @pytest.mark.parametrize(
     ("switch_us", "is_off", "may_fly"),
     [
@@ -476,6 +476,15 @@ def test_the_override_switch_is_told_apart(switch_us: int, is_off: bool, may_fly
     session.turn_switch(switch_us)
     assert session.session.is_switched_off is is_off
     assert (session.problem is None) is may_fly
+    session.rc((*RECEIVER[:6], 2000, 1500))
+    assert (session.problem is None) is may_fly  # not before the debounce
+    session.turn_switch(2000)
+    for us in (1500, 0):  # which change nothing
+        session.turn_switch(us)
+        assert session.session.switch_problem is None
+    session.now_ns += 20 * MS
+    session.rc((*RECEIVER[:6], 1000, 1500))
+    assert session.session.is_switched_off  # at once
 
 
 def with_override_switch() -> Session:
@@ -484,26 +493,6 @@ def with_override_switch() -> Session:
     for _ in range(2):  # the search for a receiver takes as long again
         session.shake_hands()
     return session
-
-
-def test_the_middle_of_the_override_switch_changes_nothing() -> None:
-    session = with_override_switch()
-    for switch_us, may_fly in ((1500, False), (2000, True), (1500, True), (0, True), (1000, False)):
-        session.turn_switch(switch_us)
-        assert (session.session.switch_problem is None) is may_fly
-    session.turn_switch(1500)
-    assert session.session.switch_problem is not None
-
-
-def test_the_override_switch_is_on_after_the_debounce_and_off_at_once() -> None:
-    session = with_override_switch()
-    session.rc((*RECEIVER[:6], 2000, 1500))
-    assert session.session.switch_problem is not None
-    session.turn_switch(2000)
-    assert session.session.switch_problem is None
-    session.now_ns += 20 * MS
-    session.rc((*RECEIVER[:6], 1000, 1500))
-    assert session.session.is_switched_off
 
 
 # --- the echo, in words
@@ -550,13 +539,6 @@ def test_the_reason_names_what_was_seen(
     # Where our packets are lost, nobody has taken over: the way out begins with neutral sticks.
     is_lost = not shown_us or shown_us[0] == 1700
     assert (session.output.overruled(session.now_ns) is None) is is_lost
-
-
-def test_a_reboot_is_noticed_by_two_old_stamps() -> None:
-    session = Session()
-    for boot_ms, has_rebooted in ((9000, False), (5, False), (9010, False), (5, False), (6, True)):
-        session.put(Attitude(True, 1000 * boot_ms, (1, 0, 0, 0), (0, 0, 0)))
-        assert session.session.has_rebooted is has_rebooted
 
 
 @given(
@@ -614,3 +596,40 @@ def test_a_clock_that_wraps_has_not_rebooted(start_ms: int, steps_ms: list[int])
         clock_ms = max(clock_ms + step_ms, start_ms)
         session.put(Attitude(True, 1000 * (clock_ms % 2**32), (1, 0, 0, 0), (0, 0, 0)))
         assert not session.session.has_rebooted
+
+
+# --- texts in pieces
+
+PIECES = [
+    StatusText("one, ", 7, 0, is_full=True),
+    StatusText("two, ", 7, 1, is_full=True),
+    StatusText("three\t", 7, 2),
+]
+
+
+@pytest.mark.parametrize("order", list(permutations(range(3))))
+def test_pieces_make_a_text_in_any_order(order: tuple[int, ...]) -> None:
+    joiner = TextJoiner()
+    texts = [text for k in order for text in joiner.receive(PIECES[k], 0)]
+    assert texts == ["one, two, three"]
+    assert joiner.step(10 * NS_PER_S) == []
+
+
+def test_a_text_in_one_piece_is_shown_at_once() -> None:
+    joiner = TextJoiner()
+    assert joiner.receive(StatusText("Armed by external command\t", 1), 0) == [
+        "Armed by external command"
+    ]
+    assert joiner.receive(PIECES[0], 0) == []
+    assert joiner.receive(StatusText("PreArm: no"), 0) == ["PreArm: no"]
+    assert joiner.receive(PIECES[1], 0) == []
+    assert joiner.receive(PIECES[2], 0) == ["one, two, three"]
+
+
+def test_a_lost_piece_is_waited_for_and_then_shows() -> None:
+    joiner = TextJoiner()
+    assert joiner.receive(PIECES[0], 0) == joiner.receive(PIECES[2], 0) == []
+    assert joiner.step(NS_PER_S) == []
+    assert joiner.step(S + MS) == ["one, ...three"]
+    assert joiner.receive(PIECES[1], 2 * NS_PER_S) == []
+    assert joiner.receive(StatusText("next", 8), 2 * NS_PER_S) == ["...two, ...", "next"]

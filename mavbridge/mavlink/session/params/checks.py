@@ -8,6 +8,7 @@ from pymavlink.dialects.v20 import ardupilotmega as dialect
 from mavbridge.core.reasons import Code, because
 from mavbridge.core.vehicle import Risk
 from mavbridge.mavlink.codec.calibration import RcCalibration
+from mavbridge.mavlink.codec.readers import IDS
 from mavbridge.mavlink.profiles.profile import (
     Danger,
     ParamContext,
@@ -72,21 +73,12 @@ def assess(profile: Profile, values: Mapping[str, float], context: ParamContext)
 
 def received_bytes_per_s(streams: Iterable[StreamGroup]) -> float:
     """Return the bandwidth of these streams with full-length messages, rare ones excluded."""
-    return _OTHERS_BYTES_PER_S + sum(
-        stream.rate_hz * (_FRAME_BYTES + _payload_bytes(stream.messages[0]))
-        for stream in streams
-        if stream.least_hz is None
+    steady = [(stream.rate_hz, stream.messages[0]) for stream in streams if stream.least_hz is None]
+    streamed: float = sum(
+        rate_hz * (_FRAME_BYTES + dialect.mavlink_map[IDS[name]].unpacker.size)
+        for rate_hz, name in steady
     )
-
-
-def _payload_bytes(name: str) -> int:
-    size: int = getattr(dialect, f"MAVLink_{name.lower()}_message").unpacker.size
-    return size
-
-
-def sent_bytes_per_s(stick_hz: float) -> float:
-    """Return the bandwidth of our sticks."""
-    return _OTHERS_BYTES_PER_S + stick_hz * _OVERRIDE_BYTES
+    return _OTHERS_BYTES_PER_S + streamed
 
 
 def serial_dangers(
@@ -96,7 +88,8 @@ def serial_dangers(
 
     A serial port carries both directions at once, so the fuller one decides.
     """
-    needed = max(received_bytes_per_s(streams), sent_bytes_per_s(stick_hz)) * _BITS_PER_BYTE
+    sent_bytes_per_s = _OTHERS_BYTES_PER_S + stick_hz * _OVERRIDE_BYTES
+    needed = max(received_bytes_per_s(streams), sent_bytes_per_s) * _BITS_PER_BYTE
     if baud is None or baud >= needed:
         return ()
     enough = next((rate for rate in _STANDARD_BAUDS if rate >= needed), needed)

@@ -144,31 +144,28 @@ def engaged(**conditions: Any) -> World:
 
 # --- no false alarms
 
+
+def resting(_now_ns: int) -> Shown:
+    return RECEIVER
+
+
 BAD_LINKS = [
-    {"loss": 0.2},
-    {"delay_ms": 200.0, "jitter_ms": 5.0},
     {"delay_ms": 100.0, "jitter_ms": 20.0, "loss": 0.2},
     {"delay_ms": 200.0, "jitter_ms": 10.0, "loss": 0.2, "rc_jitter_ms": 15.0},
     {"rc_hz": 20.0, "loss": 0.2, "rc_jitter_ms": 30.0},
     {"rc_hz": 25.0, "rc_jitter_ms": 0.0, "jitter_ms": 0.0},
-    {"rc_hz": 50.0, "rc_jitter_ms": 0.0, "jitter_ms": 0.0},
     {"rc_hz": 100.0, "rc_jitter_ms": 0.0, "jitter_ms": 0.0},
 ]
 
 
-@pytest.mark.parametrize("sticks", [still, moving])
-@pytest.mark.parametrize("send_hz", [30.0, 100.0, 400.0])
+@pytest.mark.parametrize("sticks", [still, moving, resting])
+@pytest.mark.parametrize("send_hz", [30.0, 400.0])
 @pytest.mark.parametrize("link", BAD_LINKS)
 def test_a_bad_link_raises_no_alarm(
     link: dict[str, float], send_hz: float, sticks: Callable[[int], Shown]
 ) -> None:
     world = engaged(send_hz=send_hz, sticks=sticks, **link)
     assert world.run(20.0) is None
-
-
-def test_sticks_at_the_receivers_own_place_raise_no_alarm() -> None:
-    world = engaged(sticks=lambda _now_ns: RECEIVER)
-    assert world.run(10.0) is None
 
 
 def test_a_network_that_stalls_towards_us_raises_no_alarm() -> None:
@@ -239,15 +236,6 @@ def test_a_joystick_held_where_our_sticks_rest_is_noticed_when_it_holds_the_vehi
     assert after_s < 0.5
 
 
-def test_a_joystick_on_a_bad_link_is_noticed() -> None:
-    for seed in range(20):
-        world = engaged(seed=seed, rc_hz=20.0, loss=0.2, sticks=moving)
-        world.start_joystick(50.0, after_ours_ms=2.0)
-        fault, after_s = world.seconds_to_fault()
-        assert fault == "foreign"
-        assert after_s < 1.5
-
-
 def test_a_fault_stays_known_for_three_seconds_and_only_then_is_forgotten() -> None:
     world = engaged()
     world.start_joystick(50.0, after_ours_ms=2.0)
@@ -300,19 +288,13 @@ def test_a_pause_of_our_own_says_nothing_about_the_vehicle(pause_s: float, keeps
         assert world.seconds_to_fault()[0] == "silent"
 
 
-def test_a_vehicle_that_sends_no_rc_channels_any_more_is_noticed() -> None:
-    world = engaged()
-    world.rc_hz = 0.0
-    fault, after_s = world.seconds_to_fault()
-    assert fault == "unseen"
-    assert after_s == pytest.approx(CONFIRM_NS / S, abs=0.03)
-
-
 def test_after_a_silence_the_sticks_of_before_it_are_nobody_elses() -> None:
     world = engaged(sticks=moving)
     world.is_deaf = True
     world.rc_hz = 0.0  # nothing arrives either way
-    assert world.run(2.0) == "unseen"
+    fault, after_s = world.seconds_to_fault()
+    assert fault == "unseen"
+    assert after_s == pytest.approx(CONFIRM_NS / S, abs=0.03)
     for _ in range(3000):
         world.now_ns += MS // 2
         world._step()
@@ -328,17 +310,6 @@ def test_after_a_silence_the_sticks_of_before_it_are_nobody_elses() -> None:
 
 
 # --- the first echo
-
-
-def test_an_override_that_shows_up_is_confirmed() -> None:
-    echo = EchoCheck(OVERRIDE_ECHO)
-    echo.received(RECEIVER, 1, 0)
-    echo.sent(STICKS, S)
-    echo.received(RECEIVER, 2, S + 1)
-    assert not echo.confirmed
-    echo.received(STICKS, 3, S + 2)
-    assert echo.confirmed
-    assert echo.fault(S + 3) is None
 
 
 def test_late_and_doubled_datagrams_are_left_out() -> None:
@@ -397,6 +368,18 @@ def test_the_dither_walks_towards_the_middle_and_shrinks_once_confirmed(roll_us:
         assert echo.confirmed
 
 
+def test_a_stamp_from_the_far_future_does_not_blind_the_echo_check() -> None:
+    """All that came after it was left out as late, and no flight could begin any more."""
+    echo = EchoCheck(OVERRIDE_ECHO)
+    echo.received(RECEIVER, 4_294_967_295_000, S)
+    for k in range(100):
+        now_ns = S + k * 20 * MS
+        echo.sent((*STICKS[:3], STICKS[3] - 4 * (k % 3)), now_ns)
+        echo.received((*STICKS[:3], STICKS[3] - 4 * (k % 3)), 70_000_000 + k * 20_000, now_ns)
+    assert echo.confirmed
+    assert echo.fault(now_ns) is None
+
+
 # --- release
 
 
@@ -445,12 +428,3 @@ def test_a_release_without_a_receiver_is_never_confirmed() -> None:
     assert world.echo.shows_last
     world.engage()  # the sticks of before are our own: the dither tells them apart
     assert world.run(2.0) is None
-
-
-def test_a_release_and_another_engagement_raise_no_alarm() -> None:
-    world = World(loss=0.2, delay_ms=50.0, jitter_ms=5.0, sticks=moving)
-    for _ in range(10):
-        world.engage()
-        assert world.run(0.5) is None
-        world.release()
-        assert world.run(0.5) is None

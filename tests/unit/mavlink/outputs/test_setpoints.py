@@ -73,6 +73,8 @@ def test_the_thrust_of_body_rates_is_along_the_body_whatever_the_autopilot_adds(
 
 def test_an_attitude_keeps_the_vehicles_own_heading_until_it_turns() -> None:
     flight = attitude_flight(PX4, yaw_rad=1.0)
+    unknown = AttitudeOutput(codec(), ActionMeaning(kind="attitude"), PX4, "attitude")
+    assert unknown.encode(LEVEL, flight.session, flight.now_ns) is None
     message: Any = flight.message(flight.send(AttitudeThrust(0.5, 0.2, -0.1, 0.0)))
     assert tuple(message.q) == pytest.approx(quaternion_from_euler(0.2, -0.1, 1.0), abs=1e-6)
     assert message.type_mask == 7
@@ -98,12 +100,6 @@ def test_before_another_mode_is_left_the_heading_follows_the_vehicles() -> None:
     turn_to(flight, 3.0)
     message: Any = flight.message(flight.send(LEVEL))
     assert heading_rad(tuple(message.q)) == pytest.approx(3.0, abs=1e-6)
-
-
-def test_without_the_vehicles_own_heading_no_attitude_leaves() -> None:
-    output = AttitudeOutput(codec(), ActionMeaning(kind="attitude"), PX4, "attitude")
-    flight = Flight(output, FlownVehicle(PX4))
-    assert output.encode(LEVEL, flight.session, flight.now_ns) is None
 
 
 @BOTH
@@ -266,6 +262,9 @@ def test_a_velocity_and_its_echo(profile: Profile) -> None:
     why = flight.output.overruled(flight.now_ns)
     assert why.code is Code.OVERRULED
     assert "limits or refuses them" in str(why)
+    flight.vehicle.mode = profile.modes.roles.hold
+    flight.send(Velocity(0.0, 0.0, 0.0, 0.0))
+    assert flight.output.was_confirmed  # once seen it stays so
 
 
 def test_a_target_without_a_velocity_is_no_echo() -> None:
@@ -276,10 +275,20 @@ def test_a_target_without_a_velocity_is_no_echo() -> None:
     assert not flight.output.echo_confirmed
 
 
-def test_px4_is_asked_for_no_climb_that_it_would_cut() -> None:
+@pytest.mark.parametrize(
+    ("up_mps", "down_mps", "asked_and_sent"),
+    [
+        (2.0, 1.0, ((-5.0, -2.0), (5.0, 1.0), (0.5, 0.5))),
+        # a climb rate that cannot be turns no climb into a descent
+        *((limit, limit, ((-2.0, 0.0), (0.0, 0.0), (2.0, 0.0))) for limit in (-20.0, -3.4e38)),
+    ],
+)
+def test_px4_is_asked_for_no_climb_that_it_would_cut(
+    up_mps: float, down_mps: float, asked_and_sent: tuple[tuple[float, float], ...]
+) -> None:
     flight = velocity_flight(PX4)
-    flight.vehicle.known_params = {"MPC_Z_VEL_MAX_UP": 2.0, "MPC_Z_VEL_MAX_DN": 1.0}
-    for asked, sent in ((-5.0, -2.0), (5.0, 1.0), (0.5, 0.5)):
+    flight.vehicle.known_params = {"MPC_Z_VEL_MAX_UP": up_mps, "MPC_Z_VEL_MAX_DN": down_mps}
+    for asked, sent in asked_and_sent:
         encoded = flight.send(Velocity(0.0, 0.0, asked, 0.0))
         message: Any = flight.message(encoded)
         assert message.vz == pytest.approx(sent, abs=0.003)
@@ -322,16 +331,6 @@ def test_what_is_no_such_action_never_leaves() -> None:
     ):
         with pytest.raises(CommandRefusedError):
             flight.send(action)
-
-
-def test_an_echo_that_was_seen_stays_seen_once_the_flight_has_left_the_mode() -> None:
-    flight = velocity_flight(PX4)
-    for _ in range(50):
-        message: Any = flight.message(flight.send(Velocity(0.0, 0.0, -0.5, 0.0)))
-        flight.receive(VelocityTarget(0, 7, (0.0, 0.0, message.vz), 0.0))
-    flight.vehicle.mode = "AUTO.LOITER"
-    flight.send(Velocity(0.0, 0.0, 0.0, 0.0))
-    assert flight.output.was_confirmed
 
 
 @BOTH

@@ -1,0 +1,296 @@
+"""Firmware that may be flown, and what its modes, parameters, events and streams mean.
+
+Against the facts measured on ArduCopter 4.7 and PX4 1.18.
+"""
+
+import math
+
+import pytest
+from pymavlink.dialects.v20 import ardupilotmega as dialect
+
+from mavbridge.core.errors import PeerError, UserError
+from mavbridge.core.vehicle import ACTION_CLASSES, Output
+from mavbridge.mavlink.codec.messages import CommandRequest
+from mavbridge.mavlink.profiles.ardupilot import ARDUPILOT
+from mavbridge.mavlink.profiles.ardupilot_sticks import stick_settings
+from mavbridge.mavlink.profiles.profile import ParamContext, Profile
+from mavbridge.mavlink.profiles.px4 import PX4, event_id
+from mavbridge.mavlink.session.vehicle import require_profile
+
+OUTPUTS: tuple[Output, ...] = ("rc-override", "manual-control", "attitude", "rates", "velocity")
+BOTH = pytest.mark.parametrize("profile", [ARDUPILOT, PX4], ids=lambda profile: profile.name)
+
+
+def context(output: Output | None, *, has_receiver: bool | None = True) -> ParamContext:
+    return ParamContext(output, 255, has_receiver)
+
+
+@pytest.mark.parametrize("vehicle_type", [2, 3, 4 + 9, 14, 15, 29, 35])
+def test_multirotors_of_two_firmwares_are_flown(vehicle_type: int) -> None:
+    assert require_profile(3, vehicle_type) is ARDUPILOT
+    assert require_profile(12, vehicle_type) is PX4
+
+
+@pytest.mark.parametrize(
+    ("vehicle_type", "name"),
+    [(4, "HELICOPTER"), (1, "FIXED_WING"), (10, "GROUND_ROVER"), (22, "VTOL"), (250, "unknown")],
+)
+def test_anything_but_a_multirotor_is_refused(vehicle_type: int, name: str) -> None:
+    for autopilot in (3, 12):
+        with pytest.raises(PeerError, match=rf"{name}.* \(MAV_TYPE {vehicle_type}\).*multirotors"):
+            require_profile(autopilot, vehicle_type)
+
+
+@pytest.mark.parametrize(
+    ("autopilot", "name"), [(0, "GENERIC"), (13, "SMACCMPILOT"), (4, "OPENPILOT"), (99, "unknown")]
+)
+def test_other_firmware_is_refused(autopilot: int, name: str) -> None:
+    """Betaflight and INAV call themselves generic."""
+    with pytest.raises(PeerError, match=rf"is {name} \(MAV_AUTOPILOT {autopilot}\), and only Ardu"):
+        require_profile(autopilot, 2)
+
+
+@BOTH
+def test_each_kind_of_action_has_an_output_and_what_has_none_says_which(profile: Profile) -> None:
+    assert set(profile.outputs) == set(ACTION_CLASSES)
+    assert not set(profile.outputs.values()) & set(profile.refusals)
+    assert set(profile.outputs.values()) | set(profile.refusals) == set(OUTPUTS)
+    for refusal in profile.refusals.values():
+        assert f"--output {profile.outputs['sticks']}" in refusal
+
+
+@BOTH
+def test_every_role_is_a_mode_that_can_be_asked_for(profile: Profile) -> None:
+    roles = profile.modes.roles
+    named = (roles.hold, roles.land, roles.rtl, *roles.takeoff, *roles.thrust, *roles.setpoint)
+    assert set(named) <= set(roles.names)
+    for name in roles.names:
+        main, sub = profile.modes.command(name)
+        custom_mode = main if profile is ARDUPILOT else main << 16 | sub << 24
+        assert profile.modes.name(custom_mode) == name
+
+
+def test_modes_of_a_copter() -> None:
+    modes = ARDUPILOT.modes
+    assert modes.name(2) == "ALT_HOLD"
+    assert modes.command("alt_hold") == (2, 0)
+    assert modes.name(99) == "99"
+    with pytest.raises(UserError, match="no mode 'HOVER'; it has ACRO"):
+        modes.command("HOVER")
+
+
+@pytest.mark.parametrize(
+    ("name", "main", "sub"),
+    [
+        *(("MANUAL", 1, 0), ("ALTCTL", 2, 0), ("POSCTL", 3, 0), ("ACRO", 5, 0)),
+        *(("OFFBOARD", 6, 0), ("STABILIZED", 7, 0), ("AUTO.TAKEOFF", 4, 2), ("AUTO.LOITER", 4, 3)),
+        *(("AUTO.MISSION", 4, 4), ("AUTO.RTL", 4, 5), ("AUTO.LAND", 4, 6)),
+    ],
+)
+def test_modes_of_px4_and_their_sub_modes(name: str, main: int, sub: int) -> None:
+    assert PX4.modes.name(main << 16 | sub << 24) == name
+    assert PX4.modes.command(name.lower()) == (main, sub)
+
+
+def test_modes_of_px4_without_a_name_of_their_own() -> None:
+    modes = PX4.modes
+    assert modes.name(3 << 16 | 2 << 24) == "POSCTL"  # slow: flown with sticks all the same
+    assert modes.name(4 << 16 | 8 << 24) == "AUTO.8"
+    assert modes.name(10 << 16) == "TERMINATION"
+    for name in ("AUTO", "AUTO.8", "LOITER", "TERMINATION"):
+        with pytest.raises(UserError, match=r"AUTO\.LOITER"):
+            modes.command(name)
+
+
+@BOTH
+def test_where_each_output_is_shown(profile: Profile) -> None:
+    shown = {output: profile.echo(output).messages for output in profile.outputs.values()}
+    sticks = "RC_CHANNELS" if profile is ARDUPILOT else "MANUAL_CONTROL"
+    assert shown == {
+        profile.outputs["sticks"]: (sticks,),
+        "attitude": ("ATTITUDE_TARGET",),
+        "rates": ("ATTITUDE_TARGET",),
+        "velocity": ("POSITION_TARGET_LOCAL_NED",),
+    }
+
+
+@pytest.mark.parametrize(
+    ("profile", "values", "output", "has_receiver", "expected"),
+    [
+        (ARDUPILOT, {"GUID_TIMEOUT": 3.0}, "velocity", True, ["--set GUID_TIMEOUT=0.5"]),
+        (ARDUPILOT, {"GUID_TIMEOUT": 0.5}, "velocity", True, []),
+        (ARDUPILOT, {"FS_THR_ENABLE": 1.0}, "velocity", False, ["--set FS_THR_ENABLE=0"]),
+        (ARDUPILOT, {"FS_THR_ENABLE": 1.0}, "velocity", None, []),  # not known yet
+        (ARDUPILOT, {"FS_THR_ENABLE": 0.0}, "velocity", False, []),
+        (ARDUPILOT, {"ATC_ANGLE_BOOST": 0.0}, "attitude", True, ["ATC_ANGLE_BOOST is 0"]),
+        (ARDUPILOT, {"ATC_ANGLE_BOOST": 0.0}, "rates", True, []),
+        (ARDUPILOT, {"ATC_ANGLE_BOOST": 0.0}, "velocity", True, []),
+        (ARDUPILOT, {"ATC_ANGLE_BOOST": 1.0}, "attitude", True, []),
+        (ARDUPILOT, {"GUID_TIMEOUT": 3.0, "ATC_ANGLE_BOOST": 0.0}, None, False, []),
+        (PX4, {}, "manual-control", None, []),
+        (PX4, {"COM_RC_LOSS_T": 0.5, "NAV_RCL_ACT": 2.0}, "manual-control", None, []),
+        (PX4, {"COM_RC_LOSS_T": 2.0}, "manual-control", None, ["--set COM_RC_LOSS_T=0.5"]),
+        (PX4, {"COM_RC_LOSS_T": 0.1}, "manual-control", None, ["as short as that is a failsafe"]),
+        (PX4, {"NAV_RCL_ACT": 6.0}, "manual-control", None, ["NAV_RCL_ACT is 6: it would disarm"]),
+        (PX4, {"NAV_RCL_ACT": 5.0}, "manual-control", None, ["terminate the flight"]),
+        (
+            *(PX4, {"MPC_MAN_TILT_MAX": 35.0, "MPC_TILTMAX_AIR": 20.0}),
+            *("manual-control", None),
+            ["--set MPC_TILTMAX_AIR=35"],
+        ),
+        (PX4, {"MPC_MAN_TILT_MAX": 35.0, "MPC_TILTMAX_AIR": 45.0}, "manual-control", None, []),
+        (PX4, {"MPC_THR_CURVE": 1.0}, "manual-control", None, ["--set MPC_THR_CURVE=0"]),
+        (PX4, {"MPC_THR_CURVE": 1.0, "MPC_TILTMAX_AIR": 1.0}, "rates", None, []),
+        (PX4, {"COM_RC_LOSS_T": 2.0, "NAV_RCL_ACT": 6.0}, "velocity", None, []),
+        (PX4, {"COM_OF_LOSS_T": 5.0}, "velocity", None, ["--set COM_OF_LOSS_T=0.5"]),
+        (PX4, {"COM_OBL_RC_ACT": 7.0}, "rates", None, ["COM_OBL_RC_ACT is 7: it would disarm"]),
+        (PX4, {"COM_OF_LOSS_T": 5.0, "COM_RC_LOSS_T": 2.0}, None, None, []),
+    ],
+)
+def test_advice(
+    profile: Profile,
+    values: dict[str, float],
+    output: Output | None,
+    has_receiver: bool | None,
+    expected: list[str],
+) -> None:
+    notes = list(profile.advice(values, context(output, has_receiver=has_receiver)))
+    assert len(notes) == len(expected)
+    for note, part in zip(notes, expected, strict=True):
+        assert part in note.text
+
+
+@pytest.mark.parametrize(
+    ("options", "expected"),
+    [
+        (None, "has not sent GUID_OPTIONS"),
+        (0.0, "GUID_OPTIONS is 0.*climb rate.*--set GUID_OPTIONS=8"),
+        (1.0, "--set GUID_OPTIONS=9"),
+        (8.0, None),
+        (9.0, None),
+    ],
+)
+def test_thrust_must_be_thrust(options: float | None, expected: str | None) -> None:
+    values = {} if options is None else {"GUID_OPTIONS": options}
+    for output in ("attitude", "rates"):
+        found = "; ".join(note.text for note in ARDUPILOT.obstacles(values, context(output)))
+        if expected is None:
+            assert found == ""
+        else:
+            with pytest.raises(AssertionError, match=expected):
+                assert found == ""
+    assert list(ARDUPILOT.obstacles(values, context("velocity"))) == []
+    assert list(ARDUPILOT.obstacles(values, context("rc-override"))) == []
+
+
+RCMAP = {"RCMAP_ROLL": 1.0, "RCMAP_PITCH": 2.0, "RCMAP_THROTTLE": 3.0, "RCMAP_YAW": 6.0}
+
+
+@pytest.mark.parametrize(
+    ("name", "value"),
+    [
+        ("SIMPLE", 63.0),
+        ("SIMPLE", 1.0),
+        ("SUPER_SIMPLE", 8.0),
+        ("RC7_OPTION", 3.0),
+        ("RC12_OPTION", 13.0),
+        ("RC3_OPTION", 153.0),  # the throttle arms
+        ("RC6_OPTION", 4.0),  # the yaw stick returns home
+        ("FLTMODE_CH", 6.0),
+    ],
+)
+def test_what_turns_a_stick_is_refused_with_what_mends_it(name: str, value: float) -> None:
+    settings = {each.name: each for each in stick_settings(RCMAP)}
+    (note,) = ARDUPILOT.obstacles(RCMAP | {name: value}, context("rc-override"))
+    mended = settings[name].mended
+
+    assert (note.names, note.cure) == ((name,), f"--set {name}={mended:g}")
+    assert list(ARDUPILOT.obstacles(RCMAP | {name: mended}, context("rc-override"))) == []
+    assert list(ARDUPILOT.obstacles(RCMAP | {name: value}, context("velocity"))) == []
+
+
+@pytest.mark.parametrize(
+    ("name", "value"), [("RC7_OPTION", 4.0), ("RC8_OPTION", 46.0), ("FLTMODE_CH", 5.0)]
+)
+def test_a_switch_of_the_pilots_own_is_none_of_our_sticks(name: str, value: float) -> None:
+    assert list(ARDUPILOT.obstacles(RCMAP | {name: value}, context("rc-override"))) == []
+
+
+def test_a_receiver_that_is_ignored_holds_no_stick() -> None:
+    assert [
+        ARDUPILOT.ignores_receiver({"RC_OPTIONS": bits}) for bits in (1.0, 33.0, 32.0, 2.0)
+    ] == [
+        *(True, True),
+        *(False, False),
+    ]
+
+
+def test_setpoints_that_stop_are_never_held_for_ever() -> None:
+    values = {"RC_OVERRIDE_TIME": -1.0, "FS_THR_ENABLE": 0.0}
+    assert list(ARDUPILOT.dangers(values, context("velocity", has_receiver=False))) == []
+    assert len(list(ARDUPILOT.dangers(values, context("rc-override", has_receiver=False)))) == 2
+
+
+@pytest.mark.parametrize("mode", range(9))
+def test_sticks_of_mavlink_must_be_taken(mode: int) -> None:
+    found = list(PX4.obstacles({"COM_RC_IN_MODE": float(mode)}, context("manual-control")))
+    assert bool(found) == (mode in (0, 4))
+    assert all(note.cure == "--set COM_RC_IN_MODE=1" for note in found)
+    assert list(PX4.obstacles({"COM_RC_IN_MODE": float(mode)}, context("rates"))) == []
+    assert PX4.ignores_receiver({"COM_RC_IN_MODE": float(mode)}) == (mode in (1, 4))
+
+
+@pytest.mark.parametrize("time_s", [-1.0, 0.0, 2.0])
+def test_no_gesture_of_the_policys_may_stop_the_motors(time_s: float) -> None:
+    notes = PX4.obstacles({"MAN_KILL_GEST_T": time_s}, context("manual-control"))
+    assert [note.cure for note in notes] == ["--set MAN_KILL_GEST_T=-1"] * (time_s >= 0)
+    assert list(PX4.obstacles({"MAN_KILL_GEST_T": time_s}, context("rates"))) == []
+
+
+@pytest.mark.parametrize(
+    ("name", "number", "told"),
+    [
+        ("commander_armed_by", 0x190CAF3, {"is_armed": True}),
+        ("commander_disarmed_by", 0x1F46777, {"is_armed": False}),
+        ("commander_failsafe_enter_hold", 0x1D11DF6, {"is_failsafe": True}),
+        ("commander_failsafe_enter", 0x194CA8A, {}),
+        ("commander_rc_lost", 0x155CD44, {"text": "manual control lost"}),
+    ],
+)
+def test_numbers_of_events_are_those_that_the_firmware_sent(
+    name: str, number: int, told: dict[str, object]
+) -> None:
+    assert event_id(name) == number
+    assert {key: getattr(PX4.events[number], key) for key in told} == told
+    assert 0x1A893E0 not in PX4.events  # arming checks, every two seconds
+
+
+@pytest.mark.parametrize(
+    ("profile", "name", "sticks"),
+    [(PX4, "COM_OF_LOSS_T", "manual-control"), (ARDUPILOT, "GUID_TIMEOUT", "rc-override")],
+)
+def test_a_last_setpoint_that_stays_for_long_has_to_be_accepted(
+    profile: Profile, name: str, sticks: Output
+) -> None:
+    for output in ("attitude", "rates", "velocity"):
+        assert list(profile.dangers({name: 3.0}, context(output))) == []
+        (danger,) = profile.dangers({name: 3.5}, context(output))
+        assert (danger.risk, f"--set {name}=0.5" in danger.cure) == ("long-setpoint", True)
+    assert list(profile.dangers({name: 3.5}, context(sticks))) == []
+
+
+def test_a_takeoff_is_asked_for_by_height_above_home_or_above_the_sea() -> None:
+    command = CommandRequest(dialect.MAV_CMD_NAV_TAKEOFF, (0, 0, 0, 0, 0, 0, 8.0))
+    assert ARDUPILOT.takeoff(8.0, None) == ARDUPILOT.takeoff(8.0, 489.0) == command
+    command = PX4.takeoff(5.0, 489.4)
+    assert command.command == dialect.MAV_CMD_NAV_TAKEOFF
+    assert command.params[6] == pytest.approx(494.4)
+    assert all(math.isnan(command.params[k]) for k in (3, 4, 5))  # looking as now, here
+    assert PX4.takeoff(5.0, None) is None
+
+
+def test_hover_thrust_is_the_vehicles_own_and_our_heartbeat_what_it_needs_for_texts() -> None:
+    assert PX4.heartbeat_type == dialect.MAV_TYPE_GCS
+    assert PX4.hover_thrust({"MPC_THR_HOVER": 0.5}) == 0.5
+    assert ARDUPILOT.hover_thrust({"MOT_THST_HOVER": 0.39}) == 0.39
+    assert ARDUPILOT.hover_thrust({}) is None
