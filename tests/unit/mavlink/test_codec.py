@@ -41,6 +41,7 @@ from mavbridge.mavlink.codec.messages import (
     SystemStatus,
     Timesync,
     VelocityTarget,
+    later_by_us,
 )
 from mavbridge.mavlink.codec.packets import (
     MOST_DATAGRAM_BYTES,
@@ -508,6 +509,28 @@ def test_a_parameter_that_is_no_integer_is_written_as_it_is() -> None:
     assert ParamValue("COM_RC_LOSS_T", 0.5, 9).from_bytes().value == 0.5
     too_much = ParamWrite("SYS_AUTOSTART", 1e12, kind=6).as_bytes()
     assert ParamValue("SYS_AUTOSTART", too_much.value, 6).from_bytes().value == 2**31 - 1
+
+
+WRAP = 2**32 * 1000
+
+
+@pytest.mark.parametrize(
+    ("stamp_us", "other_us", "later_us"),
+    [
+        *((5, 3, 2), (3_000_000, 4_000_000, -1_000_000), (3_000_000, 4_000_001, -1_000_001)),
+        *((10, WRAP - 10, 20), (WRAP - 10, 10, -20)),  # across the wrap
+        *((500_000, WRAP - 500_000, 1_000_000), (500_001, WRAP - 500_000, 1_000_001 - WRAP)),
+    ],
+)
+def test_a_stamp_is_later_across_a_wrap_and_after_a_restart_earlier(
+    stamp_us: int, other_us: int, later_us: int
+) -> None:
+    assert later_by_us(stamp_us, other_us) == later_us
+
+
+def test_what_a_record_is_not_told_is_zero() -> None:
+    assert (Heartbeat(2, 3, 0, 0).system_status, RcChannels(()).boot_us) == (0, 0)
+    assert (Altitude(1.0)[1:], StatusText("x")[1:]) == ((0.0, 0), (0, 0, False))
 
 
 def test_sequence_numbers_have_no_gaps() -> None:
