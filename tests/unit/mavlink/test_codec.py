@@ -290,6 +290,7 @@ def test_a_message_without_a_name_keeps_its_sender_and_its_place_in_the_sequence
         (message,) = ours.decode_datagram(packet)
         assert (message.source, message.sequence) == (source, sequence)
         assert (message.body, message.packet) == (None, packet)
+        assert message.name.startswith("UNKNOWN_")
 
 
 @pytest.mark.parametrize("unit", [b"\xfe\0", b"\xfd\0\0\0\0\0"], ids=["v1", "v2"])

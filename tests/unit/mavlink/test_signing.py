@@ -155,7 +155,7 @@ def test_our_timestamps_follow_the_clock_and_never_step_back():
 def test_without_a_key_signed_packets_are_read_and_noticed():
     codec = make_codec(None)
     assert names(codec, attitude(make_vehicle(None))) == ["ATTITUDE_QUATERNION"]
-    assert not codec.hears_signed
+    assert (codec.hears_signed, codec.refused_signatures) == (False, 0)
     for key in (KEY, None):  # it is remembered
         assert names(codec, attitude(make_vehicle(key))) == ["ATTITUDE_QUATERNION"]
         assert codec.hears_signed
