@@ -69,27 +69,22 @@ def test_incomplete_frames_are_bounded():
 
 
 @pytest.mark.parametrize(
-    "datagram",
+    ("fields", "payload_bytes"),
     [
-        pytest.param(b"", id="empty"),
-        pytest.param(HEADER.pack(8, 0, 1, 5, 5, 0), id="header alone"),
-        pytest.param(HEADER.pack(8, 0, 1, 5, 5, 0)[:20], id="cut header"),
-        pytest.param(HEADER.pack(8, 0, 1, 5, 5, 0) + b"1234", id="cut chunk"),
-        pytest.param(HEADER.pack(8, 1, 1, 5, 5, 0) + b"12345", id="chunk 1 of 1"),
-        pytest.param(HEADER.pack(8, 0, 0, 5, 5, 0) + b"12345", id="chunk of none"),
-        pytest.param(HEADER.pack(8, 0, 2, 9, 0, 0) + b"12345", id="no bytes"),
-        pytest.param(HEADER.pack(8, 0, 1, 4, 5, 0) + b"12345", id="more bytes than the picture"),
-        pytest.param(HEADER.pack(8, 0, 1, 6, 5, 0) + b"12345", id="fewer bytes than the picture"),
-        pytest.param(HEADER.pack(8, 0, 6, 5, 5, 0) + b"12345", id="more chunks than bytes"),
-        pytest.param(HEADER.pack(8, 0, 9, MAX_JPEG_BYTES + 1, 5, 0) + b"12345", id="too large"),
-        pytest.param(HEADER.pack(8, 0, 9, 2**32 - 1, 5, 0) + b"12345", id="4 GiB"),
-        pytest.param(b"GET / HTTP/1.1\r\nHost: camera\r\n\r\n", id="another protocol"),
+        pytest.param((0, 1, 5, 5), b"", id="header alone"),
+        pytest.param((0, 1, 5, 5), b"1234", id="cut chunk"),
+        pytest.param((1, 1, 5, 5), b"12345", id="chunk 1 of 1"),
+        pytest.param((0, 2, 9, 0), b"12345", id="no bytes"),
+        pytest.param((0, 1, 4, 5), b"12345", id="more bytes than the picture"),
+        pytest.param((0, 1, 6, 5), b"12345", id="fewer bytes than the picture"),
+        pytest.param((0, 6, 5, 5), b"12345", id="more chunks than bytes"),
+        pytest.param((0, 9, MAX_JPEG_BYTES + 1, 5), b"12345", id="too large"),
     ],
 )
-def test_what_is_malformed_is_counted_and_ignored(datagram):
+def test_what_is_malformed_is_counted_and_ignored(fields, payload_bytes):
     frames = FrameAssembler()
-    assert put_all(frames, [datagram]) == []
-    assert frames.malformed == 1
+    assert put_all(frames, [b"", HEADER.pack(8, *fields, 0) + payload_bytes]) == []
+    assert frames.malformed == 2
     assert put_all(frames, chunks(8, payload(8), part=9)) == [8]
 
 
@@ -112,18 +107,11 @@ def test_a_sender_that_starts_again_is_followed_after_a_second():
     assert put_all(frames, chunks(2, payload(2)), later_ns) == [2]
 
 
-@pytest.mark.parametrize(
-    ("text", "address"), [("5600", ("127.0.0.1", 5600)), ("[::1]:65535", ("::1", 65535))]
-)
-def test_addresses(text, address):
-    assert parse_jpeg_udp(text) == address
-    check_camera(f"jpeg-udp:{text}")
-
-
-@pytest.mark.parametrize("text", ["", "65536", "host"])
-def test_what_is_no_address_is_refused(text):
+def test_addresses():
+    assert parse_jpeg_udp("5600") == ("127.0.0.1", 5600)
+    assert parse_jpeg_udp("[::1]:65535") == ("::1", 65535)
     with pytest.raises(UserError, match="jpeg-udp:\\[HOST:\\]PORT"):
-        check_camera(f"jpeg-udp:{text}")
+        check_camera("jpeg-udp:host")
 
 
 class TickingClock(FakeClock):
@@ -186,17 +174,13 @@ def test_a_port_that_is_in_use_is_named():
             open_camera("jpeg-udp:17204", image_size=32, clock=MonotonicClock(), timeout_s=0.2)
 
 
-def with_size(data: bytes, at: int, sides: bytes) -> bytes:
-    return data[:at] + sides + data[at + len(sides) :]
-
-
 def test_a_picture_that_says_it_is_huge_is_not_decoded():
     jpeg, png = encoded(scene(0)), encoded(depth_scene(0), ".png")
     size_at = jpeg.index(b"\xff\xc0") + 5
-    assert decode_picture(jpeg) is not None
-    assert decode_picture(with_size(jpeg, size_at, b"\xff\xdc\xff\xdc")) is None
-    assert decode_picture(png) is not None
-    assert decode_picture(with_size(png, 16, b"\x7f\xff\xff\xff\x7f\xff\xff\xff")) is None
-    for end in range(40):
-        assert decode_picture(jpeg[:end]) is None
-        assert decode_picture(png[:end]) is None
+    for picture, at, sides in (
+        (jpeg, size_at, b"\xff\xdc" * 2),
+        (png, 16, b"\x7f\xff\xff\xff" * 2),
+    ):
+        assert decode_picture(picture) is not None
+        assert decode_picture(picture[:at] + sides + picture[at + len(sides) :]) is None
+        assert not [end for end in range(40) if decode_picture(picture[:end]) is not None]

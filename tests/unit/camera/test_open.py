@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from helpers.camera_senders import SIDE, depth_scene, scene
-from helpers.fakes import START_NS, FakeClock
+from helpers.fakes import START_NS
 from mavbridge.camera import open as camera_open
 from mavbridge.camera.open import BLANK_NS, check_camera, open_camera
 from mavbridge.config.flight import CameraConfig
@@ -17,64 +17,49 @@ from mavbridge.core.errors import CameraError, UserError
 from mavbridge.recording.video.file import FragmentedMp4
 from sitl.camera.shm import FramePublisher
 
+needs_shm = pytest.mark.skipif(not Path("/dev/shm").is_dir(), reason="needs /dev/shm")
+
 
 class NotOpenedError(Exception):
     """Carries what the opener was asked for."""
 
 
-@pytest.fixture
-def openers(monkeypatch):
-    """Sources that only say what they were asked for."""
-
-    def refuse(kind):
-        def source(*arguments, **options):
-            options.pop("clock")
-            raise NotOpenedError(kind, *arguments, options)
-
-        return source
-
-    monkeypatch.setattr(camera_open, "open_device", refuse("device"))
-    monkeypatch.setattr(camera_open, "open_stream", refuse("stream"))
+BY_ID = "/dev/v4l/by-id/usb-X-video-index0"
 
 
 @pytest.mark.parametrize(
     ("spec", "asked"),
     [
-        ("0", ("device", 0, {"image_size": 224})),
-        ("12", ("device", 12, {"image_size": 224})),
-        ("/dev/video3", ("device", Path("/dev/video3"), {"image_size": 224})),
-        ("/dev/null", ("device", Path("/dev/null"), {"image_size": 224})),
-        (
-            "/dev/v4l/by-id/usb-X-video-index0",
-            ("device", Path("/dev/v4l/by-id/usb-X-video-index0"), {"image_size": 224}),
+        ("12", ("open_device", 12)),
+        ("/dev/video3", ("open_device", Path("/dev/video3"))),
+        ("/dev/null", ("open_device", Path("/dev/null"))),
+        (BY_ID, ("open_device", Path(BY_ID))),
+        *(
+            (url, ("open_stream", url))
+            for url in ("rtp://0.0.0.0:5004", "rtsp://host:8554/cam", "udp://0.0.0.0:5600")
         ),
-        ("rtp://0.0.0.0:5004", ("stream", "rtp://0.0.0.0:5004", {})),
-        ("rtsp://host:8554/cam", ("stream", "rtsp://host:8554/cam", {})),
-        ("udp://0.0.0.0:5600", ("stream", "udp://0.0.0.0:5600", {})),
-        ("tcp://host:1", ("stream", "tcp://host:1", {})),
-        ("http://host/a.mjpg", ("stream", "http://host/a.mjpg", {})),
-        ("https://host/a.mjpg", ("stream", "https://host/a.mjpg", {})),
+        *((url, ("open_stream", url)) for url in ("tcp://h:1", "http://h/a", "https://h/a")),
     ],
 )
-@pytest.mark.usefixtures("openers")
-def test_live_sources(spec, asked):
+def test_live_sources(spec, asked, monkeypatch):
+    for name in ("open_device", "open_stream"):
+
+        def refuse(source, *, clock, image_size=224, name=name):
+            raise NotOpenedError(name, source, image_size)
+
+        monkeypatch.setattr(camera_open, name, refuse)
     with pytest.raises(CameraError) as caught:
         open_camera(spec, image_size=224, clock=MonotonicClock())
-    assert caught.value.__cause__.args == asked
+    assert caught.value.__cause__.args == (*asked, 224)
 
 
-@pytest.fixture(params=["a.avi", "10:30.avi"])  # FFmpeg would take the second for a protocol
-def video(tmp_path, monkeypatch, request):
+@pytest.mark.parametrize("name", ["a.avi", "10:30.avi"])  # FFmpeg would take one for a protocol
+def test_the_latency_lies_between_exposure_and_arrival(name, tmp_path, monkeypatch, clock):
     monkeypatch.chdir(tmp_path)
-    path = Path(request.param)
-    writer = cv2.VideoWriter(str(path), cv2.VideoWriter.fourcc(*"MJPG"), 20, (32, 32))
+    writer = cv2.VideoWriter(name, cv2.VideoWriter.fourcc(*"MJPG"), 20, (32, 32))
     writer.write(np.zeros((32, 32, 3), np.uint8))
     writer.release()
-    return str(path)
-
-
-def test_the_latency_lies_between_exposure_and_arrival(video):
-    camera = open_camera(video, image_size=224, clock=FakeClock(), latency_ms=120.5)
+    camera = open_camera(name, image_size=224, clock=clock, latency_ms=120.5)
     frame = camera.read(0)
     assert frame.captured_ns == START_NS - round(120.5 * NS_PER_MS)
     assert frame.rgb.shape == (32, 32, 3)
@@ -84,19 +69,17 @@ def test_the_latency_lies_between_exposure_and_arrival(video):
     camera.close()
 
 
-def test_shared_memory_carries_its_own_stamps_and_refuses_a_latency():
+def test_shared_memory_carries_its_own_stamps_and_refuses_a_latency(clock):
     with pytest.raises(UserError, match="--camera-latency 40 cannot be used with shm:fpv"):
-        check_camera("shm:fpv", latency_ms=40.0)
-    with pytest.raises(UserError, match="--camera-latency"):
-        open_camera("shm:fpv", image_size=224, clock=FakeClock(), latency_ms=40.0)
+        open_camera("shm:fpv", image_size=224, clock=clock, latency_ms=40.0)
     check_camera("shm:fpv")
     check_camera("rtsp://host/cam", latency_ms=40.0)
 
 
-@pytest.mark.skipif(not Path("/dev/shm").is_dir(), reason="needs /dev/shm")
+@needs_shm
 @pytest.mark.parametrize(("timeout_s", "left_s"), [(3.0, [2, 1]), (2.5, [2, 1]), (0.4, [])])
-def test_shared_memory_that_never_appears_is_counted_down_and_refused(timeout_s, left_s):
-    lines, clock = [], FakeClock()
+def test_shared_memory_that_never_appears_is_counted_down_and_refused(timeout_s, left_s, clock):
+    lines = []
     camera = {"image_size": 224, "clock": clock, "timeout_s": timeout_s, "report": lines.append}
     told = rf"within {timeout_s:g} s \(link.camera_timeout\): shm:mb-none"
     with pytest.raises(CameraError, match=told):
@@ -109,10 +92,9 @@ def test_shared_memory_that_never_appears_is_counted_down_and_refused(timeout_s,
     ], "a reason is told once"
 
 
-@pytest.mark.skipif(not Path("/dev/shm").is_dir(), reason="needs /dev/shm")
-def test_a_segment_that_no_wait_can_mend_ends_the_wait(monkeypatch):
-    path, clock = Path("/dev/shm", f"mb-wrong-{os.getpid()}"), FakeClock()
-    reasons = []
+@needs_shm
+def test_a_segment_that_no_wait_can_mend_ends_the_wait(clock):
+    path, reasons = Path("/dev/shm", f"mb-wrong-{os.getpid()}"), []
 
     def report(line):
         reasons.append(line)
@@ -126,12 +108,10 @@ def test_a_segment_that_no_wait_can_mend_ends_the_wait(monkeypatch):
     assert len(reasons) == 1
 
 
-@pytest.mark.parametrize("spec", ["", "nowhere.mp4", "-1", "ftp://host/x", "camera", "."])
+@pytest.mark.parametrize("spec", ["", "nowhere.mp4", "-1", "ftp://host/x", "."])
 def test_anything_else_is_refused_with_the_forms_there_are(spec):
-    with pytest.raises(UserError, match="no such file") as caught:
-        open_camera(spec, image_size=224, clock=FakeClock())
-    for form in ("/dev/video0", "rtsp://", "shm:NAME", "screen:"):
-        assert form in str(caught.value)
+    with pytest.raises(UserError, match=r"no such file.*/dev/video0.*rtsp://.*shm:NAME.*screen:"):
+        check_camera(spec)
 
 
 def test_a_device_that_is_not_there_is_refused():
@@ -142,11 +122,10 @@ def test_a_device_that_is_not_there_is_refused():
 
 @pytest.mark.parametrize("package", ["mss", "Xlib"])
 def test_the_screen_without_its_packages_names_the_extra(monkeypatch, package):
-    monkeypatch.delitem(sys.modules, package, raising=False)
     monkeypatch.setitem(sys.modules, package, None)
     monkeypatch.delitem(sys.modules, "mavbridge.camera.screen", raising=False)
     with pytest.raises(UserError, match=r"pip install "):
-        open_camera("screen:", image_size=224, clock=FakeClock())
+        check_camera("screen:")
 
 
 @pytest.mark.parametrize(
@@ -163,37 +142,35 @@ def test_settings_that_no_camera_has_are_refused(settings, complaint):
         CameraConfig(**settings)
 
 
-@pytest.mark.skipif(not Path("/dev/shm").is_dir(), reason="needs /dev/shm")
+@needs_shm
 @pytest.mark.parametrize("is_depth", [True, False])
-def test_a_camera_of_the_other_kind_is_refused_with_its_figures(is_depth):
+def test_a_camera_of_the_other_kind_is_refused_with_its_figures(is_depth, clock):
     name = f"mb-test-kind-{is_depth}"
     publisher = FramePublisher(name, 24, 16, is_depth=is_depth)
     publisher.publish(depth_scene(0)[:16, :24] if is_depth else scene(0)[:16, :24], START_NS)
     for wanted in (is_depth, None):
-        camera = open_camera(f"shm:{name}", image_size=16, clock=FakeClock(), is_depth=wanted)
-        camera.close()
+        open_camera(f"shm:{name}", image_size=16, clock=clock, is_depth=wanted).close()
     found = "depth of 24x16" if is_depth else "RGB images of 24x16"
     with pytest.raises(UserError, match=rf"shm:{name} delivers {found}, .*\(image_channels\)"):
-        open_camera(f"shm:{name}", image_size=16, clock=FakeClock(), is_depth=not is_depth)
+        open_camera(f"shm:{name}", image_size=16, clock=clock, is_depth=not is_depth)
     publisher.close()
 
 
-def test_the_video_of_a_depth_flight_plays_as_depth(tmp_path):
+def test_the_video_of_a_depth_flight_plays_as_depth(tmp_path, clock):
     path = tmp_path / "camera.mp4"
     video = FragmentedMp4(path, height=SIDE, width=SIDE, hz=30, is_depth=True)
     for number in range(3):
         video.append(depth_scene(number), number * NS_PER_S // 30)
     video.close()
     with pytest.raises(UserError, match=f"delivers depth of {SIDE}x{SIDE}, .* takes RGB"):
-        open_camera(str(path), image_size=32, clock=FakeClock(), is_depth=False)
-    camera = open_camera(str(path), image_size=32, clock=FakeClock(), is_depth=True)
+        open_camera(str(path), image_size=32, clock=clock, is_depth=False)
+    camera = open_camera(str(path), image_size=32, clock=clock, is_depth=True)
     for number in range(3):
         assert np.array_equal(camera.read(NS_PER_S).rgb, depth_scene(number))
     camera.close()
 
 
-def test_black_frames_come_on_a_grid_and_late_ones_are_dropped() -> None:
-    clock = FakeClock()
+def test_black_frames_come_on_a_grid_and_late_ones_are_dropped(clock):
     camera = open_camera("none", image_size=32, clock=clock)
     first = camera.read(BLANK_NS)
     assert camera.read(BLANK_NS // 2) is None

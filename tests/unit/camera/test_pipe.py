@@ -3,8 +3,7 @@
 import os
 import shlex
 import sys
-from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import closing
 from pathlib import Path
 
 import cv2
@@ -23,7 +22,7 @@ from mavbridge.core.errors import CameraError, UserError
 
 WIDTH, HEIGHT = 32, 16
 WRITER = """
-import sys, time
+import signal, sys, time
 out = sys.stdout.buffer
 def write(data):
     out.write(data)
@@ -42,47 +41,25 @@ def picture(level: int) -> np.ndarray:
     return rgb
 
 
-def jpeg(level: int) -> bytes:
-    _, data = cv2.imencode(".jpg", cv2.cvtColor(picture(level), cv2.COLOR_RGB2BGR))
-    return data.tobytes()
-
-
 def with_thumbnail(data: bytes) -> bytes:
     """The same picture with another one in its header, as cameras write them."""
-    inner = jpeg(7)
+    inner = encoded(picture(7))
     return data[:2] + b"\xff\xe1" + (len(inner) + 2).to_bytes(2, "big") + inner + data[2:]
 
 
-@contextmanager
-def source(command: str) -> Iterator[PipeSource]:
-    opened = PipeSource(parse_pipe(command), clock=MonotonicClock())
-    try:
-        yield opened
-    finally:
-        opened.close()
+def source(command: str) -> closing[PipeSource]:
+    return closing(PipeSource(parse_pipe(command), clock=MonotonicClock()))
 
 
-# --- what is written
-
-
-@pytest.mark.parametrize(
-    ("text", "raw"),
-    [
-        ("{} -c 1", None),
-        ("640x480:rgb24:{} -c 1", (640, 480, "rgb24")),
-        ("640x480:nv12:{} -c 1", (640, 480, "nv12")),
-        ("33x17:gray16le:{} -c 1", (33, 17, "gray16le")),
-    ],
-)
-def test_a_command_is_split_without_a_shell(text: str, raw: tuple[int, int, str] | None) -> None:
-    command = parse_pipe(text.format(sys.executable) + " 'two words' $HOME")
+@pytest.mark.parametrize(("prefix", "raw"), [("", None), ("33x17:gray16le:", (33, 17, "gray16le"))])
+def test_a_command_is_split_without_a_shell(prefix: str, raw: tuple[int, int, str] | None) -> None:
+    command = parse_pipe(f"{prefix}{sys.executable} -c 1 'two words' $HOME")
     assert command == PipeCommand((sys.executable, "-c", "1", "two words", "$HOME"), raw)
 
 
 @pytest.mark.parametrize(
     ("text", "told"),
     [
-        ("", "names no program"),
         ("640x480:rgb24:", "names no program"),
         ("no-such-program -o -", "there is no program 'no-such-program'"),
         ("640x480:rgb:cat", "'rgb' is no format .* rgb24"),
@@ -96,9 +73,6 @@ def test_what_cannot_run_is_refused_before_anything_is_loaded(text: str, told: s
         check_camera(f"pipe:{text}")
 
 
-# --- cutting
-
-
 @given(
     st.lists(st.integers(0, 255), min_size=1, max_size=4),
     st.lists(st.integers(1, 700), min_size=1, max_size=20),
@@ -110,7 +84,7 @@ def test_pictures_are_found_however_their_bytes_come(
 ) -> None:
     header = b"--frame\r\nContent-Type: image/jpeg\r\n\r\n" if is_multipart else b""
     frames = [
-        encoded(depth_scene(level), ".png") if is_png else with_thumbnail(jpeg(level))
+        encoded(depth_scene(level), ".png") if is_png else with_thumbnail(encoded(picture(level)))
         for level in levels
     ]
     data = b"".join(header + frame for frame in frames)
@@ -129,7 +103,7 @@ def test_pictures_are_found_however_their_bytes_come(
 def test_a_frame_is_as_old_as_its_first_byte_and_the_newest_wins() -> None:
     for cutter, frames in (
         (RawCutter(2, 2, RAW_FORMATS["gray"]), [b"abcd", b"efgh", b"ijkl"]),
-        (PictureCutter(), [jpeg(10), jpeg(20), jpeg(30)]),
+        (PictureCutter(), [encoded(picture(level)) for level in (10, 20, 30)]),
     ):
         cutter.put(frames[0][:2], 1)
         cutter.put(frames[0][2:] + frames[1][:2], 5)
@@ -141,23 +115,19 @@ def test_a_frame_is_as_old_as_its_first_byte_and_the_newest_wins() -> None:
 
 def test_every_raw_format_shows_the_colours() -> None:
     rgb = picture(60)
-    yuv = cv2.cvtColor(rgb, cv2.COLOR_RGB2YUV_I420)
-    planes = yuv.reshape(-1)
-    luma, chroma = planes[: WIDTH * HEIGHT], planes[WIDTH * HEIGHT :].reshape(2, -1)
-    grey = cv2.cvtColor(rgb, cv2.COLOR_RGB2GRAY)
-    frames = {
-        "rgb24": rgb.tobytes(),
-        "bgr24": rgb[..., ::-1].tobytes(),
-        "yuv420p": yuv.tobytes(),
-        "nv12": luma.tobytes() + chroma.T.tobytes(),
-    }
-    for name, data in frames.items():
+    grey = np.repeat(cv2.cvtColor(rgb, cv2.COLOR_RGB2GRAY)[..., None], 3, axis=2)
+    yuv = cv2.cvtColor(rgb, cv2.COLOR_RGB2YUV_I420).reshape(-1)
+    luma, chroma = yuv[: WIDTH * HEIGHT], yuv[WIDTH * HEIGHT :].reshape(2, -1)
+    for name, data, expected in (
+        ("rgb24", rgb.tobytes(), rgb),
+        ("bgr24", rgb[..., ::-1].tobytes(), rgb),
+        ("yuv420p", yuv.tobytes(), rgb),
+        ("nv12", luma.tobytes() + chroma.T.tobytes(), rgb),
+        ("gray", grey[..., 0].tobytes(), grey),
+        ("yuyv422", b"\x50\x80" * WIDTH * HEIGHT, np.full_like(rgb, 80)),
+    ):
         shown = RawCutter(WIDTH, HEIGHT, RAW_FORMATS[name]).decode(data)
-        assert np.abs(shown.astype(int) - rgb).max() <= 12, name
-    shown = RawCutter(WIDTH, HEIGHT, RAW_FORMATS["gray"]).decode(grey.tobytes())
-    assert np.array_equal(shown, np.repeat(grey[..., None], 3, axis=2))
-    shown = RawCutter(WIDTH, HEIGHT, RAW_FORMATS["yuyv422"]).decode(b"\x50\x80" * WIDTH * HEIGHT)
-    assert shown.shape == rgb.shape
+        assert np.abs(shown.astype(int) - expected).max() <= 12, name
 
 
 def test_depth_comes_as_png_of_16_bits_or_raw_and_no_other_picture_is_depth() -> None:
@@ -168,9 +138,7 @@ def test_depth_comes_as_png_of_16_bits_or_raw_and_no_other_picture_is_depth() ->
         assert found.dtype == np.uint16
         assert np.array_equal(found, depth)
     for colours in (np.dstack([depth] * 3), (depth >> 8).astype(np.uint8), scene(1)):
-        done, data = cv2.imencode(".png", colours)
-        assert done
-        picture = PictureCutter().decode(data.tobytes())
+        picture = PictureCutter().decode(encoded(colours, ".png"))
         assert (picture.dtype, picture.shape) == (np.uint8, (SIDE, SIDE, 3))
 
 
@@ -180,25 +148,21 @@ def test_garbage_ends_in_a_clear_error(data: bytes) -> None:
         PictureCutter().put(data, 0)
 
 
-# --- the program
-
-
-def test_frames_come_from_a_program(tmp_path: Path) -> None:
-    (tmp_path / "a.jpg").write_bytes(jpeg(40))
-    body = f"data = open({str(tmp_path / 'a.jpg')!r}, 'rb').read()\n"
-    camera = open_camera(
-        "pipe:" + python(body + "while True:\n    write(data)\n    time.sleep(0.01)"),
-        image_size=16,
-        clock=(clock := MonotonicClock()),
-        latency_ms=20,
-    )
-    try:
+@pytest.mark.skipif(sys.platform != "linux", reason="looks into /proc")
+@pytest.mark.parametrize("setup", ["", "signal.signal(signal.SIGTERM, signal.SIG_IGN)"])
+def test_frames_come_from_a_program_which_ends_with_the_camera(tmp_path: Path, setup: str) -> None:
+    file = tmp_path / f"{len(setup)}.jpg"
+    file.write_bytes(encoded(picture(40)))
+    body = f"{setup}\nwhile True:\n    write(open('{file}', 'rb').read()); time.sleep(0.01)"
+    clock = MonotonicClock()
+    camera = open_camera(f"pipe:{python(body)}", image_size=16, clock=clock, latency_ms=20)
+    with closing(camera):
         frame = camera.read(2_000 * NS_PER_MS)
         assert frame.rgb.shape == (HEIGHT, WIDTH, 3)
         assert abs(int(frame.rgb[8, 24, 1]) - 40) < 6
         assert frame.captured_ns <= clock.now_ns() - 20 * NS_PER_MS
-    finally:
-        camera.close()
+        pid = child_of(os.getpid(), bytes(file))
+    assert not Path(f"/proc/{pid}").exists()
 
 
 def test_a_program_faster_than_this_computer_still_gives_frames() -> None:
@@ -219,15 +183,3 @@ def test_a_program_faster_than_this_computer_still_gives_frames() -> None:
 def test_why_a_program_gives_no_more_frames_is_said(body: str, raw: str, told: str) -> None:
     with source(raw + python(body)) as opened, pytest.raises(CameraError, match=told):
         next_image(opened)
-
-
-@pytest.mark.skipif(sys.platform != "linux", reason="looks into /proc")
-@pytest.mark.parametrize("ignore", ["", "signal.signal(signal.SIGTERM, signal.SIG_IGN)"])
-def test_the_program_ends_with_the_camera(ignore: str) -> None:
-    mark = f"ends-with-{os.getpid()}-{len(ignore)}"
-    body = f"import signal  # {mark}\n{ignore}\nwhile True:\n    write(b'.' * 12); time.sleep(0.01)"
-    clock = MonotonicClock()
-    camera = open_camera(f"pipe:2x2:rgb24:{python(body)}", image_size=16, clock=clock)
-    pid = child_of(os.getpid(), mark.encode())
-    camera.close()
-    assert not Path(f"/proc/{pid}").exists()

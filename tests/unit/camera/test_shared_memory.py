@@ -1,3 +1,5 @@
+"""Frames of the simulator's writer, whose own tests read it by the description of the format."""
+
 import os
 import struct
 import subprocess
@@ -12,55 +14,19 @@ from mavbridge.camera import shared_memory
 from mavbridge.camera.shared_memory import SharedMemoryCamera
 from mavbridge.core.clock import NS_PER_MS, NS_PER_S, MonotonicClock
 from mavbridge.core.errors import CameraError
-from sitl.camera.shm import FramePublisher
+from sitl.camera.shm import SEQ, FramePublisher
 
 pytestmark = pytest.mark.skipif(not Path("/dev/shm").is_dir(), reason="needs /dev/shm")
 
 WIDTH, HEIGHT = 8, 5
-STRIDE = 192
-"""32 + 8 * 5 * 3 = 152, rounded up to 64."""
 
 
-def header(*, width=WIDTH, height=HEIGHT, channels=3, slots=4, magic=b"MBSHM\0\0\1"):
-    return magic + struct.pack("<IIIIQQ", width, height, channels, slots, 0, 1)
+def header(*, width=WIDTH, channels=3, magic=b"MBSHM\0\0\1"):
+    return magic + struct.pack("<IIIIQQ", width, HEIGHT, channels, 4, 0, 1)
 
 
-class HandWriter:
-    """A writer independent of the simulator's; a test can stop it between any two fields."""
-
-    def __init__(self, path: Path) -> None:
-        self.path = path
-        draft = path.with_suffix(".draft")
-        draft.write_bytes(header().ljust(64 + 4 * STRIDE, b"\0"))
-        draft.replace(path)
-        self._file = path.open("r+b", buffering=0)
-
-    def put(self, offset, layout, *values):
-        self._file.seek(offset)
-        self._file.write(struct.pack(layout, *values))
-
-    def begin(self, frame_id, captured_ns, grey):
-        """Half a frame: the sequence number is left odd."""
-        start = 64 + frame_id % 4 * STRIDE
-        self.put(start, "<QQq", 2 * frame_id + 1, frame_id, captured_ns)
-        self.put(start + 32, f"{WIDTH * HEIGHT * 3}s", bytes([grey]) * (WIDTH * HEIGHT * 3))
-
-    def finish(self, frame_id):
-        self.put(64 + frame_id % 4 * STRIDE, "<Q", 2 * frame_id + 2)
-
-    def announce(self, frame_id):
-        self.put(24, "<Q", frame_id)
-
-    def publish(self, frame_id, captured_ns, grey=0):
-        self.begin(frame_id, captured_ns, grey)
-        self.finish(frame_id)
-        self.announce(frame_id)
-
-    def set_closed(self):
-        self.put(32, "<Q", 2)
-
-    def close(self):
-        self._file.close()
+def grey(level):
+    return np.full((HEIGHT, WIDTH, 3), level, np.uint8)
 
 
 class HookedClock(FakeClock):
@@ -84,7 +50,7 @@ def path():
 
 @pytest.fixture
 def writer(path):
-    writer = HandWriter(path)
+    writer = FramePublisher(path.name, WIDTH, HEIGHT)
     yield writer
     writer.close()
 
@@ -101,90 +67,78 @@ def camera(writer, clock):
     camera.close()
 
 
-def test_a_frame_comes_with_its_stamp_and_cannot_be_written(camera, writer):
-    writer.publish(1, START_NS - 5 * NS_PER_MS, grey=77)
+def test_the_newest_frame_wins_with_its_stamp_and_the_skipped_are_counted(camera, writer, clock):
+    for number in range(1, 7):
+        writer.publish(grey(number), START_NS - number)
     frame = camera.read(0)
-    assert (frame.frame_id, frame.captured_ns) == (1, START_NS - 5 * NS_PER_MS)
-    assert frame.rgb.shape == (HEIGHT, WIDTH, 3)
-    assert frame.rgb.dtype == np.uint8
-    assert set(frame.rgb.ravel().tolist()) == {77}
-    assert not frame.rgb.flags.writeable
-    assert camera.read(30 * NS_PER_MS) is None  # given once
-    camera.close()
-    assert set(frame.rgb.ravel().tolist()) == {77}
-
-
-def test_the_newest_frame_wins_and_the_skipped_are_counted(camera, writer, clock):
-    for frame_id in range(1, 7):
-        writer.publish(frame_id, START_NS + frame_id, grey=frame_id)
-    assert camera.read(0).frame_id == 6
+    assert (frame.frame_id, frame.captured_ns) == (6, START_NS - 6)
     assert camera.dropped_frames == 5
+    assert camera.read(30 * NS_PER_MS) is None  # given once
     late = SharedMemoryCamera(writer.path.name, clock=clock)
     assert (late.read(0).frame_id, late.dropped_frames) == (6, 0)  # from before the opening
     late.close()
+    camera.close()
+    assert np.array_equal(frame.rgb, grey(6))
+    assert frame.rgb.dtype == np.uint8
+    assert not frame.rgb.flags.writeable
 
 
 def test_a_half_written_frame_is_waited_for(camera, writer, clock):
-    writer.begin(1, START_NS, grey=3)
-    writer.announce(1)
+    writer.publish(grey(3), START_NS, is_whole=False)
     assert camera.read(0) is None
-    clock.on_sleep = lambda: writer.finish(1)
+
+    def finish():
+        writer._fields[1][SEQ] = 2
+
+    clock.on_sleep = finish
     assert camera.read(10 * NS_PER_MS).frame_id == 1
 
 
 def test_a_lapped_copy_is_thrown_away_and_the_newer_frame_taken(camera, writer, monkeypatch):
     """The writer comes round to the slot while its pixels are being copied."""
-    writer.publish(1, START_NS, grey=1)
-    laps = iter([lambda: writer.publish(5, START_NS + 5, grey=5)])
+    writer.publish(grey(1), START_NS)
+    barriers = ["newest", "before copy", "after copy", *["later"] * 3]
 
     def interrupted():
         if barriers.pop(0) == "after copy":
-            next(laps, lambda: None)()
+            for number in range(2, 6):
+                writer.publish(grey(number), START_NS + number)
 
-    barriers = ["newest", "before copy", "after copy", *["later"] * 3]
     monkeypatch.setattr(shared_memory, "memory_barrier", interrupted)
     frame = camera.read(0)
     assert (frame.frame_id, frame.captured_ns, frame.rgb[0, 0, 0]) == (5, START_NS + 5, 5)
 
 
-def test_a_writer_that_falls_silent_is_dead_after_two_seconds(camera, writer, clock):
-    writer.publish(1, START_NS)
-    camera.read(0)
-    clock.advance_ns(2 * NS_PER_S - 1)
-    assert camera.read(0) is None
-    clock.advance_ns(1)
-    with pytest.raises(CameraError, match=f"{writer.path.name}: no new frame for 2 s"):
-        camera.read(0)
-
-
 @pytest.mark.parametrize(
     ("spoil", "told"),
     [
-        (lambda writer: (writer.set_closed(), writer.path.unlink()), "closed"),
-        (lambda writer: writer.publish(2, START_NS - 100 * NS_PER_S), "CLOCK_MONOTONIC"),
+        (lambda writer: None, "no new frame for 2 s"),
+        (FramePublisher.close, "closed"),
+        (lambda writer: writer.publish(grey(0), START_NS - 100 * NS_PER_S), "CLOCK_MONOTONIC"),
     ],
 )
-def test_a_writer_that_closed_or_leaves_our_clock_is_named_as_the_cause(
+def test_a_writer_is_dead_after_two_seconds_and_the_cause_is_named(
     camera, writer, clock, spoil, told
 ):
-    writer.publish(1, START_NS)
+    writer.publish(grey(0), START_NS)
     camera.read(0)
     spoil(writer)
-    with pytest.raises(CameraError, match=told):
+    assert camera.read(2 * NS_PER_S - 1) is None
+    with pytest.raises(CameraError, match=rf"{writer.path.name}: .*{told}"):
         camera.read(3 * NS_PER_S)
     assert clock.now_ns() <= START_NS + 2 * NS_PER_S + NS_PER_MS
 
 
 def test_a_writer_that_starts_again_is_followed_and_ids_keep_rising(camera, writer, clock):
-    for frame_id in (1, 2, 3):
-        writer.publish(frame_id, START_NS)
+    for _ in range(3):
+        writer.publish(grey(0), START_NS)
     assert camera.read(0) is not None
     successors = []
 
     def restart():
         if not successors:
-            successors.append(HandWriter(writer.path))
-            successors[0].publish(1, clock.now_ns(), grey=42)
+            successors.append(FramePublisher(writer.path.name, WIDTH, HEIGHT))
+            successors[0].publish(grey(42), clock.now_ns())
 
     clock.on_sleep = restart
     frame = camera.read(NS_PER_S)
@@ -207,18 +161,16 @@ def test_a_name_that_is_not_there_says_what_to_start_and_what_is_there(writer, c
         pytest.param(header(magic=b"MBSHM\0\0\2").ljust(832, b"\0"), "wrong magic", id="version"),
         pytest.param(header(channels=4).ljust(832, b"\0"), "4 channels", id="channels"),
         pytest.param(header(width=0).ljust(832, b"\0"), "impossible", id="no width"),
-        pytest.param(header().ljust(64 + 4 * STRIDE + 1, b"\0"), "it has 833", id="long"),
+        pytest.param(header().ljust(833, b"\0"), "take 832 bytes, it has 833", id="long"),
+        pytest.param(None, "a pipe or a device, not a file", id="pipe"),
     ],
 )
 def test_a_file_in_another_format_is_refused(path, clock, content, complaint):
-    path.write_bytes(content)
+    if content is None:
+        os.mkfifo(path)
+    else:
+        path.write_bytes(content)
     with pytest.raises(CameraError, match=complaint):
-        SharedMemoryCamera(path.name, clock=clock)
-
-
-def test_a_pipe_among_the_segments_is_not_waited_for(path, clock):
-    os.mkfifo(path)
-    with pytest.raises(CameraError, match="a pipe or a device, not a file"):
         SharedMemoryCamera(path.name, clock=clock)
     assert "there is none" in SharedMemoryCamera("nobody", clock=clock).waiting_reason
 
@@ -239,30 +191,22 @@ publisher.close()
 @pytest.mark.system
 def test_no_torn_frame_from_a_writer_at_full_speed(path):
     """Another process publishes as fast as it can; each frame read must be of one colour."""
+    command = [sys.executable, "-c", SOLID_FRAMES, path.name]
     with subprocess.Popen(
-        [sys.executable, "-c", SOLID_FRAMES, path.name],
-        stdin=subprocess.PIPE,
-        stdout=subprocess.PIPE,
-        text=True,
+        command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True
     ) as writer:
         assert writer.stdout.readline() == "ready\n"
         camera = SharedMemoryCamera(path.name, clock=MonotonicClock())
         writer.stdin.write("go\n")
         writer.stdin.flush()
-        frames = read_until(4000, camera)
+        frames = []
+        while not frames or frames[-1].frame_id < 4000:
+            frames.append(camera.read(10 * NS_PER_S))
+            level = frames[-1].frame_id % 251
+            assert frames[-1].rgb.min() == frames[-1].rgb.max() == level
         camera.close()
     assert writer.returncode == 0
     assert len(frames) > 1
-    assert all(low == high == frame_id % 251 for frame_id, low, high in frames)
-
-
-def read_until(last_id, camera):
-    """(frame_id, least, greatest value) of each frame that was seen."""
-    seen = []
-    while not seen or seen[-1][0] < last_id:
-        frame = camera.read(10 * NS_PER_S)
-        seen.append((frame.frame_id, frame.rgb.min(), frame.rgb.max()))
-    return seen
 
 
 def test_depth_is_read_as_it_was_written(path, clock):
@@ -284,6 +228,6 @@ def test_depth_is_read_as_it_was_written(path, clock):
             publisher = FramePublisher(path.name, WIDTH, HEIGHT, is_depth=True)
             publisher.publish(depth, START_NS + 1)
     with pytest.raises(ValueError, match="want uint16"):
-        publisher.publish(np.zeros((HEIGHT, WIDTH, 3), np.uint8), START_NS)
+        publisher.publish(grey(0), START_NS)
     publisher.close()
     camera.close()

@@ -3,41 +3,26 @@ import numpy as np
 import pytest
 
 from helpers.camera_senders import FakeCapture
-from helpers.fakes import START_NS, FakeClock
+from helpers.fakes import START_NS
 from mavbridge.camera.video_file import VideoFileCamera
 from mavbridge.core.clock import NS_PER_MS, NS_PER_S
 from mavbridge.core.errors import CameraError
 
-FPS = 20
 FRAMES = 10
-PERIOD_NS = NS_PER_S // FPS
+PERIOD_NS = NS_PER_S // 20
 
 
-@pytest.fixture(scope="module")
-def video(tmp_path_factory):
+@pytest.fixture
+def camera(tmp_path, clock):
     """Ten frames, 50 ms apart, each redder than the one before."""
-    path = tmp_path_factory.mktemp("video") / "red.avi"
-    writer = cv2.VideoWriter(str(path), cv2.VideoWriter.fourcc(*"MJPG"), FPS, (64, 48))
+    path = tmp_path / "red.avi"
+    writer = cv2.VideoWriter(str(path), cv2.VideoWriter.fourcc(*"MJPG"), 20, (64, 48))
     for index in range(FRAMES):
         writer.write(np.full((48, 64, 3), (0, 0, 20 * index), np.uint8))
     writer.release()
-    return path
-
-
-@pytest.fixture
-def clock():
-    return FakeClock()
-
-
-@pytest.fixture
-def camera(video, clock):
-    camera = VideoFileCamera(video, clock=clock)
+    camera = VideoFileCamera(path, clock=clock)
     yield camera
     camera.close()
-
-
-def redness(frame):
-    return frame.rgb[..., 0].mean()
 
 
 def test_it_is_paced_by_its_stamps(camera, clock):
@@ -46,22 +31,18 @@ def test_it_is_paced_by_its_stamps(camera, clock):
         assert frame.frame_id == index + 1
         assert frame.captured_ns == pytest.approx(START_NS + index * PERIOD_NS, abs=NS_PER_MS)
         assert clock.now_ns() == frame.captured_ns
-        assert redness(frame) == pytest.approx(20 * index, abs=8)
+        assert frame.rgb[..., 0].mean() == pytest.approx(20 * index, abs=8)
         assert frame.rgb[..., 2].max() < 30
     assert camera.dropped_frames == 0
 
 
-def test_a_slow_reader_gets_the_newest_and_the_others_are_counted(camera, clock):
+def test_a_slow_reader_gets_the_newest_and_the_end_is_an_error_after_the_last(camera, clock):
     camera.read(0)
     clock.advance_ns(4 * PERIOD_NS + NS_PER_MS)
     frame = camera.read(0)
     assert frame.frame_id == 5
-    assert redness(frame) == pytest.approx(80, abs=8)
+    assert frame.rgb[..., 0].mean() == pytest.approx(80, abs=8)
     assert camera.dropped_frames == 3
-
-
-def test_its_end_is_an_error_after_the_last_frame(camera, clock):
-    camera.read(0)
     clock.advance_ns(NS_PER_S)
     assert camera.read(0).frame_id == FRAMES
     with pytest.raises(CameraError, match="video ended after 10 frames"):

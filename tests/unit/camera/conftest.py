@@ -1,0 +1,8 @@
+import pytest
+
+from helpers.fakes import FakeClock
+
+
+@pytest.fixture
+def clock():
+    return FakeClock()
