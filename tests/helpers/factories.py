@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from mavbridge.core.clock import NS_PER_MS, NS_PER_S
 from mavbridge.core.reasons import Code, Reason, because
-from mavbridge.core.records import Tick, VehicleState, VisionTick
+from mavbridge.core.records import Solve, Tick, VehicleState, VisionTick
 from mavbridge.core.vehicle import NEUTRAL, ActionTrace, Sticks
 from mavbridge.guard.values import Phase
 from mavbridge.guard.wire import GuardTick
@@ -101,6 +101,26 @@ def make_vision_tick(frame_id: int = 1, **changes: Any) -> VisionTick:
         rgb=rgb,
     )
     return replace(vision, **changes)
+
+
+def make_solve(serial: int = 0, **changes: Any) -> Solve:
+    """Return the solve of tick ``serial``: 8 neutral actions, 50 ms apart, after 2 ms."""
+    first_ns = START_NS + serial * TICK_NS
+    solve = Solve(
+        serial=serial,
+        started_ns=first_ns,
+        computed_ns=first_ns + 2 * NS_PER_MS,
+        reset_ns=0,
+        state=make_state(first_ns),
+        states=np.zeros((1, 13), np.float32),
+        history=np.zeros((1, 4, 4), np.float32),
+        frame_ids=((1,),),
+        image_ns=first_ns,
+        first_ns=first_ns,
+        step_ns=50 * NS_PER_MS,
+        actions=np.zeros((1, 8, 4), np.float32),
+    )
+    return replace(solve, **changes)
 
 
 def about_z(angle_rad: NDArray[np.float64]) -> NDArray[np.float64]:

@@ -6,8 +6,8 @@ import subprocess
 import sys
 import termios
 from collections.abc import Iterator
+from contextlib import suppress
 from pathlib import Path
-from typing import Any
 
 import pytest
 
@@ -38,55 +38,62 @@ print("stopped" if os.WIFSTOPPED(status) else os.waitstatus_to_exitcode(status))
 """
 
 
-@pytest.fixture
-def terminal() -> Iterator[tuple[int, int]]:
-    """The two ends of a terminal: the user's and the process's."""
-    ends = pty.openpty()
-    yield ends
-    for end in ends:
-        os.close(end)
-
-
-class Pressed:
-    """Keys that a keyboard has passed on."""
+class Terminal:
+    """The two ends of a terminal, and the keys that a keyboard on it has passed on."""
 
     def __init__(self) -> None:
+        self.user, self.fd = pty.openpty()
         self.keys: queue.Queue[str] = queue.Queue()
+        self.keyboard = Keyboard(self.keys.put, fd=self.fd)
 
-    def next(self) -> str:
-        return self.keys.get(timeout=30.0)
+    def type(self, keys: bytes) -> None:
+        os.write(self.user, keys)
+
+    def until(self, last: str) -> list[str]:
+        """The next keys, up to this one."""
+        got = [self.keys.get(timeout=30.0)]
+        while got[-1] != last:
+            got.append(self.keys.get(timeout=30.0))
+        return got
+
+    def local_modes(self) -> int:
+        return termios.tcgetattr(self.fd)[LOCAL_MODES]
+
+    def start(self) -> None:
+        assert self.keyboard.start()
+        for _ in range(600):
+            if not self.local_modes() & termios.ICANON:
+                return
+            select.select([], [], [], 0.05)
+        raise AssertionError("the terminal did not leave its canonical mode")
 
 
-def started(fd: int, pressed: Pressed, **keys: Any) -> Keyboard:
-    keyboard = Keyboard(pressed.keys.put, fd=fd, **keys)
-    assert keyboard.start()
-    for _ in range(600):
-        if not local_modes(fd) & termios.ICANON:
-            return keyboard
-        select.select([], [], [], 0.05)
-    raise AssertionError("the terminal did not leave its canonical mode")
+@pytest.fixture
+def terminal() -> Iterator[Terminal]:
+    """Is afterwards as it was before."""
+    made = Terminal()
+    before = termios.tcgetattr(made.fd)
+    yield made
+    made.keyboard.stop(30.0)
+    made.keyboard.stop(30.0)
+    with suppress(OSError, termios.error):  # the user may have hung up
+        assert termios.tcgetattr(made.fd) == before
+        os.close(made.user)
+    os.close(made.fd)
 
 
-def local_modes(fd: int) -> int:
-    return termios.tcgetattr(fd)[LOCAL_MODES]
-
-
-def test_keys_come_singly_without_echo_and_control_c_stays_a_signal(
-    terminal: tuple[int, int],
-) -> None:
-    user, fd = terminal
-    before = termios.tcgetattr(fd)
-    pressed = Pressed()
-    keyboard = started(fd, pressed)
-    assert not local_modes(fd) & termios.ECHO
-    assert local_modes(fd) & termios.ISIG
-    for key, expected in ((b"e", "e"), (b"q", "q"), (b"E", "e")):
-        os.write(user, key)
-        assert pressed.next() == expected
-    keyboard.stop(30.0)
-    keyboard.stop(30.0)
-    assert termios.tcgetattr(fd) == before
-    assert select.select([user], [], [], 0)[0] == []  # nothing was echoed
+def test_keys_come_singly_without_echo_and_control_c_stays_a_signal(terminal: Terminal) -> None:
+    terminal.type(b"e\n")  # before the flight
+    terminal.start()
+    assert not terminal.local_modes() & termios.ECHO
+    assert terminal.local_modes() & termios.ISIG
+    while select.select([terminal.user], [], [], 0)[0]:
+        os.read(terminal.user, 100)  # the echo of what was typed before
+    for key, expected in ((b"q", "q"), (b"e", "e"), (b"E", "e")):
+        terminal.type(key)
+        assert terminal.keys.get(timeout=30.0) == expected
+    terminal.keyboard.stop(30.0)
+    assert select.select([terminal.user], [], [], 0)[0] == []  # nothing was echoed
 
 
 @pytest.mark.parametrize(
@@ -94,59 +101,42 @@ def test_keys_come_singly_without_echo_and_control_c_stays_a_signal(
     [(b"x", []), (b"\x1be", []), (b"\x1bOq", []), (b"the end\n", []), (b"ee", ["e"])],
 )
 def test_a_paste_or_a_function_key_engages_nothing(
-    terminal: tuple[int, int], typed: bytes, expected: list[str]
+    terminal: Terminal, typed: bytes, expected: list[str]
 ) -> None:
-    user, fd = terminal
-    pressed = Pressed()
-    keyboard = started(fd, pressed)
-    os.write(user, typed)
+    terminal.start()
+    terminal.type(typed)
     for _ in range(600):  # until it was read
-        if not pressed.keys.empty() or not select.select([fd], [], [], 0)[0]:
+        if not terminal.keys.empty() or not select.select([terminal.fd], [], [], 0)[0]:
             break
         select.select([], [], [], 0.05)
-    os.write(user, b"q")
-    got = [pressed.next()]
-    while got[-1] != "q":
-        got.append(pressed.next())
-    keyboard.stop(30.0)
-    assert got in ([*expected, "q"], ["q"])
+    terminal.type(b"q")
+    assert terminal.until("q") in ([*expected, "q"], ["q"])
 
 
-def test_what_was_typed_before_the_flight_does_not_engage(terminal: tuple[int, int]) -> None:
-    user, fd = terminal
-    os.write(user, b"e\n")
-    pressed = Pressed()
-    keyboard = started(fd, pressed)
-    os.write(user, b"q")
-    assert pressed.next() == "q"
-    keyboard.stop(30.0)
+def test_a_release_among_other_keys_counts(terminal: Terminal) -> None:
+    terminal.start()
+    terminal.type(b"eq")
+    terminal.until("q")
 
 
-def test_a_failing_receiver_leaves_the_terminal_as_it_was(terminal: tuple[int, int]) -> None:
-    user, fd = terminal
-    before = termios.tcgetattr(fd)
-    called = queue.Queue[str]()
-
+def test_a_failing_receiver_leaves_the_terminal_as_it_was(terminal: Terminal) -> None:
     def fail(key: str) -> None:
-        called.put(key)
+        terminal.keys.put(key)
         raise RuntimeError("no use for a key")
 
-    keyboard = Keyboard(fail, fd=fd)
+    keyboard = Keyboard(fail, fd=terminal.fd)
     assert keyboard.start()
-    while called.empty():
-        os.write(user, b"e")
+    while terminal.keys.empty():
+        terminal.type(b"e")
         select.select([], [], [], 0.05)
     with pytest.raises(RuntimeError, match="no use for a key"):
         keyboard.stop(30.0)
-    assert termios.tcgetattr(fd) == before
 
 
-def test_the_end_of_the_terminal_ends_the_thread() -> None:
-    user, fd = pty.openpty()
-    keyboard = started(fd, Pressed())
-    os.close(user)
-    keyboard.stop(30.0)
-    os.close(fd)
+def test_the_end_of_the_terminal_ends_the_thread(terminal: Terminal) -> None:
+    terminal.start()
+    os.close(terminal.user)
+    terminal.keyboard.stop(30.0)
 
 
 def test_without_a_terminal_nothing_is_read(tmp_path: Path) -> None:
@@ -159,26 +149,9 @@ def test_without_a_terminal_nothing_is_read(tmp_path: Path) -> None:
         assert stream.read() == "e"
 
 
-def test_a_job_in_the_background_is_not_stopped(terminal: tuple[int, int]) -> None:
-    user, fd = terminal
-    before = termios.tcgetattr(fd)
-    job = subprocess.Popen(
-        [sys.executable, "-c", JOB, os.ttyname(fd)],
-        stdin=subprocess.PIPE,
-        stdout=subprocess.PIPE,
-        text=True,
-    )
-    os.write(user, b"e\n")
+def test_a_job_in_the_background_is_not_stopped(terminal: Terminal) -> None:
+    command = [sys.executable, "-c", JOB, os.ttyname(terminal.fd)]
+    job = subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True)
+    terminal.type(b"e\n")
     output, _ = job.communicate("end\n", timeout=60.0)
     assert output == "0\n"
-    assert termios.tcgetattr(fd) == before
-
-
-def test_a_release_among_other_keys_counts(terminal: tuple[int, int]) -> None:
-    user, fd = terminal
-    pressed = Pressed()
-    keyboard = started(fd, pressed)
-    os.write(user, b"eq")
-    while pressed.next() != "q":
-        pass
-    keyboard.stop(30.0)

@@ -39,23 +39,20 @@ def said(text: str) -> Reason:
     return because(Code.POLICY_REFUSED, said=text)
 
 
-def fly(screen: FlightScreen, *, ticks: int, first: int = 0) -> str:
-    """Emit ticks, and frames at 25 Hz, as they come between refreshes; the last line."""
-    line = ""
-    for index in range(first, first + ticks):
+def test_the_line_has_rates_of_a_good_flight_and_none_when_the_loop_has_stopped() -> None:
+    screen, lines = make_screen(), []
+    for index in range(201):
         screen.emit(make_tick(index))
-        if index % 4 == 0:
+        if index % 4 == 0:  # 25 Hz
             screen.emit(make_vision_tick(index, ready_ns=START_NS + index * TICK_NS))
         if index % REFRESH_TICKS == 0:
-            line = screen.status_line().plain
-    return line
-
-
-def test_the_line_of_a_good_flight() -> None:
-    assert fly(make_screen(), ticks=201) == (
+            lines.append(screen.status_line().plain)
+    assert lines[-1] == (
         "FLYING  ALT_HOLD armed  action 100.0 Hz  vision 25.0 Hz"
         "  feature 40 ms  state 3 ms  missed 0"
     )
+    lines = [screen.status_line().plain for _ in range(2 * round(STATUS_HZ))]
+    assert "action - Hz  vision - Hz" in lines[-1]
 
 
 @pytest.mark.parametrize(
@@ -94,13 +91,6 @@ def test_readonly_is_not_called_flying_and_a_release_stays_a_release() -> None:
     line = screen.status_line().plain
     assert line.startswith("RELEASED  ")
     assert line.endswith("  no image feature yet")  # last, since it may be long
-
-
-def test_a_loop_that_has_stopped_has_no_rate() -> None:
-    screen = make_screen()
-    assert "action 100.0 Hz" in fly(screen, ticks=201)
-    lines = [screen.status_line().plain for _ in range(2 * round(STATUS_HZ))]
-    assert "action - Hz  vision - Hz" in lines[-1]
 
 
 def test_where_there_is_no_terminal_a_line_is_printed_now_and_then() -> None:

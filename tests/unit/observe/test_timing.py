@@ -12,20 +12,13 @@ from helpers.factories import (
     make_tick,
     make_vision_tick,
 )
+from helpers.reports import report_of
 from mavbridge.core.clock import NS_PER_MS
 from mavbridge.core.reasons import Code, Reason, because, reason_to_json
 from mavbridge.core.records import Tick
 from mavbridge.core.vehicle import LinkStats, Percentiles
-from mavbridge.observe.timing import (
-    MAX_RELEASES,
-    FlightTiming,
-    ObserverDrops,
-    ReleaseEvent,
-    TimingReport,
-    report_json,
-)
+from mavbridge.observe.timing import MAX_RELEASES, report_json
 
-NO_DROPS = ObserverDrops(rerun=None, recorder=None)
 LINK = LinkStats(
     messages_per_s=(("ATTITUDE_QUATERNION", 99.9), ("RC_CHANNELS", 20.0)),
     lost_fraction=0.001,
@@ -41,24 +34,6 @@ NO_IMAGE, OFF = because(Code.NO_IMAGE), because(Code.OVERRIDE_SWITCH_OFF)
 
 def frozen(age_s: float) -> Reason:
     return because(Code.IMAGE_FROZEN, age_s=age_s)
-
-
-def report_of(timing: FlightTiming, link: LinkStats | None = None) -> TimingReport:
-    return timing.report(
-        mode="dual",
-        engine="torch",
-        policy="scripted",
-        autopilot="ardupilot",
-        link=link,
-        observer_drops=NO_DROPS,
-    )
-
-
-def timed(*ticks: Tick) -> TimingReport:
-    timing = FlightTiming(stick_hz=100, action_hz=100, vision_hz=30)
-    for tick in ticks:
-        timing.emit(tick)
-    return report_of(timing)
 
 
 def all_equal(value: float) -> Percentiles:
@@ -133,46 +108,36 @@ TICKS: dict[str, list[Tick]] = {
     ],
 )
 def test_figures(name: str, paths: str, values: tuple[object, ...]) -> None:
-    assert attrgetter(*paths.split())(timed(*TICKS[name])) == values
+    assert attrgetter(*paths.split())(report_of(*TICKS[name])) == values
 
 
 def test_releases_are_transitions_since_the_first_tick() -> None:
-    report = timed(
-        make_released_tick(0, NO_IMAGE),
-        make_released_tick(1, NO_IMAGE),
-        make_tick(2),
-        make_released_tick(3, frozen(0.6)),
-        make_released_tick(4, OFF),
-        make_tick(5),
-        make_released_tick(6, OFF),
+    reasons = (NO_IMAGE, NO_IMAGE, None, frozen(0.6), OFF, None, OFF)
+    report = report_of(
+        *(
+            make_released_tick(index, reason) if reason else make_tick(index)
+            for index, reason in enumerate(reasons)
+        )
     )
-    assert report.releases == (
-        ReleaseEvent(t_s=0.0, reason=NO_IMAGE),
-        ReleaseEvent(t_s=0.03, reason=frozen(0.6)),
-        ReleaseEvent(t_s=0.04, reason=OFF),
-        ReleaseEvent(t_s=0.06, reason=OFF),
-    )
+    assert [(each.t_s, each.reason) for each in report.releases] == [
+        (0.0, NO_IMAGE),
+        (0.03, frozen(0.6)),
+        (0.04, OFF),
+        (0.06, OFF),
+    ]
     assert report.release_count == 4
 
 
 def test_the_release_list_is_bounded_and_the_count_is_not() -> None:
-    report = timed(
-        *(
-            make_released_tick(index, frozen(index) if index % 2 else NO_IMAGE)
-            for index in range(MAX_RELEASES + 7)
-        )
-    )
-    assert len(report.releases) == MAX_RELEASES
-    last = MAX_RELEASES - 1
-    assert report.releases[-1].reason == (frozen(last) if last % 2 else NO_IMAGE)
+    reasons = [frozen(index) if index % 2 else NO_IMAGE for index in range(MAX_RELEASES + 7)]
+    report = report_of(*(make_released_tick(*each) for each in enumerate(reasons)))
+    assert [each.reason for each in report.releases] == reasons[:MAX_RELEASES]
     assert report.release_count == MAX_RELEASES + 7
 
 
 def test_vision_counts_what_was_dropped_since_its_first_frame() -> None:
-    timing = FlightTiming(stick_hz=100, action_hz=100, vision_hz=30)
-    for number in range(1, 32):
-        timing.emit(make_vision_tick(number, dropped_frames=40 + number // 10))
-    vision = report_of(timing).vision
+    frames = (make_vision_tick(n, dropped_frames=40 + n // 10) for n in range(1, 32))
+    vision = report_of(*frames).vision
     assert vision.frames == 31
     assert vision.rate_hz == pytest.approx(30.0, abs=0.01)
     assert vision.dropped_frames == 3
@@ -180,26 +145,18 @@ def test_vision_counts_what_was_dropped_since_its_first_frame() -> None:
 
 
 def test_json_has_the_keys_of_the_report_in_order() -> None:
-    timing = FlightTiming(stick_hz=100, action_hz=100, vision_hz=30)
-    timing.emit(make_released_tick(0))
-    timing.emit(make_tick(1))
-    document = json.loads(report_json(report_of(timing, LINK)))
-    assert list(document) == [
-        *("duration_s", "mode", "engine", "policy", "autopilot", "outcome"),
-        *("sticks", "action", "vision"),
-        *("feature_age_ms", "state_age_ms", "state_to_wire_ms", "link", "releases"),
-        *("release_count", "observer_drops"),
-    ]
-    assert list(document["sticks"]) == [
-        *("target_hz", "rate_hz", "flying_s", "sends", "coasting_sends"),
-        *("slots", "missed_slots", "lateness_ms"),
-    ]
-    assert list(document["action"]) == [
-        *("target_hz", "rate_hz", "chunks", "late_chunks", "period_ms", "predict_ms")
-    ]
-    vision_keys = ["target_hz", "rate_hz", "frames", "dropped_frames", "encode_ms"]
-    assert list(document["vision"]) == vision_keys
-    assert list(document["feature_age_ms"]) == ["p50", "p99", "p999", "max"]
+    document = json.loads(report_json(report_of(make_released_tick(0), make_tick(1), link=LINK)))
+    assert " ".join(document) == (
+        "duration_s mode engine policy autopilot outcome sticks action vision feature_age_ms "
+        "state_age_ms state_to_wire_ms link releases release_count observer_drops"
+    )
+    keys = {name: " ".join(part) for name, part in document.items() if isinstance(part, dict)}
+    assert keys["sticks"] == (
+        "target_hz rate_hz flying_s sends coasting_sends slots missed_slots lateness_ms"
+    )
+    assert keys["action"] == "target_hz rate_hz chunks late_chunks period_ms predict_ms"
+    assert keys["vision"] == "target_hz rate_hz frames dropped_frames encode_ms"
+    assert keys["feature_age_ms"] == "p50 p99 p999 max"
     assert document["link"] == {
         "unusable_packets": 0,
         "refused_signatures": 0,
