@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from helpers.factories import make_state, make_tick
-from mavbridge.core.records import Tick, VehicleState
+from mavbridge.core.records import VehicleState
 from mavbridge.recording.crash import CrashWatch
 
 TICK_HZ = 100
@@ -20,15 +20,14 @@ def state(*, tilt_deg: float = 0.0, speed_mps: float = 0.0) -> VehicleState:
     return replace(make_state(), values=values)
 
 
-def watched(*ticks: Tick) -> str | None:
-    watch = CrashWatch()
-    for tick in ticks:
-        watch.see(tick)
+def watched(*stretches: tuple[float, dict[str, Any]]) -> str | None:
+    """The reason after stretches of flight: seconds, and the ticks' fields."""
+    watch, index = CrashWatch(), 0
+    for seconds, changes in stretches:
+        for _ in range(round(seconds * TICK_HZ)):
+            watch.see(make_tick(index, **changes))
+            index += 1
     return watch.reason
-
-
-def ticks(first: int, seconds: float, **changes: Any) -> list[Tick]:
-    return [make_tick(first + k, **changes) for k in range(round(seconds * TICK_HZ))]
 
 
 @pytest.mark.parametrize(
@@ -41,37 +40,31 @@ def ticks(first: int, seconds: float, **changes: Any) -> list[Tick]:
     ],
 )
 def test_the_vehicle_says_that_it_has_crashed(text: str, is_crash: bool) -> None:
-    assert (watched(make_tick(texts=(text,))) is not None) is is_crash
+    assert (watched((0.01, {"texts": (text,)})) is not None) is is_crash
+
+
+OVER, FLYING = {"state": state(tilt_deg=180.0)}, {"state": state(speed_mps=0.1)}
+FALLING = {"state": state(speed_mps=3.0), "armed": False}
 
 
 @pytest.mark.parametrize(
-    ("tilt_deg", "seconds", "is_armed", "is_crash"),
+    ("stretches", "told"),
     [
-        (95.0, 0.7, True, True),
-        (85.0, 2.0, True, False),
-        (180.0, 0.4, True, False),  # a flip
-        (180.0, 2.0, False, False),  # carried home
+        pytest.param([(0.7, {"state": state(tilt_deg=95.0)})], "lay on its back", id="on its back"),
+        pytest.param([(2.0, {"state": state(tilt_deg=85.0)})], None, id="leans"),
+        pytest.param([(0.4, OVER), (0.1, FLYING), (0.4, OVER)], None, id="two flips"),
+        pytest.param([(2.0, OVER | {"armed": False})], None, id="carried home"),
+        pytest.param([(1.0, FLYING), (0.5, FALLING)], "disarmed in the air", id="falls"),
+        pytest.param(
+            [(1.0, FLYING), (2.0, {"state": state(speed_mps=0.2), "armed": False}), (0.5, FALLING)],
+            None,
+            id="lands and is carried",
+        ),
+        pytest.param([(0.5, FALLING)], None, id="never armed"),
     ],
 )
-def test_a_vehicle_on_its_back_has_crashed_if_it_stays_there(
-    tilt_deg: float, seconds: float, is_armed: bool, is_crash: bool
+def test_a_vehicle_that_stays_over_or_is_disarmed_in_the_air_has_crashed(
+    stretches: list[tuple[float, dict[str, Any]]], told: str | None
 ) -> None:
-    over = ticks(0, seconds, state=state(tilt_deg=tilt_deg), armed=is_armed)
-    reason = watched(*over)
-    assert (reason is not None) is is_crash
-
-
-def test_two_short_flips_are_no_crash() -> None:
-    first, second = (ticks(start, 0.4, state=state(tilt_deg=170)) for start in (0, 50))
-    assert watched(*first, *ticks(40, 0.1, state=state()), *second) is None
-
-
-def test_disarmed_in_the_air_is_a_fall_and_on_the_ground_is_none() -> None:
-    flying = ticks(0, 1, state=state(speed_mps=0.1))
-    falling = ticks(100, 0.5, state=state(speed_mps=3.0), armed=False)
-    standing = ticks(100, 1, state=state(speed_mps=0.2), armed=False)
-    carried = ticks(300, 0.5, state=state(speed_mps=2.0), armed=False)
-    reason = watched(*flying, *falling)
-    assert "disarmed in the air" in reason
-    assert watched(*flying, *standing, *carried) is None
-    assert watched(*falling) is None, "it was never armed"
+    reason = watched(*stretches)
+    assert reason is None if told is None else told in str(reason)
