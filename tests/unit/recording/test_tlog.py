@@ -20,18 +20,6 @@ from mavbridge.recording.video.writer import VideoWriter, WriterError
 DEADLINE_S = 30.0
 
 
-class Link:
-    """Stands in for the process of the link."""
-
-    def __init__(self, pipe: TlogPipe) -> None:
-        self.log = PacketPipe(os.dup(pipe.writer.fileno()), wall_offset_ns=0)
-        pipe.writer.close()
-
-    def send(self, count: int) -> None:
-        for k in range(count):
-            self.log.put(Packet(k * 1000, b"%05d" % k))
-
-
 def numbers(path: Path) -> list[int]:
     data = path.read_bytes()
     assert len(data) % 13 == 0, "torn"
@@ -45,9 +33,26 @@ def pipe() -> Iterator[TlogPipe]:
     made.close()
 
 
-def start(folder: Path, pipe: TlogPipe) -> VideoWriter:
-    job = TlogJob(folder / "link.tlog", pipe.reader)
-    return VideoWriter(folder / "camera.mp4", pressure="online", hz=30, tlog=job)
+@pytest.fixture
+def link(pipe: TlogPipe) -> Iterator[PacketPipe]:
+    """The end of the link's process."""
+    made = PacketPipe(os.dup(pipe.writer.fileno()), wall_offset_ns=0)
+    pipe.writer.close()
+    yield made
+    made.close()
+
+
+@pytest.fixture
+def video(tmp_path: Path, pipe: TlogPipe, link: PacketPipe) -> Iterator[VideoWriter]:
+    job = TlogJob(tmp_path / "link.tlog", pipe.reader)
+    made = VideoWriter(tmp_path / "camera.mp4", pressure="online", hz=30, tlog=job)
+    yield made
+    made.close()
+
+
+def send(link: PacketPipe, count: int) -> None:
+    for k in range(count):
+        link.put(Packet(k * 1000, b"%05d" % k))
 
 
 def await_size(path: Path, size_bytes: int) -> None:
@@ -60,59 +65,52 @@ def await_size(path: Path, size_bytes: int) -> None:
 
 
 def test_everything_is_written_in_order_also_what_came_before_the_thread(
-    tmp_path: Path, pipe: TlogPipe
+    tmp_path: Path, pipe: TlogPipe, link: PacketPipe
 ) -> None:
     path = tmp_path / "link.tlog"
-    link = Link(pipe)
-    link.send(3_000)
+    send(link, 3_000)
     thread = TlogThread(TlogJob(path, pipe.reader))
-    link.send(3_000)
-    link.log.close()
+    send(link, 3_000)
+    link.close()
     thread.finish(DEADLINE_S)
     assert numbers(path) == [*range(3_000), *range(3_000)]
-    assert link.log.dropped == 0
+    assert link.dropped == 0
     assert thread.failure is None
 
 
-def test_a_pipe_that_does_not_end_is_left_after_the_deadline(
-    tmp_path: Path, pipe: TlogPipe
+@pytest.mark.parametrize(
+    ("name", "deadline_s", "failure"),
+    [("link.tlog", 0.0, None), ("missing/link.tlog", DEADLINE_S, FileNotFoundError)],
+)
+def test_a_pipe_that_does_not_end_or_cannot_be_written_is_left(
+    tmp_path: Path,
+    pipe: TlogPipe,
+    link: PacketPipe,
+    name: str,
+    deadline_s: float,
+    failure: type[Exception] | None,
 ) -> None:
-    thread = TlogThread(TlogJob(tmp_path / "link.tlog", pipe.reader))
-    thread.finish(0.0)
-    link = Link(pipe)
-    link.send(2)
-    assert link.log.dropped == 2, "the link learns that nobody reads"
-    link.log.close()
-
-
-def test_a_log_that_cannot_be_written_closes_the_pipe(tmp_path: Path, pipe: TlogPipe) -> None:
-    thread = TlogThread(TlogJob(tmp_path / "missing" / "link.tlog", pipe.reader))
-    thread.finish(DEADLINE_S)
-    assert isinstance(thread.failure, FileNotFoundError)
-    link = Link(pipe)
-    link.send(1)
-    assert link.log.dropped == 1
-    link.log.close()
+    thread = TlogThread(TlogJob(tmp_path / name, pipe.reader))
+    thread.finish(deadline_s)
+    assert thread.failure is None if failure is None else isinstance(thread.failure, failure)
+    send(link, 2)
+    assert link.dropped == 2, "the link learns that nobody reads"
 
 
 def test_a_log_that_cannot_be_written_is_the_writers_failure(
-    tmp_path: Path, pipe: TlogPipe
+    video: VideoWriter, link: PacketPipe
 ) -> None:
-    video = start(tmp_path, pipe)
     assert video.pid is not None
     resource.prlimit(video.pid, resource.RLIMIT_FSIZE, (6_000, 6_000))
-    link = Link(pipe)
-    link.send(1_000)
+    send(link, 1_000)
     with pytest.raises(WriterError, match=r"the log of the link cannot be written: .*File too"):
         video._wait_until(lambda: False)
-    video.close()
-    link.log.close()
 
 
-def test_the_log_goes_on_after_the_recording_was_finished(tmp_path: Path, pipe: TlogPipe) -> None:
-    video = start(tmp_path, pipe)
-    link = Link(pipe)
-    link.send(10)
+def test_the_log_goes_on_after_the_recording_was_finished(
+    tmp_path: Path, video: VideoWriter, link: PacketPipe
+) -> None:
+    send(link, 10)
     for k in range(5):
         video.submit(picture(k), make_row(k))
     for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP, signal.SIGTSTP):
@@ -121,22 +119,21 @@ def test_the_log_goes_on_after_the_recording_was_finished(tmp_path: Path, pipe: 
     video.finish()
     assert count_frames(tmp_path / "camera.mp4") == 5
     assert video._process.is_alive()
-    link.send(10)
-    link.log.close()
+    send(link, 10)
+    link.close()
     assert wait([video._process.sentinel], DEADLINE_S)
     assert numbers(tmp_path / "link.tlog") == [*range(10), *range(10)]
-    assert link.log.dropped == 0
+    assert link.dropped == 0
 
 
-def test_a_killed_writer_costs_the_log_and_not_the_link(tmp_path: Path, pipe: TlogPipe) -> None:
-    video = start(tmp_path, pipe)
-    link = Link(pipe)
-    link.send(10)
+def test_a_killed_writer_costs_the_log_and_not_the_link(
+    tmp_path: Path, video: VideoWriter, link: PacketPipe
+) -> None:
+    send(link, 10)
     await_size(tmp_path / "link.tlog", 10 * 13)
     assert video.pid is not None
     send_signal(video.pid, signal.SIGKILL)
-    link.send(7)
-    assert link.log.dropped == 7
+    send(link, 7)
+    assert link.dropped == 7
     video.close()
-    link.log.close()
     assert numbers(tmp_path / "link.tlog") == [*range(10)]
