@@ -77,18 +77,21 @@ def test_rows_keep_their_images_where_the_video_is_damaged(flight: Path) -> None
     assert (learnt.captured_ns.tolist(), learnt.damage) == (stamps, back.damage)
 
 
-def test_a_stream_that_is_cut_off_is_told(tmp_path: Path) -> None:
-    folder = write_recording(
-        tmp_path / "flight",
-        [*map(make_frame, range(5)), *map(make_tick, range(1000))],
-        finish=False,
-    )
-    stream = folder / "ticks.arrows"
+def test_a_flight_that_was_cut_off_is_read_as_far_as_it_goes(tmp_path: Path) -> None:
+    events = [*map(make_frame, range(40)), *map(make_tick, range(1000))]
+    folder = write_recording(tmp_path / "flight", events, finish=False)
+    back = open_flight(folder)
+    assert not back.meta.finished
+    assert (back.ticks.num_rows, back.frames.num_rows) == (1000, 40)
+    stream, video = folder / "ticks.arrows", folder / "camera.mp4"
     stream.write_bytes(stream.read_bytes()[:-100])
-    whole = open_flight(folder)
-    assert 0 < whole.ticks.num_rows < 1000
-    assert any("ticks.arrows" in text for text in whole.damage)
-    assert len(read_flight(folder).tick_ns) == whole.ticks.num_rows
+    video.write_bytes(video.read_bytes()[:-3000])
+    back = open_flight(folder)
+    assert 0 < back.ticks.num_rows < 1000
+    assert any("ticks.arrows" in text for text in back.damage)
+    assert len(read_flight(folder).tick_ns) == back.ticks.num_rows
+    assert 0 < back.frames.num_rows < 40
+    assert [number_of(rgb) for rgb in back.images()] == list(range(back.frames.num_rows))
 
 
 @pytest.mark.parametrize(

@@ -123,19 +123,6 @@ def test_each_camera_has_a_video_and_a_table_and_what_was_missed_is_counted(
         open_flight(tmp_path, "left")
 
 
-def test_a_flight_that_was_cut_off_is_read_as_far_as_it_goes(tmp_path: Path) -> None:
-    folder = write_recording(tmp_path / "flight", events(ticks=600, frames=40), finish=False)
-    back = open_flight(folder)
-    assert not back.meta.finished
-    assert 550 <= back.ticks.num_rows <= 600
-    assert back.frames.num_rows == 40
-    video = folder / "camera.mp4"
-    video.write_bytes(video.read_bytes()[:-3000])
-    back = open_flight(folder)
-    assert 0 < back.frames.num_rows < 40
-    assert [number_of(rgb) for rgb in back.images()] == list(range(back.frames.num_rows))
-
-
 def test_a_flight_without_a_frame_is_a_flight(tmp_path: Path) -> None:
     back = open_flight(write_recording(tmp_path / "flight", events(frames=0)))
     assert (back.ticks.num_rows, back.frames.num_rows) == (30, 0)

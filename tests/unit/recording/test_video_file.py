@@ -1,4 +1,6 @@
+from collections.abc import Iterable
 from pathlib import Path
+from typing import Any
 
 import av
 import numpy as np
@@ -6,22 +8,30 @@ import pytest
 
 from helpers.factories import FRAME_NS, START_NS
 from helpers.recordings import number_of, picture
+from mavbridge.core.records import ImageArray
 from mavbridge.recording.video.file import FragmentedMp4, VideoError, count_frames, read_video
 from policy.data.flight_data import DatasetError
 from policy.data.flight_folders import decode_video
 from policy.data.flight_video import video_parts
 
 
-def write(path: Path, count: int) -> FragmentedMp4:
-    video = FragmentedMp4(path, height=48, width=64, hz=30)
-    for k in range(count):
-        video.append(picture(k), START_NS + k * FRAME_NS)
-    return video
+@pytest.fixture
+def path(tmp_path: Path) -> Path:
+    return tmp_path / "camera.mp4"
 
 
-def test_frames_come_back_in_order_with_their_times(tmp_path: Path) -> None:
-    path = tmp_path / "camera.mp4"
-    write(path, 70).close()
+def write(path: Path, images: Iterable[ImageArray], **changes: Any) -> None:
+    """30 images a second; each can be read once the next has come."""
+    first, *others = images
+    video = FragmentedMp4(path, height=first.shape[0], width=first.shape[1], hz=30, **changes)
+    for k, image in enumerate([first, *others]):
+        video.append(image, START_NS + k * FRAME_NS)
+        assert count_frames(path) == k
+    video.close()
+
+
+def test_frames_come_back_in_order_with_their_times(path: Path) -> None:
+    write(path, map(picture, range(70)))
     assert count_frames(path) == 70
     assert [number_of(rgb) for rgb in read_video(path)] == list(range(70))
     with av.open(str(path)) as container:
@@ -29,21 +39,17 @@ def test_frames_come_back_in_order_with_their_times(tmp_path: Path) -> None:
     assert times == pytest.approx([k / 30 for k in range(70)], abs=2e-5)
 
 
-def test_colours_are_kept(tmp_path: Path) -> None:
-    path = tmp_path / "camera.mp4"
+def test_colours_are_kept(path: Path) -> None:
     rgb = np.zeros((48, 96, 3), np.uint8)
     rgb[:, :32, 0], rgb[:, 32:64, 1], rgb[:, 64:, 2] = 200, 200, 200
-    video = FragmentedMp4(path, height=48, width=96, hz=30)
-    video.append(rgb, START_NS)
-    video.close()
+    write(path, [rgb])
     (back,) = read_video(path)
     centres = back[24, [16, 48, 80]].astype(int)
     assert np.abs(centres - rgb[24, [16, 48, 80]]).max() < 12
 
 
-def test_a_video_cut_off_anywhere_has_its_whole_frames(tmp_path: Path) -> None:
-    path = tmp_path / "camera.mp4"
-    write(path, 4).close()
+def test_a_video_cut_off_anywhere_has_its_whole_frames(path: Path) -> None:
+    write(path, map(picture, range(4)))
     data = path.read_bytes()
     counts = []
     for size in range(0, len(data) + 1, 7):
@@ -56,11 +62,10 @@ def test_a_video_cut_off_anywhere_has_its_whole_frames(tmp_path: Path) -> None:
 @pytest.mark.parametrize("kind", ["overwritten", "inserted", "cut out"])
 @pytest.mark.parametrize("frame", [3, 29, 40, 60])
 def test_images_behind_damage_come_back_from_the_next_key_frame_on(
-    tmp_path: Path, kind: str, frame: int
+    path: Path, kind: str, frame: int
 ) -> None:
     """Key frames are 0, 30 and 60."""
-    path = tmp_path / "camera.mp4"
-    write(path, 90).close()
+    write(path, map(picture, range(90)))
     data = path.read_bytes()
     parts = video_parts(path)
     assert [each.number for each in parts.fragments if each.is_key] == [0, 30, 60]
@@ -81,13 +86,8 @@ def test_images_behind_damage_come_back_from_the_next_key_frame_on(
     assert damaged.skipped_bytes == path.stat().st_size - spared
 
 
-def test_an_image_that_is_damaged_inside_is_refused(tmp_path: Path) -> None:
-    path = tmp_path / "camera.mp4"
-    video = FragmentedMp4(path, height=96, width=128, hz=30)
-    noise = np.random.default_rng(0).integers(0, 256, (40, 96, 128, 3), dtype=np.uint8)
-    for k, image in enumerate(noise):
-        video.append(image, START_NS + k * FRAME_NS)
-    video.close()
+def test_an_image_that_is_damaged_inside_is_refused(path: Path) -> None:
+    write(path, np.random.default_rng(0).integers(0, 256, (40, 96, 128, 3), dtype=np.uint8))
     data = bytearray(path.read_bytes())
     place = video_parts(path).fragments[7]
     data[place.end - 900 : place.end - 500] = b"\x5a" * 400
@@ -96,30 +96,23 @@ def test_an_image_that_is_damaged_inside_is_refused(tmp_path: Path) -> None:
         list(read_video(path))
 
 
-def test_errors_say_what_is_wrong(tmp_path: Path) -> None:
-    path = tmp_path / "camera.mp4"
+def test_errors_say_what_is_wrong(path: Path) -> None:
     with pytest.raises(VideoError, match="cannot be read"):
         count_frames(path)
     path.write_bytes(b"no video")
     with pytest.raises(VideoError, match="cannot be decoded after 0 images: 3 of 3 images"):
         list(read_video(path, range(3)))
     path.unlink()
-    write(path, 3).close()
+    write(path, map(picture, range(3)))
     with pytest.raises(VideoError, match="2 of 5 images are missing"):
         list(read_video(path, range(5)))
     with pytest.raises(FileExistsError):
         FragmentedMp4(path, height=48, width=64, hz=30)
 
 
-def test_depth_comes_back_to_the_last_bit(tmp_path: Path) -> None:
-    path = tmp_path / "camera.mp4"
-    random = np.random.default_rng(0)
-    depths = [random.integers(0, 1 << 16, (48, 64), np.uint16) for _ in range(4)]
-    video = FragmentedMp4(path, height=48, width=64, hz=30, is_depth=True)
-    for k, depth in enumerate(depths):
-        video.append(depth, START_NS + k * FRAME_NS)
-        assert count_frames(path) == k
-    video.close()
+def test_depth_comes_back_to_the_last_bit(path: Path) -> None:
+    depths = np.random.default_rng(0).integers(0, 1 << 16, (4, 48, 64), np.uint16)
+    write(path, depths, is_depth=True)
     back = list(read_video(path))
     assert {each.dtype for each in back} == {np.dtype(np.uint16)}
     assert np.array_equal(back, depths)
@@ -127,8 +120,7 @@ def test_depth_comes_back_to_the_last_bit(tmp_path: Path) -> None:
         next(decode_video(path, np.arange(4)))
 
 
-def test_stamps_that_stand_still_or_go_back_still_give_frames(tmp_path: Path) -> None:
-    path = tmp_path / "camera.mp4"
+def test_stamps_that_stand_still_or_go_back_still_give_frames(path: Path) -> None:
     video = FragmentedMp4(path, height=48, width=64, hz=30)
     for k, at_ns in enumerate((0, 0, -5 * FRAME_NS, FRAME_NS, 0)):
         video.append(picture(k), START_NS + at_ns)
