@@ -2,9 +2,6 @@ import multiprocessing
 import os
 import resource
 import signal
-from collections.abc import Iterator
-from contextlib import contextmanager
-from dataclasses import dataclass, field
 from pathlib import Path
 
 import pytest
@@ -20,60 +17,45 @@ from mavbridge.recording.tlog import open_tlog_pipe
 DEADLINE_S = 30.0
 
 
-@dataclass
 class RecorderStand:
-    """A recorder and what it told a person."""
+    """A recorder with its writer process, and what it told a person; closed by the context."""
 
-    folder: Path
-    told: list[str] = field(default_factory=list)
-
-    def __post_init__(self) -> None:
+    def __init__(self, folder: Path) -> None:
         tlog_pipe = open_tlog_pipe()
+        self.told: list[str] = []
         self.packets = PacketPipe(os.dup(tlog_pipe.writer.fileno()), wall_offset_ns=10**18)
         tlog_pipe.writer.close()
         self.recorder = Recorder(
-            self.folder,
+            folder,
             make_meta(),
             tlog_pipe=tlog_pipe,
             packets_dropped=lambda: self.packets.dropped,
             autopilot=lambda: "ardupilot 4.6.0",
             report=self.told.append,
         )
-        self.writer = self.recorder._flight.writer
         (process,) = (
             child for child in multiprocessing.active_children() if child.name == "mavbridge-writer"
         )
         assert process.pid is not None
         self.pid = process.pid
 
+    def __enter__(self) -> "RecorderStand":
+        return self
 
-@contextmanager
-def stand(folder: Path) -> Iterator[RecorderStand]:
-    made = RecorderStand(folder)
-    try:
-        yield made
-    finally:
-        made.packets.close()
-        made.recorder.close(DEADLINE_S)
+    def __exit__(self, *_: object) -> None:
+        self.packets.close()
+        self.recorder.close(DEADLINE_S)
 
-
-def until(stood: RecorderStand, ticks: int) -> None:
-    """The thread has taken that many ticks."""
-    for _ in range(10_000):
-        if stood.writer.ticks >= ticks:
-            return
-        stood.recorder._closing.wait(0.01)
-    raise TimeoutError
+    def emit(self, ticks: range, frames: range) -> None:
+        for event in (*map(make_tick, ticks), *map(make_frame, frames)):
+            self.recorder.emit(event)
 
 
 def test_ticks_frames_and_packets_end_in_the_folder(tmp_path: Path) -> None:
-    with stand(tmp_path) as stood:
+    with RecorderStand(tmp_path) as stood:
         for k in range(3):
             stood.packets.put(Packet(k, b"packet"))
-        for k in range(300):
-            stood.recorder.emit(make_tick(k))
-        for k in range(20):
-            stood.recorder.emit(make_frame(k))
+        stood.emit(range(300), range(20))
     assert stood.recorder.dropped == 0
     assert stood.recorder.summary() == f"recorded 300 ticks and 20 frames in {tmp_path}"
     back = open_flight(tmp_path)
@@ -85,16 +67,13 @@ def test_ticks_frames_and_packets_end_in_the_folder(tmp_path: Path) -> None:
 
 
 def test_a_killed_writer_costs_the_images_alone_and_is_told_once(tmp_path: Path) -> None:
-    with stand(tmp_path) as stood:
-        for k in range(10):
-            stood.recorder.emit(make_tick(k))
-            stood.recorder.emit(make_frame(k))
-        until(stood, 10)
+    with RecorderStand(tmp_path) as stood:
+        stood.emit(range(10), range(10))
+        for _ in range(3_000):
+            if stood.recorder._flight.writer.ticks < 10:  # the thread has not taken them yet
+                stood.recorder._closing.wait(0.01)
         send_signal(stood.pid, signal.SIGKILL)
-        for k in range(10, 40):
-            stood.recorder.emit(make_tick(k))
-        for k in range(10, 20):
-            stood.recorder.emit(make_frame(k))
+        stood.emit(range(10, 40), range(10, 20))
     assert len(stood.told) == 1
     assert "recording no more images: the writer process has died" in stood.told[0]
     back = open_flight(tmp_path)
@@ -109,13 +88,12 @@ def test_a_killed_writer_costs_the_images_alone_and_is_told_once(tmp_path: Path)
 def test_a_full_disk_ends_the_recording_with_one_warning(
     tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
-    with stand(tmp_path) as stood:
+    with RecorderStand(tmp_path) as stood:
         resource.prlimit(stood.pid, resource.RLIMIT_FSIZE, (6_000, 6_000))
         number = 0
         while stood.recorder.failure is None:
             assert number < 10_000
-            stood.recorder.emit(make_tick(number))
-            stood.recorder.emit(make_frame(number))
+            stood.emit(range(number, number + 1), range(number, number + 1))
             number += 1
             stood.recorder._closing.wait(0.005)
         stood.recorder.emit(make_tick(number))  # the flight goes on
