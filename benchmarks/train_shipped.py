@@ -2,11 +2,10 @@
 
 python -m benchmarks.train_shipped toge --out training
 
-toge starts from the weights shipped before, taken from this repository's history: in two rounds
+toge starts from the weights shipped before, taken from this repository's history: in three rounds
 they fly, the expert corrects them, and they learn from that. toge-rates starts from nothing:
-flights of the expert, training, the student's flights, training, three times over. The shipped
-toge-rates started differently (policy/weights/README.md), and this recipe has not been run as a
-whole.
+flights of the expert, training, the student's flights, training, three times over. What shipped was
+made a little differently (policy/weights/README.md), and neither recipe has been run as a whole.
 
 Run the same command again to resume after an interruption: recorded flights and written weights are
 kept, and an unfinished training is resumed. Seeds determine the flights. Training budgets are
@@ -65,10 +64,19 @@ STEPS: dict[str, tuple[Step, ...]] = {
         flights("loop2", f"--episodes 16 --seed 84 --speed 6.5 {LOOPS}", "first"),
         flights("px2", f"--episodes 16 --seed 85 --speed 6.5 {PX4}", "first"),
         training(
-            "toge",
+            "second",
             "easy1 loop1 px1 easy2 loop2 px2",
-            f"--minutes 26 {STICKS} --pack",
+            f"--minutes 26 {STICKS}",
             start="first",
+        ),
+        flights("easy3", "--episodes 44 --seed 52 --speed 6.7", "second"),
+        flights("loop3", f"--episodes 12 --seed 54 --speed 6.5 {LOOPS}", "second"),
+        flights("px3", f"--episodes 16 --seed 53 --speed 6.5 {PX4}", "second"),
+        training(
+            "toge",
+            "easy1 loop1 px1 easy2 loop2 px2 easy3 loop3 px3",
+            f"--minutes 40 {STICKS} --pack",
+            start="second",
         ),
     ),
     "toge-rates": (

@@ -136,8 +136,8 @@ class TrainSettings(RunSettings):
     """Weight of the loss of gate positions that are read off the feature, in flights that hold
     them; 0 = off. The sticks of a few flights alone teach an encoder those flights' courses."""
     disturb: bool = True
-    """Recolour images, light them unevenly, veil them, cover parts: each a quarter of them, while
-    the encoder learns; --no-disturb where brightness or colour is what the policy is to look at."""
+    """Recolour images, light them unevenly, veil and cover them, each a quarter, while the encoder
+    learns; --no-disturb where brightness or colour is what the policy is to look at."""
     pack: bool = False
     """Write a checkpoint to ship, a third of the size: the encoder in int8, the rest in float16."""
     check_flights: int = 0
