@@ -6,7 +6,16 @@ from typing import Annotated, Literal
 
 from cyclopts import Group, Parameter
 
-from mavbridge.config.flags import CAMERA, OUTPUT, POLICY, RATES, VEHICLE, check_range, hidden
+from mavbridge.config.flags import (
+    CAMERA,
+    OUTPUT,
+    POLICY,
+    RATES,
+    VEHICLE,
+    Between,
+    Ranged,
+    hidden,
+)
 from mavbridge.config.flight import FlyConfig, ListenConfig
 from mavbridge.config.policy import Engine, PolicyConfig
 from mavbridge.core.errors import UserError
@@ -58,20 +67,20 @@ class IdentifyConfig:
 
 @Parameter(name="*")
 @dataclass(frozen=True, kw_only=True)
-class ServeConfig:
+class ServeConfig(Ranged):
     """One policy, and where it is served."""
 
     policy: PolicyConfig = field(default_factory=PolicyConfig)
     host: str = "127.0.0.1"
     """Address to listen at; by default this computer's own clients only. 0.0.0.0 is every network
     that it is in: set MAVBRIDGE_API_KEY then, on both sides."""
-    port: int = 8000
+    port: Annotated[int, Between(1, 65535)] = 8000
     """Port to listen at."""
 
     def __post_init__(self) -> None:
         """Refuse what cannot be served."""
+        super().__post_init__()
         object.__setattr__(self, "host", self.host.removeprefix("[").removesuffix("]"))
-        check_range("port", self.port, 1, 65535, "")
         if self.policy.dual_rate:
             raise UserError("each request is answered from its own image: leave out --dual-rate")
 
@@ -82,17 +91,17 @@ NO_POLICY = "none"
 
 @Parameter(name="*")
 @dataclass(frozen=True, kw_only=True)
-class CheckConfig:
+class CheckConfig(Ranged):
     """The flight to check, by its own flags."""
 
     flight: FlyConfig = field(default_factory=FlyConfig)
     echo_test: Annotated[bool, Parameter(negative="", group=VEHICLE)] = False
     """Send neutral sticks for up to three seconds, only while disarmed, and see whether the vehicle
     takes them from our system id; then release them."""
-    timing: Annotated[float, Parameter(group=RATES)] = 3.0
+    timing: Annotated[float, Parameter(group=RATES), Between(0.5, 36_000, "s")] = 3.0
     """Seconds for which the policy is run at its rates, on one dummy sample; minutes show whether
     this computer throttles."""
-    soak: Annotated[float | None, Parameter(group=RATES)] = None
+    soak: Annotated[float | None, Parameter(group=RATES), Between(1, 36_000, "s")] = None
     """Seconds to run the policy at the bundled vehicle, which climbs, and measure this computer.
     Needs the extra "sitl"."""
     json: Annotated[Path | None, Parameter(group=OUTPUT, allow_leading_hyphen=True)] = None
@@ -101,8 +110,7 @@ class CheckConfig:
 
     def __post_init__(self) -> None:
         """Refuse durations that show nothing."""
-        check_range("timing", self.timing, 0.5, 36_000, "s")
-        check_range("soak", self.soak, 1, 36_000, "s")
+        super().__post_init__()
         if self.soak is not None and self.flight.policy.policy == NO_POLICY:
             raise UserError("--soak needs a policy")
 
@@ -138,7 +146,7 @@ class ExportConfig:
 
 @Parameter(name="*")
 @dataclass(frozen=True, kw_only=True)
-class ImagineConfig:
+class ImagineConfig(Ranged):
     """Settings of one imagined flight."""
 
     start: Path
@@ -150,15 +158,15 @@ class ImagineConfig:
     world_model: Path | None = None
     """Weights of the world model; by default those that come with mavbridge."""
     policy: PolicyConfig = field(default_factory=PolicyConfig)
-    start_at: float = 0.0
+    start_at: Annotated[float, Between(0, 86400, "s")] = 0.0
     """Seconds into the flight, from its first frame with a state."""
-    n_iter: int = 8
+    n_iter: Annotated[int, Between(1, 1_000_000)] = 8
     """Iterations: a decision, and a simulation of its consequences."""
-    exe_steps: int = 1
+    exe_steps: Annotated[int, Between(1, 256)] = 1
     """Steps that are executed before the next decision."""
-    frames: int | None = None
+    frames: Annotated[int | None, Between(1, 256)] = None
     """Imagined frames that a segment of the video holds; by default the executed ones."""
-    ddim_steps: int = 4
+    ddim_steps: Annotated[int, Between(1, 1000)] = 4
     """DDIM steps of the world model."""
     decode_video: bool = True
     """Write a video; without it only the rows are written."""
@@ -168,11 +176,7 @@ class ImagineConfig:
 
     def __post_init__(self) -> None:
         """Refuse values out of range."""
-        check_range("start-at", self.start_at, 0, 86400, "s")
-        check_range("n-iter", self.n_iter, 1, 1_000_000, "")
-        check_range("frames", self.frames, 1, 256, "")
-        check_range("exe-steps", self.exe_steps, 1, 256, "")
-        check_range("ddim-steps", self.ddim_steps, 1, 1000, "")
+        super().__post_init__()
         if self.frames is not None and self.exe_steps > self.frames:
             raise UserError(
                 f"--exe-steps {self.exe_steps} is more than --frames {self.frames}: only frames "
@@ -201,59 +205,48 @@ EPISODES = Group("Episodes", sort_key=1.5)
 
 @Parameter(name="*", group=CAMERA)
 @dataclass(frozen=True, kw_only=True)
-class FilmConfig:
+class FilmConfig(Ranged):
     """The camera, whose images are recorded in the size in which they come."""
 
     camera: str = "0"
     """0, /dev/videoN, URL, FILE, shm:NAME, screen:TITLE, pipe:COMMAND or jpeg-udp:PORT."""
-    camera_size: int = 224
+    camera_size: Annotated[int, Between(32, 4096, "pixels")] = 224
     """Pixels a side that the image must cover; a device is asked for such a mode."""
-    camera_timeout: Annotated[float, hidden("link.camera-timeout")] = 10.0
+    camera_timeout: Annotated[float, hidden("link.camera-timeout"), Between(0.1, 3600, "s")] = 10.0
     """Seconds to wait for the camera's first frame."""
-    camera_latency: float = 0.0
+    camera_latency: Annotated[float, Between(0, 2000, "ms")] = 0.0
     """Milliseconds from exposure to arrival here; not for shm:, whose frames carry their own
     stamps."""
-    visual_rate: float = 30.0
+    visual_rate: Annotated[float, Between(0.5, 240, "Hz")] = 30.0
     """Most frames a second."""
-
-    def __post_init__(self) -> None:
-        """Refuse sizes and times that no camera has."""
-        check_range("camera-size", self.camera_size, 32, 4096, "pixels")
-        check_range("link.camera_timeout", self.camera_timeout, 0.1, 3600, "s")
-        check_range("camera-latency", self.camera_latency, 0, 2000, "ms")
-        check_range("visual-rate", self.visual_rate, 0.5, 240, "Hz")
 
 
 @Parameter(name="*")
 @dataclass(frozen=True, kw_only=True)
-class RecordConfig:
+class RecordConfig(Ranged):
     """Recorded flights of a human pilot."""
 
     out: Annotated[Path, Parameter(group=OUTPUT)]
     """Folder for the flights, each in a folder of its own; more are added to those in it."""
     vehicle: ListenConfig = field(default_factory=ListenConfig)
     film: FilmConfig = field(default_factory=FilmConfig)
-    rate: Annotated[float, Parameter(group=RATES)] = 100.0
+    rate: Annotated[float, Parameter(group=RATES), Between(20, 250, "Hz")] = 100.0
     """Rows a second of sticks and state, for which the vehicle is asked, too."""
-    episode_channel: Annotated[int | None, Parameter(group=EPISODES)] = None
+    episode_channel: Annotated[int | None, Parameter(group=EPISODES), Between(5, 18)] = None
     """Radio channel, from 5, whose switch records while it is high; the middle of a switch of three
     positions ends the episode and marks it as bad."""
     on_arm: Annotated[bool, Parameter(group=EPISODES, negative="")] = False
     """Record while the vehicle is armed."""
-    episodes: Annotated[int | None, Parameter(group=EPISODES)] = None
+    episodes: Annotated[int | None, Parameter(group=EPISODES), Between(1, 9999)] = None
     """End after this number of episodes."""
     rerun: Annotated[str, Parameter(group=OUTPUT)] = "off"
     """Rerun viewer: spawn, connect[=URL], FILE.rrd, or off."""
-    disk_reserve: Annotated[float, Parameter(group=OUTPUT)] = 1.0
-    """Gigabytes of the disk that stay free. An episode ends when only these are left, and none
-    begins with less than a minute of recording before that."""
+    disk_reserve: Annotated[float, Parameter(group=OUTPUT), Between(0.05, 10_000, "GB")] = 1.0
+    """Gigabytes of the disk that stay free."""
 
     def __post_init__(self) -> None:
         """Refuse contradictions, and rates that no autopilot serves."""
-        check_range("rate", self.rate, 20, 250, "Hz")
-        check_range("disk-reserve", self.disk_reserve, 0.05, 10_000, "GB")
-        check_range("episode-channel", self.episode_channel, 5, 18, "")
-        check_range("episodes", self.episodes, 1, 9999, "")
+        super().__post_init__()
         if self.on_arm and self.episode_channel is not None:
             raise UserError("--on-arm and --episode-channel both say when to record: leave one out")
 
@@ -263,7 +256,7 @@ ReplayFrom = Literal["auto", "chunks", "features", "video"]
 
 @Parameter(name="*", group=OUTPUT)
 @dataclass(frozen=True, kw_only=True)
-class ReplayConfig:
+class ReplayConfig(Ranged):
     """What is computed once more, and what is different from the flight; nothing by default."""
 
     source: Annotated[ReplayFrom, Parameter(name="--from", group=POLICY)] = "auto"
@@ -290,7 +283,7 @@ class ReplayConfig:
     """Another age of the oldest image to act on, in seconds."""
     max_chunk_age: Annotated[float | None, hidden("limits.chunk-age")] = None
     """Another time for which one chunk may be flown, in seconds."""
-    tolerance: float | None = None
+    tolerance: Annotated[float | None, Between(0, 10)] = None
     """Largest difference of a stick that still counts as equal; by default 0 for the same engine,
     and more for another one and for the video. Where something else was asked for there is none."""
     plot: Path | None = None
@@ -300,7 +293,7 @@ class ReplayConfig:
 
     def __post_init__(self) -> None:
         """Refuse what cannot be combined."""
-        check_range("tolerance", self.tolerance, 0, 10, "")
+        super().__post_init__()
         changes_policy = self.is_other_policy or self.engine is not None or self.device is not None
         if self.source == "chunks" and changes_policy:
             raise UserError(

@@ -6,7 +6,7 @@ from typing import Annotated, Literal
 
 from cyclopts import Parameter
 
-from mavbridge.config.flags import check_range, hidden
+from mavbridge.config.flags import Between, Ranged, check_range
 from mavbridge.config.flight import Limits
 from mavbridge.config.policy import PolicyConfig
 from mavbridge.config.rates import Rates
@@ -37,20 +37,16 @@ MAX_EVALUATION_SEED = (COURSE_SEEDS["race"] - HELD_OUT_COURSE_SEED) // MAX_EPISO
 
 @Parameter(name="*")
 @dataclass(frozen=True, kw_only=True)
-class WorkersConfig:
+class WorkersConfig(Ranged):
     """Number of episodes flown at a time, and the machines that fly them."""
 
-    workers: int = 1
+    workers: Annotated[int, Between(1, 10_000)] = 1
     """Episodes at a time, each in a process of its own."""
     ray: Annotated[
         bool | str, Parameter(negative="", show_default=False, metavar="[HOST:PORT]")
     ] = False
     """Fly on the Ray cluster that this machine belongs to, or on the one at HOST:PORT. Its machines
     must share the folders of files that are read and written. Needs the extra "cluster"."""
-
-    def __post_init__(self) -> None:
-        """Raise UserError for a number of processes that no machine runs."""
-        check_range("workers", self.workers, 1, 10_000, "")
 
     @property
     def ray_address(self) -> str | None:
@@ -60,28 +56,21 @@ class WorkersConfig:
 
 @Parameter(name="*")
 @dataclass(frozen=True, kw_only=True)
-class EvaluateConfig:
+class EvaluateConfig(Ranged):
     """One evaluation: many courses that no policy was trained on."""
 
     policy: PolicyConfig = field(default_factory=PolicyConfig)
     limits: Limits = field(default_factory=Limits)
-    visual_rate: Annotated[float | str, hidden("rates.visual")] = 30.0
-    """Most frames a second through the image encoder (dual rate), or auto[:MIN:MAX]."""
-    action_rate: Annotated[float | None, hidden("rates.action")] = None
-    """Most chunks of actions a second (dual rate); default: 100, or 2 / play_s for slow
-    policies."""
-    rate: Annotated[float | None, hidden("rates.single")] = None
-    """Most chunks of actions a second (single rate); default: 30, or 2 / play_s for slow
-    policies."""
-    episodes: int = 20
+    rates: Rates = field(default_factory=Rates)
+    episodes: Annotated[int, Between(1, MAX_EPISODES)] = 20
     """Courses to fly."""
-    max_time: float = 60.0
+    max_time: Annotated[float, Between(1, 3600, "s")] = 60.0
     """Seconds that a flight may take, from the policy's first action."""
     courses: CourseKind = "easy"
     """easy; race: longer, with sharper turns, climbs and dives; loop: gates around a circle."""
-    laps: int = 1
+    laps: Annotated[int, Between(1, 1000)] = 1
     """Rounds of a loop."""
-    hover: float = 1.0
+    hover: Annotated[float, Between(0, 3600, "s")] = 1.0
     """Seconds to fly on after the last gate; the drift from where it stopped is told."""
     conditions: ConditionsKind = "nominal"
     """random: each flight has another vehicle, firmware settings, wind, light, colours and lens.
@@ -90,25 +79,25 @@ class EvaluateConfig:
     dirty lens."""
     autopilot: AutopilotKind = "ardupilot"
     """Firmware of the bundled flight controller: its modes, stick curves and airframe."""
-    gains: float = 1.0
+    gains: Annotated[float, Between(0.2, 2.5)] = 1.0
     """Factor on the lean, yaw rate and climb of ArduPilot at full stick."""
-    gusts: float | None = None
+    gusts: Annotated[float | None, Between(0, 10, "m/s")] = None
     """Standard deviation of horizontal gusts, in m/s. Each axis has its own; they replace those of
     --conditions."""
     raw_sticks: bool = False
     """Send the policy's sticks as they are, without the inverse of the vehicle's curves."""
-    vision_delay: float = 0.0
+    vision_delay: Annotated[float, Between(0, 5000, "ms")] = 0.0
     """Milliseconds added to the encoding of each image; an image older than
     limits.feature_age is not flown by. Here such limits may also be looser than the policy's."""
-    vision_time: float | None = None
+    vision_time: Annotated[float | None, Between(0, 5000, "ms")] = None
     """Milliseconds that an image takes to encode, always; by default as on two shared
     cores: 11, and 25 at the 99th percentile."""
-    solve_time: float | None = None
+    solve_time: Annotated[float | None, Between(0, 5000, "ms")] = None
     """Milliseconds that a chunk takes, as from a slow head or a server; default: 3, and 6 at the
     99th percentile. The policy's play_s, and so its age limits and its rate, follow."""
     state_time: StateTime | None = None
     """measured, or execution (predicted to when the chunk acts); default: the contract's."""
-    stalls: float = 0.0
+    stalls: Annotated[float, Between(0, 5000, "ms")] = 0.0
     """Milliseconds for which the flight process stands still, at a random moment every 3 s;
     limits.stall may be looser than the policy's here, too."""
     workers: WorkersConfig = field(default_factory=WorkersConfig)
@@ -120,39 +109,24 @@ class EvaluateConfig:
 
     def __post_init__(self) -> None:
         """Raise UserError for values out of range, and for contradictions."""
-        check_range("episodes", self.episodes, 1, MAX_EPISODES, "")
-        check_range("max-time", self.max_time, 1, 3600, "s")
-        check_range("hover", self.hover, 0, 3600, "s")
-        check_range("laps", self.laps, 1, 1000, "")
+        super().__post_init__()
         if self.laps > 1 and self.courses != "loop":
             raise UserError("--laps needs --courses loop")
-        check_range("vision-delay", self.vision_delay, 0, 5000, "ms")
-        check_range("stalls", self.stalls, 0, 5000, "ms")
         if self.resume and self.json is None:
             raise UserError("--resume needs the --json FILE to go on with")
-        check_range("vision-time", self.vision_time, 0, 5000, "ms")
-        check_range("solve-time", self.solve_time, 0, 5000, "ms")
-        check_range("gains", self.gains, 0.2, 2.5, "")
         check_range("seed", self.policy.seed, 0, MAX_EVALUATION_SEED, "")
         if self.gains != 1 and self.autopilot != "ardupilot":
             raise UserError("--gains needs --autopilot ardupilot")
-        check_range("gusts", self.gusts, 0, 10, "m/s")
-        _ = self.rates
-
-    @property
-    def rates(self) -> Rates:
-        """Rates as in ``mavbridge fly``."""
-        return Rates(visual_rate=self.visual_rate, action_rate=self.action_rate, rate=self.rate)
 
 
 @Parameter(name="*")
 @dataclass(frozen=True, kw_only=True)
-class DemonstrateConfig:
+class DemonstrateConfig(Ranged):
     """Demonstrations to learn from."""
 
     out: Path
     """Folder for the flights, each in a folder of its own; finished ones are kept."""
-    episodes: int = 100
+    episodes: Annotated[int, Between(1, MAX_EPISODES)] = 100
     """Flights in all."""
     speed: float = 5.0
     """Speed of the expert along the course, in m/s; 1.5 to 10 by sticks, to 14 by rates."""
@@ -162,12 +136,12 @@ class DemonstrateConfig:
     """Firmware of the bundled flight controller: its modes, stick curves and airframe."""
     courses: CourseKind = "easy"
     """easy; race: longer, with sharper turns, climbs and dives; loop: gates around a circle."""
-    max_time: float = 40.0
+    max_time: Annotated[float, Between(1, 3600, "s")] = 40.0
     """Seconds after which a flight ends, on the course or not; a short one can start a rollout."""
     policy: PolicyConfig = field(default_factory=PolicyConfig)
     """With --checkpoint the policy flies most of the time, and the expert's actions are recorded as
     labels (DAgger)."""
-    solve_time: float = 0.0
+    solve_time: Annotated[float, Between(0, 1000, "ms")] = 0.0
     """With --checkpoint: longest time for a chunk, in milliseconds. The policy then flies as one
     with a slow head or behind a server does; each flight draws its own time, from a quarter of this
     on."""
@@ -175,10 +149,8 @@ class DemonstrateConfig:
 
     def __post_init__(self) -> None:
         """Raise UserError if the expert could not fly so."""
-        check_range("episodes", self.episodes, 1, MAX_EPISODES, "")
+        super().__post_init__()
         check_range("speed", self.speed, 1.5, 14 if self.action == "rates" else 10, "m/s")
-        check_range("max-time", self.max_time, 1, 3600, "s")
-        check_range("solve-time", self.solve_time, 0, 1000, "ms")
         if self.solve_time > 0 and self.policy.checkpoint is None:
             raise UserError("--solve-time is the student's: give its --checkpoint")
         check_range("seed", self.policy.seed, 0, CHECK_COURSE_SEED // MAX_EPISODES - 1, "")

@@ -1,6 +1,8 @@
-"""Groups, hidden settings and range checks of flags."""
+"""Groups, hidden settings and ranges of flags."""
 
 import math
+from dataclasses import dataclass
+from typing import get_type_hints
 
 from cyclopts import Group, Parameter
 
@@ -13,6 +15,46 @@ def check_range(name: str, value: float | None, low: float, high: float, unit: s
         limits = f"{low:g} and {high:g} {unit}".rstrip()
         flag = name if "." in name else f"--{name}"
         raise UserError(f"{flag} must be between {limits}, got {value:g}")
+
+
+@dataclass(frozen=True)
+class Between:
+    """Range of a number, as metadata of a field of ``Ranged``."""
+
+    low: float
+    high: float
+    unit: str = ""
+
+
+class Ranged:
+    """Base of dataclasses of flags: refuses numbers out of the ranges of their fields."""
+
+    def __post_init__(self) -> None:
+        """Raise UserError, naming the flag or setting, for a number out of its range."""
+        for field, (name, limits) in _ranges(type(self)).items():
+            check_range(name, getattr(self, field), limits.low, limits.high, limits.unit)
+
+
+def _ranges(config: type) -> dict[str, tuple[str, Between]]:
+    """Return the flag or ``section.key``, and the range, of each field that has one."""
+    shared = config.__cyclopts__.parameters[-1]  # type: ignore[attr-defined]
+    found = {}
+    for field, hint in get_type_hints(config, include_extras=True).items():
+        metadata = getattr(hint, "__metadata__", ())
+        limits = next((each for each in metadata if isinstance(each, Between)), None)
+        if limits is None:
+            continue
+        named = [
+            name for each in metadata if isinstance(each, Parameter) for name in each.name or ()
+        ]
+        if named:
+            name = named[0].removeprefix("--").replace("-", "_")
+        elif shared.name[0] != "*":  # a section
+            name = f"{shared.name[0]}.{shared.name_transform(field)}".replace("-", "_")
+        else:
+            name = field.replace("_", "-")
+        found[field] = name, limits
+    return found
 
 
 VEHICLE = Group("Vehicle", sort_key=1)

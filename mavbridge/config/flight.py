@@ -8,7 +8,16 @@ from typing import Annotated, Literal
 
 from cyclopts import Parameter
 
-from mavbridge.config.flags import CAMERA, ENGAGING, OUTPUT, VEHICLE, check_range, hidden, section
+from mavbridge.config.flags import (
+    CAMERA,
+    ENGAGING,
+    OUTPUT,
+    VEHICLE,
+    Between,
+    Ranged,
+    hidden,
+    section,
+)
 from mavbridge.config.policy import PolicyConfig
 from mavbridge.config.rates import Rates
 from mavbridge.core.errors import UserError
@@ -19,136 +28,89 @@ OutputChoice = Literal["auto", "rc-override", "manual-control", "attitude", "rat
 MAX_GOAL_M = 100_000.0
 _FLOAT32_MAX = 3.4e38
 """Largest value of a MAVLink parameter."""
+Age = Annotated[float | None, Between(0.01, 60, "s")]
 
 
 @section("limits")
 @dataclass(frozen=True, kw_only=True)
-class Limits:
+class Limits(Ranged):
     """Maximum input ages and stick speed."""
 
-    max_attitude_age: float | None = None
+    max_attitude_age: Age = None
     """Oldest attitude and body rates to act on, in seconds, when a command leaves; default: the
     policy's contract, which this can only tighten."""
-    max_velocity_age: float | None = None
+    max_velocity_age: Age = None
     """Oldest velocity and acceleration to act on, in seconds; default and direction as
     attitude_age."""
-    max_feature_age: float | None = None
+    max_feature_age: Age = None
     """Oldest image to act on, in seconds since exposure; default and direction as attitude_age."""
-    max_chunk_age: float | None = None
+    max_chunk_age: Age = None
     """Oldest chunk of actions to act on, in seconds since it was computed; default and direction as
     attitude_age."""
-    max_stall: float | None = None
+    max_stall: Age = None
     """Longest time in seconds to fly on along one chunk when no newer one comes; default and
     direction as attitude_age."""
-    max_frozen_state: float = 0.5
+    max_frozen_state: Annotated[float, Between(0, 60, "s")] = 0.5
     """Longest time in seconds for which the attitude may stay bit-identical while the vehicle
     turns; 0 = no limit."""
-    tau: float | None = None
+    tau: Annotated[float | None, Between(0, 2, "s")] = None
     """Time constant in seconds of the low-pass filter on actions; 0 = off; default: 0.05, for body
     rates 0.01."""
-    max_slew: float = 8.0
+    max_slew: Annotated[float, Between(0, 1000, "1/s")] = 8.0
     """Fastest stick movement, in full deflections a second; 0 = no limit."""
-
-    def __post_init__(self) -> None:
-        """Raise UserError for values that would disable a limit by accident."""
-        for name, unit, least, largest in (
-            ("max_attitude_age", "s", 0.01, 60),
-            ("max_velocity_age", "s", 0.01, 60),
-            ("max_feature_age", "s", 0.01, 60),
-            ("max_chunk_age", "s", 0.01, 60),
-            ("max_stall", "s", 0.01, 60),
-            ("max_frozen_state", "s", 0, 60),
-            ("tau", "s", 0, 2),
-            ("max_slew", "1/s", 0, 1000),
-        ):
-            check_range(
-                f"limits.{name.removeprefix('max_')}", getattr(self, name), least, largest, unit
-            )
 
 
 @section("envelope")
 @dataclass(frozen=True, kw_only=True)
-class EnvelopeConfig:
+class EnvelopeConfig(Ranged):
     """Flight envelope; default: the wider of ours and the policy's."""
 
-    max_tilt: float | None = None
+    max_tilt: Annotated[float | None, Between(0, 180, "deg")] = None
     """Largest tilt, in degrees; by default 60 or what the policy needs; 0 = not watched."""
-    max_height: float | None = None
+    max_height: Annotated[float | None, Between(0, 100_000, "m")] = None
     """Largest height above the estimator's origin, in metres; by default 120; 0 = not watched."""
-    max_speed: float | None = None
+    max_speed: Annotated[float | None, Between(0, 1000, "m/s")] = None
     """Fastest speed, in m/s; by default 20; 0 = not watched."""
-    max_distance: float | None = None
+    max_distance: Annotated[float | None, Between(0, 100_000, "m")] = None
     """Farthest from the estimator's origin, in metres; by default 300; 0 = not watched."""
-    min_battery: float = 10.0
+    min_battery: Annotated[float, Between(0, 100, "%")] = 10.0
     """Lowest charge, in percent; 0 = only what the vehicle itself calls low."""
-
-    def __post_init__(self) -> None:
-        """Raise UserError for values that are no limits."""
-        for name, unit, largest in (
-            ("max_tilt", "deg", 180),
-            ("max_height", "m", 100_000),
-            ("max_speed", "m/s", 1000),
-            ("max_distance", "m", 100_000),
-            ("min_battery", "%", 100),
-        ):
-            check_range(
-                f"envelope.{name.removeprefix('max_')}", getattr(self, name), 0, largest, unit
-            )
 
 
 @section("setpoints")
 @dataclass(frozen=True, kw_only=True)
-class SetpointLimits:
+class SetpointLimits(Ranged):
     """Limits of setpoints; the autopilot itself limits few of them."""
 
-    setpoint_lean: float = 35.0
+    setpoint_lean: Annotated[float, Between(0.01, 80, "deg")] = 35.0
     """Largest lean of an attitude, in degrees."""
-    setpoint_rate: float = 220.0
+    setpoint_rate: Annotated[float, Between(0.01, 2000, "deg/s")] = 220.0
     """Fastest roll and pitch rate, in degrees a second."""
-    setpoint_yaw_rate: float = 120.0
+    setpoint_yaw_rate: Annotated[float, Between(0.01, 1000, "deg/s")] = 120.0
     """Fastest yaw rate, in degrees a second."""
-    setpoint_thrust: float = 0.9
+    setpoint_thrust: Annotated[float, Between(0.01, 1, "of full thrust")] = 0.9
     """Largest collective thrust, by the policy's scale."""
-    setpoint_speed: float = 8.0
+    setpoint_speed: Annotated[float, Between(0.01, 100, "m/s")] = 8.0
     """Fastest horizontal velocity, in m/s."""
-    setpoint_climb: float = 3.0
+    setpoint_climb: Annotated[float, Between(0.01, 50, "m/s")] = 3.0
     """Fastest climb and descent, in m/s."""
-    setpoint_accel: float = 5.0
+    setpoint_accel: Annotated[float, Between(0.01, 100, "m/s^2")] = 5.0
     """Fastest change of a velocity, in m/s^2."""
-
-    def __post_init__(self) -> None:
-        """Raise UserError for limits that no multirotor has."""
-        for name, unit, largest in (
-            ("setpoint_lean", "deg", 80),
-            ("setpoint_rate", "deg/s", 2000),
-            ("setpoint_yaw_rate", "deg/s", 1000),
-            ("setpoint_thrust", "of full thrust", 1),
-            ("setpoint_speed", "m/s", 100),
-            ("setpoint_climb", "m/s", 50),
-            ("setpoint_accel", "m/s^2", 100),
-        ):
-            key = f"setpoints.{name.removeprefix('setpoint_')}"
-            check_range(key, getattr(self, name), 0.01, largest, unit)
 
 
 @Parameter(name="*", group=VEHICLE)
 @dataclass(frozen=True, kw_only=True)
-class ListenConfig:
+class ListenConfig(Ranged):
     """A vehicle to listen to."""
 
     connect: Annotated[str, Parameter(show_default=False)] = ""
     """Vehicle: udp:HOST:PORT, udpout:HOST:PORT, tcp:HOST:PORT or /dev/ttyX,BAUD."""
     signing_key_file: Annotated[Path | None, Parameter(show_default=False)] = None
     """File with the vehicle's MAVLink 2 key: sign, and accept signed packets only."""
-    target_system: Annotated[int, hidden("link.target-system")] = 0
+    target_system: Annotated[int, hidden("link.target-system"), Between(0, 254)] = 0
     """System id of the vehicle to fly; 0 = the only one on the link."""
-    connect_timeout: Annotated[float, hidden("link.timeout")] = 30.0
+    connect_timeout: Annotated[float, hidden("link.timeout"), Between(0.1, 3600, "s")] = 30.0
     """Seconds to wait for the vehicle's first heartbeat."""
-
-    def __post_init__(self) -> None:
-        """Raise UserError for ids and times that no vehicle has."""
-        check_range("link.target_system", self.target_system, 0, 254, "")
-        check_range("link.timeout", self.connect_timeout, 0.1, 3600, "s")
 
 
 @Parameter(name="*", group=VEHICLE)
@@ -156,7 +118,7 @@ class ListenConfig:
 class LinkConfig(ListenConfig):
     """The vehicle and how to reach it."""
 
-    source_system: Annotated[int, hidden("link.source-system")] = 255
+    source_system: Annotated[int, hidden("link.source-system"), Between(1, 255)] = 255
     """Our MAVLink system id. ArduPilot obeys overrides of its MAV_GCS_SYSID (255) only."""
     output: Annotated[OutputChoice, Parameter(show_choices=False)] = "auto"
     """auto, rc-override, manual-control, attitude, rates or velocity."""
@@ -174,7 +136,6 @@ class LinkConfig(ListenConfig):
         super().__post_init__()
         if self.set_params and self.readonly:
             raise UserError("--readonly sets no parameter: leave out --set")
-        check_range("link.source_system", self.source_system, 1, 255, "")
 
     @property
     def set_params(self) -> tuple[tuple[str, float], ...]:
@@ -199,27 +160,23 @@ class LinkConfig(ListenConfig):
 
 @Parameter(name="*", group=CAMERA)
 @dataclass(frozen=True, kw_only=True)
-class CameraConfig:
+class CameraConfig(Ranged):
     """Camera of the policy."""
 
     camera: Annotated[tuple[str, ...], Parameter(negative="", show_default=" ".join)] = ("0",)
     """0, /dev/videoN, URL, FILE, shm:NAME, screen:TITLE, pipe:..., none."""
-    camera_timeout: Annotated[float, hidden("link.camera-timeout")] = 10.0
+    camera_timeout: Annotated[float, hidden("link.camera-timeout"), Between(0.1, 3600, "s")] = 10.0
     """Seconds to wait for the camera's first frame."""
-    camera_latency: float = 0.0
+    camera_latency: Annotated[float, Between(0, 2000, "ms")] = 0.0
     """Milliseconds from exposure to arrival, if frames carry no stamps."""
-    max_frozen_image: Annotated[float, hidden("limits.frozen-image")] = 0.5
+    max_frozen_image: Annotated[float, hidden("limits.frozen-image"), Between(0, 60, "s")] = 0.5
     """Longest time in seconds for which the image may stay identical in flight; 0 = no limit."""
-    max_black_image: Annotated[float, hidden("limits.black-image")] = 0.5
+    max_black_image: Annotated[float, hidden("limits.black-image"), Between(0, 60, "s")] = 0.5
     """Longest time in seconds for which the image may be black or of one colour; 0 = no limit."""
 
     def __post_init__(self) -> None:
-        """Raise UserError for times that no camera has."""
-        check_range("link.camera_timeout", self.camera_timeout, 0.1, 3600, "s")
-        check_range("camera-latency", self.camera_latency, 0, 2000, "ms")
-        check_range("limits.frozen_image", self.max_frozen_image, 0, 60, "s")
-        check_range("limits.black_image", self.max_black_image, 0, 60, "s")
-
+        """Raise UserError for times that no camera has, and for cameras without names."""
+        super().__post_init__()
         names = [name for name, _ in self._named]
         if len(set(names)) < len(names) or (len(names) > 1 and "" in names):
             raise UserError(
@@ -255,7 +212,7 @@ class CameraConfig:
 
 @Parameter(name="*")
 @dataclass(frozen=True, kw_only=True)
-class FlyConfig:
+class FlyConfig(Ranged):
     """One flight."""
 
     link: LinkConfig = field(default_factory=LinkConfig)
@@ -269,13 +226,13 @@ class FlyConfig:
     """Arm and engage once, as soon as everything is ready."""
     mode: Annotated[str | None, Parameter(group=ENGAGING)] = None
     """Flight mode to request when engaging; default: one that is allowed."""
-    takeoff: Annotated[float | None, Parameter(group=ENGAGING)] = None
+    takeoff: Annotated[float | None, Parameter(group=ENGAGING), Between(0.5, 100, "m")] = None
     """With --arm: metres to climb by the autopilot's own takeoff first."""
     goal: Annotated[
         str | None, Parameter(group=ENGAGING, allow_leading_hyphen=True, show_default=False)
     ] = None
     """NORTH,EAST,DOWN of the goal, in metres from the estimator's origin."""
-    engage_channel: Annotated[int | None, Parameter(group=ENGAGING)] = None
+    engage_channel: Annotated[int | None, Parameter(group=ENGAGING), Between(5, 18)] = None
     """Radio channel, from 5, whose switch engages (high) and releases (low)."""
     engage_on_arm: Annotated[bool, Parameter(group=ENGAGING)] = False
     """Engage when the vehicle is armed for the first time."""
@@ -283,7 +240,7 @@ class FlyConfig:
     """After a fault of ours: auto, release, hold, land or rtl."""
     then: Annotated[OnFault, Parameter(group=ENGAGING, show_choices=False)] = "auto"
     """After a normal end: auto, release, hold, land or rtl."""
-    duration: Annotated[float | None, Parameter(group=ENGAGING)] = None
+    duration: Annotated[float | None, Parameter(group=ENGAGING), Between(0.1, 86400, "s")] = None
     """Seconds to fly from the policy's first action; default: until Ctrl-C."""
     rerun: Annotated[str, Parameter(group=OUTPUT)] = "off"
     """Rerun viewer: spawn, connect[=URL], FILE.rrd or off."""
@@ -298,13 +255,10 @@ class FlyConfig:
 
     def __post_init__(self) -> None:
         """Raise UserError for contradictions."""
-        check_range("duration", self.duration, 0.1, 86400, "s")
-        if self.takeoff is not None:
-            check_range("takeoff", self.takeoff, 0.5, 100, "m")
-            if not self.arm:
-                raise UserError("--takeoff needs --arm: nothing else takes off by itself")
+        super().__post_init__()
+        if self.takeoff is not None and not self.arm:
+            raise UserError("--takeoff needs --arm: nothing else takes off by itself")
         _ = self.goal_ned_m
-        check_range("engage-channel", self.engage_channel, 5, 18, "")
         engages = self.arm or self.engage_on_arm or self.engage_channel is not None
         if self.link.readonly and (engages or self.mode is not None):
             raise UserError(

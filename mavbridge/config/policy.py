@@ -6,7 +6,7 @@ from typing import Annotated, Literal
 
 from cyclopts import Parameter
 
-from mavbridge.config.flags import POLICY, RARE, check_range, hidden
+from mavbridge.config.flags import POLICY, RARE, Between, Ranged, hidden
 
 STEPS, TOGE_STEPS = 10, 1
 """DDIM steps by default, and those of toge and toge-rates, which fly as well in one
@@ -16,7 +16,7 @@ Engine = Literal["auto", "torch", "openvino", "cuda-graph"]
 
 @Parameter(name="*", group=POLICY)
 @dataclass(frozen=True, kw_only=True)
-class PolicyConfig:
+class PolicyConfig(Ranged):
     """The policy, its weights, and what runs it."""
 
     policy: str = "toge"
@@ -29,13 +29,17 @@ class PolicyConfig:
         bool | None, Parameter(negative=("--no-dual-rate", "--single-rate"), show_default=False)
     ] = None
     """Encode images at a rate of their own; default: if the policy can."""
-    num_diffusion_steps: Annotated[int | None, Parameter(show_default=False)] = None
+    num_diffusion_steps: Annotated[
+        int | None, Parameter(show_default=False), Between(1, 100, "steps")
+    ] = None
     """DDIM steps of the action head; default: 10, and 1 for toge and toge-rates."""
     allow_untrained: Annotated[bool, hidden("network.allow-untrained")] = False
     """Fly TOGE with random weights, for timing and bring-up only."""
     by_rates: bool = False
     """Fly a stick policy by thrust and body rates, its attitude loop closed here."""
-    image_size: Annotated[int | None, hidden("network.image-size")] = None
+    image_size: Annotated[int | None, hidden("network.image-size"), Between(32, 1024, "pixels")] = (
+        None
+    )
     """Side of the encoder's input in pixels; default: the contract's (224)."""
     engine: Annotated[Engine, hidden("network.engine")] = "auto"
     """Inference engine; auto: the fastest that agrees with torch."""
@@ -45,14 +49,8 @@ class PolicyConfig:
     """Device of the image encoder; default: --device."""
     action_device: Annotated[str | None, hidden("network.action-device")] = None
     """Device of the action head; default: --device."""
-    seed: Annotated[int, Parameter(group=RARE)] = 0
+    seed: Annotated[int, Parameter(group=RARE), Between(0, 2**63 - 1)] = 0
     """Seed of random weights, diffusion noise and simulated courses."""
-
-    def __post_init__(self) -> None:
-        """Raise UserError for values that scheduler or encoder do not support."""
-        check_range("num-diffusion-steps", self.steps, 1, 100, "steps")
-        check_range("network.image_size", self.image_size, 32, 1024, "pixels")
-        check_range("seed", self.seed, 0, 2**63 - 1, "")
 
     @property
     def kind(self) -> str:

@@ -6,7 +6,7 @@ from typing import Annotated
 
 from cyclopts import Parameter
 
-from mavbridge.config.flags import RATES, check_range, hidden
+from mavbridge.config.flags import RATES, Between, Ranged, check_range, hidden
 from mavbridge.core.errors import UserError
 
 LEAST_HZ = 0.5
@@ -45,19 +45,21 @@ class LoopRates:
 
 @Parameter(name="*", group=RATES)
 @dataclass(frozen=True, kw_only=True)
-class Rates:
+class Rates(Ranged):
     """Loop rates in Hz."""
 
     visual_rate: Annotated[float | str, hidden("rates.visual")] = 30.0
     """Most images encoded per second (dual rate); auto[:MIN:MAX] encodes more often when the
     vehicle turns or the image changes."""
-    action_rate: Annotated[float | None, hidden("rates.action")] = None
+    action_rate: Annotated[float | None, hidden("rates.action"), Between(LEAST_HZ, 500, "Hz")] = (
+        None
+    )
     """Most chunks of actions per second (dual rate), each from the newest attitude; default: 100,
     or 2 / play_s for slow policies."""
-    rate: Annotated[float | None, hidden("rates.single")] = None
+    rate: Annotated[float | None, hidden("rates.single"), Between(LEAST_HZ, 500, "Hz")] = None
     """Most chunks of actions per second (single rate), each from the newest image; default: 30, or
     2 / play_s for slow policies."""
-    stick_rate: Annotated[float, hidden("rates.stick")] = 100.0
+    stick_rate: Annotated[float, hidden("rates.stick"), Between(20, 400, "Hz")] = 100.0
     """Commands sent to the autopilot per second, independent of the policy's rate."""
     realtime: Annotated[bool, hidden("scheduling.realtime")] = True
     """Real-time scheduling (SCHED_FIFO) of the guard and of the policy, where the system permits
@@ -71,12 +73,10 @@ class Rates:
 
     def __post_init__(self) -> None:
         """Raise UserError for rates that no autopilot supports."""
+        super().__post_init__()
         low_hz, high_hz = self.visual_limits_hz
         check_range("rates.visual", low_hz, 0.5, high_hz, "Hz")
         check_range("rates.visual", high_hz, low_hz, 240, "Hz")
-        for name, rate_hz in (("rates.action", self.action_rate), ("rates.single", self.rate)):
-            check_range(name, rate_hz, LEAST_HZ, 500, "Hz")
-        check_range("rates.stick", self.stick_rate, 20, 400, "Hz")
 
     @property
     def visual_limits_hz(self) -> tuple[float, float]:

@@ -34,8 +34,6 @@ def test_where_to_fly() -> None:
     assert WorkersConfig().ray_address is None
     assert WorkersConfig(ray=True).ray_address == "auto"
     assert WorkersConfig(ray="head:6379").ray_address == "head:6379"
-    with pytest.raises(UserError, match="--workers must be between"):
-        WorkersConfig(workers=0)
 
 
 def test_a_bad_cluster_is_refused_before_ray_is_loaded(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -1,7 +1,6 @@
 import pytest
 
 from mavbridge.config.rates import Rates
-from mavbridge.core.errors import UserError
 
 
 @pytest.mark.parametrize(
@@ -28,17 +27,3 @@ def test_a_policy_that_plays_its_chunks_is_solved_twice_for_each(
 def test_a_slow_single_rate_policy_finds_an_image_that_has_just_come() -> None:
     assert Rates(rate=1.0).loops(is_dual=False).max_vision_hz == 30.0
     assert Rates(rate=100.0).loops(is_dual=False).max_vision_hz == 100.0
-
-
-@pytest.mark.parametrize(
-    ("flag", "value", "message"),
-    [
-        ("rate", 0.4, "rates.single must be between 0.5 and 500 Hz"),
-        ("action_rate", 501.0, "rates.action must be between 0.5 and 500 Hz"),
-        ("stick_rate", 19.0, "rates.stick must be between 20 and 400 Hz"),
-        ("stick_rate", 401.0, "rates.stick must be between 20 and 400 Hz"),
-    ],
-)
-def test_a_rate_out_of_range_is_refused_by_its_flag(flag: str, value: float, message: str) -> None:
-    with pytest.raises(UserError, match=message):
-        Rates(**{flag: value})
