@@ -10,7 +10,6 @@ import numpy as np
 
 from mavbridge.commands.inspect.moments import (
     Arrivals,
-    DelayEvent,
     Moment,
     find_delays,
     is_gap,
@@ -129,7 +128,7 @@ class FlightAnalysis:
     gates: tuple[CourseGate, ...]
     """Empty if the course is unknown."""
     holders: tuple[HolderSpan, ...]
-    delays: tuple[DelayEvent, ...]
+    delays: tuple[Moment, ...]
     """Missed slots and late chunks in the order of time, each with its cause."""
     moments: tuple[Moment, ...]
     """The ten worst, starting with the worst."""
@@ -148,7 +147,8 @@ class FlightAnalysis:
         """Number of late chunks and missed slots by cause, the most frequent first."""
         counts: dict[str, int] = {}
         for delay in self.delays:
-            counts[delay.cause] = counts.get(delay.cause, 0) + delay.count
+            if delay.cause is not None:
+                counts[delay.cause] = counts.get(delay.cause, 0) + delay.count
         return tuple(sorted(counts.items(), key=lambda item: -item[1]))
 
 

@@ -48,16 +48,24 @@ class Arrivals(NamedTuple):
 
 
 @dataclass(frozen=True)
-class DelayEvent:
-    """A late chunk, or consecutive missed slots."""
+class Moment:
+    """Moment worth a user's attention."""
 
-    at_ns: int
+    t_s: float
+    """Time since the first tick."""
     what: str
-    count: int
-    """Number of missed slots; 1 for a chunk."""
-    delay_ms: float
-    """Time beyond the period."""
-    cause: Cause
+    severity_ms: float
+    """Length of the delay, age or gap; sort key of the moments."""
+    detail: str
+    """Figures and cause, as a phrase."""
+    cause: Cause | None = None
+    """Of a late chunk or of consecutive missed slots."""
+    count: int = 1
+    """Number of missed slots; 1 for anything else."""
+
+
+def _delay(t_s: float, what: str, delay_ms: float, cause: Cause, count: int = 1) -> Moment:
+    return Moment(t_s, what, delay_ms, f"{delay_ms:.1f} ms late: {cause}", cause, count)
 
 
 class _Solve(NamedTuple):
@@ -76,17 +84,21 @@ def is_gap(last: Tick, tick: Tick) -> bool:
 
 def find_delays(
     ticks: Sequence[Tick], *, stick_hz: float, action_hz: float, arrivals: Arrivals | None = None
-) -> tuple[DelayEvent, ...]:
+) -> tuple[Moment, ...]:
     """Return missed slots and late chunks while the policy flew, in the order of time.
 
     Gaps in which the recorder lost ticks are left out.
     """
     slot_ns, chunk_ns = NS_PER_S / stick_hz, NS_PER_S / action_hz
     found = [*_missed_slots(ticks, slot_ns), *_late_chunks(ticks, chunk_ns, arrivals)]
-    return tuple(sorted(found, key=lambda delay: delay.at_ns))
+    return tuple(sorted(found, key=lambda delay: delay.t_s))
 
 
-def _missed_slots(ticks: Sequence[Tick], slot_ns: float) -> Iterator[DelayEvent]:
+def _t_s(ticks: Sequence[Tick], at_ns: int) -> float:
+    return (at_ns - ticks[0].woke_ns) / NS_PER_S
+
+
+def _missed_slots(ticks: Sequence[Tick], slot_ns: float) -> Iterator[Moment]:
     for last, tick in pairwise(ticks):
         is_flown = last.trace is not None and tick.trace is not None
         if is_flown and tick.missed_slots and not is_gap(last, tick):
@@ -95,12 +107,12 @@ def _missed_slots(ticks: Sequence[Tick], slot_ns: float) -> Iterator[DelayEvent]
             cause: Cause = "sending took long" if is_slow_send else "the guard woke late"
             count = tick.missed_slots
             what = f"{count} missed slot{'' if count == 1 else 's'}"
-            yield DelayEvent(tick.woke_ns, what, count, delay_ms, cause)
+            yield _delay(_t_s(ticks, tick.woke_ns), what, delay_ms, cause, count)
 
 
 def _late_chunks(
     ticks: Sequence[Tick], chunk_ns: float, arrivals: Arrivals | None
-) -> Iterator[DelayEvent]:
+) -> Iterator[Moment]:
     """Yield chunks that came more than ``LATE_PERIODS`` after the one before."""
     before: Tick | None = None
     last: _Solve | None = None
@@ -116,7 +128,7 @@ def _late_chunks(
             if period_ns > LATE_PERIODS * chunk_ns:
                 delay_ms = (period_ns - chunk_ns) / NS_PER_MS
                 cause = _cause(last, solve, chunk_ns, arrivals)
-                yield DelayEvent(tick.woke_ns, "late chunk", 1, delay_ms, cause)
+                yield _delay(_t_s(ticks, tick.woke_ns), "late chunk", delay_ms, cause)
             last = solve
 
 
@@ -172,28 +184,11 @@ def _arrival_ns(
     return int(arrivals.arrived_ns[number])
 
 
-@dataclass(frozen=True)
-class Moment:
-    """Moment worth a user's attention."""
-
-    t_s: float
-    """Time since the first tick."""
-    what: str
-    severity_ms: float
-    """Length of the delay, age or gap; sort key of the moments."""
-    detail: str
-    """Figures and cause, as a phrase."""
-
-
-_Found: TypeAlias = tuple[int, str, float, str]
-"""Time in ns, and the rest of a moment."""
-
-
 def worst_moments(
     flight: RecordedFlight,
     ticks: Sequence[Tick],
     frames: Sequence[FrameRow],
-    delays: Sequence[DelayEvent],
+    delays: Sequence[Moment],
     limits: FreshnessLimits | None = None,
 ) -> tuple[Moment, ...]:
     """Return the ``MOMENTS`` worst, at least ``APART_S`` apart, starting with the worst.
@@ -202,27 +197,14 @@ def worst_moments(
     """
     if not ticks:
         return ()
-    found = [
+    moments = [
         *_crash(flight, ticks),
         *_ends(ticks),
-        *(
-            (
-                delay.at_ns,
-                delay.what,
-                delay.delay_ms,
-                f"{delay.delay_ms:.1f} ms late: {delay.cause}",
-            )
-            for delay in delays
-        ),
+        *delays,
         *_coasting(ticks, limits),
         *_old_images(ticks),
         *_image_gaps(flight, frames, ticks),
-        *_rows_lost(flight),
-    ]
-    start_ns = ticks[0].woke_ns
-    moments = [
-        Moment((at_ns - start_ns) / NS_PER_S, what, severity_ms, detail)
-        for at_ns, what, severity_ms, detail in found
+        *_rows_lost(flight, ticks),
     ]
     groups: list[list[Moment]] = []
     for moment in sorted(moments, key=lambda moment: -moment.severity_ms):
@@ -238,7 +220,7 @@ def worst_moments(
     return tuple(told)
 
 
-def _crash(flight: RecordedFlight, ticks: Sequence[Tick]) -> Iterator[_Found]:
+def _crash(flight: RecordedFlight, ticks: Sequence[Tick]) -> Iterator[Moment]:
     """Yield the first crash in the ticks. The meta of a recording that was cut off cannot report
     one, so its ticks are searched, too."""
     if flight.meta.finished and flight.meta.crash is None:
@@ -247,18 +229,19 @@ def _crash(flight: RecordedFlight, ticks: Sequence[Tick]) -> Iterator[_Found]:
     for tick in ticks:
         watch.see(tick)
         if watch.reason is not None:
-            yield tick.woke_ns, "crash", CRASH_MS, watch.reason
+            yield Moment(_t_s(ticks, tick.woke_ns), "crash", CRASH_MS, watch.reason)
             return
 
 
-def _ends(ticks: Sequence[Tick]) -> Iterator[_Found]:
+def _ends(ticks: Sequence[Tick]) -> Iterator[Moment]:
     for last, tick in pairwise(ticks):
         reason = tick.release_reason
         is_asked = reason is not None and (reason.kind is Kind.END or reason.code is Code.OPERATOR)
         is_planned = is_asked or (tick.phase == "ended" and reason is None)
         if last.trace is not None and tick.trace is None and not is_planned:
             detail = f"{reason or 'no reason was recorded'}{_ages(last)}"
-            yield tick.woke_ns, "the policy's flight ended", END_MS, detail
+            at_s = _t_s(ticks, tick.woke_ns)
+            yield Moment(at_s, "the policy's flight ended", END_MS, detail)
 
 
 def _ages(tick: Tick) -> str:
@@ -272,7 +255,7 @@ def _ages(tick: Tick) -> str:
     return f"; its last sticks were by {' and '.join(parts)}" if parts else ""
 
 
-def _coasting(ticks: Sequence[Tick], limits: FreshnessLimits | None) -> Iterator[_Found]:
+def _coasting(ticks: Sequence[Tick], limits: FreshnessLimits | None) -> Iterator[Moment]:
     """Yield sends of an outdated chunk, up to the first send of a fresh one."""
     at = 0
     for is_coasting, group in groupby(ticks, lambda tick: tick.is_coasting and bool(tick.trace)):
@@ -282,7 +265,7 @@ def _coasting(ticks: Sequence[Tick], limits: FreshnessLimits | None) -> Iterator
         lasted_ms = (end_ns - run[0].woke_ns) / NS_PER_MS
         if is_coasting and lasted_ms >= LEAST_MS:
             detail = f"for {lasted_ms:.0f} ms along an old chunk: {_staleness(run[0], limits)}"
-            yield run[0].woke_ns, "coasting", lasted_ms, detail
+            yield Moment(_t_s(ticks, run[0].woke_ns), "coasting", lasted_ms, detail)
 
 
 def _staleness(tick: Tick, limits: FreshnessLimits | None) -> str:
@@ -303,7 +286,7 @@ def _staleness(tick: Tick, limits: FreshnessLimits | None) -> str:
     return "no newer one came in time"
 
 
-def _old_images(ticks: Sequence[Tick]) -> Iterator[_Found]:
+def _old_images(ticks: Sequence[Tick]) -> Iterator[Moment]:
     """Yield the oldest image of each stretch of sticks based on images twice as old as usual."""
     aged = [
         (tick.sent_ns - tick.feature_captured_ns, tick)
@@ -317,12 +300,13 @@ def _old_images(ticks: Sequence[Tick]) -> Iterator[_Found]:
         if is_old:
             age_ns, tick = max(group, key=lambda pair: pair[0])
             detail = f"sticks by an image of {age_ns / NS_PER_MS:.0f} ms ago"
-            yield tick.woke_ns, "old image", (age_ns - usual_ns) / NS_PER_MS, detail
+            older_ms = (age_ns - usual_ns) / NS_PER_MS
+            yield Moment(_t_s(ticks, tick.woke_ns), "old image", older_ms, detail)
 
 
 def _image_gaps(
     flight: RecordedFlight, frames: Sequence[FrameRow], ticks: Sequence[Tick]
-) -> Iterator[_Found]:
+) -> Iterator[Moment]:
     """Yield gaps between exposures from the first tick to the last, except the recorder's."""
     period_ms = 1000 / flight.meta.visual_hz
     for last, frame in pairwise(frames):
@@ -330,13 +314,15 @@ def _image_gaps(
         is_in_flight = ticks[0].woke_ns <= frame.captured_ns <= ticks[-1].woke_ns
         if gap_ms > IMAGE_PERIODS * period_ms and is_in_flight and not frame.dropped_before:
             detail = f"{gap_ms:.0f} ms without an exposure that was used"
-            yield frame.captured_ns, "gap between images", gap_ms - period_ms, detail
+            at_s = _t_s(ticks, frame.captured_ns)
+            yield Moment(at_s, "gap between images", gap_ms - period_ms, detail)
 
 
-def _rows_lost(flight: RecordedFlight) -> Iterator[_Found]:
+def _rows_lost(flight: RecordedFlight, ticks: Sequence[Tick]) -> Iterator[Moment]:
     dropped = flight.ticks.column("dropped_before").to_pylist()
     woke_ns = flight.ticks.column("woke_ns").to_pylist()
     for count, at_ns in zip(dropped, woke_ns, strict=True):
         if count:
             detail = f"{count} ticks before this are not in the recording: the recorder fell behind"
-            yield at_ns, "rows lost", 1000 * count / flight.meta.action_hz, detail
+            lost_ms = 1000 * count / flight.meta.action_hz
+            yield Moment(_t_s(ticks, at_ns), "rows lost", lost_ms, detail)

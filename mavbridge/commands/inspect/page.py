@@ -19,8 +19,6 @@ from mavbridge.core.errors import UserError
 from mavbridge.flight.outcome import describe
 from mavbridge.observe.viewer.layout import action_title
 
-MAX_POINTS = 20_000
-"""Points of a line: four times the pixels of a wide screen. Longer flights keep both extremes."""
 MAX_VIDEO_BYTES = 40_000_000
 """A larger video stays beside the page: larger data URLs make browsers slow."""
 BINS = 40
@@ -61,7 +59,7 @@ def _flight(flight: FlightAnalysis) -> dict[str, Any]:
         "outcome": _outcome(flight),
         "facts": list(_facts(flight)),
         "end_s": float(series.t_s[-1]) if len(series.t_s) else 0.0,
-        "t": _packed(_thinned_times(series.t_s)),
+        "t": _packed(series.t_s),
         "plots": [plot for plot in _plots(flight) if plot["series"]],
         "histograms": list(_histograms(series)),
         "holders": [asdict(span) | {"reason": str(span.reason or "")} for span in flight.holders],
@@ -168,39 +166,12 @@ def _plot(
         "series": [
             {
                 "name": name,
-                "values": _packed(_thinned(values)),
+                "values": _packed(values),
                 "width": ECHO_WIDTH if name == ECHO else LINE_WIDTH,
             }
             for name, values in known.items()
         ],
     }
-
-
-def _bin_size(count: int) -> int:
-    return -(-2 * count // MAX_POINTS) if count > MAX_POINTS else 1
-
-
-def _thinned_times(t_s: FloatColumn) -> FloatColumn:
-    """Return the times of ``_thinned`` values: two for each bin."""
-    size = _bin_size(len(t_s))
-    if size == 1:
-        return t_s
-    starts = np.arange(0, len(t_s), size)
-    middles = np.minimum(starts + size // 2, len(t_s) - 1)
-    kept: FloatColumn = t_s[np.stack((starts, middles), axis=1).ravel()]
-    return kept
-
-
-def _thinned(values: FloatColumn) -> FloatColumn:
-    """Return the minimum and maximum of each bin, so that no spike is lost."""
-    size = _bin_size(len(values))
-    if size == 1:
-        return values
-    padded = np.pad(values, (0, -len(values) % size), constant_values=np.nan).reshape(-1, size)
-    least = np.where(np.isnan(padded), np.inf, padded).min(axis=1)
-    most = np.where(np.isnan(padded), -np.inf, padded).max(axis=1)
-    pairs = np.stack((least, most), axis=1).ravel()
-    return np.where(np.isfinite(pairs), pairs, np.nan)
 
 
 def _packed(values: FloatColumn) -> str:
@@ -211,7 +182,6 @@ def _packed(values: FloatColumn) -> str:
 def _histograms(series: TickSeries) -> Iterator[dict[str, Any]]:
     for title, values_ms in (
         ("Stick lateness", series.lateness_ms),
-        ("Period of the slots", series.period_ms),
         ("Age of the feature", series.feature_age_ms),
         ("Age of the attitude", series.state_age_ms),
     ):
@@ -232,9 +202,8 @@ def _histograms(series: TickSeries) -> Iterator[dict[str, Any]]:
 def _track(flight: FlightAnalysis) -> dict[str, str] | None:
     if (track := flight.track) is None:
         return None
-    size = _bin_size(len(track.t_s))
     columns = dict(zip(("north", "east", "down"), track.position_ned_m.T, strict=True))
-    return {name: _packed(each[::size]) for name, each in ({"t": track.t_s} | columns).items()}
+    return {name: _packed(each) for name, each in ({"t": track.t_s} | columns).items()}
 
 
 def _video(flight: FlightAnalysis) -> dict[str, Any] | None:

@@ -2,7 +2,7 @@
 
 import heapq
 import json
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import closing
 from dataclasses import asdict
 from itertools import islice
@@ -23,7 +23,6 @@ from mavbridge.core.errors import UserError
 from mavbridge.core.files import require_writable
 from mavbridge.core.reasons import reason_to_json
 from mavbridge.core.records import Observed, Tick, VisionTick
-from mavbridge.core.vehicle import Percentiles
 from mavbridge.flight.action_frames import action_frame
 from mavbridge.flight.outcome import describe
 from mavbridge.observe.report_table import rate_style, shown_rate, timing_table, verdicts
@@ -51,7 +50,8 @@ class Figure(NamedTuple):
 
     name: str
     unit: str
-    value: Callable[[FlightAnalysis], float | None]
+    value: float | None
+    """None: not measured."""
     digits: int = 1
     more_is_better: bool | None = False
     """None: neither is better."""
@@ -164,15 +164,14 @@ def print_comparison(flights: Sequence[FlightAnalysis], console: Console) -> Non
     for (label, one), (_, other) in zip(_texts(first), _texts(second), strict=True):
         table.add_row(label, Text(one), Text(other), "" if one == other else "differs")
     table.add_section()
-    for figure in FIGURES:
-        one_value, other_value = figure.value(first), figure.value(second)
-        if one_value is None and other_value is None:
+    for one_figure, other_figure in zip(_figures(first), _figures(second), strict=True):
+        if one_figure.value is None and other_figure.value is None:
             continue
         table.add_row(
-            Text(f"{figure.name}{figure.unit and ' [' + figure.unit + ']'}"),
-            number(one_value, figure.digits),
-            number(other_value, figure.digits),
-            _difference(figure, one_value, other_value),
+            Text(f"{one_figure.name}{one_figure.unit and f' [{one_figure.unit}]'}"),
+            number(one_figure.value, one_figure.digits),
+            number(other_figure.value, one_figure.digits),
+            _difference(one_figure, other_figure.value),
         )
     console.print(table)
     for flight in flights:
@@ -189,7 +188,8 @@ def _texts(flight: FlightAnalysis) -> Iterator[tuple[str, str]]:
     yield "ended", end if meta.crash is None else "crashed"
 
 
-def _difference(figure: Figure, one: float | None, other: float | None) -> Text:
+def _difference(figure: Figure, other: float | None) -> Text:
+    one = figure.value
     if one is None or other is None:
         return Text("-")
     if one == other:
@@ -205,39 +205,32 @@ def _difference(figure: Figure, one: float | None, other: float | None) -> Text:
     return Text(f"{shown} worse", style="red")
 
 
-def _percentiles(
-    name: str, measured: Callable[[FlightAnalysis], Percentiles | None]
-) -> Iterator[Figure]:
-    for at in ("p50", "p99"):
-
-        def value(flight: FlightAnalysis, at: str = at) -> float | None:
-            found: float | None = getattr(measured(flight), at, None)
-            return found
-
-        yield Figure(f"{name}, {at}", "ms", value, 2)
-
-
-FIGURES = (
-    Figure("duration", "s", lambda f: f.report.duration_s, more_is_better=None),
-    Figure("flown by the policy", "s", lambda f: f.report.sticks.flying_s, more_is_better=None),
-    Figure("sticks", "1/s", lambda f: f.report.sticks.rate_hz, more_is_better=None),
-    Figure("chunks", "1/s", lambda f: f.report.action.rate_hz, more_is_better=True),
-    Figure("images", "1/s", lambda f: f.report.vision.rate_hz, more_is_better=True),
-    Figure("missed slots", "", lambda f: f.report.sticks.missed_slots, 0),
-    Figure("late chunks", "", lambda f: f.report.action.late_chunks, 0),
-    Figure("sends coasting", "", lambda f: f.report.sticks.coasting_sends, 0),
-    Figure("releases", "", lambda f: f.report.release_count, 0),
-    *_percentiles("stick lateness", lambda f: f.report.sticks.lateness_ms),
-    *_percentiles("chunk period", lambda f: f.report.action.period_ms),
-    *_percentiles("predict", lambda f: f.report.action.predict_ms),
-    *_percentiles("feature age at send", lambda f: f.report.feature_age_ms),
-    *_percentiles("attitude age at send", lambda f: f.report.state_age_ms),
-    *_percentiles("new attitude to wire", lambda f: f.report.state_to_wire_ms),
-    *_percentiles("exposure to feature", lambda f: f.images.latency_ms),
-    Figure("path", "m", lambda f: f.track.length_m if f.track else 0.0, more_is_better=None),
-    Figure("gates passed", "", lambda f: f.meta.gates_passed, 0, more_is_better=True),
-)
-"""Compared figures, in the order of the rows."""
+def _figures(flight: FlightAnalysis) -> Iterator[Figure]:
+    """Yield the compared figures, in the order of the rows; the same ones for every flight."""
+    report, sticks, action = flight.report, flight.report.sticks, flight.report.action
+    yield Figure("duration", "s", report.duration_s, more_is_better=None)
+    yield Figure("flown by the policy", "s", sticks.flying_s, more_is_better=None)
+    yield Figure("sticks", "1/s", sticks.rate_hz, more_is_better=None)
+    yield Figure("chunks", "1/s", action.rate_hz, more_is_better=True)
+    yield Figure("images", "1/s", report.vision.rate_hz, more_is_better=True)
+    yield Figure("missed slots", "", sticks.missed_slots, 0)
+    yield Figure("late chunks", "", action.late_chunks, 0)
+    yield Figure("sends coasting", "", sticks.coasting_sends, 0)
+    yield Figure("releases", "", report.release_count, 0)
+    for name, measured in (
+        ("stick lateness", sticks.lateness_ms),
+        ("chunk period", action.period_ms),
+        ("predict", action.predict_ms),
+        ("feature age at send", report.feature_age_ms),
+        ("attitude age at send", report.state_age_ms),
+        ("new attitude to wire", report.state_to_wire_ms),
+        ("exposure to feature", flight.images.latency_ms),
+    ):
+        yield Figure(f"{name}, p50", "ms", None if measured is None else measured.p50, 2)
+        yield Figure(f"{name}, p99", "ms", None if measured is None else measured.p99, 2)
+    path_m = flight.track.length_m if flight.track else 0.0
+    yield Figure("path", "m", path_m, more_is_better=None)
+    yield Figure("gates passed", "", flight.meta.gates_passed, 0, more_is_better=True)
 
 
 MAX_FLIGHTS = 2

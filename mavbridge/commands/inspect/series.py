@@ -45,8 +45,6 @@ class TickSeries:
     """[N] time from the arrival of the attitude to the send."""
     lateness_ms: FloatColumn
     """[N] time from the slot to its send."""
-    period_ms: FloatColumn
-    """[N] time from the send of the slot before, for consecutive slots."""
     velocity_ned_mps: FloatColumn
     """[N, 3]"""
     roll_pitch_yaw_deg: FloatColumn
@@ -84,7 +82,6 @@ def make_series(flight: RecordedFlight) -> TickSeries:
         feature_age_ms=flown_ms("sent_ns", "feature_captured_ns"),
         state_age_ms=flown_ms("sent_ns", "attitude_ns"),
         lateness_ms=np.maximum(flown_ms("sent_ns", "due_ns", is_slot), 0.0),
-        period_ms=_periods_ms(ticks, is_flown.to_numpy(), is_slot.to_numpy()),
         velocity_ned_mps=state[:, VELOCITY],
         roll_pitch_yaw_deg=np.degrees(np.stack(angles_rad, axis=-1)),
         rate_frd_dps=np.degrees(state[:, RATE]),
@@ -99,20 +96,6 @@ def _vectors(column: pa.ChunkedArray) -> FloatColumn:
         column.combine_chunks().flatten().to_numpy().reshape(-1, column.type.list_size)
     )
     return rows
-
-
-def _periods_ms(
-    ticks: pa.Table, is_flown: NDArray[np.bool_], is_slot: NDArray[np.bool_]
-) -> FloatColumn:
-    """Return times between the sends of consecutive flown slots without lost ticks."""
-    sent_ns, periods_ms = ticks["sent_ns"].to_numpy(), np.full(len(ticks), np.nan)
-    breaks = np.cumsum(~is_flown | (ticks["dropped_before"].to_numpy() > 0))
-    slots = np.flatnonzero(is_slot)
-    slots, before = slots[1:], slots[:-1]
-    is_whole = breaks[slots] == breaks[before]
-    slots, before = slots[is_whole], before[is_whole]
-    periods_ms[slots] = (sent_ns[slots] - sent_ns[before]) / NS_PER_MS
-    return periods_ms
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -125,9 +125,7 @@ def test_two_flights_side_by_side_mark_what_differs(tmp_path: Path) -> None:
 def test_a_flight_that_was_cut_off_is_shown_up_to_its_end(tmp_path: Path) -> None:
     folder = write(tmp_path / "flight", flight_with_a_stall()[:50], frames=0, finish=False)
     flight = analyse(folder)
-    assert not flight.meta.finished
     assert len(flight.series.t_s) == 50
-    assert flight.images.latency_ms is None
     assert "cut off" in shown(flight)
 
 
@@ -214,7 +212,6 @@ def test_what_the_recorder_has_lost_is_neither_jitter_nor_the_cameras(tmp_path: 
     flight = analyse(write(tmp_path / "flight", [*frames, *ticks], finish=False))
     assert flight.report.sticks.rate_hz == pytest.approx(100)
     assert flight.report.sticks.flying_s == pytest.approx(0.98)
-    assert np.nanmax(flight.series.period_ms) == pytest.approx(10)
     assert flight.report.vision.rate_hz == pytest.approx(30, abs=0.01)
     assert flight.report.vision.dropped_frames is None
     assert flight.report.observer_drops.recorder == 505

@@ -69,7 +69,7 @@ def test_a_late_chunk_is_put_down_to_the_stage_that_cost_most(
     ticks = [*flown(10), late(10, 9, **changes), *(make_tick(index) for index in range(11, 15))]
     (delay,) = find_delays(ticks, stick_hz=100, action_hz=100, arrivals=known)
     assert (delay.what, delay.cause) == ("late chunk", cause)
-    assert delay.delay_ms == pytest.approx(9)
+    assert delay.severity_ms == pytest.approx(9)
 
 
 def test_a_chunk_after_a_long_solve_is_late_by_that_solve() -> None:

@@ -12,9 +12,8 @@ import pytest
 
 from helpers.factories import make_released_tick, make_tick
 from helpers.recordings import make_frame, make_meta, write_recording
-from mavbridge.commands.inspect import page
 from mavbridge.commands.inspect.analysis import FlightAnalysis, analyse
-from mavbridge.commands.inspect.page import page_data, write_page
+from mavbridge.commands.inspect.page import write_page
 from mavbridge.core.course import CourseGate
 from mavbridge.core.reasons import Code, because
 from mavbridge.core.records import Position
@@ -80,21 +79,6 @@ def test_no_name_or_reason_leaves_its_place(tmp_path: Path) -> None:
     assert [span["reason"] for span in shown["holders"]] == ["", NASTY]
 
 
-def test_a_long_flight_is_thinned_and_keeps_every_spike(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(page, "MAX_POINTS", 10)
-    analysis = flight(tmp_path / "flight")
-    analysis.series.lateness_ms[17] = 99.0
-    (shown,) = json.loads(page_data([analysis]))
-    times = unpacked(shown["t"])
-    assert len(times) == 10
-    assert times == sorted(times)
-    (late,) = next(plot for plot in shown["plots"] if plot["title"] == "Lateness")["series"]
-    assert max(unpacked(late["values"])) == 99.0
-    assert len(unpacked(late["values"])) == len(times)
-
-
 @pytest.mark.skipif(CHROMIUM is None, reason="no Chromium is installed here")
 def test_a_browser_draws_it_to_the_end(tmp_path: Path) -> None:
     flights = [
@@ -109,5 +93,5 @@ def test_a_browser_draws_it_to_the_end(tmp_path: Path) -> None:
     assert 'data-drawn="2"' in ended.stdout  # set by the last line of the script
     assert "CONSOLE" not in ended.stderr
     assert "<title>mavbridge: one and two</title>" in ended.stdout
-    plots, bands, histograms, path = 10, 1, 4, 2
+    plots, bands, histograms, path = 10, 1, 3, 2
     assert ended.stdout.count("<canvas") == 2 * (plots + bands + histograms) + path
