@@ -2,64 +2,41 @@
 
 import os
 import platform
-import subprocess
-import sys
 import threading
 import time
 from collections.abc import Iterator
+from concurrent.futures import ProcessPoolExecutor
+from concurrent.futures.process import BrokenProcessPool
 from dataclasses import dataclass
 from functools import partial
+from multiprocessing import get_context
 from pathlib import Path
 
 from mavbridge.commands.check.rows import CheckRow
 from mavbridge.config.rates import Rates
 from mavbridge.core.clock import NS_PER_S, Clock
-from mavbridge.core.processes import child_environment
 from mavbridge.core.provenance import versions
-from mavbridge.core.realtime import usable_cores
+from mavbridge.core.realtime import settle_guard, settle_thread, usable_cores
 
 PROC, SYS = Path("/proc"), Path("/sys")
-_CLOCK_SOURCE = SYS / "devices/system/clocksource/clocksource0/current_clocksource"
-_SLOW_CLOCKS = ("hpet", "acpi_pm", "jiffies", "refined-jiffies", "pit")
-"""Clock sources read from a device, which takes a microsecond or more, or that only tick."""
 _CORES = 2
 """One core for the guard and one for the policy, so that neither delays the other."""
-_RIGHTS_TIMEOUT_S = 10.0
-_TRY_RIGHTS = """
-import sys
-from collections.abc import Iterator
-from functools import partial
-from mavbridge.core.realtime import settle_guard, settle_thread
-cpus = [int(word) if word else None for word in sys.argv[2:]]
-realtime = sys.argv[1] == "yes"
-refusals = [settle_guard(realtime=realtime, cpu=cpus[0])]
-refusals += [settle_thread(realtime=False, cpu=cpu) for cpu in cpus[1:]]
-print("; ".join(filter(None, refusals)))
-"""
-"""Requests the guard's rights in a separate process, so that this one is not affected."""
-_GOVERNOR = SYS / "devices/system/cpu/cpu0/cpufreq/scaling_governor"
+_GOVERNOR = "devices/system/cpu/cpu0/cpufreq/scaling_governor"
 _STEAL_FIELD = 8
 """Index of "steal" in the line "cpu": cpu user nice system idle iowait irq softirq steal."""
 _row = partial(CheckRow, "computer")
 
 
 def computer_rows(rates: Rates) -> Iterator[CheckRow]:
-    """Yield rows about clock source, cores, real-time scheduling and locked memory."""
-    source = _text(_CLOCK_SOURCE)  # no such file on macOS, or in some containers
-    slow = (
-        f"the clock source {source} is slow to read or coarse: stamps are late by its time; see "
-        "current_clocksource in the kernel's documentation"
-    )
-    yield _row(
-        "clock",
-        source or f"not told by {platform.system()}",
-        "one that the processor reads by itself, such as tsc",
-        slow if source in _SLOW_CLOCKS else "",
-    )
+    """Yield rows about cores, real-time scheduling and locked memory."""
     cores = usable_cores()
     shared = "guard and policy share one core: a slow policy delays the sticks"
     yield _row("cores", str(cores), f"{_CORES} or more", "" if cores >= _CORES else shared)
-    refused = _refused_rights(rates)
+    try:  # in a process of its own, so that this one is not affected
+        with ProcessPoolExecutor(1, get_context("spawn")) as pool:
+            refused = pool.submit(_refused_rights, rates).result()
+    except (OSError, BrokenProcessPool) as error:
+        refused = f"the rights of the guard could not be tried: {error}"
     yield _row(
         "rights of the guard",
         "refused in part" if refused else "granted",
@@ -69,22 +46,11 @@ def computer_rows(rates: Rates) -> Iterator[CheckRow]:
 
 
 def _refused_rights(rates: Rates) -> str:
-    """Return the rights that this system refuses to the guard; empty if all are granted."""
-    words = ["yes" if rates.realtime else "no"]
-    cpus = (rates.guard_cpu, rates.action_cpu, rates.vision_cpu)
-    words += ["" if cpu is None else str(cpu) for cpu in cpus]
-    try:
-        tried = subprocess.run(
-            [sys.executable, "-c", _TRY_RIGHTS, *words],
-            env=child_environment(),
-            capture_output=True,
-            text=True,
-            timeout=_RIGHTS_TIMEOUT_S,
-            check=True,
-        )
-    except (OSError, subprocess.SubprocessError) as error:
-        return f"the rights of the guard could not be tried: {error}"
-    return tried.stdout.strip()
+    """Request the guard's rights; return those that this system refuses, empty if none."""
+    refusals = [settle_guard(realtime=rates.realtime, cpu=rates.guard_cpu)]
+    cpus = (rates.action_cpu, rates.vision_cpu)
+    refusals += [settle_thread(realtime=False, cpu=cpu) for cpu in cpus]
+    return "; ".join(filter(None, refusals))
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -115,7 +81,7 @@ def this_computer() -> Computer:
         machine=platform.machine(),
         cores=usable_cores(),
         kernel=platform.release(),
-        governor=_text(_GOVERNOR),
+        governor=_text(SYS / _GOVERNOR),
         versions=versions(),
     )
 
@@ -132,33 +98,29 @@ class Usage:
     """Processor times up to a moment [ns], each since an arbitrary start; 0: not told."""
 
     at_ns: int
-    flight_ns: int
-    """Time in which this process ran."""
-    guard_ns: int
+    used_ns: dict[str, int]
+    """Time in which "flight" (this process), "guard", and, as "flight/NAME", each thread of this
+    process ran; "flight/others" are threads of libraries."""
     guard_waited_ns: int
     """Time in which the guard was runnable but not on a processor."""
     host_ns: int
     """Time in which the hypervisor gave this machine's processors to others."""
-    threads_ns: dict[str, int]
-    """Time of each thread of this process by its name; "others" are those of libraries."""
 
 
 def read_usage(clock: Clock, guard_pid: int) -> Usage:
     """Read the counters of the kernel (proc_stat(5), sched-stats.rst)."""
     guard_ns, waited_ns = _scheduled_ns(PROC / str(guard_pid))
     names = {thread.native_id: thread.name for thread in threading.enumerate()}
-    threads_ns: dict[str, int] = {}
+    used_ns = {"flight": time.process_time_ns(), "guard": guard_ns}
     for task in (PROC / "self/task").glob("*"):
-        name = names.get(int(task.name), "others")
-        threads_ns[name] = threads_ns.get(name, 0) + _scheduled_ns(task)[0]
+        name = f"flight/{names.get(int(task.name), 'others')}"
+        used_ns[name] = used_ns.get(name, 0) + _scheduled_ns(task)[0]
     steal = _text(PROC / "stat").partition("\n")[0].split()[_STEAL_FIELD:][:1] or ["0"]
     return Usage(
         at_ns=clock.now_ns(),
-        flight_ns=time.process_time_ns(),
-        guard_ns=guard_ns,
+        used_ns=used_ns,
         guard_waited_ns=waited_ns,
         host_ns=int(steal[0]) * NS_PER_S // os.sysconf("SC_CLK_TCK"),
-        threads_ns=threads_ns,
     )
 
 

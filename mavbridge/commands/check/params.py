@@ -9,7 +9,7 @@ from mavbridge.config.flight import FlyConfig
 from mavbridge.core.address import serial_baud
 from mavbridge.core.link_settings import LinkSettings
 from mavbridge.core.reasons import Code, because
-from mavbridge.core.vehicle import ActionKind, Sticks
+from mavbridge.core.vehicle import ActionKind
 from mavbridge.flight.plan import FlightPlan
 from mavbridge.mavlink.profiles.profile import (
     Danger,
@@ -115,7 +115,7 @@ class Terms:
 
 
 def param_rows(terms: Terms) -> Iterator[CheckRow]:
-    """Yield every relevant parameter, then the calibration, then the motion at full stick."""
+    """Yield every relevant parameter, then the motion at full stick."""
     refusals, warnings = terms.refusals(), terms.warnings()
     told: list[ParamNote] = []
     for name, should_be in terms.profile.wanted_params(terms.values, terms.context):
@@ -140,7 +140,6 @@ def param_rows(terms: Terms) -> Iterator[CheckRow]:
                 no_go=note.text if note in refusals else "",
                 commands=cures([note]),
             )
-    yield from _calibration_rows(terms)
     yield from _curve_rows(terms)
     if terms.contract is not None and terms.contract.action in ("rates", "attitude"):
         hover = terms.profile.hover_thrust(terms.values)
@@ -164,18 +163,6 @@ def _found(terms: Terms, name: str) -> str:
     if read == flown:
         return f"{flown:g}"
     return f"{_NOT_SENT if read is None else f'{read:g}'}; --set makes it {flown:g}"
-
-
-def _calibration_rows(terms: Terms) -> Iterator[CheckRow]:
-    """Yield the four override channels; an unusable calibration is already a note."""
-    calibration = terms.assessment.calibration
-    if terms.context.output != "rc-override" or calibration is None:
-        return
-    for stick, channel in zip(Sticks._fields, calibration.channels, strict=True):
-        turned = ", reversed" if channel.is_reversed else ""
-        ends = f"{channel.min_us}, {channel.trim_us}, {channel.max_us} us"
-        found = f"{ends}, dead zone {channel.dead_zone_us}{turned}"
-        yield _row(f"RC{channel.number} {stick}", found, "a calibrated radio")
 
 
 def _curve_rows(terms: Terms) -> Iterator[CheckRow]:

@@ -29,7 +29,7 @@ from mavbridge.core.reasons import Kind, Reason
 from mavbridge.core.records import Event, Tick
 from mavbridge.flight.app import fly_policy
 from mavbridge.flight.guard_process import start_guard
-from mavbridge.flight.plan import plan_flight
+from mavbridge.flight.plan import FlightPlan, plan_flight
 from mavbridge.flight.policies import load_configured_policy
 from mavbridge.observe.output import flight_console
 from mavbridge.observe.timing import FlightTiming, ObserverDrops, TimingReport, report_document
@@ -99,19 +99,16 @@ class FlightMeter:
     """
 
     def __init__(
-        self,
-        clock: Clock,
-        guard_pid: int,
-        runner: PolicyRunner,
-        *,
-        stick_hz: float,
-        action_hz: float,
-        vision_hz: float,
+        self, plan: FlightPlan, runner: PolicyRunner, *, clock: Clock, guard_pid: int
     ) -> None:
+        self._runner = runner
         self._clock = clock
         self._guard_pid = guard_pid
-        self._runner = runner
-        self._timing = FlightTiming(stick_hz=stick_hz, action_hz=action_hz, vision_hz=vision_hz)
+        self._timing = FlightTiming(
+            stick_hz=plan.config.rates.stick_rate,
+            action_hz=plan.loops.action_hz,
+            vision_hz=plan.loops.max_vision_hz,
+        )
         self._first: Usage | None = None
         self._last: Usage | None = None
         self._hottest_c: float | None = None
@@ -133,9 +130,8 @@ class FlightMeter:
             return
         self._last = read_usage(self._clock, self._guard_pid)
         self._first = self._first or self._last
-        heat_c = hottest_c()
-        if heat_c is not None:
-            self._hottest_c = heat_c if self._hottest_c is None else max(self._hottest_c, heat_c)
+        heats_c = [heat_c for heat_c in (self._hottest_c, hottest_c()) if heat_c is not None]
+        self._hottest_c = max(heats_c, default=None)
 
     def report(self) -> TimingReport:
         """Return the figures of the flight so far, without those of its link."""
@@ -157,13 +153,8 @@ class FlightMeter:
         first, last = self._first, self._last
         if first is None or last is None:
             raise PeerError("the policy never had the sticks of the bundled vehicle")
-        spent_ns = {
-            "flight": last.flight_ns - first.flight_ns,
-            "guard": last.guard_ns - first.guard_ns,
-        }
-        for name, used_ns in last.threads_ns.items():
-            spent_ns[f"flight/{name}"] = used_ns - first.threads_ns.get(name, 0)
         elapsed_ns = max(last.at_ns - first.at_ns, 1)
+        spent_ns = {name: used - first.used_ns.get(name, 0) for name, used in last.used_ns.items()}
         return Soak(
             computer=this_computer(),
             timing=self.report(),
@@ -233,14 +224,7 @@ def fly_and_measure(config: FlyConfig, runner: PolicyRunner, clock: Clock) -> Fl
     plan = plan_flight(config, runner.contract, is_dual=runner.dual_rate)
     with ExitStack() as stack:
         guard = start_guard(config, clock, stack)
-        meter = FlightMeter(
-            clock,
-            guard.process.pid,
-            runner,
-            stick_hz=config.rates.stick_rate,
-            action_hz=plan.loops.action_hz,
-            vision_hz=plan.loops.max_vision_hz,
-        )
+        meter = FlightMeter(plan, runner, clock=clock, guard_pid=guard.process.pid)
         fly_policy(plan, runner, clock=clock, console=flight_console(), sinks=(meter,), guard=guard)
     if meter.release_reason is not None:
         raise PeerError(f"the policy lost the sticks: {meter.release_reason}")

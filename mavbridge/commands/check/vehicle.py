@@ -213,16 +213,6 @@ def _link_rows(
     for group in terms.streams:
         if not group.is_optional:
             yield _rate_row(group, rates_hz, terms.plan)
-    watched = [
-        each.messages[0] for each in terms.streams if each.is_optional and each.least_hz != 0.0
-    ]
-    silent = [name for name in watched if name not in rates_hz]
-    yield _link_row(
-        "also watched",
-        f"{len(watched) - len(silent)} of {len(watched)} messages",
-        ", ".join(watched),
-        warn=f"not sent: {', '.join(silent)}; the flight does without" if silent else "",
-    )
     lost = stats.lost_fraction or 0.0
     bad = f", {stats.unusable_packets} unusable" if stats.unusable_packets else ""
     advice = (

@@ -10,7 +10,6 @@ import pytest
 from rich.console import Console
 
 from helpers.fakes import FakeClock
-from mavbridge import cli
 from mavbridge.commands.check.policy import Pace, check_policy
 from mavbridge.commands.check.rows import CheckRow, as_document, overall, print_check
 from mavbridge.commands.check.run import check
@@ -18,7 +17,7 @@ from mavbridge.commands.config import CheckConfig
 from mavbridge.config.flight import CameraConfig, FlyConfig, LinkConfig
 from mavbridge.config.policy import PolicyConfig
 from mavbridge.core.clock import NS_PER_MS, MonotonicClock
-from mavbridge.core.errors import ExitCode, UserError
+from mavbridge.core.errors import ExitCode
 from mavbridge.core.processes import free_port
 
 BLIND = CameraConfig(camera=("none",))
@@ -49,11 +48,6 @@ def test_no_vehicle_is_a_no_go_in_status_table_and_json(
     assert document["verdict"] == "no-go"
     assert [row["name"] for row in document["rows"] if row["verdict"] == "no-go"] == ["vehicle"]
     assert "NO-GO: " in capsys.readouterr().out
-
-
-def test_the_vehicle_must_be_named() -> None:
-    with pytest.raises(UserError, match="--connect"):
-        cli.check()
 
 
 def test_a_net_without_its_camera_is_a_no_go(capsys: pytest.CaptureFixture[str]) -> None:

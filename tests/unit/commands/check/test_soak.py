@@ -26,6 +26,7 @@ from mavbridge.config.policy import PolicyConfig
 from mavbridge.core.clock import NS_PER_MS
 from mavbridge.core.errors import PeerError, UserError
 from mavbridge.core.reasons import Code, because
+from mavbridge.flight.plan import plan_flight
 from policy.contract import Contract
 from policy.protocol import PolicyRunner
 
@@ -49,7 +50,8 @@ def make_runner(calls: list[int], contract: Contract = RATES) -> PolicyRunner:
 
 def make_meter(clock: FakeClock) -> FlightMeter:
     runner = make_runner([])
-    return FlightMeter(clock, os.getpid(), runner, stick_hz=100, action_hz=100, vision_hz=30)
+    plan = plan_flight(FlyConfig(), Contract(), is_dual=True)
+    return FlightMeter(plan, runner, clock=clock, guard_pid=os.getpid())
 
 
 def test_a_level_climb_does_the_work_and_returns_other_sticks() -> None:
@@ -132,7 +134,7 @@ def test_figures_of_the_computer_are_the_kernels(
     monkeypatch.setattr(computer, "SYS", tmp_path)
     monkeypatch.setattr(computer.os, "sysconf", lambda _: 100)
     unknown = read_usage(FakeClock(), 7)
-    assert (unknown.guard_ns, unknown.guard_waited_ns, unknown.host_ns) == (0, 0, 0)
+    assert (unknown.used_ns["guard"], unknown.guard_waited_ns, unknown.host_ns) == (0, 0, 0)
     assert (hottest_c(), this_computer().model) == (None, "")
     files = {
         "7/schedstat": "5000000 3000000 12\n",
@@ -148,7 +150,7 @@ def test_figures_of_the_computer_are_the_kernels(
         path.parent.mkdir(parents=True, exist_ok=True)
         path.write_text(text)
     known = read_usage(FakeClock(), 7)
-    assert (known.guard_ns, known.guard_waited_ns) == (5 * NS_PER_MS, 3 * NS_PER_MS)
+    assert (known.used_ns["guard"], known.guard_waited_ns) == (5 * NS_PER_MS, 3 * NS_PER_MS)
     assert known.host_ns == 40 * NS_PER_MS
     here = this_computer()
     assert (here.model, here.cpu, hottest_c()) == ("Raspberry Pi 5", "Some CPU", 61.0)
