@@ -6,7 +6,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
 from shutil import disk_usage
-from typing import Literal, NamedTuple, TypeAlias
+from typing import Literal, TypeAlias
 
 from mavbridge.core.clock import NS_PER_MS, NS_PER_S, Clock
 from mavbridge.core.errors import UserError
@@ -30,33 +30,8 @@ Mark: TypeAlias = Literal["good", "bad"]
 _MARKS: dict[str, Mark] = {GOOD_KEY: "good", BAD_KEY: "bad"}
 
 
-class Seen(NamedTuple):
-    """Inputs of the episode control at one time."""
-
-    now_ns: int
-    armed: bool
-    switch_us: int
-    """Pulse width of the switch's channel; 0: no reading."""
-    is_recording: bool
-    keys: str = ""
-    """Keys typed since the last step, in order."""
-
-
-@dataclass(slots=True, kw_only=True)
-class Orders:
-    """Actions for the recorder, in the order of execution."""
-
-    mark_before: Mark | None = None
-    """Mark for the current episode, or else for the last one."""
-    end: str | None = None
-    """End the current episode for this reason."""
-    begin: str | None = None
-    """Begin an episode for this reason."""
-    quit: bool = False
-
-
 class EpisodeControl:
-    """Decides when episodes begin and end. Call ``step`` about twenty times a second."""
+    """Decides when an episode is wanted. Call ``step`` about twenty times a second."""
 
     def __init__(self, *, has_switch: bool, on_arm: bool) -> None:
         self._has_switch = has_switch
@@ -68,97 +43,71 @@ class EpisodeControl:
         """Time at which the switch moved from high to the middle."""
         self._was_armed = False
         self._disarmed_ns: int | None = None
-        self._wanted: str | None = None
-        """Why the switch or the arming asks for an episode that could not begin yet."""
+        self.wanted: str | None = None
+        """What asks for an episode, as long as it does; an obstacle can still disappear. Set to
+        None when an episode has ended by itself: only another act then begins one."""
+        self.ended_by = ""
+        """What last asked for an end."""
 
-    def step(self, seen: Seen) -> Orders:
-        """Advance to this time; return the resulting orders."""
-        orders = Orders()
-        if self._has_switch:
-            self._by_switch(seen, orders)
+    def step(self, now_ns: int, *, armed: bool, switch_us: int = 0, keys: str = "") -> Mark | None:
+        """Advance to this time; return a mark for the current episode, or else for the last one.
+
+        ``switch_us`` is the pulse width of the switch's channel, 0 without a reading; ``keys`` were
+        typed since the last step, in order.
+        """
+        mark = self._by_switch(now_ns, switch_us) if self._has_switch else None
         if self._on_arm:
-            self._by_arming(seen, orders)
-        # Repeat the request while switch or arming asks: the obstacle can still disappear.
-        is_on = self._position == "high" if self._has_switch else seen.armed
-        if orders.begin is not None:
-            self._wanted = orders.begin
-        elif seen.is_recording or not is_on:
-            self._wanted = None
-        orders.begin = self._wanted
-        self._by_keys(seen, orders)
-        return orders
+            self._by_arming(now_ns, armed)
+        for key in keys:
+            mark = _MARKS.get(key, mark)
+            if key in (TOGGLE_KEY, " "):
+                self._want(self.wanted is None, "a key")
+        return mark
 
-    def _by_keys(self, seen: Seen, orders: Orders) -> None:
-        for key in seen.keys:
-            orders.mark_before = _MARKS.get(key, orders.mark_before)
-        orders.quit = QUIT_KEY in seen.keys
-        is_toggled = sum(seen.keys.count(key) for key in (TOGGLE_KEY, " ")) % 2 == 1
-        if seen.is_recording and (is_toggled or orders.quit):
-            orders.end = "a key"
-        elif is_toggled and not orders.quit:
-            orders.begin = "a key"
+    def _want(self, is_wanted: bool, by: str) -> None:
+        if is_wanted:
+            self.wanted = self.wanted or by
+        else:
+            self.wanted, self.ended_by = None, by
 
-    def _by_switch(self, seen: Seen, orders: Orders) -> None:
-        is_act = self._switch.read(seen.switch_us, seen.now_ns)
+    def _by_switch(self, now_ns: int, switch_us: int) -> Mark | None:
+        is_act = self._switch.read(switch_us, now_ns)
         before, now = self._position, self._switch.position or self._position
         self._position = now
         if now == "high":
             self._middle_since_ns = None
-            orders.begin = "the switch" if is_act else None
+            if is_act:
+                self._want(True, "the switch")
         elif before == "high":
-            self._middle_since_ns = seen.now_ns if now == "middle" else None
-            orders.end = "the switch" if seen.is_recording else None
+            self._middle_since_ns = now_ns if now == "middle" else None
+            self._want(False, "the switch")
         elif now == "low":
             self._middle_since_ns = None
-        elif self._middle_since_ns and seen.now_ns - self._middle_since_ns >= MIDDLE_NS:
+        elif self._middle_since_ns and now_ns - self._middle_since_ns >= MIDDLE_NS:
             self._middle_since_ns = None
-            orders.mark_before = "bad"
+            return "bad"
+        return None
 
-    def _by_arming(self, seen: Seen, orders: Orders) -> None:
-        was_armed, self._was_armed = self._was_armed, seen.armed
-        if seen.armed:
+    def _by_arming(self, now_ns: int, armed: bool) -> None:
+        was_armed, self._was_armed = self._was_armed, armed
+        if armed:
             self._disarmed_ns = None
-            orders.begin = None if was_armed or seen.is_recording else "armed"
-            return
-        if was_armed:
-            self._disarmed_ns = seen.now_ns
-        if self._disarmed_ns and seen.now_ns - self._disarmed_ns >= AFTER_DISARM_NS:
+            if not was_armed:
+                self._want(True, "armed")
+        elif was_armed:
+            self._disarmed_ns = now_ns
+        elif self._disarmed_ns and now_ns - self._disarmed_ns >= AFTER_DISARM_NS:
             self._disarmed_ns = None
-            orders.end = "disarmed" if seen.is_recording else None
+            self._want(False, "disarmed")
 
 
-FIRST_BYTES_PS = 600_000.0
-"""Assumed before a measurement: twice the rate of 224 x 224 at 30 Hz and 100 rows a second."""
-LEAST_S = 60.0
-"""Recording time for which the disk must have room when an episode begins [s]."""
-MEASURED_NS = 5 * NS_PER_S
-"""Shortest episode from which the bytes per second are measured."""
+LEAST_GB = 0.1
+"""Room on the disk above --disk-reserve without which no episode begins: minutes of 224 x 224."""
 
 
-class DiskWatch:
-    """Room on the disk, in recording time at the data rate of the newest episode."""
-
-    def __init__(self, folder: Path, *, reserve_bytes: float) -> None:
-        self._folder = folder
-        self._reserve_bytes = reserve_bytes
-        self._bytes_ps = FIRST_BYTES_PS
-
-    def measure(self, episode: Path, duration_ns: int) -> None:
-        """Measure the data rate of an episode if it is long enough; raise OSError if unreadable."""
-        if duration_ns >= MEASURED_NS:
-            size = sum(entry.stat().st_size for entry in episode.iterdir())
-            self._bytes_ps = max(1.0, size * NS_PER_S / duration_ns)
-
-    def left_s(self) -> float:
-        """Return the recording time until only the reserve is left; raise OSError if unknown."""
-        free_bytes = disk_usage(self._folder).free
-        return max(0.0, (free_bytes - self._reserve_bytes) / self._bytes_ps)
-
-    def missing(self) -> str | None:
-        """Return the room that another episode lacks, or None; raise OSError if unknown."""
-        if (left_s := self.left_s()) >= LEAST_S:
-            return None
-        return f"room on the disk for {left_s:.0f} of {LEAST_S:.0f} s above --disk-reserve"
+def disk_left_gb(folder: Path, reserve_gb: float) -> float:
+    """Return the room on the disk above the reserve; raise OSError if unknown."""
+    return max(0.0, disk_usage(folder).free / 1e9 - reserve_gb)
 
 
 PREFIX = "episode-"

@@ -1,4 +1,4 @@
-"""One recording session: opens everything, follows the orders of ``EpisodeControl``, and closes."""
+"""One recording session: opens everything, records what ``EpisodeControl`` wants, and closes."""
 
 import threading
 from collections import deque
@@ -18,11 +18,11 @@ from mavbridge.commands.config import RecordConfig
 from mavbridge.commands.record.episodes import (
     KEYS,
     KEYS_HINT,
-    DiskWatch,
+    LEAST_GB,
+    QUIT_KEY,
     EpisodeControl,
     Episodes,
-    Orders,
-    Seen,
+    disk_left_gb,
     prepare_out,
 )
 from mavbridge.commands.record.view import CONTRACT, STICKS_FRESH_NS, PilotView, RecordScreen, Shown
@@ -114,8 +114,7 @@ class _Session:
         self._control = EpisodeControl(
             has_switch=config.episode_channel is not None, on_arm=config.on_arm
         )
-        self._disk = DiskWatch(config.out, reserve_bytes=config.disk_reserve * 1e9)
-        self._disk_s, self._disk_due_ns = 0.0, 0
+        self._disk_gb, self._disk_due_ns = 0.0, 0
         self._told_missing: str | None = None
         """Why the last request for an episode was refused."""
         self._screen = RecordScreen(console, rate_hz=config.rate, vision_hz=config.film.visual_rate)
@@ -237,45 +236,49 @@ class _Session:
 
     def _step(self) -> bool:
         """Update the episodes and the status line; return False when the session is over."""
-        orders = self._control.step(self._seen())
-        if orders.mark_before is not None:
-            self._episodes.mark(orders.mark_before)
-        self._follow(orders)
         self._look_at_disk()
+        keys = "".join(self._keys.popleft() for _ in range(len(self._keys)))
+        status, channel = self._view.status, self._config.episode_channel
+        has_channel = channel is not None and len(status.rc_channels_us) >= channel
+        mark = self._control.step(
+            self._clock.now_ns(),
+            armed=status.armed,
+            switch_us=status.rc_channels_us[channel - 1] if channel and has_channel else 0,
+            keys=keys,
+        )
+        if mark is not None:
+            self._episodes.mark(mark)
+        if QUIT_KEY in keys:
+            self._episodes.end("a key")
+            return False
+        self._follow()
         config, episode, counts = self._config, self._episodes.current, self._episodes.counts
         self._screen.shown = Shown(
             number=self._episodes.number,
             duration_ns=None if episode is None else self._clock.now_ns() - episode.begin_ns,
             counts=counts,
-            disk_s=self._disk_s,
+            disk_gb=self._disk_gb,
             stick_packets=self._view.stick_packets,
             sticks_ns=self._view.sticks_ns,
             problem=self._missing() or self._doubt(),
         )
-        is_enough = config.episodes is not None and counts.total() >= config.episodes
-        return not (orders.quit or is_enough)
+        return config.episodes is None or counts.total() < config.episodes
 
-    def _seen(self) -> Seen:
-        keys = "".join(self._keys.popleft() for _ in range(len(self._keys)))
-        status, channel = self._view.status, self._config.episode_channel
-        has_channel = channel is not None and len(status.rc_channels_us) >= channel
-        return Seen(
-            now_ns=self._clock.now_ns(),
-            armed=status.armed,
-            switch_us=status.rc_channels_us[channel - 1] if channel and has_channel else 0,
-            is_recording=self._episodes.current is not None,
-            keys=keys,
-        )
-
-    def _follow(self, orders: Orders) -> None:
-        if orders.end is not None:
-            self._episodes.end(orders.end)
-        elif (episode := self._episodes.current) and (crash := episode.recorder.crash) is not None:
+    def _follow(self) -> None:
+        """Begin or end an episode as the control wants it."""
+        control, episode = self._control, self._episodes.current
+        if episode is not None and (crash := episode.recorder.crash) is not None:
+            control.wanted = None
             self._episodes.end(f"a crash ({crash})")
-        if orders.begin is None:
+        elif episode is not None and control.wanted is None:
+            self._episodes.end(control.ended_by)
+        if control.wanted is None:
             self._told_missing = None
+        if control.wanted is None or self._episodes.current is not None:
             return
-        missing = self._missing() or self._disk.missing()
+        missing = self._missing()
+        if missing is None and self._disk_gb < LEAST_GB:
+            missing = f"room on the disk for {LEAST_GB:g} GB above --disk-reserve"
         told, self._told_missing = self._told_missing, missing
         if missing is not None:
             if missing != told:
@@ -283,7 +286,7 @@ class _Session:
             return
         self._episodes.begin()
         doubt = self._doubt()
-        begun = f"episode {self._episodes.number} begins ({orders.begin})"
+        begun = f"episode {self._episodes.number} begins ({control.wanted})"
         self._screen.show_message(begun if doubt is None else f"{begun}; {doubt}")
 
     def _missing(self) -> str | None:
@@ -314,8 +317,7 @@ class _Session:
         if now_ns < self._disk_due_ns:
             return
         self._disk_due_ns = now_ns + DISK_NS
-        if (episode := self._episodes.current) is not None:
-            self._disk.measure(episode.folder, now_ns - episode.begin_ns)
-        self._disk_s = self._disk.left_s()
-        if self._disk_s == 0.0:
+        self._disk_gb = disk_left_gb(self._config.out, self._config.disk_reserve)
+        if self._disk_gb == 0.0:
+            self._control.wanted = None
             self._episodes.end("the disk, which is full up to --disk-reserve")

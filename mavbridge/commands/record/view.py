@@ -82,7 +82,7 @@ class PilotView(TelemetryCache):
         self._pilot_sink.emit(event)
 
 
-LOW_MINUTES = 10.0
+LOW_GB = 1.0
 """Room on the disk below which it is shown as a warning."""
 
 
@@ -95,7 +95,8 @@ class Shown:
     """Length of the current episode; None while none is recorded."""
     counts: Counter[bool | None]
     """Number of good, bad and unmarked episodes."""
-    disk_s: float
+    disk_gb: float
+    """Room on the disk above --disk-reserve."""
     stick_packets: int
     sticks_ns: int
     """Number of packets with the pilot's sticks so far, and the arrival of the newest."""
@@ -151,8 +152,8 @@ class RecordScreen(FlightScreen):
             line.append(f"  {name} ")
             style = "" if wanted_hz is None else rate_style(hz, wanted_hz)
             line.append(f"{shown_rate(hz)} Hz", style=style)
-        minutes = shown.disk_s / 60
-        line.append(f"  disk {minutes:.0f} min", style="yellow" if minutes < LOW_MINUTES else "")
+        style = "yellow" if shown.disk_gb < LOW_GB else ""
+        line.append(f"  disk {shown.disk_gb:.1f} GB", style=style)
         counts = shown.counts
         line.append(f"  {counts[True]} good {counts[False]} bad {counts[None]} unmarked")
         if shown.problem is not None:

@@ -1,6 +1,6 @@
 import pytest
 
-from mavbridge.commands.record.episodes import EpisodeControl, Orders, Seen
+from mavbridge.commands.record.episodes import EpisodeControl
 from mavbridge.core.clock import NS_PER_MS
 
 STEP_NS = 50 * NS_PER_MS
@@ -8,40 +8,33 @@ LOW, MIDDLE, HIGH = 1000, 1500, 2000
 
 
 class Session:
-    """Follows the orders, as a recording session does."""
+    """Records what is wanted, as a recording session does."""
 
     def __init__(self, *, has_switch: bool = False, on_arm: bool = False) -> None:
         self.control = EpisodeControl(has_switch=has_switch, on_arm=on_arm)
         self.now_ns = 0
         self.is_recording = False
         self.may_begin = True
-        self.done: list[str] = []
 
     def step(
         self, *, keys: str = "", switch_us: int = 0, armed: bool = False, times: int = 1
     ) -> list[str]:
         """What was done in these steps."""
-        self.done = []
+        done: list[str] = []
         for _ in range(times):
             self.now_ns += STEP_NS
-            seen = Seen(self.now_ns, armed, switch_us, self.is_recording, keys)
-            self._follow(self.control.step(seen))
-            keys = ""
-        return self.done
+            mark = self.control.step(self.now_ns, armed=armed, switch_us=switch_us, keys=keys)
+            keys, wanted = "", self.control.wanted is not None
+            if mark is not None:
+                done.append(mark)
+            if wanted != self.is_recording and (self.may_begin or not wanted):
+                self.is_recording = wanted
+                done.append("begin" if wanted else "end")
+        return done
 
-    def _follow(self, orders: Orders) -> None:
-        if orders.mark_before is not None:
-            self.done.append(orders.mark_before)
-        if orders.end is not None:
-            assert self.is_recording
-            self.is_recording = False
-            self.done.append("end")
-        if orders.begin is not None and self.may_begin:
-            assert not self.is_recording
-            self.is_recording = True
-            self.done.append("begin")
-        if orders.quit:
-            self.done.append("quit")
+    def crash(self) -> None:
+        """The episode ends by itself, as also with a full disk."""
+        self.is_recording, self.control.wanted = False, None
 
 
 def test_a_key_begins_and_ends_and_marks() -> None:
@@ -53,8 +46,6 @@ def test_a_key_begins_and_ends_and_marks() -> None:
     assert session.step(keys="b") == ["bad"]
     assert session.step(keys="gb") == ["bad"], "the last word counts"
     assert session.step(keys="rr") == [], "begun and ended at once"
-    assert session.step(keys="r") == ["begin"]
-    assert session.step(keys="q") == ["end", "quit"]
 
 
 def test_a_switch_records_while_it_is_high_and_its_middle_marks_as_bad() -> None:
@@ -121,7 +112,7 @@ def test_what_could_not_begin_begins_when_it_can_for_as_long_as_it_is_wanted(swi
     assert session.step(switch_us=HIGH, armed=True, times=5) == []
     session.may_begin = True
     assert session.step(switch_us=HIGH, armed=True, times=3) == ["begin"]
-    session.is_recording = False  # ended by a crash, or a full disk
+    session.crash()
     assert session.step(switch_us=HIGH, armed=True, times=5) == []
     session.step(switch_us=LOW, times=30)
     session.may_begin = False

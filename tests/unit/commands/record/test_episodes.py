@@ -9,15 +9,13 @@ import pytest
 from helpers.factories import make_tick
 from helpers.recordings import make_frame, make_meta
 from mavbridge.commands.record import episodes
-from mavbridge.commands.record.episodes import FIRST_BYTES_PS, DiskWatch, Episodes, prepare_out
-from mavbridge.core.clock import NS_PER_S
+from mavbridge.commands.record.episodes import Episodes, disk_left_gb, prepare_out
 from mavbridge.core.errors import UserError
 from mavbridge.core.vehicle import Packet
 from mavbridge.mavlink.transport.packet_pipe import PacketPipe
 from mavbridge.recording.flight_folder import RecordedFlight, open_flight
 
 PACKET = bytes(20)
-RESERVE = 1e9
 
 
 class Clock:
@@ -143,18 +141,9 @@ def test_a_flight_is_no_folder_for_flights(stand: Stand) -> None:
         prepare_out(stand.out / "file")
 
 
-@pytest.mark.parametrize(("seconds", "left_s"), [(600, 600), (61, 61), (59, 59), (-1, 0)])
-def test_seconds_are_counted_down_to_the_reserve_at_the_measured_rate(
-    seconds: float, left_s: float, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+def test_the_room_on_the_disk_counts_down_to_the_reserve(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    free = SimpleNamespace(free=RESERVE + seconds * FIRST_BYTES_PS)
-    monkeypatch.setattr(episodes, "disk_usage", lambda _: free)
-    disk = DiskWatch(tmp_path, reserve_bytes=RESERVE)
-    assert disk.left_s() == pytest.approx(left_s)
-    assert (disk.missing() is None) == (left_s >= 60), "nothing begins in the last minute"
-    (tmp_path / "camera.mp4").write_bytes(bytes(50_000))
-    (tmp_path / "ticks.arrows").write_bytes(bytes(10_000))
-    disk.measure(tmp_path, NS_PER_S)
-    assert disk.left_s() == pytest.approx(left_s), "a second is too short to measure by"
-    disk.measure(tmp_path, 10 * NS_PER_S)
-    assert disk.left_s() == pytest.approx(left_s * FIRST_BYTES_PS / 6000)
+    for free, left_gb in ((3.5e9, 2.5), (0.5e9, 0.0)):
+        monkeypatch.setattr(episodes, "disk_usage", lambda _, free=free: SimpleNamespace(free=free))
+        assert disk_left_gb(tmp_path, 1.0) == pytest.approx(left_gb)

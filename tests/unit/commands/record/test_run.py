@@ -33,9 +33,7 @@ def test_the_guard_only_listens_and_asks_for_the_pilots_sticks_at_the_rate(tmp_p
         ((*CONNECT, "--camera", "none"), "nothing to learn from without images"),
         ((*CONNECT, "--camera", "no such file"), "no such file"),
         ((*CONNECT, "--on-arm", "--episode-channel", "7"), "leave one out"),
-        ((*CONNECT, "--episode-channel", "4"), "--episode-channel"),
         ((*CONNECT, "--rate", "5"), "--rate"),
-        ((*CONNECT, "--disk-reserve", "0"), "--disk-reserve"),
         (("--connect", "udp:nowhere"), "udp:nowhere"),
     ],
 )

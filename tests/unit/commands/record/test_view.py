@@ -116,7 +116,7 @@ SHOWN = Shown(
     number=3,
     duration_ns=None,
     counts=Counter({True: 2, None: 1}),
-    disk_s=4000.0,
+    disk_gb=4.04,
     stick_packets=0,
     sticks_ns=0,
     problem=None,
@@ -137,7 +137,7 @@ def test_the_line_tells_state_number_marks_sticks_and_disk(screen: RecordScreen)
         "next: episode 3",
         "ALT_HOLD armed",
         "T+0.10 Y-0.20 P+0.30 R-1.00",
-        "disk 67 min",
+        "disk 4.0 GB",
         "2 good 0 bad 1 unmarked",
     ):
         assert part in line
