@@ -4,14 +4,15 @@ import asyncio
 import threading
 from collections.abc import Callable, Iterator
 from concurrent.futures import Future
-from contextlib import contextmanager, suppress
+from contextlib import closing, contextmanager, suppress
+from functools import partial
 from typing import TypeVar
 
 import numpy as np
 from websockets.asyncio.server import Server, ServerConnection, serve
 from websockets.exceptions import ConnectionClosed
 
-from mavbridge.commands.serve import AnswerLoop, PolicyServer
+from mavbridge.commands.serve import PolicyServer
 from mavbridge.core.clock import NS_PER_S, MonotonicClock
 from mavbridge.core.workers import Worker
 from policy.adapters.websocket.messages import Message, pack, unpack
@@ -86,21 +87,13 @@ async def _listening(talk: Callable[[ServerConnection], object], port: int) -> S
 
 
 @contextmanager
-def our_server(
-    runner: PolicyRunner, *, api_key: str | None = None, image_bytes: int = 2**20
-) -> Iterator[int]:
+def our_server(runner: PolicyRunner, *, api_key: str | None = None) -> Iterator[int]:
     """Context manager: ``mavbridge serve`` without its command line; yields its port."""
-    answers = AnswerLoop(runner, clock=MonotonicClock())
-    server = PolicyServer(
-        answers, image_bytes=image_bytes, api_key=api_key, report=lambda _line: None
-    )
-    policy = Worker("test-policy", answers.run)
-    policy.start()
-    try:
-        with _in_thread(lambda: asyncio.ensure_future(server.listen("127.0.0.1", 0))) as port:
-            yield port
-    finally:
-        policy.join(START_S)
+    clock = MonotonicClock()
+    server = PolicyServer(runner, clock=clock, api_key=api_key, report=lambda _line: None)
+    listen = partial(server.listen, "127.0.0.1", 0)
+    with closing(server), _in_thread(lambda: asyncio.ensure_future(listen())) as port:
+        yield port
 
 
 def chunk_of(value: float, horizon: int = 16) -> bytes:
