@@ -43,8 +43,6 @@ STUDENT_TURN_S, EXPERT_TURN_S = (1.5, 6.0), (0.4, 1.6)
 """Range of the length of a turn. If a student flies, the expert takes over now and then: otherwise
 a student that crashes at the first gate would learn nothing about later ones (DAgger, Ross et al.
 2011, mixes the two at random)."""
-SOLVES_KEPT = TRUTHS_KEPT = 64
-"""Solves and exposures kept until their ticks and frames are recorded."""
 NOMINAL_SHARE, AIRBORNE_SHARE, UNDISTURBED_SHARE = 0.25, 0.35, 0.3
 """Shares of flights without varied conditions, as most users fly first; that start in the air and
 off the course; and without disturbed actions, as examples of a good flight."""
@@ -139,7 +137,7 @@ class Pilot:
         self._planned: tuple[int, FloatArray] | None = None
         """Time and values of the student's chunk that flies."""
         self.expert_actions: dict[int, Action] = {}
-        """Recent expert actions by the serial of the chunk that was computed at their states."""
+        """Expert actions by the serial of the chunk that was computed at their states."""
         self.begin_ns: int | None = None
         """Start of the demonstration; None before the policy has the sticks."""
         expert = PolicyRunner(
@@ -184,7 +182,6 @@ class Pilot:
             sticks = self._expert.sticks(body, now_s)
             self.expert_actions[self._solves] = Sticks(*sticks)
             disturbed = self._disturbance.flown(sticks, now_s)
-        self.expert_actions.pop(self._solves - SOLVES_KEPT, None)
         chunk = np.tile(np.array(disturbed, np.float32), (1, horizon, 1))
         if self._student is None:
             return chunk
@@ -355,8 +352,6 @@ class _LabelledRecorder:
             velocity_ned_mps=body.velocity_ned_mps,
             **asdict(gates),
         )
-        if len(self._truths) > TRUTHS_KEPT:
-            self._truths.pop(next(iter(self._truths)))
 
     def emit(self, event: Event) -> None:
         """Record the event. Numbers count from the first recorded one."""
@@ -366,7 +361,7 @@ class _LabelledRecorder:
         if isinstance(event, Tick):
             self._record(event, from_ns)
         elif event.captured_ns >= from_ns:
-            truth = self._truths.get(event.frame_id)
+            truth = self._truths.pop(event.frame_id, None)
             self._writer.frame(replace(event, serial=self._frames), truth)
             self._frames += 1
 
@@ -376,7 +371,8 @@ class _LabelledRecorder:
         if tick.woke_ns < from_ns or serial is None or serial == self._chunk_serial:
             return
         self._chunk_serial = serial
-        self._writer.tick(replace(tick, serial=self._ticks), self._pilot.expert_actions.get(serial))
+        label = self._pilot.expert_actions.pop(serial, None)
+        self._writer.tick(replace(tick, serial=self._ticks), label)
         self._ticks += 1
 
 

@@ -65,22 +65,18 @@ def test_a_demonstration_finishes_its_course_and_says_what_it_was(flight: Record
     assert meta.frames_dropped == meta.ticks_dropped == 0
 
 
-def test_every_tick_flies_and_has_the_experts_word(flight: RecordedFlight) -> None:
+def test_every_tick_and_frame_has_the_experts_word_and_the_truth(flight: RecordedFlight) -> None:
     assert flight.ticks["expert"].null_count == 0
     assert flight.ticks["sent"].null_count == 0
     assert set(column(flight, "mode")) == {"ALT_HOLD"}
-    assert np.abs(column(flight, "expert")).max() <= 1.0
     # sticks follow the expert, late by the filter and the delays, and where they were disturbed
     error = np.abs(column(flight, "sent") - column(flight, "expert")).mean()
     assert error < np.abs(column(flight, "expert")).mean()
-
-
-def test_every_frame_has_an_image_and_the_truth(flight: RecordedFlight) -> None:
     rows = list(flight.frame_rows())
     images = list(flight.images())
     assert len(rows) == len(images) > 30
-    assert all(row.truth is not None for row in rows)
     gates = [row.truth.next_gate for row in rows if row.truth is not None]
+    assert len(gates) == len(rows)
     seen = [gate for gate in gates if gate is not None]
     assert seen == sorted(seen)
     assert gates[-1] is None  # the last gate is behind
@@ -140,12 +136,9 @@ def test_no_demonstration_flies_a_held_out_course_and_only_a_student_is_slow(
 
 def test_a_slow_student_flies_along_its_plan_from_an_old_image() -> None:
     plan = np.arange(16, dtype=np.float32).reshape(1, 4, 4)
-    assert from_now(plan, 0.0).tolist() == plan.tolist()
     assert from_now(plan, 1.5)[0, :, 0].tolist() == [6.0, 10.0, 12.0, 12.0]
     fast, slow = draw_variation(7), draw_variation(7, longest_solve_ns=400_000_000)
-    assert 100_000_000 <= slow.solve_ns <= 400_000_000
-    assert slow.delays.vision.offset_ns == slow.solve_ns
-    assert fast.delays.vision.offset_ns == fast.solve_ns == 0
+    assert 100_000_000 <= slow.solve_ns == slow.delays.vision.offset_ns <= 400_000_000
     assert replace(slow, solve_ns=0, delays=fast.delays) == fast, "all else is as without it"
 
 
@@ -161,13 +154,6 @@ def test_a_slow_student_sees_old_images_and_every_tick_has_a_label(tmp_path: Pat
     assert ages_ns.min() > 100_000_000
     assert len(set(ticks["chunk_serial"].to_pylist())) == ticks.num_rows > 100
     assert ticks["expert"].null_count == 0
-
-
-def test_flights_differ() -> None:
-    drawn = [draw_variation(seed) for seed in range(60)]
-    assert 5 < sum(one.starts_airborne for one in drawn) < 40
-    assert 5 < sum(one.disturbance == 0.0 for one in drawn) < 40
-    assert len({one.conditions for one in drawn}) > 30
 
 
 def test_student_and_expert_fly_in_turns_and_the_seed_decides_whose_it_is() -> None:

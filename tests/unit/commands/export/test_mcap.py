@@ -5,12 +5,11 @@ from base64 import b64decode
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
-from shutil import copy, copytree
+from shutil import copy
 from typing import Any, NamedTuple
 
 import cv2
 import numpy as np
-import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 from mcap.reader import make_reader
@@ -162,17 +161,11 @@ def test_a_demonstration_has_all_its_rows_at_their_times(start: File) -> None:
     stamps = [entry.at_ns for entry in start.entries]
     assert stamps == sorted(stamps)
     assert start.attachments == {"meta.json": (START / "meta.json").read_bytes()}
-
-
-def test_states_and_actions_are_those_of_the_table(start: File) -> None:
-    ticks = pq.read_table(START / "ticks.parquet")
     states = [[entry.message[name] for name in STATE_NAMES] for entry in start.of("/state")]
     np.testing.assert_array_equal(states, ticks["state"].to_pylist())
-    assert {entry.message["frame"] for entry in start.of("/state")} == {"ned_frd"}
     for name in ("raw", "smoothed", "sent", "expert", "rc_sticks"):
         found = [[*entry.message[name].values()] for entry in start.of("/actions")]
         np.testing.assert_array_equal(found, ticks[name].to_pylist())
-    assert [*start.of("/actions")[0].message["sent"]] == ["throttle", "yaw", "pitch", "roll"]
 
 
 def test_images_are_those_of_the_video(flight: File, start: File) -> None:
@@ -199,15 +192,6 @@ def test_poses_are_in_enu_and_flu(start: File) -> None:
         for frd, flu in (((1, 0, 0), (1, 0, 0)), ((0, 1, 0), (0, -1, 0)), ((0, 0, 1), (0, 0, -1))):
             north, east, down = rotate(tuple(attitude), frd)
             assert rotate(turn, flu) == pytest.approx((east, north, -down), abs=1e-6)
-
-
-def test_a_simulators_truth_replaces_the_estimate(start: File, tmp_path: Path) -> None:
-    folder = copytree(START, tmp_path / "a")
-    ticks = pq.read_table(folder / "ticks.parquet")
-    column = ticks.column_names.index("position_ned_m")
-    zeros = pa.array([(0.0, 0.0, 0.0)] * len(ticks), ticks.schema.field(column).type)
-    pq.write_table(ticks.set_column(column, "position_ned_m", zeros), folder / "ticks.parquet")
-    assert exported(folder, tmp_path / "out").of("/tf") == start.of("/tf")
 
 
 @pytest.mark.parametrize("frame", ["ned_frd", "enu_flu"])
@@ -279,9 +263,8 @@ def test_every_camera_has_a_topic(tmp_path: Path) -> None:
     assert len(file.of("/camera/front")) == len(file.of("/camera/down")) == FRAMES
 
 
-@pytest.mark.parametrize("started_at", ["", "yesterday"])
-def test_without_a_wall_time_the_stamps_are_monotonic(tmp_path: Path, started_at: str) -> None:
-    file = exported(record(tmp_path / "a", started_at=started_at), tmp_path / "out")
+def test_without_a_wall_time_the_stamps_are_monotonic(tmp_path: Path) -> None:
+    file = exported(record(tmp_path / "a", started_at="yesterday"), tmp_path / "out")
     assert file.of("/timing")[0].at_ns == START_NS
 
 
