@@ -2,8 +2,7 @@
 
 import difflib
 import os
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Annotated
 
@@ -23,7 +22,7 @@ from mavbridge.commands.config import (
     ReplayConfig,
     ServeConfig,
 )
-from mavbridge.config.episodes import DemonstrateConfig, EvaluateConfig
+from mavbridge.config.episodes import SIMULATOR, DemonstrateConfig, EvaluateConfig
 from mavbridge.config.flags import RARE
 from mavbridge.config.flight import FlyConfig
 from mavbridge.config.settings_files import (
@@ -190,24 +189,12 @@ def imagine(config: ImagineConfig) -> int:
     return run_rollout(config)
 
 
-@contextmanager
-def _needs_simulator(command: str) -> Iterator[None]:
-    """Context manager: raise UserError with what to install if the simulator cannot be imported."""
-    try:
-        yield
-    except ModuleNotFoundError as error:
-        if error.name != "mujoco":
-            raise
-        raise UserError(
-            f"{command}, which flies the simulator, needs mujoco: pip install mujoco"
-        ) from error
-
-
 @cli.command(group=LEARNING)
 def evaluate(config: EvaluateConfig | None = None) -> int:
     """Fly a policy over many simulated courses, and count the gates."""
-    with _needs_simulator("evaluate"):
-        from mavbridge.commands.evaluate import evaluate as run_evaluation
+    require_packages("evaluate", SIMULATOR)
+    from mavbridge.commands.evaluate import evaluate as run_evaluation
+
     return run_evaluation(EvaluateConfig() if config is None else config)
 
 
@@ -215,8 +202,9 @@ def evaluate(config: EvaluateConfig | None = None) -> int:
 def demonstrate(config: DemonstrateConfig) -> int:
     """Record an expert's flights of simulated courses to learn from."""
     require_extra("demonstrate")
-    with _needs_simulator("demonstrate"):
-        from mavbridge.commands.demonstrate import demonstrate as run_demonstrations
+    require_packages("demonstrate", SIMULATOR)
+    from mavbridge.commands.demonstrate import demonstrate as run_demonstrations
+
     return run_demonstrations(config)
 
 

@@ -16,7 +16,7 @@ from mavbridge.config.flags import (
     Ranged,
     hidden,
 )
-from mavbridge.config.flight import FlyConfig, ListenConfig
+from mavbridge.config.flight import CameraConfig, FlyConfig, ListenConfig
 from mavbridge.config.policy import Engine, PolicyConfig
 from mavbridge.core.errors import UserError
 
@@ -203,24 +203,6 @@ class InspectConfig:
 EPISODES = Group("Episodes", sort_key=1.5)
 
 
-@Parameter(name="*", group=CAMERA)
-@dataclass(frozen=True, kw_only=True)
-class FilmConfig(Ranged):
-    """The camera, whose images are recorded in the size in which they come."""
-
-    camera: str = "0"
-    """0, /dev/videoN, URL, FILE, shm:NAME, screen:TITLE, pipe:COMMAND or jpeg-udp:PORT."""
-    camera_size: Annotated[int, Between(32, 4096, "pixels")] = 224
-    """Pixels a side that the image must cover; a device is asked for such a mode."""
-    camera_timeout: Annotated[float, hidden("link.camera-timeout"), Between(0.1, 3600, "s")] = 10.0
-    """Seconds to wait for the camera's first frame."""
-    camera_latency: Annotated[float, Between(0, 2000, "ms")] = 0.0
-    """Milliseconds from exposure to arrival here; not for shm:, whose frames carry their own
-    stamps."""
-    visual_rate: Annotated[float, Between(0.5, 240, "Hz")] = 30.0
-    """Most frames a second."""
-
-
 @Parameter(name="*")
 @dataclass(frozen=True, kw_only=True)
 class RecordConfig(Ranged):
@@ -229,7 +211,12 @@ class RecordConfig(Ranged):
     out: Annotated[Path, Parameter(group=OUTPUT)]
     """Folder for the flights, each in a folder of its own; more are added to those in it."""
     vehicle: ListenConfig = field(default_factory=ListenConfig)
-    film: FilmConfig = field(default_factory=FilmConfig)
+    camera: CameraConfig = field(default_factory=CameraConfig)
+    camera_size: Annotated[int, Parameter(group=CAMERA), Between(32, 4096, "pixels")] = 224
+    """Pixels a side that the image must cover; a device is asked for such a mode. It is recorded in
+    the size in which it comes."""
+    visual_rate: Annotated[float, Parameter(group=CAMERA), Between(0.5, 240, "Hz")] = 30.0
+    """Most frames a second."""
     rate: Annotated[float, Parameter(group=RATES), Between(20, 250, "Hz")] = 100.0
     """Rows a second of sticks and state, for which the vehicle is asked, too."""
     episode_channel: Annotated[int | None, Parameter(group=EPISODES), Between(5, 18)] = None
@@ -247,6 +234,10 @@ class RecordConfig(Ranged):
     def __post_init__(self) -> None:
         """Refuse contradictions, and rates that no autopilot serves."""
         super().__post_init__()
+        if self.camera.sources == ("none",):
+            raise UserError("--camera none: there is nothing to learn from without images")
+        if len(self.camera.sources) > 1:
+            raise UserError("--camera: the images of one camera are recorded, name only that one")
         if self.on_arm and self.episode_channel is not None:
             raise UserError("--on-arm and --episode-channel both say when to record: leave one out")
 

@@ -10,11 +10,17 @@ from rich.progress import Progress, TaskID
 from rich.text import Text
 
 from mavbridge.commands.output import progress_bar
-from mavbridge.config.episodes import CHECK_COURSE_SEED, COURSE_SEEDS, MAX_EPISODES
+from mavbridge.config.episodes import (
+    CHECK_COURSE_SEED,
+    COURSE_SEEDS,
+    MAX_EPISODES,
+    SIMULATOR,
+)
 from mavbridge.config.flags import check_range
 from mavbridge.config.policy import PolicyConfig
 from mavbridge.core.clock import NS_PER_S, MonotonicClock
 from mavbridge.core.errors import UserError
+from mavbridge.core.extras import require_packages
 from mavbridge.core.stopping import INTERRUPTED, stop_on_signals
 from mavbridge.flight.policies import load_configured_policy
 from policy.contract import Contract
@@ -43,12 +49,7 @@ def run_policy_training(paths: Sequence[Path], settings: TrainSettings) -> int:
     check_range("check-flights", settings.check_flights, 0, MAX_EPISODES, "")
     check = None
     if settings.check_flights:
-        try:
-            import mavbridge.simulation.flight  # noqa: F401 - share_of_gates needs it
-        except ImportError as error:
-            raise UserError(
-                f"--check-flights needs the simulator ({error}): install mavbridge[sitl]"
-            ) from error
+        require_packages("--check-flights", SIMULATOR)
         check = partial(share_of_gates, settings=settings)
 
     flights = _read_flights(paths, settings)

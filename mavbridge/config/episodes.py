@@ -13,6 +13,8 @@ from mavbridge.config.rates import Rates
 from mavbridge.core.errors import UserError
 from policy.contract import StateTime
 
+SIMULATOR = {"mujoco": "mujoco"}
+"""Import and install name of what the simulator needs."""
 AutopilotKind = Literal["ardupilot", "px4"]
 CourseKind = Literal["easy", "race", "loop"]
 """Families of courses, each with its own seeds and the same ranges of them."""

@@ -13,7 +13,7 @@ from rich.text import Text
 
 import mavbridge
 from mavbridge.camera.image_watch import ImageWatch
-from mavbridge.camera.open import NO_CAMERA, check_camera, open_camera, require_present
+from mavbridge.camera.open import check_camera, open_camera, require_present
 from mavbridge.commands.config import RecordConfig
 from mavbridge.commands.record.episodes import (
     KEYS,
@@ -59,8 +59,6 @@ DISK_NS = NS_PER_S
 JOIN_S = 2.0
 RERUN_CAPACITY = 1000
 GUARD_END_S = 5.0
-MAX_FROZEN_S = MAX_BLACK_S = 0.5
-"""Time for which an image can be frozen or black before it is reported as a problem."""
 NOTHING = np.zeros((1, 1), np.float32)
 
 
@@ -68,10 +66,9 @@ def record(config: RecordConfig) -> int:
     """Record until the user, a signal or a full disk ends it; return the exit status."""
     clock = MonotonicClock()
     make_transport(config.vehicle.connect, clock)
-    check_camera(config.film.camera, latency_ms=config.film.camera_latency)
-    if config.film.camera == NO_CAMERA:
-        raise UserError("--camera none: there is nothing to learn from without images")
-    require_present(config.film.camera)
+    (source,) = config.camera.sources
+    check_camera(source, latency_ms=config.camera.camera_latency)
+    require_present(source)
     prepare_out(config.out)
     cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_SILENT)
     cv2.setNumThreads(1)
@@ -86,7 +83,7 @@ def pilot_flight(config: RecordConfig) -> FlyConfig:
     rates = Rates(
         action_rate=config.rate,
         stick_rate=config.rate,
-        visual_rate=config.film.visual_rate,
+        visual_rate=config.visual_rate,
         realtime=False,
     )
     return FlyConfig(link=LinkConfig(**vars(config.vehicle), readonly=True), rates=rates)
@@ -117,7 +114,7 @@ class _Session:
         self._disk_gb, self._disk_due_ns = 0.0, 0
         self._told_missing: str | None = None
         """Why the last request for an episode was refused."""
-        self._screen = RecordScreen(console, rate_hz=config.rate, vision_hz=config.film.visual_rate)
+        self._screen = RecordScreen(console, rate_hz=config.rate, vision_hz=config.visual_rate)
         stack.callback(self._screen.close, JOIN_S)
         viewer = () if config.rerun == "off" else (self._open_viewer(),)
         self._guard = GuardProcess(listening_guard(config, clock), clock)
@@ -147,13 +144,13 @@ class _Session:
         self._guard.send(flight)
 
     def _open_camera(self, console: Console) -> Camera:
-        film = self._config.film
+        wanted = self._config.camera
         camera = open_camera(
-            film.camera,
-            image_size=film.camera_size,
+            wanted.sources[0],
+            image_size=self._config.camera_size,
             clock=self._clock,
-            timeout_s=film.camera_timeout,
-            latency_ms=film.camera_latency,
+            timeout_s=wanted.camera_timeout,
+            latency_ms=wanted.camera_latency,
             report=lambda line: console.print(Text(line)),
             is_depth=False,
         )
@@ -162,7 +159,7 @@ class _Session:
 
     def _vision_loop(self, camera: Camera, sink: TickSink) -> VisionLoop:
         """Return a loop that encodes nothing, but paces, stamps and judges the images."""
-        frame_ns = period_ns(self._config.film.visual_rate)
+        frame_ns = period_ns(self._config.visual_rate)
         return VisionLoop(
             camera=camera,
             encode=lambda _image: NOTHING.copy(),
@@ -171,13 +168,16 @@ class _Session:
             clock=self._clock,
             period_ns=lambda: frame_ns,
             encoder_lock=threading.Lock(),
-            image_watch=ImageWatch(max_frozen_s=MAX_FROZEN_S, max_black_s=MAX_BLACK_S),
+            image_watch=ImageWatch(
+                max_frozen_s=self._config.camera.max_frozen_image,
+                max_black_s=self._config.camera.max_black_image,
+            ),
             is_airborne=lambda: self._view.status.armed and self._view.status.is_landed is False,
         )
 
     def _open_viewer(self) -> TickSink:
         rate = self._config.rate
-        flight = ViewedFlight(vision_hz=self._config.film.visual_rate, chunk_hz=rate, stick_hz=rate)
+        flight = ViewedFlight(vision_hz=self._config.visual_rate, chunk_hz=rate, stick_hz=rate)
         view = RerunView(self._config.rerun, flight)
         viewer = ObserverThread("mavbridge-rerun", view, capacity=RERUN_CAPACITY)
         self._stack.callback(viewer.close, JOIN_S)
@@ -194,12 +194,12 @@ class _Session:
             engine=None,
             mode="dual",
             action_hz=self._config.rate,
-            visual_hz=self._config.film.visual_rate,
+            visual_hz=self._config.visual_rate,
             contract=CONTRACT,
             command=command_line(),
             versions=versions(),
             git_revision=git_revision(),
-            cameras={"front": without_secrets(self._config.film.camera)},
+            cameras={"front": without_secrets(self._config.camera.sources[0])},
         )
 
     def run(self, stop: StopRequest) -> None:
