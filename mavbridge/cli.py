@@ -149,7 +149,6 @@ def replay(flight: Path, config: ReplayConfig | None = None) -> int:
 
     Args:
         flight: folder of a flight, as --record makes it.
-        config: the settings.
     """
     require_extra("replay")
     from mavbridge.commands.replay import replay as run_replay
@@ -163,7 +162,6 @@ def inspect(*flights: Path, config: InspectConfig | None = None) -> int:
 
     Args:
         flights: one or two flight folders, as --record makes them.
-        config: the settings.
     """
     require_extra("inspect")
     from mavbridge.commands.inspect.run import inspect as run_inspection
@@ -240,7 +238,6 @@ def train(*flights: Path, settings: Annotated[TrainSettings, Parameter(name="*")
 
     Args:
         flights: flight folders, folders of them, or LeRobot datasets (v3).
-        settings: the settings.
     """
     _prepare_training("train", flights, settings)
     from mavbridge.commands.train import run_policy_training
@@ -256,7 +253,6 @@ def train_world_model(
 
     Args:
         flights: flight folders, folders of them, or LeRobot datasets (v3).
-        settings: the settings.
     """
     _prepare_training("train-world-model", flights, settings)
     from mavbridge.commands.train import run_world_model_training
@@ -270,7 +266,6 @@ def export(*flights: Path, config: ExportConfig) -> int:
 
     Args:
         flights: flight folders, or folders of them.
-        config: the settings.
     """
     require_extra("export")
     if not flights:
@@ -289,7 +284,6 @@ def export_policy(checkpoint: Path | None = None, *, config: ExportPolicyConfig)
 
     Args:
         checkpoint: its weights, .safetensors; left out, those that TOGE ships with.
-        config: the settings.
     """
     from mavbridge.commands.export_policy import export_policy as run_export
 
@@ -302,7 +296,6 @@ def contract(source: Path, config: ContractConfig | None = None) -> int:
 
     Args:
         source: folder of a LeRobot policy, of a LeRobot dataset, or of ONNX files; or one of those.
-        config: the settings.
     """
     from mavbridge.commands.contract import contract as run_contract
 

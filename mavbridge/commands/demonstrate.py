@@ -60,12 +60,11 @@ class Variation:
     seed: int
     conditions: Conditions
     delays: Delays
+    """That of the student's vision is offset by the length of its solves."""
     starts_airborne: bool
     disturbance: float
     hover_s: float
     """Time to fly on after the last gate."""
-    solve_ns: int
-    """Time from the image to the student's chunk, beyond that of the delays."""
 
 
 def draw_variation(seed: int, *, longest_solve_ns: int = 0) -> Variation:
@@ -87,7 +86,6 @@ def draw_variation(seed: int, *, longest_solve_ns: int = 0) -> Variation:
         starts_airborne=bool(is_airborne),
         disturbance=disturbance,
         hover_s=float(np.random.Generator(np.random.PCG64((seed, 10))).uniform(*HOVER_S)),
-        solve_ns=solve_ns,
     )
 
 
@@ -186,7 +184,7 @@ class Pilot:
         if self._student is None:
             return chunk
         # Also in the expert's turns: the student can have internal state.
-        now_ns, solve_ns = self._flight.clock.now_ns(), self._variation.solve_ns
+        now_ns, solve_ns = self._flight.clock.now_ns(), self._variation.delays.vision.offset_ns
         if self._planned is None or now_ns - self._planned[0] >= solve_ns:
             self._planned = now_ns, self._student.act(encoded, state, history).copy()
         planned_ns, plan = self._planned

@@ -15,6 +15,7 @@ from mavbridge.config.flight import CameraConfig
 from mavbridge.core.clock import NS_PER_MS, NS_PER_S, Clock
 from mavbridge.core.errors import CameraError, MavbridgeError
 from mavbridge.core.ports import Camera
+from mavbridge.core.records import CameraImage
 from mavbridge.core.workers import HungError, Worker
 from mavbridge.flight.policies import NO_IMAGE_ADVICE
 
@@ -52,10 +53,8 @@ class CameraView:
     captured_ns: list[int] = field(default_factory=list)
     ages_ns: list[int] = field(default_factory=list)
     """Time from the stamp to the read of each frame."""
-    height_px: int = 0
-    width_px: int = 0
-    is_depth: bool = False
-    is_blank: bool = False
+    image: CameraImage | None = None
+    """The newest."""
     dropped: int = 0
     failure: str | None = None
 
@@ -118,8 +117,7 @@ def _watch(camera: Camera, seen: CameraView, clock: Clock, stop: threading.Event
                 continue
             seen.ages_ns.append(clock.now_ns() - frame.captured_ns)
             seen.captured_ns.append(frame.captured_ns)
-            seen.height_px, seen.width_px = frame.rgb.shape[:2]
-            seen.is_depth, seen.is_blank = frame.rgb.ndim == 2, is_blank(frame.rgb)
+            seen.image = frame.rgb
     except CameraError as error:
         seen.failure = str(error)
     seen.dropped = camera.dropped_frames - dropped_before
@@ -127,7 +125,7 @@ def _watch(camera: Camera, seen: CameraView, clock: Clock, stop: threading.Event
 
 def judge(need: CameraNeeds, seen: CameraView, *, latency_ms: float) -> list[CheckRow]:
     """Return the rows of one camera from its frames; ``latency_ms`` is that of --camera-latency."""
-    if seen.failure is not None or not seen.captured_ns:
+    if seen.failure is not None or seen.image is None:
         why = seen.failure or f"no frame came in {MEASURE_S:g} s"
         return [_row(need, "stopped", no_go=why)]
     slow = (
@@ -141,23 +139,24 @@ def judge(need: CameraNeeds, seen: CameraView, *, latency_ms: float) -> list[Che
         part="rate",
         warn=slow if seen.rate_hz < _ENOUGH * need.rate_hz else "",
     )
-    return [rate_row, _image_row(need, seen), _age_row(need, seen, latency_ms)]
+    return [rate_row, _image_row(need, seen.image), _age_row(need, seen, latency_ms)]
 
 
-def _image_row(need: CameraNeeds, seen: CameraView) -> CheckRow:
-    advice = ""
-    if need.is_flown_by and min(seen.height_px, seen.width_px) < need.side_px:
+def _image_row(need: CameraNeeds, image: CameraImage) -> CheckRow:
+    (height_px, width_px), is_depth = image.shape[:2], image.ndim == 2
+    advice, is_covered = "", is_blank(image)
+    if need.is_flown_by and min(height_px, width_px) < need.side_px:
         advice = "the image is smaller than what the policy takes, and is enlarged for it"
-    if seen.is_blank:
-        what = "without any depth" if seen.is_depth else "black or of one colour"
+    if is_covered:
+        what = "without any depth" if is_depth else "black or of one colour"
         advice = f"the image is {what}: is the lens covered?"
     return _row(
         need,
-        f"{seen.width_px}x{seen.height_px}{' depth' if seen.is_depth else ''}",
+        f"{width_px}x{height_px}{' depth' if is_depth else ''}",
         f"{need.side_px} px a side or more",
         part="image",
         warn=advice,
-        no_go=advice if seen.is_blank and need.is_flown_by else "",
+        no_go=advice if is_covered and need.is_flown_by else "",
     )
 
 

@@ -16,7 +16,6 @@ import numpy as np
 from av.error import FFmpegError
 from numpy.typing import NDArray
 from rich.console import Console
-from rich.progress import TaskID
 
 from mavbridge.commands.config import ExportConfig
 from mavbridge.commands.export.dataset import MIN_ROWS, DatasetSpec, DatasetWriter, fit_size
@@ -24,7 +23,6 @@ from mavbridge.commands.output import progress_bar
 from mavbridge.core.clock import NS_PER_MS, NS_PER_S
 from mavbridge.core.errors import UserError
 from mavbridge.core.records import ImageArray
-from mavbridge.core.stopping import stop_on_signals
 from policy.adapters.drafts import Entry, dataset_entries, draft_text, recorded_entries
 from policy.adapters.interface import BODY_STATE_NAMES, CONTRACT_FILE
 from policy.contract import ACTION_DIM, STATE_NAMES
@@ -151,27 +149,17 @@ def export(flights: Sequence[Path], config: ExportConfig) -> int:
     exemplary, note = leave_out_failed(folders, include_failed=config.include_failed)
     if note is not None:
         console.print(note, soft_wrap=True)
-    with (
-        stop_on_signals() as stop,
-        progress_bar(console) as progress,
-        whole_or_nothing(config.out) as folder,
-    ):
-
-        def advance(task: TaskID) -> None:
-            if stop.is_set():
-                raise KeyboardInterrupt
-            progress.advance(task)
-
+    with progress_bar(console) as progress, whole_or_nothing(config.out) as folder:
         reading = progress.add_task("reading flights", total=len(exemplary), status="")
         episodes = []
         for flight in exemplary:
             episodes.append(read_flight(flight))
             for text in episodes[-1].damage:
                 console.print(f"warning: {text}", soft_wrap=True)
-            advance(reading)
+            progress.advance(reading)
         frames = sum(len(episode.captured_ns) for episode in episodes)
         writing = progress.add_task("writing frames", total=frames, status="")
-        summary = write_dataset(episodes, folder, config, lambda: advance(writing))
+        summary = write_dataset(episodes, folder, config, lambda: progress.advance(writing))
         write_contract(folder, exemplary, config)
     Console(highlight=False).print(f"{config.out}: {summary}", soft_wrap=True)
     return 0

@@ -2,6 +2,7 @@
 
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from mavbridge.commands.check.camera import CameraNeeds, CameraView, camera_rows, judge
@@ -21,8 +22,7 @@ def seen(*, age_ms: float = 15.0, period_ns: int = FRAME_NS, size_px: int = 224)
     return CameraView(
         captured_ns=[k * period_ns for k in range(60)],
         ages_ns=[round(age_ms * NS_PER_MS)] * 60,
-        height_px=size_px,
-        width_px=size_px,
+        image=np.random.default_rng(0).integers(0, 255, (size_px, size_px, 3)).astype(np.uint8),
     )
 
 
@@ -67,7 +67,7 @@ def test_the_age_of_an_image_must_be_known_and_small(
 
 def test_a_black_image_is_a_no_go_only_for_a_policy_that_looks_at_it() -> None:
     black = seen()
-    black.is_blank = True
+    black.image = np.zeros((224, 224, 3), np.uint8)
     assert rows(needs(), black)["image"].verdict == "no-go"
     assert rows(needs(is_flown_by=False), black)["image"].verdict == "warn"
     assert rows(needs(), seen(size_px=160))["image"].verdict == "warn", "small: it is enlarged"
