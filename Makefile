@@ -87,7 +87,7 @@ test: .venv-peers/installed check docs  ## all of lint, then every test, and the
 docs: $(VENV)/documents  ## the documentation as a site in out/site; warnings are errors
 	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --quiet --strict
 
-bench: $(VENV)/installed .venv-peers/installed  ## engines, loops and link here, beside a baseline and peers
+bench: $(VENV)/installed .venv-peers/installed  ## engines, a flight and the link here, beside eager torch and peers
 	$(BIN)/python -m benchmarks.compare --json out/bench.json --check benchmarks/budget.json
 
 mutants: $(VENV)/installed  ## small changes of the safety core, each of which a test must notice; not part of test

@@ -1,15 +1,15 @@
 """Timing of one encoded image and one sampled chunk per engine, in one thread, without other
 load."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from contextlib import ExitStack
-from dataclasses import replace
+from dataclasses import dataclass
 from typing import NamedTuple
 
 import torch
+from rich.table import Table
 
-from benchmarks.results import EngineTiming, name_of
-from mavbridge.commands.output import print_status
+from mavbridge.commands.output import make_table, print_status
 from mavbridge.config.policy import Engine, PolicyConfig
 from mavbridge.core.clock import NS_PER_S, MonotonicClock
 from mavbridge.core.histogram import Histogram
@@ -18,7 +18,19 @@ from policy.engines.runner import dummy_sample, encode_all
 from policy.errors import PolicyError
 
 EAGER: Engine = "torch"
+FAST: Engine = "openvino"
 ENCODE, CHUNK, BOTH = "encode one image", "sample one chunk", "one image to one chunk"
+
+
+@dataclass(frozen=True, kw_only=True)
+class EngineTiming:
+    """Time of one piece of inference on one engine and one thread."""
+
+    policy: str
+    work: str
+    engine: str
+    p50_ms: float
+    p99_ms: float
 
 
 class _Case(NamedTuple):
@@ -31,22 +43,20 @@ class _Case(NamedTuple):
 
 def time_engines(
     policies: Sequence[PolicyConfig], *, rounds: int, block_s: float
-) -> tuple[tuple[EngineTiming, ...], tuple[str, ...]]:
-    """Time each policy on its engine, or with ``auto`` on all engines of this device.
+) -> tuple[EngineTiming, ...]:
+    """Time each policy on its engine.
 
-    Return the timings, and notes on failures. Each round times every case for ``block_s``, so that
-    a slow minute of the host affects all engines.
+    Each round times every case for ``block_s``, so that a slow minute of the host affects all.
 
     Raises:
-        PolicyError: a policy cannot be loaded on any engine.
+        PolicyError: a policy cannot be loaded on its engine.
     """
     torch.set_num_threads(1)
     clock = MonotonicClock()
     cases: list[_Case] = []
-    notes: list[str] = []
     with ExitStack() as lives:
         for policy in policies:
-            cases += _cases(policy, lives, notes)
+            cases += _cases(policy, lives)
         for number in range(rounds):
             print_status(f"engines, round {number + 1} of {rounds}")
             for case in cases:
@@ -55,27 +65,10 @@ def time_engines(
                 while (start_ns := clock.now_ns()) < end_ns or not case.durations.count:
                     case.call()
                     case.durations.add(clock.now_ns() - start_ns)
-    return tuple(map(_timing, cases)), tuple(notes)
+    return tuple(map(_timing, cases))
 
 
-def _cases(policy: PolicyConfig, lives: ExitStack, notes: list[str]) -> list[_Case]:
-    devices = (policy.device, policy.vision_device or "", policy.action_device or "")
-    fast: Engine = "cuda-graph" if any(name.startswith("cuda") for name in devices) else "openvino"
-    engines: tuple[Engine, ...] = (EAGER, fast) if policy.engine == "auto" else (policy.engine,)
-    cases: list[_Case] = []
-    failures = []
-    for engine in engines:
-        try:
-            cases += _cases_on(replace(policy, engine=engine), lives)
-        except PolicyError as error:
-            failures.append(f"{name_of(policy)} on {engine}: not measured: {error}")
-    if not cases:  # numpy policies run on "auto" only and are refused elsewhere
-        return _cases_on(policy, lives)
-    notes += failures
-    return cases
-
-
-def _cases_on(policy: PolicyConfig, lives: ExitStack) -> list[_Case]:
+def _cases(policy: PolicyConfig, lives: ExitStack) -> list[_Case]:
     loaded = lives.enter_context(load_configured_policy(policy, MonotonicClock()))
     runner = loaded.runner
     if policy.engine != "auto" and not runner.engine.startswith(policy.engine):
@@ -91,7 +84,7 @@ def _cases_on(policy: PolicyConfig, lives: ExitStack) -> list[_Case]:
     if not runner.dual_rate:
         works = {BOTH: lambda: runner.act(encode_all(runner, images), state, history)}
     engine = runner.engine if policy.engine == "auto" else policy.engine
-    name = name_of(policy)
+    name = policy.policy
     return [_Case(name, work, engine, call, Histogram()) for work, call in works.items()]
 
 
@@ -105,3 +98,19 @@ def _timing(case: _Case) -> EngineTiming:
         p50_ms=percentiles.p50,
         p99_ms=percentiles.p99,
     )
+
+
+def engine_table(timings: Iterable[EngineTiming]) -> Table:
+    """Return a table with a row for each piece of work and a column for each engine."""
+    cells = {
+        (one.policy, one.work, one.engine): f"{one.p50_ms:.2f} / {one.p99_ms:.2f}"
+        for one in timings
+    }
+    engines = tuple(dict.fromkeys(engine for _, _, engine in cells))
+    works = tuple(dict.fromkeys((policy, work) for policy, work, _ in cells))
+    rows = [
+        (policy, work, *(cells.get((policy, work, engine), "-") for engine in engines))
+        for policy, work in works
+    ]
+    title = "Inference on one thread, ms (p50 / p99)"
+    return make_table(title, ("policy", "work", *engines), rows, left_columns=2)

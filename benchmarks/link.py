@@ -3,20 +3,22 @@
 python -m benchmarks.link --rounds 3
 """
 
-import pickle
+import json
 import sys
-from dataclasses import dataclass, replace
+from collections.abc import Iterable
 from pathlib import Path
 from tempfile import TemporaryDirectory
+from typing import NamedTuple
 
 from cyclopts import App
+from rich.table import Table
 from rich.text import Text
 
-from benchmarks.link_vehicle import ATTITUDE_HZ, CONNECT_S
-from benchmarks.results import OURS, LinkLatency, link_table
-from mavbridge.commands.output import print_status, table_console
+from benchmarks.link_vehicle import ATTITUDE_HZ, CONNECT_S, LinkLatency
+from mavbridge.commands.output import make_table, number, print_status, table_console
 from mavbridge.core.errors import UserError
 from mavbridge.core.processes import IMPORT_ROOT, end, free_port, log_tail, running, wait
+from mavbridge.core.vehicle import Percentiles
 
 LINK_VEHICLE = "benchmarks.link_vehicle"
 PEERS_PYTHON = IMPORT_ROOT / ".venv-peers" / "bin" / "python"
@@ -25,19 +27,28 @@ STARTING_S = 15.0
 app = App(help=__doc__)
 
 
-@dataclass(frozen=True, kw_only=True)
-class LinkClient:
+class LinkClient(NamedTuple):
     """Program that answers each attitude with sticks."""
 
     name: str
-    module: str
-    python: str = sys.executable
+    command: str
+    """With {port} for its UDP port."""
 
 
-OUR_CLIENT = LinkClient(name=OURS, module="benchmarks.link_client")
-BARE_CLIENT = LinkClient(name="bare pymavlink loop", module="benchmarks.link_pymavlink")
+# No smoothing, so that the vehicle finds its code unchanged. Its attitude never changes. Chunks at
+# twice its rate, so that an attitude closely after a late one is answered at once.
+OUR_CLIENT = LinkClient(
+    "mavbridge",
+    f"{sys.executable} -m mavbridge --connect udp:127.0.0.1:{{port}} --camera none --arm "
+    f"--policy {Path(__file__).parent / 'link_policy.py'}:RollRate --dual-rate "
+    "--on-fault release --then release --set-config limits.tau=0 --set-config limits.slew=0 "
+    "--set-config limits.frozen_state=0 --set-config rates.action=200",
+)
+BARE_CLIENT = LinkClient(
+    "bare pymavlink loop", f"{sys.executable} -m benchmarks.link_pymavlink --port {{port}}"
+)
 MAVSDK_CLIENT = LinkClient(
-    name="MAVSDK-Python 4", module="benchmarks.link_mavsdk", python=str(PEERS_PYTHON)
+    "MAVSDK-Python 4", f"{PEERS_PYTHON} -m benchmarks.link_mavsdk --port {{port}}"
 )
 
 
@@ -65,6 +76,18 @@ def link_clients() -> tuple[tuple[LinkClient, ...], tuple[str, ...]]:
     return (OUR_CLIENT, BARE_CLIENT), (note,)
 
 
+def link_table(links: Iterable[LinkLatency]) -> Table:
+    """Return a table with a row for each client."""
+    rows = []
+    for link in links:
+        trip = link.round_trip_ms
+        values = () if trip is None else (trip.p50, trip.p99, trip.max)
+        spread = " / ".join(number(value, 2) for value in values)
+        rows.append((link.client, f"{link.answered} of {link.sent}", spread))
+    title = "Link alone: attitude out of the vehicle to sticks back in, ms (p50 / p99 / max)"
+    return make_table(title, ("client", "answered", "round trip"), rows)
+
+
 def time_link(client: LinkClient, attitudes: int) -> LinkLatency:
     """Time one client.
 
@@ -77,7 +100,7 @@ def time_link(client: LinkClient, attitudes: int) -> LinkLatency:
     with TemporaryDirectory(prefix="mavbridge-bench-") as name:
         folder = Path(name)
         log, vehicle_log, answers = (folder / file for file in ("client", "vehicle", "answers"))
-        client_command = (client.python, "-m", client.module, "--port", port)
+        client_command = client.command.format(port=port).split()
         vehicle_command = (
             *(sys.executable, "-m", LINK_VEHICLE, "--port", port),
             *("--attitudes", str(attitudes), "--out", str(answers)),
@@ -91,10 +114,11 @@ def time_link(client: LinkClient, attitudes: int) -> LinkLatency:
             except UserError as error:
                 raise UserError(f"{client.name}: {error}\nits log: {log_tail(log)}") from error
             end(process)
-        counted: LinkLatency = pickle.loads(answers.read_bytes())  # noqa: S301 - our child's
-        if counted.round_trip_ms is None:
+        counted = json.loads(answers.read_text())
+        if (trip := counted["round_trip_ms"]) is None:
             raise UserError(f"{client.name} answered no attitude; its log: {log_tail(log)}")
-        return replace(counted, client=client.name)
+        figures = {"client": client.name, "round_trip_ms": Percentiles(**trip)}
+        return LinkLatency(**counted | figures)
 
 
 if __name__ == "__main__":

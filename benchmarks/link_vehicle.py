@@ -7,17 +7,18 @@ attitude, so that they never delay it. Sends are stamped just before the system 
 arrival by the kernel, so that this process adds nothing to the figures.
 """
 
-import pickle
+import json
 from collections.abc import Iterator
+from dataclasses import asdict, dataclass
 from itertools import count
 from pathlib import Path
 
 from cyclopts import App
 from pymavlink.dialects.v20 import ardupilotmega as mav
 
-from benchmarks.results import LinkLatency
 from mavbridge.core.clock import NS_PER_MS, NS_PER_S, Clock, MonotonicClock
 from mavbridge.core.histogram import Histogram
+from mavbridge.core.vehicle import Percentiles
 from mavbridge.mavlink.transport.sockets import UdpTransport
 
 ATTITUDE_HZ = 97.0
@@ -66,7 +67,7 @@ def main(*, port: int, attitudes: int, out: Path) -> None:
     transport = UdpTransport(("127.0.0.1", port), clock, listen=False)
     transport.open()
     try:
-        out.write_bytes(pickle.dumps(LinkVehicle(transport, clock).run(attitudes)))
+        out.write_text(json.dumps(asdict(LinkVehicle(transport, clock).run(attitudes))))
     finally:
         transport.close()
 
@@ -84,6 +85,17 @@ def code_of(stick: float) -> int:
 def code_of_pwm(pwm_us: int) -> int:
     """Return the code in a channel of RC_CHANNELS_OVERRIDE."""
     return round((pwm_us - 1000) / CODE_US)
+
+
+@dataclass(frozen=True, kw_only=True)
+class LinkLatency:
+    """Time from the vehicle's send of an attitude to the arrival of its sticks."""
+
+    client: str = ""
+    sent: int
+    answered: int
+    round_trip_ms: Percentiles | None
+    """From just before a send to the kernel's stamp of the first answer; None: no answer."""
 
 
 class RoundTrips:

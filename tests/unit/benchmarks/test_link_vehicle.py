@@ -1,6 +1,6 @@
 import numpy as np
 
-from benchmarks.link_client import repeat_roll_rate
+from benchmarks.link_policy import RollRate
 from benchmarks.link_vehicle import (
     CODES,
     PARAMS,
@@ -28,7 +28,7 @@ def test_every_code_comes_back_through_policy_calibration_and_dither() -> None:
     state = np.zeros((1, 13), np.float32)
     for code in range(CODES):
         state[0, 7] = stick_of(code)
-        chunk = repeat_roll_rate(feature, state, history)
+        chunk = RollRate().predict_fast(feature, state, history, 1)
         assert chunk.shape == (1, 16, 4)
         pwm_us = calibration(PARAMS).to_pwm_us(Sticks(*chunk[0, 0].tolist()))
         dithered_us = {
