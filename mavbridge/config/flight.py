@@ -244,8 +244,6 @@ class FlyConfig(Ranged):
     """Seconds to fly from the policy's first action; default: until Ctrl-C."""
     rerun: Annotated[str, Parameter(group=OUTPUT)] = "off"
     """Rerun viewer: spawn, connect[=URL], FILE.rrd or off."""
-    serve: Annotated[str, Parameter(group=OUTPUT, show_default=False)] = ""
-    """HOST:PORT of a web page with the live flight; its data use PORT + 1."""
     gates: Annotated[Path | None, Parameter(group=OUTPUT)] = None
     """JSON of the course's gates: shown, counted, and the flight ends after the last one."""
     record: Annotated[Path | None, Parameter(group=OUTPUT)] = None

@@ -16,7 +16,7 @@ from mavbridge.core.errors import UserError
 from policy.files import user_path
 
 _DATA_KINDS = ("toge", "toge-rates", "resnet-unet", "scripted", "lerobot", "onnx")
-_ADDRESS_KEYS = ("serve", "rerun", "host", "ray")
+_ADDRESS_KEYS = ("rerun", "host", "ray")
 _OUTPUT_KEYS = ("record", "report", "json", "plot", "html", "out", "rerun")
 _LOCAL = re.compile(
     r"(?:$|off$|spawn$|/|serial:|udp://:|[\w./-]+\.rrd$"
@@ -95,8 +95,8 @@ def given_settings(texts: Sequence[str]) -> dict[str, dict[str, str | list[str]]
 
 
 class Settings(Dict):
-    """A settings file, as a cyclopts configuration. Some flags have the name of a command (record,
-    serve), so that the tables of ``commands`` are left out here."""
+    """A settings file, as a cyclopts configuration. The flag ``record`` has the name of a
+    command, so that the tables of ``commands`` are left out here."""
 
     def __init__(
         self, data: Mapping[str, Any], *, source: str, commands: Container[str] = ()

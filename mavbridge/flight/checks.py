@@ -6,7 +6,6 @@ from mavbridge.core.address import is_reachable, parse_address
 from mavbridge.core.course import read_gates
 from mavbridge.core.files import require_writable
 from mavbridge.flight.policies import check_configured_policy, require_cameras, require_images
-from mavbridge.observe.viewer.server import serve_address
 from mavbridge.observe.viewer.target import check_target
 from mavbridge.recording.folder import prepare_folder
 
@@ -34,8 +33,6 @@ def check_flight(config: FlyConfig) -> None:
     check_configured_policy(config.policy)
     require_images(config)
     require_writable(config.report, "--report")
-    if config.serve:
-        serve_address(config.serve)
     if config.gates is not None:
         read_gates(config.gates)
     if config.record is not None:

@@ -107,7 +107,7 @@ class FlightObservers:
 
     def open_viewer(self, stack: ExitStack) -> None:
         """Start the viewer, or its file, if the flags ask for it. ``stack`` closes it."""
-        if self._config.rerun == "off" and not self._config.serve:
+        if self._config.rerun == "off":
             return
         config, contract, freshness = self._config, self._plan.contract, self._plan.guard.freshness
         flight = ViewedFlight(
@@ -120,11 +120,11 @@ class FlightObservers:
             to_ned=action_frame(contract).to_guard,
             gates=self._gates or (),
         )
-        view = RerunView(config.rerun, flight, serve=config.serve)
-        if view.url is not None:
-            self.screen.show_message(f"watch this flight in a browser: {view.url}")
         self._viewer = ObserverThread(
-            "mavbridge-rerun", view, capacity=RERUN_CAPACITY, cameras=len(contract.cameras)
+            "mavbridge-rerun",
+            RerunView(config.rerun, flight),
+            capacity=RERUN_CAPACITY,
+            cameras=len(contract.cameras),
         )
         stack.callback(self._viewer.close, VIEWER_JOIN_S)
 

@@ -57,7 +57,6 @@ FLY = ("--connect", "udp:127.0.0.1:1")
             "endless-override",
         ),
         (["--connect", "udp:127.0.0.1:1", "--config", "none.toml"], "none.toml"),
-        (["--connect", "udp:127.0.0.1:1", "--serve", "9090"], "use HOST:PORT"),
         (["--connect", "udp:127.0.0.1:1", "--gates", "none.json"], "--gates none.json"),
         (["--connect", "udp:127.0.0.1:1", "--policy", "toge:medium"], "network.allow_untrained"),
         (["--connect", "udp:127.0.0.1:1", "--policy", "tog"], "tog"),

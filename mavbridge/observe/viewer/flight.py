@@ -35,16 +35,15 @@ class RerunView:
     images with their exposure. An unmeasured value is a gap in its line.
     """
 
-    def __init__(self, target: str, flight: ViewedFlight, *, serve: str = "") -> None:
+    def __init__(self, target: str, flight: ViewedFlight) -> None:
         """Check the target; calls that can block are left to ``consume`` and ``close``.
 
         Args:
-            target: that of ``prepare_target``, or ``off`` if only a browser looks.
+            target: that of ``prepare_target``.
             flight: facts known before the flight.
-            serve: HOST:PORT of a web viewer that is hosted until ``close``; empty: none.
         """
         self._flight = flight
-        self._recording = RerunRecording("mavbridge", target, serve=serve)
+        self._recording = RerunRecording("mavbridge", target)
         self._is_open = False
         self._has_start = False
         self._until_ns = 0
@@ -57,11 +56,6 @@ class RerunView:
         self._plan = PlanView(columns, flight)
         self._last_tick: Tick | None = None
         self._batches = 0
-
-    @property
-    def url(self) -> str | None:
-        """Address for a browser; None if no page is served."""
-        return self._recording.url
 
     def consume(self, batch: Sequence[Observed]) -> None:
         """Send one batch; blocks while the viewer does not keep up."""

@@ -1,7 +1,9 @@
 """A Rerun recording and its target (``--rerun``), which is ready before the flight begins."""
 
+import socket
 import subprocess
 import sys
+import tempfile
 from pathlib import Path
 from urllib.parse import urlsplit
 from uuid import uuid4
@@ -11,13 +13,7 @@ import rerun.blueprint as rrb
 
 from mavbridge.core.errors import MavbridgeError, PeerError, UserError
 from mavbridge.core.files import require_writable
-from mavbridge.core.processes import end
-from mavbridge.observe.viewer.server import (
-    listens,
-    serve_address,
-    start_listening,
-    start_web_server,
-)
+from mavbridge.core.processes import child_environment
 
 VIEWER_HOST = "127.0.0.1"
 VIEWER_PORT = 9876
@@ -25,41 +21,35 @@ VIEWER_URL = f"rerun+http://{VIEWER_HOST}:{VIEWER_PORT}/proxy"
 VIEWER_MEMORY = "2GB"
 """Above this limit the viewer drops its oldest data: it shares the machine with the flight."""
 CONNECT_TIMEOUT_S = 2.0
+SPAWN_TIMEOUT_S = 15.0
+SETTLE_S = 1.0
+"""A viewer without a display opens its port first and exits immediately afterwards."""
+_POLL_S = 0.1
 _SCHEMES = ("rerun", "rerun+http", "rerun+https")
 
 
 class RerunRecording:
-    """One recording and its targets. Every call can block while a viewer does not keep up."""
+    """One recording and its target. Every call can block while a viewer does not keep up."""
 
-    def __init__(self, application: str, target: str, *, serve: str = "") -> None:
-        """Check the targets, and start the required viewer and server.
+    def __init__(self, application: str, target: str) -> None:
+        """Check the target, and start the viewer if it is to be spawned.
 
         Args:
             application: the viewer's name for the content.
-            target: that of ``prepare_target``; with ``serve`` it can be ``off``.
-            serve: HOST:PORT of the web viewer, or empty; see ``serve_address``.
+            target: that of ``prepare_target``.
 
         Raises:
-            MavbridgeError: as in ``prepare_target`` and ``serve_address``.
+            MavbridgeError: as in ``prepare_target``.
         """
-        self._sinks: list[rr.FileSink | rr.GrpcSink] = []
-        if target != "off" or not serve:
-            prepared = prepare_target(target)
-            is_file = isinstance(prepared, Path)
-            self._sinks.append(rr.FileSink(prepared) if is_file else rr.GrpcSink(str(prepared)))
-        self._server: subprocess.Popen[bytes] | None = None
-        self.url: str | None = None
-        """Address for a browser; None if no page is served."""
-        if serve:
-            address = serve_address(serve)
-            self._server, self.url = start_web_server(address), address.page_url
-            self._sinks.append(rr.GrpcSink(address.data_url))
+        prepared = prepare_target(target)
+        is_file = isinstance(prepared, Path)
+        self._sink = rr.FileSink(prepared) if is_file else rr.GrpcSink(str(prepared))
         rr.unregister_shutdown()  # its atexit hook waits forever for a stalled viewer
         self.stream = rr.RecordingStream(application, recording_id=uuid4())
 
     def open(self, blueprint: rrb.Blueprint) -> None:
-        """Open the file and the connections, with this initial layout of the viewer."""
-        self.stream.set_sinks(*self._sinks, default_blueprint=blueprint)
+        """Open the file or the connection, with this initial layout of the viewer."""
+        self.stream.set_sinks(self._sink, default_blueprint=blueprint)
 
     def close(self) -> None:
         """Deliver the rest and close; raise MavbridgeError if the viewer is gone."""
@@ -68,9 +58,6 @@ class RerunRecording:
             self.stream.disconnect()
         except RuntimeError as error:
             raise MavbridgeError(f"the viewer did not take the whole recording: {error}") from error
-        finally:
-            if self._server is not None:
-                end(self._server)
 
 
 def prepare_target(text: str) -> Path | str:
@@ -121,12 +108,47 @@ def check_target(text: str) -> None:
         )
 
 
+def listens(host: str, port: int, *, timeout_s: float = _POLL_S) -> bool:
+    """True if a server accepts connections at this address."""
+    try:
+        socket.create_connection((host, port), timeout_s).close()
+    except OSError:
+        return False
+    return True
+
+
 def spawn_viewer(command: list[str], *, port: int) -> "subprocess.Popen[bytes]":
-    """Start a viewer, which stays open after the flight; raises as ``start_listening``."""
+    """Start a viewer, which stays open after the flight and after Ctrl-C; wait until it listens.
+
+    Raises:
+        MavbridgeError: it did not listen in time, or exited within SETTLE_S.
+    """
     options = ["--port", str(port), "--bind", VIEWER_HOST, "--memory-limit", VIEWER_MEMORY]
-    return start_listening(
-        [*command, *options, "--hide-welcome-screen", "--expect-data-soon"],
-        name="the Rerun viewer",
-        host=VIEWER_HOST,
-        ports=(port,),
+    with tempfile.TemporaryFile() as errors:
+        process = subprocess.Popen(
+            [*command, *options, "--hide-welcome-screen", "--expect-data-soon"],
+            env=child_environment(),
+            stdin=subprocess.DEVNULL,
+            stdout=subprocess.DEVNULL,
+            stderr=errors,
+            start_new_session=True,
+        )
+        for _ in range(round(SPAWN_TIMEOUT_S / _POLL_S)):
+            is_listening = listens(VIEWER_HOST, port)
+            try:
+                process.wait(SETTLE_S if is_listening else _POLL_S)
+            except subprocess.TimeoutExpired:
+                if is_listening:
+                    return process
+                continue
+            errors.seek(0)
+            lines = errors.read().decode(errors="replace").strip().splitlines()
+            problem = f"exited at once: {lines[-1] if lines else 'it gave no reason'}"
+            break
+        else:
+            process.terminate()
+            process.wait(SPAWN_TIMEOUT_S)
+            problem = f"did not listen within {SPAWN_TIMEOUT_S:g} s"
+    raise MavbridgeError(
+        f"the Rerun viewer {problem}; record to a file instead: --rerun flight.rrd"
     )

@@ -155,7 +155,6 @@ REFUSED = [
     (f'[fly]\ncamera = "{PIPE}"', "--camera"),
     (f'"--camera" = "{PIPE}"', "--camera"),
     (f'CAMERA = "{PIPE}"', "--camera"),
-    ('serve = "0.0.0.0:9090"', "--serve"),
     ('rerun = "connect=rerun+http://192.0.2.1:9876/proxy"', "--rerun"),
     ('host = "0.0.0.0"', "--host"),
     ('ray = "192.0.2.1:6379"', "--ray"),
@@ -171,7 +170,6 @@ connect = "udpin:0.0.0.0:14550"
 policy = "toge:small"
 checkpoint = "/opt/mavbridge/my.safetensors"
 camera = ["front=0", "down=/dev/video2", "side=shm:fpv", "back=rtsp://192.0.2.1/x"]
-serve = "127.0.0.1:9090"
 record = "flights/today"
 report = "report.json"
 rerun = "flight.rrd"
@@ -202,12 +200,17 @@ def test_a_settings_file_reaches_nothing_by_itself(
     assert list(untrusted_settings(read_toml(path), [f"{flag}=mine"])) == []
 
 
-def test_a_settings_file_decides_how_to_fly(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """Also by keys that are named as commands."""
+def test_a_settings_file_decides_how_to_fly(tmp_path: Path) -> None:
+    path = tmp_path / "mavbridge.toml"
+    path.write_text(TAKEN)
+    assert list(untrusted_settings(read_toml(path), [])) == []
     sample = read_toml(ROOT / "examples" / "deploy" / "mavbridge.toml")
     assert list(untrusted_settings(sample, [])) == []
+
+
+def test_keys_that_are_named_as_commands_are_flags(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     flown: list[FlyConfig] = []
     monkeypatch.setattr(cli, "config", cli.config)
     monkeypatch.setattr("mavbridge.flight.app.fly", lambda config: flown.append(config) or 0)
@@ -216,7 +219,7 @@ def test_a_settings_file_decides_how_to_fly(
     with pytest.raises(SystemExit):
         main(["--config", str(path)])
     (config,) = flown
-    assert (config.record, config.serve) == (Path("flights/today"), "127.0.0.1:9090")
+    assert config.record == Path("flights/today")
     assert config.policy.contract == Path("mine.toml")
 
 

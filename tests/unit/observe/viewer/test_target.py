@@ -5,11 +5,9 @@ from pathlib import Path
 
 import pytest
 
-from helpers.network import needs_ipv6
 from mavbridge.core.errors import MavbridgeError, PeerError, UserError
 from mavbridge.core.processes import free_port
-from mavbridge.observe.viewer import server as viewer_server
-from mavbridge.observe.viewer.server import ServeAddress, serve_address
+from mavbridge.observe.viewer import target
 from mavbridge.observe.viewer.target import check_target, prepare_target, spawn_viewer
 
 LISTENS_UNTIL_KILLED = """
@@ -71,7 +69,7 @@ def test_a_viewer_that_does_not_listen_is_named(bound_port: int) -> None:
 
 def test_a_spawned_viewer_is_waited_for(monkeypatch: pytest.MonkeyPatch) -> None:
     port = free_port(socket.SOCK_STREAM)
-    monkeypatch.setattr(viewer_server, "SETTLE_S", 0.05)
+    monkeypatch.setattr(target, "SETTLE_S", 0.05)
     viewer = spawn_viewer([sys.executable, "-c", LISTENS_UNTIL_KILLED], port=port)
     assert viewer.poll() is None
     socket.create_connection(("127.0.0.1", port), 10).close()
@@ -83,31 +81,3 @@ def test_a_spawned_viewer_that_ends_is_reported_with_its_last_words(bound_port: 
     dies = "import sys; sys.exit('starting up\\nno display is set')"
     with pytest.raises(MavbridgeError, match="exited at once: no display is set; record to a file"):
         spawn_viewer([sys.executable, "-c", dies], port=bound_port)
-
-
-@pytest.mark.parametrize("text", ["9090", "h:65535", "::1:9090"])
-def test_what_is_no_address_is_refused_with_an_example(text: str) -> None:
-    with pytest.raises(UserError, match=r"HOST:PORT, such as 127\.0\.0\.1:9090"):
-        serve_address(text)
-
-
-@pytest.mark.parametrize("distance", [0, 1])
-def test_a_port_that_is_taken_is_refused(distance: int) -> None:
-    with socket.create_server(("127.0.0.1", 0)) as server:
-        taken = server.getsockname()[1]
-        with pytest.raises(UserError, match=f"cannot listen on 127.0.0.1 port {taken} "):
-            serve_address(f"127.0.0.1:{taken - distance}")
-
-
-@needs_ipv6
-def test_an_ipv6_address() -> None:
-    port = free_port(socket.SOCK_STREAM)
-    address = serve_address(f"[::1]:{port}")
-    assert address == ServeAddress("::1", port)
-    assert address.page_url.startswith(f"http://[::1]:{port}/?url=rerun%2Bhttp://")
-
-
-def test_on_all_interfaces_the_page_names_this_computer_and_we_use_the_loopback() -> None:
-    address = ServeAddress("0.0.0.0", 9090)
-    assert socket.gethostname() in address.page_url
-    assert address.data_url == "rerun+http://127.0.0.1:9091/proxy"
