@@ -34,7 +34,6 @@ FLIGHT = Path(__file__).parents[1] / "data" / "flights" / "numpy_px4"
 FILES = sorted(path.name for path in FLIGHT.iterdir())
 REFUSALS = (MavbridgeError, PolicyError)
 BOUNDED = settings(
-    max_examples=60,
     derandomize=True,
     deadline=None,
     suppress_health_check=[HealthCheck.function_scoped_fixture],
@@ -72,32 +71,20 @@ def damaged(tmp_path: Path, name: str, damage: Damage) -> Path:
     return folder
 
 
-@BOUNDED
-@given(name=st.sampled_from(FILES), damage=damages)
-def test_a_damaged_recording_is_read_or_refused(name: str, damage: Damage, tmp_path: Path) -> None:
-    folder = damaged(tmp_path, name, damage)
-    with suppress(*REFUSALS):
-        flight = open_flight(folder)
-        list(flight.tick_rows())
-        list(flight.frame_rows())
+def read(folder: Path) -> None:
+    flight = open_flight(folder)
+    list(flight.tick_rows())
+    list(flight.frame_rows())
 
 
-@BOUNDED
+@pytest.mark.parametrize("use", [read, open_source, analyse])
+@settings(BOUNDED, max_examples=40)
 @given(name=st.sampled_from(FILES), damage=damages)
-def test_a_damaged_recording_is_replayed_or_refused(
-    name: str, damage: Damage, tmp_path: Path
+def test_a_damaged_recording_is_used_or_refused(
+    use: Callable[[Path], object], name: str, damage: Damage, tmp_path: Path
 ) -> None:
     with suppress(*REFUSALS):
-        open_source(damaged(tmp_path, name, damage))
-
-
-@settings(BOUNDED, max_examples=25)
-@given(name=st.sampled_from(FILES), damage=damages)
-def test_a_damaged_recording_is_inspected_or_refused(
-    name: str, damage: Damage, tmp_path: Path
-) -> None:
-    with suppress(*REFUSALS):
-        analyse(damaged(tmp_path, name, damage))
+        use(damaged(tmp_path, name, damage))
 
 
 @pytest.mark.parametrize("name", FILES)
