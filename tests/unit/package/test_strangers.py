@@ -200,17 +200,12 @@ def test_a_settings_file_reaches_nothing_by_itself(
     assert list(untrusted_settings(read_toml(path), [f"{flag}=mine"])) == []
 
 
-def test_a_settings_file_decides_how_to_fly(tmp_path: Path) -> None:
-    path = tmp_path / "mavbridge.toml"
-    path.write_text(TAKEN)
-    assert list(untrusted_settings(read_toml(path), [])) == []
-    sample = read_toml(ROOT / "examples" / "deploy" / "mavbridge.toml")
-    assert list(untrusted_settings(sample, [])) == []
-
-
-def test_keys_that_are_named_as_commands_are_flags(
+def test_a_settings_file_decides_how_to_fly(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    """Also by keys that are named as commands."""
+    sample = read_toml(ROOT / "examples" / "deploy" / "mavbridge.toml")
+    assert list(untrusted_settings(sample, [])) == []
     flown: list[FlyConfig] = []
     monkeypatch.setattr(cli, "config", cli.config)
     monkeypatch.setattr("mavbridge.flight.app.fly", lambda config: flown.append(config) or 0)
