@@ -90,7 +90,7 @@ def _safetensors(path: Path, text: bytes) -> tuple[str, str] | None:
     if (beside := _lerobot(path.parent)) is not None:
         what, advice = beside
         return f"the weights of {what}", advice
-    theirs = ("diffusion.unet.", "model.action_head.", "normalize_inputs.")
+    theirs = ("diffusion.unet.", "model.action_head.")
     if any(name.startswith(theirs) for name in names):
         return (
             "the weights of a LeRobot policy, without the config.json that belongs beside them",

@@ -11,16 +11,12 @@ from pathlib import Path
 from types import NoneType
 from typing import Any, ClassVar, Literal, TypeVar, get_args, get_origin, get_type_hints
 
-from policy.contract import ACTION_DIM, EXTRA_NAMES
+from policy.contract import ACTION_DIM
 from policy.errors import CheckpointError, warned
 from policy.files import read_object
 
 CONFIG_FILE = "config.json"
 STATE_KEY, ACTION_KEY = "observation.state", "action"
-ENVIRONMENT_KEY = "observation.environment_state"
-"""LeRobot's input for known facts of the world; here the vector to the flight's goal."""
-NO_IMAGE_PX = 16
-"""Side of the blank image of a policy without a camera [px]: the smallest in a contract."""
 BackboneName = Literal["resnet18", "resnet34", "resnet50", "resnet101", "resnet152"]
 Size = tuple[int, int]
 """Height and width."""
@@ -42,13 +38,11 @@ class Features:
     """Inputs and outputs of a policy, under LeRobot's names."""
 
     image_keys: tuple[str, ...]
-    """Cameras in the order of their features; empty for a policy without images."""
+    """Cameras in the order of their features."""
     image_height: int
     image_width: int
     state_dim: int | None
     """Width of observation.state; None if the policy takes none."""
-    takes_goal: bool
-    """True if observation.environment_state is the goal vector, ``policy.contract.EXTRA_NAMES``."""
     modes: Mapping[str, str]
     """Normalisation of STATE, VISUAL and ACTION; see ``plan.MODES``."""
 
@@ -120,8 +114,8 @@ class DiffusionConfig:
 
     @property
     def feature_dim(self) -> int:
-        """Size of an image's feature: two coordinates per keypoint; 1, a zero, without a camera."""
-        return 2 * self.spatial_softmax_num_keypoints if self.features.image_keys else 1
+        """Size of an image's feature: two coordinates per keypoint."""
+        return 2 * self.spatial_softmax_num_keypoints
 
     @property
     def encoded_size(self) -> Size:
@@ -176,11 +170,6 @@ def _where_to_look(folder: Path) -> str:
 
 def _act(entries: "_Entries", features: Features) -> ActConfig:
     entries.only("n_obs_steps", 1)
-    if features.takes_goal or not features.image_keys:
-        raise CheckpointError(
-            f"{entries.path}: of LeRobot's ACT those with cameras and without {ENVIRONMENT_KEY} "
-            "fly from their files; run this one behind --policy ws://HOST:PORT"
-        )
     entries.only("replace_final_stride_with_dilation", False)
     return entries.fill(ActConfig, features=features)
 
@@ -216,33 +205,22 @@ def _resize_and_crop(entries: "_Entries", features: Features) -> tuple[Size | No
     if resize is not None:  # LeRobot then derives the crop from the ratio and ignores crop_shape
         crop = None if ratio == 1.0 else (int(resize[0] * ratio), int(resize[1] * ratio))
     before = resize or (features.image_height, features.image_width)
-    if not features.image_keys:
-        return None, None
     if crop is not None and (crop[0] > before[0] or crop[1] > before[1]):
         raise CheckpointError(f"{entries.path}: cannot crop images of {before} to {crop}")
     return resize, crop
 
 
 def _features(entries: "_Entries") -> Features:
-    """Return cameras, state and action.
-
-    LeRobot's ACT and DiffusionPolicy use no STATE feature except observation.state, and no ENV
-    feature except observation.environment_state.
-    """
+    """Return cameras, state and action; LeRobot uses no STATE feature except observation.state."""
     inputs, outputs = entries.get("input_features", dict), entries.get("output_features", dict)
     kinds = {key: _feature(entries.path, key, value) for key, value in inputs.items()}
-    goal = (len(EXTRA_NAMES["goal"]),)
-    takes_goal = kinds.pop(ENVIRONMENT_KEY, None) == ("ENV", goal)
-    others = [key for key in inputs if key not in kinds and not takes_goal]
-    if others := others + [k for k, (kind, _) in kinds.items() if kind not in ("STATE", "VISUAL")]:
+    if others := [key for key, (kind, _) in kinds.items() if kind not in ("STATE", "VISUAL")]:
         raise CheckpointError(
-            f"{entries.path}: takes {others}, which no vehicle measures; supported are images, "
-            f"{STATE_KEY}, and {ENVIRONMENT_KEY} of {goal[0]} numbers: {EXTRA_NAMES['goal']}"
+            f"{entries.path}: takes {others}, which no vehicle measures; supported are images and "
+            f"{STATE_KEY}"
         )
     images = {key: shape for key, (kind, shape) in kinds.items() if kind == "VISUAL"}
     shapes = sorted(set(images.values()))
-    if not images and takes_goal:
-        shapes = [(3, NO_IMAGE_PX, NO_IMAGE_PX)]
     if len(shapes) != 1 or len(shapes[0]) != 3 or shapes[0][0] != 3:
         raise CheckpointError(
             f"{entries.path}: images must be of one shape [3, height, width], got {images}"
@@ -260,7 +238,6 @@ def _features(entries: "_Entries") -> Features:
         image_height=shapes[0][1],
         image_width=shapes[0][2],
         state_dim=state[0] if state else None,
-        takes_goal=takes_goal,
         modes={str(kind): str(mode) for kind, mode in modes.items()},
     )
 

@@ -15,7 +15,7 @@ import torch.nn.functional as F
 from torch import Tensor, nn
 
 from policy.adapters.lerobot.config import DiffusionConfig, map_size
-from policy.contract import ACTION_DIM, EXTRA_NAMES
+from policy.contract import ACTION_DIM
 from policy.errors import PolicyError
 from policy.nets.diffusion import Chunk, DdimStep, cosine_power, flight_noise
 from policy.nets.resnet import LastMap
@@ -269,13 +269,10 @@ class Diffusion(nn.Module):
         self.steps_before_now = config.n_obs_steps - 1
         self.schedule = DdimSchedule(config)
         cameras = len(config.features.image_keys)
-        self.rgb_encoder: nn.Module = nn.Identity()
-        if cameras and config.use_separate_rgb_encoder_per_camera:
+        self.rgb_encoder: nn.Module = RgbEncoder(config)
+        if config.use_separate_rgb_encoder_per_camera:
             self.rgb_encoder = nn.ModuleList(RgbEncoder(config) for _ in range(cameras))
-        elif cameras:
-            self.rgb_encoder = RgbEncoder(config)
         each = (config.features.state_dim or 0) + cameras * config.feature_dim
-        each += len(EXTRA_NAMES["goal"]) if config.features.takes_goal else 0
         self.unet = UNet(config, each * config.n_obs_steps)
         noise = torch.zeros(1, config.predicted, ACTION_DIM)
         self.initial_noise = nn.Buffer(noise, persistent=False)

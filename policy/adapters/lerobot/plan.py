@@ -3,9 +3,8 @@
 config.json gives shapes. Rate, names, units, frame and autopilot modes come from a contract file:
 ``adapters.interface``.
 
-The policy's preprocessor and postprocessor normalise. Their statistics are in a state file beside
-policy_preprocessor.json or, before 0.4, in the weights, as
-``normalize_inputs.buffer_observation_state.mean``. All modes have one affine form.
+The policy's preprocessor and postprocessor normalise, by statistics in a state file beside
+policy_preprocessor.json. All modes have one affine form.
 """
 
 from collections.abc import Mapping
@@ -17,14 +16,13 @@ import numpy as np
 from policy.adapters.interface import CONTRACT_FILE, Interface, read_interface
 from policy.adapters.lerobot.config import (
     ACTION_KEY,
-    ENVIRONMENT_KEY,
     STATE_KEY,
     Config,
     Features,
     read_config,
     read_json,
 )
-from policy.contract import EXTRA_NAMES, Contract, FloatArray
+from policy.contract import Contract, FloatArray
 from policy.errors import CheckpointError, ContractError, warned
 from policy.files import open_safetensors
 
@@ -64,8 +62,6 @@ class Normalisation:
 
     images: Mapping[str, Affine | None]
     state: Affine | None
-    goal: Affine | None
-    """Normalisation of observation.environment_state."""
     action: Affine | None
     renamed: Mapping[str, str]
     """Name of an input in the data -> its name in config.json."""
@@ -111,12 +107,13 @@ class _Statistics:
 
 def read_normalisation(folder: Path, features: Features) -> tuple[Normalisation, list[str]]:
     """Read a policy's normalisation, with notes for the user."""
-    renamed: dict[str, str] = {}
-    if (folder / PREPROCESSOR).is_file():
-        inputs, renamed = _processor(folder / PREPROCESSOR, "normalizer_processor", features)
-        outputs, _ = _processor(folder / POSTPROCESSOR, "unnormalizer_processor", features)
-    else:
-        inputs = outputs = _in_weights(folder, features)
+    if not (folder / PREPROCESSOR).is_file():
+        raise CheckpointError(
+            f"{folder}: there is no {PREPROCESSOR}: copy the whole folder that LeRobot wrote; a "
+            "policy of LeRobot before 0.4 is converted by its migrate_policy_normalization.py"
+        )
+    inputs, renamed = _processor(folder / PREPROCESSOR, "normalizer_processor", features)
+    outputs, _ = _processor(folder / POSTPROCESSOR, "unnormalizer_processor", features)
     notes: list[str] = []
     state = inputs.affine(STATE_KEY, "STATE", notes) if features.state_dim else None
     if state is not None and (constant := np.flatnonzero(state.divisor < _CONSTANT).tolist()):
@@ -127,7 +124,6 @@ def read_normalisation(folder: Path, features: Features) -> tuple[Normalisation,
     normalisation = Normalisation(
         images={key: inputs.affine(key, "VISUAL", notes) for key in features.image_keys},
         state=state,
-        goal=inputs.affine(ENVIRONMENT_KEY, "ENV", notes) if features.takes_goal else None,
         action=outputs.affine(ACTION_KEY, "ACTION", notes),
         renamed=renamed,
     )
@@ -161,24 +157,6 @@ def _processor(
     return found, renamed
 
 
-def _in_weights(folder: Path, features: Features) -> _Statistics:
-    """Read the statistics that LeRobot before 0.4 stored in the weights."""
-    path = folder / WEIGHTS_FILE
-    sides = ("normalize_inputs.buffer_", "unnormalize_outputs.buffer_")
-    found = _by_feature(_read_arrays(path, sides))
-    if not found:
-        raise CheckpointError(
-            f"{folder}: there is no {PREPROCESSOR}, and {WEIGHTS_FILE} holds no statistics "
-            "(normalize_inputs.buffer_*): copy the whole folder that LeRobot wrote"
-        )
-    names = (*features.image_keys, STATE_KEY, ENVIRONMENT_KEY)
-    keys = {key: sides[0] + key.replace(".", "_") for key in names}
-    keys[ACTION_KEY] = sides[1] + ACTION_KEY
-    arrays = {key: found[name] for key, name in keys.items() if name in found}
-    modes = features.modes
-    return _Statistics(path=path, asked=modes, modes=modes, epsilon=_EPSILON, arrays=arrays)
-
-
 def _by_feature(arrays: Mapping[str, FloatArray]) -> dict[str, dict[str, FloatArray]]:
     """Group entries such as ``observation.state.mean`` by feature, then by statistic."""
     found: dict[str, dict[str, FloatArray]] = {}
@@ -188,12 +166,11 @@ def _by_feature(arrays: Mapping[str, FloatArray]) -> dict[str, dict[str, FloatAr
     return found
 
 
-def _read_arrays(path: Path, starts: tuple[str, ...] = ("",)) -> dict[str, FloatArray]:
+def _read_arrays(path: Path) -> dict[str, FloatArray]:
     if not path.is_file():
         raise CheckpointError(f"{path} is missing: copy the whole folder that LeRobot wrote")
     with open_safetensors(path, "numpy") as file:
-        names = [name for name in file.keys() if name.startswith(starts)]  # noqa: SIM118
-        return {name: file.get_tensor(name) for name in names}
+        return {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118 - not a dict
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -252,11 +229,6 @@ def _interface(path: Path, config: Config) -> Interface:
     }
     interface = read_interface(path, derived)
     contract: Contract = interface.contract
-    if config.features.takes_goal and "goal" not in contract.state_extras:
-        contract = replace(contract, state_extras=(*contract.state_extras, "goal"))
-    if config.features.takes_goal and not interface.state_names:
-        own = tuple(name for name in contract.state_names if name not in EXTRA_NAMES["goal"])
-        interface = replace(interface, contract=contract, state_names=own)
     return replace(interface, contract=replace(contract, observation_dt_s=contract.chunk_dt_s))
 
 
@@ -277,8 +249,6 @@ def _policy_cameras(
     path: Path, interface: Interface, features: Features, normalisation: Normalisation
 ) -> tuple[int, ...]:
     known = features.image_keys
-    if not known:
-        return ()
     keys = [normalisation.renamed.get(key, key) for key in interface.camera_keys]
     if not interface.image_keys and len(known) == len(keys) == 1:
         return (0,)  # one camera on both sides: names do not matter

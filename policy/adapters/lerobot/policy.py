@@ -10,11 +10,8 @@ from policy.adapters.lerobot.config import ActConfig, DiffusionConfig
 from policy.adapters.lerobot.diffusion import Diffusion
 from policy.adapters.lerobot.plan import WEIGHTS_FILE, Affine, Plan
 from policy.checkpoints.tensors import read_tensors, require_finite, require_fit
-from policy.contract import EXTRA_NAMES, Contract
+from policy.contract import Contract
 from policy.protocol import predict_by_pair
-
-_STATISTICS = ("normalize_inputs.", "normalize_targets.", "unnormalize_outputs.")
-"""Prefixes of the statistics in checkpoints before 0.4; they are read separately."""
 
 
 class Normaliser(nn.Module):
@@ -65,10 +62,7 @@ class LeRobotPolicy(nn.Module):
         self._action = Normaliser(normalisation.action)
 
     def encode_visual(self, image: Tensor, camera: int = 0) -> Tensor:
-        """Encode an image [B, 3, H, W] of one of the contract's cameras -> feature [B,
-        feature_dim]; zeros for a policy without a camera."""
-        if not self._policy_cameras:
-            return image.new_zeros(image.shape[0], self.contract.feature_dim)
+        """Encode an image [B, 3, H, W] of one of the contract's cameras -> feature [B, F]."""
         own = self._policy_cameras[camera]
         return self.net.encode(self._images[own](image), own)
 
@@ -102,24 +96,6 @@ class LeRobotDiffusion(LeRobotPolicy):
     def __init__(self, plan: Plan, config: DiffusionConfig) -> None:
         super().__init__(plan, Diffusion(config))
         self.schedule = self.net.schedule
-        goal = EXTRA_NAMES["goal"] if config.features.takes_goal else ()
-        self._goal_columns = [self.contract.state_names.index(name) for name in goal]
-        self._goal = Normaliser(plan.normalisation.goal)
-
-    def _network_inputs(self, feature: Tensor, state: Tensor) -> tuple[Tensor, Tensor]:
-        """Return features of cameras and goal [B, T, 1, X], and normalised states [B, T, S].
-
-        In LeRobot's order: images, then the environment (``_prepare_global_conditioning``).
-        """
-        if not self._goal_columns:
-            return super()._network_inputs(feature, state)
-        states = state.reshape(state.shape[0], self.contract.observation_steps, -1)
-        parts = [self._goal(states[..., self._goal_columns])]
-        own = self._state(self._interface.to_state(states))
-        if self._policy_cameras:
-            by_camera, own = super()._network_inputs(feature, state)
-            parts.insert(0, by_camera.flatten(2))
-        return torch.cat(parts, dim=-1).unsqueeze(2), own
 
     @property
     def initial_noise(self) -> Tensor:
@@ -143,18 +119,15 @@ class LeRobotDiffusion(LeRobotPolicy):
         return self._in_units(self.net.from_now(sample))
 
 
-def build_policy_of(plan: Plan) -> LeRobotPolicy:
-    """Return a policy with random weights."""
-    if isinstance(plan.config, ActConfig):
-        return LeRobotPolicy(plan, Act(plan.config))
-    return LeRobotDiffusion(plan, plan.config)
-
-
 def load_policy_of(
     plan: Plan, *, seed: int, num_diffusion_steps: int
 ) -> tuple[LeRobotPolicy, list[str]]:
     """Build a policy, load its weights, draw the initial noise; return notes for the user too."""
-    policy = build_policy_of(plan)
+    policy: LeRobotPolicy
+    if isinstance(plan.config, ActConfig):
+        policy = LeRobotPolicy(plan, Act(plan.config))
+    else:
+        policy = LeRobotDiffusion(plan, plan.config)
     policy.net.load_state_dict(_read(plan.folder / WEIGHTS_FILE, policy.net))
     policy.eval().requires_grad_(False)
     config, kind = plan.config, "ACT" if isinstance(plan.config, ActConfig) else "DiffusionPolicy"
@@ -182,7 +155,7 @@ def _read(path: Path, net: Act | Diffusion) -> dict[str, Tensor]:
     state = {name: value for name, value in own if name.endswith("num_batches_tracked")}
     for name, value in read_tensors(path)[1].items():
         ours = net.own_name(name.removeprefix(net.prefix)) if name.startswith(net.prefix) else name
-        if ours is not None and not name.startswith(_STATISTICS):
+        if ours is not None:
             state[ours] = value
     require_finite(path, state)
     require_fit(path, net, state, "Copy both files again, from one folder")

@@ -6,13 +6,9 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-import torch
 from safetensors.numpy import load_file, save_file
 
-from policy.adapters.lerobot.config import ENVIRONMENT_KEY
 from policy.adapters.lerobot.plan import read_plan
-from policy.adapters.lerobot.policy import LeRobotDiffusion, build_policy_of
-from policy.engines.runner import level_state
 from policy.errors import CheckpointError, ContractError, PolicyError
 from policy.loading.load import check_request, read_policy_contract
 from policy.loading.request import PolicyRequest
@@ -163,28 +159,6 @@ def test_a_renamed_camera_is_known_by_both_names(folder):
         assert read_plan(folder, None).policy_cameras == (0,)
 
 
-def test_statistics_before_version_0_4_lie_in_the_weights(folder):
-    new = read_plan(folder, None).normalisation
-    statistics = load_file(folder / STATISTICS)
-    for name in ("policy_preprocessor.json", "policy_postprocessor.json"):
-        (folder / name).unlink()
-    weights = {}
-    for name, value in statistics.items():
-        key, _, statistic = name.rpartition(".")
-        side = "unnormalize_outputs" if key == "action" else "normalize_inputs"
-        weights[f"{side}.buffer_{key.replace('.', '_')}.{statistic}"] = value
-    save_file(weights, folder / "model.safetensors")
-    old = read_plan(folder, None).normalisation
-    for ours, theirs in (
-        (old.state, new.state),
-        (old.action, new.action),
-        (old.images[FRONT], new.images[FRONT]),
-    ):
-        np.testing.assert_array_equal(ours.shift, theirs.shift)
-        np.testing.assert_array_equal(ours.divisor, theirs.divisor)
-        assert (ours.gain, ours.bias) == (theirs.gain, theirs.bias)
-
-
 def test_processors_that_are_not_supported_are_refused(folder):
     path = folder / STATISTICS
     save_file({k: v for k, v in load_file(path).items() if not k.endswith("state.max")}, path)
@@ -194,55 +168,3 @@ def test_processors_that_are_not_supported_are_refused(folder):
     edit(folder / "policy_preprocessor.json", lambda data: data["steps"].append(step))
     with pytest.raises(CheckpointError, match="relative_actions_processor"):
         read_plan(folder, None)
-
-
-@pytest.fixture(params=["with a camera", "without"])
-def goal_folder(request, folder):
-    """The same policy with a goal as its environment, with and without a camera."""
-
-    def with_goal(config):
-        if request.param == "without":
-            del config["input_features"][FRONT]
-        config["input_features"][ENVIRONMENT_KEY] = {"type": "ENV", "shape": [3]}
-        config["normalization_mapping"]["ENV"] = "MEAN_STD"
-
-    def normalised(preprocessor):
-        for step in preprocessor["steps"]:
-            if step.get("registry_name") == "normalizer_processor":
-                step["config"]["norm_map"]["ENV"] = "MEAN_STD"
-
-    edit(folder / "config.json", with_goal)
-    edit(folder / "policy_preprocessor.json", normalised)
-    statistics = load_file(folder / STATISTICS)
-    statistics[f"{ENVIRONMENT_KEY}.mean"] = np.array([10.0, 0.0, 0.0], np.float32)
-    statistics[f"{ENVIRONMENT_KEY}.std"] = np.array([2.0, 1.0, 1.0], np.float32)
-    save_file(statistics, folder / STATISTICS)
-    return folder
-
-
-def test_the_condition_is_state_images_environment_as_in_lerobot(goal_folder) -> None:
-    policy = build_policy_of(read_plan(goal_folder, None)).eval()
-    assert isinstance(policy, LeRobotDiffusion)
-    contract = policy.contract
-    assert contract.state_extras == ("goal",)
-    state = torch.randn(1, 2, 16, generator=torch.Generator().manual_seed(0))
-    feature = torch.arange(2.0 * contract.feature_dim).reshape(1, 2, -1)
-    seen, own_state = policy._network_inputs(feature, state)
-    condition = torch.cat([own_state, seen.flatten(2)], dim=-1)
-    images = 0 if contract.image_height == 16 else contract.feature_dim
-    assert condition.shape == (1, 2, 13 + images + 3)
-    assert torch.equal(condition[..., 13 : 13 + images], feature[..., :images])
-    goal = (state[..., 13:] - torch.tensor([10.0, 0.0, 0.0])) / torch.tensor([2.0, 1.0, 1.0])
-    torch.testing.assert_close(condition[..., -3:], goal)
-
-
-@torch.inference_mode()
-def test_it_steers_by_its_goal(goal_folder) -> None:
-    policy = build_policy_of(read_plan(goal_folder, None)).eval()
-    image, chunks = torch.zeros(1, *policy.contract.image_shape), []
-    for goal_x_m in (0.0, 20.0):
-        state = torch.from_numpy(level_state(policy.contract))
-        state[..., 13] = goal_x_m
-        chunks.append(policy.predict(image, state, torch.zeros(1, 4, 4), 4))
-    assert chunks[0].shape == (1, 7, 4)
-    assert not torch.allclose(chunks[0], chunks[1])
