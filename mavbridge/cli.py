@@ -280,7 +280,7 @@ def export(*flights: Path, config: ExportConfig) -> int:
 
 @cli.command(group=CONVERTING)
 def export_policy(checkpoint: Path | None = None, *, config: ExportPolicyConfig) -> int:
-    """Export a policy as ONNX or TorchScript.
+    """Export a policy as ONNX.
 
     Args:
         checkpoint: its weights, .safetensors; left out, those that TOGE ships with.

@@ -35,19 +35,13 @@ class ContractConfig:
     training noted beside the policy, if it is here."""
 
 
-ExportFormat = Literal["onnx", "torchscript"]
-
-
 @Parameter(name="*")
 @dataclass(frozen=True, kw_only=True)
 class ExportPolicyConfig:
     """What is written, and where."""
 
     out: Path
-    """Folder for encoder.onnx, denoiser.onnx and policy.json; or the archive's file, .pt."""
-    format: ExportFormat = "onnx"
-    """onnx: encoder, one denoising step, contract and schedule. torchscript: the same in one
-    archive."""
+    """Folder for encoder.onnx, denoiser.onnx and policy.json."""
     policy: str = "toge"
     """Kind of the policy: toge or resnet-unet."""
 

@@ -8,7 +8,7 @@ from rich.console import Console
 from mavbridge.commands.config import ExportPolicyConfig
 from mavbridge.core.errors import UserError
 from mavbridge.core.extras import require_packages
-from policy.adapters.export import export_onnx, export_torchscript
+from policy.adapters.export import export_onnx
 from policy.engines.choose import chunks_of_samples, make_parity_samples, parity_failure
 from policy.loading.builtin import BUILTIN_KINDS, load_builtin
 from policy.loading.load import load_policy
@@ -22,18 +22,17 @@ def export_policy(checkpoint: Path | None, config: ExportPolicyConfig) -> int:
     if kind not in BUILTIN_KINDS:
         raise UserError(f"--policy {config.policy}: policies of toge and resnet-unet are exported")
     ours = PolicyRequest(spec=config.policy, checkpoint=checkpoint, engine="torch")
-    _require_room(config)
+    require_packages("export-policy", {"onnx": "onnx"})
+    if config.out.is_file() or (config.out.is_dir() and any(config.out.iterdir())):
+        raise UserError(f"--out {config.out} is taken: name a new or empty folder")
     policy, notes = load_builtin(ours)
     if policy.contract.action != "sticks":
         raise UserError(
             f"{config.policy} flies by {policy.contract.action}: policies by sticks are exported"
         )
-    if config.format == "onnx":
-        config.out.mkdir(parents=True, exist_ok=True)
-        export_onnx(policy, config.out)
-    else:
-        export_torchscript(policy, config.out)
-    spec = f"{config.format}:{config.out}"
+    config.out.mkdir(parents=True, exist_ok=True)
+    export_onnx(policy, config.out)
+    spec = f"onnx:{config.out}"
     reason = _difference(ours, PolicyRequest(spec=spec))
     if reason is not None:
         raise UserError(f"{config.out} was written, but it is another policy: {reason}")
@@ -42,16 +41,6 @@ def export_policy(checkpoint: Path | None, config: ExportPolicyConfig) -> int:
     flight = f"mavbridge --connect ... --policy {spec}"
     console.print(f"wrote {config.out}; it agrees with torch. Fly it: {flight}", soft_wrap=True)
     return 0
-
-
-def _require_room(config: ExportPolicyConfig) -> None:
-    """Refuse an output that would overwrite something, or that this installation cannot write."""
-    if config.format == "onnx":
-        require_packages("--format onnx", {"onnx": "onnx"})
-        if config.out.is_file() or (config.out.is_dir() and any(config.out.iterdir())):
-            raise UserError(f"--out {config.out} is taken: name a new or empty folder")
-    elif config.out.exists() or not config.out.parent.is_dir():
-        raise UserError(f"--out {config.out}: name a new file in a folder that exists")
 
 
 def _difference(ours: PolicyRequest, written: PolicyRequest) -> str | None:

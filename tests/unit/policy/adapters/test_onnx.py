@@ -30,8 +30,7 @@ from helpers.torch_policies import (
     loaded,
     require_same,
 )
-from policy.adapters.drafts import onnx_entries
-from policy.adapters.export import export_onnx, export_torchscript
+from policy.adapters.export import export_onnx
 from policy.adapters.onnx import GraphFile, Wanted
 from policy.engines import choose
 from policy.engines.runner import ExecutionSettings, level_state
@@ -49,16 +48,13 @@ STEPS = 4
 def exported_toge(trained_toge: Toge, tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("toge")
     export_onnx(trained_toge, folder)
-    export_torchscript(trained_toge, folder / "toge.pt")
     return folder
 
 
-@pytest.mark.parametrize(
-    ("form", "dual_rate"), [("onnx:{}", True), ("onnx:{}", False), ("torchscript:{}/toge.pt", True)]
-)
-def test_our_policy_is_the_same_from_image_to_stick(trained_toge, exported_toge, form, dual_rate):
+@pytest.mark.parametrize("dual_rate", [True, False])
+def test_our_policy_is_the_same_from_image_to_stick(trained_toge, exported_toge, dual_rate):
     flags = {"dual_rate": dual_rate, "num_diffusion_steps": STEPS}
-    runner, notes = loaded(PolicyRequest(spec=form.format(exported_toge), **flags))
+    runner, notes = loaded(PolicyRequest(spec=f"onnx:{exported_toge}", **flags))
     assert runner.engine.startswith("openvino"), notes
     assert runner.contract.feature_dim == trained_toge.contract.feature_dim
     trained_toge.head.seed_noise(0)
@@ -336,15 +332,6 @@ def test_unusable_graphs_are_refused_by_cause(tmp_path: Path, case: str) -> None
     write(tmp_path)
     with pytest.raises(PolicyError, match=told):
         fly(f"onnx:{tmp_path}")
-
-
-def test_a_draft_has_the_state_whatever_its_input_is_called(tmp_path: Path) -> None:
-    graphs.actor(tmp_path / "policy.onnx", state="obs")
-    graphs.recurrent(tmp_path / "recurrent.onnx")
-    for name in ("policy.onnx", "recurrent.onnx"):
-        found = {(each.table, each.name): each.value for each in onnx_entries([tmp_path / name])}
-        assert found["state", "key"] == "obs"
-        assert found["state", "names"] == ["?"] * 13
 
 
 def test_torchscript_of_an_observation_alone_flies_and_keeps_its_state(tmp_path: Path) -> None:
