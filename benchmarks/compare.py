@@ -2,7 +2,7 @@
 
 python -m benchmarks.compare --json bench.json --check benchmarks/budget.json
 
-Engines run the shipped policy (ResNet-8, 96 pixels) and an untrained one (EfficientNet-B3, 224
+Engines run the shipped policy (ResNet-8, 96 pixels) and an untrained one (ResNet-50, 224
 pixels). The flight is ``mavbridge check --soak`` with the shipped policy. MAVSDK is included if
 .venv-peers has it.
 
@@ -33,7 +33,7 @@ from mavbridge.core.files import require_writable
 
 TIMED: tuple[PolicyConfig, ...] = tuple(
     PolicyConfig(policy=policy, allow_untrained=is_untrained, engine=engine)
-    for policy, is_untrained in (("toge", False), ("toge:small", True))
+    for policy, is_untrained in (("toge", False), ("toge:small:resnet50", True))
     for engine in (EAGER, FAST)
 )
 FLIGHT_S, ATTITUDES = 60, 1500

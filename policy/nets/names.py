@@ -5,5 +5,5 @@ from typing import Literal, get_args
 Size = Literal["small", "medium", "large"]
 SIZE_NAMES: tuple[Size, ...] = get_args(Size)
 
-BackboneName = Literal["efficientnet_b3", "convnext_tiny", "resnet8", "resnet18", "resnet50"]
+BackboneName = Literal["resnet8", "resnet18", "resnet50"]
 BACKBONE_NAMES: tuple[BackboneName, ...] = get_args(BackboneName)

@@ -1,4 +1,4 @@
-"""ResNets (He et al. 2016) with torchvision's parameter names, and ResNet-8.
+"""Image encoders: ResNets (He et al. 2016) with torchvision's parameter names, and ResNet-8.
 
 ResNet-50 strides in the 3x3 convolution ("v1.5"), as torchvision's weights do.
 """
@@ -13,6 +13,7 @@ import torch.nn.functional as F
 from torch import Tensor, nn
 
 from policy.contract import FloatArray
+from policy.nets.names import BackboneName
 
 MOMENTS = 3
 """Moments per channel: average, and averages weighted by the position rightwards and downwards."""
@@ -144,8 +145,6 @@ class LastMap(nn.Module):
 class ResNet(LastMap):
     """Image [B, 3, H, W] -> moments [B, out_dim]; without torchvision's ``fc``."""
 
-    classifier_keys = ("fc.weight", "fc.bias")
-
     def __init__(self, name: str) -> None:
         super().__init__(name)
         self.out_dim = MOMENTS * self.channels
@@ -162,7 +161,6 @@ class ResNet8(nn.Module):
     the positions of gates from scratch in about ten minutes on one core.
     """
 
-    classifier_keys = ()
     out_dim = 256
 
     def __init__(self) -> None:
@@ -184,6 +182,19 @@ class ResNet8(nn.Module):
         cells = F.adaptive_avg_pool2d(self.relu(self.bn2(self.conv2(x))), RESNET8_CELLS)
         feature: Tensor = self.relu(self.fc(cells.flatten(1)))
         return feature
+
+
+def build_backbone(name: BackboneName) -> ResNet | ResNet8:
+    """Build an encoder with random weights: normalised image [B, 3, H, W] -> feature [B, out_dim].
+
+    He et al. 2015, fan-in: the signal survives the depth before any batch norm has statistics. With
+    torch's own default a deep encoder maps every image to almost nothing.
+    """
+    backbone = ResNet8() if name == "resnet8" else ResNet(name)
+    for module in backbone.modules():
+        if isinstance(module, nn.Conv2d):
+            nn.init.kaiming_normal_(module.weight, mode="fan_in", nonlinearity="relu")
+    return backbone
 
 
 def _layer(

@@ -17,9 +17,9 @@ from torch import Tensor, nn
 from policy.contract import ACTION_DIM, Contract
 from policy.errors import ContractError, PolicyError
 from policy.nets.attention import Attention, is_tracing
-from policy.nets.backbones import build_backbone
 from policy.nets.diffusion import DiffusionHead, NoiseSchedule, size_dims
 from policy.nets.names import BACKBONE_NAMES, BackboneName, Size
+from policy.nets.resnet import build_backbone
 from policy.preprocess import egocentric_columns, egocentric_scale
 
 HEADS = 4
@@ -214,7 +214,7 @@ class TogeConfig(BuiltinConfig):
     """Architecture settings of TOGE."""
 
     kind: ClassVar[str] = "toge"
-    backbone: BackboneName = "efficientnet_b3"
+    backbone: BackboneName = "resnet8"
 
     @property
     def feature_dim(self) -> int:

@@ -100,7 +100,7 @@ def test_a_checkpoint_decides_what_is_built(checkpoint: Path, small_toge: Toge) 
         loaded = load(spec, checkpoint=checkpoint)
         assert loaded.runner.contract == small_toge.contract
         assert "(small, resnet8)" in loaded.notes[0]
-    for spec in ("toge:medium", "toge:efficientnet_b3"):
+    for spec in ("toge:medium", "toge:resnet18"):
         with pytest.raises(PolicyError, match="holds small:resnet8"):
             load(spec, checkpoint=checkpoint)
 
