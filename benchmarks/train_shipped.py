@@ -8,7 +8,7 @@ flights of the expert, training, the student's flights, training, three times ov
 made a little differently (policy/weights/README.md), and neither recipe has been run as a whole.
 
 Run the same command again to resume after an interruption: recorded flights and written weights are
-kept, and an unfinished training is resumed. Seeds determine the flights. Training budgets are
+kept, and an unfinished training begins again. Seeds determine the flights. Training budgets are
 minutes, so another machine makes similar weights, not the same.
 """
 
@@ -128,9 +128,8 @@ def main(policy: Literal["toge", "toge-rates"], *, out: Path, workers: int = 2) 
         if step.command.startswith("demonstrate"):
             run(folder, f"{step.command} {SIZE} --workers {workers} --out {step.makes}")
         elif not (folder / step.makes).exists():
-            unfinished = folder / Path(step.makes).with_suffix(".training")
-            resume = " --resume" if unfinished.exists() else ""
-            run(folder, f"{step.command} --out {step.makes}{resume}")
+            run(folder, f"{step.command} --out partial.safetensors")
+            (folder / "partial.safetensors").replace(folder / step.makes)
 
 
 def copy_weights_before(path: Path) -> None:

@@ -39,7 +39,7 @@ from mavbridge.core.realtime import require_supported_system
 from mavbridge.recording.folder import require_extra
 from policy.adapters.websocket.kind import require_packages as require_websocket
 from policy.files import read_toml, user_path
-from policy.training.settings import RunSettings, TrainSettings, WorldModelSettings
+from policy.training.settings import TrainSettings, WorldModelSettings
 
 HELP = """Fly an ArduPilot or PX4 vehicle with a vision policy. How to start:
 
@@ -206,7 +206,9 @@ def demonstrate(config: DemonstrateConfig) -> int:
     return run_demonstrations(config)
 
 
-def _prepare_training(command: str, flights: Sequence[Path], settings: RunSettings) -> None:
+def _prepare_training(
+    command: str, flights: Sequence[Path], settings: TrainSettings | WorldModelSettings
+) -> None:
     """Check the paths before torch and the flights are loaded.
 
     Raises:
@@ -223,10 +225,8 @@ def _prepare_training(command: str, flights: Sequence[Path], settings: RunSettin
         raise UserError(f"--out {settings.out}: there is no folder {folder}")
     if not os.access(folder, os.W_OK):
         raise UserError(f"--out {settings.out}: {folder} cannot be written to")
-    for name in ("start_from", "backbone_weights"):
-        weights: Path | None = getattr(settings, name, None)
-        if weights is not None and not weights.is_file():
-            raise UserError(f"--{name.replace('_', '-')} {weights}: no such file")
+    if settings.start_from is not None and not settings.start_from.is_file():
+        raise UserError(f"--start-from {settings.start_from}: no such file")
     # torch's threads else spin at every barrier: on a core that something else uses too, ten times
     # the time. OpenMP reads it once, as torch is loaded.
     os.environ.setdefault("OMP_WAIT_POLICY", "passive")

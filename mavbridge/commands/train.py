@@ -10,19 +10,9 @@ from rich.progress import Progress, TaskID
 from rich.text import Text
 
 from mavbridge.commands.output import progress_bar
-from mavbridge.config.episodes import (
-    CHECK_COURSE_SEED,
-    COURSE_SEEDS,
-    MAX_EPISODES,
-    SIMULATOR,
-)
-from mavbridge.config.flags import check_range
-from mavbridge.config.policy import PolicyConfig
 from mavbridge.core.clock import NS_PER_S, MonotonicClock
 from mavbridge.core.errors import UserError
-from mavbridge.core.extras import require_packages
 from mavbridge.core.stopping import INTERRUPTED, stop_on_signals
-from mavbridge.flight.policies import load_configured_policy
 from policy.contract import Contract
 from policy.data.flight_data import DatasetError, FlightData, common_frame, common_terms
 from policy.data.flight_folders import find_flights, leave_out_failed, read_flight
@@ -34,7 +24,7 @@ from policy.nets.toge import BuiltinConfig
 from policy.nets.world_model.config import WorldModelConfig
 from policy.training.policy_run import train_policy
 from policy.training.report import Hooks, TrainingProgress, TrainResult
-from policy.training.run_folder import TrainingStoppedError
+from policy.training.run import TrainingStoppedError
 from policy.training.settings import RunSettings, TrainSettings, WorldModelSettings
 from policy.training.world_model_run import train_world_model
 
@@ -46,15 +36,9 @@ def run_policy_training(paths: Sequence[Path], settings: TrainSettings) -> int:
     """
     require_devices(settings.device)
     network = builtin_config(settings.policy, image_size=settings.image_size)
-    check_range("check-flights", settings.check_flights, 0, MAX_EPISODES, "")
-    check = None
-    if settings.check_flights:
-        require_packages("--check-flights", SIMULATOR)
-        check = partial(share_of_gates, settings=settings)
-
     flights = _read_flights(paths, settings)
     network = fit_to_flights(network, flights, settings)
-    return _finish(lambda hooks: train_policy(flights, network, settings, hooks, check))
+    return _finish(lambda hooks: train_policy(flights, network, settings, hooks))
 
 
 def run_world_model_training(paths: Sequence[Path], settings: WorldModelSettings) -> int:
@@ -66,20 +50,6 @@ def run_world_model_training(paths: Sequence[Path], settings: WorldModelSettings
         raise DatasetError(f"a world model learns from flights by sticks, these were by {action}")
     config = replace(config, contract=Contract(state_frame=common_frame(flights)))
     return _finish(lambda hooks: train_world_model(flights, config, settings, hooks))
-
-
-def share_of_gates(checkpoint: Path, settings: TrainSettings) -> float:
-    """Return the share of gates that a checkpoint passes at two rates on all check courses."""
-    from mavbridge.simulation.flight import SimulatedFlight
-
-    wanted = PolicyConfig(policy=settings.policy, checkpoint=checkpoint, dual_rate=True)
-    first, passed, total = COURSE_SEEDS[settings.check_courses] + CHECK_COURSE_SEED, 0, 0
-    with load_configured_policy(wanted, MonotonicClock()) as loaded:
-        for index in range(settings.check_flights):
-            flight = SimulatedFlight(course_seed=first + index, seed=index)
-            result = flight.fly(loaded.runner)
-            passed, total = passed + result.gates_passed, total + result.gates_total
-    return passed / total
 
 
 def fit_to_flights(
@@ -137,8 +107,6 @@ def _finish(train: Callable[[Hooks], TrainResult]) -> int:
     console.print(f"{result.checkpoint}: {result.steps} steps", soft_wrap=True)
     if result.validation is not None:
         console.print(result.validation.describe(), soft_wrap=True)
-    if result.score is not None:
-        console.print(f"closed-loop score {result.score:.3f}")
     return 0
 
 

@@ -24,9 +24,6 @@ ConditionsKind = Literal["nominal", "random", "held-out", "unseen"]
 COURSE_SEEDS: dict[CourseKind, int] = {"easy": 0, "race": 1_000_000_000, "loop": 2_000_000_000}
 """First seed of each family (`sitl.course`)."""
 
-CHECK_COURSE_SEED = 900_000
-"""First seed of the courses flown during training; never learned from or evaluated on."""
-
 HELD_OUT_COURSE_SEED = 1_000_000
 """First seed of the evaluation's courses; nothing is ever trained on them."""
 
@@ -155,7 +152,7 @@ class DemonstrateConfig(Ranged):
         check_range("speed", self.speed, 1.5, 14 if self.action == "rates" else 10, "m/s")
         if self.solve_time > 0 and self.policy.checkpoint is None:
             raise UserError("--solve-time is the student's: give its --checkpoint")
-        check_range("seed", self.policy.seed, 0, CHECK_COURSE_SEED // MAX_EPISODES - 1, "")
+        check_range("seed", self.policy.seed, 0, HELD_OUT_COURSE_SEED // MAX_EPISODES - 1, "")
 
     @property
     def first_course_seed(self) -> int:

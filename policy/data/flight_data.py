@@ -69,8 +69,6 @@ class FlightData:
     """[N] exposures."""
     gate: FloatArray
     """[N, 7], see ``GATE_DIM``."""
-    fingerprint: str
-    """Changes with the images."""
     decode: Callable[[], Iterator[ImageArray]]
     """Yields the images [H, W, 3] uint8 RGB in the order of ``captured_ns``."""
     terms: ActionTerms = STICK_TERMS

@@ -21,7 +21,7 @@ from policy.data.flight_data import (
     Nanoseconds,
 )
 from policy.data.flight_video import decode_images, video_parts, with_images
-from policy.data.tables import file_digest, parse_state_frame, read_rows, stamps, vectors
+from policy.data.tables import parse_state_frame, read_rows, stamps, vectors
 from policy.files import read_object, why_unreadable
 from policy.motion.stick_loop import StickLoop, rates_contract
 
@@ -153,7 +153,6 @@ def read_flight(folder: Path) -> FlightData:
         age_ns=_ages(ticks),
         captured_ns=stamps(name, frames, "captured_ns"),
         gate=_gates(name, frames),
-        fingerprint=file_digest(video),
         decode=partial(decode_video, video, numbers),
         damage=tuple(damage),
     )

@@ -1,7 +1,5 @@
 """Images of all flights, decoded once, as arrays on disk."""
 
-import errno
-import hashlib
 import shutil
 from collections.abc import Callable, Sequence
 from pathlib import Path
@@ -11,7 +9,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from policy.data.flight_data import DatasetError, FlightData, ImageArray
-from policy.files import whole_file
 from policy.preprocess import resize
 
 _SPARE_BYTES = 1 << 30
@@ -34,22 +31,21 @@ class FrameStore:
     def read(
         self,
         frames: NDArray[np.int64],
-        size: int,
         shifts: NDArray[np.int64] | None = None,
         *,
         is_mirrored: bool = False,
     ) -> ImageArray:
-        """Return images [B, size, size, 3], mirrored or not.
+        """Return images [B, height, width, 3], mirrored or not.
 
         ``shifts`` [B, 2] are pixels down and right; the edge of a shifted image is repeated.
         """
-        out = np.empty((len(frames), size, size, 3), np.uint8)
+        out = np.empty((len(frames), *self._arrays[0].shape[1:]), np.uint8)
         flights = np.searchsorted(self._starts, frames, side="right") - 1
         for row, (frame, flight) in enumerate(zip(frames, flights, strict=True)):
             image = np.asarray(self._arrays[flight][frame - self._starts[flight]])
             if shifts is not None:
                 image = _shift(image, shifts[row])
-            out[row] = resize(image, size, size)
+            out[row] = image
         return np.ascontiguousarray(out[:, :, ::-1]) if is_mirrored else out
 
 
@@ -71,48 +67,24 @@ def store_frames(
     size: int,
     progress: Callable[[float], None] = lambda _: None,
 ) -> FrameStore:
-    """Decode the images that ``folder`` does not hold yet, and resize them as in flight.
+    """Decode all images into a folder, and resize them to ``size`` pixels a side, as in flight.
 
-    It holds one file for each flight, with images of ``size`` pixels a side, named by the digest of
-    its video and the size. ``progress`` is called with the completed fraction.
+    ``progress`` is called with the completed fraction.
     """
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-        paths = [_path(folder, flight, size) for flight in flights]
-        missing = {p: f for p, f in zip(paths, flights, strict=True) if not p.is_file()}
-        need = sum(len(flight.captured_ns) for flight in missing.values()) * size * size * 3
-        free = shutil.disk_usage(folder).free
-        if need + _SPARE_BYTES > free:
-            raise DatasetError(
-                f"{folder}: the decoded images take {need / 1e9:.1f} GB and {free / 1e9:.1f} GB "
-                "are free: choose a smaller --image-size, fewer flights, or an --out elsewhere"
-            )
-        for index, (path, flight) in enumerate(missing.items()):
-            _decode(path, flight, size)
-            progress((index + 1) / len(missing))
-    except OSError as error:
-        raise disk_error(folder, error) from error
-    return FrameStore([np.memmap(p, np.uint8, mode="r").reshape(-1, size, size, 3) for p in paths])
-
-
-def disk_error(path: Path, error: OSError) -> DatasetError:
-    """Return the error to raise for a file that could not be written."""
-    if error.errno in (errno.ENOSPC, errno.EDQUOT):
-        return DatasetError(f"{path}: the disk is full: make room, or write --out elsewhere")
-    return DatasetError(f"{path}: {error.strerror or error}")
-
-
-def _path(folder: Path, flight: FlightData, size: int) -> Path:
-    key = f"{flight.fingerprint} {len(flight.captured_ns)}"
-    name = hashlib.sha256(key.encode()).hexdigest()[:20]
-    return folder / f"{name}.{size}x{size}.rgb"
-
-
-def _decode(path: Path, flight: FlightData, size: int) -> None:
-    """Store all images.
-
-    Written, not memory-mapped: a full disk under a map would kill the process.
-    """
-    with whole_file(path) as draft, draft.open("wb") as file:
-        for image in flight.decode():
-            file.write(np.ascontiguousarray(resize(image, size, size)).data)
+    folder.mkdir(parents=True, exist_ok=True)
+    need = sum(len(flight.captured_ns) for flight in flights) * size * size * 3
+    free = shutil.disk_usage(folder).free
+    if need + _SPARE_BYTES > free:
+        raise DatasetError(
+            f"{folder}: the decoded images take {need / 1e9:.1f} GB and {free / 1e9:.1f} GB "
+            "are free: choose a smaller --image-size, fewer flights, or an --out elsewhere"
+        )
+    arrays = []
+    for index, flight in enumerate(flights):
+        path = folder / f"{index}.rgb"
+        with path.open("wb") as file:  # not memory-mapped: a full disk under a map kills a process
+            for image in flight.decode():
+                file.write(np.ascontiguousarray(resize(image, size, size)).data)
+        arrays.append(np.memmap(path, np.uint8, mode="r").reshape(-1, size, size, 3))
+        progress((index + 1) / len(flights))
+    return FrameStore(arrays)

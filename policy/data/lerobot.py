@@ -25,7 +25,7 @@ from policy.contract import (
 )
 from policy.data import lerobot_format as names
 from policy.data.flight_data import GATE_DIM, DatasetError, FlightData, ImageArray, Nanoseconds
-from policy.data.tables import file_digest, numbers, parse_state_frame, stamps, vectors
+from policy.data.tables import numbers, parse_state_frame, stamps, vectors
 from policy.files import library_name, read_object, why_unreadable
 
 _PATH = re.compile(r"(?:[^{}]|\{(?:chunk_index|file_index|video_key)(?::0?\dd)?\})*")
@@ -48,7 +48,6 @@ def read_dataset(folder: Path, camera_key: str | None = None) -> list[FlightData
     """
     info = _read_info(folder, camera_key)
     rows = _read_episodes(info)
-    digests = {path: file_digest(path) for path in {row.video for row in rows}}
     columns = ["episode_index", "timestamp", names.STATE_KEY, names.ACTION_KEY]
     columns += [name for name in names.STAMPS if name in info.features]
     if names.SENT in info.features and names.SENT_AT in info.features:
@@ -66,7 +65,7 @@ def read_dataset(folder: Path, camera_key: str | None = None) -> list[FlightData
                     f"{row.name}: {path} holds {part.num_rows} rows of it, meta/episodes says "
                     f"{row.length}: the dataset is incomplete"
                 )
-            flights.append(_flight(info, row, part, digests[row.video]))
+            flights.append(_flight(info, row, part))
     return flights
 
 
@@ -215,7 +214,7 @@ def _rows_of(table: pa.Table, row: _Row) -> pa.Table:
     return table.filter(pa.array(table["episode_index"].to_numpy() == row.episode_index))
 
 
-def _flight(info: _Info, row: _Row, table: pa.Table, digest: str) -> FlightData:
+def _flight(info: _Info, row: _Row, table: pa.Table) -> FlightData:
     seconds = numbers(row.name, table, "timestamp").astype(np.float64)
     if not np.isfinite(seconds).all():
         raise DatasetError(f"{row.name}: timestamp holds NaN or infinity")
@@ -247,7 +246,6 @@ def _flight(info: _Info, row: _Row, table: pa.Table, digest: str) -> FlightData:
         age_ns=np.array([], dtype=np.int64),
         captured_ns=at(names.CAPTURED),
         gate=np.full((row.length, GATE_DIM), np.nan, dtype=np.float32),
-        fingerprint=f"{digest} {info.camera} {row.episode_index}",
         decode=partial(_decode, info, row),
     )
 

@@ -1,6 +1,5 @@
 """Reading of JSON and Arrow columns; faults are raised as ``DatasetError``."""
 
-import hashlib
 from pathlib import Path
 from typing import cast, get_args
 
@@ -128,9 +127,3 @@ def _read_groups(path: Path, damage: list[str]) -> tuple[pa.Table, NDArray[np.in
         damage.append(f"{path} is damaged: {lost} of {count} rows were skipped")
     table = pa.concat_tables(groups) if groups else schema.empty_table()
     return table, np.concatenate(numbers)
-
-
-def file_digest(path: Path) -> str:
-    """Return the SHA-256 digest of a file."""
-    with path.open("rb") as file:
-        return hashlib.file_digest(file, "sha256").hexdigest()

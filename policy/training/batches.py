@@ -1,12 +1,11 @@
 """Batches of training samples: a pure function of the seed and the step, prepared ahead.
 
-So a resumed run sees the same data as an uninterrupted one, and no random state has to be saved.
 For the stages that learn from features or latents, images are encoded once and stored.
 """
 
 import math
 from collections import deque
-from collections.abc import Callable, Generator, Iterator, Sequence
+from collections.abc import Callable, Generator, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from functools import lru_cache
@@ -21,7 +20,7 @@ from torch import Tensor
 
 from policy.contract import Contract, FloatArray
 from policy.data.flight_data import ImageArray
-from policy.data.frames import FrameStore, disk_error
+from policy.data.frames import FrameStore
 from policy.data.interpolation import Indices
 from policy.data.samples import Timeline, TrainingSamples
 from policy.training.parallel import TensorBatch, row_parts
@@ -53,8 +52,6 @@ T = TypeVar("T")
 ENCODE_BATCH = 64
 Encode: TypeAlias = Callable[[Indices, bool], Tensor]
 """(images, True to mirror all of them) -> [B, D]."""
-Job: TypeAlias = tuple[tuple[Indices, bool], ...]
-"""Images to encode between two checks of the time, each part plain or mirrored."""
 
 
 def disturb(images: ImageArray, random: np.random.Generator) -> None:
@@ -146,29 +143,17 @@ class Batch(TensorBatch):
 
 
 class FeatureStore:
-    """Features or latents on disk, of plain and of mirrored images."""
+    """Features or latents of some images on disk, plain and perhaps mirrored."""
 
-    def __init__(self, path: Path, dim: int, row_of: Indices) -> None:
-        """Open a file of float16 rows, each ``dim`` wide.
-
-        ``row_of`` [2, images] is the row of each image, plain and mirrored; -1: not encoded.
-        """
-        self._rows = np.memmap(path, np.float16, mode="r").reshape(-1, dim)
-        self._row_of = row_of
-        self.frames = np.flatnonzero((row_of >= 0).any(axis=0))
-        """Images that were encoded, plain or mirrored."""
-        self.has_mirrored = bool((row_of[1, self.frames] >= 0).all())
-        """True if all these images were encoded mirrored too."""
-
-    def ways(self, frames: Indices, is_mirrored: NDArray[np.bool_]) -> NDArray[np.bool_]:
-        """Return ``is_mirrored`` [B], changed to the other variant if only that one was encoded."""
-        is_there = self._row_of[is_mirrored.astype(int), frames] >= 0
-        return np.where(is_there, is_mirrored, ~is_mirrored)
+    def __init__(self, rows: NDArray[np.float16], frames: Indices) -> None:
+        """Take rows [1 or 2, N, D] of ascending ``frames`` [N]: plain, then mirrored."""
+        self._rows = rows
+        self.frames = frames
 
     def read(self, frames: Indices, is_mirrored: NDArray[np.bool_]) -> FloatArray:
         """[B, D]"""
-        rows = self._row_of[is_mirrored.astype(int), frames]
-        return np.asarray(self._rows[rows], dtype=np.float32)
+        rows = self._rows[is_mirrored.astype(int), np.searchsorted(self.frames, frames)]
+        return np.asarray(rows, dtype=np.float32)
 
 
 def next_of(among: Indices, step: int, count: int, seed: int) -> Indices:
@@ -198,7 +183,7 @@ class Batches:
         self._timesteps, self._settings, self._seed = timesteps, settings, settings.seed
         self.frames = timeline.frames
 
-    def with_images(self, step: int, size: int) -> Batch:
+    def with_images(self, step: int) -> Batch:
         """Return a batch to train encoder and head."""
         count = self._settings.batch_size
         random = np.random.default_rng([self._seed, step])
@@ -206,7 +191,7 @@ class Batches:
         is_mirrored = self._mirrored(random, count)
         most = round(SHIFT * self._settings.image_size)
         shifts = random.integers(-most, most + 1, size=(count, 2))
-        images = self._store.read(frames, size, shifts)
+        images = self._store.read(frames, shifts)
         images[is_mirrored] = images[is_mirrored, :, ::-1]
         if self._settings.disturb:
             disturb(images, random)
@@ -221,12 +206,12 @@ class Batches:
         count = self._settings.head_batch_size
         random = np.random.default_rng([self._seed, step])
         frames = next_of(features.frames, step, count, self._seed)
-        is_mirrored = features.ways(frames, self._mirrored(random, count))
+        is_mirrored = self._mirrored(random, count)
         rows = features.read(frames, is_mirrored)
         samples = self._samples(random, frames, is_mirrored, 1)
         return self._batch(random, samples, len(frames), features=rows)
 
-    def validation(self, samples: int, size: int) -> Iterator[Batch]:
+    def validation(self, samples: int) -> Iterator[Batch]:
         """Return the same samples at each call, not augmented, with inputs hidden as in training.
 
         Otherwise, validation by body rates would favour weights that copy.
@@ -238,13 +223,12 @@ class Batches:
             part = chosen[start : start + count]
             ticks = self._timeline.draw_ticks(part, random)
             plain = self._timeline.samples(part, ticks, random if self._timeline.by_rates else None)
-            images = self._store.read(part, size)
+            images = self._store.read(part)
             yield self._batch(random, plain, len(part), images=images)
 
     def images(self, frames: Indices, *, is_mirrored: bool) -> Tensor:
-        """Return images [B, height, width, 3] uint8 at full size, plain or all mirrored."""
-        size = self._settings.image_size
-        return torch.from_numpy(self._store.read(frames, size, is_mirrored=is_mirrored))
+        """Return images [B, height, width, 3] uint8, plain or all mirrored."""
+        return torch.from_numpy(self._store.read(frames, is_mirrored=is_mirrored))
 
     def _mirrored(self, random: np.random.Generator, count: int) -> NDArray[np.bool_]:
         return (random.random(count) < 0.5) & self._settings.mirror
@@ -334,53 +318,25 @@ def normalise_image(image: Tensor, contract: Contract) -> Tensor:
     return (image - mean) / std
 
 
-def both_ways(frames: Indices, *, mirror: bool) -> list[Job]:
-    """Return jobs that each encode some images both plain and mirrored, or only plain."""
-    ways = (False, True) if mirror else (False,)
-    return [tuple((part, way) for way in ways) for part in _parts(frames)]
-
-
-def one_way_first(frames: Indices, *, mirror: bool) -> list[Job]:
-    """Return jobs that encode every image in one variant first, and then in the other variant.
-
-    If time is short, two images teach more than one image in both variants.
-    """
-    parts = _parts(frames)
-    jobs: list[Job] = [((part, mirror and index % 2 == 1),) for index, part in enumerate(parts)]
-    if mirror:
-        jobs += [((part, index % 2 == 0),) for index, part in enumerate(parts)]
-    return jobs
-
-
-def _parts(frames: Indices) -> list[Indices]:
-    return [frames[start : start + ENCODE_BATCH] for start in range(0, len(frames), ENCODE_BATCH)]
-
-
-def encode_rows(
+def encode_frames(
     path: Path,
-    jobs: Sequence[Job],
+    frames: Indices,
     encode: Encode,
     *,
-    dim: int,
-    should_continue: Callable[[float], bool],
+    mirror: bool,
+    progress: Callable[[float], None],
 ) -> FeatureStore:
-    """Encode images to ``path``, as rows of ``dim`` float16, in the order of the jobs.
+    """Encode images with ascending numbers to ``path``, each once, or plain and mirrored.
 
-    ``should_continue`` is called with the completed share; False ends the encoding.
+    ``progress`` is called with the completed share.
     """
-    most = max(int(part.max()) for job in jobs for part, _ in job)
-    row_of = np.full((2, most + 1), -1, np.int64)
-    rows = 0
-    try:
-        with path.open("wb") as file:
-            for index, job in enumerate(jobs):
-                if index and not should_continue(index / len(jobs)):
-                    break
-                for part, is_mirrored in job:
-                    encoded = encode(part, is_mirrored).to(torch.float16)
-                    file.write(encoded.cpu().numpy().tobytes())
-                    row_of[int(is_mirrored), part] = rows + np.arange(len(part))
-                    rows += len(part)
-    except OSError as error:
-        raise disk_error(path, error) from error
-    return FeatureStore(path, dim, row_of)
+    ways = (False, True) if mirror else (False,)
+    parts = np.array_split(frames, -(-len(frames) // ENCODE_BATCH))
+    with path.open("wb") as file:
+        for way in ways:
+            for index, part in enumerate(parts):
+                encoded = encode(part, way).to(torch.float16)
+                file.write(encoded.cpu().numpy().tobytes())
+                progress((way + index / len(parts)) / len(ways))
+    rows = np.memmap(path, np.float16, mode="r").reshape(len(ways), len(frames), -1)
+    return FeatureStore(rows, frames)

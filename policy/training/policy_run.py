@@ -1,45 +1,35 @@
 """Training of a policy from flights: encoder and head, then the head alone on stored features."""
 
 import copy
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import asdict, replace
 from pathlib import Path
-from typing import TypeAlias
 
 import numpy as np
 import torch
 from torch import Tensor, nn
 
-from policy.checkpoints.networks import load_checkpoint, read_torch, save_checkpoint
+from policy.checkpoints.networks import load_checkpoint, save_checkpoint
 from policy.contract import FLIGHT_TERMS
 from policy.data.flight_data import FlightData, Nanoseconds
 from policy.data.flight_folders import read_ages
-from policy.data.frames import FrameStore
 from policy.data.interpolation import Indices
 from policy.data.samples import Timeline
-from policy.engines.openvino_cpu import BulkEncoder
 from policy.errors import PolicyError
-from policy.nets.backbones import load_imagenet_state
 from policy.nets.toge import BuiltinConfig, BuiltinPolicy, build_policy
 from policy.training.batches import (
     ENCODE_BATCH,
     Batch,
     Batches,
-    Encode,
     FeatureStore,
-    encode_rows,
+    encode_frames,
     normalise_image,
-    one_way_first,
 )
 from policy.training.parallel import StepLoss, computing_in
-from policy.training.report import Hooks, PolicyValidation, TrainResult, Validation
-from policy.training.run import TrainingRun, open_run
-from policy.training.run_folder import RunFolder
+from policy.training.report import Hooks, PolicyValidation, TrainResult
+from policy.training.run import TrainingRun, work_folder
 from policy.training.settings import MAX_AGE_MS, TrainingStage, TrainSettings, policy_stages
 from policy.training.trainee import Trainee, refresh_batch_norm, validate
-
-Check: TypeAlias = Callable[[Path], float]
-"""Flies a checkpoint in closed loop and returns a score; higher is better."""
 
 VALIDATION_SAMPLES = 256
 NORM_IMAGES = 1024
@@ -54,42 +44,35 @@ HEAD_RATE = 3
 
 
 def train_policy(
-    flights: Sequence[FlightData],
-    network: BuiltinConfig,
-    settings: TrainSettings,
-    hooks: Hooks,
-    check: Check | None = None,
+    flights: Sequence[FlightData], network: BuiltinConfig, settings: TrainSettings, hooks: Hooks
 ) -> TrainResult:
-    """Train, and write the weights that are best on held-out flights to ``settings.out``.
-
-    Best means least validation loss, or highest score by ``check``.
-    """
-    folder = open_run(settings, network, flights)
-    return _PolicyRun(flights, network, settings, folder, hooks, check).finish()
+    """Train, and write the weights that are best on held-out flights to ``settings.out``."""
+    with work_folder(settings) as folder:
+        return _PolicyRun(flights, network, settings, hooks, folder).finish()
 
 
 class _PolicyRun(TrainingRun[Trainee, Batch]):
-    validation_type, encoder_learns_alone = PolicyValidation, False
+    encoder_learns_alone = False
 
     def __init__(
         self,
         flights: Sequence[FlightData],
         network: BuiltinConfig,
         settings: TrainSettings,
-        folder: RunFolder,
         hooks: Hooks,
-        check: Check | None,
+        folder: Path,
     ) -> None:
         self.settings: TrainSettings = settings
-        self._network, self._check = network, check
+        self._network = network
         self._ages_ns = _ages(flights, settings)
         trainee = _starting_trainee(network, settings)
         trainee.to(settings.device, memory_format=torch.channels_last)  # type: ignore[call-overload]
-        super().__init__(folder, trainee, policy_stages(settings), hooks)
-        store, kept, held = self.store_flights(flights)
-        self._flights = [flights[index] for index in kept]
-        self._batches = self._batches_of(flights, kept, store)
-        self._held = self._batches_of(flights, held, store) if held else None
+        frame = network.contract.state_frame
+        stages = policy_stages(settings)
+        super().__init__(flights, trainee, stages, hooks, folder, state_frame=frame)
+        self._flights = [flights[index] for index in self.kept]
+        self._batches = self._batches_of(flights, self.kept)
+        self._held = self._batches_of(flights, self.held) if self.held else None
         is_measured = any((flight.age_ns > 0).any() for flight in flights)
         if settings.ages is None and not is_measured:
             low_ms, high_ms = USUAL_AGES_MS
@@ -97,17 +80,10 @@ class _PolicyRun(TrainingRun[Trainee, Batch]):
                 f"no policy looked in these flights: image ages of {low_ms:g} to {high_ms:g} ms "
                 "are assumed (--ages names a flight of a policy on this computer, or a range)"
             )
-        if not held:
-            self.note("no flight is held out: the last weights will be kept, not the best")
         targets = np.concatenate([flight.target for flight in self._flights])
         for each in (self.trainee, self.average):
             each.set_sticks(targets)
-        self._features: FeatureStore | None = None
-        self._held_features: list[Batch] | None = None
-
-    def finish(self) -> TrainResult:
-        result = super().finish()
-        return result if self._check is None else replace(result, score=self.position.best)
+        self._encoded: FeatureStore | None = None
 
     def learning_rate(self, stage: TrainingStage) -> float:
         if not stage.trains_encoder:
@@ -117,104 +93,66 @@ class _PolicyRun(TrainingRun[Trainee, Batch]):
     def encoder(self, trainee: Trainee) -> nn.Module:
         return trainee.policy.backbone
 
-    def encode(self, stage: TrainingStage, *, is_new: bool) -> None:
-        settings, trainee, every = self.settings, self.trainee, self._batches.frames
-        if is_new and not settings.freeze_encoder:
-            count = min(NORM_IMAGES, len(every))
-            chosen = every[np.linspace(0, len(every) - 1, count).astype(int)]
-            parts = np.array_split(chosen, max(1, count // ENCODE_BATCH))
-            with computing_in(self.device, self.bf16):
-                refresh_batch_norm(trainee, (self._images(part, False) for part in parts))
-        frames = np.random.default_rng([settings.seed, 3]).permutation(every)
-        self._features = encode_rows(
-            self.folder.features,
-            one_way_first(frames, mirror=settings.mirror),
-            self._bulk_encode(),
-            dim=trainee.policy.backbone.out_dim,
-            should_continue=self.may_encode(stage),
+    def encode(self) -> None:
+        every = self._batches.frames
+        count = min(NORM_IMAGES, len(every))
+        chosen = every[np.linspace(0, len(every) - 1, count).astype(int)]
+        parts = np.array_split(chosen, max(1, count // ENCODE_BATCH))
+        with computing_in(self.device, self.bf16):
+            refresh_batch_norm(self.trainee, (self._images(part, False) for part in parts))
+        self._encoded = encode_frames(
+            self.features,
+            every,
+            self._encode_images,
+            mirror=self.settings.mirror,
+            progress=lambda done: self.report_work(f"encoding, {done:.0%}"),
         )
-        if (left := len(every) - len(self._features.frames)) > 0:
-            self.note(f"{left} images were not encoded for lack of time: the head sees the rest")
 
-    def _bulk_encode(self) -> Encode:
-        """Encode images with the frozen backbone, on the fastest engine."""
-        if self.device.type == "cpu":
-            bulk = BulkEncoder(self.trainee.policy, "bf16" if self.bf16 else "f32")
-            return lambda frames, is_mirrored: torch.from_numpy(
-                bulk(self._images(frames, is_mirrored).numpy())
-            )
-
-        @torch.inference_mode()
-        def in_torch(frames: Indices, is_mirrored: bool) -> Tensor:
-            images = self._images(frames, is_mirrored)
-            with computing_in(self.device, self.bf16):
-                features: Tensor = self.trainee.policy.backbone(images)
-            return features
-
-        return in_torch
+    @torch.inference_mode()
+    def _encode_images(self, frames: Indices, is_mirrored: bool) -> Tensor:
+        with computing_in(self.device, self.bf16):
+            features: Tensor = self.trainee.policy.backbone(self._images(frames, is_mirrored))
+        return features
 
     def _images(self, frames: Indices, is_mirrored: bool) -> Tensor:
-        """Return normalised images [B, 3, H, W] of full size, without augmentation."""
+        """Return normalised images [B, 3, H, W], without augmentation."""
         images = self._batches.images(frames, is_mirrored=is_mirrored).to(self.device)
         return normalise_image(images.permute(0, 3, 1, 2).float() / 255, self._network.contract)
 
-    def batch_maker(self, stage: TrainingStage) -> Callable[[int], Batch]:
-        features = self._features
+    def batch_maker(self) -> Callable[[int], Batch]:
+        features = self._encoded
         if features is not None:
             return lambda step: self._batches.with_features(step, features)
-        return lambda step: self._batches.with_images(step, stage.image_size)
+        return self._batches.with_images
 
     def losses(self, trainee: Trainee, batch: Batch) -> StepLoss:
         loss: StepLoss = trainee(batch)
         return loss
 
-    def validate(self, stage: TrainingStage) -> Validation | None:
+    def validate(self) -> PolicyValidation | None:
         if self._held is None:
             return None
         with computing_in(self.device, self.bf16):
-            held: Iterable[Batch] | None = self._held_features
-            if held is None:
-                batches = self._held.validation(VALIDATION_SAMPLES, stage.image_size)
-                held = (batch.to(self.device) for batch in batches)
-                if not stage.trains_encoder:  # it no longer changes: encode once
-                    held = self._held_features = [self.average.encoded(batch) for batch in held]
-            return validate(self.average, held)
-
-    def score(self, validation: Validation | None, *, is_last: bool) -> float | None:
-        if self._check is None:
-            return super().score(validation, is_last=is_last)
-        position = self.position
-        if not is_last and position.validations % self.settings.check_every:
-            return None
-        trial = self.folder.path / "trial.safetensors"
-        self._write(trial)
-        score = self._check(trial)
-        trial.unlink(missing_ok=True)
-        self.folder.log({"step": position.step, "score": score})
-        return score
+            batches = self._held.validation(VALIDATION_SAMPLES)
+            return validate(self.average, (batch.to(self.device) for batch in batches))
 
     def export(self) -> None:
-        self._write(self.settings.out)
-
-    def _batches_of(
-        self, flights: Sequence[FlightData], indices: list[int], store: FrameStore
-    ) -> Batches:
-        chosen = [flights[index] for index in indices]
-        return Batches(
-            Timeline(chosen, self._network.contract, self._ages_ns),
-            store.only(indices),
-            timesteps=self._network.schedule.num_train_timesteps,
-            settings=self.settings,
-        )
-
-    def _write(self, path: Path) -> None:
         card = self.card(
             flights=len(self._flights),
             images=sum(len(flight.captured_ns) for flight in self._flights),
             feature_ages_ms=(self._ages_ns[[0, -1]] / NS_PER_MS).tolist(),
         )
         policy = copy.deepcopy(self.average.policy)
-        save_checkpoint(path, policy, training=card, packed=self.settings.pack)
+        save_checkpoint(self.settings.out, policy, training=card, packed=self.settings.pack)
+
+    def _batches_of(self, flights: Sequence[FlightData], indices: list[int]) -> Batches:
+        chosen = [flights[index] for index in indices]
+        return Batches(
+            Timeline(chosen, self._network.contract, self._ages_ns),
+            self.store.only(indices),
+            timesteps=self._network.schedule.num_train_timesteps,
+            settings=self.settings,
+        )
 
 
 def _ages(flights: Sequence[FlightData], settings: TrainSettings) -> Nanoseconds:
@@ -244,10 +182,7 @@ def _starting_trainee(network: BuiltinConfig, settings: TrainSettings) -> Traine
         torch.manual_seed(settings.seed)
         if settings.start_from is not None:
             return Trainee(_checkpoint(network, settings.start_from), settings.gate_weight)
-        policy = build_policy(network)
-        if settings.backbone_weights is not None:
-            load_imagenet_state(policy.backbone, read_torch(settings.backbone_weights))
-        return Trainee(policy, settings.gate_weight)
+        return Trainee(build_policy(network), settings.gate_weight)
 
 
 def _checkpoint(network: BuiltinConfig, path: Path) -> BuiltinPolicy:

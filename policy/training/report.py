@@ -34,25 +34,21 @@ class WorldModelValidation:
     loss: float
     reconstruction_psnr_db: float
     """PSNR of encoded and decoded frames: the upper limit for imagined ones."""
-    psnr_db: float | None = None
-    """PSNR of imagined frames, all of a future; None while only the autoencoder learns."""
-    copy_psnr_db: float | None = None
+    psnr_db: float
+    """PSNR of imagined frames, all of a future."""
+    copy_psnr_db: float
     """PSNR of repeating the last frame."""
-    velocity_error_mps: float | None = None
+    velocity_error_mps: float
     """Mean length of the velocity error in the last imagined state."""
-    held_velocity_error_mps: float | None = None
+    held_velocity_error_mps: float
     """Mean length of the velocity error if the velocity is held constant."""
 
     def describe(self) -> str:
         """Return one line for the user."""
-        line = (
-            f"held-out loss {self.loss:.4f}, frames coded to {self.reconstruction_psnr_db:.1f} dB"
-        )
-        if self.psnr_db is None:
-            return line
         return (
-            f"{line}, imagined to {self.psnr_db:.1f} dB (last frame copied {self.copy_psnr_db:.1f} "
-            f"dB), velocity at the end off by {self.velocity_error_mps:.2f} m/s (held "
+            f"held-out loss {self.loss:.4f}, frames coded to {self.reconstruction_psnr_db:.1f} dB, "
+            f"imagined to {self.psnr_db:.1f} dB (last frame copied {self.copy_psnr_db:.1f} dB), "
+            f"velocity at the end off by {self.velocity_error_mps:.2f} m/s (held "
             f"{self.held_velocity_error_mps:.2f} m/s)"
         )
 
@@ -93,5 +89,3 @@ class TrainResult:
     steps: int
     validation: Validation | None
     """Validation of the exported weights; None if no flights were held out."""
-    score: float | None
-    """Score of the closed-loop check, if there was one."""

@@ -1,15 +1,14 @@
 """Settings of training, each a flag of a command, and the stages of a run.
 
-First the encoder learns. A policy's encoder learns together with its head, on images that grow from
-stage to stage: the encoders are fully convolutional, and a small image costs a fraction. A world
-model's encoder learns alone. Then the encoder is frozen, each image is encoded once, and the rest
-learns from the stored features, about ten times as many steps.
+First the encoder learns: a policy's together with its head, a world model's alone. Then the encoder
+is frozen, each image is encoded once, and the rest learns from the stored features, about ten times
+as many steps.
 """
 
 import math
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal
+from typing import Literal, NamedTuple
 
 from policy.errors import PolicyError
 
@@ -31,8 +30,6 @@ _RANGES: dict[str, tuple[float, float]] = {
     "repeats": (1, 100),
     "head_batch_size": (1, 100_000),
     "gate_weight": (0, 10_000),
-    "check_flights": (0, 10_000),
-    "check_every": (1, 10_000),
     "window_batch_size": (1, 4096),
     "autoencoder_share": (0.01, 0.99),
     "decision_share": (0, 1),
@@ -44,12 +41,12 @@ class RunSettings:
     """Settings of every training run."""
 
     out: Path
-    """Checkpoint to write (.safetensors); an unfinished run is kept beside it."""
+    """Checkpoint to write (.safetensors); the log of the run is kept beside it."""
     minutes: float | None = None
     """Length of the training; 45 if neither this nor --steps is given."""
     steps: int | None = None
     """Length of the training in optimiser steps, in place of --minutes."""
-    image_size: int = 224
+    image_size: int = 96
     """Pixels along a side of the images that the encoder takes."""
     batch_size: int = 32
     """Images a step while the encoder learns."""
@@ -67,13 +64,11 @@ class RunSettings:
     """torch device: cpu, cuda, cuda:1."""
     precision: Precision = "auto"
     """Number format of the computation; auto takes bf16 where the hardware multiplies it."""
-    resume: bool = False
-    """Continue the unfinished run of --out."""
     validation_fraction: float = 0.1
     """Share of the flights that are held out."""
     validations: int | None = None
-    """Validations in the run, evenly spaced, each of which also saves the state of the run; one
-    every two minutes or fifty steps, 4 to 20, if not given."""
+    """Validations in the run, evenly spaced; one every two minutes or fifty steps, 4 to 20, if not
+    given."""
     include_failed: bool = False
     """Learn from flights, too, that crashed, were marked as bad, or missed gates."""
     camera_key: str | None = None
@@ -107,7 +102,7 @@ class RunSettings:
 
     @property
     def work_folder(self) -> Path:
-        """Folder of an unfinished run."""
+        """Folder of the log, and of the decoded images while the run lasts."""
         return self.out.with_name(self.out.stem + ".training")
 
 
@@ -124,10 +119,6 @@ class TrainSettings(RunSettings):
     default those measured in the flights, or 20 to 90 ms where no policy flew."""
     start_from: Path | None = None
     """Checkpoint to start from, e.g. after more flights were added."""
-    freeze_encoder: bool = False
-    """Train the head alone, on the features of the encoder of --start-from."""
-    backbone_weights: Path | None = None
-    """torchvision's ImageNet weights of the encoder (.pth)."""
     repeats: int = 2
     """Moments after its exposure for which an encoded image is used in a step."""
     head_batch_size: int = 256
@@ -140,20 +131,9 @@ class TrainSettings(RunSettings):
     learns; --no-disturb where brightness or colour is what the policy is to look at."""
     pack: bool = False
     """Write a checkpoint to ship, a third of the size: the encoder in int8, the rest in float16."""
-    check_flights: int = 0
-    """Courses to fly with the weights now and then; those that fly best are kept, not those with
-    the least loss. Takes the extra "sitl"."""
-    check_courses: Literal["easy", "race"] = "easy"
-    """Family of those courses."""
-    check_every: int = 5
-    """Validations between two such checks."""
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        if self.start_from is not None and self.backbone_weights is not None:
-            raise PolicyError("--start-from holds an encoder: leave out --backbone-weights")
-        if self.freeze_encoder and self.start_from is None:
-            raise PolicyError("--freeze-encoder needs a trained one: give --start-from CHECKPOINT")
         _ = self.age_range_ms
 
     @property
@@ -194,53 +174,30 @@ class WorldModelSettings(RunSettings):
     """Share of the windows in which the model has to find the actions."""
 
 
-_SIZES = ((3 / 7, 0.35, 0.20), (5 / 7, 0.30, 0.15), (1.0, 0.10, 0.10))
-"""Image size relative to the full one, share of time, share of steps; the head gets the rest."""
-MIN_IMAGE_SIZE = 96
-"""Below this size, an image costs a CPU hardly less."""
+ENCODER_SHARE_OF_TIME, ENCODER_SHARE_OF_STEPS = 0.75, 0.45
+"""Share of a policy's training in which its encoder learns."""
 
 
-@dataclass(frozen=True)
-class TrainingStage:
-    """Part of a run, between two fractions of its budget."""
+class TrainingStage(NamedTuple):
+    """Part of a run, up to a fraction of its budget."""
 
     name: str
-    start: float
     end: float
-    image_size: int
-    """Pixels along a side."""
     trains_encoder: bool
-    is_scored: bool
-    """Its weights may be exported."""
 
 
 def policy_stages(settings: TrainSettings) -> tuple[TrainingStage, ...]:
-    """Return the stages of a policy's training, in order; they fill the budget."""
-    full, shares = settings.image_size, dict[int, float]()
-    if not settings.freeze_encoder:
-        for wanted, of_time, of_steps in _SIZES:
-            scale = max(wanted, min(MIN_IMAGE_SIZE / full, 1.0))
-            # Below the full size, a multiple of 32, the stride of all encoders.
-            size = full if scale == 1.0 else min(full, round(full * scale / 32) * 32)
-            share = of_time if settings.steps is None else of_steps
-            shares[size] = shares.get(size, 0.0) + share
-    stages, start = [], 0.0
-    for size, share in shares.items():
-        name, is_scored = f"encoder and head, {size}x{size}", size == full
-        stages.append(TrainingStage(name, start, start + share, size, True, is_scored))
-        start += share
-    return (*stages, TrainingStage("head", start, 1.0, full, False, True))
+    """Return the stages: encoder and head, then the head alone."""
+    share = ENCODER_SHARE_OF_TIME if settings.steps is None else ENCODER_SHARE_OF_STEPS
+    return TrainingStage("encoder and head", share, True), TrainingStage("head", 1.0, False)
 
 
 def world_model_stages(settings: WorldModelSettings) -> tuple[TrainingStage, ...]:
     """Return the stages: autoencoder, unless an existing one is kept, then dynamics."""
-    turn, size = settings.autoencoder_share, settings.image_size
+    dynamics = TrainingStage("dynamics", 1.0, False)
     if settings.start_from is not None:
-        return (TrainingStage("dynamics", 0.0, 1.0, size, False, True),)
-    return (
-        TrainingStage("autoencoder", 0.0, turn, size, True, False),
-        TrainingStage("dynamics", turn, 1.0, size, False, True),
-    )
+        return (dynamics,)
+    return TrainingStage("autoencoder", settings.autoencoder_share, True), dynamics
 
 
 def learning_rate_factor(progress: float) -> float:

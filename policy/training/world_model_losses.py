@@ -113,7 +113,7 @@ def frame_batch(
     rows = next_of(np.arange(len(windows)), step, count, settings.seed)
     first = random.integers(0, windows.frames.shape[1] - 1, count)
     pairs = np.stack([windows.frames[rows, first], windows.frames[rows, first + 1]], axis=1)
-    images = store.read(pairs.ravel(), config.image_size)
+    images = store.read(pairs.ravel())
     images = images.reshape(count, 2, *images.shape[1:])
     is_mirrored = (random.random(count) < 0.5) & settings.mirror
     images[is_mirrored] = images[is_mirrored, :, :, ::-1]
@@ -139,9 +139,7 @@ class WindowBatches:
         count = self._settings.window_batch_size
         random = np.random.default_rng([self._seed, step])
         rows = next_of(np.arange(len(self._windows)), step, count, self._seed)
-        is_mirrored = (
-            (random.random(count) < 0.5) & self._settings.mirror & self._latents.has_mirrored
-        )
+        is_mirrored = (random.random(count) < 0.5) & self._settings.mirror
         sigma = random.uniform(0.0, CONTEXT_NOISE, (count, 1, 1, 1, 1)).astype(np.float32)
         knows_actions = random.random(count) >= self._settings.decision_share
         return self._make(random, rows, is_mirrored, sigma, knows_actions)
@@ -199,7 +197,9 @@ def autoencoder_loss(model: WorldModel, batch: FrameBatch) -> StepLoss:
     mean, log_variance = model.autoencoder.posterior(images)
     latents = mean + (0.5 * log_variance).exp() * batch.noise.flatten(0, 1)
     made = model.autoencoder.reconstruct(latents).float()
-    pixels, edges = reconstruction_errors(made, images)
+    error = made - images
+    pixels = SQUARED_WEIGHT * error.square().mean() + error.abs().mean()
+    edges = error.diff(dim=2).abs().mean() + error.diff(dim=3).abs().mean()
     mean, log_variance = mean.float(), log_variance.float()
     kl = 0.5 * (mean.square() + log_variance.exp() - 1 - log_variance).mean()
     change = mean.reshape(-1, 2, *mean.shape[1:]).diff(dim=1).square().mean()
@@ -207,13 +207,6 @@ def autoencoder_loss(model: WorldModel, batch: FrameBatch) -> StepLoss:
     loss = pixels + EDGE_WEIGHT * edges + KL_WEIGHT * kl + UNSTEADY_WEIGHT * unsteady
     metrics = {"loss": loss, "pixels": pixels, "edges": edges, "kl": kl, "unsteady": unsteady}
     return StepLoss(total=loss, metrics=metrics)
-
-
-def reconstruction_errors(made: Tensor, images: Tensor) -> tuple[Tensor, Tensor]:
-    """Return L2 and L1 [] of [B, 3, H, W] in [-1, 1], and L1 of neighbours' differences."""
-    error = made - images
-    edges = error.diff(dim=2).abs().mean() + error.diff(dim=3).abs().mean()
-    return SQUARED_WEIGHT * error.square().mean() + error.abs().mean(), edges
 
 
 def dynamics_loss(model: WorldModel, batch: WindowBatch) -> StepLoss:
@@ -319,17 +312,6 @@ def _change_std(model: WorldModel, windows: Windows, latents: FeatureStore) -> T
     normal = _normalised(model, rows.reshape(*frames.shape, *model.config.latent_shape))
     change = normal[:, context:] - normal[:, context - 1 : context]
     return change.square().mean(dim=(0, 3, 4))[..., None, None].sqrt().clamp_min(MIN_CHANGE_STD)
-
-
-@torch.no_grad()
-def validate_autoencoder(model: WorldModel, images: Tensor) -> WorldModelValidation:
-    """Return the errors of frames [N, H, W, 3] after coding; the loss is that of the pixels."""
-    made = model.decode(model.encode(images))
-    pixels, edges = reconstruction_errors(to_unit(made), to_unit(images))
-    return WorldModelValidation(
-        loss=float(pixels + EDGE_WEIGHT * edges),
-        reconstruction_psnr_db=float(psnr_db(made, images).mean()),
-    )
 
 
 @torch.no_grad()

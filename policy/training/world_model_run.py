@@ -1,6 +1,7 @@
 """Training of a world model from flights: the autoencoder, then the dynamics on stored latents."""
 
 from collections.abc import Callable, Sequence
+from pathlib import Path
 
 import numpy as np
 import torch
@@ -14,12 +15,11 @@ from policy.errors import PolicyError
 from policy.nets.world_model.autoencoder import to_unit
 from policy.nets.world_model.config import WorldModelConfig
 from policy.nets.world_model.model import WorldModel
-from policy.training.batches import FeatureStore, both_ways, encode_rows
+from policy.training.batches import FeatureStore, encode_frames
 from policy.training.parallel import StepLoss, computing_in
-from policy.training.report import Hooks, TrainResult, Validation, WorldModelValidation
-from policy.training.run import TrainingRun, open_run
-from policy.training.run_folder import RunFolder
-from policy.training.settings import TrainingStage, WorldModelSettings, world_model_stages
+from policy.training.report import Hooks, TrainResult, WorldModelValidation
+from policy.training.run import TrainingRun, work_folder
+from policy.training.settings import WorldModelSettings, world_model_stages
 from policy.training.world_model_losses import (
     FrameBatch,
     WindowBatch,
@@ -28,11 +28,9 @@ from policy.training.world_model_losses import (
     dynamics_loss,
     frame_batch,
     set_scales,
-    validate_autoencoder,
     validate_world_model,
 )
 
-VALIDATION_FRAMES = 128
 VALIDATION_WINDOWS = 128
 IMAGINED_WINDOWS = 16
 """Number of held-out windows to imagine frame by frame."""
@@ -45,93 +43,71 @@ def train_world_model(
     hooks: Hooks,
 ) -> TrainResult:
     """Train, and write the weights that are best on held-out flights to ``settings.out``."""
-    folder = open_run(settings, config, flights)
-    return _WorldModelRun(flights, config, settings, folder, hooks).finish()
+    with work_folder(settings) as folder:
+        return _WorldModelRun(flights, config, settings, hooks, folder).finish()
 
 
 class _WorldModelRun(TrainingRun[WorldModel, FrameBatch | WindowBatch]):
-    validation_type, encoder_learns_alone = WorldModelValidation, True
+    encoder_learns_alone = True
 
     def __init__(
         self,
         flights: Sequence[FlightData],
         config: WorldModelConfig,
         settings: WorldModelSettings,
-        folder: RunFolder,
         hooks: Hooks,
+        folder: Path,
     ) -> None:
         self.settings: WorldModelSettings = settings
         self._config = config
-        super().__init__(
-            folder, _starting_model(config, settings), world_model_stages(settings), hooks
-        )
-        self._store, kept, held = self.store_flights(flights)
+        model, stages = _starting_model(config, settings), world_model_stages(settings)
+        frame = config.contract.state_frame
+        super().__init__(flights, model, stages, hooks, folder, state_frame=frame)
         windows = find_windows(
             flights,
             context_frames=config.context_frames,
             frames=config.frames,
             frame_dt_s=config.frame_dt_s,
         )
-        flight_of = np.repeat(np.arange(len(flights)), self._store.counts)
-        self._frames, self._held_frames = (
-            np.flatnonzero(np.isin(flight_of, chosen)) for chosen in (kept, held)
-        )
-        self._windows = windows.among(self._frames)
-        self._held = windows.among(self._held_frames).spread(VALIDATION_WINDOWS)
-        self._flights = len(kept)
+        flight_of = np.repeat(np.arange(len(flights)), self.store.counts)
+        kept, held = (np.isin(flight_of, chosen) for chosen in (self.kept, self.held))
+        self._images_to_learn = int(kept.sum())
+        self._windows = windows.among(np.flatnonzero(kept))
+        self._held = windows.among(np.flatnonzero(held)).spread(VALIDATION_WINDOWS)
         self._latents: FeatureStore | None = None
         self._held_batches: list[WindowBatch] = []
         if len(self._windows) == 0:
             raise DatasetError("only flights that are held out are long enough: add more flights")
-        if len(self._held) == 0:
-            self.note("no flight is held out: the last weights will be kept, not the best")
 
     def encoder(self, trainee: WorldModel) -> nn.Module:
         return trainee.autoencoder
 
-    def encode(self, stage: TrainingStage, *, is_new: bool) -> None:
-        # Held-out frames first: without them no weights could be selected.
-        held, kept = np.unique(self._held.frames), np.unique(self._windows.frames)
-        mirror, total = self.settings.mirror, len(self._windows)
-        latents = self._latents = encode_rows(
-            self.folder.features,
-            both_ways(np.concatenate([held, kept]), mirror=mirror),
+    def encode(self) -> None:
+        latents = self._latents = encode_frames(
+            self.features,
+            np.union1d(self._held.frames, self._windows.frames),
             self._encode_images,
-            dim=int(np.prod(self._config.latent_shape)),
-            should_continue=self.may_encode(stage),
+            mirror=self.settings.mirror,
+            progress=lambda done: self.report_work(f"encoding, {done:.0%}"),
         )
-        self._held, self._windows = (w.among(latents.frames) for w in (self._held, self._windows))
-        if len(self._windows) == 0:
-            raise DatasetError("there was no time to encode one window: give more --minutes")
-        if (left := total - len(self._windows)) > 0:
-            self.note(
-                f"{left} windows were not encoded for lack of time: the dynamics sees the rest"
-            )
-        if is_new:
-            set_scales(self.trainee, self._windows, latents, mirrors=mirror)
+        set_scales(self.trainee, self._windows, latents, mirrors=self.settings.mirror)
         if len(self._held):
             batches = WindowBatches(self._held, latents, self._config, self.settings)
             moved = [batch.to(self.device) for batch in batches.validation(IMAGINED_WINDOWS)]
             self._held_batches = moved
 
-    def batch_maker(self, stage: TrainingStage) -> Callable[[int], FrameBatch | WindowBatch]:
+    def batch_maker(self) -> Callable[[int], FrameBatch | WindowBatch]:
         config, settings, windows = self._config, self.settings, self._windows
         if self._latents is not None:
             return WindowBatches(windows, self._latents, config, settings).batch
-        return lambda step: frame_batch(self._store, windows, config, settings, step)
+        return lambda step: frame_batch(self.store, windows, config, settings, step)
 
     def losses(self, trainee: WorldModel, batch: FrameBatch | WindowBatch) -> StepLoss:
         if isinstance(batch, FrameBatch):
             return autoencoder_loss(trainee, batch)
         return dynamics_loss(trainee, batch)
 
-    def validate(self, stage: TrainingStage) -> Validation | None:
-        if stage.trains_encoder:
-            held = self._held_frames
-            if len(held) == 0:
-                return None
-            rows = np.linspace(0, len(held) - 1, min(VALIDATION_FRAMES, len(held)))
-            return validate_autoencoder(self.average, self._images(held[rows.astype(np.int64)]))
+    def validate(self) -> WorldModelValidation | None:
         if not self._held_batches:
             return None
         frames = self._held.frames[:: len(self._held_batches)]
@@ -142,7 +118,7 @@ class _WorldModelRun(TrainingRun[WorldModel, FrameBatch | WindowBatch]):
             )
 
     def export(self) -> None:
-        counts = {"flights": self._flights, "images": len(self._frames)}
+        counts = {"flights": len(self.kept), "images": self._images_to_learn}
         card = self.card(**counts, windows=len(self._windows))
         save_world_model(self.settings.out, self.average, training=card)
 
@@ -153,7 +129,7 @@ class _WorldModelRun(TrainingRun[WorldModel, FrameBatch | WindowBatch]):
             return self.trainee.autoencoder.posterior(images)[0].flatten(1)
 
     def _images(self, frames: Indices, *, is_mirrored: bool = False) -> Tensor:
-        images = self._store.read(frames, self._config.image_size, is_mirrored=is_mirrored)
+        images = self.store.read(frames, is_mirrored=is_mirrored)
         return torch.from_numpy(images).to(self.device)
 
 

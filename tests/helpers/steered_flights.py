@@ -59,6 +59,5 @@ def steered_flight(seed: int, *, seconds: float = 3.0, size: int = 32) -> Flight
         age_ns=np.zeros(0, np.int64),
         captured_ns=captured_ns,
         gate=np.full((len(captured_ns), 7), np.nan, np.float32),
-        fingerprint=f"steered {seed} {seconds} {size}",
         decode=decode,
     )

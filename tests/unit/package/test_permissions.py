@@ -6,14 +6,12 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import pytest
-import torch
 
 from helpers.rollouts import TINY
 from policy.checkpoints.networks import save_checkpoint, save_world_model
 from policy.contract import Contract
 from policy.nets.toge import Toge, TogeConfig
 from policy.nets.world_model.model import WorldModel
-from policy.training.run_folder import RunFolder, TrainingPosition
 
 UMASK = 0o027
 
@@ -29,10 +27,6 @@ def write_world_model(out: Path) -> None:
     save_world_model(out / "world.safetensors", WorldModel(TINY))
 
 
-def write_training_state(out: Path) -> None:
-    RunFolder(out / "run", "identity").save(TrainingPosition(), {"weights": torch.zeros(3)})
-
-
 @pytest.fixture(autouse=True)
 def _umask() -> Iterator[None]:
     before = os.umask(UMASK)
@@ -40,7 +34,7 @@ def _umask() -> Iterator[None]:
     os.umask(before)
 
 
-@pytest.mark.parametrize("write", [write_checkpoint, write_world_model, write_training_state])
+@pytest.mark.parametrize("write", [write_checkpoint, write_world_model])
 def test_the_umask_decides_who_reads_a_file(write: Callable[[Path], None], tmp_path: Path) -> None:
     """safetensors makes files that only their owner can read; ours go through ``whole_file``."""
     out = tmp_path / "out"

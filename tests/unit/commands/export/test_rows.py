@@ -44,7 +44,6 @@ def episode(
         age_ns=np.array([], np.int64),
         captured_ns=captured,
         gate=np.full((len(captured), GATE_DIM), np.nan, np.float32),
-        fingerprint="",
         decode=lambda: iter(()),
     )
 

@@ -18,13 +18,9 @@ from policy.training.batches import (
     SHARE,
     Batch,
     Batches,
-    FeatureStore,
-    Job,
-    both_ways,
     colour_matrix,
     disturb,
-    encode_rows,
-    one_way_first,
+    encode_frames,
 )
 from policy.training.parallel import Gradients, StepLoss, one_thread
 from policy.training.settings import TrainSettings
@@ -50,7 +46,7 @@ def batch(tmp_path_factory: pytest.TempPathFactory) -> Batch:
     batches = Batches(
         Timeline([flight], CONTRACT, ages_ns), store, timesteps=100, settings=settings
     )
-    return batches.with_images(0, 32)
+    return batches.with_images(0)
 
 
 def trainee() -> Trainee:
@@ -105,41 +101,21 @@ def test_one_thread_is_left_as_it_was() -> None:
         torch.set_num_threads(1)
 
 
-FRAMES = 2 * ENCODE_BATCH + 10
+def test_images_are_encoded_both_ways(tmp_path: Path) -> None:
+    frames = np.arange(3, 2 * ENCODE_BATCH + 10, 2)
 
+    def encode(part: np.ndarray, is_mirrored: bool) -> torch.Tensor:
+        """Outputs that tell their image; negative where it was mirrored."""
+        return (-1.0 if is_mirrored else 1.0) * torch.from_numpy(part).float()[:, None].expand(
+            -1, 2
+        )
 
-def encoded(path: Path, jobs: list[Job], *, jobs_done: int) -> FeatureStore:
-    """Outputs that tell their image; negative where it was mirrored."""
-    asked = iter(range(1, len(jobs) + 1))
-
-    def encode(frames: np.ndarray, is_mirrored: bool) -> torch.Tensor:
-        sign = -1.0 if is_mirrored else 1.0
-        return sign * (1.0 + torch.from_numpy(frames).float())[:, None].expand(-1, 2)
-
-    return encode_rows(path, jobs, encode, dim=2, should_continue=lambda _: next(asked) < jobs_done)
-
-
-def test_half_of_the_time_encodes_each_image_one_way(tmp_path: Path) -> None:
-    frames = np.random.default_rng(0).permutation(FRAMES)
-    jobs = one_way_first(frames, mirror=True)
-    store = encoded(tmp_path / "half", jobs, jobs_done=len(jobs) // 2)
-    assert store.frames.tolist() == list(range(FRAMES))
-    assert not store.has_mirrored
-    for wanted in (False, True):
-        ways = store.ways(store.frames, np.full(FRAMES, wanted))
-        assert set(ways) == {False, True}
-        read = store.read(store.frames, ways)
-        assert np.array_equal(read[:, 0], np.where(ways, -1.0, 1.0) * (1 + store.frames))
-
-
-def test_with_time_for_all_both_ways_are_there(tmp_path: Path) -> None:
-    frames = np.arange(FRAMES)
-    for order in (one_way_first, both_ways):
-        jobs = order(frames, mirror=True)
-        store = encoded(tmp_path / "all", jobs, jobs_done=len(jobs) + 1)
-        assert store.has_mirrored
-        for wanted in (False, True):
-            assert set(store.ways(store.frames, np.full(FRAMES, wanted))) == {wanted}
+    done: list[float] = []
+    store = encode_frames(tmp_path / "all", frames, encode, mirror=True, progress=done.append)
+    is_mirrored = np.arange(len(frames)) % 3 == 0
+    read = store.read(frames[::-1], is_mirrored)
+    np.testing.assert_array_equal(read[:, 1], np.where(is_mirrored, -1.0, 1.0) * frames[::-1])
+    assert done == sorted(done)
 
 
 def test_images_are_disturbed_and_as_many_left_alone_as_the_shares_say() -> None:

@@ -3,8 +3,6 @@
 import json
 from collections.abc import Callable
 from dataclasses import replace
-from functools import partial
-from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
@@ -13,7 +11,7 @@ import torch
 from safetensors import safe_open
 
 from helpers.flight_folders import write_spot_flight
-from helpers.training_runs import check_resuming, check_stopping, make_hooks, weights_of
+from helpers.training_runs import make_hooks, weights_of
 from policy.checkpoints.networks import TRAINING_KEY, load_checkpoint, save_checkpoint
 from policy.contract import Contract
 from policy.data.flight_data import DatasetError, FlightData
@@ -25,9 +23,9 @@ from policy.nets.toge import BuiltinConfig, ResnetUnetConfig, Toge, TogeConfig, 
 from policy.training import batches as batches_module
 from policy.training.batches import Batches
 from policy.training.policy_run import train_policy
-from policy.training.report import Hooks, TrainingProgress, TrainResult
-from policy.training.run_folder import RunFolder, TrainingError, TrainingPosition
-from policy.training.settings import TrainSettings, policy_stages
+from policy.training.report import TrainingProgress, TrainResult
+from policy.training.run import TrainingError, TrainingStoppedError
+from policy.training.settings import TrainSettings
 from policy.training.trainee import gate_labels, gate_loss
 
 pytestmark = pytest.mark.usefixtures("one_thread")
@@ -63,10 +61,9 @@ def run(
     flights: list[FlightData],
     settings: TrainSettings,
     report: Callable[[TrainingProgress], None] = lambda _: None,
-    check: Callable[[Path], float] | None = None,
     network: BuiltinConfig = NETWORK,
 ) -> TrainResult:
-    return train_policy(flights, network, settings, make_hooks(report), check)
+    return train_policy(flights, network, settings, make_hooks(report))
 
 
 def test_learns_where_the_image_says_to_go(tmp_path: Path) -> None:
@@ -90,25 +87,20 @@ def test_learns_where_the_image_says_to_go(tmp_path: Path) -> None:
     assert list(asked.work_folder.iterdir()) == [log]
 
 
-def train_shortly(
-    flights: list[FlightData], hooks: Hooks, folder: Path, *, resume: bool = False
-) -> TrainResult:
-    """Two steps of encoder and head, state saved, two of the head, state saved, two more."""
-    asked = settings(folder, steps=6, validations=3, resume=resume)
-    return train_policy(flights, NETWORK, asked, hooks)
-
-
-@pytest.fixture(scope="module")
-def whole(flights: list[FlightData], tmp_path_factory: pytest.TempPathFactory) -> TrainResult:
-    return train_shortly(flights, make_hooks(), tmp_path_factory.mktemp("whole"))
-
-
-def test_a_run_killed_in_the_encoder_resumes_as_if_it_had_not_been(flights, whole, tmp_path):
-    check_resuming(partial(train_shortly, folder=tmp_path), flights, whole, killed_at=4)
-
-
-def test_a_run_stopped_in_the_head_resumes_as_if_it_had_not_been(flights, whole, tmp_path):
-    check_stopping(partial(train_shortly, folder=tmp_path), flights, whole, validated_at=4)
+def test_equal_runs_give_equal_weights_and_a_stopped_run_keeps_its_best(flights, tmp_path):
+    asked = settings(tmp_path)
+    first = weights_of(run(flights, asked).checkpoint)
+    asked.out.unlink()
+    assert weights_of(run(flights, asked).checkpoint) == first
+    validated: list[TrainingProgress] = []
+    hooks = make_hooks(
+        lambda progress: validated.append(progress) if progress.validation else None,
+        should_stop=lambda: bool(validated),
+    )
+    with pytest.raises(TrainingStoppedError, match=r"trained\.safetensors holds the best weights"):
+        train_policy(flights, NETWORK, asked, hooks)
+    load_checkpoint(asked.out, fallback=NETWORK)
+    assert [path.name for path in asked.work_folder.iterdir()] == ["log.jsonl"]
 
 
 def test_resnet_unet_trains_too_without_gates_and_packed(flights, tmp_path):
@@ -120,27 +112,18 @@ def test_resnet_unet_trains_too_without_gates_and_packed(flights, tmp_path):
     assert result.checkpoint.stat().st_size < 2 * weights
 
 
-def test_a_closed_loop_check_decides_and_a_checkpoint_is_gone_on_from(flights, tmp_path):
-    scores = iter([0.9, 0.3])
-    seen: list[Path] = []
-
-    def check(path: Path) -> float:
-        seen.append(path)
-        load_checkpoint(path, fallback=NETWORK)
-        return next(scores)
-
-    made = settings(tmp_path, check_every=1, validation_fraction=0.0)
-    result = run(flights[:2], made, check=check)
-    assert result.score == 0.9
-    assert len(seen) == 2
+def test_a_training_goes_on_from_a_checkpoint_and_keeps_its_terms(flights, tmp_path):
+    terms = {"modes": ("LOITER",), "max_chunk_age_s": 1.0, "max_stall_s": 0.35, "play_s": 0.1}
+    start = Toge(replace(NETWORK, contract=replace(CONTRACT, **terms)))
+    path = tmp_path / "start.safetensors"
+    save_checkpoint(path, start)
+    further = settings(tmp_path, start_from=path, learning_rate=0.0, validation_fraction=0.0)
+    result = run(flights[:2], further)
     assert result.validation is None
-    further = replace(
-        made, start_from=result.checkpoint, out=tmp_path / "next.safetensors", learning_rate=0.0
-    )
-    again = weights_of(run(flights[:2], further).checkpoint)
-    before = weights_of(result.checkpoint)
-    same = [name for name in before if before[name] == again[name]]
-    assert "head.unet.out.weight" in same
+    before, after = weights_of(path), weights_of(result.checkpoint)
+    assert "head.unet.out.weight" in [name for name in before if before[name] == after[name]]
+    trained = load_checkpoint(result.checkpoint, fallback=NETWORK).contract
+    assert terms == {name: getattr(trained, name) for name in terms}
     other = TogeConfig(backbone="resnet50", contract=CONTRACT)
     with pytest.raises(PolicyError, match=r"another policy: backbone 'resnet8'"):
         run(flights[:2], further, network=other)
@@ -149,38 +132,13 @@ def test_a_closed_loop_check_decides_and_a_checkpoint_is_gone_on_from(flights, t
         run(flights[:2], further, network=by_rates)
 
 
-def with_contract(checkpoint: Path, contract: Contract, path: Path) -> Path:
-    """The same weights under another contract."""
-    policy = load_checkpoint(checkpoint, fallback=NETWORK)
-    other = Toge(replace(policy.config, contract=replace(contract, feature_dim=0)))
-    other.load_state_dict(policy.state_dict())
-    save_checkpoint(path, other)
-    return path
-
-
-def test_a_frozen_encoder_stays_and_the_head_learns(flights, tmp_path, whole):
-    terms = {"modes": ("LOITER",), "max_chunk_age_s": 1.0, "max_stall_s": 0.35, "play_s": 0.1}
-    wider = replace(CONTRACT, **terms)
-    start_from = with_contract(whole.checkpoint, wider, tmp_path / "start.safetensors")
-    made = settings(tmp_path, start_from=start_from, freeze_encoder=True, steps=3)
-    stages: list[str] = []
-    result = run(flights, made, lambda progress: stages.append(progress.stage))
-    before, after = weights_of(whole.checkpoint), weights_of(result.checkpoint)
-    encoder = [name for name in before if name.startswith("backbone.")]
-    assert [name for name in encoder if before[name] != after[name]] == []
-    assert before["head.unet.out.weight"] != after["head.unet.out.weight"]
-    trained = load_checkpoint(result.checkpoint, fallback=NETWORK).contract
-    assert terms == {name: getattr(trained, name) for name in terms}
-    assert not any(stage.startswith("encoder") for stage in stages)
-
-
 def test_images_are_disturbed_in_training_and_never_in_validation(flights, tmp_path, monkeypatch):
     monkeypatch.setattr(batches_module, "disturb", lambda images, _random: images.fill(255))
     store = store_frames(flights, tmp_path / "frames", 32)
     timeline = Timeline(flights, CONTRACT, np.array([40_000_000]))
     batches = Batches(timeline, store, timesteps=100, settings=settings(tmp_path))
-    assert (batches.with_images(0, 32).images == 255).all()
-    assert not (next(batches.validation(4, 32)).images == 255).all()
+    assert (batches.with_images(0).images == 255).all()
+    assert not (next(batches.validation(4)).images == 255).all()
     assert not (batches.images(batches.frames[:4], is_mirrored=False) == 255).all()
 
 
@@ -219,7 +177,6 @@ def test_flights_that_do_not_fit_are_refused(flights: list[FlightData], tmp_path
     ("changes", "says"),
     [
         ({"batch_size": 1}, "--batch-size must be between 2 and"),
-        ({"start_from": Path(), "backbone_weights": Path()}, "leave out --backbone-weights"),
         ({"steps": None, "minutes": float("nan")}, "--minutes"),
         ({"ages": "few:many"}, "LOW:HIGH"),
     ],
@@ -227,16 +184,6 @@ def test_flights_that_do_not_fit_are_refused(flights: list[FlightData], tmp_path
 def test_settings_that_no_run_could_use_are_refused(tmp_path, changes, says):
     with pytest.raises(PolicyError, match=says):
         settings(tmp_path, **changes)
-
-
-def test_stages_grow_and_fill_the_budget(tmp_path: Path) -> None:
-    stages = policy_stages(settings(tmp_path, image_size=224))
-    assert [stage.image_size for stage in stages] == [96, 160, 224, 224]
-    assert [stage.trains_encoder for stage in stages] == [True, True, True, False]
-    assert stages[0].start == 0
-    assert stages[-1].end == 1
-    assert all(a.end == b.start for a, b in pairwise(stages))
-    assert [s.image_size for s in policy_stages(settings(tmp_path))] == [32, 32]
 
 
 def test_gate_labels_leave_out_what_no_camera_sees() -> None:
@@ -252,15 +199,3 @@ def test_gate_labels_leave_out_what_no_camera_sees() -> None:
     assert made.grad is not None
     assert made.grad.isfinite().all()
     assert not made.grad[1].any()
-
-
-def test_a_state_that_cannot_be_written_is_one_message(tmp_path: Path) -> None:
-    folder = RunFolder(tmp_path / "run", "identity")
-    folder.path.rmdir()
-    with pytest.raises(TrainingError, match="the training cannot be kept"):
-        folder.save(TrainingPosition(), {})
-    assert not folder.has_state
-    folder.path.mkdir()
-    (folder.path / "state.pt").write_bytes(b"PK torn")
-    with pytest.raises(TrainingError, match="is damaged"):
-        folder.load()

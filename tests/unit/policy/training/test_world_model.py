@@ -3,7 +3,6 @@
 import json
 from collections.abc import Callable
 from dataclasses import replace
-from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -12,7 +11,7 @@ import torch
 from safetensors import safe_open
 
 from helpers.steered_flights import steered_flight
-from helpers.training_runs import check_resuming, make_hooks, weights_of
+from helpers.training_runs import make_hooks, weights_of
 from policy.checkpoints.networks import TRAINING_KEY
 from policy.contract import Contract
 from policy.data.flight_data import DatasetError, FlightData
@@ -21,8 +20,9 @@ from policy.errors import PolicyError
 from policy.nets.world_model.config import WorldModelConfig
 from policy.nets.world_model.model import WorldModel
 from policy.nets.world_model.motion import motion_since
-from policy.training.batches import FeatureStore, both_ways, encode_rows
-from policy.training.report import Hooks, TrainingProgress, TrainResult, WorldModelValidation
+from policy.training.batches import FeatureStore, encode_frames
+from policy.training.report import TrainingProgress, TrainResult, WorldModelValidation
+from policy.training.run import TrainingError
 from policy.training.settings import WorldModelSettings
 from policy.training.world_model_losses import CONTEXT_NOISE, WindowBatches, dynamics_loss
 from policy.training.world_model_run import train_world_model
@@ -91,14 +91,12 @@ def test_sticks_tell_how_the_vehicle_will_move(trained):
     result, made = trained
     held_out = result.validation
     assert isinstance(held_out, WorldModelValidation)
-    assert held_out.velocity_error_mps is not None
-    assert held_out.held_velocity_error_mps is not None
     assert held_out.velocity_error_mps < 0.5 * held_out.held_velocity_error_mps
     log = [json.loads(line) for line in (made.work_folder / "log.jsonl").read_text().splitlines()]
     for stage in ("autoencoder", "dynamics"):
         losses = [line["loss"] for line in log if line["stage"] == stage and "loss" in line]
         assert losses[-1] < 0.7 * losses[0]
-    assert {"latents", "motion", "sticks", "learning_rate", "spent_s"} <= set(log[-2])
+    assert {"latents", "motion", "sticks", "learning_rate"} <= set(log[-2])
     predicted = [line["motion_prediction"] for line in log if "motion_prediction" in line]
     assert predicted[-1] < 0.8 * predicted[0]
     assert [path.name for path in made.work_folder.iterdir()] == ["log.jsonl"]
@@ -114,24 +112,11 @@ def test_a_checkpoint_says_how_it_was_trained(trained):
     assert card["validation"]["psnr_db"] > 10
 
 
-def train_shortly(
-    flights: list[FlightData], hooks: Hooks, folder: Path, *, resume: bool = False
-) -> TrainResult:
-    return train_world_model(flights, MODEL, settings(folder, resume=resume), hooks)
-
-
-@pytest.fixture(scope="module")
-def whole(flights: list[FlightData], tmp_path_factory: pytest.TempPathFactory) -> TrainResult:
-    return train_shortly(flights, make_hooks(), tmp_path_factory.mktemp("whole"))
-
-
-def test_a_run_killed_in_the_dynamics_resumes_as_if_it_had_not_been(flights, whole, tmp_path):
-    check_resuming(partial(train_shortly, folder=tmp_path), flights, whole, killed_at=6)
-
-
-def test_an_autoencoder_that_is_kept_stays_as_it_is(flights, whole, tmp_path):
+def test_an_autoencoder_that_is_kept_stays_as_it_is(flights, tmp_path):
+    whole = run(flights, settings(tmp_path))
+    (tmp_path / "next").mkdir()
     stages: set[str] = set()
-    made = settings(tmp_path, start_from=whole.checkpoint)
+    made = settings(tmp_path / "next", start_from=whole.checkpoint)
     result = run(flights, made, lambda progress: stages.add(progress.stage))
     assert result.steps == 6
     assert "dynamics" in stages
@@ -153,8 +138,7 @@ def latents_of(windows_frames: int, path: Path, *, mirror: bool) -> FeatureStore
         return sign * torch.from_numpy(frames)[:, None].float().expand(-1, 64)
 
     frames = np.arange(windows_frames)
-    jobs = both_ways(frames, mirror=mirror)
-    return encode_rows(path, jobs, encode, dim=64, should_continue=lambda done: True)
+    return encode_frames(path, frames, encode, mirror=mirror, progress=lambda done: None)
 
 
 def test_batches_follow_from_seed_and_step_and_mirror_all_that_a_mirror_shows(tmp_path):
@@ -211,5 +195,5 @@ def test_flights_that_do_not_fit_are_refused(flights: list[FlightData], tmp_path
     with pytest.raises(DatasetError, match="enu_flu states"):
         run([replace(flights[0], state_frame="enu_flu")], settings(tmp_path))
     hasty = settings(tmp_path, steps=None, minutes=0.01)
-    with pytest.raises(DatasetError, match="--minutes"):
+    with pytest.raises(TrainingError, match="--minutes"):
         run([steered_flight(seed, seconds=9.0) for seed in range(2)], hasty)
