@@ -65,16 +65,6 @@ def egocentric_columns(columns: Sequence[Any]) -> list[Any]:
     return [*velocity_body, forward[2], side[2], up[2], *rest]
 
 
-def egocentric(state: FloatArray, contract: Contract) -> FloatArray:
-    """Convert a state [B, state_dim] in SI units to a network's input [B, state_dim - 1]."""
-    scale = egocentric_scale(contract)
-    rows = [
-        [value / unit for value, unit in zip(egocentric_columns(row), scale, strict=True)]
-        for row in state.tolist()
-    ]
-    return np.array(rows, dtype=np.float32)
-
-
 def image_to_input(image: CameraImage, contract: Contract) -> FloatArray:
     """Convert a camera image to float32 [1, 3, image_height, image_width]; depth [1, 1, ...].
 

@@ -205,12 +205,9 @@ def _candidates(
         )
     if devices == {"cpu"} and find_spec("openvino") is not None:
         from policy.engines.openvino_compile import precisions
-        from policy.engines.openvino_cpu import make_openvino_runner
         from policy.engines.openvino_modules import ModuleConverter, make_module_runner
 
-        make: Callable[..., PolicyRunner] = make_openvino_runner
-        if not isinstance(policy, BuiltinPolicy):
-            make = partial(make_module_runner, ModuleConverter(policy, settings.name))
+        make = partial(make_module_runner, ModuleConverter(policy, settings))
         return [
             (
                 f"openvino (images {pair[0]}, actions {pair[1]})",

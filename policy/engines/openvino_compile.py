@@ -13,7 +13,7 @@ import logging
 import os
 import sys
 import warnings
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -23,8 +23,8 @@ import torch
 from torch import Tensor, nn
 
 from policy.contract import FloatArray
-from policy.engines.runner import Precision, Shape
-from policy.errors import PolicyError, user_code
+from policy.engines.runner import Precision
+from policy.errors import PolicyError
 from policy.files import whole_file
 
 MAX_ENTRIES = 24
@@ -239,16 +239,3 @@ def quiet() -> Iterator[None]:
         torch.backends.mha.set_fastpath_enabled(fast_path)
         logging.disable(disabled)
         logging.root.setLevel(level)
-
-
-def convert(policy: nn.Module, function: Callable[..., Any], shapes: Sequence[Shape]) -> ov.Model:
-    """Convert ``function`` of float32 tensors of these shapes, with the weights of ``policy``.
-
-    It is traced with zeros: decisions by a tensor's values are frozen to those for zeros.
-    """
-    with user_code("converting it for OpenVINO failed"), quiet():
-        return ov.convert_model(
-            Traceable(policy, function).eval(),
-            example_input=tuple(torch.zeros(shape) for shape in shapes),
-            input=[list(shape) for shape in shapes],
-        )

@@ -1,9 +1,10 @@
-"""Conversion of a user's torch modules to OpenVINO graphs.
+"""Conversion of torch policies to OpenVINO graphs.
 
 The policy's methods are traced with all modules that it holds: the policy itself if it is a module,
-else those among its attributes. ``torch.export`` runs first, on shapes alone: it rejects decisions
-by the values of a tensor, which a trace would silently freeze, and it gives the size and content of
-the graph before the slow conversion begins.
+else those among its attributes. For a user's policy ``torch.export`` runs first, on shapes alone:
+it rejects decisions by the values of a tensor, which a trace would silently freeze, and it gives
+the size and content of the graph before the slow conversion begins. A built-in network is known by
+its configuration and weights.
 """
 
 import hashlib
@@ -34,6 +35,7 @@ from policy.engines.runner import (
 )
 from policy.engines.torch_eager import modules_of, run_eagerly
 from policy.errors import PolicyError, user_code
+from policy.nets.toge import BuiltinPolicy
 from policy.protocol import PolicyRunner, SingleRatePolicy
 
 _MANGLED = re.compile(r"___torch_mangle_\d+\.")
@@ -72,9 +74,18 @@ def make_module_runner(
 class ModuleConverter:
     """Converts functions of a policy; a graph needed at two precisions is converted once."""
 
-    def __init__(self, policy: object, name: str) -> None:
+    def __init__(self, policy: object, settings: ExecutionSettings) -> None:
         self._modules = nn.ModuleList(modules_of(policy)).eval()
-        self._name = name
+        self._name = settings.name
+        self._known = ""
+        """Content of all graphs of a built-in network."""
+        if isinstance(policy, BuiltinPolicy):
+            digest = hashlib.sha256()
+            noise = {"noise": policy.head.initial_noise}
+            for name, value in [*policy.state_dict().items(), *noise.items()]:
+                update_digest(digest, name, value)
+            steps = settings.num_diffusion_steps
+            self._known = f"{policy.config} {digest.hexdigest()} {steps} steps"
         self._is_script = any(
             isinstance(module, torch.jit.ScriptModule) for module in self._modules.modules()
         )
@@ -88,7 +99,9 @@ class ModuleConverter:
         module = Traceable(self._modules, lambda *a: _float_tensor(function(*a))).eval()
         examples = tuple(torch.zeros(shape) for shape in shapes)
         with user_code(f"{self._name} cannot be converted"), quiet(), torch.no_grad():
-            if self._is_script:
+            if self._known:
+                digest = f"{self._known} {shapes}"
+            elif self._is_script:
                 digest = _digest_of_script(module, examples)
             else:
                 program = _exported(module, examples)

@@ -86,14 +86,6 @@ class NoiseSchedule:
         at = power[timestep].reshape(-1, *[1] * (clean.ndim - 1))
         return at.sqrt().to(clean.dtype) * clean + (1 - at).sqrt().to(clean.dtype) * noise
 
-    def coefficients(self, step: DdimStep) -> tuple[float, float, float, float]:
-        """Return ``ddim_update`` as ``next = c * clip(a * noisy + b * output) + d * noisy``."""
-        a, b = 0.0, 1.0
-        if self.prediction == "epsilon":
-            a, b = 1 / step.signal, -step.noise / step.signal
-        kept = step.next_noise / step.noise
-        return a, b, step.next_signal - kept * step.signal, kept
-
     def ddim_update(
         self, step: DdimStep, noisy: Chunk, output: Chunk, *, limit: float = 1.0
     ) -> Chunk:

@@ -51,7 +51,7 @@ class StateEncoder(nn.Module):
         self._scale = nn.Buffer(torch.tensor(scale), persistent=False)
 
     def normalise(self, state: Tensor) -> Tensor:
-        """Apply ``preprocess.egocentric`` to tensors."""
+        """Convert states [B, state_dim] in SI units to numbers [B, state_dim - 1] of about 1."""
         return torch.stack(egocentric_columns(state.unbind(1)), dim=1) / self._scale
 
     def forward(self, state: Tensor) -> Tensor:

@@ -19,19 +19,11 @@ from policy.contract import ACTION_DIM
 from policy.errors import PolicyError
 from policy.nets.diffusion import Chunk, DdimStep, cosine_power, flight_noise
 from policy.nets.resnet import LastMap
-from policy.nets.unet1d import norm_of_groups, sinusoid_frequencies
+from policy.nets.unet1d import GroupNorm, sinusoid_frequencies
 
 _PLACES = {"0": "conv1", "1": "bn1", "4": "layer1", "5": "layer2", "6": "layer3", "7": "layer4"}
 """LeRobot's names of a ResNet's parts, which it keeps in a list, and torchvision's."""
 _CHANNELS_PER_GROUP = 16
-
-
-class GroupNorm(nn.GroupNorm):
-    """Group norm in a form that OpenVINO computes fast."""
-
-    def forward(self, x: Tensor) -> Tensor:
-        """Normalise [B, C, ...]; the shape stays."""
-        return norm_of_groups(self, x)
 
 
 class Mish(nn.Module):

@@ -116,7 +116,7 @@ def features_dim(context_frames: int) -> int:
 def context_features(states: Tensor, contract: Contract) -> Tensor:
     """Return features [B, features_dim(K)] of about 1 for states [B, K, 13], oldest first.
 
-    They are the newest state by ``preprocess.egocentric``, then the motions back to the older ones.
+    They are the newest state as ``StateEncoder`` takes it, then the motions back to the older ones.
     """
     now = states[:, -1:]
     scale = now.new_tensor(egocentric_scale(contract)[:12])

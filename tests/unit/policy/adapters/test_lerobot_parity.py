@@ -109,7 +109,7 @@ def test_actions_are_those_of_lerobot(golden):
 def test_the_openvino_engine_computes_the_same_step_by_step(golden):
     _, _, policy, _ = golden
     settings = ExecutionSettings(name="lerobot", num_diffusion_steps=2)
-    converter = ModuleConverter(policy, "lerobot")
+    converter = ModuleConverter(policy, settings)
     graphs = make_module_runner(converter, policy, settings, "f32", "f32")
     samples = make_parity_samples(policy.contract)
     samples.state[..., STATE_NAMES.index(STATE[12])] = policy._state.shift[12]  # a constant there

@@ -22,7 +22,7 @@ from policy.data.samples import (
     Timeline,
     TrainingSamples,
 )
-from policy.preprocess import egocentric
+from policy.preprocess import egocentric_columns
 
 MS = 1_000_000
 CONTRACT = Contract(since_exposure=True, horizon=4)
@@ -158,7 +158,9 @@ def test_a_mirrored_flight_is_seen_mirrored_from_the_vehicle() -> None:
     np.testing.assert_array_equal(left.state[1::2], samples.state[1::2])
     vector, turn = (1, -1, 1), (-1, 1, -1)
     signs = [*vector, *vector, *turn, *vector, 1, *turn, *vector]
-    seen, mirrored = (egocentric(each.state[::2], CONTRACT) for each in (samples, left))
+    seen, mirrored = (
+        np.transpose(egocentric_columns(each.state[::2].T)) for each in (samples, left)
+    )
     np.testing.assert_allclose(mirrored, seen * signs, atol=1e-5)
     np.testing.assert_array_equal(left.chunk[::2], samples.chunk[::2] * [1, -1, 1, -1])
     np.testing.assert_array_equal(left.gate[::2], samples.gate[::2] * [*vector, -1, *vector])

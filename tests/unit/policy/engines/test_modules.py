@@ -102,7 +102,7 @@ def test_new_weights_of_a_frozen_archive_are_compiled(tmp_path: Path) -> None:
         nn.init.constant_(layer.weight, weight)
         torch.jit.freeze(torch.jit.script(layer)).save(tmp_path / "frozen.pt")
         frozen = torch.jit.load(tmp_path / "frozen.pt")
-        converter = openvino_modules.ModuleConverter(frozen, "frozen")
+        converter = openvino_modules.ModuleConverter(frozen, SETTINGS)
         call = converter.compile(lambda x: frozen(x), [(1, 64)], "f32")
         return float(call(np.ones((1, 64), np.float32))[0, 0])
 

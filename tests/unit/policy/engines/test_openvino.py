@@ -12,7 +12,7 @@ import torch
 
 from policy.checkpoints.networks import BuiltinConfig, BuiltinPolicy, build_policy
 from policy.contract import Contract, FloatArray
-from policy.engines import openvino_compile, openvino_cpu
+from policy.engines import openvino_compile
 from policy.engines.choose import chunks_of_samples, make_parity_samples
 from policy.engines.openvino_compile import (
     MAX_ENTRIES,
@@ -20,13 +20,13 @@ from policy.engines.openvino_compile import (
     precisions,
     user_cache_folder,
 )
-from policy.engines.openvino_cpu import BulkEncoder, make_openvino_runner
-from policy.engines.runner import ExecutionSettings
+from policy.engines.openvino_modules import ModuleConverter, make_module_runner
+from policy.engines.runner import ExecutionSettings, Precision
 from policy.engines.torch_eager import make_torch_runner
 from policy.errors import PolicyError
 from policy.nets.diffusion import NoiseSchedule
-from policy.nets.names import BackboneName
 from policy.nets.toge import ResnetUnetConfig, TogeConfig
+from policy.protocol import PolicyRunner
 
 SMALL = Contract(image_height=32, image_width=32)
 SETTINGS = ExecutionSettings(name="toge", num_diffusion_steps=2)
@@ -40,23 +40,23 @@ def seeded(config: BuiltinConfig) -> BuiltinPolicy:
     return policy
 
 
+def converted(
+    policy: BuiltinPolicy,
+    settings: ExecutionSettings,
+    vision: Precision = "f32",
+    action: Precision = "f32",
+) -> PolicyRunner:
+    converter = ModuleConverter(policy, settings)
+    return make_module_runner(converter, policy, settings, vision, action)
+
+
 def both(policy: BuiltinPolicy, settings: ExecutionSettings) -> tuple[FloatArray, FloatArray]:
     """Chunks by plain torch, and by OpenVINO in float32."""
     samples = make_parity_samples(policy.contract)
     reference = make_torch_runner(policy, settings)
-    runner = make_openvino_runner(policy, settings, "f32", "f32")
+    runner = converted(policy, settings)
     assert runner.engine == "openvino-f32"
     return chunks_of_samples(reference, samples), chunks_of_samples(runner, samples)
-
-
-@pytest.mark.parametrize("backbone", ["efficientnet_b3", "resnet8", "resnet50"])
-def test_every_backbone_computes_what_torch_computes(backbone: BackboneName) -> None:
-    policy = seeded(TogeConfig(backbone=backbone, contract=replace(SMALL, image_height=64)))
-    images = torch.from_numpy(np.random.default_rng(0).normal(size=(3, 3, 64, 32))).float()
-    with torch.inference_mode():
-        expected = policy.backbone(images).numpy()
-    encoded = BulkEncoder(policy, "f32")(images.numpy())
-    np.testing.assert_allclose(encoded, expected, atol=1e-4 * np.abs(expected).max())
 
 
 @pytest.mark.parametrize(
@@ -78,19 +78,11 @@ def test_single_rate_computes_what_torch_computes(config: BuiltinConfig) -> None
     np.testing.assert_allclose(chunks, expected, atol=2e-3)
 
 
-def test_segments_compute_what_a_whole_solve_on_torch_does(monkeypatch):
-    """Five steps by a graph of two: the last segment is padded."""
-    policy = seeded(TogeConfig(backbone="resnet8", contract=SMALL))
-    monkeypatch.setattr(openvino_cpu, "MAX_UNROLLED", 2)
-    expected, chunks = both(policy, ExecutionSettings(name="toge", num_diffusion_steps=5))
-    np.testing.assert_allclose(chunks, expected, atol=2e-3)
-
-
 def test_every_precision_of_this_cpu_is_near_and_results_belong_to_the_caller(trained_toge):
     samples = make_parity_samples(trained_toge.contract)
     expected = chunks_of_samples(make_torch_runner(trained_toge, SETTINGS), samples)
     for vision, action in precisions():
-        runner = make_openvino_runner(trained_toge, SETTINGS, vision, action)
+        runner = converted(trained_toge, SETTINGS, vision, action)
         assert runner.engine.startswith(f"openvino-{vision}")
         # Three significant digits of bfloat16; whether that is near enough the check decides.
         assert np.abs(chunks_of_samples(runner, samples) - expected).max() < 0.05
@@ -114,11 +106,11 @@ def test_compiled_graphs_are_cached_and_damage_does_no_harm(tmp_path, monkeypatc
     def chunks(seed: int = 0) -> FloatArray:
         policy.head.seed_noise(seed)
         settings = ExecutionSettings(name="toge", num_diffusion_steps=1)
-        return chunks_of_samples(make_openvino_runner(policy, settings, "f32", "f32"), samples)
+        return chunks_of_samples(converted(policy, settings), samples)
 
     first = chunks()
-    assert not np.array_equal(chunks(seed=1), first)  # the noise is not part of the graphs
     assert len(cached(tmp_path)) == 2
+    assert not np.array_equal(chunks(seed=1), first)  # the noise is part of the graphs
     for path in cached(tmp_path):
         path.write_bytes(path.read_bytes()[:1000])
     np.testing.assert_array_equal(chunks(), first)
@@ -126,12 +118,12 @@ def test_compiled_graphs_are_cached_and_damage_does_no_harm(tmp_path, monkeypatc
         policy.head.unet.out.bias += 0.1
     expected, anew = both(policy, ExecutionSettings(name="toge", num_diffusion_steps=1))
     np.testing.assert_allclose(anew, expected, atol=2e-3)
-    assert len(cached(tmp_path)) == 4
+    assert len(cached(tmp_path)) == 6
 
 
 def test_openvino_is_kept_from_calling_home() -> None:
     program = (
-        "import sys; import policy.engines.openvino_cpu; "
+        "import sys; import policy.engines.openvino_modules; "
         "sys.exit(sys.modules.get('openvino_telemetry') is not None)"
     )
     assert subprocess.run([sys.executable, "-c", program], timeout=60, check=False).returncode == 0
