@@ -8,7 +8,7 @@ import json
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, field, fields
 from itertools import chain
-from typing import Any, Literal, get_args
+from typing import Any, Literal, get_args, get_origin, get_type_hints
 
 import numpy as np
 from numpy.typing import NDArray
@@ -105,19 +105,6 @@ _CHUNK_AGES = ("max_state_age_s", "max_velocity_age_s", "max_feature_age_s", "ma
 LIMIT_TERMS = (*_CHUNK_AGES, "max_stall_s", *ENVELOPE_TERMS)
 FLIGHT_TERMS = ("action", "modes", "play_s", "state_time", "stops_at_end", *LIMIT_TERMS)
 """Fields that decide how a policy is flown and do not affect its network's output."""
-_TUPLES = (
-    *("cameras", "camera_rates_hz", "image_crop", "state_extras"),
-    *("image_mean_rgb", "image_std_rgb"),
-)
-_CHOICES: dict[str, Any] = {
-    "state_frame": StateFrame,
-    "state_time": StateTime,
-    "arrays": Arrays,
-    "velocity_frame": VelocityFrame,
-    "image_fit": ImageFit,
-    "image_channels": ImageChannels,
-    "action": ActionKind,
-}
 _INTEGERS = {
     "image_height": (16, 4096),
     "image_width": (16, 4096),
@@ -246,7 +233,7 @@ class Contract:
 
     def __post_init__(self) -> None:
         try:
-            for name in ("modes", *_TUPLES):
+            for name in _LISTS:
                 if isinstance(value := getattr(self, name), list):
                     object.__setattr__(self, name, tuple(value))
             if self.modes == () and self.action in ACTION_MODES:
@@ -260,11 +247,12 @@ class Contract:
 
     def _checked_values(self) -> Iterator[tuple[str, bool, str]]:
         """Yield the name of each field of one value, True if it is right, and what it must be."""
-        for name, kind in _CHOICES.items():
-            choices = get_args(kind)
-            yield name, getattr(self, name) in choices, " or ".join(map(repr, choices))
-        for name in ("since_exposure", "stops_at_end"):
-            yield name, isinstance(getattr(self, name), bool), "true or false"
+        for name, hint in _HINTS.items():
+            if get_origin(hint) is Literal:
+                choices = get_args(hint)
+                yield name, getattr(self, name) in choices, " or ".join(map(repr, choices))
+            if hint is bool:
+                yield name, isinstance(getattr(self, name), bool), "true or false"
         for name, (low, high) in _INTEGERS.items():
             value = getattr(self, name)
             yield name, type(value) is int and low <= value <= high, f"an integer in {low}..{high}"
@@ -284,7 +272,7 @@ class Contract:
 
     def _checked_lists(self) -> Iterator[tuple[str, bool, str]]:
         """Yield as ``_checked_values`` for fields of several values."""
-        for name in _TUPLES:
+        for name in _LISTS:
             yield name, isinstance(getattr(self, name), tuple), "a list"
         for name, low, usual in (
             ("image_mean_rgb", -MOST_PIXEL, IMAGENET_MEAN_RGB),
@@ -310,9 +298,8 @@ class Contract:
         are_extras = len(set(extras)) == len(extras) and set(extras) <= set(EXTRA_NAMES)
         yield "state_extras", are_extras, f"some of {', '.join(EXTRA_NAMES)}, each once"
         known = ACTION_MODES[self.action]
-        are_modes = isinstance(self.modes, tuple) and len(self.modes) > 0
-        wanted = f"one or more of {', '.join(known)} for action {self.action!r}"
-        yield "modes", are_modes and set(self.modes) <= set(known), wanted
+        are_modes = len(self.modes) > 0 and set(self.modes) <= set(known)
+        yield "modes", are_modes, f"one or more of {', '.join(known)} for action {self.action!r}"
 
     @property
     def state_names(self) -> tuple[str, ...]:
@@ -389,6 +376,10 @@ class Contract:
         if unknown := sorted(set(data) - known):
             raise ContractError(f"unknown contract keys {unknown}; there are {sorted(known)}")
         return cls(**data)
+
+
+_HINTS = get_type_hints(Contract)
+_LISTS = [name for name, hint in _HINTS.items() if get_origin(hint) is tuple]
 
 
 def _is_within(value: object, low: float, high: float) -> bool:

@@ -3,7 +3,6 @@
 ``adapters.user_class.FORMS`` lists the forms. torch is imported only if a policy needs it.
 """
 
-import inspect
 from collections.abc import Callable
 from contextlib import ExitStack, suppress
 from dataclasses import replace
@@ -29,7 +28,6 @@ LEROBOT, ONNX, TORCHSCRIPT = "lerobot", "onnx", "torchscript"
 FORMS = {LEROBOT: "lerobot:DIR", ONNX: "onnx:DIR or onnx:FILE", TORCHSCRIPT: "torchscript:FILE.pt"}
 """Forms of --policy for files of other programs."""
 Engine = tuple[PolicyRunner, tuple[str, ...]]
-_WHEN = {"reset": "when a flight begins", "close": "when it is not needed any more"}
 
 
 def check_request(request: PolicyRequest) -> Contract | None:
@@ -227,21 +225,9 @@ def _scripted(
 
 def _life_method(policy: SingleRatePolicy, name: str, spec: str) -> Callable[[], None]:
     """Return the policy's own ``reset`` or ``close``, ready to call; a no-op if it has none."""
-    method: object = getattr(policy, name, None)
+    method: Callable[[], object] | None = getattr(policy, name, None)
     if method is None:
         return keep_nothing
-    if not callable(method):
-        raise PolicyError(
-            f"--policy {spec}: {name} must be a method without arguments, which is called "
-            f"{_WHEN[name]}; it is {method!r}"
-        )
-    try:
-        inspect.signature(method).bind()
-    except (TypeError, ValueError) as error:
-        raise PolicyError(
-            f"--policy {spec}: {name} is called without arguments {_WHEN[name]}, and cannot be: "
-            f"{error}; give its parameters defaults, or give it another name"
-        ) from error
     with_torch = policy.contract.arrays == "torch"
 
     def call() -> None:

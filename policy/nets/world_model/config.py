@@ -2,7 +2,7 @@
 
 import json
 import math
-from dataclasses import asdict, dataclass, field, fields
+from dataclasses import asdict, dataclass, field
 
 from policy.contract import Contract
 from policy.errors import PolicyError
@@ -12,16 +12,6 @@ FACTOR = 8
 """Pixels along a side of one latent."""
 HEAD_DIM = 32
 """Width of one attention head."""
-
-_RANGES = {
-    "image_size": (16, 1024),
-    "latent_channels": (1, 64),
-    "frames": (1, 256),
-    "context_frames": (1, 16),
-    "patch": (1, 8),
-    "dynamics_width": (HEAD_DIM, 4096),
-    "dynamics_depth": (1, 64),
-}
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -53,27 +43,11 @@ class WorldModelConfig:
     schedule: NoiseSchedule = field(default_factory=NoiseSchedule)
 
     def __post_init__(self) -> None:
-        for name, (low, high) in _RANGES.items():
-            value = getattr(self, name)
-            if not isinstance(value, int) or not low <= value <= high:
-                raise PolicyError(f"{name} must be an integer in {low}..{high}, got {value!r}")
-        if self.image_size % (FACTOR * self.patch):
+        if self.image_size < FACTOR or self.image_size % (FACTOR * self.patch):
             raise PolicyError(
                 f"image_size must be a multiple of {FACTOR * self.patch} ({FACTOR} pixels a "
                 f"latent, {self.patch} latents a token), got {self.image_size}"
             )
-        if self.dynamics_width % HEAD_DIM:
-            raise PolicyError(f"dynamics_width must be a multiple of {HEAD_DIM}")
-        if len(self.autoencoder_widths) != 3 or min(self.autoencoder_widths) < 1:
-            raise PolicyError(f"autoencoder_widths must be three, got {self.autoencoder_widths}")
-        for name, least, most, unit in (
-            ("frame_dt_s", 0.01, 1.0, "s"),
-            ("horizontal_fov_rad", 0.2, 2.8, "rad"),
-            ("camera_tilt_rad", -1.5, 1.5, "rad"),
-        ):
-            value = getattr(self, name)
-            if not least <= value <= most:  # NaN is in no range
-                raise PolicyError(f"{name} must be {least:g} to {most:g} {unit}, got {value}")
         if self.schedule.prediction != "sample":
             raise PolicyError("the schedule of a world model must predict the sample")
 
@@ -93,11 +67,8 @@ class WorldModelConfig:
         """Read the header form."""
         try:
             data = json.loads(text)
-            known = {each.name for each in fields(cls)} - {"contract"}
-            if set(data) != known:
-                raise PolicyError(f"it must hold {sorted(known)}, not {sorted(data)}")
             data["schedule"] = NoiseSchedule(**data["schedule"])
             data["autoencoder_widths"] = tuple(data["autoencoder_widths"])
             return cls(contract=contract, **data)
-        except (PolicyError, TypeError, ValueError, RecursionError) as error:
+        except (PolicyError, LookupError, TypeError, ValueError, RecursionError) as error:
             raise PolicyError(f"malformed world model {text[:200]!r}: {error}") from error

@@ -68,7 +68,7 @@ def test_shapes_grow_by_cameras_observations_and_extras() -> None:
         ({"action": "torque"}, "action must be .*'velocity', got 'torque'"),
         ({"action": "velocity", "modes": ["GUIDED_NOGPS"]}, "of GUIDED, OFFBOARD for"),
         ({"lean_dead_zone": 0.9}, r"lean_dead_zone must be in \[0, 0.9\)"),
-        ({"modes": "ALT_HOLD"}, "modes must be one or more"),
+        ({"modes": "ALT_HOLD"}, "modes must be a list"),
         ({"modes": ["ALT_HOLD", "GUIDED"]}, r"for action 'sticks', got .*'GUIDED'"),
         ({"max_state_age_s": 0}, r"max_state_age_s must be in \[0.001, 60\] seconds, got 0"),
         ({"max_tilt_deg": 181}, r"max_tilt_deg must be in \[0.001, 180\] degrees"),
