@@ -5,7 +5,7 @@ For the stages that learn from features or latents, images are encoded once and 
 
 import math
 from collections import deque
-from collections.abc import Callable, Generator, Iterator
+from collections.abc import Callable, Generator, Iterator, Mapping
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from functools import lru_cache
@@ -23,7 +23,6 @@ from policy.data.flight_data import ImageArray
 from policy.data.frames import FrameStore
 from policy.data.interpolation import Indices
 from policy.data.samples import Timeline, TrainingSamples
-from policy.training.parallel import TensorBatch, row_parts
 from policy.training.settings import TrainSettings
 
 SHARE = 0.25
@@ -45,7 +44,6 @@ BRIGHTNESS, CONTRAST, COLOUR, NOISE = 0.15, 0.25, 0.08, 0.03
 """Half-ranges of the image augmentations, as shares of full scale; NOISE is the largest sigma."""
 AHEAD = 3
 """Batches to prepare while the network computes."""
-_PER_SAMPLE = ("state", "history", "chunk", "known", "noise", "timestep")
 VALIDATION_KEY = 2**31
 """Random key of validation samples, in place of a step; no run has this many steps."""
 T = TypeVar("T")
@@ -102,6 +100,26 @@ def _cover(image: ImageArray, random: np.random.Generator) -> None:
     image[top:bottom, left:right] = random.integers(0, 256, 3)
 
 
+@dataclass(frozen=True)
+class TensorBatch:
+    """Batch: a dataclass of tensors; one may be None."""
+
+    def to(self, device: torch.device) -> Self:
+        """Copy to a device."""
+        given = {name: value for name, value in vars(self).items() if value is not None}
+        return replace(self, **{n: v.to(device, non_blocking=True) for n, v in given.items()})
+
+
+@dataclass(frozen=True, kw_only=True)
+class StepLoss:
+    """Losses of one batch."""
+
+    total: Tensor
+    """Loss to minimise."""
+    metrics: Mapping[str, Tensor]
+    """Reported losses by name; includes ``loss``."""
+
+
 @dataclass(frozen=True, kw_only=True)
 class Batch(TensorBatch):
     """``B`` images and R times as many samples, ``S``, of a policy; each image serves R samples.
@@ -126,20 +144,6 @@ class Batch(TensorBatch):
     """[B, 7], NaN if unknown."""
     noise: Tensor
     timestep: Tensor
-
-    def split(self, count: int) -> list[Self]:
-        """Split into at most ``count`` parts of about equal size, each with two images or more."""
-        images = len(self.look)
-        repeats = len(self.state) // images
-        parts = []
-        for rows in row_parts(images, max(1, min(count, images // 2))):
-            samples = slice(rows.start * repeats, rows.stop * repeats)
-            cut = {name: getattr(self, name)[samples] for name in _PER_SAMPLE}
-            for name in ("images", "look", "features", "gate"):
-                value = getattr(self, name)
-                cut[name] = None if value is None else value[rows]
-            parts.append(replace(self, **cut))
-        return parts
 
 
 class FeatureStore:

@@ -22,12 +22,12 @@ from policy.training.batches import (
     Batch,
     Batches,
     FeatureStore,
+    StepLoss,
     encode_frames,
     normalise_image,
 )
-from policy.training.parallel import StepLoss, computing_in
 from policy.training.report import Hooks, PolicyValidation, TrainResult
-from policy.training.run import TrainingRun, work_folder
+from policy.training.run import TrainingRun, computing_in, work_folder
 from policy.training.settings import MAX_AGE_MS, TrainingStage, TrainSettings, policy_stages
 from policy.training.trainee import Trainee, refresh_batch_norm, validate
 
@@ -125,8 +125,8 @@ class _PolicyRun(TrainingRun[Trainee, Batch]):
             return lambda step: self._batches.with_features(step, features)
         return self._batches.with_images
 
-    def losses(self, trainee: Trainee, batch: Batch) -> StepLoss:
-        loss: StepLoss = trainee(batch)
+    def losses(self, batch: Batch) -> StepLoss:
+        loss: StepLoss = self.trainee(batch)
         return loss
 
     def validate(self) -> PolicyValidation | None:

@@ -15,7 +15,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import closing, contextmanager
 from dataclasses import asdict
 from pathlib import Path
-from typing import ClassVar, Generic
+from typing import ClassVar, Generic, TypeVar
 
 import numpy as np
 import torch
@@ -25,14 +25,15 @@ from policy.contract import StateFrame
 from policy.data.flight_data import DatasetError, FlightData, common_frame, hold_out
 from policy.data.frames import store_frames
 from policy.errors import PolicyError
-from policy.training.batches import ahead
-from policy.training.parallel import B, Gradients, M, StepLoss, one_thread
+from policy.training.batches import StepLoss, TensorBatch, ahead
 from policy.training.report import Hooks, TrainingProgress, TrainResult, Validation
 from policy.training.settings import Precision, RunSettings, TrainingStage, learning_rate_factor
 
 LOG_STEPS = 20
 """Steps between two lines of the log."""
 GRADIENT_LIMIT = 1.0
+M = TypeVar("M", bound=nn.Module)
+B = TypeVar("B", bound=TensorBatch)
 
 
 class TrainingError(PolicyError):
@@ -126,8 +127,8 @@ class TrainingRun(ABC, Generic[M, B]):
         """Return a function that creates the batch of a step; called in another thread."""
 
     @abstractmethod
-    def losses(self, trainee: M, batch: B) -> StepLoss:
-        """Return the losses of a batch or a part of it, on the device; called in threads."""
+    def losses(self, batch: B) -> StepLoss:
+        """Return the losses of a batch on the device."""
 
     @abstractmethod
     def validate(self) -> Validation | None:
@@ -178,27 +179,20 @@ class TrainingRun(ABC, Generic[M, B]):
         self.trainee.eval()
         self.encode()
         self.average.load_state_dict(self.trainee.state_dict())
-        self.trainee.zero_grad()  # frozen weights too: their gradients would be clipped
 
     def _train(self, stage: TrainingStage) -> None:
         count = self.settings.validation_count
         self._stage_step, self._stage_start = self.step, self._fraction
         optimiser = self._new_optimiser(stage)
         sums: dict[str, Tensor] = {}
-        with (
-            one_thread() as threads,
-            Gradients(
-                self.trainee, device=self.device, bf16=self.bf16, threads=threads
-            ) as gradients,
-            closing(ahead(self.batch_maker(), self.step)) as batches,
-        ):
-            for replica in gradients.replicas:
-                replica.train()
-                self.encoder(replica).train(stage.trains_encoder)
+        self.trainee.train()
+        self.encoder(self.trainee).train(stage.trains_encoder)
+        with closing(ahead(self.batch_maker(), self.step)) as batches:
             since = 0
             while self._fraction < stage.end:
-                metrics = gradients.compute(next(batches).to(self.device), self.losses)
-                rate = self._step(stage, optimiser)
+                metrics = self._set_gradients(next(batches).to(self.device))
+                with one_thread():
+                    rate = self._step(stage, optimiser)
                 sums = {name: sums.get(name, 0.0) + value for name, value in metrics.items()}
                 since += 1
                 if since == LOG_STEPS:
@@ -212,6 +206,13 @@ class TrainingRun(ABC, Generic[M, B]):
                 if self.hooks.should_stop():
                     self._validate(stage)
                     self._stop()
+
+    def _set_gradients(self, batch: B) -> dict[str, Tensor]:
+        self.trainee.zero_grad()
+        with computing_in(self.device, self.bf16):
+            loss = self.losses(batch)
+        torch.autograd.backward(loss.total)
+        return {name: value.detach() for name, value in loss.metrics.items()}
 
     def _step(self, stage: TrainingStage, optimiser: torch.optim.Optimizer) -> float:
         """Take one step with the computed gradients; return its learning rate."""
@@ -292,6 +293,26 @@ class TrainingRun(ABC, Generic[M, B]):
     def _write_log(self, record: Mapping[str, object]) -> None:
         with self._log.open("a") as file:
             file.write(json.dumps(record) + "\n")
+
+
+@contextmanager
+def one_thread() -> Iterator[None]:
+    """Run torch on one thread inside the block.
+
+    On cores shared with another program, threads that wait for each other in every small operator
+    of an optimiser's step took a hundred times the processor time of one.
+    """
+    before = torch.get_num_threads()
+    torch.set_num_threads(1)
+    try:
+        yield
+    finally:
+        torch.set_num_threads(before)
+
+
+def computing_in(device: torch.device, bf16: bool) -> torch.autocast:
+    """Return autocast to bfloat16, or a no-op context."""
+    return torch.autocast(device.type, torch.bfloat16, enabled=bf16)
 
 
 @torch.no_grad()

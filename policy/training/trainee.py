@@ -10,8 +10,7 @@ from torch import Tensor, nn
 from policy.contract import ACTION_DIM, FloatArray
 from policy.nets.diffusion import size_dims
 from policy.nets.toge import BuiltinPolicy
-from policy.training.batches import Batch, normalised
-from policy.training.parallel import StepLoss
+from policy.training.batches import Batch, StepLoss, normalised
 from policy.training.report import PolicyValidation
 
 GATE_LABELS = 10

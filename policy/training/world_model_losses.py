@@ -22,8 +22,7 @@ from policy.nets.world_model.config import WorldModelConfig
 from policy.nets.world_model.dynamics import Future
 from policy.nets.world_model.model import WorldModel
 from policy.nets.world_model.motion import MOTION_DIM, MOTION_SCALE, motion_since
-from policy.training.batches import VALIDATION_KEY, FeatureStore, next_of
-from policy.training.parallel import StepLoss, TensorBatch
+from policy.training.batches import VALIDATION_KEY, FeatureStore, StepLoss, TensorBatch, next_of
 from policy.training.report import WorldModelValidation
 from policy.training.settings import WorldModelSettings
 

@@ -15,10 +15,9 @@ from policy.errors import PolicyError
 from policy.nets.world_model.autoencoder import to_unit
 from policy.nets.world_model.config import WorldModelConfig
 from policy.nets.world_model.model import WorldModel
-from policy.training.batches import FeatureStore, encode_frames
-from policy.training.parallel import StepLoss, computing_in
+from policy.training.batches import FeatureStore, StepLoss, encode_frames
 from policy.training.report import Hooks, TrainResult, WorldModelValidation
-from policy.training.run import TrainingRun, work_folder
+from policy.training.run import TrainingRun, computing_in, work_folder
 from policy.training.settings import WorldModelSettings, world_model_stages
 from policy.training.world_model_losses import (
     FrameBatch,
@@ -102,10 +101,10 @@ class _WorldModelRun(TrainingRun[WorldModel, FrameBatch | WindowBatch]):
             return WindowBatches(windows, self._latents, config, settings).batch
         return lambda step: frame_batch(self.store, windows, config, settings, step)
 
-    def losses(self, trainee: WorldModel, batch: FrameBatch | WindowBatch) -> StepLoss:
+    def losses(self, batch: FrameBatch | WindowBatch) -> StepLoss:
         if isinstance(batch, FrameBatch):
-            return autoencoder_loss(trainee, batch)
-        return dynamics_loss(trainee, batch)
+            return autoencoder_loss(self.trainee, batch)
+        return dynamics_loss(self.trainee, batch)
 
     def validate(self) -> WorldModelValidation | None:
         if not self._held_batches:
