@@ -10,13 +10,11 @@ from typing import NamedTuple, TypeAlias
 from sitl import UsageError
 from sitl.clock import NS_PER_S, Clock, monotonic_from_wall_ns
 
-Address: TypeAlias = tuple[str, int, *tuple[int, ...]]
-"""Numeric host and port of the ``socket`` module; IPv6 adds flow and scope."""
+Address: TypeAlias = tuple[str, int]  # IPv4 host and port
 
 VEHICLE_KINDS = ("udpout", "udpin", "tcpin")  # links of a vehicle
 FOLLOWER_KINDS = ("udp", "udpin", "udpout", "tcp")  # links to another vehicle; ``udp`` is ``udpin``
 MAX_DATAGRAM = 65535
-MAX_PACKED = 1200  # frames of one step share a datagram up to this size: below any usual MTU
 MAX_PEERS = 8  # addresses that a listening link answers; a new one replaces the longest silent
 MAX_READS = 1000
 """Reads per drain, so that a flood cannot stop the loop; the rest waits for the next step."""
@@ -25,9 +23,6 @@ CONNECT_TIMEOUT_S = 1.0
 _SO_TIMESTAMPNS = 35  # Linux (asm-generic/socket.h); not in Python
 _TIMESPEC = struct.Struct("@qq")
 _ANCILLARY_BYTES = 64
-_UNREACHABLE = (errno.ENETUNREACH, errno.EHOSTUNREACH, errno.ENOBUFS)
-_V1_MAGIC, _V1_OVERHEAD = 0xFE, 8
-_V2_OVERHEAD, _SIGNATURE, _SIGNED_FLAG = 12, 13, 0x01
 
 
 class Received(NamedTuple):
@@ -38,7 +33,7 @@ class Received(NamedTuple):
 
 
 def open_transport(url: str, clock: Clock, kinds: tuple[str, ...] = VEHICLE_KINDS) -> "Transport":
-    """Open a link by its name, KIND:HOST:PORT or, as in MAVSDK, KIND://HOST:PORT; IPv6 in brackets.
+    """Open a link by its name, KIND:HOST:PORT or, as in MAVSDK, KIND://HOST:PORT.
 
     ``udpout`` sends first; ``udpin`` listens and answers all senders it has heard; ``tcpin`` serves
     clients, together or one after another; ``tcp`` connects at each send without a connection, so
@@ -51,15 +46,14 @@ def open_transport(url: str, clock: Clock, kinds: tuple[str, ...] = VEHICLE_KIND
     host, _, port_text = rest.removeprefix("//").rpartition(":")
     if kind == "udpin" and rest.startswith("//:"):
         host = "127.0.0.1"
-    is_bare = ":" in host and not (host.startswith("[") and host.endswith("]"))
-    if kind not in kinds or not host or is_bare or not port_text.isdecimal():
+    if kind not in kinds or not host or not port_text.isdecimal():
         wanted = ", ".join(f"{kind}:HOST:PORT" for kind in kinds)
         raise UsageError(f"link {url!r}: expected one of {wanted}")
     port = int(port_text)
     if not 0 < port < 65536:
         raise UsageError(f"link {url!r}: port {port} is not within 1..65535")
     try:
-        address = _resolve(host.strip("[]"), port)
+        address = (socket.gethostbyname(host), port)
         if kind.startswith("tcp"):
             return TcpLink(address, clock, listen=kind == "tcpin")
         return UdpLink(address, clock, listen=kind != "udpout")
@@ -72,17 +66,6 @@ def _reason(error: OSError) -> str:
     return "already in use" if in_use else error.strerror or str(error)
 
 
-def _resolve(host: str, port: int) -> Address:
-    """Resolve a host; prefer IPv4."""
-    found = [entry[4] for entry in socket.getaddrinfo(host, port, type=socket.SOCK_DGRAM)]
-    number, port_number, *scope = min(found, key=len)
-    return (str(number), int(port_number), *tuple(int(part) for part in scope))
-
-
-def _family(address: Address) -> socket.AddressFamily:
-    return socket.AF_INET if len(address) == 2 else socket.AF_INET6
-
-
 class UdpLink:
     """UDP link that either listens or sends to one address."""
 
@@ -90,7 +73,7 @@ class UdpLink:
         self._clock = clock
         self._listen = listen
         self._peers: list[Address] = [] if listen else [address]
-        self._socket = socket.socket(_family(address), socket.SOCK_DGRAM)
+        self._socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
         try:
             if listen:
                 self._socket.bind(address)
@@ -116,16 +99,10 @@ class UdpLink:
             yield Received(data, self._arrival_ns(ancillary))
 
     def send(self, data: bytes) -> None:
-        """Send whole frames to every peer; drop those that cannot be sent now."""
-        for datagram in split_frames(data, MAX_PACKED):
-            for peer in self._peers:
-                try:
-                    self._socket.sendto(datagram, peer)
-                except (BlockingIOError, ConnectionError):
-                    continue
-                except OSError as error:
-                    if error.errno not in _UNREACHABLE:
-                        raise
+        """Send one datagram to every peer; drop it where that is not possible now."""
+        for peer in self._peers if data else ():
+            with suppress(OSError):
+                self._socket.sendto(data, peer)
 
     def close(self) -> None:
         self._socket.close()
@@ -146,7 +123,7 @@ class TcpLink:
         self._clock = clock
         self._address = address
         self._connections: list[socket.socket] = []
-        self._server = socket.create_server(address, family=_family(address)) if listen else None
+        self._server = socket.create_server(address) if listen else None
         if self._server is not None:
             self._server.setblocking(False)
 
@@ -175,7 +152,7 @@ class TcpLink:
             return
         if self._server is None and not self._connections:
             try:
-                self._add(socket.create_connection(self._address[:2], CONNECT_TIMEOUT_S))
+                self._add(socket.create_connection(self._address, CONNECT_TIMEOUT_S))
             except OSError:
                 return
         for connection in tuple(self._connections):
@@ -203,24 +180,6 @@ class TcpLink:
 
 
 Transport: TypeAlias = UdpLink | TcpLink
-
-
-def split_frames(data: bytes, limit: int) -> Iterator[bytes]:
-    """Cut MAVLink data into pieces of whole frames, of at most ``limit`` bytes or one frame."""
-    start = end = 0
-    while end < len(data):
-        length = data[end + 1]  # payload length
-        if data[end] == _V1_MAGIC:
-            length += _V1_OVERHEAD
-        else:
-            is_signed = data[end + 2] & _SIGNED_FLAG
-            length += _V2_OVERHEAD + (_SIGNATURE if is_signed else 0)
-        if end > start and end + length - start > limit:
-            yield data[start:end]
-            start = end
-        end += length
-    if start < len(data):
-        yield data[start:]
 
 
 HOST = "127.0.0.1"
