@@ -161,16 +161,12 @@ class Waypoint:
     leg_s: float
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Plan:
-    """Accelerations and velocities at the start of the path and at its waypoints."""
-
-    accel_mps2: FloatArray  # [N + 1, 3]
-    velocity_mps: FloatArray  # [N + 1, 3]
-
-
-def least_acceleration(position_m: Vec3, velocity_mps: Vec3, waypoints: Sequence[Waypoint]) -> Plan:
+def least_acceleration(
+    position_m: Vec3, velocity_mps: Vec3, waypoints: Sequence[Waypoint]
+) -> FloatArray:
     """Plan from a position and velocity through the waypoints, in any inertial frame.
+
+    Return the accelerations at the start of the path and at its waypoints, [N + 1, 3].
 
     Between waypoints, a path of least integrated squared acceleration is a cubic in time (Bryson
     and Ho, Applied Optimal Control, 1975). Waypoints are soft: missing a point or its velocity has
@@ -202,7 +198,7 @@ def least_acceleration(position_m: Vec3, velocity_mps: Vec3, waypoints: Sequence
         mean = (position[k + 1] - position[k]) / leg_s
         accel[k] = (6 * mean - 4 * velocity[k] - 2 * velocity[k + 1]) / leg_s
     accel[count] = (-6 * mean + 2 * velocity[count - 1] + 4 * velocity[count]) / leg_s
-    return Plan(accel_mps2=accel, velocity_mps=velocity)
+    return accel
 
 
 def _leg_cost(leg_s: float) -> FloatArray:
@@ -221,8 +217,8 @@ def _approach(
     sight = to_aim_m / distance_m
     closing_mps = max(MIN_SPEED_MPS, (velocity * sight.conjugate()).real)
     waypoints = _waypoints(state, ahead, closing_mps, agility, speed_mps)
-    plan = least_acceleration(state.position_ned_m, state.velocity_ned_mps, waypoints)
-    accel_n, accel_e, accel_d = plan.accel_mps2[0].tolist()
+    accel_mps2 = least_acceleration(state.position_ned_m, state.velocity_ned_mps, waypoints)
+    accel_n, accel_e, accel_d = accel_mps2[0].tolist()
     # Speed along the path is controlled; the plan's speed only serves its timing.
     along = velocity + MIN_SPEED_MPS * sight
     along /= max(_length(along), 1e-3)
@@ -230,7 +226,7 @@ def _approach(
     allowed_mps = min(
         speed_mps,
         closing_mps * _corner_ratio(right_mps2, agility),
-        _corner_speed(plan, waypoints, agility),
+        _corner_speed(accel_mps2, waypoints, agility),
     )
     error_mps = max(MIN_SPEED_MPS, allowed_mps) - (velocity * along.conjugate()).real
     low, high = agility.along_accel_mps2
@@ -283,10 +279,10 @@ def _waypoints(
     return waypoints
 
 
-def _corner_speed(plan: Plan, waypoints: list[Waypoint], agility: Agility) -> float:
+def _corner_speed(accel_mps2: FloatArray, waypoints: list[Waypoint], agility: Agility) -> float:
     """Return the speed from which the vehicle can still slow down for the corners ahead."""
     allowed_mps, distance_m = math.inf, 0.0
-    for waypoint, accel in zip(waypoints, plan.accel_mps2[1:].tolist(), strict=True):
+    for waypoint, accel in zip(waypoints, accel_mps2[1:].tolist(), strict=True):
         timed_mps = math.hypot(*waypoint.velocity_mps)
         distance_m += waypoint.leg_s * timed_mps
         corner_mps = timed_mps * _corner_ratio(math.hypot(*accel[:2]), agility)

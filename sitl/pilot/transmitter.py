@@ -188,8 +188,8 @@ class ExpertPilot:
     def close(self) -> None: ...
 
 
-PilotName = Literal["gamepad", "keyboard", "expert"]
-PILOTS: tuple[PilotName, ...] = ("gamepad", "keyboard", "expert")
+PilotName = Literal["gamepad", "expert"]
+PILOTS: tuple[PilotName, ...] = ("gamepad", "expert")
 _PX4_PARAMS = {"COM_RC_IN_MODE": 0.0, "COM_FLTMODE_BOOT": 1.0}
 """Parameters for a pilot: sticks from the receiver only, Altitude mode after boot."""
 
@@ -228,16 +228,14 @@ def make_pilot(
     try:
         import pygame
 
-        from sitl.pilot import devices
+        from sitl.pilot import gamepad
     except ModuleNotFoundError as error:
         if error.name != "pygame":
             raise
-        raise UsageError(f"--pilot {name} needs pygame: pip install pygame-ce") from error
+        raise UsageError("--pilot gamepad needs pygame: pip install pygame-ce") from error
     try:
-        if name == "keyboard":
-            return devices.KeyboardPilot(clock), devices.KEYS_HELP
-        pad = devices.PygamePad()
+        pad = gamepad.PygamePad()
     except pygame.error as error:
-        raise UsageError(f"--pilot {name} needs a display: {error}") from error
+        raise UsageError(f"--pilot gamepad needs a display: {error}") from error
     found = pad.description or "no gamepad yet: plug one in (until then the receiver has no signal)"
-    return devices.GamepadPilot(pad, wanted, clock), f"{found}; {devices.PAD_HELP}"
+    return gamepad.GamepadPilot(pad, wanted, clock), f"{found}; {gamepad.PAD_HELP}"

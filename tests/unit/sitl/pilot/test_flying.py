@@ -121,7 +121,7 @@ def test_unusable_pilots_are_refused(monkeypatch):
         pilot_of("gamepad", vehicle, axes="roll=1")
     monkeypatch.setenv("SDL_VIDEODRIVER", "no-such-driver")
     with pytest.raises(UsageError, match="needs a display"):
-        pilot_of("keyboard", vehicle)
+        pilot_of("gamepad", vehicle)
 
 
 def test_a_pilot_and_another_hand_on_the_receiver_contradict(capsys):

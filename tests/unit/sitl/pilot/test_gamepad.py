@@ -1,12 +1,10 @@
-"""Gamepad and keyboard as the pilot: sticks, gestures, switch, lost signal."""
+"""Gamepad as the pilot: sticks, gestures, switch, lost signal."""
 
-import pygame
 import pytest
 
 from sitl import UsageError
-from sitl.clock import NS_PER_S
-from sitl.pilot import devices
-from sitl.pilot.devices import GamepadPilot, KeyboardPilot
+from sitl.pilot import gamepad
+from sitl.pilot.gamepad import GamepadPilot
 from sitl.pilot.transmitter import DEFAULT_AXES, OFF_US, PERIOD_NS, Axis, parse_axes
 
 MIDDLE = (1500, 1500, 1500, 1500)
@@ -55,8 +53,8 @@ class FakePad:
     def axes(self):
         return self.values
 
-    def buttons(self):
-        return [number in self.down for number in range(12)]
+    def pressed(self):
+        return self.down
 
     def frame(self, *buttons):
         """Channels of the next frame."""
@@ -65,40 +63,9 @@ class FakePad:
         return self.pilot.latest()
 
 
-class Keys:
-    def __init__(self):
-        self.clock = Clock()
-        self.pilot = KeyboardPilot(self.clock)
-
-    def post(self, kind, *keys):
-        for key in keys:
-            pygame.event.post(pygame.event.Event(kind, key=key))
-
-    def press(self, *keys):
-        self.post(pygame.KEYDOWN, *keys)
-
-    def release(self, *keys):
-        self.post(pygame.KEYUP, *keys)
-
-    def frame(self, seconds=0.0):
-        """The last frame of this time."""
-        for _ in range(max(1, round(seconds * NS_PER_S / PERIOD_NS))):
-            self.clock.now += PERIOD_NS
-            frame = self.pilot.latest()
-        return frame
-
-
 @pytest.fixture
 def pad():
     return FakePad()
-
-
-@pytest.fixture
-def keys(monkeypatch):
-    monkeypatch.setenv("SDL_VIDEODRIVER", "dummy")
-    made = Keys()
-    yield made
-    made.pilot.close()
 
 
 def test_sticks_are_channels_as_the_autopilots_have_them(pad):
@@ -118,32 +85,13 @@ def test_without_the_pad_the_receiver_has_no_signal_until_it_is_back(pad):
 
 def test_buttons_hold_the_gestures(pad):
     pad.values = [0.0, 0.0, 0.0, 1.0, 0.0, 0.0]
-    assert pad.frame(devices.ARM_BUTTON)[:4] == (1500, 1500, 1000, 2000)
-    assert pad.frame(devices.DISARM_BUTTON)[:4] == (1500, 1500, 1000, 1000)
+    assert pad.frame(gamepad.ARM_BUTTON)[:4] == (1500, 1500, 1000, 2000)
+    assert pad.frame(gamepad.DISARM_BUTTON)[:4] == (1500, 1500, 1000, 1000)
     assert pad.frame()[:4] == (2000, 1500, 1500, 1500)
 
 
 def test_buttons_move_the_switch_once_each_time(pad):
-    record, bad = devices.RECORD_BUTTON, devices.BAD_BUTTON
+    record, bad = gamepad.RECORD_BUTTON, gamepad.BAD_BUTTON
     pressed = [(), (record,), (record,), (), (bad,), (record,), (), (record,)]
     positions = [pad.frame(*buttons)[6] for buttons in pressed]
     assert positions == [1000, 2000, 2000, 2000, 1500, 2000, 2000, 1000]
-
-
-def test_keys_move_the_sticks_as_fast_as_a_thumb(keys):
-    assert keys.frame()[:4] == MIDDLE
-    keys.press(pygame.K_UP, pygame.K_RIGHT)
-    assert keys.frame()[:4] == (1540, 1460, 1500, 1500)  # 0.08 in 20 ms
-    assert keys.frame(1.0)[:4] == (1850, 1150, 1500, 1500)
-    keys.press(pygame.K_LSHIFT)
-    assert keys.frame(1.0)[:4] == (2000, 1000, 1500, 1500)
-    keys.release(pygame.K_UP, pygame.K_RIGHT, pygame.K_LSHIFT)
-    keys.press(pygame.K_w, pygame.K_a)
-    assert keys.frame(1.0)[:4] == (1500, 1500, 1850, 1150)
-    keys.press(pygame.K_s)
-    assert keys.frame(1.0)[2] == 1500, "both ways are none"
-
-
-def test_a_closed_window_is_a_lost_signal(keys):
-    pygame.event.post(pygame.event.Event(pygame.QUIT))
-    assert keys.frame() == keys.frame(1.0) == OFF_US

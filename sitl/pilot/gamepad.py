@@ -1,0 +1,92 @@
+"""Pilot at a gamepad or a USB transmitter."""
+
+from collections.abc import Sequence
+
+import pygame
+
+from sitl.clock import Clock
+from sitl.pilot.transmitter import OFF_US, Gesture, Hand, PadAxes, Switch, Transmitter
+
+RECORD_BUTTON, BAD_BUTTON, DISARM_BUTTON, ARM_BUTTON = 0, 1, 6, 7
+"""A, B, back and start on a common pad."""
+PAD_HELP = (
+    "hold button 7 (start) to arm, 6 (back) to disarm; button 0 (A) moves the switch of channel 7 "
+    "up and down, 1 (B) to its middle"
+)
+
+
+class PygamePad:
+    """First gamepad of this computer; it may be unplugged and replaced."""
+
+    def __init__(self) -> None:
+        pygame.display.init()  # needed for events
+        pygame.joystick.init()
+        self._pad: pygame.joystick.JoystickType | None = None
+
+    @property
+    def description(self) -> str | None:
+        """Name and numbers of axes and buttons; None without a pad."""
+        if not self.poll() or self._pad is None:
+            return None
+        pad = self._pad
+        return f"{pad.get_name()}: {pad.get_numaxes()} axes, {pad.get_numbuttons()} buttons"
+
+    def poll(self) -> bool:
+        for event in pygame.event.get():
+            is_ours = self._pad is not None and (
+                getattr(event, "instance_id", None) == self._pad.get_instance_id()
+            )
+            if event.type == pygame.JOYDEVICEREMOVED and is_ours:
+                self._pad = None
+        if self._pad is None and pygame.joystick.get_count():
+            self._pad = pygame.joystick.Joystick(0)
+        return self._pad is not None
+
+    def axes(self) -> Sequence[float]:
+        """Return the positions in [-1, 1], by number."""
+        pad = self._pad
+        return () if pad is None else [pad.get_axis(k) for k in range(pad.get_numaxes())]
+
+    def pressed(self) -> set[int]:
+        """Return the numbers of the buttons that are pressed."""
+        pad = self._pad
+        return (
+            set() if pad is None else {k for k in range(pad.get_numbuttons()) if pad.get_button(k)}
+        )
+
+
+class GamepadPilot:
+    """`Pilot` at a gamepad: its transmitter, gestures and switch.
+
+    Without the pad the receiver has no signal.
+    """
+
+    def __init__(self, pad: PygamePad, axes: PadAxes, clock: Clock) -> None:
+        self._pad = pad
+        self._axes = axes
+        self._clock = clock
+        self._transmitter = Transmitter(clock.now_ns())
+        self._switch: Switch = "low"
+        self._down: set[int] = set()
+
+    def latest(self) -> Sequence[int] | None:
+        now_ns = self._clock.now_ns()
+        if not self._transmitter.begins_frame(now_ns):
+            return None
+        if not self._pad.poll():
+            self._down = set()
+            return OFF_US
+        before, self._down = self._down, self._pad.pressed()
+        for number in self._down - before:
+            if number == RECORD_BUTTON:
+                self._switch = "low" if self._switch == "high" else "high"
+            elif number == BAD_BUTTON:
+                self._switch = "middle"
+        gesture: Gesture | None = "arm" if ARM_BUTTON in self._down else None
+        if gesture is None and DISARM_BUTTON in self._down:
+            gesture = "disarm"
+        hand = Hand(self._axes.sticks(self._pad.axes()), gesture, self._switch)
+        return self._transmitter.channels_us(hand, now_ns)
+
+    def close(self) -> None:
+        pygame.quit()
