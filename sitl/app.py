@@ -19,10 +19,10 @@ from sitl.link.transport import RcInput, Transport, open_transport
 from sitl.pilot.transmitter import DEFAULT_AXES, PILOTS, Pilot, make_pilot, prepare_vehicle
 from sitl.report import write_report
 from sitl.simulated_vehicle import SimulatedVehicle
-from sitl.vehicle.conditions import NOMINAL, random_conditions
 from sitl.vehicle.config import (
     IDLE_RECEIVER_US,
     MID_RECEIVER_US,
+    SIGNING_TICK_NS,
     STEP_NS,
     SigningKey,
     VehicleConfig,
@@ -32,7 +32,6 @@ JOIN_TIMEOUT_S = 5.0
 KEY_BYTES = 32
 EPOCH_2015_NS = 1_420_070_400 * NS_PER_S
 """Unix time of the epoch of MAVLink 2 signing timestamps."""
-SIGNING_TICK_NS = 10_000
 LEAST_PRIORITY = 19
 """Niceness while flying on faster than real time, to protect the timing of other flights."""
 
@@ -179,21 +178,13 @@ def _parser() -> argparse.ArgumentParser:
     add("--receiver", choices=("idle", "mid", "none"), help=receiver_help)
     rc_help = "take the receiver's values from UDP datagrams on this port (sitl/link/transport.py)"
     add("--rc-in", type=_PORT, metavar="PORT", help=rc_help)
-    pilot_help = "a gamepad, the keys of a window, or the expert over the course moves the receiver"
+    pilot_help = "a gamepad, or the expert over the course moves the receiver"
     add("--pilot", choices=PILOTS, help=pilot_help)
     axes_help = f"axes of the gamepad, a minus reverses one (default: {DEFAULT_AXES})"
     add("--pilot-axes", default=DEFAULT_AXES, metavar="AXES", help=axes_help)
     add("--pilot-speed", type=_POSITIVE, default=4.0, metavar="MPS", help="of the expert")
     key_help = "sign with this key (MAVLink 2): a file of 32 bytes or 64 hexadecimal digits"
     add("--signing-key-file", type=Path, metavar="FILE", help=key_help)
-    conditions_help = "random airframe, firmware settings, wind, light and lens by seed"
-    add(
-        "--conditions",
-        type=lambda text: random_conditions(int(_SEED(text))),
-        default=NOMINAL,
-        metavar="SEED",
-        help=conditions_help,
-    )
     _add_camera_flags(parser)
     commands = parser.add_subparsers(title="other commands", metavar="COMMAND")
     camera_help = "film the course from another vehicle's reported pose"
@@ -262,7 +253,7 @@ def _fly(args: argparse.Namespace) -> None:
             os.nice(LEAST_PRIORITY)
             fly_on(vehicle, args.fly_on)
         if args.report is not None:
-            write_report(args.report, vehicle.log.summary(vehicle.ap, vehicle.bad_frames))
+            write_report(args.report, vehicle.log.summary(vehicle.ap))
             print_status(f"report written to {args.report}")
 
 
@@ -275,7 +266,6 @@ def _config(args: argparse.Namespace, links: int, onboard: int) -> VehicleConfig
         receiver=receiver != "none",
         receiver_us=IDLE_RECEIVER_US if receiver == "idle" else MID_RECEIVER_US,
         signing=args.signing_key_file and _signing_key(args.signing_key_file),
-        conditions=args.conditions,
     )
 
 
@@ -287,8 +277,8 @@ def _signing_key(path: Path) -> SigningKey:
         raise UsageError(f"--signing-key-file {path}: {error}") from error
     if len(key) != KEY_BYTES:
         raise UsageError(f"--signing-key-file {path}: want {KEY_BYTES} bytes, got {len(key)}")
-    since_2015_ns = wall_ns() - EPOCH_2015_NS
-    return SigningKey(key, since_2015_ns // SIGNING_TICK_NS)
+    zero_ns = wall_ns() - Clock().now_ns()
+    return SigningKey(key, (zero_ns - EPOCH_2015_NS) // SIGNING_TICK_NS)
 
 
 def _film(args: argparse.Namespace) -> None:

@@ -37,7 +37,6 @@ class FlightLog:
         self.distance_m = 0.0
         self._start_ns = start_ns
         self._course = course or Course(seed=0, gates=())
-        self._has_course = course is not None
         self._gates = GateCounter(self._course)
         self.overrides = _Arrivals()  # RC_CHANNELS_OVERRIDE that drives at least one stick
         self.manual_controls = _Arrivals()  # only of senders that the vehicle listens to
@@ -143,7 +142,7 @@ class FlightLog:
         if self.crash is None:
             self.crash = Crash(t_s=self._t_s(now_ns), hit=hit, speed_mps=self._speed_mps)
 
-    def summary(self, ap: Autopilot, bad_frames: int) -> dict[str, Any]:
+    def summary(self, ap: Autopilot) -> dict[str, Any]:
         body = ap.truth
         angles = to_euler(body.ned_from_body_wxyz)
         passed = [asdict(gate) for gate in self._gates.passed]
@@ -155,17 +154,15 @@ class FlightLog:
             "manual_control": self.manual_controls.summary(),
             "setpoints": self.setpoints.summary(),
             "refused_messages": self.refused_messages,
-            "bad_frames": bad_frames,
             "armed_s": self._armed_ns / NS_PER_S,
             "max_altitude_m": self._max_altitude_m,
             "distance_m": self.distance_m,
             "crashed": self.crashed,
             "crash": asdict(self.crash) if self.crash else None,
             "impact_speed_mps": self._impact_mps,
-            "gates": {"total": self.gates_total, "passed": passed} if self._has_course else None,
+            "gates": {"total": self.gates_total, "passed": passed} if self._course.gates else None,
             "conditions": ap.config.conditions.numbers(),
             "modes": self._modes,
-            "statustexts": self.texts,
             "final": {
                 "mode": ap.mode_name,
                 "armed": ap.armed,

@@ -16,7 +16,7 @@ from sitl.px4.server import Px4Server
 from sitl.report import FlightLog
 from sitl.vehicle.config import VehicleConfig
 from sitl.vehicle.dynamics import BodyState
-from sitl.vehicle.firmware import Autopilot, Params, StatusText
+from sitl.vehicle.firmware import Autopilot, StatusText
 
 SEVERITY_CRITICAL = 2
 MAX_CATCH_UP_NS = NS_PER_S
@@ -42,31 +42,29 @@ class SimulatedVehicle:
         config: VehicleConfig | None = None,
         course: Course | None = None,
     ) -> None:
-        config = config or VehicleConfig()
+        self._config = config = config or VehicleConfig()
         self.log = FlightLog(boot_ns, course)
+        self.params: ArduPilotParams | Px4Params
+        """The firmware's parameters; they survive a reboot."""
         self.ap: Autopilot  # the flight controller since its last boot
         self.server: MavlinkServer[Any, Any]  # the vehicle's links
         if config.autopilot == "px4":
-            px4_params = Px4Params(
+            self.params = Px4Params(
                 config.conditions, receiver=config.receiver, release=config.px4_release
             )
-            self.ap = px4 = Px4(px4_params, config, boot_ns)
-            self.server = Px4Server(px4, links, self.log)
         else:
-            params = ArduPilotParams(config.conditions, config.ardupilot_release)
-            self.ap = copter = ArduCopter(params, config, boot_ns)
-            self.server = ArduPilotServer(copter, links, self.log)
+            self.params = ArduPilotParams(config.conditions, config.ardupilot_release)
+        self._boot(links, boot_ns)
         self._transmitter_us: Sequence[int] | None = None
         self.pose = Pose(stamp_ns=boot_ns, body=self.ap.truth)
 
-    @property
-    def params(self) -> Params:
-        """The firmware's parameters; they survive a reboot."""
-        return self.ap.params
-
-    @property
-    def bad_frames(self) -> int:
-        return sum(link.bad_frames for link in self.server.links)
+    def _boot(self, links: int, boot_ns: int) -> None:
+        if isinstance(self.params, Px4Params):
+            self.ap = px4 = Px4(self.params, self._config, boot_ns)
+            self.server = Px4Server(px4, links, self.log)
+        else:
+            self.ap = copter = ArduCopter(self.params, self._config, boot_ns)
+            self.server = ArduPilotServer(copter, links, self.log)
 
     def receive(self, link_id: int, data: bytes, now_ns: int) -> None:
         self.log.on_received(now_ns)
@@ -109,8 +107,10 @@ class SimulatedVehicle:
 
     def reboot(self) -> None:
         """Restart on the ground at the origin: time_boot_ms is 0, parameters stay."""
-        self.ap = self.ap.rebooted()
-        self.server.restart(self.ap)
+        unsent = [link.take_outgoing() for link in self.server.links]
+        self._boot(len(unsent), self.ap.now_ns)
+        for link, data in zip(self.server.links, unsent, strict=True):
+            link.pass_on(data)
         if self._transmitter_us is not None:
             self.ap.set_receiver(self._transmitter_us)
         self.log.on_reboot()

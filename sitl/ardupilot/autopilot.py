@@ -11,8 +11,15 @@ from contextlib import suppress
 from sitl.ardupilot.flight_modes import CopterControl, Mode
 from sitl.ardupilot.guided import GuidedControl
 from sitl.ardupilot.params import ArduPilotParams
-from sitl.ardupilot.rc import ModeSwitch, RcEngine
-from sitl.ardupilot.sticks import GESTURE_NS, Sticks, climb_rate_mps, gesture_side, read_sticks
+from sitl.ardupilot.rc import (
+    GESTURE_NS,
+    ModeSwitch,
+    RcEngine,
+    Sticks,
+    climb_rate_mps,
+    gesture_side,
+    read_sticks,
+)
 from sitl.clock import NS_PER_S
 from sitl.vehicle.config import STEP_NS, VehicleConfig
 from sitl.vehicle.dynamics import QUAD
@@ -103,7 +110,6 @@ class ArduCopter(Autopilot):
 
     step_ns = STEP_NS
     airframe = QUAD
-    gps_period_ns = NS_PER_S // 5
     id_param = "MAV_SYSID"
     battery_mv = 12_600
     params: ArduPilotParams
@@ -142,10 +148,6 @@ class ArduCopter(Autopilot):
         self.rc.set_receiver(values_us)
 
     @property
-    def has_gps(self) -> bool:
-        return math.isfinite(self.config.position_ready_s)
-
-    @property
     def guided(self) -> GuidedControl | None:
         """Setpoint control in GUIDED and GUIDED_NOGPS; None in other modes."""
         return self.control.guided if self.mode.is_guided else None
@@ -170,7 +172,8 @@ class ArduCopter(Autopilot):
         if not self.mode.can_arm:
             return f"{self.mode.name} mode not armable"
         if self.mode.needs_position and not self.position_ready:
-            return "Need Position Estimate" if self.has_gps else "GPS 1: Bad fix"
+            has_gps = math.isfinite(self.config.position_ready_s)
+            return "Need Position Estimate" if has_gps else "GPS 1: Bad fix"
         sticks = read_sticks(self.rc, self.params)
         is_thrust = self.mode.manual_throttle and sticks.throttle > 0
         if is_thrust or climb_rate_mps(sticks, self.params) > 0.0:

@@ -24,8 +24,6 @@ STEP_S = STEP_NS / NS_PER_S
 RATE_GAIN_PER_S: Vec3 = (18.0, 18.0, 6.0)
 """At the default gains. With 28 ms of motor lag, 18/s gives a damping ratio of about 0.7."""
 MIN_INPUT_TIME_S = 0.01
-MAX_TARGET_LEAD_RAD = math.radians(30.0)
-"""In rate mode, the target's largest lead over the vehicle before it is reset to the vehicle."""
 MOTOR_LAG_S = 0.028
 CATCH_UP_PER_S = 1.0
 YAW_GAIN_PER_S = 6.0
@@ -72,14 +70,6 @@ class AttitudeController:
             -sr * self._pitch_rate + cr * cp * yaw_rate_radps,
         )
         return self._track(body, self._target, feedforward)
-
-    def rates(self, body: BodyState, rate_radps: Vec3) -> Vec3:
-        """Return body angular acceleration [rad/s^2] towards a body rate; zero holds attitude."""
-        self._target = integrate(self._target, rate_radps, STEP_S)
-        error = rotation_between(body.ned_from_body_wxyz, self._target)
-        if math.hypot(*error) > MAX_TARGET_LEAD_RAD:
-            self._target = body.ned_from_body_wxyz
-        return self._track(body, self._target, rate_radps)
 
     def approach(self, body: BodyState, ned_from_body_wxyz: Quat, rate_body_radps: Vec3) -> Vec3:
         """Return body angular acceleration [rad/s^2] towards an attitude turning at a body rate."""

@@ -6,7 +6,6 @@ keeps its bias and whose magnetometer is a million times too large, positions wi
 estimator has one.
 """
 
-from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -16,170 +15,128 @@ from sitl.ardupilot.autopilot import ArduCopter
 from sitl.ardupilot.flight_modes import Mode
 from sitl.ardupilot.guided import Submode
 from sitl.clock import NS_PER_MS, NS_PER_S
-from sitl.link.server import MAX_STATUSTEXT, Endpoint, Message, flags
-from sitl.link.telemetry import Home, boot_ms, boot_us, extended_sys_state, sys_status, vfr_hud
+from sitl.link.server import MAX_STATUSTEXT, Endpoint
+from sitl.link.telemetry import Fields, Telemetry, flags
 from sitl.vehicle.config import ArduPilotRelease
-from sitl.vehicle.firmware import Autopilot
 from sitl.vehicle.rotation import Vec3
-
-HOME = Home(-35.3632621, 149.1652374, 584.0, (0.2322, 0.0520, -0.5280), 945.0, 35.0)
-"""Default home of ArduPilot's SITL."""
-GYRO_BIAS_RADPS: Vec3 = (0.003, -0.002, 0.001)
-"""Gyro bias. The estimator subtracts it; raw IMU messages contain it."""
 
 _SENSORS = flags(
     "MAV_SYS_STATUS_",
     "SENSOR_3D_GYRO SENSOR_3D_ACCEL SENSOR_3D_MAG SENSOR_ABSOLUTE_PRESSURE SENSOR_GPS "
     "SENSOR_ANGULAR_RATE_CONTROL SENSOR_ATTITUDE_STABILIZATION AHRS SENSOR_BATTERY",
 )
-_CAPABILITIES = flags(
-    "MAV_PROTOCOL_CAPABILITY_",
-    "PARAM_FLOAT MISSION_INT COMMAND_INT MAVLINK2 SET_ATTITUDE_TARGET "
-    "SET_POSITION_TARGET_LOCAL_NED",
-)
-"""Without FTP, so that clients fetch parameters with PARAM_REQUEST_LIST."""
 _FIRMWARE_VERSIONS: dict[ArduPilotRelease, int] = {
     "4.6": 4 << 24 | 6 << 16 | 3 << 8 | mav.FIRMWARE_VERSION_TYPE_OFFICIAL,
     "4.7-dev": 4 << 24 | 7 << 16 | mav.FIRMWARE_VERSION_TYPE_DEV,
     "4.7": 4 << 24 | 7 << 16 | mav.FIRMWARE_VERSION_TYPE_OFFICIAL,
 }
+_BASE_MODE = flags("MAV_MODE_FLAG_", "CUSTOM_MODE_ENABLED STABILIZE_ENABLED MANUAL_INPUT_ENABLED")
 _EKF_VERTICAL = mav.EKF_ATTITUDE | mav.EKF_VELOCITY_VERT | mav.EKF_POS_VERT_ABS
 _EKF_HORIZONTAL = flags(
     "EKF_", "VELOCITY_HORIZ POS_HORIZ_REL POS_HORIZ_ABS PRED_POS_HORIZ_REL PRED_POS_HORIZ_ABS"
 )
 _VELOCITY_ONLY = 3079  # POSITION_TARGET_LOCAL_NED.type_mask: velocity and acceleration only
 _POSITION_ONLY = 3576  # type_mask: position only
+GYRO_BIAS_RADPS: Vec3 = (0.003, -0.002, 0.001)
+"""Gyro bias. The estimator subtracts it; raw IMU messages contain it."""
 
 
-def _raw_gyro(ap: Autopilot) -> Vec3:
-    (x, y, z), (bias_x, bias_y, bias_z) = ap.sensed.rate_body_radps, GYRO_BIAS_RADPS
-    return (x + bias_x, y + bias_y, z + bias_z)
+class ArduPilotTelemetry(Telemetry[ArduCopter]):
+    """ArduPilot's messages, at the default home of its SITL."""
 
-
-def _scaled_imu(ap: Autopilot) -> tuple[int, ...]:
-    return HOME.scaled_imu(ap, _raw_gyro(ap))
-
-
-def _heartbeat(ap: ArduCopter) -> Message:
-    """Build HEARTBEAT; its state is CRITICAL while a failsafe is active."""
-    base_mode = (
-        mav.MAV_MODE_FLAG_CUSTOM_MODE_ENABLED
-        | mav.MAV_MODE_FLAG_STABILIZE_ENABLED
-        | mav.MAV_MODE_FLAG_MANUAL_INPUT_ENABLED
+    lat_deg, lon_deg, alt_m = -35.3632621, 149.1652374, 584.0
+    field_ned_gauss = (0.2322, 0.0520, -0.5280)
+    field_per_gauss = 1e6  # in micro-gauss, as in the firmware
+    pressure_hpa, temperature_c = 945.0, 35.0
+    capabilities = flags(
+        "MAV_PROTOCOL_CAPABILITY_",
+        "PARAM_FLOAT MISSION_INT COMMAND_INT MAVLINK2 SET_ATTITUDE_TARGET "
+        "SET_POSITION_TARGET_LOCAL_NED",
     )
-    status = mav.MAV_STATE_STANDBY
-    if ap.armed:
-        base_mode |= mav.MAV_MODE_FLAG_SAFETY_ARMED
-        status = mav.MAV_STATE_ACTIVE
-    if ap.radio_failsafe.active or ap.gcs_failsafe.active:
-        status = mav.MAV_STATE_CRITICAL
-    autopilot = mav.MAV_AUTOPILOT_ARDUPILOTMEGA
-    return mav.MAVLink_heartbeat_message(
-        ap.config.vehicle_type, autopilot, base_mode, int(ap.mode), status, 3
-    )
+    """Without FTP, so that clients fetch parameters with PARAM_REQUEST_LIST."""
 
+    @property
+    def gyro_radps(self) -> Vec3:
+        (x, y, z), (bias_x, bias_y, bias_z) = self.ap.sensed.rate_body_radps, GYRO_BIAS_RADPS
+        return (x + bias_x, y + bias_y, z + bias_z)
 
-def _vfr_hud(ap: ArduCopter) -> Message:
-    throttle = sum(ap.motor_commands) / len(ap.motor_commands)
-    altitude_m = HOME.alt_m - ap.sensed.position_ned_m[2] if ap.has_gps else 0.0
-    return vfr_hud(ap, altitude_m=altitude_m, throttle=throttle)
+    @property
+    def version(self) -> int:
+        return _FIRMWARE_VERSIONS[self.ap.config.ardupilot_release]
 
+    def heartbeat(self) -> Fields:
+        """Its state is CRITICAL while a failsafe is active."""
+        ap, base_mode, status = self.ap, _BASE_MODE, mav.MAV_STATE_STANDBY
+        if ap.armed:
+            base_mode |= mav.MAV_MODE_FLAG_SAFETY_ARMED
+            status = mav.MAV_STATE_ACTIVE
+        if ap.radio_failsafe.active or ap.gcs_failsafe.active:
+            status = mav.MAV_STATE_CRITICAL
+        kind = (mav.MAV_TYPE_QUADROTOR, mav.MAV_AUTOPILOT_ARDUPILOTMEGA)
+        return (*kind, base_mode, int(ap.mode), status, 3)
 
-def _sys_status(ap: ArduCopter) -> Message:
-    """Build SYS_STATUS; PREARM_CHECK is healthy if only mode and sticks can still refuse arming."""
-    present = _SENSORS | mav.MAV_SYS_STATUS_PREARM_CHECK
-    present |= mav.MAV_SYS_STATUS_SENSOR_RC_RECEIVER if ap.rc.found else 0
-    faults = 0
-    if not ap.armed and ap.prearm_refusal() is not None:
-        faults |= mav.MAV_SYS_STATUS_PREARM_CHECK
-    if ap.radio_failsafe.active:
-        faults |= mav.MAV_SYS_STATUS_SENSOR_RC_RECEIVER
-    return sys_status(ap, present=present, enabled=present, healthy=present & ~faults)
+    def sys_status(self) -> Fields:
+        """PREARM_CHECK is healthy if only mode and sticks can still refuse arming."""
+        ap, faults = self.ap, 0
+        present = _SENSORS | mav.MAV_SYS_STATUS_PREARM_CHECK
+        present |= mav.MAV_SYS_STATUS_SENSOR_RC_RECEIVER if ap.rc.found else 0
+        if not ap.armed and ap.prearm_refusal() is not None:
+            faults |= mav.MAV_SYS_STATUS_PREARM_CHECK
+        if ap.radio_failsafe.active:
+            faults |= mav.MAV_SYS_STATUS_SENSOR_RC_RECEIVER
+        return self._health(present=present, enabled=present, healthy=present & ~faults)
 
+    def raw_imu(self) -> Fields:
+        """Scaled integers in spite of the name."""
+        _, *imu, temperature_cdeg = self.scaled_imu()
+        return (self.boot_us, *imu, 0, temperature_cdeg)
 
-def _ekf_status_report(ap: ArduCopter) -> Message:
-    """Build EKF_STATUS_REPORT: the attitude flags from the start, the others with a position."""
-    flags = mav.EKF_UNINITIALIZED
-    if ap.estimator_ready:
-        flags = _EKF_VERTICAL | (0 if ap.position_ready else mav.EKF_CONST_POS_MODE)
-    if ap.position_ready:
-        flags |= _EKF_HORIZONTAL
-    return mav.MAVLink_ekf_status_report_message(flags, 0.01, 0.01, 0.01, 0.01, 0.0)
+    def scaled_imu2(self) -> Fields:
+        """The second IMU agrees with the first."""
+        return self.scaled_imu()
 
+    def local_position_ned(self) -> Fields | None:
+        if not self.ap.position_ready:
+            return None
+        body = self.ap.sensed
+        return (self.boot_ms, *body.position_ned_m, *body.velocity_ned_mps)
 
-def _extended_sys_state(ap: ArduCopter) -> Message:
-    is_taking_off = ap.guided is not None and ap.guided.is_taking_off(ap.sensed)
-    vtol, is_landing = mav.MAV_VTOL_STATE_UNDEFINED, ap.mode.lands
-    return extended_sys_state(ap, vtol, is_landing=is_landing, is_taking_off=is_taking_off)
+    def rc_channels(self) -> Fields:
+        """Channel values after overrides."""
+        rc = self.ap.rc
+        return (self.boot_ms, rc.channel_count, *rc.channels_us, 0, 0, 255)
 
+    def ekf_status_report(self) -> Fields:
+        """The attitude flags from the start, the others with a position."""
+        found, ap = mav.EKF_UNINITIALIZED, self.ap
+        if ap.estimator_ready:
+            found = _EKF_VERTICAL | (0 if ap.position_ready else mav.EKF_CONST_POS_MODE)
+        if ap.position_ready:
+            found |= _EKF_HORIZONTAL
+        return (found, 0.01, 0.01, 0.01, 0.01, 0.0)
 
-def _attitude_target(ap: ArduCopter) -> Message:
-    """Build ATTITUDE_TARGET: the controller's shaped target, not the received setpoint, and the
-    thrust before the lean boost."""
-    attitude, rate_radps = ap.control.target
-    return mav.MAVLink_attitude_target_message(
-        boot_ms(ap), 0, attitude, *rate_radps, ap.control.thrust
-    )
+    def extended_sys_state(self) -> Fields:
+        ap = self.ap
+        is_taking_off = ap.guided is not None and ap.guided.is_taking_off(ap.sensed)
+        state = self._landed_state(is_landing=ap.mode.lands, is_taking_off=is_taking_off)
+        return (mav.MAV_VTOL_STATE_UNDEFINED, state)
 
+    def attitude_target(self) -> Fields:
+        """The controller's shaped target, not the received setpoint, and the thrust before the
+        lean boost."""
+        attitude, rate_radps = self.ap.control.target
+        return (self.boot_ms, 0, attitude, *rate_radps, self.ap.control.thrust)
 
-def _position_target(ap: ArduCopter) -> Message | None:
-    """Build the setpoint that GUIDED follows, in NED axes; None for attitudes or other modes."""
-    guided = ap.guided if ap.mode is Mode.GUIDED else None
-    if guided is None or guided.submode is Submode.ATTITUDE:
-        return None
-    is_takeoff = guided.submode is Submode.TAKEOFF
-    return mav.MAVLink_position_target_local_ned_message(
-        boot_ms(ap),
-        mav.MAV_FRAME_LOCAL_NED,
-        _POSITION_ONLY if is_takeoff else _VELOCITY_ONLY,
-        *(0.0, 0.0, 0.0),  # zero even during a takeoff, as in the firmware
-        *guided.velocity.velocity_ned_mps,
-        *(0.0, 0.0, 0.0, 0.0, 0.0),
-    )
-
-
-BUILDERS: dict[int, Callable[[ArduCopter], Message | None]] = {
-    **HOME.builders(
-        gyro=_raw_gyro,
-        field_per_gauss=1e6,  # in micro-gauss, as in the firmware
-        has_pressure_difference=True,
-        version=lambda ap: _FIRMWARE_VERSIONS[ap.config.ardupilot_release],
-        capabilities=_CAPABILITIES,
-        energy_hj=0,
-    ),
-    mav.MAVLINK_MSG_ID_HEARTBEAT: _heartbeat,
-    mav.MAVLINK_MSG_ID_SYS_STATUS: _sys_status,
-    mav.MAVLINK_MSG_ID_GPS_RAW_INT: lambda ap: HOME.gps_raw_int(
-        ap, fix=mav.GPS_FIX_TYPE_3D_FIX, eph=121, epv=200
-    ),
-    # Scaled integers in spite of the name.
-    mav.MAVLINK_MSG_ID_RAW_IMU: lambda ap: mav.MAVLink_raw_imu_message(
-        boot_us(ap), *_scaled_imu(ap)[:-1], 0, _scaled_imu(ap)[-1]
-    ),
-    mav.MAVLINK_MSG_ID_LOCAL_POSITION_NED: lambda ap: (
-        mav.MAVLink_local_position_ned_message(
-            boot_ms(ap), *ap.sensed.position_ned_m, *ap.sensed.velocity_ned_mps
-        )
-        if ap.position_ready
-        else None
-    ),
-    mav.MAVLINK_MSG_ID_RC_CHANNELS_RAW: lambda _: None,  # accepted by the firmware, never sent
-    # Channel values after overrides.
-    mav.MAVLINK_MSG_ID_RC_CHANNELS: lambda ap: mav.MAVLink_rc_channels_message(
-        boot_ms(ap), ap.rc.channel_count, *ap.rc.channels_us, 0, 0, 255
-    ),
-    mav.MAVLINK_MSG_ID_VFR_HUD: _vfr_hud,
-    mav.MAVLINK_MSG_ID_OPTICAL_FLOW: lambda _: None,  # accepted by the firmware, never sent
-    # The second IMU agrees with the first.
-    mav.MAVLINK_MSG_ID_SCALED_IMU2: lambda ap: mav.MAVLink_scaled_imu2_message(
-        boot_ms(ap), *_scaled_imu(ap)
-    ),
-    mav.MAVLINK_MSG_ID_EKF_STATUS_REPORT: _ekf_status_report,
-    mav.MAVLINK_MSG_ID_ATTITUDE_TARGET: _attitude_target,
-    mav.MAVLINK_MSG_ID_POSITION_TARGET_LOCAL_NED: _position_target,
-    mav.MAVLINK_MSG_ID_EXTENDED_SYS_STATE: _extended_sys_state,
-}
-"""Builders of all messages to stream or request; they return None with nothing to report."""
+    def position_target_local_ned(self) -> Fields | None:
+        """The setpoint that GUIDED follows, in NED axes; None for attitudes or other modes."""
+        guided = self.ap.guided if self.ap.mode is Mode.GUIDED else None
+        if guided is None or guided.submode is Submode.ATTITUDE:
+            return None
+        mask = _POSITION_ONLY if guided.submode is Submode.TAKEOFF else _VELOCITY_ONLY
+        zeros = [0.0] * 3  # the position is zero even during a takeoff, as in the firmware
+        velocity_mps = guided.velocity.velocity_ned_mps
+        head = (self.boot_ms, mav.MAV_FRAME_LOCAL_NED, mask)
+        return (*head, *zeros, *velocity_mps, *zeros, 0.0, 0.0)
 
 
 HEARTBEAT_INTERVAL_MS = 1000
@@ -194,12 +151,11 @@ STREAM_GROUPS: dict[int, tuple[int, ...]] = {
     )
     for group, names in (
         ("RAW_SENSORS", "RAW_IMU SCALED_IMU2"),
-        ("EXTENDED_STATUS", "SYS_STATUS GPS_RAW_INT"),
-        ("RC_CHANNELS", "RC_CHANNELS SERVO_OUTPUT_RAW"),
+        ("EXTENDED_STATUS", "SYS_STATUS"),
+        ("RC_CHANNELS", "RC_CHANNELS"),
         ("POSITION", "GLOBAL_POSITION_INT LOCAL_POSITION_NED"),
         ("EXTRA1", "ATTITUDE"),
-        ("EXTRA2", "VFR_HUD"),
-        ("EXTRA3", "SYSTEM_TIME BATTERY_STATUS EKF_STATUS_REPORT"),
+        ("EXTRA3", "EKF_STATUS_REPORT"),
     )
 }
 
@@ -219,10 +175,7 @@ class ArduPilotEndpoint(Endpoint[ArduCopter]):
     """
 
     def __init__(self, ap: ArduCopter) -> None:
-        super().__init__(ap, BUILDERS)
-
-    def restart(self, ap: ArduCopter) -> None:
-        super().restart(ap)
+        super().__init__(ap, ArduPilotTelemetry(ap))
         self._conditions = ap.config.conditions
         self._random = np.random.Generator(np.random.PCG64((self._conditions.seed, 5)))
         self._streams: dict[int, _Stream] = {}
@@ -248,7 +201,7 @@ class ArduPilotEndpoint(Endpoint[ArduCopter]):
         if interval_us == 0 and message_id == mav.MAVLINK_MSG_ID_HEARTBEAT:
             interval_ms = HEARTBEAT_INTERVAL_MS
         refusal = None
-        if message_id not in BUILDERS:
+        if message_id not in ArduPilotTelemetry.names:
             refusal = f"No ap_message for mavlink id ({message_id})"
         elif 0 < interval_ms < self._shortest_ms:
             refusal = f"Requested rate for message ID {message_id} too fast. "
@@ -268,7 +221,7 @@ class ArduPilotEndpoint(Endpoint[ArduCopter]):
 
     def interval_us(self, message_id: int) -> int:
         """Return the interval for MESSAGE_INTERVAL: 0 = unknown message, -1 = not streamed."""
-        if message_id not in BUILDERS:
+        if message_id not in ArduPilotTelemetry.names:
             return 0
         stream = self._streams.get(message_id)
         return stream.interval_ms * 1000 if stream else -1

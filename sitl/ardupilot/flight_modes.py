@@ -3,13 +3,13 @@
 import math
 from enum import IntEnum
 
-from sitl.ardupilot import sticks as pilot
+from sitl.ardupilot import rc as pilot
 from sitl.ardupilot.control import STEP_S, AttitudeController, boosted, lean_for
 from sitl.ardupilot.guided import GuidedControl
 from sitl.ardupilot.params import ArduPilotParams
-from sitl.ardupilot.sticks import Sticks
+from sitl.ardupilot.rc import Sticks
 from sitl.vehicle.dynamics import BodyState, HeightController, mix, shorten, thrust_for
-from sitl.vehicle.rotation import Quat, Vec3, to_euler, wrap_pi
+from sitl.vehicle.rotation import Quat, Vec3
 
 IDLE = (0.03, 0.03, 0.03, 0.03)  # armed on the ground, throttle down
 
@@ -18,7 +18,6 @@ RTL_SPEED_MPS = 5.0
 RTL_ARRIVED_M = 1.0
 POSITION_GAIN_PER_S = 0.8
 VELOCITY_GAIN_PER_S = 2.0
-TRAINER_GAIN_PER_S = 5.0
 HOLD_ACCEL_MPS2 = 2.5  # limit of braking and holding: 14 degrees of lean, as in LOITER and LAND
 HOLD_BELOW_MPS = 0.3  # braking ends at this speed, and the present position is held
 
@@ -27,7 +26,6 @@ class Mode(IntEnum):
     """Flight mode by its number in HEARTBEAT.custom_mode."""
 
     STABILIZE = 0
-    ACRO = 1
     ALT_HOLD = 2
     GUIDED = 4
     LOITER = 5
@@ -40,7 +38,7 @@ class Mode(IntEnum):
     @property
     def manual_throttle(self) -> bool:
         """True if the throttle stick is thrust: refused in RC failsafe, and down for arming."""
-        return self in (Mode.STABILIZE, Mode.ACRO)
+        return self is Mode.STABILIZE
 
     @property
     def piloted(self) -> bool:
@@ -120,9 +118,6 @@ class CopterControl:
         if mode.is_guided:
             turn, self.thrust = self.guided.fly(body, now_ns, has_position=has_position)
             self.collective = boosted(self.thrust, body, self._params)
-        elif mode is Mode.ACRO:
-            turn = self._attitude.rates(body, self._acro_rates(sticks, body))
-            self.thrust = self.collective = pilot.manual_thrust(sticks, self._params)
         else:
             turn = self._lean(mode, sticks, body, has_position=has_position)
         return mix(self.collective, turn)
@@ -153,12 +148,8 @@ class CopterControl:
             return 0.0
         height = -body.position_ned_m[2]
         if mode is Mode.RTL and not self._home_reached:
-            return max(
-                0.0,
-                min(
-                    self._params["WPNAV_SPEED_UP"] / 100.0, self._params["RTL_ALT"] / 100.0 - height
-                ),
-            )
+            up = self._params["WPNAV_SPEED_UP"] / 100.0
+            return max(0.0, min(up, self._params["RTL_ALT"] / 100.0 - height))
         if height > SLOW_DESCENT_HEIGHT_M:
             return -self._params["WPNAV_SPEED_DN"] / 100.0
         return -self._params["LAND_SPEED"] / 100.0
@@ -186,26 +177,6 @@ class CopterControl:
         elif math.hypot(*body.velocity_ned_mps[:2]) < HOLD_BELOW_MPS:
             self._hold_ned_m = body.position_ned_m
         return _lean_towards(wanted_n, wanted_e, body)
-
-    def _acro_rates(self, sticks: Sticks, body: BodyState) -> Vec3:
-        roll_rate, pitch_rate, yaw_rate = pilot.acro_rates_radps(sticks, self._params)
-        trainer = self._params.integer("ACRO_TRAINER")
-        if trainer == 0:
-            return roll_rate, pitch_rate, yaw_rate
-        roll, pitch, _ = to_euler(body.ned_from_body_wxyz)
-        roll_rate -= self._params["ACRO_BAL_ROLL"] * wrap_pi(roll)
-        pitch_rate -= self._params["ACRO_BAL_PITCH"] * pitch
-        if trainer == 2:
-            limit = math.radians(self._params["ANGLE_MAX"] / 100.0)
-            roll_rate = _stay_within(roll, limit, roll_rate)
-            pitch_rate = _stay_within(pitch, limit, pitch_rate)
-        return roll_rate, pitch_rate, yaw_rate
-
-
-def _stay_within(angle: float, limit: float, rate: float) -> float:
-    """Return the rate, limited so that the angle comes to rest at the limit."""
-    lowest, highest = -limit - angle, limit - angle
-    return max(TRAINER_GAIN_PER_S * lowest, min(TRAINER_GAIN_PER_S * highest, rate))
 
 
 def _lean_towards(wanted_n_mps: float, wanted_e_mps: float, body: BodyState) -> tuple[float, float]:

@@ -14,12 +14,6 @@ from sitl.vehicle.firmware import Params, float32
 RC_CHANNELS_WITH_PARAMS = 8
 DEFAULT_RATE_P = float32(0.135)  # gain from body rates to torque, roll and pitch
 _FIXED = {
-    "ACRO_BAL_PITCH": 1.0,
-    "ACRO_BAL_ROLL": 1.0,
-    "ACRO_RP_EXPO": 0.3,
-    "ACRO_RP_RATE": 360.0,  # deg/s
-    "ACRO_TRAINER": 2.0,  # 0 none, 1 levels itself, 2 also limits the lean
-    "ACRO_Y_RATE": 202.5,  # deg/s
     "ATC_ACCEL_Y_MAX": 27000.0,  # cdeg/s^2, in GUIDED only; 0: no limit
     "ATC_ANGLE_BOOST": 1.0,  # more thrust in a lean
     "ATC_RATE_Y_MAX": 0.0,  # deg/s, in GUIDED only; 0: no limit

@@ -24,11 +24,10 @@ from sitl.link.server import (
     MAX_RC_FIELDS,
     UNSUPPORTED,
     MavlinkServer,
-    Message,
     Params7,
     send_ack,
-    sender_of,
 )
+from sitl.link.telemetry import Message
 from sitl.report import FlightLog
 from sitl.vehicle.firmware import AttitudeSetpoint
 from sitl.vehicle.rotation import from_euler, rotate
@@ -51,31 +50,6 @@ class ArduPilotServer(MavlinkServer[ArduCopter, ArduPilotEndpoint]):
 
     def __init__(self, ap: ArduCopter, link_count: int, log: FlightLog) -> None:
         super().__init__(ap, [ArduPilotEndpoint(ap) for _ in range(link_count)], log)
-        self._mode = ap.mode
-        self._handlers |= {
-            "HEARTBEAT": self._heartbeat,
-            "RC_CHANNELS_OVERRIDE": self._override,
-            "MANUAL_CONTROL": self._manual_control,
-            "SET_MODE": self._set_mode,
-            "SET_ATTITUDE_TARGET": self._attitude_target,
-            "SET_POSITION_TARGET_LOCAL_NED": self._position_target,
-            "REQUEST_DATA_STREAM": self._data_stream,
-            "MISSION_COUNT": self._refuse_mission,
-            "MISSION_CLEAR_ALL": self._refuse_mission,
-        }
-        self._commands |= {
-            mav.MAV_CMD_NAV_RETURN_TO_LAUNCH: lambda *_: self._to_mode(Mode.RTL),
-            mav.MAV_CMD_NAV_TAKEOFF: self._take_off,
-            mav.MAV_CMD_NAV_LAND: lambda *_: self._to_mode(Mode.LAND),
-            mav.MAV_CMD_DO_SET_MODE: self._do_set_mode,
-            mav.MAV_CMD_PREFLIGHT_REBOOT_SHUTDOWN: self._reboot,
-            mav.MAV_CMD_COMPONENT_ARM_DISARM: self._arm_disarm,
-            mav.MAV_CMD_GET_HOME_POSITION: self._send_home,
-            mav.MAV_CMD_REQUEST_AUTOPILOT_CAPABILITIES: self._send_version,
-        }
-
-    def restart(self, ap: ArduCopter) -> None:
-        super().restart(ap)
         self._mode = ap.mode
 
     def _pass_on(self, link: ArduPilotEndpoint, message: Message) -> None: ...
@@ -107,11 +81,13 @@ class ArduPilotServer(MavlinkServer[ArduCopter, ArduPilotEndpoint]):
         high = max(low, self._ap.params.integer("MAV_GCS_SYSID_HI"))
         return low <= int(message.get_srcSystem()) <= high
 
-    def _heartbeat(self, _link: ArduPilotEndpoint, message: Message, arrived_ns: int) -> None:
+    def on_heartbeat(self, _link: ArduPilotEndpoint, message: Message, arrived_ns: int) -> None:
         if self._is_from_gcs(message):
             self._ap.gcs_failsafe.on_contact(arrived_ns)
 
-    def _override(self, _link: ArduPilotEndpoint, message: Message, arrived_ns: int) -> None:
+    def on_rc_channels_override(
+        self, _link: ArduPilotEndpoint, message: Message, arrived_ns: int
+    ) -> None:
         if not self._is_from_gcs(message):
             return
         self._ap.gcs_failsafe.on_contact(arrived_ns)
@@ -123,7 +99,9 @@ class ArduPilotServer(MavlinkServer[ArduCopter, ArduPilotEndpoint]):
             self._log.releases += 1
         self._ap.rc.override(raw_us, arrived_ns)
 
-    def _manual_control(self, _link: ArduPilotEndpoint, message: Message, arrived_ns: int) -> None:
+    def on_manual_control(
+        self, _link: ArduPilotEndpoint, message: Message, arrived_ns: int
+    ) -> None:
         is_for_us = message.target == self._ap.system_id
         if not is_for_us or not self._is_from_gcs(message):
             return
@@ -133,7 +111,9 @@ class ArduPilotServer(MavlinkServer[ArduCopter, ArduPilotEndpoint]):
             x=message.x, y=message.y, z=message.z, r=message.r, now_ns=arrived_ns
         )
 
-    def _attitude_target(self, _link: ArduPilotEndpoint, message: Message, arrived_ns: int) -> None:
+    def on_set_attitude_target(
+        self, _link: ArduPilotEndpoint, message: Message, arrived_ns: int
+    ) -> None:
         ap = self._ap
         if ap.guided is None:
             return
@@ -144,7 +124,9 @@ class ArduPilotServer(MavlinkServer[ArduCopter, ArduPilotEndpoint]):
         elif ap.mode is Mode.GUIDED:
             ap.guided.brake(ap.sensed)
 
-    def _position_target(self, _link: ArduPilotEndpoint, message: Message, arrived_ns: int) -> None:
+    def on_set_position_target_local_ned(
+        self, _link: ArduPilotEndpoint, message: Message, arrived_ns: int
+    ) -> None:
         """Follow a velocity in GUIDED; GUIDED_NOGPS ignores it."""
         ap = self._ap
         if ap.guided is None or ap.mode is not Mode.GUIDED:
@@ -156,18 +138,16 @@ class ArduPilotServer(MavlinkServer[ArduCopter, ArduPilotEndpoint]):
             ap.guided.follow_velocity(setpoint, ap.sensed, arrived_ns)
             self._log.setpoints.add(arrived_ns)
 
-    def _set_mode(self, link: ArduPilotEndpoint, message: Message, _arrived_ns: int) -> None:
+    def on_set_mode(self, link: ArduPilotEndpoint, message: Message, _arrived_ns: int) -> None:
         has_mode = message.base_mode & mav.MAV_MODE_FLAG_CUSTOM_MODE_ENABLED
         result = self._to_mode(message.custom_mode) if has_mode else DENIED
         send_ack(link, message, mav.MAVLINK_MSG_ID_SET_MODE, result)
 
-    def _data_stream(self, link: ArduPilotEndpoint, message: Message, _arrived_ns: int) -> None:
+    def on_request_data_stream(
+        self, link: ArduPilotEndpoint, message: Message, _arrived_ns: int
+    ) -> None:
         rate_hz = message.req_message_rate if message.start_stop else 0
         link.set_group(message.req_stream_id, rate_hz)
-
-    def _refuse_mission(self, link: ArduPilotEndpoint, message: Message, _arrived_ns: int) -> None:
-        sender, result = sender_of(message), mav.MAV_MISSION_UNSUPPORTED
-        link.send(mav.MAVLink_mission_ack_message(*sender, result, message.mission_type))
 
     def _to_mode(self, number: float) -> int:
         try:
@@ -176,38 +156,36 @@ class ArduPilotServer(MavlinkServer[ArduCopter, ArduPilotEndpoint]):
             return FAILED
         return ACCEPTED if self._ap.set_mode(mode) else FAILED
 
-    def _do_set_mode(self, params: Params7, _link: ArduPilotEndpoint) -> int:
+    def cmd_nav_return_to_launch(self, _params: Params7, _link: ArduPilotEndpoint) -> int:
+        return self._to_mode(Mode.RTL)
+
+    def cmd_nav_land(self, _params: Params7, _link: ArduPilotEndpoint) -> int:
+        return self._to_mode(Mode.LAND)
+
+    def cmd_do_set_mode(self, params: Params7, _link: ArduPilotEndpoint) -> int:
         if not _are_finite(params[:2]):
             return DENIED
         if not int(params[0]) & mav.MAV_MODE_FLAG_CUSTOM_MODE_ENABLED:
             return DENIED
         return self._to_mode(params[1])
 
-    def _arm_disarm(self, params: Params7, _link: ArduPilotEndpoint) -> int:
+    def cmd_component_arm_disarm(self, params: Params7, _link: ArduPilotEndpoint) -> int:
         if params[0] not in (0.0, 1.0):
             return UNSUPPORTED
         force = params[1] == FORCE
         done = self._ap.arm(force=force) if params[0] else self._ap.disarm(force=force)
         return ACCEPTED if done else FAILED
 
-    def _request_message(self, params: Params7, link: ArduPilotEndpoint) -> int:
+    def cmd_request_message(self, params: Params7, link: ArduPilotEndpoint) -> int:
         if params[0] == mav.MAVLINK_MSG_ID_MESSAGE_INTERVAL:
-            return self._get_interval(params[1:], link)
-        return super()._request_message(params, link)
+            return self.cmd_get_message_interval(params[1:], link)
+        return super().cmd_request_message(params, link)
 
-    def _send_home(self, _params: Params7, link: ArduPilotEndpoint) -> int:
-        link.send_now(mav.MAVLINK_MSG_ID_HOME_POSITION)
-        return ACCEPTED
-
-    def _send_version(self, _params: Params7, link: ArduPilotEndpoint) -> int:
-        link.send_now(mav.MAVLINK_MSG_ID_AUTOPILOT_VERSION)
-        return ACCEPTED
-
-    def _take_off(self, params: Params7, _link: ArduPilotEndpoint) -> int:
+    def cmd_nav_takeoff(self, params: Params7, _link: ArduPilotEndpoint) -> int:
         height_m = params[6]
         return ACCEPTED if math.isfinite(height_m) and self._ap.take_off(height_m) else FAILED
 
-    def _reboot(self, params: Params7, _link: ArduPilotEndpoint) -> int:
+    def cmd_preflight_reboot_shutdown(self, params: Params7, _link: ArduPilotEndpoint) -> int:
         if self._ap.armed and params[5] != FORCE_REBOOT:
             return FAILED
         if params[0] not in (1.0, 3.0):

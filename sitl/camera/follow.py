@@ -17,7 +17,7 @@ from sitl.camera.fpv import CameraOptions, FpvRenderer
 from sitl.camera.shm import FramePublisher
 from sitl.clock import NS_PER_S, Clock
 from sitl.course import Course
-from sitl.link.server import Message
+from sitl.link.telemetry import Message
 from sitl.link.transport import FOLLOWER_KINDS, open_transport
 from sitl.vehicle.rotation import Quat, Vec3, integrate
 

@@ -1,24 +1,21 @@
 """Message handling of a vehicle's links, without I/O: the part that both firmwares share.
 
-Parameters, time, pings, missions and the dispatch of commands. A firmware adds its messages and
+Parameters, time and the dispatch of commands. A firmware adds its messages and
 commands, and decides which senders it obeys.
 """
 
 import math
 from abc import ABC, abstractmethod
 from collections import deque
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from typing import Any, ClassVar, Generic, TypeAlias, TypeVar
 
 from pymavlink.dialects.v20 import ardupilotmega as mav
 
 from sitl.clock import NS_PER_MS
+from sitl.link.telemetry import Ap, Message, Telemetry
 from sitl.report import FlightLog
-from sitl.vehicle.firmware import Autopilot
-
-Message: TypeAlias = Any  # a pymavlink message (the library has no types)
-Ap = TypeVar("Ap", bound=Autopilot)
-Builders: TypeAlias = Mapping[int, Callable[[Ap], Message | None]]
+from sitl.vehicle.config import SIGNING_TICK_NS
 
 PARAM_PERIOD_NS = 4 * NS_PER_MS
 Value = TypeVar("Value")
@@ -30,33 +27,21 @@ def by_message(**values: Value) -> dict[int, Value]:
     return {getattr(mav, f"MAVLINK_MSG_ID_{name}"): value for name, value in values.items()}
 
 
-def flags(prefix: str, names: str) -> int:
-    """Return the sum of the dialect's constants with this prefix."""
-    return sum(int(getattr(mav, prefix + name)) for name in names.split())
-
-
 class Endpoint(ABC, Generic[Ap]):
-    """Framing, messages by number and parameter list of one link; each firmware adds its streams.
+    """Framing, messages by number and parameter list of one link during one boot.
 
-    Framing and sequence numbers survive a restart of the vehicle.
+    Each firmware adds its streams.
     """
 
-    def __init__(self, ap: Ap, builders: Builders[Ap]) -> None:
-        """Join a vehicle. ``builders`` make all messages that can be streamed or requested; they
-        return None while there is nothing to report."""
-        self.bad_frames = 0
-        """Garbage, truncated frames and wrong checksums; with a key also wrong signatures."""
+    def __init__(self, ap: Ap, telemetry: Telemetry[Ap]) -> None:
         self._mav = mav.MAVLink(None, srcSystem=1, srcComponent=mav.MAV_COMP_ID_AUTOPILOT1)
         self._mav.robust_parsing = True
         if (signing := ap.config.signing) is not None:
             self._mav.signing.secret_key = signing.key
-            self._mav.signing.timestamp = signing.timestamp
+            self._mav.signing.timestamp = signing.timestamp + ap.boot_ns // SIGNING_TICK_NS
             self._mav.signing.sign_outgoing = True
         self._outgoing = bytearray()
-        self._builders = builders
-        self.restart(ap)
-
-    def restart(self, ap: Ap) -> None:
+        self._telemetry = telemetry
         self._ap = ap
         self._queued_params: deque[int] = deque()
         self._param_due_ns = ap.now_ns
@@ -76,12 +61,9 @@ class Endpoint(ABC, Generic[Ap]):
     def send_text(self, severity: int, text: str) -> None: ...
 
     def parse(self, data: bytes) -> Iterator[Message]:
-        """Yield the complete messages in these bytes; unreadable frames are counted and skipped."""
-        for message in self._mav.parse_buffer(data) or ():
-            if message.get_type() == "BAD_DATA":
-                self.bad_frames += 1
-            else:
-                yield message
+        """Yield the complete messages in these bytes; unreadable frames are skipped."""
+        messages = self._mav.parse_buffer(data) or ()
+        return (message for message in messages if message.get_type() != "BAD_DATA")
 
     def send(self, message: Message) -> None:
         self._mav.srcSystem = self._ap.system_id
@@ -99,11 +81,11 @@ class Endpoint(ABC, Generic[Ap]):
 
     def send_now(self, message_id: int) -> bool:
         """Send one message if it has anything to report. Return False if it is unknown."""
-        build = self._builders.get(message_id)
-        message = build(self._ap) if build else None
-        if message is not None:
+        if message_id not in self._telemetry.names:
+            return False
+        if (message := self._telemetry.build(message_id)) is not None:
             self.send(message)
-        return build is not None
+        return True
 
     def send_interval(self, message_id: int) -> None:
         interval_us = self.interval_us(message_id)
@@ -147,7 +129,12 @@ Params7: TypeAlias = tuple[float, ...]
 
 
 class MavlinkServer(ABC, Generic[Ap, Link]):
-    """Receives on all links of one vehicle, and acts on the messages."""
+    """Receives on all links of one vehicle, and acts on the messages.
+
+    ``on_NAME`` handles a message, given the link, the message and its arrival. ``cmd_NAME`` handles
+    a command, given its parameters and the link; it returns the MAV_RESULT of the ack, or None for
+    no ack.
+    """
 
     bad_interval: ClassVar[int]
     """MAV_RESULT for an invalid message number or interval."""
@@ -161,36 +148,13 @@ class MavlinkServer(ABC, Generic[Ap, Link]):
         self.reboot_requested = False  # a command has requested a reboot
         self._ap = ap
         self._log = log
-        self._handlers: dict[str, Callable[[Link, Message, int], None]] = {
-            "COMMAND_LONG": self._command,
-            "COMMAND_INT": self._command,
-            "PARAM_REQUEST_LIST": lambda link, _message, _arrived_ns: link.send_all_params(),
-            "PARAM_REQUEST_READ": self._param_read,
-            "PARAM_SET": self._param_set,
-            "MISSION_REQUEST_LIST": self._mission_list,
-            "TIMESYNC": self._timesync,
-            "PING": self._ping,
-        }
-        """Handlers by message name, called with the link, the message and its arrival."""
-        self._commands: dict[int, Callable[[Params7, Link], int | None]] = {
-            mav.MAV_CMD_GET_MESSAGE_INTERVAL: self._get_interval,
-            mav.MAV_CMD_SET_MESSAGE_INTERVAL: self._set_interval,
-            mav.MAV_CMD_REQUEST_MESSAGE: self._request_message,
-        }
-        """Handlers by command number; they return the MAV_RESULT of the ack, or None for no ack."""
-
-    def restart(self, ap: Ap) -> None:
-        self._ap = ap
-        self.reboot_requested = False
-        for link in self.links:
-            link.restart(ap)
 
     def receive(self, link_id: int, data: bytes, arrived_ns: int) -> None:
         """Act on the bytes of one datagram, or of one read of a stream."""
         link = self.links[link_id]
         for message in link.parse(data):
             self._pass_on(link, message)
-            handler = self._handlers.get(message.get_type())
+            handler = getattr(self, f"on_{message.get_type().lower()}", None)
             if handler is not None and self._is_accepted(message):
                 handler(link, message, arrived_ns)
 
@@ -220,58 +184,57 @@ class MavlinkServer(ABC, Generic[Ap, Link]):
 
     def _execute(self, message: Message, params: Params7, link: Link) -> int | None:
         """Execute a command. Return the MAV_RESULT for its ack, or None for no ack."""
-        handler = self._commands.get(message.command)
+        entry = mav.enums["MAV_CMD"].get(message.command)
+        name = entry.name.lower().removeprefix("mav_") if entry else ""
+        handler: Callable[[Params7, Link], int | None] | None = getattr(self, name, None)
         return UNSUPPORTED if handler is None else handler(params, link)
 
-    def _command(self, link: Link, message: Message, _arrived_ns: int) -> None:
+    def on_command_long(self, link: Link, message: Message, _arrived_ns: int) -> None:
         fields = COMMAND_FIELDS[message.get_type()]
         params = tuple(float(getattr(message, name)) for name in fields)
         result = self._execute(message, params, link)
         if result is not None:
             send_ack(link, message, message.command, result)
 
-    def _get_interval(self, params: Params7, link: Link) -> int:
+    on_command_int = on_command_long
+
+    def cmd_get_message_interval(self, params: Params7, link: Link) -> int:
         if not math.isfinite(params[0]) or not 0 <= params[0] <= UINT16_MAX:
             return self.bad_interval
         link.send_interval(int(params[0]))
         return ACCEPTED
 
-    def _set_interval(self, params: Params7, link: Link) -> int:
+    def cmd_set_message_interval(self, params: Params7, link: Link) -> int:
         is_plain = all(params[index] == 0.0 for index in self.zero_interval_params)
         if not is_plain or not all(map(math.isfinite, params[:2])):
             return self.bad_interval
         is_set = link.set_interval(int(params[0]), int(params[1]))
         return ACCEPTED if is_set else self.bad_interval
 
-    def _request_message(self, params: Params7, link: Link) -> int:
+    def cmd_request_message(self, params: Params7, link: Link) -> int:
         if not math.isfinite(params[0]):
             return DENIED
         return ACCEPTED if link.send_now(int(params[0])) else self.unknown_message
 
-    def _param_read(self, link: Link, message: Message, _arrived_ns: int) -> None:
+    def on_param_request_list(self, link: Link, _message: Message, _arrived_ns: int) -> None:
+        link.send_all_params()
+
+    def on_param_request_read(self, link: Link, message: Message, _arrived_ns: int) -> None:
         index, names = message.param_index, self._ap.params.names
         if index < 0 and message.param_id in names:
             index = names.index(message.param_id)
         if 0 <= index < len(names):
             link.send_param(index)
 
-    def _param_set(self, link: Link, message: Message, _arrived_ns: int) -> None:
+    def on_param_set(self, link: Link, message: Message, _arrived_ns: int) -> None:
         if self._ap.params.set_on_wire(message.param_id, message.param_value):
             link.send_param(self._ap.params.names.index(message.param_id))
 
-    def _mission_list(self, link: Link, message: Message, _arrived_ns: int) -> None:
-        link.send(mav.MAVLink_mission_count_message(*sender_of(message), 0, message.mission_type))
-
-    def _timesync(self, link: Link, message: Message, arrived_ns: int) -> None:
+    def on_timesync(self, link: Link, message: Message, arrived_ns: int) -> None:
         """Answer a request; answers (tc1 set) to our requests need no action."""
         if message.tc1 == 0:
             uptime_us = (arrived_ns - self._ap.boot_ns) // 1000
             link.send(mav.MAVLink_timesync_message(uptime_us * 1000, message.ts1))
-
-    def _ping(self, link: Link, message: Message, _arrived_ns: int) -> None:
-        if message.target_system == 0 and message.target_component == 0:
-            sender = sender_of(message)
-            link.send(mav.MAVLink_ping_message(message.time_usec, message.seq, *sender))
 
 
 def sender_of(message: Message) -> tuple[int, int]:

@@ -30,7 +30,6 @@ class Px4(Autopilot):
 
     step_ns = STEP_NS
     airframe = SIH_QUAD
-    gps_period_ns = NS_PER_S // 8
     gyro_noise_radps = math.radians(5.0)
     id_param = "MAV_SYS_ID"
     battery_mv = 16_200

@@ -4,8 +4,7 @@ The intended mode is the last one that the pilot or a command requested. The flo
 a failsafe may change it and leaves the intended one alone.
 """
 
-import struct
-from typing import NamedTuple
+from typing import Literal, NamedTuple
 
 from sitl.clock import NS_PER_MS, NS_PER_S
 from sitl.px4.modes import LostSticks, Phase, Px4Mode, mode_without_stream
@@ -14,34 +13,20 @@ from sitl.px4.sticks import StickInput
 from sitl.vehicle.firmware import StatusText
 
 SEVERITY_CRITICAL, SEVERITY_INFO = 2, 6
-LEVELS_INFO, LEVELS_DENIED, LEVELS_FAILSAFE = 0x66, 0x62, 0x42
-"""Event levels: low half for peers, high half for the vehicle's own log; 2 critical, 6 info."""
 _AUTOPILOT_COMPONENT = 1 << 24
 _FNV1A_32_OFFSET, _FNV1A_32_PRIME = 0x811C9DC5, 0x01000193
 
-ARM_REASON_GESTURE, ARM_REASON_COMMAND, ARM_REASON_LANDING = 1, 4, 6
-ARM_REASON_INACTION = 7
-REASON_NAMES = {
-    ARM_REASON_GESTURE: "stick gesture",
-    ARM_REASON_COMMAND: "external command",
-    ARM_REASON_LANDING: "landing",
-    ARM_REASON_INACTION: "auto preflight disarming",
-}
-
-ACTION_POSCTL, ACTION_RTL = 2, 6
-CAUSE_STICKS_LOST = 1
+ArmReason = Literal["stick gesture", "external command", "landing", "auto preflight disarming"]
 
 
 class Event(NamedTuple):
-    """One EVENT(410); ``uptime_ms`` is its time since boot.
+    """One EVENT(410), without its arguments; ``uptime_ms`` is its time since boot.
 
     Its number is the autopilot's component in the upper bits and a hash of its name below
     (MAVLink's events interface).
     """
 
     name: str
-    levels: int
-    arguments: bytes
     uptime_ms: int
 
     @property
@@ -50,11 +35,6 @@ class Event(NamedTuple):
         for letter in self.name.encode():
             value = (value ^ letter) * _FNV1A_32_PRIME & 0xFFFFFFFF
         return _AUTOPILOT_COMPONENT | value & 0xFFFFFF
-
-
-def pack(layout: str, *values: float) -> bytes:
-    """Pack the arguments of an event: `struct` letters without padding."""
-    return struct.pack("<" + layout, *values)
 
 
 CHECK_PERIOD_NS = 20 * NS_PER_MS
@@ -85,7 +65,7 @@ class Commander:
         self._texts = texts
         self._fallback = False
         self._sticks_missed = True  # the loss of sticks has been noticed
-        self._lost_ns: int | None = None
+        self._was_lost = False
         self._ignores_sticks = False  # no failsafe: sticks were absent at arming
         self.armed_ns = boot_ns
         self._landed_ns = boot_ns
@@ -108,7 +88,7 @@ class Commander:
         """True if the vehicle's health allows arming; sticks may still be too high."""
         return self.estimator_ready and self.intended.armable and self.can_fly(self.intended)
 
-    def arm(self, reason: int = ARM_REASON_COMMAND) -> bool:
+    def arm(self, reason: ArmReason = "external command") -> bool:
         """Start the motors, or send the refusal as a text. Return True if armed afterwards."""
         if self.armed:
             return True
@@ -130,8 +110,8 @@ class Commander:
             )
             return False
         self.start(ignores_sticks=not self._sticks.valid)
-        self._say(SEVERITY_INFO, f"Armed by {REASON_NAMES[reason]}")
-        self._emit("commander_armed_by", LEVELS_INFO, pack("B", reason))
+        self._say(SEVERITY_INFO, f"Armed by {reason}")
+        self._emit("commander_armed_by")
         return True
 
     def start(self, *, ignores_sticks: bool) -> None:
@@ -140,7 +120,7 @@ class Commander:
         self._ignores_sticks = ignores_sticks
         self._sticks_missed = not self._sticks.valid
 
-    def disarm(self, *, force: bool, reason: int = ARM_REASON_COMMAND) -> bool:
+    def disarm(self, *, force: bool, reason: ArmReason = "external command") -> bool:
         """Stop the motors; refused in flight unless forced. Return True if disarmed afterwards."""
         if not self.armed:
             return True
@@ -149,8 +129,8 @@ class Commander:
             return False
         self.armed = self._fallback = False
         self.lost_sticks.clear()
-        self._say(SEVERITY_INFO, f"Disarmed by {REASON_NAMES[reason]}")
-        self._emit("commander_disarmed_by", LEVELS_INFO, pack("B", reason))
+        self._say(SEVERITY_INFO, f"Disarmed by {reason}")
+        self._emit("commander_disarmed_by")
         if not self.intended.armable:
             self.intended = self._last_armable
         self.mode = self.intended
@@ -162,22 +142,17 @@ class Commander:
         A refusal becomes a text if ``says_why``.
         """
         if self.armed and mode is not Px4Mode.AUTO_LAND and not self.can_fly(mode):
-            arguments = pack("IB", self.mode.custom_mode, mode.event_number)
             text = f"Switching to {mode.spoken} is currently not available"
             if says_why:
-                self._deny(text, "commander_modeswitch_not_avail", arguments)
+                self._deny(text, "commander_modeswitch_not_avail")
             return False
         self._intend(mode)
         return True
 
     def refuse_frame(self, frame: int) -> None:
         """Report a velocity setpoint in axes that PX4 does not support."""
-        name = "SET_POSITION_TARGET_LOCAL_NED"
-        self._deny(
-            f"{name} coordinate frame {frame} unsupported",
-            "mavlink_rcv_sp_target_unsup_coord",
-            pack("B", frame),
-        )
+        text = f"SET_POSITION_TARGET_LOCAL_NED coordinate frame {frame} unsupported"
+        self._deny(text, "mavlink_rcv_sp_target_unsup_coord")
 
     def finish_takeoff(self) -> None:
         if self.intended is Px4Mode.AUTO_TAKEOFF:
@@ -189,13 +164,13 @@ class Commander:
         self._has_flown = self._has_flown or not landed
         what = "landing" if landed else "takeoff"
         self._say(SEVERITY_INFO, f"{what.capitalize()} detected")
-        self._emit(f"commander_{what}_detected", LEVELS_INFO)
+        self._emit(f"commander_{what}_detected")
 
     def update(self, now_ns: int) -> None:
         dt_ns, self.now_ns = now_ns - self.now_ns, now_ns
         self._read_gestures()
         if self.lost_sticks.update(dt_ns):
-            self._say_failsafe(ACTION_RTL)
+            self._say_failsafe()
         if now_ns >= self._check_due_ns:
             self._check_due_ns = now_ns + CHECK_PERIOD_NS
             self._watch_sticks()
@@ -209,32 +184,29 @@ class Commander:
         if not gesture or not self._params.integer("MAN_ARM_GESTURE"):
             return
         if gesture > 0:
-            self.arm(ARM_REASON_GESTURE)
+            self.arm("stick gesture")
         elif self.landed:
-            self.disarm(force=False, reason=ARM_REASON_GESTURE)
+            self.disarm(force=False, reason="stick gesture")
 
     def _watch_sticks(self) -> None:
         """Start the failsafe if sticks are lost in flight; sticks absent at arming are ignored."""
         if self._sticks.valid:
-            if self._sticks_missed and self._lost_ns is not None:
-                gap_s = (self.now_ns - self._lost_ns) / NS_PER_S
-                self._emit("commander_rc_regained", LEVELS_INFO, pack("f", gap_s))
+            if self._sticks_missed and self._was_lost:
+                self._emit("commander_rc_regained")
             self._sticks_missed = self._ignores_sticks = False
             return
         if self._sticks_missed:
             return
-        self._sticks_missed, self._lost_ns = True, self.now_ns
-        self._emit("commander_rc_lost", LEVELS_INFO)
+        self._sticks_missed = self._was_lost = True
+        self._emit("commander_rc_lost")
         is_excepted = self.lost_sticks.is_excepted(self.intended)
         if not self.armed or self._ignores_sticks or is_excepted or self.lost_sticks.active:
             return
         if not self._params.integer("NAV_RCL_ACT"):
             return
         self.lost_sticks.start()
-        if self.lost_sticks.phase is Phase.HOLDING:
-            self._say_failsafe(ACTION_RTL, hold_s=self.lost_sticks.delay_s)
-        else:
-            self._say_failsafe(ACTION_RTL)
+        is_held = self.lost_sticks.phase is Phase.HOLDING
+        self._say_failsafe(self.lost_sticks.delay_s if is_held else None)
 
     def _yield_to_pilot(self) -> None:
         """Let fast sticks take over an autonomous flight, except in a failsafe's Hold."""
@@ -246,10 +218,10 @@ class Commander:
             was_failsafe = self.in_failsafe
             self._intend(Px4Mode.POSCTL if self.position_ready else Px4Mode.ALTCTL)
             if was_failsafe:
-                self._emit("failsafe_rc_override", LEVELS_INFO)
+                self._emit("failsafe_rc_override")
             else:
                 self._say(SEVERITY_INFO, "Pilot took over using sticks")
-                self._emit("commander_rc_override", LEVELS_INFO)
+                self._emit("commander_rc_override")
 
     def _disarm_by_time(self) -> None:
         if not self.landed:
@@ -258,8 +230,9 @@ class Commander:
         since_ns = self._landed_ns if self._has_flown else self.armed_ns
         limit_s = self._params[name]
         if limit_s > 0.0 and self.now_ns - since_ns >= limit_s * NS_PER_S:
-            reason = ARM_REASON_LANDING if self._has_flown else ARM_REASON_INACTION
-            self.disarm(force=False, reason=reason)
+            self.disarm(
+                force=False, reason="landing" if self._has_flown else "auto preflight disarming"
+            )
 
     def _choose_mode(self) -> None:
         if not self.armed:
@@ -275,7 +248,7 @@ class Commander:
         was_fallback, self._fallback = self._fallback, wanted is not self.intended
         self.mode = wanted
         if self._fallback and not was_fallback:
-            self._say_failsafe(ACTION_POSCTL if wanted.piloted else ACTION_RTL)
+            self._say_failsafe()
 
     def _with_position(self, mode: Px4Mode) -> Px4Mode:
         if self.position_ready or not mode.needs_position:
@@ -290,27 +263,20 @@ class Commander:
         self._fallback = False
         self.lost_sticks.clear()
 
-    def _say_failsafe(self, action: int, hold_s: float | None = None) -> None:
-        mode = self.intended.custom_mode
+    def _say_failsafe(self, hold_s: float | None = None) -> None:
         if hold_s is None:
-            self._say(SEVERITY_CRITICAL, "Failsafe activated")
-            arguments = pack("IBB", mode, action, CAUSE_STICKS_LOST)
-            self._emit("commander_failsafe_enter", LEVELS_FAILSAFE, arguments)
-            return
-        seconds = int(hold_s)
-        text = f"Failsafe activated: entering Hold for {seconds} seconds"
-        self._say(SEVERITY_CRITICAL, text)
-        arguments = pack("IBHB", mode, action, seconds, CAUSE_STICKS_LOST)
-        self._emit("commander_failsafe_enter_hold", LEVELS_FAILSAFE, arguments)
+            self._deny("Failsafe activated", "commander_failsafe_enter")
+        else:
+            text = f"Failsafe activated: entering Hold for {int(hold_s)} seconds"
+            self._deny(text, "commander_failsafe_enter_hold")
 
-    def _deny(self, text: str, event: str, arguments: bytes = b"") -> None:
+    def _deny(self, text: str, event: str) -> None:
         self._say(SEVERITY_CRITICAL, text)
-        self._emit(event, LEVELS_DENIED, arguments)
+        self._emit(event)
 
     def _say(self, severity: int, text: str) -> None:
         # The tab marks a text that is also sent as an event; ground stations hide it.
         self._texts.append(StatusText(severity, text + "\t"))
 
-    def _emit(self, name: str, levels: int, arguments: bytes = b"") -> None:
-        uptime_ms = (self.now_ns - self._boot_ns) // NS_PER_MS
-        self.events.append(Event(name, levels, arguments, uptime_ms))
+    def _emit(self, name: str) -> None:
+        self.events.append(Event(name, (self.now_ns - self._boot_ns) // NS_PER_MS))

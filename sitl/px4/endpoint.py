@@ -1,41 +1,219 @@
-"""One link of a PX4 vehicle: texts, events and streams.
+"""One link of a PX4 vehicle: its messages, in the units that PX4 uses, texts, events and streams.
 
 Each control step, a stream is sent if its interval has passed and its topic is new. A stream that
 is late by less than half an interval keeps its grid; a later one starts a new grid. So 200 Hz of a
 250 Hz topic become 125 Hz, as measured.
+
+pymavlink's ardupilotmega dialect lacks EVENT(410) and CURRENT_MODE(436). They are packed here by
+their definitions in MAVLink's common and development sets.
 """
 
+import math
+import struct
 from collections.abc import Hashable, Mapping
 from dataclasses import dataclass
 from types import MappingProxyType
 
+import numpy as np
 from pymavlink.dialects.v20 import ardupilotmega as mav
 
-from sitl.clock import NS_PER_S
+from sitl.clock import NS_PER_MS, NS_PER_S
 from sitl.link.server import MAX_STATUSTEXT, Endpoint, by_message
+from sitl.link.telemetry import Fields, Message, Telemetry
 from sitl.px4.autopilot import Px4
 from sitl.px4.commander import Event
-from sitl.px4.messages import BUILDERS, BUILDERS_1_14, CURRENT_MODE, event_message, topic_version
+from sitl.px4.flight import PositionSetpoint
+from sitl.px4.modes import Px4Mode
+from sitl.vehicle.config import Px4Release
+
+CURRENT_MODE = 436
+EVENT = 410
+EVENT_CRC_EXTRA, CURRENT_MODE_CRC_EXTRA = 160, 193
+_EVENT = struct.Struct("<IIHBBB40s")
+_EVENT_LEVELS = 0x66  # for peers and for the vehicle's own log: info
+_CURRENT_MODE = struct.Struct("<IIB")
+
+_FIRMWARE_VERSIONS: dict[Px4Release, int] = {
+    "1.14": 0x010E04FF,
+    "1.15": 0x010F04FF,
+    "1.16": 0x011001FF,
+    "1.17": 0x011100FF,
+    "1.18": 0x01120080,  # beta
+}
+
+_SENSORS_PRESENT, _SENSORS_ENABLED, _SENSORS_HEALTHY = 0x200C02F, 0x201C02F, 0x320C83F
+_ESTIMATOR_WITHOUT_POSITION = 0xE5
+_ESTIMATOR_WITH_POSITION, _ESTIMATOR_ON_GROUND = 0x37F, 0x3FF
+
+
+class HandPacked(mav.MAVLink_message):  # type: ignore[misc]  # the library has no types
+    """Message that the dialect lacks, given by number, payload and CRC seed."""
+
+    def __init__(self, number: int, name: str, payload: bytes, crc_extra: int) -> None:
+        super().__init__(number, name)
+        self._hand_packed = payload
+        self._hand_crc_extra = crc_extra
+
+    def pack(self, sender: Message, force_mavlink1: bool = False) -> bytes:
+        packed = self._pack(sender, self._hand_crc_extra, self._hand_packed, force_mavlink1)
+        return bytes(packed)
+
+
+def event_message(event: Event, sequence: int) -> Message:
+    payload = _EVENT.pack(event.number, event.uptime_ms, sequence, 0, 0, _EVENT_LEVELS, b"")
+    return HandPacked(EVENT, "EVENT", payload, EVENT_CRC_EXTRA)
+
+
+class Px4Telemetry(Telemetry[Px4]):
+    """PX4's messages, at the default home of its SIH."""
+
+    lat_deg, lon_deg, alt_m = 47.397743, 8.545594, 489.4
+    field_ned_gauss = (0.215, 0.0118, 0.4307)
+    pressure_hpa, temperature_c = 955.6, 25.0
+    capabilities = 0xE8FF
+
+    def __init__(self, ap: Px4) -> None:
+        super().__init__(ap)
+        if ap.config.px4_release != "1.14":  # it came with 1.15 (upstream commit bb900264e0)
+            self.names = self.names | {CURRENT_MODE: "current_mode"}
+
+    def build(self, number: int) -> Message | None:
+        if number != CURRENT_MODE:
+            return super().build(number)
+        mode, intended = self.ap.mode, self.ap.commander.intended
+        payload = _CURRENT_MODE.pack(mode.custom_mode, intended.custom_mode, mode.standard)
+        return HandPacked(CURRENT_MODE, "CURRENT_MODE", payload, CURRENT_MODE_CRC_EXTRA)
+
+    @property
+    def version(self) -> int:
+        return _FIRMWARE_VERSIONS[self.ap.config.px4_release]
+
+    def heartbeat(self) -> Fields:
+        """Once a second, so a short change, even an arming, may never show."""
+        ap, base_mode = self.ap, self.ap.mode.base_flags
+        if ap.mode is Px4Mode.OFFBOARD and isinstance(ap.setpoint, PositionSetpoint):
+            base_mode |= mav.MAV_MODE_FLAG_STABILIZE_ENABLED
+        if ap.armed:
+            base_mode |= mav.MAV_MODE_FLAG_SAFETY_ARMED
+        if ap.in_failsafe:
+            status = mav.MAV_STATE_CRITICAL
+        elif ap.armed:
+            status = mav.MAV_STATE_ACTIVE
+        else:
+            status = mav.MAV_STATE_STANDBY if ap.commander.can_arm() else mav.MAV_STATE_UNINIT
+        kind = (mav.MAV_TYPE_QUADROTOR, mav.MAV_AUTOPILOT_PX4)
+        return (*kind, base_mode, ap.mode.custom_mode, status, 3)
+
+    def sys_status(self) -> Fields:
+        """PREARM_CHECK, never present, is healthy if health allows arming."""
+        sticks = mav.MAV_SYS_STATUS_SENSOR_RC_RECEIVER if self.ap.stick_input.valid else 0
+        healthy = _SENSORS_HEALTHY | sticks
+        if self.ap.armed or self.ap.commander.can_arm():
+            healthy |= mav.MAV_SYS_STATUS_PREARM_CHECK
+        present = _SENSORS_PRESENT | sticks
+        return self._health(present=present, enabled=_SENSORS_ENABLED, healthy=healthy)
+
+    def local_position_ned(self) -> Fields:
+        """Without a position, zeros that nothing marks as invalid."""
+        body = self.ap.sensed
+        (north, east, down), (vn, ve, vd) = body.position_ned_m, body.velocity_ned_mps
+        if not self.ap.position_ready:
+            north = east = vn = ve = 0.0
+        return (self.boot_ms, north, east, down, vn, ve, vd)
+
+    def rc_channels(self) -> Fields | None:
+        """A receiver's channels; MANUAL_CONTROL never shows here."""
+        if (receiver_us := self.ap.receiver_us) is None:
+            return None
+        channels = (*receiver_us, *[65535] * 18)[:18]
+        return (self.boot_ms, len(receiver_us), *channels, 100)
+
+    def manual_control(self) -> Fields | None:
+        """The chosen sticks, scaled in single precision and truncated."""
+        if not self.ap.stick_input.valid:
+            return None
+        forward, right, throttle, yaw = map(np.float32, self.ap.stick_input.sticks)
+        thousand, one, two = np.float32(1000.0), np.float32(1.0), np.float32(2.0)
+        x, y, r = (int(value * thousand) for value in (forward, right, yaw))
+        z = int((throttle + one) / two * thousand)
+        return (self.ap.system_id, x, y, z, r, 0)
+
+    def attitude_target(self) -> Fields:
+        """Setpoints of the rate and attitude loops, in any mode."""
+        flight = self.ap.flight
+        return (self.boot_ms, 0, list(flight.attitude), *flight.rates_radps, flight.thrust)
+
+    def position_target_local_ned(self) -> Fields:
+        none, flight = [math.nan] * 3, self.ap.flight
+        head = (self.boot_ms, mav.MAV_FRAME_LOCAL_NED, 0)
+        turn = (math.nan, flight.yaw_rate_radps)
+        return (*head, *none, *flight.velocity_ned_mps, *none, *turn)
+
+    def timesync(self) -> Fields:
+        """The vehicle's request; the peer's answer needs no action."""
+        return (0, self.ap.uptime_ns)
+
+    def estimator_status(self) -> Fields:
+        """The only message with the validity of the horizontal position."""
+        found = _ESTIMATOR_ON_GROUND if self.ap.landed else _ESTIMATOR_WITH_POSITION
+        if not self.ap.position_ready:
+            found = _ESTIMATOR_WITHOUT_POSITION
+        if not self.ap.estimator_ready:
+            found = 0
+        return (self.boot_us, found, 0.02, 0.02, 0.02, 0.02, 0.0, 0.0, 0.2, 0.2)
+
+    def extended_sys_state(self) -> Fields:
+        mode = self.ap.mode
+        state = self._landed_state(
+            is_landing=mode is Px4Mode.AUTO_LAND, is_taking_off=mode is Px4Mode.AUTO_TAKEOFF
+        )
+        return (mav.MAV_VTOL_STATE_MC, state)
+
+
+_SLOW_TOPICS = (
+    mav.MAVLINK_MSG_ID_LOCAL_POSITION_NED,
+    mav.MAVLINK_MSG_ID_GLOBAL_POSITION_INT,
+    mav.MAVLINK_MSG_ID_ESTIMATOR_STATUS,
+)
+
+
+def topic_version(message_id: int, ap: Px4) -> Hashable:
+    """Return a value that changes with each new sample of the topic; it bounds a stream's rate."""
+    if message_id in _SLOW_TOPICS:
+        return _at_rate(ap, 8)
+    if message_id == mav.MAVLINK_MSG_ID_ATTITUDE_TARGET:
+        sends_attitude = ap.mode is Px4Mode.OFFBOARD and not isinstance(
+            ap.setpoint, PositionSetpoint
+        )
+        return ap.setpoint_count if sends_attitude else _at_rate(ap, 8)
+    if message_id == mav.MAVLINK_MSG_ID_MANUAL_CONTROL:
+        return ap.stick_input.count
+    if message_id == CURRENT_MODE:
+        return ap.mode, ap.commander.intended, _at_rate(ap, 500)
+    return ap.uptime_ns
+
+
+def _at_rate(ap: Px4, period_ms: int) -> int:
+    """Return the version of a topic that is published with this period."""
+    return ap.uptime_ns // (period_ms * NS_PER_MS)
+
 
 NS_PER_US = 1000
 
-_BOTH = by_message(SYSTEM_TIME=1.0, BATTERY_STATUS=0.5, HOME_POSITION=0.5, ESTIMATOR_STATUS=1.0)
-_BOTH[CURRENT_MODE] = 0.5
+_BOTH = {CURRENT_MODE: 0.5, mav.MAVLINK_MSG_ID_ESTIMATOR_STATUS: 1.0}
 ONBOARD_HZ: Mapping[int, float] = MappingProxyType(
     _BOTH
     | by_message(ATTITUDE=100.0, ATTITUDE_QUATERNION=50.0, GLOBAL_POSITION_INT=50.0)
-    | by_message(HIGHRES_IMU=50.0, LOCAL_POSITION_NED=30.0, ODOMETRY=30.0, RC_CHANNELS=20.0)
-    | by_message(TIMESYNC=10.0, ATTITUDE_TARGET=10.0, POSITION_TARGET_LOCAL_NED=10.0)
-    | by_message(SERVO_OUTPUT_RAW=10.0, VFR_HUD=10.0, GPS_RAW_INT=5.0, EXTENDED_SYS_STATE=5.0)
-    | by_message(SYS_STATUS=5.0)
+    | by_message(HIGHRES_IMU=50.0, LOCAL_POSITION_NED=30.0, RC_CHANNELS=20.0, TIMESYNC=10.0)
+    | by_message(ATTITUDE_TARGET=10.0, POSITION_TARGET_LOCAL_NED=10.0)
+    | by_message(EXTENDED_SYS_STATE=5.0, SYS_STATUS=5.0)
 )
 """Message rates on a link to a companion computer (mode Onboard)."""
 GCS_HZ: Mapping[int, float] = MappingProxyType(
     _BOTH
     | by_message(ATTITUDE=50.0, ATTITUDE_QUATERNION=50.0, ATTITUDE_TARGET=50.0)
-    | by_message(LOCAL_POSITION_NED=50.0, GLOBAL_POSITION_INT=50.0, SERVO_OUTPUT_RAW=50.0)
-    | by_message(RC_CHANNELS=20.0, VFR_HUD=4.0, POSITION_TARGET_LOCAL_NED=1.5, GPS_RAW_INT=1.0)
-    | by_message(EXTENDED_SYS_STATE=1.0, SYS_STATUS=1.0)
+    | by_message(LOCAL_POSITION_NED=50.0, GLOBAL_POSITION_INT=50.0, RC_CHANNELS=20.0)
+    | by_message(POSITION_TARGET_LOCAL_NED=1.5, EXTENDED_SYS_STATE=1.0, SYS_STATUS=1.0)
 )
 """Message rates on a link to a ground station (mode Normal with the SITL script's additions)."""
 
@@ -51,15 +229,10 @@ class Px4Endpoint(Endpoint[Px4]):
     """Link to a ground station, or to a companion computer, which gets other streams."""
 
     def __init__(self, ap: Px4, *, is_onboard: bool) -> None:
-        self.heard: set[tuple[int, int]] = set()
-        """Systems and components heard on this link."""
         default_hz = ONBOARD_HZ if is_onboard else GCS_HZ
         self._default_us = {key: round(1e6 / rate) for key, rate in default_hz.items()}
         self._text_id = self._event_sequence = 0
-        super().__init__(ap, BUILDERS_1_14 if ap.config.px4_release == "1.14" else BUILDERS)
-
-    def restart(self, ap: Px4) -> None:
-        super().restart(ap)
+        super().__init__(ap, Px4Telemetry(ap))
         self.has_gcs = False  # heard a ground station's heartbeat; no text is sent before
         self._streams: dict[int, _Stream] = {}
         for message_id, interval_us in self._default_us.items():
@@ -81,7 +254,7 @@ class Px4Endpoint(Endpoint[Px4]):
 
     def set_interval(self, message_id: int, interval_us: int) -> bool:
         """Apply MAV_CMD_SET_MESSAGE_INTERVAL: -1 stops, 0 restores the link's default."""
-        if message_id not in self._builders or message_id == mav.MAVLINK_MSG_ID_HEARTBEAT:
+        if message_id not in self._telemetry.names or message_id == mav.MAVLINK_MSG_ID_HEARTBEAT:
             return False
         self._start(message_id, interval_us or self._default_us.get(message_id, -1))
         return True

@@ -14,25 +14,23 @@ _SUB_ANY = (1, 2)  # POSCTL's orbit and slow flight, flown here as POSCTL
 class Px4Mode(Enum):
     """Flight mode.
 
-    Values: main and sub mode of HEARTBEAT.custom_mode, name in status texts, number as the argument
-    of an event, and MAV_STANDARD_MODE.
+    Values: main and sub mode of HEARTBEAT.custom_mode, name in status texts, MAV_STANDARD_MODE.
     """
 
-    MANUAL = (1, 0, "Manual", 0, 0)
-    ALTCTL = (2, 0, "Altitude", 1, 4)
-    POSCTL = (3, 0, "Position", 2, 1)
-    AUTO_TAKEOFF = (4, 2, "Takeoff", 10, 8)
-    AUTO_LOITER = (4, 3, "Hold", 4, 0)
-    AUTO_MISSION = (4, 4, "Mission", 3, 6)
-    AUTO_RTL = (4, 5, "RTL", 5, 5)
-    AUTO_LAND = (4, 6, "Land", 11, 7)
-    ACRO = (5, 0, "Acro", 6, 0)
-    OFFBOARD = (6, 0, "Offboard", 7, 0)
-    STAB = (7, 0, "Stabilized", 8, 0)
+    MANUAL = (1, 0, "Manual", 0)
+    ALTCTL = (2, 0, "Altitude", 4)
+    POSCTL = (3, 0, "Position", 1)
+    AUTO_TAKEOFF = (4, 2, "Takeoff", 8)
+    AUTO_LOITER = (4, 3, "Hold", 0)
+    AUTO_MISSION = (4, 4, "Mission", 6)
+    AUTO_RTL = (4, 5, "RTL", 5)
+    AUTO_LAND = (4, 6, "Land", 7)
+    ACRO = (5, 0, "Acro", 0)
+    OFFBOARD = (6, 0, "Offboard", 0)
+    STAB = (7, 0, "Stabilized", 0)
 
-    def __init__(self, main: int, sub: int, spoken: str, event_number: int, standard: int) -> None:
-        self.main, self.sub = main, sub
-        self.spoken, self.event_number, self.standard = spoken, event_number, standard
+    def __init__(self, main: int, sub: int, spoken: str, standard: int) -> None:
+        self.main, self.sub, self.spoken, self.standard = main, sub, spoken, standard
         self.custom_mode = main << 16 | sub << 24
         self.is_auto = main == MAIN_AUTO
         self.manual_throttle = main in (1, 5, 7)  # the stick is thrust: down for arming

@@ -22,9 +22,8 @@ _INTEGERS: Mapping[str, int] = MappingProxyType(
         "RC_MAP_PITCH": 0,  # channel from 1; 0: not mapped
         "SYS_AUTOSTART": 10040,  # SIH quadrotor
     }
-    | {"COM_FLTMODE_BOOT": 4, "MAN_ARM_GESTURE": 1, "MAV_COMP_ID": 1, "MAV_PROTO_VER": 2}
-    | {"MAV_SYS_ID": 1, "MAV_TYPE": 2, "MPC_ALT_MODE": 2, "MPC_POS_MODE": 4, "MPC_THR_CURVE": 0}
-    | {"RC_CHAN_CNT": 0, "RC_MAP_ROLL": 0, "RC_MAP_THROTTLE": 0, "RC_MAP_YAW": 0}
+    | {"COM_FLTMODE_BOOT": 4, "MAN_ARM_GESTURE": 1, "MAV_COMP_ID": 1, "MAV_SYS_ID": 1}
+    | {"MAV_TYPE": 2, "MPC_THR_CURVE": 0, "RC_MAP_ROLL": 0, "RC_MAP_THROTTLE": 0, "RC_MAP_YAW": 0}
 )
 _FLOATS: Mapping[str, float] = MappingProxyType(
     {
@@ -38,7 +37,6 @@ _FLOATS: Mapping[str, float] = MappingProxyType(
         DEAD_ZONE: 0.1,  # of the stick, to each side of the middle
         "MAN_OVERRIDE_SPD": 1.0,  # full sticks per second; -1: off
         "MC_ACRO_P_MAX": 100.0,  # deg/s
-        "MC_MAN_TILT_TAU": 0.0,  # s
         "MC_PITCHRATE_MAX": 220.0,  # deg/s
         "MC_PITCH_P": 4.0,  # 1/s
         "MIS_TAKEOFF_ALT": 2.5,  # m
@@ -54,18 +52,15 @@ _FLOATS: Mapping[str, float] = MappingProxyType(
         "MPC_TKO_RAMP_T": 3.0,  # s
         "MPC_TKO_SPEED": 1.5,  # m/s
     }
-    | {"MAN_KILL_GEST_T": -1.0, "MC_ACRO_EXPO": 0.0, "MC_ACRO_EXPO_Y": 0.0, "MC_ACRO_R_MAX": 100.0}
-    | {"MC_ACRO_SUPEXPO": 0.0, "MC_ACRO_SUPEXPOY": 0.0, "MC_ACRO_Y_MAX": 100.0}
+    | {"MAN_KILL_GEST_T": -1.0, "MC_ACRO_R_MAX": 100.0, "MC_ACRO_Y_MAX": 100.0}
     | {"MC_PITCHRATE_P": 0.15, "MC_ROLLRATE_MAX": 220.0, "MC_ROLLRATE_P": 0.15, "MC_ROLL_P": 4.0}
-    | {"MC_YAWRATE_MAX": 200.0, "MC_YAW_P": 2.8, "MC_YAW_WEIGHT": 0.4, "MPC_ACC_HOR": 3.0}
-    | {"MPC_ACC_HOR_MAX": 5.0, "MPC_ACC_UP_MAX": 4.0, "MPC_JERK_MAX": 8.0, "MPC_MANTHR_MIN": 0.08}
-    | {"MPC_THR_HOVER": 0.5, "MPC_THR_MAX": 1.0, "MPC_THR_MIN": 0.12, "MPC_TILTMAX_LND": 12.0}
-    | {"MPC_VEL_MANUAL": 10.0, "MPC_XY_CRUISE": 5.0, "MPC_XY_P": 0.95, "MPC_XY_TRAJ_P": 0.5}
-    | {"MPC_XY_VEL_D_ACC": 0.2, "MPC_XY_VEL_I_ACC": 0.4, "MPC_XY_VEL_MAX": 12.0}
-    | {"MPC_XY_VEL_P_ACC": 1.8, "MPC_Z_P": 1.0, "MPC_Z_VEL_I_ACC": 2.0, "MPC_Z_VEL_MAX_DN": 1.5}
-    | {"MPC_Z_VEL_MAX_UP": 3.0, "MPC_Z_VEL_P_ACC": 4.0, "MPC_Z_V_AUTO_DN": 1.5}
-    | {"MPC_Z_V_AUTO_UP": 3.0, "NAV_ACC_RAD": 10.0, "RTL_DESCEND_ALT": 10.0, "RTL_MIN_DIST": 10.0}
-    | {"RTL_RETURN_ALT": 30.0}
+    | {"MC_YAWRATE_MAX": 200.0, "MC_YAW_P": 2.8, "MPC_ACC_HOR": 3.0, "MPC_ACC_UP_MAX": 4.0}
+    | {"MPC_JERK_MAX": 8.0, "MPC_MANTHR_MIN": 0.08, "MPC_THR_HOVER": 0.5, "MPC_THR_MAX": 1.0}
+    | {"MPC_THR_MIN": 0.12, "MPC_VEL_MANUAL": 10.0, "MPC_XY_CRUISE": 5.0, "MPC_XY_P": 0.95}
+    | {"MPC_XY_TRAJ_P": 0.5, "MPC_XY_VEL_D_ACC": 0.2, "MPC_XY_VEL_I_ACC": 0.4}
+    | {"MPC_XY_VEL_MAX": 12.0, "MPC_XY_VEL_P_ACC": 1.8, "MPC_Z_P": 1.0, "MPC_Z_VEL_MAX_DN": 1.5}
+    | {"MPC_Z_VEL_MAX_UP": 3.0, "MPC_Z_V_AUTO_DN": 1.5, "MPC_Z_V_AUTO_UP": 3.0}
+    | {"RTL_MIN_DIST": 10.0, "RTL_RETURN_ALT": 30.0}
 )
 _OLD_NAMES: Mapping[str, float] = MappingProxyType(
     {"MPC_HOLD_DZ": 0.1, "MPC_YAW_EXPO": 0.6, "MPC_Z_MAN_EXPO": 0.6}
@@ -132,7 +127,6 @@ class Px4Params(Params):
         values |= {} if DEAD_ZONE in values else _OLD_NAMES
         if receiver:
             values |= {"RC_MAP_ROLL": 1, "RC_MAP_PITCH": 2, "RC_MAP_THROTTLE": 3, "RC_MAP_YAW": 4}
-            values["RC_CHAN_CNT"] = 8
         super().__init__(values, _INTEGERS)
 
     @property

@@ -16,15 +16,13 @@ from sitl.link.server import (
     MAX_RC_FIELDS,
     REJECTED,
     MavlinkServer,
-    Message,
     Params7,
     send_ack,
-    sender_of,
 )
+from sitl.link.telemetry import Message
 from sitl.px4.autopilot import Px4
-from sitl.px4.endpoint import Px4Endpoint
+from sitl.px4.endpoint import Px4Endpoint, Px4Telemetry
 from sitl.px4.flight import PositionSetpoint, Setpoint
-from sitl.px4.messages import HOME
 from sitl.px4.modes import Px4Mode, mode_of
 from sitl.px4.sticks import from_manual_control
 from sitl.report import FlightLog
@@ -49,21 +47,6 @@ class Px4Server(MavlinkServer[Px4, Px4Endpoint]):
         onboard = ap.config.onboard_links
         links = [Px4Endpoint(ap, is_onboard=n in onboard) for n in range(link_count)]
         super().__init__(ap, links, log)
-        self._handlers |= {
-            "HEARTBEAT": self._heartbeat,
-            "MANUAL_CONTROL": self._manual_control,
-            "RC_CHANNELS_OVERRIDE": self._override,
-            "SET_MODE": self._set_mode,
-            "SET_ATTITUDE_TARGET": self._set_attitude_target,
-            "SET_POSITION_TARGET_LOCAL_NED": self._set_position_target,
-        }
-        self._commands |= {
-            mav.MAV_CMD_NAV_RETURN_TO_LAUNCH: lambda *_: self._to_mode(Px4Mode.AUTO_RTL),
-            mav.MAV_CMD_NAV_LAND: lambda *_: self._to_mode(Px4Mode.AUTO_LAND),
-            mav.MAV_CMD_NAV_TAKEOFF: self._takeoff,
-            mav.MAV_CMD_PREFLIGHT_REBOOT_SHUTDOWN: self._reboot,
-            mav.MAV_CMD_COMPONENT_ARM_DISARM: self._arm_disarm,
-        }
 
     def _announce(self) -> None:
         """Send events before the texts."""
@@ -80,45 +63,37 @@ class Px4Server(MavlinkServer[Px4, Px4Endpoint]):
         return system in (0, self._ap.system_id) and is_ours
 
     def _pass_on(self, link: Px4Endpoint, message: Message) -> None:
-        """Forward a frame unchanged to the other links.
+        """Forward a frame unchanged to the other links, unless it is for the vehicle alone.
 
-        Broadcasts go to all links; MANUAL_CONTROL counts as a broadcast, since its target is no
-        ordinary target field. Other messages go to the links where their addressee was heard.
+        MANUAL_CONTROL counts as a broadcast, since its target is no ordinary target field. Of
+        heartbeats only those of ground stations are forwarded.
         """
-        link.heard.add(sender_of(message))
-        system = getattr(message, "target_system", 0)
-        component = getattr(message, "target_component", 0)
-        if (system, component) == (self._ap.system_id, mav.MAV_COMP_ID_AUTOPILOT1):
-            return
         is_heartbeat = message.get_type() == "HEARTBEAT"
-        if is_heartbeat and message.type != mav.MAV_TYPE_GCS:
+        is_ours = getattr(message, "target_system", 0) == self._ap.system_id
+        if is_ours or (is_heartbeat and message.type != mav.MAV_TYPE_GCS):
             return
         for other in self.links:
-            if other is link:
-                continue
-            heard = any(
-                system in (0, known_system) and component in (0, known_component)
-                for known_system, known_component in other.heard
-            )
-            if system == 0 or heard:
+            if other is not link:
                 other.pass_on(bytes(message.get_msgbuf()))
 
-    def _heartbeat(self, link: Px4Endpoint, message: Message, _arrived_ns: int) -> None:
+    def on_heartbeat(self, link: Px4Endpoint, message: Message, _arrived_ns: int) -> None:
         if message.type == mav.MAV_TYPE_GCS:
             link.has_gcs = True
 
-    def _manual_control(self, link: Px4Endpoint, message: Message, arrived_ns: int) -> None:
+    def on_manual_control(self, link: Px4Endpoint, message: Message, arrived_ns: int) -> None:
         self._log.manual_controls.add(arrived_ns)
         sticks = from_manual_control(message.x, message.y, message.z, message.r)
         self._ap.stick_input.on_sticks(self.links.index(link), sticks, arrived_ns)
 
-    def _override(self, _link: Px4Endpoint, message: Message, arrived_ns: int) -> None:
+    def on_rc_channels_override(
+        self, _link: Px4Endpoint, message: Message, arrived_ns: int
+    ) -> None:
         """Treat the values as those of a receiver; PX4 has no override."""
         self._log.overrides.add(arrived_ns)
         values = [getattr(message, f"chan{n}_raw") for n in range(1, MAX_RC_FIELDS + 1)]
         self._ap.set_receiver([0 if value == _RC_IGNORE else value for value in values])
 
-    def _set_attitude_target(self, _link: Px4Endpoint, message: Message, arrived_ns: int) -> None:
+    def on_set_attitude_target(self, _link: Px4Endpoint, message: Message, arrived_ns: int) -> None:
         mask = message.type_mask
         rates: Vec3 = (message.body_roll_rate, message.body_pitch_rate, message.body_yaw_rate)
         if not mask & _IGNORE_ATTITUDE:
@@ -134,7 +109,9 @@ class Px4Server(MavlinkServer[Px4, Px4Endpoint]):
         elif not mask & _IGNORE_RATES and all(map(math.isfinite, rates)):
             self._follow(AttitudeSetpoint(None, rates, _thrust(message)), arrived_ns)
 
-    def _set_position_target(self, link: Px4Endpoint, message: Message, arrived_ns: int) -> None:
+    def on_set_position_target_local_ned(
+        self, link: Px4Endpoint, message: Message, arrived_ns: int
+    ) -> None:
         frame, mask = message.coordinate_frame, message.type_mask
         if frame not in (mav.MAV_FRAME_LOCAL_NED, mav.MAV_FRAME_BODY_NED):
             self._ap.commander.refuse_frame(frame)
@@ -164,7 +141,7 @@ class Px4Server(MavlinkServer[Px4, Px4Endpoint]):
         if self._ap.mode_name == "OFFBOARD":
             self._log.setpoints.add(arrived_ns)
 
-    def _set_mode(self, link: Px4Endpoint, message: Message, _arrived_ns: int) -> None:
+    def on_set_mode(self, link: Px4Endpoint, message: Message, _arrived_ns: int) -> None:
         """Change the mode by SET_MODE, acknowledged as DO_SET_MODE, which replaced it."""
         main, sub = message.custom_mode >> 16 & 0xFF, message.custom_mode >> 24 & 0xFF
         result = self._change_mode(message, message.base_mode, main, sub)
@@ -190,20 +167,26 @@ class Px4Server(MavlinkServer[Px4, Px4Endpoint]):
             self._ap.prepare_takeoff(None)
         return ACCEPTED if self._ap.commander.set_mode(mode, says_why=says_why) else REJECTED
 
-    def _arm_disarm(self, params: Params7, _link: Px4Endpoint) -> int | None:
+    def cmd_nav_return_to_launch(self, _params: Params7, _link: Px4Endpoint) -> int:
+        return self._to_mode(Px4Mode.AUTO_RTL)
+
+    def cmd_nav_land(self, _params: Params7, _link: Px4Endpoint) -> int:
+        return self._to_mode(Px4Mode.AUTO_LAND)
+
+    def cmd_component_arm_disarm(self, params: Params7, _link: Px4Endpoint) -> int | None:
         if params[0] not in (0.0, 1.0):
             return None
         force, commander = params[1] == FORCE, self._ap.commander
         done = commander.arm() if params[0] else commander.disarm(force=force)
         return ACCEPTED if done else REJECTED
 
-    def _takeoff(self, params: Params7, _link: Px4Endpoint) -> int:
+    def cmd_nav_takeoff(self, params: Params7, _link: Px4Endpoint) -> int:
         """Take off to param 7, an altitude above sea level; NaN: climb by MIS_TAKEOFF_ALT."""
-        height_m = params[6] - HOME.alt_m
+        height_m = params[6] - Px4Telemetry.alt_m
         self._ap.prepare_takeoff(height_m if math.isfinite(height_m) else None)
         return ACCEPTED if self._ap.commander.set_mode(Px4Mode.AUTO_TAKEOFF) else REJECTED
 
-    def _reboot(self, params: Params7, _link: Px4Endpoint) -> int:
+    def cmd_preflight_reboot_shutdown(self, params: Params7, _link: Px4Endpoint) -> int:
         """Accept 0, a no-op. PX4 refuses a reboot while armed, and always in SITL."""
         return ACCEPTED if math.isfinite(params[0]) and int(params[0]) == 0 else DENIED
 

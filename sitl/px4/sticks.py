@@ -25,11 +25,9 @@ FAST_SAMPLES = 3
 Samples at rest in between do not count, so a stick that has come to rest keeps its count."""
 OLD_TAU_S, TAU_S = 0.1, 0.05  # low-pass of a stick's speed, before 1.18 and in 1.18
 
-_ANY_SOURCE_MODES = (2, 3, 5, 6, 7, 8)
-_KEEP_FIRST = 3
-_PRIORITIES = {5: (RC_SOURCE, "low"), 6: (None, "low"), 7: (RC_SOURCE, "high"), 8: (None, "high")}
-"""By COM_RC_IN_MODE: RC_SOURCE if the receiver precedes the links (None: it comes last), and the
-winning link, lowest or highest."""
+_RECEIVER_ONLY, _LINKS_ONLY, _KEEP_FIRST, _NONE = 0, 1, 3, 4
+"""Values of COM_RC_IN_MODE. Any other takes any source, and keeps it until it is lost: the
+priorities of 5 to 8 are not imitated."""
 
 
 EXPO = 0.6
@@ -125,22 +123,11 @@ class StickInput:
 
     def _wins(self, source: int) -> bool:
         mode = self._params.integer("COM_RC_IN_MODE")
-        is_allowed = mode in _ANY_SOURCE_MODES or mode == (0 if source == RC_SOURCE else 1)
-        if not is_allowed:
+        if mode == (_LINKS_ONLY if source == RC_SOURCE else _RECEIVER_ONLY) or mode == _NONE:
             return False
         if mode == _KEEP_FIRST:
             return self._first_source in (None, source)
-        if not self.valid or self._never_ages or source == self._source:
-            return True
-        return mode in _PRIORITIES and self._rank(source, mode) < self._rank(self._source, mode)
-
-    def _rank(self, source: int | None, mode: int) -> float:
-        receiver, links = _PRIORITIES[mode]
-        if source is None:
-            return math.inf
-        if source == RC_SOURCE:
-            return -math.inf if receiver == RC_SOURCE else 1e9
-        return source if links == "low" else -source
+        return not self.valid or self._never_ages or source == self._source
 
     def _look(self, now_ns: int) -> None:
         """Detect movement since the last check, by the detector of the release."""

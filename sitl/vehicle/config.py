@@ -21,12 +21,14 @@ ArduPilotRelease: TypeAlias = Literal["4.6", "4.7-dev", "4.7"]
 Px4Release: TypeAlias = Literal["1.14", "1.15", "1.16", "1.17", "1.18"]
 """PX4 release for parameters, stick override and messages; 1.18 was measured."""
 
+SIGNING_TICK_NS = 10_000
+
 
 class SigningKey(NamedTuple):
     """MAVLink 2 signing of every link."""
 
     key: bytes  # 32 bytes
-    timestamp: int  # timestamp of the first packet, in units of 10 us since 2015
+    timestamp: int  # time since 2015 at zero of the vehicle's clock, in SIGNING_TICK_NS
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -41,8 +43,6 @@ class VehicleConfig:
     PX4 uses it only if COM_RC_IN_MODE says so."""
     receiver_us: tuple[int, ...] = IDLE_RECEIVER_US
     """Receiver channels at boot [us]."""
-    vehicle_type: int = 2
-    """HEARTBEAT.type, a MAV_TYPE: 2 is a quadrotor. The vehicle flies as one with any value."""
     estimator_ready_s: float = 3.0
     """Time from boot until arming is possible (about 23 s on the real firmware)."""
     position_ready_s: float = 5.0

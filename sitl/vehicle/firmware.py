@@ -9,7 +9,7 @@ import struct
 from abc import ABC, abstractmethod
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import replace
-from typing import ClassVar, NamedTuple, Self
+from typing import ClassVar, NamedTuple
 
 from pymavlink.dialects.v20 import ardupilotmega as mav
 
@@ -137,7 +137,6 @@ class Autopilot(ABC):
 
     step_ns: ClassVar[int]  # control period, by which `step` advances
     airframe: ClassVar[Airframe]
-    gps_period_ns: ClassVar[int]
     gyro_noise_radps: ClassVar[float] = 0.0
     """Noise of the body rates on each axis, in addition to the conditions'."""
     id_param: ClassVar[str]  # name of the system id's parameter
@@ -163,13 +162,7 @@ class Autopilot(ABC):
         self._noise = SensorNoise(replace(conditions, rate_noise_radps=rate_noise_radps))
         self._physics = self._quad.at_rest()
         self.sensed = self._physics.body
-        self.gps = self._physics.body  # state at the last fix
-        self._gps_due_ns = boot_ns
         self._still_since_ns: int | None = boot_ns
-
-    def rebooted(self) -> Self:
-        """Return the flight controller after a restart on the ground at the origin."""
-        return type(self)(self.params, self.config, self.now_ns)
 
     @property
     @abstractmethod
@@ -238,9 +231,6 @@ class Autopilot(ABC):
         self._physics = self._quad.step(self._physics, self.motor_commands, substeps, wind_mps)
         if not self.sensors_frozen:
             self.sensed = self._noise.sense(self._physics.body)
-            if self.now_ns >= self._gps_due_ns:
-                self._gps_due_ns += self.gps_period_ns
-                self.gps = self.sensed
         self._detect_landing()
 
     def launch(
@@ -251,7 +241,7 @@ class Autopilot(ABC):
         A mode flown by setpoints is kept.
         """
         self._physics = self._quad.airborne(position_ned_m, velocity_ned_mps, ned_from_body_wxyz)
-        self.sensed = self.gps = self._physics.body
+        self.sensed = self._physics.body
         self._start_in_air()
 
     @abstractmethod

@@ -49,7 +49,6 @@ def test_intervals_are_cut_to_whole_milliseconds(companion, asked_hz, got_us):
         mav.MAVLINK_MSG_ID_RAW_IMU,
         mav.MAVLINK_MSG_ID_SCALED_IMU2,
         mav.MAVLINK_MSG_ID_RC_CHANNELS,
-        mav.MAVLINK_MSG_ID_SERVO_OUTPUT_RAW,
     ],
 )
 def test_state_streams_at_the_requested_rate(companion, message_id):

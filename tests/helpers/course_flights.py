@@ -4,8 +4,6 @@ import math
 from dataclasses import dataclass
 from itertools import pairwise
 
-import numpy as np
-
 from sitl.ardupilot.flight_modes import Mode
 from sitl.clock import NS_PER_S
 from sitl.course import AirborneStart, Course
@@ -39,13 +37,9 @@ class CourseFlight:
     def succeeded(self) -> bool:
         return self.vehicle.log.next_gate is None and not self.vehicle.log.crashed
 
-    @property
-    def labels(self):
-        return np.array([tick.label for tick in self.ticks])
-
     def mean_speed_mps(self) -> float:
         """Return the speed along the straight legs between the first and the last passed gate."""
-        passed = self.vehicle.log.summary(self.vehicle.ap, 0)["gates"]["passed"]
+        passed = self.vehicle.log.summary(self.vehicle.ap)["gates"]["passed"]
         centers = [self.course.gates[entry["index"]].center_ned_m for entry in passed]
         distance_m = sum(math.dist(a, b) for a, b in pairwise(centers))
         return distance_m / (passed[-1]["t_s"] - passed[0]["t_s"]) if len(passed) > 1 else math.nan

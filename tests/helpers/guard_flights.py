@@ -87,7 +87,6 @@ class GuardFlight:
         params: dict[str, float] | None = None,
         contract: Contract = CONTRACT,
         link: dict[str, Any] | None = None,
-        vehicle_type: int = 2,
         vehicle: VehicleConfig = NOMINAL_VEHICLE,
         **config: Any,
     ) -> None:
@@ -105,7 +104,6 @@ class GuardFlight:
                 vehicle,
                 receiver=receiver_us is not None,
                 receiver_us=receiver_us or IDLE_RECEIVER_US,
-                vehicle_type=vehicle_type,
             ),
         )
         for name, value in (params or {}).items():
@@ -255,7 +253,7 @@ class GuardFlight:
     @property
     def t_s(self) -> float:
         """Seconds since boot: the time of the vehicle's records."""
-        return self.vehicle.log.summary(self.vehicle.ap, 0)["duration_s"]
+        return self.vehicle.log.summary(self.vehicle.ap)["duration_s"]
 
     @property
     def flown_s(self) -> float:
@@ -381,13 +379,13 @@ class GuardFlight:
 
     def record(self, since_s: float = 0.0) -> list[dict[str, Any]]:
         """The vehicle's own record of its sticks, by time since boot."""
-        entries = self.vehicle.log.summary(self.vehicle.ap, 0)["sticks"]
+        entries = self.vehicle.log.summary(self.vehicle.ap)["sticks"]
         return [entry for entry in entries if entry["t_s"] >= since_s]
 
     @property
     def modes(self) -> list[str]:
         """The vehicle's modes in order."""
-        return [entry["mode"] for entry in self.vehicle.log.summary(self.ap, 0)["modes"]]
+        return [entry["mode"] for entry in self.vehicle.log.summary(self.ap)["modes"]]
 
     # --- others
 

@@ -207,7 +207,7 @@ class OutputFlight(GuardFlight):
     @property
     def summary(self) -> dict[str, Any]:
         """The vehicle's report."""
-        return self.vehicle.log.summary(self.vehicle.ap, 0)
+        return self.vehicle.log.summary(self.vehicle.ap)
 
     def describe(self) -> str:
         ap = self.vehicle.ap

@@ -6,8 +6,13 @@ from dataclasses import dataclass
 from mavbridge.core.vehicle import StickGains, Sticks
 from mavbridge.mavlink.profiles.ardupilot_sticks import calibration
 from sitl.ardupilot.params import ArduPilotParams
-from sitl.ardupilot.rc import RcEngine
-from sitl.ardupilot.sticks import climb_rate_mps, lean_angles, read_sticks, yaw_rate_radps
+from sitl.ardupilot.rc import (
+    RcEngine,
+    climb_rate_mps,
+    lean_angles,
+    read_sticks,
+    yaw_rate_radps,
+)
 from sitl.vehicle.conditions import Conditions
 
 PX4_DEFAULTS = {

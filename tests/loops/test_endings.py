@@ -115,7 +115,7 @@ def judge(flight: GuardFlight, ending: Ending) -> list[str]:
         if start_m - lowest_m > MOST_LOST_M:
             sink_mps = max(sink_mps, flight.ap.truth.velocity_ned_mps[2])
     modes = flight.modes[before:]
-    impact_mps = flight.vehicle.log.summary(flight.vehicle.ap, 0)["impact_speed_mps"]
+    impact_mps = flight.vehicle.log.summary(flight.vehicle.ap)["impact_speed_mps"]
     assert impact_mps <= MOST_IMPACT_MPS, (modes, flight.describe())
     if not modes or modes[-1] not in LANDINGS:
         assert start_m - lowest_m <= MOST_LOST_M, (modes, flight.describe())

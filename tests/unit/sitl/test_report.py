@@ -20,7 +20,7 @@ def test_releases_and_foreign_overrides_on_the_link_are_distinguished():
         vehicle.receive(0, frame, 0)
     sender.srcSystem = 42
     vehicle.receive(0, mav.MAVLink_rc_channels_override_message(1, 1, *[0] * 8).pack(sender), 0)
-    summary = vehicle.log.summary(vehicle.ap, 0)
+    summary = vehicle.log.summary(vehicle.ap)
     assert summary["overrides"]["count"] == 2
     assert summary["releases"] == 2
 
@@ -33,7 +33,7 @@ def test_sticks_are_recorded_when_they_change_with_how_the_vehicle_moved(pilot):
     pilot.hold(0.5, watch=watch)
     pilot.ap.set_mode(Mode.LAND)
     pilot.hold(0.5, watch=watch)
-    entries = log.summary(pilot.ap, 0)["sticks"]
+    entries = log.summary(pilot.ap)["sticks"]
     changes = [
         after
         for before, after in pairwise(entries)
@@ -65,7 +65,7 @@ def test_after_a_stall_a_stick_is_not_recorded_before_it_came():
     override = mav.MAVLink_rc_channels_override_message(1, 1, 1700, *[65535] * 7)
     vehicle.receive(0, override.pack(mav.MAVLink(None, srcSystem=255)), 300 * NS_PER_MS)
     vehicle.step(301 * NS_PER_MS)
-    changed = vehicle.log.summary(vehicle.ap, 0)["sticks"][1]
+    changed = vehicle.log.summary(vehicle.ap)["sticks"][1]
     assert (changed["us"][0], changed["t_s"]) == (1700, 0.3)
 
 
@@ -79,6 +79,6 @@ def test_falling_out_of_the_sky_is_a_crash(pilot):
     pilot.take_off(height_m=5.0)
     pilot.ap.disarm(force=True)
     pilot.hold(3.0, watch=watch)
-    summary = log.summary(pilot.ap, 0)
+    summary = log.summary(pilot.ap)
     assert summary["crashed"]
     assert summary["impact_speed_mps"] > 5.0

@@ -8,6 +8,7 @@ import pytest
 from sitl.ardupilot.flight_modes import Mode
 from sitl.vehicle.conditions import NOMINAL
 from sitl.vehicle.config import VehicleConfig
+from sitl.vehicle.rotation import from_euler
 
 
 def test_stabilize_hovers_at_mid_stick_and_climbs_above(pilot):
@@ -17,17 +18,6 @@ def test_stabilize_hovers_at_mid_stick_and_climbs_above(pilot):
     pilot.hold(2.0, thr=1600)
     assert abs(drift_mps) < 0.1
     assert 2.5 < -pilot.ap.truth.velocity_ned_mps[2] < 4.5
-
-
-def test_acro_trainer_limits_the_lean_and_without_it_there_is_none(pilot):
-    pilot.take_off(height_m=15.0, mode=Mode.ACRO)
-    leans_deg = []
-    pilot.hold(1.5, roll=2000, watch=lambda ap: leans_deg.append(abs(pilot.angles_deg()[0])))
-    assert max(leans_deg) < 40.0
-    pilot.ap.params.set("ACRO_TRAINER", 0.0)
-    leans_deg.clear()
-    pilot.hold(1.0, roll=2000, watch=lambda ap: leans_deg.append(abs(pilot.angles_deg()[0])))
-    assert max(leans_deg) > 150.0
 
 
 def test_rtl_comes_home_and_lands(pilot):
@@ -43,9 +33,10 @@ def test_rtl_comes_home_and_lands(pilot):
 
 
 def test_a_tipped_vehicle_stops_its_motors(pilot):
-    pilot.ap.params.set("ACRO_TRAINER", 0.0)
-    pilot.take_off(height_m=3.0, mode=Mode.ACRO)
-    pilot.hold(4.0, roll=1900, thr=1200)
+    pilot.take_off(height_m=1.0)
+    pilot.ap.launch((0.0, 0.0, -1.0), (0.0, 0.0, 0.0), from_euler(2.0, 0.0, 0.0))
+    pilot.ap.params.set("ANGLE_MAX", 8000.0)
+    pilot.hold(4.0, roll=2000, thr=1000)
     assert "Crash: Disarming" in pilot.texts()
     assert not pilot.ap.armed
 
@@ -134,10 +125,10 @@ def test_a_radio_failsafe_on_the_ground_disarms_and_without_a_position_lands(pil
 
 
 def test_the_mode_switch_acts_after_its_debounce_and_only_when_it_moves(pilot):
-    pilot.take_off(mode=Mode.ACRO)
+    pilot.take_off(mode=Mode.LOITER)
     pilot.ap.rc.set_receiver([1500, 1500, 1500, 1500, 1400])
     pilot.hold(0.19)
-    assert pilot.ap.mode is Mode.ACRO
+    assert pilot.ap.mode is Mode.LOITER
     pilot.hold(0.05)
     assert pilot.ap.mode is Mode.RTL
     assert pilot.ap.set_mode(Mode.ALT_HOLD)

@@ -6,10 +6,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from sitl.ardupilot import sticks as pilot_sticks
+from sitl.ardupilot import rc as pilot_sticks
 from sitl.ardupilot.params import ArduPilotParams
-from sitl.ardupilot.rc import RcEngine
-from sitl.ardupilot.sticks import read_sticks
+from sitl.ardupilot.rc import RcEngine, read_sticks
 from sitl.clock import NS_PER_MS
 from sitl.vehicle.config import IDLE_RECEIVER_US
 

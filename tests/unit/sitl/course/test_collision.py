@@ -73,7 +73,7 @@ def test_a_struck_frame_is_a_crash_told_once_and_ends_the_count(firmware, speed_
         for message in parser.parse_buffer(vehicle.take_outgoing(0))
         if message.get_type() == "STATUSTEXT" and "Crash" in message.text
     ]
-    summary = vehicle.log.summary(vehicle.ap, 0)
+    summary = vehicle.log.summary(vehicle.ap)
     assert vehicle.ap.truth.position_ned_m[0] > 10.0, "flies on"
     assert summary["crashed"]
     assert summary["crash"]["speed_mps"] == pytest.approx(speed_mps, abs=1.0)
@@ -86,7 +86,7 @@ def test_a_launched_vehicle_flies_on_from_there():
     assert vehicle.pose.body.velocity_ned_mps == pytest.approx((5.0, 0.0, 0.0))
     assert (vehicle.ap.armed, vehicle.ap.landed, vehicle.ap.mode) == (True, False, Mode.ALT_HOLD)
     glide(vehicle, 2.5)
-    summary = vehicle.log.summary(vehicle.ap, 0)
+    summary = vehicle.log.summary(vehicle.ap)
     assert summary["crash"] is None
     assert [entry["index"] for entry in summary["gates"]["passed"]] == [1]
     assert vehicle.log.next_gate is None

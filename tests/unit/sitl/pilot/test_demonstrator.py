@@ -21,7 +21,7 @@ def nominal_flight():
 
 def test_it_takes_off_passes_every_gate_near_the_middle_and_hovers(nominal_flight):
     flight = nominal_flight
-    passed = flight.vehicle.log.summary(flight.vehicle.ap, 0)["gates"]["passed"]
+    passed = flight.vehicle.log.summary(flight.vehicle.ap)["gates"]["passed"]
     assert [entry["index"] for entry in passed] == list(range(8))
     assert not flight.vehicle.log.crashed
     assert max(flight.misses_m()) < 0.5

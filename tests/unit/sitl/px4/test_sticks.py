@@ -5,7 +5,6 @@ import pytest
 from sitl.clock import NS_PER_MS, NS_PER_S
 from sitl.px4.params import Px4Params
 from sitl.px4.sticks import RC_SOURCE, Px4Sticks, StickInput
-from sitl.vehicle.firmware import HeldGesture
 
 PERIOD_NS = 20 * NS_PER_MS
 GCS, ONBOARD = 0, 1
@@ -29,49 +28,16 @@ class Senders:
         return self.input.source
 
 
-@pytest.mark.parametrize(
-    ("in_mode", "with_both"),
-    [(1, GCS), (2, GCS), (3, GCS), (5, GCS), (6, GCS), (7, ONBOARD), (8, ONBOARD)],
-)
-def test_the_input_mode_selects_one_of_two_links(in_mode, with_both):
-    senders = Senders(in_mode)
-    senders.send(0.1, GCS)
-    assert senders.send(0.1, GCS, ONBOARD) == with_both
-
-
-@pytest.mark.parametrize(
-    ("in_mode", "after"), [(1, ONBOARD), (2, ONBOARD), (3, None), (8, ONBOARD)]
-)
+@pytest.mark.parametrize(("in_mode", "after"), [(1, ONBOARD), (2, ONBOARD), (3, None)])
 def test_another_link_takes_over_when_the_first_has_stopped(in_mode, after):
     senders = Senders(in_mode)
     senders.send(0.1, GCS)
-    if in_mode != 8:
-        assert senders.send(0.56, ONBOARD) == GCS
+    assert senders.send(0.56, ONBOARD) == GCS
     assert senders.send(0.1, ONBOARD) == after
 
 
 @pytest.mark.parametrize(
-    ("in_mode", "source"),
-    [(0, RC_SOURCE), (1, GCS), (4, None), (5, RC_SOURCE), (6, GCS), (7, RC_SOURCE), (8, GCS)],
+    ("in_mode", "source"), [(0, RC_SOURCE), (1, GCS), (2, RC_SOURCE), (4, None)]
 )
 def test_the_input_mode_selects_the_receiver_or_a_link(in_mode, source):
     assert Senders(in_mode).send(0.2, RC_SOURCE, GCS) == source
-
-
-def test_pretended_sticks_stay_until_real_ones_come():
-    senders = Senders()
-    senders.input.pretend_centred(0)
-    senders.send(5.0)
-    assert senders.input.valid
-    senders.send(0.1, ONBOARD)
-    senders.send(0.7)
-    assert not senders.input.valid
-
-
-def test_a_held_gesture_acts_once_until_it_is_made_again():
-    gesture = HeldGesture(10)
-    gesture.see(1, 0)
-    assert [gesture.take(now_ns) for now_ns in (9, 10, 30)] == [0, 1, 0]
-    gesture.see(0, 31)
-    gesture.see(-1, 32)
-    assert gesture.take(42) == -1
