@@ -253,9 +253,6 @@ class Relay(Worker):
         with self._news:
             return self._news.wait_for(condition, timeout_s)
 
-    def sent_since(self, at_ns: int, name: str) -> list[Sent]:
-        return [sent for sent in self.sent if sent.at_ns > at_ns and sent.name == name]
-
     def _run(self) -> None:
         while not self._stop.is_set():
             now_ns = self._clock.now_ns()

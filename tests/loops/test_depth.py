@@ -166,14 +166,3 @@ def test_a_graph_that_takes_bytes_is_no_policy_of_depth(tmp_path: Path) -> None:
     actor(tmp_path / "policy.onnx", kind=onnx.TensorProto.UINT8)
     with pytest.raises(MavbridgeError, match="depth in metres"):
         load_policy(request(tmp_path), now_s=lambda: 0.0)
-
-
-def test_a_simulated_camera_of_colour_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(simulated, "FpvRenderer", FpvRenderer)
-    settings = ExecutionSettings(name="deep", dual_rate=False)
-    with pytest.raises(MavbridgeError, match=r"uint16 .* got uint8"):
-        height_flown_m(make_numpy_runner(HoldsDistance(), settings))
-    monkeypatch.setattr(simulated, "FpvRenderer", GroundDepth)
-    colour = make_numpy_runner(HoldsDistance(replace(DEPTH, image_channels="rgb")), settings)
-    with pytest.raises(MavbridgeError, match=r"uint8 .* got uint16"):
-        height_flown_m(colour)

@@ -107,31 +107,6 @@ def test_a_joystick_on_our_system_id_is_noticed_within_half_a_second(
     assert not flight.modes_asked()
 
 
-@pytest.mark.parametrize("policy", [hovering, leaning])
-def test_a_vehicle_that_hears_us_no_more_is_noticed_while_the_sticks_stand_still(
-    policy: Callable[[float], tuple[float, float, float, float]],
-) -> None:
-    flight = GuardFlight(policy).fly()
-    flight.up.is_silent = True
-    took_s = flight.until(lambda: flight.phase is not Phase.FLYING, within_s=3)
-
-    assert took_s < 0.6
-    assert Code.UNHEARD in flight.codes
-    flight.up.is_silent = False
-    flight.run(0.3)
-    assert flight.record()[-1]["us"] == MID_RECEIVER_US[:4], "the release arrives once it can"
-    flight.run(5)
-    assert flight.phase is Phase.RELEASED, "and the policy does not fly again"
-
-
-def test_a_link_with_a_fifth_of_its_packets_lost_is_flown() -> None:
-    flight = GuardFlight().fly()
-    flight.up.loss = flight.down.loss = 0.2
-    flight.run(10)
-
-    assert flight.phase is Phase.FLYING, flight.describe()
-
-
 def by_parameter(flight: GuardFlight) -> None:
     flight.station(lambda mav: mav.param_set_encode(1, 1, b"FS_THR_ENABLE", 0.0, 9), system=42)
     index = flight.vehicle.params.names.index("FS_THR_ENABLE")

@@ -1,12 +1,11 @@
 """The listener is fed with real MAVLink bytes of a made-up vehicle; time is given."""
 
 import math
-from itertools import pairwise
 
 import pytest
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
-from sitl.camera.follow import SYSTEM_ID, PoseListener
+from sitl.camera.follow import PoseListener
 from sitl.clock import NS_PER_S
 from sitl.vehicle.rotation import IDENTITY, from_euler
 
@@ -88,21 +87,6 @@ def test_only_the_first_autopilot_is_followed():
     listener.receive(camera.quaternion() + camera.position(), T0_NS)
     assert listener.pose_at(T0_NS) is None
     assert {m.target_system for m in decode(listener.outgoing(T0_NS))[1:]} == {1}
-
-
-def test_a_heartbeat_a_second_and_no_request_before_a_vehicle_is_heard():
-    listener = PoseListener(rate_hz=RATE_HZ)
-    times = [T0_NS + k * NS_PER_S // 30 for k in range(91)]
-    beats = [now_ns for now_ns in times if listener.outgoing(now_ns)]
-    assert len(beats) == 4
-    assert all(b - a == pytest.approx(NS_PER_S, abs=2) for a, b in pairwise(beats))
-    (beat,) = decode(listener.outgoing(times[-1] + NS_PER_S))
-    assert beat.get_type() == "HEARTBEAT"
-    assert (beat.type, beat.autopilot) == (
-        mavlink.MAV_TYPE_ONBOARD_CONTROLLER,
-        mavlink.MAV_AUTOPILOT_INVALID,
-    )
-    assert beat.get_srcSystem() == SYSTEM_ID != 255
 
 
 def run_second(listener, second, packets):

@@ -13,7 +13,7 @@ from sitl.clock import NS_PER_MS, NS_PER_S
 from sitl.course import AirborneStart, make_course
 from sitl.pilot.demonstrator import Expert, StickPositions
 from sitl.simulated_vehicle import SimulatedVehicle
-from sitl.vehicle.conditions import NOMINAL, random_conditions
+from sitl.vehicle.conditions import NOMINAL
 from sitl.vehicle.config import STEP_NS, VehicleConfig
 from sitl.vehicle.dynamics import Quadrotor
 from sitl.vehicle.rotation import IDENTITY, to_euler
@@ -41,29 +41,6 @@ def hold(sticks, seconds=2.0, **conditions):
 
 def roll_deg(body):
     return math.degrees(to_euler(body.ned_from_body_wxyz)[0])
-
-
-def test_conditions_become_parameters():
-    drawn = random_conditions(8)
-    params = ArduPilotParams(drawn)
-    wanted = {
-        "ANGLE_MAX": drawn.angle_max_cdeg,
-        "PILOT_Y_RATE": drawn.pilot_yaw_rate_degps,
-        "PILOT_Y_EXPO": drawn.pilot_yaw_expo,
-        "PILOT_SPEED_UP": drawn.pilot_speed_up_cmps,
-        "PILOT_SPEED_DN": drawn.pilot_speed_down_cmps,
-        "PILOT_ACCEL_Z": drawn.pilot_accel_z_cmps2,
-        "THR_DZ": drawn.throttle_dead_zone_permille,
-        "RC1_DZ": drawn.rc_dead_zones_us[0],
-        "RC3_DZ": drawn.rc_dead_zones_us[2],
-        "ATC_INPUT_TC": drawn.input_time_s,
-        "ATC_ANG_PIT_P": drawn.angle_gains_per_s[1],
-        "ATC_RATE_R_MAX": drawn.lean_rate_max_degps,
-        "ATC_ACCEL_P_MAX": drawn.lean_accel_max_cdegps2,
-    }
-    assert {name: params.on_wire(name) for name in wanted} == pytest.approx(wanted, rel=1e-6)
-    nominal = ArduPilotParams()
-    assert not [name for name, value in wanted.items() if value == nominal[name]]
 
 
 @pytest.mark.parametrize("angle_max_cdeg", [3000, 4500])
